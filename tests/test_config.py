@@ -1,5 +1,6 @@
 """Every shipped run composes, every key is explained, a typo is one line."""
 
+import re
 from functools import reduce
 from pathlib import Path
 
@@ -72,6 +73,22 @@ def test_a_measure_of_a_rendered_port_that_is_below_zero_is_refused(key):
     setattr(reduce(getattr, parts, config.simulate), name, -1e-3)
     with pytest.raises(ConfigError, match=key):
         admit(config)
+
+
+FRONT = PortConfig().cameras["front"]
+
+
+@pytest.mark.parametrize(
+    ("port", "says"),
+    [
+        (PortConfig(name="../x"), "simulate.name: the name '../x' has a path separator"),
+        (PortConfig(cameras={"../x": FRONT}), "simulate.cameras: the name '../x' has a path separator"),
+        (PortConfig(cameras={"both": FRONT}), "simulate.cameras: a camera is called 'both'"),
+    ],
+)
+def test_names_of_a_rendered_port_that_become_files_are_checked(port, says):
+    with pytest.raises(ConfigError, match=re.escape(says)):
+        admit(RunConfig(name="run", simulate=port))
 
 
 def test_device_and_mode_reach_the_mapping():

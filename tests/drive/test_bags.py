@@ -9,6 +9,7 @@ import sqlite3
 import struct
 import tracemalloc
 from collections.abc import Callable
+from contextlib import closing
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -39,7 +40,7 @@ from tests.drive.bags import (
 from tests.drive.example import make_drive
 from v2hdm.cli.main import run
 from v2hdm.detection.frames import video_frames
-from v2hdm.errors import DriveError
+from v2hdm.errors import ConfigError, DriveError
 from v2hdm.geometry.ipm import mounting_angles
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.io.drive import ReadOptions, drive_name, read_drive
@@ -47,6 +48,8 @@ from v2hdm.io.drive.sources import _import_video
 from v2hdm.io.importers.bag import reading
 from v2hdm.io.importers.bag.messages import file_of
 from v2hdm.io.importers.bag.streams import ImageStream, TfStream, import_streams
+from v2hdm.store.files import replace_text
+from v2hdm.store.inputs import protected_inputs
 
 
 @pytest.fixture(scope="module")
@@ -364,6 +367,17 @@ def test_memory_does_not_grow_with_the_bag(kind, folder, tmp_path):
     assert peaks[1] < 1.1 * peaks[0] + 100_000
 
 
+def test_a_bag_is_not_written_over_whether_it_is_imported_or_was(folder, bags, tmp_path):
+    (bag,) = bags["mcap"].glob("*.mcap")
+    before = bag.read_bytes()
+    for _ in ("imported", "as it was imported"):
+        with protected_inputs():
+            read(tmp_path / "drive", topics_for(folder, bags["mcap"]))
+            with pytest.raises(ConfigError, match="is one of the inputs"):
+                replace_text(bag, "ours")
+    assert bag.read_bytes() == before
+
+
 def test_notes_beside_an_import_stay_when_it_is_made_anew(folder, bags, tmp_path):
     content = topics_for(folder, bags["mcap"])
     image = read(tmp_path / "drive", content).images[0].path
@@ -412,6 +426,30 @@ def test_a_definition_that_would_be_parsed_for_ever_is_refused(name, folder, tmp
         )
     database.close()
     with pytest.raises(DriveError, match="its definition is not from a recording"):
+        read(tmp_path / "drive", topics_for(folder, bag))
+
+
+COMPUTED = {
+    "a view": "DROP TABLE schema; CREATE VIEW schema AS SELECT 4 AS schema_version",  # it might be endless
+    "a virtual table": "DROP TABLE schema; CREATE VIRTUAL TABLE schema USING rtree(schema_version, a, b)",
+    "a computed column": "ALTER TABLE messages ADD more AS (zeroblob(1000000000))",
+}
+
+
+@pytest.mark.parametrize("sql", COMPUTED.values(), ids=COMPUTED)
+@pytest.mark.parametrize("mode", [CompressionMode.NONE, CompressionMode.FILE])
+def test_a_database_that_computes_its_rows_is_refused(mode, sql, folder, tmp_path):
+    bag = write_ros2(tmp_path / "bag", messages_of(folder), SQLITE3, mode)
+    (file,) = bag.glob("*.db3*")
+    plain = tmp_path / "plain.db3"
+    plain.write_bytes(
+        zstd.decompress(file.read_bytes()) if mode == CompressionMode.FILE else file.read_bytes()
+    )
+    with closing(sqlite3.connect(plain)) as database:
+        database.executescript(sql)
+    data = plain.read_bytes()
+    file.write_bytes(zstd.compress(data) if mode == CompressionMode.FILE else data)
+    with pytest.raises(DriveError, match="is no plain table of a recording"):
         read(tmp_path / "drive", topics_for(folder, bag))
 
 

@@ -13,7 +13,7 @@ from tests.drive.example import ORIGIN, description, make_drive
 from v2hdm.errors import DriveError
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.io.importers.poses import read_poses
-from v2hdm.io.importers.readings import read_table
+from v2hdm.io.importers.readings import read_rows, read_table
 from v2hdm.records import GeodeticOrigin
 
 START_S = 1715934630.0
@@ -267,6 +267,11 @@ def test_a_damaged_table_is_refused_in_one_line(text, message, tmp_path):
     with pytest.raises(DriveError, match=message) as caught:
         read({"csv": "route.csv"}, tmp_path)
     assert "\n" not in str(caught.value)
+
+
+def test_names_in_a_table_move_no_cursor(tmp_path):
+    (tmp_path / "a.csv").write_text("na\x1b[2Jme,x\nP\x9b2J,1\n")
+    assert read_rows(tmp_path / "a.csv", ",", "point") == (["na?[2Jme", "x"], [(2, ["P?2J", "1"])])
 
 
 def test_a_pose_whose_quality_is_left_blank_has_no_fix(tmp_path):

@@ -197,10 +197,10 @@ def flipped_png() -> bytes:
     return bytes(data)
 
 
-def chunk_of_4_gb() -> bytes:
-    """A PNG with an end, and before it a chunk that says it is longer than the file."""
+def chunk_of_4_gb(kind: bytes = b"IDAT") -> bytes:
+    """A PNG with a chunk that says it is longer than the file: one before the end, or the end itself."""
     data = picture(".png")
-    begin = data.index(b"IDAT") - 4
+    begin = data.index(kind) - 4
     return data[:begin] + struct.pack(">I", 0xF3002000) + data[begin + 4 :]
 
 
@@ -250,6 +250,7 @@ IMAGES: dict[str, tuple[bytes, str]] = {
     "half a jpeg": (picture()[:700], "truncated"),
     "half a png": (picture(".png")[:700], "truncated"),
     "png with a chunk of 4 GB": (chunk_of_4_gb(), "damaged"),
+    "png with an end of 4 GB": (chunk_of_4_gb(b"IEND"), "damaged"),
     "png with a flipped bit": (flipped_png(), "damaged"),
     "1 x 1 px": (picture(height=1, width=1), "1 x 1 px"),
     "1 x 1 px png": (picture(".png", height=1, width=1), "1 x 1 px"),
@@ -332,6 +333,14 @@ def names() -> Iterator[Case]:
         if text:
             change = described(lambda content, text=text: content.update(name=text))
             yield Case(f"drive's name: {name}", CHECK, CHECKED[:-2], drive(change), says)
+        words = ("c.yaml", "--format", "urdf", "--output", "there")
+        yield Case(
+            f"calibration's camera: {name}",
+            "v2hdm export",
+            words,
+            _calibrated(text),
+            f"{says}|expected a text",
+        )
         if isinstance(text, str):
             yield exported(f"class in a map: {name}", _map_of_class(text), says)
         words = ("points.csv", "--intrinsics", "camera_info.yaml", "--output", "out")
@@ -385,6 +394,8 @@ def images() -> Iterator[Case]:
         for ending in (".mp4", ".avi", ".mkv"):
             files = both(write("a.mp4", SHORT_VIDEO), write(f"v{ending}", text))
             yield detects(f"video: {name}, {ending}", f"v{ending}", files, "nor a video|holds no")
+    named = both(write("a.mp4", SHORT_VIDEO), write("concat:a.mp4", "x"))
+    yield detects("video: a name that FFmpeg takes for a protocol", "concat:a.mp4", named, "nor a video")
 
 
 def _imgs(change: Change) -> Prepare:
@@ -512,6 +523,15 @@ def _folder_with(folder: str, name: str) -> Prepare:
 def _calibration(root: Path) -> None:
     info = camera_info("front", 320, 240)
     write_calibration(Calibration(info, looking_forward()), root / "c.yaml")
+
+
+def _calibrated(name: object) -> Prepare:
+    def prepare(root: Path) -> None:
+        _calibration(root)
+        content = yaml.safe_load((root / "c.yaml").read_text()) | {"camera_name": name}
+        (root / "c.yaml").write_text(yaml.safe_dump(content))
+
+    return prepare
 
 
 def _linked_map(root: Path) -> None:

@@ -217,6 +217,9 @@ SQL: dict[str, tuple[str, str]] = {
     "an endless view": (f"DROP TABLE markings; CREATE VIEW markings AS {_ENDLESS}", "no plain table"),
     "an endless view about it": (f"DROP TABLE v2hdm; CREATE VIEW v2hdm AS {_ENDLESS}", "no plain table"),
     "a virtual table": ("DROP TABLE markings; CREATE VIRTUAL TABLE markings USING fts5(a)", "no plain table"),
+    "another virtual table": (
+        "DROP TABLE markings; CREATE VIRTUAL TABLE markings USING rtree(a, b, c)", "no plain table"
+    ),
     "a computed column": ("ALTER TABLE markings ADD x AS (zeroblob(1000000000))", "no plain table"),
     "no table of markings": ("DROP TABLE markings", "no plain table"),
     "no table about it": ("DROP TABLE v2hdm", "no plain table"),

@@ -14,7 +14,8 @@ from v2hdm.io.calibration.reading import read_calibration, read_camera_info
 from v2hdm.io.calibration.writing import write_calibration, write_camera_info
 from v2hdm.io.importers.readings import read_nmea, read_table
 from v2hdm.io.maps.geojson import write_geojson
-from v2hdm.io.maps.reading import read_geojson
+from v2hdm.io.maps.geopackage import write_geopackage
+from v2hdm.io.maps.reading import read_geojson, read_geopackage
 from v2hdm.io.trajectory import read_image_list, read_tum
 from v2hdm.records import Calibration
 
@@ -51,6 +52,11 @@ def calibration(path: Path) -> None:
     write_calibration(Calibration(camera_info(), looking_forward(), np.eye(6) * 1e-4), path)
 
 
+def geopackage(path: Path) -> None:
+    write_geopackage(make_map(), path.with_suffix(".gpkg"))
+    path.with_suffix(".gpkg").rename(path)
+
+
 READERS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
     "tum": (tum, read_tum),
     "image list": (image_list, read_image_list),
@@ -59,6 +65,7 @@ READERS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
     "camera_info": (lambda path: write_camera_info(camera_info(), path), read_camera_info),
     "calibration": (calibration, read_calibration),
     "map": (lambda path: write_geojson(make_map(), path), read_geojson),
+    "geopackage": (geopackage, read_geopackage),
     "jpeg": (lambda path: path.write_bytes(picture()), read_bgr),
     "png": (lambda path: path.write_bytes(picture(".png")), read_bgr),
     "tiff": (lambda path: path.write_bytes(picture(".tiff")), read_bgr),

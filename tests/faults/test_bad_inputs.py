@@ -14,13 +14,19 @@ from tests.faults.cases import all_cases, chunk_of_4_gb, damaged_inside
 from tests.faults.judge import HYDRA_DOORS, Case, judge
 from tests.faults.readers import READERS, refusal
 from v2hdm.detection.frames import read_bgr
-from v2hdm.errors import DriveError, V2hdmError
+from v2hdm.errors import ConfigError, DriveError, V2hdmError
 from v2hdm.io.safe.pixels import read_header
-from v2hdm.io.safe.texts import parse_json, parse_yaml, read_text, shown, take_name
+from v2hdm.io.safe.texts import parse_json, parse_yaml, read_text, read_yaml, shown, take_name
+from v2hdm.store.files import replace_text
+from v2hdm.store.inputs import protected_inputs
 
 CASES = all_cases()
-QUICK = [case for number, case in enumerate(CASES) if case.door not in HYDRA_DOORS or number % 8 == 0]
-"""The doors that load torch and Hydra take half a second a case: of those every eighth."""
+QUICK = [
+    case
+    for number, case in enumerate(CASES)
+    if case.door not in HYDRA_DOORS or number % 8 == 0 or "inputs" in case.says
+]
+"""Doors that load torch and Hydra take half a second a case: of those every eighth, and on inputs all."""
 
 
 @pytest.mark.parametrize("case", QUICK, ids=[case.name for case in QUICK])
@@ -149,12 +155,31 @@ def test_what_is_whole_is_read(tmp_path, name):
     assert read(tmp_path / "file") is not None
 
 
+@pytest.mark.parametrize("name", READERS)
+def test_what_a_command_reads_it_does_not_write_over(tmp_path, name):
+    write, read = READERS[name]
+    write(tmp_path / "file")
+    before = (tmp_path / "file").read_bytes()
+    with protected_inputs():
+        read(tmp_path / "file")
+        with pytest.raises(ConfigError, match="is one of the inputs"):
+            replace_text(tmp_path / "file", "ours")
+    assert (tmp_path / "file").read_bytes() == before
+
+
 @pytest.mark.parametrize("read", [lambda path: read_text(path, DriveError), read_header])
 def test_a_file_larger_than_any_is_refused_before_it_is_read(read, tmp_path):
     (tmp_path / "a").touch()
     os.truncate(tmp_path / "a", 1 << 32)
     with pytest.raises(DriveError, match="4295 MB"):
         read(tmp_path / "a")
+
+
+def test_yaml_of_more_bytes_than_any_is_refused_before_it_is_read(tmp_path):
+    (tmp_path / "a").touch()
+    os.truncate(tmp_path / "a", 1 << 25)
+    with pytest.raises(DriveError, match="has 34 MB, 17 MB at most"):
+        read_yaml(tmp_path / "a", DriveError)
 
 
 def test_the_decoders_complaints_are_kept_from_the_terminal(tmp_path, capfd):

@@ -148,6 +148,7 @@ def test_the_ground_as_points_has_heights_and_the_paint_where_it_is(result, monk
         (["mosaic.tif", "--format", "gpkg"], "its other format is pcd"),
         (["mosaic.tif", "--format", "pcd", "--crs", "local"], "in the map's own frame"),
         (["broken.tif", "--format", "pcd"], "broken.tif: cannot be read as a GeoTIFF"),
+        (["pipe.tif", "--format", "pcd"], "pipe.tif: cannot be read as a GeoTIFF (no such file)"),
         (["map.gpkg", "--format", "qgis", "--crs", "local"], "map.gpkg would be overwritten"),
     ],
 )
@@ -158,6 +159,8 @@ def test_what_cannot_be_exported_is_refused_in_one_line(result, monkeypatch, cap
     write_geojson(street(), folder / "map.geojson")
     write_map(street(), folder, "map", ["gpkg"])
     (folder / "broken.tif").write_bytes(b"II*\0" + bytes(40))
+    if words[0] == "pipe.tif":
+        os.mkfifo(folder / words[0])
     monkeypatch.chdir(folder)
     assert run(["export", *words]) == 2
     shown = capsys.readouterr().err

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
-from tests.drive.example import description
+from tests.drive.example import description, make_drive, make_map
 from tests.ports import blind_copy, run_config, short_port
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError, DetectorError, DriveError
@@ -20,16 +20,20 @@ from v2hdm.io.calibration.writing import CALIBRATION_FORMATS
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.io.maps.evidence import read_residuals
 from v2hdm.io.maps.formats import FORMATS
+from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.io.trajectory import read_tum, write_tum
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.results import AdjustedPoses
-from v2hdm.pipeline.config import ReportConfig, run_name
+from v2hdm.pipeline import map_drive
+from v2hdm.pipeline.config import MapConfig, ReportConfig, run_name
 from v2hdm.pipeline.result import _along_route, write_trajectories
-from v2hdm.pipeline.run import run
+from v2hdm.pipeline.run import made_of, run
 from v2hdm.pipeline.stages import camera_sets
 from v2hdm.records import Drive, HdMap, Image, Lane, Trajectory
 from v2hdm.site.options import AcceptanceOptions, LaneOptions
+from v2hdm.store.inputs import protected_inputs
+from v2hdm.store.results import result_folder
 from v2hdm.verdict import Status
 
 
@@ -191,6 +195,17 @@ def test_what_cannot_work_is_refused_before_anything_is_read(tmp_path, changes, 
     with pytest.raises((ConfigError, DetectorError), match=re.escape(named)):
         run(run_config(tmp_path / "no such drive", tmp_path / "outputs", **changes))
     assert not list(tmp_path.iterdir())
+
+
+def test_a_base_in_the_place_of_the_result_is_refused_before_any_work(tmp_path, monkeypatch):
+    make_drive(tmp_path / "drive")
+    base = MapConfig(base=str(tmp_path / "out" / "short"))
+    config = run_config(tmp_path / "drive", tmp_path / "out", map=base)
+    with result_folder(tmp_path / "out" / "short", made=made_of(config)) as folder:
+        write_geojson(make_map(), folder / "map.geojson")
+    monkeypatch.setattr(map_drive, "map_drive", lambda *_, **__: pytest.fail("it worked"))
+    with protected_inputs(), pytest.raises(ConfigError, match="is one of the inputs"):
+        run(config)
 
 
 def test_a_run_without_a_name_has_that_of_its_drive(tiny_drive, tmp_path):

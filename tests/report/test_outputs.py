@@ -100,6 +100,44 @@ def test_a_link_to_a_result_goes_on_leading_there(tmp_path):
     assert (tmp_path / "run" / "config").read_text() == "second"
 
 
+def test_a_link_to_what_we_wrote_is_the_users_and_kept(tmp_path):
+    write(tmp_path / "run", config="first")
+    (tmp_path / "run" / "config").rename(tmp_path / "elsewhere")
+    (tmp_path / "run" / "config").symlink_to("../elsewhere")
+    write(tmp_path / "run", config="second")
+    assert (tmp_path / "run" / "config").read_text() == "second"
+    assert (tmp_path / "run" / "config.kept").is_symlink()
+    assert (tmp_path / "elsewhere").read_text() == "first"
+
+
+def test_nothing_is_written_through_a_link_in_the_place_of_a_folder_of_ours(tmp_path):
+    there = tmp_path / "there"
+    with listed_files(there, "--output", MADE):
+        replace_text(there / "deep" / "a", "first")
+    (there / "deep").rename(tmp_path / "elsewhere")
+    (there / "deep").symlink_to("../elsewhere")
+    refused = pytest.raises(ConfigError, match="a link is not replaced")
+    with refused, listed_files(there, "--output", MADE):
+        replace_text(there / "deep" / "a", "second")
+    assert (tmp_path / "elsewhere" / "a").read_text() == "first"
+
+
+def test_a_mount_point_which_cannot_be_replaced_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(Path, "is_mount", lambda _: True)
+    with pytest.raises(ConfigError, match="is a mount point"):
+        write(tmp_path / "run", config="first")
+
+
+@pytest.mark.parametrize("kind", ["part", "previous"])
+def test_a_hidden_folder_of_the_users_is_not_taken_for_what_a_kill_has_left(kind, tmp_path):
+    notes = tmp_path / f".run.{kind}" / "notes.md"
+    notes.parent.mkdir()
+    notes.write_text("mine")
+    with pytest.raises(ConfigError, match="was not written by V2HDM"):
+        write(tmp_path / "run", config="first")
+    assert notes.read_text() == "mine"
+
+
 def test_a_damaged_list_of_ours_is_one_line(tmp_path):
     write(tmp_path / "run", config="first")
     (tmp_path / "run" / LIST).write_text("{}\n[" * 9000)

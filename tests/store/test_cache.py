@@ -188,7 +188,8 @@ def test_neither_pickles_nor_arrays_of_objects_are_read(tmp_path):
         def __reduce__(self):
             return (Path.touch, (tmp_path / "escaped",))
 
-    for data in (pickle.dumps(Evil()), msgspec.msgpack.encode(["|O", [1], pickle.dumps(Evil())])):
+    texts = msgspec.msgpack.encode(["<U2", [1], b"12345678"])  # numpy itself would read these
+    for data in (pickle.dumps(Evil()), msgspec.msgpack.encode(["|O", [1], pickle.dumps(Evil())]), texts):
         with pytest.raises(CodecError):
             decode(data, np.ndarray)
     assert not list(tmp_path.iterdir())
@@ -323,12 +324,50 @@ def folder_of_ours(cache):
 def test_a_rendered_drive_goes_but_for_what_the_user_put_there(tmp_path):
     folder = folder_of_ours(tmp_path)
     (folder / "front" / "notes.txt").write_text("mine")
+    (folder / "front" / "0.jpg").rename(tmp_path / "0.jpg")
+    (folder / "front" / "0.jpg").symlink_to(tmp_path / "0.jpg")
     (found,) = items_of(tmp_path)
     assert (found.kind, found.path) == (DRIVES, folder)
     assert found.size > 5000
     found.remove()
-    assert [path.name for path in folder.rglob("*") if path.is_file()] == ["notes.txt"]
-    (folder / "front" / "notes.txt").unlink()
+    assert {path.name for path in folder.rglob("*") if path.is_file()} == {"notes.txt", "0.jpg"}
+
+
+def test_a_folder_with_a_list_of_somebody_elses_is_not_ours(tmp_path):
+    folder = folder_of_ours(tmp_path)
+    listing = json.loads((folder / LIST).read_text())
+    (folder / LIST).write_text(json.dumps(listing | {"about": "files of mine"}))
+    assert not items_of(tmp_path)
+
+
+def test_a_hidden_folder_of_the_users_beside_an_import_stays(tmp_path):
+    own, folder = tmp_path / ".bag-front.old.part", tmp_path / "bag-front"
+    own.mkdir()
+    os.utime(own, (1000, 1000))
+    with new_entry(folder) as partial:
+        write_entry(partial)
+    assert own.is_dir()
+
+
+def test_what_a_kill_has_left_of_an_import_goes_when_it_is_made_again(tmp_path):
+    left, folder = tmp_path / ".bag-front.some-host-01234567.part", tmp_path / "bag-front"
+    left.mkdir()
+    os.utime(left, (1000, 1000))
+    with new_entry(folder) as partial:
+        write_entry(partial)
+    assert not left.exists()
+
+
+def test_an_import_is_not_made_anew_where_a_link_leads(tmp_path):
+    folder, elsewhere = tmp_path / "cache" / "bag-front", tmp_path / "elsewhere"
+    damaged_entry(folder)
+    (folder / "front").rename(elsewhere)
+    (folder / "front").symlink_to(elsewhere)
+    before = sorted(path.name for path in elsewhere.iterdir())
+    with new_entry(folder) as partial:
+        write_entry(partial)
+    assert is_whole(folder)
+    assert sorted(path.name for path in elsewhere.iterdir()) == before
 
 
 def damaged_entry(folder):

@@ -80,7 +80,7 @@ def test_what_fails_is_one_line(failure, says):
         ("s3://b//x", "not a path in a store"),
         ("s3://b/../x", "not a path in a store"),
         ("s3://b/x?versionId=3", "not a path in a store"),
-        ("s3://b/\x1b[2J", "not a path in a store"),
+        ("s3://b/\x1b]2J", "not a path in a store"),
         ("s3://key:secret@b/x", r"^output= s3://\.\.\.: is not a bucket name"),
         ("file:///data/runs", "not in a supported store"),
     ],

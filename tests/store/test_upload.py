@@ -117,6 +117,34 @@ def test_what_came_to_be_while_an_upload_had_stopped_is_not_taken_for_ours(memor
     assert there(memory)["own"] == b"7"
 
 
+def test_an_object_that_was_put_in_part_is_no_result(memory):
+    class Files:
+        def __init__(self, files):
+            self.files = files
+
+        def __getattr__(self, name):
+            return getattr(self.files, name)
+
+        def pipe_file(self, path, value, **how):
+            self.files.pipe_file(path, value[:2] if path.endswith("/log") else value, **how)
+
+    short = memory.below("run")
+    short._files = Files(short._files)
+    with pytest.raises(ConfigError, match="run/log: differs from what was uploaded"):
+        upload(short, {"map": b"123", "log": b"456"}, "us", quiet)
+    assert not is_whole_at(memory.below("run"))
+
+
+def test_what_others_put_there_during_an_upload_is_not_replaced(memory):
+    def meanwhile(done, total):
+        if done == 1:
+            memory.write("run/log", b"mine")
+
+    with pytest.raises(ConfigError, match="run/log: is no object of ours"):
+        upload(memory.below("run"), {"map": b"1", "log": b"2"}, "us", meanwhile)
+    assert there(memory)["log"] == b"mine"
+
+
 def test_a_second_writer_is_refused_until_the_first_has_finished(memory):
     with suppress(Stop):
         upload(stopping(memory, 3), {"map": b"1", "log": b"2"}, "one host", quiet)

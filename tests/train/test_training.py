@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 from tests.train.small import tiny, train
 from train import __main__ as door
 from train import data
-from train.checkpoint import load_checkpoint, save_checkpoint
+from train.checkpoint import fresh_checkpoint, load_checkpoint, save_checkpoint
 from train.config import DataConfig, LossConfig, TrainConfig
 from train.data import training_batches
 from train.distributed import Team, choose_device, joined_team
@@ -25,6 +25,7 @@ from train.scenes.scenes import TrainingSample
 from train.targets import Targets, targets
 from v2hdm.cli.compose import register
 from v2hdm.errors import ConfigError
+from v2hdm.store.inputs import protected_inputs
 
 CONF = str(Path(__file__).resolve().parents[2] / "conf")
 
@@ -186,6 +187,14 @@ def test_a_run_starts_from_the_weights_of_another(tmp_path):
     assert trainer.state.step == 0
     assert trainer.state.renders == first.renders, "the renders that taught it would be shown again"
     assert trainer.run().step == 3
+
+
+@pytest.mark.parametrize("name", ["last.pt", "best.pt"])
+def test_a_start_that_the_run_would_write_over_is_refused(name, tmp_path):
+    (tmp_path / name).write_bytes(b"of an earlier run")
+    config = replace(tiny(tmp_path), start=str(tmp_path / name))
+    with protected_inputs(), pytest.raises(ConfigError, match="is one of the inputs"):
+        fresh_checkpoint(config)
 
 
 def test_a_start_of_another_network_is_refused(tmp_path):

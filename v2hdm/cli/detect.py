@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import errno
 import json
-import os
 import sys
 import time
 from collections import deque
@@ -142,8 +140,6 @@ def _lines(output: Path | None) -> Iterator[TextIO]:
             yield sys.stdout
             sys.stdout.flush()
             return
-        if output.is_dir():
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
         refuse_input(output)
         if output.is_file():
             with output.open("rb") as earlier:

@@ -236,7 +236,6 @@ def _frames(source: str, road: RoadDetector | None, rough: _Rough) -> _Frames:
     paths = list_images(path) if path.is_dir() else [path]
     is_drive = any(READERS[name][0](path) for name in (READERS if path.is_dir() else ("bag",)))
     if is_drive and paths in ([], [path]):
-        note_input(path)
         return _drive_frames(path, road, rough)
     if not paths:
         raise DriveError(f"{path}: no images ({', '.join(IMAGE_SUFFIXES)}) and no drive in this folder")
@@ -273,8 +272,6 @@ def _drive_frames(path: Path, road: RoadDetector | None, rough: _Rough) -> _Fram
             "file as camera_info in drive.yaml"
         )
     drive = read_drive(path)
-    for image in drive.images:
-        note_input(image.path)
     roads = {name: RoadDetector(rough.detector, camera) for name, camera in drive.cameras.items()}
     if road is not None:
         name = road.camera.info.name

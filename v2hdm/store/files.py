@@ -58,7 +58,6 @@ def whole_file(path: Path) -> Iterator[Path]:
     """
     refuse_url(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    refuse_input(path)
     if path.exists() and not path.is_file():
         raise ConfigError(f"{path}: is not a regular file and is not replaced; choose another output")
     partial = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")

@@ -31,6 +31,7 @@ from typing import IO, Any
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.io.safe.texts import read_json
 from v2hdm.store.files import file_digest
+from v2hdm.store.inputs import note_input
 
 STAGES = "stages"  # folder within a cache of what runs keep, and of the locks of those in progress
 IN_USE = f"{STAGES}/in_use"
@@ -197,6 +198,8 @@ def _listed(folder: Path) -> dict[str, Any]:
 
 def entry_folder(cache: Path, files: Sequence[Path], label: str, settings: Any) -> Path:
     """The folder of an import of some files, by a hash of all that it is made of; DriveError as by stat."""
+    for file in files:
+        note_input(file)
     try:
         stats = [(file.name, file.stat()) for file in files]
     except OSError as failure:
@@ -226,7 +229,7 @@ def new_entry(folder: Path) -> Iterator[Path]:
     partial = folder.with_name(f".{folder.name}.{_WRITER}.part")
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        for left in folder.parent.glob(f".{folder.name}.*.part"):
+        for left in folder.parent.glob(f".{folder.name}.*-{'[0-9a-f]' * 8}.part"):
             if left == partial or is_stale(left):
                 shutil.rmtree(left, ignore_errors=True)
         partial.mkdir()

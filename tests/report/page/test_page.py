@@ -2,6 +2,7 @@
 
 import base64
 import json
+import os
 import re
 from dataclasses import replace
 
@@ -272,11 +273,13 @@ def test_a_picture_that_cannot_lie_under_the_map_is_refused_with_its_reason(resu
     write_tif(tmp_path / "elsewhere.tif", in_grid(5000.0, 0.0))
     write_tif(tmp_path / "nowhere.tif", in_grid(0.0, 0.0), crs=None)
     (tmp_path / "none.tif").write_bytes(b"no picture")
+    os.mkfifo(tmp_path / "pipe.tif")
     facts = read_facts(result, None)
     placed = replace(facts, hd_map=replace(facts.hd_map, origin=HAMBURG))
     for name, of, told in (
         ("elsewhere", placed, "does not cover this map"),
         ("none", placed, "not a readable GeoTIFF"),
+        ("pipe", placed, "not a readable GeoTIFF or folder of XYZ tiles; check"),
         ("nowhere", placed, "no coordinate system"),
         ("aerial", facts, "no position on the earth"),
     ):

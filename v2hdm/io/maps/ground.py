@@ -112,6 +112,8 @@ def write_cloud(mosaic: Path, path: Path, height_m: Callable[[FloatArray], Float
     MapFileError where the file is no mosaic of ours, ConfigError where rasterio is missing.
     """
     rasterio = need("rasterio", "gis", "the format pcd", ConfigError)
+    if not mosaic.is_file():
+        raise MapFileError(f"{mosaic}: cannot be read as a GeoTIFF (no such file); restore it")
     strips = []
     try:
         with rasterio.open(mosaic, driver="GTiff") as data:

@@ -87,6 +87,8 @@ def _source(path: Path) -> dict[str, Any]:
     levels = sorted(int(one.name) for one in path.glob("*") if one.name.isdecimal())
     tile = next((path / str(levels[-1])).glob("*/*.*"), None) if levels else None
     if tile is None:
+        if not path.is_file():
+            raise MapFileError(f"{path}: not a readable GeoTIFF or folder of XYZ tiles; check the path")
         return {"fp": path, "driver": "GTiff"}
     told = {"url": escape(path.resolve().as_uri()), "ending": tile.suffix, "half": _HALF_WORLD_M}
     told |= {"px": read_header(tile).width, "finest": levels[-1], "coarser": levels[-1] - levels[0]}

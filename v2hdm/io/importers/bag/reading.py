@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 import re
+import sqlite3
 from bz2 import BZ2Decompressor
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from functools import cache
 from itertools import chain
@@ -193,7 +194,7 @@ def _limit_unpacking() -> None:
     from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
     from rosbags.rosbag1 import reader as reader1
     from rosbags.rosbag2 import reader as reader2
-    from rosbags.rosbag2 import storage_mcap
+    from rosbags.rosbag2 import storage_mcap, storage_sqlite3
 
     def limited(new: Callable[[], Any]) -> Callable[..., bytes]:
         def unpack(data: bytes, *_: object) -> bytes:
@@ -219,6 +220,14 @@ def _limit_unpacking() -> None:
         with zstd.open(file, mode) as whole:
             yield SimpleNamespace(read=read)
 
+    database: Any = storage_sqlite3.Sqlite3Reader
+    opened = database._open
+
+    def open_plain(self: Any) -> None:  # after a file that is compressed as a whole was unpacked, too
+        _check_plain(self.path)
+        opened(self)
+
+    database._open = open_plain
     named: Any = reader2
     zstd, lz4 = named.zstd, limited(LZ4FrameDecompressor)
     unpack = limited(zstd.ZstdDecompressor)
@@ -250,6 +259,15 @@ def _check_database(path: Path) -> None:
     there = path.stat().st_size
     if header[24:28] == header[92:96] and there < expected:
         raise DriveError(f"{path}: is cut off: {there} of {expected} bytes; copy it again")
+
+
+def _check_plain(path: Path) -> None:
+    """Refuse an SQLite file that computes: a view, a virtual table or a computed column need never end."""
+    computes = "m.type = 'view' OR m.sql LIKE 'CREATE VIRTUAL%' OR x.hidden"
+    query = f"SELECT m.name FROM sqlite_master m LEFT JOIN pragma_table_xinfo(m.name) x WHERE {computes}"
+    with closing(sqlite3.connect(f"{path.resolve().as_uri()}?immutable=1", uri=True)) as data:
+        for (name,) in data.execute(query):
+            raise DriveError(f"{path}: {name} is no plain table of a recording; convert it to MCAP")
 
 
 @contextmanager
