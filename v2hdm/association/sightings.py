@@ -74,64 +74,42 @@ class Symbols:
 NO_SYMBOLS = Symbols(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), (), (), (), ())
 
 
-def collect_symbols(
+def collect_outlines(
     drive: Drive,
     detections: Sequence[ImageDetections],
     camera_index: Mapping[str, int],
     frame_of_image: IntArray,
-) -> Symbols:
-    """Symbols in the images of some cameras, lens distortion removed."""
-    rows = [
-        (found.image, marking)
-        for found in detections
-        if drive.images[found.image].camera in camera_index
-        for marking in found.markings
-        if len(marking.outline_px) >= 3
+) -> tuple[Symbols, Symbols]:
+    """Undistorted symbols of the cameras' images, and pieces of solid lines: centre lines for outlines."""
+    unseen = np.zeros(0, dtype=np.bool_)
+    images = [found for found in detections if drive.images[found.image].camera in camera_index]
+    symbols = [
+        (found.image, one.kind, one.outline_px, one.outline_seen)
+        for found in images
+        for one in found.markings
+        if len(one.outline_px) >= 3
     ]
-    outlines = [(image, marking.kind, marking.outline_px, marking.outline_seen) for image, marking in rows]
-    return _as_symbols(drive, outlines, camera_index, frame_of_image)
-
-
-def collect_lines(
-    drive: Drive,
-    detections: Sequence[ImageDetections],
-    camera_index: Mapping[str, int],
-    frame_of_image: IntArray,
-) -> Symbols:
-    """Pieces of solid lines in the images, with centre lines for outlines."""
-    pieces = [
-        (found.image, lane.kind, lane.points_px.astype(np.float64), np.zeros(0, dtype=np.bool_))
-        for found in detections
-        if drive.images[found.image].camera in camera_index
-        for lane in found.lanes
-        if lane.kind == LANE_LINE and len(lane.points_px) >= 2
+    lines = [
+        (found.image, one.kind, one.points_px.astype(np.float64), unseen)
+        for found in images
+        for one in found.lanes
+        if one.kind == LANE_LINE and len(one.points_px) >= 2
     ]
-    return _as_symbols(drive, pieces, camera_index, frame_of_image)
 
+    def undistorted(outlines: Sequence[tuple[int, str, FloatArray, BoolArray]]) -> Symbols:
+        image = np.array([one[0] for one in outlines], dtype=np.int64)
+        names = [drive.images[i].camera for i in image.tolist()]
+        recorded = [(drive.cameras[n].info, one[2]) for n, one in zip(names, outlines, strict=True)]
+        return Symbols(
+            camera=np.array([camera_index[name] for name in names], dtype=np.int64),
+            frame=frame_of_image[image],
+            outlines_pinhole_px=tuple(undistort_points(info, points_px) for info, points_px in recorded),
+            kinds=tuple(one[1] for one in outlines),
+            row_shares=tuple(row_shares(info, points_px) for info, points_px in recorded),
+            seen=tuple(one[3] for one in outlines),
+        )
 
-def _as_symbols(
-    drive: Drive,
-    outlines: Sequence[tuple[int, str, FloatArray, BoolArray]],
-    camera_index: Mapping[str, int],
-    frame_of_image: IntArray,
-) -> Symbols:
-    """Outlines (image, class, recorded pixels, seen sides) as :class:`Symbols`."""
-    image = np.array([one[0] for one in outlines], dtype=np.int64)
-    names = [drive.images[i].camera for i in image.tolist()]
-    infos = [drive.cameras[name].info for name in names]
-    return Symbols(
-        camera=np.array([camera_index[name] for name in names], dtype=np.int64),
-        frame=frame_of_image[image],
-        outlines_pinhole_px=tuple(
-            undistort_points(info, points_px)
-            for info, (_, _, points_px, _) in zip(infos, outlines, strict=True)
-        ),
-        kinds=tuple(kind for _, kind, _, _ in outlines),
-        row_shares=tuple(
-            row_shares(info, points_px) for info, (_, _, points_px, _) in zip(infos, outlines, strict=True)
-        ),
-        seen=tuple(seen for _, _, _, seen in outlines),
-    )
+    return undistorted(symbols), undistorted(lines)
 
 
 @dataclass(frozen=True)
@@ -225,6 +203,7 @@ def collect_sightings(
         corners[own], covariance[own] = _undistort(info, corners[own], covariance[own])
     valid = np.stack([marking.corner_valid for _, marking in rows]).astype(bool)
     valid &= np.isfinite(corners).all(axis=2) & np.isfinite(covariance).all(axis=(2, 3))
+    symbols, lines = collect_outlines(drive, detections, camera_index, frames.frame_of_image)
     sightings = Sightings(
         cameras=tuple(cameras),
         stamp_s=frames.stamp_s,
@@ -240,8 +219,8 @@ def collect_sightings(
         visit=frames.visit,
         row_share=row_share,
         log_odds=logit(np.clip([marking.score for _, marking in rows], 1e-4, 1 - 1e-4)),
-        symbols=collect_symbols(drive, detections, camera_index, frames.frame_of_image),
-        lines=collect_lines(drive, detections, camera_index, frames.frame_of_image),
+        symbols=symbols,
+        lines=lines,
     )
     sightings = sightings.subset(sightings.informs.sum(axis=1) >= 2)
     if not len(sightings):
