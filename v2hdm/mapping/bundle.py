@@ -204,7 +204,8 @@ def solve_bundle(
     solution = solve(problem, model.solver)
     if knots is not None:
         own = {name: getattr(solution, name)[: len(row)] for name in _OF_OBSERVATIONS}
-        squared, solution = solution.mahalanobis2[len(row) :], replace(solution, **own)
+        squared = knots.repeated * solution.mahalanobis2[len(row) :]
+        solution = replace(solution, **own)
         # Lines also use up degrees of freedom of the poses' priors.
         of_poses = 2 * solution.cost_terms["frame_states"] / (len(squared) + 2 * len(row))
         factor = line_variance_factor(squared, knots.count / len(squared) + of_poses)

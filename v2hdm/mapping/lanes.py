@@ -22,6 +22,7 @@ from v2hdm.association.sightings import Rig, frames_of
 from v2hdm.association.surface import Surface
 from v2hdm.geometry.planar import length_along
 from v2hdm.records import Drive, FloatArray, ImageDetections, IntArray, Lane
+from v2hdm.site.candidates import CORRELATION
 from v2hdm.site.lane_points import (
     CENTRE_SIGMA_PX,
     HALF_WIDTH_M,
@@ -69,9 +70,16 @@ class Knots:
         """Number of knots that are unknowns of the adjustment."""
         return int(self.unknown.max(initial=-1)) + 1
 
+    @property
+    def repeated(self) -> FloatArray:
+        """Variance factors (K,) of observations, as errors of one place are correlated between its images."""
+        images = np.bincount(self.knot, minlength=self.count)[self.knot]
+        return np.asarray(1 + CORRELATION * (images - 1), dtype=np.float64)
+
     def observations(self, first: int) -> Observations:
         """As observations of corners numbered from ``first``; cameras and frames are the rig's."""
-        at, covariance_px = first + self.knot, self.variance_factor * self.covariance_px
+        at, factor = first + self.knot, self.variance_factor * self.repeated
+        covariance_px = factor[:, None, None] * self.covariance_px
         return Observations(self.camera, self.frame, at, self.pinhole_px, covariance_px, self.row_share)
 
     def held(self, first: int) -> ControlPoints:
