@@ -28,10 +28,9 @@ from v2hdm.simulate.port.route import Route
 from v2hdm.simulate.render.scene import WHITE_PAINT, YELLOW_PAINT, Bgr, Paint, placed
 
 _VERTEX_SPACING_M = 0.5
-_PIECE_TURN_RAD = 0.06
-_CHORD_TURN_RAD = 0.01  # of a side of a piece: half a millimetre off a turn of 40 m
+_PIECE_TURN_RAD = 0.02  # a straight piece of .5 m is 2 mm off a turn of 12 m
 _PIECE_LENGTH_M = 25.0
-_PIECE_OVERLAP_M = 0.1
+_PIECE_OVERLAP_M = 0.02  # as wide as the gap between two pieces on the outer side of a turn, and more
 _LEAST_GAP_M = 1.7
 _LINE_GAP_M = 1.1
 _STENCIL_TRIES = 10
@@ -121,11 +120,11 @@ class _Painter:
     def _colour(self) -> Bgr:
         return WHITE_PAINT if self.rng.random() < 0.7 else YELLOW_PAINT
 
-    def _ribbon(self, stations_m: FloatArray, offset_m: float) -> FloatArray:
-        """The polygon (2 N, 2) of a line through N stations, counter-clockwise."""
-        right = self.route.points_at(stations_m, offset_m - self.config.line_width_m / 2)
-        left = self.route.points_at(stations_m, offset_m + self.config.line_width_m / 2)
-        return np.concatenate([right, left[::-1]])
+    def _ribbon(self, ends_m: FloatArray, offset_m: float) -> FloatArray:
+        """A quadrilateral (4, 2) of a line between two stations, counter-clockwise."""
+        right = self.route.points_at(ends_m, offset_m - self.config.line_width_m / 2)
+        left = self.route.points_at(ends_m, offset_m + self.config.line_width_m / 2)
+        return np.array([right[0], right[1], left[1], left[0]])
 
     def solid_line(self, offset_m: float) -> None:
         length_m = self.route.length_m
@@ -134,11 +133,7 @@ class _Painter:
         worn, seed = self._worn(), self._seed()
         for start, end in self._straight_pieces():
             around = np.array([max(start - _PIECE_OVERLAP_M, 0.0), min(end + _PIECE_OVERLAP_M, length_m)])
-            turn_rad = float(np.ptp(self.route.yaw_at(around)))
-            stations_m = np.linspace(
-                around[0], around[1], max(int(np.ceil(turn_rad / _CHORD_TURN_RAD)), 1) + 1
-            )
-            self._paint(LANE_LINE, self._ribbon(stations_m, offset_m), worn, seed)
+            self._paint(LANE_LINE, self._ribbon(around, offset_m), worn, seed)
 
     def _straight_pieces(self) -> list[tuple[float, float]]:
         """Stretches of the route that are straight to within a few millimetres."""
