@@ -13,7 +13,7 @@ from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.planar import signed_area
 from v2hdm.geometry.rigid import interpolate
 from v2hdm.library import simulate_port
-from v2hdm.records import DIAMOND, LANE_DASH
+from v2hdm.records import DIAMOND, LANE_DASH, LANE_LINE
 from v2hdm.simulate.port import drive
 from v2hdm.simulate.port.build import build_port, calibrate, cam_from_vehicle, camera_info
 from v2hdm.simulate.port.config import (
@@ -113,6 +113,24 @@ def test_a_dashed_lane_bends_between_its_dashes_as_its_road_does():
         beside = np.linalg.norm(lane[:, None] - painted, axis=2).min(axis=1)
         assert beside.max() < 0.12, "no more than a straight dash cuts"
         assert np.linalg.norm(np.diff(lane, axis=0), axis=1).max() <= 0.5 + 1e-3
+
+
+def test_solid_lines_are_painted_where_their_truth_is_without_gaps():
+    """The renderer fills convex outlines only, so that bends are painted in straight pieces."""
+    route = build_route(RouteConfig(pieces=[[20.0, 0.0], [25.0, 120.0], [20.0, 0.0]]))
+    layout = build_layout(PaintConfig(solid_offsets_m=[5.3]), route, np.random.default_rng(1))
+    (line,) = (lane.points_map for lane in layout.lanes if lane.kind == LANE_LINE)
+    quads = np.array([paint.polygon_map for paint in layout.paints if paint.kind == LANE_LINE])
+    tails, heads = quads[:, [0, 3]].mean(axis=1), quads[:, [1, 2]].mean(axis=1)
+    painted = tails[:, None] + np.linspace(0.0, 1.0, 40)[:, None] * (heads - tails)[:, None]
+    true = route.points_at(np.arange(0.0, route.length_m, 0.005), 5.3)
+    beside_m = np.linalg.norm(painted.reshape(-1, 1, 2) - true, axis=2).min(axis=1)
+    assert beside_m.max() < 0.008
+    assert np.median(beside_m) < 0.003  # true points lie 5 mm apart
+    assert np.linalg.norm(line[:, None] - true, axis=2).min(axis=1).max() < 0.003
+    for outer in (0, 3):
+        last, first = quads[:-1, 1 if outer == 0 else 2], quads[1:, outer]
+        assert (((last - first) * (heads - tails)[1:]).sum(axis=1) >= 0).all()
 
 
 def test_the_route_turns_by_what_its_pieces_say():

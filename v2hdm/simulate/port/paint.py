@@ -28,8 +28,8 @@ from v2hdm.simulate.port.route import Route
 from v2hdm.simulate.render.scene import WHITE_PAINT, YELLOW_PAINT, Bgr, Paint, placed
 
 _VERTEX_SPACING_M = 0.5
-_PIECE_TURN_RAD = 0.02  # a straight piece of .5 m is 2 mm off a turn of 12 m
-_PIECE_LENGTH_M = 25.0
+_PIECE_TURN_RAD = 0.015  # the first piece of a turn of 12 m is 4 mm off the straight line before it
+_PIECE_STEP_M, _PIECE_LENGTH_M = 0.1, 25.0
 _PIECE_OVERLAP_M = 0.02  # as wide as the gap between two pieces on the outer side of a turn, and more
 _LEAST_GAP_M = 1.7
 _LINE_GAP_M = 1.1
@@ -138,7 +138,7 @@ class _Painter:
     def _straight_pieces(self) -> list[tuple[float, float]]:
         """Stretches of the route that are straight to within a few millimetres."""
         edges = [0.0]
-        for station in np.arange(_VERTEX_SPACING_M, self.route.length_m, 0.25):
+        for station in np.arange(_VERTEX_SPACING_M, self.route.length_m, _PIECE_STEP_M):
             yaw, first_yaw = (float(self.route.yaw_at(np.array([at]))[0]) for at in (station, edges[-1]))
             if abs(yaw - first_yaw) > _PIECE_TURN_RAD or station - edges[-1] > _PIECE_LENGTH_M:
                 edges.append(float(station))
