@@ -11,12 +11,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from v2hdm.association.sightings import LEAST_HEIGHT_M, Rig, Sightings, Symbols, frames_of
-from v2hdm.geometry.ipm import (
-    apply_homography,
-    flat_motion,
-    ground_from_pinhole_px,
-    project_ground,
-)
+from v2hdm.geometry.ipm import apply_homography, flat_motion, ground_from_pinhole_px, project_ground
 from v2hdm.geometry.planar import cross, inside_convex
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.geometry.tensors import back_project, back_project_with_jacobian
