@@ -74,7 +74,7 @@ _CLUTTER_FOUND = (0.5, 2.0)
 _BARE_FOUND = (0.05, 10.0)
 """Beta distribution of the rate of such detections on bare ground: one view in two hundred."""
 
-_LIKE_CLASS, _LIKE_SHARE = 0.9, 0.2
+_LIKE_CLASS, _LIKE_SHARE = 0.7, 0.2
 """Fraction of other paint and clutter that is shaped like the class it was taken for, at any length, and the
 sigma of its corners relative to the width: detections of a class resemble it, and are fitted as such."""
 
