@@ -201,11 +201,13 @@ class Optimiser:
         knots = find_knots(final.rig, self.surface)
         if knots is not None and knots.count:
             progress("lanes")
+            fit = final.solution.chi2_per_dof  # of markings: lines, whose variance is fitted, would dilute it
             # Alternating: only residuals show the precision of lines.
             for _ in range(_LANE_ROUNDS):
                 count = int(final.corner_index.max(initial=-1)) + 1
                 lanes = final.knots or knots, final.solution.corners_map[:count]
                 final = self._solve(final.association, usable, final.rig, lanes=lanes)
+            final = replace(final, solution=replace(final.solution, chi2_per_dof=fit))
         return self._conclude(final, bundle, inlier, usable)
 
     def _conclude(self, final: Bundle, ungated: Bundle, inlier: BoolArray, usable: BoolArray) -> Optimised:
