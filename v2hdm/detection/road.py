@@ -186,15 +186,15 @@ def _marking_record(marking: RoadMarking) -> dict[str, Any]:
     image = marking.image
     record: dict[str, Any] = {"class": image.kind, "score": round(image.score, 4)}
     if len(image.outline_px):
-        record["outline_px"] = _rounded(image.outline_px, _PX_DIGITS)
+        record["outline_px"] = _plain(np.round(image.outline_px, _PX_DIGITS))
         if len(marking.outline_vehicle):
-            record["outline_vehicle"] = _rounded(marking.outline_vehicle, _M_DIGITS)
+            record["outline_vehicle"] = _plain(np.round(marking.outline_vehicle, _M_DIGITS))
         return record
-    record["corners_px"] = _rounded(image.corners_px, _PX_DIGITS)
+    record["corners_px"] = _plain(np.round(image.corners_px, _PX_DIGITS))
     record["corner_valid"] = image.corner_valid.tolist()
-    record["covariance_px"] = _rounded(image.covariance_px, _PX2_DIGITS)
+    record["covariance_px"] = _plain(np.round(image.covariance_px, _PX2_DIGITS))
     if len(marking.corners_vehicle):
-        record["corners_vehicle"] = _rounded(marking.corners_vehicle, _M_DIGITS)
+        record["corners_vehicle"] = _plain(np.round(marking.corners_vehicle, _M_DIGITS))
         record["covariance_m2"] = _significant(marking.covariance_m2)
     return record
 
@@ -204,25 +204,23 @@ def _lane_record(lane: RoadLane) -> dict[str, Any]:
     record: dict[str, Any] = {"class": image.kind, "score": round(image.score, 4)}
     if image.identity is not None:
         record["identity"] = image.identity
-    record["points_px"] = _rounded(image.points_px, _PX_DIGITS)
+    record["points_px"] = _plain(np.round(image.points_px, _PX_DIGITS))
     if len(lane.points_vehicle):
-        record["points_vehicle"] = _rounded(lane.points_vehicle, _M_DIGITS)
+        record["points_vehicle"] = _plain(np.round(lane.points_vehicle, _M_DIGITS))
         record["covariance_m2"] = _significant(lane.covariance_m2)
     return record
 
 
-def _rounded(values: FloatArray, digits: int) -> list[Any]:
-    return _plain(np.round(values, digits))
-
-
 def _significant(values: FloatArray) -> list[Any]:
     """Four significant digits: a covariance spans many powers of ten."""
-    return _plain(np.array([float(f"{value:.4g}") for value in values.ravel()]).reshape(values.shape))
+    power = 3 - np.floor(np.log10(np.clip(np.abs(values), 1e-18, 1e18)))
+    more, less = 10.0 ** np.maximum(power, 0), 10.0 ** np.maximum(-power, 0)
+    return _plain(np.round(values * more / less) * less / more)
 
 
 def _plain(values: FloatArray) -> list[Any]:
-    plain: list[Any] = np.where(np.isfinite(values), values.astype(object), np.array(None)).tolist()
-    return plain
+    finite = np.isfinite(values)
+    return list((values if finite.all() else np.where(finite, values, np.array(None))).tolist())
 
 
 def draw_detections(
