@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import sys
 import time
@@ -83,6 +84,7 @@ def _detect(parsed: argparse.Namespace) -> None:
         live=parsed.live,
         stopwatch=stopwatch,
     )
+    gc.freeze()  # modules and networks outlive every image: no collection need look at them again
     failure = None
     made = f"v2hdm detect of {parsed.source if live else Path(parsed.source).resolve()}"
     folder = nullcontext() if parsed.draw is None else growing_folder(parsed.draw, "--draw", made)
