@@ -82,6 +82,15 @@ def test_a_lane_five_centimetres_aside_over_the_visible_half_is_all_of_what_was_
     assert result.false_length_m == 0.0
 
 
+def test_of_a_lane_with_sigmas_the_share_within_95_percent_is_that_of_its_vertices():
+    _, truth = make_truth()
+    points, sigma_m = np.array([[0.0, 2.05], [5.0, 2.03], [10.0, 2.01]]), np.array([0.02, 0.02, 0.02])
+    result = lane_metrics([Lane("lane_line", points, 5, sigma_m=sigma_m)], truth)
+    assert result.inside_95 == pytest.approx(2 / 3)
+    assert 0.01 < result.rms_lateral_error_m < 0.05
+    assert np.isnan(lane_metrics([Lane("lane_line", points, 5)], truth).inside_95)
+
+
 def test_a_lane_where_there_is_none_is_false_length():
     _, truth = make_truth()
     result = lane_metrics([Lane("lane_line", np.array([[0.0, -5.0], [10.0, -5.0]]), 5)], truth)

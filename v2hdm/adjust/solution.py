@@ -42,12 +42,9 @@ def as_of_point(squared_of_line: FloatArray) -> FloatArray:
     return np.asarray(-2 * chi2.logsf(squared_of_line, 1))
 
 
-def line_variance_factor(squared: FloatArray, taken: float) -> float:
-    """Robust variance factor of lines, from the median; unknowns absorb the fraction ``taken``."""
-    if not len(squared):
-        return 1.0
-    of_line = float(chi2.isf(np.exp(-np.median(squared) / 2), 1))
-    return of_line / float(chi2.median(1)) / max(1 - taken, 0.1)
+def as_of_line(squared_of_point: FloatArray) -> FloatArray:
+    """The inverse of :func:`as_of_point`."""
+    return np.asarray(chi2.isf(np.exp(-squared_of_point / 2), 1))
 
 
 def classify(

@@ -11,23 +11,26 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from v2hdm.adjust import ControlPoints, Observations, Solution
+from v2hdm.adjust import ControlPoints, Observations, Solution, as_of_line
+from v2hdm.association.ground import ground_points, ground_points_with_jacobian
 from v2hdm.association.sightings import Rig, frames_of
 from v2hdm.association.surface import Surface
 from v2hdm.geometry.planar import length_along
 from v2hdm.records import Drive, FloatArray, ImageDetections, IntArray, Lane
-from v2hdm.site.candidates import CORRELATION
 from v2hdm.site.lane_points import (
     CENTRE_SIGMA_PX,
     HALF_WIDTH_M,
     NODE_SPACING_M,
     OWN_SIGMA_M,
+    ImageGround,
     LaneCloud,
     collect_lane_points,
     ground_by_rig,
@@ -42,6 +45,8 @@ _SPACING_M = 2.0  # spacing of knots, m: on a turn of 8 m radius the spline is a
 _HELD_M = 0.01  # sigma of a knot along its line, which nothing observes
 OPEN_END_PX = 1000.0  # sigma along its line of an observation that is no point: anywhere
 _SLOPE_SIGMA = 0.02  # rad, of a piece of paint against its lane
+_LINE_SIGMA_M = 0.0015  # error, m, of a whole line in one image; measured against the truth of rendered ports
+_MEDIAN_SQUARED = 0.455  # of a chi-square distribution with one degree of freedom
 _SAME_DIRECTION = np.cos(np.deg2rad(20.0))  # least cosine between points of one line; excludes crossing lines
 
 _TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])  # (N, 2) directions times it are rotated to the left
@@ -60,10 +65,12 @@ class Knots:
     camera: IntArray  # of each of K observations; ``knot`` is that index
     frame: IntArray
     knot: IntArray
-    pinhole_px: FloatArray  # of each observation, with covariance and row share
-    covariance_px: FloatArray
+    pinhole_px: FloatArray  # of each observation, with its row share and the image direction of its line
     row_share: FloatArray
-    variance_factor: float = 1.0  # of the observations' covariance, from residuals
+    line: FloatArray
+    own_px2: FloatArray  # variance across the line, px^2: of a piece's points, and of all of them together
+    shared_px2: FloatArray
+    shared_factor: float = 0.0  # of the latter, from residuals
 
     @property
     def count(self) -> int:
@@ -71,16 +78,26 @@ class Knots:
         return int(self.unknown.max(initial=-1)) + 1
 
     @property
-    def repeated(self) -> FloatArray:
-        """Variance factors (K,) of observations, as errors of one place are correlated between its images."""
-        images = np.bincount(self.knot, minlength=self.count)[self.knot]
-        return np.asarray(1 + CORRELATION * (images - 1), dtype=np.float64)
+    def variance_px2(self) -> FloatArray:
+        """Variances (K,) of observations across their line, px^2."""
+        return np.asarray(self.own_px2 + self.shared_factor * self.shared_px2)
 
     def observations(self, first: int) -> Observations:
         """As observations of corners numbered from ``first``; cameras and frames are the rig's."""
-        at, factor = first + self.knot, self.variance_factor * self.repeated
-        covariance_px = factor[:, None, None] * self.covariance_px
+        normal, variance_px2 = self.line @ _TURN, self.variance_px2[:, None, None]
+        covariance_px = variance_px2 * normal[:, :, None] * normal[:, None]
+        covariance_px += OPEN_END_PX**2 * self.line[:, :, None] * self.line[:, None]
+        at = first + self.knot
         return Observations(self.camera, self.frame, at, self.pinhole_px, covariance_px, self.row_share)
+
+    def weighed(self, squared: FloatArray, taken: float) -> Knots:
+        """With the factor that explains ``squared`` (K,), whitened residuals, of a robust scale.
+
+        Unknowns absorb the fraction ``taken`` of the residuals' freedom.
+        """
+        residual_px2 = as_of_line(squared) * self.variance_px2 / max(1 - taken, 0.1)
+        shared = np.median((residual_px2 / _MEDIAN_SQUARED - self.own_px2) / self.shared_px2)
+        return replace(self, shared_factor=max(float(shared), 0.0))
 
     def held(self, first: int) -> ControlPoints:
         """The prior that holds corners numbered from ``first`` along their lines."""
@@ -103,11 +120,10 @@ def find_knots(
     lanes = map_lanes(cloud, options)
     if not lanes:
         return None
-    course = _Course.of(lanes)
-    lane, at_m = course.stations()
-    points_map, along = course.at(lane, at_m), course.along(lane, at_m)
-    pairs = _pairs(cloud, course, lane, at_m)
-    image, at, *shown = _passing(cloud, points_map, along, *pairs)
+    course, px_from_map = _Course.of(lanes), np.linalg.inv(ground.map_from_pinhole_px)
+    lane, at_m, points_map, along = course.knots
+    pairs = _pairs(cloud, course, px_from_map)
+    image, at, *shown = _passing(cloud, ground, course, px_from_map, *pairs)
     enough = np.bincount(at, minlength=len(lane)) >= max(options.min_images, 2)
     unknown, kept = np.where(enough, np.cumsum(enough) - 1, -1), enough[at]
     alone = np.flatnonzero(np.bincount(lane[enough], minlength=len(lanes)) == 0)
@@ -140,11 +156,13 @@ class _Course:
         arc_m = np.concatenate([arc + begin for arc, begin in zip(arcs, begin_m, strict=True)])
         return cls(arc_m, np.concatenate([one.points_map for one in lanes]), begin_m, length_m)
 
-    def stations(self) -> tuple[IntArray, FloatArray]:
-        """Lane and arc length of each knot."""
+    @cached_property
+    def knots(self) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+        """Lane, arc length, position (N, 2) and unit direction (N, 2) of each knot."""
         count = np.maximum(np.round(self.length_m / _SPACING_M), 1).astype(np.int64) + 1
         at_m = [np.linspace(0.0, length, n) for length, n in zip(self.length_m, count, strict=True)]
-        return np.repeat(np.arange(len(count)), count), np.concatenate(at_m)
+        at = np.repeat(np.arange(len(count)), count), np.concatenate(at_m)
+        return *at, self.at(*at), self.along(*at)
 
     def at(self, lane: IntArray, at_m: FloatArray) -> FloatArray:
         """Points (N, 2) at arc lengths (N,) of lanes (N,)."""
@@ -158,12 +176,29 @@ class _Course:
         return np.asarray((ahead - behind) / np.linalg.norm(ahead - behind, axis=1, keepdims=True))
 
 
+def _image_of(
+    px_from_map: FloatArray, points_map: FloatArray, along: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Lines at ground points (N, 2) in images: direction, px per metre ahead, and left, along and across."""
+    _, px_by_map = ground_points_with_jacobian(px_from_map, points_map[:, None])
+    ahead = (px_by_map[:, 0] @ along[..., None])[..., 0]
+    px_by_ahead = np.linalg.norm(ahead, axis=1)
+    line = ahead / px_by_ahead[:, None]
+    left = (px_by_map[:, 0] @ (along @ _TURN)[..., None])[..., 0]
+    px_by_left = np.column_stack([(line * left).sum(axis=1), (line @ _TURN * left).sum(axis=1)])
+    return line, px_by_ahead, px_by_left
+
+
 def _pairs(
-    cloud: LaneCloud, course: _Course, lane: IntArray, at_m: FloatArray
+    cloud: LaneCloud, course: _Course, px_from_map: FloatArray
 ) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
-    """Points (P,) and nearest knots within half a spacing, with offsets ahead and left of these, m."""
-    knots_map, along = course.at(lane, at_m), course.along(lane, at_m)
-    reach_m = float(np.hypot(_SPACING_M / 2, HALF_WIDTH_M))
+    """Points (P,) and nearest knots within half a spacing, with offsets ahead and left of these, m.
+
+    Ahead is the foot of the point on its line, in the image: a point's own place along the line depends on
+    its error across it, and so would the choice of points at the ends of a piece.
+    """
+    lane, at_m, knots_map, along = course.knots
+    reach_m = float(np.hypot(_SPACING_M, HALF_WIDTH_M))
     near = cKDTree(cloud.points_map).sparse_distance_matrix(
         cKDTree(knots_map), reach_m, output_type="ndarray"
     )
@@ -172,6 +207,8 @@ def _pairs(
     ahead_m = ((points_map - knots_map[knot]) * along[knot]).sum(axis=1)
     here = lane[knot], at_m[knot] + ahead_m
     off_m = ((points_map - course.at(*here)) * (course.along(*here) @ _TURN)).sum(axis=1)
+    _, px_by_ahead, px_by_left = _image_of(px_from_map[cloud.image[point]], course.at(*here), along[knot])
+    ahead_m += off_m * px_by_left[:, 0] / px_by_ahead
     fits = np.abs((cloud.tangent[point] * along[knot]).sum(axis=1)) >= _SAME_DIRECTION
     fits &= (np.abs(ahead_m) <= _SPACING_M / 2) & (np.abs(off_m) <= HALF_WIDTH_M)
     order = np.lexsort((np.abs(off_m), ~fits, point))
@@ -182,48 +219,55 @@ def _pairs(
 
 def _passing(
     cloud: LaneCloud,
-    knots_map: FloatArray,
-    along: FloatArray,
+    ground: ImageGround,
+    course: _Course,
+    px_from_map: FloatArray,
     point: IntArray,
     knot: IntArray,
     ahead_m: FloatArray,
     off_m: FloatArray,
-) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray]:
-    """Observations of lines through knots: image, knot, pinhole pixel, its covariance and row share.
+) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Observations of lines through knots: image, knot, and the last five fields of :class:`Knots`.
 
-    A line is fitted to the points of a piece, with one common error: neighbouring cells are correlated.
+    A line is fitted to the points of a piece. Their scatter about it gives the variance of their own errors;
+    neighbouring cells also have errors in common. Directions and weights are those of the course: taken from
+    the points themselves they would be correlated with their errors, which turns the camera.
     """
+    lane, _, knots_map, along = course.knots
     groups, own = np.unique(np.column_stack([cloud.image[point], knot]), axis=0, return_inverse=True)
     (image, at), own = groups.T, own.ravel()
-    across = np.einsum("pi,pij->pj", along[knot] @ _TURN, cloud.jacobian[point])
-    weight = 1 / ((CENTRE_SIGMA_PX * across) ** 2).sum(axis=1)
+    foot_map = knots_map[knot] + ahead_m[:, None] * along[knot]
+    weight = _image_of(px_from_map[cloud.image[point]], foot_map, along[knot])[2][:, 1] ** 2
 
     def total(values: FloatArray) -> FloatArray:
         return np.bincount(own, weight * values, len(groups)).astype(np.float64)
 
     w, x, y, xy = (total(one) for one in (np.ones(len(own)), ahead_m, off_m, ahead_m * off_m))
-    xx = total(ahead_m**2) + _SLOPE_SIGMA**-2
-    left_m, loss = (xx * y - x * xy) / (w * xx - x**2), w * xx / (w * xx - x**2)
-    order = np.lexsort((np.abs(ahead_m), own))
-    nearest = point[order][np.unique(own[order], return_index=True)[1]]
-    along, px_by_map = along[at], np.linalg.inv(cloud.jacobian[nearest])
-    left = along @ _TURN
-    shown_map = knots_map[at] + left_m[:, None] * left
-    off_px = (px_by_map @ (shown_map - cloud.points_map[nearest])[..., None])[..., 0]
-    line = (px_by_map @ along[..., None])[..., 0]
-    line /= np.linalg.norm(line, axis=1, keepdims=True)
-    normal = line @ _TURN
-    own_px = OWN_SIGMA_M * (normal * (px_by_map @ left[..., None])[..., 0]).sum(axis=1)
-    variance = loss * (CENTRE_SIGMA_PX**2 + own_px**2)
-    covariance_px = variance[:, None, None] * normal[:, :, None] * normal[:, None]
-    covariance_px += OPEN_END_PX**2 * line[:, :, None] * line[:, None]
-    return image, at, cloud.points_px[nearest] + off_px, covariance_px, cloud.row_share[nearest]
+    xx = total(ahead_m**2) + (CENTRE_SIGMA_PX / _SLOPE_SIGMA) ** 2
+    left_m, slope = (xx * y - x * xy) / (w * xx - x**2), (w * xy - x * y) / (w * xx - x**2)
+    off_px2 = weight * (off_m - left_m[own] - slope[own] * ahead_m) ** 2
+    points = np.bincount(own)[own]
+    free = points > 2
+    scatter_px2 = off_px2[free] * points[free] / (points[free] - 2)
+    point_px2 = np.median(scatter_px2) / _MEDIAN_SQUARED if free.any() else CENTRE_SIGMA_PX**2
+    row_share = np.bincount(own, cloud.row_share[point]) / np.bincount(own)
+    shown_map = knots_map[at] + left_m[:, None] * (along[at] @ _TURN)
+    shown_map -= ground.at_rows(shown_map, image, row_share) - shown_map
+    shown_px = ground_points(px_from_map[image], shown_map[:, None])[:, 0]
+    line, _, px_by_left = _image_of(px_from_map[image], knots_map[at], along[at])
+    own_px2 = point_px2 * px_by_left[:, 1] ** 2 * xx / (w * xx - x**2)
+    # What all of a line in an image has in common counts once in its mean, so as many times in each knot.
+    of_line = np.unique(np.column_stack([image, lane[at]]), axis=0, return_inverse=True)[1].ravel()
+    own_px2 += np.bincount(of_line)[of_line] * (_LINE_SIGMA_M * px_by_left[:, 1]) ** 2
+    shared_px2 = CENTRE_SIGMA_PX**2 + (OWN_SIGMA_M * px_by_left[:, 1]) ** 2
+    return image, at, shown_px, row_share, line, own_px2, shared_px2
 
 
 def draw_lanes(knots: Knots, solution: Solution, spacing_m: float = NODE_SPACING_M) -> tuple[Lane, ...]:
     """The lanes as splines through adjusted knots, with vertices about ``spacing_m`` apart and their sigmas.
 
-    Unobserved knots, as between dashes, keep their offset from the neighbouring ones.
+    Between dashes, lines are the mean of their course before the adjustment, moved with the knots around,
+    and of a natural spline; half the difference of the two is part of the sigma.
     """
     return tuple(
         _drawn(lane, knots, np.flatnonzero(knots.lane == number), solution, spacing_m)
@@ -244,6 +288,10 @@ def _drawn(lane: Lane, knots: Knots, rows: IntArray, solution: Solution, spacing
     drawn_map = by_knot @ (points_map + (by_seen @ moved_m)[:, None] * left)
     along = np.gradient(drawn_map, axis=0)
     left = along / np.linalg.norm(along, axis=1, keepdims=True) @ _TURN
+    half_m, inner = np.zeros(len(vertex_m)), (vertex_m >= at_m[seen[0]]) & (vertex_m <= at_m[seen[-1]])
+    if len(seen) > 1:
+        smooth = CubicSpline(at_m[seen], solution.corners_map[corner], bc_type="natural")
+        half_m[inner] = ((smooth(vertex_m[inner]) - drawn_map[inner]) * left[inner]).sum(axis=1) / 2
     # A vertex depends on at most four neighbouring knots: their joint covariances suffice.
     weight = (by_knot @ by_seen).tocsr()
     weight.sort_indices()
@@ -254,9 +302,8 @@ def _drawn(lane: Lane, knots: Knots, rows: IntArray, solution: Solution, spacing
     share[:, len(seen) :] = 0.0
     by_corner = (share[:, :, None] * left[:, None]).reshape(-1, 8)
     joint = solution.corner_covariance(corner[window])[group] * max(1.0, solution.chi2_per_dof)
-    return replace(
-        lane, points_map=drawn_map, sigma_m=np.sqrt(np.einsum("vi,vij,vj->v", by_corner, joint, by_corner))
-    )
+    variance_m2 = np.einsum("vi,vij,vj->v", by_corner, joint, by_corner) + half_m**2
+    return replace(lane, points_map=drawn_map + half_m[:, None] * left, sigma_m=np.sqrt(variance_m2))
 
 
 def _between(at_m: FloatArray, wanted_m: FloatArray) -> csr_array:

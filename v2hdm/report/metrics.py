@@ -148,6 +148,8 @@ class LaneMetrics:
     lanes: int
     length_m: float
     mean_lateral_error_m: float  # of mapped length near a true line
+    rms_lateral_error_m: float
+    inside_95: float  # fraction of vertices there within 1.96 of their sigmas; nan without sigmas
     mapped_fraction: float  # of the visible true length, with a mapped line near
     false_length_m: float  # mapped without a true line near
 
@@ -162,16 +164,23 @@ def lane_metrics(lanes: Sequence[Lane], truth: Truth) -> LaneMetrics:
     )
     mapped = _stack(resample(lane.points_map) for lane in lanes)
     mapped_m = len(mapped) * SAMPLE_STEP_M
+    none = float("nan")
     if not len(mapped) or not len(true_all):
-        return LaneMetrics(len(lanes), mapped_m, float("nan"), 0.0, mapped_m)
+        return LaneMetrics(len(lanes), mapped_m, none, none, none, 0.0, mapped_m)
     lateral = distance_to_points(mapped, true_all)
     near = lateral <= LATERAL_GATE_M
+    stated = [(lane.points_map, lane.sigma_m) for lane in lanes if lane.sigma_m is not None]
+    off_m = distance_to_points(_stack(points for points, _ in stated), true_all)
+    sigmas = off_m / np.concatenate([np.zeros(0), *(sigma_m for _, sigma_m in stated)])
+    sigmas = sigmas[off_m <= LATERAL_GATE_M]
     covered = distance_to_points(true_visible, mapped) <= LATERAL_GATE_M
     return LaneMetrics(
         lanes=len(lanes),
         length_m=mapped_m,
-        mean_lateral_error_m=float(lateral[near].mean()) if near.any() else float("nan"),
-        mapped_fraction=float(covered.mean()) if len(covered) else float("nan"),
+        mean_lateral_error_m=float(lateral[near].mean()) if near.any() else none,
+        rms_lateral_error_m=float(np.sqrt((lateral[near] ** 2).mean())) if near.any() else none,
+        inside_95=float((sigmas <= 1.96).mean()) if len(sigmas) else none,
+        mapped_fraction=float(covered.mean()) if len(covered) else none,
         false_length_m=float((~near).sum() * SAMPLE_STEP_M),
     )
 

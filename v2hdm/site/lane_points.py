@@ -61,9 +61,7 @@ class LaneCloud:
     image: IntArray  # (P,) image index
     dash: BoolArray  # (P,) whether detected as a dash
     guides: Guides = field(default_factory=Guides)
-    points_px: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))  # (P, 2) pinhole
-    row_share: FloatArray = field(default_factory=lambda: np.zeros(0))
-    jacobian: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 2)))  # (P, 2, 2) by pixel
+    row_share: FloatArray = field(default_factory=lambda: np.zeros(0))  # (P,) of their pixels
 
 
 @dataclass(frozen=True)
@@ -176,7 +174,7 @@ def collect_lane_points(
     dash = np.array([lane.kind == LANE_DASH for _, lane in lanes])[piece]
     weight = 1.0 / (variance[keep] + OWN_SIGMA_M**2)
     own = points_map[keep], tangent[keep], weight, image[keep], dash[keep], guides
-    return LaneCloud(*own, points_px[keep], row_share[keep], jacobian[keep])
+    return LaneCloud(*own, row_share[keep])
 
 
 def _lanes(
