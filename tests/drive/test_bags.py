@@ -14,6 +14,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import apsw
 import av
 import cv2
 import lz4.frame
@@ -22,7 +23,7 @@ import pytest
 import yaml
 from backports import zstd
 from rosbags.rosbag1 import reader as reader1
-from rosbags.rosbag2 import CompressionMode, StoragePlugin, storage_mcap
+from rosbags.rosbag2 import CompressionMode, StoragePlugin, storage_mcap, storage_sqlite3
 from rosbags.rosbag2 import reader as reader2
 
 from tests.drive.bags import (
@@ -38,6 +39,7 @@ from tests.drive.bags import (
     write_ros2,
 )
 from tests.drive.example import make_drive
+from tests.faults.again import list_again
 from v2hdm.cli.main import run
 from v2hdm.detection.frames import video_frames
 from v2hdm.errors import ConfigError, DriveError
@@ -48,6 +50,7 @@ from v2hdm.io.drive.sources import _import_video
 from v2hdm.io.importers.bag import reading
 from v2hdm.io.importers.bag.messages import file_of
 from v2hdm.io.importers.bag.streams import ImageStream, TfStream, import_streams
+from v2hdm.io.safe.databases import opened
 from v2hdm.store.files import replace_text
 from v2hdm.store.inputs import protected_inputs
 
@@ -412,6 +415,8 @@ HOSTILE = {
     "more digits than a number has": f"uint8[{'9' * 5000}] data",
     "nested brackets": "uint8" + "[" * 3000,
     "four million letters": "uint8 a\n" * 500_000,
+    "thousands of no bytes": f"a_msgs/B[9999] x\n{'=' * 80}\nMSG: a_msgs/B\n",
+    "thousands of none each": f"a_msgs/B[9999] x\n{'=' * 80}\nMSG: a_msgs/B\nuint8[0] y\n",
 }
 
 
@@ -433,6 +438,7 @@ COMPUTED = {
     "a view": "DROP TABLE schema; CREATE VIEW schema AS SELECT 4 AS schema_version",  # it might be endless
     "a virtual table": "DROP TABLE schema; CREATE VIRTUAL TABLE schema USING rtree(schema_version, a, b)",
     "a computed column": "ALTER TABLE messages ADD more AS (zeroblob(1000000000))",
+    "an index of definitions": "CREATE INDEX again ON message_definitions (id)",
 }
 
 
@@ -469,6 +475,89 @@ def test_zeros_that_would_unpack_to_all_of_the_memory_are_refused(mode, folder, 
         read(tmp_path / "drive", topics_for(folder, bag))
 
 
+DATA = """CREATE TABLE bare (id INTEGER PRIMARY KEY, topic_id, timestamp);
+INSERT INTO bare SELECT id, topic_id, timestamp FROM messages; DROP TABLE messages;
+ALTER TABLE bare RENAME TO messages; ALTER TABLE messages ADD data DEFAULT '{}'"""
+MANY: dict[str, Callable[[Path], None]] = {
+    "messages": lambda file: list_again(file, "messages"),
+    "topics": lambda file: list_again(file, "topics"),
+    "definitions": lambda file: list_again(file, "message_definitions"),
+    "definitions that are one default": lambda file: executed(
+        file, f"ALTER TABLE message_definitions ADD more DEFAULT '{'x' * 100_000}'"
+    ),
+    "messages that are one default": lambda file: executed(file, DATA.format("x" * 100_000)),
+}
+
+
+def executed(file, sql):
+    with closing(sqlite3.connect(file)) as database:
+        database.executescript(sql)
+
+
+@pytest.mark.parametrize("name", MANY)
+def test_more_rows_than_a_database_has_bytes_are_refused(name, folder, tmp_path):
+    bag = write_ros2(tmp_path / "bag", messages_of(folder), SQLITE3)
+    MANY[name](next(bag.glob("*.db3")))
+    with pytest.raises(DriveError, match=r"interrupted|more rows than bytes|more bytes than it"):
+        read(tmp_path / "drive", topics_for(folder, bag))
+
+
+def test_no_query_of_a_database_takes_longer_than_its_bytes_need(tmp_path):
+    """Whoever asks, be it of the schema alone, which is read again and again if its pages say so."""
+    path, upward = tmp_path / "a.db3", "SELECT 1 UNION ALL SELECT k + 1 FROM n LIMIT 3000000"
+    executed(path, "CREATE TABLE a (b)")
+    reading._limit_rosbags()
+    ours, theirs = opened(path, "mode=ro"), storage_sqlite3.apsw.Connection(str(path))
+    with ours as data, closing(theirs):
+        for connection, failure in ((data, sqlite3.OperationalError), (theirs, apsw.InterruptError)):
+            with pytest.raises(failure, match="interrupt"):
+                connection.execute(f"WITH RECURSIVE n(k) AS ({upward}) SELECT max(k) FROM n").fetchall()
+
+
+BOMB = "- &a {history: 1}\n- &b {<<: [*a, *a]}\n"
+
+
+def test_profiles_of_service_which_nobody_asks_for_are_not_parsed(folder, tmp_path):
+    """In YAML, some hundred bytes that merge mappings take forever."""
+    bag = write_ros2(tmp_path / "bag", messages_of(folder), SQLITE3)
+    (file,) = bag.glob("*.db3")
+    executed(file, f"UPDATE topics SET offered_qos_profiles = '{BOMB}'")
+    assert_same_drive(read(tmp_path / "drive", topics_for(folder, bag)), read_drive(folder))
+    for reader in (reader2, storage_mcap, storage_sqlite3):
+        assert vars(reader)["parse_qos"](BOMB) == []
+
+
+def test_a_chunk_that_the_index_lists_many_times_is_refused(folder, tmp_path):
+    """All of them are held at once, for they are of one time."""
+    bag = write_ros2(tmp_path / "bag", messages_of(folder))
+    (file,) = bag.glob("*.mcap")
+    data, summary, at = file.read_bytes(), b"", 0
+    (begin,) = struct.unpack("<Q", data[-28:-20])  # in the footer, see https://mcap.dev/spec
+    at = begin
+    while at < len(data) - 37:
+        end = at + 9 + struct.unpack_from("<Q", data, at + 1)[0]
+        summary += data[at:end] * (50 if data[at] == 8 else 1)
+        at = end
+    file.write_bytes(data[:begin] + summary + data[-37:-20] + bytes(12) + data[-8:])
+    with pytest.raises(DriveError, match="its index lists a chunk twice"):
+        read(tmp_path / "drive", topics_for(folder, bag))
+
+
+@pytest.mark.parametrize("kind", ["ros1 lz4", "ros1 bz2", "mcap zstd chunks"])
+def test_chunks_of_zeros_are_refused_together_though_none_is_alone(kind, tmp_path, monkeypatch):
+    monkeypatch.setattr(reading, "_SPARE_BYTES", 4_000_000)
+    made = Messages(kind.startswith("ros1"))
+    for number in range(10):
+        zeros = made.raw_image(1.0 + number, np.zeros((600, 1000, 3), np.uint8), "rgb8", "front")
+        made.add(1.0 + number, "/image", zeros)
+    bag = PACKED[kind](tmp_path / "bag", made)
+    with pytest.raises(DriveError, match="unpacks to more than a recording could"):
+        import_streams(bag, [ImageStream("/image", "header", "here")], tmp_path / "cache")
+    made.rows = made.rows[:1]
+    one = PACKED[kind](tmp_path / "one", made)
+    import_streams(one, [ImageStream("/image", "header", "here")], tmp_path / "cache")
+
+
 PACKED: dict[str, Callable[[Path, Messages], Path]] = {
     "ros1 lz4": lambda path, made: write_ros1(path, made, "lz4"),
     "ros1 bz2": lambda path, made: write_ros1(path, made, "bz2"),
@@ -493,11 +582,12 @@ def test_chunks_of_zeros_are_refused_and_no_memory_is_asked_for(kind, tmp_path, 
 def test_no_decompressor_of_a_bag_is_without_a_limit(monkeypatch):
     """What rosbags may learn to unpack one day, too."""
     monkeypatch.setattr(reading, "_SPARE_BYTES", 1_000_000)
-    reading._limit_unpacking()
+    reading._limit_rosbags()
     pack = {"lz4": lz4.frame.compress, "zstd": zstd.compress, "bz2": bz2.compress}
     for unpackers in (storage_mcap.DECOMPRESSORS, reader1.decompressors):
         for name, unpack in unpackers.items():
             if name not in ("", "none"):
+                reading._spare.set(1_000_000)
                 assert len(unpack(pack[name](bytes(1_000_000)), 1_000_000)) == 1_000_000
                 with pytest.raises(DriveError, match="unpacks to more than a recording could"):
                     unpack(pack[name](bytes(30_000_000)), 30_000_000)

@@ -190,6 +190,13 @@ def damaged_inside() -> bytes:
     return bytes(data)
 
 
+def again_and_again() -> bytes:
+    """A progressive JPEG that repeats its last scan, of a few bytes, 100 times: each is over all pixels."""
+    plain = np.zeros((48, 64, 3), np.uint8)
+    data = cv2.imencode(".jpg", plain, (cv2.IMWRITE_JPEG_PROGRESSIVE, 1))[1].tobytes()
+    return data[:-2] + 100 * data[data.rindex(b"\xff\xda") : -2] + data[-2:]
+
+
 def flipped_png() -> bytes:
     """A PNG with one bit changed."""
     data = bytearray(picture(".png"))
@@ -252,6 +259,7 @@ IMAGES: dict[str, tuple[bytes, str]] = {
     "png with a chunk of 4 GB": (chunk_of_4_gb(), "damaged"),
     "png with an end of 4 GB": (chunk_of_4_gb(b"IEND"), "damaged"),
     "png with a flipped bit": (flipped_png(), "damaged"),
+    "jpeg that goes over its pixels 100 times": (again_and_again(), "damaged"),
     "1 x 1 px": (picture(height=1, width=1), "1 x 1 px"),
     "1 x 1 px png": (picture(".png", height=1, width=1), "1 x 1 px"),
     "3 x 2000 px": (picture(height=3, width=2000), "at least 16 px"),

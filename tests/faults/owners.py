@@ -9,6 +9,7 @@ from pathlib import Path
 
 from tests.calibration.site import INFO, clicked, mounting, write_table
 from tests.drive.example import make_map
+from tests.faults.again import list_again
 from tests.faults.judge import Case, Prepare
 from tests.faults.making import both, write, write_example
 from v2hdm.io.calibration.reading import read_provenance
@@ -233,6 +234,9 @@ SQL: dict[str, tuple[str, str]] = {
     "coordinates nested 3000 deep": (
         f"UPDATE markings SET corners_map = '{'[' * 3000}{']' * 3000}'", "nested deeper"
     ),
+    "a name in its schema that is no UTF-8": (
+        "PRAGMA writable_schema = ON; UPDATE sqlite_master SET name = CAST(X'ff' AS TEXT)", "utf-8"
+    ),
     "an origin that is a list": ("UPDATE v2hdm SET origin = '[1]'", "origin"),
 }  # fmt: skip
 _POINT = struct.pack("<BIdd", 1, 1, 0.0, 0.0)
@@ -262,6 +266,8 @@ def geopackages() -> Iterator[Case]:
         yield Case(f"geopackage: {name}", "v2hdm export", line, _executed(sql), says)
     many = "geopackage: one row many times"
     yield Case(many, "v2hdm export", line, _one_row_many_times, "more rows than bytes")
+    again = both(_executed(""), lambda root: list_again(root / "map.gpkg", "markings"))
+    yield Case("geopackage: all rows many times", "v2hdm export", line, again, "more rows than bytes")
     for name, (wkb, says) in GEOMETRIES.items():
         blob = b"GP\0\1" + bytes(4) + wkb
         prepare = _executed(f"UPDATE markings SET geom = X'{blob.hex()}'")

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from v2hdm import fleet
 from v2hdm.cli.main import run as command
 from v2hdm.fleet import FleetOptions, Row, exit_code, plan, run_fleet
 from v2hdm.io.drive import read_drive
@@ -133,6 +134,33 @@ def test_what_would_be_gone_with_a_worker_is_refused(tmp_path, drive):
     planned = plan([written(tmp_path, "one", drive)], ["output=memory://results"])
     assert not planned.jobs
     assert "is temporary, for one process" in planned.refused[0].says
+
+
+def test_a_run_whose_name_is_no_name_of_a_folder_is_refused_before_any_work(tmp_path, drive):
+    file = written(tmp_path, "one", drive)
+    file.write_text(file.read_text().replace("name: one", "name: ../one"))
+    planned = plan([file], [f"output={tmp_path / 'out'}"])
+    assert not planned.jobs
+    assert "has a path separator" in planned.refused[0].says
+
+
+def test_a_bug_is_a_row_whose_traceback_lies_beside_the_table(tmp_path, drive, monkeypatch):
+    def broken(*_):
+        raise ZeroDivisionError("a bug")
+
+    def in_turn(work, jobs, count, tell):
+        return enumerate(work(job, lambda *_: None) for job in jobs)
+
+    monkeypatch.setattr(fleet, "take_or_run", broken)
+    monkeypatch.setattr(fleet, "side_by_side", in_turn)
+    files = [written(tmp_path, name, drive) for name in ("one", "two")]
+    options = FleetOptions(tmp_path / "table")
+    rows = run_fleet(files, [f"output={tmp_path / 'out'}"], options, lambda *_: None)
+    assert [row.status for row in rows] == ["ERROR", "ERROR"]
+    assert "a bug in V2HDM, ZeroDivisionError: a bug" in rows[0].says
+    for name in ("one", "two"):
+        trace = (tmp_path / "table" / f"{name}.traceback.txt").read_text()
+        assert trace.rstrip().endswith("ZeroDivisionError: a bug")
 
 
 def test_the_table_has_a_code_for_the_worst_of_its_rows():

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pyogrio
+import rasterio
 
+from v2hdm.io.safe import pixels
 from v2hdm.records import GeodeticOrigin, HdMap, Lane, Marking, Symbol
 
 ORIGIN = GeodeticOrigin(latitude_deg=29.95, longitude_deg=122.05, altitude_m=12.0)
@@ -116,3 +118,14 @@ def assert_same_map(got: HdMap, expected: HdMap) -> None:
 
 def _features(hd_map: HdMap) -> list[Marking | Lane | Symbol]:
     return [*hd_map.markings, *hd_map.lanes, *hd_map.symbols]
+
+
+def write_empty(path, monkeypatch, **more):
+    """A GeoTIFF of nothing but a header, in blocks of a megapixel, where images of this size are large."""
+    monkeypatch.setattr(pixels, "MOST_PX", 1_000_000)
+    place = rasterio.Affine(0.02, 0, 0, 0, -0.02, 0)
+    look = {"width": 3000, "height": 3000, "count": 3, "dtype": "uint8", "transform": place, **more}
+    look |= {"tiled": True, "blockxsize": 1024, "blockysize": 1024, "sparse_ok": True}
+    with rasterio.open(path, "w", driver="GTiff", **look):
+        pass
+    assert path.stat().st_size < 2000

@@ -13,7 +13,7 @@ import rasterio
 from pypcd4 import PointCloud
 from pyproj import CRS
 
-from tests.maps.gis import street
+from tests.maps.gis import street, write_empty
 from v2hdm.cli.main import run
 from v2hdm.geometry.rigid import exp
 from v2hdm.io.maps.formats import write_map
@@ -149,6 +149,7 @@ def test_the_ground_as_points_has_heights_and_the_paint_where_it_is(result, monk
         (["mosaic.tif", "--format", "pcd", "--crs", "local"], "in the map's own frame"),
         (["broken.tif", "--format", "pcd"], "broken.tif: cannot be read as a GeoTIFF"),
         (["pipe.tif", "--format", "pcd"], "pipe.tif: cannot be read as a GeoTIFF (no such file)"),
+        (["huge.tif", "--format", "pcd"], "huge.tif: has more pixels than its bytes could hold"),
         (["map.gpkg", "--format", "qgis", "--crs", "local"], "map.gpkg would be overwritten"),
     ],
 )
@@ -159,6 +160,7 @@ def test_what_cannot_be_exported_is_refused_in_one_line(result, monkeypatch, cap
     write_geojson(street(), folder / "map.geojson")
     write_map(street(), folder, "map", ["gpkg"])
     (folder / "broken.tif").write_bytes(b"II*\0" + bytes(40))
+    write_empty(folder / "huge.tif", monkeypatch)
     if words[0] == "pipe.tif":
         os.mkfifo(folder / words[0])
     monkeypatch.chdir(folder)

@@ -340,22 +340,14 @@ def test_a_folder_with_a_list_of_somebody_elses_is_not_ours(tmp_path):
     assert not items_of(tmp_path)
 
 
-def test_a_hidden_folder_of_the_users_beside_an_import_stays(tmp_path):
-    own, folder = tmp_path / ".bag-front.old.part", tmp_path / "bag-front"
-    own.mkdir()
-    os.utime(own, (1000, 1000))
-    with new_entry(folder) as partial:
+@pytest.mark.parametrize(("name", "stays"), [("old", True), ("some-host-01234567", False)])
+def test_of_hidden_folders_beside_an_import_only_what_a_kill_has_left_goes(name, stays, tmp_path):
+    hidden = tmp_path / f".bag-front.{name}.part"
+    hidden.mkdir()
+    os.utime(hidden, (1000, 1000))
+    with new_entry(tmp_path / "bag-front") as partial:
         write_entry(partial)
-    assert own.is_dir()
-
-
-def test_what_a_kill_has_left_of_an_import_goes_when_it_is_made_again(tmp_path):
-    left, folder = tmp_path / ".bag-front.some-host-01234567.part", tmp_path / "bag-front"
-    left.mkdir()
-    os.utime(left, (1000, 1000))
-    with new_entry(folder) as partial:
-        write_entry(partial)
-    assert not left.exists()
+    assert hidden.is_dir() is stays
 
 
 def test_an_import_is_not_made_anew_where_a_link_leads(tmp_path):

@@ -57,36 +57,28 @@ def run(arguments: Sequence[str]) -> None:
 
 
 def _export_map(parsed: argparse.Namespace, folder: Path, check: Callable[[Path], object]) -> list[Path]:
-    from v2hdm.io.maps.formats import (
-        FORMATS,
-        GROUND_FORMATS,
-        check_crs,
-        check_formats,
-        holds,
-        with_data,
-        write_map,
-    )
+    from v2hdm.io.maps import formats
     from v2hdm.io.maps.reading import read_map
 
-    if ground := [one for one in parsed.format if one in GROUND_FORMATS]:
+    if ground := [one for one in parsed.format if one in formats.GROUND_FORMATS]:
         raise ConfigError(
             f"--format {ground[0]}: a map file does not hold the ground; let the run write it with "
             f"'export=[geojson,{ground[0]}]'"
         )
-    check_formats(parsed.format, "--format")
-    name, chosen = parsed.source.stem, with_data(parsed.format)
+    formats.check_formats(parsed.format, "--format")
+    name, chosen = parsed.source.stem, formats.with_data(parsed.format)
     hd_map, verdict = read_map(parsed.source)
-    grid = check_crs(parsed.crs, chosen, hd_map.origin, "--crs").get("gpkg")
+    grid = formats.check_crs(parsed.crs, chosen, hd_map.origin, "--crs").get("gpkg")
     # A project takes the GeoPackage that is there, whoever wrote it, where it is of this map.
-    there = folder / FORMATS["gpkg"].file.format(name=name)
-    has_data = "gpkg" not in parsed.format and holds(there, hd_map, None if grid is None else grid.crs)
-    kept = ["gpkg"] if has_data else []
-    files = [folder / FORMATS[one].file.format(name=name) for one in chosen if one not in kept]
+    there = folder / formats.FORMATS["gpkg"].file.format(name=name)
+    crs = None if grid is None else grid.crs
+    kept = ["gpkg"] if "gpkg" not in parsed.format and formats.holds(there, hd_map, crs) else []
+    files = [folder / formats.FORMATS[one].file.format(name=name) for one in chosen if one not in kept]
     if parsed.source.resolve() in [file.resolve() for file in files]:
         raise ConfigError(f"{parsed.source} would be overwritten: set another --output or --format")
     for file in files:
         check(file)
-    return write_map(hd_map, folder, name, parsed.format, verdict, parsed.projector, parsed.crs, kept)
+    return formats.write_map(hd_map, folder, name, parsed.format, verdict, parsed.projector, parsed.crs, kept)
 
 
 def _export_mosaic(parsed: argparse.Namespace, folder: Path, *_: object) -> list[Path]:

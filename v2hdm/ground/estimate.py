@@ -15,13 +15,7 @@ from v2hdm.ground.model import Mount, guessed_mount
 from v2hdm.ground.motion import ARM_M, Motion, changing_pairs, motion_of, spread_pairs
 from v2hdm.ground.patches import STRIP_M, Matcher, Round
 from v2hdm.ground.prior import Observations, Stated, state_sigmas
-from v2hdm.ground.results import (
-    GroundEstimate,
-    GroundOptions,
-    GroundStatus,
-    Parameter,
-    Reading,
-)
+from v2hdm.ground.results import GroundEstimate, GroundOptions, GroundStatus, Parameter, Reading
 from v2hdm.ground.start import Readings, contradicts, try_readings
 from v2hdm.records import Calibration, Drive, PoseNoise
 from v2hdm.workers import share_out

@@ -24,14 +24,7 @@ from v2hdm.adjust import (
     predicts_better,
     select_model,
 )
-from v2hdm.association.ground import (
-    Located,
-    Views,
-    easy_views,
-    images_with_line,
-    images_with_symbol,
-    locate,
-)
+from v2hdm.association.ground import Located, Views, easy_views, images_with_line, images_with_symbol, locate
 from v2hdm.association.groups import (
     Association,
     attach,

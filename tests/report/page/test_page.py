@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.faults.cases import png_header
+from tests.maps.gis import write_empty
 from tests.report.page.folder import (
     DIAMOND_M,
     GONE,
@@ -268,12 +270,13 @@ def test_a_picture_of_the_users_own_lies_under_the_map_where_it_belongs(result, 
     assert (west + column * cell_m[0], north - row * cell_m[1]) == pytest.approx((8.0, -3.0), abs=0.05)
 
 
-def test_a_picture_that_cannot_lie_under_the_map_is_refused_with_its_reason(result, tmp_path):
+def test_a_picture_that_cannot_lie_under_the_map_is_refused_with_its_reason(result, tmp_path, monkeypatch):
     write_tif(tmp_path / "aerial.tif", in_grid(0.0, 0.0))
     write_tif(tmp_path / "elsewhere.tif", in_grid(5000.0, 0.0))
     write_tif(tmp_path / "nowhere.tif", in_grid(0.0, 0.0), crs=None)
     (tmp_path / "none.tif").write_bytes(b"no picture")
     os.mkfifo(tmp_path / "pipe.tif")
+    write_empty(tmp_path / "huge.tif", monkeypatch, crs="EPSG:32632")
     facts = read_facts(result, None)
     placed = replace(facts, hd_map=replace(facts.hd_map, origin=HAMBURG))
     for name, of, told in (
@@ -282,6 +285,7 @@ def test_a_picture_that_cannot_lie_under_the_map_is_refused_with_its_reason(resu
         ("pipe", placed, "not a readable GeoTIFF or folder of XYZ tiles; check"),
         ("nowhere", placed, "no coordinate system"),
         ("aerial", facts, "no position on the earth"),
+        ("huge", placed, "more pixels than its bytes could hold"),
     ):
         with pytest.raises(MapFileError, match=f"{name}.tif: .*{told}"):
             background_layer(tmp_path / f"{name}.tif", of)
@@ -317,6 +321,16 @@ def test_a_mosaic_of_the_folder_is_a_layer_within_its_budget(tmp_path, monkeypat
     assert page.ground
     (tmp_path / "result" / "mosaic.webp").unlink()
     with pytest.raises(MapFileError, match=r"mosaic\.webp: not a readable picture"):
+        document(read_facts(tmp_path / "result", drive))
+
+
+@pytest.mark.parametrize("name", ["mosaic.png", "mosaic_before_after.png", "overlay_front.png"])
+def test_a_picture_of_the_folder_that_would_take_all_of_the_memory_is_refused(name, tmp_path):
+    drive = make_result(tmp_path)
+    write_json(tmp_path / "result" / "mosaic.json", {"image": "mosaic.png", "bounds_m": [-1, -4, 15, 8]})
+    cv2.imwrite(str(tmp_path / "result" / "mosaic.png"), np.zeros((600, 800, 4), np.uint8))
+    (tmp_path / "result" / name).write_bytes(png_header(60000, 60000))
+    with pytest.raises(DriveError, match=f"{name}: image is 60000 x 60000 px, more than"):
         document(read_facts(tmp_path / "result", drive))
 
 

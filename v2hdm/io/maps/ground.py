@@ -9,6 +9,7 @@ import numpy as np
 
 from v2hdm.errors import ConfigError, MapFileError, need
 from v2hdm.geometry.geodetic import crs_of
+from v2hdm.io.safe.pixels import check_raster
 from v2hdm.records import FloatArray, GroundStrip, HdMap
 from v2hdm.store.files import whole_file
 
@@ -119,6 +120,7 @@ def write_cloud(mosaic: Path, path: Path, height_m: Callable[[FloatArray], Float
         with rasterio.open(mosaic, driver="GTiff") as data:
             if data.count != 3 or data.dtypes[0] != "uint8" or data.transform.b or data.transform.e >= 0:
                 raise MapFileError(f"{mosaic}: not a mosaic that v2hdm wrote; give mosaic.tif of a result")
+            check_raster(data, mosaic, MapFileError)
             factor = max(round(_SPACING_M / data.transform.a), 1)
             for top in range(0, data.height, _STRIP_PX * factor):
                 rows = min(_STRIP_PX * factor, data.height - top)

@@ -10,7 +10,6 @@ import logging
 import sqlite3
 import struct
 from collections.abc import Callable, Mapping
-from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from v2hdm.errors import MapFileError
 from v2hdm.geometry.geodetic import Grid, enu_from_geodetic
 from v2hdm.geometry.planar import signed_area
 from v2hdm.io.maps.features import CORNERS, OUTLINE, PAINT, POINTS, Feature, map_of, unique_ids
+from v2hdm.io.safe.databases import opened, rows_of
 from v2hdm.io.safe.fields import take_covariance, take_origin, take_whole
 from v2hdm.io.safe.texts import parse_json, take_name
 from v2hdm.records import FloatArray, GeodeticOrigin, HdMap, PaintLeft
@@ -322,25 +322,17 @@ def _layer(path: Path, layer: str) -> list[dict[str, Any]]:
     if not path.is_file():
         raise MapFileError(f"{path}: no such file; check the path or restore it")
     others = f"{path}: not a map written by v2hdm"
-    journal = path.with_name(f"{path.name}-wal")
-    left = path.stat().st_size + (journal.stat().st_size if journal.is_file() else 0)
     try:
-        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as data:
+        with opened(path, "mode=ro") as data:
             # A view, a virtual table and a generated column would compute without end.
             about = data.execute("SELECT type, sql FROM sqlite_master WHERE name = ?", [layer]).fetchall()
-            columns = data.execute("SELECT name, hidden FROM pragma_table_xinfo(?)", [layer]).fetchall()
+            hidden = data.execute("SELECT 1 FROM pragma_table_xinfo(?) WHERE hidden", [layer]).fetchall()
             plain = [kind == "table" and "VIRTUAL" not in sql.upper()[:20] for kind, sql in about]
-            if plain != [True] or any(hidden for _, hidden in columns):
+            if plain != [True] or hidden:
                 raise MapFileError(f"{others} (it has no plain table '{layer}'); give one that is")
-            rows = []
-            for row in data.execute(f'SELECT * FROM "{layer}"'):
-                left -= sum(len(value) for value in row if isinstance(value, str | bytes)) + 1
-                if left < 0:
-                    raise MapFileError(f"{others} (it has more rows than bytes); give one that is")
-                rows.append(dict(zip((name for name, _ in columns), row, strict=True)))
-    except (sqlite3.Error, AttributeError) as failure:
+            return list(rows_of(data, path, layer))
+    except (sqlite3.Error, UnicodeError, AttributeError) as failure:
         raise MapFileError(f"{others} ({failure}); give one that is") from None
-    return rows
 
 
 def _json(text: object, where: str) -> object:

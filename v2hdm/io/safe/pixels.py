@@ -20,12 +20,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import takewhile
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import cv2
 import numpy as np
 
-from v2hdm.errors import DriveError
+from v2hdm.errors import DriveError, V2hdmError
 from v2hdm.store.inputs import note_input
 
 _log = logging.getLogger(__name__)
@@ -33,6 +33,7 @@ _log = logging.getLogger(__name__)
 MOST_PX = 200_000_000  # the largest sensors of mapping cameras have 150 million
 LEAST_SIDE_PX = 16  # narrower images show no marking, and not one cell of the network
 _MOST_BYTES = 1 << 30
+_TIMES = 4000  # what a raster's byte may unpack to, beyond the largest image: ours hold up to 320 where empty
 _TAIL_BYTES = 4096
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
@@ -40,7 +41,9 @@ _TIFF = (b"II*\0", b"MM\0*")
 # Start-of-frame markers; DHT, JPG and DAC lie in their midst and are none.
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_WITHOUT_LENGTH = frozenset([0x01, *range(0xD0, 0xD9)])
+_SEGMENT = re.compile(rb"\xff([^\0\1\xd0-\xd8\xff])")  # of a JPEG, or its end
 _APP1, _START_OF_SCAN = 0xE1, 0xDA
+_MOST_SCANS = 64  # of a JPEG; progressive ones have about ten
 _WIDTH_TAG, _HEIGHT_TAG, _ORIENTATION_TAG = 0x100, 0x101, 0x112
 _UPRIGHT = 1
 
@@ -78,7 +81,7 @@ def read_pixels(path: Path, flags: int) -> np.ndarray:
     with _opened(path) as stored:
         data = stored[:]
     header = _checked(data, path)
-    if data.startswith(_PNG) and not _is_whole_png(data):
+    if not (_is_whole_png(data) if data.startswith(_PNG) else _scans(data) <= _MOST_SCANS):
         raise DriveError(f"{path}: the image is damaged; copy it again or drop it from the list")
     if header.orientation != _UPRIGHT and not flags & cv2.IMREAD_IGNORE_ORIENTATION:
         _warn_turned(path.parent, header.orientation)
@@ -90,6 +93,14 @@ def read_pixels(path: Path, flags: int) -> np.ndarray:
     if pixels is None or any(map(_DAMAGE.search, lines)):
         raise DriveError(f"{path}: the image is damaged; copy it again or drop it from the list")
     return np.asarray(pixels)
+
+
+def check_raster(raster: Any, path: Path, error: type[V2hdmError]) -> None:
+    """Raise ``error`` where a raster, open in rasterio, would unpack to more than its file could hold."""
+    (rows, columns), *_ = raster.block_shapes
+    largest = 4 * MOST_PX + _TIMES * path.stat().st_size
+    if raster.count * (raster.height + rows) * (raster.width + columns) > largest:
+        raise error(f"{path}: has more pixels than its bytes could hold; save it without empty ones")
 
 
 def png(pixels: np.ndarray) -> bytes:
@@ -207,6 +218,15 @@ def _jpeg_header(data: _Data) -> Header | None:
             orientation = _orientation(data[at + 8 : at + length])
         at += length
     return None
+
+
+def _scans(data: bytes) -> int:
+    """How often a JPEG goes over all of its pixels, each time in a few bytes if it wants; 0 for others."""
+    at = count = 0
+    while data.startswith(_JPEG) and (found := _SEGMENT.search(data, at)) and found[1] != b"\xd9":
+        count += found[1][0] == _START_OF_SCAN
+        at = found.end() + int.from_bytes(data[found.end() : found.end() + 2], "big")
+    return count
 
 
 def _png_chunks(data: _Data) -> Iterator[tuple[bytes, int, int]]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from v2hdm.errors import MapFileError, need
 from v2hdm.geometry.geodetic import Grid, crs_of, geodetic_from_enu, utm_of
-from v2hdm.io.safe.pixels import read_header
+from v2hdm.io.safe.pixels import check_raster, read_header, read_pixels
 from v2hdm.records import FloatArray, Lane, Marking, Symbol
 from v2hdm.report.metrics import corner_errors, match_markings, rms
 from v2hdm.report.page.facts import Facts, GroundResiduals
@@ -33,7 +33,7 @@ def shrunk(pixels: np.ndarray, factor: float) -> np.ndarray:
 
 def jpeg_of(path: Path, widest_px: int, quality: int) -> str | None:
     """A picture file as JPEG in base64, at most ``widest_px`` wide; None if there is none."""
-    pixels = cv2.imread(str(path)) if path.is_file() else None
+    pixels = read_pixels(path, cv2.IMREAD_COLOR) if path.is_file() else None
     return None if pixels is None else jpeg(shrunk(pixels, min(1.0, widest_px / pixels.shape[1])), quality)
 
 
@@ -57,10 +57,9 @@ def mosaic_layer(folder: Path) -> dict[str, Any] | None:
     coded = path.read_bytes() if path.is_file() else b""
     text = base64.b64encode(coded).decode("ascii") if path.suffix == ".webp" else ""
     if not 0 < len(text) <= LARGEST_BYTES:
-        pixels = cv2.imdecode(np.frombuffer(coded, np.uint8), cv2.IMREAD_UNCHANGED) if coded else None
-        if pixels is None:
+        if not coded:
             raise MapFileError(f"{path}: not a readable picture; make the mosaic again")
-        text = _webp(pixels)
+        text = _webp(read_pixels(path, cv2.IMREAD_UNCHANGED))
     return {"src": text, "type": "image/webp", "bounds": bounds.tolist()}
 
 
@@ -113,6 +112,8 @@ def background_layer(path: Path, facts: Facts) -> dict[str, Any]:
         with rasterio.open(**_source(path)) as source:
             if source.crs is None:
                 raise MapFileError(f"{path}: states no coordinate system; give a GeoTIFF that has one")
+            if path.is_file():
+                check_raster(source, path, MapFileError)
             bilinear = rasterio.enums.Resampling.bilinear
             frame["add_alpha"] = rasterio.enums.ColorInterp.alpha not in source.colorinterp
             with warped.WarpedVRT(source, **frame, **size, resampling=bilinear) as there:

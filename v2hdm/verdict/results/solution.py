@@ -33,12 +33,7 @@ from v2hdm.mapping.results import Contradiction, MethodResult, SolveEvidence
 from v2hdm.records import Drive
 from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN
 from v2hdm.site.parallax import NOT_OBSERVED, NOT_ON_GROUND
-from v2hdm.verdict.results.agreement import (
-    check_against_ground,
-    check_agreement,
-    check_doubles,
-    check_heights,
-)
+from v2hdm.verdict.results import agreement
 from v2hdm.verdict.verdict import Finding, Status, judge, passed
 
 BEST = "Opt"  # the method whose map is the result
@@ -126,7 +121,7 @@ def check_result(
     best = list(methods.values())[-1][BEST]
     findings = check_solution(drive, methods)
     for visit, estimates in zip(drive.visits, ground, strict=False):
-        own = check_against_ground(best.calibrations, estimates)
+        own = agreement.check_against_ground(best.calibrations, estimates)
         suffix = f" of {visit.name}" if drive.joined else ""
         findings += [replace(finding, about=f"{finding.about}{suffix}") for finding in own]
     return findings
@@ -165,9 +160,10 @@ def check_solution(drive: Drive, methods: Mapping[str, Mapping[str, MethodResult
     if best.evidence is not None:
         causes = check_inputs(best.evidence)
         symptoms = [*check_fit(best.evidence), _excluded(best)]
-    symptoms += [*check_doubles(best), *check_heights(drive)]
+    symptoms += [*agreement.check_doubles(best), *agreement.check_heights(drive)]
     if len(methods) > 1:
-        symptoms += check_agreement({name: by_method[BEST] for name, by_method in methods.items()}, drive)
+        found = {name: by_method[BEST] for name, by_method in methods.items()}
+        symptoms += agreement.check_agreement(found, drive)
     named = next((finding for finding in causes if finding.status is Status.FAIL), None)
     return [*causes, *(_explained(finding, named) for finding in symptoms)]
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 import re
-import sqlite3
 from bz2 import BZ2Decompressor
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cache
 from itertools import chain
@@ -17,16 +17,19 @@ from types import SimpleNamespace
 from typing import Any
 
 from v2hdm.errors import DriveError, need
+from v2hdm.io.safe.databases import limit_steps, opened, rows_of
 from v2hdm.store.files import load_yaml, take_mapping
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"
-_TIMES, _SPARE_BYTES = 10, 200_000_000  # what a piece may unpack to: so many times its bytes, and these
+_TIMES, _SPARE_BYTES = 10, 200_000_000  # what a bag may unpack to: so many times its bytes, and these
+_spare: ContextVar[int] = ContextVar("bytes beyond so many times its own that a bag may still unpack to")
 _MOST_LETTERS = 1_000_000  # of a type's definition
 _TEXTS = re.compile(r'"(?:[^"\\]|\\.)*(?:"|\Z)|//[^\n]*|#[^\n]*|/\*.*?(?:\*/|\Z)', re.DOTALL)
 _CONSTANT, _LITERAL = re.compile(r"\bconst\b[^=;]*=([^;]*)"), re.compile(r"\s*[-+]?[\w.:]*\s*")
 _LONG = re.compile(r"\[[\s<=]*\d{8,}")  # an array of ten million elements
 _NESTED = re.compile(r"\([^()]*\(|\[[^\[\]]*\[")
+_NO_RECORDING = "its definition is not from a recording; convert it where it was recorded"
 _MEND = {".bag": "rosbag reindex", ".mcap": "mcap recover", ".db3": "ros2 bag reindex"}
 
 
@@ -125,7 +128,7 @@ class Bag:
 
     def _store_of(self, connection: Any) -> Any:
         """The types of one connection: as the bag defines them, else the common ones."""
-        from rosbags.interfaces import MessageDefinitionFormat
+        from rosbags.interfaces import MessageDefinitionFormat, Nodetype
         from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
         definition = connection.msgdef
@@ -133,13 +136,16 @@ class Bag:
         if definition.format == MessageDefinitionFormat.NONE:
             return get_typestore(Stores.ROS1_NOETIC if self._is_ros1 else Stores.LATEST)
         store = get_typestore(Stores.EMPTY)
-        if definition.format == MessageDefinitionFormat.MSG:
-            store.register(get_types_from_msg(definition.data, connection.msgtype))
-            return store
         types: dict[str, Any] = {}
-        for part in filter(str.strip, definition.data.split("=" * 80 + "\n")):
-            head, _, rest = part.partition("\n")
-            types |= get_types_from_idl(rest if head.startswith("IDL: ") else part)
+        if definition.format == MessageDefinitionFormat.MSG:
+            types = get_types_from_msg(definition.data, connection.msgtype)
+        else:
+            for part in filter(str.strip, definition.data.split("=" * 80 + "\n")):
+                head, _, rest = part.partition("\n")
+                types |= get_types_from_idl(rest if head.startswith("IDL: ") else part)
+        for _, fields in types.values():
+            if all(kind == Nodetype.ARRAY and not what[1] for _, (kind, what) in fields):
+                raise DriveError(_NO_RECORDING)  # it has no bytes: any number of them fits in a message
         store.register(types)
         return store
 
@@ -162,7 +168,8 @@ class Bag:
 def open_bag(path: Path) -> Iterator[Bag]:
     """Open the bag at ``path``: a ROS 1 file, a ROS 2 folder, or one file of it."""
     need("rosbags", "ros", f"{path}: a bag", DriveError)
-    _limit_unpacking()
+    _limit_rosbags()
+    _spare.set(_SPARE_BYTES)
     from rosbags import rosbag1, rosbag2
 
     files = bag_files(path)
@@ -189,8 +196,9 @@ def open_bag(path: Path) -> Iterator[Bag]:
 
 
 @cache
-def _limit_unpacking() -> None:
-    """Give rosbags decompressors that stop: some hundred kilobytes of zeros unpack to all of the memory."""
+def _limit_rosbags() -> None:
+    """Let no bag make rosbags take more memory or time than its bytes need: a few can ask for all of both."""
+    import apsw
     from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
     from rosbags.rosbag1 import reader as reader1
     from rosbags.rosbag2 import reader as reader2
@@ -198,10 +206,11 @@ def _limit_unpacking() -> None:
 
     def limited(new: Callable[[], Any]) -> Callable[..., bytes]:
         def unpack(data: bytes, *_: object) -> bytes:
-            stream = new()
-            out: bytes = stream.decompress(data, max_length=_TIMES * len(data) + _SPARE_BYTES)
+            stream, most = new(), _TIMES * len(data) + _spare.get()
+            out: bytes = stream.decompress(data, max_length=most)
             if not stream.eof:
-                raise DriveError("is cut off, or unpacks to more than a recording could")
+                raise DriveError("is cut off, or unpacks to more than a recording could; unpack it yourself")
+            _spare.set(min(most - len(out), _SPARE_BYTES))
             return out
 
         return unpack
@@ -220,20 +229,31 @@ def _limit_unpacking() -> None:
         with zstd.open(file, mode) as whole:
             yield SimpleNamespace(read=read)
 
-    database: Any = storage_sqlite3.Sqlite3Reader
-    opened = database._open
+    def connected(name: str, **how: Any) -> apsw.Connection:
+        limit_steps(data := apsw.Connection(name, **how), Path(data.filename))
+        return data
+
+    database, mcap = vars(storage_sqlite3)["Sqlite3Reader"], vars(storage_mcap)["McapReader"]
+    open_any, read_any = database._open, mcap.read_index
 
     def open_plain(self: Any) -> None:  # after a file that is compressed as a whole was unpacked, too
         _check_plain(self.path)
-        opened(self)
+        open_any(self)
 
-    database._open = open_plain
-    named: Any = reader2
-    zstd, lz4 = named.zstd, limited(LZ4FrameDecompressor)
+    def read_index(self: Any) -> None:  # chunks of one time are held together
+        read_any(self)
+        if sum(chunk.compressed_size for chunk in self.chunks) > self.path.stat().st_size:
+            raise DriveError("its index lists a chunk twice; run 'mcap recover'")
+
+    database._open, mcap.read_index = open_plain, read_index
+    zstd, lz4 = vars(reader2)["zstd"], limited(LZ4FrameDecompressor)
     unpack = limited(zstd.ZstdDecompressor)
     storage_mcap.DECOMPRESSORS.update(zstd=unpack, lz4=lz4)
     reader1.decompressors.update(bz2=limited(BZ2Decompressor), lz4=lz4)
-    named.zstd = SimpleNamespace(open=limited_file, decompress=unpack)
+    vars(reader2)["zstd"] = SimpleNamespace(open=limited_file, decompress=unpack)
+    vars(storage_sqlite3)["apsw"] = SimpleNamespace(**vars(apsw) | {"Connection": connected})
+    for module in (reader2, storage_mcap, storage_sqlite3):
+        vars(module)["parse_qos"] = lambda _: []  # nobody asks for them, and they are YAML
 
 
 def _check_definition(text: str) -> None:
@@ -241,33 +261,34 @@ def _check_definition(text: str) -> None:
     plain = _TEXTS.sub("", text)
     odd = any(not _LITERAL.fullmatch(one[1]) for one in _CONSTANT.finditer(plain))
     if len(text) > _MOST_LETTERS or odd or _NESTED.search(plain) or _LONG.search(plain):
-        raise DriveError("its definition is not from a recording; convert it where it was recorded")
+        raise DriveError(_NO_RECORDING)
 
 
 def _check_database(path: Path) -> None:
     """Refuse an SQLite file (https://www.sqlite.org/fileformat.html, 1.3) whose end SQLite would not miss."""
-    with path.open("rb") as file:
-        header = file.read(100)
     journal = path.with_name(f"{path.name}-wal")
     if journal.is_file() and journal.stat().st_size:
         raise DriveError(f"{path}: was not closed; {journal.name} holds its end; run 'ros2 bag reindex'")
-    if len(header) < 100:
-        return
-    page_bytes = int.from_bytes(header[16:18], "big")
-    # One stands for 65536, which two bytes cannot.
-    expected = int.from_bytes(header[28:32], "big") * (65536 if page_bytes == 1 else page_bytes)
-    there = path.stat().st_size
-    if header[24:28] == header[92:96] and there < expected:
-        raise DriveError(f"{path}: is cut off: {there} of {expected} bytes; copy it again")
+    with path.open("rb") as file:
+        page_bytes = int.from_bytes(file.read(18)[16:], "big")
+    if path.stat().st_size % (page_bytes if page_bytes > 1 else 65536):  # which two bytes cannot hold
+        raise DriveError(f"{path}: is cut off in its last page; copy it again")
 
 
 def _check_plain(path: Path) -> None:
-    """Refuse an SQLite file that computes: a view, a virtual table or a computed column need never end."""
+    """Refuse an SQLite file that computes, or lists a row again and again: its rows need never end."""
     computes = "m.type = 'view' OR m.sql LIKE 'CREATE VIRTUAL%' OR x.hidden"
-    query = f"SELECT m.name FROM sqlite_master m LEFT JOIN pragma_table_xinfo(m.name) x WHERE {computes}"
-    with closing(sqlite3.connect(f"{path.resolve().as_uri()}?immutable=1", uri=True)) as data:
+    odd = f"{computes} OR m.type = 'index' AND m.tbl_name <> 'messages'"
+    query = f"SELECT m.name FROM sqlite_master m LEFT JOIN pragma_table_xinfo(m.name) x WHERE {odd}"
+    with opened(path, "immutable=1") as data:
         for (name,) in data.execute(query):
             raise DriveError(f"{path}: {name} is no plain table of a recording; convert it to MCAP")
+        names = {name.lower() for (name,) in data.execute("SELECT name FROM sqlite_master")}
+        for table in names & {"topics", "message_definitions"}:
+            deque(rows_of(data, path, table), maxlen=0)
+        ((held,),) = data.execute("SELECT total(length(data) + 1) FROM messages")
+        if held > path.stat().st_size:
+            raise DriveError(f"{path}: its messages have more bytes than it; convert it to MCAP")
 
 
 @contextmanager
@@ -275,8 +296,9 @@ def _one_line(path: Path, what: str = "") -> Iterator[None]:
     """Turn whatever goes wrong in a damaged bag into one line."""
     try:
         yield
-    except DriveError:
-        raise
+    except DriveError as refused:  # its own files are named already
+        named = str(refused).startswith(str(path))
+        raise refused if named else DriveError(f"{path}: {what}{refused}") from None
     # Bytes that are not what they should be fail anywhere within rosbags, with any error.
     except Exception as failure:
         if isinstance(failure, KeyError):

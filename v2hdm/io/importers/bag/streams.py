@@ -22,18 +22,6 @@ from v2hdm.errors import DriveError
 from v2hdm.io.calibration.reading import info_of
 from v2hdm.io.calibration.writing import write_camera_info
 from v2hdm.io.importers.bag import messages as kinds
-from v2hdm.io.importers.bag.messages import (
-    IMAGE_KINDS,
-    TF_STATIC,
-    TF_TOPIC,
-    VIDEO,
-    Edge,
-    Frames,
-    VideoDecoder,
-    file_of,
-    frame_name,
-    transform_rows,
-)
 from v2hdm.io.importers.bag.reading import Bag, Message, bag_files, open_bag
 from v2hdm.io.importers.readings import Readings, nmea_readings
 from v2hdm.io.safe.pixels import png
@@ -72,20 +60,20 @@ class ImageStream(Stream):
     """Images of a topic as files, with their list."""
 
     def __init__(self, topic: str, stamps: str, where: str) -> None:
-        super().__init__(topic, ["images", stamps], where, (topic, (*IMAGE_KINDS, VIDEO), where))
+        super().__init__(topic, ["images", stamps], where, (topic, (*kinds.IMAGE_KINDS, kinds.VIDEO), where))
         self._stamps = stamps
 
     def write(self, folder: Path) -> Writer:
         """Write an image file per message, or per frame of a video, and the list of them."""
         stamp_s, names = array("d"), dict[int, str]()
         topic = f"{self.where}: topic {self.label}"
-        decoder: VideoDecoder | None = None
+        decoder: kinds.VideoDecoder | None = None
 
         def put(number: int, suffix: str, data: bytes) -> None:
             names[number] = f"{number:06d}{suffix}"
             (folder / names[number]).write_bytes(data)
 
-        def decode(decoder: VideoDecoder, data: bytes | None) -> None:
+        def decode(decoder: kinds.VideoDecoder, data: bytes | None) -> None:
             for number, pixels in decoder.frames(data, len(stamp_s) - 1):
                 put(number, ".png", png(pixels))
 
@@ -98,11 +86,11 @@ class ImageStream(Stream):
                     f"{where}: its time {stamp_s[-1]:.6f} s is not after the previous one "
                     f"({stamp_s[-2]:.6f} s): two clocks or two recordings in one topic; keep one of them"
                 )
-            if message.kind == VIDEO:
-                decoder = decoder or VideoDecoder(message.fields.format, topic)
+            if message.kind == kinds.VIDEO:
+                decoder = decoder or kinds.VideoDecoder(message.fields.format, topic)
                 decode(decoder, message.fields.data.tobytes())
             else:
-                put(number, *file_of(message.kind, message.fields, where))
+                put(number, *kinds.file_of(message.kind, message.fields, where))
         if decoder is not None:
             decode(decoder, None)
         if len(names) < len(stamp_s):
@@ -186,7 +174,7 @@ class TfStream(Stream):
 
     def __init__(self, moving: bool, where: str) -> None:
         super().__init__("tf" if moving else "tf_static", ["tf"], where)
-        self._wanted = [TF_TOPIC, TF_STATIC] if moving else [TF_STATIC]
+        self._wanted = [kinds.TF_TOPIC, kinds.TF_STATIC] if moving else [kinds.TF_STATIC]
 
     def topics(self, bag: Bag) -> Sequence[str]:
         """Its topics in the bag, at least one."""
@@ -199,17 +187,18 @@ class TfStream(Stream):
         """Write a row per transform."""
         with (folder / _TRANSFORMS).open("w", encoding="utf-8") as file:
             while (message := (yield)) is not None:
-                for edge, row in transform_rows(message.fields):
+                for edge, row in kinds.transform_rows(message.fields):
                     file.write("\t".join([*edge, *map(repr, map(float, row))]) + "\n")
 
-    def frames(self, folder: Path) -> Frames:
+    def frames(self, folder: Path) -> kinds.Frames:
         """The frames that the entry in ``folder`` holds."""
-        rows: dict[Edge, array[float]] = defaultdict(lambda: array("d"))
+        rows: dict[kinds.Edge, array[float]] = defaultdict(lambda: array("d"))
         with (folder / _TRANSFORMS).open(encoding="utf-8") as lines:
             for line in lines:
                 parent, child, *values = line.rstrip("\n").split("\t")
                 rows[parent, child].extend(map(float, values))
-        return Frames.of({edge: np.array(flat).reshape(-1, 8) for edge, flat in rows.items()}, self.where)
+        edges = {edge: np.array(flat).reshape(-1, 8) for edge, flat in rows.items()}
+        return kinds.Frames.of(edges, self.where)
 
 
 def import_streams(path: Path, streams: Sequence[Stream], cache: Path) -> list[Path]:
@@ -251,7 +240,7 @@ def stamp_of(message: Message, stamps: str, first: bool, where: str) -> float:
     if stamps == "received":
         return message.received_s
     fields = message.fields
-    stamp = fields.timestamp if message.kind == VIDEO else fields.header.stamp
+    stamp = fields.timestamp if message.kind == kinds.VIDEO else fields.header.stamp
     if not stamp.sec and not stamp.nanosec and not first:
         raise DriveError(
             f"{where}: its header has no time; set stamps: received to use the recorder's, which are late "
@@ -262,7 +251,7 @@ def stamp_of(message: Message, stamps: str, first: bool, where: str) -> float:
 
 def frame_of(message: Message) -> str:
     """The frame that a message's header names."""
-    return frame_name(message.fields.header.frame_id)
+    return kinds.frame_name(message.fields.header.frame_id)
 
 
 def _write_row(file: TextIO, *row: float) -> None:

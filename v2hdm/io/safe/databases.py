@@ -1,0 +1,33 @@
+"""Validation of SQLite files from outside: pages that name one again and again make any number of rows."""
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+_STEPS, _SPARE_STEPS = 10, 1_000_000  # of SQLite's machine, by byte and beyond: a row takes 4 to 16
+
+
+def limit_steps(data: Any, path: Path) -> None:
+    """Let no query of a connection to ``path``, of sqlite3 or apsw, take more than what its bytes need."""
+    data.set_progress_handler(lambda: True, _STEPS * path.stat().st_size + _SPARE_STEPS)
+
+
+@contextmanager
+def opened(path: Path, how: str) -> Iterator[sqlite3.Connection]:
+    """A connection to read the file at ``path``; ``how`` is of SQLite's own options."""
+    with closing(sqlite3.connect(f"{path.resolve().as_uri()}?{how}", uri=True)) as data:
+        limit_steps(data, path)
+        yield data
+
+
+def rows_of(data: sqlite3.Connection, path: Path, table: str) -> Iterator[dict[str, Any]]:
+    """The rows of a table; raises sqlite3.Error where they have more bytes than the file and its journal."""
+    files = (path, path.with_name(f"{path.name}-wal"))
+    left, found = sum(one.stat().st_size for one in files if one.is_file()), data.cursor()
+    for row in found.execute(f'SELECT * FROM "{table}"'):
+        left -= sum(len(value) for value in row if isinstance(value, str | bytes)) + 1
+        if left < 0:
+            raise sqlite3.DatabaseError("it has more rows than bytes")
+        yield dict(zip((name for name, *_ in found.description), row, strict=True))
