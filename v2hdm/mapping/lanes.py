@@ -120,7 +120,7 @@ def find_knots(
     lanes = map_lanes(cloud, options)
     if not lanes:
         return None
-    course, px_from_map = _Course.of(lanes), np.linalg.inv(ground.map_from_pinhole_px)
+    course, px_from_map = _Course.of(lanes), np.asarray(np.linalg.inv(ground.map_from_pinhole_px))
     lane, at_m, points_map, along = course.knots
     pairs = _pairs(cloud, course, px_from_map)
     image, at, *shown = _passing(cloud, ground, course, px_from_map, *pairs)

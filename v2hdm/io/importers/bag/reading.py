@@ -22,7 +22,8 @@ from v2hdm.store.files import load_yaml, take_mapping
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"
-_TIMES, _SPARE_BYTES = 10, 200_000_000  # what a bag may unpack to: so many times its bytes, and these
+_TIMES, _SPARE_BYTES = 10, 200_000_000  # what a piece may unpack to: so many times its bytes, and these
+_TIMES_IN_ALL = 100  # the same of all pieces: raw pictures of a simulator may pack twenty times
 _spare: ContextVar[int] = ContextVar("bytes beyond so many times its own that a bag may still unpack to")
 _MOST_LETTERS = 1_000_000  # of a type's definition
 _TEXTS = re.compile(r'"(?:[^"\\]|\\.)*(?:"|\Z)|//[^\n]*|#[^\n]*|/\*.*?(?:\*/|\Z)', re.DOTALL)
@@ -210,7 +211,7 @@ def _limit_rosbags() -> None:
             out: bytes = stream.decompress(data, max_length=most)
             if not stream.eof:
                 raise DriveError("is cut off, or unpacks to more than a recording could; unpack it yourself")
-            _spare.set(min(most - len(out), _SPARE_BYTES))
+            _spare.set(min(_spare.get() + _TIMES_IN_ALL * len(data) - len(out), _SPARE_BYTES))
             return out
 
         return unpack
