@@ -21,7 +21,6 @@ from v2hdm.adjust.solution import (
     Solution,
     Status,
     Verdict,
-    as_of_line,
     observability,
     pose_innovations,
 )
@@ -29,7 +28,7 @@ from v2hdm.adjust.solve import solve
 
 __all__ = [
     "CHANGES", "MODELS", "ControlPoints", "Drift", "Fault", "KnownLengths", "Observations", "PoseSigma",
-    "Problem", "ScoreTest", "Solution", "SolveOptions", "Status", "Verdict", "as_of_line", "estimate_noise",
+    "Problem", "ScoreTest", "Solution", "SolveOptions", "Status", "Verdict", "estimate_noise",
     "height_information", "moves_with_heights", "observability", "pose_innovations",
     "predicts_better", "score_faults", "select_model", "sigmas_of", "solve", "with_model",
 ]  # fmt: skip

@@ -42,11 +42,6 @@ def as_of_point(squared_of_line: FloatArray) -> FloatArray:
     return np.asarray(-2 * chi2.logsf(squared_of_line, 1))
 
 
-def as_of_line(squared_of_point: FloatArray) -> FloatArray:
-    """The inverse of :func:`as_of_point`."""
-    return np.asarray(chi2.isf(np.exp(-squared_of_point / 2), 1))
-
-
 def classify(
     observations: Observations, mahalanobis2: FloatArray, behind: BoolArray, probability: float, scale: float
 ) -> VerdictArray:

@@ -203,11 +203,7 @@ def solve_bundle(
     solution = solve(problem, model.solver)
     if knots is not None:
         own = {name: getattr(solution, name)[: len(row)] for name in _OF_OBSERVATIONS}
-        squared = solution.mahalanobis2[len(row) :]
         solution = replace(solution, **own)
-        # Lines also use up degrees of freedom of the poses' priors.
-        of_poses = 2 * solution.cost_terms["frame_states"] / (len(squared) + 2 * len(row))
-        knots = knots.weighed(squared, knots.count / len(squared) + of_poses)
     cam_from_vehicle, map_from_vehicle = rig.cam_from_vehicle.copy(), sightings.map_from_vehicle.copy()
     cam_from_vehicle[used], map_from_vehicle[frames] = solution.cam_from_vehicle, solution.map_from_vehicle
     adjusted = replace(rig, cam_from_vehicle=cam_from_vehicle, map_from_vehicle=map_from_vehicle)

@@ -19,7 +19,7 @@ from scipy.interpolate import CubicSpline
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from v2hdm.adjust import ControlPoints, Observations, Solution, as_of_line
+from v2hdm.adjust import ControlPoints, Observations, Solution
 from v2hdm.association.ground import ground_points, ground_points_with_jacobian
 from v2hdm.association.sightings import Rig, frames_of
 from v2hdm.association.surface import Surface
@@ -29,7 +29,6 @@ from v2hdm.site.lane_points import (
     CENTRE_SIGMA_PX,
     HALF_WIDTH_M,
     NODE_SPACING_M,
-    OWN_SIGMA_M,
     ImageGround,
     LaneCloud,
     collect_lane_points,
@@ -45,7 +44,7 @@ _SPACING_M = 2.0  # spacing of knots, m: on a turn of 8 m radius the spline is a
 _HELD_M = 0.01  # sigma of a knot along its line, which nothing observes
 OPEN_END_PX = 1000.0  # sigma along its line of an observation that is no point: anywhere
 _SLOPE_SIGMA = 0.02  # rad, of a piece of paint against its lane
-_LINE_SIGMA_M = 0.0015  # of a whole line in one image, by the truth of port 2; without it .87 lie within 95 %, not .90
+_LINE_SIGMA_M = 0.0015  # of a whole line in one image, by port 2's truth; without it .87 lie within 95 %
 _MEDIAN_SQUARED = 0.455  # of a chi-square distribution with one degree of freedom
 _SAME_DIRECTION = np.cos(np.deg2rad(20.0))  # least cosine between points of one line; excludes crossing lines
 
@@ -68,19 +67,12 @@ class Knots:
     pinhole_px: FloatArray  # of each observation, with its row share and the image direction of its line
     row_share: FloatArray
     line: FloatArray
-    own_px2: FloatArray  # variance across the line, px^2: of a piece's points, and of all of them together
-    shared_px2: FloatArray
-    shared_factor: float = 0.0  # of the latter, from residuals
+    variance_px2: FloatArray  # across the line
 
     @property
     def count(self) -> int:
         """Number of knots that are unknowns of the adjustment."""
         return int(self.unknown.max(initial=-1)) + 1
-
-    @property
-    def variance_px2(self) -> FloatArray:
-        """Variances (K,) of observations across their line, px^2."""
-        return np.asarray(self.own_px2 + self.shared_factor * self.shared_px2)
 
     def observations(self, first: int) -> Observations:
         """As observations of corners numbered from ``first``; cameras and frames are the rig's."""
@@ -89,15 +81,6 @@ class Knots:
         covariance_px += OPEN_END_PX**2 * self.line[:, :, None] * self.line[:, None]
         at = first + self.knot
         return Observations(self.camera, self.frame, at, self.pinhole_px, covariance_px, self.row_share)
-
-    def weighed(self, squared: FloatArray, taken: float) -> Knots:
-        """With the factor that explains ``squared`` (K,), whitened residuals, of a robust scale.
-
-        Unknowns absorb the fraction ``taken`` of the residuals' freedom.
-        """
-        residual_px2 = as_of_line(squared) * self.variance_px2 / max(1 - taken, 0.1)
-        shared = np.median((residual_px2 / _MEDIAN_SQUARED - self.own_px2) / self.shared_px2)
-        return replace(self, shared_factor=max(float(shared), 0.0))
 
     def held(self, first: int) -> ControlPoints:
         """The prior that holds corners numbered from ``first`` along their lines."""
@@ -226,12 +209,12 @@ def _passing(
     knot: IntArray,
     ahead_m: FloatArray,
     off_m: FloatArray,
-) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Observations of lines through knots: image, knot, and the last five fields of :class:`Knots`.
+) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Observations of lines through knots: image, knot, and the last four fields of :class:`Knots`.
 
-    A line is fitted to the points of a piece. Their scatter about it gives the variance of their own errors;
-    neighbouring cells also have errors in common. Directions and weights are those of the course: taken from
-    the points themselves they would be correlated with their errors, which turns the camera.
+    A line is fitted to the points of a piece; their scatter about it gives their variance. Directions and
+    weights are the course's: those of the points would be correlated with their errors, which turns the
+    camera.
     """
     lane, _, knots_map, along = course.knots
     groups, own = np.unique(np.column_stack([cloud.image[point], knot]), axis=0, return_inverse=True)
@@ -255,12 +238,11 @@ def _passing(
     shown_map -= ground.at_rows(shown_map, image, row_share) - shown_map
     shown_px = ground_points(px_from_map[image], shown_map[:, None])[:, 0]
     line, _, px_by_left = _image_of(px_from_map[image], knots_map[at], along[at])
-    own_px2 = point_px2 * px_by_left[:, 1] ** 2 * xx / (w * xx - x**2)
+    variance_px2 = point_px2 * px_by_left[:, 1] ** 2 * xx / (w * xx - x**2)
     # What all of a line in an image has in common counts once in its mean, so as many times in each knot.
     of_line = np.unique(np.column_stack([image, lane[at]]), axis=0, return_inverse=True)[1].ravel()
-    own_px2 += np.bincount(of_line)[of_line] * (_LINE_SIGMA_M * px_by_left[:, 1]) ** 2
-    shared_px2 = CENTRE_SIGMA_PX**2 + (OWN_SIGMA_M * px_by_left[:, 1]) ** 2
-    return image, at, shown_px, row_share, line, own_px2, shared_px2
+    variance_px2 += np.bincount(of_line)[of_line] * (_LINE_SIGMA_M * px_by_left[:, 1]) ** 2
+    return image, at, shown_px, row_share, line, variance_px2
 
 
 def draw_lanes(knots: Knots, solution: Solution, spacing_m: float = NODE_SPACING_M) -> tuple[Lane, ...]:

@@ -88,8 +88,6 @@ _LOOSE_CLOCK_SIGMA_S = 0.3
 
 _GROUND_ROUNDS = 6  # most solves over improving ground; four suffice for a crown of 4 %
 
-_LANE_ROUNDS = 3  # most solves with lanes, each with the variances that the one before it showed
-
 _SETTLED_M = 1e-3  # RMS change of the observed heights at which the ground has converged
 
 
@@ -195,15 +193,9 @@ class Optimiser:
         if knots is not None and knots.count:
             progress("lanes")
             fit = final.solution.chi2_per_dof  # of markings: lines, whose variance is fitted, would dilute it
-            # Alternating: only residuals show what the points of a piece of line have in common.
-            for _ in range(_LANE_ROUNDS):
-                count = int(final.corner_index.max(initial=-1)) + 1
-                lanes = knots, final.solution.corners_map[:count]
-                final = self._solve(final.association, usable, final.rig, lanes=lanes)
-                assert final.knots is not None
-                before, knots = knots, final.knots
-                if knots.shared_factor == before.shared_factor:
-                    break
+            count = int(final.corner_index.max(initial=-1)) + 1
+            lanes = knots, final.solution.corners_map[:count]
+            final = self._solve(final.association, usable, final.rig, lanes=lanes)
             final = replace(final, solution=replace(final.solution, chi2_per_dof=fit))
         return self._conclude(final, bundle, inlier, usable)
 
