@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.benchmarks.made.boxes import detect_pieces, largest
 from tests.benchmarks.made.detect import detect
 from tests.benchmarks.made.draw import Recipe, draw
 from tests.benchmarks.made.faults import SPOILS
@@ -64,3 +65,24 @@ def test_the_lorry_stays_ahead_of_the_vehicle_which_stands_behind_it_for_seconds
     assert np.count_nonzero(np.diff(station) == 0) >= 10
     assert (np.diff(station) >= 0).all()
     assert (np.diff(world.stamp_s["front"]) > 0).all()
+
+
+def test_the_largest_part_in_view_is_the_larger_of_two_beside_what_hides_the_rest() -> None:
+    visible = np.ones((9, 9), dtype=bool)
+    visible[5:, 3:] = False
+    corners, share = largest(visible)
+    np.testing.assert_array_equal(corners, [[0, 0], [4, 0], [4, 8], [0, 8]])
+    assert share == 4 / 8
+    assert largest(~np.ones((9, 9), dtype=bool))[1] == 0.0
+
+
+def test_behind_boxes_pieces_are_found_beside_all_else() -> None:
+    world = make(draw(1))
+    drive = drive_of(world)
+    whole, (found, _) = detect(world, drive)[0], detect_pieces(world, drive)
+    pieces = [b.markings[len(a.markings) :] for a, b in zip(whole, found, strict=True)]
+    for a, b in zip(whole, found, strict=True):
+        np.testing.assert_equal(
+            [one.corners_px for one in a.markings], [one.corners_px for one in b.markings[: len(a.markings)]]
+        )
+    assert sum(map(len, pieces)) > 50
