@@ -95,7 +95,7 @@ def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
     """Posterior of the candidates of one class, which jointly determine its markings' distribution."""
     share, paint = _PRIOR_COUNT / _PRIOR_COUNT.sum(), learn_paint_error([], [])
     # Initially, candidates that agreeing images show whole are taken for markings, others for clutter.
-    whole, believed = candidates.known.all(axis=1), candidates
+    whole, believed = np.asarray(candidates.known.all(axis=1)), candidates
     taken = whole & (2 * counts.agreeing > counts.observations)
     probability = np.eye(len(KINDS))[np.where(taken, OF_CLASS, CLUTTER)]
     for number in range(1, _PASSES + 1):
