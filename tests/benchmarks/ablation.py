@@ -29,7 +29,7 @@ import cv2
 import numpy as np
 
 from tests.benchmarks.detector_quality import Tally
-from tests.benchmarks.made.boxes import detect_pieces
+from tests.benchmarks.made.boxes import detect_pieces, make_boxes
 from tests.benchmarks.made.detect import detect
 from tests.benchmarks.made.draw import draw
 from tests.benchmarks.made.faults import SPOILS
@@ -57,6 +57,8 @@ SEED = 5_318_008
 """No seed of training, of the judge's fit or of the quality benchmark."""
 
 _WRONG_M, _WRONG_SIGMAS = 0.08, 4.0
+
+_MOST_ENDS = 0.75  # share of the images that know an end behind a box to be hidden
 
 Part = tuple[str, Callable[[], AbstractContextManager[Any]]]
 
@@ -203,6 +205,7 @@ def terms() -> Iterator[Part]:
     yield "lengths that repeat", _without_repeats
     yield "ends that run on", partial(patch.object, hypotheses, "_RUN_ON_M", 0.0)
     yield "images' disagreement on worn ends", partial(patch.object, hypotheses, "_worn_evidence", _no_odds)
+    yield "views that know a corner hidden", partial(patch.object, posterior, "_vague_evidence", _unknown)
     yield "lines of dashes", partial(patch.object, hypotheses, "in_series", _nothing)
     yield "clutter shaped like its class", partial(patch.object, hypotheses, "_LIKE_CLASS", 1e-9)
     yield "how much clutter differs from it", partial(patch.object, hypotheses, "_LIKE_SHARE", 0.0)
@@ -227,6 +230,10 @@ def _without_repeats() -> Iterator[None]:
 
 def _no_odds(_: Any, ends: Sequence[FloatArray], weight: FloatArray) -> FloatArray:
     return np.zeros((len(ends), len(weight)))
+
+
+def _unknown(_: Any, weight: FloatArray) -> FloatArray:
+    return np.zeros((len(weight), 4))
 
 
 def _no_images(_: Any, __: Any, corners_map: FloatArray) -> FloatArray:
@@ -284,14 +291,14 @@ def site_drives(
 ) -> Iterator[tuple[Drive, Sequence[ImageDetections], Truth, tuple[str, ...]]]:
     """Drives, what is found in them, what is true, and the cameras to map with."""
     for seed in seeds:
-        for world, see in (
-            (make(draw(seed)), detect),
-            (make(draw(seed)), detect_pieces),
-            (make_queue(draw(seed, "straight")), detect_queue),
+        for world, see, cameras in (
+            (make(draw(seed)), detect, ("front", "rear")),
+            (make(draw(seed)), detect_pieces, ("front", "rear")),
+            (make_boxes(draw(seed, "straight")), partial(detect_pieces, known=_MOST_ENDS), ("front",)),
+            (make_queue(draw(seed, "straight")), detect_queue, ("front",)),
         ):
             drive = drive_of(world)
             detections, visibility = see(world, drive)
-            cameras = ("front",) if see is detect_queue else tuple(drive.cameras)
             yield drive, detections, truth_of(world, drive, visibility), cameras
     for folder in folders:
         drive = read_drive(folder)

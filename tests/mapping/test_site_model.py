@@ -45,7 +45,9 @@ def row(seed, shapes, sigma_m=0.01):
 def well_seen(count):
     """Each place in ten images, in all of its easy views, and never as part of a symbol."""
     ten = np.full(count, 10)
-    return Counts(ten, 4 * ten, 4 * ten, np.full(count, 7.0), ten - 2, ten - 2, 0 * ten)
+    return Counts(
+        ten, 4 * ten, 4 * ten, np.full(count, 7.0), ten - 2, ten - 2, np.full((count, 4), 8), 0 * ten
+    )
 
 
 def of_one_class(candidates, counts=None):
@@ -143,7 +145,9 @@ def test_an_end_on_which_images_disagree_is_likelier_worn_than_one_on_which_they
     true, candidates = row(5, [DASH] * 60, 0.005)
     wear_off(candidates, true, 10, 0.1)
     wear_off(candidates, true, 20, 0.15, 0.05)
-    crisp, ragged = of_one_class(candidates).probability[[10, 20], WRONG_END]
+    counts = well_seen(60)
+    counts.pointed[20, np.diagonal(candidates.covariance_m2[20])[::2] > 0.05**2] = 6
+    crisp, ragged = of_one_class(candidates, counts).probability[[10, 20], WRONG_END]
     assert ragged > 0.8
     assert crisp < 0.5
 
@@ -157,6 +161,21 @@ def test_a_length_that_several_dashes_have_is_no_wear():
     )
     others = [of_one_class(candidates).probability[50:, OTHER_LENGTH] for candidates in (alone, repeated)]
     assert others[1].min() > 0.98 > 0.96 > others[0].max()
+
+
+def test_two_ends_that_most_views_know_to_be_hidden_are_no_other_length():
+    """Both are as short, as behind boxes of one size; were it not for the views, that would be a length."""
+    true, candidates = row(7, [DASH] * 50, 0.005)
+    counts = well_seen(50)
+    for place in (10, 20):
+        before = candidates.corners_map[place].copy()
+        wear_off(candidates, true, place, 0.25)
+        counts.pointed[place, np.abs(candidates.corners_map[place] - before).max(axis=1) > 0.1] = 2
+    unknown, known = of_one_class(candidates), of_one_class(candidates, counts)
+    assert unknown.probability[[10, 20], OTHER_LENGTH].min() > 0.5
+    assert known.probability[[10, 20], WRONG_END].min() > 0.75
+    error = np.linalg.norm(known.candidates.corners_map - true, axis=2)
+    assert (error < 3 * known.candidates.sigma_m).all()
 
 
 def moved_end(candidates, place, along, slant=0.0):
@@ -358,16 +377,17 @@ LENGTHS_M = [2.0] * 76 + [1.3] * 6 + [2.26] * 6 + [2.74] * 4
 
 
 @pytest.mark.parametrize(
-    ("squared_at_the_end", "reason"), [(14.0, None), (140.0, "its position is too uncertain")]
+    ("squared_at_the_end", "agreeing", "reason"),
+    [(14.0, 8, None), (140.0, 5, "its position is too uncertain")],
 )
 def test_a_dash_cut_at_the_usual_length_is_left_out_where_images_disagree_on_its_end(
-    squared_at_the_end, reason
+    squared_at_the_end, agreeing, reason
 ):
     rng = np.random.default_rng(21)
     true = painted([DASH * [length / 3.0, 1.0] for length in [2.74, *LENGTHS_M]], rng)
     candidates, degrees = solved(true, rng), np.full((len(true), 4), 14.0)
     squared = rng.chisquare(14, degrees.shape) * 5 / rng.chisquare(5, degrees.shape)  # heavy tails
-    one_image = np.tile(1e-4 * np.eye(2), (len(true), 4, 1, 1))
+    one_image, counts = np.tile(1e-4 * np.eye(2), (len(true), 4, 1, 1)), well_seen(len(true))
     # Boxes stand on an end of the first, which then is as long as most, and of fourteen of these.
     for dash, cut_m in enumerate([0.74, *np.linspace(0.2, 1.2, 14)]):
         end = [1, 2] if np.linalg.norm(true[dash, 1] - true[dash, 0]) > 1 else [2, 3]
@@ -375,9 +395,9 @@ def test_a_dash_cut_at_the_usual_length_is_left_out_where_images_disagree_on_its
         along = along / np.linalg.norm(along)
         candidates.corners_map[dash, end] -= cut_m * along
         one_image[dash, end] += 0.1**2 * np.outer(along, along)
-        squared[dash, end] = squared_at_the_end
+        squared[dash, end], counts.pointed[dash, end] = squared_at_the_end, agreeing
     fused = FusedGroups(candidates.corners_map, one_image / 8, np.full((len(true), 4), 8))
-    found = verdict(with_shared_errors(candidates, fused, scatter_of(squared, degrees)))
+    found = verdict(with_shared_errors(candidates, fused, scatter_of(squared, degrees)), counts)
     assert found.verdict[0] == reason
     assert not any(found.verdict[15:77])
 
@@ -394,7 +414,7 @@ def test_what_looks_unlike_its_class_and_has_another_shape_is_a_letter_and_a_wor
     counts = well_seen(60)
     counts.log_odds[:] += np.random.default_rng(22).normal(0.0, 1.0, 60)
     counts.log_odds[[7, 8]] = 1.8
-    for never_easy in (counts.easy_views, counts.found):
+    for never_easy in (counts.easy_views, counts.found, counts.pointed):
         never_easy[7:9] = 0
     assert verdict(candidates, counts).verdict[7:9] == [
         "part of other paint, such as an arrow or a solid line",

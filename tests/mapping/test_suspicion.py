@@ -15,7 +15,9 @@ def counts(rejected=None):
     """Twelve images of four corners each, of which so many were rejected."""
     twelve, zero = np.full(COUNT, 12), np.zeros(COUNT, dtype=np.int64)
     agreeing = 4 * twelve - (zero if rejected is None else rejected)
-    return Counts(twelve, 4 * twelve, agreeing, np.full(COUNT, 7.0), twelve, twelve, zero)
+    return Counts(
+        twelve, 4 * twelve, agreeing, np.full(COUNT, 7.0), twelve, twelve, np.full((COUNT, 4), 12), zero
+    )
 
 
 def usual(rng):

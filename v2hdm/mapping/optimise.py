@@ -287,6 +287,9 @@ class Optimiser:
         easy = np.stack(easy_views(self._views, rig, list(self._cameras.values()), corners_map))
         place, number = (pairs[0] * (1 << 32) + pairs[1] for pairs in (shown, easy))
         found = np.isin(number, place)
+        ended = accepted & self.sightings.valid[bundle.row, bundle.own_corner]
+        ended &= np.isin(bundle.group * (1 << 32) + self.sightings.image[bundle.row], number[found])
+        corner = 4 * bundle.group[ended] + bundle.corner[ended]
         return Counts(
             images=np.bincount(shown[0], minlength=count),
             observations=np.bincount(bundle.group, minlength=count),
@@ -294,6 +297,7 @@ class Optimiser:
             log_odds=odds / np.maximum(np.bincount(group, minlength=count), 1),
             easy_views=np.bincount(easy[0], minlength=count),
             found=np.bincount(easy[0, found], minlength=count),
+            pointed=np.bincount(corner, minlength=4 * count).reshape(-1, 4),
             as_symbol=images_with_symbol(self.sightings.symbols, rig, corners_map)
             + images_with_line(self.sightings.lines, rig, corners_map),
         )

@@ -78,6 +78,7 @@ class Counts:
     log_odds: FloatArray  # the detector's mean log-odds over these
     easy_views: IntArray  # images with an unobstructed view of the whole candidate
     found: IntArray  # of these, with a detection
+    pointed: IntArray  # (G, 4) of these, with the corner as a consistent point
     as_symbol: IntArray  # images with a symbol on it, or a solid line that continues it
 
     def subset(self, rows: IntArray | BoolArray) -> Counts:

@@ -146,7 +146,8 @@ class Hypotheses:
     """All ``found`` hypotheses on N ``candidates`` of a class.
 
     From the previous pass are their corners as ``believed``, the ``probability`` (N, K) and frequency
-    ``share`` (K,) of each kind, and the errors of ``paint``. ``series`` is the evidence of lines of dashes.
+    ``share`` (K,) of each kind, and the errors of ``paint``. ``vague`` (N, 4) are log-likelihood ratios of a
+    worn or hidden corner, from views that disagree on it; ``series`` is the evidence of lines of dashes.
     """
 
     candidates: Candidates
@@ -154,6 +155,7 @@ class Hypotheses:
     probability: FloatArray
     share: FloatArray
     paint: PaintError
+    vague: FloatArray
     found: list[Hypothesis] = field(default_factory=list)
     series: Series | None = None
 
@@ -203,6 +205,8 @@ class Hypotheses:
         self.add(OF_CLASS, part / 2, otherwise, scatter)
         if shape.is_elongated:
             worn = _worn_evidence(self.candidates, [end for end, _ in ends], self.weight)
+            at_end = np.stack([end.reshape(-1, 4, 2).any(axis=2) for end, _ in ends])
+            worn = worn + np.sum(at_end * self.vague, axis=2) / 2
             shorter = (ends[0][0] + ends[1][0]) / 2
             alike = alike + (_WORN_SHARE * sides_m.max()) ** 2 * _outer(shorter)
             self._add_lengths(part, laid, shape.sigma_m, shorter, ends, worn)

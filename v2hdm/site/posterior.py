@@ -99,8 +99,9 @@ def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
     taken = whole & (2 * counts.agreeing > counts.observations)
     probability = np.eye(len(KINDS))[np.where(taken, OF_CLASS, CLUTTER)]
     for number in range(1, _PASSES + 1):
-        space = Hypotheses(candidates, believed, probability, share, paint)
-        weight = space.weight
+        weight = probability[:, :PART_OF_SYMBOL].sum(axis=1)
+        vague = _vague_evidence(counts, weight)
+        space = Hypotheses(candidates, believed, probability, share, paint, vague)
         shapes = learn_shapes(candidates.subset(weight > 0.5))
         space.add_all(shapes)
         by_kind, sources = np.array([one.kind for one in space.found]), _counted(counts, weight)
@@ -149,6 +150,15 @@ def _counted(counts: Counts, weight: FloatArray) -> FloatArray:
     either = np.logaddexp(alike, unlike) - np.log(2)
     looks = np.stack([alike, either, unlike], axis=1) * there[:, None]
     return np.stack([shown, found, rest, looks])
+
+
+def _vague_evidence(counts: Counts, weight: FloatArray) -> FloatArray:
+    """Log-likelihood ratio (N, 4) of a worn or hidden corner, from views that disagree on it."""
+    found = np.maximum(counts.found[:, None], counts.pointed)
+    vague = found - counts.pointed
+    rate = float((weight @ vague.sum(axis=1) + 1) / (4 * weight @ counts.found + 2))
+    sound = _rates(vague, found, _RATE_STRENGTH * rate, _RATE_STRENGTH * (1 - rate))
+    return np.asarray(np.logaddexp(_rates(vague, found, 1.0, 1.0) - sound, 0.0) - np.log(2))
 
 
 def _log_like_class(odds: FloatArray, weight: FloatArray) -> FloatArray:
