@@ -1,6 +1,7 @@
 """What each part of the detector of markings earns: switched off one at a time on scenes of unseen seeds.
 
     python -m tests.benchmarks.ablation [--images 60] [--only PATTERN] [--verdict FIRST LAST]
+                                        [--site FIRST LAST] [--drives FOLDER ...]
 
 Printed, for the detector as it is and without each part: recall within 20 m of markings that must be found,
 false ones, the share of markings with four corners known well, the corners' error, px, and whether the stated
@@ -18,8 +19,9 @@ import argparse
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
@@ -27,19 +29,36 @@ import cv2
 import numpy as np
 
 from tests.benchmarks.detector_quality import Tally
+from tests.benchmarks.made.boxes import detect_pieces, make_boxes
+from tests.benchmarks.made.detect import detect
+from tests.benchmarks.made.draw import draw
 from tests.benchmarks.made.faults import SPOILS
+from tests.benchmarks.made.queue import detect_queue, make_queue
+from tests.benchmarks.made.world import drive_of, make, truth_of
 from tests.benchmarks.right_drives import CLEAN, Job, judge, map_one
+from tests.benchmarks.uncertainty import corner_errors, in_order_of
 from train.examples import Example, example
+from v2hdm.association import ground
 from v2hdm.detection import classifier as find
 from v2hdm.detection import fit, lattice, propose
+from v2hdm.detection.batch import detect_all
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.mapping import foreign, recovery
-from v2hdm.records import FloatArray
+from v2hdm.io.drive import read_drive
+from v2hdm.io.drive.truth import read_truth
+from v2hdm.mapping import foreign, optimise, recovery
+from v2hdm.mapping.methods import run_methods
+from v2hdm.records import BoolArray, Drive, FloatArray, ImageDetections, Marking, Truth
+from v2hdm.report.metrics import driven_past, marking_metrics, match_markings
+from v2hdm.site import hypotheses, markings, posterior
 from v2hdm.verdict.results import solution
 
 SEED = 5_318_008
 """No seed of training, of the judge's fit or of the quality benchmark."""
+
+_WRONG_M, _WRONG_SIGMAS = 0.08, 4.0
+
+_MOST_ENDS = 0.75  # share of the images that know an end behind a box to be hidden
 
 Part = tuple[str, Callable[[], AbstractContextManager[Any]]]
 
@@ -172,14 +191,154 @@ def row_of_verdict(name: str, seeds: Sequence[int]) -> str:
     return f"{name:38s} {failed:7d} {silent:7d} {len(told):7d} {told.count('first'):7d}"
 
 
+def terms() -> Iterator[Part]:
+    """Each term of the site model, and the context that lacks it."""
+    yield "nothing off", nullcontext
+    for kind, name in (
+        (hypotheses.OTHER_LENGTH, "dashes of another length"),
+        (hypotheses.WRONG_END, "wrong ends"),
+        (hypotheses.PIECE, "pieces"),
+    ):
+        yield name, _without_kind(kind)
+    yield "slanting cuts of pieces", partial(patch.object, hypotheses, "_SLANT_OF_PIECE", 0.0)
+    yield "slanting ends of dashes", partial(patch.object, hypotheses, "_SLANT_OF_END", 0.0)
+    yield "lengths that repeat", _without_repeats
+    yield "ends that run on", partial(patch.object, hypotheses, "_RUN_ON_M", 0.0)
+    yield "images' disagreement on worn ends", partial(patch.object, hypotheses, "_worn_evidence", _no_odds)
+    yield "views that know a corner hidden", partial(patch.object, posterior, "_vague_evidence", _unknown)
+    yield "lines of dashes", partial(patch.object, hypotheses, "in_series", _nothing)
+    yield "clutter shaped like its class", partial(patch.object, hypotheses, "_LIKE_CLASS", 1e-9)
+    yield "how much clutter differs from it", partial(patch.object, hypotheses, "_LIKE_SHARE", 0.0)
+    yield "markings seldom found", partial(patch.object, posterior, "_NEGLECTED_SHARE", 1e-9)
+    yield "symbols on candidates", partial(patch.object, optimise, "images_with_symbol", _no_images)
+    yield "lines behind dashes", partial(patch.object, optimise, "images_with_line", _no_images)
+    yield "their sureness", partial(patch.object, ground, "_SURE_M", np.inf)
+    yield "their direction", partial(patch.object, ground, "_PARALLEL", -1.0)
+
+
+@contextmanager
+def _without_repeats() -> Iterator[None]:
+    lengths = hypotheses.Hypotheses._other_lengths
+
+    def alone(space: Any, *given: Any) -> tuple[float, FloatArray]:
+        spread_m, again = lengths(space, *given)
+        return spread_m, 0 * again
+
+    with patch.object(hypotheses.Hypotheses, "_other_lengths", alone):
+        yield
+
+
+def _no_odds(_: Any, ends: Sequence[FloatArray], weight: FloatArray) -> FloatArray:
+    return np.zeros((len(ends), len(weight)))
+
+
+def _unknown(_: Any, weight: FloatArray) -> FloatArray:
+    return np.zeros((len(weight), 4))
+
+
+def _no_images(_: Any, __: Any, corners_map: FloatArray) -> FloatArray:
+    return np.zeros(len(corners_map), dtype=np.int64)
+
+
+def _without_kind(kind: int) -> Callable[[], AbstractContextManager[Any]]:
+    add = hypotheses.Hypotheses.add
+
+    def unless(space: Any, own: int, *given: Any, **named: Any) -> None:
+        if own != kind:
+            add(space, own, *given, **named)
+
+    return partial(patch.object, hypotheses.Hypotheses, "add", unless)
+
+
+@dataclass
+class Mapped:
+    """What maps of several drives have."""
+
+    markings: int = 0
+    false: int = 0
+    found: float = 0.0
+    expected: int = 0
+    wrong: int = 0
+    squared_m2: list[float] = field(default_factory=list)
+
+    def add(self, mapped: Sequence[Marking], truth: Truth, expected: BoolArray) -> None:
+        """Count a map's markings."""
+        figures = marking_metrics(replace(truth.map, markings=tuple(mapped)), truth, expected)
+        rows, columns = match_markings(mapped, truth.map.markings)
+        true = [
+            in_order_of(mapped[row].corners_map, truth.map.markings[column].corners_map)
+            for row, column in zip(rows, columns, strict=True)
+        ]
+        known = [mapped[row] for row in rows]
+        off_m = np.array(
+            [np.linalg.norm(a.corners_map - b, axis=1) for a, b in zip(known, true, strict=True)]
+        )
+        sigmas2 = corner_errors(known, np.array(true)).reshape(-1, 4)
+        self.markings += figures.markings
+        self.false += figures.false_markings
+        self.found += figures.recall * figures.expected
+        self.expected += figures.expected
+        self.wrong += int(np.count_nonzero(((off_m > _WRONG_M) & (sigmas2 > _WRONG_SIGMAS**2)).any(axis=1)))
+        self.squared_m2 += np.square(off_m).ravel().tolist()
+
+    def __str__(self) -> str:
+        rmse_m, recall = np.sqrt(np.mean(self.squared_m2)), self.found / max(self.expected, 1)
+        return f"{self.markings:8d} {self.false:6d} {recall:7.3f} {100 * rmse_m:8.2f} {self.wrong:6d}"
+
+
+def site_drives(
+    seeds: Sequence[int], folders: Sequence[Path]
+) -> Iterator[tuple[Drive, Sequence[ImageDetections], Truth, tuple[str, ...]]]:
+    """Drives, what is found in them, what is true, and the cameras to map with."""
+    for seed in seeds:
+        for world, see, cameras in (
+            (make(draw(seed)), detect, ("front", "rear")),
+            (make(draw(seed)), detect_pieces, ("front", "rear")),
+            (make_boxes(draw(seed, "straight")), partial(detect_pieces, known=_MOST_ENDS), ("front",)),
+            (make_queue(draw(seed, "straight")), detect_queue, ("front",)),
+        ):
+            drive = drive_of(world)
+            detections, visibility = see(world, drive)
+            yield drive, detections, truth_of(world, drive, visibility), cameras
+    for folder in folders:
+        drive = read_drive(folder)
+        found = detect_all(drive, DetectorOptions.for_mapping(), 1)
+        yield drive, found, read_truth(drive), tuple(drive.cameras)
+
+
+def rows_of_site(only: str, seeds: Sequence[int], folders: Sequence[Path]) -> Iterator[str]:
+    """The table of the site model. Each drive is mapped once, and its candidates classified once a term."""
+    wanted = [(name, off) for name, off in terms() if re.search(only, name) or name == "nothing off"]
+    tally = {name: Mapped() for name, _ in wanted}
+    for drive, detections, truth, cameras in site_drives(seeds, folders):
+        expected, asked = driven_past(drive, truth, cameras), []
+
+        def classify(*given: Any, asked: list[Any] = asked) -> markings.Classified:
+            asked.append(given)
+            return markings.classify(*given)
+
+        with patch.object(optimise, "classify", classify):
+            run_methods(drive, detections, cameras)
+        for name, off in wanted:
+            with off():
+                tally[name].add(markings.classify(*asked[-1]).markings(), truth, expected)
+    return (f"{name:38s} {own}" for name, own in tally.items())
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--images", type=int, default=60)
     parser.add_argument("--only", default="")
     parser.add_argument("--verdict", nargs=2, type=int, metavar=("FIRST", "LAST"))
+    parser.add_argument("--site", nargs=2, type=int, metavar=("FIRST", "LAST"))
+    parser.add_argument("--drives", nargs="+", type=Path, default=[])
     parsed = parser.parse_args()
     cv2.setNumThreads(1)
+    if parsed.site or parsed.drives:
+        print(f"{'off':38s} {'markings':>8s} {'false':>6s} {'recall':>7s} {'RMSE, cm':>8s} {'wrong':>6s}")
+        print(*rows_of_site(parsed.only, range(*(parsed.site or (0, 0))), parsed.drives), sep="\n")
+        return
     if parsed.verdict:
         print(f"{'off':38s} {'failed':>7s} {'silent':>7s} {'told':>7s} {'first':>7s}")
         for name, off in sizes():

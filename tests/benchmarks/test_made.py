@@ -5,13 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.benchmarks.made.boxes import _hidden, detect_pieces, largest, make_boxes
 from tests.benchmarks.made.detect import detect
 from tests.benchmarks.made.draw import Recipe, draw
 from tests.benchmarks.made.faults import SPOILS
 from tests.benchmarks.made.queue import make_queue, rear_map
-from tests.benchmarks.made.world import drive_of, make, smooth_noise
+from tests.benchmarks.made.world import beside, drive_of, make, smooth_noise
 from v2hdm.geometry.ipm import apply_homography, ground_from_pinhole_px
 from v2hdm.geometry.lens import undistort_points
+from v2hdm.geometry.planar import inside_convex
+from v2hdm.records import LANE_DASH
+from v2hdm.simulate.render.scene import box_footprint
 
 
 def _exact(seed: int) -> Recipe:
@@ -64,3 +68,45 @@ def test_the_lorry_stays_ahead_of_the_vehicle_which_stands_behind_it_for_seconds
     assert np.count_nonzero(np.diff(station) == 0) >= 10
     assert (np.diff(station) >= 0).all()
     assert (np.diff(world.stamp_s["front"]) > 0).all()
+
+
+def test_the_largest_part_in_view_is_the_larger_of_two_beside_what_hides_the_rest() -> None:
+    visible = np.ones((9, 9), dtype=bool)
+    visible[5:, 3:] = False
+    corners, share = largest(visible)
+    np.testing.assert_array_equal(corners, [[0, 0], [4, 0], [4, 8], [0, 8]])
+    assert share == 4 / 8
+    assert largest(~np.ones((9, 9), dtype=bool))[1] == 0.0
+
+
+def test_behind_boxes_pieces_are_found_beside_all_else() -> None:
+    world = make(draw(1))
+    drive = drive_of(world)
+    whole, (found, _) = detect(world, drive)[0], detect_pieces(world, drive)
+    pieces = [b.markings[len(a.markings) :] for a, b in zip(whole, found, strict=True)]
+    for a, b in zip(whole, found, strict=True):
+        np.testing.assert_equal(
+            [one.corners_px for one in a.markings], [one.corners_px for one in b.markings[: len(a.markings)]]
+        )
+    assert sum(map(len, pieces)) > 50
+
+
+def test_a_box_stands_on_the_far_end_of_every_second_dash_at_the_right() -> None:
+    world = make_boxes(draw(5, "straight"))
+    route, stood_on = world.port.route, 0
+    dashes = [one.corners_map for one in world.port.hd_map.markings if one.kind == LANE_DASH]
+    boxes = world.port.renderer.scene.boxes[len(make(draw(5, "straight")).port.renderer.scene.boxes) :]
+    for dash in dashes:
+        station_m, _ = beside(route, dash)
+        for inside in (inside_convex(box_footprint(box), dash) for box in boxes):
+            if inside.any():
+                np.testing.assert_array_equal(inside, station_m > station_m.mean())
+                stood_on += 1
+    assert stood_on == len(boxes) == len(dashes) // 2
+
+
+def test_what_is_hidden_of_a_piece_leaves_its_corners_free_along_the_sides_that_go_on() -> None:
+    px = np.array([[0.0, 0.0], [60.0, 0.0], [60.0, 5.0], [0.0, 5.0]])
+    covariance = _hidden(px, np.array([[0, 0], [6, 0], [6, 8], [0, 8]]))
+    np.testing.assert_array_equal(covariance[[0, 3]], 0.0)
+    np.testing.assert_array_equal(covariance[[1, 2]], 2 * [[[200.0**2, 0.0], [0.0, 0.0]]])

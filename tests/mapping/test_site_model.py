@@ -7,10 +7,11 @@ import pytest
 
 from v2hdm.association.groups import FusedGroups
 from v2hdm.site.candidates import Candidates, Counts, scatter_of, with_dissent, with_shared_errors
+from v2hdm.site.hypotheses import CLUTTER, OF_CLASS, OTHER_LENGTH, PART_OF_SYMBOL, PIECE, WRONG_END
 from v2hdm.site.markings import classify
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import Parallax
-from v2hdm.site.posterior import CLUTTER, OF_CLASS, OTHER_LENGTH, PART_OF_SYMBOL, PIECE, WRONG_END, posterior
+from v2hdm.site.posterior import posterior
 from v2hdm.site.shapes import learn_shapes
 
 DIAMOND = np.array([[0.6, 0.0], [0.0, 0.35], [-0.6, 0.0], [0.0, -0.35]])

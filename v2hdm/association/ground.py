@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import cv2
 import numpy as np
@@ -124,30 +125,27 @@ def images_with_line(lines: Symbols, rig: Rig, corners_map: FloatArray) -> IntAr
 
     The worn start of such a line looks like a dash.
     """
-    count, images = (
-        np.zeros(len(corners_map), dtype=np.int64),
-        lines.frame * len(rig.intrinsic) + lines.camera,
-    )
     pieces = _pieces_on_ground(lines, rig)
     if not pieces:
-        return count
+        return np.zeros(len(corners_map), dtype=np.int64)
     points, sigma_m = (np.concatenate(one) for one in zip(*pieces, strict=True))
-    length = [len(piece) for piece, _ in pieces]
     course = np.concatenate([np.gradient(piece, axis=0) for piece, _ in pieces])
-    sure, image = sigma_m < _SURE_M, np.repeat(images, length)
-    points, course, image = points[sure], course[sure], image[sure]
     course /= np.maximum(np.linalg.norm(course, axis=1, keepdims=True), 1e-9)
-    tree = cKDTree(points)
+    image = lines.frame * len(rig.intrinsic) + lines.camera
+    image = np.repeat(image, [len(piece) for piece, _ in pieces])
+    sure = sigma_m < _SURE_M
+    points, course, image = points[sure], course[sure], image[sure]
     centre, way, breadth_m = _middle_lines(corners_map)
     long_m = np.linalg.norm(way, axis=1)
-    for group in np.flatnonzero(np.isfinite(long_m) & (long_m > _LONG * breadth_m)).tolist():
-        ahead = way[group] / long_m[group]
-        near = np.array(tree.query_ball_point(centre[group], long_m[group] / 2 + _RUN_ON_M), dtype=np.int64)
-        off = points[near] - centre[group]
-        goes_on = np.abs(off @ ahead) > long_m[group] / 2 + breadth_m[group] / 2
-        goes_on &= (np.abs(cross(ahead, off)) < breadth_m[group]) & (np.abs(course[near] @ ahead) > _PARALLEL)
-        count[group] = len(np.unique(image[near[goes_on]]))
-    return count
+    long = np.flatnonzero(np.isfinite(long_m) & (long_m > _LONG * breadth_m))
+    found = cKDTree(points).query_ball_point(centre[long], long_m[long] / 2 + _RUN_ON_M)
+    group, near = np.repeat(long, [len(one) for one in found]), np.array([*chain(*found)], dtype=np.int64)
+    ahead, off = way[group] / long_m[group, None], points[near] - centre[group]
+    goes_on = np.abs(np.sum(off * ahead, axis=1)) > (long_m + breadth_m)[group] / 2
+    goes_on &= np.abs(cross(ahead, off)) < breadth_m[group]
+    goes_on &= np.abs(np.sum(course[near] * ahead, axis=1)) > _PARALLEL
+    shown = np.unique(np.stack([group, image[near]])[:, goes_on], axis=1)
+    return np.bincount(shown[0], minlength=len(corners_map))
 
 
 def _middle_lines(corners_map: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -17,9 +17,10 @@ from v2hdm.errors import MappingError
 from v2hdm.records import Exclusion, FloatArray, IntArray, Marking
 from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN, Candidates, Counts, variance_prior
 from v2hdm.site.corrections import MAX_OVERLAP, Stated, overlap
+from v2hdm.site.hypotheses import CLUTTER, PART_OF_SYMBOL
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import Parallax
-from v2hdm.site.posterior import CLUTTER, CORNERS_OF_IMAGE, PART_OF_SYMBOL, Posterior, posterior
+from v2hdm.site.posterior import CORNERS_OF_IMAGE, Posterior, posterior
 
 OF_SYMBOL = "part of other paint, such as an arrow or a solid line"
 COVERED = "overlaps a better supported marking"

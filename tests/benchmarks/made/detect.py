@@ -103,14 +103,14 @@ def _in_image(
 
 
 def _covered(world: World, frame: int, centre_map: FloatArray, corners_map: FloatArray) -> BoolArray:
-    """Which corners (J, 4, 3) a stack, a truck or a barrier hides from a camera."""
+    """Which points (J, K, 3) a stack, a truck or a barrier hides from a camera."""
     near = [
         box
         for box in world.port.renderer.scene.boxes + world.port.moving_boxes(frame)
         if np.hypot(*(np.array(box.centre_map) - centre_map[:2])) < _RANGE_M + np.hypot(*box.size_m[:2])
         and box.base_m < centre_map[2]
     ]
-    return hidden_by(near, centre_map, corners_map[..., :2].reshape(-1, 2)).reshape(-1, 4)
+    return hidden_by(near, centre_map, corners_map[..., :2].reshape(-1, 2)).reshape(corners_map.shape[:2])
 
 
 Pose = FloatArray | Callable[[FloatArray], FloatArray]
