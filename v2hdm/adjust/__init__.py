@@ -17,13 +17,7 @@ from v2hdm.adjust.problem import (
 from v2hdm.adjust.score_tests import CHANGES, Fault, ScoreTest, score_faults, sigmas_of
 from v2hdm.adjust.selection import MODELS, estimate_noise, predicts_better, select_model, with_model
 from v2hdm.adjust.sensitivity import height_information, moves_with_heights
-from v2hdm.adjust.solution import (
-    Solution,
-    Status,
-    Verdict,
-    observability,
-    pose_innovations,
-)
+from v2hdm.adjust.solution import Solution, Status, Verdict, observability, pose_innovations
 from v2hdm.adjust.solve import solve
 
 __all__ = [

@@ -52,8 +52,7 @@ def use_kernels() -> None:
     """Call every kernel as the adjustment of a drive does, for a small problem."""
     problem = _small_problem()
     for states in ((), SolveOptions().pose_states):
-        solution = solve(problem, SolveOptions(pose_states=states, coarse=not states))
-        descent = solution.covariance.descent
+        descent = solve(problem, SolveOptions(pose_states=states, coarse=not states)).covariance.descent
         corner_gain(descent.whitening)
         whitening = descent.whitening
         whitening.whiten([whitening.pull(torch.zeros(2, len(problem.observations.corner)))])

@@ -108,7 +108,8 @@ class Covariance:
         own = inverse.clone()
         own[torch.isin(corners, self.whitening.plan.kept).repeat_interleave(2)] = 0.0
         rows = _columns(corners, chosen)
-        spread = inverse[rows[:, :, None], _columns(corners, near)[:, None, :]] * _once(near)
+        once = ~(near[:, :, None] == near[:, None, :]).tril(-1).any(2).repeat_interleave(2, dim=1)
+        spread = inverse[rows[:, :, None], _columns(corners, near)[:, None, :]] * once[:, None]
         own = own[rows[:, :, None], rows[:, None, :]]
         return np.asarray((own + spread @ (by_near @ by_near.mT) @ spread.mT).cpu().numpy())
 
@@ -148,12 +149,6 @@ def _with_joined(arrays: Arrays, chosen: Tensor) -> Tensor:
     groups = [torch.isin(unit, unit[group]).nonzero()[:, 0] for group in chosen]
     longest = max(len(group) for group in groups)
     return torch.stack([torch.cat([g, g[-1:].expand(longest - len(g))]) for g in groups])
-
-
-def _once(near: Tensor) -> Tensor:
-    """Mask (M, 1, 2 m): 1 for the columns of a row's corners, 0 for repetitions."""
-    again = (near[:, :, None] == near[:, None, :]).tril(-1).any(2)
-    return (~again).repeat_interleave(2, dim=1)[:, None].to(torch.float64)
 
 
 def _columns(corners: Tensor, wanted: Tensor) -> Tensor:

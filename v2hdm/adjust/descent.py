@@ -284,9 +284,8 @@ def descend(
         progressing = reached < cost or not final
         # Frees the memory of the old factor, and of what refers to it, before the new one is made.
         del whitening, objective, whitened, gradient, point
-        whitening = factorise(
-            engine, plan, estimate, used if final else narrowed(engine, estimate, robust, used)
-        )
+        loss = used if final else narrowed(engine, estimate, robust, used)
+        whitening = factorise(engine, plan, estimate, loss)
 
 
 def open_descent(engine: Engine, estimate: Estimate, robust: Loss) -> Whitening:

@@ -106,8 +106,7 @@ class _Quadratic:
     def rows(self, cameras: IntArray) -> IntArray:
         """Indices of the unknowns of some cameras."""
         each = len(self.vector) // len(self.cameras)
-        place = np.searchsorted(self.cameras, cameras)
-        return np.asarray((place[:, None] * each + np.arange(each)).ravel())
+        return np.asarray((np.searchsorted(self.cameras, cameras)[:, None] * each + np.arange(each)).ravel())
 
     def plus(self, own: _Own, sign: float) -> _Quadratic:
         """With a marking's contribution added, or subtracted with ``sign`` -1."""
@@ -215,7 +214,10 @@ class IncrementalMap:
         every = list(self._sighted.values())
         problem, cameras = self._problem(every)
         options = replace(self._options, coarse=self._options.coarse and self._earlier is None)
-        solution = _sound(solve(problem, options))
+        solution = solve(problem, options)
+        bad = solution.status in (Status.BEHIND_CAMERA, Status.UNDETERMINED)
+        if bad or not np.isfinite(solution.corners_map).all():
+            raise _unsolved("the map", solution.status)
         information = solution.covariance.camera_information()
         at = np.zeros((len(cameras), len(information) // len(cameras)))
         at[:, 6:] = solution.covariance.descent.estimate.clock_s.cpu().numpy()
@@ -321,14 +323,6 @@ def _scale(information: FloatArray) -> FloatArray:
     """Products (D, D) of the roots of an information matrix' diagonal, which make entries dimensionless."""
     root = np.sqrt(np.diagonal(information))
     return np.asarray(root[:, None] * root)
-
-
-def _sound(solution: Solution) -> Solution:
-    """The solution, if it determines the map."""
-    bad = solution.status in (Status.BEHIND_CAMERA, Status.UNDETERMINED)
-    if bad or not np.isfinite(solution.corners_map).all():
-        raise _unsolved("the map", solution.status)
-    return solution
 
 
 def _unsolved(what: str, status: Status) -> AdjustError:

@@ -65,10 +65,8 @@ def state_prior(problem: Problem, pose_states: tuple[str, ...]) -> tuple[IntArra
     if not chosen:
         return np.zeros(0, dtype=np.int64), np.zeros((len(poses), 0, 0)), np.zeros((len(poses), 0))
     total = np.array([one.by_state() for one in problem.pose_sigmas])
-    drifts = [one.drift_by_state() for one in problem.pose_sigmas]
-    drift, over_m = np.array([[(each.sigma, each.over_m) for each in one] for one in drifts]).transpose(
-        2, 0, 1
-    )
+    drifts = [[(each.sigma, each.over_m) for each in one.drift_by_state()] for one in problem.pose_sigmas]
+    drift, over_m = np.array(drifts).transpose(2, 0, 1)
     white, least = np.sqrt(np.maximum(total**2 - drift**2, 0.0)), _MIN_WHITE_SHARE * total
     scattering = [k for k in chosen if (white > least)[:, k].any()]
     fading = [k for k in chosen if drift[:, k].any()]

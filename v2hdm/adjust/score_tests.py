@@ -222,11 +222,9 @@ def score_faults(problem: Problem, solution: Solution) -> tuple[ScoreTest, ...]:
 
 def _hypotheses(problem: Problem, arrays: Arrays) -> Iterator[_Hypothesis]:
     cameras, changes = range(arrays.camera_count), _changes(arrays)
-    groups = [*([-1] if arrays.camera_count > 1 else []), *cameras]
-    for camera in groups:
+    for camera in [*([-1] if arrays.camera_count > 1 else []), *cameras]:
         if problem.twist_vehicle is not None:
-            visits = range(problem.visit_count) if problem.visit_count > 1 else [-1]
-            for visit in visits:
+            for visit in range(problem.visit_count) if problem.visit_count > 1 else [-1]:
                 own = (problem.visit_of_frame == visit) | (visit < 0)
                 yield _Hypothesis(Fault.CLOCK, _moving(_late, problem, camera, own), camera, item=visit)
         yield _Hypothesis(Fault.FOCAL, partial(_lens, camera, 0), camera)
@@ -234,7 +232,9 @@ def _hypotheses(problem: Problem, arrays: Arrays) -> Iterator[_Hypothesis]:
         for axis in (0, 1):
             yield _Hypothesis(Fault.PRINCIPAL, partial(_principal, problem, camera, axis), camera, axis)
         for axis in range(_DRIFTS if problem.twist_vehicle is not None else 0):
-            wave = _drift(axis, len(problem.map_from_vehicle))
+            # The clock's error (J,) goes from half the value to minus half, in one half wave or more.
+            share = np.linspace(0.0, 1.0, len(problem.map_from_vehicle))
+            wave = share - 0.5 if axis == 0 else 0.5 * np.cos((axis + 1) * np.pi * share)
             yield _Hypothesis(Fault.CLOCK_DRIFT, _moving(_late, problem, camera, wave), camera, axis)
         for frame in changes:
             for axis in (1, 2):
@@ -345,12 +345,6 @@ def _late(problem: Problem, camera: int, share: FloatArray, _: Arrays, out: Tens
     twist = torch.as_tensor(np.asarray(problem.twist_vehicle) * share[:, None])
     out[slice(None) if camera < 0 else camera] = twist.to(out.device)
     return out
-
-
-def _drift(axis: int, frames: int) -> FloatArray:
-    """Clock error (J,) from half the value to minus half, in one half wave or more."""
-    share = np.linspace(0.0, 1.0, frames)
-    return share - 0.5 if axis == 0 else 0.5 * np.cos((axis + 1) * np.pi * share)
 
 
 def _changes(arrays: Arrays) -> list[int]:

@@ -138,9 +138,7 @@ def select_model(problem: Problem, options: SolveOptions, names: Sequence[str] =
     unknown = [name for name in names if name not in MODELS]
     if unknown:
         raise AdjustError(f"unknown model '{unknown[0]}': choose from {', '.join(MODELS)}")
-    candidates = [
-        name for name in names if problem.twist_vehicle is not None or not MODELS[name].clock_offset
-    ]
+    candidates = [one for one in names if problem.twist_vehicle is not None or not MODELS[one].clock_offset]
     punctual = [name for name in candidates if not MODELS[name].clock_offset] or candidates
     stretch, _ = restrict(problem, _stretch(problem))
     held_out = _held_out(stretch.observations)
@@ -272,9 +270,8 @@ def estimate_noise(problem: Problem, solution: Solution) -> tuple[PoseSigma, ...
         sigmas = tuple(_scaled(one, scales) for one in stated)
         _, *prior = state_prior(replace(problem, pose_sigma=sigmas), states_of)
         transition, root = (arrays.state_transition.new_tensor(one) for one in prior)
-        engine = descent.engine.over(
-            replace(arrays, state_transition=transition, state_information_root=root)
-        )
+        scaled = replace(arrays, state_transition=transition, state_information_root=root)
+        engine = descent.engine.over(scaled)
         whitening = factorise(engine, descent.plan, descent.estimate, descent.robust)
         noise = torch.randn(_DRAWS, whitening.size, generator=generator.manual_seed(0), dtype=torch.float64)
         off = [whitening.step(y.to(whitening.gradient) - whitening.gradient)[0] for y in (*noise, *-noise)]

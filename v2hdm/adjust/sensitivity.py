@@ -95,8 +95,7 @@ class Sensitivity:
     @cached_property
     def points(self) -> Tensor:
         """Observed corners (K, 3) in camera coordinates."""
-        corners = self.whitening.estimate.corners_map[self.arrays.corner.long()]
-        return points_in_camera(self.poses, corners)
+        return points_in_camera(self.poses, self.whitening.estimate.corners_map[self.arrays.corner.long()])
 
     def seen(self, moved_cam: Tensor) -> Tensor:
         """Derivatives (2, K) of the weighted residuals for motions (K, 3) of the points in the cameras."""
@@ -194,8 +193,7 @@ def stretches(arrays: Arrays) -> Tensor:
     ahead = arrays.vehicle_from_map.inverse()[:, :2, 3].diff(dim=0).norm(dim=1)
     path = torch.cat([ahead.new_zeros(1), ahead.cumsum(0)])
     out, count = torch.zeros_like(arrays.visit), 0
-    visits = int(arrays.visit.max()) + 1
-    for visit in range(visits):
+    for visit in range(int(arrays.visit.max()) + 1):
         own = arrays.visit == visit
         along = path[own] - path[own].min()
         share = along / along.max().clamp(min=1e-9)

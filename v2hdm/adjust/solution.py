@@ -163,8 +163,7 @@ class Solution:
 
     def corner_covariance(self, indices: IntArray) -> FloatArray:
         """Joint covariance (2n, 2n), m^2, x0, y0, x1, ..., of corners (n,); of groups (M, n) stacked."""
-        groups = np.atleast_2d(indices)
-        covariance = self.covariance.corners(groups)
+        covariance = self.covariance.corners(np.atleast_2d(indices))
         return covariance if np.ndim(indices) == 2 else covariance[0]
 
 
@@ -185,9 +184,8 @@ class Observability:
     @property
     def unobserved(self) -> tuple[str, ...]:
         """Directions of the camera centre that rest on its prior."""
-        return tuple(
-            axis for axis, share in zip(AXES, self.prior_share, strict=False) if share > _RESTS_ON_PRIOR
-        )
+        shares = zip(AXES, self.prior_share, strict=False)
+        return tuple(axis for axis, share in shares if share > _RESTS_ON_PRIOR)
 
     def sentence(self, camera: str) -> str:
         """One sentence for the driver: the precision of the extrinsic, and how to improve it."""

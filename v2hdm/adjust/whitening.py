@@ -138,16 +138,14 @@ def factorise(
         if factorised is None:
             continue
         factor, smallest_pivot = factorised
-        gradient = whitened_gradient(
-            plan, factor, linearised.gradient, linearised.coupled, linearised.whitened
-        )
+        force = linearised.gradient, linearised.coupled, linearised.whitened
         return Whitening(
             engine=engine,
             plan=plan,
             estimate=estimate,
             robust=robust,
             linearised=linearised,
-            gradient=gradient,
+            gradient=whitened_gradient(plan, factor, *force),
             spread=spread,
             reduced_factor=factor,
             smallest_pivot=smallest_pivot,

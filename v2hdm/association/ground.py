@@ -49,8 +49,7 @@ class Located:
 
 def ground_points(map_from_pinhole_px: FloatArray, pinhole_px: FloatArray) -> FloatArray:
     """Ground points (N, K, 2), m, of pixels (N, K, 2) under IPMs (N, 3, 3); nan on and above the horizon."""
-    points = back_project(torch.tensor(map_from_pinhole_px), torch.tensor(pinhole_px))
-    return np.asarray(points.numpy())
+    return np.asarray(back_project(torch.tensor(map_from_pinhole_px), torch.tensor(pinhole_px)).numpy())
 
 
 def ground_points_with_jacobian(
@@ -113,9 +112,8 @@ def images_with_symbol(symbols: Symbols, rig: Rig, corners_map: FloatArray) -> I
         middle, size_m = ground.mean(axis=0), float(np.ptp(ground, axis=0).max())
         polygon = (ground - middle).astype(np.float32)
         for group in known[np.linalg.norm(centre[known] - middle, axis=1) < size_m]:
-            inside = [
-                cv2.pointPolygonTest(polygon, at, False) >= 0 for at in (points[group] - middle).tolist()
-            ]
+            off = (points[group] - middle).tolist()
+            inside = [cv2.pointPolygonTest(polygon, at, False) >= 0 for at in off]
             count[group] += 2 * sum(inside) > len(inside)
     return count
 

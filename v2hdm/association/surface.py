@@ -148,12 +148,9 @@ class Paths:
         span = {v: station[visit[first] == v][[0, -1]] for v in np.unique(visit).tolist()}
         here = station[place][:, None] + np.array([-_AHEAD_M, _AHEAD_M])
         bounds = np.clip(here, *np.array([span[v] for v in visit.tolist()]).T[:, :, None])
-        heading = map_from_vehicle[:, :2, 0] / np.linalg.norm(
-            map_from_vehicle[:, :2, 0], axis=1, keepdims=True
-        )
-        return cls(
-            place, at, heading[first], sense, station, bounds, points, heading, np.array(list(span.values()))
-        )
+        forward = map_from_vehicle[:, :2, 0]
+        heading, spans = forward / np.linalg.norm(forward, axis=1, keepdims=True), np.array([*span.values()])
+        return cls(place, at, heading[first], sense, station, bounds, points, heading, spans)
 
     def beside(self, points_map: FloatArray, frame: IntArray) -> tuple[FloatArray, FloatArray]:
         """Stations (K,) and left offsets (K,), m, of points (K, 2) near frames (K,)."""
@@ -351,8 +348,7 @@ class Surface:
     def stored(self) -> dict[str, Any]:
         """File content for :meth:`from_stored`, without the covariance."""
         arrays = {name: getattr(self.paths, name).tolist() for name in _STORED}
-        parameters = {"parameters": self.parameters.tolist(), "knots": self.knots, "datum_m": self.datum_m}
-        return arrays | parameters
+        return arrays | {"parameters": self.parameters.tolist(), "knots": self.knots, "datum_m": self.datum_m}
 
     @classmethod
     def from_stored(cls, content: Mapping[str, Any], map_from_vehicle: FloatArray) -> Surface:

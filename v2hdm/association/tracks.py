@@ -127,8 +127,7 @@ class _Linker:
         found = align(corners[t], valid[t], self._located.corners_map[own], self._located.valid[own])
         covariance = self._noise_m2[last[t]] + self._noise_m2[own] + self._drift_covariance(last[t], own)
         cost = np.sum(found.offset * np.linalg.solve(covariance, found.offset[..., None])[..., 0], axis=-1)
-        tolerance_m = np.maximum(SHAPE_TOLERANCE * size_m[t], LEAST_TOLERANCE_M)
-        shape = found.deformation_m / tolerance_m
+        shape = found.deformation_m / np.maximum(SHAPE_TOLERANCE * size_m[t], LEAST_TOLERANCE_M)
         accepted = (cost <= GATE_SIGMAS**2) & (shape <= 1.0)
         accepted &= np.linalg.norm(found.offset, axis=-1) <= MAX_GATE_M
         costs = np.full((len(tracks), len(rows)), _REFUSED)

@@ -185,8 +185,7 @@ def _starts(seen: Seen, count: int) -> list[FloatArray]:
     covariance = seen.covariance(candidates)
     square = seen.squared(candidates, covariance)
     scores = seen.log_posterior(square, covariance, np.tile(_FACTORS[:, None], len(candidates)))
-    best = np.argsort(-np.max(scores, axis=0), kind="stable")[:count].tolist()
-    return [candidates[k] for k in best]
+    return [candidates[k] for k in np.argsort(-np.max(scores, axis=0), kind="stable")[:count].tolist()]
 
 
 def _subsets(count: int) -> FloatArray:

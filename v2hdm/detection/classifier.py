@@ -16,9 +16,8 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -439,9 +438,7 @@ def one_hot(kinds: Sequence[str]) -> np.ndarray:
     return np.eye(len(SHAPES), dtype=np.float32)[[SHAPES.index(shape_of(kind)) for kind in kinds]]
 
 
-@cache
-def _session(path: Path) -> Any:
-    return open_session(path, threads=1)
+_session = cache(partial(open_session, threads=1))
 
 
 @cache

@@ -400,8 +400,7 @@ def pixel_weights(
         inflation *= variance_inflation(residual, residual.take(at), pair, _MAX_CORRELATION)
     per_pixel = 1 / (variance * inflation[:, None])
     weight = robust * (per_pixel.astype(np.float32)[:, None] @ lattice.of_side)[:, 0]
-    inliers = count / np.maximum(use.sum(axis=1), 1)
-    return weight, np.sqrt(variance), inliers.astype(np.float64)
+    return weight, np.sqrt(variance), (count / np.maximum(use.sum(axis=1), 1)).astype(np.float64)
 
 
 def add_paint(

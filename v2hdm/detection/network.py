@@ -192,8 +192,7 @@ def run_on_road(
     else:
         far = run(band[: seam + _OVERLAP_PX])
         near_top = seam - _OVERLAP_PX
-        half = cv2.resize(band[near_top:], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        near = run(half)
+        near = run(cv2.resize(band[near_top:], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
         anchors = [r for r in anchor_rows(near.lanes, network, top + near_top, 2) if r.v_px >= top + seam]
         anchors += [r for r in anchor_rows(far.lanes, network, top, 1) if r.v_px < top + seam]
         paint = _joined(far.paint[None], near.paint[None], seam, near_top, info.paint_stride)[0]

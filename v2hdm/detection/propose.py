@@ -146,10 +146,8 @@ class Proposal:
         """The classes with four corners that it may be of, the likeliest first."""
         if self.corners_pinhole_px is None or self.fill < _LEAST_FILL:
             return []
-        found = [
-            k for k in self.share if catalogue.classes[k].cornered and self.share[k] >= _LEAST_CLASS_SHARE
-        ]
-        return sorted(found, key=lambda name: -self.share[name])
+        found = {k: share for k, share in self.share.items() if catalogue.classes[k].cornered}
+        return sorted((k for k in found if found[k] >= _LEAST_CLASS_SHARE), key=lambda k: -found[k])
 
 
 @dataclass(frozen=True)
@@ -178,8 +176,7 @@ def propose(
     grounds, pinhole = (np.split(points, begins[1:]) for points in (on_ground, outlines))
     size_m = np.array([rectangle_size(ground) for ground in grounds])
     shares = _shares(blobs, size_m, catalogue, whole, camera.log_size_sigma(range_m))
-    starts = _tightest(pinhole, camera, max_range_m)
-    each = enumerate(zip(blobs, shares, grounds, starts, strict=True))
+    each = enumerate(zip(blobs, shares, grounds, _tightest(pinhole, camera, max_range_m), strict=True))
     return [
         Proposal(blob, index, share, ground, *start)
         for index, (blob, share, ground, start) in each

@@ -243,8 +243,7 @@ def draw_detections(
             if not outlined:
                 dot = colour if valid else _INVALID_BGR
                 cv2.circle(canvas, corner.tolist(), 3 << _SHIFT, dot, 1, cv2.LINE_AA, _SHIFT)
-        right_px = shape_px[np.argmax(shape_px[:, 0])]
-        _write(canvas, f"{marking.kind} {marking.score:.2f}", right_px, colour)
+        _write(canvas, f"{marking.kind} {marking.score:.2f}", shape_px[np.argmax(shape_px[:, 0])], colour)
     return canvas
 
 

@@ -78,8 +78,7 @@ def _add(record: dict[str, Any], recipe: str, sets: Mapping[str, Mapping[str, Me
     for name, methods in sets.items():
         for method, result in methods.items():
             if recipe == OURS or method not in NAIVE_IPMS:
-                row = method if recipe == OURS else f"{method}, {recipe}"
-                record["maps"][name][row] = result.hd_map
+                record["maps"][name][method if recipe == OURS else f"{method}, {recipe}"] = result.hd_map
 
 
 ROWS: tuple[str, ...] = (

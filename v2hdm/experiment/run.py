@@ -35,8 +35,7 @@ def run_experiment(
             replace_text(folder / "config.yaml", config_yaml or f"{config!r}\n")
             records = _records(todo, config.workers or os.cpu_count() or 1, progress)
             measured = [measure(record) for record in records]
-            drawing = partial(progress, "figures", "draw")
-            captions = save_figures(folder, records, measured, drawing)
+            captions = save_figures(folder, records, measured, partial(progress, "figures", "draw"))
             write_tables(folder, measured)
             replace_text(folder / "experiment.md", words(measured, config))
             replace_text(folder / "figures.md", filled("figures.md", captions=captions))

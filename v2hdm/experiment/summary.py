@@ -258,9 +258,12 @@ def _save_shift(path: Path, record: Mapping[str, Any], measured: Measured) -> Ca
     true = np.array([marking.corners_map for marking in truth.map.markings])[common]
     moved = {"ENI": true + before.errors_m[rows], "ONI": true + after.errors_m[columns]}
     links = np.stack([one.reshape(-1, 2) for one in moved.values()], axis=1)
+    polygons, lanes = [m.corners_map for m in truth.map.markings], [one.points_map for one in truth.map.lanes]
     with _site_and_detail(path, np.array(record["route"])) as (site, detail):
         for axes, width in ((site, 0.7), (detail, 1.5)):
-            _draw_truth(axes, truth)
+            paint: dict[str, Any] = {"facecolors": style.PAINT, "edgecolors": style.TRUTH, "label": "truth"}
+            axes.add_collection(PolyCollection(polygons, lw=0.4, **paint))
+            axes.add_collection(LineCollection(lanes, colors=style.PAINT, lw=2.2))
             for method, corners in moved.items():
                 outline: dict[str, Any] = {"facecolors": "none", "edgecolors": style.METHOD[method]}
                 outlines = PolyCollection(list(corners), lw=width, zorder=3, label=method, **outline)
@@ -268,7 +271,9 @@ def _save_shift(path: Path, record: Mapping[str, Any], measured: Measured) -> Ca
             dashes: dict[str, Any] = {"colors": "k", "ls": (0, (3, 2)), "label": "the same corner"}
             axes.add_collection(LineCollection(list(links), lw=width, zorder=4, **dashes))
         site.set_title(f"{measured.title}: ENI against ONI, {cameras}")
-        x, y = _crowd(true.mean(axis=1)).tolist()
+        centres = true.mean(axis=1)
+        near = (np.abs(centres[:, None] - centres[None]).max(axis=2) < _CLOSE_UP_M).sum(axis=1)
+        x, y = centres[near.argmax()].tolist()
         detail.set(xlim=(x - _CLOSE_UP_M, x + _CLOSE_UP_M), ylim=(y - _CLOSE_UP_M, y + _CLOSE_UP_M))
         detail.set_title("Where markings are densest")
     said: dict[str, Any] = {"drive": measured.title, "cameras": cameras, "markings": len(common)}
@@ -293,20 +298,6 @@ def _site_and_detail(path: Path, route_map: FloatArray) -> Iterator[tuple[Axes, 
             if axes.axison:
                 axes.set(aspect="equal", xlabel="east (m)", ylabel="north (m)")
                 axes.legend(loc="upper left", bbox_to_anchor=(0.0, 0.0), ncols=5, borderaxespad=3.5)
-
-
-def _draw_truth(axes: Axes, truth: Truth) -> None:
-    """Draw the true paint."""
-    polygons, lanes = [m.corners_map for m in truth.map.markings], [one.points_map for one in truth.map.lanes]
-    paint = PolyCollection(polygons, facecolors=style.PAINT, edgecolors=style.TRUTH, lw=0.4, label="truth")
-    axes.add_collection(paint)
-    axes.add_collection(LineCollection(lanes, colors=style.PAINT, lw=2.2))
-
-
-def _crowd(centres: FloatArray) -> FloatArray:
-    """The centre (2,) with the most others in the close-up about it."""
-    near = (np.abs(centres[:, None] - centres[None]).max(axis=2) < _CLOSE_UP_M).sum(axis=1)
-    return np.asarray(centres[int(near.argmax())])
 
 
 _BOX = "#7fb8b4"

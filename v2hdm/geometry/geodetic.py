@@ -24,8 +24,7 @@ _CONFORMAL_DEG = 1e-3  # tolerance of a conformal grid's angles, for rounding
 def geodetic_from_enu(origin: GeodeticOrigin, points_map: FloatArray) -> FloatArray:
     """Map points (N, 3) in m to (N, 3): latitude and longitude in degrees, ellipsoidal height in m."""
     here = position_of(origin)
-    points_ecef = points_map @ enu_axes(here)[0].T + _ecef_from_geodetic(here)[0]
-    return _geodetic_from_ecef(points_ecef)
+    return _geodetic_from_ecef(points_map @ enu_axes(here)[0].T + _ecef_from_geodetic(here)[0])
 
 
 def enu_from_geodetic(origin: GeodeticOrigin, geodetic: FloatArray) -> FloatArray:

@@ -251,8 +251,7 @@ def side_frames(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray
     along = following(corners) - corners
     length = np.hypot(along[..., 0], along[..., 1])
     tangent = along / np.maximum(length, 1e-9)[..., None]
-    normal = tangent[..., ::-1] * _TURN
-    return tangent, normal, length
+    return tangent, tangent[..., ::-1] * _TURN, length
 
 
 def is_convex(corners_map: FloatArray) -> BoolArray:

@@ -33,8 +33,7 @@ def inverse(dst_from_src: Tensor) -> Tensor:
     """The inverse (*batch, 4, 4) of a rigid transform, by transposing its rotation."""
     turn = dst_from_src[..., :3, :3].mT
     top = torch.cat([turn, -(turn @ dst_from_src[..., :3, 3:])], dim=-1)
-    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
-    return torch.cat([top, bottom], dim=-2)
+    return torch.cat([top, top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)], dim=-2)
 
 
 def back_project(ground_from_pinhole_px: Tensor, pinhole_px: Tensor) -> Tensor:

@@ -105,8 +105,7 @@ def _slopes(at: FloatArray, values: FloatArray) -> FloatArray:
         low, high = max(min(first[k], k - 1), 0), min(max(last[k], k + 2), len(at))
         if high - low < 2:
             continue
-        lag = at[low:high] - at[k]
-        terms = np.vander(lag, 3 if high - low >= 4 else 2, increasing=True)
+        terms = np.vander(at[low:high] - at[k], 3 if high - low >= 4 else 2, increasing=True)
         out[k] = np.linalg.lstsq(terms, values[low:high] - values[k], rcond=None)[0][1]
     return out
 

@@ -110,8 +110,7 @@ class Sheet:
         px = view.pixels(self.points()).astype(np.float32).reshape(*self.shape, 2)
         seen = ~np.isnan(px[..., 0])
         px[~seen] = -1
-        grey = cv2.remap(view.grey, px[..., 0], px[..., 1], cv2.INTER_LINEAR).astype(np.float32)
-        return grey, seen
+        return cv2.remap(view.grey, px[..., 0], px[..., 1], cv2.INTER_LINEAR).astype(np.float32), seen
 
     def texture(self, view: View) -> tuple[Float32Array, BoolArray]:
         """:meth:`resample`, high-pass filtered to the ground's texture."""
@@ -120,9 +119,7 @@ class Sheet:
 
 
 def patch_centres(
-    poses: tuple[FloatArray, FloatArray],
-    roi_vehicle: FloatArray,
-    path_map: FloatArray,
+    poses: tuple[FloatArray, FloatArray], roi_vehicle: FloatArray, path_map: FloatArray
 ) -> FloatArray:
     """Centres (N, 2) in the map of patches within the region at both poses and near the driven path.
 

@@ -96,9 +96,8 @@ class Stated:
 
         ``loosened`` multiplies the stated errors of heading and lateral position.
         """
-        rows, place = np.unique(
-            np.concatenate([observations.first, observations.second]), return_inverse=True
-        )
+        images = np.concatenate([observations.first, observations.second])
+        rows, place = np.unique(images, return_inverse=True)
         count = len(observations.first)
         path_m = self.path_m()[rows]
         survey = self.camera.centre_prior if self.surveyed else None

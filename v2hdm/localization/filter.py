@@ -127,8 +127,7 @@ class Seen:
 
     def project(self, pose: FloatArray, corners_map: FloatArray) -> FloatArray:
         """Pixels (..., 4, 2) of a marking (4, 2) from poses (..., 5)."""
-        cam_from_map = self.cam_from_vehicle @ inverse(pose_of(pose))
-        return project_ground(self.intrinsic, cam_from_map, corners_map)[0]
+        return project_ground(self.intrinsic, self.cam_from_vehicle @ inverse(pose_of(pose)), corners_map)[0]
 
     def by_state(self, mean: FloatArray, corners_map: FloatArray) -> FloatArray:
         """Derivative (8, 7) of the pixels of a marking (4, 2) by a state (7,), by central differences."""

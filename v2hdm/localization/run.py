@@ -210,8 +210,7 @@ def _in_view(
     views = views_of(drive, sightings.cameras)
     corners_map = np.stack([marking.corners_map for marking in hd_map.markings])
     _, image = easy_views(views, rig, cameras, corners_map, _IN_VIEW_M)
-    shown = views.frame[np.isin(views.image, image)]
-    return np.isin(np.arange(len(sightings.stamp_s)), shown)
+    return np.isin(np.arange(len(sightings.stamp_s)), views.frame[np.isin(views.image, image)])
 
 
 def write_localised(found: Localised, drive: Drive, folder: Path) -> None:

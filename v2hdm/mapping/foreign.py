@@ -91,9 +91,8 @@ def _gains(within: FloatArray, all_over: FloatArray, share: float) -> FloatArray
     home, foreign = np.where(beyond[0] > 0, home, -np.inf), np.where(within[0] > 0, foreign, -np.inf)
     gain = np.maximum(np.maximum(home, foreign), np.log(_CONFUSED))
     both = (within[0] > 0) & (beyond[0] > 0)
-    of_home, of_foreign = (
-        np.sum(gain, axis=1, where=~both & one) for one in (home >= foreign, home < foreign)
-    )
+    likelier = home >= foreign, home < foreign
+    of_home, of_foreign = (np.sum(gain, axis=1, where=~both & one) for one in likelier)
     return np.asarray(np.sum(gain, axis=1, where=both) + np.minimum(of_home, of_foreign))
 
 

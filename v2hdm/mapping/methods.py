@@ -46,8 +46,7 @@ def adjusted_poses(outcome: Outcome) -> AdjustedPoses:
     sigma = np.stack([one.by_state() for one in bundle.model.pose_sigma])[sightings.visit]
     used = bundle.frames
     if bundle.model.solver.pose_states:
-        inflation = max(1.0, bundle.solution.chi2_per_dof)
-        sigma[used] = np.sqrt(bundle.solution.covariance.poses() * inflation)
+        sigma[used] = np.sqrt(bundle.solution.covariance.poses() * max(1.0, bundle.solution.chi2_per_dof))
     seen = np.zeros(len(sightings.stamp_s), dtype=bool)
     seen[used] = True
     frames = frames_of(drive).frame_of_image
@@ -265,9 +264,8 @@ def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
     options, drive, cameras, bundle = inputs.options, inputs.drive, inputs.cameras, optimised.bundle
     solution, noise = bundle.solution, drive.pose_noise
     if solution.status is not Status.CONVERGED:
-        _log.warning(
-            "the joint optimisation ended early (%s): %s", solution.status.value, solution.status.advice
-        )
+        status = solution.status
+        _log.warning("the joint optimisation ended early (%s): %s", status.value, status.advice)
     lost = without_corner(options.survey, bundle.problem.control)
     if len(lost):
         _log.warning(

@@ -269,8 +269,7 @@ def _tiles_under(polygon: FloatArray, limit: np.ndarray) -> np.ndarray:
     high = np.minimum(np.floor((polygon.max(axis=0) + 1) / TILE_PX).astype(int) + 1, limit)
     columns, rows = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
     tiles = np.column_stack([columns.ravel(), rows.ravel()])
-    along = np.roll(polygon, -1, axis=0) - polygon
-    normal = turned_left(along)
+    normal = turned_left(np.roll(polygon, -1, axis=0) - polygon)
     normal *= np.sign(np.einsum("ni,ni->n", normal, polygon.mean(axis=0) - polygon))[:, None]
     corners = TILE_PX * np.array([[0, 0], [0, 1], [1, 0], [1, 1]]) - 0.5
     reach = ((TILE_PX * tiles[:, None, None] + corners[:, None] - polygon) * normal).sum(axis=-1)
@@ -351,8 +350,11 @@ class _Sums:
         """
         points = TILE_PX * torch.from_numpy(tiles).to(self._nodes)[:, None] + self._nodes
         if shot.on_plane is not None:
-            moved_px = self._moved_px(tiles, shot.on_plane, map_from_sheet)
-            points = points + self._from_corners @ moved_px.to(points)
+            corners = TILE_PX * (tiles[:, None] + np.array([[0, 0], [1, 0], [0, 1], [1, 1]])).reshape(-1, 2)
+            sheet_from_map = np.asarray(np.linalg.inv(map_from_sheet), dtype=np.float64)
+            moved = shot.on_plane(apply_homography(map_from_sheet, corners.astype(np.float64)))
+            moved_px = torch.from_numpy(apply_homography(sheet_from_map, moved) - corners)
+            points = points + self._from_corners @ moved_px.reshape(-1, 4, 2).to(points)
         pinhole_px_from_sheet = shot.pinhole_px_from_map @ map_from_sheet
         homography = torch.from_numpy(pinhole_px_from_sheet).to(points)
         third = points @ homography[2, :2] + homography[2, 2]
@@ -370,16 +372,6 @@ class _Sums:
         density = float(np.linalg.det(pinhole_px_from_sheet)) / depth**3
         placed = torch.stack([x, y]) / depth
         return torch.cat([placed.where(seen, x.new_tensor(_FAR_OUT)), (density * seen)[None]])
-
-    @staticmethod
-    def _moved_px(
-        tiles: np.ndarray, on_plane: Callable[[FloatArray], FloatArray], map_from_sheet: FloatArray
-    ) -> Tensor:
-        """How far the corners (T, 4, 2) of tiles are seen from where they lie, px of the sheet."""
-        corners = TILE_PX * (tiles[:, None] + np.array([[0, 0], [1, 0], [0, 1], [1, 1]])).reshape(-1, 2)
-        sheet_from_map = np.asarray(np.linalg.inv(map_from_sheet), dtype=np.float64)
-        seen = on_plane(apply_homography(map_from_sheet, corners.astype(np.float64)))
-        return torch.from_numpy(apply_homography(sheet_from_map, seen) - corners).reshape(-1, 4, 2)
 
     def mean(self, full_weight: float) -> np.ndarray:
         """The sheet as (rows, columns, 4) uint8 RGBA, opaque from ``full_weight`` on."""

@@ -85,9 +85,8 @@ def save_comparison(
             bgr = rgba[..., :3].astype(np.float32)
             stretched = np.clip((bgr - 0.5 * low) / (max(high, low + 1) - 0.5 * low), 0, 1)
             seen = rgba[..., 3:].astype(np.float32) / 255  # white where nothing was seen
-            axes.imshow(
-                1 - seen * (1 - stretched), extent=(0, ACROSS_M, 0, AHEAD_M), interpolation="antialiased"
-            )
+            shown = 1 - seen * (1 - stretched)
+            axes.imshow(shown, extent=(0, ACROSS_M, 0, AHEAD_M), interpolation="antialiased")
             axes.set(title=title, xticks=[], yticks=[])
             axes.spines[:].set_visible(False)
             axes.plot([0.4, 0.4 + _BAR_M], [0.4, 0.4], color="white", lw=3, solid_capstyle="butt")

@@ -113,17 +113,15 @@ def detect_images(
     return _found(frames, rough, stopwatch or Stopwatch())
 
 
-def _lens(
-    camera: Path | None, camera_name: str | None, mounting: Sequence[float] | None
-) -> CameraInfo | None:
+def _lens(camera: Path | None, name: str | None, mounting: Sequence[float] | None) -> CameraInfo | None:
     """The intrinsics of ``--camera`` where they are all that the file holds, as other tools write it."""
     if camera is None:
-        if camera_name is not None:
+        if name is not None:
             raise ConfigError("--camera-name: names a camera in the file of --camera; add --camera")
         return None
     if not is_calibration(camera):
-        return read_intrinsics(camera, camera_name, "--camera-name")
-    if camera_name is not None:
+        return read_intrinsics(camera, name, "--camera-name")
+    if name is not None:
         raise ConfigError(f"--camera-name: {camera} is the calibration of one camera; drop --camera-name")
     if mounting is not None:
         raise ConfigError("--camera and --mounting exclude each other: a calibration has a mounting")

@@ -23,8 +23,7 @@ def evaluate(drive: Drive, methods: CameraSets) -> tuple[dict[str, Any], list[st
     truth = read_truth(drive) if has_truth(drive) else None
     results: dict[str, dict[str, Any]] = {}
     for name, by_method in methods.items():
-        cameras = next(iter(by_method.values())).cameras
-        expected = driven_past(drive, truth, cameras) if truth else None
+        expected = driven_past(drive, truth, next(iter(by_method.values())).cameras) if truth else None
         results[name] = {
             method: map_figures(result.hd_map, truth, expected) | _own_figures(result)
             for method, result in by_method.items()

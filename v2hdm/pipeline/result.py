@@ -295,8 +295,7 @@ def _save_overlay(path: Path, drive: Drive, image: Image, best: MethodResult) ->
         initial: partial(apply_in_front, before),
         BEST: optimised,
     }
-    position_map = adjusted[:2, 3]
-    save_overlay(path, read_image(image, camera), camera.info, best.hd_map, position_map, views)
+    save_overlay(path, read_image(image, camera), camera.info, best.hd_map, adjusted[:2, 3], views)
 
 
 def _fullest_image(drive: Drive, name: str, detections: Sequence[ImageDetections]) -> Image:

@@ -150,10 +150,8 @@ def save_points(
         sign = cv2.MARKER_DIAMOND if right else cv2.MARKER_TILTED_CROSS
         cv2.drawMarker(canvas, (u, v), pen.bgr, sign, 14, pen.width, cv2.LINE_AA)
         if np.isfinite(off).all():
-            tip = np.clip(at - (times if right else 1.0) * off, -_LARGEST_PX, _LARGEST_PX)
-            cv2.arrowedLine(
-                canvas, (u, v), np.round(tip).astype(int).tolist(), pen.bgr, pen.width, cv2.LINE_AA
-            )
+            tip = np.clip(at - (times if right else 1.0) * off, -_LARGEST_PX, _LARGEST_PX).round()
+            cv2.arrowedLine(canvas, (u, v), tip.astype(int).tolist(), pen.bgr, pen.width, cv2.LINE_AA)
         _write(canvas, label, (u + 8, v + 18), (255, 255, 255))
     legend: list[tuple[Pen | None, str]] = [(PENS["ground"], f"{info.name}: grid and horizon"), (_ROI, "ROI")]
     legend.append(
@@ -285,8 +283,7 @@ def save_overlay(
             # Densified: the lens bends lines.
             dense = np.concatenate([np.linspace(a, b, 8) for a, b in itertools.pairwise(line)])
             near = np.linalg.norm(dense - position_map, axis=1) < _OVERLAY_RANGE_M
-            pieces = _visible_pieces(info, view(dense), near, 0.1)
-            draw_lines(canvas, pieces, pen)
+            draw_lines(canvas, _visible_pieces(info, view(dense), near, 0.1), pen)
         said = "found by the run" if name in OVERLAY else "that the run started with"
         legend.append((pen, f"{name}: the map with the calibration and pose {said}"))
     _write_image(path, with_legend(canvas, legend))

@@ -159,15 +159,11 @@ class TorchEngine(Engine):
         """Gradient of a scalar from that by the whitened residuals (2, K)."""
         arrays = self.arrays
         tangent = estimate.cam_from_vehicle.new_zeros(arrays.camera_count, 6)
-        leaves = [
-            leaf(one) for one in (tangent, estimate.frame_state, estimate.corners_map, estimate.clock_s)
-        ]
+        leaves = list(map(leaf, (tangent, estimate.frame_state, estimate.corners_map, estimate.clock_s)))
         cameras = model.rigid(leaves[0]) @ estimate.cam_from_vehicle
         poses = model.cam_from_map(arrays, cameras, leaves[1], leaves[3]).flatten(0, 1)
-        residuals = [_residual(run, poses, leaves[2]) for run in arrays.runs()]
-        return Gradient(
-            *torch.autograd.grad(torch.cat(residuals), leaves, by_residual.T, materialize_grads=True)
-        )
+        residual = torch.cat([_residual(run, poses, leaves[2]) for run in arrays.runs()])
+        return Gradient(*torch.autograd.grad(residual, leaves, by_residual.T, materialize_grads=True))
 
     def spread(self, estimate: Estimate) -> Spread:
         """Jacobians of the pairs by frame states and clock offsets."""
@@ -186,9 +182,7 @@ class TorchEngine(Engine):
         camera = leaf(estimate.clock_s.new_zeros(arrays.camera_count, each))
         moved = model.rigid(camera[:, :6]) @ estimate.cam_from_vehicle
         clock = estimate.clock_s + camera[:, 6:]
-        residual = torch.cat(
-            [model.centre_residual(arrays, moved), model.clock_residual(arrays, clock)], dim=1
-        )
+        residual = torch.hstack([model.centre_residual(arrays, moved), model.clock_residual(arrays, clock)])
         (by_camera,) = jacobians(residual, [camera])
         cameras = torch.block_diag(*(by_camera.mT @ by_camera))  # type: ignore[no-untyped-call]
         own, before = leaf(estimate.frame_state), leaf(estimate.frame_state)
@@ -214,7 +208,9 @@ class TorchEngine(Engine):
         """Linearise, and subtract the eliminated corners from the reduced system."""
         arrays, poses = self.arrays, self.poses(estimate).flatten(0, 1)
         own = poses.new_zeros(arrays.pair_count, 6, 6)
-        blocks, coupling = self._corner_priors(estimate), poses.new_empty(len(arrays.pair), 2, 6)
+        corner, coupling = leaf(estimate.corners_map), poses.new_empty(len(arrays.pair), 2, 6)
+        (surveyed,) = jacobians(model.control_residual(arrays, corner), [corner])
+        blocks = surveyed.mT @ surveyed
         for run in arrays.runs():
             by_pair, by_corner = self.linearise(run, poses, estimate.corners_map[run.corners], robust)
             own.index_add_(0, run.pair, by_pair.mT @ by_pair)
@@ -237,12 +233,6 @@ class TorchEngine(Engine):
         whitened, coupled = _carry(arrays, system.spread, factor, coupling, gradient.corners_map)
         rest = self, estimate, robust, system.spread, coupling
         return TorchLinearised(terms, gradient, factor, whitened, coupled, *rest)
-
-    def _corner_priors(self, estimate: Estimate) -> Tensor:
-        """J'J (N, 2, 2) of the survey by corner."""
-        corner = leaf(estimate.corners_map)
-        (by_corner,) = jacobians(model.control_residual(self.arrays, corner), [corner])
-        return by_corner.mT @ by_corner
 
     def _by_length(self, estimate: Estimate) -> tuple[Tensor, Tensor]:
         """Derivatives (M, 2) of the lengths' residuals by first and second corner."""

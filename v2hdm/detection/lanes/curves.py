@@ -184,9 +184,8 @@ class LinePoints:
         count, begins = np.diff(ends, prepend=0), [0, *ends[:-1]]
         along, below = self.along[members], self.below[members]
         down = below - np.repeat(np.add.reduceat(below, begins) / count, count)
-        return np.asarray(
-            np.add.reduceat(down * along, begins) / np.maximum(np.add.reduceat(down**2, begins), 1)
-        )
+        squared = np.add.reduceat(down**2, begins)
+        return np.asarray(np.add.reduceat(down * along, begins) / np.maximum(squared, 1))
 
     def evidence(self, horizon: Horizon, groups: list[IntArray]) -> Evidence:
         """The evidence of each of N groups of points, roughly a line each."""
@@ -295,9 +294,7 @@ def _extend(chains: list[_Chain], row_px: float, columns: list[float], indices: 
     pairs = []
     for c, chain in enumerate(chains):
         expected, gate = chain.expected(row_px)
-        pairs += [
-            (off / gate, c, p) for p, u_px in enumerate(columns) if (off := abs(u_px - expected)) <= gate
-        ]
+        pairs += [(off / gate, c, p) for p, u in enumerate(columns) if (off := abs(u - expected)) <= gate]
     taken: set[int] = set()
     extended: set[int] = set()
     for _, c, p in sorted(pairs):

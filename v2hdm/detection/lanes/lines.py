@@ -110,21 +110,19 @@ def _centre(edges_vehicle: FloatArray) -> FloatArray:
     return np.asarray(edges_vehicle.mean(axis=1)[whole])
 
 
-def _resample(
-    centre_vehicle: FloatArray, camera: RoadCamera, step_m: float, max_range_m: float
-) -> FloatArray:
+def _resample(at_vehicle: FloatArray, camera: RoadCamera, step_m: float, max_range_m: float) -> FloatArray:
     """Means of the points within each ``step_m`` along the line, from near to far."""
-    centre_vehicle = centre_vehicle[camera.range_m(centre_vehicle) <= max_range_m]
-    if len(centre_vehicle) < _MIN_POINTS:
+    at_vehicle = at_vehicle[camera.range_m(at_vehicle) <= max_range_m]
+    if len(at_vehicle) < _MIN_POINTS:
         return np.empty((0, 2))
-    first_m, last_m = camera.range_m(centre_vehicle[[0, -1]])
+    first_m, last_m = camera.range_m(at_vehicle[[0, -1]])
     if first_m > last_m:
-        centre_vehicle = centre_vehicle[::-1]
-    gap_m = np.linalg.norm(np.diff(centre_vehicle, axis=0), axis=1)
+        at_vehicle = at_vehicle[::-1]
+    gap_m = np.linalg.norm(np.diff(at_vehicle, axis=0), axis=1)
     bins = np.floor(np.concatenate([[0.0], np.cumsum(gap_m)]) / step_m)
     starts = np.flatnonzero(np.diff(bins, prepend=-1.0))
     counts = np.diff(np.append(starts, len(bins)))
-    return np.asarray(np.add.reduceat(centre_vehicle, starts, axis=0) / counts[:, None])
+    return np.asarray(np.add.reduceat(at_vehicle, starts, axis=0) / counts[:, None])
 
 
 LEAST_LOG_ODDS = -0.5

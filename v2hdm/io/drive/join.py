@@ -100,10 +100,9 @@ def _same_rig(first: Camera, second: Camera) -> bool:
     one, other = first.info, second.info
     if (one.width, one.height, one.distortion_model) != (other.width, other.height, other.distortion_model):
         return False
-    same_matrix = np.allclose(one.intrinsic, other.intrinsic, rtol=0, atol=_SAME_LENS)
-    if not (
-        same_matrix and np.allclose(one.distortion, other.distortion, rtol=0, atol=_SAME_LENS / one.width)
-    ):
+    if not np.allclose(one.intrinsic, other.intrinsic, rtol=0, atol=_SAME_LENS):
+        return False
+    if not np.allclose(one.distortion, other.distortion, rtol=0, atol=_SAME_LENS / one.width):
         return False
     guesses = [extrinsic_from_ipm(camera.info, camera.ipm[camera.initial_ipm]) for camera in (first, second)]
     turn_rad = float(np.linalg.norm(log(guesses[0] @ np.linalg.inv(guesses[1]))[3:]))

@@ -203,5 +203,4 @@ def _mount(info: CameraInfo, cam_from_vehicle: FloatArray, options: KittiOptions
     centre_vehicle = np.asarray(np.linalg.inv(cam_from_vehicle)[:3, 3], dtype=np.float64)
     roi = _ROI_M + centre_vehicle[:2]
     prior = CentrePrior(centre_vehicle, np.full(3, options.centre_sigma_m))
-    ipm = {"estimated": ipm_from_extrinsic(info, cam_from_vehicle)}
-    return Camera(info, ipm, "estimated", roi, prior)
+    return Camera(info, {"estimated": ipm_from_extrinsic(info, cam_from_vehicle)}, "estimated", roi, prior)

@@ -305,7 +305,10 @@ def match(
         k, choice, fits = following
         out[k] = corner[k, choice]
         if fits:
-            mean, covariance = _given(mean, covariance, k, off_m[k, choice])
+            own = slice(2 * k, 2 * k + 2)
+            gain = np.linalg.solve(covariance[own, own], covariance[own]).T
+            mean = mean + (gain @ (off_m[k, choice] - mean[k])).reshape(-1, 2)
+            covariance = covariance - gain @ covariance[own]
         corner[k] = -1
         corner[corner == out[k]] = -1
         following = _surest(corner, off_m - mean[:, None], covariance, chance)
@@ -357,13 +360,3 @@ def _unlikely(corner: IntArray, off_m: FloatArray, covariance_m2: FloatArray) ->
     squared = np.einsum("nki,nij,nkj->nk", off_m, np.linalg.inv(covariance_m2), off_m)
     density = squared + np.log((2 * np.pi) ** 2 * np.linalg.det(covariance_m2))[:, None]
     return np.where(corner >= 0, density, np.inf)
-
-
-def _given(
-    mean: FloatArray, covariance: FloatArray, k: int, off_m: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Means (N, 2) and joint covariance (2N, 2N) once point ``k`` is known to be ``off_m`` (2,) off."""
-    own = slice(2 * k, 2 * k + 2)
-    gain = np.linalg.solve(covariance[own, own], covariance[own]).T
-    moved = mean + (gain @ (off_m - mean[k])).reshape(-1, 2)
-    return moved, covariance - gain @ covariance[own]

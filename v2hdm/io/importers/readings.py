@@ -312,9 +312,8 @@ class _Log:
             self._dated(date(int(fields[4]), int(fields[3]), int(fields[2])))
         elif kind == "GST":
             stamp = self._time(fields[1])
-            self._sigma_m[stamp] = float(
-                np.hypot(parse_sigma(fields[6]), parse_sigma(fields[7])) / np.sqrt(2)
-            )
+            sigma_m = np.hypot(parse_sigma(fields[6]), parse_sigma(fields[7])) / np.sqrt(2)
+            self._sigma_m[stamp] = float(sigma_m)
         # The modes of THS: autonomous, estimated, manual, simulated, and V for invalid.
         elif kind == "HDT" or (kind == "THS" and fields[2] != "V"):
             if fields[1] and self._time_s is not None:

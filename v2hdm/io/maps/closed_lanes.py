@@ -52,8 +52,7 @@ def connections(lanes: Sequence[ClosedLane], lines_map: Sequence[FloatArray]) ->
     """
     found = {}
     for side in ("left", "right"):
-        following = _next_along(lanes, side)
-        for before, after in following.items():
+        for before, after in _next_along(lanes, side).items():
             bounds = {one: _bound_between(lanes[before], lanes[after], one) for one in ("left", "right")}
             if _is_way(lanes[before], lanes[after], bounds[side], lines_map):
                 found[before, after] = Connection(before, after, **bounds)

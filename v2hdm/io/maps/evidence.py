@@ -46,8 +46,7 @@ class Residuals:
 
     def whole_views(self) -> set[tuple[str, int]]:
         """The images, by path, that show all four corners of a marking of the map, and its id."""
-        known = self.is_point & (self.marking > 0)
-        pairs = np.column_stack([self.row_image, self.marking])[known]
+        pairs = np.column_stack([self.row_image, self.marking])[self.is_point & (self.marking > 0)]
         views, corners = np.unique(pairs, axis=0, return_counts=True)
         return {(self.image[image], marking) for image, marking in views[corners == 4].tolist()}
 

@@ -21,9 +21,7 @@ _NOTHING = -9999.0
 def write_ground_geotiff(hd_map: HdMap, path: Path) -> None:
     """Write the ground as GeoTIFF, heights above the origin and sigmas, m; the surer of two strips counts."""
     rasterio = need("rasterio", "gis", "the format geotiff", ConfigError)
-    edges = np.concatenate(
-        [one.points(side) for one in hd_map.ground for side in one.left_m[[0, -1]].tolist()]
-    )
+    edges = np.concatenate([one.points(m) for one in hd_map.ground for m in one.left_m[[0, -1]].tolist()])
     low, high = edges.min(axis=0), edges.max(axis=0)
     cell_m = max(_CELL_M, float(np.sqrt(np.prod(high - low) / _MOST_CELLS)))
     columns, rows = (int(n) for n in np.ceil((high - low) / cell_m))

@@ -59,8 +59,7 @@ def write_lanelet2(hd_map: HdMap, path: Path, projector: str | None = None) -> N
         if len(feature.points_map) >= _MOST_VERTICES:
             raise MapFileError(f"feature {feature.id}: more than {_MOST_VERTICES} vertices; split it")
     document = _Document(hd_map.origin, projector)
-    lines = [feature for feature in features if not feature.closed]
-    lanes = _Lanes(document, lines)
+    lanes = _Lanes(document, [feature for feature in features if not feature.closed])
     for feature in features:
         if feature.symbol:
             outline = document.nodes(feature, feature.xyz_map[feature.ring])

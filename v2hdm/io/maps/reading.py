@@ -134,9 +134,8 @@ class _Reader:
         self._path, self._origin, self._rounding = path, origin, rounding
         self._grid: Grid | None = None
         if crs is not None:
-            self._grid = Grid.of(
-                take_text(crs, f"{path}: crs", MapFileError), origin, str(path), MapFileError
-            )
+            text = take_text(crs, f"{path}: crs", MapFileError)
+            self._grid = Grid.of(text, origin, str(path), MapFileError)
             self._rounding = np.array(_GRID_ROUNDING if origin else (1.2e-4,) * 3)
         self._features: list[Feature] = []
         self._edited: list[int] = []
@@ -150,9 +149,8 @@ class _Reader:
         if geometry is not None and geodetic and self._grid is not None:
             if geometry.positions.shape[1] < 3:
                 raise MapFileError(f"{where}: its geometry has lost its heights; keep them when you edit")
-            geometry = replace(
-                geometry, positions=self._grid.geodetic(geometry.positions, where, MapFileError)
-            )
+            positions = self._grid.geodetic(geometry.positions, where, MapFileError)
+            geometry = replace(geometry, positions=positions)
         if geometry is not None and geodetic and (np.abs(geometry.positions[:, 1]) > 90).any():
             raise MapFileError(f"{where}: its geometry is not in degrees of longitude and latitude; fix it")
         closed = POINTS not in properties if geometry is None else geometry.closed

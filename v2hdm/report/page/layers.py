@@ -96,9 +96,8 @@ def _source(path: Path) -> dict[str, Any]:
 
 def background_layer(path: Path, facts: Facts) -> dict[str, Any]:
     """The user's GeoTIFF or XYZ tiles as a layer like :func:`mosaic_layer`; MapFileError if unusable."""
-    rasterio, warped = (
-        need(name, "gis", "a background", MapFileError) for name in ("rasterio", "rasterio.vrt")
-    )
+    names = "rasterio", "rasterio.vrt"
+    rasterio, warped = (need(name, "gis", "a background", MapFileError) for name in names)
     origin = None if facts.hd_map is None else facts.hd_map.origin
     if origin is None:
         raise MapFileError(f"{path}: this map has no position on the earth; state the origin in drive.yaml")

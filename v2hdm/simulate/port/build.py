@@ -215,8 +215,7 @@ def _ground_marks(surface: SurfaceConfig, route: Route, rng: np.random.Generator
         centre, _ = route.pose_at(rng.uniform(0.0, route.length_m), rng.normal(0.0, 3.5))
         x, y = pixels(np.array(centre)).tolist()
         axes, shade = (int(rng.uniform(6, 90)), int(rng.uniform(6, 60))), int(rng.uniform(15, 60))
-        turn = float(rng.uniform(0, 180))
-        cv2.ellipse(dark, (x, y), axes, turn, 0, 360, shade, -1, cv2.LINE_AA, 3)
+        cv2.ellipse(dark, (x, y), axes, float(rng.uniform(0, 180)), 0, 360, shade, -1, cv2.LINE_AA, 3)
     tracks = np.zeros_like(dark)
     for _ in range(int(40 * surface.tyre_marks)):
         start, length = rng.uniform(0.0, route.length_m), rng.gamma(2.0, 12.0)

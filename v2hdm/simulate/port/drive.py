@@ -160,11 +160,10 @@ def _drop_damaged(folder: Path) -> bool:
 def render_drive(config: PortConfig, folder: Path, workers: int, progress: Steps) -> None:
     """Render a port's drive into ``folder`` with its truth; see :func:`rendered_drive`."""
     port = build_port(config)
+    driven = zip(port.driven.stamp_s, port.driven.map_from_vehicle, strict=True)
     images = [
         Image(name, float(stamp), folder / name / "images" / f"{frame:06d}.jpg", pose)
-        for frame, (stamp, pose) in enumerate(
-            zip(port.driven.stamp_s, port.driven.map_from_vehicle, strict=True)
-        )
+        for frame, (stamp, pose) in enumerate(driven)
         for name in port.cameras
     ]
     try:

@@ -72,8 +72,7 @@ def intersect_ground(view: View) -> GroundField | None:
     info = view.rays.info
     map_from_ray = view.cam_from_map[:3, :3].T @ np.linalg.inv(info.intrinsic)
     centre = view.centre_map
-    down = -map_from_ray[2] / centre[2]
-    inverse_depth = _plane(view, down, slice(0, None))
+    inverse_depth = _plane(view, -map_from_ray[2] / centre[2], slice(0, None))
     below = inverse_depth > np.float32(1.0 / _FARTHEST_M)
     ground_rows = np.flatnonzero(below.any(axis=1))
     if len(ground_rows) == 0:

@@ -126,9 +126,8 @@ def _draw_face(
         albedo = box.albedo_bgr if face.picture is None else face.picture(face.sides_m, *seen[1:])
         parts = [np.asarray(part * light, dtype=np.float32) for part, light in zip(albedo, lit, strict=True)]
         colour = np.stack(parts).reshape(3, *(parts[0].shape or (1, 1)))  # (3, 1, 1) where it is one tone
-        kernels.draw_face(
-            window, seen, _DIRT_TILE.padded, scale, waves, face.upright, colour, radiance, hidden
-        )
+        look = _DIRT_TILE.padded, scale, waves, face.upright, colour
+        kernels.draw_face(window, seen, *look, radiance, hidden)
 
 
 def _plane_of(face: _Face, view: View) -> Float32:
@@ -157,8 +156,7 @@ def draw_background(view: View, light: Light, backdrop: Backdrop, last_row: int)
     rotation = (view.cam_from_map[:3, :3].T @ np.linalg.inv(view.rays.info.intrinsic)).astype(np.float32)
     u, v = view.rays.u_pinhole_px[:last_row], view.rays.v_pinhole_px[:last_row]
     x, y, z = (row[0] * u + row[1] * v + row[2] for row in rotation)
-    level = np.hypot(x, y)
-    elevation = np.arctan2(z, level)
+    elevation = np.arctan2(z, np.hypot(x, y))
     azimuth = np.arctan2(y, x)
     height = np.clip(elevation * np.float32(2.2), 0, 1)[..., None]
     clouds = sample(_CLOUD_TILE, azimuth, elevation * 2)[..., None]
@@ -234,8 +232,7 @@ class Renderer:
         if before_lens is not None:
             before_lens(view, radiance, hidden)
         labels[hidden] = 0
-        image = expose(radiance, optics or Optics(), rng)
-        return Rendered(image, labels, hidden)
+        return Rendered(expose(radiance, optics or Optics(), rng), labels, hidden)
 
     def _surroundings(self, view: View, shadows: tuple[Shadow, ...], labels: NDArray[np.uint8]) -> Float32:
         """Radiance (H, W, 3) of sky and ground."""

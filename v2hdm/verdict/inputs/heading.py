@@ -48,8 +48,7 @@ def _turned(sign: float, offset_deg: float) -> Undo:
 
 
 def _reordered(position: FloatArray, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
-    quaternion = quaternion_from_rotation(rotation)
-    return position, rotation_from_quaternion(quaternion[:, [1, 2, 3, 0]])
+    return position, rotation_from_quaternion(quaternion_from_rotation(rotation)[:, [1, 2, 3, 0]])
 
 
 def _inverted(position: FloatArray, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -121,8 +121,7 @@ def shared_offsets(a: MethodResult, b: MethodResult, drive: Drive) -> FloatArray
     _, nearest = KDTree(poses[:, :2, 3]).query(places[0][first])
     forward = poses[nearest, :2, 0]
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-    left = turned_left(forward)
-    return np.stack([(apart * forward).sum(1), (apart * left).sum(1)], axis=1)
+    return np.stack([(apart * forward).sum(1), (apart * turned_left(forward)).sum(1)], axis=1)
 
 
 def check_against_ground(

@@ -146,8 +146,7 @@ class NumbaEngine(Engine):
 
     def terms(self, estimate: Estimate, robust: Loss) -> dict[str, float]:
         """The cost by name."""
-        spread = self.spread(estimate)
-        system = ReducedSystem(self.arrays, self.plan(), spread)
+        system = ReducedSystem(self.arrays, self.plan(), self.spread(estimate))
         return self.eliminate(system, estimate, robust).terms
 
     def pull(self, estimate: Estimate, spread: Spread, by_residual: Tensor) -> Gradient:
@@ -369,8 +368,7 @@ def _kept_tiles(
     tile = first + run.corner // per_corner_tile
     pairs = torch.unique(torch.stack([arrays.frame_of(run.pair) // per_tile, tile]), dim=1).T.tolist()
     # Joined corners are adjacent: a unit may reach into the next tile.
-    tiles = torch.unique(tile).tolist()
-    return [*pairs, *pairwise(tiles)]
+    return [*pairs, *pairwise(torch.unique(tile).tolist())]
 
 
 @kernel

@@ -197,8 +197,7 @@ class Seen(NamedTuple):
     @classmethod
     def of(cls, columns: Iterable[NDArray[Any]], intrinsic: FloatArray) -> Seen:
         """From columns in this order, copied only to change type or layout."""
-        kinds = 3 * (np.int64,) + 3 * (np.float64,)
-        both = zip((*columns, intrinsic), kinds, strict=True)
+        both = zip((*columns, intrinsic), 3 * (np.int64,) + 3 * (np.float64,), strict=True)
         made: list[Any] = [np.ascontiguousarray(values, dtype=kind) for values, kind in both]
         return cls(*made)
 
