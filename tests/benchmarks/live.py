@@ -35,9 +35,10 @@ from v2hdm.records import Calibration
 from v2hdm.simulate.port.build import build_port
 
 _DETECT = """
-import sys, time
+import signal, sys, time
 from unittest.mock import patch
 from v2hdm.cli.detect import run
+signal.signal(signal.SIGINT, signal.default_int_handler)  # which what runs in the background ignores
 with patch("time.perf_counter", time.process_time):
     run(sys.argv[1:])
 """  # the command itself, whose stages tell CPU time

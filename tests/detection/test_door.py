@@ -276,6 +276,21 @@ def test_of_a_folder_that_grows_the_newest_whole_image_is_taken(bench, tmp_path,
     assert "e.png" in caplog.text
 
 
+def test_a_folder_that_rests_is_not_listed_again_and_what_comes_then_is_seen(bench, tmp_path, monkeypatch):
+    (tmp_path / "0.png").write_bytes((bench.folder / "0.png").read_bytes())
+    os.utime(tmp_path, (1.0, 1.0))
+    listings, list_images = [], frames.list_images
+    monkeypatch.setattr(
+        frames, "list_images", lambda *given: listings.append(time.time()) or list_images(*given)
+    )
+    arriving = frames.arriving_frames(tmp_path)
+    assert next(arriving).name == "0"
+    threading.Timer(0.5, (tmp_path / "1.png").write_bytes, [(bench.folder / "0.png").read_bytes()]).start()
+    listings.clear()
+    assert next(arriving).name == "1"
+    assert len(listings) < 20, "a hundred looks fit into half a second"
+
+
 def not_finite(model, path):
     """A copy of the model with one weight that is not a number."""
     content = onnx.load(model)

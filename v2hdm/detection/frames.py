@@ -26,6 +26,7 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")  # 
 
 _POLL_S = 0.005  # a folder that grows is looked at this often
 _WRITTEN_S = 1.0  # an image is written within this time
+_SAME_DATE_S = 2.0  # changes of a folder this near in time may bear one date, as on FAT
 
 # Depth and channels as stored, so that what does not fit is seen instead of converted without a word.
 _AS_STORED = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR
@@ -152,9 +153,13 @@ def arriving_frames(folder: Path) -> Iterator[Frame]:
     DriveError where the folder cannot be read.
     """
     known, index = {path.name for path in list_images(folder)[:-1]}, 0
+    nothing_new_s = None  # date of the folder when it was last listed in vain
     while True:
-        came = {path: _written_s(path) for path in list_images(folder, known)}
+        now_s, changed_s = time.time(), _written_s(folder)
+        listed = list_images(folder, known) if changed_s != nothing_new_s else []
+        came = {path: _written_s(path) for path in listed}
         if not came:
+            nothing_new_s = changed_s if now_s - changed_s > _SAME_DATE_S else None
             time.sleep(_POLL_S)
             continue
         newest = max(came, key=lambda path: (came[path], path.name))
