@@ -128,9 +128,9 @@ class Optimiser:
         self.surface: Surface | None = None
         """The ground, unless a plane."""
         self._cameras = {name: cameras[name] for name in sightings.cameras}
-        self._noise_of_visits = pose_noise
-        self._pose_noise = largest_noise(self._noise_of_visits)
-        self._pose_sigma = self._own_noise = tuple(pose_sigma_of(one) for one in self._noise_of_visits)
+        self._noises, self._pose_noise = pose_noise, largest_noise(pose_noise)
+        self._stated_sigma = tuple(pose_sigma_of(one) for one in pose_noise)
+        self._pose_sigma = self._estimated_sigma = self._stated_sigma
         self._options, self._recorded = options, Recorded.of(road, self._pose_noise)
         self.pose_model = _SETTLED_MODEL if options.pose_model == AUTO else options.pose_model
         """The pose model, one of :data:`v2hdm.adjust.MODELS`."""
@@ -160,8 +160,7 @@ class Optimiser:
             # The coarse solve fixes the poses, on which no test of the inputs may rest.
             if number > 1 and same_groups(association, bundle.association):
                 break
-            bundle = self._solve(association, self._usable(association, bundle.rig), bundle.rig)
-            self._reweigh(bundle)
+            bundle = self._solve_all(association, bundle.rig)
         return self.settle_from(bundle, progress)
 
     def settle_from(
@@ -321,11 +320,6 @@ class Optimiser:
             tracks = self._track(rig, self._locate(rig), IPM_SIGMA_RAD if coarse else REFINED_SIGMA_RAD)
             return tracks, self._usable(tracks, rig)
 
-        def solve(association: Association, usable: BoolArray, rig: Rig) -> Rig:
-            bundle = self._solve(association, usable, rig)
-            self._reweigh(bundle)
-            return bundle.rig
-
         mapper = IncrementalMapper(
             self.sightings,
             self.initial_rig,
@@ -333,13 +327,11 @@ class Optimiser:
             self._pose_noise.position_m,
             self._options,
             link,
-            solve,
-            coarse_model(self.initial_rig, self._noise_of_visits, self._options),
+            lambda association, usable, rig: self._solve_all(association, rig, usable).rig,
+            coarse_model(self.initial_rig, self._noises, self._options),
         )
         association, rig = mapper.run(progress)
-        association = self._with_all_that_fit(association, rig)
-        bundle = self._solve(association, self._usable(association, rig), rig)
-        self._reweigh(bundle)
+        bundle = self._solve_all(self._with_all_that_fit(association, rig), rig)
         return self.settle_from(bundle, progress)
 
     def _fit_ground(self, bundle: Bundle, progress: Callable[[str], None], surface: Surface | None) -> Bundle:
@@ -352,9 +344,7 @@ class Optimiser:
             if number or surface is None:
                 surface, _, step_m = self._better_ground(bundle, surface)
             self.surface, self.sightings = surface, surface.flattened(self._seen, bundle.rig)
-            association = self._associate(bundle.rig)
-            bundle = self._solve(association, self._usable(association, bundle.rig), bundle.rig)
-            self._reweigh(bundle)
+            bundle = self._solve_all(self._associate(bundle.rig), bundle.rig)
             if step_m < _SETTLED_M:
                 break
         if surface is not None:
@@ -425,7 +415,7 @@ class Optimiser:
         coarse: bool = False,
         lanes: tuple[Knots, FloatArray] | None = None,
     ) -> Bundle:
-        noises, options = self._noise_of_visits, self._options
+        noises, options = self._noises, self._options
         model = (
             coarse_model(rig, noises, options)
             if coarse
@@ -437,28 +427,30 @@ class Optimiser:
             raise MappingError(f"the joint optimisation failed ({status.value}): {status.advice}")
         return bundle
 
+    def _solve_all(self, association: Association, rig: Rig, usable: BoolArray | None = None) -> Bundle:
+        """Solve with the ``usable`` corners (S, 4), by default all, and refit the observations' variance."""
+        usable = self._usable(association, rig) if usable is None else usable
+        bundle = self._solve(association, usable, rig)
+        if len(bundle.row) >= LEAST_OBSERVATIONS:
+            factor = self._variance_factor * bundle.solution.observation_factor
+            self._variance_factor = float(np.clip(factor, *VARIANCE_FACTORS))
+        return bundle
+
     def _weigh_poses(self, bundle: Bundle) -> Bundle:
         """The solve under the larger of stated and estimated noise; positions', unobservable, as stated."""
-        stated = tuple(pose_sigma_of(one) for one in self._noise_of_visits)
-        self._own_noise = estimate_noise(replace(bundle.problem, pose_sigma=stated), bundle.solution)
-        self._pose_sigma = tuple(_larger(one, own) for one, own in zip(stated, self._own_noise, strict=True))
-        bundle = self._solve(bundle.association, self._usable(bundle.association, bundle.rig), bundle.rig)
-        self._reweigh(bundle)
-        return bundle
+        stated = self._stated_sigma
+        estimated = estimate_noise(replace(bundle.problem, pose_sigma=stated), bundle.solution)
+        self._estimated_sigma = estimated
+        self._pose_sigma = tuple(_larger(*sigmas) for sigmas in zip(stated, estimated, strict=True))
+        return self._solve_all(bundle.association, bundle.rig)
 
     @property
     def pose_noise(self) -> dict[str, float]:
         """Estimated over stated pose noise, by kind."""
-        own = [self._own_noise, [pose_sigma_of(one) for one in self._noise_of_visits]]
+        both = self._estimated_sigma, self._stated_sigma
         kinds = ("position_m", "heading_rad", "roll_pitch_rad")
-        totals = {kind: [max(getattr(one, kind) for one in sigmas) for sigmas in own] for kind in kinds}
-        return {kind: found / stated for kind, (found, stated) in totals.items() if stated > 0}
-
-    def _reweigh(self, bundle: Bundle) -> None:
-        """Scale the observations' variances by their residuals under ``bundle``."""
-        if len(bundle.row) >= LEAST_OBSERVATIONS:
-            factor = self._variance_factor * bundle.solution.observation_factor
-            self._variance_factor = float(np.clip(factor, *VARIANCE_FACTORS))
+        largest = {kind: [max(getattr(one, kind) for one in sigmas) for sigmas in both] for kind in kinds}
+        return {kind: estimated / stated for kind, (estimated, stated) in largest.items() if stated > 0}
 
     def _as_stated(self, bundle: Bundle) -> Problem:
         """The problem of ``bundle``, from its end, with the detector's own covariances."""
