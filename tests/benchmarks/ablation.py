@@ -8,7 +8,7 @@ false ones, the share of markings with four corners known well, the corners' err
 covariance holds (inner-95 mean of the normalised squared error; honest 1.60). A part that earns nothing
 leaves.
 
-With ``--verdict`` instead what each column of the table of the sizes of faults (mapping/recovery.py) and each
+With ``--verdict`` instead what each column of the table of fault sizes (mapping/input_errors.py) and each
 number of mapping/foreign.py earns, on made drives of these seeds, as they are and with every fault: right
 drives failed, wrong maps without a word, and of those with one how many are named rightly, first.
 """
@@ -46,7 +46,7 @@ from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
-from v2hdm.mapping import foreign, optimise, recovery
+from v2hdm.mapping import foreign, input_errors, optimise
 from v2hdm.mapping.methods import run_methods
 from v2hdm.records import BoolArray, Drive, FloatArray, ImageDetections, Marking, Truth
 from v2hdm.report.metrics import driven_past, marking_metrics, match_markings
@@ -170,8 +170,8 @@ def sizes() -> Iterator[Part]:
     """Each column of the table of sizes, each number of the foreign images, and the context that lacks it."""
     yield "nothing off", nullcontext
     for column, nothing in (("least", 0.0), ("sigma", np.inf), ("usual", np.inf), ("most", np.inf)):
-        flat = {fault: replace(size, **{column: nothing}) for fault, size in recovery._SIZES.items()}
-        yield f"{column} size of each fault", partial(patch.object, recovery, "_SIZES", flat)
+        flat = {fault: replace(size, **{column: nothing}) for fault, size in input_errors._SIZES.items()}
+        yield f"{column} size of each fault", partial(patch.object, input_errors, "_SIZES", flat)
     yield "foreign: views that share counts for", partial(patch.object, foreign, "_PSEUDO_VIEWS", 100.0)
     yield "foreign: markings taken by mistake", partial(patch.object, foreign, "_BY_MISTAKE", 1e-6)
     yield "foreign: mixtures of two markings", partial(patch.object, foreign, "_CONFUSED", 1e-6)

@@ -8,7 +8,7 @@ import pytest
 from v2hdm.adjust import Fault, ScoreTest
 from v2hdm.errors import MappingError
 from v2hdm.mapping import foreign, recovery
-from v2hdm.mapping.foreign import foreign_stretch
+from v2hdm.mapping.foreign import foreign_segment
 from v2hdm.verdict.results.solution import _ODDS_LIMIT
 
 FRAMES, IN_VIEW = 90, 8
@@ -34,7 +34,7 @@ def stretch(monkeypatch, found, first_seen):
     views = SimpleNamespace(
         image=np.arange(FRAMES), frame=np.arange(FRAMES), camera=np.zeros(FRAMES, dtype=int)
     )
-    return foreign_stretch(bundle, sightings, views, ())
+    return foreign_segment(bundle, sightings, views, ())
 
 
 OWN = np.arange(-IN_VIEW, FRAMES, 2)
@@ -86,7 +86,7 @@ def odds_beside(monkeypatch, gain, left, worst=20.0, rows=600):
         return (ScoreTest(Fault.CLOCK, -1, 0, -1, gain=left),)
 
     for name, value in (
-        ("foreign_stretch", (3.0, 6.0, gain)),
+        ("foreign_segment", (3.0, 6.0, gain)),
         ("views_of", None),
         ("collect_sightings", None),
     ):

@@ -26,7 +26,7 @@ _HIDDEN = 0.08
 markings of eight simulated drives (right_drives, seeds 1030 to 1037)."""
 
 
-def foreign_stretch(
+def foreign_segment(
     bundle: Bundle, sightings: Sightings, views: Views, cameras: tuple[Camera, ...]
 ) -> tuple[float, float, float]:
     """Begin and end, s, of the most likely foreign segment, and its log-likelihood ratio.

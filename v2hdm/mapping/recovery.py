@@ -24,7 +24,8 @@ from v2hdm.association.surface import Surface
 from v2hdm.errors import AdjustError, MappingError
 from v2hdm.geometry.rigid import camera_centre, with_clock_offsets
 from v2hdm.mapping.bundle import Bundle, name_of
-from v2hdm.mapping.foreign import foreign_stretch
+from v2hdm.mapping.foreign import foreign_segment
+from v2hdm.mapping.input_errors import CLEAR_SIGMAS, is_contradicted, is_doubtful, log_odds
 from v2hdm.mapping.lanes import Knots, find_knots
 from v2hdm.mapping.optimise import Optimised, Optimiser
 from v2hdm.mapping.options import AUTO, INCREMENTAL, SURFACE, MappingOptions, SurveyOptions
@@ -34,54 +35,12 @@ from v2hdm.site.options import JOINT
 
 _log = logging.getLogger(__name__)
 
-CLEAR_SIGMAS = 4.0  # of a visible error; in one of 400 correct drives one of its forty tests exceeds it
-
-_PRIOR_ODDS = 1 / 400  # prior odds of a wrong input: one in forty, in one of ten drives of a new vehicle
-
-_DOUBT = 0.05  # probability of a wrong input that a PASS, stated at 95 %, leaves
-
-
-@dataclass(frozen=True)
-class _Size:
-    """Limits on the size of a fault, in its unit."""
-
-    least: float  # smaller errors do not matter
-    # largest model sigma at which a drive observes it. A less observable fault resembles others, and absorbs
-    # remaining errors: k1 on a straight street, for instance.
-    sigma: float
-    usual: float  # median size where an input is wrong
-    most: float  # largest physical value; beyond it, the cause is unforeseen
-
-
-_SIZES: Mapping[Fault, _Size] = {
-    Fault.CLOCK: _Size(0.005, 0.02, 0.05, 5.0),
-    Fault.CLOCK_DRIFT: _Size(0.01, 0.02, 0.05, 5.0),
-    Fault.FOCAL: _Size(0.003, 0.01, 0.02, 1.0),
-    Fault.DISTORTION: _Size(0.002, 0.02, 0.05, 1.0),
-    Fault.PRINCIPAL: _Size(5.0, 10.0, 20.0, 500.0),
-    Fault.SLOPE: _Size(0.002, 0.003, 0.01, 0.3),
-    Fault.CROWN: _Size(0.005, 0.005, 0.02, 0.15),
-    Fault.COURSE: _Size(0.3, 0.3, 1.0, 10.0),
-    Fault.STEP: _Size(0.03, 0.02, 0.1, 100.0),
-    Fault.KNOCK: _Size(0.002, 0.002, 0.01, 1.0),
-    Fault.SURVEY: _Size(0.03, 0.15, 0.1, 20.0),
-    Fault.LEVER: _Size(0.03, 0.15, 0.5, 20.0),
-    Fault.SIZE: _Size(0.01, 0.05, 0.05, 10.0),
-    Fault.CONTROL: _Size(0.02, 0.05, 0.1, 1e3),
-    Fault.DATUM: _Size(0.02, 0.05, 0.1, 1e3),
-}
-
-OBSERVABLE_SIGMA = {fault: size.sigma for fault, size in _SIZES.items()}
-"""Largest standard deviation, in the fault's unit, at which a drive observes it."""
-
 _LOOSE_CENTRE_SIGMA_M = 10.0
 """Standard deviation, m, of a surveyed axis after its contradiction: uninformative."""
 
 _AMBIGUOUS_SHARE = 0.8
 """Fraction of its sigmas from which another camera's fault may be the cause: a straight road at constant
 speed determines the distance of two centres, or the difference of two clocks, alone."""
-
-CLOCK_OBSERVABLE_S = 0.004  # largest sigma of an observed clock offset, s: two are 8 ms
 
 _CLOCK_CORRECTABLE_S = 0.006
 """Largest sigma, s, at which a contradicted clock is corrected: a late clock adds scatter to its estimate."""
@@ -227,7 +186,7 @@ def _foreign(
     """
     drive, names = inputs.drive, inputs.cameras
     cameras = tuple(drive.cameras[name] for name in names)
-    begin_s, end_s, gain = foreign_stretch(settled, inputs.sightings, views_of(drive, names), cameras)
+    begin_s, end_s, gain = foreign_segment(settled, inputs.sightings, views_of(drive, names), cameras)
     suspect = next(filter(is_doubtful, found), None)
     if suspect is None or gain <= 0:
         return begin_s, end_s, gain
@@ -326,49 +285,6 @@ def _is_ambiguous(worst: ScoreTest, found: Sequence[ScoreTest]) -> bool:
         and one.camera != worst.camera
     ]
     return max(rivals, default=0.0) > _AMBIGUOUS_SHARE * worst.sigmas
-
-
-def is_contradicted(one: ScoreTest) -> bool:
-    """Whether an input's error matters, is observable, and is more likely than not."""
-    return matters(one) and one.sigmas > even_sigmas(one)
-
-
-def is_doubtful(one: ScoreTest) -> bool:
-    """Whether an input's error matters, is observable, and has more than 5 % probability."""
-    return matters(one) and one.sigmas > even_sigmas(one, _DOUBT / (1 - _DOUBT))
-
-
-def even_sigmas(one: ScoreTest, odds: float = 1.0) -> float:
-    """Sigmas at which an input's error reaches ``odds``; errors are Cauchy, scaled by the usual size."""
-    return math.sqrt(2 * max(math.log(odds / _PRIOR_ODDS) - _log_spread(one), 0.0))
-
-
-def doubt(one: ScoreTest) -> float:
-    """Log-odds of an input's error, from its sigmas and size."""
-    return one.sigmas**2 / 2 + _log_spread(one) + math.log(_PRIOR_ODDS)
-
-
-def _log_spread(one: ScoreTest) -> float:
-    """Log of the prior probability of an error within one sigma of its value."""
-    usual = _SIZES[one.fault].usual
-    size = math.sqrt(2 * math.pi) * one.sigma / (math.pi * usual * (1 + (one.value / usual) ** 2))
-    return math.log(max(size, 1e-300))
-
-
-def matters(one: ScoreTest) -> bool:
-    """Whether an observable input's error is larger than a drive tolerates."""
-    size = _SIZES[one.fault]
-    return one.model_sigma <= size.sigma and abs(one.value) > size.least
-
-
-def is_physical(one: ScoreTest) -> bool:
-    """Whether an error of this size is possible; otherwise the cause is unforeseen."""
-    return abs(one.value) <= _SIZES[one.fault].most
-
-
-def log_odds(one: ScoreTest) -> float:
-    """Score of a fault as the cause: its gain, and the Cauchy prior of its size."""
-    return one.gain - math.log1p((one.value / _SIZES[one.fault].usual) ** 2)
 
 
 def _clocks(bundle: Bundle) -> tuple[dict[str, tuple[float, float]], ...]:
