@@ -16,7 +16,7 @@ from v2hdm.association.ground import Located
 from v2hdm.association.groups import LEAST_TOLERANCE_M, Association
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.geometry.ipm import ray_covariance
-from v2hdm.geometry.planar import SHIFTS, align, diameters, mean_corners
+from v2hdm.geometry.planar import SHIFTS, align, diameters, length_along, mean_corners
 from v2hdm.geometry.rigid import heading_rad
 from v2hdm.records import BoolArray, FloatArray, IntArray, PoseNoise
 
@@ -95,8 +95,7 @@ class _Linker:
         noise: PoseNoise,
     ) -> None:
         self._sightings, self._located, self._direction_rad = sightings, located, direction_rad
-        steps_m = np.linalg.norm(np.diff(map_from_vehicle[:, :2, 3], axis=0), axis=1)
-        self._odometer_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+        self._odometer_m = length_along(map_from_vehicle[:, :2, 3])
         self._heading_rad = np.unwrap(heading_rad(map_from_vehicle))
         self._ray_map = mean_corners(located.ray_map, located.valid)
         self._range_m = np.linalg.norm(self._ray_map, axis=1)

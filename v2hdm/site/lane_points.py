@@ -18,7 +18,7 @@ from v2hdm.association.sightings import LEAST_HEIGHT_M, Rig, frames_of, row_shar
 from v2hdm.association.surface import Surface
 from v2hdm.geometry.ipm import direction_covariance, facing_ipm, flat_motion, ground_from_pinhole_px
 from v2hdm.geometry.lens import undistort_points
-from v2hdm.geometry.planar import turned_left
+from v2hdm.geometry.planar import cross, turned_left
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import (
     LANE_BOUNDARY,
@@ -293,7 +293,7 @@ def _coordinates(
     seed, point = pairs
     offset = cloud.points_map[point] - points[seed]
     along = np.einsum("pi,pi->p", offset, tangent[seed])
-    across = offset[:, 1] * tangent[seed, 0] - offset[:, 0] * tangent[seed, 1]
+    across = cross(tangent[seed], offset)
     cosine = np.abs(np.einsum("pi,pi->p", cloud.tangent[point], tangent[seed]))
     return along, across, cosine
 
@@ -339,7 +339,7 @@ def _thin(points: FloatArray, tangent: FloatArray, images: IntArray) -> IntArray
         kept.append(node)
         others = np.array(near[node])
         offset = points[others] - points[node]
-        across = offset[:, 1] * tangent[node, 0] - offset[:, 0] * tangent[node, 1]
+        across = cross(tangent[node], offset)
         same = np.abs(tangent[others] @ tangent[node]) >= _SAME_DIRECTION
         alive[others[same & (np.abs(across) <= 0.5 * HALF_WIDTH_M)]] = False
     return np.array(kept, dtype=np.int64)

@@ -16,6 +16,7 @@ import numpy as np
 from v2hdm.detection.camera import FARTHEST_M, RoadCamera
 from v2hdm.detection.lanes.boundaries import boundaries, draw, log_odds, log_odds_alone, with_spans
 from v2hdm.detection.lanes.curves import LaneImage, Line, LinePoints, find_chains, find_lines
+from v2hdm.detection.network import crossings
 from v2hdm.detection.propose import Blob, Proposal
 from v2hdm.records import FloatArray, IntArray, LaneDetection
 
@@ -150,7 +151,7 @@ def find_boundaries(image: LaneImage) -> list[LaneDetection]:
 def propose(image: LaneImage, least_log_odds: float | None = None) -> tuple[LinePoints, list[Line]]:
     """The points of an image and the boundaries of lanes through them that are sure enough, best first."""
     least_log_odds = LEAST_LOG_ODDS if least_log_odds is None else least_log_odds
-    points = _crossings(image)
+    points = _crossing_points(image)
     # At, above and just below the horizon lines meet; a comparison with nan is false.
     points = points.where(image.camera.range_m(points.ground) <= FARTHEST_M)
     groups = find_chains(points.points_px, points.odds)
@@ -168,13 +169,10 @@ def _surest(lines: Sequence[Line], odds: FloatArray, least_log_odds: float) -> l
     return [replace(lines[k], log_odds=float(odds[k])) for k in order]
 
 
-def _crossings(image: LaneImage) -> LinePoints:
-    rows = image.rows
-    u = np.concatenate([np.empty(0), *(row.u_px for row in rows)])
-    v = np.repeat([row.v_px for row in rows], [len(row.u_px) for row in rows]) if rows else np.empty(0)
-    odds = np.concatenate([np.empty(0), *(row.odds for row in rows)])
-    scale = np.where(image.camera.coarse(v), 2.0, 1.0)
-    return LinePoints.of(image, np.column_stack([u, v]), odds, scale * crossing_sigma_px(odds), paint=False)
+def _crossing_points(image: LaneImage) -> LinePoints:
+    points_px, odds = crossings(image.rows)
+    scale = np.where(image.camera.coarse(points_px[:, 1]), 2.0, 1.0)
+    return LinePoints.of(image, points_px, odds, scale * crossing_sigma_px(odds), paint=False)
 
 
 def crossing_sigma_px(odds: FloatArray) -> FloatArray:

@@ -12,7 +12,7 @@ from enum import Enum
 
 import numpy as np
 
-from v2hdm.geometry.planar import angle_between
+from v2hdm.geometry.planar import angle_between, wrapped
 from v2hdm.geometry.rigid import quaternion_from_rotation, rotation_from_euler, rotation_from_quaternion
 from v2hdm.records import BoolArray, FloatArray
 from v2hdm.verdict.inputs.poses import STEEPEST_DEG, Chords, Motion
@@ -241,11 +241,6 @@ def _course_minus_yaw(motion: Motion) -> FloatArray:
 def _forward(rotation: FloatArray, chords: Chords) -> FloatArray:
     """The vehicle's x axis (N, 2) in the plane, midway on each chord."""
     return np.asarray(rotation[chords.first, :2, 0] + rotation[chords.last, :2, 0])
-
-
-def wrapped(angle_rad: FloatArray) -> FloatArray:
-    """Angles wrapped to +-pi."""
-    return np.asarray((angle_rad + np.pi) % (2 * np.pi) - np.pi)
 
 
 def _circular_median(angles_rad: FloatArray) -> float:

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from v2hdm.geometry.planar import angle_between, length_along
+from v2hdm.geometry.planar import angle_between, cross, length_along
 from v2hdm.ground.motion import trajectory_of_images
 from v2hdm.records import BoolArray, Drive, FloatArray, IntArray, PoseNoise
 from v2hdm.verdict.verdict import Finding, Status, judge
@@ -217,7 +217,7 @@ def _jitter(motion: Motion, off: FloatArray) -> Finding | None:
         return None
     # From one offset to the next, so that steady braking is none.
     along = np.diff((off * ahead).sum(axis=1))[driven]
-    across = np.diff(off[:, 1] * ahead[:, 0] - off[:, 0] * ahead[:, 1])[driven]
+    across = np.diff(cross(ahead, off))[driven]
     along_m, across_m = _robust_sigma(along), _robust_sigma(across)
     surely = float(np.exp(_SURE_JITTER / np.sqrt(len(along))))
     if not 0 < surely * across_m < along_m or np.abs(along).max() > _EXTREME / 2 * along_m:
