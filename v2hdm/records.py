@@ -311,6 +311,12 @@ class Marking:
     paint: PaintLeft | None = None  # what is left of it, if any image shows that
     heights_sigma_m: FloatArray | None = None  # (4,) where estimated
 
+    @property
+    def corner_covariances_m2(self) -> FloatArray | None:
+        """Covariance (4, 2, 2) of each corner alone, if known."""
+        whole = self.covariance_m2
+        return None if whole is None else whole.reshape(4, 2, 4, 2)[range(4), :, range(4), :]
+
 
 @dataclass(frozen=True)
 class Symbol:

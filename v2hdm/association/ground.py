@@ -167,15 +167,13 @@ def _pieces_on_ground(symbols: Symbols, rig: Rig) -> list[tuple[FloatArray, Floa
     """Outline (K, 2) of each symbol in the map, and standard deviations (K,) of its points, m."""
     if not len(symbols.camera):
         return []
-    length = [len(outline) for outline in symbols.outlines_pinhole_px]
-    of_point = np.repeat(np.arange(len(length)), length)
+    of_point = symbols.symbol_of_point
     points_px = np.concatenate(symbols.outlines_pinhole_px)
     seen = points_px[:, None], np.concatenate(symbols.row_shares)[:, None]
     found = _on_ground(rig, symbols.camera[of_point], symbols.frame[of_point], *seen)
     ground, by_px = (one[:, 0] for one in found)
     sigma_m = OUTLINE_SIGMA_PX * np.linalg.norm(by_px, axis=(1, 2))
-    ends = np.cumsum(length)[:-1]
-    return list(zip(np.split(ground, ends), np.split(sigma_m, ends), strict=True))
+    return list(zip(symbols.by_symbol(ground), symbols.by_symbol(sigma_m), strict=True))
 
 
 @dataclass(frozen=True)

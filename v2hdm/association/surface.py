@@ -559,11 +559,9 @@ class Surface:
         def moved(symbols: Symbols) -> Symbols:
             if not len(symbols.camera):
                 return symbols
-            length = [len(outline) for outline in symbols.outlines_pinhole_px]
-            of_point = np.repeat(np.arange(len(length)), length)
-            outlines = np.concatenate(symbols.outlines_pinhole_px)
-            outlines = known(symbols.camera[of_point], symbols.frame[of_point], outlines, self._flat_px)
-            return replace(symbols, outlines_pinhole_px=tuple(np.split(outlines, np.cumsum(length)[:-1])))
+            of_point, points_px = symbols.symbol_of_point, np.concatenate(symbols.outlines_pinhole_px)
+            flat_px = known(symbols.camera[of_point], symbols.frame[of_point], points_px, self._flat_px)
+            return replace(symbols, outlines_pinhole_px=tuple(symbols.by_symbol(flat_px)))
 
         return replace(
             sightings,

@@ -283,7 +283,7 @@ def _drawn(lane: Lane, knots: Knots, rows: IntArray, solution: Solution, spacing
     share = weight[np.arange(len(vertex_m))[:, None], window[group]].toarray()
     share[:, len(seen) :] = 0.0
     by_corner = (share[:, :, None] * left[:, None]).reshape(-1, 8)
-    joint = solution.corner_covariance(corner[window])[group] * max(1.0, solution.chi2_per_dof)
+    joint = solution.corner_covariance(corner[window])[group] * solution.variance_scale
     variance_m2 = np.einsum("vi,vij,vj->v", by_corner, joint, by_corner) + half_m**2
     return replace(lane, points_map=drawn_map + half_m[:, None] * left, sigma_m=np.sqrt(variance_m2))
 

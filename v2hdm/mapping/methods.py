@@ -46,7 +46,7 @@ def adjusted_poses(outcome: Outcome) -> AdjustedPoses:
     sigma = np.stack([one.by_state() for one in bundle.model.pose_sigma])[sightings.visit]
     used = bundle.frames
     if bundle.model.solver.pose_states:
-        sigma[used] = np.sqrt(bundle.solution.covariance.poses() * max(1.0, bundle.solution.chi2_per_dof))
+        sigma[used] = np.sqrt(bundle.solution.covariance.poses() * bundle.solution.variance_scale)
     seen = np.zeros(len(sightings.stamp_s), dtype=bool)
     seen[used] = True
     frames = frames_of(drive).frame_of_image
@@ -89,7 +89,7 @@ def joint_covariance(optimised: Optimised, marking: IntArray, corner: IntArray) 
     index = bundle.corner_index[optimised.groups[marking]]
     own = index[np.arange(len(corner)), corner]
     number = np.where(own >= 0, own, index.max(axis=1))
-    out = max(1.0, bundle.solution.chi2_per_dof) * bundle.solution.corner_covariance(number)
+    out = bundle.solution.variance_scale * bundle.solution.corner_covariance(number)
     _state(out, optimised.markings, marking, corner)
     # Combined from two sources, it may have negative eigenvalues of about a square millimetre.
     values, vectors = np.linalg.eigh(out)

@@ -222,7 +222,7 @@ class Optimiser:
         kind, kinds = group_kinds(final.association, self.sightings), self.sightings.kinds
         counted = partial(self._counts, final.rig, ungated, inlier)
         classified = classify(solved, kind, kinds, counted, parallax, self._options.acceptance)
-        scale = max(1.0, final.solution.chi2_per_dof)
+        scale = final.solution.variance_scale
         covariance = final.solution.extrinsic_covariance * scale
         index, names = final.camera_index, self.sightings.cameras
         markings = with_relative_sigma(
@@ -515,7 +515,7 @@ def _solved_candidates(bundle: Bundle, ungated: Bundle) -> Candidates:
     """
     known = bundle.corner_index >= 0
     covariance = np.full((len(known), 8, 8), np.nan)
-    scale = max(1.0, bundle.solution.chi2_per_dof)
+    scale = bundle.solution.variance_scale
     for count in range(1, 5):
         groups = np.flatnonzero(known.sum(axis=1) == count)
         if not len(groups):

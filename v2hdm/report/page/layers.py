@@ -156,10 +156,10 @@ _SHARED = (".geojson", ".gpkg", ".osm", ".dxf", ".csv", ".xodr", ".tif", ".tum",
 
 def ellipses(marking: Marking) -> FloatArray | None:
     """95 % ellipses (4, 3) of the corners: semi-axes a >= b, m, and direction of a, rad."""
-    if marking.covariance_m2 is None:
+    covariances = marking.corner_covariances_m2
+    if covariances is None:
         return None
-    blocks = marking.covariance_m2.reshape(4, 2, 4, 2)[range(4), :, range(4), :]
-    variance, axes = np.linalg.eigh(blocks)
+    variance, axes = np.linalg.eigh(covariances)
     half = SIGMAS_95 * np.sqrt(np.maximum(variance[:, ::-1], 0.0))
     direction = np.arctan2(axes[:, 1, 1], axes[:, 0, 1])
     return np.column_stack([half, direction])
