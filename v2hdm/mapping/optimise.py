@@ -34,8 +34,9 @@ from v2hdm.association.groups import (
     merge_groups,
     same_groups,
 )
+from v2hdm.association.paths import Paths
 from v2hdm.association.sightings import Rig, Sightings
-from v2hdm.association.surface import Paths, Recorded, Surface
+from v2hdm.association.surface import Recorded, Surface
 from v2hdm.association.tracks import (
     GATE_SIGMAS,
     IPM_SIGMA_RAD,
