@@ -195,9 +195,9 @@ def terms() -> Iterator[Part]:
     """Each term of the site model, and the context that lacks it."""
     yield "nothing off", nullcontext
     for kind, name in (
-        (hypotheses.OTHER_LENGTH, "dashes of another length"),
-        (hypotheses.WRONG_END, "wrong ends"),
-        (hypotheses.PIECE, "pieces"),
+        (hypotheses.Kind.OTHER_LENGTH, "dashes of another length"),
+        (hypotheses.Kind.WRONG_END, "wrong ends"),
+        (hypotheses.Kind.PIECE, "pieces"),
     ):
         yield name, _without_kind(kind)
     yield "slanting cuts of pieces", partial(patch.object, hypotheses, "_SLANT_OF_PIECE", 0.0)

@@ -17,7 +17,7 @@ from v2hdm.errors import MappingError
 from v2hdm.records import Exclusion, FloatArray, IntArray, Marking
 from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN, Candidates, Counts, variance_prior
 from v2hdm.site.corrections import MAX_OVERLAP, Stated, overlap
-from v2hdm.site.hypotheses import CLUTTER, PART_OF_SYMBOL
+from v2hdm.site.hypotheses import Kind
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import Parallax
 from v2hdm.site.posterior import CORNERS_OF_IMAGE, Posterior, posterior
@@ -112,7 +112,7 @@ def classify(
     found = replace(found, candidates=stated.placed(found.candidates, first.candidates))
     found.log_odds[list(stated.kept)] = np.inf
     least = np.log(options.min_probability / (1 - options.min_probability))
-    part = found.probability[:, PART_OF_SYMBOL] > found.probability[:, CLUTTER]
+    part = found.probability[:, Kind.PART_OF_SYMBOL] > found.probability[:, Kind.CLUTTER]
     verdict: list[str | None] = [
         None if odds >= least else OF_SYMBOL if part[group] else _CLUTTER_BY[found.evidence[group].argmin()]
         for group, odds in enumerate(found.log_odds)
