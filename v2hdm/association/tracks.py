@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from v2hdm.association.ground import Located
-from v2hdm.association.groups import LEAST_TOLERANCE_M, Association
+from v2hdm.association.groups import GATE_SIGMAS, LEAST_TOLERANCE_M, MAX_GATE_M, SHAPE_TOLERANCE, Association
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.geometry.ipm import ray_covariance
 from v2hdm.geometry.planar import SHIFTS, align, diameters, length_along, mean_corners
@@ -22,8 +22,6 @@ from v2hdm.records import BoolArray, FloatArray, IntArray, PoseNoise
 
 IPM_SIGMA_RAD = 0.015  # direction error of an initial IPM: markings may seem to move between images
 REFINED_SIGMA_RAD = 0.002  # the same once the extrinsic has been optimised
-GATE_SIGMAS, MAX_GATE_M = 4.0, 1.5  # size of every gate, and its limit
-SHAPE_TOLERANCE = 0.25  # corner deviation of sightings of one shape, as a fraction of the marking's diameter
 LEAST_SIGHTINGS = 3
 """Sightings required of a marking by the naive methods, and of a track by the incremental map."""
 

@@ -19,7 +19,7 @@ from v2hdm.adjust import Fault, Status, observability
 from v2hdm.association.ground import ground_points, views_of
 from v2hdm.association.groups import Association, FusedGroups, group_kinds, keep_rows, merge_groups
 from v2hdm.association.sightings import camera_of, frames_of
-from v2hdm.association.tracks import LEAST_SIGHTINGS, SHAPE_TOLERANCE
+from v2hdm.association.tracks import LEAST_SIGHTINGS
 from v2hdm.errors import ConfigError
 from v2hdm.geometry.ipm import extrinsic_from_ipm, facing_ipm, flat_motion, ipm_from_extrinsic
 from v2hdm.geometry.planar import inside_convex, is_convex
@@ -198,6 +198,7 @@ def run_naive(name: str, inputs: Inputs, ipm: Mapping[str, FloatArray]) -> Metho
 
 
 _NAIVE_MERGE_M = 1.0  # largest distance of two tracks of one marking in the naive methods
+_NAIVE_SHAPE_TOLERANCE = 0.5  # their corners' largest deviation, as a fraction of the marking's diameter
 
 
 def _naive_markings(
@@ -229,7 +230,7 @@ def _naive_markings(
         floor_m=_NAIVE_MERGE_M,
         gate_sigmas=np.inf,
         max_distance_m=_NAIVE_MERGE_M,
-        shape_tolerance=2 * SHAPE_TOLERANCE,
+        shape_tolerance=_NAIVE_SHAPE_TOLERANCE,
     )
     average = _average(association, corners_map)
     markings: list[Marking] = []

@@ -37,14 +37,7 @@ from v2hdm.association.groups import (
 from v2hdm.association.paths import Paths
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.association.surface import Recorded, Surface
-from v2hdm.association.tracks import (
-    GATE_SIGMAS,
-    IPM_SIGMA_RAD,
-    MAX_GATE_M,
-    REFINED_SIGMA_RAD,
-    SHAPE_TOLERANCE,
-    build_tracks,
-)  # fmt: skip
+from v2hdm.association.tracks import IPM_SIGMA_RAD, REFINED_SIGMA_RAD, build_tracks
 from v2hdm.errors import AdjustError, MappingError
 from v2hdm.geometry.ipm import extrinsic_from_ipm, project_ground
 from v2hdm.mapping.bundle import (
@@ -391,16 +384,8 @@ class Optimiser:
         fused = fuse_groups(tracks, located, self._pose_noise.roll_pitch_rad)
         range_m = float(np.median(located.range_m[located.valid]))
         direction_m = REFINED_SIGMA_RAD * range_m**2 / float(np.median(rig.height_m))
-        merged = merge_groups(
-            tracks,
-            self.sightings,
-            fused,
-            floor_m=float(np.hypot(self._pose_noise.position_m, direction_m)),
-            gate_sigmas=GATE_SIGMAS,
-            max_distance_m=MAX_GATE_M,
-            shape_tolerance=SHAPE_TOLERANCE,
-        )
-        return self._with_all_that_fit(merged, rig)
+        floor_m = float(np.hypot(self._pose_noise.position_m, direction_m))
+        return self._with_all_that_fit(merge_groups(tracks, self.sightings, fused, floor_m=floor_m), rig)
 
     def _with_all_that_fit(self, association: Association, rig: Rig) -> Association:
         """The groups plus ungrouped sightings, at any range, that fit exactly one of them."""
