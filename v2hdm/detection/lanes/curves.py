@@ -131,7 +131,7 @@ class Curve:
 
 
 def _completed_square(information: FloatArray, moment: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """m' inv(A) m and log det A of A (..., 3, 3), m (..., 3), by elimination: ten times as fast as LAPACK."""
+    """Quadratic form m' inv(A) m and log det A of A (..., 3, 3), m (..., 3): ten times as fast as LAPACK."""
     pivot0, below10, below20 = (information[..., k, 0] for k in range(3))
     l10, l20 = below10 / pivot0, below20 / pivot0
     pivot1 = information[..., 1, 1] - l10 * below10
