@@ -26,7 +26,6 @@ OUTLINE_SIGMA_PX = 2.5
 _RUN_ON_M = 1.0  # length, m, beyond a dash without paint: gaps are at least as long as dashes
 _SURE_M = 0.2  # largest sigma, m, of a point that identifies its line
 _LONG, _PARALLEL = 2.0, 0.9  # least length over width of a line's piece, and cosine between it and the line
-
 BORDER_PX = 10.0  # width of the image's border, px, within which a marking may be cut
 
 

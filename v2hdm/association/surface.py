@@ -46,22 +46,18 @@ _SLOPE_SIGMA = 0.03
 """Standard deviation of a change of slope: roads fall by 1.5 to 2.5 % to each side of a crown (AASHTO, A
 Policy on Geometric Design of Highways and Streets, 7th ed., section 4.2.2)."""
 
-_GRADE_SIGMA = 0.1
-"""Standard deviation of the grade of the whole map: the steepest roads rise by 10 to 15 %."""
+_GRADE_SIGMA = 0.1  # standard deviation of the grade of the whole map: the steepest roads rise by 10 to 15 %
 
 _GRADES, _HINGES = 2, 1 + 2 * len(KNOTS_M)
 _SHAPE = _GRADES + _HINGES  # parameters before the spline's
 _ALONG_M, _ACROSS_M = 6.0, 5.0  # knot spacing of the spline: a third of a camera's range, a lane with margins
-
 _GRID_M, _STRIP_M = 0.5, 8.0  # grid and half width of the ground as written
 _SIDE_M = 12.5  # farther beside the path the ground continues at this height, except for the grade
 _ACROSS = int(2 * _SIDE_M / _ACROSS_M) + 3  # functions of the spline across
 _MOST_ALONG = 120  # largest number of knots along the route; longer routes have wider spacing
 _WHEELS_M = (2.8, 0.8)  # wheelbase and half the track; the vehicle's origin is under the rear axle
-
 _CURVATURE = 1e-3  # typical second difference, 1/m: a crest of 1 km radius, bank changing by 1 % in 10 m
 _SIZES = 2.0  # standard deviation of their logarithm, over all roads
-
 _REACH_M = 40.0  # ground farther from the camera is not corrected: H is known near the path alone
 _STEPS = 12  # of the secant method; four to six suffice
 _SURE_M = 1e-7  # its tolerance

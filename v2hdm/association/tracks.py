@@ -27,8 +27,7 @@ LEAST_SIGHTINGS = 3
 
 _MAX_GAP_M = 4.0  # largest travel without a sighting within a track
 _REFUSED = 1e9  # cost of a forbidden pair in the assignment
-_POSITION_FLOOR_M = 0.02
-"""Floor of a sighting's sigma, m: keeps the gate open where the stated noise is nil."""
+_POSITION_FLOOR_M = 0.02  # floor of a sighting's sigma, m: keeps the gate open where the stated noise is nil
 
 
 @dataclass

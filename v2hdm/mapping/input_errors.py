@@ -13,9 +13,7 @@ from dataclasses import dataclass
 from v2hdm.adjust import Fault, ScoreTest
 
 CLEAR_SIGMAS = 4.0  # of a visible error; in one of 400 correct drives one of its forty tests exceeds it
-
 _PRIOR_ODDS = 1 / 400  # prior odds of a wrong input: one in forty, in one of ten drives of a new vehicle
-
 _DOUBT = 0.05  # probability of a wrong input that a PASS, stated at 95 %, leaves
 
 

@@ -72,16 +72,13 @@ from v2hdm.site.parallax import PointViews, measure_parallax
 
 _log = logging.getLogger(__name__)
 
-_SETTLED_MODEL = "heave"
-"""Pose model of the solves between associations: it omits no error of a pose."""
-
+_SETTLED_MODEL = "heave"  # pose model of the solves between associations: it omits no error of a pose
 _STEEP_SINE = 0.15  # least sine of a ray's depression in the coarse stage, unless most rays are flatter
 
 _LOOSE_CLOCK_SIGMA_S = 0.3
 """Prior sigma of clock offsets, s, once a drive shows them: half a period of a slow receiver."""
 
 _GROUND_ROUNDS = 6  # most solves over improving ground; four suffice for a crown of 4 %
-
 _SETTLED_M = 1e-3  # RMS change of the observed heights at which the ground has converged
 
 

@@ -46,7 +46,6 @@ _CLOCK_CORRECTABLE_S = 0.006
 """Largest sigma, s, at which a contradicted clock is corrected: a late clock adds scatter to its estimate."""
 
 _CENTRE_OBSERVABLE_M = 0.1  # sigma of a centre, m, above which a drive needs its survey: it shifts the map
-
 _MOST_CORRECTIONS = 4  # most inputs dropped one by one; with more of them wrong nothing is reliable
 
 _LIKE_GROUND = (Fault.CROWN, Fault.FOCAL, Fault.DISTORTION, Fault.PRINCIPAL)

@@ -37,14 +37,12 @@ class Kind(IntEnum):
 
 
 _SIZE_SIGMA_M = 1.0  # sigma of a side, m, of a marking of its own size: covers any paint on a road
-
 _LENGTH_SIGMA_M = 0.3  # prior sigma of the length of paint rolled by the metre, m: a tenth of it
 
 _REPEATED_COUNT = 3.0
 """Concentration of the Dirichlet process of lengths: paint of another length repeats a known one."""
 
 _MISPLACED_M = 0.3  # sigma, m, of a worn end, or of any corner of clutter (17 worn ends: .08 to .74 m)
-
 _WORN_SHARE = 0.5  # the same relative to the length: any part may be worn away
 
 _SLANT_OF_END, _SLANT_OF_PIECE = 0.5, 0.1

@@ -33,11 +33,8 @@ from v2hdm.records import (
 
 NODE_SPACING_M = 0.5  # between the vertices of a polyline
 HALF_WIDTH_M, _HALF_LENGTH_M = 0.3, 0.8  # half size across and along a line of the averaged neighbourhood
-
 CENTRE_SIGMA_PX = 1.0  # noise of a detected centre across its line: a cell of the network's output
-
 OWN_SIGMA_M = 0.01  # sigma, m, besides pixel noise: the nearest image must not outvote all others
-
 _TANGENT_REACH = 2  # points to either side whose difference gives the direction
 _GUIDE_RANGE = 1.8  # range of whole lines relative to paint's: they only show what is one line
 

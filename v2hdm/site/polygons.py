@@ -35,7 +35,6 @@ _TURN_SIGMA_RAD = 0.25  # of a piece of outline against its edge
 _ROUND_PX = 3.0  # distance from a corner, px, that the network rounds
 _STRAY, _STRAY_PX = 0.2, 25.0  # fraction of an outline along no edge, and its range, px
 LEAST_EXPLAINED = 1 - 2 * _STRAY  # least fraction of the outlines along their polygon's edges
-
 _ANYWHERE_M = 0.5  # sigma, m, of vertices about the outline common to sightings
 UNSEEN_M = _ANYWHERE_M / 2  # sigma, m, of vertices on which images add little to that prior
 _SIZE_SIGMA, _FREEDOM = 0.02, 4.0

@@ -24,9 +24,7 @@ from v2hdm.site.shapes import learn_paint_error, learn_shapes
 _PRIOR_COUNT = np.array([14.0, 0.5, 0.5, 0.5, 2.0, 1.0, 1.5])
 """Dirichlet prior: expected counts of the hypotheses among about twenty candidates."""
 
-_RATE_STRENGTH = 4.0
-"""Images that the class's detection rate is worth: how similar its markings' rates are."""
-
+_RATE_STRENGTH = 4.0  # images that the class's detection rate is worth: how similar its markings' rates are
 _NEGLECTED_SHARE = 0.1  # fraction of markings that are worn or hidden, with any detection rate
 
 _CLUTTER_FOUND = (0.5, 2.0)
@@ -36,9 +34,7 @@ _BARE_FOUND = (0.05, 10.0)
 """Beta distribution of the rate of such detections on bare ground: one view in two hundred."""
 
 _CLUTTER_REPEATS = 0.7  # probability that clutter seen in some images is seen in one more
-
 _AGREEING = (0.93, 0.6)  # fraction of observations of a marking, and of clutter, that agree with the solution
-
 CORNERS_OF_IMAGE = 4.0  # number of correlated observations: those of one image
 
 _UNDER_SYMBOL = (0.02, 0.5)
@@ -53,7 +49,6 @@ rendered port 335 diamonds have 7.9, 91 dashes 7.4, 3 stop lines 1.1), least sca
 (1.0 for diamonds), and degrees of freedom of Student's t distribution, for worn ones."""
 
 _OTHER_ODDS = (1.5, 1.5)  # mean and sigma of the same for anything else (14 candidates of a rendered port)
-
 _PASSES = 2  # rounds of expectation maximisation; a third changes no figure of six drives by a hundredth
 
 

@@ -35,7 +35,6 @@ _GROUND_SIGMA, _PAINT_SIGMA = 0.08, 0.09
 """Sigmas of the contrast of bare ground, and of full paint as a share of its own (43 rendered markings)."""
 
 _INDEPENDENT = 12.0  # cells that count as independent: flakes, stains and the blur of images span many
-
 _CONTRASTS = np.exp(np.linspace(np.log(0.2), np.log(4.0), 28))  # of full paint over its ground
 _ROUNDS, _FITTED = 12, 160  # of expectation and maximisation, and cells that take part
 _MODEL_SIGMA = (0.045, 0.3)

@@ -25,7 +25,6 @@ from v2hdm.detection.network import AnchorRow, NetworkOutput
 from v2hdm.records import BoolArray, FloatArray, IntArray, LaneDetection
 
 NEIGHBOURS = 3.0  # correlated points of a line that are worth an independent one
-
 _MODEL_SIGMA_M = 0.02  # sigma of painted lines about the curve
 
 
