@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from v2hdm.detection.lanes.curves import NEIGHBOURS, find_chains
+from v2hdm.detection.lanes.chains import find_chains
+from v2hdm.detection.lanes.curves import NEIGHBOURS
 from v2hdm.detection.lanes.lines import crossing_sigma_px
 from v2hdm.detection.network import Network, anchor_rows, as_probability, crossings
 from v2hdm.geometry.lens import undistort_points

@@ -1,7 +1,8 @@
 """Lines of lanes: the centre lines of paint, and the whole lines made of crossings of row anchors and paint.
 
-Crossings and paint that one curve explains are one line (:mod:`.curves`). A hidden Markov model finds from
-where to where it runs, and a logistic function gives its probability (:mod:`.boundaries`).
+Crossings are linked into chains (:mod:`.chains`); chains and paint that one curve explains are one line
+(:mod:`.curves`). A hidden Markov model finds its ends (:mod:`.boundaries`), a logistic function its
+probability (:mod:`.score`).
 """
 
 from __future__ import annotations
@@ -14,8 +15,10 @@ from operator import itemgetter
 import numpy as np
 
 from v2hdm.detection.camera import FARTHEST_M, RoadCamera
-from v2hdm.detection.lanes.boundaries import boundaries, draw, log_odds, log_odds_alone, with_spans
-from v2hdm.detection.lanes.curves import LaneImage, Line, LinePoints, find_chains, find_lines
+from v2hdm.detection.lanes.boundaries import boundaries, draw, with_spans
+from v2hdm.detection.lanes.chains import find_chains
+from v2hdm.detection.lanes.curves import LaneImage, Line, LinePoints, find_lines
+from v2hdm.detection.lanes.score import log_odds, log_odds_alone
 from v2hdm.detection.network import crossings
 from v2hdm.detection.propose import Blob, Proposal
 from v2hdm.records import FloatArray, IntArray, LaneDetection
