@@ -198,15 +198,7 @@ class Optimiser:
         final = self._with_errors_of_ground(final)
         located = locate(self.sightings, final.rig)
         located.informs[:] &= usable
-        fused = fuse_groups(final.association, located, jitter_rad=0.0)
-        solved = _solved_candidates(final, ungated)
-        solved = with_shared_errors(solved, fused, _scatter(final))
-        row, own = ungated.row, ungated.own_corner
-        out = np.flatnonzero(~inlier & self.sightings.valid[row, own])
-        place = ungated.group[out], ungated.corner[out]
-        row, own = row[out], own[out]
-        dissent = located.corners_map[row, own], located.covariance_m2[row, own]
-        solved = with_dissent(solved, fused, row, *place, *dissent)
+        solved = self._candidates(final, ungated, inlier, located)
         noise = final.model.variance_factor, final.model.pose_sigma
         corners = PointViews.of_corners(final.association, self.sightings, located, *noise)
         parallax = measure_parallax(corners, final.association.count)
@@ -244,6 +236,16 @@ class Optimiser:
             initial_reprojection_rmse_px=_root_mean_square(at_start[used]),
             suspicions=most_suspicious(classified.accepted, classified.misfit, squared, classified.counts),
         )
+
+    def _candidates(self, final: Bundle, ungated: Bundle, inlier: BoolArray, located: Located) -> Candidates:
+        """Solved candidates with the errors that their images share, and the dissent of outliers."""
+        fused = fuse_groups(final.association, located, jitter_rad=0.0)
+        solved = with_shared_errors(_solved_candidates(final, ungated), fused, _scatter(final))
+        row, own = ungated.row, ungated.own_corner
+        out = np.flatnonzero(~inlier & self.sightings.valid[row, own])
+        at = row[out], own[out]
+        place = at[0], ungated.group[out], ungated.corner[out]
+        return with_dissent(solved, fused, *place, located.corners_map[at], located.covariance_m2[at])
 
     def _with_errors_of_ground(self, bundle: Bundle) -> Bundle:
         """``bundle`` with covariances inflated by the uncertainty of its ground's heights."""
