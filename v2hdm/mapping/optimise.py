@@ -39,7 +39,7 @@ from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.association.surface import Recorded, Surface
 from v2hdm.association.tracks import IPM_SIGMA_RAD, REFINED_SIGMA_RAD, build_tracks
 from v2hdm.errors import AdjustError, MappingError
-from v2hdm.geometry.ipm import extrinsic_from_ipm, project_ground
+from v2hdm.geometry.ipm import initial_extrinsic, project_ground
 from v2hdm.mapping.bundle import (
     LEAST_OBSERVATIONS,
     VARIANCE_FACTORS,
@@ -469,8 +469,7 @@ def _larger(stated: PoseSigma, own: PoseSigma) -> PoseSigma:
 def initial_rig(cameras: Mapping[str, Camera], map_from_vehicle: FloatArray) -> Rig:
     """Extrinsics nearest to each camera's initial IPM, with the recorded poses (F, 4, 4)."""
     intrinsic = np.stack([camera.info.intrinsic for camera in cameras.values()])
-    start = [extrinsic_from_ipm(one.info, one.ipm[one.initial_ipm]) for one in cameras.values()]
-    return Rig(intrinsic, np.stack(start), map_from_vehicle)
+    return Rig(intrinsic, np.stack([initial_extrinsic(one) for one in cameras.values()]), map_from_vehicle)
 
 
 def rolling(rig: Rig, cameras: Iterable[Camera], sightings: Sightings, estimate: bool) -> Rig:

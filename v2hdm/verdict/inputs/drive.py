@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from v2hdm.geometry.ipm import apply_homography, extrinsic_from_ipm
+from v2hdm.geometry.ipm import apply_homography, initial_extrinsic
 from v2hdm.geometry.lens import distort_points, has_distortion, undistort_points
 from v2hdm.geometry.planar import inside_convex, signed_area
 from v2hdm.geometry.rigid import camera_centre
@@ -49,7 +49,7 @@ _LOWEST_M, _HIGHEST_M = 0.3, 12.0  # heights of cameras on vehicles, cranes' str
 
 def check_camera(name: str, camera: Camera) -> list[Finding]:
     """All checks of one camera's description."""
-    cam_from_vehicle = extrinsic_from_ipm(camera.info, camera.ipm[camera.initial_ipm])
+    cam_from_vehicle = initial_extrinsic(camera)
     findings = [
         *check_intrinsics(name, camera.info),
         *check_roi(name, camera, cam_from_vehicle),
