@@ -34,7 +34,6 @@ from v2hdm.geometry.tensors import inverse_depth
 from v2hdm.records import BoolArray, CameraInfo, FloatArray
 
 _WRONG_SHARE = 0.02  # prior probability that a point is wrong altogether: one slip in five tables of ten
-
 STATED_AS = 4.0  # observations that the stated errors count for: people know theirs to a factor of about 1.4
 UNKNOWNS = 6  # of a mounting
 _LEAST_VARIANCE_PX2 = 1e-9  # keeps V invertible where neither error is stated

@@ -20,7 +20,6 @@ from v2hdm.report import style
 from v2hdm.report.photos import save_grid
 
 _PICTURES = 3  # sample images of each camera: near the start, in the middle and near the end
-
 _ARROWS = 30  # arrows along the route: enough to see a heading go wrong, few enough to see each
 _MOST_POINTS = 5000  # points of the line that is drawn
 

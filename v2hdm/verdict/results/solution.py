@@ -101,7 +101,6 @@ CHECKS: Mapping[Fault, tuple[str, str]] = {
 _CORRECTED_BY = {Fault.CLOCK: "images got poses at the corrected times", Fault.SIZE: "no known size was used"}
 
 _LIKE_CLOCK = (Fault.CLOCK_DRIFT, Fault.COURSE)  # faults that a constant clock offset may stand for
-
 _RIVAL_LOG_ODDS = float(np.log(10.0))  # up to which a less likely cause is named beside the likeliest
 _WAYS = (("behind", "ahead of"), ("to the right of", "to the left of"), ("below", "above"))
 # What units are shown as, and by what values are multiplied for it.
