@@ -46,7 +46,7 @@ from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
-from v2hdm.mapping import foreign, input_errors, optimise
+from v2hdm.mapping import conclusion, foreign, input_errors
 from v2hdm.mapping.methods import run_methods
 from v2hdm.records import BoolArray, Drive, FloatArray, ImageDetections, Marking, Truth
 from v2hdm.report.metrics import driven_past, marking_metrics, match_markings
@@ -210,8 +210,8 @@ def terms() -> Iterator[Part]:
     yield "clutter shaped like its class", partial(patch.object, hypotheses, "_LIKE_CLASS", 1e-9)
     yield "how much clutter differs from it", partial(patch.object, hypotheses, "_LIKE_SHARE", 0.0)
     yield "markings seldom found", partial(patch.object, posterior, "_NEGLECTED_SHARE", 1e-9)
-    yield "symbols on candidates", partial(patch.object, optimise, "images_with_symbol", _no_images)
-    yield "lines behind dashes", partial(patch.object, optimise, "images_with_line", _no_images)
+    yield "symbols on candidates", partial(patch.object, conclusion, "images_with_symbol", _no_images)
+    yield "lines behind dashes", partial(patch.object, conclusion, "images_with_line", _no_images)
     yield "their sureness", partial(patch.object, ground, "_SURE_M", np.inf)
     yield "their direction", partial(patch.object, ground, "_PARALLEL", -1.0)
 
@@ -317,7 +317,7 @@ def rows_of_site(only: str, seeds: Sequence[int], folders: Sequence[Path]) -> It
             asked.append(given)
             return markings.classify(*given)
 
-        with patch.object(optimise, "classify", classify):
+        with patch.object(conclusion, "classify", classify):
             run_methods(drive, detections, cameras)
         for name, off in wanted:
             with off():

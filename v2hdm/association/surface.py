@@ -300,11 +300,8 @@ class Surface:
         """One sentence on the range of the ground's heights."""
         at, ahead, frame = self.paths.position_map, self.paths.heading, np.arange(len(self.paths.place))
         left, ranges = turned_left(ahead), []
-        for away, where in (
-            (10.0 * ahead, "10 m ahead"),
-            (4.0 * left, "4 m to the left"),
-            (-4.0 * left, "right"),
-        ):
+        ways = (10.0 * ahead, "10 m ahead"), (4.0 * left, "4 m to the left"), (-4.0 * left, "right")
+        for away, where in ways:
             height_cm = 100 * self.seen_height_m(at + away, frame)
             ranges.append(f"{height_cm.min():+.0f} to {height_cm.max():+.0f} cm {where}")
         return f"the ground around the vehicle is not a plane: {', '.join(ranges)}"

@@ -26,8 +26,9 @@ from v2hdm.geometry.planar import inside_convex, is_convex
 from v2hdm.io.maps.evidence import Residuals
 from v2hdm.io.maps.features import with_heights
 from v2hdm.mapping.bundle import without_corner
+from v2hdm.mapping.conclusion import Optimised
 from v2hdm.mapping.lanes import draw_lanes
-from v2hdm.mapping.optimise import Optimised, silent
+from v2hdm.mapping.optimise import silent
 from v2hdm.mapping.options import MappingOptions, check_options
 from v2hdm.mapping.recovery import Inputs, Outcome, optimise
 from v2hdm.mapping.results import AdjustedPoses, ClockOffset, MethodResult
@@ -280,10 +281,8 @@ def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
     else:
         lanes = _lanes(inputs, ground_by_rig(drive, cameras, bundle.rig, surface))
     infos = [drive.cameras[name].info for name in inputs.sightings.cameras]
-    seen, jitter_rad = inputs.optimiser.sightings.symbols, noise.roll_pitch_rad
-    symbols, no_symbols = map_symbols(
-        seen, bundle.rig, infos, jitter_rad, optimised.markings, options.acceptance
-    )
+    given = inputs.optimiser.sightings.symbols, bundle.rig, infos, noise.roll_pitch_rad, optimised.markings
+    symbols, no_symbols = map_symbols(*given, options.acceptance)
     for kind, count in Counter(one.kind for one in no_symbols if one.reason == NO_POLYGON).items():
         _log.warning("class %s: %d left out: %s", kind, count, NO_POLYGON)
     hd_map = HdMap(optimised.markings, lanes, drive.origin, symbols, noise.position_drift_over_m)

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,22 +23,14 @@ from v2hdm.adjust import (
     predicts_better,
     select_model,
 )
-from v2hdm.association.ground import Located, Views, easy_views, images_with_line, images_with_symbol, locate
-from v2hdm.association.groups import (
-    Association,
-    attach,
-    fuse_groups,
-    group_kinds,
-    in_view,
-    merge_groups,
-    same_groups,
-)
+from v2hdm.association.ground import Located, Views, locate
+from v2hdm.association.groups import Association, attach, fuse_groups, in_view, merge_groups, same_groups
 from v2hdm.association.paths import Paths
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.association.surface import Recorded, Surface
 from v2hdm.association.tracks import IPM_SIGMA_RAD, REFINED_SIGMA_RAD, build_tracks
 from v2hdm.errors import AdjustError, MappingError
-from v2hdm.geometry.ipm import initial_extrinsic, project_ground
+from v2hdm.geometry.ipm import initial_extrinsic
 from v2hdm.mapping.bundle import (
     LEAST_OBSERVATIONS,
     VARIANCE_FACTORS,
@@ -51,24 +42,11 @@ from v2hdm.mapping.bundle import (
     solve_bundle,
     vehicle_twists,
 )
+from v2hdm.mapping.conclusion import FinalSolve, Optimised, conclude
 from v2hdm.mapping.incremental import IncrementalMapper
 from v2hdm.mapping.lanes import Knots
 from v2hdm.mapping.options import AUTO, SURFACE, MappingOptions
-from v2hdm.records import (
-    BoolArray,
-    Calibration,
-    Camera,
-    Exclusion,
-    FloatArray,
-    IntArray,
-    Marking,
-    PoseNoise,
-    Road,
-    largest_noise,
-)
-from v2hdm.site.candidates import Candidates, Counts, scatter_of, with_dissent, with_shared_errors
-from v2hdm.site.markings import Suspicion, classify, most_suspicious, with_relative_sigma
-from v2hdm.site.parallax import PointViews, measure_parallax
+from v2hdm.records import BoolArray, Camera, FloatArray, PoseNoise, Road, largest_noise
 
 _log = logging.getLogger(__name__)
 
@@ -84,20 +62,6 @@ _SETTLED_M = 1e-3  # RMS change of the observed heights at which the ground has 
 
 def silent(step: str) -> None:
     """Ignore progress."""
-
-
-@dataclass(frozen=True)
-class Optimised:
-    """The result of the joint optimisation; reprojection errors are RMS over the markings' points."""
-
-    bundle: Bundle  # the adjusted extrinsics and poses
-    groups: IntArray  # of the markings
-    markings: tuple[Marking, ...]
-    excluded: tuple[Exclusion, ...]
-    calibrations: Mapping[str, Calibration]
-    reprojection_rmse_px: float  # under the optimised extrinsics
-    initial_reprojection_rmse_px: float  # under the initial ones
-    suspicions: Sequence[Suspicion] = ()  # the worst first
 
 
 class Optimiser:
@@ -171,7 +135,10 @@ class Optimiser:
         progress: Callable[[str], None] = silent,
         find_knots: Callable[[Rig, Surface | None], Knots | None] = lambda rig, surface: None,
     ) -> Optimised:
-        """Choose the pose model, drop outliers of ``bundle`` from :meth:`settle`, classify the candidates."""
+        """Choose the pose model, drop outliers of ``bundle`` from :meth:`settle`, classify the candidates.
+
+        Raises MappingError if no candidate is accepted.
+        """
         if self._options.pose_model == AUTO:
             progress("choice of the pose model")
             self.pose_model = self._choose_pose_model(bundle)
@@ -187,65 +154,9 @@ class Optimiser:
             lanes = knots, final.solution.corners_map[:count]
             final = self._solve(final.association, usable, final.rig, lanes=lanes)
             final = replace(final, solution=replace(final.solution, chi2_per_dof=fit))
-        return self._conclude(final, bundle, inlier, usable)
-
-    def _conclude(self, final: Bundle, ungated: Bundle, inlier: BoolArray, usable: BoolArray) -> Optimised:
-        """Classify the candidates of ``final``, solved from the accepted observations ``inlier`` (K,) alone.
-
-        ``ungated`` has all observations; ``usable`` (S, 4) are the accepted corners. Raises MappingError if
-        no candidate is accepted.
-        """
-        final = self._with_errors_of_ground(final)
-        located = locate(self.sightings, final.rig)
-        located.informs[:] &= usable
-        solved = self._candidates(final, ungated, inlier, located)
-        noise = final.model.variance_factor, final.model.pose_sigma
-        corners = PointViews.of_corners(final.association, self.sightings, located, *noise)
-        parallax = measure_parallax(corners, final.association.count)
-        kind, kinds = group_kinds(final.association, self.sightings), self.sightings.kinds
-        counted = partial(self._counts, final.rig, ungated, inlier)
-        classified = classify(solved, kind, kinds, counted, parallax, self._options.acceptance)
-        scale = final.solution.variance_scale
-        covariance = final.solution.extrinsic_covariance * scale
-        index, names = final.camera_index, self.sightings.cameras
-        markings = with_relative_sigma(
-            classified.markings(),
-            final.corner_index[classified.accepted],
-            lambda pairs: scale * final.solution.corner_covariance(pairs),
-        )
-        squared = np.bincount(final.group, final.solution.mahalanobis2, len(classified.kind)).astype(
-            np.float64
-        )
-        used = np.isin(final.group, classified.accepted) & self.sightings.valid[final.row, final.own_corner]
-        at_start = _residuals_under(self.initial_rig, self.sightings, final, self._pose_noise.roll_pitch_rad)
-        return Optimised(
-            bundle=final,
-            groups=classified.accepted,
-            markings=markings,
-            excluded=classified.exclusions(),
-            # A camera without markings keeps its start and has no covariance.
-            calibrations={
-                name: Calibration(
-                    info=self._cameras[name].info,
-                    cam_from_vehicle=final.rig.cam_from_vehicle[c],
-                    covariance=covariance[index[name]] if name in index else None,
-                )
-                for c, name in enumerate(names)
-            },
-            reprojection_rmse_px=_root_mean_square(final.solution.residual_px[used]),
-            initial_reprojection_rmse_px=_root_mean_square(at_start[used]),
-            suspicions=most_suspicious(classified.accepted, classified.misfit, squared, classified.counts),
-        )
-
-    def _candidates(self, final: Bundle, ungated: Bundle, inlier: BoolArray, located: Located) -> Candidates:
-        """Solved candidates with the errors that their images share, and the dissent of outliers."""
-        fused = fuse_groups(final.association, located, jitter_rad=0.0)
-        solved = with_shared_errors(_solved_candidates(final, ungated), fused, _scatter(final))
-        row, own = ungated.row, ungated.own_corner
-        out = np.flatnonzero(~inlier & self.sightings.valid[row, own])
-        at = row[out], own[out]
-        place = at[0], ungated.group[out], ungated.corner[out]
-        return with_dissent(solved, fused, *place, located.corners_map[at], located.covariance_m2[at])
+        given = self.sightings, self._views, self._cameras, self.initial_rig, self._pose_noise.roll_pitch_rad
+        solve = FinalSolve(self._with_errors_of_ground(final), bundle, inlier, usable, *given)
+        return conclude(solve, self._options.acceptance)
 
     def _with_errors_of_ground(self, bundle: Bundle) -> Bundle:
         """``bundle`` with covariances inflated by the uncertainty of its ground's heights."""
@@ -258,30 +169,6 @@ class Optimiser:
         held = moves_with_heights(bundle.solution, self.surface.seen_errors_m(points_map, frame))
         covariance = replace(bundle.solution.covariance, held=held)
         return replace(bundle, solution=replace(bundle.solution, covariance=covariance))
-
-    def _counts(self, rig: Rig, bundle: Bundle, accepted: BoolArray, corners_map: FloatArray) -> Counts:
-        """Counts of candidates with corners (G, 4, 2), from observations (K,), accepted or not."""
-        count = len(corners_map)
-        group, image = bundle.group[accepted], self.sightings.image[bundle.row[accepted]]
-        shown = np.unique(np.stack([group, image]), axis=1)
-        odds = np.bincount(group, self.sightings.log_odds[bundle.row[accepted]], minlength=count)
-        easy = np.stack(easy_views(self._views, rig, list(self._cameras.values()), corners_map))
-        place, number = (pairs[0] * (1 << 32) + pairs[1] for pairs in (shown, easy))
-        found = np.isin(number, place)
-        ended = accepted & self.sightings.valid[bundle.row, bundle.own_corner]
-        ended &= np.isin(bundle.group * (1 << 32) + self.sightings.image[bundle.row], number[found])
-        corner = 4 * bundle.group[ended] + bundle.corner[ended]
-        return Counts(
-            images=np.bincount(shown[0], minlength=count),
-            observations=np.bincount(bundle.group, minlength=count),
-            agreeing=np.bincount(group, minlength=count),
-            log_odds=odds / np.maximum(np.bincount(group, minlength=count), 1),
-            easy_views=np.bincount(easy[0], minlength=count),
-            found=np.bincount(easy[0, found], minlength=count),
-            pointed=np.bincount(corner, minlength=4 * count).reshape(-1, 4),
-            as_symbol=images_with_symbol(self.sightings.symbols, rig, corners_map)
-            + images_with_line(self.sightings.lines, rig, corners_map),
-        )
 
     def clock_offsets_s(self, bundle: Bundle) -> list[dict[str, float]]:
         """Clock offsets by session and camera from a solve with a weak prior, started at ``bundle``."""
@@ -480,54 +367,3 @@ def rolling(rig: Rig, cameras: Iterable[Camera], sightings: Sightings, estimate:
     twists = vehicle_twists(sightings.map_from_vehicle, sightings.stamp_s, sightings.visit)
     read_out_s = np.zeros(len(rig.intrinsic)) if stated_s is None else stated_s
     return replace(rig, read_out_s=read_out_s, twist_vehicle=twists)
-
-
-def _scatter(bundle: Bundle) -> FloatArray:
-    """Variance inflation of each corner's (G, 4) images relative to the usual."""
-    corner, size = 4 * bundle.group + bundle.corner, 4 * bundle.association.count
-    freedom = 2.0 - bundle.problem.observations.on_line[: len(corner)]
-    squared, degrees = np.zeros(size), np.full(size, -2.0)
-    np.add.at(squared, corner, bundle.solution.mahalanobis2)
-    np.add.at(degrees, corner, freedom)
-    return scatter_of(squared.reshape(-1, 4), degrees.reshape(-1, 4))
-
-
-def _solved_candidates(bundle: Bundle, ungated: Bundle) -> Candidates:
-    """Corners of every group of ``bundle``; a group that lost all of them is placed as in ``ungated``.
-
-    Covariances are scaled by chi^2 per degree of freedom above one.
-    """
-    known = bundle.corner_index >= 0
-    covariance = np.full((len(known), 8, 8), np.nan)
-    scale = bundle.solution.variance_scale
-    for count in range(1, 5):
-        groups = np.flatnonzero(known.sum(axis=1) == count)
-        if not len(groups):
-            continue
-        corner = np.nonzero(known[groups])[1].reshape(-1, count)
-        indices = np.take_along_axis(bundle.corner_index[groups], corner, axis=1)
-        rows = (2 * corner[..., None] + np.arange(2)).reshape(len(groups), -1)
-        blocks = scale * bundle.solution.corner_covariance(indices)
-        covariance[groups[:, None, None], rows[:, :, None], rows[:, None, :]] = blocks
-    before = ungated.corners_map
-    count = np.maximum(np.isfinite(before[..., 0]).sum(axis=1), 1)
-    about = np.nansum(before, axis=1) / count[:, None]
-    return Candidates.seen(bundle.corners_map, covariance, about)
-
-
-def _residuals_under(rig: Rig, sightings: Sightings, bundle: Bundle, jitter_rad: float) -> FloatArray:
-    """Residuals (K, 2), px, of the bundle's observations under ``rig`` with its own best corners."""
-    fused = fuse_groups(bundle.association, locate(sightings, rig), jitter_rad)
-    camera, frame = sightings.camera[bundle.row], sightings.frame[bundle.row]
-    points = fused.corners_map[bundle.group, bundle.corner]
-    own = bundle.row, bundle.own_corner
-    cam_from_map = rig.cam_from_map(camera, frame, sightings.row_share[own])
-    pixel, _ = project_ground(rig.intrinsic[camera], cam_from_map, points[:, None])
-    return np.asarray(pixel[:, 0] - sightings.corners_pinhole_px[own])
-
-
-def _root_mean_square(residual_px: FloatArray) -> float:
-    """RMS norm of residuals (K, 2), without points that have no projection."""
-    squared = np.sum(residual_px**2, axis=1)
-    finite = squared[np.isfinite(squared)]
-    return float(np.sqrt(np.mean(finite))) if len(finite) else float("nan")

@@ -24,10 +24,11 @@ from v2hdm.association.surface import Surface
 from v2hdm.errors import AdjustError, MappingError
 from v2hdm.geometry.rigid import camera_centre, with_clock_offsets
 from v2hdm.mapping.bundle import Bundle, name_of
+from v2hdm.mapping.conclusion import Optimised
 from v2hdm.mapping.foreign import foreign_segment
 from v2hdm.mapping.input_errors import CLEAR_SIGMAS, is_contradicted, is_doubtful, log_odds
 from v2hdm.mapping.lanes import Knots, find_knots
-from v2hdm.mapping.optimise import Optimised, Optimiser
+from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import AUTO, INCREMENTAL, SURFACE, MappingOptions, SurveyOptions
 from v2hdm.mapping.results import CameraFit, Contradiction, SolveEvidence
 from v2hdm.records import Drive, FloatArray, ImageDetections
