@@ -444,7 +444,7 @@ class Fate(Enum):
     FIRST_SEEN = "first seen"
     """In the map now and not before, but the earlier drive may have missed it."""
     NOT_SEEN = "not seen"
-    """Still in the map: no image looked at its place, or too few to miss it."""
+    """Still in the map: no image shows its place, or too few to miss it."""
 
 
 @dataclass(frozen=True)

@@ -116,7 +116,7 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
             left = None if _is_ambiguous(worst, found) else _recovered(inputs, worst, settled)
         if worst is None or left is None:
             break
-        corrected += _contradictions(settled, (worst,), inputs.sightings, visit_names(drive))
+        corrected += _contradictions(settled, (worst,), inputs.sightings, _session_names(drive))
         one, about = corrected[-1], f" {corrected[-1].about}" if corrected[-1].about else ""
         _log.warning(
             "%s: mapped again, for the drive contradicts the %s%s of %s by %.0f sigmas (%+.3g %s)",
@@ -127,7 +127,7 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
     # 4. Choose the pose model, solve without outliers and classify the candidates.
     optimised = optimiser.finish(settled, progress, inputs.find_knots)
     corrected = [_as_solved(one, settled) for one in corrected if _is_of_the_map(one, survey, optimised)]
-    suspected = _contradictions(settled, found, inputs.sightings, visit_names(drive))
+    suspected = _contradictions(settled, found, inputs.sightings, _session_names(drive))
     evidence = _evidence(settled, suspected, corrected, optimiser, optimised.bundle, inputs.sightings)
     return Outcome(inputs, optimised.bundle, replace(evidence, foreign=foreign)), optimised
 
@@ -209,7 +209,7 @@ def _frame_s(settled: Bundle, sightings: Sightings) -> FloatArray:
     return sightings.stamp_s[np.unique(sightings.frame[settled.row])]
 
 
-def visit_names(drive: Drive) -> tuple[str, ...]:
+def _session_names(drive: Drive) -> tuple[str, ...]:
     """Names of a joined drive's sessions; none for a single session."""
     return tuple(visit.name for visit in drive.joined)
 

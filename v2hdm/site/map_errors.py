@@ -96,7 +96,7 @@ class Shift:
 
     @cached_property
     def _weighed(self) -> FloatArray:
-        """That inverse times the differences, (P, 2)."""
+        """The differences (P, 2) times the inverse of their covariance."""
         return np.asarray((self._inverse @ self.off_map.ravel()).reshape(-1, 2))
 
     def without_itself(self, pair: int) -> tuple[FloatArray, FloatArray]:

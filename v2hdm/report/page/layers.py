@@ -89,9 +89,9 @@ def _source(path: Path) -> dict[str, Any]:
         if not path.is_file():
             raise MapFileError(f"{path}: not a readable GeoTIFF or folder of XYZ tiles; check the path")
         return {"fp": path, "driver": "GTiff"}
-    told = {"url": escape(path.resolve().as_uri()), "ending": tile.suffix, "half": _HALF_WORLD_M}
-    told |= {"px": read_header(tile).width, "finest": levels[-1], "coarser": levels[-1] - levels[0]}
-    return {"fp": _TILES.format(**told), "driver": "WMS"}
+    tiles = {"url": escape(path.resolve().as_uri()), "ending": tile.suffix, "half": _HALF_WORLD_M}
+    tiles |= {"px": read_header(tile).width, "finest": levels[-1], "coarser": levels[-1] - levels[0]}
+    return {"fp": _TILES.format(**tiles), "driver": "WMS"}
 
 
 def background_layer(path: Path, facts: Facts) -> dict[str, Any]:

@@ -145,7 +145,7 @@ _SHORTEST_ROUTE_M = 25.0  # obstacles keep 12 m from either end
 
 
 def _visit_seed(config: PortConfig, part: int) -> list[int]:
-    """Seed of a random stream that each visit draws anew."""
+    """Seed of a random stream that differs from visit to visit."""
     return [config.seed, part, *([-1 % 2**32, config.visit] if config.visit else [])]
 
 

@@ -40,8 +40,8 @@ _RTK_M = 0.3  # a position that is worse than this is no RTK, not even with a fl
 # Two degrees: worse than any heading from two antennas a metre apart, or from a gyro compass.
 _HEADING_RAD = 0.035
 _ROLL_PITCH_RAD = 0.05  # three degrees: a vehicle that sways more than this on its suspension overturns
-# Poses that scatter so many times more than stated make every sigma of the map wrong by as much, and beyond
-# the second the map itself.
+# Scatter of the poses, relative to the stated noise, beyond which the map's sigmas are wrong by as much, and
+# beyond which the map itself is wrong.
 _UNDERSTATED, _USELESS = 3.0, 10.0
 # The fourth difference: driving at 10 Hz leaves millimetres in it, white noise sqrt(70) sigmas.
 _DIFFERENCES = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
