@@ -7,7 +7,7 @@ import pytest
 
 from v2hdm.adjust import Fault, ScoreTest
 from v2hdm.errors import MappingError
-from v2hdm.mapping import foreign, recovery
+from v2hdm.mapping import foreign, inputs, recovery
 from v2hdm.mapping.foreign import foreign_segment
 from v2hdm.verdict.results.solution import _ODDS_LIMIT
 
@@ -76,8 +76,8 @@ def odds_beside(monkeypatch, gain, left, worst=20.0, rows=600):
     fault = ScoreTest(Fault.FOCAL, -1, 0, -1, **numbers, gain=worst + float(np.log1p(0.2**2)))
     solved = []
 
-    def settled(inputs, _):
-        solved.append([one.image for one in inputs.detections])
+    def settled(rest, _):
+        solved.append([one.image for one in rest.detections])
         if left is None:
             raise MappingError("no marking is left")
         return SimpleNamespace(row=np.arange(rows))
@@ -88,16 +88,16 @@ def odds_beside(monkeypatch, gain, left, worst=20.0, rows=600):
     for name, value in (
         ("foreign_segment", (3.0, 6.0, gain)),
         ("views_of", None),
-        ("collect_sightings", None),
     ):
         monkeypatch.setattr(recovery, name, lambda *_, value=value: value)
+    monkeypatch.setattr(inputs, "collect_sightings", lambda *_: None)
     monkeypatch.setattr(recovery, "_settled", settled)
     monkeypatch.setattr(recovery, "_tested", tested)
     images = [SimpleNamespace(stamp_s=float(n)) for n in range(10)]
     detections = [SimpleNamespace(image=n) for n in range(10)]
-    inputs = recovery.Inputs(SimpleNamespace(images=images, cameras={}), detections, (), None)  # type: ignore[arg-type]
+    given = inputs.Inputs(SimpleNamespace(images=images, cameras={}), detections, (), None)  # type: ignore[arg-type]
     whole = SimpleNamespace(row=np.arange(1200))
-    told = recovery._foreign(inputs, whole, (fault,) if worst else (), lambda _: None)  # type: ignore[arg-type]
+    told = recovery._foreign(given, whole, (fault,) if worst else (), lambda _: None)  # type: ignore[arg-type]
     return told[2], solved
 
 

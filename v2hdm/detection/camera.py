@@ -25,7 +25,6 @@ _LUT_STEP_PX = 4
 _HORIZON_MARGIN_PX = 16
 
 FARTHEST_M = 60.0  # neither markings nor lines are looked for beyond: networks are shown none beyond 50 m
-
 _SURROUNDINGS_PX = 24  # so far above the farthest ground what is there helps to classify what lies on it
 
 _FINE_ENOUGH_M = 0.007
@@ -35,7 +34,6 @@ ASIDE_RAD = np.deg2rad(60)
 """A camera that looks farther than this off the way that its vehicle drives, ahead or back, looks aside."""
 
 _LEAST_BELOW_PX = 4.0  # nearer to the horizon than this nothing is known of the ground
-
 _CURVE_UNIT_PX = 100.0  # unit of the distance below the horizon in lanes' curves: their parameters are alike
 
 _PROBE_PX = 50.0

@@ -27,10 +27,11 @@ from v2hdm.io.maps.evidence import Residuals
 from v2hdm.io.maps.features import with_heights
 from v2hdm.mapping.bundle import without_corner
 from v2hdm.mapping.conclusion import Optimised
+from v2hdm.mapping.inputs import Inputs
 from v2hdm.mapping.lanes import draw_lanes
 from v2hdm.mapping.optimise import silent
 from v2hdm.mapping.options import MappingOptions, check_options
-from v2hdm.mapping.recovery import Inputs, Outcome, optimise
+from v2hdm.mapping.recovery import Outcome, optimise
 from v2hdm.mapping.results import AdjustedPoses, ClockOffset, MethodResult
 from v2hdm.records import Drive, Exclusion, FloatArray, HdMap, Image, ImageDetections, IntArray, Lane, Marking
 from v2hdm.site.changes import Base, update_map
@@ -337,9 +338,7 @@ def _brought_up_to_date(
     over_m = drive.pose_noise.position_drift_over_m
     hd_map, changes, *names = update_map(base, made.hd_map, observer, mapped, over_m)
     hd_map = replace(hd_map, ground=made.hd_map.ground)
-    residuals = made.residuals
-    if residuals is not None:
-        residuals = residuals.renamed(*names)
+    residuals = None if made.residuals is None else made.residuals.renamed(*names)
     suspicions = [replace(one, marking=int(names[0][one.marking - 1])) for one in made.suspicions]
     return replace(
         made,

@@ -9,35 +9,28 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import compress
 
 import numpy as np
 
 from v2hdm.adjust import CHANGES, Fault, ScoreTest, pose_innovations, score_faults
 from v2hdm.association.ground import views_of
-from v2hdm.association.groups import Association
-from v2hdm.association.sightings import Rig, Sightings, collect_sightings
-from v2hdm.association.surface import Surface
+from v2hdm.association.sightings import Sightings
 from v2hdm.errors import AdjustError, MappingError
-from v2hdm.geometry.rigid import camera_centre, with_clock_offsets
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.mapping.bundle import Bundle, name_of
 from v2hdm.mapping.conclusion import Optimised
 from v2hdm.mapping.foreign import foreign_segment
 from v2hdm.mapping.input_errors import CLEAR_SIGMAS, is_contradicted, is_doubtful, log_odds
-from v2hdm.mapping.lanes import Knots, find_knots
+from v2hdm.mapping.inputs import Inputs
 from v2hdm.mapping.optimise import Optimiser
-from v2hdm.mapping.options import AUTO, INCREMENTAL, SURFACE, MappingOptions, SurveyOptions
+from v2hdm.mapping.options import AUTO, INCREMENTAL, SURFACE, SurveyOptions
 from v2hdm.mapping.results import CameraFit, Contradiction, SolveEvidence
-from v2hdm.records import Drive, FloatArray, ImageDetections
-from v2hdm.site.options import JOINT
+from v2hdm.records import Drive, FloatArray
 
 _log = logging.getLogger(__name__)
-
-_LOOSE_CENTRE_SIGMA_M = 10.0
-"""Standard deviation, m, of a surveyed axis after its contradiction: uninformative."""
 
 _AMBIGUOUS_SHARE = 0.8
 """Fraction of its sigmas from which another camera's fault may be the cause: a straight road at constant
@@ -54,40 +47,6 @@ _LIKE_GROUND = (Fault.CROWN, Fault.FOCAL, Fault.DISTORTION, Fault.PRINCIPAL)
 
 _MEDIAN_SQUARED = 2 * float(np.log(2))
 """Median of a squared Mahalanobis distance: chi-square with two degrees of freedom."""
-
-
-@dataclass(frozen=True)
-class Inputs:
-    """Inputs of a camera set, as given or corrected."""
-
-    drive: Drive
-    detections: Sequence[ImageDetections]
-    cameras: Sequence[str]
-    options: MappingOptions
-
-    @cached_property
-    def sightings(self) -> Sightings:
-        """The detections of these cameras as one table."""
-        return collect_sightings(self.drive, self.detections, self.cameras)
-
-    @cached_property
-    def optimiser(self) -> Optimiser:
-        """An optimiser of these inputs, not yet run."""
-        drive, options = self.drive, self.options
-        views = views_of(drive, self.cameras)
-        return Optimiser(self.sightings, views, drive.cameras, drive.noises, options, drive.road)
-
-    def find_knots(self, rig: Rig, surface: Surface | None) -> Knots | None:
-        """Knots of lanes in the adjustment, found under ``rig``; None if there are none."""
-        options = self.options.lanes
-        if options.model != JOINT:
-            return None
-        return find_knots(self.drive, self.detections, self.sightings.cameras, rig, surface, options)
-
-    @cached_property
-    def tracks(self) -> Association:
-        """Sightings linked from image to image under the initial IPMs."""
-        return self.optimiser.initial_tracks()
 
 
 @dataclass(frozen=True)
@@ -308,11 +267,11 @@ def _recovered(inputs: Inputs, worst: ScoreTest, settled: Bundle) -> Inputs | No
     if worst.fault is Fault.CLOCK:
         if worst.sigma > _CLOCK_CORRECTABLE_S:
             return None
-        return _with_clocks(inputs, inputs.optimiser.clock_offsets_s(settled))
+        return inputs.with_clocks(inputs.optimiser.clock_offsets_s(settled))
     if worst.fault in (Fault.SURVEY, Fault.LEVER):
         if worst.sigma > _CENTRE_OBSERVABLE_M:
             return None
-        return _without_axis(inputs, _cameras_of(settled, worst), worst.axis)
+        return inputs.without_axis(_cameras_of(settled, worst), worst.axis)
     options = inputs.options
     if worst.fault is Fault.SIZE:
         # One wrong size means paint of another standard; corners of others may look like outliers, which the
@@ -325,38 +284,6 @@ def _recovered(inputs: Inputs, worst: ScoreTest, settled: Bundle) -> Inputs | No
     else:
         return None
     return replace(inputs, options=options)
-
-
-def _with_clocks(inputs: Inputs, later_s: Sequence[Mapping[str, float]]) -> Inputs | None:
-    """Images posed ``later_s`` after their present times, by session and camera."""
-    drive = inputs.drive
-    if any(visit.trajectory is None for visit in drive.visits):
-        return None
-    so_far = {(image.visit, image.camera): image.clock_offset_s for image in drive.images}
-    moved = drive
-    for visit, later in enumerate(later_s):
-        own = {name: so_far[visit, name] + late for name, late in later.items() if (visit, name) in so_far}
-        moved = with_clock_offsets(moved, own, max_gap_s=float("inf"), visit=visit)
-    number = {image.path: n for n, image in enumerate(moved.images)}
-    detections = [
-        replace(one, image=number[drive.images[one.image].path])
-        for one in inputs.detections
-        if drive.images[one.image].path in number
-    ]
-    return replace(inputs, drive=moved, detections=sorted(detections, key=lambda one: one.image))
-
-
-def _without_axis(inputs: Inputs, names: Sequence[str], axis: int) -> Inputs | None:
-    """The survey without one axis of some cameras' centres; None if already unknown."""
-    cameras = dict(inputs.drive.cameras)
-    for name in names:
-        prior = cameras[name].centre_prior
-        if prior is None or prior.sigma_m[axis] >= _LOOSE_CENTRE_SIGMA_M:
-            return None
-        sigma_m = prior.sigma_m.copy()
-        sigma_m[axis] = _LOOSE_CENTRE_SIGMA_M
-        cameras[name] = replace(cameras[name], centre_prior=replace(prior, sigma_m=sigma_m))
-    return replace(inputs, drive=replace(inputs.drive, cameras=cameras))
 
 
 def _contradictions(
