@@ -24,7 +24,7 @@ _MOST_CAMERAS = 1 << 16  # OpenCV takes a larger index for something else
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")  # suffixes of images in a folder
 _POLL_S = 0.005  # a folder that grows is looked at this often
 _WRITTEN_S = 1.0  # an image is written within this time
-_SAME_DATE_S = 2.0  # changes of a folder this near in time may bear one date, as on FAT
+_SAME_DATE_S = (2.0, 0.05)  # changes this near in time may bear one date: whole seconds (FAT), fractions
 
 # Depth and channels as stored, so that what does not fit is seen instead of converted without a word.
 _AS_STORED = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR
@@ -157,7 +157,8 @@ def arriving_frames(folder: Path) -> Iterator[Frame]:
         listed = list_images(folder, known) if changed_s != nothing_new_s else []
         came = {path: _written_s(path) for path in listed}
         if not came:
-            nothing_new_s = changed_s if now_s - changed_s > _SAME_DATE_S else None
+            is_settled = now_s - changed_s > _SAME_DATE_S[changed_s % 1 > 0]
+            nothing_new_s = changed_s if is_settled else None
             time.sleep(_POLL_S)
             continue
         newest = max(came, key=lambda path: (came[path], path.name))

@@ -78,7 +78,7 @@ def save_comparison(
     last = pictures[-1]
     grey = cv2.cvtColor(np.ascontiguousarray(last[..., :3]), cv2.COLOR_RGB2GRAY)[last[..., 3] > 0]
     low, high = np.percentile(grey, (0.2, 99.8)) if grey.size else (0.0, 255.0)
-    height_in = _PANEL_IN * AHEAD_M / ACROSS_M + 0.8
+    height_in = _PANEL_IN * AHEAD_M / ACROSS_M + 0.4
     with style.figure(path, _PANEL_IN * len(panels) + 0.1, height_in) as fig:
         every = np.atleast_1d(fig.subplots(1, len(panels)))
         for axes, title, rgba in zip(every, panels, pictures, strict=True):

@@ -1,9 +1,10 @@
 """Fraction of paint left of each marking, from the nearest images.
 
 Images are decoded to linear light, in which a pixel half on paint lies half way, and divided by the ground
-beside the marking; a cell may be lit like either side, as shadow edges often cross. Each cell takes the
-median of images that show all corners. Cells are then a mixture of full paint, bare ground and partial paint;
-the contrast of full paint is the marking's own, with a prior from its class: dirt dims whole paint.
+beside the marking; a cell may be lit like either side, the nearer one more likely, as shadow edges often
+cross. Each cell takes the median of images that show all corners. Cells are then a mixture of full paint,
+bare ground and partial paint; the contrast of full paint is the marking's own, with a prior from its class:
+dirt dims whole paint.
 """
 
 from __future__ import annotations
@@ -75,13 +76,18 @@ class Cells:
 
     def fit(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Log-likelihoods by contrast, fractions of paint, and their sigmas from cells and images."""
-        every = np.clip(np.median(self.contrasts, axis=0).reshape(3, -1), -0.5, 4.0)
-        cells = every[:, None, :: -(-every.shape[1] // _FITTED)]
+        every = np.clip(np.median(self.contrasts, axis=0), -0.5, 4.0)
+        # A shadow's edge is anywhere between the sides.
+        far = np.broadcast_to((np.arange(every.shape[2]) + 0.5) / every.shape[2], every.shape[1:])
+        lit_like = np.stack([1 - far, far, np.full(far.shape, 0.5)]).reshape(3, 1, -1) / 1.5
+        every, step = every.reshape(3, 1, -1), -(-far.size // _FITTED)
+        cells, lit_like = every[..., ::step], lit_like[..., ::step]
         paint, sigma = _CONTRASTS[:, None], np.hypot(_PAINT_SIGMA * _CONTRASTS, _GROUND_SIGMA)[:, None]
         partly = norm.cdf(cells, 0.0, _GROUND_SIGMA) - norm.cdf(cells, paint, sigma)
         bare = np.broadcast_to(norm.pdf(cells, 0.0, _GROUND_SIGMA), partly.shape)
         by_side = np.stack([norm.pdf(cells, paint, sigma), bare, np.maximum(partly, 0.0) / paint])
-        densities, cells = by_side.mean(axis=1) + 1e-6, cells.mean(axis=0)
+        densities = (by_side * lit_like).sum(axis=1) + 1e-6
+        cells = (cells * lit_like).sum(axis=0)
         weight = np.broadcast_to(np.array([0.6, 0.2, 0.2])[:, None, None], (3, len(paint), 1))
         for _ in range(_ROUNDS):
             joint = weight * densities
