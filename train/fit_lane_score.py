@@ -23,8 +23,8 @@ import numpy as np
 from train.examples import LANE_TOLERANCE_PX, Example
 from train.fit_judge import FOLDS, fit, log_loss, render_to_fit
 from v2hdm.detection.detector import Detector
-from v2hdm.detection.lanes import boundaries as score
 from v2hdm.detection.lanes import lines as lane_lines
+from v2hdm.detection.lanes import score
 from v2hdm.detection.lanes.boundaries import draw
 from v2hdm.detection.lanes.curves import LaneImage, Line, LinePoints
 from v2hdm.detection.network import Network
@@ -41,7 +41,7 @@ _MOST_SLOPE = 10.0
 KEYS = {"alone": score.ALONE, "among": score.AMONG}
 
 Weights = dict[str, tuple[FloatArray, float]]
-"""The weights of :func:`v2hdm.detection.lanes.boundaries.fitted`."""
+"""The weights of :func:`v2hdm.detection.lanes.score.fitted`."""
 
 
 @dataclass(frozen=True)

@@ -25,13 +25,9 @@ QUADRILATERAL, STRIPE, LINE, SYMBOL, OTHER = "quadrilateral", "stripe", "line", 
 FAMILIES = (QUADRILATERAL, STRIPE, LINE, SYMBOL, OTHER)
 
 _SOFTNESS = 0.25  # standard deviation of a log size about its range, where the catalogue gives none
-
 _TINY_M = 1e-3  # least size that differs from nothing, m
-
 NOT_PAINT = "none"  # the label of everything that is no marking; no class may have this name
-
 _NAME = re.compile(r"[A-Za-z0-9_]{1,64}")  # names of classes stand in file formats, log lines and label files
-
 _MOST_CLASSES = 254  # labels are bytes: 0 is no paint, 255 is unknown
 
 _KEYS = frozenset({"family", "length_m", "width_m", "softness", "group"})

@@ -47,7 +47,6 @@ _FAINT_SHARE, _HIDDEN_SIGMA = 0.1, 0.5
 """Share of the sides that are faint where shown; sigma of the contrast of what stands before them."""
 
 _ALIKE = 0.5  # power of the likelihood of one side: the four of one image err alike
-
 _PAIRS_OF_BIN = 100  # detected sides by which contrasts of one size in the image are learned
 _LEAST_PAIRS = 8  # detected sides below which nothing is said of images without a detection
 _LEAST_SIGMA = 0.03

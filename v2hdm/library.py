@@ -55,8 +55,8 @@ def build_problem(
     >>> solve(problem).status.value
     'converged'
     """
+    from v2hdm.mapping.inputs import Inputs
     from v2hdm.mapping.options import MappingOptions
-    from v2hdm.mapping.recovery import Inputs
 
     inputs = Inputs(drive, detections, tuple(drive.cameras), options or MappingOptions())
     return inputs.optimiser.settle(inputs.tracks).problem

@@ -1,8 +1,7 @@
-"""The records that travel between the parts: plain frozen dataclasses over numpy arrays.
+"""The records that the stages exchange: plain frozen dataclasses over numpy arrays.
 
-Frames, names and index letters are those of :mod:`v2hdm.geometry`. Image points come in two flavours: ``_px``
-are pixels of the image as recorded, ``_pinhole_px`` the same points with the lens distortion removed, on the
-pinhole image of the same intrinsic matrix.
+Frames, names and index letters are those of :mod:`v2hdm.geometry`. ``_px`` are pixels of the recorded image,
+``_pinhole_px`` those of the same points without lens distortion, under the same intrinsic matrix.
 """
 
 from __future__ import annotations
@@ -33,8 +32,7 @@ CHEVRON = "chevron"
 OTHER_PAINT = "other_paint"
 
 SEEN_ACROSS: Mapping[str, str] = {LANE_DASH: STOP_LINE, STOP_LINE: LANE_DASH}
-"""Stripes that a camera on the vehicle's side sees as one that looks ahead sees the other: a dash lies across
-its view."""
+"""Stripes that look like each other to a camera to the side: there a dash lies across the view."""
 
 LANE_BOUNDARY = "lane_boundary"
 """Kind of a lane detection that is a whole line, gaps between dashes and hidden parts included."""
@@ -65,12 +63,12 @@ class CentrePrior:
 
 @dataclass(frozen=True)
 class Camera:
-    """One camera of a drive: its intrinsics and what is roughly known of its mounting."""
+    """One camera of a drive: its intrinsics and approximate mounting."""
 
     info: CameraInfo
     # ``vehicle_from_pinhole_px`` (3 x 3): ``calibrated``, this vehicle's own, ``estimated``, borrowed
     ipm: Mapping[str, FloatArray]
-    initial_ipm: str  # that the mapping starts from
+    initial_ipm: str  # the IPM that mapping starts from
     roi_vehicle: FloatArray  # (N, 2) m, convex polygon of ground in which the IPM is trusted
     centre_prior: CentrePrior | None = None
     linear_response: bool = False  # grey proportional to radiance, else sRGB
@@ -81,7 +79,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class GeodeticOrigin:
-    """Where the map frame's origin lies on the earth: degrees, metres above the ellipsoid."""
+    """The map frame's origin on the earth: degrees, metres above the ellipsoid."""
 
     latitude_deg: float
     longitude_deg: float
@@ -92,11 +90,10 @@ class GeodeticOrigin:
 
 @dataclass(frozen=True)
 class PoseNoise:
-    """Standard deviations of the recorded poses, as the receiver's data sheet states them.
+    """Standard deviations of the recorded poses, as in the receiver's data sheet.
 
-    Of each, ``..._drift_...`` is the part that changes only slowly, as RTK's errors do: a first-order
-    Gauss-Markov process that fades to 1 / e over ``..._drift_over_m`` of driving. The rest, in quadrature, is
-    drawn anew at every image.
+    ``..._drift_...`` is the slow part of each, as in RTK: a first-order Gauss-Markov process with the
+    correlation length ``..._drift_over_m``. The rest, in quadrature, is white noise.
     """
 
     position_m: float = 0.02
@@ -110,12 +107,11 @@ class PoseNoise:
     roll_pitch_drift_over_m: float = 5.0
 
     @classmethod
-    def as_far_as_stated(cls, **stated: float) -> PoseNoise:
-        """The noise of a drive whose description may leave out some of it.
+    def from_stated(cls, **stated: float) -> PoseNoise:
+        """The noise of a drive that states only some of it; the rest takes the mean square over drives.
 
-        What is not stated is not known to be the usual, and enters by its mean square. A drift that is not
-        stated takes half of its variance: an error that repeats from image to image does not average out, and
-        a map that reckons with none is less certain than it says.
+        An unstated drift takes half the variance: without one, errors that repeat from image to image would
+        be averaged out, and the map state too small an uncertainty.
         """
         noise = cls(**stated)
         unstated = {total: _UNSTATED * getattr(noise, total) for total in DRIFTS if total not in stated}
@@ -142,12 +138,12 @@ DRIFTS: Mapping[str, str] = {
 """The drift that belongs to each standard deviation of :class:`PoseNoise`."""
 
 _UNSTATED = math.sqrt((3.0**2 - 3.0**-2) / (2 * math.log(3.0**2)))
-"""Root of the mean square of a sigma, over the usual one, whose logarithm is even from a third to three times
-it: among receivers and vehicles it lies anywhere there."""
+"""Root mean square, relative to the usual value, of a sigma whose logarithm is uniform from a third of it to
+three times: the range of receivers and vehicles."""
 
 _USUAL_DRIFT_SHARE = 0.5
-"""Share of a variance that drifts where nobody says otherwise: RTK's errors are about half multipath and
-atmosphere, which last for tens of metres."""
+"""Fraction of an unstated variance that drifts: half of RTK's errors are multipath and atmosphere, which last
+for tens of metres."""
 
 
 @dataclass(frozen=True)
@@ -160,7 +156,7 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class Road:
-    """The recorded ground along the route, which the drive's poses have laid flat into z = 0."""
+    """The recorded ground along the route; the drive's poses are reduced to the plane z = 0."""
 
     points_map: FloatArray  # (P, 2) m in driving order
     height_m: FloatArray  # (P,)
@@ -175,7 +171,7 @@ class Image:
     stamp_s: float
     path: Path
     map_from_vehicle: FloatArray  # (4, 4) when it was taken
-    clock_offset_s: float = 0.0  # how much later than stamped, as far as known
+    clock_offset_s: float = 0.0  # exposure minus stamp, as far as known
     visit: int = 0  # an index into ``Drive.visits``
 
     @property
@@ -186,7 +182,7 @@ class Image:
 
 @dataclass(frozen=True)
 class Visit:
-    """One of the drives that a :class:`Drive` was joined of; ``cameras`` are by its own names."""
+    """A session of a :class:`Drive`, itself a drive before joining; ``cameras`` are by its own names."""
 
     name: str
     root: Path
@@ -204,16 +200,15 @@ class Drive:
     name: str
     root: Path
     cameras: Mapping[str, Camera]
-    images: Sequence[Image]  # sorted by visit, time, then camera
+    images: Sequence[Image]  # sorted by session, time, then camera
     pose_noise: PoseNoise = field(default_factory=PoseNoise)
     origin: GeodeticOrigin | None = None
     truth_dir: Path | None = None  # for the report alone
     trajectory: Trajectory | None = None  # at the receiver's rate, the road laid flat
     recorded: Trajectory | None = None  # the same as recorded
     road: Road | None = None  # as recorded, None for the plane z = 0
-    unposed: Mapping[str, int] = field(default_factory=dict)  # images left out for want of a pose
-    # drives that it was made of, if any: then without trajectory, and of the largest noise
-    joined: tuple[Visit, ...] = ()
+    unposed: Mapping[str, int] = field(default_factory=dict)  # images left out, without a pose
+    joined: tuple[Visit, ...] = ()  # its sessions, if several: then it has no trajectory
 
     def name_of(self, path: Path) -> str:
         """Name an image as files of results do: its path below the drive's folder, else its whole path."""
@@ -222,18 +217,18 @@ class Drive:
 
     @property
     def route_map(self) -> FloatArray:
-        """Where the vehicle was at the images, (I, 2) m."""
+        """The vehicle's positions (I, 2), m, at the images."""
         return np.array([image.map_from_vehicle[:2, 3] for image in self.images])
 
     @property
     def visits(self) -> tuple[Visit, ...]:
-        """The drives that it was joined of, or itself alone."""
+        """Its sessions: the drives that it was joined of, or itself alone."""
         own = (self.name, self.root, self.pose_noise, self.truth_dir, self.trajectory, self.recorded)
         return self.joined or (Visit(*own, {name: name for name in self.cameras}),)
 
     @property
     def noises(self) -> tuple[PoseNoise, ...]:
-        """The noise of the recorded poses of each visit."""
+        """The noise of each session's recorded poses."""
         return tuple(visit.pose_noise for visit in self.visits)
 
 
@@ -241,12 +236,11 @@ class Drive:
 class MarkingDetection:
     """One quadrilateral marking, or symbol, in one image.
 
-    ``corners_px`` (4, 2) run counter-clockwise as seen from above the ground, and so on the screen; which
-    comes first is arbitrary. ``covariance_px`` (8, 8), px^2, of the stacked corners (u0, v0, u1, ...) is
-    large in a direction that the image hides, as along a dash whose end lies beyond the border.
-    ``corner_valid`` (4,) says which are known well in every direction. Symbols, as arrows and chevrons, have
-    corners of nan, not valid, and a polygon ``outline_px`` (N, 2); it is empty for quadrilaterals.
-    ``outline_seen`` (N,) says which of its sides, from each point to the next, lie along an edge of paint.
+    ``corners_px`` (4, 2) run counter-clockwise as seen from above, and so on the screen, from any first one.
+    ``covariance_px`` (8, 8), px^2, of the stacked corners (u0, v0, u1, ...) is large in a direction that the
+    image hides, as along a dash whose end lies beyond the border; ``corner_valid`` (4,) flags corners known
+    well in every direction. Symbols such as arrows have corners of nan and a polygon ``outline_px`` (N, 2),
+    empty otherwise; ``outline_seen`` (N,) flags its sides, each to the next point, along an edge of paint.
     """
 
     kind: str
@@ -291,9 +285,8 @@ class PaintLeft:
         """The same, with the change since an earlier measurement."""
         if before is None:
             return self
-        return PaintLeft(
-            self.share, self.sigma, self.share - before.share, float(np.hypot(self.sigma, before.sigma))
-        )
+        sigma = float(np.hypot(self.sigma, before.sigma))
+        return replace(self, change=self.share - before.share, change_sigma=sigma)
 
 
 @dataclass(frozen=True)
@@ -304,12 +297,18 @@ class Marking:
     corners_map: FloatArray  # (4, 2) m, counter-clockwise from above
     sightings: int
     covariance_m2: FloatArray | None = None  # (8, 8) of the stacked corners, if known
-    # of a distance to one about 10 m away, a coordinate: without shared drift and survey
+    # per coordinate of the distance to a marking about 10 m away, in which shared errors cancel
     relative_sigma_m: float | None = None
     heights_m: FloatArray | None = None  # (4,) of the ground, None for z = 0
     id: int | None = None  # positive and unique; None until the map is written
-    paint: PaintLeft | None = None  # what is left of it, if any image shows that
+    paint: PaintLeft | None = None  # None if no image shows enough of it
     heights_sigma_m: FloatArray | None = None  # (4,) where estimated
+
+    @property
+    def corner_covariances_m2(self) -> FloatArray | None:
+        """Covariance (4, 2, 2) of each corner alone, if known."""
+        whole = self.covariance_m2
+        return None if whole is None else whole.reshape(4, 2, 4, 2)[range(4), :, range(4), :]
 
 
 @dataclass(frozen=True)
@@ -360,9 +359,9 @@ class GroundStrip:
 class HdMap:
     """Markings, lanes and symbols of a site in its map frame.
 
-    ``drift_over_m`` is the distance over which the error that neighbouring markings share fades, None if
-    unknown; ``largest_id`` the largest id ever given, also to what is gone, 0 where it is a feature's.
-    ``ground`` is the surface by session, where it was estimated.
+    ``drift_over_m`` is the correlation length of the error that neighbouring markings share, None if unknown;
+    ``largest_id`` the largest id ever given, 0 if a present feature has it; ``ground`` the estimated surface
+    by session.
 
     >>> marking = result.map.markings[0]
     >>> marking.corners_map.shape, marking.covariance_m2.shape
@@ -378,7 +377,7 @@ class HdMap:
     ground: tuple[GroundStrip, ...] = ()
 
     def to_geodataframe(self) -> Any:
-        """The features as a ``geopandas.GeoDataFrame``, a row each: id, layer, kind, sightings, geometry.
+        """The features as a ``geopandas.GeoDataFrame``, one row each: id, layer, kind, sightings, geometry.
 
         Geometries are longitude, latitude and ellipsoidal height, m (EPSG:4326), where the map has an origin,
         and metres of the frame ``map`` otherwise.
@@ -443,25 +442,25 @@ class Fate(Enum):
     VANISHED = "vanished"
     NEW = "new"
     FIRST_SEEN = "first seen"
-    """It is in the map now and was not before, but the earlier drive may just have missed it."""
+    """In the map now and not before, but the earlier drive may have missed it."""
     NOT_SEEN = "not seen"
-    """It is in the map still: no image looked at its place, or too few to miss it."""
+    """Still in the map: no image shows its place, or too few to miss it."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """One marking that is not what the earlier map says, and the evidence."""
+    """One marking that differs from the earlier map, with the evidence."""
 
     id: int
     kind: str
     fate: Fate
     before: FloatArray | None  # (4, 2) corners, if any
     after: FloatArray | None  # (4, 2) corners, if any
-    shift_m: FloatArray | None  # (2,) of its centre, beyond what the maps are apart there
+    shift_m: FloatArray | None  # (2,) of its centre, beyond the local shift between the maps
     shift_sigma_m: FloatArray | None
     probability: float  # of its fate
-    views: int  # images that had its place in near view (of a new one, the earlier drive's)
-    found: int  # of them showed it
+    views: int  # images with its place in near view (of a new one, the earlier drive's)
+    found: int  # of these, that showed it
     sightings: int  # of the map that has it
 
 
@@ -492,7 +491,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class Calibration:
-    """The calibration of one camera: ``cam_from_vehicle`` (4 x 4) is where it sits.
+    """The calibration of one camera, with its extrinsic ``cam_from_vehicle`` (4, 4).
 
     ``covariance`` (6, 6) is that of its left-perturbation tangent, translation (m) then rotation (rad); None
     if unknown.

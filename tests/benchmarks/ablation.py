@@ -8,7 +8,7 @@ false ones, the share of markings with four corners known well, the corners' err
 covariance holds (inner-95 mean of the normalised squared error; honest 1.60). A part that earns nothing
 leaves.
 
-With ``--verdict`` instead what each column of the table of the sizes of faults (mapping/recovery.py) and each
+With ``--verdict`` instead what each column of the table of fault sizes (mapping/input_errors.py) and each
 number of mapping/foreign.py earns, on made drives of these seeds, as they are and with every fault: right
 drives failed, wrong maps without a word, and of those with one how many are named rightly, first.
 """
@@ -46,7 +46,7 @@ from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
-from v2hdm.mapping import foreign, optimise, recovery
+from v2hdm.mapping import conclusion, foreign, input_errors
 from v2hdm.mapping.methods import run_methods
 from v2hdm.records import BoolArray, Drive, FloatArray, ImageDetections, Marking, Truth
 from v2hdm.report.metrics import driven_past, marking_metrics, match_markings
@@ -170,8 +170,8 @@ def sizes() -> Iterator[Part]:
     """Each column of the table of sizes, each number of the foreign images, and the context that lacks it."""
     yield "nothing off", nullcontext
     for column, nothing in (("least", 0.0), ("sigma", np.inf), ("usual", np.inf), ("most", np.inf)):
-        flat = {fault: replace(size, **{column: nothing}) for fault, size in recovery._SIZES.items()}
-        yield f"{column} size of each fault", partial(patch.object, recovery, "_SIZES", flat)
+        flat = {fault: replace(size, **{column: nothing}) for fault, size in input_errors._SIZES.items()}
+        yield f"{column} size of each fault", partial(patch.object, input_errors, "_SIZES", flat)
     yield "foreign: views that share counts for", partial(patch.object, foreign, "_PSEUDO_VIEWS", 100.0)
     yield "foreign: markings taken by mistake", partial(patch.object, foreign, "_BY_MISTAKE", 1e-6)
     yield "foreign: mixtures of two markings", partial(patch.object, foreign, "_CONFUSED", 1e-6)
@@ -195,9 +195,9 @@ def terms() -> Iterator[Part]:
     """Each term of the site model, and the context that lacks it."""
     yield "nothing off", nullcontext
     for kind, name in (
-        (hypotheses.OTHER_LENGTH, "dashes of another length"),
-        (hypotheses.WRONG_END, "wrong ends"),
-        (hypotheses.PIECE, "pieces"),
+        (hypotheses.Kind.OTHER_LENGTH, "dashes of another length"),
+        (hypotheses.Kind.WRONG_END, "wrong ends"),
+        (hypotheses.Kind.PIECE, "pieces"),
     ):
         yield name, _without_kind(kind)
     yield "slanting cuts of pieces", partial(patch.object, hypotheses, "_SLANT_OF_PIECE", 0.0)
@@ -210,8 +210,8 @@ def terms() -> Iterator[Part]:
     yield "clutter shaped like its class", partial(patch.object, hypotheses, "_LIKE_CLASS", 1e-9)
     yield "how much clutter differs from it", partial(patch.object, hypotheses, "_LIKE_SHARE", 0.0)
     yield "markings seldom found", partial(patch.object, posterior, "_NEGLECTED_SHARE", 1e-9)
-    yield "symbols on candidates", partial(patch.object, optimise, "images_with_symbol", _no_images)
-    yield "lines behind dashes", partial(patch.object, optimise, "images_with_line", _no_images)
+    yield "symbols on candidates", partial(patch.object, conclusion, "images_with_symbol", _no_images)
+    yield "lines behind dashes", partial(patch.object, conclusion, "images_with_line", _no_images)
     yield "their sureness", partial(patch.object, ground, "_SURE_M", np.inf)
     yield "their direction", partial(patch.object, ground, "_PARALLEL", -1.0)
 
@@ -317,7 +317,7 @@ def rows_of_site(only: str, seeds: Sequence[int], folders: Sequence[Path]) -> It
             asked.append(given)
             return markings.classify(*given)
 
-        with patch.object(optimise, "classify", classify):
+        with patch.object(conclusion, "classify", classify):
             run_methods(drive, detections, cameras)
         for name, off in wanted:
             with off():

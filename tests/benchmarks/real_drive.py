@@ -32,7 +32,8 @@ from v2hdm.detection.batch import detect_all, read_image
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.road import draw_detections
 from v2hdm.io.drive import ReadOptions, read_drive
-from v2hdm.mapping.optimise import Optimised, Optimiser
+from v2hdm.mapping.conclusion import Optimised
+from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.records import (
     ARROW,

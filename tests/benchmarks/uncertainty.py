@@ -155,7 +155,7 @@ def main() -> None:
     print(" " * 25 + " ".join(f"{name:>9s}" for name in QUANTITIES))
     found: list[Errors] = []
     for name, recorded in drives(arguments):
-        drive = replace(recorded, pose_noise=PoseNoise.as_far_as_stated()) if arguments.no_noise else recorded
+        drive = replace(recorded, pose_noise=PoseNoise.from_stated()) if arguments.no_noise else recorded
         detections = detect_all(drive, DetectorOptions.for_mapping(), arguments.workers)
         result = run_methods(drive, detections, list(drive.cameras), MappingOptions(mode=arguments.mode))[
             "Opt"

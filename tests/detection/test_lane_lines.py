@@ -23,7 +23,7 @@ from tests.detection.pictures import (
 from v2hdm.catalogue import SHIPPED
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.detector import Detector
-from v2hdm.detection.lanes import boundaries as score
+from v2hdm.detection.lanes import score
 from v2hdm.detection.lanes.curves import LaneImage
 from v2hdm.detection.lanes.lines import propose
 from v2hdm.detection.network import AnchorRow

@@ -110,14 +110,14 @@ def test_a_drive_without_any_posed_image_is_refused(tmp_path):
 
 
 def test_a_drift_that_is_not_stated_takes_half_of_its_variance():
-    noise = PoseNoise.as_far_as_stated(position_m=0.01, heading_drift_rad=0.0)
+    noise = PoseNoise.from_stated(position_m=0.01, heading_drift_rad=0.0)
     assert noise.position_drift_m == pytest.approx(0.01 / np.sqrt(2))
     assert noise.heading_drift_rad == 0.0
     assert noise.roll_pitch_drift_rad == pytest.approx(noise.roll_pitch_rad / np.sqrt(2))
 
 
 def test_noise_that_is_not_stated_counts_by_its_mean_square():
-    usual, noise = PoseNoise(), PoseNoise.as_far_as_stated(position_m=0.02)
+    usual, noise = PoseNoise(), PoseNoise.from_stated(position_m=0.02)
     factor = np.exp(np.random.default_rng(0).uniform(np.log(1 / 3), np.log(3), 100_000))
     assert noise.position_m == usual.position_m
     assert noise.heading_rad == pytest.approx(usual.heading_rad * np.sqrt(np.mean(factor**2)), rel=0.01)

@@ -7,8 +7,8 @@ import pytest
 
 from v2hdm.adjust import Fault, ScoreTest
 from v2hdm.errors import MappingError
-from v2hdm.mapping import foreign, recovery
-from v2hdm.mapping.foreign import foreign_stretch
+from v2hdm.mapping import foreign, inputs, recovery
+from v2hdm.mapping.foreign import foreign_segment
 from v2hdm.verdict.results.solution import _ODDS_LIMIT
 
 FRAMES, IN_VIEW = 90, 8
@@ -34,7 +34,7 @@ def stretch(monkeypatch, found, first_seen):
     views = SimpleNamespace(
         image=np.arange(FRAMES), frame=np.arange(FRAMES), camera=np.zeros(FRAMES, dtype=int)
     )
-    return foreign_stretch(bundle, sightings, views, ())
+    return foreign_segment(bundle, sightings, views, ())
 
 
 OWN = np.arange(-IN_VIEW, FRAMES, 2)
@@ -76,8 +76,8 @@ def odds_beside(monkeypatch, gain, left, worst=20.0, rows=600):
     fault = ScoreTest(Fault.FOCAL, -1, 0, -1, **numbers, gain=worst + float(np.log1p(0.2**2)))
     solved = []
 
-    def settled(inputs, _):
-        solved.append([one.image for one in inputs.detections])
+    def settled(rest, _):
+        solved.append([one.image for one in rest.detections])
         if left is None:
             raise MappingError("no marking is left")
         return SimpleNamespace(row=np.arange(rows))
@@ -86,18 +86,18 @@ def odds_beside(monkeypatch, gain, left, worst=20.0, rows=600):
         return (ScoreTest(Fault.CLOCK, -1, 0, -1, gain=left),)
 
     for name, value in (
-        ("foreign_stretch", (3.0, 6.0, gain)),
+        ("foreign_segment", (3.0, 6.0, gain)),
         ("views_of", None),
-        ("collect_sightings", None),
     ):
         monkeypatch.setattr(recovery, name, lambda *_, value=value: value)
+    monkeypatch.setattr(inputs, "collect_sightings", lambda *_: None)
     monkeypatch.setattr(recovery, "_settled", settled)
     monkeypatch.setattr(recovery, "_tested", tested)
     images = [SimpleNamespace(stamp_s=float(n)) for n in range(10)]
     detections = [SimpleNamespace(image=n) for n in range(10)]
-    inputs = recovery.Inputs(SimpleNamespace(images=images, cameras={}), detections, (), None)  # type: ignore[arg-type]
+    given = inputs.Inputs(SimpleNamespace(images=images, cameras={}), detections, (), None)  # type: ignore[arg-type]
     whole = SimpleNamespace(row=np.arange(1200))
-    told = recovery._foreign(inputs, whole, (fault,) if worst else (), lambda _: None)  # type: ignore[arg-type]
+    told = recovery._foreign(given, whole, (fault,) if worst else (), lambda _: None)  # type: ignore[arg-type]
     return told[2], solved
 
 

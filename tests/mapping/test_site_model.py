@@ -7,7 +7,7 @@ import pytest
 
 from v2hdm.association.groups import FusedGroups
 from v2hdm.site.candidates import Candidates, Counts, scatter_of, with_dissent, with_shared_errors
-from v2hdm.site.hypotheses import CLUTTER, OF_CLASS, OTHER_LENGTH, PART_OF_SYMBOL, PIECE, WRONG_END
+from v2hdm.site.hypotheses import Kind
 from v2hdm.site.markings import classify
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import Parallax
@@ -102,7 +102,7 @@ def test_a_corner_on_a_known_line_is_found_along_it():
         candidates.covariance_m2[4, rows, rows] += 5.0**2 * np.outer(along, along)
     found = of_one_class(candidates)
     assert np.linalg.norm(found.candidates.corners_map[4] - true[4], axis=1).max() < 0.08
-    assert found.probability[4, OF_CLASS] > 0.5
+    assert found.probability[4, Kind.OF_CLASS] > 0.5
 
 
 def test_a_corner_taken_for_another_edge_is_put_where_the_shape_has_it():
@@ -147,7 +147,7 @@ def test_an_end_on_which_images_disagree_is_likelier_worn_than_one_on_which_they
     wear_off(candidates, true, 20, 0.15, 0.05)
     counts = well_seen(60)
     counts.pointed[20, np.diagonal(candidates.covariance_m2[20])[::2] > 0.05**2] = 6
-    crisp, ragged = of_one_class(candidates, counts).probability[[10, 20], WRONG_END]
+    crisp, ragged = of_one_class(candidates, counts).probability[[10, 20], Kind.WRONG_END]
     assert ragged > 0.8
     assert crisp < 0.5
 
@@ -159,7 +159,8 @@ def test_a_length_that_several_dashes_have_is_no_wear():
         )
         for count in (1, 5)
     )
-    others = [of_one_class(candidates).probability[50:, OTHER_LENGTH] for candidates in (alone, repeated)]
+    probabilities = (of_one_class(candidates).probability[50:] for candidates in (alone, repeated))
+    others = [each[:, Kind.OTHER_LENGTH] for each in probabilities]
     assert others[1].min() > 0.98 > 0.96 > others[0].max()
 
 
@@ -172,8 +173,8 @@ def test_two_ends_that_most_views_know_to_be_hidden_are_no_other_length():
         wear_off(candidates, true, place, 0.25)
         counts.pointed[place, np.abs(candidates.corners_map[place] - before).max(axis=1) > 0.1] = 2
     unknown, known = of_one_class(candidates), of_one_class(candidates, counts)
-    assert unknown.probability[[10, 20], OTHER_LENGTH].min() > 0.5
-    assert known.probability[[10, 20], WRONG_END].min() > 0.75
+    assert unknown.probability[[10, 20], Kind.OTHER_LENGTH].min() > 0.5
+    assert known.probability[[10, 20], Kind.WRONG_END].min() > 0.75
     error = np.linalg.norm(known.candidates.corners_map - true, axis=2)
     assert (error < 3 * known.candidates.sigma_m).all()
 
@@ -254,7 +255,7 @@ def odd_and_seldom():
 
 def test_what_has_no_shape_and_is_seldom_found_is_clutter():
     found = of_one_class(*odd_and_seldom())
-    assert found.probability[7, CLUTTER] > 0.8
+    assert found.probability[7, Kind.CLUTTER] > 0.8
     assert (np.delete(found.log_odds, 7) > 5).all()
 
 
@@ -263,7 +264,7 @@ def test_what_many_images_show_as_an_arrow_is_part_of_one():
     true = painted([DASH * [(0.6 if k == 7 else 1.0), 1.0] for k in range(40)], rng)
     counts = well_seen(40)
     counts.as_symbol[7] = 8
-    assert of_one_class(solved(true, rng), counts).probability[7, PART_OF_SYMBOL] > 0.9
+    assert of_one_class(solved(true, rng), counts).probability[7, Kind.PART_OF_SYMBOL] > 0.9
 
 
 def test_what_one_image_shows_as_an_arrow_stays_a_marking():
@@ -329,7 +330,7 @@ def test_a_diamond_that_shows_only_a_piece_between_two_sides_is_not_a_small_diam
     candidates = solved(true, rng)
     candidates.corners_map[7] = piece_of(true[7])
     found = of_one_class(candidates)
-    assert found.probability[7, PIECE] > 0.8
+    assert found.probability[7, Kind.PIECE] > 0.8
     assert normalised(found, true)[7] < 20
 
 
@@ -337,7 +338,7 @@ def test_diamonds_of_a_second_stencil_are_no_pieces_of_the_first():
     rng = np.random.default_rng(17)
     true = painted([DIAMOND] * 40 + [0.7 * DIAMOND] * 12, rng)
     found = of_one_class(solved(true, rng))
-    assert (found.probability[:, OF_CLASS] > 0.9).all()
+    assert (found.probability[:, Kind.OF_CLASS] > 0.9).all()
     assert shape_rmse(found.candidates.corners_map, true) < 0.02
 
 
@@ -348,7 +349,7 @@ def test_the_odd_one_of_a_class_of_few_members_is_not_sure_of_its_size():
     candidates.corners_map[2] = piece_of(true[2])
     found = of_one_class(candidates)
     assert (normalised(found, true) < 25).all()
-    assert (found.probability[[0, 1, 3, 4], OF_CLASS] > 0.8).all()
+    assert (found.probability[[0, 1, 3, 4], Kind.OF_CLASS] > 0.8).all()
 
 
 def test_sightings_that_were_outvoted_widen_the_corner_that_they_contradict():
@@ -447,7 +448,7 @@ def bend(radius_m=15.0, apart_m=6.0):
 def test_dashes_of_a_bend_are_as_much_longer_as_they_stand_farther_apart():
     true = bend()
     found = of_one_class(solved(true, np.random.default_rng(23), 0.005))
-    assert found.probability[:, WRONG_END].max() < 0.02
+    assert found.probability[:, Kind.WRONG_END].max() < 0.02
     assert np.sqrt(np.diagonal(found.candidates.covariance_m2, axis1=1, axis2=2)).max() < 0.05
 
 

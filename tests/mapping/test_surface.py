@@ -14,7 +14,8 @@ from tests.benchmarks.right_drives import Job, map_one
 from tests.cameras import apply, level
 from tests.ports import small_port
 from v2hdm.adjust import SolveOptions, height_information, moves_with_heights, solve
-from v2hdm.association.surface import KNOTS_M, Paths, Recorded, Surface
+from v2hdm.association.paths import Paths
+from v2hdm.association.surface import KNOTS_M, Recorded, Surface
 from v2hdm.detection.batch import detect_all
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import MapFileError

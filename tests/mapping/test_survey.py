@@ -16,10 +16,10 @@ from v2hdm.catalogue import CORNERED_CLASSES
 from v2hdm.errors import ConfigError
 from v2hdm.geometry.rigid import interpolate
 from v2hdm.mapping.bundle import control_points, known_lengths, without_corner
+from v2hdm.mapping.inputs import Inputs
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import ControlOptions, MappingOptions, SizeOptions, SurveyOptions, check_options
-from v2hdm.mapping.recovery import Inputs
 from v2hdm.records import DIAMOND, LANE_DASH, Trajectory
 from v2hdm.site.options import LaneOptions
 

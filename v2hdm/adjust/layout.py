@@ -48,7 +48,6 @@ def shifted(problem: Problem, by_m: FloatArray) -> Problem:
 
 
 MIN_STEP = 1e-4  # least step between frames, as a fraction of a drift's correlation length
-
 _MIN_WHITE_SHARE = 1e-3  # a smaller white fraction of an error is rounding of the drift
 
 

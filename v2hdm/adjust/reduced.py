@@ -20,7 +20,6 @@ from v2hdm.adjust.tiles import TIP, Pattern, TiledCholesky, TiledMatrix, factori
 from v2hdm.errors import AdjustError
 
 CORNER_FLOOR = 1e-10  # information, 1 / m^2, that keeps V definite for a corner running to the horizon
-
 PIVOT_FLOOR = 1e-12  # least pivot of a corner's second coordinate, as a fraction of its information
 
 INSEPARABLE = "corners joined by known lengths cannot be solved for together: increase their sigma_m"

@@ -37,9 +37,7 @@ from v2hdm.adjust.solution import Solution
 from v2hdm.records import FloatArray
 
 _LEAST_OBSERVABLE = 1e-9  # fraction of a fault's own information, net of all else, below which it is rounding
-
 _LEAST_P = 1e-300  # a smaller p-value is zero in floating point
-
 _STRETCHES_PER_CHANGE = 2  # segments between candidate frames of a change of inputs
 
 _MOST_CHANGES = 12
@@ -51,9 +49,7 @@ _STEPS = ((1.0, 0.0), (0.0, 1.0), (0.5**0.5, 0.5**0.5), (-(0.5**0.5), 0.5**0.5))
 """Directions of position steps in the map: no direction is more than 22.5 deg from one of them."""
 
 _LEAST_SPEED_MPS = 0.5  # a slower vehicle has no course
-
 _LAGS = 1  # neighbouring segments with correlated errors
-
 _PRIOR_FREEDOM = 15.0  # degrees of freedom of the prior on each test's disagreement
 
 

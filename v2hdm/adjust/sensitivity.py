@@ -20,11 +20,8 @@ from v2hdm.geometry.tensors import NEAR_M
 from v2hdm.records import FloatArray, IntArray
 
 _STEP = 1e-3  # of the priors' central differences, in the fault's unit (s or rad): millimetres of motion
-
 STRETCHES = 24  # segments of the route: metres each, longer than the correlation of most errors
-
 _DRAWS = 16  # draws of the model's noise: they give the expected disagreement to a tenth
-
 _AT_ONCE = 64  # columns whose gradients are in memory at a time
 
 Rows = dict[str, Tensor]

@@ -152,6 +152,11 @@ class Solution:
         return sum(self.cost_terms.values())
 
     @property
+    def variance_scale(self) -> float:
+        """Factor, at least 1, that turns stated covariances into those that the residuals show."""
+        return max(1.0, self.chi2_per_dof)
+
+    @property
     def accepted(self) -> BoolArray:
         """Accepted observations (K,)."""
         return np.asarray(self.verdict == Verdict.ACCEPTED)

@@ -26,7 +26,6 @@ OUTLINE_SIGMA_PX = 2.5
 _RUN_ON_M = 1.0  # length, m, beyond a dash without paint: gaps are at least as long as dashes
 _SURE_M = 0.2  # largest sigma, m, of a point that identifies its line
 _LONG, _PARALLEL = 2.0, 0.9  # least length over width of a line's piece, and cosine between it and the line
-
 BORDER_PX = 10.0  # width of the image's border, px, within which a marking may be cut
 
 
@@ -167,15 +166,13 @@ def _pieces_on_ground(symbols: Symbols, rig: Rig) -> list[tuple[FloatArray, Floa
     """Outline (K, 2) of each symbol in the map, and standard deviations (K,) of its points, m."""
     if not len(symbols.camera):
         return []
-    length = [len(outline) for outline in symbols.outlines_pinhole_px]
-    of_point = np.repeat(np.arange(len(length)), length)
+    of_point = symbols.symbol_of_point
     points_px = np.concatenate(symbols.outlines_pinhole_px)
     seen = points_px[:, None], np.concatenate(symbols.row_shares)[:, None]
     found = _on_ground(rig, symbols.camera[of_point], symbols.frame[of_point], *seen)
     ground, by_px = (one[:, 0] for one in found)
     sigma_m = OUTLINE_SIGMA_PX * np.linalg.norm(by_px, axis=(1, 2))
-    ends = np.cumsum(length)[:-1]
-    return list(zip(np.split(ground, ends), np.split(sigma_m, ends), strict=True))
+    return list(zip(symbols.by_symbol(ground), symbols.by_symbol(sigma_m), strict=True))
 
 
 @dataclass(frozen=True)

@@ -25,11 +25,11 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 _LEAST_DEPTH_M = 1.0
 """Least depth, m, of a corner on a line to be projected: nearer, the line leaves the image steeply."""
 
+GATE_SIGMAS, MAX_GATE_M = 4.0, 1.5  # size of every gate, and its limit
+SHAPE_TOLERANCE = 0.25  # corner deviation of sightings of one shape, as a fraction of the marking's diameter
 LEAST_TOLERANCE_M = 0.05  # least tolerance, m, of corners of one shape, for small markings
-
 _CORNER_FLOOR_M = 0.001  # floor of a corner's standard deviation in fusion, m
 _HUBER_SIGMAS = 2.0  # residual in sigmas beyond which a sighting is down-weighted in its group
-
 _OPEN_END_M = 10.0  # standard deviation, m, along its side, of a corner on a line: a marking's length
 
 
@@ -167,9 +167,9 @@ def merge_groups(
     fused: FusedGroups,
     *,
     floor_m: float,
-    gate_sigmas: float,
-    max_distance_m: float,
-    shape_tolerance: float,
+    gate_sigmas: float = GATE_SIGMAS,
+    max_distance_m: float = MAX_GATE_M,
+    shape_tolerance: float = SHAPE_TOLERANCE,
 ) -> Association:
     """Merge groups of one class and shape that coincide in the map, nearest pairs first.
 

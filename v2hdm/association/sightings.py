@@ -70,6 +70,16 @@ class Symbols:
     row_shares: tuple[FloatArray, ...]
     seen: tuple[BoolArray, ...]
 
+    @property
+    def symbol_of_point(self) -> IntArray:
+        """Index (P,) of the symbol of each point of all outlines, one after the other."""
+        length = [len(outline) for outline in self.outlines_pinhole_px]
+        return np.repeat(np.arange(len(length)), length)
+
+    def by_symbol(self, values: FloatArray) -> list[FloatArray]:
+        """Values (P, ...) of the points of all outlines, split by symbol."""
+        return np.split(values, np.cumsum([len(outline) for outline in self.outlines_pinhole_px])[:-1])
+
 
 NO_SYMBOLS = Symbols(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), (), (), (), ())
 

@@ -31,6 +31,7 @@ from scipy.optimize import minimize
 from scipy.sparse import csr_array, diags_array, hstack
 from scipy.spatial import cKDTree
 
+from v2hdm.association.paths import AHEAD_M, Paths
 from v2hdm.association.sightings import Rig, Sightings, Symbols
 from v2hdm.geometry.ipm import apply_homography, pinhole_px_from_ground
 from v2hdm.geometry.planar import cross, turned_left
@@ -45,26 +46,19 @@ _SLOPE_SIGMA = 0.03
 """Standard deviation of a change of slope: roads fall by 1.5 to 2.5 % to each side of a crown (AASHTO, A
 Policy on Geometric Design of Highways and Streets, 7th ed., section 4.2.2)."""
 
-_GRADE_SIGMA = 0.1
-"""Standard deviation of the grade of the whole map: the steepest roads rise by 10 to 15 %."""
+_GRADE_SIGMA = 0.1  # standard deviation of the grade of the whole map: the steepest roads rise by 10 to 15 %
 
 _GRADES, _HINGES = 2, 1 + 2 * len(KNOTS_M)
 _SHAPE = _GRADES + _HINGES  # parameters before the spline's
 _ALONG_M, _ACROSS_M = 6.0, 5.0  # knot spacing of the spline: a third of a camera's range, a lane with margins
-
 _GRID_M, _STRIP_M = 0.5, 8.0  # grid and half width of the ground as written
 _SIDE_M = 12.5  # farther beside the path the ground continues at this height, except for the grade
 _ACROSS = int(2 * _SIDE_M / _ACROSS_M) + 3  # functions of the spline across
 _MOST_ALONG = 120  # largest number of knots along the route; longer routes have wider spacing
 _WHEELS_M = (2.8, 0.8)  # wheelbase and half the track; the vehicle's origin is under the rear axle
-
 _CURVATURE = 1e-3  # typical second difference, 1/m: a crest of 1 km radius, bank changing by 1 % in 10 m
 _SIZES = 2.0  # standard deviation of their logarithm, over all roads
-
-_STATION_M = 1.0  # least distance of places on the path: the noise of a standing vehicle is no motion
-_AHEAD_M = 30.0  # range along the path that a frame may see; beyond, the route may pass again
 _REACH_M = 40.0  # ground farther from the camera is not corrected: H is known near the path alone
-_TURN_M = 10.0  # distance that a heading difference of 1 rad counts as
 _STEPS = 12  # of the secant method; four to six suffice
 _SURE_M = 1e-7  # its tolerance
 _STEP_PX, _TOUCH_M = 0.5, 0.01  # finite differences: by pixel, and of heights by position
@@ -112,94 +106,6 @@ class Recorded:
         return self.road.height_m[near] + np.einsum("ni,ni->n", slope, off), slope
 
 
-@dataclass(frozen=True)
-class Paths:
-    """The paths of a drive's sessions through F frames."""
-
-    place: IntArray  # (F,) index of each frame's place, of N
-    points_map: FloatArray  # (N, 2) m
-    ahead: FloatArray  # (N, 2) unit vectors of the vehicle's heading
-    sense: FloatArray  # (N,) 1 when driving forwards, -1 backwards
-    station_m: FloatArray  # (N,) arc length, continued from session to session
-    bounds_m: FloatArray  # (F, 2) range of stations that a frame may see
-    position_map: FloatArray  # (F, 2) m, the vehicle's
-    heading: FloatArray  # (F, 2) unit vectors
-    visit_ends: FloatArray  # (V, 2) stations of each session's begin and end
-
-    @classmethod
-    def of(cls, map_from_vehicle: FloatArray, visit: IntArray) -> Paths:
-        """Paths of poses (F, 4, 4) of sessions (F,), each in driving order."""
-        points, first = map_from_vehicle[:, :2, 3], [0]
-        for frame in range(1, len(points)):
-            last = first[-1]
-            if visit[frame] != visit[last] or np.hypot(*(points[frame] - points[last])) >= _STATION_M:
-                first.append(frame)
-        place = np.zeros(len(points), dtype=np.int64)
-        place[first[1:]] = 1
-        place = np.cumsum(place)
-        at, ahead = points[first], map_from_vehicle[first][:, :2, 0]
-        step, begins = np.diff(at, axis=0), np.append(True, np.diff(visit[first]) != 0)
-        # A gap between sessions keeps each out of the ground of the next.
-        way_m = np.where(begins[1:], 2 * _AHEAD_M, np.linalg.norm(step, axis=1))
-        station = np.concatenate([[0.0], np.cumsum(way_m)])
-        # A place has the sense of the step before it, at a session's start of the step after it.
-        forwards = np.where(np.einsum("ni,ni->n", step, ahead[1:]) < 0, -1.0, 1.0)
-        sense = np.where(begins, np.append(forwards, 1.0), np.append(1.0, forwards))
-        span = {v: station[visit[first] == v][[0, -1]] for v in np.unique(visit).tolist()}
-        here = station[place][:, None] + np.array([-_AHEAD_M, _AHEAD_M])
-        bounds = np.clip(here, *np.array([span[v] for v in visit.tolist()]).T[:, :, None])
-        forward = map_from_vehicle[:, :2, 0]
-        heading, spans = forward / np.linalg.norm(forward, axis=1, keepdims=True), np.array([*span.values()])
-        return cls(place, at, heading[first], sense, station, bounds, points, heading, spans)
-
-    def beside(self, points_map: FloatArray, frame: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Stations (K,) and left offsets (K,), m, of points (K, 2) near frames (K,)."""
-        station, bounds = self.station_m[self.place[frame]], self.bounds_m[frame].T
-        for _ in range(4):
-            at, ahead, sense = self.at(station)
-            along = np.einsum("ki,ki->k", points_map - at, ahead) * sense
-            station = np.clip(station + along, *bounds)
-        at, ahead, sense = self.at(station)
-        off = points_map - at
-        beyond = np.einsum("ki,ki->k", off, ahead) * sense
-        return station + beyond, cross(ahead, off)
-
-    def at(self, station_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Points (K, 2), unit headings (K, 2) and senses (K,) of the path at stations (K,)."""
-        columns, last = np.hstack([self.points_map, self.ahead]), len(self.station_m) - 1
-        near = np.searchsorted(self.station_m, station_m).clip(max=last)
-        before = np.maximum(near - 1, 0)
-        begin_m, way_m = self.station_m[before], self.station_m[near] - self.station_m[before]
-        share = np.clip((station_m - begin_m) / np.where(way_m > 0, way_m, 1.0), 0.0, 1.0)[:, None]
-        at = (1 - share) * columns[before] + share * columns[near]
-        ahead = at[:, 2:] / np.maximum(np.linalg.norm(at[:, 2:], axis=1, keepdims=True), 1e-9)
-        return at[:, :2], ahead, self.sense[near]
-
-    def places(self, station_m: FloatArray, left_m: FloatArray) -> FloatArray:
-        """Map points (K, 2) at stations (K,) and left offsets (K,); straight beyond the ends."""
-        at, ahead, sense = self.at(station_m)
-        beyond = sense * (station_m - np.clip(station_m, *self.station_m[[0, -1]]))
-        left = turned_left(ahead)
-        return np.asarray(at + beyond[:, None] * ahead + left_m[:, None] * left)
-
-    def seen_from(self, map_from_vehicle: FloatArray) -> Paths:
-        """The same paths for frames at poses (F, 4, 4), in any order."""
-        position, ahead = map_from_vehicle[:, :2, 3], map_from_vehicle[:, :2, 0]
-        ahead = ahead / np.linalg.norm(ahead, axis=1, keepdims=True)
-        # Where a route crosses itself, the place passed in this direction.
-        passed = cKDTree(np.hstack([self.points_map, _TURN_M * self.ahead]))
-        _, place = passed.query(np.hstack([position, _TURN_M * ahead]))
-        station = self.station_m[place]
-        ends = self.visit_ends[np.searchsorted(self.visit_ends[:, 1], station)]
-        bounds = np.clip(station[:, None] + np.array([-_AHEAD_M, _AHEAD_M]), ends[:, :1], ends[:, 1:])
-        return replace(self, place=place, bounds_m=bounds, position_map=position, heading=ahead)
-
-    def nearest_frame(self, points_map: FloatArray) -> IntArray:
-        """The frame (K,) at the place nearest to each point (K, 2)."""
-        _, place = cKDTree(self.points_map).query(points_map)
-        return np.asarray(np.searchsorted(self.place, place), dtype=np.int64)
-
-
 def _hinges(left_m: FloatArray) -> FloatArray:
     """Heights (K, B) at left offsets (K,) per unit of each slope of the cross-section."""
     left_m = np.clip(left_m, -_SIDE_M, _SIDE_M)
@@ -219,7 +125,7 @@ def _cubic(at: FloatArray, first: float, step: float, count: int) -> tuple[IntAr
 class Surface:
     """The ground along the ``paths``."""
 
-    paths: Paths  # of the visits
+    paths: Paths  # of all sessions
     parameters: FloatArray  # (B,) grade g, slopes a, left ones first, then c, across varying fastest
     covariance: FloatArray  # (B, B) of the parameters
     knots: tuple[float, float, int]  # along the path: first and spacing, m, and number of functions
@@ -233,7 +139,7 @@ class Surface:
     @classmethod
     def level(cls, paths: Paths) -> Surface:
         """A plane, the start value."""
-        begin_m, end_m = (paths.station_m[[0, -1]] + [-_AHEAD_M, _AHEAD_M]).tolist()
+        begin_m, end_m = (paths.station_m[[0, -1]] + [-AHEAD_M, AHEAD_M]).tolist()
         step_m = max(_ALONG_M, (end_m - begin_m) / _MOST_ALONG)
         along = int(np.ceil((end_m - begin_m) / step_m)) + 3
         size = _SHAPE + along * _ACROSS
@@ -393,15 +299,12 @@ class Surface:
     def sentence(self) -> str:
         """One sentence on the range of the ground's heights."""
         at, ahead, frame = self.paths.position_map, self.paths.heading, np.arange(len(self.paths.place))
-        left, told = turned_left(ahead), []
-        for away, where in (
-            (10.0 * ahead, "10 m ahead"),
-            (4.0 * left, "4 m to the left"),
-            (-4.0 * left, "right"),
-        ):
+        left, ranges = turned_left(ahead), []
+        ways = (10.0 * ahead, "10 m ahead"), (4.0 * left, "4 m to the left"), (-4.0 * left, "right")
+        for away, where in ways:
             height_cm = 100 * self.seen_height_m(at + away, frame)
-            told.append(f"{height_cm.min():+.0f} to {height_cm.max():+.0f} cm {where}")
-        return f"the ground around the vehicle is not a plane: {', '.join(told)}"
+            ranges.append(f"{height_cm.min():+.0f} to {height_cm.max():+.0f} cm {where}")
+        return f"the ground around the vehicle is not a plane: {', '.join(ranges)}"
 
     def estimated(
         self, information: FloatArray, score: FloatArray, recorded: Recorded
@@ -559,11 +462,9 @@ class Surface:
         def moved(symbols: Symbols) -> Symbols:
             if not len(symbols.camera):
                 return symbols
-            length = [len(outline) for outline in symbols.outlines_pinhole_px]
-            of_point = np.repeat(np.arange(len(length)), length)
-            outlines = np.concatenate(symbols.outlines_pinhole_px)
-            outlines = known(symbols.camera[of_point], symbols.frame[of_point], outlines, self._flat_px)
-            return replace(symbols, outlines_pinhole_px=tuple(np.split(outlines, np.cumsum(length)[:-1])))
+            of_point, points_px = symbols.symbol_of_point, np.concatenate(symbols.outlines_pinhole_px)
+            flat_px = known(symbols.camera[of_point], symbols.frame[of_point], points_px, self._flat_px)
+            return replace(symbols, outlines_pinhole_px=tuple(symbols.by_symbol(flat_px)))
 
         return replace(
             sightings,

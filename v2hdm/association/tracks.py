@@ -13,24 +13,21 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from v2hdm.association.ground import Located
-from v2hdm.association.groups import LEAST_TOLERANCE_M, Association
+from v2hdm.association.groups import GATE_SIGMAS, LEAST_TOLERANCE_M, MAX_GATE_M, SHAPE_TOLERANCE, Association
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.geometry.ipm import ray_covariance
-from v2hdm.geometry.planar import SHIFTS, align, diameters, mean_corners
+from v2hdm.geometry.planar import SHIFTS, align, diameters, length_along, mean_corners
 from v2hdm.geometry.rigid import heading_rad
 from v2hdm.records import BoolArray, FloatArray, IntArray, PoseNoise
 
 IPM_SIGMA_RAD = 0.015  # direction error of an initial IPM: markings may seem to move between images
 REFINED_SIGMA_RAD = 0.002  # the same once the extrinsic has been optimised
-GATE_SIGMAS, MAX_GATE_M = 4.0, 1.5  # size of every gate, and its limit
-SHAPE_TOLERANCE = 0.25  # corner deviation of sightings of one shape, as a fraction of the marking's diameter
 LEAST_SIGHTINGS = 3
 """Sightings required of a marking by the naive methods, and of a track by the incremental map."""
 
 _MAX_GAP_M = 4.0  # largest travel without a sighting within a track
 _REFUSED = 1e9  # cost of a forbidden pair in the assignment
-_POSITION_FLOOR_M = 0.02
-"""Floor of a sighting's sigma, m: keeps the gate open where the stated noise is nil."""
+_POSITION_FLOOR_M = 0.02  # floor of a sighting's sigma, m: keeps the gate open where the stated noise is nil
 
 
 @dataclass
@@ -95,8 +92,7 @@ class _Linker:
         noise: PoseNoise,
     ) -> None:
         self._sightings, self._located, self._direction_rad = sightings, located, direction_rad
-        steps_m = np.linalg.norm(np.diff(map_from_vehicle[:, :2, 3], axis=0), axis=1)
-        self._odometer_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+        self._odometer_m = length_along(map_from_vehicle[:, :2, 3])
         self._heading_rad = np.unwrap(heading_rad(map_from_vehicle))
         self._ray_map = mean_corners(located.ray_map, located.valid)
         self._range_m = np.linalg.norm(self._ray_map, axis=1)

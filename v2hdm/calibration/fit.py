@@ -28,13 +28,12 @@ from kornia.geometry.linalg import transform_points
 
 from v2hdm.geometry.ipm import extrinsic_from_ipm, homography_jacobian, pinhole_px_from_ground
 from v2hdm.geometry.least_squares import Normal, covariance_of, gauss_newton, normal_equations
-from v2hdm.geometry.lens import distort_points, undistort_points
+from v2hdm.geometry.lens import distort_jacobian, undistort_points
 from v2hdm.geometry.rigid import exp, hat
 from v2hdm.geometry.tensors import inverse_depth
 from v2hdm.records import BoolArray, CameraInfo, FloatArray
 
 _WRONG_SHARE = 0.02  # prior probability that a point is wrong altogether: one slip in five tables of ten
-
 STATED_AS = 4.0  # observations that the stated errors count for: people know theirs to a factor of about 1.4
 UNKNOWNS = 6  # of a mounting
 _LEAST_VARIANCE_PX2 = 1e-9  # keeps V invertible where neither error is stated
@@ -73,10 +72,7 @@ class Seen:
     def of(cls, points_px: FloatArray, points_vehicle: FloatArray, info: CameraInfo, noise: Noise) -> Seen:
         """Recorded pixels (N, 2) of ground points (N, 2) as the camera ``info`` saw them."""
         pinhole_px = undistort_points(info, points_px)
-        steps = 0.5 * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-        moved = distort_points(info, (pinhole_px[:, None] + steps).reshape(-1, 2)).reshape(-1, 4, 2)
-        by_pinhole = np.stack([moved[:, 0] - moved[:, 1], moved[:, 2] - moved[:, 3]], axis=2)
-        return cls(info, points_px, pinhole_px, by_pinhole, points_vehicle, noise)
+        return cls(info, points_px, pinhole_px, distort_jacobian(info, pinhole_px), points_vehicle, noise)
 
     @property
     def count(self) -> int:

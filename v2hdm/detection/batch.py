@@ -33,7 +33,6 @@ _IMAGES = 24  # images that are looked at: a second and a half of work
 _LEAST_IMAGES = 10
 _APART_M = 2.0  # they are at least this far apart, m, so that markings have moved on
 _SHARE = 0.7  # paint at one place in this share of images is the vehicle: diamonds cover it in a third
-
 _MARGIN_PX = 6  # the network sees an edge this far from where it is
 
 

@@ -17,7 +17,7 @@ from v2hdm.geometry.ipm import (
     homography_jacobian,
     ipm_from_extrinsic,
 )
-from v2hdm.geometry.lens import distort_points, has_distortion, undistort_points
+from v2hdm.geometry.lens import distort_jacobian, distort_points, has_distortion, undistort_points
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import DISTORTION_COEFFICIENTS, BoolArray, Calibration, Camera, CameraInfo, FloatArray
 
@@ -25,7 +25,6 @@ _LUT_STEP_PX = 4
 _HORIZON_MARGIN_PX = 16
 
 FARTHEST_M = 60.0  # neither markings nor lines are looked for beyond: networks are shown none beyond 50 m
-
 _SURROUNDINGS_PX = 24  # so far above the farthest ground what is there helps to classify what lies on it
 
 _FINE_ENOUGH_M = 0.007
@@ -35,7 +34,6 @@ ASIDE_RAD = np.deg2rad(60)
 """A camera that looks farther than this off the way that its vehicle drives, ahead or back, looks aside."""
 
 _LEAST_BELOW_PX = 4.0  # nearer to the horizon than this nothing is known of the ground
-
 _CURVE_UNIT_PX = 100.0  # unit of the distance below the horizon in lanes' curves: their parameters are alike
 
 _PROBE_PX = 50.0
@@ -105,13 +103,11 @@ class RoadCamera:
         return distort_points(self.info, points_pinhole_px)
 
     def distort_jacobian(self, points_pinhole_px: FloatArray) -> FloatArray:
-        """Derivative (N, 2, 2) of :meth:`distort`, by central differences over one pixel."""
+        """Derivative (N, 2, 2) of :meth:`distort`."""
         points = np.asarray(points_pinhole_px, dtype=np.float64).reshape(-1, 2)
         if not self.distorted:
             return np.broadcast_to(np.eye(2), (len(points), 2, 2)).copy()
-        steps = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
-        moved = self.distort((points[:, None] + steps).reshape(-1, 2)).reshape(-1, 4, 2)
-        return np.stack([moved[:, 0] - moved[:, 1], moved[:, 2] - moved[:, 3]], axis=2)
+        return distort_jacobian(self.info, points)
 
     def ground(self, points_pinhole_px: FloatArray) -> FloatArray:
         """Where pinhole pixels (N, 2) meet the ground, vehicle frame, m; NaN at and above the horizon."""

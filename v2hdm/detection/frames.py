@@ -21,9 +21,7 @@ from v2hdm.io.safe.pixels import VIDEO_OPTIONS, read_pixels
 _log = logging.getLogger(__name__)
 
 _MOST_CAMERAS = 1 << 16  # OpenCV takes a larger index for something else
-
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")  # suffixes of images in a folder
-
 _POLL_S = 0.005  # a folder that grows is looked at this often
 _WRITTEN_S = 1.0  # an image is written within this time
 _SAME_DATE_S = (2.0, 0.05)  # changes this near in time may bear one date: whole seconds (FAT), fractions

@@ -14,9 +14,10 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from v2hdm.detection.lanes.curves import NEIGHBOURS, find_chains
+from v2hdm.detection.lanes.chains import find_chains
+from v2hdm.detection.lanes.curves import NEIGHBOURS
 from v2hdm.detection.lanes.lines import crossing_sigma_px
-from v2hdm.detection.network import Network, anchor_rows, as_probability
+from v2hdm.detection.network import Network, anchor_rows, as_probability, crossings
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.records import CameraInfo, FloatArray
 
@@ -72,13 +73,10 @@ def image_lines(network: Network, image_bgr: np.ndarray, info: CameraInfo) -> Li
     """The lines that the network shows in an image (H, W, 3) uint8; DetectorError where it cannot be run."""
     half = cv2.resize(image_bgr, None, fx=1 / _SCALE, fy=1 / _SCALE, interpolation=cv2.INTER_AREA)
     output = network.run(half)
-    rows = anchor_rows(output.lanes, network, 0, _SCALE)
-    u = np.concatenate([np.empty(0), *(row.u_px for row in rows)])
-    v = np.repeat([row.v_px for row in rows], [len(row.u_px) for row in rows]) if rows else np.empty(0)
-    odds = np.concatenate([np.empty(0), *(row.odds for row in rows)])
-    crossings_px = undistort_points(info, np.column_stack([u, v]))
-    chains = [c for c in find_chains(np.column_stack([u, v]), odds) if len(c) >= _LEAST_CROSSINGS]
-    fitted = [_fitted(crossings_px[c], _SCALE * crossing_sigma_px(odds[c])) for c in chains]
+    points_px, odds = crossings(anchor_rows(output.lanes, network, 0, _SCALE))
+    pinhole_px = undistort_points(info, points_px)
+    chains = [c for c in find_chains(points_px, odds) if len(c) >= _LEAST_CROSSINGS]
+    fitted = [_fitted(pinhole_px[c], _SCALE * crossing_sigma_px(odds[c])) for c in chains]
     level = np.round(255 * as_probability(output.paint)).astype(np.uint8)
     found = cv2.createLineSegmentDetector(cv2.LSD_REFINE_NONE).detect(level)[0]
     ends = np.zeros((0, 2, 2)) if found is None else found.reshape(-1, 2, 2).astype(np.float64)

@@ -7,7 +7,7 @@ resolution and near ground in half of it, which halves the time.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -263,6 +263,13 @@ def anchor_rows(lanes: np.ndarray, network: Network, top_px: int, scale: int) ->
         for row in range(len(odds) - 1, -1, -1)
         if (part := slice(bounds[row], bounds[row + 1])).stop > part.start
     ]
+
+
+def crossings(rows: Sequence[AnchorRow]) -> tuple[FloatArray, FloatArray]:
+    """Crossings (N, 2), px, of all ``rows`` in order, and their log odds (N,)."""
+    u_px, odds = ([np.empty(0), *(getattr(row, name) for row in rows)] for name in ("u_px", "odds"))
+    v_px = [np.empty(0), *(np.full(len(row.u_px), row.v_px) for row in rows)]
+    return np.column_stack([np.concatenate(u_px), np.concatenate(v_px)]), np.concatenate(odds)
 
 
 def check_device(device: str) -> None:

@@ -13,7 +13,6 @@ import numpy as np
 _running: ContextVar[Stopwatch | None] = ContextVar("stopwatch", default=None)
 
 KEPT = 10_000  # images whose times are kept, the last ones: a vehicle's process runs for days
-
 TOTAL = "all"  # the name of the time from beginning to end of an image, stages or not
 
 

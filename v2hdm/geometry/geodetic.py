@@ -59,7 +59,6 @@ def geodetic_from_grid(crs: str, points: FloatArray, where: str, error: type[V2h
 
 
 LOCAL = "local"  # name of the map's own frame as a coordinate system
-
 _GRID_DECIMALS, _DEGREE_DECIMALS = 4, 9  # 0.1 mm on the ground
 _BESIDE_DEG = 1.0  # a zone's grid is in use a little beyond its edges
 

@@ -18,7 +18,7 @@ from v2hdm.geometry.rigid import (
     make_transform,
     rotation_from_euler,
 )
-from v2hdm.records import CameraInfo, FloatArray
+from v2hdm.records import Camera, CameraInfo, FloatArray
 
 
 def pinhole_px_from_ground(intrinsic: FloatArray, cam_from_ground: FloatArray) -> FloatArray:
@@ -52,6 +52,11 @@ def extrinsic_from_ipm(info: CameraInfo, ipm: FloatArray) -> FloatArray:
     cam_from_vehicle = np.eye(4)
     cam_from_vehicle[:3] = np.column_stack([sign * plane, normal, sign * translation])
     return cam_from_vehicle
+
+
+def initial_extrinsic(camera: Camera) -> FloatArray:
+    """The ``cam_from_vehicle`` (4, 4) nearest to the IPM that mapping starts from."""
+    return extrinsic_from_ipm(camera.info, camera.ipm[camera.initial_ipm])
 
 
 def facing_ipm(ipm: FloatArray, seen_vehicle: FloatArray) -> FloatArray:

@@ -20,7 +20,6 @@ X = TypeVar("X")
 N = TypeVar("N", bound="Normal")
 
 _RANK = 1e-12  # relative eigenvalue of the scaled information matrix below which it is rounding
-
 _GIVE_UP = 1e8  # damping from which a cost that still rises is at its minimum up to rounding
 
 

@@ -45,6 +45,13 @@ def distort_points(info: CameraInfo, points_pinhole_px: FloatArray) -> FloatArra
     return _brown_conrady(info, points)
 
 
+def distort_jacobian(info: CameraInfo, points_pinhole_px: FloatArray) -> FloatArray:
+    """Derivative (N, 2, 2) of :func:`distort_points`, by central differences over one pixel."""
+    steps = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
+    moved = distort_points(info, (points_pinhole_px[:, None] + steps).reshape(-1, 2)).reshape(-1, 4, 2)
+    return np.stack([moved[:, 0] - moved[:, 1], moved[:, 2] - moved[:, 3]], axis=2)
+
+
 def _brown_conrady(info: CameraInfo, points_pinhole_px: FloatArray) -> FloatArray:
     """Recorded pixels (N, 2) by OpenCV's ``calib3d`` model of up to eight coefficients; skew is in K alone.
 

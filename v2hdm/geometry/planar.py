@@ -22,8 +22,8 @@ def inside_convex(polygon: FloatArray, points: FloatArray) -> BoolArray:
     """Whether points (..., 2) lie inside a convex polygon (N, 2) of either orientation; False for nan."""
     edges = np.roll(polygon, -1, axis=0) - polygon
     offsets = np.asarray(points)[..., None, :] - polygon
-    cross = edges[:, 0] * offsets[..., 1] - edges[:, 1] * offsets[..., 0]
-    return np.asarray((cross >= 0).all(axis=-1) | (cross <= 0).all(axis=-1))
+    beside = cross(edges, offsets)
+    return np.asarray((beside >= 0).all(axis=-1) | (beside <= 0).all(axis=-1))
 
 
 def cross(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -52,7 +52,7 @@ def winding(polygon: FloatArray) -> int:
     """
     edges = np.roll(polygon, -1, axis=0) - polygon
     ahead = np.roll(edges, -1, axis=0)
-    turns = edges[:, 0] * ahead[:, 1] - edges[:, 1] * ahead[:, 0]
+    turns = cross(edges, ahead)
     winding_rad = np.arctan2(turns, np.sum(edges * ahead, axis=1)).sum()
     one_way = (turns >= 0).all() or (turns <= 0).all()
     if not one_way or not turns.any() or not np.isclose(abs(winding_rad), 2 * np.pi):
@@ -66,7 +66,7 @@ def is_simple(polygon: FloatArray) -> bool:
     side, apart = ends - polygon, polygon[:, None] - polygon
     beyond = ends[:, None] - polygon
     # Signed areas (N, N) of the ends of side i beside side j: of opposite signs where i crosses j's line.
-    begin, end = (one[..., 0] * side[:, 1] - one[..., 1] * side[:, 0] for one in (apart, beyond))
+    begin, end = (cross(one, side) for one in (apart, beyond))
     crosses = begin * end < 0
     return not (crosses & crosses.T).any()
 
@@ -116,8 +116,12 @@ def points_along(line: FloatArray, at: FloatArray) -> FloatArray:
 
 def angle_between(first: FloatArray, second: FloatArray) -> FloatArray:
     """Angles (N,), rad within +-pi, from vectors (N, 2) to others, counter-clockwise."""
-    cross = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
-    return np.asarray(np.arctan2(cross, (first * second).sum(axis=1)))
+    return np.asarray(np.arctan2(cross(first, second), (first * second).sum(axis=1)))
+
+
+def wrapped(angle_rad: FloatArray) -> FloatArray:
+    """Angles (...) wrapped to +-pi."""
+    return np.asarray((angle_rad + np.pi) % (2 * np.pi) - np.pi)
 
 
 def rectangle_size(points: FloatArray) -> tuple[float, float]:

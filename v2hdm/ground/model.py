@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from v2hdm.geometry.ipm import extrinsic_from_ipm, project_ground
+from v2hdm.geometry.ipm import initial_extrinsic, project_ground
 from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.geometry.rigid import hat, rotation_from_vector
 from v2hdm.records import Camera, CameraInfo, FloatArray
@@ -91,7 +91,7 @@ class Mount:
 
 def guessed_mount(camera: Camera) -> Mount:
     """The mounting of a camera's initial IPM."""
-    return Mount.at(camera.info, extrinsic_from_ipm(camera.info, camera.ipm[camera.initial_ipm]))
+    return Mount.at(camera.info, initial_extrinsic(camera))
 
 
 @dataclass(frozen=True)

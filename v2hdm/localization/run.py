@@ -14,6 +14,7 @@ from v2hdm.association.sightings import Rig, Sightings, collect_sightings
 from v2hdm.detection.batch import detect_all
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import MapFileError
+from v2hdm.geometry.planar import wrapped
 from v2hdm.geometry.rigid import heading_rad
 from v2hdm.io.drive import as_drive
 from v2hdm.io.trajectory import write_tum
@@ -71,7 +72,7 @@ class Localised:
         estimate = self.poses.map_from_vehicle
         off = estimate[:, :2, 3] - self.recorded[:, :2, 3]
         heading = heading_rad(self.recorded)
-        turn = (heading_rad(estimate) - heading + np.pi) % (2 * np.pi) - np.pi
+        turn = wrapped(heading_rad(estimate) - heading)
         ahead = off[:, 0] * np.cos(heading) + off[:, 1] * np.sin(heading)
         left = off[:, 1] * np.cos(heading) - off[:, 0] * np.sin(heading)
         return np.column_stack([ahead, left, turn])

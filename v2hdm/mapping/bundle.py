@@ -54,8 +54,7 @@ def read_outs_s(cameras: Iterable[Camera]) -> FloatArray | None:
     return stated_s if stated_s.any() else None
 
 
-_UNSURVEYED_CENTRE_SIGMA_M = 0.3
-"""Prior sigma, m, of an unsurveyed camera centre about that of a coarse IPM."""
+_UNSURVEYED_CENTRE_SIGMA_M = 0.3  # prior sigma, m, of an unsurveyed camera centre about that of a coarse IPM
 
 HEAVE_SIGMA_M = 0.01
 """Vertical motion, m, of a vehicle's body on its suspension on paved ground."""

@@ -11,14 +11,12 @@ from v2hdm.mapping.bundle import Bundle
 from v2hdm.records import BoolArray, Camera, FloatArray, IntArray
 
 _DISTANCES = 10  # bins of a camera's views by distance, each with its own detection rate
-
 _ENDS = 60  # candidate ends of a segment within a session
 
 _PSEUDO_VIEWS = 2.0
 """Views that the drive's detection rate is worth for that of one marking: some are worn or half hidden."""
 
 _BY_MISTAKE = 0.05  # rate of a marking of one place being taken for one of the other
-
 _CONFUSED = 0.3  # fraction of markings that mix two, one of each place
 
 _HIDDEN = 0.08
@@ -26,7 +24,7 @@ _HIDDEN = 0.08
 markings of eight simulated drives (right_drives, seeds 1030 to 1037)."""
 
 
-def foreign_stretch(
+def foreign_segment(
     bundle: Bundle, sightings: Sightings, views: Views, cameras: tuple[Camera, ...]
 ) -> tuple[float, float, float]:
     """Begin and end, s, of the most likely foreign segment, and its log-likelihood ratio.

@@ -15,15 +15,16 @@ import numpy as np
 
 from v2hdm.adjust import Observations, PoseSigma
 from v2hdm.adjust.incremental import IncrementalMap, Sighted
-from v2hdm.association.groups import LEAST_TOLERANCE_M, Association, group_kinds
-from v2hdm.association.sightings import Rig, Sightings
-from v2hdm.association.tracks import (
+from v2hdm.association.groups import (
     GATE_SIGMAS,
-    LEAST_SIGHTINGS,
+    LEAST_TOLERANCE_M,
     MAX_GATE_M,
-    REFINED_SIGMA_RAD,
     SHAPE_TOLERANCE,
+    Association,
+    group_kinds,
 )
+from v2hdm.association.sightings import Rig, Sightings
+from v2hdm.association.tracks import LEAST_SIGHTINGS, REFINED_SIGMA_RAD
 from v2hdm.errors import AdjustError
 from v2hdm.geometry.planar import align, diameters
 from v2hdm.mapping.bundle import Model, control_points, drive_problem, known_lengths, observations_at

@@ -40,14 +40,12 @@ from v2hdm.site.options import LaneOptions
 _log = logging.getLogger(__name__)
 
 _SPACING_M = 2.0  # spacing of knots, m: on a turn of 8 m radius the spline is a millimetre off the circle
-
 _HELD_M = 0.01  # sigma of a knot along its line, which nothing observes
 OPEN_END_PX = 1000.0  # sigma along its line of an observation that is no point: anywhere
 _SLOPE_SIGMA = 0.02  # rad, of a piece of paint against its lane
 _LINE_SIGMA_M = 0.0015  # of a whole line in one image, by port 2's truth; without it .87 lie within 95 %
 _MEDIAN_SQUARED = 0.455  # of a chi-square distribution with one degree of freedom
 _SAME_DIRECTION = np.cos(np.deg2rad(20.0))  # least cosine between points of one line; excludes crossing lines
-
 _TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])  # (N, 2) directions times it are rotated to the left
 
 
@@ -283,7 +281,7 @@ def _drawn(lane: Lane, knots: Knots, rows: IntArray, solution: Solution, spacing
     share = weight[np.arange(len(vertex_m))[:, None], window[group]].toarray()
     share[:, len(seen) :] = 0.0
     by_corner = (share[:, :, None] * left[:, None]).reshape(-1, 8)
-    joint = solution.corner_covariance(corner[window])[group] * max(1.0, solution.chi2_per_dof)
+    joint = solution.corner_covariance(corner[window])[group] * solution.variance_scale
     variance_m2 = np.einsum("vi,vij,vj->v", by_corner, joint, by_corner) + half_m**2
     return replace(lane, points_map=drawn_map + half_m[:, None] * left, sigma_m=np.sqrt(variance_m2))
 

@@ -19,17 +19,19 @@ from v2hdm.adjust import Fault, Status, observability
 from v2hdm.association.ground import ground_points, views_of
 from v2hdm.association.groups import Association, FusedGroups, group_kinds, keep_rows, merge_groups
 from v2hdm.association.sightings import camera_of, frames_of
-from v2hdm.association.tracks import LEAST_SIGHTINGS, SHAPE_TOLERANCE
+from v2hdm.association.tracks import LEAST_SIGHTINGS
 from v2hdm.errors import ConfigError
 from v2hdm.geometry.ipm import extrinsic_from_ipm, facing_ipm, flat_motion, ipm_from_extrinsic
 from v2hdm.geometry.planar import inside_convex, is_convex
 from v2hdm.io.maps.evidence import Residuals
 from v2hdm.io.maps.features import with_heights
 from v2hdm.mapping.bundle import without_corner
+from v2hdm.mapping.conclusion import Optimised
+from v2hdm.mapping.inputs import Inputs
 from v2hdm.mapping.lanes import draw_lanes
-from v2hdm.mapping.optimise import Optimised, silent
+from v2hdm.mapping.optimise import silent
 from v2hdm.mapping.options import MappingOptions, check_options
-from v2hdm.mapping.recovery import Inputs, Outcome, optimise
+from v2hdm.mapping.recovery import Outcome, optimise
 from v2hdm.mapping.results import AdjustedPoses, ClockOffset, MethodResult
 from v2hdm.records import Drive, Exclusion, FloatArray, HdMap, Image, ImageDetections, IntArray, Lane, Marking
 from v2hdm.site.changes import Base, update_map
@@ -46,7 +48,7 @@ def adjusted_poses(outcome: Outcome) -> AdjustedPoses:
     sigma = np.stack([one.by_state() for one in bundle.model.pose_sigma])[sightings.visit]
     used = bundle.frames
     if bundle.model.solver.pose_states:
-        sigma[used] = np.sqrt(bundle.solution.covariance.poses() * max(1.0, bundle.solution.chi2_per_dof))
+        sigma[used] = np.sqrt(bundle.solution.covariance.poses() * bundle.solution.variance_scale)
     seen = np.zeros(len(sightings.stamp_s), dtype=bool)
     seen[used] = True
     frames = frames_of(drive).frame_of_image
@@ -89,7 +91,7 @@ def joint_covariance(optimised: Optimised, marking: IntArray, corner: IntArray) 
     index = bundle.corner_index[optimised.groups[marking]]
     own = index[np.arange(len(corner)), corner]
     number = np.where(own >= 0, own, index.max(axis=1))
-    out = max(1.0, bundle.solution.chi2_per_dof) * bundle.solution.corner_covariance(number)
+    out = bundle.solution.variance_scale * bundle.solution.corner_covariance(number)
     _state(out, optimised.markings, marking, corner)
     # Combined from two sources, it may have negative eigenvalues of about a square millimetre.
     values, vectors = np.linalg.eigh(out)
@@ -198,6 +200,7 @@ def run_naive(name: str, inputs: Inputs, ipm: Mapping[str, FloatArray]) -> Metho
 
 
 _NAIVE_MERGE_M = 1.0  # largest distance of two tracks of one marking in the naive methods
+_NAIVE_SHAPE_TOLERANCE = 0.5  # their corners' largest deviation, as a fraction of the marking's diameter
 
 
 def _naive_markings(
@@ -229,7 +232,7 @@ def _naive_markings(
         floor_m=_NAIVE_MERGE_M,
         gate_sigmas=np.inf,
         max_distance_m=_NAIVE_MERGE_M,
-        shape_tolerance=2 * SHAPE_TOLERANCE,
+        shape_tolerance=_NAIVE_SHAPE_TOLERANCE,
     )
     average = _average(association, corners_map)
     markings: list[Marking] = []
@@ -279,10 +282,8 @@ def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
     else:
         lanes = _lanes(inputs, ground_by_rig(drive, cameras, bundle.rig, surface))
     infos = [drive.cameras[name].info for name in inputs.sightings.cameras]
-    seen, jitter_rad = inputs.optimiser.sightings.symbols, noise.roll_pitch_rad
-    symbols, no_symbols = map_symbols(
-        seen, bundle.rig, infos, jitter_rad, optimised.markings, options.acceptance
-    )
+    given = inputs.optimiser.sightings.symbols, bundle.rig, infos, noise.roll_pitch_rad, optimised.markings
+    symbols, no_symbols = map_symbols(*given, options.acceptance)
     for kind, count in Counter(one.kind for one in no_symbols if one.reason == NO_POLYGON).items():
         _log.warning("class %s: %d left out: %s", kind, count, NO_POLYGON)
     hd_map = HdMap(optimised.markings, lanes, drive.origin, symbols, noise.position_drift_over_m)
@@ -337,9 +338,7 @@ def _brought_up_to_date(
     over_m = drive.pose_noise.position_drift_over_m
     hd_map, changes, *names = update_map(base, made.hd_map, observer, mapped, over_m)
     hd_map = replace(hd_map, ground=made.hd_map.ground)
-    residuals = made.residuals
-    if residuals is not None:
-        residuals = residuals.renamed(*names)
+    residuals = None if made.residuals is None else made.residuals.renamed(*names)
     suspicions = [replace(one, marking=int(names[0][one.marking - 1])) for one in made.suspicions]
     return replace(
         made,

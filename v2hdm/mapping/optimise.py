@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,28 +23,14 @@ from v2hdm.adjust import (
     predicts_better,
     select_model,
 )
-from v2hdm.association.ground import Located, Views, easy_views, images_with_line, images_with_symbol, locate
-from v2hdm.association.groups import (
-    Association,
-    attach,
-    fuse_groups,
-    group_kinds,
-    in_view,
-    merge_groups,
-    same_groups,
-)
+from v2hdm.association.ground import Located, Views, locate
+from v2hdm.association.groups import Association, attach, fuse_groups, in_view, merge_groups, same_groups
+from v2hdm.association.paths import Paths
 from v2hdm.association.sightings import Rig, Sightings
-from v2hdm.association.surface import Paths, Recorded, Surface
-from v2hdm.association.tracks import (
-    GATE_SIGMAS,
-    IPM_SIGMA_RAD,
-    MAX_GATE_M,
-    REFINED_SIGMA_RAD,
-    SHAPE_TOLERANCE,
-    build_tracks,
-)  # fmt: skip
+from v2hdm.association.surface import Recorded, Surface
+from v2hdm.association.tracks import IPM_SIGMA_RAD, REFINED_SIGMA_RAD, build_tracks
 from v2hdm.errors import AdjustError, MappingError
-from v2hdm.geometry.ipm import extrinsic_from_ipm, project_ground
+from v2hdm.geometry.ipm import initial_extrinsic
 from v2hdm.mapping.bundle import (
     LEAST_OBSERVATIONS,
     VARIANCE_FACTORS,
@@ -57,56 +42,26 @@ from v2hdm.mapping.bundle import (
     solve_bundle,
     vehicle_twists,
 )
+from v2hdm.mapping.conclusion import FinalSolve, Optimised, conclude
 from v2hdm.mapping.incremental import IncrementalMapper
 from v2hdm.mapping.lanes import Knots
 from v2hdm.mapping.options import AUTO, SURFACE, MappingOptions
-from v2hdm.records import (
-    BoolArray,
-    Calibration,
-    Camera,
-    Exclusion,
-    FloatArray,
-    IntArray,
-    Marking,
-    PoseNoise,
-    Road,
-    largest_noise,
-)
-from v2hdm.site.candidates import Candidates, Counts, scatter_of, with_dissent, with_shared_errors
-from v2hdm.site.markings import Suspicion, classify, most_suspicious, with_relative_sigma
-from v2hdm.site.parallax import PointViews, measure_parallax
+from v2hdm.records import BoolArray, Camera, FloatArray, PoseNoise, Road, largest_noise
 
 _log = logging.getLogger(__name__)
 
-_SETTLED_MODEL = "heave"
-"""Pose model of the solves between associations: it omits no error of a pose."""
-
+_SETTLED_MODEL = "heave"  # pose model of the solves between associations: it omits no error of a pose
 _STEEP_SINE = 0.15  # least sine of a ray's depression in the coarse stage, unless most rays are flatter
 
 _LOOSE_CLOCK_SIGMA_S = 0.3
 """Prior sigma of clock offsets, s, once a drive shows them: half a period of a slow receiver."""
 
 _GROUND_ROUNDS = 6  # most solves over improving ground; four suffice for a crown of 4 %
-
 _SETTLED_M = 1e-3  # RMS change of the observed heights at which the ground has converged
 
 
 def silent(step: str) -> None:
     """Ignore progress."""
-
-
-@dataclass(frozen=True)
-class Optimised:
-    """The result of the joint optimisation; reprojection errors are RMS over the markings' points."""
-
-    bundle: Bundle  # the adjusted extrinsics and poses
-    groups: IntArray  # of the markings
-    markings: tuple[Marking, ...]
-    excluded: tuple[Exclusion, ...]
-    calibrations: Mapping[str, Calibration]
-    reprojection_rmse_px: float  # under the optimised extrinsics
-    initial_reprojection_rmse_px: float  # under the initial ones
-    suspicions: Sequence[Suspicion] = ()  # the worst first
 
 
 class Optimiser:
@@ -128,9 +83,9 @@ class Optimiser:
         self.surface: Surface | None = None
         """The ground, unless a plane."""
         self._cameras = {name: cameras[name] for name in sightings.cameras}
-        self._noise_of_visits = pose_noise
-        self._pose_noise = largest_noise(self._noise_of_visits)
-        self._pose_sigma = self._own_noise = tuple(pose_sigma_of(one) for one in self._noise_of_visits)
+        self._noises, self._pose_noise = pose_noise, largest_noise(pose_noise)
+        self._stated_sigma = tuple(pose_sigma_of(one) for one in pose_noise)
+        self._pose_sigma = self._estimated_sigma = self._stated_sigma
         self._options, self._recorded = options, Recorded.of(road, self._pose_noise)
         self.pose_model = _SETTLED_MODEL if options.pose_model == AUTO else options.pose_model
         """The pose model, one of :data:`v2hdm.adjust.MODELS`."""
@@ -160,8 +115,7 @@ class Optimiser:
             # The coarse solve fixes the poses, on which no test of the inputs may rest.
             if number > 1 and same_groups(association, bundle.association):
                 break
-            bundle = self._solve(association, self._usable(association, bundle.rig), bundle.rig)
-            self._reweigh(bundle)
+            bundle = self._solve_all(association, bundle.rig)
         return self.settle_from(bundle, progress)
 
     def settle_from(
@@ -181,7 +135,10 @@ class Optimiser:
         progress: Callable[[str], None] = silent,
         find_knots: Callable[[Rig, Surface | None], Knots | None] = lambda rig, surface: None,
     ) -> Optimised:
-        """Choose the pose model, drop outliers of ``bundle`` from :meth:`settle`, classify the candidates."""
+        """Choose the pose model, drop outliers of ``bundle`` from :meth:`settle`, classify the candidates.
+
+        Raises MappingError if no candidate is accepted.
+        """
         if self._options.pose_model == AUTO:
             progress("choice of the pose model")
             self.pose_model = self._choose_pose_model(bundle)
@@ -197,63 +154,9 @@ class Optimiser:
             lanes = knots, final.solution.corners_map[:count]
             final = self._solve(final.association, usable, final.rig, lanes=lanes)
             final = replace(final, solution=replace(final.solution, chi2_per_dof=fit))
-        return self._conclude(final, bundle, inlier, usable)
-
-    def _conclude(self, final: Bundle, ungated: Bundle, inlier: BoolArray, usable: BoolArray) -> Optimised:
-        """Classify the candidates of ``final``, solved from the accepted observations ``inlier`` (K,) alone.
-
-        ``ungated`` has all observations; ``usable`` (S, 4) are the accepted corners. Raises MappingError if
-        no candidate is accepted.
-        """
-        final = self._with_errors_of_ground(final)
-        located = locate(self.sightings, final.rig)
-        located.informs[:] &= usable
-        fused = fuse_groups(final.association, located, jitter_rad=0.0)
-        solved = _solved_candidates(final, ungated)
-        solved = with_shared_errors(solved, fused, _scatter(final))
-        row, own = ungated.row, ungated.own_corner
-        out = np.flatnonzero(~inlier & self.sightings.valid[row, own])
-        place = ungated.group[out], ungated.corner[out]
-        row, own = row[out], own[out]
-        dissent = located.corners_map[row, own], located.covariance_m2[row, own]
-        solved = with_dissent(solved, fused, row, *place, *dissent)
-        noise = final.model.variance_factor, final.model.pose_sigma
-        corners = PointViews.of_corners(final.association, self.sightings, located, *noise)
-        parallax = measure_parallax(corners, final.association.count)
-        kind, kinds = group_kinds(final.association, self.sightings), self.sightings.kinds
-        counted = partial(self._counts, final.rig, ungated, inlier)
-        classified = classify(solved, kind, kinds, counted, parallax, self._options.acceptance)
-        scale = max(1.0, final.solution.chi2_per_dof)
-        covariance = final.solution.extrinsic_covariance * scale
-        index, names = final.camera_index, self.sightings.cameras
-        markings = with_relative_sigma(
-            classified.markings(),
-            final.corner_index[classified.accepted],
-            lambda pairs: scale * final.solution.corner_covariance(pairs),
-        )
-        squared = np.bincount(final.group, final.solution.mahalanobis2, len(classified.kind)).astype(
-            np.float64
-        )
-        used = np.isin(final.group, classified.accepted) & self.sightings.valid[final.row, final.own_corner]
-        at_start = _residuals_under(self.initial_rig, self.sightings, final, self._pose_noise.roll_pitch_rad)
-        return Optimised(
-            bundle=final,
-            groups=classified.accepted,
-            markings=markings,
-            excluded=classified.exclusions(),
-            # A camera without markings keeps its start and has no covariance.
-            calibrations={
-                name: Calibration(
-                    info=self._cameras[name].info,
-                    cam_from_vehicle=final.rig.cam_from_vehicle[c],
-                    covariance=covariance[index[name]] if name in index else None,
-                )
-                for c, name in enumerate(names)
-            },
-            reprojection_rmse_px=_root_mean_square(final.solution.residual_px[used]),
-            initial_reprojection_rmse_px=_root_mean_square(at_start[used]),
-            suspicions=most_suspicious(classified.accepted, classified.misfit, squared, classified.counts),
-        )
+        given = self.sightings, self._views, self._cameras, self.initial_rig, self._pose_noise.roll_pitch_rad
+        solve = FinalSolve(self._with_errors_of_ground(final), bundle, inlier, usable, *given)
+        return conclude(solve, self._options.acceptance)
 
     def _with_errors_of_ground(self, bundle: Bundle) -> Bundle:
         """``bundle`` with covariances inflated by the uncertainty of its ground's heights."""
@@ -266,30 +169,6 @@ class Optimiser:
         held = moves_with_heights(bundle.solution, self.surface.seen_errors_m(points_map, frame))
         covariance = replace(bundle.solution.covariance, held=held)
         return replace(bundle, solution=replace(bundle.solution, covariance=covariance))
-
-    def _counts(self, rig: Rig, bundle: Bundle, accepted: BoolArray, corners_map: FloatArray) -> Counts:
-        """Counts of candidates with corners (G, 4, 2), from observations (K,), accepted or not."""
-        count = len(corners_map)
-        group, image = bundle.group[accepted], self.sightings.image[bundle.row[accepted]]
-        shown = np.unique(np.stack([group, image]), axis=1)
-        odds = np.bincount(group, self.sightings.log_odds[bundle.row[accepted]], minlength=count)
-        easy = np.stack(easy_views(self._views, rig, list(self._cameras.values()), corners_map))
-        place, number = (pairs[0] * (1 << 32) + pairs[1] for pairs in (shown, easy))
-        found = np.isin(number, place)
-        ended = accepted & self.sightings.valid[bundle.row, bundle.own_corner]
-        ended &= np.isin(bundle.group * (1 << 32) + self.sightings.image[bundle.row], number[found])
-        corner = 4 * bundle.group[ended] + bundle.corner[ended]
-        return Counts(
-            images=np.bincount(shown[0], minlength=count),
-            observations=np.bincount(bundle.group, minlength=count),
-            agreeing=np.bincount(group, minlength=count),
-            log_odds=odds / np.maximum(np.bincount(group, minlength=count), 1),
-            easy_views=np.bincount(easy[0], minlength=count),
-            found=np.bincount(easy[0, found], minlength=count),
-            pointed=np.bincount(corner, minlength=4 * count).reshape(-1, 4),
-            as_symbol=images_with_symbol(self.sightings.symbols, rig, corners_map)
-            + images_with_line(self.sightings.lines, rig, corners_map),
-        )
 
     def clock_offsets_s(self, bundle: Bundle) -> list[dict[str, float]]:
         """Clock offsets by session and camera from a solve with a weak prior, started at ``bundle``."""
@@ -321,11 +200,6 @@ class Optimiser:
             tracks = self._track(rig, self._locate(rig), IPM_SIGMA_RAD if coarse else REFINED_SIGMA_RAD)
             return tracks, self._usable(tracks, rig)
 
-        def solve(association: Association, usable: BoolArray, rig: Rig) -> Rig:
-            bundle = self._solve(association, usable, rig)
-            self._reweigh(bundle)
-            return bundle.rig
-
         mapper = IncrementalMapper(
             self.sightings,
             self.initial_rig,
@@ -333,13 +207,11 @@ class Optimiser:
             self._pose_noise.position_m,
             self._options,
             link,
-            solve,
-            coarse_model(self.initial_rig, self._noise_of_visits, self._options),
+            lambda association, usable, rig: self._solve_all(association, rig, usable).rig,
+            coarse_model(self.initial_rig, self._noises, self._options),
         )
         association, rig = mapper.run(progress)
-        association = self._with_all_that_fit(association, rig)
-        bundle = self._solve(association, self._usable(association, rig), rig)
-        self._reweigh(bundle)
+        bundle = self._solve_all(self._with_all_that_fit(association, rig), rig)
         return self.settle_from(bundle, progress)
 
     def _fit_ground(self, bundle: Bundle, progress: Callable[[str], None], surface: Surface | None) -> Bundle:
@@ -352,9 +224,7 @@ class Optimiser:
             if number or surface is None:
                 surface, _, step_m = self._better_ground(bundle, surface)
             self.surface, self.sightings = surface, surface.flattened(self._seen, bundle.rig)
-            association = self._associate(bundle.rig)
-            bundle = self._solve(association, self._usable(association, bundle.rig), bundle.rig)
-            self._reweigh(bundle)
+            bundle = self._solve_all(self._associate(bundle.rig), bundle.rig)
             if step_m < _SETTLED_M:
                 break
         if surface is not None:
@@ -400,16 +270,8 @@ class Optimiser:
         fused = fuse_groups(tracks, located, self._pose_noise.roll_pitch_rad)
         range_m = float(np.median(located.range_m[located.valid]))
         direction_m = REFINED_SIGMA_RAD * range_m**2 / float(np.median(rig.height_m))
-        merged = merge_groups(
-            tracks,
-            self.sightings,
-            fused,
-            floor_m=float(np.hypot(self._pose_noise.position_m, direction_m)),
-            gate_sigmas=GATE_SIGMAS,
-            max_distance_m=MAX_GATE_M,
-            shape_tolerance=SHAPE_TOLERANCE,
-        )
-        return self._with_all_that_fit(merged, rig)
+        floor_m = float(np.hypot(self._pose_noise.position_m, direction_m))
+        return self._with_all_that_fit(merge_groups(tracks, self.sightings, fused, floor_m=floor_m), rig)
 
     def _with_all_that_fit(self, association: Association, rig: Rig) -> Association:
         """The groups plus ungrouped sightings, at any range, that fit exactly one of them."""
@@ -425,7 +287,7 @@ class Optimiser:
         coarse: bool = False,
         lanes: tuple[Knots, FloatArray] | None = None,
     ) -> Bundle:
-        noises, options = self._noise_of_visits, self._options
+        noises, options = self._noises, self._options
         model = (
             coarse_model(rig, noises, options)
             if coarse
@@ -437,28 +299,30 @@ class Optimiser:
             raise MappingError(f"the joint optimisation failed ({status.value}): {status.advice}")
         return bundle
 
+    def _solve_all(self, association: Association, rig: Rig, usable: BoolArray | None = None) -> Bundle:
+        """Solve with the ``usable`` corners (S, 4), by default all, and refit the observations' variance."""
+        usable = self._usable(association, rig) if usable is None else usable
+        bundle = self._solve(association, usable, rig)
+        if len(bundle.row) >= LEAST_OBSERVATIONS:
+            factor = self._variance_factor * bundle.solution.observation_factor
+            self._variance_factor = float(np.clip(factor, *VARIANCE_FACTORS))
+        return bundle
+
     def _weigh_poses(self, bundle: Bundle) -> Bundle:
         """The solve under the larger of stated and estimated noise; positions', unobservable, as stated."""
-        stated = tuple(pose_sigma_of(one) for one in self._noise_of_visits)
-        self._own_noise = estimate_noise(replace(bundle.problem, pose_sigma=stated), bundle.solution)
-        self._pose_sigma = tuple(_larger(one, own) for one, own in zip(stated, self._own_noise, strict=True))
-        bundle = self._solve(bundle.association, self._usable(bundle.association, bundle.rig), bundle.rig)
-        self._reweigh(bundle)
-        return bundle
+        stated = self._stated_sigma
+        estimated = estimate_noise(replace(bundle.problem, pose_sigma=stated), bundle.solution)
+        self._estimated_sigma = estimated
+        self._pose_sigma = tuple(_larger(*sigmas) for sigmas in zip(stated, estimated, strict=True))
+        return self._solve_all(bundle.association, bundle.rig)
 
     @property
     def pose_noise(self) -> dict[str, float]:
         """Estimated over stated pose noise, by kind."""
-        own = [self._own_noise, [pose_sigma_of(one) for one in self._noise_of_visits]]
+        both = self._estimated_sigma, self._stated_sigma
         kinds = ("position_m", "heading_rad", "roll_pitch_rad")
-        totals = {kind: [max(getattr(one, kind) for one in sigmas) for sigmas in own] for kind in kinds}
-        return {kind: found / stated for kind, (found, stated) in totals.items() if stated > 0}
-
-    def _reweigh(self, bundle: Bundle) -> None:
-        """Scale the observations' variances by their residuals under ``bundle``."""
-        if len(bundle.row) >= LEAST_OBSERVATIONS:
-            factor = self._variance_factor * bundle.solution.observation_factor
-            self._variance_factor = float(np.clip(factor, *VARIANCE_FACTORS))
+        largest = {kind: [max(getattr(one, kind) for one in sigmas) for sigmas in both] for kind in kinds}
+        return {kind: estimated / stated for kind, (estimated, stated) in largest.items() if stated > 0}
 
     def _as_stated(self, bundle: Bundle) -> Problem:
         """The problem of ``bundle``, from its end, with the detector's own covariances."""
@@ -492,8 +356,7 @@ def _larger(stated: PoseSigma, own: PoseSigma) -> PoseSigma:
 def initial_rig(cameras: Mapping[str, Camera], map_from_vehicle: FloatArray) -> Rig:
     """Extrinsics nearest to each camera's initial IPM, with the recorded poses (F, 4, 4)."""
     intrinsic = np.stack([camera.info.intrinsic for camera in cameras.values()])
-    start = [extrinsic_from_ipm(one.info, one.ipm[one.initial_ipm]) for one in cameras.values()]
-    return Rig(intrinsic, np.stack(start), map_from_vehicle)
+    return Rig(intrinsic, np.stack([initial_extrinsic(one) for one in cameras.values()]), map_from_vehicle)
 
 
 def rolling(rig: Rig, cameras: Iterable[Camera], sightings: Sightings, estimate: bool) -> Rig:
@@ -504,54 +367,3 @@ def rolling(rig: Rig, cameras: Iterable[Camera], sightings: Sightings, estimate:
     twists = vehicle_twists(sightings.map_from_vehicle, sightings.stamp_s, sightings.visit)
     read_out_s = np.zeros(len(rig.intrinsic)) if stated_s is None else stated_s
     return replace(rig, read_out_s=read_out_s, twist_vehicle=twists)
-
-
-def _scatter(bundle: Bundle) -> FloatArray:
-    """Variance inflation of each corner's (G, 4) images relative to the usual."""
-    corner, size = 4 * bundle.group + bundle.corner, 4 * bundle.association.count
-    freedom = 2.0 - bundle.problem.observations.on_line[: len(corner)]
-    squared, degrees = np.zeros(size), np.full(size, -2.0)
-    np.add.at(squared, corner, bundle.solution.mahalanobis2)
-    np.add.at(degrees, corner, freedom)
-    return scatter_of(squared.reshape(-1, 4), degrees.reshape(-1, 4))
-
-
-def _solved_candidates(bundle: Bundle, ungated: Bundle) -> Candidates:
-    """Corners of every group of ``bundle``; a group that lost all of them is placed as in ``ungated``.
-
-    Covariances are scaled by chi^2 per degree of freedom above one.
-    """
-    known = bundle.corner_index >= 0
-    covariance = np.full((len(known), 8, 8), np.nan)
-    scale = max(1.0, bundle.solution.chi2_per_dof)
-    for count in range(1, 5):
-        groups = np.flatnonzero(known.sum(axis=1) == count)
-        if not len(groups):
-            continue
-        corner = np.nonzero(known[groups])[1].reshape(-1, count)
-        indices = np.take_along_axis(bundle.corner_index[groups], corner, axis=1)
-        rows = (2 * corner[..., None] + np.arange(2)).reshape(len(groups), -1)
-        blocks = scale * bundle.solution.corner_covariance(indices)
-        covariance[groups[:, None, None], rows[:, :, None], rows[:, None, :]] = blocks
-    before = ungated.corners_map
-    count = np.maximum(np.isfinite(before[..., 0]).sum(axis=1), 1)
-    about = np.nansum(before, axis=1) / count[:, None]
-    return Candidates.seen(bundle.corners_map, covariance, about)
-
-
-def _residuals_under(rig: Rig, sightings: Sightings, bundle: Bundle, jitter_rad: float) -> FloatArray:
-    """Residuals (K, 2), px, of the bundle's observations under ``rig`` with its own best corners."""
-    fused = fuse_groups(bundle.association, locate(sightings, rig), jitter_rad)
-    camera, frame = sightings.camera[bundle.row], sightings.frame[bundle.row]
-    points = fused.corners_map[bundle.group, bundle.corner]
-    own = bundle.row, bundle.own_corner
-    cam_from_map = rig.cam_from_map(camera, frame, sightings.row_share[own])
-    pixel, _ = project_ground(rig.intrinsic[camera], cam_from_map, points[:, None])
-    return np.asarray(pixel[:, 0] - sightings.corners_pinhole_px[own])
-
-
-def _root_mean_square(residual_px: FloatArray) -> float:
-    """RMS norm of residuals (K, 2), without points that have no projection."""
-    squared = np.sum(residual_px**2, axis=1)
-    finite = squared[np.isfinite(squared)]
-    return float(np.sqrt(np.mean(finite))) if len(finite) else float("nan")

@@ -9,85 +9,37 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import compress
 
 import numpy as np
 
 from v2hdm.adjust import CHANGES, Fault, ScoreTest, pose_innovations, score_faults
 from v2hdm.association.ground import views_of
-from v2hdm.association.groups import Association
-from v2hdm.association.sightings import Rig, Sightings, collect_sightings
-from v2hdm.association.surface import Surface
+from v2hdm.association.sightings import Sightings
 from v2hdm.errors import AdjustError, MappingError
-from v2hdm.geometry.rigid import camera_centre, with_clock_offsets
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.mapping.bundle import Bundle, name_of
-from v2hdm.mapping.foreign import foreign_stretch
-from v2hdm.mapping.lanes import Knots, find_knots
-from v2hdm.mapping.optimise import Optimised, Optimiser
-from v2hdm.mapping.options import AUTO, INCREMENTAL, SURFACE, MappingOptions, SurveyOptions
+from v2hdm.mapping.conclusion import Optimised
+from v2hdm.mapping.foreign import foreign_segment
+from v2hdm.mapping.input_errors import CLEAR_SIGMAS, is_contradicted, is_doubtful, log_odds
+from v2hdm.mapping.inputs import Inputs
+from v2hdm.mapping.optimise import Optimiser
+from v2hdm.mapping.options import AUTO, INCREMENTAL, SURFACE, SurveyOptions
 from v2hdm.mapping.results import CameraFit, Contradiction, SolveEvidence
-from v2hdm.records import Drive, FloatArray, ImageDetections
-from v2hdm.site.options import JOINT
+from v2hdm.records import Drive, FloatArray
 
 _log = logging.getLogger(__name__)
-
-CLEAR_SIGMAS = 4.0  # of a visible error; in one of 400 correct drives one of its forty tests exceeds it
-
-_PRIOR_ODDS = 1 / 400  # prior odds of a wrong input: one in forty, in one of ten drives of a new vehicle
-
-_DOUBT = 0.05  # probability of a wrong input that a PASS, stated at 95 %, leaves
-
-
-@dataclass(frozen=True)
-class _Size:
-    """Limits on the size of a fault, in its unit."""
-
-    least: float  # smaller errors do not matter
-    # largest model sigma at which a drive observes it. A less observable fault resembles others, and absorbs
-    # remaining errors: k1 on a straight street, for instance.
-    sigma: float
-    usual: float  # median size where an input is wrong
-    most: float  # largest physical value; beyond it, the cause is unforeseen
-
-
-_SIZES: Mapping[Fault, _Size] = {
-    Fault.CLOCK: _Size(0.005, 0.02, 0.05, 5.0),
-    Fault.CLOCK_DRIFT: _Size(0.01, 0.02, 0.05, 5.0),
-    Fault.FOCAL: _Size(0.003, 0.01, 0.02, 1.0),
-    Fault.DISTORTION: _Size(0.002, 0.02, 0.05, 1.0),
-    Fault.PRINCIPAL: _Size(5.0, 10.0, 20.0, 500.0),
-    Fault.SLOPE: _Size(0.002, 0.003, 0.01, 0.3),
-    Fault.CROWN: _Size(0.005, 0.005, 0.02, 0.15),
-    Fault.COURSE: _Size(0.3, 0.3, 1.0, 10.0),
-    Fault.STEP: _Size(0.03, 0.02, 0.1, 100.0),
-    Fault.KNOCK: _Size(0.002, 0.002, 0.01, 1.0),
-    Fault.SURVEY: _Size(0.03, 0.15, 0.1, 20.0),
-    Fault.LEVER: _Size(0.03, 0.15, 0.5, 20.0),
-    Fault.SIZE: _Size(0.01, 0.05, 0.05, 10.0),
-    Fault.CONTROL: _Size(0.02, 0.05, 0.1, 1e3),
-    Fault.DATUM: _Size(0.02, 0.05, 0.1, 1e3),
-}
-
-OBSERVABLE_SIGMA = {fault: size.sigma for fault, size in _SIZES.items()}
-"""Largest standard deviation, in the fault's unit, at which a drive observes it."""
-
-_LOOSE_CENTRE_SIGMA_M = 10.0
-"""Standard deviation, m, of a surveyed axis after its contradiction: uninformative."""
 
 _AMBIGUOUS_SHARE = 0.8
 """Fraction of its sigmas from which another camera's fault may be the cause: a straight road at constant
 speed determines the distance of two centres, or the difference of two clocks, alone."""
 
-CLOCK_OBSERVABLE_S = 0.004  # largest sigma of an observed clock offset, s: two are 8 ms
-
 _CLOCK_CORRECTABLE_S = 0.006
 """Largest sigma, s, at which a contradicted clock is corrected: a late clock adds scatter to its estimate."""
 
 _CENTRE_OBSERVABLE_M = 0.1  # sigma of a centre, m, above which a drive needs its survey: it shifts the map
-
 _MOST_CORRECTIONS = 4  # most inputs dropped one by one; with more of them wrong nothing is reliable
 
 _LIKE_GROUND = (Fault.CROWN, Fault.FOCAL, Fault.DISTORTION, Fault.PRINCIPAL)
@@ -95,40 +47,6 @@ _LIKE_GROUND = (Fault.CROWN, Fault.FOCAL, Fault.DISTORTION, Fault.PRINCIPAL)
 
 _MEDIAN_SQUARED = 2 * float(np.log(2))
 """Median of a squared Mahalanobis distance: chi-square with two degrees of freedom."""
-
-
-@dataclass(frozen=True)
-class Inputs:
-    """Inputs of a camera set, as given or corrected."""
-
-    drive: Drive
-    detections: Sequence[ImageDetections]
-    cameras: Sequence[str]
-    options: MappingOptions
-
-    @cached_property
-    def sightings(self) -> Sightings:
-        """The detections of these cameras as one table."""
-        return collect_sightings(self.drive, self.detections, self.cameras)
-
-    @cached_property
-    def optimiser(self) -> Optimiser:
-        """An optimiser of these inputs, not yet run."""
-        drive, options = self.drive, self.options
-        views = views_of(drive, self.cameras)
-        return Optimiser(self.sightings, views, drive.cameras, drive.noises, options, drive.road)
-
-    def find_knots(self, rig: Rig, surface: Surface | None) -> Knots | None:
-        """Knots of lanes in the adjustment, found under ``rig``; None if there are none."""
-        options = self.options.lanes
-        if options.model != JOINT:
-            return None
-        return find_knots(self.drive, self.detections, self.sightings.cameras, rig, surface, options)
-
-    @cached_property
-    def tracks(self) -> Association:
-        """Sightings linked from image to image under the initial IPMs."""
-        return self.optimiser.initial_tracks()
 
 
 @dataclass(frozen=True)
@@ -157,7 +75,7 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
             left = None if _is_ambiguous(worst, found) else _recovered(inputs, worst, settled)
         if worst is None or left is None:
             break
-        corrected += _contradictions(settled, (worst,), inputs.sightings, visit_names(drive))
+        corrected += _contradictions(settled, (worst,), inputs.sightings, _session_names(drive))
         one, about = corrected[-1], f" {corrected[-1].about}" if corrected[-1].about else ""
         _log.warning(
             "%s: mapped again, for the drive contradicts the %s%s of %s by %.0f sigmas (%+.3g %s)",
@@ -168,7 +86,7 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
     # 4. Choose the pose model, solve without outliers and classify the candidates.
     optimised = optimiser.finish(settled, progress, inputs.find_knots)
     corrected = [_as_solved(one, settled) for one in corrected if _is_of_the_map(one, survey, optimised)]
-    suspected = _contradictions(settled, found, inputs.sightings, visit_names(drive))
+    suspected = _contradictions(settled, found, inputs.sightings, _session_names(drive))
     evidence = _evidence(settled, suspected, corrected, optimiser, optimised.bundle, inputs.sightings)
     return Outcome(inputs, optimised.bundle, replace(evidence, foreign=foreign)), optimised
 
@@ -227,7 +145,7 @@ def _foreign(
     """
     drive, names = inputs.drive, inputs.cameras
     cameras = tuple(drive.cameras[name] for name in names)
-    begin_s, end_s, gain = foreign_stretch(settled, inputs.sightings, views_of(drive, names), cameras)
+    begin_s, end_s, gain = foreign_segment(settled, inputs.sightings, views_of(drive, names), cameras)
     suspect = next(filter(is_doubtful, found), None)
     if suspect is None or gain <= 0:
         return begin_s, end_s, gain
@@ -250,7 +168,7 @@ def _frame_s(settled: Bundle, sightings: Sightings) -> FloatArray:
     return sightings.stamp_s[np.unique(sightings.frame[settled.row])]
 
 
-def visit_names(drive: Drive) -> tuple[str, ...]:
+def _session_names(drive: Drive) -> tuple[str, ...]:
     """Names of a joined drive's sessions; none for a single session."""
     return tuple(visit.name for visit in drive.joined)
 
@@ -328,49 +246,6 @@ def _is_ambiguous(worst: ScoreTest, found: Sequence[ScoreTest]) -> bool:
     return max(rivals, default=0.0) > _AMBIGUOUS_SHARE * worst.sigmas
 
 
-def is_contradicted(one: ScoreTest) -> bool:
-    """Whether an input's error matters, is observable, and is more likely than not."""
-    return matters(one) and one.sigmas > even_sigmas(one)
-
-
-def is_doubtful(one: ScoreTest) -> bool:
-    """Whether an input's error matters, is observable, and has more than 5 % probability."""
-    return matters(one) and one.sigmas > even_sigmas(one, _DOUBT / (1 - _DOUBT))
-
-
-def even_sigmas(one: ScoreTest, odds: float = 1.0) -> float:
-    """Sigmas at which an input's error reaches ``odds``; errors are Cauchy, scaled by the usual size."""
-    return math.sqrt(2 * max(math.log(odds / _PRIOR_ODDS) - _log_spread(one), 0.0))
-
-
-def doubt(one: ScoreTest) -> float:
-    """Log-odds of an input's error, from its sigmas and size."""
-    return one.sigmas**2 / 2 + _log_spread(one) + math.log(_PRIOR_ODDS)
-
-
-def _log_spread(one: ScoreTest) -> float:
-    """Log of the prior probability of an error within one sigma of its value."""
-    usual = _SIZES[one.fault].usual
-    size = math.sqrt(2 * math.pi) * one.sigma / (math.pi * usual * (1 + (one.value / usual) ** 2))
-    return math.log(max(size, 1e-300))
-
-
-def matters(one: ScoreTest) -> bool:
-    """Whether an observable input's error is larger than a drive tolerates."""
-    size = _SIZES[one.fault]
-    return one.model_sigma <= size.sigma and abs(one.value) > size.least
-
-
-def is_physical(one: ScoreTest) -> bool:
-    """Whether an error of this size is possible; otherwise the cause is unforeseen."""
-    return abs(one.value) <= _SIZES[one.fault].most
-
-
-def log_odds(one: ScoreTest) -> float:
-    """Score of a fault as the cause: its gain, and the Cauchy prior of its size."""
-    return one.gain - math.log1p((one.value / _SIZES[one.fault].usual) ** 2)
-
-
 def _clocks(bundle: Bundle) -> tuple[dict[str, tuple[float, float]], ...]:
     offset_s = bundle.solution.clock_offset_s.T.tolist()
     if not bundle.model.solver.clock_offset:
@@ -392,11 +267,11 @@ def _recovered(inputs: Inputs, worst: ScoreTest, settled: Bundle) -> Inputs | No
     if worst.fault is Fault.CLOCK:
         if worst.sigma > _CLOCK_CORRECTABLE_S:
             return None
-        return _with_clocks(inputs, inputs.optimiser.clock_offsets_s(settled))
+        return inputs.with_clocks(inputs.optimiser.clock_offsets_s(settled))
     if worst.fault in (Fault.SURVEY, Fault.LEVER):
         if worst.sigma > _CENTRE_OBSERVABLE_M:
             return None
-        return _without_axis(inputs, _cameras_of(settled, worst), worst.axis)
+        return inputs.without_axis(_cameras_of(settled, worst), worst.axis)
     options = inputs.options
     if worst.fault is Fault.SIZE:
         # One wrong size means paint of another standard; corners of others may look like outliers, which the
@@ -409,38 +284,6 @@ def _recovered(inputs: Inputs, worst: ScoreTest, settled: Bundle) -> Inputs | No
     else:
         return None
     return replace(inputs, options=options)
-
-
-def _with_clocks(inputs: Inputs, later_s: Sequence[Mapping[str, float]]) -> Inputs | None:
-    """Images posed ``later_s`` after their present times, by session and camera."""
-    drive = inputs.drive
-    if any(visit.trajectory is None for visit in drive.visits):
-        return None
-    so_far = {(image.visit, image.camera): image.clock_offset_s for image in drive.images}
-    moved = drive
-    for visit, later in enumerate(later_s):
-        own = {name: so_far[visit, name] + late for name, late in later.items() if (visit, name) in so_far}
-        moved = with_clock_offsets(moved, own, max_gap_s=float("inf"), visit=visit)
-    number = {image.path: n for n, image in enumerate(moved.images)}
-    detections = [
-        replace(one, image=number[drive.images[one.image].path])
-        for one in inputs.detections
-        if drive.images[one.image].path in number
-    ]
-    return replace(inputs, drive=moved, detections=sorted(detections, key=lambda one: one.image))
-
-
-def _without_axis(inputs: Inputs, names: Sequence[str], axis: int) -> Inputs | None:
-    """The survey without one axis of some cameras' centres; None if already unknown."""
-    cameras = dict(inputs.drive.cameras)
-    for name in names:
-        prior = cameras[name].centre_prior
-        if prior is None or prior.sigma_m[axis] >= _LOOSE_CENTRE_SIGMA_M:
-            return None
-        sigma_m = prior.sigma_m.copy()
-        sigma_m[axis] = _LOOSE_CENTRE_SIGMA_M
-        cameras[name] = replace(cameras[name], centre_prior=replace(prior, sigma_m=sigma_m))
-    return replace(inputs, drive=replace(inputs.drive, cameras=cameras))
 
 
 def _contradictions(

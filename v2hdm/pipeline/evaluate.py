@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.geometry.ipm import extrinsic_from_ipm
+from v2hdm.geometry.ipm import initial_extrinsic
 from v2hdm.io.drive.truth import has_truth, read_truth
 from v2hdm.mapping.results import MethodResult
 from v2hdm.records import Drive, Truth
@@ -68,7 +68,7 @@ def _extrinsics(drive: Drive, methods: CameraSets, truth: Truth | None) -> dict[
             continue
         for name, calibration in optimised.calibrations.items():
             camera = drive.cameras[name]
-            initial = extrinsic_from_ipm(camera.info, camera.ipm[camera.initial_ipm])
+            initial = initial_extrinsic(camera)
             true = truth.cam_from_vehicle[name] if truth else None
             found: dict[str, Any] = extrinsic_figures(calibration.cam_from_vehicle, initial, true)
             found["certainty"] = optimised.certainty.get(name, "")

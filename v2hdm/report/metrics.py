@@ -40,11 +40,10 @@ class MarkingMetrics:
 
 def driven_past(drive: Drive, truth: Truth, cameras: Sequence[str]) -> BoolArray:
     """True markings (J,) that the cameras saw whole in their ROI in :data:`MIN_SIGHTINGS` images."""
-    plan, heights = (
-        np.array([np.zeros(4) if one is None else one for one in ours], dtype=np.float64)
-        for ours in ((m.corners_map for m in truth.map.markings), (m.heights_m for m in truth.map.markings))
-    )
-    corners = np.concatenate([plan.reshape(-1, 4, 2), heights.reshape(-1, 4, 1)], axis=2)
+    corners = np.zeros((len(truth.map.markings), 4, 3))
+    for j, marking in enumerate(truth.map.markings):
+        corners[j, :, :2] = marking.corners_map
+        corners[j, :, 2] = 0.0 if marking.heights_m is None else marking.heights_m
     sightings = np.zeros(len(corners), dtype=int)
     for i, image in enumerate(drive.images):
         if image.camera not in cameras:
@@ -179,7 +178,7 @@ def lane_metrics(lanes: Sequence[Lane], truth: Truth) -> LaneMetrics:
         length_m=mapped_m,
         mean_lateral_error_m=float(lateral[near].mean()) if near.any() else none,
         rms_lateral_error_m=float(np.sqrt((lateral[near] ** 2).mean())) if near.any() else none,
-        inside_95=float((sigmas <= 1.96).mean()) if len(sigmas) else none,
+        inside_95=float((sigmas <= _TWO_SIDED_95).mean()) if len(sigmas) else none,
         mapped_fraction=float(covered.mean()) if len(covered) else none,
         false_length_m=float((~near).sum() * SAMPLE_STEP_M),
     )

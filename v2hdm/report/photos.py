@@ -89,7 +89,6 @@ def with_legend(canvas: np.ndarray, entries: Sequence[tuple[Pen | None, str]]) -
 
 
 _FARTHEST_M = 40.0  # farther lines overlap near the horizon
-
 _ALONG_M, _ACROSS_M = 5.0, 2.0  # spacing of the grid along and across the vehicle
 _HALF_WIDTH_M = 8.0  # half width of the grid about the camera
 _NEAREST_M = 0.3  # least depth of ground in an image
@@ -256,7 +255,6 @@ def _write(canvas: np.ndarray, text: str, at: tuple[int, int], colour: tuple[int
 _OVERLAY_RANGE_M = 30.0
 
 _BEFORE = Pen(OKABE_ITO["orange"], dash_px=(9.0, 6.0))  # the map under the initial calibration
-
 OVERLAY = {"Opt": Pen(OKABE_ITO["sky"])}  # the map under the results
 
 

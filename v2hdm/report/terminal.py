@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -25,22 +25,26 @@ METHODS: Mapping[str, str] = {
 """The methods of the paper (IROS 2023), in the order of its tables."""
 
 _Column = tuple[str, int, float]  # key in metrics.json, digits behind the point, factor
-AGAINST_TRUTH: Mapping[str, _Column] = {
+_AGAINST_TRUTH: Mapping[str, _Column] = {
     "recall": ("recall", 3, 1.0),
     "false": ("false_markings", 0, 1.0),
     "corner RMSE (cm)": ("corner_rmse_m", 1, 100.0),
     "bias (cm)": ("corner_bias_m", 1, 100.0),
 }
-WITHOUT_TRUTH: Mapping[str, _Column] = {
+_WITHOUT_TRUTH: Mapping[str, _Column] = {
     "sigma (cm)": ("median_sigma_m", 1, 100.0),
     "reprojection (px)": ("reprojection_rmse_px", 2, 1.0),
 }
 
 
+def figure_columns(figures: Iterable[Mapping[str, Any]]) -> Mapping[str, _Column]:
+    """The columns of a table of methods: errors where any of their ``figures`` has ground truth."""
+    return _AGAINST_TRUTH if any("recall" in one for one in figures) else _WITHOUT_TRUTH
+
+
 def results_table(title: str, results: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Table:
     """Markings, recall and corner errors by method and camera set, from ``results`` in ``metrics.json``."""
-    has_truth = any("recall" in row for rows in results.values() for row in rows.values())
-    columns = AGAINST_TRUTH if has_truth else WITHOUT_TRUTH
+    columns = figure_columns(row for rows in results.values() for row in rows.values())
     table = new_table(title, ("method", "cameras"), ("markings", *columns))
     others = sorted({method for rows in results.values() for method in rows} - set(METHODS))
     for method in (*METHODS, *others):

@@ -13,9 +13,7 @@ from v2hdm.geometry.planar import block_diagonal
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 _UNSEEN_M2 = 1e4  # variance of an unseen corner, m^2: effectively infinite at the size of a site
-
 CORRELATION = 0.2  # of a corner's errors between images; .3 overstates sides' sigmas, .1 understates corners'
-
 _KNOWN_SIGMA_M = 0.5  # largest sigma, m, of a known corner: a fraction of any marking's length
 
 TOO_UNCERTAIN, LACKS_A_CORNER = "its position is too uncertain", "a corner was never seen twice"

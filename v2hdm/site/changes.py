@@ -88,11 +88,8 @@ def fused_markings(
 
 
 _DRIFT_OVER_M = 30.0  # correlation length of markings' common error, m, if the map does not state it
-
 _LIKELY = 0.5  # probability at which a marking is reported as moved, gone or new
-
 _LEAST_PAIRED = 0.3  # least fraction of inspected markings that a drive of the same site finds again
-
 _LOOKED = 3  # easy views of a place that count as an inspection for that fraction
 
 

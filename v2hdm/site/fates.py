@@ -22,14 +22,12 @@ from v2hdm.site.map_errors import SHIFT, Errors, Shift
 from v2hdm.site.shapes import rigid_motions
 
 _MOVED_SIGMA_M = 0.5  # per coordinate, m, of a repainted marking about its old place: a new line
-
 _TURNED_SIGMA_RAD = 0.2  # of its rotation, rad
 _REACH_M = 4 * _MOVED_SIGMA_M  # largest distance of one marking in both maps, m
 _OTHER_SHAPE_M = 0.1
 """Standard deviation, m, of corners between two markings of a class: two shapes, or two lengths."""
 
 _MISREAD_M = 0.3  # standard deviation, m, of an end or corner that one drive took from another edge
-
 _MISREAD_SHARE = 0.05  # fraction of markings with an end or corner that one of two drives misread
 _PRIOR_COUNT = np.array([47.0, 1.0, 2.0])
 """Dirichlet prior: of fifty markings, the numbers that stay, are repainted elsewhere, are gone."""

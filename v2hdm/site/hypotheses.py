@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from enum import IntEnum
 from functools import cached_property
 from itertools import product
 
@@ -22,27 +23,26 @@ from v2hdm.site.candidates import Candidates
 from v2hdm.site.series import Series, in_series
 from v2hdm.site.shapes import SHAPE_SIGMA_M, Laid, PaintError, Shape, lay, learn_paint_error, parallelograms
 
-OF_CLASS, OTHER_LENGTH, WRONG_END, PIECE, OWN_SHAPE, PART_OF_SYMBOL, CLUTTER = KINDS = range(7)
-"""Kinds of hypotheses; the first five are markings. N and O are
 
-- of class: N as the class's markings, or as long as the spacing of its line shows;
-- other length: N of any length, for paint rolled by the metre;
-- wrong end: N as one of these, O an end worn away or running into other paint, cut at any angle;
-- piece: N as the class, O two adjacent sides hidden;
-- own shape: N of any size;
-- part of symbol: N somewhat like the class, or of any size;
-- clutter: the same, and O for each corner.
-"""
+class Kind(IntEnum):
+    """Kinds of hypotheses, with the covariances N and O; those before :attr:`PART_OF_SYMBOL` are markings."""
+
+    OF_CLASS = 0  # N as the class's markings, or as long as the spacing of its line shows
+    OTHER_LENGTH = 1  # N of any length, for paint rolled by the metre
+    WRONG_END = 2  # N as one of these, O an end worn away or running into other paint, cut at any angle
+    PIECE = 3  # N as the class, O two adjacent sides hidden
+    OWN_SHAPE = 4  # N of any size
+    PART_OF_SYMBOL = 5  # N somewhat like the class, or of any size
+    CLUTTER = 6  # the same, and O for each corner
+
 
 _SIZE_SIGMA_M = 1.0  # sigma of a side, m, of a marking of its own size: covers any paint on a road
-
 _LENGTH_SIGMA_M = 0.3  # prior sigma of the length of paint rolled by the metre, m: a tenth of it
 
 _REPEATED_COUNT = 3.0
 """Concentration of the Dirichlet process of lengths: paint of another length repeats a known one."""
 
 _MISPLACED_M = 0.3  # sigma, m, of a worn end, or of any corner of clutter (17 worn ends: .08 to .74 m)
-
 _WORN_SHARE = 0.5  # the same relative to the length: any part may be worn away
 
 _SLANT_OF_END, _SLANT_OF_PIECE = 0.5, 0.1
@@ -77,7 +77,7 @@ _Ends = Sequence[tuple[FloatArray, FloatArray]]
 class Hypothesis:
     """One hypothesis on N candidates."""
 
-    kind: int
+    kind: Kind
     log_prior: float
     candidates: Candidates
     directions: FloatArray  # (N, 5, 8) in which deviations are tested
@@ -122,7 +122,7 @@ class Hypothesis:
         A candidate's deviation from a shape of its class narrows their variance down.
         """
         paint_m2 = np.full(len(self.residual), paint.sigma_m**2)
-        if self.kind == OF_CLASS:
+        if self.kind == Kind.OF_CLASS:
             pairs = zip(self.residual, self.formal, strict=True)
             paint_m2 = np.array([paint.variance_m2(*pair) for pair in pairs])
         covariance = self.candidates.covariance_m2 + self.misplaced + paint_m2[:, None, None] * np.eye(8)
@@ -162,11 +162,11 @@ class Hypotheses:
     @property
     def weight(self) -> FloatArray:
         """Probability (N,) of a marking."""
-        return np.asarray(self.probability[:, :PART_OF_SYMBOL].sum(axis=1))
+        return np.asarray(self.probability[:, : Kind.PART_OF_SYMBOL].sum(axis=1))
 
     def add(
         self,
-        kind: int,
+        kind: Kind,
         part: float,
         laid: Laid,
         scatter: FloatArray,
@@ -191,7 +191,7 @@ class Hypotheses:
         own = Laid(parallelograms(candidates.corners_map) + centre[:, None], turns, centre, shifts)
         own = lay(shapes[0].corners, SHAPE_SIGMA_M, candidates)[0] if shapes else own
         any_size = SHAPE_SIGMA_M**2 * np.eye(8) + _OWN_SIZE
-        self.add(OWN_SHAPE, 1.0, own, any_size)
+        self.add(Kind.OWN_SHAPE, 1.0, own, any_size)
         self._add_unlike(1 - _LIKE_CLASS if shapes else 1.0, own, any_size, ragged)
 
     def _add_shape(self, shape: Shape, part: float) -> FloatArray:
@@ -202,7 +202,7 @@ class Hypotheses:
         alike = scatter + (_LIKE_SHARE * sides_m.min()) ** 2 * np.eye(8)
         ends = _inwards(laid.corners_map, shape.is_elongated)
         worn = np.zeros((len(ends), len(self.candidates)))
-        self.add(OF_CLASS, part / 2, otherwise, scatter)
+        self.add(Kind.OF_CLASS, part / 2, otherwise, scatter)
         if shape.is_elongated:
             worn = _worn_evidence(self.candidates, [end for end, _ in ends], self.weight)
             at_end = np.stack([end.reshape(-1, 4, 2).any(axis=2) for end, _ in ends])
@@ -211,7 +211,7 @@ class Hypotheses:
             alike = alike + (_WORN_SHARE * sides_m.max()) ** 2 * _outer(shorter)
             self._add_lengths(part, laid, shape.sigma_m, shorter, ends, worn)
         else:
-            self.add(OF_CLASS, part / 2, laid, scatter)
+            self.add(Kind.OF_CLASS, part / 2, laid, scatter)
             self._add_wrong_ends(part, laid, [(1.0, scatter)], ends, worn, [0.0])
             self._add_pieces(part, laid, scatter, ends)
         # An end of clutter is ragged with probability one half.
@@ -226,8 +226,8 @@ class Hypotheses:
         scatter: FloatArray = sigma_m**2 * np.eye(8)
         spread_m, again = self._other_lengths(laid, shorter, sigma_m)
         any_length = scatter + spread_m**2 * _outer(shorter)
-        self.add(OTHER_LENGTH, part, laid, any_length, beside=again)
-        other = self.share[OTHER_LENGTH] / (self.share[OF_CLASS] + self.share[OTHER_LENGTH])
+        self.add(Kind.OTHER_LENGTH, part, laid, any_length, beside=again)
+        other = self.share[Kind.OTHER_LENGTH] / (self.share[Kind.OF_CLASS] + self.share[Kind.OTHER_LENGTH])
         ways = [(part, laid, scatter)]
         series = in_series(self.candidates, self.believed, laid, shorter, sigma_m, self.weight)
         if series is not None:
@@ -239,13 +239,13 @@ class Hypotheses:
                 (part * series.longer_often, replace(laid, corners_map=stretched), about),
             ]
         for each, one, about in ways:
-            self.add(OF_CLASS, each / 2, one, about)
+            self.add(Kind.OF_CLASS, each / 2, one, about)
             lengths = (1 - other, about), (other, any_length)
             self._add_wrong_ends(each, one, lengths, ends, worn, [0.0, _SLANT_OF_END])
 
     def _other_lengths(self, laid: Laid, shorter: FloatArray, sigma_m: float) -> tuple[float, FloatArray]:
         """Sigma, m, of other lengths, and the log-likelihood ratio (N,) of a repeated to a new one."""
-        weight = self.probability[:, OTHER_LENGTH]
+        weight = self.probability[:, Kind.OTHER_LENGTH]
         off_m = np.sum((laid.corners_map - self.candidates.corners_map).reshape(-1, 8) * shorter, axis=1)
         own_m2 = self.candidates.along(shorter, shorter)
         squared = _REPEATED_COUNT * _LENGTH_SIGMA_M**2 + weight @ np.maximum(off_m**2 - own_m2, 0.0)
@@ -275,33 +275,33 @@ class Hypotheses:
             for (way, beside), (likely, scatter), slant in product(ways, lengths, slants):
                 each = part * likely / len(ends) / len(ways) / len(slants)
                 misplaced = _outer(way) + _cut(laid.corners_map, end, slant)
-                self.add(WRONG_END, each, laid, scatter, misplaced, way[..., None], beside)
+                self.add(Kind.WRONG_END, each, laid, scatter, misplaced, way[..., None], beside)
 
     def _add_pieces(self, part: float, laid: Laid, scatter: FloatArray, ends: _Ends) -> None:
         """Add those of two adjacent sides hidden, as another vehicle may leave a piece in view."""
         for (one, reach_m), (other, across_m) in product(ends[:2], ends[2:]):
             both = np.asarray(_WORN_SHARE * np.stack([reach_m * one, across_m * other], axis=2))
             cut = _cut(laid.corners_map, one + other, _SLANT_OF_PIECE)
-            self.add(PIECE, part / 4, laid, scatter, both @ np.swapaxes(both, 1, 2) + cut, both)
+            self.add(Kind.PIECE, part / 4, laid, scatter, both @ np.swapaxes(both, 1, 2) + cut, both)
 
     def _add_unlike(self, part: float, laid: Laid, scatter: FloatArray, ragged: FloatArray) -> None:
         """Add those of other paint and of clutter."""
-        self.add(PART_OF_SYMBOL, part, laid, scatter, beside=ragged)
-        self.add(CLUTTER, part, laid, scatter + _MISPLACED_M**2 * np.eye(8), beside=ragged)
+        self.add(Kind.PART_OF_SYMBOL, part, laid, scatter, beside=ragged)
+        self.add(Kind.CLUTTER, part, laid, scatter + _MISPLACED_M**2 * np.eye(8), beside=ragged)
 
     def paint_error(self, probability: FloatArray, whole: BoolArray) -> PaintError:
         """Paint error from the deviations of ``whole`` candidates (N,), each ``found`` with (H, N)."""
         members = [
             (one.residual[k], one.formal[k])
             for one, probable in zip(self.found, probability > 0.5, strict=True)
-            if one.kind == OF_CLASS
+            if one.kind == Kind.OF_CLASS
             for k in np.flatnonzero(whole & probable)
         ]
         return learn_paint_error([residual for residual, _ in members], [formal for _, formal in members])
 
     def mixture(self, joint: FloatArray, paint: PaintError) -> Candidates:
         """Mean and covariance of the corners over the markings among :attr:`found`, of ``joint`` (H, N)."""
-        markings = [k for k, one in enumerate(self.found) if one.kind < PART_OF_SYMBOL]
+        markings = [k for k, one in enumerate(self.found) if one.kind < Kind.PART_OF_SYMBOL]
         weight = np.exp(joint[markings] - logsumexp(joint[markings], axis=0))[..., None, None]
         each = [self.found[k].corners(paint) for k in markings]
         mean = np.asarray(sum(w * one.corners_map for w, one in zip(weight, each, strict=True)))

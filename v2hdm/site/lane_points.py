@@ -18,7 +18,7 @@ from v2hdm.association.sightings import LEAST_HEIGHT_M, Rig, frames_of, row_shar
 from v2hdm.association.surface import Surface
 from v2hdm.geometry.ipm import direction_covariance, facing_ipm, flat_motion, ground_from_pinhole_px
 from v2hdm.geometry.lens import undistort_points
-from v2hdm.geometry.planar import turned_left
+from v2hdm.geometry.planar import cross, turned_left
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import (
     LANE_BOUNDARY,
@@ -33,11 +33,8 @@ from v2hdm.records import (
 
 NODE_SPACING_M = 0.5  # between the vertices of a polyline
 HALF_WIDTH_M, _HALF_LENGTH_M = 0.3, 0.8  # half size across and along a line of the averaged neighbourhood
-
 CENTRE_SIGMA_PX = 1.0  # noise of a detected centre across its line: a cell of the network's output
-
 OWN_SIGMA_M = 0.01  # sigma, m, besides pixel noise: the nearest image must not outvote all others
-
 _TANGENT_REACH = 2  # points to either side whose difference gives the direction
 _GUIDE_RANGE = 1.8  # range of whole lines relative to paint's: they only show what is one line
 
@@ -293,7 +290,7 @@ def _coordinates(
     seed, point = pairs
     offset = cloud.points_map[point] - points[seed]
     along = np.einsum("pi,pi->p", offset, tangent[seed])
-    across = offset[:, 1] * tangent[seed, 0] - offset[:, 0] * tangent[seed, 1]
+    across = cross(tangent[seed], offset)
     cosine = np.abs(np.einsum("pi,pi->p", cloud.tangent[point], tangent[seed]))
     return along, across, cosine
 
@@ -339,7 +336,7 @@ def _thin(points: FloatArray, tangent: FloatArray, images: IntArray) -> IntArray
         kept.append(node)
         others = np.array(near[node])
         offset = points[others] - points[node]
-        across = offset[:, 1] * tangent[node, 0] - offset[:, 0] * tangent[node, 1]
+        across = cross(tangent[node], offset)
         same = np.abs(tangent[others] @ tangent[node]) >= _SAME_DIRECTION
         alive[others[same & (np.abs(across) <= 0.5 * HALF_WIDTH_M)]] = False
     return np.array(kept, dtype=np.int64)

@@ -39,9 +39,7 @@ _ASIDE_M = 1.3  # distance of bare ground from a marking, m
 _CLEAR_M = 1.0  # least distance of bare ground from all known paint, m
 _LEAST_LEARNED = 8  # least places for the drive's own contrast of paint or ground; with fewer it is unknown
 _HIDDEN_SIGMA = 0.5  # sigma of the contrast, log ratio of grey values, of anything that hides the ground
-
 _HIDDEN_SHARE = 0.5  # fraction of the existing, undetected markings that are hidden; the others are worn
-
 _STRANGE_SHARE = 0.05  # fraction of bare places with something else: a stain, the edge of a shadow
 _LEAST_SIGMA = 0.02  # floor of the sigma of bare ground's contrast: the grain of an image
 
@@ -116,7 +114,6 @@ _MOST_SQUARED = 25.0
 """Largest squared Mahalanobis distance of a sighting's corners from a place that it shows."""
 
 _NEAR_M = 12.0  # largest range, m, of a constant detection rate
-
 _SAME_PLACE_M = 0.05  # largest distance, m, of another marking of the class that occupies a place
 _REACH_M = 2.0  # largest distance, m, of a sighting's centre from a place's: it may show a dash's end alone
 

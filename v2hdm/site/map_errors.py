@@ -20,9 +20,7 @@ from v2hdm.geometry.planar import length_along, points_along
 from v2hdm.records import FloatArray, IntArray, Lane, Marking, Symbol
 
 _UNKNOWN_SIGMA_M = 0.02  # per coordinate, m, of corners whose map states none: drawn over an image
-
 _LEAST_SIGMA_M = 1e-4  # floor of the sigmas of a marking's own error, m: the rounding of a survey
-
 SHIFT = np.tile(np.eye(2), (4, 1))  # derivative of the stacked corners (8,) by a shift (2,)
 
 
@@ -98,7 +96,7 @@ class Shift:
 
     @cached_property
     def _weighed(self) -> FloatArray:
-        """That inverse times the differences, (P, 2)."""
+        """The differences (P, 2) times the inverse of their covariance."""
         return np.asarray((self._inverse @ self.off_map.ravel()).reshape(-1, 2))
 
     def without_itself(self, pair: int) -> tuple[FloatArray, FloatArray]:
@@ -148,7 +146,6 @@ class Shift:
 
 
 _SAME_LINE_M = 0.3  # largest distance of one line in two maps, m: parallel lines are twice as far apart
-
 _LEAST_SHARED = 0.5  # least fraction of a new line's vertices on an earlier line for it to be that line
 
 

@@ -17,7 +17,7 @@ from v2hdm.errors import MappingError
 from v2hdm.records import Exclusion, FloatArray, IntArray, Marking
 from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN, Candidates, Counts, variance_prior
 from v2hdm.site.corrections import MAX_OVERLAP, Stated, overlap
-from v2hdm.site.hypotheses import CLUTTER, PART_OF_SYMBOL
+from v2hdm.site.hypotheses import Kind
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import Parallax
 from v2hdm.site.posterior import CORNERS_OF_IMAGE, Posterior, posterior
@@ -112,7 +112,7 @@ def classify(
     found = replace(found, candidates=stated.placed(found.candidates, first.candidates))
     found.log_odds[list(stated.kept)] = np.inf
     least = np.log(options.min_probability / (1 - options.min_probability))
-    part = found.probability[:, PART_OF_SYMBOL] > found.probability[:, CLUTTER]
+    part = found.probability[:, Kind.PART_OF_SYMBOL] > found.probability[:, Kind.CLUTTER]
     verdict: list[str | None] = [
         None if odds >= least else OF_SYMBOL if part[group] else _CLUTTER_BY[found.evidence[group].argmin()]
         for group, odds in enumerate(found.log_odds)
@@ -151,7 +151,6 @@ JointCovariance = Callable[[IntArray], FloatArray]
 """Covariances (P, 8, 8), m^2, of the stacked corners of pairs of diagonals (P, 4), two corners of each."""
 
 _NEIGHBOUR_M = 10.0  # distance at which markings are compared, m: a vehicle's length, for manoeuvres
-
 _FARTHEST_M = 15.0  # largest distance to another marking, m, for a relative standard deviation
 _CENTRES = np.kron(np.array([[0.5, 0.5, -0.5, -0.5]]), np.eye(2))
 

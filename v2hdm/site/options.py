@@ -26,7 +26,7 @@ AFTER, JOINT = "after", "joint"  # values of ``mapping.lanes.model``
 
 @dataclass(kw_only=True)
 class LaneOptions:
-    """How lane paint becomes polylines.
+    """Options of the polylines of lane paint.
 
     ``model`` is ``after``, which draws lanes after the adjustment, or ``joint``, which adjusts them as cubic
     splines whose vertices have sigmas. Lane paint counts up to ``max_range_m`` from the camera; a vertex

@@ -26,9 +26,7 @@ _ELSEWHERE = ((2.0, 0.5), (0.0, 0.5))
 """Mean and standard deviation of s of other things: at half the camera's height, or moving along."""
 
 _UNEVEN = 0.1  # sigma of s on the ground: a bump of a tenth of the camera's height, or poor fits from afar
-
 _ONE_VIEW_M = 0.1  # motion, m, within which images are one view with one error: the same texture by an edge
-
 _POSE_SIGMAS = 4.0  # largest distance, in sigmas, of recorded positions of one place
 _LEVEL_RAD = 1e-5  # standard deviation, rad, of an attitude treated as exact
 _LEAST_SIGMA_M = 1e-3  # floor of a point's standard deviation, m, however precise an image states it

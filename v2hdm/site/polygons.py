@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from v2hdm.geometry.ipm import apply_in_front, homography_jacobian
-from v2hdm.geometry.planar import is_simple, signed_area
+from v2hdm.geometry.planar import cross, is_simple, length_along, points_along, signed_area
 from v2hdm.records import BoolArray, FloatArray, IntArray
 from v2hdm.site.shapes import EDGE_SIGMA_M, SHAPE_SIGMA_M, learn_paint_error
 
@@ -35,7 +35,6 @@ _TURN_SIGMA_RAD = 0.25  # of a piece of outline against its edge
 _ROUND_PX = 3.0  # distance from a corner, px, that the network rounds
 _STRAY, _STRAY_PX = 0.2, 25.0  # fraction of an outline along no edge, and its range, px
 LEAST_EXPLAINED = 1 - 2 * _STRAY  # least fraction of the outlines along their polygon's edges
-
 _ANYWHERE_M = 0.5  # sigma, m, of vertices about the outline common to sightings
 UNSEEN_M = _ANYWHERE_M / 2  # sigma, m, of vertices on which images add little to that prior
 _SIZE_SIGMA, _FREEDOM = 0.02, 4.0
@@ -295,9 +294,7 @@ class _Template:
 def _evenly(ring: FloatArray) -> FloatArray:
     """Points (100, 2), evenly spaced along a closed polygon (N, 2)."""
     closed = np.vstack([ring, ring[:1]])
-    at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
-    wanted = np.linspace(0, at[-1], 100, endpoint=False)
-    return np.column_stack([np.interp(wanted, at, axis) for axis in closed.T])
+    return points_along(closed, np.linspace(0, length_along(closed)[-1], 100, endpoint=False))
 
 
 def _fit(traces: Traces, start: FloatArray, prior: Prior, steps: int = _STEPS) -> Polygon:
@@ -340,7 +337,7 @@ def _explained(
     along = (side / length[..., None])[image]
     apart = (traces.points_px - shift_px[image])[:, None] - pixel[image]
     at = (apart * along).sum(axis=2)
-    off = apart[..., 1] * along[..., 0] - apart[..., 0] * along[..., 1]
+    off = cross(along, apart)
     end = np.nan_to_num(np.minimum(at, length[image] - at))
     turn = np.arccos(np.clip((along * traces.along_px[:, None]).sum(axis=2), -1, 1))
     squared = (off**2 + np.minimum(end, 0.0) ** 2) / sigma_px**2 + (turn / _TURN_SIGMA_RAD) ** 2

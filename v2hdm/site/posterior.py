@@ -18,23 +18,13 @@ from scipy.stats import f, norm, t
 
 from v2hdm.records import FloatArray, IntArray
 from v2hdm.site.candidates import Candidates, Counts
-from v2hdm.site.hypotheses import (
-    CLUTTER,
-    KINDS,
-    OF_CLASS,
-    OTHER_LENGTH,
-    OWN_SHAPE,
-    PART_OF_SYMBOL,
-    Hypotheses,
-)
+from v2hdm.site.hypotheses import Hypotheses, Kind
 from v2hdm.site.shapes import learn_paint_error, learn_shapes
 
 _PRIOR_COUNT = np.array([14.0, 0.5, 0.5, 0.5, 2.0, 1.0, 1.5])
 """Dirichlet prior: expected counts of the hypotheses among about twenty candidates."""
 
-_RATE_STRENGTH = 4.0
-"""Images that the class's detection rate is worth: how similar its markings' rates are."""
-
+_RATE_STRENGTH = 4.0  # images that the class's detection rate is worth: how similar its markings' rates are
 _NEGLECTED_SHARE = 0.1  # fraction of markings that are worn or hidden, with any detection rate
 
 _CLUTTER_FOUND = (0.5, 2.0)
@@ -44,9 +34,7 @@ _BARE_FOUND = (0.05, 10.0)
 """Beta distribution of the rate of such detections on bare ground: one view in two hundred."""
 
 _CLUTTER_REPEATS = 0.7  # probability that clutter seen in some images is seen in one more
-
 _AGREEING = (0.93, 0.6)  # fraction of observations of a marking, and of clutter, that agree with the solution
-
 CORNERS_OF_IMAGE = 4.0  # number of correlated observations: those of one image
 
 _UNDER_SYMBOL = (0.02, 0.5)
@@ -61,7 +49,6 @@ rendered port 335 diamonds have 7.9, 91 dashes 7.4, 3 stop lines 1.1), least sca
 (1.0 for diamonds), and degrees of freedom of Student's t distribution, for worn ones."""
 
 _OTHER_ODDS = (1.5, 1.5)  # mean and sigma of the same for anything else (14 candidates of a rendered port)
-
 _PASSES = 2  # rounds of expectation maximisation; a third changes no figure of six drives by a hundredth
 
 
@@ -79,7 +66,7 @@ class Posterior:
 def posterior(candidates: Candidates, kind: IntArray, counts: Counts) -> Posterior:
     """Posterior of G candidates of classes ``kind`` (G,), given their positions and counts."""
     total = len(candidates)
-    probability, evidence = np.zeros((total, len(KINDS))), np.zeros((total, 5))
+    probability, evidence = np.zeros((total, len(Kind))), np.zeros((total, 5))
     log_odds, misfit = np.zeros(total), np.ones(total)
     corners, covariance = candidates.corners_map.copy(), candidates.covariance_m2.copy()
     for one in np.unique(kind):
@@ -97,32 +84,33 @@ def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
     # Initially, candidates that agreeing images show whole are taken for markings, others for clutter.
     whole, believed = np.asarray(candidates.known.all(axis=1)), candidates
     taken = whole & (2 * counts.agreeing > counts.observations)
-    probability = np.eye(len(KINDS))[np.where(taken, OF_CLASS, CLUTTER)]
+    probability = np.eye(len(Kind))[np.where(taken, Kind.OF_CLASS, Kind.CLUTTER)]
     for number in range(1, _PASSES + 1):
-        weight = probability[:, :PART_OF_SYMBOL].sum(axis=1)
+        weight = probability[:, : Kind.PART_OF_SYMBOL].sum(axis=1)
         vague = _vague_evidence(counts, weight)
         space = Hypotheses(candidates, believed, probability, share, paint, vague)
         shapes = learn_shapes(candidates.subset(weight > 0.5))
         space.add_all(shapes)
         by_kind, sources = np.array([one.kind for one in space.found]), _counted(counts, weight)
-        marking, of_sources = by_kind < PART_OF_SYMBOL, np.maximum(by_kind - OWN_SHAPE, 0)
+        marking = by_kind < Kind.PART_OF_SYMBOL
+        column = np.where(marking, 0, by_kind - Kind.OWN_SHAPE)  # of the sources: marking, symbol, clutter
         shaped = np.stack([one.log_likelihood for one in space.found])
         joint = shaped + np.array([one.log_prior for one in space.found])[:, None]
-        joint += sources.sum(axis=0)[:, of_sources].T
+        joint += sources.sum(axis=0)[:, column].T
         if space.series is not None:
-            placed = [one.corners(paint) for one in space.found if one.kind < PART_OF_SYMBOL]
+            placed = [one.corners(paint) for one in space.found if one.kind < Kind.PART_OF_SYMBOL]
             joint[marking] += np.stack([space.series.evidence(one) for one in placed])
         each = np.exp(joint - logsumexp(joint, axis=0))
-        probability = np.stack([each[by_kind == one].sum(axis=0) for one in KINDS], axis=1)
+        probability = np.stack([each[by_kind == one].sum(axis=0) for one in Kind], axis=1)
         share = _PRIOR_COUNT + probability.sum(axis=0)
         share /= share.sum()
         paint = space.paint_error(each, whole)
         if space.series is not None and number < _PASSES:
             believed = space.mixture(joint, paint)
     log_odds = logsumexp(joint[marking], axis=0) - logsumexp(joint[~marking], axis=0)
-    by_shape = shaped[marking].max(axis=0) - shaped[by_kind == CLUTTER].max(axis=0)
+    by_shape = shaped[marking].max(axis=0) - shaped[by_kind == Kind.CLUTTER].max(axis=0)
     evidence = np.column_stack([by_shape, *(sources[:, :, 0] - sources[:, :, 2])])
-    like_others = [one.fit[2] for one in space.found if one.kind in (OF_CLASS, OTHER_LENGTH)]
+    like_others = [one.fit[2] for one in space.found if one.kind in (Kind.OF_CLASS, Kind.OTHER_LENGTH)]
     # Paint errors follow Student's t distribution, their squares Fisher's F.
     misfit = f.sf(np.min(like_others, axis=0) / 5, 5, paint.freedom) if shapes else np.ones(len(candidates))
     return Posterior(probability, log_odds, space.mixture(joint, paint), evidence, misfit)

@@ -87,9 +87,9 @@ def in_series(
         return None
     # The largest stretch in bends acts as a prior: uncertain spacings are shrunk to the class's length.
     unknown_m2, most_m2 = (length_m / step_m) ** 2 * apart_m2, (length_m * np.log(_STRETCH) / 2) ** 2
-    told = np.where(in_line, most_m2 / (most_m2 + unknown_m2), 0.0)
-    longer_m = length_m * told * np.where(in_line, stretch - 1, 0.0)
-    longer_m2 = np.where(in_line, told * unknown_m2, 0.0)
+    trust = np.where(in_line, most_m2 / (most_m2 + unknown_m2), 0.0)
+    longer_m = length_m * trust * np.where(in_line, stretch - 1, 0.0)
+    longer_m2 = np.where(in_line, trust * unknown_m2, 0.0)
     fixed = norm.pdf(own_m[known], 0.0, np.sqrt(variance[known]))
     spread_m, often = _regularity((own_m - longer_m)[known], (variance + longer_m2)[known], fixed)
     longer_sigma_m = np.where(in_line, np.sqrt(longer_m2 + spread_m**2), 0.0)

@@ -37,8 +37,7 @@ _CELL_M = 0.02
 """Cells of the average, m; its contour is interpolated between them and simplified by half a cell."""
 
 _MOST_CELLS = 500  # most cells along the longer side of the average; larger symbols have larger cells
-_PART = 0.3
-"""Least weighted fraction of the images of a place that show paint there: some miss a part."""
+_PART = 0.3  # least weighted fraction of the images of a place that show paint there: some miss a part
 
 NO_POLYGON = "no simple polygon explains its outline"
 

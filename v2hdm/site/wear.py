@@ -36,7 +36,6 @@ _GROUND_SIGMA, _PAINT_SIGMA = 0.08, 0.09
 """Sigmas of the contrast of bare ground, and of full paint as a share of its own (43 rendered markings)."""
 
 _INDEPENDENT = 12.0  # cells that count as independent: flakes, stains and the blur of images span many
-
 _CONTRASTS = np.exp(np.linspace(np.log(0.2), np.log(4.0), 28))  # of full paint over its ground
 _ROUNDS, _FITTED = 12, 160  # of expectation and maximisation, and cells that take part
 _MODEL_SIGMA = (0.045, 0.3)
@@ -123,7 +122,8 @@ def with_wear(
     """
     cells = [Cells.of(one.corners_map) for one in hd_map.markings]
     ground = None if surface is None else surface.seen_from(np.array(map_from_vehicle))
-    for number, light in _seen(cells, images, map_from_vehicle, calibrations, grey, shown, threads, ground):
+    footage = _Footage(images, map_from_vehicle, calibrations, ground)
+    for number, light in _lights(cells, footage, _best_views(cells, footage, shown), grey, threads):
         cells[number].add(light)
     known = [k for k, one in enumerate(cells) if len(one.contrasts) >= _VIEWS[0]]
     shares = _shares([cells[k].fit() for k in known], [hd_map.markings[k].kind for k in known])
@@ -165,59 +165,72 @@ _LIGHT = np.where(_LIGHT <= 0.04045, _LIGHT / 12.92, ((_LIGHT + 0.055) / 1.055) 
 """Linear light by the grey value of sRGB, an adequate model of cameras for a ratio."""
 
 
-def _seen(
-    cells: Sequence[Cells],
-    images: Sequence[Image],
-    map_from_vehicle: Sequence[FloatArray],
-    calibrations: Mapping[str, Calibration],
-    grey: Callable[[Image], NDArray[np.float32]],
-    shown: Set[tuple[int, int]],
-    threads: int,
-    ground: Surface | None,
-) -> Iterator[tuple[int, FloatArray]]:
-    """(marking, light of its cells) in the nearest images that show it whole."""
-    if not cells:
-        return
+@dataclass(frozen=True)
+class _Footage:
+    """Images with their poses (4, 4) on the flat road, their calibrations, and the ground unless a plane."""
 
-    def pinhole_px(index: int, places_map: FloatArray) -> tuple[FloatArray, FloatArray]:
-        own = calibrations[images[index].camera]
-        cam_from_map = own.cam_from_vehicle @ inverse(map_from_vehicle[index])
-        if ground is not None:
-            places_map = ground.on_plane(places_map, cam_from_map, index)
+    images: Sequence[Image]
+    map_from_vehicle: Sequence[FloatArray]
+    calibrations: Mapping[str, Calibration]
+    ground: Surface | None
+
+    def pinhole_px(self, index: int, places_map: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Pinhole px (N, 2) and depth (N,), m, of ground points (N, 2) in an image."""
+        own = self.calibrations[self.images[index].camera]
+        cam_from_map = own.cam_from_vehicle @ inverse(self.map_from_vehicle[index])
+        if self.ground is not None:
+            places_map = self.ground.on_plane(places_map, cam_from_map, index)
         return project_ground(own.info.intrinsic, cam_from_map, places_map)
 
+
+def _best_views(
+    cells: Sequence[Cells], footage: _Footage, shown: Set[tuple[int, int]]
+) -> dict[int, list[int]]:
+    """By image, the markings that it shows whole, as one of the nearest images of each."""
+    if not cells:
+        return {}
     tree = cKDTree([one.places_map.mean(axis=(0, 1)) for one in cells])
     views: list[list[tuple[float, int]]] = [[] for _ in cells]
-    for index, (image, pose) in enumerate(zip(images, map_from_vehicle, strict=True)):
-        if image.camera not in calibrations:
+    for index, (image, pose) in enumerate(zip(footage.images, footage.map_from_vehicle, strict=True)):
+        if image.camera not in footage.calibrations:
             continue
-        own = calibrations[image.camera]
-        size = np.array([own.info.width, own.info.height])
+        info = footage.calibrations[image.camera].info
         for number in tree.query_ball_point(pose[:2, 3], _NEAR_M):
             if (index, number) not in shown:
                 continue
             edge = cells[number].places_map[[0, 0, -1, -1], [0, -1, 0, -1]]
-            pinhole, depth_m = pinhole_px(index, edge)
+            pinhole, depth_m = footage.pinhole_px(index, edge)
             if (depth_m <= 0.3).any():
                 continue
-            px = distort_points(own.info, pinhole)
-            if (px >= 2).all() and (px <= size - 3).all():
-                away_m = float(np.linalg.norm(edge.mean(axis=0) - pose[:2, 3]))
-                views[number].append((away_m, index))
+            px = distort_points(info, pinhole)
+            if (px >= 2).all() and (px <= (info.width - 3, info.height - 3)).all():
+                views[number].append((float(np.linalg.norm(edge.mean(axis=0) - pose[:2, 3])), index))
     wanted: dict[int, list[int]] = {}
     for number, found in enumerate(views):
         for _, index in sorted(found)[: _VIEWS[1]] if len(found) >= _VIEWS[0] else ():
             wanted.setdefault(index, []).append(number)
+    return wanted
+
+
+def _lights(
+    cells: Sequence[Cells],
+    footage: _Footage,
+    wanted: Mapping[int, Sequence[int]],
+    grey: Callable[[Image], NDArray[np.float32]],
+    threads: int,
+) -> Iterator[tuple[int, FloatArray]]:
+    """Each wanted marking of each image, and the light of its cells (along, across) there."""
     order = sorted(wanted)
     with ThreadPoolExecutor(threads) as readers:
         for start in range(0, len(order), 8 * threads):  # limits the decoded images in memory
             some = order[start : start + 8 * threads]
-            for index, pixels in zip(some, readers.map(lambda one: grey(images[one]), some), strict=True):
-                own = calibrations[images[index].camera]
+            read = readers.map(lambda one: grey(footage.images[one]), some)
+            for index, pixels in zip(some, read, strict=True):
+                info = footage.calibrations[footage.images[index].camera].info
                 light = cv2.LUT(pixels.astype(np.uint8), _LIGHT)
                 for number in wanted[index]:
                     places = cells[number].places_map
-                    px = distort_points(own.info, pinhole_px(index, places.reshape(-1, 2))[0])
+                    px = distort_points(info, footage.pinhole_px(index, places.reshape(-1, 2))[0])
                     at = px.reshape(places.shape).astype(np.float32)
                     seen = cv2.remap(light, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
                     yield number, np.asarray(seen, dtype=np.float64)

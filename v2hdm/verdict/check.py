@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
 from v2hdm.detection.frames import read_bgr
-from v2hdm.geometry.ipm import extrinsic_from_ipm
+from v2hdm.geometry.ipm import initial_extrinsic
 from v2hdm.geometry.planar import length_along
 from v2hdm.ground.motion import trajectory_of_images
 from v2hdm.ground.results import GroundEstimate
@@ -20,7 +20,6 @@ from v2hdm.report import style
 from v2hdm.report.photos import save_grid
 
 _PICTURES = 3  # sample images of each camera: near the start, in the middle and near the end
-
 _ARROWS = 30  # arrows along the route: enough to see a heading go wrong, few enough to see each
 _MOST_POINTS = 5000  # points of the line that is drawn
 
@@ -30,7 +29,7 @@ def draw_check(drive: Drive, folder: Path, ground: Mapping[str, GroundEstimate])
     _save_route(folder / "route.png", drive.recorded or drive.trajectory or trajectory_of_images(drive))
     for name, camera in drive.cameras.items():
         images = [image for image in drive.images if image.camera == name]
-        mountings = {"guess": extrinsic_from_ipm(camera.info, camera.ipm[camera.initial_ipm])}
+        mountings = {"guess": initial_extrinsic(camera)}
         calibration = ground[name].calibration if name in ground else None
         if calibration is not None:
             mountings["ground"] = calibration.cam_from_vehicle

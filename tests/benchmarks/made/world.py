@@ -115,7 +115,7 @@ def make(recipe: Recipe) -> World:
         cameras=port.cameras,
         stamp_s=dict.fromkeys(port.cameras, taken_s),
         recorded=Trajectory(poses_s, _recorded(recipe, port, poses_s, true[len(taken_s) :])),
-        pose_noise=PoseNoise.as_far_as_stated() if recipe.default_noise else recipe.poses.as_stated(),
+        pose_noise=PoseNoise.from_stated() if recipe.default_noise else recipe.poses.as_stated(),
     )
 
 

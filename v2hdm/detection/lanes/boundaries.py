@@ -1,20 +1,15 @@
-"""Boundaries of lanes: where along each line it is painted, in a gap or has ended, and its probability.
+"""Boundaries of lanes: the rows on which each line is painted, in a gap or has ended.
 
-A hidden Markov model on rows of the image, from far to near. Its states are *ended*, *gap*, *solid* and
-*dash*; the rates at which one becomes another are per metre of ground. The evidence of a row is two log odds
-of the network: of the surest crossing on the line and of the surest paint about it. The forward and backward
-pass (L. Rabiner, "A tutorial on hidden Markov models", Proc. IEEE 77, 1989) gives the probability of each
-state on each row and the likelihood of the line over that of ground without one. Two lines side by side may
-be strands of one double line, along the middle of those present.
-
-How probable it is that a line is one of a lane is a logistic function of its features: first of each alone,
-then with its span and among the others of its image, which run a lane apart; kerbs, joints and shadows run
-closer. Its weights, in ``lane_score.json``, belong to the network; ``python -m train.ship`` fits them.
+A hidden Markov model runs over the image's rows from far to near. Its states are *ended*, *gap*, *solid* and
+*dash*, with transition rates per metre of ground. A row's evidence is two of the network's log odds: those of
+the best crossing on the line and of the best paint about it. The forward-backward algorithm (L. Rabiner, "A
+tutorial on hidden Markov models", Proc. IEEE 77, 1989) gives the probability of each state on each row, and
+the likelihood ratio of the line to ground without one. Two lines side by side may be the strands of a double
+line, which runs along the middle of the strands present.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
@@ -24,83 +19,44 @@ import numpy as np
 from v2hdm.detection.camera import FARTHEST_M
 from v2hdm.detection.lanes.curves import NEIGHBOURS, LaneImage, Line, LinePoints, Span
 from v2hdm.detection.network import as_probability
-from v2hdm.detection.weights import LANE_SCORE_FILE
-from v2hdm.records import LANE_BOUNDARY, LANE_DASH, BoolArray, FloatArray, IntArray, LaneDetection
+from v2hdm.records import LANE_BOUNDARY, BoolArray, FloatArray, LaneDetection
 
-_DRAWN_STEP_PX = 8.0  # rows of the image from one point of a line to the next, px
+_DRAWN_STEP_PX = 8.0  # rows from one point of a drawn line to the next, px
 _ENDED, _GAP, _SOLID, _DASH = range(4)
-_DASH_STAGES = 3  # stages of a dash: its length is Erlang's distribution, scattered by 58 % of the mean
+_DASH_STAGES = 3  # of a dash: its length is Erlang distributed, with a deviation of 58 % of the mean
 
 _STATES = _DASH + _DASH_STAGES
 _DASH_M, _GAP_M = 3.6, 5.1
 """Mean lengths of dashes and of the gaps between them, m, in the renders (train/scenes/paint)."""
 
 _SOLID_M, _DASHED_M, _ENDED_M = 100.0, 120.0, 60.0
-"""Mean lengths, m, of solid lines, of rows of dashes, and of bare ground from one line to the next on a
-curve; fitted to renders. After the ground a solid line is as likely as a row of dashes."""
+"""Mean lengths, m, of solid lines, of rows of dashes, and of bare ground between lines on one curve; fitted
+to renders. After bare ground, a solid line is as likely as a row of dashes."""
 
 _CROSSING_WEIGHT, _CROSSING_EVEN, _CROSSING_RANGE = 0.05, -2.7, (-3.0, 6.7)
-"""A crossing of log odds x, clipped to the range, adds weight * (x - even) to a line's log likelihood.
-Weights are small because rows err together; all six numbers are fitted to renders."""
+"""A crossing of log odds x, clipped to the range, adds weight * (x - even) to a line's log likelihood. The
+weight is small since rows err together. Fitted to renders, as are those of paint."""
 
 _PAINT_WEIGHT, _PAINT_EVEN, _PAINT_RANGE = 0.3, -1.0, (-4.0, 4.0)
 """The same for paint and the log likelihoods of *solid* and *dash*."""
 
 _HALF_WIDTH_M, _LEAST_HALF_WIDTH_PX = 0.06, 4.0
 _ACROSS = np.linspace(-1.0, 1.0, 7)
-"""Paint of a line is looked for so far to either side of its curve, at so many places."""
+"""Half width, m and at least px, and relative places across a curve at which its paint is sought."""
 
-_CROSSING_M = 0.3  # lines that lie so far left of another one here and so far to its right there cross it
-
+_CROSSING_M = 0.3  # lines cross if one lies this far to the left of the other and, elsewhere, to its right
 _DOUBLE_M = 0.75  # lines nearer than this are one boundary: two strands if both show paint abreast, else one
-
-_LEAST_ABREAST_M = 1.0  # both strands of a double line show paint on so much ground abreast
+_LEAST_ABREAST_M = 1.0  # ground on which both strands of a double line show paint
 _ONE_LINE_M = 0.12  # lines nearer to each other than this are one
-_CERTAIN_SIGMA_M = 0.3  # rows on which a line is known worse than this do not show its place beside others
-_EVEN = 0.5  # a line is where it is present rather than not
-_SMOOTH_PX = 24.0
-_FREEDOM_M = 0.03  # a line follows its points within such a distance, and by so much
-_EXTENSION_SIGMA = 0.03
-"""Beyond its own points a line is drawn while it is known within this share of the image's width."""
-
-ALONE = (
-    "best_crossings", "log_length_m", "log_length_px", "log_rows", "along_road", "paint_odds", "paint_along",
-    "dash_share",
-)  # fmt: skip
-"""Features of a line by itself: log odds of its three surest crossings; its length on the ground, in the
-image and down the image (upright things are as tall as they are long); the log ratio of its being along the
-road; the log odds of its surest paint; the mean log odds of paint along it, and the share of that which the
-network takes for dashes."""
-
-_SPAN = ("likelihood", "present_m", "painted_m", "painted_share")
-"""Features of a line's span: the root of its log likelihood, the length of ground on which it is present,
-that on which it shows paint between its points, and the share of rows there that do."""
-
-AMONG = ("alone", "near_horizon", *_SPAN, "a_lane_apart", "too_near")
-"""Features of a line among others: its log odds alone, how far from the horizon it begins, its span; and of
-the others that run beside it, weighed by their probability, the likest one a lane away and the number of
-those nearer than a lane can be."""
-
-_NO_PAINT = -3.0  # log odds of the surest paint of a line that shows none
-_BEST = 3
-_MOST_LOG_RATIO = 6.0
-_UNKNOWN = (2.3, 0.4)
-"""The last two of a line in an image of which the paint is not known: the median of true lines."""
-
-_PLACES = 24
-_ON_M = np.linspace(-0.25, 0.25, 7)
-"""Paint of a line, be it a double one, is within such a distance of where it is drawn."""
-
-_LEAST_WEIGHT = 0.05  # places without paint have this weight, that of paint being one
-_LANE_M, _LANE_SIGMA_M = 3.2, 0.65  # lanes of roads are 2.5 to 4 m wide
-_TOO_NEAR_M = 1.8
-_MOST_NEAR = 2.0  # more lines than this add nothing
-_CHANGE_M, _CHANGE_SHARE = 0.15, 0.06
-"""The distance between lines that run beside each other changes by so much and by this share of it."""
+_CERTAIN_SIGMA_M = 0.3  # largest sigma of a line on rows that locate it beside others
+_EVEN = 0.5  # probability of presence from which a line is drawn
+_SMOOTH_PX = 24.0  # half width of the triangular window over a line's points
+_FREEDOM_M = 0.03  # sigma of a line about its curve
+_EXTENSION_SIGMA = 0.03  # largest sigma of a line beyond its points, relative to the image's width
 
 
 def with_spans(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> list[Line]:
-    """The lines through an image's points with their :class:`Span`."""
+    """The lines through an image's points, each with its :class:`Span`."""
     if not lines:
         return []
     camera, horizon = image.camera, image.horizon
@@ -113,7 +69,7 @@ def with_spans(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> l
     step_m = np.hypot(np.diff(horizon.depth_m(below)), np.diff(beside_m, axis=1))
     half_px = np.maximum(_HALF_WIDTH_M * horizon.px_per_m * below, _LEAST_HALF_WIDTH_PX)
     across = along[..., None] + half_px[:, None] * _ACROSS
-    places_px = _places_px(image, across, below[:, None])
+    places_px = image.places_px(across, below[:, None])
     likelihood = np.zeros((*along.shape, _STATES))
     crossing = _crossings(lines, points, image, below)
     likelihood[..., _GAP:] = _evidence(crossing, _CROSSING_WEIGHT, _CROSSING_EVEN, _CROSSING_RANGE)[..., None]
@@ -130,19 +86,12 @@ def with_spans(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> l
     return [replace(line, span=Span(below, *rest)) for line, *rest in each]
 
 
-def _places_px(image: LaneImage, along: FloatArray, below: FloatArray) -> FloatArray:
-    """Recorded px (..., 2) of places along and below the horizon, which broadcast."""
-    rows = np.broadcast_to(below, along.shape)
-    pinhole_px = image.horizon.pinhole_px(along.ravel(), rows.ravel())
-    return image.camera.distort(pinhole_px).reshape(*along.shape, 2)
-
-
 def _evidence(odds: FloatArray, weight: float, even: float, bounds: tuple[float, float]) -> FloatArray:
     return np.asarray(weight * (np.clip(odds, *bounds) - even))
 
 
 def _crossings(lines: Sequence[Line], points: LinePoints, image: LaneImage, below: FloatArray) -> FloatArray:
-    """Log odds (N, T) of the surest crossing of each line near each row; -inf where there is none."""
+    """Log odds (N, T) of the best crossing of each line near each row; -inf without one."""
     out = np.full((len(lines), len(below)), -np.inf)
     for k, line in enumerate(lines):
         own = line.members[~points.is_paint[line.members]]
@@ -154,7 +103,7 @@ def _crossings(lines: Sequence[Line], points: LinePoints, image: LaneImage, belo
 
 
 def _rates() -> FloatArray:
-    """Changes of state per metre of ground (S, S); rows sum up to nought."""
+    """Transition rates (S, S) of the states per metre of ground; rows sum to zero."""
     rates = np.zeros((_STATES, _STATES))
     rates[_ENDED, _SOLID] = rates[_ENDED, _GAP] = 0.5 / _ENDED_M
     rates[_GAP:, _ENDED] = 1 / _DASHED_M
@@ -167,7 +116,7 @@ def _rates() -> FloatArray:
 
 @cache
 def _modes() -> tuple[np.ndarray, np.ndarray, np.ndarray, FloatArray]:
-    """Eigenvalues (S,), right and left eigenvectors (S, S) of the rates; shares (S,) of the states."""
+    """Eigenvalues (S,), right and left eigenvectors (S, S) of the rates; stationary distribution (S,)."""
     values, right = np.linalg.eig(_rates())
     left = np.linalg.inv(right)
     shares = left[np.argmax(values.real)].real
@@ -175,7 +124,7 @@ def _modes() -> tuple[np.ndarray, np.ndarray, np.ndarray, FloatArray]:
 
 
 def _forward_backward(likelihood: FloatArray, step_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Probabilities of states (N, T, S) and log likelihood (N,), by that of rows, ``step_m`` apart."""
+    """Probabilities (N, T, S) of the states, and log likelihood (N,), from those of rows ``step_m`` apart."""
     values, right, left, shares = _modes()
     move = np.maximum(((right * np.exp(values * step_m[..., None])[..., None, :]) @ left).real, 0.0)
     evidence = np.exp(likelihood)
@@ -194,7 +143,7 @@ def _forward_backward(likelihood: FloatArray, step_m: FloatArray) -> tuple[Float
 
 
 def boundaries(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> list[Line]:
-    """The lines, best first, without those that repeat or cross a better one; a double one has a strand."""
+    """The lines, best first, without repetitions and crossings of better ones; double lines get a strand."""
     kept: list[Line] = []
     for line in lines:
         for k, other in enumerate(kept):
@@ -212,7 +161,7 @@ _APART, _REPEATS, _DOUBLES = range(3)
 
 
 def _relation(line: Line, other: Line, points: LinePoints, image: LaneImage) -> int:
-    """Whether a line is apart from another, repeats or crosses it, or is the other strand of a double one."""
+    """Whether a line is apart from another, repeats or crosses it, or is its second strand."""
     assert line.span is not None
     assert other.span is not None
     phi, px_per_m = image.horizon.basis(line.span.below), image.horizon.px_per_m * line.span.below
@@ -235,7 +184,7 @@ def _relation(line: Line, other: Line, points: LinePoints, image: LaneImage) -> 
 
 
 def _shown(line: Line, points: LinePoints, below: FloatArray) -> BoolArray:
-    """Which rows (T,) lie between the nearest and the farthest point of a line; one at least."""
+    """Flags (T,) of the rows between the nearest and the farthest point of a line; at least one."""
     own = points.below[line.members]
     rows = np.arange(len(below))
     first, last = np.searchsorted(below, (own.min(), own.max()))
@@ -269,7 +218,7 @@ def draw(line: Line, points: LinePoints, image: LaneImage) -> LaneDetection | No
 def _followed(
     points: LinePoints, line: Line, image: LaneImage, at: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Where a line is along the horizon and its sigma (N,), px, ``at`` (N,) px below: points and curve."""
+    """Position of a line along the horizon and its sigma (N,), px, ``at`` (N,) px below it."""
     phi = image.horizon.basis(at)
     curve_sigma, along = line.curve.sigma(phi), line.curve.along(phi)
     members = line.members
@@ -279,125 +228,3 @@ def _followed(
     own = 1 / (curve_sigma**2 + (_FREEDOM_M * image.horizon.px_per_m * at) ** 2)
     total = weight.sum(axis=1) + own
     return along + weight @ off / total, np.sqrt(1 / total)
-
-
-def log_odds_alone(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> FloatArray:
-    """Log odds (N,) of N lines through an image's points, each by itself."""
-    weights, bias = (image.score or fitted())["alone"]
-    return np.asarray(features_alone(lines, points, image) @ weights + bias)
-
-
-def log_odds(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> FloatArray:
-    """Log odds (N,) of N lines, all there are in an image; they have their spans and their log odds alone."""
-    weights, bias = (image.score or fitted())["among"]
-    return np.asarray(features_among(lines, points, image) @ weights + bias)
-
-
-def features_among(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> FloatArray:
-    """The features (N, F) of N lines, all there are in an image, in the order of :data:`AMONG`."""
-    if not lines:
-        return np.empty((0, len(AMONG)))
-    far = np.log([points.below[line.members].min() for line in lines])
-    spans = [_span_features(line, points) for line in lines]
-    return np.column_stack([[line.log_odds for line in lines], far, spans, _company(points, lines, image)])
-
-
-def _span_features(line: Line, points: LinePoints) -> tuple[float, float, float, float]:
-    span, own = line.span, points.below[line.members]
-    assert span is not None
-    between = (span.below >= own.min()) & (span.below <= own.max())
-    return (
-        float(np.sqrt(max(span.log_likelihood, 0.0))),
-        float(span.length_m @ span.present),
-        float(span.length_m[between] @ span.painted[between]),
-        float(span.painted[between].sum() / max(between.sum(), 1)),
-    )
-
-
-def features_alone(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> FloatArray:
-    """The features (N, F) of N lines by themselves, in the order of :data:`ALONE`."""
-    if not lines:
-        return np.empty((0, len(ALONE)))
-    members = np.concatenate([line.members for line in lines])
-    count = np.array([len(line.members) for line in lines])
-    begins = np.cumsum(count) - count
-    is_paint, odds = points.is_paint[members], points.odds[members]
-    at_px, ground = points.points_px[members], points.ground[members]
-    size_m = np.maximum.reduceat(ground, begins) - np.minimum.reduceat(ground, begins)
-    size = np.maximum.reduceat(at_px, begins) - np.minimum.reduceat(at_px, begins)
-    size = size / image.camera.info.width
-    length_m = np.hypot(*size_m.T)
-    paint_odds = np.maximum.reduceat(np.where(is_paint, odds, -np.inf), begins)
-    ratio = np.array([line.log_ratio for line in lines])
-    columns = (
-        _best_crossings(np.where(is_paint, -np.inf, odds), begins, count),
-        np.log(length_m + 0.1),
-        np.log(np.hypot(*size.T) + 0.005),
-        np.log(size[:, 1] + 0.005),
-        np.clip(ratio, -_MOST_LOG_RATIO, _MOST_LOG_RATIO),
-        np.where(np.isfinite(paint_odds), paint_odds, _NO_PAINT),
-        _paint_along(lines, points, image),
-    )
-    return np.column_stack(columns).astype(np.float64)
-
-
-def _best_crossings(odds: FloatArray, begins: IntArray, count: IntArray) -> FloatArray:
-    """Mean log odds (N,) of the surest crossings of each line, 0 where it has none; paint's are -inf."""
-    order = np.lexsort((-odds, np.repeat(np.arange(len(count)), count)))
-    first = begins[:, None] + np.minimum(np.arange(_BEST), count[:, None] - 1)
-    best = odds[order[first]]
-    there = np.isfinite(best) & (np.arange(_BEST) < count[:, None])
-    return np.asarray(np.where(there, best, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1))
-
-
-def _paint_along(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> FloatArray:
-    """Mean log odds of paint along each line between its points, and the share of dashes in that (N, 2)."""
-    output, horizon = image.output, image.horizon
-    if output is None:
-        return np.tile(_UNKNOWN, (len(lines), 1))
-    own = [points.below[line.members] for line in lines]
-    below = np.linspace([b.min() for b in own], [b.max() for b in own], _PLACES, axis=1)
-    phi = horizon.basis(below.ravel()).reshape(len(lines), _PLACES, 3)
-    along = np.einsum("npk,nk->np", phi, np.array([line.curve.parameters for line in lines]))
-    across = along[..., None] + horizon.px_per_m * below[..., None] * _ON_M
-    places_px = _places_px(image, across, below[..., None])
-    paint = output.odds_at(places_px).max(axis=2)
-    weight = as_probability(paint) + _LEAST_WEIGHT
-    dashes = output.shares_at(places_px[:, :, len(_ON_M) // 2])[output.classes.index(LANE_DASH)]
-    return np.column_stack([paint.mean(axis=1), (dashes * weight).sum(axis=1) / weight.sum(axis=1)])
-
-
-def _company(points: LinePoints, lines: Sequence[Line], image: LaneImage) -> FloatArray:
-    """How much the likest other line is a lane away, and how many are too near (N, 2)."""
-    if len(lines) < 2:
-        return np.zeros((len(lines), 2))
-    apart = _apart_m(points, lines, image)
-    gap = np.abs(apart[1])
-    change = np.ptp(apart, axis=0) / (_CHANGE_M + _CHANGE_SHARE * gap)
-    beside = as_probability(np.array([line.log_odds for line in lines])) * np.exp(-0.5 * change**2)
-    np.fill_diagonal(beside, 0.0)
-    lane = beside * np.exp(-0.5 * ((gap - _LANE_M) / _LANE_SIGMA_M) ** 2)
-    near = np.where(gap < _TOO_NEAR_M, beside, 0.0).sum(axis=1)
-    return np.column_stack([lane.max(axis=1), np.minimum(near, _MOST_NEAR)])
-
-
-def _apart_m(points: LinePoints, lines: Sequence[Line], image: LaneImage) -> FloatArray:
-    """How far lines are apart along the horizon (3, N, N), m, at the far end, middle and near end of each."""
-    parameters = np.array([line.curve.parameters for line in lines])
-    spans = np.array([np.ptp(points.below[line.members]) for line in lines])
-    low = np.array([points.below[line.members].min() for line in lines])
-    below = (low + spans * np.array([[0.0], [0.5], [1.0]])).ravel()
-    horizon = image.horizon
-    # Each line's own rows, at which all the others are looked at.
-    rows = (horizon.basis(below) / (horizon.px_per_m * below)[:, None]).reshape(3, len(lines), 3)
-    return np.asarray(np.einsum("sik,ijk->sij", rows, parameters[:, None] - parameters))
-
-
-@cache
-def fitted() -> dict[str, tuple[FloatArray, float]]:
-    """Weights and bias of the logistic functions of a line ``alone`` and ``among`` others, from the file."""
-    content = json.loads(LANE_SCORE_FILE.read_text(encoding="utf-8"))
-    return {
-        name: (np.array([content[name]["weights"][key] for key in keys]), float(content[name]["bias"]))
-        for name, keys in (("alone", ALONE), ("among", AMONG))
-    }

@@ -1,7 +1,8 @@
 """Lines of lanes: the centre lines of paint, and the whole lines made of crossings of row anchors and paint.
 
-Crossings and paint that one curve explains are one line (:mod:`.curves`). A hidden Markov model finds from
-where to where it runs, and a logistic function gives its probability (:mod:`.boundaries`).
+Crossings are linked into chains (:mod:`.chains`); chains and paint that one curve explains are one line
+(:mod:`.curves`). A hidden Markov model finds its ends (:mod:`.boundaries`), a logistic function its
+probability (:mod:`.score`).
 """
 
 from __future__ import annotations
@@ -14,24 +15,26 @@ from operator import itemgetter
 import numpy as np
 
 from v2hdm.detection.camera import FARTHEST_M, RoadCamera
-from v2hdm.detection.lanes.boundaries import boundaries, draw, log_odds, log_odds_alone, with_spans
-from v2hdm.detection.lanes.curves import LaneImage, Line, LinePoints, find_chains, find_lines
+from v2hdm.detection.lanes.boundaries import boundaries, draw, with_spans
+from v2hdm.detection.lanes.chains import find_chains
+from v2hdm.detection.lanes.curves import LaneImage, Line, LinePoints, find_lines
+from v2hdm.detection.lanes.score import log_odds, log_odds_alone
+from v2hdm.detection.network import crossings
 from v2hdm.detection.propose import Blob, Proposal
 from v2hdm.records import FloatArray, IntArray, LaneDetection
 
-_CAP_WIDTH_RATIO = 0.7
+_CAP_WIDTH_RATIO = 0.7  # cuts whose width differs more from the median are through slanted ends
 _MIN_POINTS = 2
-_ROWS_MIN_ASPECT = 0.35
+_ROWS_MIN_ASPECT = 0.35  # height over width from which a blob is cut by rows
 
 
 def trace_lanes(
     paints: Sequence[tuple[Proposal, float]], camera: RoadCamera, step_m: float, max_range_m: float
 ) -> list[LaneDetection]:
-    """The centre lines of lane paint with its score, a point every ``step_m`` on the ground, near to far.
+    """Centre lines of lane paint with its score: a point every ``step_m`` on the ground, near to far.
 
-    A blob is cut by image rows (by columns where it lies flat); each cut's two edge points are averaged on
-    the ground, so that perspective does not pull the centre. Cuts through slanted ends are left out; of two
-    lines that touch each has points.
+    A blob is cut by image rows, a flat one by columns. Each cut's edge points are averaged on the ground, so
+    that perspective does not bias the centre; cuts through slanted ends are omitted.
     """
     branches = [(paint, edges) for paint in paints for edges in _branches(paint[0].blob)]
     if not branches:
@@ -52,12 +55,12 @@ def trace_lanes(
 
 
 def _at_once(function: Callable[[FloatArray], FloatArray], parts: Sequence[FloatArray]) -> list[FloatArray]:
-    """A function of points, of several arrays of them by one call."""
+    """Values of a vectorised function at several arrays of points, by one call."""
     return np.split(function(np.concatenate(parts)), np.cumsum([len(part) for part in parts])[:-1])
 
 
 def _branches(blob: Blob) -> list[FloatArray]:
-    """The two edges (n, 2, 2), recorded px, of each branch of a blob, cut by cut."""
+    """Edge points (n, 2, 2), recorded px, of the cuts of each branch of a blob."""
     height, width = blob.level.shape
     by_rows = height >= _ROWS_MIN_ASPECT * width
     level, order = (blob.level, [1, 0]) if by_rows else (blob.level.T, [0, 1])
@@ -71,7 +74,7 @@ def _branches(blob: Blob) -> list[FloatArray]:
 
 
 def _chains(runs: FloatArray) -> list[FloatArray]:
-    """Runs (R, 3) of row, start and end column, linked where they overlap: a branch of the blob each."""
+    """Branches of a blob: its runs (R, 3), row, start and end column, linked where they overlap."""
     if len(runs) < _MIN_POINTS:
         return []
     above, below = runs[:-1], runs[1:]
@@ -100,7 +103,7 @@ def _chains(runs: FloatArray) -> list[FloatArray]:
 
 
 def _centre(edges_vehicle: FloatArray) -> FloatArray:
-    """Centres (n, 2) of cuts between two edge points on the ground (n, 2, 2), caps left out."""
+    """Centres (n, 2) of cuts with edge points (n, 2, 2) on the ground, without slanted ends."""
     width_m = np.linalg.norm(edges_vehicle[:, 1] - edges_vehicle[:, 0], axis=1)
     finite = np.isfinite(width_m)
     if not finite.any():
@@ -126,18 +129,17 @@ def _resample(at_vehicle: FloatArray, camera: RoadCamera, step_m: float, max_ran
 
 
 LEAST_LOG_ODDS = -0.5
-"""Lines less sure are not given. A bound of -1.4 gives .7 points more of TuSimple's accuracy and 40 % more
-false lines on renders."""
+"""Least log odds of a reported line. With -1.4, TuSimple's accuracy is .7 points higher, and false lines on
+renders are 40 % more."""
 
-_DOUBTFUL = 1.5  # lines so much less sure, in log odds, than is asked for alone may be sure among the others
+_DOUBTFUL = 1.5  # log odds that a line may gain among the others
 
 _SIGMA_PX = (0.4, 2.7)
-"""Crossings err by s + t / exp(log odds), in px of the resolution looked at; measured on renders."""
+"""Crossings have the sigma s + t / exp(log odds), px of the resolution in use; measured on renders."""
 
-_PAINT_SIGMA_PX = 1.0
-_LEAST_PAINT_LENGTH_M = 0.8
-_MAX_PAINT_SLOPE = 8.0
-"""Paint that runs flatter across the view, px along the horizon per px down, is on no curve of ours."""
+_PAINT_SIGMA_PX = 1.0  # of points of paint
+_LEAST_PAINT_LENGTH_M = 0.8  # of paint that shows a direction
+_MAX_PAINT_SLOPE = 8.0  # px along the horizon per px down: flatter paint runs across the view
 
 
 def find_boundaries(image: LaneImage) -> list[LaneDetection]:
@@ -148,10 +150,10 @@ def find_boundaries(image: LaneImage) -> list[LaneDetection]:
 
 
 def propose(image: LaneImage, least_log_odds: float | None = None) -> tuple[LinePoints, list[Line]]:
-    """The points of an image and the boundaries of lanes through them that are sure enough, best first."""
+    """The points of an image, and the lane boundaries through them above ``least_log_odds``, best first."""
     least_log_odds = LEAST_LOG_ODDS if least_log_odds is None else least_log_odds
-    points = _crossings(image)
-    # At, above and just below the horizon lines meet; a comparison with nan is false.
+    points = _crossing_points(image)
+    # Lines meet at the horizon. Above it the range is nan, and the comparison false.
     points = points.where(image.camera.range_m(points.ground) <= FARTHEST_M)
     groups = find_chains(points.points_px, points.odds)
     points, on_paint = _with_paint(points, image)
@@ -163,27 +165,24 @@ def propose(image: LaneImage, least_log_odds: float | None = None) -> tuple[Line
 
 
 def _surest(lines: Sequence[Line], odds: FloatArray, least_log_odds: float) -> list[Line]:
-    """The lines of more than such log odds (N,), best first."""
+    """The lines whose ``odds`` (N,) exceed ``least_log_odds``, best first."""
     order = [k for k in np.argsort(-odds, kind="stable").tolist() if odds[k] > least_log_odds]
     return [replace(lines[k], log_odds=float(odds[k])) for k in order]
 
 
-def _crossings(image: LaneImage) -> LinePoints:
-    rows = image.rows
-    u = np.concatenate([np.empty(0), *(row.u_px for row in rows)])
-    v = np.repeat([row.v_px for row in rows], [len(row.u_px) for row in rows]) if rows else np.empty(0)
-    odds = np.concatenate([np.empty(0), *(row.odds for row in rows)])
-    scale = np.where(image.camera.coarse(v), 2.0, 1.0)
-    return LinePoints.of(image, np.column_stack([u, v]), odds, scale * crossing_sigma_px(odds), paint=False)
+def _crossing_points(image: LaneImage) -> LinePoints:
+    points_px, odds = crossings(image.rows)
+    scale = np.where(image.camera.coarse(points_px[:, 1]), 2.0, 1.0)
+    return LinePoints.of(image, points_px, odds, scale * crossing_sigma_px(odds), paint=False)
 
 
 def crossing_sigma_px(odds: FloatArray) -> FloatArray:
-    """Standard deviation (N,) of crossings of such log odds, px of the resolution looked at."""
+    """Standard deviations (N,) of crossings with log ``odds`` (N,), px of the resolution in use."""
     return np.asarray(_SIGMA_PX[0] + _SIGMA_PX[1] * np.exp(-odds))
 
 
 def _with_paint(points: LinePoints, image: LaneImage) -> tuple[LinePoints, list[IntArray]]:
-    """The points with those of pieces of paint after them, and which those are, piece by piece."""
+    """The points followed by those of pieces of paint, and the indices of each piece's points."""
     pieces = _along_the_view(image)
     if not pieces:
         return points, []
@@ -198,7 +197,7 @@ def _with_paint(points: LinePoints, image: LaneImage) -> tuple[LinePoints, list[
 
 
 def _along_the_view(image: LaneImage) -> list[LaneDetection]:
-    """Pieces of paint that are long enough to have a direction, and not one across the camera."""
+    """Pieces of paint long enough to show a direction, not across the view."""
     if not image.paint:
         return []
     ends_px = image.camera.undistort(np.concatenate([lane.points_px[[0, -1]] for lane in image.paint]))
@@ -210,7 +209,7 @@ def _along_the_view(image: LaneImage) -> list[LaneDetection]:
 
 
 def _identified(lanes: list[LaneDetection], camera: RoadCamera) -> list[LaneDetection]:
-    """Number the lines from the vehicle outwards, by where each is beside the vehicle."""
+    """Number the lines from the vehicle outwards, by their offset beside it."""
     if not lanes:
         return []
     ground = _at_once(camera.unproject, [lane.points_px for lane in lanes])
@@ -222,7 +221,7 @@ def _identified(lanes: list[LaneDetection], camera: RoadCamera) -> list[LaneDete
 
 
 def _lateral_m(ground: FloatArray, camera: RoadCamera) -> float:
-    """How far left of the vehicle a line (N, 2) is, its near half carried on to there; nan if unknown."""
+    """Offset, m, of a line (N, 2) to the vehicle's left, extrapolated from its near half; nan if unknown."""
     ground = ground[np.isfinite(ground).all(axis=1)]
     near = ground[: max(2, len(ground) // 2)]
     if len(near) < 2:

@@ -169,7 +169,7 @@ def _read_pose_noise(content: object, of_source: Mapping[str, float], where: str
         if key.endswith("_over_m") and value == 0:
             raise DriveError(f"{where}, {key}: an error that fades over 0 m is not a drift; leave it out")
     stated = {key: value for key, value in of_source.items() if not {key, DRIFTS[key]} & set(values)}
-    noise = PoseNoise.as_far_as_stated(**stated, **values)
+    noise = PoseNoise.from_stated(**stated, **values)
     for total, drift in DRIFTS.items():
         if getattr(noise, drift) > getattr(noise, total):
             raise DriveError(f"{where}, {drift}: is part of {total}, so not above it; fix one of them")

@@ -16,7 +16,7 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.geometry.geodetic import enu_axes, enu_from_geodetic, position_of
-from v2hdm.geometry.ipm import extrinsic_from_ipm
+from v2hdm.geometry.ipm import initial_extrinsic
 from v2hdm.geometry.rigid import camera_centre, in_order, log, make_transform
 from v2hdm.records import (
     Camera,
@@ -104,7 +104,7 @@ def _same_rig(first: Camera, second: Camera) -> bool:
         return False
     if not np.allclose(one.distortion, other.distortion, rtol=0, atol=_SAME_LENS / one.width):
         return False
-    guesses = [extrinsic_from_ipm(camera.info, camera.ipm[camera.initial_ipm]) for camera in (first, second)]
+    guesses = [initial_extrinsic(camera) for camera in (first, second)]
     turn_rad = float(np.linalg.norm(log(guesses[0] @ np.linalg.inv(guesses[1]))[3:]))
     if turn_rad > _SAME_RIG_SIGMAS * np.sqrt(2) * _GUESS_SIGMA_RAD:
         return False

@@ -40,7 +40,6 @@ _MOUNT_RAD = (0.1, 0.02)
 _REPORTED_RAD = float(np.radians(0.3))  # a sensor that is further off level is reported
 _STEEPEST = 0.35  # no road has this slope; up-axes that lean further, in the median, are no ground vehicle's
 _ROUNDING = 1e-9  # slope below which a rotation that was made of the heading alone is level
-
 STATION_M = 1.0  # nearer poses are one station: a vehicle that stands drives no path in its noise
 _WINDOW_SIGMAS = 3.0  # a Gaussian is cut off here; 0.3 % of it lies beyond
 _END_RIDGE = 0.2  # keeps lines through few stations from being steep, as a share of the Gaussian's width

@@ -9,6 +9,7 @@ import numpy as np
 
 from v2hdm.errors import ConfigError, MapFileError, need
 from v2hdm.geometry.geodetic import crs_of
+from v2hdm.geometry.planar import cross
 from v2hdm.io.safe.pixels import check_raster
 from v2hdm.records import FloatArray, GroundStrip, HdMap
 from v2hdm.store.files import whole_file
@@ -59,7 +60,7 @@ def _sampled(strip: GroundStrip, cells: FloatArray) -> FloatArray:
     seen = np.flatnonzero(np.isfinite(distance_m))
     off, ahead = cells[seen] - strip.points_map[near[seen]], strip.ahead[near[seen]]
     along = near[seen] + np.einsum("ki,ki->k", off, ahead) / strip.step_m
-    side = off[:, 1] * ahead[:, 0] - off[:, 0] * ahead[:, 1]
+    side = cross(ahead, off)
     inside = (side >= right_m) & (side <= left_m) & (along >= 0) & (along <= len(strip.points_map) - 1)
     at = np.stack([along, (side - right_m) / (strip.left_m[1] - right_m)])[:, inside]
     for band, values in zip(out, (strip.heights_m, strip.sigma_m), strict=True):

@@ -89,9 +89,9 @@ def _source(path: Path) -> dict[str, Any]:
         if not path.is_file():
             raise MapFileError(f"{path}: not a readable GeoTIFF or folder of XYZ tiles; check the path")
         return {"fp": path, "driver": "GTiff"}
-    told = {"url": escape(path.resolve().as_uri()), "ending": tile.suffix, "half": _HALF_WORLD_M}
-    told |= {"px": read_header(tile).width, "finest": levels[-1], "coarser": levels[-1] - levels[0]}
-    return {"fp": _TILES.format(**told), "driver": "WMS"}
+    tiles = {"url": escape(path.resolve().as_uri()), "ending": tile.suffix, "half": _HALF_WORLD_M}
+    tiles |= {"px": read_header(tile).width, "finest": levels[-1], "coarser": levels[-1] - levels[0]}
+    return {"fp": _TILES.format(**tiles), "driver": "WMS"}
 
 
 def background_layer(path: Path, facts: Facts) -> dict[str, Any]:
@@ -156,10 +156,10 @@ _SHARED = (".geojson", ".gpkg", ".osm", ".dxf", ".csv", ".xodr", ".tif", ".tum",
 
 def ellipses(marking: Marking) -> FloatArray | None:
     """95 % ellipses (4, 3) of the corners: semi-axes a >= b, m, and direction of a, rad."""
-    if marking.covariance_m2 is None:
+    covariances = marking.corner_covariances_m2
+    if covariances is None:
         return None
-    blocks = marking.covariance_m2.reshape(4, 2, 4, 2)[range(4), :, range(4), :]
-    variance, axes = np.linalg.eigh(blocks)
+    variance, axes = np.linalg.eigh(covariances)
     half = SIGMAS_95 * np.sqrt(np.maximum(variance[:, ::-1], 0.0))
     direction = np.arctan2(axes[:, 1, 1], axes[:, 0, 1])
     return np.column_stack([half, direction])

@@ -16,7 +16,7 @@ from v2hdm.records import FloatArray, Lane, Marking, Symbol
 from v2hdm.report.metrics import corner_errors, match_markings
 from v2hdm.report.page.facts import CameraFacts, Facts
 from v2hdm.report.page.layers import SIGMAS_95, ellipses
-from v2hdm.report.terminal import AGAINST_TRUTH, METHODS, WITHOUT_TRUTH
+from v2hdm.report.terminal import METHODS, figure_columns
 
 
 class Table(NamedTuple):
@@ -155,11 +155,10 @@ def _inside(markings: Sequence[Marking], facts: Facts) -> float | None:
     rows, columns = match_markings(markings, facts.truth.map.markings)
     squared: list[float] = []
     for row, column in zip(rows, columns, strict=True):
-        covariance = markings[row].covariance_m2
-        if covariance is not None:
+        covariances = markings[row].corner_covariances_m2
+        if covariances is not None:
             off = corner_errors([markings[row]], [facts.truth.map.markings[column]])
-            blocks = covariance.reshape(4, 2, 4, 2)[range(4), :, range(4), :]
-            squared += np.einsum("ni,nij,nj->n", off, np.linalg.inv(blocks), off).tolist()
+            squared += np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariances), off).tolist()
     return None if len(squared) < _LEAST_FOR_SHARE else float(np.mean(np.array(squared) <= SIGMAS_95**2))
 
 
@@ -227,8 +226,7 @@ def method_table(facts: Facts) -> Table | None:
     """The paper's methods side by side, with all cameras."""
     if not facts.results:
         return None
-    has_truth = any("recall" in row for row in facts.results.values())
-    columns = AGAINST_TRUTH if has_truth else WITHOUT_TRUTH
+    columns = figure_columns(facts.results.values())
     rows = [
         [name, METHODS[name], str(row.get("markings", "–"))]
         + [number(row.get(key), digits, factor) for key, digits, factor in columns.values()]

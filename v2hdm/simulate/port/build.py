@@ -1,4 +1,4 @@
-"""A port made from its configuration: scene, vehicle, manual calibration, drive, and single images."""
+"""A port made from its configuration: cameras and their manual calibration, drive, and single images."""
 
 from __future__ import annotations
 
@@ -17,219 +17,13 @@ from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.geometry.planar import winding
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import Camera, CameraInfo, CentrePrior, FloatArray, GeodeticOrigin, HdMap
-from v2hdm.simulate.port.config import (
-    CalibrationConfig,
-    CameraConfig,
-    MountConfig,
-    PortConfig,
-    SurfaceConfig,
-    YardConfig,
-)
+from v2hdm.simulate.port.config import CalibrationConfig, CameraConfig, MountConfig, PortConfig
 from v2hdm.simulate.port.paint import build_layout
 from v2hdm.simulate.port.route import DrivenPoses, Route, build_relief, build_route, drive_along, stands
-from v2hdm.simulate.render import scene as parts
+from v2hdm.simulate.port.scene import MovingTruck, build_scene, moving_trucks
 from v2hdm.simulate.render.relief import Relief
 from v2hdm.simulate.render.renderer import Motion, Optics, Rendered, Renderer
-from v2hdm.simulate.render.scene import RECTANGLE, Bgr, Box, box_footprint, convex_hull, placed
-
-_CONTAINER_M = (12.19, 2.44, 2.59)
-_CONTAINER_COLOURS: tuple[Bgr, ...] = (
-    (0.06, 0.07, 0.27), (0.30, 0.13, 0.04), (0.07, 0.20, 0.38), (0.11, 0.22, 0.08),
-    (0.45, 0.46, 0.46), (0.04, 0.12, 0.33), (0.19, 0.17, 0.16), (0.27, 0.26, 0.05),
-)  # fmt: skip
-_RASTER_M = 0.05
-_RASTER_BORDER_M = 18.0
-_SUBPIXEL_BITS = 3
-
-
-@dataclass(frozen=True)
-class MovingTruck:
-    """A truck that comes along the route from its far end, on the left of the vehicle's way."""
-
-    start_m: float
-    speed_mps: float
-    offset_m: float
-    colour: Bgr
-    seed: int
-
-    def boxes(self, route: Route, stamp_s: float) -> tuple[Box, ...]:
-        """Its container and cab at a time, or nothing once it has left the route."""
-        station = self.start_m - self.speed_mps * stamp_s
-        if not 15.0 < station < route.length_m - 15.0:
-            return ()
-        centre, yaw = route.pose_at(station, self.offset_m)
-        return _truck(centre, yaw + np.pi, self.colour, self.seed)
-
-
-def _truck(centre_map: tuple[float, float], yaw_rad: float, colour: Bgr, seed: int) -> tuple[Box, ...]:
-    """A container on a chassis with a cab before it, heading along ``yaw_rad``."""
-    ahead = np.array([np.cos(yaw_rad), np.sin(yaw_rad)])
-
-    def part(along: float, size: tuple[float, float, float], base: float, paint: Bgr, ribbed: bool) -> Box:
-        x, y = np.array(centre_map) + along * ahead
-        at: dict[str, Any] = {"centre_map": (float(x), float(y)), "yaw_rad": yaw_rad, "base_m": base}
-        return Box(size_m=size, albedo_bgr=paint, corrugated=ribbed, seed=seed, **at)
-
-    black: Bgr = (0.03, 0.03, 0.03)
-    return (
-        part(-1.2, (6.06, 2.44, 2.59), 1.2, colour, True),
-        part(-1.2, (6.3, 0.9, 0.25), 0.95, black, False),
-        part(-3.0, (2.4, 2.3, 0.95), 0.0, black, False),
-        part(3.2, (1.9, 2.4, 2.6), 0.45, (0.55, 0.56, 0.57), False),
-        part(3.2, (1.2, 2.3, 0.9), 0.0, black, False),
-    )
-
-
-def build_scene(
-    surface: SurfaceConfig, yard: YardConfig, route: Route, rng: np.random.Generator, seed: int
-) -> parts.Scene:
-    """A port without its paint."""
-    azimuth, elevation = np.deg2rad(yard.sun_azimuth_deg), np.deg2rad(yard.sun_elevation_deg)
-    east, north = np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation)
-    blue, green, red = (yard.sun_strength * channel for channel in parts.Light().sun_bgr)
-    direction = (float(east), float(north), float(np.sin(elevation)))
-    light = parts.Light(sun_direction_map=direction, sun_bgr=(blue, green, red))
-    a, slab_m = surface.albedo, (surface.slab_m[0], surface.slab_m[1])
-    ground = parts.Ground(
-        albedo_bgr=(0.95 * a, a, 1.03 * a),
-        texture=surface.texture,
-        contrast=surface.contrast,
-        stains=surface.stains,
-        slab_m=slab_m if min(slab_m) > 0 else None,
-        slab_yaw_rad=0.02,
-        joint_width_m=surface.joint_width_m,
-        wet_fraction=surface.wet_fraction,
-        marks=_ground_marks(surface, route, rng),
-        seed=seed,
-    )
-    return parts.Scene(
-        ground=ground,
-        boxes=(*_stacks(yard, route, rng), *_occluders(yard, route, rng)),
-        shadows=tuple(_strips(yard, route, rng)),
-        light=light,
-        backdrop=parts.Backdrop(seed=seed, haze_m=yard.haze_m),
-    )
-
-
-def moving_trucks(yard: YardConfig, route: Route, rng: np.random.Generator) -> tuple[MovingTruck, ...]:
-    """The trucks that the vehicle will meet, spread evenly over the drive."""
-    trucks = []
-    for k in range(yard.moving_trucks):
-        speed = float(rng.uniform(3.0, 6.0))
-        meeting_m = route.length_m * (k + rng.uniform(0.3, 0.9)) / yard.moving_trucks
-        start = meeting_m * (1 + speed / route.speed_mps)
-        colour, seed = _colour(rng), int(rng.integers(1 << 20))
-        trucks.append(MovingTruck(float(start), speed, yard.moving_offset_m, colour, seed))
-    return tuple(trucks)
-
-
-def _colour(rng: np.random.Generator) -> Bgr:
-    return _CONTAINER_COLOURS[int(rng.integers(len(_CONTAINER_COLOURS)))]
-
-
-def _stacks(yard: YardConfig, route: Route, rng: np.random.Generator) -> list[Box]:
-    """Rows of container stacks beside the route, wherever they keep clear of all of it."""
-    boxes: list[Box] = []
-    length, width, height = _CONTAINER_M
-    for side in (-1.0, 1.0):
-        for row in range(2):
-            offset = side * (yard.stack_clearance_m + width / 2 + row * (width + 0.4) + rng.uniform(0, 1.5))
-            for station in np.arange(4.0, route.length_m, length + 0.6):
-                filled, tall = rng.random() < yard.stack_fill / (1 + row), int(rng.integers(1, 4))
-                colours = rng.integers(len(_CONTAINER_COLOURS), size=3)
-                centre, yaw = route.pose_at(station, offset)
-                base = Box(centre_map=centre, size_m=_CONTAINER_M, yaw_rad=yaw)
-                if not filled or not _keeps_clear(base, route, boxes, yard.stack_clearance_m - 0.5):
-                    continue
-                base = replace(base, corrugated=True)
-                for level in range(tall):
-                    colour, seed = _CONTAINER_COLOURS[int(colours[level])], int(station * 10) + level
-                    boxes.append(replace(base, base_m=level * height, albedo_bgr=colour, seed=seed))
-    return boxes
-
-
-def _keeps_clear(box: Box, route: Route, others: list[Box], clearance_m: float) -> bool:
-    corners = box_footprint(box)
-    sides = np.roll(corners, -1, axis=0) - corners
-    outline = np.vstack([corners + t * sides for t in (0.0, 0.25, 0.5, 0.75)])
-    if float(route.distance_to(outline).min()) < clearance_m:
-        return False
-    reach = np.hypot(box.size_m[0], box.size_m[1]) / 2
-    for other in others:
-        gap = np.hypot(*(np.array(other.centre_map) - box.centre_map))
-        along = abs(np.cos(other.yaw_rad - box.yaw_rad)) > 0.99
-        if gap < (min(other.size_m[1], box.size_m[1]) if along else reach):
-            return False
-    return True
-
-
-def _occluders(yard: YardConfig, route: Route, rng: np.random.Generator) -> list[Box]:
-    """Parked trucks, barriers and lamp posts nearer to the route than the stacks."""
-    boxes: list[Box] = []
-    for _ in range(yard.parked_trucks):
-        station, side = rng.uniform(12.0, route.length_m - 12.0), float(rng.choice([-1.0, 1.0]))
-        centre, yaw = route.pose_at(station, side * rng.uniform(6.3, 7.4))
-        boxes += _truck(centre, yaw, _colour(rng), int(rng.integers(1 << 20)))
-    for count, size, offsets, colour in (
-        (yard.barriers, (1.3, 0.5, 0.85), (2.6, 5.0), (0.5, 0.5, 0.5)),
-        (yard.lamp_posts, (0.22, 0.22, 11.0), (5.9, 8.0), (0.3, 0.3, 0.3)),
-    ):
-        for _ in range(count):
-            station, side = rng.uniform(8.0, route.length_m - 8.0), float(rng.choice([-1.0, 1.0]))
-            centre, yaw = route.pose_at(station, side * rng.uniform(*offsets))
-            yaw += rng.normal(0.0, 0.3)
-            boxes.append(Box(centre_map=centre, size_m=size, yaw_rad=yaw, albedo_bgr=colour))
-    return [box for box in boxes if float(route.distance_to(box_footprint(box)).min()) > 1.9]
-
-
-def _strips(yard: YardConfig, route: Route, rng: np.random.Generator) -> list[parts.Shadow]:
-    """Hard shadows of cranes, gantries and cables across the route."""
-    strips = []
-    for _ in range(yard.shadow_strips):
-        centre, yaw = route.pose_at(rng.uniform(0.0, route.length_m), rng.uniform(-4.0, 4.0))
-        yaw += rng.uniform(0.3, 2.8)
-        axis = np.array([np.cos(yaw), np.sin(yaw)])
-        across = np.array([-axis[1], axis[0]])
-        length, width = rng.uniform(8.0, 30.0), rng.choice([0.15, 0.4, 0.9, 2.5])
-        corners = RECTANGLE * (length / 2, width / 2)
-        polygon = centre + corners[:, :1] * axis + corners[:, 1:] * across
-        strips.append(parts.Shadow(polygon_map=polygon, softness_m=float(rng.uniform(0.03, 0.2))))
-    return strips
-
-
-def _ground_marks(surface: SurfaceConfig, route: Route, rng: np.random.Generator) -> parts.GroundMarks:
-    """Tyre marks along the route, repaired patches and oil stains, as a raster of factors."""
-    low = route.points_map.min(axis=0) - _RASTER_BORDER_M
-    high = route.points_map.max(axis=0) + _RASTER_BORDER_M
-    columns, rows = (int(n) for n in np.ceil((high - low) / _RASTER_M))
-    dark = np.zeros((rows, columns), dtype=np.uint8)
-
-    def pixels(points_map: FloatArray) -> NDArray[np.int32]:
-        return np.asarray(np.round((points_map - low) / _RASTER_M * 2**_SUBPIXEL_BITS), dtype=np.int32)
-
-    for _ in range(surface.patches):
-        centre, yaw = route.pose_at(rng.uniform(0.0, route.length_m), rng.uniform(-5.0, 5.0))
-        polygon = pixels(placed(RECTANGLE * rng.uniform(0.6, 3.0, 2), centre, yaw))
-        cv2.fillPoly(dark, [polygon], int(rng.uniform(6, 26)), cv2.LINE_AA, _SUBPIXEL_BITS)
-    for _ in range(surface.oil_stains):
-        centre, _ = route.pose_at(rng.uniform(0.0, route.length_m), rng.normal(0.0, 3.5))
-        x, y = pixels(np.array(centre)).tolist()
-        axes, shade = (int(rng.uniform(6, 90)), int(rng.uniform(6, 60))), int(rng.uniform(15, 60))
-        cv2.ellipse(dark, (x, y), axes, float(rng.uniform(0, 180)), 0, 360, shade, -1, cv2.LINE_AA, 3)
-    tracks = np.zeros_like(dark)
-    for _ in range(int(40 * surface.tyre_marks)):
-        start, length = rng.uniform(0.0, route.length_m), rng.gamma(2.0, 12.0)
-        station = np.arange(start, min(start + length, route.length_m), 0.5)
-        if len(station) < 2:
-            continue
-        drift = rng.normal(0.0, 1.2) + rng.normal(0.0, 0.02) * (station - start)
-        shade, width = int(rng.uniform(8, 38)), int(rng.integers(4, 8))
-        for wheel in (-0.9, 0.9):
-            points = pixels(route.points_at(station, drift + wheel))
-            cv2.polylines(tracks, [points], False, shade, width, cv2.LINE_AA, _SUBPIXEL_BITS)
-    soft = cv2.GaussianBlur(cv2.add(dark, tracks), (0, 0), 1.2)
-    factor = np.asarray(np.clip(128 - soft.astype(np.int16), 40, 128), dtype=np.uint8)
-    return parts.GroundMarks(factor=factor, origin_map=(float(low[0]), float(low[1])), resolution_m=_RASTER_M)
+from v2hdm.simulate.render.scene import Box, convex_hull, standing
 
 
 def camera_info(name: str, config: CameraConfig) -> CameraInfo:
@@ -269,7 +63,7 @@ def calibrate(
         first_ahead, first_left = config.points_ahead_m[int(np.argmax(outside))]
         problem = f"[{first_ahead:g}, {first_left:g}] is outside camera '{info.name}'"
         raise ConfigError(f"calibration.points_ahead_m: {problem}; move it or the mount")
-    # Solved towards pixels, where the larger and equal errors are.
+    # Minimises errors in pixels: clicks err by more than the survey, and all alike.
     pinhole_from_vehicle, _ = cv2.findHomography(surveyed, undistort_points(info, clicked_px), 0)
     if pinhole_from_vehicle is None:
         raise ConfigError("calibration.points_ahead_m: these points do not fix a homography; spread them out")
@@ -287,7 +81,7 @@ _LAYOUT, _YARD, _TRUCKS, _POSES, _CALIBRATION, _IMAGES = range(6)
 
 @dataclass(frozen=True)
 class Port:
-    """Everything of a rendered drive but the pictures."""
+    """A rendered drive without its pictures."""
 
     config: PortConfig
     route: Route
@@ -299,14 +93,14 @@ class Port:
     driven: DrivenPoses
 
     def cam_from_map(self, camera: str, frame: int) -> FloatArray:
-        """Where a camera (4 x 4) truly was at an image."""
+        """The true pose ``cam_from_map`` (4, 4) of a camera at an image."""
         return np.asarray(self.cam_from_vehicle[camera] @ np.linalg.inv(self.driven.map_from_vehicle[frame]))
 
     def moving_boxes(self, frame: int) -> tuple[Box, ...]:
         """The moving trucks at the time of an image."""
         stamp = float(self.driven.stamp_s[frame])
         boxes = [box for truck in self.trucks for box in truck.boxes(self.route, stamp)]
-        return tuple(parts.standing(box, self.renderer.scene.relief) for box in boxes)
+        return tuple(standing(box, self.renderer.scene.relief) for box in boxes)
 
     def picture(self, camera: str, frame: int) -> Rendered:
         """Render an image and its labels: a function of the configuration, the camera and the frame alone."""
@@ -347,11 +141,11 @@ class Port:
         return Motion(velocity_cam=(vx, vy, vz), angular_velocity_cam=(wx, wy, wz), exposure_s=exposure_s)
 
 
-_SHORTEST_ROUTE_M = 25.0  # what stands in the way does so at least 12 m from either end
+_SHORTEST_ROUTE_M = 25.0  # obstacles keep 12 m from either end
 
 
 def _visit_seed(config: PortConfig, part: int) -> list[int]:
-    """The seed of a stream that is drawn anew at every visit."""
+    """Seed of a random stream that differs from visit to visit."""
     return [config.seed, part, *([-1 % 2**32, config.visit] if config.visit else [])]
 
 
@@ -371,7 +165,7 @@ def _surveyed_cameras(config: PortConfig) -> dict[str, Camera]:
 
 
 def build_port(config: PortConfig) -> Port:
-    """Build a port; equal configurations give equal ports, values that contradict each other ConfigError."""
+    """Build a port, the same from the same configuration; raises ConfigError for contradicting values."""
     _check(config)
     streams = {part: np.random.default_rng([config.seed, part]) for part in (_LAYOUT, _YARD)}
     anew = {part: np.random.default_rng(_visit_seed(config, part)) for part in (_TRUCKS, _POSES)}
@@ -382,7 +176,7 @@ def build_port(config: PortConfig) -> Port:
     layout = build_layout(config.paint, route, streams[_LAYOUT])
     scene = build_scene(config.surface, config.yard, route, streams[_YARD], config.seed)
     relief = build_relief(config.relief, route)
-    boxes = tuple(parts.standing(box, relief) for box in scene.boxes)
+    boxes = tuple(standing(box, relief) for box in scene.boxes)
     scene = replace(scene, paints=tuple(layout.paints), boxes=boxes, relief=relief)
     cameras, classes = _surveyed_cameras(config), (*PAINT_CLASSES, *config.paint.stencils)
     return Port(
@@ -409,7 +203,7 @@ def _raised(hd_map: HdMap, relief: Relief | None) -> HdMap:
 
 
 def _check(config: PortConfig) -> None:
-    """Refuse what would fail far from its cause."""
+    """Refuse values that would fail far from their cause; raises ConfigError."""
     route, pieces = config.route, config.route.pieces
     rules: list[tuple[Any, str]] = [
         (config.cameras, "cameras: none given; add at least one"),

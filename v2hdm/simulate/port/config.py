@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 @dataclass(kw_only=True)
 class MountConfig:
-    """Where a camera sits on the vehicle: its centre, then yaw (left), pitch (down) and roll.
+    """A camera's mounting on the vehicle: its centre, then yaw (left), pitch (down) and roll.
 
     Attributes:
         x_m: distance ahead of the vehicle's origin.

@@ -47,7 +47,7 @@ def points_seen(
     boxes: Sequence[Box],
     relief: Relief | None = None,
 ) -> BoolArray:
-    """Which ground points (N, 2) an image shows: inside its border, within 40 m, not hidden."""
+    """Flags (N,) of ground points (N, 2) that an image shows: inside its border, within 40 m, not hidden."""
     centre = camera_centre(cam_from_map)
     seen = np.hypot(*(points_map - centre[:2]).T) < _FARTHEST_M
     seen[seen] = inside_image(info, cam_from_map, points_map[seen], relief)
@@ -75,7 +75,7 @@ def _on_ground(points_map: FloatArray, relief: Relief | None) -> FloatArray:
 def inside_image(
     info: CameraInfo, cam_from_map: FloatArray, points_map: FloatArray, relief: Relief | None = None
 ) -> BoolArray:
-    """Which ground points (N, 2) fall between the image's borders."""
+    """Flags (N,) of the ground points (N, 2) within the image's borders."""
     points_cam = _on_ground(points_map, relief) @ cam_from_map[:3, :3].T + cam_from_map[:3, 3]
     inside = points_cam[:, 2] > _NEAR_M
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -89,7 +89,7 @@ def inside_image(
 
 
 def hidden_by(boxes: Sequence[Box], centre_map: FloatArray, points_map: FloatArray) -> BoolArray:
-    """Which sight lines from ``centre_map`` (3,) to points (N, 2 or 3) pass a box (Kay and Kajiya 1986)."""
+    """Flags (N,) of lines from ``centre_map`` (3,) to points (N, 2 or 3) through a box (Kay, Kajiya 1986)."""
     hidden = np.zeros(len(points_map), dtype=np.bool_)
     points = points_map if points_map.shape[1] == 3 else _on_ground(points_map, None)
     for box in boxes:
@@ -130,7 +130,7 @@ def rendered_drive(config: PortConfig, cache: Path, workers: int, progress: Step
 
 
 def folder_of_port(config: PortConfig, cache: Path) -> Path:
-    """Where a port's drive belongs in a cache: named by the port and a hash of what it is rendered from."""
+    """The folder of a port's drive in a cache, named by the port and a hash of its configuration."""
     content = asdict(config)
     # Ports that were rendered before there were visits, stencils and reliefs stay the same.
     if not config.visit:
@@ -144,7 +144,7 @@ def folder_of_port(config: PortConfig, cache: Path) -> Path:
 
 
 def _drop_damaged(folder: Path) -> bool:
-    """Remove images that are not whole from a rendered drive; whether any is missing."""
+    """Remove damaged images from a rendered drive; returns whether any is missing."""
     missing = False
     for listing in folder.glob("*/images.txt"):
         for name in read_image_list(listing)[1]:

@@ -1,4 +1,4 @@
-"""The markings of a port: what is painted where, and the true map of it."""
+"""The markings of a port: its paint, and the true map."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ _Worn = tuple[float, float]  # wear and dirt
 
 @dataclass
 class Layout:
-    """Paint, and the markings and lanes of the true map that it stands for."""
+    """Paint, with its markings and lanes in the true map."""
 
     paints: list[Paint] = field(default_factory=list)
     markings: list[Marking] = field(default_factory=list)
@@ -109,7 +109,7 @@ class _Painter:
         )
 
     def _worn(self) -> _Worn:
-        """Wear and dirt of one marking: gamma distributed about the means, never gone altogether."""
+        """Wear and dirt of one marking: gamma distributed about the means, never complete."""
         wear = self.config.wear * float(self.rng.gamma(2.0, 0.5))
         dirt = self.config.dirt * float(self.rng.gamma(2.0, 0.5))
         return min(wear, 0.4), min(dirt, 0.7)
@@ -136,7 +136,7 @@ class _Painter:
             self._paint(LANE_LINE, self._ribbon(around, offset_m), worn, seed)
 
     def _straight_pieces(self) -> list[tuple[float, float]]:
-        """Stretches of the route that are straight to within a few millimetres."""
+        """Segments of the route that are straight to within a few millimetres."""
         edges = [0.0]
         for station in np.arange(_VERTEX_SPACING_M, self.route.length_m, _PIECE_STEP_M):
             yaw, first_yaw = (float(self.route.yaw_at(np.array([at]))[0]) for at in (station, edges[-1]))
@@ -178,7 +178,7 @@ class _Painter:
             worn, seed = self._worn(), self._seed()
             if is_field and abs(np.interp(at[0], route.station_m, route.curvature)) >= _STRAIGHT_PER_M:
                 continue
-            # Rows beyond the lanes may run into another stretch of the route behind a turn.
+            # Rows beyond the lanes may run into another part of the route behind a turn.
             near_route = float(route.distance_to(centre[None])[0]) < abs(offset_m) - 0.5
             if near_route or not self.layout.is_free(centre, lines):
                 continue
@@ -242,5 +242,5 @@ class _Painter:
 
 
 def _shares(length_m: float) -> FloatArray:
-    """From 0 to 1 in steps that are at most half a metre of a length."""
+    """Fractions of a length from 0 to 1, at most half a metre apart."""
     return np.linspace(0.0, 1.0, max(int(np.ceil(length_m / _VERTEX_SPACING_M)), 1) + 1)

@@ -1,4 +1,4 @@
-"""The way the vehicle takes, its poses in time, how the recorded ones differ, and the relief beneath it."""
+"""The vehicle's route, its true and recorded poses over time, and the relief of the ground."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ _LEAD_S = 0.35
 
 @dataclass(frozen=True)
 class DrivenPoses:
-    """The drive in time: images at ``stamp_s`` (I,), where the vehicle truly was and what was recorded.
+    """The drive over time: images at ``stamp_s`` (I,), the vehicle's true poses, and the recorded ones.
 
     ``above_plane`` (I, 4, 4) are the true poses without the ground's heights and slopes.
     """
@@ -222,7 +222,7 @@ _WHEELS_M = np.array([[2.8, 0.8], [2.8, -0.8], [0.0, 0.8], [0.0, -0.8]])
 
 
 def build_relief(config: ReliefConfig, route: Route) -> Relief | None:
-    """The heights around a route, None if a plane z = 0; ConfigError where it does not have the ramp."""
+    """The heights around a route, None if a plane z = 0; ConfigError if the ramp does not fit on it."""
     if not any((config.grade, config.crown, config.ramp, config.bank, config.gully_m, config.kerb_m)):
         return None
     if config.ramp_at_m + config.ramp_length_m > route.length_m:
@@ -238,7 +238,7 @@ def build_relief(config: ReliefConfig, route: Route) -> Relief | None:
 
 
 def _on_ramp(config: ReliefConfig, station_m: FloatArray) -> FloatArray:
-    """How much (...) of the ramp's slopes the ground has at stations: 0 to 1, eased at both ends."""
+    """Fraction (...) of the ramp's slope at stations: 0 to 1, eased at both ends."""
     way = np.minimum(station_m - config.ramp_at_m, config.ramp_at_m + config.ramp_length_m - station_m)
     share = np.clip(way / min(_EASE_M, config.ramp_length_m / 2), 0.0, 1.0)
     return np.asarray(share * share * (3 - 2 * share))

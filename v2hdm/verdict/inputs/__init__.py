@@ -1,1 +1,1 @@
-"""Checks before a run: what a drive states, held against itself, its images and its bare ground; no torch."""
+"""Checks before a run: a drive's statements against each other, its images and bare ground; no torch."""

@@ -1,6 +1,6 @@
 """All checks before a run: poses, clocks, noise, road, cameras, images, and bare ground.
 
-A camera's intrinsics, guess, survey and ROI are held against each other; no image is looked at.
+A camera's intrinsics, guess, survey and ROI are compared with each other, without its images.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from v2hdm.geometry.ipm import apply_homography, extrinsic_from_ipm
+from v2hdm.geometry.ipm import apply_homography, initial_extrinsic
 from v2hdm.geometry.lens import distort_points, has_distortion, undistort_points
 from v2hdm.geometry.planar import inside_convex, signed_area
 from v2hdm.geometry.rigid import camera_centre
@@ -27,16 +27,16 @@ from v2hdm.verdict.inputs.poses import Motion, check_attitude, check_jumps, chec
 from v2hdm.verdict.inputs.recording import check_clocks, check_images
 from v2hdm.verdict.verdict import Finding, Status, Verdict, judge, passed
 
-# Lenses sit over their sensor to a few percent of the image's width; cropped images are rare beyond this.
+# Lenses are centred to a few percent of the image's width; cropped images are rarely farther off than this.
 _OFF_CENTRE = 0.15
-# A principal point in the middle of an image smaller or larger by this is that of another resolution.
+# A principal point in the middle of an image smaller or larger by this is of another resolution.
 _OTHER_SIZE = 0.15
 # Focal lengths, in image widths, of lenses that map roads: 118 deg wide (fisheyes more) to 11 deg.
 _SHORTEST, _LONGEST = 0.3, 5.0
 _SQUARE = 0.03  # pixels are square to far less than this
 _MISSHAPEN = 0.03  # clicked homographies depart from K [r1 r2 t] by about one percent
-_BORROWED_M = 1.0  # a guess borrowed from another vehicle of the kind, or from a drawing, is decimetres off
-_NEAR_SURVEY_M = 0.6  # survey and guess that come so close once a sign or a unit is changed show the cause
+_BORROWED_M = 1.0  # a guess from another vehicle of the same type, or from a drawing, is decimetres off
+_NEAR_SURVEY_M = 0.6  # distance of survey and guess at which a changed sign or unit is the cause
 # Units that surveys come in, in 1/m.
 _SURVEY_UNITS = {"centimetres": 1e2, "millimetres": 1e3, "feet": 1 / 0.3048, "inches": 1 / 0.0254}
 _ROI_IN_VIEW = 0.5  # at least this share of the ROI must be in the image
@@ -49,7 +49,7 @@ _LOWEST_M, _HIGHEST_M = 0.3, 12.0  # heights of cameras on vehicles, cranes' str
 
 def check_camera(name: str, camera: Camera) -> list[Finding]:
     """All checks of one camera's description."""
-    cam_from_vehicle = extrinsic_from_ipm(camera.info, camera.ipm[camera.initial_ipm])
+    cam_from_vehicle = initial_extrinsic(camera)
     findings = [
         *check_intrinsics(name, camera.info),
         *check_roi(name, camera, cam_from_vehicle),
@@ -172,7 +172,7 @@ def _mounting(name: str, cam_from_vehicle: FloatArray) -> Iterator[Finding]:
 
 
 def _shape(name: str, info: CameraInfo, ipm: FloatArray) -> Finding:
-    """How far the IPM is from K [r1 r2 t]: its two axes on the ground must be equally long and square."""
+    """Deviation of the IPM from K [r1 r2 t]: its ground axes must be equally long and perpendicular."""
     columns = np.linalg.inv(info.intrinsic) @ np.linalg.inv(ipm)
     first, second = columns[:, 0], columns[:, 1]
     lengths = np.linalg.norm(first), np.linalg.norm(second)
@@ -189,7 +189,7 @@ def _shape(name: str, info: CameraInfo, ipm: FloatArray) -> Finding:
 
 
 def _lens(name: str, info: CameraInfo) -> Finding:
-    """How wide the lens is, and whether it has distortion; only the images tell whether that is right."""
+    """Field of view, and whether the lens has distortion; only images show whether that is right."""
     corners = np.array([[0.0, info.height / 2], [info.width - 1.0, info.height / 2]])
     pinhole = (undistort_points(info, corners) - info.intrinsic[:2, 2]) / np.diag(info.intrinsic)[:2]
     width_deg = float(np.rad2deg(np.arctan(np.abs(pinhole[:, 0])).sum()))
@@ -198,7 +198,7 @@ def _lens(name: str, info: CameraInfo) -> Finding:
 
 
 def _farthest(name: str, camera: Camera, cam_from_vehicle: FloatArray, grid: FloatArray) -> Finding:
-    """Metres of ground along the view that one pixel shows at the far end: range^2 / (height focal)."""
+    """Ground along the view per pixel, m, at the ROI's far end: range^2 / (height focal)."""
     centre = camera_centre(cam_from_vehicle)
     range_m = float(np.linalg.norm(grid - centre[:2], axis=1).max())
     focal = float(camera.info.intrinsic[1, 1])
@@ -215,7 +215,7 @@ def _share_in_image(camera: Camera, grid: FloatArray, depth: FloatArray) -> floa
     info = camera.info
     ipm = np.asarray(np.linalg.inv(camera.ipm[camera.initial_ipm]))
     pinhole = apply_homography(ipm, grid[depth > 0])
-    # Lens models fold over far outside the image: what the pinhole puts there is not in it.
+    # Lens models fold over far outside the image: points of the pinhole there are not in it.
     near = inside_convex(_frame(info, 0.5), pinhole)
     points_px = distort_points(info, pinhole[near])
     return float(inside_convex(_frame(info, 0.0), points_px).sum() / len(grid))
@@ -229,16 +229,16 @@ def _frame(info: CameraInfo, margin: float) -> FloatArray:
 
 
 def _grid(polygon: FloatArray) -> FloatArray:
-    """Points (N, 2) all over a convex polygon, its corners among them."""
+    """A grid of points (N, 2) in a convex polygon, with its corners."""
     axes = [np.linspace(*bounds, 15) for bounds in zip(polygon.min(axis=0), polygon.max(axis=0), strict=True)]
     grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
     return np.vstack([polygon, grid[inside_convex(polygon, grid)]])
 
 
-# Sigmas of roll and pitch that the mapping takes for noise, ground that leans more is bent; and sigmas
-# beyond which markings on it are wrong by many times what the map states.
+# Sigmas of roll and pitch beyond which ground is bent, not noisy; and beyond which markings on it are wrong
+# by many times what the map states.
 _ROAD_SIGMAS, _ROAD_BENT = 3.0, 10.0
-_LEAST_SWAY_RAD = 0.003  # roll and pitch that every vehicle sways by, whatever pose_noise says
+_LEAST_SWAY_RAD = 0.003  # roll and pitch of every vehicle on its suspension, whatever pose_noise states
 _STEPS = ("position jumps", "height jumps", "pose scatter", "image spacing", "pose gaps", "pose rate")
 _MOUNTING = ("roi", "roi range", "ipm against camera matrix", "camera height", "survey against guess")
 _SURVEY = ("survey height", "survey forward", "survey left")
@@ -287,7 +287,7 @@ def check_drive(
 
     Args:
         drive: the drive, or its folder.
-        ground: whether to match bare ground (seconds a camera), or the estimates where they are at hand.
+        ground: whether to match bare ground (seconds per camera), or its estimates by camera.
         workers: processes that match ground.
         progress: called as ``progress(done, total)`` cameras.
 
@@ -330,7 +330,7 @@ def input_findings(drive: Drive, ground: Mapping[str, GroundEstimate] | None = N
 
 
 def check_road(drive: Drive) -> Iterator[Finding]:
-    """How far the ground deviates from the plane beneath the vehicle, within the ROIs' reach."""
+    """Deviation of the ground from the plane beneath the vehicle, within the ROIs' reach."""
     if drive.road is None or len(drive.road.points_map) < 2:
         yield passed("road", "poses", "the ground was recorded as the plane z = 0", 0.0, "deg")
         return
@@ -350,7 +350,7 @@ def check_road(drive: Drive) -> Iterator[Finding]:
 
 
 def causes(findings: Iterable[Finding]) -> list[Finding]:
-    """The findings without those that another one explains (:data:`HIDES`), as bad as the worst of them."""
+    """The findings that no other one explains (:data:`HIDES`), each as bad as the worst that it explains."""
     findings = list(findings)
     raised = [finding for finding in findings if finding.status is not Status.PASS]
     explained: set[int] = set()

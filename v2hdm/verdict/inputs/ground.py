@@ -1,7 +1,7 @@
 """Findings from bare ground, matched between images: one for each quantity that the drive states.
 
-The limits are above everything measured on twelve clean camera-drives and below the smallest fault that harms
-a map; a quantity must also be five of its own sigmas off.
+The limits are above all values of twelve clean drives of a camera, and below the smallest fault that harms a
+map; a quantity must also be off by five of its own sigmas.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from v2hdm.verdict.verdict import Finding, Status, judge, passed
 
 _SURE = 5.0  # sigmas that a quantity must be off
 _CLOCK_S = 0.015  # clocks of clean drives were found right to 7 ms; 15 ms at 5 m/s are 7 cm
-_CORRECTABLE_S = 0.25  # a clock found off by more may lie beyond the search; it is not corrected
+_CORRECTABLE_S = 0.25  # a clock error above this may lie beyond the search; it is not corrected
 # Focal lengths of clean drives were found right to .8 %; confusion with the pitch costs 1 to 2 %.
 _FOCAL = 0.025
 # Change of k1 that moves the corner of a lens 74 deg wide by 3 px; clean drives stay below .001.
@@ -27,15 +27,15 @@ _DISTORTION = 0.02
 _GRADE = 0.001  # rise of the poses over the ground, m per m: clean drives stay below .0003
 _UP_M = 0.08  # heights of clean drives were found right to 6 cm, mostly to 1
 _ALONG_M = 0.15  # places in the plane of clean drives were found right to 8 cm
-_VAGUE_M = 0.1  # a place in the plane that is known worse than this says nothing of a survey
+_VAGUE_M = 0.1  # largest sigma of a place in the plane that tests a survey
 # Median residual of matched patches: .23 to .46 on clean drives, 1.1 to 1.5 without a lens' distortion.
 _RESIDUAL = 0.8
-_PULL = 3.0  # root mean square of the poses' errors in their stated sigmas: up to 2.2 on clean drives
-# More patches match under another reading than as given by this share: they lie .1 to .2 below on clean
-# turning drives, and differ by .03 from pair to pair of images.
+_POSE_SIGMAS = 3.0  # RMS of the poses' errors in their stated sigmas: up to 2.2 on clean drives
+# Lead of another reading over the one as given in the fraction of matching patches: on clean turning drives
+# others are .1 to .2 behind, and differ by .03 between pairs of images.
 _LEADS = 0.05
 _FOOT_M = 0.3048
-# A third of the usual pairs: whether the ground matches shows at once.
+# A third of the usual pairs suffices to see whether the ground matches.
 _QUICK = GroundOptions(pairs=12, free=(), readings=False)
 
 CHECKS = (
@@ -57,9 +57,9 @@ NO_MATCH = (
     "bare ground does not match between the images with these stamps, poses, lens and guess: check the "
     "clock, the unit of the positions (feet?), whether the images are upside down, and the guessed mounting"
 )
-"""The sentence where no cause is known."""
+"""The sentence without a known cause."""
 
-_UNTOLD = {
+_NOT_CHECKED = {
     GroundStatus.TOO_LITTLE: "too little ground in view, or too little motion, to check lens, clock and "
     "mounting: drive farther, or enlarge roi_vehicle",
     GroundStatus.NO_TEXTURE: "too little of the ground matches other images to check lens and "
@@ -121,7 +121,7 @@ _CHECKS: Mapping[str, _Check] = {
 
 
 def rival_of(ground: Mapping[str, GroundEstimate]) -> Reading | None:
-    """Another reading of the poses that fits every camera better, where the one as given needs excuses."""
+    """A reading of the poses that fits every camera better than the one given, if that leaves errors."""
     asked = [estimate for estimate in ground.values() if estimate.status is GroundStatus.FOUND]
     if len(asked) < len(ground) or not any(_is_bent(estimate) for estimate in asked):
         return None
@@ -141,17 +141,17 @@ def _is_bent(estimate: GroundEstimate) -> bool:
     return (
         _is_off(estimate.parameters.get("clock_s"))
         or (focal is not None and focal.observable and abs(focal.value) > _FOCAL)
-        or max(estimate.innovations.values(), default=0.0) > _PULL
+        or max(estimate.innovations.values(), default=0.0) > _POSE_SIGMAS
     )
 
 
 def path_of(ground: Mapping[str, GroundEstimate]) -> Path | None:
-    """The recorded path, judged by all cameras' ground; None where they do not agree or do not say."""
+    """The recorded path, judged by all cameras' ground; None if they disagree or do not show it."""
     rival = rival_of(ground)
     readings = {
         rival or estimate.reading
         for estimate in ground.values()
-        if estimate.status not in _UNTOLD and max(estimate.shares.values(), default=0.0) > 0
+        if estimate.status not in _NOT_CHECKED and max(estimate.shares.values(), default=0.0) > 0
     }
     known = {
         Reading.AS_GIVEN: Path.AS_GIVEN,
@@ -164,7 +164,7 @@ def path_of(ground: Mapping[str, GroundEstimate]) -> Path | None:
 def check_ground(
     drive: Drive, ground: Mapping[str, GroundEstimate], cause: str | None = None
 ) -> list[Finding]:
-    """All findings from the cameras' ground; ``cause`` says why none matches, where that is known."""
+    """All findings from the cameras' ground; ``cause`` is the reason why none matches, if known."""
     rival = rival_of(ground)
     if rival is not None:
         return [_read_as(name, estimate, rival) for name, estimate in ground.items()]
@@ -181,8 +181,8 @@ def _camera(drive: Drive, name: str, estimate: GroundEstimate, cause: str | None
     as_given = estimate.shares.get(Reading.AS_GIVEN, 0.0)
     if estimate.reading is not Reading.AS_GIVEN:
         return [_read_as(name, estimate, estimate.reading)]
-    if estimate.status in _UNTOLD and cause is None:
-        return [passed("ground match", name, _UNTOLD[estimate.status])]
+    if estimate.status in _NOT_CHECKED and cause is None:
+        return [passed("ground match", name, _NOT_CHECKED[estimate.status])]
     if estimate.status is not GroundStatus.FOUND:
         return [Finding("ground match", Status.FAIL, as_given, None, "", cause or NO_MATCH, name)]
     matched = passed("ground match", name, "bare ground matches between the images", as_given)
@@ -196,7 +196,7 @@ def _camera(drive: Drive, name: str, estimate: GroundEstimate, cause: str | None
 
 
 def _confounded(estimate: GroundEstimate, key: str) -> str:
-    """Why this drive mixes a parameter of the lens up with another quantity; empty where it does not.
+    """Why this drive confuses a parameter of the lens with another quantity; empty if it does not.
 
     Clean drives: on a straight one, focal lengths came out 6 and 8 % wrong at 15 sigmas, since height and
     focal length slide together; with a level camera, k1 came out .05 wrong at 10 sigmas.
@@ -225,7 +225,7 @@ def _judge_parameter(name: str, parameter: Parameter, confounded: str) -> Findin
 
 
 def _fit(name: str, estimate: GroundEstimate, own: list[Finding]) -> Iterator[Finding]:
-    """Residuals and errors of poses: they show that something is wrong where nothing above says what."""
+    """Residuals and errors of poses: signs of faults that no parameter above explains."""
     yield judge(
         "ground residual", name, estimate.median_residual, _RESIDUAL, "",
         fine="matched ground lies where lens and mounting predict",
@@ -233,11 +233,11 @@ def _fit(name: str, estimate: GroundEstimate, own: list[Finding]) -> Iterator[Fi
         "length in camera_info is wrong, or the road in the ROI is no plane",
     )  # fmt: skip
     raised = any(finding.status is not Status.PASS for finding in own)
-    innovations = {part: pull for part, pull in estimate.innovations.items() if np.isfinite(pull)}
+    innovations = {part: sigmas for part, sigmas in estimate.innovations.items() if np.isfinite(sigmas)}
     if innovations and not raised and not _is_off(estimate.parameters.get("clock_s")):
         part = max(innovations, key=lambda key: innovations[key])
         yield judge(
-            "poses against ground", name, innovations[part], _PULL, "",
+            "poses against ground", name, innovations[part], _POSE_SIGMAS, "",
             fine="the images move as the poses do, within pose_noise",
             wrong=f"images and poses move differently: their {part} is {innovations[part]:.0f} times "
             "pose_noise off; state the actual noise, or check the clock",
@@ -246,7 +246,7 @@ def _fit(name: str, estimate: GroundEstimate, own: list[Finding]) -> Iterator[Fi
 
 
 def clock_corrections(ground: Mapping[str, GroundEstimate]) -> dict[str, float]:
-    """By camera, how much later than stamped its images were taken, s, where that is sure and correctable."""
+    """Exposure minus stamp, s, of cameras whose clock is surely and correctably off."""
     if rival_of(ground) is not None:
         return {}
     clocks = {name: clock for name, clock in _asked_clocks(ground).items() if _is_off(clock)}
@@ -266,7 +266,7 @@ def _is_off(clock: Parameter | None) -> bool:
 
 
 def _clocks(ground: Mapping[str, GroundEstimate]) -> Iterator[Finding]:
-    """Each camera's clock; one sentence for all where they are off alike."""
+    """Each camera's clock; one sentence for all if they are off alike."""
     clocks = _asked_clocks(ground)
     late = [clock.value for clock in clocks.values() if _is_off(clock)]
     common = len(late) == len(clocks) > 1 and np.ptp(late) < _CLOCK_S
@@ -288,7 +288,7 @@ def _clocks(ground: Mapping[str, GroundEstimate]) -> Iterator[Finding]:
 
 
 def find_cause(drive: Drive, ground: Mapping[str, GroundEstimate]) -> str | None:
-    """The usual mistake without which the ground of a camera that never matched does; else None."""
+    """The usual mistake whose correction makes the ground match, if it never does; else None."""
     lost = [
         name
         for name, estimate in ground.items()
@@ -320,7 +320,7 @@ def scaled(drive: Drive, factor: float) -> Drive:
 
 
 def upside_down(drive: Drive) -> Drive:
-    """The drive as if all its images had been turned by 180 deg: their lenses and IPMs turned instead."""
+    """The drive as if all images were rotated by 180 deg: their lenses and IPMs are instead."""
     return replace(drive, cameras={name: _turned(camera) for name, camera in drive.cameras.items()})
 
 
@@ -339,8 +339,7 @@ def _turned(camera: Camera) -> Camera:
     )
 
 
-# The mistakes that are tried, the likelier first, with how to undo them; each costs some seconds on a drive
-# that fails anyway.
+# Mistakes to try, the likelier first, and how to undo them; each costs seconds on a drive that fails anyway.
 _MISTAKES: tuple[tuple[Callable[[Drive], Drive], str], ...] = (
     (
         lambda drive: scaled(drive, _FOOT_M),

@@ -12,13 +12,13 @@ from enum import Enum
 
 import numpy as np
 
-from v2hdm.geometry.planar import angle_between
+from v2hdm.geometry.planar import angle_between, wrapped
 from v2hdm.geometry.rigid import quaternion_from_rotation, rotation_from_euler, rotation_from_quaternion
 from v2hdm.records import BoolArray, FloatArray
 from v2hdm.verdict.inputs.poses import STEEPEST_DEG, Chords, Motion
 from v2hdm.verdict.verdict import Finding, Status, judge, passed
 
-# Course and heading agree within this: an origin 1.5 m ahead of the axle errs so on a circle of 6 m.
+# Course and heading agree within this: so far off is an origin 1.5 m ahead of the axle on a circle of 6 m.
 _AGREES_RAD = np.deg2rad(15)
 # A convention fits if this share of the chords agrees: the rest may be wheel spin, ferries, bad fixes.
 _FITS = 0.8
@@ -32,7 +32,7 @@ _SURE = 5.0
 _CURVED_PER_M = 0.02  # curvature of a turn that shows where the origin sits
 
 Undo = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
-"""Takes positions (P, 3) and rotations (P, 3, 3) to what they should be."""
+"""Corrects positions (P, 3) and rotations (P, 3, 3)."""
 
 
 def _turned(sign: float, offset_deg: float) -> Undo:
@@ -138,7 +138,7 @@ def _alignment(motion: Motion) -> Iterator[Finding]:
     offset = np.where(reverse, wrapped(offset + np.pi), offset)
     curvature = motion.turn_rad / np.linalg.norm(motion.course, axis=1) * np.where(reverse, -1.0, 1.0)
     keep = np.abs(offset) < _AGREES_RAD
-    # Neighbouring chords share their poses: so many count as one.
+    # Neighbouring chords share poses: this many count as one.
     overlap = float(max(1.0, np.median(motion.chords.last - motion.chords.first)))
     yield _constant_offset(offset[keep], np.abs(motion.turn_rad[keep]), overlap)
     yield from _lever(offset[keep], curvature[keep], overlap)
@@ -161,7 +161,7 @@ def _constant_offset(offset_rad: FloatArray, turn_rad: FloatArray, overlap: floa
 
 
 def _lever(offset_rad: FloatArray, curvature: FloatArray, overlap: float) -> list[Finding]:
-    """How far ahead of the axle, which does not slip sideways, the origin is: tan(offset) / curvature."""
+    """Distance of the origin ahead of the axle, which does not slip sideways: tan(offset) / curvature."""
     turns = np.abs(curvature) > _CURVED_PER_M
     if turns.sum() < 30:
         same = "a straight route looks the same in a mirrored world (x and y swapped, NED): drive a turn"
@@ -186,7 +186,7 @@ def _lever(offset_rad: FloatArray, curvature: FloatArray, overlap: float) -> lis
 
 
 def _cause(motion: Motion, path: Path | None) -> str | None:
-    """The sentence that names what is wrong; None where it is not the heading."""
+    """The sentence that names the error; None if it is not the heading's."""
     if path is Path.MIRRORED:
         return AXES_SWAPPED
     fitting = [name for name, (undo, _) in _CONVENTIONS.items() if _agreement(motion, undo)[0] >= _FITS]
@@ -211,7 +211,7 @@ def _cause(motion: Motion, path: Path | None) -> str | None:
 
 
 def _upright(rotation: FloatArray, chords: Chords) -> BoolArray:
-    """On which chords (N,) the vehicle stands upright."""
+    """Flags (N,) of the chords on which the vehicle is upright."""
     return np.asarray(rotation[chords.first, 2, 2] > np.cos(np.deg2rad(STEEPEST_DEG)))
 
 
@@ -224,7 +224,7 @@ def _turns_too_fast(motion: Motion) -> bool:
 
 
 def _agreement(motion: Motion, undo: Undo | None = None) -> tuple[float, float]:
-    """The shares of chords along which the vehicle stands upright and points ahead, and ahead or back."""
+    """Fractions of chords on which the vehicle is upright and points ahead, and ahead or back."""
     position, rotation, chords = motion.position, motion.rotation, motion.chords
     if undo is not None:
         position, rotation = undo(position, rotation)
@@ -241,11 +241,6 @@ def _course_minus_yaw(motion: Motion) -> FloatArray:
 def _forward(rotation: FloatArray, chords: Chords) -> FloatArray:
     """The vehicle's x axis (N, 2) in the plane, midway on each chord."""
     return np.asarray(rotation[chords.first, :2, 0] + rotation[chords.last, :2, 0])
-
-
-def wrapped(angle_rad: FloatArray) -> FloatArray:
-    """Angles wrapped to +-pi."""
-    return np.asarray((angle_rad + np.pi) % (2 * np.pi) - np.pi)
 
 
 def _circular_median(angles_rad: FloatArray) -> float:

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from v2hdm.geometry.planar import angle_between, length_along
+from v2hdm.geometry.planar import angle_between, cross, length_along
 from v2hdm.ground.motion import trajectory_of_images
 from v2hdm.records import BoolArray, Drive, FloatArray, IntArray, PoseNoise
 from v2hdm.verdict.verdict import Finding, Status, judge
@@ -40,8 +40,8 @@ _RTK_M = 0.3  # a position that is worse than this is no RTK, not even with a fl
 # Two degrees: worse than any heading from two antennas a metre apart, or from a gyro compass.
 _HEADING_RAD = 0.035
 _ROLL_PITCH_RAD = 0.05  # three degrees: a vehicle that sways more than this on its suspension overturns
-# Poses that scatter so many times more than stated make every sigma of the map wrong by as much, and beyond
-# the second the map itself.
+# Scatter of the poses, relative to the stated noise, beyond which the map's sigmas are wrong by as much, and
+# beyond which the map itself is wrong.
 _UNDERSTATED, _USELESS = 3.0, 10.0
 # The fourth difference: driving at 10 Hz leaves millimetres in it, white noise sqrt(70) sigmas.
 _DIFFERENCES = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
@@ -52,7 +52,7 @@ _SLOWEST_HZ = 8.0  # below this rate driving itself shows in a fourth difference
 
 @dataclass(frozen=True)
 class Chords:
-    """Stretches of :data:`_CHORD_M` that the vehicle moved: indices (N,) of their first and last pose."""
+    """Chords of :data:`_CHORD_M` of the driven path: indices (N,) of their first and last pose."""
 
     first: IntArray
     last: IntArray
@@ -72,13 +72,13 @@ class Motion:
 
     @classmethod
     def of(cls, drive: Drive) -> Motion:
-        """The poses of a drive as they were recorded; those of its images where nothing else is kept."""
+        """The poses of a drive as recorded, or those of its images without a recording."""
         poses = drive.recorded or drive.trajectory or trajectory_of_images(drive)
         return cls(poses.stamp_s, poses.map_from_vehicle[:, :3, 3], poses.map_from_vehicle[:, :3, :3])
 
     @cached_property
     def chords(self) -> Chords:
-        """The chords of the stretches on which the vehicle moves."""
+        """The chords from evenly spaced poses, where the vehicle moves."""
         stride = -(-len(self.stamp_s) // _MOST_STARTS)
         starts = range(0, len(self.stamp_s), stride)
         pairs = [(start, end) for start in starts if (end := self._reached(start)) is not None]
@@ -97,7 +97,7 @@ class Motion:
 
     @cached_property
     def moving(self) -> BoolArray:
-        """Which steps (P - 1,) from pose to pose lie on a chord."""
+        """Flags (P - 1,) of the steps from pose to pose that lie on a chord."""
         covered = np.zeros(len(self.stamp_s))
         np.add.at(covered, self.chords.first, 1)
         np.add.at(covered, self.chords.last, -1)
@@ -116,12 +116,12 @@ class Motion:
 
     @cached_property
     def turn_rad(self) -> FloatArray:
-        """By how much (N,) the recorded heading turns on each chord."""
+        """Turn (N,) of the recorded heading on each chord."""
         first, last = self.rotation[self.chords.first, :2, 0], self.rotation[self.chords.last, :2, 0]
         return angle_between(first, last)
 
     def _reached(self, start: int) -> int | None:
-        """The first pose a chord away from ``start``, if the vehicle gets there at a moving speed."""
+        """The first pose a chord away from ``start``, if the vehicle is fast enough to be moving."""
         end = np.searchsorted(self.stamp_s, self.stamp_s[start] + _CHORD_M / _SLOWEST_MPS, side="right")
         offset = self.position[start + 1 : end, :2] - self.position[start, :2]
         reached = np.flatnonzero((offset**2).sum(axis=1) >= _CHORD_M**2)
@@ -129,7 +129,7 @@ class Motion:
 
 
 def check_path(motion: Motion) -> list[Finding]:
-    """Whether the path is one that a road vehicle drives in metres and seconds."""
+    """Whether a road vehicle can drive the path, in metres and seconds."""
     if not len(motion.chords):
         return [_hardly_moves(motion)]
     speed = float(np.percentile(motion.speed_mps, 95))
@@ -162,7 +162,7 @@ def _hardly_moves(motion: Motion) -> Finding:
 
 
 def _is_smooth(motion: Motion) -> bool:
-    """Whether most chords are driven at a vehicle's speed and about as long as the way between their ends."""
+    """Whether most chords have a vehicle's speed and are about as long as the path between their ends."""
     way = length_along(motion.position[:, :2])
     chords = motion.chords
     straight = motion.speed_mps * (motion.stamp_s[chords.last] - motion.stamp_s[chords.first])
@@ -176,7 +176,7 @@ def check_jumps(motion: Motion, noise: PoseNoise) -> list[Finding]:
         return []
     longest_s = np.maximum(motion.interval_s[:-1], motion.interval_s[1:])
     spare = 0.5 * _HARDEST_MPS2 * longest_s**2
-    # Poses that all scatter by so many times what is stated do not jump: their scatter is a check of its own.
+    # Poses that all scatter by more than stated do not jump: their scatter has a check of its own.
     off = _off_neighbours(motion, motion.position[:, :2])
     scatter_m = max(map(_robust_sigma, off.T)) / np.sqrt(1.5)
     usual = _EXTREME / 2 * float(np.clip(scatter_m, noise.position_m, _UNDERSTATED * noise.position_m))
@@ -188,11 +188,11 @@ def check_jumps(motion: Motion, noise: PoseNoise) -> list[Finding]:
 
 
 def _jump(which: str, motion: Motion, off: FloatArray, limit: FloatArray) -> Finding:
-    """The worst of offsets (P - 2, D), m, from the line between neighbours, by its limit."""
+    """Judge the worst of offsets (P - 2, D), m, from the line between neighbours, relative to its limit."""
     size = np.linalg.norm(off, axis=1)
     worst = int(np.argmax(size / limit))
     count = int((size > limit).sum())
-    # a step shows as half of it before and minus half of it behind.
+    # A step appears as half of it before and minus half of it behind.
     beside = off[max(worst - 1, 0) : worst + 2]
     step_m = float(np.linalg.norm(beside - off[worst], axis=1).max())
     return judge(
@@ -204,25 +204,25 @@ def _jump(which: str, motion: Motion, off: FloatArray, limit: FloatArray) -> Fin
 
 
 def _off_neighbours(motion: Motion, values: FloatArray) -> FloatArray:
-    """How far values (P, D) are off the line between their neighbours (P - 2, D)."""
+    """Offsets (P - 2, D) of values (P, D) from the line between their neighbours."""
     part = (motion.interval_s[:-1] / (motion.interval_s[:-1] + motion.interval_s[1:]))[:, None]
     return np.asarray(values[1:-1] - (values[:-2] + part * (values[2:] - values[:-2])))
 
 
 def _jitter(motion: Motion, off: FloatArray) -> Finding | None:
-    """The finding that stamps scatter: positions are ``off`` (P - 2, D) along the way alone, all of them."""
+    """A finding if stamps jitter: all positions are ``off`` (P - 2, D) the line, along the path alone."""
     ahead = motion.rotation[1:-1, :2, 0]
     driven = motion.moving[:-2] & motion.moving[1:-1] & motion.moving[2:]
     if not driven.any():
         return None
-    # From one offset to the next, so that steady braking is none.
+    # From one offset to the next: steady braking cancels.
     along = np.diff((off * ahead).sum(axis=1))[driven]
-    across = np.diff(off[:, 1] * ahead[:, 0] - off[:, 0] * ahead[:, 1])[driven]
+    across = np.diff(cross(ahead, off))[driven]
     along_m, across_m = _robust_sigma(along), _robust_sigma(across)
     surely = float(np.exp(_SURE_JITTER / np.sqrt(len(along))))
     if not 0 < surely * across_m < along_m or np.abs(along).max() > _EXTREME / 2 * along_m:
         return None
-    # Four poses that err alike, by -1/2, 3/2, -3/2 and 1/2.
+    # A difference of offsets weights four poses by -1/2, 3/2, -3/2 and 1/2.
     jitter_ms = 1e3 * float(np.sqrt((along_m**2 - across_m**2) / 5.0) / np.median(motion.speed_mps))
     if jitter_ms < _LEAST_JITTER_MS:
         return None
@@ -262,7 +262,7 @@ def _pitch_sign(motion: Motion, pitch_rad: FloatArray) -> Iterator[Finding]:
     if spread < _GRADE_CHANGE_RAD or np.std(middle) < 0.3 * np.std(grade_rad):
         return
     slope = float(np.cov(middle, -grade_rad)[0, 1] / np.var(grade_rad))
-    # Chords overlap: those of the way that do not are so many.
+    # Chords overlap: this is the number of independent ones.
     apart = max(float(motion.step_m[motion.moving].sum()) / _CHORD_M, 1.0)
     sigma = float(np.std(middle + slope * grade_rad) / np.std(grade_rad) / np.sqrt(apart))
     yield judge(
@@ -294,7 +294,7 @@ def check_noise(motion: Motion, noise: PoseNoise) -> list[Finding]:
 
 
 def _is_course(motion: Motion, scatter_rad: float) -> bool:
-    """Whether the heading's scatter from pose to pose is mostly that of the course, so of positions."""
+    """Whether the heading's scatter is mostly that of the course, and so of the positions."""
     ahead, at = motion.rotation[1:-1, :2, 0], motion.position[:, :2]
     courses = (at[1:-1] - at[:-2], at[2:] - at[1:-1], at[2:] - at[:-2])
     return min(_robust_sigma(_fourth(angle_between(ahead, one))) for one in courses) < scatter_rad / 2
@@ -347,6 +347,7 @@ def _white_noise(motion: Motion) -> tuple[float, float] | tuple[None, None]:
 
 
 def _fourth(values: FloatArray) -> FloatArray:
+    """Fourth differences (P - 4,), scaled to the deviation of white noise."""
     return np.convolve(values, _DIFFERENCES, mode="valid") / float(np.linalg.norm(_DIFFERENCES))
 
 

@@ -76,7 +76,7 @@ def _pose_rate(drive: Drive, motion: Motion) -> Iterator[Finding]:
 
 
 def _held(motion: Motion) -> Finding:
-    """Poses that repeat the one before while the vehicle moves."""
+    """Poses that repeat the previous one while the vehicle moves."""
     same = (np.diff(motion.position, axis=0) == 0).all(axis=1) & motion.moving
     share = float(same.sum() / motion.moving.sum())
     jump_m = float(motion.step_m[1:][same[:-1]].max(initial=0.0))
@@ -102,7 +102,7 @@ def _posed(drive: Drive, name: str, posed: int) -> Finding:
 
 
 def _overlap(spans: dict[str, tuple[float, float]], name: str) -> Finding:
-    """How much of the time that any camera recorded this one missed."""
+    """The fraction of all cameras' recording time that this one misses."""
     start, end = min(first for first, _ in spans.values()), max(last for _, last in spans.values())
     missed = 1 - (spans[name][1] - spans[name][0]) / max(end - start, 1e-9)
     return judge(
@@ -133,7 +133,7 @@ def _spacing(drive: Drive, motion: Motion, name: str) -> Iterator[Finding]:
 
 
 def check_images(drive: Drive) -> list[Finding]:
-    """Whether the images are those of a moving camera each, and show road; DriveError for a damaged one."""
+    """Whether each camera's images differ while it moves, and show road; DriveError for a damaged one."""
     findings = _shared(drive)
     for name, camera in drive.cameras.items():
         images = [image for image in drive.images if image.camera == name]
@@ -143,7 +143,7 @@ def check_images(drive: Drive) -> list[Finding]:
 
 
 def _shared(drive: Drive) -> list[Finding]:
-    """Images that two cameras both claim as theirs."""
+    """Images listed for two cameras."""
     owner: dict[Path, str] = {}
     for image in drive.images:
         other = owner.setdefault(image.path.resolve(), image.camera)
@@ -154,7 +154,7 @@ def _shared(drive: Drive) -> list[Finding]:
 
 
 def _frozen(name: str, images: Sequence[Image]) -> Finding:
-    """The share of images that repeat the one before while the vehicle moves."""
+    """The fraction of images that repeat the previous one while the vehicle moves."""
     steps_m = np.diff([image.map_from_vehicle[:2, 3] for image in images], axis=0)
     moving = (np.flatnonzero(np.linalg.norm(steps_m, axis=1) > _MOVED_M) + 1).tolist()
     if not moving:
@@ -168,7 +168,7 @@ def _frozen(name: str, images: Sequence[Image]) -> Finding:
         if len(alike) > 1:  # one alone may be a dropped frame
             share, at = len(alike) / len(sampled), alike
     if share <= _FROZEN:
-        # Successive numbers are as far from their places among all.
+        # Within a run of successive numbers, number minus index is constant.
         runs = [[k for _, k in run] for _, run in groupby(enumerate(copied), lambda one: one[1] - one[0])]
         longest = max(runs, key=len, default=[])
         if len(longest) >= _STUCK:
@@ -187,7 +187,7 @@ def _frozen(name: str, images: Sequence[Image]) -> Finding:
 
 
 def _exposure(name: str, camera: Camera, images: Sequence[Image]) -> Iterator[Finding]:
-    """The clipped share of the ROI in sampled images."""
+    """The clipped fraction of the ROI in sampled images."""
     first, *rest = _spread(images, _SAMPLES)
     greys = [_read(first.path)]
     mask = _roi_mask(camera, greys[0])
@@ -221,7 +221,7 @@ def _read(path: Path) -> np.ndarray:
 
 
 def _roi_mask(camera: Camera, grey: np.ndarray) -> np.ndarray:
-    """Where the reduced image shows the ROI, as the guess says."""
+    """Pixels of the reduced image that show the ROI under the guess."""
     pinhole = apply_homography(np.asarray(np.linalg.inv(camera.ipm[camera.initial_ipm])), camera.roi_vehicle)
     corners = distort_points(camera.info, pinhole) / _REDUCED
     mask = np.zeros(grey.shape, np.uint8)

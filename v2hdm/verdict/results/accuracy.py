@@ -88,10 +88,8 @@ def _largest_part(best: MethodResult, coarse: Sequence[Marking]) -> str:
 
 def _corner_radii_m(marking: Marking) -> FloatArray:
     """The 95 % radii (4,) of a marking's corners, m; infinite where no covariance is stated."""
-    if marking.covariance_m2 is None:
-        return np.full(4, np.inf)
-    blocks = np.einsum("iaib->iab", marking.covariance_m2.reshape(4, 2, 4, 2))
-    return np.array([_radius_m(block) for block in blocks])
+    covariances = marking.corner_covariances_m2
+    return np.full(4, np.inf) if covariances is None else np.array([_radius_m(one) for one in covariances])
 
 
 def _radius_of_all_m(radius_m: FloatArray) -> float:

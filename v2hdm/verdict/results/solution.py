@@ -17,9 +17,8 @@ import numpy as np
 from v2hdm.adjust import Fault
 from v2hdm.adjust.sensitivity import STRETCHES
 from v2hdm.ground import GroundEstimate
-from v2hdm.mapping.recovery import (
+from v2hdm.mapping.input_errors import (
     CLEAR_SIGMAS,
-    CLOCK_OBSERVABLE_S,
     OBSERVABLE_SIGMA,
     doubt,
     even_sigmas,
@@ -53,6 +52,7 @@ _ODDS_LIMIT = CLEAR_SIGMAS**2 / 2  # log odds from which a cause is named that n
 # Scatter of stamps, s, that does not matter, and that is usual where there is any.
 _LEAST_JITTER_S, _USUAL_JITTER_S = 0.005, 0.02
 _JUMP_LIMIT = 9.0  # largest single correction of a pose, in sigmas
+_CLOCK_OBSERVABLE_S = 0.004  # largest sigma of an observed clock offset, s: two are 8 ms
 # Sigma, m, of the point that the poses are of, up to which a drive observes it: twice that, at 95 %, is the
 # usual accuracy goal.
 _LEVER_OBSERVABLE_M = 0.025
@@ -101,7 +101,6 @@ CHECKS: Mapping[Fault, tuple[str, str]] = {
 _CORRECTED_BY = {Fault.CLOCK: "images got poses at the corrected times", Fault.SIZE: "no known size was used"}
 
 _LIKE_CLOCK = (Fault.CLOCK_DRIFT, Fault.COURSE)  # faults that a constant clock offset may stand for
-
 _RIVAL_LOG_ODDS = float(np.log(10.0))  # up to which a less likely cause is named beside the likeliest
 _WAYS = (("behind", "ahead of"), ("to the right of", "to the left of"), ("below", "above"))
 # What units are shown as, and by what values are multiplied for it.
@@ -294,7 +293,7 @@ def doubted(evidence: SolveEvidence) -> Contradiction | None:
 
 def relied_on(evidence: SolveEvidence) -> list[str]:
     """The inputs that would move the whole map if they erred in all cameras alike, unseen by this drive."""
-    loose = {"the clocks": _loosest_clock_s(evidence) > CLOCK_OBSERVABLE_S}
+    loose = {"the clocks": _loosest_clock_s(evidence) > _CLOCK_OBSERVABLE_S}
     loose["the surveyed centres"] = bool(_loose_levers(evidence))
     return [name for name, is_loose in loose.items() if is_loose]
 
@@ -311,7 +310,7 @@ def _loose_levers(evidence: SolveEvidence) -> list[Contradiction]:
 def _unobservable(evidence: SolveEvidence, raised: set[str]) -> Iterator[Finding]:
     """Errors of all cameras together that no drive of this kind shows, and the drive that would."""
     loosest_s, loose = _loosest_clock_s(evidence), _loose_levers(evidence)
-    if loosest_s > CLOCK_OBSERVABLE_S and "clock" not in raised:
+    if loosest_s > _CLOCK_OBSERVABLE_S and "clock" not in raised:
         sure = f"to better than {2e3 * loosest_s:.0f} ms" if np.isfinite(loosest_s) else "at all"
         says = f"the markings do not show {sure} whether all clocks are equally late: drive a turn"
         yield passed("clock", "all cameras", says)

@@ -1,0 +1,74 @@
+"""Chains: crossings of lines linked from row to row, beginning near the camera, where lines are far apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from v2hdm.records import FloatArray, IntArray
+
+_MIN_CHAIN = 3  # crossings
+_CHAIN_ODDS = 0.0  # least log odds of a chain's crossings
+_MAX_GAP_PX = 40.0  # rows between crossings of a chain
+_SLOPE_POINTS = 6  # last points of a chain that give its direction
+_MAX_SLOPE = 4.5  # columns per row from a chain's first crossing to its second
+_GATE_PX = 12.0  # distance of a crossing from a chain's continuation
+
+
+@dataclass
+class _Chain:
+    """An unfinished line: rows and columns, px, and indices of its crossings, from near to far."""
+
+    v_px: list[float]
+    u_px: list[float]
+    index: list[int]
+    slope: float | None = None  # columns per row over the last points; None with a single one
+
+    def add(self, v_px: float, u_px: float, index: int) -> None:
+        self.v_px.append(v_px)
+        self.u_px.append(u_px)
+        self.index.append(index)
+        first = max(-len(self.v_px), -_SLOPE_POINTS)
+        self.slope = (u_px - self.u_px[first]) / (self.v_px[first] - v_px)
+
+    def expected(self, v_px: float) -> tuple[float, float]:
+        """Expected column, px, of the line's crossing of a farther row, and the gate about it, px."""
+        ahead = self.v_px[-1] - v_px
+        if self.slope is None:
+            return self.u_px[-1], _MAX_SLOPE * ahead
+        young = 1.5 if len(self.v_px) < _SLOPE_POINTS else 1.0
+        return self.u_px[-1] + self.slope * ahead, _GATE_PX * young * (1 + 0.04 * (ahead - 8))
+
+
+def find_chains(points_px: FloatArray, odds: FloatArray) -> list[IntArray]:
+    """Link likely crossings (N, 2), from near to far, from row to row; ``odds`` (N,) are log odds."""
+    likely = np.flatnonzero(odds > _CHAIN_ODDS)
+    u_px, v_px = points_px[likely].T
+    if not len(likely):
+        return []
+    begins = np.flatnonzero(np.diff(v_px, prepend=np.nan)).tolist()  # nan differs from any row
+    columns, indices, row_px = u_px.tolist(), likely.tolist(), v_px[begins].tolist()
+    open_chains: list[_Chain] = []
+    done: list[_Chain] = []
+    for begin, end, row in zip(begins, [*begins[1:], len(likely)], row_px, strict=True):
+        done += [chain for chain in open_chains if chain.v_px[-1] - row > _MAX_GAP_PX]
+        open_chains = [chain for chain in open_chains if chain.v_px[-1] - row <= _MAX_GAP_PX]
+        open_chains += _extend(open_chains, row, columns[begin:end], indices[begin:end])
+    return [np.array(chain.index) for chain in done + open_chains if len(chain.index) >= _MIN_CHAIN]
+
+
+def _extend(chains: list[_Chain], row_px: float, columns: list[float], indices: list[int]) -> list[_Chain]:
+    """Give each crossing of a row to the chain that it fits best; the rest start new chains."""
+    pairs = []
+    for c, chain in enumerate(chains):
+        expected, gate = chain.expected(row_px)
+        pairs += [(off / gate, c, p) for p, u in enumerate(columns) if (off := abs(u - expected)) <= gate]
+    taken: set[int] = set()
+    extended: set[int] = set()
+    for _, c, p in sorted(pairs):
+        if c not in extended and p not in taken:
+            chains[c].add(row_px, columns[p], indices[p])
+            extended.add(c)
+            taken.add(p)
+    return [_Chain([row_px], [columns[p]], [indices[p]]) for p in range(len(columns)) if p not in taken]

@@ -1,0 +1,183 @@
+"""The end of the joint optimisation: from the final solve to classified markings with their uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from v2hdm.association.ground import Located, Views, easy_views, images_with_line, images_with_symbol, locate
+from v2hdm.association.groups import fuse_groups, group_kinds
+from v2hdm.association.sightings import Rig, Sightings
+from v2hdm.geometry.ipm import project_ground
+from v2hdm.mapping.bundle import Bundle
+from v2hdm.records import BoolArray, Calibration, Camera, Exclusion, FloatArray, IntArray, Marking
+from v2hdm.site.candidates import Candidates, Counts, scatter_of, with_dissent, with_shared_errors
+from v2hdm.site.markings import Suspicion, classify, most_suspicious, with_relative_sigma
+from v2hdm.site.options import AcceptanceOptions
+from v2hdm.site.parallax import PointViews, measure_parallax
+
+
+@dataclass(frozen=True)
+class Optimised:
+    """The result of the joint optimisation; reprojection errors are RMS over the markings' points."""
+
+    bundle: Bundle  # the adjusted extrinsics and poses
+    groups: IntArray  # of the markings
+    markings: tuple[Marking, ...]
+    excluded: tuple[Exclusion, ...]
+    calibrations: Mapping[str, Calibration]
+    reprojection_rmse_px: float  # under the optimised extrinsics
+    initial_reprojection_rmse_px: float  # under the initial ones
+    suspicions: Sequence[Suspicion] = ()  # the worst first
+
+
+@dataclass(frozen=True)
+class FinalSolve:
+    """The solve of the accepted observations, and what it was made from."""
+
+    bundle: Bundle  # of the accepted observations alone
+    ungated: Bundle  # of all K observations
+    inlier: BoolArray  # (K,) the accepted ones
+    usable: BoolArray  # (S, 4) their corners in the sightings
+    sightings: Sightings
+    views: Views
+    cameras: Mapping[str, Camera]
+    initial_rig: Rig
+    jitter_rad: float  # of roll and pitch
+
+    def candidates(self, located: Located) -> Candidates:
+        """Solved candidates with the errors that their images share, and the dissent of outliers."""
+        fused, ungated = fuse_groups(self.bundle.association, located, jitter_rad=0.0), self.ungated
+        solved = _solved_candidates(self.bundle, ungated)
+        solved = with_shared_errors(solved, fused, _scatter(self.bundle))
+        row, own = ungated.row, ungated.own_corner
+        out = np.flatnonzero(~self.inlier & self.sightings.valid[row, own])
+        at = row[out], own[out]
+        place = at[0], ungated.group[out], ungated.corner[out]
+        return with_dissent(solved, fused, *place, located.corners_map[at], located.covariance_m2[at])
+
+    def counts(self, corners_map: FloatArray) -> Counts:
+        """Counts of candidates with corners (G, 4, 2), from all observations."""
+        count, all_seen, rig = len(corners_map), self.ungated, self.bundle.rig
+        image = self.sightings.image[all_seen.row]
+        group, accepted = all_seen.group[self.inlier], all_seen.row[self.inlier]
+        shown = np.unique(np.stack([group, image[self.inlier]]), axis=1)
+        odds = np.bincount(group, self.sightings.log_odds[accepted], minlength=count)
+        easy = np.stack(easy_views(self.views, rig, list(self.cameras.values()), corners_map))
+        found = np.isin(_pair(*easy), _pair(*shown))
+        ended = self.inlier & self.sightings.valid[all_seen.row, all_seen.own_corner]
+        ended &= np.isin(_pair(all_seen.group, image), _pair(*easy[:, found]))
+        corner = 4 * all_seen.group[ended] + all_seen.corner[ended]
+        return Counts(
+            images=np.bincount(shown[0], minlength=count),
+            observations=np.bincount(all_seen.group, minlength=count),
+            agreeing=np.bincount(group, minlength=count),
+            log_odds=odds / np.maximum(np.bincount(group, minlength=count), 1),
+            easy_views=np.bincount(easy[0], minlength=count),
+            found=np.bincount(easy[0, found], minlength=count),
+            pointed=np.bincount(corner, minlength=4 * count).reshape(-1, 4),
+            as_symbol=images_with_symbol(self.sightings.symbols, rig, corners_map)
+            + images_with_line(self.sightings.lines, rig, corners_map),
+        )
+
+    def residual_px(self, rig: Rig) -> FloatArray:
+        """Residuals (K, 2), px, of the accepted observations under ``rig`` with its own best corners."""
+        bundle, sightings = self.bundle, self.sightings
+        fused = fuse_groups(bundle.association, locate(sightings, rig), self.jitter_rad)
+        camera, frame = sightings.camera[bundle.row], sightings.frame[bundle.row]
+        points = fused.corners_map[bundle.group, bundle.corner]
+        own = bundle.row, bundle.own_corner
+        cam_from_map = rig.cam_from_map(camera, frame, sightings.row_share[own])
+        pixel, _ = project_ground(rig.intrinsic[camera], cam_from_map, points[:, None])
+        return np.asarray(pixel[:, 0] - sightings.corners_pinhole_px[own])
+
+
+def _pair(group: IntArray, image: IntArray) -> IntArray:
+    """One number for each pair of a group and an image."""
+    return np.asarray(group * (1 << 32) + image)
+
+
+def conclude(solve: FinalSolve, acceptance: AcceptanceOptions) -> Optimised:
+    """Classify the candidates of the final solve; raises MappingError if none is accepted."""
+    bundle, sightings = solve.bundle, solve.sightings
+    located = locate(sightings, bundle.rig)
+    located.informs[:] &= solve.usable
+    solved = solve.candidates(located)
+    noise = bundle.model.variance_factor, bundle.model.pose_sigma
+    corners = PointViews.of_corners(bundle.association, sightings, located, *noise)
+    parallax = measure_parallax(corners, bundle.association.count)
+    kind = group_kinds(bundle.association, sightings)
+    classified = classify(solved, kind, sightings.kinds, solve.counts, parallax, acceptance)
+    scale = bundle.solution.variance_scale
+    markings = with_relative_sigma(
+        classified.markings(),
+        bundle.corner_index[classified.accepted],
+        lambda pairs: scale * bundle.solution.corner_covariance(pairs),
+    )
+    squared = np.bincount(bundle.group, bundle.solution.mahalanobis2, len(classified.kind)).astype(float)
+    used = np.isin(bundle.group, classified.accepted) & sightings.valid[bundle.row, bundle.own_corner]
+    return Optimised(
+        bundle=bundle,
+        groups=classified.accepted,
+        markings=markings,
+        excluded=classified.exclusions(),
+        calibrations=_calibrations(bundle, solve.cameras),
+        reprojection_rmse_px=_root_mean_square(bundle.solution.residual_px[used]),
+        initial_reprojection_rmse_px=_root_mean_square(solve.residual_px(solve.initial_rig)[used]),
+        suspicions=most_suspicious(classified.accepted, classified.misfit, squared, classified.counts),
+    )
+
+
+def _calibrations(bundle: Bundle, cameras: Mapping[str, Camera]) -> dict[str, Calibration]:
+    """Adjusted calibrations; a camera without markings keeps its start and has no covariance."""
+    covariance = bundle.solution.extrinsic_covariance * bundle.solution.variance_scale
+    return {
+        name: Calibration(
+            info=camera.info,
+            cam_from_vehicle=bundle.rig.cam_from_vehicle[c],
+            covariance=covariance[bundle.camera_index[name]] if name in bundle.camera_index else None,
+        )
+        for c, (name, camera) in enumerate(cameras.items())
+    }
+
+
+def _scatter(bundle: Bundle) -> FloatArray:
+    """Variance inflation of each corner's (G, 4) images relative to the usual."""
+    corner, size = 4 * bundle.group + bundle.corner, 4 * bundle.association.count
+    freedom = 2.0 - bundle.problem.observations.on_line[: len(corner)]
+    squared, degrees = np.zeros(size), np.full(size, -2.0)
+    np.add.at(squared, corner, bundle.solution.mahalanobis2)
+    np.add.at(degrees, corner, freedom)
+    return scatter_of(squared.reshape(-1, 4), degrees.reshape(-1, 4))
+
+
+def _solved_candidates(bundle: Bundle, ungated: Bundle) -> Candidates:
+    """Corners of every group of ``bundle``; a group that lost all of them is placed as in ``ungated``.
+
+    Covariances are scaled by chi^2 per degree of freedom above one.
+    """
+    known = bundle.corner_index >= 0
+    covariance = np.full((len(known), 8, 8), np.nan)
+    scale = bundle.solution.variance_scale
+    for count in range(1, 5):
+        groups = np.flatnonzero(known.sum(axis=1) == count)
+        if not len(groups):
+            continue
+        corner = np.nonzero(known[groups])[1].reshape(-1, count)
+        indices = np.take_along_axis(bundle.corner_index[groups], corner, axis=1)
+        rows = (2 * corner[..., None] + np.arange(2)).reshape(len(groups), -1)
+        blocks = scale * bundle.solution.corner_covariance(indices)
+        covariance[groups[:, None, None], rows[:, :, None], rows[:, None, :]] = blocks
+    before = ungated.corners_map
+    count = np.maximum(np.isfinite(before[..., 0]).sum(axis=1), 1)
+    about = np.nansum(before, axis=1) / count[:, None]
+    return Candidates.seen(bundle.corners_map, covariance, about)
+
+
+def _root_mean_square(residual_px: FloatArray) -> float:
+    """RMS norm of residuals (K, 2), without points that have no projection."""
+    squared = np.sum(residual_px**2, axis=1)
+    finite = squared[np.isfinite(squared)]
+    return float(np.sqrt(np.mean(finite))) if len(finite) else float("nan")

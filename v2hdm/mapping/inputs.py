@@ -1,0 +1,83 @@
+"""The inputs of a camera set's optimisation, as given or without one that the drive contradicts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+from v2hdm.association.ground import views_of
+from v2hdm.association.groups import Association
+from v2hdm.association.sightings import Rig, Sightings, collect_sightings
+from v2hdm.association.surface import Surface
+from v2hdm.geometry.rigid import with_clock_offsets
+from v2hdm.mapping.lanes import Knots, find_knots
+from v2hdm.mapping.optimise import Optimiser
+from v2hdm.mapping.options import MappingOptions
+from v2hdm.records import Drive, ImageDetections
+from v2hdm.site.options import JOINT
+
+_LOOSE_CENTRE_SIGMA_M = 10.0  # standard deviation of a surveyed axis after its contradiction: uninformative
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Inputs of a camera set, as given or corrected."""
+
+    drive: Drive
+    detections: Sequence[ImageDetections]
+    cameras: Sequence[str]
+    options: MappingOptions
+
+    @cached_property
+    def sightings(self) -> Sightings:
+        """The detections of these cameras as one table."""
+        return collect_sightings(self.drive, self.detections, self.cameras)
+
+    @cached_property
+    def optimiser(self) -> Optimiser:
+        """An optimiser of these inputs, not yet run."""
+        drive, options = self.drive, self.options
+        views = views_of(drive, self.cameras)
+        return Optimiser(self.sightings, views, drive.cameras, drive.noises, options, drive.road)
+
+    def find_knots(self, rig: Rig, surface: Surface | None) -> Knots | None:
+        """Knots of lanes in the adjustment, found under ``rig``; None if there are none."""
+        options = self.options.lanes
+        if options.model != JOINT:
+            return None
+        return find_knots(self.drive, self.detections, self.sightings.cameras, rig, surface, options)
+
+    @cached_property
+    def tracks(self) -> Association:
+        """Sightings linked from image to image under the initial IPMs."""
+        return self.optimiser.initial_tracks()
+
+    def with_clocks(self, later_s: Sequence[Mapping[str, float]]) -> Inputs | None:
+        """The inputs with images ``later_s`` later, by session and camera; None without trajectories."""
+        drive = self.drive
+        if any(visit.trajectory is None for visit in drive.visits):
+            return None
+        now_s, moved = {(image.visit, image.camera): image.clock_offset_s for image in drive.images}, drive
+        for visit, later in enumerate(later_s):
+            own = {name: now_s[visit, name] + late for name, late in later.items() if (visit, name) in now_s}
+            moved = with_clock_offsets(moved, own, max_gap_s=float("inf"), visit=visit)
+        number = {image.path: n for n, image in enumerate(moved.images)}
+        detections = [
+            replace(one, image=number[drive.images[one.image].path])
+            for one in self.detections
+            if drive.images[one.image].path in number
+        ]
+        return replace(self, drive=moved, detections=sorted(detections, key=lambda one: one.image))
+
+    def without_axis(self, names: Sequence[str], axis: int) -> Inputs | None:
+        """The inputs with one axis of these cameras' centres unsurveyed; None if it is already."""
+        cameras = dict(self.drive.cameras)
+        for name in names:
+            prior = cameras[name].centre_prior
+            if prior is None or prior.sigma_m[axis] >= _LOOSE_CENTRE_SIGMA_M:
+                return None
+            sigma_m = prior.sigma_m.copy()
+            sigma_m[axis] = _LOOSE_CENTRE_SIGMA_M
+            cameras[name] = replace(cameras[name], centre_prior=replace(prior, sigma_m=sigma_m))
+        return replace(self, drive=replace(self.drive, cameras=cameras))
