@@ -38,7 +38,7 @@ def run(arguments: Sequence[str]) -> None:
     parser.add_argument("--mounting", type=float, nargs=3, metavar=three, help=rough)
     parser.add_argument("--linear", action="store_true", help="grey values proportional to light, not sRGB")
     parser.add_argument("--model", metavar="FILE", help="the network, ONNX (default: the shipped one)")
-    parser.add_argument("--threads", type=int, default=1, metavar="N", help="of the network (default: 1)")
+    parser.add_argument("--threads", type=int, default=1, metavar="N", help="for the network (default: 1)")
     parser.add_argument("--limit", type=int, metavar="N", help="stop after N images")
     newest = "process the newest image of a camera or growing folder, and drop older ones"
     parser.add_argument("--live", action="store_true", help=newest)
