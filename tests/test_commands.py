@@ -185,6 +185,22 @@ def test_help_explains_each_command_and_names_it(name, capsys):
     assert COMMANDS[name].says in text
 
 
+@pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("map", "experiment")])
+@pytest.mark.parametrize("given", ["", "--no\x1b[2Jsuch"])
+def test_arguments_that_are_missing_or_unknown_are_one_line_that_names_the_help(name, given, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        run([*name.split(), *given.split()])
+    error = capsys.readouterr().err
+    assert re.fullmatch(rf"error: [ -~]+; see v2hdm {name} --help\n", error)
+
+
+def test_help_says_what_a_key_is_without_its_name(capsys):
+    assert run(["map", "--help"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "map.base (text or null, null) the map.geojson that the drive brings up to date." in text
+    assert "drive.path (any, null) the drive's folder or bag, or a list of drives through one site, " in text
+
+
 IMPORTS = """
 import importlib, pkgutil, sys
 from pathlib import Path

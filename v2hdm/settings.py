@@ -39,7 +39,7 @@ class Within:
 
 
 POSITIVE, NOT_NEGATIVE, SHARE = Within(0, open=True), Within(0), Within(0, 1)
-COUNT = Within(1, 2**40)
+COUNT = Within(1, 10**12)
 SEED = Within(0, 2**63 - 1)
 
 

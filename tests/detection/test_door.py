@@ -19,6 +19,7 @@ import pytest
 from onnx import numpy_helper
 
 from tests.detection.pictures import HEIGHT, WIDTH, brightness_model, diamond, extrinsic, make_camera, picture
+from tests.drive.example import make_drive
 from v2hdm.cli.main import run
 from v2hdm.detection import frames
 from v2hdm.detection.detector import Detector
@@ -143,6 +144,13 @@ def test_images_of_one_name_are_drawn_one_by_one(bench, tmp_path):
     for _ in range(2):
         assert bench.run(source, "--draw", drawn) == 0
         assert len(list(drawn.glob("*.jpg"))) == 5
+
+
+def test_the_images_of_a_drive_are_numbered_by_camera(tmp_path, capsys):
+    make_drive(tmp_path / "drive")
+    assert run(["detect", str(tmp_path / "drive")]) == 0
+    found = [(one["camera"], one["frame"]) for one in lines(capsys.readouterr().out)]
+    assert sorted(found) == [(name, number) for name in ("front", "rear") for number in range(3)]
 
 
 def test_a_video_gives_a_line_a_frame_with_its_time(bench, video, tmp_path, capsys):

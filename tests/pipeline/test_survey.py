@@ -156,6 +156,13 @@ def test_a_survey_in_the_wrong_frame_is_refused_before_any_long_work(site, tmp_p
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
+def test_control_points_that_match_no_corner_leave_the_map_in_the_frame_of_the_poses(site, tmp_path):
+    unmatched = SurveyOptions(file=str(site.folder / "points.csv"), reach_m=1e-6)
+    made = run(site.config(tmp_path, unmatched))
+    assert "in the frame of the poses" in made.verdict.lines[0]
+
+
 def test_a_survey_that_cannot_be_read_is_refused_before_the_drive_is(tmp_path):
     config = run_config(
         tmp_path / "no drive", tmp_path, mapping=MappingOptions(survey=SurveyOptions(file="none.csv"))

@@ -14,11 +14,18 @@ from tests.report.scene import diamond_at, make_truth
 from tests.report.yard import OWN_M, SHARED_M, SURVEY_M, checked, point, yard
 from v2hdm.geometry.ipm import apply_in_front, ipm_from_extrinsic
 from v2hdm.records import DIAMOND, LANE_DASH, HdMap, Lane, Marking
-from v2hdm.report import style
+from v2hdm.report import photos, style
 from v2hdm.report.check_points import COLUMNS, write_check_points
-from v2hdm.report.metrics import corner_errors, driven_past, extrinsic_metrics, lane_metrics, marking_metrics
+from v2hdm.report.metrics import (
+    corner_errors,
+    driven_past,
+    extrinsic_metrics,
+    headline,
+    lane_metrics,
+    marking_metrics,
+)
 from v2hdm.report.photos import save_overlay
-from v2hdm.report.terminal import METHODS, results_table
+from v2hdm.report.terminal import METHODS, changes_table, results_table
 
 
 def test_what_a_camera_saw_unoccluded_inside_its_region_of_interest_counts_as_driven_past():
@@ -207,3 +214,35 @@ def test_nothing_within_reach_is_a_table_without_figures():
     table = checked(yard(), point(500.0, 0.0))
     assert table.headline == "check points: none of 1 has a map corner within reach"
     assert "rmse_m" not in table.figures()
+
+
+def test_a_map_without_changes_is_one_line_and_no_empty_table():
+    counts = {"same": 12, "moved": 0}
+    assert changes_table({"counts": counts, "listed": []}) == "changes: 12 same"
+
+
+def test_a_map_without_truth_names_the_main_reasons_why_candidates_are_left_out():
+    figures = {
+        "markings": 13,
+        "lanes": {"lanes": 1},
+        "excluded": 3,
+        "excluded_for": {"too far": 2, "hidden": 1},
+    }
+    says = "front: 13 markings, 1 lane line; 3 candidates left out, most often: too far (2); hidden (1)"
+    assert headline("front", {"Opt": figures}) == says
+
+
+def test_the_region_of_interest_hides_no_coordinate_of_the_grid(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(photos, "draw_lines", lambda canvas, lines, pen: drawn.append(pen))
+    monkeypatch.setattr(photos, "_write", lambda canvas, text, *_: drawn.append(text))
+    monkeypatch.setattr(photos, "with_legend", lambda canvas, _: canvas)
+    camera = make_truth()[0].cameras["front"]
+    blank, looks = np.full((480, 640, 3), 255, np.uint8), mounted([0.0, 0.0, 2.0], 15.0)
+    photos.save_grid(tmp_path / "grid.jpg", blank, camera, {"guess": looks}, "front")
+    assert drawn.count(photos._ROI) == 1
+    assert "x 10 m" in drawn[drawn.index(photos._ROI) :]
+    drawn.clear()
+    photos.save_points(tmp_path / "points.png", blank, camera.info, looks, camera.roi_vehicle, [])
+    assert drawn.count(photos._ROI) == 1
+    assert "x 10 m" in drawn[drawn.index(photos._ROI) :]

@@ -72,7 +72,7 @@ def test_a_straight_drive_with_70_cm_of_uncertainty_is_no_pass_and_names_the_mou
         "WARN: 95 % of the corners of 34 markings within 69 cm in the frame of the poses, 0.5 cm"
     )
     says = {finding.about: finding.says for finding in verdict.raised}
-    assert "0 % of the markings meet it; the largest part" in says["map"]
+    assert "0 % of the markings meet the goal; the largest part" in says["map"]
     assert all("drive a turn, or survey the camera's place" in one for one in says.values())
 
 
@@ -83,7 +83,7 @@ def test_one_corner_in_twenty_may_miss_the_goal(coarse, status):
     assert found.status is status
     assert (found.limit, found.unit) == (5.0, "cm")
     if status is Status.WARN:
-        assert "88 % of the markings meet it" in found.says
+        assert "88 % of the markings meet the goal" in found.says
         assert "is each marking's own views: pass them closer" in found.says
 
 

@@ -18,12 +18,12 @@ _GB = 1e9
 def run(arguments: Sequence[str]) -> None:
     """List or prune a cache."""
     parser = parser_of("cache")
-    actions = parser.add_subparsers(dest="what", required=True)
+    actions = parser.add_subparsers(dest="what", metavar="{list,prune}", required=True)
     shown = actions.add_parser("list", help="list entries, their size and last use")
     pruned = actions.add_parser("prune", help="remove least recently used entries, and leftovers")
     pruned.add_argument("--gb", type=float, required=True, help="size to keep, GB; 0 empties the cache")
     for action in (shown, pruned):
-        action.add_argument("--cache", default=Path("cache"), type=Path, help="the folder (default: cache)")
+        action.add_argument("--cache", default=Path("cache"), type=Path, metavar="DIR", help="default: cache")
     parsed = parser.parse_args(arguments)
     from v2hdm.errors import ConfigError
     from v2hdm.store.cache import items_of, prune

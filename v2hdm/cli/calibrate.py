@@ -26,11 +26,11 @@ def from_points(arguments: Sequence[str]) -> int:
     parser.add_argument("--intrinsics", type=Path, required=True, metavar="FILE", help=written)
     parser.add_argument("--camera-name", metavar="NAME", help="the camera to use if the file has several")
     parser.add_argument("--name", help="name of the camera (default: that in the intrinsics)")
-    parser.add_argument("--image", type=Path, help="image that the pixels were read from, for the picture")
+    parser.add_argument("--image", type=Path, metavar="FILE", help="where the pixels were read, to draw on")
     for option, default, unit, of in (("pixel", 0.5, "PX", "a pixel"), ("survey", 0.01, "M", "a survey")):
         meaning = _SIGMA.format(of, unit.lower())
         parser.add_argument(f"--{option}-sigma", type=float, default=default, metavar=unit, help=meaning)
-    parser.add_argument("--output", type=Path, help="folder (default: outputs/<camera>-calibrate)")
+    parser.add_argument("--output", type=Path, metavar="DIR", help="default: outputs/<camera>-calibrate")
     parsed = parser.parse_args(arguments)
     from dataclasses import replace
 

@@ -174,7 +174,7 @@ def explain(error: Exception, schema: type[Any], overrides: list[str]) -> Config
     place = f" of {key.group(1)}" if key and key.group(1) not in message else ""
     if "missing EQUAL" in message:
         bare = [one for one in overrides if "=" not in one and not one.startswith(("-", "~"))]
-        named = " ".join(bare[:1]) or "an argument"
+        named = " ".join(bare[-1:]) or "an argument"
         return ConfigError(f"configuration: '{named}' is not key=value; write drive.path={named}, see --help")
     # Of a long command line only what the message is about: the override that has the key it names.
     about = [one for one in overrides if one.lstrip("+~").split("=")[0] in message + place]
@@ -198,6 +198,9 @@ def _advice(message: str, schema: type[Any]) -> str:
     whole = re.search(r"Value (-?\d+) \(int\) is incompatible with type hint 'float'", message)
     if whole:  # OmegaConf turns whole numbers into fractions, but not inside of lists
         return f"write {whole.group(1)}.0"
+    listed = re.search(r"override ([\w.]+)=(.*); Invalid value assigned: \w+ is not a ListConfig", message)
+    if listed:
+        return f"write {listed.group(1)}=[{listed.group(2)}]"
     unknown = re.search(r"[Kk]ey '([\w.]+)' (?:not in|is not in)", message)
     if unknown:
         leaves = [key.name.split(".") for key in keys_of(schema)]
@@ -279,7 +282,7 @@ def meaning_of(schema: type[Any], name: str) -> str:
         sentences = re.split(r"(?<=[.;:])\s+(?=[`A-Z])", " ".join(prose.split()))
         naming = [sentence for sentence in sentences if f"``{name}``" in sentence]
         if naming:
-            return _plain(" ".join(naming))
+            return _plain(re.sub(rf"^``{name}`` (?:is|are) ", "", " ".join(naming)))
         for module, other in re.findall(r":class:`~?([\w.]+)\.(\w+)`", text):
             described = getattr(importlib.import_module(module), other)
             if _is_schema(described) and (meaning := meaning_of(described, name)):

@@ -29,32 +29,20 @@ def run(arguments: Sequence[str]) -> None:
     """Detect in every image of a source."""
     parser = parser_of("detect")
     parser.add_argument("source", help="an image, a folder, a drive, a video, or a camera's index")
-    parser.add_argument(
-        "--camera",
-        type=Path,
-        metavar="FILE",
-        help="the camera's calibration, for metres; or its intrinsics from Kalibr, OpenCV, ROS or COLMAP",
-    )
+    known = "the camera's calibration, for metres; or its intrinsics from Kalibr, OpenCV, ROS or COLMAP"
+    parser.add_argument("--camera", type=Path, metavar="FILE", help=known)
     parser.add_argument("--camera-name", metavar="NAME", help="the camera to use if the file has several")
-    parser.add_argument(
-        "--mounting",
-        type=float,
-        nargs=3,
-        metavar=("HEIGHT_M", "PITCH_DEG", "FOV_DEG"),
-        help="without a calibration: approximate camera height, downward pitch and horizontal field of view "
-        "(default: 1.6 5 60; the images correct the pitch); intrinsics from --camera override the field of "
-        "view",
-    )
+    rough = "without a calibration: approximate camera height, downward pitch and horizontal field of view "
+    rough += "(default: 1.6 5 60; the images correct the pitch); intrinsics from --camera override the latter"
+    three = ("HEIGHT_M", "PITCH_DEG", "FOV_DEG")
+    parser.add_argument("--mounting", type=float, nargs=3, metavar=three, help=rough)
     parser.add_argument("--linear", action="store_true", help="grey values proportional to light, not sRGB")
-    parser.add_argument("--model", help="ONNX file of the detector (default: the shipped one)")
-    parser.add_argument("--threads", type=int, default=1, help="threads of the network (default: 1)")
+    parser.add_argument("--model", metavar="FILE", help="the network, ONNX (default: the shipped one)")
+    parser.add_argument("--threads", type=int, default=1, metavar="N", help="for the network (default: 1)")
     parser.add_argument("--limit", type=int, metavar="N", help="stop after N images")
-    parser.add_argument(
-        "--live",
-        action="store_true",
-        help="process the newest image of a camera or growing folder, and drop older ones",
-    )
-    parser.add_argument("--output", type=Path, help="file for the JSON lines (default: stdout)")
+    newest = "process the newest image of a camera or growing folder, and drop older ones"
+    parser.add_argument("--live", action="store_true", help=newest)
+    parser.add_argument("--output", type=Path, metavar="FILE", help="for the JSON lines (default: stdout)")
     parser.add_argument("--draw", type=Path, metavar="DIR", help="folder for images with detections drawn")
     _detect(parser.parse_args(arguments))
 
@@ -169,7 +157,7 @@ def _report(stopwatch: Stopwatch, age_s: Sequence[float]) -> None:
     if not stopwatch.images:
         print("no images", file=sys.stderr)
         return
-    print(f"{stopwatch.images} images{_peak_memory()}", file=sys.stderr)
+    print(f"{stopwatch.images} image{'s' * (stopwatch.images != 1)}{_peak_memory()}", file=sys.stderr)
     print(f"{'latency, ms':12s} {'p50':>7s} {'p90':>7s} {'p99':>7s}", file=sys.stderr)
     first = [stage for stage in _STAGES if stage in stopwatch.stages]
     times_s = {stage: stopwatch.times_s(stage) for stage in dict.fromkeys([*first, *stopwatch.stages])}

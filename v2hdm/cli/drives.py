@@ -16,10 +16,8 @@ def check(arguments: Sequence[str]) -> int:
     add_drive(parser, "check")
     parser.add_argument("--no-ground", dest="ground", action="store_false", help="skip bare ground: faster")
     parser.add_argument("--list-topics", action="store_true", help="only print a bag's topics and drive.yaml")
-    written, wanted = (
-        "write a drive.yaml for a bag, video or image folder",
-        "with --write: values that it asks for",
-    )
+    written = "write a drive.yaml for a bag, video or image folder"
+    wanted = "with --write: values that it asks for"
     parser.add_argument("--write", type=Path, metavar="DIR", help=written)
     parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="KEY=VALUE", help=wanted)
     parser.add_argument("--all", action="store_true", help="also print passed checks")

@@ -23,14 +23,9 @@ def run(arguments: Sequence[str]) -> None:
     """Convert a map or a calibration."""
     parser = parser_of("export")
     parser.add_argument("source", type=Path, metavar="MAP", help="map.geojson, .gpkg, or calibration_*.yaml")
-    parser.add_argument(
-        "--format",
-        action="append",
-        required=True,
-        metavar="NAME",
-        help="for a map: geojson, csv, gpkg, lanelet2, dxf, qgis, opendrive, landxml; for mosaic.tif: pcd; "
-        "for a calibration: camera_info, static_transform, urdf, kalibr, opencv; may be repeated",
-    )
+    kinds = "for a map: geojson, csv, gpkg, lanelet2, dxf, qgis, opendrive, landxml; for mosaic.tif: pcd; "
+    kinds += "for a calibration: camera_info, static_transform, urdf, kalibr, opencv; may be repeated"
+    parser.add_argument("--format", action="append", required=True, metavar="NAME", help=kinds)
     parser.add_argument("--output", type=Path, metavar="DIR", help="output folder (default: that of MAP)")
     ways = "for lanelet2: Local, MGRS, or LocalCartesian (default with an origin, else Local)"
     parser.add_argument("--projector", metavar="NAME", help=ways)
@@ -42,8 +37,8 @@ def run(arguments: Sequence[str]) -> None:
 
     handler, folder = logging.StreamHandler(), parsed.output or parsed.source.parent
     handler.setLevel(logging.INFO)
-    kinds = {".yaml": _export_calibration, ".yml": _export_calibration, ".tif": _export_mosaic}
-    export = kinds.get(parsed.source.suffix.lower(), _export_map)
+    exports = {".yaml": _export_calibration, ".yml": _export_calibration, ".tif": _export_mosaic}
+    export = exports.get(parsed.source.suffix.lower(), _export_map)
     try:
         with logging_to(handler):
             source = os.path.relpath(parsed.source.resolve(), folder.resolve())  # both may be moved together

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from v2hdm import __version__
 from v2hdm.errors import EXIT_FAILED_VERDICT, EXIT_USER_ERROR, describe, one_line
@@ -191,18 +191,25 @@ def _list(names: Sequence[str]) -> str:
     return "\n".join(["Usage: v2hdm COMMAND ...; v2hdm COMMAND --help explains a command.", "", *lines])
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line."""
+
+    def error(self, message: str) -> NoReturn:
+        sys.exit(_fail(f"{message}; see {self.prog} --help"))
+
+
 def parser_of(name: str) -> argparse.ArgumentParser:
     """The beginning of a command's parser of arguments."""
-    return argparse.ArgumentParser(prog=COMMANDS[name].name, description=COMMANDS[name].says)
+    return _Parser(prog=COMMANDS[name].name, description=COMMANDS[name].says)
 
 
 def add_drive(parser: argparse.ArgumentParser, result: str) -> None:
     """Add the arguments of commands that read a drive; ``result`` ends the name of the default folder."""
     parser.add_argument("drive", type=Path, help="a drive folder or a bag; see docs/drive-format.md")
     parser.add_argument("--camera", action="append", default=[], metavar="NAME", help="only this; repeatable")
-    parser.add_argument("--format", default="auto", help="drive format: folder or kitti (default: auto)")
+    parser.add_argument("--format", default="auto", metavar="NAME", help="folder, kitti, bag (default: auto)")
     parser.add_argument("--output", type=Path, metavar="DIR", help=f"default: outputs/<drive>-{result}")
-    parser.add_argument("--workers", type=int, default=0, help="processes (default: one per core)")
+    parser.add_argument("--workers", type=int, default=0, metavar="N", help="processes (default: all cores)")
 
 
 def drive_of(parsed: argparse.Namespace) -> Drive:

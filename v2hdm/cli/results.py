@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import logging
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,11 +11,18 @@ from v2hdm.cli.main import parser_of, result_of, steps_of
 from v2hdm.errors import MapFileError
 
 
+def _parser_of(name: str) -> argparse.ArgumentParser:
+    """The beginning of the parser of a command on a result."""
+    parser = parser_of(name)
+    parser.add_argument("result", type=Path, help="result folder of v2hdm map")
+    where = "the drive's folder (default: where it was when mapped)"
+    parser.add_argument("--drive", type=Path, metavar="DIR", help=where)
+    return parser
+
+
 def report(arguments: Sequence[str]) -> None:
     """Write ``report.html`` again: after an update, or where check points or a mosaic were added."""
-    parser = parser_of("report")
-    parser.add_argument("folder", type=Path, help="result folder of v2hdm map")
-    parser.add_argument("--drive", type=Path, help="the drive's folder (default: where it was when mapped)")
+    parser = _parser_of("report")
     under = "picture under the map: a GeoTIFF, such as an aerial photograph, or a folder of XYZ tiles"
     parser.add_argument("--background", type=Path, metavar="PATH", help=under)
     parsed = parser.parse_args(arguments)
@@ -22,17 +30,16 @@ def report(arguments: Sequence[str]) -> None:
     from v2hdm.report.page.document import write_page
     from v2hdm.store.results import added_to
 
-    drive = drive_of(parsed.folder, parsed.drive)
-    with added_to(parsed.folder, "folder") as folder:
+    drive = drive_of(parsed.result, parsed.drive)
+    with added_to(parsed.result, "RESULT") as folder:
         path = write_page(folder, drive, parsed.background)
-    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB" + ("" if drive else ", without the drive's images"))
+    without = "" if drive else ", without the drive's images"
+    print(f"{parsed.result / path.name}: {path.stat().st_size / 1e6:.1f} MB{without}")
 
 
 def view(arguments: Sequence[str]) -> None:
     """Serve the report, to correct markings in, until Ctrl-C; every correction is written at once."""
-    parser = parser_of("view")
-    parser.add_argument("result", type=Path, help="result folder of v2hdm map")
-    parser.add_argument("--drive", type=Path, help="the drive's folder (default: where it was when mapped)")
+    parser = _parser_of("view")
     parser.add_argument("--corrections", type=Path, metavar="FILE", help="default: RESULT.corrections.yaml")
     parsed = parser.parse_args(arguments)
     from v2hdm.io.drive import drive_of
@@ -52,11 +59,9 @@ def view(arguments: Sequence[str]) -> None:
 
 def labels(arguments: Sequence[str]) -> None:
     """Write ``instances.json``, the map in every image of its drive, in COCO's format."""
-    parser = parser_of("labels")
-    parser.add_argument("result", type=Path, help="result folder of v2hdm map")
+    parser = _parser_of("labels")
     parser.add_argument("--output", type=Path, metavar="DIR", help="folder (default: outputs/<drive>-labels)")
-    parser.add_argument("--drive", type=Path, help="the drive's folder (default: where it was when mapped)")
-    parser.add_argument("--range", type=float, metavar="M", default=16.0, help="range (default: 16)")
+    parser.add_argument("--range", type=float, metavar="M", default=16.0, help="farthest label (default: 16)")
     parsed = parser.parse_args(arguments)
     from v2hdm.io.drive import single_drive_of
     from v2hdm.labels import FILE, write_labels
@@ -76,11 +81,9 @@ def labels(arguments: Sequence[str]) -> None:
 
 def mosaic(arguments: Sequence[str]) -> None:
     """Add the mosaic to a result: the ground as a GeoTIFF, and pictures before and after."""
-    parser = parser_of("mosaic")
-    parser.add_argument("result", type=Path, help="result folder of v2hdm map")
-    parser.add_argument("--drive", type=Path, help="the drive's folder (default: where it was when mapped)")
-    parser.add_argument("--resolution", type=float, metavar="M", default=0.02, help="pixel (default: 0.02)")
-    parser.add_argument("--device", default="cpu", help="cpu or cuda (default: cpu)")
+    parser = _parser_of("mosaic")
+    parser.add_argument("--resolution", type=float, metavar="M", default=0.02, help="a pixel (default: 0.02)")
+    parser.add_argument("--device", default="cpu", metavar="NAME", help="cpu or cuda (default: cpu)")
     parsed = parser.parse_args(arguments)
     import torch  # noqa: F401  # its absence is reported before that of what is built on it
 

@@ -85,17 +85,11 @@ def fleet(arguments: Sequence[str]) -> int:
     """
     parser = parser_of("fleet")
     parser.add_argument("drives", nargs="+", help="run files, as for v2hdm map; or key=value for all of them")
-    parser.add_argument("--workers", type=int, default=0, help="cores to use (default: all)")
-    parser.add_argument(
-        "--table",
-        type=Path,
-        default=Path("outputs/fleet"),
-        metavar="FOLDER",
-        help="folder for the verdicts, fleet.csv and fleet.json (default: outputs/fleet)",
-    )
-    parser.add_argument(
-        "--share", metavar="K/N", help="map every N-th drive, starting with the K-th; table in FOLDER-K-of-N"
-    )
+    parser.add_argument("--workers", type=int, default=0, metavar="N", help="cores to use (default: all)")
+    tables = "folder for the verdicts, fleet.csv and fleet.json (default: outputs/fleet)"
+    parser.add_argument("--table", type=Path, default=Path("outputs/fleet"), metavar="DIR", help=tables)
+    every = "map every N-th drive, starting with the K-th; table in DIR-K-of-N"
+    parser.add_argument("--share", metavar="K/N", help=every)
     parser.add_argument("--again", action="store_true", help="map finished drives again")
     parsed = parser.parse_intermixed_args(arguments)
     from v2hdm.fleet import FleetOptions, fleet_on_terminal

@@ -243,13 +243,14 @@ def summary_lines(found: Localised) -> list[str]:
     """The figures for a terminal, with a FAIL where the map does not explain the drive."""
     figures = found.figures()
     lines = [
-        f"{figures['localised_share']:.1%} of {figures['frames_with_a_marking_in_view']} frames with a "
-        f"marking in view localised; position {100 * figures['position_rmse_m']:.1f} cm, heading "
+        f"{100 * figures['localised_share']:.1f} % of {figures['frames_with_a_marking_in_view']} frames with "
+        f"a marking in view localised; position {100 * figures['position_rmse_m']:.1f} cm, heading "
         f"{figures['heading_rmse_deg']:.2f} deg from the recorded poses (RMSE)"
     ]
     if not found.explained:
+        share = f"{100 * figures['matched_share']:.0f} %"
         lines.append(
-            f"FAIL: the map explains {figures['matched_share']:.0%} of the detections, so that the figures "
-            "above cannot be relied on: is it of this site, as painted today, and is the first pose right?"
+            f"FAIL: the map explains {share} of the detections, so that the figures above cannot be relied "
+            "on: is it of this site, as painted today, and is the first pose right?"
         )
     return lines

@@ -303,6 +303,7 @@ def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
         diagnostics={
             "observations": float(len(bundle.row)),
             "candidates": float(bundle.association.count),
+            "control_points": float(len(options.survey.points) - len(lost)),
             "evaluations": float(solution.evaluations),
             "gap": solution.gap,
             "chi2_per_dof": solution.chi2_per_dof,

@@ -91,8 +91,8 @@ class MappingOptions:
     """Settings of the mapping, except the solver's own.
 
     Attributes:
-        max_range_m: sightings farther from the camera start no marking, but join one if only that one fits;
-            starting one, they could tie a repainted marking's old place to its new one.
+        max_range_m: sightings farther from the camera join a marking if only that one fits, but start none:
+            they could tie a repainted marking's old place to its new one.
         model_floor_px: added to every corner's covariance for errors that no corner fit knows: lens, shutter.
         pose_model: the part of each frame's pose that is estimated: ``paper``, none; ``roll_pitch``;
             ``full``, also heading and position; ``heave``, also height; ``clock``, also each camera's clock

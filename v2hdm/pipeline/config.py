@@ -34,7 +34,7 @@ class DriveConfig(ReadOptions):
     """The drive and how to read it.
 
     ``path`` is the drive's folder or bag, or a list of drives through one site, which are mapped together
-    (docs/living-map.md); None if the drive is rendered.
+    (docs/living-map.md). None if the drive is rendered.
     """
 
     path: Any = None

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import count, islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -276,10 +276,14 @@ def _drive_frames(path: Path, road: RoadDetector | None, rough: _Rough) -> _Fram
         if name not in drive.cameras:
             raise DriveError(f"{path}: no camera '{name}' in the calibration; it has {', '.join(roads)}")
         roads = {name: road}
+    numbers = {name: count() for name in roads}
     return (
-        (replace(frame, name=f"{image.camera}_{frame.name}", stamp_s=image.stamp_s), roads[image.camera])
+        (
+            replace(frame, name=f"{name}_{frame.name}", index=next(numbers[name]), stamp_s=image.stamp_s),
+            roads[name],
+        )
         for image in drive.images
-        if image.camera in roads
+        if (name := image.camera) in roads
         for frame in image_frames([image.path])
     )
 

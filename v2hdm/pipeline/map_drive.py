@@ -212,7 +212,8 @@ def _judge(
         found = check_result(checked.drive, methods, checked.ground)
         unfit = check_known_sizes(survey.mapping.known_sizes, best)
         unfit += check_corrections(survey.mapping.acceptance.corrections, best)
-        reached = check_goal(best, goal_cm / 100, "survey" if survey.mapping.survey.points else "poses")
+        frame = "survey" if best.diagnostics["control_points"] else "poses"
+        reached = check_goal(best, goal_cm / 100, frame)
         surveyed = check_survey(survey, best, compared)
         before = over_ground(checked.findings, best, survey.mapping.ground == AUTO)
         verdict = Verdict.of([*before, *found, *unfit, *surveyed, *reached])

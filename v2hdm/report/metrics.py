@@ -282,9 +282,10 @@ def _own_words(figures: Mapping[str, Any]) -> str:
     words = f"{figures.get('markings', 0)} markings"
     if np.isfinite(figures.get("median_sigma_m", np.nan)):
         words += f" (sigma of a corner {100 * figures['median_sigma_m']:.1f} cm)"
-    words += f", {figures.get('lanes', {}).get('lanes', 0)} lane lines"
+    lanes = figures.get("lanes", {}).get("lanes", 0)
+    words += f", {lanes} lane line{'s' * (lanes != 1)}"
     reasons = list(figures.get("excluded_for", {}).items())[:_MAIN_REASONS]
     if reasons:
-        listed = ", ".join(f"{count} {reason}" for reason, count in reasons)
+        listed = "; ".join(f"{reason} ({count})" for reason, count in reasons)
         words += f"; {figures['excluded']} candidates left out, most often: {listed}"
     return words

@@ -112,11 +112,11 @@ def save_grid(
     """Draw horizon, ground grid and ROI for ``mountings`` of :data:`PENS` into an image (H, W, 3) BGR."""
     canvas = image.copy()
     legend: list[tuple[Pen | None, str]] = [(None, caption)]
+    first = next(iter(mountings.values()))
+    draw_lines(canvas, project_outline(camera.info, first, camera.roi_vehicle), _ROI)
     for number, (name, cam_from_vehicle) in enumerate(mountings.items()):
         _draw_grid(canvas, camera.info, cam_from_vehicle, PENS[name], to_the_left=number == 0)
         legend.append((PENS[name], _WORDS[name]))
-    first = next(iter(mountings.values()))
-    draw_lines(canvas, project_outline(camera.info, first, camera.roi_vehicle), _ROI)
     legend.append((_ROI, "roi_vehicle, by the guess"))
     _write_image(path, with_legend(canvas, legend), cv2.IMWRITE_JPEG_QUALITY, 88)
 
@@ -140,8 +140,8 @@ def save_points(
     predicted pixels, magnified for inliers.
     """
     canvas = np.full((info.height, info.width, 3), 255, np.uint8) if image is None else image.copy()
-    _draw_grid(canvas, info, cam_from_vehicle, PENS["ground"], to_the_left=False)
     draw_lines(canvas, project_outline(info, cam_from_vehicle, roi_vehicle), _ROI)
+    _draw_grid(canvas, info, cam_from_vehicle, PENS["ground"], to_the_left=False)
     longest = max((float(np.hypot(*off)) for _, _, off, right in points if right), default=0.0)
     times = min(_ARROW_SHARE * info.width / max(longest, 1e-9), _MOST_TIMES)
     for label, at, off, right in points:

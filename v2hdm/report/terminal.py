@@ -71,9 +71,11 @@ def _number(value: float | None, digits: int, factor: float) -> str:
     return "-" if value is None or math.isnan(value) else f"{factor * value:.{digits}f}"
 
 
-def changes_table(changes: Mapping[str, Any]) -> Table:
-    """Moved, vanished and new markings with respect to an earlier map, one per row."""
+def changes_table(changes: Mapping[str, Any]) -> Table | str:
+    """Moved, vanished and new markings with respect to an earlier map, one per row; else one line."""
     counts = ", ".join(f"{number} {fate}" for fate, number in changes["counts"].items() if number)
+    if not changes["listed"]:
+        return f"changes: {counts}"
     numbers = ("by (cm)", "sigma (cm)", "odds", "seen / should be")
     table = new_table(f"changes: {counts}", ("class", "fate"), numbers, before=("id",))
     table.add_column("at (m)")

@@ -11,9 +11,9 @@ from v2hdm.io.maps.corrections import Correction
 class AcceptanceOptions:
     """Conditions for a candidate to enter the map.
 
-    It must be a marking (by shape and detections) and lie on the ground (by parallax) with at least
-    ``min_probability``. Its worst corner's sigma may exceed that of the map's best corner by at most
-    ``max_sigma_m``. ``corrections`` are a person's decisions, from the file ``map.corrections``.
+    A candidate must be a marking (by shape and detections) and lie on the ground (by parallax) with at least
+    ``min_probability``. The sigma of its worst corner may exceed that of the map's best by ``max_sigma_m`` at
+    most. ``corrections`` are a person's decisions, from the file ``map.corrections``.
     """
 
     min_probability: float = 0.9

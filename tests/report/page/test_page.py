@@ -9,6 +9,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from tests.faults.cases import png_header
 from tests.maps.gis import write_empty
@@ -291,6 +292,21 @@ def test_a_picture_that_cannot_lie_under_the_map_is_refused_with_its_reason(resu
             background_layer(tmp_path / f"{name}.tif", of)
 
 
+def test_no_chart_cuts_off_its_labels(drive, result, monkeypatch):
+    ends = []
+
+    def saved(figure, *arguments, **options):
+        save(figure, *arguments, **options)
+        box, tight = figure.bbox_inches, figure.get_tightbbox()
+        ends.append([box.x0 - tight.x0, box.y0 - tight.y0, tight.x1 - box.x1, tight.y1 - box.y1])
+
+    save = Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", saved)
+    document(read_facts(result, drive))
+    assert len(ends) >= 6
+    assert np.max(ends) < 0.02
+
+
 def test_a_report_made_again_keeps_the_background_of_the_one_before(tmp_path, monkeypatch):
     make_result(tmp_path)
     shown = {"src": "UklGRg==", "type": "image/webp", "bounds": [0, 0, 1, 1]}
@@ -352,6 +368,8 @@ def test_the_door_finds_the_drive_and_names_what_is_wrong(tmp_path, capsys):
     (result / "residuals.csv").write_text("\n".join([*lines[:3], "front/0.png,front,x"]) + "\n")
     assert run(["report", str(result)]) == 2
     assert "residuals.csv: line 4" in capsys.readouterr().err
+    assert run(["report", str(result), "--drive", "nowhere"]) == 2
+    assert "nowhere: no such drive folder or bag; check the path" in capsys.readouterr().err
     (result / "residuals.csv").write_text("a,b\n")
     assert run(["report", str(result)]) == 2
     assert ",".join(COLUMNS) in capsys.readouterr().err

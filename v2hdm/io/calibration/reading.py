@@ -51,6 +51,8 @@ class Provenance:
 def read_calibration(path: Path) -> Calibration:
     """Read our own calibration; raises MapFileError when it is missing, damaged or of another format."""
     content = load_yaml(path, MapFileError)
+    if "cam_from_vehicle" not in content:
+        raise MapFileError(f"{path}: no cam_from_vehicle: give a calibration_<camera>.yaml of V2HDM")
     check_keys(content, (*_INFO, "cam_from_vehicle"), _OPTIONAL, str(path), MapFileError)
 
     def array(key: str, *shape: int) -> Any:

@@ -56,7 +56,7 @@ def read_drive(path: str | Path, options: ReadOptions | None = None) -> Drive:
     path = Path(path)
     options = options or ReadOptions()
     if not path.exists():
-        raise DriveError(f"{path}: no such drive folder or bag; check drive.path")
+        raise DriveError(f"{path}: no such drive folder or bag; check the path")
     if options.max_gap_s <= 0:
         raise DriveError(f"max_gap_s is {options.max_gap_s:g}; give a positive number of seconds")
     if options.format not in ("auto", *READERS):
@@ -110,7 +110,7 @@ def drive_of(folder: Path, path: Path | None) -> Drive | None:
         options = _options(stated)
     except (TypeError, ValueError) as failure:
         raise MapFileError(f"{folder / METRICS}: its data on the drive are damaged ({failure})") from None
-    if not paths or not all(one.exists() for one in paths):
+    if path is None and not (paths and all(one.exists() for one in paths)):
         return None
     drive = join_drives([read_drive(one, options) for one in paths])
     expected = (stated.get("name", drive.name), stated.get("images", len(drive.images)))

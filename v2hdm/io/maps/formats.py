@@ -185,8 +185,8 @@ def check_crs(
     """The grid of each format that takes the ``crs``; raises ConfigError where it cannot hold the site."""
     chosen = [name for name in formats if crs is not None and _ALL[name].takes_crs]
     if crs is not None and not chosen:
-        takers = ", ".join(name for name, one in FORMATS.items() if one.takes_crs)
-        raise ConfigError(f"{key}: none of the formats to write uses it (only {takers}); leave it out")
+        others = ", ".join(name for name, one in FORMATS.items() if one.takes_crs and name != "geojson")
+        raise ConfigError(f"{key}: no format to write uses it; add one of {others}, or leave it out")
     return {name: Grid.of(str(crs), origin, key, ConfigError, FORMATS[name].metres) for name in chosen}
 
 

@@ -202,7 +202,7 @@ def _range_chart(residuals: GroundResiduals) -> str:
             for axes, values in ((left, residuals.size_px), (right, ground_cm)):
                 axes.plot(*_rms_by(residuals.range_m[own], values[own], edges), label=name, **look)
         left.set_ylabel("RMS residual (px)")
-        right.set_ylabel("RMS residual on the ground (cm)")
+        right.set_ylabel("RMS ground residual (cm)")
         for axes in (left, right):
             axes.set_xlabel("distance from the camera (m)")
             axes.set_ylim(bottom=0)

@@ -48,7 +48,7 @@ def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Findin
         says += f"{goal}; {uncertain} more left out as too uncertain" if uncertain else goal
         coarse = [one for one, own_m in zip(markings, radius_m.max(axis=1), strict=True) if own_m > goal_m]
         met = 100 * (len(markings) - len(coarse)) // len(markings)
-        helps = f"{met} % of the markings meet it; {_largest_part(best, coarse or markings)}"
+        helps = f"{met} % of the markings meet the goal; {_largest_part(best, coarse or markings)}"
         yield _judged("map", reached_m, goal_m, says, helps)
     for name, one in best.calibrations.items():
         left_m, helps = ground_ahead(one)
