@@ -1,5 +1,7 @@
 """Cameras, images and classes that files describe: which of them can be."""
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -100,6 +102,26 @@ def test_a_large_png_with_a_flipped_bit_is_refused_before_it_is_worked_on(noise,
     path.write_bytes(data)
     with pytest.raises(DriveError, match="damaged"):
         read_pixels(path, cv2.IMREAD_COLOR)
+
+
+def test_threads_that_read_images_leave_stderr_alone_and_blame_the_damaged_one(noise, tmp_path):
+    whole = cv2.imencode(".jpg", noise)[1].tobytes()
+    for number in range(40):
+        cut = number == 20
+        content = whole[: len(whole) // 2] + whole[-2:] if cut else whole
+        (tmp_path / f"{number}.jpg").write_bytes(content)
+
+    def is_read(number):
+        try:
+            return read_pixels(tmp_path / f"{number}.jpg", cv2.IMREAD_COLOR).shape == noise.shape
+        except DriveError:
+            return False
+
+    before = os.fstat(2)
+    with ThreadPoolExecutor(8) as readers:
+        for _ in range(5):
+            assert [k for k, read in enumerate(readers.map(is_read, range(40))) if not read] == [20]
+    assert (os.fstat(2).st_dev, os.fstat(2).st_ino) == (before.st_dev, before.st_ino)
 
 
 ROOT = Path(__file__).resolve().parents[1]

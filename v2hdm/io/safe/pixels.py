@@ -13,6 +13,7 @@ import stat
 import struct
 import sys
 import tempfile
+import threading
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -59,6 +60,7 @@ VIDEO_OPTIONS = {
 DECODER_OPTIONS = {"err_detect": "crccheck"}
 """FFmpeg's, without which hashes of pictures that a video of H.265 carries are not looked at."""
 _QUICK = (cv2.IMWRITE_PNG_COMPRESSION, 1)
+_stderr = threading.Lock()  # one descriptor for all threads: who exchanges it has to put it back first
 
 
 @dataclass(frozen=True)
@@ -295,12 +297,12 @@ def _complaints() -> Iterator[list[str]]:
     """Collect the lines that C libraries print on stderr; those that report no damage are printed after."""
     complaints: list[str] = []
     sys.stderr.flush()
-    try:
-        stderr = os.dup(2)
-    except OSError:  # no stderr at all
-        yield complaints
-        return
-    with tempfile.TemporaryFile() as printed:
+    with _stderr, tempfile.TemporaryFile() as printed:
+        try:
+            stderr = os.dup(2)
+        except OSError:  # no stderr at all
+            yield complaints
+            return
         os.dup2(printed.fileno(), 2)
         try:
             yield complaints
