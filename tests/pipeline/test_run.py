@@ -12,7 +12,7 @@ import yaml
 from tests.drive.example import description, make_drive, make_map
 from tests.ports import blind_copy, run_config, short_port
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.errors import ConfigError, DetectorError, DriveError
+from v2hdm.errors import ConfigError, DetectorError, DriveError, MapFileError
 from v2hdm.geometry.geodetic import crs_of
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.io.calibration.reading import read_calibration
@@ -26,7 +26,7 @@ from v2hdm.io.trajectory import read_tum, write_tum
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.results import AdjustedPoses
 from v2hdm.pipeline import map_drive
-from v2hdm.pipeline.config import MapConfig, ReportConfig, run_name
+from v2hdm.pipeline.config import MapConfig, ReportConfig, admit, run_name
 from v2hdm.pipeline.result import _along_route, write_trajectories
 from v2hdm.pipeline.run import made_of, run
 from v2hdm.pipeline.stages import camera_sets
@@ -58,6 +58,10 @@ def test_a_picture_of_the_users_own_lies_under_the_map_of_the_report(result, sho
     gone = run_config(short_drive, tmp_path, report=ReportConfig(background=str(tmp_path / "gone.tif")))
     with pytest.raises(ConfigError, match=r"report.background: no file or folder .*gone\.tif"):
         run(gone)
+    (tmp_path / "points.csv").write_text("name,u,v\n")
+    table = ReportConfig(background=str(tmp_path / "points.csv"))
+    with pytest.raises(MapFileError, match="not a readable GeoTIFF"):
+        admit(run_config(short_drive, tmp_path, report=table))
 
 
 @pytest.mark.slow

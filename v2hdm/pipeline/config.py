@@ -202,6 +202,10 @@ def admit(config: RunConfig) -> str:
         need("rasterio", "gis", "report.background", ConfigError)
         if not Path(config.report.background).exists():
             raise ConfigError(f"report.background: no file or folder {config.report.background}")
+        from v2hdm.report.page.layers import open_background
+
+        with open_background(Path(config.report.background)):
+            pass  # readable: it will be, after minutes of mapping
     has_base = config.map.base is not None
     check_choice(config.mapping, len(config.drive.paths), has_base, config.accuracy_goal_cm)
     return name

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import escape
@@ -94,6 +96,21 @@ def _source(path: Path) -> dict[str, Any]:
     return {"fp": _TILES.format(**tiles), "driver": "WMS"}
 
 
+@contextmanager
+def open_background(path: Path) -> Iterator[Any]:
+    """The user's GeoTIFF or XYZ tiles, open in rasterio; MapFileError if unusable."""
+    rasterio = need("rasterio", "gis", "a background", MapFileError)
+    try:
+        with rasterio.open(**_source(path)) as source:
+            if source.crs is None:
+                raise MapFileError(f"{path}: states no coordinate system; give a GeoTIFF that has one")
+            if path.is_file():
+                check_raster(source, path, MapFileError)
+            yield source
+    except (rasterio.errors.RasterioError, rasterio.errors.CRSError) as failure:
+        raise MapFileError(f"{path}: not a readable GeoTIFF or folder of XYZ tiles ({failure})") from None
+
+
 def background_layer(path: Path, facts: Facts) -> dict[str, Any]:
     """The user's GeoTIFF or XYZ tiles as a layer like :func:`mosaic_layer`; MapFileError if unusable."""
     names = "rasterio", "rasterio.vrt"
@@ -104,22 +121,15 @@ def background_layer(path: Path, facts: Facts) -> dict[str, Any]:
     (west, south), (east, north) = _extent(facts)
     step = max(float(max(east - west, north - south)) / _BACKGROUND_PX, _FINEST_M)
     size = {"width": int(np.ceil((east - west) / step)), "height": int(np.ceil((north - south) / step))}
-    # The mosaic's projection agrees with the map frame to a millimetre.
-    frame = {"crs": rasterio.crs.CRS.from_user_input(crs_of(origin))}
-    frame |= {"transform": rasterio.Affine(step, 0, west, 0, -step, north)}
-    try:
-        with rasterio.open(**_source(path)) as source:
-            if source.crs is None:
-                raise MapFileError(f"{path}: states no coordinate system; give a GeoTIFF that has one")
-            if path.is_file():
-                check_raster(source, path, MapFileError)
-            bilinear = rasterio.enums.Resampling.bilinear
-            frame["add_alpha"] = rasterio.enums.ColorInterp.alpha not in source.colorinterp
-            with warped.WarpedVRT(source, **frame, **size, resampling=bilinear) as there:
-                bands = there.read([3, 2, 1] if source.count >= 3 else [1, 1, 1])
-                seen = there.dataset_mask()
-    except (rasterio.errors.RasterioError, rasterio.errors.CRSError) as failure:
-        raise MapFileError(f"{path}: not a readable GeoTIFF or folder of XYZ tiles ({failure})") from None
+    with open_background(path) as source:
+        # The mosaic's projection agrees with the map frame to a millimetre.
+        frame = {"crs": rasterio.crs.CRS.from_user_input(crs_of(origin))}
+        frame |= {"transform": rasterio.Affine(step, 0, west, 0, -step, north)}
+        frame["add_alpha"] = rasterio.enums.ColorInterp.alpha not in source.colorinterp
+        bilinear = rasterio.enums.Resampling.bilinear
+        with warped.WarpedVRT(source, **frame, **size, resampling=bilinear) as there:
+            bands = there.read([3, 2, 1] if source.count >= 3 else [1, 1, 1])
+            seen = there.dataset_mask()
     if not seen.any():
         raise MapFileError(f"{path}: does not cover this map; give a picture of its site")
     if bands.dtype != np.uint8:
