@@ -10,6 +10,7 @@ import pytest
 from train.config import DataConfig
 from train.labels_coco import UNKNOWN, read_coco
 from v2hdm.cli.main import run
+from v2hdm.errors import ConfigError
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.io.drive import read_drive
@@ -113,3 +114,9 @@ def test_a_failed_map_is_refused_and_the_command_says_what_to_do_next(small_mapp
     assert run(["labels", str(failed), "--output", str(tmp_path / "none")]) == 2
     assert "its verdict is FAIL: labels of a map that may be wrong" in capsys.readouterr().err
     assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize("range_m", [0.0, -3.0, float("nan"), float("inf")])
+def test_a_range_that_holds_no_label_is_refused(small_mapped, small_drive, tmp_path, range_m):
+    with pytest.raises(ConfigError, match="holds no labels"):
+        write_labels(small_mapped[0], read_drive(small_drive), tmp_path, range_m)

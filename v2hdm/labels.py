@@ -23,7 +23,7 @@ from scipy.stats import norm
 from v2hdm.association.sightings import row_shares
 from v2hdm.association.surface import Surface
 from v2hdm.detection.batch import read_grey
-from v2hdm.errors import MapFileError
+from v2hdm.errors import ConfigError, MapFileError
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points, has_distortion
 from v2hdm.geometry.planar import clip_convex, clip_half, densified, rectangle_size, signed_area
@@ -169,8 +169,10 @@ def write_labels(
     Its ``file_name`` entries start from the drive's folder; markings are labelled up to ``range_m`` from a
     camera. Returns how many are whole and shown ("shown"), of unsure visibility ("unsure"), and in view but
     hidden ("hidden"). Raises MapFileError where the folder is no result or its verdict is FAIL, DriveError
-    where an image cannot be read.
+    where an image cannot be read, ConfigError for a range that is not positive.
     """
+    if not 0 < range_m < np.inf:
+        raise ConfigError(f"a range of {range_m:g} m holds no labels; give metres, such as 16")
     facts = read_facts(folder, drive)
     status = (facts.metrics.get("verdict") or {}).get("status")
     if facts.hd_map is None or facts.route is None or status not in ("PASS", "WARN"):
