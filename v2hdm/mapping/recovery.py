@@ -66,6 +66,7 @@ _SIZES: Mapping[Fault, _Size] = {
     Fault.KNOCK: _Size(0.002, 0.002, 0.01, 1.0),
     Fault.SURVEY: _Size(0.03, 0.15, 0.1, 20.0),
     Fault.LEVER: _Size(0.03, 0.15, 0.5, 20.0),
+    Fault.SCALE: _Size(0.003, 0.05, 0.15, 1.0),  # Web Mercator at 30 degrees of latitude: .15
     Fault.SIZE: _Size(0.01, 0.05, 0.05, 10.0),
     Fault.CONTROL: _Size(0.02, 0.05, 0.1, 1e3),
     Fault.DATUM: _Size(0.02, 0.05, 0.1, 1e3),
@@ -87,6 +88,8 @@ _CLOCK_CORRECTABLE_S = 0.006
 """Largest sigma, s, at which a contradicted clock is corrected: a late clock adds scatter to its estimate."""
 
 _CENTRE_OBSERVABLE_M = 0.1  # sigma of a centre, m, above which a drive needs its survey: it shifts the map
+
+RIVAL_LOG_ODDS = float(np.log(10.0))  # up to which a less likely cause may be the true one
 
 _MOST_CORRECTIONS = 4  # most inputs dropped one by one; with more of them wrong nothing is reliable
 
@@ -257,7 +260,7 @@ def visit_names(drive: Drive) -> tuple[str, ...]:
 
 def _is_stated(one: ScoreTest, bundle: Bundle, drive: Drive) -> bool:
     """Whether the suspected input was stated: an unsurveyed centre is a guess."""
-    if one.fault not in (Fault.SURVEY, Fault.LEVER):
+    if one.fault not in (Fault.SURVEY, Fault.LEVER, Fault.SCALE):
         return True
     return all(drive.cameras[name].centre_prior is not None for name in _cameras_of(bundle, one))
 
@@ -315,7 +318,11 @@ def _evidence(
 
 
 def _is_ambiguous(worst: ScoreTest, found: Sequence[ScoreTest]) -> bool:
-    """Whether the same fault of another camera would explain nearly as much."""
+    """Whether another camera's fault, or for centres the poses' scale, would explain nearly as much."""
+    if worst.fault in (Fault.SURVEY, Fault.LEVER):
+        least = doubt(worst) - RIVAL_LOG_ODDS
+        if any(one.fault is Fault.SCALE and is_contradicted(one) and doubt(one) > least for one in found):
+            return True
     rivals = [
         one.sigmas
         for one in found
