@@ -198,6 +198,13 @@ def stepped(scene: Scene):
     return replace(scene.problem, map_from_vehicle=poses)
 
 
+def scaled(scene: Scene):
+    """Recorded positions lie 15 % too far apart, as in Web Mercator at 30 degrees of latitude."""
+    poses = scene.problem.map_from_vehicle.copy()
+    poses[:, :3, 3] *= 1.15
+    return replace(scene.problem, map_from_vehicle=poses)
+
+
 def crowned(scene: Scene):
     """The ground falls by 3 % to both sides of the route."""
     seen = scene.problem.observations
@@ -227,6 +234,7 @@ def drifting(scene: Scene):
         (knocked, Fault.KNOCK, 0.0105),
         (loaded, Fault.KNOCK, 0.0105),
         (stepped, Fault.STEP, 0.3),
+        (scaled, Fault.SCALE, 0.13),
         (crowned, Fault.CROWN, 0.03),
         (drifting, Fault.CLOCK_DRIFT, 0.1),
     ],

@@ -16,6 +16,7 @@ from v2hdm.catalogue import CORNERED_CLASSES
 from v2hdm.errors import ConfigError
 from v2hdm.geometry.rigid import interpolate
 from v2hdm.mapping.bundle import control_points, known_lengths, without_corner
+from v2hdm.mapping.input_errors import is_contradicted
 from v2hdm.mapping.inputs import Inputs
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.optimise import Optimiser
@@ -268,6 +269,19 @@ def test_a_survey_half_a_metre_too_high_is_dropped_and_told(scene):
     assert (told.cameras, told.axis) == (("front",), 2)
     assert told.value == pytest.approx(-0.5, abs=0.1)
     assert centre_of(result)[2] == pytest.approx(2.4, abs=0.05)
+
+
+@pytest.mark.parametrize("turns", [True, False])
+def test_positions_in_web_mercator_are_reported_and_no_survey_is_dropped_for_them(turns):
+    street = make_scene(SceneOptions(seed=31, length_m=90.0, turns=turns, wild_rate=0.0, false_rate=0.0))
+    images = []
+    for image in street.drive.images:
+        pose = image.map_from_vehicle.copy()
+        pose[:2, 3] *= 1.15
+        images.append(replace(image, map_from_vehicle=pose))
+    result = mapped(street, replace(street.drive, images=images))
+    assert faults(result) == []
+    assert Fault.SCALE in [one.fault for one in result.evidence.score_tests if is_contradicted(one)]
 
 
 def test_known_sizes_that_the_paint_does_not_have_are_dropped_and_told(scene):

@@ -68,6 +68,7 @@ class Fault(Enum):
     KNOCK = "knock"  # rotation of a camera from some time on; of all cameras by load
     SURVEY = "survey"  # of one camera's centre
     LEVER = "lever"  # of all centres, or of the point that poses refer to
+    SCALE = "scale"  # relative error of distances between recorded positions
     SIZE = "size"  # of known lengths of one value
     CONTROL = "control"  # of one surveyed point
     DATUM = "datum"  # of all surveyed points
@@ -87,6 +88,7 @@ _UNITS = {
     Fault.SLOPE: "rad",
     Fault.CROWN: "",
     Fault.KNOCK: "rad",
+    Fault.SCALE: "",
 }
 
 
@@ -250,6 +252,7 @@ def _hypotheses(problem: Problem, arrays: Arrays) -> Iterator[_Hypothesis]:
                 yield _Hypothesis(Fault.SURVEY, partial(_survey, camera, axis), camera, axis)
             if arrays.camera_count > 1:
                 yield _Hypothesis(Fault.LEVER, partial(_survey, -1, axis), -1, axis)
+        yield _Hypothesis(Fault.SCALE, _moving(_scale))
     if bool((arrays.control_root > 0).any()):
         for axis in (0, 1):
             yield _Hypothesis(Fault.DATUM, partial(_datum, axis), axis=axis)
@@ -364,6 +367,13 @@ def _step(axis: int, frame: int, arrays: Arrays, out: Tensor) -> Tensor:
     """Positions recorded short along a direction, from a frame to the end of its session."""
     out[..., :3] = arrays.vehicle_from_map[:, :3, :2] @ arrays.centre.new_tensor(_STEPS[axis])
     return out * _since(arrays, frame)
+
+
+def _scale(arrays: Arrays, out: Tensor) -> Tensor:
+    """Positions recorded too close together, as those of a grid that shrinks the ground."""
+    position = arrays.vehicle_from_map.inverse()[:, :3, 3:]
+    out[..., :3] = (arrays.vehicle_from_map[:, :3, :3] @ (position - position.mean(dim=0)))[..., 0]
+    return out
 
 
 def _knock(camera: int, axis: int, frame: int, arrays: Arrays, out: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ from v2hdm.adjust import Fault, ScoreTest
 
 CLEAR_SIGMAS = 4.0  # of a visible error; in one of 400 correct drives one of its forty tests exceeds it
 _PRIOR_ODDS = 1 / 400  # prior odds of a wrong input: one in forty, in one of ten drives of a new vehicle
+RIVAL_LOG_ODDS = math.log(10.0)  # up to which a less likely cause may be the true one
 _DOUBT = 0.05  # probability of a wrong input that a PASS, stated at 95 %, leaves
 
 
@@ -42,6 +43,7 @@ _SIZES: Mapping[Fault, _Size] = {
     Fault.KNOCK: _Size(0.002, 0.002, 0.01, 1.0),
     Fault.SURVEY: _Size(0.03, 0.15, 0.1, 20.0),
     Fault.LEVER: _Size(0.03, 0.15, 0.5, 20.0),
+    Fault.SCALE: _Size(0.003, 0.05, 0.15, 1.0),  # Web Mercator at 30 degrees of latitude: .15
     Fault.SIZE: _Size(0.01, 0.05, 0.05, 10.0),
     Fault.CONTROL: _Size(0.02, 0.05, 0.1, 1e3),
     Fault.DATUM: _Size(0.02, 0.05, 0.1, 1e3),

@@ -23,7 +23,14 @@ from v2hdm.geometry.rigid import camera_centre
 from v2hdm.mapping.bundle import Bundle, name_of
 from v2hdm.mapping.conclusion import Optimised
 from v2hdm.mapping.foreign import foreign_segment
-from v2hdm.mapping.input_errors import CLEAR_SIGMAS, is_contradicted, is_doubtful, log_odds
+from v2hdm.mapping.input_errors import (
+    CLEAR_SIGMAS,
+    RIVAL_LOG_ODDS,
+    doubt,
+    is_contradicted,
+    is_doubtful,
+    log_odds,
+)
 from v2hdm.mapping.inputs import Inputs
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import AUTO, INCREMENTAL, SURFACE, SurveyOptions
@@ -175,7 +182,7 @@ def _session_names(drive: Drive) -> tuple[str, ...]:
 
 def _is_stated(one: ScoreTest, bundle: Bundle, drive: Drive) -> bool:
     """Whether the suspected input was stated: an unsurveyed centre is a guess."""
-    if one.fault not in (Fault.SURVEY, Fault.LEVER):
+    if one.fault not in (Fault.SURVEY, Fault.LEVER, Fault.SCALE):
         return True
     return all(drive.cameras[name].centre_prior is not None for name in _cameras_of(bundle, one))
 
@@ -233,7 +240,11 @@ def _evidence(
 
 
 def _is_ambiguous(worst: ScoreTest, found: Sequence[ScoreTest]) -> bool:
-    """Whether the same fault of another camera would explain nearly as much."""
+    """Whether another camera's fault, or for centres the poses' scale, would explain nearly as much."""
+    if worst.fault in (Fault.SURVEY, Fault.LEVER):
+        least = doubt(worst) - RIVAL_LOG_ODDS
+        if any(one.fault is Fault.SCALE and is_contradicted(one) and doubt(one) > least for one in found):
+            return True
     rivals = [
         one.sigmas
         for one in found

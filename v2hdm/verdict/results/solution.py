@@ -20,6 +20,7 @@ from v2hdm.ground import GroundEstimate
 from v2hdm.mapping.input_errors import (
     CLEAR_SIGMAS,
     OBSERVABLE_SIGMA,
+    RIVAL_LOG_ODDS,
     doubt,
     even_sigmas,
     is_contradicted,
@@ -92,6 +93,9 @@ CHECKS: Mapping[Fault, tuple[str, str]] = {
         "survey",
         "measure the centres from the reference point of the poses, such as the antenna, or move the poses",
     ),
+    Fault.SCALE: (
+        "scale", "give positions in metres on the ground, as in UTM or a local frame, not in Web Mercator",
+    ),
     Fault.SIZE: ("known_sizes", "measure the paint, or leave it out of mapping.known_sizes"),
     Fault.CONTROL: ("surveyed points", "survey it again, or leave it out of mapping.survey"),
     Fault.DATUM: ("surveyed points", "check that survey and poses have the same datum and origin"),
@@ -101,7 +105,6 @@ CHECKS: Mapping[Fault, tuple[str, str]] = {
 _CORRECTED_BY = {Fault.CLOCK: "images got poses at the corrected times", Fault.SIZE: "no known size was used"}
 
 _LIKE_CLOCK = (Fault.CLOCK_DRIFT, Fault.COURSE)  # faults that a constant clock offset may stand for
-_RIVAL_LOG_ODDS = float(np.log(10.0))  # up to which a less likely cause is named beside the likeliest
 _WAYS = (("behind", "ahead of"), ("to the right of", "to the left of"), ("below", "above"))
 # What units are shown as, and by what values are multiplied for it.
 _SHOWN = {"m": (100.0, "cm"), "s": (1e3, "ms"), "rad": (180 / np.pi, "deg"), "px": (1.0, "px"), "": (1.0, "")}
@@ -186,7 +189,7 @@ def check_inputs(evidence: SolveEvidence) -> list[Finding]:
         causes[_contradicted(still) if is_physical(still[0]) else _unknown(still[0])] = log_odds(still[0])
     # Each would explain part of the same contradictions: the likeliest is named, and what nearly is.
     causes = {one: odds for one, odds in causes.items() if one.status is Status.FAIL}
-    least = max(causes.values(), default=0.0) - _RIVAL_LOG_ODDS
+    least = max(causes.values(), default=0.0) - RIVAL_LOG_ODDS
     named = [one for one in sorted(causes, key=lambda one: -causes[one]) if causes[one] > least]
     doubtful = doubted(evidence)
     named = named or ([_doubtful(doubtful)] if doubtful is not None else [])
@@ -241,7 +244,7 @@ def _unknown(one: Contradiction) -> Finding:
 
 def _contradicted(still: list[Contradiction]) -> Finding:
     one = still[0]
-    rivals = [_words(other) for other in still if log_odds(other) > log_odds(one) - _RIVAL_LOG_ODDS]
+    rivals = [_words(other) for other in still if log_odds(other) > log_odds(one) - RIVAL_LOG_ODDS]
     says = f"{' or '.join(rivals)} ({one.sigmas:.0f} sigmas)"
     return _input(one, Status.FAIL, f"{says}, and the map is wrong by it: {CHECKS[one.fault][1]}")
 
@@ -476,6 +479,9 @@ def _words(one: Contradiction) -> str:
                 f"the centres of {whose} all lie {way} their surveys, as if the poses were of another "
                 "point of the vehicle (antenna instead of axle)"
             )
+        case Fault.SCALE:
+            apart = "too close together" if one.value > 0 else "too far apart"
+            return f"the recorded positions lie {100 * size:.1f} % {apart}"
         case Fault.SIZE:
             longer = "longer" if one.value > 0 else "shorter"
             return f"paint that known_sizes states as {one.about} is {cm:.1f} cm {longer}"
