@@ -198,6 +198,13 @@ def stepped(scene: Scene):
     return replace(scene.problem, map_from_vehicle=poses)
 
 
+def wandering(scene: Scene):
+    """Recorded positions wander off by 30 cm within an eighth of the way, and stay there."""
+    poses = scene.problem.map_from_vehicle.copy()
+    poses[:, 0, 3] -= 0.3 * np.clip(np.linspace(-4.0, 4.0, len(poses)) + 0.5, 0.0, 1.0)
+    return replace(scene.problem, map_from_vehicle=poses)
+
+
 def scaled(scene: Scene):
     """Recorded positions lie 15 % too far apart, as in Web Mercator at 30 degrees of latitude."""
     poses = scene.problem.map_from_vehicle.copy()
@@ -234,6 +241,7 @@ def drifting(scene: Scene):
         (knocked, Fault.KNOCK, 0.0105),
         (loaded, Fault.KNOCK, 0.0105),
         (stepped, Fault.STEP, 0.3),
+        (wandering, Fault.STEP, 0.3),
         (scaled, Fault.SCALE, 0.13),
         (crowned, Fault.CROWN, 0.03),
         (drifting, Fault.CLOCK_DRIFT, 0.1),

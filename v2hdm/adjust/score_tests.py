@@ -134,6 +134,11 @@ class _Hypothesis:
     axis: int = 0
     item: int = -1
 
+    @property
+    def key(self) -> tuple[Fault, int, int, int]:
+        """What is tested, whatever its course."""
+        return self.fault, self.camera, self.axis, self.item
+
 
 @dataclass(frozen=True)
 class _Answer:
@@ -211,8 +216,9 @@ def score_faults(problem: Problem, solution: Solution) -> tuple[ScoreTest, ...]:
     """Tests at ``solution`` of every fault that ``problem`` can have, largest gain first."""
     solved = Sensitivity.at(solution.covariance.whitening)
     answers = [_Answer.to(hypothesis, solved) for hypothesis in _hypotheses(problem, solved.arrays)]
-    said = [one.disagreement for one in answers if one.is_observable]
-    usual = float(np.median(said)) if said else 1.0
+    # A step counts once, however it may grow: the sudden one, which comes first.
+    said = {one.hypothesis.key: one.disagreement for one in reversed(answers) if one.is_observable}
+    usual = float(np.median(list(said.values()))) if said else 1.0
     found = _likeliest_changes([(one, one.test(usual)) for one in answers])
     found += _control_points(problem, solution, usual)
     return tuple(sorted(found, key=lambda test: -test.gain))
@@ -240,8 +246,8 @@ def _hypotheses(problem: Problem, arrays: Arrays) -> Iterator[_Hypothesis]:
     for axis in (0, 1):
         yield _Hypothesis(Fault.SLOPE, _moving(_slope, axis), axis=axis)
     for axis in range(len(_STEPS)):
-        for frame in changes:
-            yield _Hypothesis(Fault.STEP, _moving(_step, axis, frame), axis=axis, item=frame)
+        for frame, until in [*zip(changes, changes, strict=True), *zip(changes, changes[2:], strict=False)]:
+            yield _Hypothesis(Fault.STEP, _moving(_step, axis, frame, until), axis=axis, item=frame)
     for axis in range(3):
         yield _Hypothesis(Fault.CROWN, partial(_crown, axis), axis=axis)
     if problem.twist_vehicle is not None:
@@ -363,10 +369,11 @@ def _course(problem: Problem, _: Arrays, out: Tensor) -> Tensor:
     return out
 
 
-def _step(axis: int, frame: int, arrays: Arrays, out: Tensor) -> Tensor:
-    """Positions recorded short along a direction, from a frame to the end of its session."""
+def _step(axis: int, frame: int, until: int, arrays: Arrays, out: Tensor) -> Tensor:
+    """Positions recorded short along a direction from a frame on, fully from ``until``, in its session."""
     out[..., :3] = arrays.vehicle_from_map[:, :3, :2] @ arrays.centre.new_tensor(_STEPS[axis])
-    return out * _since(arrays, frame)
+    after = torch.arange(1 - frame, 1 - frame + arrays.frame_count, device=out.device)[:, None]
+    return out * _since(arrays, frame) * (after / (until - frame + 1)).clamp(max=1.0)
 
 
 def _scale(arrays: Arrays, out: Tensor) -> Tensor:
