@@ -136,6 +136,11 @@ def test_what_would_be_gone_with_a_worker_is_refused(tmp_path, drive):
     assert "is temporary, for one process" in planned.refused[0].says
 
 
+def test_a_drive_in_place_of_a_run_file_is_named_as_one(drive):
+    planned = plan([drive / "drive.yaml"], [])
+    assert "a drive; give a run file that names its folder" in planned.refused[0].says
+
+
 def test_a_run_whose_name_is_no_name_of_a_folder_is_refused_before_any_work(tmp_path, drive):
     file = written(tmp_path, "one", drive)
     file.write_text(file.read_text().replace("name: one", "name: ../one"))

@@ -29,6 +29,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from v2hdm.cli.main import Command
 from v2hdm.errors import ConfigError, V2hdmError
+from v2hdm.io.drive.folder import DRIVE_FILE
 from v2hdm.io.safe.texts import read_yaml
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -142,6 +143,8 @@ def _check_own_files(folders: Sequence[Path], overrides: Sequence[str]) -> None:
 
 def _refuse_headless(path: Path) -> None:
     if not re.search(r"^#\s*@package\s+_global_\s*$", path.read_text(encoding="utf-8-sig"), re.MULTILINE):
+        if path.name == DRIVE_FILE:
+            raise ConfigError(f"{path}: a drive; give a run file that names its folder (docs/fleet.md)")
         raise ConfigError(f"{path}: its first line must be '# @package _global_'; add it")
 
 
