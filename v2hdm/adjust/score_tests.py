@@ -136,7 +136,7 @@ class _Hypothesis:
 
     @property
     def key(self) -> tuple[Fault, int, int, int]:
-        """What is tested, whatever its course."""
+        """The fault that is tested; a sudden and a gradual step from one frame share it."""
         return self.fault, self.camera, self.axis, self.item
 
 
@@ -216,7 +216,7 @@ def score_faults(problem: Problem, solution: Solution) -> tuple[ScoreTest, ...]:
     """Tests at ``solution`` of every fault that ``problem`` can have, largest gain first."""
     solved = Sensitivity.at(solution.covariance.whitening)
     answers = [_Answer.to(hypothesis, solved) for hypothesis in _hypotheses(problem, solved.arrays)]
-    # A step counts once, however it may grow: the sudden one, which comes first.
+    # Sudden and gradual steps from one frame count as one test: the sudden one, which comes first.
     said = {one.hypothesis.key: one.disagreement for one in reversed(answers) if one.is_observable}
     usual = float(np.median(list(said.values()))) if said else 1.0
     found = _likeliest_changes([(one, one.test(usual)) for one in answers])
@@ -370,7 +370,7 @@ def _course(problem: Problem, _: Arrays, out: Tensor) -> Tensor:
 
 
 def _step(axis: int, frame: int, until: int, arrays: Arrays, out: Tensor) -> Tensor:
-    """Positions recorded short along a direction from a frame on, fully from ``until``, in its session."""
+    """Positions recorded short along a direction: growing from ``frame`` to ``until``, then constant."""
     out[..., :3] = arrays.vehicle_from_map[:, :3, :2] @ arrays.centre.new_tensor(_STEPS[axis])
     after = torch.arange(1 - frame, 1 - frame + arrays.frame_count, device=out.device)[:, None]
     return out * _since(arrays, frame) * (after / (until - frame + 1)).clamp(max=1.0)

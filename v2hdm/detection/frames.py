@@ -24,7 +24,7 @@ _MOST_CAMERAS = 1 << 16  # OpenCV takes a larger index for something else
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")  # suffixes of images in a folder
 _POLL_S = 0.005  # a folder that grows is looked at this often
 _WRITTEN_S = 1.0  # an image is written within this time
-_SAME_DATE_S = (2.0, 0.05)  # changes this near in time may bear one date: whole seconds (FAT), fractions
+_SAME_DATE_S = (2.0, 0.05)  # two changes this close may have one date: in whole seconds (FAT), in fractions
 
 # Depth and channels as stored, so that what does not fit is seen instead of converted without a word.
 _AS_STORED = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR

@@ -205,7 +205,7 @@ def admit(config: RunConfig) -> str:
         from v2hdm.report.page.layers import open_background
 
         with open_background(Path(config.report.background)):
-            pass  # readable: it will be, after minutes of mapping
+            pass  # an unreadable one is refused here, not after minutes of mapping
     has_base = config.map.base is not None
     check_choice(config.mapping, len(config.drive.paths), has_base, config.accuracy_goal_cm)
     return name

@@ -60,7 +60,7 @@ VIDEO_OPTIONS = {
 DECODER_OPTIONS = {"err_detect": "crccheck"}
 """FFmpeg's, without which hashes of pictures that a video of H.265 carries are not looked at."""
 _QUICK = (cv2.IMWRITE_PNG_COMPRESSION, 1)
-_stderr = threading.Lock()  # one descriptor for all threads: who exchanges it has to put it back first
+_stderr = threading.Lock()  # held while descriptor 2, which all threads share, is redirected
 
 
 @dataclass(frozen=True)

@@ -431,7 +431,8 @@ def _excluded(best: MethodResult) -> Finding:
 def _words(one: Contradiction) -> str:
     """The error and its size, as a clause."""
     whose, size = " and ".join(one.cameras), abs(one.value)
-    cm = 100 * size
+    cm, longer = 100 * size, "longer" if one.value > 0 else "shorter"
+    axis = _MAP_AXES[one.axis]
     way = f"{cm:.0f} cm {_WAYS[min(one.axis, 2)][one.value > 0]}"
     match one.fault:
         case Fault.CLOCK:
@@ -453,7 +454,6 @@ def _words(one: Contradiction) -> str:
                 f"{'ahead of' if one.value > 0 else 'behind'} the rear axle"
             )
         case Fault.STEP:
-            axis = _MAP_AXES[one.axis]
             return f"the position steps by {100 * one.value:+.0f} cm {axis} and stays there, {one.about}"
         case Fault.KNOCK:
             turned = ("in roll", "in pitch", "in yaw")[one.axis]
@@ -462,7 +462,6 @@ def _words(one: Contradiction) -> str:
             by = f"{np.rad2deg(size):.1f} deg {turned}"
             return f"the mounting of {whose} is turned by {by} {one.about}, {cause}"
         case Fault.FOCAL:
-            longer = "longer" if one.value > 0 else "shorter"
             return f"the focal length of {whose} is {100 * size:.1f} % {longer} than camera_info says"
         case Fault.DISTORTION:
             return f"the lens distortion of {whose} is not that of camera_info (k1 off by {one.value:+.3f})"
@@ -470,7 +469,6 @@ def _words(one: Contradiction) -> str:
             axis = ("right", "down")[one.axis]
             return f"the principal point of {whose} lies {one.value:+.0f} px {axis} of where camera_info says"
         case Fault.SLOPE:
-            axis = _MAP_AXES[one.axis]
             return f"the ground rises by {100 * one.value:+.1f} % to the {axis} under the poses"
         case Fault.SURVEY:
             return f"the centre of {whose} lies {way} its survey"
@@ -480,13 +478,11 @@ def _words(one: Contradiction) -> str:
                 "point of the vehicle (antenna instead of axle)"
             )
         case Fault.SCALE:
-            apart = "too close together" if one.value > 0 else "too far apart"
-            return f"the recorded positions lie {100 * size:.1f} % {apart}"
+            apart = "close together" if one.value > 0 else "far apart"
+            return f"the recorded positions lie {cm:.1f} % too {apart}"
         case Fault.SIZE:
-            longer = "longer" if one.value > 0 else "shorter"
             return f"paint that known_sizes states as {one.about} is {cm:.1f} cm {longer}"
         case Fault.CONTROL:
             return f"the surveyed point {one.about} is {cm:.0f} cm off the marking's corner"
         case Fault.DATUM:
-            axis = _MAP_AXES[one.axis]
             return f"the surveyed points all lie {100 * one.value:+.0f} cm {axis} of the markings"
