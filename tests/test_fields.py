@@ -12,9 +12,9 @@ from train.checkpoint import own_entries
 from v2hdm.catalogue import CORNERED_CLASSES, PAINT_CLASSES, SHIPPED, load_catalogue
 from v2hdm.errors import ConfigError, DriveError, MapFileError
 from v2hdm.geometry.lens import distort_points, undistort_points
-from v2hdm.io.safe.fields import check_camera, lens_reach
-from v2hdm.io.safe.pixels import read_header, read_pixels
 from v2hdm.records import CameraInfo
+from v2hdm.safe.fields import check_camera, lens_reach
+from v2hdm.safe.pixels import read_header, read_pixels
 
 INTRINSIC = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])
 KITTI = np.array([[984.2, 0.0, 690.0], [0.0, 980.8, 233.2], [0.0, 0.0, 1.0]])

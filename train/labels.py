@@ -23,9 +23,9 @@ from train.scenes.scenes import TrainingSample
 from train.targets import IGNORE, Targets, targets
 from v2hdm.catalogue import NOT_PAINT, PAINT_CLASSES
 from v2hdm.errors import ConfigError, DriveError
-from v2hdm.io.safe.pixels import read_header
-from v2hdm.io.safe.texts import shown
 from v2hdm.records import BoolArray, FloatArray
+from v2hdm.safe.pixels import read_header
+from v2hdm.safe.texts import shown
 
 LEARNT, VALIDATION, JUDGING = "learnt", "validation", "judging"
 """The roles of labelled images."""

@@ -11,8 +11,8 @@ import numpy as np
 from train.config import DataConfig, LabelError
 from train.labels_image import LabelledImage, Shape
 from v2hdm.catalogue import NOT_PAINT, PAINT_CLASSES
-from v2hdm.io.safe.texts import shown
 from v2hdm.records import FloatArray
+from v2hdm.safe.texts import shown
 from v2hdm.store.files import load_json
 
 EITHER = "|"

@@ -9,8 +9,8 @@ import numpy as np
 
 from train.config import LabelError
 from train.labels_image import LabelledImage
-from v2hdm.io.safe.texts import parse_json, read_text, shown
 from v2hdm.records import FloatArray
+from v2hdm.safe.texts import parse_json, read_text, shown
 
 _KEYS = ("raw_file", "lanes", "h_samples")
 _LEAST_POINTS = 2

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import ConfigError
-from v2hdm.io.safe.texts import read_yaml, shown
 from v2hdm.records import LANE_BOUNDARY, BoolArray, FloatArray
+from v2hdm.safe.texts import read_yaml, shown
 
 CATALOGUE_FILE = Path(__file__).with_name("catalogue.yaml")
 

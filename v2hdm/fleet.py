@@ -28,11 +28,11 @@ from v2hdm.errors import (
     describe,
     one_line,
 )  # fmt: skip
-from v2hdm.io.safe.texts import take_name
 from v2hdm.pipeline.config import RunConfig, run_name
 from v2hdm.pipeline.run import take_or_run
 from v2hdm.progress import Progress, patient
 from v2hdm.report.terminal import DriveProgress, drive_bars, new_table, plain
+from v2hdm.safe.texts import take_name
 from v2hdm.store.remote import place_of
 from v2hdm.store.results import WriteFile, growing_folder
 from v2hdm.workers import side_by_side

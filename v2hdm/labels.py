@@ -21,7 +21,6 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 
 from v2hdm.association.sightings import row_shares
-from v2hdm.association.surface import Surface
 from v2hdm.detection.batch import read_grey
 from v2hdm.errors import ConfigError, MapFileError
 from v2hdm.geometry.ipm import project_ground
@@ -32,6 +31,7 @@ from v2hdm.progress import Steps
 from v2hdm.records import BoolArray, CameraInfo, Drive, FloatArray, Image, IntArray, Trajectory
 from v2hdm.report.page.facts import CameraFacts, Facts, read_facts
 from v2hdm.store.files import write_json
+from v2hdm.surface.surface import Surface
 
 FILE = "instances.json"
 RANGE_M = 16.0  # how far from a camera markings are labelled: farther ones need not be in the map

@@ -10,17 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.adjust.scene import HEIGHT, make_scene, with_late_clocks
-from v2hdm.adjust import (
-    ControlPoints,
-    Drift,
-    KnownLengths,
-    PoseSigma,
-    SolveOptions,
-    Status,
-    model,
-    score_faults,
-    solve,
-)
+from v2hdm.adjust import ControlPoints, Drift, KnownLengths, PoseSigma, SolveOptions, Status, model, solve
 from v2hdm.adjust.descent import Objective
 from v2hdm.adjust.engines import make_engine
 from v2hdm.adjust.engines.autograd import TorchEngine
@@ -30,6 +20,7 @@ from v2hdm.adjust.model import Estimate, Loss
 from v2hdm.adjust.problem import LOSSES, POSE_STATES
 from v2hdm.adjust.reduced import ReducedSystem
 from v2hdm.adjust.whitening import factorise
+from v2hdm.faults import score_faults
 
 POSES = PoseSigma(position_drift=Drift(0.01, 10.0), roll_pitch_drift=Drift(0.003, 2.0))
 MODELS = [((), False), ((), True), (("roll", "pitch"), True), (POSE_STATES, False), (POSE_STATES, True)]

@@ -7,18 +7,10 @@ import pytest
 import torch
 
 from tests.adjust.scene import PIXEL_SIGMA, Scene, exp, make_scene, project, with_late_clocks
-from v2hdm.adjust import (
-    ControlPoints,
-    Fault,
-    KnownLengths,
-    PoseSigma,
-    SolveOptions,
-    pose_innovations,
-    score_faults,
-    solve,
-)
+from v2hdm.adjust import ControlPoints, KnownLengths, PoseSigma, SolveOptions, pose_innovations, solve
 from v2hdm.adjust.problem import POSE_STATES
-from v2hdm.adjust.sensitivity import Sensitivity
+from v2hdm.faults import Fault, score_faults
+from v2hdm.faults.sensitivity import Sensitivity
 
 OPTIONS = SolveOptions(coarse=False, loss="none")
 POSES = PoseSigma(0.01, 0.001, 0.002, 0.005)

@@ -7,12 +7,13 @@ import pytest
 
 from tests.adjust.scene import exp, make_scene, pose_errors, project, with_late_clocks
 from tests.adjust.site import DRIFTING, SCATTERING, site
-from v2hdm.adjust import ControlPoints, KnownLengths, PoseSigma, SolveOptions, Status, score_faults, solve
+from v2hdm.adjust import ControlPoints, KnownLengths, PoseSigma, SolveOptions, Status, solve
 from v2hdm.adjust.covariance import corner_gain
 from v2hdm.adjust.engines import make_engine
 from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.problem import POSE_STATES
 from v2hdm.errors import AdjustError
+from v2hdm.faults import score_faults
 
 
 def joined(first, second):

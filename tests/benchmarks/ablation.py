@@ -40,10 +40,10 @@ from tests.benchmarks.uncertainty import corner_errors, in_order_of
 from train.examples import Example, example
 from v2hdm.association import ground
 from v2hdm.detection import classifier as find
-from v2hdm.detection import fit, lattice, propose
 from v2hdm.detection.batch import detect_all
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.detection.quads import fit, lattice, propose
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.mapping import conclusion, foreign, input_errors
@@ -140,7 +140,7 @@ def _without_sizes() -> Iterator[None]:
 
 @contextmanager
 def _without_parts() -> Iterator[None]:
-    with patch("v2hdm.detection.propose._split", lambda *_: []):
+    with patch("v2hdm.detection.quads.propose._split", lambda *_: []):
         yield
 
 

@@ -10,9 +10,9 @@ import time
 import numpy as np
 
 from tests.mapping.scene import Scene, SceneOptions, make_scene
+from v2hdm.lanes.knots import draw_lanes
 from v2hdm.mapping.conclusion import Optimised
 from v2hdm.mapping.inputs import Inputs
-from v2hdm.mapping.lanes import draw_lanes
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.records import FloatArray, Marking
 from v2hdm.site.options import JOINT, LaneOptions

@@ -36,7 +36,7 @@ from v2hdm.report.metrics import corner_errors, driven_past, marking_metrics, ma
 from v2hdm.simulate import PortConfig, rendered_drive
 from v2hdm.simulate.port.build import build_port
 from v2hdm.simulate.port.config import RouteConfig, YardConfig
-from v2hdm.site.changes import Base
+from v2hdm.site.living.changes import Base
 
 CACHE = Path("~/.cache/v2hdm/living").expanduser()
 

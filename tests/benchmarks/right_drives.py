@@ -39,7 +39,7 @@ from tests.benchmarks.made.world import World, drive_of, make, truth_of
 from tests.benchmarks.uncertainty import QUANTITIES, squared_errors
 from tests.benchmarks.wrong_inputs import RIGHT_FACTOR
 from v2hdm.errors import V2hdmError
-from v2hdm.mapping.input_errors import doubt, log_odds, matters
+from v2hdm.faults.odds import doubt, log_odds, matters
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import AUTO, GROUNDS, MappingOptions
 from v2hdm.pipeline.stages import BEST, camera_sets

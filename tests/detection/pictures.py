@@ -21,7 +21,7 @@ from v2hdm.detection.classifier import rectified_views
 from v2hdm.detection.lanes.curves import LaneImage
 from v2hdm.detection.lanes.lines import find_boundaries
 from v2hdm.detection.network import AnchorRow, NetworkOutput
-from v2hdm.detection.patch import ImageQuads, Patches
+from v2hdm.detection.quads.patch import ImageQuads, Patches
 from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic
 from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.geometry.planar import Quad, order_corners

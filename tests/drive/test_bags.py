@@ -50,7 +50,7 @@ from v2hdm.io.drive.sources import _import_video
 from v2hdm.io.importers.bag import reading
 from v2hdm.io.importers.bag.messages import file_of
 from v2hdm.io.importers.bag.streams import ImageStream, TfStream, import_streams
-from v2hdm.io.safe.databases import opened
+from v2hdm.safe.databases import opened
 from v2hdm.store.files import replace_text
 from v2hdm.store.inputs import protected_inputs
 

@@ -35,9 +35,9 @@ from v2hdm.io.drive.truth import read_truth
 from v2hdm.io.drive.writing import write_drive
 from v2hdm.io.importers.poses import COMMON_KEYS, POSE_FORMATS, TOPIC_KEYS
 from v2hdm.io.importers.readings import NAMES
-from v2hdm.io.safe.pixels import read_header
 from v2hdm.io.trajectory import read_image_list, read_tum, write_tum
 from v2hdm.records import DISTORTION_COEFFICIENTS, CameraInfo, PoseNoise
+from v2hdm.safe.pixels import read_header
 
 
 def test_a_drive_that_was_written_is_read_back_as_it_was(tmp_path):

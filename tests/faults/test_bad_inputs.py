@@ -15,8 +15,8 @@ from tests.faults.judge import HYDRA_DOORS, Case, judge
 from tests.faults.readers import READERS, refusal
 from v2hdm.detection.frames import read_bgr
 from v2hdm.errors import ConfigError, DriveError, V2hdmError
-from v2hdm.io.safe.pixels import read_header
-from v2hdm.io.safe.texts import parse_json, parse_yaml, read_text, read_yaml, shown, take_name
+from v2hdm.safe.pixels import read_header
+from v2hdm.safe.texts import parse_json, parse_yaml, read_text, read_yaml, shown, take_name
 from v2hdm.store.files import replace_text
 from v2hdm.store.inputs import protected_inputs
 

@@ -13,9 +13,9 @@ from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.mapping.methods import run_methods
 from v2hdm.records import Fate, Lane, Marking
-from v2hdm.site.changes import Base, fused_markings
-from v2hdm.site.fates import Watched, decide
-from v2hdm.site.map_errors import Errors, updated_lanes
+from v2hdm.site.living.changes import Base, fused_markings
+from v2hdm.site.living.fates import Watched, decide
+from v2hdm.site.living.map_errors import Errors, updated_lanes
 
 
 def base_of(result, folder):

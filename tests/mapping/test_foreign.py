@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from v2hdm.adjust import Fault, ScoreTest
 from v2hdm.errors import MappingError
+from v2hdm.faults import Fault, ScoreTest
 from v2hdm.mapping import foreign, inputs, recovery
 from v2hdm.mapping.foreign import foreign_segment
 from v2hdm.verdict.results.solution import _ODDS_LIMIT

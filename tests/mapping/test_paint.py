@@ -10,7 +10,7 @@ from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.records import Camera, CameraInfo, Marking
-from v2hdm.site.looks import Observer, learn_paint
+from v2hdm.site.living.looks import Observer, learn_paint
 from v2hdm.site.markings import neighbours, with_relative_sigma
 from v2hdm.site.shapes import PaintError, learn_paint_error
 

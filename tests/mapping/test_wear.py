@@ -13,7 +13,7 @@ from v2hdm.records import Calibration, HdMap, PaintLeft
 from v2hdm.simulate.port.build import build_port
 from v2hdm.simulate.port.config import PaintConfig, RouteConfig
 from v2hdm.simulate.render import ground
-from v2hdm.site.wear import with_wear
+from v2hdm.site.living.wear import with_wear
 
 FOOTPRINT_M = 0.012  # of a pixel of the nearest images, at which the renderer draws the flakes
 

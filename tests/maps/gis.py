@@ -9,8 +9,8 @@ import numpy as np
 import pyogrio
 import rasterio
 
-from v2hdm.io.safe import pixels
 from v2hdm.records import GeodeticOrigin, HdMap, Lane, Marking, Symbol
+from v2hdm.safe import pixels
 
 ORIGIN = GeodeticOrigin(latitude_deg=29.95, longitude_deg=122.05, altitude_m=12.0)
 

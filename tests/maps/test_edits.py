@@ -11,12 +11,12 @@ import pytest
 
 from tests.maps.gis import ORIGIN, assert_same_map, move_feature, street
 from v2hdm.errors import MapFileError
-from v2hdm.io.drive.survey import match
 from v2hdm.io.maps.formats import FORMATS
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.maps.geopackage import write_geopackage
 from v2hdm.io.maps.reading import read_geojson, read_geopackage, read_map
 from v2hdm.records import HdMap, Marking
+from v2hdm.survey.match import match
 
 EDITED = ["geojson", "gpkg"]
 METRES_A_DEGREE = 111_000.0

@@ -12,9 +12,9 @@ from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline import stages
 from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.stages import MappedSet, map_camera_sets
-from v2hdm.pipeline.survey import Survey
 from v2hdm.records import HdMap
 from v2hdm.store.cache import StageCache
+from v2hdm.survey.run import Survey
 
 
 @dataclass

@@ -15,7 +15,6 @@ from tests.report.yard import OWN_M, SHARED_M, SURVEY_M, checked, point, yard
 from v2hdm.geometry.ipm import apply_in_front, ipm_from_extrinsic
 from v2hdm.records import DIAMOND, LANE_DASH, HdMap, Lane, Marking
 from v2hdm.report import photos, style
-from v2hdm.report.check_points import COLUMNS, write_check_points
 from v2hdm.report.metrics import (
     corner_errors,
     driven_past,
@@ -26,6 +25,7 @@ from v2hdm.report.metrics import (
 )
 from v2hdm.report.photos import save_overlay
 from v2hdm.report.terminal import METHODS, changes_table, results_table
+from v2hdm.survey.check_points import COLUMNS, write_check_points
 
 
 def test_what_a_camera_saw_unoccluded_inside_its_region_of_interest_counts_as_driven_past():

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from v2hdm.io.drive.survey import SurveyedPoint
 from v2hdm.records import FloatArray, HdMap, IntArray, Marking
-from v2hdm.report.check_points import CheckTable, compare
+from v2hdm.survey.check_points import CheckTable, compare
+from v2hdm.survey.read import SurveyedPoint
 
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 

@@ -11,7 +11,7 @@ from tests.cameras import mounted
 from tests.mapping.scene import SceneOptions, make_scene
 from tests.report.yard import SURVEY_M, checked, point, yard
 from tests.verdict.drives import INFO, square_at
-from v2hdm.adjust import Fault
+from v2hdm.faults import Fault
 from v2hdm.mapping.results import CameraFit, Contradiction, MethodResult, SolveEvidence
 from v2hdm.records import Calibration, Exclusion, GroundStrip, HdMap
 from v2hdm.site.candidates import LACKS_A_CORNER

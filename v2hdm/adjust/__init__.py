@@ -14,15 +14,12 @@ from v2hdm.adjust.problem import (
     Problem,
     SolveOptions,
 )  # fmt: skip
-from v2hdm.adjust.score_tests import CHANGES, Fault, ScoreTest, score_faults, sigmas_of
 from v2hdm.adjust.selection import MODELS, estimate_noise, predicts_better, select_model, with_model
-from v2hdm.adjust.sensitivity import height_information, moves_with_heights
 from v2hdm.adjust.solution import Solution, Status, Verdict, observability, pose_innovations
 from v2hdm.adjust.solve import solve
 
 __all__ = [
-    "CHANGES", "MODELS", "ControlPoints", "Drift", "Fault", "KnownLengths", "Observations", "PoseSigma",
-    "Problem", "ScoreTest", "Solution", "SolveOptions", "Status", "Verdict", "estimate_noise",
-    "height_information", "moves_with_heights", "observability", "pose_innovations",
-    "predicts_better", "score_faults", "select_model", "sigmas_of", "solve", "with_model",
+    "MODELS", "ControlPoints", "Drift", "KnownLengths", "Observations", "PoseSigma", "Problem", "Solution",
+    "SolveOptions", "Status", "Verdict", "estimate_noise", "observability", "pose_innovations",
+    "predicts_better", "select_model", "solve", "with_model",
 ]  # fmt: skip

@@ -38,7 +38,7 @@ def from_points(arguments: Sequence[str]) -> int:
     from v2hdm.calibration.points import read_points
     from v2hdm.detection.frames import read_bgr
     from v2hdm.io.calibration.intrinsics import read_intrinsics
-    from v2hdm.io.safe.texts import take_camera_name
+    from v2hdm.safe.texts import take_camera_name
 
     info = read_intrinsics(parsed.intrinsics, parsed.camera_name, "--camera-name")
     info = replace(info, name=parsed.name or info.name)

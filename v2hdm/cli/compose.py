@@ -30,7 +30,7 @@ from omegaconf.errors import OmegaConfBaseException
 from v2hdm.cli.main import Command
 from v2hdm.errors import ConfigError, V2hdmError
 from v2hdm.io.drive.folder import DRIVE_FILE
-from v2hdm.io.safe.texts import read_yaml
+from v2hdm.safe.texts import read_yaml
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _Schema = TypeVar("_Schema")

@@ -62,7 +62,7 @@ def check(arguments: Sequence[str]) -> int:
 def _recording_of(drive: Path) -> Path:
     """The bag that a drive folder describes, so that both have one result; else the drive itself."""
     from v2hdm.io.drive.folder import DRIVE_FILE
-    from v2hdm.io.safe.texts import read_yaml
+    from v2hdm.safe.texts import read_yaml
 
     file = drive / DRIVE_FILE
     return (drive / (read_yaml(file, DriveError).get("bag", "") if file.is_file() else "")).resolve()

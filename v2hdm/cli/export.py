@@ -79,8 +79,8 @@ def _export_map(parsed: argparse.Namespace, folder: Path, check: Callable[[Path]
 def _export_mosaic(parsed: argparse.Namespace, folder: Path, *_: object) -> list[Path]:
     from v2hdm.io.drive.road import lay_flat
     from v2hdm.io.maps.features import ground_height_m
-    from v2hdm.io.maps.ground import write_cloud
     from v2hdm.io.trajectory import read_tum
+    from v2hdm.surface.strips import write_cloud
 
     _refuse_crs(parsed, "a point cloud is in the map's own frame")
     if parsed.format != ["pcd"]:

@@ -23,11 +23,11 @@ import numpy as np
 
 from v2hdm.catalogue import LINE, OTHER, SYMBOL, Catalogue
 from v2hdm.detection.camera import RoadCamera
-from v2hdm.detection.fit import OPEN_SIGMA, STATISTICS, TYPICAL_BLUR_PX, Fit, fit_quadrilaterals
 from v2hdm.detection.network import NetworkOutput, as_probability, open_session
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.patch import ImageQuads, Patches, grey_of, log_light
-from v2hdm.detection.propose import Proposal, Proposals, open_sides
+from v2hdm.detection.quads.fit import OPEN_SIGMA, STATISTICS, TYPICAL_BLUR_PX, Fit, fit_quadrilaterals
+from v2hdm.detection.quads.patch import ImageQuads, Patches, grey_of, log_light
+from v2hdm.detection.quads.propose import Proposal, Proposals, open_sides
 from v2hdm.detection.weights import CONFIDENCE_FILE, JUDGE_FILE
 from v2hdm.geometry.planar import Quad, cross
 from v2hdm.records import DIAMOND, LANE_DASH, LANE_LINE, STOP_LINE, BoolArray, FloatArray, MarkingDetection

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.io.safe.pixels import VIDEO_OPTIONS, read_pixels
+from v2hdm.safe.pixels import VIDEO_OPTIONS, read_pixels
 
 _log = logging.getLogger(__name__)
 

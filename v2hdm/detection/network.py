@@ -21,8 +21,8 @@ from v2hdm.catalogue import SHIPPED, Catalogue
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.weights import NETWORK_FILE
 from v2hdm.errors import ConfigError, DetectorError
-from v2hdm.io.safe.texts import parse_json
 from v2hdm.records import SEEN_ACROSS, FloatArray
+from v2hdm.safe.texts import parse_json
 
 METADATA_KEY = "v2hdm"  # key of the file's ``metadata_props`` that holds its label, as JSON
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from v2hdm.errors import ConfigError
-from v2hdm.io.safe.texts import shown
+from v2hdm.safe.texts import shown
 from v2hdm.settings import NOT_NEGATIVE, POSITIVE, Within, check_settings
 
 DEVICES = ("cpu", "cuda")

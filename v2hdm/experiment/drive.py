@@ -23,13 +23,13 @@ from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.inspect import inspect_each
 from v2hdm.pipeline.map_drive import read_all
 from v2hdm.pipeline.stages import camera_sets, detect_in_pieces, map_camera_sets
-from v2hdm.pipeline.survey import take_survey
 from v2hdm.progress import Progress
 from v2hdm.records import DIAMOND, Drive, FloatArray, HdMap, IntArray, Marking, Truth
 from v2hdm.report.metrics import corner_errors, driven_past, marking_metrics, match_markings, rms
 from v2hdm.report.terminal import METHODS
 from v2hdm.simulate import rendered_drive
 from v2hdm.store.cache import StageCache
+from v2hdm.survey.run import take_survey
 
 
 def drive_record(job: Job, progress: Progress, workers: int = 1) -> dict[str, Any]:

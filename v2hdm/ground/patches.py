@@ -15,8 +15,8 @@ from v2hdm.geometry.rigid import ground_in_vehicle
 from v2hdm.ground.model import Mount
 from v2hdm.ground.motion import Motion
 from v2hdm.ground.prior import Observations
-from v2hdm.io.safe.pixels import read_pixels
 from v2hdm.records import BoolArray, Drive, FloatArray, IntArray
+from v2hdm.safe.pixels import read_pixels
 
 ImageArray = NDArray[np.uint8]
 Float32Array = NDArray[np.float32]

@@ -28,10 +28,10 @@ from v2hdm.association.groups import Association, fuse_groups, group_kinds, know
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.errors import MappingError
 from v2hdm.geometry.rigid import camera_centre, inverse, log
-from v2hdm.io.drive.survey import match
-from v2hdm.mapping.lanes import OPEN_END_PX, Knots
+from v2hdm.lanes.knots import OPEN_END_PX, Knots
 from v2hdm.mapping.options import MappingOptions, SizeOptions, SurveyOptions
 from v2hdm.records import DIAMOND, BoolArray, Camera, FloatArray, IntArray, PoseNoise
+from v2hdm.survey.match import match
 
 
 def vehicle_twists(

@@ -9,13 +9,13 @@ from functools import cached_property
 from v2hdm.association.ground import views_of
 from v2hdm.association.groups import Association
 from v2hdm.association.sightings import Rig, Sightings, collect_sightings
-from v2hdm.association.surface import Surface
 from v2hdm.geometry.rigid import with_clock_offsets
-from v2hdm.mapping.lanes import Knots, find_knots
+from v2hdm.lanes.knots import Knots, find_knots
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.site.options import JOINT
+from v2hdm.surface.surface import Surface
 
 _LOOSE_CENTRE_SIGMA_M = 10.0  # standard deviation of a surveyed axis after its contradiction: uninformative
 

@@ -15,30 +15,31 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.adjust import Fault, Status, observability
+from v2hdm.adjust import Status, observability
 from v2hdm.association.ground import ground_points, views_of
 from v2hdm.association.groups import Association, FusedGroups, group_kinds, keep_rows, merge_groups
 from v2hdm.association.sightings import camera_of, frames_of
 from v2hdm.association.tracks import LEAST_SIGHTINGS
 from v2hdm.errors import ConfigError
+from v2hdm.faults import Fault
 from v2hdm.geometry.ipm import extrinsic_from_ipm, facing_ipm, flat_motion, ipm_from_extrinsic
 from v2hdm.geometry.planar import inside_convex, is_convex
 from v2hdm.io.maps.evidence import Residuals
 from v2hdm.io.maps.features import with_heights
+from v2hdm.lanes.knots import draw_lanes
+from v2hdm.lanes.lines import map_lanes
+from v2hdm.lanes.points import ImageGround, collect_lane_points, ground_by_ipm, ground_by_rig
 from v2hdm.mapping.bundle import without_corner
 from v2hdm.mapping.conclusion import Optimised
 from v2hdm.mapping.inputs import Inputs
-from v2hdm.mapping.lanes import draw_lanes
 from v2hdm.mapping.optimise import silent
 from v2hdm.mapping.options import MappingOptions, check_options
 from v2hdm.mapping.recovery import Outcome, optimise
 from v2hdm.mapping.results import AdjustedPoses, ClockOffset, MethodResult
 from v2hdm.records import Drive, Exclusion, FloatArray, HdMap, Image, ImageDetections, IntArray, Lane, Marking
-from v2hdm.site.changes import Base, update_map
 from v2hdm.site.corrections import with_symbols_corrected
-from v2hdm.site.lane_points import ImageGround, collect_lane_points, ground_by_ipm, ground_by_rig
-from v2hdm.site.lanes import map_lanes
-from v2hdm.site.looks import Observer
+from v2hdm.site.living.changes import Base, update_map
+from v2hdm.site.living.looks import Observer
 from v2hdm.site.symbols import NO_POLYGON, map_symbols
 
 

@@ -13,24 +13,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from v2hdm.adjust import (
-    PoseSigma,
-    Problem,
-    Status,
-    estimate_noise,
-    height_information,
-    moves_with_heights,
-    predicts_better,
-    select_model,
-)
+from v2hdm.adjust import PoseSigma, Problem, Status, estimate_noise, predicts_better, select_model
 from v2hdm.association.ground import Located, Views, locate
 from v2hdm.association.groups import Association, attach, fuse_groups, in_view, merge_groups, same_groups
-from v2hdm.association.paths import Paths
 from v2hdm.association.sightings import Rig, Sightings
-from v2hdm.association.surface import Recorded, Surface
 from v2hdm.association.tracks import IPM_SIGMA_RAD, REFINED_SIGMA_RAD, build_tracks
 from v2hdm.errors import AdjustError, MappingError
+from v2hdm.faults import height_information, moves_with_heights
 from v2hdm.geometry.ipm import initial_extrinsic
+from v2hdm.lanes.knots import Knots
 from v2hdm.mapping.bundle import (
     LEAST_OBSERVATIONS,
     VARIANCE_FACTORS,
@@ -44,9 +35,10 @@ from v2hdm.mapping.bundle import (
 )
 from v2hdm.mapping.conclusion import FinalSolve, Optimised, conclude
 from v2hdm.mapping.incremental import IncrementalMapper
-from v2hdm.mapping.lanes import Knots
 from v2hdm.mapping.options import AUTO, SURFACE, MappingOptions
 from v2hdm.records import BoolArray, Camera, FloatArray, PoseNoise, Road, largest_noise
+from v2hdm.surface.paths import Paths
+from v2hdm.surface.surface import Recorded, Surface
 
 _log = logging.getLogger(__name__)
 

@@ -15,15 +15,12 @@ from itertools import compress
 
 import numpy as np
 
-from v2hdm.adjust import CHANGES, Fault, ScoreTest, pose_innovations, score_faults
+from v2hdm.adjust import pose_innovations
 from v2hdm.association.ground import views_of
 from v2hdm.association.sightings import Sightings
 from v2hdm.errors import AdjustError, MappingError
-from v2hdm.geometry.rigid import camera_centre
-from v2hdm.mapping.bundle import Bundle, name_of
-from v2hdm.mapping.conclusion import Optimised
-from v2hdm.mapping.foreign import foreign_segment
-from v2hdm.mapping.input_errors import (
+from v2hdm.faults import CHANGES, Fault, ScoreTest, score_faults
+from v2hdm.faults.odds import (
     CLEAR_SIGMAS,
     RIVAL_LOG_ODDS,
     doubt,
@@ -31,6 +28,10 @@ from v2hdm.mapping.input_errors import (
     is_doubtful,
     log_odds,
 )
+from v2hdm.geometry.rigid import camera_centre
+from v2hdm.mapping.bundle import Bundle, name_of
+from v2hdm.mapping.conclusion import Optimised
+from v2hdm.mapping.foreign import foreign_segment
 from v2hdm.mapping.inputs import Inputs
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import AUTO, INCREMENTAL, SURFACE, SurveyOptions

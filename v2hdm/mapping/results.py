@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from v2hdm.adjust import ScoreTest
-from v2hdm.association.surface import Surface
+from v2hdm.faults import ScoreTest
 from v2hdm.io.maps.evidence import Residuals
 from v2hdm.records import (
     BoolArray,
@@ -23,6 +22,7 @@ from v2hdm.records import (
     JointCovariance,
 )
 from v2hdm.site.markings import Suspicion
+from v2hdm.surface.surface import Surface
 
 
 @dataclass(frozen=True)

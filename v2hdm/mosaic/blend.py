@@ -22,7 +22,6 @@ from kornia.geometry.linalg import transform_points
 from kornia.geometry.transform import remap
 from torch import Tensor
 
-from v2hdm.association.surface import Surface
 from v2hdm.detection.frames import read_bgr
 from v2hdm.errors import DriveError
 from v2hdm.geometry import tensors
@@ -38,6 +37,7 @@ from v2hdm.geometry.planar import densified, turned_left
 from v2hdm.geometry.rigid import interpolate, inverse
 from v2hdm.progress import Steps
 from v2hdm.records import Calibration, Camera, CameraInfo, Drive, FloatArray, Trajectory
+from v2hdm.surface.surface import Surface
 
 
 @dataclass(frozen=True)

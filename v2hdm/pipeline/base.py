@@ -20,7 +20,7 @@ from v2hdm.io.maps.reading import read_geojson, read_verdict
 from v2hdm.io.trajectory import read_tum
 from v2hdm.pipeline.config import base_files
 from v2hdm.records import Change, Changes, Drive, Fate, HdMap, Image
-from v2hdm.site.changes import Base
+from v2hdm.site.living.changes import Base
 
 _SITE_M = 40.0  # markings farther from a route are not seen from it: twice what a camera reaches
 LISTED = (Fate.MOVED, Fate.VANISHED, Fate.NEW)  # fates that are changes of the site, and no want of images

@@ -13,9 +13,9 @@ from v2hdm.errors import ConfigError, DriveError, need
 from v2hdm.io.drive import ReadOptions, drive_name
 from v2hdm.io.maps.corrections import read_corrections
 from v2hdm.io.maps.formats import check_formats
-from v2hdm.io.safe.texts import shown, take_camera_name, take_name
 from v2hdm.mapping.options import INCREMENTAL, MappingOptions, check_options
 from v2hdm.records import Drive, Image
+from v2hdm.safe.texts import shown, take_camera_name, take_name
 from v2hdm.settings import COUNT, MOST_PROCESSES, NOT_NEGATIVE, POSITIVE, SEED, SHARE, Within, check_settings
 from v2hdm.simulate import PortConfig
 from v2hdm.store.cache import key_of
@@ -182,7 +182,7 @@ _RANGES = {f"{below}{key}": allowed for allowed, below, keys in _KEYS_WITHIN for
 def admit(config: RunConfig) -> str:
     """Raise ConfigError, which names the key, for settings that cannot work; returns the run's name."""
     from v2hdm.detection.detector import Detector
-    from v2hdm.pipeline.survey import table_of
+    from v2hdm.survey.run import table_of
 
     name = run_name(config)
     take_name(name, "name", ConfigError)

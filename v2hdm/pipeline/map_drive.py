@@ -26,12 +26,12 @@ from v2hdm.pipeline.evaluate import evaluate
 from v2hdm.pipeline.inspect import Inspection, inspect_each, join
 from v2hdm.pipeline.result import Result, describe_run
 from v2hdm.pipeline.stages import BEST, MappedSet, detect_in_pieces, map_camera_sets
-from v2hdm.pipeline.survey import Survey, check_survey, take_survey
 from v2hdm.progress import Progress, silent
 from v2hdm.records import Drive, ImageDetections
-from v2hdm.site.changes import Base
-from v2hdm.site.wear import with_wear
+from v2hdm.site.living.changes import Base
+from v2hdm.site.living.wear import with_wear
 from v2hdm.store.cache import StageCache
+from v2hdm.survey.run import Survey, check_survey, take_survey
 from v2hdm.verdict import Finding, Status, Verdict
 from v2hdm.verdict.results.accuracy import check_corrections, check_goal, check_known_sizes
 from v2hdm.verdict.results.solution import check_result, over_ground

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from v2hdm import __version__
-from v2hdm.association.surface import FILE as GROUND
 from v2hdm.detection.batch import read_image
 from v2hdm.errors import ConfigError, DriveError, MapFileError, MappingError
 from v2hdm.geometry.ipm import apply_in_front, facing_ipm, flat_motion, pinhole_px_from_ground
@@ -36,11 +35,12 @@ from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.evaluate import CameraSets
 from v2hdm.pipeline.stages import BEST
 from v2hdm.records import Calibration, Drive, FloatArray, HdMap, Image, ImageDetections, Trajectory
-from v2hdm.report.check_points import CheckTable, write_check_points
 from v2hdm.report.photos import save_overlay
 from v2hdm.store.cache import library_versions
 from v2hdm.store.files import replace_text, write_json
 from v2hdm.store.results import result_folder
+from v2hdm.surface.surface import FILE as GROUND
+from v2hdm.survey.check_points import CheckTable, write_check_points
 from v2hdm.verdict import Verdict
 
 

@@ -19,7 +19,6 @@ from v2hdm import __version__
 from v2hdm.errors import ConfigError, V2hdmError
 from v2hdm.io.drive import read_drive
 from v2hdm.io.maps.formats import check_crs
-from v2hdm.io.safe.texts import take_name
 from v2hdm.pipeline.config import (
     NO_DRIVE,
     Contents,
@@ -33,6 +32,7 @@ from v2hdm.pipeline.config import (
 from v2hdm.pipeline.context import Context, log_file, logging_to
 from v2hdm.progress import Progress, silent
 from v2hdm.records import Drive
+from v2hdm.safe.texts import take_name
 from v2hdm.simulate.port.drive import folder_of_port
 from v2hdm.store import remote
 from v2hdm.store.cache import CodecError, StageCache, code_key, decode, encode, key_of, prune_to_limit

@@ -25,12 +25,12 @@ from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.base import grey_reader
 from v2hdm.pipeline.config import Contents, model_key
 from v2hdm.pipeline.context import Context
-from v2hdm.pipeline.survey import Survey, compare_survey
 from v2hdm.progress import Progress, silent
 from v2hdm.records import Drive, ImageDetections
-from v2hdm.report.check_points import CheckTable
-from v2hdm.site.changes import Base
+from v2hdm.site.living.changes import Base
 from v2hdm.store.cache import Line, key_of, log_again, recorded
+from v2hdm.survey.check_points import CheckTable
+from v2hdm.survey.run import Survey, compare_survey
 from v2hdm.workers import side_by_side
 
 _DETECT = "detect"

@@ -26,9 +26,9 @@ import numpy as np
 import yaml
 
 from v2hdm.errors import ConfigError, V2hdmError
-from v2hdm.io.safe.texts import read_json, read_yaml, shown
-from v2hdm.io.safe.texts import read_text as read_text
 from v2hdm.records import FloatArray
+from v2hdm.safe.texts import read_json, read_yaml, shown
+from v2hdm.safe.texts import read_text as read_text
 from v2hdm.store.inputs import refuse_input
 
 _URL = re.compile(r"[a-z][a-z0-9+.-]+:/")

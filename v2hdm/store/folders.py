@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from v2hdm.errors import ConfigError, DriveError
-from v2hdm.io.safe.texts import read_json
+from v2hdm.safe.texts import read_json
 from v2hdm.store.files import file_digest
 from v2hdm.store.inputs import note_input
 

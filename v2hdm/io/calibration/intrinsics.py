@@ -17,9 +17,9 @@ import numpy as np
 
 from v2hdm.errors import DriveError, MapFileError
 from v2hdm.io.calibration.reading import info_of, read_calibration, take_camera_info, take_matrix
-from v2hdm.io.safe.fields import check_camera, take_size_px
-from v2hdm.io.safe.texts import parse_json, parse_yaml, read_text
 from v2hdm.records import DISTORTION_COEFFICIENTS, CameraInfo, FloatArray
+from v2hdm.safe.fields import check_camera, take_size_px
+from v2hdm.safe.texts import parse_json, parse_yaml, read_text
 from v2hdm.store.files import take_array, take_text
 
 _XML = re.compile(r"<[?!\w]")  # YAML may begin with ``<<``

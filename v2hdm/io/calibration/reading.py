@@ -18,9 +18,9 @@ from v2hdm.errors import DriveError, MapFileError
 from v2hdm.geometry.ipm import cam_from_mounting, extrinsic_from_ipm, ipm_from_extrinsic
 from v2hdm.geometry.planar import winding
 from v2hdm.geometry.rigid import camera_centre, inverse
-from v2hdm.io.safe.fields import check_camera, recorded_distance, take_covariance, take_size_px
-from v2hdm.io.safe.texts import take_camera_name
 from v2hdm.records import DISTORTION_COEFFICIENTS, BoolArray, Calibration, CameraInfo, CentrePrior, FloatArray
+from v2hdm.safe.fields import check_camera, recorded_distance, take_covariance, take_size_px
+from v2hdm.safe.texts import take_camera_name
 from v2hdm.store.files import check_keys, load_yaml, take_array, take_mapping, take_text
 
 _SIZE = ("image_width", "image_height")

@@ -14,7 +14,7 @@ from v2hdm.io.drive.images import ReadOptions
 from v2hdm.io.drive.sources import SUFFIXES
 from v2hdm.io.importers.bag.describe import LENS, MOUNTING, BagDescription
 from v2hdm.io.importers.bag.reading import is_bag
-from v2hdm.io.safe.texts import parse_yaml
+from v2hdm.safe.texts import parse_yaml
 from v2hdm.store.files import dump_yaml, replace_text
 
 _POSES = (

@@ -15,10 +15,10 @@ from v2hdm.io.calibration import reading
 from v2hdm.io.drive.images import ImageFiles, ReadOptions, assemble_drive, select_cameras
 from v2hdm.io.drive.sources import Sources, plan_images, plan_info, plan_topic_poses
 from v2hdm.io.importers.poses import read_poses
-from v2hdm.io.safe.fields import take_origin
-from v2hdm.io.safe.pixels import read_pixels
-from v2hdm.io.safe.texts import shown, take_camera_name, take_name
 from v2hdm.records import DRIFTS, BoolArray, Camera, CameraInfo, Drive, FloatArray, PoseNoise
+from v2hdm.safe.fields import take_origin
+from v2hdm.safe.pixels import read_pixels
+from v2hdm.safe.texts import shown, take_camera_name, take_name
 from v2hdm.store.files import check_keys, load_yaml, take_mapping, take_number, take_text
 
 DRIVE_FILE = "drive.yaml"

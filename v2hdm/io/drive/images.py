@@ -13,9 +13,9 @@ import numpy as np
 from v2hdm.errors import DriveError
 from v2hdm.geometry.rigid import in_order, interpolate
 from v2hdm.io.drive.road import lay_flat, log_road
-from v2hdm.io.safe.pixels import read_header
 from v2hdm.io.trajectory import check_trajectory, span, why_no_pose
 from v2hdm.records import Camera, Drive, FloatArray, Image, Trajectory
+from v2hdm.safe.pixels import read_header
 
 _log = logging.getLogger(__name__)
 

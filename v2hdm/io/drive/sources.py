@@ -17,9 +17,9 @@ from v2hdm.io.drive.images import ImageFiles
 from v2hdm.io.importers.bag import streams
 from v2hdm.io.importers.bag.messages import TF_TOPIC
 from v2hdm.io.importers.readings import Readings, read_stamps, readings_of_poses
-from v2hdm.io.safe.pixels import DECODER_OPTIONS, VIDEO_OPTIONS, png
 from v2hdm.io.trajectory import UNITS, read_image_list, write_image_list
 from v2hdm.records import CameraInfo
+from v2hdm.safe.pixels import DECODER_OPTIONS, VIDEO_OPTIONS, png
 from v2hdm.store.files import check_keys, take_choice, take_mapping, take_number, take_text
 from v2hdm.store.folders import entry_folder, is_whole, new_entry
 

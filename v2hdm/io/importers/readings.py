@@ -24,9 +24,9 @@ import numpy as np
 
 from v2hdm.errors import DriveError, one_line
 from v2hdm.geometry.rigid import rotation_from_euler
-from v2hdm.io.safe.texts import read_bytes, shown
 from v2hdm.io.trajectory import UNITS, checked_rotations, in_order, parse_number
 from v2hdm.records import FloatArray, Trajectory
+from v2hdm.safe.texts import read_bytes, shown
 from v2hdm.store.files import check_keys, read_text, take_mapping, take_text
 
 TABLE_KEYS = ("columns",)

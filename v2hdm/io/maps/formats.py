@@ -21,13 +21,13 @@ from v2hdm.geometry.geodetic import Grid
 from v2hdm.io.maps.features import PAINT, Feature, features_of, properties_of
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.maps.geopackage import write_geopackage, write_qgis
-from v2hdm.io.maps.ground import write_ground_geotiff, write_opencrg
 from v2hdm.io.maps.lanelet2 import write_lanelet2
 from v2hdm.io.maps.reading import Verdict, read_geopackage, stated_in
 from v2hdm.io.maps.road_xml import write_landxml, write_opendrive
 from v2hdm.records import GeodeticOrigin, HdMap
 from v2hdm.store.files import replace_csv, whole_file
 from v2hdm.store.inputs import protected_inputs
+from v2hdm.surface.strips import write_ground_geotiff, write_opencrg
 
 _log = logging.getLogger(__name__)
 

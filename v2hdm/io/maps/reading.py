@@ -20,10 +20,10 @@ from v2hdm.errors import MapFileError
 from v2hdm.geometry.geodetic import Grid, enu_from_geodetic
 from v2hdm.geometry.planar import signed_area
 from v2hdm.io.maps.features import CORNERS, OUTLINE, PAINT, POINTS, Feature, map_of, unique_ids
-from v2hdm.io.safe.databases import opened, rows_of
-from v2hdm.io.safe.fields import take_covariance, take_origin, take_whole
-from v2hdm.io.safe.texts import parse_json, take_name
 from v2hdm.records import FloatArray, GeodeticOrigin, HdMap, PaintLeft
+from v2hdm.safe.databases import opened, rows_of
+from v2hdm.safe.fields import take_covariance, take_origin, take_whole
+from v2hdm.safe.texts import parse_json, take_name
 from v2hdm.store.files import load_json, take_array, take_mapping, take_number, take_text
 from v2hdm.store.inputs import note_input
 

@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.association.surface import FILE as GROUND
-from v2hdm.association.surface import Surface
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import apply_in_front, ground_from_pinhole_px
 from v2hdm.geometry.planar import length_along
@@ -24,6 +22,8 @@ from v2hdm.io.maps.reading import read_geojson
 from v2hdm.io.trajectory import read_tum
 from v2hdm.records import BoolArray, Calibration, Drive, Exclusion, FloatArray, HdMap, IntArray, Truth
 from v2hdm.store.files import load_json, load_yaml, read_csv, read_text, take_number
+from v2hdm.surface.surface import FILE as GROUND
+from v2hdm.surface.surface import Surface
 
 BEST = "Opt"  # method of the run's result, as in metrics.json
 

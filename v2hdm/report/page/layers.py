@@ -14,10 +14,10 @@ import numpy as np
 
 from v2hdm.errors import MapFileError, need
 from v2hdm.geometry.geodetic import Grid, crs_of, geodetic_from_enu, utm_of
-from v2hdm.io.safe.pixels import check_raster, read_header, read_pixels
 from v2hdm.records import FloatArray, Lane, Marking, Symbol
 from v2hdm.report.metrics import corner_errors, match_markings, rms
 from v2hdm.report.page.facts import Facts, GroundResiduals
+from v2hdm.safe.pixels import check_raster, read_header, read_pixels
 from v2hdm.store.files import load_json, take_array, take_text
 
 

@@ -22,10 +22,10 @@ from v2hdm.geometry.planar import inside_convex
 from v2hdm.geometry.rigid import camera_centre, ground_in_vehicle
 from v2hdm.io.drive.folder import DRIVE_FILE, TRUTH_FOLDER
 from v2hdm.io.drive.writing import write_drive, write_truth
-from v2hdm.io.safe.pixels import read_header
 from v2hdm.io.trajectory import read_image_list
 from v2hdm.progress import Steps
 from v2hdm.records import BoolArray, CameraInfo, Drive, FloatArray, Image, Truth
+from v2hdm.safe.pixels import read_header
 from v2hdm.simulate.port.build import Port, build_port
 from v2hdm.simulate.port.config import PortConfig, ReliefConfig
 from v2hdm.simulate.port.route import measured_disturbances, pose_noise

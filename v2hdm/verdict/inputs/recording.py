@@ -13,8 +13,8 @@ import numpy as np
 
 from v2hdm.geometry.ipm import apply_homography
 from v2hdm.geometry.lens import distort_points
-from v2hdm.io.safe.pixels import read_pixels
 from v2hdm.records import Camera, Drive, Image
+from v2hdm.safe.pixels import read_pixels
 from v2hdm.verdict.inputs.poses import Motion
 from v2hdm.verdict.verdict import Finding, Status, judge, passed
 

@@ -20,9 +20,9 @@ from v2hdm.mapping.bundle import known_lengths
 from v2hdm.mapping.options import SizeOptions
 from v2hdm.mapping.results import MethodResult, SolveEvidence
 from v2hdm.records import Calibration, FloatArray, Marking
-from v2hdm.report.check_points import CheckTable, squared
 from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN
 from v2hdm.site.corrections import unmet
+from v2hdm.survey.check_points import CheckTable, squared
 from v2hdm.verdict.results.solution import CHECKS, doubted, relied_on
 from v2hdm.verdict.verdict import GOAL, Finding, Status, passed
 

@@ -1,6 +1,6 @@
 """After the solve: contradicted inputs, how well everything fits, and whether results agree.
 
-The inputs are tested one at a time (:mod:`v2hdm.adjust.score_tests`); a contradicted input that could be done
+The inputs are tested one at a time (:mod:`v2hdm.faults.score_tests`); a contradicted input that could be done
 without has been dropped (:mod:`v2hdm.mapping.recovery`) and is reported here. Every other sign of a wrong
 input is measured as well, so that an unforeseen fault is not silent. docs/verdict.md has the figures of clean
 and spoilt drives.
@@ -14,10 +14,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from v2hdm.adjust import Fault
-from v2hdm.adjust.sensitivity import STRETCHES
-from v2hdm.ground import GroundEstimate
-from v2hdm.mapping.input_errors import (
+from v2hdm.faults import Fault
+from v2hdm.faults.odds import (
     CLEAR_SIGMAS,
     OBSERVABLE_SIGMA,
     RIVAL_LOG_ODDS,
@@ -29,6 +27,8 @@ from v2hdm.mapping.input_errors import (
     log_odds,
     matters,
 )
+from v2hdm.faults.sensitivity import STRETCHES
+from v2hdm.ground import GroundEstimate
 from v2hdm.mapping.results import Contradiction, MethodResult, SolveEvidence
 from v2hdm.records import Drive
 from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN

@@ -13,9 +13,9 @@ import numpy as np
 from v2hdm.errors import DriveError, need
 from v2hdm.geometry.rigid import interpolate, inverse, make_transform, rotation_from_quaternion
 from v2hdm.io.importers.readings import Attitudes, Readings
-from v2hdm.io.safe.pixels import png
 from v2hdm.io.trajectory import checked_rotations, in_order
 from v2hdm.records import FloatArray, Trajectory
+from v2hdm.safe.pixels import png
 
 _log = logging.getLogger(__name__)
 

@@ -17,7 +17,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from v2hdm.errors import DriveError, need
-from v2hdm.io.safe.databases import limit_steps, opened, rows_of
+from v2hdm.safe.databases import limit_steps, opened, rows_of
 from v2hdm.store.files import load_yaml, take_mapping
 
 SUFFIXES = (".bag", ".mcap", ".db3")

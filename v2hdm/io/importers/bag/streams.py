@@ -24,9 +24,9 @@ from v2hdm.io.calibration.writing import write_camera_info
 from v2hdm.io.importers.bag import messages as kinds
 from v2hdm.io.importers.bag.reading import Bag, Message, bag_files, open_bag
 from v2hdm.io.importers.readings import Readings, nmea_readings
-from v2hdm.io.safe.pixels import png
 from v2hdm.io.trajectory import write_image_list
 from v2hdm.records import FloatArray
+from v2hdm.safe.pixels import png
 from v2hdm.store.folders import entry_folder, is_whole, new_entry
 
 _log = logging.getLogger(__name__)

@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.stats import norm
 
-from v2hdm.association.surface import Surface
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.planar import Quad
 from v2hdm.geometry.rigid import inverse
 from v2hdm.records import Calibration, FloatArray, HdMap, Image, PaintLeft
+from v2hdm.surface.surface import Surface
 
 _CELL_M = 0.02
 _EDGE_M = 0.03  # margin inside the sides that is left out: blurred, and uncertain by pose errors

@@ -15,7 +15,6 @@ from scipy.spatial import cKDTree
 
 from v2hdm.association.ground import ground_points, ground_points_with_jacobian
 from v2hdm.association.sightings import LEAST_HEIGHT_M, Rig, frames_of, row_shares
-from v2hdm.association.surface import Surface
 from v2hdm.geometry.ipm import direction_covariance, facing_ipm, flat_motion, ground_from_pinhole_px
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.planar import cross, turned_left
@@ -30,6 +29,7 @@ from v2hdm.records import (
     IntArray,
     LaneDetection,
 )
+from v2hdm.surface.surface import Surface
 
 NODE_SPACING_M = 0.5  # between the vertices of a polyline
 HALF_WIDTH_M, _HALF_LENGTH_M = 0.3, 0.8  # half size across and along a line of the averaged neighbourhood

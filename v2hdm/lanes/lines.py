@@ -16,8 +16,8 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial import cKDTree
 
 from v2hdm.geometry.planar import angle_between, length_along, points_along
+from v2hdm.lanes.points import NODE_SPACING_M, Guides, LaneCloud, Nodes, find_nodes
 from v2hdm.records import LANE_DASH, LANE_LINE, FloatArray, IntArray, Lane
-from v2hdm.site.lane_points import NODE_SPACING_M, Guides, LaneCloud, Nodes, find_nodes
 from v2hdm.site.options import LaneOptions
 
 _MAX_DASH_GAP_M, _MAX_BREAK_M = 9.0, 3.0  # longest bridged gap between dashes, and break in solid paint

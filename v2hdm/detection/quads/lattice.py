@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 
 from v2hdm.detection.network import as_probability
-from v2hdm.detection.patch import LensFrames, Patches
+from v2hdm.detection.quads.patch import LensFrames, Patches
 from v2hdm.geometry.planar import Quad
 from v2hdm.records import BoolArray, FloatArray, IntArray
 

@@ -32,8 +32,8 @@ from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
 from v2hdm.adjust.problem import Problem
-from v2hdm.adjust.sensitivity import Rows, Sensitivity, raised, stretches
 from v2hdm.adjust.solution import Solution
+from v2hdm.faults.sensitivity import Rows, Sensitivity, raised, stretches
 from v2hdm.records import FloatArray
 
 _LEAST_OBSERVABLE = 1e-9  # fraction of a fault's own information, net of all else, below which it is rounding

@@ -24,7 +24,7 @@ from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.planar import Quad, turned_left
 from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, Marking
-from v2hdm.site.fates import Watched
+from v2hdm.site.living.fates import Watched
 from v2hdm.site.posterior import log_found, log_found_where_none_is
 
 Grey = Callable[[int], NDArray[np.float32]]  # grey values (H, W) of an image, by its index in the drive

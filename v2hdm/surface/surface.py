@@ -31,12 +31,12 @@ from scipy.optimize import minimize
 from scipy.sparse import csr_array, diags_array, hstack
 from scipy.spatial import cKDTree
 
-from v2hdm.association.paths import AHEAD_M, Paths
 from v2hdm.association.sightings import Rig, Sightings, Symbols
 from v2hdm.geometry.ipm import apply_homography, pinhole_px_from_ground
 from v2hdm.geometry.planar import cross, turned_left
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import BoolArray, FloatArray, GroundStrip, IntArray, PoseNoise, Road
+from v2hdm.surface.paths import AHEAD_M, Paths
 
 KNOTS_M = (1.75, 3.5, 5.25)
 """Offsets from the path at which the slope may change: every half lane of 3.5 m. A crown follows a lane line;

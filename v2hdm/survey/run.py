@@ -11,12 +11,12 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from v2hdm.errors import DriveError
-from v2hdm.io.drive.survey import SurveyedPoint, SurveyTable, in_map, misreadings, read_survey
 from v2hdm.io.maps.features import with_heights
 from v2hdm.mapping.options import ControlOptions, MappingOptions, SurveyOptions
 from v2hdm.mapping.results import MethodResult
 from v2hdm.records import Drive, FloatArray
-from v2hdm.report.check_points import CheckTable, compare
+from v2hdm.survey.check_points import CheckTable, compare
+from v2hdm.survey.read import SurveyedPoint, SurveyTable, in_map, misreadings, read_survey
 from v2hdm.verdict import Finding
 from v2hdm.verdict.results.accuracy import check_frame, check_points
 

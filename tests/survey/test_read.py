@@ -8,8 +8,8 @@ import pytest
 
 from v2hdm.errors import DriveError
 from v2hdm.geometry.geodetic import geodetic_from_enu
-from v2hdm.io.drive.survey import in_map, misreadings, read_survey
 from v2hdm.records import GeodeticOrigin
+from v2hdm.survey.read import in_map, misreadings, read_survey
 
 ORIGIN = GeodeticOrigin(53.54, 9.02, 45.0)
 """Nearly at the edge of its UTM zone: the convergence is 0.02 degrees there, 4.8 in the next one."""

@@ -9,14 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.mapping.scene import SceneOptions, make_scene
-from v2hdm.adjust import Drift, Fault, PoseSigma
+from v2hdm.adjust import Drift, PoseSigma
 from v2hdm.association.ground import views_of
 from v2hdm.association.sightings import collect_sightings
 from v2hdm.catalogue import CORNERED_CLASSES
 from v2hdm.errors import ConfigError
+from v2hdm.faults import Fault
+from v2hdm.faults.odds import is_contradicted
 from v2hdm.geometry.rigid import interpolate
 from v2hdm.mapping.bundle import control_points, known_lengths, without_corner
-from v2hdm.mapping.input_errors import is_contradicted
 from v2hdm.mapping.inputs import Inputs
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.optimise import Optimiser

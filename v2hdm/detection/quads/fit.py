@@ -21,7 +21,7 @@ from functools import cached_property
 import numpy as np
 
 from v2hdm.detection.camera import RoadCamera
-from v2hdm.detection.lattice import (
+from v2hdm.detection.quads.lattice import (
     KNOTS,
     Lattice,
     add_paint,
@@ -30,7 +30,7 @@ from v2hdm.detection.lattice import (
     lay_lattice,
     pixel_weights,
 )
-from v2hdm.detection.patch import LensFrames, Patches
+from v2hdm.detection.quads.patch import LensFrames, Patches
 from v2hdm.geometry.planar import Quad, following, is_convex_px
 from v2hdm.records import BoolArray, FloatArray
 

@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from v2hdm.adjust import Fault, ScoreTest
+from v2hdm.faults.score_tests import Fault, ScoreTest
 
 CLEAR_SIGMAS = 4.0  # of a visible error; in one of 400 correct drives one of its forty tests exceeds it
 _PRIOR_ODDS = 1 / 400  # prior odds of a wrong input: one in forty, in one of ten drives of a new vehicle

@@ -1,9 +1,9 @@
 """Update of an earlier map by a new drive: ids persist, changes are listed with their evidence.
 
 Corners in both maps are re-estimated from both. Given the errors common to markings
-(:mod:`v2hdm.site.map_errors`), each is the mean of two under their own errors; the common ones follow from
-the differences of all. So one map's drift counts once, however many markings it moved, and what one map alone
-has moves with its surroundings.
+(:mod:`v2hdm.site.living.map_errors`), each is the mean of two under their own errors; the common ones follow
+from the differences of all. So one map's drift counts once, however many markings it moved, and what one map
+alone has moves with its surroundings.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from v2hdm.association.sightings import Rig
 from v2hdm.errors import MappingError
 from v2hdm.geometry.planar import SHIFTS
 from v2hdm.records import BoolArray, Change, Changes, Fate, FloatArray, HdMap, IntArray, Marking
-from v2hdm.site.fates import Decision, Watched, decide
-from v2hdm.site.looks import Looks, Observer, find_rates, with_paint
-from v2hdm.site.map_errors import SHIFT, Errors, Shift, updated_lanes, updated_symbols
+from v2hdm.site.living.fates import Decision, Watched, decide
+from v2hdm.site.living.looks import Looks, Observer, find_rates, with_paint
+from v2hdm.site.living.map_errors import SHIFT, Errors, Shift, updated_lanes, updated_symbols
 
 
 def fused(old: Marking, new: Marking, turn: int, pair: int, shift: Shift) -> Marking:

@@ -10,8 +10,8 @@ import numpy as np
 from v2hdm.errors import ConfigError, MapFileError, need
 from v2hdm.geometry.geodetic import crs_of
 from v2hdm.geometry.planar import cross
-from v2hdm.io.safe.pixels import check_raster
 from v2hdm.records import FloatArray, GroundStrip, HdMap
+from v2hdm.safe.pixels import check_raster
 from v2hdm.store.files import whole_file
 
 _CELL_M = 0.25

@@ -13,12 +13,11 @@ from tests.benchmarks.made.draw import draw
 from tests.benchmarks.right_drives import Job, map_one
 from tests.cameras import apply, level
 from tests.ports import small_port
-from v2hdm.adjust import SolveOptions, height_information, moves_with_heights, solve
-from v2hdm.association.paths import Paths
-from v2hdm.association.surface import KNOTS_M, Recorded, Surface
+from v2hdm.adjust import SolveOptions, solve
 from v2hdm.detection.batch import detect_all
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import MapFileError
+from v2hdm.faults import height_information, moves_with_heights
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
@@ -28,6 +27,8 @@ from v2hdm.records import HdMap, PoseNoise, Road
 from v2hdm.report.metrics import driven_past, map_figures
 from v2hdm.simulate.port.config import PortConfig, ReliefConfig
 from v2hdm.store.files import load_json, write_json
+from v2hdm.surface.paths import Paths
+from v2hdm.surface.surface import KNOTS_M, Recorded, Surface
 
 FALLS = np.array([0.02, 0.03, -0.01, 0.01, 0.015, 0.02, -0.02])
 SHAPE = np.array([0.0, 0.0, *FALLS])  # with the grade

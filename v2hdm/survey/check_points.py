@@ -20,10 +20,11 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.stats import chi2
 
-from v2hdm.io.drive.survey import SurveyedPoint, match
 from v2hdm.io.maps.features import features_of
 from v2hdm.records import FloatArray, HdMap, JointCovariance
 from v2hdm.store.files import replace_csv
+from v2hdm.survey.match import match
+from v2hdm.survey.read import SurveyedPoint
 
 INSIDE = 0.95  # probability of the reported confidence ellipse
 

@@ -12,10 +12,10 @@ from tests.cameras import level, mounted
 from v2hdm.association.ground import images_with_line, images_with_symbol
 from v2hdm.association.sightings import NO_SYMBOLS, Rig, Symbols
 from v2hdm.geometry.planar import signed_area
+from v2hdm.lanes.lines import map_lanes
+from v2hdm.lanes.points import NODE_SPACING_M, Guides, LaneCloud
 from v2hdm.records import CameraInfo, Marking
 from v2hdm.site.candidates import LACKS_A_CORNER
-from v2hdm.site.lane_points import NODE_SPACING_M, Guides, LaneCloud
-from v2hdm.site.lanes import map_lanes
 from v2hdm.site.options import AcceptanceOptions, LaneOptions
 from v2hdm.site.parallax import NOT_OBSERVED, NOT_ON_GROUND
 from v2hdm.site.polygons import Polygon

@@ -22,10 +22,9 @@ from scipy.spatial import cKDTree
 from v2hdm.adjust import ControlPoints, Observations, Solution
 from v2hdm.association.ground import ground_points, ground_points_with_jacobian
 from v2hdm.association.sightings import Rig, frames_of
-from v2hdm.association.surface import Surface
 from v2hdm.geometry.planar import length_along
-from v2hdm.records import Drive, FloatArray, ImageDetections, IntArray, Lane
-from v2hdm.site.lane_points import (
+from v2hdm.lanes.lines import map_lanes
+from v2hdm.lanes.points import (
     CENTRE_SIGMA_PX,
     HALF_WIDTH_M,
     NODE_SPACING_M,
@@ -34,8 +33,9 @@ from v2hdm.site.lane_points import (
     collect_lane_points,
     ground_by_rig,
 )
-from v2hdm.site.lanes import map_lanes
+from v2hdm.records import Drive, FloatArray, ImageDetections, IntArray, Lane
 from v2hdm.site.options import LaneOptions
+from v2hdm.surface.surface import Surface
 
 _log = logging.getLogger(__name__)
 

@@ -11,8 +11,8 @@ from tests.benchmarks.highway import LINES, few_dashes, mounting_of
 from tests.mapping.scene import SceneOptions, make_scene
 from v2hdm.adjust import ControlPoints
 from v2hdm.io.maps.features import features_of, map_of
+from v2hdm.lanes.knots import _catmull_rom, draw_lanes, find_knots
 from v2hdm.mapping.inputs import Inputs
-from v2hdm.mapping.lanes import _catmull_rom, draw_lanes, find_knots
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.records import HdMap

@@ -18,7 +18,7 @@ from scipy.special import logsumexp
 
 from v2hdm.geometry.planar import SHIFTS, align
 from v2hdm.records import FloatArray, IntArray, Marking
-from v2hdm.site.map_errors import SHIFT, Errors, Shift
+from v2hdm.site.living.map_errors import SHIFT, Errors, Shift
 from v2hdm.site.shapes import rigid_motions
 
 _MOVED_SIGMA_M = 0.5  # per coordinate, m, of a repainted marking about its old place: a new line

@@ -1,0 +1,1 @@
+"""Surveyed points: read, matched with corners, used in a run, and compared with its map."""
