@@ -27,8 +27,7 @@ if TYPE_CHECKING:
     from v2hdm.pipeline.detect_images import detect_images
     from v2hdm.pipeline.map_drive import map_drive
     from v2hdm.pipeline.result import Result
-    from v2hdm.records import Calibration
-    from v2hdm.records import HdMap as HDMap
+    from v2hdm.records import Calibration, HDMap
     from v2hdm.verdict.inputs.drive import check_drive
     from v2hdm.verdict.verdict import Verdict
 
@@ -62,7 +61,7 @@ def __getattr__(name: str) -> Any:
             raise
         line = f"v2hdm.{name} needs {missing.name}: install the map extra, pip install 'v2hdm[map]'"
         raise ModuleNotFoundError(line, name=missing.name) from None
-    globals()[name] = found = getattr(home, "HdMap" if name == "HDMap" else name)
+    globals()[name] = found = getattr(home, name)
     return found
 
 

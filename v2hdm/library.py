@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from v2hdm.io.drive import read_drive
 from v2hdm.io.maps.reading import read_map as _read
 from v2hdm.progress import Steps
-from v2hdm.records import Drive, HdMap, ImageDetections
+from v2hdm.records import Drive, HDMap, ImageDetections
 
 if TYPE_CHECKING:  # load torch or scipy
     from v2hdm.adjust.problem import Problem
@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # load torch or scipy
     from v2hdm.simulate import PortConfig
 
 
-def read_map(path: str | Path) -> HdMap:
+def read_map(path: str | Path) -> HDMap:
     """Read a map: the folder of a result, or a ``map.geojson`` or ``map.gpkg``, edited or not.
 
     Raises:

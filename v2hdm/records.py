@@ -172,7 +172,7 @@ class Image:
     path: Path
     map_from_vehicle: FloatArray  # (4, 4) when it was taken
     clock_offset_s: float = 0.0  # exposure minus stamp, as far as known
-    visit: int = 0  # an index into ``Drive.visits``
+    session: int = 0  # an index into ``Drive.sessions``
 
     @property
     def taken_s(self) -> float:
@@ -181,7 +181,7 @@ class Image:
 
 
 @dataclass(frozen=True)
-class Visit:
+class Session:
     """A session of a :class:`Drive`, itself a drive before joining; ``cameras`` are by its own names."""
 
     name: str
@@ -208,7 +208,7 @@ class Drive:
     recorded: Trajectory | None = None  # the same as recorded
     road: Road | None = None  # as recorded, None for the plane z = 0
     unposed: Mapping[str, int] = field(default_factory=dict)  # images left out, without a pose
-    joined: tuple[Visit, ...] = ()  # its sessions, if several: then it has no trajectory
+    joined: tuple[Session, ...] = ()  # its sessions, if several: then it has no trajectory
 
     def name_of(self, path: Path) -> str:
         """Name an image as files of results do: its path below the drive's folder, else its whole path."""
@@ -221,15 +221,15 @@ class Drive:
         return np.array([image.map_from_vehicle[:2, 3] for image in self.images])
 
     @property
-    def visits(self) -> tuple[Visit, ...]:
+    def sessions(self) -> tuple[Session, ...]:
         """Its sessions: the drives that it was joined of, or itself alone."""
         own = (self.name, self.root, self.pose_noise, self.truth_dir, self.trajectory, self.recorded)
-        return self.joined or (Visit(*own, {name: name for name in self.cameras}),)
+        return self.joined or (Session(*own, {name: name for name in self.cameras}),)
 
     @property
     def noises(self) -> tuple[PoseNoise, ...]:
         """The noise of each session's recorded poses."""
-        return tuple(visit.pose_noise for visit in self.visits)
+        return tuple(session.pose_noise for session in self.sessions)
 
 
 @dataclass(frozen=True)
@@ -356,7 +356,7 @@ class GroundStrip:
 
 
 @dataclass(frozen=True)
-class HdMap:
+class HDMap:
     """Markings, lanes and symbols of a site in its map frame.
 
     ``drift_over_m`` is the correlation length of the error that neighbouring markings share, None if unknown;
@@ -481,7 +481,7 @@ class Changes:
 class Truth:
     """Ground truth of a rendered drive. Only the report reads it; the mapper never does."""
 
-    map: HdMap
+    map: HDMap
     cam_from_vehicle: Mapping[str, FloatArray]
     map_from_vehicle: FloatArray  # (I, 4, 4) one per ``Drive.images``
     visibility: FloatArray  # (I, J) fraction of marking j that image i shows, unoccluded

@@ -44,5 +44,5 @@ def site(drives: int, frames: int, overlap: int, *, every_m: float = 2.0, seed: 
         observations=Observations(seen.camera[rows], frame, corner, pixel, seen.covariance_px[rows]),
         corner_count=int(often.sum()),
         pose_sigma=tuple(sigmas),
-        visit=np.repeat(np.arange(drives), frames),
+        session=np.repeat(np.arange(drives), frames),
     )

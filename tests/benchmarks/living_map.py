@@ -31,7 +31,7 @@ from v2hdm.io.maps.reading import read_geojson
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.base import grey_reader, read_base
-from v2hdm.records import Change, Drive, Fate, FloatArray, HdMap, ImageDetections, Truth
+from v2hdm.records import Change, Drive, Fate, FloatArray, HDMap, ImageDetections, Truth
 from v2hdm.report.metrics import corner_errors, driven_past, marking_metrics, match_markings
 from v2hdm.simulate import PortConfig, rendered_drive
 from v2hdm.simulate.port.build import build_port
@@ -46,12 +46,12 @@ SAME_M = 0.25
 Seen = tuple[Drive, list[ImageDetections]]
 
 
-def port(full: bool, visit: int) -> PortConfig:
+def port(full: bool, session: int) -> PortConfig:
     """Port 2, or a short way through its yard."""
     run = OmegaConf.load(Path(__file__).parents[2] / "conf/run/port2.yaml").simulate
     config = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(PortConfig), run))
     assert isinstance(config, PortConfig)
-    config = replace(config, visit=visit)
+    config = replace(config, session=session)
     if full:
         return config
     route = RouteConfig(pieces=[[30.0, 0.0], [23.0, -90.0], [25.0, 0.0]])
@@ -63,7 +63,7 @@ def port(full: bool, visit: int) -> PortConfig:
 def seen(config: PortConfig, cache: Path, workers: int) -> Seen:
     """A drive and its detections."""
     drive = read_drive(rendered_drive(config, cache, workers, lambda _, __: None))
-    drive = replace(drive, name=f"{drive.name} {config.visit}")
+    drive = replace(drive, name=f"{drive.name} {config.session}")
     return drive, detect_all(drive, DetectorOptions.for_mapping(), workers, lambda _, __: None)
 
 
@@ -73,7 +73,7 @@ def mapped(one: Seen, base: Base | None = None) -> MethodResult:
 
 
 def together(drives: Sequence[Seen]) -> Seen:
-    """Drives as visits of one."""
+    """Drives as sessions of one."""
     detections: list[ImageDetections] = []
     for drive, found in drives:
         before = sum(len(one.images) for one, _ in drives[: [d for d, _ in drives].index(drive)])
@@ -81,7 +81,7 @@ def together(drives: Sequence[Seen]) -> Seen:
     return join_drives([drive for drive, _ in drives]), detections
 
 
-def told(name: str, hd_map: HdMap, truth: Truth, drive: Drive) -> float:
+def told(name: str, hd_map: HDMap, truth: Truth, drive: Drive) -> float:
     """Print how good a map is; returns its corner RMSE, m."""
     figures = marking_metrics(hd_map, truth, driven_past(drive, truth, tuple(drive.cameras)))
     print(
@@ -102,7 +102,7 @@ def base_of(result: MethodResult) -> Base:
     return Base(hd_map, result.poses.map_from_vehicle, left_out)
 
 
-def ids_kept(before: HdMap, after: HdMap, truth: Truth) -> str:
+def ids_kept(before: HDMap, after: HDMap, truth: Truth) -> str:
     """Of the true markings that both maps have, how many have one id in both."""
     ids = []
     for hd_map in (before, after):
@@ -119,7 +119,7 @@ def at(corners: FloatArray | None, other: FloatArray | None) -> bool:
     return bool(np.linalg.norm(corners.mean(axis=0) - other.mean(axis=0)) < SAME_M)
 
 
-def tell_changes(changes: Sequence[Change], alterations: Sequence[Alteration], base: HdMap) -> None:
+def tell_changes(changes: Sequence[Change], alterations: Sequence[Alteration], base: HDMap) -> None:
     """Print which alterations are listed, and what else is."""
     known = [one.corners_map for one in base.markings]
     for fate, is_one in (
@@ -153,7 +153,7 @@ def tell_changes(changes: Sequence[Change], alterations: Sequence[Alteration], b
                 print(f"   missed at ({x:.1f}, {y:.1f}): {fates or 'nothing listed'}")
 
 
-def common_rmse_m(hd_map: HdMap, others: Sequence[HdMap], truth: Truth) -> float:
+def common_rmse_m(hd_map: HDMap, others: Sequence[HDMap], truth: Truth) -> float:
     """Corner RMSE, m, over the true markings that all of the maps have."""
     columns = [set(match_markings(one.markings, truth.map.markings)[1]) for one in (hd_map, *others)]
     shared = set.intersection(*columns)
@@ -207,7 +207,7 @@ def main() -> None:
     arguments = parser.parse_args()
     count = 12 if arguments.full else 4
     base = two_drives(arguments) if arguments.base is None else read_base(arguments.base)
-    config = port(full=arguments.full, visit=1 if arguments.full else 2)
+    config = port(full=arguments.full, session=1 if arguments.full else 2)
     config = replace(config, name=f"{config.name}-altered")
     with altered(count, config.seed) as alterations:  # in this process alone, which renders them
         build_port(config)

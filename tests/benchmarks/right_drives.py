@@ -43,7 +43,7 @@ from v2hdm.faults.odds import doubt, log_odds, matters
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import AUTO, GROUNDS, MappingOptions
 from v2hdm.pipeline.stages import BEST, camera_sets
-from v2hdm.records import Drive, FloatArray, HdMap
+from v2hdm.records import Drive, FloatArray, HDMap
 from v2hdm.report.metrics import driven_past, marking_metrics
 from v2hdm.verdict import Finding, Verdict
 from v2hdm.verdict.inputs.drive import causes, check_camera, check_road
@@ -185,7 +185,7 @@ def map_one(job: Job) -> Row:
     )
 
 
-def height_errors_m(world: World, hd_map: HdMap) -> tuple[FloatArray, FloatArray]:
+def height_errors_m(world: World, hd_map: HDMap) -> tuple[FloatArray, FloatArray]:
     """The errors of the corners' heights, by the nearest true corner, and their sigmas; none are not told."""
     true, told = (
         world.corners_map.reshape(-1, 3),

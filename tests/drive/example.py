@@ -21,7 +21,7 @@ from v2hdm.records import (
     Drive,
     FloatArray,
     GeodeticOrigin,
-    HdMap,
+    HDMap,
     Image,
     Lane,
     Marking,
@@ -85,7 +85,7 @@ def make_drive(folder: Path, stamps: tuple[float, ...] = (100.05, 100.95, 101.25
     return drive
 
 
-def make_map() -> HdMap:
+def make_map() -> HDMap:
     square = np.array([[0.0, 0.0], [0.5, 0.0], [0.5, 0.5], [0.0, 0.5]])
     lane = Lane("lane_line", np.array([[0.0, 2.0], [1 / 3, 2.0], [7.5, 2.25]]), sightings=4)
     rng = np.random.default_rng(3)
@@ -94,7 +94,7 @@ def make_map() -> HdMap:
         Marking("diamond", square + 1 / 3, 5, half @ half.T),
         Marking("lane_dash", square - 1e6 / 7, 3),
     )
-    return HdMap(markings, (lane,), ORIGIN)
+    return HDMap(markings, (lane,), ORIGIN)
 
 
 def make_truth(drive: Drive) -> Truth:

@@ -138,8 +138,8 @@ def test_drives_of_one_rig_share_its_cameras_and_no_frame(drives):
     assert joined.name == "monday+friday"
     frames = frames_of(joined)
     alone = len(frames_of(drives[0]).stamp_s)
-    assert frames.visit.tolist() == [0] * alone + [1] * alone
-    assert [image.visit for image in joined.images] == sorted(image.visit for image in joined.images)
+    assert frames.session.tolist() == [0] * alone + [1] * alone
+    assert [image.session for image in joined.images] == sorted(image.session for image in joined.images)
     assert joined.noises == (drives[0].pose_noise, drives[1].pose_noise)
     assert joined.pose_noise.position_m == 0.05
     assert joined.pose_noise.heading_rad == max(drives[0].pose_noise.heading_rad, 1e-4)
@@ -157,7 +157,7 @@ def test_a_frame_of_another_origin_is_moved_to_its_place_on_the_earth(drives):
         for one in drives[1].images
     ]
     joined = join_drives([drives[0], replace(drives[1], origin=there, images=moved)])
-    back = next(one for one in joined.images if one.visit == 1).map_from_vehicle
+    back = next(one for one in joined.images if one.session == 1).map_from_vehicle
     assert back[:2, 3] == pytest.approx(image[:2, 3], abs=2e-3)
     # The meridians converge by the difference of longitude times the sine of the latitude.
     convergence = np.radians(0.003) * np.sin(np.radians(50.0))
@@ -179,7 +179,7 @@ def test_a_camera_with_another_lens_or_mounting_is_another_camera(drives, caplog
     joined = join_drives([drives[0], replace(drives[1], cameras={**drives[1].cameras, name: zoomed})])
     assert f"{name}@friday" in joined.cameras
     assert joined.cameras[f"{name}@friday"].info.name == f"{name}@friday"
-    assert {image.camera for image in joined.images if image.visit == 1} >= {f"{name}@friday"}
+    assert {image.camera for image in joined.images if image.session == 1} >= {f"{name}@friday"}
     assert f"calibrated separately, as {name}@friday" in caplog.text
     apart = join_drives(drives, [(1, name)])
     assert f"{name}@friday" in apart.cameras
@@ -201,11 +201,11 @@ def test_drives_without_origins_are_taken_to_share_a_frame(drives, caplog):
     assert "assumed to share one frame" in caplog.text
 
 
-def test_each_visit_has_clocks_of_its_own(drives):
+def test_each_session_has_clocks_of_its_own(drives):
     joined = join_drives(drives)
     name = next(iter(joined.cameras))
-    moved = with_clock_offsets(joined, {name: 0.05}, max_gap_s=1.0, visit=1)
-    offsets = {(one.visit, one.camera): one.clock_offset_s for one in moved.images}
+    moved = with_clock_offsets(joined, {name: 0.05}, max_gap_s=1.0, session=1)
+    offsets = {(one.session, one.camera): one.clock_offset_s for one in moved.images}
     assert offsets[0, name] == 0.0
     assert offsets[1, name] == 0.05
 

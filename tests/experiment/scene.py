@@ -5,18 +5,18 @@ from typing import Any
 import numpy as np
 
 from v2hdm.experiment.plan import DriveConfig, ExperimentConfig, Site
-from v2hdm.records import DIAMOND, LANE_LINE, HdMap, Lane, Marking, Truth
+from v2hdm.records import DIAMOND, LANE_LINE, HDMap, Lane, Marking, Truth
 
 DIAMOND_CORNERS = np.array([[0.5, 0.0], [0.0, 0.25], [-0.5, 0.0], [0.0, -0.25]])
 TRUE = DIAMOND_CORNERS + np.column_stack([5.0 + 4.0 * np.arange(5), np.full(5, 2.0)])[:, None]
 CALIBRATED, ESTIMATED = "calibrated", "estimated"
 
 
-def diamonds(corners: np.ndarray, lanes: tuple[Lane, ...] = ()) -> HdMap:
-    return HdMap(tuple(Marking(DIAMOND, own, 5) for own in corners), lanes)
+def diamonds(corners: np.ndarray, lanes: tuple[Lane, ...] = ()) -> HDMap:
+    return HDMap(tuple(Marking(DIAMOND, own, 5) for own in corners), lanes)
 
 
-def shifted(metres: float, markings: int = 5) -> HdMap:
+def shifted(metres: float, markings: int = 5) -> HDMap:
     """The first true markings, all of them too far east."""
     return diamonds(TRUE[:markings] + np.array([metres, 0.0]))
 

@@ -15,7 +15,7 @@ from v2hdm.lanes.knots import _catmull_rom, draw_lanes, find_knots
 from v2hdm.mapping.inputs import Inputs
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.records import HdMap
+from v2hdm.records import HDMap
 from v2hdm.site.options import JOINT, LaneOptions
 
 JOINTLY = MappingOptions(lanes=LaneOptions(model=JOINT))
@@ -153,7 +153,7 @@ def test_a_drive_without_lane_paint_has_no_knots(highway, inputs, solved):
 def test_sigmas_survive_writing_and_reading_as_features(solved):
     bundle = solved[1].bundle
     lanes = draw_lanes(bundle.knots, bundle.solution, 0.5)
-    again = map_of(features_of(HdMap((), lanes)), range(1, len(lanes) + 1), None)
+    again = map_of(features_of(HDMap((), lanes)), range(1, len(lanes) + 1), None)
     for one, other in zip(lanes, again.lanes, strict=True):
         np.testing.assert_array_equal(one.sigma_m, other.sigma_m)
 

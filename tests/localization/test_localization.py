@@ -6,7 +6,7 @@ from tests.cameras import mounted
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.rigid import heading_rad
 from v2hdm.localization.filter import Markings, Seen, locate, pose_of, predict, start
-from v2hdm.records import HdMap, Marking
+from v2hdm.records import HDMap, Marking
 
 INTRINSIC = np.array([[700.0, 0, 640], [0, 700, 360], [0, 0, 1]])
 SIGMA_PX = 0.4
@@ -26,7 +26,7 @@ def mapped(true, rng, sigma_m=0.01):
     block = sigma_m**2 * np.eye(8)
     corners = [one.corners_map + sigma_m * rng.standard_normal((4, 2)) for one in true.markings]
     kinds = [one.kind for one in true.markings]
-    return HdMap(tuple(Marking(kind, c, 10, block, sigma_m) for kind, c in zip(kinds, corners, strict=True)))
+    return HDMap(tuple(Marking(kind, c, 10, block, sigma_m) for kind, c in zip(kinds, corners, strict=True)))
 
 
 def yard(rng, length_m=120.0):
@@ -36,7 +36,7 @@ def yard(rng, length_m=120.0):
         markings.append(Marking("lane_dash", DASH + np.array([x, 1.8]), 10))
         place = np.array([x + rng.uniform(-1, 1), rng.uniform(-4, -2)])
         markings.append(Marking("diamond", DIAMOND + place, 10))
-    return HdMap(tuple(markings))
+    return HDMap(tuple(markings))
 
 
 def seen_from(pose, hd_map, rng):
@@ -110,7 +110,7 @@ def test_where_nothing_is_painted_the_vehicle_says_that_it_is_lost_and_finds_its
     painted = yard(rng)
     gap = [m for m in painted.markings if not 30 < m.corners_map[:, 0].mean() < 60]
     true = drive(110, rng)
-    states = follow(true, HdMap(tuple(gap)), np.zeros(2), rng)
+    states = follow(true, HDMap(tuple(gap)), np.zeros(2), rng)
     sigma_m = np.array([state.sigma_m for state in states])
     in_gap = (true[:, 0] > 40) & (true[:, 0] < 45)
     after = true[:, 0] > 62
@@ -122,7 +122,7 @@ def test_where_nothing_is_painted_the_vehicle_says_that_it_is_lost_and_finds_its
 
 def test_a_detection_that_two_markings_could_explain_is_not_used():
     rng = np.random.default_rng(3)
-    dashes = HdMap(tuple(Marking("lane_dash", DASH + np.array([x, 1.8]), 10) for x in (8.0, 11.0)))
+    dashes = HDMap(tuple(Marking("lane_dash", DASH + np.array([x, 1.8]), 10) for x in (8.0, 11.0)))
     seen = seen_from(np.zeros(5), dashes, rng)[:1]
     unsure = start(pose_of(np.zeros(5)), 3.0, 0.02, ATTITUDE_RAD)
     assert locate(unsure, seen, Markings(dashes))[1] == []

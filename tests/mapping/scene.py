@@ -22,7 +22,7 @@ from v2hdm.records import (
     CentrePrior,
     Drive,
     FloatArray,
-    HdMap,
+    HDMap,
     Image,
     ImageDetections,
     Lane,
@@ -80,7 +80,7 @@ MOUNTS = {
 
 
 def make_scene(options: SceneOptions, repaint: Callable[[list[Marking]], list[Marking]] = list) -> Scene:
-    """Build the yard, drive through it and detect; equal options but for the seed are visits of one yard.
+    """Build the yard, drive through it and detect; equal options but for the seed are sessions of one yard.
 
     ``repaint`` takes the markings that the yard was laid out with to those that are there by now.
     """
@@ -277,7 +277,7 @@ MATCH_M = 0.3
 """How far apart, m, a mapped and a true marking are one."""
 
 
-def match(hd_map: HdMap, truth: list[Marking], gate_m: float) -> tuple[list[tuple[int, int]], float]:
+def match(hd_map: HDMap, truth: list[Marking], gate_m: float) -> tuple[list[tuple[int, int]], float]:
     """Pairs (mapped, true) of nearest centres within the gate, and the corner RMSE over them."""
     centres = np.array([m.corners_map.mean(axis=0) for m in truth])
     pairs, squared = [], []

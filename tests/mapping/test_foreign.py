@@ -30,7 +30,7 @@ def stretch(monkeypatch, found, first_seen):
         row=np.arange(kept.sum()),
     )  # fmt: skip
     stamps = 0.1 * np.arange(FRAMES)
-    sightings = SimpleNamespace(image=frame[kept], visit=np.zeros(FRAMES, dtype=int), stamp_s=stamps)
+    sightings = SimpleNamespace(image=frame[kept], session=np.zeros(FRAMES, dtype=int), stamp_s=stamps)
     views = SimpleNamespace(
         image=np.arange(FRAMES), frame=np.arange(FRAMES), camera=np.zeros(FRAMES, dtype=int)
     )

@@ -14,7 +14,7 @@ from v2hdm.association.sightings import collect_sightings
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.optimise import Optimiser, initial_rig
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.records import DIAMOND, HdMap, ImageDetections
+from v2hdm.records import DIAMOND, HDMap, ImageDetections
 
 CAMERAS = ("front", "rear")
 
@@ -135,7 +135,7 @@ def test_the_naive_methods_use_whole_sightings_only(scene):
     results = run_methods(
         scene.drive, with_cut_dashes(scene, 1.0), CAMERAS, MappingOptions(pose_model="heave", rounds=1)
     )
-    naive: HdMap = results["CNI"].hd_map
+    naive: HDMap = results["CNI"].hd_map
     assert not [marking for marking in naive.markings if marking.kind == "lane_dash"]
 
 

@@ -9,7 +9,7 @@ from tests.ports import TINY_ROUTE, short_port, small_port
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.pipeline.base import grey_reader
-from v2hdm.records import Calibration, HdMap, PaintLeft
+from v2hdm.records import Calibration, HDMap, PaintLeft
 from v2hdm.simulate.port.build import build_port
 from v2hdm.simulate.port.config import PaintConfig, RouteConfig
 from v2hdm.simulate.render import ground
@@ -52,7 +52,7 @@ def measured(folder, port, earlier=None):
     centres = np.array([one.polygon_map.mean(axis=0) for one in paints])
     nearest = [np.argmin(((centres - m.corners_map.mean(axis=0)) ** 2).sum(axis=1)) for m in markings]
     poses, grey = truth.map_from_vehicle, grey_reader(drive)
-    hd_map = with_wear(HdMap(tuple(markings)), drive.images, poses, calibrations, grey, shown, earlier)
+    hd_map = with_wear(HDMap(tuple(markings)), drive.images, poses, calibrations, grey, shown, earlier)
     return hd_map, {m.id: share_rendered(paints[k]) for m, k in zip(markings, nearest, strict=True)}
 
 
@@ -78,7 +78,7 @@ def test_shadows_and_vehicles_of_a_port_that_nothing_was_tuned_on_are_no_wear(re
     assert np.mean(np.abs(share - true) <= 2 * sigma) >= 0.95
 
 
-def test_two_visits_keep_the_order_and_the_second_states_the_change(rendered):
+def test_two_sessions_keep_the_order_and_the_second_states_the_change(rendered):
     worn = small_port(paint=replace(PaintConfig(), wear=0.3))
     first, before = measured(rendered(small_port()), small_port())
     second, after = measured(rendered(worn), worn, first)
@@ -95,7 +95,7 @@ def test_two_visits_keep_the_order_and_the_second_states_the_change(rendered):
 def test_a_marking_that_no_image_shows_keeps_what_the_earlier_map_says(small_drive):
     drive = read_drive(small_drive)
     away = replace(read_truth(drive).map.markings[0], corners_map=np.eye(4)[:, :2] + 1e4, id=1)
-    before = HdMap((replace(away, paint=PaintLeft(0.7, 0.1)),))
+    before = HDMap((replace(away, paint=PaintLeft(0.7, 0.1)),))
     arguments = drive.images, [one.map_from_vehicle for one in drive.images], {}, grey_reader(drive), set()
-    assert with_wear(HdMap((away,)), *arguments, before).markings[0].paint == PaintLeft(0.7, 0.1)
-    assert with_wear(HdMap((away,)), *arguments).markings[0].paint is None
+    assert with_wear(HDMap((away,)), *arguments, before).markings[0].paint == PaintLeft(0.7, 0.1)
+    assert with_wear(HDMap((away,)), *arguments).markings[0].paint is None

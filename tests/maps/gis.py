@@ -9,7 +9,7 @@ import numpy as np
 import pyogrio
 import rasterio
 
-from v2hdm.records import GeodeticOrigin, HdMap, Lane, Marking, Symbol
+from v2hdm.records import GeodeticOrigin, HDMap, Lane, Marking, Symbol
 from v2hdm.safe import pixels
 
 ORIGIN = GeodeticOrigin(latitude_deg=29.95, longitude_deg=122.05, altitude_m=12.0)
@@ -74,7 +74,7 @@ def _ogr() -> ctypes.CDLL:
     return ogr
 
 
-def street(origin: GeodeticOrigin | None = ORIGIN, with_heights: bool = True) -> HdMap:
+def street(origin: GeodeticOrigin | None = ORIGIN, with_heights: bool = True) -> HDMap:
     """A street bending left: three lane lines 3.5 m apart, a stop line across the right lane, and more.
 
     Corners of one diamond run clockwise, and everything is known with correlated covariances.
@@ -105,10 +105,10 @@ def street(origin: GeodeticOrigin | None = ORIGIN, with_heights: bool = True) ->
                 kind, corners, int(rng.integers(3, 20)), half @ half.T, 0.002 + rng.random() / 1e3, heights
             )
         )
-    return HdMap(tuple(markings), tuple(lanes), origin)
+    return HDMap(tuple(markings), tuple(lanes), origin)
 
 
-def assert_same_map(got: HdMap, expected: HdMap) -> None:
+def assert_same_map(got: HDMap, expected: HDMap) -> None:
     """Every value to the last bit, but ids, which a file gives."""
     assert got.origin == expected.origin
     for one, other in zip(_features(got), _features(expected), strict=True):
@@ -116,7 +116,7 @@ def assert_same_map(got: HdMap, expected: HdMap) -> None:
             np.testing.assert_array_equal(getattr(one, name), value, err_msg=name)
 
 
-def _features(hd_map: HdMap) -> list[Marking | Lane | Symbol]:
+def _features(hd_map: HDMap) -> list[Marking | Lane | Symbol]:
     return [*hd_map.markings, *hd_map.lanes, *hd_map.symbols]
 
 

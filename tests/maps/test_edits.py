@@ -15,7 +15,7 @@ from v2hdm.io.maps.formats import FORMATS
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.maps.geopackage import write_geopackage
 from v2hdm.io.maps.reading import read_geojson, read_geopackage, read_map
-from v2hdm.records import HdMap, Marking
+from v2hdm.records import HDMap, Marking
 from v2hdm.survey.match import match
 
 EDITED = ["geojson", "gpkg"]
@@ -199,7 +199,7 @@ def test_where_gdal_cannot_write_is_one_line(tmp_path, monkeypatch):
 
 def test_a_geopackage_that_cannot_be_written_leaves_the_old_one(tmp_path):
     path = written(tmp_path, "gpkg", street())
-    broken = HdMap((Marking("diamond", np.zeros((4, 2)), 3, id="seven"),))  # type: ignore[arg-type]
+    broken = HDMap((Marking("diamond", np.zeros((4, 2)), 3, id="seven"),))  # type: ignore[arg-type]
     with pytest.raises(TypeError):
         write_geopackage(broken, path)
     assert len(read_geopackage(path).markings) == 5

@@ -24,7 +24,7 @@ from v2hdm.io.maps.closed_lanes import closed_lanes
 from v2hdm.io.maps.formats import FORMATS, check_formats, write_map
 from v2hdm.io.maps.lanelet2 import grid_places
 from v2hdm.io.maps.reading import read_map
-from v2hdm.records import GeodeticOrigin, HdMap, Lane, Marking
+from v2hdm.records import GeodeticOrigin, HDMap, Lane, Marking
 
 TENTH_OF_A_MM = 1e-4
 BOTH = pytest.mark.parametrize("origin", [ORIGIN, None])
@@ -304,7 +304,7 @@ def test_lanes_between_two_lines_make_a_routing_graph_with_a_lane_change(tmp_pat
 
 def test_lanelet2_ids_are_positive_unique_and_stay_when_another_feature_goes(tmp_path):
     hd_map = street()
-    known = HdMap(
+    known = HDMap(
         tuple(replace(one, id=k + 1) for k, one in enumerate(hd_map.markings)),
         tuple(replace(one, id=k + 6) for k, one in enumerate(hd_map.lanes)),
         hd_map.origin,
@@ -430,7 +430,7 @@ def test_classes_of_ones_own_with_signs_in_their_names_are_written(tmp_path):
         "lanelet2": lambda path: load(path, ORIGIN).polygonLayer[1].attributes["subtype"],
     }
     for file_format, name in names.items():
-        path = exported(tmp_path, file_format, HdMap((marking,), (), ORIGIN))
+        path = exported(tmp_path, file_format, HDMap((marking,), (), ORIGIN))
         assert name(path).startswith("pad ")
 
 
@@ -440,7 +440,7 @@ def test_a_lane_beside_which_another_begins_is_cut_there_so_that_one_can_change(
         return Lane(kind, np.column_stack([x, np.full(len(x), y)]), 3)
 
     lines = (line("lane_line", 0.0, 0.0), line("lane_dash", 3.5, 0.2), line("lane_line", 7.0, 21.3))
-    loaded = load(exported(tmp_path, "lanelet2", HdMap((), lines, ORIGIN)), ORIGIN)
+    loaded = load(exported(tmp_path, "lanelet2", HDMap((), lines, ORIGIN)), ORIGIN)
     before, beside, begun = sorted(
         loaded.laneletLayer, key=lambda one: points_of(one.centerline)[:, :2].mean(axis=0) @ [1.0, 10.0]
     )
@@ -461,7 +461,7 @@ def _destinations(tmp_path, lines):
         x = np.linspace(*x_ends[[0, -1]], int(abs(np.ptp(x_ends)) * 2) + 1)
         y = np.interp(x, x_ends, y_ends) if x[-1] > x[0] else np.interp(x, x_ends[::-1], y_ends[::-1])
         lanes.append(Lane("lane_line", np.column_stack([x, y]), 3))
-    loaded = load(exported(tmp_path, "lanelet2", HdMap((), tuple(lanes), ORIGIN)), ORIGIN)
+    loaded = load(exported(tmp_path, "lanelet2", HDMap((), tuple(lanes), ORIGIN)), ORIGIN)
     _, graph = routing(loaded)
     firsts = [one for one in loaded.laneletLayer if not graph.previous(one)]
     routes = {}
@@ -502,7 +502,7 @@ def test_no_way_is_made_up_where_both_lines_of_a_lane_end(tmp_path):
 
 @pytest.mark.parametrize("file_format", list(FORMATS))
 def test_an_empty_map_can_be_written_and_read(tmp_path, file_format):
-    path = exported(tmp_path, file_format, HdMap((), (), ORIGIN))
+    path = exported(tmp_path, file_format, HDMap((), (), ORIGIN))
     assert path.is_file()
     if file_format in ("geojson", "gpkg"):
-        assert read_map(path)[0] == HdMap((), (), ORIGIN)
+        assert read_map(path)[0] == HDMap((), (), ORIGIN)

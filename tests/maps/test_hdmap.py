@@ -31,7 +31,7 @@ from v2hdm.records import (
     CameraInfo,
     Exclusion,
     GeodeticOrigin,
-    HdMap,
+    HDMap,
     Lane,
     Marking,
     Road,
@@ -64,7 +64,7 @@ def test_symbols_survive_their_file_and_are_polygons(tmp_path, origin):
         Symbol("arrow", 2 * outline, 3),
     )
     path = tmp_path / "map.geojson"
-    write_geojson(HdMap(make_map().markings, (), origin, symbols), path)
+    write_geojson(HDMap(make_map().markings, (), origin, symbols), path)
     for got, expected in zip(read_geojson(path).symbols, symbols, strict=True):
         assert (got.kind, got.sightings, got.sigma_m) == (expected.kind, expected.sightings, expected.sigma_m)
         np.testing.assert_array_equal(got.outline_map, expected.outline_map)
@@ -81,7 +81,7 @@ def test_symbols_survive_their_file_and_are_polygons(tmp_path, origin):
 @pytest.mark.parametrize("ending", ["csv", "gpkg", "dxf", "osm"])
 def test_every_format_holds_a_symbol_of_three_corners(tmp_path, ending):
     symbol = Symbol("parking_t", np.array([[0.1, 0.0], [1.0, 0.2], [0.3, 0.7]]), 5, 0.013)
-    hd_map = HdMap((), (), ORIGIN, (symbol,))
+    hd_map = HDMap((), (), ORIGIN, (symbol,))
     file_format = {"osm": "lanelet2"}.get(ending, ending)
     path = tmp_path / f"map.{ending}"
     FORMATS[file_format].write(hd_map, path, None)
@@ -97,7 +97,7 @@ def test_every_format_holds_a_symbol_of_three_corners(tmp_path, ending):
 @pytest.mark.parametrize("turn", [1, -1])
 def test_rings_are_closed_and_counter_clockwise_whatever_the_corners_do(tmp_path, turn):
     corners = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [0.0, 1.0]])[::turn]
-    write_geojson(HdMap((Marking("diamond", corners, 3),), (), ORIGIN), tmp_path / "map.geojson")
+    write_geojson(HDMap((Marking("diamond", corners, 3),), (), ORIGIN), tmp_path / "map.geojson")
     geometry = json.loads((tmp_path / "map.geojson").read_text())["features"][0]["geometry"]
     ring = np.array(geometry["coordinates"][0])
     assert geometry["type"] == "Polygon"
@@ -113,7 +113,7 @@ def test_the_road_s_height_is_the_third_coordinate_and_survives_the_file(tmp_pat
     road = Road(stations, 2.0 + 0.05 * stations[:, 0], np.tile([0.05, 0.02], (41, 1)))
     corners = np.array([[0.0, 1.0], [0.0, 0.0], [2.0, 0.0], [2.0, 1.0]])
     lane = Lane("lane_line", np.array([[0.0, 2.0], [10.0, 2.0]]), 4)
-    hd_map = with_heights(HdMap((Marking("diamond", corners, 3),), (lane,), origin), road)
+    hd_map = with_heights(HDMap((Marking("diamond", corners, 3),), (lane,), origin), road)
     expected = [2.02, 2.0, 2.1, 2.12]
     assert hd_map.markings[0].heights_m is not None
     np.testing.assert_allclose(hd_map.markings[0].heights_m, expected, atol=1e-9)
@@ -128,14 +128,14 @@ def test_the_road_s_height_is_the_third_coordinate_and_survives_the_file(tmp_pat
 
 
 def test_local_metres_say_that_they_are_not_degrees(tmp_path):
-    write_geojson(HdMap(make_map().markings), tmp_path / "map.geojson")
+    write_geojson(HDMap(make_map().markings), tmp_path / "map.geojson")
     assert "metres" in json.loads((tmp_path / "map.geojson").read_text())["v2hdm"]["coordinates"]
 
 
 def test_a_map_that_cannot_be_written_leaves_the_old_one(tmp_path):
     path = tmp_path / "map.geojson"
     write_geojson(make_map(), path)
-    broken = HdMap((Marking("diamond", np.full((4, 2), np.nan), 3),))
+    broken = HDMap((Marking("diamond", np.full((4, 2), np.nan), 3),))
     with pytest.raises(ValueError, match="JSON compliant"):
         write_geojson(broken, path)
     assert_same_map(read_geojson(path), make_map())
@@ -281,7 +281,7 @@ def test_exclusions_without_a_place_are_refused(tmp_path):
 
 
 VERDICT = {"status": "WARN", "findings": [{"check": "clock", "says": "late"}], "passed": []}
-MAP = HdMap((Marking("diamond", np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]), 3),))
+MAP = HDMap((Marking("diamond", np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]), 3),))
 CALIBRATION = Calibration(CameraInfo("front", 640, 480, np.diag([500.0, 500.0, 1.0])), np.eye(4))
 
 

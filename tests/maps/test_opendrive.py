@@ -11,7 +11,7 @@ from pyproj import Proj
 from tests.maps.gis import ORIGIN, street
 from v2hdm.io.maps.closed_lanes import closed_lanes
 from v2hdm.io.maps.formats import write_map
-from v2hdm.records import HdMap
+from v2hdm.records import HDMap
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # of the reader's own libraries
 
@@ -85,4 +85,4 @@ def test_the_projection_puts_the_origin_where_it_is(tmp_path):
 
 
 def test_an_empty_map_is_a_file_that_opens(tmp_path):
-    assert len(loaded(written(tmp_path, HdMap((), (), ORIGIN)))) == 1
+    assert len(loaded(written(tmp_path, HDMap((), (), ORIGIN)))) == 1

@@ -25,7 +25,7 @@ from v2hdm.records import (
     Drive,
     FloatArray,
     GeodeticOrigin,
-    HdMap,
+    HDMap,
     Image,
     Marking,
     Trajectory,
@@ -119,7 +119,7 @@ def result_of(folder: Path, drive: Drive) -> Path:
         write_calibration(
             Calibration(INFO, cam_from_vehicle()), out / "calibration_front.yaml", clock_s=(0.0, 0.001)
         )
-        hd_map = HdMap(tuple(Marking("diamond", s, 7) for s in SQUARES), origin=ORIGIN)
+        hd_map = HDMap(tuple(Marking("diamond", s, 7) for s in SQUARES), origin=ORIGIN)
         write_geojson(hd_map, out / "map.geojson")
         write_json(out / METRICS, {"drive": told_of(drive, [drive.root], ReadOptions())})
     return folder / "result"

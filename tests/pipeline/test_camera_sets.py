@@ -12,7 +12,7 @@ from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline import stages
 from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.stages import MappedSet, map_camera_sets
-from v2hdm.records import HdMap
+from v2hdm.records import HDMap
 from v2hdm.store.cache import StageCache
 from v2hdm.survey.run import Survey
 
@@ -31,7 +31,7 @@ class Cameras:
 
 def mapped(work, name, cameras):
     logging.getLogger("v2hdm.mapping").info("mapped with %s", name)
-    return MappedSet({"Opt": MethodResult("Opt", tuple(cameras), HdMap((), (), None))})
+    return MappedSet({"Opt": MethodResult("Opt", tuple(cameras), HDMap((), (), None))})
 
 
 @pytest.fixture

@@ -51,8 +51,8 @@ def results(tmp_path_factory):
 
     def detected(drive, *_):
         out: list[ImageDetections] = []
-        for visit in drive.visits:
-            found = scenes[visit.root.name].detections
+        for session in drive.sessions:
+            found = scenes[session.root.name].detections
             out += [replace(one, image=one.image + len(out)) for one in found]
         return out
 

@@ -30,7 +30,7 @@ from v2hdm.pipeline.config import MapConfig, ReportConfig, admit, run_name
 from v2hdm.pipeline.result import _along_route, write_trajectories
 from v2hdm.pipeline.run import made_of, run
 from v2hdm.pipeline.stages import camera_sets
-from v2hdm.records import Drive, HdMap, Image, Lane, Trajectory
+from v2hdm.records import Drive, HDMap, Image, Lane, Trajectory
 from v2hdm.site.options import AcceptanceOptions, LaneOptions
 from v2hdm.store.inputs import protected_inputs
 from v2hdm.store.results import result_folder
@@ -249,8 +249,8 @@ def test_poses_that_were_laid_flat_are_written_at_their_recorded_height(tmp_path
     drive = Drive("d", tmp_path, {}, (), recorded=recorded)
     sigma = np.tile([0.01, 0.02, 0.003, 1e-4, 2e-4, 3e-4], (3, 1))
     seen = np.array([True, False, True])
-    visit = np.zeros(len(stamp_s), dtype=np.int64)
-    adjusted = AdjustedPoses(stamp_s, poses(), poses(forward_m=0.05), sigma, seen, {}, visit)
+    session = np.zeros(len(stamp_s), dtype=np.int64)
+    adjusted = AdjustedPoses(stamp_s, poses(), poses(forward_m=0.05), sigma, seen, {}, session)
     write_trajectories(adjusted, drive, tmp_path)
     got = read_tum(tmp_path / "trajectory.tum")
     np.testing.assert_allclose(got.stamp_s, stamp_s)
@@ -265,7 +265,7 @@ def test_a_lane_that_is_turned_to_the_route_takes_the_sigmas_of_its_vertices_alo
     rising = np.arange(3.0)
     lane = Lane("lane_line", np.column_stack([-rising, rising]), 3, rising, 1, rising + 1, rising + 2)
     drive = Drive("east", Path(), {}, [Image("front", 0.0, Path("0.png"), np.eye(4))])
-    (turned,) = _along_route(HdMap((), (lane,)), drive).lanes
+    (turned,) = _along_route(HDMap((), (lane,)), drive).lanes
     assert turned.points_map[:, 0].tolist() == [-2, -1, 0]
     assert turned.heights_m.tolist() == [2, 1, 0]
     assert turned.sigma_m.tolist() == [3, 2, 1]

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from v2hdm.records import DIAMOND, LANE_LINE, Camera, CameraInfo, Drive, HdMap, Image, Lane, Marking, Truth
+from v2hdm.records import DIAMOND, LANE_LINE, Camera, CameraInfo, Drive, HDMap, Image, Lane, Marking, Truth
 
 DIAMOND_CORNERS = np.array([[0.5, 0.0], [0.0, 0.25], [-0.5, 0.0], [0.0, -0.25]])
 
@@ -29,7 +29,7 @@ def make_truth(visibility: float = 1.0) -> tuple[Drive, Truth]:
     images = [Image("front", float(i), Path(f"{i}.png"), pose) for i, pose in enumerate(poses)]
     lane = Lane(LANE_LINE, np.column_stack([np.linspace(0, 20, 41), np.full(41, 2.0)]), 1)
     truth = Truth(
-        map=HdMap((diamond_at(10, 0), diamond_at(10, 40)), (lane,)),
+        map=HDMap((diamond_at(10, 0), diamond_at(10, 40)), (lane,)),
         cam_from_vehicle={"front": np.eye(4)},
         map_from_vehicle=poses,
         visibility=np.full((3, 2), visibility),

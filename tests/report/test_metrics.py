@@ -13,7 +13,7 @@ from tests.cameras import mounted
 from tests.report.scene import diamond_at, make_truth
 from tests.report.yard import OWN_M, SHARED_M, SURVEY_M, checked, point, yard
 from v2hdm.geometry.ipm import apply_in_front, ipm_from_extrinsic
-from v2hdm.records import DIAMOND, LANE_DASH, HdMap, Lane, Marking
+from v2hdm.records import DIAMOND, LANE_DASH, HDMap, Lane, Marking
 from v2hdm.report import photos, style
 from v2hdm.report.metrics import (
     corner_errors,
@@ -37,7 +37,7 @@ def test_what_a_camera_saw_unoccluded_inside_its_region_of_interest_counts_as_dr
 
 def test_a_shift_of_three_and_four_centimetres_is_an_error_and_a_bias_of_five():
     _, truth = make_truth()
-    result = marking_metrics(HdMap((diamond_at(10.03, 0.04),)), truth, np.array([True, False]))
+    result = marking_metrics(HDMap((diamond_at(10.03, 0.04),)), truth, np.array([True, False]))
     assert result.corner_rmse_m == pytest.approx(0.05)
     assert result.corner_bias_m == pytest.approx(0.05)
     assert (result.markings, result.false_markings, result.expected, result.recall) == (1, 0, 1, 1.0)
@@ -54,18 +54,18 @@ def test_a_duplicate_and_a_wrong_class_are_false_and_opposite_errors_have_no_bia
     duplicate = diamond_at(10.2, 0)
     wrong_class = Marking(LANE_DASH, diamond_at(10, 40).corners_map, 3)
     result = marking_metrics(
-        HdMap((diamond_at(10, 0), duplicate, wrong_class)), truth, np.array([True, True])
+        HDMap((diamond_at(10, 0), duplicate, wrong_class)), truth, np.array([True, True])
     )
     assert result.false_markings == 2
     assert result.recall == 0.5
-    pair = marking_metrics(HdMap((diamond_at(10.1, 0), diamond_at(9.9, 40))), truth, np.array([True, True]))
+    pair = marking_metrics(HDMap((diamond_at(10.1, 0), diamond_at(9.9, 40))), truth, np.array([True, True]))
     assert pair.corner_rmse_m == pytest.approx(0.1)
     assert pair.corner_bias_m == pytest.approx(0.0, abs=1e-12)
 
 
 def test_an_empty_map_has_no_recall_and_no_error():
     _, truth = make_truth()
-    result = marking_metrics(HdMap(()), truth, np.array([True, False]))
+    result = marking_metrics(HDMap(()), truth, np.array([True, False]))
     assert result.recall == 0.0
     assert np.isnan(result.corner_rmse_m)
 
@@ -112,7 +112,7 @@ def test_the_overlay_draws_the_marking_where_the_camera_sees_it(tmp_path):
     # 2 m above the ground, optical axis level and forward: ground at (10, 0) projects to v = 240 + 100.
     views = {"Opt": partial(apply_in_front, np.linalg.inv(ipm_from_extrinsic(info, mounted([0, 0, 2]))))}
     black = np.zeros((480, 640, 3), np.uint8)
-    save_overlay(tmp_path / "overlay.png", black, info, HdMap((diamond_at(10, 0),)), np.zeros(2), views)
+    save_overlay(tmp_path / "overlay.png", black, info, HDMap((diamond_at(10, 0),)), np.zeros(2), views)
     drawn = cv2.imread(str(tmp_path / "overlay.png"))
     assert len(drawn) > 480  # the legend stands below
     drawn = drawn[:480].any(axis=2)
@@ -124,7 +124,7 @@ def test_the_overlay_draws_the_marking_where_the_camera_sees_it(tmp_path):
 def test_before_and_after_differ_in_dashes_and_not_in_colour_alone(tmp_path):
     drive, truth = make_truth()
     info = drive.cameras["front"].info
-    lane = HdMap((), truth.map.lanes)
+    lane = HDMap((), truth.map.lanes)
     view = partial(apply_in_front, np.linalg.inv(ipm_from_extrinsic(info, mounted([0, 0, 2]))))
     covered = {}
     for name in ("ENI", "Opt"):

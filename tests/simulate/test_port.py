@@ -219,8 +219,8 @@ def test_the_stated_drift_is_that_of_the_recorded_positions():
     assert stated.heading_drift_over_m == config.speed_mps * disturbance.heading_correlation_s
 
 
-def test_another_visit_finds_the_same_paint_under_other_noise():
-    first, second = build_port(tiny_port()), build_port(tiny_port(visit=1))
+def test_another_session_finds_the_same_paint_under_other_noise():
+    first, second = build_port(tiny_port()), build_port(tiny_port(session=1))
     for one, other in zip(first.hd_map.markings, second.hd_map.markings, strict=True):
         np.testing.assert_array_equal(one.corners_map, other.corners_map)
     assert not np.allclose(first.driven.map_from_vehicle, second.driven.map_from_vehicle, atol=1e-6)

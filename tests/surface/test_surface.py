@@ -23,7 +23,7 @@ from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.io.maps.formats import write_map
 from v2hdm.mapping.methods import run_methods
-from v2hdm.records import HdMap, PoseNoise, Road
+from v2hdm.records import HDMap, PoseNoise, Road
 from v2hdm.report.metrics import driven_past, map_figures
 from v2hdm.simulate.port.config import PortConfig, ReliefConfig
 from v2hdm.store.files import load_json, write_json
@@ -113,8 +113,8 @@ def test_a_vehicle_that_stands_backs_up_or_comes_again_keeps_its_left():
     waits = there[[19] * 15]
     waits[:, :2, 3] += rng.normal(0.0, 0.01, (15, 2))
     poses = np.concatenate([there[:20], waits, there[19:5:-1], there[5:], there])
-    visit = np.repeat([0, 1], [len(poses) - len(there), len(there)])
-    paths = Paths.of(poses, visit)
+    session = np.repeat([0, 1], [len(poses) - len(there), len(there)])
+    paths = Paths.of(poses, session)
     frame = rng.integers(0, len(poses), 300)
     off = rng.uniform(-6, 6, 300)
     beside = poses[frame, :2, 3] + off[:, None] * poses[frame, :2, 1]
@@ -176,7 +176,7 @@ def test_a_surface_read_back_shows_from_any_pose_what_the_plane_would(tmp_path):
         {"points_map": "far"},
         {"parameters": [np.nan]},
         {"ahead": None},
-        {"visit_ends": [[0.0, 1.0]]},
+        {"session_ends": [[0.0, 1.0]]},
     ],
 )
 def test_a_damaged_ground_is_named(damage):
@@ -263,7 +263,7 @@ def test_the_ground_of_a_map_is_the_same_in_files(tmp_path):
     smooth = np.concatenate([0 * SHAPE, (0.3 * np.sin(along / 2) + 0.1 * np.cos(across / 2)).ravel()])
     surface = replace(flat, parameters=smooth, covariance=1e-4 * np.eye(len(smooth)), datum_m=80.0)
     strips = surface.strips()
-    paths = write_map(HdMap((), ground=strips), tmp_path, "map", ["geotiff", "opencrg"])
+    paths = write_map(HDMap((), ground=strips), tmp_path, "map", ["geotiff", "opencrg"])
     spots = np.concatenate([strips[0].points(d)[5:-5:4] for d in (-6.1, 0.2, 5.3)])
     true, sigma = surface.height_m(spots)
     assert np.ptp(true) > 0.3
@@ -277,7 +277,7 @@ def test_the_ground_of_a_map_is_the_same_in_files(tmp_path):
 
 
 def test_a_map_over_a_plane_gets_no_file_of_its_ground_and_is_told_so(tmp_path, caplog):
-    assert write_map(HdMap(()), tmp_path, "map", ["opencrg"]) == []
+    assert write_map(HDMap(()), tmp_path, "map", ["opencrg"]) == []
     assert "map_ground.crg is not written: the map holds no ground surface" in caplog.text
     assert not list(tmp_path.iterdir())
 

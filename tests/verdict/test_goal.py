@@ -19,7 +19,7 @@ from v2hdm.mapping.results import AdjustedPoses, MethodResult
 from v2hdm.pipeline.config import RunConfig, check_choice
 from v2hdm.pipeline.map_drive import map_drive
 from v2hdm.pipeline.run import RunResult
-from v2hdm.records import Calibration, Exclusion, HdMap
+from v2hdm.records import Calibration, Exclusion, HDMap
 from v2hdm.site.candidates import TOO_UNCERTAIN
 from v2hdm.verdict import Finding, Status, Verdict
 from v2hdm.verdict.results.accuracy import _corner_radii_m, check_goal, ground_ahead
@@ -42,7 +42,7 @@ def mapped(markings, calibration=None, position_m=0.003):
     sigma, seen = np.full((5, 6), position_m), np.ones(5, dtype=bool)
     poses = AdjustedPoses(np.arange(5.0), still, still, sigma, seen, {}, np.zeros(5, dtype=np.int64))
     calibrations = {"front": calibration or calibrated()}
-    return MethodResult("Opt", ("front",), HdMap(tuple(markings)), calibrations, poses=poses)
+    return MethodResult("Opt", ("front",), HDMap(tuple(markings)), calibrations, poses=poses)
 
 
 def judged(one, goal_m=0.05):

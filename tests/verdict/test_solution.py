@@ -13,7 +13,7 @@ from tests.report.yard import SURVEY_M, checked, point, yard
 from tests.verdict.drives import INFO, square_at
 from v2hdm.faults import Fault
 from v2hdm.mapping.results import CameraFit, Contradiction, MethodResult, SolveEvidence
-from v2hdm.records import Calibration, Exclusion, GroundStrip, HdMap
+from v2hdm.records import Calibration, Exclusion, GroundStrip, HDMap
 from v2hdm.site.candidates import LACKS_A_CORNER
 from v2hdm.verdict import Finding, Status, Verdict
 from v2hdm.verdict.results.accuracy import SIGNIFICANCE, check_frame, check_goal, check_points
@@ -48,7 +48,7 @@ def drive():
 
 
 def result(evidence=FINE, *markings, **changes):
-    mapped = HdMap(markings or tuple(square_at(3.0 * n, 0.0) for n in range(12)))
+    mapped = HDMap(markings or tuple(square_at(3.0 * n, 0.0) for n in range(12)))
     return replace(MethodResult("Opt", ("front", "rear"), mapped, evidence=evidence), **changes)  # type: ignore[arg-type]
 
 
@@ -173,7 +173,7 @@ def test_an_input_that_may_well_be_wrong_is_a_warning(sigmas, is_told, drive):
 def test_a_bend_of_the_recorded_heights_matters_as_the_map_s_ground_says(recorded, is_curved, is_tried):
     grid = np.zeros((2, 2))
     strip = GroundStrip(grid, grid, 0.5, np.zeros(2), grid, grid)
-    mapped = replace(result(), hd_map=HdMap((), ground=(strip,) * is_curved))
+    mapped = replace(result(), hd_map=HDMap((), ground=(strip,) * is_curved))
     bends = Finding("road", recorded, 2.0, 1.0, "deg", "the ground bends by 0.2 m", "poses")
     (answer,) = over_ground([bends], mapped, is_tried)
     is_fine = is_curved or (is_tried and recorded is Status.WARN)

@@ -67,7 +67,7 @@ class Arrays:
         measured: (2, K) the observation at depth 1.
         root_information: (3, K) a, b, c of the whitened residual (a dx, b dx + c dy), dx at depth 1.
         vehicle_from_map: (J, 4, 4) as recorded.
-        visit: (J,) session of each frame.
+        session: (J,) session of each frame.
         states: column of the frame tangent of each state. An error with a drift beside its white part
             has two states on one column.
         centre, centre_information_root: (C, 3) prior on the camera centres, and 1 / sigma.
@@ -91,7 +91,7 @@ class Arrays:
     measured: Tensor
     root_information: Tensor
     vehicle_from_map: Tensor
-    visit: Tensor
+    session: Tensor
     states: tuple[int, ...]
     centre: Tensor
     centre_information_root: Tensor

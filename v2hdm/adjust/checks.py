@@ -202,7 +202,7 @@ def _check_priors(problem: Problem) -> None:
     if problem.read_out_s is not None:
         said = "read_out_s of camera {} is {} s: give 0 (all rows at once) or more"
         _refuse(problem.read_out_s < 0, said, problem.read_out_s)
-    _check_visits(problem)
+    _check_sessions(problem)
     for one in problem.pose_sigmas:
         sigma = one.by_state()
         if not (np.isfinite(sigma).all() and (sigma > 0).all()):
@@ -214,11 +214,11 @@ def _check_priors(problem: Problem) -> None:
                 )
 
 
-def _check_visits(problem: Problem) -> None:
-    visit = problem.visit_of_frame
-    if visit.shape != (len(problem.map_from_vehicle),) or (np.diff(visit, prepend=0) < 0).any():
-        raise AdjustError("visit must number each frame's session, from 0 and rising along the frames")
-    if visit.max(initial=0) >= len(problem.pose_sigmas):
+def _check_sessions(problem: Problem) -> None:
+    session = problem.session_of_frame
+    if session.shape != (len(problem.map_from_vehicle),) or (np.diff(session, prepend=0) < 0).any():
+        raise AdjustError("session must number each frame's session, from 0 and rising along the frames")
+    if session.max(initial=0) >= len(problem.pose_sigmas):
         raise AdjustError(
-            f"visit {visit.max()} has no pose_sigma: give one for all sessions, or one for each"
+            f"session {session.max()} has no pose_sigma: give one for all sessions, or one for each"
         )

@@ -59,7 +59,7 @@ def state_prior(problem: Problem, pose_states: tuple[str, ...]) -> tuple[IntArra
     (Gelb, Applied Optimal Estimation, section 3.8). Returns the tangent's column (S,) of each, the transition
     (J, S, S) and the inverse sigma (J, S) of its innovation.
     """
-    poses, visit = problem.map_from_vehicle, problem.visit_of_frame
+    poses, session = problem.map_from_vehicle, problem.session_of_frame
     chosen = [k for k, name in enumerate(POSE_STATES) if name in pose_states]
     if not chosen:
         return np.zeros(0, dtype=np.int64), np.zeros((len(poses), 0, 0)), np.zeros((len(poses), 0))
@@ -75,13 +75,13 @@ def state_prior(problem: Problem, pose_states: tuple[str, ...]) -> tuple[IntArra
     memory = np.zeros((len(poses), len(columns)))
     fades = np.arange(len(columns)) >= len(scattering)
     # A standing vehicle repeats its error; a floor on the step keeps the innovation's sigma above 0.
-    faded = np.exp(-np.maximum(step_m[:, None] / over_m[visit][1:, fading], MIN_STEP))
-    memory[1:, fades] = (np.diff(visit) == 0)[:, None] * faded
+    faded = np.exp(-np.maximum(step_m[:, None] / over_m[session][1:, fading], MIN_STEP))
+    memory[1:, fades] = (np.diff(session) == 0)[:, None] * faded
     turn = np.tile(np.eye(6), (max(len(poses) - 1, 0), 1, 1))
     turn[:, :2, :2] = poses[1:, :2, :2].transpose(0, 2, 1) @ poses[:-1, :2, :2]
     transition = np.zeros((len(poses), len(columns), len(columns)))
     transition[1:] = memory[1:, :, None] * turn[:, columns][:, :, columns] * fades
-    return columns, transition, 1 / (sigma[visit] * np.sqrt(1 - memory**2))
+    return columns, transition, 1 / (sigma[session] * np.sqrt(1 - memory**2))
 
 
 _MOST_JOINED = 256  # most corners joined by known lengths: time grows with the cube, memory the square
@@ -130,7 +130,7 @@ def make_arrays(
         measured=real(measured),
         root_information=real(root),
         vehicle_from_map=real(inverse(problem.map_from_vehicle)),
-        visit=index(np.asarray(problem.visit_of_frame, dtype=np.int64)),
+        session=index(np.asarray(problem.session_of_frame, dtype=np.int64)),
         states=tuple(states.tolist()),
         centre=real(centre),
         centre_information_root=real(centre_root),
@@ -211,8 +211,8 @@ def _clock_twist(problem: Problem, clock_offset: bool) -> tuple[FloatArray, list
     """Twists (J, 6, Q), one column per session if clock offsets are estimated; prior sigmas."""
     if not clock_offset or problem.twist_vehicle is None:
         return np.zeros((len(problem.map_from_vehicle), 6, 0)), []
-    own = problem.visit_of_frame[:, None] == np.arange(problem.visit_count)
-    sigma_s = problem.visit_count * [problem.clock_sigma_s]
+    own = problem.session_of_frame[:, None] == np.arange(problem.session_count)
+    sigma_s = problem.session_count * [problem.clock_sigma_s]
     return np.asarray(problem.twist_vehicle[:, :, None] * own[:, None]), sigma_s
 
 

@@ -180,7 +180,7 @@ class Problem:
     for clock offsets, whose prior sigma is ``clock_sigma_s``. ``read_out_s`` (C,) are the stated read-out
     times, None for global shutters; their prior sigma is ``read_out_sigma_s``. ``control`` are surveyed
     corners: they alone separate a shift of the whole map from the drift of GNSS. ``lengths`` are known
-    distances. ``visit`` (J,) numbers the session of each frame, from 0 and rising; ``pose_sigma`` is one for
+    distances. ``session`` (J,) numbers the session of each frame, from 0 and rising; ``pose_sigma`` is one for
     all sessions or one per session.
 
     >>> problem = build_problem(port, result.detections)
@@ -203,7 +203,7 @@ class Problem:
     read_out_sigma_s: float = READ_OUT_SIGMA_S
     control: ControlPoints | None = None
     lengths: KnownLengths | None = None
-    visit: IntArray | None = None
+    session: IntArray | None = None
 
     def seen_by(self, observations: Observations) -> tuple[Problem, IntArray, IntArray]:
         """The problem of the cameras and frames of ``observations``, and their indices (C,), (J,) here.
@@ -213,7 +213,7 @@ class Problem:
         cameras, camera = np.unique(observations.camera, return_inverse=True)
         frames, frame = np.unique(observations.frame, return_inverse=True)
         of_cameras = "intrinsic", "cam_from_vehicle", "centre_vehicle", "centre_sigma_m", "read_out_s"
-        of_frames = "map_from_vehicle", "twist_vehicle", "visit"
+        of_frames = "map_from_vehicle", "twist_vehicle", "session"
         rows = dict.fromkeys(of_cameras, cameras) | dict.fromkeys(of_frames, frames)
         own = {name: getattr(self, name)[at] for name, at in rows.items() if getattr(self, name) is not None}
         seen = replace(observations, camera=camera, frame=frame)
@@ -222,22 +222,22 @@ class Problem:
         return replace(self, observations=seen, corner_count=count, **own), cameras, frames
 
     @property
-    def visit_of_frame(self) -> IntArray:
+    def session_of_frame(self) -> IntArray:
         """Session (J,) of each frame."""
-        return np.zeros(len(self.map_from_vehicle), dtype=np.int64) if self.visit is None else self.visit
+        return np.zeros(len(self.map_from_vehicle), dtype=np.int64) if self.session is None else self.session
 
     @property
-    def visit_count(self) -> int:
+    def session_count(self) -> int:
         """Number of sessions."""
         if not isinstance(self.pose_sigma, PoseSigma):
             return len(self.pose_sigma)
-        return int(self.visit_of_frame.max(initial=0)) + 1
+        return int(self.session_of_frame.max(initial=0)) + 1
 
     @property
     def pose_sigmas(self) -> tuple[PoseSigma, ...]:
         """Standard deviations of each session's recorded poses."""
         one = self.pose_sigma
-        return self.visit_count * (one,) if isinstance(one, PoseSigma) else one
+        return self.session_count * (one,) if isinstance(one, PoseSigma) else one
 
 
 @dataclass(kw_only=True)

@@ -67,7 +67,7 @@ def restrict(problem: Problem, keep: BoolArray) -> tuple[Problem, IntArray]:
         corner_count=len(corners),
         corners_start=None if start is None else start[corners],
         twist_vehicle=None if twist is None else twist[used],
-        visit=None if problem.visit is None else problem.visit[used],
+        session=None if problem.session is None else problem.session[used],
         control=control,
         lengths=lengths,
     )
@@ -183,7 +183,7 @@ def predicted_squared(
     first = int(whole.observations.frame[~held_out].min())
     vehicle_from_map = np.linalg.inv(solution.map_from_vehicle)[frame - first]
     if fitted.twist_vehicle is not None:
-        late_s = solution.clock_offset_s[camera, fitted.visit_of_frame[frame - first]]
+        late_s = solution.clock_offset_s[camera, fitted.session_of_frame[frame - first]]
         if seen.row_share is not None:
             late_s = late_s + solution.read_out_s[camera] * seen.row_share[held_out]
         moved = fitted.twist_vehicle[frame - first] * late_s[:, None]
@@ -332,12 +332,12 @@ def _scales(problem: Problem, drawn: FloatArray, name: str) -> _Scales:
 
 def _autocorrelation(problem: Problem, errors: FloatArray) -> tuple[FloatArray, float, float]:
     """Autocorrelation of errors (D, J, a) at lags of 0, 1, 2 ... steps, the step, m, and the path, m."""
-    poses, visit = problem.map_from_vehicle, problem.visit_of_frame
+    poses, session = problem.map_from_vehicle, problem.session_of_frame
     products, counts, path_m = np.zeros(0), np.zeros(0), 0.0
-    moved = np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1)[np.diff(visit) == 0]
+    moved = np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1)[np.diff(session) == 0]
     moved = moved[moved > _LEAST_STEP_M]
     step_m = float(np.median(moved)) if len(moved) else _LEAST_STEP_M
-    for own in (visit == number for number in range(problem.visit_count)):
+    for own in (session == number for number in range(problem.session_count)):
         place = length_along(poses[own][:, :2, 3])
         grid = np.arange(0.0, place[-1] + step_m / 2, step_m)
         nearest = np.rint(np.interp(grid, place, np.arange(len(place)))).astype(np.int64)

@@ -231,7 +231,7 @@ def _report(
         residual_px=residual_px,
         mahalanobis2=mahalanobis2,
         verdict=classify(problem.observations, mahalanobis2, behind, options.gate_probability, scale),
-        clock_offset_s=clock_s if clock_s.size else np.zeros((len(clock_s), problem.visit_count)),
+        clock_offset_s=clock_s if clock_s.size else np.zeros((len(clock_s), problem.session_count)),
         read_out_s=read_out_s,
         cost_terms=terms,
         evaluations=descent.evaluations + spent,

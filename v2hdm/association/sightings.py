@@ -127,7 +127,7 @@ class Sightings:
     """S quadrilateral detections of a drive, by image; simultaneous images share a frame."""
 
     cameras: tuple[str, ...]
-    stamp_s: FloatArray  # (F,) distinct times, sorted by visit, then time
+    stamp_s: FloatArray  # (F,) distinct times, sorted by session, then time
     map_from_vehicle: FloatArray  # (F, 4, 4) as recorded
     image: IntArray  # (S,) indices into ``Drive.images``
     camera: IntArray  # (S,) into ``cameras``
@@ -137,7 +137,7 @@ class Sightings:
     covariance_px: FloatArray  # (S, 4, 2, 2), px^2
     valid: BoolArray  # (S, 4) corners that are points: small in every direction
     kinds: tuple[str, ...]
-    visit: IntArray  # (F,) as in ``Image.visit``
+    session: IntArray  # (F,) as in ``Image.session``
     row_share: FloatArray  # (S, 4) read-out time of the corners' rows, see :func:`row_shares`
     log_odds: FloatArray  # (S,) log-odds of being a marking, from the detector
     symbols: Symbols = NO_SYMBOLS  # of the same images
@@ -164,18 +164,18 @@ class Frames:
     """Distinct times of sessions and the recorded poses, (F,) each, indexed by ``frame_of_image`` (I,)."""
 
     frame_of_image: IntArray
-    visit: IntArray
+    session: IntArray
     stamp_s: FloatArray
     map_from_vehicle: FloatArray
 
 
 def frames_of(drive: Drive) -> Frames:
     """Number the distinct times of ``drive``; simultaneous images of one session share a frame."""
-    taken = np.array([(image.visit, image.taken_s) for image in drive.images])
+    taken = np.array([(image.session, image.taken_s) for image in drive.images])
     distinct, first, inverse = np.unique(taken, axis=0, return_index=True, return_inverse=True)
     poses = np.stack([drive.images[i].map_from_vehicle for i in first])
-    frame, visit = inverse.ravel().astype(np.int64), distinct[:, 0].astype(np.int64)
-    return Frames(frame, visit, distinct[:, 1], poses.astype(np.float64))
+    frame, session = inverse.ravel().astype(np.int64), distinct[:, 0].astype(np.int64)
+    return Frames(frame, session, distinct[:, 1], poses.astype(np.float64))
 
 
 def collect_sightings(
@@ -226,7 +226,7 @@ def collect_sightings(
         covariance_px=covariance,
         valid=valid,
         kinds=kinds,
-        visit=frames.visit,
+        session=frames.session,
         row_share=row_share,
         log_odds=logit(np.clip([marking.score for _, marking in rows], 1e-4, 1 - 1e-4)),
         symbols=symbols,

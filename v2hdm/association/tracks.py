@@ -104,7 +104,7 @@ class _Linker:
         """Whether ``track`` may still be continued by the sighting at ``row``."""
         now, last = self._sightings.frame[[row, track.row]]
         gap_m = self._odometer_m[now] - self._odometer_m[last]
-        return bool(self._sightings.visit[now] == self._sightings.visit[last] and gap_m <= _MAX_GAP_M)
+        return bool(self._sightings.session[now] == self._sightings.session[last] and gap_m <= _MAX_GAP_M)
 
     def match(self, tracks: list[_Track], rows: IntArray) -> dict[int, tuple[_Track, int]]:
         """Track and corner shift of each row that continues a track."""

@@ -24,7 +24,7 @@ from v2hdm.pipeline.inspect import inspect_each
 from v2hdm.pipeline.map_drive import read_all
 from v2hdm.pipeline.stages import camera_sets, detect_in_pieces, map_camera_sets
 from v2hdm.progress import Progress
-from v2hdm.records import DIAMOND, Drive, FloatArray, HdMap, IntArray, Marking, Truth
+from v2hdm.records import DIAMOND, Drive, FloatArray, HDMap, IntArray, Marking, Truth
 from v2hdm.report.metrics import corner_errors, driven_past, marking_metrics, match_markings, rms
 from v2hdm.report.terminal import METHODS
 from v2hdm.simulate import rendered_drive
@@ -151,7 +151,7 @@ def _passed(true: tuple[Marking, ...], route_map: FloatArray) -> IntArray:
     return np.asarray(away_m.argmin(axis=1))
 
 
-def _matched(hd_map: HdMap, true: tuple[Marking, ...], passed: IntArray) -> Matched:
+def _matched(hd_map: HDMap, true: tuple[Marking, ...], passed: IntArray) -> Matched:
     mapped, other = (np.array(i, dtype=np.int64) for i in match_markings(hd_map.markings, true))
     order = np.argsort(passed[other], kind="stable")
     mapped, other = mapped[order], other[order]
@@ -159,7 +159,7 @@ def _matched(hd_map: HdMap, true: tuple[Marking, ...], passed: IntArray) -> Matc
     return Matched(other, errors.reshape(-1, 4, 2))
 
 
-def _row(hd_map: HdMap, truth: Truth, expected: np.ndarray, matched: Matched, shared: set[int]) -> Row:
+def _row(hd_map: HDMap, truth: Truth, expected: np.ndarray, matched: Matched, shared: set[int]) -> Row:
     overall = marking_metrics(hd_map, truth, expected)
     diamonds = marking_metrics(hd_map, truth, expected, DIAMOND)
     errors = matched.errors_m.reshape(-1, 2)

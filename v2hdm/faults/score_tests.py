@@ -228,9 +228,9 @@ def _hypotheses(problem: Problem, arrays: Arrays) -> Iterator[_Hypothesis]:
     cameras, changes = range(arrays.camera_count), _changes(arrays)
     for camera in [*([-1] if arrays.camera_count > 1 else []), *cameras]:
         if problem.twist_vehicle is not None:
-            for visit in range(problem.visit_count) if problem.visit_count > 1 else [-1]:
-                own = (problem.visit_of_frame == visit) | (visit < 0)
-                yield _Hypothesis(Fault.CLOCK, _moving(_late, problem, camera, own), camera, item=visit)
+            for session in range(problem.session_count) if problem.session_count > 1 else [-1]:
+                own = (problem.session_of_frame == session) | (session < 0)
+                yield _Hypothesis(Fault.CLOCK, _moving(_late, problem, camera, own), camera, item=session)
         yield _Hypothesis(Fault.FOCAL, partial(_lens, camera, 0), camera)
         yield _Hypothesis(Fault.DISTORTION, partial(_lens, camera, 1), camera)
         for axis in (0, 1):
@@ -356,7 +356,7 @@ def _changes(arrays: Arrays) -> list[int]:
     """Candidate frames of a change: about a dozen, evenly spread over the segments of all sessions."""
     stretch = stretches(arrays)
     begins = (stretch.diff() > 0).nonzero()[:, 0] + 1
-    within = [int(j) for j in begins if arrays.visit[j] == arrays.visit[j - 1]]
+    within = [int(j) for j in begins if arrays.session[j] == arrays.session[j - 1]]
     return within[1 :: max(_STRETCHES_PER_CHANGE, -(-len(within) // _MOST_CHANGES))]
 
 
@@ -395,8 +395,8 @@ def _knock(camera: int, axis: int, frame: int, arrays: Arrays, out: Tensor) -> T
 
 def _since(arrays: Arrays, frame: int) -> Tensor:
     """1 for the frames (J, 1) from ``frame`` to the end of its session, else 0."""
-    later = torch.arange(arrays.frame_count, device=arrays.visit.device) >= frame
-    return (later & (arrays.visit == arrays.visit[frame])).to(arrays.centre.dtype)[:, None]
+    later = torch.arange(arrays.frame_count, device=arrays.session.device) >= frame
+    return (later & (arrays.session == arrays.session[frame])).to(arrays.centre.dtype)[:, None]
 
 
 def _crown(axis: int, solved: Sensitivity) -> Rows:

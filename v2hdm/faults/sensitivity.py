@@ -189,9 +189,9 @@ def stretches(arrays: Arrays) -> Tensor:
     """Segment (J,) of the route of each frame; the segments of a session have equal lengths."""
     ahead = arrays.vehicle_from_map.inverse()[:, :2, 3].diff(dim=0).norm(dim=1)
     path = torch.cat([ahead.new_zeros(1), ahead.cumsum(0)])
-    out, count = torch.zeros_like(arrays.visit), 0
-    for visit in range(int(arrays.visit.max()) + 1):
-        own = arrays.visit == visit
+    out, count = torch.zeros_like(arrays.session), 0
+    for session in range(int(arrays.session.max()) + 1):
+        own = arrays.session == session
         along = path[own] - path[own].min()
         share = along / along.max().clamp(min=1e-9)
         out[own] = count + (share * STRETCHES).long().clamp(max=STRETCHES - 1)

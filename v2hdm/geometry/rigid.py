@@ -207,11 +207,11 @@ def interpolate(
 
 def in_order(image: Image) -> tuple[int, float, str]:
     """Key by which a drive's images are sorted."""
-    return image.visit, image.taken_s, image.camera
+    return image.session, image.taken_s, image.camera
 
 
 def with_clock_offsets(
-    drive: Drive, offset_s: Mapping[str, float], max_gap_s: float, visit: int = 0
+    drive: Drive, offset_s: Mapping[str, float], max_gap_s: float, session: int = 0
 ) -> Drive:
     """The drive with images of a session re-posed by its cameras' clock offsets.
 
@@ -219,12 +219,12 @@ def with_clock_offsets(
     or in a gap above ``max_gap_s`` are left out. Raises DriveError without a trajectory, or if a camera keeps
     no image.
     """
-    root, trajectory = drive.visits[visit].root, drive.visits[visit].trajectory
+    root, trajectory = drive.sessions[session].root, drive.sessions[session].trajectory
     if trajectory is None:
         raise DriveError(f"{root}: holds no trajectory to pose its images anew from")
-    images: list[Image] = [image for image in drive.images if image.visit != visit]
-    for name in dict.fromkeys(image.camera for image in drive.images if image.visit == visit):
-        own = [image for image in drive.images if (image.visit, image.camera) == (visit, name)]
+    images: list[Image] = [image for image in drive.images if image.session != session]
+    for name in dict.fromkeys(image.camera for image in drive.images if image.session == session):
+        own = [image for image in drive.images if (image.session, image.camera) == (session, name)]
         if offset_s.get(name):
             taken_s = np.array([image.stamp_s + offset_s[name] for image in own])
             poses, inside = interpolate(trajectory, taken_s, max_gap_s)

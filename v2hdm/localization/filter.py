@@ -19,7 +19,7 @@ from v2hdm.geometry.ipm import (
 from v2hdm.geometry.least_squares import Normal, gauss_newton
 from v2hdm.geometry.planar import SHIFTS, align, block_diagonal
 from v2hdm.geometry.rigid import inverse, rotation_from_euler
-from v2hdm.records import BoolArray, FloatArray, HdMap, IntArray
+from v2hdm.records import BoolArray, FloatArray, HDMap, IntArray
 
 # Standard deviation of the acceleration that holds for a second: a yard truck brakes with 2 to 3 m/s^2.
 _ACCELERATION_M_S2 = 1.5
@@ -172,7 +172,7 @@ class Markings:
     ``shared_m2`` a coordinate, it is no noise between two of them.
     """
 
-    def __init__(self, hd_map: HdMap) -> None:
+    def __init__(self, hd_map: HDMap) -> None:
         self._corners = np.stack([marking.corners_map for marking in hd_map.markings])
         stated = [marking.covariance_m2 for marking in hd_map.markings]
         total = np.stack([_UNKNOWN_SIGMA_M**2 * np.eye(8) if one is None else one for one in stated])

@@ -24,7 +24,7 @@ from v2hdm.records import (
     Calibration,
     Drive,
     FloatArray,
-    HdMap,
+    HDMap,
     ImageDetections,
     IntArray,
     Trajectory,
@@ -110,7 +110,7 @@ class Localised:
 
 
 def localize(
-    hd_map: HdMap,
+    hd_map: HDMap,
     drive: Drive | str | Path,
     calibrations: Mapping[str, Calibration],
     *,
@@ -171,7 +171,7 @@ def localize(
     )
 
 
-def check_together(hd_map: HdMap, calibrations: Mapping[str, Calibration], drive: Drive) -> None:
+def check_together(hd_map: HDMap, calibrations: Mapping[str, Calibration], drive: Drive) -> None:
     """Refuse a map without markings, without a calibration of the drive's cameras, or of another frame."""
     if not hd_map.markings:
         raise MapFileError("the map has no markings; nothing can be localised in it")
@@ -202,7 +202,7 @@ def _seen(
 
 
 def _in_view(
-    drive: Drive, sightings: Sightings, hd_map: HdMap, calibrations: Mapping[str, Calibration]
+    drive: Drive, sightings: Sightings, hd_map: HDMap, calibrations: Mapping[str, Calibration]
 ) -> BoolArray:
     """In which frames (F,) a whole marking of the map is near and within an image, by the recorded poses."""
     cameras = [drive.cameras[name] for name in sightings.cameras]

@@ -35,14 +35,14 @@ from v2hdm.survey.match import match
 
 
 def vehicle_twists(
-    map_from_vehicle: FloatArray, stamp_s: FloatArray, visit: IntArray | None = None
+    map_from_vehicle: FloatArray, stamp_s: FloatArray, session: IntArray | None = None
 ) -> FloatArray:
-    """Vehicle twists (F, 6) in its own frame, m/s, rad/s, by central differences within each ``visit``."""
+    """Vehicle twists (F, 6) in its own frame, m/s, rad/s, by central differences within each ``session``."""
     own = np.arange(len(stamp_s))
     before, after = np.maximum(own - 1, 0), np.minimum(own + 1, len(own) - 1)
-    if visit is not None:
-        before = np.where(visit[before] == visit, before, own)
-        after = np.where(visit[after] == visit, after, own)
+    if session is not None:
+        before = np.where(session[before] == session, before, own)
+        after = np.where(session[after] == session, after, own)
     moved = inverse(map_from_vehicle[before]) @ map_from_vehicle[after]
     elapsed_s = stamp_s[after] - stamp_s[before]
     return np.asarray(log(moved) / np.where(elapsed_s > 0, elapsed_s, 1.0)[:, None])
@@ -266,8 +266,8 @@ def drive_problem(sightings: Sightings, rig: Rig, cameras: Mapping[str, Camera],
         centre_vehicle=centre,
         centre_sigma_m=sigma,
         pose_sigma=model.pose_sigma,
-        twist_vehicle=vehicle_twists(sightings.map_from_vehicle, sightings.stamp_s, sightings.visit),
-        visit=sightings.visit,
+        twist_vehicle=vehicle_twists(sightings.map_from_vehicle, sightings.stamp_s, sightings.session),
+        session=sightings.session,
         clock_sigma_s=model.clock_sigma_s,
         read_out_s=read_outs_s(stated),
     )

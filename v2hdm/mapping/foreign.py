@@ -41,8 +41,8 @@ def foreign_segment(
     # A miss counts less where markings at that distance are detected less often.
     counted = np.where(found, 1.0, _ease(found, views.camera[view], np.linalg.norm(apart, axis=1)))
     best = 0.0, 0.0, -np.inf
-    for visit in np.unique(sightings.visit):
-        frames, own = np.flatnonzero(sightings.visit == visit), sightings.visit[frame] == visit
+    for session in np.unique(sightings.session):
+        frames, own = np.flatnonzero(sightings.session == session), sightings.session[frame] == session
         own &= np.isin(group, group[own & found])
         if not own.any():
             continue

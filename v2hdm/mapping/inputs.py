@@ -56,12 +56,14 @@ class Inputs:
     def with_clocks(self, later_s: Sequence[Mapping[str, float]]) -> Inputs | None:
         """The inputs with images ``later_s`` later, by session and camera; None without trajectories."""
         drive = self.drive
-        if any(visit.trajectory is None for visit in drive.visits):
+        if any(session.trajectory is None for session in drive.sessions):
             return None
-        now_s, moved = {(image.visit, image.camera): image.clock_offset_s for image in drive.images}, drive
-        for visit, later in enumerate(later_s):
-            own = {name: now_s[visit, name] + late for name, late in later.items() if (visit, name) in now_s}
-            moved = with_clock_offsets(moved, own, max_gap_s=float("inf"), visit=visit)
+        now_s, moved = {(image.session, image.camera): image.clock_offset_s for image in drive.images}, drive
+        for session, later in enumerate(later_s):
+            own = {
+                name: now_s[session, name] + late for name, late in later.items() if (session, name) in now_s
+            }
+            moved = with_clock_offsets(moved, own, max_gap_s=float("inf"), session=session)
         number = {image.path: n for n, image in enumerate(moved.images)}
         detections = [
             replace(one, image=number[drive.images[one.image].path])

@@ -36,7 +36,7 @@ from v2hdm.mapping.optimise import silent
 from v2hdm.mapping.options import MappingOptions, check_options
 from v2hdm.mapping.recovery import Outcome, optimise
 from v2hdm.mapping.results import AdjustedPoses, ClockOffset, MethodResult
-from v2hdm.records import Drive, Exclusion, FloatArray, HdMap, Image, ImageDetections, IntArray, Lane, Marking
+from v2hdm.records import Drive, Exclusion, FloatArray, HDMap, Image, ImageDetections, IntArray, Lane, Marking
 from v2hdm.site.corrections import with_symbols_corrected
 from v2hdm.site.living.changes import Base, update_map
 from v2hdm.site.living.looks import Observer
@@ -46,7 +46,7 @@ from v2hdm.site.symbols import NO_POLYGON, map_symbols
 def adjusted_poses(outcome: Outcome) -> AdjustedPoses:
     """Poses of all frames of the drive."""
     drive, sightings, bundle = outcome.inputs.drive, outcome.inputs.sightings, outcome.bundle
-    sigma = np.stack([one.by_state() for one in bundle.model.pose_sigma])[sightings.visit]
+    sigma = np.stack([one.by_state() for one in bundle.model.pose_sigma])[sightings.session]
     used = bundle.frames
     if bundle.model.solver.pose_states:
         sigma[used] = np.sqrt(bundle.solution.covariance.poses() * bundle.solution.variance_scale)
@@ -60,25 +60,25 @@ def adjusted_poses(outcome: Outcome) -> AdjustedPoses:
         sigma=sigma,
         seen=seen,
         frame={image.path: int(frame) for image, frame in zip(drive.images, frames, strict=True)},
-        visit=sightings.visit,
+        session=sightings.session,
     )
 
 
 def clock_offsets(outcome: Outcome) -> tuple[dict[str, ClockOffset], ...]:
     """Clock offset of each camera by session: the images' earlier shift plus the solve's estimate, s."""
     evidence, drive = outcome.evidence, outcome.inputs.drive
-    applied_s = {(image.visit, image.camera): image.clock_offset_s for image in drive.images}
+    applied_s = {(image.session, image.camera): image.clock_offset_s for image in drive.images}
     score_tests = [one for one in evidence.score_tests if one.fault is Fault.CLOCK]
     out = []
-    for visit, (place, estimated) in enumerate(zip(drive.visits, evidence.clock_s, strict=True)):
+    for session, (place, estimated) in enumerate(zip(drive.sessions, evidence.clock_s, strict=True)):
         here, clocks = [one for one in score_tests if one.about in ("", f"in {place.name}")], {}
         for name in outcome.inputs.sightings.cameras:
             # A camera's own clock and one common to all cameras: the offset may differ by both.
             tested = [one.sigma**2 for one in here if name in one.cameras]
             unobserved = 0.0, float(np.sqrt(sum(tested))) if tested else float("inf")
             beyond_s, sigma_s = estimated.get(name, unobserved)
-            if (visit, name) in applied_s:
-                clocks[name] = ClockOffset(applied_s[visit, name] + beyond_s, sigma_s)
+            if (session, name) in applied_s:
+                clocks[name] = ClockOffset(applied_s[session, name] + beyond_s, sigma_s)
         out.append(clocks)
     return tuple(out)
 
@@ -195,7 +195,7 @@ def run_naive(name: str, inputs: Inputs, ipm: Mapping[str, FloatArray]) -> Metho
     return MethodResult(
         name=name,
         cameras=sightings.cameras,
-        hd_map=HdMap(tuple(markings), lanes, drive.origin),
+        hd_map=HDMap(tuple(markings), lanes, drive.origin),
         excluded=tuple(excluded),
     )
 
@@ -287,7 +287,7 @@ def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
     symbols, no_symbols = map_symbols(*given, options.acceptance)
     for kind, count in Counter(one.kind for one in no_symbols if one.reason == NO_POLYGON).items():
         _log.warning("class %s: %d left out: %s", kind, count, NO_POLYGON)
-    hd_map = HdMap(optimised.markings, lanes, drive.origin, symbols, noise.position_drift_over_m)
+    hd_map = HDMap(optimised.markings, lanes, drive.origin, symbols, noise.position_drift_over_m)
     if surface is not None:
         # A spline already contains the recorded heights.
         hd_map = with_heights(hd_map, None, surface.height_m)

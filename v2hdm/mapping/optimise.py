@@ -225,7 +225,7 @@ class Optimiser:
 
     def _better_ground(self, bundle: Bundle, surface: Surface | None) -> tuple[Surface, float, float]:
         """The most likely ground under ``bundle``, from ``surface`` or level, its gain, and its change, m."""
-        paths = Paths.of(bundle.rig.map_from_vehicle, self._seen.visit)
+        paths = Paths.of(bundle.rig.map_from_vehicle, self._seen.session)
         surface = Surface.level(paths) if surface is None else replace(surface, paths=paths)
         points_map = bundle.solution.corners_map[bundle.problem.observations.corner]
         columns = surface.seen_columns(points_map, self._seen.frame[bundle.row])
@@ -356,6 +356,6 @@ def rolling(rig: Rig, cameras: Iterable[Camera], sightings: Sightings, estimate:
     stated_s = read_outs_s(cameras)
     if stated_s is None and not estimate:
         return rig
-    twists = vehicle_twists(sightings.map_from_vehicle, sightings.stamp_s, sightings.visit)
+    twists = vehicle_twists(sightings.map_from_vehicle, sightings.stamp_s, sightings.session)
     read_out_s = np.zeros(len(rig.intrinsic)) if stated_s is None else stated_s
     return replace(rig, read_out_s=read_out_s, twist_vehicle=twists)

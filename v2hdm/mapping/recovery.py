@@ -178,7 +178,7 @@ def _frame_s(settled: Bundle, sightings: Sightings) -> FloatArray:
 
 def _session_names(drive: Drive) -> tuple[str, ...]:
     """Names of a joined drive's sessions; none for a single session."""
-    return tuple(visit.name for visit in drive.joined)
+    return tuple(session.name for session in drive.joined)
 
 
 def _is_stated(one: ScoreTest, bundle: Bundle, drive: Drive) -> bool:
@@ -263,8 +263,8 @@ def _clocks(bundle: Bundle) -> tuple[dict[str, tuple[float, float]], ...]:
     if not bundle.model.solver.clock_offset:
         return tuple({} for _ in offset_s)
     sigma_s = np.sqrt(bundle.solution.covariance.clock_s2()).T.tolist()[: len(offset_s)]
-    index, visits = bundle.camera_index.items(), zip(offset_s, sigma_s, strict=True)
-    return tuple({name: (off[c], sigma[c]) for name, c in index} for off, sigma in visits)
+    index, sessions = bundle.camera_index.items(), zip(offset_s, sigma_s, strict=True)
+    return tuple({name: (off[c], sigma[c]) for name, c in index} for off, sigma in sessions)
 
 
 def _read_outs(bundle: Bundle) -> dict[str, tuple[float, float]]:
@@ -299,13 +299,13 @@ def _recovered(inputs: Inputs, worst: ScoreTest, settled: Bundle) -> Inputs | No
 
 
 def _contradictions(
-    bundle: Bundle, found: Sequence[ScoreTest], sightings: Sightings, visits: Sequence[str] = ()
+    bundle: Bundle, found: Sequence[ScoreTest], sightings: Sightings, sessions: Sequence[str] = ()
 ) -> tuple[Contradiction, ...]:
-    """``found`` for the bundle's problem, in terms of the user's inputs; several ``visits`` are named."""
+    """``found`` for the bundle's problem, in terms of the user's inputs; several ``sessions`` are named."""
     frame_s = _frame_s(bundle, sightings)
     return tuple(
         Contradiction(
-            **vars(one), cameras=_cameras_of(bundle, one), about=_about(bundle, one, frame_s, visits)
+            **vars(one), cameras=_cameras_of(bundle, one), about=_about(bundle, one, frame_s, sessions)
         )
         for one in found
     )
@@ -342,11 +342,11 @@ def _factor(bundle: Bundle, mahalanobis2: FloatArray) -> float:
     return bundle.model.variance_factor * float(np.median(mahalanobis2)) / _MEDIAN_SQUARED
 
 
-def _about(bundle: Bundle, test: ScoreTest, frame_s: FloatArray, visits: Sequence[str]) -> str:
+def _about(bundle: Bundle, test: ScoreTest, frame_s: FloatArray, sessions: Sequence[str]) -> str:
     if test.fault in CHANGES:
         return f"from {frame_s[test.item]:.1f} s on"
-    if test.fault is Fault.CLOCK and test.item >= 0 and visits:
-        return f"in {visits[test.item]}"
+    if test.fault is Fault.CLOCK and test.item >= 0 and sessions:
+        return f"in {sessions[test.item]}"
     lengths = bundle.problem.lengths
     if test.fault is Fault.SIZE and lengths is not None:
         length_m = float(np.unique(lengths.length_m)[test.item])

@@ -16,7 +16,7 @@ from v2hdm.records import (
     Changes,
     Exclusion,
     FloatArray,
-    HdMap,
+    HDMap,
     Image,
     IntArray,
     JointCovariance,
@@ -77,7 +77,7 @@ class AdjustedPoses:
     sigma: FloatArray  # (F, 6) in vehicle axes, m and rad; as stated without markings
     seen: BoolArray  # (F,) whether a marking was seen
     frame: Mapping[Path, int]  # frame of each image, by its path
-    visit: IntArray  # (F,) session
+    session: IntArray  # (F,) session
 
     def of_image(self, image: Image) -> FloatArray:
         """Adjusted pose (4, 4) of an image; the recorded one if not in the solve."""
@@ -99,7 +99,7 @@ class MethodResult:
 
     name: str
     cameras: tuple[str, ...]
-    hd_map: HdMap
+    hd_map: HDMap
     calibrations: Mapping[str, Calibration] = field(default_factory=dict)  # empty for an IPM alone
     excluded: tuple[Exclusion, ...] = ()
     reprojection_rmse_px: float | None = None  # of accepted corners; None without reprojection

@@ -31,7 +31,7 @@ from v2hdm.mosaic.blend import (
     whole,
 )
 from v2hdm.progress import Steps
-from v2hdm.records import Drive, FloatArray, GeodeticOrigin, HdMap
+from v2hdm.records import Drive, FloatArray, GeodeticOrigin, HDMap
 from v2hdm.report import style
 from v2hdm.report.page.facts import read_cameras, read_surface
 from v2hdm.store.files import whole_file, write_json
@@ -42,7 +42,7 @@ _PANEL_IN = 5.2
 _BAR_M = 2.0
 
 
-def richest_place(drive: Drive, hd_map: HdMap) -> FloatArray:
+def richest_place(drive: Drive, hd_map: HDMap) -> FloatArray:
     """The image's pose (4, 4) about which the most paint was found, counted by the images that show it."""
     painted = [(m.corners_map, m.sightings) for m in hd_map.markings]
     painted += [(s.outline_map, s.sightings) for s in hd_map.symbols]

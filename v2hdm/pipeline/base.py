@@ -19,7 +19,7 @@ from v2hdm.io.maps.geojson import geojson_feature, geojson_positions, write_feat
 from v2hdm.io.maps.reading import read_geojson, read_verdict
 from v2hdm.io.trajectory import read_tum
 from v2hdm.pipeline.config import base_files
-from v2hdm.records import Change, Changes, Drive, Fate, HdMap, Image
+from v2hdm.records import Change, Changes, Drive, Fate, HDMap, Image
 from v2hdm.site.living.changes import Base
 
 _SITE_M = 40.0  # markings farther from a route are not seen from it: twice what a camera reaches
@@ -88,7 +88,7 @@ def _as_json(one: Change) -> dict[str, Any]:
     return {name: value.tolist() if hasattr(value, "tolist") else value for name, value in plain.items()}
 
 
-def write_changes(changes: Changes, hd_map: HdMap, folder: Path) -> None:
+def write_changes(changes: Changes, hd_map: HDMap, folder: Path) -> None:
     """Write ``changes.geojson``: a feature is an outline now, or that which it had if it is gone."""
     features = []
     for one in changes.changes:

@@ -135,7 +135,7 @@ def run_name(config: RunConfig) -> str:
 
 _KEYS_WITHIN: tuple[tuple[Within, str, str], ...] = (
     (Within(0, MOST_PROCESSES), "", "workers"),
-    (NOT_NEGATIVE, "", "cache_gb drive.start_s simulate.visit"),
+    (NOT_NEGATIVE, "", "cache_gb drive.start_s simulate.session"),
     (POSITIVE, "drive.", "max_gap_s end_s kitti.camera_height_m kitti.centre_sigma_m"),
     (COUNT, "drive.", "limit"),
     (SEED, "simulate.", "seed"),

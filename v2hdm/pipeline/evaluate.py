@@ -90,10 +90,10 @@ def _extrinsics(drive: Drive, methods: CameraSets, truth: Truth | None) -> dict[
 def _clocks(drive: Drive, optimised: MethodResult, camera: str) -> dict[str, Any]:
     """A camera's clock offset and its sigma; of joined drives one a drive, by its name."""
     offsets: dict[str, dict[str, float | None]] = {"clock_offset_s": {}, "clock_sigma_s": {}}
-    for visit, clocks in zip(drive.visits, optimised.clocks, strict=True):
+    for session, clocks in zip(drive.sessions, optimised.clocks, strict=True):
         if (clock := clocks.get(camera)) is not None:
-            offsets["clock_offset_s"][visit.name] = clock.value_s
-            offsets["clock_sigma_s"][visit.name] = clock.sigma_s if np.isfinite(clock.sigma_s) else None
+            offsets["clock_offset_s"][session.name] = clock.value_s
+            offsets["clock_sigma_s"][session.name] = clock.sigma_s if np.isfinite(clock.sigma_s) else None
     if drive.joined:
         return dict(offsets)
     return {key: value for key, by_name in offsets.items() for value in by_name.values()}

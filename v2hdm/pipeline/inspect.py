@@ -79,17 +79,17 @@ def join(inspections: Sequence[Inspection]) -> Inspection:
     given = join_drives([one.drive_as_described for one in inspections], moved)
     drive = replace(given, cameras=_started(given, inspections))
     ground, findings = [], []
-    for visit, one in zip(drive.joined, inspections, strict=True):
-        ground.append({visit.cameras[name]: estimate for name, estimate in one.ground[0].items()})
-        findings += [replace(finding, about=f"{finding.about} of {visit.name}") for finding in one.findings]
+    for session, one in zip(drive.joined, inspections, strict=True):
+        ground.append({session.cameras[name]: estimate for name, estimate in one.ground[0].items()})
+        findings += [replace(finding, about=f"{finding.about} of {session.name}") for finding in one.findings]
     return Inspection(drive, given.cameras, tuple(ground), tuple(findings))
 
 
 def _started(drive: Drive, inspections: Sequence[Inspection]) -> dict[str, Camera]:
-    """Each camera with the start that the ground gave it on the first visit where it did."""
+    """Each camera with the start that the ground gave it on the first session where it did."""
     started = dict(drive.cameras)
-    for visit, one in reversed(list(zip(drive.joined, inspections, strict=True))):
-        for own, name in visit.cameras.items():
+    for session, one in reversed(list(zip(drive.joined, inspections, strict=True))):
+        for own, name in session.cameras.items():
             camera = one.drive.cameras[own]
             if camera.initial_ipm == GROUND_IPM:
                 described = drive.cameras[name]

@@ -34,7 +34,7 @@ from v2hdm.pipeline.config import Contents, made_of_drives
 from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.evaluate import CameraSets
 from v2hdm.pipeline.stages import BEST
-from v2hdm.records import Calibration, Drive, FloatArray, HdMap, Image, ImageDetections, Trajectory
+from v2hdm.records import Calibration, Drive, FloatArray, HDMap, Image, ImageDetections, Trajectory
 from v2hdm.report.photos import save_overlay
 from v2hdm.store.cache import library_versions
 from v2hdm.store.files import replace_text, write_json
@@ -72,14 +72,14 @@ def write_trajectories(poses: AdjustedPoses, drive: Drive, folder: Path) -> None
     recorded ones, whose road is not flat: moved as the solve has moved the flat ones. ``seen`` says whether a
     marking was seen then; else pose and sigmas are those of the drive.
     """
-    for number, visit in enumerate(drive.visits):
-        own = poses.visit == number
-        stem = f"trajectory_{visit.name}" if drive.joined else "trajectory"
+    for number, session in enumerate(drive.sessions):
+        own = poses.session == number
+        stem = f"trajectory_{session.name}" if drive.joined else "trajectory"
         stamp_s, before = poses.stamp_s[own], poses.before[own]
         moved = np.linalg.inv(before) @ poses.map_from_vehicle[own]
-        recorded = before  # laid flat, where the visit has no others
-        if visit.recorded is not None:
-            recorded, _ = interpolate(visit.recorded, stamp_s, float("inf"))
+        recorded = before  # laid flat, where the session has no others
+        if session.recorded is not None:
+            recorded, _ = interpolate(session.recorded, stamp_s, float("inf"))
         write_tum(Trajectory(stamp_s, recorded @ moved), folder / f"{stem}.tum")
         rows = [
             f"{stamp:.9f},{int(seen)}," + ",".join(f"{value:.6g}" for value in sigma)
@@ -146,7 +146,7 @@ class Result:
         return list(self.methods.values())[-1][BEST]
 
     @property
-    def map(self) -> HdMap:
+    def map(self) -> HDMap:
         """The map, in the frame ``map``: m, its lane lines in the direction in which they were passed."""
         return _along_route(with_heights(self.best.hd_map, self.drive.road), self.drive)
 
@@ -259,7 +259,7 @@ def _write_map(folder: Path, result: Result, formats: Sequence[str], crs: str | 
 _BY_VERTEX = ("points_map", "heights_m", "sigma_m", "heights_sigma_m")
 
 
-def _along_route(hd_map: HdMap, drive: Drive) -> HdMap:
+def _along_route(hd_map: HDMap, drive: Drive) -> HDMap:
     """The map with every lane line in the direction in which the drive passed it: that of its lanelets."""
     route_map = drive.route_map
     ahead = np.array([image.map_from_vehicle[:2, 0] for image in drive.images])

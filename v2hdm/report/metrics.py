@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from v2hdm.catalogue import CORNERED_CLASSES
 from v2hdm.geometry.planar import inside_convex, length_along, points_along
 from v2hdm.geometry.rigid import camera_centre, ground_in_vehicle
-from v2hdm.records import DIAMOND, BoolArray, Drive, FloatArray, HdMap, Lane, Marking, Truth
+from v2hdm.records import DIAMOND, BoolArray, Drive, FloatArray, HDMap, Lane, Marking, Truth
 
 MATCH_GATE_M = 2.0  # a mapped marking farther from every true one of its class is false
 MIN_SIGHTINGS = 3  # images with the whole marking in the region of interest that count as driven past
@@ -56,7 +56,7 @@ def driven_past(drive: Drive, truth: Truth, cameras: Sequence[str]) -> BoolArray
 
 
 def marking_metrics(
-    hd_map: HdMap, truth: Truth, expected: BoolArray, kind: str | None = None
+    hd_map: HDMap, truth: Truth, expected: BoolArray, kind: str | None = None
 ) -> MarkingMetrics:
     """Compare markings of ``kind``, all if None, with the truth; see :class:`MarkingMetrics`."""
     mapped = [m for m in hd_map.markings if kind is None or m.kind == kind]
@@ -222,7 +222,7 @@ def _stack(pieces: Iterable[FloatArray]) -> FloatArray:
 _MAIN_REASONS = 3  # number of reasons for exclusion in a headline
 
 
-def map_figures(hd_map: HdMap, truth: Truth | None, expected: BoolArray | None) -> dict[str, Any]:
+def map_figures(hd_map: HDMap, truth: Truth | None, expected: BoolArray | None) -> dict[str, Any]:
     """Figures of one map: counts, and errors if there is ground truth.
 
     They are of all classes, except ``recall`` and ``expected``: of diamonds, the site's landmarks, where it

@@ -14,7 +14,7 @@ from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.planar import length_along, points_along
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.records import BoolArray, Camera, CameraInfo, FloatArray, HdMap
+from v2hdm.records import BoolArray, Camera, CameraInfo, FloatArray, HDMap
 from v2hdm.report.metrics import runs
 from v2hdm.report.style import OKABE_ITO
 from v2hdm.store.files import whole_file
@@ -262,7 +262,7 @@ def save_overlay(
     path: Path,
     image: np.ndarray,
     info: CameraInfo,
-    hd_map: HdMap,
+    hd_map: HDMap,
     position_map: FloatArray,
     views: Mapping[str, Callable[[FloatArray], FloatArray]],
 ) -> None:

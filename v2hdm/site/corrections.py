@@ -9,7 +9,7 @@ import numpy as np
 
 from v2hdm.geometry.planar import clip_convex, signed_area
 from v2hdm.io.maps.corrections import ACCEPTED, REJECTED, Correction
-from v2hdm.records import Exclusion, FloatArray, HdMap, IntArray
+from v2hdm.records import Exclusion, FloatArray, HDMap, IntArray
 from v2hdm.site.candidates import Candidates
 
 _SAME_M = 0.4  # largest distance, m, between a candidate's centre and the one that a person corrected
@@ -93,8 +93,8 @@ def overlap(a: FloatArray, b: FloatArray) -> float:
 
 
 def with_symbols_corrected(
-    hd_map: HdMap, corrections: Sequence[Correction]
-) -> tuple[HdMap, tuple[Exclusion, ...]]:
+    hd_map: HDMap, corrections: Sequence[Correction]
+) -> tuple[HDMap, tuple[Exclusion, ...]]:
     """The map with a person's corrections to its symbols, and the rejected symbols."""
     kept, out = [], []
     for symbol in hd_map.symbols:
@@ -112,7 +112,7 @@ def with_symbols_corrected(
     return replace(hd_map, symbols=tuple(kept)), tuple(out)
 
 
-def unmet(corrections: Sequence[Correction], hd_map: HdMap) -> list[str]:
+def unmet(corrections: Sequence[Correction], hd_map: HDMap) -> list[str]:
     """Corrections that found nothing at their position in a finished map."""
     corners = np.array([one.corners_map for one in hd_map.markings]).reshape(-1, 4, 2)
     missing = []

@@ -63,7 +63,7 @@ class PointViews:
             association.in_group_order(one)[rows]
             for one in (located.corners_map, located.ray_map, variance_factor * located.covariance_m2)
         )
-        by_visit = np.array([one.by_state() for one in pose_sigma])
+        by_session = np.array([one.by_state() for one in pose_sigma])
         return cls(
             group=association.group[rows],
             camera=sightings.camera[rows],
@@ -72,7 +72,7 @@ class PointViews:
             covariance_m2=covariance,
             used=used[rows],
             height_m=located.height_m[rows],
-            pose_sigma=by_visit[sightings.visit[sightings.frame[rows]]],
+            pose_sigma=by_session[sightings.session[sightings.frame[rows]]],
         )
 
 

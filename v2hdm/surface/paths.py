@@ -27,30 +27,30 @@ class Paths:
     bounds_m: FloatArray  # (F, 2) range of stations that a frame may see
     position_map: FloatArray  # (F, 2) m, the vehicle's
     heading: FloatArray  # (F, 2) unit vectors
-    visit_ends: FloatArray  # (V, 2) stations of each session's begin and end
+    session_ends: FloatArray  # (V, 2) stations of each session's begin and end
 
     @classmethod
-    def of(cls, map_from_vehicle: FloatArray, visit: IntArray) -> Paths:
+    def of(cls, map_from_vehicle: FloatArray, session: IntArray) -> Paths:
         """Paths of poses (F, 4, 4) of sessions (F,), each in driving order."""
         points, first = map_from_vehicle[:, :2, 3], [0]
         for frame in range(1, len(points)):
             last = first[-1]
-            if visit[frame] != visit[last] or np.hypot(*(points[frame] - points[last])) >= _STATION_M:
+            if session[frame] != session[last] or np.hypot(*(points[frame] - points[last])) >= _STATION_M:
                 first.append(frame)
         place = np.zeros(len(points), dtype=np.int64)
         place[first[1:]] = 1
         place = np.cumsum(place)
         at, ahead = points[first], map_from_vehicle[first][:, :2, 0]
-        step, begins = np.diff(at, axis=0), np.append(True, np.diff(visit[first]) != 0)
+        step, begins = np.diff(at, axis=0), np.append(True, np.diff(session[first]) != 0)
         # A gap between sessions keeps each out of the ground of the next.
         way_m = np.where(begins[1:], 2 * AHEAD_M, np.linalg.norm(step, axis=1))
         station = np.concatenate([[0.0], np.cumsum(way_m)])
         # A place has the sense of the step before it, at a session's start of the step after it.
         forwards = np.where(np.einsum("ni,ni->n", step, ahead[1:]) < 0, -1.0, 1.0)
         sense = np.where(begins, np.append(forwards, 1.0), np.append(1.0, forwards))
-        span = {v: station[visit[first] == v][[0, -1]] for v in np.unique(visit).tolist()}
+        span = {v: station[session[first] == v][[0, -1]] for v in np.unique(session).tolist()}
         here = station[place][:, None] + np.array([-AHEAD_M, AHEAD_M])
-        bounds = np.clip(here, *np.array([span[v] for v in visit.tolist()]).T[:, :, None])
+        bounds = np.clip(here, *np.array([span[v] for v in session.tolist()]).T[:, :, None])
         forward = map_from_vehicle[:, :2, 0]
         heading, spans = forward / np.linalg.norm(forward, axis=1, keepdims=True), np.array([*span.values()])
         return cls(place, at, heading[first], sense, station, bounds, points, heading, spans)
@@ -93,7 +93,7 @@ class Paths:
         passed = cKDTree(np.hstack([self.points_map, _TURN_M * self.ahead]))
         _, place = passed.query(np.hstack([position, _TURN_M * ahead]))
         station = self.station_m[place]
-        ends = self.visit_ends[np.searchsorted(self.visit_ends[:, 1], station)]
+        ends = self.session_ends[np.searchsorted(self.session_ends[:, 1], station)]
         bounds = np.clip(station[:, None] + np.array([-AHEAD_M, AHEAD_M]), ends[:, :1], ends[:, 1:])
         return replace(self, place=place, bounds_m=bounds, position_map=position, heading=ahead)
 

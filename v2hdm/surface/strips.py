@@ -10,7 +10,7 @@ import numpy as np
 from v2hdm.errors import ConfigError, MapFileError, need
 from v2hdm.geometry.geodetic import crs_of
 from v2hdm.geometry.planar import cross
-from v2hdm.records import FloatArray, GroundStrip, HdMap
+from v2hdm.records import FloatArray, GroundStrip, HDMap
 from v2hdm.safe.pixels import check_raster
 from v2hdm.store.files import whole_file
 
@@ -19,7 +19,7 @@ _MOST_CELLS = 4e6  # of the rectangle about a map; beyond, cells are larger
 _NOTHING = -9999.0
 
 
-def write_ground_geotiff(hd_map: HdMap, path: Path) -> None:
+def write_ground_geotiff(hd_map: HDMap, path: Path) -> None:
     """Write the ground as GeoTIFF, heights above the origin and sigmas, m; the surer of two strips counts."""
     rasterio = need("rasterio", "gis", "the format geotiff", ConfigError)
     edges = np.concatenate([one.points(m) for one in hd_map.ground for m in one.left_m[[0, -1]].tolist()])
@@ -68,7 +68,7 @@ def _sampled(strip: GroundStrip, cells: FloatArray) -> FloatArray:
     return out
 
 
-def write_opencrg(hd_map: HdMap, path: Path) -> None:
+def write_opencrg(hd_map: HDMap, path: Path) -> None:
     """Write the ground as OpenCRG, by session: heights (m) on a grid along the path; sigmas have no place."""
     crg = need("pyopencrg", "gis", "the format opencrg", ConfigError)
     for number, strip in enumerate(hd_map.ground, start=1):

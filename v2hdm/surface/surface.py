@@ -72,7 +72,7 @@ Heights = Callable[[FloatArray], FloatArray]
 
 FILE = "ground.json"  # in a result folder
 
-_STORED = ("points_map", "ahead", "sense", "station_m", "visit_ends")
+_STORED = ("points_map", "ahead", "sense", "station_m", "session_ends")
 """Fields of the paths that are stored; frames are assigned on reading."""
 
 
@@ -284,7 +284,7 @@ class Surface:
         """The ground by session, on a grid of 0.5 m."""
         paths, out = self.paths, []
         left_m = np.arange(-_STRIP_M, _STRIP_M + _GRID_M / 2, _GRID_M)
-        for begin_m, end_m in paths.visit_ends.tolist():
+        for begin_m, end_m in paths.session_ends.tolist():
             station = np.arange(begin_m, end_m, _GRID_M)
             if len(station) < 2:
                 continue

@@ -21,7 +21,7 @@ from scipy.spatial import KDTree
 from scipy.stats import chi2
 
 from v2hdm.io.maps.features import features_of
-from v2hdm.records import FloatArray, HdMap, JointCovariance
+from v2hdm.records import FloatArray, HDMap, JointCovariance
 from v2hdm.store.files import replace_csv
 from v2hdm.survey.match import match
 from v2hdm.survey.read import SurveyedPoint
@@ -153,7 +153,7 @@ def squared(off_m: FloatArray, covariance_m2: FloatArray) -> float:
 
 
 def compare(
-    hd_map: HdMap,
+    hd_map: HDMap,
     points: Sequence[SurveyedPoint],
     reach_m: float,
     joint: JointCovariance,

@@ -24,7 +24,7 @@ from v2hdm.records import (
     CameraInfo,
     Drive,
     Exclusion,
-    HdMap,
+    HDMap,
     Image,
     Lane,
     Marking,
@@ -47,11 +47,11 @@ def covariance(sigma_m: float = 0.01) -> np.ndarray:
     return sigma_m**2 * (0.5 * np.eye(8) + 0.5 * np.tile(np.eye(2), (4, 4)))
 
 
-def small_map(names: str = DIAMOND) -> HdMap:
+def small_map(names: str = DIAMOND) -> HDMap:
     markings = [Marking(names, DIAMOND_M + place, 4, covariance(), 0.004) for place in PLACES]
     lane = Lane(LANE_LINE, np.column_stack([np.linspace(0, 12, 25), np.full(25, 2.4)]), 4)
     arrow = Symbol(ARROW, np.array([[4.5, -0.2], [5.2, 0.0], [4.5, 0.2]]), 3, 0.02)
-    return HdMap(tuple(markings), (lane,), symbols=(arrow,))
+    return HDMap(tuple(markings), (lane,), symbols=(arrow,))
 
 
 def verdict(status: str = "PASS") -> dict[str, object]:
@@ -117,7 +117,7 @@ def make_result(folder: Path, name: str = "small", kind: str = DIAMOND, status: 
 
 
 def _write_drive(
-    folder: Path, name: str, hd_map: HdMap, poses: np.ndarray, cam_from_vehicle: np.ndarray
+    folder: Path, name: str, hd_map: HDMap, poses: np.ndarray, cam_from_vehicle: np.ndarray
 ) -> Drive:
     """Grey ground, white diamonds."""
     (folder / "front").mkdir(parents=True)
@@ -141,7 +141,7 @@ def _write_drive(
     return drive
 
 
-def _residuals(drive: Drive, hd_map: HdMap, poses: np.ndarray, cam_from_vehicle: np.ndarray) -> Residuals:
+def _residuals(drive: Drive, hd_map: HDMap, poses: np.ndarray, cam_from_vehicle: np.ndarray) -> Residuals:
     """All corners in all images, each :data:`SHIFT_PX` off."""
     rows, seen = [], []
     for i, pose in enumerate(poses):
@@ -181,7 +181,7 @@ def make_site(folder: Path, count: int) -> None:
         Lane(LANE_LINE, np.column_stack([along, np.full(len(along), row * 9.0 + 2.2)]), 9)
         for row in range(side // 2)
     ]
-    write_geojson(HdMap(tuple(markings), tuple(lanes)), folder / "map.geojson")
+    write_geojson(HDMap(tuple(markings), tuple(lanes)), folder / "map.geojson")
     metrics = {
         "name": f"{count} markings", "version": "0.1.0", "verdict": verdict(),
         "results": {"front": {"Opt": {"markings": count}}},

@@ -75,7 +75,7 @@ def test_an_ellipse_has_the_half_axes_and_the_direction_of_its_covariance():
 
 
 def test_the_stated_ellipses_hold_95_of_100_true_corners_of_right_covariances(result, drive, monkeypatch):
-    from v2hdm.records import HdMap, Truth
+    from v2hdm.records import HDMap, Truth
     from v2hdm.report.page import tables
 
     random = np.random.default_rng(3)
@@ -89,8 +89,8 @@ def test_the_stated_ellipses_hold_95_of_100_true_corners_of_right_covariances(re
     ]  # fmt: skip
     facts = replace(
         read_facts(result, drive),
-        hd_map=HdMap(tuple(mapped)),
-        truth=Truth(HdMap(tuple(true)), {}, np.empty((0, 4, 4)), np.empty((0, 1000)), (), {}),
+        hd_map=HDMap(tuple(mapped)),
+        truth=Truth(HDMap(tuple(true)), {}, np.empty((0, 4, 4)), np.empty((0, 1000)), (), {}),
     )
     table = tables.truth_table(facts)
     assert abs(int(table.rows[-1][-1]) - 95) <= 1

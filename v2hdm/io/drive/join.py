@@ -26,8 +26,8 @@ from v2hdm.records import (
     GeodeticOrigin,
     Image,
     Road,
+    Session,
     Trajectory,
-    Visit,
     largest_noise,
 )
 
@@ -68,9 +68,9 @@ def join_drives(drives: Sequence[Drive], apart: Collection[tuple[int, str]] = ()
         again = (f"{drive.name}-{number}" for number in count(2))
         names.append(next(name for name in chain([drive.name], again) if name not in names))
     cameras: dict[str, Camera] = {}
-    images, visits, roads = [], [], []
+    images, sessions, roads = [], [], []
     for number, (drive, name) in enumerate(zip(drives, names, strict=True)):
-        moved = [camera for visit, camera in apart if visit == number]
+        moved = [camera for session, camera in apart if session == number]
         own = {key: _name_of(key, one, name, cameras, key in moved) for key, one in drive.cameras.items()}
         for camera, joined in own.items():
             one = drive.cameras[camera]
@@ -78,11 +78,11 @@ def join_drives(drives: Sequence[Drive], apart: Collection[tuple[int, str]] = ()
         whole, planar = _move(drives[0].origin, drive.origin)
         for image in drive.images:
             pose = planar @ image.map_from_vehicle
-            images.append(replace(image, camera=own[image.camera], visit=number, map_from_vehicle=pose))
+            images.append(replace(image, camera=own[image.camera], session=number, map_from_vehicle=pose))
         poses = (_moved(drive.trajectory, planar), _moved(drive.recorded, whole))
-        visits.append(Visit(name, drive.root, drive.pose_noise, drive.truth_dir, *poses, own))
+        sessions.append(Session(name, drive.root, drive.pose_noise, drive.truth_dir, *poses, own))
         roads.append(_moved_road(drive.road, whole))
-    _check_overlap(images, visits)
+    _check_overlap(images, sessions)
     return Drive(
         "+".join(names),
         drives[0].root,
@@ -90,8 +90,8 @@ def join_drives(drives: Sequence[Drive], apart: Collection[tuple[int, str]] = ()
         tuple(sorted(images, key=in_order)),
         largest_noise([drive.pose_noise for drive in drives]),
         drives[0].origin,
-        road=_one_road(roads, visits),
-        joined=tuple(visits),
+        road=_one_road(roads, sessions),
+        joined=tuple(sessions),
     )
 
 
@@ -116,7 +116,7 @@ def _same_rig(first: Camera, second: Camera) -> bool:
     return bool((apart_m <= _SAME_RIG_SIGMAS * np.hypot(centres[0].sigma_m, centres[1].sigma_m)).all())
 
 
-def _name_of(camera: str, one: Camera, visit: str, so_far: Mapping[str, Camera], apart: bool) -> str:
+def _name_of(camera: str, one: Camera, session: str, so_far: Mapping[str, Camera], apart: bool) -> str:
     """The joined drive's name for a camera of a session: that of the same rig, if there has been one."""
     if camera not in so_far:
         return camera
@@ -125,9 +125,9 @@ def _name_of(camera: str, one: Camera, visit: str, so_far: Mapping[str, Camera],
     why = "its mounting has changed" if apart else "its lens or guessed mounting differs"
     _log.warning(
         "camera %s of drive %s is not the earlier one (%s): it is calibrated separately, as %s@%s",
-        camera, visit, why, camera, visit,
+        camera, session, why, camera, session,
     )  # fmt: skip
-    return f"{camera}@{visit}"
+    return f"{camera}@{session}"
 
 
 def _check(drives: Sequence[Drive]) -> None:
@@ -147,12 +147,12 @@ def _check(drives: Sequence[Drive]) -> None:
         raise DriveError(f"drives of several datums ({stated}): transform their poses to one")
 
 
-def _check_overlap(images: Sequence[Image], visits: Sequence[Visit]) -> None:
+def _check_overlap(images: Sequence[Image], sessions: Sequence[Session]) -> None:
     """Refuse a session that comes near to no other: they would have nothing in common."""
     places = np.array([image.map_from_vehicle[:2, 3] for image in images])
-    number = np.array([image.visit for image in images])
-    for visit, one in enumerate(visits):
-        own, others = places[number == visit], places[number != visit]
+    number = np.array([image.session for image in images])
+    for session, one in enumerate(sessions):
+        own, others = places[number == session], places[number != session]
 
         def away_m(place: FloatArray, others: FloatArray = others) -> float:
             return float(np.linalg.norm(others - place, axis=1).min())
@@ -178,16 +178,16 @@ def _move(to: GeodeticOrigin | None, origin: GeodeticOrigin | None) -> tuple[Flo
     return whole, planar
 
 
-def _one_road(roads: Sequence[Road | None], visits: Sequence[Visit]) -> Road | None:
+def _one_road(roads: Sequence[Road | None], sessions: Sequence[Session]) -> Road | None:
     """The recorded ground of all sessions; one recorded as z = 0 counts where others have heights."""
     if all(road is None for road in roads):
         return None
     known: list[Road] = []
-    for road, visit in zip(roads, visits, strict=True):
+    for road, session in zip(roads, sessions, strict=True):
         if road is not None:
             known.append(road)
-        elif visit.recorded is not None:
-            places = visit.recorded.map_from_vehicle[:, :3, 3]
+        elif session.recorded is not None:
+            places = session.recorded.map_from_vehicle[:, :3, 3]
             known.append(Road(places[:, :2], places[:, 2], np.zeros((len(places), 2))))
     columns = zip(*((one.points_map, one.height_m, one.slope) for one in known), strict=True)
     return Road(*map(np.concatenate, columns))

@@ -12,7 +12,7 @@ from v2hdm.errors import DriveError
 from v2hdm.io.calibration.reading import take_rigid
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.io.trajectory import read_tum
-from v2hdm.records import BoolArray, Drive, FloatArray, HdMap, Image, Truth
+from v2hdm.records import BoolArray, Drive, FloatArray, HDMap, Image, Truth
 from v2hdm.store.files import check_keys, load_yaml, read_csv, take_mapping, take_number
 
 SIGHTINGS = ("camera", "timestamp", "marking", "visible_fraction")
@@ -42,8 +42,8 @@ def has_truth(drive: Drive) -> bool:
     """Whether there is a ground truth that holds for all of the drive: joined ones must share it."""
     if not drive.joined:
         return drive.truth_dir is not None
-    folders = [visit.truth_dir for visit in drive.visits if visit.truth_dir is not None]
-    if len(folders) < len(drive.visits):
+    folders = [session.truth_dir for session in drive.sessions if session.truth_dir is not None]
+    if len(folders) < len(drive.sessions):
         return False
     maps = [read_geojson(folder / "map.geojson") for folder in folders]
     corners = [[one.corners_map for one in hd_map.markings] for hd_map in maps]
@@ -54,20 +54,22 @@ def has_truth(drive: Drive) -> bool:
 def _joined_truth(drive: Drive) -> Truth:
     """The truths of all sessions as one, in the order of the joined drive's images."""
     parts, rows = [], []
-    for number, visit in enumerate(drive.joined):
-        own_name = {joined: own for own, joined in visit.cameras.items()}
-        own = [i for i, image in enumerate(drive.images) if image.visit == number]
+    for number, session in enumerate(drive.joined):
+        own_name = {joined: own for own, joined in session.cameras.items()}
+        own = [i for i, image in enumerate(drive.images) if image.session == number]
         images = [replace(drive.images[i], camera=own_name[drive.images[i].camera]) for i in own]
-        cameras = {name: drive.cameras[joined] for name, joined in visit.cameras.items()}
+        cameras = {name: drive.cameras[joined] for name, joined in session.cameras.items()}
         rows.append(own)
-        parts.append(read_truth(Drive(visit.name, visit.root, cameras, images, truth_dir=visit.truth_dir)))
+        parts.append(
+            read_truth(Drive(session.name, session.root, cameras, images, truth_dir=session.truth_dir))
+        )
     order = np.argsort(np.concatenate(rows), kind="stable")
     cam_from_vehicle: dict[str, FloatArray] = {}
     disturbances: dict[str, float] = {}
-    for visit, part in zip(drive.joined, parts, strict=True):
-        disturbances |= {f"{visit.name}: {key}": value for key, value in part.disturbances.items()}
+    for session, part in zip(drive.joined, parts, strict=True):
+        disturbances |= {f"{session.name}: {key}": value for key, value in part.disturbances.items()}
         for name, matrix in part.cam_from_vehicle.items():
-            cam_from_vehicle.setdefault(visit.cameras[name], matrix)
+            cam_from_vehicle.setdefault(session.cameras[name], matrix)
     lanes = zip(*(part.lane_visible for part in parts), strict=True)
     return Truth(
         map=parts[0].map,
@@ -121,7 +123,7 @@ def _read_sightings(path: Path, images: Sequence[Image], markings: int) -> Float
     return visibility
 
 
-def _read_lane_visible(path: Path, hd_map: HdMap) -> tuple[BoolArray, ...]:
+def _read_lane_visible(path: Path, hd_map: HDMap) -> tuple[BoolArray, ...]:
     visible = tuple(np.zeros(len(lane.points_map), dtype=np.bool_) for lane in hd_map.lanes)
     for where, (lane, vertex) in _rows(path, LANE_VISIBLE):
         known = lane.isdecimal() and vertex.isdecimal()

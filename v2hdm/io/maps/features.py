@@ -10,7 +10,7 @@ import numpy as np
 
 from v2hdm.geometry.geodetic import Grid, geodetic_from_enu
 from v2hdm.geometry.planar import signed_area
-from v2hdm.records import FloatArray, GeodeticOrigin, HdMap, IntArray, Lane, Marking, PaintLeft, Road, Symbol
+from v2hdm.records import FloatArray, GeodeticOrigin, HDMap, IntArray, Lane, Marking, PaintLeft, Road, Symbol
 
 CORNERS, POINTS, OUTLINE = "corners_map", "points_map", "outline_map"
 """Properties with the exact local coordinates of a marking's corners, a lane's points, a symbol's outline."""
@@ -87,7 +87,7 @@ class Feature:
         return geodetic_from_enu(origin, self.xyz_map)[self.ring][:, [1, 0, 2]]
 
 
-def features_of(hd_map: HdMap) -> list[Feature]:
+def features_of(hd_map: HDMap) -> list[Feature]:
     """Markings, lanes, then symbols, each with its own id: that which it has, else the next free one."""
     everything: list[Any] = [*hd_map.markings, *hd_map.lanes, *hd_map.symbols]
     ids = unique_ids([one.id or 0 for one in everything], hd_map.largest_id)
@@ -107,7 +107,7 @@ def features_of(hd_map: HdMap) -> list[Feature]:
     return features
 
 
-def map_of(features: Sequence[Feature], ids: Sequence[int], origin: GeodeticOrigin | None) -> HdMap:
+def map_of(features: Sequence[Feature], ids: Sequence[int], origin: GeodeticOrigin | None) -> HDMap:
     """The map whose features these are, in their order, with other ids."""
     markings: list[Marking] = []
     lanes: list[Lane] = []
@@ -122,7 +122,7 @@ def map_of(features: Sequence[Feature], ids: Sequence[int], origin: GeodeticOrig
             markings.append(replace(marking, paint=one.paint, heights_sigma_m=one.heights_sigma_m))
         else:
             lanes.append(Lane(*own, one.heights_m, number, one.vertex_sigma_m, one.heights_sigma_m))
-    return HdMap(tuple(markings), tuple(lanes), origin, tuple(symbols))
+    return HDMap(tuple(markings), tuple(lanes), origin, tuple(symbols))
 
 
 def unique_ids(ids: Sequence[int], largest: int = 0) -> list[int]:
@@ -158,7 +158,7 @@ def properties_of(feature: Feature) -> dict[str, Any]:
     }
 
 
-def with_heights(hd_map: HdMap, road: Road | None, surface: Heights | None = None) -> HdMap:
+def with_heights(hd_map: HDMap, road: Road | None, surface: Heights | None = None) -> HDMap:
     """``hd_map`` with the height of every corner and vertex; as it is without a ``road`` or ``surface``.
 
     What has heights already, of an earlier drive, keeps them. ``surface`` gives the heights (N,) of the

@@ -24,7 +24,7 @@ from v2hdm.io.maps.geopackage import write_geopackage, write_qgis
 from v2hdm.io.maps.lanelet2 import write_lanelet2
 from v2hdm.io.maps.reading import Verdict, read_geopackage, stated_in
 from v2hdm.io.maps.road_xml import write_landxml, write_opendrive
-from v2hdm.records import GeodeticOrigin, HdMap
+from v2hdm.records import GeodeticOrigin, HDMap
 from v2hdm.store.files import replace_csv, whole_file
 from v2hdm.store.inputs import protected_inputs
 from v2hdm.surface.strips import write_ground_geotiff, write_opencrg
@@ -38,7 +38,7 @@ _TEXT, _REAL, _WHOLE = 1000, 1040, 1071
 _COLOURS = 6  # AutoCAD's first colours, red to magenta, take turns
 
 
-def write_dxf(hd_map: HdMap, path: Path, grid: Grid | None = None) -> None:
+def write_dxf(hd_map: HDMap, path: Path, grid: Grid | None = None) -> None:
     """Write ``hd_map`` as DXF, atomically: metres, a layer per class, closed 3D polylines for markings.
 
     They are local, or of the ``grid``, which the drawing's custom properties name with datum and epoch.
@@ -82,7 +82,7 @@ COLUMNS: tuple[str, ...] = (
 of point 3 of the same feature. Empty where it is not known."""
 
 
-def write_csv(hd_map: HdMap, path: Path, grid: Grid | None = None) -> None:
+def write_csv(hd_map: HDMap, path: Path, grid: Grid | None = None) -> None:
     """Write ``hd_map`` as CSV, atomically: a row per corner or vertex, every number at full precision.
 
     Coordinates in a ``grid``, rounded to 0.1 mm, take the place of longitude and latitude, which its last
@@ -162,7 +162,7 @@ def check_formats(names: Sequence[str], key: str) -> None:
             need(package, "gis", f"the format {name}", ConfigError)
 
 
-def holds(path: Path, hd_map: HdMap, crs: str | None) -> bool:
+def holds(path: Path, hd_map: HDMap, crs: str | None) -> bool:
     """Whether the GeoPackage at ``path`` holds just this map's features, in the system ``crs``."""
     try:
         with protected_inputs():  # where it holds others, it may be written anew
@@ -191,7 +191,7 @@ def check_crs(
 
 
 def write_map(
-    hd_map: HdMap,
+    hd_map: HDMap,
     folder: Path,
     name: str,
     formats: Sequence[str],

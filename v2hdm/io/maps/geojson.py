@@ -20,7 +20,7 @@ import numpy as np
 from v2hdm.geometry.geodetic import Grid
 from v2hdm.io.maps.features import Feature, features_of, properties_of
 from v2hdm.io.maps.reading import RESOLUTION
-from v2hdm.records import FloatArray, GeodeticOrigin, HdMap
+from v2hdm.records import FloatArray, GeodeticOrigin, HDMap
 from v2hdm.store.files import replace_text
 
 _WGS84 = "WGS84 longitude and latitude, degrees, and height above the ellipsoid, metres"
@@ -29,7 +29,7 @@ _DEGREE_DECIMALS, _HEIGHT_DECIMALS = 11, 5  # 0.001 mm on the ground
 
 
 def write_geojson(
-    hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None, grid: Grid | None = None
+    hd_map: HDMap, path: Path, verdict: Mapping[str, Any] | None = None, grid: Grid | None = None
 ) -> None:
     """Write ``hd_map`` to ``path`` as a FeatureCollection, atomically, in a ``grid`` if there is one.
 

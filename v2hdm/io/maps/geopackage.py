@@ -28,7 +28,7 @@ from v2hdm.errors import ConfigError, MapFileError, need
 from v2hdm.geometry.geodetic import Grid, crs_of
 from v2hdm.io.maps.features import CORNERS, PAINT, POINTS, Feature, features_of, properties_of
 from v2hdm.io.maps.reading import EXACT, GEOMETRY, LAYERS
-from v2hdm.records import CROSSWALK_BAR, DIAMOND, LANE_DASH, LANE_LINE, STOP_LINE, GeodeticOrigin, HdMap
+from v2hdm.records import CROSSWALK_BAR, DIAMOND, LANE_DASH, LANE_LINE, STOP_LINE, GeodeticOrigin, HDMap
 from v2hdm.store.files import replace_text, whole_file
 
 LOCAL_CRS = (
@@ -62,7 +62,7 @@ AnyArray = NDArray[Any]
 
 
 def write_geopackage(
-    hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None, grid: Grid | None = None
+    hd_map: HDMap, path: Path, verdict: Mapping[str, Any] | None = None, grid: Grid | None = None
 ) -> None:
     """Write ``hd_map`` and the ``verdict``, atomically; MapFileError when GDAL cannot write there."""
     raw = need("pyogrio.raw", "gis", "the format gpkg", ConfigError)
@@ -188,7 +188,7 @@ MOSAIC = "mosaic.tif"  # beside the project, where the run has made one
 _AROUND_M = 5.0
 
 
-def write_qgis(hd_map: HdMap, path: Path, grid: Grid | None = None) -> None:
+def write_qgis(hd_map: HDMap, path: Path, grid: Grid | None = None) -> None:
     """Write the project ``path`` of the GeoPackage beside it that has its name, atomically.
 
     The canvas is in metres: of the ``grid``, else of the map frame, about whose origin it is projected. All

@@ -24,7 +24,7 @@ from v2hdm.errors import ConfigError, MapFileError, need
 from v2hdm.geometry.geodetic import geodetic_from_enu, position_of
 from v2hdm.io.maps.closed_lanes import closed_lanes, connections
 from v2hdm.io.maps.features import Feature, features_of
-from v2hdm.records import LANE_DASH, STOP_LINE, FloatArray, GeodeticOrigin, HdMap, IntArray
+from v2hdm.records import LANE_DASH, STOP_LINE, FloatArray, GeodeticOrigin, HDMap, IntArray
 from v2hdm.store.files import dump_yaml, replace_text, xml_text
 
 LOCAL, LOCAL_CARTESIAN, MGRS = PROJECTORS = ("Local", "LocalCartesian", "MGRS")
@@ -41,7 +41,7 @@ _MOST_VERTICES = _PARTS // 2
 _NOWHERE = GeodeticOrigin(0.0, 0.0, 0.0)
 
 
-def write_lanelet2(hd_map: HdMap, path: Path, projector: str | None = None) -> None:
+def write_lanelet2(hd_map: HDMap, path: Path, projector: str | None = None) -> None:
     """Write ``hd_map`` to ``path`` and ``map_projector_info.yaml`` beside it, each atomically.
 
     Without a ``projector`` of :data:`PROJECTORS` it is ``LocalCartesian`` for a map with an origin, else

@@ -20,7 +20,7 @@ from v2hdm.errors import MapFileError
 from v2hdm.geometry.geodetic import Grid, enu_from_geodetic
 from v2hdm.geometry.planar import signed_area
 from v2hdm.io.maps.features import CORNERS, OUTLINE, PAINT, POINTS, Feature, map_of, unique_ids
-from v2hdm.records import FloatArray, GeodeticOrigin, HdMap, PaintLeft
+from v2hdm.records import FloatArray, GeodeticOrigin, HDMap, PaintLeft
 from v2hdm.safe.databases import opened, rows_of
 from v2hdm.safe.fields import take_covariance, take_origin, take_whole
 from v2hdm.safe.texts import parse_json, take_name
@@ -54,7 +54,7 @@ LAYERS = {CORNERS: "markings", POINTS: "lanes", OUTLINE: "symbols"}
 GEOMETRY = "geom"  # the column of a GeoPackage's layer
 
 
-def read_map(path: Path) -> tuple[HdMap, Verdict]:
+def read_map(path: Path) -> tuple[HDMap, Verdict]:
     """A map and its verdict, from GeoJSON or GeoPackage; MapFileError, or ConfigError without a package."""
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
@@ -63,7 +63,7 @@ def read_map(path: Path) -> tuple[HdMap, Verdict]:
     return reader(path), read_verdict(path)
 
 
-def read_geojson(path: Path) -> HdMap:
+def read_geojson(path: Path) -> HDMap:
     """Read our own GeoJSON, perhaps edited, in its order; missing or repeated ids are given anew."""
     content = load_json(path, MapFileError)
     about, features = content.get("v2hdm"), content.get("features")
@@ -101,7 +101,7 @@ def read_verdict(path: Path) -> Verdict:
     return verdict if isinstance(verdict, dict) else None
 
 
-def read_geopackage(path: Path) -> HdMap:
+def read_geopackage(path: Path) -> HDMap:
     """Read our own GeoPackage, which others may have edited, as :func:`read_geojson` does."""
     origin = take_origin(stated_in(path, "origin"), f"{path}: origin", MapFileError)
     rounding = np.full(3, _LOCAL_ROUNDING_M) if origin is None else np.array(_BINARY_ROUNDING)
@@ -114,7 +114,7 @@ def read_geopackage(path: Path) -> HdMap:
     return reader.map()
 
 
-_READERS: Mapping[str, Callable[[Path], HdMap]] = {".geojson": read_geojson, ".gpkg": read_geopackage}
+_READERS: Mapping[str, Callable[[Path], HDMap]] = {".geojson": read_geojson, ".gpkg": read_geopackage}
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ class _Reader:
             self._edited.append(len(self._features))
         self._features.append(feature)
 
-    def map(self) -> HdMap:
+    def map(self) -> HDMap:
         """All that was read, logging edits and new ids."""
         before = [feature.id for feature in self._features]
         ids = unique_ids(before)

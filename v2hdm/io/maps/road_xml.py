@@ -26,7 +26,7 @@ from v2hdm.geometry.geodetic import LOCAL, Grid, crs_of
 from v2hdm.geometry.planar import length_along
 from v2hdm.io.maps.closed_lanes import closed_lanes
 from v2hdm.io.maps.features import Feature, features_of, properties_of
-from v2hdm.records import LANE_DASH, FloatArray, HdMap
+from v2hdm.records import LANE_DASH, FloatArray, HDMap
 from v2hdm.store.files import replace_text, xml_text
 
 _LEAST_STEP_M = 1e-3  # between vertices of a reference line: shorter geometries are refused by readers
@@ -59,7 +59,7 @@ class _Road:
         return float(away[segment]), segment, float(along[segment])
 
 
-def write_opendrive(hd_map: HdMap, path: Path) -> None:
+def write_opendrive(hd_map: HDMap, path: Path) -> None:
     """Write ``hd_map`` as OpenDRIVE, atomically, in metres of the map frame, whose projection it states."""
     features = features_of(hd_map)
     roads = _roads(features)
@@ -179,7 +179,7 @@ def _text(value: float) -> str:
 _NAMESPACE = "http://www.landxml.org/schema/LandXML-1.2"
 
 
-def write_landxml(hd_map: HdMap, path: Path, grid: Grid | None = None) -> None:
+def write_landxml(hd_map: HDMap, path: Path, grid: Grid | None = None) -> None:
     """Write ``hd_map`` as LandXML, atomically, in metres of the ``grid``, else of the map's own frame."""
     grid = grid or Grid(LOCAL, hd_map.origin)
     now = datetime.now(UTC)

@@ -14,7 +14,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
-from v2hdm.records import FloatArray, HdMap
+from v2hdm.records import FloatArray, HDMap
 from v2hdm.report.page.facts import Facts, GroundResiduals, Route
 from v2hdm.report.page.layers import SIGMAS_95
 from v2hdm.report.style import OKABE_ITO, RC, draw_arrows
@@ -74,7 +74,7 @@ def _look(number: int) -> dict[str, Any]:
     return {"color": OKABE_ITO[_ORDER[number % len(_ORDER)]], "linestyle": _DASHES[number % len(_DASHES)]}
 
 
-def site_chart(hd_map: HdMap, route: Route | None, excluded: FloatArray) -> str:
+def site_chart(hd_map: HDMap, route: Route | None, excluded: FloatArray) -> str:
     """Plan view of the map, for paper: markings, lane lines, route, excluded candidates (N, 2)."""
     way = np.empty((0, 2)) if route is None else route.map_from_vehicle[:, :2, 3]
     shapes, lanes = [m.corners_map for m in hd_map.markings], [one.points_map for one in hd_map.lanes]

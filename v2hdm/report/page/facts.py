@@ -20,7 +20,7 @@ from v2hdm.io.maps.evidence import Residuals, read_exclusions, read_residuals
 from v2hdm.io.maps.features import features_of, map_of
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.io.trajectory import read_tum
-from v2hdm.records import BoolArray, Calibration, Drive, Exclusion, FloatArray, HdMap, IntArray, Truth
+from v2hdm.records import BoolArray, Calibration, Drive, Exclusion, FloatArray, HDMap, IntArray, Truth
 from v2hdm.store.files import load_json, load_yaml, read_csv, read_text, take_number
 from v2hdm.surface.surface import FILE as GROUND
 from v2hdm.surface.surface import Surface
@@ -67,7 +67,7 @@ class Facts:
     folder: Path
     metrics: Mapping[str, Any]
     config: str
-    hd_map: HdMap | None
+    hd_map: HDMap | None
     excluded: tuple[Exclusion, ...]  # candidates excluded by the map of all cameras
     cameras: Mapping[str, CameraFacts]
     route: Route | None

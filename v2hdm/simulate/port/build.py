@@ -16,7 +16,7 @@ from v2hdm.geometry.ipm import cam_from_mounting, project_ground
 from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.geometry.planar import winding
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.records import Camera, CameraInfo, CentrePrior, FloatArray, GeodeticOrigin, HdMap
+from v2hdm.records import Camera, CameraInfo, CentrePrior, FloatArray, GeodeticOrigin, HDMap
 from v2hdm.simulate.port.config import CalibrationConfig, CameraConfig, MountConfig, PortConfig
 from v2hdm.simulate.port.paint import build_layout
 from v2hdm.simulate.port.route import DrivenPoses, Route, build_relief, build_route, drive_along, stands
@@ -87,7 +87,7 @@ class Port:
     route: Route
     renderer: Renderer
     trucks: tuple[MovingTruck, ...]
-    hd_map: HdMap
+    hd_map: HDMap
     cameras: dict[str, Camera]
     cam_from_vehicle: dict[str, FloatArray]
     driven: DrivenPoses
@@ -105,7 +105,7 @@ class Port:
     def picture(self, camera: str, frame: int) -> Rendered:
         """Render an image and its labels: a function of the configuration, the camera and the frame alone."""
         number = sorted(self.cameras).index(camera)
-        rng = np.random.default_rng([*_visit_seed(self.config, _IMAGES), number, frame])
+        rng = np.random.default_rng([*_session_seed(self.config, _IMAGES), number, frame])
         exposure, lens = self.config.exposure, self.config.cameras[camera]
         optics = Optics(
             psf_sigma_px=lens.psf_sigma_px,
@@ -144,9 +144,9 @@ class Port:
 _SHORTEST_ROUTE_M = 25.0  # obstacles keep 12 m from either end
 
 
-def _visit_seed(config: PortConfig, part: int) -> list[int]:
-    """Seed of a random stream that differs from visit to visit."""
-    return [config.seed, part, *([-1 % 2**32, config.visit] if config.visit else [])]
+def _session_seed(config: PortConfig, part: int) -> list[int]:
+    """Seed of a random stream that differs from session to session."""
+    return [config.seed, part, *([-1 % 2**32, config.session] if config.session else [])]
 
 
 def _surveyed_cameras(config: PortConfig) -> dict[str, Camera]:
@@ -168,7 +168,7 @@ def build_port(config: PortConfig) -> Port:
     """Build a port, the same from the same configuration; raises ConfigError for contradicting values."""
     _check(config)
     streams = {part: np.random.default_rng([config.seed, part]) for part in (_LAYOUT, _YARD)}
-    anew = {part: np.random.default_rng(_visit_seed(config, part)) for part in (_TRUCKS, _POSES)}
+    anew = {part: np.random.default_rng(_session_seed(config, part)) for part in (_TRUCKS, _POSES)}
     route = build_route(config.route)
     if route.length_m < _SHORTEST_ROUTE_M:
         problem = f"{route.length_m:g} m in total; give {_SHORTEST_ROUTE_M:g} m or more"
@@ -193,7 +193,7 @@ def build_port(config: PortConfig) -> Port:
     )
 
 
-def _raised(hd_map: HdMap, relief: Relief | None) -> HdMap:
+def _raised(hd_map: HDMap, relief: Relief | None) -> HDMap:
     """The map with the heights of its ground."""
     if relief is None:
         return hd_map
@@ -208,7 +208,7 @@ def _check(config: PortConfig) -> None:
     rules: list[tuple[Any, str]] = [
         (config.cameras, "cameras: none given; add at least one"),
         (config.initial_ipm in _IPMS, "initial_ipm: choose 'calibrated' or 'estimated'"),
-        (config.visit >= 0, "visit: must be 0 or more"),
+        (config.session >= 0, "session: must be 0 or more"),
         (pieces, "route.pieces: empty; give [length_m, turn_deg] pieces"),
         (all(len(p) == 2 and p[0] > 0 for p in pieces), "route.pieces: each is [length_m > 0, turn_deg]"),
         (route.speed_mps > 0, "route.speed_mps: must be positive"),

@@ -320,7 +320,7 @@ class PortConfig:
     """A port, a vehicle with its cameras, and one drive through it.
 
     ``initial_ipm`` is the calibration that the drive starts from: calibrated (this vehicle's own, manual) or
-    estimated (the other vehicle's). ``visit`` numbers drives through one port: the same paint with different
+    estimated (the other vehicle's). ``session`` numbers drives through one port: the same paint with different
     pose noise, image noise and traffic. Equal values give equal files, byte for byte.
 
     Attributes:
@@ -330,7 +330,7 @@ class PortConfig:
 
     name: str = "port1"
     seed: int = 1
-    visit: int = 0
+    session: int = 0
     initial_ipm: str = "calibrated"
     cameras: dict[str, CameraConfig] = field(default_factory=lambda: {"front": _front(), "rear": _rear()})
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)

@@ -132,9 +132,9 @@ def rendered_drive(config: PortConfig, cache: Path, workers: int, progress: Step
 def folder_of_port(config: PortConfig, cache: Path) -> Path:
     """The folder of a port's drive in a cache, named by the port and a hash of its configuration."""
     content = asdict(config)
-    # Ports that were rendered before there were visits, stencils and reliefs stay the same.
-    if not config.visit:
-        del content["visit"]
+    # Ports that were rendered before there were sessions, stencils and reliefs stay the same.
+    if not config.session:
+        del content["session"]
     if config.relief == ReliefConfig():
         del content["relief"]
     if not config.paint.stencils:

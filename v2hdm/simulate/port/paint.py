@@ -19,7 +19,7 @@ from v2hdm.records import (
     STOP_LINE,
     FloatArray,
     GeodeticOrigin,
-    HdMap,
+    HDMap,
     Lane,
     Marking,
 )
@@ -61,9 +61,9 @@ class Layout:
     lanes: list[Lane] = field(default_factory=list)
     occupied_map: list[FloatArray] = field(default_factory=list)
 
-    def hd_map(self, origin: GeodeticOrigin | None) -> HdMap:
+    def hd_map(self, origin: GeodeticOrigin | None) -> HDMap:
         """The true map."""
-        return HdMap(markings=tuple(self.markings), lanes=tuple(self.lanes), origin=origin)
+        return HDMap(markings=tuple(self.markings), lanes=tuple(self.lanes), origin=origin)
 
     def vertices(self) -> FloatArray:
         """The vertices (N, 2) of all lanes."""

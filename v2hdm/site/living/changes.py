@@ -18,7 +18,7 @@ from v2hdm.association.ground import Views
 from v2hdm.association.sightings import Rig
 from v2hdm.errors import MappingError
 from v2hdm.geometry.planar import SHIFTS
-from v2hdm.records import BoolArray, Change, Changes, Fate, FloatArray, HdMap, IntArray, Marking
+from v2hdm.records import BoolArray, Change, Changes, Fate, FloatArray, HDMap, IntArray, Marking
 from v2hdm.site.living.fates import Decision, Watched, decide
 from v2hdm.site.living.looks import Looks, Observer, find_rates, with_paint
 from v2hdm.site.living.map_errors import SHIFT, Errors, Shift, updated_lanes, updated_symbols
@@ -97,14 +97,14 @@ _LOOKED = 3  # easy views of a place that count as an inspection for that fracti
 class Base:
     """An earlier map with ids, and the poses of its drives."""
 
-    hd_map: HdMap
+    hd_map: HDMap
     poses: FloatArray  # (F, 4, 4) of its images, (0, 4, 4) if unknown
     left_out: tuple[tuple[str, FloatArray, int], ...] = ()  # class, position (2,), sightings of candidates
 
 
 def update_map(
-    base: Base, made: HdMap, observer: Observer, mapped: BoolArray, drift_over_m: float
-) -> tuple[HdMap, Changes, IntArray, IntArray]:
+    base: Base, made: HDMap, observer: Observer, mapped: BoolArray, drift_over_m: float
+) -> tuple[HDMap, Changes, IntArray, IntArray]:
     """Update the ``base`` map with ``made``, the new drive's own map in the same frame.
 
     Returns the map, the changes, the ids in it of the M markings of ``made`` (M,), 0 for none, and their

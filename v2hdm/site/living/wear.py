@@ -23,7 +23,7 @@ from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.planar import Quad
 from v2hdm.geometry.rigid import inverse
-from v2hdm.records import Calibration, FloatArray, HdMap, Image, PaintLeft
+from v2hdm.records import Calibration, FloatArray, HDMap, Image, PaintLeft
 from v2hdm.surface.surface import Surface
 
 _CELL_M = 0.02
@@ -104,16 +104,16 @@ class Cells:
 
 
 def with_wear(
-    hd_map: HdMap,
+    hd_map: HDMap,
     images: Sequence[Image],
     map_from_vehicle: Sequence[FloatArray],
     calibrations: Mapping[str, Calibration],
     grey: Callable[[Image], NDArray[np.float32]],
     shown: Set[tuple[int, int]],
-    earlier: HdMap | None = None,
+    earlier: HDMap | None = None,
     threads: int = 1,
     surface: Surface | None = None,
-) -> HdMap:
+) -> HDMap:
     """``hd_map`` with the fraction of paint left of each marking that two or more images show near.
 
     ``map_from_vehicle`` (4, 4) are the poses of the ``images`` on the flat road, ``grey`` reads one (H, W),

@@ -122,9 +122,9 @@ def check_result(
     """
     best = list(methods.values())[-1][BEST]
     findings = check_solution(drive, methods)
-    for visit, estimates in zip(drive.visits, ground, strict=False):
+    for session, estimates in zip(drive.sessions, ground, strict=False):
         own = agreement.check_against_ground(best.calibrations, estimates)
-        suffix = f" of {visit.name}" if drive.joined else ""
+        suffix = f" of {session.name}" if drive.joined else ""
         findings += [replace(finding, about=f"{finding.about}{suffix}") for finding in own]
     return findings
 

@@ -96,9 +96,9 @@ class NumbaEngine(Engine):
     def _shared_corners(self) -> Tensor:
         """Corners (n,) that several drives observed, and all that known lengths join to them."""
         arrays, layout = self.arrays, self._whole
-        visit = arrays.visit[arrays.frame_of(arrays.pair).long()].numpy()
+        session = arrays.session[arrays.frame_of(arrays.pair).long()].numpy()
         begin = layout.begin[layout.unit[:-1]]
-        shared = np.minimum.reduceat(visit, begin) < np.maximum.reduceat(visit, begin)
+        shared = np.minimum.reduceat(session, begin) < np.maximum.reduceat(session, begin)
         size = np.diff(layout.unit)
         # A unit larger than a tile would reach beyond the next one.
         most = frames_per_tile(arrays) * len(arrays.states) // 2

@@ -1,4 +1,4 @@
-"""Two visits of one street in one problem: drifts and clocks are their own, cameras and corners common."""
+"""Two sessions of one street in one problem: drifts and clocks are their own, cameras and corners common."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ from v2hdm.faults import score_faults
 
 
 def joined(first, second):
-    """Two problems of the same cameras and corners as two visits of one problem."""
+    """Two problems of the same cameras and corners as two sessions of one problem."""
     frames = [len(one.map_from_vehicle) for one in (first, second)]
     one, other = first.observations, second.observations
     other = replace(other, frame=other.frame + frames[0])
@@ -30,7 +30,7 @@ def joined(first, second):
         observations=replace(one, **seen),
         pose_sigma=(first.pose_sigma, second.pose_sigma),
         twist_vehicle=None if twists[0] is None else np.concatenate(twists),
-        visit=np.repeat([0, 1], frames),
+        session=np.repeat([0, 1], frames),
     )
 
 
@@ -52,11 +52,11 @@ def street():
     return make_scene(3, frames=60)
 
 
-def test_two_visits_together_are_better_than_one_and_say_by_how_much():
+def test_two_sessions_together_are_better_than_one_and_say_by_how_much():
     street, errors, sigmas = make_scene(3, frames=40, prior_sigma_m=0.002), [], []
     for seed in range(10):
-        visits = [visited_again(street, DRIFTING, 10 * seed + k) for k in (1, 2)]
-        problems = [visit.problem for visit in visits]
+        sessions = [visited_again(street, DRIFTING, 10 * seed + k) for k in (1, 2)]
+        problems = [session.problem for session in sessions]
         solutions = [solve(one) for one in (*problems, joined(*problems))]
         assert all(one.status is Status.CONVERGED for one in solutions)
         errors.append([np.square(one.corners_map - street.corners_map).sum() for one in solutions])
@@ -69,7 +69,7 @@ def test_two_visits_together_are_better_than_one_and_say_by_how_much():
     assert np.sqrt(both) == pytest.approx(stated[2], rel=0.35)
 
 
-def test_the_order_of_the_visits_changes_nothing(street):
+def test_the_order_of_the_sessions_changes_nothing(street):
     first = visited_again(street, DRIFTING, 1).problem
     second = visited_again(street, SCATTERING, 2).problem
     one, other = solve(joined(first, second)), solve(joined(second, first))
@@ -77,8 +77,8 @@ def test_the_order_of_the_visits_changes_nothing(street):
     assert one.cost == pytest.approx(other.cost, rel=1e-9)
 
 
-def test_a_visit_without_drift_beside_one_with_it_is_as_by_itself(street):
-    """Far apart, and with cameras that are known, two visits have nothing to say of each other."""
+def test_a_session_without_drift_beside_one_with_it_is_as_by_itself(street):
+    """Far apart, and with cameras that are known, two sessions have nothing to say of each other."""
     known = replace(street.problem, centre_sigma_m=np.full((2, 3), 1e-5))
     scene = replace(street, problem=known)
     first, second = visited_again(scene, DRIFTING, 3).problem, visited_again(scene, SCATTERING, 4).problem
@@ -91,10 +91,10 @@ def test_a_visit_without_drift_beside_one_with_it_is_as_by_itself(street):
 
 
 @pytest.mark.parametrize("states", [(), ("roll", "pitch", "heading")])
-def test_every_visit_has_clocks_of_its_own(states):
+def test_every_session_has_clocks_of_its_own(states):
     offsets_s = np.array([[0.03, -0.02], [-0.01, 0.04]])
     street = make_scene(14, frames=60, turn_deg_per_m=8.0, prior_sigma_m=0.01)
-    problems = [with_late_clocks(street, offsets_s[:, visit]).problem for visit in (0, 1)]
+    problems = [with_late_clocks(street, offsets_s[:, session]).problem for session in (0, 1)]
     options = SolveOptions(pose_states=states, clock_offset=True)
     found = solve(joined(*problems), options)
     assert found.status is Status.CONVERGED
@@ -105,11 +105,11 @@ def test_every_visit_has_clocks_of_its_own(states):
     assert plain.clock_offset_s == pytest.approx(found.clock_offset_s, abs=1e-6)
 
 
-def test_visits_that_are_not_numbered_in_order_are_refused(street):
+def test_sessions_that_are_not_numbered_in_order_are_refused(street):
     problem = joined(street.problem, street.problem)
     with pytest.raises(AdjustError, match="rising along the frames"):
-        solve(replace(problem, visit=problem.visit[::-1]))
-    with pytest.raises(AdjustError, match="visit 1 has no pose_sigma"):
+        solve(replace(problem, session=problem.session[::-1]))
+    with pytest.raises(AdjustError, match="session 1 has no pose_sigma"):
         solve(replace(problem, pose_sigma=(PoseSigma(),)))
 
 
