@@ -21,7 +21,11 @@ from v2hdm.safe.texts import read_yaml, shown
 
 CATALOGUE_FILE = Path(__file__).with_name("catalogue.yaml")
 
-QUADRILATERAL, STRIPE, LINE, SYMBOL, OTHER = "quadrilateral", "stripe", "line", "symbol", "other"
+QUADRILATERAL = "quadrilateral"
+STRIPE = "stripe"
+LINE = "line"
+SYMBOL = "symbol"
+OTHER = "other"
 FAMILIES = (QUADRILATERAL, STRIPE, LINE, SYMBOL, OTHER)
 
 _SOFTNESS = 0.25  # standard deviation of a log size about its range, where the catalogue gives none
@@ -32,7 +36,8 @@ _MOST_CLASSES = 254  # labels are bytes: 0 is no paint, 255 is unknown
 
 _KEYS = frozenset({"family", "length_m", "width_m", "softness", "group"})
 
-_STRIPE_ASPECT, _ASPECT_SOFTNESS = 3.0, 0.1
+_STRIPE_ASPECT = 3.0
+_ASPECT_SOFTNESS = 0.1
 """A stripe or a line is at least this many times as long as wide; the deviation of the logarithm of that."""
 
 

@@ -56,8 +56,10 @@ def exact_kernel(function: _Function) -> _Function:
 
 
 def _kept(function: _Function, options: dict[str, Any]) -> _Function:
-    folder, settings = folder_of(sys.modules[function.__module__]), cast(Any, numba.config)
-    usual, settings.CACHE_DIR = settings.CACHE_DIR, str(folder or "")
+    folder = folder_of(sys.modules[function.__module__])
+    settings = cast(Any, numba.config)
+    usual = settings.CACHE_DIR
+    settings.CACHE_DIR = str(folder or "")
     try:
         compiled: Callable[..., Any] = numba.njit(cache=folder is not None, **options)(function)
     except (OSError, RuntimeError):  # numba has no use for the folder

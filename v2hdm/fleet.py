@@ -63,10 +63,12 @@ class Row:
     @classmethod
     def of_result(cls, drive: str, source: str, place: str, metrics: Mapping[str, Any], kept: bool) -> Row:
         """The row of a finished run, from its ``metrics.json``."""
-        verdict, sets = metrics["verdict"], list(metrics["results"].values())
+        verdict = metrics["verdict"]
+        sets = list(metrics["results"].values())
         worst = next((f"{one['check']} ({one['about']}): {one['says']}" for one in verdict["findings"]), "")
         markings = int(sets[-1]["Opt"]["markings"]) if sets else None
-        images, seconds = int(metrics["drive"]["images"]), sum(metrics.get("seconds", {}).values())
+        images = int(metrics["drive"]["images"])
+        seconds = sum(metrics.get("seconds", {}).values())
         figures = (images, markings, round(seconds / 60, 3))
         return cls(drive, str(verdict["status"]), one_line(worst), *figures, kept, place, source)
 
@@ -208,7 +210,9 @@ class _Table:
     """The rows so far, on disk as well."""
 
     def __init__(self, write: WriteFile, sources: Sequence[str], progress: DriveProgress) -> None:
-        self._write, self._sources, self._progress = write, sources, progress
+        self._write = write
+        self._sources = sources
+        self._progress = progress
         self._rows: dict[str, Row] = {}
 
     @property

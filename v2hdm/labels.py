@@ -43,7 +43,8 @@ _PRIOR = np.array([6.0, 3.0, 1.0])
 """Dirichlet prior of that an image in which a marking was not detected shows, hides or partly hides it."""
 
 _DETECTED = np.array([0.98, 0.005, 0.015])  # the same where it was detected
-_FAINT_SHARE, _HIDDEN_SIGMA = 0.1, 0.5
+_FAINT_SHARE = 0.1
+_HIDDEN_SIGMA = 0.5
 """Share of the sides that are faint where shown; sigma of the contrast of what stands before them."""
 
 _ALIKE = 0.5  # power of the likelihood of one side: the four of one image err alike
@@ -52,7 +53,8 @@ _LEAST_PAIRS = 8  # detected sides below which nothing is said of images without
 _LEAST_SIGMA = 0.03
 _NEAREST_M = 0.3  # ground nearer to the camera's plane is cut off
 _LEAST_PX2 = 2.0  # area of the smallest piece that is labelled
-_INSIDE_M, _BESIDE_M = 0.06, (0.1, 0.18)  # how far from an edge paint and ground are sampled, at most, m
+_INSIDE_M = 0.06
+_BESIDE_M = (0.1, 0.18)  # how far from an edge paint and ground are sampled, at most, m
 _CLEAR_M = 1.0  # radius about a candidate that was left out of which nothing is said
 
 
@@ -72,7 +74,9 @@ class _Outline:
         """With samples at the middle parts of all edges."""
         inset_m = min(_INSIDE_M, 0.3 * rectangle_size(outline_map)[1])
         ahead = np.roll(outline_map, -1, axis=0)
-        inside, beside, side = [], [], []
+        inside = []
+        beside = []
+        side = []
         for n, (a, b) in enumerate(zip(outline_map, ahead, strict=True)):
             along = b - a
             outwards = np.array([along[1], -along[0]]) / max(float(np.linalg.norm(along)), 1e-9)
@@ -108,7 +112,8 @@ class _Eye:
     @classmethod
     def of(cls, image: Image, own: CameraFacts, facts: Facts) -> _Eye:
         """By the adjusted poses of the run."""
-        info, route = own.calibration.info, facts.route
+        info = own.calibration.info
+        route = facts.route
         assert route is not None
         read_out_s = own.read_out_s or 0.0
         taken_s = image.stamp_s + (own.clock_offset_s or 0.0) + np.array([-0.5, 0.5]) * read_out_s
@@ -153,7 +158,8 @@ class _Eye:
             px = np.where((depth_m > _NEAREST_M)[:, None], px, -9.0).astype(np.float32)
             seen = cv2.remap(grey, px[None, :, 0], px[None, :, 1], cv2.INTER_LINEAR, borderValue=-1e4)[0]
             values.append(np.where(seen < 0, np.nan, seen + 1.0))
-        ratio, out = np.log(values[0] / values[1]), np.full(4, np.nan)
+        ratio = np.log(values[0] / values[1])
+        out = np.full(4, np.nan)
         for side in range(4):
             own = ratio[outline.side == side]
             own = own[np.isfinite(own)]
@@ -205,7 +211,8 @@ def write_labels(
 
 def _detected(facts: Facts) -> Mapping[str, set[int]]:
     """By image the markings of which the mapping accepted three corners or more as points."""
-    residuals, out = facts.residuals, dict[str, set[int]]()
+    residuals = facts.residuals
+    out = dict[str, set[int]]()
     if residuals is not None:
         used = residuals.is_point & (residuals.marking > 0)
         pairs = np.stack([residuals.row_image[used], residuals.marking[used]], axis=1)
@@ -240,7 +247,8 @@ def _views(
 
 def _silent(eye: _Eye, facts: Facts, range_m: float) -> list[FloatArray]:
     """Polygons of an image of which the map says nothing: ground beyond the range, candidates left out."""
-    centre, view = camera_centre(eye.cam_from_map[:1])[0], eye.cam_from_map[0, 2, :2]
+    centre = camera_centre(eye.cam_from_map[:1])[0]
+    view = eye.cam_from_map[0, 2, :2]
     ahead = np.arctan2(view[1], view[0]) + np.linspace(-1.2, 1.2, 25)
     arc = np.column_stack([np.cos(ahead), np.sin(ahead)])
     beyond = np.concatenate([centre[:2] + range_m * arc, centre[:2] + 1e3 * arc[::-1]])
@@ -270,7 +278,8 @@ def _states(views: Sequence[_View], outlines: int) -> IntArray:
     hidden = norm.logpdf(np.where(known, contrast, 0.0), 0.0, _HIDDEN_SIGMA)
     either = np.logaddexp(shown, hidden) + np.log(0.5)
     sides = np.where(known[..., None], _ALIKE * np.stack([shown, hidden, either], axis=2), 0.0).sum(axis=1)
-    share, posterior = _PRIOR / _PRIOR.sum(), np.zeros((len(views), 3))
+    share = _PRIOR / _PRIOR.sum()
+    posterior = np.zeros((len(views), 3))
     for _ in range(10):  # settles within five
         prior = np.where(detected[:, None], _DETECTED, share)
         posterior = sides + np.log(prior)
@@ -307,13 +316,15 @@ def _expected(
     order = np.sort(np.broadcast_to(size[:, None], used.shape)[used])
     bins = max(1, min(8, len(order) // _PAIRS_OF_BIN))
     place = np.searchsorted(order[:: -(-len(order) // bins)][1:], size)
-    factor, sigma = np.ones(len(size)), np.full(len(size), _HIDDEN_SIGMA)
+    factor = np.ones(len(size))
+    sigma = np.full(len(size), _HIDDEN_SIGMA)
     for one in np.unique(place):
         here = place == one
         rows = used & here[:, None]
         if rows.sum() < _LEAST_PAIRS:
             continue
-        a, b = contrast[rows], own[rows]
+        a = contrast[rows]
+        b = own[rows]
         factor[here] = ratio = float((a * b).sum() / max((b * b).sum(), 1e-9))
         sigma[here] = max(1.4826 * float(np.median(np.abs(a - ratio * b))), _LEAST_SIGMA)
     return factor[:, None] * own, np.broadcast_to(sigma[:, None], own.shape)
@@ -356,7 +367,8 @@ def _coco(
 
 def _instance(category: int, image: int, polygon_px: FloatArray, unsure: bool) -> dict[str, Any]:
     points = polygon_px + 0.5
-    low, high = points.min(axis=0), points.max(axis=0)
+    low = points.min(axis=0)
+    high = points.max(axis=0)
     return {
         "image_id": image + 1,
         "category_id": category,

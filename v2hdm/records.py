@@ -212,7 +212,8 @@ class Drive:
 
     def name_of(self, path: Path) -> str:
         """Name an image as files of results do: its path below the drive's folder, else its whole path."""
-        path, root = path.absolute(), self.root.absolute()
+        path = path.absolute()
+        root = self.root.absolute()
         return path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
 
     @property

@@ -30,7 +30,8 @@ class Within:
         return above and value <= self.most and (self.step is None or value % self.step == 0)
 
     def __str__(self) -> str:
-        low, high = f"{self.least:g}", f"{self.most:g}"
+        low = f"{self.least:g}"
+        high = f"{self.most:g}"
         if self.most == math.inf:
             text = f"more than {low}" if self.open else f"{low} or more"
         else:
@@ -38,7 +39,9 @@ class Within:
         return text if self.step is None else f"a multiple of {self.step}, {text}"
 
 
-POSITIVE, NOT_NEGATIVE, SHARE = Within(0, open=True), Within(0), Within(0, 1)
+POSITIVE = Within(0, open=True)
+NOT_NEGATIVE = Within(0)
+SHARE = Within(0, 1)
 COUNT = Within(1, 10**12)
 SEED = Within(0, 2**63 - 1)
 

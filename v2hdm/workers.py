@@ -44,7 +44,8 @@ def share_out(
 ) -> None:
     """Do short jobs in processes that call ``start`` first; results in order, their errors or WorkerError."""
     found: dict[int, _Result] = {}
-    taken, ready = 0, _Prepared(work, start, arguments)
+    taken = 0
+    ready = _Prepared(work, start, arguments)
     for number, result in side_by_side(ready, jobs, min(processes, len(jobs)), lambda *_: None):
         if isinstance(result, WorkerError):
             raise result
@@ -60,7 +61,9 @@ class _Prepared(Generic[_Job, _Result]):
     def __init__(
         self, work: Callable[[_Job], _Result], start: Callable[..., None], arguments: tuple[object, ...]
     ) -> None:
-        self._work, self._start, self._arguments = work, start, arguments
+        self._work = work
+        self._start = start
+        self._arguments = arguments
         self._is_ready = False
 
     def __call__(self, job: _Job, progress: Progress) -> _Result:
@@ -82,14 +85,16 @@ def side_by_side(
     and a WorkerError is its result where that dies, too. An exception of ``work`` is raised here. Processes
     are spawned, as a fork would inherit the locks of threads; a pipe each takes no other's messages with it.
     """
-    left, died = list(range(len(jobs)))[::-1], set[int]()
+    left = list(range(len(jobs)))[::-1]
+    died = set[int]()
     others = set(multiprocessing.active_children())
     idle: list[_Worker] = []
     doing: dict[object, tuple[_Worker, int]] = {}
     try:
         while left or doing:
             while left and len(doing) < max(1, processes):
-                worker, number = idle.pop() if idle else _Worker(work), left.pop()
+                worker = idle.pop() if idle else _Worker(work)
+                number = left.pop()
                 doing[worker.pipe] = worker, number
                 with suppress(OSError):  # it has died, as what is received says
                     worker.pipe.send(jobs[number])

@@ -25,7 +25,8 @@ _PROGRAM = "from v2hdm.adjust import ahead; ahead.compile_kernels()"
 @contextmanager
 def compiled_meanwhile(device: str) -> Iterator[None]:
     """Have the kernels of an adjustment on the CPU compiled by the end of the block, if cacheable."""
-    folder, quiet = folder_of(engine), subprocess.DEVNULL
+    folder = folder_of(engine)
+    quiet = subprocess.DEVNULL
     if device != "cpu" or folder is None or (folder / _DONE).exists():
         yield
         return
@@ -60,10 +61,12 @@ def use_kernels() -> None:
 
 def _small_problem() -> Problem:
     """A camera two metres up that looks down on six points, from four places."""
-    points_map, driven_m = np.array([[x, y] for x in (-1.0, 0.0, 1.0) for y in (-0.6, 0.5)]), np.arange(4) / 5
+    points_map = np.array([[x, y] for x in (-1.0, 0.0, 1.0) for y in (-0.6, 0.5)])
+    driven_m = np.arange(4) / 5
     seen_px = 250.0 * (points_map - np.stack([driven_m, 0 * driven_m], axis=1)[:, None]) * [1, -1]
     frame, corner = (place.ravel() for place in np.indices(seen_px.shape[:2]))
-    noise_px, covariance_px = np.sin(np.arange(seen_px.size)), np.tile(np.eye(2), (len(frame), 1, 1))
+    noise_px = np.sin(np.arange(seen_px.size))
+    covariance_px = np.tile(np.eye(2), (len(frame), 1, 1))
     measured_px = (seen_px + noise_px.reshape(seen_px.shape)).reshape(-1, 2)
     map_from_vehicle = np.tile(np.eye(4), (4, 1, 1))
     map_from_vehicle[:, 0, 3] = driven_m

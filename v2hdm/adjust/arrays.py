@@ -224,7 +224,8 @@ class Arrays:
         corners = corners.long()
         rank = torch.full_like(self.corner_order, -1)
         rank[corners] = torch.arange(len(corners), device=rank.device)
-        first, second = rank[self.lengths.first], rank[self.lengths.second]
+        first = rank[self.lengths.first]
+        second = rank[self.lengths.second]
         both = (first >= 0) & (second >= 0)
         unit = (~self.joined).cumsum(0)[corners]
         part = replace(

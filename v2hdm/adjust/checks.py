@@ -38,7 +38,8 @@ def _check_control(problem: Problem) -> None:
     control = problem.control
     if control is None:
         return
-    count, named = len(control.corner), control.corner
+    count = len(control.corner)
+    named = control.corner
     if np.shape(control.points_map) != (count, 2) or np.shape(control.sigma_m) != (count, 2):
         raise AdjustError(f"control points: {count} corners need as many points_map and sigma_m (x, y)")
     there = (named >= 0) & (named < problem.corner_count)
@@ -53,7 +54,9 @@ def _check_lengths(problem: Problem) -> None:
     known = problem.lengths
     if known is None:
         return
-    count, length_m, sigma_m = len(known.first), known.length_m, known.sigma_m
+    count = len(known.first)
+    length_m = known.length_m
+    sigma_m = known.sigma_m
     if any(np.shape(values) != (count,) for values in (known.second, length_m, sigma_m)):
         raise AdjustError(f"known lengths: {count} first corners need as many second, length_m and sigma_m")
     first, second = ends = np.stack([known.first, known.second])
@@ -122,7 +125,8 @@ def _check_arrays(problem: Problem) -> None:
     for of, arrays in _ARRAYS.items():
         owner, prefix = (seen, "observations.") if of == "observation" else (problem, "")
         for name, each in arrays.items():
-            values, shape = getattr(owner, name), (sizes[of], *each)
+            values = getattr(owner, name)
+            shape = (sizes[of], *each)
             if values is None:
                 continue
             if not isinstance(values, np.ndarray):

@@ -64,8 +64,10 @@ class Covariance:
 
     def poses(self) -> FloatArray:
         """Variances (J, 6) of the frames' tangents; 0 without states."""
-        arrays, whitening = self.whitening.engine.arrays, self.whitening
-        frames, states = arrays.frame_count, len(arrays.states)
+        arrays = self.whitening.engine.arrays
+        whitening = self.whitening
+        frames = arrays.frame_count
+        states = len(arrays.states)
         out = np.zeros((frames, 6))
         columns = torch.tensor(arrays.states, dtype=torch.int64, device=arrays.centre.device)
         acts = torch.nn.functional.one_hot(columns, 6).to(torch.float64)
@@ -120,9 +122,11 @@ def corner_gain(whitening: Whitening) -> FloatArray:
     Frames follow too: e changes the reduced unknowns by x = L_S^-T (0, L_tip' e), column by column, so that
     W' x = (L_S^-1 W)' (0, L_tip' e).
     """
-    arrays, tip = whitening.engine.arrays, whitening.reduced_factor.tip
+    arrays = whitening.engine.arrays
+    tip = whitening.reduced_factor.tip
     out = np.empty((arrays.corner_count, 2, len(tip)))
-    begin, at_once = 0, _at_once(whitening)
+    begin = 0
+    at_once = _at_once(whitening)
     for end in arrays.units.tolist()[1:]:
         if end - begin < at_once and end < arrays.corner_count:
             continue
@@ -159,7 +163,8 @@ def _columns(corners: Tensor, wanted: Tensor) -> Tensor:
 
 def _reduced_root(whitening: Whitening, corners: Tensor) -> Tensor:
     """L_S^-1 W (D, 2 n) for n corners, ascending; -L_S^-1 E, with the selection E, for kept ones."""
-    plan, estimate = whitening.plan, whitening.estimate
+    plan = whitening.plan
+    estimate = whitening.estimate
     arrays = whitening.engine.arrays
     run = arrays.whole() if len(corners) == arrays.corner_count else arrays.gather(corners)
     coupling = whitening.linearised.coupling(run, estimate.corners_map[corners])

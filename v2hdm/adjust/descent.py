@@ -77,8 +77,10 @@ def minimise(
     optimizer = torch.optim.LBFGS([u], line_search_fn="strong_wolfe", **_STEPWISE, **_LINE_SEARCH)
     # Unwrapped: the profiler's hooks around it take as long as the step.
     step = inspect.unwrap(torch.optim.LBFGS.step)
-    best, best_gradient = cost, gradient
-    gap, slow = predicted_gap(best, best_gradient), False
+    best = cost
+    best_gradient = gradient
+    gap = predicted_gap(best, best_gradient)
+    slow = False
     for iteration in range(max_iterations):
         if gap <= tolerance or slow:
             break
@@ -93,10 +95,12 @@ def minimise(
             break
         seen.begin_step(u, reached, reached_gradient)
         progress = best - reached
-        best, best_gradient = reached, reached_gradient
+        best = reached
+        best_gradient = reached_gradient
         if progress <= _NO_PROGRESS * best:
             break
-        before, gap = gap, predicted_gap(best, best_gradient)
+        before = gap
+        gap = predicted_gap(best, best_gradient)
         slow = iteration > 0 and _steps_left(before, gap, tolerance) > renewal + _STEPS_FROM_NEARBY
     return Minimum(u * scale, best, best_gradient, slow)
 
@@ -248,8 +252,12 @@ def descend(
     """Minimise the cost while narrowing the loss; ``opening`` is :func:`open_descent` of the start."""
     whitening = opening or open_descent(engine, estimate, robust)
     del opening
-    plan, renewal = whitening.plan, RENEWAL_WITH_STATES if engine.arrays.states else RENEWAL
-    evaluations, refreshes, progressing, slow = 0, 0, True, False
+    plan = whitening.plan
+    renewal = RENEWAL_WITH_STATES if engine.arrays.states else RENEWAL
+    evaluations = 0
+    refreshes = 0
+    progressing = True
+    slow = False
     while True:
         final = whitening.robust.scale <= robust.scale
         objective = Objective(whitening)
@@ -262,7 +270,9 @@ def descend(
             or evaluations >= max_evaluations
             or not progressing
         )
-        whitened, reached, made = torch.zeros_like(gradient), cost, None
+        whitened = torch.zeros_like(gradient)
+        reached = cost
+        made = None
         if ended:
             made = whitening
         else:
@@ -274,7 +284,8 @@ def descend(
             gap = predicted_gap(reached, gradient)
             # A whitening under which the gap shrank this fast determines it well.
             ended = final and not slow and gap <= tolerance
-        point, used = objective.point(whitened), whitening.robust
+        point = objective.point(whitened)
+        used = whitening.robust
         evaluations += objective.evaluations
         singular = whitening.is_singular
         if ended:

@@ -110,7 +110,8 @@ class _Quadratic:
 
     def plus(self, own: _Own, sign: float) -> _Quadratic:
         """With a marking's contribution added, or subtracted with ``sign`` -1."""
-        added, moved = self.information.copy(), self.vector.copy()
+        added = self.information.copy()
+        moved = self.vector.copy()
         added[own.rows[:, None], own.rows] += sign * own.information
         moved[own.rows] += sign * own.vector
         return replace(self, information=added, vector=moved)
@@ -223,7 +224,8 @@ class IncrementalMap:
         at[:, 6:] = solution.covariance.descent.estimate.clock_s.cpu().numpy()
         self._earlier = _Quadratic(cameras, solution.cam_from_vehicle, information, information @ at.ravel())
         self._adjusted_count = len(every)
-        gain, end = corner_gain(solution.covariance.whitening), 0
+        gain = corner_gain(solution.covariance.whitening)
+        end = 0
         for marking, sighted in self._sighted.items():
             own = slice(end, end := end + sighted.corner_count)
             self._settled[marking] = _Settled(at.ravel(), solution.corners_map[own], gain[own], None)
@@ -237,12 +239,17 @@ class IncrementalMap:
         without = {"centre_vehicle": None, "clock_sigma_s": np.inf, "read_out_sigma_s": np.inf}
         problem, cameras = self._problem([sighted], **without)
         check_observations(problem)
-        options, rows, at = self._options, earlier.rows(cameras), earlier.mean
+        options = self._options
+        rows = earlier.rows(cameras)
+        at = earlier.mean
         base = earlier.base[np.searchsorted(earlier.cameras, cameras)]
         estimated = options.clock_offset, options.read_out
         arrays = make_arrays(problem, tuple(options.pose_states), options.device, *estimated)
-        engine, robust = make_engine(options.engine, arrays), Loss(options.loss, options.loss_scale)
-        plan, loss, gap = engine.plan(), None, np.inf
+        engine = make_engine(options.engine, arrays)
+        robust = Loss(options.loss, options.loss_scale)
+        plan = engine.plan()
+        loss = None
+        gap = np.inf
         moved, clock_s, chart = _moved(base, at[rows], options.device)
         corners, fixed = engine.back_project(moved)
         if not bool(fixed.all()):
@@ -256,7 +263,8 @@ class IncrementalMap:
             step = held.step(whitened)
             if not float(step[1][..., 3:].norm(dim=-1).max()) <= math.pi:  # outside the chart
                 raise _unsolved(f"marking {marking}", Status.STALLED)
-            done, at = held.linearised.evaluate(*step), joint.mean
+            done = held.linearised.evaluate(*step)
+            at = joint.mean
             left = done.gradient, done.coupled, done.whitened
             own, joint, _, gained = share(at, whitened_gradient(plan, held.reduced_factor, *left))
             gap = gained / max(sum(done.terms.values()), 1.0)
@@ -313,7 +321,8 @@ def _moved(base: FloatArray, unknowns: FloatArray, device: str) -> tuple[Tensor,
     """
     by_camera = unknowns.reshape(len(base), -1)
     moved, turns = move(np.ascontiguousarray(by_camera[:, :6]), base)
-    chart, each = np.eye(len(unknowns)), by_camera.shape[1]
+    chart = np.eye(len(unknowns))
+    each = by_camera.shape[1]
     for begin, turn in zip(range(0, len(unknowns), each), turns, strict=True):
         chart[begin : begin + 6, begin : begin + 6] = turn
     return torch.as_tensor(moved, device=device), torch.as_tensor(by_camera[:, 6:], device=device), chart

@@ -38,7 +38,8 @@ def shifted(problem: Problem, by_m: FloatArray) -> Problem:
         return problem
     poses = problem.map_from_vehicle.copy()
     poses[:, :2, 3] += by_m
-    start, control = problem.corners_start, problem.control
+    start = problem.corners_start
+    control = problem.control
     return replace(
         problem,
         map_from_vehicle=poses,
@@ -59,14 +60,16 @@ def state_prior(problem: Problem, pose_states: tuple[str, ...]) -> tuple[IntArra
     (Gelb, Applied Optimal Estimation, section 3.8). Returns the tangent's column (S,) of each, the transition
     (J, S, S) and the inverse sigma (J, S) of its innovation.
     """
-    poses, session = problem.map_from_vehicle, problem.session_of_frame
+    poses = problem.map_from_vehicle
+    session = problem.session_of_frame
     chosen = [k for k, name in enumerate(POSE_STATES) if name in pose_states]
     if not chosen:
         return np.zeros(0, dtype=np.int64), np.zeros((len(poses), 0, 0)), np.zeros((len(poses), 0))
     total = np.array([one.by_state() for one in problem.pose_sigmas])
     drifts = [[(each.sigma, each.over_m) for each in one.drift_by_state()] for one in problem.pose_sigmas]
     drift, over_m = np.array(drifts).transpose(2, 0, 1)
-    white, least = np.sqrt(np.maximum(total**2 - drift**2, 0.0)), _MIN_WHITE_SHARE * total
+    white = np.sqrt(np.maximum(total**2 - drift**2, 0.0))
+    least = _MIN_WHITE_SHARE * total
     scattering = [k for k in chosen if (white > least)[:, k].any()]
     fading = [k for k in chosen if drift[:, k].any()]
     columns = np.array(scattering + fading, dtype=np.int64)
@@ -150,8 +153,10 @@ def _surveys(problem: Problem) -> tuple[FloatArray, FloatArray, FloatArray, Floa
     """Surveyed centres (C, 3) and corners (N, 2), each with its root information, 0 without survey."""
     centre, centre_root = np.zeros((2, len(problem.intrinsic), 3))
     if problem.centre_vehicle is not None and problem.centre_sigma_m is not None:
-        centre, centre_root = problem.centre_vehicle, 1 / problem.centre_sigma_m
-    control, control_root = np.zeros((problem.corner_count, 2)), np.zeros((problem.corner_count, 3))
+        centre = problem.centre_vehicle
+        centre_root = 1 / problem.centre_sigma_m
+    control = np.zeros((problem.corner_count, 2))
+    control_root = np.zeros((problem.corner_count, 3))
     if problem.control is not None:
         control[problem.control.corner] = problem.control.points_map
         control_root[problem.control.corner] = problem.control.root_information
@@ -167,8 +172,10 @@ def _lengths(problem: Problem, rank: IntArray) -> tuple[NDArray[Any], ...]:
 
 def _corners_in_route_order(problem: Problem) -> tuple[IntArray, BoolArray]:
     """Corners (N,) by first frame, joined ones contiguous, and whether (N,) each is joined to the last."""
-    count, lengths = problem.corner_count, problem.lengths
-    seen, frames = problem.observations, len(problem.map_from_vehicle)
+    count = problem.corner_count
+    lengths = problem.lengths
+    seen = problem.observations
+    frames = len(problem.map_from_vehicle)
     first_frame = np.full(count, frames)
     np.minimum.at(first_frame, seen.corner, seen.frame)
     if lengths is None or not len(lengths.first):
@@ -191,12 +198,14 @@ def _sorted_observations(problem: Problem, rank: IntArray) -> tuple[NDArray[Any]
     """Observations (K,) by corner, camera, frame; then corner, pair and measurement of each."""
     from v2hdm.adjust.engines.numba.layout import Seen, lay_out  # loads numba
 
-    seen, count = Seen.of(problem.observations.columns, problem.intrinsic), len(problem.observations.corner)
+    seen = Seen.of(problem.observations.columns, problem.intrinsic)
+    count = len(problem.observations.corner)
     frames = len(problem.map_from_vehicle)
     key = (rank[seen.corner] * len(seen.intrinsic) + seen.camera) * frames + seen.frame
     order = np.argsort(key, kind="stable")
     corner, pair = np.empty((2, count), dtype=np.int32)
-    measured, root = np.empty((2, count)), np.empty((3, count))
+    measured = np.empty((2, count))
+    root = np.empty((3, count))
     again = lay_out(seen, rank, frames, order, corner, pair, measured, root)
     if again >= 0:
         first, second = order[again - 1 : again + 1].tolist()
@@ -224,5 +233,6 @@ def _moments(problem: Problem) -> tuple[IntArray, IntArray, FloatArray]:
     seen = problem.observations
     rows = np.column_stack([seen.frame, np.asarray(seen.row_share)])
     moments, own = np.unique(rows, axis=0, return_inverse=True)
-    frame, own = moments[:, 0].astype(np.int64), own.ravel().astype(np.int64)
+    frame = moments[:, 0].astype(np.int64)
+    own = own.ravel().astype(np.int64)
     return frame, own, np.asarray(problem.twist_vehicle)[frame] * moments[:, 1:]

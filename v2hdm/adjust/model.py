@@ -94,7 +94,8 @@ def cam_from_map(arrays: Arrays, cam_from_vehicle: Tensor, frame_state: Tensor, 
     ``cam_from_vehicle`` is (C, 4, 4), ``frame_state`` (J, S) or by pair (C, M, S), ``clock_s`` (C, Q) or by
     pair (C, M, Q).
     """
-    camera, vehicle_from_map = cam_from_vehicle[:, None], arrays.vehicle_from_map
+    camera = cam_from_vehicle[:, None]
+    vehicle_from_map = arrays.vehicle_from_map
     by_pair = frame_state.ndim == 3
     if by_pair:
         vehicle_from_map = arrays.at_moments(vehicle_from_map)
@@ -154,7 +155,8 @@ def depression_sine(cam_from_map: Tensor, measured: Tensor) -> Tensor:
 
 def centre_residual(arrays: Arrays, cam_from_vehicle: Tensor) -> Tensor:
     """Camera centres o = -R' t minus the surveyed ones, (C, 3)."""
-    rotation, translation = cam_from_vehicle[:, :3, :3], cam_from_vehicle[:, :3, 3:]
+    rotation = cam_from_vehicle[:, :3, :3]
+    translation = cam_from_vehicle[:, :3, 3:]
     return (-(rotation.mT @ translation)[..., 0] - arrays.centre) * arrays.centre_information_root
 
 
@@ -191,7 +193,8 @@ def length_residual(arrays: Arrays, first_map: Tensor, second_map: Tensor) -> Te
 
 def prior_residuals(arrays: Arrays, estimate: Estimate) -> dict[str, Tensor]:
     """All residuals except those of observations, by name."""
-    corners, known = estimate.corners_map, arrays.lengths
+    corners = estimate.corners_map
+    known = arrays.lengths
     return {
         "camera_centre": centre_residual(arrays, estimate.cam_from_vehicle),
         "frame_states": state_residual(arrays, estimate.frame_state),

@@ -121,7 +121,8 @@ class ControlPoints:
         """Root information a, b, c (M, 3) of whitened residuals (a dx, b dx + c dy)."""
         t = np.array([[1.0, 0.0]]) if self.along is None else self.along
         one, other = (1 / self.sigma_m**2).T
-        xx, yy = one * t[:, 0] ** 2 + other * t[:, 1] ** 2, one * t[:, 1] ** 2 + other * t[:, 0] ** 2
+        xx = one * t[:, 0] ** 2 + other * t[:, 1] ** 2
+        yy = one * t[:, 1] ** 2 + other * t[:, 0] ** 2
         c = np.sqrt(yy)
         b = np.where(c > 0, (one - other) * t[:, 0] * t[:, 1] / np.where(c > 0, c, 1.0), 0.0)
         left = xx - b**2
@@ -160,12 +161,14 @@ class PoseSigma:
 
     def by_state(self) -> FloatArray:
         """Sigmas (6,) in the order of :data:`POSE_STATES`."""
-        position, attitude = self.position_m, self.roll_pitch_rad
+        position = self.position_m
+        attitude = self.roll_pitch_rad
         return np.array([position, position, self.height_m, attitude, attitude, self.heading_rad])
 
     def drift_by_state(self) -> tuple[Drift, ...]:
         """The six drifts in the order of :data:`POSE_STATES`."""
-        position, attitude = self.position_drift, self.roll_pitch_drift
+        position = self.position_drift
+        attitude = self.roll_pitch_drift
         return (position, position, Drift(), attitude, attitude, self.heading_drift)
 
 
@@ -180,8 +183,8 @@ class Problem:
     for clock offsets, whose prior sigma is ``clock_sigma_s``. ``read_out_s`` (C,) are the stated read-out
     times, None for global shutters; their prior sigma is ``read_out_sigma_s``. ``control`` are surveyed
     corners: they alone separate a shift of the whole map from the drift of GNSS. ``lengths`` are known
-    distances. ``session`` (J,) numbers the session of each frame, from 0 and rising; ``pose_sigma`` is one for
-    all sessions or one per session.
+    distances. ``session`` (J,) is the number of each frame's session, from 0 and rising; ``pose_sigma`` is
+    one for all sessions or one per session.
 
     >>> problem = build_problem(port, result.detections)
     >>> problem.intrinsic.shape, problem.observations.pinhole_px.shape[1:]

@@ -82,7 +82,8 @@ class CornerFactor:
 
     def _solve_joint(self, right: Tensor, out: Tensor, transposed: bool) -> Tensor:
         for group in self.joint:
-            index, factor = group.index, group.factor.mT if transposed else group.factor
+            index = group.index
+            factor = group.factor.mT if transposed else group.factor
             stacked = right[index].reshape(*factor.shape[:2], -1)
             solved = torch.linalg.solve_triangular(factor, stacked, upper=transposed)
             out[index] = solved.reshape(*index.shape, *right.shape[1:])
@@ -94,10 +95,13 @@ def factorise_corners(arrays: Arrays, blocks: Tensor, by_length: tuple[Tensor, T
 
     Raises AdjustError if a block of joined corners is singular.
     """
-    xx, yx, yy = blocks[:, 0, 0], blocks[:, 1, 0], blocks[:, 1, 1]
+    xx = blocks[:, 0, 0]
+    yx = blocks[:, 1, 0]
+    yy = blocks[:, 1, 1]
     lower = cholesky_2x2(xx + CORNER_FLOOR, yx, yy + CORNER_FLOOR)
     units = arrays.units
-    size, groups = torch.diff(units), []
+    size = torch.diff(units)
+    groups = []
     for corners in torch.unique(size[size > 1]).tolist():
         group = Joint(units[:-1][size == corners], corners, lower)
         matrix = blocks.new_zeros(len(group.begin), corners, 2, corners, 2)
@@ -225,7 +229,8 @@ class Spread:
 
     def gather(self, by_pair: Tensor) -> Coupled:
         """A gradient (C, M, 6) by the pairs' tangents, carried back to the reduced unknowns."""
-        by_state, by_camera = by_pair.new_zeros(self.arrays.frame_count, 0), by_pair.sum(1)
+        by_state = by_pair.new_zeros(self.arrays.frame_count, 0)
+        by_camera = by_pair.sum(1)
         if self.state.shape[-1]:
             by_state = self.arrays.over_moments((self.state.mT @ by_pair[..., None])[..., 0].sum(0))
         if self.clock.shape[-1]:
@@ -263,7 +268,9 @@ class ReducedSystem:
     """S under assembly: U is accumulated, the corners' part subtracted."""
 
     def __init__(self, arrays: Arrays, plan: Plan, spread: Spread) -> None:
-        self.arrays, self.plan, self.spread = arrays, plan, spread
+        self.arrays = arrays
+        self.plan = plan
+        self.spread = spread
         # U by pair, or by camera where pairs move with their camera alone.
         self.by_pair = bool(arrays.states) or arrays.camera_unknowns > 6
         self.tip = arrays.camera_count * arrays.camera_unknowns
@@ -283,7 +290,8 @@ class ReducedSystem:
         ``coupling`` (k, 2, 6) is their W', ``blocks`` (m, 2, 2) the part of V at ``index`` (2, m), lower
         triangle.
         """
-        plan, axes = self.plan, torch.arange(2, device=index.device)
+        plan = self.plan
+        axes = torch.arange(2, device=index.device)
         by_state = self.spread.by_state(run, coupling)
         rows = self._kept_rows(run.corner)[:, None] + axes
         columns = self._frame_rows(self.arrays.frame_of(run.pair))
@@ -304,7 +312,8 @@ class ReducedSystem:
 
     def _frame_rows(self, frame: Tensor) -> Tensor:
         """Rows (n, S) of the states of frames (n,)."""
-        plan, states = self.plan, len(self.arrays.states)
+        plan = self.plan
+        states = len(self.arrays.states)
         begin = plan.position[frame // plan.frames_per_tile] * plan.size
         within = frame % plan.frames_per_tile * states
         return (begin + within)[:, None] + torch.arange(states, device=frame.device)
@@ -312,8 +321,10 @@ class ReducedSystem:
     def _scatter(self, rows: Tensor, columns: Tensor, values: Tensor) -> None:
         """Add values at rows and columns of the tiles, at the lower triangle's of two mirrored ones."""
         rows, columns = torch.broadcast_tensors(rows, columns)  # type: ignore[no-untyped-call]
-        low, high = torch.minimum(rows, columns), torch.maximum(rows, columns)
-        size, device = self.plan.size, values.device
+        low = torch.minimum(rows, columns)
+        high = torch.maximum(rows, columns)
+        size = self.plan.size
+        device = values.device
         tile = low // size * (self.plan.tile_count + 1) + high // size
         keys, at = (torch.as_tensor(one, device=device) for one in (self.matrix.keys, self.matrix.at))
         places = at[torch.searchsorted(keys, tile)] + high % size * size + low % size
@@ -338,7 +349,8 @@ class ReducedSystem:
         by_pair = self._own
         if self.arrays.camera_unknowns > 6:
             by_pair = self.spread.camera.mT @ by_pair @ self.spread.camera
-        tip, each = priors.camera.clone(), self.arrays.camera_unknowns
+        tip = priors.camera.clone()
+        each = self.arrays.camera_unknowns
         for begin, own in zip(range(0, len(tip), each), by_pair.sum(1), strict=True):
             tip[begin : begin + each, begin : begin + each] += own
         self.matrix.tiles[TIP, TIP].add_(tip)
@@ -346,7 +358,9 @@ class ReducedSystem:
 
     def _add_frames(self, priors: PriorBlocks) -> None:
         """Add the frames' information, prior and coupling to the cameras."""
-        arrays, plan, spread = self.arrays, self.plan, self.spread
+        arrays = self.arrays
+        plan = self.plan
+        spread = self.spread
         if not arrays.states:
             return
         by_state = self._own @ spread.state

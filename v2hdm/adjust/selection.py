@@ -50,7 +50,9 @@ def restrict(problem: Problem, keep: BoolArray) -> tuple[Problem, IntArray]:
     corners, corner = np.unique(seen.corner[keep], return_inverse=True)
     frame = seen.frame[keep]
     used = slice(int(frame.min()), int(frame.max()) + 1)
-    start, twist, control = problem.corners_start, problem.twist_vehicle, problem.control
+    start = problem.corners_start
+    twist = problem.twist_vehicle
+    control = problem.control
     if control is not None:
         left = np.isin(control.corner, corners)
         number = np.searchsorted(corners, control.corner[left])
@@ -179,7 +181,8 @@ def predicted_squared(
 ) -> FloatArray:
     """Squared Mahalanobis distances of ``held_out`` observations from the solution of the others."""
     seen = whole.observations
-    camera, frame = seen.camera[held_out], seen.frame[held_out]
+    camera = seen.camera[held_out]
+    frame = seen.frame[held_out]
     first = int(whole.observations.frame[~held_out].min())
     vehicle_from_map = np.linalg.inv(solution.map_from_vehicle)[frame - first]
     if fitted.twist_vehicle is not None:
@@ -201,7 +204,8 @@ def predicted_squared(
 
 def _stretch(problem: Problem) -> BoolArray:
     """Observations (K,) of the run of frames with most of them, including every camera's."""
-    seen, frames = problem.observations, len(problem.map_from_vehicle)
+    seen = problem.observations
+    frames = len(problem.map_from_vehicle)
     if frames <= _STRETCH_FRAMES:
         return np.ones(len(seen.frame), dtype=bool)
     count = np.zeros(frames + 1)
@@ -261,11 +265,13 @@ def estimate_noise(problem: Problem, solution: Solution) -> tuple[PoseSigma, ...
     ``solution`` must be under roughly correct sigmas. All sessions share the scales.
     """
     descent = solution.covariance.descent
-    arrays, stated = descent.engine.arrays, problem.pose_sigmas
+    arrays = descent.engine.arrays
+    stated = problem.pose_sigmas
     if not arrays.states:
         return stated
     states_of = tuple(POSE_STATES[axis] for axis in arrays.states)
-    scales, generator = dict.fromkeys(_GROUPS, _Scales()), torch.Generator()
+    scales = dict.fromkeys(_GROUPS, _Scales())
+    generator = torch.Generator()
     for _ in range(_ROUNDS):
         sigmas = tuple(_scaled(one, scales) for one in stated)
         _, *prior = state_prior(replace(problem, pose_sigma=sigmas), states_of)
@@ -297,8 +303,10 @@ def _scaled(stated: PoseSigma, scales: Mapping[str, _Scales]) -> PoseSigma:
         white = math.sqrt(max(sigma**2 - drift.sigma**2, 0.0)) * math.exp(scale.white)
         fading = Drift(drift.sigma * math.exp(scale.drift), drift.over_m * math.exp(scale.over))
         out[name] = math.hypot(white, fading.sigma), fading
-    (position_m, position), (height_m, _) = out["position"], out["height"]
-    (attitude_rad, attitude), (heading_rad, heading) = out["roll_pitch"], out["heading"]
+    (position_m, position) = out["position"]
+    (height_m, _) = out["height"]
+    (attitude_rad, attitude) = out["roll_pitch"]
+    (heading_rad, heading) = out["heading"]
     return PoseSigma(position_m, heading_rad, attitude_rad, height_m, position, heading, attitude)
 
 
@@ -316,7 +324,8 @@ def _scales(problem: Problem, drawn: FloatArray, name: str) -> _Scales:
     if not drift_m2 or len(correlation) < _LEAST_LAGS:
         count = errors.shape[1] * errors.shape[2]
         return _Scales(white=_shrunk(0.5 * math.log(correlation[0] / total_m2), 1 / (2 * count)))
-    fading, white = max(float(correlation[1]), 0.01 * correlation[0]), float(correlation[0] - correlation[1])
+    fading = max(float(correlation[1]), 0.01 * correlation[0])
+    white = float(correlation[0] - correlation[1])
     below = np.flatnonzero(correlation <= fading / math.e)
     faded_m = step_m * float(below[0] if len(below) else len(correlation))
     independent = errors.shape[2] * max(path_m / (2 * faded_m), 0.5)
@@ -332,8 +341,11 @@ def _scales(problem: Problem, drawn: FloatArray, name: str) -> _Scales:
 
 def _autocorrelation(problem: Problem, errors: FloatArray) -> tuple[FloatArray, float, float]:
     """Autocorrelation of errors (D, J, a) at lags of 0, 1, 2 ... steps, the step, m, and the path, m."""
-    poses, session = problem.map_from_vehicle, problem.session_of_frame
-    products, counts, path_m = np.zeros(0), np.zeros(0), 0.0
+    poses = problem.map_from_vehicle
+    session = problem.session_of_frame
+    products = np.zeros(0)
+    counts = np.zeros(0)
+    path_m = 0.0
     moved = np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1)[np.diff(session) == 0]
     moved = moved[moved > _LEAST_STEP_M]
     step_m = float(np.median(moved)) if len(moved) else _LEAST_STEP_M

@@ -208,7 +208,8 @@ class Observability:
 
 def observability(problem: Problem, solution: Solution) -> Sequence[Observability]:
     """Observability of each camera's extrinsic in ``problem``, one record per camera."""
-    rotation, covariance = solution.cam_from_vehicle[:, :3, :3], solution.extrinsic_covariance
+    rotation = solution.cam_from_vehicle[:, :3, :3]
+    covariance = solution.extrinsic_covariance
     centre_sigma_m = np.inf if problem.centre_sigma_m is None else problem.centre_sigma_m
     # The tangent is in camera axes; its translation is minus the motion of the centre.
     centre = rotation.transpose(0, 2, 1) @ covariance[:, :3, :3] @ rotation

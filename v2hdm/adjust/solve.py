@@ -92,7 +92,8 @@ def _papers_model(arrays: Arrays, corners: int) -> Arrays:
         arrays, _ = arrays.take(_route_blocks(arrays, corners))
     # Without states each moment is a frame.
     moments, moment = torch.unique(arrays.pair % arrays.moment_count, return_inverse=True)
-    camera, moments = arrays.camera_of(arrays.pair), moments.long()
+    camera = arrays.camera_of(arrays.pair)
+    moments = moments.long()
     frames = arrays.frame_of(moments)
     return replace(
         arrays,
@@ -150,9 +151,11 @@ def _solve(problem: Problem, options: SolveOptions) -> Solution:
     """Solve a checked problem."""
     origin_map = nearby_origin(problem)
     near = shifted(problem, -origin_map)
-    states, estimated = tuple(options.pose_states), (options.clock_offset, options.read_out)
+    states = tuple(options.pose_states)
+    estimated = (options.clock_offset, options.read_out)
     arrays = make_arrays(near, states, options.device, *estimated)
-    engine, robust = make_engine(options.engine, arrays), Loss(options.loss, options.loss_scale)
+    engine = make_engine(options.engine, arrays)
+    robust = Loss(options.loss, options.loss_scale)
     start, opening, spent = _start(near, engine, robust, options)
     del near
     descent = descend(
@@ -202,7 +205,9 @@ def _report(
 ) -> Solution:
     """The solution in the frame of ``problem``; ``origin_map`` is the arrays' origin in it."""
     robust = Loss(options.loss, options.loss_scale)
-    engine, estimate, terms = descent.engine, descent.estimate, descent.terms
+    engine = descent.engine
+    estimate = descent.estimate
+    terms = descent.terms
     arrays = engine.arrays
     if descent.robust != robust:
         terms = engine.terms(estimate, robust)
@@ -217,7 +222,8 @@ def _report(
     variance = variance_factors(mahalanobis2, of_priors, free, scale)
     corners_map = np.empty(estimate.corners_map.shape)
     corners_map[arrays.corner_order.cpu().numpy()] = estimate.corners_map.cpu().numpy()
-    map_from_vehicle, clock_s = problem.map_from_vehicle.copy(), estimate.clock_s.cpu().numpy()
+    map_from_vehicle = problem.map_from_vehicle.copy()
+    clock_s = estimate.clock_s.cpu().numpy()
     read_out_s = np.zeros(len(clock_s)) if problem.read_out_s is None else problem.read_out_s
     if options.read_out:
         clock_s, read_out_s = clock_s[:, :-1], read_out_s + clock_s[:, -1]

@@ -111,7 +111,8 @@ class TiledMatrix:
         *stacked, last = torch.split(values, [*areas, tip * tip])
         columns = tuple(part.view(-1, size) for part in stacked)
         tiles = {(TIP, TIP): last.view(tip, tip)}
-        keys, at = [], []
+        keys = []
+        at = []
         for column, (part, below) in enumerate(zip(columns, pattern.below, strict=True)):
             rows = (column, *below, TIP)
             parts = torch.split(part, [size] * (len(rows) - 1) + [tip])
@@ -155,7 +156,8 @@ class TiledCholesky:
     @cached_property
     def _flat(self) -> _Flat:
         at = np.array([tile.storage_offset() for tile in self.diagonal])
-        begin, tip = np.cumsum([0, *map(len, self.rows)]), np.ascontiguousarray(self.tip.numpy())
+        begin = np.cumsum([0, *map(len, self.rows)])
+        tip = np.ascontiguousarray(self.tip.numpy())
         rows = torch.cat(self.rows).numpy()
         return _Flat(self.values.numpy(), at, rows, begin, len(self.diagonal[0]), tip)
 
@@ -172,7 +174,8 @@ class TiledCholesky:
         """L^-1 b for b (size, n)."""
         if self._is_one_column(right):
             return self._substitute(_substitute_forward, right)
-        out, begin = right.clone(), 0
+        out = right.clone()
+        begin = 0
         # Rows above the first nonzero one stay zero.
         first = int(right.any(dim=1).to(torch.uint8).argmax()) if self.diagonal else 0
         for tile, panel, rows in zip(self.diagonal, self.panels, self.rows, strict=True):
@@ -188,7 +191,8 @@ class TiledCholesky:
         """L^-T b for b (size, n)."""
         if self._is_one_column(right):
             return self._substitute(_substitute_backward, right)
-        out, end = right.clone(), self.size - len(self.tip)
+        out = right.clone()
+        end = self.size - len(self.tip)
         out[end:] = torch.linalg.solve_triangular(self.tip.mT, out[end:], upper=True)
         for tile, panel, rows in zip(self.diagonal[::-1], self.panels[::-1], self.rows[::-1], strict=True):
             begin = end - len(tile)
@@ -200,7 +204,9 @@ class TiledCholesky:
 
 def factorise_tiles(matrix: TiledMatrix, hold_tip: bool = False) -> TiledCholesky | None:
     """Factorise in place, right-looking, the tip too unless held; None if not positive definite."""
-    diagonal, panels, rows = [], [], []
+    diagonal = []
+    panels = []
+    rows = []
     tip = matrix.tip
     size = matrix.columns[0].shape[1] if matrix.columns else 0
     index = torch.arange(size * len(matrix.columns) + len(tip), device=tip.device)
@@ -213,7 +219,8 @@ def factorise_tiles(matrix: TiledMatrix, hold_tip: bool = False) -> TiledCholesk
         keys = (*below, TIP)
         for n, first in enumerate(keys):
             for second in keys[n:]:
-                left, right = matrix.tiles[second, column], matrix.tiles[first, column]
+                left = matrix.tiles[second, column]
+                right = matrix.tiles[first, column]
                 matrix.tiles[second, first].addmm_(left, right.mT, alpha=-1)
         diagonal.append(own)
         panels.append(panel)
@@ -234,12 +241,14 @@ def _substitute_forward(factor: _Flat, out: FloatArray) -> None:
     for g in range(len(at)):
         own = g * size
         for i in range(size):
-            row, rest = at[g] + i * size, out[own + i]
+            row = at[g] + i * size
+            rest = out[own + i]
             for j in range(i):
                 rest -= values[row + j] * out[own + j]
             out[own + i] = rest / values[row + i]
         for k in range(begin[g], begin[g + 1]):
-            row, rest = at[g] + (size + k - begin[g]) * size, 0.0
+            row = at[g] + (size + k - begin[g]) * size
+            rest = 0.0
             for j in range(size):
                 rest += values[row + j] * out[own + j]
             out[rows[k]] -= rest
@@ -263,7 +272,8 @@ def _substitute_backward(factor: _Flat, out: FloatArray) -> None:
     for g in range(len(at) - 1, -1, -1):
         own = g * size
         for k in range(begin[g], begin[g + 1]):
-            row, known = at[g] + (size + k - begin[g]) * size, out[rows[k]]
+            row = at[g] + (size + k - begin[g]) * size
+            known = out[rows[k]]
             for j in range(size):
                 out[own + j] -= values[row + j] * known
         for i in range(size - 1, -1, -1):

@@ -90,7 +90,8 @@ class Whitening:
         solved = self.reduced_factor.solve_transposed(whitened[: self.reduced_factor.size, None])[:, 0]
         states, kept = from_tiles(self.plan, solved[:-tip], arrays.frame_count, len(arrays.states))
         by_camera = solved[-tip:].reshape(arrays.camera_count, -1)
-        extrinsics, clock = by_camera[:, :6], by_camera[:, 6:]
+        extrinsics = by_camera[:, :6]
+        clock = by_camera[:, 6:]
         motion = extrinsics[:, None].expand(-1, arrays.moment_count, -1)
         if arrays.states:
             motion = motion + (self.spread.state @ arrays.at_moments(states)[None, ..., None])[..., 0]
@@ -130,7 +131,8 @@ def factorise(
 
     Raises AdjustError if the normal equations cannot be factorised.
     """
-    spread, priors = engine.spread(estimate), engine.prior_blocks(estimate)
+    spread = engine.spread(estimate)
+    priors = engine.prior_blocks(estimate)
     for jitter in JITTER_STEPS:
         system = ReducedSystem(engine.arrays, plan, spread)
         linearised = engine.eliminate(system, estimate, robust)

@@ -25,7 +25,8 @@ OUTLINE_SIGMA_PX = 2.5
 
 _RUN_ON_M = 1.0  # length, m, beyond a dash without paint: gaps are at least as long as dashes
 _SURE_M = 0.2  # largest sigma, m, of a point that identifies its line
-_LONG, _PARALLEL = 2.0, 0.9  # least length over width of a line's piece, and cosine between it and the line
+_LONG = 2.0
+_PARALLEL = 0.9  # least length over width of a line's piece, and cosine between it and the line
 BORDER_PX = 10.0  # width of the image's border, px, within which a marking may be cut
 
 
@@ -76,7 +77,8 @@ def _on_ground(
 
 def locate(sightings: Sightings, rig: Rig) -> Located:
     """Back-project every corner of ``sightings`` to z = 0 of the map under ``rig``."""
-    camera, frame = sightings.camera, sightings.frame
+    camera = sightings.camera
+    frame = sightings.frame
     seen = sightings.corners_pinhole_px, sightings.row_share
     corners_map, jacobian = _on_ground(rig, camera, frame, *seen)
     covariance = jacobian @ sightings.covariance_px @ np.swapaxes(jacobian, -1, -2)
@@ -108,7 +110,8 @@ def images_with_symbol(symbols: Symbols, rig: Rig, corners_map: FloatArray) -> I
     for ground in outlines_on_ground(symbols, rig):
         if ground is None:
             continue
-        middle, size_m = ground.mean(axis=0), float(np.ptp(ground, axis=0).max())
+        middle = ground.mean(axis=0)
+        size_m = float(np.ptp(ground, axis=0).max())
         polygon = (ground - middle).astype(np.float32)
         for group in known[np.linalg.norm(centre[known] - middle, axis=1) < size_m]:
             off = (points[group] - middle).tolist()
@@ -131,13 +134,17 @@ def images_with_line(lines: Symbols, rig: Rig, corners_map: FloatArray) -> IntAr
     image = lines.frame * len(rig.intrinsic) + lines.camera
     image = np.repeat(image, [len(piece) for piece, _ in pieces])
     sure = sigma_m < _SURE_M
-    points, course, image = points[sure], course[sure], image[sure]
+    points = points[sure]
+    course = course[sure]
+    image = image[sure]
     centre, way, breadth_m = _middle_lines(corners_map)
     long_m = np.linalg.norm(way, axis=1)
     long = np.flatnonzero(np.isfinite(long_m) & (long_m > _LONG * breadth_m))
     found = cKDTree(points).query_ball_point(centre[long], long_m[long] / 2 + _RUN_ON_M)
-    group, near = np.repeat(long, [len(one) for one in found]), np.array([*chain(*found)], dtype=np.int64)
-    ahead, off = way[group] / long_m[group, None], points[near] - centre[group]
+    group = np.repeat(long, [len(one) for one in found])
+    near = np.array([*chain(*found)], dtype=np.int64)
+    ahead = way[group] / long_m[group, None]
+    off = points[near] - centre[group]
     goes_on = np.abs(np.sum(off * ahead, axis=1)) > (long_m + breadth_m)[group] / 2
     goes_on &= np.abs(cross(ahead, off)) < breadth_m[group]
     goes_on &= np.abs(np.sum(course[near] * ahead, axis=1)) > _PARALLEL
@@ -204,7 +211,8 @@ def easy_views(
     rig's.
     """
     whole = np.flatnonzero(np.isfinite(corners_map).all(axis=(1, 2)))
-    groups, images = [], []
+    groups = []
+    images = []
     for c, camera in enumerate(cameras):
         own = views.camera == c
         if not own.any() or not len(whole):
@@ -218,7 +226,8 @@ def easy_views(
         group = np.repeat(whole, [len(n) for n in near])
         view = np.flatnonzero(own)[np.concatenate([np.asarray(n, dtype=np.int64) for n in near])]
         vehicle_from_map = np.linalg.inv(rig.map_from_vehicle[views.frame[view]])
-        cam_from_vehicle, corners = rig.cam_from_vehicle[c], corners_map[group]
+        cam_from_vehicle = rig.cam_from_vehicle[c]
+        corners = corners_map[group]
         corners_vehicle = apply_homography(flat_motion(vehicle_from_map), corners)
         if within_m is None:
             seen = inside_convex(camera.roi_vehicle, corners_vehicle).all(axis=1)

@@ -25,7 +25,8 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 _LEAST_DEPTH_M = 1.0
 """Least depth, m, of a corner on a line to be projected: nearer, the line leaves the image steeply."""
 
-GATE_SIGMAS, MAX_GATE_M = 4.0, 1.5  # size of every gate, and its limit
+GATE_SIGMAS = 4.0
+MAX_GATE_M = 1.5  # size of every gate, and its limit
 SHAPE_TOLERANCE = 0.25  # corner deviation of sightings of one shape, as a fraction of the marking's diameter
 LEAST_TOLERANCE_M = 0.05  # least tolerance, m, of corners of one shape, for small markings
 _CORNER_FLOOR_M = 0.001  # floor of a corner's standard deviation in fusion, m
@@ -125,7 +126,8 @@ def fuse_groups(association: Association, located: Located, jitter_rad: float) -
     size = association.count * 4 + 1
     weight = informs.astype(float)
     for _ in range(3):
-        total, vector = np.zeros((size, 2, 2)), np.zeros((size, 2))
+        total = np.zeros((size, 2, 2))
+        vector = np.zeros((size, 2))
         weighted = information * weight[..., None, None]
         np.add.at(total, corner, weighted)
         np.add.at(vector, corner, (weighted @ points[..., None])[..., 0])
@@ -182,7 +184,8 @@ def merge_groups(
     centre = np.nanmean(fused.corners_map[usable], axis=1)
     # In a drive of a few images the extrinsic is poorly known, and rays may miss the ground.
     somewhere = np.isfinite(centre).all(axis=1)
-    usable, centre = usable[somewhere], centre[somewhere]
+    usable = usable[somewhere]
+    centre = centre[somewhere]
     if not len(usable):
         return association
     kind = group_kinds(association, sightings)
@@ -206,7 +209,8 @@ def merge_groups(
             images[group].add(image)
     pairs = zip(*(of[accepted] for of in (distance, a, b, found.shift)), strict=True)
     for _, a, b, s in sorted(pairs, key=lambda pair: float(pair[0])):
-        root_a, root_b = root[a], root[b]
+        root_a = root[a]
+        root_b = root[b]
         if root_a == root_b or not images[root_a].isdisjoint(images[root_b]):
             continue
         members = root == root_b
@@ -261,9 +265,11 @@ def attach(
     row, near = near_pairs(located, rows, fused.corners_map[whole].mean(axis=1), _REACH_M)
     group = whole[near]
     alike = group_kinds(association, sightings)[group] == sightings.kind[row]
-    row, group = row[alike], group[alike]
+    row = row[alike]
+    group = group[alike]
     squared = squared_distances(sightings, located, rig, row, fused.corners_map[group], jitter_rad)
-    out_group, out_shift = association.group.copy(), association.shift.copy()
+    out_group = association.group.copy()
+    out_shift = association.shift.copy()
     shown = set(zip(association.group.tolist(), sightings.image.tolist(), strict=True))
     for one in np.unique(row):
         own = np.flatnonzero(row == one)
@@ -272,7 +278,8 @@ def attach(
         best, second = squared[own].ravel()[order[:2]]
         place = (int(group[own[pair]]), int(sightings.image[one]))
         if best <= _MOST_SQUARED and second >= best + _CLEARER_BY and place not in shown:
-            out_group[one], out_shift[one] = place[0], shift
+            out_group[one] = place[0]
+            out_shift[one] = shift
             shown.add(place)
     return Association(out_group, out_shift, association.count)
 
@@ -302,7 +309,8 @@ def squared_distances(
     seen = camera[:, None], sightings.frame[row][:, None], sightings.row_share[row]
     cam_from_map = rig.cam_from_map(*np.broadcast_arrays(*seen))
     expected, depth_m = project_ground(rig.intrinsic[camera][:, None], cam_from_map, corners_map[:, None])
-    expected, depth_m = expected[:, SHIFTS, np.arange(4)], depth_m[:, SHIFTS, np.arange(4)]
+    expected = expected[:, SHIFTS, np.arange(4)]
+    depth_m = depth_m[:, SHIFTS, np.arange(4)]
     jitter_px = rig.intrinsic[camera, 0, 0] * jitter_rad
     noise = sightings.covariance_px[row] + jitter_px[:, None, None, None] ** 2 * np.eye(2)
     used = located.informs[row]

@@ -39,7 +39,8 @@ class Rig:
         self, camera: IntArray, frame: IntArray, row_share: FloatArray | None = None
     ) -> FloatArray:
         """Poses (..., 4, 4) of cameras (...) at frames (...), at the read-out of rows ``row_share`` (...)."""
-        cam_from_vehicle, poses = self.cam_from_vehicle[camera], self.map_from_vehicle[frame]
+        cam_from_vehicle = self.cam_from_vehicle[camera]
+        poses = self.map_from_vehicle[frame]
         if row_share is not None and self.read_out_s is not None and self.twist_vehicle is not None:
             late_s = self.read_out_s[camera] * np.nan_to_num(row_share)
             poses = poses @ exp(self.twist_vehicle[frame] * late_s[..., None])
@@ -174,7 +175,8 @@ def frames_of(drive: Drive) -> Frames:
     taken = np.array([(image.session, image.taken_s) for image in drive.images])
     distinct, first, inverse = np.unique(taken, axis=0, return_index=True, return_inverse=True)
     poses = np.stack([drive.images[i].map_from_vehicle for i in first])
-    frame, session = inverse.ravel().astype(np.int64), distinct[:, 0].astype(np.int64)
+    frame = inverse.ravel().astype(np.int64)
+    session = distinct[:, 0].astype(np.int64)
     return Frames(frame, session, distinct[:, 1], poses.astype(np.float64))
 
 
@@ -186,7 +188,8 @@ def collect_sightings(
     Raises MappingError for an unknown camera, or if its images hold no usable marking.
     """
     infos = [camera_of(drive, name).info for name in cameras]
-    camera_index, frames = {name: c for c, name in enumerate(cameras)}, frames_of(drive)
+    camera_index = {name: c for c, name in enumerate(cameras)}
+    frames = frames_of(drive)
     rows = [
         (found.image, marking)
         for found in sorted(detections, key=lambda one: one.image)

@@ -91,7 +91,9 @@ class _Linker:
         direction_rad: float,
         noise: PoseNoise,
     ) -> None:
-        self._sightings, self._located, self._direction_rad = sightings, located, direction_rad
+        self._sightings = sightings
+        self._located = located
+        self._direction_rad = direction_rad
         self._odometer_m = length_along(map_from_vehicle[:, :2, 3])
         self._heading_rad = np.unwrap(heading_rad(map_from_vehicle))
         self._ray_map = mean_corners(located.ray_map, located.valid)
@@ -142,7 +144,8 @@ class _Linker:
         frame = self._sightings.frame
         moved_m = np.abs(self._odometer_m[frame[rows]] - self._odometer_m[frame[last]])
         turned = np.abs(self._heading_rad[frame[rows]] - self._heading_rad[frame[last]])
-        height_m, range_m = self._located.height_m[rows], self._range_m[rows]
+        height_m = self._located.height_m[rows]
+        range_m = self._range_m[rows]
         direction = self._direction_rad
         along_m = direction * (1.0 + 2.0 * range_m / height_m) * (moved_m + range_m * turned)
         across_m = direction * (moved_m + range_m * turned + range_m**2 / height_m * turned)
@@ -151,7 +154,8 @@ class _Linker:
 
 def _noise_covariances(located: Located, ray: FloatArray, noise: PoseNoise) -> FloatArray:
     """Covariance (S, 2, 2) of the mean position, at the end of ``ray``: pixels, attitude, position."""
-    range_m, height_m = np.linalg.norm(ray, axis=1), located.height_m
+    range_m = np.linalg.norm(ray, axis=1)
+    height_m = located.height_m
     jitter_m = noise.roll_pitch_rad * (range_m**2 + height_m**2) / height_m
     weight = located.valid / np.maximum(located.valid.sum(axis=1, keepdims=True), 1)
     pixels = np.sum(

@@ -66,7 +66,8 @@ def movement(before: Calibration, after: Calibration) -> Movement:
     assert before.covariance is not None
     assert after.covariance is not None
     change = after.cam_from_vehicle @ inverse(before.cam_from_vehicle)
-    tangent, carried = log(change), adjoint(change)
+    tangent = log(change)
+    carried = adjoint(change)
     spread = after.covariance + carried @ before.covariance @ carried.T
     squared = float(tangent @ np.linalg.solve(spread, tangent))
     # A left perturbation (v, w) of cam_from_vehicle moves the centre by -R'v and turns the camera by -R'w.
@@ -95,7 +96,8 @@ def turned_alike(movements: Sequence[Movement]) -> bool:
 
 
 def _check_comparable(before: Calibration, after: Calibration) -> None:
-    first, second = before.info, after.info
+    first = before.info
+    second = after.info
     who = f"camera '{first.name}'"
     if first.name != second.name:
         raise MapFileError(f"{who} and '{second.name}': two different cameras; give two calibrations of one")

@@ -41,7 +41,8 @@ _LEAST_SHARE = 1e-12  # and, as a share of its trace, near the horizon, where on
 _SUBSETS = 300  # subsets of four points that are tried; of ten points these are all 210
 _REFINED = 4  # starts that are refined
 # Rounds of expectation maximisation after which a refinement ends, and steps of each, converged or not.
-_ROUNDS, _STEPS = 60, 30
+_ROUNDS = 60
+_STEPS = 30
 # Noise factors q under which a start is scored; the refinement finds its own.
 _FACTORS = np.array([1.0, 10.0, 100.0, 1e3, 1e4])
 _DAMPING = 1e-6
@@ -215,7 +216,8 @@ def _refine(seen: Seen, mounting: FloatArray, rounds: int) -> Fit:
             break
         before = after
         mounting = _descend(seen, mounting, covariance, factor)
-    slopes, weight = seen.jacobian(mounting), right[:, None, None] / factor * np.linalg.inv(covariance)
+    slopes = seen.jacobian(mounting)
+    weight = right[:, None, None] / factor * np.linalg.inv(covariance)
     information = normal_equations(np.zeros((seen.count, 2)), slopes, weight).information
     return Fit(seen, mounting, covariance_of(information), factor, right, after)
 

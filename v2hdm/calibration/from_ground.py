@@ -95,7 +95,8 @@ def _lines(estimate: GroundEstimate) -> Iterator[str]:
     for parameter in estimate.parameters.values():
         if parameter.observable:
             name, factor, unit = _NAMES[parameter.name]
-            value, sigma = factor * parameter.value, factor * parameter.sigma
+            value = factor * parameter.value
+            sigma = factor * parameter.sigma
             found.append(f"{name} {value:+.2g} +- {sigma:.2g} {unit}".rstrip())
     if found:
         yield f"  also: {', '.join(found)}"

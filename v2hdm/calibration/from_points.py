@@ -49,9 +49,11 @@ _ROLL_RAD = np.radians(15.0)  # standard deviation of the roll of cameras on veh
 _BESIDE_M = 1.5  # standard deviation of their place to the left
 _UNUSUAL = 8.0  # log odds at most against an unusual mounting: some cameras hang on their side or head
 # Median height of cameras on vehicles, m, and the standard deviation of its logarithm.
-_HEIGHT_M, _LOG_HEIGHT = 2.0, 0.7
+_HEIGHT_M = 2.0
+_LOG_HEIGHT = 0.7
 _SCALES = (0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0)  # usual ratios of the sizes of one camera's images
-_STARTS, _ROUNDS = 1, 6  # enough to tell a reading that explains the points from one that does not
+_STARTS = 1
+_ROUNDS = 6  # enough to tell a reading that explains the points from one that does not
 _TOLD = 300  # points, at most, that readings are compared by
 _UNRELATED = "pixels and places are unrelated; check which pixel belongs to which place"
 
@@ -78,7 +80,8 @@ class PointCalibration:
 
     def camera_entry(self, info_file: str) -> dict[str, Any]:
         """The camera's entry for ``drive.yaml``, but for the file names of a real drive."""
-        info, mounting = self.fit.seen.info, self.fit.cam_from_vehicle
+        info = self.fit.seen.info
+        mounting = self.fit.cam_from_vehicle
         sigma = centre_sigmas(mounting, self.fit.covariance)
         return {
             "camera_info": info_file,
@@ -170,7 +173,8 @@ def _doubtful(fits: list[Fit]) -> bool:
 def _misreading(points: SurveyedPoints, info: CameraInfo, noise: Noise) -> str | None:
     """The likeliest reason why the points make no sense as they are; None where none is likely."""
     some = slice(None, None, -(-len(points.names) // _TOLD))
-    px, ground = points.points_px[some], points.points_vehicle[some]
+    px = points.points_px[some]
+    ground = points.points_vehicle[some]
 
     def score(points_px: FloatArray, points_vehicle: FloatArray, *effort: int) -> float:
         fits = fit_mountings(Seen.of(points_px, points_vehicle, info, noise), *effort)
@@ -221,7 +225,8 @@ _COLUMNS = (
 
 def write_point_calibration(found: PointCalibration, folder: Path, image: np.ndarray | None = None) -> None:
     """Write calibration, drive entry, table, verdict and picture, in the image (H, W, 3) BGR if given."""
-    info, verdict = found.fit.seen.info, found.verdict.as_json()
+    info = found.fit.seen.info
+    verdict = found.verdict.as_json()
     write_json(folder / "verdict.json", verdict)
     path = folder / f"calibration_{info.name}.yaml"
     about = Provenance.today(found.points.path.stem, verdict)
@@ -232,7 +237,9 @@ def write_point_calibration(found: PointCalibration, folder: Path, image: np.nda
         "# For drive.yaml. Under images, name the list of your images (docs/drive-format.md).\n" + entry,
         encoding="utf-8",
     )
-    points, off, rows = found.points, found.residuals, []
+    points = found.points
+    off = found.residuals
+    rows = []
     for k, name in enumerate(points.names):
         shift = [*(f"{px:.3f}" for px in off.off_px[k]), *(f"{m:.4f}" for m in off.off_m[k])]
         known = [f"{off.sigmas[k]:.2f}", f"{found.fit.right[k]:.3g}", f"{off.known_m[k]:.4f}"]
@@ -245,7 +252,9 @@ def write_point_calibration(found: PointCalibration, folder: Path, image: np.nda
 
 def summary_lines(found: PointCalibration) -> list[str]:
     """The mounting, every point's residual and the verdict, for a terminal."""
-    fit, off, verdict = found.fit, found.residuals, found.verdict
+    fit = found.fit
+    off = found.residuals
+    verdict = found.verdict
     turned, placed = mounting_words(fit.cam_from_vehicle, fit.covariance)
     right = fit.is_right
     off_px, off_cm = (np.hypot(*part.T) for part in (off.off_px, 100 * off.off_m))

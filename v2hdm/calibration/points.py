@@ -47,7 +47,9 @@ def read_points(path: Path) -> SurveyedPoints:
     """Read a CSV file: names of :data:`COLUMNS`, perhaps ``name``, then a point a line; raises DriveError."""
     header, lines = read_rows(path, ";,\t", "point")
     columns = _columns(header, path)
-    names, labels, rows = [], [], []
+    names = []
+    labels = []
+    rows = []
     for number, cells in lines:
         row = dict(zip(columns, cells, strict=True))
         name = row.get(_NAME, "")
@@ -82,7 +84,8 @@ def check_points(points: SurveyedPoints, info: CameraInfo) -> None:
         _, first, same = np.unique(table, axis=0, return_index=True, return_inverse=True)
         again = np.flatnonzero(first[same.ravel()] < np.arange(len(table)))
         if len(again):
-            a, b = first[same.ravel()[again[0]]], again[0]
+            a = first[same.ravel()[again[0]]]
+            b = again[0]
             raise DriveError(
                 f"{points.path}: {points.names[a]} and {points.names[b]} have the same {what}; drop or fix "
                 "one of them"
@@ -130,7 +133,8 @@ class Residuals:
 
 def residuals(fit: Fit) -> Residuals:
     """The residuals of every point, wrong ones included."""
-    seen, mounting = fit.seen, fit.cam_from_vehicle
+    seen = fit.seen
+    mounting = fit.cam_from_vehicle
     predicted, depth = project_ground(seen.info.intrinsic, mounting, seen.points_vehicle)
     off_px = np.where(depth[:, None] > 0, seen.points_px - distort_points(seen.info, predicted), np.nan)
     in_view = seen.points_vehicle[int(np.argmax(np.where(depth > 0, fit.right, -1.0)))]
@@ -142,7 +146,8 @@ def residuals(fit: Fit) -> Residuals:
 
 def known_ground(fit: Fit, places_vehicle: FloatArray) -> FloatArray:
     """Standard deviation (M,) of the IPM at places (M, 2), m, the worst way; inf behind the camera."""
-    seen, mounting = fit.seen, fit.cam_from_vehicle
+    seen = fit.seen
+    mounting = fit.cam_from_vehicle
     count = len(places_vehicle)
     places = replace(
         seen,
@@ -264,14 +269,16 @@ def _gain_of(
     wanted = np.einsum("nij,nik,nj->k", stated, more, residual)
     pull = np.einsum("nij,nik,nj->k", stated, slopes, residual)
     through = shared @ np.linalg.pinv(mounting)
-    left, force = own - through @ shared.T, wanted - through @ pull
+    left = own - through @ shared.T
+    force = wanted - through @ pull
     step = -np.linalg.pinv(left, hermitian=True) @ force
     return float(-step @ force), step, left
 
 
 def judge_fit(points: SurveyedPoints, fits: Sequence[Fit], residuals: Residuals) -> Iterator[Finding]:
     """The findings on the most likely of ``fits``."""
-    fit, about = fits[0], fits[0].seen.info.name
+    fit = fits[0]
+    about = fits[0].seen.info.name
     yield from _wrong_points(points, fits, residuals, about)
     spread = scatter(fit, CHANCE)
     says = f"the points scatter {spread.ratio:.2g} times as much as --pixel-sigma and --survey-sigma state"
@@ -294,7 +301,8 @@ def judge_fit(points: SurveyedPoints, fits: Sequence[Fit], residuals: Residuals)
 def _wrong_points(
     points: SurveyedPoints, fits: Sequence[Fit], residuals: Residuals, about: str
 ) -> Iterator[Finding]:
-    fit, total = fits[0], len(points.names)
+    fit = fits[0]
+    total = len(points.names)
     named = np.flatnonzero(~fit.is_right | (residuals.probability < CHANCE / total)).tolist()
     for k in named:
         how_far = _how_far(residuals.off_px[k], residuals.off_m[k])
@@ -343,7 +351,8 @@ def _intrinsics(fit: Fit, about: str) -> Finding:
 
 def _how_far(off_px: FloatArray, off_m: FloatArray) -> str:
     """How far a point (2,) is off in the image and on the ground."""
-    pixels, metres = float(np.hypot(*off_px)), float(np.hypot(*off_m))
+    pixels = float(np.hypot(*off_px))
+    metres = float(np.hypot(*off_m))
     if not np.isfinite(pixels):
         return "its place is behind the camera"
     if not np.isfinite(metres):

@@ -37,7 +37,8 @@ def run(arguments: Sequence[str]) -> None:
     if not parsed.gb >= 0:
         raise ConfigError(f"--gb {parsed.gb:g}: give 0 or more")
     removed = prune(cache, parsed.gb * _GB)
-    freed, left = sum(item.size for item in removed), sum(item.size for item in items_of(cache))
+    freed = sum(item.size for item in removed)
+    left = sum(item.size for item in items_of(cache))
     print(f"removed {len(removed)} entries of {_size(freed)}; {_size(left)} are left")
 
 

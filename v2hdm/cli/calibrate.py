@@ -118,7 +118,8 @@ def _line(one: Movement) -> str:
         f"{axis} {degrees(value):+.2f} +- {degrees(sigma):.2f} deg"
         for axis, value, sigma in zip(("roll", "pitch", "yaw"), one.turn_rad, one.sigma[3:], strict=True)
     ]
-    least_mm, least_deg = 1e3 * one.detectable[:3].max(), degrees(one.detectable[3:].max())
+    least_mm = 1e3 * one.detectable[:3].max()
+    least_deg = degrees(one.detectable[3:].max())
     found = (
         f"MOVED (by chance in at most {max(one.probability, _LEAST):.1g} of such pairs)"
         if one.moved

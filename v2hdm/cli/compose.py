@@ -263,7 +263,8 @@ def keys_of(schema: type[Any], prefix: str = "") -> Iterator[Key]:
     """All keys below a dataclass, in order; those of an entry of a mapping stand under ``NAME``."""
     hints = get_type_hints(schema)
     for one in fields(schema):
-        hint, name = hints[one.name], f"{prefix}{one.name}"
+        hint = hints[one.name]
+        name = f"{prefix}{one.name}"
         below = next((kind for kind in (hint, *get_args(hint)) if _is_schema(kind)), None)
         is_mapping = hint is not below and "dict" in str(hint)
         if below is None or hint is not below:

@@ -59,8 +59,11 @@ def _detect(parsed: argparse.Namespace) -> None:
     from v2hdm.store.results import growing_folder
 
     cv2.setNumThreads(1)
-    stopwatch, live = Stopwatch(), parsed.live or parsed.source.isdecimal()
-    dropped, age_s, drawn_as = 0, deque[float](maxlen=KEPT), set[str]()
+    stopwatch = Stopwatch()
+    live = parsed.live or parsed.source.isdecimal()
+    dropped = 0
+    age_s = deque[float](maxlen=KEPT)
+    drawn_as = set[str]()
     frames = detect_images(
         parsed.source,
         camera=parsed.camera,
@@ -114,7 +117,8 @@ def _drawing(frame: Frame, road: Road) -> bytes:
 
     from v2hdm.detection.road import draw_detections
 
-    markings, lanes = [one.image for one in road.markings], [one.image for one in road.lanes]
+    markings = [one.image for one in road.markings]
+    lanes = [one.image for one in road.lanes]
     drawn = draw_detections(frame.pixels, markings, lanes)
     return cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, 92])[1].tobytes()
 

@@ -82,7 +82,8 @@ def localize_drive(arguments: Sequence[str]) -> int:
     from v2hdm.localization.run import localize, summary_lines, write_localised
 
     path = parsed.map / "map.geojson" if parsed.map.is_dir() else parsed.map
-    hd_map, calibrations = read_geojson(path), trusted_calibrations(path.parent)
+    hd_map = read_geojson(path)
+    calibrations = trusted_calibrations(path.parent)
     drive = drive_of(parsed)
     folder = parsed.output or Path("outputs") / f"{drive.name}-localized"
     settings = {"map": str(parsed.map), "drive": str(parsed.drive), "cameras": list(drive.cameras)}

@@ -35,7 +35,8 @@ def run(arguments: Sequence[str]) -> None:
     from v2hdm.pipeline.context import logging_to
     from v2hdm.store.results import listed_files
 
-    handler, folder = logging.StreamHandler(), parsed.output or parsed.source.parent
+    handler = logging.StreamHandler()
+    folder = parsed.output or parsed.source.parent
     handler.setLevel(logging.INFO)
     exports = {".yaml": _export_calibration, ".yml": _export_calibration, ".tif": _export_mosaic}
     export = exports.get(parsed.source.suffix.lower(), _export_map)
@@ -61,7 +62,8 @@ def _export_map(parsed: argparse.Namespace, folder: Path, check: Callable[[Path]
             f"'export=[geojson,{ground[0]}]'"
         )
     formats.check_formats(parsed.format, "--format")
-    name, chosen = parsed.source.stem, formats.with_data(parsed.format)
+    name = parsed.source.stem
+    chosen = formats.with_data(parsed.format)
     hd_map, verdict = read_map(parsed.source)
     grid = formats.check_crs(parsed.crs, chosen, hd_map.origin, "--crs").get("gpkg")
     # A project takes the GeoPackage that is there, whoever wrote it, where it is of this map.
@@ -109,6 +111,7 @@ def _export_calibration(parsed: argparse.Namespace, folder: Path, *_: object) ->
     if unknown:
         known = ", ".join(CALIBRATION_FORMATS)
         raise ConfigError(f"--format: unknown format '{unknown[0]}' for a calibration; choose from: {known}")
-    calibration, about = read_calibration(parsed.source), read_provenance(parsed.source)
+    calibration = read_calibration(parsed.source)
+    about = read_provenance(parsed.source)
     camera = calibration.info.name
     return [write_calibration_as(name, calibration, about, folder, camera) for name in parsed.format]

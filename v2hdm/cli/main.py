@@ -269,7 +269,8 @@ def answer_signals() -> None:
 
     def interrupt(*_: object) -> None:
         nonlocal pressed_s
-        before_s, pressed_s = pressed_s, time.monotonic()
+        before_s = pressed_s
+        pressed_s = time.monotonic()
         if pressed_s - before_s > _ONE_PRESS_S:
             raise KeyboardInterrupt
 

@@ -36,7 +36,8 @@ def _map(job: Job) -> int:
     from v2hdm.progress import patient, progress_bars
     from v2hdm.report.terminal import changes_table, results_table
 
-    config, console = job.settings, Console(file=patient(sys.stdout))
+    config = job.settings
+    console = Console(file=patient(sys.stdout))
     handler = RichHandler(logging.INFO, console, show_path=False, show_level=False, log_time_format="%X")
     # The verdict's lines, which stand at the end, once and unbroken.
     handler.addFilter(lambda record: record.levelno > logging.INFO or record.msg != "%s")
@@ -101,7 +102,8 @@ def fleet(arguments: Sequence[str]) -> int:
     files = [Path(one) for one in dict.fromkeys(parsed.drives) if one not in overrides]
     if not files:
         raise ConfigError("no drives given: name run files, as in v2hdm fleet drives/*.yaml")
-    table, share = parsed.table, (1, 1)
+    table = parsed.table
+    share = (1, 1)
     if parsed.share is not None:
         share = _share(parsed.share)
         table = table.with_name(f"{table.name}-{share[0]}-of-{share[1]}")

@@ -46,7 +46,8 @@ def _learn(detector: Detector, images: Sequence[Image], camera: Camera) -> BoolA
     chosen = np.unique(np.linspace(0, len(apart) - 1, min(_IMAGES, len(apart))).round().astype(np.intp))
     if len(chosen) < _LEAST_IMAGES:
         return None
-    shape, painted = (camera.info.height, camera.info.width), []
+    shape = (camera.info.height, camera.info.width)
+    painted = []
     for k in chosen.tolist():
         pixels = read_bgr(apart[k].path)
         if pixels.shape[:2] != shape:
@@ -55,10 +56,12 @@ def _learn(detector: Detector, images: Sequence[Image], camera: Camera) -> BoolA
     always = np.sum(painted, axis=0) >= _SHARE * len(chosen)
     if not always.any():
         return None
-    top, stride = detector.road_camera(camera).far_row, detector.network.info.paint_stride
+    top = detector.road_camera(camera).far_row
+    stride = detector.network.info.paint_stride
     mask = np.zeros(shape, dtype=np.uint8)
     grown = np.kron(always.astype(np.uint8), np.ones((stride, stride), dtype=np.uint8))
-    rows, columns = min(len(grown), len(mask) - top), min(grown.shape[1], mask.shape[1])
+    rows = min(len(grown), len(mask) - top)
+    columns = min(grown.shape[1], mask.shape[1])
     mask[top : top + rows, :columns] = grown[:rows, :columns]
     size = 2 * _MARGIN_PX + 1
     return np.asarray(cv2.dilate(mask, np.ones((size, size), np.uint8)) > 0)

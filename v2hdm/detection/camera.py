@@ -65,7 +65,8 @@ class RoadCamera:
         rows = np.arange(0.0, self.info.height + _LUT_STEP_PX, _LUT_STEP_PX)
         grid_px = np.stack(np.meshgrid(columns, rows), axis=-1)
         node = undistort_points(self.info, grid_px.reshape(-1, 2)).reshape(grid_px.shape)
-        right, down = np.diff(node, axis=1)[:-1], np.diff(node, axis=0)
+        right = np.diff(node, axis=1)[:-1]
+        down = np.diff(node, axis=0)
         slopes = right, down[:, :-1], np.diff(down, axis=1)
         self._pinhole_lut: FloatArray = np.stack([node[:-1, :-1], *slopes]).transpose(3, 0, 1, 2).copy()
         self._ground_from_pinhole_px = facing_ipm(
@@ -75,7 +76,8 @@ class RoadCamera:
         ahead, left, _ = cam_from_vehicle[2, :3]
         self.aside = bool(np.arctan2(abs(left), abs(ahead)) > ASIDE_RAD)
         centre = camera_centre(cam_from_vehicle)
-        self.foot_vehicle, self._height_m = centre[:2], float(centre[2])
+        self.foot_vehicle = centre[:2]
+        self._height_m = float(centre[2])
         on_ground = np.any(np.isfinite(self._row_grid_vehicle()).all(axis=2), axis=1)
         height = self.info.height - max(0, int(np.argmax(on_ground)) - _HORIZON_MARGIN_PX)
         self.top = self.info.height - min(-(-height // multiple) * multiple, self.info.height)
@@ -90,8 +92,11 @@ class RoadCamera:
             return points
         rows, columns = self._pinhole_lut.shape[2:]
         u, v = points.T / _LUT_STEP_PX
-        column, row = np.clip(u.astype(np.intp), 0, columns - 1), np.clip(v.astype(np.intp), 0, rows - 1)
-        right, down, at = u - column, v - row, columns * row + column
+        column = np.clip(u.astype(np.intp), 0, columns - 1)
+        row = np.clip(v.astype(np.intp), 0, rows - 1)
+        right = u - column
+        down = v - row
+        at = columns * row + column
         # Plane by plane numpy takes a sixth of the time.
         for axis, table in enumerate(self._pinhole_lut.reshape(2, 4, -1)):
             there, by_right, by_down, by_both = (plane.take(at) for plane in table)
@@ -144,7 +149,8 @@ class RoadCamera:
 
     def inside(self, points_px: FloatArray, border_px: float) -> BoolArray:
         """Which recorded points (..., 2) lie at least ``border_px`` inside the image."""
-        u, v = points_px[..., 0], points_px[..., 1]
+        u = points_px[..., 0]
+        v = points_px[..., 1]
         across = (u >= border_px) & (u <= self.info.width - 1 - border_px)
         return np.asarray(across & (v >= border_px) & (v <= self.info.height - 1 - border_px))
 
@@ -159,7 +165,8 @@ class RoadCamera:
         """
         pinhole_px = self.undistort(points_px)
         points_vehicle = self.ground(pinhole_px)
-        intrinsic, matrix = calibration.info.intrinsic, calibration.cam_from_vehicle
+        intrinsic = calibration.info.intrinsic
+        matrix = calibration.cam_from_vehicle
         cam = points_vehicle @ matrix[:3, :2].T + matrix[:3, 3]
         project = np.zeros((len(cam), 2, 3))
         project[:, :, :2] = intrinsic[:2, :2]
@@ -169,9 +176,12 @@ class RoadCamera:
         moved = np.zeros((len(cam), 3, 6))
         moved[:, range(3), range(3)] = 1.0
         x, y, z = cam.T
-        moved[:, 0, 4], moved[:, 0, 5] = z, -y
-        moved[:, 1, 3], moved[:, 1, 5] = -z, x
-        moved[:, 2, 3], moved[:, 2, 4] = y, -x
+        moved[:, 0, 4] = z
+        moved[:, 0, 5] = -y
+        moved[:, 1, 3] = -z
+        moved[:, 1, 5] = x
+        moved[:, 2, 3] = y
+        moved[:, 2, 4] = -x
         by_px = by_pinhole @ _inverse(self.distort_jacobian(pinhole_px))
         covariance = np.zeros((6, 6)) if calibration.covariance is None else calibration.covariance
         return GroundPoints(points_vehicle, by_px, -by_pinhole @ project @ moved, covariance)
@@ -238,7 +248,8 @@ class GroundPoints:
 
 def _inverse(matrices: FloatArray) -> FloatArray:
     """Inverses (N, 2, 2), by Cramer's rule so that nan stays where it is."""
-    (a, b), (c, d) = matrices[:, 0].T, matrices[:, 1].T
+    (a, b) = matrices[:, 0].T
+    (c, d) = matrices[:, 1].T
     adjugate = np.stack([np.stack([d, -b], axis=1), np.stack([-c, a], axis=1)], axis=1)
     return np.asarray(adjugate / (a * d - b * c)[:, None, None])
 
@@ -277,7 +288,8 @@ class Horizon:
         """The factors (N, 3) of a curve's a, b and c at distances (N,) below the horizon, px."""
         v = np.maximum(below, _LEAST_BELOW_PX) / _CURVE_UNIT_PX
         phi = np.ones((len(v), 3))
-        phi[:, 1], phi[:, 2] = v, 1.0 / v
+        phi[:, 1] = v
+        phi[:, 2] = 1.0 / v
         return phi
 
     def depth_m(self, below: FloatArray) -> FloatArray:
@@ -301,7 +313,8 @@ def camera_from_calibration(
     calibration: Calibration, linear_response: bool = False, mounting_sigma: tuple[float, float] = (0.0, 0.0)
 ) -> Camera:
     """A camera of a calibration that is ``mounting_sigma`` off; MapFileError where it sees no ground."""
-    info, cam_from_vehicle = calibration.info, calibration.cam_from_vehicle
+    info = calibration.info
+    cam_from_vehicle = calibration.cam_from_vehicle
     problem = _problem(calibration)
     if not problem:
         below_px = np.array([[info.intrinsic[0, 2], info.height - 1.0]])
@@ -332,10 +345,12 @@ def rough_calibration(
     """
     focal_px = width / 2 / np.tan(np.deg2rad(fov_deg) / 2)
     intrinsic = np.array([[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]])
-    c, s = np.cos(np.deg2rad(pitch_deg)), np.sin(np.deg2rad(pitch_deg))
+    c = np.cos(np.deg2rad(pitch_deg))
+    s = np.sin(np.deg2rad(pitch_deg))
     cam_from_vehicle = np.eye(4)
     cam_from_vehicle[:3, :3] = [[0, -1, 0], [-s, 0, -c], [c, 0, -s]]
-    c, s = np.cos(np.deg2rad(roll_deg)), np.sin(np.deg2rad(roll_deg))
+    c = np.cos(np.deg2rad(roll_deg))
+    s = np.sin(np.deg2rad(roll_deg))
     cam_from_vehicle[:3, :3] = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ cam_from_vehicle[:3, :3]
     cam_from_vehicle[:3, 3] = -cam_from_vehicle[:3, :3] @ [0, 0, height_m]
     return Calibration(CameraInfo(name, width, height, intrinsic), cam_from_vehicle)
@@ -343,7 +358,8 @@ def rough_calibration(
 
 def _problem(calibration: Calibration) -> str | None:
     """The reason why a calibration cannot be used, if there is one."""
-    info, cam_from_vehicle = calibration.info, calibration.cam_from_vehicle
+    info = calibration.info
+    cam_from_vehicle = calibration.cam_from_vehicle
     rotation = cam_from_vehicle[:3, :3]
     count = DISTORTION_COEFFICIENTS.get(info.distortion_model)
     if count is None:

@@ -59,12 +59,15 @@ whether it is outside the image."""
 SIZE = 20  # rows and columns of a picture
 
 _AROUND = 0.6
-_BEFORE, _BESIDE = 0.3, 1.0
+_BEFORE = 0.3
+_BESIDE = 1.0
 """How far a picture reaches beyond the corners, in parts of the sides: of a diamond; of all else along its
 longer sides and across them."""
 
 _FINER = 2  # so many samples of the image per element, in each direction
-_GREY_GAIN, _COLOUR_GAIN, _ODDS_GAIN = 2.0, 2.0, 1 / 3  # bring the channels to about one
+_GREY_GAIN = 2.0
+_COLOUR_GAIN = 2.0
+_ODDS_GAIN = 1 / 3  # bring the channels to about one
 _GRID = (np.arange(6) + 0.5) / 6
 _INNER = tuple(part.reshape(-1) for part in np.meshgrid(_GRID, _GRID))
 _SUREST = -4  # place of the ninth decile among 36, in order
@@ -89,7 +92,8 @@ def gather(
     sides = np.sort(np.nan_to_num(ground.length, nan=1.0), axis=1)
     log_sides = np.log(np.clip(sides, *_SIZE_LIMITS_M))
     inside, beside = _paint_odds(output, quads)
-    lines, symbols = catalogue.of_family(LINE), catalogue.of_family(SYMBOL, OTHER)
+    lines = catalogue.of_family(LINE)
+    symbols = catalogue.of_family(SYMBOL, OTHER)
     shared = {
         "odds_inside": inside.mean(axis=1),
         "surest_inside": np.sort(inside, axis=1)[:, _SUREST],
@@ -136,11 +140,13 @@ def rectified_views(
     # All readings of a quadrilateral as a diamond share a picture, and so do those as anything else.
     key = np.array([2 * m + (kind == DIAMOND) for m, kind in readings], dtype=np.intp)
     shown, of_reading = np.unique(key, return_inverse=True)
-    marking, diamond = shown // 2, shown % 2 == 1
+    marking = shown // 2
+    diamond = shown % 2 == 1
     length = np.nan_to_num(ground.length, nan=1.0)
     lengthwise = length[:, 0] + length[:, 2] >= length[:, 1] + length[:, 3]
     ordered = quads.long_first(lengthwise).corners[marking]
-    quads, output = quads.take(marking), patches.output
+    quads = quads.take(marking)
+    output = patches.output
     points = quads.px(_points(ordered, diamond, SIZE))
     fine = patches.light_at(quads.px(_points(ordered, diamond, _FINER * SIZE)))
     fine = fine.reshape(-1, SIZE, _FINER, SIZE, _FINER, 3)
@@ -154,7 +160,8 @@ def rectified_views(
         plane - np.median(plane, axis=(1, 2), keepdims=True)
         for plane in (log_light(grey_of(bgr)), logs[..., 0] - logs[..., 2])
     )
-    odds, shares = output.odds_at(points), output.shares_at(points)
+    odds = output.odds_at(points)
+    shares = output.shares_at(points)
     names = catalogue.of_family(SYMBOL, OTHER)
     symbols = [k for k, name in enumerate(output.classes) if name in names]
     shared = {
@@ -178,10 +185,12 @@ def _points(corners: FloatArray, diamond: np.ndarray, size: int) -> np.ndarray:
     first, second, third, fourth = corners.swapaxes(0, 1)
     # Heckbert, "Fundamentals of Texture Mapping and Image Warping" (1989), 2.2.3: from the unit square.
     surplus = first - second + third - fourth
-    one, other = second - third, fourth - third
+    one = second - third
+    other = fourth - third
     cross = _cross(one, other)
     cross = np.where(np.abs(cross) < 1e-9, 1e-9, cross)
-    g, h = _cross(surplus, other) / cross, _cross(one, surplus) / cross
+    g = _cross(surplus, other) / cross
+    h = _cross(one, surplus) / cross
     to_px = np.empty((len(corners), 3, 3))
     to_px[:, :2] = np.stack([second - first + g * second, fourth - first + h * fourth, first], axis=-1)
     to_px[:, 2] = np.column_stack([g, h, np.ones(len(g))])
@@ -244,14 +253,18 @@ _STRIP_PX = np.array([2.5, 4.5, 6.5, 8.5])
 """So far from an end, and from the long sides, the ground about it is looked at; nearer the paint blurs."""
 
 _ASPECT = 2.0  # longer than that a marking has ends, which things hide a part at a time
-_HIDDEN, _BORDER, _STAIN = 0.05, 0.003, 0.02
+_HIDDEN = 0.05
+_BORDER = 0.003
+_STAIN = 0.02
 """Shares of ends behind a thing, at the border of a shadow or a patch all across, and of spots of the ground
 that are unlike the next one."""
 
-_UNLIKE, _ALIKE = np.array([0.8, 0.3]), np.array([0.3, 0.15])
+_UNLIKE = np.array([0.8, 0.3])
+_ALIKE = np.array([0.3, 0.15])
 """Standard deviations of log grey and of log blue over red: a thing's from the ground, and its own parts'."""
 
-_EVEN, _GRAIN = np.array([0.08, 0.05]), 0.25
+_EVEN = np.array([0.08, 0.05])
+_GRAIN = 0.25
 """Bare ground differs from the next by so much, and by this share of its own scatter.
 
 With these, 89 of 100 ends of dashes that boxes hid by more than 25 cm are known, and 5 that none hid are held
@@ -284,7 +297,8 @@ def read_markings(
     image_bgr: np.ndarray, found: Proposals, catalogue: Catalogue, blur_px: float | None
 ) -> Readings | None:
     """Fit the proposals with four corners and gather the evidence for their classes; None for none."""
-    camera, output = found.camera, found.output
+    camera = found.camera
+    output = found.output
     tried = [(proposal, kinds) for proposal in found.pieces if (kinds := proposal.kinds(catalogue))]
     if not tried:
         return None
@@ -295,11 +309,13 @@ def read_markings(
     patches = Patches(image_bgr, camera, output, found.owner, own)
     cut = open_sides(start_px, camera)
     fit = fit_quadrilaterals(patches, camera, start_px, cut, blur_px or TYPICAL_BLUR_PX)
-    quads, ground = ImageQuads.of(camera, fit.corners_px), Quad(camera.unproject(fit.corners_px))
+    quads = ImageQuads.of(camera, fit.corners_px)
+    ground = Quad(camera.unproject(fit.corners_px))
     rows = [(m, kind) for m, (_, kinds) in enumerate(tried) for kind in kinds]
     evidence = gather(fit, output, quads, ground, chosen, rows, catalogue)
     views, first_side = rectified_views(patches, quads, ground, rows, catalogue)
-    at, kinds = np.array([m for m, _ in rows], dtype=np.intp), [kind for _, kind in rows]
+    at = np.array([m for m, _ in rows], dtype=np.intp)
+    kinds = [kind for _, kind in rows]
     place = {p.index: m for m, p in enumerate(chosen)}
     parts = {
         m: among
@@ -342,7 +358,8 @@ def hidden_ends(patches: Patches, quads: ImageQuads, ground: Quad) -> BoolArray:
     bare_ground = light[:, ::2, 1].reshape(len(end), -1, 2)
     sigma = np.hypot(_EVEN, _GRAIN * bare_ground.std(axis=1))[:, None]
     off = np.median(light[:, :, 0], axis=2) - np.median(bare_ground, axis=1)[:, None]
-    paint, beside = off[:, 1], off[:, ::2]
+    paint = off[:, 1]
+    beside = off[:, ::2]
     spots = np.logaddexp(np.log(1 - _STAIN) + _normal(off, sigma), np.log(_STAIN) + _normal(off, _UNLIKE))
     wide = _normal(beside - paint[:, None], np.hypot(sigma, _ALIKE))
     other = _normal(paint, np.hypot(sigma[:, 0], _UNLIKE))

@@ -94,14 +94,16 @@ class Detector:
 
     def propose(self, output: NetworkOutput, camera: Camera) -> Proposals:
         """The pieces of paint of one image, each with the classes that it may be of."""
-        road_camera, reach_px = self.road_camera(camera), self._cameras[camera.info.name][1]
+        road_camera = self.road_camera(camera)
+        reach_px = self._cameras[camera.info.name][1]
         blobs, owner = find_blobs(output, reach_px, self.catalogue)
         pieces = propose(blobs, road_camera, self.catalogue, self.options.max_range_m)
         return Proposals(road_camera, output, pieces, owner)
 
     def lane_image(self, found: Proposals) -> LaneImage:
         """An image in which boundaries of lanes are looked for: row anchors and centre lines of paint."""
-        step_m, lane_classes = self.options.lane_step_m, set(self.catalogue.lane_paint)
+        step_m = self.options.lane_step_m
+        lane_classes = set(self.catalogue.lane_paint)
         paint = [
             (piece, own)
             for piece in found.pieces
@@ -135,12 +137,15 @@ class Detector:
     def _symbols(self, image_bgr: np.ndarray, found: Proposals) -> list[MarkingDetection]:
         """Markings within range with an outline but no four corners; of a piece and its parts only one."""
         nothing = np.full((4, 2), np.nan), np.full((8, 8), np.nan), np.zeros(4, dtype=np.bool_)
-        names, symbols, parts_until = self.catalogue.of_family(SYMBOL), [], 0
+        names = self.catalogue.of_family(SYMBOL)
+        symbols = []
+        parts_until = 0
         for piece in found.pieces:
             if not names or piece.index < parts_until:
                 continue
             kind = max(names, key=lambda name: piece.share.get(name, 0.0))
-            score, ground = piece.symbol_score(kind), piece.outline_vehicle
+            score = piece.symbol_score(kind)
+            ground = piece.outline_vehicle
             within = found.camera.range_m(ground.mean(axis=0)) <= self.options.max_range_m  # nan is not
             after = piece.index + 1 + piece.blob.parts
             if not within or score < self.options.min_score:
@@ -168,7 +173,8 @@ def _likelier(quads: Sequence[MarkingDetection], symbols: Sequence[MarkingDetect
 
 
 def _check_image(image_bgr: np.ndarray, camera: Camera) -> None:
-    expected, problem = (camera.info.height, camera.info.width, 3), None
+    expected = (camera.info.height, camera.info.width, 3)
+    problem = None
     if not isinstance(image_bgr, np.ndarray):
         problem = f"not an image but {shown(image_bgr)}; cv2.imread gives None if the file is missing"
     elif image_bgr.dtype != np.uint8 or image_bgr.shape != expected:

@@ -86,7 +86,8 @@ def video_frames(path: Path) -> Iterator[Frame]:
         promised = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
         count = 0
         for count, pixels in enumerate(_pixels(capture), start=1):
-            stamp_s, name = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3, f"{path.stem}_{count - 1:06d}"
+            stamp_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
+            name = f"{path.stem}_{count - 1:06d}"
             yield Frame(str(path), name, count - 1, stamp_s, pixels)
         if not count:
             raise DriveError(f"{path}: the video has no readable frame; copy or convert it again")
@@ -137,7 +138,8 @@ class NewestFrames(Iterator[Frame]):
         with self._changed:
             while self._newest is None and self._end is None:
                 self._changed.wait(1.0)  # Windows takes Ctrl-C only between waits
-            frame, self._newest = self._newest, None
+            frame = self._newest
+            self._newest = None
             if frame is not None:
                 return frame
         assert self._end is not None
@@ -150,10 +152,12 @@ def arriving_frames(folder: Path) -> Iterator[Frame]:
     Its time is when it was written. One that cannot be read a second after is left out with a warning. Raises
     DriveError where the folder cannot be read.
     """
-    known, index = {path.name for path in list_images(folder)[:-1]}, 0
+    known = {path.name for path in list_images(folder)[:-1]}
+    index = 0
     nothing_new_s = None  # date of the folder when it was last listed in vain
     while True:
-        now_s, changed_s = time.time(), _written_s(folder)
+        now_s = time.time()
+        changed_s = _written_s(folder)
         listed = list_images(folder, known) if changed_s != nothing_new_s else []
         came = {path: _written_s(path) for path in listed}
         if not came:

@@ -27,7 +27,8 @@ and .1 to .4 in `docs/kitti.md`."""
 
 _SCALE = 2  # an image is looked at in half its resolution: a sixth of the time, and a third less certain
 _LEAST_CROSSINGS = 4
-_LEAST_EDGE_PX, _EDGE_SIGMA_PX = 6.0, 0.45
+_LEAST_EDGE_PX = 6.0
+_EDGE_SIGMA_PX = 0.45
 """Least length of a paint's edge, and the standard deviation of its ends, in elements of the paint."""
 
 _FLAT = 0.12  # edges that rise less than this are of stop lines and of shadows across the road
@@ -38,11 +39,14 @@ _SHARE = 0.4  # share of the lines that keep to the road: kerbs, arrows, letters
 _POINT_SIGMA_PX = 1.5  # a vanishing point is a point to no more than this
 _EDGE_WEIGHT = 0.3  # a marking has two edges in several pieces each, which err together
 _SILENT = 0.05  # share of images whose lines are of something else
-_AHEAD_RAD, _AHEAD_SHARE, _ASIDE_RAD = np.deg2rad(6.0), 0.85, np.deg2rad(30.0)
+_AHEAD_RAD = np.deg2rad(6.0)
+_AHEAD_SHARE = 0.85
+_ASIDE_RAD = np.deg2rad(30.0)
 """Roads lead so far off a camera's axis, in so many images, and as far in the others."""
 
 _PITCH_STEP_RAD, _ROLL_STEP_RAD, _COLUMN_STEP_RAD = np.deg2rad([0.4, 0.75, 1.25])
-_SIGMAS, _REACH_RAD = 4.0, np.deg2rad(40.0)
+_SIGMAS = 4.0
+_REACH_RAD = np.deg2rad(40.0)
 _STEEPEST_RAD = np.deg2rad(80.0)  # nearer to straight down or up lines look parallel
 
 
@@ -116,7 +120,8 @@ class MountingEstimate:
         self._prior = prior
         self._centre_px = info.intrinsic[:2, 2]
         self._focal_px = float(info.intrinsic[1, 1])
-        (pitch, roll), steps = prior.sigma_rad, (_PITCH_STEP_RAD, _ROLL_STEP_RAD)
+        (pitch, roll) = prior.sigma_rad
+        steps = (_PITCH_STEP_RAD, _ROLL_STEP_RAD)
         self._pitch, self._roll = (
             mean + step * np.arange(-(reach := int(np.ceil(_SIGMAS * sigma / step))), reach + 1)
             for mean, sigma, step in zip((prior.pitch_rad, prior.roll_rad), (pitch, roll), steps, strict=True)
@@ -159,7 +164,8 @@ class MountingEstimate:
         up = level[:, None, None] + np.tan(self._roll)[:, None] * columns / self._focal_px
         place = (np.arctan(up) - at[0]) / _PITCH_STEP_RAD
         first = np.clip(np.floor(place).astype(np.intp), 0, len(at) - 2)
-        share, column = np.clip(place - first, 0, 1), np.arange(len(columns))
+        share = np.clip(place - first, 0, 1)
+        column = np.arange(len(columns))
         on_it = (1 - share) * points[first, column] + share * points[first + 1, column]
         likelihood = np.exp(on_it - on_it.max()).sum(axis=2)
         body = np.exp(-0.5 * ((self._pitch[:, None] - self._pitch) / BODY_SIGMA_RAD) ** 2)
@@ -172,10 +178,13 @@ class MountingEstimate:
         point = (lines.point_px - self._centre_px).astype(np.float32)
         parallel_px = _PARALLEL_SIGMA_RAD * self._focal_px * lines.direction[:, 1]
         variance_px2 = (lines.sigma_px**2 + _POINT_SIGMA_PX**2 + parallel_px**2).astype(np.float32)
-        direction, turned = lines.direction.astype(np.float32), (lines.sigma_rad**2).astype(np.float32)
-        u, v = columns.astype(np.float32), rows.astype(np.float32)[:, None]
+        direction = lines.direction.astype(np.float32)
+        turned = (lines.sigma_rad**2).astype(np.float32)
+        u = columns.astype(np.float32)
+        v = rows.astype(np.float32)[:, None]
         for k, weight in enumerate(lines.weight.tolist()):
-            across, down = u - point[k, 0], v - point[k, 1]
+            across = u - point[k, 0]
+            down = v - point[k, 1]
             nearer = 1 / np.maximum(across**2 + down**2, np.float32(1))
             variance = turned[k] + variance_px2[k] * nearer
             sine2 = (across * direction[k, 1] - down * direction[k, 0]) ** 2 * nearer

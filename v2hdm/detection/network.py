@@ -118,7 +118,8 @@ class NetworkOutput:
 
     def class_probability(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Probability (K, N) of each class at elements of ``paint``."""
-        scale, width = self.kind_scale, self.kinds.shape[2]
+        scale = self.kind_scale
+        width = self.kinds.shape[2]
         place = (rows / scale).astype(np.intp) * width + (columns / scale).astype(np.intp)
         odds = self.kinds.reshape(len(self.kinds), -1).take(place, axis=1)
         odds -= odds.max(axis=0)
@@ -128,7 +129,8 @@ class NetworkOutput:
 
     def _sample(self, planes: np.ndarray, stride: float, points_px: FloatArray) -> np.ndarray:
         """Values (K, M, N) of planes (K, h, w), elements ``stride`` px apart, at recorded px (M, ..., 2)."""
-        middle, rows = (stride - 1) / 2, len(points_px)
+        middle = (stride - 1) / 2
+        rows = len(points_px)
         u = ((points_px[..., 0] - middle) / stride).astype(np.float32).reshape(rows, -1)
         v = ((points_px[..., 1] - self.top - middle) / stride).astype(np.float32).reshape(rows, -1)
         found = np.empty((len(planes), *u.shape), dtype=np.float32)
@@ -149,7 +151,8 @@ class Network:
     def run(self, image_bgr: np.ndarray) -> RawOutput:
         """Look at an image (H, W, 3) uint8 of any size; DetectorError where the output is not as labelled."""
         height, width = image_bgr.shape[:2]
-        below, right = -height % self.info.multiple, -width % self.info.multiple
+        below = -height % self.info.multiple
+        right = -width % self.info.multiple
         padded = image_bgr
         if below or right:
             padded = cv2.copyMakeBorder(image_bgr, 0, below, 0, right, cv2.BORDER_REPLICATE)
@@ -182,13 +185,16 @@ def run_on_road(
     network: Network, image_bgr: np.ndarray, camera: RoadCamera, mirrored: bool = False
 ) -> NetworkOutput:
     """Run the network on the rows that show ground in reach, and take the mean with the mirror image's."""
-    info, top = network.info, camera.far_row
+    info = network.info
+    top = camera.far_row
     band = image_bgr[top:]
     run = partial(_run_twice, network) if mirrored else network.run
     seam = _seam_row(network, camera)
     if seam is None:
         output = run(band)
-        paint, kinds, anchors = output.paint, output.kinds, anchor_rows(output.lanes, network, top, 1)
+        paint = output.paint
+        kinds = output.kinds
+        anchors = anchor_rows(output.lanes, network, top, 1)
     else:
         far = run(band[: seam + _OVERLAP_PX])
         near_top = seam - _OVERLAP_PX
@@ -206,13 +212,16 @@ def run_on_road(
 
 def _run_twice(network: Network, image_bgr: np.ndarray) -> RawOutput:
     """The mean of the outputs on an image (H, W, 3) and on its mirror image."""
-    width, info = image_bgr.shape[1], network.info
+    width = image_bgr.shape[1]
+    info = network.info
     # Only whole elements have mirror images on the same grid.
     padded = cv2.copyMakeBorder(image_bgr, 0, 0, 0, -width % info.multiple, cv2.BORDER_REPLICATE)
-    one, other = network.run(padded), network.run(np.ascontiguousarray(padded[:, ::-1]))
+    one = network.run(padded)
+    other = network.run(np.ascontiguousarray(padded[:, ::-1]))
     paint = (one.paint + other.paint[:, ::-1]) / 2
     kinds = (one.kinds + other.kinds[..., ::-1]) / 2
-    (odds, offset), (odds_too, offset_too) = one.lanes, other.lanes[..., ::-1] * _MIRRORED
+    (odds, offset) = one.lanes
+    (odds_too, offset_too) = other.lanes[..., ::-1] * _MIRRORED
     # Where a line crosses a cell only that output knows that sees it cross.
     weight = as_probability(odds - odds_too)
     lanes = np.stack([(odds + odds_too) / 2, weight * offset + (1 - weight) * offset_too])
@@ -234,7 +243,8 @@ def _seam_row(network: Network, camera: RoadCamera) -> int | None:
 
 def _joined(far: np.ndarray, near: np.ndarray, seam: int, near_top: int, stride: int) -> np.ndarray:
     """Planes (K, h, w), ``stride`` px per element: far ones above the seam, near ones, doubled, below it."""
-    first, overlap = seam // stride, (seam - near_top) // stride
+    first = seam // stride
+    overlap = (seam - near_top) // stride
     height = first - overlap + 2 * near.shape[1]
     joined = np.empty((len(far), height, 2 * near.shape[2]), dtype=np.float32)
     joined[:, :first] = far[:, :first]
@@ -255,7 +265,8 @@ def anchor_rows(lanes: np.ndarray, network: Network, top_px: int, scale: int) ->
     u = stride * (j + np.clip(offset[i, j], -0.5, 0.5) + 0.5) - 0.5
     v = stride * np.arange(len(odds)) + (stride - 1) / 2
     # Pixel p of the reduced image is centred on scale * p + (scale - 1) / 2 of the image.
-    u, v = scale * u + (scale - 1) / 2, scale * v + (scale - 1) / 2 + top_px
+    u = scale * u + (scale - 1) / 2
+    v = scale * v + (scale - 1) / 2 + top_px
     found = odds[i, j].astype(np.float64)
     bounds = np.searchsorted(i, np.arange(len(odds) + 1))
     return [

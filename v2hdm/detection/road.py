@@ -44,7 +44,9 @@ from v2hdm.records import (
 
 _LANE_SIGMA_PX = 1.0  # standard deviation of a point of a lane's paint; points of whole lines have their own
 
-_PX_DIGITS, _PX2_DIGITS, _M_DIGITS = 3, 5, 4
+_PX_DIGITS = 3
+_PX2_DIGITS = 5
+_M_DIGITS = 4
 
 _COLOUR_BGR = {
     DIAMOND: (60, 200, 60),
@@ -60,7 +62,9 @@ _OTHER_BGR = (200, 200, 200)
 _INVALID_BGR = (60, 60, 230)
 _SHIFT = 4
 _FAR_PX = 30000.0
-_TEXT_SCALE, _LEAST_TEXT_SCALE, _FULL_WIDTH_PX = 0.45, 0.35, 1280
+_TEXT_SCALE = 0.45
+_LEAST_TEXT_SCALE = 0.35
+_FULL_WIDTH_PX = 1280
 
 
 @dataclass(frozen=True)
@@ -214,7 +218,8 @@ def _lane_record(lane: RoadLane) -> dict[str, Any]:
 def _significant(values: FloatArray) -> list[Any]:
     """Four significant digits: a covariance spans many powers of ten."""
     power = 3 - np.floor(np.log10(np.clip(np.abs(values), 1e-18, 1e18)))
-    more, less = 10.0 ** np.maximum(power, 0), 10.0 ** np.maximum(-power, 0)
+    more = 10.0 ** np.maximum(power, 0)
+    less = 10.0 ** np.maximum(-power, 0)
     return _plain(np.round(values * more / less) * less / more)
 
 
@@ -229,14 +234,16 @@ def draw_detections(
     """A copy of an image with its detections; red corners are not valid."""
     canvas = image_bgr.copy()
     for lane in lanes:
-        colour, points = _COLOUR_BGR.get(lane.kind, _OTHER_BGR), _fixed(lane.points_px)
+        colour = _COLOUR_BGR.get(lane.kind, _OTHER_BGR)
+        points = _fixed(lane.points_px)
         cv2.polylines(canvas, [points], False, colour, 1, cv2.LINE_AA, _SHIFT)
         for point in points:
             cv2.circle(canvas, point.tolist(), 2 << _SHIFT, colour, -1, cv2.LINE_AA, _SHIFT)
         if lane.identity is not None and len(points):
             _write(canvas, f"{lane.identity:+d}", lane.points_px[0], colour)
     for marking in markings:
-        colour, outlined = _COLOUR_BGR.get(marking.kind, _OTHER_BGR), len(marking.outline_px) > 0
+        colour = _COLOUR_BGR.get(marking.kind, _OTHER_BGR)
+        outlined = len(marking.outline_px) > 0
         shape_px = marking.outline_px if outlined else marking.corners_px
         cv2.polylines(canvas, [_fixed(shape_px)], True, colour, 1, cv2.LINE_AA, _SHIFT)
         for corner, valid in zip(_fixed(marking.corners_px), marking.corner_valid, strict=True):

@@ -55,7 +55,8 @@ class Stopwatch:
 @contextmanager
 def lap(stage: str) -> Iterator[None]:
     """Time a stage; entered again for the same image, the times add up. Stages must not be nested."""
-    stopwatch, start = _running.get(), time.perf_counter()
+    stopwatch = _running.get()
+    start = time.perf_counter()
     try:
         yield
     finally:

@@ -46,7 +46,8 @@ def drive_record(job: Job, progress: Progress, workers: int = 1) -> dict[str, An
         detections = detect_in_pieces(drive, read.contents, job.detector, context)
         record = _setting(job, read.whole, truth)
         for recipe, options in job.options.items():
-            survey, key = take_survey(drive, options), read.contents.key(drive)
+            survey = take_survey(drive, options)
+            key = read.contents.key(drive)
             try:
                 found = map_camera_sets(drive, key, detections, survey, None, context)
             except (MappingError, AdjustError) as failure:
@@ -154,7 +155,8 @@ def _passed(true: tuple[Marking, ...], route_map: FloatArray) -> IntArray:
 def _matched(hd_map: HDMap, true: tuple[Marking, ...], passed: IntArray) -> Matched:
     mapped, other = (np.array(i, dtype=np.int64) for i in match_markings(hd_map.markings, true))
     order = np.argsort(passed[other], kind="stable")
-    mapped, other = mapped[order], other[order]
+    mapped = mapped[order]
+    other = other[order]
     errors = corner_errors([hd_map.markings[m] for m in mapped], [true[t] for t in other])
     return Matched(other, errors.reshape(-1, 4, 2))
 

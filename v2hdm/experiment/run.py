@@ -21,7 +21,8 @@ from v2hdm.store.files import replace_text
 from v2hdm.store.results import growing_folder
 from v2hdm.workers import side_by_side
 
-_OPTION, _MADE = "output=", "v2hdm experiment"
+_OPTION = "output="
+_MADE = "v2hdm experiment"
 
 
 def run_experiment(

@@ -248,7 +248,8 @@ _CLOSE_UP_M = 6.0  # half the width of the close-up on where most markings stand
 def _save_shift(path: Path, record: Mapping[str, Any], measured: Measured) -> Caption | None:
     """Draw ENI against ONI with corner correspondences."""
     cameras, by_method = list(measured.matched.items())[-1]
-    before, after = by_method.get("ENI"), by_method.get("ONI")
+    before = by_method.get("ENI")
+    after = by_method.get("ONI")
     if before is None or after is None:
         return None
     common, rows, columns = np.intersect1d(before.true, after.true, return_indices=True)
@@ -258,7 +259,8 @@ def _save_shift(path: Path, record: Mapping[str, Any], measured: Measured) -> Ca
     true = np.array([marking.corners_map for marking in truth.map.markings])[common]
     moved = {"ENI": true + before.errors_m[rows], "ONI": true + after.errors_m[columns]}
     links = np.stack([one.reshape(-1, 2) for one in moved.values()], axis=1)
-    polygons, lanes = [m.corners_map for m in truth.map.markings], [one.points_map for one in truth.map.lanes]
+    polygons = [m.corners_map for m in truth.map.markings]
+    lanes = [one.points_map for one in truth.map.lanes]
     with _site_and_detail(path, np.array(record["route"])) as (site, detail):
         for axes, width in ((site, 0.7), (detail, 1.5)):
             paint: dict[str, Any] = {"facecolors": style.PAINT, "edgecolors": style.TRUTH, "label": "truth"}
@@ -286,7 +288,8 @@ def _save_shift(path: Path, record: Mapping[str, Any], measured: Measured) -> Ca
 @contextmanager
 def _site_and_detail(path: Path, route_map: FloatArray) -> Iterator[tuple[Axes, Axes]]:
     """A figure of two panels, the site with the route (N, 2) in it and a close-up; legends below them."""
-    low, high = route_map.min(axis=0) - _BESIDE_ROUTE_M, route_map.max(axis=0) + _BESIDE_ROUTE_M
+    low = route_map.min(axis=0) - _BESIDE_ROUTE_M
+    high = route_map.max(axis=0) + _BESIDE_ROUTE_M
     extent_m = high - low
     site_width_in = _HEIGHT_IN * float(np.clip(extent_m[0] / extent_m[1], 0.5, 2.0)) + 1.6
     with style.figure(path, site_width_in + _HEIGHT_IN, _HEIGHT_IN) as fig:

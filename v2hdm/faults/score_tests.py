@@ -202,7 +202,9 @@ class _Answer:
             # Noise as lasting as the fault is common to all segments, and no disagreement of theirs: they may
             # widen the model's sigma, but not narrow it.
             multiple = max(multiple, 1.0)
-        w, s, total = self.information, self.score, float(self.information.sum())
+        w = self.information
+        s = self.score
+        total = float(self.information.sum())
         sigma = float(np.sqrt(multiple * w[:-1].sum() + w[-1])) / total
         # Each segment is predicted from the others, which include priors of no segment.
         others = (s.sum() - s[:-1]) / np.maximum(total - w[:-1], _LEAST_OBSERVABLE * total)
@@ -225,7 +227,8 @@ def score_faults(problem: Problem, solution: Solution) -> tuple[ScoreTest, ...]:
 
 
 def _hypotheses(problem: Problem, arrays: Arrays) -> Iterator[_Hypothesis]:
-    cameras, changes = range(arrays.camera_count), _changes(arrays)
+    cameras = range(arrays.camera_count)
+    changes = _changes(arrays)
     for camera in [*([-1] if arrays.camera_count > 1 else []), *cameras]:
         if problem.twist_vehicle is not None:
             for session in range(problem.session_count) if problem.session_count > 1 else [-1]:
@@ -274,7 +277,8 @@ def _likeliest_changes(found: list[tuple[_Answer, ScoreTest]]) -> list[ScoreTest
         if one.fault in CHANGES:
             changes.setdefault((one.fault, one.camera, one.axis), []).append((answer, one))
     for chances in changes.values():
-        best, many = max((one for _, one in chances), key=lambda one: one.gain), _chances(chances)
+        best = max((one for _, one in chances), key=lambda one: one.gain)
+        many = _chances(chances)
         p_value = -float(np.expm1(many * np.log1p(-min(best.p_value, 1 - 1e-9))))
         kept.append(replace(best, p_value=p_value, gain=best.gain - float(np.log(many))))
     return kept
@@ -310,20 +314,23 @@ def _control_points(problem: Problem, solution: Solution, usual: float) -> Itera
         squared = float(off @ np.linalg.solve(expected, off)) / max(usual, 1.0)
         # Without the point, its corner would lie farther away, by the point's share of the information.
         apart = float(np.linalg.norm(sigma_m**2 * np.linalg.solve(expected, off)))
-        sigma, p_value = apart / max(squared, 1e-12) ** 0.5, float(stats.chi2.sf(squared, 2))
+        sigma = apart / max(squared, 1e-12) ** 0.5
+        p_value = float(stats.chi2.sf(squared, 2))
         yield ScoreTest(Fault.CONTROL, -1, -1, m, apart, sigma, sigma, p_value, squared / 2)
 
 
 def _lens(camera: int, power: int, solved: Sensitivity) -> Rows:
     """Relative error p of a focal length or, with ``power`` 1, error p of the first radial coefficient."""
     # Projected points rather than measured ones: pixels, whose noise is stated, do not scale.
-    projected, mine = solved.projected, (solved.camera == camera) | (camera < 0)
+    projected = solved.projected
+    mine = (solved.camera == camera) | (camera < 0)
     return {"observations": solved.whiten(projected * projected.square().sum(0) ** power * mine)}
 
 
 def _principal(problem: Problem, camera: int, axis: int, solved: Sensitivity) -> Rows:
     """A principal point one pixel farther right, or down."""
-    seen_by, focal_px = solved.camera, torch.as_tensor(problem.intrinsic[:, axis])
+    seen_by = solved.camera
+    focal_px = torch.as_tensor(problem.intrinsic[:, axis])
     off = ((seen_by == camera) | (camera < 0)) / focal_px.to(seen_by.device)[seen_by]
     none = torch.zeros_like(off)
     return {"observations": solved.whiten(torch.stack([off, none] if axis == 0 else [none, off]))}
@@ -333,7 +340,8 @@ def _moving(motion: Callable[..., Tensor], *about: object) -> Callable[[Sensitiv
     """The column of a ``motion`` (C, J, 6) of the vehicle in its own frame, which is written into zeros."""
 
     def column(solved: Sensitivity) -> Rows:
-        extrinsic, arrays = solved.whitening.estimate.cam_from_vehicle[:, None], solved.arrays
+        extrinsic = solved.whitening.estimate.cam_from_vehicle[:, None]
+        arrays = solved.arrays
         still = arrays.centre.new_zeros(arrays.camera_count, arrays.frame_count, 6)
         tangent = arrays.at_moments(motion(*about, arrays, still), axis=1)
         shift, turn = (
@@ -401,7 +409,8 @@ def _since(arrays: Arrays, frame: int) -> Tensor:
 
 def _crown(axis: int, solved: Sensitivity) -> Rows:
     """Corners lower by the value times their distance from the route, on both sides or one."""
-    arrays, estimate = solved.arrays, solved.whitening.estimate
+    arrays = solved.arrays
+    estimate = solved.whitening.estimate
     frames = arrays.vehicle_from_map.inverse()
     route = KDTree(frames[:, :2, 3].cpu().numpy())
     nearest = torch.as_tensor(route.query(estimate.corners_map.cpu().numpy())[1], device=frames.device)
@@ -418,7 +427,8 @@ def _slope(axis: int, arrays: Arrays, out: Tensor) -> Tensor:
 
 
 def _survey(camera: int, axis: int, solved: Sensitivity) -> Rows:
-    out, which = torch.zeros_like(solved.arrays.centre), slice(None) if camera < 0 else camera
+    out = torch.zeros_like(solved.arrays.centre)
+    which = slice(None) if camera < 0 else camera
     out[which, axis] = -solved.arrays.centre_information_root[which, axis]
     return {"camera_centre": out}
 

@@ -42,7 +42,8 @@ class Sensitivity:
     @classmethod
     def at(cls, whitening: Whitening) -> Sensitivity:
         """The sensitivity at a solution, from its Hessian."""
-        engine, estimate = whitening.engine, whitening.estimate
+        engine = whitening.engine
+        estimate = whitening.estimate
         whitened_px = engine.residuals(engine.poses(estimate), estimate.corners_map)
         _, weight = robustified(whitening.robust, whitened_px.square().sum(0))
         root = weight.sqrt()  # without the floor, which keeps corners definite but is no evidence
@@ -113,7 +114,8 @@ class Sensitivity:
 
     def _along(self, whitened: Tensor) -> Rows:
         """Derivatives of all residuals along a whitened step of the unknowns."""
-        base, arrays = self.whitening.estimate, self.arrays
+        base = self.whitening.estimate
+        arrays = self.arrays
         _, tangents, _ = self.whitening.step(whitened)
         # Derivatives are linear, poses are not: take a step that moves no pair by more than 1 m or rad.
         size = max(float(tangents.abs().max()), 1.0)
@@ -140,7 +142,8 @@ class Sensitivity:
 
     def _coupling(self, column: Rows) -> Tensor:
         """N_yp: inner products of the column with the whitened unknowns."""
-        engine, estimate = self.whitening.engine, self.whitening.estimate
+        engine = self.whitening.engine
+        estimate = self.whitening.estimate
         tangent = estimate.cam_from_vehicle.new_zeros(len(estimate.cam_from_vehicle), 6)
         at = (tangent, estimate.frame_state, estimate.corners_map, estimate.clock_s)
         leaves = [one.clone().requires_grad_() for one in at]
@@ -149,7 +152,8 @@ class Sensitivity:
         gradient = Gradient(*(torch.zeros_like(one) for one in at))
         if of_priors:
             priors = _rows(engine.arrays, moved)
-            ends, by = [priors[name] for name in of_priors], [column[name] for name in of_priors]
+            ends = [priors[name] for name in of_priors]
+            by = [column[name] for name in of_priors]
             gradient = Gradient(*torch.autograd.grad(ends, leaves, by, materialize_grads=True))
         if "observations" in column:
             seen = self.whitening.pull(column["observations"] * self.root)
@@ -189,7 +193,8 @@ def stretches(arrays: Arrays) -> Tensor:
     """Segment (J,) of the route of each frame; the segments of a session have equal lengths."""
     ahead = arrays.vehicle_from_map.inverse()[:, :2, 3].diff(dim=0).norm(dim=1)
     path = torch.cat([ahead.new_zeros(1), ahead.cumsum(0)])
-    out, count = torch.zeros_like(arrays.session), 0
+    out = torch.zeros_like(arrays.session)
+    count = 0
     for session in range(int(arrays.session.max()) + 1):
         own = arrays.session == session
         along = path[own] - path[own].min()
@@ -217,7 +222,8 @@ def height_information(solution: Solution, heights: Any) -> tuple[FloatArray, Fl
     information = (columns.T @ (columns.multiply(squared[:, None]))).toarray()
     seen = np.flatnonzero(information.diagonal() > 0)
     by_column = columns[:, seen].tocsc()
-    coupled, weighted = solved.root.new_zeros(len(seen), solved.whitening.size), unit * solved.root
+    coupled = solved.root.new_zeros(len(seen), solved.whitening.size)
+    weighted = unit * solved.root
     for begin in range(0, len(seen), _AT_ONCE):
         lifted = torch.as_tensor(by_column[:, begin : begin + _AT_ONCE].toarray().T).to(unit)
         pulled = [solved.whitening.pull(weighted * one) for one in lifted]
@@ -231,9 +237,12 @@ def height_information(solution: Solution, heights: Any) -> tuple[FloatArray, Fl
 def moves_with_heights(solution: Solution, heights: FloatArray) -> Moves:
     """Motion of a solution under B errors of the observed ground's heights (K, B), m."""
     solved = Sensitivity.at(solution.covariance.whitening)
-    whitening, arrays = solved.whitening, solved.arrays
+    whitening = solved.whitening
+    arrays = solved.arrays
     weighted = raised(solved, torch.ones_like(solved.root))["observations"] * solved.root
-    corners, extrinsic, poses = [], [], []
+    corners = []
+    extrinsic = []
+    poses = []
     for column in torch.as_tensor(heights[arrays.order.cpu().numpy()].T).to(weighted):
         whitened = whitening.whiten([whitening.pull(weighted * column)])[0]
         step, tangents, own = whitening.step(whitened)

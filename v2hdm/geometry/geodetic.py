@@ -15,7 +15,8 @@ import numpy as np
 from v2hdm.errors import MapFileError, V2hdmError, need
 from v2hdm.records import FloatArray, GeodeticOrigin
 
-_SEMI_MAJOR_M, _FLATTENING = 6378137.0, 1 / 298.257223563  # of WGS84
+_SEMI_MAJOR_M = 6378137.0
+_FLATTENING = 1 / 298.257223563  # of WGS84
 _ECCENTRICITY2 = _FLATTENING * (2 - _FLATTENING)
 _SAME_ELLIPSOID_M = 1e-3  # GRS80's semi-minor axis is 0.1 mm longer than WGS84's
 _CONFORMAL_DEG = 1e-3  # tolerance of a conformal grid's angles, for rounding
@@ -35,7 +36,8 @@ def enu_from_geodetic(origin: GeodeticOrigin, geodetic: FloatArray) -> FloatArra
 
 def enu_axes(geodetic: FloatArray) -> FloatArray:
     """Rotations (N, 3, 3), earth-centred from local, with columns east, north, up at points (N, 3)."""
-    lat, lon = np.radians(geodetic[:, 0]), np.radians(geodetic[:, 1])
+    lat = np.radians(geodetic[:, 0])
+    lon = np.radians(geodetic[:, 1])
     east = np.column_stack([-np.sin(lon), np.cos(lon), np.zeros(len(lat))])
     north = np.column_stack([-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)])
     up = np.column_stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
@@ -59,7 +61,8 @@ def geodetic_from_grid(crs: str, points: FloatArray, where: str, error: type[V2h
 
 
 LOCAL = "local"  # name of the map's own frame as a coordinate system
-_GRID_DECIMALS, _DEGREE_DECIMALS = 4, 9  # 0.1 mm on the ground
+_GRID_DECIMALS = 4
+_DEGREE_DECIMALS = 9  # 0.1 mm on the ground
 _BESIDE_DEG = 1.0  # a zone's grid is in use a little beyond its edges
 
 
@@ -89,7 +92,8 @@ class Grid:
         """
         if crs == LOCAL:
             return cls(crs, origin)
-        system, datum = _system(crs, where, error), datum_of(crs, where, error)
+        system = _system(crs, where, error)
+        datum = datum_of(crs, where, error)
         if origin is None:
             raise error(f"{where}: {crs} needs an origin on the earth, which the map lacks; give {LOCAL}")
         fit = utm_of(origin)
@@ -151,7 +155,8 @@ class Grid:
 def utm_of(origin: GeodeticOrigin) -> str:
     """The UTM zone of an origin as an EPSG code."""
     zone = int((origin.longitude_deg + 180) // 6) % 60 + 1
-    north, etrs = origin.latitude_deg >= 0, origin.datum.upper().startswith("ETRS")
+    north = origin.latitude_deg >= 0
+    etrs = origin.datum.upper().startswith("ETRS")
     return f"EPSG:{(25800 if etrs else 32600 if north else 32700) + zone}"
 
 
@@ -224,7 +229,8 @@ def _system(crs: str, where: str, error: type[V2hdmError]) -> Any:
 @lru_cache(maxsize=8)
 def _inverse_of(crs: str) -> Any:
     """The transformer from a projected system to its longitude and latitude."""
-    pyproj, horizontal = need("pyproj", "map", "a projected system", MapFileError), _horizontal(crs)
+    pyproj = need("pyproj", "map", "a projected system", MapFileError)
+    horizontal = _horizontal(crs)
     return pyproj.Transformer.from_crs(horizontal, horizontal.geodetic_crs, always_xy=True)
 
 
@@ -240,7 +246,9 @@ def position_of(origin: GeodeticOrigin) -> FloatArray:
 
 
 def _ecef_from_geodetic(geodetic: FloatArray) -> FloatArray:
-    lat, lon, height_m = np.radians(geodetic[:, 0]), np.radians(geodetic[:, 1]), geodetic[:, 2]
+    lat = np.radians(geodetic[:, 0])
+    lon = np.radians(geodetic[:, 1])
+    height_m = geodetic[:, 2]
     across_m = _SEMI_MAJOR_M / np.sqrt(1 - _ECCENTRICITY2 * np.sin(lat) ** 2)
     out_m = (across_m + height_m) * np.cos(lat)
     north_m = (across_m * (1 - _ECCENTRICITY2) + height_m) * np.sin(lat)

@@ -46,7 +46,8 @@ def extrinsic_from_ipm(info: CameraInfo, ipm: FloatArray) -> FloatArray:
     """
     columns = np.linalg.solve(info.intrinsic, np.linalg.inv(ipm))
     left, singular, right = np.linalg.svd(columns[:, :2], full_matrices=False)
-    plane, translation = left @ right, columns[:, 2] / singular.mean()
+    plane = left @ right
+    translation = columns[:, 2] / singular.mean()
     normal = np.cross(plane[:, 0], plane[:, 1])
     sign = -1.0 if normal @ translation > 0 else 1.0
     cam_from_vehicle = np.eye(4)
@@ -122,7 +123,8 @@ def ray_covariance(ray_ground: FloatArray, along_m: FloatArray, across_m: FloatA
     """Covariances (..., 2, 2) of points with standard deviations (...) along and across rays (..., 2)."""
     along = ray_ground / np.maximum(np.linalg.norm(ray_ground, axis=-1, keepdims=True), 1e-9)
     outer = along[..., :, None] * along[..., None, :]
-    along_m2, across_m2 = np.square(along_m)[..., None, None], np.square(across_m)[..., None, None]
+    along_m2 = np.square(along_m)[..., None, None]
+    across_m2 = np.square(across_m)[..., None, None]
     return np.asarray(along_m2 * outer + across_m2 * (np.eye(2) - outer))
 
 
@@ -166,7 +168,8 @@ def mounting_words(cam_from_vehicle: FloatArray, covariance: FloatArray) -> tupl
     """Roll, pitch and yaw, and forward, left and height of the centre, each with its standard deviation."""
     angles = np.degrees(mounting_angles(cam_from_vehicle))
     angle_sigma = np.degrees(angle_sigmas(cam_from_vehicle, covariance))
-    centre, centre_sigma = camera_centre(cam_from_vehicle), centre_sigmas(cam_from_vehicle, covariance)
+    centre = camera_centre(cam_from_vehicle)
+    centre_sigma = centre_sigmas(cam_from_vehicle, covariance)
     turned = zip(("roll", "pitch", "yaw"), angles, angle_sigma, strict=True)
     placed = zip(("forward", "left", "height"), centre, centre_sigma, strict=True)
     return (

@@ -56,7 +56,8 @@ class Fit(Generic[X, N]):
     @property
     def predicted_cost(self) -> float:
         """The cost at :attr:`x` that the linearisation predicts; infinite where the problem is not finite."""
-        last, step = self.last, self.step
+        last = self.last
+        step = self.step
         cost = last.cost + float(last.gradient @ step) + 0.5 * float(step @ last.information @ step)
         return cost if np.isfinite(cost) else np.inf
 
@@ -85,14 +86,18 @@ def gauss_newton(
     the cost is rejected and the damping raised tenfold; at 0 every step is accepted whole.
     """
     move: Callable[[X, FloatArray], X] = retract or add
-    x, last, damped = x0, linearise(x0), damping
-    step, taken = np.zeros(len(last.gradient)), 0
+    x = x0
+    last = linearise(x0)
+    damped = damping
+    step = np.zeros(len(last.gradient))
+    taken = 0
     while taken < steps:
         if not (np.isfinite(last.gradient).all() and np.isfinite(last.information).all()):
             return Fit(x, last, np.full(len(last.gradient), np.nan), False, taken)
         step = solve_normal(last, damped)
         step = step if limit is None else limit(step)
-        moved, taken = move(x, step), taken + 1
+        moved = move(x, step)
+        taken = taken + 1
         in_sigmas = np.abs(step) * np.sqrt(np.diag(last.information))
         if settled(step) if settled else np.max(in_sigmas, initial=0.0) < tolerance:
             return Fit(moved, last, step, True, taken)
@@ -104,7 +109,9 @@ def gauss_newton(
                 return Fit(x, last, np.zeros(len(step)), True, taken)
             damped *= 10.0
         else:
-            x, last, damped = moved, after, damped / 10.0
+            x = moved
+            last = after
+            damped = damped / 10.0
     return Fit(x, last, step, False, taken)
 
 

@@ -61,7 +61,9 @@ def _brown_conrady(info: CameraInfo, points_pinhole_px: FloatArray) -> FloatArra
     (fx, skew, cx), (_, fy, cy), _ = info.intrinsic
     y = (points_pinhole_px[:, 1] - cy) / fy
     x = (points_pinhole_px[:, 0] - cx - skew * y) / fx
-    xy, xx, yy = x * y, x * x, y * y
+    xy = x * y
+    xx = x * x
+    yy = y * y
     r2 = xx + yy
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
     if k4 or k5 or k6:

@@ -63,7 +63,8 @@ def winding(polygon: FloatArray) -> int:
 def is_simple(polygon: FloatArray) -> bool:
     """Whether no two sides of a polygon (N, 2) cross each other."""
     ends = np.roll(polygon, -1, axis=0)
-    side, apart = ends - polygon, polygon[:, None] - polygon
+    side = ends - polygon
+    apart = polygon[:, None] - polygon
     beyond = ends[:, None] - polygon
     # Signed areas (N, N) of the ends of side i beside side j: of opposite signs where i crosses j's line.
     begin, end = (cross(one, side) for one in (apart, beyond))
@@ -134,7 +135,8 @@ def rectangle_size(points: FloatArray) -> tuple[float, float]:
 
 
 # Much faster than np.roll, which the fit of a few markings would call very often.
-_NEXT, _LAST = np.array([1, 2, 3, 0]), np.array([3, 0, 1, 2])
+_NEXT = np.array([1, 2, 3, 0])
+_LAST = np.array([3, 0, 1, 2])
 _TURN = np.array([-1.0, 1.0])
 
 _CORNER = np.arange(4)

@@ -51,7 +51,9 @@ def ground_in_vehicle(map_from_vehicle: FloatArray, points_map: FloatArray) -> F
 def make_transform(rotation: FloatArray, translation: FloatArray) -> FloatArray:
     """The transforms (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3)."""
     out = np.zeros((*np.shape(rotation)[:-2], 4, 4))
-    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = rotation, translation, 1.0
+    out[..., :3, :3] = rotation
+    out[..., :3, 3] = translation
+    out[..., 3, 3] = 1.0
     return out
 
 
@@ -136,7 +138,8 @@ def quaternion_from_rotation(rotation: FloatArray) -> FloatArray:
     trace = diagonal.sum(axis=1)
     candidates = np.empty((len(rotation), 4, 4))
     for axis in range(3):
-        second, third = (axis + 1) % 3, (axis + 2) % 3
+        second = (axis + 1) % 3
+        third = (axis + 2) % 3
         candidates[:, axis, axis] = 1 + 2 * diagonal[:, axis] - trace
         candidates[:, axis, second] = rotation[:, second, axis] + rotation[:, axis, second]
         candidates[:, axis, third] = rotation[:, third, axis] + rotation[:, axis, third]
@@ -198,7 +201,8 @@ def interpolate(
         linear = np.where(span_s > 0, (stamp_s - recorded[before]) / span_s, 0.0)
     fraction = np.clip(np.where(inside, linear, np.round(linear)), 0.0, 1.0)
 
-    first, second = trajectory.map_from_vehicle[before], trajectory.map_from_vehicle[after]
+    first = trajectory.map_from_vehicle[before]
+    second = trajectory.map_from_vehicle[after]
     turn = log(inverse(first) @ second)
     turn[:, :3] = 0.0
     points = first[:, :3, 3] + fraction[:, None] * (second[:, :3, 3] - first[:, :3, 3])
@@ -219,7 +223,8 @@ def with_clock_offsets(
     or in a gap above ``max_gap_s`` are left out. Raises DriveError without a trajectory, or if a camera keeps
     no image.
     """
-    root, trajectory = drive.sessions[session].root, drive.sessions[session].trajectory
+    root = drive.sessions[session].root
+    trajectory = drive.sessions[session].trajectory
     if trajectory is None:
         raise DriveError(f"{root}: holds no trajectory to pose its images anew from")
     images: list[Image] = [image for image in drive.images if image.session != session]

@@ -25,16 +25,20 @@ _CAUCHY = 2.5  # whitened residual at which Cauchy's weight is 1/2
 _LENS_SIGMA_PX = 0.1
 # Fall of a crowned road to both sides of the vehicle, whose wheels stand half a track beside the crown: it
 # looks like lens distortion (AASHTO, A Policy on Geometric Design of Highways and Streets, 7th ed., 4.2.2).
-_ROOF_SIGMA, _HALF_TRACK_M = 0.03, 0.8
+_ROOF_SIGMA = 0.03
+_HALF_TRACK_M = 0.8
 _BENDS = 6  # coefficients of a smooth error of each pixel coordinate, a quadratic polynomial
-_LARGEST_TURN_RAD, _LARGEST_SHIFT_M = 0.05, 0.2  # of a step, within which the equations are linear
+_LARGEST_TURN_RAD = 0.05
+_LARGEST_SHIFT_M = 0.2  # of a step, within which the equations are linear
 _STEPS = 20
 _CONVERGED = 0.02  # step, in standard deviations, that ends the iteration
 _DAMPING = 1e-3  # damping against endless overshoot of a correlated focal length and height
 _LARGEST_NOISE_PX = 2.0  # limit of the removed noise: beyond is no noise of a pixel
 _STRETCHES = 12  # segments of the route, several metres each: longer than the correlation of most errors
 
-TURN, CENTRE, BENDS = slice(0, 3), slice(3, 6), slice(6, 6 + 2 * _BENDS)
+TURN = slice(0, 3)
+CENTRE = slice(3, 6)
+BENDS = slice(6, 6 + 2 * _BENDS)
 _ROOF = BENDS.stop
 
 
@@ -106,13 +110,15 @@ def adjust(
     damping = 0.0
     begin = _Unknowns(start, 0.0, np.zeros((len(prior.poses), 6)), np.zeros(2 * _BENDS), 0.0)
     if near is not None:
-        begin, damping = _Unknowns(near.mount, 0.0, near.pose_errors, near.bends, near.roof), _DAMPING
+        begin = _Unknowns(near.mount, 0.0, near.pose_errors, near.bends, near.roof)
+        damping = _DAMPING
         problem = replace(problem, sigma_px=problem.linearise(begin).sigma_px)
     fit = gauss_newton(
         problem.linearise, begin, retract=problem.moved, limit=_short, steps=_STEPS, tolerance=_CONVERGED,
         damping=damping,
     )  # fmt: skip
-    found, last = fit.x, fit.last
+    found = fit.x
+    last = fit.last
     wanted = [*range(6), *range(_ROOF + 1, problem.known)]
     inverse = np.linalg.inv(last.information)
     own = inverse[: problem.known, : problem.known]
@@ -145,7 +151,8 @@ def _by_stretch(moved: FloatArray, image: IntArray) -> FloatArray:
 
 
 def _short(step: FloatArray) -> FloatArray:
-    turn, shift = np.abs(step[TURN]).max(), np.abs(step[CENTRE]).max()
+    turn = np.abs(step[TURN]).max()
+    shift = np.abs(step[CENTRE]).max()
     return np.asarray(step / max(1.0, float(turn) / _LARGEST_TURN_RAD, float(shift) / _LARGEST_SHIFT_M))
 
 
@@ -174,14 +181,17 @@ class _Problem:
         """Prior information (U,) of the unknowns without the poses' errors."""
         stiffness = np.zeros(self.known)
         # Weak priors keep few matches from being singular: 1 rad for an angle, ten units for a parameter.
-        stiffness[TURN], stiffness[_ROOF + 1 :] = 1.0, 0.01
+        stiffness[TURN] = 1.0
+        stiffness[_ROOF + 1 :] = 0.01
         stiffness[_ROOF] = _ROOF_SIGMA**-2
-        stiffness[CENTRE], stiffness[BENDS] = self.prior.centre_sigma_m**-2, _LENS_SIGMA_PX**-2
+        stiffness[CENTRE] = self.prior.centre_sigma_m**-2
+        stiffness[BENDS] = _LENS_SIGMA_PX**-2
         return stiffness
 
     def moved(self, now: _Unknowns, step: FloatArray) -> _Unknowns:
         """The estimate after a step."""
-        mount, extra = now.mount.moved(step[TURN], step[CENTRE]), now.extra
+        mount = now.mount.moved(step[TURN], step[CENTRE])
+        extra = now.extra
         if self.free is not None:
             change = float(step[self.known - 1])
             extra += change
@@ -195,7 +205,8 @@ class _Problem:
     def poses(self, now: _Unknowns) -> FloatArray:
         """Poses (I, 4, 4) with their estimated errors and the freed parameter applied."""
         prior = self.prior
-        turn, shift = now.errors[:, :3].copy(), now.errors[:, 3:].copy()
+        turn = now.errors[:, :3].copy()
+        shift = now.errors[:, 3:].copy()
         if self.free == "clock_s":
             shift[:, :2] += now.extra * prior.velocity[:, :2]
             turn[:, 2] += now.extra * prior.velocity[:, 2]
@@ -215,11 +226,13 @@ class _Problem:
         sigma_px = self.sigma_px or float(
             np.clip(PIXEL_SIGMA * scale, _LEAST_PIXEL_SIGMA, self.tolerance * PIXEL_SIGMA)
         )
-        unit, far = PIXEL_SIGMA / sigma_px, _CAUCHY * self.tolerance
+        unit = PIXEL_SIGMA / sigma_px
+        far = _CAUCHY * self.tolerance
         weight = np.where(usable, 1 / (1 + (length * unit / far) ** 2), 0.0)
         good = weight > 0
         scaled = np.sqrt(weight[good])[:, None, None] * (root * unit)[good]
-        rows, value = scaled @ jacobian[good], (scaled @ residual[good][:, :, None])[..., 0]
+        rows = scaled @ jacobian[good]
+        value = (scaled @ residual[good][:, :, None])[..., 0]
         information, gradient = self._sum_pairs(rows, value, self.observations.only(good))
         score = np.zeros((len(weight), self.known))
         score[good] = np.einsum("nij,ni->nj", rows[:, :, : self.known], value)
@@ -237,8 +250,12 @@ class _Problem:
         observed pixels correlate with the noise: over thousands of matches, focal lengths come out up to 1 %
         too long (Pope, Some pitfalls to be avoided in the iterative adjustment of nonlinear problems, 1972).
         """
-        seen, poses = self.observations, self.poses(now)
-        points, known, pose, slopes = [], [], [], []
+        seen = self.observations
+        poses = self.poses(now)
+        points = []
+        known = []
+        pose = []
+        slopes = []
         spread = np.zeros((len(seen.first), 2, 2))
         off = noise_px or (0 * seen.first_px,) * 2
         for (image, seen_px), off_px, lower_m in zip(_both(seen), off, self.lower_m, strict=True):
@@ -285,7 +302,8 @@ class _Problem:
         """Information (U, U) and gradient (U,) of the matches, with a block of two poses per pair."""
         known = self.known
         size = known + 6 * len(self.prior.poses)
-        information, gradient = np.zeros((size, size)), np.zeros(size)
+        information = np.zeros((size, size))
+        gradient = np.zeros(size)
         cuts = np.flatnonzero(np.diff(seen.pair)) + 1
         for low, high in zip([0, *cuts], [*cuts, len(seen.pair)], strict=True):
             if high == low:
@@ -308,7 +326,8 @@ class _Problem:
             cost += 0.5 * float(now.errors[:, state] @ pull)
         stiffness = self.stiffness
         off = np.zeros(self.known)
-        off[CENTRE], off[BENDS] = now.mount.centre_vehicle - self.prior.centre_vehicle, now.bends
+        off[CENTRE] = now.mount.centre_vehicle - self.prior.centre_vehicle
+        off[BENDS] = now.bends
         off[_ROOF] = now.roof
         place = np.arange(self.known)
         information[place, place] += stiffness

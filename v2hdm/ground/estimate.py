@@ -89,7 +89,8 @@ def estimate_ground(drive: Drive, camera: str, options: GroundOptions | None = N
     stated = Stated(drive, drive.cameras[camera], motion, guessed_mount(drive.cameras[camera]))
     matcher = Matcher(drive, camera, motion)
     readings = try_readings(drive, camera, matcher, stated, options.readings)
-    out, start = _nothing(camera, readings), readings.start
+    out = _nothing(camera, readings)
+    start = readings.start
     if readings.best is Reading.AS_GIVEN:
         solved = None
         if start.mount is not None:
@@ -147,11 +148,14 @@ def _solve(
 
 
 def _found(nothing: GroundEstimate, solved: _Solved, free: tuple[str, ...]) -> GroundEstimate:
-    mount, matched, adjusted = solved.adjusted.mount, solved.matched, solved.adjusted
+    mount = solved.adjusted.mount
+    matched = solved.matched
+    adjusted = solved.adjusted
     seen = matched.observations
     factor = _scatter(seen, solved.stated, adjusted)
     # Uneven ground tilts and lifts all pairs alike.
-    tilt, pitch = _FLATNESS_M / (2 * STRIP_M), _FLATNESS_M / (2 * _APART_M[1])
+    tilt = _FLATNESS_M / (2 * STRIP_M)
+    pitch = _FLATNESS_M / (2 * _APART_M[1])
     flatness = np.diag(np.square([tilt, pitch, 0.0, 0.0, 0.0, _FLATNESS_M]))
     # Left tangent of ``cam_from_vehicle`` (translation, rotation) by turn and centre in vehicle axes.
     by_own = -np.kron([[0, 1], [1, 0]], mount.vehicle_from_cam_rotation.T)

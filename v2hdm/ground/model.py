@@ -80,7 +80,8 @@ class Mount:
         size = np.array([self.info.width, self.info.height])
         with np.errstate(invalid="ignore"):
             # Far outside the image a lens model folds points back into it.
-            low, high = -0.5 * size, 1.5 * size
+            low = -0.5 * size
+            high = 1.5 * size
             hidden = (depth_m <= 0) | ((pinhole < low) | (pinhole > high)).any(axis=1)
             pinhole[hidden] = size / 2
             px = distort_points(self.info, pinhole)
@@ -131,7 +132,8 @@ class GroundHits:
 def hit_ground(mount: Mount, points_px: FloatArray, poses: FloatArray) -> GroundHits:
     """Ground points at pixels (N, 2), from vehicle ``poses`` (N, 4, 4)."""
     rays_vehicle = mount.rays(points_px)
-    turn, position = poses[:, :3, :3], poses[:, :3, 3]
+    turn = poses[:, :3, :3]
+    position = poses[:, :3, 3]
     rays_map = (turn @ rays_vehicle[:, :, None])[..., 0]
     centre_map = turn @ mount.centre_vehicle + position
     down = np.where(rays_map[:, 2] < -1e-3, rays_map[:, 2], np.nan)

@@ -91,7 +91,8 @@ def _velocity(trajectory: Trajectory) -> FloatArray:
     poses = trajectory.map_from_vehicle
     yaw = np.unwrap(heading_rad(poses))
     rate = _slopes(trajectory.stamp_s, np.column_stack([poses[:, :2, 3], yaw]))
-    c, s = np.cos(yaw), np.sin(yaw)
+    c = np.cos(yaw)
+    s = np.sin(yaw)
     return np.column_stack([c * rate[:, 0] + s * rate[:, 1], c * rate[:, 1] - s * rate[:, 0], rate[:, 2]])
 
 
@@ -102,7 +103,8 @@ def _slopes(at: FloatArray, values: FloatArray) -> FloatArray:
     last = np.searchsorted(at, at + _SMOOTHING_S + 1e-9)
     for k in range(len(at)):
         # Three poses at least, however far apart.
-        low, high = max(min(first[k], k - 1), 0), min(max(last[k], k + 2), len(at))
+        low = max(min(first[k], k - 1), 0)
+        high = min(max(last[k], k + 2), len(at))
         if high - low < 2:
             continue
         terms = np.vander(at[low:high] - at[k], 3 if high - low >= 4 else 2, increasing=True)

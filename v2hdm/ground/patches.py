@@ -22,7 +22,8 @@ ImageArray = NDArray[np.uint8]
 Float32Array = NDArray[np.float32]
 
 STRIP_M = 2.0  # half width of the strip about the driven path that counts as road
-_PATCH_M, _STEP_M = 0.9, 0.6  # side of a patch; spacing, which leaves an overlap of a third
+_PATCH_M = 0.9
+_STEP_M = 0.6  # side of a patch; spacing, which leaves an overlap of a third
 _LEAST_CORRELATION = 0.5  # least normalised cross-correlation of two patches of the same ground
 _LEAST_ROUNDNESS = 0.1  # ratio of a peak's curvatures; below, the patch is an edge that slides along itself
 _LEAST_LEAD = 0.1  # least lead of the best peak over another one in the search window
@@ -125,7 +126,8 @@ def patch_centres(
 
     Their lattice is aligned with the first pose.
     """
-    pose, lattice = poses[0], _lattice(roi_vehicle)
+    pose = poses[0]
+    lattice = _lattice(roi_vehicle)
     centres = lattice @ pose[:2, :2].T + pose[:2, 3]
     inside = np.ones(len(centres), dtype=np.bool_)
     for each in poses:
@@ -139,7 +141,8 @@ def patch_centres(
 
 def _lattice(roi_vehicle: FloatArray) -> FloatArray:
     """Lattice points (N, 2) of patches over the bounding rectangle of a region."""
-    low, high = roi_vehicle.min(axis=0), roi_vehicle.max(axis=0)
+    low = roi_vehicle.min(axis=0)
+    high = roi_vehicle.max(axis=0)
     ahead, left = np.meshgrid(*(np.arange(a, b, _STEP_M) for a, b in zip(low, high, strict=True)))
     return np.column_stack([ahead.ravel(), left.ravel()])
 
@@ -198,7 +201,8 @@ def match_anywhere(first: View, second: View, roi_vehicle: FloatArray, grid_m: f
     if len(found) < _LEAST_OF_A_PAIR:
         return Matches.none_of(len(in_view))
     table = np.array(found)
-    first_px, second_px = first.pixels(sheet.at(table[:, :2])), second.pixels(sheet.at(table[:, 2:4] + half))
+    first_px = first.pixels(sheet.at(table[:, :2]))
+    second_px = second.pixels(sheet.at(table[:, 2:4] + half))
     moving = np.linalg.norm(second_px - first_px, axis=1) > _STILL_PX
     return _on_one_plane(Matches(first_px[moving], second_px[moving], len(in_view)))
 
@@ -219,7 +223,8 @@ def _peak(score: Float32Array) -> tuple[float, float] | None:
     rr = around[2, 1] - 2 * around[1, 1] + around[0, 1]
     cc = around[1, 2] - 2 * around[1, 1] + around[1, 0]
     rc = (around[2, 2] - around[2, 0] - around[0, 2] + around[0, 0]) / 4
-    trace, spread = (rr + cc) / 2, np.hypot((rr - cc) / 2, rc)
+    trace = (rr + cc) / 2
+    spread = np.hypot((rr - cc) / 2, rc)
     if trace + spread >= 0 or trace + spread > _LEAST_ROUNDNESS * (trace - spread):
         return None
     determinant = rr * cc - rc * rc
@@ -228,7 +233,8 @@ def _peak(score: Float32Array) -> tuple[float, float] | None:
     if abs(down) > 1 or abs(right) > 1:
         return None
     rest = score.copy()
-    top, left = max(row - _PEAK_CELLS, 0), max(column - _PEAK_CELLS, 0)
+    top = max(row - _PEAK_CELLS, 0)
+    left = max(column - _PEAK_CELLS, 0)
     rest[top : row + _PEAK_CELLS + 1, left : column + _PEAK_CELLS + 1] = -1
     if rest.max() > best - _LEAST_LEAD:
         return None
@@ -238,7 +244,8 @@ def _peak(score: Float32Array) -> tuple[float, float] | None:
 def _on_one_plane(matches: Matches) -> Matches:
     """The inliers of one homography between the images: a plane seen twice."""
     known = ~(np.isnan(matches.first_px) | np.isnan(matches.second_px)).any(axis=1)
-    first, second = matches.first_px[known], matches.second_px[known]
+    first = matches.first_px[known]
+    second = matches.second_px[known]
     if len(first) < _LEAST_OF_A_PAIR:
         return Matches.none_of(matches.sought)
     _, inlier = cv2.findHomography(first, second, cv2.RANSAC, _HOMOGRAPHY_PX)
@@ -273,7 +280,8 @@ class Matcher:
     def under(self, motion: Motion, turned: bool = False) -> Matcher:
         """The same images under another reading of the poses, the region ``turned`` to the other end."""
         other = copy(self)
-        other._path, other._roi = motion.course_map(), -self._roi if turned else self._roi
+        other._path = motion.course_map()
+        other._roi = -self._roi if turned else self._roi
         return other
 
     def match(

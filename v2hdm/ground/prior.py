@@ -120,7 +120,8 @@ class Stated:
 
 def state_sigmas(noise: PoseNoise) -> FloatArray:
     """Standard deviations (6,) of a pose's :data:`STATES`."""
-    tilt, position = noise.roll_pitch_rad, noise.position_m
+    tilt = noise.roll_pitch_rad
+    position = noise.position_m
     sigmas = [tilt, tilt, noise.heading_rad, position, position, HEAVE_SIGMA_M]
     return np.asarray(np.maximum(np.array(sigmas), _LEAST_POSE_SIGMA))
 

@@ -17,7 +17,8 @@ from v2hdm.ground.prior import Stated
 from v2hdm.ground.results import Reading
 from v2hdm.records import Drive, FloatArray, IntArray
 
-_PAIRS, _GRID_M = 10, 0.06
+_PAIRS = 10
+_GRID_M = 0.06
 _SHORT_M = (0.3, 1.6)  # baseline of a pair for the start: a wrong guess shifts the ground by a fraction of it
 _TOLERANCE = 8.0  # factor on the residual at which weights fall: the guess is degrees off
 _SEARCH_M = (0.9, 0.5)
@@ -81,7 +82,8 @@ def contradicts(matcher: Matcher, stated: Stated) -> bool:
     pairs = start_pairs(stated)
     pairs = pairs[:: -(-len(pairs) // _PAIRS)]
     found = matcher.match_anywhere(stated.guess, pairs, _GRID_M)
-    share, turn_rad = [], []
+    share = []
+    turn_rad = []
     for matches, (first, second) in zip(found, stated.poses()[pairs], strict=True):
         seen = _motion(matches, stated.guess)
         if seen is not None:

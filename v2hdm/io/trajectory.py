@@ -24,7 +24,8 @@ _FARTHEST_FROM_ORIGIN_M = 1e5  # a map is flat, and there the ground is 800 m be
 _LATE_S = 1.0  # a reading that comes later than this after its successor is of another clock or recording
 
 _UNITS: Mapping[str, float] = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
-_LONGEST_S, _QUICKEST_S = 5.0, 5e-4  # limits of the time between two poses, or images, of a drive
+_LONGEST_S = 5.0
+_QUICKEST_S = 5e-4  # limits of the time between two poses, or images, of a drive
 _ALIKE = 5.0  # poses and images of one drive last equally long to within this factor
 _LATEST_S = 1e11  # stamps in s since 1970 stay below this for three thousand years
 
@@ -70,11 +71,13 @@ def read_tum(path: Path) -> Trajectory:
     """Read the trajectory at ``path``: stamps in s, strictly rising, and poses ``map_from_vehicle`` in m."""
     rows: dict[int, list[float]] = {}
     for number, line in _content_lines(path, "holds no pose", _COLUMNS):
-        where, parts = f"{path}: line {number}", line.replace(",", " ").split()
+        where = f"{path}: line {number}"
+        parts = line.replace(",", " ").split()
         if len(parts) != 8:
             raise DriveError(f"{where}: expected 8 columns '{_COLUMNS}', got {len(parts)}; fix that line")
         rows[number] = [parse_number(part, where) for part in parts]
-    numbers, table = list(rows), np.array(list(rows.values()))
+    numbers = list(rows)
+    table = np.array(list(rows.values()))
     _check_rising(table[:, 0], numbers, path)
     advice = "normalise it, order qx qy qz qw"
     rotation = checked_rotations(table[:, 4:], lambda k: f"{path}: line {numbers[k]}", advice)
@@ -95,7 +98,8 @@ def read_image_list(path: Path) -> tuple[FloatArray, list[str]]:
     stamps: dict[int, float] = {}
     names: list[str] = []
     for number, line in _content_lines(path, "lists no image", "timestamp filename"):
-        where, parts = f"{path}: line {number}", line.split(maxsplit=1)
+        where = f"{path}: line {number}"
+        parts = line.split(maxsplit=1)
         if len(parts) != 2:
             raise DriveError(f"{where}: expected 'timestamp filename', got '{line}'; fix that line")
         stamps[number] = parse_number(parts[0], where)
@@ -168,7 +172,8 @@ def why_no_pose(
     asked: str = "poses",
 ) -> str:
     """Why no image (N,) finds a pose (P,), or what is called so, and what to do: units, epochs or gaps."""
-    images, poses = unit_of(image_stamp_s), unit_of(pose_stamp_s)
+    images = unit_of(image_stamp_s)
+    poses = unit_of(pose_stamp_s)
     if unit := images or poses:
         whose = "all stamps" if images == poses else f"the {asking if images else asked}' stamps"
         return f"{whose} are in {unit}: divide them by {_UNITS[unit]:g} to give seconds"

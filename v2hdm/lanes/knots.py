@@ -74,7 +74,8 @@ class Knots:
 
     def observations(self, first: int) -> Observations:
         """As observations of corners numbered from ``first``; cameras and frames are the rig's."""
-        normal, variance_px2 = self.line @ _TURN, self.variance_px2[:, None, None]
+        normal = self.line @ _TURN
+        variance_px2 = self.variance_px2[:, None, None]
         covariance_px = variance_px2 * normal[:, :, None] * normal[:, None]
         covariance_px += OPEN_END_PX**2 * self.line[:, :, None] * self.line[:, None]
         at = first + self.knot
@@ -96,17 +97,20 @@ def find_knots(
     options: LaneOptions,
 ) -> Knots | None:
     """Knots along a drive's lanes under ``rig``, which is over ``cameras``; None without any."""
-    ground, jitter_rad = ground_by_rig(drive, cameras, rig, surface), drive.pose_noise.roll_pitch_rad
+    ground = ground_by_rig(drive, cameras, rig, surface)
+    jitter_rad = drive.pose_noise.roll_pitch_rad
     cloud = collect_lane_points(drive, detections, ground, options.max_range_m, jitter_rad)
     lanes = map_lanes(cloud, options)
     if not lanes:
         return None
-    course, px_from_map = _Course.of(lanes), np.asarray(np.linalg.inv(ground.map_from_pinhole_px))
+    course = _Course.of(lanes)
+    px_from_map = np.asarray(np.linalg.inv(ground.map_from_pinhole_px))
     lane, at_m, points_map, along = course.knots
     pairs = _pairs(cloud, course, px_from_map)
     image, at, *shown = _passing(cloud, ground, course, px_from_map, *pairs)
     enough = np.bincount(at, minlength=len(lane)) >= max(options.min_images, 2)
-    unknown, kept = np.where(enough, np.cumsum(enough) - 1, -1), enough[at]
+    unknown = np.where(enough, np.cumsum(enough) - 1, -1)
+    kept = enough[at]
     alone = np.flatnonzero(np.bincount(lane[enough], minlength=len(lanes)) == 0)
     if len(alone):
         _log.warning(
@@ -183,7 +187,8 @@ def _pairs(
     near = cKDTree(cloud.points_map).sparse_distance_matrix(
         cKDTree(knots_map), reach_m, output_type="ndarray"
     )
-    point, knot = near["i"].astype(np.int64), near["j"].astype(np.int64)
+    point = near["i"].astype(np.int64)
+    knot = near["j"].astype(np.int64)
     points_map = cloud.points_map[point]
     ahead_m = ((points_map - knots_map[knot]) * along[knot]).sum(axis=1)
     here = lane[knot], at_m[knot] + ahead_m
@@ -216,7 +221,8 @@ def _passing(
     """
     lane, _, knots_map, along = course.knots
     groups, own = np.unique(np.column_stack([cloud.image[point], knot]), axis=0, return_inverse=True)
-    (image, at), own = groups.T, own.ravel()
+    (image, at) = groups.T
+    own = own.ravel()
     foot_map = knots_map[knot] + ahead_m[:, None] * along[knot]
     weight = _image_of(px_from_map[cloud.image[point]], foot_map, along[knot])[2][:, 1] ** 2
 
@@ -225,7 +231,8 @@ def _passing(
 
     w, x, y, xy = (total(one) for one in (np.ones(len(own)), ahead_m, off_m, ahead_m * off_m))
     xx = total(ahead_m**2) + (CENTRE_SIGMA_PX / _SLOPE_SIGMA) ** 2
-    left_m, slope = (xx * y - x * xy) / (w * xx - x**2), (w * xy - x * y) / (w * xx - x**2)
+    left_m = (xx * y - x * xy) / (w * xx - x**2)
+    slope = (w * xy - x * y) / (w * xx - x**2)
     off_px2 = weight * (off_m - left_m[own] - slope[own] * ahead_m) ** 2
     points = np.bincount(own)[own]
     free = points > 2
@@ -261,14 +268,18 @@ def _drawn(lane: Lane, knots: Knots, rows: IntArray, solution: Solution, spacing
     if not len(seen):
         return lane
     corner = len(solution.corners_map) - knots.count + knots.unknown[rows[seen]]
-    at_m, points_map, left = knots.at_m[rows], knots.points_map[rows], knots.along[rows] @ _TURN
+    at_m = knots.at_m[rows]
+    points_map = knots.points_map[rows]
+    left = knots.along[rows] @ _TURN
     vertex_m = np.linspace(0.0, at_m[-1], max(round(float(at_m[-1]) / spacing_m), 1) + 1)
-    by_knot, by_seen = _catmull_rom(at_m, vertex_m), _between(at_m[seen], at_m)
+    by_knot = _catmull_rom(at_m, vertex_m)
+    by_seen = _between(at_m[seen], at_m)
     moved_m = ((solution.corners_map[corner] - points_map[seen]) * left[seen]).sum(axis=1)
     drawn_map = by_knot @ (points_map + (by_seen @ moved_m)[:, None] * left)
     along = np.gradient(drawn_map, axis=0)
     left = along / np.linalg.norm(along, axis=1, keepdims=True) @ _TURN
-    half_m, inner = np.zeros(len(vertex_m)), (vertex_m >= at_m[seen[0]]) & (vertex_m <= at_m[seen[-1]])
+    half_m = np.zeros(len(vertex_m))
+    inner = (vertex_m >= at_m[seen[0]]) & (vertex_m <= at_m[seen[-1]])
     if len(seen) > 1:
         smooth = CubicSpline(at_m[seen], solution.corners_map[corner], bc_type="natural")
         half_m[inner] = ((smooth(vertex_m[inner]) - drawn_map[inner]) * left[inner]).sum(axis=1) / 2
@@ -308,10 +319,12 @@ def _catmull_rom(at_m: FloatArray, wanted_m: FloatArray) -> csr_array:
     knot = low + np.arange(-1, 3)[:, None]
     # Extrapolates the curvature at the ends, P_-1 = 3 P_0 - 3 P_1 + P_2; a straight line for two knots.
     beyond = np.array([3.0, -3.0, 1.0] if last > 1 else [2.0, -1.0, 0.0])
-    before, after = knot[0] < 0, knot[3] > last
+    before = knot[0] < 0
+    after = knot[3] > last
     value[1:, before] += beyond[:, None] * value[0, before]
     value[2::-1, after] += beyond[:, None] * value[3, after]
-    value[0, before], value[3, after] = 0.0, 0.0
+    value[0, before] = 0.0
+    value[3, after] = 0.0
     row = np.broadcast_to(np.arange(len(wanted_m)), knot.shape)
     column = np.clip(knot, 0, last)
     return csr_array((value.ravel(), (row.ravel(), column.ravel())), shape=(len(wanted_m), len(at_m)))

@@ -20,7 +20,8 @@ from v2hdm.lanes.points import NODE_SPACING_M, Guides, LaneCloud, Nodes, find_no
 from v2hdm.records import LANE_DASH, LANE_LINE, FloatArray, IntArray, Lane
 from v2hdm.site.options import LaneOptions
 
-_MAX_DASH_GAP_M, _MAX_BREAK_M = 9.0, 3.0  # longest bridged gap between dashes, and break in solid paint
+_MAX_DASH_GAP_M = 9.0
+_MAX_BREAK_M = 3.0  # longest bridged gap between dashes, and break in solid paint
 _LEAST_PIECE_M = 2.0  # least length of a lane line
 _SAME_DIRECTION = np.cos(np.deg2rad(25.0))  # least cosine between nodes of one line
 _MAX_LINK_SPACINGS = 2.5  # longest link of two nodes, in spacings
@@ -85,7 +86,10 @@ def _mutual_links(nodes: Nodes, reach_m: float) -> IntArray:
     ) / np.maximum(distance, 1e-9)
     parallel = np.abs(np.einsum("pi,pi->p", tangent, nodes.tangent[target]))
     fits = (straight >= _SAME_DIRECTION) & (parallel >= _SAME_DIRECTION)
-    source, target, along, cost = source[fits], target[fits], along[fits], (distance / straight**4)[fits]
+    source = source[fits]
+    target = target[fits]
+    along = along[fits]
+    cost = (distance / straight**4)[fits]
     best = np.full((len(nodes.points_map), 2), -1, dtype=np.int64)
     # In order of falling cost: the cheapest is written last and stays.
     order = np.argsort(-cost, kind="stable")
@@ -102,12 +106,15 @@ def _walk(links: IntArray) -> list[IntArray]:
     for start in np.concatenate([np.flatnonzero(degree == 1), np.flatnonzero(degree == 2)]).tolist():
         if not left[start]:
             continue
-        path, previous, node = [], -1, start
+        path = []
+        previous = -1
+        node = start
         while node >= 0 and left[node]:
             left[node] = False
             path.append(node)
             ahead = [n for n in links[node].tolist() if n >= 0 and n != previous and left[n]]
-            previous, node = node, ahead[0] if ahead else -1
+            previous = node
+            node = ahead[0] if ahead else -1
         if degree[start] == 2 and start in links[path[-1]] and len(path) > 2:
             path.append(start)
         paths.append(np.array(path, dtype=np.int64))
@@ -123,7 +130,8 @@ def _joints(paths: list[Path]) -> list[tuple[int, int, int, int]]:
     outward = outward.reshape(-1, 2)
     dashed = np.repeat([path.dash > 0.5 for path in paths], 2)
     pairs = cKDTree(end).query_pairs(max(_MAX_DASH_GAP_M, _MAX_BREAK_M), output_type="ndarray")
-    a, b = pairs[:, 0], pairs[:, 1]
+    a = pairs[:, 0]
+    b = pairs[:, 1]
     gap = end[b] - end[a]
     gap_m = np.linalg.norm(gap, axis=1)
     limit_m = np.where(dashed[a] & dashed[b], _MAX_DASH_GAP_M, _MAX_BREAK_M)
@@ -182,17 +190,20 @@ def _merged(points_map: FloatArray, paths: Sequence[Path]) -> Path:
 
 def _bridge(before: FloatArray, after: FloatArray, spacing_m: float) -> FloatArray:
     """Vertices (N, 2) of the Hermite cubic from the end of ``before`` to the start of ``after``."""
-    start, stop = before[-1], after[0]
+    start = before[-1]
+    stop = after[0]
     gap_m = float(np.linalg.norm(stop - start))
     t = np.linspace(0.0, 1.0, max(int(np.ceil(gap_m / spacing_m)), 1) + 1)[1:-1]
-    leave, arrive = gap_m * _outward(before), -gap_m * _outward(after[::-1])
+    leave = gap_m * _outward(before)
+    arrive = -gap_m * _outward(after[::-1])
     return np.asarray(CubicHermiteSpline([0.0, 1.0], [start, stop], [leave, arrive])(t))
 
 
 _MAX_BRIDGE_M = 25.0  # longest gap bridged by images' whole lines, m
 _PASSES_M = 0.4  # largest distance, m, of a whole line from the end of a piece that it passes
 _LEAST_COSINE = np.cos(np.deg2rad(30.0))  # least cosine between a gap and the directions of its ends
-_FIRST, _LAST = 0, 1
+_FIRST = 0
+_LAST = 1
 _DIRECTION_LENGTH_M = 5.0  # length, m, of a piece's end that gives a bridge's direction
 
 
@@ -205,12 +216,14 @@ def bridge_paths(paths: list[Path], guides: Guides, least_images: int) -> list[P
     while bridged and len(paths) > 1:
         bridged = False
         for a, end_a, b, end_b in _gaps(np.stack([_ends(path) for path in paths])).tolist():
-            before, after = paths[a].turned(end_a == _FIRST), paths[b].turned(end_b == _LAST)
+            before = paths[a].turned(end_a == _FIRST)
+            after = paths[b].turned(end_b == _LAST)
             between = _course_between(before.points_map[-1], after.points_map[0], guides, tree, least_images)
             if between is not None:
                 points = np.concatenate([before.points_map, between, after.points_map])
                 rest = [path for k, path in enumerate(paths) if k not in (a, b)]
-                paths, bridged = [*rest, _merged(points, [before, after])], True
+                paths = [*rest, _merged(points, [before, after])]
+                bridged = True
                 break
     return paths
 
@@ -259,7 +272,8 @@ def _course_between(
     courses = []
     for line in common:
         offset = guides.points_map[guides.line == line] - start
-        along, across = offset @ ahead, offset[:, 1] * ahead[0] - offset[:, 0] * ahead[1]
+        along = offset @ ahead
+        across = offset[:, 1] * ahead[0] - offset[:, 0] * ahead[1]
         order = np.argsort(along)
         courses.append(np.interp(at, along[order], across[order]))
     course = np.median(courses, axis=0)

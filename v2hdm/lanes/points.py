@@ -32,7 +32,8 @@ from v2hdm.records import (
 from v2hdm.surface.surface import Surface
 
 NODE_SPACING_M = 0.5  # between the vertices of a polyline
-HALF_WIDTH_M, _HALF_LENGTH_M = 0.3, 0.8  # half size across and along a line of the averaged neighbourhood
+HALF_WIDTH_M = 0.3
+_HALF_LENGTH_M = 0.8  # half size across and along a line of the averaged neighbourhood
 CENTRE_SIGMA_PX = 1.0  # noise of a detected centre across its line: a cell of the network's output
 OWN_SIGMA_M = 0.01  # sigma, m, besides pixel noise: the nearest image must not outvote all others
 _TANGENT_REACH = 2  # points to either side whose difference gives the direction
@@ -78,7 +79,8 @@ class ImageGround:
         """The mapping of the images ``rows``, of ``count``."""
         out = cls(np.full((count, 3, 3), np.nan), np.full((count, 3), np.nan))
         centre = (poses[:, :3, :3] @ camera_centre(extrinsic)[..., None])[..., 0] + poses[:, :3, 3]
-        out.map_from_pinhole_px[rows], out.centre_map[rows] = homographies, centre
+        out.map_from_pinhole_px[rows] = homographies
+        out.centre_map[rows] = centre
         return out
 
     def rolling(
@@ -129,11 +131,13 @@ def ground_by_rig(
     out = out.rolling(rows, camera, frame, poses, rig)
     if surface is None:
         return out
-    of_image, frame_of_image = np.full(len(drive.images), -1), frames_of(drive).frame_of_image
+    of_image = np.full(len(drive.images), -1)
+    frame_of_image = frames_of(drive).frame_of_image
     of_image[rows] = camera
 
     def flattened_px(image: IntArray, points_px: FloatArray) -> FloatArray:
-        camera, frame = of_image[image], frame_of_image[image]
+        camera = of_image[image]
+        frame = frame_of_image[image]
         cam_from_map = rig.cam_from_map(camera, frame)
         return surface.flattened_px(rig.intrinsic[camera], cam_from_map, frame, points_px)
 
@@ -157,7 +161,8 @@ def collect_lane_points(
     points_px = ground.flattened_px(image, points_px)
     homographies = ground.map_from_pinhole_px[image]
     points_map, jacobian = ground_points_with_jacobian(homographies, points_px[:, None])
-    points_map, jacobian = ground.at_rows(points_map[:, 0], image, row_share), jacobian[:, 0]
+    points_map = ground.at_rows(points_map[:, 0], image, row_share)
+    jacobian = jacobian[:, 0]
     tangent = _tangents(points_map, piece)
     centre = ground.centre_map[image]
     ray = points_map - centre[:, :2]
@@ -198,7 +203,8 @@ def _points(
     points_px = np.concatenate([lane.points_px for _, lane in lanes]).astype(np.float64)
     row_share = np.zeros(len(points_px))
     for name in np.unique(camera):
-        own, info = camera == name, drive.cameras[str(name)].info
+        own = camera == name
+        info = drive.cameras[str(name)].info
         row_share[own] = row_shares(info, points_px[own])
         points_px[own] = undistort_points(info, points_px[own])
     return of_lane, image, points_px, row_share
@@ -264,7 +270,8 @@ def find_nodes(cloud: LaneCloud, least_images: int) -> Nodes:
     place = np.floor(cloud.points_map / _SEED_CELL_M)
     cell = np.column_stack([place, np.floor(angle / np.pi * _DIRECTION_BINS)]).astype(np.int64)
     seeds = np.unique(cell, axis=0, return_index=True)[1]
-    points, tangent = cloud.points_map[seeds], cloud.tangent[seeds]
+    points = cloud.points_map[seeds]
+    tangent = cloud.tangent[seeds]
     # Pairs of seeds and points that can be neighbours in any iteration.
     reach_m = float(np.hypot(_HALF_LENGTH_M, 2 * HALF_WIDTH_M))
     apart = cKDTree(points).sparse_distance_matrix(cKDTree(cloud.points_map), reach_m, output_type="ndarray")
@@ -274,9 +281,11 @@ def find_nodes(cloud: LaneCloud, least_images: int) -> Nodes:
     along, across, cosine = _coordinates(points, tangent, cloud, pairs)
     near = (np.abs(along) <= NODE_SPACING_M) & (np.abs(across) <= 0.5 * HALF_WIDTH_M)
     near &= cosine >= _SAME_DIRECTION
-    seed, point = pairs[0][near], pairs[1][near]
+    seed = pairs[0][near]
+    point = pairs[1][near]
     shown = np.unique(np.stack([seed, cloud.image[point]]), axis=1)[0]
-    images, total = np.bincount(shown, minlength=len(points)), np.bincount(seed, minlength=len(points))
+    images = np.bincount(shown, minlength=len(points))
+    total = np.bincount(seed, minlength=len(points))
     dash = np.bincount(seed, cloud.dash[point].astype(float), len(points)) / np.maximum(total, 1)
     supported = np.flatnonzero(images >= least_images)
     kept = supported[_thin(points[supported], tangent[supported], images[supported])]
@@ -302,7 +311,8 @@ def _shift(
     along, across, cosine = _coordinates(points, tangent, cloud, pairs)
     near = (np.abs(along) <= _HALF_LENGTH_M) & (np.abs(across) <= HALF_WIDTH_M)
     near &= cosine >= _SAME_DIRECTION
-    x, y = along[near], across[near]
+    x = along[near]
+    y = across[near]
     # Gaussian across, so that the nearer of two lines wins.
     kernel = np.exp(-0.5 * (2.0 * y / HALF_WIDTH_M) ** 2) * (1 - (x / _HALF_LENGTH_M) ** 2)
     weight = cloud.weight[pairs[1][near]] * kernel

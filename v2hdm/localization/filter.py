@@ -28,13 +28,15 @@ _TURN_ACCELERATION_RAD_S2 = 0.3
 # Standard deviation of the sideways speed: tyres slip, and the poses' origin may lie off the rear axle.
 _SLIP_M_S = 0.05
 # Sigmas of speed and yaw rate before the first frame: anything that a vehicle does in a yard.
-_START_SPEED_M_S, _START_TURN_RAD_S = 5.0, 0.3
+_START_SPEED_M_S = 5.0
+_START_TURN_RAD_S = 0.3
 # Squared distance, in sigmas, up to which a detection fits: one in a thousand is farther.
 _LARGEST_SQUARE = float(chi2.isf(1e-3, 8))
 _CLEARER_BY = 9.0  # how much worse, in the same unit, any other marking must fit: odds of ninety to one
 # How far from where a detection seems to lie its marking is looked for, in sigmas of the place, and at
 # least: the far corners of a cut marking are not where they seem.
-_REACH_SIGMAS, _LEAST_REACH_M = 4.0, 1.5
+_REACH_SIGMAS = 4.0
+_LEAST_REACH_M = 1.5
 _UNKNOWN_SIGMA_M = 0.02  # sigma of a corner of a map that states none
 # Factor of a detection's covariance: an edge that shadow or wear misplaces stays so in the next images.
 # Errors of one corner correlate by about .2 from image to image, over the ten frames that the filter
@@ -77,7 +79,8 @@ def pose_of(parts: FloatArray) -> FloatArray:
     flat = parts.reshape(-1, 5)
     turned = rotation_from_euler(flat[:, 3], flat[:, 4], flat[:, 2])
     out[..., :3, :3] = turned.reshape(*parts.shape[:-1], 3, 3)
-    out[..., :2, 3], out[..., 3, 3] = parts[..., :2], 1.0
+    out[..., :2, 3] = parts[..., :2]
+    out[..., 3, 3] = 1.0
     return out
 
 
@@ -104,9 +107,11 @@ def predict(state: State, step_s: float, attitude_rad: float) -> State:
     change[HEADING, TURN] = step_s
     change[ROLL:, :] = 0.0
     pushed = np.zeros((7, 2))
-    pushed[:2, 0], pushed[SPEED, 0] = step_s**2 / 2 * ahead, step_s
+    pushed[:2, 0] = step_s**2 / 2 * ahead
+    pushed[SPEED, 0] = step_s
     pushed[:2, 1] = speed * step_s**3 / 6 * left
-    pushed[HEADING, 1], pushed[TURN, 1] = step_s**2 / 2, step_s
+    pushed[HEADING, 1] = step_s**2 / 2
+    pushed[TURN, 1] = step_s
     noise = np.square([_ACCELERATION_M_S2, _TURN_ACCELERATION_RAD_S2])
     covariance = change @ state.covariance @ change.T + (pushed * noise) @ pushed.T
     covariance[:2, :2] += (_SLIP_M_S * step_s) ** 2 * np.outer(left, left)
@@ -208,7 +213,8 @@ class Markings:
 
     def _pair(self, seen: Seen, state: State, marking: int, order: IntArray) -> Match:
         kept = np.repeat(seen.informs, 2)[order]
-        rows, corners = order[kept], self._corners[marking]
+        rows = order[kept]
+        corners = self._corners[marking]
         by_place = seen.by_place(state.mean[POSE], corners)[kept]
         noise = _REPEATS * block_diagonal(seen.covariance_px[None])[0][np.ix_(rows, rows)]
         return Match(seen, rows, kept, noise + by_place @ self._covariance[marking] @ by_place.T, corners)

@@ -33,14 +33,17 @@ from v2hdm.report import style
 from v2hdm.store.files import write_json
 
 # How well the first pose is known: a coordinate of a place that RTK has once fixed, and a compass.
-_START_SIGMA_M, _START_SIGMA_RAD = 0.5, float(np.deg2rad(3.0))
+_START_SIGMA_M = 0.5
+_START_SIGMA_RAD = float(np.deg2rad(3.0))
 # With a larger standard deviation of the place the vehicle does not know where it is: half a dash's gap.
 _LOST_M = 0.3
 # Share of the detections that a map of the site explains at least: one explained .86, another site's .04.
 _LEAST_MATCHED = 0.5
 _IN_VIEW_M = 15.0  # A marking is in view whose corners are all in an image and no farther from the camera
 _PANELS = (("ahead", 100.0, "cm"), ("to the left", 100.0, "cm"), ("heading", float(np.degrees(1.0)), "deg"))
-_KNOWN, _LOST, _BAND = "#0072b2", "#d55e00", "#bbbbbb"
+_KNOWN = "#0072b2"
+_LOST = "#d55e00"
+_BAND = "#bbbbbb"
 
 
 @dataclass(frozen=True)
@@ -82,7 +85,8 @@ class Localised:
         """Standard deviations (F, 3) of ahead, left and heading, the map's own shift included."""
         out = []
         for state in self.states:
-            c, s = np.cos(state.mean[2]), np.sin(state.mean[2])
+            c = np.cos(state.mean[2])
+            s = np.sin(state.mean[2])
             turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
             out.append(np.sqrt(np.diag(turn @ state.covariance[:3, :3] @ turn.T) + self.shared))
         return np.stack(out)
@@ -140,7 +144,8 @@ def localize(
     >>> found.error.shape == found.sigma.shape == (len(found.stamp_s), 3)
     True
     """
-    drive, workers = as_drive(drive), workers or os.cpu_count() or 1
+    drive = as_drive(drive)
+    workers = workers or os.cpu_count() or 1
     check_together(hd_map, calibrations, drive)
     if detections is None:
         report = progress or (lambda done, total: None)
@@ -150,7 +155,8 @@ def localize(
     attitude_rad = drive.pose_noise.roll_pitch_rad
     markings = Markings(hd_map)
     state = start(sightings.map_from_vehicle[0], _START_SIGMA_M, _START_SIGMA_RAD, attitude_rad)
-    states, matched = [], []
+    states = []
+    matched = []
     for frame, stamp_s in enumerate(sightings.stamp_s):
         if frame:
             state = predict(state, float(stamp_s - sightings.stamp_s[frame - 1]), attitude_rad)
@@ -195,7 +201,8 @@ def _seen(
     out = []
     for row in np.flatnonzero(sightings.frame == frame).tolist():
         camera = names[sightings.camera[row]]
-        kind, corners_px = sightings.kinds[sightings.kind[row]], sightings.corners_pinhole_px[row]
+        kind = sightings.kinds[sightings.kind[row]]
+        corners_px = sightings.corners_pinhole_px[row]
         pose = (drive.cameras[camera].info.intrinsic, calibrations[camera].cam_from_vehicle)
         out.append(Seen(kind, *pose, corners_px, sightings.covariance_px[row], informs[row]))
     return out
@@ -220,7 +227,9 @@ def write_localised(found: Localised, drive: Drive, folder: Path) -> None:
     write_tum(found.poses, folder / "localized.tum")
     noise = drive.pose_noise
     sigma = np.hypot(found.sigma, [noise.position_m, noise.position_m, noise.heading_rad])
-    time_s, error, known = found.stamp_s - found.stamp_s[0], found.error, found.known
+    time_s = found.stamp_s - found.stamp_s[0]
+    error = found.error
+    known = found.known
     with style.figure(folder / "errors.png", 9, 6) as figure:
         axes = figure.subplots(3, 1, sharex=True)
         for k, (axis, (name, factor, unit)) in enumerate(zip(axes, _PANELS, strict=True)):

@@ -39,7 +39,8 @@ def vehicle_twists(
 ) -> FloatArray:
     """Vehicle twists (F, 6) in its own frame, m/s, rad/s, by central differences within each ``session``."""
     own = np.arange(len(stamp_s))
-    before, after = np.maximum(own - 1, 0), np.minimum(own + 1, len(own) - 1)
+    before = np.maximum(own - 1, 0)
+    after = np.minimum(own + 1, len(own) - 1)
     if session is not None:
         before = np.where(session[before] == session, before, own)
         after = np.where(session[after] == session, after, own)
@@ -133,7 +134,8 @@ def full_model(
 ) -> Model:
     """Every frame deviates from its recorded pose by the states of the pose model ``poses``."""
     solver = with_model(replace(_solver(options), coarse=False), MODELS[poses])
-    sizes, survey = options.known_sizes, options.survey
+    sizes = options.known_sizes
+    survey = options.survey
     return Model(tuple(pose_sigma), options.model_floor_px, solver, variance_factor, sizes, survey)
 
 
@@ -159,7 +161,8 @@ def coarse_model(rig: Rig, pose_noise: Sequence[PoseNoise], options: MappingOpti
 
 
 def _solver(options: MappingOptions) -> SolveOptions:
-    robust, read_out = (options.loss, options.loss_scale), options.estimate_read_out
+    robust = (options.loss, options.loss_scale)
+    read_out = options.estimate_read_out
     return SolveOptions(loss=robust[0], loss_scale=robust[1], read_out=read_out, device=options.device)
 
 
@@ -203,14 +206,17 @@ def solve_bundle(
     if knots is not None:
         own = {name: getattr(solution, name)[: len(row)] for name in _OF_OBSERVATIONS}
         solution = replace(solution, **own)
-    cam_from_vehicle, map_from_vehicle = rig.cam_from_vehicle.copy(), sightings.map_from_vehicle.copy()
-    cam_from_vehicle[used], map_from_vehicle[frames] = solution.cam_from_vehicle, solution.map_from_vehicle
+    cam_from_vehicle = rig.cam_from_vehicle.copy()
+    map_from_vehicle = sightings.map_from_vehicle.copy()
+    cam_from_vehicle[used] = solution.cam_from_vehicle
+    map_from_vehicle[frames] = solution.map_from_vehicle
     adjusted = replace(rig, cam_from_vehicle=cam_from_vehicle, map_from_vehicle=map_from_vehicle)
     if rig.read_out_s is not None:
         read_out_s = rig.read_out_s.copy()
         read_out_s[used] = solution.read_out_s
         adjusted = replace(adjusted, read_out_s=read_out_s)
-    index, seen = {sightings.cameras[c]: k for k, c in enumerate(used.tolist())}, (row, group, corner)
+    index = {sightings.cameras[c]: k for k, c in enumerate(used.tolist())}
+    seen = (row, group, corner)
     return Bundle(adjusted, model, problem, solution, association, *seen, corner_index, index, frames, knots)
 
 
@@ -250,13 +256,15 @@ def _joined(one: _Rows, other: _Rows) -> _Rows:
 
 def drive_problem(sightings: Sightings, rig: Rig, cameras: Mapping[str, Camera], model: Model) -> Problem:
     """All cameras and frames of a drive with their priors, without observations."""
-    none, stated = np.zeros(0, dtype=np.int64), [cameras[name] for name in sightings.cameras]
+    none = np.zeros(0, dtype=np.int64)
+    stated = [cameras[name] for name in sightings.cameras]
     # Camera centres are surveyed, or implied by the initial extrinsic.
     centre = camera_centre(rig.cam_from_vehicle)
     sigma = np.full_like(centre, _UNSURVEYED_CENTRE_SIGMA_M)
     for c, camera in enumerate(stated):
         if camera.centre_prior is not None:
-            centre[c], sigma[c] = camera.centre_prior.centre_vehicle, camera.centre_prior.sigma_m
+            centre[c] = camera.centre_prior.centre_vehicle
+            sigma[c] = camera.centre_prior.sigma_m
     return Problem(
         intrinsic=np.column_stack([rig.intrinsic[:, 0, 0], rig.intrinsic[:, 1, 1], rig.intrinsic[:, :2, 2]]),
         cam_from_vehicle=rig.cam_from_vehicle,
@@ -371,7 +379,8 @@ def control_points(
 
 def _covariance(points: FloatArray, sigma_m: FloatArray, poses: PoseSigma) -> FloatArray:
     """Joint covariance (2N, 2N), m^2, of corners minus points (N, 2), before the survey is applied."""
-    drift, apart_m = poses.position_drift, np.linalg.norm(points[:, None] - points, axis=-1)
+    drift = poses.position_drift
+    apart_m = np.linalg.norm(points[:, None] - points, axis=-1)
     shared = drift.sigma**2 * np.exp(-apart_m / drift.over_m)
     own = (poses.position_m**2 - drift.sigma**2) * np.eye(len(points))
     return np.kron(shared + own, np.eye(2)) + np.diag(sigma_m.ravel() ** 2)

@@ -49,10 +49,12 @@ class FinalSolve:
 
     def candidates(self, located: Located) -> Candidates:
         """Solved candidates with the errors that their images share, and the dissent of outliers."""
-        fused, ungated = fuse_groups(self.bundle.association, located, jitter_rad=0.0), self.ungated
+        fused = fuse_groups(self.bundle.association, located, jitter_rad=0.0)
+        ungated = self.ungated
         solved = _solved_candidates(self.bundle, ungated)
         solved = with_shared_errors(solved, fused, _scatter(self.bundle))
-        row, own = ungated.row, ungated.own_corner
+        row = ungated.row
+        own = ungated.own_corner
         out = np.flatnonzero(~self.inlier & self.sightings.valid[row, own])
         at = row[out], own[out]
         place = at[0], ungated.group[out], ungated.corner[out]
@@ -60,9 +62,12 @@ class FinalSolve:
 
     def counts(self, corners_map: FloatArray) -> Counts:
         """Counts of candidates with corners (G, 4, 2), from all observations."""
-        count, all_seen, rig = len(corners_map), self.ungated, self.bundle.rig
+        count = len(corners_map)
+        all_seen = self.ungated
+        rig = self.bundle.rig
         image = self.sightings.image[all_seen.row]
-        group, accepted = all_seen.group[self.inlier], all_seen.row[self.inlier]
+        group = all_seen.group[self.inlier]
+        accepted = all_seen.row[self.inlier]
         shown = np.unique(np.stack([group, image[self.inlier]]), axis=1)
         odds = np.bincount(group, self.sightings.log_odds[accepted], minlength=count)
         easy = np.stack(easy_views(self.views, rig, list(self.cameras.values()), corners_map))
@@ -84,9 +89,11 @@ class FinalSolve:
 
     def residual_px(self, rig: Rig) -> FloatArray:
         """Residuals (K, 2), px, of the accepted observations under ``rig`` with its own best corners."""
-        bundle, sightings = self.bundle, self.sightings
+        bundle = self.bundle
+        sightings = self.sightings
         fused = fuse_groups(bundle.association, locate(sightings, rig), self.jitter_rad)
-        camera, frame = sightings.camera[bundle.row], sightings.frame[bundle.row]
+        camera = sightings.camera[bundle.row]
+        frame = sightings.frame[bundle.row]
         points = fused.corners_map[bundle.group, bundle.corner]
         own = bundle.row, bundle.own_corner
         cam_from_map = rig.cam_from_map(camera, frame, sightings.row_share[own])
@@ -101,7 +108,8 @@ def _pair(group: IntArray, image: IntArray) -> IntArray:
 
 def conclude(solve: FinalSolve, acceptance: AcceptanceOptions) -> Optimised:
     """Classify the candidates of the final solve; raises MappingError if none is accepted."""
-    bundle, sightings = solve.bundle, solve.sightings
+    bundle = solve.bundle
+    sightings = solve.sightings
     located = locate(sightings, bundle.rig)
     located.informs[:] &= solve.usable
     solved = solve.candidates(located)
@@ -145,9 +153,11 @@ def _calibrations(bundle: Bundle, cameras: Mapping[str, Camera]) -> dict[str, Ca
 
 def _scatter(bundle: Bundle) -> FloatArray:
     """Variance inflation of each corner's (G, 4) images relative to the usual."""
-    corner, size = 4 * bundle.group + bundle.corner, 4 * bundle.association.count
+    corner = 4 * bundle.group + bundle.corner
+    size = 4 * bundle.association.count
     freedom = 2.0 - bundle.problem.observations.on_line[: len(corner)]
-    squared, degrees = np.zeros(size), np.full(size, -2.0)
+    squared = np.zeros(size)
+    degrees = np.full(size, -2.0)
     np.add.at(squared, corner, bundle.solution.mahalanobis2)
     np.add.at(degrees, corner, freedom)
     return scatter_of(squared.reshape(-1, 4), degrees.reshape(-1, 4))

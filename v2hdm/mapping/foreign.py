@@ -33,16 +33,19 @@ def foreign_segment(
     segment: the gain is the lower of both places'.
     """
     group, image = easy_views(views, bundle.rig, cameras, bundle.corners_map)
-    accepted, size = bundle.inliers, int(views.image.max()) + 1
+    accepted = bundle.inliers
+    size = int(views.image.max()) + 1
     known = bundle.group[accepted] * size + sightings.image[bundle.row[accepted]]
-    found, view = np.isin(group * size + image, known), np.searchsorted(views.image, image)
+    found = np.isin(group * size + image, known)
+    view = np.searchsorted(views.image, image)
     frame = views.frame[view]
     apart = bundle.corners_map[group].mean(axis=1) - bundle.rig.map_from_vehicle[frame, :2, 3]
     # A miss counts less where markings at that distance are detected less often.
     counted = np.where(found, 1.0, _ease(found, views.camera[view], np.linalg.norm(apart, axis=1)))
     best = 0.0, 0.0, -np.inf
     for session in np.unique(sightings.session):
-        frames, own = np.flatnonzero(sightings.session == session), sightings.session[frame] == session
+        frames = np.flatnonzero(sightings.session == session)
+        own = sightings.session[frame] == session
         own &= np.isin(group, group[own & found])
         if not own.any():
             continue
@@ -52,7 +55,8 @@ def foreign_segment(
         step = np.searchsorted(ends, frame[own] - frames[0], side="right")
         for count, views_of_kind in zip(counts, (found[own], counted[own]), strict=True):
             np.add.at(count, (step, number), views_of_kind)
-        counts, share = counts.cumsum(axis=1), (found[own].sum() + 1.0) / (counted[own].sum() + 2.0)
+        counts = counts.cumsum(axis=1)
+        share = (found[own].sum() + 1.0) / (counted[own].sum() + 2.0)
         for first in range(len(ends) - 1):
             gains = _gains(counts[:, first + 1 :] - counts[:, first, None], counts[:, -1, None], share)
             last = first + 1 + int(gains.argmax())
@@ -77,7 +81,8 @@ def _ease(found: BoolArray, camera: IntArray, distance_m: FloatArray) -> FloatAr
 
 def _gains(within: FloatArray, all_over: FloatArray, share: float) -> FloatArray:
     """Gains (E,) of segments, from views (2, E, G) within them, with detections and in all; and overall."""
-    beyond, together = all_over - within, _log_likelihood(all_over, share)
+    beyond = all_over - within
+    together = _log_likelihood(all_over, share)
     mistake = np.log([_BY_MISTAKE, 1 - _BY_MISTAKE])
     home, foreign = (
         _log_likelihood(own, share) + other[0] * mistake[0] + (other[1] - other[0]) * mistake[1]
@@ -85,8 +90,10 @@ def _gains(within: FloatArray, all_over: FloatArray, share: float) -> FloatArray
     )
     hidden = np.maximum(home, foreign) + np.log(_HIDDEN / np.maximum(all_over[1], 1.0))
     usual = np.logaddexp(np.log(1 - _HIDDEN) + together, hidden)
-    home, foreign = home - usual, foreign - usual
-    home, foreign = np.where(beyond[0] > 0, home, -np.inf), np.where(within[0] > 0, foreign, -np.inf)
+    home = home - usual
+    foreign = foreign - usual
+    home = np.where(beyond[0] > 0, home, -np.inf)
+    foreign = np.where(within[0] > 0, foreign, -np.inf)
     gain = np.maximum(np.maximum(home, foreign), np.log(_CONFUSED))
     both = (within[0] > 0) & (beyond[0] > 0)
     likelier = home >= foreign, home < foreign
@@ -96,5 +103,6 @@ def _gains(within: FloatArray, all_over: FloatArray, share: float) -> FloatArray
 
 def _log_likelihood(counts: FloatArray, share: float) -> FloatArray:
     """Beta-binomial log-likelihood of each marking's detections in its views."""
-    a, b = _PSEUDO_VIEWS * share, _PSEUDO_VIEWS * (1 - share)
+    a = _PSEUDO_VIEWS * share
+    b = _PSEUDO_VIEWS * (1 - share)
     return np.asarray(betaln(counts[0] + a, counts[1] - counts[0] + b) - betaln(a, b))

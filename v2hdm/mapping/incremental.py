@@ -81,8 +81,13 @@ class IncrementalMapper:
         model: Model,
     ) -> None:
         """An empty map; ``model`` is that of single markings, without pose states."""
-        self._sightings, self._link, self._solve, self._options = sightings, link, solve, options
-        self._floor_m, self._model, self._first_rig = position_sigma_m, model, rig
+        self._sightings = sightings
+        self._link = link
+        self._solve = solve
+        self._options = options
+        self._floor_m = position_sigma_m
+        self._model = model
+        self._first_rig = rig
         self._drive = drive_problem(sightings, rig, cameras, model)
         self._begin(rig, 0)
 
@@ -92,7 +97,8 @@ class IncrementalMapper:
         ``progress`` receives the map's size. Raises MappingError if nothing can be solved.
         """
         tracks, usable = self._link(self._rig, True)
-        due, ended = _FIRST_LINK_MARKINGS, False
+        due = _FIRST_LINK_MARKINGS
+        ended = False
         while not ended:
             association, ended = self._take_up_safely(tracks, usable, due)
             progress(f"associating again with {len(self._places)} markings mapped")
@@ -106,7 +112,8 @@ class IncrementalMapper:
 
     def _begin(self, rig: Rig, known: int) -> None:
         """Start an empty map from ``rig``; its first ``known`` markings are solved together."""
-        self._rig, self._known = rig, known
+        self._rig = rig
+        self._known = known
         # Only the IPM that the first map starts from, and all that it locates, may be far off.
         self._coarse = rig is self._first_rig
         read_out_s = None if rig.read_out_s is None else np.maximum(rig.read_out_s, 0.0)
@@ -150,7 +157,8 @@ class IncrementalMapper:
 
     def _take(self, track: _Track, marking: int | None, turn: int) -> bool:
         """Map a track as part of ``marking``, or as a new one if None; returns whether it succeeded."""
-        corner, known = (track.seen.corner - turn) % 4, np.isfinite(track.corners_map).all(axis=1)
+        corner = (track.seen.corner - turn) % 4
+        known = np.isfinite(track.corners_map).all(axis=1)
         place = (
             _Place(np.full(4, -1, dtype=np.int64), track.kind, set(), np.asarray(known), track.corners_map)
             if marking is None
@@ -162,7 +170,8 @@ class IncrementalMapper:
         turned_map = track.corners_map[(np.arange(4) + turn) % 4]
         sighted = Sighted(replace(track.seen, corner=numbers[corner]))
         if not self._coarse:
-            kind, corners = self._sightings.kinds[place.kind], (turned_map[None], numbers[None])
+            kind = self._sightings.kinds[place.kind]
+            corners = (turned_map[None], numbers[None])
             lengths = known_lengths(self._options.known_sizes, [kind], *corners)
             control = control_points(self._options.survey, *corners, PoseSigma(self._floor_m))
             sighted = replace(sighted, lengths=lengths, control=control)
@@ -202,8 +211,10 @@ class IncrementalMapper:
         twice = np.bincount(corner, minlength=4) >= 2
         if len(rows) < LEAST_SIGHTINGS or np.count_nonzero(twice) < _LEAST_CORNERS:
             return None
-        which, corner = which[twice[corner]], corner[twice[corner]]
-        row, own = rows[which], order[which, corner]
+        which = which[twice[corner]]
+        corner = corner[twice[corner]]
+        row = rows[which]
+        own = order[which, corner]
         points = np.bincount(corner[self._sightings.valid[row, own]], minlength=4) > 0
         if np.count_nonzero(points) < 2:
             return None

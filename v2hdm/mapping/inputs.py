@@ -37,7 +37,8 @@ class Inputs:
     @cached_property
     def optimiser(self) -> Optimiser:
         """An optimiser of these inputs, not yet run."""
-        drive, options = self.drive, self.options
+        drive = self.drive
+        options = self.options
         views = views_of(drive, self.cameras)
         return Optimiser(self.sightings, views, drive.cameras, drive.noises, options, drive.road)
 
@@ -58,7 +59,8 @@ class Inputs:
         drive = self.drive
         if any(session.trajectory is None for session in drive.sessions):
             return None
-        now_s, moved = {(image.session, image.camera): image.clock_offset_s for image in drive.images}, drive
+        now_s = {(image.session, image.camera): image.clock_offset_s for image in drive.images}
+        moved = drive
         for session, later in enumerate(later_s):
             own = {
                 name: now_s[session, name] + late for name, late in later.items() if (session, name) in now_s

@@ -45,7 +45,9 @@ from v2hdm.site.symbols import NO_POLYGON, map_symbols
 
 def adjusted_poses(outcome: Outcome) -> AdjustedPoses:
     """Poses of all frames of the drive."""
-    drive, sightings, bundle = outcome.inputs.drive, outcome.inputs.sightings, outcome.bundle
+    drive = outcome.inputs.drive
+    sightings = outcome.inputs.sightings
+    bundle = outcome.bundle
     sigma = np.stack([one.by_state() for one in bundle.model.pose_sigma])[sightings.session]
     used = bundle.frames
     if bundle.model.solver.pose_states:
@@ -66,12 +68,14 @@ def adjusted_poses(outcome: Outcome) -> AdjustedPoses:
 
 def clock_offsets(outcome: Outcome) -> tuple[dict[str, ClockOffset], ...]:
     """Clock offset of each camera by session: the images' earlier shift plus the solve's estimate, s."""
-    evidence, drive = outcome.evidence, outcome.inputs.drive
+    evidence = outcome.evidence
+    drive = outcome.inputs.drive
     applied_s = {(image.session, image.camera): image.clock_offset_s for image in drive.images}
     score_tests = [one for one in evidence.score_tests if one.fault is Fault.CLOCK]
     out = []
     for session, (place, estimated) in enumerate(zip(drive.sessions, evidence.clock_s, strict=True)):
-        here, clocks = [one for one in score_tests if one.about in ("", f"in {place.name}")], {}
+        here = [one for one in score_tests if one.about in ("", f"in {place.name}")]
+        clocks = {}
         for name in outcome.inputs.sightings.cameras:
             # A camera's own clock and one common to all cameras: the offset may differ by both.
             tested = [one.sigma**2 for one in here if name in one.cameras]
@@ -118,7 +122,9 @@ def _state(out: FloatArray, markings: Sequence[Marking], marking: IntArray, corn
 
 def residuals_of(outcome: Outcome, optimised: Optimised) -> Residuals:
     """Residuals of accepted observations, of markings and of rejected candidates."""
-    drive, sightings, bundle = outcome.inputs.drive, outcome.inputs.sightings, optimised.bundle
+    drive = outcome.inputs.drive
+    sightings = outcome.inputs.sightings
+    bundle = optimised.bundle
     seen, row_image = np.unique(sightings.image[bundle.row], return_inverse=True)
     marking = np.zeros(bundle.association.count, dtype=np.int64)
     # Markings without ids are numbered in order, as in the files.
@@ -187,7 +193,8 @@ def run_methods(
 
 def run_naive(name: str, inputs: Inputs, ipm: Mapping[str, FloatArray]) -> MethodResult:
     """The naive strategy under one IPM per camera, such as that of a known extrinsic."""
-    drive, sightings = inputs.drive, inputs.sightings
+    drive = inputs.drive
+    sightings = inputs.sightings
     extrinsic = {c: extrinsic_from_ipm(drive.cameras[c].info, matrix) for c, matrix in ipm.items()}
     ground = ground_by_ipm(drive, ipm, extrinsic, inputs.optimiser.initial_rig)
     markings, excluded = _naive_markings(inputs, ipm, ground)
@@ -265,8 +272,12 @@ def _average(association: Association, corners_map: FloatArray) -> FusedGroups:
 
 def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
     inputs = outcome.inputs
-    options, drive, cameras, bundle = inputs.options, inputs.drive, inputs.cameras, optimised.bundle
-    solution, noise = bundle.solution, drive.pose_noise
+    options = inputs.options
+    drive = inputs.drive
+    cameras = inputs.cameras
+    bundle = optimised.bundle
+    solution = bundle.solution
+    noise = drive.pose_noise
     if solution.status is not Status.CONVERGED:
         status = solution.status
         _log.warning("the joint optimisation ended early (%s): %s", status.value, status.advice)
@@ -327,7 +338,8 @@ def _brought_up_to_date(
     optimised: Optimised,
     grey: Callable[[Image], NDArray[np.float32]] | None,
 ) -> MethodResult:
-    drive, group = outcome.inputs.drive, optimised.bundle.association.group
+    drive = outcome.inputs.drive
+    group = optimised.bundle.association.group
     observer = Observer(
         outcome.inputs.optimiser.sightings,
         views_of(drive, made.cameras),
@@ -353,7 +365,8 @@ def _brought_up_to_date(
 
 
 def _lanes(inputs: Inputs, ground: ImageGround) -> tuple[Lane, ...]:
-    drive, options = inputs.drive, inputs.options.lanes
+    drive = inputs.drive
+    options = inputs.options.lanes
     jitter_rad = drive.pose_noise.roll_pitch_rad
     cloud = collect_lane_points(drive, inputs.detections, ground, options.max_range_m, jitter_rad)
     return map_lanes(cloud, options)

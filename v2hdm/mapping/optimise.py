@@ -69,13 +69,15 @@ class Optimiser:
         road: Road | None = None,
     ) -> None:
         """``pose_noise`` is by session; gates use the largest of each kind."""
-        self._seen, self._views = sightings, views
+        self._seen = sightings
+        self._views = views
         self.sightings = sightings
         """The sightings, reduced to the plane."""
         self.surface: Surface | None = None
         """The ground, unless a plane."""
         self._cameras = {name: cameras[name] for name in sightings.cameras}
-        self._noises, self._pose_noise = pose_noise, largest_noise(pose_noise)
+        self._noises = pose_noise
+        self._pose_noise = largest_noise(pose_noise)
         self._stated_sigma = tuple(pose_sigma_of(one) for one in pose_noise)
         self._pose_sigma = self._estimated_sigma = self._stated_sigma
         self._options, self._recorded = options, Recorded.of(road, self._pose_noise)
@@ -135,7 +137,8 @@ class Optimiser:
             progress("choice of the pose model")
             self.pose_model = self._choose_pose_model(bundle)
         progress("final solve")
-        inlier, usable = bundle.inliers, np.zeros_like(self.sightings.valid)
+        inlier = bundle.inliers
+        usable = np.zeros_like(self.sightings.valid)
         usable[bundle.row[inlier], bundle.own_corner[inlier]] = True
         final = self._solve(bundle.association, usable, bundle.rig)
         knots = find_knots(final.rig, self.surface)
@@ -177,7 +180,8 @@ class Optimiser:
 
     def is_curved(self, bundle: Bundle) -> bool:
         """Whether ``bundle``, on a surface, predicts held-out observations better than on the plane."""
-        problem, own = self._as_stated(bundle), bundle.own_corner
+        problem = self._as_stated(bundle)
+        own = bundle.own_corner
         seen = replace(problem.observations, pinhole_px=self._seen.corners_pinhole_px[bundle.row, own])
         try:
             return predicts_better(problem, replace(problem, observations=seen), bundle.model.solver)
@@ -279,7 +283,8 @@ class Optimiser:
         coarse: bool = False,
         lanes: tuple[Knots, FloatArray] | None = None,
     ) -> Bundle:
-        noises, options = self._noises, self._options
+        noises = self._noises
+        options = self._options
         model = (
             coarse_model(rig, noises, options)
             if coarse

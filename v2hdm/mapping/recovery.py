@@ -76,15 +76,18 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
         # 2. Switch to a surface where the drive contradicts the plane and a surface explains all of it.
         inputs, settled, found = _over_ground(inputs, settled, progress)
         worst = _worst(found)
-        optimiser, drive = inputs.optimiser, inputs.drive
+        optimiser = inputs.optimiser
+        drive = inputs.drive
         # 3. Start again without the most likely wrong input, if dispensable; foreign images stay.
-        foreign, left = _foreign(inputs, settled, found, progress), None
+        foreign = _foreign(inputs, settled, found, progress)
+        left = None
         if worst is not None and log_odds(worst) > foreign[2] and len(corrected) < _MOST_CORRECTIONS:
             left = None if _is_ambiguous(worst, found) else _recovered(inputs, worst, settled)
         if worst is None or left is None:
             break
         corrected += _contradictions(settled, (worst,), inputs.sightings, _session_names(drive))
-        one, about = corrected[-1], f" {corrected[-1].about}" if corrected[-1].about else ""
+        one = corrected[-1]
+        about = f" {corrected[-1].about}" if corrected[-1].about else ""
         _log.warning(
             "%s: mapped again, for the drive contradicts the %s%s of %s by %.0f sigmas (%+.3g %s)",
             ", ".join(inputs.cameras), one.fault.value, about, " and ".join(one.cameras), one.sigmas,
@@ -151,7 +154,8 @@ def _foreign(
 
     It explains the corners, plus the doubts that a solve without its images removes.
     """
-    drive, names = inputs.drive, inputs.cameras
+    drive = inputs.drive
+    names = inputs.cameras
     cameras = tuple(drive.cameras[name] for name in names)
     begin_s, end_s, gain = foreign_segment(settled, inputs.sightings, views_of(drive, names), cameras)
     suspect = next(filter(is_doubtful, found), None)
@@ -263,14 +267,16 @@ def _clocks(bundle: Bundle) -> tuple[dict[str, tuple[float, float]], ...]:
     if not bundle.model.solver.clock_offset:
         return tuple({} for _ in offset_s)
     sigma_s = np.sqrt(bundle.solution.covariance.clock_s2()).T.tolist()[: len(offset_s)]
-    index, sessions = bundle.camera_index.items(), zip(offset_s, sigma_s, strict=True)
+    index = bundle.camera_index.items()
+    sessions = zip(offset_s, sigma_s, strict=True)
     return tuple({name: (off[c], sigma[c]) for name, c in index} for off, sigma in sessions)
 
 
 def _read_outs(bundle: Bundle) -> dict[str, tuple[float, float]]:
     if not bundle.model.solver.read_out:
         return {}
-    read_out_s, sigma_s = bundle.solution.read_out_s, np.sqrt(bundle.solution.covariance.clock_s2()[:, -1])
+    read_out_s = bundle.solution.read_out_s
+    sigma_s = np.sqrt(bundle.solution.covariance.clock_s2()[:, -1])
     return {name: (float(read_out_s[c]), float(sigma_s[c])) for name, c in bundle.camera_index.items()}
 
 
@@ -325,7 +331,8 @@ def _point_of(bundle: Bundle, item: int) -> str:
 
 def _camera_fits(bundle: Bundle) -> dict[str, CameraFit]:
     """Fit of each camera's observations in ``bundle``, a solve with all of them."""
-    seen, fits = bundle.problem.observations, {}
+    seen = bundle.problem.observations
+    fits = {}
     # Corners weigh by their information: distant and outlying detections err by more than stated.
     knows = 1 / np.trace(seen.covariance_px, axis1=1, axis2=2)
     for name, c in bundle.camera_index.items():

@@ -165,7 +165,8 @@ def adjusted_shots(
     if drive.recorded is not None and drive.trajectory is not None:
         recorded, flat = (interpolate(one, taken_s, np.inf)[0] for one in (drive.recorded, drive.trajectory))
         poses = flat @ np.linalg.inv(recorded) @ poses
-    shots, surface = [], surface_at(poses)
+    shots = []
+    surface = surface_at(poses)
     for frame, (image, pose) in enumerate(zip(images, poses, strict=True)):
         own = calibrations[image.camera]
         cam_from_map = own.cam_from_vehicle @ inverse(pose)
@@ -219,7 +220,8 @@ def blend(
     sources = _sources(shots, lenses, device, order)
     done = 0
     for (row, column), views in plan:
-        rows, columns = min(SHEET_PX, canvas.rows - row), min(SHEET_PX, canvas.columns - column)
+        rows = min(SHEET_PX, canvas.rows - row)
+        columns = min(SHEET_PX, canvas.columns - column)
         sums = _Sums((rows, columns), views, device)
         map_from_sheet = canvas.window(row, column, rows, columns).map_from_canvas
         for index, tiles in views:
@@ -294,7 +296,8 @@ def _sources(
 
     @lru_cache(maxsize=_KEPT_IMAGES)
     def decoded(path: Path, camera: str) -> np.ndarray:
-        pixels, lens = read_bgr(path), lenses[camera]
+        pixels = read_bgr(path)
+        lens = lenses[camera]
         if pixels.shape[:2] != lens.trust.shape:
             raise DriveError(
                 f"{path}: the image is {pixels.shape[1]}x{pixels.shape[0]} but camera {camera!r} has "
@@ -309,7 +312,8 @@ def _sources(
             pixels = ahead.pop().result()
             if following is not None:
                 ahead.append(decoder.submit(decoded, following.path, following.camera))
-            box, trust = boxes[shot.camera], trusts[shot.camera]
+            box = boxes[shot.camera]
+            trust = trusts[shot.camera]
             values = torch.empty((4, *trust.shape), dtype=torch.float32, device=device)
             values[:3] = torch.from_numpy(pixels).to(device).permute(2, 0, 1)
             values[3] = trust
@@ -320,7 +324,8 @@ class _Sums:
     """The weighted sums (tiles, 4, side, side) of colours and weights on one sheet."""
 
     def __init__(self, shape: tuple[int, int], views: _Views, device: str):
-        self._shape, self._device = shape, device
+        self._shape = shape
+        self._device = device
         self._tiles = np.unique(np.concatenate([tiles for _, tiles in views]), axis=0)
         self._at = {(int(c), int(r)): k for k, (c, r) in enumerate(self._tiles)}
         self._sums = torch.zeros((len(self._tiles), 4, TILE_PX, TILE_PX), device=device)
@@ -379,8 +384,10 @@ class _Sums:
         colours = self._sums[:, [2, 1, 0]] / weight.where(weight > 0, torch.ones_like(weight))
         alpha = (255 / full_weight * weight).clamp(max=255)
         rgba = torch.cat([colours, alpha], dim=1).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().numpy()
-        (rows, columns), side = self._shape, TILE_PX
-        down, across = -(-rows // side), -(-columns // side)
+        (rows, columns) = self._shape
+        side = TILE_PX
+        down = -(-rows // side)
+        across = -(-columns // side)
         out = np.zeros((down, side, across, side, 4), dtype=np.uint8)
         out[self._tiles[:, 1], :, self._tiles[:, 0]] = rgba
         return out.reshape(down * side, -1, 4)[:rows, :columns]

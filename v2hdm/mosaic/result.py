@@ -36,7 +36,8 @@ from v2hdm.report import style
 from v2hdm.report.page.facts import read_cameras, read_surface
 from v2hdm.store.files import whole_file, write_json
 
-AHEAD_M, ACROSS_M = 12.0, 8.0  # length and width of the ground that is compared
+AHEAD_M = 12.0
+ACROSS_M = 8.0  # length and width of the ground that is compared
 _CELL_M = 0.01
 _PANEL_IN = 5.2
 _BAR_M = 2.0
@@ -61,7 +62,8 @@ def close_up_canvas(map_from_vehicle: FloatArray) -> Canvas:
     ahead = map_from_vehicle[:2, 0] / np.linalg.norm(map_from_vehicle[:2, 0])
     right = np.array([ahead[1], -ahead[0]])
     corner = map_from_vehicle[:2, 3] + ahead * AHEAD_M / 2 - right * ACROSS_M / 2
-    rows, columns = round(AHEAD_M / _CELL_M), round(ACROSS_M / _CELL_M)
+    rows = round(AHEAD_M / _CELL_M)
+    columns = round(ACROSS_M / _CELL_M)
     return Canvas(corner, _CELL_M, rows, columns, (float(right[0]), float(right[1])))
 
 
@@ -153,7 +155,8 @@ class Picture:
     def put(self, sheet: Sheet) -> None:
         """Draw one sheet: the mean over the pixels that are seen."""
         rows, columns = (side // self.factor for side in sheet.rgba.shape[:2])
-        row, column = sheet.row // self.factor, sheet.column // self.factor
+        row = sheet.row // self.factor
+        column = sheet.column // self.factor
         alpha = sheet.rgba[..., 3:].astype(np.float32) / 255
         weighed = np.concatenate([sheet.rgba[..., :3] * alpha, alpha], axis=2)
         reduced = cv2.resize(weighed, (columns, rows), interpolation=cv2.INTER_AREA)
@@ -173,7 +176,10 @@ class Picture:
 _log = logging.getLogger(__name__)
 
 RESOLUTION_M = 0.02  # side of a pixel of the mosaic unless another is asked for
-TIFF, PICTURE, EXTENT, COMPARISON = "mosaic.tif", "mosaic.webp", "mosaic.json", "mosaic_before_after.png"
+TIFF = "mosaic.tif"
+PICTURE = "mosaic.webp"
+EXTENT = "mosaic.json"
+COMPARISON = "mosaic_before_after.png"
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,10 @@ from v2hdm.records import CameraInfo
 from v2hdm.store.inputs import note_input
 
 ROUGH_MOUNTING = (1.6, 5.0, 60.0)  # height (m), pitch, horizontal field of view (deg) where nothing is known
-_UNKNOWN_PITCH_DEG, _STATED_PITCH_DEG, _ROLL_DEG, _LOG_FOCAL = 8.0, 4.0, 1.5, 0.3
+_UNKNOWN_PITCH_DEG = 8.0
+_STATED_PITCH_DEG = 4.0
+_ROLL_DEG = 1.5
+_LOG_FOCAL = 0.3
 """Standard deviations of an assumed and of a stated pitch, of the roll, and of the logarithm of an assumed
 focal length: within one are lenses of 46 to 76 degrees."""
 

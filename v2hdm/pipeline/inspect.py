@@ -53,7 +53,8 @@ def inspect_each(
     drives: Sequence[Drive], contents: Contents, max_gap_s: float, context: Context
 ) -> list[Inspection]:
     """As :func:`inspect` of each drive, or what it found before of the same, with the same log."""
-    inspections, cache = [], context.cache
+    inspections = []
+    cache = context.cache
     for drive in drives:
         steps = context.steps("check" if len(drives) == 1 else f"check {drive.name}")
         work = partial(inspect, drive, max_gap_s, context.processes, steps)
@@ -78,7 +79,8 @@ def join(inspections: Sequence[Inspection]) -> Inspection:
     ]
     given = join_drives([one.drive_as_described for one in inspections], moved)
     drive = replace(given, cameras=_started(given, inspections))
-    ground, findings = [], []
+    ground = []
+    findings = []
     for session, one in zip(drive.joined, inspections, strict=True):
         ground.append({session.cameras[name]: estimate for name, estimate in one.ground[0].items()})
         findings += [replace(finding, about=f"{finding.about} of {session.name}") for finding in one.findings]

@@ -94,19 +94,22 @@ def map_drive(
     """
     kept = StageCache(None if cache is None else Path(cache))
     context = context or Context(kept, progress, workers=workers)
-    options, reading = options or MappingOptions(), reading or ReadOptions()
+    options = options or MappingOptions()
+    reading = reading or ReadOptions()
     if corrections is not None:
         stated = read_corrections(Path(corrections))
         options = replace(options, acceptance=replace(options.acceptance, corrections=stated))
     sources = [drive] if isinstance(drive, Source) else list(drive)
     check_choice(options, len(sources), base is not None, accuracy_goal_cm)
     read = read_all(sources, reading, context)
-    earlier, survey = _earlier(base, read.whole, context), take_survey(read.whole, options)
+    earlier = _earlier(base, read.whole, context)
+    survey = take_survey(read.whole, options)
     with context.timed("check"):
         checked = join(inspect_each(read.drives, read.contents, reading.max_gap_s, context))
     paths = [one.root if isinstance(one, Drive) else Path(one) for one in sources]
     about = describe_run(name or read.whole.name, read.whole, paths, reading)
-    described, seconds = checked.drive_as_described, context.seconds
+    described = checked.drive_as_described
+    seconds = context.seconds
     begun = Result(about, read.drives, read.contents, described, seconds, options.device)
     return _mapped(begun, checked, detector, survey, earlier, accuracy_goal_cm, context)
 
@@ -184,7 +187,8 @@ def _with_wear(
         return dict(sets)
     poses = [best.poses.of_image(image) for image in drive.images]
     before = None if earlier is None else earlier.hd_map
-    grey, threads = grey_reader(drive), context.processes
+    grey = grey_reader(drive)
+    threads = context.processes
     whole = best.residuals.whole_views()
     index = {drive.name_of(image.path): k for k, image in enumerate(drive.images)}
     ids = (k if one.id is None else one.id for k, one in enumerate(best.hd_map.markings, start=1))
@@ -207,7 +211,8 @@ def _judge(
     context: Context,
 ) -> Result:
     methods = {name: one.methods for name, one in sets.items()}
-    best, compared = list(methods.values())[-1][BEST], list(sets.values())[-1].checked
+    best = list(methods.values())[-1][BEST]
+    compared = list(sets.values())[-1].checked
     with context.timed("judge"):
         found = check_result(checked.drive, methods, checked.ground)
         unfit = check_known_sizes(survey.mapping.known_sizes, best)

@@ -75,7 +75,8 @@ def write_trajectories(poses: AdjustedPoses, drive: Drive, folder: Path) -> None
     for number, session in enumerate(drive.sessions):
         own = poses.session == number
         stem = f"trajectory_{session.name}" if drive.joined else "trajectory"
-        stamp_s, before = poses.stamp_s[own], poses.before[own]
+        stamp_s = poses.stamp_s[own]
+        before = poses.before[own]
         moved = np.linalg.inv(before) @ poses.map_from_vehicle[own]
         recorded = before  # laid flat, where the session has no others
         if session.recorded is not None:
@@ -221,7 +222,9 @@ class Result:
 
 
 def _write_map(folder: Path, result: Result, formats: Sequence[str], crs: str | None) -> None:
-    drive, best, verdict = result.drive, result.best, result.verdict.as_json()
+    drive = result.drive
+    best = result.best
+    verdict = result.verdict.as_json()
     geojson = [one for one in formats if one == "geojson"]  # longitude and latitude, whatever the others have
     write_map(result.map, folder, "map", geojson, verdict)
     others = [one for one in with_data(formats) if one not in ("geojson", "qgis")]

@@ -140,7 +140,8 @@ def _take_or_upload(
 ) -> tuple[RunResult, bool]:
     name = run_name(config)
     take_name(name, "name", ConfigError)
-    place, folder = output.below(name), Path(config.cache) / _UPLOADS / key_of(output.url)[:16]
+    place = output.below(name)
+    folder = Path(config.cache) / _UPLOADS / key_of(output.url)[:16]
     if take and (there := _finished_at(place, config)) is not None:
         return there, True
     writer = f"{HOST}, {key_of(folder.resolve())[:8]}"
@@ -259,5 +260,6 @@ def _drive_folders(config: RunConfig, context: Context) -> tuple[Path, ...]:
     from v2hdm.simulate import rendered_drive
 
     with context.timed("render"):
-        folder, steps = Path(config.cache), context.steps("render")
+        folder = Path(config.cache)
+        steps = context.steps("render")
         return (rendered_drive(config.simulate, folder, context.processes, steps),)

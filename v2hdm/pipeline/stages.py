@@ -47,7 +47,8 @@ def detect_in_pieces(
     detect: Detect = detect_images,
 ) -> list[ImageDetections]:
     """Detect in every image of a drive, in its order, where that is not known yet, by ``detect``."""
-    cache, progress = context.cache, context.steps("detect")
+    cache = context.cache
+    progress = context.steps("detect")
     detector_key = cache.key(options, model_key(options))
     masks = cache.get_or_make(
         "own_vehicle",
@@ -131,7 +132,8 @@ def map_camera_sets(
     against the finished map of all cameras, which alone brings ``base`` up to date. Raises MappingError where
     no map can be made, AdjustError where the adjustment fails.
     """
-    cache, sets = context.cache, camera_sets(drive)
+    cache = context.cache
+    sets = camera_sets(drive)
     begun = cache.key(drive_key, list(detections), survey.mapping)
     *single, last = sets
     keys = {name: cache.key(begun, name, sets[name], None) for name in single}
@@ -185,8 +187,11 @@ class _Work:
             return job[0], self._map(*job), lines
 
     def _map(self, name: str, cameras: Sequence[str]) -> MappedSet:
-        begin_s, drive, survey = time.perf_counter(), self.drive, self.survey
-        log, base = partial(_log.debug, "%s: %s", name), self.base if name == self.last else None
+        begin_s = time.perf_counter()
+        drive = self.drive
+        survey = self.survey
+        log = partial(_log.debug, "%s: %s", name)
+        base = self.base if name == self.last else None
         methods = run_methods(drive, self.detections, cameras, survey.mapping, log, base, grey_reader(drive))
         best = methods[BEST]
         checked = compare_survey(survey, drive, best) if name == self.last else None

@@ -103,7 +103,8 @@ def corner_errors(mapped: Sequence[Marking], true: Sequence[Marking]) -> FloatAr
 
 def height_figures(mapped: Sequence[Marking], true: Sequence[Marking]) -> dict[str, float]:
     """RMSE, m, of paired corners' heights, and the fraction within 1.96 sigmas, where known."""
-    off, inside = [], []
+    off = []
+    inside = []
     for one, other, shift in zip(mapped, true, _first_corners(mapped, true), strict=True):
         if one.heights_m is None or other.heights_m is None:
             continue
@@ -127,7 +128,8 @@ def extrinsic_metrics(cam_from_vehicle: FloatArray, true_cam_from_vehicle: Float
     """Angle (deg) between two camera orientations (4, 4), and distance (m) of their centres."""
     turn = Rotation.from_matrix(cam_from_vehicle[:3, :3] @ true_cam_from_vehicle[:3, :3].T)
     shift_m = camera_centre(cam_from_vehicle) - camera_centre(true_cam_from_vehicle)
-    angle_deg, distance_m = np.rad2deg(turn.magnitude()), np.linalg.norm(shift_m)
+    angle_deg = np.rad2deg(turn.magnitude())
+    distance_m = np.linalg.norm(shift_m)
     return {"rotation_error_deg": float(angle_deg), "translation_error_m": float(distance_m)}
 
 
@@ -198,7 +200,8 @@ def distance_to_points(points: FloatArray, line: FloatArray) -> FloatArray:
     if len(line) < 2:
         return np.asarray(np.linalg.norm(points - line[0], axis=1))
     distance, nearest = cKDTree(line).query(points, k=2)
-    first, second = line[nearest[:, 0]], line[nearest[:, 1]]
+    first = line[nearest[:, 0]]
+    second = line[nearest[:, 1]]
     span = second - first
     length2 = np.maximum((span**2).sum(axis=1), 1e-18)
     share = np.clip(((points - first) * span).sum(axis=1) / length2, 0.0, 1.0)

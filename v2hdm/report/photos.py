@@ -67,7 +67,8 @@ def with_legend(canvas: np.ndarray, entries: Sequence[tuple[Pen | None, str]]) -
     """The picture (H, W, 3) with a legend of the pens below it; entries without pen are text alone."""
     width = canvas.shape[1]
     size = float(np.clip(width / 1900, 0.4, 0.75))
-    row_px, sample_px = round(44 * size), round(64 * size)
+    row_px = round(44 * size)
+    sample_px = round(64 * size)
     rows: list[list[tuple[Pen | None, str, int]]] = [[]]
     used = 0
     for pen, text in entries:
@@ -89,7 +90,8 @@ def with_legend(canvas: np.ndarray, entries: Sequence[tuple[Pen | None, str]]) -
 
 
 _FARTHEST_M = 40.0  # farther lines overlap near the horizon
-_ALONG_M, _ACROSS_M = 5.0, 2.0  # spacing of the grid along and across the vehicle
+_ALONG_M = 5.0
+_ACROSS_M = 2.0  # spacing of the grid along and across the vehicle
 _HALF_WIDTH_M = 8.0  # half width of the grid about the camera
 _NEAREST_M = 0.3  # least depth of ground in an image
 
@@ -103,7 +105,8 @@ _WORDS: Mapping[str, str] = {"guess": "grid and horizon: the guess", "ground": "
 
 _ROI = Pen("#ffffff")
 
-_SMALL_FONT, _TEXT_SIZE = cv2.FONT_HERSHEY_SIMPLEX, 0.45
+_SMALL_FONT = cv2.FONT_HERSHEY_SIMPLEX
+_TEXT_SIZE = 0.45
 
 
 def save_grid(
@@ -123,7 +126,8 @@ def save_grid(
 
 _ARROW_SHARE = 0.06  # length of the longest inlier's arrow, relative to the image's width
 _MOST_TIMES = 1000.0  # limit of the arrows' magnification
-_RIGHT, _WRONG = Pen(OKABE_ITO["blue"]), Pen(OKABE_ITO["vermillion"])
+_RIGHT = Pen(OKABE_ITO["blue"])
+_WRONG = Pen(OKABE_ITO["vermillion"])
 
 
 def save_points(
@@ -145,7 +149,8 @@ def save_points(
     longest = max((float(np.hypot(*off)) for _, _, off, right in points if right), default=0.0)
     times = min(_ARROW_SHARE * info.width / max(longest, 1e-9), _MOST_TIMES)
     for label, at, off, right in points:
-        pen, (u, v) = _RIGHT if right else _WRONG, np.round(at).astype(int).tolist()
+        pen = _RIGHT if right else _WRONG
+        (u, v) = np.round(at).astype(int).tolist()
         sign = cv2.MARKER_DIAMOND if right else cv2.MARKER_TILTED_CROSS
         cv2.drawMarker(canvas, (u, v), pen.bgr, sign, 14, pen.width, cv2.LINE_AA)
         if np.isfinite(off).all():
@@ -247,7 +252,8 @@ def _label(
 
 def _write(canvas: np.ndarray, text: str, at: tuple[int, int], colour: tuple[int, int, int]) -> None:
     (width, height), below = cv2.getTextSize(text, _SMALL_FONT, _TEXT_SIZE, 1)
-    corner, opposite = (at[0] - 2, at[1] - height - 2), (at[0] + width + 2, at[1] + below)
+    corner = (at[0] - 2, at[1] - height - 2)
+    opposite = (at[0] + width + 2, at[1] + below)
     cv2.rectangle(canvas, corner, opposite, (40, 40, 40), cv2.FILLED)
     cv2.putText(canvas, text, at, _SMALL_FONT, _TEXT_SIZE, colour, 1, cv2.LINE_AA)
 

@@ -80,7 +80,8 @@ def changes_table(changes: Mapping[str, Any]) -> Table | str:
     table = new_table(f"changes: {counts}", ("class", "fate"), numbers, before=("id",))
     table.add_column("at (m)")
     for one in changes["listed"]:
-        shift, sigma = one["shift_m"], one["shift_sigma_m"]
+        shift = one["shift_m"]
+        sigma = one["shift_sigma_m"]
         corners = one["after_map"] or one["before_map"]
         x, y = (sum(corner[k] for corner in corners) / len(corners) for k in (0, 1))
         table.add_row(

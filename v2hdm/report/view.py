@@ -53,7 +53,8 @@ class Session:
         """Store or remove a correction and write the file; raises MapFileError if malformed."""
         try:
             content = json.loads(sent)
-            key, entry = str(content["key"]), content["correction"]
+            key = str(content["key"])
+            entry = content["correction"]
         except (ValueError, TypeError, LookupError, RecursionError):
             raise MapFileError("not a correction: expected a key and a correction") from None
         with self._lock:
@@ -84,8 +85,10 @@ def server_of(folder: Path, drive: Drive | None, path: Path) -> tuple[ThreadingH
     facts = read_facts(folder, drive)
     if facts.hd_map is None:
         raise MapFileError(f"{folder}: has no map to view; fix its drive and map it again")
-    session, secret = Session.begun(folder, path, facts), secrets.token_urlsafe(16)
-    text, place = page_text(folder, drive, {"secret": secret}), json_text({"secret": secret})
+    session = Session.begun(folder, path, facts)
+    secret = secrets.token_urlsafe(16)
+    text = page_text(folder, drive, {"secret": secret})
+    place = json_text({"secret": secret})
     kinds: Sequence[str] = sorted({*SHIPPED.names, *(one.kind for one in facts.hd_map.markings)})
 
     class Handler(BaseHTTPRequestHandler):

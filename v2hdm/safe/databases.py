@@ -6,7 +6,8 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-_STEPS, _SPARE_STEPS = 10, 1_000_000  # of SQLite's machine, by byte and beyond: a row takes 4 to 16
+_STEPS = 10
+_SPARE_STEPS = 1_000_000  # of SQLite's machine, by byte and beyond: a row takes 4 to 16
 
 
 def limit_steps(data: Any, path: Path) -> None:
@@ -25,7 +26,8 @@ def opened(path: Path, how: str) -> Iterator[sqlite3.Connection]:
 def rows_of(data: sqlite3.Connection, path: Path, table: str) -> Iterator[dict[str, Any]]:
     """The rows of a table; raises sqlite3.Error where they have more bytes than the file and its journal."""
     files = (path, path.with_name(f"{path.name}-wal"))
-    left, found = sum(one.stat().st_size for one in files if one.is_file()), data.cursor()
+    left = sum(one.stat().st_size for one in files if one.is_file())
+    found = data.cursor()
     for row in found.execute(f'SELECT * FROM "{table}"'):
         left -= sum(len(value) for value in row if isinstance(value, str | bytes)) + 1
         if left < 0:

@@ -42,7 +42,8 @@ def take_origin(content: object, where: str, error: type[V2hdmError]) -> Geodeti
     def number(key: str) -> float:
         return take_number(entry[key], f"{where}, {key}", error)
 
-    latitude_deg, longitude_deg = number("latitude_deg"), number("longitude_deg")
+    latitude_deg = number("latitude_deg")
+    longitude_deg = number("longitude_deg")
     if abs(latitude_deg) > 90 or abs(longitude_deg) > 180:
         raise error(f"{where}: latitude must lie within +-90 and longitude within +-180 degrees; fix them")
     return GeodeticOrigin(
@@ -82,13 +83,15 @@ def check_camera(info: CameraInfo, where: str, error: type[V2hdmError]) -> Camer
     # The image's reach from the axis to a side, and up or down, in focal lengths.
     across = max(abs(cx + 0.5), abs(info.width - 0.5 - cx)) / fx
     down = max(abs(cy + 0.5), abs(info.height - 0.5 - cy)) / fy
-    at, k = f"{where}: distortion_coefficients", info.distortion
+    at = f"{where}: distortion_coefficients"
+    k = info.distortion
     # The tangential part moves a point at r focal lengths by up to 3 p r^2, so that neighbours change places
     # where 6 p r reaches 1; every real lens is below a tenth of that.
     tangential = np.hypot(k[2], k[3]) if info.distortion_model != "equidistant" and len(k) > 3 else 0.0
     if 6 * tangential * min(max(across, down), _MIDDLE) >= 1:
         raise error(f"{at}: p1 and p2 of {k[2]:g} and {k[3]:g} flip the image; order k1 k2 p1 p2 k3")
-    reach, scale_px = lens_reach(info), (fx + fy) / 2
+    reach = lens_reach(info)
+    scale_px = (fx + fy) / 2
     if reach >= np.hypot(across, down):
         return info
     problem = (

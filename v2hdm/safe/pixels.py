@@ -43,9 +43,12 @@ _TIFF = (b"II*\0", b"MM\0*")
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_WITHOUT_LENGTH = frozenset([0x01, *range(0xD0, 0xD9)])
 _SEGMENT = re.compile(rb"\xff([^\0\1\xd0-\xd8\xff])")  # of a JPEG, or its end
-_APP1, _START_OF_SCAN = 0xE1, 0xDA
+_APP1 = 0xE1
+_START_OF_SCAN = 0xDA
 _MOST_SCANS = 64  # of a JPEG; progressive ones have about ten
-_WIDTH_TAG, _HEIGHT_TAG, _ORIENTATION_TAG = 0x100, 0x101, 0x112
+_WIDTH_TAG = 0x100
+_HEIGHT_TAG = 0x101
+_ORIENTATION_TAG = 0x112
 _UPRIGHT = 1
 
 # Warnings of the libraries below OpenCV about an image that they decode all the same.
@@ -124,7 +127,8 @@ class _Stored:
     """The bytes of an open file, read where they are asked for: a header may lie at its end (TIFF)."""
 
     def __init__(self, stream: BinaryIO, size: int) -> None:
-        self._stream, self._size = stream, size
+        self._stream = stream
+        self._size = size
 
     def __len__(self) -> int:
         return self._size
@@ -204,7 +208,8 @@ def _unpack(form: str, data: _Data, at: int) -> tuple[int, ...]:
 
 def _jpeg_header(data: _Data) -> Header | None:
     """Walk the segments up to the start of frame (ITU-T T.81, B.2)."""
-    orientation, at = _UPRIGHT, 2
+    orientation = _UPRIGHT
+    at = 2
     while at < len(data):
         marker = data[at : at + 1][0]
         at += 1
@@ -233,7 +238,8 @@ def _scans(data: bytes) -> int:
 
 def _png_chunks(data: _Data) -> Iterator[tuple[bytes, int, int]]:
     """Kind, begin and length of the body of each whole chunk (PNG, third edition, section 5.3)."""
-    at, kind = len(_PNG), b""
+    at = len(_PNG)
+    kind = b""
     while kind != b"IEND" and at + 12 <= len(data):
         (length,) = _unpack(">I", data, at)
         if at + 12 + length > len(data):
@@ -255,7 +261,8 @@ def _webp_header(data: _Data) -> Header:
     """The size in the first chunk (RFC 9649, section 2)."""
     kind = data[12:16]
     if kind == b"VP8X":
-        at, exif = 12, b""
+        at = 12
+        exif = b""
         while not exif and at + 8 <= len(data):
             end = at + 8 + _unpack("<I", data, at + 4)[0]
             exif = data[at + 8 : end].removeprefix(b"Exif\0\0") if data[at : at + 4] == b"EXIF" else b""

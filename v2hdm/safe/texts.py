@@ -25,13 +25,16 @@ MOST_YAML_BYTES = 1 << 24  # ours have kilobytes, and PyYAML takes a second for 
 MOST_DEPTH = 64  # of nested lists and mappings; ours are 8 deep
 MOST_ENTRIES = 1_000_000  # values in a YAML file, with everything that an alias repeats
 MOST_DIGITS = 64  # of a whole number; doubles end at 309 digits, and nothing here counts beyond 2**64
-MOST_NAME_LETTERS, _MOST_NAME_BYTES = 64, 200  # file systems end at 255 bytes
-_SHORT, _FEW = 60, 4
+MOST_NAME_LETTERS = 64
+_MOST_NAME_BYTES = 200  # file systems end at 255 bytes
+_SHORT = 60
+_FEW = 4
 ALL_CAMERAS = ("both", "all")  # names of results of all cameras together
 _HALF = "half a character (a lone surrogate)"
 _ESCAPED_HALF = re.compile(r"\\u[dD][89a-fA-F]")
 _QUOTED = re.compile(r'"(?:[^"\\]|\\.)*"')
-_OPENING, _CLOSING = [ord("["), ord("{")], [ord("]"), ord("}")]
+_OPENING = [ord("["), ord("{")]
+_CLOSING = [ord("]"), ord("}")]
 
 
 def read_bytes(path: Path, error: type[V2hdmError], most: int = MOST_BYTES) -> bytes:
@@ -42,7 +45,8 @@ def read_bytes(path: Path, error: type[V2hdmError], most: int = MOST_BYTES) -> b
             kind = "a folder" if stat.S_ISDIR(about.st_mode) else "a pipe or a device"
             raise error(f"{path}: is {kind}, not a file; check the path")
         if about.st_size > most:
-            size, largest = f"{about.st_size / 1e6:.0f} MB", f"{most / 1e6:.0f} MB"
+            size = f"{about.st_size / 1e6:.0f} MB"
+            largest = f"{most / 1e6:.0f} MB"
             raise error(f"{path}: has {size}, {largest} at most; check the path")
         note_input(path)
         data = path.read_bytes()
@@ -82,7 +86,8 @@ def parse_yaml(text: str, where: str, error: type[V2hdmError]) -> Any:
     try:
         return _Loader(text).get_single_data()  # looks for letters that are none at once
     except yaml.YAMLError as failure:
-        mark, at = getattr(failure, "problem_mark", None), getattr(failure, "position", None)
+        mark = getattr(failure, "problem_mark", None)
+        at = getattr(failure, "position", None)
         row = mark.line if mark is not None else None if at is None else text.count("\n", 0, at)
         line = "" if row is None else f" line {row + 1}"
         problem = getattr(failure, "problem", None) or getattr(failure, "reason", None) or "not readable"

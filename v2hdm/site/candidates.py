@@ -16,7 +16,8 @@ _UNSEEN_M2 = 1e4  # variance of an unseen corner, m^2: effectively infinite at t
 CORRELATION = 0.2  # of a corner's errors between images; .3 overstates sides' sigmas, .1 understates corners'
 _KNOWN_SIGMA_M = 0.5  # largest sigma, m, of a known corner: a fraction of any marking's length
 
-TOO_UNCERTAIN, LACKS_A_CORNER = "its position is too uncertain", "a corner was never seen twice"
+TOO_UNCERTAIN = "its position is too uncertain"
+LACKS_A_CORNER = "a corner was never seen twice"
 
 _OTHER_EDGE_M = 0.3
 """Sigma, m, of a sighting's edge, such as a worn end's, about where others see it; beyond lies something
@@ -106,7 +107,9 @@ def with_dissent(
     agreed = fused.covariance_m2[group, corner]
     usable = fused.valid[group, corner] & (away_m < 3 * _OTHER_EDGE_M)
     usable &= np.isfinite(covariance_m2).all(axis=(1, 2)) & np.isfinite(off).all(axis=1)
-    off, away_m, agreed = off[usable], away_m[usable], agreed[usable]
+    off = off[usable]
+    away_m = away_m[usable]
+    agreed = agreed[usable]
     one, all_others = (
         np.einsum("ri,rij,rj->r", off, np.linalg.inv(each), off) for each in (covariance_m2[usable], agreed)
     )
@@ -114,7 +117,8 @@ def with_dissent(
     sightings, number = np.unique(np.stack([group, row])[:, usable], axis=1, return_inverse=True)
     moved = np.zeros((sightings.shape[1], 4, 2))
     moved[number.ravel(), corner[usable]] = np.sqrt(share)[:, None] * off
-    covariance, ways = candidates.covariance_m2.copy(), moved.reshape(-1, 8)
+    covariance = candidates.covariance_m2.copy()
+    ways = moved.reshape(-1, 8)
     np.add.at(covariance, sightings[0], ways[:, :, None] * ways[:, None, :])
     return Candidates(candidates.corners_map, covariance)
 

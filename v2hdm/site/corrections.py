@@ -46,7 +46,8 @@ class Stated:
         placed beside others of its marking has their common error and its own sigma: a shift of the whole map
         does not reduce its weight, nor do many corrections make the map more precise.
         """
-        corners, covariance = candidates.corners_map.copy(), candidates.covariance_m2.copy()
+        corners = candidates.corners_map.copy()
+        covariance = candidates.covariance_m2.copy()
         for group, one in self.kept.items():
             if not one.moved:
                 continue
@@ -96,7 +97,8 @@ def with_symbols_corrected(
     hd_map: HDMap, corrections: Sequence[Correction]
 ) -> tuple[HDMap, tuple[Exclusion, ...]]:
     """The map with a person's corrections to its symbols, and the rejected symbols."""
-    kept, out = [], []
+    kept = []
+    out = []
     for symbol in hd_map.symbols:
         middle = symbol.outline_map.mean(axis=0)
         for one in corrections:

@@ -45,24 +45,29 @@ _REPEATED_COUNT = 3.0
 _MISPLACED_M = 0.3  # sigma, m, of a worn end, or of any corner of clutter (17 worn ends: .08 to .74 m)
 _WORN_SHARE = 0.5  # the same relative to the length: any part may be worn away
 
-_SLANT_OF_END, _SLANT_OF_PIECE = 0.5, 0.1
+_SLANT_OF_END = 0.5
+_SLANT_OF_PIECE = 0.1
 """Sigma, relative to the width, of a corner of a dash's end cut at any angle, and of a piece."""
 
 _RUN_ON_M = 1.0  # sigma, m, of an end that merges with other paint: about the length of letters
 
-_LIKE_CLASS, _LIKE_SHARE = 0.7, 0.2
+_LIKE_CLASS = 0.7
+_LIKE_SHARE = 0.2
 """Fraction of other paint and clutter that is shaped like the class it was taken for, at any length, and the
 sigma of its corners relative to the width: detections of a class resemble it, and are fitted as such."""
 
-_SOUND_SPREAD, _WORN_SPREAD = (0.0, 0.4), (1.5, 0.7)
+_SOUND_SPREAD = (0.0, 0.4)
+_WORN_SPREAD = (1.5, 0.7)
 """Mean and standard deviation of the logarithm of an end's scatter relative to its class: images agree on a
 sound end, a worn one ends elsewhere in each (229 sound and 10 worn ends of a rendered port)."""
 
-_UNCLEAR_SHARE, _CLEAR_SHARE = 0.05, 0.1
+_UNCLEAR_SHARE = 0.05
+_CLEAR_SHARE = 0.1
 """Fraction of sound ends that scatter like worn ones, being distant, and of worn ones that all images show
 alike (5 of 229 and 1 of 11 ends there)."""
 
-_FIRST, _SECOND = np.array([-0.5, 0.5, 0.5, -0.5]), np.array([-0.5, -0.5, 0.5, 0.5])
+_FIRST = np.array([-0.5, 0.5, 0.5, -0.5])
+_SECOND = np.array([-0.5, -0.5, 0.5, 0.5])
 """Corner k of a parallelogram with sides u and v lies at its centre plus first[k] u + second[k] v."""
 
 _OWN_SIZE = _SIZE_SIGMA_M**2 * np.kron(np.outer(_FIRST, _FIRST) + np.outer(_SECOND, _SECOND), np.eye(2))
@@ -187,7 +192,8 @@ class Hypotheses:
         for shape in shapes:
             ragged = self._add_shape(shape, shape.share / sum(one.share for one in shapes))
         centre = candidates.corners_map.mean(axis=1)
-        turns, shifts = np.tile(np.eye(2), (len(centre), 1, 1)), np.zeros(len(centre), dtype=np.int64)
+        turns = np.tile(np.eye(2), (len(centre), 1, 1))
+        shifts = np.zeros(len(centre), dtype=np.int64)
         own = Laid(parallelograms(candidates.corners_map) + centre[:, None], turns, centre, shifts)
         own = lay(shapes[0].corners, SHAPE_SIGMA_M, candidates)[0] if shapes else own
         any_size = SHAPE_SIGMA_M**2 * np.eye(8) + _OWN_SIZE
@@ -332,7 +338,8 @@ def _worn_evidence(candidates: Candidates, ends: Sequence[FloatArray], weight: F
     variance = [candidates.along(end / 2, (end + ends[k ^ 1]) / 2) for k, end in enumerate(ends)]
     sigma = 0.5 * np.log(np.maximum(variance, 0.0) + SHAPE_SIGMA_M**2)
     off = sigma - np.median(sigma[:, weight * whole > 0.5])
-    worn, sound = norm.pdf(off, *_WORN_SPREAD), norm.pdf(off, *_SOUND_SPREAD)
+    worn = norm.pdf(off, *_WORN_SPREAD)
+    sound = norm.pdf(off, *_SOUND_SPREAD)
     odds = worn + _CLEAR_SHARE * (sound - worn)
     odds /= sound + _UNCLEAR_SHARE * (worn - sound)
     return np.asarray(np.where(whole, np.log(odds), 0.0))

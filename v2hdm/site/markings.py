@@ -98,7 +98,8 @@ def classify(
     that they lie on the ground.
     """
     first = posterior(solved, kind, counted(np.where(solved.known[..., None], solved.corners_map, np.nan)))
-    names, number = [kinds[one] for one in kind], kind.copy()
+    names = [kinds[one] for one in kind]
+    number = kind.copy()
     stated = Stated.of(options.corrections, first.candidates.corners_map, names)
     known = {kinds[one]: one for one in np.unique(kind).tolist()}
     for group, correction in stated.kept.items():
@@ -117,7 +118,8 @@ def classify(
         None if odds >= least else OF_SYMBOL if part[group] else _CLUTTER_BY[found.evidence[group].argmin()]
         for group, odds in enumerate(found.log_odds)
     ]
-    sigma_m, seen_corners = found.candidates.sigma_m.max(axis=1), solved.known.sum(axis=1)
+    sigma_m = found.candidates.sigma_m.max(axis=1)
+    seen_corners = solved.known.sum(axis=1)
     # The best one's uncertainty is common to all: a shift of the whole map speaks against no marking.
     uncertain = sigma_m**2 > np.min(sigma_m, initial=np.inf) ** 2 + options.max_sigma_m**2
     for group in np.flatnonzero(uncertain).tolist():
@@ -136,7 +138,8 @@ def _covered(found: Posterior, standing: IntArray) -> IntArray:
     """Candidates of ``standing`` that overlap one with better odds."""
     if len(standing) < 2:
         return np.zeros(0, dtype=np.int64)
-    corners, odds = found.candidates.corners_map, found.log_odds
+    corners = found.candidates.corners_map
+    odds = found.log_odds
     centres = corners[standing].mean(axis=1)
     reach_m = 2 * float(np.max(np.linalg.norm(corners[standing] - centres[:, None], axis=2)))
     pairs = standing[cKDTree(centres).query_pairs(reach_m, output_type="ndarray")].reshape(-1, 2)
@@ -168,7 +171,8 @@ def with_relative_sigma(
         return tuple(markings)
     chosen = [markings[m] for m in seen.tolist()]
     # Opposite corners: of a marking at least three are known.
-    even, odd = corner_index[seen][:, [0, 2]], corner_index[seen][:, [1, 3]]
+    even = corner_index[seen][:, [0, 2]]
+    odd = corner_index[seen][:, [1, 3]]
     diagonal = np.where((even >= 0).all(axis=1, keepdims=True), even, odd)
     first, second = neighbours(np.array([marking.corners_map.mean(axis=0) for marking in chosen]))
     if not len(first):
@@ -189,7 +193,8 @@ def with_relative_sigma(
 
 def neighbours(centres_map: FloatArray) -> tuple[IntArray, IntArray]:
     """Pairs of points (N, 2): each with neighbours, and its neighbour at the distance nearest to 10 m."""
-    first, second = [], []
+    first = []
+    second = []
     tree = cKDTree(centres_map)
     for own, near in enumerate(tree.query_ball_point(centres_map, _FARTHEST_M)):
         others = np.array([other for other in near if other != own], dtype=np.int64)
@@ -223,7 +228,8 @@ def most_suspicious(
     accepted: IntArray, misfit: FloatArray, squared: FloatArray, counts: Counts
 ) -> Sequence[Suspicion]:
     """The most suspicious of the ``accepted`` (M,), worst first, by p-values of shape and residuals."""
-    seen, agreed = counts.observations[accepted], counts.agreeing[accepted]
+    seen = counts.observations[accepted]
+    agreed = counts.agreeing[accepted]
     freedom = np.maximum(2.0 * agreed - 8, 1.0)  # two per observation, less eight of the corners
     # With an inverse-gamma prior, the variance follows Fisher's F distribution.
     variance = np.nan_to_num(squared[accepted], nan=1e9) / freedom
@@ -231,7 +237,8 @@ def most_suspicious(
     residuals = f.sf(variance / scale, freedom, prior)
     # Binomial tail, continued to fractions of an image.
     rate = (seen - agreed).sum() / max(seen.sum(), 1)
-    disputes, images = (seen - agreed) / CORNERS_OF_IMAGE, seen / CORNERS_OF_IMAGE
+    disputes = (seen - agreed) / CORNERS_OF_IMAGE
+    images = seen / CORNERS_OF_IMAGE
     sightings = np.where(disputes > 0, beta.cdf(rate, np.maximum(disputes, 1e-9), images - disputes + 1), 1.0)
     rows = zip(misfit[accepted], residuals, sightings, (seen - agreed) / np.maximum(seen, 1), strict=True)
     found = [Suspicion(number, *map(float, row)) for number, row in enumerate(rows, start=1)]

@@ -21,7 +21,8 @@ class AcceptanceOptions:
     corrections: list[Correction] = field(default_factory=list)
 
 
-AFTER, JOINT = "after", "joint"  # values of ``mapping.lanes.model``
+AFTER = "after"
+JOINT = "joint"  # values of ``mapping.lanes.model``
 
 
 @dataclass(kw_only=True)

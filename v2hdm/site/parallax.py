@@ -108,7 +108,8 @@ def measure_parallax(views: PointViews, count: int) -> Parallax:
     Unknown as well: their positions, and a roll and pitch error common to all images.
     """
     group, used, each = views.group, views.used, views.used.shape[1]
-    total, slopes = 2 * each, slice(2 * each, 3 * each)
+    total = 2 * each
+    slopes = slice(2 * each, 3 * each)
     points, ray = (np.where(used[..., None], one, 0.0) for one in (views.points_map, views.ray_map))
     centre = (points - ray).sum(axis=1) / used.sum(axis=1)[:, None]
     seen = _sum(used, group, count)
@@ -165,8 +166,11 @@ def _sum(values: FloatArray | BoolArray, group: IntArray, count: int) -> FloatAr
 
 def _by_pose(ray: FloatArray, height_m: FloatArray) -> FloatArray:
     """Jacobian (N, P, 2, 6) of ground points at the ends of rays (N, P, 2) by :data:`POSE_STATES`."""
-    x, y = ray[..., 0], ray[..., 1]
-    one, none, h = np.ones_like(x), np.zeros_like(x), np.broadcast_to(height_m[:, None], x.shape)
+    x = ray[..., 0]
+    y = ray[..., 1]
+    one = np.ones_like(x)
+    none = np.zeros_like(x)
+    h = np.broadcast_to(height_m[:, None], x.shape)
     columns = (
         (one, none),
         (none, one),

@@ -28,22 +28,27 @@ _SPACING_PX = 4.0  # length, px, of an outline's pieces: an element of the netwo
 _CORRELATED_PX = 20.0
 """Correlation length of an outline, px: twice the integral of its autocorrelation in renders."""
 
-_SIGMA_PX, _SIGMA_WEIGHT = 0.5, 10.0
+_SIGMA_PX = 0.5
+_SIGMA_WEIGHT = 10.0
 """Prior sigma of an outline about the paint's edge, px, and the number of independent points it is worth."""
 
 _TURN_SIGMA_RAD = 0.25  # of a piece of outline against its edge
 _ROUND_PX = 3.0  # distance from a corner, px, that the network rounds
-_STRAY, _STRAY_PX = 0.2, 25.0  # fraction of an outline along no edge, and its range, px
+_STRAY = 0.2
+_STRAY_PX = 25.0  # fraction of an outline along no edge, and its range, px
 LEAST_EXPLAINED = 1 - 2 * _STRAY  # least fraction of the outlines along their polygon's edges
 _ANYWHERE_M = 0.5  # sigma, m, of vertices about the outline common to sightings
 UNSEEN_M = _ANYWHERE_M / 2  # sigma, m, of vertices on which images add little to that prior
-_SIZE_SIGMA, _FREEDOM = 0.02, 4.0
+_SIZE_SIGMA = 0.02
+_FREEDOM = 4.0
 """Prior sigma of the logarithm of a symbol's sizes about its template's; and the number of symbols that this
 prior, and that of the vertices' own deviations, are worth."""
 
 _MOST_VERTICES = 18
 _STEP_M = 0.1  # largest motion of a vertex in a step: beyond, other edges explain the pieces
-_STEPS, _FEW_STEPS, _ROUNDS = 15, 4, 3  # of a fit, of one after removing a vertex, of learning a template
+_STEPS = 15
+_FEW_STEPS = 4
+_ROUNDS = 3  # of a fit, of one after removing a vertex, of learning a template
 
 
 @dataclass(frozen=True)
@@ -81,7 +86,8 @@ class Traces:
             count = np.ceil(length / _SPACING_PX).astype(np.int64)
             own = np.repeat(np.arange(len(ring)), count)
             share = (np.arange(len(own)) - (np.cumsum(count) - count)[own] + 0.5) / count[own]
-            along, weight = side[own] / length[own, None], length[own] / count[own] / _CORRELATED_PX
+            along = side[own] / length[own, None]
+            weight = length[own] / count[own] / _CORRELATED_PX
             pieces.append((np.full(len(own), number), ring[own] + share[:, None] * side[own], along, weight))
         return cls(px_from_map, shift_px, *(np.concatenate(one) for one in zip(*pieces, strict=True)))
 
@@ -112,9 +118,11 @@ def find_polygons(
 ) -> list[Polygon]:
     """Polygons of symbols of classes ``kinds``, from their traces, started from ``outlines`` (K, 2)."""
     own = [_own_polygon(trace, outline) for trace, outline in zip(traces, outlines, strict=True)]
-    found, classes = list(own), list[tuple[_Template, list[int]]]()
+    found = list(own)
+    classes = list[tuple[_Template, list[int]]]()
     for k in np.argsort([-trace.weight.sum() for trace in traces]).tolist():
-        best, home = own[k], None
+        best = own[k]
+        home = None
         for template, members in classes:
             if kinds[members[0]] == kinds[k]:
                 for start in template.laid_about(outlines[k]):
@@ -127,7 +135,8 @@ def find_polygons(
         elif is_simple(best.vertices):
             classes.append((_Template.of(best), [k]))
     for template, members in classes:
-        shown, polygons = [traces[k] for k in members], [found[k] for k in members]
+        shown = [traces[k] for k in members]
+        polygons = [found[k] for k in members]
         if len(members) > 1:
             template, polygons = _of_template(template, shown, polygons)
         for k, one, error in zip(members, polygons, template.edge_errors(polygons), strict=True):
@@ -185,7 +194,8 @@ def _anywhere(start: FloatArray) -> Prior:
 
 def _but_flattest(vertices: FloatArray) -> BoolArray:
     """The vertices (N,) of a polygon except that of the smallest area (Visvalingam and Whyatt, 1993)."""
-    before, after = np.roll(vertices, 1, axis=0), np.roll(vertices, -1, axis=0)
+    before = np.roll(vertices, 1, axis=0)
+    after = np.roll(vertices, -1, axis=0)
     area = np.abs(signed_area(np.stack([before, vertices, after], axis=1)))
     return np.asarray(np.arange(len(vertices)) != area.argmin())
 
@@ -249,20 +259,26 @@ class _Template:
 
     def learnt(self, members: Sequence[Polygon]) -> tuple[_Template, list[_Template]]:
         """The template of all members, and for each member that of the others."""
-        mean, spread = self.vertices.ravel(), np.linalg.inv(self.spread)
-        paint2, sizes2 = _FREEDOM * SHAPE_SIGMA_M**2, _FREEDOM * np.full(2, _SIZE_SIGMA**2)
-        information, pulls = [], []
+        mean = self.vertices.ravel()
+        spread = np.linalg.inv(self.spread)
+        paint2 = _FREEDOM * SHAPE_SIGMA_M**2
+        sizes2 = _FREEDOM * np.full(2, _SIZE_SIGMA**2)
+        information = []
+        pulls = []
         for one in members:
             rotation, place = self.pose(one.vertices)
             turn = np.kron(np.eye(len(one.vertices)), rotation)
-            data, here = turn.T @ one.data @ turn, ((one.vertices - place) @ rotation).ravel()
+            data = turn.T @ one.data @ turn
+            here = ((one.vertices - place) @ rotation).ravel()
             # Information of the images on the template, the symbol's own deviations marginalised.
             gain = spread @ np.linalg.inv(data + spread)
-            known, pull = gain @ data, gain @ (data @ here - turn.T @ one.pull)
+            known = gain @ data
+            pull = gain @ (data @ here - turn.T @ one.pull)
             information.append(known)
             pulls.append(pull)
             # Second moments of those deviations given the images (expectation maximisation).
-            off, own2 = pull - known @ mean, np.square(self.sizes)
+            off = pull - known @ mean
+            own2 = np.square(self.sizes)
             paint2 += self.paint_m**2 * (1 + self.paint_m**2 * (off @ off - np.trace(known)) / len(off))
             by_size = self.stretch.T @ known @ self.stretch
             sizes2 += own2 * (1 + own2 * ((self.stretch.T @ off) ** 2 - np.diag(by_size)))
@@ -282,7 +298,8 @@ class _Template:
         """Covariances (2N, 2N), m^2, of errors common to all images, from each member's deviation."""
         if len(members) < 2:
             return [EDGE_SIGMA_M**2 * np.eye(self.vertices.size)]
-        off, formal = [], []
+        off = []
+        formal = []
         for one, other in zip(members, self.learnt(members)[1], strict=True):
             off += list(one.vertices - other.prior(one.vertices)[0].reshape(-1, 2))
             formal += [one.covariance[n : n + 2, n : n + 2] for n in range(0, one.vertices.size, 2)]
@@ -300,10 +317,12 @@ def _evenly(ring: FloatArray) -> FloatArray:
 def _fit(traces: Traces, start: FloatArray, prior: Prior, steps: int = _STEPS) -> Polygon:
     """The maximum a posteriori polygon, from vertices ``start`` (N, 2)."""
     vertices: FloatArray = start
-    shift_px, sigma_px = np.zeros((len(traces.px_from_map), 2)), 2 * _SIGMA_PX
+    shift_px = np.zeros((len(traces.px_from_map), 2))
+    sigma_px = 2 * _SIGMA_PX
     for _ in range(steps):
         weight, off_px, normal, jacobian, log_likelihood = _explained(traces, vertices, shift_px, sigma_px)
-        squared, count = _SIGMA_WEIGHT * _SIGMA_PX**2 + weight @ off_px**2, _SIGMA_WEIGHT + weight.sum()
+        squared = _SIGMA_WEIGHT * _SIGMA_PX**2 + weight @ off_px**2
+        count = _SIGMA_WEIGHT + weight.sum()
         sigma_px = float(np.sqrt(squared / count))
         off_px += (normal * shift_px[traces.image]).sum(axis=1)
         data, gradient, follow = _normal(traces, weight / sigma_px**2, off_px, normal, jacobian)
@@ -311,9 +330,11 @@ def _fit(traces: Traces, start: FloatArray, prior: Prior, steps: int = _STEPS) -
         precision = np.linalg.inv(covariance)
         step = np.linalg.solve(data + precision, gradient + precision @ (mean - vertices.ravel()))
         step = step * min(1.0, _STEP_M / float(np.abs(step).max()))
-        vertices, shift_px = np.asarray(vertices + step.reshape(-1, 2)), follow(np.asarray(step))
+        vertices = np.asarray(vertices + step.reshape(-1, 2))
+        shift_px = follow(np.asarray(step))
     mean, covariance = prior(vertices)
-    precision, off = np.linalg.inv(covariance), mean - vertices.ravel()
+    precision = np.linalg.inv(covariance)
+    off = mean - vertices.ravel()
     evidence = log_likelihood - 0.5 * off @ precision @ off
     evidence -= 0.5 * (np.linalg.slogdet(data + precision)[1] + np.linalg.slogdet(covariance)[1])
     explained = float(weight.sum() / max(traces.weight.sum(), 1e-9))
@@ -330,7 +351,8 @@ def _explained(
     Then the edge's outer normal (P, 2), the Jacobian (P, 2N) of the edge by the vertices, and the
     log-likelihood of all pieces.
     """
-    rows, image = np.arange(len(traces.image)), traces.image
+    rows = np.arange(len(traces.image))
+    image = traces.image
     pixel = apply_in_front(traces.px_from_map, vertices)
     side = np.roll(pixel, -1, axis=1) - pixel
     length = np.maximum(np.linalg.norm(side, axis=2), 1e-6)
@@ -356,10 +378,8 @@ def _explained(
     weight = traces.weight * np.exp(inlier - total)
     normal = np.stack([-along[rows, edge, 1], along[rows, edge, 0]], axis=-1)
     share = np.clip(at[rows, edge] / length[image, edge], 0.0, 1.0)
-    slope, jacobian = (
-        homography_jacobian(traces.px_from_map, vertices),
-        np.zeros((len(rows), *vertices.shape)),
-    )
+    slope = homography_jacobian(traces.px_from_map, vertices)
+    jacobian = np.zeros((len(rows), *vertices.shape))
     for corner, part in ((edge, 1 - share), ((edge + 1) % len(vertices), share)):
         jacobian[rows, corner] = part[:, None] * np.einsum("pi,pij->pj", normal, slope[image, corner])
     known = weight > 0
@@ -377,9 +397,11 @@ def _normal(
 
     Then a function from a step (2N,) to the shifts (I, 2), px.
     """
-    weighted, images = info[:, None] * jacobian, len(traces.px_from_map)
+    weighted = info[:, None] * jacobian
+    images = len(traces.px_from_map)
     shifted = np.eye(2) / traces.shift_px[:, None, None] ** 2
-    coupling, pull = np.zeros((images, 2, jacobian.shape[1])), np.zeros((images, 2))
+    coupling = np.zeros((images, 2, jacobian.shape[1]))
+    pull = np.zeros((images, 2))
     np.add.at(shifted, traces.image, info[:, None, None] * normal[:, :, None] * normal[:, None])
     np.add.at(coupling, traces.image, normal[:, :, None] * weighted[:, None])
     np.add.at(pull, traces.image, (info * off_px)[:, None] * normal)

@@ -43,7 +43,9 @@ _UNDER_SYMBOL = (0.02, 0.5)
 Half of the parts of other paint belong to letters or drawings without a class, and count as markings here.
 """
 
-_ODDS, _ODDS_SIGMA, _ODDS_FREEDOM = (5.0, 2.5), 1.2, 4.0
+_ODDS = (5.0, 2.5)
+_ODDS_SIGMA = 1.2
+_ODDS_FREEDOM = 4.0
 """Log-odds of the detector, averaged over a marking: prior mean and standard deviation of a class's (in a
 rendered port 335 diamonds have 7.9, 91 dashes 7.4, 3 stop lines 1.1), least scale of its members about it
 (1.0 for diamonds), and degrees of freedom of Student's t distribution, for worn ones."""
@@ -66,23 +68,31 @@ class Posterior:
 def posterior(candidates: Candidates, kind: IntArray, counts: Counts) -> Posterior:
     """Posterior of G candidates of classes ``kind`` (G,), given their positions and counts."""
     total = len(candidates)
-    probability, evidence = np.zeros((total, len(Kind))), np.zeros((total, 5))
-    log_odds, misfit = np.zeros(total), np.ones(total)
-    corners, covariance = candidates.corners_map.copy(), candidates.covariance_m2.copy()
+    probability = np.zeros((total, len(Kind)))
+    evidence = np.zeros((total, 5))
+    log_odds = np.zeros(total)
+    misfit = np.ones(total)
+    corners = candidates.corners_map.copy()
+    covariance = candidates.covariance_m2.copy()
     for one in np.unique(kind):
         own = np.flatnonzero(kind == one)
         found = _of_class(candidates.subset(own), counts.subset(own))
-        probability[own], log_odds[own], evidence[own] = found.probability, found.log_odds, found.evidence
-        corners[own], covariance[own] = found.candidates.corners_map, found.candidates.covariance_m2
+        probability[own] = found.probability
+        log_odds[own] = found.log_odds
+        evidence[own] = found.evidence
+        corners[own] = found.candidates.corners_map
+        covariance[own] = found.candidates.covariance_m2
         misfit[own] = found.misfit
     return Posterior(probability, log_odds, Candidates(corners, covariance), evidence, misfit)
 
 
 def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
     """Posterior of the candidates of one class, which jointly determine its markings' distribution."""
-    share, paint = _PRIOR_COUNT / _PRIOR_COUNT.sum(), learn_paint_error([], [])
+    share = _PRIOR_COUNT / _PRIOR_COUNT.sum()
+    paint = learn_paint_error([], [])
     # Initially, candidates that agreeing images show whole are taken for markings, others for clutter.
-    whole, believed = np.asarray(candidates.known.all(axis=1)), candidates
+    whole = np.asarray(candidates.known.all(axis=1))
+    believed = candidates
     taken = whole & (2 * counts.agreeing > counts.observations)
     probability = np.eye(len(Kind))[np.where(taken, Kind.OF_CLASS, Kind.CLUTTER)]
     for number in range(1, _PASSES + 1):
@@ -91,7 +101,8 @@ def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
         space = Hypotheses(candidates, believed, probability, share, paint, vague)
         shapes = learn_shapes(candidates.subset(weight > 0.5))
         space.add_all(shapes)
-        by_kind, sources = np.array([one.kind for one in space.found]), _counted(counts, weight)
+        by_kind = np.array([one.kind for one in space.found])
+        sources = _counted(counts, weight)
         marking = by_kind < Kind.PART_OF_SYMBOL
         column = np.where(marking, 0, by_kind - Kind.OWN_SHAPE)  # of the sources: marking, symbol, clutter
         shaped = np.stack([one.log_likelihood for one in space.found])
@@ -125,9 +136,11 @@ def _counted(counts: Counts, weight: FloatArray) -> FloatArray:
     own = log_found(counts.found, counts.easy_views, rate)
     clutter = _rates(counts.found, counts.easy_views, *_CLUTTER_FOUND)
     found = np.stack([own, clutter, clutter], axis=1)
-    agree, differ = counts.agreeing, counts.observations - counts.agreeing
+    agree = counts.agreeing
+    differ = counts.observations - counts.agreeing
     right, wrong = (agree[:, None] * np.log(p) + differ[:, None] * np.log1p(-p) for p in _AGREEING)
-    under, alone = counts.as_symbol, counts.images
+    under = counts.as_symbol
+    alone = counts.images
     plain, covered = (under[:, None] * np.log(p) + alone[:, None] * np.log1p(-p) for p in _UNDER_SYMBOL)
     covered = np.logaddexp(covered, plain) - np.log(2)
     rest = np.hstack([right, right, wrong]) / CORNERS_OF_IMAGE + np.hstack([plain, covered, plain])
@@ -151,7 +164,9 @@ def _vague_evidence(counts: Counts, weight: FloatArray) -> FloatArray:
 
 def _log_like_class(odds: FloatArray, weight: FloatArray) -> FloatArray:
     """Log-likelihood (N,) of a marking's mean log-odds ``odds`` (N,), under that of markings (``weight``)."""
-    (usual, sigma), least, total = _ODDS, _ODDS_SIGMA**2, weight.sum()
+    (usual, sigma) = _ODDS
+    least = _ODDS_SIGMA**2
+    total = weight.sum()
     information = sigma**-2 + total / least
     mean = (usual / sigma**2 + weight @ odds / least) / information
     spread = weight @ (odds - mean) ** 2 * (1 - 2 / _ODDS_FREEDOM) / max(total, 1.0)

@@ -17,7 +17,8 @@ from v2hdm.records import BoolArray, FloatArray
 from v2hdm.site.candidates import Candidates
 from v2hdm.site.shapes import MEMBER_M, Laid
 
-_TURN_RAD, _BESIDE_M = 1.0, 0.5
+_TURN_RAD = 1.0
+_BESIDE_M = 0.5
 """Limits from one dash to the next: the line's rotation, as in a bend of 6 m radius at 6 m spacing, and its
 distance from an arc between them, less than that of parallel lines."""
 
@@ -67,11 +68,13 @@ def in_series(
     (N,) is the probability of a marking.
     """
     sides = np.roll(laid.corners_map, -1, axis=1) - laid.corners_map
-    lengths, rows = np.linalg.norm(sides, axis=2), np.arange(len(sides))
+    lengths = np.linalg.norm(sides, axis=2)
+    rows = np.arange(len(sides))
     longest = lengths.argmax(axis=1)
     length_m = lengths[rows, longest]
     axis = sides[rows, longest] / length_m[:, None]
-    marking, middle = weight > 0.5, np.tile(axis, 4) / 4
+    marking = weight > 0.5
+    middle = np.tile(axis, 4) / 4
     own_m2 = believed.along(middle, middle)
     apart_m, apart_m2, off_m, off_m2 = _ways(believed, axis, own_m2, length_m, marking)
     own_m = np.sum((laid.corners_map - candidates.corners_map).reshape(-1, 8) * shorter, axis=1)
@@ -86,7 +89,8 @@ def in_series(
     if known.sum() < _LEAST:
         return None
     # The largest stretch in bends acts as a prior: uncertain spacings are shrunk to the class's length.
-    unknown_m2, most_m2 = (length_m / step_m) ** 2 * apart_m2, (length_m * np.log(_STRETCH) / 2) ** 2
+    unknown_m2 = (length_m / step_m) ** 2 * apart_m2
+    most_m2 = (length_m * np.log(_STRETCH) / 2) ** 2
     trust = np.where(in_line, most_m2 / (most_m2 + unknown_m2), 0.0)
     longer_m = length_m * trust * np.where(in_line, stretch - 1, 0.0)
     longer_m2 = np.where(in_line, trust * unknown_m2, 0.0)
@@ -94,7 +98,8 @@ def in_series(
     spread_m, often = _regularity((own_m - longer_m)[known], (variance + longer_m2)[known], fixed)
     longer_sigma_m = np.where(in_line, np.sqrt(longer_m2 + spread_m**2), 0.0)
     enclosed = known & np.isfinite(off_m)
-    scatter_m, midway = MEMBER_M, 0.0
+    scatter_m = MEMBER_M
+    midway = 0.0
     if enclosed.sum() >= _LEAST:
         scatter_m, midway = _regularity(off_m[enclosed], (own_m2 + off_m2)[enclosed], 1 / apart_m[enclosed])
     middle_m = _times(middle, believed) + off_m
@@ -113,10 +118,13 @@ def _ways(
     """
     centre = believed.corners_map.mean(axis=1)
     near = cKDTree(centre).query(centre, min(_NEAR, len(centre)))[1].reshape(len(centre), -1)
-    to, others = centre[near] - centre[:, None], axis[near]
-    along, alike = np.einsum("nki,ni->nk", to, axis), np.einsum("nki,ni->nk", others, axis)
+    to = centre[near] - centre[:, None]
+    others = axis[near]
+    along = np.einsum("nki,ni->nk", to, axis)
+    alike = np.einsum("nki,ni->nk", others, axis)
     others *= np.where(alike < 0, -1.0, 1.0)[..., None]
-    across, across_other = cross(axis[:, None], to), cross(to, others)
+    across = cross(axis[:, None], to)
+    across_other = cross(to, others)
     turn = np.arctan2(cross(axis[:, None], others), np.abs(alike))
     # The chord between two points of a circle makes equal angles with the tangents there.
     beside_m = np.abs(across - across_other) / 2
@@ -145,7 +153,8 @@ def _regularity(off_m: FloatArray, variance: FloatArray, otherwise: FloatArray) 
     ``off_m`` (N,) are deviations, ``otherwise`` (N,) their density for dashes that do not follow.
     """
     # Dashes that scatter more than markings of a class form no series.
-    spread_m, often = min(float(np.median(np.abs(off_m)) / norm.ppf(0.75)), MEMBER_M), 0.5
+    spread_m = min(float(np.median(np.abs(off_m)) / norm.ppf(0.75)), MEMBER_M)
+    often = 0.5
     series = norm.pdf(off_m, 0.0, np.sqrt(variance + spread_m**2))
     for _ in range(_PASSES):
         both = often * series + (1 - often) * otherwise

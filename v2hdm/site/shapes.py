@@ -127,7 +127,8 @@ def _lay(
     common = np.einsum("naibi->n", apart) / 32
     weight = 1 / np.maximum(candidates.sigma_m**2 / 2 - common[:, None], 1e-6)
     total = weight.sum(axis=1, keepdims=True)
-    target_centre, own_centre = np.einsum("nc,ncx->nx", weight, corners) / total, weight @ shape / total
+    target_centre = np.einsum("nc,ncx->nx", weight, corners) / total
+    own_centre = weight @ shape / total
     # With complex numbers the rotation is the argument of the weighted sum of targets over shapes.
     a, b = (
         (one - middle[:, None]) @ [1, 1j] for one, middle in ((shape, own_centre), (corners, target_centre))
@@ -140,7 +141,8 @@ def _lay(
         rigid = rigid_motions(placed)
         normal = np.swapaxes(rigid, 1, 2) @ information @ rigid
         step = np.linalg.solve(normal, np.swapaxes(rigid, 1, 2) @ information @ off)[..., 0]
-        turn, centre = turn + step[:, 2], centre + step[:, :2]
+        turn = turn + step[:, 2]
+        centre = centre + step[:, :2]
     placed = shape @ np.swapaxes(_turned(turn), 1, 2) + centre[:, None]
     off = (corners - placed).reshape(-1, 8, 1)
     squared = (np.swapaxes(off, 1, 2) @ information @ off)[:, 0, 0]
@@ -149,7 +151,8 @@ def _lay(
 
 def _turned(angle: FloatArray) -> FloatArray:
     """Rotations (N, 2, 2)."""
-    cosine, sine = np.cos(angle), np.sin(angle)
+    cosine = np.cos(angle)
+    sine = np.sin(angle)
     return np.stack([np.stack([cosine, -sine], axis=-1), np.stack([sine, cosine], axis=-1)], axis=-2)
 
 
@@ -215,7 +218,8 @@ def _spread_m(shape: FloatArray, candidates: Candidates) -> tuple[float, float]:
     off = directions @ (candidates.corners_map - laid.corners_map).reshape(-1, 8, 1)
     own = directions @ candidates.covariance_m2 @ np.swapaxes(directions, 1, 2)
     wanted = float(chi2.median(off.shape[1]))
-    low, high = SHAPE_SIGMA_M, float(np.abs(off).max()) + SHAPE_SIGMA_M
+    low = SHAPE_SIGMA_M
+    high = float(np.abs(off).max()) + SHAPE_SIGMA_M
     for _ in range(20):
         sigma_m = np.sqrt(low * high)
         innovation = own + sigma_m**2 * np.eye(off.shape[1])

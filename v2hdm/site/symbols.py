@@ -62,11 +62,14 @@ def map_symbols(
     grounds = {
         row: outline for row, outline in enumerate(outlines_on_ground(symbols, rig)) if outline is not None
     }
-    rows, shapes = np.array(list(grounds), dtype=np.int64), list(grounds.values())
+    rows = np.array(list(grounds), dtype=np.int64)
+    shapes = list(grounds.values())
     if not shapes:
         return (), ()
     places = np.array([marking.corners_map.mean(axis=0) for marking in markings]).reshape(-1, 2)
-    found, left_out, seen = [], [], []
+    found = []
+    left_out = []
+    seen = []
     for own in _groups(shapes):
         at = np.stack([symbols.camera[rows[own]], symbols.frame[rows[own]]])
         (camera, frame), image = np.unique(at, axis=1, return_inverse=True)
@@ -76,8 +79,10 @@ def map_symbols(
         outline = _fused_outline([shapes[n] for n in own], image.ravel(), eyes)
         if outline is None:
             continue
-        middle, size_m = outline.mean(axis=0), np.ptp(outline, axis=0).max()
-        ring, near = (outline - middle).astype(np.float32), np.linalg.norm(places - middle, axis=1) < size_m
+        middle = outline.mean(axis=0)
+        size_m = np.ptp(outline, axis=0).max()
+        ring = (outline - middle).astype(np.float32)
+        near = np.linalg.norm(places - middle, axis=1) < size_m
         if any(cv2.pointPolygonTest(ring, one.tolist(), False) >= 0 for one in places[near] - middle):
             continue
         kind = Counter(symbols.kinds[n] for n in rows[own]).most_common(1)[0][0]
@@ -137,7 +142,8 @@ class _Eyes:
     @cached_property
     def centre_map(self) -> FloatArray:
         """Camera centres (I, 3)."""
-        extrinsic, pose = self.rig.cam_from_vehicle[self.camera], self.rig.map_from_vehicle[self.frame]
+        extrinsic = self.rig.cam_from_vehicle[self.camera]
+        pose = self.rig.map_from_vehicle[self.frame]
         return np.asarray(np.einsum("nij,nj->ni", pose[:, :3, :3], camera_centre(extrinsic)) + pose[:, :3, 3])
 
     def sigma_m(self, points_map: FloatArray) -> FloatArray:

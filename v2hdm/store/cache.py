@@ -186,7 +186,8 @@ class StageCache:
         self, stage: str, key: str, kind: type[_Value], value: _Value, lines: list[Line] | None = None
     ) -> _Value:
         """Keep ``value`` under ``key`` and return it as :meth:`get` will; a warning where it cannot."""
-        content, path = encode(value), self.path(stage, key)
+        content = encode(value)
+        path = self.path(stage, key)
         partial = path.with_name(f".{HOST}-{secrets.token_hex(8)}.part")
         try:
             if self._can_write:
@@ -231,7 +232,8 @@ def log_again(lines: Sequence[Line]) -> None:
 @contextmanager
 def recorded() -> Iterator[list[Line]]:
     """Record what this library logs within."""
-    recorder, logger = _Recorder(), logging.getLogger("v2hdm")
+    recorder = _Recorder()
+    logger = logging.getLogger("v2hdm")
     logger.addHandler(recorder)
     try:
         yield recorder.lines
@@ -265,7 +267,8 @@ def items_of(cache: Path) -> list[Item]:
         if (kind == LEFT and not _PARTIAL.fullmatch(path.name)) or not path.is_file():
             continue
         with suppress(OSError):  # another process has removed it
-            about, remove = path.stat(), partial(path.unlink, missing_ok=True)
+            about = path.stat()
+            remove = partial(path.unlink, missing_ok=True)
             found.append(Item(kind, path, about.st_size, about.st_mtime, remove))
     for folder in cache.glob(".*.part"):
         with suppress(OSError):
@@ -273,7 +276,8 @@ def items_of(cache: Path) -> list[Item]:
                 left = sum(one.stat().st_size for one in folder.rglob("*"))
                 found.append(Item(LEFT, folder, left, folder.stat().st_mtime, partial(shutil.rmtree, folder)))
     for listing in cache.glob(f"*/{LIST}"):
-        folder, size = listing.parent, size_of(listing.parent)
+        folder = listing.parent
+        size = size_of(listing.parent)
         with suppress(OSError):
             if size is not None:
                 used_s = listing.stat().st_mtime
@@ -283,7 +287,9 @@ def items_of(cache: Path) -> list[Item]:
 
 def prune(cache: Path, limit: float) -> list[Item]:
     """Remove what was unused longest until ``limit`` bytes are left, and killed runs' rests; returns it."""
-    before_s, items, removed = unused_before(cache), items_of(cache), []
+    before_s = unused_before(cache)
+    items = items_of(cache)
+    removed = []
     size = sum(item.size for item in items)
     for item in items:
         if item.used_s >= before_s or (size <= limit and item.kind != LEFT):

@@ -62,7 +62,9 @@ def take_lock(stream: IO[str]) -> bool:
 @contextmanager
 def in_use(cache: Path) -> Iterator[None]:
     """Protect from pruning what is used in a cache within this block, if anything can be written there."""
-    path, here, stream = cache / IN_USE / f"{secrets.token_hex(8)}{_ENDING}", cache.resolve(), None
+    path = cache / IN_USE / f"{secrets.token_hex(8)}{_ENDING}"
+    here = cache.resolve()
+    stream = None
     for _ in range(_TRIES):  # whoever leaves may remove the folder meanwhile
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -93,7 +95,8 @@ def unused_before(cache: Path) -> float:
     earliest = time.time()
     for path in (cache / IN_USE).glob(f"*{_ENDING}"):
         with suppress(OSError):  # given up meanwhile
-            began_s, is_left = path.stat().st_mtime, False
+            began_s = path.stat().st_mtime
+            is_left = False
             with suppress(OSError), path.open(encoding="utf-8") as stream:  # unreadable counts as held
                 is_left = take_lock(stream)
             if is_left:

@@ -61,7 +61,9 @@ def _identity(path: Path) -> tuple[int, int] | None:
 def warn_if_changed(path: Path, data: bytes) -> None:
     """Warn, once, of a file of a result that holds other ``data`` than we wrote; it is read all the same."""
     with suppress(OSError, RuntimeError):
-        path, digest, written = path.resolve(), hashlib.sha256(data).hexdigest(), set()
+        path = path.resolve()
+        digest = hashlib.sha256(data).hexdigest()
+        written = set()
         folder = next((one for one in path.parents[:_DEEPEST] if (one / LIST).is_file()), None)
         if folder is None:
             return

@@ -65,7 +65,10 @@ class RemoteFolder:
 
     def __init__(self, files: Any, root: str, url: str, option: str) -> None:
         """``files`` is the file system of fsspec, ``root`` the path of ``url`` there."""
-        self._files, self._root, self.url, self._option = files, root.rstrip("/"), url.rstrip("/"), option
+        self._files = files
+        self._root = root.rstrip("/")
+        self.url = url.rstrip("/")
+        self._option = option
 
     @classmethod
     def at(cls, url: str, option: str) -> RemoteFolder:
@@ -190,7 +193,8 @@ def is_whole_at(place: RemoteFolder) -> bool:
     listing = place.read(LIST)
     if listing is None:
         return False
-    there, (_, entries) = place.listed(), _entries(place, LIST, listing)
+    there = place.listed()
+    (_, entries) = _entries(place, LIST, listing)
     return bool(entries) and all(
         one.file in there and (one.size, one.token) == (there[one.file].size, there[one.file].token)
         for one in entries
@@ -227,7 +231,8 @@ def upload(place: RemoteFolder, contents: Mapping[str, bytes | Path], writer: st
     stopped, another is refused. Raises ConfigError as :func:`refuse_upload`, or where a name is taken.
     """
     new = {name: _Entry.of(name, content) for name, content in contents.items()}
-    listing, ours = place.read(LIST), refuse_upload(place, writer)
+    listing = place.read(LIST)
+    ours = refuse_upload(place, writer)
     for name in sorted(set(new) & set(place.listed()) - set(ours)):
         raise _foreign(place, name)
     begun = _listing([*ours.values(), *new.values()], writer)
@@ -243,7 +248,8 @@ def upload(place: RemoteFolder, contents: Mapping[str, bytes | Path], writer: st
         report(number, len(contents))
         if not place.create(name, content):
             raise _foreign(place, name)
-    there, put = place.listed(), []
+    there = place.listed()
+    put = []
     for name, one in new.items():
         if name not in there or there[name].size != one.size:
             raise ConfigError(f"{place}/{name}: differs from what was uploaded; start again")

@@ -36,7 +36,8 @@ class _Target:
     def __init__(self, shown: Path, option: str) -> None:
         """Where ``shown`` leads; what is no folder is refused before any work."""
         refuse_url(shown)
-        self.shown, self.option = shown, option
+        self.shown = shown
+        self.option = option
         try:
             self.path = shown.resolve()
         except (OSError, RuntimeError, ValueError):
@@ -181,7 +182,9 @@ def result_folder(folder: Path, option: str = "output=", made: str = "") -> Iter
     an input, or another process is writing it.
     """
     with _locked(folder, option) as there:
-        target, unfinished, previous = there.path, there.hidden("part"), there.hidden("previous")
+        target = there.path
+        unfinished = there.hidden("part")
+        previous = there.hidden("previous")
         with there.explained():
             there.recover(unfinished, previous)
             listed = there.listed(made)

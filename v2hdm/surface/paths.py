@@ -32,7 +32,8 @@ class Paths:
     @classmethod
     def of(cls, map_from_vehicle: FloatArray, session: IntArray) -> Paths:
         """Paths of poses (F, 4, 4) of sessions (F,), each in driving order."""
-        points, first = map_from_vehicle[:, :2, 3], [0]
+        points = map_from_vehicle[:, :2, 3]
+        first = [0]
         for frame in range(1, len(points)):
             last = first[-1]
             if session[frame] != session[last] or np.hypot(*(points[frame] - points[last])) >= _STATION_M:
@@ -40,8 +41,10 @@ class Paths:
         place = np.zeros(len(points), dtype=np.int64)
         place[first[1:]] = 1
         place = np.cumsum(place)
-        at, ahead = points[first], map_from_vehicle[first][:, :2, 0]
-        step, begins = np.diff(at, axis=0), np.append(True, np.diff(session[first]) != 0)
+        at = points[first]
+        ahead = map_from_vehicle[first][:, :2, 0]
+        step = np.diff(at, axis=0)
+        begins = np.append(True, np.diff(session[first]) != 0)
         # A gap between sessions keeps each out of the ground of the next.
         way_m = np.where(begins[1:], 2 * AHEAD_M, np.linalg.norm(step, axis=1))
         station = np.concatenate([[0.0], np.cumsum(way_m)])
@@ -52,12 +55,14 @@ class Paths:
         here = station[place][:, None] + np.array([-AHEAD_M, AHEAD_M])
         bounds = np.clip(here, *np.array([span[v] for v in session.tolist()]).T[:, :, None])
         forward = map_from_vehicle[:, :2, 0]
-        heading, spans = forward / np.linalg.norm(forward, axis=1, keepdims=True), np.array([*span.values()])
+        heading = forward / np.linalg.norm(forward, axis=1, keepdims=True)
+        spans = np.array([*span.values()])
         return cls(place, at, heading[first], sense, station, bounds, points, heading, spans)
 
     def beside(self, points_map: FloatArray, frame: IntArray) -> tuple[FloatArray, FloatArray]:
         """Stations (K,) and left offsets (K,), m, of points (K, 2) near frames (K,)."""
-        station, bounds = self.station_m[self.place[frame]], self.bounds_m[frame].T
+        station = self.station_m[self.place[frame]]
+        bounds = self.bounds_m[frame].T
         for _ in range(4):
             at, ahead, sense = self.at(station)
             along = np.einsum("ki,ki->k", points_map - at, ahead) * sense
@@ -69,10 +74,12 @@ class Paths:
 
     def at(self, station_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Points (K, 2), unit headings (K, 2) and senses (K,) of the path at stations (K,)."""
-        columns, last = np.hstack([self.points_map, self.ahead]), len(self.station_m) - 1
+        columns = np.hstack([self.points_map, self.ahead])
+        last = len(self.station_m) - 1
         near = np.searchsorted(self.station_m, station_m).clip(max=last)
         before = np.maximum(near - 1, 0)
-        begin_m, way_m = self.station_m[before], self.station_m[near] - self.station_m[before]
+        begin_m = self.station_m[before]
+        way_m = self.station_m[near] - self.station_m[before]
         share = np.clip((station_m - begin_m) / np.where(way_m > 0, way_m, 1.0), 0.0, 1.0)[:, None]
         at = (1 - share) * columns[before] + share * columns[near]
         ahead = at[:, 2:] / np.maximum(np.linalg.norm(at[:, 2:], axis=1, keepdims=True), 1e-9)
@@ -87,7 +94,8 @@ class Paths:
 
     def seen_from(self, map_from_vehicle: FloatArray) -> Paths:
         """The same paths for frames at poses (F, 4, 4), in any order."""
-        position, ahead = map_from_vehicle[:, :2, 3], map_from_vehicle[:, :2, 0]
+        position = map_from_vehicle[:, :2, 3]
+        ahead = map_from_vehicle[:, :2, 0]
         ahead = ahead / np.linalg.norm(ahead, axis=1, keepdims=True)
         # Where a route crosses itself, the place passed in this direction.
         passed = cKDTree(np.hstack([self.points_map, _TURN_M * self.ahead]))

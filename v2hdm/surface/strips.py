@@ -23,10 +23,12 @@ def write_ground_geotiff(hd_map: HDMap, path: Path) -> None:
     """Write the ground as GeoTIFF, heights above the origin and sigmas, m; the surer of two strips counts."""
     rasterio = need("rasterio", "gis", "the format geotiff", ConfigError)
     edges = np.concatenate([one.points(m) for one in hd_map.ground for m in one.left_m[[0, -1]].tolist()])
-    low, high = edges.min(axis=0), edges.max(axis=0)
+    low = edges.min(axis=0)
+    high = edges.max(axis=0)
     cell_m = max(_CELL_M, float(np.sqrt(np.prod(high - low) / _MOST_CELLS)))
     columns, rows = (int(n) for n in np.ceil((high - low) / cell_m))
-    x, y = low[0] + cell_m * (np.arange(columns) + 0.5), high[1] - cell_m * (np.arange(rows) + 0.5)
+    x = low[0] + cell_m * (np.arange(columns) + 0.5)
+    y = high[1] - cell_m * (np.arange(rows) + 0.5)
     cells = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     found = np.full((2, len(cells)), np.inf)
     for strip in hd_map.ground:
@@ -52,13 +54,15 @@ def _sampled(strip: GroundStrip, cells: FloatArray) -> FloatArray:
     from scipy.ndimage import map_coordinates  # of the map extra, whose runs alone have such a strip
     from scipy.spatial import cKDTree
 
-    out, (right_m, left_m) = np.full((2, len(cells)), np.inf), strip.left_m[[0, -1]].tolist()
+    out = np.full((2, len(cells)), np.inf)
+    (right_m, left_m) = strip.left_m[[0, -1]].tolist()
     reach_m = max(-right_m, left_m)
     distance_m, near = cKDTree(strip.points_map).query(
         cells, distance_upper_bound=np.hypot(reach_m, strip.step_m)
     )
     seen = np.flatnonzero(np.isfinite(distance_m))
-    off, ahead = cells[seen] - strip.points_map[near[seen]], strip.ahead[near[seen]]
+    off = cells[seen] - strip.points_map[near[seen]]
+    ahead = strip.ahead[near[seen]]
     along = near[seen] + np.einsum("ki,ki->k", off, ahead) / strip.step_m
     side = cross(ahead, off)
     inside = (side >= right_m) & (side <= left_m) & (along >= 0) & (along <= len(strip.points_map) - 1)

@@ -48,10 +48,13 @@ Policy on Geometric Design of Highways and Streets, 7th ed., section 4.2.2)."""
 
 _GRADE_SIGMA = 0.1  # standard deviation of the grade of the whole map: the steepest roads rise by 10 to 15 %
 
-_GRADES, _HINGES = 2, 1 + 2 * len(KNOTS_M)
+_GRADES = 2
+_HINGES = 1 + 2 * len(KNOTS_M)
 _SHAPE = _GRADES + _HINGES  # parameters before the spline's
-_ALONG_M, _ACROSS_M = 6.0, 5.0  # knot spacing of the spline: a third of a camera's range, a lane with margins
-_GRID_M, _STRIP_M = 0.5, 8.0  # grid and half width of the ground as written
+_ALONG_M = 6.0
+_ACROSS_M = 5.0  # knot spacing of the spline: a third of a camera's range, a lane with margins
+_GRID_M = 0.5
+_STRIP_M = 8.0  # grid and half width of the ground as written
 _SIDE_M = 12.5  # farther beside the path the ground continues at this height, except for the grade
 _ACROSS = int(2 * _SIDE_M / _ACROSS_M) + 3  # functions of the spline across
 _MOST_ALONG = 120  # largest number of knots along the route; longer routes have wider spacing
@@ -61,7 +64,8 @@ _SIZES = 2.0  # standard deviation of their logarithm, over all roads
 _REACH_M = 40.0  # ground farther from the camera is not corrected: H is known near the path alone
 _STEPS = 12  # of the secant method; four to six suffice
 _SURE_M = 1e-7  # its tolerance
-_STEP_PX, _TOUCH_M = 0.5, 0.01  # finite differences: by pixel, and of heights by position
+_STEP_PX = 0.5
+_TOUCH_M = 0.01  # finite differences: by pixel, and of heights by position
 _LEAN = (0.003, 1e4)  # roll of the sensor on the vehicle, constant: only turns separate it from bank
 _MOST_RECORDED = 500  # largest number of evenly spaced path points whose records are used
 _FORGOTTEN = 1e-2  # fraction of the total height variance that is dropped with the smallest errors
@@ -102,7 +106,8 @@ class Recorded:
         if self.road is None:
             return np.zeros(len(points_map)), np.zeros((len(points_map), 2))
         _, near = cKDTree(self.road.points_map).query(points_map)
-        slope, off = self.road.slope[near], points_map - self.road.points_map[near]
+        slope = self.road.slope[near]
+        off = points_map - self.road.points_map[near]
         return self.road.height_m[near] + np.einsum("ni,ni->n", slope, off), slope
 
 
@@ -165,8 +170,10 @@ class Surface:
 
         A plane touches the ground under the wheels: on a crown its origin lies below the ground.
         """
-        paths, (long, wide) = self.paths, _WHEELS_M
-        frame, ahead = np.arange(len(paths.place)), paths.heading
+        paths = self.paths
+        (long, wide) = _WHEELS_M
+        frame = np.arange(len(paths.place))
+        ahead = paths.heading
         left = turned_left(ahead)
         # In a bend the front wheels leave the path of the rear axle.
         (right_rear, left_rear), (right_front, left_front) = (
@@ -174,13 +181,15 @@ class Surface:
              for side in (-wide, wide)]
             for along in (0.0, long)
         )  # fmt: skip
-        rear, front = (right_rear + left_rear) / 2, (right_front + left_front) / 2
+        rear = (right_rear + left_rear) / 2
+        front = (right_front + left_front) / 2
         sideways = (left_rear - right_rear + left_front - right_front) / (4 * wide)
         return rear, (front - rear) / long, sideways
 
     def _from(self, points_map: FloatArray, frame: IntArray) -> FloatArray:
         """Forward and left offsets (K, 2), m, of points (K, 2) from the vehicle at frames (K,)."""
-        off, ahead = points_map - self.paths.position_map[frame], self.paths.heading[frame]
+        off = points_map - self.paths.position_map[frame]
+        ahead = self.paths.heading[frame]
         forwards = np.einsum("ki,ki->k", off, ahead)
         return np.column_stack([forwards, cross(ahead, off)])
 
@@ -190,7 +199,8 @@ class Surface:
         A length along a slope exceeds its map length by half the slope squared; heights lean with the plane.
         """
         forwards, sideways = (one[frame] for one in self._stands[1:])
-        (along, across), ahead = self._from(points_map, frame).T, self.paths.heading[frame]
+        (along, across) = self._from(points_map, frame).T
+        ahead = self.paths.heading[frame]
         by_along = forwards * (forwards * along / 2 + sideways * across + above_m)
         by_across = sideways * (sideways * across / 2 + above_m)
         left = turned_left(ahead)
@@ -198,7 +208,8 @@ class Surface:
 
     def seen_columns(self, points_map: FloatArray, frame: IntArray) -> csr_array:
         """Jacobian (K, B) of :meth:`seen_height_m` by the parameters."""
-        stands, away = self._footprints(), self._from(points_map, frame)
+        stands = self._footprints()
+        away = self._from(points_map, frame)
         plane = stands[0][frame]
         for axis in (0, 1):
             plane = plane + diags_array(away[:, axis]) @ stands[1 + axis][frame]
@@ -214,7 +225,8 @@ class Surface:
 
     def seen_height_m(self, points_map: FloatArray, frame: IntArray) -> FloatArray:
         """Heights (K,) of the ground at points (K, 2) above the planes of the vehicle at frames (K,)."""
-        away, (height, forwards, sideways) = self._from(points_map, frame), self._stands
+        away = self._from(points_map, frame)
+        (height, forwards, sideways) = self._stands
         plane = height[frame] + away[:, 0] * forwards[frame] + away[:, 1] * sideways[frame]
         return np.asarray(self._height_m(*self.paths.beside(points_map, frame)) - plane)
 
@@ -244,7 +256,8 @@ class Surface:
         """Points (K, 2) of z = 0 on a camera's rays to the ground's (K, 2): inverts :meth:`flattened_px`."""
         height_m = self.seen_height_m(points_map, np.full(len(points_map), frame))
         centre = camera_centre(cam_from_map)
-        place, frames = points_map, np.full(len(points_map), frame)
+        place = points_map
+        frames = np.full(len(points_map), frame)
         for _ in range(4):
             points_map = place + self._leaning(points_map, height_m, frames)
         off = points_map - centre[:2]
@@ -267,7 +280,8 @@ class Surface:
             along = int(content["knots"][2])
         except (IndexError, KeyError, OverflowError, TypeError, ValueError):
             raise ValueError("not a ground surface: numbers are missing") from None
-        places, none = len(station), np.zeros((0, 2))
+        places = len(station)
+        none = np.zeros((0, 2))
         shapes = (points.shape, ahead.shape, sense.shape, ends.shape[1:], parameters.shape)
         expected = ((places, 2), (places, 2), (places,), (2,), (_SHAPE + along * _ACROSS,))
         numbers = np.array([begin_m, step_m, datum_m])
@@ -282,7 +296,8 @@ class Surface:
 
     def strips(self) -> tuple[GroundStrip, ...]:
         """The ground by session, on a grid of 0.5 m."""
-        paths, out = self.paths, []
+        paths = self.paths
+        out = []
         left_m = np.arange(-_STRIP_M, _STRIP_M + _GRID_M / 2, _GRID_M)
         for begin_m, end_m in paths.session_ends.tolist():
             station = np.arange(begin_m, end_m, _GRID_M)
@@ -298,8 +313,11 @@ class Surface:
     @property
     def sentence(self) -> str:
         """One sentence on the range of the ground's heights."""
-        at, ahead, frame = self.paths.position_map, self.paths.heading, np.arange(len(self.paths.place))
-        left, ranges = turned_left(ahead), []
+        at = self.paths.position_map
+        ahead = self.paths.heading
+        frame = np.arange(len(self.paths.place))
+        left = turned_left(ahead)
+        ranges = []
         ways = (10.0 * ahead, "10 m ahead"), (4.0 * left, "4 m to the left"), (-4.0 * left, "right")
         for away, where in ways:
             height_cm = 100 * self.seen_height_m(at + away, frame)
@@ -316,7 +334,8 @@ class Surface:
         """
         known, towards, datum_m = self._recorded(recorded)
         towards = towards + information @ self.parameters - score
-        usual, whole = np.full(3, np.log(_CURVATURE)), information + known
+        usual = np.full(3, np.log(_CURVATURE))
+        whole = information + known
 
         def cost(sizes: FloatArray) -> float:
             prior = self._smoothness(sizes)
@@ -354,11 +373,14 @@ class Surface:
         size = len(self.parameters)
         frame = np.unique(np.linspace(0, len(self.paths.place) - 1, _MOST_RECORDED).astype(np.int64))
         height, slope = recorded.at(self.paths.position_map[frame])
-        ahead, station = self.paths.heading[frame], self.paths.station_m[self.paths.place[frame]]
+        ahead = self.paths.heading[frame]
+        station = self.paths.station_m[self.paths.place[frame]]
         forwards = np.einsum("fi,fi->f", slope, ahead)
         sideways = cross(ahead, slope)
-        datum_m, apart_m = float(height.mean()), np.abs(station[:, None] - station)
-        known, towards = np.zeros((size, size)), np.zeros(size)
+        datum_m = float(height.mean())
+        apart_m = np.abs(station[:, None] - station)
+        known = np.zeros((size, size))
+        towards = np.zeros(size)
         values = (height - datum_m, forwards, sideways)
         noises = (recorded.heights, recorded.slopes, (*recorded.slopes, _LEAN))
         for columns, value, noise in zip(self._footprints(), values, noises, strict=True):
@@ -378,11 +400,13 @@ class Surface:
 
         Rays that miss the ground, or meet it far away, keep their point of the plane.
         """
-        rays, centre_map = view.rays(pixels), view.centre
+        rays = view.rays(pixels)
+        centre_map = view.centre
         with np.errstate(all="ignore"):
             plane = centre_map[:, :2] - (centre_map[:, 2:] / rays[:, 2:]) * rays[:, :2]
             found = (rays[:, 2] < 0) & (np.linalg.norm(plane - centre_map[:, :2], axis=1) < _REACH_M)
-        down, out = np.where(found, rays[:, 2], -1.0), np.zeros_like(plane)
+        down = np.where(found, rays[:, 2], -1.0)
+        out = np.zeros_like(plane)
         last = np.where(found, -centre_map[:, 2] / down, 0.0)
 
         def on_map(far: FloatArray) -> FloatArray:
@@ -400,7 +424,9 @@ class Surface:
                 break
             with np.errstate(all="ignore"):
                 fall = np.where(np.abs(far - last) > 1e-12, (off - before) / (far - last), down)
-            last, before, far = far, off, far - off / np.where(fall < 0, fall, down)
+            last = far
+            before = off
+            far = far - off / np.where(fall < 0, fall, down)
         else:
             off = above(far)
         found &= (np.abs(off) < _SURE_M) & (far > 0)
@@ -425,7 +451,8 @@ class Surface:
         """Rows (K, 3, 2) of :meth:`flattened_px` and its Jacobian, for planes tangent to the ground."""
         points, found = self._shown(view, frame, pixels)
         flat = np.where(found[:, None], view.on_plane_px(points, found), pixels)
-        height_m, slope = self.seen_height_m(points, frame), np.empty_like(points)
+        height_m = self.seen_height_m(points, frame)
+        slope = np.empty_like(points)
         for axis, step in enumerate(_TOUCH_M * np.eye(2)):
             rise_m = self.seen_height_m(points + step, frame) - self.seen_height_m(points - step, frame)
             slope[:, axis] = rise_m / (2 * _TOUCH_M)
@@ -449,7 +476,8 @@ class Surface:
         ) -> FloatArray:
             """``of`` the finite pixels (N, 2), nan for others."""
             seen = np.isfinite(pixels).all(axis=1)
-            camera, frame = camera[seen], frame[seen]
+            camera = camera[seen]
+            frame = frame[seen]
             found = of(_View(rig.intrinsic[camera], rig.cam_from_map(camera, frame)), frame, pixels[seen])
             out = np.full((len(pixels), *found.shape[1:]), np.nan)
             out[seen] = found
@@ -462,7 +490,8 @@ class Surface:
         def moved(symbols: Symbols) -> Symbols:
             if not len(symbols.camera):
                 return symbols
-            of_point, points_px = symbols.symbol_of_point, np.concatenate(symbols.outlines_pinhole_px)
+            of_point = symbols.symbol_of_point
+            points_px = np.concatenate(symbols.outlines_pinhole_px)
             flat_px = known(symbols.camera[of_point], symbols.frame[of_point], points_px, self._flat_px)
             return replace(symbols, outlines_pinhole_px=tuple(symbols.by_symbol(flat_px)))
 

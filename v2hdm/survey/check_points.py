@@ -168,7 +168,8 @@ def compare(
     of_map = joint(*np.divmod(nearest, 4))
     own = np.diag(np.concatenate([point.sigma_m**2 for point in points]))
     matched = match(positions, corners, reach_m, of_map + own)
-    compared, unmatched = [], []
+    compared = []
+    unmatched = []
     for k, point in enumerate(points):
         if matched[k] < 0:
             there = f"{hd_map.markings[nearest[k] // 4].kind} {ids[nearest[k] // 4]}"
@@ -181,7 +182,8 @@ def compare(
             unmatched.append((point, why))
             continue
         marking, corner = divmod(int(matched[k]), 4)
-        found, height_m = hd_map.markings[marking], point.height_m
+        found = hd_map.markings[marking]
+        height_m = point.height_m
         off_height_m = None
         if found.heights_m is not None and height_m is not None:
             off_height_m = float(found.heights_m[corner] - height_m)

@@ -32,7 +32,8 @@ def match(
     out = np.full(count, -1, dtype=np.int64)
     # Survey and poses may be of two datums: then all points are off alike, within reach at two sigmas.
     datum = (reach_m / 2) ** 2 * np.kron(np.ones((count, count)), np.eye(2))
-    mean, covariance = np.zeros((count, 2)), covariance_m2 + datum
+    mean = np.zeros((count, 2))
+    covariance = covariance_m2 + datum
     # A corner that is not the point's lies anywhere within reach of it.
     chance = 2 * float(np.log(np.pi * reach_m**2))
     following = _first(corner, off_m, covariance, chance)

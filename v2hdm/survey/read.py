@@ -96,7 +96,8 @@ def read_survey(path: Path, crs: str | None, geoid_m: float | None, sigma_m: flo
     """
     header, lines = read_rows(path, ";\t,", "point")
     names = _columns(header, path)
-    rows, seen = [], dict[str, int]()
+    rows = []
+    seen = dict[str, int]()
     for line, cells in lines:
         known = {name: cell for name, cell in zip(names, cells, strict=True) if name is not None}
         rows.append(_Row(known, where := f"{path}: line {line}"))
@@ -128,7 +129,8 @@ def in_map(table: SurveyTable, origin: GeodeticOrigin | None) -> tuple[SurveyedP
     DriveError when the drive has no origin that the coordinates need, they are of another datum, or outside
     of their system.
     """
-    positions, height_m = table.coordinates, table.height_m
+    positions = table.coordinates
+    height_m = table.height_m
     if table.frame is not Frame.MAP:
         positions, height_m = _on_earth(table, origin)
     heights = [float(height) if np.isfinite(height) else None for height in height_m]
@@ -169,7 +171,8 @@ def _other_systems(table: SurveyTable, origin: GeodeticOrigin | None) -> list[st
 
 def _on_earth(table: SurveyTable, origin: GeodeticOrigin | None) -> tuple[FloatArray, FloatArray]:
     """Positions (N, 2) and heights (N,) in the map, nan where they are not known."""
-    where, crs = str(table.path), table.crs
+    where = str(table.path)
+    crs = table.crs
     if origin is None:
         raise DriveError(
             f"{where}: {table.frame.value} have a position on the earth, the drive's map has none; give the "
@@ -220,7 +223,8 @@ class _Row:
 
     def sigmas(self, usual_m: float) -> tuple[float, float]:
         both_m = self.number("sigma_m", usual_m)
-        east_m, north_m = self.number("sigma_east_m", both_m), self.number("sigma_north_m", both_m)
+        east_m = self.number("sigma_east_m", both_m)
+        north_m = self.number("sigma_north_m", both_m)
         if min(east_m, north_m) <= 0:
             raise DriveError(f"{self.where}: a sigma of {min(east_m, north_m):g} m; give one above 0")
         return east_m, north_m

@@ -76,7 +76,8 @@ def compare_survey(survey: Survey, drive: Drive, best: MethodResult) -> CheckTab
     if not survey.check:
         return None
     assert best.joint_covariance is not None
-    hd_map, reach_m = with_heights(best.hd_map, drive.road), survey.mapping.survey.reach_m
+    hd_map = with_heights(best.hd_map, drive.road)
+    reach_m = survey.mapping.survey.reach_m
     return compare(hd_map, survey.check, reach_m, best.joint_covariance, drive.route_map)
 
 

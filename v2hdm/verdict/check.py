@@ -43,7 +43,8 @@ def draw_check(drive: Drive, folder: Path, ground: Mapping[str, GroundEstimate])
 def _save_route(path: Path, trajectory: Trajectory) -> None:
     """Draw where the vehicle was, how fast, and where its x axis pointed."""
     stride = -(-len(trajectory.stamp_s) // _MOST_POINTS)
-    stamp_s, poses = trajectory.stamp_s[::stride], trajectory.map_from_vehicle[::stride]
+    stamp_s = trajectory.stamp_s[::stride]
+    poses = trajectory.map_from_vehicle[::stride]
     place = poses[:, :2, 3]
     with style.figure(path, 8.0, 6.0) as fig:
         axes = fig.subplots()

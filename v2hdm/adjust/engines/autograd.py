@@ -86,15 +86,18 @@ class TorchEngine(Engine):
 
     def report(self, estimate: Estimate, focal_px: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
         """In problem order: residuals (K, 2), px, squared Mahalanobis distances, points behind."""
-        arrays, poses = self.arrays, self.poses(estimate).flatten(0, 1)
-        corners_map, order = estimate.corners_map[arrays.corner.long()], arrays.order.cpu().numpy()
+        arrays = self.arrays
+        poses = self.poses(estimate).flatten(0, 1)
+        corners_map = estimate.corners_map[arrays.corner.long()]
+        order = arrays.order.cpu().numpy()
         points = model.points_in_camera(poses[arrays.pair.long()], corners_map)
         none = torch.tensor([[1.0], [0.0], [1.0]], dtype=points.dtype, device=points.device)
         off = model.corner_residual(points, arrays.measured, none).cpu().numpy()
         squared = self.residuals(poses[None], estimate.corners_map).square().sum(0).cpu().numpy()
         camera = arrays.camera_of(arrays.pair).cpu().numpy()
         out = np.empty((len(order), 2)), np.empty(len(order)), np.empty(len(order), dtype=np.bool_)
-        out[0][order], out[1][order] = off * focal_px[camera], squared
+        out[0][order] = off * focal_px[camera]
+        out[1][order] = squared
         out[2][order] = (points[:, 2] <= NEAR_M).cpu().numpy()
         return out
 
@@ -104,7 +107,8 @@ class TorchEngine(Engine):
         state = torch.zeros_like(arrays.state_information_root)
         at = Estimate(cam_from_vehicle, state, arrays.control, arrays.no_clock())
         poses = self.poses(at).flatten(0, 1)
-        corners, fixed = torch.empty_like(arrays.control), torch.empty_like(arrays.joined)
+        corners = torch.empty_like(arrays.control)
+        fixed = torch.empty_like(arrays.joined)
         for run in arrays.runs():
             usable = model.depression_sine(poses[run.pair], run.measured) > model.MIN_DEPRESSION_SINE
             ground = model.ground_points(poses[run.pair], run.measured)
@@ -141,7 +145,8 @@ class TorchEngine(Engine):
         estimate = Estimate(model.rigid(tangent) @ base.cam_from_vehicle, state, corners_map, clock_s)
         poses = model.cam_from_map(arrays, estimate.cam_from_vehicle, state, clock_s).flatten(0, 1)
         # The gradient by poses and corners is summed over runs and carried back to their unknowns once.
-        pose, corner = leaf(poses), leaf(corners_map)
+        pose = leaf(poses)
+        corner = leaf(corners_map)
         observations = poses.new_zeros(())
         for run in arrays.runs():
             squared = _residual(run, pose, corner).square().sum(1)
@@ -185,7 +190,8 @@ class TorchEngine(Engine):
         residual = torch.hstack([model.centre_residual(arrays, moved), model.clock_residual(arrays, clock)])
         (by_camera,) = jacobians(residual, [camera])
         cameras = torch.block_diag(*(by_camera.mT @ by_camera))  # type: ignore[no-untyped-call]
-        own, before = leaf(estimate.frame_state), leaf(estimate.frame_state)
+        own = leaf(estimate.frame_state)
+        before = leaf(estimate.frame_state)
         frame = own.new_zeros(arrays.frame_count, *2 * (len(arrays.states),))
         if not arrays.states:
             return PriorBlocks(cameras, frame, frame)
@@ -196,7 +202,8 @@ class TorchEngine(Engine):
 
     def linearise(self, run: Run, poses: Tensor, corners_map: Tensor, robust: Loss) -> tuple[Tensor, Tensor]:
         """Jacobians (k, 2, 6) and (k, 2, 2) of a run's residuals by pair and corner, times root weights."""
-        tangent, corner = leaf(poses.new_zeros(len(run.pair), 6)), leaf(corners_map[run.corner])
+        tangent = leaf(poses.new_zeros(len(run.pair), 6))
+        corner = leaf(corners_map[run.corner])
         points = model.points_in_camera(model.rigid(tangent) @ poses[run.pair], corner)
         residual = model.corner_residual(points, run.measured, run.root_information)
         by_pair, by_corner = jacobians(residual, [tangent, corner])
@@ -206,9 +213,11 @@ class TorchEngine(Engine):
 
     def eliminate(self, system: ReducedSystem, estimate: Estimate, robust: Loss) -> TorchLinearised:
         """Linearise, and subtract the eliminated corners from the reduced system."""
-        arrays, poses = self.arrays, self.poses(estimate).flatten(0, 1)
+        arrays = self.arrays
+        poses = self.poses(estimate).flatten(0, 1)
         own = poses.new_zeros(arrays.pair_count, 6, 6)
-        corner, coupling = leaf(estimate.corners_map), poses.new_empty(len(arrays.pair), 2, 6)
+        corner = leaf(estimate.corners_map)
+        coupling = poses.new_empty(len(arrays.pair), 2, 6)
         (surveyed,) = jacobians(model.control_residual(arrays, corner), [corner])
         blocks = surveyed.mT @ surveyed
         for run in arrays.runs():
@@ -220,7 +229,8 @@ class TorchEngine(Engine):
         own = own.view(arrays.camera_count, -1, 6, 6)
         tip = own.new_zeros(system.tip, system.tip)
         for n, run in enumerate(arrays.runs(_BLOCK if arrays.states else None)):
-            of_run, part = factor.part(run.corners), coupling[run.observations]
+            of_run = factor.part(run.corners)
+            part = coupling[run.observations]
             by_camera = of_run.solve(system.spread.by_camera(run, part)).flatten(0, 1)
             tip.addmm_(by_camera.mT, by_camera)
             if arrays.states:
@@ -236,8 +246,10 @@ class TorchEngine(Engine):
 
     def _by_length(self, estimate: Estimate) -> tuple[Tensor, Tensor]:
         """Derivatives (M, 2) of the lengths' residuals by first and second corner."""
-        known, corners = self.arrays.lengths, estimate.corners_map
-        first, second = leaf(corners[known.first]), leaf(corners[known.second])
+        known = self.arrays.lengths
+        corners = estimate.corners_map
+        first = leaf(corners[known.first])
+        second = leaf(corners[known.second])
         residual = model.length_residual(self.arrays, first, second)
         by_first, by_second = jacobians(residual[:, None], [first, second])
         return by_first[:, 0], by_second[:, 0]
@@ -255,13 +267,16 @@ class TorchLinearised(Linearised):
 
     def evaluate(self, step: Gradient, tangents: Tensor, own: Tensor) -> Evaluated:
         """Evaluate after a step of the reduced unknowns: x_c = L^-T (y_c - B x_r)."""
-        motion, base, factor = tangents.flatten(0, 1)[..., None], self.estimate, self.corner_factor
+        motion = tangents.flatten(0, 1)[..., None]
+        base = self.estimate
+        factor = self.corner_factor
         moved = [
             run.sum_by_corner((self.couplings[run.observations] @ motion[run.pair])[..., 0])
             for run in self.engine.arrays.runs()
         ]
         corners = base.corners_map + factor.solve_transposed(own - factor.solve(torch.cat(moved)))
-        state, clock = base.frame_state + step.frame_state, base.clock_s + step.clock_s
+        state = base.frame_state + step.frame_state
+        clock = base.clock_s + step.clock_s
         at = Estimate(base.cam_from_vehicle, state, corners, clock)
         estimate, terms, gradient = self.engine.cost_and_gradient(at, step.extrinsic, self.robust)
         return Evaluated(estimate, terms, gradient, *self.carry(gradient.corners_map))
@@ -297,8 +312,10 @@ def _residual(run: Run, poses: Tensor, corners_map: Tensor) -> Tensor:
 
 def _by_frame(system: ReducedSystem, run: Run, tiles: tuple[int, ...], by_state: Tensor) -> Tensor:
     """W' of a block by the frame states of its tiles, (n, 2, tiles * F * S)."""
-    per_tile, frame = system.plan.frames_per_tile, system.arrays.frame_of(run.pair)
-    index, slots = torch.tensor(tiles, device=frame.device), per_tile * len(tiles)
+    per_tile = system.plan.frames_per_tile
+    frame = system.arrays.frame_of(run.pair)
+    index = torch.tensor(tiles, device=frame.device)
+    slots = per_tile * len(tiles)
     slot = torch.searchsorted(index, frame // per_tile) * per_tile + frame % per_tile
     rows = by_state.new_zeros(run.corner_count * slots, *by_state.shape[1:])
     rows.index_add_(0, run.corner * slots + slot, by_state)
@@ -307,7 +324,8 @@ def _by_frame(system: ReducedSystem, run: Run, tiles: tuple[int, ...], by_state:
 
 def _subtract_block(system: ReducedSystem, tiles: tuple[int, ...], columns: Tensor, tip: Tensor) -> None:
     """Subtract the products of a block's frames (2 n, tiles * F * S) with each other and the cameras."""
-    matrix, position = system.matrix.tiles, system.plan.pattern.position
+    matrix = system.matrix.tiles
+    position = system.plan.pattern.position
     parts = zip((position[tile] for tile in tiles), columns.chunk(len(tiles), dim=1), strict=True)
     placed = sorted(parts, key=lambda part: part[0])
     for n, (column, first) in enumerate(placed):

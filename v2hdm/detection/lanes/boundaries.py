@@ -26,21 +26,29 @@ _ENDED, _GAP, _SOLID, _DASH = range(4)
 _DASH_STAGES = 3  # of a dash: its length is Erlang distributed, with a deviation of 58 % of the mean
 
 _STATES = _DASH + _DASH_STAGES
-_DASH_M, _GAP_M = 3.6, 5.1
+_DASH_M = 3.6
+_GAP_M = 5.1
 """Mean lengths of dashes and of the gaps between them, m, in the renders (train/scenes/paint)."""
 
-_SOLID_M, _DASHED_M, _ENDED_M = 100.0, 120.0, 60.0
+_SOLID_M = 100.0
+_DASHED_M = 120.0
+_ENDED_M = 60.0
 """Mean lengths, m, of solid lines, of rows of dashes, and of bare ground between lines on one curve; fitted
 to renders. After bare ground, a solid line is as likely as a row of dashes."""
 
-_CROSSING_WEIGHT, _CROSSING_EVEN, _CROSSING_RANGE = 0.05, -2.7, (-3.0, 6.7)
+_CROSSING_WEIGHT = 0.05
+_CROSSING_EVEN = -2.7
+_CROSSING_RANGE = (-3.0, 6.7)
 """A crossing of log odds x, clipped to the range, adds weight * (x - even) to a line's log likelihood. The
 weight is small since rows err together. Fitted to renders, as are those of paint."""
 
-_PAINT_WEIGHT, _PAINT_EVEN, _PAINT_RANGE = 0.3, -1.0, (-4.0, 4.0)
+_PAINT_WEIGHT = 0.3
+_PAINT_EVEN = -1.0
+_PAINT_RANGE = (-4.0, 4.0)
 """The same for paint and the log likelihoods of *solid* and *dash*."""
 
-_HALF_WIDTH_M, _LEAST_HALF_WIDTH_PX = 0.06, 4.0
+_HALF_WIDTH_M = 0.06
+_LEAST_HALF_WIDTH_PX = 4.0
 _ACROSS = np.linspace(-1.0, 1.0, 7)
 """Half width, m and at least px, and relative places across a curve at which its paint is sought."""
 
@@ -59,7 +67,8 @@ def with_spans(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> l
     """The lines through an image's points, each with its :class:`Span`."""
     if not lines:
         return []
-    camera, horizon = image.camera, image.horizon
+    camera = image.camera
+    horizon = image.horizon
     corners = (camera.info.height - 1.0) * np.array([[0.0, 1.0], [0.0, 1.0]])
     corners[1, 0] = camera.info.width - 1.0
     lowest = float(horizon.coordinates(camera.undistort(corners))[1].max())
@@ -81,7 +90,8 @@ def with_spans(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> l
     likelihood *= camera.inside(middle_px, 0)[..., None]
     states, total = _forward_backward(likelihood, step_m)
     length_m = (np.pad(step_m, [(0, 0), (0, 1)]) + np.pad(step_m, [(0, 0), (1, 0)])) / 2
-    present, painted = 1 - states[..., _ENDED], states[..., _SOLID:].sum(axis=2)
+    present = 1 - states[..., _ENDED]
+    painted = states[..., _SOLID:].sum(axis=2)
     each = zip(lines, present, painted, length_m, total.tolist(), strict=True)
     return [replace(line, span=Span(below, *rest)) for line, *rest in each]
 
@@ -128,7 +138,8 @@ def _forward_backward(likelihood: FloatArray, step_m: FloatArray) -> tuple[Float
     values, right, left, shares = _modes()
     move = np.maximum(((right * np.exp(values * step_m[..., None])[..., None, :]) @ left).real, 0.0)
     evidence = np.exp(likelihood)
-    forward, scale = np.empty_like(evidence), np.empty(evidence.shape[:2])
+    forward = np.empty_like(evidence)
+    scale = np.empty(evidence.shape[:2])
     state = np.broadcast_to(shares, evidence[:, 0].shape)
     for t in range(evidence.shape[1]):
         state = (state if t == 0 else (state[:, None] @ move[:, t - 1])[:, 0]) * evidence[:, t]
@@ -164,7 +175,8 @@ def _relation(line: Line, other: Line, points: LinePoints, image: LaneImage) -> 
     """Whether a line is apart from another, repeats or crosses it, or is its second strand."""
     assert line.span is not None
     assert other.span is not None
-    phi, px_per_m = image.horizon.basis(line.span.below), image.horizon.px_per_m * line.span.below
+    phi = image.horizon.basis(line.span.below)
+    px_per_m = image.horizon.px_per_m * line.span.below
     sigma_m, other_sigma_m = (each.curve.sigma(phi) / px_per_m for each in (line, other))
     offset_m = (line.curve.along(phi) - other.curve.along(phi)) / px_per_m
     known = np.maximum(sigma_m, other_sigma_m) < _CERTAIN_SIGMA_M
@@ -194,15 +206,19 @@ def _shown(line: Line, points: LinePoints, below: FloatArray) -> BoolArray:
 def draw(line: Line, points: LinePoints, image: LaneImage) -> LaneDetection | None:
     """A line's points in the image, near to far, with their standard deviations; None if fewer than two."""
     assert line.span is not None
-    camera, below, present = image.camera, line.span.below, line.span.present
+    camera = image.camera
+    below = line.span.below
+    present = line.span.present
     along, sigma = _followed(points, line, image, below)
     if line.strand is not None and line.strand.span is not None:
         other = line.strand.span.present
         beside, beside_sigma = _followed(points, line.strand, image, below)
         share = other / np.maximum(present + other, 1e-9)
-        along, sigma = along + share * (beside - along), sigma + share * (beside_sigma - sigma)
+        along = along + share * (beside - along)
+        sigma = sigma + share * (beside_sigma - sigma)
         present = np.maximum(present, other)
-    rows, drawn = np.arange(len(below)), np.flatnonzero(present > _EVEN)
+    rows = np.arange(len(below))
+    drawn = np.flatnonzero(present > _EVEN)
     if not len(drawn):
         return None
     points_px = camera.distort(image.horizon.pinhole_px(along, below))
@@ -220,7 +236,8 @@ def _followed(
 ) -> tuple[FloatArray, FloatArray]:
     """Position of a line along the horizon and its sigma (N,), px, ``at`` (N,) px below it."""
     phi = image.horizon.basis(at)
-    curve_sigma, along = line.curve.sigma(phi), line.curve.along(phi)
+    curve_sigma = line.curve.sigma(phi)
+    along = line.curve.along(phi)
     members = line.members
     off = points.along[members] - line.curve.along(points.phi[members])
     near = np.maximum(1 - np.abs(at[:, None] - points.below[members]) / _SMOOTH_PX, 0)

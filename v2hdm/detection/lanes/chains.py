@@ -48,7 +48,9 @@ def find_chains(points_px: FloatArray, odds: FloatArray) -> list[IntArray]:
     if not len(likely):
         return []
     begins = np.flatnonzero(np.diff(v_px, prepend=np.nan)).tolist()  # nan differs from any row
-    columns, indices, row_px = u_px.tolist(), likely.tolist(), v_px[begins].tolist()
+    columns = u_px.tolist()
+    indices = likely.tolist()
+    row_px = v_px[begins].tolist()
     open_chains: list[_Chain] = []
     done: list[_Chain] = []
     for begin, end, row in zip(begins, [*begins[1:], len(likely)], row_px, strict=True):

@@ -137,7 +137,8 @@ class Curve:
 def _completed_square(information: FloatArray, moment: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Quadratic form m' inv(A) m and log det A of A (..., 3, 3), m (..., 3): ten times as fast as LAPACK."""
     pivot0, below10, below20 = (information[..., k, 0] for k in range(3))
-    l10, l20 = below10 / pivot0, below20 / pivot0
+    l10 = below10 / pivot0
+    l20 = below20 / pivot0
     pivot1 = information[..., 1, 1] - l10 * below10
     l21 = (information[..., 2, 1] - l20 * below10) / pivot1
     pivot2 = information[..., 2, 2] - l20 * below20 - l21**2 * pivot1
@@ -165,10 +166,12 @@ class LinePoints:
         cls, image: LaneImage, points_px: FloatArray, odds: FloatArray, sigma_px: FloatArray, *, paint: bool
     ) -> LinePoints:
         """Points (N, 2) with standard deviations (N,): of ``paint``, or crossings of row anchors."""
-        horizon, pinhole_px = image.horizon, image.camera.undistort(points_px)
+        horizon = image.horizon
+        pinhole_px = image.camera.undistort(points_px)
         along, below = horizon.coordinates(pinhole_px)
         sigma = np.hypot(sigma_px, _MODEL_SIGMA_M * horizon.px_per_m * np.maximum(below, 0))
-        ground, is_paint = image.camera.ground(pinhole_px), np.full(len(odds), paint)
+        ground = image.camera.ground(pinhole_px)
+        is_paint = np.full(len(odds), paint)
         return cls(points_px, along, below, horizon.basis(below), sigma, odds, ground, is_paint)
 
     @classmethod
@@ -183,16 +186,20 @@ class LinePoints:
 
     def slopes(self, groups: list[IntArray]) -> FloatArray:
         """Px along the horizon per px down (N,) of groups of points, roughly one line each."""
-        members, ends = np.concatenate(groups), np.cumsum([len(group) for group in groups])
-        count, begins = np.diff(ends, prepend=0), [0, *ends[:-1]]
-        along, below = self.along[members], self.below[members]
+        members = np.concatenate(groups)
+        ends = np.cumsum([len(group) for group in groups])
+        count = np.diff(ends, prepend=0)
+        begins = [0, *ends[:-1]]
+        along = self.along[members]
+        below = self.below[members]
         down = below - np.repeat(np.add.reduceat(below, begins) / count, count)
         squared = np.add.reduceat(down**2, begins)
         return np.asarray(np.add.reduceat(down * along, begins) / np.maximum(squared, 1))
 
     def evidence(self, horizon: Horizon, groups: list[IntArray]) -> Evidence:
         """Evidence of N groups of points, roughly one line each."""
-        members, count = np.concatenate(groups), [len(group) for group in groups]
+        members = np.concatenate(groups)
+        count = [len(group) for group in groups]
         across = np.hypot(1, self.slopes(groups))
         sigma = self.sigma_px[members] * np.repeat(across, count) * np.sqrt(NEIGHBOURS)
         u = self.along[members] - horizon.centre_px
@@ -327,13 +334,15 @@ def _join(evidence: Evidence, groups: list[IntArray], road: Road) -> list[IntArr
             total[a] += total[b]
             total[b] = 0
         left[b] = False
-        gain[b], gain[:, b] = -np.inf, -np.inf
+        gain[b] = -np.inf
+        gain[:, b] = -np.inf
         # The evidence of b is zero now: its entry is that of the joined group alone.
         together = road.weigh(evidence[np.full(count, a)] + evidence)[0]
         alone[a] = together[b]
         left[a] = False
         others = np.flatnonzero(left)
         left[a] = True
-        low, high = np.minimum(others, a), np.maximum(others, a)
+        low = np.minimum(others, a)
+        high = np.maximum(others, a)
         gain[low, high] = together[others] - alone[a] - alone[others]
     return [groups[k] for k in np.flatnonzero(left)]

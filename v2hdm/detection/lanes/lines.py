@@ -77,7 +77,8 @@ def _chains(runs: FloatArray) -> list[FloatArray]:
     """Branches of a blob: its runs (R, 3), row, start and end column, linked where they overlap."""
     if len(runs) < _MIN_POINTS:
         return []
-    above, below = runs[:-1], runs[1:]
+    above = runs[:-1]
+    below = runs[1:]
     linked = (below[:, 0] == above[:, 0] + 1) & (above[:, 1] < below[:, 2]) & (below[:, 1] < above[:, 2])
     if linked.all():
         return [runs]

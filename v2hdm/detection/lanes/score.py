@@ -43,10 +43,12 @@ _UNKNOWN = (2.3, 0.4)  # features of the paint along a line without network outp
 _PLACES = 24  # along a line at which its paint is sampled
 _ON_M = np.linspace(-0.25, 0.25, 7)  # across it: paint, also of double lines, lies within
 _LEAST_WEIGHT = 0.05  # of places without paint, that of paint being one
-_LANE_M, _LANE_SIGMA_M = 3.2, 0.65  # lanes of roads are 2.5 to 4 m wide
+_LANE_M = 3.2
+_LANE_SIGMA_M = 0.65  # lanes of roads are 2.5 to 4 m wide
 _TOO_NEAR_M = 1.8  # lines nearer than this do not bound one lane
 _MOST_NEAR = 2.0  # more lines than this add nothing
-_CHANGE_M, _CHANGE_SHARE = 0.15, 0.06  # sigma of the distance of parallel lines, m, and relative to it
+_CHANGE_M = 0.15
+_CHANGE_SHARE = 0.06  # sigma of the distance of parallel lines, m, and relative to it
 
 
 def log_odds_alone(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> FloatArray:
@@ -71,7 +73,8 @@ def features_among(lines: Sequence[Line], points: LinePoints, image: LaneImage) 
 
 
 def _span_features(line: Line, points: LinePoints) -> tuple[float, float, float, float]:
-    span, own = line.span, points.below[line.members]
+    span = line.span
+    own = points.below[line.members]
     assert span is not None
     between = (span.below >= own.min()) & (span.below <= own.max())
     return (
@@ -89,8 +92,10 @@ def features_alone(lines: Sequence[Line], points: LinePoints, image: LaneImage) 
     members = np.concatenate([line.members for line in lines])
     count = np.array([len(line.members) for line in lines])
     begins = np.cumsum(count) - count
-    is_paint, odds = points.is_paint[members], points.odds[members]
-    at_px, ground = points.points_px[members], points.ground[members]
+    is_paint = points.is_paint[members]
+    odds = points.odds[members]
+    at_px = points.points_px[members]
+    ground = points.ground[members]
     size_m = np.maximum.reduceat(ground, begins) - np.minimum.reduceat(ground, begins)
     size = np.maximum.reduceat(at_px, begins) - np.minimum.reduceat(at_px, begins)
     size = size / image.camera.info.width
@@ -120,7 +125,8 @@ def _best_crossings(odds: FloatArray, begins: IntArray, count: IntArray) -> Floa
 
 def _paint_along(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> FloatArray:
     """Mean log odds of paint along each line between its points, and the share of dashes in that (N, 2)."""
-    output, horizon = image.output, image.horizon
+    output = image.output
+    horizon = image.horizon
     if output is None:
         return np.tile(_UNKNOWN, (len(lines), 1))
     own = [points.below[line.members] for line in lines]

@@ -38,21 +38,25 @@ TYPICAL_BLUR_PX = 0.75  # point spread of a focused camera, px, pixel aperture i
 
 _BLUR_SIGMA_PX = 0.2  # how far one marking's blur is from the typical one, px: motion, focus, frayed paint
 _BLUR_LIMITS_PX = (0.35, 3.0)
-_SEARCH_BLUR, _LEAST_SEARCH_BLUR_PX = 0.6, 1.5
+_SEARCH_BLUR = 0.6
+_LEAST_SEARCH_BLUR_PX = 1.5
 """Blur of the first steps, in distances of the grid's points and px: a wide one sees sides from far away."""
 
 _SEARCH_SIGMA = 0.1  # how far the network's outline is from a side's end before the search, marking lengths
 
-_CLOSURE_SHARE, _CLOSURE_M = 0.03, 0.005
+_CLOSURE_SHARE = 0.03
+_CLOSURE_M = 0.005
 """Standard deviation of the sum of opposite corners, in parts of the root of the area and at least in m.
 
 Stencils are true to 5 mm; a guess of the mounting that is 2 degrees off makes 3 % of a parallelogram.
 """
 
 # Where this share of a marking's pixels is clipped, its outline lies about so many blurs outside the paint.
-_BLOOM, _MUCH_CLIPPED = 1.2, 0.15
+_BLOOM = 1.2
+_MUCH_CLIPPED = 0.15
 
-_MOST_MOVED, _MOST_GROWTH = 0.5, 4.0
+_MOST_MOVED = 0.5
+_MOST_GROWTH = 4.0
 """A fit that moves its middle by more of its size, or grows or shrinks by more, follows something else."""
 
 _OUTLINE_SIGMA_PX = 2.5
@@ -61,24 +65,29 @@ _OUTLINE_SIGMA_PX = 2.5
 OPEN_SIGMA = 3.0  # a side cut by the image's border is unknown within this many lengths of the marking
 _BEYOND_PX = 6.0  # how far beyond the border a side that it cuts is started, px: farther than blur reaches
 
-_CONTRAST, _CONTRAST_SIGMA = 0.95, 1.0
+_CONTRAST = 0.95
+_CONTRAST_SIGMA = 1.0
 """Log contrast of paint over ground, as measured on asphalt, widened for worn and for fresh paint."""
 
 _MOST_CONTRAST = 4.0  # log contrast of white paint on the blackest ground
 _LIGHT_STEP = 0.4  # by how much the log light differs between knots: a shadow's border is a few of that
 
 # Least scatter at the first step of search and fit, halved at each: the next may explain what one rejects.
-_WIDE_SCATTER, _FINAL_SCATTER = 0.4, 0.1
+_WIDE_SCATTER = 0.4
+_FINAL_SCATTER = 0.1
 
 _MODEL_SIGMA_PX = 0.04
 """Error of a side along the pixels' rows, px, with no noise at all: a Gaussian is not quite a pixel's
 aperture."""
 
-_SEARCH_STEPS, _STEPS = 4, 8
+_SEARCH_STEPS = 4
+_STEPS = 8
 _MAX_STEP = 2.0  # longest step of a side, in blurs
-_SETTLED_PX, _FOUND_PX = 0.05, 0.3  # steps of fit and of search that are shorter than this are the last, px
+_SETTLED_PX = 0.05
+_FOUND_PX = 0.3  # steps of fit and of search that are shorter than this are the last, px
 _INSIGNIFICANT = 0.01  # and so are those by which chi-square was to fall by no more than this
-_BLUR, _K = 8, 9
+_BLUR = 8
+_K = 9
 _LIGHT = 10
 _SLOPE = _LIGHT + KNOTS
 _UNKNOWNS = _SLOPE + 1
@@ -109,8 +118,10 @@ _ALTERNATING = np.array([1.0, -1.0, 1.0, -1.0])
 _DIFFERENCE = np.diff(np.eye(KNOTS), axis=0)
 _ROUGHNESS = (_DIFFERENCE.T @ _DIFFERENCE + 1e-6 * np.eye(KNOTS)) / _LIGHT_STEP**2
 _PRIOR = np.zeros((_UNKNOWNS, _UNKNOWNS))
-_PRIOR[_BLUR, _BLUR], _PRIOR[_K, _K] = 1 / _BLUR_SIGMA_PX**2, 1 / _CONTRAST_SIGMA**2
-_PRIOR[_SLOPE, _SLOPE], _PRIOR[_LIGHT:_SLOPE, _LIGHT:_SLOPE] = 1 / _LIGHT_STEP**2, _ROUGHNESS
+_PRIOR[_BLUR, _BLUR] = 1 / _BLUR_SIGMA_PX**2
+_PRIOR[_K, _K] = 1 / _CONTRAST_SIGMA**2
+_PRIOR[_SLOPE, _SLOPE] = 1 / _LIGHT_STEP**2
+_PRIOR[_LIGHT:_SLOPE, _LIGHT:_SLOPE] = _ROUGHNESS
 """Information that the typical blur and contrast are of, and that light changes little."""
 
 _HELD = 1e9  # information of a blur that is held
@@ -177,7 +188,8 @@ class Fit:
 
 def _ends(by_side: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Variances (M, 4) of each side's start and end, and their covariance."""
-    start, end = by_side[:, _CORNER, _CORNER], by_side[:, _CORNER + 4, _CORNER + 4]
+    start = by_side[:, _CORNER, _CORNER]
+    end = by_side[:, _CORNER + 4, _CORNER + 4]
     return start, end, by_side[:, _CORNER, _CORNER + 4]
 
 
@@ -293,7 +305,8 @@ class _State:
         count = len(blur_px)
         outline = quad.corners, outline_sigma_px, *_closure(quad.corners, frames)
         known = Quad(quad.corners.copy()), blur_px, expected_blur_px, *outline
-        contrast, light = np.full(count, _CONTRAST), np.full((count, KNOTS), np.nan)
+        contrast = np.full(count, _CONTRAST)
+        light = np.full((count, KNOTS), np.nan)
         return cls(*known, contrast, contrast.copy(), light, np.zeros(count))
 
     def settle(self, lattice: Lattice, steps: int, paint: np.ndarray | None = None) -> _System:
@@ -315,7 +328,8 @@ class _State:
             if not len(moving):
                 break
             if len(moving) < len(running):
-                running, lattice = running[moving], lattice.take(moving)
+                running = running[moving]
+                lattice = lattice.take(moving)
                 paint = None if paint is None else paint[moving]
         self.quad = Quad(self.quad.corners)
         return system
@@ -327,7 +341,8 @@ class _State:
     def step(self, lattice: Lattice, paint: np.ndarray | None, least_scatter: float) -> _System:
         """One Gauss-Newton step, in place; the robust scale is ``least_scatter`` or more."""
         coverage, by_shape = blurred_coverage(self.quad, lattice.points, self.blur_px)
-        hats, across = lattice.hats, lattice.across
+        hats = lattice.hats
+        across = lattice.across
         if np.isnan(self.light).any():
             self._first_light(lattice, coverage)
         gain = np.exp(self.contrast).astype(np.float32)[:, None] - 1
@@ -375,7 +390,8 @@ class _State:
         contrast = found[:, KNOTS]
         # Yellow paint is darker than the ground in blue.
         self.expected_contrast = np.where(contrast < 0, -_CONTRAST, _CONTRAST)
-        self.light, self.contrast = found[:, :KNOTS], np.clip(contrast, -_MOST_CONTRAST, _MOST_CONTRAST)
+        self.light = found[:, :KNOTS]
+        self.contrast = np.clip(contrast, -_MOST_CONTRAST, _MOST_CONTRAST)
 
     def open_gap(self) -> FloatArray:
         """The sum p0 - p1 + p2 - p3 of the corners on the ground (M, 2), in its deviation."""
@@ -384,7 +400,8 @@ class _State:
 
     def _add_priors(self, information: FloatArray, gradient: FloatArray, *, hold_blur: bool) -> None:
         """Add the outline, the typical blur and contrast, and that light changes little."""
-        normal, off = self.quad.normal, self.outline - self.quad.corners
+        normal = self.quad.normal
+        off = self.outline - self.quad.corners
         start = (off * normal).sum(axis=-1)
         end = (following(off) * normal).sum(axis=-1)
         stiffness = 1 / self.outline_sigma_px**2
@@ -431,7 +448,8 @@ def _statistics(
     )
     lengthwise = state.quad.lengthwise
     pairs = (side_sigma[:, :2] + side_sigma[:, 2:]) / 2
-    long, end = np.where(lengthwise, pairs[:, 0], pairs[:, 1]), np.where(lengthwise, pairs[:, 1], pairs[:, 0])
+    long = np.where(lengthwise, pairs[:, 0], pairs[:, 1])
+    end = np.where(lengthwise, pairs[:, 1], pairs[:, 0])
     columns = {
         "contrast": state.contrast,
         "fit_scatter": np.log(np.sqrt((system.scatter**2).mean(axis=1)) / contrast),

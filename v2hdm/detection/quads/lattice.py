@@ -37,13 +37,16 @@ _INSIDE_PX = 4.0
 _MEDIAN_STRIDE = 3
 _MAX_PIXELS = 350
 _MOST_PIXELS = 600  # a band of more pixels is thinned: all markings of an image are padded to the most
-_MAX_BETWEEN, _MAX_AT_ENDS = 160, 260
+_MAX_BETWEEN = 160
+_MAX_AT_ENDS = 260
 _END_PX = 2.0
 _MOST_ENDS = 1 / 3
 """Ends of at most this share of the length make a quadrilateral slim; they reach that far past corners."""
 
-_SEARCH_ALONG, _SEARCH_ACROSS = 40, 12  # rows and columns of the coarse grid on which a fit begins
-_MARGIN_ALONG, _MARGIN_ACROSS = 0.2, 0.4  # how far it reaches beyond a quadrilateral, in lengths and widths
+_SEARCH_ALONG = 40
+_SEARCH_ACROSS = 12  # rows and columns of the coarse grid on which a fit begins
+_MARGIN_ALONG = 0.2
+_MARGIN_ACROSS = 0.4  # how far it reaches beyond a quadrilateral, in lengths and widths
 
 _GREY_FIRST = 1.2  # how many times clearer red or blue must be for grey to be left: it has the least noise
 
@@ -120,7 +123,8 @@ def lay_grid(
     looked = (light.reshape(3, *shape), use.reshape(shape).astype(np.float32), clipped.reshape(shape))
     paint = as_probability(patches.output.odds_at(pixels)).astype(np.float32)
     spacing = quad.length.max(axis=1) * (1 + 2 * _MARGIN_ALONG) / _SEARCH_ALONG
-    none, count = np.zeros((shape[0], 0, shape[1]), dtype=np.intp), np.full(shape[0], shape[1])
+    none = np.zeros((shape[0], 0, shape[1]), dtype=np.intp)
+    count = np.full(shape[0], shape[1])
     return Lattice.about(frames, quad, pixels, looked, none, count), paint, spacing
 
 
@@ -132,18 +136,21 @@ def lay_lattice(patches: Patches, frames: LensFrames, corners_px: FloatArray) ->
     size = np.ceil(corners_px.max(axis=1)).astype(np.intp) + spare + 1 - low
     in_box = Quad(corners_px - low[:, None])
     columns, rows = _columns_and_rows(in_box, size)
-    across, down = columns.shape[1], rows.shape[1]
+    across = columns.shape[1]
+    down = rows.shape[1]
     band = _in_band(in_box, bow_px, columns, rows, size)
     cell = np.flatnonzero(band)
     marking, within = np.divmod(cell, across * down)
     i, j = np.divmod(within, across)
-    u, v = low[marking, 0] + columns[marking, j], low[marking, 1] + rows[marking, i]
+    u = low[marking, 0] + columns[marking, j]
+    v = low[marking, 1] + rows[marking, i]
     count = np.bincount(marking, minlength=len(low))
     place = np.arange(len(cell)) - np.repeat(np.cumsum(count) - count, count)
     thin = -(-count // _MOST_PIXELS)
     kept = place % thin[marking] == 0
     cell, marking, i, j, u, v = (part[kept] for part in (cell, marking, i, j, u, v))
-    place, count = place[kept] // thin[marking], -(-count // thin)
+    place = place[kept] // thin[marking]
+    count = -(-count // thin)
     shape = len(low), max(1, int(count.max()))
     pixels = np.repeat(corners_px.mean(axis=1)[:, None], shape[1], axis=1)
     pixels[marking, place] = np.column_stack([u, v])
@@ -159,15 +166,18 @@ def lay_lattice(patches: Patches, frames: LensFrames, corners_px: FloatArray) ->
     light, use, clipped = patches.look(u, v, marking)
     planes = np.zeros((3, *shape), dtype=np.float32)
     planes[:, marking, place] = light
-    used, limited = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.bool_)
-    used[marking, place], limited[marking, place] = use, clipped
+    used = np.zeros(shape, dtype=np.float32)
+    limited = np.zeros(shape, dtype=np.bool_)
+    used[marking, place] = use
+    limited[marking, place] = clipped
     quad = Quad(frames.from_image(corners_px))
     return Lattice.about(frames, quad, pixels, (planes, used, limited), neighbours, count)
 
 
 def _clearest(light: np.ndarray, used: np.ndarray, inside: np.ndarray) -> np.ndarray:
     """Log grey, red or blue (M, N) of (3, M, N), in which inside and outside differ most: yellow in blue."""
-    apart, variance = np.float32(0), np.float32(0)
+    apart = np.float32(0)
+    variance = np.float32(0)
     for part, sign in ((inside * used, 1), ((1 - inside) * used, -1)):
         count = np.maximum(part.sum(axis=1), 1)
         mean = (light * part).sum(axis=2) / count
@@ -207,14 +217,17 @@ def _columns_and_rows(quad: Quad, size: np.ndarray) -> tuple[np.ndarray, np.ndar
     """
     each = np.arange(len(size))
     along = np.where(size[:, 0] >= size[:, 1], 0, 1)
-    longest, area = quad.length.max(axis=1), quad.area
+    longest = quad.length.max(axis=1)
+    area = quad.area
     band = area + _OUTSIDE_PX * (quad.length.sum(axis=1) + 4 * _OUTSIDE_PX)
     band -= np.maximum(longest - 2 * _INSIDE_PX, 0) * np.maximum(area / longest - 2 * _INSIDE_PX, 0)
     ratio = np.maximum(band / _MAX_PIXELS, 1.0)
     longer = np.ceil(ratio / np.maximum(ratio / 4, 1))
     step = np.empty_like(size)
-    step[each, along], step[each, 1 - along] = longer, np.ceil(ratio / longer)
-    place, extent = np.sort(quad.corners[each, :, along], axis=1), size[each, along]
+    step[each, along] = longer
+    step[each, 1 - along] = np.ceil(ratio / longer)
+    place = np.sort(quad.corners[each, :, along], axis=1)
+    extent = size[each, along]
     head = np.ceil(np.minimum(place[:, 1], place[:, 0] + quad.width) + _END_PX).astype(np.intp)
     tail = np.floor(np.maximum(place[:, 2], place[:, 3] - quad.width) - _END_PX).astype(np.intp)
     slim = (step[each, along] > 1) & (head + extent - tail < _MOST_ENDS * extent)
@@ -235,12 +248,18 @@ def _columns_and_rows(quad: Quad, size: np.ndarray) -> tuple[np.ndarray, np.ndar
 def _steps(bounds: np.ndarray, step: np.ndarray, outer: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Places (M, n) up to ``size`` (M,): every ``step``-th within ``bounds`` (M, 2), else ``outer``-th."""
     head, tail = bounds.T
-    first, between = -(-head // outer), -(-(tail - head) // step)
+    first = -(-head // outer)
+    between = -(-(tail - head) // step)
     count = first + between + np.maximum(-(-(size - tail) // outer), 0)
     k = np.arange(int(count.max()) + 1)
-    head, tail, step, outer = head[:, None], tail[:, None], step[:, None], outer[:, None]
-    first, between = first[:, None], between[:, None]
-    middle, last = head + (k - first) * step, tail + (k - first - between) * outer
+    head = head[:, None]
+    tail = tail[:, None]
+    step = step[:, None]
+    outer = outer[:, None]
+    first = first[:, None]
+    between = between[:, None]
+    middle = head + (k - first) * step
+    last = tail + (k - first - between) * outer
     return np.asarray(np.where(k < first, k * outer, np.where(k < first + between, middle, last)))
 
 
@@ -249,13 +268,17 @@ def _in_band(
 ) -> BoolArray:
     """Which pixels (M, H, W) of a lattice are near a side, bowed by up to ``bow_px`` (M,), within the box."""
     band = np.zeros((len(size), rows.shape[1], columns.shape[1]), dtype=np.bool_)
-    widths, heights = (columns < size[:, :1]).sum(axis=1), (rows < size[:, 1:]).sum(axis=1)
+    widths = (columns < size[:, :1]).sum(axis=1)
+    heights = (rows < size[:, 1:]).sum(axis=1)
     outward = quad.outward.astype(np.float32)
-    spare, columns, rows = bow_px.astype(np.float32), columns.astype(np.float32), rows.astype(np.float32)
+    spare = bow_px.astype(np.float32)
+    columns = columns.astype(np.float32)
+    rows = rows.astype(np.float32)
     # One by one: the largest box is many times as large as most.
     for m, (width, height) in enumerate(zip(widths.tolist(), heights.tolist(), strict=True)):
         by_u, by_v, offset = outward[m].T[:, :, None]
-        across, down = by_u * columns[m, :width], by_v * rows[m, :height] + offset
+        across = by_u * columns[m, :width]
+        down = by_v * rows[m, :height] + offset
         reach = (down[:, :, None] + across[:, None]).max(axis=0)
         band[m, :height, :width] = (reach < spare[m] + _OUTSIDE_PX) & (reach > -spare[m] - _INSIDE_PX)
     return band
@@ -304,7 +327,8 @@ def blurred_coverage(
     grows; all float32. ``points`` (M, 3, N) are pixel centres (u, v, 1) from a point near each quadrilateral,
     ``blur_px`` the point spread's sigma, pixel aperture included.
     """
-    tangent, length = quad.tangent, quad.length
+    tangent = quad.tangent
+    length = quad.length
     per_blur = 1 / np.reshape(blur_px, (-1, 1, 1))
     # Rows of a matrix that takes (u, v, 1) to the outward distance, and to the side's start and end.
     rows = np.empty((3, len(tangent), 4, 3))
@@ -387,7 +411,8 @@ def pixel_weights(
     scale = np.maximum(1.4826 * lattice.median_used(size, use), max(_MIN_SCATTER, least_scatter))
     robust = use / (1 + (size / (_CAUCHY * scale[:, None])) ** 2)
     square = robust * residual * residual
-    total, count = square.sum(axis=1), robust.sum(axis=1)
+    total = square.sum(axis=1)
+    count = robust.sum(axis=1)
     shared = total / np.maximum(count, 1)
     by_side = np.stack([square, robust], axis=1) @ lattice.of_side.swapaxes(1, 2)
     variance = (by_side[:, 0] + _SHARED_PIXELS * shared[:, None]) / (by_side[:, 1] + _SHARED_PIXELS)

@@ -67,7 +67,9 @@ class Patches:
     ):
         self.output = output
         self._last_px = np.array([image_bgr.shape[1] - 1, image_bgr.shape[0] - 1])
-        self._image, self._owner, self._own = np.ascontiguousarray(image_bgr), owner, own
+        self._image = np.ascontiguousarray(image_bgr)
+        self._owner = owner
+        self._own = own
         self._linear_response = camera.camera.linear_response
 
     def look(
@@ -76,9 +78,11 @@ class Patches:
         """Log grey, red and blue (3, n) of pixels of markings (n,), which take part, which are clipped."""
         last_u, last_v = self._last_px.tolist()
         use = (u >= 0) & (u <= last_u) & (v >= 0) & (v <= last_v)
-        u, v = np.clip(u, 0, last_u), np.clip(v, 0, last_v)
+        u = np.clip(u, 0, last_u)
+        v = np.clip(v, 0, last_v)
         coded = self._image.reshape(-1, 3).take(v * (last_u + 1) + u, axis=0)
-        (rows, columns), stride = self._owner.shape, self.output.stride
+        (rows, columns) = self._owner.shape
+        stride = self.output.stride
         row = np.clip((v - self.output.top) // stride, 0, rows - 1)
         owner = self._owner.take(row * columns + np.minimum(u // stride, columns - 1))
         first, last = self._own.take(marking, axis=0).T
@@ -160,7 +164,8 @@ class ImageQuads(Quad):
             return cls(corners_px, np.zeros(len(corners_px), dtype=np.bool_), None)
         frames = LensFrames.about(camera, corners_px)
         bowed = frames.bow_px(corners_px) > _BOW_PX
-        frames, corners = frames.take(bowed), corners_px.copy()
+        frames = frames.take(bowed)
+        corners = corners_px.copy()
         corners[bowed] = frames.from_image(corners_px[bowed])
         return cls(corners, bowed, frames)
 

@@ -21,24 +21,30 @@ from v2hdm.geometry.planar import following, is_convex_px, quad_from_hull, recta
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 _MIN_CELLS = 5  # blobs of fewer cells are noise: their outline is not worth four corners
-_LEAST_SHARE, _LEAST_SYMBOL_SHARE = 0.15, 0.25
+_LEAST_SHARE = 0.15
+_LEAST_SYMBOL_SHARE = 0.25
 """Where two groups of classes hold this much of a blob, two markings touch. The head is more of an arrow."""
 
-_SURE, _DOUBTFUL = 2.0, -2.0
+_SURE = 2.0
+_DOUBTFUL = -2.0
 """Log odds at which paint is sure, and down to which it is in doubt.
 
 Markings that nearly touch come apart in sure paint; doubtful paint joins parts of one that a shadow divides.
 """
 
-_LEAST_SURE, _MOST_SURE = 0.2, 0.6
+_LEAST_SURE = 0.2
+_MOST_SURE = 0.6
 """A piece of doubtful paint is of use if this much of it is likely, and news if no more than that."""
 
 _MOST_PARTS = 12  # parts that are looked at of one piece: more are the grains of bad light
 _OUTLINE_SCALE = 4
-_OUTLINE_SIGMA_PX, _REACH_PX, _STEP_PX = 2.0, 6.0, 0.5
+_OUTLINE_SIGMA_PX = 2.0
+_REACH_PX = 6.0
+_STEP_PX = 0.5
 """How far the network's outline is from an edge of paint; how far, and in what steps, that is looked for."""
 
-_EDGE_PX, _LEAST_CONTRAST = 2.0, 0.25
+_EDGE_PX = 2.0
+_LEAST_CONTRAST = 0.25
 """Half the width of an edge in the image, px: its blur. And the share of an outline's median contrast that
 there is at an edge: beside paint that is half worn there is half of it, where paint runs on there is none."""
 
@@ -55,13 +61,16 @@ _VOTES = 3.0
 130 photographs for validation, 1 loses small ones."""
 
 _SYMBOL_ODDS = float(np.log(859 / 5548))  # arrows among other labelled markings of the photographs
-_NAMED_ODDS, _MISSED_ODDS = float(np.log(0.79 / 0.01)), float(np.log(0.99 / 0.21))
+_NAMED_ODDS = float(np.log(0.79 / 0.01))
+_MISSED_ODDS = float(np.log(0.99 / 0.21))
 """Log odds by a vote for and against a symbol: of arrows .79 of the paint is named so, of lines .01.
 
 Shares of 39 arrows and 62 lines of 24 px and more, on photographs.
 """
 
-_NAMED_OF_SYMBOL, _SELDOM_NAMED, _NAMED_RIGHTLY = {"diamond": 0.4, "lane": 0.1}, 0.02, 0.8
+_NAMED_OF_SYMBOL = {"diamond": 0.4, "lane": 0.1}
+_SELDOM_NAMED = 0.02
+_NAMED_RIGHTLY = 0.8
 """Shares of an arrow's paint that are named of these groups, and of any other; of a marking's, of its own.
 
 Of 160 views of arrows in rendered port 2, whose shafts are taken for dashes less often than in photographs.
@@ -133,7 +142,8 @@ class Proposal:
 
         A shaft may be taken for a dash, and a head for a diamond, but hardly either for a stop line.
         """
-        cells, odds = np.count_nonzero(self.blob.level > 0), -_TOUCHING
+        cells = np.count_nonzero(self.blob.level > 0)
+        odds = -_TOUCHING
         alike = catalogue.of_family(SYMBOL, OTHER)
         for part in parts:
             if not part.blob.parts and part.blob.kind not in alike:
@@ -263,7 +273,8 @@ def find_blobs(
         parts = _split(inside, level[box], output, box, groups, votes[index])
         scores = dict(zip(output.classes, score[:, index].tolist(), strict=True))
         outline_px = _origin_px(output, 0, 0) + output.stride * outlines[index]
-        signed, origin_px = _signed(inside, level[box]), _origin_px(output, box[0].start, box[1].start)
+        signed = _signed(inside, level[box])
+        origin_px = _origin_px(output, box[0].start, box[1].start)
         whole = Blob(scores, signed, origin_px, output.stride, outline_px, parts=len(parts))
         blobs.append(replace(whole, traced=not any(part.traced for part in parts)))
         owner[box][inside] = len(blobs)
@@ -292,7 +303,8 @@ def _doubtful(
 ) -> tuple[np.ndarray, np.ndarray, IntArray]:
     """Labels (h, w) of doubtful paint, their statistics, the label of each piece (B,), 0 if the same area."""
     doubtful = (level > _DOUBTFUL).view(np.uint8)
-    doubtful[[0, -1]], doubtful[:, [0, -1]] = 0, 0
+    doubtful[[0, -1]] = 0
+    doubtful[:, [0, -1]] = 0
     # Labels of 16 bits take a third of the time.
     _, labels, stats, _ = cv2.connectedComponentsWithStats(doubtful, ltype=cv2.CV_16U)
     if not contours:
@@ -335,8 +347,11 @@ def _class_scores(
 
 def _outlines(level: np.ndarray, piece: np.ndarray, count: int) -> list[FloatArray]:
     """Points (N, 2), (column, row), of each piece's outline: where the level falls to zero beside it."""
-    pieces, levels, columns = piece.ravel(), level.ravel(), piece.shape[1]
-    points, owners = [], []
+    pieces = piece.ravel()
+    levels = level.ravel()
+    columns = piece.shape[1]
+    points = []
+    owners = []
     # The frame is empty, so that the step from the end of one row to the start of the next crosses nothing.
     for step in (columns, 1):
         here = np.flatnonzero(pieces[:-step] != pieces[step:])

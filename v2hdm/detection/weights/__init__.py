@@ -77,7 +77,8 @@ def _problem(folder: Path) -> str | None:
     """The defect of a folder's files, in one line; None if they belong together."""
     files = read_manifest(folder)["files"]
     for name, command in COMMANDS.items():
-        path, problem = folder / name, None
+        path = folder / name
+        problem = None
         if not path.is_file():
             problem = f"no such file; install v2hdm again, or make it with `{command}`"
         elif digest(path) != files[name]["sha256"]:

@@ -221,7 +221,8 @@ def _read_colmap(document: Document, name: str) -> CameraInfo:
         raise DriveError(f"{where}: {kind} has {focals + 2 + coefficients} parameters; restore the file")
     matrix = _matrix(values[0], values[focals - 1], *(values[focals : focals + 2] - 0.5))
     lens = _complete(model, values[focals + 2 :].tolist())
-    size, size_at = (int(width), int(height)), [f"{where}: WIDTH", f"{where}: HEIGHT"]
+    size = (int(width), int(height))
+    size_at = [f"{where}: WIDTH", f"{where}: HEIGHT"]
     return _camera(name, size, size_at, matrix, lens, where)
 
 
@@ -234,7 +235,8 @@ def _kalibr_names(document: Document) -> list[str]:
 
 
 def _read_kalibr(document: Document, name: str) -> CameraInfo:
-    where, entry = f"{document.path}: {name}", document.entries[name]
+    where = f"{document.path}: {name}"
+    entry = document.entries[name]
     needed = ("camera_model", "intrinsics", "distortion_model", "resolution")
     _need(entry, needed, where, "take the camchain that Kalibr wrote")
     projection = take_text(entry["camera_model"], f"{where}, camera_model", DriveError)
@@ -242,7 +244,8 @@ def _read_kalibr(document: Document, name: str) -> CameraInfo:
         lens_name = _KALIBR_PROJECTIONS.get(projection, repr(projection))
         raise _beyond(where, lens_name, "pinhole-radtan or pinhole-equi")
     model = take_text(entry["distortion_model"], f"{where}, distortion_model", DriveError)
-    given, at = entry.get("distortion_coeffs"), f"{where}, distortion_coeffs"
+    given = entry.get("distortion_coeffs")
+    at = f"{where}, distortion_coeffs"
     values = [] if given in (None, []) else take_array(given, (-1,), at, DriveError).tolist()
     if model in ("equidistant", "equi"):
         lens = _equidistant(values, at)
@@ -256,7 +259,9 @@ def _read_kalibr(document: Document, name: str) -> CameraInfo:
 
 
 def _read_opencv(document: Document, name: str) -> CameraInfo:
-    where, entries, sides = str(document.path), document.lower, ("image_width", "image_height")
+    where = str(document.path)
+    entries = document.lower
+    sides = ("image_width", "image_height")
     if "xi" in entries:
         raise _beyond(where, "omnidirectional (xi)", "cv2.calibrateCamera or cv2.fisheye.calibrate")
     _need(entries, ["distortion_coefficients"], where, "add it, with zeros for a pinhole camera")
@@ -291,7 +296,8 @@ def _message_names(document: Document) -> list[str]:
 
 
 def _read_message(document: Document, name: str) -> CameraInfo:
-    where, entries = str(document.path), document.lower
+    where = str(document.path)
+    entries = document.lower
     _need(entries, ("k", "d"), where, "write the message to the file again")
     region = _mapping(entries.get("roi"))
     fields = SimpleNamespace(

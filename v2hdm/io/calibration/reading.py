@@ -171,7 +171,8 @@ _MOUNTING = ("xyz_m", "rpy_deg")
 _SINGULAR = 1e-12  # reciprocal condition number, rows and columns scaled to unit norm
 _ROTATION_TOLERANCE = 1e-4
 _ROI_SAMPLES = 8  # points along each edge of a region of interest that are looked for in the image
-_ROI_M, _ROI_HALF_WIDTH_M = (2.0, 20.0), 5.0  # default region of interest, ahead of a camera: from, to
+_ROI_M = (2.0, 20.0)
+_ROI_HALF_WIDTH_M = 5.0  # default region of interest, ahead of a camera: from, to
 _STEEPEST_RAY = 0.999
 
 
@@ -259,12 +260,14 @@ def _in_image(info: CameraInfo, rays_cam: FloatArray) -> BoolArray:
 def roi_of_ipm(info: CameraInfo, ipm: FloatArray) -> FloatArray:
     """The region of interest (4, 2) of a camera for which none is stated: a rectangle where it looks."""
     vehicle_from_cam = inverse(extrinsic_from_ipm(info, ipm))
-    forward, down = vehicle_from_cam[:2, 2], vehicle_from_cam[:2, 1]
+    forward = vehicle_from_cam[:2, 2]
+    down = vehicle_from_cam[:2, 1]
     # A camera that looks straight down has its image's top ahead.
     along = forward if np.linalg.norm(forward) > np.sqrt(1 - _STEEPEST_RAY**2) else -down
     along = along / np.linalg.norm(along)
     left = np.array([-along[1], along[0]])
-    (near, far), half = _ROI_M, _ROI_HALF_WIDTH_M
+    (near, far) = _ROI_M
+    half = _ROI_HALF_WIDTH_M
     corners = [(near, -half), (far, -half), (far, half), (near, half)]
     return np.array([vehicle_from_cam[:2, 3] + ahead * along + side * left for ahead, side in corners])
 

@@ -62,7 +62,8 @@ def write_calibration(
 
 def _entries(calibration: Calibration) -> dict[str, Any]:
     """The entries that files with all of a calibration share: numbers, words and arrays."""
-    info, covariance = calibration.info, calibration.covariance
+    info = calibration.info
+    covariance = calibration.covariance
     return {
         "camera_name": info.name,
         "image_width": info.width,
@@ -118,7 +119,8 @@ def urdf(calibration: Calibration, about: Provenance) -> str:
     joint = ET.SubElement(robot, "joint", name=f"{frame}_joint", type="fixed")
     ET.SubElement(joint, "parent", link=VEHICLE_FRAME)
     ET.SubElement(joint, "child", link=frame)
-    xyz, rpy = vehicle_from_cam[:3, 3].tolist(), euler_from_rotation(vehicle_from_cam[:3, :3]).tolist()
+    xyz = vehicle_from_cam[:3, 3].tolist()
+    rpy = euler_from_rotation(vehicle_from_cam[:3, :3]).tolist()
     ET.SubElement(joint, "origin", xyz=" ".join(map(repr, xyz)), rpy=" ".join(map(repr, rpy)))
     comment = _comments(calibration, about).replace("--", "- -")
     return xml_text(robot, "  ", f"<!--\n{comment}-->\n")

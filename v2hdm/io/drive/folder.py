@@ -78,7 +78,8 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
     for name, (entry, read_info, list_images) in planned.items():
         # Many tools call every camera they calibrate alike: the drive's own name for it holds.
         named = replace(read_info(), name=name)
-        listed, place = list_images(), f"{where}: camera '{name}'"
+        listed = list_images()
+        place = f"{where}: camera '{name}'"
         read_out_s = _take_read_out(entry, listed.stamp_s, f"{place}, read_out_s")
         cameras[name] = replace(_read_camera(entry, named, path, place), read_out_s=read_out_s)
         files.append(listed)
@@ -110,7 +111,8 @@ def _read_camera(entry: dict[str, Any], info: CameraInfo, root: Path, where: str
         if not ipm:
             raise DriveError(f"{where}, ipm: no matrix; give one of: {', '.join(reading.IPM_NAMES)}")
     else:
-        (key,), guess = guesses, entry[guesses[0]]
+        (key,) = guesses
+        guess = entry[guesses[0]]
         guess = reading.take_mounting(guess, f"{where}, mounting") if key == "mounting" else guess
         ipm = {"estimated": reading.ipm_from_guess(info, guess, f"{where}, {key}")}
     linear = entry.get("linear_response", False)

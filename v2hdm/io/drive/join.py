@@ -68,7 +68,9 @@ def join_drives(drives: Sequence[Drive], apart: Collection[tuple[int, str]] = ()
         again = (f"{drive.name}-{number}" for number in count(2))
         names.append(next(name for name in chain([drive.name], again) if name not in names))
     cameras: dict[str, Camera] = {}
-    images, sessions, roads = [], [], []
+    images = []
+    sessions = []
+    roads = []
     for number, (drive, name) in enumerate(zip(drives, names, strict=True)):
         moved = [camera for session, camera in apart if session == number]
         own = {key: _name_of(key, one, name, cameras, key in moved) for key, one in drive.cameras.items()}
@@ -97,7 +99,8 @@ def join_drives(drives: Sequence[Drive], apart: Collection[tuple[int, str]] = ()
 
 def _same_rig(first: Camera, second: Camera) -> bool:
     """Whether two descriptions are of one camera on one mounting: lens exactly, guess by its sigmas."""
-    one, other = first.info, second.info
+    one = first.info
+    other = second.info
     if (one.width, one.height, one.distortion_model) != (other.width, other.height, other.distortion_model):
         return False
     if not np.allclose(one.intrinsic, other.intrinsic, rtol=0, atol=_SAME_LENS):
@@ -152,7 +155,8 @@ def _check_overlap(images: Sequence[Image], sessions: Sequence[Session]) -> None
     places = np.array([image.map_from_vehicle[:2, 3] for image in images])
     number = np.array([image.session for image in images])
     for session, one in enumerate(sessions):
-        own, others = places[number == session], places[number != session]
+        own = places[number == session]
+        others = places[number != session]
 
         def away_m(place: FloatArray, others: FloatArray = others) -> float:
             return float(np.linalg.norm(others - place, axis=1).min())

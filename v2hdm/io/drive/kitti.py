@@ -127,7 +127,8 @@ def read_kitti_drive(path: Path, options: ReadOptions) -> Drive:
         for name, (info, cam_from_imu) in calibrations.items()
     }
     on_road = geodetic_from_enu(origin_imu, np.array([[0.0, 0.0, -vehicle_from_imu[2, 3]]]))[0]
-    recorded, where = Trajectory(stamp_s, enu_from_vehicle), f"{path / 'oxts'}"
+    recorded = Trajectory(stamp_s, enu_from_vehicle)
+    where = f"{path / 'oxts'}"
     origin = GeodeticOrigin(*on_road.tolist())
     drive = Drive(path.name, path, cameras, (), _POSE_NOISE, origin, recorded=recorded)
     return assemble_drive(drive, files, options.max_gap_s, where, by_imu.mount_rad)

@@ -25,10 +25,12 @@ _log = logging.getLogger(__name__)
 # shorter waves are the suspension's, which at 1.5 Hz are 3 to 10 m long at 5 to 15 m/s. Under the second
 # heights are compared with the up-axis: short enough for a vehicle's squat at a start or stop, long enough
 # for heights of 2 cm to show 1 mrad.
-_ROAD_M, _HEIGHTS_M = 5.0, 10.0
+_ROAD_M = 5.0
+_HEIGHTS_M = 10.0
 
 # Slow sway of a vehicle by acceleration and in bends: 0.17 deg, as on KITTI drives, over a few seconds.
-_SWAY_RAD, _SWAY_M = 0.003, 10.0
+_SWAY_RAD = 0.003
+_SWAY_M = 10.0
 # GNSS heights are half again as uncertain as positions: no satellite is below the antenna.
 HEIGHT_SIGMAS = 1.5
 _HEIGHT_M = 5.0  # way over which an error of the height is of one piece
@@ -138,7 +140,8 @@ def _fit(
 def _mount(leans: FloatArray) -> FloatArray:
     """The sensor's slopes (2,) forward and left that leave least of ``leans`` (N, 2, 3)."""
     weight = STATION_M / (_SWAY_RAD**2 * _SWAY_M)
-    recorded, by_mount = leans[..., 0], leans[..., 1:]
+    recorded = leans[..., 0]
+    by_mount = leans[..., 1:]
     normal = weight * np.einsum("nim,nik->mk", by_mount, by_mount) + np.diag(1.0 / np.square(_MOUNT_RAD))
     return np.asarray(np.linalg.solve(normal, -weight * np.einsum("nim,ni->m", by_mount, recorded)))
 
@@ -157,7 +160,8 @@ def roll_pitch(lean: FloatArray) -> FloatArray:
 
 def _turned(vectors: FloatArray, angle_rad: FloatArray) -> FloatArray:
     """Vectors (P, 2), each turned by its angle (P,)."""
-    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    c = np.cos(angle_rad)
+    s = np.sin(angle_rad)
     x, y = vectors.T
     return np.column_stack([c * x - s * y, s * x + c * y])
 
@@ -196,7 +200,8 @@ def along_route(points_map: FloatArray) -> Stations:
     for p, (x, y) in enumerate(points_map.tolist()):
         if (x - x0) ** 2 + (y - y0) ** 2 >= STATION_M**2:
             first.append(p)
-            x0, y0 = x, y
+            x0 = x
+            y0 = y
     starts = np.array([*first, len(points_map)])
     centres = _means(points_map, starts)
     return Stations(starts, centres, length_along(centres))
@@ -224,7 +229,8 @@ def local_planes(
     ``slope`` (N, 2, C) is known apart from the heights; ``trust_m2`` (N,) is the mean squared leverage, m^2,
     at which heights say as much as these slopes.
     """
-    fitted, inclined = np.empty_like(height), np.empty_like(slope)
+    fitted = np.empty_like(height)
+    inclined = np.empty_like(slope)
     for k in range(len(height)):
         near, weight = stations.around(k, width_m)
         weight = weight / weight.sum()

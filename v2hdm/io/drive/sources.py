@@ -159,7 +159,8 @@ def _of_folder(entry: dict[str, Any], camera: str, sources: Sources, where: str)
                     f"{where}: the images of {folder} are not named by their times; add stamps, one per line"
                 ) from None
             order = np.argsort(stamp_s, kind="stable")
-            stamp_s, paths = stamp_s[order], [paths[n] for n in order.tolist()]
+            stamp_s = stamp_s[order]
+            paths = [paths[n] for n in order.tolist()]
         if (np.diff(stamp_s) <= 0).any():
             raise DriveError(f"{where}: the image times of {folder} do not increase strictly; fix them")
         return ImageFiles(camera=camera, stamp_s=stamp_s / UNITS[unit], paths=paths)

@@ -26,7 +26,8 @@ def read_truth(drive: Drive) -> Truth:
     folder = drive.truth_dir
     if folder is None:
         raise DriveError(f"{drive.root}: has no ground truth to compare with; drop the comparison")
-    hd_map, noted = read_geojson(folder / "map.geojson"), folder / "disturbances.yaml"
+    hd_map = read_geojson(folder / "map.geojson")
+    noted = folder / "disturbances.yaml"
     named = load_yaml(noted, DriveError)
     return Truth(
         map=hd_map,
@@ -53,7 +54,8 @@ def has_truth(drive: Drive) -> bool:
 
 def _joined_truth(drive: Drive) -> Truth:
     """The truths of all sessions as one, in the order of the joined drive's images."""
-    parts, rows = [], []
+    parts = []
+    rows = []
     for number, session in enumerate(drive.joined):
         own_name = {joined: own for own, joined in session.cameras.items()}
         own = [i for i, image in enumerate(drive.images) if image.session == number]
@@ -86,7 +88,8 @@ def _microseconds(stamp_s: float) -> int:
 
 
 def _read_cameras(path: Path, drive: Drive) -> Mapping[str, FloatArray]:
-    content, found = load_yaml(path, DriveError), {}
+    content = load_yaml(path, DriveError)
+    found = {}
     for name in drive.cameras:
         where = f"{path}: camera '{name}'"
         if name not in content:
@@ -113,7 +116,9 @@ def _read_sightings(path: Path, images: Sequence[Image], markings: int) -> Float
     visibility = np.zeros((len(images), markings))
     for where, (camera, stamp, marking, fraction) in _rows(path, SIGHTINGS):
         try:
-            key, j, value = (camera, _microseconds(float(stamp))), int(marking), float(fraction)
+            key = (camera, _microseconds(float(stamp)))
+            j = int(marking)
+            value = float(fraction)
         except ValueError:
             raise DriveError(f"{where}: not '{','.join(SIGHTINGS)}'; fix that line") from None
         if not 0 <= j < markings or not 0.0 <= value <= 1.0:

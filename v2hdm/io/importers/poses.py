@@ -141,7 +141,8 @@ def assemble(
     kept = {key: getattr(readings, key)[sure] for key in ("stamp_s", "points", "sigma_m")}
     readings = replace(readings, **kept)
     rotation, known = _rotation_at(readings, max_gap_s, where)
-    points, sigma_m = readings.points[known], readings.sigma_m[known]
+    points = readings.points[known]
+    sigma_m = readings.sigma_m[known]
     rotation = rotation @ settings.vehicle_from_sensor.T
     stamp_s = readings.stamp_s[known] + settings.offset_s
     if readings.geodetic or settings.crs is not None:

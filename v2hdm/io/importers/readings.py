@@ -203,7 +203,8 @@ def parse_sigma(cell: str) -> float:
 def _stamps(columns: Mapping[str, FloatArray], path: Path) -> FloatArray:
     named = [name for name in (*_STAMPS, "utc") if name in columns]
     if len(named) != 1:
-        wanted, has = ", ".join(_STAMPS), ", ".join(named) or "none"
+        wanted = ", ".join(_STAMPS)
+        has = ", ".join(named) or "none"
         raise DriveError(f"{path}: needs one time column, {wanted} or utc, has {has}; see columns")
     return columns[named[0]] / _STAMPS.get(named[0], 1.0)
 
@@ -285,7 +286,9 @@ class _Log:
     """Sentences so far; times are seconds of the day until the date is known."""
 
     def __init__(self, where: str) -> None:
-        self._where, self._day, self._above_sea = where, 0, False
+        self._where = where
+        self._day = 0
+        self._above_sea = False
         self._time_s: float | None = None
         self._first_date: date | None = None
         self._fixes: dict[float, tuple[float, ...]] = {}

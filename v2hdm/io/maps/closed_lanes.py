@@ -77,7 +77,8 @@ def _next_along(lanes: Sequence[ClosedLane], side: str) -> dict[int, int]:
 
 
 def _bound_between(before: ClosedLane, after: ClosedLane, side: str) -> tuple[int, IntArray] | None:
-    (line, end), (other, start) = getattr(before, side), getattr(after, side)
+    (line, end) = getattr(before, side)
+    (other, start) = getattr(after, side)
     turn = 1 if end[-1] > end[0] else -1
     if line != other or (start[0] - end[-1]) * turn <= 0:
         return None
@@ -205,7 +206,8 @@ class _Segments:
 
     @classmethod
     def of(cls, lines_map: Sequence[FloatArray]) -> _Segments:
-        none, counts = np.empty((0, 2)), [max(len(line) - 1, 0) for line in lines_map]
+        none = np.empty((0, 2))
+        counts = [max(len(line) - 1, 0) for line in lines_map]
         start = np.concatenate([none, *(line[:-1] for line in lines_map)])
         end = np.concatenate([none, *(line[1:] for line in lines_map)])
         index = np.concatenate([np.arange(0), *map(np.arange, counts)])
@@ -227,13 +229,15 @@ class _Segments:
         self, number: int, places: FloatArray, away: FloatArray
     ) -> tuple[IntArray, IntArray, FloatArray]:
         """The result of :meth:`across` for neighbouring places (N, 2) and directions ``away`` (N, 2)."""
-        low, high = places.min(axis=0) - LANE_WIDTH_M[1], places.max(axis=0) + LANE_WIDTH_M[1]
+        low = places.min(axis=0) - LANE_WIDTH_M[1]
+        high = places.max(axis=0) + LANE_WIDTH_M[1]
         near = (np.maximum(self.start, self.end) >= low) & (np.minimum(self.start, self.end) <= high)
         candidates = np.flatnonzero(near.all(axis=1) & (self.line != number))
         if not len(candidates):
             nothing = np.zeros(len(places), dtype=np.int64)
             return nothing - 1, nothing, np.full(len(places), LANE_WIDTH_M[1])
-        ahead, beside = [], []
+        ahead = []
+        beside = []
         for ends in (self.start, self.end):
             offset = ends[candidates] - places[:, None]
             ahead.append(np.einsum("nsi,ni->ns", offset, away))
@@ -242,7 +246,8 @@ class _Segments:
         part = beside[0] / np.where(crosses, beside[0] - beside[1], 1.0)
         met_m = ahead[0] + part * (ahead[1] - ahead[0])
         met_m[~crosses | (met_m <= 0)] = np.inf
-        rows, best = np.arange(len(places)), np.argmin(met_m, axis=1)
+        rows = np.arange(len(places))
+        best = np.argmin(met_m, axis=1)
         met_at = candidates[best]
         gap_m = met_m[rows, best]
         reached = gap_m < LANE_WIDTH_M[1]

@@ -25,7 +25,9 @@ from v2hdm.store.files import (
     take_text,
 )
 
-ACCEPTED, REJECTED, CORRECTED = "accepted", "rejected", "corrected"
+ACCEPTED = "accepted"
+REJECTED = "rejected"
+CORRECTED = "corrected"
 SIGMA_M = 0.02  # how well a person places a corner beside the others of its marking, m: a pixel of a mosaic
 
 _HEAD = "# Corrections of a map by a person: map.corrections=THIS FILE in the next run (docs/report.md).\n"
@@ -85,7 +87,8 @@ def correction_of(entry: object, where: str) -> Correction:
     sigma_m = take_number(found.get("sigma_m", SIGMA_M), f"{where}: sigma_m", MapFileError)
     if not len(outline) or not 0 < sigma_m <= 1:
         raise MapFileError(f"{where}: needs a point in outline_map, and sigma_m above 0 and at most 1 m")
-    marking, new = found.get("marking"), found.get("new_class")
+    marking = found.get("marking")
+    new = found.get("new_class")
     return Correction(
         says=says,
         kind=take_text(found["class"], f"{where}: class", MapFileError),

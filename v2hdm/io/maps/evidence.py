@@ -81,7 +81,8 @@ def read_residuals(path: Path) -> Residuals:
     if not rows or tuple(rows[0]) != COLUMNS:
         raise MapFileError(f"{path}: its columns are not {','.join(COLUMNS)}; map the drive again")
     images: dict[str, tuple[int, str, float]] = {}
-    row_image, numbers = [], []
+    row_image = []
+    numbers = []
     for line, row in enumerate(rows[1:], start=2):
         try:
             image, camera, taken_s, marking, *rest = row

@@ -12,7 +12,9 @@ from v2hdm.geometry.geodetic import Grid, geodetic_from_enu
 from v2hdm.geometry.planar import signed_area
 from v2hdm.records import FloatArray, GeodeticOrigin, HDMap, IntArray, Lane, Marking, PaintLeft, Road, Symbol
 
-CORNERS, POINTS, OUTLINE = "corners_map", "points_map", "outline_map"
+CORNERS = "corners_map"
+POINTS = "points_map"
+OUTLINE = "outline_map"
 """Properties with the exact local coordinates of a marking's corners, a lane's points, a symbol's outline."""
 
 Heights = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
@@ -94,12 +96,15 @@ def features_of(hd_map: HDMap) -> list[Feature]:
     features = []
     for one, number in zip(everything, ids, strict=True):
         if isinstance(one, Symbol):
-            points, more = one.outline_map, dict[str, Any](symbol=True, place_sigma_m=one.sigma_m)
+            points = one.outline_map
+            more = dict[str, Any](symbol=True, place_sigma_m=one.sigma_m)
             more["covariance_m2"] = one.covariance_m2
         elif isinstance(one, Lane):
-            points, more = one.points_map, {"vertex_sigma_m": one.sigma_m}
+            points = one.points_map
+            more = {"vertex_sigma_m": one.sigma_m}
         else:
-            sigma_m, points = one.relative_sigma_m, one.corners_map
+            sigma_m = one.relative_sigma_m
+            points = one.corners_map
             more = {"covariance_m2": one.covariance_m2, "relative_sigma_m": sigma_m, "paint": one.paint}
         closed = not isinstance(one, Lane)
         more["heights_sigma_m"] = one.heights_sigma_m
@@ -131,7 +136,8 @@ def unique_ids(ids: Sequence[int], largest: int = 0) -> list[int]:
     out: dict[int, None] = {}
     for number in ids:
         if number < 1 or number in out:
-            number, following = following, following + 1
+            number = following
+            following = following + 1
         out[number] = None
     return list(out)
 

@@ -32,7 +32,9 @@ from v2hdm.surface.strips import write_ground_geotiff, write_opencrg
 _log = logging.getLogger(__name__)
 
 APPLICATION = "V2HDM"
-_TEXT, _REAL, _WHOLE = 1000, 1040, 1071
+_TEXT = 1000
+_REAL = 1040
+_WHOLE = 1071
 """Group codes of extended data (DXF reference, "Extended data"): string, real, whole number of 32 bits."""
 
 _COLOURS = 6  # AutoCAD's first colours, red to magenta, take turns
@@ -88,7 +90,8 @@ def write_csv(hd_map: HDMap, path: Path, grid: Grid | None = None) -> None:
     Coordinates in a ``grid``, rounded to 0.1 mm, take the place of longitude and latitude, which its last
     columns name.
     """
-    columns, about = [*COLUMNS], {} if grid is None else grid.stated
+    columns = [*COLUMNS]
+    about = {} if grid is None else grid.stated
     if grid is not None:
         columns[6:9] = ["easting", "northing", "up_m" if grid.is_local else COLUMNS[8]]
     place = grid or hd_map.origin
@@ -166,7 +169,8 @@ def holds(path: Path, hd_map: HDMap, crs: str | None) -> bool:
     """Whether the GeoPackage at ``path`` holds just this map's features, in the system ``crs``."""
     try:
         with protected_inputs():  # where it holds others, it may be written anew
-            there, stated = read_geopackage(path), stated_in(path, "crs")
+            there = read_geopackage(path)
+            stated = stated_in(path, "crs")
     except (V2hdmError, OSError):
         return False
     mine, its = ([properties_of(one) for one in features_of(whole)] for whole in (hd_map, there))

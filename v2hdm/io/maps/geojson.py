@@ -25,7 +25,8 @@ from v2hdm.store.files import replace_text
 
 _WGS84 = "WGS84 longitude and latitude, degrees, and height above the ellipsoid, metres"
 _LOCAL = "local map frame, metres east and north, up where known; NOT longitude and latitude"
-_DEGREE_DECIMALS, _HEIGHT_DECIMALS = 11, 5  # 0.001 mm on the ground
+_DEGREE_DECIMALS = 11
+_HEIGHT_DECIMALS = 5  # 0.001 mm on the ground
 
 
 def write_geojson(

@@ -162,7 +162,8 @@ def _shapes(features: Sequence[Feature], origin: GeodeticOrigin | Grid | None) -
 
 def layer_style(kinds: Sequence[str], closed: bool) -> str:
     """QGIS's style of a layer; classes of later edits fall into the last category, of an empty value."""
-    categories, symbols = "", ""
+    categories = ""
+    symbols = ""
     shape, drawing, options = ("fill", "SimpleFill", _FILL) if closed else ("line", "SimpleLine", _LINE)
     for number, kind in enumerate([*kinds, ""]):
         categories += _CATEGORY.format(number, quoteattr(kind), quoteattr(kind or "other"))
@@ -195,7 +196,8 @@ def write_qgis(hd_map: HDMap, path: Path, grid: Grid | None = None) -> None:
     files are named relative to the project, so that the folder may be moved.
     """
     pyproj = need("pyproj", "map", "the format qgis", ConfigError)
-    features, where = features_of(hd_map), grid or Grid("local", hd_map.origin)
+    features = features_of(hd_map)
+    where = grid or Grid("local", hd_map.origin)
     placed = hd_map.origin is not None and (grid is None or not grid.is_local)
     ground = crs_of(hd_map.origin) if placed and hd_map.origin is not None else LOCAL_CRS
     layers_crs = LOCAL_CRS if not placed else "EPSG:4326" if grid is None else grid.crs

@@ -30,11 +30,13 @@ from v2hdm.store.files import dump_yaml, replace_text, xml_text
 LOCAL, LOCAL_CARTESIAN, MGRS = PROJECTORS = ("Local", "LocalCartesian", "MGRS")
 """Autoware's projectors that this format knows, by their names in ``map_projector_info.yaml``."""
 
-_DEGREE_DECIMALS, _HEIGHT_DECIMALS = 12, 6  # 1e-7 m; JOSM writes 11
+_DEGREE_DECIMALS = 12
+_HEIGHT_DECIMALS = 6  # 1e-7 m; JOSM writes 11
 
 # Ids of each feature's parts, above all ids of features and exact in every language; vertices take the lower
 # half.
-_FIRST_PART, _PARTS = 1 << 40, 1 << 20
+_FIRST_PART = 1 << 40
+_PARTS = 1 << 20
 _MOST_VERTICES = _PARTS // 2
 
 # Lanelet2 reads no node without latitude and longitude: local maps lie where the equator meets Greenwich.
@@ -107,7 +109,8 @@ def _stop_edges(corners: FloatArray, direction: FloatArray | None) -> tuple[Floa
     """
     length = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
     start = int(length[1] + length[3] > length[0] + length[2])
-    one, two = corners[[start, start + 1]], corners[[(start + 3) % 4, (start + 2) % 4]]
+    one = corners[[start, start + 1]]
+    two = corners[[(start + 3) % 4, (start + 2) % 4]]
     if direction is None:
         return (one + two) / 2, two
     return (one, two) if (two - one)[:, :2].mean(axis=0) @ direction > 0 else (two, one)
@@ -117,7 +120,8 @@ class _Lanes:
     """The lanelets of a map, and the stop lines' rules that they refer to."""
 
     def __init__(self, document: _Document, lines: Sequence[Feature]) -> None:
-        self._document, self._lines = document, lines
+        self._document = document
+        self._lines = lines
         self._lanes = closed_lanes([line.points_map for line in lines])
         self.vertices = {line.id: document.nodes(line, line.xyz_map) for line in lines}
         self.rules: list[list[int]] = [[] for _ in self._lanes]
@@ -146,7 +150,8 @@ class _Lanes:
         for lane, rules in zip(self._lanes, self.rules, strict=True):
             self._lanelet(self._lines[lane.left[0]], self._bound(*lane.left), self._bound(*lane.right), rules)
         for one in connections(self._lanes, [line.points_map for line in self._lines]):
-            before, after = self._lanes[one.before], self._lanes[one.after]
+            before = self._lanes[one.before]
+            after = self._lanes[one.after]
             left, right = (
                 self._virtual(end, start) if bound is None else self._bound(*bound)
                 for bound, end, start in (
@@ -216,7 +221,8 @@ class _Document:
     """The OSM document; nodes are placed last, all at once."""
 
     def __init__(self, origin: GeodeticOrigin | None, projector: str) -> None:
-        self._origin, self._projector = origin, projector
+        self._origin = origin
+        self._projector = projector
         self._root = ET.Element("osm", version="0.6", generator="v2hdm")
         ET.SubElement(self._root, "MetaInfo", format_version="1", map_version="1")
         self._nodes: dict[int, FloatArray] = {}
@@ -244,7 +250,8 @@ class _Document:
         """Write the nodes; returns the grid square where the projector has one."""
         xyz_map = np.array(list(self._nodes.values())).reshape(-1, 3)
         degrees = geodetic_from_enu(self._origin or _NOWHERE, xyz_map)
-        local, square = xyz_map[:, :2], None
+        local = xyz_map[:, :2]
+        square = None
         if self._projector == MGRS:
             if self._origin is not None and not len(xyz_map):
                 here = position_of(self._origin)

@@ -37,7 +37,9 @@ _NAMED = 9  # edited features that the log names
 # Degrees and m by which positions may be off without an edit. Of GeoJSON, GDAL takes a last digit after
 # several zeros for noise and drops it, and files of version 0.1 have nine and four decimals: 0.1 mm on the
 # ground. Local metres are written at full precision; a GIS that rewrites them keeps 15 digits.
-_TEXT_ROUNDING, _BINARY_ROUNDING, _LOCAL_ROUNDING_M = (1e-9, 1e-9, 1e-4), (1e-11, 1e-11, 1e-6), 1e-6
+_TEXT_ROUNDING = (1e-9, 1e-9, 1e-4)
+_BINARY_ROUNDING = (1e-11, 1e-11, 1e-6)
+_LOCAL_ROUNDING_M = 1e-6
 _GRID_ROUNDING = (3e-9, 3e-9, 1.2e-4)  # of a grid's 0.1 mm, as far as 70 degrees north
 
 RESOLUTION = ("xy_coordinate_resolution", "z_coordinate_resolution")
@@ -66,7 +68,8 @@ def read_map(path: Path) -> tuple[HDMap, Verdict]:
 def read_geojson(path: Path) -> HDMap:
     """Read our own GeoJSON, perhaps edited, in its order; missing or repeated ids are given anew."""
     content = load_json(path, MapFileError)
-    about, features = content.get("v2hdm"), content.get("features")
+    about = content.get("v2hdm")
+    features = content.get("features")
     if not isinstance(about, dict) or not isinstance(features, list):
         raise MapFileError(
             f"{path}: not a map written by v2hdm (no 'v2hdm' member or no 'features'); give one that is. A "
@@ -84,7 +87,8 @@ def read_geojson(path: Path) -> HDMap:
         entry = take_mapping(feature, where, MapFileError)
         properties = take_mapping(entry.get("properties"), where, MapFileError)
         reader.add(properties, _of_geojson(entry.get("geometry"), where), where)
-    hd_map, over_m = reader.map(), about.get("drift_over_m")
+    hd_map = reader.map()
+    over_m = about.get("drift_over_m")
     largest = take_whole(about.get("largest_id") or 0, 0, _LARGEST_ID, f"{path}: largest_id", MapFileError)
     if over_m is not None:
         over_m = take_number(over_m, f"{path}: drift_over_m", MapFileError)
@@ -131,7 +135,9 @@ class _Reader:
     def __init__(
         self, path: Path, origin: GeodeticOrigin | None, rounding: FloatArray, crs: object = None
     ) -> None:
-        self._path, self._origin, self._rounding = path, origin, rounding
+        self._path = path
+        self._origin = origin
+        self._rounding = rounding
         self._grid: Grid | None = None
         if crs is not None:
             text = take_text(crs, f"{path}: crs", MapFileError)
@@ -264,7 +270,8 @@ def _of_geojson(content: object, where: str) -> Geometry | None:
     if content is None:
         return None
     entry = take_mapping(content, f"{where}, geometry", MapFileError)
-    kind, parts = entry.get("type"), entry.get("coordinates")
+    kind = entry.get("type")
+    parts = entry.get("coordinates")
     closed = kind in ("Polygon", "MultiPolygon")
     if not closed and kind not in ("LineString", "MultiLineString"):
         raise MapFileError(f"{where}: its geometry is a {kind}; draw Polygons (markings) or LineStrings")
@@ -286,12 +293,15 @@ def _of_wkb(blob: object, where: str) -> Geometry | None:
         return None
     try:
         data = bytes(memoryview(blob))  # type: ignore[arg-type]
-        kind, count, at = 5, 1, 8 + (0, 32, 48, 48, 64)[data[3] >> 1 & 7]
+        kind = 5
+        count = 1
+        at = 8 + (0, 32, 48, 48, 64)[data[3] >> 1 & 7]
         for _ in range(2):  # a Multi..., and what is in it
             if kind % 1000 in (5, 6) and count == 1:
                 order = "<" if data[at] else ">"
                 kind, count, at = (*struct.unpack_from(f"{order}II", data, at + 1), at + 9)
-        closed, dimensions = kind % 1000 == 3, (2, 3, 3, 4)[kind // 1000]
+        closed = kind % 1000 == 3
+        dimensions = (2, 3, 3, 4)[kind // 1000]
         if kind % 1000 not in (2, 3):
             several = kind % 1000 in (5, 6)
             problem = "has several parts; split it" if several else "is not one that maps have; draw another"
@@ -299,7 +309,8 @@ def _of_wkb(blob: object, where: str) -> Geometry | None:
         if closed and count != 1:
             raise MapFileError(f"{where}: its polygon has holes; fill them")
         if closed:
-            (count,), at = struct.unpack_from(f"{order}I", data, at), at + 4
+            (count,) = struct.unpack_from(f"{order}I", data, at)
+            at = at + 4
         positions = np.frombuffer(data, f"{order}f8", count * dimensions, at).reshape(count, dimensions)
     except (TypeError, ValueError, LookupError, struct.error):
         raise MapFileError(f"{where}: its geometry is damaged; draw it again") from None

@@ -66,7 +66,8 @@ def write_opendrive(hd_map: HDMap, path: Path) -> None:
     root = ET.Element("OpenDRIVE")
     stamp = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S")
     everything = np.concatenate([one.points_map for one in features] or [np.zeros((1, 2))])
-    (west, south), (east, north) = everything.min(axis=0), everything.max(axis=0)
+    (west, south) = everything.min(axis=0)
+    (east, north) = everything.max(axis=0)
     bounds = {
         key: f"{v:.4f}" for key, v in (("north", north), ("south", south), ("east", east), ("west", west))
     }
@@ -123,7 +124,8 @@ def _write_road(root: ET.Element, number: int, road: _Road) -> ET.Element:
     s_m = road.s_m
     whole = {"name": "", "length": _text(s_m[-1]), "id": str(number), "junction": "-1"}
     element = ET.SubElement(root, "road", whole)
-    view, profile = ET.SubElement(element, "planView"), ET.SubElement(element, "elevationProfile")
+    view = ET.SubElement(element, "planView")
+    profile = ET.SubElement(element, "elevationProfile")
     heading = np.arctan2(road.steps[:, 1], road.steps[:, 0])
     slope = np.diff(road.xyz[:, 2]) / np.diff(s_m)
     for k, (x, y, z) in enumerate(road.xyz[:-1].tolist()):

@@ -19,7 +19,10 @@ from v2hdm.report.page.facts import Facts, GroundResiduals, Route
 from v2hdm.report.page.layers import SIGMAS_95
 from v2hdm.report.style import OKABE_ITO, RC, draw_arrows
 
-INK, MUTED, GRID, PAPER = "#1b1e21", "#5c646b", "#dde1e5", "#fdfdfd"
+INK = "#1b1e21"
+MUTED = "#5c646b"
+GRID = "#dde1e5"
+PAPER = "#fdfdfd"
 """Colours of text, axes, grid and background, which ``page.css`` replaces by its theme's."""
 
 _ORDER = ("blue", "vermillion", "green", "purple", "orange", "sky")
@@ -77,7 +80,8 @@ def _look(number: int) -> dict[str, Any]:
 def site_chart(hd_map: HDMap, route: Route | None, excluded: FloatArray) -> str:
     """Plan view of the map, for paper: markings, lane lines, route, excluded candidates (N, 2)."""
     way = np.empty((0, 2)) if route is None else route.map_from_vehicle[:, :2, 3]
-    shapes, lanes = [m.corners_map for m in hd_map.markings], [one.points_map for one in hd_map.lanes]
+    shapes = [m.corners_map for m in hd_map.markings]
+    lanes = [one.points_map for one in hd_map.lanes]
     spread = np.ptp(np.concatenate([*shapes, *lanes, way]), axis=0) + 10.0
     height_in = float(np.clip(6.4 * spread[1] / spread[0] + 0.8, 2.4, 6.2))
     with _chart("site", 7.2, height_in) as (figure, out):
@@ -118,7 +122,8 @@ def _histogram_chart(residuals: GroundResiduals) -> str:
         _chart("histogram", 3.5, 2.5) as (figure, first),
         _chart("histogram in sigmas", 3.5, 2.5) as (other, second),
     ):
-        left, right = figure.subplots(), other.subplots()
+        left = figure.subplots()
+        right = other.subplots()
         size_px = residuals.size_px[residuals.is_point]
         edges_px = np.linspace(0, max(float(np.percentile(size_px, 99)) if len(size_px) else 1.0, 0.1), 41)
         edges_sigma = np.linspace(0, 5, 41)
@@ -150,7 +155,8 @@ def _field_chart(residuals: GroundResiduals, sizes: Mapping[str, tuple[int, int]
     names = residuals.cameras
     fields = [_field(residuals, number, sizes[name]) for number, name in enumerate(names)]
     longest = max([float(np.linalg.norm(mean, axis=1).max()) for _, mean in fields if len(mean)] or [0.1])
-    panel_in, charts = _SINGLE_IN if len(names) == 1 else 3.5, ""
+    panel_in = _SINGLE_IN if len(names) == 1 else 3.5
+    charts = ""
     for number, name in enumerate(names):
         width_px, height_px = sizes[name]
         with _chart(f"field {name}", panel_in, 0.84 * panel_in * height_px / width_px + 0.75) as (
@@ -159,7 +165,8 @@ def _field_chart(residuals: GroundResiduals, sizes: Mapping[str, tuple[int, int]
         ):
             axes = figure.subplots()
             # The longest arrow spans one and a half cells.
-            span, colour = 1.5 * width_px / CELLS[1], OKABE_ITO[_ORDER[number % len(_ORDER)]]
+            span = 1.5 * width_px / CELLS[1]
+            colour = OKABE_ITO[_ORDER[number % len(_ORDER)]]
             draw_arrows(axes, *fields[number], longest, span, color=colour, width=0.005, headwidth=3.6)
             axes.set(
                 xlim=(0, width_px), ylim=(height_px, 0), xlabel="u (px)", ylabel="v (px)", aspect="equal"
@@ -174,7 +181,8 @@ def _field_chart(residuals: GroundResiduals, sizes: Mapping[str, tuple[int, int]
 def _field(residuals: GroundResiduals, camera: int, size: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
     """Centres (N, 2) of image cells with enough observations, and mean residuals (N, 2), px."""
     own = (residuals.camera == camera) & residuals.is_point
-    place, off = residuals.observed_px[own], residuals.residual_px[own]
+    place = residuals.observed_px[own]
+    off = residuals.residual_px[own]
     rows, columns = CELLS
     column, row = np.floor(place / size * (columns, rows)).astype(np.int64).T
     inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
@@ -182,7 +190,8 @@ def _field(residuals: GroundResiduals, camera: int, size: tuple[int, int]) -> tu
     count = np.bincount(cell, minlength=rows * columns)
     enough = np.flatnonzero(count >= _LEAST_IN_CELL)
     mean = np.column_stack([np.bincount(cell, off[inside, a], rows * columns) for a in (0, 1)])
-    u, v = (enough % columns + 0.5) * size[0] / columns, (enough // columns + 0.5) * size[1] / rows
+    u = (enough % columns + 0.5) * size[0] / columns
+    v = (enough // columns + 0.5) * size[1] / rows
     return np.column_stack([u, v]), mean[enough] / count[enough][:, None]
 
 
@@ -192,7 +201,8 @@ def _range_chart(residuals: GroundResiduals) -> str:
         _chart("range", 3.5, 2.5) as (figure, first),
         _chart("range on the ground", 3.5, 2.5) as (other, second),
     ):
-        left, right = figure.subplots(), other.subplots()
+        left = figure.subplots()
+        right = other.subplots()
         farthest = float(np.ceil(residuals.range_m.max(initial=1.0)))
         edges = np.linspace(0, farthest, max(2, min(int(farthest), 24)) + 1)
         ground_cm = 100 * np.linalg.norm(residuals.ground_m, axis=1)
@@ -226,7 +236,8 @@ def _route_chart(route: Route, residuals: GroundResiduals) -> str:
     rows = 1 if route.recorded is None else 2
     with _chart("route", _SINGLE_IN, 1.7 * rows + 0.3) as (figure, out):
         panels = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
-        way_m, fit = route.way_m, panels[0]
+        way_m = route.way_m
+        fit = panels[0]
         total = max(float(way_m[-1]), 1.0)
         edges = np.linspace(0, total, int(np.clip(total / 5, 4, 80)) + 1)
         taken_m = np.interp(residuals.taken_s, route.stamp_s, way_m)
@@ -240,7 +251,9 @@ def _route_chart(route: Route, residuals: GroundResiduals) -> str:
         if route.recorded is not None:
             moved_cm = 100 * (np.linalg.inv(route.recorded) @ route.map_from_vehicle)[:, :2, 3]
             for axis, name in enumerate(("forward", "left")):
-                shift, band, look = moved_cm[:, axis], SIGMAS_95 * 100 * route.sigma[:, axis], _look(axis)
+                shift = moved_cm[:, axis]
+                band = SIGMAS_95 * 100 * route.sigma[:, axis]
+                look = _look(axis)
                 shade = {"color": look["color"], "alpha": 0.15, "lw": 0}
                 panels[1].fill_between(way_m, shift - band, shift + band, **shade)
                 panels[1].plot(way_m, shift, label=name, lw=1.1, **look)

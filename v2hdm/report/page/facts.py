@@ -98,7 +98,9 @@ def read_facts(folder: Path, drive: Drive | None) -> Facts:
     hd_map = read_geojson(folder / "map.geojson") if (folder / "map.geojson").is_file() else None
     excluded = read_exclusions(folder / "excluded.geojson") if (folder / "excluded.geojson").is_file() else []
     features = features_of(hd_map) if hd_map else []
-    residuals, config, points = folder / RESIDUALS, folder / "config.yaml", folder / "check_points.csv"
+    residuals = folder / RESIDUALS
+    config = folder / "config.yaml"
+    points = folder / "check_points.csv"
     route = _route(folder, drive)
     heading, *checked = (read_csv(points, MapFileError) if points.is_file() else []) or [[]]
     return Facts(
@@ -121,7 +123,8 @@ def read_cameras(folder: Path) -> dict[str, CameraFacts]:
     """Calibrations of a result folder by camera; raises MapFileError for damaged files."""
     found = {}
     for path in sorted(folder.glob("calibration_*.yaml")):
-        content, calibration = load_yaml(path, MapFileError), read_calibration(path)
+        content = load_yaml(path, MapFileError)
+        calibration = read_calibration(path)
         times_s = (
             take_number(content[key], f"{path}: {key}", MapFileError) if key in content else None
             for key in ("clock_offset_s", "clock_sigma_s", "read_out_s", "read_out_sigma_s")
@@ -140,8 +143,10 @@ def _route(folder: Path, drive: Drive | None) -> Route | None:
         table = np.array(rows, dtype=np.float64).reshape(len(adjusted.stamp_s), 8)
     except ValueError:
         raise MapFileError(f"{path}: not one line of 8 numbers per pose of trajectory.tum") from None
-    stamp_s, poses = adjusted.stamp_s, adjusted.map_from_vehicle
-    recorded, moved = None, poses
+    stamp_s = adjusted.stamp_s
+    poses = adjusted.map_from_vehicle
+    recorded = None
+    moved = poses
     if drive is not None and drive.trajectory is not None:
         recorded, flat = (
             interpolate(one, stamp_s, float("inf"))[0]
@@ -200,10 +205,12 @@ def ground_residuals(facts: Facts) -> GroundResiduals | None:
     rows = np.flatnonzero(of_image[residuals.row_image] >= 0)
     row_image = residuals.row_image[rows]
     cam_from_map = cams_from_map(residuals, facts.route, calibrations)
-    observed, off = residuals.observed_px[rows], residuals.residual_px[rows]
+    observed = residuals.observed_px[rows]
+    off = residuals.residual_px[rows]
     known = np.flatnonzero(of_image >= 0)
     intrinsic = np.array([calibrations[residuals.camera[i]].info.intrinsic for i in known])
-    map_from_px, foot_map = np.full((len(of_image), 3, 3), np.nan), np.full((len(of_image), 2), np.nan)
+    map_from_px = np.full((len(of_image), 3, 3), np.nan)
+    foot_map = np.full((len(of_image), 2), np.nan)
     map_from_px[known] = ground_from_pinhole_px(intrinsic, cam_from_map[known])
     foot_map[known] = camera_centre(cam_from_map[known])[:, :2]
     ground = map_from_px[row_image]

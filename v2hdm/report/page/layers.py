@@ -43,7 +43,8 @@ def _coded(kind: str, pixels: np.ndarray, *options: int) -> str:
     return base64.b64encode(cv2.imencode(kind, pixels, options)[1].tobytes()).decode("ascii")
 
 
-EXTENT, COMPARISON = "mosaic.json", "mosaic_before_after.png"
+EXTENT = "mosaic.json"
+COMPARISON = "mosaic_before_after.png"
 
 LARGEST_BYTES = 3_500_000  # limit of the mosaic, as text in the page
 _QUALITY = 72
@@ -53,7 +54,8 @@ def mosaic_layer(folder: Path) -> dict[str, Any] | None:
     """The mosaic, if any: WebP in base64, bounds (west, south, east, north), m; MapFileError if damaged."""
     if not (folder / EXTENT).is_file():
         return None
-    content, where = load_json(folder / EXTENT, MapFileError), f"{folder / EXTENT}"
+    content = load_json(folder / EXTENT, MapFileError)
+    where = f"{folder / EXTENT}"
     bounds = take_array(content.get("bounds_m"), (4,), f"{where}: bounds_m", MapFileError)
     path = folder / Path(take_text(content.get("image"), f"{where}: image", MapFileError)).name
     coded = path.read_bytes() if path.is_file() else b""
@@ -182,7 +184,8 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
         return {}
     named: list[Marking | Symbol | Lane] = [*hd_map.markings, *hd_map.symbols, *hd_map.lanes]
     kinds = sorted({one.kind for one in named})
-    arrows, errors = _arrows(residuals), _errors(facts)
+    arrows = _arrows(residuals)
+    errors = _errors(facts)
     markings = []
     for number, marking in enumerate(hd_map.markings):
         found = _feature(marking, kinds, "c", marking.corners_map)
@@ -235,7 +238,8 @@ def _systems(facts: Facts) -> list[dict[str, Any]]:
     if hd_map is None or hd_map.origin is None:
         return []
     x, y = (grid.ravel() for grid in np.meshgrid(*np.linspace(*_extent(facts), 7).T))
-    places_map, code = np.column_stack([x, y, np.zeros_like(x)]), utm_of(hd_map.origin)
+    places_map = np.column_stack([x, y, np.zeros_like(x)])
+    code = utm_of(hd_map.origin)
     earth = geodetic_from_enu(hd_map.origin, places_map)
     grid = Grid(code, hd_map.origin).positions(places_map)[:, :2]
     scale = float(np.abs([x, y]).max())
@@ -267,7 +271,8 @@ def _errors(facts: Facts) -> dict[int, float]:
     """RMS corner error, m, of each marking with a true counterpart, by id."""
     if facts.truth is None or facts.hd_map is None:
         return {}
-    mapped, true = facts.hd_map.markings, facts.truth.map.markings
+    mapped = facts.hd_map.markings
+    true = facts.truth.map.markings
     pairs = zip(*match_markings(mapped, true), strict=True)
     return {row: rms(corner_errors([mapped[row]], [true[column]])) for row, column in pairs}
 

@@ -23,7 +23,8 @@ _LEAST_PX = 96
 _MARGIN = 0.45  # margin around a marking, relative to its size
 _QUALITY = 72
 
-_NEAR_M, _FAR_M = 3.0, 14.0  # range ahead of a camera for features other than markings
+_NEAR_M = 3.0
+_FAR_M = 14.0  # range ahead of a camera for features other than markings
 
 
 @dataclass(frozen=True)
@@ -142,7 +143,8 @@ def _cut_out(
         return None
     shape_px = distort_points(info, px)
     shown = np.concatenate([shape_px, cut.seen_px])
-    low, high = shown.min(axis=0), shown.max(axis=0)
+    low = shown.min(axis=0)
+    high = shown.max(axis=0)
     half = np.maximum((0.5 + _MARGIN) * (high - low), _LEAST_PX / 2)
     # An aspect ratio of at most 3, so that pictures in a row look alike.
     half = np.maximum(half, half[::-1] / 3)

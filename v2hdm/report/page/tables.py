@@ -92,9 +92,11 @@ def key_figures(facts: Facts) -> tuple[Figure, ...]:
     """Key figures at the top of the page."""
     if facts.hd_map is None:
         return ()
-    markings, best = facts.hd_map.markings, facts.best
+    markings = facts.hd_map.markings
+    best = facts.best
     lanes = best.get("lanes", {})
-    symbols, length = in_words(len(facts.hd_map.symbols), "symbol"), number(lanes.get("length_m"), 0)
+    symbols = in_words(len(facts.hd_map.symbols), "symbol")
+    length = number(lanes.get("length_m"), 0)
     figures = [
         Figure("Markings", str(len(markings)), "", f"and {symbols}"),
         Figure("Lane lines", str(len(facts.hd_map.lanes)), "", f"{length} m in total"),
@@ -143,7 +145,8 @@ def truth_table(facts: Facts) -> Table | None:
         found = facts.best if name == "all" else by_class.get(name, {})
         recall = None if name == "all" else found.get("recall")
         errors = [number(found.get(key), 2, 100) for key in ("corner_rmse_m", "corner_bias_m")]
-        false, inside = number(found.get("false_markings"), 0), number(_inside(own, facts), 0, 100)
+        false = number(found.get("false_markings"), 0)
+        inside = number(_inside(own, facts), 0, 100)
         rows.append([name_of(name), str(len(own)), false, number(recall, 1, 100), *errors, inside])
     errors_of = ("false", "recall (%)", "RMSE (cm)", "bias (cm)", "inside 95 % ellipse (%)")
     return table(("class", "markings", *errors_of), rows)
@@ -292,24 +295,29 @@ def camera_pages(facts: Facts, pictures: Mapping[str, str]) -> tuple[CameraPage,
 
 def _mounting(one: CameraFacts, found: Mapping[str, Any]) -> Table:
     calibration = one.calibration
-    matrix, covariance = calibration.cam_from_vehicle, calibration.covariance
-    centre, angles = camera_centre(matrix), np.rad2deg(mounting_angles(matrix))
+    matrix = calibration.cam_from_vehicle
+    covariance = calibration.covariance
+    centre = camera_centre(matrix)
+    angles = np.rad2deg(mounting_angles(matrix))
     unknown = np.full(3, np.nan)
     centre_sigma = unknown if covariance is None else centre_sigmas(matrix, covariance)
     angle_sigma = unknown if covariance is None else np.rad2deg(angle_sigmas(matrix, covariance))
     rows = []
     for n, (axis, key) in enumerate((("forward", "x"), ("left", "y"), ("up", "z"))):
         changed = _change(found.get(f"{key}_change_m"), 1e3, 0, " mm")
-        value, sigma = number(centre[n], 3), number(centre_sigma[n], 1, 1e3)
+        value = number(centre[n], 3)
+        sigma = number(centre_sigma[n], 1, 1e3)
         rows.append([f"centre {axis}", f"{value} m", f"{sigma} mm", changed])
     for n, (axis, key) in enumerate((("roll", "roll"), ("pitch, down", "pitch"), ("yaw, left", "yaw"))):
         changed = _change(found.get(f"{key}_change_deg"), 1.0, 2, "°")
         rows.append([axis, f"{number(angles[n], 3)}°", f"{number(angle_sigma[n], 3)}°", changed])
     if one.clock_offset_s is not None:
-        offset, sigma = number(one.clock_offset_s, 1, 1e3), number(one.clock_sigma_s, 1, 1e3)
+        offset = number(one.clock_offset_s, 1, 1e3)
+        sigma = number(one.clock_sigma_s, 1, 1e3)
         rows.append(["clock, images later", f"{offset} ms", f"{sigma} ms", "–"])
     if one.read_out_s is not None:
-        read_out, sigma = number(one.read_out_s, 1, 1e3), number(one.read_out_sigma_s, 1, 1e3)
+        read_out = number(one.read_out_s, 1, 1e3)
+        sigma = number(one.read_out_sigma_s, 1, 1e3)
         rows.append(["read-out, first row to last", f"{read_out} ms", f"{sigma} ms", "–"])
     return table(("", "value", "± 1 σ", "change"), rows)
 

@@ -30,7 +30,8 @@ def camera_info(name: str, config: CameraConfig) -> CameraInfo:
     """The intrinsics of a configured camera."""
     focal = config.focal_px
     du, dv = config.principal_offset_px
-    u, v = (config.width - 1) / 2 + du, (config.height - 1) / 2 + dv
+    u = (config.width - 1) / 2 + du
+    v = (config.height - 1) / 2 + dv
     intrinsic = np.array([[focal, 0.0, u], [0.0, focal, v], [0.0, 0.0, 1.0]])
     distortion = tuple(float(d) for d in config.distortion)
     return CameraInfo(name, config.width, config.height, intrinsic, "plumb_bob", distortion)
@@ -106,7 +107,8 @@ class Port:
         """Render an image and its labels: a function of the configuration, the camera and the frame alone."""
         number = sorted(self.cameras).index(camera)
         rng = np.random.default_rng([*_session_seed(self.config, _IMAGES), number, frame])
-        exposure, lens = self.config.exposure, self.config.cameras[camera]
+        exposure = self.config.exposure
+        lens = self.config.cameras[camera]
         optics = Optics(
             psf_sigma_px=lens.psf_sigma_px,
             vignetting=lens.vignetting,
@@ -114,7 +116,8 @@ class Port:
             full_well_electrons=exposure.full_well_electrons,
             read_noise=exposure.read_noise,
         )
-        info, pose = self.cameras[camera].info, self.cam_from_map(camera, frame)
+        info = self.cameras[camera].info
+        pose = self.cam_from_map(camera, frame)
         boxes = self.moving_boxes(frame)
         return self.renderer.render(info, pose, rng, optics, self._motion(camera, frame), boxes)
 
@@ -130,13 +133,16 @@ class Port:
 
     def _motion(self, camera: str, frame: int) -> Motion:
         """The camera's motion on its way along the route, in its own frame."""
-        stamp, extrinsic = self.driven.stamp_s[frame : frame + 1], self.cam_from_vehicle[camera]
-        speed, station = float(self.route.speed_at(stamp)[0]), self.route.station_at(stamp)
+        stamp = self.driven.stamp_s[frame : frame + 1]
+        extrinsic = self.cam_from_vehicle[camera]
+        speed = float(self.route.speed_at(stamp)[0])
+        station = self.route.station_at(stamp)
         yaw_rate = speed * float(np.interp(station[0], self.route.station_m, self.route.curvature))
         turning = np.array([0.0, 0.0, yaw_rate])
         moving = np.array([speed, 0.0, 0.0]) + np.cross(turning, camera_centre(extrinsic))
         velocity = extrinsic[:3, :3] @ moving
-        (vx, vy, vz), (wx, wy, wz) = velocity.tolist(), (extrinsic[:3, :3] @ turning).tolist()
+        (vx, vy, vz) = velocity.tolist()
+        (wx, wy, wz) = (extrinsic[:3, :3] @ turning).tolist()
         exposure_s = self.config.exposure.exposure_s
         return Motion(velocity_cam=(vx, vy, vz), angular_velocity_cam=(wx, wy, wz), exposure_s=exposure_s)
 
@@ -152,9 +158,11 @@ def _session_seed(config: PortConfig, part: int) -> list[int]:
 def _surveyed_cameras(config: PortConfig) -> dict[str, Camera]:
     """A port's cameras as the mapper knows them: IPMs, a region, a surveyed centre. Raises ConfigError."""
     rng = np.random.default_rng([config.seed, _CALIBRATION])
-    sigma, surveyed = np.full(3, config.calibration.centre_sigma_m), {}
+    sigma = np.full(3, config.calibration.centre_sigma_m)
+    surveyed = {}
     for name, camera in sorted(config.cameras.items()):
-        info, mount = camera_info(name, camera), camera.mount
+        info = camera_info(name, camera)
+        mount = camera.mount
         own, own_roi = calibrate(info, mount, config.calibration, rng)
         borrowed, borrowed_roi = calibrate(info, camera.borrowed_mount, config.calibration, rng)
         prior = CentrePrior(np.array([mount.x_m, mount.y_m, mount.z_m]) + rng.normal(0.0, sigma), sigma)
@@ -178,7 +186,8 @@ def build_port(config: PortConfig) -> Port:
     relief = build_relief(config.relief, route)
     boxes = tuple(standing(box, relief) for box in scene.boxes)
     scene = replace(scene, paints=tuple(layout.paints), boxes=boxes, relief=relief)
-    cameras, classes = _surveyed_cameras(config), (*PAINT_CLASSES, *config.paint.stencils)
+    cameras = _surveyed_cameras(config)
+    classes = (*PAINT_CLASSES, *config.paint.stencils)
     return Port(
         config=config,
         route=route,

@@ -320,7 +320,7 @@ class PortConfig:
     """A port, a vehicle with its cameras, and one drive through it.
 
     ``initial_ipm`` is the calibration that the drive starts from: calibrated (this vehicle's own, manual) or
-    estimated (the other vehicle's). ``session`` numbers drives through one port: the same paint with different
+    estimated (the other vehicle's). ``session`` numbers drives through one port: the same paint with other
     pose noise, image noise and traffic. Equal values give equal files, byte for byte.
 
     Attributes:

@@ -93,16 +93,19 @@ def hidden_by(boxes: Sequence[Box], centre_map: FloatArray, points_map: FloatArr
     hidden = np.zeros(len(points_map), dtype=np.bool_)
     points = points_map if points_map.shape[1] == 3 else _on_ground(points_map, None)
     for box in boxes:
-        cos, sin = np.cos(box.yaw_rad), np.sin(box.yaw_rad)
+        cos = np.cos(box.yaw_rad)
+        sin = np.sin(box.yaw_rad)
         turn = np.array([[cos, -sin], [sin, cos]])
         ends = np.vstack([centre_map, points])
         above_m = ends[:, 2] - ground_under(box, ends[:, :2]) - box.base_m
         eye, *ground = np.column_stack([(ends[:, :2] - box.centre_map) @ turn, above_m])
         ray = np.reshape(ground, (-1, 3)) - eye
         half = np.array([box.size_m[0] / 2, box.size_m[1] / 2])
-        low, high = np.append(-half, 0.0), np.append(half, box.size_m[2])
+        low = np.append(-half, 0.0)
+        high = np.append(half, box.size_m[2])
         with np.errstate(divide="ignore", invalid="ignore"):
-            first, second = (low - eye) / ray, (high - eye) / ray
+            first = (low - eye) / ray
+            second = (high - eye) / ray
         enter = np.fmin(first, second).max(axis=1)
         leave = np.fmax(first, second).min(axis=1)
         hidden |= (enter < np.minimum(leave, 1.0)) & (leave > 0)
@@ -170,7 +173,8 @@ def render_drive(config: PortConfig, folder: Path, workers: int, progress: Steps
         for name in port.cameras:
             (folder / name / "images").mkdir(parents=True, exist_ok=True)
         _render_all(port, images, workers, progress)
-        noise, truth_dir = pose_noise(config.disturbance, config.route.speed_mps), folder / TRUTH_FOLDER
+        noise = pose_noise(config.disturbance, config.route.speed_mps)
+        truth_dir = folder / TRUTH_FOLDER
         drive = Drive(config.name, folder, port.cameras, images, noise, port.hd_map.origin, truth_dir)
         write_truth(truth_dir, _truth(port, images), images)
         write_drive(folder, drive, port.driven.recorded)
@@ -206,7 +210,8 @@ def _start_worker(config: PortConfig) -> None:
 
 
 def _write_picture(job: _Job, own: Port | None = None) -> None:
-    port, (camera, frame, target) = own or _worker_port, job
+    port = own or _worker_port
+    (camera, frame, target) = job
     assert port is not None
     data = port.jpeg(port.picture(camera, frame).image)
     with whole_file(Path(target)) as partial:

@@ -29,7 +29,8 @@ from v2hdm.simulate.render.scene import WHITE_PAINT, YELLOW_PAINT, Bgr, Paint, p
 
 _VERTEX_SPACING_M = 0.5
 _PIECE_TURN_RAD = 0.015  # the first piece of a turn of 12 m is 4 mm off the straight line before it
-_PIECE_STEP_M, _PIECE_LENGTH_M = 0.1, 25.0
+_PIECE_STEP_M = 0.1
+_PIECE_LENGTH_M = 25.0
 _PIECE_OVERLAP_M = 0.02  # as wide as the gap between two pieces on the outer side of a turn, and more
 _LEAST_GAP_M = 1.7
 _LINE_GAP_M = 1.1
@@ -130,7 +131,8 @@ class _Painter:
         length_m = self.route.length_m
         points = self.route.points_at(np.arange(0.0, length_m, _VERTEX_SPACING_M), offset_m)
         self.layout.lanes.append(Lane(LANE_LINE, points, 0))
-        worn, seed = self._worn(), self._seed()
+        worn = self._worn()
+        seed = self._seed()
         for start, end in self._straight_pieces():
             around = np.array([max(start - _PIECE_OVERLAP_M, 0.0), min(end + _PIECE_OVERLAP_M, length_m)])
             self._paint(LANE_LINE, self._ribbon(around, offset_m), worn, seed)
@@ -146,7 +148,8 @@ class _Painter:
 
     def dashed_line(self, offset_m: float) -> None:
         """Dashes as markings, each straight, and one lane through them all, beside the route between them."""
-        config, route = self.config, self.route
+        config = self.config
+        route = self.route
         period = config.dash_length_m + config.dash_gap_m
         longer = 1 + abs(offset_m) * float(np.abs(route.curvature).max())
         points: list[FloatArray] = []
@@ -159,14 +162,17 @@ class _Painter:
             if points:
                 gap_m = start - last_m
                 points.append(route.points_at(last_m + gap_m * _shares(longer * gap_m)[1:-1], offset_m))
-            tail, head = polygon[[0, 3]].mean(axis=0), polygon[[1, 2]].mean(axis=0)
+            tail = polygon[[0, 3]].mean(axis=0)
+            head = polygon[[1, 2]].mean(axis=0)
             points.append(tail + _shares(float(np.linalg.norm(head - tail)))[:, None] * (head - tail))
             last_m = float(ends[1])
         if points:
             self.layout.lanes.append(Lane(LANE_DASH, np.concatenate(points), 0))
 
     def diamond_row(self, offset_m: float, is_field: bool) -> None:
-        config, route, rng = self.config, self.route, self.rng
+        config = self.config
+        route = self.route
+        rng = self.rng
         half = _DIAMOND * (config.diamond_length_m, config.diamond_width_m)
         colour = YELLOW_PAINT if config.yellow_diamonds else WHITE_PAINT
         lines = self.layout.vertices()
@@ -175,7 +181,8 @@ class _Painter:
             at = np.array([station + rng.normal(0.0, config.placing_sigma_m)])
             yaw = float(route.yaw_at(at)[0]) + np.deg2rad(rng.normal(0.0, config.placing_sigma_deg))
             centre = route.points_at(at, offset_m + rng.normal(0.0, config.placing_sigma_m))[0]
-            worn, seed = self._worn(), self._seed()
+            worn = self._worn()
+            seed = self._seed()
             if is_field and abs(np.interp(at[0], route.station_m, route.curvature)) >= _STRAIGHT_PER_M:
                 continue
             # Rows beyond the lanes may run into another part of the route behind a turn.
@@ -188,13 +195,16 @@ class _Painter:
             self._paint(DIAMOND, corners, worn, seed, colour)
 
     def stencil_rows(self, kind: str, stencil: StencilConfig) -> None:
-        route, rng, spacing_m = self.route, self.rng, stencil.spacing_m
+        route = self.route
+        rng = self.rng
+        spacing_m = stencil.spacing_m
         shapes = [np.array(shape) for shape in stencil.shapes_m]
         shapes = [shape if signed_area(shape) > 0 else shape[::-1] for shape in shapes]
         lines = self.layout.vertices()
         for offset_m in stencil.offsets_m:
             for station in np.arange(rng.uniform(0.0, spacing_m), route.length_m - 2.0, spacing_m):
-                worn, turned = self._worn(), np.deg2rad(rng.normal(0.0, self.config.placing_sigma_deg))
+                worn = self._worn()
+                turned = np.deg2rad(rng.normal(0.0, self.config.placing_sigma_deg))
                 colour = self._colour()
                 for at in station + np.linspace(0.0, spacing_m, _STENCIL_TRIES, endpoint=False):
                     centre = route.points_at(np.array([at]), offset_m)[0]
@@ -206,7 +216,9 @@ class _Painter:
 
     def other_paint(self) -> None:
         """Arrows, stop lines and lettering; of these only the stop lines are markings of the map."""
-        config, route, rng = self.config, self.route, self.rng
+        config = self.config
+        route = self.route
+        rng = self.rng
         for kind, spacing, shapes in (
             (ARROW, config.arrow_spacing_m, _ARROW_M),
             (STOP_LINE, config.stop_line_spacing_m, _STOP_LINE_M),
@@ -225,7 +237,8 @@ class _Painter:
             left = -0.55 * letter
             for x0, x1, y0, y1 in _LETTER_BARS_M:
                 if self.rng.random() < 0.7:
-                    low, high = left + y0, left + y1
+                    low = left + y0
+                    high = left + y1
                     bars.append(np.array([[x0, low], [x1, low], [x1, high], [x0, high]]))
         return bars
 

@@ -144,7 +144,8 @@ def drive_along(
     jitter = correlated_noise(stamp_s, sigma, disturbance.jitter_correlation_s, rng, 2)
     jitter += rng.normal(0.0, sigma, (len(stamp_s), 2))
     heave = correlated_noise(stamp_s, disturbance.heave_m, disturbance.jitter_correlation_s, rng)
-    at, yaw = route.points_at(station), route.yaw_at(station)
+    at = route.points_at(station)
+    yaw = route.yaw_at(station)
     true = above_plane = _poses(at, heave[:, 0], jitter, yaw)
     if stands is not None:
         ground = stands(at, yaw)
@@ -160,7 +161,8 @@ def drive_along(
     ground = np.zeros((len(recorded_s), 3))
     if stands is not None:
         ground = stands(route.points_at(station), route.yaw_at(station))
-        drift, over_m = disturbance.rtk_correlated_m, disturbance.rtk_correlation_m
+        drift = disturbance.rtk_correlated_m
+        over_m = disturbance.rtk_correlation_m
         errors = correlated_noise(station, drift, over_m, rng)[:, 0]
         errors += rng.normal(0.0, disturbance.rtk_white_m, len(errors))
         ground[:, 0] += HEIGHT_SIGMAS * errors
@@ -212,11 +214,14 @@ def measured_disturbances(config: DisturbanceConfig, driven: DrivenPoses) -> dic
     }
 
 
-_GRID_M, _BORDER_M = 0.25, 60.0
+_GRID_M = 0.25
+_BORDER_M = 60.0
 _REACH_M = 20.0  # beside the route; farther out the ground knows nothing of it
-_CROWN_M, _BANK_M = 10.0, 8.0  # to either side: as far as the ground falls, or leans undiminished
+_CROWN_M = 10.0
+_BANK_M = 8.0  # to either side: as far as the ground falls, or leans undiminished
 _EASE_M = 12.0  # over which a ramp begins and ends
-_GULLY_M, _KERB_M = 0.4, 0.3  # standard deviation of its section, and its width
+_GULLY_M = 0.4
+_KERB_M = 0.3  # standard deviation of its section, and its width
 _WHEELS_M = np.array([[2.8, 0.8], [2.8, -0.8], [0.0, 0.8], [0.0, -0.8]])
 """Ahead of the vehicle's origin, which is under the rear axle, and to its left: front wheels first."""
 
@@ -229,7 +234,8 @@ def build_relief(config: ReliefConfig, route: Route) -> Relief | None:
         end_m = config.ramp_at_m + config.ramp_length_m
         problem = f"the ramp ends {end_m:g} m along a route of {route.length_m:.0f} m"
         raise ConfigError(f"simulate.relief: {problem}; set a lower ramp_at_m or ramp_length_m")
-    low, high = route.points_map.min(axis=0) - _BORDER_M, route.points_map.max(axis=0) + _BORDER_M
+    low = route.points_map.min(axis=0) - _BORDER_M
+    high = route.points_map.max(axis=0) + _BORDER_M
     columns, rows = (np.arange(a, b, _GRID_M) for a, b in zip(low, high, strict=True))
     points = np.stack(np.meshgrid(columns, rows), axis=-1)
     heights = config.grade * points[..., 0] + _ramp(config, route, points)
@@ -256,8 +262,10 @@ def _ramp(config: ReliefConfig, route: Route, points: FloatArray) -> FloatArray:
 def _beside(config: ReliefConfig, route: Route, points: FloatArray) -> FloatArray:
     """Heights (N,) at points (N, 2) by their distance from the route."""
     away, at = cKDTree(route.points_map).query(points, distance_upper_bound=_REACH_M)
-    at, away = np.minimum(at, len(route.yaw_rad) - 1), np.minimum(away, _REACH_M)
-    off, yaw = points - route.points_map[at], route.yaw_rad[at]
+    at = np.minimum(at, len(route.yaw_rad) - 1)
+    away = np.minimum(away, _REACH_M)
+    off = points - route.points_map[at]
+    yaw = route.yaw_rad[at]
     left = np.copysign(away, off[:, 1] * np.cos(yaw) - off[:, 0] * np.sin(yaw))
     heights = -config.crown * np.minimum(away, _CROWN_M)
     heights -= config.gully_m * np.exp(-0.5 * ((away - config.gully_offset_m) / _GULLY_M) ** 2)
@@ -271,7 +279,8 @@ def stands(relief: Relief | None, points_map: FloatArray, yaw_rad: FloatArray) -
     """Height, roll and pitch (N, 3) of a vehicle whose wheels are on the ground, at points (N, 2)."""
     if relief is None:
         return np.zeros((len(points_map), 3))
-    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+    cos = np.cos(yaw_rad)
+    sin = np.sin(yaw_rad)
     turn = np.stack([np.stack([cos, sin], axis=1), np.stack([-sin, cos], axis=1)], axis=1)
     wheels = relief.height_m(points_map[:, None] + _WHEELS_M @ turn)
     middle = _WHEELS_M.mean(axis=0)

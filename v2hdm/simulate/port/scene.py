@@ -67,12 +67,15 @@ def build_scene(
     surface: SurfaceConfig, yard: YardConfig, route: Route, rng: np.random.Generator, seed: int
 ) -> parts.Scene:
     """Build the scene of a port without its paint."""
-    azimuth, elevation = np.deg2rad(yard.sun_azimuth_deg), np.deg2rad(yard.sun_elevation_deg)
-    east, north = np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation)
+    azimuth = np.deg2rad(yard.sun_azimuth_deg)
+    elevation = np.deg2rad(yard.sun_elevation_deg)
+    east = np.cos(azimuth) * np.cos(elevation)
+    north = np.sin(azimuth) * np.cos(elevation)
     blue, green, red = (yard.sun_strength * channel for channel in parts.Light().sun_bgr)
     direction = (float(east), float(north), float(np.sin(elevation)))
     light = parts.Light(sun_direction_map=direction, sun_bgr=(blue, green, red))
-    a, slab_m = surface.albedo, (surface.slab_m[0], surface.slab_m[1])
+    a = surface.albedo
+    slab_m = (surface.slab_m[0], surface.slab_m[1])
     ground = parts.Ground(
         albedo_bgr=(0.95 * a, a, 1.03 * a),
         texture=surface.texture,
@@ -101,7 +104,8 @@ def moving_trucks(yard: YardConfig, route: Route, rng: np.random.Generator) -> t
         speed = float(rng.uniform(3.0, 6.0))
         meeting_m = route.length_m * (k + rng.uniform(0.3, 0.9)) / yard.moving_trucks
         start = meeting_m * (1 + speed / route.speed_mps)
-        colour, seed = _colour(rng), int(rng.integers(1 << 20))
+        colour = _colour(rng)
+        seed = int(rng.integers(1 << 20))
         trucks.append(MovingTruck(float(start), speed, yard.moving_offset_m, colour, seed))
     return tuple(trucks)
 
@@ -118,7 +122,8 @@ def _stacks(yard: YardConfig, route: Route, rng: np.random.Generator) -> list[Bo
         for row in range(2):
             offset = side * (yard.stack_clearance_m + width / 2 + row * (width + 0.4) + rng.uniform(0, 1.5))
             for station in np.arange(4.0, route.length_m, length + 0.6):
-                filled, tall = rng.random() < yard.stack_fill / (1 + row), int(rng.integers(1, 4))
+                filled = rng.random() < yard.stack_fill / (1 + row)
+                tall = int(rng.integers(1, 4))
                 colours = rng.integers(len(_CONTAINER_COLOURS), size=3)
                 centre, yaw = route.pose_at(station, offset)
                 base = Box(centre_map=centre, size_m=_CONTAINER_M, yaw_rad=yaw)
@@ -126,7 +131,8 @@ def _stacks(yard: YardConfig, route: Route, rng: np.random.Generator) -> list[Bo
                     continue
                 base = replace(base, corrugated=True)
                 for level in range(tall):
-                    colour, seed = _CONTAINER_COLOURS[int(colours[level])], int(station * 10) + level
+                    colour = _CONTAINER_COLOURS[int(colours[level])]
+                    seed = int(station * 10) + level
                     boxes.append(replace(base, base_m=level * height, albedo_bgr=colour, seed=seed))
     return boxes
 
@@ -150,7 +156,8 @@ def _occluders(yard: YardConfig, route: Route, rng: np.random.Generator) -> list
     """Parked trucks, barriers and lamp posts nearer to the route than the stacks."""
     boxes: list[Box] = []
     for _ in range(yard.parked_trucks):
-        station, side = rng.uniform(12.0, route.length_m - 12.0), float(rng.choice([-1.0, 1.0]))
+        station = rng.uniform(12.0, route.length_m - 12.0)
+        side = float(rng.choice([-1.0, 1.0]))
         centre, yaw = route.pose_at(station, side * rng.uniform(6.3, 7.4))
         boxes += _truck(centre, yaw, _colour(rng), int(rng.integers(1 << 20)))
     for count, size, offsets, colour in (
@@ -158,7 +165,8 @@ def _occluders(yard: YardConfig, route: Route, rng: np.random.Generator) -> list
         (yard.lamp_posts, (0.22, 0.22, 11.0), (5.9, 8.0), (0.3, 0.3, 0.3)),
     ):
         for _ in range(count):
-            station, side = rng.uniform(8.0, route.length_m - 8.0), float(rng.choice([-1.0, 1.0]))
+            station = rng.uniform(8.0, route.length_m - 8.0)
+            side = float(rng.choice([-1.0, 1.0]))
             centre, yaw = route.pose_at(station, side * rng.uniform(*offsets))
             yaw += rng.normal(0.0, 0.3)
             boxes.append(Box(centre_map=centre, size_m=size, yaw_rad=yaw, albedo_bgr=colour))
@@ -173,7 +181,8 @@ def _strips(yard: YardConfig, route: Route, rng: np.random.Generator) -> list[pa
         yaw += rng.uniform(0.3, 2.8)
         axis = np.array([np.cos(yaw), np.sin(yaw)])
         across = np.array([-axis[1], axis[0]])
-        length, width = rng.uniform(8.0, 30.0), rng.choice([0.15, 0.4, 0.9, 2.5])
+        length = rng.uniform(8.0, 30.0)
+        width = rng.choice([0.15, 0.4, 0.9, 2.5])
         corners = RECTANGLE * (length / 2, width / 2)
         polygon = centre + corners[:, :1] * axis + corners[:, 1:] * across
         strips.append(parts.Shadow(polygon_map=polygon, softness_m=float(rng.uniform(0.03, 0.2))))
@@ -197,17 +206,20 @@ def _ground_marks(surface: SurfaceConfig, route: Route, rng: np.random.Generator
     for _ in range(surface.oil_stains):
         centre, _ = route.pose_at(rng.uniform(0.0, route.length_m), rng.normal(0.0, 3.5))
         x, y = pixels(np.array(centre)).tolist()
-        axes, shade = (int(rng.uniform(6, 90)), int(rng.uniform(6, 60))), int(rng.uniform(15, 60))
+        axes = (int(rng.uniform(6, 90)), int(rng.uniform(6, 60)))
+        shade = int(rng.uniform(15, 60))
         turn_deg = float(rng.uniform(0, 180))
         cv2.ellipse(dark, (x, y), axes, turn_deg, 0, 360, shade, -1, cv2.LINE_AA, _SUBPIXEL_BITS)
     tracks = np.zeros_like(dark)
     for _ in range(int(40 * surface.tyre_marks)):
-        start, length = rng.uniform(0.0, route.length_m), rng.gamma(2.0, 12.0)
+        start = rng.uniform(0.0, route.length_m)
+        length = rng.gamma(2.0, 12.0)
         station = np.arange(start, min(start + length, route.length_m), 0.5)
         if len(station) < 2:
             continue
         drift = rng.normal(0.0, 1.2) + rng.normal(0.0, 0.02) * (station - start)
-        shade, width = int(rng.uniform(8, 38)), int(rng.integers(4, 8))
+        shade = int(rng.uniform(8, 38))
+        width = int(rng.integers(4, 8))
         for wheel in (-0.9, 0.9):
             points = pixels(route.points_at(station, drift + wheel))
             cv2.polylines(tracks, [points], False, shade, width, cv2.LINE_AA, _SUBPIXEL_BITS)

@@ -88,10 +88,13 @@ def intersect_ground(view: View) -> GroundField | None:
 
 
 def _intersect_relief(view: View, relief: Relief) -> GroundField | None:
-    info, rays = view.rays.info, (view.rays.u_pinhole_px, view.rays.v_pinhole_px)
-    found, below = np.empty((6, *rays[0].shape), dtype=np.float32), np.empty(rays[0].shape, dtype=np.bool_)
+    info = view.rays.info
+    rays = (view.rays.u_pinhole_px, view.rays.v_pinhole_px)
+    found = np.empty((6, *rays[0].shape), dtype=np.float32)
+    below = np.empty(rays[0].shape, dtype=np.bool_)
     map_from_ray = view.cam_from_map[:3, :3].T @ np.linalg.inv(info.intrinsic)
-    at, per_focal = view.centre_map, float(1.0 / info.intrinsic[1, 1])
+    at = view.centre_map
+    per_focal = float(1.0 / info.intrinsic[1, 1])
     meet_ground(relief.placed, rays, map_from_ray, at, _FARTHEST_M, per_focal, found, below)
     ground_rows = np.flatnonzero(below.any(axis=1))
     if len(ground_rows) == 0:
@@ -134,7 +137,8 @@ def tone(ground: Ground, field: GroundField) -> Float32:
     fine = fine_tile(ground.texture)
     scales = np.array([scale_of(fine, shift), scale_of(MEDIUM_TILE, shift)], dtype=np.float32)
     amplitudes = np.array([ground.contrast, 0.6 * ground.stains, 0.8 * ground.stains], dtype=np.float32)
-    coarse, out = _sample_smooth(COARSE_TILE, field, shift), np.empty_like(field.x_m)
+    coarse = _sample_smooth(COARSE_TILE, field, shift)
+    out = np.empty_like(field.x_m)
     kernels.ground_tone((fine.padded, MEDIUM_TILE.padded), scales, amplitudes, coarse, field.planes, out)
     if ground.slab_m is not None:
         _slabs(ground, ground.slab_m, field, out)
@@ -153,7 +157,8 @@ def _sample_smooth(tile: Tile, field: GroundField, shift: tuple[float, float]) -
 
 def _slabs(ground: Ground, slab_m: tuple[float, float], field: GroundField, out: Float32) -> None:
     """Multiply joints and the slightly different tones of the slabs into ``out``."""
-    cos, sin = np.float32(np.cos(ground.slab_yaw_rad)), np.float32(np.sin(ground.slab_yaw_rad))
+    cos = np.float32(np.cos(ground.slab_yaw_rad))
+    sin = np.float32(np.sin(ground.slab_yaw_rad))
     index = []
     for pitch, along in (
         (slab_m[0], field.x_m * cos + field.y_m * sin),
@@ -203,7 +208,8 @@ def sun_visibility(
     ]
     for shadow, shape in zip(near, outlines(view, [_penumbra_px(one, view) for one in near]), strict=True):
         if shape is not None:
-            lines, first = inward_lines(np.asarray(shadow.polygon_map, dtype=np.float64)), field.first_row
+            lines = inward_lines(np.asarray(shadow.polygon_map, dtype=np.float64))
+            first = field.first_row
             look = np.float32(shadow.softness_m), np.float32(1.0 - shadow.transmission)
             kernels.cast_shadow(*bands_of(view, shape, first), first, lines, *look, field.planes, out)
     for shade in shades:

@@ -18,7 +18,9 @@ from v2hdm.records import FloatArray, IntArray
 _Plane = NDArray[np.float32]
 _f = np.float32
 _TILE_PX = 512.0
-_ONE, _HALF, _ZERO = _f(1.0), _f(0.5), _f(0.0)
+_ONE = _f(1.0)
+_HALF = _f(0.5)
+_ZERO = _f(0.0)
 
 
 def _rounded_once(_: Any, a: Any, b: Any, c: Any) -> Any:
@@ -47,9 +49,12 @@ def _wrap(metres: Any, per_metre: Any, turn: Any) -> Any:
 @exactly_inlined
 def _sample(tile: _Plane, x_m: Any, y_m: Any, per_metre: Any, turn_x: Any, turn_y: Any) -> Any:
     """A padded tile's value at a ground point, as :func:`v2hdm.simulate.render.scene.sample` has it."""
-    x, y = _wrap(x_m, per_metre, turn_x), _wrap(y_m, per_metre, turn_y)
-    column, row = int(x), int(y)
-    share_x, share_y = x - _f(column), y - _f(row)
+    x = _wrap(x_m, per_metre, turn_x)
+    y = _wrap(y_m, per_metre, turn_y)
+    column = int(x)
+    row = int(y)
+    share_x = x - _f(column)
+    share_y = y - _f(row)
     above = _fma(share_x, tile[row, column + 1] - tile[row, column], tile[row, column])
     below = _fma(share_x, tile[row + 1, column + 1] - tile[row + 1, column], tile[row + 1, column])
     return _fma(share_y, below - above, above)
@@ -84,16 +89,23 @@ def _coverage(edges: NDArray[np.float32], u: Any, v: Any) -> Any:
 def bands(boundary: FloatArray, first_row: int, height: int, width: int, limits: Any, out: IntArray) -> int:
     """Write the windows of an outline px into ``out``, several from an area on; returns their number."""
     count = len(boundary)
-    top, bottom, left, right = boundary[0, 1], boundary[0, 1], boundary[0, 0], boundary[0, 0]
+    top = boundary[0, 1]
+    bottom = boundary[0, 1]
+    left = boundary[0, 0]
+    right = boundary[0, 0]
     for k in range(1, count):
-        top, bottom = min(top, boundary[k, 1]), max(bottom, boundary[k, 1])
-        left, right = min(left, boundary[k, 0]), max(right, boundary[k, 0])
-    begin, end = max(int(np.floor(top)) - 2, first_row), min(int(np.ceil(bottom)) + 3, height)
+        top = min(top, boundary[k, 1])
+        bottom = max(bottom, boundary[k, 1])
+        left = min(left, boundary[k, 0])
+        right = max(right, boundary[k, 0])
+    begin = max(int(np.floor(top)) - 2, first_row)
+    end = min(int(np.ceil(bottom)) + 3, height)
     step = limits[0] if (end - begin) * (right - left) > limits[1] else max(end - begin, 1)
     found = 0
     for row in range(begin, end, step):
         last = min(row + step, end)
-        least, most = np.inf, -np.inf
+        least = np.inf
+        most = -np.inf
         for k in range(count):
             following = k + 1 if k + 1 < count else 0
             rise = boundary[following, 1] - boundary[k, 1]
@@ -104,13 +116,17 @@ def bands(boundary: FloatArray, first_row: int, height: int, width: int, limits:
                 y = boundary[k, 1] + at * (boundary[following, 1] - boundary[k, 1])
                 if row - 2.01 <= y <= last + 2.01:
                     x = boundary[k, 0] + at * (boundary[following, 0] - boundary[k, 0])
-                    least, most = min(least, x), max(most, x)
+                    least = min(least, x)
+                    most = max(most, x)
         if least > most:
             continue
-        first_column, end_column = max(int(np.floor(least)) - 2, 0), min(int(np.ceil(most)) + 3, width)
+        first_column = max(int(np.floor(least)) - 2, 0)
+        end_column = min(int(np.ceil(most)) + 3, width)
         if first_column < end_column:
-            out[found, 0], out[found, 1] = row, last
-            out[found, 2], out[found, 3] = first_column, end_column
+            out[found, 0] = row
+            out[found, 1] = last
+            out[found, 2] = first_column
+            out[found, 3] = end_column
             found += 1
     return found
 
@@ -137,7 +153,9 @@ def draw_paint(
                     continue
                 if covered > _HALF:
                     labels[row, column] = label
-                x, y, footprint = x_m[at, column], y_m[at, column], footprint_m[at, column]
+                x = x_m[at, column]
+                y = y_m[at, column]
+                footprint = footprint_m[at, column]
                 own = _sample(wear, x, y, scales[0, 0], scales[0, 1], scales[0, 2])
                 flaking = own * _fade(footprint, scales[0, 3])
                 own = _sample(stains, x, y, scales[1, 0], scales[1, 1], scales[1, 2])
@@ -163,8 +181,10 @@ def look_at_face(
     m = face_from_pinhole
     for row in range(window[0], window[1]):
         for column in range(window[2], window[3]):
-            i, j = row - window[0], column - window[2]
-            own_u, own_v = u[row, column], v[row, column]
+            i = row - window[0]
+            j = column - window[2]
+            own_u = u[row, column]
+            own_v = v[row, column]
             covered = _coverage(edges, own_u, own_v)
             out[0, i, j] = covered
             covers |= covered > _ZERO
@@ -185,16 +205,20 @@ def draw_face(
 
     ``wave`` (h, w), or of no size, is the sine of the corrugation; ``colour`` is (3, h, w) or (3, 1, 1).
     """
-    corrugated, pictured = wave.shape[0] > 0, colour.shape[1] * colour.shape[2] > 1
+    corrugated = wave.shape[0] > 0
+    pictured = colour.shape[1] * colour.shape[2] > 1
     for i in range(window[1] - window[0]):
         for j in range(window[3] - window[2]):
             covered = face[0, i, j]
             if covered == _ZERO:
                 continue
-            row, column = i + window[0], j + window[2]
+            row = i + window[0]
+            column = j + window[2]
             if covered > _HALF:
                 hidden[row, column] = True
-            along, up, footprint = face[1, i, j], face[2, i, j], face[3, i, j]
+            along = face[1, i, j]
+            up = face[2, i, j]
+            footprint = face[3, i, j]
             tone = _ONE + _f(0.1) * _sample(tile, along, up * _f(0.35), scale[0], scale[1], scale[2])
             if corrugated:
                 ripple = _clip(wave[i, j] * _f(2.5), _f(-1.0), _ONE)
@@ -241,7 +265,9 @@ def ground_tone(
     x_m, y_m, footprint_m = ground
     for row in range(out.shape[0]):
         for column in range(out.shape[1]):
-            x, y, footprint = x_m[row, column], y_m[row, column], footprint_m[row, column]
+            x = x_m[row, column]
+            y = y_m[row, column]
+            footprint = footprint_m[row, column]
             own = _sample(fine, x, y, scales[0, 0], scales[0, 1], scales[0, 2])
             tone = own * (_fade(footprint, scales[0, 3]) * amplitudes[0])
             own = _sample(medium, x, y, scales[1, 0], scales[1, 1], scales[1, 2])
@@ -266,7 +292,8 @@ def light_ground(
             film = mirror = _ZERO
             if wet.shape[0] > 0:
                 film = wet[row, column]
-                x, y = x_m[row, column] - centre[0], y_m[row, column] - centre[1]
+                x = x_m[row, column] - centre[0]
+                y = y_m[row, column] - centre[1]
                 sine = centre[2] / _f(np.sqrt(x * x + y * y + squared_height))
                 grazing = _ONE - max(sine, _f(0.12))
                 squared = grazing * grazing
@@ -286,7 +313,8 @@ def _at_border(place: int, size: int) -> int:
 @exact_kernel
 def blur_along(image: _Plane, flow: _Plane, out: _Plane) -> None:
     """Write the mean (H, W, 3) of an image and of it moved by the flow (H, W, 2) px either way."""
-    height, width = image.shape[0], image.shape[1]
+    height = image.shape[0]
+    width = image.shape[1]
     for row in range(height):
         for column in range(width):
             for c in range(3):
@@ -294,10 +322,14 @@ def blur_along(image: _Plane, flow: _Plane, out: _Plane) -> None:
             for sign in (_f(-1.0), _ONE):
                 x = _f(column) + sign * flow[row, column, 0]
                 y = _f(row) + sign * flow[row, column, 1]
-                floor_x, floor_y = _f(np.floor(x)), _f(np.floor(y))
-                share_x, share_y = x - floor_x, y - floor_y
-                left, right = _at_border(int(floor_x), width), _at_border(int(floor_x) + 1, width)
-                top, bottom = _at_border(int(floor_y), height), _at_border(int(floor_y) + 1, height)
+                floor_x = _f(np.floor(x))
+                floor_y = _f(np.floor(y))
+                share_x = x - floor_x
+                share_y = y - floor_y
+                left = _at_border(int(floor_x), width)
+                right = _at_border(int(floor_x) + 1, width)
+                top = _at_border(int(floor_y), height)
+                bottom = _at_border(int(floor_y) + 1, height)
                 for c in range(3):
                     above = _fma(share_x, image[top, right, c] - image[top, left, c], image[top, left, c])
                     first = image[bottom, left, c]

@@ -13,7 +13,8 @@ from v2hdm.records import BoolArray, FloatArray
 
 _MOST_STEPS = 200
 _SURE_M = 1e-6  # of a height where a ray meets the ground: 0.1 mm along it, 100 times as far as high
-_STEP, _FIRST_STEP_M = 0.2, 0.5  # a ray's steps, as a share of the way behind it and beside that, m
+_STEP = 0.2
+_FIRST_STEP_M = 0.5  # a ray's steps, as a share of the way behind it and beside that, m
 _BACK = 0.98  # share of the way of the ray below at which one begins: no two are in one upright plane
 _ALONG_SIGHT = np.linspace(0.02, 0.98, 33)[:, None, None]
 
@@ -60,7 +61,9 @@ class Relief:
 @exactly_inlined
 def _cubic(a: Any, b: Any, c: Any, d: Any, t: Any) -> Any:
     """A uniform cubic B-spline of four knots and its slope, ``t`` between the second and the third."""
-    second, third, last = (c - a) / 2, (a - 2 * b + c) / 2, (d - 3 * c + 3 * b - a) / 6
+    second = (c - a) / 2
+    third = (a - 2 * b + c) / 2
+    last = (d - 3 * c + 3 * b - a) / 6
     value = (a + 4 * b + c) / 6 + t * (second + t * (third + t * last))
     return value, second + t * (2 * third + t * 3 * last)
 
@@ -71,8 +74,10 @@ def _ground_at(placed: Any, x_m: Any, y_m: Any) -> Any:
     knots, x0_m, y0_m, per_metre = placed
     x = min(max((x_m - x0_m) * per_metre, 1.0), knots.shape[1] - 2.001)
     y = min(max((y_m - y0_m) * per_metre, 1.0), knots.shape[0] - 2.001)
-    i, j = int(x) - 1, int(y) - 1
-    s, t = x - i - 1, y - j - 1
+    i = int(x) - 1
+    j = int(y) - 1
+    s = x - i - 1
+    t = y - j - 1
     a, a_x = _cubic(knots[j, i], knots[j, i + 1], knots[j, i + 2], knots[j, i + 3], s)
     b, b_x = _cubic(knots[j + 1, i], knots[j + 1, i + 1], knots[j + 1, i + 2], knots[j + 1, i + 3], s)
     c, c_x = _cubic(knots[j + 2, i], knots[j + 2, i + 1], knots[j + 2, i + 2], knots[j + 2, i + 3], s)
@@ -100,17 +105,20 @@ def meet_ground(
     missed, begin where the ray of the row below ended: as far as that, no ground reaches up to this one.
     """
     u, v = rays
-    m, last = map_from_ray, u.shape[0] - 1
+    m = map_from_ray
+    last = u.shape[0] - 1
     for rank in range(last + 1):
         row, following = (last - rank, last - rank + 1) if m[2, 1] < 0 else (rank, rank - 1)
         for column in range(u.shape[1]):
             x = m[0, 0] * u[row, column] + m[0, 1] * v[row, column] + m[0, 2]
             y = m[1, 0] * u[row, column] + m[1, 1] * v[row, column] + m[1, 2]
             z = m[2, 0] * u[row, column] + m[2, 1] * v[row, column] + m[2, 2]
-            depth, found = _BACK * out[2, following, column] if rank else 0.0, False
+            depth = _BACK * out[2, following, column] if rank else 0.0
+            found = False
             height, by_x, by_y = _ground_at(placed, centre[0] + depth * x, centre[1] + depth * y)
             for _ in range(_MOST_STEPS):
-                above, falls = centre[2] + depth * z - height, z - by_x * x - by_y * y
+                above = centre[2] + depth * z - height
+                falls = z - by_x * x - by_y * y
                 if abs(above) < _SURE_M or depth > farthest_m:
                     found = depth <= farthest_m
                     break
@@ -120,7 +128,9 @@ def meet_ground(
                 height, by_x, by_y = _ground_at(placed, centre[0] + depth * x, centre[1] + depth * y)
             below[row, column] = found
             depth = depth if found else farthest_m
-            out[0, row, column], out[1, row, column] = centre[0] + depth * x, centre[1] + depth * y
+            out[0, row, column] = centre[0] + depth * x
+            out[1, row, column] = centre[1] + depth * y
             out[2, row, column] = depth
             out[3, row, column] = depth * per_focal / max(by_x * x + by_y * y - z, 1e-3)
-            out[4, row, column], out[5, row, column] = by_x, by_y
+            out[4, row, column] = by_x
+            out[5, row, column] = by_y

@@ -88,7 +88,8 @@ def _faces(box: Box) -> list[_Face]:
     pictures = (*box.pictures, *(None,) * 6)
     for k in range(4):
         after = (k + 1) % 4
-        a, b = low[k, :2], low[after, :2]
+        a = low[k, :2]
+        b = low[after, :2]
         along = (b - a) / max(float(np.linalg.norm(b - a)), 1e-9)
         corners = np.array([low[k], low[after], high[after], high[k]])
         faces.append(_Face(corners, np.array([along[1], -along[0], 0.0]), True, pictures[k]))
@@ -112,10 +113,13 @@ def _draw_face(
         sun * s + (sky if face.normal[2] >= 0 else 0.35) * d
         for s, d in zip(light.sun_bgr, light.sky_bgr, strict=True)
     ]
-    edges, rays = edges_of(shape, grown_px=0.5), (view.rays.u_pinhole_px, view.rays.v_pinhole_px)
-    face_from_pinhole, per_focal = _plane_of(face, view), np.float32(1.0 / view.rays.info.intrinsic[0, 0])
+    edges = edges_of(shape, grown_px=0.5)
+    rays = (view.rays.u_pinhole_px, view.rays.v_pinhole_px)
+    face_from_pinhole = _plane_of(face, view)
+    per_focal = np.float32(1.0 / view.rays.info.intrinsic[0, 0])
     offset = (float(box.seed % 101) * 0.37, float(box.seed % 71) * 0.29)
-    scale, waves = np.array(scale_of(_DIRT_TILE, offset), dtype=np.float32), np.empty((0, 0), np.float32)
+    scale = np.array(scale_of(_DIRT_TILE, offset), dtype=np.float32)
+    waves = np.empty((0, 0), np.float32)
     found, count = bands_of(view, shape)
     for window in found[:count]:
         seen = np.empty((4, window[1] - window[0], window[3] - window[2]), dtype=np.float32)
@@ -132,10 +136,13 @@ def _draw_face(
 
 def _plane_of(face: _Face, view: View) -> Float32:
     """Metres along a face's first and last edge, and the inverse depth, from pinhole pixels (3, 3)."""
-    origin, first, last = face.corners_map[0], face.corners_map[1], face.corners_map[3]
+    origin = face.corners_map[0]
+    first = face.corners_map[1]
+    last = face.corners_map[3]
     sides = (first - origin, last - origin)
     axes = np.column_stack([side / max(float(np.linalg.norm(side)), 1e-9) for side in sides])
-    rotation, translation = view.cam_from_map[:3, :3], view.cam_from_map[:3, 3]
+    rotation = view.cam_from_map[:3, :3]
+    translation = view.cam_from_map[:3, 3]
     cam_from_face = np.column_stack([rotation @ axes, rotation @ origin + translation])
     return np.linalg.inv(view.rays.info.intrinsic @ cam_from_face).astype(np.float32)
 
@@ -154,7 +161,8 @@ def _skyline(seed: int, blocks: int) -> Float32:
 def draw_background(view: View, light: Light, backdrop: Backdrop, last_row: int) -> Float32:
     """Radiance (last_row, W, 3) of sky and skyline for the image rows above ``last_row``."""
     rotation = (view.cam_from_map[:3, :3].T @ np.linalg.inv(view.rays.info.intrinsic)).astype(np.float32)
-    u, v = view.rays.u_pinhole_px[:last_row], view.rays.v_pinhole_px[:last_row]
+    u = view.rays.u_pinhole_px[:last_row]
+    v = view.rays.v_pinhole_px[:last_row]
     x, y, z = (row[0] * u + row[1] * v + row[2] for row in rotation)
     elevation = np.arctan2(z, np.hypot(x, y))
     azimuth = np.arctan2(y, x)
@@ -249,7 +257,8 @@ class Renderer:
             background = draw_background(view, scene.light, scene.backdrop, last_row)
             radiance[: ground.first_row] = background[: ground.first_row]
             # The ground's far rows fade into the background of the same pixels.
-            rows, part = slice(ground.first_row, last_row), slice(0, last_row - ground.first_row)
+            rows = slice(ground.first_row, last_row)
+            part = slice(0, last_row - ground.first_row)
             clear = np.exp(ground.depth_m[part] * np.float32(-1.0 / scene.backdrop.haze_m))
             clear = np.where(ground.below[part], clear, 0)[..., None]
             radiance[rows] = background[rows] + clear * (radiance[rows] - background[rows])
@@ -320,7 +329,8 @@ def expose(image: Float32, optics: Optics, rng: np.random.Generator) -> NDArray[
     row, column = (int(n) for n in rng.integers(0, _NOISE_SHIFT_PX, 2))
     field = _normal_field(height + _NOISE_SHIFT_PX, width + _NOISE_SHIFT_PX)
     noise = field[row : row + height, column : column + width]
-    per_electron, dark = np.float32(1.0 / optics.full_well_electrons), np.float32(optics.read_noise**2)
+    per_electron = np.float32(1.0 / optics.full_well_electrons)
+    dark = np.float32(optics.read_noise**2)
     kernels.record(image, noise, per_electron, dark, _srgb_codes(), out)
     return out
 

@@ -230,7 +230,8 @@ def convex_hull(points: FloatArray) -> FloatArray:
 
 def placed(shape: FloatArray, centre_map: FloatArray | tuple[float, float], yaw_rad: float) -> FloatArray:
     """A shape (N, 2) turned by ``yaw_rad`` about its origin, which comes to lie at ``centre_map``."""
-    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+    cos = np.cos(yaw_rad)
+    sin = np.sin(yaw_rad)
     return np.asarray(shape @ np.array([[cos, sin], [-sin, cos]]) + centre_map)
 
 
@@ -246,9 +247,11 @@ def ground_under(box: Box, points_map: FloatArray) -> FloatArray:
 
 def box_faces(box: Box) -> FloatArray:
     """The corners (2, 4, 3) of a box's lower and upper face, counter-clockwise from above."""
-    faces, footprint = np.empty((2, 4, 3)), box_footprint(box)
+    faces = np.empty((2, 4, 3))
+    footprint = box_footprint(box)
     faces[..., :2] = footprint
-    faces[0, :, 2], faces[1, :, 2] = box.base_m, box.base_m + box.size_m[2]
+    faces[0, :, 2] = box.base_m
+    faces[1, :, 2] = box.base_m + box.size_m[2]
     if any(box.beneath):
         faces[..., 2] += ground_under(box, footprint)
     return faces
@@ -262,6 +265,7 @@ def standing(box: Box, relief: Relief | None) -> Box:
 def box_shadow(box: Box, light: Light, softness_m: float = 0.08) -> Shadow:
     """The shadow that a box throws on the ground: hull of its lower and upper face along the sun's rays."""
     sun = np.array(light.sun_direction_map)
-    per_metre, footprint = -sun[:2] / max(sun[2], 0.1), box_footprint(box)
+    per_metre = -sun[:2] / max(sun[2], 0.1)
+    footprint = box_footprint(box)
     faces = [footprint + height * per_metre for height in (box.base_m, box.base_m + box.size_m[2])]
     return Shadow(polygon_map=convex_hull(np.vstack(faces)), softness_m=softness_m)

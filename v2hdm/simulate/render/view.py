@@ -53,7 +53,8 @@ def _rays(width: int, height: int, intrinsic: bytes, model: str, distortion: tup
     shift = (undistort_points(info, grid.reshape(-1, 2)).reshape(grid.shape) - grid).astype(np.float32)
     u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     dense = cv2.remap(shift, u / _GRID_STEP_PX, v / _GRID_STEP_PX, cv2.INTER_LINEAR)
-    u, v = u + dense[..., 0], v + dense[..., 1]
+    u = u + dense[..., 0]
+    v = v + dense[..., 1]
     bounds = (float(u.min()), float(v.min()), float(u.max()), float(v.max()))
     return Rays(info, u, v, bounds)
 
@@ -123,7 +124,8 @@ def outlines(
     """Outlines of polygons of homogeneous pixels (N, 3), None out of view; boundaries those of ``draped``."""
     if not polygons:
         return []
-    count, points = np.array([len(polygon) for polygon in polygons]), np.concatenate(polygons)
+    count = np.array([len(polygon) for polygon in polygons])
+    points = np.concatenate(polygons)
     ends = np.cumsum(count)
     parts = _visible_parts(view, polygons if draped is None else draped)
     place = np.arange(1, len(points) + 1)

@@ -26,7 +26,8 @@ from v2hdm.site.living.map_errors import SHIFT, Errors, Shift, updated_lanes, up
 
 def fused(old: Marking, new: Marking, turn: int, pair: int, shift: Shift) -> Marking:
     """A marking in both maps, with the old one's id and order of corners, and the sightings of both."""
-    of_old, of_new = shift.of_old.own_m2[shift.old[pair]], shift.of_new.own_m2[shift.new[pair]]
+    of_old = shift.of_old.own_m2[shift.old[pair]]
+    of_new = shift.of_new.own_m2[shift.new[pair]]
     order = SHIFTS[turn]
     rows = (2 * order[:, None] + np.arange(2)).ravel()
     information = [np.linalg.inv(of_old), np.linalg.inv(of_new[np.ix_(rows, rows)])]
@@ -76,7 +77,8 @@ def fused_markings(
         else:
             # Repainted elsewhere: at the new map's position, under the old id.
             order = SHIFTS[pair.turn]
-            rows, covariance = (2 * order[:, None] + np.arange(2)).ravel(), moved.covariance_m2
+            rows = (2 * order[:, None] + np.arange(2)).ravel()
+            covariance = moved.covariance_m2
             by_old[pair.old] = replace(
                 moved,
                 corners_map=moved.corners_map[order],
@@ -112,11 +114,13 @@ def update_map(
     correlation length of the poses' error. Raises MappingError if the drive finds too little of the map
     again.
     """
-    old, new = base.hd_map.markings, made.markings
+    old = base.hd_map.markings
+    new = made.markings
     of_old = Errors.of(old, base.hd_map.drift_over_m or _DRIFT_OVER_M)
     of_new = Errors.of(new, drift_over_m)
     rates = find_rates(observer, new)
-    now, before = observer.looks(old, ~mapped), _looks_of(base, new, observer)
+    now = observer.looks(old, ~mapped)
+    before = _looks_of(base, new, observer)
     usual = float(np.mean(list(rates.values())))
     decision = decide(
         old,
@@ -143,7 +147,8 @@ def update_map(
         drift_over_m=max(of_old.over_m, of_new.over_m),
         largest_id=number() - 1,
     )
-    number_of, corner_of = np.zeros(len(new), dtype=np.int64), np.tile(np.arange(4), (len(new), 1))
+    number_of = np.zeros(len(new), dtype=np.int64)
+    corner_of = np.tile(np.arange(4), (len(new), 1))
     for k, one in fresh.items():
         number_of[k] = one.id or 0
     for pair in decision.pairs:
@@ -157,7 +162,8 @@ def update_map(
 
 def _looks_of(base: Base, places: Sequence[Marking], observer: Observer) -> Looks:
     """Looks of the earlier drive at ``places``, assuming the new drive's cameras at its poses."""
-    poses, count = base.poses, len(observer.cameras)
+    poses = base.poses
+    count = len(observer.cameras)
     views = Views(
         image=np.arange(count * len(poses)),
         camera=np.repeat(np.arange(count), len(poses)),
@@ -197,11 +203,13 @@ def _changes(
     before: Looks,
 ) -> list[Change]:
     """Moved, missing and new markings, from the looks at old and new places."""
-    shift, out = decision.shift, []
+    shift = decision.shift
+    out = []
     for pair in decision.pairs:
         if pair.moved <= _LIKELY:
             continue
-        k, after = pair.old, by_old[pair.old]
+        k = pair.old
+        after = by_old[pair.old]
         mean, spread = shift.of_old_at(shift.of_old.centres_map[[k]], shift.of_old.shared_m2[[k]])
         own = shift.of_old.own_m2[k] + shift.of_new.own_m2[pair.new]
         sigma = np.sqrt(np.diag(own.reshape(4, 2, 4, 2).mean(axis=(0, 2)) + spread[0]))
@@ -211,7 +219,8 @@ def _changes(
         course = placed, after.corners_map, moved, sigma, *numbers
         out.append(Change(old[k].id or 0, old[k].kind, Fate.MOVED, *course))
     for k, gone in decision.gone.items():
-        fate, corners = Fate.VANISHED if gone > _LIKELY else Fate.NOT_SEEN, by_old[k].corners_map
+        fate = Fate.VANISHED if gone > _LIKELY else Fate.NOT_SEEN
+        corners = by_old[k].corners_map
         numbers = max(gone, 1 - gone), int(now.views[k]), int(now.found[k]), old[k].sightings
         left = None if gone > _LIKELY else corners
         out.append(Change(old[k].id or 0, old[k].kind, fate, corners, left, None, None, *numbers))

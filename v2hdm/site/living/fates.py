@@ -115,8 +115,10 @@ def decide(
     candidates = _candidates(old, new, of_old, of_new)
     shift = _shift(of_old, of_new, candidates, np.zeros(0, dtype=np.int64))
     rates = _rates(_PRIOR_COUNT, _PRIOR_NEW)
-    chosen, moved = np.zeros(0, dtype=np.int64), np.zeros(0)
-    gone, fresh = np.zeros(len(old)), np.zeros(len(new))
+    chosen = np.zeros(0, dtype=np.int64)
+    moved = np.zeros(0)
+    gone = np.zeros(len(old))
+    fresh = np.zeros(len(new))
     for _ in range(_PASSES):
         likelihood = _likelihoods(candidates, shift, chosen, rates)
         unseen = np.logaddexp(rates.gone + watched_now.bare, rates.kept + watched_now.there)
@@ -192,14 +194,16 @@ def _likelihoods(candidates: _Candidates, shift: Shift, chosen: IntArray, rates:
     of_pair = {(int(a), int(b)): k for k, (a, b) in enumerate(zip(shift.old, shift.new, strict=True))}
     out = np.empty((len(candidates), 2))
     for p in range(len(candidates)):
-        old, new = int(candidates.old[p]), int(candidates.new[p])
+        old = int(candidates.old[p])
+        new = int(candidates.new[p])
         own = of_pair.get((old, new))
         mean, spread = shift.at(old, new) if own is None else shift.without_itself(own)
         off = candidates.basis[p] @ (candidates.off[p] - SHIFT @ mean)
         noise = candidates.basis[p] @ (candidates.noise[p] + SHIFT @ spread @ SHIFT.T) @ candidates.basis[p].T
         # In this basis a shift counts twice its length, a rotation its arm.
         free = np.zeros(8)
-        free[:2], free[2] = (2 * _MOVED_SIGMA_M) ** 2, (candidates.arm_m[p] * _TURNED_SIGMA_RAD) ** 2
+        free[:2] = (2 * _MOVED_SIGMA_M) ** 2
+        free[2] = (candidates.arm_m[p] * _TURNED_SIGMA_RAD) ** 2
         out[p, STAYED] = rates.stayed + _read(off, noise)
         out[p, MOVED] = rates.moved + _read(off, noise + np.diag(free))
     return out
@@ -235,7 +239,8 @@ def _assign(candidates: _Candidates, score: FloatArray) -> IntArray:
     old, row = np.unique(candidates.old[better], return_inverse=True)
     new, column = np.unique(candidates.new[better], return_inverse=True)
     # A dummy column per old marking lets it stay unassigned.
-    alone, most = np.arange(len(old)), 1.0 + score[better].max()
+    alone = np.arange(len(old))
+    most = 1.0 + score[better].max()
     cost = np.append(most - score[better], np.full(len(old), most))
     places = np.append(row, alone), np.append(column, len(new) + alone)
     graph = coo_array((cost, places), shape=(len(old), len(new) + len(old))).tocsr()

@@ -92,7 +92,8 @@ def learn_paint(
         # Across the longest side or diagonal of each.
         every = own[:, [1, 2, 2, 3]] - own[:, [0, 1, 0, 1]]
         extent_m = np.linalg.norm(every, axis=2)
-        rows, longest = np.arange(len(every)), np.argmax(extent_m, axis=1)
+        rows = np.arange(len(every))
+        longest = np.argmax(extent_m, axis=1)
         along = every[rows, longest] / extent_m[rows, longest, None]
         across = _ASIDE_M * turned_left(along)[:, None]
         aside = np.concatenate([own - across, own + across])
@@ -150,7 +151,8 @@ class Observer:
         """Views of ``markings``, and detections of them among the sightings ``free`` (S,)."""
         if not markings:
             return Looks(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
-        corners, count = np.stack([one.corners_map for one in markings]), len(markings)
+        corners = np.stack([one.corners_map for one in markings])
+        count = len(markings)
         place, image = self.easy_views(corners)
         shown = self._shown(markings, corners, free)
         found = [pair in shown for pair in zip(place.tolist(), image.tolist(), strict=True)]
@@ -168,7 +170,8 @@ class Observer:
         row, place = near_pairs(located, rows, corners.mean(axis=1), _REACH_M)
         kinds = np.array([one.kind for one in markings])
         alike = kinds[place] == np.array(self.sightings.kinds)[self.sightings.kind[row]]
-        row, place = row[alike], place[alike]
+        row = row[alike]
+        place = place[alike]
         squared = squared_distances(
             self.sightings, located, self.rig, row, corners[place], self.jitter_rad
         ).min(axis=1, initial=np.inf)
@@ -196,8 +199,10 @@ class Observer:
 
     def _contrast(self, grey: NDArray[np.float32], row: int, corners: FloatArray) -> float:
         """Log ratio of mean grey values within an outline (4, 2) and beside it."""
-        camera, frame = self.views.camera[row], self.views.frame[row]
-        info, cam_from_map = self.cameras[camera].info, self.rig.cam_from_map(camera, frame)
+        camera = self.views.camera[row]
+        frame = self.views.frame[row]
+        info = self.cameras[camera].info
+        cam_from_map = self.rig.cam_from_map(camera, frame)
         if self.rig.read_out_s is not None:  # its middle's row gives the outline's read-out
             seen, _ = project_ground(self.rig.intrinsic[camera], cam_from_map, corners)
             middle = distort_points(info, seen.mean(axis=0, keepdims=True))
@@ -231,7 +236,8 @@ def with_paint(
         return watched
     old_at, new_at = (np.array([one.corners_map.mean(axis=0) for one in some]) for some in (old, new))
     paint_map = np.concatenate([one.corners_map for one in (*old, *new)] + [old_at, new_at])
-    there, bare = watched.there.copy(), watched.bare.copy()
+    there = watched.there.copy()
+    bare = watched.bare.copy()
     for kind, paint in learn_paint(observer, new, paint_map).items():
         alike = np.array([one.kind == kind for one in new])
         near_m = cKDTree(new_at[alike]).query(old_at)[0]

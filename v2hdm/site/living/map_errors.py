@@ -40,7 +40,8 @@ class Errors:
         unknown = np.eye(8) * _UNKNOWN_SIGMA_M**2
         stated = [unknown if one.covariance_m2 is None else one.covariance_m2 for one in markings]
         relative_m = [np.nan if one.relative_sigma_m is None else one.relative_sigma_m for one in markings]
-        whole, own_m2 = np.array(stated).reshape(-1, 8, 8), np.array(relative_m) ** 2
+        whole = np.array(stated).reshape(-1, 8, 8)
+        own_m2 = np.array(relative_m) ** 2
         centre_m2 = np.einsum("miaja->m", whole.reshape(-1, 4, 2, 4, 2)) / 32
         shared_m2 = np.maximum(centre_m2 - own_m2, 0.0)
         # A marking without neighbours has no relative sigma: its common error is the others'.
@@ -108,7 +109,8 @@ class Shift:
 
     def at(self, old: int, new: int) -> tuple[FloatArray, FloatArray]:
         """Mean (2,) and covariance (2, 2) of the maps' shift between an old and a new marking."""
-        one, other = np.array([old]), np.array([new])
+        one = np.array([old])
+        other = np.array([new])
         prior_m2 = self.of_old.shared_m2[old] + self.of_new.shared_m2[new]
         if not len(self.old):
             return np.zeros(2), prior_m2 * np.eye(2)
@@ -137,7 +139,8 @@ class Shift:
 
     def of_both(self, pair: int) -> tuple[FloatArray, FloatArray]:
         """Common errors of the old and the new map at a pair: mean (4,) and covariance (4, 4)."""
-        one, other = np.array([self.old[pair]]), np.array([self.new[pair]])
+        one = np.array([self.old[pair]])
+        other = np.array([self.new[pair]])
         known = [-self.of_old.between(self.old, one)[:, 0], self.of_new.between(self.new, other)[:, 0]]
         gain = np.concatenate([np.kron(part[None], np.eye(2)) for part in known])
         prior = [self.of_old.shared_m2[one[0]], self.of_new.shared_m2[other[0]]]
@@ -209,7 +212,8 @@ def _owner(lane: Lane, lanes: Sequence[Lane]) -> int | None:
 
 def _stations(points: FloatArray, line: FloatArray) -> FloatArray:
     """Arc lengths, m, along a polyline (M, 2) of the feet of points (N, 2), beside the nearest vertex."""
-    along, nearest = length_along(line), cKDTree(line).query(points)[1]
+    along = length_along(line)
+    nearest = cKDTree(line).query(points)[1]
     best = np.full(len(points), np.inf)
     station = np.asarray(along[nearest], dtype=np.float64)
     for first in (nearest - 1, nearest):
@@ -228,14 +232,16 @@ def _renewed(lane: Lane, pieces: Sequence[Lane]) -> Lane:
     """The earlier line, with its course replaced by new lines where they coincide."""
     if not pieces:
         return lane
-    along, heights = length_along(lane.points_map), lane.heights_m
+    along = length_along(lane.points_map)
+    heights = lane.heights_m
     points: list[FloatArray] = []
     up: list[FloatArray] = []
     reached = -1.0
     placed = [(_stations(piece.points_map, lane.points_map), piece.points_map) for piece in pieces]
     for station, course in sorted(placed, key=lambda one: float(one[0].min())):
         if station[-1] < station[0]:
-            station, course = station[::-1], course[::-1]
+            station = station[::-1]
+            course = course[::-1]
         old = (along > reached) & (along < station.min())
         # Of two overlapping new pieces, the later begins where the earlier ends.
         own = (station > reached) | (reached < 0)

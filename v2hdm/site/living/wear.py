@@ -32,12 +32,14 @@ _BESIDE_M = np.array([0.06, 0.10, 0.14, 0.18])  # from the long sides, where the
 _MOST_CELLS = (60, 24)  # along and across
 _NEAR_M = 12.0  # largest range, at which images resolve flakes of paint
 _VIEWS = (2, 6)  # fewest and most images of a marking: errors of more repeat
-_GROUND_SIGMA, _PAINT_SIGMA = 0.08, 0.09
+_GROUND_SIGMA = 0.08
+_PAINT_SIGMA = 0.09
 """Sigmas of the contrast of bare ground, and of full paint as a share of its own (43 rendered markings)."""
 
 _INDEPENDENT = 12.0  # cells that count as independent: flakes, stains and the blur of images span many
 _CONTRASTS = np.exp(np.linspace(np.log(0.2), np.log(4.0), 28))  # of full paint over its ground
-_ROUNDS, _FITTED = 12, 160  # of expectation and maximisation, and cells that take part
+_ROUNDS = 12
+_FITTED = 160  # of expectation and maximisation, and cells that take part
 _MODEL_SIGMA = (0.045, 0.3)
 """Sigma of a fraction beside the fit's, and its growth with wear: flakes finer than a pixel look like dirt, a
 shadow narrower than a marking like wear (143 rendered markings of ports 5 to 8 and 11)."""
@@ -55,7 +57,8 @@ class Cells:
         """The cells of a marking's corners (4, 2)."""
         sides = np.linalg.norm(np.roll(corners_map, -1, axis=0) - corners_map, axis=1)
         if sides[1] + sides[3] > sides[0] + sides[2]:
-            corners_map, sides = np.roll(corners_map, -1, axis=0), np.roll(sides, -1)
+            corners_map = np.roll(corners_map, -1, axis=0)
+            sides = np.roll(sides, -1)
         length, width = (max(float(sides[k] + sides[k + 2]) / 2, 4 * _EDGE_M) for k in (0, 1))
         along, across = (
             np.linspace(_EDGE_M / m, 1 - _EDGE_M / m, int(np.clip((m - 2 * _EDGE_M) / _CELL_M, least, most)))
@@ -80,9 +83,12 @@ class Cells:
         # A shadow's edge is anywhere between the sides.
         far = np.broadcast_to((np.arange(every.shape[2]) + 0.5) / every.shape[2], every.shape[1:])
         lit_like = np.stack([1 - far, far, np.full(far.shape, 0.5)]).reshape(3, 1, -1) / 1.5
-        every, step = every.reshape(3, 1, -1), -(-far.size // _FITTED)
-        cells, lit_like = every[..., ::step], lit_like[..., ::step]
-        paint, sigma = _CONTRASTS[:, None], np.hypot(_PAINT_SIGMA * _CONTRASTS, _GROUND_SIGMA)[:, None]
+        every = every.reshape(3, 1, -1)
+        step = -(-far.size // _FITTED)
+        cells = every[..., ::step]
+        lit_like = lit_like[..., ::step]
+        paint = _CONTRASTS[:, None]
+        sigma = np.hypot(_PAINT_SIGMA * _CONTRASTS, _GROUND_SIGMA)[:, None]
         partly = norm.cdf(cells, 0.0, _GROUND_SIGMA) - norm.cdf(cells, paint, sigma)
         bare = np.broadcast_to(norm.pdf(cells, 0.0, _GROUND_SIGMA), partly.shape)
         by_side = np.stack([norm.pdf(cells, paint, sigma), bare, np.maximum(partly, 0.0) / paint])
@@ -143,7 +149,8 @@ def _shares(fits: Sequence[tuple[FloatArray, ...]], kinds: Sequence[str]) -> lis
     for kind in set(kinds):
         mine = [k for k, one in enumerate(kinds) if one == kind]
         likelihood, share, own_sigma = (np.stack([fits[k][part] for k in mine]) for part in range(3))
-        middle, spread = np.log(1.3), 0.5
+        middle = np.log(1.3)
+        spread = 0.5
         for _ in range(3):
             log_posterior = likelihood + norm.logpdf(log_contrasts, middle, spread)
             posterior = np.exp(log_posterior - log_posterior.max(axis=1, keepdims=True))

@@ -32,7 +32,8 @@ _OFF_CENTRE = 0.15
 # A principal point in the middle of an image smaller or larger by this is of another resolution.
 _OTHER_SIZE = 0.15
 # Focal lengths, in image widths, of lenses that map roads: 118 deg wide (fisheyes more) to 11 deg.
-_SHORTEST, _LONGEST = 0.3, 5.0
+_SHORTEST = 0.3
+_LONGEST = 5.0
 _SQUARE = 0.03  # pixels are square to far less than this
 _MISSHAPEN = 0.03  # clicked homographies depart from K [r1 r2 t] by about one percent
 _BORROWED_M = 1.0  # a guess from another vehicle of the same type, or from a drawing, is decimetres off
@@ -44,7 +45,8 @@ _ROI_AREA_M2 = 4.0  # a smaller ROI holds no whole marking: a dash alone is 3 m 
 # Ground per pixel, along the view, at the ROI's far end: beyond, a pixel of noise is half a metre.
 _COARSEST_M = 0.5
 _TILTED_DEG = 30.0  # cameras for roads are mounted upright
-_LOWEST_M, _HIGHEST_M = 0.3, 12.0  # heights of cameras on vehicles, cranes' straddle carriers included
+_LOWEST_M = 0.3
+_HIGHEST_M = 12.0  # heights of cameras on vehicles, cranes' straddle carriers included
 
 
 def check_camera(name: str, camera: Camera) -> list[Finding]:
@@ -65,7 +67,8 @@ def check_intrinsics(name: str, info: CameraInfo) -> Iterator[Finding]:
     """Camera matrix against image size."""
     (fx, _, cx), (_, fy, cy), _ = info.intrinsic
     off = max(abs(cx + 0.5 - info.width / 2), abs(cy + 0.5 - info.height / 2)) / info.width
-    scale_u, scale_v = (2 * cx + 1) / info.width, (2 * cy + 1) / info.height
+    scale_u = (2 * cx + 1) / info.width
+    scale_v = (2 * cy + 1) / info.height
     other = abs(scale_u / max(scale_v, 1e-9) - 1) < _OTHER_SIZE and abs(scale_u - 1) > _OTHER_SIZE
     size = f"{scale_u * info.width:.0f} x {scale_v * info.height:.0f}"
     cause = (
@@ -174,7 +177,8 @@ def _mounting(name: str, cam_from_vehicle: FloatArray) -> Iterator[Finding]:
 def _shape(name: str, info: CameraInfo, ipm: FloatArray) -> Finding:
     """Deviation of the IPM from K [r1 r2 t]: its ground axes must be equally long and perpendicular."""
     columns = np.linalg.inv(info.intrinsic) @ np.linalg.inv(ipm)
-    first, second = columns[:, 0], columns[:, 1]
+    first = columns[:, 0]
+    second = columns[:, 1]
     lengths = np.linalg.norm(first), np.linalg.norm(second)
     ratio = float(lengths[0] / lengths[1] - 1)
     cosine = float(first @ second / (lengths[0] * lengths[1]))
@@ -223,8 +227,10 @@ def _share_in_image(camera: Camera, grid: FloatArray, depth: FloatArray) -> floa
 
 def _frame(info: CameraInfo, margin: float) -> FloatArray:
     """The image's border, wider by ``margin`` of its size on each side."""
-    left, top = -margin * info.width, -margin * info.height
-    right, bottom = info.width - 1 - left, info.height - 1 - top
+    left = -margin * info.width
+    top = -margin * info.height
+    right = info.width - 1 - left
+    bottom = info.height - 1 - top
     return np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
 
 
@@ -237,7 +243,8 @@ def _grid(polygon: FloatArray) -> FloatArray:
 
 # Sigmas of roll and pitch beyond which ground is bent, not noisy; and beyond which markings on it are wrong
 # by many times what the map states.
-_ROAD_SIGMAS, _ROAD_BENT = 3.0, 10.0
+_ROAD_SIGMAS = 3.0
+_ROAD_BENT = 10.0
 _LEAST_SWAY_RAD = 0.003  # roll and pitch of every vehicle on its suspension, whatever pose_noise states
 _STEPS = ("position jumps", "height jumps", "pose scatter", "image spacing", "pose gaps", "pose rate")
 _MOUNTING = ("roi", "roi range", "ipm against camera matrix", "camera height", "survey against guess")

@@ -173,7 +173,8 @@ def check_ground(
 
 
 def _read_as(name: str, estimate: GroundEstimate, reading: Reading) -> Finding:
-    as_given, best = estimate.shares.get(Reading.AS_GIVEN, 0.0), estimate.shares.get(reading, 0.0)
+    as_given = estimate.shares.get(Reading.AS_GIVEN, 0.0)
+    best = estimate.shares.get(reading, 0.0)
     return Finding("path", Status.FAIL, as_given, best, "", _READ_AS[reading], name)
 
 
@@ -219,7 +220,8 @@ def _judge_parameter(name: str, parameter: Parameter, confounded: str) -> Findin
         why = parameter.why_not or confounded or "the route turns too little; drive a turn"
         says = f"this drive does not show it: {why}"
         return Finding(one.name, Status.PASS, None, one.scale * one.limit, one.unit, says, name)
-    value, limit = one.scale * parameter.value, one.scale * max(one.limit, _SURE * parameter.sigma)
+    value = one.scale * parameter.value
+    limit = one.scale * max(one.limit, _SURE * parameter.sigma)
     wrong = one.wrong.format(size=abs(value), way=one.ways[parameter.value < 0])
     return judge(one.name, name, value, limit, one.unit, fine=one.fine, wrong=wrong, status=one.status)
 
@@ -275,7 +277,8 @@ def _clocks(ground: Mapping[str, GroundEstimate]) -> Iterator[Finding]:
             says = f"this drive cannot tell whether the clock is right: {clock.why_not}"
             yield Finding("clock", Status.PASS, None, 1e3 * _CLOCK_S, "ms", says, name)
             continue
-        size, way = abs(1e3 * clock.value), "later" if clock.value > 0 else "earlier"
+        size = abs(1e3 * clock.value)
+        way = "later" if clock.value > 0 else "earlier"
         correctable = abs(clock.value) <= _CORRECTABLE_S
         recovery = "the map is corrected for it; fix the stamps" if correctable else "fix the stamps"
         whose = "all cameras equally: the poses' clock is off" if common else "this camera's clock is off"
@@ -315,7 +318,8 @@ def scaled(drive: Drive, factor: float) -> Drive:
         return None if path is None else replace(path, map_from_vehicle=moved(path.map_from_vehicle))
 
     images = [replace(image, map_from_vehicle=moved(image.map_from_vehicle)) for image in drive.images]
-    trajectory, recorded = along(drive.trajectory), along(drive.recorded)
+    trajectory = along(drive.trajectory)
+    recorded = along(drive.recorded)
     return replace(drive, images=images, trajectory=trajectory, recorded=recorded, road=None)
 
 

@@ -225,7 +225,9 @@ def _turns_too_fast(motion: Motion) -> bool:
 
 def _agreement(motion: Motion, undo: Undo | None = None) -> tuple[float, float]:
     """Fractions of chords on which the vehicle is upright and points ahead, and ahead or back."""
-    position, rotation, chords = motion.position, motion.rotation, motion.chords
+    position = motion.position
+    rotation = motion.rotation
+    chords = motion.chords
     if undo is not None:
         position, rotation = undo(position, rotation)
     angle = angle_between(_forward(rotation, chords), position[chords.last, :2] - position[chords.first, :2])

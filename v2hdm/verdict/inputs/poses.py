@@ -42,7 +42,8 @@ _HEADING_RAD = 0.035
 _ROLL_PITCH_RAD = 0.05  # three degrees: a vehicle that sways more than this on its suspension overturns
 # Scatter of the poses, relative to the stated noise, beyond which the map's sigmas are wrong by as much, and
 # beyond which the map itself is wrong.
-_UNDERSTATED, _USELESS = 3.0, 10.0
+_UNDERSTATED = 3.0
+_USELESS = 10.0
 # The fourth difference: driving at 10 Hz leaves millimetres in it, white noise sqrt(70) sigmas.
 _DIFFERENCES = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
 # Poses whose intervals vary less than this share are evenly spaced, as a fourth difference needs.
@@ -117,7 +118,8 @@ class Motion:
     @cached_property
     def turn_rad(self) -> FloatArray:
         """Turn (N,) of the recorded heading on each chord."""
-        first, last = self.rotation[self.chords.first, :2, 0], self.rotation[self.chords.last, :2, 0]
+        first = self.rotation[self.chords.first, :2, 0]
+        last = self.rotation[self.chords.last, :2, 0]
         return angle_between(first, last)
 
     def _reached(self, start: int) -> int | None:
@@ -218,7 +220,8 @@ def _jitter(motion: Motion, off: FloatArray) -> Finding | None:
     # From one offset to the next: steady braking cancels.
     along = np.diff((off * ahead).sum(axis=1))[driven]
     across = np.diff(cross(ahead, off))[driven]
-    along_m, across_m = _robust_sigma(along), _robust_sigma(across)
+    along_m = _robust_sigma(along)
+    across_m = _robust_sigma(across)
     surely = float(np.exp(_SURE_JITTER / np.sqrt(len(along))))
     if not 0 < surely * across_m < along_m or np.abs(along).max() > _EXTREME / 2 * along_m:
         return None
@@ -295,7 +298,8 @@ def check_noise(motion: Motion, noise: PoseNoise) -> list[Finding]:
 
 def _is_course(motion: Motion, scatter_rad: float) -> bool:
     """Whether the heading's scatter is mostly that of the course, and so of the positions."""
-    ahead, at = motion.rotation[1:-1, :2, 0], motion.position[:, :2]
+    ahead = motion.rotation[1:-1, :2, 0]
+    at = motion.position[:, :2]
     courses = (at[1:-1] - at[:-2], at[2:] - at[1:-1], at[2:] - at[:-2])
     return min(_robust_sigma(_fourth(angle_between(ahead, one))) for one in courses) < scatter_rad / 2
 

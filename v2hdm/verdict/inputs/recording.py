@@ -33,7 +33,8 @@ _SAME_GREY = 0.5
 # Share of repeated images on the way that passes: a dropped frame now and then, filled by the one before.
 _FROZEN = 0.02
 _STUCK = 3  # repeats in a row that no single dropped frame makes
-_BRIGHTEST, _DARKEST = 250, 5  # grey values at which an image of 8 bits is clipped
+_BRIGHTEST = 250
+_DARKEST = 5  # grey values at which an image of 8 bits is clipped
 _CLIPPED = 0.25  # share of clipped road that hides markings; paint itself takes a few percent
 
 
@@ -103,7 +104,8 @@ def _posed(drive: Drive, name: str, posed: int) -> Finding:
 
 def _overlap(spans: dict[str, tuple[float, float]], name: str) -> Finding:
     """The fraction of all cameras' recording time that this one misses."""
-    start, end = min(first for first, _ in spans.values()), max(last for _, last in spans.values())
+    start = min(first for first, _ in spans.values())
+    end = max(last for _, last in spans.values())
     missed = 1 - (spans[name][1] - spans[name][0]) / max(end - start, 1e-9)
     return judge(
         "camera span", name, missed, _HALF / 2, "",
@@ -161,12 +163,14 @@ def _frozen(name: str, images: Sequence[Image]) -> Finding:
         says = "the vehicle does not move between the images, so repeated ones cannot be recognised"
         return passed("frozen images", name, says)
     copied = [k for k in moving if filecmp.cmp(images[k - 1].path, images[k].path, shallow=False)]
-    share, at = len(copied) / len(moving), copied
+    share = len(copied) / len(moving)
+    at = copied
     if share <= _FROZEN:
         sampled = _spread(moving, _SAMPLES)
         alike = [k for k in sampled if _alike(images[k - 1].path, images[k].path)]
         if len(alike) > 1:  # one alone may be a dropped frame
-            share, at = len(alike) / len(sampled), alike
+            share = len(alike) / len(sampled)
+            at = alike
     if share <= _FROZEN:
         # Within a run of successive numbers, number minus index is constant.
         runs = [[k for _, k in run] for _, run in groupby(enumerate(copied), lambda one: one[1] - one[0])]
@@ -211,7 +215,8 @@ def _exposure(name: str, camera: Camera, images: Sequence[Image]) -> Iterator[Fi
 
 
 def _alike(first: Path, second: Path) -> bool:
-    one, other = _read(first), _read(second)
+    one = _read(first)
+    other = _read(second)
     return one.shape == other.shape and float(cv2.absdiff(one, other).mean()) < _SAME_GREY
 
 

@@ -33,7 +33,8 @@ _CIRCLE_95 = 2.4477  # radius, in sigmas of a coordinate, where both have the sa
 
 def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Finding]:
     """The map, in a ``frame`` of poses or survey, against the 95 % radius ``goal_m``, then each mounting."""
-    markings, goal = best.hd_map.markings, f"; goal {100 * goal_m:g} cm"
+    markings = best.hd_map.markings
+    goal = f"; goal {100 * goal_m:g} cm"
     if markings:
         radius_m = np.array([_corner_radii_m(one) for one in markings])
         reached_m = _radius_of_all_m(radius_m.ravel())
@@ -58,7 +59,8 @@ def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Findin
 
 def _conditions(evidence: SolveEvidence) -> str:
     """The inputs that absolute accuracy rests on: one that may be wrong, or those that no image shows."""
-    doubtful, relied = doubted(evidence), relied_on(evidence)
+    doubtful = doubted(evidence)
+    relied = relied_on(evidence)
     if doubtful is not None:
         return f" (unless the {CHECKS[doubtful.fault][0]} is off, which is possible)"
     return f" (if {' and '.join(relied)} are right, which this drive cannot show)" if relied else ""
@@ -120,21 +122,25 @@ def ground_ahead(calibration: Calibration) -> tuple[float, str]:
 
     The point is where the camera looks, or 10 m ahead where that is farther; infinite if unknown.
     """
-    moves, covariance = _ground_jacobian(calibration.cam_from_vehicle), calibration.covariance
+    moves = _ground_jacobian(calibration.cam_from_vehicle)
+    covariance = calibration.covariance
     if covariance is None:
         return float("inf"), "it saw no marking of the map"
     place_m, turn_m, left_m = (
         _radius_m(moves[:, own] @ covariance[own, own] @ moves[:, own].T)
         for own in (slice(0, 3), slice(3, 6), slice(6))
     )
-    of_place, of_turn = "drive a turn, or survey the camera's place", "drive past more markings, near and far"
+    of_place = "drive a turn, or survey the camera's place"
+    of_turn = "drive past more markings, near and far"
     return left_m, of_place if place_m > turn_m else of_turn
 
 
 def _ground_jacobian(cam_from_vehicle: FloatArray) -> FloatArray:
     """How the ground (x, y) at one pixel moves with the mounting's left tangent: (2, 6)."""
-    to_vehicle, height_m = cam_from_vehicle[:3, :3].T, camera_centre(cam_from_vehicle)[2]
-    axis, level = to_vehicle[:, 2], float(np.hypot(*to_vehicle[:2, 2]))
+    to_vehicle = cam_from_vehicle[:3, :3].T
+    height_m = camera_centre(cam_from_vehicle)[2]
+    axis = to_vehicle[:, 2]
+    level = float(np.hypot(*to_vehicle[:2, 2]))
     is_near = -axis[2] * _AHEAD_M > level * height_m
     x, y, z = axis * height_m / -axis[2] if is_near else (*axis[:2] * _AHEAD_M / level, -height_m)
     # exp(xi) moves a point p of the camera by -R'(v + w x p) in the vehicle; its ray meets the ground anew.
@@ -171,10 +177,13 @@ def check_points(table: CheckTable) -> Finding:
     if not table.compared:
         says = f"none of {total} has a map corner within reach, the first: {table.unmatched[0][1]}"
         return Finding(CHECK, Status.WARN, None, None, "", says, "map")
-    off_m, covariance = table.off_m.ravel(), table.covariance_m2
-    value, limit = _ratio(table.squared, len(off_m)), _limit(len(off_m))
+    off_m = table.off_m.ravel()
+    covariance = table.covariance_m2
+    value = _ratio(table.squared, len(off_m))
+    limit = _limit(len(off_m))
     off = f"{len(table.compared)} of {total} lie {100 * table.rmse_m:.1f} cm off the map (RMSE)"
-    status, says = Status.PASS, f"{off}, as far as map and survey state"
+    status = Status.PASS
+    says = f"{off}, as far as map and survey state"
     if value > limit:
         status, says = _explained(table, off_m, covariance)
     return Finding(CHECK, status, value, limit, "", says, "map")
@@ -184,7 +193,8 @@ def check_frame(found: Mapping[str, int]) -> list[Finding]:
     """A survey that fits not at all, or better by another reading, by the counts of corners in reach."""
     others = {says: count for says, count in found.items() if says}
     likeliest = max(others, key=lambda says: others[says], default="")
-    stated, most = found.get("", 0), others.get(likeliest, 0)
+    stated = found.get("", 0)
+    most = others.get(likeliest, 0)
     if stated and most <= stated:
         return [passed(FRAME, "survey", f"{stated} corners of the map have a point within reach", stated)]
     says = (

@@ -28,13 +28,18 @@ _MOUNTING_LIMIT_SIGMAS = 5.0
 # Root mean square of the six parameters' deviations, in the sigmas of both: one in a million by chance.
 _GROUND_LIMIT_SIGMAS = 4.0
 # Where the mountings turn by less and their heights differ by less, the ground is no better judge.
-_LEAST_TURN_DEG, _LEAST_HEIGHT_M = 0.2, 0.04
+_LEAST_TURN_DEG = 0.2
+_LEAST_HEIGHT_M = 0.04
 _OVERLAP = 0.1  # share of the smaller of two markings of a class that both cover; paint does not lie on paint
 # Share of markings that overlap another: clean drives have none, one in a hundred may be on old paint.
 _DOUBLES_LIMIT = 0.02
 # Passes of one place drive within so much of each other, after so much of the way; on another storey of a
 # car park they are farther above. Heights are twice as noisy as positions.
-_SAME_PLACE_M, _ANOTHER_PASS_M, _STOREY_M, _HEIGHT_NOISE, _SURE_SIGMAS = 2.0, 20.0, 1.8, 2.0, 5.0
+_SAME_PLACE_M = 2.0
+_ANOTHER_PASS_M = 20.0
+_STOREY_M = 1.8
+_HEIGHT_NOISE = 2.0
+_SURE_SIGMAS = 5.0
 # Added to a covariance's diagonal (m^2, rad^2): a tenth of a millimetre, a thousandth of a degree.
 _LEAST_VARIANCE = np.array([1e-8] * 3 + [1e-10] * 3)
 
@@ -198,13 +203,15 @@ def _overlap(first: FloatArray, second: FloatArray) -> float:
 
 def check_heights(drive: Drive) -> Iterator[Finding]:
     """Whether the heights that were recorded agree where a place was passed more than once."""
-    road, sigma_m = drive.road, _HEIGHT_NOISE * drive.pose_noise.position_m
+    road = drive.road
+    sigma_m = _HEIGHT_NOISE * drive.pose_noise.position_m
     if road is None or len(road.points_map) < 2:
         return
     way_m = length_along(road.points_map)
     one, other = KDTree(road.points_map).query_pairs(_SAME_PLACE_M, output_type="ndarray").T
     again = np.abs(way_m[other] - way_m[one]) > _ANOTHER_PASS_M
-    one, other = one[again], other[again]
+    one = one[again]
+    other = other[again]
     between = road.points_map[other] - road.points_map[one]
     rise = np.einsum("ni,ni->n", between, road.slope[one] + road.slope[other]) / 2
     off_m = np.abs(road.height_m[other] - road.height_m[one] - rise)

@@ -51,7 +51,8 @@ _VARIANCE_LIMIT = 3.0
 _POSE_NOISE_LIMIT = 3.0
 _ODDS_LIMIT = CLEAR_SIGMAS**2 / 2  # log odds from which a cause is named that no score test looks for
 # Scatter of stamps, s, that does not matter, and that is usual where there is any.
-_LEAST_JITTER_S, _USUAL_JITTER_S = 0.005, 0.02
+_LEAST_JITTER_S = 0.005
+_USUAL_JITTER_S = 0.02
 _JUMP_LIMIT = 9.0  # largest single correction of a pose, in sigmas
 _CLOCK_OBSERVABLE_S = 0.004  # largest sigma of an observed clock offset, s: two are 8 ms
 # Sigma, m, of the point that the poses are of, up to which a drive observes it: twice that, at 95 %, is the
@@ -183,7 +184,8 @@ def check_inputs(evidence: SolveEvidence) -> list[Finding]:
     raised = {finding.check for finding in findings}
     still = [one for one in evidence.score_tests if is_contradicted(one)]
     still = still or [one for one in evidence.score_tests if _is_left(one, evidence.corrected)][:1]
-    foreign, stamps = _foreign(evidence), _stamps(evidence)
+    foreign = _foreign(evidence)
+    stamps = _stamps(evidence)
     causes = {foreign: evidence.foreign[2], stamps: _jitter_odds(evidence)}
     if still:
         causes[_contradicted(still) if is_physical(still[0]) else _unknown(still[0])] = log_odds(still[0])
@@ -255,7 +257,8 @@ def _doubtful(one: Contradiction) -> Finding:
 
 
 def _input(one: Contradiction, status: Status, says: str) -> Finding:
-    check, about = CHECKS[one.fault][0], ", ".join(one.cameras)
+    check = CHECKS[one.fault][0]
+    about = ", ".join(one.cameras)
     return Finding(check, status, one.sigmas, even_sigmas(one), "sigmas", says, about)
 
 
@@ -312,7 +315,8 @@ def _loose_levers(evidence: SolveEvidence) -> list[Contradiction]:
 
 def _unobservable(evidence: SolveEvidence, raised: set[str]) -> Iterator[Finding]:
     """Errors of all cameras together that no drive of this kind shows, and the drive that would."""
-    loosest_s, loose = _loosest_clock_s(evidence), _loose_levers(evidence)
+    loosest_s = _loosest_clock_s(evidence)
+    loose = _loose_levers(evidence)
     if loosest_s > _CLOCK_OBSERVABLE_S and "clock" not in raised:
         sure = f"to better than {2e3 * loosest_s:.0f} ms" if np.isfinite(loosest_s) else "at all"
         says = f"the markings do not show {sure} whether all clocks are equally late: drive a turn"
@@ -381,7 +385,8 @@ def _jitter_odds(evidence: SolveEvidence) -> float:
 
 def _stamps(evidence: SolveEvidence) -> Finding:
     """Stamps that scatter: the poses err more than stated, from image to image, and only along the way."""
-    ratio, by_ms = evidence.along_over_across, 1e3 * evidence.jitter_s
+    ratio = evidence.along_over_across
+    by_ms = 1e3 * evidence.jitter_s
     allowed = max(evidence.pose_noise.values(), default=0.0) <= _POSE_NOISE_LIMIT
     return judge(
         "image stamps", "poses", _jitter_odds(evidence) * (evidence.jitter_s > _LEAST_JITTER_S), _ODDS_LIMIT,
@@ -430,8 +435,10 @@ def _excluded(best: MethodResult) -> Finding:
 
 def _words(one: Contradiction) -> str:
     """The error and its size, as a clause."""
-    whose, size = " and ".join(one.cameras), abs(one.value)
-    cm, longer = 100 * size, "longer" if one.value > 0 else "shorter"
+    whose = " and ".join(one.cameras)
+    size = abs(one.value)
+    cm = 100 * size
+    longer = "longer" if one.value > 0 else "shorter"
     axis = _MAP_AXES[one.axis]
     way = f"{cm:.0f} cm {_WAYS[min(one.axis, 2)][one.value > 0]}"
     match one.fault:

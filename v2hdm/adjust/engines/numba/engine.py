@@ -67,10 +67,12 @@ class NumbaEngine(Engine):
     def _plan(self) -> Plan:
         """The cheapest: all corners eliminated first, in either order, or those of several drives kept."""
         arrays, per_tile = self.arrays, frames_per_tile(self.arrays)
-        none, states = arrays.corner_order[:0], len(arrays.states)
+        none = arrays.corner_order[:0]
+        states = len(arrays.states)
         if not states:
             return Plan(per_tile, 0, 0, find_pattern(0, []), none)
-        count, size = -(-arrays.frame_count // per_tile), per_tile * states
+        count = -(-arrays.frame_count // per_tile)
+        size = per_tile * states
         tip = arrays.camera_count * arrays.camera_unknowns
         along = list(pairwise(range(count))) if bool(arrays.state_transition.any()) else []
         edges, most = self._coupled_tiles(self._whole, per_tile, count)
@@ -85,7 +87,8 @@ class NumbaEngine(Engine):
             pattern = find_pattern(total, [*edges, *along, *corner_tiles], least_degree=True)
             cost = pattern.multiplications(size, tip)
             if cost < _CLEARLY_LESS * least:
-                best, least = Plan(per_tile, size, count, pattern, kept, most), cost
+                best = Plan(per_tile, size, count, pattern, kept, most)
+                least = cost
         return best
 
     def _with_kept(self, kept: Tensor) -> Layout:
@@ -95,7 +98,8 @@ class NumbaEngine(Engine):
 
     def _shared_corners(self) -> Tensor:
         """Corners (n,) that several drives observed, and all that known lengths join to them."""
-        arrays, layout = self.arrays, self._whole
+        arrays = self.arrays
+        layout = self._whole
         session = arrays.session[arrays.frame_of(arrays.pair).long()].numpy()
         begin = layout.begin[layout.unit[:-1]]
         shared = np.minimum.reduceat(session, begin) < np.maximum.reduceat(session, begin)
@@ -107,7 +111,8 @@ class NumbaEngine(Engine):
     def _coupled_tiles(self, layout: Layout, per_tile: int, tile_count: int) -> tuple[list[list[int]], int]:
         """Pairs of tiles coupled by eliminated corners, and the largest number of tiles of a unit."""
         tile = layout.frame[layout.pair % layout.moments] // per_tile
-        units, seen = len(layout.kept), layout.begin[layout.unit]
+        units = len(layout.kept)
+        seen = layout.begin[layout.unit]
         touched = csr_array((np.ones(len(tile), dtype=np.int32), tile, seen), shape=(units, tile_count))
         touched.sum_duplicates()
         touched = touched[~layout.kept]
@@ -122,7 +127,8 @@ class NumbaEngine(Engine):
     def back_project(self, cam_from_vehicle: Tensor) -> tuple[Tensor, Tensor]:
         """Corners (N, 2) by weighted back-projection from recorded poses, and which (N,) are determined."""
         arrays, count = self.arrays, self.arrays.corner_count
-        corners, fixed = np.empty((count, 2)), np.empty(count, dtype=np.bool_)
+        corners = np.empty((count, 2))
+        fixed = np.empty(count, dtype=np.bool_)
         state = torch.zeros_like(arrays.state_information_root)
         table = _table(self.poses(Estimate(cam_from_vehicle, state, arrays.control, arrays.no_clock())))
         self.share(lambda b, e: evaluate.back_project(b, e, self._whole, table, corners, fixed))
@@ -130,17 +136,20 @@ class NumbaEngine(Engine):
 
     def residuals(self, cam_from_map: Tensor, corners_map: Tensor) -> Tensor:
         """Whitened residuals (2, K) of the observations."""
-        table, corners = _table(cam_from_map), _rows(corners_map)
+        table = _table(cam_from_map)
+        corners = _rows(corners_map)
         out = np.empty((2, len(self._whole.pair)))
         self.share(lambda b, e: evaluate.residuals(b, e, self._whole, table, corners, out))
         return torch.from_numpy(out)
 
     def report(self, estimate: Estimate, focal_px: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
         """In problem order: residuals (K, 2), px, squared Mahalanobis distances, points behind."""
-        table, corners = _table(self.poses(estimate)), _rows(estimate.corners_map)
+        table = _table(self.poses(estimate))
+        corners = _rows(estimate.corners_map)
         count = len(self._whole.pair)
         out = evaluate.Report(np.empty((count, 2)), np.empty(count), np.empty(count, dtype=np.bool_))
-        order, focal = self.arrays.order.numpy(), np.ascontiguousarray(focal_px)
+        order = self.arrays.order.numpy()
+        focal = np.ascontiguousarray(focal_px)
         self.share(lambda b, e: evaluate.report(b, e, self._whole, table, corners, order, focal, out))
         return out
 
@@ -151,8 +160,10 @@ class NumbaEngine(Engine):
 
     def pull(self, estimate: Estimate, spread: Spread, by_residual: Tensor) -> Gradient:
         """Gradient of a scalar from that by the whitened residuals (2, K)."""
-        table, corners = _table(self.poses(estimate)), _rows(estimate.corners_map)
-        wrench, by_corner = np.zeros((len(table), 6)), np.zeros_like(corners)
+        table = _table(self.poses(estimate))
+        corners = _rows(estimate.corners_map)
+        wrench = np.zeros((len(table), 6))
+        by_corner = np.zeros_like(corners)
         evaluate.pull(self._whole, table, corners, _rows(by_residual), np.empty(16), wrench, by_corner)
         gathered = spread.gather(torch.from_numpy(wrench).view(self.arrays.camera_count, -1, 6))
         camera = gathered.camera
@@ -168,11 +179,17 @@ class NumbaEngine(Engine):
 
     def eliminate(self, system: ReducedSystem, estimate: Estimate, robust: Loss) -> NumbaLinearised:
         """Linearise and eliminate the corners; raises AdjustError if a block of joined ones is singular."""
-        arrays, layout, spread = self.arrays, self.layout, system.spread
-        clock, width, pairs = _by_pair(spread.clock), system.tip, arrays.pair_count
-        touched, chunks = len(layout.touched), len(layout.chunk) - 1
+        arrays = self.arrays
+        layout = self.layout
+        spread = system.spread
+        clock = _by_pair(spread.clock)
+        width = system.tip
+        pairs = arrays.pair_count
+        touched = len(layout.touched)
+        chunks = len(layout.chunk) - 1
         owners = touched if system.by_pair else chunks * arrays.camera_count
-        joined, states = np.diff(layout.unit), bool(arrays.states)
+        joined = np.diff(layout.unit)
+        states = bool(arrays.states)
         base = Base(
             table=_table(self.poses(estimate)),
             corners=_rows(estimate.corners_map),
@@ -223,12 +240,15 @@ class NumbaEngine(Engine):
 
     def _keep(self, system: ReducedSystem, base: Base) -> None:
         """Add the kept corners' blocks, stored as factors, to the system; sets those factors to 1."""
-        layout, kept = self.layout, system.plan.kept
+        layout = self.layout
+        kept = system.plan.kept
         number = np.full(self.arrays.corner_count, -1)
         number[kept.numpy()] = np.arange(len(kept))
-        index, blocks = [], []
+        index = []
+        blocks = []
         for u in np.flatnonzero(layout.kept):
-            first, size = layout.unit[u], layout.unit[u + 1] - layout.unit[u]
+            first = layout.unit[u]
+            size = layout.unit[u + 1] - layout.unit[u]
             if size == 1:
                 index.append((number[first], number[first]))
                 xx, yx, yy = base.lower[:, first]
@@ -258,7 +278,10 @@ class NumbaEngine(Engine):
         return torch.from_numpy(out).view(-1, 2, 6)
 
     def _subtract_frames(self, base: Base, system: ReducedSystem) -> None:
-        plan, matrix, spread, layout = system.plan, system.matrix, system.spread, self.layout
+        plan = system.plan
+        matrix = system.matrix
+        spread = system.spread
+        layout = self.layout
         column, row = np.divmod(matrix.keys, plan.tile_count + 1)
         tiles = linearise.TileMap(
             per_tile=plan.frames_per_tile,
@@ -268,8 +291,10 @@ class NumbaEngine(Engine):
             row=row,
             at=matrix.at,
         )
-        by_state, clock = _by_pair(spread.state), _by_pair(spread.clock)
-        each, values = self.arrays.camera_unknowns, matrix.values.numpy()
+        by_state = _by_pair(spread.state)
+        clock = _by_pair(spread.clock)
+        each = self.arrays.camera_unknowns
+        values = matrix.values.numpy()
         cuts = np.linspace(0, plan.tile_count, min(_COLUMN_RANGES, plan.tile_count) + 1).astype(int)
 
         def work(begin: int, end: int) -> None:
@@ -312,19 +337,24 @@ class NumbaLinearised(Linearised):
         """Evaluate after a step of the reduced unknowns, in one pass over the observations."""
         engine, base, before, arrays = self.engine, self.base, self.estimate, self.engine.arrays
         cameras, chart = move(_rows(step.extrinsic), _rows(before.cam_from_vehicle))
-        state, clock = before.frame_state + step.frame_state, before.clock_s + step.clock_s
+        state = before.frame_state + step.frame_state
+        clock = before.clock_s + step.clock_s
         at = Estimate(torch.from_numpy(cameras), state, before.corners_map, clock)
-        table, whitened = _table(engine.poses(at)), _rows(own.reshape(-1))
+        table = _table(engine.poses(at))
+        whitened = _rows(own.reshape(-1))
         moved = _rows(tangents.reshape(-1, 6)) if arrays.states else np.empty((0, 6))
         by_camera = _rows(torch.cat([step.extrinsic, step.clock_s], dim=1).ravel())
-        layout, out, pairs = engine.layout, self._room(), len(table)
+        layout = engine.layout
+        out = self._room()
+        pairs = len(table)
 
         def work(begin: int, end: int) -> None:
             room = Scratch.of(layout, pairs)
             evaluate.evaluate(begin, end, layout, base, table, moved, by_camera, whitened, room, out)
 
         engine.share(work)
-        costs, wrench = out.costs.sum(0), engine.pairs(out.wrench)
+        costs = out.costs.sum(0)
+        wrench = engine.pairs(out.wrench)
         terms, gradient = with_priors(arrays, at, engine.spread(at), costs, wrench)
         by_tangent = (torch.from_numpy(chart).mT @ gradient.extrinsic[..., None])[..., 0]
         at = replace(at, corners_map=torch.from_numpy(out.corners))
@@ -332,7 +362,10 @@ class NumbaLinearised(Linearised):
 
     def carry(self, by_corner: Tensor) -> tuple[Tensor, Coupled]:
         """L^-1 g (N, 2) and W V^-1 g of a gradient g (N, 2) by the corners."""
-        layout, base, rows, out = self.engine.layout, self.base, _rows(by_corner), self._room()
+        layout = self.engine.layout
+        base = self.base
+        rows = _rows(by_corner)
+        out = self._room()
 
         def work(begin: int, end: int) -> None:
             evaluate.carry(begin, end, layout, base, rows, Scratch.of(layout, len(base.table)), out)
@@ -349,7 +382,8 @@ class NumbaLinearised(Linearised):
         return torch.from_numpy(out.whitened).view(-1, 2), coupled
 
     def _room(self) -> Evaluation:
-        chunks, touched = len(self.engine.layout.chunk) - 1, len(self.engine.layout.touched)
+        chunks = len(self.engine.layout.chunk) - 1
+        touched = len(self.engine.layout.touched)
         return Evaluation(
             costs=np.zeros((chunks, 3)),
             wrench=np.zeros((touched, 6)),
@@ -382,8 +416,10 @@ def _corner_factor(arrays: Arrays, base: Base) -> CornerFactor:
     """The kernels' factors of V for torch, sharing memory."""
     if not len(base.joint):
         return CornerFactor(torch.from_numpy(base.lower), ())
-    joint, begin = [], 0
-    values, units = torch.from_numpy(base.joint), arrays.units
+    joint = []
+    begin = 0
+    values = torch.from_numpy(base.joint)
+    units = arrays.units
     joined = torch.diff(units)
     for size in torch.unique(joined[joined > 1]).tolist():
         first = units[:-1][joined == size]

@@ -44,8 +44,10 @@ class Evaluation(NamedTuple):
 def _oppose(known: FloatArray, i: int, mx: float, my: float, mz: float) -> tuple[float, float, float]:
     """Force with which the observation in row i of ``known`` opposes a motion of its point."""
     along = known[i, 4] * mz
-    x, y = mx * known[i, 3] + known[i, 0] * along, my * known[i, 3] + known[i, 1] * along
-    fu, fv = known[i, 5] * x + known[i, 6] * y, known[i, 6] * x + known[i, 7] * y
+    x = mx * known[i, 3] + known[i, 0] * along
+    y = my * known[i, 3] + known[i, 1] * along
+    fu = known[i, 5] * x + known[i, 6] * y
+    fv = known[i, 6] * x + known[i, 7] * y
     return fu * known[i, 3], fv * known[i, 3], (fu * known[i, 0] + fv * known[i, 1]) * known[i, 4]
 
 
@@ -53,13 +55,21 @@ def _oppose(known: FloatArray, i: int, mx: float, my: float, mz: float) -> tuple
 def _recall(layout: Layout, base: Base, k: int, c: int, known: FloatArray, i: int) -> None:
     """Write a linearised observation (8,): point, inverse depth, slope, weighted information at depth 1."""
     px, py, pz, inverse, slope, u, v = see(layout, base.table, k, base.corners[c, 0], base.corners[c, 1])
-    a, b, d = layout.root[0, k], layout.root[1, k], layout.root[2, k]
+    a = layout.root[0, k]
+    b = layout.root[1, k]
+    d = layout.root[2, k]
     weight = 1.0
     if base.code:
         r0, r1 = whiten(layout, k, u, v)
         weight = floored(weigh(base, r0 * r0 + r1 * r1))
-    known[i, 0], known[i, 1], known[i, 2], known[i, 3], known[i, 4] = px, py, pz, inverse, slope
-    known[i, 5], known[i, 6], known[i, 7] = (a * a + b * b) * weight, b * d * weight, d * d * weight
+    known[i, 0] = px
+    known[i, 1] = py
+    known[i, 2] = pz
+    known[i, 3] = inverse
+    known[i, 4] = slope
+    known[i, 5] = (a * a + b * b) * weight
+    known[i, 6] = b * d * weight
+    known[i, 7] = d * d * weight
 
 
 @inlined
@@ -68,7 +78,8 @@ def _carry(
 ) -> None:
     """Whiten the gradient of unit u of chunk q, and add W V^-1 g to the pairs' or to the cameras'."""
     slot, _, _, known, _, _, gradient, _ = scratch
-    first, last = layout.unit[u], layout.unit[u + 1]
+    first = layout.unit[u]
+    last = layout.unit[u + 1]
     solve_unit(layout, base, u, gradient)
     for i in range(2 * (last - first)):
         out.whitened[2 * first + i] = gradient[i]
@@ -78,9 +89,11 @@ def _carry(
         return
     solve_unit_transposed(layout, base, u, gradient)
     for c in range(first, last):
-        x, y = gradient[2 * (c - first)], gradient[2 * (c - first) + 1]
+        x = gradient[2 * (c - first)]
+        y = gradient[2 * (c - first) + 1]
         for k in range(layout.begin[c], layout.begin[c + 1]):
-            j, t = k - layout.begin[first], layout.pair[k]
+            j = k - layout.begin[first]
+            t = layout.pair[k]
             mx = base.table[t, 0] * x + base.table[t, 1] * y
             my = base.table[t, 4] * x + base.table[t, 5] * y
             mz = base.table[t, 8] * x + base.table[t, 9] * y
@@ -100,7 +113,8 @@ def carry(
             coupled = len(base.rows) == 0 and not layout.kept[u]
             for c in range(first, layout.unit[u + 1]):
                 i = 2 * (c - first)
-                scratch.gradient[i], scratch.gradient[i + 1] = by_corner[c, 0], by_corner[c, 1]
+                scratch.gradient[i] = by_corner[c, 0]
+                scratch.gradient[i + 1] = by_corner[c, 1]
                 for k in range(layout.begin[c], layout.begin[c + 1] if coupled else layout.begin[c]):
                     _recall(layout, base, k, c, scratch.known, k - layout.begin[first])
             _carry(layout, base, q, u, coupled, scratch, out)
@@ -123,7 +137,8 @@ def _pushed(
         sx += base.rows[2 * c, p] * cameras[p]
         sy += base.rows[2 * c + 1, p] * cameras[p]
     for k in range(layout.begin[c], layout.begin[c + 1] if coupled else layout.begin[c]):
-        j, t = k - layout.begin[first], layout.pair[k]
+        j = k - layout.begin[first]
+        t = layout.pair[k]
         _recall(layout, base, k, c, known, j)
         mx = motion[t, 0] + motion[t, 4] * known[j, 2] - motion[t, 5] * known[j, 1]
         my = motion[t, 1] + motion[t, 5] * known[j, 0] - motion[t, 3] * known[j, 2]
@@ -153,10 +168,13 @@ def _at_corner(
         squared = r0 * r0 + r1 * r1
         total, product = add_loss(base, squared, total, product)
         weight = weigh(base, squared)
-        w0, w1 = weight * r0, weight * r1
+        w0 = weight * r0
+        w1 = weight * r1
         fu = layout.root[0, k] * w0 + layout.root[1, k] * w1
         fv = layout.root[2, k] * w1
-        fx, fy, fz = fu * inverse, fv * inverse, (fu * px + fv * py) * slope
+        fx = fu * inverse
+        fy = fv * inverse
+        fz = (fu * px + fv * py) * slope
         ax, ay = along_axes(table, layout.pair[k], fx, fy, fz)
         gx += ax
         gy += ay
@@ -183,12 +201,16 @@ def evaluate(
     frames have states, ``cameras`` (D,) that of the cameras' unknowns, ``own`` (2 N,) the corners' whitened
     variables.
     """
-    step, gradient, states = scratch.step, scratch.gradient, len(base.rows) == 0
+    step = scratch.step
+    gradient = scratch.gradient
+    states = len(base.rows) == 0
     for q in range(begin, end):
         number_touched(layout, q, scratch.slot)
-        total, product = 0.0, 1.0
+        total = 0.0
+        product = 1.0
         for u in range(layout.chunk[q], layout.chunk[q + 1]):
-            first, last = layout.unit[u], layout.unit[u + 1]
+            first = layout.unit[u]
+            last = layout.unit[u + 1]
             coupled = states and not layout.kept[u]
             for c in range(first, last):
                 i = 2 * (c - first)
@@ -223,7 +245,8 @@ def back_project(
         xx = yx = yy = x = y = 0.0
         for k in range(layout.begin[c], layout.begin[c + 1]):
             t = layout.pair[k]
-            u, v = layout.measured[0, k], layout.measured[1, k]
+            u = layout.measured[0, k]
+            v = layout.measured[1, k]
             # The ray in the map, by the transposed rotation.
             dx = table[t, 0] * u + table[t, 4] * v + table[t, 8]
             dy = table[t, 1] * u + table[t, 5] * v + table[t, 9]
@@ -231,7 +254,9 @@ def back_project(
             least = MIN_DEPRESSION_SINE * MIN_DEPRESSION_SINE * (dx * dx + dy * dy + dz * dz)
             if not (dz < 0 and dz * dz > least):
                 continue
-            sx, sy, sz = table[t, 3], table[t, 7], table[t, 11]
+            sx = table[t, 3]
+            sy = table[t, 7]
+            sz = table[t, 11]
             reach = (table[t, 2] * sx + table[t, 6] * sy + table[t, 10] * sz) / dz
             gx = reach * dx - (table[t, 0] * sx + table[t, 4] * sy + table[t, 8] * sz)
             gy = reach * dy - (table[t, 1] * sx + table[t, 5] * sy + table[t, 9] * sz)
@@ -242,20 +267,27 @@ def back_project(
             yv = inverse * table[t, 5] + slope * py * table[t, 9]
             j0, j2 = whiten(layout, k, xu, xv)
             j1, j3 = whiten(layout, k, yu, yv)
-            a, b, d = j0 * j0 + j2 * j2, j0 * j1 + j2 * j3, j1 * j1 + j3 * j3
-            xx, yx, yy = xx + a, yx + b, yy + d
-            x, y = x + a * gx + b * gy, y + b * gx + d * gy
+            a = j0 * j0 + j2 * j2
+            b = j0 * j1 + j2 * j3
+            d = j1 * j1 + j3 * j3
+            xx = xx + a
+            yx = yx + b
+            yy = yy + d
+            x = x + a * gx + b * gy
+            y = y + b * gx + d * gy
         fixed[c] = xx > 0
         if not xx > 0:
             corners[c, 0] = corners[c, 1] = 0.0
             continue
         first = math.sqrt(xx)
         below = yx / first
-        rest, least = yy - below * below, 1e-12 * yy
+        rest = yy - below * below
+        least = 1e-12 * yy
         last = math.sqrt(least if rest < least else rest)
         top = x / first
         low = (y - below * top) / last / last
-        corners[c, 0], corners[c, 1] = (top - below * low) / first, low
+        corners[c, 0] = (top - below * low) / first
+        corners[c, 1] = low
 
 
 class Report(NamedTuple):
@@ -279,11 +311,13 @@ def report(
 ) -> None:
     """Report on chunks ``begin`` to ``end``; ``order`` (K,) is the problem's, ``focal`` (C, 2) in px."""
     for c in range(layout.unit[layout.chunk[begin]], layout.unit[layout.chunk[end]]):
-        x, y = corners[c, 0], corners[c, 1]
+        x = corners[c, 0]
+        y = corners[c, 1]
         for k in range(layout.begin[c], layout.begin[c + 1]):
             _, _, pz, _, _, u, v = see(layout, table, k, x, y)
             r0, r1 = whiten(layout, k, u, v)
-            row, camera = order[k], layout.pair[k] // layout.moments
+            row = order[k]
+            camera = layout.pair[k] // layout.moments
             out.residual_px[row, 0] = u * focal[camera, 0]
             out.residual_px[row, 1] = v * focal[camera, 1]
             out.mahalanobis2[row] = r0 * r0 + r1 * r1
@@ -296,7 +330,8 @@ def residuals(
 ) -> None:
     """Whitened residuals (2, K) of the observations of chunks ``begin`` to ``end``."""
     for c in range(layout.unit[layout.chunk[begin]], layout.unit[layout.chunk[end]]):
-        x, y = corners[c, 0], corners[c, 1]
+        x = corners[c, 0]
+        y = corners[c, 1]
         for k in range(layout.begin[c], layout.begin[c + 1]):
             _, _, _, _, _, u, v = see(layout, table, k, x, y)
             out[0, k], out[1, k] = whiten(layout, k, u, v)
@@ -316,7 +351,8 @@ def pull(
     for c in range(len(corners)):
         for k in range(layout.begin[c], layout.begin[c + 1]):
             differentiate(layout, table, k, corners[c, 0], corners[c, 1], jacobian)
-            r0, r1 = by_residual[0, k], by_residual[1, k]
+            r0 = by_residual[0, k]
+            r1 = by_residual[1, k]
             by_corner[c, 0] += jacobian[12] * r0 + jacobian[14] * r1
             by_corner[c, 1] += jacobian[13] * r0 + jacobian[15] * r1
             for p in range(6):
@@ -327,6 +363,7 @@ def pull(
 def couplings(layout: Layout, base: Base, corner: IntArray, jacobian: FloatArray, out: FloatArray) -> None:
     """Write W' (k, 12) of the layout's observations of the base's corners, numbered by ``corner``."""
     for k in range(len(corner)):
-        x, y = base.corners[corner[k], 0], base.corners[corner[k], 1]
+        x = base.corners[corner[k], 0]
+        y = base.corners[corner[k], 1]
         r0, r1, _, _, _ = differentiate(layout, base.table, k, x, y, jacobian)
         couple(jacobian, floored(weigh(base, r0 * r0 + r1 * r1)), out, k)

@@ -31,7 +31,8 @@ def see(layout: Layout, table: FloatArray, k: int, x: float, y: float) -> _Seen:
     reciprocal = 1.0 / near
     slope = -reciprocal * reciprocal
     inverse = reciprocal + slope * (pz - near)
-    u, v = px * inverse - layout.measured[0, k], py * inverse - layout.measured[1, k]
+    u = px * inverse - layout.measured[0, k]
+    v = py * inverse - layout.measured[1, k]
     return px, py, pz, inverse, slope, u, v
 
 
@@ -98,16 +99,20 @@ def add_corner_priors(
     """Add a unit's survey and known lengths to its gradient (2g,), and to ``costs[1]`` and ``costs[2]``."""
     first = layout.unit[u]
     for c in range(first, layout.unit[u + 1]):
-        x, y = layout.control_root[c, 0], layout.control_root[c, 2]
+        x = layout.control_root[c, 0]
+        y = layout.control_root[c, 2]
         if x > 0 or y > 0:
-            yx, dx = layout.control_root[c, 1], corners[c, 0] - layout.control[c, 0]
-            top, low = x * dx, yx * dx + y * (corners[c, 1] - layout.control[c, 1])
+            yx = layout.control_root[c, 1]
+            dx = corners[c, 0] - layout.control[c, 0]
+            top = x * dx
+            low = yx * dx + y * (corners[c, 1] - layout.control[c, 1])
             gradient[2 * (c - first)] += x * top + yx * low
             gradient[2 * (c - first) + 1] += y * low
             costs[1] += (top * top + low * low) / 2
     for m in range(layout.length_at[u], layout.length_at[u + 1]):
         residual, jx, jy = length_residual(layout, m, corners)
-        a, b = 2 * (layout.length_first[m] - first), 2 * (layout.length_second[m] - first)
+        a = 2 * (layout.length_first[m] - first)
+        b = 2 * (layout.length_second[m] - first)
         gradient[a] += jx * residual
         gradient[a + 1] += jy * residual
         gradient[b] -= jx * residual
@@ -118,8 +123,10 @@ def add_corner_priors(
 @inlined
 def length_residual(layout: Layout, m: int, corners: FloatArray) -> tuple[float, float, float]:
     """Whitened residual of a known length, and its derivative by the first corner."""
-    a, b = layout.length_first[m], layout.length_second[m]
-    dx, dy = corners[a, 0] - corners[b, 0], corners[a, 1] - corners[b, 1]
+    a = layout.length_first[m]
+    b = layout.length_second[m]
+    dx = corners[a, 0] - corners[b, 0]
+    dy = corners[a, 1] - corners[b, 1]
     distance = math.sqrt(dx * dx + dy * dy)
     root = layout.length_root[m]
     over = root / distance if distance > 0 else 0.0
@@ -136,7 +143,9 @@ def unit_of(layout: Layout, u: int) -> tuple[int, int, int]:
 @inlined
 def factorise_unit(layout: Layout, base: Base, u: int, block: FloatArray) -> bool:
     """Factorise a unit's block (2g, 2g) into ``base.lower``, or ``base.joint`` for joined corners."""
-    (n, c, at), lower, joint = unit_of(layout, u), base.lower, base.joint
+    (n, c, at) = unit_of(layout, u)
+    lower = base.lower
+    joint = base.joint
     for i in range(n):
         block[i, i] += CORNER_FLOOR
     if n == 2:
@@ -144,10 +153,14 @@ def factorise_unit(layout: Layout, base: Base, u: int, block: FloatArray) -> boo
         below = block[1, 0] / first
         rest = block[1, 1] - below * below
         least = PIVOT_FLOOR * block[1, 1]
-        lower[0, c], lower[1, c], lower[2, c] = first, below, math.sqrt(least if rest < least else rest)
+        lower[0, c] = first
+        lower[1, c] = below
+        lower[2, c] = math.sqrt(least if rest < least else rest)
         return True
     for i in range(n // 2):
-        lower[0, c + i], lower[1, c + i], lower[2, c + i] = 1.0, 0.0, 1.0
+        lower[0, c + i] = 1.0
+        lower[1, c + i] = 0.0
+        lower[2, c + i] = 1.0
     for i in range(n):
         for j in range(i + 1):
             rest = block[i, j]
@@ -171,7 +184,9 @@ def keep_unit(layout: Layout, base: Base, u: int, block: FloatArray) -> None:
     for i in range(n):
         block[i, i] += CORNER_FLOOR
     if n == 2:
-        base.lower[0, c], base.lower[1, c], base.lower[2, c] = block[0, 0], block[1, 0], block[1, 1]
+        base.lower[0, c] = block[0, 0]
+        base.lower[1, c] = block[1, 0]
+        base.lower[2, c] = block[1, 1]
         return
     for i in range(n):
         for j in range(n):
@@ -181,7 +196,9 @@ def keep_unit(layout: Layout, base: Base, u: int, block: FloatArray) -> None:
 @inlined
 def solve_unit(layout: Layout, base: Base, u: int, right: FloatArray) -> None:
     """Replace b (2g,) by L^-1 b."""
-    (n, c, at), lower, joint = unit_of(layout, u), base.lower, base.joint
+    (n, c, at) = unit_of(layout, u)
+    lower = base.lower
+    joint = base.joint
     if n == 2:
         right[0] /= lower[0, c]
         right[1] = (right[1] - lower[1, c] * right[0]) / lower[2, c]
@@ -196,7 +213,9 @@ def solve_unit(layout: Layout, base: Base, u: int, right: FloatArray) -> None:
 @inlined
 def solve_unit_transposed(layout: Layout, base: Base, u: int, right: FloatArray) -> None:
     """Replace b (2g,) by L^-T b."""
-    (n, c, at), lower, joint = unit_of(layout, u), base.lower, base.joint
+    (n, c, at) = unit_of(layout, u)
+    lower = base.lower
+    joint = base.joint
     if n == 2:
         right[1] /= lower[2, c]
         right[0] = (right[0] - lower[1, c] * right[1]) / lower[0, c]
@@ -211,9 +230,13 @@ def solve_unit_transposed(layout: Layout, base: Base, u: int, right: FloatArray)
 @inlined
 def solve_unit_rows(layout: Layout, base: Base, u: int, rows: FloatArray, begin: int, end: int) -> None:
     """Replace b (2g, end - begin), columns ``begin`` to ``end`` of ``rows``, by L^-1 b."""
-    (n, c, at), lower, joint = unit_of(layout, u), base.lower, base.joint
+    (n, c, at) = unit_of(layout, u)
+    lower = base.lower
+    joint = base.joint
     if n == 2:
-        first, below, last = lower[0, c], lower[1, c], lower[2, c]
+        first = lower[0, c]
+        below = lower[1, c]
+        last = lower[2, c]
         for p in range(begin, end):
             rows[0, p] /= first
             rows[1, p] = (rows[1, p] - below * rows[0, p]) / last

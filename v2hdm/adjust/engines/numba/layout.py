@@ -98,7 +98,8 @@ def _distinct(pair: IntArray, pairs: int) -> IntArray:
 
 def joint_offsets(joined: IntArray) -> IntArray:
     """Offsets (M,) of the factors (2g, 2g) of units of g > 1 corners; equal sizes are contiguous."""
-    out, begin = np.zeros(len(joined), dtype=np.int64), 0
+    out = np.zeros(len(joined), dtype=np.int64)
+    begin = 0
     for size in np.unique(joined[joined > 1]):
         same = np.flatnonzero(joined == size)
         out[same] = begin + 4 * size * size * np.arange(len(same))
@@ -151,7 +152,8 @@ def one_thread_in_torch(observations: int, alone: bool) -> Iterator[None]:
     nothing large to do, for any number of ``observations``.
     """
     global _granted
-    before, granted = torch.get_num_threads(), _granted
+    before = torch.get_num_threads()
+    granted = _granted
     if before == 1 or not (alone or observations < _WORTH_THREADS):
         yield
         return
@@ -208,19 +210,23 @@ def first_unsound(
 ) -> int:
     """Index of the first unsound observation, or -1; counts the observations of each corner and camera."""
     for k in range(len(seen.camera)):
-        c, n = seen.camera[k], seen.corner[k]
+        c = seen.camera[k]
+        n = seen.corner[k]
         if not (0 <= c < len(by_camera) and 0 <= seen.frame[k] < frames and 0 <= n < len(by_corner)):
             return k
         by_corner[n] += 1
         by_camera[c] += 1
-        xx, xy = seen.covariance_px[k, 0, 0], seen.covariance_px[k, 0, 1]
-        yx, yy = seen.covariance_px[k, 1, 0], seen.covariance_px[k, 1, 1]
+        xx = seen.covariance_px[k, 0, 0]
+        xy = seen.covariance_px[k, 0, 1]
+        yx = seen.covariance_px[k, 1, 0]
+        yy = seen.covariance_px[k, 1, 1]
         if not (xx > 0 and xx * yy > yx * yx and xx * yy < math.inf):
             return k
         if not (xy - yx) * (xy - yx) <= symmetric_to * symmetric_to * xx * yy:
             return k
         for axis in range(2):
-            focal, centre = seen.intrinsic[c, axis], seen.intrinsic[c, 2 + axis]
+            focal = seen.intrinsic[c, axis]
+            centre = seen.intrinsic[c, 2 + axis]
             if not abs((seen.pinhole_px[k, axis] - centre) / focal) <= max_slope:
                 return k
     return -1
@@ -242,14 +248,18 @@ def lay_out(
     for i in range(len(order)):
         k = order[i]
         c = seen.camera[k]
-        corner[i], pair[i] = rank[seen.corner[k]], c * frames + seen.frame[k]
+        corner[i] = rank[seen.corner[k]]
+        pair[i] = c * frames + seen.frame[k]
         if i and corner[i] == corner[i - 1] and pair[i] == pair[i - 1] and again < 0:
             again = i
-        fx, fy = seen.intrinsic[c, 0], seen.intrinsic[c, 1]
+        fx = seen.intrinsic[c, 0]
+        fy = seen.intrinsic[c, 1]
         measured[0, i] = (seen.pinhole_px[k, 0] - seen.intrinsic[c, 2]) / fx
         measured[1, i] = (seen.pinhole_px[k, 1] - seen.intrinsic[c, 3]) / fy
         first = math.sqrt(seen.covariance_px[k, 0, 0])
         below = seen.covariance_px[k, 1, 0] / first
         last = math.sqrt(seen.covariance_px[k, 1, 1] - below * below)
-        root[0, i], root[1, i], root[2, i] = fx / first, -below * fx / (first * last), fy / last
+        root[0, i] = fx / first
+        root[1, i] = -below * fx / (first * last)
+        root[2, i] = fy / last
     return again

@@ -45,14 +45,27 @@ def differentiate(
 ) -> tuple[float, float, float, float, float]:
     """Write the Jacobian (16,) of observation k by pair and corner; returns residual and point."""
     px, py, pz, inverse, slope, u, v = see(layout, table, k, x, y)
-    a, b, c = layout.root[0, k], layout.root[1, k], layout.root[2, k]
-    ad, bd, cd = a * inverse, b * inverse, c * inverse
-    g, h = a * px * slope, (b * px + c * py) * slope
+    a = layout.root[0, k]
+    b = layout.root[1, k]
+    c = layout.root[2, k]
+    ad = a * inverse
+    bd = b * inverse
+    cd = c * inverse
+    g = a * px * slope
+    h = (b * px + c * py) * slope
     t = layout.pair[k]
-    jacobian[0], jacobian[1], jacobian[2] = ad, 0.0, g
-    jacobian[3], jacobian[4], jacobian[5] = py * g, pz * ad - px * g, -py * ad
-    jacobian[6], jacobian[7], jacobian[8] = bd, cd, h
-    jacobian[9], jacobian[10], jacobian[11] = py * h - pz * cd, pz * bd - px * h, px * cd - py * bd
+    jacobian[0] = ad
+    jacobian[1] = 0.0
+    jacobian[2] = g
+    jacobian[3] = py * g
+    jacobian[4] = pz * ad - px * g
+    jacobian[5] = -py * ad
+    jacobian[6] = bd
+    jacobian[7] = cd
+    jacobian[8] = h
+    jacobian[9] = py * h - pz * cd
+    jacobian[10] = pz * bd - px * h
+    jacobian[11] = px * cd - py * bd
     jacobian[12] = ad * table[t, 0] + g * table[t, 8]
     jacobian[13] = ad * table[t, 1] + g * table[t, 9]
     jacobian[14] = bd * table[t, 0] + cd * table[t, 4] + h * table[t, 8]
@@ -65,7 +78,8 @@ def differentiate(
 def couple(jacobian: FloatArray, weight: float, out: FloatArray, i: int) -> None:
     """Write W' of an observation, (12,), from :func:`differentiate`, in row i of ``out``."""
     for p in range(6):
-        top, low = weight * jacobian[p], weight * jacobian[6 + p]
+        top = weight * jacobian[p]
+        low = weight * jacobian[6 + p]
         out[i, p] = jacobian[12] * top + jacobian[14] * low
         out[i, 6 + p] = jacobian[13] * top + jacobian[15] * low
 
@@ -100,8 +114,10 @@ def _add_corner(
 ) -> tuple[float, float]:
     """Add the observations of corner c to gradients, blocks, rows and loss; its unit begins at ``first``."""
     slot, jacobian, coupling, _, block, _, gradient, rows = scratch
-    cameras, i = len(base.table) // layout.moments, 2 * (c - first)
-    each, states = out.tip.shape[1] // cameras, len(base.rows) == 0
+    cameras = len(base.table) // layout.moments
+    i = 2 * (c - first)
+    each = out.tip.shape[1] // cameras
+    states = len(base.rows) == 0
     gx = gy = xx = yx = yy = 0.0
     for k in range(layout.begin[c], layout.begin[c + 1]):
         r0, r1, px, py, pz = differentiate(
@@ -110,11 +126,14 @@ def _add_corner(
         squared = r0 * r0 + r1 * r1
         total, product = add_loss(base, squared, total, product)
         weight = weigh(base, squared)
-        w0, w1 = weight * r0, weight * r1
+        w0 = weight * r0
+        w1 = weight * r1
         gx += jacobian[12] * w0 + jacobian[14] * w1
         gy += jacobian[13] * w0 + jacobian[15] * w1
-        at, camera = slot[layout.pair[k]], layout.pair[k] // layout.moments
-        fx, fy = jacobian[0] * w0 + jacobian[6] * w1, jacobian[7] * w1
+        at = slot[layout.pair[k]]
+        camera = layout.pair[k] // layout.moments
+        fx = jacobian[0] * w0 + jacobian[6] * w1
+        fy = jacobian[7] * w1
         add_force(out.wrench, at, px, py, pz, fx, fy, jacobian[2] * w0 + jacobian[8] * w1)
         weight = floored(weight)
         xx += weight * (jacobian[12] * jacobian[12] + jacobian[14] * jacobian[14])
@@ -124,10 +143,14 @@ def _add_corner(
         j = k - layout.begin[first] if states else 0
         couple(jacobian, weight, coupling, j)
         add_camera(coupling, j, clock, layout.pair[k], each, rows, i, camera * each)
-    a, b, d = layout.control_root[c, 0], layout.control_root[c, 1], layout.control_root[c, 2]
+    a = layout.control_root[c, 0]
+    b = layout.control_root[c, 1]
+    d = layout.control_root[c, 2]
     block[i, i] = xx + a * a + b * b
-    block[i + 1, i], block[i + 1, i + 1] = yx + b * d, yy + d * d
-    gradient[i], gradient[i + 1] = gx, gy
+    block[i + 1, i] = yx + b * d
+    block[i + 1, i + 1] = yy + d * d
+    gradient[i] = gx
+    gradient[i + 1] = gy
     return total, product
 
 
@@ -136,7 +159,8 @@ def _add_square(jacobian: FloatArray, weight: float, own: FloatArray, owner: int
     """Add J'J of an observation by its pair, upper triangle row by row, to row ``owner`` of ``own``."""
     m = 0
     for p in range(6):
-        top, low = weight * jacobian[p], weight * jacobian[6 + p]
+        top = weight * jacobian[p]
+        low = weight * jacobian[6 + p]
         for s in range(p, 6):
             own[owner, m] += top * jacobian[s] + low * jacobian[6 + s]
             m += 1
@@ -145,11 +169,15 @@ def _add_square(jacobian: FloatArray, weight: float, own: FloatArray, owner: int
 @inlined
 def _carry_back(layout: Layout, u: int, scratch: Scratch, coupled: FloatArray) -> None:
     """Add W times unit u's ``gradient`` to the pairs that see it."""
-    coupling, gradient, first = scratch.coupling, scratch.gradient, layout.unit[u]
+    coupling = scratch.coupling
+    gradient = scratch.gradient
+    first = layout.unit[u]
     for c in range(first, layout.unit[u + 1]):
-        x, y = gradient[2 * (c - first)], gradient[2 * (c - first) + 1]
+        x = gradient[2 * (c - first)]
+        y = gradient[2 * (c - first) + 1]
         for k in range(layout.begin[c], layout.begin[c + 1]):
-            at, j = scratch.slot[layout.pair[k]], k - layout.begin[first]
+            at = scratch.slot[layout.pair[k]]
+            j = k - layout.begin[first]
             for p in range(6):
                 coupled[at, p] += coupling[j, p] * x + coupling[j, 6 + p] * y
 
@@ -159,7 +187,8 @@ def _add_products(rows: FloatArray, count: int, tip: FloatArray) -> None:
     """Add B'B of a unit's ``count`` rows to the lower triangle of the ``tip``."""
     for i in range(0, count, 2):
         for p in range(len(tip)):
-            top, low = rows[i, p], rows[i + 1, p]
+            top = rows[i, p]
+            low = rows[i + 1, p]
             for s in range(p + 1):
                 tip[p, s] += top * rows[i, s] + low * rows[i + 1, s]
 
@@ -180,13 +209,18 @@ def linearise(
     ``clock`` (P, 6 Q) are the pairs' left tangents by their camera's clock offsets; ``by_pair`` requests J'J
     by pair.
     """
-    states, width = len(base.rows) == 0, out.tip.shape[1]
-    block, gradient, rows = scratch.block, scratch.gradient, scratch.rows
+    states = len(base.rows) == 0
+    width = out.tip.shape[1]
+    block = scratch.block
+    gradient = scratch.gradient
+    rows = scratch.rows
     for q in range(begin, end):
         number_touched(layout, q, scratch.slot)
-        total, product = 0.0, 1.0
+        total = 0.0
+        product = 1.0
         for u in range(layout.chunk[q], layout.chunk[q + 1]):
-            first, last = layout.unit[u], layout.unit[u + 1]
+            first = layout.unit[u]
+            last = layout.unit[u + 1]
             size = last - first
             block[: 2 * size, : 2 * size] = 0.0
             gradient[: 2 * size] = 0.0
@@ -227,12 +261,14 @@ def _add_lengths(layout: Layout, u: int, corners: FloatArray, block: FloatArray)
     first = layout.unit[u]
     for m in range(layout.length_at[u], layout.length_at[u + 1]):
         _, jx, jy = length_residual(layout, m, corners)
-        a, b = 2 * (layout.length_first[m] - first), 2 * (layout.length_second[m] - first)
+        a = 2 * (layout.length_first[m] - first)
+        b = 2 * (layout.length_second[m] - first)
         for at in (a, b):
             block[at, at] += jx * jx
             block[at + 1, at] += jx * jy
             block[at + 1, at + 1] += jy * jy
-        low, high = min(a, b), max(a, b)
+        low = min(a, b)
+        high = max(a, b)
         block[high, low] -= jx * jx
         block[high, low + 1] -= jx * jy
         block[high + 1, low] -= jx * jy
@@ -253,7 +289,9 @@ class TileMap(NamedTuple):
 @inlined
 def _touch(layout: Layout, u: int, tiles: TileMap, marks: IntArray) -> int:
     """List the tiles of unit u in elimination order, with ``marks`` by tile; returns their number."""
-    mark, place, touched = marks[0], marks[1], marks[2]
+    mark = marks[0]
+    place = marks[1]
+    touched = marks[2]
     count = 0
     for k in range(layout.begin[layout.unit[u]], layout.begin[layout.unit[u + 1]]):
         tile = layout.frame[layout.pair[k] % layout.moments] // tiles.per_tile
@@ -261,7 +299,8 @@ def _touch(layout: Layout, u: int, tiles: TileMap, marks: IntArray) -> int:
             mark[tile], touched[count] = u, tile
             count += 1
     for a in range(1, count):
-        tile, b = touched[a], a
+        tile = touched[a]
+        b = a
         while b > 0 and tiles.position[touched[b - 1]] > tiles.position[tile]:
             touched[b] = touched[b - 1]
             b -= 1
@@ -276,7 +315,10 @@ def _subtract_products(
     begin: int, end: int, tiles: TileMap, marks: IntArray, count: int, rows: FloatArray, values: FloatArray
 ) -> None:
     """Subtract B'B of a unit's ``rows`` (2g, ...) in columns ``begin`` to ``end`` of its ``count`` tiles."""
-    size, touched, low, high = tiles.size, marks[2], marks[3], marks[4]
+    size = tiles.size
+    touched = marks[2]
+    low = marks[3]
+    high = marks[4]
     for a in range(count):
         column = tiles.position[touched[a]]
         if not begin <= column < end:
@@ -288,12 +330,14 @@ def _subtract_products(
                 found += 1
             for i in range(0, len(rows), 2):
                 for r in range(low[b], high[b]):
-                    x, y = rows[i, b * size + r], rows[i + 1, b * size + r]
+                    x = rows[i, b * size + r]
+                    y = rows[i + 1, b * size + r]
                     if x == 0.0 and y == 0.0:
                         continue
                     # Diagonal tiles are lower triangular.
                     stop = r + 1 if a == b else high[a]
-                    at, right = tiles.at[found] + r * size, a * size
+                    at = tiles.at[found] + r * size
+                    right = a * size
                     out = values[at + low[a] : at + stop]
                     top = rows[i, right + low[a] : right + stop]
                     bottom = rows[i + 1, right + low[a] : right + stop]
@@ -322,10 +366,16 @@ def subtract_frames(
     unknowns. ``marks`` (5, G + 1), initially -1, is scratch: its last two rows are the nonzero columns of
     each touched tile and of the tip.
     """
-    states, size = by_state.shape[1] // 6, tiles.size
+    states = by_state.shape[1] // 6
+    size = tiles.size
     width = len(base.table) // layout.moments * each
-    place, touched, low, high = marks[1], marks[2], marks[3], marks[4]
-    jacobian, w, rows = scratch.jacobian, scratch.coupling, scratch.rows
+    place = marks[1]
+    touched = marks[2]
+    low = marks[3]
+    high = marks[4]
+    jacobian = scratch.jacobian
+    w = scratch.coupling
+    rows = scratch.rows
     for u in range(len(layout.unit) - 1):
         if layout.kept[u]:
             continue
@@ -335,20 +385,26 @@ def subtract_frames(
             wanted |= begin <= tiles.position[touched[a]] < end
         if not wanted:
             continue
-        low[:count], high[:count] = size, 0
-        low[count], high[count] = 0, width
-        first, last = layout.unit[u], layout.unit[u + 1]
-        joined, tip = last - first, count * size
+        low[:count] = size
+        high[:count] = 0
+        low[count] = 0
+        high[count] = width
+        first = layout.unit[u]
+        last = layout.unit[u + 1]
+        joined = last - first
+        tip = count * size
         rows[: 2 * joined, : tip + width] = 0.0
         for c in range(first, last):
             i = 2 * (c - first)
             for k in range(layout.begin[c], layout.begin[c + 1]):
                 t = layout.pair[k]
-                x, y = base.corners[c, 0], base.corners[c, 1]
+                x = base.corners[c, 0]
+                y = base.corners[c, 1]
                 r0, r1, _, _, _ = differentiate(layout, base.table, k, x, y, jacobian)
                 couple(jacobian, floored(weigh(base, r0 * r0 + r1 * r1)), w, 0)
                 frame = layout.frame[t % layout.moments]
-                a, within = place[frame // tiles.per_tile], frame % tiles.per_tile * states
+                a = place[frame // tiles.per_tile]
+                within = frame % tiles.per_tile * states
                 low[a], high[a] = min(low[a], within), max(high[a], within + states)
                 column = a * size + within
                 for p in range(6):

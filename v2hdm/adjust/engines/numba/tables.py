@@ -29,7 +29,8 @@ _LEFT_JACOBIAN = np.ascontiguousarray(LEFT_JACOBIAN_SERIES, dtype=np.float64)
 
 def move(tangents: FloatArray, dst_from_src: FloatArray) -> tuple[FloatArray, FloatArray]:
     """``exp(tangents) @ dst_from_src`` (C, 4, 4) and the left Jacobian (C, 6, 6) of the tangents (C, 6)."""
-    moved, jacobian = np.zeros((len(tangents), 4, 4)), np.empty((len(tangents), 6, 6))
+    moved = np.zeros((len(tangents), 4, 4))
+    jacobian = np.empty((len(tangents), 6, 6))
     _move(tangents, dst_from_src, _EXP, _LEFT_JACOBIAN, np.empty((5, 6, 6)), moved, jacobian)
     return moved, jacobian
 
@@ -66,9 +67,15 @@ def _series(terms: FloatArray, column: int, x: float) -> float:
 @inlined
 def _hat(out: FloatArray, i: int, j: int, x: float, y: float, z: float) -> None:
     """Write the skew matrix of a vector at row i and column j."""
-    out[i, j], out[i, j + 1], out[i, j + 2] = 0.0, -z, y
-    out[i + 1, j], out[i + 1, j + 1], out[i + 1, j + 2] = z, 0.0, -x
-    out[i + 2, j], out[i + 2, j + 1], out[i + 2, j + 2] = -y, x, 0.0
+    out[i, j] = 0.0
+    out[i, j + 1] = -z
+    out[i, j + 2] = y
+    out[i + 1, j] = z
+    out[i + 1, j + 1] = 0.0
+    out[i + 1, j + 2] = -x
+    out[i + 2, j] = -y
+    out[i + 2, j + 1] = x
+    out[i + 2, j + 2] = 0.0
 
 
 @inlined
@@ -91,15 +98,19 @@ def _move(
     moved: FloatArray,
     jacobian: FloatArray,
 ) -> None:
-    ad, inner, product, omega, square = room[0], room[1], room[2], room[3], room[4]
+    ad = room[0]
+    inner = room[1]
+    product = room[2]
+    omega = room[3]
+    square = room[4]
     for c in range(len(tangents)):
-        wx, wy, wz = tangents[c, 3], tangents[c, 4], tangents[c, 5]
+        wx = tangents[c, 3]
+        wy = tangents[c, 4]
+        wz = tangents[c, 5]
         x = -(wx * wx + wy * wy + wz * wz)
-        sine, cosine, third = (
-            _series(exp_series, 0, x),
-            _series(exp_series, 1, x),
-            _series(exp_series, 2, x),
-        )
+        sine = _series(exp_series, 0, x)
+        cosine = _series(exp_series, 1, x)
+        third = _series(exp_series, 2, x)
         _hat(omega, 0, 0, wx, wy, wz)
         _product(omega, omega, 3, square)
         for i in range(3):
@@ -179,7 +190,8 @@ def with_priors(
     ``costs`` (3,) are of observations, survey and known lengths, ``wrench`` (C, M, 6) is the observations'
     gradient by the pairs' left tangents.
     """
-    cameras, centre_root = estimate.cam_from_vehicle.numpy(), arrays.centre_information_root.numpy()
+    cameras = estimate.cam_from_vehicle.numpy()
+    centre_root = arrays.centre_information_root.numpy()
     centre = (rigid.camera_centre(cameras) - arrays.centre.numpy()) * centre_root
     state = state_residual(arrays, estimate.frame_state) if arrays.states else estimate.frame_state
     clock = clock_residual(arrays, estimate.clock_s) if arrays.camera_unknowns > 6 else estimate.clock_s
@@ -208,9 +220,11 @@ def with_priors(
 
 def prior_blocks_of(arrays: Arrays, estimate: Estimate) -> PriorBlocks:
     """Gauss-Newton Hessian of the priors by the reduced unknowns."""
-    count, each = arrays.camera_count, arrays.camera_unknowns
+    count = arrays.camera_count
+    each = arrays.camera_unknowns
     by_camera = np.zeros((count, each, count, each))
-    root, clock_root = arrays.centre_information_root.numpy(), arrays.clock_information_root.numpy()
+    root = arrays.centre_information_root.numpy()
+    clock_root = arrays.clock_information_root.numpy()
     for c, turn in enumerate(estimate.cam_from_vehicle.numpy()[:, :3, :3]):
         by_camera[c, :3, c, :3] = turn * root[c] ** 2 @ turn.T
         by_camera[c, 6:, c, 6:] = np.diag(clock_root**2)

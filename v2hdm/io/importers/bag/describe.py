@@ -77,7 +77,8 @@ class BagDescription:
             if position is not None and position.kind == kinds.FIX:
                 heading = _only(bag, [kinds.QUATERNION]) or _only(bag, [kinds.IMU])
             wanted = [*infos.values(), position, heading]
-            has_static, has_tf = TF_STATIC in bag.topics, TF_TOPIC in bag.topics
+            has_static = TF_STATIC in bag.topics
+            has_tf = TF_TOPIC in bag.topics
             self._frame_of = _frames_of_topics(bag, {topic.name for topic in wanted if topic is not None})
         if not images:
             raise DriveError(f"{path}: has no image topic ({', '.join(IMAGE_KINDS)}); not a drive")
@@ -134,7 +135,8 @@ class BagDescription:
             self.missing[f"cameras.{name}.mounting"] = MOUNTING
             return entry | {"mounting": "?"}
         angles_deg = np.degrees(mounting_angles(inverse(vehicle_from_cam)))
-        xyz_m, rpy_deg = np.round(vehicle_from_cam[:3, 3], 9).tolist(), np.round(angles_deg, 9).tolist()
+        xyz_m = np.round(vehicle_from_cam[:3, 3], 9).tolist()
+        rpy_deg = np.round(angles_deg, 9).tolist()
         return entry | {"mounting": {"xyz_m": xyz_m, "rpy_deg": rpy_deg}}
 
     def _vehicle_from(self, sensor: str) -> FloatArray | None:

@@ -19,10 +19,12 @@ from v2hdm.safe.pixels import png
 
 _log = logging.getLogger(__name__)
 
-RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+RAW = "sensor_msgs/msg/Image"
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
 IMAGE_KINDS = (RAW, COMPRESSED)
 
-_PNG_SIGNATURE, _JPEG_START = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_JPEG_START = b"\xff\xd8"
 
 # Channels, and OpenCV's conversion to BGR.
 _ENCODINGS: Mapping[str, tuple[int, int | None]] = {
@@ -62,7 +64,9 @@ def _pixels(fields: Any, where: str) -> np.ndarray:
         known = ", ".join(_ENCODINGS)
         raise DriveError(f"{where}: encoding '{fields.encoding}' is not known; record one of {known}")
     channels, to_bgr = _ENCODINGS[fields.encoding]
-    height, width, step = int(fields.height), int(fields.width), int(fields.step)
+    height = int(fields.height)
+    width = int(fields.width)
+    step = int(fields.step)
     row = width * channels
     if not height or not width or step < row or len(fields.data) < step * (height - 1) + row:
         raise DriveError(
@@ -133,7 +137,8 @@ class VideoDecoder:
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 FIX = "sensor_msgs/msg/NavSatFix"
-TF, OLD_TF = "tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"
+TF = "tf2_msgs/msg/TFMessage"
+OLD_TF = "tf/msg/tfMessage"
 NMEA = "nmea_msgs/msg/Sentence"
 _WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 _POSE = "geometry_msgs/msg/PoseStamped"
@@ -182,12 +187,14 @@ def readings_of(
     """Readings of a topic's stamps (P,) and rows (P, 9), and of rows (A, 5) of a topic of headings."""
     stamp_s, rows = positions
     order = in_order(stamp_s, where, "message")
-    stamp_s, rows = stamp_s[order], rows[order]
+    stamp_s = stamp_s[order]
+    rows = rows[order]
     if not np.isfinite(rows[:, :3][~np.isinf(rows[:, 3])]).all():
         raise DriveError(f"{where}: holds a position that is not finite; record it again")
     heading_s, turned = headings or (stamp_s, rows[:, 4:])
     by_time = in_order(heading_s, where, "message of the heading")
-    heading_s, turned = heading_s[by_time], turned[by_time]
+    heading_s = heading_s[by_time]
+    turned = turned[by_time]
     if (rows[:, 3] < 0).any() or (turned[:, 4] < 0).any():
         raise DriveError(f"{where}: a message states a negative variance; record it again with 0 for unknown")
     # A dual antenna writes nan where it has none.
@@ -203,9 +210,11 @@ def readings_of(
 
 def _pose(pose: Any, covariance: Any) -> Row:
     place = pose.position
-    sigma_m, sigma_rad = np.nan, np.nan
+    sigma_m = np.nan
+    sigma_rad = np.nan
     if covariance is not None:
-        sigma_m, sigma_rad = _sigma(covariance[0], covariance[7]), _sigma(covariance[_YAW])
+        sigma_m = _sigma(covariance[0], covariance[7])
+        sigma_rad = _sigma(covariance[_YAW])
     return (place.x, place.y, place.z, sigma_m, *_quaternion(pose.orientation), sigma_rad)
 
 
@@ -221,7 +230,8 @@ def _sigma(*variances: float) -> float:
 
 
 Edge = tuple[str, str]  # parent and child
-TF_TOPIC, TF_STATIC = "/tf", "/tf_static"
+TF_TOPIC = "/tf"
+TF_STATIC = "/tf_static"
 
 _FIXED = 1e-9  # elements of a transform, m or 1, that change by less do so by rounding
 
@@ -304,7 +314,8 @@ def transform_rows(fields: Any) -> list[tuple[Edge, tuple[float, ...]]]:
     """Edges of a ``TFMessage`` with their rows of stamp, translation and quaternion."""
     rows: list[tuple[Edge, tuple[float, ...]]] = []
     for one in fields.transforms:
-        move, turn = one.transform.translation, one.transform.rotation
+        move = one.transform.translation
+        turn = one.transform.rotation
         stamp = one.header.stamp
         row = (stamp.sec + stamp.nanosec / 1e9, move.x, move.y, move.z, turn.x, turn.y, turn.z, turn.w)
         rows.append(((frame_name(one.header.frame_id), frame_name(one.child_frame_id)), row))

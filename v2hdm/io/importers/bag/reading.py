@@ -22,12 +22,14 @@ from v2hdm.store.files import load_yaml, take_mapping
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"
-_TIMES, _SPARE_BYTES = 10, 200_000_000  # what a piece may unpack to: so many times its bytes, and these
+_TIMES = 10
+_SPARE_BYTES = 200_000_000  # what a piece may unpack to: so many times its bytes, and these
 _TIMES_IN_ALL = 100  # the same of all pieces: raw pictures of a simulator may pack twenty times
 _spare: ContextVar[int] = ContextVar("bytes beyond so many times its own that a bag may still unpack to")
 _MOST_LETTERS = 1_000_000  # of a type's definition
 _TEXTS = re.compile(r'"(?:[^"\\]|\\.)*(?:"|\Z)|//[^\n]*|#[^\n]*|/\*.*?(?:\*/|\Z)', re.DOTALL)
-_CONSTANT, _LITERAL = re.compile(r"\bconst\b[^=;]*=([^;]*)"), re.compile(r"\s*[-+]?[\w.:]*\s*")
+_CONSTANT = re.compile(r"\bconst\b[^=;]*=([^;]*)")
+_LITERAL = re.compile(r"\s*[-+]?[\w.:]*\s*")
 _LONG = re.compile(r"\[[\s<=]*\d{8,}")  # an array of ten million elements
 _NESTED = re.compile(r"\([^()]*\(|\[[^\[\]]*\[")
 _NO_RECORDING = "its definition is not from a recording; convert it where it was recorded"
@@ -207,7 +209,8 @@ def _limit_rosbags() -> None:
 
     def limited(new: Callable[[], Any]) -> Callable[..., bytes]:
         def unpack(data: bytes, *_: object) -> bytes:
-            stream, most = new(), _TIMES * len(data) + _spare.get()
+            stream = new()
+            most = _TIMES * len(data) + _spare.get()
             out: bytes = stream.decompress(data, max_length=most)
             if not stream.eof:
                 raise DriveError("is cut off, or unpacks to more than a recording could; unpack it yourself")
@@ -234,8 +237,10 @@ def _limit_rosbags() -> None:
         limit_steps(data := apsw.Connection(name, **how), Path(data.filename))
         return data
 
-    database, mcap = vars(storage_sqlite3)["Sqlite3Reader"], vars(storage_mcap)["McapReader"]
-    open_any, read_any = database._open, mcap.read_index
+    database = vars(storage_sqlite3)["Sqlite3Reader"]
+    mcap = vars(storage_mcap)["McapReader"]
+    open_any = database._open
+    read_any = mcap.read_index
 
     def open_plain(self: Any) -> None:  # after a file that is compressed as a whole was unpacked, too
         _check_plain(self.path)
@@ -246,8 +251,10 @@ def _limit_rosbags() -> None:
         if sum(chunk.compressed_size for chunk in self.chunks) > self.path.stat().st_size:
             raise DriveError("its index lists a chunk twice; run 'mcap recover'")
 
-    database._open, mcap.read_index = open_plain, read_index
-    zstd, lz4 = vars(reader2)["zstd"], limited(LZ4FrameDecompressor)
+    database._open = open_plain
+    mcap.read_index = read_index
+    zstd = vars(reader2)["zstd"]
+    lz4 = limited(LZ4FrameDecompressor)
     unpack = limited(zstd.ZstdDecompressor)
     storage_mcap.DECOMPRESSORS.update(zstd=unpack, lz4=lz4)
     reader1.decompressors.update(bz2=limited(BZ2Decompressor), lz4=lz4)

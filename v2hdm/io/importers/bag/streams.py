@@ -33,8 +33,12 @@ _log = logging.getLogger(__name__)
 
 STAMPS = ("header", "received")  # times that count: the headers', or when the recorder received the message
 INFO_KIND = "sensor_msgs/msg/CameraInfo"
-IMAGE_LIST, INFO_FILE = "images.txt", "camera_info.yaml"
-_POSES, _HEADINGS, _KIND, _TRANSFORMS = "positions.txt", "headings.txt", "kind.txt", "transforms.txt"
+IMAGE_LIST = "images.txt"
+INFO_FILE = "camera_info.yaml"
+_POSES = "positions.txt"
+_HEADINGS = "headings.txt"
+_KIND = "kind.txt"
+_TRANSFORMS = "transforms.txt"
 
 Writer = Generator[None, Message | None, None]  # is sent its messages, then None; closing closes its files
 
@@ -45,7 +49,10 @@ class Stream(ABC):
     def __init__(
         self, label: str, settings: Any, where: str, *needs: tuple[str, Collection[str], str]
     ) -> None:
-        self.label, self.settings, self.where, self.needs = label, settings, where, needs
+        self.label = label
+        self.settings = settings
+        self.where = where
+        self.needs = needs
 
     def topics(self, bag: Bag) -> Sequence[str]:
         """The topics to be read; raises DriveError where the bag lacks them or they are of another type."""
@@ -65,7 +72,8 @@ class ImageStream(Stream):
 
     def write(self, folder: Path) -> Writer:
         """Write an image file per message, or per frame of a video, and the list of them."""
-        stamp_s, names = array("d"), dict[int, str]()
+        stamp_s = array("d")
+        names = dict[int, str]()
         topic = f"{self.where}: topic {self.label}"
         decoder: kinds.VideoDecoder | None = None
 
@@ -115,7 +123,8 @@ class InfoStream(Stream):
         if (first := (yield)) is not None:
             where = f"{self.where}: topic {self.label}"
             write_camera_info(info_of(first.fields, self.label, where), folder / INFO_FILE)
-            number, lens = 1, _lens(first.fields)
+            number = 1
+            lens = _lens(first.fields)
             while (later := (yield)) is not None:
                 number += 1
                 if _lens(later.fields) != lens:
@@ -133,11 +142,13 @@ class PoseStream(Stream):
         if heading_topic is not None:
             needs.append((heading_topic, kinds.HEADING_KINDS, f"{where}, heading_topic"))
         super().__init__(topic, ["poses", heading_topic, stamps], where, *needs)
-        self._heading, self._stamps = heading_topic, stamps
+        self._heading = heading_topic
+        self._stamps = stamps
 
     def write(self, folder: Path) -> Writer:
         """Write rows of positions and of headings, and the type of the messages."""
-        kind, begun = "", set[str]()
+        kind = ""
+        begun = set[str]()
         with (
             (folder / _POSES).open("w", encoding="utf-8") as positions,
             (folder / _HEADINGS).open("w", encoding="utf-8") as headings,
