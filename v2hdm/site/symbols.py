@@ -21,13 +21,22 @@ from skimage.draw import polygon
 from skimage.measure import approximate_polygon, find_contours
 
 from v2hdm.adjust import PoseSigma
-from v2hdm.association.ground import BORDER_PX, OUTLINE_SIGMA_PX, outlines_on_ground
+from v2hdm.association.ground import BORDER_PX, outlines_on_ground
 from v2hdm.association.sightings import Rig, Symbols
 from v2hdm.association.tracks import LEAST_SIGHTINGS
 from v2hdm.geometry.ipm import apply_in_front, pinhole_px_from_ground, project_ground
 from v2hdm.geometry.planar import is_simple, signed_area
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.records import BoolArray, CameraInfo, Exclusion, FloatArray, IntArray, Marking, Symbol
+from v2hdm.records import (
+    OUTLINE_SIGMA_PX,
+    BoolArray,
+    CameraInfo,
+    Exclusion,
+    FloatArray,
+    IntArray,
+    Marking,
+    Symbol,
+)
 from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import PointViews, measure_parallax
