@@ -18,6 +18,7 @@ from v2hdm.records import Drive, Image
 from v2hdm.safe.texts import shown, take_camera_name, take_name
 from v2hdm.settings import MOST_PROCESSES, NOT_NEGATIVE, POSITIVE, Within, check_settings
 from v2hdm.simulate import PortConfig
+from v2hdm.store import names
 from v2hdm.store.cache import key_of
 from v2hdm.store.files import file_digest
 
@@ -221,8 +222,9 @@ def model_key(options: DetectorOptions) -> str | None:
 
 def base_files(path: Path) -> tuple[Path, tuple[Path, ...], Path]:
     """The map, trajectories and exclusions of an earlier map, given as a folder or its ``map.geojson``."""
-    hd_map = path / "map.geojson" if path.is_dir() else path
-    return hd_map, tuple(sorted(hd_map.parent.glob("trajectory*.tum"))), hd_map.parent / "excluded.geojson"
+    hd_map = names.map_file(path)
+    trajectories = sorted(hd_map.parent.glob(names.TRAJECTORIES))
+    return hd_map, tuple(trajectories), hd_map.parent / names.EXCLUDED
 
 
 def made_of_drives(paths: Sequence[str]) -> str:
