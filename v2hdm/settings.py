@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
-from functools import cache
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 from v2hdm.errors import ConfigError
@@ -58,7 +57,6 @@ class Setting:
     meaning: str = ""
 
 
-@cache
 def settings_of(schema: type[Any]) -> Mapping[str, Setting]:
     """The settings of a dataclass by name, in order, those of classes that it extends first."""
     hints = get_type_hints(schema, include_extras=True)
