@@ -30,6 +30,7 @@ def check(arguments: Sequence[str]) -> int:
         return 0
     from v2hdm.ground import estimate_cameras
     from v2hdm.store.files import write_json
+    from v2hdm.store.names import VERDICT
     from v2hdm.verdict import check_drive
     from v2hdm.verdict.check import draw_check
 
@@ -52,7 +53,7 @@ def check(arguments: Sequence[str]) -> int:
         ground = estimate_cameras(drive, parsed.workers, matched) if parsed.ground else {}
         print("check the drive", file=sys.stderr, flush=True)
         verdict = check_drive(drive, ground=ground)
-        write_json(unfinished / "verdict.json", verdict.as_json())
+        write_json(unfinished / VERDICT, verdict.as_json())
         draw_check(drive, unfinished, ground)
     passed = [finding.line for finding in verdict.passed if parsed.all]
     print(*passed, *verdict.lines[1:], verdict.lines[0], f"pictures in {folder}", sep="\n")
@@ -80,8 +81,9 @@ def localize_drive(arguments: Sequence[str]) -> int:
     from v2hdm.io.calibration.reading import trusted_calibrations
     from v2hdm.io.maps.reading import read_geojson
     from v2hdm.localization.run import localize, summary_lines, write_localised
+    from v2hdm.store.names import map_file
 
-    path = parsed.map / "map.geojson" if parsed.map.is_dir() else parsed.map
+    path = map_file(parsed.map)
     hd_map = read_geojson(path)
     calibrations = trusted_calibrations(path.parent)
     drive = drive_of(parsed)

@@ -82,12 +82,13 @@ def _export_mosaic(parsed: argparse.Namespace, folder: Path, *_: object) -> list
     from v2hdm.io.drive.road import lay_flat
     from v2hdm.io.maps.features import ground_height_m
     from v2hdm.io.trajectory import read_tum
+    from v2hdm.store.names import TRAJECTORY
     from v2hdm.surface.strips import write_cloud
 
     _refuse_crs(parsed, "a point cloud is in the map's own frame")
     if parsed.format != ["pcd"]:
         raise ConfigError("--format: a mosaic is already a GeoTIFF; its other format is pcd")
-    driven = lay_flat(read_tum(parsed.source.with_name("trajectory.tum")))
+    driven = lay_flat(read_tum(parsed.source.with_name(TRAJECTORY)))
 
     def height_m(places: FloatArray) -> FloatArray:
         return np.zeros(len(places)) if driven.road is None else ground_height_m(driven.road, places)

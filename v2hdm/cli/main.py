@@ -230,10 +230,11 @@ def drive_of(parsed: argparse.Namespace) -> Drive:
 @contextmanager
 def result_of(folder: Path, made: str, settings: Mapping[str, object]) -> Iterator[Path]:
     """The unfinished folder of a command's results, with the settings that they were made of."""
+    from v2hdm.store.names import CONFIG
     from v2hdm.store.results import result_folder
 
     with result_folder(folder, "--output", made) as unfinished:
-        (unfinished / "config.yaml").write_text(json.dumps(settings) + "\n", encoding="utf-8")
+        (unfinished / CONFIG).write_text(json.dumps(settings) + "\n", encoding="utf-8")
         yield unfinished
 
 

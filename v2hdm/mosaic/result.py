@@ -34,6 +34,7 @@ from v2hdm.progress import Steps
 from v2hdm.records import Drive, FloatArray, GeodeticOrigin, HDMap
 from v2hdm.report import style
 from v2hdm.report.page.facts import read_cameras, read_surface
+from v2hdm.store import names
 from v2hdm.store.files import whole_file, write_json
 
 AHEAD_M = 12.0
@@ -176,10 +177,6 @@ class Picture:
 _log = logging.getLogger(__name__)
 
 RESOLUTION_M = 0.02  # side of a pixel of the mosaic unless another is asked for
-TIFF = "mosaic.tif"
-PICTURE = "mosaic.webp"
-EXTENT = "mosaic.json"
-COMPARISON = "mosaic_before_after.png"
 
 
 @dataclass(frozen=True)
@@ -210,12 +207,12 @@ def write_mosaic(
         raise ConfigError(
             f"a resolution of {resolution_m:g} m per pixel is too fine for a mosaic; give {_FINEST_M} or more"
         )
-    hd_map = read_geojson(folder / "map.geojson")
+    hd_map = read_geojson(folder / names.MAP)
     ground = ground_of(folder, drive, resolution_m)
     picture = Picture(ground.canvas)
     with ExitStack() as stack:
         try:
-            put = stack.enter_context(geotiff(folder / TIFF, ground.canvas, drive.origin))
+            put = stack.enter_context(geotiff(folder / names.MOSAIC, ground.canvas, drive.origin))
         except ConfigError as missing:
             _log.warning("no GeoTIFF was written: %s", missing)
             put = None
@@ -223,12 +220,12 @@ def write_mosaic(
             if put is not None:
                 put(sheet)
             picture.put(sheet)
-    picture.write(folder / PICTURE)
+    picture.write(folder / names.MOSAIC_PICTURE)
     content = {
-        "image": PICTURE,
+        "image": names.MOSAIC_PICTURE,
         "bounds_m": ground.canvas.bounds_m,
         "resolution_m": picture.resolution_m,
-        "geotiff": None if put is None else TIFF,
+        "geotiff": None if put is None else names.MOSAIC,
         "geotiff_resolution_m": resolution_m,
         "crs": crs_of(drive.origin),
     }
@@ -236,8 +233,8 @@ def write_mosaic(
         "before: initial calibration, recorded poses": ground.before,
         "after: optimised calibration, adjusted poses": ground.after,
     }
-    save_comparison(folder / COMPARISON, richest_place(drive, hd_map), panels, ground.lenses, device)
-    write_json(folder / EXTENT, content)
+    save_comparison(folder / names.COMPARISON, richest_place(drive, hd_map), panels, ground.lenses, device)
+    write_json(folder / names.MOSAIC_EXTENT, content)
     return content
 
 
@@ -245,7 +242,7 @@ def ground_of(folder: Path, drive: Drive, resolution_m: float) -> Ground:
     """The ground that a run's images show, and the canvas around it; errors as :func:`write_mosaic`."""
     cameras = read_cameras(folder)
     if not cameras:
-        raise MapFileError(f"{folder}: no calibration_*.yaml in it; give the result folder of v2hdm map")
+        raise MapFileError(f"{folder}: no {names.CALIBRATIONS} in it; give the result folder of v2hdm map")
     calibrations = {name: one.calibration for name, one in cameras.items()}
     clock_s = {name: one.clock_offset_s or 0.0 for name, one in cameras.items()}
     missing = [name for name in drive.cameras if name not in calibrations]
@@ -256,11 +253,11 @@ def ground_of(folder: Path, drive: Drive, resolution_m: float) -> Ground:
         )
     for name in missing:
         _log.warning("camera %s has no calibration in %s: its images are left out", name, folder)
-    adjusted = read_tum(folder / "trajectory.tum")
+    adjusted = read_tum(folder / names.TRAJECTORY)
     taken_s = np.array([image.taken_s for image in drive.images])
     if adjusted.stamp_s[0] > taken_s.max() or adjusted.stamp_s[-1] < taken_s.min():
         raise MapFileError(
-            f"{folder / 'trajectory.tum'} and drive {drive.name} share no time: give the drive of this result"
+            f"{folder / names.TRAJECTORY} and drive {drive.name} share no time: give the drive of this result"
         )
     drive = with_own_vehicle(drive, Detector.load())
     lenses = {

@@ -19,6 +19,7 @@ from v2hdm.report.page.facts import Facts, ground_residuals, read_facts
 from v2hdm.report.page.layers import background_layer, comparison, layers
 from v2hdm.report.page.pictures import overlays, pictures
 from v2hdm.report.page.tables import in_words
+from v2hdm.store import names
 from v2hdm.store.files import replace_text
 
 
@@ -86,7 +87,6 @@ def _ellipses(facts: Facts) -> str:
     return charts.ellipse_chart(series) if series else ""
 
 
-FILE = "report.html"  # name of the page in a result folder
 _ASSETS = {"vendor": ("leaflet.js", "leaflet.css"), "templates": ("page.css", "map.js", "edit.js")}
 """Scripts and styles that the page embeds, by folder."""
 
@@ -98,8 +98,8 @@ def write_page(folder: Path, drive: Drive | None, background: Path | None = None
     tiles. If either is None, its content is taken from an existing report. Raises MapFileError for an invalid
     folder, file or background, DriveError for a damaged image or truth.
     """
-    replace_text(folder / FILE, page_text(folder, drive, background=background))
-    return folder / FILE
+    replace_text(folder / names.REPORT, page_text(folder, drive, background=background))
+    return folder / names.REPORT
 
 
 def page_text(
@@ -119,9 +119,9 @@ def page_text(
     here = files("v2hdm.report.page")
     facts = read_facts(folder, drive)
     page = document(facts)
-    page.pictures = page.pictures or _kept(folder / FILE, "pictures")
+    page.pictures = page.pictures or _kept(folder / names.REPORT, "pictures")
     if page.map_data:
-        kept = _kept(folder / FILE, "map-data").get("background") if background is None else None
+        kept = _kept(folder / names.REPORT, "map-data").get("background") if background is None else None
         page.map_data["background"] = kept if background is None else background_layer(background, facts)
     return environment.get_template("page.html").render(
         page=page,

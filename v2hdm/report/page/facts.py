@@ -15,14 +15,13 @@ from v2hdm.geometry.planar import length_along
 from v2hdm.geometry.rigid import camera_centre, interpolate, inverse
 from v2hdm.io.calibration.reading import read_calibration
 from v2hdm.io.drive.truth import read_truth
-from v2hdm.io.maps.evidence import FILE as RESIDUALS
 from v2hdm.io.maps.evidence import Residuals, read_exclusions, read_residuals
 from v2hdm.io.maps.features import features_of, map_of
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.io.trajectory import read_tum
 from v2hdm.records import BoolArray, Calibration, Drive, Exclusion, FloatArray, HDMap, IntArray, Truth
+from v2hdm.store import names
 from v2hdm.store.files import load_json, load_yaml, read_csv, read_text, take_number
-from v2hdm.surface.surface import FILE as GROUND
 from v2hdm.surface.surface import Surface
 
 BEST = "Opt"  # method of the run's result, as in metrics.json
@@ -91,16 +90,16 @@ class Facts:
 
 def read_facts(folder: Path, drive: Drive | None) -> Facts:
     """Read a run's result folder and the data of its ``drive``; MapFileError for damaged files."""
-    if not (folder / "metrics.json").is_file():
-        raise MapFileError(f"{folder}: not a result of v2hdm map (no metrics.json); give its folder")
-    metrics = load_json(folder / "metrics.json", MapFileError)
+    if not (folder / names.METRICS).is_file():
+        raise MapFileError(f"{folder}: not a result of v2hdm map (no {names.METRICS}); give its folder")
+    metrics = load_json(folder / names.METRICS, MapFileError)
     sets = list(metrics.get("results") or {})
-    hd_map = read_geojson(folder / "map.geojson") if (folder / "map.geojson").is_file() else None
-    excluded = read_exclusions(folder / "excluded.geojson") if (folder / "excluded.geojson").is_file() else []
+    hd_map = read_geojson(folder / names.MAP) if (folder / names.MAP).is_file() else None
+    excluded = read_exclusions(folder / names.EXCLUDED) if (folder / names.EXCLUDED).is_file() else []
     features = features_of(hd_map) if hd_map else []
-    residuals = folder / RESIDUALS
-    config = folder / "config.yaml"
-    points = folder / "check_points.csv"
+    residuals = folder / names.RESIDUALS
+    config = folder / names.CONFIG
+    points = folder / names.CHECK_POINTS
     route = _route(folder, drive)
     heading, *checked = (read_csv(points, MapFileError) if points.is_file() else []) or [[]]
     return Facts(
@@ -122,7 +121,7 @@ def read_facts(folder: Path, drive: Drive | None) -> Facts:
 def read_cameras(folder: Path) -> dict[str, CameraFacts]:
     """Calibrations of a result folder by camera; raises MapFileError for damaged files."""
     found = {}
-    for path in sorted(folder.glob("calibration_*.yaml")):
+    for path in sorted(folder.glob(names.CALIBRATIONS)):
         content = load_yaml(path, MapFileError)
         calibration = read_calibration(path)
         times_s = (
@@ -134,15 +133,15 @@ def read_cameras(folder: Path) -> dict[str, CameraFacts]:
 
 
 def _route(folder: Path, drive: Drive | None) -> Route | None:
-    if not (folder / "trajectory.tum").is_file():
+    if not (folder / names.TRAJECTORY).is_file():
         return None
-    adjusted = read_tum(folder / "trajectory.tum")
-    path = folder / "trajectory_sigma.csv"
+    adjusted = read_tum(folder / names.TRAJECTORY)
+    path = folder / names.TRAJECTORY_SIGMA
     rows = [row for row in read_csv(path, MapFileError)[1:] if row]
     try:
         table = np.array(rows, dtype=np.float64).reshape(len(adjusted.stamp_s), 8)
     except ValueError:
-        raise MapFileError(f"{path}: not one line of 8 numbers per pose of trajectory.tum") from None
+        raise MapFileError(f"{path}: not one line of 8 numbers per pose of {names.TRAJECTORY}") from None
     stamp_s = adjusted.stamp_s
     poses = adjusted.map_from_vehicle
     recorded = None
@@ -160,7 +159,7 @@ def _route(folder: Path, drive: Drive | None) -> Route | None:
 
 def read_surface(folder: Path, map_from_vehicle: FloatArray) -> Surface | None:
     """The ground of a result under vehicle poses (F, 4, 4), None for a plane; MapFileError if damaged."""
-    path = folder / GROUND
+    path = folder / names.GROUND
     if not path.is_file():
         return None
     try:
@@ -197,10 +196,10 @@ def ground_residuals(facts: Facts) -> GroundResiduals | None:
         return None
     residuals = facts.residuals
     calibrations = {name: one.calibration for name, one in facts.cameras.items()}
-    names = tuple(sorted(set(residuals.camera) & calibrations.keys()))
-    if not names:
+    cameras = tuple(sorted(set(residuals.camera) & calibrations.keys()))
+    if not cameras:
         return None
-    number = {name: n for n, name in enumerate(names)}
+    number = {name: n for n, name in enumerate(cameras)}
     of_image = np.array([number.get(name, -1) for name in residuals.camera])
     rows = np.flatnonzero(of_image[residuals.row_image] >= 0)
     row_image = residuals.row_image[rows]
@@ -216,7 +215,7 @@ def ground_residuals(facts: Facts) -> GroundResiduals | None:
     ground = map_from_px[row_image]
     seen, projected = (apply_in_front(ground, px[:, None])[:, 0] for px in (observed, observed + off))
     return GroundResiduals(
-        cameras=names,
+        cameras=cameras,
         camera=of_image[row_image],
         marking=residuals.marking[rows],
         corner=residuals.corner[rows],

@@ -18,6 +18,7 @@ from v2hdm.records import FloatArray, Lane, Marking, Symbol
 from v2hdm.report.metrics import corner_errors, match_markings, rms
 from v2hdm.report.page.facts import Facts, GroundResiduals
 from v2hdm.safe.pixels import check_raster, read_header, read_pixels
+from v2hdm.store import names
 from v2hdm.store.files import load_json, take_array, take_text
 
 
@@ -43,19 +44,16 @@ def _coded(kind: str, pixels: np.ndarray, *options: int) -> str:
     return base64.b64encode(cv2.imencode(kind, pixels, options)[1].tobytes()).decode("ascii")
 
 
-EXTENT = "mosaic.json"
-COMPARISON = "mosaic_before_after.png"
-
 LARGEST_BYTES = 3_500_000  # limit of the mosaic, as text in the page
 _QUALITY = 72
 
 
 def mosaic_layer(folder: Path) -> dict[str, Any] | None:
     """The mosaic, if any: WebP in base64, bounds (west, south, east, north), m; MapFileError if damaged."""
-    if not (folder / EXTENT).is_file():
+    if not (folder / names.MOSAIC_EXTENT).is_file():
         return None
-    content = load_json(folder / EXTENT, MapFileError)
-    where = f"{folder / EXTENT}"
+    content = load_json(folder / names.MOSAIC_EXTENT, MapFileError)
+    where = f"{folder / names.MOSAIC_EXTENT}"
     bounds = take_array(content.get("bounds_m"), (4,), f"{where}: bounds_m", MapFileError)
     path = folder / Path(take_text(content.get("image"), f"{where}: image", MapFileError)).name
     coded = path.read_bytes() if path.is_file() else b""
@@ -115,8 +113,8 @@ def open_background(path: Path) -> Iterator[Any]:
 
 def background_layer(path: Path, facts: Facts) -> dict[str, Any]:
     """The user's GeoTIFF or XYZ tiles as a layer like :func:`mosaic_layer`; MapFileError if unusable."""
-    names = "rasterio", "rasterio.vrt"
-    rasterio, warped = (need(name, "gis", "a background", MapFileError) for name in names)
+    rasterio = need("rasterio", "gis", "a background", MapFileError)
+    warped = need("rasterio.vrt", "gis", "a background", MapFileError)
     origin = None if facts.hd_map is None else facts.hd_map.origin
     if origin is None:
         raise MapFileError(f"{path}: this map has no position on the earth; state the origin in drive.yaml")
@@ -154,7 +152,7 @@ def _extent(facts: Facts) -> tuple[FloatArray, FloatArray]:
 
 def comparison(folder: Path) -> str | None:
     """The ground before and after the optimisation, JPEG in base64; None if not in the folder."""
-    return jpeg_of(folder / COMPARISON, 1400, 84)
+    return jpeg_of(folder / names.COMPARISON, 1400, 84)
 
 
 SIGMAS_95 = 2.4477

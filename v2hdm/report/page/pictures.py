@@ -14,6 +14,7 @@ from v2hdm.geometry.lens import distort_points
 from v2hdm.records import FloatArray, Image
 from v2hdm.report.page.facts import Facts, cams_from_map
 from v2hdm.report.page.layers import jpeg, jpeg_of, rounded, shrunk
+from v2hdm.store.names import overlay_file
 
 BUDGET_BYTES = 8_000_000  # limit of all pictures, as text in the page: reports stay below 15 MB
 PER_CAMERA = 2  # pictures per marking and camera: the nearest, and one from the middle of its sightings
@@ -170,5 +171,5 @@ def _cut_out(
 
 def overlays(facts: Facts) -> Mapping[str, str]:
     """The folder's ``overlay_<camera>.png`` by camera, as JPEG in base64."""
-    found = {name: jpeg_of(facts.folder / f"overlay_{name}.png", 1200, 82) for name in facts.cameras}
+    found = {name: jpeg_of(facts.folder / overlay_file(name), 1200, 82) for name in facts.cameras}
     return {name: picture for name, picture in found.items() if picture is not None}
