@@ -117,7 +117,7 @@ def _strict_jpeg(data: bytes, header: Header, flags: int) -> np.ndarray | None:
         return None
     if header.orientation != _UPRIGHT or flags not in (*_GREY_FLAGS, AS_STORED, cv2.IMREAD_COLOR):
         return None
-    return pixels[..., 0] if is_grey else pixels
+    return np.asarray(pixels[..., 0] if is_grey else pixels)
 
 
 def check_raster(raster: Any, path: Path, error: type[V2hdmError]) -> None:
