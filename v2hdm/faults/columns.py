@@ -6,7 +6,7 @@ of cameras are hypotheses on each camera, and on all of them together.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
 
@@ -49,7 +49,7 @@ class Hypothesis:
     item: int = -1
 
     @property
-    def key(self) -> tuple[Fault, int, int, int]:
+    def key(self) -> Hashable:
         """The fault that is tested; a sudden and a gradual step from one frame share it."""
         return self.fault, self.camera, self.axis, self.item
 

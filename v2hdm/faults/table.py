@@ -107,7 +107,7 @@ class Fault:
         """The fault by its name."""
         return f"<fault: {self.name}>"
 
-    def __reduce__(self) -> tuple[Callable[[str], Fault], tuple[str]]:
+    def __reduce__(self) -> tuple[object, ...]:
         """The fault by its name, so that it is the same object in every process."""
         return fault_named, (self.name,)
 
