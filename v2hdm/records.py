@@ -88,6 +88,10 @@ class GeodeticOrigin:
     epoch: float | None = None
 
 
+HEAVE_SIGMA_M = 0.01
+"""Standard deviation, m, of a vehicle body's height on its suspension, on paved ground."""
+
+
 @dataclass(frozen=True)
 class PoseNoise:
     """Standard deviations of the recorded poses, as in the receiver's data sheet.
@@ -231,6 +235,10 @@ class Drive:
     def noises(self) -> tuple[PoseNoise, ...]:
         """The noise of each session's recorded poses."""
         return tuple(session.pose_noise for session in self.sessions)
+
+
+OUTLINE_SIGMA_PX = 2.5
+"""Standard deviation, px, of the network's outline of a marking from its paint's edge; 1 to 3 on renders."""
 
 
 @dataclass(frozen=True)

@@ -16,12 +16,9 @@ from v2hdm.geometry.ipm import apply_homography, flat_motion, ground_from_pinhol
 from v2hdm.geometry.planar import cross, inside_convex
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.geometry.tensors import back_project, back_project_with_jacobian
-from v2hdm.records import BoolArray, Camera, Drive, FloatArray, IntArray
+from v2hdm.records import OUTLINE_SIGMA_PX, BoolArray, Camera, Drive, FloatArray, IntArray
 
 _HORIZON_M2 = 1e4  # smaller variance of a ground point, m^2, from which it counts as on the horizon
-
-OUTLINE_SIGMA_PX = 2.5
-"""Standard deviation of the network's outline from the edge of paint, px: 1 to 3 on renders."""
 
 _RUN_ON_M = 1.0  # length, m, beyond a dash without paint: gaps are at least as long as dashes
 _SURE_M = 0.2  # largest sigma, m, of a point that identifies its line

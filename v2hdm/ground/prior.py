@@ -8,10 +8,7 @@ import numpy as np
 
 from v2hdm.ground.model import Mount
 from v2hdm.ground.motion import Motion
-from v2hdm.records import BoolArray, Camera, Drive, FloatArray, IntArray, PoseNoise
-
-HEAVE_SIGMA_M = 0.01
-"""Vertical motion of the body on its suspension on paved ground, m; equal to the mapping's."""
+from v2hdm.records import HEAVE_SIGMA_M, BoolArray, Camera, Drive, FloatArray, IntArray, PoseNoise
 
 STATES = ("roll", "pitch", "yaw", "forward", "left", "up")
 """Errors of a pose, rad and m, in vehicle axes."""

@@ -30,7 +30,7 @@ from v2hdm.errors import MappingError
 from v2hdm.geometry.rigid import camera_centre, inverse, log
 from v2hdm.lanes.knots import OPEN_END_PX, Knots
 from v2hdm.mapping.options import MappingOptions, SizeOptions, SurveyOptions
-from v2hdm.records import DIAMOND, BoolArray, Camera, FloatArray, IntArray, PoseNoise
+from v2hdm.records import DIAMOND, HEAVE_SIGMA_M, BoolArray, Camera, FloatArray, IntArray, PoseNoise
 from v2hdm.survey.match import match
 
 
@@ -56,9 +56,6 @@ def read_outs_s(cameras: Iterable[Camera]) -> FloatArray | None:
 
 
 _UNSURVEYED_CENTRE_SIGMA_M = 0.3  # prior sigma, m, of an unsurveyed camera centre about that of a coarse IPM
-
-HEAVE_SIGMA_M = 0.01
-"""Vertical motion, m, of a vehicle's body on its suspension on paved ground."""
 
 LEAST_OBSERVATIONS = 200
 """Fewer residuals do not determine their variance."""

@@ -32,7 +32,7 @@ from v2hdm.detection.quads.lattice import (
 )
 from v2hdm.detection.quads.patch import LensFrames, Patches
 from v2hdm.geometry.planar import Quad, following, is_convex_px
-from v2hdm.records import BoolArray, FloatArray
+from v2hdm.records import OUTLINE_SIGMA_PX, BoolArray, FloatArray
 
 TYPICAL_BLUR_PX = 0.75  # point spread of a focused camera, px, pixel aperture included
 
@@ -58,9 +58,6 @@ _MUCH_CLIPPED = 0.15
 _MOST_MOVED = 0.5
 _MOST_GROWTH = 4.0
 """A fit that moves its middle by more of its size, or grows or shrinks by more, follows something else."""
-
-_OUTLINE_SIGMA_PX = 2.5
-"""How far the network's outline is from the end of a side, px; measured on renders, where it is 1 to 3."""
 
 OPEN_SIGMA = 3.0  # a side cut by the image's border is unknown within this many lengths of the marking
 _BEYOND_PX = 6.0  # how far beyond the border a side that it cuts is started, px: farther than blur reaches
@@ -223,7 +220,7 @@ def fit_quadrilaterals(
     searched[lost] = start.corners[lost]
     searched_px = frames.to_px(searched)
     # Beyond the image a lens model may fold.
-    within = camera.inside(searched_px, -OPEN_SIGMA * _OUTLINE_SIGMA_PX).all(axis=1)
+    within = camera.inside(searched_px, -OPEN_SIGMA * OUTLINE_SIGMA_PX).all(axis=1)
     folded = ~within & ~open_sides.any(axis=1)
     folded |= ~(np.ptp(searched_px, axis=1).max(axis=1) < 2 * np.ptp(corners_px, axis=1).max(axis=1))
     searched[folded], searched_px[folded] = start.corners[folded], corners_px[folded]
@@ -232,7 +229,7 @@ def fit_quadrilaterals(
     found = Quad(searched)
     inward_px = -_BLOOM * blur_px * np.minimum(lattice.clipped[:, 0] / _MUCH_CLIPPED, 1.0)
     begun = found.moved(np.repeat(inward_px[:, None], 8, axis=1))
-    sigma_px = np.tile(np.where(open_sides, OPEN_SIGMA * length_px, _OUTLINE_SIGMA_PX), 2)
+    sigma_px = np.tile(np.where(open_sides, OPEN_SIGMA * length_px, OUTLINE_SIGMA_PX), 2)
     state = _State.at(begun, np.full(len(searched), blur_px), blur_px, sigma_px, frames)
     system = state.settle(lattice, _STEPS)
     covariance = np.linalg.inv(system.information)[:, :8, :8]
@@ -253,7 +250,7 @@ def _sound(quad: Quad, before: Quad) -> BoolArray:
     corners, old = quad.corners, before.corners
     moved = np.abs(corners.mean(axis=1) - old.mean(axis=1)).max(axis=1)
     area = quad.area / np.maximum(before.area, 1e-6)
-    near = moved < _MOST_MOVED * np.ptp(old, axis=1).max(axis=1) + 2 * _OUTLINE_SIGMA_PX
+    near = moved < _MOST_MOVED * np.ptp(old, axis=1).max(axis=1) + 2 * OUTLINE_SIGMA_PX
     near &= (area < _MOST_GROWTH) & (area > 1 / _MOST_GROWTH)
     return np.asarray(is_convex_px(corners) & np.isfinite(corners).all(axis=(1, 2)) & near)
 

@@ -38,7 +38,7 @@ _MOST_SURE = 0.6
 
 _MOST_PARTS = 12  # parts that are looked at of one piece: more are the grains of bad light
 _OUTLINE_SCALE = 4
-_OUTLINE_SIGMA_PX = 2.0
+_EDGE_SIGMA_PX = 2.0
 _REACH_PX = 6.0
 _STEP_PX = 0.5
 """How far the network's outline is from an edge of paint; how far, and in what steps, that is looked for."""
@@ -453,7 +453,7 @@ def on_edges(outline_px: FloatArray, bgr: np.ndarray) -> tuple[FloatArray, BoolA
     light = cv2.remap(bgr, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).mean(axis=2)
     light = _with_neighbours(light).mean(axis=0)
     fall = np.maximum(-np.gradient(light, axis=1), 0.0)
-    best = (fall**2 * np.exp(-0.5 * (off_px / _OUTLINE_SIGMA_PX) ** 2)).argmax(axis=1)
+    best = (fall**2 * np.exp(-0.5 * (off_px / _EDGE_SIGMA_PX) ** 2)).argmax(axis=1)
     from_edge_px = np.abs(off_px - off_px[best][:, None])
     fall = np.where(from_edge_px <= 2 * _STEP_PX, fall, 0.0)
     moved_px = fall @ off_px / np.maximum(fall.sum(axis=1), 1e-6)
