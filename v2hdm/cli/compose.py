@@ -25,7 +25,7 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from v2hdm.cli.main import Command
+from v2hdm.cli.command import Command
 from v2hdm.errors import ConfigError, V2hdmError
 from v2hdm.io.drive.folder import DRIVE_FILE
 from v2hdm.safe.texts import read_yaml
