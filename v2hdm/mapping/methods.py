@@ -350,14 +350,14 @@ def _brought_up_to_date(
     )
     mapped = np.isin(group, optimised.groups)
     over_m = drive.pose_noise.position_drift_over_m
-    hd_map, changes, *names = update_map(base, made.hd_map, observer, mapped, over_m)
-    hd_map = replace(hd_map, ground=made.hd_map.ground)
-    residuals = None if made.residuals is None else made.residuals.renamed(*names)
-    suspicions = [replace(one, marking=int(names[0][one.marking - 1])) for one in made.suspicions]
+    update = update_map(base, made.hd_map, observer, mapped, over_m)
+    hd_map = replace(update.hd_map, ground=made.hd_map.ground)
+    residuals = None if made.residuals is None else made.residuals.renamed(update.ids, update.corners)
+    suspicions = [replace(one, marking=int(update.ids[one.marking - 1])) for one in made.suspicions]
     return replace(
         made,
         hd_map=hd_map,
-        changes=changes,
+        changes=update.changes,
         joint_covariance=partial(stated_covariance, hd_map.markings),
         residuals=residuals,
         suspicions=suspicions,
