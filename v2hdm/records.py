@@ -299,7 +299,7 @@ class PaintLeft:
 
 
 UNSTATED_SIGMA_M = 0.02
-"""Standard deviation, m, of a corner's coordinate in a map that states none, as of one drawn over an image."""
+"""Standard deviation, m, of a corner's coordinate in a map that states none: drawn over an image."""
 
 
 @dataclass(frozen=True)
