@@ -234,7 +234,7 @@ def easy_views(
         group = np.repeat(whole, [len(views_in_reach) for views_in_reach in views_of_marking])
         view_of_camera = np.array(list(chain.from_iterable(views_of_marking)), dtype=np.int64)
         view = np.flatnonzero(is_of_camera)[view_of_camera]
-        vehicle_from_map = np.linalg.inv(rig.map_from_vehicle[views.frame[view]])
+        vehicle_from_map = np.asarray(np.linalg.inv(rig.map_from_vehicle[views.frame[view]]), np.float64)
         cam_from_vehicle = rig.cam_from_vehicle[c]
         corners = corners_map[group]
         corners_vehicle = apply_homography(flat_motion(vehicle_from_map), corners)
