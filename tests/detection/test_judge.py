@@ -23,7 +23,8 @@ from v2hdm.detection.classifier import (
 )
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.quads.propose import Blob, open_sides, propose
+from v2hdm.detection.quads.blobs import Blob
+from v2hdm.detection.quads.propose import open_sides, propose
 from v2hdm.detection.weights import CONFIDENCE_FILE, JUDGE_FILE
 from v2hdm.geometry.planar import order_corners
 from v2hdm.records import ARROW, CHEVRON, DIAMOND, LANE_DASH, LANE_LINE, OTHER_PAINT, STOP_LINE

@@ -16,7 +16,9 @@ from v2hdm.detection.lanes.curves import LaneImage
 from v2hdm.detection.lanes.lines import find_boundaries, trace_lanes
 from v2hdm.detection.network import Network, NetworkOutput, run_on_road
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.quads.propose import Proposals, find_blobs, on_edges, outline_polygon, propose
+from v2hdm.detection.quads.blobs import find_blobs
+from v2hdm.detection.quads.outline import on_edges, outline_polygon
+from v2hdm.detection.quads.propose import Proposals, propose
 from v2hdm.detection.stopwatch import lap
 from v2hdm.detection.weights import check_weights
 from v2hdm.errors import DetectorError

@@ -20,7 +20,8 @@ from v2hdm.detection.lanes.chains import find_chains
 from v2hdm.detection.lanes.curves import LaneImage, Line, LinePoints, find_lines
 from v2hdm.detection.lanes.score import log_odds, log_odds_alone
 from v2hdm.detection.network import crossings
-from v2hdm.detection.quads.propose import Blob, Proposal
+from v2hdm.detection.quads.blobs import Blob
+from v2hdm.detection.quads.propose import Proposal
 from v2hdm.records import FloatArray, IntArray, LaneDetection
 
 _CAP_WIDTH_RATIO = 0.7  # cuts whose width differs more from the median are through slanted ends
