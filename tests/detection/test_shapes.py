@@ -7,7 +7,7 @@ import pytest
 from tests.detection.pictures import LENSES, bar, diamond, make_camera, output_of, picture, to_image, view_of
 from v2hdm.catalogue import PAINT_CLASSES, SHIPPED
 from v2hdm.detection.camera import RoadCamera
-from v2hdm.detection.classifier import CHANNELS, SIZE
+from v2hdm.detection.evidence import CHANNELS, SIZE
 from v2hdm.detection.network import NetworkOutput
 from v2hdm.detection.quads.blobs import Blob, find_blobs
 from v2hdm.detection.quads.coverage import blurred_coverage

@@ -82,7 +82,7 @@ def find_blobs(
         if area and area not in first_of_area:
             first_of_area[area] = len(blobs)
             blobs.append(_doubtful_blob(doubtful, area, level, output))
-        box = _framed(*cv2.boundingRect(contours[index]))
+        box = _framed(cv2.boundingRect(contours[index]))
         inside = piece[box] == index + 1
         parts = _split(inside, level[box], output, box, groups, scores.votes[index])
         whole = Blob(
@@ -105,8 +105,9 @@ def find_blobs(
     return blobs, owner[1:-1, 1:-1]
 
 
-def _framed(x: int, y: int, width: int, height: int) -> Box:
-    """Rows and columns of a box with one element around it."""
+def _framed(rectangle: Sequence[int]) -> Box:
+    """Rows and columns of a rectangle (x, y, width, height) with one element around it."""
+    x, y, width, height = rectangle
     return slice(y - 1, y + height + 1), slice(x - 1, x + width + 1)
 
 
@@ -143,7 +144,7 @@ def _doubtful(level: np.ndarray, contours: Sequence[np.ndarray], cells: np.ndarr
 
 def _doubtful_blob(doubtful: _Doubtful, area: int, level: np.ndarray, output: NetworkOutput) -> Blob:
     """The blob of one area of doubtful paint."""
-    box = _framed(*doubtful.stats[area, : cv2.CC_STAT_AREA].tolist())
+    box = _framed(doubtful.stats[area, : cv2.CC_STAT_AREA].tolist())
     raised = level[box] - np.float32(_DOUBTFUL)
     return replace(_blob(doubtful.labels[box] == area, raised, output, box), traced=False)
 
@@ -257,7 +258,8 @@ def _lead(output: NetworkOutput, is_of_group: BoolArray, box: Box) -> np.ndarray
         (np.arange(part.start, part.stop, dtype=np.float32) - 0.5) / np.float32(scale) - (0.5 + first.start)
         for part, first in zip(box, kind_box, strict=True)
     )
-    return cv2.remap(lead, *np.meshgrid(u, v), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    map_u, map_v = np.meshgrid(u, v)
+    return cv2.remap(lead, map_u, map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 def _signed(mask: BoolArray, level: np.ndarray) -> np.ndarray:

@@ -85,7 +85,7 @@ class _Ends(NamedTuple):
 
     start: FloatArray
     end: FloatArray
-    both: FloatArray  # their covariance
+    joint: FloatArray  # their covariance
 
     @classmethod
     def of(cls, by_side: FloatArray) -> _Ends:
@@ -93,7 +93,7 @@ class _Ends(NamedTuple):
         return cls(
             start=by_side[:, _CORNER, _CORNER],
             end=by_side[:, _CORNER + 4, _CORNER + 4],
-            both=by_side[:, _CORNER, _CORNER + 4],
+            joint=by_side[:, _CORNER, _CORNER + 4],
         )
 
 
@@ -127,7 +127,7 @@ class Fit:
     def side_variance(self) -> FloatArray:
         """Variance (M, 4), px^2, of the place of each side's middle along its normal."""
         ends = _Ends.of(self.side_covariance)
-        return np.asarray((ends.start + ends.end + 2 * ends.both) / 4)
+        return np.asarray((ends.start + ends.end + 2 * ends.joint) / 4)
 
     def _second_order(self, by_side: FloatArray) -> FloatArray:
         """Covariance (M, 8, 8), px^2, that the error of a side's direction adds where its end is vague.
@@ -137,7 +137,7 @@ class Fit:
         """
         ends = _Ends.of(by_side)
         normal = self.quad.normal
-        askew = np.maximum(ends.start + ends.end - 2 * ends.both, 0)
+        askew = np.maximum(ends.start + ends.end - 2 * ends.joint, 0)
         tilt_variance = askew / np.maximum(self.quad.length, 1.0) ** 2
         covariance = np.zeros((len(normal), 4, 2, 4, 2))
         # Corner c runs along side c if the end of side c - 1 is vague, along side c - 1 if the start of c is.

@@ -152,15 +152,15 @@ def lay_lattice(patches: Patches, frames: LensFrames, corners_px: FloatArray) ->
     pixels = np.repeat(corners_px.mean(axis=1)[:, None], shape[1], axis=1)
     pixels[marking, place] = np.column_stack([u, v])
     neighbours = _neighbours(chosen, columns, rows, size, shape)
-    seen = patches.look(u, v, marking)
+    flat = patches.look(u, v, marking)
     looked = Looked(
         light=np.zeros((3, *shape), dtype=np.float32),
         use=np.zeros(shape, dtype=np.float32),
         clipped=np.zeros(shape, dtype=np.bool_),
     )
-    looked.light[:, marking, place] = seen.light
-    looked.use[marking, place] = seen.use
-    looked.clipped[marking, place] = seen.clipped
+    looked.light[:, marking, place] = flat.light
+    looked.use[marking, place] = flat.use
+    looked.clipped[marking, place] = flat.clipped
     quad = Quad(frames.from_image(corners_px))
     return Lattice.about(frames, quad, pixels, looked, neighbours, chosen.count)
 

@@ -146,7 +146,14 @@ def propose(
     shares = _shares(blobs, size_m, catalogue, whole, camera.log_size_sigma(range_m))
     tightest = _tightest(outlines_pinhole_px, camera, max_range_m)
     return [
-        Proposal(blob, index, shares[index], outlines_vehicle[index], *tightest[index])
+        Proposal(
+            blob=blob,
+            index=index,
+            share=shares[index],
+            outline_vehicle=outlines_vehicle[index],
+            corners_pinhole_px=tightest[index].corners_pinhole_px,
+            fill=tightest[index].fill,
+        )
         for index, blob in enumerate(blobs)
         if sum(blob.class_score.values()) >= _LEAST_CERTAINTY
     ]

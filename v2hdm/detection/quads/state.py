@@ -1,8 +1,8 @@
 """The unknowns of markings, and the steps of Gauss-Newton that find them.
 
 A marking's unknowns are the starts and ends of its four sides, its blur, its contrast, the light at knots
-along it and the light's slope across it. All markings of an image take a step at once, but for those that have
-settled.
+along it and the light's slope across it. All markings of an image take a step at once, but for those that
+have settled.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from v2hdm.geometry.planar import Quad, following
 from v2hdm.records import FloatArray
 
 _BLUR_SIGMA_PX = 0.2  # how far one marking's blur is from the typical one, px: motion, focus, frayed paint
-_BLUR_LIMITS_PX = (0.35, 3.0)  # least and largest blur of a marking, px
+_LEAST_BLUR_PX = 0.35  # least blur of a marking, px
+_MOST_BLUR_PX = 3.0  # largest blur of a marking, px
 
 _CLOSURE_SHARE = 0.03
 """Standard deviation of the sum of opposite corners, in parts of the root of a marking's area.
@@ -209,7 +210,7 @@ class State:
         side_step = np.clip(step[:, :_BLUR], -most_px, most_px)
         self.quad = self.quad.moved(side_step)
         if paint is None:
-            self.blur_px = np.clip(self.blur_px + step[:, _BLUR], *_BLUR_LIMITS_PX)
+            self.blur_px = np.clip(self.blur_px + step[:, _BLUR], _LEAST_BLUR_PX, _MOST_BLUR_PX)
         self.contrast = self.contrast + np.clip(step[:, _K], -_MAX_CONTRAST_STEP, _MAX_CONTRAST_STEP)
         self.light = self.light + step[:, _LIGHT:_SLOPE]
         self.slope = self.slope + step[:, _SLOPE]
