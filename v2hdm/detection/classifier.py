@@ -138,7 +138,7 @@ def find_markings(
 
 
 def _left_out(parts_of: Mapping[int, Sequence[int]], score: FloatArray) -> set[int]:
-    """Quadrilaterals, of scores (M,), that are no markings: parts of a surer one, wholes with a surer part."""
+    """Quadrilaterals, of scores (M,), that are no markings: parts of surer ones, wholes with a surer part."""
     left_out: set[int] = set()
     for whole, parts in parts_of.items():
         if whole not in left_out:

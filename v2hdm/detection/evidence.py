@@ -52,7 +52,8 @@ _COLOUR_GAIN = 2.0  # factor that brings the blueness of a picture to about one
 _ODDS_GAIN = 1 / 3  # factor that brings the log odds of paint to about one
 
 _GRID = (np.arange(6) + 0.5) / 6  # places along a side, in parts of it, at which paint is looked for
-_INNER_ALONG, _INNER_ACROSS = (part.reshape(-1) for part in np.meshgrid(_GRID, _GRID))
+_INNER_ALONG = np.tile(_GRID, 6)  # places (36,) all over a marking, in parts of its length
+_INNER_ACROSS = np.repeat(_GRID, 6)  # the same places, in parts of its width
 _SUREST = -4  # place of the ninth decile among the 36 places inside, in order
 _BESIDE_PX = 2.5  # distance outside a side, px, at which paint beside it is looked for
 _LEAST_WIDTH_PX = 0.3  # least width of a marking in the image that is told from smaller ones, px
