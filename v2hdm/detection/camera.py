@@ -289,9 +289,9 @@ class Horizon:
         by_curvature = 0.5 * range_m**2 * probe_px_per_m * _PROBE_PX / _CURVE_UNIT_PX
         self._units = np.array([float(intrinsic[0, 0]), self.px_per_m * _CURVE_UNIT_PX, by_curvature])
 
-    def parameters(self, direction_rad: float, beside_m: float, curvature: float) -> FloatArray:
-        """The a, b and c (3,) of a line by direction, place beside the camera and curvature, 1/m."""
-        return self._units * (direction_rad, beside_m, curvature)
+    def parameters(self, line: tuple[float, float, float]) -> FloatArray:
+        """The a, b and c (3,) of a line by direction, rad, place beside the camera, m, and curvature, 1/m."""
+        return self._units * line
 
     def basis(self, below: FloatArray) -> FloatArray:
         """The factors (N, 3) of a curve's a, b and c at distances (N,) below the horizon, px."""

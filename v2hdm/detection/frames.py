@@ -196,8 +196,10 @@ def _capture(source: str | int, refused: str) -> Iterator[cv2.VideoCapture]:
     os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", options)
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        backend = cv2.CAP_ANY if isinstance(source, int) else cv2.CAP_FFMPEG
-        capture = cv2.VideoCapture(source, backend)
+        if isinstance(source, int):
+            capture = cv2.VideoCapture(source)
+        else:
+            capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG)
     finally:
         cv2.utils.logging.setLogLevel(level)
     try:

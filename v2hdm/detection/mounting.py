@@ -212,7 +212,7 @@ class MountingEstimate:
 def _grid(mean: float, sigma: float, step: float) -> FloatArray:
     """Values ``step`` apart, as many to either side of a mean as reach ``_SIGMAS`` standard deviations."""
     reach = int(np.ceil(_SIGMAS * sigma / step))
-    return mean + step * np.arange(-reach, reach + 1)
+    return np.asarray(mean + step * np.arange(-reach, reach + 1))
 
 
 def _moments(share: FloatArray, values: FloatArray, step: float) -> tuple[float, float]:

@@ -259,7 +259,7 @@ def _lead(output: NetworkOutput, is_of_group: BoolArray, box: Box) -> np.ndarray
         for part, first in zip(box, kind_box, strict=True)
     )
     map_u, map_v = np.meshgrid(u, v)
-    return cv2.remap(lead, map_u, map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(cv2.remap(lead, map_u, map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
 def _signed(mask: BoolArray, level: np.ndarray) -> np.ndarray:

@@ -148,7 +148,7 @@ def lay_lattice(patches: Patches, frames: LensFrames, corners_px: FloatArray) ->
     place = chosen.place
     u = low[marking, 0] + columns[marking, chosen.column]
     v = low[marking, 1] + rows[marking, chosen.row]
-    shape = (len(low), max(1, int(chosen.count.max())))
+    shape = (len(low), max(1, int(chosen.list_length.max())))
     pixels = np.repeat(corners_px.mean(axis=1)[:, None], shape[1], axis=1)
     pixels[marking, place] = np.column_stack([u, v])
     neighbours = _neighbours(chosen, columns, rows, size, shape)
@@ -162,7 +162,7 @@ def lay_lattice(patches: Patches, frames: LensFrames, corners_px: FloatArray) ->
     looked.use[marking, place] = flat.use
     looked.clipped[marking, place] = flat.clipped
     quad = Quad(frames.from_image(corners_px))
-    return Lattice.about(frames, quad, pixels, looked, neighbours, chosen.count)
+    return Lattice.about(frames, quad, pixels, looked, neighbours, chosen.list_length)
 
 
 class _Chosen(NamedTuple):
@@ -174,7 +174,7 @@ class _Chosen(NamedTuple):
     column: IntArray  # (n,)
     place: IntArray  # (n,) in the list of its marking
     thin: IntArray  # (M,) every so many-th pixel of the band is in the list
-    count: IntArray  # (M,) pixels of each list
+    list_length: IntArray  # (M,) pixels of each list
     band_shape: tuple[int, ...]  # M, H, W
 
 
@@ -196,7 +196,7 @@ def _chosen_pixels(band: BoolArray) -> _Chosen:
         column=column[stays],
         place=place[stays] // thin[marking],
         thin=thin,
-        count=-(-count // thin),
+        list_length=-(-count // thin),
         band_shape=band.shape,
     )
 
