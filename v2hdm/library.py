@@ -11,6 +11,7 @@ from v2hdm.io.drive import read_drive
 from v2hdm.io.maps.reading import read_map as _read
 from v2hdm.progress import Steps
 from v2hdm.records import Drive, HDMap, ImageDetections
+from v2hdm.store.names import map_file
 
 if TYPE_CHECKING:  # load torch or scipy
     from v2hdm.adjust.problem import Problem
@@ -30,7 +31,7 @@ def read_map(path: str | Path) -> HDMap:
     True
     """
     path = Path(path)
-    return _read(path / "map.geojson" if path.is_dir() else path)[0]
+    return _read(map_file(path))[0]
 
 
 def build_problem(

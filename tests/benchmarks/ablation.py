@@ -8,7 +8,7 @@ false ones, the share of markings with four corners known well, the corners' err
 covariance holds (inner-95 mean of the normalised squared error; honest 1.60). A part that earns nothing
 leaves.
 
-With ``--verdict`` instead what each column of the table of fault sizes (mapping/input_errors.py) and each
+With ``--verdict`` instead what each column of the table of fault sizes (faults/table.py) and each
 number of mapping/foreign.py earns, on made drives of these seeds, as they are and with every fault: right
 drives failed, wrong maps without a word, and of those with one how many are named rightly, first.
 """
@@ -18,7 +18,7 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -44,9 +44,10 @@ from v2hdm.detection.batch import detect_all
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.quads import fit, lattice, propose, robust, state
+from v2hdm.faults import FAULTS
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
-from v2hdm.mapping import conclusion, foreign, input_errors
+from v2hdm.mapping import conclusion, foreign
 from v2hdm.mapping.methods import run_methods
 from v2hdm.records import BoolArray, Drive, FloatArray, ImageDetections, Marking, Truth
 from v2hdm.report.metrics import driven_past, marking_metrics, match_markings
@@ -169,9 +170,10 @@ def row(name: str, shown: Sequence[Example]) -> str:
 def sizes() -> Iterator[Part]:
     """Each column of the table of sizes, each number of the foreign images, and the context that lacks it."""
     yield "nothing off", nullcontext
-    for column, nothing in (("least", 0.0), ("sigma", np.inf), ("usual", np.inf), ("most", np.inf)):
-        flat = {fault: replace(size, **{column: nothing}) for fault, size in input_errors._SIZES.items()}
-        yield f"{column} size of each fault", partial(patch.object, input_errors, "_SIZES", flat)
+    for column, nothing in (
+        ("least", 0.0), ("observable_sigma", np.inf), ("usual", np.inf), ("most", np.inf),
+    ):  # fmt: skip
+        yield f"{column} size of each fault", partial(_without_size, column, nothing)
     yield "foreign: views that share counts for", partial(patch.object, foreign, "_PSEUDO_VIEWS", 100.0)
     yield "foreign: markings taken by mistake", partial(patch.object, foreign, "_BY_MISTAKE", 1e-6)
     yield "foreign: mixtures of two markings", partial(patch.object, foreign, "_CONFUSED", 1e-6)
@@ -214,6 +216,15 @@ def terms() -> Iterator[Part]:
     yield "lines behind dashes", partial(patch.object, conclusion, "images_with_line", _no_images)
     yield "their sureness", partial(patch.object, ground, "_SURE_M", np.inf)
     yield "their direction", partial(patch.object, ground, "_PARALLEL", -1.0)
+
+
+@contextmanager
+def _without_size(column: str, nothing: float) -> Iterator[None]:
+    with ExitStack() as stack:
+        for fault in FAULTS.values():
+            # Records are frozen: what they hold is replaced below their guard.
+            stack.enter_context(patch.dict(vars(fault), {column: nothing}))
+        yield
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from v2hdm.io.calibration.writing import write_calibration
 from v2hdm.io.drive import as_drive
 from v2hdm.records import Calibration, Drive
 from v2hdm.store.files import write_json
+from v2hdm.store.names import VERDICT, calibration_file
 from v2hdm.verdict import Verdict, check_drive
 
 # Each parameter's name, and the factor and unit that people read it in.
@@ -108,7 +109,7 @@ def _lines(estimate: GroundEstimate) -> Iterator[str]:
 def write_ground_calibration(found: GroundCalibration, folder: Path) -> None:
     """Write the verdict, and the calibration of each camera that has one."""
     verdict = found.verdict.as_json()
-    write_json(folder / "verdict.json", verdict)
+    write_json(folder / VERDICT, verdict)
     about = Provenance.today(found.drive.name, verdict)
     for name, calibration in found.calibrations.items():
-        write_calibration(calibration, folder / f"calibration_{name}.yaml", verdict=verdict, about=about)
+        write_calibration(calibration, folder / calibration_file(name), verdict=verdict, about=about)

@@ -36,6 +36,7 @@ from v2hdm.io.calibration.writing import write_calibration, write_camera_info
 from v2hdm.records import Calibration, CameraInfo, FloatArray
 from v2hdm.report.photos import save_points
 from v2hdm.store.files import dump_yaml, replace_csv, write_json
+from v2hdm.store.names import VERDICT, calibration_file
 from v2hdm.verdict.verdict import Verdict
 
 ENTRY_FILE = "drive_camera.yaml"
@@ -227,8 +228,8 @@ def write_point_calibration(found: PointCalibration, folder: Path, image: np.nda
     """Write calibration, drive entry, table, verdict and picture, in the image (H, W, 3) BGR if given."""
     info = found.fit.seen.info
     verdict = found.verdict.as_json()
-    write_json(folder / "verdict.json", verdict)
-    path = folder / f"calibration_{info.name}.yaml"
+    write_json(folder / VERDICT, verdict)
+    path = folder / calibration_file(info.name)
     about = Provenance.today(found.points.path.stem, verdict)
     write_calibration(found.calibration, path, verdict=verdict, about=about)
     write_camera_info(info, folder / info.name / "camera_info.yaml")

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.safe.pixels import VIDEO_OPTIONS, read_pixels
+from v2hdm.safe.pixels import AS_STORED, VIDEO_OPTIONS, read_pixels
 
 _log = logging.getLogger(__name__)
 
@@ -27,13 +27,10 @@ _WRITTEN_S = 1.0  # an image is written within this time
 _SAME_DATE_S = (2.0, 0.05)
 """Seconds within which two changes may have one date: of dates in whole seconds (FAT), and in fractions."""
 
-# Depth and channels as stored, so that what does not fit is seen instead of converted without a word.
-_AS_STORED = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR
-
 
 def read_bgr(path: Path) -> np.ndarray:
     """Decode an image file to (H, W, 3) uint8 BGR; raises DriveError where it is damaged or not of 8 bits."""
-    pixels = read_pixels(path, _AS_STORED)
+    pixels = read_pixels(path, AS_STORED)  # so that what does not fit is seen, not converted without a word
     if pixels.dtype != np.uint8:
         raise DriveError(
             f"{path}: the image has {8 * pixels.dtype.itemsize} bits per channel; convert it to 8 bits"

@@ -18,6 +18,7 @@ from v2hdm.experiment.summary import claims, filled, save_figures, words, write_
 from v2hdm.progress import patient
 from v2hdm.report.terminal import DriveProgress, drive_bars, plain
 from v2hdm.store.files import replace_text
+from v2hdm.store.names import CONFIG
 from v2hdm.store.results import growing_folder
 from v2hdm.workers import side_by_side
 
@@ -33,7 +34,7 @@ def run_experiment(
     folder = Path(config.output) / config.name
     try:
         with growing_folder(folder, _OPTION, _MADE):
-            replace_text(folder / "config.yaml", config_yaml or f"{config!r}\n")
+            replace_text(folder / CONFIG, config_yaml or f"{config!r}\n")
             records = _records(todo, config.workers or os.cpu_count() or 1, progress)
             measured = [measure(record) for record in records]
             captions = save_figures(folder, records, measured, partial(progress, "figures", "draw"))

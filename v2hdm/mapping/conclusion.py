@@ -81,7 +81,7 @@ class FinalSolve:
             agreeing=np.bincount(group, minlength=count),
             log_odds=odds / np.maximum(np.bincount(group, minlength=count), 1),
             easy_views=np.bincount(easy[0], minlength=count),
-            found=np.bincount(easy[0, found], minlength=count),
+            detected_views=np.bincount(easy[0, found], minlength=count),
             pointed=np.bincount(corner, minlength=4 * count).reshape(-1, 4),
             as_symbol=images_with_symbol(self.sightings.symbols, rig, corners_map)
             + images_with_line(self.sightings.lines, rig, corners_map),

@@ -21,6 +21,7 @@ from v2hdm.io.trajectory import read_tum
 from v2hdm.pipeline.config import base_files
 from v2hdm.records import Change, Changes, Drive, Fate, HDMap, Image
 from v2hdm.site.living.changes import Base
+from v2hdm.store.names import CHANGES
 
 _SITE_M = 40.0  # markings farther from a route are not seen from it: twice what a camera reaches
 LISTED = (Fate.MOVED, Fate.VANISHED, Fate.NEW)  # fates that are changes of the site, and no want of images
@@ -96,4 +97,4 @@ def write_changes(changes: Changes, hd_map: HDMap, folder: Path) -> None:
         assert corners is not None
         ring = geojson_positions(corners, None, hd_map.origin)
         features.append(geojson_feature(f"changes/{one.id}", "Polygon", [[*ring, ring[0]]], _as_json(one)))
-    write_features(folder / "changes.geojson", features, hd_map.origin, {"same": changes.same})
+    write_features(folder / CHANGES, features, hd_map.origin, {"same": changes.same})

@@ -21,7 +21,6 @@ from v2hdm.geometry.rigid import interpolate, inverse
 from v2hdm.io.calibration.reading import Provenance
 from v2hdm.io.calibration.writing import CALIBRATION_FORMATS, write_calibration, write_calibration_as
 from v2hdm.io.drive import ReadOptions, told_of
-from v2hdm.io.maps.evidence import FILE as RESIDUALS
 from v2hdm.io.maps.evidence import write_exclusions, write_residuals
 from v2hdm.io.maps.features import with_heights
 from v2hdm.io.maps.formats import check_crs, with_data, write_map
@@ -36,10 +35,10 @@ from v2hdm.pipeline.evaluate import CameraSets
 from v2hdm.pipeline.stages import BEST
 from v2hdm.records import Calibration, Drive, FloatArray, HDMap, Image, ImageDetections, Trajectory
 from v2hdm.report.photos import save_overlay
+from v2hdm.store import names
 from v2hdm.store.cache import library_versions
 from v2hdm.store.files import replace_text, write_json
 from v2hdm.store.results import result_folder
-from v2hdm.surface.surface import FILE as GROUND
 from v2hdm.survey.check_points import CheckTable, write_check_points
 from v2hdm.verdict import Verdict
 
@@ -74,19 +73,19 @@ def write_trajectories(poses: AdjustedPoses, drive: Drive, folder: Path) -> None
     """
     for number, session in enumerate(drive.sessions):
         own = poses.session == number
-        stem = f"trajectory_{session.name}" if drive.joined else "trajectory"
+        poses_file, sigma_file = names.trajectory_files(session.name if drive.joined else None)
         stamp_s = poses.stamp_s[own]
         before = poses.before[own]
         moved = np.linalg.inv(before) @ poses.map_from_vehicle[own]
         recorded = before  # laid flat, where the session has no others
         if session.recorded is not None:
             recorded, _ = interpolate(session.recorded, stamp_s, float("inf"))
-        write_tum(Trajectory(stamp_s, recorded @ moved), folder / f"{stem}.tum")
+        write_tum(Trajectory(stamp_s, recorded @ moved), folder / poses_file)
         rows = [
             f"{stamp:.9f},{int(seen)}," + ",".join(f"{value:.6g}" for value in sigma)
             for stamp, seen, sigma in zip(stamp_s, poses.seen[own], poses.sigma[own], strict=True)
         ]
-        replace_text(folder / f"{stem}_sigma.csv", "\n".join([_HEADER, *rows]) + "\n")
+        replace_text(folder / sigma_file, "\n".join([_HEADER, *rows]) + "\n")
 
 
 _log = logging.getLogger(__name__)
@@ -207,7 +206,7 @@ class Result:
                 for method, made in methods.items():
                     path = folder / "maps" / f"{name}_{method}.geojson"
                     write_geojson(with_heights(made.hd_map, self.drive.road), path)
-        write_json(folder / "metrics.json", self.metrics)
+        write_json(folder / names.METRICS, self.metrics)
         if mosaic and self.methods and not self.drive.joined:
             with context.timed("mosaic"):
                 try:
@@ -216,7 +215,7 @@ class Result:
                     _log.warning("no mosaic was made: %s", failure)
         if "qgis" in formats and self.methods:  # it opens the mosaic, too
             grid = check_crs(crs, ["qgis"], self.map.origin, "crs").get("qgis")
-            write_qgis(self.map, folder / "map.qgs", grid=grid)
+            write_qgis(self.map, folder / names.PROJECT, grid=grid)
         with context.timed("report"):
             write_page(folder, self.drive, None if background is None else Path(background))
 
@@ -233,7 +232,7 @@ def _write_map(folder: Path, result: Result, formats: Sequence[str], crs: str | 
     for name, calibration in best.calibrations.items():
         clock = None if drive.joined else best.clocks[0].get(name)
         clock_s = None if clock is None else (clock.value_s, clock.sigma_s)
-        path = folder / f"calibration_{name}.yaml"
+        path = folder / names.calibration_file(name)
         read_out_s = None if best.evidence is None else best.evidence.read_out_s.get(name)
         noted: dict[str, Any] = {"clock_s": clock_s, "read_out_s": read_out_s, "verdict": verdict}
         write_calibration(calibration, path, about=about, **noted)
@@ -244,19 +243,19 @@ def _write_map(folder: Path, result: Result, formats: Sequence[str], crs: str | 
                 _log.info("no %s calibration is written: %s", form, error)
     write_trajectories(result.trajectory, drive, folder)
     if best.surface is not None:
-        write_json(folder / GROUND, best.surface.stored())
+        write_json(folder / names.GROUND, best.surface.stored())
     if best.residuals is not None:
-        write_residuals(best.residuals, folder / RESIDUALS)
+        write_residuals(best.residuals, folder / names.RESIDUALS)
     if best.changes is not None:
         write_changes(best.changes, best.hd_map, folder)
     if result.check_points is not None:
-        write_check_points(result.check_points, folder / "check_points.csv")
+        write_check_points(result.check_points, folder / names.CHECK_POINTS)
     sets = result.methods.items()
     excluded = [replace(one, cameras=name) for name, methods in sets for one in methods[BEST].excluded]
-    write_exclusions(excluded, folder / "excluded.geojson", drive.origin, drive.road)
+    write_exclusions(excluded, folder / names.EXCLUDED, drive.origin, drive.road)
     for name in best.calibrations:
         image = _fullest_image(drive, name, result.detections)
-        _save_overlay(folder / f"overlay_{name}.png", drive, image, best)
+        _save_overlay(folder / names.overlay_file(name), drive, image, best)
 
 
 _BY_VERTEX = ("points_map", "heights_m", "sigma_m", "heights_sigma_m")

@@ -38,6 +38,7 @@ from v2hdm.store import remote
 from v2hdm.store.cache import CodecError, StageCache, code_key, decode, encode, key_of, prune_to_limit
 from v2hdm.store.folders import HOST, note_use
 from v2hdm.store.inputs import note_input
+from v2hdm.store.names import CONFIG, LOG
 from v2hdm.store.remote import RemoteFolder, is_url, place_of
 from v2hdm.store.results import drop_result, files_of_result, is_whole, locked_folder, result_folder
 from v2hdm.verdict.verdict import Verdict
@@ -219,9 +220,9 @@ def map_and_save(
     with cache.in_use():
         for path in () if config.map.base is None else base_files(Path(config.map.base))[:1]:
             note_input(path)  # before any work is done for nothing
-        with result_folder(place, made=made) as folder, logging_to(log_file(folder / "run.log")):
+        with result_folder(place, made=made) as folder, logging_to(log_file(folder / LOG)):
             _log.info("v2hdm %s, run %s", __version__, name)
-            (folder / "config.yaml").write_text(config_yaml or f"{config!r}\n", encoding="utf-8")
+            (folder / CONFIG).write_text(config_yaml or f"{config!r}\n", encoding="utf-8")
 
             def accept(drive: Drive) -> None:
                 check_crs(config.crs, [one for one in config.export if one != "geojson"], drive.origin, "crs")

@@ -74,8 +74,6 @@ _RIDGE_M = 30.0  # standard deviation of the spline's coefficients: keeps the in
 Heights = Callable[[FloatArray], FloatArray]
 """Heights (K,) at points (K, 2)."""
 
-FILE = "ground.json"  # in a result folder
-
 _STORED = ("points_map", "ahead", "sense", "station_m", "session_ends")
 """Fields of the paths that are stored; frames are assigned on reading."""
 

@@ -17,6 +17,7 @@ from v2hdm.io.importers.bag.describe import describe_bag
 from v2hdm.io.importers.bag.reading import is_bag
 from v2hdm.records import Drive, Trajectory
 from v2hdm.store.files import load_json, load_yaml
+from v2hdm.store.names import METRICS
 
 __all__ = [
     "READERS", "KittiOptions", "ReadOptions", "Trajectory", "drive_name", "join_drives",
@@ -78,9 +79,6 @@ def drive_name(path: Path) -> str:
     if is_folder_drive(path):
         return name_of(load_yaml(path / DRIVE_FILE, DriveError), path)
     return path.resolve().stem if is_bag(path) else path.resolve().name
-
-
-METRICS = "metrics.json"  # in a result folder
 
 
 def told_of(drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[str, Any]:
