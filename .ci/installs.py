@@ -23,7 +23,7 @@ import cv2
 from tests.docs.blocks import ROOT, blocks, document
 from tests.docs.sandbox import furnish
 from tests.docs.smaller import SMALL_PORT, smaller
-from v2hdm.cli.main import COMMANDS
+from v2hdm.cli.main import all_commands
 
 _NEEDS = re.compile(r"\*Needs `pip install '?\.(?:\[([a-z,]+)\])?'?`")
 _PIP = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "-c", str(ROOT / "constraints.txt")]
@@ -162,7 +162,7 @@ def tried(name: str, environment: Environment, lines: list[str], here: Path) -> 
 def missing(environment: Environment, here: Path) -> int:
     """Run what the base install cannot do: each is one line that names an extra; how many are not."""
     failed = 0
-    for name, command in COMMANDS.items():
+    for name, command in all_commands().items():
         if command.extra is None or name == "calibrate ground":  # which the base install can do
             continue
         arguments = {"calibrate points": "points.csv --intrinsics camera_info.yaml"}

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -21,6 +21,7 @@ from torch.nn.functional import interpolate
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from v2hdm.catalogue import PAINT_CLASSES
+from v2hdm.settings import Within
 
 MULTIPLE = 16
 """Image height and width must be multiples of this many pixels."""
@@ -40,23 +41,27 @@ _GREY_SCALE = 64.0
 class NetConfig:
     """Channel counts of :class:`MarkingNet` at 1/4, 1/8 and 1/16 of the image and at the bottom.
 
-    ``separable`` takes depthwise separable convolutions (Howard et al., "MobileNets", 2017) where the image
-    is large; ``lanes`` adds the head of row anchors; ``wide_kinds`` lets the features at 1/8, which know a
-    marking's whole shape and its surroundings, speak on its class. They are switches to measure what each
-    costs and brings.
-
-    Attributes:
-        widths: channels at 1/4, 1/8, 1/16 and at the bottom.
-        dilations: of the blocks at the bottom, one each.
-        head_width: channels of the paint's head.
+    The last three are switches to measure what each costs and brings.
     """
 
-    widths: list[int] = field(default_factory=lambda: [32, 64, 96, 128])
-    dilations: list[int] = field(default_factory=lambda: [1, 2, 4, 8])
-    head_width: int = 8
-    separable: bool = False
-    lanes: bool = True
-    wide_kinds: bool = True
+    widths: Annotated[list[int], Within(8, 4096, step=8), "channels at 1/4, 1/8, 1/16 and at the bottom."] = (
+        field(default_factory=lambda: [32, 64, 96, 128])
+    )
+    dilations: Annotated[list[int], Within(1, 256), "of the blocks at the bottom, one each."] = field(
+        default_factory=lambda: [1, 2, 4, 8]
+    )
+    head_width: Annotated[int, Within(1, 1024), "channels of the paint's head."] = 8
+    separable: Annotated[
+        bool,
+        'separable takes depthwise separable convolutions (Howard et al., "MobileNets", 2017) where the '
+        "image is large;",
+    ] = False
+    lanes: Annotated[bool, "lanes adds the head of row anchors;"] = True
+    wide_kinds: Annotated[
+        bool,
+        "wide_kinds lets the features at 1/8, which know a marking's whole shape and its surroundings, "
+        "speak on its class.",
+    ] = True
 
 
 class Prediction(NamedTuple):

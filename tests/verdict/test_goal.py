@@ -10,8 +10,8 @@ import pytest
 
 from tests.cameras import mounted
 from tests.verdict.drives import INFO, square_at
+from v2hdm.cli.commands.map import _map
 from v2hdm.cli.compose import Job
-from v2hdm.cli.runs import _map
 from v2hdm.errors import ConfigError
 from v2hdm.geometry.rigid import camera_centre, exp
 from v2hdm.mapping.options import MappingOptions

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import argparse
 import difflib
-import importlib
-import inspect
 import re
 import shutil
 import sys
@@ -19,7 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import MISSING, Field, fields, is_dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, get_args, get_type_hints
+from typing import Any, NamedTuple, TypeVar, get_args
 
 import hydra
 from hydra.core.config_store import ConfigStore
@@ -27,10 +25,11 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from v2hdm.cli.main import Command
+from v2hdm.cli.command import Command
 from v2hdm.errors import ConfigError, V2hdmError
 from v2hdm.io.drive.folder import DRIVE_FILE
 from v2hdm.safe.texts import read_yaml
+from v2hdm.settings import settings_of
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _Schema = TypeVar("_Schema")
@@ -261,43 +260,22 @@ def help_text(command: str, says: str, schema: type[Any], conf: Path) -> str:
 
 def keys_of(schema: type[Any], prefix: str = "") -> Iterator[Key]:
     """All keys below a dataclass, in order; those of an entry of a mapping stand under ``NAME``."""
-    hints = get_type_hints(schema)
-    for one in fields(schema):
-        hint = hints[one.name]
-        name = f"{prefix}{one.name}"
-        below = next((kind for kind in (hint, *get_args(hint)) if _is_schema(kind)), None)
+    settings = settings_of(schema)
+    for field in fields(schema):
+        setting = settings[field.name]
+        hint = setting.hint
+        name = f"{prefix}{field.name}"
+        below = schema_in(hint)
         is_mapping = hint is not below and "dict" in str(hint)
-        if below is None or hint is not below:
-            about = "" if below is None else " ".join((inspect.getdoc(below) or "").split("\n\n")[0].split())
-            yield Key(name, _kind(hint), _default(one), meaning_of(schema, one.name) or about)
+        if hint is not below or below is None:
+            yield Key(name, _kind(hint), _default(field), setting.meaning)
         if below is not None:
             yield from keys_of(below, f"{name}.NAME." if is_mapping else f"{name}.")
 
 
-def meaning_of(schema: type[Any], name: str) -> str:
-    """The meaning of a key by the docstring of its dataclass, or of one that this extends."""
-    for owner in schema.__mro__:
-        text = inspect.cleandoc(owner.__doc__ or "") if "__doc__" in vars(owner) else ""
-        prose, _, attributes = text.partition("Attributes:\n")
-        for entry in re.split(r"\n(?=    \w+: )", "\n" + attributes):
-            key, found, meaning = entry.strip().partition(": ")
-            if found and key == name:
-                return _plain(" ".join(meaning.split("\n\n")[0].split()))
-        sentences = re.split(r"(?<=[.;:])\s+(?=[`A-Z])", " ".join(prose.split()))
-        naming = [sentence for sentence in sentences if f"``{name}``" in sentence]
-        if naming:
-            return _plain(re.sub(rf"^``{name}`` (?:is|are) ", "", " ".join(naming)))
-        for module, other in re.findall(r":class:`~?([\w.]+)\.(\w+)`", text):
-            described = getattr(importlib.import_module(module), other)
-            if _is_schema(described) and (meaning := meaning_of(described, name)):
-                return meaning
-    return ""
-
-
-def _plain(text: str) -> str:
-    """A docstring's sentence without its markup, in the words of YAML."""
-    text = re.sub(r":\w+:`~?(?:[\w.]+\.)?(\w+)`", r"\1", text)
-    return re.sub(r"\bNone\b", "null", text.replace("`", ""))
+def schema_in(hint: Any) -> type[Any] | None:
+    """The dataclass that a type is, or that its entries are; None for plain values."""
+    return next((kind for kind in (hint, *get_args(hint)) if _is_schema(kind)), None)
 
 
 def _is_schema(kind: Any) -> bool:

@@ -21,7 +21,7 @@ from v2hdm.association.groups import Association, FusedGroups, group_kinds, keep
 from v2hdm.association.sightings import camera_of, frames_of
 from v2hdm.association.tracks import LEAST_SIGHTINGS
 from v2hdm.errors import ConfigError
-from v2hdm.faults import Fault
+from v2hdm.faults import table
 from v2hdm.geometry.ipm import extrinsic_from_ipm, facing_ipm, flat_motion, ipm_from_extrinsic
 from v2hdm.geometry.planar import inside_convex, is_convex
 from v2hdm.io.maps.evidence import Residuals
@@ -71,7 +71,7 @@ def clock_offsets(outcome: Outcome) -> tuple[dict[str, ClockOffset], ...]:
     evidence = outcome.evidence
     drive = outcome.inputs.drive
     applied_s = {(image.session, image.camera): image.clock_offset_s for image in drive.images}
-    score_tests = [one for one in evidence.score_tests if one.fault is Fault.CLOCK]
+    score_tests = [one for one in evidence.score_tests if one.fault is table.CLOCK]
     out = []
     for session, (place, estimated) in enumerate(zip(drive.sessions, evidence.clock_s, strict=True)):
         here = [one for one in score_tests if one.about in ("", f"in {place.name}")]

@@ -37,11 +37,12 @@ from v2hdm.report.page.facts import read_cameras, read_surface
 from v2hdm.store import names
 from v2hdm.store.files import whole_file, write_json
 
-AHEAD_M = 12.0
-ACROSS_M = 8.0  # length and width of the ground that is compared
-_CELL_M = 0.01
-_PANEL_IN = 5.2
-_BAR_M = 2.0
+# The comparison before and after.
+AHEAD_M = 12.0  # length of the ground that is compared
+ACROSS_M = 8.0  # width of the ground that is compared
+_CELL_M = 0.01  # side of a pixel on that ground
+_PANEL_IN = 5.2  # width of either picture
+_BAR_M = 2.0  # length of the scale bar
 
 
 def richest_place(drive: Drive, hd_map: HDMap) -> FloatArray:
@@ -49,7 +50,7 @@ def richest_place(drive: Drive, hd_map: HDMap) -> FloatArray:
     painted = [(m.corners_map, m.sightings) for m in hd_map.markings]
     painted += [(s.outline_map, s.sightings) for s in hd_map.symbols]
     centres = np.array([outline.mean(axis=0) for outline, _ in painted]).reshape(-1, 2)
-    sightings = np.array([seen for _, seen in painted])
+    sightings = np.array([count for _, count in painted])
 
     def worth(pose: FloatArray) -> float:
         offset = (centres - pose[:2, 3]) @ pose[:2, :2]
@@ -87,8 +88,8 @@ def save_comparison(
         for axes, title, rgba in zip(every, panels, pictures, strict=True):
             bgr = rgba[..., :3].astype(np.float32)
             stretched = np.clip((bgr - 0.5 * low) / (max(high, low + 1) - 0.5 * low), 0, 1)
-            seen = rgba[..., 3:].astype(np.float32) / 255  # white where nothing was seen
-            shown = 1 - seen * (1 - stretched)
+            alpha = rgba[..., 3:].astype(np.float32) / 255
+            shown = 1 - alpha * (1 - stretched)  # white where nothing was seen
             axes.imshow(shown, extent=(0, ACROSS_M, 0, AHEAD_M), interpolation="antialiased")
             axes.set(title=title, xticks=[], yticks=[])
             axes.spines[:].set_visible(False)
@@ -98,12 +99,12 @@ def save_comparison(
 
 LARGEST_PICTURE_PX = 8192  # of either side of the picture: graphics cards of computers and phones draw that
 MULTIPLE_PX = 256  # divides sides of a canvas, so that pictures reduced by up to that factor fit it exactly
-_FINEST_M = 1e-3  # side of a pixel: no camera on a vehicle shows finer ground
-_PICTURE_QUALITY = 80
-_JPEG_QUALITY = 90
-_SEEN_ALPHA = 128  # the mask of a GeoTIFF knows but seen and unseen
-_BLOCK_PX = 512
-_AT_ONCE_BYTES = 1 << 24
+_FINEST_M = 1e-3  # least side of a pixel: no camera on a vehicle shows finer ground
+_PICTURE_QUALITY = 80  # quality of the WebP, of 100
+_JPEG_QUALITY = 90  # quality of the JPEG in the GeoTIFF, of 100
+_SEEN_ALPHA = 128  # least alpha of a pixel that the GeoTIFF's mask shows as seen: it knows no half
+_BLOCK_PX = 512  # side of a block of the GeoTIFF
+_AT_ONCE_BYTES = 1 << 24  # size of the pieces in which the GeoTIFF is written to the disk
 
 
 @contextmanager
@@ -161,9 +162,9 @@ class Picture:
         alpha = sheet.rgba[..., 3:].astype(np.float32) / 255
         weighed = np.concatenate([sheet.rgba[..., :3] * alpha, alpha], axis=2)
         reduced = cv2.resize(weighed, (columns, rows), interpolation=cv2.INTER_AREA)
-        seen = reduced[..., 3:]
-        colours = np.divide(reduced[..., :3], seen, out=np.zeros_like(reduced[..., :3]), where=seen > 0)
-        drawn = np.round(np.concatenate([colours, 255 * seen], axis=2))
+        opacity = reduced[..., 3:]
+        colours = np.divide(reduced[..., :3], opacity, out=np.zeros_like(reduced[..., :3]), where=opacity > 0)
+        drawn = np.round(np.concatenate([colours, 255 * opacity], axis=2))
         self._rgba[row : row + rows, column : column + columns] = drawn
 
     def write(self, path: Path) -> None:
@@ -243,8 +244,8 @@ def ground_of(folder: Path, drive: Drive, resolution_m: float) -> Ground:
     cameras = read_cameras(folder)
     if not cameras:
         raise MapFileError(f"{folder}: no {names.CALIBRATIONS} in it; give the result folder of v2hdm map")
-    calibrations = {name: one.calibration for name, one in cameras.items()}
-    clock_s = {name: one.clock_offset_s or 0.0 for name, one in cameras.items()}
+    calibrations = {name: camera.calibration for name, camera in cameras.items()}
+    clock_s = {name: camera.clock_offset_s or 0.0 for name, camera in cameras.items()}
     missing = [name for name in drive.cameras if name not in calibrations]
     if len(missing) == len(drive.cameras):
         raise MapFileError(
@@ -267,7 +268,7 @@ def ground_of(folder: Path, drive: Drive, resolution_m: float) -> Ground:
     }
     after = adjusted_shots(drive, calibrations, clock_s, adjusted, partial(read_surface, folder))
     before = [shot for shot in recorded_shots(drive) if shot.camera in lenses]
-    seen = np.concatenate([shot.outline_map(lenses[shot.camera]) for shot in after])
-    if not np.isfinite(seen).all():
+    outlines_map = np.concatenate([shot.outline_map(lenses[shot.camera]) for shot in after])
+    if not np.isfinite(outlines_map).all():
         raise DriveError(f"drive {drive.name}: an ROI reaches the horizon; draw it nearer to the camera")
-    return Ground(lenses, after, before, Canvas.around(seen, resolution_m, MULTIPLE_PX))
+    return Ground(lenses, after, before, Canvas.around(outlines_map, resolution_m, MULTIPLE_PX))

@@ -36,7 +36,6 @@ class Route:
     recorded: FloatArray | None  # (F, 4, 4) as recorded, None without the drive
     flat: FloatArray  # (F, 4, 4) adjusted, on the flattened road of the map, if there is a drive
     sigma: FloatArray  # (F, 6) forward, left, up in m, roll, pitch, heading in rad
-    seen: BoolArray  # (F,) whether a marking was seen
 
     @property
     def way_m(self) -> FloatArray:
@@ -106,8 +105,8 @@ def read_facts(folder: Path, drive: Drive | None) -> Facts:
         folder=folder,
         metrics=metrics,
         config=read_text(config, MapFileError).strip() if config.is_file() else "",
-        hd_map=map_of(features, [one.id for one in features], hd_map.origin) if hd_map else None,
-        excluded=tuple(one for one in excluded if not sets or one.cameras == sets[-1]),
+        hd_map=map_of(features, [feature.id for feature in features], hd_map.origin) if hd_map else None,
+        excluded=tuple(candidate for candidate in excluded if not sets or candidate.cameras == sets[-1]),
         cameras=read_cameras(folder),
         route=route,
         surface=None if route is None else read_surface(folder, route.flat),
@@ -120,16 +119,16 @@ def read_facts(folder: Path, drive: Drive | None) -> Facts:
 
 def read_cameras(folder: Path) -> dict[str, CameraFacts]:
     """Calibrations of a result folder by camera; raises MapFileError for damaged files."""
-    found = {}
+    cameras = {}
     for path in sorted(folder.glob(names.CALIBRATIONS)):
         content = load_yaml(path, MapFileError)
         calibration = read_calibration(path)
-        times_s = (
-            take_number(content[key], f"{path}: {key}", MapFileError) if key in content else None
+        times_s = {
+            key: take_number(content[key], f"{path}: {key}", MapFileError) if key in content else None
             for key in ("clock_offset_s", "clock_sigma_s", "read_out_s", "read_out_sigma_s")
-        )
-        found[calibration.info.name] = CameraFacts(calibration, *times_s)
-    return found
+        }
+        cameras[calibration.info.name] = CameraFacts(calibration, **times_s)
+    return cameras
 
 
 def _route(folder: Path, drive: Drive | None) -> Route | None:
@@ -148,13 +147,13 @@ def _route(folder: Path, drive: Drive | None) -> Route | None:
     moved = poses
     if drive is not None and drive.trajectory is not None:
         recorded, flat = (
-            interpolate(one, stamp_s, float("inf"))[0]
-            for one in (drive.recorded or drive.trajectory, drive.trajectory)
+            interpolate(trajectory, stamp_s, float("inf"))[0]
+            for trajectory in (drive.recorded or drive.trajectory, drive.trajectory)
         )
         moved = flat @ inverse(recorded) @ poses
     elif drive is not None and drive.recorded is not None:
         recorded = interpolate(drive.recorded, stamp_s, float("inf"))[0]
-    return Route(stamp_s, poses, recorded, moved, table[:, 2:], table[:, 1] > 0)
+    return Route(stamp_s, poses, recorded, moved, table[:, 2:])
 
 
 def read_surface(folder: Path, map_from_vehicle: FloatArray) -> Surface | None:
@@ -195,7 +194,7 @@ def ground_residuals(facts: Facts) -> GroundResiduals | None:
     if facts.residuals is None or facts.route is None or not len(facts.residuals):
         return None
     residuals = facts.residuals
-    calibrations = {name: one.calibration for name, one in facts.cameras.items()}
+    calibrations = {name: camera.calibration for name, camera in facts.cameras.items()}
     cameras = tuple(sorted(set(residuals.camera) & calibrations.keys()))
     if not cameras:
         return None
@@ -206,14 +205,15 @@ def ground_residuals(facts: Facts) -> GroundResiduals | None:
     cam_from_map = cams_from_map(residuals, facts.route, calibrations)
     observed = residuals.observed_px[rows]
     off = residuals.residual_px[rows]
-    known = np.flatnonzero(of_image >= 0)
-    intrinsic = np.array([calibrations[residuals.camera[i]].info.intrinsic for i in known])
+    calibrated = np.flatnonzero(of_image >= 0)
+    intrinsic = np.array([calibrations[residuals.camera[i]].info.intrinsic for i in calibrated])
     map_from_px = np.full((len(of_image), 3, 3), np.nan)
     foot_map = np.full((len(of_image), 2), np.nan)
-    map_from_px[known] = ground_from_pinhole_px(intrinsic, cam_from_map[known])
-    foot_map[known] = camera_centre(cam_from_map[known])[:, :2]
+    map_from_px[calibrated] = ground_from_pinhole_px(intrinsic, cam_from_map[calibrated])
+    foot_map[calibrated] = camera_centre(cam_from_map[calibrated])[:, :2]
     ground = map_from_px[row_image]
-    seen, projected = (apply_in_front(ground, px[:, None])[:, 0] for px in (observed, observed + off))
+    observed_map = apply_in_front(ground, observed[:, None])[:, 0]
+    projected_map = apply_in_front(ground, (observed + off)[:, None])[:, 0]
     return GroundResiduals(
         cameras=cameras,
         camera=of_image[row_image],
@@ -224,8 +224,8 @@ def ground_residuals(facts: Facts) -> GroundResiduals | None:
         observed_px=observed,
         residual_px=off,
         distance_sigma=residuals.distance_sigma[rows],
-        range_m=np.linalg.norm(seen - foot_map[row_image], axis=1),
-        ground_m=projected - seen,
+        range_m=np.linalg.norm(observed_map - foot_map[row_image], axis=1),
+        ground_m=projected_map - observed_map,
     )
 
 

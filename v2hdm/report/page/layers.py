@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from v2hdm.store.files import load_json, take_array, take_text
 def jpeg(pixels: np.ndarray, quality: int) -> str:
     """An image (H, W, 3) BGR as JPEG in base64."""
     options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
-    return _coded(".jpg", pixels, *options)
+    return _coded(".jpg", pixels, options)
 
 
 def shrunk(pixels: np.ndarray, factor: float) -> np.ndarray:
@@ -40,12 +40,12 @@ def jpeg_of(path: Path, widest_px: int, quality: int) -> str | None:
     return None if pixels is None else jpeg(shrunk(pixels, min(1.0, widest_px / pixels.shape[1])), quality)
 
 
-def _coded(kind: str, pixels: np.ndarray, *options: int) -> str:
+def _coded(kind: str, pixels: np.ndarray, options: Sequence[int]) -> str:
     return base64.b64encode(cv2.imencode(kind, pixels, options)[1].tobytes()).decode("ascii")
 
 
 LARGEST_BYTES = 3_500_000  # limit of the mosaic, as text in the page
-_QUALITY = 72
+_QUALITY = 72  # quality of the mosaic's WebP, of 100
 
 
 def mosaic_layer(folder: Path) -> dict[str, Any] | None:
@@ -67,13 +67,13 @@ def mosaic_layer(folder: Path) -> dict[str, Any] | None:
 
 def _webp(pixels: np.ndarray) -> str:
     """An image as WebP in base64, scaled down to the limit."""
-    while len(text := _coded(".webp", pixels, cv2.IMWRITE_WEBP_QUALITY, _QUALITY)) > LARGEST_BYTES:
+    while len(text := _coded(".webp", pixels, (cv2.IMWRITE_WEBP_QUALITY, _QUALITY))) > LARGEST_BYTES:
         pixels = shrunk(pixels, 0.9 * float(np.sqrt(LARGEST_BYTES / len(text))))
     return text
 
 
 _BACKGROUND_PX = 3000  # longer side of the background: 20 cm per pixel over 600 m
-_FINEST_M = 0.05
+_FINEST_M = 0.05  # least side of a pixel of the background
 _HALF_WORLD_M = 20037508.342789244  # half the side of Web Mercator's square
 _TILES = """<GDAL_WMS><Service name="TMS"><ServerUrl>{url}/${{z}}/${{x}}/${{y}}{ending}</ServerUrl></Service>
 <DataWindow><UpperLeftX>-{half}</UpperLeftX><UpperLeftY>{half}</UpperLeftY><LowerRightX>{half}</LowerRightX>
@@ -85,7 +85,7 @@ _TILES = """<GDAL_WMS><Service name="TMS"><ServerUrl>{url}/${{z}}/${{x}}/${{y}}{
 
 def _source(path: Path) -> dict[str, Any]:
     """Source for rasterio: a GeoTIFF, or a folder ``z/x/y.png`` of XYZ tiles as one picture."""
-    levels = sorted(int(one.name) for one in path.glob("*") if one.name.isdecimal())
+    levels = sorted(int(level.name) for level in path.glob("*") if level.name.isdecimal())
     tile = next((path / str(levels[-1])).glob("*/*.*"), None) if levels else None
     if tile is None:
         if not path.is_file():
@@ -127,27 +127,28 @@ def background_layer(path: Path, facts: Facts) -> dict[str, Any]:
         frame |= {"transform": rasterio.Affine(step, 0, west, 0, -step, north)}
         frame["add_alpha"] = rasterio.enums.ColorInterp.alpha not in source.colorinterp
         bilinear = rasterio.enums.Resampling.bilinear
-        with warped.WarpedVRT(source, **frame, **size, resampling=bilinear) as there:
-            bands = there.read([3, 2, 1] if source.count >= 3 else [1, 1, 1])
-            seen = there.dataset_mask()
-    if not seen.any():
+        with warped.WarpedVRT(source, **frame, **size, resampling=bilinear) as raster:
+            bands = raster.read([3, 2, 1] if source.count >= 3 else [1, 1, 1])
+            mask = raster.dataset_mask()
+    if not mask.any():
         raise MapFileError(f"{path}: does not cover this map; give a picture of its site")
     if bands.dtype != np.uint8:
-        low, high = np.percentile(bands[:, seen > 0], (1, 99))
+        low, high = np.percentile(bands[:, mask > 0], (1, 99))
         bands = np.clip((bands - low) * 255.0 / max(high - low, 1e-9), 0, 255).astype(np.uint8)
     bounds = [west, north - step * size["height"], west + step * size["width"], north]
-    pixels = np.ascontiguousarray(np.moveaxis(np.concatenate([bands, seen[None]]), 0, 2))
-    return {"src": _webp(pixels), "type": "image/webp", "bounds": [float(one) for one in bounds]}
+    pixels = np.ascontiguousarray(np.moveaxis(np.concatenate([bands, mask[None]]), 0, 2))
+    return {"src": _webp(pixels), "type": "image/webp", "bounds": [float(edge) for edge in bounds]}
 
 
 def _extent(facts: Facts) -> tuple[FloatArray, FloatArray]:
     """South-west and north-east (2,), m, of the map with a margin of 50 m."""
     assert facts.hd_map is not None
-    places = [one.corners_map for one in facts.hd_map.markings]
-    places += [one.points_map for one in facts.hd_map.lanes]
-    places += [] if facts.route is None else [facts.route.map_from_vehicle[:, :2, 3]]
-    both = np.concatenate([*places, np.zeros((0 if places else 1, 2))])
-    return both.min(axis=0) - 50.0, both.max(axis=0) + 50.0
+    shapes = [marking.corners_map for marking in facts.hd_map.markings]
+    shapes += [lane.points_map for lane in facts.hd_map.lanes]
+    if facts.route is not None:
+        shapes.append(facts.route.map_from_vehicle[:, :2, 3])
+    points = np.concatenate(shapes or [np.zeros((1, 2))])
+    return points.min(axis=0) - 50.0, points.max(axis=0) + 50.0
 
 
 def comparison(folder: Path) -> str | None:
@@ -159,7 +160,7 @@ SIGMAS_95 = 2.4477
 """Semi-axes of the 95 % ellipse of a two-dimensional normal error, in standard deviations: the root of the
 chi-square quantile with two degrees of freedom."""
 
-_LEAST_ARROW_SIGHTINGS = 4
+_LEAST_ARROW_SIGHTINGS = 4  # least number of sightings of a marking whose mean residual is drawn
 _SHARED = (".geojson", ".gpkg", ".osm", ".dxf", ".csv", ".xodr", ".tif", ".tum", ".yaml", ".json", ".log")
 """Suffixes of the result files that the page links."""
 
@@ -181,43 +182,48 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
     if hd_map is None:
         return {}
     named: list[Marking | Symbol | Lane] = [*hd_map.markings, *hd_map.symbols, *hd_map.lanes]
-    kinds = sorted({one.kind for one in named})
+    kinds = sorted({feature.kind for feature in named})
     arrows = _arrows(residuals)
     errors = _errors(facts)
     markings = []
     for number, marking in enumerate(hd_map.markings):
-        found = _feature(marking, kinds, "c", marking.corners_map)
+        feature = _feature(marking, kinds, "c", marking.corners_map)
         axes = ellipses(marking)
         if axes is not None:
-            found["e"] = np.round(axes, 5).tolist()
+            feature["e"] = np.round(axes, 5).tolist()
         if marking.relative_sigma_m is not None:
-            found["r"] = round(SIGMAS_95 * marking.relative_sigma_m, 5)
+            feature["r"] = round(SIGMAS_95 * marking.relative_sigma_m, 5)
         if number in errors:
-            found["t"] = round(errors[number], 5)
+            feature["t"] = round(errors[number], 5)
         if marking.id in arrows:
-            found["a"] = arrows[marking.id]
-        markings.append(found)
+            feature["a"] = arrows[marking.id]
+        markings.append(feature)
     route = facts.route
     return {
         "kinds": kinds,
         "cameras": list(residuals.cameras) if residuals else [],
         "markings": markings,
-        "lanes": [_feature(one, kinds, "p", one.points_map) for one in hd_map.lanes],
+        "lanes": [_feature(lane, kinds, "p", lane.points_map) for lane in hd_map.lanes],
         "symbols": [
-            _feature(one, kinds, "p", one.outline_map)
-            | {"e": None if one.sigma_m is None else round(SIGMAS_95 * one.sigma_m, 5)}
-            for one in hd_map.symbols
+            _feature(symbol, kinds, "p", symbol.outline_map)
+            | {"e": None if symbol.sigma_m is None else round(SIGMAS_95 * symbol.sigma_m, 5)}
+            for symbol in hd_map.symbols
         ],
         "excluded": [
-            {"k": one.kind, "p": rounded(one.position_map[None])[0], "n": one.sightings, "why": one.reason}
-            for one in facts.excluded
+            {
+                "k": candidate.kind,
+                "p": rounded(candidate.position_map[None])[0],
+                "n": candidate.sightings,
+                "why": candidate.reason,
+            }
+            for candidate in facts.excluded
         ],
         "checks": _checks(facts),
         "changes": _changes(facts),
         "truth": facts.truth
         and {
-            "markings": [rounded(one.corners_map) for one in facts.truth.map.markings],
-            "lanes": [rounded(one.points_map) for one in facts.truth.map.lanes],
+            "markings": [rounded(marking.corners_map) for marking in facts.truth.map.markings],
+            "lanes": [rounded(lane.points_map) for lane in facts.truth.map.lanes],
         },
         "route": {
             "adjusted": [] if route is None else rounded(route.map_from_vehicle[:, :2, 3]),
@@ -225,8 +231,10 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
         },
         "mosaic": mosaic_layer(facts.folder),
         "systems": _systems(facts),
-        "suspicion": {str(one["marking"]): float(one["p"]) for one in facts.best.get("suspicious") or []},
-        "files": sorted(one.name for one in facts.folder.iterdir() if one.suffix in _SHARED),
+        "suspicion": {
+            str(suspect["marking"]): float(suspect["p"]) for suspect in facts.best.get("suspicious") or []
+        },
+        "files": sorted(path.name for path in facts.folder.iterdir() if path.suffix in _SHARED),
     }
 
 
@@ -235,7 +243,9 @@ def _systems(facts: Facts) -> list[dict[str, Any]]:
     hd_map = facts.hd_map
     if hd_map is None or hd_map.origin is None:
         return []
-    x, y = (grid.ravel() for grid in np.meshgrid(*np.linspace(*_extent(facts), 7).T))
+    south_west, north_east = _extent(facts)
+    east_m, north_m = np.linspace(south_west, north_east, 7).T
+    x, y = (grid.ravel() for grid in np.meshgrid(east_m, north_m))
     places_map = np.column_stack([x, y, np.zeros_like(x)])
     code = utm_of(hd_map.origin)
     earth = geodetic_from_enu(hd_map.origin, places_map)
@@ -254,9 +264,14 @@ def _systems(facts: Facts) -> list[dict[str, Any]]:
 
 
 def _feature(
-    one: Marking | Symbol | Lane, kinds: list[str], key: str, points_map: FloatArray
+    feature: Marking | Symbol | Lane, kinds: list[str], key: str, points_map: FloatArray
 ) -> dict[str, Any]:
-    return {"id": one.id, "k": kinds.index(one.kind), key: rounded(points_map), "n": one.sightings}
+    return {
+        "id": feature.id,
+        "k": kinds.index(feature.kind),
+        key: rounded(points_map),
+        "n": feature.sightings,
+    }
 
 
 def rounded(points: FloatArray, digits: int = 3) -> list[list[float]]:
@@ -271,29 +286,32 @@ def _errors(facts: Facts) -> dict[int, float]:
         return {}
     mapped = facts.hd_map.markings
     true = facts.truth.map.markings
-    pairs = zip(*match_markings(mapped, true), strict=True)
-    return {row: rms(corner_errors([mapped[row]], [true[column]])) for row, column in pairs}
+    rows, columns = match_markings(mapped, true)
+    return {
+        row: rms(corner_errors([mapped[row]], [true[column]]))
+        for row, column in zip(rows, columns, strict=True)
+    }
 
 
 def _checks(facts: Facts) -> list[dict[str, Any]]:
     """Surveyed check points: position, and map minus survey."""
     checks = []
-    for one in facts.check_points:
-        place = [_number(one.get(key)) for key in ("x_map_m", "y_map_m")]
-        off = [_number(one.get(key)) for key in ("dx_m", "dy_m")]
+    for point in facts.check_points:
+        place = [_number(point.get(key)) for key in ("x_map_m", "y_map_m")]
+        off = [_number(point.get(key)) for key in ("dx_m", "dy_m")]
         if None not in place:
-            inside = one.get("inside_95_percent", "")
-            checks.append({"id": one.get("id", ""), "p": place, "off": off, "inside": inside})
+            inside = point.get("inside_95_percent", "")
+            checks.append({"id": point.get("id", ""), "p": place, "off": off, "inside": inside})
     return checks
 
 
 def _changes(facts: Facts) -> list[dict[str, Any]]:
     """Changes from the base map, as listed in ``metrics.json``."""
     return [
-        {name: one[name] for name in ("id", "fate", "shift_m", "shift_sigma_m", "probability", "views")}
-        | {"k": one["class"], "n": one["found"], "p": one["after_map"] or one["before_map"]}
-        | {"before": one["before_map"] or []}
-        for one in (facts.metrics.get("changes") or {}).get("listed") or []
+        {name: change[name] for name in ("id", "fate", "shift_m", "shift_sigma_m", "probability", "views")}
+        | {"k": change["class"], "n": change["found"], "p": change["after_map"] or change["before_map"]}
+        | {"before": change["before_map"] or []}
+        for change in (facts.metrics.get("changes") or {}).get("listed") or []
     ]
 
 
@@ -313,13 +331,14 @@ def _arrows(residuals: GroundResiduals | None) -> dict[int, list[list[float]]]:
         return {}
     good = residuals.is_point & np.isfinite(residuals.ground_m).all(axis=1) & (residuals.marking > 0)
     weight = 1.0 / np.maximum(residuals.range_m[good], 1.0) ** 4
-    count = len(residuals.cameras)
-    cell = residuals.marking[good] * count + residuals.camera[good]
+    cameras = len(residuals.cameras)
+    cell = residuals.marking[good] * cameras + residuals.camera[good]
     total = np.bincount(cell, weight)
-    seen = np.bincount(cell)
+    count = np.bincount(cell)
     sums = np.stack([np.bincount(cell, weight * residuals.ground_m[good, a]) for a in (0, 1)], axis=1)
     out: dict[int, list[list[float]]] = {}
-    for one in np.flatnonzero(seen >= _LEAST_ARROW_SIGHTINGS).tolist():
-        mean = np.round(sums[one] / total[one], 5).tolist()
-        out.setdefault(one // count, []).append([one % count, *mean, int(seen[one])])
+    for index in np.flatnonzero(count >= _LEAST_ARROW_SIGHTINGS).tolist():
+        marking, camera = divmod(index, cameras)
+        mean = np.round(sums[index] / total[index], 5).tolist()
+        out.setdefault(marking, []).append([camera, *mean, int(count[index])])
     return out
