@@ -225,7 +225,7 @@ def _test(one: Any) -> dict[str, Any]:
     own = getattr(one, "p_value", None)
     whose = "each" if len(one.cameras) == 1 else "all"
     return {
-        "kind": f"{one.fault.value} {one.axis} {whose}",
+        "kind": f"{one.fault.name} {one.axis} {whose}",
         "cameras": list(one.cameras),
         "p": float(chi2.sf(one.sigmas**2, 1)) if own is None else float(own),
         "value": one.value,

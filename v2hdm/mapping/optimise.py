@@ -19,7 +19,7 @@ from v2hdm.association.groups import Association, attach, fuse_groups, in_view, 
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.association.tracks import IPM_SIGMA_RAD, REFINED_SIGMA_RAD, build_tracks
 from v2hdm.errors import AdjustError, MappingError
-from v2hdm.faults import height_information, moves_with_heights
+from v2hdm.faults.sensitivity import height_information, moves_with_heights
 from v2hdm.geometry.ipm import initial_extrinsic
 from v2hdm.lanes.knots import Knots
 from v2hdm.mapping.bundle import (

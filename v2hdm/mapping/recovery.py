@@ -19,7 +19,7 @@ from v2hdm.adjust import pose_innovations
 from v2hdm.association.ground import views_of
 from v2hdm.association.sightings import Sightings
 from v2hdm.errors import AdjustError, MappingError
-from v2hdm.faults import CHANGES, Fault, ScoreTest, score_faults
+from v2hdm.faults import Contradiction, Item, Recovery, ScoreTest, table
 from v2hdm.faults.odds import (
     CLEAR_SIGMAS,
     RIVAL_LOG_ODDS,
@@ -28,6 +28,7 @@ from v2hdm.faults.odds import (
     is_doubtful,
     log_odds,
 )
+from v2hdm.faults.score_tests import score_faults
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.mapping.bundle import Bundle, name_of
 from v2hdm.mapping.conclusion import Optimised
@@ -35,7 +36,7 @@ from v2hdm.mapping.foreign import foreign_segment
 from v2hdm.mapping.inputs import Inputs
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import AUTO, INCREMENTAL, SURFACE, SurveyOptions
-from v2hdm.mapping.results import CameraFit, Contradiction, SolveEvidence
+from v2hdm.mapping.results import CameraFit, SolveEvidence
 from v2hdm.records import Drive, FloatArray
 
 _log = logging.getLogger(__name__)
@@ -44,14 +45,7 @@ _AMBIGUOUS_SHARE = 0.8
 """Fraction of its sigmas from which another camera's fault may be the cause: a straight road at constant
 speed determines the distance of two centres, or the difference of two clocks, alone."""
 
-_CLOCK_CORRECTABLE_S = 0.006
-"""Largest sigma, s, at which a contradicted clock is corrected: a late clock adds scatter to its estimate."""
-
-_CENTRE_OBSERVABLE_M = 0.1  # sigma of a centre, m, above which a drive needs its survey: it shifts the map
 _MOST_CORRECTIONS = 4  # most inputs dropped one by one; with more of them wrong nothing is reliable
-
-_LIKE_GROUND = (Fault.CROWN, Fault.FOCAL, Fault.DISTORTION, Fault.PRINCIPAL)
-"""Faults that deform a plane's image: if a surface leaves one, that is the more likely cause."""
 
 _MEDIAN_SQUARED = 2 * float(np.log(2))
 """Median of a squared Mahalanobis distance: chi-square with two degrees of freedom."""
@@ -90,7 +84,7 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
         about = f" {corrected[-1].about}" if corrected[-1].about else ""
         _log.warning(
             "%s: mapped again, for the drive contradicts the %s%s of %s by %.0f sigmas (%+.3g %s)",
-            ", ".join(inputs.cameras), one.fault.value, about, " and ".join(one.cameras), one.sigmas,
+            ", ".join(inputs.cameras), one.fault.name, about, " and ".join(one.cameras), one.sigmas,
             one.value, one.fault.unit,
         )  # fmt: skip
         inputs = left
@@ -133,12 +127,12 @@ def _over_ground(
     surface, gain = inputs.optimiser.likeliest_surface(settled)
     is_bent = gain > CLEAR_SIGMAS**2 / 2
     found = () if is_bent else _tested(inputs, settled, progress)
-    if is_bent or any(one.fault is Fault.CROWN and one.sigmas > CLEAR_SIGMAS for one in found):
+    if is_bent or any(one.fault is table.CROWN and one.sigmas > CLEAR_SIGMAS for one in found):
         curved = replace(inputs, options=replace(inputs.options, ground=SURFACE))
         over = curved.optimiser.settle_from(settled, progress, surface)
         tests = _tested(curved, over, progress)
         rival = _worst(tests)
-        explained = rival is None or rival.fault not in _LIKE_GROUND
+        explained = rival is None or not rival.fault.like_ground
         is_curved = explained and curved.optimiser.is_curved(over)
         taken = "a surface" if is_curved else "a plane: no surface explains the drive"
         _log.info("%s: the ground is mapped as %s", ", ".join(inputs.cameras), taken)
@@ -187,14 +181,14 @@ def _session_names(drive: Drive) -> tuple[str, ...]:
 
 def _is_stated(one: ScoreTest, bundle: Bundle, drive: Drive) -> bool:
     """Whether the suspected input was stated: an unsurveyed centre is a guess."""
-    if one.fault not in (Fault.SURVEY, Fault.LEVER, Fault.SCALE):
+    if not one.fault.needs_centres:
         return True
     return all(drive.cameras[name].centre_prior is not None for name in _cameras_of(bundle, one))
 
 
 def _is_of_the_map(one: Contradiction, survey: SurveyOptions, optimised: Optimised) -> bool:
     """False for a surveyed point matched to a candidate outside the map, such as a worn marking."""
-    if one.fault is not Fault.CONTROL:
+    if one.fault.recovery is not Recovery.DROP_POINT:
         return True
     point_map = next(point.position_map for point in survey.points if point.id == one.about)
     corners_map = np.array([marking.corners_map for marking in optimised.markings])
@@ -206,7 +200,7 @@ def _is_of_the_map(one: Contradiction, survey: SurveyOptions, optimised: Optimis
 
 def _as_solved(one: Contradiction, bundle: Bundle) -> Contradiction:
     """A dropped survey with its error from the solve without it; others unchanged."""
-    if one.fault not in (Fault.SURVEY, Fault.LEVER) or bundle.problem.centre_vehicle is None:
+    if one.fault.recovery is not Recovery.DROP_CENTRES or bundle.problem.centre_vehicle is None:
         return one
     rows = [bundle.camera_index[name] for name in one.cameras if name in bundle.camera_index]
     off = camera_centre(bundle.solution.cam_from_vehicle)[rows] - bundle.problem.centre_vehicle[rows]
@@ -246,9 +240,9 @@ def _evidence(
 
 def _is_ambiguous(worst: ScoreTest, found: Sequence[ScoreTest]) -> bool:
     """Whether another camera's fault, or for centres the poses' scale, would explain nearly as much."""
-    if worst.fault in (Fault.SURVEY, Fault.LEVER):
+    if worst.fault.recovery is Recovery.DROP_CENTRES:
         least = doubt(worst) - RIVAL_LOG_ODDS
-        if any(one.fault is Fault.SCALE and is_contradicted(one) and doubt(one) > least for one in found):
+        if any(one.fault is table.SCALE and is_contradicted(one) and doubt(one) > least for one in found):
             return True
     rivals = [
         one.sigmas
@@ -282,25 +276,24 @@ def _read_outs(bundle: Bundle) -> dict[str, tuple[float, float]]:
 
 def _recovered(inputs: Inputs, worst: ScoreTest, settled: Bundle) -> Inputs | None:
     """The inputs without the fault ``worst``; None if the drive needs them."""
-    if worst.fault is Fault.CLOCK:
-        if worst.sigma > _CLOCK_CORRECTABLE_S:
-            return None
-        return inputs.with_clocks(inputs.optimiser.clock_offsets_s(settled))
-    if worst.fault in (Fault.SURVEY, Fault.LEVER):
-        if worst.sigma > _CENTRE_OBSERVABLE_M:
-            return None
-        return inputs.without_axis(_cameras_of(settled, worst), worst.axis)
-    options = inputs.options
-    if worst.fault is Fault.SIZE:
-        # One wrong size means paint of another standard; corners of others may look like outliers, which the
-        # robust loss hides from the tests.
-        options = replace(options, known_sizes=replace(options.known_sizes, by_class_m={}))
-    elif worst.fault is Fault.CONTROL:
-        options = replace(options, survey=options.survey.without(_point_of(settled, worst.item)))
-    elif worst.fault is Fault.DATUM:
-        options = replace(options, survey=options.survey.only([]))
-    else:
+    if worst.sigma > worst.fault.recoverable_sigma:
         return None
+    options = inputs.options
+    match worst.fault.recovery:
+        case Recovery.NONE:
+            return None
+        case Recovery.SHIFT_CLOCKS:
+            return inputs.with_clocks(inputs.optimiser.clock_offsets_s(settled))
+        case Recovery.DROP_CENTRES:
+            return inputs.without_axis(_cameras_of(settled, worst), worst.axis)
+        case Recovery.DROP_SIZES:
+            # One wrong size means paint of another standard; corners of others may look like outliers, which
+            # the robust loss hides from the tests.
+            options = replace(options, known_sizes=replace(options.known_sizes, by_class_m={}))
+        case Recovery.DROP_POINT:
+            options = replace(options, survey=options.survey.without(_point_of(settled, worst.item)))
+        case Recovery.DROP_POINTS:
+            options = replace(options, survey=options.survey.only([]))
     return replace(inputs, options=options)
 
 
@@ -350,16 +343,17 @@ def _factor(bundle: Bundle, mahalanobis2: FloatArray) -> float:
 
 
 def _about(bundle: Bundle, test: ScoreTest, frame_s: FloatArray, sessions: Sequence[str]) -> str:
-    if test.fault in CHANGES:
-        return f"from {frame_s[test.item]:.1f} s on"
-    if test.fault is Fault.CLOCK and test.item >= 0 and sessions:
-        return f"in {sessions[test.item]}"
-    lengths = bundle.problem.lengths
-    if test.fault is Fault.SIZE and lengths is not None:
-        length_m = float(np.unique(lengths.length_m)[test.item])
-        stated = bundle.model.sizes.by_class_m.items()
-        names = [name for name, size in stated if any(abs(one - length_m) < 1e-9 for one in size)]
-        return f"{', '.join(names)} {length_m:.2f} m"
-    if test.fault is Fault.CONTROL:
-        return _point_of(bundle, test.item)
+    """Which session, size or point a test is of, or from when on; empty for all of them."""
+    match test.fault.item:
+        case Item.FRAME:
+            return f"from {frame_s[test.item]:.1f} s on"
+        case Item.SESSION if test.item >= 0 and sessions:
+            return f"in {sessions[test.item]}"
+        case Item.LENGTH if bundle.problem.lengths is not None:
+            length_m = float(np.unique(bundle.problem.lengths.length_m)[test.item])
+            stated = bundle.model.sizes.by_class_m.items()
+            names = [name for name, sides_m in stated if any(abs(m - length_m) < 1e-9 for m in sides_m)]
+            return f"{', '.join(names)} {length_m:.2f} m"
+        case Item.POINT:
+            return _point_of(bundle, test.item)
     return ""

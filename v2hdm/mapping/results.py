@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from v2hdm.faults import ScoreTest
+from v2hdm.faults import Contradiction
 from v2hdm.io.maps.evidence import Residuals
 from v2hdm.records import (
     BoolArray,
@@ -23,14 +23,6 @@ from v2hdm.records import (
 )
 from v2hdm.site.markings import Suspicion
 from v2hdm.surface.surface import Surface
-
-
-@dataclass(frozen=True)
-class Contradiction(ScoreTest):
-    """A possible error of one input, in the user's terms: of which cameras, and ``about`` what."""
-
-    cameras: tuple[str, ...] = ()
-    about: str = ""
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from v2hdm.records import Calibration, FloatArray, Marking
 from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN
 from v2hdm.site.corrections import unmet
 from v2hdm.survey.check_points import CheckTable, squared
-from v2hdm.verdict.results.solution import CHECKS, doubted, relied_on
+from v2hdm.verdict.results.solution import doubted, relied_on
 from v2hdm.verdict.verdict import GOAL, Finding, Status, passed
 
 _AHEAD_M = 10.0  # within which a vehicle uses what it sees on the ground
@@ -62,7 +62,7 @@ def _conditions(evidence: SolveEvidence) -> str:
     doubtful = doubted(evidence)
     relied = relied_on(evidence)
     if doubtful is not None:
-        return f" (unless the {CHECKS[doubtful.fault][0]} is off, which is possible)"
+        return f" (unless the {doubtful.fault.check} is off, which is possible)"
     return f" (if {' and '.join(relied)} are right, which this drive cannot show)" if relied else ""
 
 

@@ -14,10 +14,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from v2hdm.faults import Fault
+from v2hdm.faults import Contradiction, Fault, table
 from v2hdm.faults.odds import (
     CLEAR_SIGMAS,
-    OBSERVABLE_SIGMA,
     RIVAL_LOG_ODDS,
     doubt,
     even_sigmas,
@@ -29,7 +28,7 @@ from v2hdm.faults.odds import (
 )
 from v2hdm.faults.sensitivity import STRETCHES
 from v2hdm.ground import GroundEstimate
-from v2hdm.mapping.results import Contradiction, MethodResult, SolveEvidence
+from v2hdm.mapping.results import MethodResult, SolveEvidence
 from v2hdm.records import Drive
 from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN
 from v2hdm.site.parallax import NOT_OBSERVED, NOT_ON_GROUND
@@ -58,58 +57,6 @@ _CLOCK_OBSERVABLE_S = 0.004  # largest sigma of an observed clock offset, s: two
 # Sigma, m, of the point that the poses are of, up to which a drive observes it: twice that, at 95 %, is the
 # usual accuracy goal.
 _LEVER_OBSERVABLE_M = 0.025
-
-# The check that reports each fault, and the recovery.
-CHECKS: Mapping[Fault, tuple[str, str]] = {
-    Fault.CLOCK: (
-        "clock", "synchronise the clocks of cameras and receiver, or shift the stamps by that",
-    ),
-    Fault.CLOCK_DRIFT: (
-        "clock drift", "stamp images with their exposure time on the receiver's clock",
-    ),
-    Fault.CROWN: (
-        "crown", "leave mapping.ground at auto, or map the two sides of the crown separately",
-    ),
-    Fault.COURSE: ("heading", "record the vehicle's heading from two antennas or an INS"),
-    Fault.STEP: ("position step", "check the receiver's log there, and leave out poses without an RTK fix"),
-    Fault.KNOCK: ("mounting", "fasten the camera, and map what was driven before and after by themselves"),
-    Fault.FOCAL: (
-        "focal length",
-        "check fx and fy in camera_info against the resolution, or recalibrate the lens",
-    ),
-    Fault.DISTORTION: (
-        "distortion",
-        "check distortion_coefficients (and the focal length) in camera_info, or recalibrate",
-    ),
-    Fault.PRINCIPAL: (
-        "principal point",
-        "check cx and cy in camera_info against the image's size and crop, or recalibrate",
-    ),
-    Fault.SLOPE: ("slope", "record the height of the poses, or roll and pitch"),
-    Fault.SURVEY: (
-        "survey",
-        "survey the camera's centre again; check signs, axes and the origin on the ground under the axle",
-    ),
-    Fault.LEVER: (
-        "survey",
-        "measure the centres from the reference point of the poses, such as the antenna, or move the poses",
-    ),
-    Fault.SCALE: (
-        "scale", "give positions in metres on the ground, as in UTM or a local frame, not in Web Mercator",
-    ),
-    Fault.SIZE: ("known_sizes", "measure the paint, or leave it out of mapping.known_sizes"),
-    Fault.CONTROL: ("surveyed points", "survey it again, or leave it out of mapping.survey"),
-    Fault.DATUM: ("surveyed points", "check that survey and poses have the same datum and origin"),
-}  # fmt: skip
-
-# How an input was corrected, where it was not just left out.
-_CORRECTED_BY = {Fault.CLOCK: "images got poses at the corrected times", Fault.SIZE: "no known size was used"}
-
-_LIKE_CLOCK = (Fault.CLOCK_DRIFT, Fault.COURSE)  # faults that a constant clock offset may stand for
-_WAYS = (("behind", "ahead of"), ("to the right of", "to the left of"), ("below", "above"))
-# What units are shown as, and by what values are multiplied for it.
-_SHOWN = {"m": (100.0, "cm"), "s": (1e3, "ms"), "rad": (180 / np.pi, "deg"), "px": (1.0, "px"), "": (1.0, "")}
-_MAP_AXES = ("east", "north", "north-east", "north-west")
 
 
 def check_result(
@@ -200,7 +147,7 @@ def check_inputs(evidence: SolveEvidence) -> list[Finding]:
     raised |= {one.check for one in named}
     by_check: dict[str, list[Contradiction]] = {}
     for one in evidence.score_tests:
-        by_check.setdefault(CHECKS[one.fault][0], []).append(one)
+        by_check.setdefault(one.fault.check, []).append(one)
     unobservable = list(_unobservable(evidence, raised))
     said = raised | {one.check for one in unobservable if not _observable(by_check[one.check])}
     findings += [_agrees(check, tested) for check, tested in by_check.items() if check not in said]
@@ -220,19 +167,19 @@ def _hidden(tested: list[Contradiction]) -> list[Contradiction]:
 
 
 def _is_observable(one: Contradiction) -> bool:
-    return _sigma(one) <= OBSERVABLE_SIGMA[one.fault]
+    return _sigma(one) <= one.fault.observable_sigma
 
 
 def _corrected(one: Contradiction) -> Finding:
-    done = _CORRECTED_BY.get(one.fault, "it was left out of the result")
-    says = f"{_words(one)} ({one.sigmas:.0f} sigmas); {done}: {CHECKS[one.fault][1]}"
+    fault = one.fault
+    says = f"{one.sentence} ({one.sigmas:.0f} sigmas); {fault.corrected_by}: {fault.remedy}"
     return _input(one, Status.WARN, says)
 
 
 def _is_left(one: Contradiction, corrected: Sequence[Contradiction]) -> bool:
     """Whether, a clock corrected, a drift or heading is likelier than none: even odds, once it is off."""
-    off = {camera for each in corrected if each.fault is Fault.CLOCK for camera in each.cameras}
-    return one.fault in _LIKE_CLOCK and off >= set(one.cameras) and matters(one) and log_odds(one) > 0
+    off = {camera for each in corrected if each.fault is table.CLOCK for camera in each.cameras}
+    return one.fault.like_clock and off >= set(one.cameras) and matters(one) and log_odds(one) > 0
 
 
 def _unknown(one: Contradiction) -> Finding:
@@ -246,18 +193,18 @@ def _unknown(one: Contradiction) -> Finding:
 
 def _contradicted(still: list[Contradiction]) -> Finding:
     one = still[0]
-    rivals = [_words(other) for other in still if log_odds(other) > log_odds(one) - RIVAL_LOG_ODDS]
+    rivals = [other.sentence for other in still if log_odds(other) > log_odds(one) - RIVAL_LOG_ODDS]
     says = f"{' or '.join(rivals)} ({one.sigmas:.0f} sigmas)"
-    return _input(one, Status.FAIL, f"{says}, and the map is wrong by it: {CHECKS[one.fault][1]}")
+    return _input(one, Status.FAIL, f"{says}, and the map is wrong by it: {one.fault.remedy}")
 
 
 def _doubtful(one: Contradiction) -> Finding:
-    says = f"{_words(one)}, as far as the drive can tell ({one.sigmas:.1f} sigmas): {CHECKS[one.fault][1]}"
+    says = f"{one.sentence}, as far as the drive can tell ({one.sigmas:.1f} sigmas): {one.fault.remedy}"
     return _input(one, Status.WARN, says)
 
 
 def _input(one: Contradiction, status: Status, says: str) -> Finding:
-    check = CHECKS[one.fault][0]
+    check = one.fault.check
     about = ", ".join(one.cameras)
     return Finding(check, status, one.sigmas, even_sigmas(one), "sigmas", says, about)
 
@@ -285,10 +232,9 @@ def _sigma(one: Contradiction) -> float:
     return max(one.sigma, one.model_sigma)
 
 
-def _least_shown(one: Contradiction) -> str:
+def _least_shown(test: Contradiction) -> str:
     """The size from which on a drive shows an error, with its unit."""
-    scale, unit = _SHOWN[one.fault.unit]
-    return f"{CLEAR_SIGMAS * scale * _sigma(one):.2g} {unit}".rstrip()
+    return test.fault.shown(CLEAR_SIGMAS * _sigma(test))
 
 
 def doubted(evidence: SolveEvidence) -> Contradiction | None:
@@ -305,11 +251,11 @@ def relied_on(evidence: SolveEvidence) -> list[str]:
 
 
 def _loosest_clock_s(evidence: SolveEvidence) -> float:
-    return max((one.sigma for one in _of_all(evidence, Fault.CLOCK, Fault.CLOCK)), default=0.0)
+    return max((one.sigma for one in _of_all(evidence, table.CLOCK, table.CLOCK)), default=0.0)
 
 
 def _loose_levers(evidence: SolveEvidence) -> list[Contradiction]:
-    levers = _of_all(evidence, Fault.LEVER, Fault.SURVEY)
+    levers = _of_all(evidence, table.LEVER, table.SURVEY)
     return [one for one in levers if one.axis < 2 and one.sigma > _LEVER_OBSERVABLE_M]
 
 
@@ -431,65 +377,3 @@ def _excluded(best: MethodResult) -> Finding:
         wrong=f"{says}: markings are seen, but not where others place them; see excluded.geojson",
         status=Status.WARN,
     )  # fmt: skip
-
-
-def _words(one: Contradiction) -> str:
-    """The error and its size, as a clause."""
-    whose = " and ".join(one.cameras)
-    size = abs(one.value)
-    cm = 100 * size
-    longer = "longer" if one.value > 0 else "shorter"
-    axis = _MAP_AXES[one.axis]
-    way = f"{cm:.0f} cm {_WAYS[min(one.axis, 2)][one.value > 0]}"
-    match one.fault:
-        case Fault.CLOCK:
-            late = "later" if one.value > 0 else "earlier"
-            where = f" {one.about}" if one.about else ""
-            return f"the images of {whose}{where} were taken {1e3 * size:.0f} ms {late} than their stamps say"
-        case Fault.CLOCK_DRIFT:
-            how = f"wanders, as counted stamps do: within {1e3 * size:.0f} ms"
-            if one.axis == 0:
-                how = f"runs {'slow' if one.value > 0 else 'fast'}: by {1e3 * size:.0f} ms over the drive"
-            return f"the clock of the images of {whose} {how}"
-        case Fault.CROWN:
-            way = "falls" if one.value > 0 else "rises"
-            side = ("both sides", "the left", "the right")[one.axis]
-            return f"the ground {way} by {100 * size:.1f} % to {side} of the route, as on a crown"
-        case Fault.COURSE:
-            return (
-                f"the heading is not the vehicle's, but the course of a point {size:.1f} m "
-                f"{'ahead of' if one.value > 0 else 'behind'} the rear axle"
-            )
-        case Fault.STEP:
-            return f"the position steps by {100 * one.value:+.0f} cm {axis} and stays there, {one.about}"
-        case Fault.KNOCK:
-            turned = ("in roll", "in pitch", "in yaw")[one.axis]
-            of_all = "as if the heading stepped" if one.axis == 2 else "as by load"
-            cause = of_all if len(one.cameras) > 1 else "as by a knock"
-            by = f"{np.rad2deg(size):.1f} deg {turned}"
-            return f"the mounting of {whose} is turned by {by} {one.about}, {cause}"
-        case Fault.FOCAL:
-            return f"the focal length of {whose} is {100 * size:.1f} % {longer} than camera_info says"
-        case Fault.DISTORTION:
-            return f"the lens distortion of {whose} is not that of camera_info (k1 off by {one.value:+.3f})"
-        case Fault.PRINCIPAL:
-            axis = ("right", "down")[one.axis]
-            return f"the principal point of {whose} lies {one.value:+.0f} px {axis} of where camera_info says"
-        case Fault.SLOPE:
-            return f"the ground rises by {100 * one.value:+.1f} % to the {axis} under the poses"
-        case Fault.SURVEY:
-            return f"the centre of {whose} lies {way} its survey"
-        case Fault.LEVER:
-            return (
-                f"the centres of {whose} all lie {way} their surveys, as if the poses were of another "
-                "point of the vehicle (antenna instead of axle)"
-            )
-        case Fault.SCALE:
-            apart = "close together" if one.value > 0 else "far apart"
-            return f"the recorded positions lie {cm:.1f} % too {apart}"
-        case Fault.SIZE:
-            return f"paint that known_sizes states as {one.about} is {cm:.1f} cm {longer}"
-        case Fault.CONTROL:
-            return f"the surveyed point {one.about} is {cm:.0f} cm off the marking's corner"
-        case Fault.DATUM:
-            return f"the surveyed points all lie {100 * one.value:+.0f} cm {axis} of the markings"
