@@ -69,7 +69,7 @@ def write_project(folder: Path) -> None:
             (folder / "docs" / name).write_text(text, encoding="utf-8")
         else:
             shutil.copy(ROOT / source, folder / "docs" / name)
-    for settings in (ROOT / "zensical.toml", ROOT / "docs" / "tools" / "doctests.py"):
+    for settings in (ROOT / "zensical.toml", ROOT / "docs" / "tools" / "api_pages.py"):
         shutil.copy(settings, folder)
 
 

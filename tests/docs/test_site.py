@@ -101,3 +101,12 @@ def test_a_link_to_a_heading_that_is_gone_stops_the_build(tmp_path, monkeypatch)
 
 def test_examples_in_docstrings_are_shown_as_code(site):
     assert '<span class="gp">&gt;&gt;&gt; </span>' in (site / "api.html").read_text()
+
+
+def test_settings_are_listed_with_their_meaning_and_range(site):
+    text = (site / "api.html").read_text()
+    assert (
+        "longest gap between poses to interpolate across; images in a longer one are dropped; more than 0."
+        in text
+    )
+    assert "Annotated" not in text
