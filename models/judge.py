@@ -2,8 +2,8 @@
 
 :class:`models.MarkingNet` separates paint from ground, pixel by pixel. Whether a piece of paint is a whole
 marking of a class shows in its shape and in the image about it. The classifier gets both: the quadrilateral
-rectified (:mod:`v2hdm.detection.classifier`) and what was measured of it
-(:data:`v2hdm.detection.classifier.FEATURES`), as the second stage of Faster R-CNN gets features of its
+rectified (:mod:`v2hdm.detection.evidence`) and what was measured of it
+(:data:`v2hdm.detection.evidence.FEATURES`), as the second stage of Faster R-CNN gets features of its
 region (Ren et al., NeurIPS 2015).
 """
 

@@ -32,20 +32,9 @@ from train.judge import JudgeConfig, Quadrilaterals, judged, train_judge
 from train.labels import LabelledImages
 from train.scenes.hardships import NONE
 from v2hdm.catalogue import SHIPPED, SYMBOL
-from v2hdm.detection.classifier import (
-    AMONG,
-    CHANNELS,
-    CLAIMED,
-    COMPANIES,
-    FEATURES,
-    SHAPES,
-    SIZE,
-    Readings,
-    features_among,
-    one_hot,
-    shape_of,
-)
+from v2hdm.detection.classifier import AMONG, COMPANIES, SHAPES, Readings, features_among, one_hot, shape_of
 from v2hdm.detection.detector import Detector
+from v2hdm.detection.evidence import CHANNELS, CLAIMED, FEATURES, SIZE
 from v2hdm.detection.network import Network
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.weights import CONFIDENCE_FILE, JUDGE_FILE

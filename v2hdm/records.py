@@ -301,6 +301,10 @@ class PaintLeft:
         return replace(self, change=self.share - before.share, change_sigma=sigma)
 
 
+UNSTATED_SIGMA_M = 0.02
+"""Standard deviation, m, of a corner's coordinate in a map that states none: drawn over an image."""
+
+
 @dataclass(frozen=True)
 class Marking:
     """One mapped marking."""

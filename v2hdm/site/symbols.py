@@ -101,7 +101,7 @@ def map_symbols(
         objections = [measure_parallax(view, 1).objections(options.min_probability)[0] for view in views]
         if None in objections:
             symbols_found.append(Symbol(kind, outline, len(camera)))
-            sides = [symbols.seen[n] for n in rows[members]]
+            sides = [symbols.seen_sides[n] for n in rows[members]]
             traces.append(eyes.traces(outlines, sides, image.ravel()))
         else:
             exclusions.append(Exclusion(kind, middle, len(camera), objections[0] or ""))

@@ -38,6 +38,7 @@ ENDING = ".v2hdm"  # of an entry's name, after its key
 
 LIBRARIES = (
     "torch", "kornia", "numpy", "scipy", "onnxruntime", "onnxruntime-gpu", "opencv-python-headless", "numba",
+    "simplejpeg",
 )  # fmt: skip
 """Libraries that the figures of a run depend on."""
 
