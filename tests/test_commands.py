@@ -45,6 +45,7 @@ def run_command(folder, *arguments, **variables):
 NEEDED = {
     "v2hdm map +run=port2": ("map", "torch", "kornia"),
     "v2hdm experiment": ("map", "torch", "matplotlib"),
+    "v2hdm simulate +run=port2": ("map", "omegaconf", "omegaconf"),
     "v2hdm check drive": ("map", "cv2", "matplotlib"),
     "v2hdm calibrate points points.csv --intrinsics a.yaml": ("map", "torch", "kornia"),
     "v2hdm mosaic outputs/port2": ("map", "torch", "kornia"),
@@ -183,7 +184,7 @@ def test_help_explains_each_command_and_names_it(name, capsys):
     assert COMMANDS[name].says in text
 
 
-@pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("map", "experiment")])
+@pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("map", "experiment", "simulate")])
 @pytest.mark.parametrize("given", ["", "--no\x1b[2Jsuch"])
 def test_arguments_that_are_missing_or_unknown_are_one_line_that_names_the_help(name, given, capsys):
     with pytest.raises(SystemExit, match="2"):
