@@ -177,8 +177,8 @@ SIGNIFICANCE = 1e-3  # share of maps as good as they state that are contradicted
 def check_points(table: CheckTable) -> Finding:
     """Whether the check points contradict the sigmas that map and survey state, by their chi-square.
 
-    Where they do, the simplest cause is named that leaves what it does not explain as stated: one point off, or
-    all off alike.
+    Where they do, the simplest cause is named that leaves what it does not explain as stated: one point off,
+    or all off alike.
     """
     total = len(table.compared) + len(table.unmatched)
     if not table.compared:

@@ -21,7 +21,7 @@ SAME_M = 1.0  # centres of one marking in the maps of two cameras lie closer tha
 _LEAST_SHARED = 8  # markings that two maps must share for their offset to be observable
 
 _OFFSET_LIMIT_SIGMAS = 5.0
-"""Largest offset of two cameras' maps in the sigmas of their centres and markings: below 3 on clean drives."""
+"""Largest offset of two cameras' maps, in sigmas of their centres and markings: below 3 on clean drives."""
 
 _LEAST_OFFSET_M = 0.03  # a smaller offset is no finding, however sure it is: corners are good to 2 cm
 
@@ -47,7 +47,7 @@ _HEIGHT_NOISE = 2.0  # noise of recorded heights over that of positions
 _SURE_SIGMAS = 5.0  # deviation of two passes' heights, in sigmas, that is no noise
 
 _LEAST_VARIANCE = np.array([1e-8] * 3 + [1e-10] * 3)
-"""Variances (m^2, rad^2) that are added to a mounting's: a tenth of a millimetre, a thousandth of a degree."""
+"""Variances (m^2, rad^2) added to a mounting's: a tenth of a millimetre, a thousandth of a degree."""
 
 
 def mounting_sigmas(mounting: Calibration, other: Calibration, of_both: bool = False) -> float:
