@@ -34,16 +34,18 @@ def write_judge(judge: Judge, views_shape: tuple[int, int, int], label: dict[str
         DetectorError: the file's answers would not be the network's.
     """
     rows_of_each = {0: torch.export.Dim("rows", min=1, max=4096)}
-    given = _any_rows(judge, views_shape, 5)
-    model = graph_of(judge, given, list(JUDGE_OUTPUTS), (rows_of_each,) * 3, _OPSET)
+    inputs = _any_rows(judge, views_shape, 5)
+    model = graph_of(judge, inputs, list(JUDGE_OUTPUTS), (rows_of_each,) * 3, _OPSET)
     session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
     for rows in _ROWS:
-        given = _any_rows(judge, views_shape, rows)
+        inputs = _any_rows(judge, views_shape, rows)
         with torch.no_grad():
-            expected = judge(*given.values())
-        named = {name: part.numpy() for name, part in given.items()}
-        for name, answer, own in zip(JUDGE_OUTPUTS, session.run(None, named), expected, strict=True):
-            difference = float(np.abs(answer - own.numpy()).max())
+            expected = judge(*inputs.values())
+        named = {name: part.numpy() for name, part in inputs.items()}
+        for name, answer, answer_of_network in zip(
+            JUDGE_OUTPUTS, session.run(None, named), expected, strict=True
+        ):
+            difference = float(np.abs(answer - answer_of_network.numpy()).max())
             if not difference <= _TOLERANCE:
                 raise DetectorError(f"{path} was not written: its {name} would differ by {difference:.2g}")
     write_labelled(model, label, path)

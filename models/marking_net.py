@@ -103,7 +103,8 @@ class ConvNormRelu(nn.Sequential):
 
     def fold(self) -> None:
         """Merge the running statistics into the convolution; only for a network in eval mode."""
-        convolution, norm = self[0], self[1]
+        convolution = self[0]
+        norm = self[1]
         if isinstance(convolution, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d):
             self[0] = fuse_conv_bn_eval(convolution, norm)
             self[1] = nn.Identity()
@@ -192,7 +193,8 @@ def _space_to_depth(image: Tensor) -> Tensor:
     """
     batch, height, width, _ = image.shape
     s = _STEM_STRIDE
-    rows, columns = height // s, width // s
+    rows = height // s
+    columns = width // s
     tiles = image.reshape(batch, rows, s, columns * s * 3).permute(0, 2, 1, 3)
     channels = tiles.reshape(batch * s, rows * columns, s * 3).permute(0, 2, 1)
     return (channels.reshape(batch, 3 * s * s, rows, columns).to(torch.float32) - _GREY_MEAN) * (
