@@ -64,7 +64,7 @@ class JudgeConfig:
 
 
 def train_judge(quadrilaterals: Quadrilaterals, config: JudgeConfig, start: Judge | None = None) -> Judge:
-    """A judge that has learnt from all of ``known``, ready to be asked.
+    """A judge that has learnt from all of ``quadrilaterals``, ready to be asked.
 
     One to ``start`` from knows most of it already: a quarter of the time at a third of the rate is enough.
     """
