@@ -32,8 +32,7 @@ from v2hdm.pipeline.base import write_changes
 from v2hdm.pipeline.config import Contents, made_of_drives
 from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.evaluate import CameraSets
-from v2hdm.pipeline.stages import BEST
-from v2hdm.records import Calibration, Drive, FloatArray, HDMap, Image, ImageDetections, Trajectory
+from v2hdm.records import BEST, Calibration, Drive, FloatArray, HDMap, Image, ImageDetections, Trajectory
 from v2hdm.report.photos import save_overlay
 from v2hdm.store import names
 from v2hdm.store.cache import library_versions

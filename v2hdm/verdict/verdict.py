@@ -117,7 +117,7 @@ class Verdict:
             "status": self.status.value,
             "headline": self.headline,
             "findings": [finding.as_json() for finding in self.raised],
-            "untold": [finding.as_json() for finding in self.unobservable],
+            "unobservable": [finding.as_json() for finding in self.unobservable],
             "passed": [finding.as_json() for finding in self.passed],
         }
 

@@ -204,7 +204,7 @@ def _confounded(estimate: GroundEstimate, key: str) -> str:
     """
     ahead = estimate.parameters.get("forward_m")
     if key == "focal_scale" and ahead is not None and not ahead.observable:
-        return "on a straight road focal length and height slide together: drive a turn"
+        return "on a straight road focal length and height slide together: include a turn"
     calibration = estimate.calibration
     if key == "distortion_k1" and calibration is not None:
         down_rad = np.arcsin(-calibration.cam_from_vehicle[2, 2])
@@ -217,7 +217,7 @@ def _judge_parameter(name: str, parameter: Parameter, confounded: str) -> Findin
     one = _CHECKS[parameter.name]
     vague = parameter.name in ("forward_m", "left_m") and parameter.sigma > _VAGUE_M
     if not parameter.observable or vague or confounded:
-        why = parameter.why_not or confounded or "the route turns too little; drive a turn"
+        why = parameter.why_not or confounded or "the route turns too little; include a turn"
         says = f"this drive does not show it: {why}"
         return Finding(one.name, Status.PASS, None, one.scale * one.limit, one.unit, says, name)
     value = one.scale * parameter.value

@@ -130,7 +130,7 @@ def ground_ahead(calibration: Calibration) -> tuple[float, str]:
         _radius_m(moves[:, own] @ covariance[own, own] @ moves[:, own].T)
         for own in (slice(0, 3), slice(3, 6), slice(6))
     )
-    of_place = "drive a turn, or survey the camera's place"
+    of_place = "include a turn, or survey the camera's place"
     of_turn = "drive past more markings, near and far"
     return left_m, of_place if place_m > turn_m else of_turn
 

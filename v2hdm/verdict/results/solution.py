@@ -29,13 +29,11 @@ from v2hdm.faults.odds import (
 from v2hdm.faults.sensitivity import STRETCHES
 from v2hdm.ground import GroundEstimate
 from v2hdm.mapping.results import MethodResult, SolveEvidence
-from v2hdm.records import Drive
+from v2hdm.records import BEST, Drive
 from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN
 from v2hdm.site.parallax import NOT_OBSERVED, NOT_ON_GROUND
 from v2hdm.verdict.results import agreement
 from v2hdm.verdict.verdict import Finding, Status, judge, passed
-
-BEST = "Opt"  # the method whose map is the result
 
 # Mean robust loss of held-out observations: clean drives reach 1.9 to 2.3, wrong inputs begin at 6.5.
 _HELD_OUT_LIMIT = 4.0
@@ -217,7 +215,7 @@ def _agrees(check: str, tested: list[Contradiction]) -> Finding:
         below = f" below {_least_shown(least)}" if np.isfinite(_sigma(least)) else ""
         whose = " that all cameras share" if hidden else ""
         says = f"the markings of this drive do not reveal errors{whose}{below}"
-        return passed(check, ", ".join(least.cameras), f"{says}: drive a turn, and past more of them")
+        return passed(check, ", ".join(least.cameras), f"{says}: include a turn, and drive past more of them")
     worst = max(observable, key=lambda one: one.sigmas)
     if is_contradicted(worst):
         says = "not told apart from what is named as wrong: fix that first"
@@ -265,7 +263,7 @@ def _unobservable(evidence: SolveEvidence, raised: set[str]) -> Iterator[Finding
     loose = _loose_levers(evidence)
     if loosest_s > _CLOCK_OBSERVABLE_S and "clock" not in raised:
         sure = f"to better than {2e3 * loosest_s:.0f} ms" if np.isfinite(loosest_s) else "at all"
-        says = f"the markings do not show {sure} whether all clocks are equally late: drive a turn"
+        says = f"the markings do not show {sure} whether all clocks are equally late: include a turn"
         yield passed("clock", "all cameras", says)
     if loose and "survey" not in raised:
         names = " and ".join(("forward", "left")[axis] for axis in sorted({one.axis for one in loose}))
@@ -273,7 +271,7 @@ def _unobservable(evidence: SolveEvidence, raised: set[str]) -> Iterator[Finding
         shows = f"shows only to {200 * worst_m:.0f} cm" if worst_m < 1 else "does not show"
         says = (
             f"this drive {shows} how far {names} the cameras are from the poses' reference point: "
-            "the result relies on the survey of centre and antenna; drive a turn"
+            "the result relies on the survey of centre and antenna; include a turn"
         )
         yield passed("survey", "all cameras", says)
 
