@@ -25,8 +25,8 @@ from onnx import helper, numpy_helper
 
 from export.graph import Graph
 
-_CHANNELS_LAST = [0, 2, 3, 1]
-_CHANNELS_FIRST = [0, 3, 1, 2]
+_CHANNELS_LAST = [0, 2, 3, 1]  # places of (n, c, h, w) that make (n, h, w, c)
+_CHANNELS_FIRST = [0, 3, 1, 2]  # places of (n, h, w, c) that make (n, c, h, w)
 
 _TO_FINER = ["Reshape", "Transpose", "Reshape", "Transpose", "Reshape"]
 """The nodes that turn four channels into one of twice the resolution."""

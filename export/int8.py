@@ -29,7 +29,7 @@ from v2hdm.errors import DetectorError
 HIGHEST_WEIGHT = 64
 """Weights are integers from minus this to this."""
 
-_HIGHEST_INPUT = 255
+_HIGHEST_INPUT = 255  # highest value of a byte
 
 _ROWS = slice(None, None, 4)
 """Share of an output's rows that the correlation of its inputs is estimated from."""

@@ -16,9 +16,9 @@ from models.judge import Judge
 from v2hdm.detection.classifier import JUDGE_INPUTS, JUDGE_OUTPUTS
 from v2hdm.errors import DetectorError
 
-_OPSET = 20
-_TOLERANCE = 1e-3
-_ROWS = (1, 7, 64)
+_OPSET = 20  # version of ONNX's operators
+_TOLERANCE = 1e-3  # largest difference of the file's answers from the network's
+_ROWS = (1, 7, 64)  # numbers of rows that the file is checked with
 
 
 def write_judge(judge: Judge, views_shape: tuple[int, int, int], label: dict[str, Any], path: Path) -> None:

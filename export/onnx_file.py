@@ -28,7 +28,7 @@ from v2hdm.detection.network import METADATA_KEY
 from v2hdm.errors import ConfigError, DetectorError
 from v2hdm.store.files import whole_file
 
-_PARITY_SEED_OFFSET = 1_000_003
+_PARITY_SEED_OFFSET = 1_000_003  # distance of the seeds that a file is checked with from those of its making
 _FITTING = 0.15
 """Share of the time of an int8 export that does not go into its renders, about."""
 

@@ -16,7 +16,7 @@ _CELLS = 2
 """Rows and columns that convolutions end in: means over parts of a view that overlap in its middle."""
 
 
-_SIDES = 4
+_SIDES = 4  # sides of a quadrilateral
 _LOG_SIGMA = (-4.0, 4.0)
 """Limits of the logarithm of a side's error, px."""
 

@@ -26,15 +26,15 @@ from v2hdm.settings import Within
 MULTIPLE = 16
 """Image height and width must be multiples of this many pixels."""
 
-PAINT_STRIDE = 2
-KIND_STRIDE = 4
+PAINT_STRIDE = 2  # image pixels per element of paint, in both directions
+KIND_STRIDE = 4  # image pixels per element of kinds, in both directions
 LANE_STRIDE = 8
 """Image pixels per element of each output, in both directions."""
 
-_STEM_STRIDE = 4
+_STEM_STRIDE = 4  # image pixels per element after the first convolution, in both directions
 PAINT_UPSCALE = _STEM_STRIDE // PAINT_STRIDE
-_GREY_MEAN = 112.0
-_GREY_SCALE = 64.0
+_GREY_MEAN = 112.0  # grey level that is subtracted from an image
+_GREY_SCALE = 64.0  # grey levels that are the unit of an image
 
 
 @dataclass(kw_only=True)

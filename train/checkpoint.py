@@ -33,7 +33,7 @@ _FREE_TO_CHANGE = (
     "validation",
 )
 
-_VIEWS_TO_UNFOLD = 24
+_VIEWS_TO_UNFOLD = 24  # views by which folded weights are unfolded
 _ENTRY = ("family", "length_m", "width_m", "softness", "group")
 
 

@@ -17,21 +17,22 @@ from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.network import NetworkOutput
 from v2hdm.records import CROSSWALK_BAR, DIAMOND, LANE_DASH, FloatArray
 
-SPOTS = 3
-_TRIES = 20
-_RADIUS_M = (0.2, 0.9)
-_SLIM = (0.3, 1.0)
+SPOTS = 3  # spots of sun that an image gets at most
+_TRIES = 20  # places that are tried for one spot
+_RADIUS_M = (0.2, 0.9)  # least and largest radius of a spot, m
+_SLIM = (0.3, 1.0)  # least and largest ratio of a spot's axes
 _SOFT = (0.15, 0.8)
 """By which share of its radius a spot fades out."""
 
-_GAIN = (1.3, 3.5)
+_GAIN = (1.3, 3.5)  # least and largest factor on the light in a spot
 _BOUND_PX = 6
 """Distance of spots from markings, which must not change, px."""
 
 _CLAIM_ODDS = (4.0, 16.0)
 """How fast the network's log odds of paint rise with the light of a spot."""
 
-_CLAIM_LOGIT = 8.0
+_CLAIM_LOGIT = 8.0  # logits that the claimed class gains within a spot
+# Shares of the classes that the network takes spots for.
 _CLAIMED = {DIAMOND: 0.6, LANE_DASH: 0.2, CROSSWALK_BAR: 0.2}
 
 

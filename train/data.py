@@ -20,7 +20,7 @@ from train.scenes.scenes import TrainingSample, training_sample
 from train.targets import Targets, targets
 from v2hdm.workers import undisturbed_starts
 
-_VALIDATION_SEED_OFFSET = 1_000_003
+_VALIDATION_SEED_OFFSET = 1_000_003  # distance of the validation's seeds from the training's
 
 Pair = tuple[Tensor, Targets]
 """Images (H, W, 3) uint8 and the answers for them."""

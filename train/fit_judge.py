@@ -42,10 +42,10 @@ from v2hdm.geometry.planar import Quad, following
 from v2hdm.records import BoolArray, FloatArray
 from v2hdm.store.files import replace_text, whole_file
 
-SEED = 917
-EASY = 0.2
-RIDGE = 2.0
-FOLDS = 5
+SEED = 917  # seed of the rendered scenes, not that of the benchmark nor of a training
+EASY = 0.2  # difficulty of the easy scenes
+RIDGE = 2.0  # information of the prior that weights of the logistic functions are 0
+FOLDS = 5  # parts of the images by which log loss is measured, each by a fit to the others
 _JUDGE_FOLDS = 2
 """Parts of the images, each judged by what was learnt from the others; a judge takes minutes to learn."""
 
@@ -62,12 +62,12 @@ HARDSHIPS = replace(
 """Those of training, oftener where the classifier decides: outlines and letters, stop lines that meet lines,
 ends that are hidden. A camera that looks aside sees classes by other names."""
 
-JUNCTIONS_SHARE = 1 / 12
+JUNCTIONS_SHARE = 1 / 12  # share of the scenes, the last ones, that are at junctions
 AT_JUNCTIONS = replace(HARDSHIPS, junctions=0.7, crossings=0.7)
 """The last of the scenes have most of the stop lines, which are else one in two hundred true readings."""
 
 CONFIG = JudgeConfig()
-LIT_EVERY = 2
+LIT_EVERY = 2  # every so many-th image is looked at once more with spots of sun
 MIRRORED_EVERY = 3
 """Which images are looked at once more, with spots of sun and as in the mapping."""
 

@@ -33,10 +33,10 @@ from v2hdm.detection.weights import LANE_SCORE_FILE
 from v2hdm.records import BoolArray, FloatArray
 from v2hdm.store.files import replace_text
 
-SEED = 921
-ROUNDS = 2
-LEAST_SHARE = 0.8
-_MOST_SLOPE = 10.0
+SEED = 921  # seed of the rendered scenes, not that of the benchmark nor of a training
+ROUNDS = 2  # rounds of proposing lines by the weights fitted before
+LEAST_SHARE = 0.8  # share of a line's points that must lie on a true one
+_MOST_SLOPE = 10.0  # most columns a row of a line, by which the tolerance about it is widened
 
 KEYS = {"alone": score.ALONE, "among": score.AMONG}
 

@@ -32,7 +32,7 @@ VALIDATION = "validation"
 JUDGING = "judging"
 """The roles of labelled images."""
 
-_BLOCK_PLACES = 10
+_BLOCK_PLACES = 10  # neighbouring photographs that have one role
 _ROLES = (LEARNT, LEARNT, LEARNT, VALIDATION, LEARNT, JUDGING, LEARNT, LEARNT, JUDGING, LEARNT)
 
 _ZOOM = (0.6, 1.5)

@@ -13,7 +13,7 @@ from v2hdm.records import FloatArray
 from v2hdm.safe.texts import parse_json, read_text, shown
 
 _KEYS = ("raw_file", "lanes", "h_samples")
-_LEAST_POINTS = 2
+_LEAST_POINTS = 2  # least number of points of a lane's line
 
 
 def read_tusimple(path: Path, images: Path) -> list[LabelledImage]:

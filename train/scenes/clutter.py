@@ -17,8 +17,8 @@ from v2hdm.simulate.render.scene import Bgr, Box, GroundMarks
 Factor = NDArray[np.uint8]
 Thing = Callable[[np.random.Generator, float, float], list[Box]]
 
-_MARKS_M = (56.0, 28.0)
-_MARKS_RESOLUTION_M = 0.04
+_MARKS_M = (56.0, 28.0)  # length and width of the ground that has marks, m
+_MARKS_RESOLUTION_M = 0.04  # ground per element of the marks, m
 _BESIDE_M = (
     ((0.8, 0.15, 0.5), (4.0, 0.6, 1.1)),
     ((0.3, 0.2, 0.8), (1.2, 0.8, 2.5)),

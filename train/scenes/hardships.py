@@ -18,15 +18,15 @@ from v2hdm.records import ARROW, CROSSWALK_BAR, STOP_LINE, FloatArray
 from v2hdm.simulate.render.renderer import Optics
 from v2hdm.simulate.render.scene import Bgr, Box, Ground, GroundMarks, Light, Paint, Shadow, box_footprint
 
-_CROSSED_M = 22.0
-_LONGEST_LEVEL = 0.9
-_CAMERA_CLEARANCE_M = 3.5
-_KERB_M = 45.0
-_SEAM_STEP_M = 0.25
+_CROSSED_M = 22.0  # distance ahead, m, within which a shadow may cross a marking
+_LONGEST_LEVEL = 0.9  # highest mean level of an overexposed image, of 1
+_CAMERA_CLEARANCE_M = 3.5  # least distance of things beside markings from the camera, m
+_KERB_M = 45.0  # distance ahead to which kerbs reach, m
+_SEAM_STEP_M = 0.25  # distance between the points of a seam, m
 _BLEACHED_ALBEDO = (0.37, 0.52)
 """Of sun-bleached concrete; fresh paint has 0.6 to 0.9."""
 
-_BLEACHED_OVEREXPOSED = 0.5
+_BLEACHED_OVEREXPOSED = 0.5  # least share of images of bleached ground that are overexposed
 _SHIFT = 4
 """Bits of fraction of the coordinates that OpenCV is given."""
 

@@ -23,18 +23,18 @@ from v2hdm.records import (
 )
 from v2hdm.simulate.render.scene import WHITE_PAINT, YELLOW_PAINT, Bgr, Paint
 
-FAR_M = 50.0
-_DIAMONDS_FAR_M = 32.0
-_NEAR_M = -4.0
-_LANE_STEP_M = 0.5
+FAR_M = 50.0  # distance ahead to which lines are painted, m
+_DIAMONDS_FAR_M = 32.0  # distance ahead to which fields of diamonds reach, m
+_NEAR_M = -4.0  # distance ahead from which the ground is painted, m
+_LANE_STEP_M = 0.5  # distance between the points of a lane's line, m
 _PASSING_M = 3.0
 """Over such a length a curve drawn by hand passes from two strands to the one that goes on."""
 
 _LEAST_APART_M = 0.75
 """Strands nearer than this are those of one line to whoever drives or labels."""
 
-_PIECE_M = 2.5
-_PIECE_BESIDE_M = 0.02
+_PIECE_M = 2.5  # largest length of a straight piece of a bent line, m
+_PIECE_BESIDE_M = 0.02  # largest distance of a straight piece from the bend, m
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from train.scenes.paint import arrow, crosswalk, rectangle, rhombus, stop_line
 from v2hdm.records import FloatArray
 from v2hdm.simulate.render.scene import Box, GroundMarks, placed
 
-_SHIFT = 4
-_MARGIN_PX = 3
+_SHIFT = 4  # bits of fraction of the coordinates that OpenCV is given
+_MARGIN_PX = 3  # elements around an erased marking that are redrawn
 
 
 def with_erased(rng: np.random.Generator, marks: GroundMarks | None, mean: float) -> GroundMarks | None:

@@ -63,15 +63,15 @@ from v2hdm.simulate.render.scene import Backdrop, Bgr, Ground, GroundMarks, Ligh
 
 # The renderer keeps one tile per fleck size, so sizes come from a short list.
 _NEAR_M = 0.3
-_STEPS_BETWEEN = 5
-_LENS_TOLERANCE_PX = 1.0
+_STEPS_BETWEEN = 5  # parts of each piece of a line that is projected through the lens
+_LENS_TOLERANCE_PX = 1.0  # largest error of undistorting a point, px, whose place in the image is known
 _TO_ONE_ASIDE = np.array(
     [0, *(1 + PAINT_CLASSES.index(SEEN_ACROSS.get(kind, kind)) for kind in PAINT_CLASSES)], dtype=np.uint8
 )
 """By label, the answer for a camera on the vehicle's side: the detector knows how its cameras look, and turns
 the names back, see :mod:`v2hdm.detection.network`."""
 
-_FLECK_SIZES_M = tuple(float(s) for s in np.geomspace(0.12, 2.5, 10))
+_FLECK_SIZES_M = tuple(float(s) for s in np.geomspace(0.12, 2.5, 10))  # sizes of flecks of sun, m
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from v2hdm.geometry.planar import clip_convex, inside_convex
 from v2hdm.records import DIAMOND, LANE_DASH, LANE_LINE, OTHER_PAINT, STOP_LINE, FloatArray
 from v2hdm.simulate.render.scene import Paint
 
-_ACROSS_M = 9.0
+_ACROSS_M = 9.0  # distance to either side, m, within which lines meet a stop line
 _LANE_M = (2.2, 4.2)
 """Width of what counts as a lane between two lines."""
 

@@ -16,15 +16,15 @@ from v2hdm.simulate.render.scene import Bgr, Box, Float32
 
 Picture = NDArray[np.uint8]
 
-_PX_PER_M = 50
-_SHIFT = 4
+_PX_PER_M = 50  # resolution of the pictures on a thing's sides, px per m
+_SHIFT = 4  # bits of fraction of the coordinates that OpenCV is given
 _CLEARANCE_M = 2.2
 """Distance of everything from the camera, which stands at the map's origin, m."""
 
-_BLACK = (0.02, 0.02, 0.02)
-_RED = (0.05, 0.05, 0.5)
-_WHITE = (0.75, 0.78, 0.78)
-_YELLOW = (0.03, 0.5, 0.7)
+_BLACK = (0.02, 0.02, 0.02)  # radiance, BGR, of black stripes and tyres
+_RED = (0.05, 0.05, 0.5)  # radiance, BGR, of red stripes
+_WHITE = (0.75, 0.78, 0.78)  # radiance, BGR, of white stripes
+_YELLOW = (0.03, 0.5, 0.7)  # radiance, BGR, of yellow stripes
 _GLASS = ((0.03, 0.03, 0.03), (0.12, 0.1, 0.08), (0.5, 0.42, 0.36))
 """Windows: dark ones, and those that mirror the sky."""
 

@@ -16,7 +16,7 @@ from v2hdm.simulate.render.renderer import Optics
 from v2hdm.simulate.render.scene import Float32, Ground, Light, Tile, noise_tile, sample, smoothstep
 from v2hdm.simulate.render.view import View, bands_of, outlines
 
-_TILE_PX = 512
+_TILE_PX = 512  # side of a tile of a photographed ground, elements
 _GROUNDS = Path(__file__).parent / "grounds"
 GROUNDS = tuple(sorted(path.stem for path in _GROUNDS.glob("*.jpg")))
 """Photographs of asphalt and concrete that come with the training; see their README."""

@@ -25,7 +25,7 @@ LOW_SUN_SINE = 0.2
 RAINED_FRACTION = 0.7
 """From this wet fraction on the ground mirrors what stands on it."""
 
-_LEAST_MIRRORED_PX = 8
+_LEAST_MIRRORED_PX = 8  # least number of rows above and below the horizon to mirror
 
 
 def before_lens(
