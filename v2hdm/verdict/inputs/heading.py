@@ -217,7 +217,7 @@ def _upright(rotation: FloatArray, chords: Chords) -> BoolArray:
 
 def _turns_too_fast(motion: Motion) -> bool:
     """Whether the heading turns about 180 / pi times as much as the path."""
-    course = np.unwrap(np.arctan2(*motion.course.T[::-1]))
+    course = np.unwrap(np.arctan2(motion.course[:, 1], motion.course[:, 0]))
     path_turn = np.abs(np.diff(course)).sum()
     steps = angle_between(motion.rotation[:-1, :2, 0], motion.rotation[1:, :2, 0])
     return bool(np.abs(steps).sum() > 10 * max(path_turn, 0.1))
