@@ -62,7 +62,7 @@ def test_a_value_within_five_of_its_sigmas_passes_and_a_clock_beyond_what_is_cor
     assert [one.status for one in findings if one.check == "clock"] == [Status.FAIL]
 
 
-WHY = "constant speed on a straight road: drive a turn"
+WHY = "constant speed on a straight road: include a turn"
 LEVEL = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 OPEN = {
     "clock": (known(estimate(), "clock_s", 0.1, 0.01, WHY), WHY),

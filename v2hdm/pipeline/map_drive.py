@@ -23,9 +23,9 @@ from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.evaluate import evaluate
 from v2hdm.pipeline.inspect import Inspection, inspect_each, join
 from v2hdm.pipeline.result import Result, describe_run
-from v2hdm.pipeline.stages import BEST, MappedSet, detect_in_pieces, map_camera_sets
+from v2hdm.pipeline.stages import MappedSet, detect_in_pieces, map_camera_sets
 from v2hdm.progress import Progress, silent
-from v2hdm.records import Drive, ImageDetections
+from v2hdm.records import BEST, Drive, ImageDetections
 from v2hdm.site.living.changes import Base
 from v2hdm.site.living.wear import with_wear
 from v2hdm.store.cache import StageCache

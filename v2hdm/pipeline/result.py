@@ -19,8 +19,7 @@ from v2hdm.mapping.results import AdjustedPoses, MethodResult
 from v2hdm.pipeline.config import Contents, made_of_drives
 from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.evaluate import CameraSets
-from v2hdm.pipeline.stages import BEST
-from v2hdm.records import Calibration, Drive, HDMap, ImageDetections
+from v2hdm.records import BEST, Calibration, Drive, HDMap, ImageDetections
 from v2hdm.store.cache import library_versions
 from v2hdm.survey.check_points import CheckTable
 from v2hdm.verdict import Verdict

@@ -30,8 +30,7 @@ from v2hdm.mapping.results import AdjustedPoses, MethodResult
 from v2hdm.mosaic.result import write_mosaic
 from v2hdm.pipeline.base import change_json
 from v2hdm.pipeline.context import Context
-from v2hdm.pipeline.stages import BEST
-from v2hdm.records import Changes, Drive, FloatArray, HDMap, Image, ImageDetections, Trajectory
+from v2hdm.records import BEST, Changes, Drive, FloatArray, HDMap, Image, ImageDetections, Trajectory
 from v2hdm.report.page.document import write_page
 from v2hdm.report.photos import save_overlay
 from v2hdm.store import names
