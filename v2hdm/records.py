@@ -37,6 +37,9 @@ SEEN_ACROSS: Mapping[str, str] = {LANE_DASH: STOP_LINE, STOP_LINE: LANE_DASH}
 LANE_BOUNDARY = "lane_boundary"
 """Kind of a lane detection that is a whole line, gaps between dashes and hidden parts included."""
 
+BEST = "Opt"
+"""Name of the method whose map and calibration are the result, also in ``metrics.json``."""
+
 DISTORTION_COEFFICIENTS: Mapping[str, int] = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
 """Distortion models by their ROS ``camera_info`` name, with their number of coefficients."""
 

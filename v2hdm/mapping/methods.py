@@ -36,7 +36,18 @@ from v2hdm.mapping.optimise import silent
 from v2hdm.mapping.options import MappingOptions, check_options
 from v2hdm.mapping.recovery import Outcome, optimise
 from v2hdm.mapping.results import AdjustedPoses, ClockOffset, MethodResult
-from v2hdm.records import Drive, Exclusion, FloatArray, HDMap, Image, ImageDetections, IntArray, Lane, Marking
+from v2hdm.records import (
+    BEST,
+    Drive,
+    Exclusion,
+    FloatArray,
+    HDMap,
+    Image,
+    ImageDetections,
+    IntArray,
+    Lane,
+    Marking,
+)
 from v2hdm.site.corrections import with_symbols_corrected
 from v2hdm.site.living.changes import Base, update_map
 from v2hdm.site.living.looks import Observer
@@ -183,7 +194,7 @@ def run_methods(
     if base is not None:
         progress("the earlier map")
         optimal = _brought_up_to_date(base, optimal, outcome, optimised, grey)
-    results["Opt"] = optimal
+    results[BEST] = optimal
     progress("ONI")
     found = optimal.calibrations
     ipm_found = {c: ipm_from_extrinsic(found[c].info, found[c].cam_from_vehicle) for c in cameras}
@@ -310,7 +321,7 @@ def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
         hd_map = replace(hd_map, ground=surface.strips())
     hd_map, rejected = with_symbols_corrected(hd_map, options.acceptance.corrections)
     return MethodResult(
-        name="Opt",
+        name=BEST,
         cameras=tuple(cameras),
         hd_map=hd_map,
         calibrations=optimised.calibrations,
