@@ -145,7 +145,9 @@ def _crowned(trajectory: Trajectory, fall: float) -> Heights:
     return of
 
 
-def _look(floor: FloatArray, rays_vehicle: FloatArray, pose: FloatArray, height_m: Heights | None) -> FloatArray:
+def _look(
+    floor: FloatArray, rays_vehicle: FloatArray, pose: FloatArray, height_m: Heights | None
+) -> FloatArray:
     """The floor as the camera sees it; level at z = 0 without ``height_m``."""
     rays = rays_vehicle @ pose[:3, :3].T
     centre = pose[:3, :3] @ CENTRE + pose[:3, 3]
