@@ -20,7 +20,7 @@ def sigmas_of(p_value: float) -> float:
 class ScoreTest:
     """The test of one fault."""
 
-    fault_name: str  # of the hypothesis, by which the cache keeps it
+    fault_name: str  # of the hypothesis; by name a test can be cached
     camera: int  # index in the problem; -1 for all together
     # axis, 0 to 2, of the vehicle (survey, lever, knock), map (slope, datum; step: east, north, north-east,
     # north-west) or image (principal); side (crown: both, left, right); or shape of a drift
