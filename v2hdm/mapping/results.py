@@ -44,6 +44,7 @@ class ForeignSegment(NamedTuple):
 
 
 NO_SEGMENT = ForeignSegment(0.0, 0.0, 0.0)
+"""No image is foreign: times, s, of an empty segment, and even odds."""
 
 
 @dataclass(frozen=True)
