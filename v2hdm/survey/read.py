@@ -20,7 +20,7 @@ from v2hdm.errors import DriveError
 from v2hdm.geometry import geodetic
 from v2hdm.io.importers.readings import read_rows
 from v2hdm.io.trajectory import parse_number
-from v2hdm.records import FloatArray, GeodeticOrigin
+from v2hdm.records import FOOT_M, FloatArray, GeodeticOrigin
 
 _log = logging.getLogger(__name__)
 
@@ -154,7 +154,7 @@ def misreadings(table: SurveyTable, origin: GeodeticOrigin | None) -> dict[str, 
     first, second = table.frame.columns
     others = {f"with {first} and {second} swapped": replace(table, coordinates=table.coordinates[:, ::-1])}
     if table.frame is not Frame.GEODETIC:
-        others["in feet"] = replace(table, coordinates=0.3048 * table.coordinates)
+        others["in feet"] = replace(table, coordinates=FOOT_M * table.coordinates)
         others["in millimetres"] = replace(table, coordinates=1e-3 * table.coordinates)
     if table.frame is Frame.GRID:
         others["as local metres (columns x_m, y_m)"] = replace(table, frame=Frame.MAP)
