@@ -30,6 +30,7 @@ from v2hdm.geometry.rigid import camera_centre, interpolate, inverse
 from v2hdm.progress import Steps
 from v2hdm.records import SIGMA_OF_MAD, BoolArray, CameraInfo, Drive, FloatArray, Image, IntArray, Trajectory
 from v2hdm.report.page.facts import CameraFacts, Facts, read_facts
+from v2hdm.site.living.looks import HIDDEN_SIGMA
 from v2hdm.store.files import write_json
 from v2hdm.surface.surface import Surface
 
@@ -49,7 +50,6 @@ _DETECTED = np.array([0.98, 0.005, 0.015])
 """Probability that an image in which a marking was detected shows, hides or partly hides it."""
 
 _FAINT_SHARE = 0.1  # share of the sides that are faint where shown
-_HIDDEN_SIGMA = 0.5  # standard deviation of the contrast of what stands before a side
 _ALIKE = 0.5  # power of the likelihood of one side: the four of one image err alike
 _PAIRS_OF_BIN = 100  # detected sides by which contrasts of one size in the image are learned
 _MOST_BINS = 8  # sizes in the image, at most, of which contrasts are learned
@@ -293,7 +293,7 @@ def _states(views: Sequence[_View], outlines: int) -> IntArray:
     faint = norm.logpdf(np.where(is_known, contrast - usual / 2, 0.0), 0.0, np.abs(usual) / 3 + sigma)
     clear = np.log1p(-_FAINT_SHARE) + norm.logpdf(off, 0.0, sigma)
     shown = logsumexp([clear, np.log(_FAINT_SHARE) + faint], axis=0)
-    hidden = norm.logpdf(np.where(is_known, contrast, 0.0), 0.0, _HIDDEN_SIGMA)
+    hidden = norm.logpdf(np.where(is_known, contrast, 0.0), 0.0, HIDDEN_SIGMA)
     either = np.logaddexp(shown, hidden) + np.log(0.5)
     sides = np.where(is_known[..., None], _ALIKE * np.stack([shown, hidden, either], axis=2), 0.0).sum(axis=1)
     share = _PRIOR / _PRIOR.sum()
@@ -330,12 +330,12 @@ def _expected(
     """Contrast (V, 4) and its sigma that sides have when shown, by how large a metre is in the image."""
     used = np.isfinite(contrast) & np.isfinite(usual) & detected[:, None]
     if used.sum() < _LEAST_PAIRS:
-        return usual, np.full_like(usual, _HIDDEN_SIGMA)
+        return usual, np.full_like(usual, HIDDEN_SIGMA)
     order = np.sort(np.broadcast_to(size[:, None], used.shape)[used])
     bins = max(1, min(_MOST_BINS, len(order) // _PAIRS_OF_BIN))
     bin_of_view = np.searchsorted(order[:: -(-len(order) // bins)][1:], size)
     factor = np.ones(len(size))
-    sigma = np.full(len(size), _HIDDEN_SIGMA)
+    sigma = np.full(len(size), HIDDEN_SIGMA)
     for number in np.unique(bin_of_view):
         in_bin = bin_of_view == number
         rows = used & in_bin[:, None]

@@ -33,7 +33,8 @@ from v2hdm.mapping.options import MappingOptions
 from v2hdm.pipeline.config import DriveConfig, RunConfig
 from v2hdm.pipeline.run import run
 from v2hdm.report.metrics import marking_metrics
-from v2hdm.simulate import PortConfig, rendered_drive
+from v2hdm.simulate.port.config import PortConfig
+from v2hdm.simulate.port.drive import rendered_drive
 from v2hdm.workers import share_out
 
 ROUTES = {

@@ -24,7 +24,7 @@ FIT = CameraFit(observations=2000, variance_factor=0.15, rejected_share=0.02)
 
 def contradiction(fault, cameras, axis, about, value, sigma, sigmas):
     numbers = value, sigma, sigma, 2 * norm.sf(sigmas), sigmas**2 / 2
-    return Contradiction(fault, 0 if len(cameras) == 1 else -1, axis, -1, *numbers, cameras, about)
+    return Contradiction(fault.name, 0 if len(cameras) == 1 else -1, axis, -1, *numbers, cameras, about)
 
 
 CLOCK = contradiction(table.CLOCK, ("front", "rear"), 0, "", 0.001, 0.001, 1.0)

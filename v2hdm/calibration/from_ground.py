@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from v2hdm.geometry.ipm import mounting_words
-from v2hdm.ground import GroundEstimate, GroundStatus, Reading, estimate_cameras
+from v2hdm.ground.estimate import estimate_cameras
+from v2hdm.ground.results import GroundEstimate, GroundStatus, Reading
 from v2hdm.io.calibration.reading import Provenance
 from v2hdm.io.calibration.writing import write_calibration
 from v2hdm.io.drive import as_drive

@@ -13,7 +13,7 @@ from v2hdm.detection.network import NetworkOutput
 from v2hdm.detection.quads.fit import STATISTICS, Fit
 from v2hdm.detection.quads.patch import ImageQuads, Patches, grey_of, log_light
 from v2hdm.detection.quads.propose import Proposal
-from v2hdm.geometry.planar import Quad
+from v2hdm.geometry.planar import Quad, cross
 from v2hdm.records import DIAMOND, LANE_LINE, FloatArray
 
 CLAIMED = (
@@ -179,10 +179,10 @@ def _points(corners: FloatArray, is_diamond: np.ndarray, size: int) -> np.ndarra
     # Vectors from the third corner.
     to_second = second - third
     to_fourth = fourth - third
-    determinant = _cross(to_second, to_fourth)
+    determinant = cross(to_second, to_fourth)[:, None]
     determinant = np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
-    g = _cross(surplus, to_fourth) / determinant
-    h = _cross(to_second, surplus) / determinant
+    g = cross(surplus, to_fourth)[:, None] / determinant
+    h = cross(to_second, surplus)[:, None] / determinant
     to_px = np.empty((len(corners), 3, 3))
     to_px[:, :2] = np.stack([second - first + g * second, fourth - first + h * fourth, first], axis=-1)
     to_px[:, 2] = np.column_stack([g, h, np.ones(len(g))])
@@ -200,8 +200,3 @@ def _grids(size: int) -> np.ndarray:
         along, across = (step * (1 + 2 * margin) - margin for margin in margins)
         grid[:2] = np.meshgrid(along, across)
     return grids.reshape(2, 3, -1)
-
-
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Cross product (M, 1) of vectors (M, 2)."""
-    return np.asarray(a[..., :1] * b[..., 1:] - a[..., 1:] * b[..., :1])

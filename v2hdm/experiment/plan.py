@@ -13,7 +13,7 @@ from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError
 from v2hdm.mapping.options import INCREMENTAL, MappingOptions, check_options
 from v2hdm.pipeline.config import DriveConfig
-from v2hdm.simulate import PortConfig
+from v2hdm.simulate.port.config import PortConfig
 from v2hdm.store.files import refuse_url
 
 OURS = "ours"

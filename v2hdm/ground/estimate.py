@@ -15,14 +15,10 @@ from v2hdm.ground.model import Mount, guessed_mount
 from v2hdm.ground.motion import ARM_M, Motion, changing_pairs, motion_of, spread_pairs
 from v2hdm.ground.patches import STRIP_M, Matcher, Round
 from v2hdm.ground.prior import Observations, Stated, state_sigmas
-from v2hdm.ground.results import GroundEstimate, GroundOptions, GroundStatus, Parameter, Reading
+from v2hdm.ground.results import STEEP_RAD, GroundEstimate, GroundOptions, GroundStatus, Parameter, Reading
 from v2hdm.ground.start import Readings, contradicts, try_readings
 from v2hdm.records import Calibration, Drive, PoseNoise
 from v2hdm.workers import share_out
-
-STEEP_RAD = np.deg2rad(10)
-"""Least depression of a camera: seen flatter, focal length and height appear as a product, and lens
-distortion looks like a curved road."""
 
 _FREE_CENTRE = {"forward_m": (0, 2.0), "left_m": (1, 2.0), "up_m": (2, 0.3)}  # axis, prior sigma, m
 _STRAIGHT = "the vehicle drives straight: include a turn"

@@ -12,12 +12,11 @@ from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError, DriveError, need
 from v2hdm.io.drive import ReadOptions, drive_name
 from v2hdm.io.maps.corrections import read_corrections
-from v2hdm.io.maps.formats import check_formats
 from v2hdm.mapping.options import BATCH, INCREMENTAL, MappingOptions, check_options
 from v2hdm.records import Drive, Image
 from v2hdm.safe.texts import shown, take_camera_name, take_name
 from v2hdm.settings import MOST_PROCESSES, NOT_NEGATIVE, POSITIVE, Within, check_settings
-from v2hdm.simulate import PortConfig
+from v2hdm.simulate.port.config import PortConfig
 from v2hdm.store import names
 from v2hdm.store.cache import key_of
 from v2hdm.store.files import file_digest
@@ -148,6 +147,7 @@ def run_name(config: RunConfig) -> str:
 def admit(config: RunConfig) -> str:
     """Raise ConfigError, which names the key, for settings that cannot work; returns the run's name."""
     from v2hdm.detection.detector import Detector
+    from v2hdm.io.maps.formats import check_formats
     from v2hdm.survey.run import table_of
 
     name = run_name(config)

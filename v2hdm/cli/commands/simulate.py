@@ -28,7 +28,7 @@ def _render(job: Job) -> None:
     from pathlib import Path
 
     from v2hdm.pipeline.config import admit_port
-    from v2hdm.simulate import rendered_drive
+    from v2hdm.simulate.port.drive import rendered_drive
 
     config = job.settings
     workers = config.workers or os.cpu_count() or 1

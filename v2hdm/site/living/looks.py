@@ -39,7 +39,7 @@ _ASIDE_M = 1.3  # distance of bare ground from a marking, m
 _CLEAR_M = 1.0  # least distance of bare ground from all known paint, m
 _LEAST_LEARNED = 8  # least places for the drive's own contrast of paint or ground; with fewer it is unknown
 
-_HIDDEN_SIGMA = 0.5  # sigma of the contrast, log ratio of grey values, of anything that hides the ground
+HIDDEN_SIGMA = 0.5  # sigma of the contrast, log ratio of grey values, of anything that hides the ground
 _HIDDEN_SHARE = 0.5  # fraction of the existing, undetected markings that are hidden; the others are worn
 _STRANGE_SHARE = 0.05  # fraction of bare places with something else: a stain, the edge of a shadow
 _LEAST_SIGMA = 0.02  # floor of the sigma of bare ground's contrast: the grain of an image
@@ -56,13 +56,13 @@ class Paint:
         """Log density (N,) of contrasts at undetected markings: worn, or hidden."""
         mean, sigma = self.painted
         worn = norm.logpdf(contrast, mean / 2, abs(mean) / 3 + sigma)
-        hidden = norm.logpdf(contrast, 0.0, _HIDDEN_SIGMA)
+        hidden = norm.logpdf(contrast, 0.0, HIDDEN_SIGMA)
         return _mixed(hidden, worn, _HIDDEN_SHARE)
 
     def log_bare(self, contrast: FloatArray) -> FloatArray:
         """Log density (N,) of contrasts of bare ground."""
         mean, sigma = self.bare
-        strange = norm.logpdf(contrast, 0.0, _HIDDEN_SIGMA)
+        strange = norm.logpdf(contrast, 0.0, HIDDEN_SIGMA)
         return _mixed(strange, norm.logpdf(contrast, mean, sigma), _STRANGE_SHARE)
 
 

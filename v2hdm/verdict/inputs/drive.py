@@ -15,7 +15,6 @@ from v2hdm.geometry.ipm import apply_homography, initial_extrinsic
 from v2hdm.geometry.lens import distort_points, has_distortion, undistort_points
 from v2hdm.geometry.planar import inside_convex, signed_area
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.ground.estimate import estimate_cameras
 from v2hdm.ground.results import GroundEstimate
 from v2hdm.io.drive import as_drive
 from v2hdm.io.drive.road import unevenness
@@ -310,6 +309,8 @@ def check_drive(
     """
     drive = as_drive(drive)
     if isinstance(ground, bool):
+        from v2hdm.ground.estimate import estimate_cameras
+
         ground = estimate_cameras(drive, workers, progress) if ground else {}
     return Verdict.of(input_findings(drive, ground))
 

@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from v2hdm.ground import GroundEstimate, GroundOptions, GroundStatus, Parameter, Reading, estimate_ground
-from v2hdm.ground.estimate import STEEP_RAD
+from v2hdm.ground.results import STEEP_RAD, GroundEstimate, GroundOptions, GroundStatus, Parameter, Reading
 from v2hdm.records import FOOT_M, Camera, Drive, FloatArray, Trajectory
 from v2hdm.verdict.inputs.heading import Path
 from v2hdm.verdict.verdict import Finding, Status, judge, passed
@@ -303,6 +302,8 @@ def find_cause(drive: Drive, ground: Mapping[str, GroundEstimate]) -> str | None
     ]
     if not lost or len(lost) < len(ground):
         return None
+    from v2hdm.ground.estimate import estimate_ground
+
     for undo, says in _MISTAKES:
         if estimate_ground(undo(drive), lost[0], _QUICK).status is GroundStatus.FOUND:
             return says

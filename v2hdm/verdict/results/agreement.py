@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from v2hdm.geometry.ipm import centre_sigmas
 from v2hdm.geometry.planar import length_along, turned_left
 from v2hdm.geometry.rigid import camera_centre, inverse, log
-from v2hdm.ground import GroundEstimate, GroundStatus
+from v2hdm.ground.results import GroundEstimate, GroundStatus
 from v2hdm.mapping.results import MethodResult
 from v2hdm.records import HEIGHT_NOISE, SIGMA_OF_MAD, Calibration, Drive, FloatArray, Marking
 from v2hdm.verdict.verdict import Finding, Status, judge

@@ -27,7 +27,7 @@ from v2hdm.faults.odds import (
     matters,
 )
 from v2hdm.faults.sensitivity import STRETCHES
-from v2hdm.ground import GroundEstimate
+from v2hdm.ground.results import GroundEstimate
 from v2hdm.mapping.results import MethodResult, SolveEvidence
 from v2hdm.records import BEST, Drive
 from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN
