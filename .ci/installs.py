@@ -166,7 +166,13 @@ def missing(environment: Environment, here: Path) -> int:
         if command.extra is None or name == "calibrate ground":  # which the base install can do
             continue
         arguments = {"calibrate points": "points.csv --intrinsics camera_info.yaml"}
-        given = {"map": "+run=port2", "experiment": "", "fleet": "a.yaml", "check": "drives/mysite"}
+        given = {
+            "map": "+run=port2",
+            "simulate": "+run=port2",
+            "experiment": "",
+            "fleet": "a.yaml",
+            "check": "drives/mysite",
+        }
         words = arguments.get(name) or given.get(name, "outputs/port2")
         words += " outputs/friday" * (name in ("calibrate compare", "localize"))
         done = environment.run(f"v2hdm {name} {words}", here)

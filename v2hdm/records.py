@@ -37,6 +37,9 @@ SEEN_ACROSS: Mapping[str, str] = {LANE_DASH: STOP_LINE, STOP_LINE: LANE_DASH}
 LANE_BOUNDARY = "lane_boundary"
 """Kind of a lane detection that is a whole line, gaps between dashes and hidden parts included."""
 
+BEST = "Opt"
+"""Name of the method whose map and calibration are the result, also in ``metrics.json``."""
+
 DISTORTION_COEFFICIENTS: Mapping[str, int] = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
 """Distortion models by their ROS ``camera_info`` name, with their number of coefficients."""
 
@@ -296,6 +299,10 @@ class PaintLeft:
             return self
         sigma = float(np.hypot(self.sigma, before.sigma))
         return replace(self, change=self.share - before.share, change_sigma=sigma)
+
+
+UNSTATED_SIGMA_M = 0.02
+"""Standard deviation, m, of a corner's coordinate in a map that states none: drawn over an image."""
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,8 @@ from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.quads.fit import fit_quadrilaterals
-from v2hdm.detection.quads.lattice import variance_inflation
 from v2hdm.detection.quads.propose import open_sides
+from v2hdm.detection.quads.robust import variance_inflation
 from v2hdm.geometry.planar import order_corners, side_frames, signed_area
 from v2hdm.simulate.render.renderer import Renderer
 from v2hdm.simulate.render.scene import Box, Paint, Scene

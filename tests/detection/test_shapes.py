@@ -7,11 +7,13 @@ import pytest
 from tests.detection.pictures import LENSES, bar, diamond, make_camera, output_of, picture, to_image, view_of
 from v2hdm.catalogue import PAINT_CLASSES, SHIPPED
 from v2hdm.detection.camera import RoadCamera
-from v2hdm.detection.classifier import CHANNELS, SIZE
+from v2hdm.detection.evidence import CHANNELS, SIZE
 from v2hdm.detection.network import NetworkOutput
-from v2hdm.detection.quads.lattice import blurred_coverage
+from v2hdm.detection.quads.blobs import Blob, find_blobs
+from v2hdm.detection.quads.coverage import blurred_coverage
+from v2hdm.detection.quads.outline import on_edges, outline_polygon
 from v2hdm.detection.quads.patch import ImageQuads, LensFrames
-from v2hdm.detection.quads.propose import Blob, Proposal, find_blobs, on_edges, outline_polygon
+from v2hdm.detection.quads.propose import Proposal
 from v2hdm.geometry.planar import Quad, order_corners, side_frames, signed_area
 from v2hdm.records import DIAMOND, LANE_DASH
 

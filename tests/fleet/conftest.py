@@ -3,8 +3,7 @@
 import pytest
 
 from tests.stores import s3 as s3
-from v2hdm.simulate import PortConfig
-from v2hdm.simulate.port.config import RouteConfig, YardConfig
+from v2hdm.simulate.port.config import PortConfig, RouteConfig, YardConfig
 
 
 @pytest.fixture(scope="session")

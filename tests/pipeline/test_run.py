@@ -80,7 +80,7 @@ def test_a_good_drive_passes_and_every_file_says_so(result):
     verdict = json.loads((result / "metrics.json").read_text())["verdict"]
     assert verdict["status"] == "PASS", verdict["findings"]
     assert {"heading", "clock", "ground match"} <= {
-        one["check"] for one in verdict["passed"] + verdict["untold"]
+        one["check"] for one in verdict["passed"] + verdict["unobservable"]
     }
     assert json.loads((result / "map.geojson").read_text())["v2hdm"]["verdict"]["status"] == "PASS"
     assert yaml.safe_load((result / "calibration_front.yaml").read_text())["verdict"]["status"] == "PASS"

@@ -28,8 +28,9 @@ from train.scenes.paint import Brush, rectangle, rhombus
 from train.scenes.symbols import hollow_diamond
 from train.shipment import Order
 from v2hdm.detection import weights
-from v2hdm.detection.classifier import AMONG, CHANNELS, COMPANIES, FEATURES, SHAPES
+from v2hdm.detection.classifier import AMONG, COMPANIES, SHAPES
 from v2hdm.detection.detector import Detector
+from v2hdm.detection.evidence import CHANNELS, FEATURES
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import DetectorError
 from v2hdm.records import ARROW, DIAMOND, LANE_DASH

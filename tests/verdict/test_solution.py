@@ -192,9 +192,9 @@ def test_a_small_contradiction_is_none_however_sure_it_is():
 
 def test_a_straight_drive_says_what_it_cannot_tell():
     unsure = replace(FINE, score_tests=(replace(CLOCK, sigma=0.01), replace(LEVER, sigma=float("inf"))))
-    untold = [f for f in check_inputs(unsure) if f.is_unobservable]
-    assert {f.check for f in untold} == {"clock", "survey"}
-    assert all("drive a turn" in f.says for f in untold)
+    unobservable = [f for f in check_inputs(unsure) if f.is_unobservable]
+    assert {f.check for f in unobservable} == {"clock", "survey"}
+    assert all("include a turn" in f.says for f in unobservable)
     sure = replace(square_at(0.0, 0.0), covariance_m2=1e-6 * np.eye(8))
     for evidence, is_told in ((unsure, True), (FINE, False)):
         headline = Verdict.of(check_goal(result(evidence, sure), 0.05, "poses")).headline

@@ -36,7 +36,18 @@ from v2hdm.mapping.optimise import silent
 from v2hdm.mapping.options import MappingOptions, check_options
 from v2hdm.mapping.recovery import Outcome, optimise
 from v2hdm.mapping.results import AdjustedPoses, ClockOffset, MethodResult
-from v2hdm.records import Drive, Exclusion, FloatArray, HDMap, Image, ImageDetections, IntArray, Lane, Marking
+from v2hdm.records import (
+    BEST,
+    Drive,
+    Exclusion,
+    FloatArray,
+    HDMap,
+    Image,
+    ImageDetections,
+    IntArray,
+    Lane,
+    Marking,
+)
 from v2hdm.site.corrections import with_symbols_corrected
 from v2hdm.site.living.changes import Base, update_map
 from v2hdm.site.living.looks import Observer
@@ -183,7 +194,7 @@ def run_methods(
     if base is not None:
         progress("the earlier map")
         optimal = _brought_up_to_date(base, optimal, outcome, optimised, grey)
-    results["Opt"] = optimal
+    results[BEST] = optimal
     progress("ONI")
     found = optimal.calibrations
     ipm_found = {c: ipm_from_extrinsic(found[c].info, found[c].cam_from_vehicle) for c in cameras}
@@ -245,7 +256,12 @@ def _naive_markings(
     average = _average(association, corners_map)
     markings: list[Marking] = []
     excluded: list[Exclusion] = []
-    each = zip(average.corners_map, is_convex(average.corners_map), average.seen[:, 0].tolist(), strict=True)
+    each = zip(
+        average.corners_map,
+        is_convex(average.corners_map),
+        average.point_sightings[:, 0].tolist(),
+        strict=True,
+    )
     for kind, (corners, convex, count) in zip(group_kinds(association, sightings), each, strict=True):
         name = sightings.kinds[kind]
         if count >= LEAST_SIGHTINGS and convex:
@@ -260,13 +276,13 @@ def _average(association: Association, corners_map: FloatArray) -> FusedGroups:
     """Mean of each group's corners, without covariance."""
     rows = np.flatnonzero(association.group >= 0)
     corners = association.in_group_order(corners_map)[rows]
-    seen = np.bincount(association.group[rows], minlength=association.count)
+    sightings = np.bincount(association.group[rows], minlength=association.count)
     total = np.zeros((association.count, 4, 2))
     np.add.at(total, association.group[rows], corners)
     return FusedGroups(
-        corners_map=total / np.maximum(seen, 1)[:, None, None],
+        corners_map=total / np.maximum(sightings, 1)[:, None, None],
         covariance_m2=np.zeros((association.count, 4, 2, 2)),
-        seen=np.repeat(seen[:, None], 4, axis=1),
+        point_sightings=np.repeat(sightings[:, None], 4, axis=1),
     )
 
 
@@ -305,7 +321,7 @@ def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
         hd_map = replace(hd_map, ground=surface.strips())
     hd_map, rejected = with_symbols_corrected(hd_map, options.acceptance.corrections)
     return MethodResult(
-        name="Opt",
+        name=BEST,
         cameras=tuple(cameras),
         hd_map=hd_map,
         calibrations=optimised.calibrations,
@@ -350,14 +366,14 @@ def _brought_up_to_date(
     )
     mapped = np.isin(group, optimised.groups)
     over_m = drive.pose_noise.position_drift_over_m
-    hd_map, changes, *names = update_map(base, made.hd_map, observer, mapped, over_m)
-    hd_map = replace(hd_map, ground=made.hd_map.ground)
-    residuals = None if made.residuals is None else made.residuals.renamed(*names)
-    suspicions = [replace(one, marking=int(names[0][one.marking - 1])) for one in made.suspicions]
+    update = update_map(base, made.hd_map, observer, mapped, over_m)
+    hd_map = replace(update.hd_map, ground=made.hd_map.ground)
+    residuals = None if made.residuals is None else made.residuals.renamed(update.ids, update.corners)
+    suspicions = [replace(one, marking=int(update.ids[one.marking - 1])) for one in made.suspicions]
     return replace(
         made,
         hd_map=hd_map,
-        changes=changes,
+        changes=update.changes,
         joint_covariance=partial(stated_covariance, hd_map.markings),
         residuals=residuals,
         suspicions=suspicions,

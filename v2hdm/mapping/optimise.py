@@ -34,7 +34,6 @@ from v2hdm.mapping.bundle import (
     vehicle_twists,
 )
 from v2hdm.mapping.conclusion import FinalSolve, Optimised, conclude
-from v2hdm.mapping.incremental import IncrementalMapper
 from v2hdm.mapping.options import AUTO, SURFACE, MappingOptions
 from v2hdm.records import BoolArray, Camera, FloatArray, PoseNoise, Road, largest_noise
 from v2hdm.surface.paths import Paths
@@ -191,6 +190,7 @@ class Optimiser:
 
     def grow(self, progress: Callable[[str], None] = silent) -> Bundle:
         """Map track after track, as on the vehicle, in place of :meth:`settle`; then solve for all."""
+        from v2hdm.mapping.incremental import IncrementalMapper
 
         def link(rig: Rig, coarse: bool) -> tuple[Association, BoolArray]:
             tracks = self._track(rig, self._locate(rig), IPM_SIGMA_RAD if coarse else REFINED_SIGMA_RAD)

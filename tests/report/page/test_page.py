@@ -167,10 +167,20 @@ def test_without_its_drive_the_page_says_what_it_lacks(result):
     assert len(page.map_data["markings"]) == 4
 
 
+def test_a_result_of_an_older_version_shows_what_its_drive_cannot_tell_as_one_of_today_does(result):
+    metrics = json.loads((result / "metrics.json").read_text())
+    today = document(read_facts(result, None)).findings
+    assert today["unobservable"]
+    metrics["verdict"]["untold"] = metrics["verdict"].pop("unobservable")
+    write_json(result / "metrics.json", metrics)
+    assert document(read_facts(result, None)).findings == today
+    assert "Unobservable in this drive" in write_page(result, None).read_text()
+
+
 def test_a_run_without_a_map_has_a_page_with_its_verdict(tmp_path):
     finding = {"check": "map", "status": "FAIL", "value": None, "limit": None, "unit": "",
                "says": "this drive gave no map", "about": "map"}  # fmt: skip
-    verdict = {"status": "FAIL", "findings": [finding], "untold": [], "passed": []}
+    verdict = {"status": "FAIL", "findings": [finding], "unobservable": [], "passed": []}
     write_json(tmp_path / "metrics.json", {"name": "n", "verdict": verdict, "results": {}})
     text = write_page(tmp_path, None).read_text()
     assert "this drive gave no map" in text

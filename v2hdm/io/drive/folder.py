@@ -12,18 +12,15 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.io.calibration import reading
+from v2hdm.io.drive.description import DRIVE_FILE, POSES_FILE, name_of
 from v2hdm.io.drive.images import ImageFiles, ReadOptions, assemble_drive, select_cameras
 from v2hdm.io.drive.sources import Sources, plan_images, plan_info, plan_topic_poses
 from v2hdm.io.importers.poses import read_poses
 from v2hdm.records import DRIFTS, BoolArray, Camera, CameraInfo, Drive, FloatArray, PoseNoise
 from v2hdm.safe.fields import take_origin
 from v2hdm.safe.pixels import read_pixels
-from v2hdm.safe.texts import shown, take_camera_name, take_name
+from v2hdm.safe.texts import shown, take_camera_name
 from v2hdm.store.files import check_keys, load_yaml, take_mapping, take_number, take_text
-
-DRIVE_FILE = "drive.yaml"
-POSES_FILE = "poses.tum"
-TRUTH_FOLDER = "truth"
 
 _DRIVE_KEYS = (("cameras",), ("name", "bag", "poses", "pose_noise", "origin", "truth"))
 _CAMERA_KEYS = (
@@ -33,11 +30,6 @@ _CAMERA_KEYS = (
         "linear_response", "mask", "read_out_s",
     ),
 )  # fmt: skip
-
-
-def is_folder_drive(path: Path) -> bool:
-    """Whether ``path`` looks like a drive in this format."""
-    return (path / DRIVE_FILE).is_file()
 
 
 def read_folder_drive(path: Path, options: ReadOptions) -> Drive:
@@ -93,11 +85,6 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
     name = name_of(content, path)
     drive = Drive(name, path, cameras, (), pose_noise, recorded.origin, truth, recorded=recorded.trajectory)
     return assemble_drive(drive, files, options.max_gap_s, poses_at)
-
-
-def name_of(content: dict[str, Any], path: Path) -> str:
-    """The name that the ``content`` of a ``drive.yaml`` at ``path`` gives the drive, else its folder's."""
-    return take_name(content.get("name", path.resolve().name), f"{path / DRIVE_FILE}: name", DriveError)
 
 
 def _read_camera(entry: dict[str, Any], info: CameraInfo, root: Path, where: str) -> Camera:

@@ -253,13 +253,17 @@ def method_table(facts: Facts) -> Table | None:
     return table(("", "method", "markings", *columns), rows, words=2)
 
 
+_FORMERLY = {"unobservable": "untold"}
+"""What older results call a list of findings."""
+
+
 def finding_rows(verdict: Mapping[str, Any], which: str) -> tuple[tuple[str, ...], ...]:
     """Status, check, subject, measured value, limit and sentence of the findings ``which``."""
     rows = []
-    for finding in verdict.get(which) or []:
+    for finding in verdict.get(which) or verdict.get(_FORMERLY.get(which, which)) or []:
         unit = f" {finding['unit']}" if finding.get("unit") else ""
         value, limit = (number(finding.get(key)) for key in ("value", "limit"))
-        outcome = "untold" if which == "untold" else str(finding["status"])
+        outcome = which if which == "unobservable" else str(finding["status"])
         measured = [text if text == "–" else f"{text}{unit}" for text in (value, limit)]
         rows.append((outcome, str(finding["check"]), str(finding["about"]), *measured, str(finding["says"])))
     return tuple(rows)
