@@ -14,10 +14,9 @@ from v2hdm.geometry.ipm import mounting_angles
 from v2hdm.geometry.rigid import euler_from_rotation, inverse
 from v2hdm.io.importers.bag import messages as kinds
 from v2hdm.io.importers.bag.messages import TF_STATIC, TF_TOPIC, Frames, frame_name
-from v2hdm.io.importers.bag.reading import Bag, Topic, bag_files, open_bag
+from v2hdm.io.importers.bag.reading import Bag, Topic, bag_files, in_child_of, open_bag
 from v2hdm.io.importers.bag.streams import INFO_KIND, TfStream, frame_of, import_streams
 from v2hdm.records import FloatArray
-from v2hdm.safe.child import Limits, in_child
 from v2hdm.store.files import dump_yaml, load_yaml
 from v2hdm.store.folders import entry_folder, is_whole, new_entry
 
@@ -114,10 +113,9 @@ class _Outline:
 
 
 def _outline_of(path: Path) -> _Outline:
-    limits = Limits.of(*bag_files(path))
-    told = in_child(outline_bag, path, limits=limits, where=str(path), error=DriveError)
-    topics = [Topic(**fields) for fields in told["topics"]]
-    return _Outline({topic.name: topic for topic in topics}, told["frame_of"])
+    outline = in_child_of(path, outline_bag)
+    topics = [Topic(**fields) for fields in outline["topics"]]
+    return _Outline({topic.name: topic for topic in topics}, outline["frame_of"])
 
 
 def outline_bag(path: Path) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from collections import defaultdict, deque
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import chain
@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from v2hdm.errors import DriveError, need
-from v2hdm.safe.child import next_step
+from v2hdm.safe.child import Limits, in_child, next_step
 from v2hdm.safe.databases import opened, rows_of
 from v2hdm.store.files import load_yaml, take_mapping
 
@@ -171,10 +171,16 @@ class Bag:
         return topic
 
 
+def in_child_of(path: Path, work: Callable[..., Any], *arguments: Any) -> Any:
+    """The answer of ``work`` on the bag at ``path`` and more ``arguments``, done in a child."""
+    need("rosbags", "ros", f"{path}: a bag", DriveError)
+    limits = Limits.of(*bag_files(path))
+    return in_child(work, path, *arguments, limits=limits, where=str(path), error=DriveError)
+
+
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
     """Open the bag at ``path``: a ROS 1 file, a ROS 2 folder, or one file of it."""
-    need("rosbags", "ros", f"{path}: a bag", DriveError)
     from rosbags import rosbag1, rosbag2
 
     files = bag_files(path)

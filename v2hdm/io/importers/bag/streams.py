@@ -22,11 +22,10 @@ from v2hdm.errors import DriveError
 from v2hdm.io.calibration.reading import info_of
 from v2hdm.io.calibration.writing import write_camera_info
 from v2hdm.io.importers.bag import messages as kinds
-from v2hdm.io.importers.bag.reading import Bag, Message, bag_files, open_bag
+from v2hdm.io.importers.bag.reading import Bag, Message, bag_files, in_child_of, open_bag
 from v2hdm.io.importers.readings import Readings, nmea_readings
 from v2hdm.io.trajectory import write_image_list
 from v2hdm.records import FloatArray
-from v2hdm.safe.child import Limits, in_child
 from v2hdm.safe.pixels import png
 from v2hdm.store.folders import entry_folder, is_whole, new_entry
 
@@ -227,7 +226,7 @@ def import_streams(path: Path, streams: Sequence[Stream], cache: Path) -> list[P
     _log.info("%s: importing %s from %.0f MB into %s, once", path, labels, size_mb, cache)
     with ExitStack() as entries:
         partial = {entries.enter_context(new_entry(folder)): stream for folder, stream in missing.items()}
-        in_child(write_streams, path, partial, limits=Limits.of(*files), where=str(path), error=DriveError)
+        in_child_of(path, write_streams, partial)
     return folders
 
 
