@@ -27,8 +27,9 @@ from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.results import AdjustedPoses
 from v2hdm.pipeline import map_drive
 from v2hdm.pipeline.config import MapConfig, ReportConfig, admit, run_name
-from v2hdm.pipeline.result import _along_route, write_trajectories
+from v2hdm.pipeline.result import _along_route
 from v2hdm.pipeline.run import made_of, run
+from v2hdm.pipeline.saving import write_trajectories
 from v2hdm.pipeline.stages import camera_sets
 from v2hdm.records import Drive, HDMap, Image, Lane, Trajectory
 from v2hdm.site.options import AcceptanceOptions, LaneOptions

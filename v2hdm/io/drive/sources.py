@@ -13,6 +13,7 @@ import numpy as np
 from v2hdm.errors import DriveError, need
 from v2hdm.io.calibration.intrinsics import read_intrinsics
 from v2hdm.io.calibration.reading import read_camera_info
+from v2hdm.io.description import FolderImages, InfoFile, TopicImages, VideoImages, keys_in
 from v2hdm.io.drive.images import ImageFiles
 from v2hdm.io.importers.bag import streams
 from v2hdm.io.importers.bag.messages import TF_TOPIC
@@ -84,7 +85,8 @@ def plan_info(content: object, camera: str, sources: Sources, where: str) -> Cal
         path = sources.root / take_text(content, where, DriveError)
         return lambda: _read_info(path, None)
     if "file" in content:
-        check_keys(content, ("file",), ("camera",), where, DriveError)
+        info_keys = keys_in(InfoFile)
+        check_keys(content, info_keys.required, info_keys.optional, where, DriveError)
         named = sources.root / take_text(content["file"], f"{where}, file", DriveError)
         chosen = content.get("camera")
         if chosen is not None and not isinstance(chosen, int):  # COLMAP numbers its cameras
@@ -252,8 +254,8 @@ def _of_video(entry: dict[str, Any], camera: str, sources: Sources, where: str) 
 IMAGE_SOURCES: Mapping[
     str, tuple[Callable[[dict[str, Any], str, Sources, str], _Lister], tuple[str, ...]]
 ] = {
-    "folder": (_of_folder, ("stamps", "unit")),
-    "video": (_of_video, ("start_s", "stamps")),
-    "topic": (_of_topic, ("stamps",)),
+    "folder": (_of_folder, keys_in(FolderImages).optional),
+    "video": (_of_video, keys_in(VideoImages).optional),
+    "topic": (_of_topic, keys_in(TopicImages).optional),
 }
 """Sources of images other than a list file, by the key that names them: how they are planned, other keys."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.geodetic import Grid, crs_of, geodetic_from_enu, utm_of
-from v2hdm.records import FloatArray, Lane, Marking, Symbol
+from v2hdm.records import SIGMAS_95, FloatArray, Lane, Marking, Symbol
 from v2hdm.report.metrics import corner_errors, match_markings, rms
 from v2hdm.report.page.facts import Facts, GroundResiduals
 from v2hdm.safe.pixels import read_pixels
@@ -106,10 +106,6 @@ def comparison(folder: Path) -> str | None:
     """The ground before and after the optimisation, JPEG in base64; None if not in the folder."""
     return jpeg_of(folder / names.COMPARISON, 1400, 84)
 
-
-SIGMAS_95 = 2.4477
-"""Semi-axes of the 95 % ellipse of a two-dimensional normal error, in standard deviations: the root of the
-chi-square quantile with two degrees of freedom."""
 
 _LEAST_ARROW_SIGHTINGS = 4  # least number of sightings of a marking whose mean residual is drawn
 _SHARED = (".geojson", ".gpkg", ".osm", ".dxf", ".csv", ".xodr", ".tif", ".tum", ".yaml", ".json", ".log")
