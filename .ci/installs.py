@@ -51,6 +51,7 @@ MORE = {
         f"v2hdm map +run=port2 workers=1 resume=false all_maps=true {' '.join(map(repr, SMALL_PORT))}",
         "v2hdm export map.geojson --format lanelet2",
         "v2hdm experiment --cfg job",
+        "python -c 'import v2hdm.paper, v2hdm.experiment.run'",
         "v2hdm detect images --limit 1",
     ),
     "map,ros": ("v2hdm check site --list-topics", "v2hdm detect site --limit 1"),

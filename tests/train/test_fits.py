@@ -15,6 +15,7 @@ import torch
 from export.judge_file import read_judge, write_judge
 from export.onnx_file import export_checkpoint
 from models.judge import Judge
+from tests.export.graphs import graphs_made_once as graphs_made_once
 from tests.train.small import tiny, train
 from train import fit_judge, fit_lane_score, ship, shipment
 from train.checkpoint import load_checkpoint

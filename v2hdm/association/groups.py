@@ -249,7 +249,8 @@ _REACH_M = 4.0  # largest distance, m, from a sighting's centre to its marking's
 _MOST_SQUARED = 16.0
 """Largest squared Mahalanobis distance of a match: four corners on lines have four degrees of freedom."""
 
-_CLEARER_BY = 9.0  # least margin in squared distance to any other marking or corner order
+CLEARER_BY = 9.0
+"""Least margin in squared distance to any other marking or corner order: odds of ninety to one."""
 
 
 def attach(
@@ -283,7 +284,7 @@ def attach(
         pair, shift = divmod(int(order[0]), 4)
         best, second = squared[pairs_of_sighting].ravel()[order[:2]]
         place_in_image = (int(group[pairs_of_sighting[pair]]), int(sightings.image[sighting]))
-        if best <= _MOST_SQUARED and second >= best + _CLEARER_BY and place_in_image not in shown:
+        if best <= _MOST_SQUARED and second >= best + CLEARER_BY and place_in_image not in shown:
             out_group[sighting] = place_in_image[0]
             out_shift[sighting] = shift
             shown.add(place_in_image)

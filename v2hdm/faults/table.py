@@ -107,15 +107,6 @@ class Fault:
         """The fault by its name."""
         return f"<fault: {self.name}>"
 
-    def __reduce__(self) -> tuple[object, ...]:
-        """The fault by its name, so that it is the same object in every process."""
-        return fault_named, (self.name,)
-
-
-def fault_named(name: str) -> Fault:
-    """The fault of this name."""
-    return FAULTS[name]
-
 
 def _clock(error: Error) -> str:
     images = f"the images of {error.whose}{f' {error.about}' if error.about else ''}"

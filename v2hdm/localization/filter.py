@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
+from v2hdm.association.groups import CLEARER_BY
 from v2hdm.geometry.ipm import (
     apply_in_front,
     ground_from_pinhole_px,
@@ -35,7 +36,6 @@ _START_TURN_RAD_S = 0.3  # standard deviation of the yaw rate then, rad/s
 
 # Squared distance, in sigmas, up to which a detection fits: one in a thousand is farther.
 _LARGEST_SQUARE = float(chi2.isf(1e-3, 8))
-_CLEARER_BY = 9.0  # least margin in squared distance to any other marking: odds of ninety to one
 
 # Radius about where a detection seems to lie, in sigmas of the place, in which its marking is looked for.
 _REACH_SIGMAS = 4.0
@@ -213,7 +213,7 @@ class Markings:
             if candidate.squared <= _LARGEST_SQUARE:
                 fits.append((marking, candidate))
         fits.sort(key=lambda marking_and_fit: marking_and_fit[1].loss)
-        if not fits or (len(fits) > 1 and fits[1][1].loss < fits[0][1].loss + _CLEARER_BY):
+        if not fits or (len(fits) > 1 and fits[1][1].loss < fits[0][1].loss + CLEARER_BY):
             return None
         marking, best = fits[0]
         return marking, best.state

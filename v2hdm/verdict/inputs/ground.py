@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from v2hdm.ground.results import STEEP_RAD, GroundEstimate, GroundOptions, GroundStatus, Parameter, Reading
-from v2hdm.records import Camera, Drive, FloatArray, Trajectory
+from v2hdm.records import FOOT_M, Camera, Drive, FloatArray, Trajectory
 from v2hdm.verdict.inputs.heading import Path
 from v2hdm.verdict.verdict import Finding, Status, judge, passed
 
@@ -33,7 +33,6 @@ _POSE_SIGMAS = 3.0  # RMS of the poses' errors in their stated sigmas: up to 2.2
 # Lead of another reading over the one as given in the fraction of matching patches: on clean turning drives
 # others are .1 to .2 behind, and differ by .03 between pairs of images.
 _LEADS = 0.05
-_FOOT_M = 0.3048  # an international foot, m
 # A third of the usual pairs suffices to see whether the ground matches.
 _QUICK = GroundOptions(pairs=12, free=(), readings=False)
 
@@ -351,7 +350,7 @@ def _turned(camera: Camera) -> Camera:
 # Mistakes to try, the likelier first, and how to undo them; each costs seconds on a drive that fails anyway.
 _MISTAKES: tuple[tuple[Callable[[Drive], Drive], str], ...] = (
     (
-        lambda drive: scaled(drive, _FOOT_M),
+        lambda drive: scaled(drive, FOOT_M),
         "the ground matches if positions are in feet; multiply them by 0.3048 to get metres",
     ),
     (
