@@ -51,6 +51,8 @@ def test_the_wheel_holds_the_library_with_its_data_and_nothing_else(released):
     needed = {
         "conf/map.yaml",
         "conf/run/port2.yaml",
+        "conf/schema/drive.json",
+        "conf/schema/run.json",
         "paper/claims.py",
         "paper/templates/experiment.md",
         "report/page/vendor/leaflet.js",

@@ -28,7 +28,7 @@ from v2hdm.geometry.lens import distort_points, has_distortion
 from v2hdm.geometry.planar import clip_convex, clip_half, densified, rectangle_size, signed_area
 from v2hdm.geometry.rigid import camera_centre, interpolate, inverse
 from v2hdm.progress import Steps
-from v2hdm.records import BoolArray, CameraInfo, Drive, FloatArray, Image, IntArray, Trajectory
+from v2hdm.records import SIGMA_OF_MAD, BoolArray, CameraInfo, Drive, FloatArray, Image, IntArray, Trajectory
 from v2hdm.report.page.facts import CameraFacts, Facts, read_facts
 from v2hdm.site.living.looks import HIDDEN_SIGMA
 from v2hdm.store.files import write_json
@@ -345,7 +345,7 @@ def _expected(
         as_usual = usual[rows]
         ratio = float((shown * as_usual).sum() / max((as_usual * as_usual).sum(), 1e-9))
         factor[in_bin] = ratio
-        sigma[in_bin] = max(1.4826 * float(np.median(np.abs(shown - ratio * as_usual))), _LEAST_SIGMA)
+        sigma[in_bin] = max(SIGMA_OF_MAD * float(np.median(np.abs(shown - ratio * as_usual))), _LEAST_SIGMA)
     return factor[:, None] * usual, np.broadcast_to(sigma[:, None], usual.shape)
 
 

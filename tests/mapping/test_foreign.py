@@ -9,6 +9,7 @@ from v2hdm.errors import MappingError
 from v2hdm.faults import ScoreTest, table
 from v2hdm.mapping import foreign, inputs, recovery
 from v2hdm.mapping.foreign import foreign_segment
+from v2hdm.mapping.results import ForeignSegment
 from v2hdm.verdict.results.solution import _ODDS_LIMIT
 
 FRAMES, IN_VIEW = 90, 8
@@ -86,7 +87,7 @@ def odds_beside(monkeypatch, gain, left, worst=20.0, rows=600):
         return (ScoreTest(table.CLOCK.name, -1, 0, -1, gain=left),)
 
     for name, value in (
-        ("foreign_segment", (3.0, 6.0, gain)),
+        ("foreign_segment", ForeignSegment(3.0, 6.0, gain)),
         ("views_of", None),
     ):
         monkeypatch.setattr(recovery, name, lambda *_, value=value: value)

@@ -27,7 +27,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from v2hdm.cli.command import Command
 from v2hdm.errors import ConfigError, V2hdmError
-from v2hdm.io.drive.description import DRIVE_FILE
+from v2hdm.io.description import DRIVE_FILE
 from v2hdm.safe.texts import read_yaml
 from v2hdm.settings import NO_KEY, settings_of
 

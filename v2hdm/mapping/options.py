@@ -166,13 +166,13 @@ def check_options(options: MappingOptions, kinds: Sequence[str] | None = None) -
             raise ConfigError(f"{key}: there is no such class; choose from {', '.join(kinds)}.")
         if len(size) != 2 or not 0 < size[1] <= size[0]:
             raise ConfigError(f"{key} is {list(size)}; give length and width in m, the longer one first.")
-    for number, one in enumerate(options.survey.points):
+    for number, point in enumerate(options.survey.points):
         key = f"mapping.survey.points[{number}]"
-        if len(one.position_map) != 2:
-            raise ConfigError(f"{key}.position_map is {list(one.position_map)}; give x and y in m.")
-        if len(one.sigma_m) != 2 or not all(value > 0 for value in one.sigma_m):
-            raise ConfigError(f"{key}.sigma_m is {list(one.sigma_m)}; give those of x and y in m, above 0.")
-    names = [one.id for one in options.survey.points]
+        if len(point.position_map) != 2:
+            raise ConfigError(f"{key}.position_map is {list(point.position_map)}; give x and y in m.")
+        if len(point.sigma_m) != 2 or not all(value > 0 for value in point.sigma_m):
+            raise ConfigError(f"{key}.sigma_m is {list(point.sigma_m)}; give those of x and y in m, above 0.")
+    names = [point.id for point in options.survey.points]
     twice = next((name for number, name in enumerate(names) if name in names[:number]), None)
     if twice is not None:
         raise ConfigError(f"mapping.survey names the point {twice} twice; keep one of them.")

@@ -221,7 +221,7 @@ def map_and_save(
     with cache.in_use():
         for path in () if config.map.base is None else base_files(Path(config.map.base))[:1]:
             note_input(path)  # before any work is done for nothing
-        with result_folder(place, made=made) as folder, logging_to(log_file(folder / LOG)):
+        with result_folder(place, maker=made) as folder, logging_to(log_file(folder / LOG)):
             _log.info("v2hdm %s, run %s", __version__, name)
             (folder / CONFIG).write_text(config_yaml or f"{config!r}\n", encoding="utf-8")
 

@@ -63,7 +63,7 @@ def _run(arguments: Sequence[str]) -> int:
 
 def _recording_of(drive: Path) -> Path:
     """The bag that a drive folder describes, so that both have one result; else the drive itself."""
-    from v2hdm.io.drive.description import DRIVE_FILE
+    from v2hdm.io.description import DRIVE_FILE
     from v2hdm.safe.texts import read_yaml
 
     file = drive / DRIVE_FILE

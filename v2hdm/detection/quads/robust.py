@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from v2hdm.detection.quads.lattice import Lattice
-from v2hdm.records import FloatArray
+from v2hdm.records import SIGMA_OF_MAD, FloatArray
 
 _PAINT_SIGMA = 0.25  # how far the network's probability of paint is from the coverage
 _MIN_SCATTER = 0.01  # least scatter of log grey: quantisation and noise of the best sensor
@@ -44,7 +44,7 @@ def pixel_weights(
 ) -> PixelWeights:
     """Weights by residuals (M, N) of log grey, where pixels are of ``use`` (M, N)."""
     size = np.abs(residual)
-    scale = np.maximum(1.4826 * lattice.median_used(size, use), max(_MIN_SCATTER, least_scatter))
+    scale = np.maximum(SIGMA_OF_MAD * lattice.median_used(size, use), max(_MIN_SCATTER, least_scatter))
     robust = use / (1 + (size / (_CAUCHY * scale[:, None])) ** 2)
     square = robust * residual * residual
     total = square.sum(axis=1)

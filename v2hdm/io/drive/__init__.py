@@ -9,7 +9,7 @@ from typing import Any
 
 from v2hdm.errors import DriveError, MapFileError
 from v2hdm.geometry.rigid import with_clock_offsets
-from v2hdm.io.drive.description import DRIVE_FILE, is_folder_drive, name_of
+from v2hdm.io.description import DRIVE_FILE, is_folder_drive, name_of
 from v2hdm.io.drive.images import KittiOptions, ReadOptions, part_of
 from v2hdm.io.drive.join import join_drives
 from v2hdm.records import Drive, Trajectory

@@ -14,9 +14,8 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
-from v2hdm.records import FloatArray, HDMap
+from v2hdm.records import SIGMAS_95, FloatArray, HDMap
 from v2hdm.report.page.facts import Facts, GroundResiduals, Route
-from v2hdm.report.page.layers import SIGMAS_95
 from v2hdm.report.style import OKABE_ITO, RC, draw_arrows
 
 INK = "#1b1e21"

@@ -12,10 +12,10 @@ import numpy as np
 from v2hdm.geometry.ipm import angle_sigmas, centre_sigmas, mounting_angles
 from v2hdm.geometry.planar import length_along
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.records import FloatArray, Lane, Marking, Symbol
+from v2hdm.records import SIGMAS_95, FloatArray, Lane, Marking, Symbol
 from v2hdm.report.metrics import corner_errors, match_markings
 from v2hdm.report.page.facts import CameraFacts, Facts
-from v2hdm.report.page.layers import SIGMAS_95, ellipses
+from v2hdm.report.page.layers import ellipses
 from v2hdm.report.terminal import METHODS, figure_columns
 
 

@@ -23,7 +23,7 @@ from v2hdm.association.sightings import Rig, Sightings, row_shares
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.planar import Quad, turned_left
-from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, Marking
+from v2hdm.records import SIGMA_OF_MAD, BoolArray, Camera, FloatArray, IntArray, Marking
 from v2hdm.site.living.fates import Watched
 from v2hdm.site.posterior import log_found, log_found_where_none_is
 
@@ -113,7 +113,7 @@ def learn_paint(
 def _robust(values: FloatArray) -> tuple[float, float]:
     """Median, and the standard deviation that its median deviation implies."""
     middle = float(np.median(values))
-    return middle, max(1.4826 * float(np.median(np.abs(values - middle))), _LEAST_SIGMA)
+    return middle, max(SIGMA_OF_MAD * float(np.median(np.abs(values - middle))), _LEAST_SIGMA)
 
 
 _MOST_SQUARED = 25.0

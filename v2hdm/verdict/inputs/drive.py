@@ -18,7 +18,7 @@ from v2hdm.geometry.rigid import camera_centre
 from v2hdm.ground.results import GroundEstimate
 from v2hdm.io.drive import as_drive
 from v2hdm.io.drive.road import unevenness
-from v2hdm.records import Camera, CameraInfo, CentrePrior, Drive, FloatArray
+from v2hdm.records import FOOT_M, Camera, CameraInfo, CentrePrior, Drive, FloatArray
 from v2hdm.verdict.inputs import ground as ground_checks
 from v2hdm.verdict.inputs.ground import check_ground, find_cause, path_of
 from v2hdm.verdict.inputs.heading import check_heading
@@ -37,7 +37,7 @@ _MISSHAPEN = 0.03  # clicked homographies depart from K [r1 r2 t] by about one p
 _BORROWED_M = 1.0  # a guess from another vehicle of the same type, or from a drawing, is decimetres off
 _NEAR_SURVEY_M = 0.6  # distance of survey and guess at which a changed sign or unit is the cause
 # Units that surveys come in, in 1/m.
-_SURVEY_UNITS = {"centimetres": 1e2, "millimetres": 1e3, "feet": 1 / 0.3048, "inches": 1 / 0.0254}
+_SURVEY_UNITS = {"centimetres": 1e2, "millimetres": 1e3, "feet": 1 / FOOT_M, "inches": 1 / 0.0254}
 _ROI_IN_VIEW = 0.5  # at least this share of the ROI must be in the image
 _ROI_AREA_M2 = 4.0  # a smaller ROI holds no whole marking: a dash alone is 3 m long
 # Ground per pixel, along the view, at the ROI's far end: beyond, a pixel of noise is half a metre.

@@ -11,7 +11,7 @@ import numpy as np
 
 from v2hdm.geometry.planar import angle_between, cross, length_along
 from v2hdm.ground.motion import trajectory_of_images
-from v2hdm.records import BoolArray, Drive, FloatArray, IntArray, PoseNoise
+from v2hdm.records import HEIGHT_NOISE, SIGMA_OF_MAD, BoolArray, Drive, FloatArray, IntArray, PoseNoise
 from v2hdm.verdict.verdict import Finding, Status, judge
 
 # Length of the chords whose direction is the course: RTK noise of 2 cm turns one by less than a degree.
@@ -29,9 +29,8 @@ _HARDEST_MPS2 = 9.0  # no tyre turns or brakes a road vehicle harder
 _EXTREME = 12.0
 _LEAST_JITTER_MS = 5.0  # stamps that scatter less are as good as a drive needs them
 # Four standard errors of the logarithm of a ratio of two robust sigmas of one offset: half the offsets count,
-# as neighbours share poses, and a median absolute deviation is worth .37 of a standard deviation.
+# as neighbours share poses, and a median absolute deviation is worth 0.37 of a standard deviation.
 _SURE_JITTER = 4 / (0.5 * 0.37) ** 0.5
-_HEIGHT_NOISE = 2.0  # RTK heights are about twice as noisy as positions in the plane
 _TOO_LARGE: Mapping[str, float] = {"centimetres": 1e2, "millimetres": 1e3}
 """How many times too large positions are in a unit that they may be in by mistake."""
 
@@ -187,7 +186,7 @@ def check_jumps(motion: Motion, noise: PoseNoise) -> list[Finding]:
     heights = _off_neighbours(motion, motion.position[:, 2:])
     return [
         _jitter(motion, off) or _jump("position", motion, off, usual + spare),
-        _jump("height", motion, heights, _HEIGHT_NOISE * usual + spare),
+        _jump("height", motion, heights, HEIGHT_NOISE * usual + spare),
     ]
 
 
@@ -365,4 +364,4 @@ def _fourth(values: FloatArray) -> FloatArray:
 
 
 def _robust_sigma(values: FloatArray) -> float:
-    return float(1.4826 * np.median(np.abs(values)))
+    return float(SIGMA_OF_MAD * np.median(np.abs(values)))

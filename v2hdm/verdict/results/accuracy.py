@@ -21,7 +21,7 @@ from v2hdm.io.maps.corrections import Correction
 from v2hdm.mapping.bundle import known_lengths
 from v2hdm.mapping.options import SizeOptions
 from v2hdm.mapping.results import MethodResult, SolveEvidence
-from v2hdm.records import Calibration, FloatArray, Marking
+from v2hdm.records import SIGMAS_95, Calibration, FloatArray, Marking
 from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN
 from v2hdm.site.corrections import unmet
 from v2hdm.survey.check_points import CheckTable, squared
@@ -30,7 +30,6 @@ from v2hdm.verdict.verdict import GOAL, Finding, Status, passed
 
 _AHEAD_M = 10.0  # distance, m, within which a vehicle uses what it sees on the ground
 _SHARE = 0.95  # share of the corners that have to meet the goal
-_CIRCLE_95 = 2.4477  # radius, in sigmas of a coordinate, that holds 95 % of errors alike in both coordinates
 
 
 def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Finding]:
@@ -43,7 +42,7 @@ def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Findin
         corners = f"95 % of the corners of {len(markings)} markings"
         says = f"{corners} within {_cm(reached_m)} in the frame of the {frame}"
         says += "" if best.evidence is None else _conditions(best.evidence)
-        relative_m = [_CIRCLE_95 * m.relative_sigma_m for m in markings if m.relative_sigma_m is not None]
+        relative_m = [SIGMAS_95 * m.relative_sigma_m for m in markings if m.relative_sigma_m is not None]
         if relative_m:
             says += f", {_cm(_radius_of_all_m(np.array(relative_m)))} from marking to marking"
         # The map's own limit on sigmas leaves the worst out, so that the share alone would flatter.
@@ -78,7 +77,7 @@ def _judged(about: str, radius_m: float, goal_m: float, says: str, helps: str) -
 
 def _largest_part(best: MethodResult, coarse: Sequence[Marking]) -> str:
     """The largest of the errors that are stated of the markings that miss the goal, and what helps."""
-    pose_m = [] if best.poses is None else _CIRCLE_95 * best.poses.sigma[best.poses.seen, :2].max(axis=1)
+    pose_m = [] if best.poses is None else SIGMAS_95 * best.poses.sigma[best.poses.seen, :2].max(axis=1)
     parts = [
         (_median(pose_m), "the poses: tie them down by mapping.survey"),
         (_median(list(map(_own_m, coarse))), "each marking's own views: pass them closer and again"),
@@ -100,7 +99,7 @@ def _corner_radii_m(marking: Marking) -> FloatArray:
 def _radius_of_all_m(radius_m: FloatArray) -> float:
     """The radius that holds 95 % of all corners, given the radius (N,) that holds each with 95 %.
 
-    Errors are circular normal: with 1 - .05^((r / own)^2) a corner lies within r.
+    Errors are circular normal: with 1 - 0.05^((r / own)^2) a corner lies within r.
     """
     if np.mean(np.isfinite(radius_m)) < _SHARE:
         return float("inf")
@@ -117,7 +116,7 @@ def _own_m(marking: Marking) -> float:
         return 0.0
     centre_m = _radius_m(np.einsum("iajb->ab", marking.covariance_m2.reshape(4, 2, 4, 2)) / 16)
     shape_m2 = max(float(_corner_radii_m(marking).max()) ** 2 - centre_m**2, 0.0)
-    return float(np.hypot(_CIRCLE_95 * (marking.relative_sigma_m or 0.0), np.sqrt(shape_m2)))
+    return float(np.hypot(SIGMAS_95 * (marking.relative_sigma_m or 0.0), np.sqrt(shape_m2)))
 
 
 def ground_ahead(calibration: Calibration) -> tuple[float, str]:

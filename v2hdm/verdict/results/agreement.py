@@ -14,7 +14,7 @@ from v2hdm.geometry.planar import length_along, turned_left
 from v2hdm.geometry.rigid import camera_centre, inverse, log
 from v2hdm.ground.results import GroundEstimate, GroundStatus
 from v2hdm.mapping.results import MethodResult
-from v2hdm.records import Calibration, Drive, FloatArray, Marking
+from v2hdm.records import HEIGHT_NOISE, SIGMA_OF_MAD, Calibration, Drive, FloatArray, Marking
 from v2hdm.verdict.verdict import Finding, Status, judge
 
 SAME_M = 1.0  # centres of one marking in the maps of two cameras lie closer than this
@@ -43,7 +43,6 @@ _DOUBLES_LIMIT = 0.02  # share of markings that overlap another: none on clean d
 _SAME_PLACE_M = 2.0  # largest distance between two passes of one place
 _ANOTHER_PASS_M = 20.0  # least way between two passes of one place
 _STOREY_M = 1.8  # least difference in height of two storeys of a car park
-_HEIGHT_NOISE = 2.0  # noise of recorded heights over that of positions
 _SURE_SIGMAS = 5.0  # deviation of two passes' heights, in sigmas, that is no noise
 
 _LEAST_VARIANCE = np.array([1e-8] * 3 + [1e-10] * 3)
@@ -98,7 +97,7 @@ def _offset(first: str, second: str, offset_m: FloatArray, sigma_m: FloatArray) 
     """How far two cameras' maps are apart (N, 2), forward and left, with the sigmas (2,) of their centres."""
     count = len(offset_m)
     middle = np.median(offset_m, axis=0)
-    spread = 1.4826 * np.median(np.abs(offset_m - middle), axis=0) / np.sqrt(count)
+    spread = SIGMA_OF_MAD * np.median(np.abs(offset_m - middle), axis=0) / np.sqrt(count)
     sigmas = np.where(np.abs(middle) > _LEAST_OFFSET_M, np.abs(middle) / np.hypot(sigma_m, spread), 0.0)
     axis = int(np.argmax(sigmas))
     where = (("behind", "ahead of"), ("right of", "left of"))[axis][int(middle[axis] > 0)]
@@ -212,7 +211,7 @@ def _overlap(first: FloatArray, second: FloatArray) -> float:
 def check_heights(drive: Drive) -> Iterator[Finding]:
     """Whether the heights that were recorded agree where a place was passed more than once."""
     road = drive.road
-    sigma_m = _HEIGHT_NOISE * drive.pose_noise.position_m
+    sigma_m = HEIGHT_NOISE * drive.pose_noise.position_m
     if road is None or len(road.points_map) < 2:
         return
     way_m = length_along(road.points_map)

@@ -141,7 +141,7 @@ def check_inputs(evidence: SolveEvidence) -> list[Finding]:
         contradicted = [test for test in evidence.score_tests if _is_left(test, evidence.corrected)][:1]
     foreign = _foreign(evidence)
     stamps = _stamps(evidence)
-    causes = {foreign: evidence.foreign[2], stamps: _jitter_odds(evidence)}
+    causes = {foreign: evidence.foreign.gain, stamps: _jitter_odds(evidence)}
     if contradicted:
         likeliest = contradicted[0]
         finding = _contradicted(contradicted) if is_physical(likeliest) else _unknown(likeliest)
@@ -331,12 +331,12 @@ def check_fit(evidence: SolveEvidence) -> Iterator[Finding]:
 
 def _foreign(evidence: SolveEvidence) -> Finding:
     """Images of another place than those before and after them, and than their poses."""
-    begin_s, end_s, gain = evidence.foreign
+    segment = evidence.foreign
     return judge(
-        "foreign images", "map", max(gain, 0.0), _ODDS_LIMIT, "",
+        "foreign images", "map", max(segment.gain, 0.0), _ODDS_LIMIT, "",
         fine="no stretch has markings that the other images lack",
-        wrong=f"from {begin_s:.1f} to {end_s:.1f} s the images show other markings than before and after, as "
-        "those of another drive do: compare the lists of images and poses",
+        wrong=f"from {segment.begin_s:.1f} to {segment.end_s:.1f} s the images show other markings than "
+        "before and after, as those of another drive do: compare the lists of images and poses",
     )  # fmt: skip
 
 
