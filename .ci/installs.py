@@ -51,6 +51,7 @@ MORE = {
         f"v2hdm map +run=port2 workers=1 resume=false all_maps=true {' '.join(map(repr, SMALL_PORT))}",
         "v2hdm export map.geojson --format lanelet2",
         "v2hdm experiment --cfg job",
+        "python -c 'import v2hdm.paper, v2hdm.experiment.run'",
         "v2hdm detect images --limit 1",
     ),
     "map,ros": ("v2hdm check site --list-topics", "v2hdm detect site --limit 1"),
@@ -166,7 +167,13 @@ def missing(environment: Environment, here: Path) -> int:
         if command.extra is None or name == "calibrate ground":  # which the base install can do
             continue
         arguments = {"calibrate points": "points.csv --intrinsics camera_info.yaml"}
-        given = {"map": "+run=port2", "experiment": "", "fleet": "a.yaml", "check": "drives/mysite"}
+        given = {
+            "map": "+run=port2",
+            "simulate": "+run=port2",
+            "experiment": "",
+            "fleet": "a.yaml",
+            "check": "drives/mysite",
+        }
         words = arguments.get(name) or given.get(name, "outputs/port2")
         words += " outputs/friday" * (name in ("calibrate compare", "localize"))
         done = environment.run(f"v2hdm {name} {words}", here)

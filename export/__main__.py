@@ -20,10 +20,10 @@ def main() -> int:
 
 def _run(arguments: Sequence[str]) -> int:
     from export.config import ExportConfig
-    from v2hdm.cli.compose import work_on
+    from v2hdm.cli.compose import Door, work_on
 
     advice = "`python -m export checkpoint=... output=...`"
-    return work_on(COMMAND, "export", ExportConfig, _export, arguments, advice)
+    return work_on(COMMAND, Door("export", ExportConfig, advice), _export, arguments)
 
 
 def _export(job: Job) -> None:

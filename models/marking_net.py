@@ -26,15 +26,15 @@ from v2hdm.settings import Within
 MULTIPLE = 16
 """Image height and width must be multiples of this many pixels."""
 
-PAINT_STRIDE = 2
-KIND_STRIDE = 4
+PAINT_STRIDE = 2  # image pixels per element of paint, in both directions
+KIND_STRIDE = 4  # image pixels per element of kinds, in both directions
 LANE_STRIDE = 8
 """Image pixels per element of each output, in both directions."""
 
-_STEM_STRIDE = 4
+_STEM_STRIDE = 4  # image pixels per element after the first convolution, in both directions
 PAINT_UPSCALE = _STEM_STRIDE // PAINT_STRIDE
-_GREY_MEAN = 112.0
-_GREY_SCALE = 64.0
+_GREY_MEAN = 112.0  # grey level that is subtracted from an image
+_GREY_SCALE = 64.0  # grey levels that are the unit of an image
 
 
 @dataclass(kw_only=True)
@@ -103,7 +103,8 @@ class ConvNormRelu(nn.Sequential):
 
     def fold(self) -> None:
         """Merge the running statistics into the convolution; only for a network in eval mode."""
-        convolution, norm = self[0], self[1]
+        convolution = self[0]
+        norm = self[1]
         if isinstance(convolution, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d):
             self[0] = fuse_conv_bn_eval(convolution, norm)
             self[1] = nn.Identity()
@@ -192,7 +193,8 @@ def _space_to_depth(image: Tensor) -> Tensor:
     """
     batch, height, width, _ = image.shape
     s = _STEM_STRIDE
-    rows, columns = height // s, width // s
+    rows = height // s
+    columns = width // s
     tiles = image.reshape(batch, rows, s, columns * s * 3).permute(0, 2, 1, 3)
     channels = tiles.reshape(batch * s, rows * columns, s * 3).permute(0, 2, 1)
     return (channels.reshape(batch, 3 * s * s, rows, columns).to(torch.float32) - _GREY_MEAN) * (

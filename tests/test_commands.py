@@ -45,6 +45,7 @@ def run_command(folder, *arguments, **variables):
 NEEDED = {
     "v2hdm map +run=port2": ("map", "torch", "kornia"),
     "v2hdm experiment": ("map", "torch", "matplotlib"),
+    "v2hdm simulate +run=port2": ("map", "omegaconf", "omegaconf"),
     "v2hdm check drive": ("map", "cv2", "matplotlib"),
     "v2hdm calibrate points points.csv --intrinsics a.yaml": ("map", "torch", "kornia"),
     "v2hdm mosaic outputs/port2": ("map", "torch", "kornia"),
@@ -183,7 +184,7 @@ def test_help_explains_each_command_and_names_it(name, capsys):
     assert COMMANDS[name].says in text
 
 
-@pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("map", "experiment")])
+@pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("map", "experiment", "simulate")])
 @pytest.mark.parametrize("given", ["", "--no\x1b[2Jsuch"])
 def test_arguments_that_are_missing_or_unknown_are_one_line_that_names_the_help(name, given, capsys):
     with pytest.raises(SystemExit, match="2"):
@@ -229,6 +230,28 @@ def test_what_must_be_light_loads_nothing_heavy_and_the_base_install_is_enough_o
     done = run_command(tmp_path, "probe")
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "drawn" / "a.jpg").is_file()
+
+
+LOADED = """
+import sys
+from pathlib import Path
+import v2hdm.pipeline.map_drive
+ours = {name: module for name, module in sys.modules.items() if name.split(".")[0] == "v2hdm"}
+files = [Path(module.__file__) for module in ours.values()]
+print(sum(len(file.read_text(encoding="utf-8").splitlines()) for file in files))
+print(*ours)
+"""
+
+
+def test_mapping_loads_no_writer_no_page_no_mosaic_and_no_renderer():
+    done = subprocess.run(
+        [sys.executable, "-c", LOADED], cwd=ROOT, capture_output=True, text=True, timeout=60, check=True
+    )
+    lines, modules = done.stdout.splitlines()
+    assert int(lines) <= 30_000
+    unneeded = "io.maps.formats io.calibration.writing io.importers.bag report.page report.photos mosaic"
+    for name in (*unneeded.split(), "simulate.render"):
+        assert not [one for one in modules.split() if f"{one}.".startswith(f"v2hdm.{name}.")], name
 
 
 def test_the_only_console_script_is_v2hdm():

@@ -21,9 +21,9 @@ def main() -> int:
 
 def _run(arguments: Sequence[str]) -> int:
     from train.config import TrainConfig
-    from v2hdm.cli.compose import work_on
+    from v2hdm.cli.compose import Door, work_on
 
-    return work_on(COMMAND, "train", TrainConfig, _train, arguments, "set it on the command line")
+    return work_on(COMMAND, Door("train", TrainConfig, "set it on the command line"), _train, arguments)
 
 
 def _train(job: Job) -> None:

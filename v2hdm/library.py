@@ -16,7 +16,7 @@ from v2hdm.store.names import map_file
 if TYPE_CHECKING:  # load torch or scipy
     from v2hdm.adjust.problem import Problem
     from v2hdm.mapping.options import MappingOptions
-    from v2hdm.simulate import PortConfig
+    from v2hdm.simulate.port.config import PortConfig
 
 
 def read_map(path: str | Path) -> HDMap:
@@ -85,15 +85,14 @@ def simulate_port(
     >>> drive.name, list(drive.cameras), len(drive.images)
     ('port', ['front'], 22)
     """
-    from v2hdm.simulate import rendered_drive
+    from v2hdm.simulate.port.drive import rendered_drive
 
     config = config or _short_port()
     return read_drive(rendered_drive(config, Path(folder), workers, progress or (lambda done, total: None)))
 
 
 def _short_port() -> PortConfig:
-    from v2hdm.simulate import PortConfig
-    from v2hdm.simulate.port.config import RouteConfig, YardConfig
+    from v2hdm.simulate.port.config import PortConfig, RouteConfig, YardConfig
 
     port = PortConfig(name="port", seed=11, initial_ipm="estimated")
     return replace(

@@ -40,6 +40,9 @@ class Within:
         return text if self.step is None else f"a multiple of {self.step}, {text}"
 
 
+NO_KEY = {"omegaconf_ignore": True}
+"""Metadata of a field that no run file and no command line sets: another setting does."""
+
 ANY_NUMBER = Within()
 POSITIVE = Within(0, open=True)
 NOT_NEGATIVE = Within(0)

@@ -43,7 +43,7 @@ from v2hdm.detection import classifier as find
 from v2hdm.detection.batch import detect_all
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.quads import fit, lattice, propose
+from v2hdm.detection.quads import fit, lattice, propose, robust, state
 from v2hdm.faults import FAULTS
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
@@ -66,13 +66,13 @@ Part = tuple[str, Callable[[], AbstractContextManager[Any]]]
 
 def parts() -> Iterator[Part]:
     """Each part's name, and within which context it is off."""
-    yield "nothing off", lambda: patch.object(fit, "KNOTS", fit.KNOTS)
+    yield "nothing off", lambda: patch.object(state, "KNOTS", state.KNOTS)
     yield "search on the coarse grid", _without_search
     yield "the network's paint in the search", _without_paint
-    yield "parallelograms on the ground", lambda: patch.object(fit, "_CLOSURE_SHARE", 100.0)
+    yield "parallelograms on the ground", lambda: patch.object(state, "_CLOSURE_SHARE", 100.0)
     yield "red and blue beside grey", lambda: patch.object(lattice, "_GREY_FIRST", 1e6)
-    yield "light that changes along", lambda: patch.object(fit, "_LIGHT_STEP", 1e-3)
-    yield "a variance for each side", lambda: patch.object(fit, "_SHARED_PIXELS", 1e6)
+    yield "light that changes along", lambda: patch.object(state, "_LIGHT_STEP", 1e-3)
+    yield "a variance for each side", lambda: patch.object(robust, "_SHARED_PIXELS", 1e6)
     yield "the way from wide to narrow scatter", _with_narrow_scatter
     yield "the start within clipped paint", lambda: patch.object(fit, "_BLOOM", 0.0)
     yield "the floor of a side's error", lambda: patch.object(fit, "_MODEL_SIGMA_PX", 0.0)
@@ -84,24 +84,24 @@ def parts() -> Iterator[Part]:
 
 @contextmanager
 def _without_search() -> Iterator[None]:
-    settle = fit._State.settle
+    settle = state.State.settle
 
-    def unless_searching(state: Any, seen: Any, steps: int, paint: Any = None) -> Any:
-        return settle(state, seen, steps) if paint is None else None
+    def unless_searching(unknowns: Any, lattice: Any, steps: int, paint: Any = None) -> Any:
+        return settle(unknowns, lattice, steps) if paint is None else None
 
-    with patch.object(fit._State, "settle", unless_searching):
+    with patch.object(state.State, "settle", unless_searching):
         yield
 
 
 @contextmanager
 def _without_paint() -> Iterator[None]:
-    with patch.object(fit, "_add_paint", _nothing):
+    with patch.object(state, "add_paint", _nothing):
         yield
 
 
 @contextmanager
 def _with_narrow_scatter() -> Iterator[None]:
-    with patch.object(fit, "_WIDE_SCATTER", 0.0), patch.object(fit, "_FINAL_SCATTER", 0.0):
+    with patch.object(state, "_WIDE_SCATTER", 0.0), patch.object(state, "_FINAL_SCATTER", 0.0):
         yield
 
 
@@ -141,7 +141,7 @@ def _without_sizes() -> Iterator[None]:
 
 @contextmanager
 def _without_parts() -> Iterator[None]:
-    with patch("v2hdm.detection.quads.propose._split", lambda *_: []):
+    with patch("v2hdm.detection.quads.blobs._split", lambda *_: []):
         yield
 
 

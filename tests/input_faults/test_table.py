@@ -18,7 +18,8 @@ from v2hdm.faults.score_tests import score_faults
 from v2hdm.mapping import recovery
 from v2hdm.mapping.inputs import Inputs
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.mapping.results import CameraFit, SolveEvidence
+from v2hdm.mapping.results import CameraFit, ForeignSegment, SolveEvidence
+from v2hdm.store.cache import decode, encode
 from v2hdm.verdict import Status
 from v2hdm.verdict.results.solution import check_inputs
 
@@ -94,9 +95,13 @@ def test_a_new_fault_is_tested_for_weighed_named_and_recovered_from_by_its_recor
 
 
 @pytest.mark.usefixtures("with_a_new_fault")
-def test_a_fault_is_the_same_object_in_every_process():
-    assert pickle.loads(pickle.dumps(ROLLED)) is ROLLED
-    assert pickle.loads(pickle.dumps(table.CLOCK)) is table.CLOCK
+def test_evidence_comes_back_from_the_cache_and_from_other_processes_as_it_was():
+    told = Contradiction(ROLLED.name, -1, 0, -1, 0.03, 0.002, 0.002, 1e-40, 100.0, ("front", "rear"))
+    whole = evidence(score_tests=(told,), foreign=ForeignSegment(1.0, 2.0, 3.0))
+    for copy in (decode(encode(whole), SolveEvidence), pickle.loads(pickle.dumps(whole))):
+        assert copy.score_tests == whole.score_tests
+        assert copy.score_tests[0].fault is ROLLED
+        assert copy.foreign.gain == 3.0
 
 
 def test_every_fault_has_columns_but_that_of_single_points_which_needs_none():

@@ -169,7 +169,7 @@ def test_the_errors_of_a_maps_corners_hang_together_as_drift_makes_them():
         ({"known_sizes": {"by_class_m": {DIAMOND: [1.0, 0.0]}}}, r"by_class_m\.diamond"),
         ({"known_sizes": {"sigma_m": 0.0}}, r"known_sizes\.sigma_m"),
         ({"lanes": {"model": "spline"}}, r"mapping\.lanes\.model is 'spline'; choose after or joint"),
-        ({"mode": "online"}, r"mapping.mode is 'online'; choose batch or incremental"),
+        ({"mode": "online"}, r"mode is 'online'; choose batch or incremental"),
         ({"max_range_m": 0.0}, r"mapping\.max_range_m"),
     ],
 )

@@ -73,7 +73,7 @@ def test_a_straight_drive_with_70_cm_of_uncertainty_is_no_pass_and_names_the_mou
     )
     says = {finding.about: finding.says for finding in verdict.raised}
     assert "0 % of the markings meet the goal; the largest part" in says["map"]
-    assert all("drive a turn, or survey the camera's place" in one for one in says.values())
+    assert all("include a turn, or survey the camera's place" in one for one in says.values())
 
 
 @pytest.mark.parametrize(("coarse", "status"), [(2, Status.PASS), (12, Status.WARN)])

@@ -12,7 +12,7 @@ from tests.mapping.scene import SceneOptions, make_scene
 from tests.report.yard import SURVEY_M, checked, point, yard
 from tests.verdict.drives import INFO, square_at
 from v2hdm.faults import Contradiction, table
-from v2hdm.mapping.results import CameraFit, MethodResult, SolveEvidence
+from v2hdm.mapping.results import CameraFit, ForeignSegment, MethodResult, SolveEvidence
 from v2hdm.records import Calibration, Exclusion, GroundStrip, HDMap
 from v2hdm.site.candidates import LACKS_A_CORNER
 from v2hdm.verdict import Finding, Status, Verdict
@@ -24,7 +24,7 @@ FIT = CameraFit(observations=2000, variance_factor=0.15, rejected_share=0.02)
 
 def contradiction(fault, cameras, axis, about, value, sigma, sigmas):
     numbers = value, sigma, sigma, 2 * norm.sf(sigmas), sigmas**2 / 2
-    return Contradiction(fault, 0 if len(cameras) == 1 else -1, axis, -1, *numbers, cameras, about)
+    return Contradiction(fault.name, 0 if len(cameras) == 1 else -1, axis, -1, *numbers, cameras, about)
 
 
 CLOCK = contradiction(table.CLOCK, ("front", "rear"), 0, "", 0.001, 0.001, 1.0)
@@ -126,7 +126,7 @@ def test_an_input_that_is_contradicted_still_fails_and_symptoms_point_to_it(driv
 )
 def test_foreign_images_are_named_by_their_odds_among_other_causes(odds, named):
     focal = replace(contradiction(table.FOCAL, ("front", "rear"), 0, "", -0.02, 0.003, 7.0), gain=20.7)
-    evidence = replace(FINE, score_tests=(focal,), foreign=(4.0, 8.0, odds))
+    evidence = replace(FINE, score_tests=(focal,), foreign=ForeignSegment(4.0, 8.0, odds))
     assert [f.check for f in check_inputs(evidence) if f.status is Status.FAIL] == named
 
 
@@ -192,9 +192,9 @@ def test_a_small_contradiction_is_none_however_sure_it_is():
 
 def test_a_straight_drive_says_what_it_cannot_tell():
     unsure = replace(FINE, score_tests=(replace(CLOCK, sigma=0.01), replace(LEVER, sigma=float("inf"))))
-    untold = [f for f in check_inputs(unsure) if f.is_unobservable]
-    assert {f.check for f in untold} == {"clock", "survey"}
-    assert all("drive a turn" in f.says for f in untold)
+    unobservable = [f for f in check_inputs(unsure) if f.is_unobservable]
+    assert {f.check for f in unobservable} == {"clock", "survey"}
+    assert all("include a turn" in f.says for f in unobservable)
     sure = replace(square_at(0.0, 0.0), covariance_m2=1e-6 * np.eye(8))
     for evidence, is_told in ((unsure, True), (FINE, False)):
         headline = Verdict.of(check_goal(result(evidence, sure), 0.05, "poses")).headline
@@ -206,7 +206,7 @@ def test_a_straight_drive_says_what_it_cannot_tell():
     ("check", "change"),
     [
         ("fit", {"variance_factor": 6.0}),
-        ("foreign images", {"foreign": (4.0, 8.0, 20.0)}),
+        ("foreign images", {"foreign": ForeignSegment(4.0, 8.0, 20.0)}),
         ("rejected", {"fits": {"front": replace(FIT, rejected_share=0.14)}}),
         ("held out", {"held_out": {"heave": 6.5}}),
         ("pose noise", {"pose_noise": {"heading_rad": 4.0}}),

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from v2hdm.adjust.covariance import corner_gain
-from v2hdm.adjust.engines.numba import engine
+from v2hdm.adjust.engines import numba as kernels
 from v2hdm.adjust.problem import Observations, Problem, SolveOptions
 from v2hdm.adjust.solve import solve
 from v2hdm.compiled import folder_of
@@ -25,7 +25,7 @@ _PROGRAM = "from v2hdm.adjust import ahead; ahead.compile_kernels()"
 @contextmanager
 def compiled_meanwhile(device: str) -> Iterator[None]:
     """Have the kernels of an adjustment on the CPU compiled by the end of the block, if cacheable."""
-    folder = folder_of(engine)
+    folder = folder_of(kernels)
     quiet = subprocess.DEVNULL
     if device != "cpu" or folder is None or (folder / _DONE).exists():
         yield
@@ -45,7 +45,7 @@ def compile_kernels() -> None:
     """Compile all kernels and mark them complete; ends with the process at the other end of stdin."""
     threading.Thread(target=lambda: (os.read(0, 1), os._exit(1)), daemon=True).start()
     use_kernels()
-    if (folder := folder_of(engine)) is not None:
+    if (folder := folder_of(kernels)) is not None:
         (folder / _DONE).touch()
 
 

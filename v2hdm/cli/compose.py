@@ -14,7 +14,7 @@ import sys
 import tempfile
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import MISSING, Field, fields, is_dataclass
+from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, get_args
@@ -27,9 +27,9 @@ from omegaconf.errors import OmegaConfBaseException
 
 from v2hdm.cli.command import Command
 from v2hdm.errors import ConfigError, V2hdmError
-from v2hdm.io.drive.folder import DRIVE_FILE
+from v2hdm.io.description import DRIVE_FILE
 from v2hdm.safe.texts import read_yaml
-from v2hdm.settings import settings_of
+from v2hdm.settings import NO_KEY, settings_of
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _Schema = TypeVar("_Schema")
@@ -53,17 +53,30 @@ class Job(NamedTuple):
     yaml: str
 
 
-def work_on(
-    command: Command,
-    name: str,
-    schema: type[Any],
-    work: Callable[[Job], int | None],
-    arguments: Sequence[str],
-    advice: str,
-) -> int:
-    """Compose ``conf/<name>.yaml`` with the command line and work on it; returns the exit code.
+@dataclass(frozen=True)
+class Door:
+    """What a command takes: overrides of ``conf/<name>.yaml``, which ``schema`` checks.
 
-    ``advice`` is on values that are missing. Raises ConfigError where a key or value is wrong.
+    Attributes:
+        name: of the configuration.
+        schema: the dataclass that it fills.
+        advice: on values that are missing.
+        lists: whether ``--help`` lists a key, by its name.
+        further: a line on keys that it does not list.
+    """
+
+    name: str
+    schema: type[Any]
+    advice: str
+    lists: Callable[[str], bool] = lambda key: True
+    further: str = ""
+
+
+def work_on(command: Command, door: Door, work: Callable[[Job], int | None], arguments: Sequence[str]) -> int:
+    """Compose the configuration with the command line and work on it; returns the exit code.
+
+    Raises:
+        ConfigError: a key or value is wrong.
     """
     parser = argparse.ArgumentParser(command.name, add_help=False, allow_abbrev=False)
     parser.add_argument("overrides", nargs="*")
@@ -74,19 +87,19 @@ def work_on(
     if unknown:
         raise ConfigError(f"there is no option {unknown[0]}; {command.name} --help lists them")
     if parsed.help:
-        print(help_text(command.name, command.says, schema, conf_dir()))
+        print(help_text(command, door))
         return 0
     try:
         _check_own_files(parsed.config_dir, parsed.overrides)
-        composed = _compose(name, schema, parsed.overrides, parsed.config_dir)
+        composed = _compose(door.name, door.schema, parsed.overrides, parsed.config_dir)
     except V2hdmError:
         raise
     except Exception as error:  # whatever Hydra, OmegaConf and PyYAML raise about texts that users wrote
-        raise explain(error, schema, parsed.overrides) from error
+        raise explain(error, door.schema, parsed.overrides) from error
     if parsed.cfg:
         print(OmegaConf.to_yaml(composed))
         return 0
-    return work(Job(to_dataclass(composed, schema, advice), to_yaml(composed))) or 0
+    return work(Job(to_dataclass(composed, door.schema, door.advice), to_yaml(composed))) or 0
 
 
 def _compose(
@@ -227,7 +240,7 @@ Usage: {command} [key=value ...] [--config-dir FOLDER]
 """
 _OFTEN = {
     "drive.path", "drive.format", "drive.cameras", "map.base", "mapping.max_range_m", "mapping.survey.file",
-    "report.background",
+    "report.background", "simulate.name", "simulate.seed", "simulate.session", "simulate.initial_ipm",
 }  # fmt: skip
 """Keys below others that are often set; the rest is for experts."""
 
@@ -243,25 +256,28 @@ class Key(NamedTuple):
     meaning: str
 
 
-def help_text(command: str, says: str, schema: type[Any], conf: Path) -> str:
-    """The page that ``--help`` prints, of a command, a sentence about it, its dataclass and ``conf/``."""
-    parts = [_USAGE.format(command=command), says, ""]
-    if "drive" in {one.name for one in fields(schema)}:
-        runs = ", ".join(sorted(path.stem for path in (conf / "run").glob("*.yaml")))
-        parts += [f"Shipped runs: {runs}", ""]
-    often: list[str] = ["Keys, as key (type, default):"]
-    rest: list[str] = ["", "For experts:"]
-    for key in keys_of(schema):
-        page = often if key.name in _OFTEN or "." not in key.name else rest
-        page.append(f"  {key.name} ({key.kind}{f', {key.default}' if key.default else ''})")
-        page += textwrap.wrap(key.meaning, 100, initial_indent=" " * 6, subsequent_indent=" " * 6)
-    return "\n".join([*parts, *often, *rest])
+def help_text(command: Command, door: Door) -> str:
+    """The page that ``--help`` prints."""
+    head = [_USAGE.format(command=command.name), command.says, ""]
+    if "drive" in settings_of(door.schema):
+        runs = ", ".join(sorted(path.stem for path in (conf_dir() / "run").glob("*.yaml")))
+        head += [f"Shipped runs: {runs}", ""]
+    often = ["Keys, as key (type, default):"]
+    for_experts = ["", "For experts:"]
+    for key in keys_of(door.schema):
+        if door.lists(key.name):
+            page = often if key.name in _OFTEN or "." not in key.name else for_experts
+            page.append(f"  {key.name} ({key.kind}{f', {key.default}' if key.default else ''})")
+            page += textwrap.wrap(key.meaning, 100, initial_indent=" " * 6, subsequent_indent=" " * 6)
+    return "\n".join([*head, *often, *for_experts, *([door.further] if door.further else [])])
 
 
 def keys_of(schema: type[Any], prefix: str = "") -> Iterator[Key]:
     """All keys below a dataclass, in order; those of an entry of a mapping stand under ``NAME``."""
     settings = settings_of(schema)
     for field in fields(schema):
+        if field.metadata == NO_KEY:
+            continue
         setting = settings[field.name]
         hint = setting.hint
         name = f"{prefix}{field.name}"

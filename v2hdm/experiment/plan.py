@@ -13,7 +13,7 @@ from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError
 from v2hdm.mapping.options import INCREMENTAL, MappingOptions, check_options
 from v2hdm.pipeline.config import DriveConfig
-from v2hdm.simulate import PortConfig
+from v2hdm.simulate.port.config import PortConfig
 from v2hdm.store.files import refuse_url
 
 OURS = "ours"
@@ -56,6 +56,7 @@ class ExperimentConfig:
     name: Annotated[str, "name of the results folder, <output>/<name>/."] = "experiment"
     output: Annotated[str, "folder for the results."] = "outputs"
     cache: Annotated[str, "folder for rendered drives and the results of each stage."] = "cache"
+    device: Annotated[str, "where the adjustment runs, cpu or cuda."] = "cpu"
     workers: Annotated[
         int, "number of processes, each of which maps one drive at a time; 0 for one per core."
     ] = 0
@@ -85,7 +86,9 @@ def jobs(config: ExperimentConfig) -> list[Job]:
         OURS: {}, PAPER: {"pose_model": "paper", "loss": "none"}, INCREMENTAL: {"mode": INCREMENTAL}
     }  # fmt: skip
     recipes = dict.fromkeys([OURS, *config.recipes])
-    options = {name: replace(deepcopy(config.mapping), **changed[name]) for name in recipes}
+    options = {
+        name: replace(deepcopy(config.mapping), device=config.device, **changed[name]) for name in recipes
+    }
     found: list[tuple[str, int | None, Site]] = []
     for seed in config.seeds:
         for port, site in config.ports.items():

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from scipy import stats
 
-from v2hdm.faults.table import Error, Fault
+from v2hdm.faults.table import FAULTS, Error, Fault
 
 _LEAST_P = 1e-300  # a smaller p-value is zero in floating point
 
@@ -20,11 +20,9 @@ def sigmas_of(p_value: float) -> float:
 class ScoreTest:
     """The test of one fault."""
 
-    fault: Fault  # the hypothesis
+    fault_name: str  # by its name alone a fault is cached and comes from another process
     camera: int  # index in the problem; -1 for all together
-    # axis, 0 to 2, of the vehicle (survey, lever, knock), map (slope, datum; step: east, north, north-east,
-    # north-west) or image (principal); side (crown: both, left, right); or shape of a drift
-    axis: int
+    axis: int  # which of the fault's axes, sides or shapes, as its record says; 0 if it has one
     item: int  # of what the fault's own ``item`` names; -1: of none, or of all
     value: float = 0.0  # true minus stated
     sigma: float = float("inf")  # from the segments' disagreement; inf if unobservable
@@ -32,6 +30,11 @@ class ScoreTest:
     p_value: float = 1.0  # probability of such a value without the fault; 1 if unobservable
     # log-likelihood ratio of the fault, each segment predicted from the others; negative if they disagree
     gain: float = 0.0
+
+    @property
+    def fault(self) -> Fault:
+        """The hypothesis."""
+        return FAULTS[self.fault_name]
 
     @property
     def sigmas(self) -> float:

@@ -95,7 +95,7 @@ class _Answer:
         """The test, shrinking the variance factor towards the drive's ``usual`` one."""
         hypothesis = self.hypothesis
         fault = hypothesis.fault
-        blank = ScoreTest(fault, hypothesis.camera, hypothesis.axis, hypothesis.item)
+        blank = ScoreTest(fault.name, hypothesis.camera, hypothesis.axis, hypothesis.item)
         if not self.is_observable:
             return blank
         freedom = self.freedom
@@ -182,7 +182,7 @@ def _control_points(problem: Problem, solution: Solution, usual: float) -> Itera
         distance_m = float(np.linalg.norm(sigma_m**2 * np.linalg.solve(expected, off)))
         test_sigma_m = distance_m / max(squared, 1e-12) ** 0.5
         yield ScoreTest(
-            table.CONTROL,
+            table.CONTROL.name,
             camera=-1,
             axis=-1,
             item=item,

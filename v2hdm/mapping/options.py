@@ -7,13 +7,13 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 from v2hdm.errors import ConfigError
-from v2hdm.settings import NOT_NEGATIVE, POSITIVE, Within, check_settings
+from v2hdm.settings import NO_KEY, NOT_NEGATIVE, POSITIVE, Within, check_settings
 from v2hdm.site.options import AFTER, JOINT, AcceptanceOptions, LaneOptions
 
 BATCH = "batch"
 INCREMENTAL = "incremental"
 AUTO = "auto"
-MODES = (BATCH, INCREMENTAL)  # values of ``mapping.mode``
+MODES = (BATCH, INCREMENTAL)  # values of ``mode``
 
 PLANE = "plane"
 SURFACE = "surface"
@@ -106,7 +106,7 @@ class MappingOptions:
     ] = 0.15
     mode: Annotated[
         str, "batch; or incremental, marking by marking as on the vehicle, then solved like batch."
-    ] = BATCH
+    ] = field(default=BATCH, metadata=NO_KEY)
     pose_model: Annotated[
         str,
         "the part of each frame's pose that is estimated: paper, none; roll_pitch; full, also heading and "
@@ -131,7 +131,9 @@ class MappingOptions:
         Within(1, 100),
         "number of times that association under the optimised extrinsic and a joint solve repeat.",
     ] = 2
-    device: Annotated[str, "torch device of the joint solves, cpu or cuda."] = "cpu"
+    device: Annotated[str, "torch device of the joint solves, cpu or cuda."] = field(
+        default="cpu", metadata=NO_KEY
+    )
     acceptance: AcceptanceOptions = field(default_factory=AcceptanceOptions)
     lanes: LaneOptions = field(default_factory=LaneOptions)
     known_sizes: SizeOptions = field(default_factory=SizeOptions)
@@ -145,12 +147,16 @@ def check_options(options: MappingOptions, kinds: Sequence[str] | None = None) -
     """
     from v2hdm.adjust.problem import LOSSES  # brings torch, which settings as such do without
 
-    choices = {"mode": MODES, "pose_model": POSE_MODELS, "ground": GROUNDS, "loss": LOSSES}
-    for key, allowed in choices.items():
-        value = getattr(options, key)
+    choices = {
+        "mode": (options.mode, MODES),
+        "mapping.pose_model": (options.pose_model, POSE_MODELS),
+        "mapping.ground": (options.ground, GROUNDS),
+        "mapping.loss": (options.loss, LOSSES),
+    }
+    for key, (value, allowed) in choices.items():
         if value not in allowed:
             which = " or ".join(allowed) if len(allowed) == 2 else f"from {', '.join(allowed)}"
-            raise ConfigError(f"mapping.{key} is '{value}'; choose {which}.")
+            raise ConfigError(f"{key} is '{value}'; choose {which}.")
     if options.lanes.model not in (AFTER, JOINT):
         raise ConfigError(f"mapping.lanes.model is '{options.lanes.model}'; choose {AFTER} or {JOINT}.")
     check_settings(options, "mapping.")
@@ -160,13 +166,13 @@ def check_options(options: MappingOptions, kinds: Sequence[str] | None = None) -
             raise ConfigError(f"{key}: there is no such class; choose from {', '.join(kinds)}.")
         if len(size) != 2 or not 0 < size[1] <= size[0]:
             raise ConfigError(f"{key} is {list(size)}; give length and width in m, the longer one first.")
-    for number, one in enumerate(options.survey.points):
+    for number, point in enumerate(options.survey.points):
         key = f"mapping.survey.points[{number}]"
-        if len(one.position_map) != 2:
-            raise ConfigError(f"{key}.position_map is {list(one.position_map)}; give x and y in m.")
-        if len(one.sigma_m) != 2 or not all(value > 0 for value in one.sigma_m):
-            raise ConfigError(f"{key}.sigma_m is {list(one.sigma_m)}; give those of x and y in m, above 0.")
-    names = [one.id for one in options.survey.points]
+        if len(point.position_map) != 2:
+            raise ConfigError(f"{key}.position_map is {list(point.position_map)}; give x and y in m.")
+        if len(point.sigma_m) != 2 or not all(value > 0 for value in point.sigma_m):
+            raise ConfigError(f"{key}.sigma_m is {list(point.sigma_m)}; give those of x and y in m, above 0.")
+    names = [point.id for point in options.survey.points]
     twice = next((name for number, name in enumerate(names) if name in names[:number]), None)
     if twice is not None:
         raise ConfigError(f"mapping.survey names the point {twice} twice; keep one of them.")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,6 +35,18 @@ class CameraFit:
     rejected_share: float
 
 
+class ForeignSegment(NamedTuple):
+    """Images between two times that may be those of another drive."""
+
+    begin_s: float
+    end_s: float
+    gain: float  # log-odds that they are
+
+
+NO_SEGMENT = ForeignSegment(0.0, 0.0, 0.0)
+"""No image is foreign: times, s, of an empty segment, and even odds."""
+
+
 @dataclass(frozen=True)
 class SolveEvidence:
     """Evidence from the joint optimisation of one set of cameras, for the checks."""
@@ -51,7 +64,7 @@ class SolveEvidence:
     read_out_s: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # by camera, with sigma
     jitter_s: float = 0.0  # scatter of stamps, s, that would explain all noise of the positions
     along_over_across: float = 1.0  # ratio of white position errors along and across the path
-    foreign: tuple[float, float, float] = (0.0, 0.0, 0.0)  # segment's begin, end, s; log-odds
+    foreign: ForeignSegment = NO_SEGMENT
 
     @property
     def held_out_loss(self) -> float | None:

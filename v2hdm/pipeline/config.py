@@ -12,12 +12,12 @@ from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError, DriveError, need
 from v2hdm.io.drive import ReadOptions, drive_name
 from v2hdm.io.maps.corrections import read_corrections
-from v2hdm.io.maps.formats import check_formats
-from v2hdm.mapping.options import INCREMENTAL, MappingOptions, check_options
+from v2hdm.mapping.options import BATCH, INCREMENTAL, MappingOptions, check_options
 from v2hdm.records import Drive, Image
+from v2hdm.safe.rasters import check_background
 from v2hdm.safe.texts import shown, take_camera_name, take_name
 from v2hdm.settings import MOST_PROCESSES, NOT_NEGATIVE, POSITIVE, Within, check_settings
-from v2hdm.simulate import PortConfig
+from v2hdm.simulate.port.config import PortConfig
 from v2hdm.store import names
 from v2hdm.store.cache import key_of
 from v2hdm.store.files import file_digest
@@ -73,7 +73,7 @@ class ReportConfig:
 
 @dataclass(kw_only=True)
 class RunConfig:
-    """Everything about one run."""
+    """Everything about one run; its ``device`` and ``mode`` take the place of the mapping's."""
 
     name: Annotated[
         str | None, "name of the results folder, <output>/<name>/; null takes the drive's own name."
@@ -105,10 +105,13 @@ class RunConfig:
     workers: Annotated[
         int, Within(0, MOST_PROCESSES), "number of processes for rendering and detection; 0 for one per core."
     ] = 0
-    device: Annotated[str, "where the adjustment runs, cpu or cuda; the same as mapping.device."] = "cpu"
-    mode: Annotated[str, "batch or incremental; the same as mapping.mode."] = "batch"
+    device: Annotated[str, "where the adjustment runs, cpu or cuda."] = "cpu"
+    mode: Annotated[
+        str, "batch; or incremental, marking by marking as on the vehicle, then solved like batch."
+    ] = BATCH
     accuracy_goal_cm: Annotated[
         float,
+        POSITIVE,
         "95 % of the corners, and the calibrations, must be known to this radius, cm, at 95 %, else the "
         "verdict is WARN (docs/verdict.md).",
     ] = ACCURACY_GOAL_CM
@@ -127,6 +130,9 @@ class RunConfig:
         "latitude.",
     ] = None
 
+    def __post_init__(self) -> None:
+        self.mapping = replace(self.mapping, device=self.device, mode=self.mode)
+
 
 def run_name(config: RunConfig) -> str:
     """The name of the run: as configured, else that of the drive to be rendered or read."""
@@ -142,14 +148,13 @@ def run_name(config: RunConfig) -> str:
 def admit(config: RunConfig) -> str:
     """Raise ConfigError, which names the key, for settings that cannot work; returns the run's name."""
     from v2hdm.detection.detector import Detector
+    from v2hdm.io.maps.formats import check_formats
     from v2hdm.survey.run import table_of
 
     name = run_name(config)
     take_name(name, "name", ConfigError)
     if config.simulate is not None:
-        take_name(config.simulate.name, "simulate.name", ConfigError)
-        for camera in config.simulate.cameras:
-            take_camera_name(camera, "simulate.cameras", ConfigError)
+        _check_names(config.simulate)
     check_settings(config)
     # Wherever the detector will run, it can be looked at here.
     detector = Detector.load(options=replace(config.detector, device="cpu"))
@@ -162,13 +167,26 @@ def admit(config: RunConfig) -> str:
         need("rasterio", "gis", "report.background", ConfigError)
         if not Path(config.report.background).exists():
             raise ConfigError(f"report.background: no file or folder {config.report.background}")
-        from v2hdm.report.page.layers import open_background
-
-        with open_background(Path(config.report.background)):
-            pass  # an unreadable one is refused here, not after minutes of mapping
+        check_background(Path(config.report.background))  # before minutes of mapping
     has_base = config.map.base is not None
     check_choice(config.mapping, len(config.drive.paths), has_base, config.accuracy_goal_cm)
     return name
+
+
+def admit_port(config: RunConfig) -> PortConfig:
+    """The port to render; raises ConfigError, which names the key, where there is none or it cannot work."""
+    if config.simulate is None:
+        raise ConfigError("simulate is not set: choose a port to render (+run=port1, +run=port2)")
+    _check_names(config.simulate)
+    check_settings(config)
+    return config.simulate
+
+
+def _check_names(port: PortConfig) -> None:
+    """Raise ConfigError for names of a port that cannot be those of files."""
+    take_name(port.name, "simulate.name", ConfigError)
+    for camera in port.cameras:
+        take_camera_name(camera, "simulate.cameras", ConfigError)
 
 
 def check_choice(options: MappingOptions, drives: int, has_base: bool, goal_cm: float) -> None:

@@ -214,13 +214,14 @@ def map_and_save(
 ) -> RunResult:
     """Do what :func:`run` says, with what ``cache`` keeps, in place of an earlier result of the same."""
     from v2hdm.pipeline.map_drive import map_drive  # torch and much else, which takes seconds
+    from v2hdm.pipeline.saving import Outputs, write_result
 
     name = admit(config)
     place = Path(config.output) / name
     with cache.in_use():
         for path in () if config.map.base is None else base_files(Path(config.map.base))[:1]:
             note_input(path)  # before any work is done for nothing
-        with result_folder(place, made=made) as folder, logging_to(log_file(folder / LOG)):
+        with result_folder(place, maker=made) as folder, logging_to(log_file(folder / LOG)):
             _log.info("v2hdm %s, run %s", __version__, name)
             (folder / CONFIG).write_text(config_yaml or f"{config!r}\n", encoding="utf-8")
 
@@ -240,8 +241,14 @@ def map_and_save(
                 context=context,
             )
             key = result_key(config, found.drives, found.contents, context.cache.key())
-            below = config.report.background
-            found.write(folder, config.export, config.all_maps, config.mosaic, context, config.crs, below)
+            outputs = Outputs(
+                formats=config.export,
+                all_maps=config.all_maps,
+                mosaic=config.mosaic,
+                crs=config.crs,
+                background=config.report.background,
+            )
+            write_result(found, folder, outputs, context)
             for line in found.verdict.lines:
                 _log.info("%s", line)
         result = RunResult(place, found.metrics, found.headlines, found.verdict)
@@ -258,7 +265,7 @@ def _drive_folders(config: RunConfig, context: Context) -> tuple[Path, ...]:
         return config.drive.paths
     if config.drive.paths:
         raise ConfigError("both simulate and drive.path are set: a run takes one, remove the other")
-    from v2hdm.simulate import rendered_drive
+    from v2hdm.simulate.port.drive import rendered_drive
 
     with context.timed("render"):
         folder = Path(config.cache)

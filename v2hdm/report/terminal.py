@@ -88,7 +88,7 @@ def changes_table(changes: Mapping[str, Any]) -> Table | str:
     if not changes["listed"]:
         return f"changes: {counts}"
     numbers = ("by (cm)", "sigma (cm)", "odds", "seen / should be")
-    table = new_table(f"changes: {counts}", ("class", "fate"), numbers, before=("id",))
+    table = new_table(f"changes: {counts}", ("class", "change"), numbers, before=("id",))
     table.add_column("at (m)")
     for change in changes["listed"]:
         shift = change["shift_m"]

@@ -133,12 +133,12 @@ def with_shared_errors(candidates: Candidates, fused: FusedGroups, scatter: Floa
     With correlation r, the mean of n images has the variance (1 + (n - 1) r) / n (Kish, Survey Sampling,
     1965): about r times a single image's, as in ``fused``. ``scatter`` (G, 4) inflates a corner's variance.
     """
-    sightings = np.maximum(fused.seen, 1)
+    sightings = np.maximum(fused.point_sightings, 1)
     share = scatter - 1 + CORRELATION * sightings * scatter
     unseen = np.asarray(np.isnan(fused.corners_map).any(axis=2))
     shared = np.where(unseen[..., None, None], 0.0, share[..., None, None] * fused.covariance_m2)
     # Images that are cut alike share one error: their number does not locate the corner.
-    no_point = (fused.seen == 0) & ~unseen
+    no_point = (fused.point_sightings == 0) & ~unseen
     shared[no_point] = line_only(shared[no_point], _UNSEEN_M2**0.5)
     return Candidates(candidates.corners_map, candidates.covariance_m2 + block_diagonal(shared))
 

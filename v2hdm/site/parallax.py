@@ -168,9 +168,9 @@ def _log_normal(off: FloatArray, covariance: FloatArray) -> FloatArray:
 
 def _sum(values: FloatArray | BoolArray, group: IntArray, count: int) -> FloatArray:
     """Sums (G, ...) of values (N, ...) by group (N,)."""
-    out = np.zeros((count, *values.shape[1:]))
-    np.add.at(out, group, values)
-    return out
+    totals = np.zeros((count, *values.shape[1:]))
+    np.add.at(totals, group, values)
+    return totals
 
 
 def _by_pose(ray: FloatArray, height_m: FloatArray) -> FloatArray:

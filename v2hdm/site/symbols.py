@@ -101,7 +101,7 @@ def map_symbols(
         objections = [measure_parallax(view, 1).objections(options.min_probability)[0] for view in views]
         if None in objections:
             symbols_found.append(Symbol(kind, outline, len(camera)))
-            sides = [symbols.seen[n] for n in rows[members]]
+            sides = [symbols.seen_sides[n] for n in rows[members]]
             traces.append(eyes.traces(outlines, sides, image.ravel()))
         else:
             exclusions.append(Exclusion(kind, middle, len(camera), objections[0] or ""))
@@ -161,11 +161,11 @@ class _Eyes:
 
     def sigma_m(self, points_map: FloatArray) -> FloatArray:
         """Standard deviation (I, ...), m, along the ray, of an outline at points (..., 2)."""
-        many = (slice(None), *(None,) * (points_map.ndim - 1))
-        range_m = np.linalg.norm(points_map - self.centre_map[(*many, slice(2))], axis=-1)
-        height_m = self.rig.height_m[self.camera][many]
+        by_image = (slice(None), *(None,) * (points_map.ndim - 1))
+        range_m = np.linalg.norm(points_map - self.centre_map[(*by_image, slice(2))], axis=-1)
+        height_m = self.rig.height_m[self.camera][by_image]
         direction_rad = np.hypot(self.jitter_rad, OUTLINE_SIGMA_PX / self.rig.intrinsic[self.camera, 0, 0])
-        return np.asarray(direction_rad[many] * (range_m**2 + height_m**2) / height_m)
+        return np.asarray(direction_rad[by_image] * (range_m**2 + height_m**2) / height_m)
 
     def traces(
         self, shapes: Sequence[FloatArray], seen_sides: Sequence[BoolArray], image: IntArray

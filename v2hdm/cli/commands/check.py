@@ -29,7 +29,7 @@ def _run(arguments: Sequence[str]) -> int:
 
         print(list_topics(parsed.drive, Path(ReadOptions().cache)))
         return 0
-    from v2hdm.ground import estimate_cameras
+    from v2hdm.ground.estimate import estimate_cameras
     from v2hdm.store.files import write_json
     from v2hdm.store.names import VERDICT
     from v2hdm.verdict import check_drive
@@ -63,7 +63,7 @@ def _run(arguments: Sequence[str]) -> int:
 
 def _recording_of(drive: Path) -> Path:
     """The bag that a drive folder describes, so that both have one result; else the drive itself."""
-    from v2hdm.io.drive.folder import DRIVE_FILE
+    from v2hdm.io.description import DRIVE_FILE
     from v2hdm.safe.texts import read_yaml
 
     file = drive / DRIVE_FILE

@@ -10,17 +10,18 @@ from v2hdm.cli.command import GO_ON, Command
 if TYPE_CHECKING:
     from v2hdm.cli.compose import Job
 
-_ADVICE = "name ports (+run@ports.port1=port1) or set the missing keys on the command line"
-
 
 def _run(arguments: Sequence[str]) -> int:
     """Compare all methods."""
     import torch  # noqa: F401  # its absence is reported before that of what is built on it
 
-    from v2hdm.cli.compose import work_on
+    from v2hdm.cli.compose import Door, work_on
     from v2hdm.experiment.plan import ExperimentConfig
 
-    return work_on(COMMAND, "experiment", ExperimentConfig, _compare, arguments, _ADVICE)
+    advice = "name ports (+run@ports.port1=port1) or set the missing keys on the command line"
+    further = "\nThose of a rendered port, ports.NAME.simulate.*, are listed by v2hdm simulate --help."
+    door = Door("experiment", ExperimentConfig, advice, lambda key: ".simulate." not in key, further)
+    return work_on(COMMAND, door, _compare, arguments)
 
 
 def _compare(job: Job) -> None:

@@ -13,16 +13,18 @@ from v2hdm.cli.command import Command
 if TYPE_CHECKING:
     from v2hdm.cli.compose import Job
 
-_ADVICE = "choose a run (+run=port1, +run=port2, +run=kitti drive.path=...) or set it on the command line"
 _STYLES = {"PASS": "bold green", "WARN": "bold yellow", "FAIL": "bold red"}  # of rich, by verdict
 
 
 def _run(arguments: Sequence[str]) -> int:
     """Map a drive; 0 for PASS and WARN, 3 for FAIL."""
-    from v2hdm.cli.compose import work_on
+    from v2hdm.cli.compose import Door, work_on
     from v2hdm.pipeline.config import RunConfig
 
-    return work_on(COMMAND, "map", RunConfig, _map, arguments, _ADVICE)
+    advice = "choose a run (+run=port1, +run=port2, +run=kitti drive.path=...) or set it on the command line"
+    further = "\nThose of a rendered port, simulate.*, are listed by v2hdm simulate --help."
+    door = Door("map", RunConfig, advice, lambda key: not key.startswith("simulate."), further)
+    return work_on(COMMAND, door, _map, arguments)
 
 
 def _map(job: Job) -> int:

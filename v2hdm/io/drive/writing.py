@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from v2hdm.io.calibration.writing import write_camera_info
-from v2hdm.io.drive.folder import DRIVE_FILE, POSES_FILE
+from v2hdm.io.description import DRIVE_FILE, POSES_FILE
 from v2hdm.io.drive.truth import LANE_VISIBLE, SIGHTINGS
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.trajectory import write_image_list, write_tum

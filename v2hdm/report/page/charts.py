@@ -14,9 +14,8 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
-from v2hdm.records import FloatArray, HDMap
+from v2hdm.records import SIGMAS_95, FloatArray, HDMap
 from v2hdm.report.page.facts import Facts, GroundResiduals, Route
-from v2hdm.report.page.layers import SIGMAS_95
 from v2hdm.report.style import OKABE_ITO, RC, draw_arrows
 
 INK = "#1b1e21"
@@ -98,7 +97,7 @@ def site_chart(hd_map: HDMap, route: Route | None, excluded: FloatArray) -> str:
         axes.add_collection(PolyCollection(shapes, linewidths=0.8, label="markings", **paint))
         if len(excluded):
             cross: dict[str, Any] = {"color": OKABE_ITO["vermillion"], "ms": 4, "mew": 1.0}
-            axes.plot(excluded[:, 0], excluded[:, 1], "x", label="left out", **cross)
+            axes.plot(excluded[:, 0], excluded[:, 1], "x", label="excluded", **cross)
         axes.set_aspect("equal", adjustable="datalim")
         axes.autoscale_view()
         axes.set(xlabel="east (m)", ylabel="north (m)")

@@ -28,7 +28,9 @@ def document(facts: Facts) -> SimpleNamespace:
     metrics = facts.metrics
     verdict = metrics.get("verdict") or {}
     residuals = ground_residuals(facts)
-    findings = {which: tables.finding_rows(verdict, which) for which in ("findings", "untold", "passed")}
+    findings = {
+        which: tables.finding_rows(verdict, which) for which in ("findings", "unobservable", "passed")
+    }
     return SimpleNamespace(
         facts=facts,
         name=str(metrics.get("name", facts.folder.name)),

@@ -19,12 +19,10 @@ from v2hdm.io.maps.evidence import Residuals, read_exclusions, read_residuals
 from v2hdm.io.maps.features import features_of, map_of
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.io.trajectory import read_tum
-from v2hdm.records import BoolArray, Calibration, Drive, Exclusion, FloatArray, HDMap, IntArray, Truth
+from v2hdm.records import BEST, BoolArray, Calibration, Drive, Exclusion, FloatArray, HDMap, IntArray, Truth
 from v2hdm.store import names
 from v2hdm.store.files import load_json, load_yaml, read_csv, read_text, take_number
 from v2hdm.surface.surface import Surface
-
-BEST = "Opt"  # method of the run's result, as in metrics.json
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ import numpy as np
 from v2hdm.geometry.ipm import angle_sigmas, centre_sigmas, mounting_angles
 from v2hdm.geometry.planar import length_along
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.records import FloatArray, Lane, Marking, Symbol
+from v2hdm.records import SIGMAS_95, FloatArray, Lane, Marking, Symbol
 from v2hdm.report.metrics import corner_errors, match_markings
 from v2hdm.report.page.facts import CameraFacts, Facts
-from v2hdm.report.page.layers import SIGMAS_95, ellipses
+from v2hdm.report.page.layers import ellipses
 from v2hdm.report.terminal import METHODS, figure_columns
 
 
@@ -253,13 +253,17 @@ def method_table(facts: Facts) -> Table | None:
     return table(("", "method", "markings", *columns), rows, words=2)
 
 
+_FORMERLY = {"unobservable": "untold"}
+"""What older results call a list of findings."""
+
+
 def finding_rows(verdict: Mapping[str, Any], which: str) -> tuple[tuple[str, ...], ...]:
     """Status, check, subject, measured value, limit and sentence of the findings ``which``."""
     rows = []
-    for finding in verdict.get(which) or []:
+    for finding in verdict.get(which) or verdict.get(_FORMERLY.get(which, which)) or []:
         unit = f" {finding['unit']}" if finding.get("unit") else ""
         value, limit = (number(finding.get(key)) for key in ("value", "limit"))
-        outcome = "untold" if which == "untold" else str(finding["status"])
+        outcome = which if which == "unobservable" else str(finding["status"])
         measured = [text if text == "–" else f"{text}{unit}" for text in (value, limit)]
         rows.append((outcome, str(finding["check"]), str(finding["about"]), *measured, str(finding["says"])))
     return tuple(rows)
