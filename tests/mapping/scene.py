@@ -15,7 +15,7 @@ from tests.cameras import level, mounted
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.rigid import exp
-from v2hdm.mapping.bundle import vehicle_twists
+from v2hdm.geometry.twists import vehicle_twists
 from v2hdm.records import (
     Camera,
     CameraInfo,

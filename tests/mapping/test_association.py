@@ -19,7 +19,7 @@ from v2hdm.association.groups import (
 from v2hdm.association.sightings import Rig, collect_sightings
 from v2hdm.association.tracks import build_tracks
 from v2hdm.geometry.planar import align
-from v2hdm.mapping.bundle import vehicle_twists
+from v2hdm.geometry.twists import vehicle_twists
 from v2hdm.mapping.optimise import initial_rig
 from v2hdm.records import PoseNoise
 

@@ -27,26 +27,12 @@ from v2hdm.association.ground import locate
 from v2hdm.association.groups import Association, fuse_groups, group_kinds, known_elsewhere, line_only
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.errors import MappingError
-from v2hdm.geometry.rigid import camera_centre, inverse, log
+from v2hdm.geometry.rigid import camera_centre
+from v2hdm.geometry.twists import vehicle_twists
 from v2hdm.lanes.knots import OPEN_END_PX, Knots
 from v2hdm.mapping.options import MappingOptions, SizeOptions, SurveyOptions
 from v2hdm.records import DIAMOND, HEAVE_SIGMA_M, BoolArray, Camera, FloatArray, IntArray, PoseNoise
 from v2hdm.survey.match import match
-
-
-def vehicle_twists(
-    map_from_vehicle: FloatArray, stamp_s: FloatArray, session: IntArray | None = None
-) -> FloatArray:
-    """Vehicle twists (F, 6) in its own frame, m/s, rad/s, by central differences within each ``session``."""
-    now = np.arange(len(stamp_s))
-    before = np.maximum(now - 1, 0)
-    after = np.minimum(now + 1, len(now) - 1)
-    if session is not None:
-        before = np.where(session[before] == session, before, now)
-        after = np.where(session[after] == session, after, now)
-    moved = inverse(map_from_vehicle[before]) @ map_from_vehicle[after]
-    elapsed_s = stamp_s[after] - stamp_s[before]
-    return np.asarray(log(moved) / np.where(elapsed_s > 0, elapsed_s, 1.0)[:, None])
 
 
 def read_outs_s(cameras: Iterable[Camera]) -> FloatArray | None:

@@ -22,6 +22,7 @@ from v2hdm.association.tracks import IPM_SIGMA_RAD, REFINED_SIGMA_RAD, build_tra
 from v2hdm.errors import AdjustError, MappingError
 from v2hdm.faults.sensitivity import height_information, moves_with_heights
 from v2hdm.geometry.ipm import initial_extrinsic
+from v2hdm.geometry.twists import vehicle_twists
 from v2hdm.lanes.knots import Knots
 from v2hdm.mapping.bundle import (
     LEAST_OBSERVATIONS,
@@ -32,7 +33,6 @@ from v2hdm.mapping.bundle import (
     pose_sigma_of,
     read_outs_s,
     solve_bundle,
-    vehicle_twists,
 )
 from v2hdm.mapping.conclusion import FinalSolve, Optimised, conclude
 from v2hdm.mapping.options import AUTO, SURFACE, MappingOptions

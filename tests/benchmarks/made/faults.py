@@ -148,6 +148,13 @@ def _relief(relief: str, fall: float, world: World) -> World:
     return _crown(fall, 0.0, shaped) if fall else shaped
 
 
+def _in_turn(pose_rate_hz: float, apart_s: float, world: World) -> World:
+    """Cameras that fire in turn, between the poses of a stream: neighbouring images share a pose's noise."""
+    port = world.recipe.port
+    streamed = replace(port, route=replace(port.route, pose_rate_hz=pose_rate_hz))
+    return make(replace(world.recipe, port=streamed), apart_s)
+
+
 def _grade(grade: float, world: World, heights: bool = True) -> World:
     """The world tilted about the map's y axis: recorded as on a real slope, or without the heights."""
     tilt = np.eye(4)
@@ -240,6 +247,10 @@ RELIEFS: Mapping[str, Spoil] = {
         Spoil("grade and crown", None, partial(_relief, "grade", 0.03)),
         Spoil("ramp", None, partial(_relief, "ramp", 0.0)),
         Spoil("crest", None, partial(_relief, "crest", 0.0)),
+        Spoil("cameras in turn", None, partial(_in_turn, 20.0, 0.037)),
     )
 }
-"""Ground that is no plane, recorded as it is: nothing is wrong, but that the mapper has to know of it."""
+"""What is recorded as it is, but unusual: nothing is wrong, but that the mapper has to know of it.
+
+Ground that is no plane; and cameras that fire 37 ms after each other, under poses at 20 Hz.
+"""

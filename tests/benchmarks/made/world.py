@@ -13,8 +13,8 @@ from scipy.spatial import cKDTree
 
 from tests.benchmarks.made.draw import Recipe
 from v2hdm.geometry.rigid import exp, interpolate, rotation_from_euler
+from v2hdm.geometry.twists import vehicle_twists
 from v2hdm.io.drive.road import lay_flat
-from v2hdm.mapping.bundle import vehicle_twists
 from v2hdm.records import Camera, CameraInfo, Drive, FloatArray, Image, PoseNoise, Trajectory, Truth
 from v2hdm.simulate.port.build import Port, build_port
 from v2hdm.simulate.port.route import Route, correlated_noise
@@ -42,7 +42,7 @@ class World:
         cam_from_vehicle: (F, 4, 4) by camera, where it truly sat then.
         corners_map: (J, 4, 3) of the true markings, with their heights.
         cameras: as the user describes them.
-        stamp_s: (F,) by camera, as its images are stamped.
+        stamp_s: (F,) by camera, as its images are stamped; nan where it took none.
         recorded: poses.
         pose_noise: as stated.
         read_out_s: time from the first row of every image to its last.
@@ -94,10 +94,22 @@ class World:
         return int(image.path.stem)
 
 
-def make(recipe: Recipe) -> World:
-    """The world of a right drive."""
+def make(recipe: Recipe, apart_s: float = 0.0) -> World:
+    """The world of a right drive, whose cameras take their images in turn, ``apart_s`` after each other."""
     port = build_port(recipe.port)
-    route, taken_s, poses_s = port.route, port.driven.stamp_s, port.driven.recorded.stamp_s
+    poses_s = port.driven.recorded.stamp_s
+    taken_s = port.driven.stamp_s
+    stamp_s = dict.fromkeys(port.cameras, taken_s)
+    if apart_s:
+        own_s = [taken_s + turn * apart_s for turn in range(len(port.cameras))]
+        own_s = [times_s[times_s < poses_s[-1]] for times_s in own_s]
+        taken_s = np.sort(np.concatenate(own_s))
+        stamp_s = {
+            name: np.where(np.isin(taken_s, times_s), taken_s, np.nan)
+            for name, times_s in zip(port.cameras, own_s, strict=True)
+        }
+        port = replace(port, driven=replace(port.driven, stamp_s=taken_s))
+    route = port.route
     ground = Ground.of(recipe, port)
     true = _driven(recipe, port, ground, np.concatenate([taken_s, poses_s]))
     corners = np.array([marking.corners_map for marking in port.hd_map.markings]).reshape(-1, 4, 2)
@@ -113,7 +125,7 @@ def make(recipe: Recipe) -> World:
         },
         corners_map=np.concatenate([corners, height_m], axis=2),
         cameras=port.cameras,
-        stamp_s=dict.fromkeys(port.cameras, taken_s),
+        stamp_s=stamp_s,
         recorded=Trajectory(poses_s, _recorded(recipe, port, poses_s, true[len(taken_s) :])),
         pose_noise=PoseNoise.from_stated() if recipe.default_noise else recipe.poses.as_stated(),
     )
@@ -240,11 +252,12 @@ def drive_of(world: World) -> Drive:
     root, images, unposed = Path(world.recipe.name.replace(" ", "_")), [], {}
     for name in world.cameras:
         stamp_s = world.stamp_s[name]
-        poses, inside = interpolate(laid.trajectory, stamp_s, MAX_GAP_S)
+        taken = np.flatnonzero(np.isfinite(stamp_s))
+        poses, inside = interpolate(laid.trajectory, stamp_s[taken], MAX_GAP_S)
         unposed[name] = int((~inside).sum())
         images += [
-            Image(name, float(stamp_s[f]), root / name / f"{f:06d}.jpg", poses[f])
-            for f in np.flatnonzero(inside).tolist()
+            Image(name, float(stamp_s[frame]), root / name / f"{frame:06d}.jpg", pose)
+            for frame, pose in zip(taken[inside].tolist(), poses[inside], strict=True)
         ]
     return Drive(
         name=world.recipe.name,
