@@ -47,8 +47,8 @@ ANY_NUMBER = Within()
 POSITIVE = Within(0, open=True)
 NOT_NEGATIVE = Within(0)
 SHARE = Within(0, 1)
-COUNT = Within(1, 10**12)
-SEED = Within(0, 2**63 - 1)
+COUNT = Within(1, 10**12)  # chosen: more than any machine holds
+SEED = Within(0, 2**63 - 1)  # whole numbers of 64 bits with a sign
 
 
 @dataclass(frozen=True)

@@ -49,11 +49,11 @@ def drive_record(job: Job, progress: Progress, workers: int = 1) -> dict[str, An
             survey = take_survey(drive, options)
             key = read.contents.key(drive)
             try:
-                found = map_camera_sets(drive, key, detections, survey, None, context)
+                mapped_sets = map_camera_sets(drive, key, detections, survey, None, context)
             except (MappingError, AdjustError) as failure:
                 record["failures"].append([recipe, "all cameras", str(failure)])
             else:
-                _add(record, recipe, {name: one.methods for name, one in found.items()})
+                _add(record, recipe, {name: mapped.methods for name, mapped in mapped_sets.items()})
     progress("finished", 1, 1)
     return record
 
