@@ -130,9 +130,9 @@ class Catalogue:
                     f"({', '.join(self.lane_paint)}); choose another family and group"
                 )
             if added.group not in groups | set(own_classes):
-                known = ", ".join(sorted(groups - lanes))
+                shipped_groups = ", ".join(sorted(groups - lanes))
                 raise ConfigError(
-                    f"{where}: group of {shown(name)} is {shown(added.group)}; name one of {known}, "
+                    f"{where}: group of {shown(name)} is {shown(added.group)}; name one of {shipped_groups}, "
                     "or a class of your own"
                 )
         if len(self.classes) + len(own_classes) > _MOST_CLASSES:

@@ -61,7 +61,9 @@ class Row:
         return cls(drive, ERROR, one_line(message), None, None, None, False, "", source)
 
     @classmethod
-    def of_result(cls, drive: str, source: str, place: str, metrics: Mapping[str, Any], kept: bool) -> Row:
+    def of_result(
+        cls, drive: str, source: str, place: str, metrics: Mapping[str, Any], is_reused: bool
+    ) -> Row:
         """The row of a finished run, from its ``metrics.json``."""
         verdict = metrics["verdict"]
         sets = list(metrics["results"].values())
@@ -82,7 +84,7 @@ class Row:
             images=images,
             markings=markings,
             minutes=round(seconds / 60, 3),
-            kept=kept,
+            kept=is_reused,
             folder=place,
             source=source,
         )
@@ -271,11 +273,11 @@ def _map_all(jobs: Sequence[Job], cores: int, table: _Table, progress: DriveProg
 def _mapped(job: Job, progress: Progress) -> tuple[Row, str]:
     """Map one drive and write its results; its row, and the traceback where it met a bug of ours."""
     try:
-        result, kept = take_or_run(job.config, job.config_yaml, progress)
+        result, is_reused = take_or_run(job.config, job.config_yaml, progress)
     except Exception as error:  # a drive that fails is a row, and the others go on
         line = describe(error)
         if line is not None:
             return Row.of_error(job.name, job.source, line), ""
         line = f"a bug in V2HDM, {type(error).__name__}: {error}; its traceback is in the fleet's folder"
         return Row.of_error(job.name, job.source, line), traceback.format_exc()
-    return Row.of_result(job.name, job.source, result.place, result.metrics, kept), ""
+    return Row.of_result(job.name, job.source, result.place, result.metrics, is_reused), ""

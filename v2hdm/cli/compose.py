@@ -225,10 +225,10 @@ def _advice(message: str, schema: type[Any]) -> str:
     unknown = re.search(r"[Kk]ey '([\w.]+)' (?:not in|is not in)", message)
     if unknown:
         leaves = [key.name.split(".") for key in keys_of(schema)]
-        known = dict.fromkeys(".".join(one[:end]) for one in leaves for end in range(1, len(one) + 1))
+        keys = dict.fromkeys(".".join(parts[:end]) for parts in leaves for end in range(1, len(parts) + 1))
         leaf = unknown.group(1).split(".")[-1]
-        near = difflib.get_close_matches(leaf, {key.split(".")[-1] for key in known}, n=1)
-        names = [key for key in known if near and key.split(".")[-1] == near[0]]
+        similar = difflib.get_close_matches(leaf, {key.split(".")[-1] for key in keys}, n=1)
+        names = [key for key in keys if similar and key.split(".")[-1] == similar[0]]
         if names:
             return f"did you mean {' or '.join(names[:3])}?"
     return "--help lists the keys"
@@ -305,21 +305,21 @@ def _is_schema(kind: Any) -> bool:
 
 
 def _kind(hint: Any) -> str:
-    parts = [one for one in get_args(hint) if one is not type(None)]
+    parts = [part for part in get_args(hint) if part is not type(None)]
     for word, kind in (("dict", "mapping"), ("list", "list")):
         if word in str(hint):
             return kind
     if parts:
         return f"{_kind(parts[0])} or null"
     if isinstance(hint, type) and issubclass(hint, Enum):
-        return " or ".join(str(one.value) for one in hint)
+        return " or ".join(str(choice.value) for choice in hint)
     return "mapping" if _is_schema(hint) else _KINDS.get(getattr(hint, "__name__", ""), "any")
 
 
-def _default(one: Field[Any]) -> str:
-    if one.default is MISSING and one.default_factory is MISSING:
+def _default(field: Field[Any]) -> str:
+    if field.default is MISSING and field.default_factory is MISSING:
         return "required"
-    value = one.default if one.default_factory is MISSING else one.default_factory()
+    value = field.default if field.default_factory is MISSING else field.default_factory()
     if is_dataclass(value) or isinstance(value, dict):
         return ""
     text = str(value.value if isinstance(value, Enum) else value)

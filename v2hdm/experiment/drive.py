@@ -133,11 +133,13 @@ def measure(record: Mapping[str, Any]) -> Measured:
     matched: dict[str, Mapping[str, Matched]] = {}
     for cameras, by_row in record["maps"].items():
         maps = {row: by_row[row] for row in ROWS if row in by_row}
-        found = {row: _matched(hd_map, true, passed) for row, hd_map in maps.items()}
-        shared = set(range(len(true))).intersection(*(one.true.tolist() for one in found.values()))
+        matched_rows = {row: _matched(hd_map, true, passed) for row, hd_map in maps.items()}
+        shared = set(range(len(true))).intersection(
+            *(in_row.true.tolist() for in_row in matched_rows.values())
+        )
         expected = np.array(record["expected"][cameras], dtype=np.bool_)
-        rows[cameras] = {row: _row(maps[row], truth, expected, found[row], shared) for row in maps}
-        matched[cameras] = found
+        rows[cameras] = {row: _row(maps[row], truth, expected, matched_rows[row], shared) for row in maps}
+        matched[cameras] = matched_rows
     failures = tuple((recipe, cameras, text) for recipe, cameras, text in record["failures"])
     title, port, seed, started_from = (record[name] for name in ("title", "port", "seed", "started_from"))
     return Measured(title, port, seed, started_from, rows, matched, failures)
