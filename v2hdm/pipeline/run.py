@@ -210,7 +210,7 @@ def made_of(config: RunConfig) -> str:
 
 
 def map_and_save(
-    config: RunConfig, cache: StageCache, config_yaml: str, context: Context, made_by: str
+    config: RunConfig, cache: StageCache, config_yaml: str, context: Context, maker: str
 ) -> RunResult:
     """Do what :func:`run` says, with what ``cache`` keeps, in place of an earlier result of the same."""
     from v2hdm.pipeline.map_drive import map_drive  # torch and much else, which takes seconds
@@ -221,7 +221,7 @@ def map_and_save(
     with cache.in_use():
         for path in () if config.map.base is None else base_files(Path(config.map.base))[:1]:
             note_input(path)  # before any work is done for nothing
-        with result_folder(place, made=made_by) as folder, logging_to(log_file(folder / LOG)):
+        with result_folder(place, maker=maker) as folder, logging_to(log_file(folder / LOG)):
             _log.info("v2hdm %s, run %s", __version__, name)
             (folder / CONFIG).write_text(config_yaml or f"{config!r}\n", encoding="utf-8")
 

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from v2hdm.errors import ConfigError, MapFileError, need
+from v2hdm.errors import ConfigError, need
 from v2hdm.geometry.geodetic import crs_of
 from v2hdm.geometry.planar import cross
 from v2hdm.records import FloatArray, GroundStrip, HDMap
-from v2hdm.safe.pixels import check_raster
+from v2hdm.safe.rasters import mosaic_points
 from v2hdm.store.files import whole_file
 
 _CELL_M = 0.25  # size of a cell of the GeoTIFF, m
@@ -117,37 +117,11 @@ def write_cloud(mosaic: Path, path: Path, height_m: Callable[[FloatArray], Float
     ``height_m`` gives the heights (N,) of places (N, 2). The intensity is the grey value, 0 to 255. Raises
     MapFileError where the file is no mosaic of ours, ConfigError where rasterio is missing.
     """
-    rasterio = need("rasterio", "gis", "the format pcd", ConfigError)
-    if not mosaic.is_file():
-        raise MapFileError(f"{mosaic}: cannot be read as a GeoTIFF (no such file); restore it")
     strips = []
-    try:
-        with rasterio.open(mosaic, driver="GTiff") as data:
-            if data.count != 3 or data.dtypes[0] != "uint8" or data.transform.b or data.transform.e >= 0:
-                raise MapFileError(f"{mosaic}: not a mosaic that v2hdm wrote; give mosaic.tif of a result")
-            check_raster(data, mosaic, MapFileError)
-            factor = max(round(_SPACING_M / data.transform.a), 1)
-            for top in range(0, data.height, _STRIP_PX * factor):
-                rows = min(_STRIP_PX * factor, data.height - top)
-                window = rasterio.windows.Window(0, top, data.width, rows)
-                shape = (-(-rows // factor), -(-data.width // factor))
-                average = rasterio.enums.Resampling.average
-                is_shown = data.dataset_mask(window=window, out_shape=shape) > 0
-                if is_shown.any():
-                    pixels = data.read(window=window, out_shape=(3, *shape), resampling=average)
-                    row, column = np.nonzero(is_shown)
-                    step = np.array([data.width / shape[1], rows / shape[0]])
-                    cells_px = (np.column_stack([column, row]) + 0.5) * step + [0, top]
-                    places = cells_px * [data.transform.a, data.transform.e] + [
-                        data.transform.c,
-                        data.transform.f,
-                    ]
-                    grey = pixels.mean(axis=0)[is_shown]
-                    strips.append(np.column_stack([places, height_m(places), grey]).astype("<f4"))
-    except rasterio.errors.RasterioError as failure:
-        first = str(failure).splitlines()[0]
-        raise MapFileError(f"{mosaic}: cannot be read as a GeoTIFF ({first}); restore it") from None
-    points = np.concatenate([np.empty((0, 4), "<f4"), *strips])
+    for points in mosaic_points(mosaic, _SPACING_M, _STRIP_PX):
+        places = points[:, :2]
+        strips.append(np.column_stack([places, height_m(places), points[:, 2]]).astype("<f4"))
+    cloud = np.concatenate([np.empty((0, 4), "<f4"), *strips])
     with whole_file(path) as partial, partial.open("wb") as file:
-        file.write(_HEADER.format(len(points)).encode("ascii"))
-        file.write(points.tobytes())
+        file.write(_HEADER.format(len(cloud)).encode("ascii"))
+        file.write(cloud.tobytes())

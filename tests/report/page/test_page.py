@@ -281,13 +281,13 @@ def test_a_picture_of_the_users_own_lies_under_the_map_where_it_belongs(result, 
     assert (west + column * cell_m[0], north - row * cell_m[1]) == pytest.approx((8.0, -3.0), abs=0.05)
 
 
-def test_a_picture_that_cannot_lie_under_the_map_is_refused_with_its_reason(result, tmp_path, monkeypatch):
+def test_a_picture_that_cannot_lie_under_the_map_is_refused_with_its_reason(result, tmp_path):
     write_tif(tmp_path / "aerial.tif", in_grid(0.0, 0.0))
     write_tif(tmp_path / "elsewhere.tif", in_grid(5000.0, 0.0))
     write_tif(tmp_path / "nowhere.tif", in_grid(0.0, 0.0), crs=None)
     (tmp_path / "none.tif").write_bytes(b"no picture")
     os.mkfifo(tmp_path / "pipe.tif")
-    write_empty(tmp_path / "huge.tif", monkeypatch, crs="EPSG:32632")
+    write_empty(tmp_path / "huge.tif", crs="EPSG:32632")
     facts = read_facts(result, None)
     placed = replace(facts, hd_map=replace(facts.hd_map, origin=HAMBURG))
     for name, of, told in (

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
-from xml.sax.saxutils import escape
 
 import cv2
 import numpy as np
 
-from v2hdm.errors import MapFileError, need
+from v2hdm.errors import MapFileError
 from v2hdm.geometry.geodetic import Grid, crs_of, geodetic_from_enu, utm_of
 from v2hdm.records import SIGMAS_95, FloatArray, Lane, Marking, Symbol
 from v2hdm.report.metrics import corner_errors, match_markings, rms
 from v2hdm.report.page.facts import Facts, GroundResiduals
-from v2hdm.safe.pixels import check_raster, read_header, read_pixels
+from v2hdm.safe.pixels import read_pixels
+from v2hdm.safe.rasters import Window, background_pixels
 from v2hdm.store import names
 from v2hdm.store.files import load_json, take_array, take_text
 
@@ -74,69 +73,21 @@ def _webp(pixels: np.ndarray) -> str:
 
 _BACKGROUND_PX = 3000  # longer side of the background: 20 cm per pixel over 600 m
 _FINEST_M = 0.05  # least side of a pixel of the background
-_HALF_WORLD_M = 20037508.342789244  # half the side of Web Mercator's square
-_TILES = """<GDAL_WMS><Service name="TMS"><ServerUrl>{url}/${{z}}/${{x}}/${{y}}{ending}</ServerUrl></Service>
-<DataWindow><UpperLeftX>-{half}</UpperLeftX><UpperLeftY>{half}</UpperLeftY><LowerRightX>{half}</LowerRightX>
-<LowerRightY>-{half}</LowerRightY><TileLevel>{finest}</TileLevel><TileCountX>1</TileCountX>
-<TileCountY>1</TileCountY><YOrigin>top</YOrigin></DataWindow><Projection>EPSG:3857</Projection>
-<BlockSizeX>{px}</BlockSizeX><BlockSizeY>{px}</BlockSizeY><BandsCount>4</BandsCount>
-<OverviewCount>{coarser}</OverviewCount></GDAL_WMS>"""  # GDAL's description of tiles, here in a folder
-
-
-def _source(path: Path) -> dict[str, Any]:
-    """Source for rasterio: a GeoTIFF, or a folder ``z/x/y.png`` of XYZ tiles as one picture."""
-    levels = sorted(int(level.name) for level in path.glob("*") if level.name.isdecimal())
-    tile = next((path / str(levels[-1])).glob("*/*.*"), None) if levels else None
-    if tile is None:
-        if not path.is_file():
-            raise MapFileError(f"{path}: not a readable GeoTIFF or folder of XYZ tiles; check the path")
-        return {"fp": path, "driver": "GTiff"}
-    tiles = {"url": escape(path.resolve().as_uri()), "ending": tile.suffix, "half": _HALF_WORLD_M}
-    tiles |= {"px": read_header(tile).width, "finest": levels[-1], "coarser": levels[-1] - levels[0]}
-    return {"fp": _TILES.format(**tiles), "driver": "WMS"}
-
-
-@contextmanager
-def open_background(path: Path) -> Iterator[Any]:
-    """The user's GeoTIFF or XYZ tiles, open in rasterio; MapFileError if unusable."""
-    rasterio = need("rasterio", "gis", "a background", MapFileError)
-    try:
-        with rasterio.open(**_source(path)) as source:
-            if source.crs is None:
-                raise MapFileError(f"{path}: states no coordinate system; give a GeoTIFF that has one")
-            if path.is_file():
-                check_raster(source, path, MapFileError)
-            yield source
-    except (rasterio.errors.RasterioError, rasterio.errors.CRSError) as failure:
-        raise MapFileError(f"{path}: not a readable GeoTIFF or folder of XYZ tiles ({failure})") from None
 
 
 def background_layer(path: Path, facts: Facts) -> dict[str, Any]:
     """The user's GeoTIFF or XYZ tiles as a layer like :func:`mosaic_layer`; MapFileError if unusable."""
-    rasterio = need("rasterio", "gis", "a background", MapFileError)
-    warped = need("rasterio.vrt", "gis", "a background", MapFileError)
     origin = None if facts.hd_map is None else facts.hd_map.origin
     if origin is None:
         raise MapFileError(f"{path}: this map has no position on the earth; state the origin in drive.yaml")
     (west, south), (east, north) = _extent(facts)
-    step = max(float(max(east - west, north - south)) / _BACKGROUND_PX, _FINEST_M)
-    size = {"width": int(np.ceil((east - west) / step)), "height": int(np.ceil((north - south) / step))}
-    with open_background(path) as source:
-        # The mosaic's projection agrees with the map frame to a millimetre.
-        frame = {"crs": rasterio.crs.CRS.from_user_input(crs_of(origin))}
-        frame |= {"transform": rasterio.Affine(step, 0, west, 0, -step, north)}
-        frame["add_alpha"] = rasterio.enums.ColorInterp.alpha not in source.colorinterp
-        bilinear = rasterio.enums.Resampling.bilinear
-        with warped.WarpedVRT(source, **frame, **size, resampling=bilinear) as raster:
-            bands = raster.read([3, 2, 1] if source.count >= 3 else [1, 1, 1])
-            mask = raster.dataset_mask()
-    if not mask.any():
-        raise MapFileError(f"{path}: does not cover this map; give a picture of its site")
-    if bands.dtype != np.uint8:
-        low, high = np.percentile(bands[:, mask > 0], (1, 99))
-        bands = np.clip((bands - low) * 255.0 / max(high - low, 1e-9), 0, 255).astype(np.uint8)
-    bounds = [west, north - step * size["height"], west + step * size["width"], north]
-    pixels = np.ascontiguousarray(np.moveaxis(np.concatenate([bands, mask[None]]), 0, 2))
+    step_m = max(float(max(east - west, north - south)) / _BACKGROUND_PX, _FINEST_M)
+    width = int(np.ceil((east - west) / step_m))
+    height = int(np.ceil((north - south) / step_m))
+    # The mosaic's projection agrees with the map frame to a millimetre.
+    window = Window(crs_of(origin), float(west), float(north), step_m, width, height)
+    bounds = [west, north - step_m * height, west + step_m * width, north]
+    pixels = background_pixels(path, window)
     return {"src": _webp(pixels), "type": "image/webp", "bounds": [float(edge) for edge in bounds]}
 
 
