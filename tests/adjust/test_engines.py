@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 from tests.adjust.scene import HEIGHT, make_scene, with_late_clocks
 from v2hdm.adjust import ControlPoints, Drift, KnownLengths, PoseSigma, SolveOptions, Status, model, solve
 from v2hdm.adjust.descent import Objective
+from v2hdm.adjust.engine import TorchEngine
 from v2hdm.adjust.engines import make_engine
-from v2hdm.adjust.engines.autograd import TorchEngine
-from v2hdm.adjust.engines.numba import layout as kernel_layout
 from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.model import Estimate, Loss
 from v2hdm.adjust.problem import LOSSES, POSE_STATES
@@ -204,7 +203,7 @@ def test_a_solve_ends_where_that_of_torch_ends(pose_states, clock):
 def test_results_do_not_depend_on_the_number_of_threads(pose_states, monkeypatch):
     """To the last bit: many small chunks, side by side or one after the other."""
     monkeypatch.setattr("v2hdm.adjust.arrays._RUN", 200)
-    monkeypatch.setattr(kernel_layout, "_WORTH_THREADS", 1)
+    monkeypatch.setattr("v2hdm.adjust.threads._WORTH_THREADS", 1)
     problem = example()
     options = SolveOptions(pose_states=pose_states)
     before, found = torch.get_num_threads(), []
