@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from tests.adjust.scene import HEIGHT, make_scene, with_late_clocks
 from v2hdm.adjust import ControlPoints, Drift, KnownLengths, PoseSigma, SolveOptions, Status, model, solve
 from v2hdm.adjust.descent import Objective
-from v2hdm.adjust.engine import TorchEngine
+from v2hdm.adjust.engine import Pairs, TorchEngine, View
 from v2hdm.adjust.engines import make_engine
 from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.model import Estimate, Loss
@@ -160,6 +160,22 @@ def test_engines_agree_on_a_step(pose_states, clock, loss):
         assert_same(getattr(one.gradient, name), getattr(other.gradient, name), 1e-9)
     assert_same(one.whitened, other.whitened, 1e-9)
     assert_same(one.coupled, other.coupled, 1e-9)
+
+
+@pytest.mark.parametrize("behind", [False, True])
+def test_torch_differentiates_an_observation_as_autograd_does(behind):
+    problem = example(frames=14)
+    _, engine = engines(problem, ())
+    estimate = estimate_of(engine, problem, torch.Generator().manual_seed(3), behind=behind)
+    run = engine.arrays.whole()
+    view = View.of(run, Pairs.of(engine.poses(estimate)), estimate.corners_map)
+    points = view.point.T.clone().requires_grad_()
+    residual = model.corner_residual(points, run.measured, run.root_information)
+    by_row = [torch.autograd.grad(row.sum(), points, retain_graph=True)[0].T for row in residual.unbind(1)]
+    assert_same(view.by_point(), torch.stack(by_row))
+    by_residual = torch.randn(view.residual.shape, generator=torch.Generator().manual_seed(4)).double()
+    (force,) = torch.autograd.grad(residual, points, by_residual.T)
+    assert_same(view.force(by_residual), force.T)
 
 
 @pytest.mark.parametrize(("pose_states", "clock"), MODELS)

@@ -1,13 +1,15 @@
 """The engine ``torch``: the model on any device, the reference of the kernels and the interface of engines.
 
 An engine evaluates and linearises one problem and eliminates its corners. This one takes every observation
-from :mod:`v2hdm.adjust.model` and differentiates it by its point in the camera, in one backward pass over a
-run of observations per pixel coordinate. The rest of the chain is short: a left tangent (t, w) of the pair
-moves the point p by t + w x p, a motion of the corner on the ground moves it along the pair's first two axes.
-Pairs themselves are few, and autograd carries gradients from them to cameras, frames and clocks.
+from :mod:`v2hdm.adjust.model` and differentiates it in closed form (:class:`View`): a left tangent (t, w) of
+its pair moves the point p in the camera by t + w x p, a motion of the corner moves it along the pair's first
+two axes, and the projection's derivative is two numbers. Autograd carries gradients on from pairs, which are
+few, to cameras, frames and clocks.
+
+Numbers of observations are columns, (..., k): torch is several times faster along them than across.
 
 :class:`v2hdm.adjust.kernels.engine.NumbaEngine` inherits all of this and replaces the passes over the
-observations by compiled closed forms.
+observations by compiled ones.
 """
 
 from __future__ import annotations
@@ -21,7 +23,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from v2hdm.adjust import model
 from v2hdm.adjust.arrays import Arrays, Run
@@ -38,7 +39,7 @@ from v2hdm.adjust.reduced import (
     frames_per_tile,
 )
 from v2hdm.adjust.tiles import TIP, find_pattern
-from v2hdm.geometry.tensors import NEAR_M
+from v2hdm.geometry.tensors import NEAR_M, inverse_depth
 from v2hdm.records import BoolArray, FloatArray
 
 WEIGHT_FLOOR = 1e-6
@@ -116,9 +117,9 @@ class TorchEngine:
 
     def residuals(self, cam_from_map: Tensor, corners_map: Tensor) -> Tensor:
         """Whitened residuals (2, K) of the observations, for pairs (C, M, 4, 4)."""
-        poses = cam_from_map.flatten(0, 1)
-        with torch.no_grad():
-            return torch.cat([_residual(run, poses, corners_map) for run in self.arrays.runs()]).T
+        pairs = Pairs.of(cam_from_map)
+        views = (View.of(run, pairs, corners_map[run.corners]) for run in self.arrays.runs())
+        return torch.cat([view.residual for view in views], dim=1)
 
     def report(self, estimate: Estimate, focal_px: FloatArray) -> Report:
         """The observations at an estimate, under focal lengths (C, 2), px."""
@@ -153,9 +154,9 @@ class TorchEngine:
         corners = torch.empty_like(arrays.control)
         is_determined = torch.empty_like(arrays.joined)
         for run in arrays.runs():
-            of_ray = homographies.gather(1, run.pair.expand(9, -1))
-            sums = run.sum_by_corner(model.back_projected(of_ray, run.measured, run.root_information).T)
-            xx, yx, yy, x, y = sums.unbind(1)
+            of_ray = _of_each(homographies, run.pair)
+            of_rays = model.back_projected(of_ray, run.measured, run.root_information)
+            xx, yx, yy, x, y = _sums_by_corner(run, of_rays)
             is_met = xx > 0
             unit = is_met.logical_not().to(xx.dtype)
             factor = CornerFactor(cholesky_2x2(xx + unit, yx, yy + unit), ())
@@ -178,9 +179,9 @@ class TorchEngine:
         observations = base.corners_map.new_zeros(())
 
         def weighted(run: Run, residual: Tensor) -> Tensor:
-            loss, weight = model.robustified(robust, residual.square().sum(1))
+            loss, weight = model.robustified(robust, residual.square().sum(0))
             observations.add_(loss.sum() / 2)
-            return residual * weight[:, None]
+            return residual * weight
 
         unknowns = _Unknowns.of(self.arrays, base, step)
         priors = model.prior_terms(self.arrays, unknowns.estimate)
@@ -194,28 +195,28 @@ class TorchEngine:
         """Gradient of a scalar from that by the whitened residuals (2, K); :meth:`spread` at the estimate."""
         step = estimate.cam_from_vehicle.new_zeros(self.arrays.camera_count, 6)
         unknowns = _Unknowns.of(self.arrays, estimate, step)
-        return self._gradient(unknowns, lambda run, _: by_residual[:, run.observations].T)
+        return self._gradient(unknowns, lambda run, _: by_residual[:, run.observations])
 
     def _gradient(
         self, unknowns: _Unknowns, by_residual: Callable[[Run, Tensor], Tensor], priors: Tensor | None = None
     ) -> Gradient:
-        """Gradient of ``priors`` and of what has the gradient ``by_residual`` (k, 2) by a run's residuals."""
-        arrays = self.arrays
-        poses = unknowns.poses.detach()
+        """Gradient of ``priors`` and of what has the gradient ``by_residual`` (2, k) by a run's residuals."""
+        pairs = Pairs.of(unknowns.poses.detach())
         corners_map = unknowns.estimate.corners_map.detach()
-        # Summed over runs by pose and corner, then carried back to their unknowns once.
-        by_pose = poses.new_zeros(arrays.pair_count, 9)
+        # Summed over runs by the first, second and last columns of the poses and by corner.
+        by_column = corners_map.new_zeros(9, self.arrays.pair_count)
         by_corner = torch.empty_like(corners_map)
-        for run in arrays.runs():
-            view = View.of(run, poses, corners_map[run.corners])
-            force = view.force(by_residual(run, view.residual.detach()))
-            ground = pad(view.corners_map, (0, 1), value=1.0)
-            by_pose.index_add_(0, run.pair, (force[:, :, None] * ground[:, None]).flatten(1))
-            by_corner[run.corners] = run.sum_by_corner((view.axes * force[:, :, None]).sum(1))
-        by_matrix = torch.zeros_like(poses)
-        by_matrix[:, :3, [0, 1, 3]] = by_pose.view(-1, 3, 3)
+        for run in self.arrays.runs():
+            view = View.of(run, pairs, corners_map[run.corners])
+            force = view.force(by_residual(run, view.residual))
+            x, y = view.ground
+            by_column.index_add_(1, run.pair, torch.cat([force * x, force * y, force]))
+            by_corner[run.corners] = _sums_by_corner(run, (view.axes * force).sum(1)).T
+        by_pose = torch.zeros_like(pairs.poses)
+        by_pose[:, :3, [0, 1, 3]] = by_column.T.view(-1, 3, 3).mT
+        # Then carried back to the unknowns once.
         ends = [unknowns.poses, unknowns.estimate.corners_map]
-        by_end: list[Tensor | None] = [by_matrix, by_corner]
+        by_end: list[Tensor | None] = [by_pose, by_corner]
         if priors is not None:
             ends.append(priors)
             by_end.append(None)
@@ -250,36 +251,36 @@ class TorchEngine:
         frame[:-1] += (by_before.mT @ by_before)[1:]
         return PriorBlocks(cameras, frame, root[..., None] * by_before)
 
-    def linearise(self, run: Run, poses: Tensor, corners_map: Tensor, robust: Loss) -> tuple[Tensor, Tensor]:
-        """Jacobians (k, 2, 6) and (k, 2, 2) of a run's residuals by pair and corner, times root weights."""
-        view = View.of(run, poses, corners_map)
-        _, weight = model.robustified(robust, view.residual.detach().square().sum(1))
-        root = weight.clamp(min=WEIGHT_FLOOR).sqrt()
-        (by_point,) = jacobians(view.residual, [view.points_cam])
-        by_point = by_point * root[:, None, None]
-        turned = torch.linalg.cross(view.points_cam.detach()[:, None], by_point)
-        return torch.cat([by_point, turned], dim=2), by_point @ view.axes
+    def linearise(self, run: Run, pairs: Pairs, corners_map: Tensor, robust: Loss) -> tuple[Tensor, Tensor]:
+        """Jacobians (2, 6, k) and (2, 2, k) of a run's residuals by pair and corner, times root weights."""
+        view = View.of(run, pairs, corners_map)
+        _, weight = model.robustified(robust, view.residual.square().sum(0))
+        by_point = view.by_point() * weight.clamp(min=WEIGHT_FLOOR).sqrt()
+        turned = torch.linalg.cross(view.point.expand(2, -1, -1), by_point, dim=1)
+        by_corner = (by_point[:, None] * view.axes).sum(2)
+        return torch.cat([by_point, turned], dim=1), by_corner
 
     def eliminate(self, system: ReducedSystem, estimate: Estimate, robust: Loss) -> Linearised:
         """Linearise and eliminate the corners; raises AdjustError if a block of joined ones is singular."""
         arrays = self.arrays
-        poses = self.poses(estimate).flatten(0, 1)
-        of_pairs = poses.new_zeros(arrays.pair_count, 6, 6)
+        pairs = Pairs.of(self.poses(estimate))
+        of_pairs = pairs.poses.new_zeros(36, arrays.pair_count)
         corner = leaf(estimate.corners_map)
-        coupling = poses.new_empty(len(arrays.pair), 2, 6)
+        couplings = of_pairs.new_empty(2, 6, len(arrays.pair))
         (surveyed,) = jacobians(model.control_residual(arrays, corner), [corner])
         blocks = surveyed.mT @ surveyed
         for run in arrays.runs():
-            by_pair, by_corner = self.linearise(run, poses, estimate.corners_map[run.corners], robust)
-            of_pairs.index_add_(0, run.pair, by_pair.mT @ by_pair)
-            blocks[run.corners] += run.sum_by_corner(by_corner.mT @ by_corner)
-            coupling[run.observations] = by_corner.mT @ by_pair
+            by_pair, by_corner = self.linearise(run, pairs, estimate.corners_map[run.corners], robust)
+            of_pairs.index_add_(1, run.pair, _products(by_pair, by_pair).flatten(0, 1))
+            of_corners = _sums_by_corner(run, _products(by_corner, by_corner).flatten(0, 1))
+            blocks[run.corners] += of_corners.T.view(-1, 2, 2)
+            couplings[:, :, run.observations] = _products(by_corner, by_pair)
         factor = factorise_corners(arrays, blocks, self._by_length(estimate))
-        of_pairs = of_pairs.view(arrays.camera_count, -1, 6, 6)
+        of_pairs = of_pairs.T.reshape(arrays.camera_count, -1, 6, 6)
         tip = of_pairs.new_zeros(system.tip, system.tip)
         for n, run in enumerate(arrays.runs(_BLOCK if arrays.states else None)):
             of_run = factor.part(run.corners)
-            part = coupling[run.observations]
+            part = couplings[:, :, run.observations].permute(2, 0, 1).contiguous()
             by_camera = of_run.solve(system.spread.by_camera(run, part)).flatten(0, 1)
             tip.addmm_(by_camera.mT, by_camera)
             if arrays.states:
@@ -288,7 +289,7 @@ class TorchEngine:
         system.add(of_pairs if system.by_pair else of_pairs.sum(1, keepdim=True), tip)
         step = estimate.clock_s.new_zeros(arrays.camera_count, 6)
         _, terms, gradient = self.cost_and_gradient(estimate, step, robust)
-        whitened, coupled = _carry(arrays, system.spread, factor, coupling, gradient.corners_map)
+        whitened, coupled = _carry(arrays, system.spread, factor, couplings, gradient.corners_map)
         return Linearised(
             engine=self,
             estimate=estimate,
@@ -299,7 +300,7 @@ class TorchEngine:
             corner_factor=factor,
             whitened=whitened,
             coupled=coupled,
-            couplings=coupling,
+            couplings=couplings,
         )
 
     def _by_length(self, estimate: Estimate) -> tuple[Tensor, Tensor]:
@@ -325,21 +326,22 @@ class Linearised:
     corner_factor: CornerFactor  # L, the factor of the corners' own block
     whitened: Tensor  # L^-1 g of the corners, see :meth:`carry`
     coupled: Coupled
-    couplings: Tensor  # (K, 2, 6) W'; kernels compute it anew, and keep (0, 2, 6)
+    couplings: Tensor  # (2, 6, K) W'; kernels compute it anew, and keep (2, 6, 0)
 
     def evaluate(self, step: Gradient, tangents: Tensor, own: Tensor) -> Evaluated:
         """Evaluate after a step of the reduced unknowns, the corners following: x_c = L^-T (y_c - B x_r).
 
         ``tangents`` (C, M, 6) are the pairs' under the step, ``own`` (N, 2) the corners' whitened variables.
         """
-        motion = tangents.flatten(0, 1)
+        motion = tangents.flatten(0, 1).T.contiguous()
         base = self.estimate
         factor = self.corner_factor
         pushed = [
-            run.sum_by_corner((self.couplings[run.observations] * motion[run.pair][:, None]).sum(2))
+            _sums_by_corner(run, (self.couplings[:, :, run.observations] * _of_each(motion, run.pair)).sum(1))
             for run in self.engine.arrays.runs()
         ]
-        corners = base.corners_map + factor.solve_transposed(own - factor.solve(torch.cat(pushed)))
+        push = torch.cat(pushed, dim=1).T
+        corners = base.corners_map + factor.solve_transposed(own - factor.solve(push))
         state = base.frame_state + step.frame_state
         clock = base.clock_s + step.clock_s
         moved = Estimate(base.cam_from_vehicle, state, corners, clock)
@@ -353,32 +355,76 @@ class Linearised:
 
     def coupling(self, run: Run, corners_map: Tensor) -> Tensor:
         """W' (k, 2, 6) of a run's observations, of corners (n, 2), by the left tangents of their pairs."""
-        poses = self.engine.poses(self.estimate).flatten(0, 1)
-        by_pair, by_corner = self.engine.linearise(run, poses, corners_map, self.robust)
-        return by_corner.mT @ by_pair
+        pairs = Pairs.of(self.engine.poses(self.estimate))
+        by_pair, by_corner = self.engine.linearise(run, pairs, corners_map, self.robust)
+        return _products(by_corner, by_pair).permute(2, 0, 1).contiguous()
+
+
+class Pairs(NamedTuple):
+    """The poses ``cam_from_map`` of all pairs."""
+
+    poses: Tensor  # (P, 4, 4)
+    axes: Tensor  # (6, P) axes of the ground in the camera: the first columns of the rotation, in turn
+
+    @classmethod
+    def of(cls, cam_from_map: Tensor) -> Pairs:
+        """Of poses (..., 4, 4)."""
+        poses = cam_from_map.reshape(-1, 4, 4)
+        return cls(poses, poses[:, :3, :2].permute(2, 1, 0).reshape(6, -1))
 
 
 class View(NamedTuple):
-    """A run's observations under some poses and corners, differentiable by the points in the cameras."""
+    """A run's observations under some poses and corners, and the derivative of what the camera sees."""
 
-    corners_map: Tensor  # (k, 2) the observed corners
-    axes: Tensor  # (k, 3, 2) axes of the ground in the camera: motions of the point by those of the corner
-    points_cam: Tensor  # (k, 3), a leaf
-    residual: Tensor  # (k, 2) whitened
+    root_information: Tensor  # (3, k)
+    ground: Tensor  # (2, k) the observed corners
+    axes: Tensor  # (2, 3, k) axes of the ground in the camera: motions of the point by those of the corner
+    point: Tensor  # (3, k) the corner in the camera
+    residual: Tensor  # (2, k) whitened
 
     @classmethod
-    def of(cls, run: Run, poses: Tensor, corners_map: Tensor) -> View:
-        """The view of a run, of its corners (n, 2), under the poses (P, 4, 4) of all pairs."""
-        cam_from_map = poses.index_select(0, run.pair)
-        corners = corners_map.index_select(0, run.corner)
-        points = model.points_in_camera(cam_from_map, corners).detach().requires_grad_()
-        residual = model.corner_residual(points, run.measured, run.root_information)
-        return cls(corners, cam_from_map[:, :3, :2], points, residual)
+    def of(cls, run: Run, pairs: Pairs, corners_map: Tensor) -> View:
+        """The view of a run, of its corners (n, 2)."""
+        with torch.no_grad():
+            corners = corners_map.index_select(0, run.corner)
+            points = model.points_in_camera(pairs.poses.index_select(0, run.pair), corners)
+            residual = model.corner_residual(points, run.measured, run.root_information)
+            axes = _of_each(pairs.axes, run.pair).view(2, 3, -1)
+            return cls(run.root_information, corners.T, axes, points.T.contiguous(), residual.T.contiguous())
+
+    def by_point(self) -> Tensor:
+        """Derivative (2, 3, k) of the residual by the point."""
+        x, y, depth = self.point
+        reciprocal, slope = inverse_depth(depth)
+        a, b, c = self.root_information
+        by_depth = a * x * slope, (b * x + c * y) * slope
+        rows = [a * reciprocal, torch.zeros_like(a), by_depth[0], b * reciprocal, c * reciprocal, by_depth[1]]
+        return torch.stack(rows).view(2, 3, -1)
 
     def force(self, by_residual: Tensor) -> Tensor:
-        """Gradient (k, 3) by the points of what has the gradient ``by_residual`` (k, 2) by the residuals."""
-        (force,) = torch.autograd.grad(self.residual, [self.points_cam], by_residual)
-        return force
+        """Gradient (3, k) by the point of what has the gradient ``by_residual`` (2, k) by the residual."""
+        x, y, depth = self.point
+        reciprocal, slope = inverse_depth(depth)
+        a, b, c = self.root_information
+        first, second = by_residual
+        along_u = a * first + b * second
+        along_v = c * second
+        return torch.stack([along_u * reciprocal, along_v * reciprocal, (along_u * x + along_v * y) * slope])
+
+
+def _of_each(table: Tensor, index: Tensor) -> Tensor:
+    """Columns (m, k) of a table (m, n)."""
+    return table.gather(1, index.expand(len(table), -1))
+
+
+def _sums_by_corner(run: Run, columns: Tensor) -> Tensor:
+    """Sums (m, n) over each corner's observations of values (m, k)."""
+    return columns.new_zeros(len(columns), run.corner_count).index_add_(1, run.corner, columns)
+
+
+def _products(left: Tensor, right: Tensor) -> Tensor:
+    """Products J'K (a, b, k) of each observation's Jacobians J (2, a, k) and K (2, b, k)."""
+    return torch.addcmul(left[0][:, None] * right[0], left[1][:, None], right[1])
 
 
 class _Unknowns(NamedTuple):
@@ -402,17 +448,13 @@ def _carry(
     arrays: Arrays, spread: Spread, factor: CornerFactor, couplings: Tensor, by_corner: Tensor
 ) -> tuple[Tensor, Coupled]:
     whitened = factor.solve(by_corner)
-    step = factor.solve_transposed(whitened)
-    by_pair = step.new_zeros(arrays.pair_count, 6)
+    step = factor.solve_transposed(whitened).T.contiguous()
+    by_pair = step.new_zeros(6, arrays.pair_count)
     for run in arrays.runs():
-        motion = step[run.corners].index_select(0, run.corner)
-        by_pair.index_add_(0, run.pair, (couplings[run.observations] * motion[:, :, None]).sum(1))
-    return whitened, spread.gather(by_pair.view(arrays.camera_count, -1, 6))
-
-
-def _residual(run: Run, poses: Tensor, corners_map: Tensor) -> Tensor:
-    """Whitened residuals (k, 2) of a run, for pairs (P, 4, 4) and all corners (N, 2)."""
-    return View.of(run, poses, corners_map[run.corners]).residual.detach()
+        x, y = _of_each(step[:, run.corners], run.corner)
+        by_x, by_y = couplings[:, :, run.observations]
+        by_pair.index_add_(1, run.pair, torch.addcmul(by_x * x, by_y, y))
+    return whitened, spread.gather(by_pair.T.reshape(arrays.camera_count, -1, 6))
 
 
 def _by_frame(system: ReducedSystem, run: Run, tiles: tuple[int, ...], by_state: Tensor) -> Tensor:

@@ -16,8 +16,7 @@ alone, since t'(l - l0) along it is held at zero. The cost is half the sum of sq
 under a robust loss.
 
 Tangents are (translation, rotation), as in kornia's ``Se3``, and act from the left: exp(x) T.
-Derivatives are left to autograd (:mod:`v2hdm.adjust.engine`), against which the closed forms of
-:mod:`v2hdm.adjust.kernels` are tested.
+Derivatives are those of :mod:`v2hdm.adjust.engine`, against which :mod:`v2hdm.adjust.kernels` are tested.
 """
 
 from __future__ import annotations

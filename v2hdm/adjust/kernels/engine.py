@@ -227,7 +227,7 @@ class NumbaEngine(TorchEngine):
             corner_factor=_corner_factor(arrays, base),
             whitened=torch.from_numpy(out.whitened).view(-1, 2),
             coupled=self.coupled(out.coupled, out.carried, spread),
-            couplings=gradient.extrinsic.new_empty(0, 2, 6),
+            couplings=gradient.extrinsic.new_empty(2, 6, 0),
             base=base,
         )
 
