@@ -35,7 +35,7 @@ check: $(DEV_INSTALLED)
 	$(BIN)/lint-imports
 
 docs: $(DEV_INSTALLED)
-	$(BIN)/mkdocs build --strict --quiet
+	$(BIN)/python docs/tools/site.py site
 
 audit: $(DEV_INSTALLED)
 	@$(BIN)/python -c "import urllib.request as u; assert b'CVE-' in u.urlopen('$(ADVISORIES)', timeout=10).read()" \

@@ -23,7 +23,7 @@ import cv2
 from tests.docs.blocks import ROOT, blocks, document
 from tests.docs.sandbox import furnish
 from tests.docs.smaller import SMALL_PORT, smaller
-from v2hdm.cli.main import COMMANDS
+from v2hdm.cli.main import all_commands
 
 _NEEDS = re.compile(r"\*Needs `pip install '?\.(?:\[([a-z,]+)\])?'?`")
 _PIP = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "-c", str(ROOT / "constraints.txt")]
@@ -51,6 +51,7 @@ MORE = {
         f"v2hdm map +run=port2 workers=1 resume=false all_maps=true {' '.join(map(repr, SMALL_PORT))}",
         "v2hdm export map.geojson --format lanelet2",
         "v2hdm experiment --cfg job",
+        "python -c 'import v2hdm.paper, v2hdm.experiment.run'",
         "v2hdm detect images --limit 1",
     ),
     "map,ros": ("v2hdm check site --list-topics", "v2hdm detect site --limit 1"),
@@ -162,11 +163,17 @@ def tried(name: str, environment: Environment, lines: list[str], here: Path) -> 
 def missing(environment: Environment, here: Path) -> int:
     """Run what the base install cannot do: each is one line that names an extra; how many are not."""
     failed = 0
-    for name, command in COMMANDS.items():
+    for name, command in all_commands().items():
         if command.extra is None or name == "calibrate ground":  # which the base install can do
             continue
         arguments = {"calibrate points": "points.csv --intrinsics camera_info.yaml"}
-        given = {"map": "+run=port2", "experiment": "", "fleet": "a.yaml", "check": "drives/mysite"}
+        given = {
+            "map": "+run=port2",
+            "simulate": "+run=port2",
+            "experiment": "",
+            "fleet": "a.yaml",
+            "check": "drives/mysite",
+        }
         words = arguments.get(name) or given.get(name, "outputs/port2")
         words += " outputs/friday" * (name in ("calibrate compare", "localize"))
         done = environment.run(f"v2hdm {name} {words}", here)

@@ -3,34 +3,36 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from v2hdm.cli.main import Command, answer_signals
+from v2hdm.cli.command import Command
+from v2hdm.cli.main import answer_signals
 
 if TYPE_CHECKING:
     from v2hdm.cli.compose import Job
 
-_COMMAND = Command("python -m export", "Export a checkpoint of the detector to ONNX.", "train")
-
 
 def main() -> int:
     """Export; returns the exit code."""
-    return _COMMAND.guard(_export)
+    return COMMAND(sys.argv[1:])
 
 
-def _export() -> int:
+def _run(arguments: Sequence[str]) -> int:
     from export.config import ExportConfig
-    from v2hdm.cli.compose import work_on
+    from v2hdm.cli.compose import Door, work_on
 
     advice = "`python -m export checkpoint=... output=...`"
-    return work_on(_COMMAND, "export", ExportConfig, _run, sys.argv[1:], advice)
+    return work_on(COMMAND, Door("export", ExportConfig, advice), _export, arguments)
 
 
-def _run(job: Job) -> None:
+def _export(job: Job) -> None:
     from export.console import export
 
     export(job.settings)
 
+
+COMMAND = Command("python -m export", "Export a checkpoint of the detector to ONNX.", _run, extra="train")
 
 if __name__ == "__main__":
     answer_signals()

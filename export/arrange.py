@@ -25,7 +25,8 @@ from onnx import helper, numpy_helper
 
 from export.graph import Graph
 
-_CHANNELS_LAST, _CHANNELS_FIRST = [0, 2, 3, 1], [0, 3, 1, 2]
+_CHANNELS_LAST = [0, 2, 3, 1]  # places of (n, c, h, w) that make (n, h, w, c)
+_CHANNELS_FIRST = [0, 3, 1, 2]  # places of (n, h, w, c) that make (n, c, h, w)
 
 _TO_FINER = ["Reshape", "Transpose", "Reshape", "Transpose", "Reshape"]
 """The nodes that turn four channels into one of twice the resolution."""
@@ -60,11 +61,12 @@ class _Arranger:
         """Where bytes are made of a sum with what was doubled: without a tensor of the doubled."""
         total = self._maker[encode.input[0]]
         steps = ["DequantizeLinear", "QuantizeLinear", "Resize"]
-        small, large = (self._behind(name, steps) for name in total.input), reversed(total.input)
-        found = [pair for pair in zip(small, large, strict=True) if total.op_type == "Add" and pair[0]]
-        if not found:
+        small = (self._behind(name, steps) for name in total.input)
+        large = reversed(total.input)
+        pairs = [pair for pair in zip(small, large, strict=True) if total.op_type == "Add" and pair[0]]
+        if not pairs:
             return
-        coarse, fine = (self._maker[name] for name in found[0])
+        coarse, fine = (self._maker[name] for name in pairs[0])
         coarse_bytes, fine_bytes = (
             self._write("Transpose", [decode.input[0]], perm=_CHANNELS_LAST) for decode in (coarse, fine)
         )
@@ -77,7 +79,8 @@ class _Arranger:
 
     def read_off_twice(self, total: onnx.NodeProto) -> None:
         """An output that is the sum of two convolutions of one pixel, the second of them doubled."""
-        fine, coarse = total.input[0], self._behind(total.input[1], ["Resize"])
+        fine = total.input[0]
+        coarse = self._behind(total.input[1], ["Resize"])
         convolutions = [self._maker.get(name) for name in (fine, coarse or "")]
         if not all(conv is not None and self._is_of_one_pixel(conv) for conv in convolutions):
             return
@@ -113,13 +116,13 @@ class _Arranger:
     def drop_unused(self) -> None:
         """Leave out whatever no output needs."""
         needed = {value.name for value in self._graph.output}
-        kept = []
+        used = []
         for node in reversed(self._graph.node):
             if needed.intersection(node.output):
                 needed.update(node.input)
-                kept.append(node)
+                used.append(node)
         for whole, part in (
-            (self._graph.node, kept[::-1]),
+            (self._graph.node, used[::-1]),
             (self._graph.initializer, [t for t in self._graph.initializer if t.name in needed]),
         ):
             part = list(part)
@@ -129,11 +132,11 @@ class _Arranger:
     def _in_pairs(self, coarse: str, fine: str) -> tuple[str, str]:
         """Tensors (1, h, w, c) and (1, 2h, 2w, c) as (h, 1, 2wc) and (h, 2, 2wc), the first one doubled."""
         beside = self._write("Concat", [coarse, coarse], axis=3)
-        once, each = (
+        doubled, unpaired = (
             self._write("Unsqueeze", [self._write("Flatten", [name], axis=2), self._constant([1])])
             for name in (beside, fine)
         )
-        return once, self._write("Reshape", [each, self._constant([-1, 2, 0])])
+        return doubled, self._write("Reshape", [unpaired, self._constant([-1, 2, 0])])
 
     def _products(self, conv: onnx.NodeProto) -> str:
         """The output of a convolution of one pixel before its bias, channels last."""

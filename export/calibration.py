@@ -23,7 +23,7 @@ from v2hdm.simulate.render.renderer import Renderer
 FRAME_SIZES = ((1280, 720), (1248, 384), (1920, 1088))
 """Widths and heights of the cameras that take turns; multiples of 32 px, so that none of them is padded."""
 
-_PATCH_M = 0.1
+_PATCH_M = 0.1  # half the side, m, of a camera's region of interest
 
 
 def looks(

@@ -36,8 +36,8 @@ def equalise(graph: Graph, images: Sequence[NDArray[np.uint8]]) -> None:
     """Bring the channels of each inner tensor to one range, as seen on ``images``; outputs stay the same."""
     groups = _groups(graph)
     ranges: dict[str, FloatTensor] = {}
-    for seen in graph.run([name for group in groups for name in group.tensors], images):
-        for name, value in seen.items():
+    for values in graph.run([name for group in groups for name in group.tensors], images):
+        for name, value in values.items():
             highest = np.abs(value[0]).max(axis=(1, 2))
             ranges[name] = np.maximum(ranges.get(name, highest), highest)
     for group in groups:

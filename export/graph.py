@@ -74,9 +74,9 @@ class Graph:
         names = list(dict.fromkeys(names))
         watched = onnx.ModelProto()
         watched.CopyFrom(self.stored())
-        known = {*self.outputs}
+        already_out = {*self.outputs}
         for name in names:
-            if name not in known:
+            if name not in already_out:
                 watched.graph.output.append(helper.make_tensor_value_info(name, TensorProto.FLOAT, None))
         session = open_session(watched.SerializeToString())
         for image in images:

@@ -29,12 +29,14 @@ from v2hdm.errors import DetectorError
 HIGHEST_WEIGHT = 64
 """Weights are integers from minus this to this."""
 
-_HIGHEST_INPUT = 255
+_HIGHEST_INPUT = 255  # highest value of a byte
 
 _ROWS = slice(None, None, 4)
 """Share of an output's rows that the correlation of its inputs is estimated from."""
 
-_BYTES, _SCALE, _ZERO = "{}.bytes", "{}.scale", "{}.zero"
+_BYTES = "{}.bytes"
+_SCALE = "{}.scale"
+_ZERO = "{}.zero"
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,8 @@ def _image_input(graph: Graph) -> _Image:
     (shift,) = (node for node in graph.nodes if cast.output[0] in node.input)
     (gain,) = (node for node in graph.nodes if shift.output[0] in node.input)
     assert (shift.op_type, gain.op_type) == ("Sub", "Mul")
-    zero, scale = graph.weights[shift.input[1]].item(), graph.weights[gain.input[1]].item()
+    zero = graph.weights[shift.input[1]].item()
+    scale = graph.weights[gain.input[1]].item()
     assert zero == np.uint8(zero), "grey values are shifted by a whole number"
     return _Image(cast.input[0], [cast, shift, gain], _Coding(np.float32(scale), np.uint8(zero)))
 
@@ -115,13 +118,13 @@ def _fine(graph: Graph) -> set[str]:
 
 def _codings(graph: Graph, images: Sequence[NDArray[np.uint8]], fine: set[str]) -> dict[str, _Coding]:
     """The codings of all tensors that go through bytes, by their names."""
-    kept = fine | {node.input[0] for node in graph.nodes if node.op_type == "Relu"}
+    not_coded = fine | {node.input[0] for node in graph.nodes if node.op_type == "Relu"}
     through = ("Conv", "Relu", "Add", "Resize")
-    names = [n.output[0] for n in graph.nodes if n.op_type in through and n.output[0] not in kept]
+    names = [n.output[0] for n in graph.nodes if n.op_type in through and n.output[0] not in not_coded]
     low: dict[str, float] = dict.fromkeys(names, 0.0)
     high: dict[str, float] = dict.fromkeys(names, 0.0)
-    for seen in graph.run(names, images):
-        for name, value in seen.items():
+    for values in graph.run(names, images):
+        for name, value in values.items():
             low[name], high[name] = min(low[name], float(value.min())), max(high[name], float(value.max()))
     return {name: _coding(low[name], high[name]) for name in names}
 
@@ -136,35 +139,36 @@ def _moments(
 ) -> dict[str, Moments]:
     """:func:`input_moments` of every convolution, by the names of their weights."""
     sums: dict[str, Moments] = {}
-    for seen in graph.run([conv.input for conv in convolutions], images):
+    for inputs in graph.run([conv.input for conv in convolutions], images):
         for conv in convolutions:
-            moments = input_moments(conv, seen[conv.input], _ROWS)
+            moments = input_moments(conv, inputs[conv.input], _ROWS)
             sums[conv.weight] = sums[conv.weight] + moments if conv.weight in sums else moments
     return sums
 
 
 def _round(graph: Graph, conv: Convolution, coding: _Coding, moments: Moments) -> None:
     """Make a convolution read rounded weights and a bias in 32 bits, each by the name that it had."""
-    whole, scale, bias = round_weights(
+    rounded = round_weights(
         graph.weights.pop(conv.weight), graph.weights.pop(conv.bias), moments, HIGHEST_WEIGHT
     )
-    bias_scale = (scale * coding.scale).astype(np.float32)
-    whole_bias = np.clip(np.round(bias / bias_scale.astype(np.float64)), -(2**31) + 1, 2**31 - 1)
+    bias_scale = (rounded.scale * coding.scale).astype(np.float32)
+    whole_bias = np.clip(np.round(rounded.bias / bias_scale.astype(np.float64)), -(2**31) + 1, 2**31 - 1)
     _remove_initializers(graph, {conv.weight, conv.bias})
-    _dequantized(graph, conv.weight, whole, scale)
+    _dequantized(graph, conv.weight, rounded.whole, rounded.scale)
     _dequantized(graph, conv.bias, whole_bias.astype(np.int32), bias_scale)
 
 
 def _remove_initializers(graph: Graph, names: set[str]) -> None:
     tensors = graph.model.graph.initializer
-    kept = [tensor for tensor in tensors if tensor.name not in names]
+    others = [tensor for tensor in tensors if tensor.name not in names]
     del tensors[:]
-    tensors.extend(kept)
+    tensors.extend(others)
 
 
 def _dequantized(graph: Graph, name: str, whole: NDArray[np.integer], scale: FloatTensor) -> None:
     """A constant tensor as integers with a scale for each output."""
-    whole_name, scale_name = _BYTES.format(name), _SCALE.format(name)
+    whole_name = _BYTES.format(name)
+    scale_name = _SCALE.format(name)
     graph.model.graph.initializer.extend(
         [numpy_helper.from_array(whole, whole_name), numpy_helper.from_array(scale, scale_name)]
     )
@@ -202,7 +206,8 @@ def _through_bytes(graph: Graph, codings: dict[str, _Coding]) -> None:
 
 
 def _decode(graph: Graph, source: str, output: str, coding: _Coding) -> onnx.NodeProto:
-    scale, zero = _SCALE.format(output), _ZERO.format(output)
+    scale = _SCALE.format(output)
+    zero = _ZERO.format(output)
     graph.model.graph.initializer.extend(
         [
             numpy_helper.from_array(np.asarray(coding.scale), scale),

@@ -16,9 +16,9 @@ from models.judge import Judge
 from v2hdm.detection.classifier import JUDGE_INPUTS, JUDGE_OUTPUTS
 from v2hdm.errors import DetectorError
 
-_OPSET = 20
-_TOLERANCE = 1e-3
-_ROWS = (1, 7, 64)
+_OPSET = 20  # version of ONNX's operators
+_TOLERANCE = 1e-3  # largest difference of the file's answers from the network's
+_ROWS = (1, 7, 64)  # numbers of rows that the file is checked with
 
 
 def write_judge(judge: Judge, views_shape: tuple[int, int, int], label: dict[str, Any], path: Path) -> None:
@@ -34,16 +34,18 @@ def write_judge(judge: Judge, views_shape: tuple[int, int, int], label: dict[str
         DetectorError: the file's answers would not be the network's.
     """
     rows_of_each = {0: torch.export.Dim("rows", min=1, max=4096)}
-    given = _any_rows(judge, views_shape, 5)
-    model = graph_of(judge, given, list(JUDGE_OUTPUTS), (rows_of_each,) * 3, _OPSET)
+    inputs = _any_rows(judge, views_shape, 5)
+    model = graph_of(judge, inputs, list(JUDGE_OUTPUTS), (rows_of_each,) * 3, _OPSET)
     session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
     for rows in _ROWS:
-        given = _any_rows(judge, views_shape, rows)
+        inputs = _any_rows(judge, views_shape, rows)
         with torch.no_grad():
-            expected = judge(*given.values())
-        named = {name: part.numpy() for name, part in given.items()}
-        for name, answer, own in zip(JUDGE_OUTPUTS, session.run(None, named), expected, strict=True):
-            difference = float(np.abs(answer - own.numpy()).max())
+            expected = judge(*inputs.values())
+        named = {name: part.numpy() for name, part in inputs.items()}
+        for name, answer, answer_of_network in zip(
+            JUDGE_OUTPUTS, session.run(None, named), expected, strict=True
+        ):
+            difference = float(np.abs(answer - answer_of_network.numpy()).max())
             if not difference <= _TOLERANCE:
                 raise DetectorError(f"{path} was not written: its {name} would differ by {difference:.2g}")
     write_labelled(model, label, path)

@@ -26,15 +26,15 @@ def record(names: Sequence[str], command: str, folder: Path = weights.FOLDER) ->
     """
     unknown = [name for name in names if name not in weights.COMMANDS or not (folder / name).is_file()]
     if unknown:
-        known = ", ".join(weights.COMMANDS)
-        raise DetectorError(f"{folder / unknown[0]}: no fitted file of the detector; give one of {known}")
+        fitted = ", ".join(weights.COMMANDS)
+        raise DetectorError(f"{folder / unknown[0]}: no fitted file of the detector; give one of {fitted}")
     manifest_file = folder / weights.MANIFEST_FILE.name
     manifest = weights.read_manifest(folder) if manifest_file.is_file() else {"files": {}}
     network = weights.digest(folder / weights.NETWORK_FILE.name)
-    made = datetime.now(UTC).date().isoformat()
+    today = datetime.now(UTC).date().isoformat()
     for name in names:
         sha256 = weights.digest(folder / name)
-        manifest["files"][name] = {"sha256": sha256, "network": network, "made": made, "command": command}
+        manifest["files"][name] = {"sha256": sha256, "network": network, "made": today, "command": command}
     manifest = {"commit": _commit(), "files": manifest["files"]}
     replace_text(manifest_file, json.dumps(manifest, indent=1) + "\n")
 

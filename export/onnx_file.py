@@ -28,7 +28,7 @@ from v2hdm.detection.network import METADATA_KEY
 from v2hdm.errors import ConfigError, DetectorError
 from v2hdm.store.files import whole_file
 
-_PARITY_SEED_OFFSET = 1_000_003
+_PARITY_SEED_OFFSET = 1_000_003  # distance of the seeds that a file is checked with from those of its making
 _FITTING = 0.15
 """Share of the time of an int8 export that does not go into its renders, about."""
 
@@ -100,7 +100,8 @@ def export_int8(source: Source, path: Path, opset: int, config: Int8Config, tell
 
 def to_onnx(net: MarkingNet, opset: int) -> onnx.ModelProto:
     """The graph of a network, its height and width left open."""
-    rows, columns = torch.export.Dim("rows", min=1, max=512), torch.export.Dim("columns", min=1, max=512)
+    rows = torch.export.Dim("rows", min=1, max=512)
+    columns = torch.export.Dim("columns", min=1, max=512)
     image = torch.zeros((1, 5 * MULTIPLE, 7 * MULTIPLE, 3), dtype=torch.uint8)
     open_sizes = ({1: MULTIPLE * rows, 2: MULTIPLE * columns},)
     model = graph_of(net, {"image": image}, list(Prediction._fields), open_sizes, opset)
@@ -159,8 +160,8 @@ def _checked(source: Source, path: Path, opset: int) -> onnx.ModelProto:
 def _images(seed: int, frames: int, tell: Share, start: float, share: float) -> list[NDArray[np.uint8]]:
     """All that the detector shows its network of some renders."""
     images: list[NDArray[np.uint8]] = []
-    for index, seen in enumerate(looks(seed, frames)):
-        images += seen
+    for index, images_of_frame in enumerate(looks(seed, frames)):
+        images += images_of_frame
         tell(start + (index + 1) * share, "rendering what the detector looks at")
     return images
 

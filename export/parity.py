@@ -49,8 +49,8 @@ class Parity:
         out = []
         for name, value in asdict(self).items():
             bound = bounds[name]
-            kept = value >= bound if name in _AT_LEAST else abs(value) <= bound
-            if not kept:
+            is_within = value >= bound if name in _AT_LEAST else abs(value) <= bound
+            if not is_within:
                 out.append(f"{name} {value:.3g} (int8.bounds.{name}={bound:g})")
         return out
 
@@ -61,10 +61,10 @@ def largest_difference(net: MarkingNet, content: bytes) -> float:
     images = (generator.integers(0, 256, (*size, 3), dtype=np.uint8) for size in PARITY_SIZES)
     worst = 0.0
     for expected, outputs in _pairs(net, content, images):
-        for one, other in zip(expected, outputs, strict=True):
-            if one.shape != other.shape:
+        for array, array_of_file in zip(expected, outputs, strict=True):
+            if array.shape != array_of_file.shape:
                 return float("inf")
-            worst = max(worst, float(np.abs(one - other).max()))
+            worst = max(worst, float(np.abs(array - array_of_file).max()))
     return worst
 
 
@@ -74,21 +74,21 @@ def int8_parity(net: MarkingNet, content: bytes, images: Iterable[NDArray[np.uin
     What there is nothing of in any image counts as the same.
     """
     pairs = [
-        ([array[0] for array in one], [array[0] for array in other])
-        for one, other in _pairs(net, content, images)
+        ([array[0] for array in outputs], [array[0] for array in outputs_of_file])
+        for outputs, outputs_of_file in _pairs(net, content, images)
     ]
-    paint = [(one[0][0], other[0][0]) for one, other in pairs]
+    paint = [(outputs[0][0], outputs_of_file[0][0]) for outputs, outputs_of_file in pairs]
     changed = sum(int(((a > 0) != (b > 0)).sum()) for a, b in paint)
     painted = sum(int((a > 0).sum()) for a, _ in paint)
     moved = np.concatenate([_outline_shift_px(a, b) for a, b in paint])
-    same_kind = np.concatenate([_same_kinds(one, other) for one, other in pairs])
-    crossed = [(one[2][0] > 0, other[2][0] > 0) for one, other in pairs]
-    both = sum(int((a & b).sum()) for a, b in crossed)
-    either = sum(int(a.sum()) + int(b.sum()) for a, b in crossed)
+    same_kind = np.concatenate([_same_kinds(outputs, of_file) for outputs, of_file in pairs])
+    crossed = [(outputs[2][0] > 0, of_file[2][0] > 0) for outputs, of_file in pairs]
+    cross_in_both = sum(int((a & b).sum()) for a, b in crossed)
+    crossings = sum(int(a.sum()) + int(b.sum()) for a, b in crossed)
     offsets = np.concatenate(
         [
-            LANE_STRIDE * (other[2][1] - one[2][1])[a & b]
-            for (a, b), (one, other) in zip(crossed, pairs, strict=True)
+            LANE_STRIDE * (of_file[2][1] - outputs[2][1])[a & b]
+            for (a, b), (outputs, of_file) in zip(crossed, pairs, strict=True)
         ]
     )
     return Parity(
@@ -96,7 +96,7 @@ def int8_parity(net: MarkingNet, content: bytes, images: Iterable[NDArray[np.uin
         outline_px=float(np.median(np.abs(moved))) if len(moved) else 0.0,
         outline_bias_px=float(moved.mean()) if len(moved) else 0.0,
         kinds_agree=float(same_kind.mean()) if len(same_kind) else 1.0,
-        lanes_agree=2 * both / either if either else 1.0,
+        lanes_agree=2 * cross_in_both / crossings if crossings else 1.0,
         lane_offset_px=float(np.median(np.abs(offsets))) if len(offsets) else 0.0,
     )
 
@@ -110,19 +110,23 @@ def _pairs(net: MarkingNet, content: bytes, images: Iterable[NDArray[np.uint8]])
         yield [output.numpy() for output in prediction], outputs
 
 
-def _same_kinds(one: list[NDArray[np.float32]], other: list[NDArray[np.float32]]) -> NDArray[np.bool_]:
+def _same_kinds(
+    outputs: list[NDArray[np.float32]], outputs_of_file: list[NDArray[np.float32]]
+) -> NDArray[np.bool_]:
     """Whether the likeliest class is the same, for every element of kinds that is half paint or more."""
-    paint, (_, height, width) = one[0][0], one[1].shape
+    paint = outputs[0][0]
+    _, height, width = outputs[1].shape
     side = KIND_STRIDE // PAINT_STRIDE
     share = (paint > 0).reshape(height, side, width, side).mean(axis=(1, 3))
-    return np.asarray((one[1].argmax(axis=0) == other[1].argmax(axis=0))[share >= 0.5])
+    return np.asarray((outputs[1].argmax(axis=0) == outputs_of_file[1].argmax(axis=0))[share >= 0.5])
 
 
-def _outline_shift_px(one: NDArray[np.float32], other: NDArray[np.float32]) -> NDArray[np.float32]:
+def _outline_shift_px(paint: NDArray[np.float32], paint_of_file: NDArray[np.float32]) -> NDArray[np.float32]:
     """How far zero crossings (N,) between the same neighbours are moved, from paint to ground, image px."""
     out = []
     for axis in (0, 1):
-        a, b = np.moveaxis(one, axis, 0), np.moveaxis(other, axis, 0)
+        a = np.moveaxis(paint, axis, 0)
+        b = np.moveaxis(paint_of_file, axis, 0)
         crossing = (
             ((a[:-1] > 0) != (a[1:] > 0)) & ((b[:-1] > 0) == (a[:-1] > 0)) & ((b[1:] > 0) == (a[1:] > 0))
         )

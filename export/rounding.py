@@ -8,6 +8,8 @@ up for each error as well as they can on the inputs seen, at last the bias (Fran
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -43,42 +45,46 @@ def input_moments(conv: Convolution, tensor: FloatTensor, rows: slice = slice(No
     return np.asarray(columns @ columns.transpose(0, 2, 1), dtype=np.float64)
 
 
-def round_weights(
-    weight: FloatTensor, bias: FloatTensor, moments: Moments, highest: int
-) -> tuple[NDArray[np.int8], FloatTensor, FloatTensor]:
-    """Round the weights (N, C, h, w) and bias (N,) of a convolution to integers from -highest to highest.
+class Rounded(NamedTuple):
+    """The weights of a convolution, rounded."""
 
-    Returns:
-        The integers, the scale (N,) that makes them weights, and the bias to go with them.
-    """
+    whole: NDArray[np.int8]  # (N, C, h, w)
+    scale: FloatTensor  # (N,) that makes them weights
+    bias: FloatTensor  # (N,) that goes with them
+
+
+def round_weights(weight: FloatTensor, bias: FloatTensor, moments: Moments, highest: int) -> Rounded:
+    """Round the weights (N, C, h, w) and bias (N,) of a convolution to integers from -highest to highest."""
     flat = weight.reshape(len(weight), -1).astype(np.float64)
     scale = np.maximum(np.abs(flat).max(axis=1), 1e-12) / highest
-    rest = np.column_stack([flat, bias.astype(np.float64)])
+    unrounded = np.column_stack([flat, bias.astype(np.float64)])
     whole = np.zeros(flat.shape)
     for outputs, moment in zip(np.array_split(np.arange(len(flat)), len(moments)), moments, strict=True):
-        whole[outputs], rest[outputs] = _round_in_turn(rest[outputs], scale[outputs, None], moment, highest)
-    new_bias = rest[:, -1]
-    return (
-        whole.reshape(weight.shape).astype(np.int8),
-        scale.astype(np.float32),
-        new_bias.astype(np.float32),
+        whole[outputs], unrounded[outputs] = _round_in_turn(
+            unrounded[outputs], scale[outputs, None], moment, highest
+        )
+    new_bias = unrounded[:, -1]
+    return Rounded(
+        whole=whole.reshape(weight.shape).astype(np.int8),
+        scale=scale.astype(np.float32),
+        bias=new_bias.astype(np.float32),
     )
 
 
 def _round_in_turn(
-    rest: NDArray[np.float64], scale: NDArray[np.float64], moment: Moments, highest: int
+    unrounded: NDArray[np.float64], scale: NDArray[np.float64], moment: Moments, highest: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Round all columns but the last, of which there is no need; those of the strongest inputs first."""
-    count = rest.shape[1] - 1
+    count = unrounded.shape[1] - 1
     power = np.diag(moment)[:count]
     order = np.append(np.argsort(-power, kind="stable"), count)
     damped = moment[np.ix_(order, order)]
     damped[np.arange(count), np.arange(count)] += _DAMPING * max(power.mean(), 1e-12)
     upper = np.linalg.cholesky(np.linalg.inv(damped)).T
-    rest, whole = rest[:, order], np.zeros((len(rest), count))
+    unrounded, whole = unrounded[:, order], np.zeros((len(unrounded), count))
     for k in range(count):
-        whole[:, k] = np.clip(np.round(rest[:, k] / scale[:, 0]), -highest, highest)
-        error = (rest[:, k] - whole[:, k] * scale[:, 0]) / upper[k, k]
-        rest[:, k:] -= error[:, None] * upper[k, k:]
+        whole[:, k] = np.clip(np.round(unrounded[:, k] / scale[:, 0]), -highest, highest)
+        error = (unrounded[:, k] - whole[:, k] * scale[:, 0]) / upper[k, k]
+        unrounded[:, k:] -= error[:, None] * upper[k, k:]
     back = np.argsort(order)
-    return whole[:, back[:-1]], rest[:, back]
+    return whole[:, back[:-1]], unrounded[:, back]

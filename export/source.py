@@ -78,13 +78,13 @@ def weights_not_finite(net: torch.nn.Module) -> list[str]:
 
 def _without_paths(config: Mapping[str, Any]) -> dict[str, Any]:
     """The settings of a training less what says something of the machine that it ran on."""
-    kept = {key: value for key, value in config.items() if key not in ("output", "device", "resume")}
+    settings = {key: value for key, value in config.items() if key not in ("output", "device", "resume")}
     for key in ("start", "catalogue"):
-        kept[key] = kept.get(key) and Path(kept[key]).name
-    labels = {key: bool(kept["data"].get(key)) for key in ("coco", "tusimple")}
+        settings[key] = settings.get(key) and Path(settings[key]).name
+    labels = {key: bool(settings["data"].get(key)) for key in ("coco", "tusimple")}
     paths = ("coco", "coco_images", "tusimple", "tusimple_images")
-    kept["data"] = {k: v for k, v in kept["data"].items() if k not in paths} | {"own_labels": labels}
-    return kept
+    settings["data"] = {k: v for k, v in settings["data"].items() if k not in paths} | {"own_labels": labels}
+    return settings
 
 
 def _commit() -> str:

@@ -2,8 +2,8 @@
 
 :class:`models.MarkingNet` separates paint from ground, pixel by pixel. Whether a piece of paint is a whole
 marking of a class shows in its shape and in the image about it. The classifier gets both: the quadrilateral
-rectified (:mod:`v2hdm.detection.classifier`) and what was measured of it
-(:data:`v2hdm.detection.classifier.FEATURES`), as the second stage of Faster R-CNN gets features of its
+rectified (:mod:`v2hdm.detection.evidence`) and what was measured of it
+(:data:`v2hdm.detection.evidence.FEATURES`), as the second stage of Faster R-CNN gets features of its
 region (Ren et al., NeurIPS 2015).
 """
 
@@ -16,7 +16,7 @@ _CELLS = 2
 """Rows and columns that convolutions end in: means over parts of a view that overlap in its middle."""
 
 
-_SIDES = 4
+_SIDES = 4  # sides of a quadrilateral
 _LOG_SIGMA = (-4.0, 4.0)
 """Limits of the logarithm of a side's error, px."""
 
@@ -61,15 +61,15 @@ class Judge(nn.Module):
             nn.AvgPool2d(3, stride=2),
             nn.Flatten(),
         )
-        known = features + shapes
+        inputs = features + shapes
         self.weigh = nn.Sequential(
-            nn.Linear(2 * width * _CELLS**2 + known, hidden),
+            nn.Linear(2 * width * _CELLS**2 + inputs, hidden),
             nn.ReLU(),
             nn.Dropout(dropout),
             nn.Linear(hidden, shapes),
         )
         self.doubt = nn.Sequential(
-            nn.Linear(2 * width * _CELLS**2 + known, hidden), nn.ReLU(), nn.Linear(hidden, _SIDES)
+            nn.Linear(2 * width * _CELLS**2 + inputs, hidden), nn.ReLU(), nn.Linear(hidden, _SIDES)
         )
         self.hide = nn.Dropout(dropout)
         self.register_buffer("mean", torch.zeros(features))
@@ -83,6 +83,6 @@ class Judge(nn.Module):
             evidence: (M, F).
             shape: (M, K), one-hot.
         """
-        known = torch.cat([(evidence - self.mean) / self.deviation, shape], dim=1)
-        seen = torch.cat([self.hide(self.see(views)), known], dim=1)
-        return (self.weigh(seen) * shape).sum(dim=1), self.doubt(seen).clamp(*_LOG_SIGMA)
+        measured = torch.cat([(evidence - self.mean) / self.deviation, shape], dim=1)
+        all_inputs = torch.cat([self.hide(self.see(views)), measured], dim=1)
+        return (self.weigh(all_inputs) * shape).sum(dim=1), self.doubt(all_inputs).clamp(*_LOG_SIGMA)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -21,42 +21,47 @@ from torch.nn.functional import interpolate
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from v2hdm.catalogue import PAINT_CLASSES
+from v2hdm.settings import Within
 
 MULTIPLE = 16
 """Image height and width must be multiples of this many pixels."""
 
-PAINT_STRIDE = 2
-KIND_STRIDE = 4
+PAINT_STRIDE = 2  # image pixels per element of paint, in both directions
+KIND_STRIDE = 4  # image pixels per element of kinds, in both directions
 LANE_STRIDE = 8
 """Image pixels per element of each output, in both directions."""
 
-_STEM_STRIDE = 4
+_STEM_STRIDE = 4  # image pixels per element after the first convolution, in both directions
 PAINT_UPSCALE = _STEM_STRIDE // PAINT_STRIDE
-_GREY_MEAN = 112.0
-_GREY_SCALE = 64.0
+_GREY_MEAN = 112.0  # grey level that is subtracted from an image
+_GREY_SCALE = 64.0  # grey levels that are the unit of an image
 
 
 @dataclass(kw_only=True)
 class NetConfig:
     """Channel counts of :class:`MarkingNet` at 1/4, 1/8 and 1/16 of the image and at the bottom.
 
-    ``separable`` takes depthwise separable convolutions (Howard et al., "MobileNets", 2017) where the image
-    is large; ``lanes`` adds the head of row anchors; ``wide_kinds`` lets the features at 1/8, which know a
-    marking's whole shape and its surroundings, speak on its class. They are switches to measure what each
-    costs and brings.
-
-    Attributes:
-        widths: channels at 1/4, 1/8, 1/16 and at the bottom.
-        dilations: of the blocks at the bottom, one each.
-        head_width: channels of the paint's head.
+    The last three are switches to measure what each costs and brings.
     """
 
-    widths: list[int] = field(default_factory=lambda: [32, 64, 96, 128])
-    dilations: list[int] = field(default_factory=lambda: [1, 2, 4, 8])
-    head_width: int = 8
-    separable: bool = False
-    lanes: bool = True
-    wide_kinds: bool = True
+    widths: Annotated[list[int], Within(8, 4096, step=8), "channels at 1/4, 1/8, 1/16 and at the bottom."] = (
+        field(default_factory=lambda: [32, 64, 96, 128])
+    )
+    dilations: Annotated[list[int], Within(1, 256), "of the blocks at the bottom, one each."] = field(
+        default_factory=lambda: [1, 2, 4, 8]
+    )
+    head_width: Annotated[int, Within(1, 1024), "channels of the paint's head."] = 8
+    separable: Annotated[
+        bool,
+        'separable takes depthwise separable convolutions (Howard et al., "MobileNets", 2017) where the '
+        "image is large;",
+    ] = False
+    lanes: Annotated[bool, "lanes adds the head of row anchors;"] = True
+    wide_kinds: Annotated[
+        bool,
+        "wide_kinds lets the features at 1/8, which know a marking's whole shape and its surroundings, "
+        "speak on its class.",
+    ] = True
 
 
 class Prediction(NamedTuple):
@@ -98,7 +103,8 @@ class ConvNormRelu(nn.Sequential):
 
     def fold(self) -> None:
         """Merge the running statistics into the convolution; only for a network in eval mode."""
-        convolution, norm = self[0], self[1]
+        convolution = self[0]
+        norm = self[1]
         if isinstance(convolution, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d):
             self[0] = fuse_conv_bn_eval(convolution, norm)
             self[1] = nn.Identity()
@@ -187,7 +193,8 @@ def _space_to_depth(image: Tensor) -> Tensor:
     """
     batch, height, width, _ = image.shape
     s = _STEM_STRIDE
-    rows, columns = height // s, width // s
+    rows = height // s
+    columns = width // s
     tiles = image.reshape(batch, rows, s, columns * s * 3).permute(0, 2, 1, 3)
     channels = tiles.reshape(batch * s, rows * columns, s * 3).permute(0, 2, 1)
     return (channels.reshape(batch, 3 * s * s, rows, columns).to(torch.float32) - _GREY_MEAN) * (

@@ -10,8 +10,7 @@ import pytest
 
 from tests.drive.example import description
 from v2hdm.pipeline.config import DriveConfig, RunConfig
-from v2hdm.simulate import PortConfig
-from v2hdm.simulate.port.config import RouteConfig, YardConfig
+from v2hdm.simulate.port.config import PortConfig, RouteConfig, YardConfig
 from v2hdm.simulate.port.drive import rendered_drive
 
 ROUTE = [[20.0, 0.0], [16.0, 70.0], [10.0, 0.0]]

@@ -9,18 +9,19 @@ import subprocess
 import sys
 import tomllib
 from contextlib import suppress
+from dataclasses import replace
 from importlib import metadata
-from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
 import yaml
 
 from v2hdm import __version__
-from v2hdm.cli.main import COMMANDS, HOMES, run, version_line
+from v2hdm.cli.main import all_commands, run, version_line
 from v2hdm.progress import patient
 
 ROOT = Path(__file__).parents[1]
+COMMANDS = all_commands()
 PRESSED_TWICE = """
 import os, signal, time
 try:
@@ -44,6 +45,7 @@ def run_command(folder, *arguments, **variables):
 NEEDED = {
     "v2hdm map +run=port2": ("map", "torch", "kornia"),
     "v2hdm experiment": ("map", "torch", "matplotlib"),
+    "v2hdm simulate +run=port2": ("map", "omegaconf", "omegaconf"),
     "v2hdm check drive": ("map", "cv2", "matplotlib"),
     "v2hdm calibrate points points.csv --intrinsics a.yaml": ("map", "torch", "kornia"),
     "v2hdm mosaic outputs/port2": ("map", "torch", "kornia"),
@@ -141,12 +143,13 @@ def test_a_terminal_that_fails_stops_no_work_and_is_reported_at_its_end(monkeypa
                 print("progress", file=stream, flush=True)
         done.append("all of it")
 
+    command = replace(COMMANDS["map"], run=lambda _: work())
     with monkeypatch.context() as patch:
         patch.setattr(sys, "stdout", FullDisk())
-        assert COMMANDS["map"].guard(work) == 2
+        assert command(()) == 2
     with monkeypatch.context() as patch:
         patch.setattr(sys, "stderr", FullDisk())
-        assert COMMANDS["map"].guard(work) == 0
+        assert command(()) == 0
     assert done == ["all of it"] * 2
     assert "error: standard output, when all files were written: No space left" in capsys.readouterr().err
 
@@ -158,18 +161,14 @@ def test_openmp_waits_without_spinning_unless_the_user_says_so(given, expected, 
     assert run_command(tmp_path, "v2hdm.map", "+run=port2", **given).stderr.strip() == expected
 
 
-SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
-
-
-def test_the_list_has_a_sentence_for_each_command_and_each_has_a_file(capsys):
+def test_the_list_has_a_sentence_for_each_command_and_each_file_declares_its_own(capsys):
     assert run([]) == 0
     lines = capsys.readouterr().out.splitlines()[2:]
     assert {line.split("  ")[1].strip() for line in lines} == set(COMMANDS)
     assert all(line.endswith(".") for line in lines)
     assert run(["calibrate"]) == 0
     assert capsys.readouterr().out.count("\n  calibrate ") == 3
-    for name in COMMANDS:
-        assert (ROOT / "v2hdm" / "cli" / f"{HOMES.get(name, (name,))[0]}.py").is_file(), name
+    assert [command.name for command in COMMANDS.values()] == [f"v2hdm {name}" for name in COMMANDS]
     assert run(["calibrate", "pints"]) == 2
     assert (
         capsys.readouterr().err == "error: v2hdm calibrate pints: no such command; v2hdm --help lists them\n"
@@ -185,7 +184,7 @@ def test_help_explains_each_command_and_names_it(name, capsys):
     assert COMMANDS[name].says in text
 
 
-@pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("map", "experiment")])
+@pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("map", "experiment", "simulate")])
 @pytest.mark.parametrize("given", ["", "--no\x1b[2Jsuch"])
 def test_arguments_that_are_missing_or_unknown_are_one_line_that_names_the_help(name, given, capsys):
     with pytest.raises(SystemExit, match="2"):
@@ -233,20 +232,31 @@ def test_what_must_be_light_loads_nothing_heavy_and_the_base_install_is_enough_o
     assert (tmp_path / "drawn" / "a.jpg").is_file()
 
 
-OLD = {"extrinsic": "calibrate ground", "calibration": "calibrate compare", "calibrate": "calibrate points"}
+LOADED = """
+import sys
+from pathlib import Path
+import v2hdm.pipeline.map_drive
+ours = {name: module for name, module in sys.modules.items() if name.split(".")[0] == "v2hdm"}
+files = [Path(module.__file__) for module in ours.values()]
+print(sum(len(file.read_text(encoding="utf-8").splitlines()) for file in files))
+print(*ours)
+"""
 
 
-@pytest.mark.parametrize("name", SCRIPTS)
-def test_every_console_script_is_a_command_old_names_too(name, monkeypatch):
-    script = EntryPoint(name, SCRIPTS[name], "console_scripts").load()
-    asked: list[list[str]] = []
-    monkeypatch.setattr("v2hdm.cli.main.answer_signals", lambda: None)
-    monkeypatch.setattr("v2hdm.cli.main.run", lambda words: asked.append(list(words)) or 0)
-    monkeypatch.setattr(sys, "argv", [f"/usr/bin/{name}", "--version"])
-    assert script() == 0
-    (words,) = asked
-    old = name.removeprefix("v2hdm").removeprefix("-")
-    assert words == [*OLD.get(old, old).split(), "--version"]
+def test_mapping_loads_no_writer_no_page_no_mosaic_and_no_renderer():
+    done = subprocess.run(
+        [sys.executable, "-c", LOADED], cwd=ROOT, capture_output=True, text=True, timeout=60, check=True
+    )
+    lines, modules = done.stdout.splitlines()
+    assert int(lines) <= 30_000
+    unneeded = "io.maps.formats io.calibration.writing io.importers.bag report.page report.photos mosaic"
+    for name in (*unneeded.split(), "simulate.render"):
+        assert not [one for one in modules.split() if f"{one}.".startswith(f"v2hdm.{name}.")], name
+
+
+def test_the_only_console_script_is_v2hdm():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["scripts"] == {"v2hdm": "v2hdm.cli.main:main"}
 
 
 @pytest.mark.parametrize(

@@ -8,13 +8,16 @@ import pytest
 from hydra import compose, initialize_config_dir
 
 from export.config import ExportConfig
+from tests.docs.smaller import SMALL_PORT
 from tests.faults.cases import SIGNED, measures
 from train.config import TrainConfig
 from v2hdm.cli import compose as config
-from v2hdm.cli.compose import help_text, keys_of
-from v2hdm.cli.main import run
+from v2hdm.cli.compose import Door, help_text, keys_of
+from v2hdm.cli.main import command_of, run
 from v2hdm.errors import ConfigError
+from v2hdm.io.drive import read_drive
 from v2hdm.pipeline.config import PortConfig, RunConfig, admit
+from v2hdm.simulate.port.drive import folder_of_port
 
 RUNS = sorted(path.stem for path in (config.conf_dir() / "run").glob("*.yaml"))
 
@@ -94,10 +97,39 @@ def test_names_of_a_rendered_port_that_become_files_are_checked(port, says):
         admit(RunConfig(name="run", simulate=port))
 
 
-def test_device_and_mode_reach_the_mapping():
+def test_device_and_mode_reach_the_mapping_and_are_keys_once():
     mapping = composed("+run=port1", "device=cuda", "mode=incremental").mapping
     assert (mapping.device, mapping.mode) == ("cuda", "incremental")
     assert composed("+run=port1").mapping.mode == "batch"
+    names = [key.name for key in keys_of(RunConfig)]
+    assert [name for name in names if name.split(".")[-1] in ("device", "mode")] == [
+        "detector.device", "device", "mode"
+    ]  # fmt: skip
+
+
+def test_a_port_is_rendered_where_a_run_of_it_takes_it_from(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = ["+run=port2", "workers=1", *SMALL_PORT, "simulate.exposure.jpeg_quality=60"]
+    assert run(["simulate", *words]) == 0
+    printed = Path(capsys.readouterr().out.strip())
+    port = composed(*words).simulate
+    assert printed == folder_of_port(port, Path("cache"))
+    assert read_drive(printed).truth_dir is not None
+    assert run(["simulate", "workers=1"]) == 2
+    assert "simulate is not set: choose a port to render" in capsys.readouterr().err
+
+
+def test_the_keys_of_rendered_ports_are_listed_where_ports_are_rendered(capsys):
+    assert run(["simulate", "--help"]) == 0
+    rendering = capsys.readouterr().out
+    assert run(["map", "--help"]) == 0
+    mapping = capsys.readouterr().out
+    listed = re.findall(r"^  ([\w.]+) \(", mapping, re.MULTILINE)
+    assert len(listed) <= 73
+    assert not [key for key in listed if key.startswith("simulate.")]
+    assert "v2hdm simulate --help" in mapping
+    for key in keys_of(RunConfig):
+        assert f"\n  {key.name} (" in (rendering if key.name.startswith("simulate.") else mapping)
 
 
 @pytest.mark.parametrize("schema", [RunConfig, TrainConfig, ExportConfig])
@@ -109,7 +141,7 @@ def test_every_key_is_explained(schema):
 
 
 def test_the_page_has_every_key_with_its_default_and_the_runs_that_are_shipped():
-    page = help_text("v2hdm map", "Maps.", RunConfig, Path(__file__).parents[1] / "conf")
+    page = help_text(command_of("map"), Door("map", RunConfig, ""))
     assert "v2hdm map [key=value ...]" in page
     assert "mapping.max_range_m (number, 16.0)\n      sightings farther from" in page
     assert "Shipped runs: kitti, port1, port2" in page

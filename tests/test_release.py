@@ -51,6 +51,10 @@ def test_the_wheel_holds_the_library_with_its_data_and_nothing_else(released):
     needed = {
         "conf/map.yaml",
         "conf/run/port2.yaml",
+        "conf/schema/drive.json",
+        "conf/schema/run.json",
+        "paper/claims.py",
+        "paper/templates/experiment.md",
         "report/page/vendor/leaflet.js",
         "report/page/templates/map.js",
     }
@@ -117,12 +121,3 @@ def test_an_audit_that_reaches_no_advisories_says_so():
     command = ["make", "--no-print-directory", "--old-file", ".venv/.installed-dev", *place, "audit"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout == "audit skipped: no advisories at http://127.0.0.1:9/\n"
-
-
-@pytest.mark.parametrize("name", ["fast", "fleet"])
-def test_what_will_go_is_said_in_the_change_log(name):
-    assert PROJECT["optional-dependencies"][name] == ["v2hdm[map]"]
-    assert (
-        f"`{name}`"
-        in (ROOT / "CHANGELOG.md").read_text().partition("Deprecated until 2.0")[2].splitlines()[0]
-    )

@@ -4,31 +4,29 @@ from __future__ import annotations
 
 import sys
 import threading
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from v2hdm.cli.main import Command, answer_signals
+from v2hdm.cli.command import Command
+from v2hdm.cli.main import answer_signals
 
 if TYPE_CHECKING:
     from v2hdm.cli.compose import Job
 
-_COMMAND = Command(
-    "python -m train", "Train the detector.", "train", "interrupted; what was saved until then is kept"
-)
-
 
 def main() -> int:
     """Train; returns the exit code."""
-    return _COMMAND.guard(_train)
+    return COMMAND(sys.argv[1:])
 
 
-def _train() -> int:
+def _run(arguments: Sequence[str]) -> int:
     from train.config import TrainConfig
-    from v2hdm.cli.compose import work_on
+    from v2hdm.cli.compose import Door, work_on
 
-    return work_on(_COMMAND, "train", TrainConfig, _run, sys.argv[1:], "set it on the command line")
+    return work_on(COMMAND, Door("train", TrainConfig, "set it on the command line"), _train, arguments)
 
 
-def _run(job: Job) -> None:
+def _train(job: Job) -> None:
     from train.console import train
 
     threading.excepthook = _leave_to_main
@@ -40,6 +38,14 @@ def _leave_to_main(failed: threading.ExceptHookArgs) -> None:
     if not isinstance(failed.exc_value, OSError):
         threading.__excepthook__(failed)
 
+
+COMMAND = Command(
+    "python -m train",
+    "Train the detector.",
+    _run,
+    extra="train",
+    interrupted="interrupted; what was saved until then is kept",
+)
 
 if __name__ == "__main__":
     answer_signals()

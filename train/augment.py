@@ -32,7 +32,9 @@ def random_crop(rng: np.random.Generator, sample: TrainingSample, width: int, he
 def random_photometry(rng: np.random.Generator, image: Bytes) -> Bytes:
     """Another contrast, brightness, gamma and tint, now and then grey, compressed or sharpened."""
     levels = np.linspace(0.0, 1.0, 256)
-    gain, lift, gamma = np.exp(rng.normal(0, 0.15)), rng.normal(0, 0.03), np.exp(rng.normal(0, 0.15))
+    gain = np.exp(rng.normal(0, 0.15))
+    lift = rng.normal(0, 0.03)
+    gamma = np.exp(rng.normal(0, 0.15))
     tint = np.exp(rng.normal(0, 0.05, 3))
     curve = np.clip(((levels**gamma - 0.4) * gain + 0.4 + lift)[:, None] * tint, 0, 1)
     out = _bytes(cv2.LUT(image, np.round(curve * 255).astype(np.uint8)[None]))

@@ -58,14 +58,18 @@ def mean_checkpoint(
         else value
         for name, value in mean.averaged.items()
     }
-    mean.model, mean.optimizer, mean.metrics = mean.averaged, {}, {}
+    mean.model = mean.averaged
+    mean.optimizer = {}
+    mean.metrics = {}
     return mean
 
 
 @torch.inference_mode()
 def scored(checkpoint: Checkpoint) -> dict[str, float]:
     """The score of a checkpoint's averaged weights on the validation renders of its own settings."""
-    config, net, tally = checkpoint.config, checkpoint.network(), Tally(checkpoint.catalogue.names)
+    config = checkpoint.config
+    net = checkpoint.network()
+    tally = Tally(checkpoint.catalogue.names)
     images = config["validation"]["images"]
     for image, targets in validation_pairs(DataConfig(**config["data"]), config["seed"], images):
         tally.add(net(image[None]), Targets(*(target[None] for target in targets)))

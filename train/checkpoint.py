@@ -33,16 +33,20 @@ _FREE_TO_CHANGE = (
     "validation",
 )
 
-_VIEWS_TO_UNFOLD = 24
+_VIEWS_TO_UNFOLD = 24  # views by which folded weights are unfolded
 _ENTRY = ("family", "length_m", "width_m", "softness", "group")
 
 
 def own_entries(catalogue: Catalogue) -> dict[str, dict[str, Any]]:
     """The classes that are not shipped, as plain data that :meth:`Catalogue.with_own` takes."""
-    own = {name: asdict(one) for name, one in catalogue.classes.items() if name not in SHIPPED.classes}
+    own_classes = {
+        name: asdict(description)
+        for name, description in catalogue.classes.items()
+        if name not in SHIPPED.classes
+    }
     return {
-        name: {key: list(one[key]) if isinstance(one[key], tuple) else one[key] for key in _ENTRY}
-        for name, one in own.items()
+        name: {key: list(entry[key]) if isinstance(entry[key], tuple) else entry[key] for key in _ENTRY}
+        for name, entry in own_classes.items()
     }
 
 
@@ -104,7 +108,8 @@ def fresh_checkpoint(config: TrainConfig, catalogue: Catalogue | None = None) ->
         )
     catalogue = catalogue or earlier.catalogue
     state.own_classes = own_entries(catalogue)
-    classes, where = earlier.catalogue.names, f"start={config.start}"
+    classes = earlier.catalogue.names
+    where = f"start={config.start}"
     if isinstance(earlier, Checkpoint) and then == config.net:
         state.averaged = with_classes(earlier.averaged, classes, catalogue, where)
     else:
@@ -160,18 +165,19 @@ def check_same_experiment(checkpoint: Checkpoint, config: TrainConfig, path: Pat
     Raises:
         ConfigError: Naming the settings that differ.
     """
-    then, now = _completed(checkpoint.config, asdict(TrainConfig())), asdict(config)
+    then = _completed(checkpoint.config, asdict(TrainConfig()))
+    now = asdict(config)
     changed = [key for key in now if key not in _FREE_TO_CHANGE and then.get(key) != now[key]]
     if changed:
         raise ConfigError(
             f"{path} was trained with another {', '.join(changed)}: set it back, or choose a new `output`"
         )
     if config.catalogue is not None:
-        own = own_entries(load_catalogue(Path(config.catalogue)))
-        if list(own) != list(checkpoint.own_classes):
+        own_classes = own_entries(load_catalogue(Path(config.catalogue)))
+        if list(own_classes) != list(checkpoint.own_classes):
             raise ConfigError(
                 f"{path} was trained with the classes {', '.join(checkpoint.own_classes)}, not "
-                f"{', '.join(own)}: set them back in {config.catalogue}, or choose a new `output`"
+                f"{', '.join(own_classes)}: set them back in {config.catalogue}, or choose a new `output`"
             )
 
 

@@ -17,21 +17,22 @@ from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.network import NetworkOutput
 from v2hdm.records import CROSSWALK_BAR, DIAMOND, LANE_DASH, FloatArray
 
-SPOTS = 3
-_TRIES = 20
-_RADIUS_M = (0.2, 0.9)
-_SLIM = (0.3, 1.0)
+SPOTS = 3  # spots of sun that an image gets at most
+_TRIES = 20  # places that are tried for one spot
+_RADIUS_M = (0.2, 0.9)  # least and largest radius of a spot, m
+_SLIM = (0.3, 1.0)  # least and largest ratio of a spot's axes
 _SOFT = (0.15, 0.8)
 """By which share of its radius a spot fades out."""
 
-_GAIN = (1.3, 3.5)
+_GAIN = (1.3, 3.5)  # least and largest factor on the light in a spot
 _BOUND_PX = 6
 """Distance of spots from markings, which must not change, px."""
 
 _CLAIM_ODDS = (4.0, 16.0)
 """How fast the network's log odds of paint rise with the light of a spot."""
 
-_CLAIM_LOGIT = 8.0
+_CLAIM_LOGIT = 8.0  # logits that the claimed class gains within a spot
+# Shares of the classes that the network takes spots for.
 _CLAIMED = {DIAMOND: 0.6, LANE_DASH: 0.2, CROSSWALK_BAR: 0.2}
 
 
@@ -45,7 +46,9 @@ class Spots:
 
     def claimed(self, output: NetworkOutput) -> NetworkOutput:
         """The network's output, in which the spots are confident paint of their class."""
-        paint, kinds, stride = output.paint.copy(), output.kinds.copy(), output.stride
+        paint = output.paint.copy()
+        kinds = output.kinds.copy()
+        stride = output.stride
         light = self._at(paint.shape, stride, output.top)
         claimed = np.clip(self.steepness * (light - 0.5), -6, 6)
         np.maximum(paint, claimed, out=paint, where=light > 0)
@@ -63,18 +66,19 @@ class Spots:
 
 def lit(shown: Example, view: RoadCamera, rng: np.random.Generator) -> tuple[Example, Spots]:
     """An image with some spots of sun on its ground, none of them on a marking."""
-    taken = np.zeros(shown.image.shape[:2], dtype=np.uint8)
+    occupied = np.zeros(shown.image.shape[:2], dtype=np.uint8)
     for true in shown.markings:
-        cv2.fillPoly(taken, [np.round(true.polygon_px).astype(np.int32)], 1)
-    taken = cv2.dilate(taken, np.ones((2 * _BOUND_PX + 1,) * 2, np.uint8))
-    light = np.zeros(taken.shape, dtype=np.float32)
+        cv2.fillPoly(occupied, [np.round(true.polygon_px).astype(np.int32)], 1)
+    occupied = cv2.dilate(occupied, np.ones((2 * _BOUND_PX + 1,) * 2, np.uint8))
+    light = np.zeros(occupied.shape, dtype=np.float32)
     soft = rng.uniform(*_SOFT)
-    ground = _ground(taken.shape, view)
+    ground = _ground(occupied.shape, view)
     for _ in range(SPOTS):
         for _ in range(_TRIES):
             spot = _spot(ground, view, soft, rng)
-            if spot is not None and not taken[spot > 0].any():
-                light, taken = np.maximum(light, spot), taken | (cv2.dilate(spot, None) > 0).astype(np.uint8)
+            if spot is not None and not occupied[spot > 0].any():
+                light = np.maximum(light, spot)
+                occupied = occupied | (cv2.dilate(spot, None) > 0).astype(np.uint8)
                 break
     gain = 1 + (rng.uniform(*_GAIN) - 1) * light[..., None]
     image = np.clip(np.round(shown.image * gain), 0, 255).astype(np.uint8)
@@ -97,7 +101,9 @@ def _spot(ground: FloatArray, view: RoadCamera, soft: float, rng: np.random.Gene
     centre = ground[rng.integers(view.far_row, height), rng.integers(width)]
     if not view.range_m(centre) < MAX_RANGE_M:
         return None
-    radius_m, slim, turn = rng.uniform(*_RADIUS_M), rng.uniform(*_SLIM), rng.uniform(0, np.pi)
+    radius_m = rng.uniform(*_RADIUS_M)
+    slim = rng.uniform(*_SLIM)
+    turn = rng.uniform(0, np.pi)
     axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     axes /= np.array([[radius_m], [radius_m * slim]])
     radius = np.linalg.norm((ground - centre) @ axes.T, axis=2)

@@ -43,8 +43,8 @@ def _train(config: TrainConfig, team: Team) -> None:
             _end_workers()
             raise
     # The renders that choose best.pt show none of a user's own classes.
-    kept = Path(config.output) / ("last.pt" if state.own_classes else "best.pt")
-    console.print(f"trained {state.step} steps, mean IoU {state.best_iou:.3f}: {kept}")
+    checkpoint = Path(config.output) / ("last.pt" if state.own_classes else "best.pt")
+    console.print(f"trained {state.step} steps, mean IoU {state.best_iou:.3f}: {checkpoint}")
 
 
 def _end_workers() -> None:

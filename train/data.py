@@ -20,7 +20,7 @@ from train.scenes.scenes import TrainingSample, training_sample
 from train.targets import Targets, targets
 from v2hdm.workers import undisturbed_starts
 
-_VALIDATION_SEED_OFFSET = 1_000_003
+_VALIDATION_SEED_OFFSET = 1_000_003  # distance of the validation's seeds from the training's
 
 Pair = tuple[Tensor, Targets]
 """Images (H, W, 3) uint8 and the answers for them."""
@@ -28,7 +28,7 @@ Pair = tuple[Tensor, Targets]
 
 def hardships_of(config: DataConfig) -> Hardships:
     """The hardships that renders are drawn with."""
-    return Hardships(**{each.name: getattr(config, each.name) for each in fields(Hardships)})
+    return Hardships(**{setting.name: getattr(config, setting.name) for setting in fields(Hardships)})
 
 
 class RenderStream(IterableDataset[Pair]):
@@ -61,7 +61,8 @@ class RenderStream(IterableDataset[Pair]):
         worker = get_worker_info()
         number, workers = (worker.id, worker.num_workers) if worker else (0, 1)
         rank, size = self.part
-        number, workers = rank * workers + number, size * workers
+        number = rank * workers + number
+        workers = size * workers
         rng = np.random.default_rng([self.seed, self.first_render, number, 9])
         for pair in self._renders(rng, number, workers):
             while self.labels is not None and rng.random() < self.config.labelled_share:

@@ -82,9 +82,9 @@ class Team:
         if failed:
             raise SystemExit(EXIT_USER_ERROR)
         dist.broadcast_object_list(message, src=0, device=self.device)
-        made = message[0]
-        assert made is not None
-        return made
+        answer = message[0]
+        assert answer is not None
+        return answer
 
     @staticmethod
     def _fill(tensors: Iterable[Tensor], message: Tensor) -> None:

@@ -32,20 +32,21 @@ from v2hdm.simulate.render.scene import Paint, Scene
 SEED = 771_000_003
 """No training or validation seed, whatever their index: those start from single-digit seeds."""
 
-WIDTH, HEIGHT = 1280, 720
-MAX_RANGE_M = 20.0
+WIDTH = 1280  # columns of a rendered image
+HEIGHT = 720  # rows of a rendered image
+MAX_RANGE_M = 20.0  # distance, m, beyond which a marking need not be found
 WHOLE_SHARE = 0.97
 """A marking counts as wholly seen when this share of its area is; others may be found or not."""
 
-TOUCHING_PX = 2
+TOUCHING_PX = 2  # width of the seam around a marking in which other paint touches it, px
 TOUCHED_SHARE = 0.05
 """Other paint touches a marking if it holds more than this share of a seam of so many px around it."""
 
-NEAREST_M = 0.3
+NEAREST_M = 0.3  # least depth, m, of ground whose markings are known
 _FRAME_PX = np.array([[-1.0, -1.0], [2.0, -1.0], [2.0, 2.0], [-1.0, 2.0]]) * (WIDTH, HEIGHT)
 """Markings are known to be there as far as they lie before the camera and about the image."""
 
-MIN_HEIGHT_PX = 4.0
+MIN_HEIGHT_PX = 4.0  # least height in the image, px, of a marking that is to be found
 LEAST_SHOWN_M = 1.0
 """A line shows if so much of its paint is in the image and in front of what stands there; who labels images
 cannot know of others. Those parts of such a line that are hidden or between its dashes are asked for."""
@@ -53,10 +54,11 @@ cannot know of others. Those parts of such a line that are hidden or between its
 LANE_TOLERANCE_PX = 20.0
 """A point of a line is on a true line within this, across it."""
 
-_MOUNTING_SIGMA, _PITCH_SIGMA_DEG = 0.1, 0.7
+_MOUNTING_SIGMA = 0.1  # standard deviation of a photograph's camera height, as a share of it
+_PITCH_SIGMA_DEG = 0.7
 """How well the mounting of a photograph's camera is taken to be known: share of its height, and pitch."""
 
-_STATION_M = 0.5
+_STATION_M = 0.5  # distance between the places on a line at which its paint is looked for, m
 _BESIDE_M = np.linspace(-0.5, 0.5, 21)
 """Paint this far beside a line's middle is its own: those of double lines are."""
 
@@ -133,9 +135,9 @@ def example_of(
 ) -> Example:
     """The ground truth of an image of a scene, whose lines (N, 2) have a point every half metre."""
     lines_px = [image_line(view, lane) for lane in lanes_map]
-    seen = [lane for lane, line_px in zip(lanes_map, lines_px, strict=True) if len(line_px) > 1]
+    visible_lanes = [lane for lane, line_px in zip(lanes_map, lines_px, strict=True) if len(line_px) > 1]
     lanes_px = [line_px for line_px in lines_px if len(line_px) > 1]
-    lanes_shown = [_shows(lane, view, rendered) for lane in seen]
+    lanes_shown = [_shows(lane, view, rendered) for lane in visible_lanes]
     return Example(rendered.image, camera, _markings(scene, view, rendered), lanes_px, lanes_shown)
 
 
@@ -226,7 +228,8 @@ def _seen_alone(polygon_px: FloatArray, label: int, rendered: Rendered) -> bool:
 def _share(mask: np.ndarray, low: np.ndarray, rendered: Rendered, labels: Iterable[int]) -> float:
     """Share of a mask's pixels, placed at ``low``, that show one of the labels; 0 if some are outside."""
     v, u = np.nonzero(mask)
-    u, v = u + low[0], v + low[1]
+    u = u + low[0]
+    v = v + low[1]
     inside = (u >= 0) & (v >= 0) & (u < WIDTH) & (v < HEIGHT)
     if not len(u) or not inside.all():
         return 0.0

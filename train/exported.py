@@ -56,7 +56,8 @@ def read_exported(path: Path) -> Exported:
     try:
         model = onnx.load_model(str(path))
         label = json.loads({entry.key: entry.value for entry in model.metadata_props}[METADATA_KEY])
-        config, renders = dict(label["training"]), int(label.get("renders", 0))
+        config = dict(label["training"])
+        renders = int(label.get("renders", 0))
         NetConfig(**config["net"])
         arrays = _constants(model.graph)
     except Exception as error:
@@ -71,7 +72,8 @@ def _constants(graph: onnx.GraphProto) -> dict[str, np.ndarray]:
     arrays = {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.initializer}
     for node in graph.node:
         if node.op_type == "DequantizeLinear" and node.input[0] in arrays:
-            whole, scale = arrays[node.input[0]], arrays[node.input[1]]
+            whole = arrays[node.input[0]]
+            scale = arrays[node.input[1]]
             zero = arrays[node.input[2]].astype(np.int64) if len(node.input) > 2 else np.zeros_like(scale)
             along = (-1, *[1] * (whole.ndim - 1))  # an export scales each output, its first axis
             steps = whole.astype(np.float64) - zero.reshape(along)
@@ -93,18 +95,18 @@ def unfold(folded: dict[str, Tensor], config: NetConfig, images: Iterable[Tensor
         ConfigError: A weight is missing or of another shape.
     """
     classes = len(folded["kinds.bias"]) if "kinds.bias" in folded else 1
-    wanted = MarkingNet(config, classes).fold().state_dict()
-    for name, value in wanted.items():
+    parameters = MarkingNet(config, classes).fold().state_dict()
+    for name, value in parameters.items():
         if name not in folded or folded[name].shape != value.shape:
             raise ConfigError(f"the file to start from has no weight {name} of shape {tuple(value.shape)}")
     net = MarkingNet(config, classes).eval()
     norms = {name: module[1] for name, module in net.named_modules() if isinstance(module, ConvNormRelu)}
     shifts = {f"{name}.0.bias": f"{name}.1.bias" for name in norms}
     state = net.state_dict()
-    state |= {shifts.get(name, name): value for name, value in folded.items() if name in wanted}
+    state |= {shifts.get(name, name): value for name, value in folded.items() if name in parameters}
     for name in norms:
         convolution = f"{name}.0.weight"
-        scale = _GROWTH * _size(wanted[convolution]).mean() / _size(folded[convolution]).clamp(min=1e-6)
+        scale = _GROWTH * _size(parameters[convolution]).mean() / _size(folded[convolution]).clamp(min=1e-6)
         state[convolution] = folded[convolution] * scale
         state[f"{name}.1.weight"] = 1 / scale.flatten()
     net.load_state_dict(state)

@@ -32,20 +32,9 @@ from train.judge import JudgeConfig, Quadrilaterals, judged, train_judge
 from train.labels import LabelledImages
 from train.scenes.hardships import NONE
 from v2hdm.catalogue import SHIPPED, SYMBOL
-from v2hdm.detection.classifier import (
-    AMONG,
-    CHANNELS,
-    CLAIMED,
-    COMPANIES,
-    FEATURES,
-    SHAPES,
-    SIZE,
-    Readings,
-    features_among,
-    one_hot,
-    shape_of,
-)
+from v2hdm.detection.classifier import AMONG, COMPANIES, SHAPES, Readings, features_among, one_hot, shape_of
 from v2hdm.detection.detector import Detector
+from v2hdm.detection.evidence import CHANNELS, CLAIMED, FEATURES, SIZE
 from v2hdm.detection.network import Network
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.weights import CONFIDENCE_FILE, JUDGE_FILE
@@ -53,10 +42,10 @@ from v2hdm.geometry.planar import Quad, following
 from v2hdm.records import BoolArray, FloatArray
 from v2hdm.store.files import replace_text, whole_file
 
-SEED = 917
-EASY = 0.2
-RIDGE = 2.0
-FOLDS = 5
+SEED = 917  # seed of the rendered scenes, not that of the benchmark nor of a training
+EASY = 0.2  # difficulty of the easy scenes
+RIDGE = 2.0  # information of the prior that weights of the logistic functions are 0
+FOLDS = 5  # parts of the images by which log loss is measured, each by a fit to the others
 _JUDGE_FOLDS = 2
 """Parts of the images, each judged by what was learnt from the others; a judge takes minutes to learn."""
 
@@ -73,12 +62,13 @@ HARDSHIPS = replace(
 """Those of training, oftener where the classifier decides: outlines and letters, stop lines that meet lines,
 ends that are hidden. A camera that looks aside sees classes by other names."""
 
-JUNCTIONS_SHARE = 1 / 12
+JUNCTIONS_SHARE = 1 / 12  # share of the scenes, the last ones, that are at junctions
 AT_JUNCTIONS = replace(HARDSHIPS, junctions=0.7, crossings=0.7)
 """The last of the scenes have most of the stop lines, which are else one in two hundred true readings."""
 
 CONFIG = JudgeConfig()
-LIT_EVERY, MIRRORED_EVERY = 2, 3
+LIT_EVERY = 2  # every so many-th image is looked at once more with spots of sun
+MIRRORED_EVERY = 3
 """Which images are looked at once more, with spots of sun and as in the mapping."""
 
 _UNTOLD_SHARE = 0.05
@@ -164,9 +154,9 @@ class Gathered:
 def is_true(shown: Example, kind: str, corners_px: FloatArray) -> tuple[bool | None, TrueMarking | None]:
     """Whether a quadrilateral (4, 2) is a marking, and which; None where the quality benchmark lets it be."""
     overlaps = [(polygon_overlap(corners_px, true.polygon_px), true) for true in shown.markings]
-    own = [pair for pair in overlaps if pair[0] >= 0.5 and pair[1].kind == kind]
-    if own:
-        return True, max(own, key=lambda pair: pair[0])[1]
+    of_kind = [pair for pair in overlaps if pair[0] >= 0.5 and pair[1].kind == kind]
+    if of_kind:
+        return True, max(of_kind, key=lambda pair: pair[0])[1]
     share, nearest = max(overlaps, key=lambda pair: pair[0], default=(0.0, None))
     if share <= 0.05 or nearest is None:
         return (None if _is_untold(shown, kind, corners_px) else False), None
@@ -195,7 +185,7 @@ def side_errors(readings: Readings, m: int, corners_px: FloatArray, true: TrueMa
     nearest = min(turned, key=lambda corners: float(np.abs(corners - corners_px).sum()))
     quad = Quad(readings.fit.quad.corners[m])
     placed = readings.fit.frames.take(np.array([m])).from_image(nearest[None])[0]
-    middle, true_middle = ((each + following(each)) / 2 for each in (quad.corners, placed))
+    middle, true_middle = ((corners + following(corners)) / 2 for corners in (quad.corners, placed))
     return np.asarray(((true_middle - middle) * quad.normal).sum(axis=-1))
 
 
@@ -218,7 +208,8 @@ def render_to_judge(number: int, images: int, seed: int) -> tuple[int, Example]:
 
 def fit(evidence: FloatArray, true: BoolArray) -> tuple[FloatArray, float]:
     """Weights (F,) and bias of a logistic regression, by Newton's method on standardised features."""
-    mean, deviation = evidence.mean(axis=0), np.maximum(evidence.std(axis=0), 1e-6)
+    mean = evidence.mean(axis=0)
+    deviation = np.maximum(evidence.std(axis=0), 1e-6)
     design = np.column_stack([(evidence - mean) / deviation, np.ones(len(evidence))])
     ridge = RIDGE * np.diag(np.append(np.ones(evidence.shape[1]), 1e-6))
     solution = np.zeros(design.shape[1])
@@ -290,11 +281,12 @@ def fit_all(
     """
     inputs = len(CHANNELS), len(FEATURES), len(SHAPES)
     before = None if start is None else read_judge(start, *inputs, CONFIG.width)
-    known = np.array([true is not None for true in gathered.true])
+    has_answer = np.array([true is not None for true in gathered.true])
     true = np.array([true is True for true in gathered.true])
-    fold, spotted = np.array(gathered.image) % _JUDGE_FOLDS, np.array(gathered.lit)
+    fold = np.array(gathered.image) % _JUDGE_FOLDS
+    spotted = np.array(gathered.lit)
     photo = np.array(gathered.photograph)
-    print(f"{(true & ~spotted).sum()} of {(known & ~spotted).sum()} readings true", flush=True)
+    print(f"{(true & ~spotted).sum()} of {(has_answer & ~spotted).sum()} readings true", flush=True)
     asked = Quadrilaterals(
         np.array(gathered.views, dtype=np.float32),
         np.array(gathered.evidence, dtype=np.float32),
@@ -306,7 +298,7 @@ def fit_all(
         tuple(FEATURES.index(name) for name in CLAIMED),
     )
     # What is true of the images with spots has been seen without them, too.
-    lessons = known & ~(spotted & true)
+    lessons = has_answer & ~(spotted & true)
     lessons &= true | photo | (np.random.default_rng(SEED).random(len(true)) < _FALSE_SHARE)
 
     def learnt_from(rows: BoolArray) -> Judge:
@@ -314,22 +306,23 @@ def fit_all(
         return train_judge(asked.take(np.concatenate([chosen, chosen[photo[chosen]]])), CONFIG, before)
 
     # Each is judged by odds that its own image had no part in.
-    odds, side_sigma_px = np.zeros(len(true)), np.ones((len(true), 4))
+    odds = np.zeros(len(true))
+    side_sigma_px = np.ones((len(true), 4))
     for k in range(_JUDGE_FOLDS):
         judge = learnt_from(lessons & (fold != k))
         odds[fold == k], side_sigma_px[fold == k] = judged(judge, asked.take(fold == k))
         tell((k + 1) / (_JUDGE_FOLDS + 2))
     _print_sides(asked, side_sigma_px)
-    seen_through = (odds < 0)[spotted & known & ~true]
+    seen_through = (odds < 0)[spotted & has_answer & ~true]
     print(f"seen through: {seen_through.mean():.3f} of the false claims", flush=True)
     return learnt_from(lessons), fit_among(gathered, odds)
 
 
 def _print_sides(asked: Quadrilaterals, side_sigma_px: FloatArray) -> None:
     """Whether the errors of sides of images left out are as large as stated."""
-    known = np.isfinite(asked.side_error)
-    square = (asked.side_error**2 / (asked.side_variance + side_sigma_px**2))[known]
-    alone = (asked.side_error**2 / asked.side_variance)[known]
+    is_known = np.isfinite(asked.side_error)
+    square = (asked.side_error**2 / (asked.side_variance + side_sigma_px**2))[is_known]
+    alone = (asked.side_error**2 / asked.side_variance)[is_known]
     for name, values in (("by the fit alone", alone), ("with the judge", square)):
         inner = np.sort(values)[: int(0.95 * len(values))].mean()
         print(
@@ -341,35 +334,38 @@ def _print_sides(asked: Quadrilaterals, side_sigma_px: FloatArray) -> None:
 def fit_among(gathered: Gathered, odds: FloatArray) -> dict[str, dict[str, object]]:
     """Content of ``confidence.json`` from the log odds (N,) of each proposal alone; prints its log loss."""
     # With spots of sun in it an image is no more what others look like.
-    known = np.array([true is not None for true in gathered.true]) & ~np.array(gathered.lit)
+    is_counted = np.array([true is not None for true in gathered.true]) & ~np.array(gathered.lit)
     true = np.array([true is True for true in gathered.true])
     fold = np.array(gathered.image) % FOLDS
-    _print_worth("alone", odds[known], true[known])
-    look, ground = np.array(gathered.look), np.array(gathered.ground)
+    _print_worth("alone", odds[is_counted], true[is_counted])
+    look = np.array(gathered.look)
+    ground = np.array(gathered.ground)
     features = np.zeros((len(odds), len(AMONG)))
     for number in range(1 + look.max()):
         mine = np.flatnonzero(look == number)
         features[mine] = features_among(odds[mine], ground[mine], [gathered.kind[m] for m in mine])
     company = np.array([shape_of(kind, COMPANIES) for kind in gathered.kind])
-    fitted, left_out = _fit_each(features, company, true, known, fold)
-    _print_worth("among others", left_out[known], true[known])
+    fitted, left_out = _fit_each(features, company, true, is_counted, fold)
+    _print_worth("among others", left_out[is_counted], true[is_counted])
     return fitted
 
 
 def _fit_each(
-    features: FloatArray, company: np.ndarray, true: BoolArray, known: BoolArray, fold: np.ndarray
+    features: FloatArray, company: np.ndarray, true: BoolArray, is_counted: BoolArray, fold: np.ndarray
 ) -> tuple[dict[str, dict[str, object]], FloatArray]:
     """The fit of each company to features (N, F), and log odds (N,) by fits to other images."""
     fitted: dict[str, dict[str, object]] = {}
-    effect, left_out = {}, np.zeros(len(true))
+    effect = {}
+    left_out = np.zeros(len(true))
     for name in COMPANIES:
-        mine = known & (company == name)
+        mine = is_counted & (company == name)
         weights, bias = fit(features[mine], true[mine])
         effect[name] = weights * features[mine].std(axis=0)
         named = dict(zip(AMONG, weights.round(4).tolist(), strict=True))
         fitted[name] = {"bias": round(bias, 4), "weights": named}
         for k in range(FOLDS):
-            others, these = mine & (fold != k), (company == name) & (fold == k)
+            others = mine & (fold != k)
+            these = (company == name) & (fold == k)
             weights, bias = fit(features[others], true[others])
             left_out[these] = features[these] @ weights + bias
     print(f"{'':16s} " + " ".join(f"{name:>9s}" for name in COMPANIES))
@@ -381,9 +377,12 @@ def _fit_each(
 def _print_worth(name: str, odds: FloatArray, true: BoolArray) -> None:
     """The quality of log odds (N,) on images that had no part in their fit."""
     order = np.argsort(-odds)
-    false, found = np.cumsum(~true[order]), np.cumsum(true[order])
+    false = np.cumsum(~true[order])
+    true_found = np.cumsum(true[order])
     ranks = [np.searchsorted(false, count, side="right") for count in COUNTS]
-    counts = ", ".join(f"{count} false {found[rank - 1]}" for count, rank in zip(COUNTS, ranks, strict=True))
+    counts = ", ".join(
+        f"{count} false {true_found[rank - 1]}" for count, rank in zip(COUNTS, ranks, strict=True)
+    )
     print(
         f"{name}: log loss of images left out {log_loss(odds, true):.3f}; true ones at {counts}", flush=True
     )

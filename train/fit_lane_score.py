@@ -33,10 +33,10 @@ from v2hdm.detection.weights import LANE_SCORE_FILE
 from v2hdm.records import BoolArray, FloatArray
 from v2hdm.store.files import replace_text
 
-SEED = 921
-ROUNDS = 2
-LEAST_SHARE = 0.8
-_MOST_SLOPE = 10.0
+SEED = 921  # seed of the rendered scenes, not that of the benchmark nor of a training
+ROUNDS = 2  # rounds of proposing lines by the weights fitted before
+LEAST_SHARE = 0.8  # share of a line's points that must lie on a true one
+_MOST_SLOPE = 10.0  # most columns a row of a line, by which the tolerance about it is widened
 
 KEYS = {"alone": score.ALONE, "among": score.AMONG}
 
@@ -54,8 +54,8 @@ class Seen:
 
 def seen(shown: Example, detector: Detector) -> Seen:
     """The evidence for lanes in the network's output and the paint of an image."""
-    found = detector.propose(detector.run_network(shown.image, shown.camera), shown.camera)
-    return Seen(detector.lane_image(found), shown.lanes_px)
+    proposals = detector.propose(detector.run_network(shown.image, shown.camera), shown.camera)
+    return Seen(detector.lane_image(proposals), shown.lanes_px)
 
 
 @dataclass
@@ -81,9 +81,9 @@ class Proposed:
         drawn = draw(line, self.points, self.image.image)
         if drawn is None:
             return False
-        own = self.points.points_px[line.members, 1]
-        seen = (drawn.points_px[:, 1] >= own.min()) & (drawn.points_px[:, 1] <= own.max())
-        line_px = drawn.points_px[seen] if seen.any() else drawn.points_px
+        rows_px = self.points.points_px[line.members, 1]
+        within = (drawn.points_px[:, 1] >= rows_px.min()) & (drawn.points_px[:, 1] <= rows_px.max())
+        line_px = drawn.points_px[within] if within.any() else drawn.points_px
         return max((share_on(lane, line_px) for lane in self.image.lanes_px), default=0.0) >= LEAST_SHARE
 
 
@@ -96,7 +96,8 @@ def proposed(image: Seen) -> Proposed | None:
 def share_on(lane_px: FloatArray, points_px: FloatArray) -> float:
     """The share of points (N, 2) that lie on a line (M, 2), within 20 px widened by its slope there."""
     order = np.argsort(lane_px[:, 1])
-    v, u = lane_px[order, 1], lane_px[order, 0]
+    v = lane_px[order, 1]
+    u = lane_px[order, 0]
     slope = np.clip(np.gradient(u) / np.maximum(np.gradient(v), 1e-6), -_MOST_SLOPE, _MOST_SLOPE)
     at = points_px[:, 1]
     off = np.abs(np.interp(at, v, u, left=np.nan, right=np.nan) - points_px[:, 0])
@@ -107,7 +108,7 @@ class Gathered:
     """The lines proposed in all images, by the weights that there are."""
 
     def __init__(self, images: Sequence[Seen]):
-        self._images = [found for image in images if (found := proposed(image)) is not None]
+        self._images = [lines_of_image for image in images if (lines_of_image := proposed(image)) is not None]
         self._alone = np.concatenate([image.alone for image in self._images])
         self._count = [len(image.lines) for image in self._images]
         self._fold = np.repeat(np.arange(len(self._count)) % FOLDS, self._count)
@@ -174,15 +175,20 @@ def fit_to(images: Sequence[Seen]) -> Weights:
     print(f"log loss of the weights so far {log_loss(before, gathered.true):.3f}")
     for _ in range(ROUNDS):
         weights, _, _ = gathered.fit()
-        gathered = Gathered([replace(one, image=replace(one.image, score=weights)) for one in images])
+        gathered = Gathered(
+            [
+                replace(proposed_image, image=replace(proposed_image.image, score=weights))
+                for proposed_image in images
+            ]
+        )
     for name, (effect, _) in gathered.effects(weights).items():
         for key, value in zip(KEYS[name], effect, strict=True):
             print(f"{name:6s} {key:16s} {value:+.2f}")
     _, alone, among = gathered.fit()
     losses = [log_loss(odds, gathered.true) for odds in (alone, among)]
     print(f"log loss of images left out: alone {losses[0]:.3f}, among the others {losses[1]:.3f}")
-    given = gathered.odds(weights) > lane_lines.LEAST_LOG_ODDS
-    print(f"given: {(given & gathered.true).sum()} true, {(given & ~gathered.true).sum()} false")
+    reported = gathered.odds(weights) > lane_lines.LEAST_LOG_ODDS
+    print(f"given: {(reported & gathered.true).sum()} true, {(reported & ~gathered.true).sum()} false")
     return weights
 
 

@@ -59,7 +59,7 @@ def with_classes(
     told = dict(weights)
     if tuple(then) == catalogue.names:
         return told
-    known = [name in then for name in catalogue.names]
+    has_earlier = [name in then for name in catalogue.names]
     origin = [
         then.index(name if name in then else _STARTS_AS[catalogue.classes[name].family])
         for name in catalogue.names
@@ -67,7 +67,9 @@ def with_classes(
     for head in (head for head in _CLASS_HEADS if f"{head}.bias" in told):
         for part in ("weight", "bias"):
             told[f"{head}.{part}"] = told[f"{head}.{part}"][origin]
-    told["kinds.bias"] = told["kinds.bias"] + torch.where(torch.tensor(known), 0.0, math.log(_STARTS_WITH))
+    told["kinds.bias"] = told["kinds.bias"] + torch.where(
+        torch.tensor(has_earlier), 0.0, math.log(_STARTS_WITH)
+    )
     return told
 
 
@@ -130,7 +132,8 @@ def _join_separable(folded: dict[str, Tensor]) -> None:
         first = f"{layer}.0.0.weight"
         if first not in folded or folded[first].shape[1] != 1 or folded[across].shape[2] != 1:
             continue  # two layers that follow each other, the first of which is a whole one
-        inside, mixing = folded.pop(first), folded.pop(across)
+        inside = folded.pop(first)
+        mixing = folded.pop(across)
         shift = mixing[:, :, 0, 0] @ folded.pop(f"{layer}.0.0.bias")
         folded[f"{layer}.0.weight"] = mixing * inside.transpose(0, 1)
         folded[f"{layer}.0.bias"] = folded.pop(f"{layer}.1.0.bias") + shift

@@ -11,8 +11,8 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 
 from models.judge import Judge
 
-_BATCH = 64
-_LEAST_DEVIATION = 1e-6
+_BATCH = 64  # quadrilaterals in a batch
+_LEAST_DEVIATION = 1e-6  # least standard deviation of a feature that is divided by
 
 
 @dataclass(frozen=True)
@@ -63,25 +63,33 @@ class JudgeConfig:
     seed: int = 0
 
 
-def train_judge(known: Quadrilaterals, config: JudgeConfig, start: Judge | None = None) -> Judge:
-    """A judge that has learnt from all of ``known``, ready to be asked.
+def train_judge(quadrilaterals: Quadrilaterals, config: JudgeConfig, start: Judge | None = None) -> Judge:
+    """A judge that has learnt from all of ``quadrilaterals``, ready to be asked.
 
     One to ``start`` from knows most of it already: a quarter of the time at a third of the rate is enough.
     """
     torch.manual_seed(config.seed)
     rng = np.random.default_rng(config.seed)
-    channels, features, shapes = known.views.shape[1], known.evidence.shape[1], known.shape.shape[1]
+    channels = quadrilaterals.views.shape[1]
+    features = quadrilaterals.evidence.shape[1]
+    shapes = quadrilaterals.shape.shape[1]
     judge = Judge(channels, features, shapes, config.width, config.dropout).train()
     if start is not None:
         judge.load_state_dict(start.state_dict())
         config = replace(config, epochs=-(-config.epochs // 4), learning_rate=config.learning_rate / 3)
     else:
-        judge.mean.copy_(torch.from_numpy(known.evidence.mean(axis=0)))
-        judge.deviation.copy_(torch.from_numpy(np.maximum(known.evidence.std(axis=0), _LEAST_DEVIATION)))
-    parts = [torch.from_numpy(part) for part in (known.views, known.evidence, known.shape)]
-    true = torch.from_numpy(known.true.astype(np.float32))
-    side_error, side_variance = torch.from_numpy(known.side_error), torch.from_numpy(known.side_variance)
-    claims = _Claims.of(known)
+        judge.mean.copy_(torch.from_numpy(quadrilaterals.evidence.mean(axis=0)))
+        judge.deviation.copy_(
+            torch.from_numpy(np.maximum(quadrilaterals.evidence.std(axis=0), _LEAST_DEVIATION))
+        )
+    parts = [
+        torch.from_numpy(part)
+        for part in (quadrilaterals.views, quadrilaterals.evidence, quadrilaterals.shape)
+    ]
+    true = torch.from_numpy(quadrilaterals.true.astype(np.float32))
+    side_error = torch.from_numpy(quadrilaterals.side_error)
+    side_variance = torch.from_numpy(quadrilaterals.side_variance)
+    claims = _Claims.of(quadrilaterals)
     batches = -(-len(true) // (_BATCH if start is None else 2 * _BATCH))
     optimiser = torch.optim.AdamW(judge.parameters(), config.learning_rate, weight_decay=config.weight_decay)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
@@ -114,21 +122,22 @@ altogether."""
 
 def _side_loss(error: torch.Tensor, variance: torch.Tensor, log_sigma: torch.Tensor) -> torch.Tensor:
     """Minus the mean log likelihood of errors (B, 4), nan where unknown, whose formal variance is (B, 4)."""
-    known = torch.isfinite(error)
+    is_known = torch.isfinite(error)
     total = variance + torch.exp(2 * log_sigma)
-    square = torch.where(known, error, torch.zeros_like(error)) ** 2 / total
+    square = torch.where(is_known, error, torch.zeros_like(error)) ** 2 / total
     loss = 0.5 * torch.log(total) + 0.5 * (_FREEDOM + 1) * torch.log1p(square / _FREEDOM)
-    return (loss * known).sum() / known.sum().clamp(min=1)
+    return (loss * is_known).sum() / is_known.sum().clamp(min=1)
 
 
 def judged(judge: Judge, asked: Quadrilaterals) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Log odds (N,), and how far the sides may be off (N, 4), px."""
-    out, sides = [], []
+    out = []
+    sides = []
     with torch.no_grad():
         for first in range(0, len(asked.true), 512):
             part = asked.take(np.arange(first, min(first + 512, len(asked.true))))
-            given = (torch.from_numpy(array) for array in (part.views, part.evidence, part.shape))
-            odds, log_sigma = judge(*given)
+            inputs = (torch.from_numpy(array) for array in (part.views, part.evidence, part.shape))
+            odds, log_sigma = judge(*inputs)
             out.append(odds.numpy().astype(np.float64))
             sides.append(log_sigma.exp().numpy().astype(np.float64))
     return (np.concatenate(out), np.concatenate(sides)) if out else (np.zeros(0), np.zeros((0, 4)))
@@ -144,17 +153,19 @@ class _Claims:
     evidence: torch.Tensor
 
     @classmethod
-    def of(cls, known: Quadrilaterals) -> _Claims:
-        channels, features = list(known.claimed_channels), list(known.claimed_features)
-        views = known.views[known.true][:, channels].mean(axis=0)
-        evidence = known.evidence[known.true][:, features].mean(axis=0)
+    def of(cls, quadrilaterals: Quadrilaterals) -> _Claims:
+        channels = list(quadrilaterals.claimed_channels)
+        features = list(quadrilaterals.claimed_features)
+        views = quadrilaterals.views[quadrilaterals.true][:, channels].mean(axis=0)
+        evidence = quadrilaterals.evidence[quadrilaterals.true][:, features].mean(axis=0)
         return cls(channels, features, torch.from_numpy(views), torch.from_numpy(evidence))
 
     def put(
         self, views: torch.Tensor, evidence: torch.Tensor, where: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Views (M, C, S, S) and evidence (M, F) with these claims in place of their own, ``where`` (M,)."""
-        views, evidence = views.clone(), evidence.clone()
+        views = views.clone()
+        evidence = evidence.clone()
         views[:, self.channels] = torch.where(where[:, None, None, None], self.views, views[:, self.channels])
         evidence[:, self.features] = torch.where(where[:, None], self.evidence, evidence[:, self.features])
         return views, evidence

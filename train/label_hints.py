@@ -71,11 +71,11 @@ class _Hints:
         kinds -= np.log(np.exp(kinds).sum(axis=0))
         camera = self._camera(pixels.shape[1], pixels.shape[0])
         shapes = tuple(self._resolved(shape, kinds, camera) for shape in image.shapes or ())
-        seen = paint > _HINT
+        is_paint = paint > _HINT
         silence = Silence(
-            np.packbits(seen, axis=1),
-            np.packbits(seen & self._unsaid(kinds, camera), axis=1),
-            (seen.shape[0], seen.shape[1]),
+            np.packbits(is_paint, axis=1),
+            np.packbits(is_paint & self._unsaid(kinds, camera), axis=1),
+            (is_paint.shape[0], is_paint.shape[1]),
         )
         return replace(image, shapes=shapes, silence=silence)
 

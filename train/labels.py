@@ -27,10 +27,12 @@ from v2hdm.records import BoolArray, FloatArray
 from v2hdm.safe.pixels import read_header
 from v2hdm.safe.texts import shown
 
-LEARNT, VALIDATION, JUDGING = "learnt", "validation", "judging"
+LEARNT = "learnt"
+VALIDATION = "validation"
+JUDGING = "judging"
 """The roles of labelled images."""
 
-_BLOCK_PLACES = 10
+_BLOCK_PLACES = 10  # neighbouring photographs that have one role
 _ROLES = (LEARNT, LEARNT, LEARNT, VALIDATION, LEARNT, JUDGING, LEARNT, LEARNT, JUDGING, LEARNT)
 
 _ZOOM = (0.6, 1.5)
@@ -72,13 +74,13 @@ def read_labels(
         if name not in classes:
             raise LabelError(f"data.coco_complete: no class {shown(name)}; choose from: {', '.join(classes)}")
     images: dict[Path, LabelledImage] = {}
-    found: list[LabelledImage] = []
+    labelled: list[LabelledImage] = []
     if config.coco is not None:
         folder = _folder(config.coco, config.coco_images)
-        found += read_coco(Path(config.coco), folder, config, classes)
+        labelled += read_coco(Path(config.coco), folder, config, classes)
     if config.tusimple is not None:
-        found += read_tusimple(Path(config.tusimple), _folder(config.tusimple, config.tusimple_images))
-    for image in found:
+        labelled += read_tusimple(Path(config.tusimple), _folder(config.tusimple, config.tusimple_images))
+    for image in labelled:
         key = image.path.resolve()
         images[key] = images[key].merged(image) if key in images else image
     for image in images.values():
@@ -225,7 +227,8 @@ def paint_labels(
     of an unknown class, or 0.
     """
     size = place.height, place.width
-    labels, unknown = np.zeros(size, dtype=np.uint8), np.zeros(size, dtype=np.bool_)
+    labels = np.zeros(size, dtype=np.uint8)
+    unknown = np.zeros(size, dtype=np.bool_)
     paint = None
     if image.silence is not None:
         unknown |= place.sampled(image.silence.plane(image.silence.unknown))
@@ -234,8 +237,8 @@ def paint_labels(
     for shape in image.shapes or ():
         kinds = [kind for kind in shape.kinds if kind != NOT_PAINT]
         in_part = len(kinds) < len(shape.kinds)
-        known = len(kinds) == 1 and kinds[0] in classes
-        value = 1 + classes.index(kinds[0]) if known else PAINT_ONLY
+        is_one_class = len(kinds) == 1 and kinds[0] in classes
+        value = 1 + classes.index(kinds[0]) if is_one_class else PAINT_ONLY
         for ring_px in shape.rings_px:
             inside = coverage(place.moved(ring_px), 0, 0, place.width, place.height) > 0.5
             if not inside.any():

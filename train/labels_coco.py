@@ -26,7 +26,7 @@ _HALF_PX = 0.5
 
 
 def read_coco(
-    path: Path, images: Path, config: DataConfig, known: Sequence[str] = PAINT_CLASSES
+    path: Path, images: Path, config: DataConfig, own_classes: Sequence[str] = PAINT_CLASSES
 ) -> list[LabelledImage]:
     """Every image of a COCO file; those without annotations are images without markings.
 
@@ -34,7 +34,7 @@ def read_coco(
         path: the JSON file.
         images: the folder that its ``file_name`` entries start from.
         config: what its categories mean, see ``coco_classes``, and at which size its images are shown.
-        known: the classes.
+        own_classes: the classes.
 
     Raises:
         LabelError: the file is missing or damaged, or uses a category that is not known.
@@ -49,7 +49,7 @@ def read_coco(
         if entry["id"] in shapes:
             raise LabelError(f"{path}: two images have the id {entry['id']}; give each its own")
         shapes[entry["id"]] = []
-    kinds = _kinds(names, config.coco_classes, known, path)
+    kinds = _kinds(names, config.coco_classes, own_classes, path)
     shown_size = None if config.coco_size is None else (config.coco_size[0], config.coco_size[1])
     scales = {entry["id"]: _scale(entry, shown_size, path) for entry in entries}
     for number, entry in enumerate(
@@ -64,7 +64,7 @@ def read_coco(
             raise LabelError(f"{where}: its image {shown(entry['image_id'])} is not in the file; add it")
         # What COCO calls a crowd is of no score there: nobody knows what of it is one of the category.
         unsure = bool(entry.get("iscrowd"))
-        kind = (UNKNOWN,) if unsure else _kind(names[entry["category_id"]], kinds, known, where)
+        kind = (UNKNOWN,) if unsure else _kind(names[entry["category_id"]], kinds, own_classes, where)
         if kind != (NOT_PAINT,):
             rings = _rings(entry["segmentation"], where, scales[entry["image_id"]])
             shapes[entry["image_id"]].append(Shape(kind, rings))
@@ -84,7 +84,7 @@ def read_coco(
 
 
 def _kinds(
-    names: Mapping[Any, str], classes: Mapping[str, str], known: Sequence[str], path: Path
+    names: Mapping[Any, str], classes: Mapping[str, str], own_classes: Sequence[str], path: Path
 ) -> dict[str, tuple[str, ...]]:
     """The classes that each category may be, complete with the names that are classes."""
     for name, kind in classes.items():
@@ -93,25 +93,25 @@ def _kinds(
                 f"data.coco_classes: {path} has no category {shown(name)}, only "
                 f"{', '.join(names.values())}; mend it"
             )
-        for one in kind.split(EITHER):
-            if one not in (*known, NOT_PAINT, UNKNOWN):
+        for name_of_class in kind.split(EITHER):
+            if name_of_class not in (*own_classes, NOT_PAINT, UNKNOWN):
                 raise LabelError(
-                    f"data.coco_classes: {shown(name)} is to be {shown(one)}; choose from: "
-                    f"{', '.join(known)}, {NOT_PAINT}, {UNKNOWN}"
+                    f"data.coco_classes: {shown(name)} is to be {shown(name_of_class)}; choose from: "
+                    f"{', '.join(own_classes)}, {NOT_PAINT}, {UNKNOWN}"
                 )
     alike = {name: name.strip().lower().replace(" ", "_").replace("-", "_") for name in names.values()}
-    by_name = {kind.lower(): (kind,) for kind in known}
+    by_name = {kind.lower(): (kind,) for kind in own_classes}
     mapped = {name: tuple(kind.split(EITHER)) for name, kind in classes.items()}
     return {name: by_name[kind] for name, kind in alike.items() if kind in by_name} | mapped
 
 
 def _kind(
-    name: str, kinds: Mapping[str, tuple[str, ...]], known: Sequence[str], where: str
+    name: str, kinds: Mapping[str, tuple[str, ...]], own_classes: Sequence[str], where: str
 ) -> tuple[str, ...]:
     if name not in kinds:
         raise LabelError(
             f"{where}: category {shown(name)} is no class of the detector; say which it is with "
-            f"'+data.coco_classes={{{name}: CLASS}}', CLASS one of: {', '.join(known)}, "
+            f"'+data.coco_classes={{{name}: CLASS}}', CLASS one of: {', '.join(own_classes)}, "
             f"{NOT_PAINT}, {UNKNOWN}"
         )
     return kinds[name]
@@ -146,7 +146,8 @@ def _scale(entry: Mapping[str, Any], shown_size: tuple[int, int] | None, path: P
 
 
 def _size(entry: Mapping[str, Any]) -> tuple[int, int] | None:
-    width, height = entry.get("width"), entry.get("height")
+    width = entry.get("width")
+    height = entry.get("height")
     return (width, height) if isinstance(width, int) and isinstance(height, int) else None
 
 

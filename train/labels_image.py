@@ -97,7 +97,7 @@ class LabelledImage:
         return np.concatenate([np.empty((0, 2)), *middles, *(self.lanes_px or ())])
 
 
-def _joined(one: tuple[_T, ...] | None, other: tuple[_T, ...] | None) -> tuple[_T, ...] | None:
-    if one is None or other is None:
-        return one if other is None else other
-    return one + other
+def _joined(first: tuple[_T, ...] | None, second: tuple[_T, ...] | None) -> tuple[_T, ...] | None:
+    if first is None or second is None:
+        return first if second is None else second
+    return first + second

@@ -29,8 +29,10 @@ def coverage(ring_px: FloatArray, left: int, top: int, width: int, height: int) 
         height: the window's rows.
     """
     covered = np.zeros((height, width), dtype=np.float32)
-    low, high = np.floor(ring_px[:, 1].min() + 0.5) - top, np.floor(ring_px[:, 1].max() + 0.5) - top
-    first, last = int(np.clip(low, 0, height)), int(np.clip(high + 1, 0, height))
+    low = np.floor(ring_px[:, 1].min() + 0.5) - top
+    high = np.floor(ring_px[:, 1].max() + 0.5) - top
+    first = int(np.clip(low, 0, height))
+    last = int(np.clip(high + 1, 0, height))
     if last > first:
         rows = last - first
         v = top + first - 0.5 + (np.arange(rows * _ROWS_PER_PX) + 0.5) / _ROWS_PER_PX
@@ -41,12 +43,14 @@ def coverage(ring_px: FloatArray, left: int, top: int, width: int, height: int) 
 
 def _scan(ring: FloatArray, v: FloatArray, width: int) -> FloatArray:
     """The length of the lines ``v`` (S,) within the polygon, in each cell (S, width) from u = 0 on."""
-    start, end = ring, np.roll(ring, -1, axis=0)
+    start = ring
+    end = np.roll(ring, -1, axis=0)
     line, edge = np.nonzero((start[:, 1] <= v[:, None]) != (end[:, 1] <= v[:, None]))
     slope = (end[edge, 0] - start[edge, 0]) / (end[edge, 1] - start[edge, 1])
     u = np.clip(start[edge, 0] + slope * (v[line] - start[edge, 1]), 0.0, width)
     order = np.lexsort((u, line))
-    line, u = line[order], u[order]
+    line = line[order]
+    u = u[order]
     entering = np.where(np.arange(len(u)) % 2 == 0, 1.0, -1.0)  # every line crosses an even number of edges
     cell = np.floor(u).astype(np.intp)
     change = np.zeros((len(v), width + 2))

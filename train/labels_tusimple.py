@@ -13,7 +13,7 @@ from v2hdm.records import FloatArray
 from v2hdm.safe.texts import parse_json, read_text, shown
 
 _KEYS = ("raw_file", "lanes", "h_samples")
-_LEAST_POINTS = 2
+_LEAST_POINTS = 2  # least number of points of a lane's line
 
 
 def read_tusimple(path: Path, images: Path) -> list[LabelledImage]:
@@ -26,14 +26,14 @@ def read_tusimple(path: Path, images: Path) -> list[LabelledImage]:
     Raises:
         LabelError: the file is missing or damaged.
     """
-    found = [
+    labelled = [
         _image(line, f"{path}: line {number}", images)
         for number, line in enumerate(read_text(path, LabelError).splitlines(), start=1)
         if line.strip()
     ]
-    if not found:
+    if not labelled:
         raise LabelError(f"{path}: has no images; give another file")
-    return found
+    return labelled
 
 
 def _image(line: str, where: str, images: Path) -> LabelledImage:

@@ -70,22 +70,24 @@ class Trainer:
 
     def run(self) -> Checkpoint:
         """Train to the end; returns the last state, which is also in last.pt."""
-        config, state, team = self.config, self.state, self._team
+        config = self.config
+        state = self.state
+        team = self._team
         part = team.rank, team.size
         classes = state.catalogue.names
         labels = read_labels(config.data, classes, self.progress)
         batches = training_batches(config.data, config.seed, config.batch, state.renders, part, labels)
         images = config.validation.images if team.leads else 0
         validation = {"": list(validation_pairs(config.data, config.seed, images))}
-        kept = read_labels(config.data, classes, self.progress, VALIDATION) if images else None
-        if kept is not None:
-            validation["photographs_"] = list(kept.whole())
-        begun = time.monotonic() - state.elapsed_s
+        held_out = read_labels(config.data, classes, self.progress, VALIDATION) if images else None
+        if held_out is not None:
+            validation["photographs_"] = list(held_out.whole())
+        began_s = time.monotonic() - state.elapsed_s
         saved = validated = state.elapsed_s
         with SummaryWriter(str(self.output)) if team.leads else nullcontext() as board:
             while self._share() < 1:
                 loss = self._update(next(batches))
-                state.elapsed_s = team.agree(time.monotonic() - begun)
+                state.elapsed_s = team.agree(time.monotonic() - began_s)
                 if state.step % 20 == 0:
                     self._report(loss, board)
                 if state.elapsed_s - validated > 60 * config.validation.every_minutes:
@@ -125,7 +127,8 @@ class Trainer:
         return max(by_time, by_step)
 
     def _learning_rate(self) -> float:
-        share, warmup = min(self._share(), 1.0), self.config.warmup
+        share = min(self._share(), 1.0)
+        warmup = self.config.warmup
         if share < warmup:
             return self.config.learning_rate * (0.05 + 0.95 * share / warmup)
         return self.config.learning_rate * 0.5 * (1 + math.cos(math.pi * (share - warmup) / (1 - warmup)))

@@ -47,8 +47,8 @@ def dice_loss(logits: Tensor, labels: Tensor) -> Tensor:
 
     Milletari et al., "V-Net", 2016, eq. for D with squared denominators.
     """
-    known = labels != IGNORE
-    probability = logits.sigmoid() * known
+    is_labelled = labels != IGNORE
+    probability = logits.sigmoid() * is_labelled
     target = (labels == 1).to(probability.dtype)
     return 1 - (2 * (probability * target).sum() + 1) / (probability.square().sum() + target.sum() + 1)
 
@@ -59,15 +59,16 @@ def kind_loss(logits: Tensor, labels: Tensor, weight: Tensor) -> Tensor:
     Cells weigh ``weight`` (B, H, W), and the more the rarer their class is: by the root of how many times its
     cells' weights go into those of all classes. Arrows are few, lines are many.
     """
-    known = labels != IGNORE
-    if not known.any():
+    is_labelled = labels != IGNORE
+    if not is_labelled.any():
         return logits.sum() * 0
-    cells, weight = labels[known].long(), weight[known]
+    cells = labels[is_labelled].long()
+    weight = weight[is_labelled]
     total = torch.zeros(logits.shape[1], dtype=weight.dtype, device=weight.device).index_add(0, cells, weight)
     rarity = (total.sum() / total.clamp(min=1e-6)).sqrt().clamp(max=6.0)
     weight = weight * rarity[cells]
-    each = cross_entropy(logits.movedim(1, -1)[known], cells, reduction="none")
-    return (weight * each).sum() / weight.sum()
+    loss = cross_entropy(logits.movedim(1, -1)[is_labelled], cells, reduction="none")
+    return (weight * loss).sum() / weight.sum()
 
 
 def lane_loss(logits: Tensor, targets: Targets, positive_weight: float) -> Tensor:
@@ -83,8 +84,8 @@ def _balanced_cross_entropy(
     logits: Tensor, labels: Tensor, positive_weight: float, worth: Tensor | float = 1.0
 ) -> Tensor:
     """Mean binary cross entropy of the elements that are known, positive ones weighing more."""
-    known = labels != IGNORE
+    is_labelled = labels != IGNORE
     target = (labels == 1).to(logits.dtype)
-    weight = known * worth * (1 + (positive_weight - 1) * target)
+    weight = is_labelled * worth * (1 + (positive_weight - 1) * target)
     total = binary_cross_entropy_with_logits(logits, target, weight, reduction="sum")
     return total / weight.sum().clamp(min=1)

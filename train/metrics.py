@@ -46,8 +46,8 @@ class Tally:
 
     def add(self, prediction: Prediction, targets: Targets) -> None:
         """Count a batch, except for what its targets ignore."""
-        known = targets.paint != IGNORE
-        _count(self._paint, targets.paint[known], prediction.paint[:, 0][known] > 0)
+        is_labelled = targets.paint != IGNORE
+        _count(self._paint, targets.paint[is_labelled], prediction.paint[:, 0][is_labelled] > 0)
         self._add_kinds(prediction, targets)
         self._add_lanes(prediction.lanes[:, 0] > 0, targets.lane_there)
 
@@ -58,12 +58,12 @@ class Tally:
         shown = self._kinds.sum(axis=1) > 0
         iou = {name: float(hits[c] / union[c]) for c, name in enumerate(self._classes, start=1) if shown[c]}
         paint = self._paint
-        found, true, right, given = (int(count) for count in self._lanes)
+        met, true, right, reported = (int(count) for count in self._lanes)
         return Score(
             iou,
             float(paint[1, 1] / max(paint.sum() - paint[0, 0], 1)),
-            found / max(true, 1),
-            right / max(given, 1),
+            met / max(true, 1),
+            right / max(reported, 1),
         )
 
     def _add_kinds(self, prediction: Prediction, targets: Targets) -> None:
@@ -74,17 +74,18 @@ class Tally:
         truth_paint = targets.paint.to(torch.float32)[:, None]
         empty = max_pool2d(truth_paint, scale)[:, 0] == 0
         truth = torch.where(targets.kinds == IGNORE, 0, targets.kinds.long() + 1)
-        known = (targets.kinds != IGNORE) | empty
-        _count(self._kinds, truth[known], guess[known])
+        counts = (targets.kinds != IGNORE) | empty
+        _count(self._kinds, truth[counts], guess[counts])
 
-    def _add_lanes(self, given: Tensor, there: Tensor) -> None:
-        true, possible = there == 1, there != 0
+    def _add_lanes(self, reported: Tensor, truth: Tensor) -> None:
+        true = truth == 1
+        possible = truth != 0
         self._lanes += np.array(
             [
-                (true & _widened(given)).sum().item(),
+                (true & _widened(reported)).sum().item(),
                 true.sum().item(),
-                (given & _widened(possible)).sum().item(),
-                given.sum().item(),
+                (reported & _widened(possible)).sum().item(),
+                reported.sum().item(),
             ]
         )
 

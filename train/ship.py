@@ -11,23 +11,17 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from v2hdm.cli.main import Command, answer_signals
-
-_COMMAND = Command(
-    "python -m train.ship",
-    "Make a trained network the detector's own.",
-    "train",
-    "interrupted; the same command resumes from here, and the detector's files are unchanged",
-)
+from v2hdm.cli.command import Command
+from v2hdm.cli.main import answer_signals
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; the exit code is 0, or 2 with one line on stderr for what a user can mend."""
+    return COMMAND(sys.argv[1:] if arguments is None else arguments)
+
+
+def _run(arguments: Sequence[str]) -> None:
     parsed = _parser().parse_args(arguments)
-    return _COMMAND.guard(lambda: _ship(parsed))
-
-
-def _ship(parsed: argparse.Namespace) -> None:
     from train.shipment import Order, ship_on_terminal
 
     ship_on_terminal(Order(**vars(parsed)))
@@ -61,6 +55,14 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--workers", type=int, default=0, help="processes (default: one per core)")
     return parser
 
+
+COMMAND = Command(
+    "python -m train.ship",
+    "Make a trained network the detector's own.",
+    _run,
+    extra="train",
+    interrupted="interrupted; the same command resumes from here, and the detector's files are unchanged",
+)
 
 if __name__ == "__main__":
     answer_signals()

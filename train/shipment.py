@@ -44,7 +44,10 @@ _LEAST_IMAGES = 100
 _PART_IMAGES = 25
 """Renders that one process looks at in one go: what a kill loses at most, per process."""
 
-_EXPORTED, _GATHERED, _JUDGED, _LANES_SEEN = 0.05, 0.6, 0.85, 0.99
+_EXPORTED = 0.05
+_GATHERED = 0.6
+_JUDGED = 0.85
+_LANES_SEEN = 0.99
 """Shares of the time that have passed after each step, about."""
 
 
@@ -74,12 +77,13 @@ class Order:
     @property
     def command(self) -> str:
         """The command that this is, without folders of this machine: users read it in the manifest."""
-        source, here = self.source.resolve(), Path.cwd()
+        source = self.source.resolve()
+        here = Path.cwd()
         shown = source.relative_to(here) if source.is_relative_to(here) else source.name
-        kept = f" --keep {' '.join(self.keep)}" if self.keep else ""
-        kept += f" --labels {self.labels.name}" if self.labels else ""
+        options = f" --keep {' '.join(self.keep)}" if self.keep else ""
+        options += f" --labels {self.labels.name}" if self.labels else ""
         images = f"--judge-images {self.judge_images} --lane-images {self.lane_images}"
-        return f"python -m train.ship {shown} --precision {self.precision} {images}{kept}"
+        return f"python -m train.ship {shown} --precision {self.precision} {images}{options}"
 
 
 def ship(order: Order, tell: Share) -> Path:
@@ -198,8 +202,8 @@ def _fit_judge(order: Order, folder: Path, tell: Share) -> None:
 def _judge_before(order: Order, network: Path) -> Path | None:
     """The judge of the same network that is to be replaced, to learn on from it, if there is one."""
     judge, before = (order.folder / name for name in (weights.JUDGE_FILE.name, weights.NETWORK_FILE.name))
-    known = judge.is_file() and before.is_file() and before.read_bytes() == network.read_bytes()
-    return judge if known else None
+    is_same = judge.is_file() and before.is_file() and before.read_bytes() == network.read_bytes()
+    return judge if is_same else None
 
 
 def _labels(order: Order, tell: Share) -> LabelledImages | None:
@@ -220,8 +224,8 @@ def _fit_lane_score(order: Order, folder: Path, tell: Share) -> None:
     ]
     images: list[fit_lane_score.Seen] = []
 
-    def take(seen: list[fit_lane_score.Seen]) -> None:
-        images.extend(seen)
+    def take(images_of_part: list[fit_lane_score.Seen]) -> None:
+        images.extend(images_of_part)
         share = _JUDGED + (_LANES_SEEN - _JUDGED) * len(images) / order.lane_images
         tell(share, f"lane score: {len(images)} renders seen")
 

@@ -59,15 +59,15 @@ class Targets(NamedTuple):
 
 def targets(sample: TrainingSample) -> Targets:
     """The answers for one image. Where a box stands before a lane's line, either answer will do."""
-    there, offset = lane_targets(sample.lanes_px, *sample.labels.shape)
-    there[_blocks(sample.hidden, LANE_STRIDE).any(axis=2) & (there == 1)] = IGNORE
+    lines, offset = lane_targets(sample.lanes_px, *sample.labels.shape)
+    lines[_blocks(sample.hidden, LANE_STRIDE).any(axis=2) & (lines == 1)] = IGNORE
     kinds = kind_target(sample.labels)
     size = piece_size(kinds)
     painted = paint_target(sample.labels)
     if sample.unknown is not None:
         painted[_blocks(sample.unknown, PAINT_STRIDE).any(axis=2)] = IGNORE
     paint = painted, paint_weight(size)
-    answers = *paint, kinds, kind_weight(size), there, offset
+    answers = *paint, kinds, kind_weight(size), lines, offset
     return Targets(*(torch.from_numpy(answer) for answer in answers))
 
 
@@ -123,8 +123,9 @@ def lane_targets(
     lanes_px: Sequence[FloatArray], height: int, width: int
 ) -> tuple[Bytes, NDArray[np.float32]]:
     """Which cells (H/8, W/8) the lines cross at the cell row's middle, and where in the cell."""
-    rows, columns = height // LANE_STRIDE, width // LANE_STRIDE
-    there = np.zeros((rows, columns), dtype=np.uint8)
+    rows = height // LANE_STRIDE
+    columns = width // LANE_STRIDE
+    lines = np.zeros((rows, columns), dtype=np.uint8)
     offset = np.zeros((rows, columns), dtype=np.float32)
     for lane in lanes_px:
         row, u, slope = _crossings(lane, rows)
@@ -133,21 +134,22 @@ def lane_targets(
         within = cell - column - 0.5
         inside = (column >= 0) & (column < columns)
         flat = inside & (np.abs(slope) > _MAX_SLOPE)
-        there[row[flat], column[flat]] = IGNORE
+        lines[row[flat], column[flat]] = IGNORE
         side = column + np.sign(within).astype(np.intp)
         unclear = (np.abs(within) > _NEAR_EDGE) & (side >= 0) & (side < columns)
         beside = row[unclear], side[unclear]
-        there[beside] = np.where(there[beside] == 1, 1, IGNORE)
+        lines[beside] = np.where(lines[beside] == 1, 1, IGNORE)
         clear = inside & ~flat
-        there[row[clear], column[clear]] = 1
+        lines[row[clear], column[clear]] = 1
         offset[row[clear], column[clear]] = within[clear]
-    return there, offset
+    return lines, offset
 
 
 def _crossings(lane_px: FloatArray, rows: int) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
     """Where a polyline (N, 2) crosses the row anchors: row (K,), pixel column (K,), columns per row (K,)."""
     anchors = LANE_STRIDE * np.arange(rows) + (LANE_STRIDE - 1) / 2
-    first, second = lane_px[:-1], lane_px[1:]
+    first = lane_px[:-1]
+    second = lane_px[1:]
     crossed = (first[:, None, 1] > anchors) != (second[:, None, 1] > anchors)
     segment, row = np.nonzero(crossed)
     slope = (second[segment, 0] - first[segment, 0]) / (second[segment, 1] - first[segment, 1])

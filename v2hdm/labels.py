@@ -28,8 +28,9 @@ from v2hdm.geometry.lens import distort_points, has_distortion
 from v2hdm.geometry.planar import clip_convex, clip_half, densified, rectangle_size, signed_area
 from v2hdm.geometry.rigid import camera_centre, interpolate, inverse
 from v2hdm.progress import Steps
-from v2hdm.records import BoolArray, CameraInfo, Drive, FloatArray, Image, IntArray, Trajectory
+from v2hdm.records import SIGMA_OF_MAD, BoolArray, CameraInfo, Drive, FloatArray, Image, IntArray, Trajectory
 from v2hdm.report.page.facts import CameraFacts, Facts, read_facts
+from v2hdm.site.living.looks import HIDDEN_SIGMA
 from v2hdm.store.files import write_json
 from v2hdm.surface.surface import Surface
 
@@ -37,25 +38,32 @@ FILE = "instances.json"
 RANGE_M = 16.0  # how far from a camera markings are labelled: farther ones need not be in the map
 UNKNOWN = "unknown"  # the category of what nobody knows, as `data.coco_classes` calls it
 
+# States of a marking in an image, and their places in arrays of probabilities.
 SHOWN, HIDDEN, PARTLY = range(3)
+
 _SURE = 0.9  # posterior probability from which a marking counts as shown, or as hidden
+
 _PRIOR = np.array([6.0, 3.0, 1.0])
 """Dirichlet prior of that an image in which a marking was not detected shows, hides or partly hides it."""
 
-_DETECTED = np.array([0.98, 0.005, 0.015])  # the same where it was detected
-_FAINT_SHARE = 0.1
-_HIDDEN_SIGMA = 0.5
-"""Share of the sides that are faint where shown; sigma of the contrast of what stands before them."""
+_DETECTED = np.array([0.98, 0.005, 0.015])
+"""Probability that an image in which a marking was detected shows, hides or partly hides it."""
 
+_FAINT_SHARE = 0.1  # share of the sides that are faint where shown
 _ALIKE = 0.5  # power of the likelihood of one side: the four of one image err alike
 _PAIRS_OF_BIN = 100  # detected sides by which contrasts of one size in the image are learned
+_MOST_BINS = 8  # sizes in the image, at most, of which contrasts are learned
 _LEAST_PAIRS = 8  # detected sides below which nothing is said of images without a detection
-_LEAST_SIGMA = 0.03
-_NEAREST_M = 0.3  # ground nearer to the camera's plane is cut off
-_LEAST_PX2 = 2.0  # area of the smallest piece that is labelled
-_INSIDE_M = 0.06
-_BESIDE_M = (0.1, 0.18)  # how far from an edge paint and ground are sampled, at most, m
-_CLEAR_M = 1.0  # radius about a candidate that was left out of which nothing is said
+_LEAST_SIGMA = 0.03  # least standard deviation of a side's contrast about the expected one
+_LEAST_IMAGES = 3  # images with a detection from which a side's contrast is taken from these alone
+_LEAST_CORNERS = 3  # corners accepted as points from which a marking counts as detected in an image
+
+_NEAREST_M = 0.3  # depth, m, below which ground is cut off
+_LEAST_PX2 = 2.0  # area of the smallest piece that is labelled, px^2
+_INSIDE_M = 0.06  # distance inside an edge, m, at most at which paint is sampled
+_BESIDE_M = (0.1, 0.18)  # distances outside an edge, m, at which ground is sampled
+_SAMPLES = 7  # samples along the middle part of an edge
+_CLEAR_M = 1.0  # radius about a candidate that was left out, m, of which nothing is said
 
 
 @dataclass(frozen=True)
@@ -65,9 +73,9 @@ class _Outline:
     id: int
     kind: str
     outline_map: FloatArray  # (N, 2)
-    inside_map: FloatArray  # (K, 2)
-    beside_map: FloatArray  # (K, 2)
-    side: IntArray  # (K,)
+    inside_map: FloatArray  # (K, 2) samples of paint
+    beside_map: FloatArray  # (K, 2) samples of ground
+    side: IntArray  # (K,) of each sample
 
     @classmethod
     def of(cls, number: int, kind: str, outline_map: FloatArray) -> _Outline:
@@ -77,27 +85,27 @@ class _Outline:
         inside = []
         beside = []
         side = []
-        for n, (a, b) in enumerate(zip(outline_map, ahead, strict=True)):
-            along = b - a
+        for n, (start, end) in enumerate(zip(outline_map, ahead, strict=True)):
+            along = end - start
             outwards = np.array([along[1], -along[0]]) / max(float(np.linalg.norm(along)), 1e-9)
-            middle = a + np.linspace(0.2, 0.8, 7)[:, None] * along
+            middle = start + np.linspace(0.2, 0.8, _SAMPLES)[:, None] * along
             for away_m in _BESIDE_M:
                 inside.append(middle - inset_m * outwards)
                 beside.append(middle + away_m * outwards)
-            side += [4 * n // len(outline_map)] * (7 * len(_BESIDE_M))
+            side += [4 * n // len(outline_map)] * (_SAMPLES * len(_BESIDE_M))
         return cls(number, kind, outline_map, np.concatenate(inside), np.concatenate(beside), np.array(side))
 
 
 @dataclass(frozen=True)
 class _View:
-    """One outline in one image: its polygon (N, 2), recorded px, and the contrast of each side, or nan."""
+    """One outline in one image."""
 
     outline: int
     image: int
-    polygon_px: FloatArray
-    whole: bool
-    contrast: FloatArray  # (4,)
-    px_per_m: float
+    polygon_px: FloatArray  # (N, 2) recorded px, the part in the image
+    whole: bool  # that part is all of it
+    contrast: FloatArray  # (4,) of each side, log ratio of grey values, or nan
+    px_per_m: float  # how large a metre of it is
     detected: bool
 
 
@@ -110,29 +118,32 @@ class _Eye:
     ground: Surface | None  # under the vehicle at these two times
 
     @classmethod
-    def of(cls, image: Image, own: CameraFacts, facts: Facts) -> _Eye:
+    def of(cls, image: Image, camera: CameraFacts, facts: Facts) -> _Eye:
         """By the adjusted poses of the run."""
-        info = own.calibration.info
+        info = camera.calibration.info
         route = facts.route
         assert route is not None
-        read_out_s = own.read_out_s or 0.0
-        taken_s = image.stamp_s + (own.clock_offset_s or 0.0) + np.array([-0.5, 0.5]) * read_out_s
+        read_out_s = camera.read_out_s or 0.0
+        taken_s = image.stamp_s + (camera.clock_offset_s or 0.0) + np.array([-0.5, 0.5]) * read_out_s
         poses = interpolate(Trajectory(route.stamp_s, route.flat), taken_s, np.inf)[0]
         ground = None if facts.surface is None else facts.surface.seen_from(poses)
-        return cls(info, own.calibration.cam_from_vehicle @ inverse(poses), ground)
+        return cls(info, camera.calibration.cam_from_vehicle @ inverse(poses), ground)
 
     def project(self, points_map: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Recorded px (N, 2) of ground points (N, 2), and their depths (N,), m."""
-        laid = [points_map, points_map]
+        first_pose, last_pose = self.cam_from_map
+        first_points = points_map
+        last_points = points_map
         if self.ground is not None:
-            laid = [self.ground.on_plane(points_map, one, n) for n, one in enumerate(self.cam_from_map)]
-        views = zip(self.cam_from_map, laid, strict=True)
-        first, last = (project_ground(self.info.intrinsic, one, points) for one, points in views)
-        px = distort_points(self.info, (first[0] + last[0]) / 2)
-        if np.array_equal(*self.cam_from_map):
-            return px, first[1]
+            first_points = self.ground.on_plane(points_map, first_pose, 0)
+            last_points = self.ground.on_plane(points_map, last_pose, 1)
+        first_px, depth_m = project_ground(self.info.intrinsic, first_pose, first_points)
+        last_px, _ = project_ground(self.info.intrinsic, last_pose, last_points)
+        px = distort_points(self.info, (first_px + last_px) / 2)
+        if np.array_equal(first_pose, last_pose):
+            return px, depth_m
         share = (row_shares(self.info, px) + 0.5)[:, None]
-        return distort_points(self.info, (1 - share) * first[0] + share * last[0]), first[1]
+        return distort_points(self.info, (1 - share) * first_px + share * last_px), depth_m
 
     def polygon(self, outline_map: FloatArray) -> tuple[FloatArray, bool]:
         """The part (N, 2), recorded px, of an outline that lies in the image, and whether that is all."""
@@ -156,15 +167,15 @@ class _Eye:
         for points_map in (outline.inside_map, outline.beside_map):
             px, depth_m = self.project(points_map)
             px = np.where((depth_m > _NEAREST_M)[:, None], px, -9.0).astype(np.float32)
-            seen = cv2.remap(grey, px[None, :, 0], px[None, :, 1], cv2.INTER_LINEAR, borderValue=-1e4)[0]
-            values.append(np.where(seen < 0, np.nan, seen + 1.0))
+            sampled = cv2.remap(grey, px[None, :, 0], px[None, :, 1], cv2.INTER_LINEAR, borderValue=-1e4)[0]
+            values.append(np.where(sampled < 0, np.nan, sampled + 1.0))
         ratio = np.log(values[0] / values[1])
-        out = np.full(4, np.nan)
+        contrast = np.full(4, np.nan)
         for side in range(4):
-            own = ratio[outline.side == side]
-            own = own[np.isfinite(own)]
-            out[side] = np.mean(own) if len(own) else np.nan
-        return out
+            of_side = ratio[outline.side == side]
+            of_side = of_side[np.isfinite(of_side)]
+            contrast[side] = np.mean(of_side) if len(of_side) else np.nan
+        return contrast
 
 
 def write_labels(
@@ -186,9 +197,13 @@ def write_labels(
             f"{folder}: its verdict is {status or 'missing'}: labels of a map that may be wrong would teach "
             "what is wrong; fix the drive (docs/verdict.md) and map it again"
         )
-    outlines = [_Outline.of(one.id or 0, one.kind, one.corners_map) for one in facts.hd_map.markings]
-    outlines += [_Outline.of(one.id or 0, one.kind, one.outline_map) for one in facts.hd_map.symbols]
-    seen = _detected(facts)
+    outlines = [
+        _Outline.of(marking.id or 0, marking.kind, marking.corners_map) for marking in facts.hd_map.markings
+    ]
+    outlines += [
+        _Outline.of(symbol.id or 0, symbol.kind, symbol.outline_map) for symbol in facts.hd_map.symbols
+    ]
+    detected_in = _detected(facts)
     images: list[Image] = []
     views: list[_View] = []
     silent: list[tuple[int, FloatArray]] = []
@@ -196,9 +211,9 @@ def write_labels(
         if image.camera in facts.cameras:
             eye = _Eye.of(image, facts.cameras[image.camera], facts)
             grey = read_grey(image, drive.cameras[image.camera])
-            found = seen.get(drive.name_of(image.path), set())
-            views += _views(eye, grey, outlines, len(images), found, range_m)
-            silent += [(len(images), one) for one in _silent(eye, facts, range_m)]
+            detected = detected_in.get(drive.name_of(image.path), set())
+            views += _views(eye, grey, outlines, len(images), detected, range_m)
+            silent += [(len(images), polygon) for polygon in _silent(eye, facts, range_m)]
             images.append(image)
         if progress:
             progress(number + 1, len(drive.images))
@@ -212,14 +227,14 @@ def write_labels(
 def _detected(facts: Facts) -> Mapping[str, set[int]]:
     """By image the markings of which the mapping accepted three corners or more as points."""
     residuals = facts.residuals
-    out = dict[str, set[int]]()
+    detected = dict[str, set[int]]()
     if residuals is not None:
         used = residuals.is_point & (residuals.marking > 0)
         pairs = np.stack([residuals.row_image[used], residuals.marking[used]], axis=1)
-        for (row, marking), count in zip(*np.unique(pairs, axis=0, return_counts=True), strict=True):
-            if count >= 3:
-                out.setdefault(residuals.image[row], set()).add(int(marking))
-    return out
+        unique_pairs, corners = np.unique(pairs, axis=0, return_counts=True)
+        for row, marking in unique_pairs[corners >= _LEAST_CORNERS]:
+            detected.setdefault(residuals.image[row], set()).add(int(marking))
+    return detected
 
 
 def _views(
@@ -232,7 +247,7 @@ def _views(
 ) -> list[_View]:
     """The parts of the outlines that lie in an image, within range."""
     foot = camera_centre(eye.cam_from_map[:1])[0, :2]
-    out = []
+    views = []
     for number, outline in enumerate(outlines):
         if np.linalg.norm(outline.outline_map - foot, axis=1).min() > range_m:
             continue
@@ -241,8 +256,8 @@ def _views(
         if area_px2 >= _LEAST_PX2:
             size = np.sqrt(area_px2 / abs(float(signed_area(outline.outline_map))))
             contrast = eye.contrast(grey, outline)
-            out.append(_View(number, image, polygon, whole, contrast, size, outline.id in detected))
-    return out
+            views.append(_View(number, image, polygon, whole, contrast, size, outline.id in detected))
+    return views
 
 
 def _silent(eye: _Eye, facts: Facts, range_m: float) -> list[FloatArray]:
@@ -254,30 +269,33 @@ def _silent(eye: _Eye, facts: Facts, range_m: float) -> list[FloatArray]:
     beyond = np.concatenate([centre[:2] + range_m * arc, centre[:2] + 1e3 * arc[::-1]])
     turn = np.linspace(0, 2 * np.pi, 12, endpoint=False)
     disc = _CLEAR_M * np.column_stack([np.cos(turn), np.sin(turn)])
-    near = [one.position_map for one in facts.excluded]
-    near = [one for one in near if np.linalg.norm(one - centre[:2]) < range_m + _CLEAR_M]
-    found = [eye.polygon(one)[0] for one in (beyond, *(place + disc for place in near))]
-    return [one for one in found if len(one) > 2 and abs(float(signed_area(one))) >= _LEAST_PX2]
+    places = [exclusion.position_map for exclusion in facts.excluded]
+    in_range = [place for place in places if np.linalg.norm(place - centre[:2]) < range_m + _CLEAR_M]
+    outlines = [beyond, *(place + disc for place in in_range)]
+    polygons = [eye.polygon(outline)[0] for outline in outlines]
+    return [
+        polygon for polygon in polygons if len(polygon) > 2 and abs(float(signed_area(polygon))) >= _LEAST_PX2
+    ]
 
 
 def _states(views: Sequence[_View], outlines: int) -> IntArray:
     """Whether each view is shown, hidden, or partly so or unsure (V,), by the contrasts of all of them."""
     if not views:
         return np.zeros(0, dtype=np.int64)
-    contrast = np.stack([one.contrast for one in views])
-    detected = np.array([one.detected for one in views])
-    outline = np.array([one.outline for one in views])
-    own = _own_contrasts(contrast, outline, detected, outlines)[outline]
-    size = np.array([one.px_per_m for one in views])
-    expected, sigma = _expected(contrast, own, size, detected)
-    known = np.isfinite(contrast) & np.isfinite(own)
-    off = np.where(known, contrast - expected, 0.0)
-    faint = norm.logpdf(np.where(known, contrast - own / 2, 0.0), 0.0, np.abs(own) / 3 + sigma)
+    contrast = np.stack([view.contrast for view in views])
+    detected = np.array([view.detected for view in views])
+    outline = np.array([view.outline for view in views])
+    usual = _usual_contrasts(contrast, outline, detected, outlines)[outline]
+    size = np.array([view.px_per_m for view in views])
+    expected, sigma = _expected(contrast, usual, size, detected)
+    is_known = np.isfinite(contrast) & np.isfinite(usual)
+    off = np.where(is_known, contrast - expected, 0.0)
+    faint = norm.logpdf(np.where(is_known, contrast - usual / 2, 0.0), 0.0, np.abs(usual) / 3 + sigma)
     clear = np.log1p(-_FAINT_SHARE) + norm.logpdf(off, 0.0, sigma)
     shown = logsumexp([clear, np.log(_FAINT_SHARE) + faint], axis=0)
-    hidden = norm.logpdf(np.where(known, contrast, 0.0), 0.0, _HIDDEN_SIGMA)
+    hidden = norm.logpdf(np.where(is_known, contrast, 0.0), 0.0, HIDDEN_SIGMA)
     either = np.logaddexp(shown, hidden) + np.log(0.5)
-    sides = np.where(known[..., None], _ALIKE * np.stack([shown, hidden, either], axis=2), 0.0).sum(axis=1)
+    sides = np.where(is_known[..., None], _ALIKE * np.stack([shown, hidden, either], axis=2), 0.0).sum(axis=1)
     share = _PRIOR / _PRIOR.sum()
     posterior = np.zeros((len(views), 3))
     for _ in range(10):  # settles within five
@@ -288,46 +306,47 @@ def _states(views: Sequence[_View], outlines: int) -> IntArray:
     states = np.full(len(views), PARTLY)
     states[posterior[:, SHOWN] >= _SURE] = SHOWN
     states[posterior[:, HIDDEN] >= _SURE] = HIDDEN
-    states[~known.any(axis=1) & ~detected] = PARTLY
+    states[~is_known.any(axis=1) & ~detected] = PARTLY
     return states
 
 
-def _own_contrasts(contrast: FloatArray, outline: IntArray, detected: BoolArray, count: int) -> FloatArray:
+def _usual_contrasts(contrast: FloatArray, outline: IntArray, detected: BoolArray, count: int) -> FloatArray:
     """The contrast of sides (count, 4) by the images that an outline was detected in, if three, else all."""
-    out = np.full((count, 4), np.nan)
+    usual = np.full((count, 4), np.nan)
     for number in range(count):
-        own = outline == number
-        if np.count_nonzero(own & detected) >= 3:
-            own &= detected
-        values = contrast[own]
+        of_outline = outline == number
+        if np.count_nonzero(of_outline & detected) >= _LEAST_IMAGES:
+            of_outline &= detected
+        values = contrast[of_outline]
         for side in range(4):
-            known = values[np.isfinite(values[:, side]), side]
-            out[number, side] = np.median(known) if len(known) else np.nan
-    return out
+            of_side = values[np.isfinite(values[:, side]), side]
+            usual[number, side] = np.median(of_side) if len(of_side) else np.nan
+    return usual
 
 
 def _expected(
-    contrast: FloatArray, own: FloatArray, size: FloatArray, detected: BoolArray
+    contrast: FloatArray, usual: FloatArray, size: FloatArray, detected: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
     """Contrast (V, 4) and its sigma that sides have when shown, by how large a metre is in the image."""
-    used = np.isfinite(contrast) & np.isfinite(own) & detected[:, None]
+    used = np.isfinite(contrast) & np.isfinite(usual) & detected[:, None]
     if used.sum() < _LEAST_PAIRS:
-        return own, np.full_like(own, _HIDDEN_SIGMA)
+        return usual, np.full_like(usual, HIDDEN_SIGMA)
     order = np.sort(np.broadcast_to(size[:, None], used.shape)[used])
-    bins = max(1, min(8, len(order) // _PAIRS_OF_BIN))
-    place = np.searchsorted(order[:: -(-len(order) // bins)][1:], size)
+    bins = max(1, min(_MOST_BINS, len(order) // _PAIRS_OF_BIN))
+    bin_of_view = np.searchsorted(order[:: -(-len(order) // bins)][1:], size)
     factor = np.ones(len(size))
-    sigma = np.full(len(size), _HIDDEN_SIGMA)
-    for one in np.unique(place):
-        here = place == one
-        rows = used & here[:, None]
+    sigma = np.full(len(size), HIDDEN_SIGMA)
+    for number in np.unique(bin_of_view):
+        in_bin = bin_of_view == number
+        rows = used & in_bin[:, None]
         if rows.sum() < _LEAST_PAIRS:
             continue
-        a = contrast[rows]
-        b = own[rows]
-        factor[here] = ratio = float((a * b).sum() / max((b * b).sum(), 1e-9))
-        sigma[here] = max(1.4826 * float(np.median(np.abs(a - ratio * b))), _LEAST_SIGMA)
-    return factor[:, None] * own, np.broadcast_to(sigma[:, None], own.shape)
+        shown = contrast[rows]
+        as_usual = usual[rows]
+        ratio = float((shown * as_usual).sum() / max((as_usual * as_usual).sum(), 1e-9))
+        factor[in_bin] = ratio
+        sigma[in_bin] = max(SIGMA_OF_MAD * float(np.median(np.abs(shown - ratio * as_usual))), _LEAST_SIGMA)
+    return factor[:, None] * usual, np.broadcast_to(sigma[:, None], usual.shape)
 
 
 def _coco(
@@ -339,7 +358,7 @@ def _coco(
     silent: Sequence[tuple[int, FloatArray]],
 ) -> dict[str, Any]:
     """COCO instances; what is unsure, and ground of which nothing is known, is ``iscrowd``."""
-    kinds = sorted({one.kind for one in outlines})
+    kinds = sorted({outline.kind for outline in outlines})
     number_of = {kind: n for n, kind in enumerate([*kinds, UNKNOWN], start=1)}
     # A marking that reaches beyond the range comes after the ground there, of which it is no part.
     annotations = [_instance(number_of[UNKNOWN], image, polygon, True) for image, polygon in silent]
@@ -361,11 +380,12 @@ def _coco(
             for n, (image, info) in enumerate(zip(images, infos, strict=True))
         ],
         "categories": [{"id": number, "name": kind} for kind, number in number_of.items()],
-        "annotations": [{"id": n, **one} for n, one in enumerate(annotations, start=1)],
+        "annotations": [{"id": n, **annotation} for n, annotation in enumerate(annotations, start=1)],
     }
 
 
 def _instance(category: int, image: int, polygon_px: FloatArray, unsure: bool) -> dict[str, Any]:
+    """A COCO annotation of one polygon (N, 2) in an image."""
     points = polygon_px + 0.5
     low = points.min(axis=0)
     high = points.max(axis=0)

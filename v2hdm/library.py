@@ -11,11 +11,12 @@ from v2hdm.io.drive import read_drive
 from v2hdm.io.maps.reading import read_map as _read
 from v2hdm.progress import Steps
 from v2hdm.records import Drive, HDMap, ImageDetections
+from v2hdm.store.names import map_file
 
 if TYPE_CHECKING:  # load torch or scipy
     from v2hdm.adjust.problem import Problem
     from v2hdm.mapping.options import MappingOptions
-    from v2hdm.simulate import PortConfig
+    from v2hdm.simulate.port.config import PortConfig
 
 
 def read_map(path: str | Path) -> HDMap:
@@ -30,7 +31,7 @@ def read_map(path: str | Path) -> HDMap:
     True
     """
     path = Path(path)
-    return _read(path / "map.geojson" if path.is_dir() else path)[0]
+    return _read(map_file(path))[0]
 
 
 def build_problem(
@@ -84,15 +85,14 @@ def simulate_port(
     >>> drive.name, list(drive.cameras), len(drive.images)
     ('port', ['front'], 22)
     """
-    from v2hdm.simulate import rendered_drive
+    from v2hdm.simulate.port.drive import rendered_drive
 
     config = config or _short_port()
     return read_drive(rendered_drive(config, Path(folder), workers, progress or (lambda done, total: None)))
 
 
 def _short_port() -> PortConfig:
-    from v2hdm.simulate import PortConfig
-    from v2hdm.simulate.port.config import RouteConfig, YardConfig
+    from v2hdm.simulate.port.config import PortConfig, RouteConfig, YardConfig
 
     port = PortConfig(name="port", seed=11, initial_ipm="estimated")
     return replace(

@@ -37,6 +37,9 @@ SEEN_ACROSS: Mapping[str, str] = {LANE_DASH: STOP_LINE, STOP_LINE: LANE_DASH}
 LANE_BOUNDARY = "lane_boundary"
 """Kind of a lane detection that is a whole line, gaps between dashes and hidden parts included."""
 
+BEST = "Opt"
+"""Name of the method whose map and calibration are the result, also in ``metrics.json``."""
+
 DISTORTION_COEFFICIENTS: Mapping[str, int] = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
 """Distortion models by their ROS ``camera_info`` name, with their number of coefficients."""
 
@@ -86,6 +89,21 @@ class GeodeticOrigin:
     altitude_m: float
     datum: str = "WGS84"
     epoch: float | None = None
+
+
+SIGMA_OF_MAD = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation."""
+
+SIGMAS_95 = 2.4477
+"""Semi-axes of the 95 % ellipse of a two-dimensional normal error, in standard deviations: the root of the
+chi-square quantile with two degrees of freedom."""
+
+FOOT_M = 0.3048  # an international foot, m
+
+HEIGHT_NOISE = 2.0  # noise of heights by RTK over that of positions in the plane, about
+
+HEAVE_SIGMA_M = 0.01
+"""Standard deviation, m, of a vehicle body's height on its suspension, on paved ground."""
 
 
 @dataclass(frozen=True)
@@ -233,6 +251,10 @@ class Drive:
         return tuple(session.pose_noise for session in self.sessions)
 
 
+OUTLINE_SIGMA_PX = 2.5
+"""Standard deviation, px, of the network's outline of a marking from its paint's edge; 1 to 3 on renders."""
+
+
 @dataclass(frozen=True)
 class MarkingDetection:
     """One quadrilateral marking, or symbol, in one image.
@@ -288,6 +310,10 @@ class PaintLeft:
             return self
         sigma = float(np.hypot(self.sigma, before.sigma))
         return replace(self, change=self.share - before.share, change_sigma=sigma)
+
+
+UNSTATED_SIGMA_M = 0.02
+"""Standard deviation, m, of a corner's coordinate in a map that states none: drawn over an image."""
 
 
 @dataclass(frozen=True)

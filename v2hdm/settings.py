@@ -1,14 +1,15 @@
-"""One check for the settings of all commands: every number is finite and within its range.
+"""What the settings of all commands say of themselves: type, range and meaning, beside each of them.
 
-Ranges stand beside the dataclasses that they are of, by the keys that users write. A key in a list or a
-mapping shares the range of the list.
+A setting is a field of a dataclass, ``max_gap_s: Annotated[float, POSITIVE, "longest gap, s."] = 0.5``. The
+check before any work, ``--help``, the schemas for editors and the library's pages are made of these.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 from v2hdm.errors import ConfigError
 
@@ -39,11 +40,38 @@ class Within:
         return text if self.step is None else f"a multiple of {self.step}, {text}"
 
 
+NO_KEY = {"omegaconf_ignore": True}
+"""Metadata of a field that no run file and no command line sets: another setting does."""
+
+ANY_NUMBER = Within()
 POSITIVE = Within(0, open=True)
 NOT_NEGATIVE = Within(0)
 SHARE = Within(0, 1)
 COUNT = Within(1, 10**12)
 SEED = Within(0, 2**63 - 1)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What a field of a dataclass declares: its type, the numbers it takes, and what it means."""
+
+    hint: Any
+    allowed: Within = ANY_NUMBER
+    meaning: str = ""
+
+
+def settings_of(schema: type[Any]) -> Mapping[str, Setting]:
+    """The settings of a dataclass by name, in order, those of classes that it extends first."""
+    hints = get_type_hints(schema, include_extras=True)
+    return {field.name: _setting_of(hints[field.name]) for field in fields(schema)}
+
+
+def _setting_of(hint: Any) -> Setting:
+    if get_origin(hint) is not Annotated:
+        return Setting(hint)
+    plain, *notes = get_args(hint)
+    allowed = next((note for note in notes if isinstance(note, Within)), ANY_NUMBER)
+    return Setting(plain, allowed, next((note for note in notes if isinstance(note, str)), ""))
 
 
 def check_workers(workers: int) -> None:
@@ -52,32 +80,32 @@ def check_workers(workers: int) -> None:
         raise ConfigError(f"--workers {workers}: give 1 to {MOST_PROCESSES} processes, or 0 for one per core")
 
 
-def check_settings(config: object, ranges: Mapping[str, Within], prefix: str = "") -> None:
-    """Refuse numbers that are not finite or out of range, with ConfigError that names ``prefix`` and key.
+def check_settings(config: Any, prefix: str = "") -> None:
+    """Refuse numbers that are not finite or not in the range of their setting.
 
-    ``ranges`` are by dotted key; ``*`` stands for the entries of a mapping.
+    Raises:
+        ConfigError: names ``prefix`` and the key.
     """
-    for key, pattern, value in _numbers(config, "", ""):
+    for key, value, allowed in _numbers(config, prefix, ANY_NUMBER):
         if not math.isfinite(value):
-            raise ConfigError(f"{prefix}{key} is {value}: set a finite number")
-        allowed = ranges.get(pattern)
-        if allowed is not None and not allowed.holds(value):
-            raise ConfigError(f"{prefix}{key} is {value}: set {allowed}")
+            raise ConfigError(f"{key} is {value}: set a finite number")
+        if not allowed.holds(value):
+            raise ConfigError(f"{key} is {value}: set {allowed}")
 
 
-def _numbers(value: object, key: str, pattern: str) -> Iterator[tuple[str, str, float]]:
-    """All numbers with their keys, and with the keys of their ranges."""
+def _numbers(value: object, key: str, allowed: Within) -> Iterator[tuple[str, float, Within]]:
+    """All numbers with their keys and ranges; the entries of a list or a mapping share its range."""
     if isinstance(value, bool):
         return
     if isinstance(value, int | float):
-        yield key, pattern, value
-    elif is_dataclass(value):
-        dot = "." if key else ""
-        for name, item in vars(value).items():
-            yield from _numbers(item, f"{key}{dot}{name}", f"{pattern}{dot}{name}")
+        yield key, value, allowed
+    elif is_dataclass(value) and not isinstance(value, type):
+        dot = "" if not key or key.endswith(".") else "."
+        for name, setting in settings_of(type(value)).items():
+            yield from _numbers(getattr(value, name), f"{key}{dot}{name}", setting.allowed)
     elif isinstance(value, Mapping):
-        for name, item in value.items():
-            yield from _numbers(item, f"{key}.{name}", f"{pattern}.*")
+        for name, entry in value.items():
+            yield from _numbers(entry, f"{key}.{name}", allowed)
     elif isinstance(value, list | tuple):
-        for number, item in enumerate(value):
-            yield from _numbers(item, f"{key}[{number}]", pattern)
+        for number, entry in enumerate(value):
+            yield from _numbers(entry, f"{key}[{number}]", allowed)

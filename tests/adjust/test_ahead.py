@@ -31,7 +31,7 @@ def test_the_small_problem_calls_every_kernel_of_the_engine(monkeypatch):
 @pytest.fixture
 def new_folder(tmp_path, monkeypatch):
     """A folder where no kernel is kept yet, and the program of the process that compiles."""
-    monkeypatch.setattr(ahead, "_folder", lambda: tmp_path)
+    monkeypatch.setattr(ahead, "kept_in", lambda: tmp_path)
     return tmp_path
 
 

@@ -19,7 +19,7 @@ from v2hdm.adjust.model import Estimate, Loss
 from v2hdm.adjust.problem import LOSSES, POSE_STATES
 from v2hdm.adjust.reduced import ReducedSystem
 from v2hdm.adjust.whitening import factorise
-from v2hdm.faults import score_faults
+from v2hdm.faults.score_tests import score_faults
 
 POSES = PoseSigma(position_drift=Drift(0.01, 10.0), roll_pitch_drift=Drift(0.003, 2.0))
 MODELS = [((), False), ((), True), (("roll", "pitch"), True), (POSE_STATES, False), (POSE_STATES, True)]

@@ -13,7 +13,7 @@ from v2hdm.adjust.engines import make_engine
 from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.problem import POSE_STATES
 from v2hdm.errors import AdjustError
-from v2hdm.faults import score_faults
+from v2hdm.faults.score_tests import score_faults
 
 
 def joined(first, second):

@@ -8,7 +8,7 @@ false ones, the share of markings with four corners known well, the corners' err
 covariance holds (inner-95 mean of the normalised squared error; honest 1.60). A part that earns nothing
 leaves.
 
-With ``--verdict`` instead what each column of the table of fault sizes (mapping/input_errors.py) and each
+With ``--verdict`` instead what each column of the table of fault sizes (faults/table.py) and each
 number of mapping/foreign.py earns, on made drives of these seeds, as they are and with every fault: right
 drives failed, wrong maps without a word, and of those with one how many are named rightly, first.
 """
@@ -18,7 +18,7 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -43,10 +43,11 @@ from v2hdm.detection import classifier as find
 from v2hdm.detection.batch import detect_all
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.quads import fit, lattice, propose
+from v2hdm.detection.quads import fit, lattice, propose, robust, state
+from v2hdm.faults import FAULTS
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
-from v2hdm.mapping import conclusion, foreign, input_errors
+from v2hdm.mapping import conclusion, foreign
 from v2hdm.mapping.methods import run_methods
 from v2hdm.records import BoolArray, Drive, FloatArray, ImageDetections, Marking, Truth
 from v2hdm.report.metrics import driven_past, marking_metrics, match_markings
@@ -65,13 +66,13 @@ Part = tuple[str, Callable[[], AbstractContextManager[Any]]]
 
 def parts() -> Iterator[Part]:
     """Each part's name, and within which context it is off."""
-    yield "nothing off", lambda: patch.object(fit, "KNOTS", fit.KNOTS)
+    yield "nothing off", lambda: patch.object(state, "KNOTS", state.KNOTS)
     yield "search on the coarse grid", _without_search
     yield "the network's paint in the search", _without_paint
-    yield "parallelograms on the ground", lambda: patch.object(fit, "_CLOSURE_SHARE", 100.0)
+    yield "parallelograms on the ground", lambda: patch.object(state, "_CLOSURE_SHARE", 100.0)
     yield "red and blue beside grey", lambda: patch.object(lattice, "_GREY_FIRST", 1e6)
-    yield "light that changes along", lambda: patch.object(fit, "_LIGHT_STEP", 1e-3)
-    yield "a variance for each side", lambda: patch.object(fit, "_SHARED_PIXELS", 1e6)
+    yield "light that changes along", lambda: patch.object(state, "_LIGHT_STEP", 1e-3)
+    yield "a variance for each side", lambda: patch.object(robust, "_SHARED_PIXELS", 1e6)
     yield "the way from wide to narrow scatter", _with_narrow_scatter
     yield "the start within clipped paint", lambda: patch.object(fit, "_BLOOM", 0.0)
     yield "the floor of a side's error", lambda: patch.object(fit, "_MODEL_SIGMA_PX", 0.0)
@@ -83,24 +84,24 @@ def parts() -> Iterator[Part]:
 
 @contextmanager
 def _without_search() -> Iterator[None]:
-    settle = fit._State.settle
+    settle = state.State.settle
 
-    def unless_searching(state: Any, seen: Any, steps: int, paint: Any = None) -> Any:
-        return settle(state, seen, steps) if paint is None else None
+    def unless_searching(unknowns: Any, lattice: Any, steps: int, paint: Any = None) -> Any:
+        return settle(unknowns, lattice, steps) if paint is None else None
 
-    with patch.object(fit._State, "settle", unless_searching):
+    with patch.object(state.State, "settle", unless_searching):
         yield
 
 
 @contextmanager
 def _without_paint() -> Iterator[None]:
-    with patch.object(fit, "_add_paint", _nothing):
+    with patch.object(state, "add_paint", _nothing):
         yield
 
 
 @contextmanager
 def _with_narrow_scatter() -> Iterator[None]:
-    with patch.object(fit, "_WIDE_SCATTER", 0.0), patch.object(fit, "_FINAL_SCATTER", 0.0):
+    with patch.object(state, "_WIDE_SCATTER", 0.0), patch.object(state, "_FINAL_SCATTER", 0.0):
         yield
 
 
@@ -140,7 +141,7 @@ def _without_sizes() -> Iterator[None]:
 
 @contextmanager
 def _without_parts() -> Iterator[None]:
-    with patch("v2hdm.detection.quads.propose._split", lambda *_: []):
+    with patch("v2hdm.detection.quads.blobs._split", lambda *_: []):
         yield
 
 
@@ -169,9 +170,10 @@ def row(name: str, shown: Sequence[Example]) -> str:
 def sizes() -> Iterator[Part]:
     """Each column of the table of sizes, each number of the foreign images, and the context that lacks it."""
     yield "nothing off", nullcontext
-    for column, nothing in (("least", 0.0), ("sigma", np.inf), ("usual", np.inf), ("most", np.inf)):
-        flat = {fault: replace(size, **{column: nothing}) for fault, size in input_errors._SIZES.items()}
-        yield f"{column} size of each fault", partial(patch.object, input_errors, "_SIZES", flat)
+    for column, nothing in (
+        ("least", 0.0), ("observable_sigma", np.inf), ("usual", np.inf), ("most", np.inf),
+    ):  # fmt: skip
+        yield f"{column} size of each fault", partial(_without_size, column, nothing)
     yield "foreign: views that share counts for", partial(patch.object, foreign, "_PSEUDO_VIEWS", 100.0)
     yield "foreign: markings taken by mistake", partial(patch.object, foreign, "_BY_MISTAKE", 1e-6)
     yield "foreign: mixtures of two markings", partial(patch.object, foreign, "_CONFUSED", 1e-6)
@@ -214,6 +216,15 @@ def terms() -> Iterator[Part]:
     yield "lines behind dashes", partial(patch.object, conclusion, "images_with_line", _no_images)
     yield "their sureness", partial(patch.object, ground, "_SURE_M", np.inf)
     yield "their direction", partial(patch.object, ground, "_PARALLEL", -1.0)
+
+
+@contextmanager
+def _without_size(column: str, nothing: float) -> Iterator[None]:
+    with ExitStack() as stack:
+        for fault in FAULTS.values():
+            # Records are frozen: what they hold is replaced below their guard.
+            stack.enter_context(patch.dict(vars(fault), {column: nothing}))
+        yield
 
 
 @contextmanager

@@ -20,8 +20,8 @@ from tests.benchmarks.adjust_accuracy import PLAIN, root_mean_cm, squared_bound_
 from v2hdm.adjust import Drift, PoseSigma, solve
 from v2hdm.cli import compose as config
 from v2hdm.pipeline.config import RunConfig
-from v2hdm.simulate import PortConfig
 from v2hdm.simulate.port.build import cam_from_vehicle
+from v2hdm.simulate.port.config import PortConfig
 from v2hdm.simulate.port.route import pose_noise
 
 WANTED_M = 0.02

@@ -18,8 +18,9 @@ import numpy as np
 
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.rigid import rotation_from_vector
-from v2hdm.ground import GroundOptions, estimate_ground
+from v2hdm.ground.estimate import estimate_ground
 from v2hdm.ground.model import guessed_mount
+from v2hdm.ground.results import GroundOptions
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.records import Calibration, Camera, Drive, FloatArray, Trajectory

@@ -29,7 +29,7 @@ import v2hdm.pipeline.map_drive  # noqa: F401  # loaded once, before any run is 
 from tests.ports import short_port
 from v2hdm.pipeline.config import DriveConfig, RunConfig
 from v2hdm.pipeline.run import run
-from v2hdm.simulate import render_drive
+from v2hdm.simulate.port.drive import render_drive
 from v2hdm.store.cache import items_of
 
 Start = Callable[[Path, DriveConfig], int]

@@ -37,7 +37,7 @@ from v2hdm.simulate.port.build import build_port
 _DETECT = """
 import signal, sys, time
 from unittest.mock import patch
-from v2hdm.cli.detect import run
+from v2hdm.cli.commands.detect import _run as run
 signal.signal(signal.SIGINT, signal.default_int_handler)  # which what runs in the background ignores
 with patch("time.perf_counter", time.process_time):
     run(sys.argv[1:])

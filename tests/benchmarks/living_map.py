@@ -33,9 +33,9 @@ from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.base import grey_reader, read_base
 from v2hdm.records import Change, Drive, Fate, FloatArray, HDMap, ImageDetections, Truth
 from v2hdm.report.metrics import corner_errors, driven_past, marking_metrics, match_markings
-from v2hdm.simulate import PortConfig, rendered_drive
 from v2hdm.simulate.port.build import build_port
-from v2hdm.simulate.port.config import RouteConfig, YardConfig
+from v2hdm.simulate.port.config import PortConfig, RouteConfig, YardConfig
+from v2hdm.simulate.port.drive import rendered_drive
 from v2hdm.site.living.changes import Base
 
 CACHE = Path("~/.cache/v2hdm/living").expanduser()

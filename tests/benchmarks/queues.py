@@ -19,7 +19,7 @@ from tests.benchmarks.made.queue import detect_queue, make_queue
 from tests.benchmarks.made.world import drive_of, truth_of
 from v2hdm.errors import V2hdmError
 from v2hdm.mapping.methods import run_methods
-from v2hdm.pipeline.stages import BEST
+from v2hdm.records import BEST
 from v2hdm.report.metrics import driven_past, marking_metrics
 
 _CAMERA = "front"

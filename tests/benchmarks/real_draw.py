@@ -4,7 +4,7 @@
 
 The road is stitched from all images into tiles, pictures from above with the way along the driven path (m,
 to the right) and the offset to its left (m, upwards) at their margins. Mark in them what is painted and run
-it again with ``--drawn``, a file of :func:`~tests.benchmarks.real_reference.make_reference` with a
+it again with ``--drawn``, a file of :func:`~tests.benchmarks.real_reference.read_reference` with a
 ``polygon_road`` for each. Every camera is then moved until the drawing lies on the paint of its image, see
 :mod:`tests.benchmarks.real_align`; what belongs to another road or is optional moves none. Written are the
 same reference with these cameras, and the tiles again, sharper and drawn over: where something is out of
@@ -24,12 +24,12 @@ import cv2
 import numpy as np
 
 from tests.benchmarks.real_align import align
-from tests.benchmarks.real_drive import optimise, views_of_images
-from tests.benchmarks.real_reference import Reference, Route, make_reference
+from tests.benchmarks.real_drive import views_of_images
+from tests.benchmarks.real_reference import Reference, Route, read_reference
 from tests.benchmarks.real_view import View
-from v2hdm.detection.batch import detect_all, read_image
-from v2hdm.detection.options import DetectorOptions
-from v2hdm.io.drive import ReadOptions, read_drive
+from v2hdm.detection.batch import read_image
+from v2hdm.io.drive import ReadOptions
+from v2hdm.pipeline.map_drive import map_drive
 from v2hdm.records import FloatArray
 from v2hdm.store.files import replace_text
 
@@ -126,14 +126,14 @@ def main() -> None:
     if (parsed.drawn is None) != (parsed.output is None):
         parser.error("--drawn and --output belong together")
     cv2.setNumThreads(1)
-    drive = read_drive(parsed.drive, ReadOptions(cameras=[parsed.camera] if parsed.camera else []))
-    optimised = optimise(drive, detect_all(drive, DetectorOptions.for_mapping()))
-    views = views_of_images(drive, optimised)
+    result = map_drive(parsed.drive, reading=ReadOptions(cameras=[parsed.camera] if parsed.camera else []))
+    drive = result.drive
+    views = views_of_images(result)
     images = [read_image(image, drive.cameras[image.camera]) for image in drive.images]
     route_map = np.array([image.map_from_vehicle[:2, 3] for image in drive.images])
     polygons: list[FloatArray] = []
     if parsed.drawn is not None:
-        reference = make_reference(optimised.markings, route_map, parsed.drawn)
+        reference = read_reference(parsed.drawn, route_map)
         polygons = [p.polygon_map for p in reference.markings]
         views = _align_all(reference, views, images)
         content = json.loads(parsed.drawn.read_text(encoding="utf-8"))

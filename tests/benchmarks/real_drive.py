@@ -1,16 +1,20 @@
 """How well the shipped detector sees on a real drive, which no training ever showed.
 
-    python -m tests.benchmarks.real_drive --drive DRIVE [--reference FILE] [--overlays FOLDER]
+    python -m tests.benchmarks.real_drive --drive DRIVE --reference FILE [--max-sigma M] [--overlays FOLDER]
 
-The drive is detected in with the mapping's own settings and mapped once; the calibration and poses found
-place the reference, what is really painted there, in every image. Without a file it is the dashes of the map
-and those that must lie between them, see :func:`tests.benchmarks.real_reference.make_reference`.
+The drive is mapped as ``v2hdm map`` maps it. The reference is a file of what is really painted there, see
+:func:`tests.benchmarks.real_reference.read_reference`: never a map of our own. Two tables are printed.
 
-A marking counts in an image if it lies wholly inside, is not hidden and its centre is within 20 m of the
-camera on the ground. It is found by a detection of any class that overlaps it with its centre within half a
-metre; the class is right if that of the detection is. A detection (lane lines are none) is false if it has no
-part within half a metre of anything painted. Dashes are in the sun or under the trees by the light on the
-road around them: see :func:`tests.benchmarks.real_view.shaded_share`.
+*The map*: each marking of the reference is mapped if the map has one of its class whose centre lies within
+half a metre (an arrow's: one metre). Those that are missing are listed with the reason that the map gives. A
+marking of the map is false if nothing of the reference lies there and the reference is whole for its class.
+
+*The images*: the calibration and poses of the map place the reference in every image. A marking counts in an
+image if it lies wholly inside, is not hidden and its centre is within 20 m of the camera on the ground. It is
+found by a detection of any class that overlaps it with its centre as near as above; the class is right if
+that of the detection is. A detection (lane lines are none) is false if it has no part within half a metre of
+anything painted. Dashes are in the sun or under the trees by the light on the road around them: see
+:func:`tests.benchmarks.real_view.shaded_share`.
 """
 
 from __future__ import annotations
@@ -24,39 +28,41 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from tests.benchmarks.real_reference import Painted, Reference, centre_of_area, make_reference
+from tests.benchmarks.real_reference import TOLERANCE_M, Painted, Reference, centre_of_area, read_reference
 from tests.benchmarks.real_view import View, shaded_share
-from v2hdm.association.ground import views_of
-from v2hdm.association.sightings import collect_sightings, frames_of
-from v2hdm.detection.batch import detect_all, read_image
+from v2hdm.detection.batch import read_image
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.road import draw_detections
-from v2hdm.io.drive import ReadOptions, read_drive
-from v2hdm.mapping.conclusion import Optimised
-from v2hdm.mapping.optimise import Optimiser
+from v2hdm.errors import MapFileError
+from v2hdm.io.drive import ReadOptions
 from v2hdm.mapping.options import MappingOptions
+from v2hdm.pipeline.map_drive import map_drive
+from v2hdm.pipeline.result import Result
 from v2hdm.records import (
     ARROW,
     LANE_DASH,
     LANE_LINE,
-    Drive,
+    Exclusion,
     FloatArray,
-    ImageDetections,
-    Marking,
     MarkingDetection,
 )
+from v2hdm.site.options import AcceptanceOptions
 
 MAX_RANGE_M = 20.0
-TOLERANCE_M = 0.5
+"""Distance from the camera on the ground, m, up to which an image must show a marking."""
+
 SHADED_SHARE = 0.25
 """A dash is under the trees if more than this share of the road around it is in shade."""
+
+_LEFT_OUT_M = 1.5
+"""Distance, m, between a marking and a candidate that the map left out, up to which that is its reason."""
 
 _TARGETS = {"dashes in the sun": 0.98, "dashes under trees": 0.85}
 _GREEN, _RED, _MAGENTA, _GREY = (0, 220, 0), (0, 0, 255), (255, 0, 255), (160, 160, 160)
 
 
 @dataclass(frozen=True)
-class Seen:
+class Shown:
     """A marking of the reference, by index, that an image shows, and the class it was found as if it was."""
 
     marking: int
@@ -68,7 +74,7 @@ class Seen:
 class ImageResult:
     """What one image says: ``on`` pairs markings of the reference with the class of a detection on them."""
 
-    seen: list[Seen] = field(default_factory=list)
+    shown: list[Shown] = field(default_factory=list)
     on: list[tuple[int, str]] = field(default_factory=list)
     false: list[MarkingDetection] = field(default_factory=list)
 
@@ -85,7 +91,8 @@ def judge_image(
         ground = view.ground(shape_px)
         near = [m for m, p in enumerate(reference.markings) if is_near(ground, p.polygon_map)]
         if not near:
-            result.false.append(detection)
+            if not reference.whole or detection.kind in reference.whole:
+                result.false.append(detection)
             continue
         overlap = {m: _overlap(shape_px, polygons_px[m]) for m in near}
         best = max(overlap, key=overlap.__getitem__)
@@ -94,7 +101,7 @@ def judge_image(
         centre = centre_of_area(ground) if np.isfinite(ground).all() else np.full(2, np.nan)
         for m, share in overlap.items():
             beside_m = float(np.linalg.norm(centre - reference.markings[m].centre_map))
-            if share > 0 and beside_m <= TOLERANCE_M:
+            if share > 0 and beside_m <= reference.markings[m].tolerance_m:
                 pairs.append((share, m, d))
     found: dict[int, int] = {}
     for _, m, d in sorted(pairs, reverse=True):
@@ -107,7 +114,7 @@ def judge_image(
         if range_m > MAX_RANGE_M or not view.holds(polygons_px[m]):
             continue
         if not any(_touches_box(polygons_px[m], box) for box in hidden):
-            result.seen.append(Seen(m, range_m, detections[found[m]].kind if m in found else None))
+            result.shown.append(Shown(m, range_m, detections[found[m]].kind if m in found else None))
     return result
 
 
@@ -164,17 +171,19 @@ class Tally:
         self.taken_for: Counter[tuple[str, str]] = Counter()
         self.false: Counter[str] = Counter()
         self.images = 0
-        self.markings_seen: set[int] = set()
+        self.images_shown: Counter[int] = Counter()  # by marking, images that must show it
+        self.images_found: Counter[int] = Counter()  # and those in which it was found
 
     def add(self, result: ImageResult) -> None:
         """Count one image."""
         self.images += 1
-        for seen in result.seen:
-            group = self.groups[seen.marking]
-            self.markings_seen.add(seen.marking)
+        for shown in result.shown:
+            group = self.groups[shown.marking]
+            self.images_shown[shown.marking] += 1
+            self.images_found[shown.marking] += shown.found_as is not None
             self.seen[group] += 1
-            self.found[group] += seen.found_as is not None
-            self.right[group] += seen.found_as == self.kinds[seen.marking]
+            self.found[group] += shown.found_as is not None
+            self.right[group] += shown.found_as == self.kinds[shown.marking]
         for marking, kind in result.on:
             if not self.optional[marking]:
                 right = kind == self.kinds[marking]
@@ -233,7 +242,7 @@ def draw(image: np.ndarray, view: View, reference: Reference, result: ImageResul
 
     Detections that are false are magenta.
     """
-    state = {seen.marking: _GREEN if seen.found_as else _RED for seen in result.seen}
+    state = {shown.marking: _GREEN if shown.found_as else _RED for shown in result.shown}
     canvas = image.copy()
     for m, painted in enumerate(reference.markings):
         polygon = view.project(painted.polygon_map)
@@ -251,72 +260,98 @@ def _draw_polygon(
     cv2.polylines(canvas, [points], True, colour, width, cv2.LINE_AA, 4)
 
 
-def optimise(drive: Drive, detections: Sequence[ImageDetections]) -> Optimised:
-    """Map a drive with all its cameras together."""
-    cameras = tuple(drive.cameras)
-    sightings = collect_sightings(drive, detections, cameras)
-    views = views_of(drive, cameras)
-    optimiser = Optimiser(sightings, views, drive.cameras, drive.noises, MappingOptions())
-    return optimiser.finish(optimiser.settle(optimiser.initial_tracks()))
-
-
-def views_of_images(drive: Drive, optimised: Optimised) -> list[View]:
+def views_of_images(result: Result) -> list[View]:
     """The view of every image under the optimised calibration and poses."""
-    vehicle_from_map = np.linalg.inv(optimised.bundle.rig.map_from_vehicle)
-    frame = frames_of(drive).frame_of_image
     views = []
-    for index, image in enumerate(drive.images):
-        calibration = optimised.calibrations[image.camera]
-        views.append(View(calibration.info, calibration.cam_from_vehicle @ vehicle_from_map[frame[index]]))
+    for image in result.drive.images:
+        calibration = result.calibrations[image.camera]
+        vehicle_from_map = np.linalg.inv(result.trajectory.of_image(image))
+        views.append(View(calibration.info, calibration.cam_from_vehicle @ vehicle_from_map))
     return views
 
 
-def report(
-    drive: Drive,
-    detections: Sequence[ImageDetections],
-    optimised: Optimised,
-    reference_path: Path | None,
-    overlays: Path | None,
-) -> str:
-    """Judge every image, draw it if asked to, and return the table."""
-    views = views_of_images(drive, optimised)
-    route = np.array([image.map_from_vehicle[:2, 3] for image in drive.images])
-    reference = make_reference(optimised.markings, route, reference_path)
+def report(result: Result, reference: Reference, overlays: Path | None) -> str:
+    """Judge the map and every image, draw the images if asked to, and return the tables."""
     views = [
         replace(view, cam_from_map=reference.cam_from_map.get(index, view.cam_from_map))
-        for index, view in enumerate(views)
+        for index, view in enumerate(views_of_images(result))
     ]
+    drive = result.drive
     tally = Tally(reference, shaded_share(drive, views, reference.markings))
     for index, (view, image) in enumerate(zip(views, drive.images, strict=True)):
-        found = detections[index]
-        result = judge_image(view, reference, reference.hidden.get(index, []), found.markings)
-        tally.add(result)
+        detections = result.detections[index]
+        judged = judge_image(view, reference, reference.hidden.get(index, []), detections.markings)
+        tally.add(judged)
         if overlays:
             pixels = read_image(image, drive.cameras[image.camera])
-            shown = draw(draw_detections(pixels, found.markings, found.lanes), view, reference, result)
+            marked = draw_detections(pixels, detections.markings, detections.lanes)
             overlays.mkdir(parents=True, exist_ok=True)
-            cv2.imwrite(str(overlays / f"{index:06d}.png"), shown)
-    return summary(tally, reference) + "\n" + map_summary(optimised.markings, reference, tally)
+            cv2.imwrite(str(overlays / f"{index:06d}.png"), draw(marked, view, reference, judged))
+    hd_map = result.best.hd_map
+    mapped = [(marking.kind, marking.corners_map) for marking in hd_map.markings]
+    mapped += [(symbol.kind, symbol.outline_map) for symbol in hd_map.symbols]
+    on_map = map_summary(mapped, result.best.excluded, reference, tally)
+    return f"{result.verdict.lines[0]}\n\n{on_map}\n\n{summary(tally, reference)}"
 
 
-def map_summary(mapped: Sequence[Marking], reference: Reference, tally: Tally) -> str:
-    """What became of the detections in the map: markings of nothing painted, and dashes that it holds."""
+def map_summary(
+    mapped: Sequence[tuple[str, FloatArray]],
+    excluded: Sequence[Exclusion],
+    reference: Reference,
+    tally: Tally,
+) -> str:
+    """What of the reference the map holds, what is missing and why, and what of the map is false.
+
+    ``mapped`` are class and polygon (N, 2), m, of each marking and symbol of the map.
+    """
+    centres_map = np.array([centre_of_area(polygon) for _, polygon in mapped]).reshape(-1, 2)
+    kinds = np.array([kind for kind, _ in mapped])
+    lines = [f"{'':28s} {'painted':>8s} {'found':>6s} {'mapped':>7s}"]
+    missing = []
+    for kind in sorted({painted.kind for painted in reference.markings}):
+        asked = [
+            m
+            for m, painted in enumerate(reference.markings)
+            if painted.kind == kind and not (painted.optional or painted.other_road)
+        ]
+        lost = []
+        for m in asked:
+            painted = reference.markings[m]
+            off_m = np.linalg.norm(centres_map[kinds == kind] - painted.centre_map, axis=1)
+            if off_m.min(initial=np.inf) > painted.tolerance_m:
+                lost.append(m)
+        found = sum(tally.images_found[m] > 0 for m in asked)
+        lines.append(f"{kind:28s} {len(asked):8d} {found:6d} {len(asked) - len(lost):7d}")
+        missing += lost
+    for m in missing:
+        painted = reference.markings[m]
+        images = f"found in {tally.images_found[m]} of the {tally.images_shown[m]} images that show it"
+        lines.append(
+            f"missing: {painted.kind} at {_place(painted.centre_map)}: {images}; {_reason(painted, excluded)}"
+        )
     stray = [
-        f"{marking.kind} at {np.round(marking.corners_map.mean(axis=0), 1)}"
-        for marking in mapped
-        if not any(is_near(marking.corners_map, p.polygon_map) for p in reference.markings)
+        f"{kind} at {_place(centre_of_area(polygon))}"
+        for kind, polygon in mapped
+        if (not reference.whole or kind in reference.whole)
+        and not any(is_near(polygon, painted.polygon_map) for painted in reference.markings)
     ]
-    centres = np.array([m.corners_map.mean(axis=0) for m in mapped if m.kind == LANE_DASH]).reshape(-1, 2)
-    dashes = [m for m in tally.markings_seen if tally.groups[m].startswith("dashes")]
-    held = sum(
-        float(np.linalg.norm(centres - reference.markings[m].centre_map, axis=1).min(initial=np.inf))
-        <= TOLERANCE_M
-        for m in dashes
-    )
-    return (
-        f"map: {len(stray)} markings {_false_name(reference)} (target none) {stray}; "
-        f"{held} of the {len(dashes)} dashes of the road that images showed are in it"
-    )
+    listed = f": {'; '.join(stray)}" if stray else ""
+    lines.append(f"{_false_name(reference)}: {len(stray)} markings of the map (target none){listed}")
+    return "\n".join(lines)
+
+
+def _place(point_map: FloatArray) -> str:
+    """A point (2,) in words."""
+    return ", ".join(f"{coordinate_m:.1f}" for coordinate_m in point_map)
+
+
+def _reason(painted: Painted, excluded: Sequence[Exclusion]) -> str:
+    """Why the map left out the candidate that is nearest to a marking."""
+    offsets_m = [np.linalg.norm(candidate.position_map - painted.centre_map) for candidate in excluded]
+    if min(offsets_m, default=np.inf) > _LEFT_OUT_M:
+        return "no candidate of the map lies there"
+    nearest = excluded[int(np.argmin(offsets_m))]
+    return f"left out as {nearest.kind} of {nearest.sightings} sightings: {nearest.reason}"
 
 
 def main() -> None:
@@ -324,15 +359,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--drive", type=Path, required=True)
     parser.add_argument("--camera", help="the camera to look through, if the drive has several")
-    parser.add_argument("--reference", type=Path)
+    parser.add_argument("--reference", type=Path, required=True, help="file of what is painted there")
+    usual_m = AcceptanceOptions().max_sigma_m
+    parser.add_argument("--max-sigma", type=float, default=usual_m, help="mapping.acceptance.max_sigma_m")
     parser.add_argument("--overlays", type=Path, help="folder for a picture of every image")
     parser.add_argument("--model")
     parsed = parser.parse_args()
     cv2.setNumThreads(1)
-    drive = read_drive(parsed.drive, ReadOptions(cameras=[parsed.camera] if parsed.camera else []))
-    detections = detect_all(drive, replace(DetectorOptions.for_mapping(), model=parsed.model))
-    optimised = optimise(drive, detections)
-    print(report(drive, detections, optimised, parsed.reference, parsed.overlays))
+    result = map_drive(
+        parsed.drive,
+        options=MappingOptions(acceptance=AcceptanceOptions(max_sigma_m=parsed.max_sigma)),
+        detector=replace(DetectorOptions.for_mapping(), model=parsed.model),
+        reading=ReadOptions(cameras=[parsed.camera] if parsed.camera else []),
+    )
+    try:
+        reference = read_reference(parsed.reference, result.drive.route_map)
+    except MapFileError as error:
+        parser.error(str(error))
+    print(report(result, reference, parsed.overlays))
 
 
 if __name__ == "__main__":

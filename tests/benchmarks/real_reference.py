@@ -1,33 +1,33 @@
-"""What is painted on a real road, for :mod:`tests.benchmarks.real_drive`: read from a file, or from the map.
+"""What is painted on a real road, for :mod:`tests.benchmarks.real_drive`: read from a file that people drew.
 
-A real drive has no ground truth. Painted dashes repeat, though, so those that the map holds tell where the
-others are; a file drawn by hand corrects that, or replaces it.
+A reference never comes from a map of our own: what the map lacks would be missing in it, too.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
 from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.errors import MapFileError
-from v2hdm.records import LANE_DASH, FloatArray, Marking
+from v2hdm.records import ARROW, LANE_DASH, FloatArray
 
-MAX_FILLED_M = 30.0
-"""Between dashes of the map farther apart than this, none are implied."""
+TOLERANCE_M = 0.5
+"""Distance between the centres of a dash and of what is taken for it, up to which they are one marking."""
 
-MAX_BESIDE_M = 0.6
-MAX_OFF_BEAT_M = 0.5
-"""A dash this far beside its line, or from the beat of its line, is taken for another line's."""
+ARROW_TOLERANCE_M = 1.0
+"""The same of an arrow: its centre in a truth file is good to half a metre."""
 
-_LEAST_DASHES = 3
-_BEYOND_ROUTE_M = 30.0
-_PERIODS_M = (2.0, 18.0)
+REACH_M = 20.0
+"""Distance from the route, m, beyond which no marking of a drive's own reference lies."""
+
+_BEYOND_ROUTE_M = 30.0  # length, m, by which a route is continued straight at both ends
 
 
 @dataclass(frozen=True)
@@ -35,13 +35,15 @@ class Painted:
     """A marking that is really there: ``polygon_map`` (N, 2) m, any simple polygon.
 
     ``other_road`` says that it lies on a road beside the one driven, which need not be in its plane;
-    an ``optional`` one is neither missed where it is not found, nor false where it is.
+    an ``optional`` one is neither missed where it is not found, nor false where it is. Something is taken
+    for it whose centre lies within ``tolerance_m``.
     """
 
     kind: str
     polygon_map: FloatArray
     other_road: bool = False
     optional: bool = False
+    tolerance_m: float = TOLERANCE_M
 
     @property
     def centre_map(self) -> FloatArray:
@@ -51,16 +53,16 @@ class Painted:
 
 @dataclass(frozen=True)
 class Reference:
-    """All that is painted; ``whole`` if that is really all, so that anything else is false.
+    """All that is painted; of the classes ``whole`` it is really all, so that anything else is false.
 
     ``hidden`` are the boxes (u0, v0, u1, v1) of an image behind which something stands before the road;
     ``cam_from_map`` (4, 4) places the camera of an image better than the drive's own map does.
     """
 
     markings: tuple[Painted, ...]
-    whole: bool
-    hidden: dict[int, list[FloatArray]]
-    cam_from_map: dict[int, FloatArray] = field(default_factory=dict)
+    whole: frozenset[str]
+    hidden: Mapping[int, list[FloatArray]] = field(default_factory=dict)
+    cam_from_map: Mapping[int, FloatArray] = field(default_factory=dict)
 
 
 def centre_of_area(polygon: FloatArray) -> FloatArray:
@@ -72,39 +74,58 @@ def centre_of_area(polygon: FloatArray) -> FloatArray:
     return np.asarray(middle + np.array([moments["m10"], moments["m01"]]) / moments["m00"])
 
 
-def make_reference(mapped: Sequence[Marking], route_map: FloatArray, path: Path | None) -> Reference:
-    """The dashes of the map, completed along their lines, as the file at ``path`` corrects them.
+def read_reference(path: Path, route_map: FloatArray) -> Reference:
+    """The reference in a JSON file, as drawn over pictures of the road or measured otherwise.
 
-    The file is JSON: ``markings``, a list of ``{"kind", "polygon_map", "other_road", "optional"}``, each of
-    which takes the place of what it lies on; ``remove``, a list of places [x, y] where the map is wrong;
-    ``whole``, true if nothing else is painted, whereupon the map is not asked; ``hidden``, a list of
-    ``{"image", "box_px"}``; ``cam_from_map``, a list of ``{"image", "matrix"}``. Lengths are metres in the
-    map frame; a marking may give ``polygon_road``, ways along ``route_map`` (N, 2) and offsets to its left,
-    instead of ``polygon_map``. All but ``markings`` may be left out.
+    A file has ``markings``, a list of ``{"kind", "polygon_map", "other_road", "optional"}``; ``whole``, true
+    if nothing else is painted; ``hidden``, a list of ``{"image", "box_px"}``; ``cam_from_map``, a list of
+    ``{"image", "matrix"}``. Lengths are metres in the map frame; a marking may give ``polygon_road``, ways
+    along ``route_map`` (N, 2) and offsets to its left, instead of ``polygon_map``. All but ``markings`` may
+    be left out. A truth file has instead ``dashes``, corners (M, 4, 2), and ``arrows``, centres (2,) by name:
+    of these two classes it is whole.
 
     Raises:
-        MapFileError: the file is missing or not of this form.
+        MapFileError: the file is missing, not of this form, or of another drive than the route's.
     """
-    if path is None:
-        return Reference(tuple(complete_lines(mapped, route_map)), False, {})
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        drawn = [_painted(entry, route_map) for entry in content["markings"]]
-        places = np.array(content.get("remove", []), dtype=np.float64).reshape(-1, 2)
-        hidden: dict[int, list[FloatArray]] = {}
-        for entry in content.get("hidden", []):
-            hidden.setdefault(int(entry["image"]), []).append(np.array(entry["box_px"], dtype=np.float64))
-        cameras = {
-            int(entry["image"]): np.array(entry["matrix"], dtype=np.float64).reshape(4, 4)
-            for entry in content.get("cam_from_map", [])
-        }
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        raise MapFileError(f"{path}: no reference can be read ({error!r}); see make_reference") from error
-    whole = bool(content.get("whole", False))
-    implied = [] if whole else complete_lines(mapped, route_map)
-    taken = np.concatenate([places, *[p.centre_map[None] for p in drawn]])
-    kept = [p for p in implied if _nearest(p.centre_map, taken) > 1.0]
-    return Reference((*drawn, *kept), whole, hidden, cameras)
+        reference = _truth(content) if "dashes" in content else _drawn(content, route_map)
+    except (OSError, KeyError, TypeError, ValueError, AttributeError) as error:
+        raise MapFileError(f"{path}: no reference can be read ({error!r}); see read_reference") from error
+    centres = np.array([painted.centre_map for painted in reference.markings]).reshape(-1, 2)
+    offset_m = np.linalg.norm(centres[:, None] - route_map, axis=2)
+    if len(centres) and offset_m.min() > REACH_M:
+        raise MapFileError(
+            f"{path}: none of its {len(centres)} markings lies within {REACH_M:g} m of the route, the "
+            f"nearest {offset_m.min():.0f} m away: is it the reference of another drive?"
+        )
+    return reference
+
+
+def _drawn(content: Mapping[str, Any], route_map: FloatArray) -> Reference:
+    """The reference of a file with ``markings``."""
+    markings = tuple(_painted(entry, route_map) for entry in content["markings"])
+    hidden: dict[int, list[FloatArray]] = {}
+    for entry in content.get("hidden", []):
+        hidden.setdefault(int(entry["image"]), []).append(np.array(entry["box_px"], dtype=np.float64))
+    cameras = {
+        int(entry["image"]): np.array(entry["matrix"], dtype=np.float64).reshape(4, 4)
+        for entry in content.get("cam_from_map", [])
+    }
+    whole = frozenset(PAINT_CLASSES if content.get("whole", False) else ())
+    return Reference(markings, whole, hidden, cameras)
+
+
+def _truth(content: Mapping[str, Any]) -> Reference:
+    """The reference of a file with ``dashes`` and ``arrows``."""
+    corners_map = np.array(content["dashes"], dtype=np.float64).reshape(-1, 4, 2)
+    dashes = [Painted(LANE_DASH, corners) for corners in corners_map]
+    centres_map = np.array(list(content["arrows"].values()), dtype=np.float64).reshape(-1, 2)
+    # What is known of an arrow is its centre: it stands for all within its tolerance.
+    angle_rad = np.linspace(0.0, 2 * np.pi, 12, endpoint=False)
+    disc = ARROW_TOLERANCE_M * np.column_stack([np.cos(angle_rad), np.sin(angle_rad)])
+    arrows = [Painted(ARROW, centre + disc, tolerance_m=ARROW_TOLERANCE_M) for centre in centres_map]
+    return Reference((*dashes, *arrows), frozenset({LANE_DASH, ARROW}))
 
 
 def _painted(entry: dict[str, object], route_map: FloatArray) -> Painted:
@@ -115,34 +136,6 @@ def _painted(entry: dict[str, object], route_map: FloatArray) -> Painted:
     if on_road:
         polygon = Route(route_map).at(polygon)
     return Painted(str(entry["kind"]), polygon, bool(entry.get("other_road")), bool(entry.get("optional")))
-
-
-def _nearest(point: FloatArray, others: FloatArray) -> float:
-    return float(np.linalg.norm(others - point, axis=1).min(initial=np.inf))
-
-
-def complete_lines(mapped: Sequence[Marking], route_map: FloatArray) -> list[Painted]:
-    """The markings of the map and the dashes that are missing between its dashes.
-
-    Dashes are sorted by their way along the route (N, 2) and their offset from it into lines. On each the
-    n-th dash is at a constant beat; where none is mapped, one of the line's mean shape is put in.
-    """
-    out = [Painted(m.kind, m.corners_map) for m in mapped]
-    dashes = [m.corners_map for m in mapped if m.kind == LANE_DASH]
-    if len(dashes) < _LEAST_DASHES:
-        return out
-    route = Route(route_map)
-    way = route.along(np.array([centre_of_area(dash) for dash in dashes]))
-    for line in _lines(way):
-        size = np.median([_size(dashes[k]) for k in line], axis=0)
-        missing = _missing(way[line])
-        half_length = np.array([size[0] / 2, 0.0])
-        ends = zip(route.at(missing - half_length), route.at(missing + half_length), strict=True)
-        for start, end in ends:
-            side = np.array([start[1] - end[1], end[0] - start[0]]) / np.linalg.norm(end - start)
-            half = side * size[1] / 2
-            out.append(Painted(LANE_DASH, np.array([start - half, end - half, end + half, start + half])))
-    return out
 
 
 class Route:
@@ -178,44 +171,3 @@ class Route:
         at = [np.interp(way_offset[:, 0], self.way, self.points[:, k]) for k in (0, 1)]
         tx, ty = (np.interp(way_offset[:, 0], self.way, self.tangent[:, k]) for k in (0, 1))
         return np.asarray(np.column_stack(at) + way_offset[:, 1:] * np.column_stack([-ty, tx]))
-
-
-def _lines(way: FloatArray) -> list[list[int]]:
-    """Indices of dashes at (way, offset) (N, 2) by line; lines of too few dashes are left out."""
-    lines: list[list[int]] = []
-    for k in np.argsort(way[:, 0]):
-        for line in lines:
-            ahead, beside = way[k] - way[line[-1]]
-            if 0.5 < ahead <= MAX_FILLED_M and abs(beside) <= MAX_BESIDE_M:
-                line.append(int(k))
-                break
-        else:
-            lines.append([int(k)])
-    return [line for line in lines if len(line) >= _LEAST_DASHES]
-
-
-def _missing(way: FloatArray) -> FloatArray:
-    """(way, offset) of the dashes that the beat of a line (N, 2), in order, has between its own."""
-    steps = np.diff(way[:, 0])
-    usual = steps[(steps > _PERIODS_M[0]) & (steps < _PERIODS_M[1])]
-    if not len(usual):
-        return np.empty((0, 2))
-    period = float(np.median(usual[usual < 1.5 * usual.min()]))
-    count = np.concatenate([[0], np.cumsum(np.maximum(np.round(steps / period), 1))])
-    beat = np.polyfit(count, way[:, 0], 1)
-    on_beat = np.abs(np.polyval(beat, count) - way[:, 0]) <= MAX_OFF_BEAT_M
-    missing = np.setdiff1d(np.arange(count[-1]), count)
-    # Painters drift: a dash lies where its neighbours say, not where the whole line's beat does.
-    at = (
-        np.interp(missing, count[on_beat], way[on_beat, 0])
-        if on_beat.sum() > 1
-        else np.polyval(beat, missing)
-    )
-    return np.column_stack([at, np.interp(at, way[:, 0], way[:, 1])])
-
-
-def _size(corners: FloatArray) -> tuple[float, float]:
-    """Length and width of a quadrilateral (4, 2)."""
-    sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
-    first, second = (sides[0] + sides[2]) / 2, (sides[1] + sides[3]) / 2
-    return float(max(first, second)), float(min(first, second))

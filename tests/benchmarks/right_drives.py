@@ -42,8 +42,8 @@ from v2hdm.errors import V2hdmError
 from v2hdm.faults.odds import doubt, log_odds, matters
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import AUTO, GROUNDS, MappingOptions
-from v2hdm.pipeline.stages import BEST, camera_sets
-from v2hdm.records import Drive, FloatArray, HDMap
+from v2hdm.pipeline.stages import camera_sets
+from v2hdm.records import BEST, Drive, FloatArray, HDMap
 from v2hdm.report.metrics import driven_past, marking_metrics
 from v2hdm.verdict import Finding, Verdict
 from v2hdm.verdict.inputs.drive import causes, check_camera, check_road
@@ -78,7 +78,7 @@ class Row:
     road: bool
     status: str
     findings: list[dict[str, Any]] = field(default_factory=list)
-    untold: list[dict[str, Any]] = field(default_factory=list)
+    unobservable: list[dict[str, Any]] = field(default_factory=list)
     rmse_m: float = float("nan")
     height_rmse_m: float = float("nan")
     height_scatter_m: float = float("nan")
@@ -172,7 +172,7 @@ def map_one(job: Job) -> Row:
         **about,
         status=verdict.status.value,
         findings=[finding.as_json() for finding in verdict.raised],
-        untold=[finding.as_json() for finding in verdict.unobservable],
+        unobservable=[finding.as_json() for finding in verdict.unobservable],
         rmse_m=figures.corner_rmse_m,
         height_rmse_m=float(np.sqrt(np.mean(height_off_m**2))) if len(height_off_m) else float("nan"),
         height_scatter_m=float(np.std(height_off_m)) if len(height_off_m) else float("nan"),
@@ -225,7 +225,7 @@ def _test(one: Any) -> dict[str, Any]:
     own = getattr(one, "p_value", None)
     whose = "each" if len(one.cameras) == 1 else "all"
     return {
-        "kind": f"{one.fault.value} {one.axis} {whose}",
+        "kind": f"{one.fault.name} {one.axis} {whose}",
         "cameras": list(one.cameras),
         "p": float(chi2.sf(one.sigmas**2, 1)) if own is None else float(own),
         "value": one.value,
@@ -278,7 +278,7 @@ def judge(row: Row, clean: Row) -> tuple[bool, bool, str]:
     wrong = not row.rmse_m <= RIGHT_FACTOR * clean.rmse_m
     said, pattern = [_clause(finding) for finding in row.findings], spoil.cause
     if row.route == "straight" and spoil.hidden is not None and not said:
-        said, pattern = [_clause(finding) for finding in row.untold], spoil.hidden
+        said, pattern = [_clause(finding) for finding in row.unobservable], spoil.hidden
     if pattern is None or not said:
         return wrong, bool(said), "-"
     hits = [re.search(pattern, one, re.IGNORECASE) is not None for one in said]

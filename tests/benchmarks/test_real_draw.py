@@ -12,7 +12,7 @@ import pytest
 
 from tests.benchmarks.real_align import align, edge_offsets
 from tests.benchmarks.real_draw import Tile, stitch
-from tests.benchmarks.real_reference import Route, make_reference
+from tests.benchmarks.real_reference import Route, read_reference
 from tests.benchmarks.real_view import View
 from v2hdm.records import CameraInfo, FloatArray
 
@@ -130,6 +130,6 @@ def test_a_polygon_drawn_along_the_road_lies_beside_the_driven_path(tmp_path: Pa
     route_map = np.column_stack([np.zeros(81), np.linspace(0, 40, 81)])
     road = [[35.0, 1.5], [38.0, 1.5], [38.0, 1.7]]
     path.write_text(json.dumps({"markings": [{"kind": "arrow", "polygon_road": road}], "whole": True}))
-    polygon = make_reference([], route_map, path).markings[0].polygon_map
+    polygon = read_reference(path, route_map).markings[0].polygon_map
     # The route goes north, from 29.9 m before its start on; left of it is west.
     np.testing.assert_allclose(polygon, [[-1.5, 5.1], [-1.5, 8.1], [-1.7, 8.1]], atol=0.01)

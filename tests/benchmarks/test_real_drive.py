@@ -9,10 +9,18 @@ import numpy as np
 import pytest
 
 from tests.benchmarks.real_drive import Tally, judge_image, map_summary, summary
-from tests.benchmarks.real_reference import Painted, Reference, make_reference
+from tests.benchmarks.real_reference import Painted, Reference, read_reference
 from tests.benchmarks.real_view import View
 from v2hdm.errors import MapFileError
-from v2hdm.records import ARROW, LANE_DASH, CameraInfo, FloatArray, Marking, MarkingDetection
+from v2hdm.records import (
+    ARROW,
+    LANE_DASH,
+    LANE_LINE,
+    CameraInfo,
+    Exclusion,
+    FloatArray,
+    MarkingDetection,
+)
 
 INFO = CameraInfo("front", 1200, 600, np.array([[700.0, 0, 600], [0, 700.0, 200], [0, 0, 1]]))
 # The camera stands 1.6 m above the origin and looks along the map's x.
@@ -24,85 +32,81 @@ def dash(x: float, y: float = 1.5) -> FloatArray:
     return np.array([[x, y - 0.1], [x + 3, y - 0.1], [x + 3, y + 0.1], [x, y + 0.1]])
 
 
-def mapped(*starts: float) -> list[Marking]:
-    return [Marking(LANE_DASH, dash(x), 5) for x in starts]
-
-
 def detection(polygon_map: FloatArray, kind: str = LANE_DASH) -> MarkingDetection:
     return MarkingDetection(kind, 0.9, VIEW.project(polygon_map), np.eye(8), np.ones(4, dtype=np.bool_))
 
 
-def one(*painted: Painted) -> Reference:
-    return Reference(painted, True, {})
+def whole(*painted: Painted) -> Reference:
+    return Reference(painted, frozenset({LANE_DASH, ARROW}))
 
 
-def test_a_dash_that_the_map_lacks_is_put_between_its_neighbours() -> None:
-    found = make_reference(mapped(2, 8, 20, 26), ROUTE, None)
-    assert len(found.markings) == 5
-    assert not found.whole
-    np.testing.assert_allclose(found.markings[-1].centre_map, [15.5, 1.5], atol=0.05)
-    np.testing.assert_allclose(np.ptp(found.markings[-1].polygon_map, axis=0), [3.0, 0.2], atol=0.02)
+def written(folder: Path, content: object) -> Path:
+    path = folder / "reference.json"
+    path.write_text(json.dumps(content))
+    return path
 
 
-def test_dashes_of_two_lines_are_completed_apart_and_not_beyond_their_ends() -> None:
-    other = [Marking(LANE_DASH, dash(x, -1.8), 5) for x in (5, 11, 17)]
-    found = make_reference([*mapped(2, 8, 20, 26), *other], ROUTE, None)
-    assert len(found.markings) == 8
-
-
-def test_a_file_adds_removes_hides_and_places_cameras(tmp_path: Path) -> None:
-    path = tmp_path / "reference.json"
+def test_a_drawn_file_places_markings_hides_and_places_cameras(tmp_path: Path) -> None:
     arrow = {"kind": ARROW, "polygon_map": [[10, 0], [14, 0], [12, 1]]}
     hidden = [{"image": 3, "box_px": [0, 0, 10, 10]}]
     camera = [{"image": 5, "matrix": VIEW.cam_from_map.tolist()}]
-    content = {"markings": [arrow], "remove": [[3.5, 1.5]], "hidden": hidden, "cam_from_map": camera}
-    path.write_text(json.dumps(content))
-    found = make_reference(mapped(2, 8, 14), ROUTE, path)
-    assert [p.kind for p in found.markings] == [ARROW, LANE_DASH, LANE_DASH]
-    assert len(found.hidden[3]) == 1
-    np.testing.assert_array_equal(found.cam_from_map[5], VIEW.cam_from_map)
+    path = written(tmp_path, {"markings": [arrow], "hidden": hidden, "cam_from_map": camera})
+    reference = read_reference(path, ROUTE)
+    assert [painted.kind for painted in reference.markings] == [ARROW]
+    assert not reference.whole
+    assert len(reference.hidden[3]) == 1
+    np.testing.assert_array_equal(reference.cam_from_map[5], VIEW.cam_from_map)
 
 
-def test_a_file_that_is_whole_leaves_the_map_out(tmp_path: Path) -> None:
-    path = tmp_path / "reference.json"
-    path.write_text(json.dumps({"markings": [], "whole": True}))
-    assert make_reference(mapped(2, 8, 14), ROUTE, path).markings == ()
+def test_a_truth_file_is_whole_for_dashes_and_arrows_alone(tmp_path: Path) -> None:
+    content = {"dashes": [dash(8).tolist()], "arrows": {"left": [20.0, 1.0]}, "whole": "in reach"}
+    reference = read_reference(written(tmp_path, content), ROUTE)
+    assert [painted.kind for painted in reference.markings] == [LANE_DASH, ARROW]
+    assert reference.whole == {LANE_DASH, ARROW}
+    np.testing.assert_allclose(reference.markings[1].centre_map, [20.0, 1.0], atol=1e-6)
+
+
+def test_the_reference_of_another_drive_is_refused(tmp_path: Path) -> None:
+    path = written(tmp_path, {"dashes": [dash(8, y=500.0).tolist()], "arrows": {}})
+    with pytest.raises(MapFileError, match=r"within 20 m of the route, the nearest 500 m away"):
+        read_reference(path, ROUTE)
 
 
 @pytest.mark.parametrize(
-    "text", ["no json", '{"markings": [{"kind": "cow", "polygon_map": [[0, 0]]}]}', "{}"]
+    "text",
+    ["no json", "[]", '{"markings": [{"kind": "cow", "polygon_map": [[0, 0]]}]}', "{}", '{"dashes": [[1]]}'],
 )
 def test_a_file_of_another_form_is_refused_by_name(tmp_path: Path, text: str) -> None:
     path = tmp_path / "reference.json"
     path.write_text(text)
     with pytest.raises(MapFileError, match=r"reference\.json"):
-        make_reference([], ROUTE, path)
+        read_reference(path, ROUTE)
 
 
 def test_a_marking_is_found_only_within_half_a_metre() -> None:
-    reference = one(Painted(LANE_DASH, dash(8)))
+    reference = whole(Painted(LANE_DASH, dash(8)))
     for offset, found_as in ((0.3, LANE_DASH), (0.8, None)):
         result = judge_image(VIEW, reference, [], [detection(dash(8 + offset))])
-        assert [seen.found_as for seen in result.seen] == [found_as]
+        assert [shown.found_as for shown in result.shown] == [found_as]
         assert not result.false
 
 
 def test_what_is_far_cut_or_hidden_is_not_asked_for() -> None:
     for start in (0.5, 19.0):
-        assert not judge_image(VIEW, one(Painted(LANE_DASH, dash(start))), [], []).seen
+        assert not judge_image(VIEW, whole(Painted(LANE_DASH, dash(start))), [], []).shown
     box = np.array([0.0, 0.0, 1200.0, 600.0])
-    assert not judge_image(VIEW, one(Painted(LANE_DASH, dash(8))), [box], []).seen
+    assert not judge_image(VIEW, whole(Painted(LANE_DASH, dash(8))), [box], []).shown
 
 
 def test_a_detection_away_from_all_paint_is_false_and_one_beside_its_dash_is_not() -> None:
-    reference = one(Painted(LANE_DASH, dash(8)))
+    reference = whole(Painted(LANE_DASH, dash(8)))
     result = judge_image(VIEW, reference, [], [detection(dash(8, -3.0)), detection(dash(8, 1.2))])
     assert len(result.false) == 1
-    assert result.seen[0].found_as is None
+    assert result.shown[0].found_as is None
 
 
 def test_two_detections_on_one_dash_find_it_once_and_a_wrong_class_is_told() -> None:
-    reference = one(Painted(LANE_DASH, dash(8)))
+    reference = whole(Painted(LANE_DASH, dash(8)))
     given = [detection(dash(8), ARROW), detection(dash(8.3))]
     tally = Tally(reference, np.zeros(1))
     tally.add(judge_image(VIEW, reference, [], given))
@@ -113,16 +117,24 @@ def test_two_detections_on_one_dash_find_it_once_and_a_wrong_class_is_told() -> 
 
 
 def test_an_optional_marking_is_neither_missed_nor_false() -> None:
-    reference = one(Painted(LANE_DASH, dash(8), optional=True))
+    reference = whole(Painted(LANE_DASH, dash(8), optional=True))
     result = judge_image(VIEW, reference, [], [detection(dash(8))])
-    assert not result.seen
+    assert not result.shown
     assert not result.false
 
 
 def test_the_map_is_judged_by_what_is_painted() -> None:
-    reference = one(Painted(LANE_DASH, dash(8)), Painted(LANE_DASH, dash(14)))
-    tally = Tally(reference, np.zeros(2))
-    tally.add(judge_image(VIEW, reference, [], []))
-    text = map_summary([*mapped(8), Marking(LANE_DASH, dash(8, -4.0), 3)], reference, tally)
-    assert "1 markings false" in text
-    assert "1 of the 2 dashes of the road" in text
+    reference = whole(Painted(LANE_DASH, dash(8)), Painted(LANE_DASH, dash(14)), Painted(LANE_DASH, dash(20)))
+    tally = Tally(reference, np.zeros(3))
+    tally.add(judge_image(VIEW, reference, [], [detection(dash(14))]))
+    mapped = [(LANE_DASH, dash(8)), (LANE_DASH, dash(8, -4.0)), (LANE_LINE, dash(8, -6.0))]
+    left_out = Exclusion(LANE_DASH, np.array([15.0, 1.5]), 7, "its position is too uncertain")
+    table, *rest = map_summary(mapped, [left_out], reference, tally).split("\n")[1:]
+    assert table.split() == ["lane_dash", "3", "1", "1"]
+    assert rest == [
+        "missing: lane_dash at 15.5, 1.5: found in 1 of the 1 images that show it; left out as lane_dash of "
+        "7 sightings: its position is too uncertain",
+        "missing: lane_dash at 21.5, 1.5: found in 0 of the 0 images that show it; no candidate of the map "
+        "lies there",
+        "false: 1 markings of the map (target none): lane_dash at 9.5, -4.0",
+    ]

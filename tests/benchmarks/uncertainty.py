@@ -29,7 +29,8 @@ from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.results import MethodResult
 from v2hdm.records import Calibration, Drive, FloatArray, Marking, PoseNoise, Truth
 from v2hdm.report.metrics import match_markings
-from v2hdm.simulate import PortConfig, rendered_drive
+from v2hdm.simulate.port.config import PortConfig
+from v2hdm.simulate.port.drive import rendered_drive
 from v2hdm.site.markings import neighbours
 
 QUANTITIES = ("corners", "sides", "distances", "height", "roll", "pitch", "yaw")

@@ -33,7 +33,8 @@ from v2hdm.mapping.options import MappingOptions
 from v2hdm.pipeline.config import DriveConfig, RunConfig
 from v2hdm.pipeline.run import run
 from v2hdm.report.metrics import marking_metrics
-from v2hdm.simulate import PortConfig, rendered_drive
+from v2hdm.simulate.port.config import PortConfig
+from v2hdm.simulate.port.drive import rendered_drive
 from v2hdm.workers import share_out
 
 ROUTES = {
@@ -59,7 +60,7 @@ class Outcome:
     false: int = 0
     markings: int = 0
     findings: list[dict[str, Any]] = field(default_factory=list)
-    untold: list[dict[str, Any]] = field(default_factory=list)
+    unobservable: list[dict[str, Any]] = field(default_factory=list)
     seconds: float = 0.0
 
 
@@ -127,7 +128,7 @@ def map_drive(
         false,
         markings,
         verdict["findings"],
-        verdict.get("untold", []),
+        verdict.get("unobservable", verdict.get("untold", [])),
         time.perf_counter() - begin_s,
     )
 
@@ -152,7 +153,7 @@ def judge(drive: str, fault: Fault, outcome: Outcome, clean: Outcome) -> Row:
     told = outcome.status in ("WARN", "FAIL", _REFUSED)
     hidden = fault.hidden_on_straight if "straight" in drive else None
     if hidden is not None and not told:
-        said = [_clause(one) for one in outcome.untold]
+        said = [_clause(one) for one in outcome.unobservable]
         told, pattern = bool(said), hidden
     named = [pattern is None or re.search(pattern, one, re.IGNORECASE) is not None for one in said]
     return Row(drive, fault.name, outcome, right, told, any(named), bool(named and named[0]))

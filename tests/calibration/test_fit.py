@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.calibration.site import INFO, PLACES, clicked, mounting, project
-from v2hdm.calibration.fit import Noise, Seen, fit_mountings
+from v2hdm.calibration.fit import Noise, SeenPoints, fit_mountings
 from v2hdm.calibration.points import SurveyedPoints, known_ground, lens, residuals
 from v2hdm.geometry.ipm import apply_in_front, facing_ipm, ipm_from_extrinsic
 from v2hdm.geometry.lens import undistort_points
@@ -18,7 +18,7 @@ NAMES = tuple(f"P{n}" for n in range(1, 11))
 
 def fit(px, places, noise, starts=1):
     points = SurveyedPoints(Path("points.csv"), NAMES, NAMES, px, places)
-    return fit_mountings(Seen.of(points.points_px, points.points_vehicle, INFO, noise), starts)[0]
+    return fit_mountings(SeenPoints.of(points.points_px, points.points_vehicle, INFO, noise), starts)[0]
 
 
 def by_tangent(places):
@@ -92,7 +92,7 @@ def test_one_wrong_point_is_named_and_moves_nothing(moved):
     others = np.arange(10) != wrong
     np.testing.assert_array_equal(found.is_right, others)
     without = fit_mountings(
-        Seen.of(px[others], places[others], INFO, Noise()), starts=4
+        SeenPoints.of(px[others], places[others], INFO, Noise()), starts=4
     )[0]  # fmt: skip
     np.testing.assert_allclose(found.cam_from_vehicle, without.cam_from_vehicle, atol=1e-4)
     off = residuals(found)
@@ -118,12 +118,12 @@ def test_a_wrong_focal_length_is_told_with_its_size():
     longer = INFO.intrinsic * [[1.04, 1, 1], [1, 1.04, 1], [1, 1, 1]]
     info = type(INFO)("front", 1280, 720, longer, INFO.distortion_model, INFO.distortion)
     px, places = clicked(2)
-    tested = lens(fit_mountings(Seen.of(px, places, info, Noise()))[0])
+    tested = lens(fit_mountings(SeenPoints.of(px, places, info, Noise()))[0])
     assert tested.probability < 1e-4
-    assert tested.focal[0] == pytest.approx(1 / 1.04 - 1, abs=0.012)
+    assert tested.focal == pytest.approx(1 / 1.04 - 1, abs=0.012)
     right = lens(fit(px, places, Noise()))
     assert right.probability > 1e-3
-    assert abs(right.focal[0]) < 4 * right.focal[1]
+    assert abs(right.focal) < 4 * right.focal_sigma
 
 
 MOUNTINGS = {
@@ -150,5 +150,5 @@ def test_cameras_that_look_any_way_through_any_lens_are_found(where, model):
     ipm = facing_ipm(ipm_from_extrinsic(info, truth), ahead[:2])
     places = apply_in_front(ipm, undistort_points(info, px))
     assert np.isfinite(places).all()
-    found = fit_mountings(Seen.of(px, places, info, Noise()), starts=1)[0]
+    found = fit_mountings(SeenPoints.of(px, places, info, Noise()), starts=1)[0]
     np.testing.assert_allclose(found.cam_from_vehicle, truth, atol=1e-5)

@@ -17,7 +17,7 @@ from onnx import TensorProto, helper, numpy_helper
 from tests.cameras import mounted
 from v2hdm.catalogue import PAINT_CLASSES, SHIPPED
 from v2hdm.detection.camera import RoadCamera
-from v2hdm.detection.classifier import rectified_views
+from v2hdm.detection.evidence import rectified_views
 from v2hdm.detection.lanes.curves import LaneImage
 from v2hdm.detection.lanes.lines import find_boundaries
 from v2hdm.detection.network import AnchorRow, NetworkOutput

@@ -20,8 +20,8 @@ from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.quads.fit import fit_quadrilaterals
-from v2hdm.detection.quads.lattice import variance_inflation
 from v2hdm.detection.quads.propose import open_sides
+from v2hdm.detection.quads.robust import variance_inflation
 from v2hdm.geometry.planar import order_corners, side_frames, signed_area
 from v2hdm.simulate.render.renderer import Renderer
 from v2hdm.simulate.render.scene import Box, Paint, Scene
@@ -285,7 +285,7 @@ def test_paint_brighter_than_the_sensor_can_say_is_not_drawn_larger(paint):
     camera = make_camera()
     shapes = [diamond(x, y, 1.2, 0.7, 9.0 * y) for x in (6.0, 8.0, 10.0) for y in (-1.9, -0.3, 1.4)]
     fit, _, _, error = fitted(picture(camera, shapes, paint=paint, blur_px=0.9), camera, shapes)
-    _, normal, _ = side_frames(fit.quad.corners)
+    normal = side_frames(fit.quad.corners).normal
     outward = (error * normal).sum(axis=-1)
     assert abs(np.median(outward)) < 0.12
     assert np.median(np.linalg.norm(error, axis=-1)) < 0.25
@@ -319,7 +319,7 @@ def test_a_crack_along_one_side_hides_that_side_alone():
     shape = bar(6.0, 0.0, 3.0, 0.3)
     image = picture(camera, [shape]).copy()
     corners = order_corners(to_image(camera, shape))
-    _, _, length = side_frames(corners)
+    length = side_frames(corners).length
     side = int(length.argmax())
     first, last = corners[side], corners[(side + 1) % 4]
     rng = np.random.default_rng(1)

@@ -11,19 +11,13 @@ from tests.detection.pictures import bar, brightness_model, diamond, make_camera
 from train.fit_judge import fit
 from v2hdm.catalogue import load_catalogue
 from v2hdm.detection.camera import RoadCamera
-from v2hdm.detection.classifier import (
-    AMONG,
-    CHANNELS,
-    COMPANIES,
-    COMPANY,
-    FEATURES,
-    SHAPES,
-    classify_among,
-    company,
-)
+from v2hdm.detection.classifier import AMONG, COMPANIES, SHAPES, classify_among
+from v2hdm.detection.company import COMPANY, company
 from v2hdm.detection.detector import Detector
+from v2hdm.detection.evidence import CHANNELS, FEATURES
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.quads.propose import Blob, open_sides, propose
+from v2hdm.detection.quads.blobs import Blob
+from v2hdm.detection.quads.propose import open_sides, propose
 from v2hdm.detection.weights import CONFIDENCE_FILE, JUDGE_FILE
 from v2hdm.geometry.planar import order_corners
 from v2hdm.records import ARROW, CHEVRON, DIAMOND, LANE_DASH, LANE_LINE, OTHER_PAINT, STOP_LINE

@@ -7,11 +7,13 @@ import pytest
 from tests.detection.pictures import LENSES, bar, diamond, make_camera, output_of, picture, to_image, view_of
 from v2hdm.catalogue import PAINT_CLASSES, SHIPPED
 from v2hdm.detection.camera import RoadCamera
-from v2hdm.detection.classifier import CHANNELS, SIZE
+from v2hdm.detection.evidence import CHANNELS, SIZE
 from v2hdm.detection.network import NetworkOutput
-from v2hdm.detection.quads.lattice import blurred_coverage
+from v2hdm.detection.quads.blobs import Blob, find_blobs
+from v2hdm.detection.quads.coverage import blurred_coverage
+from v2hdm.detection.quads.outline import on_edges, outline_polygon
 from v2hdm.detection.quads.patch import ImageQuads, LensFrames
-from v2hdm.detection.quads.propose import Blob, Proposal, find_blobs, on_edges, outline_polygon
+from v2hdm.detection.quads.propose import Proposal
 from v2hdm.geometry.planar import Quad, order_corners, side_frames, signed_area
 from v2hdm.records import DIAMOND, LANE_DASH
 
@@ -35,7 +37,7 @@ def lattice(columns, rows):
 def test_blurred_coverage_is_that_of_a_finely_drawn_and_blurred_shape():
     blur_px, fine = 0.7, 15
     u, v = np.meshgrid((np.arange(45 * fine) + 0.5) / fine - 0.5, (np.arange(28 * fine) + 0.5) / fine - 0.5)
-    _, normal, _ = side_frames(KITE)
+    normal = side_frames(KITE).normal
     offset = np.stack([u, v], axis=-1)[:, :, None] - KITE
     drawn = ((offset * normal).sum(axis=-1) < 0).all(axis=-1).astype(np.float32)
     drawn = cv2.GaussianBlur(drawn, (0, 0), blur_px * fine)[fine // 2 :: fine, fine // 2 :: fine]
@@ -48,7 +50,7 @@ def test_the_derivative_of_coverage_is_its_slope():
     """Corner c is the start of side c and the end of side c - 1, and moves each along its normal."""
     points, step = lattice(45, 28), 0.15
     _, by_side = blurred_coverage(Quad(KITE[None]), points, 0.7)
-    _, normal, _ = side_frames(KITE)
+    normal = side_frames(KITE).normal
     for corner, axis in np.ndindex(4, 2):
         shift = np.zeros((1, 4, 2))
         shift[0, corner, axis] = step

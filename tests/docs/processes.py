@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[2]
 
 LOADED = (
     "torch", "kornia", "scipy.optimize", "hydra", "matplotlib.pyplot", "rasterio", "pyogrio", "ezdxf",
-    "v2hdm.cli.compose", "v2hdm.cli.runs", "v2hdm.verdict.check", "v2hdm.pipeline.detect_images",
+    "v2hdm.cli.compose", "v2hdm.cli.commands.map", "v2hdm.verdict.check", "v2hdm.pipeline.detect_images",
     "v2hdm.mosaic.result", "v2hdm.localization", "v2hdm.calibration", "v2hdm.adjust.kernels.engine",
     "rosbags.highlevel",
 )  # fmt: skip

@@ -14,7 +14,7 @@ def smaller(arguments: list[str]) -> list[str]:
     name, given = arguments[0], arguments[1:]
     if (name in ("check", "localize") and "--list-topics" not in given) or given[:1] == ["ground"]:
         return [*arguments, "--workers", "1"]
-    if name != "map" or "--cfg=job" in given:
+    if name not in ("map", "simulate") or "--cfg=job" in given:
         return arguments
     ports = [one for one in given if one.startswith("+run=port")]
     return [*arguments, *(SMALL_PORT if ports else ()), "workers=1"]

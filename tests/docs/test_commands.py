@@ -18,7 +18,7 @@ from tests.docs.blocks import ROOT, blocks, document, documents
 from tests.docs.processes import python_in
 from tests.docs.sandbox import furnish
 from v2hdm import __version__
-from v2hdm.cli.main import COMMANDS, HOMES
+from v2hdm.cli.main import command_names
 from v2hdm.io.maps.reading import read_geojson
 
 RUN_BY = {
@@ -37,7 +37,7 @@ SHELL = [block for name in documents() for block in blocks(name, "sh")]
 RUN = [block for block in SHELL if block.not_run_because is None and not run_elsewhere(block)]
 PYTHON = [block for name in documents() for block in blocks(name, "python")]
 NOT_RUN = [block for block in SHELL if block.not_run_because is not None]
-COMPOSED = ("map", "experiment", "train", "export")
+COMPOSED = ("map", "simulate", "experiment", "train", "export")
 """Commands whose arguments are checked by composing their configuration."""
 
 FOREIGN = ("pip",)
@@ -155,9 +155,9 @@ def test_what_is_not_run_names_commands_and_settings_that_are_there(block, shell
             continue
         module, *arguments = shlex.split(called.group(1))
         if module == "v2hdm":
-            name = next(one for one in COMMANDS if " ".join(arguments).startswith(one))
+            name = next(one for one in command_names() if " ".join(arguments).startswith(one))
             program, arguments = ["v2hdm", *name.split()], arguments[len(name.split()) :]
-            module = f"v2hdm.cli.{HOMES.get(name, (name,))[0]}"
+            module = f"v2hdm.cli.commands.{name.replace(' ', '_')}"
         else:
             name, program = module.removeprefix("v2hdm."), ["python", "-m", module]
         assert importlib.util.find_spec(module) is not None, line
@@ -182,7 +182,7 @@ def test_a_document_names_only_modules_extras_and_targets_that_are_there(name):
     for module in re.findall(r"python -m ([a-z][a-z_0-9.]*[a-z_0-9])\b", text):
         assert importlib.util.find_spec(module) is not None, module
     for name in re.findall(r"(?:`|^)v2hdm (calibrate [a-z]+|[a-z]+)\b", text, re.MULTILINE):
-        assert name in COMMANDS, name
+        assert name in command_names(), name
     for listed in re.findall(r"(?:\.|v2hdm|\.whl)\[([a-z, ]+)\]'", text):
         assert {one.strip() for one in listed.split(",")} <= set(EXTRAS), listed
     targets = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)

@@ -1,12 +1,12 @@
 """The documentation's site builds without a warning, and asks no other machine for anything."""
 
+import os
 import re
 import subprocess
 import sys
-from types import SimpleNamespace
+import tomllib
 
 import pytest
-import yaml
 
 from tests.docs.blocks import ROOT, module_at
 from tests.report.page.browser import browser_path, opened
@@ -17,19 +17,19 @@ _IMPORTED = re.compile(r"""(?:url\(|@import)\s*["']?(?:https?:|//)""")
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    pytest.importorskip("material", reason="no mkdocs-material: pip install 'v2hdm[docs]'")
-    folder = tmp_path_factory.mktemp("site")
+    pytest.importorskip("zensical", reason="no zensical: pip install 'v2hdm[docs]'")
+    folder = tmp_path_factory.mktemp("built") / "site"
     built = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)],
-        cwd=ROOT, capture_output=True, text=True, timeout=120, env={"NO_MKDOCS_2_WARNING": "1", "PATH": ""},
+        [sys.executable, str(ROOT / "docs" / "tools" / "site.py"), str(folder)],
+        cwd=ROOT, capture_output=True, text=True, timeout=120, env=os.environ | {"PYTHONPATH": str(ROOT)},
     )  # fmt: skip
-    assert built.returncode == 0, built.stderr
-    assert "WARNING" not in built.stderr
+    assert built.returncode == 0, built.stdout + built.stderr
+    assert "No issues found" in built.stderr
     return folder
 
 
 def test_every_page_is_built_and_in_the_navigation(site):
-    listed = set(re.findall(r"[\w-]+\.md", (ROOT / "mkdocs.yml").read_text()))
+    listed = set(re.findall(r"[\w-]+\.md", (ROOT / "zensical.toml").read_text()))
     pages = {path.name for path in (ROOT / "docs").glob("*.md")}
     assert pages <= listed
     for page in listed:
@@ -44,8 +44,9 @@ def test_no_page_loads_anything_from_another_machine(site):
     # The theme's script fetches these for what no page of ours may hold.
     for page in site.rglob("*.html"):
         assert 'class="mermaid"' not in page.read_text(encoding="utf-8"), page
-    settings = yaml.safe_load((ROOT / "mkdocs.yml").read_text())
-    assert not {"repo_url", "extra_javascript", "extra_css"} & set(settings)
+    project = tomllib.loads((ROOT / "zensical.toml").read_text())["project"]
+    assert not {"repo_url", "extra_javascript", "extra_css"} & set(project)
+    assert "offline" not in project["plugins"]
 
 
 def test_pages_of_the_repository_lead_to_each_other(site):
@@ -82,13 +83,30 @@ def test_the_drawn_floors_are_those_of_the_contracts(floors):
 
 
 def test_a_link_to_nowhere_stops_the_build():
-    pytest.importorskip("mkdocs", reason="no mkdocs-material: pip install 'v2hdm[docs]'")
-    from mkdocs.exceptions import PluginError
-    from mkdocs.structure.files import File, Files
+    tool = module_at(ROOT / "docs" / "tools" / "site.py")
+    text = tool.page_text("docs/check.md", "[a](check.md#x) [b](../pyproject.toml) [c](../README.md)")
+    assert text == "[a](check.md#x) b [c](index.md)"
+    with pytest.raises(tool.BrokenLinkError, match=r"docs/check\.md: links to gone\.md"):
+        tool.page_text("docs/check.md", "[a](gone.md)")
 
-    hook = module_at(ROOT / "docs" / "tools" / "repository_pages.py")
-    file = File("check.md", str(ROOT / "docs"), "site", use_directory_urls=False)
-    page, files = SimpleNamespace(file=file), Files([file])
-    assert hook.on_page_markdown("[a](check.md#x) [b](../pyproject.toml)", page, files) == "[a](check.md#x) b"
-    with pytest.raises(PluginError, match=r"check\.md: links to gone\.md"):
-        hook.on_page_markdown("[a](gone.md)", page, files)
+
+def test_a_link_to_a_heading_that_is_gone_stops_the_build(tmp_path, monkeypatch):
+    pytest.importorskip("zensical", reason="no zensical: pip install 'v2hdm[docs]'")
+    tool = module_at(ROOT / "docs" / "tools" / "site.py")
+    tool.write_project(tmp_path)
+    page = tmp_path / "docs" / "check.md"
+    page.write_text(page.read_text() + "\n[a](bags.md#no-such-heading)\n")
+    assert tool.zensical_build(tmp_path).returncode != 0
+
+
+def test_examples_in_docstrings_are_shown_as_code(site):
+    assert '<span class="gp">&gt;&gt;&gt; </span>' in (site / "api.html").read_text()
+
+
+def test_settings_are_listed_with_their_meaning_and_range(site):
+    text = (site / "api.html").read_text()
+    assert (
+        "longest gap between poses to interpolate across; images in a longer one are dropped; more than 0."
+        in text
+    )
+    assert "Annotated" not in text

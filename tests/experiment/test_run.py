@@ -13,11 +13,13 @@ from v2hdm.cli.compose import conf_dir, register, to_dataclass
 from v2hdm.cli.main import run
 from v2hdm.errors import ConfigError
 from v2hdm.experiment.drive import drive_record, measure
+from v2hdm.experiment.paper import load_paper
 from v2hdm.experiment.plan import ExperimentConfig, Site, jobs
 from v2hdm.experiment.run import run_experiment
-from v2hdm.experiment.summary import claims, latex, words, write_tables
 from v2hdm.pipeline.config import DriveConfig
 from v2hdm.report import style
+
+PAPER = load_paper()
 
 
 def rgb(method):
@@ -123,7 +125,7 @@ def test_errors_come_in_the_order_in_which_the_vehicle_passed():
 
 
 def test_claims_are_tested_where_the_start_of_the_port_allows_it():
-    tested = claims(two_ports())
+    tested = PAPER.claims(two_ports())
     assert {c.where.split(",")[0] for c in tested if "Opt / CNI" in c.text} == {"port1"}
     assert {c.where.split(",")[0] for c in tested if "ENI / Opt" in c.text} == {"port2"}
     ratio = next(c for c in tested if "ENI / Opt" in c.text)
@@ -133,25 +135,28 @@ def test_claims_are_tested_where_the_start_of_the_port_allows_it():
 
 def test_what_disagrees_with_the_paper_is_said_plainly():
     measured = two_ports(opt_m=0.07)
-    text = words(measured, experiment("out"))
-    broken = [c for c in claims(measured) if not c.holds]
+    text = PAPER.words(measured, experiment("out"))
+    broken = [c for c in PAPER.claims(measured) if not c.holds]
     assert {c.text.rsplit(": ", 1)[1] for c in broken} == {"Opt / CNI", "ENI / Opt"}
-    assert f"**{len(broken)} of {len(claims(measured))} figures disagree with the paper's claims:**" in text
+    assert (
+        f"**{len(broken)} of {len(PAPER.claims(measured))} figures disagree with the paper's claims:**"
+        in text
+    )
     for claim in broken:
         assert f"- {claim.where}: {claim.text} is {claim.figure}, asked was {claim.limit}" in text
-    assert "All 14 figures agree" in words(two_ports(), experiment("out"))
+    assert "All 14 figures agree" in PAPER.words(two_ports(), experiment("out"))
 
 
 def test_a_recipe_of_which_no_map_came_is_told():
     plain = record("port1", 1, CALIBRATED)
     plain["failures"] = [["paper", "rear", "nothing to map"]]
     del plain["maps"]["rear"]["Opt, paper"]
-    text = words([measure(plain)], experiment("out"))
+    text = PAPER.words([measure(plain)], experiment("out"))
     assert "- port1 seed 1, rear, recipe paper: nothing to map" in text
 
 
 def test_tables_are_written_for_spreadsheets_and_papers(tmp_path):
-    write_tables(tmp_path, two_ports())
+    PAPER.write_tables(tmp_path, two_ports())
     with (tmp_path / "results.csv").open() as stream:
         lines = list(csv.DictReader(stream))
     assert len(lines) == 4 * 3 * 5
@@ -163,7 +168,7 @@ def test_tables_are_written_for_spreadsheets_and_papers(tmp_path):
 
 
 def test_what_latex_would_take_for_a_command_is_a_letter_in_a_table():
-    text = latex(["port", "RMSE (cm)"], [["a_b & 5 %", "1.0 +- 0.2"], ["other", r"\x"]])
+    text = PAPER.latex(["port", "RMSE (cm)"], [["a_b & 5 %", "1.0 +- 0.2"], ["other", r"\x"]])
     assert r"a\_b \& 5 \% & 1.0 $\pm$ 0.2 \\" in text
     assert r"\textbackslash{}x" in text
     assert text.startswith("\\begin{tabular}{lr}\n\\toprule\nport & RMSE (cm)")

@@ -25,6 +25,7 @@ from export.parity import Parity, int8_parity
 from export.rounding import input_moments, round_weights
 from export.source import of_checkpoint, read_source
 from models import MarkingNet, NetConfig, Prediction
+from tests.export.graphs import graphs_made_once as graphs_made_once
 from train.checkpoint import Checkpoint
 from train.config import TrainConfig
 from train.exported import read_exported

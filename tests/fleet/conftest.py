@@ -1,10 +1,11 @@
 """A drive of a fleet."""
 
+from dataclasses import replace
+
 import pytest
 
 from tests.stores import s3 as s3
-from v2hdm.simulate import PortConfig
-from v2hdm.simulate.port.config import RouteConfig, YardConfig
+from v2hdm.simulate.port.config import PortConfig, RouteConfig, YardConfig
 
 
 @pytest.fixture(scope="session")
@@ -12,6 +13,6 @@ def drive(rendered):
     """Ten images of one camera on a straight."""
     route = RouteConfig(pieces=[[26.0, 0.0]], image_spacing_m=2.6)
     yard = YardConfig(parked_trucks=0, barriers=0, lamp_posts=0, moving_trucks=0, shadow_strips=0)
+    front = replace(PortConfig().cameras["front"], width=640, height=360, focal_px=450.0)
     port = PortConfig(name="tiny", seed=3, initial_ipm="calibrated", route=route, yard=yard)
-    port.cameras = {"front": port.cameras["front"]}
-    return rendered(port)
+    return rendered(replace(port, cameras={"front": front}))

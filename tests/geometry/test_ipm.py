@@ -220,7 +220,7 @@ def test_ordered_corners_run_counter_clockwise_on_the_screen():
 
 @pytest.mark.parametrize(("corners", "outwards"), [(KITE, 1), (DIAMOND, -1)], ids=["image", "map"])
 def test_normals_of_image_corners_point_outwards_and_of_map_corners_inwards(corners, outwards):
-    _, normal, _ = side_frames(corners)
+    normal = side_frames(corners).normal
     middle = (corners + np.roll(corners, -1, axis=0)) / 2
     assert (outwards * ((middle - corners.mean(axis=0)) * normal).sum(axis=1) > 0).all()
 

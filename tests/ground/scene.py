@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -26,6 +27,7 @@ Heights = Callable[[FloatArray], FloatArray]
 """Heights (N,) of points (N, 2)."""
 
 _TEXEL_M = 0.03
+_HEIGHT_TEXEL_M = 0.06
 _FLOOR_M = (-8.0, 46.0, -12.0, 30.0)
 _SPEED_MPS = 5.0
 _EVERY_M = 0.8
@@ -68,12 +70,14 @@ def make_drive(
     poses, _ = interpolate(trajectory, stamps, np.inf)
     floor = _floor(contrast)
     rays = _rays(true)
+    height_m = _crowned(trajectory, crown) if crown else None
     (folder / "front").mkdir(parents=True, exist_ok=True)
     images = []
     for k, (stamp, pose) in enumerate(zip(stamps, poses, strict=True)):
         file = folder / "front" / f"{k:03d}.png"
-        seen = _look(floor, rays, pose, _crowned(trajectory, crown))
-        cv2.imwrite(str(file), np.clip(seen + rng.normal(0.0, grain, seen.shape), 0, 255).astype(np.uint8))
+        seen = _look(floor, rays, pose, height_m)
+        noisy = np.clip(seen + rng.normal(0.0, grain, seen.shape), 0, 255).astype(np.uint8)
+        cv2.imwrite(str(file), noisy, [cv2.IMWRITE_PNG_COMPRESSION, 1])
         images.append(Image("front", float(stamp), file, pose))
     camera = Camera(
         INFO,
@@ -98,35 +102,60 @@ def with_trajectory(drive: Drive, trajectory: Trajectory) -> Drive:
     return replace(drive, trajectory=trajectory, images=images)
 
 
-def _floor(contrast: float) -> FloatArray:
+@cache
+def _texture() -> FloatArray:
     west, east, south, north = _FLOOR_M
     shape = (round((north - south) / _TEXEL_M), round((east - west) / _TEXEL_M))
     noise = np.random.default_rng(5).standard_normal(shape).astype(np.float32)
-    noise = sum(cv2.GaussianBlur(noise, (0, 0), s) * s for s in (1.5, 3.0))
+    return np.asarray(sum(cv2.GaussianBlur(noise, (0, 0), s) * s for s in (1.5, 3.0)))
+
+
+def _floor(contrast: float) -> FloatArray:
+    noise = _texture()
     return np.asarray(np.clip(128 + contrast * noise / noise.std(), 0, 255), dtype=np.float32)
 
 
-def _rays(true: FloatArray) -> FloatArray:
+@cache
+def _pinhole_rays() -> FloatArray:
+    """The ray (N, 3) of each pixel in the camera's coordinates, at depth 1."""
     u, v = np.meshgrid(np.arange(INFO.width, dtype=np.float64), np.arange(INFO.height, dtype=np.float64))
     pinhole = undistort_points(INFO, np.column_stack([u.ravel(), v.ravel()]))
-    cam = np.column_stack([pinhole, np.ones(len(pinhole))]) @ np.linalg.inv(INFO.intrinsic).T
-    return np.asarray(cam @ true[:3, :3])
+    return np.asarray(np.column_stack([pinhole, np.ones(len(pinhole))]) @ np.linalg.inv(INFO.intrinsic).T)
+
+
+def _rays(true: FloatArray) -> FloatArray:
+    return np.asarray(_pinhole_rays() @ true[:3, :3])
 
 
 def _crowned(trajectory: Trajectory, fall: float) -> Heights:
-    """Heights (N,) of the floor at points (N, 2)."""
+    """Heights of a floor that falls to both sides of the path, looked up in a grid."""
+    west, east, south, north = _FLOOR_M
     at = np.linspace(*trajectory.stamp_s[[0, -1]], 1000)
     middle = cKDTree(interpolate(trajectory, at, np.inf)[0][:, :2, 3])
-    return lambda points: fall * (0.8 - middle.query(points)[0]) if fall else np.zeros(len(points))
+    x, y = np.meshgrid(np.arange(west, east, _HEIGHT_TEXEL_M), np.arange(south, north, _HEIGHT_TEXEL_M))
+    aside_m, _ = middle.query(np.column_stack([x.ravel(), y.ravel()]))
+    height_m = (fall * (0.8 - aside_m)).reshape(x.shape).astype(np.float32)
+
+    def of(points: FloatArray) -> FloatArray:
+        column, row = ((points - (west, south)) / _HEIGHT_TEXEL_M).astype(np.float32).T
+        shape = (INFO.height, INFO.width)
+        maps = column.reshape(shape), row.reshape(shape)
+        return cv2.remap(height_m, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).ravel()
+
+    return of
 
 
-def _look(floor: FloatArray, rays_vehicle: FloatArray, pose: FloatArray, height_m: Heights) -> FloatArray:
+def _look(
+    floor: FloatArray, rays_vehicle: FloatArray, pose: FloatArray, height_m: Heights | None
+) -> FloatArray:
+    """The floor as the camera sees it; level at z = 0 without ``height_m``."""
     rays = rays_vehicle @ pose[:3, :3].T
     centre = pose[:3, :3] @ CENTRE + pose[:3, 3]
-    above, down = centre[2], np.maximum(-rays[:, 2], 1e-3)
-    for _ in range(4):
-        ground = centre[:2] + (above / down)[:, None] * rays[:, :2]
+    down = np.maximum(-rays[:, 2], 1e-3)
+    ground = centre[:2] + (centre[2] / down)[:, None] * rays[:, :2]
+    for _ in range(3 if height_m else 0):
         above = centre[2] - height_m(ground)
+        ground = centre[:2] + (above / down)[:, None] * rays[:, :2]
     x, y = ground.T
     columns = ((x - _FLOOR_M[0]) / _TEXEL_M).astype(np.float32).reshape(INFO.height, INFO.width)
     rows = ((y - _FLOOR_M[2]) / _TEXEL_M).astype(np.float32).reshape(INFO.height, INFO.width)

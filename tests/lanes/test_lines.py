@@ -196,7 +196,7 @@ def of_outlines(symbols, outlines):
     """The symbols with other outlines, whose sides all lie along edges."""
     seen = tuple(np.ones(len(one), dtype=bool) for one in outlines)
     rows = tuple(np.zeros(len(one)) for one in outlines)
-    return replace(symbols, outlines_pinhole_px=tuple(outlines), row_shares=rows, seen=seen)
+    return replace(symbols, outlines_pinhole_px=tuple(outlines), row_shares=rows, seen_sides=seen)
 
 
 def scene(arrow_x_m):
@@ -363,7 +363,7 @@ def test_where_other_paint_cuts_an_arrow_its_template_says_how_long_it_is_or_it_
     short, own = cut(-1.0)
     shapes = [short + places[0]] * 4 + [ARROW + at for at in places[1:] for _ in ways_m]
     symbols, rig = seen(shapes, ["arrow"] * len(shapes), (1 + others) * ways_m)
-    symbols = replace(symbols, seen=tuple([own] * 4) + symbols.seen[4:])
+    symbols = replace(symbols, seen_sides=tuple([own] * 4) + symbols.seen_sides[4:])
     found, left_out = map_symbols(symbols, rig, INFOS, JITTER_RAD, (), AcceptanceOptions())
     if others:
         arrow = min(found, key=lambda one: np.linalg.norm(one.outline_map.mean(axis=0) - places[0]))

@@ -5,7 +5,7 @@ import numpy as np
 from tests.cameras import mounted
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.rigid import heading_rad
-from v2hdm.localization.filter import Markings, Seen, locate, pose_of, predict, start
+from v2hdm.localization.filter import Markings, Sighting, locate, pose_of, predict, start
 from v2hdm.records import HDMap, Marking
 
 INTRINSIC = np.array([[700.0, 0, 640], [0, 700, 360], [0, 0, 1]])
@@ -51,7 +51,7 @@ def seen_from(pose, hd_map, rng):
         if inside and depth_m.min() > 0 and depth_m.max() < 15:
             noisy = np.roll(pixels + SIGMA_PX * rng.standard_normal((4, 2)), int(rng.integers(4)), axis=0)
             covariance = np.tile(SIGMA_PX**2 * np.eye(2), (4, 1, 1))
-            out.append(Seen(marking.kind, INTRINSIC, camera, noisy, covariance, np.ones(4, dtype=bool)))
+            out.append(Sighting(marking.kind, INTRINSIC, camera, noisy, covariance, np.ones(4, dtype=bool)))
     return out
 
 

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from v2hdm.errors import MappingError
-from v2hdm.faults import Fault, ScoreTest
+from v2hdm.faults import ScoreTest, table
 from v2hdm.mapping import foreign, inputs, recovery
 from v2hdm.mapping.foreign import foreign_segment
+from v2hdm.mapping.results import ForeignSegment
 from v2hdm.verdict.results.solution import _ODDS_LIMIT
 
 FRAMES, IN_VIEW = 90, 8
@@ -73,7 +74,7 @@ def odds_beside(monkeypatch, gain, left, worst=20.0, rows=600):
     """Log odds of images from 3 to 6 s beside a fault that has ``left`` odds in a solve without them."""
     # A focal length that is surely longer, by a fifth of what is usual.
     numbers = {"value": 0.004, "sigma": 4e-4, "model_sigma": 4e-4, "p_value": 1e-20}
-    fault = ScoreTest(Fault.FOCAL, -1, 0, -1, **numbers, gain=worst + float(np.log1p(0.2**2)))
+    fault = ScoreTest(table.FOCAL.name, -1, 0, -1, **numbers, gain=worst + float(np.log1p(0.2**2)))
     solved = []
 
     def settled(rest, _):
@@ -83,10 +84,10 @@ def odds_beside(monkeypatch, gain, left, worst=20.0, rows=600):
         return SimpleNamespace(row=np.arange(rows))
 
     def tested(*_):
-        return (ScoreTest(Fault.CLOCK, -1, 0, -1, gain=left),)
+        return (ScoreTest(table.CLOCK.name, -1, 0, -1, gain=left),)
 
     for name, value in (
-        ("foreign_segment", (3.0, 6.0, gain)),
+        ("foreign_segment", ForeignSegment(3.0, 6.0, gain)),
         ("views_of", None),
     ):
         monkeypatch.setattr(recovery, name, lambda *_, value=value: value)

@@ -161,11 +161,11 @@ def test_paint_stands_out_and_bare_ground_does_not(observer):
 
 def test_a_gone_marking_is_told_from_a_hidden_and_from_a_worn_one(observer):
     paint, contrast = contrasts_of(observer)
-    odds = paint.log_bare(contrast) - paint.log_there(contrast)
+    odds = paint.log_bare(contrast) - paint.log_painted(contrast)
     assert odds[GONE] > 1.5
     assert odds[HIDDEN] < 0.0
     worn = np.array([0.4 * paint.painted[0]])
-    assert paint.log_bare(worn) - paint.log_there(worn) < -1.5
+    assert paint.log_bare(worn) - paint.log_painted(worn) < -1.5
 
 
 def test_too_few_markings_say_nothing_of_paint(observer):

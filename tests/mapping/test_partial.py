@@ -128,7 +128,7 @@ def test_a_corner_behind_the_camera_is_not_observed_by_its_line(scene, sightings
     assert (usable >= located.valid).all()
     assert usable.sum() > located.valid.sum()
     fused = fuse_groups(tracks, located, 0.003)
-    assert (fused.seen > 0).sum() < np.isfinite(fused.corners_map).all(axis=2).sum()
+    assert (fused.point_sightings > 0).sum() < np.isfinite(fused.corners_map).all(axis=2).sum()
 
 
 def test_the_naive_methods_use_whole_sightings_only(scene):

@@ -240,7 +240,7 @@ def test_a_class_of_many_shapes_is_left_as_it_was_seen_but_for_being_parallelogr
 
 def test_a_worn_marking_of_known_shape_is_one_although_few_images_show_it():
     (_, candidates), counts = row(10, [DIAMOND] * 40), well_seen(40)
-    counts.found[7], counts.images[7] = 1, 3
+    counts.detected_views[7], counts.images[7] = 1, 3
     assert of_one_class(candidates, counts).log_odds[7] > 2
 
 
@@ -248,7 +248,7 @@ def odd_and_seldom():
     """Forty candidates; number 7 has no marking's shape or look, and is seen in three images of many."""
     (_, candidates), counts = row(11, [DIAMOND] * 40), well_seen(40)
     candidates.corners_map[7] += np.random.default_rng(11).normal(0, 0.25, (4, 2))
-    counts.found[7], counts.images[7], counts.easy_views[7] = 1, 3, 15
+    counts.detected_views[7], counts.images[7], counts.easy_views[7] = 1, 3, 15
     counts.observations[7], counts.agreeing[7], counts.log_odds[7] = 12, 8, 1.0
     return candidates, counts
 
@@ -415,7 +415,7 @@ def test_what_looks_unlike_its_class_and_has_another_shape_is_a_letter_and_a_wor
     counts = well_seen(60)
     counts.log_odds[:] += np.random.default_rng(22).normal(0.0, 1.0, 60)
     counts.log_odds[[7, 8]] = 1.8
-    for never_easy in (counts.easy_views, counts.found, counts.pointed):
+    for never_easy in (counts.easy_views, counts.detected_views, counts.pointed):
         never_easy[7:9] = 0
     assert verdict(candidates, counts).verdict[7:9] == [
         "part of other paint, such as an arrow or a solid line",

@@ -14,7 +14,7 @@ from v2hdm.geometry.ipm import apply_homography, ground_from_pinhole_px, ipm_fro
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.rigid import exp, inverse
 from v2hdm.io.calibration.writing import write_calibration
-from v2hdm.io.drive import METRICS, ReadOptions, told_of
+from v2hdm.io.drive import ReadOptions, told_of
 from v2hdm.io.drive.writing import write_drive
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.trajectory import write_tum
@@ -31,6 +31,7 @@ from v2hdm.records import (
     Trajectory,
 )
 from v2hdm.store.files import write_json
+from v2hdm.store.names import METRICS
 from v2hdm.store.results import result_folder
 
 INFO = CameraInfo(

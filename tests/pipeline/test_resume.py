@@ -69,7 +69,7 @@ def seen_images(monkeypatch):
 def test_another_mapping_setting_needs_no_image_again(site, monkeypatch):
     monkeypatch.setattr(inspection, "inspect", refused)
     monkeypatch.setattr(batch, "detect_image", refused)
-    monkeypatch.setattr(stages, "own_vehicles", refused)
+    monkeypatch.setattr(batch, "own_vehicles", refused)
     nearer = run(config(site, "nearer", mapping=MappingOptions(max_range_m=6.0)))
     before, after = ((one / "map.geojson").read_bytes() for one in (site / "first" / "short", nearer.folder))
     assert before != after

@@ -27,8 +27,9 @@ from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.results import AdjustedPoses
 from v2hdm.pipeline import map_drive
 from v2hdm.pipeline.config import MapConfig, ReportConfig, admit, run_name
-from v2hdm.pipeline.result import _along_route, write_trajectories
+from v2hdm.pipeline.result import _along_route
 from v2hdm.pipeline.run import made_of, run
+from v2hdm.pipeline.saving import write_trajectories
 from v2hdm.pipeline.stages import camera_sets
 from v2hdm.records import Drive, HDMap, Image, Lane, Trajectory
 from v2hdm.site.options import AcceptanceOptions, LaneOptions
@@ -80,7 +81,7 @@ def test_a_good_drive_passes_and_every_file_says_so(result):
     verdict = json.loads((result / "metrics.json").read_text())["verdict"]
     assert verdict["status"] == "PASS", verdict["findings"]
     assert {"heading", "clock", "ground match"} <= {
-        one["check"] for one in verdict["passed"] + verdict["untold"]
+        one["check"] for one in verdict["passed"] + verdict["unobservable"]
     }
     assert json.loads((result / "map.geojson").read_text())["v2hdm"]["verdict"]["status"] == "PASS"
     assert yaml.safe_load((result / "calibration_front.yaml").read_text())["verdict"]["status"] == "PASS"
@@ -205,7 +206,7 @@ def test_a_base_in_the_place_of_the_result_is_refused_before_any_work(tmp_path, 
     make_drive(tmp_path / "drive")
     base = MapConfig(base=str(tmp_path / "out" / "short"))
     config = run_config(tmp_path / "drive", tmp_path / "out", map=base)
-    with result_folder(tmp_path / "out" / "short", made=made_of(config)) as folder:
+    with result_folder(tmp_path / "out" / "short", maker=made_of(config)) as folder:
         write_geojson(make_map(), folder / "map.geojson")
     monkeypatch.setattr(map_drive, "map_drive", lambda *_, **__: pytest.fail("it worked"))
     with protected_inputs(), pytest.raises(ConfigError, match="is one of the inputs"):

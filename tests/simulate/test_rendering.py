@@ -9,7 +9,7 @@ from v2hdm.geometry.lens import distort_points
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.records import DIAMOND, CameraInfo
-from v2hdm.simulate import render_drive
+from v2hdm.simulate.port.drive import render_drive
 from v2hdm.simulate.render.renderer import Motion, Optics, Renderer
 from v2hdm.simulate.render.scene import Box, Ground, Light, Paint, Scene
 from v2hdm.simulate.render.view import camera_rays

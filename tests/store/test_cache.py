@@ -26,7 +26,7 @@ from hypothesis.extra import numpy as npst
 
 from tests.drive.example import make_map
 from v2hdm.cli.main import run
-from v2hdm.ground import GroundStatus, Reading
+from v2hdm.ground.results import GroundStatus, Reading
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.mapping.results import AdjustedPoses

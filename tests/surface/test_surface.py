@@ -17,7 +17,7 @@ from v2hdm.adjust import SolveOptions, solve
 from v2hdm.detection.batch import detect_all
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import MapFileError
-from v2hdm.faults import height_information, moves_with_heights
+from v2hdm.faults.sensitivity import height_information, moves_with_heights
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth

@@ -14,7 +14,7 @@ from v2hdm.association.ground import views_of
 from v2hdm.association.sightings import collect_sightings
 from v2hdm.catalogue import CORNERED_CLASSES
 from v2hdm.errors import ConfigError
-from v2hdm.faults import Fault
+from v2hdm.faults import table
 from v2hdm.faults.odds import is_contradicted
 from v2hdm.geometry.rigid import interpolate
 from v2hdm.mapping.bundle import control_points, known_lengths, without_corner
@@ -169,7 +169,7 @@ def test_the_errors_of_a_maps_corners_hang_together_as_drift_makes_them():
         ({"known_sizes": {"by_class_m": {DIAMOND: [1.0, 0.0]}}}, r"by_class_m\.diamond"),
         ({"known_sizes": {"sigma_m": 0.0}}, r"known_sizes\.sigma_m"),
         ({"lanes": {"model": "spline"}}, r"mapping\.lanes\.model is 'spline'; choose after or joint"),
-        ({"mode": "online"}, r"mapping.mode is 'online'; choose batch or incremental"),
+        ({"mode": "online"}, r"mode is 'online'; choose batch or incremental"),
         ({"max_range_m": 0.0}, r"mapping\.max_range_m"),
     ],
 )
@@ -265,7 +265,7 @@ def surveyed(drive, off_m):
 
 def test_a_survey_half_a_metre_too_high_is_dropped_and_told(scene):
     result = mapped(scene, surveyed(scene.drive, (0.0, 0.0, 0.5)))
-    assert faults(result) == [Fault.SURVEY]
+    assert faults(result) == [table.SURVEY]
     (told,) = result.evidence.corrected
     assert (told.cameras, told.axis) == (("front",), 2)
     assert told.value == pytest.approx(-0.5, abs=0.1)
@@ -282,14 +282,14 @@ def test_positions_in_web_mercator_are_reported_and_no_survey_is_dropped_for_the
         images.append(replace(image, map_from_vehicle=pose))
     result = mapped(street, replace(street.drive, images=images))
     assert faults(result) == []
-    assert Fault.SCALE in [one.fault for one in result.evidence.score_tests if is_contradicted(one)]
+    assert table.SCALE in [one.fault for one in result.evidence.score_tests if is_contradicted(one)]
 
 
 def test_known_sizes_that_the_paint_does_not_have_are_dropped_and_told(scene):
     # Diamonds of the scene are 1.2 m by 0.6 m.
     sizes = SizeOptions(by_class_m={DIAMOND: [1.1, 0.55]}, sigma_m=0.005)
     result = mapped(scene, scene.drive, replace(OPTIONS, known_sizes=sizes))
-    assert Fault.SIZE in faults(result)
+    assert table.SIZE in faults(result)
     longest = [np.ptp(m.corners_map, axis=0) for m in result.hd_map.markings if m.kind == DIAMOND]
     assert np.median(np.linalg.norm(longest, axis=1)) > 1.15
 
@@ -316,7 +316,7 @@ def test_a_clock_60_ms_late_is_put_right(scene):
         images=[replace(image, map_from_vehicle=_before(trajectory, image.stamp_s)) for image in late.images],
     )
     result = mapped(scene, late)
-    assert faults(result) == [Fault.CLOCK]
+    assert faults(result) == [table.CLOCK]
     assert result.clocks[0]["front"].value_s == pytest.approx(0.06, abs=0.008)
 
 

@@ -12,6 +12,7 @@ import torch
 from export.onnx_file import export_checkpoint, to_onnx
 from export.source import read_source
 from models import MarkingNet, NetConfig, Prediction
+from tests.export.graphs import graphs_made_once as graphs_made_once
 from tests.train.small import coco, tiny
 from train.average import mean_checkpoint, scored
 from train.checkpoint import Checkpoint, fresh_checkpoint, load_checkpoint, save_checkpoint

@@ -15,6 +15,7 @@ import torch
 from export.judge_file import read_judge, write_judge
 from export.onnx_file import export_checkpoint
 from models.judge import Judge
+from tests.export.graphs import graphs_made_once as graphs_made_once
 from tests.train.small import tiny, train
 from train import fit_judge, fit_lane_score, ship, shipment
 from train.checkpoint import load_checkpoint
@@ -28,8 +29,9 @@ from train.scenes.paint import Brush, rectangle, rhombus
 from train.scenes.symbols import hollow_diamond
 from train.shipment import Order
 from v2hdm.detection import weights
-from v2hdm.detection.classifier import AMONG, CHANNELS, COMPANIES, FEATURES, SHAPES
+from v2hdm.detection.classifier import AMONG, COMPANIES, SHAPES
 from v2hdm.detection.detector import Detector
+from v2hdm.detection.evidence import CHANNELS, FEATURES
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import DetectorError
 from v2hdm.records import ARROW, DIAMOND, LANE_DASH

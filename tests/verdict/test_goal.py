@@ -10,8 +10,8 @@ import pytest
 
 from tests.cameras import mounted
 from tests.verdict.drives import INFO, square_at
+from v2hdm.cli.commands.map import _map
 from v2hdm.cli.compose import Job
-from v2hdm.cli.runs import _map
 from v2hdm.errors import ConfigError
 from v2hdm.geometry.rigid import camera_centre, exp
 from v2hdm.mapping.options import MappingOptions
@@ -73,7 +73,7 @@ def test_a_straight_drive_with_70_cm_of_uncertainty_is_no_pass_and_names_the_mou
     )
     says = {finding.about: finding.says for finding in verdict.raised}
     assert "0 % of the markings meet the goal; the largest part" in says["map"]
-    assert all("drive a turn, or survey the camera's place" in one for one in says.values())
+    assert all("include a turn, or survey the camera's place" in one for one in says.values())
 
 
 @pytest.mark.parametrize(("coarse", "status"), [(2, Status.PASS), (12, Status.WARN)])

@@ -11,7 +11,6 @@ from v2hdm.geometry.lens import undistort_points
 from v2hdm.ground.results import GroundStatus, Parameter, Reading
 from v2hdm.records import Calibration
 from v2hdm.verdict import Status, clock_corrections
-from v2hdm.verdict.inputs import ground as ground_checks
 from v2hdm.verdict.inputs.ground import CHECKS, check_ground, find_cause, path_of, scaled, upside_down
 from v2hdm.verdict.inputs.heading import Path
 
@@ -63,7 +62,7 @@ def test_a_value_within_five_of_its_sigmas_passes_and_a_clock_beyond_what_is_cor
     assert [one.status for one in findings if one.check == "clock"] == [Status.FAIL]
 
 
-WHY = "constant speed on a straight road: drive a turn"
+WHY = "constant speed on a straight road: include a turn"
 LEVEL = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 OPEN = {
     "clock": (known(estimate(), "clock_s", 0.1, 0.01, WHY), WHY),
@@ -197,13 +196,13 @@ def test_the_first_mistake_whose_undoing_makes_the_ground_match_is_told(monkeypa
         length_m = tried.images[-1].map_from_vehicle[0, 3]
         return estimate() if length_m < 0.5 * drive(poses()).images[-1].map_from_vehicle[0, 3] else LOST
 
-    monkeypatch.setattr(ground_checks, "estimate_ground", only_in_metres)
+    monkeypatch.setattr("v2hdm.ground.estimate.estimate_ground", only_in_metres)
     says = find_cause(drive(poses()), {"front": LOST})
     assert says is not None
     assert "feet" in says
 
 
 def test_nothing_is_tried_where_a_camera_matches(monkeypatch):
-    monkeypatch.setattr(ground_checks, "estimate_ground", None)
+    monkeypatch.setattr("v2hdm.ground.estimate.estimate_ground", None)
     assert find_cause(drive(poses()), {"front": LOST, "rear": estimate("rear")}) is None
     assert find_cause(drive(poses()), {}) is None

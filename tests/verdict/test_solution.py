@@ -11,8 +11,8 @@ from tests.cameras import mounted
 from tests.mapping.scene import SceneOptions, make_scene
 from tests.report.yard import SURVEY_M, checked, point, yard
 from tests.verdict.drives import INFO, square_at
-from v2hdm.faults import Fault
-from v2hdm.mapping.results import CameraFit, Contradiction, MethodResult, SolveEvidence
+from v2hdm.faults import Contradiction, table
+from v2hdm.mapping.results import CameraFit, ForeignSegment, MethodResult, SolveEvidence
 from v2hdm.records import Calibration, Exclusion, GroundStrip, HDMap
 from v2hdm.site.candidates import LACKS_A_CORNER
 from v2hdm.verdict import Finding, Status, Verdict
@@ -24,11 +24,11 @@ FIT = CameraFit(observations=2000, variance_factor=0.15, rejected_share=0.02)
 
 def contradiction(fault, cameras, axis, about, value, sigma, sigmas):
     numbers = value, sigma, sigma, 2 * norm.sf(sigmas), sigmas**2 / 2
-    return Contradiction(fault, 0 if len(cameras) == 1 else -1, axis, -1, *numbers, cameras, about)
+    return Contradiction(fault.name, 0 if len(cameras) == 1 else -1, axis, -1, *numbers, cameras, about)
 
 
-CLOCK = contradiction(Fault.CLOCK, ("front", "rear"), 0, "", 0.001, 0.001, 1.0)
-LEVER = contradiction(Fault.LEVER, ("front", "rear"), 0, "", 0.01, 0.02, 0.5)
+CLOCK = contradiction(table.CLOCK, ("front", "rear"), 0, "", 0.001, 0.001, 1.0)
+LEVER = contradiction(table.LEVER, ("front", "rear"), 0, "", 0.01, 0.02, 0.5)
 FINE = SolveEvidence(
     score_tests=(CLOCK, LEVER),
     corrected=(),
@@ -88,15 +88,15 @@ def test_an_input_that_was_dropped_is_a_warning_that_names_it(drive):
 @pytest.mark.parametrize(
     ("fault", "value", "of", "status"),
     [
-        (Fault.CLOCK_DRIFT, 0.017, ("front", "rear"), Status.FAIL),
-        (Fault.CLOCK_DRIFT, 0.007, ("front", "rear"), Status.WARN),
-        (Fault.CLOCK_DRIFT, 0.017, ("rear",), Status.WARN),
-        (Fault.FOCAL, 0.017, ("front", "rear"), Status.WARN),
+        (table.CLOCK_DRIFT, 0.017, ("front", "rear"), Status.FAIL),
+        (table.CLOCK_DRIFT, 0.007, ("front", "rear"), Status.WARN),
+        (table.CLOCK_DRIFT, 0.017, ("rear",), Status.WARN),
+        (table.FOCAL, 0.017, ("front", "rear"), Status.WARN),
     ],
 )
 def test_a_clock_is_corrected_only_if_no_drift_of_it_is_likelier_than_none(drive, fault, value, of, status):
     mended = ("front",) if of == ("rear",) else of
-    clock = contradiction(Fault.CLOCK, mended, 0, "", 0.02, 0.002, 10.0)
+    clock = contradiction(table.CLOCK, mended, 0, "", 0.02, 0.002, 10.0)
     left = contradiction(fault, of, 0, "", value, 0.006, 2.7)
     alone = raised(result(replace(FINE, score_tests=(left,))), drive)
     found = raised(result(replace(FINE, score_tests=(left,), corrected=(clock,))), drive)
@@ -105,7 +105,7 @@ def test_a_clock_is_corrected_only_if_no_drift_of_it_is_likelier_than_none(drive
 
 
 def test_an_input_that_is_contradicted_still_fails_and_symptoms_point_to_it(drive):
-    focal = contradiction(Fault.FOCAL, ("front", "rear"), 0, "", -0.045, 0.001, 45.0)
+    focal = contradiction(table.FOCAL, ("front", "rear"), 0, "", -0.045, 0.001, 45.0)
     late = replace(CLOCK, value=0.2, p_value=1e-80)
     evidence = replace(FINE, score_tests=(focal, late, LEVER), held_out={"heave": 9.0})
     found = raised(result(evidence), drive)
@@ -125,14 +125,14 @@ def test_an_input_that_is_contradicted_still_fails_and_symptoms_point_to_it(driv
     ],
 )
 def test_foreign_images_are_named_by_their_odds_among_other_causes(odds, named):
-    focal = replace(contradiction(Fault.FOCAL, ("front", "rear"), 0, "", -0.02, 0.003, 7.0), gain=20.7)
-    evidence = replace(FINE, score_tests=(focal,), foreign=(4.0, 8.0, odds))
+    focal = replace(contradiction(table.FOCAL, ("front", "rear"), 0, "", -0.02, 0.003, 7.0), gain=20.7)
+    evidence = replace(FINE, score_tests=(focal,), foreign=ForeignSegment(4.0, 8.0, odds))
     assert [f.check for f in check_inputs(evidence) if f.status is Status.FAIL] == named
 
 
 @pytest.mark.parametrize(("model_sigma", "is_told"), [(0.015, True), (0.023, False)])
 def test_a_step_within_the_noise_that_is_stated_is_unobservable_however_quiet_the_drive(model_sigma, is_told):
-    step = contradiction(Fault.STEP, ("front", "rear"), 2, "from 9.0 s on", -0.048, 0.018, 1.5)
+    step = contradiction(table.STEP, ("front", "rear"), 2, "from 9.0 s on", -0.048, 0.018, 1.5)
     evidence = replace(FINE, score_tests=(replace(step, model_sigma=model_sigma),))
     (finding,) = [f for f in check_inputs(evidence) if f.check == "position step"]
     assert finding.status is Status.PASS
@@ -143,7 +143,7 @@ def test_a_step_within_the_noise_that_is_stated_is_unobservable_however_quiet_th
 @pytest.mark.parametrize(("of_all", "is_told"), [(0.004, True), (0.03, False)])
 def test_a_focal_length_that_both_cameras_may_share_unseen_is_unobservable(of_all, is_told):
     sigmas = {("front",): 0.001, ("rear",): 0.001, ("front", "rear"): of_all}
-    tests = tuple(contradiction(Fault.FOCAL, who, 0, "", 0.001, one, 1.0) for who, one in sigmas.items())
+    tests = tuple(contradiction(table.FOCAL, who, 0, "", 0.001, one, 1.0) for who, one in sigmas.items())
     (finding,) = [f for f in check_inputs(replace(FINE, score_tests=tests)) if f.check == "focal length"]
     assert finding.status is Status.PASS
     assert finding.is_unobservable is not is_told
@@ -151,15 +151,15 @@ def test_a_focal_length_that_both_cameras_may_share_unseen_is_unobservable(of_al
 
 
 def test_a_rival_that_explains_as_much_is_named_as_well():
-    one = contradiction(Fault.SURVEY, ("front",), 0, "", 4.9, 0.1, 37.0)
-    other = contradiction(Fault.SURVEY, ("rear",), 0, "", -4.7, 0.1, 36.99)
+    one = contradiction(table.SURVEY, ("front",), 0, "", 4.9, 0.1, 37.0)
+    other = contradiction(table.SURVEY, ("rear",), 0, "", -4.7, 0.1, 36.99)
     finding = check_inputs(replace(FINE, score_tests=(one, other)))[0]
     assert "front lies 490 cm ahead of its survey or the centre of rear" in finding.says
 
 
 @pytest.mark.parametrize(("sigmas", "is_told"), [(3.72, True), (2.5, False)])
 def test_an_input_that_may_well_be_wrong_is_a_warning(sigmas, is_told, drive):
-    focal = contradiction(Fault.FOCAL, ("front", "rear"), 0, "", -0.024, 0.0057, sigmas)
+    focal = contradiction(table.FOCAL, ("front", "rear"), 0, "", -0.024, 0.0057, sigmas)
     told = raised(result(replace(FINE, score_tests=(replace(focal, gain=0.2),))), drive)
     assert [one.status for one in told.values()] == [Status.WARN] * is_told
     assert not is_told or "2.4 % shorter" in told["focal length"].says
@@ -192,9 +192,9 @@ def test_a_small_contradiction_is_none_however_sure_it_is():
 
 def test_a_straight_drive_says_what_it_cannot_tell():
     unsure = replace(FINE, score_tests=(replace(CLOCK, sigma=0.01), replace(LEVER, sigma=float("inf"))))
-    untold = [f for f in check_inputs(unsure) if f.is_unobservable]
-    assert {f.check for f in untold} == {"clock", "survey"}
-    assert all("drive a turn" in f.says for f in untold)
+    unobservable = [f for f in check_inputs(unsure) if f.is_unobservable]
+    assert {f.check for f in unobservable} == {"clock", "survey"}
+    assert all("include a turn" in f.says for f in unobservable)
     sure = replace(square_at(0.0, 0.0), covariance_m2=1e-6 * np.eye(8))
     for evidence, is_told in ((unsure, True), (FINE, False)):
         headline = Verdict.of(check_goal(result(evidence, sure), 0.05, "poses")).headline
@@ -206,7 +206,7 @@ def test_a_straight_drive_says_what_it_cannot_tell():
     ("check", "change"),
     [
         ("fit", {"variance_factor": 6.0}),
-        ("foreign images", {"foreign": (4.0, 8.0, 20.0)}),
+        ("foreign images", {"foreign": ForeignSegment(4.0, 8.0, 20.0)}),
         ("rejected", {"fits": {"front": replace(FIT, rejected_share=0.14)}}),
         ("held out", {"held_out": {"heave": 6.5}}),
         ("pose noise", {"pose_noise": {"heading_rad": 4.0}}),

@@ -47,7 +47,7 @@ def test_a_check_that_the_drive_cannot_answer_is_told_apart_from_one_that_passed
     verdict = Verdict.of([finding(Status.PASS, value=None)])
     assert verdict.status is Status.PASS
     assert not verdict.passed
-    assert verdict.as_json()["untold"][0]["check"] == "clock"
+    assert verdict.as_json()["unobservable"][0]["check"] == "clock"
     assert verdict.lines[1].startswith("cannot tell clock (front)")
 
 

@@ -17,8 +17,8 @@ from v2hdm.simulate.render.scene import Bgr, Box, GroundMarks
 Factor = NDArray[np.uint8]
 Thing = Callable[[np.random.Generator, float, float], list[Box]]
 
-_MARKS_M = (56.0, 28.0)
-_MARKS_RESOLUTION_M = 0.04
+_MARKS_M = (56.0, 28.0)  # length and width of the ground that has marks, m
+_MARKS_RESOLUTION_M = 0.04  # ground per element of the marks, m
 _BESIDE_M = (
     ((0.8, 0.15, 0.5), (4.0, 0.6, 1.1)),
     ((0.3, 0.2, 0.8), (1.2, 0.8, 2.5)),
@@ -152,7 +152,8 @@ def _row(rng: np.random.Generator, left: float, thing: Thing) -> list[Box]:
 
 def _pavement(rng: np.random.Generator, edge: float, side: int) -> list[Box]:
     """A kerb, lighter or darker than the pavement or verge behind it."""
-    tall, deep = rng.uniform(0.04, 0.16), rng.uniform(1.5, 5)
+    tall = rng.uniform(0.04, 0.16)
+    deep = rng.uniform(1.5, 5)
     surface = _albedo(rng, 0.1, 0.5, 0.08) if rng.random() < 0.7 else (0.05, 0.16, 0.1)
     kerb = _albedo(rng, 0.15, 0.6, 0.04)
     return [
@@ -165,7 +166,8 @@ def _buildings(rng: np.random.Generator, left: float, side: int) -> list[Box]:
     out: list[Box] = []
     along = rng.uniform(-5, 10)
     while along < 70 and len(out) < 12:
-        length, tall = rng.uniform(6, 20), rng.uniform(2.5, 14)
+        length = rng.uniform(6, 20)
+        tall = rng.uniform(2.5, 14)
         out.append(
             _box(
                 rng, (along + length / 2, left + side * 4), (length, 8.0, tall), _albedo(rng, 0.08, 0.7, 0.12)
@@ -173,7 +175,8 @@ def _buildings(rng: np.random.Generator, left: float, side: int) -> list[Box]:
         )
         for _ in range(int(rng.integers(0, 3))):
             at = (along + rng.uniform(1, length - 1), left - side * 0.05)
-            wide, high = rng.uniform(0.8, 2.5), rng.uniform(0.9, 2.2)
+            wide = rng.uniform(0.8, 2.5)
+            high = rng.uniform(0.9, 2.2)
             out.append(_box(rng, at, (wide, 0.12, high), _albedo(rng), rng.uniform(0, 1.5)))
         along += length + rng.uniform(0, 8)
     return out
@@ -225,7 +228,8 @@ def _furniture(rng: np.random.Generator, x: float, y: float) -> list[Box]:
 
 def _vehicle(rng: np.random.Generator, x: float, y: float) -> list[Box]:
     """A car, van or truck out of a few boxes: body, cabin or load, wheels, bright plates."""
-    kind, yaw = rng.integers(3), float(rng.normal(0, 0.05))
+    kind = rng.integers(3)
+    yaw = float(rng.normal(0, 0.05))
     colour = _white(rng) if rng.random() < 0.45 else _albedo(rng, 0.02, 0.6, 0.4)
     length, width, tall = ((4.3, 1.8, 0.6), (5.6, 2.0, 1.9), (9.0, 2.5, 2.9))[int(kind)]
     base = 0.3 if kind < 2 else 1.0
@@ -314,10 +318,10 @@ def _verge(rng: np.random.Generator, factor: Factor, side: int) -> None:
     rough = np.exp(
         contrast * (specks / specks.std() + rng.uniform(0.2, 0.8) * clumps) + rng.uniform(-0.2, 0.3)
     )
-    near, far = (rows / 2 + side * rng.uniform(1.5, 9, 2) / _MARKS_RESOLUTION_M).astype(int)
+    near_row, far_row = (rows / 2 + side * rng.uniform(1.5, 9, 2) / _MARKS_RESOLUTION_M).astype(int)
     edge = 0 if side < 0 else rows
     outline = np.array(
-        [[0, edge], [0, near], [columns, near if rng.random() < 0.6 else far], [columns, edge]]
+        [[0, edge], [0, near_row], [columns, near_row if rng.random() < 0.6 else far_row], [columns, edge]]
     )
     beyond = cv2.fillPoly(np.zeros_like(factor), [outline.astype(np.int32)], 1) > 0
     factor[beyond] = np.clip(128 * rough, 0, 255).astype(np.uint8)[beyond]
@@ -334,7 +338,8 @@ def _tyre_marks(rng: np.random.Generator, factor: Factor) -> None:
     """A pair of dark, curved tracks."""
     x = np.linspace(0, factor.shape[1], 24)
     y = rng.uniform(0, factor.shape[0]) + rng.normal(0, 0.15) * x + rng.normal(0, 1.5e-4) * x**2
-    tone, thick = int(rng.uniform(60, 118)), int(rng.integers(3, 8))
+    tone = int(rng.uniform(60, 118))
+    thick = int(rng.integers(3, 8))
     for offset in (0, 1.6 / _MARKS_RESOLUTION_M):
         track = np.column_stack([x, y + offset]).astype(np.int32)
         cv2.polylines(factor, [track], False, tone, thick)
@@ -350,9 +355,11 @@ def _crack(rng: np.random.Generator, factor: Factor) -> None:
 
 def _rails(rng: np.random.Generator, factor: Factor) -> None:
     """Tram or crane rails or a gutter: long, straight, bright or dark, with a dark groove."""
-    x, y = factor.shape[1], rng.uniform(0, factor.shape[0])
+    x = factor.shape[1]
+    y = rng.uniform(0, factor.shape[0])
     rise = rng.normal(0, 0.1) * x
-    tone, thick = int(rng.choice([rng.uniform(50, 100), rng.uniform(165, 250)])), int(rng.integers(1, 5))
+    tone = int(rng.choice([rng.uniform(50, 100), rng.uniform(165, 250)]))
+    thick = int(rng.integers(1, 5))
     for offset in (0, 1.435 / _MARKS_RESOLUTION_M):
         ends = (0, int(y + offset)), (x, int(y + offset + rise))
         cv2.line(factor, *ends, int(rng.uniform(40, 90)), thick + 2)

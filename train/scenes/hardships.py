@@ -18,15 +18,15 @@ from v2hdm.records import ARROW, CROSSWALK_BAR, STOP_LINE, FloatArray
 from v2hdm.simulate.render.renderer import Optics
 from v2hdm.simulate.render.scene import Bgr, Box, Ground, GroundMarks, Light, Paint, Shadow, box_footprint
 
-_CROSSED_M = 22.0
-_LONGEST_LEVEL = 0.9
-_CAMERA_CLEARANCE_M = 3.5
-_KERB_M = 45.0
-_SEAM_STEP_M = 0.25
+_CROSSED_M = 22.0  # distance ahead, m, within which a shadow may cross a marking
+_LONGEST_LEVEL = 0.9  # highest mean level of an overexposed image, of 1
+_CAMERA_CLEARANCE_M = 3.5  # least distance of things beside markings from the camera, m
+_KERB_M = 45.0  # distance ahead to which kerbs reach, m
+_SEAM_STEP_M = 0.25  # distance between the points of a seam, m
 _BLEACHED_ALBEDO = (0.37, 0.52)
 """Of sun-bleached concrete; fresh paint has 0.6 to 0.9."""
 
-_BLEACHED_OVEREXPOSED = 0.5
+_BLEACHED_OVEREXPOSED = 0.5  # least share of images of bleached ground that are overexposed
 _SHIFT = 4
 """Bits of fraction of the coordinates that OpenCV is given."""
 
@@ -192,7 +192,9 @@ def kerbs(rng: np.random.Generator, lines_map: Sequence[FloatArray], share: floa
     side = rng.choice([-1.0, 1.0])
     line = lines_map[int(rng.integers(len(lines_map)))]
     offset_m = side * (rng.uniform(0.2, 1.2) if rng.random() < 0.5 else rng.uniform(1.2, 4.5))
-    wide_m, tall_m, behind_m = rng.uniform(0.06, 0.3), rng.uniform(0.06, 0.2), rng.uniform(1.0, 4.0)
+    wide_m = rng.uniform(0.06, 0.3)
+    tall_m = rng.uniform(0.06, 0.2)
+    behind_m = rng.uniform(1.0, 4.0)
     stone, behind = kerb_colours(rng)
     edge = _beside(line, np.full(len(line), offset_m))
     middle = _beside(line, np.full(len(line), offset_m + side * (wide_m + behind_m) / 2))
@@ -245,20 +247,25 @@ def junction_approach(rng: np.random.Generator, brush: Brush, bend: Bend) -> tup
     Returns:
         The paint, and the outline (4, 2, map) of the ground from the stop line to the end of the crosswalk.
     """
-    lanes, lane_m = int(rng.integers(1, 4)), rng.uniform(2.6, 3.8)
-    right, stop_m, thick_m = rng.uniform(-1.5, -0.2) * lane_m, rng.uniform(5, 26), rng.uniform(0.2, 0.6)
+    lanes = int(rng.integers(1, 4))
+    lane_m = rng.uniform(2.6, 3.8)
+    right = rng.uniform(-1.5, -0.2) * lane_m
+    stop_m = rng.uniform(5, 26)
+    thick_m = rng.uniform(0.2, 0.6)
     shapes = [
         (STOP_LINE, shape + np.array([stop_m, right])) for shape in stop_line(rng, lanes * lane_m, thick_m)
     ]
     for lane in range(lanes):
-        tip_m, head = stop_m - rng.uniform(1, 5), 1 if rng.random() < 0.5 else -1
+        tip_m = stop_m - rng.uniform(1, 5)
+        head = 1 if rng.random() < 0.5 else -1
         while rng.random() < 0.8 and tip_m > 5:
             parts = list(arrow(rng, lane_m))
             long_m = max(part[:, 0].max() for part in parts)
             tail = (tip_m - long_m if head > 0 else tip_m, right + (lane + 0.5) * lane_m)
             shapes += [(ARROW, head * part + tail) for part in parts]
             tip_m -= long_m + rng.uniform(4, 15)
-    behind_m, beside_m = stop_m + thick_m / 2 + rng.uniform(0.4, 2), rng.uniform(0, 2 * lane_m, 2)
+    behind_m = stop_m + thick_m / 2 + rng.uniform(0.4, 2)
+    beside_m = rng.uniform(0, 2 * lane_m, 2)
     extent_m = lanes * lane_m + beside_m.sum()
     bars = list(crosswalk(rng, extent_m)) if rng.random() < 0.8 else []
     long_m = np.ptp(bars[0][:, 0]) if bars else 0.0
@@ -271,9 +278,13 @@ def junction_approach(rng: np.random.Generator, brush: Brush, bend: Bend) -> tup
 
 def _some_within_sight(rng: np.random.Generator, paints: Sequence[Paint], mean: float) -> list[FloatArray]:
     """The polygons (N, 2) of some markings with corners that are near, ``mean`` of them on average."""
-    near = [p for p in paints if p.kind in CORNERED_CLASSES and 1 < p.polygon_map[:, 0].mean() < _CROSSED_M]
-    count = int(rng.poisson(mean)) if near else 0
-    return [near[int(k)].polygon_map for k in rng.integers(len(near), size=count)] if near else []
+    crossable = [
+        p for p in paints if p.kind in CORNERED_CLASSES and 1 < p.polygon_map[:, 0].mean() < _CROSSED_M
+    ]
+    count = int(rng.poisson(mean)) if crossable else 0
+    return (
+        [crossable[int(k)].polygon_map for k in rng.integers(len(crossable), size=count)] if crossable else []
+    )
 
 
 def with_seams(

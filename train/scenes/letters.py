@@ -48,5 +48,6 @@ def _stroke(start: FloatArray, end: FloatArray, thick_m: float) -> FloatArray:
     """A bar (4, 2) from point to point and half its thickness beyond both."""
     ahead = (end - start) * (thick_m / 2 / np.linalg.norm(end - start))
     left = np.array([-ahead[1], ahead[0]])
-    start, end = start - ahead, end + ahead
+    start = start - ahead
+    end = end + ahead
     return np.array([start - left, end - left, end + left, start + left])

@@ -23,18 +23,18 @@ from v2hdm.records import (
 )
 from v2hdm.simulate.render.scene import WHITE_PAINT, YELLOW_PAINT, Bgr, Paint
 
-FAR_M = 50.0
-_DIAMONDS_FAR_M = 32.0
-_NEAR_M = -4.0
-_LANE_STEP_M = 0.5
+FAR_M = 50.0  # distance ahead to which lines are painted, m
+_DIAMONDS_FAR_M = 32.0  # distance ahead to which fields of diamonds reach, m
+_NEAR_M = -4.0  # distance ahead from which the ground is painted, m
+_LANE_STEP_M = 0.5  # distance between the points of a lane's line, m
 _PASSING_M = 3.0
 """Over such a length a curve drawn by hand passes from two strands to the one that goes on."""
 
 _LEAST_APART_M = 0.75
 """Strands nearer than this are those of one line to whoever drives or labels."""
 
-_PIECE_M = 2.5
-_PIECE_BESIDE_M = 0.02
+_PIECE_M = 2.5  # largest length of a straight piece of a bent line, m
+_PIECE_BESIDE_M = 0.02  # largest distance of a straight piece from the bend, m
 
 
 @dataclass(frozen=True)
@@ -54,8 +54,10 @@ class Bend:
 
     def to_map(self, points: FloatArray) -> FloatArray:
         """Points (..., 2) as (distance along the way, offset to the left of it) in the map."""
-        along, left = points[..., 0], points[..., 1]
-        on_arc, angle = self._on_arc(along), self.heading(along)
+        along = points[..., 0]
+        left = points[..., 1]
+        on_arc = self._on_arc(along)
+        angle = self.heading(along)
         straight = along - on_arc - self._first_m
         x = self._first_m + on_arc * np.sinc(angle / np.pi) + straight * np.cos(angle) - left * np.sin(angle)
         y = on_arc * np.sinc(angle / (2 * np.pi)) * np.sin(angle / 2) + straight * np.sin(angle)
@@ -116,7 +118,8 @@ def rhombus(centre: FloatArray, length: float, width: float, yaw_rad: float = 0.
 
 
 def _turned(points: FloatArray, yaw_rad: float) -> FloatArray:
-    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+    cos = np.cos(yaw_rad)
+    sin = np.sin(yaw_rad)
     return np.asarray(points @ np.array([[cos, sin], [-sin, cos]]))
 
 
@@ -256,7 +259,8 @@ def _centre(strands: list[tuple[float, tuple[float, float]]]) -> FloatArray:
 
     It is the middle of those that run beside each other, and keeps to the one that goes on.
     """
-    start, end = min(extent[0] for _, extent in strands), max(extent[1] for _, extent in strands)
+    start = min(extent[0] for _, extent in strands)
+    end = max(extent[1] for _, extent in strands)
     along = np.arange(start, end + 1e-6, _LANE_STEP_M)
     runs = np.array([(along >= first) & (along <= last) for _, (first, last) in strands])
     some = runs.any(axis=0)
@@ -328,15 +332,19 @@ def _lane_symbols(
 
 def arrow(rng: np.random.Generator, lane_m: float) -> Iterator[FloatArray]:
     """Convex parts of a lane arrow: straight on, a turn, or both."""
-    length, shaft = rng.uniform(2.0, 6.0), rng.uniform(0.12, 0.3)
-    head_length, head = rng.uniform(0.25, 0.45) * length, rng.uniform(2.5, 4.5) * shaft
-    turn, straight = rng.choice([-1, 0, 1]), rng.random() < 0.6
+    length = rng.uniform(2.0, 6.0)
+    shaft = rng.uniform(0.12, 0.3)
+    head_length = rng.uniform(0.25, 0.45) * length
+    head = rng.uniform(2.5, 4.5) * shaft
+    turn = rng.choice([-1, 0, 1])
+    straight = rng.random() < 0.6
     if turn == 0 or straight:
         yield rectangle(np.array([(length - head_length) / 2, 0.0]), length - head_length, shaft)
         tip = np.array([[length - head_length, -head / 2], [length, 0.0], [length - head_length, head / 2]])
         yield tip
     if turn:
-        root, side = rng.uniform(0.1, 0.45) * length, turn * rng.uniform(0.5, 0.9)
+        root = rng.uniform(0.1, 0.45) * length
+        side = turn * rng.uniform(0.5, 0.9)
         if not straight:
             yield rectangle(np.array([root / 2, 0.0]), root, shaft)
         end = np.array([root + rng.uniform(0.1, 0.3) * length, side])
@@ -349,9 +357,13 @@ def arrow(rng: np.random.Generator, lane_m: float) -> Iterator[FloatArray]:
 
 def stout_arrow(rng: np.random.Generator) -> Iterator[FloatArray]:
     """Convex parts of an arrow with a thick, tapered shaft and a short head, its turns curved."""
-    length, tail_m = rng.uniform(2.5, 6.0), rng.uniform(0.22, 0.45)
-    neck, head, wide = rng.uniform(0.68, 0.82) * length, rng.uniform(1.7, 2.6) * tail_m, rng.uniform(0.7, 1.1)
-    side, ahead = int(rng.choice([-1, 0, 1])), rng.random() < 0.5
+    length = rng.uniform(2.5, 6.0)
+    tail_m = rng.uniform(0.22, 0.45)
+    neck = rng.uniform(0.68, 0.82) * length
+    head = rng.uniform(1.7, 2.6) * tail_m
+    wide = rng.uniform(0.7, 1.1)
+    side = int(rng.choice([-1, 0, 1]))
+    ahead = rng.random() < 0.5
     root = rng.uniform(0.25, 0.55) * length
     end = neck if not side or ahead else root
     half = tail_m / 2 * np.array([1.0, wide])
@@ -359,11 +371,14 @@ def stout_arrow(rng: np.random.Generator) -> Iterator[FloatArray]:
     if not side or ahead:
         yield np.array([[neck, -head / 2], [length, 0], [neck, head / 2]])
     if side:
-        reach, rise, thick = rng.uniform(0.25, 0.6), rng.uniform(0.15, 0.35) * length, 0.08 * length
+        reach = rng.uniform(0.25, 0.6)
+        rise = rng.uniform(0.15, 0.35) * length
+        thick = 0.08 * length
         turn = np.linspace(0, np.pi / 2, 4)
         middle = np.column_stack([root + rise * np.sin(turn), side * reach * (1 - np.cos(turn))])
         off = np.column_stack([thick / 2 * np.sin(turn), -side * half[1] * np.cos(turn)])
-        outer, inner = middle + off, middle - off
+        outer = middle + off
+        inner = middle - off
         for k in range(3):
             part = np.array([inner[k], outer[k], outer[k + 1], inner[k + 1]])
             yield part[::side]
@@ -373,7 +388,8 @@ def stout_arrow(rng: np.random.Generator) -> Iterator[FloatArray]:
 
 def _writing(rng: np.random.Generator, lane_m: float) -> Iterator[FloatArray]:
     """Strokes of letters or digits, drawn out along the lane as road writing is."""
-    letters, tall = int(rng.integers(1, 6)), rng.uniform(1.0, 4.0)
+    letters = int(rng.integers(1, 6))
+    tall = rng.uniform(1.0, 4.0)
     wide = min(0.75, 0.8 * lane_m / letters)
     stroke = rng.uniform(0.12, 0.2) * wide + 0.03
     for letter in range(letters):
@@ -389,7 +405,8 @@ def _writing(rng: np.random.Generator, lane_m: float) -> Iterator[FloatArray]:
 
 def _junction(rng: np.random.Generator, brush: Brush, bend: Bend, lane_m: float) -> list[Paint]:
     """A stop line, a crosswalk, teeth, or chevrons across the way."""
-    along, left = rng.uniform(3, 25), rng.uniform(-5, 2)
+    along = rng.uniform(3, 25)
+    left = rng.uniform(-5, 2)
     extent = lane_m * rng.integers(1, 4)
     draw, kind = [
         (stop_line, STOP_LINE),
@@ -410,7 +427,8 @@ def stop_line(rng: np.random.Generator, extent: float, thick_m: float | None = N
 
 def crosswalk(rng: np.random.Generator, extent: float) -> Iterator[FloatArray]:
     """Bars along the way, side by side across it."""
-    bar, long = rng.uniform(0.35, 0.6), rng.uniform(2, 4.5)
+    bar = rng.uniform(0.35, 0.6)
+    long = rng.uniform(2, 4.5)
     for left in np.arange(0, extent, 2 * bar):
         yield rectangle(np.array([0.0, left]), long, bar)
 
@@ -425,7 +443,8 @@ def _teeth(rng: np.random.Generator, extent: float) -> Iterator[FloatArray]:
 def _chevrons(rng: np.random.Generator, extent: float) -> Iterator[FloatArray]:
     """Parallel slanted bars, or angles made of two, one behind the other."""
     slope = rng.uniform(0.5, 1.1) * rng.choice([-1, 1])
-    wide, thick = rng.uniform(1.0, 3.0), rng.uniform(0.15, 0.45)
+    wide = rng.uniform(1.0, 3.0)
+    thick = rng.uniform(0.15, 0.45)
     angles = rng.random() < 0.6
     for along in np.arange(0, 12, rng.uniform(1.0, 2.5)):
         yield _slanted(along, 0.0, wide, thick, slope)

@@ -11,8 +11,8 @@ from train.scenes.paint import arrow, crosswalk, rectangle, rhombus, stop_line
 from v2hdm.records import FloatArray
 from v2hdm.simulate.render.scene import Box, GroundMarks, placed
 
-_SHIFT = 4
-_MARGIN_PX = 3
+_SHIFT = 4  # bits of fraction of the coordinates that OpenCV is given
+_MARGIN_PX = 3  # elements around an erased marking that are redrawn
 
 
 def with_erased(rng: np.random.Generator, marks: GroundMarks | None, mean: float) -> GroundMarks | None:
@@ -84,7 +84,8 @@ def litter(rng: np.random.Generator, mean: float) -> tuple[Box, ...]:
     """Sheets, cardboard, bags, cans and boards on the ground, ``mean`` on average; half of them white."""
     out = []
     for _ in range(int(rng.poisson(mean))):
-        x, y = float(np.exp(rng.uniform(np.log(2.5), np.log(22)))), float(rng.normal(0, 3))
+        x = float(np.exp(rng.uniform(np.log(2.5), np.log(22))))
+        y = float(rng.normal(0, 3))
         kind = rng.choice(4, p=[0.5, 0.2, 0.2, 0.1])
         low, high = (
             ((0.15, 0.1, 0.002), (0.7, 0.6, 0.03)),

@@ -63,15 +63,15 @@ from v2hdm.simulate.render.scene import Backdrop, Bgr, Ground, GroundMarks, Ligh
 
 # The renderer keeps one tile per fleck size, so sizes come from a short list.
 _NEAR_M = 0.3
-_STEPS_BETWEEN = 5
-_LENS_TOLERANCE_PX = 1.0
+_STEPS_BETWEEN = 5  # parts of each piece of a line that is projected through the lens
+_LENS_TOLERANCE_PX = 1.0  # largest error of undistorting a point, px, whose place in the image is known
 _TO_ONE_ASIDE = np.array(
     [0, *(1 + PAINT_CLASSES.index(SEEN_ACROSS.get(kind, kind)) for kind in PAINT_CLASSES)], dtype=np.uint8
 )
 """By label, the answer for a camera on the vehicle's side: the detector knows how its cameras look, and turns
 the names back, see :mod:`v2hdm.detection.network`."""
 
-_FLECK_SIZES_M = tuple(float(s) for s in np.geomspace(0.12, 2.5, 10))
+_FLECK_SIZES_M = tuple(float(s) for s in np.geomspace(0.12, 2.5, 10))  # sizes of flecks of sun, m
 
 
 @dataclass(frozen=True)
@@ -115,8 +115,8 @@ def training_sample(
     rng = np.random.default_rng([seed, index])
     drawn = drawn_scene(rng, width, height, difficulty, hardships)
     rendered = drawn.rendered
-    seen = (image_line(drawn.view, lane) for lane in drawn.lanes_map)
-    lanes_px = tuple(lane for lane in seen if len(lane) > 1)
+    lines_px = (image_line(drawn.view, lane) for lane in drawn.lanes_map)
+    lanes_px = tuple(lane for lane in lines_px if len(lane) > 1)
     labels = _TO_ONE_ASIDE[rendered.labels] if drawn.aside else rendered.labels
     return TrainingSample(rendered.image, labels, rendered.hidden, lanes_px)
 
@@ -183,7 +183,9 @@ def _in_image(view: TrainingView, points_map: FloatArray) -> tuple[FloatArray, N
     pixels = distort_points(view.info, pinhole)
     reach = np.array([view.info.width, view.info.height])
     about = ((pixels > -0.5 * reach) & (pixels < 1.5 * reach)).all(axis=1)
-    index, pinhole, pixels = index[about], pinhole[about], pixels[about]
+    index = index[about]
+    pinhole = pinhole[about]
+    pixels = pixels[about]
     # Far outside the image the lens polynomial folds back into it.
     back = undistort_points(view.info, pixels)
     told = np.linalg.norm(back - pinhole, axis=1) < _LENS_TOLERANCE_PX
@@ -216,17 +218,21 @@ def random_scene(
     road_half_m = float(rng.uniform(2, 9))
     facing = Facing(for_facing, hardships.facing, hardships.stout)
     if place == "port":
-        road, boxes = port_paint(rng, brush, bend, facing), port_boxes(rng)
+        road = port_paint(rng, brush, bend, facing)
+        boxes = port_boxes(rng)
     elif place == "street":
-        road, boxes = street_paint(rng, brush, bend, facing), street_boxes(rng, road_half_m)
+        road = street_paint(rng, brush, bend, facing)
+        boxes = street_boxes(rng, road_half_m)
     else:
-        road, boxes = RoadPaint(), street_boxes(rng, road_half_m) if rng.random() < 0.7 else port_boxes(rng)
+        road = RoadPaint()
+        boxes = street_boxes(rng, road_half_m) if rng.random() < 0.7 else port_boxes(rng)
     junction = with_junction(for_junction, road, brush, bend, hardships.junctions)
     boxes = clear_of(boxes, junction.paints) if tight or junction is not road else boxes
     road = junction
     if place != "bare":
         road = _with_symbols(for_symbols, road, brush, bend, hardships)
-    ground, shadows = _ground(rng, place == "port", difficulty), _shadows(rng, difficulty)
+    ground = _ground(rng, place == "port", difficulty)
+    shadows = _shadows(rng, difficulty)
     marks = _marked(for_ground, for_remains, ground.marks, road, hardships)
     ground = photographed(for_grounds, bleached(for_ground, ground, hardships.bleached), hardships.grounds)
     dapples = _dapples(rng, difficulty)
@@ -283,13 +289,15 @@ def _without_hidden_boxes(scene: Scene, view: TrainingView) -> Scene:
     centre = np.column_stack([[box.centre_map for box in scene.boxes], height])
     cam = centre @ view.cam_from_map[:3, :3].T + view.cam_from_map[:3, 3]
     radius = np.linalg.norm(size, axis=1) / 2
-    k, info = view.info.intrinsic, view.info
-    seen = cam[:, 2] > -radius
+    k = view.info.intrinsic
+    info = view.info
+    in_view = cam[:, 2] > -radius
     for axis, pixels in ((0, info.width), (1, info.height)):
-        low, high = (-k[axis, 2]) / k[axis, axis] - 0.1, (pixels - k[axis, 2]) / k[axis, axis] + 0.1
+        low = (-k[axis, 2]) / k[axis, axis] - 0.1
+        high = (pixels - k[axis, 2]) / k[axis, axis] + 0.1
         for slope, sign in ((low, 1), (high, -1)):
-            seen &= sign * (cam[:, axis] - slope * cam[:, 2]) / np.hypot(1, slope) > -radius
-    return replace(scene, boxes=tuple(box for box, s in zip(scene.boxes, seen, strict=True) if s))
+            in_view &= sign * (cam[:, axis] - slope * cam[:, 2]) / np.hypot(1, slope) > -radius
+    return replace(scene, boxes=tuple(box for box, s in zip(scene.boxes, in_view, strict=True) if s))
 
 
 def _ground(rng: np.random.Generator, port: bool, difficulty: float) -> Ground:
@@ -320,7 +328,8 @@ def _ground(rng: np.random.Generator, port: bool, difficulty: float) -> Ground:
 
 def _light(rng: np.random.Generator) -> Light:
     """From deep overcast to hard, low sun; ratios of sun to skylight up to 15."""
-    elevation, azimuth = np.deg2rad(rng.uniform(12, 78)), rng.uniform(0, 2 * np.pi)
+    elevation = np.deg2rad(rng.uniform(12, 78))
+    azimuth = rng.uniform(0, 2 * np.pi)
     direction = (np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation))
     overcast = rng.random() < 0.25
     sun = rng.uniform(0.0, 0.4) if overcast else rng.uniform(0.8, 1.3)

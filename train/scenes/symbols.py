@@ -13,7 +13,7 @@ from v2hdm.geometry.planar import clip_convex, inside_convex
 from v2hdm.records import DIAMOND, LANE_DASH, LANE_LINE, OTHER_PAINT, STOP_LINE, FloatArray
 from v2hdm.simulate.render.scene import Paint
 
-_ACROSS_M = 9.0
+_ACROSS_M = 9.0  # distance to either side, m, within which lines meet a stop line
 _LANE_M = (2.2, 4.2)
 """Width of what counts as a lane between two lines."""
 
@@ -43,11 +43,13 @@ def with_hollow(
     stroke_m = rng.uniform(0.08, 0.32)
     diamonds = [paint.polygon_map for paint in road.paints if paint.kind == DIAMOND]
     if diamonds:
-        kept = [paint for paint in road.paints if paint.kind != DIAMOND]
+        others = [paint for paint in road.paints if paint.kind != DIAMOND]
         hollow = [part for shape in diamonds for part in hollow_diamond(brush, rng, shape, stroke_m)]
-        return RoadPaint(kept + hollow, road.lanes)
-    length_m, wide_m = rng.uniform(1.4, 4.0), rng.uniform(0.7, 1.7)
-    start_m, pitch_m = rng.uniform(3, 12), rng.uniform(length_m + 2, 30)
+        return RoadPaint(others + hollow, road.lanes)
+    length_m = rng.uniform(1.4, 4.0)
+    wide_m = rng.uniform(0.7, 1.7)
+    start_m = rng.uniform(3, 12)
+    pitch_m = rng.uniform(length_m + 2, 30)
     for along in np.arange(start_m, 30, pitch_m):
         for middle, _ in _some_lanes(rng, road, bend, float(along)):
             ground = _placed(bend, along, middle, rectangle(np.zeros(2), length_m + 0.4, wide_m + 0.4))
@@ -64,9 +66,11 @@ def with_words(
         return road
     if rng.random() < 0.25:
         return _hatched_box(rng, road, brush, bend)
-    text, turn = str(rng.choice(WORDS)), rng.choice([-1, 1])
+    text = str(rng.choice(WORDS))
+    turn = rng.choice([-1, 1])
     letters = max(len(part) for part in text.split())
-    tall_m, along = rng.uniform(1.2, 4.5), float(np.exp(rng.uniform(np.log(3), np.log(18))))
+    tall_m = rng.uniform(1.2, 4.5)
+    along = float(np.exp(rng.uniform(np.log(3), np.log(18))))
     for middle, lane_m in _some_lanes(rng, road, bend, along):
         wide_m = min(rng.uniform(0.4, 0.9), 0.62 * lane_m / letters)
         strokes = list(word(text, tall_m, wide_m, rng.uniform(0.14, 0.3) * wide_m + 0.03))
@@ -80,12 +84,16 @@ def with_words(
 
 def _hatched_box(rng: np.random.Generator, road: RoadPaint, brush: Brush, bend: Bend) -> RoadPaint:
     """This road with a box to be kept clear: its frame, and lines across it one or both ways."""
-    along, left = float(np.exp(rng.uniform(np.log(4), np.log(20)))), float(rng.uniform(-3, 3))
-    long_m, wide_m, thick_m = rng.uniform(2, 9), rng.uniform(2, 7), rng.uniform(0.1, 0.22)
+    along = float(np.exp(rng.uniform(np.log(4), np.log(20))))
+    left = float(rng.uniform(-3, 3))
+    long_m = rng.uniform(2, 9)
+    wide_m = rng.uniform(2, 7)
+    thick_m = rng.uniform(0.1, 0.22)
     box = rectangle(np.zeros(2), long_m, wide_m)
     shapes = [rectangle(np.array([end * long_m / 2, 0.0]), thick_m, wide_m + thick_m) for end in (-1, 1)]
     shapes += [rectangle(np.array([0.0, side * wide_m / 2]), long_m + thick_m, thick_m) for side in (-1, 1)]
-    lean, pitch_m = rng.uniform(0.5, 1.1), rng.uniform(0.7, 2.0)
+    lean = rng.uniform(0.5, 1.1)
+    pitch_m = rng.uniform(0.7, 2.0)
     for yaw in (lean, -lean)[: int(rng.integers(1, 3))]:
         for at in np.arange(-long_m, long_m, pitch_m):
             bar = clip_convex(rectangle(np.array([at, 0.0]), 2 * (long_m + wide_m), thick_m, yaw), box)
@@ -109,12 +117,15 @@ def with_crossing(
         return road
     first = int(rng.integers(len(lines) - 1))
     last = int(rng.integers(first + 1, len(lines)))
-    thick_m, over_m = rng.uniform(0.2, 0.65), rng.choice([0.0, rng.normal(0, 0.15), rng.uniform(0, 1.5)])
-    low, high = lines[first] - over_m, lines[last] + over_m
+    thick_m = rng.uniform(0.2, 0.65)
+    over_m = rng.choice([0.0, rng.normal(0, 0.15), rng.uniform(0, 1.5)])
+    low = lines[first] - over_m
+    high = lines[last] + over_m
     if high - low < 1:
         return road
     paints = list(road.paints)
-    solid_m, wide_m = rng.uniform(4, 20), rng.uniform(0.1, 0.22)
+    solid_m = rng.uniform(4, 20)
+    wide_m = rng.uniform(0.1, 0.22)
     if rng.random() < 0.5:
         for left in lines[first : last + 1]:
             paints += _solid_before(rng, paints, brush, bend, along, float(left), solid_m, wide_m)
@@ -141,13 +152,15 @@ def _solid_before(
 def lines_across(lanes_map: Iterable[FloatArray], bend: Bend, along: float) -> FloatArray:
     """How far left of the way, in order, lines (N, 2, map) pass a place along it, m."""
     heading = float(bend.heading(along))
-    ahead, left = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
+    ahead = np.array([np.cos(heading), np.sin(heading)])
+    left = np.array([-np.sin(heading), np.cos(heading)])
     origin = bend.to_map(np.array([along, 0.0]))
     passed = []
     for lane in lanes_map:
-        before, beside = (lane - origin) @ ahead, (lane - origin) @ left
-        near = np.flatnonzero((np.diff(np.sign(before)) != 0) & (np.abs(beside[:-1]) < _ACROSS_M))
-        passed += [float(beside[near[0]])] if len(near) else []
+        before = (lane - origin) @ ahead
+        beside = (lane - origin) @ left
+        crossings = np.flatnonzero((np.diff(np.sign(before)) != 0) & (np.abs(beside[:-1]) < _ACROSS_M))
+        passed += [float(beside[crossings[0]])] if len(crossings) else []
     return np.sort(np.array(passed))
 
 
@@ -164,7 +177,8 @@ def _some_lanes(
 def _placed(bend: Bend, along: float, left: float, shape: FloatArray) -> FloatArray:
     """A shape (N, 2) in the map, its origin at a place of the way and its first axis along it."""
     heading = float(bend.heading(along))
-    cos, sin = np.cos(heading), np.sin(heading)
+    cos = np.cos(heading)
+    sin = np.sin(heading)
     centre = bend.to_map(np.array([along, left]))
     return np.asarray(centre + shape @ np.array([[cos, sin], [-sin, cos]]))
 
@@ -172,6 +186,6 @@ def _placed(bend: Bend, along: float, left: float, shape: FloatArray) -> FloatAr
 def laid(road: RoadPaint, paints: Sequence[Paint], ground_map: FloatArray) -> RoadPaint:
     """This road with other paint, in place of what had its middle on a convex piece of ground (N, 2)."""
     middles = np.array([paint.polygon_map.mean(axis=0) for paint in road.paints]).reshape(-1, 2)
-    there = inside_convex(ground_map, middles)
-    kept = [paint for paint, inside in zip(road.paints, there, strict=True) if not inside]
-    return RoadPaint([*kept, *paints], road.lanes)
+    is_inside = inside_convex(ground_map, middles)
+    others = [paint for paint, inside in zip(road.paints, is_inside, strict=True) if not inside]
+    return RoadPaint([*others, *paints], road.lanes)

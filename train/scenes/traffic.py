@@ -16,12 +16,15 @@ from v2hdm.simulate.render.scene import Bgr, Box, Float32
 
 Picture = NDArray[np.uint8]
 
-_PX_PER_M = 50
-_SHIFT = 4
+_PX_PER_M = 50  # resolution of the pictures on a thing's sides, px per m
+_SHIFT = 4  # bits of fraction of the coordinates that OpenCV is given
 _CLEARANCE_M = 2.2
 """Distance of everything from the camera, which stands at the map's origin, m."""
 
-_BLACK, _RED, _WHITE, _YELLOW = (0.02, 0.02, 0.02), (0.05, 0.05, 0.5), (0.75, 0.78, 0.78), (0.03, 0.5, 0.7)
+_BLACK = (0.02, 0.02, 0.02)  # radiance, BGR, of black stripes and tyres
+_RED = (0.05, 0.05, 0.5)  # radiance, BGR, of red stripes
+_WHITE = (0.75, 0.78, 0.78)  # radiance, BGR, of white stripes
+_YELLOW = (0.03, 0.5, 0.7)  # radiance, BGR, of yellow stripes
 _GLASS = ((0.03, 0.03, 0.03), (0.12, 0.1, 0.08), (0.5, 0.42, 0.36))
 """Windows: dark ones, and those that mirror the sky."""
 
@@ -44,7 +47,8 @@ def traffic(rng: np.random.Generator, mean: float) -> tuple[Box, ...]:
 
 def _is_clear(box: Box) -> bool:
     """Whether the camera stands outside of a box and some way from it."""
-    cos, sin = np.cos(box.yaw_rad), np.sin(box.yaw_rad)
+    cos = np.cos(box.yaw_rad)
+    sin = np.sin(box.yaw_rad)
     x, y = box.centre_map
     off = np.abs([x * cos + y * sin, y * cos - x * sin]) - np.array(box.size_m[:2]) / 2
     return bool(np.hypot(*np.maximum(off, 0)) > _CLEARANCE_M)
@@ -66,8 +70,8 @@ def reflectance(
     averaged = cv2.resize(picture, (columns, rows), interpolation=cv2.INTER_AREA)
     u = along_m * np.float32(columns / sides_m[0]) - np.float32(0.5)
     v = np.float32(rows - 0.5) - up_m * np.float32(rows / sides_m[1])
-    seen = cv2.remap(averaged, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.moveaxis(seen.astype(np.float32) * np.float32(1 / 255), 2, 0)
+    sampled = cv2.remap(averaged, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.moveaxis(sampled.astype(np.float32) * np.float32(1 / 255), 2, 0)
 
 
 def _fill(picture: Picture, polygon_m: FloatArray, albedo_bgr: Bgr) -> None:
@@ -86,16 +90,17 @@ def _stripes(
     rng: np.random.Generator, picture: Picture, left: float, low: float, wide: float, tall: float
 ) -> None:
     """Slanted or upright stripes of two colours in a rectangle, as of warning boards."""
-    one, other = ((_RED, _WHITE), (_RED, _YELLOW), (_BLACK, _YELLOW), (_BLACK, _WHITE))[
+    first_colour, second_colour = ((_RED, _WHITE), (_RED, _YELLOW), (_BLACK, _YELLOW), (_BLACK, _WHITE))[
         int(rng.choice(4, p=[0.45, 0.3, 0.15, 0.1]))
     ]
-    rows, columns = (len(picture) - int((low + tall) * _PX_PER_M), len(picture) - int(low * _PX_PER_M)), (
+    rows = (len(picture) - int((low + tall) * _PX_PER_M), len(picture) - int(low * _PX_PER_M))
+    columns = (
         int(left * _PX_PER_M), int((left + wide) * _PX_PER_M),
     )  # fmt: skip
     part = picture[max(rows[0], 0) : rows[1], max(columns[0], 0) : columns[1]]
     if not part.size:
         return
-    stripes = _plain((wide, tall), one)
+    stripes = _plain((wide, tall), first_colour)
     pitch = rng.uniform(0.2, 0.6) * (1.0 if max(wide, tall) < 1.2 else rng.uniform(1.0, 1.8))
     slope = rng.choice([-1.0, 1.0]) * rng.uniform(0.6, 1.4) if rng.random() < 0.8 else 0.0
     chevron = slope != 0 and wide > 1 and rng.random() < 0.5
@@ -103,7 +108,7 @@ def _stripes(
         bar = np.array(
             [[at, 0], [at + pitch / 2, 0], [at + pitch / 2 + slope * tall, tall], [at + slope * tall, tall]]
         )
-        _fill(stripes, bar, other)
+        _fill(stripes, bar, second_colour)
     if chevron:
         half = stripes.shape[1] // 2
         stripes[:, -half:] = stripes[:, :half][:, ::-1]
@@ -161,7 +166,8 @@ def _glass(rng: np.random.Generator) -> Bgr:
 
 
 def _lights(rng: np.random.Generator, picture: Picture, wide: float, low: float, front: bool) -> None:
-    tall, broad = rng.uniform(0.1, 0.35), rng.uniform(0.15, 0.4)
+    tall = rng.uniform(0.1, 0.35)
+    broad = rng.uniform(0.15, 0.4)
     colour = (0.8, 0.85, 0.85) if front else (0.08, 0.06, float(rng.uniform(0.3, 0.8)))
     for left in (0.06, wide - broad - 0.06):
         _rectangle(picture, left, low, broad, tall, colour)
@@ -175,7 +181,7 @@ def _box(
     albedo_bgr: Bgr,
     base_m: float = 0.0,
 ) -> Box:
-    sides = tuple(None if one is None else partial(reflectance, one) for one in pictures)
+    sides = tuple(None if picture is None else partial(reflectance, picture) for picture in pictures)
     return Box(
         centre_map=at, size_m=size_m, yaw_rad=yaw, albedo_bgr=albedo_bgr, base_m=base_m, pictures=sides
     )
@@ -183,13 +189,12 @@ def _box(
 
 def _lorry(rng: np.random.Generator, x: float, y: float, yaw: float) -> list[Box]:
     """A lorry, a trailer or a works vehicle: stripes at its rear; tape, wheels and writing on its sides."""
-    length, wide, tall = (
-        float(rng.uniform(5, 13)),
-        float(rng.uniform(2.1, 2.55)),
-        float(rng.uniform(2.4, 4.0)),
-    )
+    length = float(rng.uniform(5, 13))
+    wide = float(rng.uniform(2.1, 2.55))
+    tall = float(rng.uniform(2.4, 4.0))
     colour = _colour(rng)
-    rear, side = _plain((wide, tall), colour), _plain((length, tall), colour)
+    rear = _plain((wide, tall), colour)
+    side = _plain((length, tall), colour)
     bumper = rng.uniform(0.5, 1.1)
     _rectangle(rear, 0, 0, wide, bumper, (0.04, 0.04, 0.04))
     for left in (0.1, wide - 0.7):
@@ -233,7 +238,8 @@ def _tape(rng: np.random.Generator, side: Picture, length: float, low: float) ->
     """The reflecting tape along a trailer's side: in one piece or in dashes, of one or two colours."""
     if rng.random() < 0.3:
         return
-    tall, piece = rng.uniform(0.05, 0.15), rng.uniform(0.25, 1.5)
+    tall = rng.uniform(0.05, 0.15)
+    piece = rng.uniform(0.25, 1.5)
     colours = ((_WHITE, _RED), (_WHITE, None), (_YELLOW, None), (_RED, None))[int(rng.integers(4))]
     for k, at in enumerate(np.arange(0, length, piece)):
         colour = colours[k % 2]
@@ -243,13 +249,12 @@ def _tape(rng: np.random.Generator, side: Picture, length: float, low: float) ->
 
 def _car(rng: np.random.Generator, x: float, y: float, yaw: float) -> list[Box]:
     """A car or a three-wheeler: body and cabin."""
-    length, wide, tall = (
-        float(rng.uniform(2.6, 4.7)),
-        float(rng.uniform(1.3, 1.85)),
-        float(rng.uniform(0.75, 1.0)),
-    )
+    length = float(rng.uniform(2.6, 4.7))
+    wide = float(rng.uniform(1.3, 1.85))
+    tall = float(rng.uniform(0.75, 1.0))
     up = float(rng.uniform(0.45, 0.8))
-    colour, rim = _colour(rng), float(rng.uniform(0.05, 0.6))
+    colour = _colour(rng)
+    rim = float(rng.uniform(0.05, 0.6))
     side = _plain((length, tall), colour)
     _rectangle(side, 0, 0, length, 0.25, (0.02, 0.02, 0.02))
     for middle in (0.18 * length, 0.8 * length):
@@ -262,8 +267,10 @@ def _car(rng: np.random.Generator, x: float, y: float, yaw: float) -> list[Box]:
         _lights(rng, end, wide, tall - 0.4, front)
         _plate(rng, end, wide / 2, float(rng.choice([0.3, 0.5])))
         ends.append(end)
-    cabin, glass = (0.55 * length, wide - 0.2), _glass(rng)
-    along, across = _plain((cabin[0], up), colour), _plain((cabin[1], up), colour)
+    cabin = (0.55 * length, wide - 0.2)
+    glass = _glass(rng)
+    along = _plain((cabin[0], up), colour)
+    across = _plain((cabin[1], up), colour)
     for left in (0.06, 0.52):
         _rectangle(along, left * cabin[0], 0.05, 0.42 * cabin[0], up - 0.12, glass)
     _rectangle(across, 0.08 * cabin[1], 0.05, 0.84 * cabin[1], up - 0.12, glass)
@@ -277,13 +284,13 @@ def _car(rng: np.random.Generator, x: float, y: float, yaw: float) -> list[Box]:
 
 def _bus(rng: np.random.Generator, x: float, y: float, yaw: float) -> list[Box]:
     """A bus or a van: rows of windows over a coloured band."""
-    length, wide, tall = (
-        float(rng.uniform(4.5, 12)),
-        float(rng.uniform(1.8, 2.5)),
-        float(rng.uniform(1.9, 3.1)),
-    )
-    colour, glass = _colour(rng), _glass(rng)
-    side, end = _plain((length, tall), colour), _plain((wide, tall), colour)
+    length = float(rng.uniform(4.5, 12))
+    wide = float(rng.uniform(1.8, 2.5))
+    tall = float(rng.uniform(1.9, 3.1))
+    colour = _colour(rng)
+    glass = _glass(rng)
+    side = _plain((length, tall), colour)
+    end = _plain((wide, tall), colour)
     if rng.random() < 0.6:
         band = _colour(rng)
         for picture in (side, end):
@@ -298,7 +305,8 @@ def _bus(rng: np.random.Generator, x: float, y: float, yaw: float) -> list[Box]:
         _wheel(side, middle, 0.42, (0.2, 0.2, 0.2))
     if rng.random() < 0.6:
         _writing(rng, side, 0.15 * length, 0.3 * tall, 0.6 * length, 0.3)
-    rear, front = end.copy(), end
+    rear = end.copy()
+    front = end
     _lights(rng, rear, wide, 0.55, front=False)
     _lights(rng, front, wide, 0.45, front=True)
     for picture in (rear, front):
@@ -309,7 +317,8 @@ def _bus(rng: np.random.Generator, x: float, y: float, yaw: float) -> list[Box]:
 def _board(rng: np.random.Generator, x: float, y: float, yaw: float) -> list[Box]:
     """A works barrier or a row of beacons with stripes."""
     if rng.random() < 0.5:
-        wide, tall = float(rng.uniform(0.8, 3.0)), float(rng.uniform(0.2, 0.5))
+        wide = float(rng.uniform(0.8, 3.0))
+        tall = float(rng.uniform(0.2, 0.5))
         face = _plain((wide, tall), _WHITE)
         _stripes(rng, face, 0, 0, wide, tall)
         return [
@@ -322,7 +331,8 @@ def _board(rng: np.random.Generator, x: float, y: float, yaw: float) -> list[Box
                 float(rng.uniform(0.1, 0.9)),
             )
         ]
-    out, ahead = [], np.array([np.cos(yaw), np.sin(yaw)])
+    out = []
+    ahead = np.array([np.cos(yaw), np.sin(yaw)])
     face = _plain((0.25, 1.0), _WHITE)
     _stripes(rng, face, 0, 0, 0.25, 1.0)
     for k in range(int(rng.integers(1, 5))):
@@ -335,7 +345,8 @@ def _board(rng: np.random.Generator, x: float, y: float, yaw: float) -> list[Box
 
 def _fence(rng: np.random.Generator, x: float, y: float, yaw: float) -> list[Box]:
     """A railing of upright bars or a crash barrier, before dark or bright ground."""
-    length, tall = float(rng.uniform(4, 25)), float(rng.uniform(0.7, 1.3))
+    length = float(rng.uniform(4, 25))
+    tall = float(rng.uniform(0.7, 1.3))
     bars, behind = (float(c) for c in rng.uniform(0.05, 0.75, 2))
     face = _plain((length, tall), (behind, behind, behind))
     if rng.random() < 0.6:
@@ -350,14 +361,13 @@ def _fence(rng: np.random.Generator, x: float, y: float, yaw: float) -> list[Box
 
 def _striped_kerb(rng: np.random.Generator, x: float, y: float, yaw: float) -> list[Box]:
     """A kerb or an island painted in blocks of black and white or yellow."""
-    length, wide, tall = (
-        float(rng.uniform(6, 25)),
-        float(rng.uniform(0.12, 1.5)),
-        float(rng.uniform(0.1, 0.3)),
-    )
+    length = float(rng.uniform(6, 25))
+    wide = float(rng.uniform(0.12, 1.5))
+    tall = float(rng.uniform(0.1, 0.3))
     light = _WHITE if rng.random() < 0.6 else _YELLOW
     block = rng.uniform(0.3, 1.2)
-    side, top = _plain((length, tall), (0.06, 0.06, 0.06)), _plain((length, wide), (0.06, 0.06, 0.06))
+    side = _plain((length, tall), (0.06, 0.06, 0.06))
+    top = _plain((length, wide), (0.06, 0.06, 0.06))
     for at in np.arange(0, length, 2 * block):
         _rectangle(side, at, 0, block, tall, light)
         _rectangle(top, at, 0, block, wide, light)

@@ -17,9 +17,9 @@ from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import CameraInfo, FloatArray
 from v2hdm.simulate.render.renderer import Motion, Optics
 
-_LENS_TOLERANCE_PX = 0.1
-_BORDER_POINTS = 17
-_FARTHEST_PASSED_M = 12.0
+_LENS_TOLERANCE_PX = 0.1  # largest error of a lens model's inverse, px
+_BORDER_POINTS = 17  # points of each border of an image at which a lens is checked
+_FARTHEST_PASSED_M = 12.0  # largest distance, m, of a place that a camera on the vehicle's side passes
 _UNUSUAL_HEIGHTS_M = ((0.5, 1.1), (3.6, 5.0))
 """Of cameras in bumpers and on small robots, and of those on masts, cranes and straddle carriers."""
 
@@ -41,9 +41,12 @@ def random_view(rng: np.random.Generator, width: int, height: int) -> TrainingVi
     two in five like the usual camera of a car (level, low, 600 to 1000 px).
     """
     if rng.random() < 0.4:
-        focal_px, height_m, pitch = _log_uniform(rng, 600, 1000), rng.uniform(1.2, 1.9), rng.uniform(-1.5, 3)
+        focal_px = _log_uniform(rng, 600, 1000)
+        height_m = rng.uniform(1.2, 1.9)
+        pitch = rng.uniform(-1.5, 3)
     else:
-        focal_px, height_m = _log_uniform(rng, 300, 1500), rng.uniform(1.1, 3.6)
+        focal_px = _log_uniform(rng, 300, 1500)
+        height_m = rng.uniform(1.1, 3.6)
         pitch = rng.uniform(0, 28 if rng.random() < 0.6 else 8)
     pitch = np.deg2rad(pitch)
     yaw = np.deg2rad(rng.normal(0, 4) if rng.random() < 0.75 else rng.uniform(-60, 60))
@@ -78,7 +81,8 @@ def turned_aside(
         return view
     yaw = rng.choice([-1.0, 1.0]) * rng.uniform(ASIDE_RAD, np.pi - ASIDE_RAD)
     right, _, forward = view.cam_from_map[:3, :3]
-    pitch, roll = -np.arcsin(forward[2]), np.arcsin(np.clip(-right[2] / np.hypot(*forward[:2]), -1, 1))
+    pitch = -np.arcsin(forward[2])
+    roll = np.arcsin(np.clip(-right[2] / np.hypot(*forward[:2]), -1, 1))
     height_m = -view.cam_from_map[:3, 2] @ view.cam_from_map[:3, 3]
     (fx, _, cx), (_, fy, cy), _ = view.info.intrinsic
     bearing = yaw - np.arctan((view.info.width / 2 - cx) / fx) + rng.normal(0, 0.15)
@@ -97,7 +101,8 @@ def looking(centre_map: FloatArray, yaw_rad: float, pitch_rad: float, roll_rad: 
 
     It looks along +x, turned left by yaw, then tilted down by pitch, then rolled about its axis.
     """
-    cos, sin = np.cos, np.sin
+    cos = np.cos
+    sin = np.sin
     forward = np.array([cos(yaw_rad) * cos(pitch_rad), sin(yaw_rad) * cos(pitch_rad), -sin(pitch_rad)])
     right = np.array([sin(yaw_rad), -cos(yaw_rad), 0.0])
     down = np.cross(forward, right)

@@ -16,7 +16,7 @@ from v2hdm.simulate.render.renderer import Optics
 from v2hdm.simulate.render.scene import Float32, Ground, Light, Tile, noise_tile, sample, smoothstep
 from v2hdm.simulate.render.view import View, bands_of, outlines
 
-_TILE_PX = 512
+_TILE_PX = 512  # side of a tile of a photographed ground, elements
 _GROUNDS = Path(__file__).parent / "grounds"
 GROUNDS = tuple(sorted(path.stem for path in _GROUNDS.glob("*.jpg")))
 """Photographs of asphalt and concrete that come with the training; see their README."""
@@ -45,11 +45,13 @@ class Dapple:
         parts = [(slice(None), slice(None))]
         if self.region_map is not None:
             (shape,) = outlines(view, [on_ground_px(view, self.region_map)])
-            found, count = (np.empty((0, 4)), 0) if shape is None else bands_of(view, shape, field.first_row)
-            rows = found[:count] - np.array([field.first_row, field.first_row, 0, 0])
+            bands, count = (np.empty((0, 4)), 0) if shape is None else bands_of(view, shape, field.first_row)
+            rows = bands[:count] - np.array([field.first_row, field.first_row, 0, 0])
             parts = [(slice(top, end), slice(left, right)) for top, end, left, right in rows.tolist()]
         for part in parts:
-            x, y, footprint = field.x_m[part], field.y_m[part], field.footprint_m[part]
+            x = field.x_m[part]
+            y = field.y_m[part]
+            footprint = field.footprint_m[part]
             lit = smoothstep(sample(tile, x, y, texture_shift(self.seed)), level - 0.12, level + 0.12)
             amplitude = _fade(tile, footprint, 8.0)
             lit = lit * amplitude + (np.float32(1.0) - amplitude) * np.float32(1.0 - self.shaded)
@@ -95,7 +97,8 @@ def rain(rng: np.random.Generator, ground: Ground, light: Light, share: float) -
     wet = replace(
         ground, albedo_bgr=(blue, green, red), wet_fraction=float(rng.uniform(RAINED_FRACTION, 0.99))
     )
-    grey, bright = rng.uniform(0.25, 0.6), rng.uniform(0.7, 1.8)
+    grey = rng.uniform(0.25, 0.6)
+    bright = rng.uniform(0.7, 1.8)
     tint = np.exp(rng.normal(0, 0.06, 3))
     sky = _bgr(grey * tint)
     return wet, replace(
@@ -124,7 +127,8 @@ def dusk(rng: np.random.Generator, light: Light, share: float) -> Light:
     """This light, or in a ``share`` of cases none but that of a bluish or reddish sky after sunset."""
     if rng.random() >= share:
         return light
-    sky, red = rng.uniform(0.05, 0.3), rng.uniform(-0.2, 0.5)
+    sky = rng.uniform(0.05, 0.3)
+    red = rng.uniform(-0.2, 0.5)
     return replace(
         light, sun_bgr=(0.0, 0.0, 0.0), sky_bgr=_bgr(sky * np.array([1.3, 1.0, 0.85])),
         zenith_bgr=_bgr(sky * rng.uniform(0.3, 1.0) * np.array([1.5, 0.9, 0.7])),

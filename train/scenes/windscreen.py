@@ -25,7 +25,7 @@ LOW_SUN_SINE = 0.2
 RAINED_FRACTION = 0.7
 """From this wet fraction on the ground mirrors what stands on it."""
 
-_LEAST_MIRRORED_PX = 8
+_LEAST_MIRRORED_PX = 8  # least number of rows above and below the horizon to mirror
 
 
 def before_lens(
@@ -95,7 +95,8 @@ def _headlights(rng: np.random.Generator, view: View, radiance: Float32) -> None
         radiance[ground.first_row :] *= gain * np.array([0.85, 1.0, 1.1], dtype=np.float32)
     column, row = _pixels(radiance)
     for _ in range(int(rng.poisson(4))):
-        u, v = rng.uniform(0, column.size), _horizon_row(view) + rng.normal(0, 0.12) * row.size
+        u = rng.uniform(0, column.size)
+        v = _horizon_row(view) + rng.normal(0, 0.12) * row.size
         size = float(np.exp(rng.uniform(np.log(1), np.log(8))))
         low, high = (int(np.clip(at, 0, n)) for at, n in ((v - 4 * size, row.size), (v + 9 * size, row.size)))
         below = np.maximum(row[low:high] - v, 0) / 2.5 + np.minimum(row[low:high] - v, 0)
@@ -111,7 +112,8 @@ def _glare(rng: np.random.Generator, light: Light, view: View, radiance: Float32
         return
     u, v = at[:2] / at[2]
     column, row = _pixels(radiance)
-    width, height = column.size, row.size
+    width = column.size
+    height = row.size
     level = float(radiance.mean())
     wide = rng.uniform(0.08, 0.35) * width
     below = row - _horizon_row(view)
@@ -162,10 +164,10 @@ def _bonnet(rng: np.random.Generator, radiance: Float32, hidden: Hidden) -> None
         shrink = rng.uniform(0.6, 3.0)
         u = np.broadcast_to(column + rng.uniform(-0.3, 0.3) * across * width / 4, (len(rows), width))
         v = np.maximum(edge - shrink * (rows - edge), 0)
-        seen = cv2.remap(radiance, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
+        mirrored = cv2.remap(radiance, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
         if rng.random() < 0.6:
-            seen = cv2.GaussianBlur(seen, (0, 0), float(rng.uniform(0.7, 4)))
-        body = body + np.float32(rng.uniform(0.1, 0.8)) * seen
+            mirrored = cv2.GaussianBlur(mirrored, (0, 0), float(rng.uniform(0.7, 4)))
+        body = body + np.float32(rng.uniform(0.1, 0.8)) * mirrored
     for _ in range(int(rng.poisson(1.5))):
         middle = width * (0.5 + rng.normal(0, 0.3)) + rng.normal(0, 1.5) * (rows - height)
         crease = np.exp(-(((column - middle) / rng.uniform(1, 6)) ** 2))[..., None]
@@ -206,7 +208,8 @@ def _filled(polygon_px: FloatArray, shape: tuple[int, ...]) -> Float32:
 def _wipers(rng: np.random.Generator, radiance: Float32, hidden: Hidden) -> None:
     """One or two dark blades that rise from the image's bottom."""
     height, width = radiance.shape[:2]
-    level, lean = float(radiance.mean()), rng.choice([-1, 1]) * rng.uniform(2, 12)
+    level = float(radiance.mean())
+    lean = rng.choice([-1, 1]) * rng.uniform(2, 12)
     for _ in range(int(rng.integers(1, 3))):
         foot = np.array([rng.uniform(0, width), height + 4.0])
         tip = foot + rng.uniform(0.1, 0.3) * height * np.array([lean, -1.0])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -16,17 +17,15 @@ from v2hdm.geometry.ipm import apply_homography, flat_motion, ground_from_pinhol
 from v2hdm.geometry.planar import cross, inside_convex
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.geometry.tensors import back_project, back_project_with_jacobian
-from v2hdm.records import BoolArray, Camera, Drive, FloatArray, IntArray
+from v2hdm.records import OUTLINE_SIGMA_PX, BoolArray, Camera, Drive, FloatArray, IntArray
 
 _HORIZON_M2 = 1e4  # smaller variance of a ground point, m^2, from which it counts as on the horizon
 
-OUTLINE_SIGMA_PX = 2.5
-"""Standard deviation of the network's outline from the edge of paint, px: 1 to 3 on renders."""
-
 _RUN_ON_M = 1.0  # length, m, beyond a dash without paint: gaps are at least as long as dashes
 _SURE_M = 0.2  # largest sigma, m, of a point that identifies its line
-_LONG = 2.0
-_PARALLEL = 0.9  # least length over width of a line's piece, and cosine between it and the line
+_LONG = 2.0  # least ratio of length to width of a marking that may be a piece of a line
+_PARALLEL = 0.9  # least cosine between such a marking and the line that continues it
+
 BORDER_PX = 10.0  # width of the image's border, px, within which a marking may be cut
 
 
@@ -56,9 +55,8 @@ def ground_points_with_jacobian(
     map_from_pinhole_px: FloatArray, pinhole_px: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """:func:`ground_points` and their Jacobians (N, K, 2, 2), m/px, by the pixels; nan together."""
-    found = back_project_with_jacobian(torch.tensor(map_from_pinhole_px), torch.tensor(pinhole_px))
-    points, jacobian = (one.numpy() for one in found)
-    return points, jacobian
+    points, jacobian = back_project_with_jacobian(torch.tensor(map_from_pinhole_px), torch.tensor(pinhole_px))
+    return points.numpy(), jacobian.numpy()
 
 
 def _on_ground(
@@ -68,19 +66,18 @@ def _on_ground(
     if rig.read_out_s is None:
         ipms = ground_from_pinhole_px(rig.intrinsic[camera], rig.cam_from_map(camera, frame))
         return ground_points_with_jacobian(ipms, pinhole_px)
-    camera, frame = (np.broadcast_to(one[:, None], row_share.shape).ravel() for one in (camera, frame))
+    camera, frame = (np.broadcast_to(index[:, None], row_share.shape).ravel() for index in (camera, frame))
     cam_from_map = rig.cam_from_map(camera, frame, row_share.ravel())
     ipms = ground_from_pinhole_px(rig.intrinsic[camera], cam_from_map)
     points, jacobian = ground_points_with_jacobian(ipms, pinhole_px.reshape(-1, 1, 2))
-    return points.reshape(pinhole_px.shape), jacobian.reshape(*pinhole_px.shape, 2)
+    return points.reshape(pinhole_px.shape), jacobian.reshape((*pinhole_px.shape, 2))
 
 
 def locate(sightings: Sightings, rig: Rig) -> Located:
     """Back-project every corner of ``sightings`` to z = 0 of the map under ``rig``."""
     camera = sightings.camera
     frame = sightings.frame
-    seen = sightings.corners_pinhole_px, sightings.row_share
-    corners_map, jacobian = _on_ground(rig, camera, frame, *seen)
+    corners_map, jacobian = _on_ground(rig, camera, frame, sightings.corners_pinhole_px, sightings.row_share)
     covariance = jacobian @ sightings.covariance_px @ np.swapaxes(jacobian, -1, -2)
     centre_vehicle = camera_centre(rig.cam_from_vehicle)[camera]
     poses = rig.map_from_vehicle[frame]
@@ -104,8 +101,9 @@ def images_with_symbol(symbols: Symbols, rig: Rig, corners_map: FloatArray) -> I
     The visible shaft of an arrow looks like a dash in some images; others show the whole arrow.
     """
     count = np.zeros(len(corners_map), dtype=np.int64)
-    known = np.flatnonzero(np.isfinite(corners_map).all(axis=(1, 2)))
-    centre, way, _ = _middle_lines(corners_map)
+    complete = np.flatnonzero(np.isfinite(corners_map).all(axis=(1, 2)))
+    centre = corners_map.mean(axis=1)
+    way = _middle_lines(corners_map).way
     points = centre[:, None] + np.linspace(-0.4, 0.4, 5)[:, None] * way[:, None]
     for ground in outlines_on_ground(symbols, rig):
         if ground is None:
@@ -113,9 +111,9 @@ def images_with_symbol(symbols: Symbols, rig: Rig, corners_map: FloatArray) -> I
         middle = ground.mean(axis=0)
         size_m = float(np.ptp(ground, axis=0).max())
         polygon = (ground - middle).astype(np.float32)
-        for group in known[np.linalg.norm(centre[known] - middle, axis=1) < size_m]:
-            off = (points[group] - middle).tolist()
-            inside = [cv2.pointPolygonTest(polygon, at, False) >= 0 for at in off]
+        for group in complete[np.linalg.norm(centre[complete] - middle, axis=1) < size_m]:
+            offsets_m = (points[group] - middle).tolist()
+            inside = [cv2.pointPolygonTest(polygon, offset_m, False) >= 0 for offset_m in offsets_m]
             count[group] += 2 * sum(inside) > len(inside)
     return count
 
@@ -128,7 +126,8 @@ def images_with_line(lines: Symbols, rig: Rig, corners_map: FloatArray) -> IntAr
     pieces = _pieces_on_ground(lines, rig)
     if not pieces:
         return np.zeros(len(corners_map), dtype=np.int64)
-    points, sigma_m = (np.concatenate(one) for one in zip(*pieces, strict=True))
+    points = np.concatenate([piece for piece, _ in pieces])
+    sigma_m = np.concatenate([sigma_of_piece_m for _, sigma_of_piece_m in pieces])
     course = np.concatenate([np.gradient(piece, axis=0) for piece, _ in pieces])
     course /= np.maximum(np.linalg.norm(course, axis=1, keepdims=True), 1e-9)
     image = lines.frame * len(rig.intrinsic) + lines.camera
@@ -137,35 +136,43 @@ def images_with_line(lines: Symbols, rig: Rig, corners_map: FloatArray) -> IntAr
     points = points[sure]
     course = course[sure]
     image = image[sure]
-    centre, way, breadth_m = _middle_lines(corners_map)
+    centre = corners_map.mean(axis=1)
+    way, breadth_m = _middle_lines(corners_map)
     long_m = np.linalg.norm(way, axis=1)
     long = np.flatnonzero(np.isfinite(long_m) & (long_m > _LONG * breadth_m))
-    found = cKDTree(points).query_ball_point(centre[long], long_m[long] / 2 + _RUN_ON_M)
-    group = np.repeat(long, [len(one) for one in found])
-    near = np.array([*chain(*found)], dtype=np.int64)
+    in_reach = cKDTree(points).query_ball_point(centre[long], long_m[long] / 2 + _RUN_ON_M)
+    group = np.repeat(long, [len(points_in_reach) for points_in_reach in in_reach])
+    point = np.array(list(chain.from_iterable(in_reach)), dtype=np.int64)
     ahead = way[group] / long_m[group, None]
-    off = points[near] - centre[group]
+    off = points[point] - centre[group]
     goes_on = np.abs(np.sum(off * ahead, axis=1)) > (long_m + breadth_m)[group] / 2
     goes_on &= np.abs(cross(ahead, off)) < breadth_m[group]
-    goes_on &= np.abs(np.sum(course[near] * ahead, axis=1)) > _PARALLEL
-    shown = np.unique(np.stack([group, image[near]])[:, goes_on], axis=1)
-    return np.bincount(shown[0], minlength=len(corners_map))
+    goes_on &= np.abs(np.sum(course[point] * ahead, axis=1)) > _PARALLEL
+    image_of_marking = np.unique(np.stack([group, image[point]])[:, goes_on], axis=1)
+    return np.bincount(image_of_marking[0], minlength=len(corners_map))
 
 
-def _middle_lines(corners_map: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Centres and longer middle lines (G, 2), and widths (G,), m, of quadrilaterals (G, 4, 2)."""
+class _MiddleLines(NamedTuple):
+    """The longer middle lines of G quadrilaterals, through their centres."""
+
+    way: FloatArray  # (G, 2) m, from one end to the other
+    breadth_m: FloatArray  # (G,) length of the other middle line
+
+
+def _middle_lines(corners_map: FloatArray) -> _MiddleLines:
+    """The middle lines of quadrilaterals (G, 4, 2)."""
     sides = (corners_map + np.roll(corners_map, -1, axis=1)) / 2
     across = sides[:, 2:] - sides[:, :2]
     length_m = np.linalg.norm(across, axis=2)
     way = across[np.arange(len(across)), np.argmax(length_m, axis=1)]
-    return corners_map.mean(axis=1), way, length_m.min(axis=1)
+    return _MiddleLines(way, length_m.min(axis=1))
 
 
 def outlines_on_ground(symbols: Symbols, rig: Rig) -> list[FloatArray | None]:
     """Outline (K, 2) of each symbol in the map, None if too uncertain for the symbol's length."""
     return [
-        outline if np.isfinite(outline).all() and 2 * own.max() < np.ptp(outline, axis=0).max() else None
-        for outline, own in _pieces_on_ground(symbols, rig)
+        outline if np.isfinite(outline).all() and 2 * sigma_m.max() < np.ptp(outline, axis=0).max() else None
+        for outline, sigma_m in _pieces_on_ground(symbols, rig)
     ]
 
 
@@ -175,11 +182,12 @@ def _pieces_on_ground(symbols: Symbols, rig: Rig) -> list[tuple[FloatArray, Floa
         return []
     of_point = symbols.symbol_of_point
     points_px = np.concatenate(symbols.outlines_pinhole_px)
-    seen = points_px[:, None], np.concatenate(symbols.row_shares)[:, None]
-    found = _on_ground(rig, symbols.camera[of_point], symbols.frame[of_point], *seen)
-    ground, by_px = (one[:, 0] for one in found)
-    sigma_m = OUTLINE_SIGMA_PX * np.linalg.norm(by_px, axis=(1, 2))
-    return list(zip(symbols.by_symbol(ground), symbols.by_symbol(sigma_m), strict=True))
+    row_share = np.concatenate(symbols.row_shares)
+    ground, by_px = _on_ground(
+        rig, symbols.camera[of_point], symbols.frame[of_point], points_px[:, None], row_share[:, None]
+    )
+    sigma_m = OUTLINE_SIGMA_PX * np.linalg.norm(by_px[:, 0], axis=(1, 2))
+    return list(zip(symbols.by_symbol(ground[:, 0]), symbols.by_symbol(sigma_m), strict=True))
 
 
 @dataclass(frozen=True)
@@ -214,30 +222,31 @@ def easy_views(
     groups = []
     images = []
     for c, camera in enumerate(cameras):
-        own = views.camera == c
-        if not own.any() or not len(whole):
+        is_of_camera = views.camera == c
+        if not is_of_camera.any() or not len(whole):
             continue
         centre = camera_centre(rig.cam_from_vehicle[c])[:2]
         reach_m = float(np.max(np.linalg.norm(camera.roi_vehicle, axis=1)))
         if within_m is not None:
             reach_m = within_m + float(np.linalg.norm(centre))
-        positions = rig.map_from_vehicle[views.frame[own]][:, :2, 3]
-        near = cKDTree(positions).query_ball_point(corners_map[whole].mean(axis=1), reach_m)
-        group = np.repeat(whole, [len(n) for n in near])
-        view = np.flatnonzero(own)[np.concatenate([np.asarray(n, dtype=np.int64) for n in near])]
-        vehicle_from_map = np.linalg.inv(rig.map_from_vehicle[views.frame[view]])
+        positions = rig.map_from_vehicle[views.frame[is_of_camera]][:, :2, 3]
+        views_of_marking = cKDTree(positions).query_ball_point(corners_map[whole].mean(axis=1), reach_m)
+        group = np.repeat(whole, [len(views_in_reach) for views_in_reach in views_of_marking])
+        view_of_camera = np.array(list(chain.from_iterable(views_of_marking)), dtype=np.int64)
+        view = np.flatnonzero(is_of_camera)[view_of_camera]
+        vehicle_from_map = np.asarray(np.linalg.inv(rig.map_from_vehicle[views.frame[view]]), np.float64)
         cam_from_vehicle = rig.cam_from_vehicle[c]
         corners = corners_map[group]
         corners_vehicle = apply_homography(flat_motion(vehicle_from_map), corners)
         if within_m is None:
-            seen = inside_convex(camera.roi_vehicle, corners_vehicle).all(axis=1)
+            is_in_view = inside_convex(camera.roi_vehicle, corners_vehicle).all(axis=1)
         else:
-            seen = (np.linalg.norm(corners_vehicle - centre, axis=2) <= within_m).all(axis=1)
+            is_in_view = (np.linalg.norm(corners_vehicle - centre, axis=2) <= within_m).all(axis=1)
         pixel, depth = project_ground(camera.info.intrinsic, cam_from_vehicle @ vehicle_from_map, corners)
         limit = np.array([camera.info.width, camera.info.height]) - BORDER_PX
         with np.errstate(invalid="ignore"):
-            seen &= ((pixel > BORDER_PX) & (pixel < limit)).all(axis=(1, 2)) & (depth > 0).all(axis=1)
-        groups.append(group[seen])
-        images.append(views.image[view[seen]])
+            is_in_view &= ((pixel > BORDER_PX) & (pixel < limit)).all(axis=(1, 2)) & (depth > 0).all(axis=1)
+        groups.append(group[is_in_view])
+        images.append(views.image[view[is_in_view]])
     empty = [np.zeros(0, dtype=np.int64)]
     return np.concatenate(groups or empty), np.concatenate(images or empty)

@@ -25,10 +25,11 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 _LEAST_DEPTH_M = 1.0
 """Least depth, m, of a corner on a line to be projected: nearer, the line leaves the image steeply."""
 
-GATE_SIGMAS = 4.0
-MAX_GATE_M = 1.5  # size of every gate, and its limit
+GATE_SIGMAS = 4.0  # size of a gate, in sigmas of the distance between two positions of one marking
+MAX_GATE_M = 1.5  # largest size of a gate, m
 SHAPE_TOLERANCE = 0.25  # corner deviation of sightings of one shape, as a fraction of the marking's diameter
 LEAST_TOLERANCE_M = 0.05  # least tolerance, m, of corners of one shape, for small markings
+
 _CORNER_FLOOR_M = 0.001  # floor of a corner's standard deviation in fusion, m
 _HUBER_SIGMAS = 2.0  # residual in sigmas beyond which a sighting is down-weighted in its group
 _OPEN_END_M = 10.0  # standard deviation, m, along its side, of a corner on a line: a marking's length
@@ -53,10 +54,10 @@ class Association:
 
 def keep_rows(association: Association, rows: BoolArray) -> Association:
     """The association restricted to ``rows`` (S,), groups renumbered."""
-    kept = rows & (association.group >= 0)
-    numbers, group = np.unique(association.group[kept], return_inverse=True)
+    is_in_group = rows & (association.group >= 0)
+    numbers, group = np.unique(association.group[is_in_group], return_inverse=True)
     full = np.full(len(association.group), -1, dtype=np.int64)
-    full[kept] = group
+    full[is_in_group] = group
     return Association(full, association.shift, len(numbers))
 
 
@@ -73,12 +74,12 @@ class FusedGroups:
 
     corners_map: FloatArray  # (G, 4, 2) m
     covariance_m2: FloatArray  # (G, 4, 2, 2), large along the line of a corner that is no point
-    seen: IntArray  # (G, 4) number of sightings that show the corner as a point
+    point_sightings: IntArray  # (G, 4) number of sightings that show the corner as a point
 
     @property
     def valid(self) -> BoolArray:
         """Corners (G, 4) seen as points."""
-        return np.asarray(self.seen > 0)
+        return np.asarray(self.point_sightings > 0)
 
 
 def known_elsewhere(association: Association, point: BoolArray, informs: BoolArray) -> BoolArray:
@@ -92,10 +93,10 @@ def known_elsewhere(association: Association, point: BoolArray, informs: BoolArr
     points = association.in_group_order(point) & grouped
     has_point = np.zeros(4 * association.count + 1, dtype=np.bool_)
     has_point[number[points]] = True
-    out = np.zeros_like(point)
-    known = grouped & has_point[np.where(grouped, number, -1)]
-    np.put_along_axis(out, association.corner_order(), known, axis=1)
-    return np.asarray(out & informs & ~point)
+    is_elsewhere = np.zeros_like(point)
+    has_point_elsewhere = grouped & has_point[np.where(grouped, number, -1)]
+    np.put_along_axis(is_elsewhere, association.corner_order(), has_point_elsewhere, axis=1)
+    return np.asarray(is_elsewhere & informs & ~point)
 
 
 def line_only(covariance: FloatArray, sigma: float) -> FloatArray:
@@ -137,10 +138,13 @@ def fuse_groups(association: Association, located: Located, jitter_rad: float) -
         miss = points - mean[corner]
         distance = np.sqrt(np.maximum(np.einsum("sci,scij,scj->sc", miss, information, miss), 1e-12))
         weight = informs * np.minimum(1.0, _HUBER_SIGMAS / distance)
-    seen = np.bincount(corner[point], minlength=size)[:-1]
+    point_sightings = np.bincount(corner[point], minlength=size)[:-1]
     mean[~solvable] = np.nan
-    covariance_m2 = spread[:-1].reshape(-1, 4, 2, 2)
-    return FusedGroups(mean[:-1].reshape(-1, 4, 2), covariance_m2, seen.reshape(-1, 4).astype(np.int64))
+    return FusedGroups(
+        corners_map=mean[:-1].reshape(-1, 4, 2),
+        covariance_m2=spread[:-1].reshape(-1, 4, 2, 2),
+        point_sightings=point_sightings.reshape(-1, 4).astype(np.int64),
+    )
 
 
 def in_view(
@@ -154,7 +158,9 @@ def in_view(
     fused = fuse_groups(association, located, jitter_rad)
     cam_from_map = rig.cam_from_map(sightings.camera, sightings.frame)
     group = np.maximum(association.group, 0)
-    corners = fused.corners_map[group] if association.count else np.full(located.corners_map.shape, np.nan)
+    corners = np.full(located.corners_map.shape, np.nan)
+    if association.count:
+        corners = fused.corners_map[group]
     _, depth_m = project_ground(rig.intrinsic[sightings.camera], cam_from_map, corners)
     order = association.corner_order()
     in_front = np.zeros_like(located.valid)
@@ -183,9 +189,9 @@ def merge_groups(
     usable = np.flatnonzero(fused.valid.sum(axis=1) >= 2)
     centre = np.nanmean(fused.corners_map[usable], axis=1)
     # In a drive of a few images the extrinsic is poorly known, and rays may miss the ground.
-    somewhere = np.isfinite(centre).all(axis=1)
-    usable = usable[somewhere]
-    centre = centre[somewhere]
+    on_ground = np.isfinite(centre).all(axis=1)
+    usable = usable[on_ground]
+    centre = centre[on_ground]
     if not len(usable):
         return association
     kind = group_kinds(association, sightings)
@@ -193,13 +199,13 @@ def merge_groups(
     # Centres of different valid corners differ by up to half a diameter.
     reach_m = max_distance_m + 0.5 * float(np.max(size_m[usable]))
     a, b = usable[cKDTree(centre).query_pairs(reach_m, output_type="ndarray")].T
-    found = align(fused.corners_map[a], fused.valid[a], fused.corners_map[b], fused.valid[b])
+    aligned = align(fused.corners_map[a], fused.valid[a], fused.corners_map[b], fused.valid[b])
     covariance = _mean_covariance(fused, a) + _mean_covariance(fused, b) + 2 * floor_m**2 * np.eye(2)
-    solved = np.linalg.solve(covariance, found.offset[..., None])[..., 0]
-    distance = np.sqrt(np.sum(found.offset * solved, axis=-1))
+    solved = np.linalg.solve(covariance, aligned.offset[..., None])[..., 0]
+    distance = np.sqrt(np.sum(aligned.offset * solved, axis=-1))
     tolerance_m = np.maximum(shape_tolerance * np.maximum(size_m[a], size_m[b]), LEAST_TOLERANCE_M)
-    accepted = (kind[a] == kind[b]) & (distance <= gate_sigmas) & (found.deformation_m <= tolerance_m)
-    accepted &= np.linalg.norm(found.offset, axis=-1) <= max_distance_m
+    accepted = (kind[a] == kind[b]) & (distance <= gate_sigmas) & (aligned.deformation_m <= tolerance_m)
+    accepted &= np.linalg.norm(aligned.offset, axis=-1) <= max_distance_m
     root = np.arange(association.count)
     # Corner c of the root is corner (c + turn) mod 4 of the group.
     turn = np.zeros(association.count, dtype=np.int64)
@@ -207,20 +213,20 @@ def merge_groups(
     for group, image in zip(association.group.tolist(), sightings.image.tolist(), strict=True):
         if group >= 0:
             images[group].add(image)
-    pairs = zip(*(of[accepted] for of in (distance, a, b, found.shift)), strict=True)
-    for _, a, b, s in sorted(pairs, key=lambda pair: float(pair[0])):
-        root_a = root[a]
-        root_b = root[b]
+    pairs = np.flatnonzero(accepted)
+    for pair in pairs[np.argsort(distance[pairs], kind="stable")]:
+        root_a = root[a[pair]]
+        root_b = root[b[pair]]
         if root_a == root_b or not images[root_a].isdisjoint(images[root_b]):
             continue
         members = root == root_b
-        turn[members] = (turn[members] + turn[a] + s - turn[b]) % 4
+        turn[members] = (turn[members] + turn[a[pair]] + aligned.shift[pair] - turn[b[pair]]) % 4
         root[members] = root_a
         images[root_a] |= images[root_b]
-    kept, number = np.unique(root, return_inverse=True)
+    roots, number = np.unique(root, return_inverse=True)
     grouped = association.group >= 0
     shift = (association.shift + np.where(grouped, turn[association.group], 0)) % 4
-    return Association(np.where(grouped, number[association.group], -1), shift, len(kept))
+    return Association(np.where(grouped, number[association.group], -1), shift, len(roots))
 
 
 def group_kinds(association: Association, sightings: Sightings) -> IntArray:
@@ -243,7 +249,8 @@ _REACH_M = 4.0  # largest distance, m, from a sighting's centre to its marking's
 _MOST_SQUARED = 16.0
 """Largest squared Mahalanobis distance of a match: four corners on lines have four degrees of freedom."""
 
-_CLEARER_BY = 9.0  # least margin in squared distance to any other marking or corner order
+CLEARER_BY = 9.0
+"""Least margin in squared distance to any other marking or corner order: odds of ninety to one."""
 
 
 def attach(
@@ -262,8 +269,8 @@ def attach(
     whole = np.flatnonzero(fused.valid.all(axis=1))
     if not len(rows) or not len(whole):
         return association
-    row, near = near_pairs(located, rows, fused.corners_map[whole].mean(axis=1), _REACH_M)
-    group = whole[near]
+    row, index = near_pairs(located, rows, fused.corners_map[whole].mean(axis=1), _REACH_M)
+    group = whole[index]
     alike = group_kinds(association, sightings)[group] == sightings.kind[row]
     row = row[alike]
     group = group[alike]
@@ -271,16 +278,16 @@ def attach(
     out_group = association.group.copy()
     out_shift = association.shift.copy()
     shown = set(zip(association.group.tolist(), sightings.image.tolist(), strict=True))
-    for one in np.unique(row):
-        own = np.flatnonzero(row == one)
-        order = np.argsort(squared[own], axis=None)
+    for sighting in np.unique(row):
+        pairs_of_sighting = np.flatnonzero(row == sighting)
+        order = np.argsort(squared[pairs_of_sighting], axis=None)
         pair, shift = divmod(int(order[0]), 4)
-        best, second = squared[own].ravel()[order[:2]]
-        place = (int(group[own[pair]]), int(sightings.image[one]))
-        if best <= _MOST_SQUARED and second >= best + _CLEARER_BY and place not in shown:
-            out_group[one] = place[0]
-            out_shift[one] = shift
-            shown.add(place)
+        best, second = squared[pairs_of_sighting].ravel()[order[:2]]
+        place_in_image = (int(group[pairs_of_sighting[pair]]), int(sightings.image[sighting]))
+        if best <= _MOST_SQUARED and second >= best + CLEARER_BY and place_in_image not in shown:
+            out_group[sighting] = place_in_image[0]
+            out_shift[sighting] = shift
+            shown.add(place_in_image)
     return Association(out_group, out_shift, association.count)
 
 
@@ -290,9 +297,9 @@ def near_pairs(
     """Pairs (P,), (P,) of sightings, out of ``rows``, and centres (G, 2) within ``reach_m``."""
     informs = located.informs[rows][..., None]
     middle = np.where(informs, located.corners_map[rows], 0.0).sum(axis=1) / informs.sum(axis=1)
-    near = cKDTree(centres_map).query_ball_point(middle, reach_m)
-    row = np.repeat(rows, [len(places) for places in near])
-    return row, np.concatenate([np.asarray(places, dtype=np.int64) for places in near])
+    places_in_reach = cKDTree(centres_map).query_ball_point(middle, reach_m)
+    row = np.repeat(rows, [len(places) for places in places_in_reach])
+    return row, np.concatenate([np.asarray(places, dtype=np.int64) for places in places_in_reach])
 
 
 def squared_distances(
@@ -306,8 +313,10 @@ def squared_distances(
     """Squared Mahalanobis distances (P, 4) of sightings ``row`` (P,) from markings (P, 4, 2), by shift."""
     camera = sightings.camera[row]
     # A rolling shutter reads each corner's row at a pose of its own.
-    seen = camera[:, None], sightings.frame[row][:, None], sightings.row_share[row]
-    cam_from_map = rig.cam_from_map(*np.broadcast_arrays(*seen))
+    row_share = sightings.row_share[row]
+    camera_of_corner = np.broadcast_to(camera[:, None], row_share.shape)
+    frame_of_corner = np.broadcast_to(sightings.frame[row][:, None], row_share.shape)
+    cam_from_map = rig.cam_from_map(camera_of_corner, frame_of_corner, row_share)
     expected, depth_m = project_ground(rig.intrinsic[camera][:, None], cam_from_map, corners_map[:, None])
     expected = expected[:, SHIFTS, np.arange(4)]
     depth_m = depth_m[:, SHIFTS, np.arange(4)]
@@ -316,6 +325,6 @@ def squared_distances(
     used = located.informs[row]
     information = np.linalg.inv(np.where(used[..., None, None], noise, np.eye(2)))[:, SHIFTS]
     off = np.where(used[..., None], sightings.corners_pinhole_px[row], 0.0)[:, SHIFTS] - expected
-    each = np.einsum("psci,pscij,pscj->psc", off, information, off)
-    each = np.where(depth_m > 0, each, np.inf)
-    return np.asarray(np.where(used[:, SHIFTS], each, 0.0).sum(axis=2))
+    squared = np.einsum("psci,pscij,pscj->psc", off, information, off)
+    squared = np.where(depth_m > 0, squared, np.inf)
+    return np.asarray(np.where(used[:, SHIFTS], squared, 0.0).sum(axis=2))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import logit
@@ -61,7 +62,7 @@ def row_shares(info: CameraInfo, points_px: FloatArray) -> FloatArray:
 class Symbols:
     """N detected symbols: ``camera`` and ``frame`` (N,), pinhole outlines, row shares and classes.
 
-    ``seen`` flags the sides, each from its point to the next, that lie along an edge of the paint.
+    ``seen_sides`` flags the sides, each from its point to the next, that lie along an edge of the paint.
     """
 
     camera: IntArray
@@ -69,7 +70,7 @@ class Symbols:
     outlines_pinhole_px: tuple[FloatArray, ...]
     kinds: tuple[str, ...]
     row_shares: tuple[FloatArray, ...]
-    seen: tuple[BoolArray, ...]
+    seen_sides: tuple[BoolArray, ...]
 
     @property
     def symbol_of_point(self) -> IntArray:
@@ -83,6 +84,16 @@ class Symbols:
 
 
 NO_SYMBOLS = Symbols(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), (), (), (), ())
+"""The symbols of images that show none."""
+
+
+class _Outline(NamedTuple):
+    """The outline of a symbol, or the centre line of a piece of line, in one image."""
+
+    image: int
+    kind: str
+    points_px: FloatArray  # (K, 2)
+    seen_sides: BoolArray  # (K,) sides along an edge of the paint; empty for a line
 
 
 def collect_outlines(
@@ -93,31 +104,34 @@ def collect_outlines(
 ) -> tuple[Symbols, Symbols]:
     """Undistorted symbols of the cameras' images, and pieces of solid lines: centre lines for outlines."""
     unseen = np.zeros(0, dtype=np.bool_)
-    images = [found for found in detections if drive.images[found.image].camera in camera_index]
+    images = [detected for detected in detections if drive.images[detected.image].camera in camera_index]
     symbols = [
-        (found.image, one.kind, one.outline_px, one.outline_seen)
-        for found in images
-        for one in found.markings
-        if len(one.outline_px) >= 3
+        _Outline(detected.image, marking.kind, marking.outline_px, marking.outline_seen)
+        for detected in images
+        for marking in detected.markings
+        if len(marking.outline_px) >= 3
     ]
     lines = [
-        (found.image, one.kind, one.points_px.astype(np.float64), unseen)
-        for found in images
-        for one in found.lanes
-        if one.kind == LANE_LINE and len(one.points_px) >= 2
+        _Outline(detected.image, lane.kind, lane.points_px.astype(np.float64), unseen)
+        for detected in images
+        for lane in detected.lanes
+        if lane.kind == LANE_LINE and len(lane.points_px) >= 2
     ]
 
-    def undistorted(outlines: Sequence[tuple[int, str, FloatArray, BoolArray]]) -> Symbols:
-        image = np.array([one[0] for one in outlines], dtype=np.int64)
+    def undistorted(outlines: Sequence[_Outline]) -> Symbols:
+        image = np.array([outline.image for outline in outlines], dtype=np.int64)
         names = [drive.images[i].camera for i in image.tolist()]
-        recorded = [(drive.cameras[n].info, one[2]) for n, one in zip(names, outlines, strict=True)]
+        recorded = [
+            (drive.cameras[name].info, outline.points_px)
+            for name, outline in zip(names, outlines, strict=True)
+        ]
         return Symbols(
             camera=np.array([camera_index[name] for name in names], dtype=np.int64),
             frame=frame_of_image[image],
             outlines_pinhole_px=tuple(undistort_points(info, points_px) for info, points_px in recorded),
-            kinds=tuple(one[1] for one in outlines),
+            kinds=tuple(outline.kind for outline in outlines),
             row_shares=tuple(row_shares(info, points_px) for info, points_px in recorded),
-            seen=tuple(one[3] for one in outlines),
+            seen_sides=tuple(outline.seen_sides for outline in outlines),
         )
 
     return undistorted(symbols), undistorted(lines)
@@ -172,8 +186,8 @@ class Frames:
 
 def frames_of(drive: Drive) -> Frames:
     """Number the distinct times of ``drive``; simultaneous images of one session share a frame."""
-    taken = np.array([(image.session, image.taken_s) for image in drive.images])
-    distinct, first, inverse = np.unique(taken, axis=0, return_index=True, return_inverse=True)
+    moments = np.array([(image.session, image.taken_s) for image in drive.images])
+    distinct, first, inverse = np.unique(moments, axis=0, return_index=True, return_inverse=True)
     poses = np.stack([drive.images[i].map_from_vehicle for i in first])
     frame = inverse.ravel().astype(np.int64)
     session = distinct[:, 0].astype(np.int64)
@@ -191,10 +205,10 @@ def collect_sightings(
     camera_index = {name: c for c, name in enumerate(cameras)}
     frames = frames_of(drive)
     rows = [
-        (found.image, marking)
-        for found in sorted(detections, key=lambda one: one.image)
-        if drive.images[found.image].camera in camera_index
-        for marking in found.markings
+        (detected.image, marking)
+        for detected in sorted(detections, key=lambda detected: detected.image)
+        if drive.images[detected.image].camera in camera_index
+        for marking in detected.markings
         if not len(marking.outline_px)
     ]
     nothing = (
@@ -211,9 +225,11 @@ def collect_sightings(
     covariance = np.stack([covariance[:, c : c + 2, c : c + 2] for c in (0, 2, 4, 6)], axis=1)
     row_share = np.zeros(corners.shape[:2])
     for c, info in enumerate(infos):
-        own = camera == c
-        row_share[own] = row_shares(info, corners[own])
-        corners[own], covariance[own] = _undistort(info, corners[own], covariance[own])
+        is_of_camera = camera == c
+        row_share[is_of_camera] = row_shares(info, corners[is_of_camera])
+        corners[is_of_camera], covariance[is_of_camera] = _undistort(
+            info, corners[is_of_camera], covariance[is_of_camera]
+        )
     valid = np.stack([marking.corner_valid for _, marking in rows]).astype(bool)
     valid &= np.isfinite(corners).all(axis=2) & np.isfinite(covariance).all(axis=(2, 3))
     symbols, lines = collect_outlines(drive, detections, camera_index, frames.frame_of_image)
@@ -244,8 +260,8 @@ def collect_sightings(
 def camera_of(drive: Drive, name: str) -> Camera:
     """The camera ``name`` of ``drive``; raises MappingError if unknown."""
     if name not in drive.cameras:
-        known = ", ".join(drive.cameras)
-        raise MappingError(f"drive {drive.name} has no camera '{name}'; choose among {known}.")
+        names = ", ".join(drive.cameras)
+        raise MappingError(f"drive {drive.name} has no camera '{name}'; choose among {names}.")
     return drive.cameras[name]
 
 
@@ -261,6 +277,6 @@ def _undistort(
         undistort_points(info, flat + step) - undistort_points(info, flat - step)
         for step in (np.array([step_px, 0.0]), np.array([0.0, step_px]))
     ]
-    jacobian = np.stack(columns, axis=2).reshape(*corners_px.shape, 2) / (2 * step_px)
-    moved = jacobian @ covariance_px @ np.swapaxes(jacobian, -1, -2)
-    return undistort_points(info, flat).reshape(corners_px.shape), moved
+    jacobian = np.stack(columns, axis=2).reshape((*corners_px.shape, 2)) / (2 * step_px)
+    pinhole_covariance = jacobian @ covariance_px @ np.swapaxes(jacobian, -1, -2)
+    return undistort_points(info, flat).reshape(corners_px.shape), pinhole_covariance

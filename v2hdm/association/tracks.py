@@ -21,7 +21,8 @@ from v2hdm.geometry.rigid import heading_rad
 from v2hdm.records import BoolArray, FloatArray, IntArray, PoseNoise
 
 IPM_SIGMA_RAD = 0.015  # direction error of an initial IPM: markings may seem to move between images
-REFINED_SIGMA_RAD = 0.002  # the same once the extrinsic has been optimised
+REFINED_SIGMA_RAD = 0.002  # direction error of an IPM once the extrinsic has been optimised
+
 LEAST_SIGHTINGS = 3
 """Sightings required of a marking by the naive methods, and of a track by the incremental map."""
 
@@ -117,23 +118,33 @@ class _Linker:
         valid = np.stack([track.valid for track in tracks])
         size_m = diameters(corners, valid)
         # Pairs of one class no farther apart than their sizes.
-        apart_m = np.linalg.norm(mean_corners(corners, valid)[:, None] - self._centre_map[rows], axis=-1)
+        distance_m = np.linalg.norm(mean_corners(corners, valid)[:, None] - self._centre_map[rows], axis=-1)
         reach_m = MAX_GATE_M + size_m[:, None] + self._size_m[rows]
         alike = self._sightings.kind[last][:, None] == self._sightings.kind[rows]
-        t, d = np.argwhere(alike & (apart_m <= reach_m)).T
-        own = rows[d]
-        found = align(corners[t], valid[t], self._located.corners_map[own], self._located.valid[own])
-        covariance = self._noise_m2[last[t]] + self._noise_m2[own] + self._drift_covariance(last[t], own)
-        cost = np.sum(found.offset * np.linalg.solve(covariance, found.offset[..., None])[..., 0], axis=-1)
-        shape = found.deformation_m / np.maximum(SHAPE_TOLERANCE * size_m[t], LEAST_TOLERANCE_M)
+        t, d = np.argwhere(alike & (distance_m <= reach_m)).T
+        pair_rows = rows[d]
+        pair_last = last[t]
+        aligned = align(
+            corners[t], valid[t], self._located.corners_map[pair_rows], self._located.valid[pair_rows]
+        )
+        noise_m2 = self._noise_m2[pair_last] + self._noise_m2[pair_rows]
+        covariance = noise_m2 + self._drift_covariance(pair_last, pair_rows)
+        cost = np.sum(
+            aligned.offset * np.linalg.solve(covariance, aligned.offset[..., None])[..., 0], axis=-1
+        )
+        shape = aligned.deformation_m / np.maximum(SHAPE_TOLERANCE * size_m[t], LEAST_TOLERANCE_M)
         accepted = (cost <= GATE_SIGMAS**2) & (shape <= 1.0)
-        accepted &= np.linalg.norm(found.offset, axis=-1) <= MAX_GATE_M
+        accepted &= np.linalg.norm(aligned.offset, axis=-1) <= MAX_GATE_M
         costs = np.full((len(tracks), len(rows)), _REFUSED)
         costs[t, d] = np.where(accepted, cost + shape**2, _REFUSED)
         shift = np.zeros(costs.shape, dtype=np.int64)
-        shift[t, d] = found.shift
-        picked = zip(*linear_sum_assignment(costs), strict=True)
-        return {int(rows[d]): (tracks[t], int(shift[t, d])) for t, d in picked if costs[t, d] < _REFUSED}
+        shift[t, d] = aligned.shift
+        track_index, row_index = linear_sum_assignment(costs)
+        return {
+            int(rows[d]): (tracks[t], int(shift[t, d]))
+            for t, d in zip(track_index, row_index, strict=True)
+            if costs[t, d] < _REFUSED
+        }
 
     def _drift_covariance(self, last: IntArray, rows: IntArray) -> FloatArray:
         """Covariance (P, 2, 2) that a wrong extrinsic adds between the images of two sightings.

@@ -13,10 +13,10 @@ from v2hdm.errors import MapFileError
 from v2hdm.geometry.rigid import adjoint, camera_centre, inverse, log
 from v2hdm.records import Calibration, FloatArray
 
-FALSE_ALARM = (
-    1e-3  # probability that a camera at rest is said to have moved: once in 20 years, checked weekly
-)
+# Probability that a camera at rest is said to have moved: once in 20 years, checked weekly.
+FALSE_ALARM = 1e-3
 _MISSED = 0.05  # probability with which a movement of the size reported as detectable would be missed
+
 # Difference of the intrinsics, as a share of focal length or width, up to which they are of one lens: more of
 # it turns into pitch, yaw and height.
 _SAME_LENS = 2e-3
@@ -84,7 +84,7 @@ def movement(before: Calibration, after: Calibration) -> Movement:
 
 def turned_alike(movements: Sequence[Movement]) -> bool:
     """Whether several cameras have moved, all by the same turn: then it is no camera that has moved."""
-    if len(movements) < 2 or not all(one.moved for one in movements):
+    if len(movements) < 2 or not all(movement.moved for movement in movements):
         return False
     first = movements[0]
     for other in movements[1:]:
@@ -96,6 +96,7 @@ def turned_alike(movements: Sequence[Movement]) -> bool:
 
 
 def _check_comparable(before: Calibration, after: Calibration) -> None:
+    """Raise MapFileError for calibrations that are not of one camera and lens, or have no covariance."""
     first = before.info
     second = after.info
     who = f"camera '{first.name}'"

@@ -35,19 +35,25 @@ from v2hdm.records import BoolArray, CameraInfo, FloatArray
 
 _WRONG_SHARE = 0.02  # prior probability that a point is wrong altogether: one slip in five tables of ten
 STATED_AS = 4.0  # observations that the stated errors count for: people know theirs to a factor of about 1.4
-UNKNOWNS = 6  # of a mounting
-_LEAST_VARIANCE_PX2 = 1e-9  # keeps V invertible where neither error is stated
-_LEAST_SHARE = 1e-12  # and, as a share of its trace, near the horizon, where one variance dwarfs the other
+UNKNOWNS = 6  # number of unknowns of a mounting
+
+_LEAST_VARIANCE_PX2 = 1e-9  # variance, px^2, that keeps V invertible where neither error is stated
+
+# Share of V's trace that keeps V invertible near the horizon, where one variance dwarfs the other.
+_LEAST_SHARE = 1e-12
+
 _SUBSETS = 300  # subsets of four points that are tried; of ten points these are all 210
 _REFINED = 4  # starts that are refined
-# Rounds of expectation maximisation after which a refinement ends, and steps of each, converged or not.
-_ROUNDS = 60
-_STEPS = 30
+_SINGULAR = 1e-14  # reciprocal condition of a homography below which its points lie on a line
+
 # Noise factors q under which a start is scored; the refinement finds its own.
 _FACTORS = np.array([1.0, 10.0, 100.0, 1e3, 1e4])
-_DAMPING = 1e-6
+
+_ROUNDS = 60  # rounds of expectation maximisation after which a refinement ends, converged or not
+_STEPS = 30  # steps of Gauss-Newton after which a round ends, converged or not
+_DAMPING = 1e-6  # damping of the steps, which keeps directions finite that the points leave free
 _SETTLED = 1e-10  # relative change of the log posterior that ends the rounds
-_SINGULAR = 1e-14  # reciprocal condition of a homography below which its points lie on a line
+_ALIKE = 1e-3  # entries of cam_from_vehicle, m and 1, up to which two fits are one: fits converge to this
 
 
 @dataclass(frozen=True)
@@ -59,7 +65,7 @@ class Noise:
 
 
 @dataclass(frozen=True)
-class Seen:
+class SeenPoints:
     """N points of a camera: recorded and pinhole pixels, their derivative ``by_pinhole`` (N, 2, 2)."""
 
     info: CameraInfo
@@ -70,7 +76,9 @@ class Seen:
     noise: Noise
 
     @classmethod
-    def of(cls, points_px: FloatArray, points_vehicle: FloatArray, info: CameraInfo, noise: Noise) -> Seen:
+    def of(
+        cls, points_px: FloatArray, points_vehicle: FloatArray, info: CameraInfo, noise: Noise
+    ) -> SeenPoints:
         """Recorded pixels (N, 2) of ground points (N, 2) as the camera ``info`` saw them."""
         pinhole_px = undistort_points(info, points_px)
         return cls(info, points_px, pinhole_px, distort_jacobian(info, pinhole_px), points_vehicle, noise)
@@ -84,7 +92,7 @@ class Seen:
         """V (..., N, 2, 2), px^2, under mountings (..., 4, 4)."""
         pinhole_from_ground = pinhole_px_from_ground(self.info.intrinsic, cam_from_vehicle)
         by_ground = self.by_pinhole @ homography_jacobian(pinhole_from_ground, self.points_vehicle)
-        # a point behind the camera has no pixel to err by.
+        # A point behind the camera has no pixel to err by.
         by_ground = np.nan_to_num(by_ground, nan=0.0, posinf=0.0, neginf=0.0)
         surveyed = self.noise.survey_m**2 * by_ground @ np.swapaxes(by_ground, -1, -2)
         least = _LEAST_VARIANCE_PX2 + _LEAST_SHARE * np.trace(surveyed, axis1=-2, axis2=-1)
@@ -100,7 +108,7 @@ class Seen:
         rays = convert_points_from_homogeneous(torch.cat([cam[..., :2], 1 / reciprocal], dim=-1))
         intrinsic = torch.as_tensor(self.info.intrinsic).expand(len(mountings), 3, 3)
         off = transform_points(intrinsic, rays).numpy() - self.pinhole_px
-        return np.asarray((self.by_pinhole @ off[..., None])[..., 0].reshape(*batch, self.count, 2))
+        return np.asarray((self.by_pinhole @ off[..., None])[..., 0].reshape((*batch, self.count, 2)))
 
     def jacobian(self, cam_from_vehicle: FloatArray) -> FloatArray:
         """Derivative (N, 2, 6) of :meth:`residual_px` by the left tangent of ``cam_from_vehicle``."""
@@ -142,8 +150,8 @@ class Seen:
 class Fit:
     """A mounting and how well the points determine it."""
 
-    seen: Seen
-    cam_from_vehicle: FloatArray
+    points: SeenPoints
+    cam_from_vehicle: FloatArray  # (4, 4)
     # (6, 6) of the left tangent, infinite on the diagonal where the points leave it free
     covariance: FloatArray
     factor: float  # q, of the stated variances
@@ -156,32 +164,36 @@ class Fit:
         return np.asarray(self.right > 0.5)
 
 
-def fit_mountings(seen: Seen, starts: int = _REFINED, rounds: int = _ROUNDS) -> list[Fit]:
+def fit_mountings(points: SeenPoints, starts: int = _REFINED, rounds: int = _ROUNDS) -> list[Fit]:
     """Mountings that explain the points, the most likely first; none where all points lie on a line."""
-    found: list[Fit] = []
-    for start in _starts(seen, starts):
-        fit = _refine(seen, start, rounds)
-        alike = [other for other in found if np.array_equal(fit.is_right, other.is_right)]
-        # Up to their convergence two fits are one.
-        if all(np.abs(fit.cam_from_vehicle - other.cam_from_vehicle).max() >= 1e-3 for other in alike):
-            found.append(fit)
-    return sorted(found, key=lambda one: -one.log_posterior)
+    fits: list[Fit] = []
+    for start in _starts(points, starts):
+        fit = _refine(points, start, rounds)
+        of_same_points = [other for other in fits if np.array_equal(fit.is_right, other.is_right)]
+        differences = [fit.cam_from_vehicle - other.cam_from_vehicle for other in of_same_points]
+        if all(np.abs(difference).max() >= _ALIKE for difference in differences):
+            fits.append(fit)
+    return sorted(fits, key=lambda fit: -fit.log_posterior)
 
 
-def _starts(seen: Seen, count: int) -> list[FloatArray]:
+def _starts(points: SeenPoints, count: int) -> list[FloatArray]:
     """The most likely mountings (4, 4) by direct linear transforms."""
-    weights = torch.as_tensor(_subsets(seen.count))
-    ground = torch.as_tensor(seen.points_vehicle).expand(len(weights), -1, -1)
-    pixels = torch.as_tensor(seen.pinhole_px).expand(len(weights), -1, -1)
+    weights = torch.as_tensor(_subsets(points.count))
+    ground = torch.as_tensor(points.points_vehicle).expand(len(weights), -1, -1)
+    pixels = torch.as_tensor(points.pinhole_px).expand(len(weights), -1, -1)
     homographies = find_homography_dlt(ground, pixels, weights).numpy()
-    regular = [one for one in homographies if np.isfinite(one).all() and 1 / np.linalg.cond(one) > _SINGULAR]
-    mountings = [extrinsic_from_ipm(seen.info, np.linalg.inv(one)) for one in regular]
-    candidates = np.array([one for one in mountings if np.isfinite(one).all()])
+    regular = [
+        homography
+        for homography in homographies
+        if np.isfinite(homography).all() and 1 / np.linalg.cond(homography) > _SINGULAR
+    ]
+    mountings = [extrinsic_from_ipm(points.info, np.linalg.inv(homography)) for homography in regular]
+    candidates = np.array([mounting for mounting in mountings if np.isfinite(mounting).all()])
     if not len(candidates):
         return []
-    covariance = seen.covariance(candidates)
-    square = seen.squared(candidates, covariance)
-    scores = seen.log_posterior(square, covariance, np.tile(_FACTORS[:, None], len(candidates)))
+    covariance = points.covariance(candidates)
+    square = points.squared(candidates, covariance)
+    scores = points.log_posterior(square, covariance, np.tile(_FACTORS[:, None], len(candidates)))
     return [candidates[k] for k in np.argsort(-np.max(scores, axis=0), kind="stable")[:count].tolist()]
 
 
@@ -198,42 +210,42 @@ def _subsets(count: int) -> FloatArray:
     return weights
 
 
-def _refine(seen: Seen, mounting: FloatArray, rounds: int) -> Fit:
+def _refine(points: SeenPoints, mounting: FloatArray, rounds: int) -> Fit:
     """The optimum that a start (4, 4) leads to."""
-    covariance = seen.covariance(mounting)
-    square = seen.squared(mounting, covariance)
-    factor = float(_FACTORS[np.argmax(seen.log_posterior(square, covariance, _FACTORS))])
+    covariance = points.covariance(mounting)
+    square = points.squared(mounting, covariance)
+    factor = float(_FACTORS[np.argmax(points.log_posterior(square, covariance, _FACTORS))])
     before = -np.inf
     for _ in range(rounds):
-        covariance = seen.covariance(mounting)
-        square = seen.squared(mounting, covariance)
-        _, right = seen.mixture(square, covariance, factor)
+        covariance = points.covariance(mounting)
+        square = points.squared(mounting, covariance)
+        _, right = points.mixture(square, covariance, factor)
         # The mounting takes six of the right points' coordinates, so that fewer are left to estimate q.
         free = max(2 * right.sum() - UNKNOWNS, 0.0)
         factor = float((right @ square + STATED_AS) / (free + STATED_AS))
-        after = float(seen.log_posterior(square, covariance, factor))
+        after = float(points.log_posterior(square, covariance, factor))
         if abs(after - before) < _SETTLED * max(abs(after), 1.0):
             break
         before = after
-        mounting = _descend(seen, mounting, covariance, factor)
-    slopes = seen.jacobian(mounting)
+        mounting = _descend(points, mounting, covariance, factor)
+    slopes = points.jacobian(mounting)
     weight = right[:, None, None] / factor * np.linalg.inv(covariance)
-    information = normal_equations(np.zeros((seen.count, 2)), slopes, weight).information
-    return Fit(seen, mounting, covariance_of(information), factor, right, after)
+    information = normal_equations(np.zeros((points.count, 2)), slopes, weight).information
+    return Fit(points, mounting, covariance_of(information), factor, right, after)
 
 
-def _descend(seen: Seen, mounting: FloatArray, covariance: FloatArray, factor: float) -> FloatArray:
+def _descend(points: SeenPoints, mounting: FloatArray, covariance: FloatArray, factor: float) -> FloatArray:
     """The most likely mounting for a given q and V."""
     precision = np.linalg.inv(covariance) / factor
 
     def linearise(now: FloatArray) -> Normal:
-        residual = seen.residual_px(now)
+        residual = points.residual_px(now)
         square = factor * np.einsum("ni,nij,nj->n", residual, precision, residual)
-        total, right = seen.mixture(square, covariance, factor)
-        equations = normal_equations(residual, seen.jacobian(now), right[:, None, None] * precision)
+        total, right = points.mixture(square, covariance, factor)
+        equations = normal_equations(residual, points.jacobian(now), right[:, None, None] * precision)
         return Normal(equations.information, equations.gradient, -float(total.sum()))
 
-    found = gauss_newton(
+    descent = gauss_newton(
         linearise, mounting, retract=lambda now, step: exp(step) @ now, steps=_STEPS, damping=_DAMPING
     )
-    return found.x
+    return descent.x

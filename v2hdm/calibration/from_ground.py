@@ -7,12 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from v2hdm.geometry.ipm import mounting_words
-from v2hdm.ground import GroundEstimate, GroundStatus, Reading, estimate_cameras
+from v2hdm.ground.estimate import estimate_cameras
+from v2hdm.ground.results import GroundEstimate, GroundStatus, Reading
 from v2hdm.io.calibration.reading import Provenance
 from v2hdm.io.calibration.writing import write_calibration
 from v2hdm.io.drive import as_drive
 from v2hdm.records import Calibration, Drive
 from v2hdm.store.files import write_json
+from v2hdm.store.names import VERDICT, calibration_file
 from v2hdm.verdict import Verdict, check_drive
 
 # Each parameter's name, and the factor and unit that people read it in.
@@ -44,8 +46,8 @@ class GroundCalibration:
     @property
     def calibrations(self) -> dict[str, Calibration]:
         """By camera, where the ground gave a mounting."""
-        found = {name: estimate.calibration for name, estimate in self.estimates.items()}
-        return {name: calibration for name, calibration in found.items() if calibration is not None}
+        of_camera = {name: estimate.calibration for name, estimate in self.estimates.items()}
+        return {name: calibration for name, calibration in of_camera.items() if calibration is not None}
 
 
 def calibrate_from_ground(
@@ -64,10 +66,10 @@ def calibrate_from_ground(
     Raises:
         DriveError: the drive, or an image, cannot be read.
 
-    >>> found = calibrate_from_ground(port)
-    >>> found.verdict.status.value
+    >>> calibrated = calibrate_from_ground(port)
+    >>> calibrated.verdict.status.value
     'PASS'
-    >>> [one.cam_from_vehicle.shape for one in found.calibrations.values()]
+    >>> [calibration.cam_from_vehicle.shape for calibration in calibrated.calibrations.values()]
     [(4, 4)]
     """
     drive = as_drive(drive)
@@ -75,10 +77,10 @@ def calibrate_from_ground(
     return GroundCalibration(drive, estimates, check_drive(drive, ground=estimates))
 
 
-def summary_lines(found: GroundCalibration) -> list[str]:
+def summary_lines(calibrated: GroundCalibration) -> list[str]:
     """Every camera's mounting and the verdict, for a terminal."""
-    cameras = [line for estimate in found.estimates.values() for line in _lines(estimate)]
-    return [*cameras, found.verdict.lines[0], *(finding.line for finding in found.verdict.raised)]
+    cameras = [line for estimate in calibrated.estimates.values() for line in _lines(estimate)]
+    return [*cameras, calibrated.verdict.lines[0], *(finding.line for finding in calibrated.verdict.raised)]
 
 
 def _lines(estimate: GroundEstimate) -> Iterator[str]:
@@ -91,24 +93,24 @@ def _lines(estimate: GroundEstimate) -> Iterator[str]:
         return
     angles, place = mounting_words(calibration.cam_from_vehicle, calibration.covariance)
     yield f"{estimate.camera}: {', '.join((*angles, place[2]))}"
-    found = []
+    observed = []
     for parameter in estimate.parameters.values():
         if parameter.observable:
             name, factor, unit = _NAMES[parameter.name]
             value = factor * parameter.value
             sigma = factor * parameter.sigma
-            found.append(f"{name} {value:+.2g} +- {sigma:.2g} {unit}".rstrip())
-    if found:
-        yield f"  also: {', '.join(found)}"
+            observed.append(f"{name} {value:+.2g} +- {sigma:.2g} {unit}".rstrip())
+    if observed:
+        yield f"  also: {', '.join(observed)}"
     for parameter in estimate.parameters.values():
         if not parameter.observable:
             yield f"  cannot tell {_NAMES[parameter.name][0]}: {parameter.why_not}"
 
 
-def write_ground_calibration(found: GroundCalibration, folder: Path) -> None:
+def write_ground_calibration(calibrated: GroundCalibration, folder: Path) -> None:
     """Write the verdict, and the calibration of each camera that has one."""
-    verdict = found.verdict.as_json()
-    write_json(folder / "verdict.json", verdict)
-    about = Provenance.today(found.drive.name, verdict)
-    for name, calibration in found.calibrations.items():
-        write_calibration(calibration, folder / f"calibration_{name}.yaml", verdict=verdict, about=about)
+    verdict = calibrated.verdict.as_json()
+    write_json(folder / VERDICT, verdict)
+    about = Provenance.today(calibrated.drive.name, verdict)
+    for name, calibration in calibrated.calibrations.items():
+        write_calibration(calibration, folder / calibration_file(name), verdict=verdict, about=about)

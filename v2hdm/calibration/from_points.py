@@ -11,12 +11,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from v2hdm.calibration.fit import Fit, Noise, Seen, fit_mountings
+from v2hdm.calibration.fit import Fit, Noise, SeenPoints, fit_mountings
 from v2hdm.calibration.points import (
     CHANCE,
     LEAST_POINTS,
@@ -36,6 +36,7 @@ from v2hdm.io.calibration.writing import write_calibration, write_camera_info
 from v2hdm.records import Calibration, CameraInfo, FloatArray
 from v2hdm.report.photos import save_points
 from v2hdm.store.files import dump_yaml, replace_csv, write_json
+from v2hdm.store.names import VERDICT, calibration_file
 from v2hdm.verdict.verdict import Verdict
 
 ENTRY_FILE = "drive_camera.yaml"
@@ -46,14 +47,14 @@ UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "kilometres": 1e3}  # units o
 _MISREAD = 0.01  # prior probability of each way to write the table wrongly
 _SURE = np.log(1e3)  # log odds from which a reading is reported as the cause
 _ROLL_RAD = np.radians(15.0)  # standard deviation of the roll of cameras on vehicles
-_BESIDE_M = 1.5  # standard deviation of their place to the left
+_BESIDE_M = 1.5  # standard deviation of the place of cameras on vehicles to the left, m
+_HEIGHT_M = 2.0  # median height of cameras on vehicles, m
+_LOG_HEIGHT = 0.7  # standard deviation of the logarithm of that height
 _UNUSUAL = 8.0  # log odds at most against an unusual mounting: some cameras hang on their side or head
-# Median height of cameras on vehicles, m, and the standard deviation of its logarithm.
-_HEIGHT_M = 2.0
-_LOG_HEIGHT = 0.7
 _SCALES = (0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0)  # usual ratios of the sizes of one camera's images
-_STARTS = 1
-_ROUNDS = 6  # enough to tell a reading that explains the points from one that does not
+
+_STARTS = 1  # starts that are refined under a reading of the table
+_ROUNDS = 6  # rounds of a refinement that tell a reading that explains the points from one that does not
 _TOLD = 300  # points, at most, that readings are compared by
 _UNRELATED = "pixels and places are unrelated; check which pixel belongs to which place"
 
@@ -70,17 +71,17 @@ class PointCalibration:
     @property
     def calibration(self) -> Calibration:
         """Intrinsics, ``cam_from_vehicle`` (4, 4) and the covariance (6, 6) of its left tangent."""
-        return Calibration(self.fit.seen.info, self.fit.cam_from_vehicle, self.fit.covariance)
+        return Calibration(self.fit.points.info, self.fit.cam_from_vehicle, self.fit.covariance)
 
     @property
     def roi_vehicle(self) -> FloatArray:
         """The convex hull (M, 2) of the right points, counter-clockwise, m."""
-        right = self.fit.seen.points_vehicle[self.fit.is_right]
+        right = self.fit.points.points_vehicle[self.fit.is_right]
         return np.asarray(right[ConvexHull(right).vertices])
 
     def camera_entry(self, info_file: str) -> dict[str, Any]:
         """The camera's entry for ``drive.yaml``, but for the file names of a real drive."""
-        info = self.fit.seen.info
+        info = self.fit.points.info
         mounting = self.fit.cam_from_vehicle
         sigma = centre_sigmas(mounting, self.fit.covariance)
         return {
@@ -114,8 +115,8 @@ def calibrate_from_points(
         DriveError: a point is impossible, or the points fit no mounting; the message names the cause.
         ConfigError: a standard deviation is no number, negative, or both are 0.
 
-    >>> found = calibrate_from_points(points, port.cameras["front"].info)
-    >>> found.verdict.status.value, found.calibration.covariance.shape
+    >>> calibrated = calibrate_from_points(points, port.cameras["front"].info)
+    >>> calibrated.verdict.status.value, calibrated.calibration.covariance.shape
     ('PASS', (6, 6))
     """
     for option, value in (("--pixel-sigma", pixel_sigma), ("--survey-sigma", survey_sigma)):
@@ -132,7 +133,7 @@ def calibrate_from_points(
 
 def solve(points: SurveyedPoints, info: CameraInfo, noise: Noise) -> list[Fit]:
     """The mountings that explain the points, the most likely first; DriveError, with why, where none does."""
-    fits = fit_mountings(Seen.of(points.points_px, points.points_vehicle, info, noise))
+    fits = fit_mountings(SeenPoints.of(points.points_px, points.points_vehicle, info, noise))
     if _doubtful(fits):
         cause = _misreading(points, info, noise)
         if cause is not None:
@@ -157,6 +158,7 @@ def solve(points: SurveyedPoints, info: CameraInfo, noise: Noise) -> list[Fit]:
 
 
 def _height_m(fit: Fit) -> float:
+    """Height of the camera, m."""
     return float(camera_centre(fit.cam_from_vehicle)[2])
 
 
@@ -165,7 +167,7 @@ def _doubtful(fits: list[Fit]) -> bool:
     if not fits:
         return True
     right = int(fits[0].is_right.sum())
-    if right < LEAST_POINTS or 2 * right <= fits[0].seen.count:
+    if right < LEAST_POINTS or 2 * right <= fits[0].points.count:
         return True
     return scatter(fits[0], CHANCE).probability < CHANCE
 
@@ -176,20 +178,22 @@ def _misreading(points: SurveyedPoints, info: CameraInfo, noise: Noise) -> str |
     px = points.points_px[some]
     ground = points.points_vehicle[some]
 
-    def score(points_px: FloatArray, points_vehicle: FloatArray, *effort: int) -> float:
-        fits = fit_mountings(Seen.of(points_px, points_vehicle, info, noise), *effort)
-        return max((_score(fit) for fit in fits), default=-np.inf)
-
-    as_given = score(px, ground)
-    # Pixels that are scaled have another density: by scale^2 each in those of the table.
-    causes = {
-        words: score(read_px, read_vehicle, _STARTS, _ROUNDS) + 2 * len(px) * float(np.log(scale))
-        for words, read_px, read_vehicle, scale in _readings(px, ground, info)
-    }
+    as_given = _best_score(fit_mountings(SeenPoints.of(px, ground, info, noise)))
+    causes = {}
+    for reading in _readings(px, ground, info):
+        read_points = SeenPoints.of(reading.points_px, reading.points_vehicle, info, noise)
+        fits = fit_mountings(read_points, starts=_STARTS, rounds=_ROUNDS)
+        # Pixels that are scaled have another density: by scale^2 each in those of the table.
+        causes[reading.cause] = _best_score(fits) + 2 * len(px) * float(np.log(reading.scale))
     if as_given > -np.inf:
         causes[_UNRELATED] = -len(px) * float(np.log(info.width * info.height))
     cause = max(causes, key=lambda words: causes[words])
     return cause if causes[cause] > as_given + _SURE - np.log(_MISREAD) else None
+
+
+def _best_score(fits: list[Fit]) -> float:
+    """The highest score of mountings, -inf for none."""
+    return max((_score(fit) for fit in fits), default=-np.inf)
 
 
 def _score(fit: Fit) -> float:
@@ -200,21 +204,28 @@ def _score(fit: Fit) -> float:
     return fit.log_posterior - min(float(unusual), _UNUSUAL)
 
 
-def _readings(
-    px: FloatArray, ground: FloatArray, info: CameraInfo
-) -> Iterator[tuple[str, FloatArray, FloatArray, float]]:
-    """Causes, the pixels and places without them, and the scale of these pixels."""
+class _Reading(NamedTuple):
+    """The points of a table, read as if it was written wrongly in one way."""
+
+    cause: str
+    points_px: FloatArray  # (N, 2) pixels as meant
+    points_vehicle: FloatArray  # (N, 2) places as meant, m
+    scale: float = 1.0  # of these pixels
+
+
+def _readings(px: FloatArray, ground: FloatArray, info: CameraInfo) -> Iterator[_Reading]:
+    """The other readings of a table of pixels (N, 2) and places (N, 2)."""
     mirrored = "y counts to the right, or x backward; write y positive to the left, x forward"
-    yield mirrored, px, ground * [1.0, -1.0], 1.0
-    yield "x and y are exchanged; x is forward, y to the left", px, ground[:, ::-1].copy(), 1.0
-    swapped = px[:, ::-1].copy()
-    yield "u and v are exchanged; u counts columns to the right, v rows down", swapped, ground, 1.0
-    upward = np.column_stack([px[:, 0], info.height - 1 - px[:, 1]])
-    counted = "v counts upward from the image's lower edge; count it down from the upper one"
-    yield counted, upward, ground, 1.0
+    yield _Reading(mirrored, px, ground * [1.0, -1.0])
+    exchanged = "x and y are exchanged; x is forward, y to the left"
+    yield _Reading(exchanged, px, ground[:, ::-1].copy())
+    swapped = "u and v are exchanged; u counts columns to the right, v rows down"
+    yield _Reading(swapped, px[:, ::-1].copy(), ground)
+    upward = "v counts upward from the image's lower edge; count it down from the upper one"
+    yield _Reading(upward, np.column_stack([px[:, 0], info.height - 1 - px[:, 1]]), ground)
     for scale in _SCALES:
         size = f"the pixels are of an image {1 / scale:.3g} times as large as that of the intrinsics"
-        yield f"{size}; give both at the same size", (px + 0.5) * scale - 0.5, ground, scale
+        yield _Reading(f"{size}; give both at the same size", (px + 0.5) * scale - 0.5, ground, scale)
 
 
 _COLUMNS = (
@@ -223,53 +234,57 @@ _COLUMNS = (
 )  # fmt: skip
 
 
-def write_point_calibration(found: PointCalibration, folder: Path, image: np.ndarray | None = None) -> None:
+def write_point_calibration(
+    calibrated: PointCalibration, folder: Path, image: np.ndarray | None = None
+) -> None:
     """Write calibration, drive entry, table, verdict and picture, in the image (H, W, 3) BGR if given."""
-    info = found.fit.seen.info
-    verdict = found.verdict.as_json()
-    write_json(folder / "verdict.json", verdict)
-    path = folder / f"calibration_{info.name}.yaml"
-    about = Provenance.today(found.points.path.stem, verdict)
-    write_calibration(found.calibration, path, verdict=verdict, about=about)
+    info = calibrated.fit.points.info
+    verdict = calibrated.verdict.as_json()
+    write_json(folder / VERDICT, verdict)
+    path = folder / calibration_file(info.name)
+    about = Provenance.today(calibrated.points.path.stem, verdict)
+    write_calibration(calibrated.calibration, path, verdict=verdict, about=about)
     write_camera_info(info, folder / info.name / "camera_info.yaml")
-    entry = dump_yaml({"cameras": {info.name: found.camera_entry(f"{info.name}/camera_info.yaml")}})
+    entry = dump_yaml({"cameras": {info.name: calibrated.camera_entry(f"{info.name}/camera_info.yaml")}})
     (folder / ENTRY_FILE).write_text(
         "# For drive.yaml. Under images, name the list of your images (docs/drive-format.md).\n" + entry,
         encoding="utf-8",
     )
-    points = found.points
-    off = found.residuals
+    points = calibrated.points
+    off = calibrated.residuals
     rows = []
     for k, name in enumerate(points.names):
         shift = [*(f"{px:.3f}" for px in off.off_px[k]), *(f"{m:.4f}" for m in off.off_m[k])]
-        known = [f"{off.sigmas[k]:.2f}", f"{found.fit.right[k]:.3g}", f"{off.known_m[k]:.4f}"]
+        sureness = [f"{off.sigmas[k]:.2f}", f"{calibrated.fit.right[k]:.3g}", f"{off.known_m[k]:.4f}"]
         place = [*points.points_px[k].tolist(), *points.points_vehicle[k].tolist()]
-        rows.append([name, *place, *shift, *known])
+        rows.append([name, *place, *shift, *sureness])
     replace_csv(folder / POINTS_FILE, [_COLUMNS, *rows])
-    seen = zip(points.labels, points.points_px, off.off_px, found.fit.is_right.tolist(), strict=True)
-    save_points(folder / PICTURE_FILE, image, info, found.fit.cam_from_vehicle, found.roi_vehicle, list(seen))
+    is_right = calibrated.fit.is_right.tolist()
+    drawn = list(zip(points.labels, points.points_px, off.off_px, is_right, strict=True))
+    mounting = calibrated.fit.cam_from_vehicle
+    save_points(folder / PICTURE_FILE, image, info, mounting, calibrated.roi_vehicle, drawn)
 
 
-def summary_lines(found: PointCalibration) -> list[str]:
+def summary_lines(calibrated: PointCalibration) -> list[str]:
     """The mounting, every point's residual and the verdict, for a terminal."""
-    fit = found.fit
-    off = found.residuals
-    verdict = found.verdict
+    fit = calibrated.fit
+    off = calibrated.residuals
+    verdict = calibrated.verdict
     turned, placed = mounting_words(fit.cam_from_vehicle, fit.covariance)
     right = fit.is_right
-    off_px, off_cm = (np.hypot(*part.T) for part in (off.off_px, 100 * off.off_m))
+    off_px, off_cm = (np.hypot(part[:, 0], part[:, 1]) for part in (off.off_px, 100 * off.off_m))
     px, cm = (float(np.sqrt(np.mean(part[right] ** 2))) for part in (off_px, off_cm))
-    known = 100 * off.known_m[right]
-    width = max(len(name) for name in found.points.names)
+    known_cm = 100 * off.known_m[right]
+    width = max(len(name) for name in calibrated.points.names)
     return [
-        f"{fit.seen.info.name}: {', '.join(turned)}",
+        f"{fit.points.info.name}: {', '.join(turned)}",
         f"  centre {', '.join(placed)}",
         f"  {right.sum()} of {len(right)} points agree: {px:.2f} px and {cm:.1f} cm on the ground rms; "
-        f"IPM known to {known.min():.1f} cm at the best of them, {known.max():.1f} cm at the worst",
+        f"IPM known to {known_cm.min():.1f} cm at the best of them, {known_cm.max():.1f} cm at the worst",
         *(
             f"  {name:{width}}  off {_number(off_px[k], 6, 2)} px {_number(off_cm[k], 7, 1)} cm "
             f"{off.sigmas[k]:6.1f} sigmas"
-            for k, name in enumerate(found.points.names)
+            for k, name in enumerate(calibrated.points.names)
         ),
         verdict.lines[0],
         *(finding.line for finding in verdict.raised),

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2, f
 
-from v2hdm.calibration.fit import STATED_AS, UNKNOWNS, Fit, Seen, fit_mountings
+from v2hdm.calibration.fit import STATED_AS, UNKNOWNS, Fit, SeenPoints, fit_mountings
 from v2hdm.errors import DriveError
 from v2hdm.geometry.ipm import (
     apply_in_front,
@@ -113,10 +113,11 @@ CHANCE = 1e-3  # probability with which a right calibration raises a finding
 
 # Standard deviation up to which a start serves the mapping, which copes with IPMs decimetres off, m.
 _WELL_KNOWN_M = 0.3
-# Error of the focal length from which it is another lens or image size, rather than a poor calibration.
+
+# Relative error of the focal length from which it is another lens or image size, not a poor calibration.
 _FOCAL_OFF = 0.05
+_FOCAL_ROUNDS = 3  # rounds in which a focal length that is off is estimated again from where it led
 _RIVAL = float(np.log(100.0))  # log odds up to which another mounting explains the points nearly as well
-_FOCAL_ROUNDS = 3
 _AROUND = 12  # places on the circle of known_around
 
 
@@ -133,48 +134,50 @@ class Residuals:
 
 def residuals(fit: Fit) -> Residuals:
     """The residuals of every point, wrong ones included."""
-    seen = fit.seen
+    points = fit.points
+    info = points.info
     mounting = fit.cam_from_vehicle
-    predicted, depth = project_ground(seen.info.intrinsic, mounting, seen.points_vehicle)
-    off_px = np.where(depth[:, None] > 0, seen.points_px - distort_points(seen.info, predicted), np.nan)
-    in_view = seen.points_vehicle[int(np.argmax(np.where(depth > 0, fit.right, -1.0)))]
-    ipm = facing_ipm(ipm_from_extrinsic(seen.info, mounting), in_view)
-    off_m = apply_in_front(ipm, undistort_points(seen.info, seen.points_px)) - seen.points_vehicle
+    predicted, depth = project_ground(info.intrinsic, mounting, points.points_vehicle)
+    off_px = np.where(depth[:, None] > 0, points.points_px - distort_points(info, predicted), np.nan)
+    in_view = points.points_vehicle[int(np.argmax(np.where(depth > 0, fit.right, -1.0)))]
+    ipm = facing_ipm(ipm_from_extrinsic(info, mounting), in_view)
+    off_m = apply_in_front(ipm, undistort_points(info, points.points_px)) - points.points_vehicle
     sigmas, probability = _held_out(fit)
-    return Residuals(off_px, off_m, sigmas, probability, known_ground(fit, seen.points_vehicle))
+    return Residuals(off_px, off_m, sigmas, probability, known_ground(fit, points.points_vehicle))
 
 
 def known_ground(fit: Fit, places_vehicle: FloatArray) -> FloatArray:
     """Standard deviation (M,) of the IPM at places (M, 2), m, the worst way; inf behind the camera."""
-    seen = fit.seen
     mounting = fit.cam_from_vehicle
     count = len(places_vehicle)
     places = replace(
-        seen,
+        fit.points,
         points_px=np.zeros((count, 2)),
         pinhole_px=np.zeros((count, 2)),
         by_pinhole=np.broadcast_to(np.eye(2), (count, 2, 2)),
         points_vehicle=places_vehicle,
     )
     slopes = places.jacobian(mounting)
-    by_ground = homography_jacobian(pinhole_px_from_ground(seen.info.intrinsic, mounting), places_vehicle)
+    by_ground = homography_jacobian(
+        pinhole_px_from_ground(fit.points.info.intrinsic, mounting), places_vehicle
+    )
     in_front = np.isfinite(by_ground).all(axis=(1, 2))
-    out = np.full(count, np.inf)
-    back = np.linalg.inv(by_ground[in_front]) @ slopes[in_front]
-    on_ground = back @ fit.covariance @ np.swapaxes(back, 1, 2)
-    out[in_front] = np.sqrt(np.maximum(np.linalg.eigvalsh(on_ground)[:, -1], 0.0))
-    return out
+    sigma_m = np.full(count, np.inf)
+    by_mounting = np.linalg.inv(by_ground[in_front]) @ slopes[in_front]
+    covariance_m2 = by_mounting @ fit.covariance @ np.swapaxes(by_mounting, 1, 2)
+    sigma_m[in_front] = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance_m2)[:, -1], 0.0))
+    return sigma_m
 
 
 def known_around(fit: Fit) -> float:
     """The worst of :func:`known_ground` at the right points and on a circle around them."""
-    right = fit.seen.points_vehicle[fit.is_right]
+    right = fit.points.points_vehicle[fit.is_right]
     radius = np.ptp(right, axis=0).max() / 2
     angles = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False)
     middle = (right.min(axis=0) + right.max(axis=0)) / 2
     circle = middle + radius * np.column_stack([np.cos(angles), np.sin(angles)])
-    known = known_ground(fit, np.vstack([right, circle]))
-    in_front = known[np.isfinite(known)]
+    sigma_m = known_ground(fit, np.vstack([right, circle]))
+    in_front = sigma_m[np.isfinite(sigma_m)]
     return float(in_front.max()) if len(in_front) else np.inf
 
 
@@ -183,15 +186,15 @@ def _held_out(fit: Fit) -> tuple[FloatArray, FloatArray]:
 
     The covariance is q V - J C J' of a point that took part, of another q V + J C J'.
     """
-    slopes = fit.seen.jacobian(fit.cam_from_vehicle)
-    stated = fit.seen.covariance(fit.cam_from_vehicle)
+    slopes = fit.points.jacobian(fit.cam_from_vehicle)
+    stated = fit.points.covariance(fit.cam_from_vehicle)
     by_mounting = slopes @ (fit.covariance / fit.factor) @ np.swapaxes(slopes, 1, 2)
-    residual = fit.seen.residual_px(fit.cam_from_vehicle)
+    residual = fit.points.residual_px(fit.cam_from_vehicle)
     took_part = np.where(fit.is_right, -1.0, 1.0)[:, None, None]
     inverse = np.linalg.pinv(stated + took_part * by_mounting, rcond=1e-9, hermitian=True)
     square = np.einsum("ni,nij,nj->n", residual, inverse, residual)
-    own = np.einsum("ni,nij,nj->n", residual, np.linalg.inv(stated), residual)
-    total = float(own[fit.is_right].sum())
+    of_stated = np.einsum("ni,nij,nj->n", residual, np.linalg.inv(stated), residual)
+    total = float(of_stated[fit.is_right].sum())
     count = 2.0 * (fit.is_right.sum() - fit.is_right)
     free = np.maximum(count - UNKNOWNS, 0.0) + STATED_AS
     others = (np.maximum(total - np.where(fit.is_right, square, 0.0), 0.0) + STATED_AS) / free
@@ -209,8 +212,8 @@ class Scatter(NamedTuple):
 
 def scatter(fit: Fit, chance: float) -> Scatter:
     """The chi-square of the right points against the noise as stated; ``limit`` belongs to ``chance``."""
-    residual = fit.seen.residual_px(fit.cam_from_vehicle)[fit.is_right]
-    stated = fit.seen.covariance(fit.cam_from_vehicle)[fit.is_right]
+    residual = fit.points.residual_px(fit.cam_from_vehicle)[fit.is_right]
+    stated = fit.points.covariance(fit.cam_from_vehicle)[fit.is_right]
     total = float(np.einsum("ni,nij,nj->", residual, np.linalg.inv(stated), residual))
     free = max(2 * len(residual) - UNKNOWNS, 1)
     limit = float(np.sqrt(chi2.isf(chance, free) / free))
@@ -221,64 +224,78 @@ class Lens(NamedTuple):
     """Whether the points agree with the intrinsics."""
 
     probability: float  # of as large a disagreement by chance, both focal lengths freed
-    focal: tuple[float, float]  # by which share the points want it longer, and its sigma
+    focal: float  # share by which the points want the focal length longer
+    focal_sigma: float  # standard deviation of that share
 
 
 def lens(fit: Fit) -> Lens:
     """Test the intrinsics: a homography has two degrees of freedom more than a mounting."""
-    probability, focal, sigma = _freed(fit)
-    total = 1 + focal
-    for _ in range(_FOCAL_ROUNDS if abs(focal) > sigma else 0):
-        seen, intrinsic = fit.seen, fit.seen.info.intrinsic.copy()
+    freed = _freed(fit)
+    probability = freed.probability
+    total = 1 + freed.focal
+    points = fit.points
+    for _ in range(_FOCAL_ROUNDS if abs(freed.focal) > freed.focal_sigma else 0):
+        intrinsic = points.info.intrinsic.copy()
         intrinsic[:2, :2] *= total
-        info = replace(seen.info, intrinsic=intrinsic)
-        again = fit_mountings(Seen.of(seen.points_px, seen.points_vehicle, info, seen.noise), starts=1)
-        if not again:
+        info = replace(points.info, intrinsic=intrinsic)
+        longer = SeenPoints.of(points.points_px, points.points_vehicle, info, points.noise)
+        fits = fit_mountings(longer, starts=1)
+        if not fits:
             break
-        _, focal, sigma = _freed(again[0])
-        total *= 1 + focal
-    return Lens(probability, (total - 1, sigma))
+        freed = _freed(fits[0])
+        total *= 1 + freed.focal
+    return Lens(probability, total - 1, freed.focal_sigma)
 
 
-def _freed(fit: Fit) -> tuple[float, float, float]:
-    """The chance of the disagreement, and the focal length's relative error with its sigma."""
-    seen = fit.seen
+def _freed(fit: Fit) -> Lens:
+    """The lens as one linear step from a fit shows it."""
+    points = fit.points
     right = fit.is_right
-    stated = np.asarray(np.linalg.inv(seen.covariance(fit.cam_from_vehicle)[right]), dtype=np.float64)
-    slopes = seen.jacobian(fit.cam_from_vehicle)[right]
-    residual = seen.residual_px(fit.cam_from_vehicle)[right]
-    from_centre = seen.points_px[right] - seen.info.intrinsic[:2, 2]
+    stated = np.asarray(np.linalg.inv(points.covariance(fit.cam_from_vehicle)[right]), dtype=np.float64)
+    slopes = points.jacobian(fit.cam_from_vehicle)[right]
+    residual = points.residual_px(fit.cam_from_vehicle)[right]
+    from_centre = points.points_px[right] - points.info.intrinsic[:2, 2]
     # Longer by a share, a focal length moves the predicted pixel away from the centre by that share.
-    each = np.zeros((len(residual), 2, 2))
-    each[:, [0, 1], [0, 1]] = from_centre
-    gain, _, _ = _gain_of(each, stated, slopes, residual)
+    by_both_focals = np.zeros((len(residual), 2, 2))
+    by_both_focals[:, [0, 1], [0, 1]] = from_centre
+    gain = _gain_of(by_both_focals, stated, slopes, residual).decrease
     total = float(np.einsum("ni,nij,nj->", residual, stated, residual))
     free = max(2 * len(residual) - UNKNOWNS - 2, 0) + STATED_AS
     noise = (max(total - gain, 0.0) + STATED_AS) / free
-    _, step, left = _gain_of(from_centre[..., None], stated, slopes, residual)
-    return float(f.sf(gain / 2 / noise, 2, free)), float(step[0]), float(np.sqrt(noise / left[0, 0]))
+    focal = _gain_of(from_centre[..., None], stated, slopes, residual)
+    return Lens(
+        probability=float(f.sf(gain / 2 / noise, 2, free)),
+        focal=float(focal.step[0]),
+        focal_sigma=float(np.sqrt(noise / focal.information[0, 0])),
+    )
 
 
-def _gain_of(
-    more: FloatArray, stated: FloatArray, slopes: FloatArray, residual: FloatArray
-) -> tuple[float, FloatArray, FloatArray]:
-    """Decrease of the cost by unknowns with derivatives (N, 2, K), their values, their information."""
-    own = np.einsum("nij,nik,njl->kl", stated, more, more)
+class _Gain(NamedTuple):
+    """What K further unknowns beside a mounting would gain."""
+
+    decrease: float  # of the cost
+    step: FloatArray  # (K,) their values
+    information: FloatArray  # (K, K) that is left on them, the mounting freed
+
+
+def _gain_of(more: FloatArray, stated: FloatArray, slopes: FloatArray, residual: FloatArray) -> _Gain:
+    """The gain by unknowns that have derivatives ``more`` (N, 2, K), beside a mounting's ``slopes``."""
+    of_more = np.einsum("nij,nik,njl->kl", stated, more, more)
     shared = np.einsum("nij,nik,njl->kl", stated, more, slopes)
     mounting = np.einsum("nij,nik,njl->kl", stated, slopes, slopes)
-    wanted = np.einsum("nij,nik,nj->k", stated, more, residual)
+    pull_of_more = np.einsum("nij,nik,nj->k", stated, more, residual)
     pull = np.einsum("nij,nik,nj->k", stated, slopes, residual)
     through = shared @ np.linalg.pinv(mounting)
-    left = own - through @ shared.T
-    force = wanted - through @ pull
-    step = -np.linalg.pinv(left, hermitian=True) @ force
-    return float(-step @ force), step, left
+    information = of_more - through @ shared.T
+    force = pull_of_more - through @ pull
+    step = -np.linalg.pinv(information, hermitian=True) @ force
+    return _Gain(float(-step @ force), step, information)
 
 
 def judge_fit(points: SurveyedPoints, fits: Sequence[Fit], residuals: Residuals) -> Iterator[Finding]:
     """The findings on the most likely of ``fits``."""
     fit = fits[0]
-    about = fits[0].seen.info.name
+    about = fits[0].points.info.name
     yield from _wrong_points(points, fits, residuals, about)
     spread = scatter(fit, CHANCE)
     says = f"the points scatter {spread.ratio:.2g} times as much as --pixel-sigma and --survey-sigma state"
@@ -301,6 +318,7 @@ def judge_fit(points: SurveyedPoints, fits: Sequence[Fit], residuals: Residuals)
 def _wrong_points(
     points: SurveyedPoints, fits: Sequence[Fit], residuals: Residuals, about: str
 ) -> Iterator[Finding]:
+    """The findings on points that contradict the others."""
     fit = fits[0]
     total = len(points.names)
     named = np.flatnonzero(~fit.is_right | (residuals.probability < CHANCE / total)).tolist()
@@ -321,7 +339,7 @@ def _wrong_points(
             "which place, and the intrinsics"
         )
         yield Finding("agreement", Status.FAIL, float(count), None, "points", says, about)
-    rivals = [one for one in fits[1:] if fit.log_posterior - one.log_posterior < _RIVAL]
+    rivals = [rival for rival in fits[1:] if fit.log_posterior - rival.log_posterior < _RIVAL]
     if rivals and named:
         other = [points.names[k] for k in np.flatnonzero(~rivals[0].is_right)]
         says = (
@@ -332,8 +350,10 @@ def _wrong_points(
 
 
 def _intrinsics(fit: Fit, about: str) -> Finding:
+    """The finding on the intrinsics."""
     tested = lens(fit)
-    focal, sigma = tested.focal
+    focal = tested.focal
+    sigma = tested.focal_sigma
     far = abs(focal) > _FOCAL_OFF
     recovery = (
         "were the pixels read from an image of another size, or is this another camera's file?"
@@ -351,8 +371,8 @@ def _intrinsics(fit: Fit, about: str) -> Finding:
 
 def _how_far(off_px: FloatArray, off_m: FloatArray) -> str:
     """How far a point (2,) is off in the image and on the ground."""
-    pixels = float(np.hypot(*off_px))
-    metres = float(np.hypot(*off_m))
+    pixels = float(np.hypot(off_px[0], off_px[1]))
+    metres = float(np.hypot(off_m[0], off_m[1]))
     if not np.isfinite(pixels):
         return "its place is behind the camera"
     if not np.isfinite(metres):

@@ -8,18 +8,16 @@ from __future__ import annotations
 
 import argparse
 import difflib
-import importlib
-import inspect
 import re
 import shutil
 import sys
 import tempfile
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import MISSING, Field, fields, is_dataclass
+from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, get_args, get_type_hints
+from typing import Any, NamedTuple, TypeVar, get_args
 
 import hydra
 from hydra.core.config_store import ConfigStore
@@ -27,10 +25,11 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from v2hdm.cli.main import Command
+from v2hdm.cli.command import Command
 from v2hdm.errors import ConfigError, V2hdmError
-from v2hdm.io.drive.folder import DRIVE_FILE
+from v2hdm.io.description import DRIVE_FILE
 from v2hdm.safe.texts import read_yaml
+from v2hdm.settings import NO_KEY, settings_of
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _Schema = TypeVar("_Schema")
@@ -54,17 +53,30 @@ class Job(NamedTuple):
     yaml: str
 
 
-def work_on(
-    command: Command,
-    name: str,
-    schema: type[Any],
-    work: Callable[[Job], int | None],
-    arguments: Sequence[str],
-    advice: str,
-) -> int:
-    """Compose ``conf/<name>.yaml`` with the command line and work on it; returns the exit code.
+@dataclass(frozen=True)
+class Door:
+    """What a command takes: overrides of ``conf/<name>.yaml``, which ``schema`` checks.
 
-    ``advice`` is on values that are missing. Raises ConfigError where a key or value is wrong.
+    Attributes:
+        name: of the configuration.
+        schema: the dataclass that it fills.
+        advice: on values that are missing.
+        lists: whether ``--help`` lists a key, by its name.
+        further: a line on keys that it does not list.
+    """
+
+    name: str
+    schema: type[Any]
+    advice: str
+    lists: Callable[[str], bool] = lambda key: True
+    further: str = ""
+
+
+def work_on(command: Command, door: Door, work: Callable[[Job], int | None], arguments: Sequence[str]) -> int:
+    """Compose the configuration with the command line and work on it; returns the exit code.
+
+    Raises:
+        ConfigError: a key or value is wrong.
     """
     parser = argparse.ArgumentParser(command.name, add_help=False, allow_abbrev=False)
     parser.add_argument("overrides", nargs="*")
@@ -75,19 +87,19 @@ def work_on(
     if unknown:
         raise ConfigError(f"there is no option {unknown[0]}; {command.name} --help lists them")
     if parsed.help:
-        print(help_text(command.name, command.says, schema, conf_dir()))
+        print(help_text(command, door))
         return 0
     try:
         _check_own_files(parsed.config_dir, parsed.overrides)
-        composed = _compose(name, schema, parsed.overrides, parsed.config_dir)
+        composed = _compose(door.name, door.schema, parsed.overrides, parsed.config_dir)
     except V2hdmError:
         raise
     except Exception as error:  # whatever Hydra, OmegaConf and PyYAML raise about texts that users wrote
-        raise explain(error, schema, parsed.overrides) from error
+        raise explain(error, door.schema, parsed.overrides) from error
     if parsed.cfg:
         print(OmegaConf.to_yaml(composed))
         return 0
-    return work(Job(to_dataclass(composed, schema, advice), to_yaml(composed))) or 0
+    return work(Job(to_dataclass(composed, door.schema, door.advice), to_yaml(composed))) or 0
 
 
 def _compose(
@@ -228,7 +240,7 @@ Usage: {command} [key=value ...] [--config-dir FOLDER]
 """
 _OFTEN = {
     "drive.path", "drive.format", "drive.cameras", "map.base", "mapping.max_range_m", "mapping.survey.file",
-    "report.background",
+    "report.background", "simulate.name", "simulate.seed", "simulate.session", "simulate.initial_ipm",
 }  # fmt: skip
 """Keys below others that are often set; the rest is for experts."""
 
@@ -244,60 +256,42 @@ class Key(NamedTuple):
     meaning: str
 
 
-def help_text(command: str, says: str, schema: type[Any], conf: Path) -> str:
-    """The page that ``--help`` prints, of a command, a sentence about it, its dataclass and ``conf/``."""
-    parts = [_USAGE.format(command=command), says, ""]
-    if "drive" in {one.name for one in fields(schema)}:
-        runs = ", ".join(sorted(path.stem for path in (conf / "run").glob("*.yaml")))
-        parts += [f"Shipped runs: {runs}", ""]
-    often: list[str] = ["Keys, as key (type, default):"]
-    rest: list[str] = ["", "For experts:"]
-    for key in keys_of(schema):
-        page = often if key.name in _OFTEN or "." not in key.name else rest
-        page.append(f"  {key.name} ({key.kind}{f', {key.default}' if key.default else ''})")
-        page += textwrap.wrap(key.meaning, 100, initial_indent=" " * 6, subsequent_indent=" " * 6)
-    return "\n".join([*parts, *often, *rest])
+def help_text(command: Command, door: Door) -> str:
+    """The page that ``--help`` prints."""
+    head = [_USAGE.format(command=command.name), command.says, ""]
+    if "drive" in settings_of(door.schema):
+        runs = ", ".join(sorted(path.stem for path in (conf_dir() / "run").glob("*.yaml")))
+        head += [f"Shipped runs: {runs}", ""]
+    often = ["Keys, as key (type, default):"]
+    for_experts = ["", "For experts:"]
+    for key in keys_of(door.schema):
+        if door.lists(key.name):
+            page = often if key.name in _OFTEN or "." not in key.name else for_experts
+            page.append(f"  {key.name} ({key.kind}{f', {key.default}' if key.default else ''})")
+            page += textwrap.wrap(key.meaning, 100, initial_indent=" " * 6, subsequent_indent=" " * 6)
+    return "\n".join([*head, *often, *for_experts, *([door.further] if door.further else [])])
 
 
 def keys_of(schema: type[Any], prefix: str = "") -> Iterator[Key]:
     """All keys below a dataclass, in order; those of an entry of a mapping stand under ``NAME``."""
-    hints = get_type_hints(schema)
-    for one in fields(schema):
-        hint = hints[one.name]
-        name = f"{prefix}{one.name}"
-        below = next((kind for kind in (hint, *get_args(hint)) if _is_schema(kind)), None)
+    settings = settings_of(schema)
+    for field in fields(schema):
+        if field.metadata == NO_KEY:
+            continue
+        setting = settings[field.name]
+        hint = setting.hint
+        name = f"{prefix}{field.name}"
+        below = schema_in(hint)
         is_mapping = hint is not below and "dict" in str(hint)
-        if below is None or hint is not below:
-            about = "" if below is None else " ".join((inspect.getdoc(below) or "").split("\n\n")[0].split())
-            yield Key(name, _kind(hint), _default(one), meaning_of(schema, one.name) or about)
+        if hint is not below or below is None:
+            yield Key(name, _kind(hint), _default(field), setting.meaning)
         if below is not None:
             yield from keys_of(below, f"{name}.NAME." if is_mapping else f"{name}.")
 
 
-def meaning_of(schema: type[Any], name: str) -> str:
-    """The meaning of a key by the docstring of its dataclass, or of one that this extends."""
-    for owner in schema.__mro__:
-        text = inspect.cleandoc(owner.__doc__ or "") if "__doc__" in vars(owner) else ""
-        prose, _, attributes = text.partition("Attributes:\n")
-        for entry in re.split(r"\n(?=    \w+: )", "\n" + attributes):
-            key, found, meaning = entry.strip().partition(": ")
-            if found and key == name:
-                return _plain(" ".join(meaning.split("\n\n")[0].split()))
-        sentences = re.split(r"(?<=[.;:])\s+(?=[`A-Z])", " ".join(prose.split()))
-        naming = [sentence for sentence in sentences if f"``{name}``" in sentence]
-        if naming:
-            return _plain(re.sub(rf"^``{name}`` (?:is|are) ", "", " ".join(naming)))
-        for module, other in re.findall(r":class:`~?([\w.]+)\.(\w+)`", text):
-            described = getattr(importlib.import_module(module), other)
-            if _is_schema(described) and (meaning := meaning_of(described, name)):
-                return meaning
-    return ""
-
-
-def _plain(text: str) -> str:
-    """A docstring's sentence without its markup, in the words of YAML."""
-    text = re.sub(r":\w+:`~?(?:[\w.]+\.)?(\w+)`", r"\1", text)
-    return re.sub(r"\bNone\b", "null", text.replace("`", ""))
+def schema_in(hint: Any) -> type[Any] | None:
+    """The dataclass that a type is, or that its entries are; None for plain values."""
+    return next((kind for kind in (hint, *get_args(hint)) if _is_schema(kind)), None)
 
 
 def _is_schema(kind: Any) -> bool:

@@ -23,46 +23,47 @@ from v2hdm.workers import share_out
 
 _log = logging.getLogger(__name__)
 _worker: tuple[Detector, Drive] | None = None
-_WORKERS_A_GPU = 8  # processes that share one: each takes memory of its own there
+_WORKERS_A_GPU = 8  # processes that share a GPU: each takes memory of its own there
 
 Detect = Callable[[Drive, DetectorOptions, Sequence[int], int, Callable[[ImageDetections], None]], None]
 """A function that does what :func:`detect_images` does."""
 
-_FEW_IMAGES = 8  # fewer are looked at before a process has started
-_IMAGES = 24  # images that are looked at: a second and a half of work
-_LEAST_IMAGES = 10
-_APART_M = 2.0  # they are at least this far apart, m, so that markings have moved on
+_FEW_IMAGES = 8  # fewer images than this are looked at before a process has started
+
+_IMAGES = 24  # images in which a camera's own vehicle is looked for: a second and a half of work
+_LEAST_IMAGES = 10  # images that a mask of the vehicle needs at least
+_APART_M = 2.0  # least way of the vehicle between two of these images, m, so that markings have moved on
 _SHARE = 0.7  # paint at one place in this share of images is the vehicle: diamonds cover it in a third
-_MARGIN_PX = 6  # the network sees an edge this far from where it is
+_MARGIN_PX = 6  # distance, px, at most at which the network sees an edge from where it is
 
 
 def _learn(detector: Detector, images: Sequence[Image], camera: Camera) -> BoolArray | None:
     """Where (height, width) a camera's images, in driving order, show its vehicle; None for nowhere."""
-    apart: list[Image] = []
+    spread: list[Image] = []
     for image in images:
         place = image.map_from_vehicle[:2, 3]
-        if not apart or np.linalg.norm(place - apart[-1].map_from_vehicle[:2, 3]) >= _APART_M:
-            apart.append(image)
-    chosen = np.unique(np.linspace(0, len(apart) - 1, min(_IMAGES, len(apart))).round().astype(np.intp))
+        if not spread or np.linalg.norm(place - spread[-1].map_from_vehicle[:2, 3]) >= _APART_M:
+            spread.append(image)
+    chosen = np.unique(np.linspace(0, len(spread) - 1, min(_IMAGES, len(spread))).round().astype(np.intp))
     if len(chosen) < _LEAST_IMAGES:
         return None
     shape = (camera.info.height, camera.info.width)
-    painted = []
+    paint = []
     for k in chosen.tolist():
-        pixels = read_bgr(apart[k].path)
+        pixels = read_bgr(spread[k].path)
         if pixels.shape[:2] != shape:
             return None
-        painted.append(detector.markings_paint(pixels, camera))
-    always = np.sum(painted, axis=0) >= _SHARE * len(chosen)
+        paint.append(detector.markings_paint(pixels, camera))
+    always = np.sum(paint, axis=0) >= _SHARE * len(chosen)
     if not always.any():
         return None
     top = detector.road_camera(camera).far_row
     stride = detector.network.info.paint_stride
     mask = np.zeros(shape, dtype=np.uint8)
-    grown = np.kron(always.astype(np.uint8), np.ones((stride, stride), dtype=np.uint8))
-    rows = min(len(grown), len(mask) - top)
-    columns = min(grown.shape[1], mask.shape[1])
-    mask[top : top + rows, :columns] = grown[:rows, :columns]
+    in_pixels = np.kron(always.astype(np.uint8), np.ones((stride, stride), dtype=np.uint8))
+    rows = min(len(in_pixels), len(mask) - top)
+    columns = min(in_pixels.shape[1], mask.shape[1])
+    mask[top : top + rows, :columns] = in_pixels[:rows, :columns]
     size = 2 * _MARGIN_PX + 1
     return np.asarray(cv2.dilate(mask, np.ones((size, size), np.uint8)) > 0)
 
@@ -153,17 +154,19 @@ def with_masks(drive: Drive, masks: Mapping[str, BoolArray]) -> Drive:
 def _start_worker(drive: Drive, options: DetectorOptions) -> None:
     global _worker
     cv2.setNumThreads(1)
-    _worker = Detector.load(options=options), drive
+    _worker = (Detector.load(options=options), drive)
 
 
 def _work(index: int) -> ImageDetections:
     if _worker is None:
         raise RuntimeError("worker was not started")
-    return detect_image(*_worker, index)
+    detector, drive = _worker
+    return detect_image(detector, drive, index)
 
 
 def detect_image(detector: Detector, drive: Drive, index: int) -> ImageDetections:
     """The detections of image ``index`` of a drive, whose cameras know their vehicle; raises DriveError."""
     image = drive.images[index]
     camera = drive.cameras[image.camera]
-    return ImageDetections(index, *detector.detect(read_image(image, camera), camera))
+    markings, lanes = detector.detect(read_image(image, camera), camera)
+    return ImageDetections(index, markings, lanes)

@@ -21,11 +21,11 @@ from v2hdm.geometry.lens import distort_jacobian, distort_points, has_distortion
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import DISTORTION_COEFFICIENTS, BoolArray, Calibration, Camera, CameraInfo, FloatArray
 
-_LUT_STEP_PX = 4
-_HORIZON_MARGIN_PX = 16
+_LUT_STEP_PX = 4  # distance between the nodes of the table of the lens, px
+_HORIZON_MARGIN_PX = 16  # rows above the horizon of the initial IPM that are looked at
 
-FARTHEST_M = 60.0  # neither markings nor lines are looked for beyond: networks are shown none beyond 50 m
-_SURROUNDINGS_PX = 24  # so far above the farthest ground what is there helps to classify what lies on it
+FARTHEST_M = 60.0  # distance, m, beyond which nothing is looked for: networks are shown none beyond 50 m
+_SURROUNDINGS_PX = 24  # rows above the farthest ground that help to classify what lies on it
 
 _FINE_ENOUGH_M = 0.007
 """Ground per pixel, across the view, of which half the resolution shows enough: a dash stays 10 px wide."""
@@ -33,14 +33,13 @@ _FINE_ENOUGH_M = 0.007
 ASIDE_RAD = np.deg2rad(60)
 """A camera that looks farther than this off the way that its vehicle drives, ahead or back, looks aside."""
 
-_LEAST_BELOW_PX = 4.0  # nearer to the horizon than this nothing is known of the ground
+_LEAST_BELOW_PX = 4.0  # distance below the horizon, px, nearer than which nothing is known of the ground
 _CURVE_UNIT_PX = 100.0  # unit of the distance below the horizon in lanes' curves: their parameters are alike
+_PROBE_PX = 50.0  # distance below the horizon, px, at which the width of a metre of ground is measured
 
-_PROBE_PX = 50.0
-
-_ROTATION_TOLERANCE = 1e-6
-_BELOW_M = 0.1
-_FARTHEST_MOUNT_M = 100.0
+_ROTATION_TOLERANCE = 1e-6  # largest error of R R' - 1 of a stated rotation R
+_BELOW_M = 0.1  # half the side, m, of the region of interest about the ground that the lowest pixel shows
+_FARTHEST_MOUNT_M = 100.0  # largest coordinate of a camera on its vehicle, m
 
 
 class RoadCamera:
@@ -65,10 +64,10 @@ class RoadCamera:
         rows = np.arange(0.0, self.info.height + _LUT_STEP_PX, _LUT_STEP_PX)
         grid_px = np.stack(np.meshgrid(columns, rows), axis=-1)
         node = undistort_points(self.info, grid_px.reshape(-1, 2)).reshape(grid_px.shape)
-        right = np.diff(node, axis=1)[:-1]
-        down = np.diff(node, axis=0)
-        slopes = right, down[:, :-1], np.diff(down, axis=1)
-        self._pinhole_lut: FloatArray = np.stack([node[:-1, :-1], *slopes]).transpose(3, 0, 1, 2).copy()
+        by_right = np.diff(node, axis=1)[:-1]
+        by_down = np.diff(node, axis=0)
+        tables = np.stack([node[:-1, :-1], by_right, by_down[:, :-1], np.diff(by_down, axis=1)])
+        self._pinhole_lut: FloatArray = tables.transpose(3, 0, 1, 2).copy()
         self._ground_from_pinhole_px = facing_ipm(
             self.vehicle_from_pinhole_px, camera.roi_vehicle.mean(axis=0)
         )
@@ -96,11 +95,11 @@ class RoadCamera:
         row = np.clip(v.astype(np.intp), 0, rows - 1)
         right = u - column
         down = v - row
-        at = columns * row + column
+        cell = columns * row + column
         # Plane by plane numpy takes a sixth of the time.
         for axis, table in enumerate(self._pinhole_lut.reshape(2, 4, -1)):
-            there, by_right, by_down, by_both = (plane.take(at) for plane in table)
-            points[:, axis] = there + by_right * right + (by_down + by_both * right) * down
+            corner, by_right, by_down, by_right_and_down = (plane.take(cell) for plane in table)
+            points[:, axis] = corner + by_right * right + (by_down + by_right_and_down * right) * down
         return points
 
     def distort(self, points_pinhole_px: FloatArray) -> FloatArray:
@@ -168,23 +167,28 @@ class RoadCamera:
         intrinsic = calibration.info.intrinsic
         matrix = calibration.cam_from_vehicle
         cam = points_vehicle @ matrix[:3, :2].T + matrix[:3, 3]
-        project = np.zeros((len(cam), 2, 3))
-        project[:, :, :2] = intrinsic[:2, :2]
-        project[:, :, 2] = intrinsic[:2, 2] - pinhole_px
-        project /= cam[:, 2, None, None]
-        by_pinhole = _inverse(project @ matrix[:3, :2])
-        moved = np.zeros((len(cam), 3, 6))
-        moved[:, range(3), range(3)] = 1.0
+        pinhole_by_cam = np.zeros((len(cam), 2, 3))
+        pinhole_by_cam[:, :, :2] = intrinsic[:2, :2]
+        pinhole_by_cam[:, :, 2] = intrinsic[:2, 2] - pinhole_px
+        pinhole_by_cam /= cam[:, 2, None, None]
+        by_pinhole = _inverse(pinhole_by_cam @ matrix[:3, :2])
+        cam_by_mounting = np.zeros((len(cam), 3, 6))
+        cam_by_mounting[:, range(3), range(3)] = 1.0
         x, y, z = cam.T
-        moved[:, 0, 4] = z
-        moved[:, 0, 5] = -y
-        moved[:, 1, 3] = -z
-        moved[:, 1, 5] = x
-        moved[:, 2, 3] = y
-        moved[:, 2, 4] = -x
-        by_px = by_pinhole @ _inverse(self.distort_jacobian(pinhole_px))
-        covariance = np.zeros((6, 6)) if calibration.covariance is None else calibration.covariance
-        return GroundPoints(points_vehicle, by_px, -by_pinhole @ project @ moved, covariance)
+        cam_by_mounting[:, 0, 4] = z
+        cam_by_mounting[:, 0, 5] = -y
+        cam_by_mounting[:, 1, 3] = -z
+        cam_by_mounting[:, 1, 5] = x
+        cam_by_mounting[:, 2, 3] = y
+        cam_by_mounting[:, 2, 4] = -x
+        return GroundPoints(
+            points_vehicle=points_vehicle,
+            by_px=by_pinhole @ _inverse(self.distort_jacobian(pinhole_px)),
+            by_mounting=-by_pinhole @ pinhole_by_cam @ cam_by_mounting,
+            mounting_covariance=np.zeros((6, 6))
+            if calibration.covariance is None
+            else calibration.covariance,
+        )
 
     @cached_property
     def horizon(self) -> Horizon:
@@ -193,8 +197,8 @@ class RoadCamera:
 
     def first_row_within(self, range_m: float) -> int:
         """The uppermost row from ``top`` on that shows ground within ``range_m`` of the camera's foot."""
-        near = self.range_m(self._row_grid_vehicle()) <= range_m
-        return max(self.top, int(np.argmax(near.any(axis=1)))) if near.any() else self.info.height
+        is_within = self.range_m(self._row_grid_vehicle()) <= range_m
+        return max(self.top, int(np.argmax(is_within.any(axis=1)))) if is_within.any() else self.info.height
 
     def _row_grid_vehicle(self) -> FloatArray:
         """Ground points (H, 9, 2) of every row at nine columns, vehicle frame; nan above the horizon."""
@@ -203,6 +207,7 @@ class RoadCamera:
         return self.unproject(np.stack(np.meshgrid(columns, rows), axis=-1))
 
     def _fine_row(self) -> int | None:
+        """The first row from which on a pixel is less than ``_FINE_ENOUGH_M`` of ground wide, if any."""
         rows = np.arange(self.top, self.info.height, dtype=np.float64)
         columns = (self.info.width - 1) / 2 + np.array([-0.5, 0.5])
         ends = self.unproject(np.stack(np.meshgrid(columns, rows), axis=-1))
@@ -222,8 +227,12 @@ class GroundPoints:
 
     def __getitem__(self, part: slice) -> GroundPoints:
         """Some of the points."""
-        points = self.points_vehicle[part], self.by_px[part], self.by_mounting[part]
-        return GroundPoints(*points, self.mounting_covariance)
+        return GroundPoints(
+            points_vehicle=self.points_vehicle[part],
+            by_px=self.by_px[part],
+            by_mounting=self.by_mounting[part],
+            mounting_covariance=self.mounting_covariance,
+        )
 
     def joint_covariance(self, covariance_px: FloatArray) -> FloatArray:
         """Covariance (2N, 2N), m^2, of the stacked points (x0, y0, x1, ...).
@@ -248,8 +257,8 @@ class GroundPoints:
 
 def _inverse(matrices: FloatArray) -> FloatArray:
     """Inverses (N, 2, 2), by Cramer's rule so that nan stays where it is."""
-    (a, b) = matrices[:, 0].T
-    (c, d) = matrices[:, 1].T
+    a, b = matrices[:, 0].T
+    c, d = matrices[:, 1].T
     adjugate = np.stack([np.stack([d, -b], axis=1), np.stack([-c, a], axis=1)], axis=1)
     return np.asarray(adjugate / (a * d - b * c)[:, None, None])
 
@@ -280,9 +289,9 @@ class Horizon:
         by_curvature = 0.5 * range_m**2 * probe_px_per_m * _PROBE_PX / _CURVE_UNIT_PX
         self._units = np.array([float(intrinsic[0, 0]), self.px_per_m * _CURVE_UNIT_PX, by_curvature])
 
-    def parameters(self, direction_rad: float, beside_m: float, curvature: float) -> FloatArray:
-        """The a, b and c (3,) of a line by direction, place beside the camera and curvature, 1/m."""
-        return self._units * (direction_rad, beside_m, curvature)
+    def parameters(self, line: tuple[float, float, float]) -> FloatArray:
+        """The a, b and c (3,) of a line by direction, rad, place beside the camera, m, and curvature, 1/m."""
+        return self._units * line
 
     def basis(self, below: FloatArray) -> FloatArray:
         """The factors (N, 3) of a curve's a, b and c at distances (N,) below the horizon, px."""
@@ -347,11 +356,12 @@ def rough_calibration(
     intrinsic = np.array([[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]])
     c = np.cos(np.deg2rad(pitch_deg))
     s = np.sin(np.deg2rad(pitch_deg))
-    cam_from_vehicle = np.eye(4)
-    cam_from_vehicle[:3, :3] = [[0, -1, 0], [-s, 0, -c], [c, 0, -s]]
+    pitched = np.array([[0, -1, 0], [-s, 0, -c], [c, 0, -s]])
     c = np.cos(np.deg2rad(roll_deg))
     s = np.sin(np.deg2rad(roll_deg))
-    cam_from_vehicle[:3, :3] = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ cam_from_vehicle[:3, :3]
+    rolled = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+    cam_from_vehicle = np.eye(4)
+    cam_from_vehicle[:3, :3] = rolled @ pitched
     cam_from_vehicle[:3, 3] = -cam_from_vehicle[:3, :3] @ [0, 0, height_m]
     return Calibration(CameraInfo(name, width, height, intrinsic), cam_from_vehicle)
 
@@ -363,8 +373,8 @@ def _problem(calibration: Calibration) -> str | None:
     rotation = cam_from_vehicle[:3, :3]
     count = DISTORTION_COEFFICIENTS.get(info.distortion_model)
     if count is None:
-        known = ", ".join(DISTORTION_COEFFICIENTS)
-        return f"unknown distortion_model '{info.distortion_model}'; known are {known}"
+        models = ", ".join(DISTORTION_COEFFICIENTS)
+        return f"unknown distortion_model '{info.distortion_model}'; known are {models}"
     if len(info.distortion) != count:
         return f"{info.distortion_model} has {count} coefficients, not {len(info.distortion)}; fix them"
     if info.width < 1 or info.height < 1 or min(info.intrinsic[0, 0], info.intrinsic[1, 1]) <= 0:

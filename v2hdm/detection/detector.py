@@ -16,7 +16,9 @@ from v2hdm.detection.lanes.curves import LaneImage
 from v2hdm.detection.lanes.lines import find_boundaries, trace_lanes
 from v2hdm.detection.network import Network, NetworkOutput, run_on_road
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.quads.propose import Proposals, find_blobs, on_edges, outline_polygon, propose
+from v2hdm.detection.quads.blobs import find_blobs
+from v2hdm.detection.quads.outline import on_edges, outline_polygon
+from v2hdm.detection.quads.propose import Proposals, propose
 from v2hdm.detection.stopwatch import lap
 from v2hdm.detection.weights import check_weights
 from v2hdm.errors import DetectorError
@@ -43,6 +45,7 @@ class Detector:
         self.network = network
         self.options = options
         self.catalogue = catalogue or network.info.catalogue
+        # By name, with the first row that shows ground within ``max_range_m``.
         self._cameras: dict[str, tuple[RoadCamera, int]] = {}
 
     @classmethod
@@ -65,15 +68,15 @@ class Detector:
         """
         output = self.run_network(image_bgr, camera)
         with lap("propose"):
-            found = self.propose(output, camera)
+            proposals = self.propose(output, camera)
         with lap("lanes"):
-            image = self.lane_image(found)
+            image = self.lane_image(proposals)
             lanes = (*image.paint, *find_boundaries(image))
         with lap("fit"):
-            readings = self.read(image_bgr, found)
+            readings = self.read(image_bgr, proposals)
         with lap("judge"):
-            markings = find_markings(readings, found.camera, self.options)
-        return _likelier(markings, self._symbols(image_bgr, found)), lanes
+            markings = find_markings(readings, proposals.camera, self.options)
+        return _likelier(markings, self._symbols(image_bgr, proposals)), lanes
 
     def run_network(self, image_bgr: np.ndarray, camera: Camera) -> NetworkOutput:
         """Run the network on an image, less what shows the vehicle; raises as :meth:`detect`."""
@@ -84,11 +87,12 @@ class Detector:
         mask = camera.own_vehicle
         if mask is None:
             return output
+        # The pixel in the middle of each element of paint.
         stride = output.stride
-        rows, columns = (
-            np.minimum(stride * np.arange(count) + stride // 2 + first, last - 1)
-            for count, first, last in zip(output.paint.shape, (output.top, 0), mask.shape, strict=True)
-        )
+        rows = output.top + stride * np.arange(output.paint.shape[0]) + stride // 2
+        columns = stride * np.arange(output.paint.shape[1]) + stride // 2
+        rows = np.minimum(rows, mask.shape[0] - 1)
+        columns = np.minimum(columns, mask.shape[1] - 1)
         paint = np.where(mask[np.ix_(rows, columns)], np.float32(_NO_PAINT), output.paint)
         return replace(output, paint=paint)
 
@@ -100,60 +104,74 @@ class Detector:
         pieces = propose(blobs, road_camera, self.catalogue, self.options.max_range_m)
         return Proposals(road_camera, output, pieces, owner)
 
-    def lane_image(self, found: Proposals) -> LaneImage:
+    def lane_image(self, proposals: Proposals) -> LaneImage:
         """An image in which boundaries of lanes are looked for: row anchors and centre lines of paint."""
         step_m = self.options.lane_step_m
         lane_classes = set(self.catalogue.lane_paint)
         paint = [
-            (piece, own)
-            for piece in found.pieces
+            (piece, score)
+            for piece in proposals.pieces
             if piece.blob.traced and piece.kind in lane_classes and not piece.blob.touches_symbol
-            if (own := piece.score_of(lane_classes)) >= self.options.min_score
+            if (score := piece.score_of(lane_classes)) >= self.options.min_score
         ]
-        lines = trace_lanes(paint, found.camera, step_m, self.options.max_range_m)
-        stride = self.network.info.lane_stride
-        return LaneImage(found.camera, found.output.anchors, lines, found.output, step_m, stride)
+        return LaneImage(
+            camera=proposals.camera,
+            rows=proposals.output.anchors,
+            paint=trace_lanes(paint, proposals.camera, step_m, self.options.max_range_m),
+            output=proposals.output,
+            paint_step_m=step_m,
+            row_step_px=self.network.info.lane_stride,
+        )
 
-    def read(self, image_bgr: np.ndarray, found: Proposals) -> Readings | None:
+    def read(self, image_bgr: np.ndarray, proposals: Proposals) -> Readings | None:
         """Fit an image's proposals, and gather the evidence for each; None where there is none."""
-        return read_markings(image_bgr, found, self.catalogue, self.options.blur_px)
+        return read_markings(image_bgr, proposals, self.catalogue, self.options.blur_px)
 
     def markings_paint(self, image_bgr: np.ndarray, camera: Camera) -> BoolArray:
         """Where (h, w) the network sees paint of markings, from the camera's ``far_row`` on."""
         output = run_on_road(self.network, image_bgr, self.road_camera(camera))
         lanes = np.isin(output.classes, self.catalogue.lane_paint)
         lead = output.kinds[~lanes].max(axis=0) - output.kinds[lanes].max(axis=0)
-        size = output.paint.shape[1], output.paint.shape[0]
+        size = (output.paint.shape[1], output.paint.shape[0])
         return np.asarray((output.paint > 0) & (cv2.resize(lead, size, interpolation=cv2.INTER_LINEAR) > 0))
 
     def road_camera(self, camera: Camera) -> RoadCamera:
         """The tables of a camera, built at its first use."""
-        known, _ = self._cameras.get(camera.info.name, (None, 0))
-        if known is None or known.camera is not camera:
-            known = RoadCamera(camera, self.network.info.multiple)
-            self._cameras[camera.info.name] = known, known.first_row_within(self.options.max_range_m)
-        return known
+        road_camera, _ = self._cameras.get(camera.info.name, (None, 0))
+        if road_camera is None or road_camera.camera is not camera:
+            road_camera = RoadCamera(camera, self.network.info.multiple)
+            reach_px = road_camera.first_row_within(self.options.max_range_m)
+            self._cameras[camera.info.name] = (road_camera, reach_px)
+        return road_camera
 
-    def _symbols(self, image_bgr: np.ndarray, found: Proposals) -> list[MarkingDetection]:
+    def _symbols(self, image_bgr: np.ndarray, proposals: Proposals) -> list[MarkingDetection]:
         """Markings within range with an outline but no four corners; of a piece and its parts only one."""
-        nothing = np.full((4, 2), np.nan), np.full((8, 8), np.nan), np.zeros(4, dtype=np.bool_)
         names = self.catalogue.of_family(SYMBOL)
         symbols = []
         parts_until = 0
-        for piece in found.pieces:
+        for piece in proposals.pieces:
             if not names or piece.index < parts_until:
                 continue
             kind = max(names, key=lambda name: piece.share.get(name, 0.0))
             score = piece.symbol_score(kind)
             ground = piece.outline_vehicle
-            within = found.camera.range_m(ground.mean(axis=0)) <= self.options.max_range_m  # nan is not
+            within = proposals.camera.range_m(ground.mean(axis=0)) <= self.options.max_range_m  # nan is not
             after = piece.index + 1 + piece.blob.parts
             if not within or score < self.options.min_score:
                 continue
-            parts = [part for part in found.pieces if piece.index < part.index < after]
+            parts = [part for part in proposals.pieces if piece.index < part.index < after]
             if piece.is_one_symbol(parts, self.catalogue):
-                outline = on_edges(outline_polygon(piece.blob), image_bgr)
-                symbols.append(MarkingDetection(kind, score, *nothing, *outline))
+                outline_px, outline_seen = on_edges(outline_polygon(piece.blob), image_bgr)
+                symbol = MarkingDetection(
+                    kind=kind,
+                    score=score,
+                    corners_px=np.full((4, 2), np.nan),
+                    covariance_px=np.full((8, 8), np.nan),
+                    corner_valid=np.zeros(4, dtype=np.bool_),
+                    outline_px=outline_px,
+                    outline_seen=outline_seen,
+                )
+                symbols.append(symbol)
                 parts_until = after
         return symbols
 
@@ -162,14 +180,14 @@ def _likelier(quads: Sequence[MarkingDetection], symbols: Sequence[MarkingDetect
     """Quadrilaterals and symbols of one image: where one lies in the other, the one of the higher score."""
     centres = [quad.corners_px.mean(axis=0).tolist() for quad in quads]
     left_out: set[int] = set()
-    kept = []
+    likelier_symbols = []
     for symbol in symbols:
         polygon = symbol.outline_px.astype(np.float32)
-        on = [k for k, centre in enumerate(centres) if cv2.pointPolygonTest(polygon, centre, False) > 0]
-        if all(quads[k].score < symbol.score for k in on):
-            left_out.update(on)
-            kept.append(symbol)
-    return (*(quad for k, quad in enumerate(quads) if k not in left_out), *kept)
+        on_it = [k for k, centre in enumerate(centres) if cv2.pointPolygonTest(polygon, centre, False) > 0]
+        if all(quads[k].score < symbol.score for k in on_it):
+            left_out.update(on_it)
+            likelier_symbols.append(symbol)
+    return (*(quad for k, quad in enumerate(quads) if k not in left_out), *likelier_symbols)
 
 
 def _check_image(image_bgr: np.ndarray, camera: Camera) -> None:

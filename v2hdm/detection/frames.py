@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.safe.pixels import VIDEO_OPTIONS, read_pixels
+from v2hdm.safe.pixels import AS_STORED, VIDEO_OPTIONS, read_pixels
 
 _log = logging.getLogger(__name__)
 
@@ -24,15 +24,13 @@ _MOST_CAMERAS = 1 << 16  # OpenCV takes a larger index for something else
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")  # suffixes of images in a folder
 _POLL_S = 0.005  # a folder that grows is looked at this often
 _WRITTEN_S = 1.0  # an image is written within this time
-_SAME_DATE_S = (2.0, 0.05)  # two changes this close may have one date: in whole seconds (FAT), in fractions
-
-# Depth and channels as stored, so that what does not fit is seen instead of converted without a word.
-_AS_STORED = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR
+_SAME_DATE_S = (2.0, 0.05)
+"""Seconds within which two changes may have one date: of dates in whole seconds (FAT), and in fractions."""
 
 
 def read_bgr(path: Path) -> np.ndarray:
     """Decode an image file to (H, W, 3) uint8 BGR; raises DriveError where it is damaged or not of 8 bits."""
-    pixels = read_pixels(path, _AS_STORED)
+    pixels = read_pixels(path, AS_STORED)  # so that what does not fit is seen, not converted without a word
     if pixels.dtype != np.uint8:
         raise DriveError(
             f"{path}: the image has {8 * pixels.dtype.itemsize} bits per channel; convert it to 8 bits"
@@ -63,11 +61,11 @@ def image_frames(paths: Sequence[Path]) -> Iterator[Frame]:
         yield Frame(str(path), name, index, None, read_bgr(path))
 
 
-def list_images(folder: Path, known: AbstractSet[str] = frozenset()) -> list[Path]:
-    """The image files that lie in a folder itself, by name, but for those of ``known`` names."""
+def list_images(folder: Path, left_out: AbstractSet[str] = frozenset()) -> list[Path]:
+    """The image files that lie in a folder itself, by name, but for those whose names are ``left_out``."""
     try:
         # Names alone: of thousands of images paths would take longer than it takes to look at one.
-        names = {*os.listdir(folder)} - known  # noqa: PTH208
+        names = {*os.listdir(folder)} - left_out  # noqa: PTH208
     except OSError as error:
         raise DriveError(
             f"{folder}: cannot read this folder ({error.strerror}); check its permissions"
@@ -152,30 +150,30 @@ def arriving_frames(folder: Path) -> Iterator[Frame]:
     Its time is when it was written. One that cannot be read a second after is left out with a warning. Raises
     DriveError where the folder cannot be read.
     """
-    known = {path.name for path in list_images(folder)[:-1]}
+    done = {path.name for path in list_images(folder)[:-1]}
     index = 0
     nothing_new_s = None  # date of the folder when it was last listed in vain
     while True:
         now_s = time.time()
         changed_s = _written_s(folder)
-        listed = list_images(folder, known) if changed_s != nothing_new_s else []
-        came = {path: _written_s(path) for path in listed}
-        if not came:
+        listed = list_images(folder, done) if changed_s != nothing_new_s else []
+        written_s = {path: _written_s(path) for path in listed}
+        if not written_s:
             is_settled = now_s - changed_s > _SAME_DATE_S[changed_s % 1 > 0]
             nothing_new_s = changed_s if is_settled else None
             time.sleep(_POLL_S)
             continue
-        newest = max(came, key=lambda path: (came[path], path.name))
+        newest = max(written_s, key=lambda path: (written_s[path], path.name))
         try:
             pixels = read_bgr(newest)
         except DriveError as error:
-            if time.time() - came[newest] > _WRITTEN_S:
+            if time.time() - written_s[newest] > _WRITTEN_S:
                 _log.warning("%s", error)
-                known.add(newest.name)
+                done.add(newest.name)
             time.sleep(_POLL_S)
             continue
-        known.update(path.name for path in came)
-        yield Frame(str(newest), newest.stem, index, came[newest], pixels, len(came) - 1)
+        done.update(path.name for path in written_s)
+        yield Frame(str(newest), newest.stem, index, written_s[newest], pixels, len(written_s) - 1)
         index += 1
 
 
@@ -195,8 +193,10 @@ def _capture(source: str | int, refused: str) -> Iterator[cv2.VideoCapture]:
     os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", options)
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        backend = () if isinstance(source, int) else (cv2.CAP_FFMPEG,)
-        capture = cv2.VideoCapture(source, *backend)
+        if isinstance(source, int):
+            capture = cv2.VideoCapture(source)
+        else:
+            capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG)
     finally:
         cv2.utils.logging.setLogLevel(level)
     try:
@@ -208,5 +208,9 @@ def _capture(source: str | int, refused: str) -> Iterator[cv2.VideoCapture]:
 
 
 def _pixels(capture: cv2.VideoCapture) -> Iterator[np.ndarray]:
-    while (read := capture.read())[0]:
-        yield np.asarray(read[1])
+    """The images (H, W, 3) of a capture until it gives no more."""
+    while True:
+        is_read, pixels = capture.read()
+        if not is_read:
+            return
+        yield np.asarray(pixels)

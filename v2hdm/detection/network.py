@@ -35,16 +35,16 @@ _PROVIDERS: dict[str, tuple[str, dict[str, str]]] = {
 }
 
 _OVERLAP_PX = 64  # overlap of the two resolutions, so that either has its surroundings where they are joined
-_MOST_MULTIPLE = 1024  # px; images are padded to it, and an encoder halves them at most ten times
-_GRID_PX = 16  # the seam is on the grid of all outputs; the network's own multiple may be larger
+_MOST_MULTIPLE = 1024  # largest multiple of px that images are padded to: an encoder halves them ten times
+_GRID_PX = 16  # least grid, px, of the rows that the seam may be at: it is that of all outputs
 _MIRRORED = np.array([1.0, -1.0], dtype=np.float32)[:, None, None]
 """Factors of a lane output (2, h, w), log odds and offset, in the mirror."""
 
 _LEAST_LOG_ODDS = -3.0
 """Crossings of lanes' lines less likely than this are left out; unlikely ones help to follow a known line."""
 
-_MOST_ODDS = 6.0  # log odds beyond this differ by chance only
-_MOST_EXPONENT = 30.0
+_MOST_ODDS = 6.0  # log odds of paint beyond which they differ by chance only
+_MOST_EXPONENT = 30.0  # log odds beyond which a probability is the same: 1e-13 of 0 or 1
 
 
 def as_probability(odds: np.ndarray) -> np.ndarray:
@@ -64,8 +64,8 @@ class NetworkInfo:
     catalogue: Catalogue = SHIPPED
 
     @property
-    def strides(self) -> tuple[int, int, int]:
-        """Pixels per element of paint, kinds and lanes."""
+    def strides(self) -> tuple[int, ...]:
+        """Pixels per element of the three outputs: paint, kinds and lanes."""
         return self.paint_stride, self.kind_stride, self.lane_stride
 
 
@@ -106,15 +106,15 @@ class NetworkOutput:
 
     def odds_at(self, points_px: FloatArray) -> np.ndarray:
         """Log odds of paint, at most 6 either way, at recorded px (..., 2); outside, those of the border."""
-        (found,) = self._sample(self.paint[None], self.stride, points_px)
-        return np.asarray(np.clip(found, -_MOST_ODDS, _MOST_ODDS)).reshape(points_px.shape[:-1])
+        (odds,) = self._sample(self.paint[None], self.stride, points_px)
+        return np.asarray(np.clip(odds, -_MOST_ODDS, _MOST_ODDS)).reshape(points_px.shape[:-1])
 
     def shares_at(self, points_px: FloatArray) -> np.ndarray:
         """Probability of each of the classes, were it paint, at recorded px (M, ..., 2): (K, M, ...)."""
         odds = self._sample(self.kinds, self.stride * self.kind_scale, points_px)
         odds -= odds.max(axis=0)
         odds = np.asarray(cv2.exp(odds.reshape(len(odds), -1)))
-        return np.asarray(odds / odds.sum(axis=0)).reshape(len(odds), *points_px.shape[:-1])
+        return np.asarray(odds / odds.sum(axis=0)).reshape((len(odds), *points_px.shape[:-1]))
 
     def class_probability(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Probability (K, N) of each class at elements of ``paint``."""
@@ -133,10 +133,10 @@ class NetworkOutput:
         rows = len(points_px)
         u = ((points_px[..., 0] - middle) / stride).astype(np.float32).reshape(rows, -1)
         v = ((points_px[..., 1] - self.top - middle) / stride).astype(np.float32).reshape(rows, -1)
-        found = np.empty((len(planes), *u.shape), dtype=np.float32)
-        for plane, values in zip(planes, found, strict=True):
-            cv2.remap(plane, u, v, cv2.INTER_LINEAR, dst=values, borderMode=cv2.BORDER_REPLICATE)
-        return found
+        values = np.empty((len(planes), *u.shape), dtype=np.float32)
+        for plane, values_of_plane in zip(planes, values, strict=True):
+            cv2.remap(plane, u, v, cv2.INTER_LINEAR, dst=values_of_plane, borderMode=cv2.BORDER_REPLICATE)
+        return values
 
 
 class Network:
@@ -163,7 +163,7 @@ class Network:
                 f"{self.path}: the network failed on a {width}x{height} image ({_one_line(error)}); "
                 "export it again with dynamic sizes"
             ) from error
-        found = []
+        planes = []
         channels = (1, len(self.info.classes), 2)
         for name, output, count, stride in zip(_OUTPUTS, outputs, channels, self.info.strides, strict=True):
             expected = (1, count, padded.shape[0] // stride, padded.shape[1] // stride)
@@ -171,13 +171,13 @@ class Network:
                 raise DetectorError(
                     f"{self.path}: {name} is {output.shape} instead of {expected}; export it again"
                 )
-            found.append(np.asarray(output[0, :, : -(-height // stride), : -(-width // stride)]))
+            planes.append(np.asarray(output[0, :, : -(-height // stride), : -(-width // stride)]))
         # A sum meets every value: not-a-number among the weights of an output spreads over all of it.
-        if not all(np.isfinite(output[0].sum()) for output in found):
+        if not all(np.isfinite(output[0].sum()) for output in planes):
             raise DetectorError(
                 f"{self.path}: the network's outputs are not finite; export an earlier checkpoint"
             )
-        paint, kinds, lanes = found
+        paint, kinds, lanes = planes
         return RawOutput(paint[0], kinds, lanes)
 
 
@@ -196,13 +196,15 @@ def run_on_road(
         kinds = output.kinds
         anchors = anchor_rows(output.lanes, network, top, 1)
     else:
-        far = run(band[: seam + _OVERLAP_PX])
-        near_top = seam - _OVERLAP_PX
-        near = run(cv2.resize(band[near_top:], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
-        anchors = [r for r in anchor_rows(near.lanes, network, top + near_top, 2) if r.v_px >= top + seam]
-        anchors += [r for r in anchor_rows(far.lanes, network, top, 1) if r.v_px < top + seam]
-        paint = _joined(far.paint[None], near.paint[None], seam, near_top, info.paint_stride)[0]
-        kinds = _joined(far.kinds, near.kinds, seam, near_top, info.kind_stride)
+        fine = run(band[: seam + _OVERLAP_PX])
+        coarse_top = seam - _OVERLAP_PX
+        coarse = run(cv2.resize(band[coarse_top:], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+        coarse_rows = anchor_rows(coarse.lanes, network, top + coarse_top, 2)
+        fine_rows = anchor_rows(fine.lanes, network, top, 1)
+        anchors = [row for row in coarse_rows if row.v_px >= top + seam]
+        anchors += [row for row in fine_rows if row.v_px < top + seam]
+        paint = _joined(fine.paint[None], coarse.paint[None], seam, coarse_top, info.paint_stride)[0]
+        kinds = _joined(fine.kinds, coarse.kinds, seam, coarse_top, info.kind_stride)
     # Seen from the side a dash lies across the view, as a stop line does seen from the front, and the other
     # way round: the network knows of the view alone.
     if camera.aside and set(SEEN_ACROSS) <= set(info.classes):
@@ -216,17 +218,20 @@ def _run_twice(network: Network, image_bgr: np.ndarray) -> RawOutput:
     info = network.info
     # Only whole elements have mirror images on the same grid.
     padded = cv2.copyMakeBorder(image_bgr, 0, 0, 0, -width % info.multiple, cv2.BORDER_REPLICATE)
-    one = network.run(padded)
-    other = network.run(np.ascontiguousarray(padded[:, ::-1]))
-    paint = (one.paint + other.paint[:, ::-1]) / 2
-    kinds = (one.kinds + other.kinds[..., ::-1]) / 2
-    (odds, offset) = one.lanes
-    (odds_too, offset_too) = other.lanes[..., ::-1] * _MIRRORED
+    output = network.run(padded)
+    mirrored = network.run(np.ascontiguousarray(padded[:, ::-1]))
+    odds, offset = output.lanes
+    mirrored_odds, mirrored_offset = mirrored.lanes[..., ::-1] * _MIRRORED
     # Where a line crosses a cell only that output knows that sees it cross.
-    weight = as_probability(odds - odds_too)
-    lanes = np.stack([(odds + odds_too) / 2, weight * offset + (1 - weight) * offset_too])
-    columns = [-(-width // stride) for stride in info.strides]
-    return RawOutput(*(a[..., :n] for a, n in zip((paint, kinds, lanes), columns, strict=True)))
+    weight = as_probability(odds - mirrored_odds)
+    mean_odds = (odds + mirrored_odds) / 2
+    lanes = np.stack([mean_odds, weight * offset + (1 - weight) * mirrored_offset])
+    paint_columns, kind_columns, lane_columns = (-(-width // stride) for stride in info.strides)
+    return RawOutput(
+        paint=((output.paint + mirrored.paint[:, ::-1]) / 2)[..., :paint_columns],
+        kinds=((output.kinds + mirrored.kinds[..., ::-1]) / 2)[..., :kind_columns],
+        lanes=lanes[..., :lane_columns],
+    )
 
 
 def _seam_row(network: Network, camera: RoadCamera) -> int | None:
@@ -237,18 +242,18 @@ def _seam_row(network: Network, camera: RoadCamera) -> int | None:
         return None
     seam = -(-max(camera.fine_row - camera.far_row, 0) // grid) * grid
     seam += (height - seam) % (2 * grid)
-    worth = height - seam >= 3 * _OVERLAP_PX
-    return seam if worth and seam >= _OVERLAP_PX else None
+    is_worth_it = height - seam >= 3 * _OVERLAP_PX
+    return seam if is_worth_it and seam >= _OVERLAP_PX else None
 
 
-def _joined(far: np.ndarray, near: np.ndarray, seam: int, near_top: int, stride: int) -> np.ndarray:
-    """Planes (K, h, w), ``stride`` px per element: far ones above the seam, near ones, doubled, below it."""
+def _joined(fine: np.ndarray, coarse: np.ndarray, seam: int, coarse_top: int, stride: int) -> np.ndarray:
+    """Planes (K, h, w), ``stride`` px per element: fine ones above the seam, doubled coarse ones below it."""
     first = seam // stride
-    overlap = (seam - near_top) // stride
-    height = first - overlap + 2 * near.shape[1]
-    joined = np.empty((len(far), height, 2 * near.shape[2]), dtype=np.float32)
-    joined[:, :first] = far[:, :first]
-    for whole, plane in zip(joined, near, strict=True):
+    overlap = (seam - coarse_top) // stride
+    height = first - overlap + 2 * coarse.shape[1]
+    joined = np.empty((len(fine), height, 2 * coarse.shape[2]), dtype=np.float32)
+    joined[:, :first] = fine[:, :first]
+    for whole, plane in zip(joined, coarse, strict=True):
         doubled = cv2.resize(plane, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
         whole[first:] = doubled[overlap:]
     return joined
@@ -267,10 +272,10 @@ def anchor_rows(lanes: np.ndarray, network: Network, top_px: int, scale: int) ->
     # Pixel p of the reduced image is centred on scale * p + (scale - 1) / 2 of the image.
     u = scale * u + (scale - 1) / 2
     v = scale * v + (scale - 1) / 2 + top_px
-    found = odds[i, j].astype(np.float64)
+    peak_odds = odds[i, j].astype(np.float64)
     bounds = np.searchsorted(i, np.arange(len(odds) + 1))
     return [
-        AnchorRow(float(v[row]), u[part], found[part])
+        AnchorRow(float(v[row]), u[part], peak_odds[part])
         for row in range(len(odds) - 1, -1, -1)
         if (part := slice(bounds[row], bounds[row + 1])).stop > part.start
     ]
@@ -278,9 +283,10 @@ def anchor_rows(lanes: np.ndarray, network: Network, top_px: int, scale: int) ->
 
 def crossings(rows: Sequence[AnchorRow]) -> tuple[FloatArray, FloatArray]:
     """Crossings (N, 2), px, of all ``rows`` in order, and their log odds (N,)."""
-    u_px, odds = ([np.empty(0), *(getattr(row, name) for row in rows)] for name in ("u_px", "odds"))
-    v_px = [np.empty(0), *(np.full(len(row.u_px), row.v_px) for row in rows)]
-    return np.column_stack([np.concatenate(u_px), np.concatenate(v_px)]), np.concatenate(odds)
+    none = np.empty(0)
+    u_px = np.concatenate([none, *(row.u_px for row in rows)])
+    v_px = np.concatenate([none, *(np.full(len(row.u_px), row.v_px) for row in rows)])
+    return np.column_stack([u_px, v_px]), np.concatenate([none, *(row.odds for row in rows)])
 
 
 def check_device(device: str) -> None:
@@ -345,8 +351,8 @@ def _read_info(session: Any, path: Path) -> NetworkInfo:
     names = ([node.name for node in session.get_inputs()], [node.name for node in session.get_outputs()])
     channels = session.get_outputs()[1].shape[1:2] if len(session.get_outputs()) > 1 else []
     if unknown or not info.classes:
-        known = ", ".join(info.catalogue.names)
-        problem = f"unknown classes {unknown}, known are {known}; use another model"
+        names_known = ", ".join(info.catalogue.names)
+        problem = f"unknown classes {unknown}, known are {names_known}; use another model"
     elif len(set(info.classes)) < len(info.classes) or any(
         isinstance(count, int) and count != len(info.classes) for count in channels
     ):

@@ -44,10 +44,11 @@ from v2hdm.records import (
 
 _LANE_SIGMA_PX = 1.0  # standard deviation of a point of a lane's paint; points of whole lines have their own
 
-_PX_DIGITS = 3
-_PX2_DIGITS = 5
-_M_DIGITS = 4
+_PX_DIGITS = 3  # decimals of px in JSON
+_PX2_DIGITS = 5  # decimals of px^2 in JSON
+_M_DIGITS = 4  # decimals of m in JSON
 
+# Colours of the classes in a drawing.
 _COLOUR_BGR = {
     DIAMOND: (60, 200, 60),
     LANE_DASH: (240, 160, 40),
@@ -58,13 +59,14 @@ _COLOUR_BGR = {
     CROSSWALK_BAR: (230, 230, 90),
     CHEVRON: (160, 220, 160),
 }
-_OTHER_BGR = (200, 200, 200)
-_INVALID_BGR = (60, 60, 230)
-_SHIFT = 4
-_FAR_PX = 30000.0
-_TEXT_SCALE = 0.45
-_LEAST_TEXT_SCALE = 0.35
-_FULL_WIDTH_PX = 1280
+_OTHER_BGR = (200, 200, 200)  # colour of all other classes
+_INVALID_BGR = (60, 60, 230)  # colour of corners that are not valid
+_SHIFT = 4  # bits after the point of the numbers that OpenCV draws at
+_FAR_PX = 30000.0  # largest coordinate that is drawn, px: OpenCV's numbers have 32 bits
+
+_TEXT_SCALE = 0.45  # OpenCV's scale of a text in an image of full width
+_LEAST_TEXT_SCALE = 0.35  # scale of a text in the smallest images
+_FULL_WIDTH_PX = 1280  # width of an image, px, from which texts grow no more
 
 
 @dataclass(frozen=True)
@@ -147,6 +149,7 @@ class RoadDetector:
             return self._on_ground(markings, lanes)
 
     def _on_ground(self, markings: Sequence[MarkingDetection], lanes: Sequence[LaneDetection]) -> Road:
+        """The detections with their places on the ground, if the camera is calibrated."""
         none = np.empty((0, 2))
         if self.calibration is None:
             return Road(
@@ -159,7 +162,8 @@ class RoadDetector:
         ground = camera.footprint(np.concatenate([none, *shapes_px]), self.calibration)
         ends = np.cumsum([0, *map(len, shapes_px)])
         parts = [ground[begin:end] for begin, end in pairwise(ends.tolist())]
-        return Road(tuple(map(_marking, markings, parts)), tuple(map(_lane, lanes, parts[len(markings) :])))
+        road_markings = tuple(map(_marking, markings, parts))
+        return Road(road_markings, tuple(map(_lane, lanes, parts[len(markings) :])))
 
 
 def _marking(image: MarkingDetection, ground: GroundPoints) -> RoadMarking:
@@ -257,13 +261,13 @@ def draw_detections(
 def _write(canvas: np.ndarray, text: str, at_px: FloatArray, colour: tuple[int, int, int]) -> None:
     """Text to the right of a point, with a shadow so that it shows on paint."""
     scale = max(_LEAST_TEXT_SCALE, _TEXT_SCALE * min(1.0, canvas.shape[1] / _FULL_WIDTH_PX))
-    u, v = (int(c) for c in np.clip(np.nan_to_num(at_px), -_FAR_PX, _FAR_PX))
+    u, v = (int(coordinate) for coordinate in np.clip(np.nan_to_num(at_px), -_FAR_PX, _FAR_PX))
     for shift, tone in ((1, (0, 0, 0)), (0, colour)):
-        at = (u + 6 + shift, v + 4 + shift)
-        cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, scale, tone, 1, cv2.LINE_AA)
+        origin = (u + 6 + shift, v + 4 + shift)
+        cv2.putText(canvas, text, origin, cv2.FONT_HERSHEY_SIMPLEX, scale, tone, 1, cv2.LINE_AA)
 
 
 def _fixed(points_px: FloatArray) -> np.ndarray:
     """Points as OpenCV's fixed-point integers."""
-    near = np.clip(np.nan_to_num(points_px), -_FAR_PX, _FAR_PX)
-    return np.asarray(np.round(near * (1 << _SHIFT)).astype(np.int32))
+    clipped_px = np.clip(np.nan_to_num(points_px), -_FAR_PX, _FAR_PX)
+    return np.asarray(np.round(clipped_px * (1 << _SHIFT)).astype(np.int32))

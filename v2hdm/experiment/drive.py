@@ -27,7 +27,7 @@ from v2hdm.progress import Progress
 from v2hdm.records import DIAMOND, Drive, FloatArray, HDMap, IntArray, Marking, Truth
 from v2hdm.report.metrics import corner_errors, driven_past, marking_metrics, match_markings, rms
 from v2hdm.report.terminal import METHODS
-from v2hdm.simulate import rendered_drive
+from v2hdm.simulate.port.drive import rendered_drive
 from v2hdm.store.cache import StageCache
 from v2hdm.survey.run import take_survey
 

@@ -6,14 +6,14 @@ from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError
 from v2hdm.mapping.options import INCREMENTAL, MappingOptions, check_options
 from v2hdm.pipeline.config import DriveConfig
-from v2hdm.simulate import PortConfig
+from v2hdm.simulate.port.config import PortConfig
 from v2hdm.store.files import refuse_url
 
 OURS = "ours"
@@ -35,36 +35,31 @@ class Site:
     """
 
     name: str | None = None
-    mosaic: bool = False
-    simulate: PortConfig | None = None
+    mosaic: Annotated[bool, "mosaic has no effect: only v2hdm map makes one."] = False
+    simulate: Annotated[PortConfig | None, "rendered once per seed."] = None
     drive: DriveConfig = field(default_factory=DriveConfig)
 
 
 @dataclass(kw_only=True)
 class ExperimentConfig:
-    """Everything about one experiment.
+    """Everything about one experiment."""
 
-    Attributes:
-        ports: the ports and drives to map, by name.
-        seeds: seeds of the rendered ports; each gives a different port, drive and calibration.
-        recipes: recipes to run, besides ``ours``: ``paper`` and ``incremental`` (:data:`RECIPES`).
-        detector: settings of the detector.
-        mapping: settings of the mapping.
-        name: name of the results folder, ``<output>/<name>/``.
-        output: folder for the results.
-        cache: folder for rendered drives and the results of each stage.
-        workers: number of processes, each of which maps one drive at a time; 0 for one per core.
-    """
-
-    ports: dict[str, Site] = field(default_factory=dict)
-    seeds: list[int] = field(default_factory=lambda: [1, 2, 3, 4, 5])
-    recipes: list[str] = field(default_factory=lambda: [OURS, PAPER, INCREMENTAL])
+    ports: Annotated[dict[str, Site], "the ports and drives to map, by name."] = field(default_factory=dict)
+    seeds: Annotated[
+        list[int], "seeds of the rendered ports; each gives a different port, drive and calibration."
+    ] = field(default_factory=lambda: [1, 2, 3, 4, 5])
+    recipes: Annotated[list[str], "recipes to run, besides ours: paper and incremental (RECIPES)."] = field(
+        default_factory=lambda: [OURS, PAPER, INCREMENTAL]
+    )
     detector: DetectorOptions = field(default_factory=DetectorOptions.for_mapping)
     mapping: MappingOptions = field(default_factory=MappingOptions)
-    name: str = "experiment"
-    output: str = "outputs"
-    cache: str = "cache"
-    workers: int = 0
+    name: Annotated[str, "name of the results folder, <output>/<name>/."] = "experiment"
+    output: Annotated[str, "folder for the results."] = "outputs"
+    cache: Annotated[str, "folder for rendered drives and the results of each stage."] = "cache"
+    device: Annotated[str, "where the adjustment runs, cpu or cuda."] = "cpu"
+    workers: Annotated[
+        int, "number of processes, each of which maps one drive at a time; 0 for one per core."
+    ] = 0
 
 
 @dataclass(frozen=True)
@@ -91,7 +86,9 @@ def jobs(config: ExperimentConfig) -> list[Job]:
         OURS: {}, PAPER: {"pose_model": "paper", "loss": "none"}, INCREMENTAL: {"mode": INCREMENTAL}
     }  # fmt: skip
     recipes = dict.fromkeys([OURS, *config.recipes])
-    options = {name: replace(deepcopy(config.mapping), **changed[name]) for name in recipes}
+    options = {
+        name: replace(deepcopy(config.mapping), device=config.device, **changed[name]) for name in recipes
+    }
     found: list[tuple[str, int | None, Site]] = []
     for seed in config.seeds:
         for port, site in config.ports.items():

@@ -13,14 +13,16 @@ from rich.console import Console
 
 from v2hdm.errors import ConfigError, WorkerError
 from v2hdm.experiment.drive import Measured, drive_record, measure
+from v2hdm.experiment.paper import load_paper
 from v2hdm.experiment.plan import ExperimentConfig, Job, jobs
-from v2hdm.experiment.summary import claims, filled, save_figures, words, write_tables
 from v2hdm.progress import patient
 from v2hdm.report.terminal import DriveProgress, drive_bars, plain
 from v2hdm.store.files import replace_text
+from v2hdm.store.names import CONFIG
 from v2hdm.store.results import growing_folder
 from v2hdm.workers import side_by_side
 
+_paper = load_paper()
 _OPTION = "output="
 _MADE = "v2hdm experiment"
 
@@ -33,13 +35,13 @@ def run_experiment(
     folder = Path(config.output) / config.name
     try:
         with growing_folder(folder, _OPTION, _MADE):
-            replace_text(folder / "config.yaml", config_yaml or f"{config!r}\n")
+            replace_text(folder / CONFIG, config_yaml or f"{config!r}\n")
             records = _records(todo, config.workers or os.cpu_count() or 1, progress)
             measured = [measure(record) for record in records]
-            captions = save_figures(folder, records, measured, partial(progress, "figures", "draw"))
-            write_tables(folder, measured)
-            replace_text(folder / "experiment.md", words(measured, config))
-            replace_text(folder / "figures.md", filled("figures.md", captions=captions))
+            captions = _paper.save_figures(folder, records, measured, partial(progress, "figures", "draw"))
+            _paper.write_tables(folder, measured)
+            replace_text(folder / "experiment.md", _paper.words(measured, config))
+            replace_text(folder / "figures.md", _paper.filled("figures.md", captions=captions))
     except OSError as failure:
         raise ConfigError(f"{folder}: cannot be written ({failure.strerror}); set output=") from failure
     return folder, measured
@@ -63,7 +65,7 @@ def experiment_on_terminal(config: ExperimentConfig, config_yaml: str) -> None:
     console = Console(file=patient(sys.stdout))
     with drive_bars(console) as progress:
         folder, measured = run_experiment(config, config_yaml, progress)
-    tested = claims(measured)
+    tested = _paper.claims(measured)
     for claim in tested:
         if not claim.holds:
             difference = f"{claim.where}: {claim.text} is {claim.figure}, expected {claim.limit}"

@@ -1,8 +1,6 @@
 """Faults of the inputs: what each is, its score test at a solution, its odds, and what corrects it."""
 
-from v2hdm.faults.score_tests import CHANGES, Fault, ScoreTest, score_faults, sigmas_of
-from v2hdm.faults.sensitivity import height_information, moves_with_heights
+from v2hdm.faults.score import Contradiction, ScoreTest, sigmas_of
+from v2hdm.faults.table import FAULTS, Fault, Item, Recovery
 
-__all__ = [
-    "CHANGES", "Fault", "ScoreTest", "height_information", "moves_with_heights", "score_faults", "sigmas_of",
-]  # fmt: skip
+__all__ = ["FAULTS", "Contradiction", "Fault", "Item", "Recovery", "ScoreTest", "sigmas_of"]

@@ -19,9 +19,11 @@ from v2hdm.adjust.whitening import Whitening
 from v2hdm.geometry.tensors import NEAR_M
 from v2hdm.records import FloatArray, IntArray
 
-_STEP = 1e-3  # of the priors' central differences, in the fault's unit (s or rad): millimetres of motion
-STRETCHES = 24  # segments of the route: metres each, longer than the correlation of most errors
-_DRAWS = 16  # draws of the model's noise: they give the expected disagreement to a tenth
+_STEP = (
+    1e-3  # step of the central differences of priors, in the fault's unit (s or rad): millimetres of motion
+)
+STRETCHES = 24  # segments of a session's route: metres each, longer than the correlation of most errors
+_DRAWS = 16  # draws of the model's noise, which give the expected disagreement to a tenth
 _AT_ONCE = 64  # columns whose gradients are in memory at a time
 
 Rows = dict[str, Tensor]
@@ -65,7 +67,7 @@ class Sensitivity:
 
         residuals = self.residuals.items()
         drawn = [self.efficient({name: like(row) for name, row in residuals}) for _ in range(_DRAWS)]
-        return np.stack([self.flat(one) for one in drawn], axis=1)
+        return np.stack([self.flat(rows) for rows in drawn], axis=1)
 
     @property
     def camera(self) -> Tensor:
@@ -116,50 +118,68 @@ class Sensitivity:
         """Derivatives of all residuals along a whitened step of the unknowns."""
         base = self.whitening.estimate
         arrays = self.arrays
-        _, tangents, _ = self.whitening.step(whitened)
+        step, tangents, whitened_corners = self.whitening.step(whitened)
         # Derivatives are linear, poses are not: take a step that moves no pair by more than 1 m or rad.
         size = max(float(tangents.abs().max()), 1.0)
-        step, tangents, own = self.whitening.step(whitened / size)
+        if size > 1:
+            step, tangents, whitened_corners = self.whitening.step(whitened / size)
         # Corners move in proportion to the step: a whole step gives their derivative.
-        at = self.whitening.linearised.evaluate(step, tangents, own).estimate
-        corners = at.corners_map - base.corners_map
+        stepped = self.whitening.linearised.evaluate(step, tangents, whitened_corners).estimate
+        corners = stepped.corners_map - base.corners_map
         along = (self.poses[:, :3, :2] @ corners[arrays.corner.long(), :, None])[..., 0]
-        high, low = (
-            _rows(
-                arrays,
-                Estimate(
-                    rigid(by * step.extrinsic) @ base.cam_from_vehicle,
-                    base.frame_state + by * step.frame_state,
-                    base.corners_map + by * corners,
-                    base.clock_s + by * step.clock_s,
-                ),
+
+        def priors_after(share: float, motion: Tensor) -> Rows:
+            moved = Estimate(
+                motion @ base.cam_from_vehicle,
+                base.frame_state + share * step.frame_state,
+                base.corners_map + share * corners,
+                base.clock_s + share * step.clock_s,
             )
-            for by in (_STEP, -_STEP)
-        )
+            return _rows(arrays, moved)
+
+        forth, back = rigid(torch.stack([_STEP * step.extrinsic, -_STEP * step.extrinsic]))
+        high = priors_after(_STEP, forth)
+        low = priors_after(-_STEP, back)
         moved = {name: size * (row - low[name]) / (2 * _STEP) for name, row in high.items()}
         moved["observations"] = size * self.seen(self.turned(tangents) + along)
         return moved
 
-    def _coupling(self, column: Rows) -> Tensor:
-        """N_yp: inner products of the column with the whitened unknowns."""
-        engine = self.whitening.engine
+    @cached_property
+    def _priors(self) -> tuple[dict[str, Tensor], Rows]:
+        """The unknowns as leaves of a graph, by the names of :class:`Gradient`, and the priors' residuals."""
         estimate = self.whitening.estimate
         tangent = estimate.cam_from_vehicle.new_zeros(len(estimate.cam_from_vehicle), 6)
-        at = (tangent, estimate.frame_state, estimate.corners_map, estimate.clock_s)
-        leaves = [one.clone().requires_grad_() for one in at]
-        moved = Estimate(rigid(leaves[0]) @ estimate.cam_from_vehicle, *leaves[1:])
+        variables = {
+            "extrinsic": tangent,
+            "frame_state": estimate.frame_state,
+            "corners_map": estimate.corners_map,
+            "clock_s": estimate.clock_s,
+        }
+        leaves = {name: variable.clone().requires_grad_() for name, variable in variables.items()}
+        moved = Estimate(
+            rigid(leaves["extrinsic"]) @ estimate.cam_from_vehicle,
+            leaves["frame_state"],
+            leaves["corners_map"],
+            leaves["clock_s"],
+        )
+        return leaves, _rows(self.whitening.engine.arrays, moved)
+
+    def _coupling(self, column: Rows) -> Tensor:
+        """N_yp: inner products of the column with the whitened unknowns."""
+        leaves, priors = self._priors
         of_priors = [name for name in column if name != "observations"]
-        gradient = Gradient(*(torch.zeros_like(one) for one in at))
+        by_variable = {name: torch.zeros_like(leaf) for name, leaf in leaves.items()}
         if of_priors:
-            priors = _rows(engine.arrays, moved)
             ends = [priors[name] for name in of_priors]
-            by = [column[name] for name in of_priors]
-            gradient = Gradient(*torch.autograd.grad(ends, leaves, by, materialize_grads=True))
+            along = [column[name] for name in of_priors]
+            slopes = torch.autograd.grad(
+                ends, list(leaves.values()), along, retain_graph=True, materialize_grads=True
+            )
+            by_variable = dict(zip(leaves, slopes, strict=True))
         if "observations" in column:
-            seen = self.whitening.pull(column["observations"] * self.root)
-            pairs = zip(vars(gradient).values(), vars(seen).values(), strict=True)
-            gradient = Gradient(*(one + other for one, other in pairs))
-        return self.whitening.whiten([gradient])[0]
+            of_observations = vars(self.whitening.pull(column["observations"] * self.root))
+            by_variable = {name: slope + of_observations[name] for name, slope in by_variable.items()}
+        return self.whitening.whiten([Gradient(**by_variable)])[0]
 
     def flat(self, rows: Rows) -> FloatArray:
         """All residuals, or derivatives, concatenated, (R,)."""
@@ -176,11 +196,11 @@ class Sensitivity:
         order = np.argsort(stretch, kind="stable")
         return order, np.searchsorted(stretch[order], np.arange(count + 2))
 
-    def by_stretch(self, one: FloatArray, others: FloatArray) -> FloatArray:
+    def by_stretch(self, column: FloatArray, others: FloatArray) -> FloatArray:
         """Products (G + 1, ...) of a column (R,) and others (R, ...) by segment; last, priors of none."""
         order, begin = self._stretch_of
-        shape = len(begin) - 1, len(one)
-        return np.asarray(csr_array((one[order], order, begin), shape=shape) @ others)
+        shape = len(begin) - 1, len(column)
+        return np.asarray(csr_array((column[order], order, begin), shape=shape) @ others)
 
 
 def _rows(arrays: Arrays, estimate: Estimate, observations: Tensor | None = None) -> Rows:
@@ -196,10 +216,10 @@ def stretches(arrays: Arrays) -> Tensor:
     out = torch.zeros_like(arrays.session)
     count = 0
     for session in range(int(arrays.session.max()) + 1):
-        own = arrays.session == session
-        along = path[own] - path[own].min()
+        is_in_session = arrays.session == session
+        along = path[is_in_session] - path[is_in_session].min()
         share = along / along.max().clamp(min=1e-9)
-        out[own] = count + (share * STRETCHES).long().clamp(max=STRETCHES - 1)
+        out[is_in_session] = count + (share * STRETCHES).long().clamp(max=STRETCHES - 1)
         count += STRETCHES
     stretch: Tensor = torch.unique(out, return_inverse=True)[1]
     return stretch
@@ -220,17 +240,17 @@ def height_information(solution: Solution, heights: Any) -> tuple[FloatArray, Fl
     columns = heights[solved.arrays.order.cpu().numpy()]
     squared = unit.square().sum(0).cpu().numpy()
     information = (columns.T @ (columns.multiply(squared[:, None]))).toarray()
-    seen = np.flatnonzero(information.diagonal() > 0)
-    by_column = columns[:, seen].tocsc()
-    coupled = solved.root.new_zeros(len(seen), solved.whitening.size)
+    observed = np.flatnonzero(information.diagonal() > 0)
+    by_column = columns[:, observed].tocsc()
+    coupled = solved.root.new_zeros(len(observed), solved.whitening.size)
     weighted = unit * solved.root
-    for begin in range(0, len(seen), _AT_ONCE):
+    for begin in range(0, len(observed), _AT_ONCE):
         lifted = torch.as_tensor(by_column[:, begin : begin + _AT_ONCE].toarray().T).to(unit)
-        pulled = [solved.whitening.pull(weighted * one) for one in lifted]
+        pulled = [solved.whitening.pull(weighted * height_m) for height_m in lifted]
         coupled[begin : begin + _AT_ONCE] = solved.whitening.whiten(pulled)
-    information[np.ix_(seen, seen)] -= (coupled @ coupled.mT).cpu().numpy()
+    information[np.ix_(observed, observed)] -= (coupled @ coupled.mT).cpu().numpy()
     gradient = columns.T @ (unit * solved.residuals["observations"]).sum(0).cpu().numpy()
-    gradient[seen] -= (coupled @ solved.whitening.gradient).cpu().numpy()
+    gradient[observed] -= (coupled @ solved.whitening.gradient).cpu().numpy()
     return information, gradient
 
 
@@ -245,9 +265,9 @@ def moves_with_heights(solution: Solution, heights: FloatArray) -> Moves:
     poses = []
     for column in torch.as_tensor(heights[arrays.order.cpu().numpy()].T).to(weighted):
         whitened = whitening.whiten([whitening.pull(weighted * column)])[0]
-        step, tangents, own = whitening.step(whitened)
-        at = whitening.linearised.evaluate(step, tangents, own).estimate
-        corners.append(whitening.estimate.corners_map - at.corners_map)
+        step, tangents, whitened_corners = whitening.step(whitened)
+        stepped = whitening.linearised.evaluate(step, tangents, whitened_corners).estimate
+        corners.append(whitening.estimate.corners_map - stepped.corners_map)
         extrinsic.append(-step.extrinsic)
         poses.append(-step.frame_state)
     of_corners = np.empty((*whitening.estimate.corners_map.shape, len(corners)))

@@ -15,11 +15,14 @@ import numpy as np
 from v2hdm.errors import MapFileError, V2hdmError, need
 from v2hdm.records import FloatArray, GeodeticOrigin
 
-_SEMI_MAJOR_M = 6378137.0
-_FLATTENING = 1 / 298.257223563  # of WGS84
-_ECCENTRICITY2 = _FLATTENING * (2 - _FLATTENING)
-_SAME_ELLIPSOID_M = 1e-3  # GRS80's semi-minor axis is 0.1 mm longer than WGS84's
-_CONFORMAL_DEG = 1e-3  # tolerance of a conformal grid's angles, for rounding
+_SEMI_MAJOR_M = 6378137.0  # semi-major axis, m, of the ellipsoid WGS84 (NGA.STND.0036)
+_FLATTENING = 1 / 298.257223563  # flattening of the ellipsoid WGS84 (NGA.STND.0036)
+_ECCENTRICITY2 = _FLATTENING * (2 - _FLATTENING)  # square of the first eccentricity of WGS84
+
+_SAME_ELLIPSOID_M = (
+    1e-3  # difference, m, of axes of one ellipsoid: GRS80's semi-minor is 0.1 mm longer than WGS84's
+)
+_CONFORMAL_DEG = 1e-3  # tolerance, deg, of a conformal grid's angles, for rounding
 
 
 def geodetic_from_enu(origin: GeodeticOrigin, points_map: FloatArray) -> FloatArray:
@@ -61,9 +64,9 @@ def geodetic_from_grid(crs: str, points: FloatArray, where: str, error: type[V2h
 
 
 LOCAL = "local"  # name of the map's own frame as a coordinate system
-_GRID_DECIMALS = 4
-_DEGREE_DECIMALS = 9  # 0.1 mm on the ground
-_BESIDE_DEG = 1.0  # a zone's grid is in use a little beyond its edges
+_GRID_DECIMALS = 4  # decimals of a coordinate in metres: 0.1 mm
+_DEGREE_DECIMALS = 9  # decimals of a latitude or longitude in degrees: 0.1 mm on the ground
+_BESIDE_DEG = 1.0  # longitude, deg, by which a zone's grid is in use beyond its edges
 
 
 @dataclass(frozen=True)

@@ -145,7 +145,8 @@ def mounting_angles(cam_from_vehicle: FloatArray) -> FloatArray:
 
 def cam_from_mounting(xyz_m: FloatArray, angles_rad: FloatArray) -> FloatArray:
     """``cam_from_vehicle`` (4, 4) of a camera with centre ``xyz_m`` (3,) and :func:`mounting_angles` (3,)."""
-    turn = rotation_from_euler(*np.asarray(angles_rad)[:, None])[0]
+    roll_rad, pitch_rad, yaw_rad = np.asarray(angles_rad)[:, None]
+    turn = rotation_from_euler(roll_rad, pitch_rad, yaw_rad)[0]
     return inverse(make_transform(turn @ LEVEL, xyz_m))
 
 

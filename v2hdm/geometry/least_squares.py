@@ -90,29 +90,29 @@ def gauss_newton(
     last = linearise(x0)
     damped = damping
     step = np.zeros(len(last.gradient))
-    taken = 0
-    while taken < steps:
+    step_count = 0
+    while step_count < steps:
         if not (np.isfinite(last.gradient).all() and np.isfinite(last.information).all()):
-            return Fit(x, last, np.full(len(last.gradient), np.nan), False, taken)
+            return Fit(x, last, np.full(len(last.gradient), np.nan), False, step_count)
         step = solve_normal(last, damped)
         step = step if limit is None else limit(step)
         moved = move(x, step)
-        taken = taken + 1
+        step_count = step_count + 1
         in_sigmas = np.abs(step) * np.sqrt(np.diag(last.information))
         if settled(step) if settled else np.max(in_sigmas, initial=0.0) < tolerance:
-            return Fit(moved, last, step, True, taken)
-        if damping == 0 and taken == steps:
-            return Fit(moved, last, step, False, taken)
+            return Fit(moved, last, step, True, step_count)
+        if damping == 0 and step_count == steps:
+            return Fit(moved, last, step, False, step_count)
         after = linearise(moved)
         if damping > 0 and not after.cost <= last.cost:
             if damped > _GIVE_UP:
-                return Fit(x, last, np.zeros(len(step)), True, taken)
+                return Fit(x, last, np.zeros(len(step)), True, step_count)
             damped *= 10.0
         else:
             x = moved
             last = after
             damped = damped / 10.0
-    return Fit(x, last, step, False, taken)
+    return Fit(x, last, step, False, step_count)
 
 
 def solve_normal(equations: Normal, damping: float = 0.0) -> FloatArray:

@@ -64,11 +64,10 @@ def is_simple(polygon: FloatArray) -> bool:
     """Whether no two sides of a polygon (N, 2) cross each other."""
     ends = np.roll(polygon, -1, axis=0)
     side = ends - polygon
-    apart = polygon[:, None] - polygon
-    beyond = ends[:, None] - polygon
+    begin_offset = polygon[:, None] - polygon
+    end_offset = ends[:, None] - polygon
     # Signed areas (N, N) of the ends of side i beside side j: of opposite signs where i crosses j's line.
-    begin, end = (cross(one, side) for one in (apart, beyond))
-    crosses = begin * end < 0
+    crosses = cross(begin_offset, side) * cross(end_offset, side) < 0
     return not (crosses & crosses.T).any()
 
 
@@ -87,15 +86,15 @@ def clip_convex(polygon: FloatArray, window: FloatArray) -> FloatArray:
 
 def clip_half(polygon: FloatArray, depth: FloatArray) -> FloatArray:
     """The part of a polygon (N, D) where ``depth`` (N,), linear in its plane, is not negative."""
-    kept: list[FloatArray] = []
+    vertices: list[FloatArray] = []
     for k in range(len(polygon)):
         before = k - 1
         if (depth[k] >= 0) != (depth[before] >= 0):
             part = depth[before] / (depth[before] - depth[k])
-            kept.append(polygon[before] + part * (polygon[k] - polygon[before]))
+            vertices.append(polygon[before] + part * (polygon[k] - polygon[before]))
         if depth[k] >= 0:
-            kept.append(polygon[k])
-    return np.array(kept).reshape(-1, polygon.shape[1])
+            vertices.append(polygon[k])
+    return np.array(vertices).reshape(-1, polygon.shape[1])
 
 
 def densified(polygon: FloatArray, pieces: int) -> FloatArray:
@@ -127,23 +126,24 @@ def wrapped(angle_rad: FloatArray) -> FloatArray:
 
 def rectangle_size(points: FloatArray) -> tuple[float, float]:
     """Length and width of the smallest rectangle around points (N, 2); nan for fewer than three finite."""
-    seen = points[np.isfinite(points[:, 0])]
-    if len(seen) < 3:
+    finite = points[np.isfinite(points[:, 0])]
+    if len(finite) < 3:
         return float("nan"), float("nan")
-    _, size, _ = cv2.minAreaRect(seen.astype(np.float32))
+    _, size, _ = cv2.minAreaRect(finite.astype(np.float32))
     return float(max(size)), float(min(size))
 
 
 # Much faster than np.roll, which the fit of a few markings would call very often.
-_NEXT = np.array([1, 2, 3, 0])
-_LAST = np.array([3, 0, 1, 2])
-_TURN = np.array([-1.0, 1.0])
+_NEXT = np.array([1, 2, 3, 0])  # index of the corner that follows each of four
+_LAST = np.array([3, 0, 1, 2])  # index of the corner before each of four
 
-_CORNER = np.arange(4)
+_TURN = np.array([-1.0, 1.0])  # signs that turn a swapped direction (y, x) into its normal (-y, x)
+
+_CORNER = np.arange(4)  # indices of four corners
 SHIFTS = (_CORNER[:, None] + _CORNER[None, :]) % 4
 """Row s lists, for corner c of one quadrilateral, corner (c + s) mod 4 of the other."""
 
-_LEAST_SINE = 1e-3  # of the angle between adjacent sides; parallel ones do not intersect
+_LEAST_SINE = 1e-3  # least sine of the angle between adjacent sides; parallel ones do not intersect
 # A corner starts its own side and ends the one before: the index of that end among the side moves.
 _END = 4 + (_CORNER - 1) % 4
 
@@ -155,23 +155,23 @@ class Quad:
     corners: FloatArray
 
     @cached_property
-    def _sides(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _sides(self) -> SideFrames:
         return side_frames(self.corners)
 
     @property
     def tangent(self) -> FloatArray:
         """Unit direction (..., 4, 2) of each side."""
-        return self._sides[0]
+        return self._sides.tangent
 
     @property
     def normal(self) -> FloatArray:
         """Unit normal (..., 4, 2) of each side."""
-        return self._sides[1]
+        return self._sides.normal
 
     @property
     def length(self) -> FloatArray:
         """Length (..., 4) of each side."""
-        return self._sides[2]
+        return self._sides.length
 
     @cached_property
     def area(self) -> FloatArray:
@@ -252,12 +252,20 @@ def following(values: np.ndarray, axis: int = -2) -> np.ndarray:
     return np.asarray(values.take(_NEXT, axis=axis))
 
 
-def side_frames(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Tangent t (..., 4, 2), normal (-t_y, t_x) (..., 4, 2) and length (..., 4) of each side."""
+class SideFrames(NamedTuple):
+    """The sides of quadrilaterals, each from its corner to the next."""
+
+    tangent: FloatArray  # (..., 4, 2) unit direction t
+    normal: FloatArray  # (..., 4, 2) unit normal (-t_y, t_x)
+    length: FloatArray  # (..., 4)
+
+
+def side_frames(corners: FloatArray) -> SideFrames:
+    """The frames of the sides of quadrilaterals (..., 4, 2)."""
     along = following(corners) - corners
     length = np.hypot(along[..., 0], along[..., 1])
     tangent = along / np.maximum(length, 1e-9)[..., None]
-    return tangent, tangent[..., ::-1] * _TURN, length
+    return SideFrames(tangent, tangent[..., ::-1] * _TURN, length)
 
 
 def is_convex(corners_map: FloatArray) -> BoolArray:
@@ -272,9 +280,9 @@ def is_convex_px(corners_px: FloatArray) -> BoolArray:
 
 def align(a: FloatArray, valid_a: BoolArray, b: FloatArray, valid_b: BoolArray) -> Alignment:
     """Align ``b`` (..., 4, 2) to ``a`` by the cyclic shift that brings the common valid corners nearest."""
-    both = valid_a[..., None, :] & valid_b[..., SHIFTS]
-    difference = np.where(both[..., None], b[..., SHIFTS, :] - a[..., None, :, :], 0.0)
-    common = both.sum(axis=-1)
+    is_common = valid_a[..., None, :] & valid_b[..., SHIFTS]
+    difference = np.where(is_common[..., None], b[..., SHIFTS, :] - a[..., None, :, :], 0.0)
+    common = is_common.sum(axis=-1)
     count = np.maximum(common, 1)
     squared = np.sum(difference**2, axis=(-1, -2)) / count
     shift = np.argmin(np.where(common >= 2, squared, np.inf), axis=-1)
@@ -282,8 +290,9 @@ def align(a: FloatArray, valid_a: BoolArray, b: FloatArray, valid_b: BoolArray) 
     mean = difference.sum(axis=-2) / count[..., None]
     offset = np.take_along_axis(mean, chosen[..., None], axis=-2)[..., 0, :]
     deviation = np.linalg.norm(difference - mean[..., None, :], axis=-1)
-    worst = np.max(np.where(both, deviation, 0.0), axis=-1)
-    common, worst = (np.take_along_axis(each, chosen, axis=-1)[..., 0] for each in (common, worst))
+    worst = np.max(np.where(is_common, deviation, 0.0), axis=-1)
+    common = np.take_along_axis(common, chosen, axis=-1)[..., 0]
+    worst = np.take_along_axis(worst, chosen, axis=-1)[..., 0]
     return Alignment(shift, offset, np.where(common >= 2, worst, np.inf))
 
 
@@ -291,8 +300,8 @@ def diameters(corners: FloatArray, valid: BoolArray) -> FloatArray:
     """Largest distance (...) between two valid corners of quadrilaterals (..., 4, 2)."""
     difference = corners[..., :, None, :] - corners[..., None, :, :]
     distance = np.linalg.norm(difference, axis=-1)
-    both = valid[..., :, None] & valid[..., None, :]
-    return np.asarray(np.max(np.where(both, distance, 0.0), axis=(-1, -2)))
+    is_valid_pair = valid[..., :, None] & valid[..., None, :]
+    return np.asarray(np.max(np.where(is_valid_pair, distance, 0.0), axis=(-1, -2)))
 
 
 def mean_corners(corners: FloatArray, valid: BoolArray) -> FloatArray:

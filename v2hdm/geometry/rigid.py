@@ -229,18 +229,20 @@ def with_clock_offsets(
         raise DriveError(f"{root}: holds no trajectory to pose its images anew from")
     images: list[Image] = [image for image in drive.images if image.session != session]
     for name in dict.fromkeys(image.camera for image in drive.images if image.session == session):
-        own = [image for image in drive.images if (image.session, image.camera) == (session, name)]
+        images_of_camera = [
+            image for image in drive.images if (image.session, image.camera) == (session, name)
+        ]
         if offset_s.get(name):
-            taken_s = np.array([image.stamp_s + offset_s[name] for image in own])
+            taken_s = np.array([image.stamp_s + offset_s[name] for image in images_of_camera])
             poses, inside = interpolate(trajectory, taken_s, max_gap_s)
-            own = [
-                replace(own[n], map_from_vehicle=poses[n], clock_offset_s=offset_s[name])
+            images_of_camera = [
+                replace(images_of_camera[n], map_from_vehicle=poses[n], clock_offset_s=offset_s[name])
                 for n in np.flatnonzero(inside).tolist()
             ]
-        if not own:
+        if not images_of_camera:
             raise DriveError(
                 f"{root}: {1e3 * offset_s[name]:.0f} ms after their stamps, no image of '{name}' "
                 "has a pose; record poses as long as images"
             )
-        images += own
+        images += images_of_camera
     return replace(drive, images=tuple(sorted(images, key=in_order)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,29 +18,34 @@ from v2hdm.records import FloatArray, IntArray
 PIXEL_SIGMA = 0.4
 """Largest standard deviation of a patch's position in an image, px; the unit of the residuals."""
 
-_LEAST_PIXEL_SIGMA = 0.1  # floor of the same, px, from interpolation and the grid
+_LEAST_PIXEL_SIGMA = (
+    0.1  # least standard deviation of a patch's position, px, from interpolation and the grid
+)
 _RAYLEIGH_MEDIAN = np.sqrt(2 * np.log(2))  # median length of a 2D vector with unit standard deviations
 _CAUCHY = 2.5  # whitened residual at which Cauchy's weight is 1/2
+
 # Systematic error of a good lens model and of matching, px, smooth over the image and equal in all images:
 # small against a pixel, but common to thousands of matches.
 _LENS_SIGMA_PX = 0.1
-# Fall of a crowned road to both sides of the vehicle, whose wheels stand half a track beside the crown: it
-# looks like lens distortion (AASHTO, A Policy on Geometric Design of Highways and Streets, 7th ed., 4.2.2).
+
+# Standard deviation of the fall of a crowned road to both sides of the vehicle, m per m: it looks like lens
+# distortion (AASHTO, A Policy on Geometric Design of Highways and Streets, 7th ed., 4.2.2).
 _ROOF_SIGMA = 0.03
-_HALF_TRACK_M = 0.8
+_HALF_TRACK_M = 0.8  # distance, m, of a vehicle's wheels from the crown that it drives on
 _BENDS = 6  # coefficients of a smooth error of each pixel coordinate, a quadratic polynomial
-_LARGEST_TURN_RAD = 0.05
-_LARGEST_SHIFT_M = 0.2  # of a step, within which the equations are linear
-_STEPS = 20
+
+_LARGEST_TURN_RAD = 0.05  # largest turn of a step, rad, within which the equations are linear
+_LARGEST_SHIFT_M = 0.2  # largest shift of a step, m, within which the equations are linear
+_STEPS = 20  # steps after which the iteration ends, converged or not
 _CONVERGED = 0.02  # step, in standard deviations, that ends the iteration
 _DAMPING = 1e-3  # damping against endless overshoot of a correlated focal length and height
-_LARGEST_NOISE_PX = 2.0  # limit of the removed noise: beyond is no noise of a pixel
+_LARGEST_NOISE_PX = 2.0  # limit of the removed noise, px: beyond is no noise of a pixel
 _STRETCHES = 12  # segments of the route, several metres each: longer than the correlation of most errors
 
-TURN = slice(0, 3)
-CENTRE = slice(3, 6)
-BENDS = slice(6, 6 + 2 * _BENDS)
-_ROOF = BENDS.stop
+TURN = slice(0, 3)  # places of the mount's turn among the unknowns
+CENTRE = slice(3, 6)  # places of the camera's centre among the unknowns
+BENDS = slice(6, 6 + 2 * _BENDS)  # places of the smooth pixel error among the unknowns
+_ROOF = BENDS.stop  # place of the road's fall among the unknowns
 
 
 @dataclass(frozen=True)
@@ -79,6 +85,14 @@ class _Unknowns:
     roof: float
 
 
+class _Differences(NamedTuple):
+    """The ground points of N matches' first pixels less those of their second ones."""
+
+    residual: FloatArray  # (N, 2) m
+    jacobian: FloatArray  # (N, 2, K) by the unknowns that all images share, and by both poses
+    root: FloatArray  # (N, 2, 2) whitens
+
+
 @dataclass(frozen=True)
 class _Weighted(Normal):
     """Normal equations, residual norms (N,), weights (N,) and each match's ``score`` (N, U)."""
@@ -95,45 +109,45 @@ def adjust(
     start: Mount,
     free: str | None = None,
     tolerance: float = 1.0,
-    near: Adjusted | None = None,
+    without: Adjusted | None = None,
 ) -> Adjusted:
     """Estimate the mounting, with the parameter ``free`` if given, with Cauchy weights.
 
     ``free`` is ``clock_s``, ``focal_scale``, ``distortion_k1`` or ``grade``; ``tolerance`` multiplies the
-    residual at which weights fall. It starts from ``start``, or from ``near``, a solution for the same images
-    without the parameter.
+    residual at which weights fall. It starts from ``start``, or from the solution ``without`` the parameter
+    for the same images.
     """
     # Steps move a ground point by centimetres: its distance from the path is computed once.
-    hits = (hit_ground(start, px, prior.poses[image]) for image, px in _both(observations))
-    lower_m = tuple(_beside_m(prior.course_map, one.points_map) - _HALF_TRACK_M for one in hits)
+    hits = [hit_ground(start, half.px, prior.poses[half.image]) for half in _halves(observations)]
+    lower_m = tuple(_beside_m(prior.course_map, hit.points_map) - _HALF_TRACK_M for hit in hits)
     problem = _Problem(observations, prior, free, tolerance, lower_m)
     damping = 0.0
     begin = _Unknowns(start, 0.0, np.zeros((len(prior.poses), 6)), np.zeros(2 * _BENDS), 0.0)
-    if near is not None:
-        begin = _Unknowns(near.mount, 0.0, near.pose_errors, near.bends, near.roof)
+    if without is not None:
+        begin = _Unknowns(without.mount, 0.0, without.pose_errors, without.bends, without.roof)
         damping = _DAMPING
         problem = replace(problem, sigma_px=problem.linearise(begin).sigma_px)
     fit = gauss_newton(
         problem.linearise, begin, retract=problem.moved, limit=_short, steps=_STEPS, tolerance=_CONVERGED,
         damping=damping,
     )  # fmt: skip
-    found = fit.x
+    unknowns = fit.x
     last = fit.last
-    wanted = [*range(6), *range(_ROOF + 1, problem.known)]
+    reported = [*range(6), *range(_ROOF + 1, problem.shared)]
     inverse = np.linalg.inv(last.information)
-    own = inverse[: problem.known, : problem.known]
+    of_shared = inverse[: problem.shared, : problem.shared]
     return Adjusted(
-        mount=found.mount,
-        extra=found.extra,
-        covariance=np.asarray(inverse[np.ix_(wanted, wanted)]),
-        pose_errors=found.errors,
-        bends=found.bends,
-        roof=found.roof,
-        poses=problem.poses(found),
+        mount=unknowns.mount,
+        extra=unknowns.extra,
+        covariance=np.asarray(inverse[np.ix_(reported, reported)]),
+        pose_errors=unknowns.errors,
+        bends=unknowns.bends,
+        roof=unknowns.roof,
+        poses=problem.poses(unknowns),
         residual=last.length,
         weight=last.weight,
-        data_variance=(np.diag(own) - own**2 @ problem.stiffness)[wanted],
-        stretch_variance=_by_stretch(last.score @ own, observations.first)[wanted],
+        data_variance=(np.diag(of_shared) - of_shared**2 @ problem.stiffness)[reported],
+        stretch_variance=_by_stretch(last.score @ of_shared, observations.first)[reported],
     )
 
 
@@ -151,6 +165,7 @@ def _by_stretch(moved: FloatArray, image: IntArray) -> FloatArray:
 
 
 def _short(step: FloatArray) -> FloatArray:
+    """The step, shortened to where the equations are linear."""
     turn = np.abs(step[TURN]).max()
     shift = np.abs(step[CENTRE]).max()
     return np.asarray(step / max(1.0, float(turn) / _LARGEST_TURN_RAD, float(shift) / _LARGEST_SHIFT_M))
@@ -172,14 +187,14 @@ class _Problem:
     sigma_px: float | None = None
 
     @property
-    def known(self) -> int:
-        """Number of unknowns without the poses' errors."""
+    def shared(self) -> int:
+        """Number of unknowns that all images share: without the poses' errors."""
         return _ROOF + 1 + (self.free is not None)
 
     @property
     def stiffness(self) -> FloatArray:
         """Prior information (U,) of the unknowns without the poses' errors."""
-        stiffness = np.zeros(self.known)
+        stiffness = np.zeros(self.shared)
         # Weak priors keep few matches from being singular: 1 rad for an angle, ten units for a parameter.
         stiffness[TURN] = 1.0
         stiffness[_ROOF + 1 :] = 0.01
@@ -193,13 +208,13 @@ class _Problem:
         mount = now.mount.moved(step[TURN], step[CENTRE])
         extra = now.extra
         if self.free is not None:
-            change = float(step[self.known - 1])
+            change = float(step[self.shared - 1])
             extra += change
             if self.free == "focal_scale":
                 mount = mount.with_focal_scale((1 + extra) / (1 + now.extra) - 1)
             elif self.free == "distortion_k1":
                 mount = mount.with_k1(change)
-        errors = now.errors + step[self.known :].reshape(-1, 6)
+        errors = now.errors + step[self.shared :].reshape(-1, 6)
         return _Unknowns(mount, extra, errors, now.bends + step[BENDS], now.roof + float(step[_ROOF]))
 
     def poses(self, now: _Unknowns) -> FloatArray:
@@ -219,7 +234,9 @@ class _Problem:
 
     def linearise(self, now: _Unknowns) -> _Weighted:
         """Normal equations, with the pixel noise estimated from the residuals."""
-        residual, jacobian, root = self._differences(now)
+        differences = self._differences(now)
+        residual = differences.residual
+        root = differences.root
         length = np.linalg.norm((root @ residual[:, :, None])[..., 0], axis=1)
         usable = np.isfinite(length)
         scale = float(np.median(length[usable])) / _RAYLEIGH_MEDIAN if usable.any() else 1.0
@@ -231,46 +248,46 @@ class _Problem:
         weight = np.where(usable, 1 / (1 + (length * unit / far) ** 2), 0.0)
         good = weight > 0
         scaled = np.sqrt(weight[good])[:, None, None] * (root * unit)[good]
-        rows = scaled @ jacobian[good]
+        rows = scaled @ differences.jacobian[good]
         value = (scaled @ residual[good][:, :, None])[..., 0]
         information, gradient = self._sum_pairs(rows, value, self.observations.only(good))
-        score = np.zeros((len(weight), self.known))
-        score[good] = np.einsum("nij,ni->nj", rows[:, :, : self.known], value)
-        cost = -0.5 * far**2 * float(np.log(weight[good]).sum()) + self._add_priors(
-            now, information, gradient
-        )
+        score = np.zeros((len(weight), self.shared))
+        score[good] = np.einsum("nij,ni->nj", rows[:, :, : self.shared], value)
+        prior_cost = self._add_priors(now, information, gradient)
+        cost = -0.5 * far**2 * float(np.log(weight[good]).sum()) + prior_cost
         return _Weighted(information, gradient, cost, length, weight, score, sigma_px)
 
-    def _differences(
-        self, now: _Unknowns, noise_px: Sequence[FloatArray] | None = None
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Differences (N, 2), m, their Jacobians by unknowns and both poses, and whitening (N, 2, 2).
+    def _differences(self, now: _Unknowns, noise_px: Sequence[FloatArray] | None = None) -> _Differences:
+        """The differences of the matches' ground points.
 
         Once the noise is known they are linearised at pixels with the most likely noise removed. Jacobians at
         observed pixels correlate with the noise: over thousands of matches, focal lengths come out up to 1 %
         too long (Pope, Some pitfalls to be avoided in the iterative adjustment of nonlinear problems, 1972).
         """
-        seen = self.observations
+        observations = self.observations
         poses = self.poses(now)
         points = []
-        known = []
-        pose = []
+        by_shared = []
+        by_pose = []
         slopes = []
-        spread = np.zeros((len(seen.first), 2, 2))
-        off = noise_px or (0 * seen.first_px,) * 2
-        for (image, seen_px), off_px, lower_m in zip(_both(seen), off, self.lower_m, strict=True):
-            px = seen_px - off_px
-            hits = hit_ground(now.mount, px, poses[image])
+        spread = np.zeros((len(observations.first), 2, 2))
+        removed_px = noise_px or (0 * observations.first_px,) * 2
+        halves = _halves(observations)
+        for half, off_px, lower_m in zip(halves, removed_px, self.lower_m, strict=True):
+            px = half.px - off_px
+            half_poses = poses[half.image]
+            hits = hit_ground(now.mount, px, half_poses)
             by_px = by_pixel(now.mount, hits)
             bending = _bending(now.mount, px, by_px)
             falling = hits.by_fall(lower_m)
             columns = [hits.by_mount(), bending, falling[:, :, None]]
             if self.free is not None:
-                columns.append(self._by_parameter(now.mount, hits, px, poses[image], image)[:, :, None])
+                by_parameter = self._by_parameter(now.mount, hits, px, half_poses, half.image)
+                columns.append(by_parameter[:, :, None])
             by_noise = (by_px @ off_px[:, :, None])[..., 0]
             points.append(hits.points_map + bending @ now.bends + now.roof * falling + by_noise)
-            known.append(np.concatenate(columns, axis=2))
-            pose.append(hits.by_pose())
+            by_shared.append(np.concatenate(columns, axis=2))
+            by_pose.append(hits.by_pose())
             slopes.append(by_px)
             blur = PIXEL_SIGMA * by_px
             spread = spread + blur @ np.swapaxes(blur, 1, 2)
@@ -282,9 +299,11 @@ class _Problem:
             pull = PIXEL_SIGMA**2 * np.nan_to_num(np.swapaxes(root, 1, 2) @ whitened)
             likeliest = (np.swapaxes(np.nan_to_num(by_px), 1, 2) @ pull for by_px in (slopes[0], -slopes[1]))
             limit_px = _LARGEST_NOISE_PX
-            return self._differences(now, [np.clip(one[..., 0], -limit_px, limit_px) for one in likeliest])
-        jacobian = np.concatenate([known[0] - known[1], pose[0], -pose[1]], axis=2)
-        return points[0] - points[1], jacobian, root
+            return self._differences(
+                now, [np.clip(noise[..., 0], -limit_px, limit_px) for noise in likeliest]
+            )
+        jacobian = np.concatenate([by_shared[0] - by_shared[1], by_pose[0], -by_pose[1]], axis=2)
+        return _Differences(points[0] - points[1], jacobian, root)
 
     def _by_parameter(
         self, mount: Mount, hits: GroundHits, px: FloatArray, poses: FloatArray, image: IntArray
@@ -297,59 +316,69 @@ class _Problem:
         return by_lens(mount, px, poses, str(self.free))
 
     def _sum_pairs(
-        self, rows: FloatArray, value: FloatArray, seen: Observations
+        self, rows: FloatArray, value: FloatArray, observations: Observations
     ) -> tuple[FloatArray, FloatArray]:
         """Information (U, U) and gradient (U,) of the matches, with a block of two poses per pair."""
-        known = self.known
-        size = known + 6 * len(self.prior.poses)
+        shared = self.shared
+        size = shared + 6 * len(self.prior.poses)
         information = np.zeros((size, size))
         gradient = np.zeros(size)
-        cuts = np.flatnonzero(np.diff(seen.pair)) + 1
-        for low, high in zip([0, *cuts], [*cuts, len(seen.pair)], strict=True):
+        pair = observations.pair
+        cuts = np.flatnonzero(np.diff(pair)) + 1
+        for low, high in zip([0, *cuts], [*cuts, len(pair)], strict=True):
             if high == low:
                 continue
-            block = rows[low:high].reshape(-1, known + 12)
-            images = (int(seen.first[low]), int(seen.second[low]))
-            at = np.concatenate([np.arange(known), *(known + 6 * image + np.arange(6) for image in images)])
-            information[np.ix_(at, at)] += block.T @ block
-            gradient[at] += block.T @ value[low:high].ravel()
+            block = rows[low:high].reshape(-1, shared + 12)
+            images = (int(observations.first[low]), int(observations.second[low]))
+            of_poses = [shared + 6 * image + np.arange(6) for image in images]
+            place = np.concatenate([np.arange(shared), *of_poses])
+            information[np.ix_(place, place)] += block.T @ block
+            gradient[place] += block.T @ value[low:high].ravel()
         return information, gradient
 
     def _add_priors(self, now: _Unknowns, information: FloatArray, gradient: FloatArray) -> float:
         """Add the priors to the normal equations, in place; returns their cost."""
         cost = 0.0
         for state in range(6):
-            at = self.known + 6 * np.arange(len(self.prior.poses)) + state
+            place = self.shared + 6 * np.arange(len(self.prior.poses)) + state
             pull = self.prior.pose_information[state] @ now.errors[:, state]
-            information[np.ix_(at, at)] += self.prior.pose_information[state]
-            gradient[at] += pull
+            information[np.ix_(place, place)] += self.prior.pose_information[state]
+            gradient[place] += pull
             cost += 0.5 * float(now.errors[:, state] @ pull)
         stiffness = self.stiffness
-        off = np.zeros(self.known)
+        off = np.zeros(self.shared)
         off[CENTRE] = now.mount.centre_vehicle - self.prior.centre_vehicle
         off[BENDS] = now.bends
         off[_ROOF] = now.roof
-        place = np.arange(self.known)
+        place = np.arange(self.shared)
         information[place, place] += stiffness
         gradient[place] += stiffness * off
         return cost + 0.5 * float(stiffness @ off**2)
 
 
-def _both(seen: Observations) -> tuple[tuple[IntArray, FloatArray], tuple[IntArray, FloatArray]]:
-    """Image (N,) and pixel (N, 2) of each match, for its first and its second image."""
-    return (seen.first, seen.first_px), (seen.second, seen.second_px)
+class _Half(NamedTuple):
+    """One side of N matches."""
+
+    image: IntArray  # (N,)
+    px: FloatArray  # (N, 2)
+
+
+def _halves(observations: Observations) -> tuple[_Half, _Half]:
+    """The matches' first and second images and pixels."""
+    first = _Half(observations.first, observations.first_px)
+    return first, _Half(observations.second, observations.second_px)
 
 
 def _beside_m(course_map: FloatArray, points_map: FloatArray) -> FloatArray:
     """Distance (N,), m, of points (N, 2) from the driven path (P, 2)."""
     ahead = np.gradient(course_map, axis=0)
     ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)  # of a vehicle that stands
-    out = []
+    beside_m = []
     for points in np.array_split(points_map, len(points_map) // 1000 + 1):
         off = points[:, None] - course_map[None]
-        near = np.argmin(np.square(off).sum(axis=2), axis=1)
-        out.append(np.abs(cross(ahead[near], off[np.arange(len(near)), near])))
-    return np.concatenate(out)
+        nearest = np.argmin(np.square(off).sum(axis=2), axis=1)
+        beside_m.append(np.abs(cross(ahead[nearest], off[np.arange(len(nearest)), nearest])))
+    return np.concatenate(beside_m)
 
 
 def _bending(mount: Mount, px: FloatArray, by_px: FloatArray) -> FloatArray:

@@ -15,23 +15,20 @@ from v2hdm.ground.model import Mount, guessed_mount
 from v2hdm.ground.motion import ARM_M, Motion, changing_pairs, motion_of, spread_pairs
 from v2hdm.ground.patches import STRIP_M, Matcher, Round
 from v2hdm.ground.prior import Observations, Stated, state_sigmas
-from v2hdm.ground.results import GroundEstimate, GroundOptions, GroundStatus, Parameter, Reading
+from v2hdm.ground.results import STEEP_RAD, GroundEstimate, GroundOptions, GroundStatus, Parameter, Reading
 from v2hdm.ground.start import Readings, contradicts, try_readings
 from v2hdm.records import Calibration, Drive, PoseNoise
 from v2hdm.workers import share_out
 
-STEEP_RAD = np.deg2rad(10)
-"""Least depression of a camera: seen flatter, focal length and height appear as a product, and lens
-distortion looks like a curved road."""
-
 _FREE_CENTRE = {"forward_m": (0, 2.0), "left_m": (1, 2.0), "up_m": (2, 0.3)}  # axis, prior sigma, m
-_STRAIGHT = "the vehicle drives straight: drive a turn"
+_STRAIGHT = "the vehicle drives straight: include a turn"
 _FEW = "too few matches: drive farther"
+
 # Largest standard deviation of an observable value, a third of the smallest error worth reporting, and the
 # drive that would reduce it.
 _OBSERVABLE = {
-    "clock_s": (0.015, "speed and direction hardly change: drive a turn"),
-    "focal_scale": (0.01, "the camera looks too level and the vehicle drives straight: drive a turn"),
+    "clock_s": (0.015, "speed and direction hardly change: include a turn"),
+    "focal_scale": (0.01, "the camera looks too level and the vehicle drives straight: include a turn"),
     "distortion_k1": (
         0.03, "too little ground is matched away from the image centre: drive on rougher ground",
     ),
@@ -42,17 +39,22 @@ _OBSERVABLE = {
 }  # fmt: skip
 
 _LEAST_TURN_RADPS = 0.05  # change of yaw rate within a pair that shows 15 ms over the noise of 20 pairs
-_STRETCHES = 8  # enough to estimate a variance, with several pairs in each
+_STRETCHES = 8  # segments of the route: enough to estimate a variance, with several pairs in each
 _WELL_KNOWN = [0, 1, 2, 5]  # roll, pitch, yaw and height: the other two come mostly from the survey
-# Baseline of a pair: errors of position weigh less the longer it is; beyond, the ground changes its
-# appearance and leaves the region common to both images.
+
+# Shortest and longest baseline of a pair, m: errors of position weigh less the longer it is; beyond, the
+# ground changes its appearance and leaves the region common to both images.
 _APART_M = (2.0, 4.0)
-_GRID_M = 0.04  # spacing of the resampled ground
-_CLOCK_APART_M = (0.8, 4.0)  # baseline of a pair for the clock: motion changes within it
+_CLOCK_APART_M = (
+    0.8,
+    4.0,
+)  # shortest and longest baseline of a pair for the clock, m: motion changes within it
 _CLOCK_LOOSENED = 2.0  # factor on the stated heading noise up to which a clock offset is separable from it
-_LEAST_MATCHES = 60  # ten for each degree of freedom of a mounting
-_FLATNESS_M = 0.003  # roads are laid to 3 to 5 mm under a straightedge, as EN 13036-7 measures it
-_LEAST_PATCHES = 200  # fewer in view of all pairs are no evidence, matched or not
+
+_GRID_M = 0.04  # spacing of the resampled ground, m
+_LEAST_MATCHES = 60  # matches of a mounting at least: ten for each of its degrees of freedom
+_FLATNESS_M = 0.003  # unevenness, m: roads are laid to 3 to 5 mm under a straightedge (EN 13036-7)
+_LEAST_PATCHES = 200  # fewer patches than this in view of all pairs are no evidence, matched or not
 
 
 class _Stage(NamedTuple):
@@ -68,12 +70,15 @@ class _Stage(NamedTuple):
     loosened: float
 
 
+# The rounds of an estimate, from coarse to fine.
 _STAGES = (
-    _Stage(0.9, 1.5, 2, 20.0),
-    _Stage(0.5, 1.5, 2, 8.0),
-    _Stage(0.24, 1.0, 1, 2.0),
-    _Stage(0.12, 1.0, 1, 1.0),
+    _Stage(search_m=0.9, grids=1.5, every=2, loosened=20.0),
+    _Stage(search_m=0.5, grids=1.5, every=2, loosened=8.0),
+    _Stage(search_m=0.24, grids=1.0, every=1, loosened=2.0),
+    _Stage(search_m=0.12, grids=1.0, every=1, loosened=1.0),
 )
+
+# The rounds of an estimate with few pairs, which cannot hold poses that may be far off.
 _HELD_STAGES = tuple(stage._replace(loosened=min(stage.loosened, 2.0)) for stage in _STAGES)
 
 
@@ -119,27 +124,28 @@ def _solve(
 ) -> _Solved | None:
     """Match and adjust in turn, each round from the last solution; None with too few matches."""
     path_m = stated.path_m()
-    pairs = spread_pairs(path_m, options.pairs, *_APART_M)
+    pairs = spread_pairs(path_m, options.pairs, _APART_M)
     free = "clock_s" if "clock_s" in options.free and clock_shows(stated.motion) else None
     if free is not None:
         moves = stated.motion.velocity_at_images() * [1.0, 1.0, ARM_M]  # of the ground in view, m/s
-        pairs = np.vstack([pairs, changing_pairs(path_m, moves, options.clock_pairs, *_CLOCK_APART_M)])
+        pairs = np.vstack([pairs, changing_pairs(path_m, moves, options.clock_pairs, _CLOCK_APART_M)])
     poses = stated.poses()
     for stage in stages:
         matched = matcher.match(mount, poses, pairs[:: stage.every], stage.search_m, stage.grids * _GRID_M)
         if len(matched) < _LEAST_MATCHES:
             return None
-        used, prior, rows = stated.prior_of(matched.observations, stage.loosened)
+        observed = stated.prior_of(matched.observations, stage.loosened)
         # With loose headings nothing would hold the camera's yaw against a free clock.
         freed = free if stage.loosened <= _CLOCK_LOOSENED else None
-        adjusted = adjust(used, prior, mount, freed, max(stage.loosened / 2, 1.0))
+        tolerance = max(stage.loosened / 2, 1.0)
+        adjusted = adjust(observed.observations, observed.prior, mount, freed, tolerance)
         if np.count_nonzero(adjusted.weight) < _LEAST_MATCHES:  # rays that miss the ground fix nothing
             return None
         mount = adjusted.mount
         if freed is not None:
             stated = replace(stated, clock_s=stated.clock_s + adjusted.extra)
         poses = stated.poses()
-        poses[rows] = adjusted.poses
+        poses[observed.rows] = adjusted.poses
     clock = None
     if free is not None:
         sigma = float(np.sqrt(adjusted.covariance[6, 6]))
@@ -148,29 +154,30 @@ def _solve(
 
 
 def _found(nothing: GroundEstimate, solved: _Solved, free: tuple[str, ...]) -> GroundEstimate:
-    mount = solved.adjusted.mount
-    matched = solved.matched
+    """The estimate of a solution, with the parameters ``free`` freed one at a time."""
     adjusted = solved.adjusted
-    seen = matched.observations
-    factor = _scatter(seen, solved.stated, adjusted)
+    mount = adjusted.mount
+    observations = solved.matched.observations
+    factor = _scatter(observations, solved.stated, adjusted)
     # Uneven ground tilts and lifts all pairs alike.
     tilt = _FLATNESS_M / (2 * STRIP_M)
     pitch = _FLATNESS_M / (2 * _APART_M[1])
     flatness = np.diag(np.square([tilt, pitch, 0.0, 0.0, 0.0, _FLATNESS_M]))
     # Left tangent of ``cam_from_vehicle`` (translation, rotation) by turn and centre in vehicle axes.
-    by_own = -np.kron([[0, 1], [1, 0]], mount.vehicle_from_cam_rotation.T)
-    covariance = by_own @ (factor * adjusted.covariance[:6, :6] + flatness) @ by_own.T
+    by_axes = -np.kron([[0, 1], [1, 0]], mount.vehicle_from_cam_rotation.T)
+    covariance = by_axes @ (factor * adjusted.covariance[:6, :6] + flatness) @ by_axes.T
     return replace(
         nothing,
         status=GroundStatus.FOUND,
         calibration=Calibration(mount.info, mount.cam_from_vehicle, covariance),
-        parameters=_free_parameters(free, seen, solved, factor),
+        parameters=_free_parameters(free, observations, solved, factor),
         median_residual=float(np.median(adjusted.residual)),
         innovations=_innovations(adjusted, solved.stated.drive.pose_noise),
     )
 
 
 def _nothing(camera: str, readings: Readings) -> GroundEstimate:
+    """The estimate where no mounting is found."""
     little = readings.start.sought < _LEAST_PATCHES and readings.best is Reading.AS_GIVEN
     return GroundEstimate(
         camera=camera,
@@ -186,6 +193,7 @@ def _nothing(camera: str, readings: Readings) -> GroundEstimate:
 
 
 def _innovations(adjusted: Adjusted, noise: PoseNoise) -> Mapping[str, float]:
+    """RMS of the estimated pose errors, by kind, in stated sigmas."""
     rms = np.sqrt(np.mean((adjusted.pose_errors / state_sigmas(noise)) ** 2, axis=0))
     return {
         "heading": float(rms[2]),
@@ -202,14 +210,14 @@ def _scatter(observations: Observations, stated: Stated, solved: Adjusted) -> fl
     disagree. Each segment is left out in turn (Efron and Stein, The jackknife estimate of variance, 1981);
     the factor is the jackknife variance over the formal one, averaged over the angles and the height.
     """
-    pairs, at = np.unique(observations.pair, return_index=True)
-    ordered = pairs[np.argsort(observations.first[at], kind="stable")]
+    pairs, first_match = np.unique(observations.pair, return_index=True)
+    ordered = pairs[np.argsort(observations.first[first_match], kind="stable")]
     stretches = [part for part in np.array_split(ordered, _STRETCHES) if len(part)]
     free = "clock_s" if len(solved.covariance) > 6 else None
     answers = []
     for part in stretches:
-        used, prior, _ = stated.prior_of(observations.only(~np.isin(observations.pair, part)))
-        mount = adjust(used, prior, solved.mount, free).mount
+        observed = stated.prior_of(observations.only(~np.isin(observations.pair, part)))
+        mount = adjust(observed.observations, observed.prior, solved.mount, free).mount
         turn = mount.vehicle_from_cam_rotation @ solved.mount.vehicle_from_cam_rotation.T
         small = [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
         answers.append([*(np.array(small) / 2), *(mount.centre_vehicle - solved.mount.centre_vehicle)])
@@ -232,48 +240,58 @@ def _free_parameters(
     """Each of ``names`` freed alone; ``factor`` inflates all variances, see :func:`_scatter`."""
     turns = clock_shows(solved.stated.motion)
     widened = float(np.sqrt(factor))
-    out = {}
+    parameters = {}
     for name in names:
         if name == "clock_s" and solved.clock is not None:
-            out[name] = replace(solved.clock, sigma=solved.clock.sigma * widened)
+            parameters[name] = replace(solved.clock, sigma=solved.clock.sigma * widened)
             continue
-        value, adjusted, k = _free(name, observations, solved.stated, solved.adjusted)
+        freed = _free(name, observations, solved.stated, solved.adjusted)
         largest, why_not = _OBSERVABLE[name]
         # An error inflates the variance; whether it is observable must not depend on that.
-        observable = name != "clock_s" and float(np.sqrt(adjusted.covariance[k, k])) < largest
+        observable = name != "clock_s" and float(np.sqrt(freed.variance)) < largest
         if name == "focal_scale":
             observable = observable and (turns or solved.adjusted.mount.depression_rad > STEEP_RAD)
-        sigma = _sigma(adjusted, k, factor)
-        out[name] = Parameter(name, value, sigma, observable, "" if observable else why_not)
-    return out
+        sigma = freed.sigma(factor)
+        parameters[name] = Parameter(name, freed.value, sigma, observable, "" if observable else why_not)
+    return parameters
 
 
-def _free(
-    name: str, observations: Observations, stated: Stated, solved: Adjusted
-) -> tuple[float, Adjusted, int]:
-    """The parameter, the solution with it free, and its index in that covariance."""
+class _Freed(NamedTuple):
+    """A parameter that is freed beside the mounting."""
+
+    value: float
+    adjusted: Adjusted  # the solution with it free
+    place: int  # of the parameter in that solution's covariance
+
+    @property
+    def variance(self) -> float:
+        """Variance of the parameter."""
+        return float(self.adjusted.covariance[self.place, self.place])
+
+    def sigma(self, usual: float) -> float:
+        """Standard deviation from the disagreement of the route's segments, shrunk to the drive's ``usual``.
+
+        Variances of so few segments are themselves noisy (Smyth, Statistical Applications in Genetics and
+        Molecular Biology 3, 2004).
+        """
+        data = self.adjusted.data_variance[self.place]
+        multiple = (usual + self.adjusted.stretch_variance[self.place] / max(data, 1e-300)) / 2
+        return float(np.sqrt(self.variance + max(multiple - 1, 0.0) * data))
+
+
+def _free(name: str, observations: Observations, stated: Stated, solved: Adjusted) -> _Freed:
+    """The solution with one parameter free."""
     if name in _FREE_CENTRE:
         axis, sigma_m = _FREE_CENTRE[name]
         wider = replace(stated, centre_sigma_m={**stated.centre_sigma_m, axis: sigma_m})
-        used, prior, _ = wider.prior_of(observations)
-        adjusted = adjust(used, prior, solved.mount, near=solved)
-        value = adjusted.mount.centre_vehicle[axis] - prior.centre_vehicle[axis]
-        return float(value), adjusted, CENTRE.start + axis
+        observed = wider.prior_of(observations)
+        adjusted = adjust(observed.observations, observed.prior, solved.mount, without=solved)
+        value = adjusted.mount.centre_vehicle[axis] - observed.prior.centre_vehicle[axis]
+        return _Freed(float(value), adjusted, CENTRE.start + axis)
     held = stated.with_surveyed_height() if name == "focal_scale" else stated
-    used, prior, _ = held.prior_of(observations)
-    adjusted = adjust(used, prior, solved.mount, free=name, near=solved)
-    return adjusted.extra, adjusted, 6
-
-
-def _sigma(adjusted: Adjusted, k: int, usual: float) -> float:
-    """Standard deviation from the disagreement of the route's segments, shrunk to the drive's ``usual``.
-
-    Variances of so few segments are themselves noisy (Smyth, Statistical Applications in Genetics and
-    Molecular Biology 3, 2004).
-    """
-    data = adjusted.data_variance[k]
-    multiple = (usual + adjusted.stretch_variance[k] / max(data, 1e-300)) / 2
-    return float(np.sqrt(adjusted.covariance[k, k] + max(multiple - 1, 0.0) * data))
+    observed = held.prior_of(observations)
+    adjusted = adjust(observed.observations, observed.prior, solved.mount, free=name, without=solved)
+    return _Freed(adjusted.extra, adjusted, 6)
 
 
 _worker_drive: Drive | None = None
@@ -287,12 +305,12 @@ def estimate_cameras(
     ``progress(done, total)`` is called before the first camera and after each; 1 worker is this process.
     Raises DriveError for an unreadable image, WorkerError if a process died.
     """
-    found: dict[str, GroundEstimate] = {}
+    estimates: dict[str, GroundEstimate] = {}
 
     def take(estimate: GroundEstimate) -> None:
-        found[estimate.camera] = estimate
+        estimates[estimate.camera] = estimate
         if progress:
-            progress(len(found), len(drive.cameras))
+            progress(len(estimates), len(drive.cameras))
 
     names = list(drive.cameras)
     if progress:
@@ -302,7 +320,7 @@ def estimate_cameras(
             take(estimate_ground(drive, name))
     else:
         share_out(_work, names, workers, _start_worker, (drive,), take)
-    return found
+    return estimates
 
 
 def _start_worker(drive: Drive) -> None:

@@ -11,7 +11,7 @@ from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.geometry.rigid import hat, rotation_from_vector
 from v2hdm.records import Camera, CameraInfo, FloatArray
 
-_LENS_STEP = 1e-5  # finite differences: of the focal length, relative, and of k1
+_LENS_STEP = 1e-5  # step of finite differences: of the focal length, relative, and of k1
 
 
 @dataclass(frozen=True)
@@ -64,8 +64,8 @@ class Mount:
 
     def with_k1(self, change: float) -> Mount:
         """The mount with ``change`` added to k1."""
-        first, *rest = self.info.distortion
-        return replace(self, info=replace(self.info, distortion=(first + change, *rest)))
+        k1, *others = self.info.distortion
+        return replace(self, info=replace(self.info, distortion=(k1 + change, *others)))
 
     def rays(self, points_px: FloatArray) -> FloatArray:
         """Viewing directions (N, 3) in the vehicle frame of recorded pixels (N, 2)."""

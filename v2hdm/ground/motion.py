@@ -13,9 +13,9 @@ from v2hdm.records import Drive, FloatArray, IntArray, Trajectory
 
 _SMOOTHING_S = 0.5  # half width of the parabola fitted to poses: steering and pedals act no faster
 _STANDING_MPS = 0.3  # below this a path has no direction: GNSS positions wander by centimetres
-_PATH_STEP_M = 0.5
+_PATH_STEP_M = 0.5  # distance between the points of a driven path, m
 _BEYOND_M = 30.0  # straight extension of the path beyond the drive's ends, the reach of a region
-ARM_M = 10.0  # a turn by 1 rad moves the visible ground by about this
+ARM_M = 10.0  # distance of the visible ground, m, by which a turn by 1 rad moves it
 
 
 @dataclass(frozen=True)
@@ -112,11 +112,12 @@ def _slopes(at: FloatArray, values: FloatArray) -> FloatArray:
     return out
 
 
-def spread_pairs(path_m: FloatArray, count: int, shortest_m: float, longest_m: float) -> IntArray:
+def spread_pairs(path_m: FloatArray, count: int, baseline_m: tuple[float, float]) -> IntArray:
     """Pairs (P, 2) of images, spread evenly along ``path_m`` (I,), using no image twice if possible.
 
-    ``count`` pairs are wanted, their baselines between ``shortest_m`` and ``longest_m``.
+    ``count`` pairs are wanted; ``baseline_m`` is the shortest and the longest of theirs.
     """
+    shortest_m, longest_m = baseline_m
     chosen: list[tuple[int, int]] = []
     used: set[int] = set()
     middle = (shortest_m + longest_m) / 2
@@ -129,25 +130,29 @@ def spread_pairs(path_m: FloatArray, count: int, shortest_m: float, longest_m: f
         fitting = np.flatnonzero((away >= shortest_m) & (away <= longest_m)).tolist()
         if fitting:
             free = [k for k in fitting if k not in used] or fitting
-            pair = first, free[int(np.argmin(np.abs(away[free] - middle)))]
+            pair = (first, free[int(np.argmin(np.abs(away[free] - middle)))])
             chosen.append(pair)
             used.update(pair)
     return np.array(chosen, dtype=np.int64).reshape(-1, 2)
 
 
 def changing_pairs(
-    path_m: FloatArray, values: FloatArray, count: int, shortest_m: float, longest_m: float
+    path_m: FloatArray, values: FloatArray, count: int, baseline_m: tuple[float, float]
 ) -> IntArray:
-    """Pairs (P, 2) of images with the largest change of ``values`` (I, K), using no image twice."""
-    found: list[tuple[float, int, int]] = []
+    """Pairs (P, 2) of images with the largest change of ``values`` (I, K), using no image twice.
+
+    ``baseline_m`` is the shortest and the longest baseline of a pair.
+    """
+    shortest_m, longest_m = baseline_m
+    candidates: list[tuple[float, int, int]] = []
     for first in range(len(path_m)):
         away = path_m - path_m[first]
         fitting = np.flatnonzero((away >= shortest_m) & (away <= longest_m))
         change = np.hypot.reduce(values[fitting] - values[first], axis=1)
-        found += zip(change.tolist(), [first] * len(fitting), fitting.tolist(), strict=True)
+        candidates += zip(change.tolist(), [first] * len(fitting), fitting.tolist(), strict=True)
     used: set[int] = set()
     chosen: list[tuple[int, int]] = []
-    for _, first, second in sorted(found, reverse=True):
+    for _, first, second in sorted(candidates, reverse=True):
         if first not in used and second not in used and len(chosen) < count:
             chosen.append((first, second))
             used.update((first, second))

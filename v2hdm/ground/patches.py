@@ -22,23 +22,25 @@ ImageArray = NDArray[np.uint8]
 Float32Array = NDArray[np.float32]
 
 STRIP_M = 2.0  # half width of the strip about the driven path that counts as road
-_PATCH_M = 0.9
-_STEP_M = 0.6  # side of a patch; spacing, which leaves an overlap of a third
+_PATCH_M = 0.9  # side of a patch, m
+_STEP_M = 0.6  # spacing of the patches, m, which leaves an overlap of a third
+
 _LEAST_CORRELATION = 0.5  # least normalised cross-correlation of two patches of the same ground
 _LEAST_ROUNDNESS = 0.1  # ratio of a peak's curvatures; below, the patch is an edge that slides along itself
 _LEAST_LEAD = 0.1  # least lead of the best peak over another one in the search window
 _PEAK_CELLS = 3  # half width of a peak, grid cells
+
 # Standard deviation, m, of the high-pass filter: highlights, shadows and wet sheen are wider, and move with
 # the light or the camera rather than the ground.
 _COARSEST_M = 0.1
 _LEAST_CONTRAST = 1.0  # grey levels; below is the noise of an even surface
 _ALL = 0.9999  # mean of flags that are all set, up to rounding
 _HOMOGRAPHY_PX = 2.0  # inlier threshold of a pair's plane; kerbs, shadows and moving things are off it
-_LEAST_OF_A_PAIR = 8  # twice the four of a homography
-_AROUND_M = 2.0  # search margin around a region: the spacing of neighbouring images
-_STILL_PX = (
-    1.5  # what moves less between images far apart is bonnet, shadow of the vehicle, or dirt on the lens
-)
+_LEAST_OF_A_PAIR = 8  # least number of matches of a pair: twice the four of a homography
+_AROUND_M = 2.0  # search margin around a region, m: the spacing of neighbouring images
+
+# What moves less than this between images far apart is bonnet, shadow of the vehicle, or dirt on the lens.
+_STILL_PX = 1.5
 
 
 @dataclass(frozen=True)
@@ -108,15 +110,15 @@ class Sheet:
 
     def resample(self, view: View) -> tuple[Float32Array, BoolArray]:
         """The rectified ground (rows, columns) of ``view``, float32, and a mask of its pixels in view."""
-        px = view.pixels(self.points()).astype(np.float32).reshape(*self.shape, 2)
-        seen = ~np.isnan(px[..., 0])
-        px[~seen] = -1
-        return cv2.remap(view.grey, px[..., 0], px[..., 1], cv2.INTER_LINEAR).astype(np.float32), seen
+        px = view.pixels(self.points()).astype(np.float32).reshape((*self.shape, 2))
+        in_view = ~np.isnan(px[..., 0])
+        px[~in_view] = -1
+        return cv2.remap(view.grey, px[..., 0], px[..., 1], cv2.INTER_LINEAR).astype(np.float32), in_view
 
     def texture(self, view: View) -> tuple[Float32Array, BoolArray]:
         """:meth:`resample`, high-pass filtered to the ground's texture."""
-        grey, seen = self.resample(view)
-        return grey - cv2.GaussianBlur(grey, (0, 0), _COARSEST_M / self.grid_m), seen
+        grey, in_view = self.resample(view)
+        return grey - cv2.GaussianBlur(grey, (0, 0), _COARSEST_M / self.grid_m), in_view
 
 
 def patch_centres(
@@ -126,24 +128,24 @@ def patch_centres(
 
     Their lattice is aligned with the first pose.
     """
-    pose = poses[0]
+    first_pose = poses[0]
     lattice = _lattice(roi_vehicle)
-    centres = lattice @ pose[:2, :2].T + pose[:2, 3]
+    centres = lattice @ first_pose[:2, :2].T + first_pose[:2, 3]
     inside = np.ones(len(centres), dtype=np.bool_)
-    for each in poses:
-        inside &= inside_convex(roi_vehicle, ground_in_vehicle(each, centres))
+    for pose in poses:
+        inside &= inside_convex(roi_vehicle, ground_in_vehicle(pose, centres))
     centres = centres[inside]
     if not len(centres):
         return centres
-    near = np.linalg.norm(centres[:, None] - path_map[None], axis=2).min(axis=1) <= STRIP_M
-    return np.asarray(centres[near])
+    in_strip = np.linalg.norm(centres[:, None] - path_map[None], axis=2).min(axis=1) <= STRIP_M
+    return np.asarray(centres[in_strip])
 
 
 def _lattice(roi_vehicle: FloatArray) -> FloatArray:
     """Lattice points (N, 2) of patches over the bounding rectangle of a region."""
     low = roi_vehicle.min(axis=0)
     high = roi_vehicle.max(axis=0)
-    ahead, left = np.meshgrid(*(np.arange(a, b, _STEP_M) for a, b in zip(low, high, strict=True)))
+    ahead, left = np.meshgrid(np.arange(low[0], high[0], _STEP_M), np.arange(low[1], high[1], _STEP_M))
     return np.column_stack([ahead.ravel(), left.ravel()])
 
 
@@ -152,28 +154,30 @@ def match_pair(first: View, second: View, centres_map: FloatArray, search_m: flo
     half = round(_PATCH_M / 2 / grid_m)
     reach = max(round(search_m / grid_m), _PEAK_CELLS)
     sheet, cells = Sheet.around(centres_map, first.map_from_vehicle, half + reach + 1, grid_m)
-    first_grey, first_seen = sheet.texture(first)
-    second_grey, second_seen = sheet.texture(second)
+    first_grey, first_mask = sheet.texture(first)
+    second_grey, second_mask = sheet.texture(second)
     wide = half + reach
-    row, column = cells.T
-    in_view = (_mean(first_seen, half) > _ALL)[row, column] & (_mean(second_seen, half) > _ALL)[row, column]
-    rough = (_mean(first_grey * first_grey, half) > _LEAST_CONTRAST**2)[row, column]
-    found = []
-    for number in np.flatnonzero(in_view & rough & (_mean(second_seen, wide) > _ALL)[row, column]).tolist():
+    rows, columns = cells.T
+    in_first = (_mean(first_mask, half) > _ALL)[rows, columns]
+    in_view = in_first & (_mean(second_mask, half) > _ALL)[rows, columns]
+    is_rough = (_mean(first_grey * first_grey, half) > _LEAST_CONTRAST**2)[rows, columns]
+    search_in_view = (_mean(second_mask, wide) > _ALL)[rows, columns]
+    peaks = []
+    for number in np.flatnonzero(in_view & is_rough & search_in_view).tolist():
         row, column = cells[number]
-        own = np.s_[row - half : row + half + 1, column - half : column + half + 1]
-        area = np.s_[row - wide : row + wide + 1, column - wide : column + wide + 1]
-        score = cv2.matchTemplate(second_grey[area], first_grey[own], cv2.TM_CCOEFF_NORMED)
+        patch = np.s_[row - half : row + half + 1, column - half : column + half + 1]
+        search = np.s_[row - wide : row + wide + 1, column - wide : column + wide + 1]
+        score = cv2.matchTemplate(second_grey[search], first_grey[patch], cv2.TM_CCOEFF_NORMED)
         peak = _peak(np.asarray(score, np.float32))
         if peak is not None:
-            found.append((number, *peak))
+            peaks.append((number, *peak))
     sought = int(in_view.sum())
-    if len(found) < _LEAST_OF_A_PAIR:
+    if len(peaks) < _LEAST_OF_A_PAIR:
         return Matches.none_of(sought)
-    table = np.array(found)
-    at = cells[table[:, 0].astype(np.int64)]
-    first_px = first.pixels(sheet.at(at))
-    second_px = second.pixels(sheet.at(at + table[:, 1:3] - reach))
+    table = np.array(peaks)
+    matched = cells[table[:, 0].astype(np.int64)]
+    first_px = first.pixels(sheet.at(matched))
+    second_px = second.pixels(sheet.at(matched + table[:, 1:3] - reach))
     return _on_one_plane(Matches(first_px, second_px, sought))
 
 
@@ -186,21 +190,23 @@ def match_anywhere(first: View, second: View, roi_vehicle: FloatArray, grid_m: f
     centres = centres[inside_convex(roi_vehicle, centres)]
     if not len(centres):
         return Matches.none_of(0)
-    half, wide = (round(size_m / grid_m) for size_m in (_PATCH_M / 2, _AROUND_M))
+    half = round(_PATCH_M / 2 / grid_m)
+    wide = round(_AROUND_M / grid_m)
     sheet, cells = Sheet.around(centres, first.map_from_vehicle, half + wide, grid_m)
-    grey, seen = sheet.texture(first)
-    other, other_seen = sheet.texture(second)
-    other[~other_seen] = 0.0
-    found = []
-    in_view = cells[(_mean(seen, half) > _ALL)[cells[:, 0], cells[:, 1]]]
+    first_grey, first_mask = sheet.texture(first)
+    second_grey, second_mask = sheet.texture(second)
+    second_grey[~second_mask] = 0.0
+    peaks = []
+    in_view = cells[(_mean(first_mask, half) > _ALL)[cells[:, 0], cells[:, 1]]]
     for row, column in in_view.tolist():
-        own = grey[row - half : row + half + 1, column - half : column + half + 1]
-        peak = _peak(np.asarray(cv2.matchTemplate(other, own, cv2.TM_CCOEFF_NORMED), np.float32))
+        patch = first_grey[row - half : row + half + 1, column - half : column + half + 1]
+        score = cv2.matchTemplate(second_grey, patch, cv2.TM_CCOEFF_NORMED)
+        peak = _peak(np.asarray(score, np.float32))
         if peak is not None:
-            found.append((row, column, *peak))
-    if len(found) < _LEAST_OF_A_PAIR:
+            peaks.append((row, column, *peak))
+    if len(peaks) < _LEAST_OF_A_PAIR:
         return Matches.none_of(len(in_view))
-    table = np.array(found)
+    table = np.array(peaks)
     first_px = first.pixels(sheet.at(table[:, :2]))
     second_px = second.pixels(sheet.at(table[:, 2:4] + half))
     moving = np.linalg.norm(second_px - first_px, axis=1) > _STILL_PX
@@ -232,20 +238,20 @@ def _peak(score: Float32Array) -> tuple[float, float] | None:
     right = -(rr * slope[1] - rc * slope[0]) / determinant
     if abs(down) > 1 or abs(right) > 1:
         return None
-    rest = score.copy()
+    other_score = score.copy()
     top = max(row - _PEAK_CELLS, 0)
     left = max(column - _PEAK_CELLS, 0)
-    rest[top : row + _PEAK_CELLS + 1, left : column + _PEAK_CELLS + 1] = -1
-    if rest.max() > best - _LEAST_LEAD:
+    other_score[top : row + _PEAK_CELLS + 1, left : column + _PEAK_CELLS + 1] = -1
+    if other_score.max() > best - _LEAST_LEAD:
         return None
     return row + float(down), column + float(right)
 
 
 def _on_one_plane(matches: Matches) -> Matches:
     """The inliers of one homography between the images: a plane seen twice."""
-    known = ~(np.isnan(matches.first_px) | np.isnan(matches.second_px)).any(axis=1)
-    first = matches.first_px[known]
-    second = matches.second_px[known]
+    in_images = ~(np.isnan(matches.first_px) | np.isnan(matches.second_px)).any(axis=1)
+    first = matches.first_px[in_images]
+    second = matches.second_px[in_images]
     if len(first) < _LEAST_OF_A_PAIR:
         return Matches.none_of(matches.sought)
     _, inlier = cv2.findHomography(first, second, cv2.RANSAC, _HOMOGRAPHY_PX)
@@ -288,16 +294,19 @@ class Matcher:
         self, mount: Mount, poses: FloatArray, pairs: IntArray, search_m: float, grid_m: float
     ) -> Round:
         """Match every pair (P, 2) of rows of ``poses`` on a grid rectified with ``mount``."""
-        found: list[Matches] = []
+        of_pair: list[Matches] = []
         for first, second in pairs.tolist():
             centres = patch_centres((poses[first], poses[second]), self._roi, self._path)
-            one, other = (View(self._read(k), mount, poses[k]) for k in (first, second))
-            own = match_pair(one, other, centres, search_m, grid_m) if len(centres) else Matches.none_of(0)
-            found.append(own)
-        pair = np.repeat(np.arange(len(pairs)), [len(each) for each in found])
-        sought = sum(each.sought for each in found)
-        first_px = np.concatenate([np.empty((0, 2)), *(each.first_px for each in found)])
-        second_px = np.concatenate([np.empty((0, 2)), *(each.second_px for each in found)])
+            first_view = View(self._read(first), mount, poses[first])
+            second_view = View(self._read(second), mount, poses[second])
+            matches = Matches.none_of(0)
+            if len(centres):
+                matches = match_pair(first_view, second_view, centres, search_m, grid_m)
+            of_pair.append(matches)
+        pair = np.repeat(np.arange(len(pairs)), [len(matches) for matches in of_pair])
+        sought = sum(matches.sought for matches in of_pair)
+        first_px = np.concatenate([np.empty((0, 2)), *(matches.first_px for matches in of_pair)])
+        second_px = np.concatenate([np.empty((0, 2)), *(matches.second_px for matches in of_pair)])
         observations = Observations(pairs[pair, 0], pairs[pair, 1], first_px, second_px, pair)
         return Round(observations, sought, len(pair) / sought if sought else 0.0)
 

@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from v2hdm.ground.model import Mount
 from v2hdm.ground.motion import Motion
-from v2hdm.records import BoolArray, Camera, Drive, FloatArray, IntArray, PoseNoise
-
-HEAVE_SIGMA_M = 0.01
-"""Vertical motion of the body on its suspension on paved ground, m; equal to the mapping's."""
+from v2hdm.records import HEAVE_SIGMA_M, BoolArray, Camera, Drive, FloatArray, IntArray, PoseNoise
 
 STATES = ("roll", "pitch", "yaw", "forward", "left", "up")
 """Errors of a pose, rad and m, in vehicle axes."""
 
-_LEAST_POSE_SIGMA = 1e-6  # m or rad; poses stated as exact would make the covariance singular
+_LEAST_POSE_SIGMA = 1e-6  # least sigma, m or rad: poses stated as exact would make the covariance singular
 _FORWARD_LOOSENED = 2.0  # largest factor on the error along the path; beyond, distance and height drift
-_UNSURVEYED_M = 0.5  # error of a camera centre from a guess, m
-_HEIGHT_SIGMA_M = 0.2  # the ground shows the height to millimetres; a survey's sigma would only bias it
+_UNSURVEYED_M = 0.5  # standard deviation of a camera centre from a guess, m
+_HEIGHT_SIGMA_M = 0.2  # least sigma of a height, m: the ground shows it better, a survey's would bias it
 
 
 @dataclass(frozen=True)
@@ -38,7 +36,7 @@ class Observations:
 
     def only(self, keep: BoolArray) -> Observations:
         """The matches selected by a mask (N,)."""
-        return Observations(*(values[keep] for values in vars(self).values()))
+        return Observations(**{name: values[keep] for name, values in vars(self).items()})
 
 
 @dataclass(frozen=True)
@@ -58,6 +56,14 @@ class Prior:
     course_map: FloatArray
     centre_vehicle: FloatArray
     centre_sigma_m: FloatArray
+
+
+class ObservedPrior(NamedTuple):
+    """Observations, and the statements of a drive about their images."""
+
+    observations: Observations  # with the images of ``prior``
+    prior: Prior
+    rows: IntArray  # (I,) of the motion, of these images
 
 
 @dataclass(frozen=True)
@@ -89,10 +95,8 @@ class Stated:
         """Distance driven (I,) at all images."""
         return self.motion.path_at_images(self.clock_s)
 
-    def prior_of(
-        self, observations: Observations, loosened: float = 1.0
-    ) -> tuple[Observations, Prior, IntArray]:
-        """The observations with images renumbered, the prior of these images, and their rows of the motion.
+    def prior_of(self, observations: Observations, loosened: float = 1.0) -> ObservedPrior:
+        """The prior of the images of observations.
 
         ``loosened`` multiplies the stated errors of heading and lateral position.
         """
@@ -115,7 +119,8 @@ class Stated:
             centre_vehicle=self.guess.centre_vehicle if survey is None else survey.centre_vehicle,
             centre_sigma_m=sigma_m,
         )
-        return replace(observations, first=place[:count], second=place[count:]), prior, rows
+        renumbered = replace(observations, first=place[:count], second=place[count:])
+        return ObservedPrior(renumbered, prior, rows)
 
 
 def state_sigmas(noise: PoseNoise) -> FloatArray:

@@ -14,6 +14,10 @@ from v2hdm.records import Calibration, Camera, Drive
 GROUND_IPM = "ground"
 """Name of the ground's IPM, beside those of the drive."""
 
+STEEP_RAD = np.deg2rad(10)
+"""Least depression of a camera: seen flatter, focal length and height appear as a product, and lens
+distortion looks like a curved road."""
+
 _SURE_RAD = np.deg2rad(0.5)  # an estimate with a larger standard deviation is no better than a guess
 
 

@@ -17,22 +17,29 @@ from v2hdm.ground.prior import Stated
 from v2hdm.ground.results import Reading
 from v2hdm.records import Drive, FloatArray, IntArray
 
-_PAIRS = 10
-_GRID_M = 0.06
-_SHORT_M = (0.3, 1.6)  # baseline of a pair for the start: a wrong guess shifts the ground by a fraction of it
+_PAIRS = 10  # pairs of images for a start, and for a comparison of readings
+_GRID_M = 0.06  # spacing of the resampled ground, m
+_SHORT_M = (0.3, 1.6)
+"""Shortest and longest baseline of a pair for the start, m: a wrong guess shifts the ground by a share."""
+
 _TOLERANCE = 8.0  # factor on the residual at which weights fall: the guess is degrees off
-_SEARCH_M = (0.9, 0.5)
+_SEARCH_M = (0.9, 0.5)  # distances, m, within which a patch is looked for in the rounds of a start
+
 _LEAST_SHARE = 0.1
-"""Least matched fraction of patches: .16 to .43 in parts of a real drive half in the shade of trees, once the
-pitch has settled; at most .09 with positions in feet or images upside down."""
+"""Least matched fraction of patches: 0.16 to 0.43 in parts of a real drive half in the shade of trees, once
+the pitch has settled; at most 0.09 with positions in feet or images upside down."""
+
 _TURNS_DEG = (0.0, 3.0, -3.0, 6.0, -6.0, 9.0, -9.0, 12.0, -12.0)  # pitch offsets, tried in this order
 _FARTHEST_DEG = 20.0  # largest angle between a start and its guess
-_LEAST_MATCHES = 30  # ten for each angle of the mounting
-# Baseline of a pair that separates readings: wrongly read poses move the ground beyond the search.
+_LEAST_MATCHES = 30  # matches of a start at least: ten for each angle of the mounting
+
+# Shortest and longest baseline of a pair that separates readings, m: wrongly read poses move the ground
+# beyond the search.
 _APART_M = (1.2, 2.8)
 _TURN_RAD = np.deg2rad(2)  # largest turn within a pair from the noise of a path
-_READING_SEARCH_M = 0.6
+_READING_SEARCH_M = 0.6  # distance, m, within which a patch is looked for under a reading
 _RIVAL = 0.5  # least matched fraction as given, relative to another reading's
+
 # Factor on the stated motion within which the ground agrees: guesses 10 deg off in pitch yield 0.75 to 1.06,
 # positions in feet 3.3.
 _STRETCHED = 2.0
@@ -66,9 +73,9 @@ def find_start(matcher: Matcher, stated: Stated, guess: Mount) -> Start:
 def start_pairs(stated: Stated) -> IntArray:
     """Pairs (P, 2) of images for the start."""
     path_m = stated.path_m()
-    pairs = spread_pairs(path_m, _PAIRS, *_SHORT_M)
+    pairs = spread_pairs(path_m, _PAIRS, _SHORT_M)
     if len(pairs) < _PAIRS // 2:  # images are rarer: those next to each other
-        pairs = spread_pairs(path_m, _PAIRS, _SHORT_M[0], 2 * _SHORT_M[1])
+        pairs = spread_pairs(path_m, _PAIRS, (_SHORT_M[0], 2 * _SHORT_M[1]))
     return pairs
 
 
@@ -81,17 +88,17 @@ def contradicts(matcher: Matcher, stated: Stated) -> bool:
     """
     pairs = start_pairs(stated)
     pairs = pairs[:: -(-len(pairs) // _PAIRS)]
-    found = matcher.match_anywhere(stated.guess, pairs, _GRID_M)
+    matches_of_pair = matcher.match_anywhere(stated.guess, pairs, _GRID_M)
     share = []
     turn_rad = []
-    for matches, (first, second) in zip(found, stated.poses()[pairs], strict=True):
-        seen = _motion(matches, stated.guess)
-        if seen is not None:
-            moved = np.linalg.inv(first) @ second
-            way = moved[:2, 3]
-            share.append(seen[:, 2] @ way / (way @ way))
-            turn_rad.append(heading_rad(seen[:, :2].T @ moved[:2, :2]))
-    if sum(map(len, found)) < _LEAST_MATCHES or not share:
+    for matches, (first, second) in zip(matches_of_pair, stated.poses()[pairs], strict=True):
+        motion = _motion(matches, stated.guess)
+        if motion is not None:
+            stated_motion = np.linalg.inv(first) @ second
+            way = stated_motion[:2, 3]
+            share.append(motion[:, 2] @ way / (way @ way))
+            turn_rad.append(heading_rad(motion[:, :2].T @ stated_motion[:2, :2]))
+    if sum(map(len, matches_of_pair)) < _LEAST_MATCHES or not share:
         return False
     as_far = 1 / _STRETCHED < np.median(share) < _STRETCHED
     return not as_far or bool(np.median(np.abs(turn_rad)) > _TURN_RAD)
@@ -99,23 +106,25 @@ def contradicts(matcher: Matcher, stated: Stated) -> bool:
 
 def _motion(matches: Matches, mount: Mount) -> FloatArray | None:
     """Pose (2, 3) of the vehicle at the second image relative to the first, up to scale."""
-    here = np.broadcast_to(np.eye(4), (len(matches), 4, 4))
-    first, second = (hit_ground(mount, px, here).points_map for px in (matches.first_px, matches.second_px))
-    known = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
-    if np.count_nonzero(known) < 2:
+    at_origin = np.broadcast_to(np.eye(4), (len(matches), 4, 4))
+    first = hit_ground(mount, matches.first_px, at_origin).points_map
+    second = hit_ground(mount, matches.second_px, at_origin).points_map
+    on_ground = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
+    if np.count_nonzero(on_ground) < 2:
         return None
-    found, _ = cv2.estimateAffinePartial2D(second[known], first[known])
-    return None if found is None else found.astype(np.float64)
+    motion, _ = cv2.estimateAffinePartial2D(second[on_ground], first[on_ground])
+    return None if motion is None else motion.astype(np.float64)
 
 
 def _settle(matcher: Matcher, stated: Stated, pairs: IntArray, mount: Mount, guess: Mount) -> Start:
+    """The start that matching and adjusting in turn lead to from ``mount``."""
     surveyed = stated.with_surveyed_height()
     for search_m in _SEARCH_M:
         matched = matcher.match(mount, stated.poses(), pairs, search_m, _GRID_M)
         if len(matched) < _LEAST_MATCHES or matched.share < _LEAST_SHARE:
             return Start(None, matched.share, matched.sought)
-        used, prior, _ = surveyed.prior_of(matched.observations)
-        mount = adjust(used, prior, mount, tolerance=_TOLERANCE).mount
+        observed = surveyed.prior_of(matched.observations)
+        mount = adjust(observed.observations, observed.prior, mount, tolerance=_TOLERANCE).mount
         away = guess.vehicle_from_cam_rotation.T @ mount.vehicle_from_cam_rotation
         if np.trace(away) < 1 + 2 * np.cos(np.deg2rad(_FARTHEST_DEG)):
             return Start(None, 0.0, matched.sought)
@@ -149,15 +158,21 @@ def try_readings(drive: Drive, camera: str, matcher: Matcher, stated: Stated, ot
 
 
 def _share_under(
-    reading: Reading, camera: str, matcher: Matcher, stated: Stated, found: Mount | None, pairs: IntArray
+    reading: Reading,
+    camera: str,
+    matcher: Matcher,
+    stated: Stated,
+    start_mount: Mount | None,
+    pairs: IntArray,
 ) -> float:
+    """The matched fraction of patches under a reading of the poses; a start is found if there is none."""
     motion = motion_of(stated.drive, camera, reading)
     backwards = reading is Reading.BACKWARDS
-    guess = stated.guess if found is None else found
+    guess = stated.guess if start_mount is None else start_mount
     guess = guess.turned_around() if backwards else guess
     other = matcher.under(motion, turned=backwards)
     read = replace(stated, motion=motion, guess=guess, surveyed=not backwards)
-    mount = guess if found is not None else find_start(other, read, guess).mount
+    mount = guess if start_mount is not None else find_start(other, read, guess).mount
     return 0.0 if mount is None else _share(other, read, mount, pairs)
 
 
@@ -165,11 +180,12 @@ def _distinctive_pairs(drive: Drive, camera: str) -> IntArray:
     """Pairs with the largest turns along the path; evenly spread pairs on a straight route."""
     motion = motion_of(drive, camera, Reading.HEADING_FROM_PATH)
     yaw = np.unwrap(heading_rad(motion.poses()))
-    pairs = changing_pairs(motion.path_at_images(), yaw[:, None], _PAIRS, *_APART_M)
+    pairs = changing_pairs(motion.path_at_images(), yaw[:, None], _PAIRS, _APART_M)
     if len(pairs) and np.median(np.abs(yaw[pairs[:, 1]] - yaw[pairs[:, 0]])) > _TURN_RAD:
         return pairs
-    return spread_pairs(motion.path_at_images(), _PAIRS, *_APART_M)
+    return spread_pairs(motion.path_at_images(), _PAIRS, _APART_M)
 
 
 def _share(matcher: Matcher, stated: Stated, mount: Mount, pairs: IntArray) -> float:
+    """The matched fraction of patches."""
     return matcher.match(mount, stated.poses(), pairs, _READING_SEARCH_M, _GRID_M).share

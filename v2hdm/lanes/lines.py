@@ -20,11 +20,13 @@ from v2hdm.lanes.points import NODE_SPACING_M, Guides, LaneCloud, Nodes, find_no
 from v2hdm.records import LANE_DASH, LANE_LINE, FloatArray, IntArray, Lane
 from v2hdm.site.options import LaneOptions
 
-_MAX_DASH_GAP_M = 9.0
-_MAX_BREAK_M = 3.0  # longest bridged gap between dashes, and break in solid paint
-_LEAST_PIECE_M = 2.0  # least length of a lane line
-_SAME_DIRECTION = np.cos(np.deg2rad(25.0))  # least cosine between nodes of one line
+_MAX_DASH_GAP_M = 9.0  # longest gap between dashes, m, that is bridged
+_MAX_BREAK_M = 3.0  # longest break in solid paint, m, that is bridged
+_LEAST_PIECE_M = 2.0  # least length of a lane line, m
+
+_LINKED_COSINE = np.cos(np.deg2rad(25.0))  # least cosine between linked nodes, and of each to their link
 _MAX_LINK_SPACINGS = 2.5  # longest link of two nodes, in spacings
+
 _MAX_BEND_RAD, _MAX_ARC_MISMATCH_RAD = np.deg2rad([25.0, 8.0])
 """Limits, rad: angle between a gap's chord and an end's tangent, and its difference between the two ends."""
 
@@ -65,11 +67,11 @@ def join_paths(paths: list[Path]) -> list[Path]:
     """Join paths whose ends lie on one arc, shortest gaps first."""
     joined = []
     for run in _runs(len(paths), _joints(paths)):
-        own = [paths[path].turned(backwards) for path, backwards in run]
-        pieces = [own[0].points_map]
-        for before, after in itertools.pairwise(own):
+        paths_of_run = [paths[path].turned(backwards) for path, backwards in run]
+        pieces = [paths_of_run[0].points_map]
+        for before, after in itertools.pairwise(paths_of_run):
             pieces += [_bridge(before.points_map, after.points_map, NODE_SPACING_M), after.points_map]
-        joined.append(_merged(np.concatenate(pieces), own))
+        joined.append(_merged(np.concatenate(pieces), paths_of_run))
     return joined
 
 
@@ -81,11 +83,10 @@ def _mutual_links(nodes: Nodes, reach_m: float) -> IntArray:
     distance = np.linalg.norm(offset, axis=1)
     tangent = nodes.tangent[source]
     along = np.einsum("pi,pi->p", offset, tangent)
-    straight = np.minimum(
-        np.abs(along), np.abs(np.einsum("pi,pi->p", offset, nodes.tangent[target]))
-    ) / np.maximum(distance, 1e-9)
+    along_target = np.einsum("pi,pi->p", offset, nodes.tangent[target])
+    straight = np.minimum(np.abs(along), np.abs(along_target)) / np.maximum(distance, 1e-9)
     parallel = np.abs(np.einsum("pi,pi->p", tangent, nodes.tangent[target]))
-    fits = (straight >= _SAME_DIRECTION) & (parallel >= _SAME_DIRECTION)
+    fits = (straight >= _LINKED_COSINE) & (parallel >= _LINKED_COSINE)
     source = source[fits]
     target = target[fits]
     along = along[fits]
@@ -94,25 +95,25 @@ def _mutual_links(nodes: Nodes, reach_m: float) -> IntArray:
     # In order of falling cost: the cheapest is written last and stays.
     order = np.argsort(-cost, kind="stable")
     best[source[order], (along[order] < 0).astype(int)] = target[order]
-    own = np.arange(len(best))[:, None, None]
-    return np.where((best[best] == own).any(axis=2) & (best >= 0), best, -1)
+    node = np.arange(len(best))[:, None, None]
+    return np.where((best[best] == node).any(axis=2) & (best >= 0), best, -1)
 
 
 def _walk(links: IntArray) -> list[IntArray]:
     """Follow links (N, 2) from end to end, then around closed loops, repeating their start."""
     degree = (links >= 0).sum(axis=1)
-    left = np.ones(len(links), dtype=bool)
+    is_unvisited = np.ones(len(links), dtype=bool)
     paths = []
     for start in np.concatenate([np.flatnonzero(degree == 1), np.flatnonzero(degree == 2)]).tolist():
-        if not left[start]:
+        if not is_unvisited[start]:
             continue
         path = []
         previous = -1
         node = start
-        while node >= 0 and left[node]:
-            left[node] = False
+        while node >= 0 and is_unvisited[node]:
+            is_unvisited[node] = False
             path.append(node)
-            ahead = [n for n in links[node].tolist() if n >= 0 and n != previous and left[n]]
+            ahead = [n for n in links[node].tolist() if n >= 0 and n != previous and is_unvisited[n]]
             previous = node
             node = ahead[0] if ahead else -1
         if degree[start] == 2 and start in links[path[-1]] and len(path) > 2:
@@ -155,6 +156,7 @@ def _outward(points: FloatArray) -> FloatArray:
 
 
 def _unit(way: FloatArray) -> FloatArray:
+    """``way`` (2,) at unit length."""
     return np.asarray(way / max(float(np.linalg.norm(way)), 1e-9))
 
 
@@ -178,6 +180,7 @@ def _ending_with(last: tuple[int, bool], run: list[tuple[int, bool]]) -> list[tu
 
 
 def _backwards(run: list[tuple[int, bool]]) -> list[tuple[int, bool]]:
+    """The run from its other end."""
     return [(path, not backwards) for path, backwards in reversed(run)]
 
 
@@ -202,9 +205,10 @@ def _bridge(before: FloatArray, after: FloatArray, spacing_m: float) -> FloatArr
 _MAX_BRIDGE_M = 25.0  # longest gap bridged by images' whole lines, m
 _PASSES_M = 0.4  # largest distance, m, of a whole line from the end of a piece that it passes
 _LEAST_COSINE = np.cos(np.deg2rad(30.0))  # least cosine between a gap and the directions of its ends
-_FIRST = 0
-_LAST = 1
 _DIRECTION_LENGTH_M = 5.0  # length, m, of a piece's end that gives a bridge's direction
+
+_FIRST = 0  # number of a path's first end
+_LAST = 1  # number of a path's last end
 
 
 def bridge_paths(paths: list[Path], guides: Guides, least_images: int) -> list[Path]:
@@ -221,8 +225,8 @@ def bridge_paths(paths: list[Path], guides: Guides, least_images: int) -> list[P
             between = _course_between(before.points_map[-1], after.points_map[0], guides, tree, least_images)
             if between is not None:
                 points = np.concatenate([before.points_map, between, after.points_map])
-                rest = [path for k, path in enumerate(paths) if k not in (a, b)]
-                paths = [*rest, _merged(points, [before, after])]
+                others = [path for k, path in enumerate(paths) if k not in (a, b)]
+                paths = [*others, _merged(points, [before, after])]
                 bridged = True
                 break
     return paths
@@ -251,9 +255,9 @@ def _ends(path: Path) -> FloatArray:
 
 def _end_direction(points: FloatArray) -> FloatArray:
     """Direction (2,) of a polyline's end, over its last metres."""
-    away = np.linalg.norm(points - points[-1], axis=1)
-    at = int(np.argmin(np.abs(away - min(_DIRECTION_LENGTH_M, float(away.max())))))
-    return _unit(points[-1] - points[at])
+    distance_m = np.linalg.norm(points - points[-1], axis=1)
+    vertex = int(np.argmin(np.abs(distance_m - min(_DIRECTION_LENGTH_M, float(distance_m.max())))))
+    return _unit(points[-1] - points[vertex])
 
 
 def _course_between(
@@ -268,18 +272,18 @@ def _course_between(
     gap_m = float(np.linalg.norm(gap))
     ahead = gap / gap_m
     count = max(int(np.ceil(gap_m / NODE_SPACING_M)), 1)
-    at = np.linspace(0.0, gap_m, count + 1)
+    vertex_m = np.linspace(0.0, gap_m, count + 1)
     courses = []
     for line in common:
         offset = guides.points_map[guides.line == line] - start
         along = offset @ ahead
         across = offset[:, 1] * ahead[0] - offset[:, 0] * ahead[1]
         order = np.argsort(along)
-        courses.append(np.interp(at, along[order], across[order]))
+        courses.append(np.interp(vertex_m, along[order], across[order]))
     course = np.median(courses, axis=0)
     # The paint is at the ends: the whole lines' offset there is removed along the gap.
-    course -= np.interp(at, [0.0, gap_m], [course[0], course[-1]])
-    points = start + at[:, None] * ahead + course[:, None] * np.array([-ahead[1], ahead[0]])
+    course -= np.interp(vertex_m, [0.0, gap_m], [course[0], course[-1]])
+    points = start + vertex_m[:, None] * ahead + course[:, None] * np.array([-ahead[1], ahead[0]])
     return np.asarray(points[1:-1])
 
 

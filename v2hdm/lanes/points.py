@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -31,11 +32,13 @@ from v2hdm.records import (
 )
 from v2hdm.surface.surface import Surface
 
-NODE_SPACING_M = 0.5  # between the vertices of a polyline
-HALF_WIDTH_M = 0.3
-_HALF_LENGTH_M = 0.8  # half size across and along a line of the averaged neighbourhood
+NODE_SPACING_M = 0.5  # distance, m, between the vertices of a polyline
+HALF_WIDTH_M = 0.3  # half width, m, across its line of the neighbourhood that is averaged
+_HALF_LENGTH_M = 0.8  # half length, m, along its line of the neighbourhood that is averaged
+
 CENTRE_SIGMA_PX = 1.0  # noise of a detected centre across its line: a cell of the network's output
 OWN_SIGMA_M = 0.01  # sigma, m, besides pixel noise: the nearest image must not outvote all others
+
 _TANGENT_REACH = 2  # points to either side whose difference gives the direction
 _GUIDE_RANGE = 1.8  # range of whole lines relative to paint's: they only show what is one line
 
@@ -77,11 +80,11 @@ class ImageGround:
         cls, count: int, rows: IntArray, homographies: FloatArray, extrinsic: FloatArray, poses: FloatArray
     ) -> ImageGround:
         """The mapping of the images ``rows``, of ``count``."""
-        out = cls(np.full((count, 3, 3), np.nan), np.full((count, 3), np.nan))
+        ground = cls(np.full((count, 3, 3), np.nan), np.full((count, 3), np.nan))
         centre = (poses[:, :3, :3] @ camera_centre(extrinsic)[..., None])[..., 0] + poses[:, :3, 3]
-        out.map_from_pinhole_px[rows] = homographies
-        out.centre_map[rows] = centre
-        return out
+        ground.map_from_pinhole_px[rows] = homographies
+        ground.centre_map[rows] = centre
+        return ground
 
     def rolling(
         self, rows: IntArray, camera: IntArray, frame: IntArray, poses: FloatArray, rig: Rig
@@ -90,11 +93,11 @@ class ImageGround:
         if rig.read_out_s is None or rig.twist_vehicle is None:
             return self
         moved = rig.twist_vehicle[frame] * rig.read_out_s[camera, None]
-        out = np.zeros((len(self.centre_map), 2, 3))
+        moved_map = np.zeros((len(self.centre_map), 2, 3))
         turn = moved[:, 5, None, None] * np.array([[0.0, -1.0], [1.0, 0.0]])
-        out[rows, :, :2] = turn
-        out[rows, :, 2] = (poses[:, :2, :2] @ moved[:, :2, None] - turn @ poses[:, :2, 3:])[..., 0]
-        return replace(self, moved_map=out)
+        moved_map[rows, :, :2] = turn
+        moved_map[rows, :, 2] = (poses[:, :2, :2] @ moved[:, :2, None] - turn @ poses[:, :2, 3:])[..., 0]
+        return replace(self, moved_map=moved_map)
 
     def at_rows(self, points_map: FloatArray, image: IntArray, row_share: FloatArray) -> FloatArray:
         """Points (..., 2) of images (...) under the poses at their rows' read-out, to first order."""
@@ -127,10 +130,10 @@ def ground_by_rig(
     poses = rig.map_from_vehicle[frame]
     extrinsic = rig.cam_from_vehicle[camera]
     homographies = ground_from_pinhole_px(rig.intrinsic[camera], extrinsic @ np.linalg.inv(poses))
-    out = ImageGround.of_images(len(drive.images), rows, homographies, extrinsic, poses)
-    out = out.rolling(rows, camera, frame, poses, rig)
+    ground = ImageGround.of_images(len(drive.images), rows, homographies, extrinsic, poses)
+    ground = ground.rolling(rows, camera, frame, poses, rig)
     if surface is None:
-        return out
+        return ground
     of_image = np.full(len(drive.images), -1)
     frame_of_image = frames_of(drive).frame_of_image
     of_image[rows] = camera
@@ -141,7 +144,7 @@ def ground_by_rig(
         cam_from_map = rig.cam_from_map(camera, frame)
         return surface.flattened_px(rig.intrinsic[camera], cam_from_map, frame, points_px)
 
-    return replace(out, flattened_px=flattened_px)
+    return replace(ground, flattened_px=flattened_px)
 
 
 def collect_lane_points(
@@ -155,13 +158,21 @@ def collect_lane_points(
     guides = _guides(drive, detections, ground, _GUIDE_RANGE * max_range_m)
     lanes = _lanes(detections, ground, whole=False)
     if not lanes:
-        empty = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, int), np.zeros(0, bool)
-        return LaneCloud(*empty, guides)
-    piece, image, points_px, row_share = _points(drive, lanes)
-    points_px = ground.flattened_px(image, points_px)
+        return LaneCloud(
+            points_map=np.zeros((0, 2)),
+            tangent=np.zeros((0, 2)),
+            weight=np.zeros(0),
+            image=np.zeros(0, int),
+            dash=np.zeros(0, bool),
+            guides=guides,
+        )
+    points = _points(drive, lanes)
+    piece = points.lane
+    image = points.image
+    points_px = ground.flattened_px(image, points.pinhole_px)
     homographies = ground.map_from_pinhole_px[image]
     points_map, jacobian = ground_points_with_jacobian(homographies, points_px[:, None])
-    points_map = ground.at_rows(points_map[:, 0], image, row_share)
+    points_map = ground.at_rows(points_map[:, 0], image, points.row_share)
     jacobian = jacobian[:, 0]
     tangent = _tangents(points_map, piece)
     centre = ground.centre_map[image]
@@ -171,12 +182,18 @@ def collect_lane_points(
     normal = turned_left(tangent)
     variance = np.einsum("pi,pij,pj->p", normal, covariance, normal)
     with np.errstate(invalid="ignore"):
-        keep = (np.linalg.norm(ray, axis=1) <= max_range_m) & np.isfinite(tangent).all(axis=1)
-        keep &= np.isfinite(variance)
+        is_usable = (np.linalg.norm(ray, axis=1) <= max_range_m) & np.isfinite(tangent).all(axis=1)
+        is_usable &= np.isfinite(variance)
     dash = np.array([lane.kind == LANE_DASH for _, lane in lanes])[piece]
-    weight = 1.0 / (variance[keep] + OWN_SIGMA_M**2)
-    own = points_map[keep], tangent[keep], weight, image[keep], dash[keep], guides
-    return LaneCloud(*own, row_share[keep])
+    return LaneCloud(
+        points_map=points_map[is_usable],
+        tangent=tangent[is_usable],
+        weight=1.0 / (variance[is_usable] + OWN_SIGMA_M**2),
+        image=image[is_usable],
+        dash=dash[is_usable],
+        guides=guides,
+        row_share=points.row_share[is_usable],
+    )
 
 
 def _lanes(
@@ -185,29 +202,36 @@ def _lanes(
     """Images and lane detections, ``whole`` lines or pieces, of the images that ``ground`` covers."""
     covered = np.isfinite(ground.centre_map[:, 0])
     return [
-        (found.image, lane)
-        for found in detections
-        if covered[found.image]
-        for lane in found.lanes
+        (detected.image, lane)
+        for detected in detections
+        if covered[detected.image]
+        for lane in detected.lanes
         if (lane.kind == LANE_BOUNDARY) == whole and (whole or len(lane.points_px) >= 2)
     ]
 
 
-def _points(
-    drive: Drive, lanes: Sequence[tuple[int, LaneDetection]]
-) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
-    """Lane (P,), image (P,), pinhole pixels (P, 2) and row shares (P,) of all points of ``lanes``."""
+class _Points(NamedTuple):
+    """P points of lane detections."""
+
+    lane: IntArray  # (P,) index of the detection
+    image: IntArray  # (P,) image index
+    pinhole_px: FloatArray  # (P, 2)
+    row_share: FloatArray  # (P,) read-out time of the rows, see :func:`row_shares`
+
+
+def _points(drive: Drive, lanes: Sequence[tuple[int, LaneDetection]]) -> _Points:
+    """All points of ``lanes``, images and detections, without lens distortion."""
     of_lane = np.repeat(np.arange(len(lanes)), [len(lane.points_px) for _, lane in lanes])
     image = np.array([i for i, _ in lanes], dtype=np.int64)[of_lane]
-    camera = np.array([one.camera for one in drive.images])[image]
+    camera = np.array([image_of_drive.camera for image_of_drive in drive.images])[image]
     points_px = np.concatenate([lane.points_px for _, lane in lanes]).astype(np.float64)
     row_share = np.zeros(len(points_px))
     for name in np.unique(camera):
-        own = camera == name
+        is_of_camera = camera == name
         info = drive.cameras[str(name)].info
-        row_share[own] = row_shares(info, points_px[own])
-        points_px[own] = undistort_points(info, points_px[own])
-    return of_lane, image, points_px, row_share
+        row_share[is_of_camera] = row_shares(info, points_px[is_of_camera])
+        points_px[is_of_camera] = undistort_points(info, points_px[is_of_camera])
+    return _Points(of_lane, image, points_px, row_share)
 
 
 def _guides(
@@ -217,13 +241,16 @@ def _guides(
     lanes = _lanes(detections, ground, whole=True)
     if not lanes:
         return Guides()
-    line, image, points_px, row_share = _points(drive, lanes)
-    points_px = ground.flattened_px(image, points_px)
+    points = _points(drive, lanes)
+    image = points.image
+    points_px = ground.flattened_px(image, points.pinhole_px)
     points_map = ground_points(ground.map_from_pinhole_px[image], points_px[:, None])[:, 0]
-    points_map = ground.at_rows(points_map, image, row_share)
+    points_map = ground.at_rows(points_map, image, points.row_share)
     with np.errstate(invalid="ignore"):
-        near = np.linalg.norm(points_map - ground.centre_map[image, :2], axis=1) <= max_range_m
-    return Guides(points_map[near], line[near], np.array([i for i, _ in lanes], dtype=np.int64))
+        in_reach = np.linalg.norm(points_map - ground.centre_map[image, :2], axis=1) <= max_range_m
+    return Guides(
+        points_map[in_reach], points.lane[in_reach], np.array([i for i, _ in lanes], dtype=np.int64)
+    )
 
 
 def _rows(drive: Drive, cameras: Sequence[str]) -> tuple[IntArray, IntArray]:
@@ -238,9 +265,9 @@ def _tangents(points: FloatArray, piece: IntArray) -> FloatArray:
     length = np.bincount(piece)
     first = (np.cumsum(length) - length)[piece]
     last = first + length[piece] - 1
-    here = np.arange(len(points))
+    row = np.arange(len(points))
     difference = (
-        points[np.minimum(here + _TANGENT_REACH, last)] - points[np.maximum(here - _TANGENT_REACH, first)]
+        points[np.minimum(row + _TANGENT_REACH, last)] - points[np.maximum(row - _TANGENT_REACH, first)]
     )
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(difference / np.linalg.norm(difference, axis=1, keepdims=True))
@@ -248,7 +275,7 @@ def _tangents(points: FloatArray, piece: IntArray) -> FloatArray:
 
 _SEED_CELL_M = 0.25  # side of the cells with one seed each, m
 _DIRECTION_BINS = 8  # directions distinguished within a cell, over half a circle
-_SAME_DIRECTION = np.cos(np.deg2rad(20.0))  # least cosine of directions within one line
+SAME_DIRECTION = np.cos(np.deg2rad(20.0))  # least cosine of directions within one line; crossing ones differ
 _ITERATIONS = 4  # mean shifts of each seed
 _THIN_SPACINGS = 0.7  # radius, in spacings, in which the best supported node suppresses others of its line
 
@@ -274,52 +301,68 @@ def find_nodes(cloud: LaneCloud, least_images: int) -> Nodes:
     tangent = cloud.tangent[seeds]
     # Pairs of seeds and points that can be neighbours in any iteration.
     reach_m = float(np.hypot(_HALF_LENGTH_M, 2 * HALF_WIDTH_M))
-    apart = cKDTree(points).sparse_distance_matrix(cKDTree(cloud.points_map), reach_m, output_type="ndarray")
-    pairs = apart["i"].astype(np.int64), apart["j"].astype(np.int64)
+    distances = cKDTree(points).sparse_distance_matrix(
+        cKDTree(cloud.points_map), reach_m, output_type="ndarray"
+    )
+    pairs = _Pairs(distances["i"].astype(np.int64), distances["j"].astype(np.int64))
     for _ in range(_ITERATIONS):
         points, tangent = _shift(points, tangent, cloud, pairs)
-    along, across, cosine = _coordinates(points, tangent, cloud, pairs)
-    near = (np.abs(along) <= NODE_SPACING_M) & (np.abs(across) <= 0.5 * HALF_WIDTH_M)
-    near &= cosine >= _SAME_DIRECTION
-    seed = pairs[0][near]
-    point = pairs[1][near]
-    shown = np.unique(np.stack([seed, cloud.image[point]]), axis=1)[0]
-    images = np.bincount(shown, minlength=len(points))
+    in_line = _in_line(points, tangent, cloud, pairs)
+    in_reach = (np.abs(in_line.along_m) <= NODE_SPACING_M) & (np.abs(in_line.across_m) <= 0.5 * HALF_WIDTH_M)
+    in_reach &= in_line.cosine >= SAME_DIRECTION
+    seed = pairs.seed[in_reach]
+    point = pairs.point[in_reach]
+    seed_of_image = np.unique(np.stack([seed, cloud.image[point]]), axis=1)[0]
+    images = np.bincount(seed_of_image, minlength=len(points))
     total = np.bincount(seed, minlength=len(points))
     dash = np.bincount(seed, cloud.dash[point].astype(float), len(points)) / np.maximum(total, 1)
     supported = np.flatnonzero(images >= least_images)
-    kept = supported[_thin(points[supported], tangent[supported], images[supported])]
-    return Nodes(points[kept], tangent[kept], images[kept], dash[kept])
+    chosen = supported[_thin(points[supported], tangent[supported], images[supported])]
+    return Nodes(points[chosen], tangent[chosen], images[chosen], dash[chosen])
 
 
-def _coordinates(
-    points: FloatArray, tangent: FloatArray, cloud: LaneCloud, pairs: tuple[IntArray, IntArray]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Coordinates of each pair's point along and across the seed's line, and cosine of directions."""
+class _Pairs(NamedTuple):
+    """K pairs of a seed and a point of the cloud that may be neighbours."""
+
+    seed: IntArray  # (K,)
+    point: IntArray  # (K,)
+
+
+class _InLine(NamedTuple):
+    """Points of K pairs as their seeds see them."""
+
+    along_m: FloatArray  # (K,) coordinate along the seed's line
+    across_m: FloatArray  # (K,) coordinate to the left of it
+    cosine: FloatArray  # (K,) of the angle between both directions
+
+
+def _in_line(points: FloatArray, tangent: FloatArray, cloud: LaneCloud, pairs: _Pairs) -> _InLine:
+    """The points of ``pairs`` beside the lines through seeds at ``points`` (N, 2), along ``tangent``."""
     seed, point = pairs
     offset = cloud.points_map[point] - points[seed]
-    along = np.einsum("pi,pi->p", offset, tangent[seed])
-    across = cross(tangent[seed], offset)
-    cosine = np.abs(np.einsum("pi,pi->p", cloud.tangent[point], tangent[seed]))
-    return along, across, cosine
+    return _InLine(
+        along_m=np.einsum("pi,pi->p", offset, tangent[seed]),
+        across_m=cross(tangent[seed], offset),
+        cosine=np.abs(np.einsum("pi,pi->p", cloud.tangent[point], tangent[seed])),
+    )
 
 
 def _shift(
-    points: FloatArray, tangent: FloatArray, cloud: LaneCloud, pairs: tuple[IntArray, IntArray]
+    points: FloatArray, tangent: FloatArray, cloud: LaneCloud, pairs: _Pairs
 ) -> tuple[FloatArray, FloatArray]:
     """Move each seed across its line onto the weighted regression line of its neighbourhood."""
-    along, across, cosine = _coordinates(points, tangent, cloud, pairs)
-    near = (np.abs(along) <= _HALF_LENGTH_M) & (np.abs(across) <= HALF_WIDTH_M)
-    near &= cosine >= _SAME_DIRECTION
-    x = along[near]
-    y = across[near]
+    in_line = _in_line(points, tangent, cloud, pairs)
+    in_reach = (np.abs(in_line.along_m) <= _HALF_LENGTH_M) & (np.abs(in_line.across_m) <= HALF_WIDTH_M)
+    in_reach &= in_line.cosine >= SAME_DIRECTION
+    x = in_line.along_m[in_reach]
+    y = in_line.across_m[in_reach]
     # Gaussian across, so that the nearer of two lines wins.
     kernel = np.exp(-0.5 * (2.0 * y / HALF_WIDTH_M) ** 2) * (1 - (x / _HALF_LENGTH_M) ** 2)
-    weight = cloud.weight[pairs[1][near]] * kernel
+    weight = cloud.weight[pairs.point[in_reach]] * kernel
     count = len(points)
 
     def total(value: FloatArray) -> FloatArray:
-        return np.bincount(pairs[0][near], weights=value, minlength=count).astype(np.float64)
+        return np.bincount(pairs.seed[in_reach], weights=value, minlength=count).astype(np.float64)
 
     w, wx, wy, wxx, wxy = (total(weight * v) for v in (np.ones_like(x), x, y, x * x, x * y))
     safe = np.maximum(w, 1e-12)
@@ -333,20 +376,20 @@ def _shift(
 
 
 def _thin(points: FloatArray, tangent: FloatArray, images: IntArray) -> IntArray:
-    """Indices of the best supported nodes, at least .7 of the spacing apart along and beside a line."""
+    """Indices of the best supported nodes, at least 0.7 of the spacing apart along and beside a line."""
     if not len(points):
         return np.zeros(0, dtype=np.int64)
     reach_m = _THIN_SPACINGS * NODE_SPACING_M
-    near = cKDTree(points).query_ball_point(points, reach_m)
+    in_reach = cKDTree(points).query_ball_point(points, reach_m)
     alive = np.ones(len(points), dtype=bool)
-    kept = []
+    chosen = []
     for node in np.argsort(-images, kind="stable").tolist():
         if not alive[node]:
             continue
-        kept.append(node)
-        others = np.array(near[node])
+        chosen.append(node)
+        others = np.array(in_reach[node])
         offset = points[others] - points[node]
         across = cross(tangent[node], offset)
-        same = np.abs(tangent[others] @ tangent[node]) >= _SAME_DIRECTION
+        same = np.abs(tangent[others] @ tangent[node]) >= SAME_DIRECTION
         alive[others[same & (np.abs(across) <= 0.5 * HALF_WIDTH_M)]] = False
-    return np.array(kept, dtype=np.int64)
+    return np.array(chosen, dtype=np.int64)

@@ -18,7 +18,7 @@ from v2hdm.geometry.planar import wrapped
 from v2hdm.geometry.rigid import heading_rad
 from v2hdm.io.drive import as_drive
 from v2hdm.io.trajectory import write_tum
-from v2hdm.localization.filter import Markings, Seen, State, locate, predict, start
+from v2hdm.localization.filter import Markings, Sighting, State, locate, predict, start
 from v2hdm.records import (
     BoolArray,
     Calibration,
@@ -32,15 +32,17 @@ from v2hdm.records import (
 from v2hdm.report import style
 from v2hdm.store.files import write_json
 
-# How well the first pose is known: a coordinate of a place that RTK has once fixed, and a compass.
-_START_SIGMA_M = 0.5
-_START_SIGMA_RAD = float(np.deg2rad(3.0))
+_START_SIGMA_M = 0.5  # standard deviation, m, of a coordinate of the first pose: a place that RTK once fixed
+_START_SIGMA_RAD = float(np.deg2rad(3.0))  # standard deviation, rad, of the first heading: a compass
 # With a larger standard deviation of the place the vehicle does not know where it is: half a dash's gap.
 _LOST_M = 0.3
-# Share of the detections that a map of the site explains at least: one explained .86, another site's .04.
+# Least share of the detections that a map of the site explains: one explained 0.86, another site's 0.04.
 _LEAST_MATCHED = 0.5
-_IN_VIEW_M = 15.0  # A marking is in view whose corners are all in an image and no farther from the camera
+_IN_VIEW_M = 15.0  # largest distance, m, from the camera of the corners of a marking that counts as in view
+
 _PANELS = (("ahead", 100.0, "cm"), ("to the left", 100.0, "cm"), ("heading", float(np.degrees(1.0)), "deg"))
+"""Panels of the errors' picture: title, units per metre or radian, and unit."""
+
 _KNOWN = "#0072b2"
 _LOST = "#d55e00"
 _BAND = "#bbbbbb"
@@ -83,13 +85,13 @@ class Localised:
     @property
     def sigma(self) -> FloatArray:
         """Standard deviations (F, 3) of ahead, left and heading, the map's own shift included."""
-        out = []
+        sigmas = []
         for state in self.states:
             c = np.cos(state.mean[2])
             s = np.sin(state.mean[2])
             turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-            out.append(np.sqrt(np.diag(turn @ state.covariance[:3, :3] @ turn.T) + self.shared))
-        return np.stack(out)
+            sigmas.append(np.sqrt(np.diag(turn @ state.covariance[:3, :3] @ turn.T) + self.shared))
+        return np.stack(sigmas)
 
     @property
     def explained(self) -> bool:
@@ -98,16 +100,17 @@ class Localised:
 
     def figures(self) -> dict[str, float | int]:
         """The figures of ``localization.json``, errors over the frames with a marking in view."""
-        kept = self.in_view & self.known
-        error = self.error[kept] if kept.any() else np.full((1, 3), np.nan)
+        is_localised = self.in_view & self.known
+        error = self.error[is_localised] if is_localised.any() else np.full((1, 3), np.nan)
+        sigma = self.sigma
         return {
             "frames": len(self.states),
             "frames_with_a_marking_in_view": int(self.in_view.sum()),
-            "localised_share": float(kept.sum() / max(self.in_view.sum(), 1)),
+            "localised_share": float(is_localised.sum() / max(self.in_view.sum(), 1)),
             "position_rmse_m": float(np.sqrt((error[:, :2] ** 2).sum(axis=1).mean())),
             "heading_rmse_deg": float(np.degrees(np.sqrt((error[:, 2] ** 2).mean()))),
-            "worst_position_m": float(np.hypot(*error[:, :2].T).max()),
-            "median_sigma_m": float(np.median(np.hypot(*self.sigma[:, :2].T))),
+            "worst_position_m": float(np.hypot(error[:, 0], error[:, 1]).max()),
+            "median_sigma_m": float(np.median(np.hypot(sigma[:, 0], sigma[:, 1]))),
             "detections": self.detections,
             "matched_share": float(self.matched.sum() / max(self.detections, 1)),
         }
@@ -140,8 +143,8 @@ def localize(
         MapFileError: map, calibrations and drive do not belong together.
         MappingError: the images hold no marking.
 
-    >>> found = localize(result.map, port, result.calibrations, detections=result.detections)
-    >>> found.error.shape == found.sigma.shape == (len(found.stamp_s), 3)
+    >>> localised = localize(result.map, port, result.calibrations, detections=result.detections)
+    >>> localised.error.shape == localised.sigma.shape == (len(localised.stamp_s), 3)
     True
     """
     drive = as_drive(drive)
@@ -160,21 +163,30 @@ def localize(
     for frame, stamp_s in enumerate(sightings.stamp_s):
         if frame:
             state = predict(state, float(stamp_s - sightings.stamp_s[frame - 1]), attitude_rad)
-        state, found = locate(state, _seen(drive, sightings, frame, names, calibrations), markings)
+        state, markings_of_frame = locate(
+            state, _sightings_of(drive, sightings, frame, names, calibrations), markings
+        )
         states.append(state)
-        matched.append(len(found))
+        matched.append(len(markings_of_frame))
     # The cameras' common turn about the vertical is that of their mean.
-    turns = [(one.cam_from_vehicle[:3, 2], one.covariance) for one in calibrations.values()]
-    yaw_m2 = [0.0 if c is None else float(up @ c[3:, 3:] @ up) for up, c in turns]
+    yaw_rad2 = [_yaw_variance(calibration) for calibration in calibrations.values()]
     return Localised(
         stamp_s=sightings.stamp_s,
         recorded=sightings.map_from_vehicle,
         states=tuple(states),
         matched=np.array(matched),
         in_view=_in_view(drive, sightings, hd_map, calibrations),
-        shared=np.array([markings.shared_m2, markings.shared_m2, np.mean(yaw_m2)]),
+        shared=np.array([markings.shared_m2, markings.shared_m2, np.mean(yaw_rad2)]),
         detections=len(sightings),
     )
+
+
+def _yaw_variance(calibration: Calibration) -> float:
+    """Variance, rad^2, of a camera's turn about the vertical; 0 if unknown."""
+    if calibration.covariance is None:
+        return 0.0
+    up = calibration.cam_from_vehicle[:3, 2]
+    return float(up @ calibration.covariance[3:, 3:] @ up)
 
 
 def check_together(hd_map: HDMap, calibrations: Mapping[str, Calibration], drive: Drive) -> None:
@@ -193,19 +205,25 @@ def check_together(hd_map: HDMap, calibrations: Mapping[str, Calibration], drive
         )
 
 
-def _seen(
+def _sightings_of(
     drive: Drive, sightings: Sightings, frame: int, names: list[str], calibrations: Mapping[str, Calibration]
-) -> list[Seen]:
+) -> list[Sighting]:
     """The detections of one frame."""
     informs = sightings.informs
-    out = []
+    detections = []
     for row in np.flatnonzero(sightings.frame == frame).tolist():
         camera = names[sightings.camera[row]]
-        kind = sightings.kinds[sightings.kind[row]]
-        corners_px = sightings.corners_pinhole_px[row]
-        pose = (drive.cameras[camera].info.intrinsic, calibrations[camera].cam_from_vehicle)
-        out.append(Seen(kind, *pose, corners_px, sightings.covariance_px[row], informs[row]))
-    return out
+        detections.append(
+            Sighting(
+                kind=sightings.kinds[sightings.kind[row]],
+                intrinsic=drive.cameras[camera].info.intrinsic,
+                cam_from_vehicle=calibrations[camera].cam_from_vehicle,
+                corners_px=sightings.corners_pinhole_px[row],
+                covariance_px=sightings.covariance_px[row],
+                informs=informs[row],
+            )
+        )
+    return detections
 
 
 def _in_view(
@@ -214,30 +232,34 @@ def _in_view(
     """In which frames (F,) a whole marking of the map is near and within an image, by the recorded poses."""
     cameras = [drive.cameras[name] for name in sightings.cameras]
     extrinsics = np.stack([calibrations[name].cam_from_vehicle for name in sightings.cameras])
-    rig = Rig(np.stack([one.info.intrinsic for one in cameras]), extrinsics, sightings.map_from_vehicle)
+    rig = Rig(np.stack([camera.info.intrinsic for camera in cameras]), extrinsics, sightings.map_from_vehicle)
     views = views_of(drive, sightings.cameras)
     corners_map = np.stack([marking.corners_map for marking in hd_map.markings])
     _, image = easy_views(views, rig, cameras, corners_map, _IN_VIEW_M)
     return np.isin(np.arange(len(sightings.stamp_s)), views.frame[np.isin(views.image, image)])
 
 
-def write_localised(found: Localised, drive: Drive, folder: Path) -> None:
+def write_localised(localised: Localised, drive: Drive, folder: Path) -> None:
     """Write figures, poses and the errors' picture: two-sigma bands, crosses where the vehicle is lost."""
-    write_json(folder / "localization.json", found.figures())
-    write_tum(found.poses, folder / "localized.tum")
+    write_json(folder / "localization.json", localised.figures())
+    write_tum(localised.poses, folder / "localized.tum")
     noise = drive.pose_noise
-    sigma = np.hypot(found.sigma, [noise.position_m, noise.position_m, noise.heading_rad])
-    time_s = found.stamp_s - found.stamp_s[0]
-    error = found.error
-    known = found.known
+    sigma = np.hypot(localised.sigma, [noise.position_m, noise.position_m, noise.heading_rad])
+    time_s = localised.stamp_s - localised.stamp_s[0]
+    error = localised.error
+    is_known = localised.known
     with style.figure(folder / "errors.png", 9, 6) as figure:
         axes = figure.subplots(3, 1, sharex=True)
         for k, (axis, (name, factor, unit)) in enumerate(zip(axes, _PANELS, strict=True)):
             band = 2 * factor * sigma[:, k]
             axis.fill_between(time_s, -band, band, color=_BAND, alpha=0.6, lw=0, label="two sigmas, of both")
-            axis.plot(time_s[known], factor * error[known, k], ".", ms=3, color=_KNOWN, label="localised")
-            if not known.all():
-                axis.plot(time_s[~known], factor * error[~known, k], "x", ms=4, color=_LOST, label="lost")
+            axis.plot(
+                time_s[is_known], factor * error[is_known, k], ".", ms=3, color=_KNOWN, label="localised"
+            )
+            if not is_known.all():
+                axis.plot(
+                    time_s[~is_known], factor * error[~is_known, k], "x", ms=4, color=_LOST, label="lost"
+                )
             limit = 1.2 * float(np.percentile(np.abs(factor * error[:, k]), 99)) + 1e-9
             limit = max(limit, 2 * float(np.median(band)))
             axis.set_ylim(-limit, limit)
@@ -248,15 +270,15 @@ def write_localised(found: Localised, drive: Drive, folder: Path) -> None:
         axes[-1].set_xlabel("time, s")
 
 
-def summary_lines(found: Localised) -> list[str]:
+def summary_lines(localised: Localised) -> list[str]:
     """The figures for a terminal, with a FAIL where the map does not explain the drive."""
-    figures = found.figures()
+    figures = localised.figures()
     lines = [
         f"{100 * figures['localised_share']:.1f} % of {figures['frames_with_a_marking_in_view']} frames with "
         f"a marking in view localised; position {100 * figures['position_rmse_m']:.1f} cm, heading "
         f"{figures['heading_rmse_deg']:.2f} deg from the recorded poses (RMSE)"
     ]
-    if not found.explained:
+    if not localised.explained:
         share = f"{100 * figures['matched_share']:.0f} %"
         lines.append(
             f"FAIL: the map explains {share} of the detections, so that the figures above cannot be relied "

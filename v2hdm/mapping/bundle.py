@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -30,7 +30,7 @@ from v2hdm.errors import MappingError
 from v2hdm.geometry.rigid import camera_centre, inverse, log
 from v2hdm.lanes.knots import OPEN_END_PX, Knots
 from v2hdm.mapping.options import MappingOptions, SizeOptions, SurveyOptions
-from v2hdm.records import DIAMOND, BoolArray, Camera, FloatArray, IntArray, PoseNoise
+from v2hdm.records import DIAMOND, HEAVE_SIGMA_M, BoolArray, Camera, FloatArray, IntArray, PoseNoise
 from v2hdm.survey.match import match
 
 
@@ -38,12 +38,12 @@ def vehicle_twists(
     map_from_vehicle: FloatArray, stamp_s: FloatArray, session: IntArray | None = None
 ) -> FloatArray:
     """Vehicle twists (F, 6) in its own frame, m/s, rad/s, by central differences within each ``session``."""
-    own = np.arange(len(stamp_s))
-    before = np.maximum(own - 1, 0)
-    after = np.minimum(own + 1, len(own) - 1)
+    now = np.arange(len(stamp_s))
+    before = np.maximum(now - 1, 0)
+    after = np.minimum(now + 1, len(now) - 1)
     if session is not None:
-        before = np.where(session[before] == session, before, own)
-        after = np.where(session[after] == session, after, own)
+        before = np.where(session[before] == session, before, now)
+        after = np.where(session[after] == session, after, now)
     moved = inverse(map_from_vehicle[before]) @ map_from_vehicle[after]
     elapsed_s = stamp_s[after] - stamp_s[before]
     return np.asarray(log(moved) / np.where(elapsed_s > 0, elapsed_s, 1.0)[:, None])
@@ -56,9 +56,6 @@ def read_outs_s(cameras: Iterable[Camera]) -> FloatArray | None:
 
 
 _UNSURVEYED_CENTRE_SIGMA_M = 0.3  # prior sigma, m, of an unsurveyed camera centre about that of a coarse IPM
-
-HEAVE_SIGMA_M = 0.01
-"""Vertical motion, m, of a vehicle's body on its suspension on paved ground."""
 
 LEAST_OBSERVATIONS = 200
 """Fewer residuals do not determine their variance."""
@@ -114,8 +111,8 @@ class Bundle:
     def corners_map(self) -> FloatArray:
         """Adjusted corners (G, 4, 2), nan for corners outside the solution."""
         out = np.full((*self.corner_index.shape, 2), np.nan)
-        known = self.corner_index >= 0
-        out[known] = self.solution.corners_map[self.corner_index[known]]
+        solved = self.corner_index >= 0
+        out[solved] = self.solution.corners_map[self.corner_index[solved]]
         return out
 
     @property
@@ -155,15 +152,19 @@ def pose_sigma_of(pose_noise: PoseNoise) -> PoseSigma:
 def coarse_model(rig: Rig, pose_noise: Sequence[PoseNoise], options: MappingOptions) -> Model:
     """Exact poses, with their errors as image noise: enough to separate markings."""
     focal_px = float(np.mean(rig.intrinsic[:, 0, 0]))
-    jitter_px = focal_px * max(float(np.hypot(one.roll_pitch_rad, one.heading_rad)) for one in pose_noise)
+    turn_rad = max(float(np.hypot(noise.roll_pitch_rad, noise.heading_rad)) for noise in pose_noise)
+    jitter_px = focal_px * turn_rad
     floor_px = float(np.hypot(options.model_floor_px, jitter_px))
     return Model(len(pose_noise) * (PoseSigma(),), floor_px, replace(_solver(options), pose_states=()))
 
 
 def _solver(options: MappingOptions) -> SolveOptions:
-    robust = (options.loss, options.loss_scale)
-    read_out = options.estimate_read_out
-    return SolveOptions(loss=robust[0], loss_scale=robust[1], read_out=read_out, device=options.device)
+    return SolveOptions(
+        loss=options.loss,
+        loss_scale=options.loss_scale,
+        read_out=options.estimate_read_out,
+        device=options.device,
+    )
 
 
 def solve_bundle(
@@ -181,7 +182,11 @@ def solve_bundle(
     intersection. ``usable`` (S, 4), in the sightings' own order, selects corners. Extrinsics start from
     ``rig``, poses from the recorded ones. Raises MappingError if no corner was seen twice.
     """
-    row, group, corner, corner_index = _observed_corners(association, usable)
+    observed = _observed_corners(association, usable)
+    row = observed.row
+    group = observed.group
+    corner = observed.corner
+    corner_index = observed.corner_index
     if not len(row):
         raise MappingError(
             "no marking was seen in two images, so nothing can be optimised; drive past the markings "
@@ -204,8 +209,8 @@ def solve_bundle(
     problem = replace(problem, lengths=lengths, control=control, corners_start=corners_start)
     solution = solve(problem, model.solver)
     if knots is not None:
-        own = {name: getattr(solution, name)[: len(row)] for name in _OF_OBSERVATIONS}
-        solution = replace(solution, **own)
+        of_markings = {name: getattr(solution, name)[: len(row)] for name in _OF_OBSERVATIONS}
+        solution = replace(solution, **of_markings)
     cam_from_vehicle = rig.cam_from_vehicle.copy()
     map_from_vehicle = sightings.map_from_vehicle.copy()
     cam_from_vehicle[used] = solution.cam_from_vehicle
@@ -215,9 +220,20 @@ def solve_bundle(
         read_out_s = rig.read_out_s.copy()
         read_out_s[used] = solution.read_out_s
         adjusted = replace(adjusted, read_out_s=read_out_s)
-    index = {sightings.cameras[c]: k for k, c in enumerate(used.tolist())}
-    seen = (row, group, corner)
-    return Bundle(adjusted, model, problem, solution, association, *seen, corner_index, index, frames, knots)
+    return Bundle(
+        rig=adjusted,
+        model=model,
+        problem=problem,
+        solution=solution,
+        association=association,
+        row=row,
+        group=group,
+        corner=corner,
+        corner_index=corner_index,
+        camera_index={sightings.cameras[c]: k for k, c in enumerate(used.tolist())},
+        frames=frames,
+        knots=knots,
+    )
 
 
 def observations_at(
@@ -244,14 +260,15 @@ def observations_at(
     )
 
 
-_OF_OBSERVATIONS = "residual_px", "mahalanobis2", "verdict"
+_OF_OBSERVATIONS = ("residual_px", "mahalanobis2", "verdict")
 _Rows = TypeVar("_Rows", Observations, ControlPoints)
 
 
-def _joined(one: _Rows, other: _Rows) -> _Rows:
-    """The rows of one, then those of the other."""
-    pairs = zip(vars(one).values(), vars(other).values(), strict=True)
-    return type(one)(*(np.concatenate(pair) for pair in pairs))
+def _joined(rows: _Rows, more: _Rows) -> _Rows:
+    """The ``rows``, then ``more`` of them."""
+    added = vars(more)
+    columns = {name: np.concatenate([column, added[name]]) for name, column in vars(rows).items()}
+    return replace(rows, **columns)
 
 
 def drive_problem(sightings: Sightings, rig: Rig, cameras: Mapping[str, Camera], model: Model) -> Problem:
@@ -297,7 +314,7 @@ def _constraints(
     fused = fuse_groups(association, located, jitter_rad=0.0)
     points_map = np.where(fused.valid[..., None], fused.corners_map, np.nan)
     # Surveyed points are matched under the least certain poses of all sessions.
-    poses = max(model.pose_sigma, key=lambda one: one.position_m)
+    poses = max(model.pose_sigma, key=lambda sigma: sigma.position_m)
     kinds = group_kinds(association, sightings)
     return (
         known_lengths(model.sizes, [sightings.kinds[k] for k in kinds], points_map, corner_index),
@@ -305,24 +322,33 @@ def _constraints(
     )
 
 
-def _observed_corners(
-    association: Association, usable: BoolArray
-) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-    """Observations (row, group, corner; K each) of corners seen at least twice, and the corners' indices."""
+class _Observed(NamedTuple):
+    """The K observations of corners that were seen at least twice."""
+
+    row: IntArray  # (K,) row in the sightings
+    group: IntArray  # (K,) group of the row
+    corner: IntArray  # (K,) corner of the group
+    corner_index: IntArray  # (G, 4) number of each corner; -1 for one that was not seen twice
+
+
+def _observed_corners(association: Association, usable: BoolArray) -> _Observed:
+    """The observations of corners that at least two of the ``usable`` sightings (S, 4) see."""
     in_order = association.in_group_order(usable) & (association.group >= 0)[:, None]
     row, corner = np.nonzero(in_order)
     group = association.group[row]
     flat = group * 4 + corner
     number = np.full(4 * association.count, -1, dtype=np.int64)
-    kept = np.bincount(flat, minlength=4 * association.count) >= 2
-    number[kept] = np.arange(np.count_nonzero(kept))
-    known = kept[flat]
-    return row[known], group[known], corner[known], number.reshape(-1, 4)
+    is_repeated = np.bincount(flat, minlength=4 * association.count) >= 2
+    number[is_repeated] = np.arange(np.count_nonzero(is_repeated))
+    observed = is_repeated[flat]
+    return _Observed(row[observed], group[observed], corner[observed], number.reshape(-1, 4))
 
 
 _DIAGONALS = (((0, 2),), ((1, 3),))
+"""The pair of corners of each of a diamond's diagonals; the map decides which is the longer one."""
+
 _SIDES = (((0, 1), (3, 2)), ((1, 2), (0, 3)))
-"""Pairs of corners a marking's length or width apart; the map decides which."""
+"""Pairs of corners that are a marking's length or width apart; the map decides which."""
 
 
 def known_lengths(
@@ -334,24 +360,24 @@ def known_lengths(
     or cut off, and unconstrained. ``kind`` (G,) is each group's class, ``corners_map`` (G, 4, 2) approximate,
     nan if unknown, ``corner_index`` (G, 4) the index in the adjustment, -1 for none.
     """
-    found: list[tuple[int, int, float]] = []
+    lengths: list[tuple[int, int, float]] = []
     for name, size in sizes.by_class_m.items():
         spans = _DIAGONALS if name == DIAMOND else _SIDES
         for group in np.flatnonzero(np.array(kind) == name):
             corners = corners_map[group]
-            apart = [[np.linalg.norm(corners[a] - corners[b]) for a, b in span] for span in spans]
-            seen = np.array([np.mean(distances) for distances in apart])
-            wanted = np.array(size) if seen[0] >= seen[1] else np.array(size)[::-1]
+            distances_m = [[np.linalg.norm(corners[a] - corners[b]) for a, b in span] for span in spans]
+            measured_m = np.array([np.mean(of_span_m) for of_span_m in distances_m])
+            stated_m = np.array(size) if measured_m[0] >= measured_m[1] else np.array(size)[::-1]
             # Also false if a corner is unknown: then the longer direction is unknown too.
-            if not (np.abs(seen - wanted) <= sizes.tolerance * wanted).all():
+            if not (np.abs(measured_m - stated_m) <= sizes.tolerance * stated_m).all():
                 continue
-            for span, metres in zip(spans, wanted, strict=True):
+            for span, metres in zip(spans, stated_m, strict=True):
                 ends = corner_index[group][np.array(span)]
-                found += [(a, b, metres) for a, b in ends[(ends >= 0).all(axis=1)].tolist()]
-    if not found:
+                lengths += [(a, b, metres) for a, b in ends[(ends >= 0).all(axis=1)].tolist()]
+    if not lengths:
         return None
-    first, second, length_m = (np.array(column) for column in zip(*found, strict=True))
-    return KnownLengths(first, second, length_m, np.full(len(found), sizes.sigma_m))
+    first, second, length_m = map(np.array, zip(*lengths, strict=True))
+    return KnownLengths(first, second, length_m, np.full(len(lengths), sizes.sigma_m))
 
 
 def control_points(
@@ -362,19 +388,19 @@ def control_points(
     ``corners_map`` and ``corner_index`` are as in :func:`known_lengths`, ``poses`` the sigmas of recorded
     poses, whose drift neighbouring corners have in common.
     """
-    points = np.array([one.position_map for one in survey.points], dtype=np.float64).reshape(-1, 2)
-    sigma_m = np.array([one.sigma_m for one in survey.points], dtype=np.float64).reshape(-1, 2)
-    known = (corner_index >= 0) & np.isfinite(corners_map).all(axis=-1)
-    if not len(points) or not known.any():
+    points = np.array([point.position_map for point in survey.points], dtype=np.float64).reshape(-1, 2)
+    sigma_m = np.array([point.sigma_m for point in survey.points], dtype=np.float64).reshape(-1, 2)
+    mapped = (corner_index >= 0) & np.isfinite(corners_map).all(axis=-1)
+    if not len(points) or not mapped.any():
         return None
-    off_m, _ = KDTree(corners_map[known]).query(points)
-    near = np.flatnonzero(off_m <= survey.reach_m)
-    covariance = _covariance(points[near], sigma_m[near], poses)
-    found = match(points[near], corners_map[known], survey.reach_m, covariance)
-    used = near[found >= 0]
+    off_m, _ = KDTree(corners_map[mapped]).query(points)
+    in_reach = np.flatnonzero(off_m <= survey.reach_m)
+    covariance = _covariance(points[in_reach], sigma_m[in_reach], poses)
+    corner_of = match(points[in_reach], corners_map[mapped], survey.reach_m, covariance)
+    used = in_reach[corner_of >= 0]
     if not len(used):
         return None
-    return ControlPoints(corner_index[known][found[found >= 0]], points[used], sigma_m[used])
+    return ControlPoints(corner_index[mapped][corner_of[corner_of >= 0]], points[used], sigma_m[used])
 
 
 def _covariance(points: FloatArray, sigma_m: FloatArray, poses: PoseSigma) -> FloatArray:
@@ -382,16 +408,16 @@ def _covariance(points: FloatArray, sigma_m: FloatArray, poses: PoseSigma) -> Fl
     drift = poses.position_drift
     apart_m = np.linalg.norm(points[:, None] - points, axis=-1)
     shared = drift.sigma**2 * np.exp(-apart_m / drift.over_m)
-    own = (poses.position_m**2 - drift.sigma**2) * np.eye(len(points))
-    return np.kron(shared + own, np.eye(2)) + np.diag(sigma_m.ravel() ** 2)
+    single = (poses.position_m**2 - drift.sigma**2) * np.eye(len(points))
+    return np.kron(shared + single, np.eye(2)) + np.diag(sigma_m.ravel() ** 2)
 
 
 def name_of(survey: SurveyOptions, point_map: FloatArray) -> str:
     """Name of the survey's control point at ``point_map`` (2,)."""
-    return next(one.id for one in survey.points if np.array_equal(one.position_map, point_map))
+    return next(point.id for point in survey.points if np.array_equal(point.position_map, point_map))
 
 
 def without_corner(survey: SurveyOptions, control: ControlPoints | None) -> list[str]:
     """Names of the control points that ``control`` does not use."""
     used = set() if control is None else set(map(tuple, control.points_map.tolist()))
-    return [one.id for one in survey.points if tuple(one.position_map) not in used]
+    return [point.id for point in survey.points if tuple(point.position_map) not in used]

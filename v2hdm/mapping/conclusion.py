@@ -54,11 +54,18 @@ class FinalSolve:
         solved = _solved_candidates(self.bundle, ungated)
         solved = with_shared_errors(solved, fused, _scatter(self.bundle))
         row = ungated.row
-        own = ungated.own_corner
-        out = np.flatnonzero(~self.inlier & self.sightings.valid[row, own])
-        at = row[out], own[out]
-        place = at[0], ungated.group[out], ungated.corner[out]
-        return with_dissent(solved, fused, *place, located.corners_map[at], located.covariance_m2[at])
+        corner = ungated.own_corner
+        rejected = np.flatnonzero(~self.inlier & self.sightings.valid[row, corner])
+        place = (row[rejected], corner[rejected])
+        return with_dissent(
+            solved,
+            fused,
+            row=row[rejected],
+            group=ungated.group[rejected],
+            corner=ungated.corner[rejected],
+            seen_map=located.corners_map[place],
+            covariance_m2=located.covariance_m2[place],
+        )
 
     def counts(self, corners_map: FloatArray) -> Counts:
         """Counts of candidates with corners (G, 4, 2), from all observations."""
@@ -71,9 +78,9 @@ class FinalSolve:
         shown = np.unique(np.stack([group, image[self.inlier]]), axis=1)
         odds = np.bincount(group, self.sightings.log_odds[accepted], minlength=count)
         easy = np.stack(easy_views(self.views, rig, list(self.cameras.values()), corners_map))
-        found = np.isin(_pair(*easy), _pair(*shown))
+        is_detected = np.isin(_pairs(easy), _pairs(shown))
         ended = self.inlier & self.sightings.valid[all_seen.row, all_seen.own_corner]
-        ended &= np.isin(_pair(all_seen.group, image), _pair(*easy[:, found]))
+        ended &= np.isin(_pairs(np.stack([all_seen.group, image])), _pairs(easy[:, is_detected]))
         corner = 4 * all_seen.group[ended] + all_seen.corner[ended]
         return Counts(
             images=np.bincount(shown[0], minlength=count),
@@ -81,7 +88,7 @@ class FinalSolve:
             agreeing=np.bincount(group, minlength=count),
             log_odds=odds / np.maximum(np.bincount(group, minlength=count), 1),
             easy_views=np.bincount(easy[0], minlength=count),
-            found=np.bincount(easy[0, found], minlength=count),
+            detected_views=np.bincount(easy[0, is_detected], minlength=count),
             pointed=np.bincount(corner, minlength=4 * count).reshape(-1, 4),
             as_symbol=images_with_symbol(self.sightings.symbols, rig, corners_map)
             + images_with_line(self.sightings.lines, rig, corners_map),
@@ -95,14 +102,15 @@ class FinalSolve:
         camera = sightings.camera[bundle.row]
         frame = sightings.frame[bundle.row]
         points = fused.corners_map[bundle.group, bundle.corner]
-        own = bundle.row, bundle.own_corner
-        cam_from_map = rig.cam_from_map(camera, frame, sightings.row_share[own])
+        place = bundle.row, bundle.own_corner
+        cam_from_map = rig.cam_from_map(camera, frame, sightings.row_share[place])
         pixel, _ = project_ground(rig.intrinsic[camera], cam_from_map, points[:, None])
-        return np.asarray(pixel[:, 0] - sightings.corners_pinhole_px[own])
+        return np.asarray(pixel[:, 0] - sightings.corners_pinhole_px[place])
 
 
-def _pair(group: IntArray, image: IntArray) -> IntArray:
-    """One number for each pair of a group and an image."""
+def _pairs(views: IntArray) -> IntArray:
+    """One number (N,) for each pair of a group and an image (2, N)."""
+    group, image = views
     return np.asarray(group * (1 << 32) + image)
 
 
@@ -113,8 +121,10 @@ def conclude(solve: FinalSolve, acceptance: AcceptanceOptions) -> Optimised:
     located = locate(sightings, bundle.rig)
     located.informs[:] &= solve.usable
     solved = solve.candidates(located)
-    noise = bundle.model.variance_factor, bundle.model.pose_sigma
-    corners = PointViews.of_corners(bundle.association, sightings, located, *noise)
+    model = bundle.model
+    corners = PointViews.of_corners(
+        bundle.association, sightings, located, model.variance_factor, model.pose_sigma
+    )
     parallax = measure_parallax(corners, bundle.association.count)
     kind = group_kinds(bundle.association, sightings)
     classified = classify(solved, kind, sightings.kinds, solve.counts, parallax, acceptance)
@@ -168,14 +178,14 @@ def _solved_candidates(bundle: Bundle, ungated: Bundle) -> Candidates:
 
     Covariances are scaled by chi^2 per degree of freedom above one.
     """
-    known = bundle.corner_index >= 0
-    covariance = np.full((len(known), 8, 8), np.nan)
+    solved = bundle.corner_index >= 0
+    covariance = np.full((len(solved), 8, 8), np.nan)
     scale = bundle.solution.variance_scale
     for count in range(1, 5):
-        groups = np.flatnonzero(known.sum(axis=1) == count)
+        groups = np.flatnonzero(solved.sum(axis=1) == count)
         if not len(groups):
             continue
-        corner = np.nonzero(known[groups])[1].reshape(-1, count)
+        corner = np.nonzero(solved[groups])[1].reshape(-1, count)
         indices = np.take_along_axis(bundle.corner_index[groups], corner, axis=1)
         rows = (2 * corner[..., None] + np.arange(2)).reshape(len(groups), -1)
         blocks = scale * bundle.solution.corner_covariance(indices)

@@ -8,6 +8,7 @@ from scipy.special import betaln
 from v2hdm.association.ground import Views, easy_views
 from v2hdm.association.sightings import Sightings
 from v2hdm.mapping.bundle import Bundle
+from v2hdm.mapping.results import ForeignSegment
 from v2hdm.records import BoolArray, Camera, FloatArray, IntArray
 
 _DISTANCES = 10  # bins of a camera's views by distance, each with its own detection rate
@@ -26,8 +27,8 @@ markings of eight simulated drives (right_drives, seeds 1030 to 1037)."""
 
 def foreign_segment(
     bundle: Bundle, sightings: Sightings, views: Views, cameras: tuple[Camera, ...]
-) -> tuple[float, float, float]:
-    """Begin and end, s, of the most likely foreign segment, and its log-likelihood ratio.
+) -> ForeignSegment:
+    """The most likely foreign segment, with its log-likelihood ratio.
 
     Markings of both places must be missing from the other's views, so that lorries and worn paint make no
     segment: the gain is the lower of both places'.
@@ -35,45 +36,45 @@ def foreign_segment(
     group, image = easy_views(views, bundle.rig, cameras, bundle.corners_map)
     accepted = bundle.inliers
     size = int(views.image.max()) + 1
-    known = bundle.group[accepted] * size + sightings.image[bundle.row[accepted]]
-    found = np.isin(group * size + image, known)
+    sighted = bundle.group[accepted] * size + sightings.image[bundle.row[accepted]]
+    detected = np.isin(group * size + image, sighted)
     view = np.searchsorted(views.image, image)
     frame = views.frame[view]
-    apart = bundle.corners_map[group].mean(axis=1) - bundle.rig.map_from_vehicle[frame, :2, 3]
+    away_m = bundle.corners_map[group].mean(axis=1) - bundle.rig.map_from_vehicle[frame, :2, 3]
     # A miss counts less where markings at that distance are detected less often.
-    counted = np.where(found, 1.0, _ease(found, views.camera[view], np.linalg.norm(apart, axis=1)))
-    best = 0.0, 0.0, -np.inf
+    counted = np.where(detected, 1.0, _ease(detected, views.camera[view], np.linalg.norm(away_m, axis=1)))
+    best = ForeignSegment(0.0, 0.0, -np.inf)
     for session in np.unique(sightings.session):
         frames = np.flatnonzero(sightings.session == session)
-        own = sightings.session[frame] == session
-        own &= np.isin(group, group[own & found])
-        if not own.any():
+        in_session = sightings.session[frame] == session
+        in_session &= np.isin(group, group[in_session & detected])
+        if not in_session.any():
             continue
         ends = np.unique(np.linspace(0, len(frames), _ENDS + 1).astype(np.int64))
-        groups, number = np.unique(group[own], return_inverse=True)
+        groups, number = np.unique(group[in_session], return_inverse=True)
         counts = np.zeros((2, len(ends), len(groups)))  # cumulative views: with a detection, and all
-        step = np.searchsorted(ends, frame[own] - frames[0], side="right")
-        for count, views_of_kind in zip(counts, (found[own], counted[own]), strict=True):
+        step = np.searchsorted(ends, frame[in_session] - frames[0], side="right")
+        for count, views_of_kind in zip(counts, (detected[in_session], counted[in_session]), strict=True):
             np.add.at(count, (step, number), views_of_kind)
         counts = counts.cumsum(axis=1)
-        share = (found[own].sum() + 1.0) / (counted[own].sum() + 2.0)
+        share = (detected[in_session].sum() + 1.0) / (counted[in_session].sum() + 2.0)
         for first in range(len(ends) - 1):
             gains = _gains(counts[:, first + 1 :] - counts[:, first, None], counts[:, -1, None], share)
             last = first + 1 + int(gains.argmax())
             gain = float(gains.max() - np.log(len(ends) * (len(ends) - 1) / 2))
-            if gain > best[2]:
+            if gain > best.gain:
                 begin_s, end_s = sightings.stamp_s[frames[[ends[first], ends[last] - 1]]]
-                best = float(begin_s), float(end_s), gain
+                best = ForeignSegment(float(begin_s), float(end_s), gain)
     return best
 
 
-def _ease(found: BoolArray, camera: IntArray, distance_m: FloatArray) -> FloatArray:
+def _ease(detected: BoolArray, camera: IntArray, distance_m: FloatArray) -> FloatArray:
     """Detection rate (P,) at a marking's distance from a camera, relative to the camera's best."""
-    ease = np.ones(len(found))
-    for one in np.unique(camera):
-        own = np.flatnonzero(camera == one)
-        parts = np.array_split(own[np.argsort(distance_m[own])], _DISTANCES)
-        rates = np.array([(found[part].sum() + 1.0) / (len(part) + 2.0) for part in parts])
+    ease = np.ones(len(detected))
+    for index in np.unique(camera):
+        views = np.flatnonzero(camera == index)
+        parts = np.array_split(views[np.argsort(distance_m[views])], _DISTANCES)
+        rates = np.array([(detected[part].sum() + 1.0) / (len(part) + 2.0) for part in parts])
         for part, rate in zip(parts, rates / rates.max(), strict=True):
             ease[part] = rate
     return ease
@@ -84,10 +85,13 @@ def _gains(within: FloatArray, all_over: FloatArray, share: float) -> FloatArray
     beyond = all_over - within
     together = _log_likelihood(all_over, share)
     mistake = np.log([_BY_MISTAKE, 1 - _BY_MISTAKE])
-    home, foreign = (
-        _log_likelihood(own, share) + other[0] * mistake[0] + (other[1] - other[0]) * mistake[1]
-        for own, other in ((beyond, within), (within, beyond))
-    )
+
+    def of_place(inside: FloatArray, outside: FloatArray) -> FloatArray:
+        likelihood = _log_likelihood(inside, share)
+        return np.asarray(likelihood + outside[0] * mistake[0] + (outside[1] - outside[0]) * mistake[1])
+
+    home = of_place(beyond, within)
+    foreign = of_place(within, beyond)
     hidden = np.maximum(home, foreign) + np.log(_HIDDEN / np.maximum(all_over[1], 1.0))
     usual = np.logaddexp(np.log(1 - _HIDDEN) + together, hidden)
     home = home - usual
@@ -95,10 +99,10 @@ def _gains(within: FloatArray, all_over: FloatArray, share: float) -> FloatArray
     home = np.where(beyond[0] > 0, home, -np.inf)
     foreign = np.where(within[0] > 0, foreign, -np.inf)
     gain = np.maximum(np.maximum(home, foreign), np.log(_CONFUSED))
-    both = (within[0] > 0) & (beyond[0] > 0)
-    likelier = home >= foreign, home < foreign
-    of_home, of_foreign = (np.sum(gain, axis=1, where=~both & one) for one in likelier)
-    return np.asarray(np.sum(gain, axis=1, where=both) + np.minimum(of_home, of_foreign))
+    is_mixed = (within[0] > 0) & (beyond[0] > 0)
+    of_home = np.sum(gain, axis=1, where=~is_mixed & (home >= foreign))
+    of_foreign = np.sum(gain, axis=1, where=~is_mixed & (home < foreign))
+    return np.asarray(np.sum(gain, axis=1, where=is_mixed) + np.minimum(of_home, of_foreign))
 
 
 def _log_likelihood(counts: FloatArray, share: float) -> FloatArray:

@@ -62,7 +62,7 @@ class _Track:
 
     rows: IntArray
     kind: int
-    seen: Observations
+    observations: Observations
     corners_map: FloatArray
 
 
@@ -110,10 +110,10 @@ class IncrementalMapper:
         association, _ = self._take_up_safely(tracks, usable, len(self._sightings))
         return association, replace(self._rig, cam_from_vehicle=self.grown.cam_from_vehicle)
 
-    def _begin(self, rig: Rig, known: int) -> None:
+    def _begin(self, rig: Rig, count: int) -> None:
         """Start an empty map from ``rig``; its first ``known`` markings are solved together."""
         self._rig = rig
-        self._known = known
+        self._known = count
         # Only the IPM that the first map starts from, and all that it locates, may be far off.
         self._coarse = rig is self._first_rig
         read_out_s = None if rig.read_out_s is None else np.maximum(rig.read_out_s, 0.0)
@@ -139,28 +139,29 @@ class IncrementalMapper:
         """Map tracks up to ``most`` markings; returns them as groups, and whether the drive ended."""
         number = np.full(len(self._sightings), -1, dtype=np.int64)
         shift = tracks.shift.copy()
-        rows = np.flatnonzero(tracks.group >= 0)
-        rows = rows[np.argsort(tracks.group[rows], kind="stable")]
-        members = np.split(rows, np.flatnonzero(np.diff(tracks.group[rows])) + 1) if len(rows) else []
+        tracked = np.flatnonzero(tracks.group >= 0)
+        tracked = tracked[np.argsort(tracks.group[tracked], kind="stable")]
+        begins = np.flatnonzero(np.diff(tracks.group[tracked])) + 1
+        members = np.split(tracked, begins) if len(tracked) else []
         kinds = group_kinds(tracks, self._sightings)
-        for own in sorted(members, key=lambda own: int(own[-1])):
+        for rows in sorted(members, key=lambda rows: int(rows[-1])):
             if len(self._places) >= most:
                 return Association(number, shift, len(self._places)), False
-            track = self._track(own, int(kinds[tracks.group[own[0]]]), tracks, usable)
+            track = self._track(rows, int(kinds[tracks.group[rows[0]]]), tracks, usable)
             if track is None:
                 continue
             marking, turn = self._same_as(track)
             if self._take(track, marking, turn):
-                number[own] = len(self._places) - 1 if marking is None else marking
-                shift[own] = (shift[own] + turn) % 4
+                number[rows] = len(self._places) - 1 if marking is None else marking
+                shift[rows] = (shift[rows] + turn) % 4
         return Association(number, shift, len(self._places)), True
 
     def _take(self, track: _Track, marking: int | None, turn: int) -> bool:
         """Map a track as part of ``marking``, or as a new one if None; returns whether it succeeded."""
-        corner = (track.seen.corner - turn) % 4
-        known = np.isfinite(track.corners_map).all(axis=1)
+        corner = (track.observations.corner - turn) % 4
+        is_point = np.isfinite(track.corners_map).all(axis=1)
         place = (
-            _Place(np.full(4, -1, dtype=np.int64), track.kind, set(), np.asarray(known), track.corners_map)
+            _Place(np.full(4, -1, dtype=np.int64), track.kind, set(), np.asarray(is_point), track.corners_map)
             if marking is None
             else self._places[marking]
         )
@@ -168,12 +169,13 @@ class IncrementalMapper:
         further = np.setdiff1d(corner, np.flatnonzero(numbers >= 0))
         numbers[further] = np.count_nonzero(numbers >= 0) + np.arange(len(further))
         turned_map = track.corners_map[(np.arange(4) + turn) % 4]
-        sighted = Sighted(replace(track.seen, corner=numbers[corner]))
+        sighted = Sighted(replace(track.observations, corner=numbers[corner]))
         if not self._coarse:
             kind = self._sightings.kinds[place.kind]
-            corners = (turned_map[None], numbers[None])
-            lengths = known_lengths(self._options.known_sizes, [kind], *corners)
-            control = control_points(self._options.survey, *corners, PoseSigma(self._floor_m))
+            sizes = self._options.known_sizes
+            poses = PoseSigma(self._floor_m)
+            lengths = known_lengths(sizes, [kind], turned_map[None], numbers[None])
+            control = control_points(self._options.survey, turned_map[None], numbers[None], poses)
             sighted = replace(sighted, lengths=lengths, control=control)
         count = len(self._places)
         number = count if marking is None else marking
@@ -200,8 +202,8 @@ class IncrementalMapper:
         if not self.grown.is_solved(marking):
             return place.preview
         out = np.full((4, 2), np.nan)
-        known = (place.corner >= 0) & place.point
-        out[known] = self.grown.corners_map(marking)[place.corner[known]]
+        is_seen = (place.corner >= 0) & place.point
+        out[is_seen] = self.grown.corners_map(marking)[place.corner[is_seen]]
         return out
 
     def _track(self, rows: IntArray, kind: int, tracks: Association, usable: BoolArray) -> _Track | None:
@@ -214,21 +216,22 @@ class IncrementalMapper:
         which = which[twice[corner]]
         corner = corner[twice[corner]]
         row = rows[which]
-        own = order[which, corner]
-        points = np.bincount(corner[self._sightings.valid[row, own]], minlength=4) > 0
+        own_corner = order[which, corner]
+        points = np.bincount(corner[self._sightings.valid[row, own_corner]], minlength=4) > 0
         if np.count_nonzero(points) < 2:
             return None
-        known, dense = np.unique(corner, return_inverse=True)
-        seen = observations_at(self._sightings, (row, own), dense.astype(np.int64), self._model)
+        present, dense = np.unique(corner, return_inverse=True)
+        at = (row, own_corner)
+        observations = observations_at(self._sightings, at, dense.astype(np.int64), self._model)
         corners = np.full((4, 2), np.nan)
         try:
-            corners[known] = self.grown.preview(Sighted(seen))
+            corners[present] = self.grown.preview(Sighted(observations))
         except AdjustError:
             return None
-        if not np.isfinite(corners[known]).all():
+        if not np.isfinite(corners[present]).all():
             return None
         corners[~points] = np.nan
-        return _Track(rows, kind, replace(seen, corner=corner), corners)
+        return _Track(rows, kind, replace(observations, corner=corner), corners)
 
     def _same_as(self, track: _Track) -> tuple[int | None, int]:
         """The mapped marking at a track's position, if any: its corner c is the track's (c + turn) mod 4."""
@@ -246,15 +249,15 @@ class IncrementalMapper:
         floor_m = np.hypot(self._floor_m, REFINED_SIGMA_RAD * range_m**2 / height_m)
         gate_m = float(min(GATE_SIGMAS * np.sqrt(2) * floor_m, MAX_GATE_M))
         best: tuple[float, int | None, int] = (gate_m, None, 0)
-        near = np.linalg.norm(self._centres - middle, axis=1) < gate_m + size_m
-        for marking in np.flatnonzero(near).tolist():
+        in_reach = np.linalg.norm(self._centres - middle, axis=1) < gate_m + size_m
+        for marking in np.flatnonzero(in_reach).tolist():
             place = self._places[marking]
             if place.kind != track.kind or not images.isdisjoint(place.images):
                 continue
             mapped = self._corners(marking)
             whole = np.asarray(np.isfinite(mapped).all(axis=1))
-            there = align(np.nan_to_num(mapped), whole, np.nan_to_num(corners), valid)
-            off_m = float(np.linalg.norm(there.offset))
-            if off_m < best[0] and there.deformation_m < tolerance_m:
-                best = (off_m, marking, int(there.shift))
+            aligned = align(np.nan_to_num(mapped), whole, np.nan_to_num(corners), valid)
+            off_m = float(np.linalg.norm(aligned.offset))
+            if off_m < best[0] and aligned.deformation_m < tolerance_m:
+                best = (off_m, marking, int(aligned.shift))
         return best[1], best[2]

@@ -62,17 +62,17 @@ class Inputs:
         now_s = {(image.session, image.camera): image.clock_offset_s for image in drive.images}
         moved = drive
         for session, later in enumerate(later_s):
-            own = {
+            offset_s = {
                 name: now_s[session, name] + late for name, late in later.items() if (session, name) in now_s
             }
-            moved = with_clock_offsets(moved, own, max_gap_s=float("inf"), session=session)
+            moved = with_clock_offsets(moved, offset_s, max_gap_s=float("inf"), session=session)
         number = {image.path: n for n, image in enumerate(moved.images)}
         detections = [
-            replace(one, image=number[drive.images[one.image].path])
-            for one in self.detections
-            if drive.images[one.image].path in number
+            replace(detected, image=number[drive.images[detected.image].path])
+            for detected in self.detections
+            if drive.images[detected.image].path in number
         ]
-        return replace(self, drive=moved, detections=sorted(detections, key=lambda one: one.image))
+        return replace(self, drive=moved, detections=sorted(detections, key=lambda detected: detected.image))
 
     def without_axis(self, names: Sequence[str], axis: int) -> Inputs | None:
         """The inputs with one axis of these cameras' centres unsurveyed; None if it is already."""

@@ -21,7 +21,7 @@ from v2hdm.association.groups import Association, FusedGroups, group_kinds, keep
 from v2hdm.association.sightings import camera_of, frames_of
 from v2hdm.association.tracks import LEAST_SIGHTINGS
 from v2hdm.errors import ConfigError
-from v2hdm.faults import Fault
+from v2hdm.faults import table
 from v2hdm.geometry.ipm import extrinsic_from_ipm, facing_ipm, flat_motion, ipm_from_extrinsic
 from v2hdm.geometry.planar import inside_convex, is_convex
 from v2hdm.io.maps.evidence import Residuals
@@ -36,7 +36,18 @@ from v2hdm.mapping.optimise import silent
 from v2hdm.mapping.options import MappingOptions, check_options
 from v2hdm.mapping.recovery import Outcome, optimise
 from v2hdm.mapping.results import AdjustedPoses, ClockOffset, MethodResult
-from v2hdm.records import Drive, Exclusion, FloatArray, HDMap, Image, ImageDetections, IntArray, Lane, Marking
+from v2hdm.records import (
+    BEST,
+    Drive,
+    Exclusion,
+    FloatArray,
+    HDMap,
+    Image,
+    ImageDetections,
+    IntArray,
+    Lane,
+    Marking,
+)
 from v2hdm.site.corrections import with_symbols_corrected
 from v2hdm.site.living.changes import Base, update_map
 from v2hdm.site.living.looks import Observer
@@ -48,19 +59,20 @@ def adjusted_poses(outcome: Outcome) -> AdjustedPoses:
     drive = outcome.inputs.drive
     sightings = outcome.inputs.sightings
     bundle = outcome.bundle
-    sigma = np.stack([one.by_state() for one in bundle.model.pose_sigma])[sightings.session]
+    by_session = np.stack([stated.by_state() for stated in bundle.model.pose_sigma])
+    sigma = by_session[sightings.session]
     used = bundle.frames
     if bundle.model.solver.pose_states:
         sigma[used] = np.sqrt(bundle.solution.covariance.poses() * bundle.solution.variance_scale)
-    seen = np.zeros(len(sightings.stamp_s), dtype=bool)
-    seen[used] = True
+    is_used = np.zeros(len(sightings.stamp_s), dtype=bool)
+    is_used[used] = True
     frames = frames_of(drive).frame_of_image
     return AdjustedPoses(
         stamp_s=sightings.stamp_s,
         before=sightings.map_from_vehicle,
         map_from_vehicle=bundle.rig.map_from_vehicle,
         sigma=sigma,
-        seen=seen,
+        seen=is_used,
         frame={image.path: int(frame) for image, frame in zip(drive.images, frames, strict=True)},
         session=sightings.session,
     )
@@ -71,15 +83,15 @@ def clock_offsets(outcome: Outcome) -> tuple[dict[str, ClockOffset], ...]:
     evidence = outcome.evidence
     drive = outcome.inputs.drive
     applied_s = {(image.session, image.camera): image.clock_offset_s for image in drive.images}
-    score_tests = [one for one in evidence.score_tests if one.fault is Fault.CLOCK]
+    score_tests = [test for test in evidence.score_tests if test.fault is table.CLOCK]
     out = []
     for session, (place, estimated) in enumerate(zip(drive.sessions, evidence.clock_s, strict=True)):
-        here = [one for one in score_tests if one.about in ("", f"in {place.name}")]
+        tests_here = [test for test in score_tests if test.about in ("", f"in {place.name}")]
         clocks = {}
         for name in outcome.inputs.sightings.cameras:
             # A camera's own clock and one common to all cameras: the offset may differ by both.
-            tested = [one.sigma**2 for one in here if name in one.cameras]
-            unobserved = 0.0, float(np.sqrt(sum(tested))) if tested else float("inf")
+            variances_s2 = [test.sigma**2 for test in tests_here if name in test.cameras]
+            unobserved = 0.0, float(np.sqrt(sum(variances_s2))) if variances_s2 else float("inf")
             beyond_s, sigma_s = estimated.get(name, unobserved)
             if (session, name) in applied_s:
                 clocks[name] = ClockOffset(applied_s[session, name] + beyond_s, sigma_s)
@@ -94,8 +106,8 @@ def joint_covariance(optimised: Optimised, marking: IntArray, corner: IntArray) 
     """
     bundle = optimised.bundle
     index = bundle.corner_index[optimised.groups[marking]]
-    own = index[np.arange(len(corner)), corner]
-    number = np.where(own >= 0, own, index.max(axis=1))
+    corner_index = index[np.arange(len(corner)), corner]
+    number = np.where(corner_index >= 0, corner_index, index.max(axis=1))
     out = bundle.solution.variance_scale * bundle.solution.corner_covariance(number)
     _state(out, optimised.markings, marking, corner)
     # Combined from two sources, it may have negative eigenvalues of about a square millimetre.
@@ -113,10 +125,10 @@ def stated_covariance(markings: Sequence[Marking], marking: IntArray, corner: In
 def _state(out: FloatArray, markings: Sequence[Marking], marking: IntArray, corner: IntArray) -> None:
     """Set each marking's blocks of ``out`` to its own covariance."""
     rows = 2 * corner[:, None] + np.arange(2)
-    for k, own in enumerate(marking.tolist()):
-        stated = markings[own].covariance_m2
+    for k, number in enumerate(marking.tolist()):
+        stated = markings[number].covariance_m2
         assert stated is not None
-        for other in np.flatnonzero(marking == own):
+        for other in np.flatnonzero(marking == number):
             out[2 * k : 2 * k + 2, 2 * other : 2 * other + 2] = stated[np.ix_(rows[k], rows[other])]
 
 
@@ -125,11 +137,11 @@ def residuals_of(outcome: Outcome, optimised: Optimised) -> Residuals:
     drive = outcome.inputs.drive
     sightings = outcome.inputs.sightings
     bundle = optimised.bundle
-    seen, row_image = np.unique(sightings.image[bundle.row], return_inverse=True)
+    numbers, row_image = np.unique(sightings.image[bundle.row], return_inverse=True)
     marking = np.zeros(bundle.association.count, dtype=np.int64)
     # Markings without ids are numbered in order, as in the files.
     marking[optimised.groups] = np.arange(1, len(optimised.groups) + 1)
-    images = [drive.images[i] for i in seen.tolist()]
+    images = [drive.images[i] for i in numbers.tolist()]
     return Residuals(
         image=tuple(drive.name_of(image.path) for image in images),
         camera=tuple(image.camera for image in images),
@@ -171,23 +183,24 @@ def run_methods(
     if options.survey.file is not None:
         raise ConfigError(f"mapping.survey.file is {options.survey.file!r}: read it and give its points")
     progress("linking sightings")
-    given = Inputs(drive, detections, cameras, options)
+    inputs = Inputs(drive, detections, cameras, options)
     results: dict[str, MethodResult] = {}
     for name, known_as in NAIVE_IPMS.items():
-        ipms = {one: camera_of(drive, one).ipm for one in cameras}
+        ipms = {camera: camera_of(drive, camera).ipm for camera in cameras}
         if all(known_as in ipm for ipm in ipms.values()):
             progress(name)
-            results[name] = run_naive(name, given, {one: ipm[known_as] for one, ipm in ipms.items()})
-    outcome, optimised = optimise(given, progress)
+            results[name] = run_naive(name, inputs, {camera: ipm[known_as] for camera, ipm in ipms.items()})
+    outcome, optimised = optimise(inputs, progress)
     optimal = _optimised_result(outcome, optimised)
     if base is not None:
         progress("the earlier map")
         optimal = _brought_up_to_date(base, optimal, outcome, optimised, grey)
-    results["Opt"] = optimal
+    results[BEST] = optimal
     progress("ONI")
-    found = optimal.calibrations
-    ipm_found = {c: ipm_from_extrinsic(found[c].info, found[c].cam_from_vehicle) for c in cameras}
-    results["ONI"] = replace(run_naive("ONI", outcome.inputs, ipm_found), calibrations=found)
+    calibrations = optimal.calibrations
+    in_order = [(camera, calibrations[camera]) for camera in cameras]
+    optimised_ipm = {camera: ipm_from_extrinsic(at.info, at.cam_from_vehicle) for camera, at in in_order}
+    results["ONI"] = replace(run_naive("ONI", outcome.inputs, optimised_ipm), calibrations=calibrations)
     return results
 
 
@@ -208,7 +221,7 @@ def run_naive(name: str, inputs: Inputs, ipm: Mapping[str, FloatArray]) -> Metho
 
 
 _NAIVE_MERGE_M = 1.0  # largest distance of two tracks of one marking in the naive methods
-_NAIVE_SHAPE_TOLERANCE = 0.5  # their corners' largest deviation, as a fraction of the marking's diameter
+_NAIVE_SHAPE_TOLERANCE = 0.5  # largest deviation of the corners of two such tracks over a marking's diameter
 
 
 def _naive_markings(
@@ -230,8 +243,8 @@ def _naive_markings(
     corners_map = ground.at_rows(corners_map, sightings.image[:, None], sightings.row_share)
     usable = (inputs.tracks.group >= 0) & sightings.valid.all(axis=1)
     for c, roi in enumerate(rois):
-        own = sightings.camera == c
-        usable[own] &= inside_convex(roi, corners_vehicle[own]).all(axis=1)
+        of_camera = sightings.camera == c
+        usable[of_camera] &= inside_convex(roi, corners_vehicle[of_camera]).all(axis=1)
     tracks = keep_rows(inputs.tracks, usable)
     association = merge_groups(
         tracks,
@@ -245,8 +258,14 @@ def _naive_markings(
     average = _average(association, corners_map)
     markings: list[Marking] = []
     excluded: list[Exclusion] = []
-    each = zip(average.corners_map, is_convex(average.corners_map), average.seen[:, 0].tolist(), strict=True)
-    for kind, (corners, convex, count) in zip(group_kinds(association, sightings), each, strict=True):
+    groups = zip(
+        group_kinds(association, sightings),
+        average.corners_map,
+        is_convex(average.corners_map),
+        average.point_sightings[:, 0].tolist(),
+        strict=True,
+    )
+    for kind, corners, convex, count in groups:
         name = sightings.kinds[kind]
         if count >= LEAST_SIGHTINGS and convex:
             markings.append(Marking(name, corners, count))
@@ -260,13 +279,13 @@ def _average(association: Association, corners_map: FloatArray) -> FusedGroups:
     """Mean of each group's corners, without covariance."""
     rows = np.flatnonzero(association.group >= 0)
     corners = association.in_group_order(corners_map)[rows]
-    seen = np.bincount(association.group[rows], minlength=association.count)
+    sightings = np.bincount(association.group[rows], minlength=association.count)
     total = np.zeros((association.count, 4, 2))
     np.add.at(total, association.group[rows], corners)
     return FusedGroups(
-        corners_map=total / np.maximum(seen, 1)[:, None, None],
+        corners_map=total / np.maximum(sightings, 1)[:, None, None],
         covariance_m2=np.zeros((association.count, 4, 2, 2)),
-        seen=np.repeat(seen[:, None], 4, axis=1),
+        point_sightings=np.repeat(sightings[:, None], 4, axis=1),
     )
 
 
@@ -287,16 +306,23 @@ def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
             "%d of %d surveyed points are not used, since no map corner matches them within %g m: %s",
             len(lost), len(options.survey.points), options.survey.reach_m, ", ".join(lost),
         )  # fmt: skip
-    known = observability(bundle.problem, solution)
+    observed = observability(bundle.problem, solution)
     surface = inputs.optimiser.surface
     if bundle.knots is not None:
         lanes = draw_lanes(bundle.knots, solution)
     else:
         lanes = _lanes(inputs, ground_by_rig(drive, cameras, bundle.rig, surface))
     infos = [drive.cameras[name].info for name in inputs.sightings.cameras]
-    given = inputs.optimiser.sightings.symbols, bundle.rig, infos, noise.roll_pitch_rad, optimised.markings
-    symbols, no_symbols = map_symbols(*given, options.acceptance)
-    for kind, count in Counter(one.kind for one in no_symbols if one.reason == NO_POLYGON).items():
+    symbols, no_symbols = map_symbols(
+        inputs.optimiser.sightings.symbols,
+        bundle.rig,
+        infos,
+        noise.roll_pitch_rad,
+        optimised.markings,
+        options.acceptance,
+    )
+    no_polygons = Counter(exclusion.kind for exclusion in no_symbols if exclusion.reason == NO_POLYGON)
+    for kind, count in no_polygons.items():
         _log.warning("class %s: %d left out: %s", kind, count, NO_POLYGON)
     hd_map = HDMap(optimised.markings, lanes, drive.origin, symbols, noise.position_drift_over_m)
     if surface is not None:
@@ -305,7 +331,7 @@ def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
         hd_map = replace(hd_map, ground=surface.strips())
     hd_map, rejected = with_symbols_corrected(hd_map, options.acceptance.corrections)
     return MethodResult(
-        name="Opt",
+        name=BEST,
         cameras=tuple(cameras),
         hd_map=hd_map,
         calibrations=optimised.calibrations,
@@ -320,7 +346,7 @@ def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
             "gap": solution.gap,
             "chi2_per_dof": solution.chi2_per_dof,
         },
-        certainty={name: known[index].sentence(name) for name, index in bundle.camera_index.items()},
+        certainty={name: observed[index].sentence(name) for name, index in bundle.camera_index.items()},
         evidence=outcome.evidence,
         poses=adjusted_poses(outcome),
         clocks=clock_offsets(outcome),
@@ -333,7 +359,7 @@ def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
 
 def _brought_up_to_date(
     base: Base,
-    made: MethodResult,
+    result: MethodResult,
     outcome: Outcome,
     optimised: Optimised,
     grey: Callable[[Image], NDArray[np.float32]] | None,
@@ -342,22 +368,24 @@ def _brought_up_to_date(
     group = optimised.bundle.association.group
     observer = Observer(
         outcome.inputs.optimiser.sightings,
-        views_of(drive, made.cameras),
-        tuple(drive.cameras[name] for name in made.cameras),
+        views_of(drive, result.cameras),
+        tuple(drive.cameras[name] for name in result.cameras),
         optimised.bundle.rig,
         drive.pose_noise.roll_pitch_rad,
         None if grey is None else lambda image: grey(drive.images[image]),
     )
     mapped = np.isin(group, optimised.groups)
     over_m = drive.pose_noise.position_drift_over_m
-    hd_map, changes, *names = update_map(base, made.hd_map, observer, mapped, over_m)
-    hd_map = replace(hd_map, ground=made.hd_map.ground)
-    residuals = None if made.residuals is None else made.residuals.renamed(*names)
-    suspicions = [replace(one, marking=int(names[0][one.marking - 1])) for one in made.suspicions]
+    update = update_map(base, result.hd_map, observer, mapped, over_m)
+    hd_map = replace(update.hd_map, ground=result.hd_map.ground)
+    residuals = None if result.residuals is None else result.residuals.renamed(update.ids, update.corners)
+    suspicions = [
+        replace(suspicion, marking=int(update.ids[suspicion.marking - 1])) for suspicion in result.suspicions
+    ]
     return replace(
-        made,
+        result,
         hd_map=hd_map,
-        changes=changes,
+        changes=update.changes,
         joint_covariance=partial(stated_covariance, hd_map.markings),
         residuals=residuals,
         suspicions=suspicions,

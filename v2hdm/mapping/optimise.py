@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from v2hdm.association.groups import Association, attach, fuse_groups, in_view, 
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.association.tracks import IPM_SIGMA_RAD, REFINED_SIGMA_RAD, build_tracks
 from v2hdm.errors import AdjustError, MappingError
-from v2hdm.faults import height_information, moves_with_heights
+from v2hdm.faults.sensitivity import height_information, moves_with_heights
 from v2hdm.geometry.ipm import initial_extrinsic
 from v2hdm.lanes.knots import Knots
 from v2hdm.mapping.bundle import (
@@ -34,7 +35,6 @@ from v2hdm.mapping.bundle import (
     vehicle_twists,
 )
 from v2hdm.mapping.conclusion import FinalSolve, Optimised, conclude
-from v2hdm.mapping.incremental import IncrementalMapper
 from v2hdm.mapping.options import AUTO, SURFACE, MappingOptions
 from v2hdm.records import BoolArray, Camera, FloatArray, PoseNoise, Road, largest_noise
 from v2hdm.surface.paths import Paths
@@ -54,6 +54,14 @@ _SETTLED_M = 1e-3  # RMS change of the observed heights at which the ground has 
 
 def silent(step: str) -> None:
     """Ignore progress."""
+
+
+class _BetterGround(NamedTuple):
+    """A more likely ground."""
+
+    surface: Surface
+    gain: float  # fall of the cost beyond that by noise
+    step_m: float  # RMS change of the observed heights
 
 
 class Optimiser:
@@ -78,9 +86,10 @@ class Optimiser:
         self._cameras = {name: cameras[name] for name in sightings.cameras}
         self._noises = pose_noise
         self._pose_noise = largest_noise(pose_noise)
-        self._stated_sigma = tuple(pose_sigma_of(one) for one in pose_noise)
+        self._stated_sigma = tuple(pose_sigma_of(noise) for noise in pose_noise)
         self._pose_sigma = self._estimated_sigma = self._stated_sigma
-        self._options, self._recorded = options, Recorded.of(road, self._pose_noise)
+        self._options = options
+        self._recorded = Recorded.of(road, self._pose_noise)
         self.pose_model = _SETTLED_MODEL if options.pose_model == AUTO else options.pose_model
         """The pose model, one of :data:`v2hdm.adjust.MODELS`."""
         self._variance_factor = 1.0
@@ -100,9 +109,10 @@ class Optimiser:
         located = self._locate(self.initial_rig)
         height_m = located.height_m[:, None]
         sine = np.where(located.valid, height_m / np.hypot(located.range_m, height_m), -np.inf)
-        known = sine[located.valid]
-        steep = sine >= (min(_STEEP_SINE, float(np.median(known))) if len(known) else _STEEP_SINE)
-        bundle = self._solve(tracks, steep, self.initial_rig, coarse=True)
+        least = _STEEP_SINE
+        if located.valid.any():
+            least = min(least, float(np.median(sine[located.valid])))
+        bundle = self._solve(tracks, sine >= least, self.initial_rig, coarse=True)
         for number in range(1, self._options.rounds + 1):
             progress(f"joint solve {number}")
             association = self._associate(bundle.rig)
@@ -149,8 +159,17 @@ class Optimiser:
             lanes = knots, final.solution.corners_map[:count]
             final = self._solve(final.association, usable, final.rig, lanes=lanes)
             final = replace(final, solution=replace(final.solution, chi2_per_dof=fit))
-        given = self.sightings, self._views, self._cameras, self.initial_rig, self._pose_noise.roll_pitch_rad
-        solve = FinalSolve(self._with_errors_of_ground(final), bundle, inlier, usable, *given)
+        solve = FinalSolve(
+            bundle=self._with_errors_of_ground(final),
+            ungated=bundle,
+            inlier=inlier,
+            usable=usable,
+            sightings=self.sightings,
+            views=self._views,
+            cameras=self._cameras,
+            initial_rig=self.initial_rig,
+            jitter_rad=self._pose_noise.roll_pitch_rad,
+        )
         return conclude(solve, self._options.acceptance)
 
     def _with_errors_of_ground(self, bundle: Bundle) -> Bundle:
@@ -181,16 +200,17 @@ class Optimiser:
     def is_curved(self, bundle: Bundle) -> bool:
         """Whether ``bundle``, on a surface, predicts held-out observations better than on the plane."""
         problem = self._as_stated(bundle)
-        own = bundle.own_corner
-        seen = replace(problem.observations, pinhole_px=self._seen.corners_pinhole_px[bundle.row, own])
+        pinhole_px = self._seen.corners_pinhole_px[bundle.row, bundle.own_corner]
+        flat = replace(problem, observations=replace(problem.observations, pinhole_px=pinhole_px))
         try:
-            return predicts_better(problem, replace(problem, observations=seen), bundle.model.solver)
+            return predicts_better(problem, flat, bundle.model.solver)
         except AdjustError as failure:
             _log.warning("the ground stays a plane, since no surface could be fitted: %s", failure)
             return False
 
     def grow(self, progress: Callable[[str], None] = silent) -> Bundle:
         """Map track after track, as on the vehicle, in place of :meth:`settle`; then solve for all."""
+        from v2hdm.mapping.incremental import IncrementalMapper
 
         def link(rig: Rig, coarse: bool) -> tuple[Association, BoolArray]:
             tracks = self._track(rig, self._locate(rig), IPM_SIGMA_RAD if coarse else REFINED_SIGMA_RAD)
@@ -218,8 +238,11 @@ class Optimiser:
         step_m = np.inf
         for number in range(_GROUND_ROUNDS):
             if number or surface is None:
-                surface, _, step_m = self._better_ground(bundle, surface)
-            self.surface, self.sightings = surface, surface.flattened(self._seen, bundle.rig)
+                better = self._better_ground(bundle, surface)
+                surface = better.surface
+                step_m = better.step_m
+            self.surface = surface
+            self.sightings = surface.flattened(self._seen, bundle.rig)
             bundle = self._solve_all(self._associate(bundle.rig), bundle.rig)
             if step_m < _SETTLED_M:
                 break
@@ -227,29 +250,31 @@ class Optimiser:
             _log.info("%s: %s", ", ".join(self.camera_names), surface.sentence)
         return bundle
 
-    def _better_ground(self, bundle: Bundle, surface: Surface | None) -> tuple[Surface, float, float]:
-        """The most likely ground under ``bundle``, from ``surface`` or level, its gain, and its change, m."""
+    def _better_ground(self, bundle: Bundle, surface: Surface | None) -> _BetterGround:
+        """The most likely ground under ``bundle``, starting from ``surface`` or level."""
         paths = Paths.of(bundle.rig.map_from_vehicle, self._seen.session)
         surface = Surface.level(paths) if surface is None else replace(surface, paths=paths)
         points_map = bundle.solution.corners_map[bundle.problem.observations.corner]
         columns = surface.seen_columns(points_map, self._seen.frame[bundle.row])
-        better, gain = surface.estimated(*height_information(bundle.solution, columns), self._recorded)
+        information, score = height_information(bundle.solution, columns)
+        better, gain = surface.estimated(information, score, self._recorded)
         step_m = columns @ (better.parameters - surface.parameters)
-        return better, gain, float(np.sqrt(np.mean(step_m**2)))
+        return _BetterGround(better, gain, float(np.sqrt(np.mean(step_m**2))))
 
     def likeliest_surface(self, bundle: Bundle) -> tuple[Surface, float]:
         """The most likely surface under ``bundle``, on the plane, and its gain.
 
         The gain is the improvement in cost over that expected from noise (AIC).
         """
-        return self._better_ground(bundle, None)[:2]
+        better = self._better_ground(bundle, None)
+        return better.surface, better.gain
 
     def _locate(self, rig: Rig) -> Located:
         """Ground positions, restricted to the range within which sightings form groups."""
         located = locate(self.sightings, rig)
         with np.errstate(invalid="ignore"):
-            near = located.range_m <= self._options.max_range_m
-        return replace(located, valid=located.valid & near, informs=located.informs & near)
+            in_range = located.range_m <= self._options.max_range_m
+        return replace(located, valid=located.valid & in_range, informs=located.informs & in_range)
 
     def _usable(self, association: Association, rig: Rig) -> BoolArray:
         """Corners (S, 4) that a joint solve may use, given the groups' positions."""
@@ -302,7 +327,8 @@ class Optimiser:
         bundle = self._solve(association, usable, rig)
         if len(bundle.row) >= LEAST_OBSERVATIONS:
             factor = self._variance_factor * bundle.solution.observation_factor
-            self._variance_factor = float(np.clip(factor, *VARIANCE_FACTORS))
+            least, largest = VARIANCE_FACTORS
+            self._variance_factor = float(np.clip(factor, least, largest))
         return bundle
 
     def _weigh_poses(self, bundle: Bundle) -> Bundle:
@@ -310,22 +336,30 @@ class Optimiser:
         stated = self._stated_sigma
         estimated = estimate_noise(replace(bundle.problem, pose_sigma=stated), bundle.solution)
         self._estimated_sigma = estimated
-        self._pose_sigma = tuple(_larger(*sigmas) for sigmas in zip(stated, estimated, strict=True))
+        self._pose_sigma = tuple(map(_larger, stated, estimated))
         return self._solve_all(bundle.association, bundle.rig)
 
     @property
     def pose_noise(self) -> dict[str, float]:
         """Estimated over stated pose noise, by kind."""
-        both = self._estimated_sigma, self._stated_sigma
+
+        def largest(sigmas: Sequence[PoseSigma], kind: str) -> float:
+            return max(float(getattr(sigma, kind)) for sigma in sigmas)
+
         kinds = ("position_m", "heading_rad", "roll_pitch_rad")
-        largest = {kind: [max(getattr(one, kind) for one in sigmas) for sigmas in both] for kind in kinds}
-        return {kind: estimated / stated for kind, (estimated, stated) in largest.items() if stated > 0}
+        estimated = {kind: largest(self._estimated_sigma, kind) for kind in kinds}
+        stated = {kind: largest(self._stated_sigma, kind) for kind in kinds}
+        return {kind: estimated[kind] / stated[kind] for kind in kinds if stated[kind] > 0}
 
     def _as_stated(self, bundle: Bundle) -> Problem:
         """The problem of ``bundle``, from its end, with the detector's own covariances."""
-        seen = bundle.problem.observations
-        stated = replace(seen, covariance_px=seen.covariance_px / bundle.model.variance_factor)
-        return replace(bundle.problem, cam_from_vehicle=bundle.solution.cam_from_vehicle, observations=stated)
+        observations = bundle.problem.observations
+        covariance_px = observations.covariance_px / bundle.model.variance_factor
+        return replace(
+            bundle.problem,
+            cam_from_vehicle=bundle.solution.cam_from_vehicle,
+            observations=replace(observations, covariance_px=covariance_px),
+        )
 
     def _choose_pose_model(self, bundle: Bundle) -> str:
         """Name of the model that best predicts held-out observations, from the end of ``bundle``."""
@@ -339,21 +373,23 @@ class Optimiser:
         return selection.name
 
 
-def _larger(stated: PoseSigma, own: PoseSigma) -> PoseSigma:
+def _larger(stated: PoseSigma, estimated: PoseSigma) -> PoseSigma:
     """``stated`` with the estimated noise of height, attitude or heading where larger."""
     kinds = {
         "height_m": ("height_m",),
         "roll_pitch_rad": ("roll_pitch_rad", "roll_pitch_drift"),
         "heading_rad": ("heading_rad", "heading_drift"),
     }
-    larger = [names for kind, names in kinds.items() if getattr(own, kind) > getattr(stated, kind)]
-    return replace(stated, **{name: getattr(own, name) for names in larger for name in names})
+    larger = [names for kind, names in kinds.items() if getattr(estimated, kind) > getattr(stated, kind)]
+    return replace(stated, **{name: getattr(estimated, name) for names in larger for name in names})
 
 
 def initial_rig(cameras: Mapping[str, Camera], map_from_vehicle: FloatArray) -> Rig:
     """Extrinsics nearest to each camera's initial IPM, with the recorded poses (F, 4, 4)."""
     intrinsic = np.stack([camera.info.intrinsic for camera in cameras.values()])
-    return Rig(intrinsic, np.stack([initial_extrinsic(one) for one in cameras.values()]), map_from_vehicle)
+    return Rig(
+        intrinsic, np.stack([initial_extrinsic(camera) for camera in cameras.values()]), map_from_vehicle
+    )
 
 
 def rolling(rig: Rig, cameras: Iterable[Camera], sightings: Sightings, estimate: bool) -> Rig:

@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from v2hdm.adjust import pose_innovations
 from v2hdm.association.ground import views_of
 from v2hdm.association.sightings import Sightings
 from v2hdm.errors import AdjustError, MappingError
-from v2hdm.faults import CHANGES, Fault, ScoreTest, score_faults
+from v2hdm.faults import Contradiction, Item, Recovery, ScoreTest, table
 from v2hdm.faults.odds import (
     CLEAR_SIGMAS,
     RIVAL_LOG_ODDS,
@@ -28,6 +29,7 @@ from v2hdm.faults.odds import (
     is_doubtful,
     log_odds,
 )
+from v2hdm.faults.score_tests import score_faults
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.mapping.bundle import Bundle, name_of
 from v2hdm.mapping.conclusion import Optimised
@@ -35,7 +37,7 @@ from v2hdm.mapping.foreign import foreign_segment
 from v2hdm.mapping.inputs import Inputs
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import AUTO, INCREMENTAL, SURFACE, SurveyOptions
-from v2hdm.mapping.results import CameraFit, Contradiction, SolveEvidence
+from v2hdm.mapping.results import CameraFit, ForeignSegment, SolveEvidence
 from v2hdm.records import Drive, FloatArray
 
 _log = logging.getLogger(__name__)
@@ -44,14 +46,7 @@ _AMBIGUOUS_SHARE = 0.8
 """Fraction of its sigmas from which another camera's fault may be the cause: a straight road at constant
 speed determines the distance of two centres, or the difference of two clocks, alone."""
 
-_CLOCK_CORRECTABLE_S = 0.006
-"""Largest sigma, s, at which a contradicted clock is corrected: a late clock adds scatter to its estimate."""
-
-_CENTRE_OBSERVABLE_M = 0.1  # sigma of a centre, m, above which a drive needs its survey: it shifts the map
 _MOST_CORRECTIONS = 4  # most inputs dropped one by one; with more of them wrong nothing is reliable
-
-_LIKE_GROUND = (Fault.CROWN, Fault.FOCAL, Fault.DISTORTION, Fault.PRINCIPAL)
-"""Faults that deform a plane's image: if a surface leaves one, that is the more likely cause."""
 
 _MEDIAN_SQUARED = 2 * float(np.log(2))
 """Median of a squared Mahalanobis distance: chi-square with two degrees of freedom."""
@@ -74,32 +69,40 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
         # 1. Associate and solve, as a batch or marking by marking.
         settled = _settled(inputs, progress)
         # 2. Switch to a surface where the drive contradicts the plane and a surface explains all of it.
-        inputs, settled, found = _over_ground(inputs, settled, progress)
-        worst = _worst(found)
+        tested = _over_ground(inputs, settled, progress)
+        inputs = tested.inputs
+        settled = tested.settled
+        worst = _worst(tested.tests)
         optimiser = inputs.optimiser
-        drive = inputs.drive
+        sessions = _session_names(inputs.drive)
         # 3. Start again without the most likely wrong input, if dispensable; foreign images stay.
-        foreign = _foreign(inputs, settled, found, progress)
-        left = None
-        if worst is not None and log_odds(worst) > foreign[2] and len(corrected) < _MOST_CORRECTIONS:
-            left = None if _is_ambiguous(worst, found) else _recovered(inputs, worst, settled)
-        if worst is None or left is None:
+        foreign = _foreign(inputs, settled, tested.tests, progress)
+        remaining = None
+        if worst is not None and log_odds(worst) > foreign.gain and len(corrected) < _MOST_CORRECTIONS:
+            is_ambiguous = _is_ambiguous(worst, tested.tests)
+            remaining = None if is_ambiguous else _recovered(inputs, worst, settled)
+        if worst is None or remaining is None:
             break
-        corrected += _contradictions(settled, (worst,), inputs.sightings, _session_names(drive))
-        one = corrected[-1]
-        about = f" {corrected[-1].about}" if corrected[-1].about else ""
-        _log.warning(
-            "%s: mapped again, for the drive contradicts the %s%s of %s by %.0f sigmas (%+.3g %s)",
-            ", ".join(inputs.cameras), one.fault.value, about, " and ".join(one.cameras), one.sigmas,
-            one.value, one.fault.unit,
-        )  # fmt: skip
-        inputs = left
+        corrected += _contradictions(settled, (worst,), inputs.sightings, sessions)
+        _log_correction(inputs, corrected[-1])
+        inputs = remaining
     # 4. Choose the pose model, solve without outliers and classify the candidates.
     optimised = optimiser.finish(settled, progress, inputs.find_knots)
-    corrected = [_as_solved(one, settled) for one in corrected if _is_of_the_map(one, survey, optimised)]
-    suspected = _contradictions(settled, found, inputs.sightings, _session_names(drive))
+    corrected = [
+        _as_solved(error, settled) for error in corrected if _is_of_the_map(error, survey, optimised)
+    ]
+    suspected = _contradictions(settled, tested.tests, inputs.sightings, sessions)
     evidence = _evidence(settled, suspected, corrected, optimiser, optimised.bundle, inputs.sightings)
     return Outcome(inputs, optimised.bundle, replace(evidence, foreign=foreign)), optimised
+
+
+def _log_correction(inputs: Inputs, error: Contradiction) -> None:
+    about = f" {error.about}" if error.about else ""
+    _log.warning(
+        "%s: mapped again, for the drive contradicts the %s%s of %s by %.0f sigmas (%+.3g %s)",
+        ", ".join(inputs.cameras), error.fault.name, about, " and ".join(error.cameras), error.sigmas,
+        error.value, error.fault.unit,
+    )  # fmt: skip
 
 
 def _settled(inputs: Inputs, progress: Callable[[str], None]) -> Bundle:
@@ -112,67 +115,74 @@ def _settled(inputs: Inputs, progress: Callable[[str], None]) -> Bundle:
 def _tested(inputs: Inputs, settled: Bundle, progress: Callable[[str], None]) -> tuple[ScoreTest, ...]:
     """Tests of the inputs of ``settled``, most likely fault first."""
     progress("tests of the inputs")
-    found = score_faults(settled.problem, settled.solution)
-    stated = (one for one in found if _is_stated(one, settled, inputs.drive))
+    tests = score_faults(settled.problem, settled.solution)
+    stated = (test for test in tests if _is_stated(test, settled, inputs.drive))
     return tuple(sorted(stated, key=log_odds, reverse=True))
 
 
-def _worst(found: Sequence[ScoreTest]) -> ScoreTest | None:
-    return next((one for one in found if is_contradicted(one)), None)
+def _worst(tests: Sequence[ScoreTest]) -> ScoreTest | None:
+    return next((test for test in tests if is_contradicted(test)), None)
 
 
-def _over_ground(
-    inputs: Inputs, settled: Bundle, progress: Callable[[str], None]
-) -> tuple[Inputs, Bundle, tuple[ScoreTest, ...]]:
+class _Tested(NamedTuple):
+    """A solve on the ground that the drive shows, and what it says of its inputs."""
+
+    inputs: Inputs
+    settled: Bundle
+    tests: tuple[ScoreTest, ...]  # most likely fault first
+
+
+def _over_ground(inputs: Inputs, settled: Bundle, progress: Callable[[str], None]) -> _Tested:
     """Inputs, ``settled`` and its tests, or those on a surface if the drive shows one.
 
     A fall or rise of the ground contradicts the plane even if only as small as outliers leave it.
     """
     if inputs.options.ground != AUTO:
-        return inputs, settled, _tested(inputs, settled, progress)
+        return _Tested(inputs, settled, _tested(inputs, settled, progress))
     surface, gain = inputs.optimiser.likeliest_surface(settled)
     is_bent = gain > CLEAR_SIGMAS**2 / 2
-    found = () if is_bent else _tested(inputs, settled, progress)
-    if is_bent or any(one.fault is Fault.CROWN and one.sigmas > CLEAR_SIGMAS for one in found):
+    tests = () if is_bent else _tested(inputs, settled, progress)
+    if is_bent or any(test.fault is table.CROWN and test.sigmas > CLEAR_SIGMAS for test in tests):
         curved = replace(inputs, options=replace(inputs.options, ground=SURFACE))
         over = curved.optimiser.settle_from(settled, progress, surface)
-        tests = _tested(curved, over, progress)
-        rival = _worst(tests)
-        explained = rival is None or rival.fault not in _LIKE_GROUND
+        tests_over = _tested(curved, over, progress)
+        rival = _worst(tests_over)
+        explained = rival is None or not rival.fault.like_ground
         is_curved = explained and curved.optimiser.is_curved(over)
-        taken = "a surface" if is_curved else "a plane: no surface explains the drive"
-        _log.info("%s: the ground is mapped as %s", ", ".join(inputs.cameras), taken)
+        shape = "a surface" if is_curved else "a plane: no surface explains the drive"
+        _log.info("%s: the ground is mapped as %s", ", ".join(inputs.cameras), shape)
         if is_curved:
-            return curved, over, tests
-    return inputs, settled, found or _tested(inputs, settled, progress)
+            return _Tested(curved, over, tests_over)
+    return _Tested(inputs, settled, tests or _tested(inputs, settled, progress))
 
 
 def _foreign(
-    inputs: Inputs, settled: Bundle, found: Sequence[ScoreTest], progress: Callable[[str], None]
-) -> tuple[float, float, float]:
-    """The most likely segment of foreign images, s, and its log-odds as the cause of all doubts.
+    inputs: Inputs, settled: Bundle, tests: Sequence[ScoreTest], progress: Callable[[str], None]
+) -> ForeignSegment:
+    """The most likely segment of foreign images, with its log-odds as the cause of all doubts.
 
     It explains the corners, plus the doubts that a solve without its images removes.
     """
     drive = inputs.drive
     names = inputs.cameras
     cameras = tuple(drive.cameras[name] for name in names)
-    begin_s, end_s, gain = foreign_segment(settled, inputs.sightings, views_of(drive, names), cameras)
-    suspect = next(filter(is_doubtful, found), None)
-    if suspect is None or gain <= 0:
-        return begin_s, end_s, gain
-    stamp_s = np.array([drive.images[one.image].stamp_s for one in inputs.detections])
-    beyond = ((stamp_s < begin_s) | (stamp_s > end_s)).tolist()
-    rest = replace(inputs, detections=list(compress(inputs.detections, beyond)))
+    segment = foreign_segment(settled, inputs.sightings, views_of(drive, names), cameras)
+    suspect = next(filter(is_doubtful, tests), None)
+    if suspect is None or segment.gain <= 0:
+        return segment
+    begin_s = segment.begin_s
+    end_s = segment.end_s
+    stamp_s = np.array([drive.images[detections.image].stamp_s for detections in inputs.detections])
+    is_beyond = ((stamp_s < begin_s) | (stamp_s > end_s)).tolist()
+    remaining = replace(inputs, detections=list(compress(inputs.detections, is_beyond)))
     try:
-        without = _settled(rest, progress)
-        tests = _tested(rest, without, progress)
+        without = _settled(remaining, progress)
+        tests_without = _tested(remaining, without, progress)
     except (AdjustError, MappingError) as failure:
         _log.warning("whether images from %.1f to %.1f s are foreign: %s", begin_s, end_s, failure)
-        return begin_s, end_s, gain
-    left = max([0.0, *map(log_odds, tests)]) * len(settled.row) / len(without.row)
-    gain += max(log_odds(suspect) - left, 0.0)
-    return begin_s, end_s, gain
+        return segment
+    left = max([0.0, *map(log_odds, tests_without)]) * len(settled.row) / len(without.row)
+    return segment._replace(gain=segment.gain + max(log_odds(suspect) - left, 0.0))
 
 
 def _frame_s(settled: Bundle, sightings: Sightings) -> FloatArray:
@@ -185,37 +195,37 @@ def _session_names(drive: Drive) -> tuple[str, ...]:
     return tuple(session.name for session in drive.joined)
 
 
-def _is_stated(one: ScoreTest, bundle: Bundle, drive: Drive) -> bool:
+def _is_stated(test: ScoreTest, bundle: Bundle, drive: Drive) -> bool:
     """Whether the suspected input was stated: an unsurveyed centre is a guess."""
-    if one.fault not in (Fault.SURVEY, Fault.LEVER, Fault.SCALE):
+    if not test.fault.needs_centres:
         return True
-    return all(drive.cameras[name].centre_prior is not None for name in _cameras_of(bundle, one))
+    return all(drive.cameras[name].centre_prior is not None for name in _cameras_of(bundle, test))
 
 
-def _is_of_the_map(one: Contradiction, survey: SurveyOptions, optimised: Optimised) -> bool:
+def _is_of_the_map(error: Contradiction, survey: SurveyOptions, optimised: Optimised) -> bool:
     """False for a surveyed point matched to a candidate outside the map, such as a worn marking."""
-    if one.fault is not Fault.CONTROL:
+    if error.fault.recovery is not Recovery.DROP_POINT:
         return True
-    point_map = next(point.position_map for point in survey.points if point.id == one.about)
+    point_map = next(point.position_map for point in survey.points if point.id == error.about)
     corners_map = np.array([marking.corners_map for marking in optimised.markings])
     if np.linalg.norm(corners_map - point_map, axis=-1).min() <= survey.reach_m:
         return True
-    _log.warning("the surveyed point %s is not used: its marking did not enter the map", one.about)
+    _log.warning("the surveyed point %s is not used: its marking did not enter the map", error.about)
     return False
 
 
-def _as_solved(one: Contradiction, bundle: Bundle) -> Contradiction:
+def _as_solved(error: Contradiction, bundle: Bundle) -> Contradiction:
     """A dropped survey with its error from the solve without it; others unchanged."""
-    if one.fault not in (Fault.SURVEY, Fault.LEVER) or bundle.problem.centre_vehicle is None:
-        return one
-    rows = [bundle.camera_index[name] for name in one.cameras if name in bundle.camera_index]
+    if error.fault.recovery is not Recovery.DROP_CENTRES or bundle.problem.centre_vehicle is None:
+        return error
+    rows = [bundle.camera_index[name] for name in error.cameras if name in bundle.camera_index]
     off = camera_centre(bundle.solution.cam_from_vehicle)[rows] - bundle.problem.centre_vehicle[rows]
-    return replace(one, value=float(off[:, one.axis].mean()))
+    return replace(error, value=float(off[:, error.axis].mean()))
 
 
 def _evidence(
     settled: Bundle,
-    found: tuple[Contradiction, ...],
+    suspected: tuple[Contradiction, ...],
     corrected: Sequence[Contradiction],
     optimiser: Optimiser,
     final: Bundle,
@@ -227,7 +237,7 @@ def _evidence(
     twist = settled.problem.twist_vehicle
     speed_mps = 0.0 if twist is None else float(np.median(np.hypot(twist[:, 0], twist[:, 1])))
     return SolveEvidence(
-        score_tests=found,
+        score_tests=suspected,
         corrected=tuple(corrected),
         pose_model=optimiser.pose_model,
         held_out=optimiser.held_out,
@@ -244,20 +254,20 @@ def _evidence(
     )
 
 
-def _is_ambiguous(worst: ScoreTest, found: Sequence[ScoreTest]) -> bool:
+def _is_ambiguous(worst: ScoreTest, tests: Sequence[ScoreTest]) -> bool:
     """Whether another camera's fault, or for centres the poses' scale, would explain nearly as much."""
-    if worst.fault in (Fault.SURVEY, Fault.LEVER):
+    if worst.fault.recovery is Recovery.DROP_CENTRES:
         least = doubt(worst) - RIVAL_LOG_ODDS
-        if any(one.fault is Fault.SCALE and is_contradicted(one) and doubt(one) > least for one in found):
+        if any(test.fault is table.SCALE and is_contradicted(test) and doubt(test) > least for test in tests):
             return True
     rivals = [
-        one.sigmas
-        for one in found
-        if one.fault is worst.fault
-        and one.axis == worst.axis
-        and one.item == worst.item
-        and min(one.camera, worst.camera) >= 0
-        and one.camera != worst.camera
+        test.sigmas
+        for test in tests
+        if test.fault is worst.fault
+        and test.axis == worst.axis
+        and test.item == worst.item
+        and min(test.camera, worst.camera) >= 0
+        and test.camera != worst.camera
     ]
     return max(rivals, default=0.0) > _AMBIGUOUS_SHARE * worst.sigmas
 
@@ -282,38 +292,37 @@ def _read_outs(bundle: Bundle) -> dict[str, tuple[float, float]]:
 
 def _recovered(inputs: Inputs, worst: ScoreTest, settled: Bundle) -> Inputs | None:
     """The inputs without the fault ``worst``; None if the drive needs them."""
-    if worst.fault is Fault.CLOCK:
-        if worst.sigma > _CLOCK_CORRECTABLE_S:
-            return None
-        return inputs.with_clocks(inputs.optimiser.clock_offsets_s(settled))
-    if worst.fault in (Fault.SURVEY, Fault.LEVER):
-        if worst.sigma > _CENTRE_OBSERVABLE_M:
-            return None
-        return inputs.without_axis(_cameras_of(settled, worst), worst.axis)
-    options = inputs.options
-    if worst.fault is Fault.SIZE:
-        # One wrong size means paint of another standard; corners of others may look like outliers, which the
-        # robust loss hides from the tests.
-        options = replace(options, known_sizes=replace(options.known_sizes, by_class_m={}))
-    elif worst.fault is Fault.CONTROL:
-        options = replace(options, survey=options.survey.without(_point_of(settled, worst.item)))
-    elif worst.fault is Fault.DATUM:
-        options = replace(options, survey=options.survey.only([]))
-    else:
+    if worst.sigma > worst.fault.recoverable_sigma:
         return None
+    options = inputs.options
+    match worst.fault.recovery:
+        case Recovery.NONE:
+            return None
+        case Recovery.SHIFT_CLOCKS:
+            return inputs.with_clocks(inputs.optimiser.clock_offsets_s(settled))
+        case Recovery.DROP_CENTRES:
+            return inputs.without_axis(_cameras_of(settled, worst), worst.axis)
+        case Recovery.DROP_SIZES:
+            # One wrong size means paint of another standard; corners of others may look like outliers, which
+            # the robust loss hides from the tests.
+            options = replace(options, known_sizes=replace(options.known_sizes, by_class_m={}))
+        case Recovery.DROP_POINT:
+            options = replace(options, survey=options.survey.without(_point_of(settled, worst.item)))
+        case Recovery.DROP_POINTS:
+            options = replace(options, survey=options.survey.only([]))
     return replace(inputs, options=options)
 
 
 def _contradictions(
-    bundle: Bundle, found: Sequence[ScoreTest], sightings: Sightings, sessions: Sequence[str] = ()
+    bundle: Bundle, tests: Sequence[ScoreTest], sightings: Sightings, sessions: Sequence[str] = ()
 ) -> tuple[Contradiction, ...]:
-    """``found`` for the bundle's problem, in terms of the user's inputs; several ``sessions`` are named."""
+    """``tests`` of the bundle's problem, in terms of the user's inputs; several ``sessions`` are named."""
     frame_s = _frame_s(bundle, sightings)
     return tuple(
         Contradiction(
-            **vars(one), cameras=_cameras_of(bundle, one), about=_about(bundle, one, frame_s, sessions)
+            **vars(test), cameras=_cameras_of(bundle, test), about=_about(bundle, test, frame_s, sessions)
         )
-        for one in found
+        for test in tests
     )
 
 
@@ -331,16 +340,16 @@ def _point_of(bundle: Bundle, item: int) -> str:
 
 def _camera_fits(bundle: Bundle) -> dict[str, CameraFit]:
     """Fit of each camera's observations in ``bundle``, a solve with all of them."""
-    seen = bundle.problem.observations
+    observations = bundle.problem.observations
     fits = {}
     # Corners weigh by their information: distant and outlying detections err by more than stated.
-    knows = 1 / np.trace(seen.covariance_px, axis1=1, axis2=2)
+    information = 1 / np.trace(observations.covariance_px, axis1=1, axis2=2)
     for name, c in bundle.camera_index.items():
-        own = seen.camera == c
+        of_camera = observations.camera == c
         fits[name] = CameraFit(
-            observations=int(own.sum()),
-            variance_factor=_factor(bundle, bundle.solution.mahalanobis2[own]),
-            rejected_share=float(1 - np.average(bundle.inliers[own], weights=knows[own])),
+            observations=int(of_camera.sum()),
+            variance_factor=_factor(bundle, bundle.solution.mahalanobis2[of_camera]),
+            rejected_share=float(1 - np.average(bundle.inliers[of_camera], weights=information[of_camera])),
         )
     return fits
 
@@ -350,16 +359,17 @@ def _factor(bundle: Bundle, mahalanobis2: FloatArray) -> float:
 
 
 def _about(bundle: Bundle, test: ScoreTest, frame_s: FloatArray, sessions: Sequence[str]) -> str:
-    if test.fault in CHANGES:
-        return f"from {frame_s[test.item]:.1f} s on"
-    if test.fault is Fault.CLOCK and test.item >= 0 and sessions:
-        return f"in {sessions[test.item]}"
-    lengths = bundle.problem.lengths
-    if test.fault is Fault.SIZE and lengths is not None:
-        length_m = float(np.unique(lengths.length_m)[test.item])
-        stated = bundle.model.sizes.by_class_m.items()
-        names = [name for name, size in stated if any(abs(one - length_m) < 1e-9 for one in size)]
-        return f"{', '.join(names)} {length_m:.2f} m"
-    if test.fault is Fault.CONTROL:
-        return _point_of(bundle, test.item)
+    """Which session, size or point a test is of, or from when on; empty for all of them."""
+    match test.fault.item:
+        case Item.FRAME:
+            return f"from {frame_s[test.item]:.1f} s on"
+        case Item.SESSION if test.item >= 0 and sessions:
+            return f"in {sessions[test.item]}"
+        case Item.LENGTH if bundle.problem.lengths is not None:
+            length_m = float(np.unique(bundle.problem.lengths.length_m)[test.item])
+            stated = bundle.model.sizes.by_class_m.items()
+            names = [name for name, sides_m in stated if any(abs(m - length_m) < 1e-9 for m in sides_m)]
+            return f"{', '.join(names)} {length_m:.2f} m"
+        case Item.POINT:
+            return _point_of(bundle, test.item)
     return ""

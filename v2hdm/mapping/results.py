@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from v2hdm.faults import ScoreTest
+from v2hdm.faults import Contradiction
 from v2hdm.io.maps.evidence import Residuals
 from v2hdm.records import (
     BoolArray,
@@ -26,20 +27,24 @@ from v2hdm.surface.surface import Surface
 
 
 @dataclass(frozen=True)
-class Contradiction(ScoreTest):
-    """A possible error of one input, in the user's terms: of which cameras, and ``about`` what."""
-
-    cameras: tuple[str, ...] = ()
-    about: str = ""
-
-
-@dataclass(frozen=True)
 class CameraFit:
     """Fit of a camera: median variance factor, and contradicted fraction of its observations."""
 
     observations: int
     variance_factor: float
     rejected_share: float
+
+
+class ForeignSegment(NamedTuple):
+    """Images between two times that may be those of another drive."""
+
+    begin_s: float
+    end_s: float
+    gain: float  # log-odds that they are
+
+
+NO_SEGMENT = ForeignSegment(0.0, 0.0, 0.0)
+"""No image is foreign: times, s, of an empty segment, and even odds."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +64,7 @@ class SolveEvidence:
     read_out_s: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # by camera, with sigma
     jitter_s: float = 0.0  # scatter of stamps, s, that would explain all noise of the positions
     along_over_across: float = 1.0  # ratio of white position errors along and across the path
-    foreign: tuple[float, float, float] = (0.0, 0.0, 0.0)  # segment's begin, end, s; log-odds
+    foreign: ForeignSegment = NO_SEGMENT
 
     @property
     def held_out_loss(self) -> float | None:

@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -38,6 +39,15 @@ from v2hdm.geometry.rigid import interpolate, inverse
 from v2hdm.progress import Steps
 from v2hdm.records import Calibration, Camera, CameraInfo, Drive, FloatArray, Trajectory
 from v2hdm.surface.surface import Surface
+
+
+class Bounds(NamedTuple):
+    """Edges of a canvas with north above, m in the map."""
+
+    west: float
+    south: float
+    east: float
+    north: float
 
 
 @dataclass(frozen=True)
@@ -81,10 +91,12 @@ class Canvas:
         return cls(corner, cell_m, rows, columns)
 
     @property
-    def bounds_m(self) -> tuple[float, float, float, float]:
-        """West, south, east and north edge, m, of a canvas with north above."""
+    def bounds_m(self) -> Bounds:
+        """The edges of a canvas with north above."""
         west, north = (float(value) for value in self.corner_map)
-        return west, north - self.rows * self.cell_m, west + self.columns * self.cell_m, north
+        south = north - self.rows * self.cell_m
+        east = west + self.columns * self.cell_m
+        return Bounds(west, south, east, north)
 
 
 FEATHER = 1 / 15  # band at the edge of what is trusted where the weight rises to 1, in heights of the image
@@ -142,8 +154,12 @@ def recorded_shots(drive: Drive) -> list[Shot]:
         for name, camera in drive.cameras.items()
     }
     return [
-        Shot(one.path, one.camera, px_from_vehicle[one.camera] @ flat_motion(inverse(one.map_from_vehicle)))
-        for one in drive.images
+        Shot(
+            image.path,
+            image.camera,
+            px_from_vehicle[image.camera] @ flat_motion(inverse(image.map_from_vehicle)),
+        )
+        for image in drive.images
     ]
 
 
@@ -163,14 +179,16 @@ def adjusted_shots(
     taken_s = np.array([image.stamp_s + clock_s[image.camera] for image in images])
     poses, _ = interpolate(adjusted, taken_s, np.inf)
     if drive.recorded is not None and drive.trajectory is not None:
-        recorded, flat = (interpolate(one, taken_s, np.inf)[0] for one in (drive.recorded, drive.trajectory))
+        recorded, flat = (
+            interpolate(trajectory, taken_s, np.inf)[0] for trajectory in (drive.recorded, drive.trajectory)
+        )
         poses = flat @ np.linalg.inv(recorded) @ poses
     shots = []
     surface = surface_at(poses)
     for frame, (image, pose) in enumerate(zip(images, poses, strict=True)):
-        own = calibrations[image.camera]
-        cam_from_map = own.cam_from_vehicle @ inverse(pose)
-        px_from_map = pinhole_px_from_ground(own.info.intrinsic, cam_from_map)
+        calibration = calibrations[image.camera]
+        cam_from_map = calibration.cam_from_vehicle @ inverse(pose)
+        px_from_map = pinhole_px_from_ground(calibration.info.intrinsic, cam_from_map)
         on_plane = None
         if surface is not None:
             on_plane = partial(surface.on_plane, cam_from_map=cam_from_map, frame=frame)
@@ -305,10 +323,10 @@ def _sources(
             )
         return pixels[boxes[camera]].copy()
 
-    wanted = [shots[index] for index in order]
+    ordered = [shots[index] for index in order]
     with ThreadPoolExecutor(1) as decoder:
-        ahead = [decoder.submit(decoded, shot.path, shot.camera) for shot in wanted[:1]]
-        for shot, following in zip(wanted, [*wanted[1:], None], strict=True):
+        ahead = [decoder.submit(decoded, shot.path, shot.camera) for shot in ordered[:1]]
+        for shot, following in zip(ordered, [*ordered[1:], None], strict=True):
             pixels = ahead.pop().result()
             if following is not None:
                 ahead.append(decoder.submit(decoded, following.path, following.camera))
@@ -333,8 +351,8 @@ class _Sums:
         self._nodes = torch.cartesian_prod(at, at).flip(1)
         x, y = (self._nodes / TILE_PX).T
         self._from_corners = torch.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], dim=1)
-        apart = (torch.arange(TILE_PX, device=device)[:, None] - at).abs()
-        self._from_nodes = (1 - apart / _NODE_PX).clamp(min=0)  # hat functions (TILE_PX, nodes)
+        distance_px = (torch.arange(TILE_PX, device=device)[:, None] - at).abs()
+        self._from_nodes = (1 - distance_px / _NODE_PX).clamp(min=0)  # hat functions (TILE_PX, nodes)
 
     def add(self, source: _Source, shot: Shot, map_from_sheet: FloatArray, tiles: np.ndarray) -> None:
         """Add an image to the tiles (T, 2) of (column, row) that it shows."""
@@ -351,7 +369,7 @@ class _Sums:
         """Where tiles' pixels lie in an image, as ``grid_sample`` has it, and their density (3, T, ...).
 
         The lens is evaluated at nodes. Times the third coordinate, where a pixel lies is linear on the ground
-        but for the lens: interpolated so, a pixel is off by .01 px at most, by .1 px a metre from a fisheye.
+        but for the lens: interpolated so, a pixel is at most 0.01 px off, or 0.1 px a metre from a fisheye.
         """
         points = TILE_PX * torch.from_numpy(tiles).to(self._nodes)[:, None] + self._nodes
         if shot.on_plane is not None:
@@ -372,11 +390,11 @@ class _Sums:
         nodes = torch.stack([*(placed * third[..., None]).unbind(-1), third])
         side = len(self._from_nodes.T)
         x, y, third = self._from_nodes @ nodes.reshape(3, len(tiles), side, side) @ self._from_nodes.T
-        seen = third > 0  # a tile may reach beyond the horizon, where no image shows the ground
-        depth = third.where(seen, third.new_tensor(1.0))
+        in_front = third > 0  # a tile may reach beyond the horizon, where no image shows the ground
+        depth = third.where(in_front, third.new_tensor(1.0))
         density = float(np.linalg.det(pinhole_px_from_sheet)) / depth**3
         placed = torch.stack([x, y]) / depth
-        return torch.cat([placed.where(seen, x.new_tensor(_FAR_OUT)), (density * seen)[None]])
+        return torch.cat([placed.where(in_front, x.new_tensor(_FAR_OUT)), (density * in_front)[None]])
 
     def mean(self, full_weight: float) -> np.ndarray:
         """The sheet as (rows, columns, 4) uint8 RGBA, opaque from ``full_weight`` on."""
@@ -396,5 +414,5 @@ class _Sums:
 def _box(trust: np.ndarray) -> tuple[slice, slice]:
     """The rows and columns that are trusted at all, and one around them."""
     trusted = (np.flatnonzero(trust.any(axis=axis)) for axis in (1, 0))
-    rows, columns = (slice(max(int(one[0]) - 1, 0), int(one[-1]) + 2) for one in trusted)
+    rows, columns = (slice(max(int(index[0]) - 1, 0), int(index[-1]) + 2) for index in trusted)
     return rows, columns

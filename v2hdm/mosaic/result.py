@@ -34,13 +34,15 @@ from v2hdm.progress import Steps
 from v2hdm.records import Drive, FloatArray, GeodeticOrigin, HDMap
 from v2hdm.report import style
 from v2hdm.report.page.facts import read_cameras, read_surface
+from v2hdm.store import names
 from v2hdm.store.files import whole_file, write_json
 
-AHEAD_M = 12.0
-ACROSS_M = 8.0  # length and width of the ground that is compared
-_CELL_M = 0.01
-_PANEL_IN = 5.2
-_BAR_M = 2.0
+# The comparison before and after.
+AHEAD_M = 12.0  # length of the ground that is compared
+ACROSS_M = 8.0  # width of the ground that is compared
+_CELL_M = 0.01  # side of a pixel on that ground
+_PANEL_IN = 5.2  # width of either picture
+_BAR_M = 2.0  # length of the scale bar
 
 
 def richest_place(drive: Drive, hd_map: HDMap) -> FloatArray:
@@ -48,7 +50,7 @@ def richest_place(drive: Drive, hd_map: HDMap) -> FloatArray:
     painted = [(m.corners_map, m.sightings) for m in hd_map.markings]
     painted += [(s.outline_map, s.sightings) for s in hd_map.symbols]
     centres = np.array([outline.mean(axis=0) for outline, _ in painted]).reshape(-1, 2)
-    sightings = np.array([seen for _, seen in painted])
+    sightings = np.array([count for _, count in painted])
 
     def worth(pose: FloatArray) -> float:
         offset = (centres - pose[:2, 3]) @ pose[:2, :2]
@@ -86,8 +88,8 @@ def save_comparison(
         for axes, title, rgba in zip(every, panels, pictures, strict=True):
             bgr = rgba[..., :3].astype(np.float32)
             stretched = np.clip((bgr - 0.5 * low) / (max(high, low + 1) - 0.5 * low), 0, 1)
-            seen = rgba[..., 3:].astype(np.float32) / 255  # white where nothing was seen
-            shown = 1 - seen * (1 - stretched)
+            alpha = rgba[..., 3:].astype(np.float32) / 255
+            shown = 1 - alpha * (1 - stretched)  # white where nothing was seen
             axes.imshow(shown, extent=(0, ACROSS_M, 0, AHEAD_M), interpolation="antialiased")
             axes.set(title=title, xticks=[], yticks=[])
             axes.spines[:].set_visible(False)
@@ -97,12 +99,12 @@ def save_comparison(
 
 LARGEST_PICTURE_PX = 8192  # of either side of the picture: graphics cards of computers and phones draw that
 MULTIPLE_PX = 256  # divides sides of a canvas, so that pictures reduced by up to that factor fit it exactly
-_FINEST_M = 1e-3  # side of a pixel: no camera on a vehicle shows finer ground
-_PICTURE_QUALITY = 80
-_JPEG_QUALITY = 90
-_SEEN_ALPHA = 128  # the mask of a GeoTIFF knows but seen and unseen
-_BLOCK_PX = 512
-_AT_ONCE_BYTES = 1 << 24
+_FINEST_M = 1e-3  # least side of a pixel: no camera on a vehicle shows finer ground
+_PICTURE_QUALITY = 80  # quality of the WebP, of 100
+_JPEG_QUALITY = 90  # quality of the JPEG in the GeoTIFF, of 100
+_SEEN_ALPHA = 128  # least alpha of a pixel that the GeoTIFF's mask shows as seen: it knows no half
+_BLOCK_PX = 512  # side of a block of the GeoTIFF
+_AT_ONCE_BYTES = 1 << 24  # size of the pieces in which the GeoTIFF is written to the disk
 
 
 @contextmanager
@@ -160,9 +162,9 @@ class Picture:
         alpha = sheet.rgba[..., 3:].astype(np.float32) / 255
         weighed = np.concatenate([sheet.rgba[..., :3] * alpha, alpha], axis=2)
         reduced = cv2.resize(weighed, (columns, rows), interpolation=cv2.INTER_AREA)
-        seen = reduced[..., 3:]
-        colours = np.divide(reduced[..., :3], seen, out=np.zeros_like(reduced[..., :3]), where=seen > 0)
-        drawn = np.round(np.concatenate([colours, 255 * seen], axis=2))
+        opacity = reduced[..., 3:]
+        colours = np.divide(reduced[..., :3], opacity, out=np.zeros_like(reduced[..., :3]), where=opacity > 0)
+        drawn = np.round(np.concatenate([colours, 255 * opacity], axis=2))
         self._rgba[row : row + rows, column : column + columns] = drawn
 
     def write(self, path: Path) -> None:
@@ -176,10 +178,6 @@ class Picture:
 _log = logging.getLogger(__name__)
 
 RESOLUTION_M = 0.02  # side of a pixel of the mosaic unless another is asked for
-TIFF = "mosaic.tif"
-PICTURE = "mosaic.webp"
-EXTENT = "mosaic.json"
-COMPARISON = "mosaic_before_after.png"
 
 
 @dataclass(frozen=True)
@@ -210,12 +208,12 @@ def write_mosaic(
         raise ConfigError(
             f"a resolution of {resolution_m:g} m per pixel is too fine for a mosaic; give {_FINEST_M} or more"
         )
-    hd_map = read_geojson(folder / "map.geojson")
+    hd_map = read_geojson(folder / names.MAP)
     ground = ground_of(folder, drive, resolution_m)
     picture = Picture(ground.canvas)
     with ExitStack() as stack:
         try:
-            put = stack.enter_context(geotiff(folder / TIFF, ground.canvas, drive.origin))
+            put = stack.enter_context(geotiff(folder / names.MOSAIC, ground.canvas, drive.origin))
         except ConfigError as missing:
             _log.warning("no GeoTIFF was written: %s", missing)
             put = None
@@ -223,12 +221,12 @@ def write_mosaic(
             if put is not None:
                 put(sheet)
             picture.put(sheet)
-    picture.write(folder / PICTURE)
+    picture.write(folder / names.MOSAIC_PICTURE)
     content = {
-        "image": PICTURE,
+        "image": names.MOSAIC_PICTURE,
         "bounds_m": ground.canvas.bounds_m,
         "resolution_m": picture.resolution_m,
-        "geotiff": None if put is None else TIFF,
+        "geotiff": None if put is None else names.MOSAIC,
         "geotiff_resolution_m": resolution_m,
         "crs": crs_of(drive.origin),
     }
@@ -236,8 +234,8 @@ def write_mosaic(
         "before: initial calibration, recorded poses": ground.before,
         "after: optimised calibration, adjusted poses": ground.after,
     }
-    save_comparison(folder / COMPARISON, richest_place(drive, hd_map), panels, ground.lenses, device)
-    write_json(folder / EXTENT, content)
+    save_comparison(folder / names.COMPARISON, richest_place(drive, hd_map), panels, ground.lenses, device)
+    write_json(folder / names.MOSAIC_EXTENT, content)
     return content
 
 
@@ -245,9 +243,9 @@ def ground_of(folder: Path, drive: Drive, resolution_m: float) -> Ground:
     """The ground that a run's images show, and the canvas around it; errors as :func:`write_mosaic`."""
     cameras = read_cameras(folder)
     if not cameras:
-        raise MapFileError(f"{folder}: no calibration_*.yaml in it; give the result folder of v2hdm map")
-    calibrations = {name: one.calibration for name, one in cameras.items()}
-    clock_s = {name: one.clock_offset_s or 0.0 for name, one in cameras.items()}
+        raise MapFileError(f"{folder}: no {names.CALIBRATIONS} in it; give the result folder of v2hdm map")
+    calibrations = {name: camera.calibration for name, camera in cameras.items()}
+    clock_s = {name: camera.clock_offset_s or 0.0 for name, camera in cameras.items()}
     missing = [name for name in drive.cameras if name not in calibrations]
     if len(missing) == len(drive.cameras):
         raise MapFileError(
@@ -256,11 +254,11 @@ def ground_of(folder: Path, drive: Drive, resolution_m: float) -> Ground:
         )
     for name in missing:
         _log.warning("camera %s has no calibration in %s: its images are left out", name, folder)
-    adjusted = read_tum(folder / "trajectory.tum")
+    adjusted = read_tum(folder / names.TRAJECTORY)
     taken_s = np.array([image.taken_s for image in drive.images])
     if adjusted.stamp_s[0] > taken_s.max() or adjusted.stamp_s[-1] < taken_s.min():
         raise MapFileError(
-            f"{folder / 'trajectory.tum'} and drive {drive.name} share no time: give the drive of this result"
+            f"{folder / names.TRAJECTORY} and drive {drive.name} share no time: give the drive of this result"
         )
     drive = with_own_vehicle(drive, Detector.load())
     lenses = {
@@ -270,7 +268,7 @@ def ground_of(folder: Path, drive: Drive, resolution_m: float) -> Ground:
     }
     after = adjusted_shots(drive, calibrations, clock_s, adjusted, partial(read_surface, folder))
     before = [shot for shot in recorded_shots(drive) if shot.camera in lenses]
-    seen = np.concatenate([shot.outline_map(lenses[shot.camera]) for shot in after])
-    if not np.isfinite(seen).all():
+    outlines_map = np.concatenate([shot.outline_map(lenses[shot.camera]) for shot in after])
+    if not np.isfinite(outlines_map).all():
         raise DriveError(f"drive {drive.name}: an ROI reaches the horizon; draw it nearer to the camera")
-    return Ground(lenses, after, before, Canvas.around(seen, resolution_m, MULTIPLE_PX))
+    return Ground(lenses, after, before, Canvas.around(outlines_map, resolution_m, MULTIPLE_PX))

@@ -11,15 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from v2hdm.detection.batch import read_grey
 from v2hdm.errors import MapFileError
 from v2hdm.io.drive.road import lay_flat
 from v2hdm.io.maps.evidence import read_exclusions
-from v2hdm.io.maps.geojson import geojson_feature, geojson_positions, write_features
 from v2hdm.io.maps.reading import read_geojson, read_verdict
 from v2hdm.io.trajectory import read_tum
 from v2hdm.pipeline.config import base_files
-from v2hdm.records import Change, Changes, Drive, Fate, HDMap, Image
+from v2hdm.records import Change, Changes, Drive, Fate, Image
 from v2hdm.site.living.changes import Base
 
 _SITE_M = 40.0  # markings farther from a route are not seen from it: twice what a camera reaches
@@ -68,6 +66,8 @@ def check_together(base: Base, drive: Drive, path: str) -> None:
 
 def grey_reader(drive: Drive) -> Callable[[Image], NDArray[np.float32]]:
     """Reads the grey values of a drive's images."""
+    from v2hdm.detection.batch import read_grey
+
     return lambda image: read_grey(image, drive.cameras[image.camera])
 
 
@@ -77,23 +77,15 @@ def changes_json(changes: Changes) -> dict[str, Any]:
     return {
         "counts": {"same": changes.same, **{fate.value: counted[fate] for fate in Fate}},
         "shift_m": changes.shift_m.tolist(),
-        "listed": [_as_json(one) for fate in LISTED for one in changes.of(fate)],
-        "unsure": [_as_json(one) for one in changes.changes if one.fate not in LISTED],
+        "listed": [change_json(one) for fate in LISTED for one in changes.of(fate)],
+        "unsure": [change_json(one) for one in changes.changes if one.fate not in LISTED],
     }
 
 
-def _as_json(one: Change) -> dict[str, Any]:
+def change_json(change: Change) -> dict[str, Any]:
+    """A change as plain values."""
     names = {"kind": "class", "before": "before_map", "after": "after_map"}
-    plain = {names.get(name, name): value for name, value in vars(one).items()} | {"fate": one.fate.value}
+    plain = {names.get(name, name): value for name, value in vars(change).items()} | {
+        "fate": change.fate.value
+    }
     return {name: value.tolist() if hasattr(value, "tolist") else value for name, value in plain.items()}
-
-
-def write_changes(changes: Changes, hd_map: HDMap, folder: Path) -> None:
-    """Write ``changes.geojson``: a feature is an outline now, or that which it had if it is gone."""
-    features = []
-    for one in changes.changes:
-        corners = one.before if one.after is None else one.after
-        assert corners is not None
-        ring = geojson_positions(corners, None, hd_map.origin)
-        features.append(geojson_feature(f"changes/{one.id}", "Polygon", [[*ring, ring[0]]], _as_json(one)))
-    write_features(folder / "changes.geojson", features, hd_map.origin, {"same": changes.same})

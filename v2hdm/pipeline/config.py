@@ -6,18 +6,19 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError, DriveError, need
 from v2hdm.io.drive import ReadOptions, drive_name
 from v2hdm.io.maps.corrections import read_corrections
-from v2hdm.io.maps.formats import check_formats
-from v2hdm.mapping.options import INCREMENTAL, MappingOptions, check_options
+from v2hdm.mapping.options import BATCH, INCREMENTAL, MappingOptions, check_options
 from v2hdm.records import Drive, Image
+from v2hdm.safe.rasters import check_background
 from v2hdm.safe.texts import shown, take_camera_name, take_name
-from v2hdm.settings import COUNT, MOST_PROCESSES, NOT_NEGATIVE, POSITIVE, SEED, SHARE, Within, check_settings
-from v2hdm.simulate import PortConfig
+from v2hdm.settings import MOST_PROCESSES, NOT_NEGATIVE, POSITIVE, Within, check_settings
+from v2hdm.simulate.port.config import PortConfig
+from v2hdm.store import names
 from v2hdm.store.cache import key_of
 from v2hdm.store.files import file_digest
 
@@ -31,13 +32,13 @@ NO_DRIVE = (
 
 @dataclass(kw_only=True)
 class DriveConfig(ReadOptions):
-    """The drive and how to read it.
+    """The drive and how to read it; ``path`` is None if the drive is rendered."""
 
-    ``path`` is the drive's folder or bag, or a list of drives through one site, which are mapped together
-    (docs/living-map.md). None if the drive is rendered.
-    """
-
-    path: Any = None
+    path: Annotated[
+        Any,
+        "the drive's folder or bag, or a list of drives through one site, which are mapped together "
+        "(docs/living-map.md).",
+    ] = None
 
     @property
     def paths(self) -> tuple[Path, ...]:
@@ -53,73 +54,84 @@ class DriveConfig(ReadOptions):
 
 @dataclass(kw_only=True)
 class MapConfig:
-    """The map to update or correct; None for none.
+    """The map to update or correct; None for none."""
 
-    ``base`` is the map.geojson that the drive brings up to date.
-    ``corrections`` is a file of corrections to an earlier map of the same drive (``v2hdm view``).
-    """
-
-    base: str | None = None
-    corrections: str | None = None
+    base: Annotated[str | None, "the map.geojson that the drive brings up to date."] = None
+    corrections: Annotated[
+        str | None, "a file of corrections to an earlier map of the same drive (v2hdm view)."
+    ] = None
 
 
 @dataclass(kw_only=True)
 class ReportConfig:
-    """The report; ``background`` is a GeoTIFF or a folder of XYZ tiles under its map, None for none."""
+    """What the report shows."""
 
-    background: str | None = None
+    background: Annotated[str | None, "a GeoTIFF or a folder of XYZ tiles under its map, null for none."] = (
+        None
+    )
 
 
 @dataclass(kw_only=True)
 class RunConfig:
-    """Everything about one run.
+    """Everything about one run; its ``device`` and ``mode`` take the place of the mapping's."""
 
-    Attributes:
-        name: name of the results folder, ``<output>/<name>/``; None takes the drive's own name.
-        drive: the drive to map, or several that are mapped together.
-        map: an earlier map to bring up to date, if there is one.
-        report: contents of the report (docs/report.md).
-        simulate: a port to render into the cache and map, instead of reading ``drive.path``.
-        detector: settings of the detector.
-        mapping: settings of association, optimisation and lanes.
-        output: folder for the results, or the URL of one in an object store (docs/fleet.md).
-        cache: folder for rendered drives, imports from bags and videos, and the results of each stage,
-            which later runs reuse (docs/cache.md).
-        cache_gb: size limit of the cache, GB (10^9 bytes); least recently used entries go first.
-        resume: whether to reuse results of earlier runs whose inputs have not changed; false recomputes
-            everything.
-        workers: number of processes for rendering and detection; 0 for one per core.
-        device: where the adjustment runs, ``cpu`` or ``cuda``; the same as ``mapping.device``.
-        all_maps: whether to write the map of every method and camera set, into ``maps/``.
-        mode: ``batch`` or ``incremental``; the same as ``mapping.mode``.
-        accuracy_goal_cm: 95 % of the corners, and the calibrations, must be known to this radius, cm, at
-            95 %, else the verdict is WARN (docs/verdict.md).
-        mosaic: whether to show the ground of a single drive from above (docs/report.md).
-        export: formats of the map (``geojson``, ``gpkg``, ``lanelet2``, ...) and of the ground (``geotiff``,
-            ``opencrg``; docs/exports.md).
-        crs: coordinate system of exports, such as ``EPSG:25832``, or ``local``; ``map.geojson`` keeps its
-            longitude and latitude.
-    """
-
-    name: str | None = None
+    name: Annotated[
+        str | None, "name of the results folder, <output>/<name>/; null takes the drive's own name."
+    ] = None
     drive: DriveConfig = field(default_factory=DriveConfig)
     map: MapConfig = field(default_factory=MapConfig)
     report: ReportConfig = field(default_factory=ReportConfig)
-    simulate: PortConfig | None = None
+    simulate: Annotated[
+        PortConfig | None, "a port to render into the cache and map, instead of reading drive.path."
+    ] = None
     detector: DetectorOptions = field(default_factory=DetectorOptions.for_mapping)
     mapping: MappingOptions = field(default_factory=MappingOptions)
-    output: str = "outputs"
-    cache: str = "cache"
-    cache_gb: float = 50.0
-    resume: bool = True
-    workers: int = 0
-    device: str = "cpu"
-    mode: str = "batch"
-    accuracy_goal_cm: float = ACCURACY_GOAL_CM
-    all_maps: bool = False
-    mosaic: bool = True
-    export: list[str] = field(default_factory=lambda: ["geojson"])
-    crs: str | None = None
+    output: Annotated[
+        str, "folder for the results, or the URL of one in an object store (docs/fleet.md)."
+    ] = "outputs"
+    cache: Annotated[
+        str,
+        "folder for rendered drives, imports from bags and videos, and the results of each stage, which "
+        "later runs reuse (docs/cache.md).",
+    ] = "cache"
+    cache_gb: Annotated[
+        float, NOT_NEGATIVE, "size limit of the cache, GB (10^9 bytes); least recently used entries go first."
+    ] = 50.0
+    resume: Annotated[
+        bool,
+        "whether to reuse results of earlier runs whose inputs have not changed; false recomputes "
+        "everything.",
+    ] = True
+    workers: Annotated[
+        int, Within(0, MOST_PROCESSES), "number of processes for rendering and detection; 0 for one per core."
+    ] = 0
+    device: Annotated[str, "where the adjustment runs, cpu or cuda."] = "cpu"
+    mode: Annotated[
+        str, "batch; or incremental, marking by marking as on the vehicle, then solved like batch."
+    ] = BATCH
+    accuracy_goal_cm: Annotated[
+        float,
+        POSITIVE,
+        "95 % of the corners, and the calibrations, must be known to this radius, cm, at 95 %, else the "
+        "verdict is WARN (docs/verdict.md).",
+    ] = ACCURACY_GOAL_CM
+    all_maps: Annotated[bool, "whether to write the map of every method and camera set, into maps/."] = False
+    mosaic: Annotated[bool, "whether to show the ground of a single drive from above (docs/report.md)."] = (
+        True
+    )
+    export: Annotated[
+        list[str],
+        "formats of the map (geojson, gpkg, lanelet2, ...) and of the ground (geotiff, opencrg; "
+        "docs/exports.md).",
+    ] = field(default_factory=lambda: ["geojson"])
+    crs: Annotated[
+        str | None,
+        "coordinate system of exports, such as EPSG:25832, or local; map.geojson keeps its longitude and "
+        "latitude.",
+    ] = None
+
+    def __post_init__(self) -> None:
+        self.mapping = replace(self.mapping, device=self.device, mode=self.mode)
 
 
 def run_name(config: RunConfig) -> str:
@@ -133,64 +145,17 @@ def run_name(config: RunConfig) -> str:
     return "+".join(drive_name(path) for path in config.drive.paths)
 
 
-_KEYS_WITHIN: tuple[tuple[Within, str, str], ...] = (
-    (Within(0, MOST_PROCESSES), "", "workers"),
-    (NOT_NEGATIVE, "", "cache_gb drive.start_s simulate.session"),
-    (POSITIVE, "drive.", "max_gap_s end_s kitti.camera_height_m kitti.centre_sigma_m"),
-    (COUNT, "drive.", "limit"),
-    (SEED, "simulate.", "seed"),
-    (Within(64, 2**13), "simulate.cameras.*.", "width height"),
-    (Within(10, 1e5), "simulate.cameras.*.", "focal_px"),
-    (NOT_NEGATIVE, "simulate.cameras.*.", "psf_sigma_px"),
-    (SHARE, "simulate.cameras.*.", "vignetting"),
-    (Within(-2, 2), "simulate.cameras.*.", "distortion"),
-    (Within(0.2, 20), "simulate.cameras.*.", "mount.z_m borrowed_mount.z_m"),
-    (Within(-1e5, 1e5), "simulate.route.", "pieces"),
-    (Within(0.01, 1e3), "simulate.route.", "image_spacing_m speed_mps"),
-    (Within(0.1, 1e4), "simulate.route.", "pose_rate_hz"),
-    (Within(0, 1), "simulate.exposure.", "exposure_s"),
-    (Within(0, 1, open=True), "simulate.exposure.", "level"),
-    (POSITIVE, "simulate.exposure.", "full_well_electrons"),
-    (NOT_NEGATIVE, "simulate.disturbance.", "roll_pitch_deg heave_m heading_deg rtk_white_m"),
-    (NOT_NEGATIVE, "simulate.disturbance.", "rtk_correlated_m"),
-    (NOT_NEGATIVE, "simulate.calibration.", "survey_sigma_m click_sigma_px centre_sigma_m"),
-    (POSITIVE, "simulate.disturbance.", "jitter_correlation_s rtk_correlation_m heading_correlation_s"),
-    (SHARE, "simulate.paint.", "wear dirt"),
-    (NOT_NEGATIVE, "simulate.paint.", "placing_sigma_m placing_sigma_deg dash_gap_m"),
-    (POSITIVE, "simulate.paint.", "diamond_length_m diamond_width_m line_width_m"),
-    # Closer, a port's paint would never be finished.
-    (Within(0.1), "simulate.paint.", "dash_length_m diamond_spacing_m arrow_spacing_m lettering_spacing_m"),
-    (Within(0.1), "simulate.paint.", "stop_line_spacing_m"),
-    (SHARE, "simulate.surface.", "albedo wet_fraction"),
-    (NOT_NEGATIVE, "simulate.surface.", "contrast stains joint_width_m tyre_marks"),
-    # Steeper, a vehicle would slide; a higher kerb is a wall.
-    (Within(0, 0.15), "simulate.relief.", "grade crown ramp bank"),
-    (Within(0, 0.3), "simulate.relief.", "gully_m kerb_m"),
-    (NOT_NEGATIVE, "simulate.relief.", "ramp_at_m"),
-    (Within(1), "simulate.relief.", "ramp_length_m"),
-    (Within(1, 15), "simulate.relief.", "gully_offset_m kerb_offset_m"),
-    (NOT_NEGATIVE, "simulate.yard.", "stack_fill stack_clearance_m sun_strength"),
-    (NOT_NEGATIVE, "simulate.exposure.", "level_sigma read_noise"),
-    (Within(0, 1e5), "simulate.surface.", "patches oil_stains"),
-    (Within(0, 1e4), "simulate.yard.", "parked_trucks barriers lamp_posts moving_trucks shadow_strips"),
-    (POSITIVE, "simulate.yard.", "haze_m"),
-    (Within(1, 100), "mapping.", "rounds"),
-)
-_RANGES = {f"{below}{key}": allowed for allowed, below, keys in _KEYS_WITHIN for key in keys.split()}
-
-
 def admit(config: RunConfig) -> str:
     """Raise ConfigError, which names the key, for settings that cannot work; returns the run's name."""
     from v2hdm.detection.detector import Detector
+    from v2hdm.io.maps.formats import check_formats
     from v2hdm.survey.run import table_of
 
     name = run_name(config)
     take_name(name, "name", ConfigError)
     if config.simulate is not None:
-        take_name(config.simulate.name, "simulate.name", ConfigError)
-        for camera in config.simulate.cameras:
-            take_camera_name(camera, "simulate.cameras", ConfigError)
-    check_settings(config, _RANGES)
+        _check_names(config.simulate)
+    check_settings(config)
     # Wherever the detector will run, it can be looked at here.
     detector = Detector.load(options=replace(config.detector, device="cpu"))
     check_options(config.mapping, detector.catalogue.cornered)
@@ -202,13 +167,26 @@ def admit(config: RunConfig) -> str:
         need("rasterio", "gis", "report.background", ConfigError)
         if not Path(config.report.background).exists():
             raise ConfigError(f"report.background: no file or folder {config.report.background}")
-        from v2hdm.report.page.layers import open_background
-
-        with open_background(Path(config.report.background)):
-            pass  # an unreadable one is refused here, not after minutes of mapping
+        check_background(Path(config.report.background))  # before minutes of mapping
     has_base = config.map.base is not None
     check_choice(config.mapping, len(config.drive.paths), has_base, config.accuracy_goal_cm)
     return name
+
+
+def admit_port(config: RunConfig) -> PortConfig:
+    """The port to render; raises ConfigError, which names the key, where there is none or it cannot work."""
+    if config.simulate is None:
+        raise ConfigError("simulate is not set: choose a port to render (+run=port1, +run=port2)")
+    _check_names(config.simulate)
+    check_settings(config)
+    return config.simulate
+
+
+def _check_names(port: PortConfig) -> None:
+    """Raise ConfigError for names of a port that cannot be those of files."""
+    take_name(port.name, "simulate.name", ConfigError)
+    for camera in port.cameras:
+        take_camera_name(camera, "simulate.cameras", ConfigError)
 
 
 def check_choice(options: MappingOptions, drives: int, has_base: bool, goal_cm: float) -> None:
@@ -262,8 +240,9 @@ def model_key(options: DetectorOptions) -> str | None:
 
 def base_files(path: Path) -> tuple[Path, tuple[Path, ...], Path]:
     """The map, trajectories and exclusions of an earlier map, given as a folder or its ``map.geojson``."""
-    hd_map = path / "map.geojson" if path.is_dir() else path
-    return hd_map, tuple(sorted(hd_map.parent.glob("trajectory*.tum"))), hd_map.parent / "excluded.geojson"
+    hd_map = names.map_file(path)
+    trajectories = sorted(hd_map.parent.glob(names.TRAJECTORIES))
+    return hd_map, tuple(trajectories), hd_map.parent / names.EXCLUDED
 
 
 def made_of_drives(paths: Sequence[str]) -> str:

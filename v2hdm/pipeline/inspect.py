@@ -9,8 +9,7 @@ from functools import partial
 
 from v2hdm.calibration.compare import movement
 from v2hdm.errors import MapFileError
-from v2hdm.ground import GroundEstimate, GroundStatus, better_start, estimate_cameras
-from v2hdm.ground.results import GROUND_IPM
+from v2hdm.ground.results import GROUND_IPM, GroundEstimate, GroundStatus, better_start
 from v2hdm.io.drive import join_drives, with_clock_offsets
 from v2hdm.pipeline.config import Contents
 from v2hdm.pipeline.context import Context
@@ -37,6 +36,8 @@ class Inspection:
 
 def inspect(drive: Drive, max_gap_s: float, workers: int, progress: Callable[[int, int], None]) -> Inspection:
     """Check a drive and correct what can be corrected; ``max_gap_s`` bounds the gaps between poses."""
+    from v2hdm.ground.estimate import estimate_cameras
+
     ground = estimate_cameras(drive, workers, progress)
     findings = tuple(input_findings(drive, ground))
     for finding in findings:

@@ -6,13 +6,11 @@ import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch  # noqa: F401  # its absence is reported before that of what is built on it
 
 from v2hdm.adjust.ahead import compiled_meanwhile
-from v2hdm.detection.batch import detect_images
-from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.weights import unknown_network
 from v2hdm.errors import AdjustError, MappingError
@@ -25,9 +23,9 @@ from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.evaluate import evaluate
 from v2hdm.pipeline.inspect import Inspection, inspect_each, join
 from v2hdm.pipeline.result import Result, describe_run
-from v2hdm.pipeline.stages import BEST, MappedSet, detect_in_pieces, map_camera_sets
+from v2hdm.pipeline.stages import MappedSet, detect_in_pieces, map_camera_sets
 from v2hdm.progress import Progress, silent
-from v2hdm.records import Drive, ImageDetections
+from v2hdm.records import BEST, Drive, ImageDetections
 from v2hdm.site.living.changes import Base
 from v2hdm.site.living.wear import with_wear
 from v2hdm.store.cache import StageCache
@@ -35,6 +33,9 @@ from v2hdm.survey.run import Survey, check_survey, take_survey
 from v2hdm.verdict import Finding, Status, Verdict
 from v2hdm.verdict.results.accuracy import check_corrections, check_goal, check_known_sizes
 from v2hdm.verdict.results.solution import check_result, over_ground
+
+if TYPE_CHECKING:
+    from v2hdm.detection.detector import Detector
 
 _log = logging.getLogger(__name__)
 
@@ -134,8 +135,9 @@ def _mapped(
     context: Context,
 ) -> Result:
     """The result of a drive that was read and checked."""
-    settings = detector.options if isinstance(detector, Detector) else detector
-    settings = settings or DetectorOptions.for_mapping()
+    if detector is None:
+        detector = DetectorOptions.for_mapping()
+    settings = detector if isinstance(detector, DetectorOptions) else detector.options
     try:
         with compiled_meanwhile(survey.mapping.device):
             detections = _detect(checked.drive, begun.contents, settings, context)
@@ -170,7 +172,7 @@ def _detect(
     if unknown is not None:
         _log.warning("%s", unknown)
     with context.timed("detect"):
-        detections = detect_in_pieces(drive, contents, options, context, context.detect or detect_images)
+        detections = detect_in_pieces(drive, contents, options, context, context.detect)
     markings = sum(len(found.markings) for found in detections)
     lanes = sum(len(found.lanes) for found in detections)
     _log.info("detected %d markings, %d pieces of lane paint in %d images", markings, lanes, len(detections))

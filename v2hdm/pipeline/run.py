@@ -38,6 +38,7 @@ from v2hdm.store import remote
 from v2hdm.store.cache import CodecError, StageCache, code_key, decode, encode, key_of, prune_to_limit
 from v2hdm.store.folders import HOST, note_use
 from v2hdm.store.inputs import note_input
+from v2hdm.store.names import CONFIG, LOG
 from v2hdm.store.remote import RemoteFolder, is_url, place_of
 from v2hdm.store.results import drop_result, files_of_result, is_whole, locked_folder, result_folder
 from v2hdm.verdict.verdict import Verdict
@@ -213,15 +214,16 @@ def map_and_save(
 ) -> RunResult:
     """Do what :func:`run` says, with what ``cache`` keeps, in place of an earlier result of the same."""
     from v2hdm.pipeline.map_drive import map_drive  # torch and much else, which takes seconds
+    from v2hdm.pipeline.saving import Outputs, write_result
 
     name = admit(config)
     place = Path(config.output) / name
     with cache.in_use():
         for path in () if config.map.base is None else base_files(Path(config.map.base))[:1]:
             note_input(path)  # before any work is done for nothing
-        with result_folder(place, made=made) as folder, logging_to(log_file(folder / "run.log")):
+        with result_folder(place, maker=made) as folder, logging_to(log_file(folder / LOG)):
             _log.info("v2hdm %s, run %s", __version__, name)
-            (folder / "config.yaml").write_text(config_yaml or f"{config!r}\n", encoding="utf-8")
+            (folder / CONFIG).write_text(config_yaml or f"{config!r}\n", encoding="utf-8")
 
             def accept(drive: Drive) -> None:
                 check_crs(config.crs, [one for one in config.export if one != "geojson"], drive.origin, "crs")
@@ -239,8 +241,14 @@ def map_and_save(
                 context=context,
             )
             key = result_key(config, found.drives, found.contents, context.cache.key())
-            below = config.report.background
-            found.write(folder, config.export, config.all_maps, config.mosaic, context, config.crs, below)
+            outputs = Outputs(
+                formats=config.export,
+                all_maps=config.all_maps,
+                mosaic=config.mosaic,
+                crs=config.crs,
+                background=config.report.background,
+            )
+            write_result(found, folder, outputs, context)
             for line in found.verdict.lines:
                 _log.info("%s", line)
         result = RunResult(place, found.metrics, found.headlines, found.verdict)
@@ -257,7 +265,7 @@ def _drive_folders(config: RunConfig, context: Context) -> tuple[Path, ...]:
         return config.drive.paths
     if config.drive.paths:
         raise ConfigError("both simulate and drive.path are set: a run takes one, remove the other")
-    from v2hdm.simulate import rendered_drive
+    from v2hdm.simulate.port.drive import rendered_drive
 
     with context.timed("render"):
         folder = Path(config.cache)

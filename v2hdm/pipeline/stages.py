@@ -12,12 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import parent_process
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.detection.batch import Detect, detect_images, own_vehicles, with_masks
-from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import WorkerError
 from v2hdm.mapping.methods import run_methods
@@ -26,12 +25,15 @@ from v2hdm.pipeline.base import grey_reader
 from v2hdm.pipeline.config import Contents, model_key
 from v2hdm.pipeline.context import Context
 from v2hdm.progress import Progress, silent
-from v2hdm.records import Drive, ImageDetections
+from v2hdm.records import BEST, Drive, ImageDetections
 from v2hdm.site.living.changes import Base
 from v2hdm.store.cache import Line, key_of, log_again, recorded
 from v2hdm.survey.check_points import CheckTable
 from v2hdm.survey.run import Survey, compare_survey
 from v2hdm.workers import side_by_side
+
+if TYPE_CHECKING:
+    from v2hdm.detection.batch import Detect
 
 _DETECT = "detect"
 PIECE = 16  # images of a piece: a second or two of work
@@ -44,9 +46,15 @@ def detect_in_pieces(
     contents: Contents,
     options: DetectorOptions,
     context: Context,
-    detect: Detect = detect_images,
+    detect: Detect | None = None,
 ) -> list[ImageDetections]:
-    """Detect in every image of a drive, in its order, where that is not known yet, by ``detect``."""
+    """Detect in every image of a drive, in its order, where that is not known yet.
+
+    ``detect`` does so in place of processes of this machine.
+    """
+    from v2hdm.detection.batch import detect_images, own_vehicles, with_masks
+    from v2hdm.detection.detector import Detector
+
     cache = context.cache
     progress = context.steps("detect")
     detector_key = cache.key(options, model_key(options))
@@ -80,7 +88,7 @@ def detect_in_pieces(
         progress(total - len(todo) + done, total)
 
     if todo:
-        detect(drive, options, todo, context.processes, take)
+        (detect or detect_images)(drive, options, todo, context.processes, take)
     return [replace(one, image=start + one.image) for start, piece in pieces.items() for one in piece or ()]
 
 
@@ -97,7 +105,6 @@ def _keys(drive: Drive, contents: Contents, detector_key: str) -> dict[int, str]
 
 _log = logging.getLogger(__name__)
 
-BEST = "Opt"  # the method whose map and calibration are the result
 _MAP = "map"
 
 

@@ -62,16 +62,16 @@ def marking_metrics(
     mapped = [m for m in hd_map.markings if kind is None or m.kind == kind]
     true_index = [j for j, m in enumerate(truth.map.markings) if kind is None or m.kind == kind]
     true = [truth.map.markings[j] for j in true_index]
-    wanted = expected[true_index]
+    is_expected = expected[true_index]
     rows, columns = match_markings(mapped, true)
-    found = np.zeros(len(true), dtype=bool)
-    found[columns] = True
+    is_mapped = np.zeros(len(true), dtype=bool)
+    is_mapped[columns] = True
     errors = corner_errors([mapped[r] for r in rows], [true[c] for c in columns])
     return MarkingMetrics(
         markings=len(mapped),
         false_markings=len(mapped) - len(rows),
-        expected=int(wanted.sum()),
-        recall=float(found[wanted].mean()) if wanted.any() else float("nan"),
+        expected=int(is_expected.sum()),
+        recall=float(is_mapped[is_expected].mean()) if is_expected.any() else float("nan"),
         corner_rmse_m=rms(errors),
         corner_bias_m=float(np.linalg.norm(errors.mean(axis=0))) if len(errors) else float("nan"),
     )
@@ -97,30 +97,33 @@ def match_markings(
 def corner_errors(mapped: Sequence[Marking], true: Sequence[Marking]) -> FloatArray:
     """Error vectors (4 M, 2) of paired markings, over the best of the four cyclic corner orders."""
     pairs = zip(mapped, true, _first_corners(mapped, true), strict=True)
-    errors = [np.roll(one.corners_map, shift, axis=0) - other.corners_map for one, other, shift in pairs]
+    errors = [
+        np.roll(marking.corners_map, shift, axis=0) - counterpart.corners_map
+        for marking, counterpart, shift in pairs
+    ]
     return np.concatenate(errors) if errors else np.empty((0, 2))
 
 
 def height_figures(mapped: Sequence[Marking], true: Sequence[Marking]) -> dict[str, float]:
     """RMSE, m, of paired corners' heights, and the fraction within 1.96 sigmas, where known."""
-    off = []
+    errors_m = []
     inside = []
-    for one, other, shift in zip(mapped, true, _first_corners(mapped, true), strict=True):
-        if one.heights_m is None or other.heights_m is None:
+    for marking, counterpart, shift in zip(mapped, true, _first_corners(mapped, true), strict=True):
+        if marking.heights_m is None or counterpart.heights_m is None:
             continue
-        off.append(one.heights_m - np.roll(other.heights_m, -shift))
-        if one.heights_sigma_m is not None:
-            inside.append(np.abs(off[-1]) < _TWO_SIDED_95 * one.heights_sigma_m)
-    figures = {"height_rmse_m": float(np.sqrt(np.mean(np.square(off))))} if off else {}
+        errors_m.append(marking.heights_m - np.roll(counterpart.heights_m, -shift))
+        if marking.heights_sigma_m is not None:
+            inside.append(np.abs(errors_m[-1]) < _TWO_SIDED_95 * marking.heights_sigma_m)
+    figures = {"height_rmse_m": float(np.sqrt(np.mean(np.square(errors_m))))} if errors_m else {}
     return figures | ({"heights_inside_95": float(np.mean(inside))} if inside else {})
 
 
 def _first_corners(mapped: Sequence[Marking], true: Sequence[Marking]) -> list[int]:
     """Cyclic shift of each pair's corners with the least error."""
     shifts = []
-    for one, other in zip(mapped, true, strict=True):
-        off = [np.roll(one.corners_map, s, axis=0) - other.corners_map for s in range(4)]
-        shifts.append(int(np.argmin([(each**2).sum() for each in off])))
+    for marking, counterpart in zip(mapped, true, strict=True):
+        errors = [np.roll(marking.corners_map, s, axis=0) - counterpart.corners_map for s in range(4)]
+        shifts.append(int(np.argmin([(error**2).sum() for error in errors])))
     return shifts
 
 
@@ -169,7 +172,7 @@ def lane_metrics(lanes: Sequence[Lane], truth: Truth) -> LaneMetrics:
     if not len(mapped) or not len(true_all):
         return LaneMetrics(len(lanes), mapped_m, none, none, none, 0.0, mapped_m)
     lateral = distance_to_points(mapped, true_all)
-    near = lateral <= LATERAL_GATE_M
+    is_near = lateral <= LATERAL_GATE_M
     stated = [(lane.points_map, lane.sigma_m) for lane in lanes if lane.sigma_m is not None]
     off_m = distance_to_points(_stack(points for points, _ in stated), true_all)
     sigmas = off_m / np.concatenate([np.zeros(0), *(sigma_m for _, sigma_m in stated)])
@@ -178,11 +181,11 @@ def lane_metrics(lanes: Sequence[Lane], truth: Truth) -> LaneMetrics:
     return LaneMetrics(
         lanes=len(lanes),
         length_m=mapped_m,
-        mean_lateral_error_m=float(lateral[near].mean()) if near.any() else none,
-        rms_lateral_error_m=float(np.sqrt((lateral[near] ** 2).mean())) if near.any() else none,
+        mean_lateral_error_m=float(lateral[is_near].mean()) if is_near.any() else none,
+        rms_lateral_error_m=float(np.sqrt((lateral[is_near] ** 2).mean())) if is_near.any() else none,
         inside_95=float((sigmas <= _TWO_SIDED_95).mean()) if len(sigmas) else none,
         mapped_fraction=float(covered.mean()) if len(covered) else none,
-        false_length_m=float((~near).sum() * SAMPLE_STEP_M),
+        false_length_m=float((~is_near).sum() * SAMPLE_STEP_M),
     )
 
 

@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -21,9 +22,13 @@ from v2hdm.store.files import whole_file
 
 _SUBPIXELS = 4  # fractional bits of OpenCV's coordinates
 _LARGEST_PX = 1e4  # limit of drawn coordinates, below the overflow of OpenCV's integers
-_HALO_BGR = (25, 25, 25)
-_STRIP_BGR = (250, 250, 250)
-_TEXT_BGR = (35, 35, 35)
+
+Bgr = tuple[int, int, int]
+"""A colour as OpenCV takes it: blue, green and red, 0 to 255."""
+
+_HALO_BGR: Bgr = (25, 25, 25)  # edge of lines: nearly black
+_STRIP_BGR: Bgr = (250, 250, 250)  # background of the legend: nearly white
+_TEXT_BGR: Bgr = (35, 35, 35)  # text of the legend: nearly black
 _FONT = cv2.FONT_HERSHEY_DUPLEX
 
 
@@ -36,7 +41,7 @@ class Pen:
     width: int = 2
 
     @property
-    def bgr(self) -> tuple[int, int, int]:
+    def bgr(self) -> Bgr:
         """The colour in OpenCV's order."""
         value = int(self.colour[1:], 16)
         return value & 255, value >> 8 & 255, value >> 16
@@ -44,15 +49,16 @@ class Pen:
 
 def draw_lines(canvas: np.ndarray, lines: Iterable[FloatArray], pen: Pen) -> None:
     """Draw polylines (N, 2), px, with a dark edge for contrast on paint and on asphalt."""
-    pieces = [piece for line in lines for piece in (_dashes(line, *pen.dash_px) if pen.dash_px else [line])]
+    pieces = [piece for line in lines for piece in (_dashes(line, pen.dash_px) if pen.dash_px else [line])]
     clipped = [np.clip(piece, -_LARGEST_PX, _LARGEST_PX) for piece in pieces]
     fixed = [np.round(piece * (1 << _SUBPIXELS)).astype(np.int32) for piece in clipped]
     for colour, width in ((_HALO_BGR, 2 * pen.width), (pen.bgr, pen.width)):
         cv2.polylines(canvas, fixed, False, colour, width, cv2.LINE_AA, shift=_SUBPIXELS)
 
 
-def _dashes(line: FloatArray, dash_px: float, gap_px: float) -> list[FloatArray]:
-    """Pieces of a polyline, ``dash_px`` long, ``gap_px`` apart."""
+def _dashes(line: FloatArray, lengths_px: tuple[float, float]) -> list[FloatArray]:
+    """Pieces of a polyline; ``lengths_px`` are those of a piece and of the gap behind it."""
+    dash_px, gap_px = lengths_px
     way = length_along(line)
     out = []
     for start in np.arange(0.0, way[-1], dash_px + gap_px):
@@ -89,11 +95,11 @@ def with_legend(canvas: np.ndarray, entries: Sequence[tuple[Pen | None, str]]) -
     return np.vstack([canvas, strip])
 
 
-_FARTHEST_M = 40.0  # farther lines overlap near the horizon
-_ALONG_M = 5.0
-_ACROSS_M = 2.0  # spacing of the grid along and across the vehicle
+_FARTHEST_M = 40.0  # length of the grid ahead of the camera: lines farther out overlap near the horizon
+_ALONG_M = 5.0  # spacing of the grid's lines along the view
+_ACROSS_M = 2.0  # spacing of the grid's lines across the view
 _HALF_WIDTH_M = 8.0  # half width of the grid about the camera
-_NEAREST_M = 0.3  # least depth of ground in an image
+_NEAREST_M = 0.3  # least depth of ground that is drawn
 
 PENS: Mapping[str, Pen] = {
     "guess": Pen(OKABE_ITO["orange"], dash_px=(8.0, 5.0), width=1),
@@ -106,7 +112,7 @@ _WORDS: Mapping[str, str] = {"guess": "grid and horizon: the guess", "ground": "
 _ROI = Pen("#ffffff")
 
 _SMALL_FONT = cv2.FONT_HERSHEY_SIMPLEX
-_TEXT_SIZE = 0.45
+_TEXT_SIZE = 0.45  # size of the grid's coordinates, relative to OpenCV's font
 
 
 def save_grid(
@@ -146,7 +152,7 @@ def save_points(
     canvas = np.full((info.height, info.width, 3), 255, np.uint8) if image is None else image.copy()
     draw_lines(canvas, project_outline(info, cam_from_vehicle, roi_vehicle), _ROI)
     _draw_grid(canvas, info, cam_from_vehicle, PENS["ground"], to_the_left=False)
-    longest = max((float(np.hypot(*off)) for _, _, off, right in points if right), default=0.0)
+    longest = max((float(np.hypot(off[0], off[1])) for _, _, off, right in points if right), default=0.0)
     times = min(_ARROW_SHARE * info.width / max(longest, 1e-9), _MOST_TIMES)
     for label, at, off, right in points:
         pen = _RIGHT if right else _WRONG
@@ -161,7 +167,8 @@ def save_points(
     legend.append(
         (_RIGHT, f"to the predicted pixels, {times:.0f} times as long; the longest {longest:.2f} px")
     )
-    legend += [(_WRONG, "contradict the others, true to scale")] if not all(one[3] for one in points) else []
+    if not all(right for _, _, _, right in points):
+        legend.append((_WRONG, "contradict the others, true to scale"))
     _write_image(path, with_legend(canvas, legend))
 
 
@@ -189,23 +196,30 @@ def project_outline(info: CameraInfo, cam_from_vehicle: FloatArray, outline: Flo
     return project_line(info, cam_from_vehicle, np.concatenate([np.linspace(a, b, 40) for a, b in sides]))
 
 
-def _axes(cam_from_vehicle: FloatArray) -> tuple[FloatArray, int, float]:
-    """The camera's nadir, the vehicle axis (0 or 1) nearest to its view, and the sign along it."""
+class _View(NamedTuple):
+    """Where a camera stands, and where it looks among the vehicle's axes."""
+
+    foot_vehicle: FloatArray  # (2,) m, the camera's nadir
+    along: int  # the axis nearest to the view: 0 ahead, 1 to the left
+    sign: float  # of the view along that axis
+
+
+def _view_of(cam_from_vehicle: FloatArray) -> _View:
     foot = camera_centre(cam_from_vehicle)[:2]
     view = cam_from_vehicle[2, :2]
     along = int(np.argmax(np.abs(view)))
-    return foot, along, float(np.sign(view[along]) or 1.0)
+    return _View(foot, along, float(np.sign(view[along]) or 1.0))
 
 
 def _marks(cam_from_vehicle: FloatArray) -> FloatArray:
     """Coordinates, in the vehicle frame, of the grid lines across the view."""
-    foot, along, side = _axes(cam_from_vehicle)
+    foot, along, side = _view_of(cam_from_vehicle)
     ends = np.sort([foot[along], foot[along] + side * _FARTHEST_M])
     return np.arange(np.ceil(ends[0] / _ALONG_M), np.floor(ends[1] / _ALONG_M) + 1) * _ALONG_M
 
 
 def _grid_lines(cam_from_vehicle: FloatArray) -> list[FloatArray]:
-    foot, along, side = _axes(cam_from_vehicle)
+    foot, along, side = _view_of(cam_from_vehicle)
     other = 1 - along
     middle = round(float(foot[other]) / _ACROSS_M) * _ACROSS_M
     sides = middle + np.arange(-_HALF_WIDTH_M, _HALF_WIDTH_M + 0.1, _ACROSS_M)
@@ -236,7 +250,7 @@ def _label(
     canvas: np.ndarray, info: CameraInfo, cam_from_vehicle: FloatArray, pen: Pen, to_the_left: bool
 ) -> None:
     """Write the grid's coordinates, m, beside the middle of the view."""
-    foot, along, _ = _axes(cam_from_vehicle)
+    foot, along, _ = _view_of(cam_from_vehicle)
     last_v = np.inf
     for mark in sorted(_marks(cam_from_vehicle), key=lambda mark: abs(mark - foot[along])):
         place = foot.copy()
@@ -250,7 +264,7 @@ def _label(
         _write(canvas, text, (int(u) + left, int(last_v) - 4), pen.bgr)
 
 
-def _write(canvas: np.ndarray, text: str, at: tuple[int, int], colour: tuple[int, int, int]) -> None:
+def _write(canvas: np.ndarray, text: str, at: tuple[int, int], colour: Bgr) -> None:
     (width, height), below = cv2.getTextSize(text, _SMALL_FONT, _TEXT_SIZE, 1)
     corner = (at[0] - 2, at[1] - height - 2)
     opposite = (at[0] + width + 2, at[1] + below)
@@ -258,7 +272,7 @@ def _write(canvas: np.ndarray, text: str, at: tuple[int, int], colour: tuple[int
     cv2.putText(canvas, text, at, _SMALL_FONT, _TEXT_SIZE, colour, 1, cv2.LINE_AA)
 
 
-_OVERLAY_RANGE_M = 30.0
+_OVERLAY_RANGE_M = 30.0  # largest distance from the vehicle of markings in an overlay
 
 _BEFORE = Pen(OKABE_ITO["orange"], dash_px=(9.0, 6.0))  # the map under the initial calibration
 OVERLAY = {"Opt": Pen(OKABE_ITO["sky"])}  # the map under the results
@@ -278,16 +292,18 @@ def save_overlay(
     ground points (N, 2) to pinhole px (N, 2), nan behind the camera.
     """
     canvas = image.copy()
-    outlines = [one.corners_map for one in hd_map.markings] + [one.outline_map for one in hd_map.symbols]
-    lines = [*(np.vstack([one, one[:1]]) for one in outlines), *(lane.points_map for lane in hd_map.lanes)]
+    outlines = [marking.corners_map for marking in hd_map.markings]
+    outlines += [symbol.outline_map for symbol in hd_map.symbols]
+    lines = [np.vstack([outline, outline[:1]]) for outline in outlines]
+    lines += [lane.points_map for lane in hd_map.lanes]
     legend: list[tuple[Pen | None, str]] = []
     for name, view in views.items():
         pen = OVERLAY.get(name, _BEFORE)
         for line in lines:
             # Densified: the lens bends lines.
             dense = np.concatenate([np.linspace(a, b, 8) for a, b in itertools.pairwise(line)])
-            near = np.linalg.norm(dense - position_map, axis=1) < _OVERLAY_RANGE_M
-            draw_lines(canvas, _visible_pieces(info, view(dense), near, 0.1), pen)
+            in_range = np.linalg.norm(dense - position_map, axis=1) < _OVERLAY_RANGE_M
+            draw_lines(canvas, _visible_pieces(info, view(dense), in_range, 0.1), pen)
         said = "found by the run" if name in OVERLAY else "that the run started with"
         legend.append((pen, f"{name}: the map with the calibration and pose {said}"))
     _write_image(path, with_legend(canvas, legend))

@@ -70,7 +70,10 @@ def draw_arrows(
     if not len(places):  # matplotlib cannot draw a key without arrows
         return
     longest = max(longest, 1e-3)
-    drawn = axes.quiver(*places.T, *arrows.T, angles="xy", scale_units="xy", scale=longest / span, **look)
+    x, y = places.T
+    dx, dy = arrows.T
+    scale = longest / span
+    drawn = axes.quiver(x, y, dx, dy, angles="xy", scale_units="xy", scale=scale, **look)
     power = 10.0 ** np.floor(np.log10(longest))
     key_px = max(step for step in (1, 2, 5) if step * power <= longest * (1 + 1e-9)) * power
     size = {"size": mpl.rcParams["font.size"] - 1}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
@@ -24,22 +24,33 @@ METHODS: Mapping[str, str] = {
 }
 """The methods of the paper (IROS 2023), in the order of its tables."""
 
-_Column = tuple[str, int, float]  # key in metrics.json, digits behind the point, factor
-_AGAINST_TRUTH: Mapping[str, _Column] = {
-    "recall": ("recall", 3, 1.0),
-    "false": ("false_markings", 0, 1.0),
-    "corner RMSE (cm)": ("corner_rmse_m", 1, 100.0),
-    "bias (cm)": ("corner_bias_m", 1, 100.0),
+
+class FigureColumn(NamedTuple):
+    """How a column of a table shows a figure of ``metrics.json``."""
+
+    key: str
+    digits: int  # behind the point
+    factor: float  # from the figure's unit to the column's
+
+
+# Columns, by heading, of a table of maps that have ground truth.
+_AGAINST_TRUTH: Mapping[str, FigureColumn] = {
+    "recall": FigureColumn("recall", 3, 1.0),
+    "false": FigureColumn("false_markings", 0, 1.0),
+    "corner RMSE (cm)": FigureColumn("corner_rmse_m", 1, 100.0),
+    "bias (cm)": FigureColumn("corner_bias_m", 1, 100.0),
 }
-_WITHOUT_TRUTH: Mapping[str, _Column] = {
-    "sigma (cm)": ("median_sigma_m", 1, 100.0),
-    "reprojection (px)": ("reprojection_rmse_px", 2, 1.0),
+
+# Columns, by heading, of a table of maps without ground truth.
+_WITHOUT_TRUTH: Mapping[str, FigureColumn] = {
+    "sigma (cm)": FigureColumn("median_sigma_m", 1, 100.0),
+    "reprojection (px)": FigureColumn("reprojection_rmse_px", 2, 1.0),
 }
 
 
-def figure_columns(figures: Iterable[Mapping[str, Any]]) -> Mapping[str, _Column]:
+def figure_columns(figures: Iterable[Mapping[str, Any]]) -> Mapping[str, FigureColumn]:
     """The columns of a table of methods: errors where any of their ``figures`` has ground truth."""
-    return _AGAINST_TRUTH if any("recall" in one for one in figures) else _WITHOUT_TRUTH
+    return _AGAINST_TRUTH if any("recall" in row for row in figures) else _WITHOUT_TRUTH
 
 
 def results_table(title: str, results: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Table:
@@ -50,9 +61,9 @@ def results_table(title: str, results: Mapping[str, Mapping[str, Mapping[str, fl
     for method in (*METHODS, *others):
         for cameras, rows in results.items():
             if method in rows:
-                found = rows[method]
-                cells = [_number(found.get(key), digits, by) for key, digits, by in columns.values()]
-                table.add_row(method, cameras, str(found["markings"]), *cells)
+                row = rows[method]
+                cells = [_number(row.get(key), digits, factor) for key, digits, factor in columns.values()]
+                table.add_row(method, cameras, str(row["markings"]), *cells)
         table.add_section()
     return table
 
@@ -77,21 +88,21 @@ def changes_table(changes: Mapping[str, Any]) -> Table | str:
     if not changes["listed"]:
         return f"changes: {counts}"
     numbers = ("by (cm)", "sigma (cm)", "odds", "seen / should be")
-    table = new_table(f"changes: {counts}", ("class", "fate"), numbers, before=("id",))
+    table = new_table(f"changes: {counts}", ("class", "change"), numbers, before=("id",))
     table.add_column("at (m)")
-    for one in changes["listed"]:
-        shift = one["shift_m"]
-        sigma = one["shift_sigma_m"]
-        corners = one["after_map"] or one["before_map"]
+    for change in changes["listed"]:
+        shift = change["shift_m"]
+        sigma = change["shift_sigma_m"]
+        corners = change["after_map"] or change["before_map"]
         x, y = (sum(corner[k] for corner in corners) / len(corners) for k in (0, 1))
         table.add_row(
-            str(one["id"]),
-            one["class"],
-            one["fate"],
-            "" if shift is None else f"{100 * math.hypot(*shift):.0f}",
-            "" if sigma is None else f"{100 * math.hypot(*sigma) / math.sqrt(2):.1f}",
-            f"{one['probability']:.3f}",
-            f"{one['found']} / {one['views']}",
+            str(change["id"]),
+            change["class"],
+            change["fate"],
+            "" if shift is None else f"{100 * math.hypot(shift[0], shift[1]):.0f}",
+            "" if sigma is None else f"{100 * math.hypot(sigma[0], sigma[1]) / math.sqrt(2):.1f}",
+            f"{change['probability']:.3f}",
+            f"{change['found']} / {change['views']}",
             f"({x:.1f}, {y:.1f})",
         )
     return table
@@ -104,9 +115,10 @@ def drive_bars(console: Console, endings: Collection[str] = ()) -> Iterator[Driv
         lines = progress_lines(lambda line: plain(console, line))
         yield lambda drive, stage, done, total: lines(f"{drive}: {stage}", done, total)
         return
-    texts = [TextColumn(one, markup=False) for one in ("{task.description:<20}", "{task.fields[stage]:<16}")]
-    bar = (BarColumn(30), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*texts, *bar, console=console) as bars:
+    name = TextColumn("{task.description:<20}", markup=False)
+    stage_name = TextColumn("{task.fields[stage]:<16}", markup=False)
+    columns = (name, stage_name, BarColumn(30), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console) as bars:
         tasks: dict[str, TaskID] = {}
 
         def advance(drive: str, stage: str, done: int, total: int) -> None:

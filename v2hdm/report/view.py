@@ -15,6 +15,7 @@ from contextvars import Context
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,7 +27,7 @@ from v2hdm.report.page.document import json_text, page_text
 from v2hdm.report.page.facts import Facts, read_facts
 
 _SAME_M = 0.01  # largest distance, m, between a correction and its feature
-_MOST_BYTES = 100_000  # of one correction
+_MOST_BYTES = 100_000  # largest size of a correction that is sent
 
 
 def file_beside(folder: Path) -> Path:
@@ -44,10 +45,14 @@ class Session:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     @classmethod
-    def begun(cls, folder: Path, path: Path, facts: Facts) -> Session:
+    def start(cls, folder: Path, path: Path, facts: Facts) -> Session:
         """Start from the file's content; raises MapFileError if it is no file of corrections."""
         corrections = read_corrections(path) if path.exists() else []
-        return cls(folder, path, {_key(one, facts) or f"old{n}": one for n, one in enumerate(corrections)})
+        return cls(
+            folder,
+            path,
+            {_key(correction, facts) or f"old{n}": correction for n, correction in enumerate(corrections)},
+        )
 
     def take(self, sent: bytes) -> None:
         """Store or remove a correction and write the file; raises MapFileError if malformed."""
@@ -58,38 +63,46 @@ class Session:
         except (ValueError, TypeError, LookupError, RecursionError):
             raise MapFileError("not a correction: expected a key and a correction") from None
         with self._lock:
-            now = {name: one for name, one in self.corrections.items() if name != key}
+            corrections = {name: other for name, other in self.corrections.items() if name != key}
             if entry is not None:
-                now[key] = correction_of(entry, key)
+                corrections[key] = correction_of(entry, key)
             # This command read the file at its start, and continues after writing it.
-            Context().run(write_corrections, list(now.values()), str(self.folder), self.path)
-            self.corrections = now
+            Context().run(write_corrections, list(corrections.values()), str(self.folder), self.path)
+            self.corrections = corrections
 
 
-def _key(one: Correction, facts: Facts) -> str | None:
+def _key(correction: Correction, facts: Facts) -> str | None:
     """Key in the page of a correction's feature; None if not in the map."""
     hd_map = facts.hd_map
     places = {f"x{n}": out.position_map[None] for n, out in enumerate(facts.excluded)}
     if hd_map is not None:
         places |= {f"m{marking.id}": marking.corners_map for marking in hd_map.markings}
         places |= {f"s{symbol.id}": symbol.outline_map for symbol in hd_map.symbols}
-    said = np.array(one.outline_map)
+    outline = np.array(correction.outline_map)
     for key, place in places.items():
-        if place.shape == said.shape and np.abs(place - said).max() < _SAME_M:
+        if place.shape == outline.shape and np.abs(place - outline).max() < _SAME_M:
             return key
     return None
 
 
-def server_of(folder: Path, drive: Drive | None, path: Path) -> tuple[ThreadingHTTPServer, str, Session]:
-    """A server of a result on a free port of 127.0.0.1, not yet running, its address, and its session."""
+class Viewing(NamedTuple):
+    """A server of a result on a free port of 127.0.0.1, not yet running."""
+
+    server: ThreadingHTTPServer
+    address: str
+    session: Session
+
+
+def server_of(folder: Path, drive: Drive | None, path: Path) -> Viewing:
+    """Serve the result in ``folder`` and its corrections in the file ``path``; MapFileError without a map."""
     facts = read_facts(folder, drive)
     if facts.hd_map is None:
         raise MapFileError(f"{folder}: has no map to view; fix its drive and map it again")
-    session = Session.begun(folder, path, facts)
+    session = Session.start(folder, path, facts)
     secret = secrets.token_urlsafe(16)
     text = page_text(folder, drive, {"secret": secret})
     place = json_text({"secret": secret})
-    kinds: Sequence[str] = sorted({*SHIPPED.names, *(one.kind for one in facts.hd_map.markings)})
+    kinds: Sequence[str] = sorted({*SHIPPED.names, *(marking.kind for marking in facts.hd_map.markings)})
 
     class Handler(BaseHTTPRequestHandler):
         timeout = 30
@@ -100,8 +113,8 @@ def server_of(folder: Path, drive: Drive | None, path: Path) -> tuple[ThreadingH
         def do_GET(self) -> None:
             if not self._is_ours() or self.path != f"/{secret}/":
                 return self._answer(404, "no such page")
-            own = {key: entry_of(one) for key, one in session.corrections.items()}
-            editing = {"file": path.name, "corrections": own, "kinds": kinds}
+            entries = {key: entry_of(correction) for key, correction in session.corrections.items()}
+            editing = {"file": path.name, "corrections": entries, "kinds": kinds}
             return self._answer(200, text.replace(place, json_text(editing), 1), "text/html")
 
         def do_POST(self) -> None:
@@ -133,4 +146,4 @@ def server_of(folder: Path, drive: Drive | None, path: Path) -> tuple[ThreadingH
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
     server.daemon_threads = True
     base = f"http://127.0.0.1:{server.server_address[1]}"
-    return server, f"{base}/{secret}/", session
+    return Viewing(server, f"{base}/{secret}/", session)

@@ -7,13 +7,9 @@ memory. Damage that decoders only warn of, such as half an image or grey blocks,
 from __future__ import annotations
 
 import logging
-import os
 import re
 import stat
 import struct
-import sys
-import tempfile
-import threading
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -25,6 +21,7 @@ from typing import Any, BinaryIO
 
 import cv2
 import numpy as np
+import simplejpeg
 
 from v2hdm.errors import DriveError, V2hdmError
 from v2hdm.store.inputs import note_input
@@ -51,10 +48,11 @@ _HEIGHT_TAG = 0x101
 _ORIENTATION_TAG = 0x112
 _UPRIGHT = 1
 
-# Warnings of the libraries below OpenCV about an image that they decode all the same.
-_DAMAGE = re.compile(
-    r"Corrupt JPEG|Premature end|libpng (error|warning: .*CRC)|Invalid SOS|bad Huffman", re.I
-)
+AS_STORED = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR  # OpenCV's flags for the depth and channels of the file
+_GREY_FLAGS = (cv2.IMREAD_GRAYSCALE, cv2.IMREAD_REDUCED_GRAYSCALE_4)
+_PRINTERS_SPACES = ("CMYK", "YCCK")  # which TurboJPEG turns into no other
+_ODD = re.compile("JFIF revision|Adobe color|progression sequence|subsampling")
+"""What a strict decoder refuses in a JPEG that may be whole: others make these, too."""
 VIDEO_OPTIONS = {
     "protocol_whitelist": "file",
     "format_whitelist": "mov,matroska,avi,mpegts,mpeg,mpegvideo,m4v,h264,hevc,ivf,obu,asf,flv,ogg,mjpeg,mxf",
@@ -63,7 +61,6 @@ VIDEO_OPTIONS = {
 DECODER_OPTIONS = {"err_detect": "crccheck"}
 """FFmpeg's, without which hashes of pictures that a video of H.265 carries are not looked at."""
 _QUICK = (cv2.IMWRITE_PNG_COMPRESSION, 1)
-_stderr = threading.Lock()  # held while descriptor 2, which all threads share, is redirected
 
 
 @dataclass(frozen=True)
@@ -90,14 +87,37 @@ def read_pixels(path: Path, flags: int) -> np.ndarray:
         raise DriveError(f"{path}: the image is damaged; copy it again or drop it from the list")
     if header.orientation != _UPRIGHT and not flags & cv2.IMREAD_IGNORE_ORIENTATION:
         _warn_turned(path.parent, header.orientation)
-    with _complaints() as lines:
-        try:
+    try:
+        pixels = _strict_jpeg(data, header, flags) if data.startswith(_JPEG) else None
+        if pixels is None:
             pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
-        except cv2.error:
-            pixels = None
-    if pixels is None or any(map(_DAMAGE.search, lines)):
+    except (ValueError, cv2.error):
+        pixels = None
+    if pixels is None:
         raise DriveError(f"{path}: the image is damaged; copy it again or drop it from the list")
     return np.asarray(pixels)
+
+
+def _strict_jpeg(data: bytes, header: Header, flags: int) -> np.ndarray | None:
+    """The pixels that OpenCV decodes with ``flags``, None where only it can; ValueError on damage."""
+    try:
+        *_, colour_space, _ = simplejpeg.decode_jpeg_header(data)
+        if colour_space in _PRINTERS_SPACES:
+            simplejpeg.decode_jpeg(data, "CMYK")
+            return None
+        is_grey = flags in _GREY_FLAGS or (flags == AS_STORED and colour_space == "Gray")
+        shrink = 4 if flags == cv2.IMREAD_REDUCED_GRAYSCALE_4 else 1
+        pixels = simplejpeg.decode_jpeg(
+            data, "GRAY" if is_grey else "BGR",
+            min_height=-(-header.height // shrink), min_width=-(-header.width // shrink), min_factor=shrink,
+        )  # fmt: skip
+    except ValueError as complaint:
+        if not _ODD.search(str(complaint)):
+            raise
+        return None
+    if header.orientation != _UPRIGHT or flags not in (*_GREY_FLAGS, AS_STORED, cv2.IMREAD_COLOR):
+        return None
+    return np.asarray(pixels[..., 0] if is_grey else pixels)
 
 
 def check_raster(raster: Any, path: Path, error: type[V2hdmError]) -> None:
@@ -297,27 +317,3 @@ def _tiff_tags(data: _Data) -> dict[int, int]:
     if _WIDTH_TAG in tags and _HEIGHT_TAG not in tags:
         raise ValueError("no height")
     return tags
-
-
-@contextmanager
-def _complaints() -> Iterator[list[str]]:
-    """Collect the lines that C libraries print on stderr; those that report no damage are printed after."""
-    complaints: list[str] = []
-    sys.stderr.flush()
-    with _stderr, tempfile.TemporaryFile() as printed:
-        try:
-            stderr = os.dup(2)
-        except OSError:  # no stderr at all
-            yield complaints
-            return
-        os.dup2(printed.fileno(), 2)
-        try:
-            yield complaints
-        finally:
-            os.dup2(stderr, 2)
-            os.close(stderr)
-            printed.seek(0)
-            for line in printed.read(1 << 20).decode("utf-8", "replace").splitlines():
-                complaints.append(line)
-                if not _DAMAGE.search(line):
-                    print(line, file=sys.stderr)

@@ -129,7 +129,7 @@ def parse_json(text: str, where: str, error: type[V2hdmError]) -> Any:
             json.dumps(content, ensure_ascii=False).encode()
         return content
     except UnicodeEncodeError:
-        raise error(f"{where}: {_HALF}instead of a text; fix it") from None
+        raise error(f"{where}: {_HALF} instead of a text; fix it") from None
     except RecursionError:
         raise error(f"{where}: JSON nested too deep; fix it") from None
     except json.JSONDecodeError as failure:

@@ -13,15 +13,17 @@ from v2hdm.geometry.planar import block_diagonal
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 _UNSEEN_M2 = 1e4  # variance of an unseen corner, m^2: effectively infinite at the size of a site
-CORRELATION = 0.2  # of a corner's errors between images; .3 overstates sides' sigmas, .1 understates corners'
+CORRELATION = 0.2
+"""Correlation of a corner's errors between images: 0.3 overstates sides' sigmas, 0.1 understates corners'."""
+
 _KNOWN_SIGMA_M = 0.5  # largest sigma, m, of a known corner: a fraction of any marking's length
 
 TOO_UNCERTAIN = "its position is too uncertain"
 LACKS_A_CORNER = "a corner was never seen twice"
 
 _OTHER_EDGE_M = 0.3
-"""Sigma, m, of a sighting's edge, such as a worn end's, about where others see it; beyond lies something
-else."""
+"""Sigma, m, of a sighting's edge, such as a worn end's, about where others see it; what lies farther off is
+something else."""
 
 
 @dataclass(frozen=True)
@@ -76,13 +78,13 @@ class Counts:
     agreeing: IntArray  # of these, consistent with the solution
     log_odds: FloatArray  # the detector's mean log-odds over these
     easy_views: IntArray  # images with an unobstructed view of the whole candidate
-    found: IntArray  # of these, with a detection
+    detected_views: IntArray  # of these, with a detection
     pointed: IntArray  # (G, 4) of these, with the corner as a consistent point
     as_symbol: IntArray  # images with a symbol on it, or a solid line that continues it
 
     def subset(self, rows: IntArray | BoolArray) -> Counts:
         """The candidates at ``rows``."""
-        return Counts(*(values[rows] for values in vars(self).values()))
+        return Counts(**{name: values[rows] for name, values in vars(self).items()})
 
 
 def with_dissent(
@@ -101,26 +103,28 @@ def with_dissent(
     either is right with a probability p in proportion to its information; the mixture adds the variance p
     (1 - p) of their squared distance. Corners of one sighting are treated jointly.
     """
-    off = seen_map - candidates.corners_map[group, corner]
-    away_m = np.linalg.norm(off, axis=1)
-    # x' C^-1 x is the information along the line between both positions, times the squared length.
-    agreed = fused.covariance_m2[group, corner]
+    offset_m = seen_map - candidates.corners_map[group, corner]
+    away_m = np.linalg.norm(offset_m, axis=1)
+    agreed_m2 = fused.covariance_m2[group, corner]
     usable = fused.valid[group, corner] & (away_m < 3 * _OTHER_EDGE_M)
-    usable &= np.isfinite(covariance_m2).all(axis=(1, 2)) & np.isfinite(off).all(axis=1)
-    off = off[usable]
+    usable &= np.isfinite(covariance_m2).all(axis=(1, 2)) & np.isfinite(offset_m).all(axis=1)
+    offset_m = offset_m[usable]
     away_m = away_m[usable]
-    agreed = agreed[usable]
-    one, all_others = (
-        np.einsum("ri,rij,rj->r", off, np.linalg.inv(each), off) for each in (covariance_m2[usable], agreed)
-    )
-    share = one / (one + all_others) * np.exp(-0.5 * (away_m / _OTHER_EDGE_M) ** 2)
-    sightings, number = np.unique(np.stack([group, row])[:, usable], axis=1, return_inverse=True)
+    alone = _information(offset_m, covariance_m2[usable])
+    all_others = _information(offset_m, agreed_m2[usable])
+    share = alone / (alone + all_others) * np.exp(-0.5 * (away_m / _OTHER_EDGE_M) ** 2)
+    sightings, sighting_of_corner = np.unique(np.stack([group, row])[:, usable], axis=1, return_inverse=True)
     moved = np.zeros((sightings.shape[1], 4, 2))
-    moved[number.ravel(), corner[usable]] = np.sqrt(share)[:, None] * off
+    moved[sighting_of_corner.ravel(), corner[usable]] = np.sqrt(share)[:, None] * offset_m
     covariance = candidates.covariance_m2.copy()
-    ways = moved.reshape(-1, 8)
-    np.add.at(covariance, sightings[0], ways[:, :, None] * ways[:, None, :])
+    shift = moved.reshape(-1, 8)
+    np.add.at(covariance, sightings[0], shift[:, :, None] * shift[:, None, :])
     return Candidates(candidates.corners_map, covariance)
+
+
+def _information(offset_m: FloatArray, covariance_m2: FloatArray) -> FloatArray:
+    """Information x' C^-1 x (R,) along ``offset_m`` (R, 2), times its squared length, of (R, 2, 2)."""
+    return np.asarray(np.einsum("ri,rij,rj->r", offset_m, np.linalg.inv(covariance_m2), offset_m))
 
 
 def with_shared_errors(candidates: Candidates, fused: FusedGroups, scatter: FloatArray) -> Candidates:
@@ -129,17 +133,17 @@ def with_shared_errors(candidates: Candidates, fused: FusedGroups, scatter: Floa
     With correlation r, the mean of n images has the variance (1 + (n - 1) r) / n (Kish, Survey Sampling,
     1965): about r times a single image's, as in ``fused``. ``scatter`` (G, 4) inflates a corner's variance.
     """
-    seen = np.maximum(fused.seen, 1)
-    share = scatter - 1 + CORRELATION * seen * scatter
+    sightings = np.maximum(fused.point_sightings, 1)
+    share = scatter - 1 + CORRELATION * sightings * scatter
     unseen = np.asarray(np.isnan(fused.corners_map).any(axis=2))
     shared = np.where(unseen[..., None, None], 0.0, share[..., None, None] * fused.covariance_m2)
     # Images that are cut alike share one error: their number does not locate the corner.
-    no_point = (fused.seen == 0) & ~unseen
+    no_point = (fused.point_sightings == 0) & ~unseen
     shared[no_point] = line_only(shared[no_point], _UNSEEN_M2**0.5)
     return Candidates(candidates.corners_map, candidates.covariance_m2 + block_diagonal(shared))
 
 
-_LARGEST = 1e9  # of residual variances, squared sigmas: beyond it, and below its inverse, all are equal
+_LARGEST = 1e9  # largest residual variance, squared sigmas: beyond it, and below its inverse, all are equal
 
 _PRIOR_FREEDOM = (1.0, 1e4)
 """Limits of the prior's degrees of freedom for a variance: from tails as heavy as Cauchy's to none."""
@@ -154,18 +158,18 @@ def variance_prior(variance: FloatArray, freedom: FloatArray) -> tuple[float, fl
     """
     if len(variance) < _LEAST_TO_COMPARE:
         return _LARGEST, _PRIOR_FREEDOM[1]
-    off = np.log(np.clip(variance, 1 / _LARGEST, _LARGEST)) - psi(freedom / 2) + np.log(freedom / 2)
-    beyond = off.var(ddof=1) - polygamma(1, freedom / 2).mean()
+    offset = np.log(np.clip(variance, 1 / _LARGEST, _LARGEST)) - psi(freedom / 2) + np.log(freedom / 2)
+    excess = offset.var(ddof=1) - polygamma(1, freedom / 2).mean()
     low, high = _PRIOR_FREEDOM
-    beyond = float(np.clip(beyond, polygamma(1, high / 2) * 1.001, polygamma(1, low / 2) * 0.999))
-    prior = float(brentq(lambda count: polygamma(1, count / 2) - beyond, low, high))
-    return float(np.exp(off.mean() + psi(prior / 2) - np.log(prior / 2))), prior
+    excess = float(np.clip(excess, polygamma(1, high / 2) * 1.001, polygamma(1, low / 2) * 0.999))
+    prior = float(brentq(lambda count: polygamma(1, count / 2) - excess, low, high))
+    return float(np.exp(offset.mean() + psi(prior / 2) - np.log(prior / 2))), prior
 
 
 def scatter_of(squared: FloatArray, freedom: FloatArray) -> FloatArray:
     """Variance inflation (G, 4) of corners' images relative to the usual, at least 1; all are shrunk."""
-    known = freedom > 0
+    has_spread = freedom > 0
     squared = np.minimum(squared, _LARGEST * np.maximum(freedom, 1.0))  # infinite in the camera's plane
-    scale, prior = variance_prior(squared[known] / freedom[known], freedom[known])
-    after = (prior * scale + squared) / (prior + np.maximum(freedom, 0.0))
-    return np.asarray(np.where(known, np.maximum(after / scale, 1.0), 1.0))
+    scale, prior = variance_prior(squared[has_spread] / freedom[has_spread], freedom[has_spread])
+    posterior_variance = (prior * scale + squared) / (prior + np.maximum(freedom, 0.0))
+    return np.asarray(np.where(has_spread, np.maximum(posterior_variance / scale, 1.0), 1.0))

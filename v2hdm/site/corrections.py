@@ -18,26 +18,26 @@ MAX_OVERLAP = 0.2  # overlap of outlines, relative to the smaller, from which th
 
 @dataclass(frozen=True)
 class Stated:
-    """Corrections by candidate: ``rejected`` with reasons, ``kept`` with the correction."""
+    """Corrections by candidate: ``rejected`` with reasons, ``confirmed`` with the correction."""
 
     rejected: dict[int, str]
-    kept: dict[int, Correction]
+    confirmed: dict[int, Correction]
 
     @classmethod
     def of(cls, corrections: Sequence[Correction], corners_map: FloatArray, kinds: Sequence[str]) -> Stated:
         """Corrections of the nearest candidates (G, 4, 2), own class first; rejections are of all there."""
         rejected: dict[int, str] = {}
-        kept: dict[int, Correction] = {}
-        for one in corrections:
-            same = _same(one, corners_map)
-            if one.says == REJECTED:
-                rejected |= dict.fromkeys(same.tolist(), reason_of(one))
+        confirmed: dict[int, Correction] = {}
+        for correction in corrections:
+            same = _same(correction, corners_map)
+            if correction.says == REJECTED:
+                rejected |= dict.fromkeys(same.tolist(), reason_of(correction))
             elif len(same):
-                middle = np.mean(one.outline_map, axis=0)
+                middle = np.mean(correction.outline_map, axis=0)
                 away_m = np.linalg.norm(corners_map[same].mean(axis=1) - middle, axis=1)
-                away_m = away_m + [0.0 if kinds[group] == one.kind else _SAME_M for group in same]
-                kept[int(same[np.argmin(away_m)])] = one
-        return cls({group: why for group, why in rejected.items() if group not in kept}, kept)
+                away_m = away_m + [0.0 if kinds[group] == correction.kind else _SAME_M for group in same]
+                confirmed[int(same[np.argmin(away_m)])] = correction
+        return cls({group: why for group, why in rejected.items() if group not in confirmed}, confirmed)
 
     def placed(self, candidates: Candidates, uncorrected: Candidates) -> Candidates:
         """The candidates with the corners that a person moved.
@@ -48,43 +48,43 @@ class Stated:
         """
         corners = candidates.corners_map.copy()
         covariance = candidates.covariance_m2.copy()
-        for group, one in self.kept.items():
-            if not one.moved:
+        for group, correction in self.confirmed.items():
+            if not correction.moved:
                 continue
-            before = np.array(one.outline_map)
+            before = np.array(correction.outline_map)
             turns = [np.roll(np.arange(4), -k) for k in range(4)]
             now = uncorrected.corners_map[group]
             turn = min(turns, key=lambda order: float(np.sum((now[order] - before) ** 2)))
-            moved = [int(turn[number - 1]) for number in one.moved]
+            moved = [int(turn[number - 1]) for number in correction.moved]
             others = [int(k) for k in turn if k not in moved and candidates.known[group, k]] or turn.tolist()
-            seen = [turn.tolist().index(k) for k in others]
-            shift = (now[others] - before[seen]).mean(axis=0)
+            numbers = [turn.tolist().index(k) for k in others]
+            shift = (now[others] - before[numbers]).mean(axis=0)
             mixing = np.eye(4)
-            for place, corner in zip(one.moved.values(), moved, strict=True):
+            for place, corner in zip(correction.moved.values(), moved, strict=True):
                 corners[group, corner] = np.array(place) + shift
                 mixing[corner] = np.isin(np.arange(4), others) / len(others)
             by_axis = np.kron(mixing, np.eye(2))
             covariance[group] = by_axis @ covariance[group] @ by_axis.T
             for corner in moved:
-                own = slice(2 * corner, 2 * corner + 2)
-                covariance[group][own, own] += one.sigma_m**2 * np.eye(2)
+                rows = slice(2 * corner, 2 * corner + 2)
+                covariance[group][rows, rows] += correction.sigma_m**2 * np.eye(2)
         return Candidates(corners, covariance)
 
 
-def reason_of(one: Correction) -> str:
+def reason_of(correction: Correction) -> str:
     """The reason for a marking that a person rejected."""
-    return "rejected by a person" + (f": {one.reason}" if one.reason else "")
+    return "rejected by a person" + (f": {correction.reason}" if correction.reason else "")
 
 
-def _same(one: Correction, corners_map: FloatArray) -> IntArray:
+def _same(correction: Correction, corners_map: FloatArray) -> IntArray:
     """The candidates on the paint that a person corrected."""
-    outline = np.array(one.outline_map)
+    outline = np.array(correction.outline_map)
     away_m = np.linalg.norm(corners_map.mean(axis=1) - outline.mean(axis=0), axis=1)
     if len(outline) != 4:
         return np.flatnonzero(away_m < _SAME_M)
     reach_m = float(np.ptp(outline, axis=0).max()) + _SAME_M
-    near = np.flatnonzero(away_m < reach_m)
-    return near[[overlap(corners_map[group], outline) > MAX_OVERLAP for group in near]]
+    in_reach = np.flatnonzero(away_m < reach_m)
+    return in_reach[[overlap(corners_map[group], outline) > MAX_OVERLAP for group in in_reach]]
 
 
 def overlap(a: FloatArray, b: FloatArray) -> float:
@@ -97,36 +97,38 @@ def with_symbols_corrected(
     hd_map: HDMap, corrections: Sequence[Correction]
 ) -> tuple[HDMap, tuple[Exclusion, ...]]:
     """The map with a person's corrections to its symbols, and the rejected symbols."""
-    kept = []
-    out = []
+    kept_symbols = []
+    exclusions = []
     for symbol in hd_map.symbols:
         middle = symbol.outline_map.mean(axis=0)
-        for one in corrections:
-            if len(one.outline_map) < 5 and symbol.kind != one.kind:
+        for correction in corrections:
+            if len(correction.outline_map) < 5 and symbol.kind != correction.kind:
                 continue
-            if np.linalg.norm(np.mean(one.outline_map, axis=0) - middle) < _SAME_M:
-                if one.says == REJECTED:
-                    out.append(Exclusion(symbol.kind, middle, symbol.sightings, reason_of(one)))
+            if np.linalg.norm(np.mean(correction.outline_map, axis=0) - middle) < _SAME_M:
+                if correction.says == REJECTED:
+                    exclusions.append(Exclusion(symbol.kind, middle, symbol.sightings, reason_of(correction)))
                     break
-                symbol = replace(symbol, kind=one.new_kind or symbol.kind)
+                symbol = replace(symbol, kind=correction.new_kind or symbol.kind)
         else:
-            kept.append(symbol)
-    return replace(hd_map, symbols=tuple(kept)), tuple(out)
+            kept_symbols.append(symbol)
+    return replace(hd_map, symbols=tuple(kept_symbols)), tuple(exclusions)
 
 
 def unmet(corrections: Sequence[Correction], hd_map: HDMap) -> list[str]:
     """Corrections that found nothing at their position in a finished map."""
-    corners = np.array([one.corners_map for one in hd_map.markings]).reshape(-1, 4, 2)
+    corners = np.array([marking.corners_map for marking in hd_map.markings]).reshape(-1, 4, 2)
     missing = []
-    for one in corrections:
-        same = _same(one, corners)
+    for correction in corrections:
+        same = _same(correction, corners)
         kinds = {hd_map.markings[k].kind for k in same}
+        middle = np.mean(correction.outline_map, axis=0)
         kinds |= {
             symbol.kind
             for symbol in hd_map.symbols
-            if np.linalg.norm(symbol.outline_map.mean(axis=0) - np.mean(one.outline_map, axis=0)) < _SAME_M
+            if np.linalg.norm(symbol.outline_map.mean(axis=0) - middle) < _SAME_M
         }
-        there = (one.new_kind or one.kind) in kinds if one.says != ACCEPTED or one.new_kind else bool(kinds)
-        if there == (one.says == REJECTED):
-            missing.append(one.place)
+        names_a_class = correction.says != ACCEPTED or bool(correction.new_kind)
+        is_present = (correction.new_kind or correction.kind) in kinds if names_a_class else bool(kinds)
+        if is_present == (correction.says == REJECTED):
+            missing.append(correction.place)
     return missing

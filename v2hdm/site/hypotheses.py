@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import cached_property
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import logsumexp
@@ -42,40 +43,48 @@ _LENGTH_SIGMA_M = 0.3  # prior sigma of the length of paint rolled by the metre,
 _REPEATED_COUNT = 3.0
 """Concentration of the Dirichlet process of lengths: paint of another length repeats a known one."""
 
-_MISPLACED_M = 0.3  # sigma, m, of a worn end, or of any corner of clutter (17 worn ends: .08 to .74 m)
-_WORN_SHARE = 0.5  # the same relative to the length: any part may be worn away
+_MISPLACED_M = 0.3  # sigma, m, of a worn end, or of any corner of clutter (17 worn ends: 0.08 to 0.74 m)
+_WORN_SHARE = 0.5  # sigma of a worn end relative to the marking's length: any part may be worn away
 
-_SLANT_OF_END = 0.5
-_SLANT_OF_PIECE = 0.1
-"""Sigma, relative to the width, of a corner of a dash's end cut at any angle, and of a piece."""
+_SLANT_OF_END = 0.5  # sigma, relative to the width, of a corner of a dash's end that is cut at any angle
+_SLANT_OF_PIECE = 0.1  # sigma, relative to the width, of a corner of a marking's piece that is in view
 
 _RUN_ON_M = 1.0  # sigma, m, of an end that merges with other paint: about the length of letters
 
-_LIKE_CLASS = 0.7
-_LIKE_SHARE = 0.2
-"""Fraction of other paint and clutter that is shaped like the class it was taken for, at any length, and the
-sigma of its corners relative to the width: detections of a class resemble it, and are fitted as such."""
+# Detections of a class resemble it, and are fitted as such.
+_LIKE_CLASS = 0.7  # fraction of other paint and clutter that is shaped like its class, at any length
+_LIKE_SHARE = 0.2  # sigma of the corners of such paint, relative to the width of the class
 
-_SOUND_SPREAD = (0.0, 0.4)
-_WORN_SPREAD = (1.5, 0.7)
-"""Mean and standard deviation of the logarithm of an end's scatter relative to its class: images agree on a
-sound end, a worn one ends elsewhere in each (229 sound and 10 worn ends of a rendered port)."""
+# Images agree on a sound end; a worn one ends elsewhere in each.
+_SOUND_SPREAD = (0.0, 0.4)  # mean and sigma of the log of a sound end's scatter (229 ends of a rendered port)
+_WORN_SPREAD = (1.5, 0.7)  # mean and sigma of the log of a worn end's scatter (10 ends of that port)
 
-_UNCLEAR_SHARE = 0.05
-_CLEAR_SHARE = 0.1
-"""Fraction of sound ends that scatter like worn ones, being distant, and of worn ones that all images show
-alike (5 of 229 and 1 of 11 ends there)."""
+_UNCLEAR_SHARE = 0.05  # fraction of sound ends that scatter like worn ones, being distant (5 of 229 there)
+_CLEAR_SHARE = 0.1  # fraction of worn ends that all images show alike (1 of 11 there)
 
-_FIRST = np.array([-0.5, 0.5, 0.5, -0.5])
-_SECOND = np.array([-0.5, -0.5, 0.5, 0.5])
-"""Corner k of a parallelogram with sides u and v lies at its centre plus first[k] u + second[k] v."""
+# Corner k of a parallelogram with sides u and v lies at its centre plus first[k] u + second[k] v.
+_FIRST = np.array([-0.5, 0.5, 0.5, -0.5])  # offsets of the four corners along u, in lengths of u
+_SECOND = np.array([-0.5, -0.5, 0.5, 0.5])  # offsets of the four corners along v, in lengths of v
 
+# Covariance (8, 8), m^2, of the corners of a parallelogram whose sides have any length and direction.
 _OWN_SIZE = _SIZE_SIGMA_M**2 * np.kron(np.outer(_FIRST, _FIRST) + np.outer(_SECOND, _SECOND), np.eye(2))
 
 _NOTHING = np.zeros((8, 8))  # covariance of no misplacement
 
-_Ends = Sequence[tuple[FloatArray, FloatArray]]
-"""Motions (N, 8) of corners for a side moving inwards by 1 m, and their limits (N, 1), m."""
+
+class _End(NamedTuple):
+    """An end or a side of a shape on N candidates, which may lie farther inwards than its class's."""
+
+    inwards: FloatArray  # (N, 8) motions of the corners as the side moves inwards by 1 m
+    limit_m: FloatArray  # (N, 1) largest such motion, m: the extent of the shape
+
+
+class Fit(NamedTuple):
+    """The deviations of N candidates from a laid shape, beside what is expected of them."""
+
+    innovation: FloatArray  # (N, 5, 5) covariance of the residual
+    solved: FloatArray  # (N, 5) inverse of the covariance times the residual
+    squared: FloatArray  # (N,) squared Mahalanobis distance
 
 
 @dataclass(frozen=True)
@@ -99,12 +108,12 @@ class Hypothesis:
         return _within(self.directions, self.candidates.covariance_m2)
 
     @cached_property
-    def fit(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Covariance of the residual, its inverse times the residual, and squared Mahalanobis distance."""
+    def fit(self) -> Fit:
+        """The residual under its covariance from all errors."""
         innovation = self.formal + _within(self.directions, self.scatter + self.misplaced)
         innovation = innovation + self.paint.sigma_m**2 * np.eye(5)
         solved = np.linalg.solve(innovation, self.residual[..., None])[..., 0]
-        return innovation, np.asarray(solved), np.asarray(np.sum(self.residual * solved, axis=1))
+        return Fit(innovation, np.asarray(solved), np.asarray(np.sum(self.residual * solved, axis=1)))
 
     @property
     def log_likelihood(self) -> FloatArray:
@@ -114,11 +123,11 @@ class Hypothesis:
         both_ways = both_ways + self.beside
         if self.one_way is None:
             return np.asarray(both_ways)
-        moved = self.directions @ self.one_way
-        mean = np.sum(moved * solved[..., None], axis=1)
-        held = np.sum(moved * np.linalg.solve(innovation, moved), axis=1)
+        one_sided = self.directions @ self.one_way
+        mean = np.sum(one_sided * solved[..., None], axis=1)
+        explained = np.sum(one_sided * np.linalg.solve(innovation, one_sided), axis=1)
         # Two directions are treated as independent: correlation changes the quadrant's probability little.
-        inside = norm.logcdf(mean / np.sqrt(np.maximum(1 - held, 1e-9))) + np.log(2)
+        inside = norm.logcdf(mean / np.sqrt(np.maximum(1 - explained, 1e-9))) + np.log(2)
         return np.asarray(both_ways + inside.sum(axis=1))
 
     def corners(self, paint: PaintError) -> Candidates:
@@ -128,27 +137,28 @@ class Hypothesis:
         """
         paint_m2 = np.full(len(self.residual), paint.sigma_m**2)
         if self.kind == Kind.OF_CLASS:
-            pairs = zip(self.residual, self.formal, strict=True)
-            paint_m2 = np.array([paint.variance_m2(*pair) for pair in pairs])
+            deviations = zip(self.residual, self.formal, strict=True)
+            paint_m2 = np.array([paint.variance_m2(residual, formal) for residual, formal in deviations])
         covariance = self.candidates.covariance_m2 + self.misplaced + paint_m2[:, None, None] * np.eye(8)
         noise = _within(self.directions, self.scatter)
-        seen = self.directions @ covariance
-        innovation = seen @ np.swapaxes(self.directions, 1, 2) + noise
-        gain = np.swapaxes(np.linalg.solve(innovation, seen), 1, 2)
+        gained = self.directions @ covariance
+        innovation = gained @ np.swapaxes(self.directions, 1, 2) + noise
+        gain = np.swapaxes(np.linalg.solve(innovation, gained), 1, 2)
         # Joseph's form, a sum of squares, keeps small variances positive.
         left = np.eye(8) - gain @ self.directions
-        after = left @ covariance @ np.swapaxes(left, 1, 2) + gain @ noise @ np.swapaxes(gain, 1, 2)
+        posterior_m2 = left @ covariance @ np.swapaxes(left, 1, 2) + gain @ noise @ np.swapaxes(gain, 1, 2)
         corners = self.candidates.corners_map - (gain @ self.residual[..., None]).reshape(-1, 4, 2)
-        return Candidates(corners, (after + np.swapaxes(after, 1, 2)) / 2)
+        return Candidates(corners, (posterior_m2 + np.swapaxes(posterior_m2, 1, 2)) / 2)
 
 
 def _within(directions: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Covariance (N, 5, 5) of deviations in ``directions`` (N, 5, 8), of the corners' (..., 8, 8)."""
     return np.asarray(directions @ covariance @ np.swapaxes(directions, 1, 2))
 
 
 @dataclass
 class Hypotheses:
-    """All ``found`` hypotheses on N ``candidates`` of a class.
+    """All hypotheses (``members``) on N ``candidates`` of a class.
 
     From the previous pass are their corners as ``believed``, the ``probability`` (N, K) and frequency
     ``share`` (K,) of each kind, and the errors of ``paint``. ``vague`` (N, 4) are log-likelihood ratios of a
@@ -161,7 +171,7 @@ class Hypotheses:
     share: FloatArray
     paint: PaintError
     vague: FloatArray
-    found: list[Hypothesis] = field(default_factory=list)
+    members: list[Hypothesis] = field(default_factory=list)
     series: Series | None = None
 
     @property
@@ -182,38 +192,50 @@ class Hypotheses:
         """Add one with a ``part`` of its kind's frequency; see :class:`Hypothesis` for the rest."""
         off = (self.candidates.corners_map - laid.corners_map).reshape(-1, 8, 1)
         residual = (laid.directions @ off)[..., 0]
-        errors = scatter, misplaced, self.paint, one_way, beside
-        prior = float(np.log(part * self.share[kind]))
-        self.found.append(Hypothesis(kind, prior, self.candidates, laid.directions, residual, *errors))
+        hypothesis = Hypothesis(
+            kind=kind,
+            log_prior=float(np.log(part * self.share[kind])),
+            candidates=self.candidates,
+            directions=laid.directions,
+            residual=residual,
+            scatter=scatter,
+            misplaced=misplaced,
+            paint=self.paint,
+            one_way=one_way,
+            beside=beside,
+        )
+        self.members.append(hypothesis)
 
     def add_all(self, shapes: Sequence[Shape]) -> None:
         """Add those on the class's ``shapes``, and those on a parallelogram of any size."""
-        candidates, ragged = self.candidates, np.zeros(len(self.candidates))
+        candidates = self.candidates
+        ragged = np.zeros(len(candidates))
+        total_share = sum(shape.share for shape in shapes)
         for shape in shapes:
-            ragged = self._add_shape(shape, shape.share / sum(one.share for one in shapes))
+            ragged = self._add_shape(shape, shape.share / total_share)
         centre = candidates.corners_map.mean(axis=1)
         turns = np.tile(np.eye(2), (len(centre), 1, 1))
         shifts = np.zeros(len(centre), dtype=np.int64)
-        own = Laid(parallelograms(candidates.corners_map) + centre[:, None], turns, centre, shifts)
-        own = lay(shapes[0].corners, SHAPE_SIGMA_M, candidates)[0] if shapes else own
+        own_shape = Laid(parallelograms(candidates.corners_map) + centre[:, None], turns, centre, shifts)
+        own_shape = lay(shapes[0].corners, SHAPE_SIGMA_M, candidates)[0] if shapes else own_shape
         any_size = SHAPE_SIGMA_M**2 * np.eye(8) + _OWN_SIZE
-        self.add(Kind.OWN_SHAPE, 1.0, own, any_size)
-        self._add_unlike(1 - _LIKE_CLASS if shapes else 1.0, own, any_size, ragged)
+        self.add(Kind.OWN_SHAPE, 1.0, own_shape, any_size)
+        self._add_unlike(1 - _LIKE_CLASS if shapes else 1.0, own_shape, any_size, ragged)
 
     def _add_shape(self, shape: Shape, part: float) -> FloatArray:
         """Add those on one shape, a ``part`` of the class; log-likelihood (N,) of equally ragged clutter."""
-        laid, otherwise = lay(shape.corners, shape.sigma_m, self.candidates)
+        laid, other_way_round = lay(shape.corners, shape.sigma_m, self.candidates)
         scatter: FloatArray = shape.sigma_m**2 * np.eye(8)
         sides_m = np.linalg.norm(np.roll(shape.corners, -1, axis=0) - shape.corners, axis=1)
         alike = scatter + (_LIKE_SHARE * sides_m.min()) ** 2 * np.eye(8)
         ends = _inwards(laid.corners_map, shape.is_elongated)
         worn = np.zeros((len(ends), len(self.candidates)))
-        self.add(Kind.OF_CLASS, part / 2, otherwise, scatter)
+        self.add(Kind.OF_CLASS, part / 2, other_way_round, scatter)
         if shape.is_elongated:
-            worn = _worn_evidence(self.candidates, [end for end, _ in ends], self.weight)
-            at_end = np.stack([end.reshape(-1, 4, 2).any(axis=2) for end, _ in ends])
+            worn = _worn_evidence(self.candidates, [end.inwards for end in ends], self.weight)
+            at_end = np.stack([end.inwards.reshape(-1, 4, 2).any(axis=2) for end in ends])
             worn = worn + np.sum(at_end * self.vague, axis=2) / 2
-            shorter = (ends[0][0] + ends[1][0]) / 2
+            shorter = (ends[0].inwards + ends[1].inwards) / 2
             alike = alike + (_WORN_SHARE * sides_m.max()) ** 2 * _outer(shorter)
             self._add_lengths(part, laid, shape.sigma_m, shorter, ends, worn)
         else:
@@ -226,28 +248,36 @@ class Hypotheses:
         return ragged
 
     def _add_lengths(
-        self, part: float, laid: Laid, sigma_m: float, shorter: FloatArray, ends: _Ends, worn: FloatArray
+        self,
+        part: float,
+        laid: Laid,
+        sigma_m: float,
+        shorter: FloatArray,
+        ends: Sequence[_End],
+        worn: FloatArray,
     ) -> None:
         """Add those on a shape rolled by the metre, which ``shorter`` (N, 8) shortens by 1 m."""
         scatter: FloatArray = sigma_m**2 * np.eye(8)
-        spread_m, again = self._other_lengths(laid, shorter, sigma_m)
+        spread_m, repeated = self._other_lengths(laid, shorter, sigma_m)
         any_length = scatter + spread_m**2 * _outer(shorter)
-        self.add(Kind.OTHER_LENGTH, part, laid, any_length, beside=again)
-        other = self.share[Kind.OTHER_LENGTH] / (self.share[Kind.OF_CLASS] + self.share[Kind.OTHER_LENGTH])
-        ways = [(part, laid, scatter)]
+        self.add(Kind.OTHER_LENGTH, part, laid, any_length, beside=repeated)
+        of_other_length = self.share[Kind.OTHER_LENGTH] / (
+            self.share[Kind.OF_CLASS] + self.share[Kind.OTHER_LENGTH]
+        )
+        lengths_of_class = [(part, laid, scatter)]
         series = in_series(self.candidates, self.believed, laid, shorter, sigma_m, self.weight)
         if series is not None:
             self.series = self.series or series
             stretched = laid.corners_map - (series.longer_m[:, None] * shorter).reshape(-1, 4, 2)
-            about = scatter + series.longer_sigma_m[:, None, None] ** 2 * _outer(shorter)
-            ways = [
+            scatter_at_length = scatter + series.longer_sigma_m[:, None, None] ** 2 * _outer(shorter)
+            lengths_of_class = [
                 (part * (1 - series.longer_often), laid, scatter),
-                (part * series.longer_often, replace(laid, corners_map=stretched), about),
+                (part * series.longer_often, replace(laid, corners_map=stretched), scatter_at_length),
             ]
-        for each, one, about in ways:
-            self.add(Kind.OF_CLASS, each / 2, one, about)
-            lengths = (1 - other, about), (other, any_length)
-            self._add_wrong_ends(each, one, lengths, ends, worn, [0.0, _SLANT_OF_END])
+        for part_of_length, laid_at_length, scatter_at_length in lengths_of_class:
+            self.add(Kind.OF_CLASS, part_of_length / 2, laid_at_length, scatter_at_length)
+            lengths = (1 - of_other_length, scatter_at_length), (of_other_length, any_length)
+            self._add_wrong_ends(part_of_length, laid_at_length, lengths, ends, worn, [0.0, _SLANT_OF_END])
 
     def _other_lengths(self, laid: Laid, shorter: FloatArray, sigma_m: float) -> tuple[float, FloatArray]:
         """Sigma, m, of other lengths, and the log-likelihood ratio (N,) of a repeated to a new one."""
@@ -257,8 +287,8 @@ class Hypotheses:
         squared = _REPEATED_COUNT * _LENGTH_SIGMA_M**2 + weight @ np.maximum(off_m**2 - own_m2, 0.0)
         spread_m = float(np.sqrt(squared / (_REPEATED_COUNT + weight.sum())))
         alone = norm.pdf(off_m, 0.0, np.sqrt(own_m2 + spread_m**2))
-        apart = np.sqrt(own_m2 + own_m2[:, None] + 2 * sigma_m**2)
-        alike = weight * (1 - np.eye(len(weight))) * norm.pdf(off_m, off_m[:, None], apart)
+        sigma_between = np.sqrt(own_m2 + own_m2[:, None] + 2 * sigma_m**2)
+        alike = weight * (1 - np.eye(len(weight))) * norm.pdf(off_m, off_m[:, None], sigma_between)
         drawn = (_REPEATED_COUNT * alone + alike.sum(axis=1)) / (_REPEATED_COUNT + weight.sum() - weight)
         return spread_m, np.asarray(np.log(np.maximum(drawn, 1e-300) / np.maximum(alone, 1e-300)))
 
@@ -267,28 +297,32 @@ class Hypotheses:
         part: float,
         laid: Laid,
         lengths: Sequence[tuple[float, FloatArray]],
-        ends: _Ends,
+        ends: Sequence[_End],
         worn: FloatArray,
         slants: Sequence[float],
     ) -> None:
-        """Add those of one end worn, or merged with other paint, of any of the ``lengths`` and ``slants``."""
-        for (end, extent_m), ragged in zip(ends, worn, strict=True):
+        """Add those of one end worn, or merged with other paint, of any of the ``lengths`` and ``slants``.
+
+        ``lengths`` are fractions of the ``part`` with the scatter (..., 8, 8) of their corners.
+        """
+        for end, ragged in zip(ends, worn, strict=True):
             ways: tuple[tuple[FloatArray, FloatArray | float], ...] = (
-                (_MISPLACED_M * end, ragged),
-                (_WORN_SHARE * extent_m * end, ragged),
-                (-_RUN_ON_M * end, 0.0),
+                (_MISPLACED_M * end.inwards, ragged),
+                (_WORN_SHARE * end.limit_m * end.inwards, ragged),
+                (-_RUN_ON_M * end.inwards, 0.0),
             )
             for (way, beside), (likely, scatter), slant in product(ways, lengths, slants):
-                each = part * likely / len(ends) / len(ways) / len(slants)
-                misplaced = _outer(way) + _cut(laid.corners_map, end, slant)
-                self.add(Kind.WRONG_END, each, laid, scatter, misplaced, way[..., None], beside)
+                part_of_way = part * likely / len(ends) / len(ways) / len(slants)
+                misplaced = _outer(way) + _cut(laid.corners_map, end.inwards, slant)
+                self.add(Kind.WRONG_END, part_of_way, laid, scatter, misplaced, way[..., None], beside)
 
-    def _add_pieces(self, part: float, laid: Laid, scatter: FloatArray, ends: _Ends) -> None:
+    def _add_pieces(self, part: float, laid: Laid, scatter: FloatArray, ends: Sequence[_End]) -> None:
         """Add those of two adjacent sides hidden, as another vehicle may leave a piece in view."""
-        for (one, reach_m), (other, across_m) in product(ends[:2], ends[2:]):
-            both = np.asarray(_WORN_SHARE * np.stack([reach_m * one, across_m * other], axis=2))
-            cut = _cut(laid.corners_map, one + other, _SLANT_OF_PIECE)
-            self.add(Kind.PIECE, part / 4, laid, scatter, both @ np.swapaxes(both, 1, 2) + cut, both)
+        for side, adjacent in product(ends[:2], ends[2:]):
+            sides = [side.limit_m * side.inwards, adjacent.limit_m * adjacent.inwards]
+            hidden = np.asarray(_WORN_SHARE * np.stack(sides, axis=2))
+            cut = _cut(laid.corners_map, side.inwards + adjacent.inwards, _SLANT_OF_PIECE)
+            self.add(Kind.PIECE, part / 4, laid, scatter, hidden @ np.swapaxes(hidden, 1, 2) + cut, hidden)
 
     def _add_unlike(self, part: float, laid: Laid, scatter: FloatArray, ragged: FloatArray) -> None:
         """Add those of other paint and of clutter."""
@@ -296,37 +330,45 @@ class Hypotheses:
         self.add(Kind.CLUTTER, part, laid, scatter + _MISPLACED_M**2 * np.eye(8), beside=ragged)
 
     def paint_error(self, probability: FloatArray, whole: BoolArray) -> PaintError:
-        """Paint error from the deviations of ``whole`` candidates (N,), each ``found`` with (H, N)."""
-        members = [
-            (one.residual[k], one.formal[k])
-            for one, probable in zip(self.found, probability > 0.5, strict=True)
-            if one.kind == Kind.OF_CLASS
-            for k in np.flatnonzero(whole & probable)
-        ]
-        return learn_paint_error([residual for residual, _ in members], [formal for _, formal in members])
+        """Paint error from the deviations of ``whole`` candidates (N,), given ``probability`` (H, N)."""
+        residuals = []
+        formal = []
+        for hypothesis, probable in zip(self.members, probability > 0.5, strict=True):
+            if hypothesis.kind == Kind.OF_CLASS:
+                rows = np.flatnonzero(whole & probable)
+                residuals += [hypothesis.residual[k] for k in rows]
+                formal += [hypothesis.formal[k] for k in rows]
+        return learn_paint_error(residuals, formal)
 
     def mixture(self, joint: FloatArray, paint: PaintError) -> Candidates:
-        """Mean and covariance of the corners over the markings among :attr:`found`, of ``joint`` (H, N)."""
-        markings = [k for k, one in enumerate(self.found) if one.kind < Kind.PART_OF_SYMBOL]
+        """Mean and covariance of the corners over the markings among ``members``, of ``joint`` (H, N)."""
+        markings = [k for k, hypothesis in enumerate(self.members) if hypothesis.kind < Kind.PART_OF_SYMBOL]
         weight = np.exp(joint[markings] - logsumexp(joint[markings], axis=0))[..., None, None]
-        each = [self.found[k].corners(paint) for k in markings]
-        mean = np.asarray(sum(w * one.corners_map for w, one in zip(weight, each, strict=True)))
-        off = [(one.corners_map - mean).reshape(-1, 8) for one in each]
-        spread = [one.covariance_m2 + _outer(away) for one, away in zip(each, off, strict=True)]
+        solved = [self.members[k].corners(paint) for k in markings]
+        mean = np.asarray(sum(w * corners.corners_map for w, corners in zip(weight, solved, strict=True)))
+        spread = [
+            corners.covariance_m2 + _outer((corners.corners_map - mean).reshape(-1, 8)) for corners in solved
+        ]
         return Candidates(mean, np.sum(weight * spread, axis=0))
 
 
-def _inwards(corners: FloatArray, elongated: bool) -> _Ends:
+def _inwards(corners: FloatArray, elongated: bool) -> list[_End]:
     """Both ends of an elongated shape at ``corners`` (N, 4, 2), else all sides, opposite ones in pairs."""
-    ways = []
+    pairs = []
     for along, side in ((corners[:, 1] - corners[:, 0], _FIRST), (corners[:, 2] - corners[:, 1], _SECOND)):
         extent_m = np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
-        both = [-np.sign(sign) * (side * sign > 0)[:, None] * (along / extent_m)[:, None] for sign in (-1, 1)]
-        ways.append([(one.reshape(-1, 8), extent_m) for one in both])
+        inwards = [
+            -np.sign(sign) * (side * sign > 0)[:, None] * (along / extent_m)[:, None] for sign in (-1, 1)
+        ]
+        pairs.append([_End(motion.reshape(-1, 8), extent_m) for motion in inwards])
+    first_pair, second_pair = pairs
     if not elongated:
-        return [*ways[0], *ways[1]]
-    first = ways[0][0][1] > ways[1][0][1]
-    return [(np.where(first, a[0], b[0]), np.where(first, a[1], b[1])) for a, b in zip(*ways, strict=True)]
+        return [*first_pair, *second_pair]
+    first_is_longer = first_pair[0].limit_m > second_pair[0].limit_m
+    return [
+        _End(np.where(first_is_longer, a.inwards, b.inwards), np.where(first_is_longer, a.limit_m, b.limit_m))
+        for a, b in zip(first_pair, second_pair, strict=True)
+    ]
 
 
 def _worn_evidence(candidates: Candidates, ends: Sequence[FloatArray], weight: FloatArray) -> FloatArray:
@@ -337,9 +379,11 @@ def _worn_evidence(candidates: Candidates, ends: Sequence[FloatArray], weight: F
     whole = candidates.known.all(axis=1)
     variance = [candidates.along(end / 2, (end + ends[k ^ 1]) / 2) for k, end in enumerate(ends)]
     sigma = 0.5 * np.log(np.maximum(variance, 0.0) + SHAPE_SIGMA_M**2)
-    off = sigma - np.median(sigma[:, weight * whole > 0.5])
-    worn = norm.pdf(off, *_WORN_SPREAD)
-    sound = norm.pdf(off, *_SOUND_SPREAD)
+    excess = sigma - np.median(sigma[:, weight * whole > 0.5])
+    worn_mean, worn_sigma = _WORN_SPREAD
+    sound_mean, sound_sigma = _SOUND_SPREAD
+    worn = norm.pdf(excess, worn_mean, worn_sigma)
+    sound = norm.pdf(excess, sound_mean, sound_sigma)
     odds = worn + _CLEAR_SHARE * (sound - worn)
     odds /= sound + _UNCLEAR_SHARE * (worn - sound)
     return np.asarray(np.where(whole, np.log(odds), 0.0))
@@ -348,9 +392,12 @@ def _worn_evidence(candidates: Candidates, ends: Sequence[FloatArray], weight: F
 def _cut(corners: FloatArray, end: FloatArray, slant: float) -> FloatArray:
     """Covariance (N, 8, 8), m^2, of the corners of an ``end`` cut at a ``slant``, relative to the width."""
     breadth_m = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).min(axis=1)
-    each = (end.reshape(-1, 4, 1, 2) * np.eye(4)[:, :, None]).reshape(-1, 4, 8)
-    return np.asarray((slant * breadth_m)[:, None, None] ** 2 * (np.swapaxes(each, 1, 2) @ each))
+    corner_motions = (end.reshape(-1, 4, 1, 2) * np.eye(4)[:, :, None]).reshape(-1, 4, 8)
+    return np.asarray(
+        (slant * breadth_m)[:, None, None] ** 2 * (np.swapaxes(corner_motions, 1, 2) @ corner_motions)
+    )
 
 
 def _outer(vectors: FloatArray) -> FloatArray:
+    """Outer products (N, 8, 8) of ``vectors`` (N, 8) with themselves."""
     return np.asarray(vectors[:, :, None] * vectors[:, None, :])

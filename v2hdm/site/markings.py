@@ -97,28 +97,29 @@ def classify(
     ``kind`` (G,) indexes the class names ``kinds``; ``counted`` counts their sightings, ``parallax`` tests
     that they lie on the ground.
     """
-    first = posterior(solved, kind, counted(np.where(solved.known[..., None], solved.corners_map, np.nan)))
-    names = [kinds[one] for one in kind]
+    known_corners = np.where(solved.known[..., None], solved.corners_map, np.nan)
+    uncorrected = posterior(solved, kind, counted(known_corners))
+    names = [kinds[index] for index in kind]
     number = kind.copy()
-    stated = Stated.of(options.corrections, first.candidates.corners_map, names)
-    known = {kinds[one]: one for one in np.unique(kind).tolist()}
-    for group, correction in stated.kept.items():
+    stated = Stated.of(options.corrections, uncorrected.candidates.corners_map, names)
+    index_of_name = {kinds[index]: index for index in np.unique(kind).tolist()}
+    for group, correction in stated.confirmed.items():
         names[group] = correction.new_kind or names[group]
         # The shape of a class is learned from its candidates: without other candidates there is none.
-        number[group] = known.get(names[group], number[group])
-    solved = stated.placed(solved, first.candidates)
+        number[group] = index_of_name.get(names[group], number[group])
+    solved = stated.placed(solved, uncorrected.candidates)
     # With the class's shape, a missing corner has a place where it should have been visible.
-    counts = counted(first.candidates.corners_map)
-    found = posterior(solved, number, counts)
-    found = replace(found, candidates=stated.placed(found.candidates, first.candidates))
-    found.log_odds[list(stated.kept)] = np.inf
+    counts = counted(uncorrected.candidates.corners_map)
+    judged = posterior(solved, number, counts)
+    judged = replace(judged, candidates=stated.placed(judged.candidates, uncorrected.candidates))
+    judged.log_odds[list(stated.confirmed)] = np.inf
     least = np.log(options.min_probability / (1 - options.min_probability))
-    part = found.probability[:, Kind.PART_OF_SYMBOL] > found.probability[:, Kind.CLUTTER]
-    verdict: list[str | None] = [
-        None if odds >= least else OF_SYMBOL if part[group] else _CLUTTER_BY[found.evidence[group].argmin()]
-        for group, odds in enumerate(found.log_odds)
-    ]
-    sigma_m = found.candidates.sigma_m.max(axis=1)
+    is_part = judged.probability[:, Kind.PART_OF_SYMBOL] > judged.probability[:, Kind.CLUTTER]
+    verdict: list[str | None] = []
+    for group, odds in enumerate(judged.log_odds):
+        against = OF_SYMBOL if is_part[group] else _CLUTTER_BY[judged.evidence[group].argmin()]
+        verdict.append(None if odds >= least else against)
+    sigma_m = judged.candidates.sigma_m.max(axis=1)
     seen_corners = solved.known.sum(axis=1)
     # The best one's uncertainty is common to all: a shift of the whole map speaks against no marking.
     uncertain = sigma_m**2 > np.min(sigma_m, initial=np.inf) ** 2 + options.max_sigma_m**2
@@ -126,20 +127,21 @@ def classify(
         verdict[group] = TOO_UNCERTAIN if seen_corners[group] == 4 else LACKS_A_CORNER
     objections = parallax.objections(options.min_probability)
     verdict = [reason or objection for reason, objection in zip(verdict, objections, strict=True)]
-    for kept in stated.kept:
-        verdict[kept] = None
+    for group in stated.confirmed:
+        verdict[group] = None
     verdict = [stated.rejected.get(group, reason) for group, reason in enumerate(verdict)]
-    for group in _covered(found, np.flatnonzero([reason is None for reason in verdict])).tolist():
+    standing = np.flatnonzero([reason is None for reason in verdict])
+    for group in _covered(judged, standing).tolist():
         verdict[group] = COVERED
-    return Classified(tuple(names), found.candidates, counts, found.misfit, verdict)
+    return Classified(tuple(names), judged.candidates, counts, judged.misfit, verdict)
 
 
-def _covered(found: Posterior, standing: IntArray) -> IntArray:
+def _covered(judged: Posterior, standing: IntArray) -> IntArray:
     """Candidates of ``standing`` that overlap one with better odds."""
     if len(standing) < 2:
         return np.zeros(0, dtype=np.int64)
-    corners = found.candidates.corners_map
-    odds = found.log_odds
+    corners = judged.candidates.corners_map
+    odds = judged.log_odds
     centres = corners[standing].mean(axis=1)
     reach_m = 2 * float(np.max(np.linalg.norm(corners[standing] - centres[:, None], axis=2)))
     pairs = standing[cKDTree(centres).query_pairs(reach_m, output_type="ndarray")].reshape(-1, 2)
@@ -156,6 +158,7 @@ JointCovariance = Callable[[IntArray], FloatArray]
 _NEIGHBOUR_M = 10.0  # distance at which markings are compared, m: a vehicle's length, for manoeuvres
 _FARTHEST_M = 15.0  # largest distance to another marking, m, for a relative standard deviation
 _CENTRES = np.kron(np.array([[0.5, 0.5, -0.5, -0.5]]), np.eye(2))
+"""Matrix (2, 8) that makes of two diagonals (four corners) the difference of their centres."""
 
 
 def with_relative_sigma(
@@ -166,29 +169,29 @@ def with_relative_sigma(
     Paint error is added to the adjustment's. ``corner_index`` (M, 4) numbers the corners in the solution, -1
     for unseen ones; ``joint`` is the solution's.
     """
-    seen = np.flatnonzero((corner_index >= 0).sum(axis=1) >= 3)
-    if not len(seen):
+    rows = np.flatnonzero((corner_index >= 0).sum(axis=1) >= 3)
+    if not len(rows):
         return tuple(markings)
-    chosen = [markings[m] for m in seen.tolist()]
+    chosen = [markings[m] for m in rows.tolist()]
     # Opposite corners: of a marking at least three are known.
-    even = corner_index[seen][:, [0, 2]]
-    odd = corner_index[seen][:, [1, 3]]
+    even = corner_index[rows][:, [0, 2]]
+    odd = corner_index[rows][:, [1, 3]]
     diagonal = np.where((even >= 0).all(axis=1, keepdims=True), even, odd)
     first, second = neighbours(np.array([marking.corners_map.mean(axis=0) for marking in chosen]))
     if not len(first):
         return tuple(markings)
     covariance = joint(np.concatenate([diagonal[first], diagonal[second]], axis=1))
-    apart = _CENTRES @ covariance @ _CENTRES.T
+    covariance_of_difference = _CENTRES @ covariance @ _CENTRES.T
     formal = _CENTRES[:, :4] @ covariance[:, :4, :4] @ _CENTRES[:, :4].T
     stated_m2 = np.array([chosen[k].covariance_m2 for k in first]).reshape(-1, 4, 2, 4, 2)
-    stated = np.array([np.einsum("iaja->", one) for one in stated_m2]) / 32
-    own = np.maximum(stated - np.trace(formal, axis1=1, axis2=2) / 2, 0.0)
+    stated = np.array([np.einsum("iaja->", covariance_m2) for covariance_m2 in stated_m2]) / 32
+    paint_m2 = np.maximum(stated - np.trace(formal, axis1=1, axis2=2) / 2, 0.0)
     # A difference of two centres has both errors.
-    sigma_m = np.sqrt(np.trace(apart, axis1=1, axis2=2) / 4 + own)
-    out = list(markings)
-    for marking, sigma in zip(seen[first].tolist(), sigma_m.tolist(), strict=True):
-        out[marking] = replace(markings[marking], relative_sigma_m=sigma)
-    return tuple(out)
+    sigma_m = np.sqrt(np.trace(covariance_of_difference, axis1=1, axis2=2) / 4 + paint_m2)
+    improved = list(markings)
+    for marking, sigma in zip(rows[first].tolist(), sigma_m.tolist(), strict=True):
+        improved[marking] = replace(markings[marking], relative_sigma_m=sigma)
+    return tuple(improved)
 
 
 def neighbours(centres_map: FloatArray) -> tuple[IntArray, IntArray]:
@@ -196,11 +199,11 @@ def neighbours(centres_map: FloatArray) -> tuple[IntArray, IntArray]:
     first = []
     second = []
     tree = cKDTree(centres_map)
-    for own, near in enumerate(tree.query_ball_point(centres_map, _FARTHEST_M)):
-        others = np.array([other for other in near if other != own], dtype=np.int64)
+    for k, in_reach in enumerate(tree.query_ball_point(centres_map, _FARTHEST_M)):
+        others = np.array([other for other in in_reach if other != k], dtype=np.int64)
         if len(others):
-            distance_m = np.linalg.norm(centres_map[others] - centres_map[own], axis=1)
-            first.append(own)
+            distance_m = np.linalg.norm(centres_map[others] - centres_map[k], axis=1)
+            first.append(k)
             second.append(int(others[np.argmin(np.abs(distance_m - _NEIGHBOUR_M))]))
     return np.array(first, dtype=np.int64), np.array(second, dtype=np.int64)
 
@@ -228,7 +231,7 @@ def most_suspicious(
     accepted: IntArray, misfit: FloatArray, squared: FloatArray, counts: Counts
 ) -> Sequence[Suspicion]:
     """The most suspicious of the ``accepted`` (M,), worst first, by p-values of shape and residuals."""
-    seen = counts.observations[accepted]
+    observations = counts.observations[accepted]
     agreed = counts.agreeing[accepted]
     freedom = np.maximum(2.0 * agreed - 8, 1.0)  # two per observation, less eight of the corners
     # With an inverse-gamma prior, the variance follows Fisher's F distribution.
@@ -236,10 +239,25 @@ def most_suspicious(
     scale, prior = variance_prior(variance, freedom)
     residuals = f.sf(variance / scale, freedom, prior)
     # Binomial tail, continued to fractions of an image.
-    rate = (seen - agreed).sum() / max(seen.sum(), 1)
-    disputes = (seen - agreed) / CORNERS_OF_IMAGE
-    images = seen / CORNERS_OF_IMAGE
+    rate = (observations - agreed).sum() / max(observations.sum(), 1)
+    disputes = (observations - agreed) / CORNERS_OF_IMAGE
+    images = observations / CORNERS_OF_IMAGE
     sightings = np.where(disputes > 0, beta.cdf(rate, np.maximum(disputes, 1e-9), images - disputes + 1), 1.0)
-    rows = zip(misfit[accepted], residuals, sightings, (seen - agreed) / np.maximum(seen, 1), strict=True)
-    found = [Suspicion(number, *map(float, row)) for number, row in enumerate(rows, start=1)]
-    return sorted(found, key=lambda one: one.p)[:_LISTED]
+    rows = zip(
+        misfit[accepted],
+        residuals,
+        sightings,
+        (observations - agreed) / np.maximum(observations, 1),
+        strict=True,
+    )
+    suspicions = [
+        Suspicion(
+            marking=number,
+            p_shape=float(p_shape),
+            p_residuals=float(p_residuals),
+            p_sightings=float(p_sightings),
+            disputed=float(disputed),
+        )
+        for number, (p_shape, p_residuals, p_sightings, disputed) in enumerate(rows, start=1)
+    ]
+    return sorted(suspicions, key=lambda suspicion: suspicion.p)[:_LISTED]

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,27 +29,26 @@ _SPACING_PX = 4.0  # length, px, of an outline's pieces: an element of the netwo
 _CORRELATED_PX = 20.0
 """Correlation length of an outline, px: twice the integral of its autocorrelation in renders."""
 
-_SIGMA_PX = 0.5
-_SIGMA_WEIGHT = 10.0
-"""Prior sigma of an outline about the paint's edge, px, and the number of independent points it is worth."""
-
-_TURN_SIGMA_RAD = 0.25  # of a piece of outline against its edge
+_SIGMA_PX = 0.5  # prior sigma, px, of an outline about the paint's edge
+_SIGMA_WEIGHT = 10.0  # number of independent points that this prior is worth
+_TURN_SIGMA_RAD = 0.25  # sigma, rad, of the direction of a piece of outline about its edge's
 _ROUND_PX = 3.0  # distance from a corner, px, that the network rounds
-_STRAY = 0.2
-_STRAY_PX = 25.0  # fraction of an outline along no edge, and its range, px
+
+_STRAY = 0.2  # fraction of an outline that lies along no edge
+_STRAY_PX = 25.0  # range, px, on either side of the edges, in which such pieces lie
 LEAST_EXPLAINED = 1 - 2 * _STRAY  # least fraction of the outlines along their polygon's edges
+
 _ANYWHERE_M = 0.5  # sigma, m, of vertices about the outline common to sightings
 UNSEEN_M = _ANYWHERE_M / 2  # sigma, m, of vertices on which images add little to that prior
-_SIZE_SIGMA = 0.02
-_FREEDOM = 4.0
-"""Prior sigma of the logarithm of a symbol's sizes about its template's; and the number of symbols that this
-prior, and that of the vertices' own deviations, are worth."""
 
-_MOST_VERTICES = 18
+_SIZE_SIGMA = 0.02  # prior sigma of the logarithm of a symbol's sizes about its template's
+_FREEDOM = 4.0  # number of symbols that this prior, and that of the vertices' own deviations, are worth
+
+_MOST_VERTICES = 18  # most vertices of a symbol
 _STEP_M = 0.1  # largest motion of a vertex in a step: beyond, other edges explain the pieces
-_STEPS = 15
-_FEW_STEPS = 4
-_ROUNDS = 3  # of a fit, of one after removing a vertex, of learning a template
+_STEPS = 15  # steps of a fit from an outline
+_FEW_STEPS = 4  # steps of a fit from a polygon that had one more vertex or another prior
+_ROUNDS = 3  # rounds of learning a template
 
 
 @dataclass(frozen=True)
@@ -71,25 +71,39 @@ class Traces:
     def of(
         cls,
         outlines_px: Sequence[FloatArray],
-        seen: Sequence[BoolArray],
+        seen_sides: Sequence[BoolArray],
         image: IntArray,
         px_from_map: FloatArray,
         shift_px: FloatArray,
     ) -> Traces:
-        """Pieces of outlines (K, 2), each of an ``image`` (S,), along the sides (K,) that were ``seen``."""
-        pieces = []
-        for outline, sides, number in zip(outlines_px, seen, image, strict=True):
-            clockwise = signed_area(outline) < 0
-            ring, lit = (outline, sides) if clockwise else (outline[::-1], np.roll(sides[::-1], -1))
+        """Pieces of outlines (K, 2), each of an ``image`` (S,), along those ``seen_sides`` (K,)."""
+        images = []
+        points_px = []
+        along_px = []
+        weights = []
+        for outline, is_seen, number in zip(outlines_px, seen_sides, image, strict=True):
+            is_clockwise = signed_area(outline) < 0
+            ring = outline if is_clockwise else outline[::-1]
+            is_seen_side = is_seen if is_clockwise else np.roll(is_seen[::-1], -1)
             side = np.roll(ring, -1, axis=0) - ring
-            length = np.linalg.norm(side, axis=1) * lit
+            length = np.linalg.norm(side, axis=1) * is_seen_side
             count = np.ceil(length / _SPACING_PX).astype(np.int64)
-            own = np.repeat(np.arange(len(ring)), count)
-            share = (np.arange(len(own)) - (np.cumsum(count) - count)[own] + 0.5) / count[own]
-            along = side[own] / length[own, None]
-            weight = length[own] / count[own] / _CORRELATED_PX
-            pieces.append((np.full(len(own), number), ring[own] + share[:, None] * side[own], along, weight))
-        return cls(px_from_map, shift_px, *(np.concatenate(one) for one in zip(*pieces, strict=True)))
+            # Each side is cut into pieces of one length; ``of_side`` numbers the side of each piece.
+            of_side = np.repeat(np.arange(len(ring)), count)
+            piece_in_side = np.arange(len(of_side)) - (np.cumsum(count) - count)[of_side]
+            share = (piece_in_side + 0.5) / count[of_side]
+            images.append(np.full(len(of_side), number))
+            points_px.append(ring[of_side] + share[:, None] * side[of_side])
+            along_px.append(side[of_side] / length[of_side, None])
+            weights.append(length[of_side] / count[of_side] / _CORRELATED_PX)
+        return cls(
+            px_from_map=px_from_map,
+            shift_px=shift_px,
+            image=np.concatenate(images),
+            points_px=np.concatenate(points_px),
+            along_px=np.concatenate(along_px),
+            weight=np.concatenate(weights),
+        )
 
 
 @dataclass(frozen=True)
@@ -117,31 +131,33 @@ def find_polygons(
     kinds: Sequence[str], traces: Sequence[Traces], outlines: Sequence[FloatArray]
 ) -> list[Polygon]:
     """Polygons of symbols of classes ``kinds``, from their traces, started from ``outlines`` (K, 2)."""
-    own = [_own_polygon(trace, outline) for trace, outline in zip(traces, outlines, strict=True)]
-    found = list(own)
-    classes = list[tuple[_Template, list[int]]]()
+    own_polygons = [_own_polygon(trace, outline) for trace, outline in zip(traces, outlines, strict=True)]
+    polygons = list(own_polygons)
+    classes: list[tuple[_Template, list[int]]] = []
     for k in np.argsort([-trace.weight.sum() for trace in traces]).tolist():
-        best = own[k]
+        best = own_polygons[k]
         home = None
         for template, members in classes:
             if kinds[members[0]] == kinds[k]:
                 for start in template.laid_about(outlines[k]):
-                    one = _fit(traces[k], start, template.prior)
-                    better = one.evidence > best.evidence and is_simple(one.vertices)
-                    best, home = (one, members) if better else (best, home)
-        found[k] = best
+                    polygon = _fit(traces[k], start, template.prior)
+                    if polygon.evidence > best.evidence and is_simple(polygon.vertices):
+                        best = polygon
+                        home = members
+        polygons[k] = best
         if home is not None:
             home.append(k)
         elif is_simple(best.vertices):
             classes.append((_Template.of(best), [k]))
     for template, members in classes:
-        shown = [traces[k] for k in members]
-        polygons = [found[k] for k in members]
+        members_traces = [traces[k] for k in members]
+        members_polygons = [polygons[k] for k in members]
         if len(members) > 1:
-            template, polygons = _of_template(template, shown, polygons)
-        for k, one, error in zip(members, polygons, template.edge_errors(polygons), strict=True):
-            found[k] = replace(one, covariance=one.covariance + error)
-    return found
+            template, members_polygons = _of_template(template, members_traces, members_polygons)
+        edge_errors = template.edge_errors(members_polygons)
+        for k, polygon, error in zip(members, members_polygons, edge_errors, strict=True):
+            polygons[k] = replace(polygon, covariance=polygon.covariance + error)
+    return polygons
 
 
 def _of_template(
@@ -151,15 +167,18 @@ def _of_template(
     for _ in range(_ROUNDS):
         template, polygons = _taught(template, traces, polygons)
     while len(template.vertices) > 3:
-        kept = _but_flattest(template.vertices)
-        known = template.covariance[np.ix_(*2 * [np.repeat(kept, 2)])]
-        fewer = replace(template, vertices=template.vertices[kept], covariance=known)
-        pairs = zip(traces, polygons, strict=True)
-        tried = [_fit(trace, one.vertices[kept], fewer.prior, _FEW_STEPS) for trace, one in pairs]
-        fewer, tried = _taught(fewer, traces, tried)
-        if sum(one.evidence for one in tried) < sum(one.evidence for one in polygons):
+        remaining = _but_flattest(template.vertices)
+        coordinates = np.repeat(remaining, 2)
+        covariance = template.covariance[np.ix_(coordinates, coordinates)]
+        fewer = replace(template, vertices=template.vertices[remaining], covariance=covariance)
+        refitted = [
+            _fit(trace, polygon.vertices[remaining], fewer.prior, _FEW_STEPS)
+            for trace, polygon in zip(traces, polygons, strict=True)
+        ]
+        fewer, refitted = _taught(fewer, traces, refitted)
+        if sum(polygon.evidence for polygon in refitted) < sum(polygon.evidence for polygon in polygons):
             break
-        template, polygons = _taught(fewer, traces, tried)
+        template, polygons = _taught(fewer, traces, refitted)
     return template, polygons
 
 
@@ -168,8 +187,11 @@ def _taught(
 ) -> tuple[_Template, list[Polygon]]:
     """The template learned from all symbols, and each symbol under that of the others."""
     template, others = template.learnt(polygons)
-    each = zip(traces, polygons, others, strict=True)
-    return template, [_fit(trace, one.vertices, other.prior, _FEW_STEPS) for trace, one, other in each]
+    refitted = [
+        _fit(trace, polygon.vertices, other.prior, _FEW_STEPS)
+        for trace, polygon, other in zip(traces, polygons, others, strict=True)
+    ]
+    return template, refitted
 
 
 def _own_polygon(traces: Traces, outline: FloatArray) -> Polygon:
@@ -178,17 +200,18 @@ def _own_polygon(traces: Traces, outline: FloatArray) -> Polygon:
     while len(vertices) > _MOST_VERTICES:
         vertices = vertices[_but_flattest(vertices)]
     now = _fit(traces, vertices, _anywhere(vertices))
-    tried = [now]
+    polygons = [now]
     while len(now.vertices) > 3:
         vertices = now.vertices[_but_flattest(now.vertices)]
         now = _fit(traces, vertices, _anywhere(vertices), _FEW_STEPS)
-        tried.append(now)
-    best = max(tried, key=lambda one: (is_simple(one.vertices), one.evidence))
+        polygons.append(now)
+    best = max(polygons, key=lambda polygon: (is_simple(polygon.vertices), polygon.evidence))
     refined = _fit(traces, best.vertices, _anywhere(best.vertices))
     return refined if is_simple(refined.vertices) else best
 
 
 def _anywhere(start: FloatArray) -> Prior:
+    """The prior of vertices about an outline ``start`` (N, 2)."""
     return lambda vertices: (start.ravel(), _ANYWHERE_M**2 * np.eye(start.size))
 
 
@@ -232,8 +255,8 @@ class _Template:
         turning = (self.vertices @ [[0.0, 1.0], [-1.0, 0.0]]).ravel()
         basis = np.linalg.qr(np.column_stack([np.tile(np.eye(2), (len(self.vertices), 1)), turning]))[0]
         sized = self.stretch * self.sizes
-        own = self.paint_m**2 * np.eye(len(basis)) + sized @ sized.T
-        return np.asarray(own + _ANYWHERE_M**2 * len(self.vertices) * basis @ basis.T)
+        deviations_m2 = self.paint_m**2 * np.eye(len(basis)) + sized @ sized.T
+        return np.asarray(deviations_m2 + _ANYWHERE_M**2 * len(self.vertices) * basis @ basis.T)
 
     def pose(self, vertices: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rotation (2, 2) and translation (2,) that align the template with vertices (N, 2)."""
@@ -253,46 +276,52 @@ class _Template:
         """The template placed on an outline (K, 2): along it, across it, and both reversed."""
         points = _evenly(outline)
         axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
-        own = (self.vertices - _evenly(self.vertices).mean(axis=0)) @ [1, 1j] * (axes[0] @ [1, 1j])
-        turned = [own * turn for turn in (1, 1j, -1, -1j)]
-        return [np.column_stack([one.real, one.imag]) + points.mean(axis=0) for one in turned]
+        template = (self.vertices - _evenly(self.vertices).mean(axis=0)) @ [1, 1j] * (axes[0] @ [1, 1j])
+        turned = [template * turn for turn in (1, 1j, -1, -1j)]
+        return [np.column_stack([ring.real, ring.imag]) + points.mean(axis=0) for ring in turned]
 
     def learnt(self, members: Sequence[Polygon]) -> tuple[_Template, list[_Template]]:
         """The template of all members, and for each member that of the others."""
         mean = self.vertices.ravel()
         spread = np.linalg.inv(self.spread)
-        paint2 = _FREEDOM * SHAPE_SIGMA_M**2
-        sizes2 = _FREEDOM * np.full(2, _SIZE_SIGMA**2)
+        paint_m2 = _FREEDOM * SHAPE_SIGMA_M**2
+        sizes_squared = _FREEDOM * np.full(2, _SIZE_SIGMA**2)
         information = []
         pulls = []
-        for one in members:
-            rotation, place = self.pose(one.vertices)
-            turn = np.kron(np.eye(len(one.vertices)), rotation)
-            data = turn.T @ one.data @ turn
-            here = ((one.vertices - place) @ rotation).ravel()
+        for member in members:
+            rotation, place = self.pose(member.vertices)
+            turn = np.kron(np.eye(len(member.vertices)), rotation)
+            data = turn.T @ member.data @ turn
+            vertices_of_template = ((member.vertices - place) @ rotation).ravel()
             # Information of the images on the template, the symbol's own deviations marginalised.
             gain = spread @ np.linalg.inv(data + spread)
-            known = gain @ data
-            pull = gain @ (data @ here - turn.T @ one.pull)
-            information.append(known)
+            member_information = gain @ data
+            pull = gain @ (data @ vertices_of_template - turn.T @ member.pull)
+            information.append(member_information)
             pulls.append(pull)
             # Second moments of those deviations given the images (expectation maximisation).
-            off = pull - known @ mean
-            own2 = np.square(self.sizes)
-            paint2 += self.paint_m**2 * (1 + self.paint_m**2 * (off @ off - np.trace(known)) / len(off))
-            by_size = self.stretch.T @ known @ self.stretch
-            sizes2 += own2 * (1 + own2 * ((self.stretch.T @ off) ** 2 - np.diag(by_size)))
+            deviation = pull - member_information @ mean
+            size_variance = np.square(self.sizes)
+            paint_m2 += self.paint_m**2 * (
+                1 + self.paint_m**2 * (deviation @ deviation - np.trace(member_information)) / len(deviation)
+            )
+            by_size = self.stretch.T @ member_information @ self.stretch
+            sizes_squared += size_variance * (
+                1 + size_variance * ((self.stretch.T @ deviation) ** 2 - np.diag(by_size))
+            )
         count = _FREEDOM + len(members)
-        freedom = float(np.sqrt(paint2 / count)), tuple(np.sqrt(sizes2 / count).tolist())
+        paint_m = float(np.sqrt(paint_m2 / count))
+        sizes = tuple(np.sqrt(sizes_squared / count).tolist())
 
         def of(rows: Sequence[int]) -> _Template:
             about = np.eye(mean.size) / _ANYWHERE_M**2
             covariance = np.linalg.inv(sum((information[k] for k in rows), about))
             vertices = covariance @ sum((pulls[k] for k in rows), about @ mean)
-            return _Template(vertices.reshape(-1, 2), (covariance + covariance.T) / 2, *freedom)
+            symmetric = (covariance + covariance.T) / 2
+            return _Template(vertices.reshape(-1, 2), symmetric, paint_m, sizes)
 
         everyone = range(len(members))
-        return of(everyone), [of([k for k in everyone if k != own]) for own in everyone]
+        return of(everyone), [of([k for k in everyone if k != member]) for member in everyone]
 
     def edge_errors(self, members: Sequence[Polygon]) -> list[FloatArray]:
         """Covariances (2N, 2N), m^2, of errors common to all images, from each member's deviation."""
@@ -300,12 +329,14 @@ class _Template:
             return [EDGE_SIGMA_M**2 * np.eye(self.vertices.size)]
         off = []
         formal = []
-        for one, other in zip(members, self.learnt(members)[1], strict=True):
-            off += list(one.vertices - other.prior(one.vertices)[0].reshape(-1, 2))
-            formal += [one.covariance[n : n + 2, n : n + 2] for n in range(0, one.vertices.size, 2)]
+        for member, other in zip(members, self.learnt(members)[1], strict=True):
+            off += list(member.vertices - other.prior(member.vertices)[0].reshape(-1, 2))
+            formal += [member.covariance[n : n + 2, n : n + 2] for n in range(0, member.vertices.size, 2)]
         error = learn_paint_error(off, formal)
-        own = [error.variance_m2(*pair) for pair in zip(off, formal, strict=True)]
-        return [np.diag(np.repeat(part, 2)) for part in np.split(np.array(own), len(members))]
+        edge_m2 = [
+            error.variance_m2(deviation, formal_m2) for deviation, formal_m2 in zip(off, formal, strict=True)
+        ]
+        return [np.diag(np.repeat(variances, 2)) for variances in np.split(np.array(edge_m2), len(members))]
 
 
 def _evenly(ring: FloatArray) -> FloatArray:
@@ -320,36 +351,50 @@ def _fit(traces: Traces, start: FloatArray, prior: Prior, steps: int = _STEPS) -
     shift_px = np.zeros((len(traces.px_from_map), 2))
     sigma_px = 2 * _SIGMA_PX
     for _ in range(steps):
-        weight, off_px, normal, jacobian, log_likelihood = _explained(traces, vertices, shift_px, sigma_px)
-        squared = _SIGMA_WEIGHT * _SIGMA_PX**2 + weight @ off_px**2
-        count = _SIGMA_WEIGHT + weight.sum()
+        pieces = _explained(traces, vertices, shift_px, sigma_px)
+        squared = _SIGMA_WEIGHT * _SIGMA_PX**2 + pieces.weight @ pieces.off_px**2
+        count = _SIGMA_WEIGHT + pieces.weight.sum()
         sigma_px = float(np.sqrt(squared / count))
-        off_px += (normal * shift_px[traces.image]).sum(axis=1)
-        data, gradient, follow = _normal(traces, weight / sigma_px**2, off_px, normal, jacobian)
+        equations = _normal_equations(traces, pieces, shift_px, sigma_px)
         mean, covariance = prior(vertices)
         precision = np.linalg.inv(covariance)
-        step = np.linalg.solve(data + precision, gradient + precision @ (mean - vertices.ravel()))
+        step = np.linalg.solve(
+            equations.information + precision,
+            equations.gradient + precision @ (mean - vertices.ravel()),
+        )
         step = step * min(1.0, _STEP_M / float(np.abs(step).max()))
         vertices = np.asarray(vertices + step.reshape(-1, 2))
-        shift_px = follow(np.asarray(step))
+        shift_px = equations.shifts_after(np.asarray(step))
     mean, covariance = prior(vertices)
     precision = np.linalg.inv(covariance)
     off = mean - vertices.ravel()
-    evidence = log_likelihood - 0.5 * off @ precision @ off
+    data = equations.information
+    evidence = pieces.log_likelihood - 0.5 * off @ precision @ off
     evidence -= 0.5 * (np.linalg.slogdet(data + precision)[1] + np.linalg.slogdet(covariance)[1])
-    explained = float(weight.sum() / max(traces.weight.sum(), 1e-9))
     return Polygon(
-        vertices, np.linalg.inv(data + precision), data, precision @ off, float(evidence), explained
+        vertices=vertices,
+        covariance=np.linalg.inv(data + precision),
+        data=data,
+        pull=precision @ off,
+        evidence=float(evidence),
+        explained=float(pieces.weight.sum() / max(traces.weight.sum(), 1e-9)),
     )
 
 
-def _explained(
-    traces: Traces, vertices: FloatArray, shift_px: FloatArray, sigma_px: float
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float]:
-    """Effective observations (P,) and offset, px, (P,) of each piece from its most likely edge.
+class _Explained(NamedTuple):
+    """P pieces of outlines, each beside the most likely of a polygon's N edges."""
 
-    Then the edge's outer normal (P, 2), the Jacobian (P, 2N) of the edge by the vertices, and the
-    log-likelihood of all pieces.
+    weight: FloatArray  # (P,) effective number of independent observations
+    off_px: FloatArray  # (P,) offset, px, from the edge
+    normal: FloatArray  # (P, 2) outer normal of the edge
+    jacobian: FloatArray  # (P, 2N) derivative of the edge, along its normal, by the vertices
+    log_likelihood: float  # of all pieces
+
+
+def _explained(traces: Traces, vertices: FloatArray, shift_px: FloatArray, sigma_px: float) -> _Explained:
+    """The pieces of ``traces`` beside the edges of a polygon with ``vertices`` (N, 2).
+
+    ``shift_px`` (I, 2) are the images' shifts, ``sigma_px`` is the outlines' standard deviation.
     """
     rows = np.arange(len(traces.image))
     image = traces.image
@@ -357,10 +402,10 @@ def _explained(
     side = np.roll(pixel, -1, axis=1) - pixel
     length = np.maximum(np.linalg.norm(side, axis=2), 1e-6)
     along = (side / length[..., None])[image]
-    apart = (traces.points_px - shift_px[image])[:, None] - pixel[image]
-    at = (apart * along).sum(axis=2)
-    off = cross(along, apart)
-    end = np.nan_to_num(np.minimum(at, length[image] - at))
+    offset_px = (traces.points_px - shift_px[image])[:, None] - pixel[image]
+    along_px = (offset_px * along).sum(axis=2)
+    off = cross(along, offset_px)
+    end = np.nan_to_num(np.minimum(along_px, length[image] - along_px))
     turn = np.arccos(np.clip((along * traces.along_px[:, None]).sum(axis=2), -1, 1))
     squared = (off**2 + np.minimum(end, 0.0) ** 2) / sigma_px**2 + (turn / _TURN_SIGMA_RAD) ** 2
     squared = np.where(np.isfinite(squared), squared, np.inf)
@@ -377,26 +422,37 @@ def _explained(
     total = np.logaddexp(inlier, np.log(_STRAY / (2 * _STRAY_PX * 2 * np.pi)))
     weight = traces.weight * np.exp(inlier - total)
     normal = np.stack([-along[rows, edge, 1], along[rows, edge, 0]], axis=-1)
-    share = np.clip(at[rows, edge] / length[image, edge], 0.0, 1.0)
+    share = np.clip(along_px[rows, edge] / length[image, edge], 0.0, 1.0)
     slope = homography_jacobian(traces.px_from_map, vertices)
     jacobian = np.zeros((len(rows), *vertices.shape))
     for corner, part in ((edge, 1 - share), ((edge + 1) % len(vertices), share)):
         jacobian[rows, corner] = part[:, None] * np.einsum("pi,pij->pj", normal, slope[image, corner])
-    known = weight > 0
-    off_px, normal, jacobian = (
-        np.where(known.reshape(-1, *(1,) * (one.ndim - 1)), one, 0.0)
-        for one in (off[rows, edge], normal, jacobian)
+    is_near = weight > 0
+    return _Explained(
+        weight=weight,
+        off_px=np.where(is_near, off[rows, edge], 0.0),
+        normal=np.where(is_near[:, None], normal, 0.0),
+        jacobian=np.where(is_near[:, None, None], jacobian, 0.0).reshape(len(rows), -1),
+        log_likelihood=float(traces.weight @ total),
     )
-    return weight, off_px, normal, jacobian.reshape(len(rows), -1), float(traces.weight @ total)
 
 
-def _normal(
-    traces: Traces, info: FloatArray, off_px: FloatArray, normal: FloatArray, jacobian: FloatArray
-) -> tuple[FloatArray, FloatArray, Callable[[FloatArray], FloatArray]]:
-    """Information (2N, 2N) and gradient (2N,) of the vertices, image shifts marginalised.
+class _NormalEquations(NamedTuple):
+    """Normal equations of N vertices, with the shifts of I images marginalised."""
 
-    Then a function from a step (2N,) to the shifts (I, 2), px.
-    """
+    information: FloatArray  # (2N, 2N)
+    gradient: FloatArray  # (2N,)
+    shifts_after: Callable[[FloatArray], FloatArray]  # shifts (I, 2), px, that follow a step (2N,)
+
+
+def _normal_equations(
+    traces: Traces, pieces: _Explained, shift_px: FloatArray, sigma_px: float
+) -> _NormalEquations:
+    """The normal equations from ``pieces``, which lie beside edges under ``shift_px`` (I, 2)."""
+    info = pieces.weight / sigma_px**2
+    normal = pieces.normal
+    jacobian = pieces.jacobian
+    off_px = pieces.off_px + (normal * shift_px[traces.image]).sum(axis=1)
     weighted = info[:, None] * jacobian
     images = len(traces.px_from_map)
     shifted = np.eye(2) / traces.shift_px[:, None, None] ** 2
@@ -409,4 +465,6 @@ def _normal(
     gain = np.einsum("iju,ijk->iuk", coupling, inverse)
     information = weighted.T @ jacobian - np.einsum("iuk,ikv->uv", gain, coupling)
     gradient = weighted.T @ off_px - np.einsum("iuk,ik->u", gain, pull)
-    return information, gradient, lambda step: np.einsum("ijk,ik->ij", inverse, pull - coupling @ step)
+    return _NormalEquations(
+        information, gradient, lambda step: np.einsum("ijk,ik->ij", inverse, pull - coupling @ step)
+    )

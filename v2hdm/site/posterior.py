@@ -11,6 +11,7 @@ maximisation with a Dirichlet prior).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import betaln, logsumexp
@@ -24,14 +25,19 @@ from v2hdm.site.shapes import learn_paint_error, learn_shapes
 _PRIOR_COUNT = np.array([14.0, 0.5, 0.5, 0.5, 2.0, 1.0, 1.5])
 """Dirichlet prior: expected counts of the hypotheses among about twenty candidates."""
 
+
+class _Beta(NamedTuple):
+    """A beta distribution of a rate, as numbers of views with and without a detection."""
+
+    hits: float
+    misses: float
+
+
 _RATE_STRENGTH = 4.0  # images that the class's detection rate is worth: how similar its markings' rates are
 _NEGLECTED_SHARE = 0.1  # fraction of markings that are worn or hidden, with any detection rate
-
-_CLUTTER_FOUND = (0.5, 2.0)
-"""Beta distribution of the detection rate of clutter, or part of a symbol, in easy views: a fifth."""
-
-_BARE_FOUND = (0.05, 10.0)
-"""Beta distribution of the rate of such detections on bare ground: one view in two hundred."""
+_ANY_RATE = _Beta(1.0, 1.0)  # detection rate of a worn or hidden marking or corner: all are as likely
+_CLUTTER_FOUND = _Beta(0.5, 2.0)  # detection rate of clutter, or part of a symbol, in easy views: a fifth
+_BARE_FOUND = _Beta(0.05, 10.0)  # detection rate of bare ground in easy views: one in two hundred
 
 _CLUTTER_REPEATS = 0.7  # probability that clutter seen in some images is seen in one more
 _AGREEING = (0.93, 0.6)  # fraction of observations of a marking, and of clutter, that agree with the solution
@@ -43,14 +49,12 @@ _UNDER_SYMBOL = (0.02, 0.5)
 Half of the parts of other paint belong to letters or drawings without a class, and count as markings here.
 """
 
-_ODDS = (5.0, 2.5)
-_ODDS_SIGMA = 1.2
-_ODDS_FREEDOM = 4.0
-"""Log-odds of the detector, averaged over a marking: prior mean and standard deviation of a class's (in a
-rendered port 335 diamonds have 7.9, 91 dashes 7.4, 3 stop lines 1.1), least scale of its members about it
-(1.0 for diamonds), and degrees of freedom of Student's t distribution, for worn ones."""
-
-_OTHER_ODDS = (1.5, 1.5)  # mean and sigma of the same for anything else (14 candidates of a rendered port)
+# Log-odds of the detector, averaged over a marking. In a rendered port 335 diamonds have 7.9, 91 dashes 7.4,
+# 3 stop lines 1.1, and 14 other candidates 1.5.
+_ODDS = (5.0, 2.5)  # prior mean and standard deviation of a class's log-odds
+_ODDS_SIGMA = 1.2  # least scale of a marking's log-odds about its class's (1.0 for diamonds)
+_ODDS_FREEDOM = 4.0  # degrees of freedom of their Student's t distribution, for worn markings
+_OTHER_ODDS = (1.5, 1.5)  # mean and standard deviation of the log-odds of anything else
 _PASSES = 2  # rounds of expectation maximisation; a third changes no figure of six drives by a hundredth
 
 
@@ -74,15 +78,15 @@ def posterior(candidates: Candidates, kind: IntArray, counts: Counts) -> Posteri
     misfit = np.ones(total)
     corners = candidates.corners_map.copy()
     covariance = candidates.covariance_m2.copy()
-    for one in np.unique(kind):
-        own = np.flatnonzero(kind == one)
-        found = _of_class(candidates.subset(own), counts.subset(own))
-        probability[own] = found.probability
-        log_odds[own] = found.log_odds
-        evidence[own] = found.evidence
-        corners[own] = found.candidates.corners_map
-        covariance[own] = found.candidates.covariance_m2
-        misfit[own] = found.misfit
+    for class_index in np.unique(kind):
+        members = np.flatnonzero(kind == class_index)
+        of_class = _of_class(candidates.subset(members), counts.subset(members))
+        probability[members] = of_class.probability
+        log_odds[members] = of_class.log_odds
+        evidence[members] = of_class.evidence
+        corners[members] = of_class.candidates.corners_map
+        covariance[members] = of_class.candidates.covariance_m2
+        misfit[members] = of_class.misfit
     return Posterior(probability, log_odds, Candidates(corners, covariance), evidence, misfit)
 
 
@@ -93,35 +97,43 @@ def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
     # Initially, candidates that agreeing images show whole are taken for markings, others for clutter.
     whole = np.asarray(candidates.known.all(axis=1))
     believed = candidates
-    taken = whole & (2 * counts.agreeing > counts.observations)
-    probability = np.eye(len(Kind))[np.where(taken, Kind.OF_CLASS, Kind.CLUTTER)]
+    is_clear = whole & (2 * counts.agreeing > counts.observations)
+    probability = np.eye(len(Kind))[np.where(is_clear, Kind.OF_CLASS, Kind.CLUTTER)]
     for number in range(1, _PASSES + 1):
         weight = probability[:, : Kind.PART_OF_SYMBOL].sum(axis=1)
         vague = _vague_evidence(counts, weight)
         space = Hypotheses(candidates, believed, probability, share, paint, vague)
         shapes = learn_shapes(candidates.subset(weight > 0.5))
         space.add_all(shapes)
-        by_kind = np.array([one.kind for one in space.found])
+        by_kind = np.array([hypothesis.kind for hypothesis in space.members])
         sources = _counted(counts, weight)
         marking = by_kind < Kind.PART_OF_SYMBOL
         column = np.where(marking, 0, by_kind - Kind.OWN_SHAPE)  # of the sources: marking, symbol, clutter
-        shaped = np.stack([one.log_likelihood for one in space.found])
-        joint = shaped + np.array([one.log_prior for one in space.found])[:, None]
+        shaped = np.stack([hypothesis.log_likelihood for hypothesis in space.members])
+        joint = shaped + np.array([hypothesis.log_prior for hypothesis in space.members])[:, None]
         joint += sources.sum(axis=0)[:, column].T
         if space.series is not None:
-            placed = [one.corners(paint) for one in space.found if one.kind < Kind.PART_OF_SYMBOL]
-            joint[marking] += np.stack([space.series.evidence(one) for one in placed])
-        each = np.exp(joint - logsumexp(joint, axis=0))
-        probability = np.stack([each[by_kind == one].sum(axis=0) for one in Kind], axis=1)
+            placed = [
+                hypothesis.corners(paint)
+                for hypothesis in space.members
+                if hypothesis.kind < Kind.PART_OF_SYMBOL
+            ]
+            joint[marking] += np.stack([space.series.evidence(corners) for corners in placed])
+        responsibility = np.exp(joint - logsumexp(joint, axis=0))
+        probability = np.stack([responsibility[by_kind == kind].sum(axis=0) for kind in Kind], axis=1)
         share = _PRIOR_COUNT + probability.sum(axis=0)
         share /= share.sum()
-        paint = space.paint_error(each, whole)
+        paint = space.paint_error(responsibility, whole)
         if space.series is not None and number < _PASSES:
             believed = space.mixture(joint, paint)
     log_odds = logsumexp(joint[marking], axis=0) - logsumexp(joint[~marking], axis=0)
     by_shape = shaped[marking].max(axis=0) - shaped[by_kind == Kind.CLUTTER].max(axis=0)
     evidence = np.column_stack([by_shape, *(sources[:, :, 0] - sources[:, :, 2])])
-    like_others = [one.fit[2] for one in space.found if one.kind in (Kind.OF_CLASS, Kind.OTHER_LENGTH)]
+    like_others = [
+        hypothesis.fit.squared
+        for hypothesis in space.members
+        if hypothesis.kind in (Kind.OF_CLASS, Kind.OTHER_LENGTH)
+    ]
     # Paint errors follow Student's t distribution, their squares Fisher's F.
     misfit = f.sf(np.min(like_others, axis=0) / 5, 5, paint.freedom) if shapes else np.ones(len(candidates))
     return Posterior(probability, log_odds, space.mixture(joint, paint), evidence, misfit)
@@ -131,35 +143,39 @@ def _counted(counts: Counts, weight: FloatArray) -> FloatArray:
     """Log-likelihoods (4, N, 3) of images, easy views, others, appearance; marking, other paint, clutter."""
     images = np.maximum(counts.images, 1)
     stay = 1 - (weight.sum() + 1) / (weight @ images + 2)
-    shown = np.stack([_geometric(images, stay), *2 * [_geometric(images, _CLUTTER_REPEATS)]], axis=1)
-    rate = float((weight @ counts.found + 1) / (weight @ counts.easy_views + 2))
-    own = log_found(counts.found, counts.easy_views, rate)
-    clutter = _rates(counts.found, counts.easy_views, *_CLUTTER_FOUND)
-    found = np.stack([own, clutter, clutter], axis=1)
+    repeated = _geometric(images, _CLUTTER_REPEATS)
+    shown = np.stack([_geometric(images, stay), repeated, repeated], axis=1)
+    rate = float((weight @ counts.detected_views + 1) / (weight @ counts.easy_views + 2))
+    of_marking = log_found(counts.detected_views, counts.easy_views, rate)
+    of_clutter = _rates(counts.detected_views, counts.easy_views, _CLUTTER_FOUND)
+    detected = np.stack([of_marking, of_clutter, of_clutter], axis=1)
     agree = counts.agreeing
     differ = counts.observations - counts.agreeing
     right, wrong = (agree[:, None] * np.log(p) + differ[:, None] * np.log1p(-p) for p in _AGREEING)
-    under = counts.as_symbol
-    alone = counts.images
-    plain, covered = (under[:, None] * np.log(p) + alone[:, None] * np.log1p(-p) for p in _UNDER_SYMBOL)
+    with_symbol = counts.as_symbol
+    without_symbol = counts.images
+    plain, covered = (
+        with_symbol[:, None] * np.log(p) + without_symbol[:, None] * np.log1p(-p) for p in _UNDER_SYMBOL
+    )
     covered = np.logaddexp(covered, plain) - np.log(2)
-    rest = np.hstack([right, right, wrong]) / CORNERS_OF_IMAGE + np.hstack([plain, covered, plain])
-    there = counts.images > 0
-    alike = _log_like_class(counts.log_odds, weight * there)
-    unlike = norm.logpdf(counts.log_odds, *_OTHER_ODDS)
+    agreement = np.hstack([right, right, wrong]) / CORNERS_OF_IMAGE + np.hstack([plain, covered, plain])
+    is_in_images = counts.images > 0
+    alike = _log_like_class(counts.log_odds, weight * is_in_images)
+    other_mean, other_sigma = _OTHER_ODDS
+    unlike = norm.logpdf(counts.log_odds, other_mean, other_sigma)
     # The shaft of an arrow looks like a dash; most other clutter like no known class.
     either = np.logaddexp(alike, unlike) - np.log(2)
-    looks = np.stack([alike, either, unlike], axis=1) * there[:, None]
-    return np.stack([shown, found, rest, looks])
+    looks = np.stack([alike, either, unlike], axis=1) * is_in_images[:, None]
+    return np.stack([shown, detected, agreement, looks])
 
 
 def _vague_evidence(counts: Counts, weight: FloatArray) -> FloatArray:
     """Log-likelihood ratio (N, 4) of a worn or hidden corner, from views that disagree on it."""
-    found = np.maximum(counts.found[:, None], counts.pointed)
-    vague = found - counts.pointed
-    rate = float((weight @ vague.sum(axis=1) + 1) / (4 * weight @ counts.found + 2))
-    sound = _rates(vague, found, _RATE_STRENGTH * rate, _RATE_STRENGTH * (1 - rate))
-    return np.asarray(np.logaddexp(_rates(vague, found, 1.0, 1.0) - sound, 0.0) - np.log(2))
+    detections = np.maximum(counts.detected_views[:, None], counts.pointed)
+    vague = detections - counts.pointed
+    rate = float((weight @ vague.sum(axis=1) + 1) / (4 * weight @ counts.detected_views + 2))
+    sound = _rates(vague, detections, _about(rate))
+    return np.asarray(np.logaddexp(_rates(vague, detections, _ANY_RATE) - sound, 0.0) - np.log(2))
 
 
 def _log_like_class(odds: FloatArray, weight: FloatArray) -> FloatArray:
@@ -179,20 +195,24 @@ def _geometric(images: IntArray, stay: float) -> FloatArray:
     return np.asarray(np.log1p(-stay) + (images - 1) * np.log(stay))
 
 
-def log_found(found: IntArray, easy_views: IntArray, rate: float) -> FloatArray:
-    """Log-likelihood (N,) of ``found`` out of ``easy_views`` (N,), at the class's ``rate`` or any."""
-    usual = _rates(found, easy_views, _RATE_STRENGTH * rate, _RATE_STRENGTH * (1 - rate))
-    neglected = _rates(found, easy_views, 1.0, 1.0)
-    both = np.log1p(-_NEGLECTED_SHARE) + usual, np.log(_NEGLECTED_SHARE) + neglected
-    return np.asarray(np.logaddexp(*both))
+def log_found(detections: IntArray, easy_views: IntArray, rate: float) -> FloatArray:
+    """Log-likelihood (N,) of ``detections`` in ``easy_views`` (N,), at the class's ``rate`` or any."""
+    usual = np.log1p(-_NEGLECTED_SHARE) + _rates(detections, easy_views, _about(rate))
+    neglected = np.log(_NEGLECTED_SHARE) + _rates(detections, easy_views, _ANY_RATE)
+    return np.asarray(np.logaddexp(usual, neglected))
 
 
-def log_found_where_none_is(found: IntArray, easy_views: IntArray) -> FloatArray:
-    """Log-likelihood (N,) of ``found`` detections out of ``easy_views`` (N,) on bare ground."""
-    return _rates(found, easy_views, *_BARE_FOUND)
+def log_found_where_none_is(detections: IntArray, easy_views: IntArray) -> FloatArray:
+    """Log-likelihood (N,) of ``detections`` in ``easy_views`` (N,) on bare ground."""
+    return _rates(detections, easy_views, _BARE_FOUND)
 
 
-def _rates(found: IntArray, easy_views: IntArray, hits: float, misses: float) -> FloatArray:
+def _about(rate: float) -> _Beta:
+    """The distribution of markings' rates about their class's."""
+    return _Beta(_RATE_STRENGTH * rate, _RATE_STRENGTH * (1 - rate))
+
+
+def _rates(detections: IntArray, easy_views: IntArray, rate: _Beta) -> FloatArray:
     """Beta-binomial log-likelihood (N,) of the easy views."""
-    left = easy_views - found
-    return np.asarray(betaln(found + hits, left + misses) - betaln(hits, misses))
+    missed = easy_views - detections
+    return np.asarray(betaln(detections + rate.hits, missed + rate.misses) - betaln(rate.hits, rate.misses))

@@ -7,6 +7,7 @@ frequency and precision of both regularities are learned from the drive.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -17,10 +18,8 @@ from v2hdm.records import BoolArray, FloatArray
 from v2hdm.site.candidates import Candidates
 from v2hdm.site.shapes import MEMBER_M, Laid
 
-_TURN_RAD = 1.0
-_BESIDE_M = 0.5
-"""Limits from one dash to the next: the line's rotation, as in a bend of 6 m radius at 6 m spacing, and its
-distance from an arc between them, less than that of parallel lines."""
+_TURN_RAD = 1.0  # largest rotation, rad, of a line from dash to dash: a bend of 6 m radius at 6 m spacing
+_BESIDE_M = 0.5  # largest distance, m, of dashes from an arc between them: less than that of parallel lines
 
 _UNEVEN = 1 / 6
 """Largest difference of a dash's two spacings, relative to their sum: none, or a third with one missing."""
@@ -50,8 +49,8 @@ class Series:
         off_m = _times(self.middle, corners) - self.middle_m
         sigma_m = np.sqrt(self.middle_sigma_m**2 + corners.along(self.middle, self.middle))
         ratio = norm.pdf(np.nan_to_num(off_m), 0.0, sigma_m) * np.where(np.isnan(off_m), 1.0, self.apart_m)
-        found = np.log(self.middle_often * ratio + 1 - self.middle_often)
-        return np.asarray(np.where(np.isnan(off_m), 0.0, found))
+        log_ratio = np.log(self.middle_often * ratio + 1 - self.middle_often)
+        return np.asarray(np.where(np.isnan(off_m), 0.0, log_ratio))
 
 
 def in_series(
@@ -76,7 +75,9 @@ def in_series(
     marking = weight > 0.5
     middle = np.tile(axis, 4) / 4
     own_m2 = believed.along(middle, middle)
-    apart_m, apart_m2, off_m, off_m2 = _ways(believed, axis, own_m2, length_m, marking)
+    spacing = _spacing(believed, axis, own_m2, length_m, marking)
+    apart_m = spacing.apart_m
+    off_m = spacing.off_m
     own_m = np.sum((laid.corners_map - candidates.corners_map).reshape(-1, 8) * shorter, axis=1)
     variance = candidates.along(shorter, shorter) + sigma_m**2
     usual = np.isfinite(apart_m) & marking & (own_m**2 < 9 * variance)
@@ -85,66 +86,86 @@ def in_series(
     step_m = np.median(apart_m[usual])
     stretch = apart_m / step_m
     in_line = np.abs(np.log(stretch)) < np.log(_STRETCH)
-    known = in_line & marking
-    if known.sum() < _LEAST:
+    regular = in_line & marking
+    if regular.sum() < _LEAST:
         return None
     # The largest stretch in bends acts as a prior: uncertain spacings are shrunk to the class's length.
-    unknown_m2 = (length_m / step_m) ** 2 * apart_m2
+    unknown_m2 = (length_m / step_m) ** 2 * spacing.apart_m2
     most_m2 = (length_m * np.log(_STRETCH) / 2) ** 2
     trust = np.where(in_line, most_m2 / (most_m2 + unknown_m2), 0.0)
     longer_m = length_m * trust * np.where(in_line, stretch - 1, 0.0)
     longer_m2 = np.where(in_line, trust * unknown_m2, 0.0)
-    fixed = norm.pdf(own_m[known], 0.0, np.sqrt(variance[known]))
-    spread_m, often = _regularity((own_m - longer_m)[known], (variance + longer_m2)[known], fixed)
+    fixed = norm.pdf(own_m[regular], 0.0, np.sqrt(variance[regular]))
+    spread_m, often = _regularity((own_m - longer_m)[regular], (variance + longer_m2)[regular], fixed)
     longer_sigma_m = np.where(in_line, np.sqrt(longer_m2 + spread_m**2), 0.0)
-    enclosed = known & np.isfinite(off_m)
+    enclosed = regular & np.isfinite(off_m)
     scatter_m = MEMBER_M
     midway = 0.0
     if enclosed.sum() >= _LEAST:
-        scatter_m, midway = _regularity(off_m[enclosed], (own_m2 + off_m2)[enclosed], 1 / apart_m[enclosed])
-    middle_m = _times(middle, believed) + off_m
+        scatter_m, midway = _regularity(
+            off_m[enclosed], (own_m2 + spacing.off_m2)[enclosed], 1 / apart_m[enclosed]
+        )
     return Series(
-        longer_m, longer_sigma_m, often, apart_m, middle, middle_m, np.sqrt(off_m2 + scatter_m**2), midway
+        longer_m=longer_m,
+        longer_sigma_m=longer_sigma_m,
+        longer_often=often,
+        apart_m=apart_m,
+        middle=middle,
+        middle_m=_times(middle, believed) + off_m,
+        middle_sigma_m=np.sqrt(spacing.off_m2 + scatter_m**2),
+        middle_often=midway,
     )
 
 
-def _ways(
-    believed: Candidates, axis: FloatArray, own_m2: FloatArray, length_m: FloatArray, marking: BoolArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Spacing of each dash to its neighbours and offset of their midpoint ahead, m, with variances.
+class _Spacing(NamedTuple):
+    """Places of N dashes among their neighbours, along the line."""
 
-    ``own_m2`` (N,) is the variance of its position along ``axis`` (N, 2). Spacing is inf without a neighbour,
-    the offset nan without one on either side.
+    apart_m: FloatArray  # (N,) spacing to its neighbours, inf without one
+    apart_m2: FloatArray  # (N,) variance, m^2
+    off_m: FloatArray  # (N,) offset ahead of the neighbours' midpoint, nan without one on either side
+    off_m2: FloatArray  # (N,) variance, m^2
+
+
+def _spacing(
+    believed: Candidates, axis: FloatArray, own_m2: FloatArray, length_m: FloatArray, marking: BoolArray
+) -> _Spacing:
+    """Spacing of each dash to its neighbours, and where their midpoint lies.
+
+    ``own_m2`` (N,) is the variance of its position along ``axis`` (N, 2).
     """
     centre = believed.corners_map.mean(axis=1)
-    near = cKDTree(centre).query(centre, min(_NEAR, len(centre)))[1].reshape(len(centre), -1)
-    to = centre[near] - centre[:, None]
-    others = axis[near]
-    along = np.einsum("nki,ni->nk", to, axis)
+    neighbours = cKDTree(centre).query(centre, min(_NEAR, len(centre)))[1].reshape(len(centre), -1)
+    offset = centre[neighbours] - centre[:, None]
+    others = axis[neighbours]
+    along = np.einsum("nki,ni->nk", offset, axis)
     alike = np.einsum("nki,ni->nk", others, axis)
     others *= np.where(alike < 0, -1.0, 1.0)[..., None]
-    across = cross(axis[:, None], to)
-    across_other = cross(to, others)
+    across = cross(axis[:, None], offset)
+    across_other = cross(offset, others)
     turn = np.arctan2(cross(axis[:, None], others), np.abs(alike))
     # The chord between two points of a circle makes equal angles with the tangents there.
     beside_m = np.abs(across - across_other) / 2
-    follows = marking[near] & (np.abs(along) > length_m[:, None])
+    follows = marking[neighbours] & (np.abs(along) > length_m[:, None])
     follows &= (np.abs(turn) < _TURN_RAD) & (beside_m < _BESIDE_M)
-    arc_m = np.linalg.norm(to, axis=2) / np.sinc(turn / 2 / np.pi)
-    ways = [np.where(follows & (sign * along > 0), arc_m, np.inf) for sign in (1, -1)]
-    (ahead, ahead_m2, ahead_rad), (behind, behind_m2, behind_rad) = (
-        (way.min(axis=1), *(each[np.arange(len(near)), way.argmin(axis=1)] for each in (own_m2[near], turn)))
-        for way in ways
-    )
+    arc_m = np.linalg.norm(offset, axis=2) / np.sinc(turn / 2 / np.pi)
+    rows = np.arange(len(neighbours))
+    arc_ahead_m = np.where(follows & (along > 0), arc_m, np.inf)
+    arc_behind_m = np.where(follows & (along < 0), arc_m, np.inf)
+    ahead = arc_ahead_m.min(axis=1)
+    behind = arc_behind_m.min(axis=1)
+    nearest_ahead = rows, arc_ahead_m.argmin(axis=1)
+    nearest_behind = rows, arc_behind_m.argmin(axis=1)
     with np.errstate(invalid="ignore"):
         enclosed = np.abs(ahead - behind) < _UNEVEN * (ahead + behind)
         apart_m = np.where(enclosed, (ahead + behind) / 2, np.minimum(ahead, behind))
         off_m = np.where(enclosed, (ahead - behind) / 2, np.nan)
     # At the start of a bend, the two spacings differ by the line's distance from the bend's centre line times
     # the difference of their rotations.
-    off_m2 = (ahead_m2 + behind_m2 + (_ASIDE_M * (ahead_rad + behind_rad)) ** 2) / 4
+    ahead_m2 = own_m2[neighbours][nearest_ahead]
+    behind_m2 = own_m2[neighbours][nearest_behind]
+    off_m2 = (ahead_m2 + behind_m2 + (_ASIDE_M * (turn[nearest_ahead] + turn[nearest_behind])) ** 2) / 4
     apart_m2 = np.where(enclosed, off_m2, own_m2 + np.where(ahead < behind, ahead_m2, behind_m2))
-    return apart_m, apart_m2, off_m, off_m2
+    return _Spacing(apart_m, apart_m2, off_m, off_m2)
 
 
 def _regularity(off_m: FloatArray, variance: FloatArray, otherwise: FloatArray) -> tuple[float, float]:
@@ -157,10 +178,11 @@ def _regularity(off_m: FloatArray, variance: FloatArray, otherwise: FloatArray) 
     often = 0.5
     series = norm.pdf(off_m, 0.0, np.sqrt(variance + spread_m**2))
     for _ in range(_PASSES):
-        both = often * series + (1 - often) * otherwise
-        often = float((1 + np.sum(often * series / np.maximum(both, 1e-300))) / (2 + len(off_m)))
+        mixture = often * series + (1 - often) * otherwise
+        often = float((1 + np.sum(often * series / np.maximum(mixture, 1e-300))) / (2 + len(off_m)))
     return spread_m, often
 
 
 def _times(middle: FloatArray, corners: Candidates) -> FloatArray:
+    """Position (N,), m, of the mean of ``corners`` along the dash, by ``middle`` (N, 8)."""
     return np.asarray(np.sum(middle * corners.corners_map.reshape(-1, 8), axis=1))

@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
@@ -30,15 +31,15 @@ from v2hdm.site.candidates import Candidates
 _LEAST_MEMBERS = 8  # least markings of one shape of a class
 
 _FEWEST_MEMBERS = 3
-"""The same if they are at least half of the class and agree as one stencil makes them: from three on, two
-agree against a third. Beside a more common shape, its fragments soon agree by threes."""
+"""Least markings of a shape if they are at least half of the class and agree as one stencil makes them: from
+three on, two agree against a third. Beside a more common shape, its fragments soon agree by threes."""
 
-_STENCIL_M = 0.03
-"""Largest sigma of a corner's coordinate about a shape, m, of such agreement: a brush's width."""
-
+_STENCIL_M = 0.03  # largest sigma, m, of a corner's coordinate about a stencil's shape: a brush's width
 _LEAST_SHARE = 0.1  # least fraction of a class's markings with a shape of the class
+
 MEMBER_M = 0.05  # largest deviation of a member's corners from its shape, m
-_MEMBER_SHARE = 0.08  # the same relative to the longer diagonal: large paint is laid out less exactly
+_MEMBER_SHARE = 0.08
+"""Largest such deviation relative to the longer diagonal: large paint is laid out less exactly."""
 
 SHAPE_SIGMA_M = 0.01
 """Least sigma of a painted corner about the stencil's, m."""
@@ -83,9 +84,8 @@ class Laid:
     @cached_property
     def directions(self) -> FloatArray:
         """Orthonormal directions (N, 5, 8)."""
-        return np.asarray(
-            np.swapaxes(np.linalg.qr(rigid_motions(self.corners_map), mode="complete")[0][:, :, 3:], 1, 2)
-        )
+        basis = np.linalg.qr(rigid_motions(self.corners_map), mode="complete")[0]
+        return np.asarray(np.swapaxes(basis[:, :, 3:], 1, 2))
 
     def in_frame_of_shape(self, corners_map: FloatArray) -> FloatArray:
         """Corners (N, 4, 2) in the frame and order of the shape."""
@@ -106,10 +106,12 @@ def lay(shape: FloatArray, sigma_m: float, candidates: Candidates) -> tuple[Laid
     By its symmetry there are two alignments, shifted by one corner: the better one comes first.
     """
     information = np.asarray(np.linalg.inv(candidates.covariance_m2 + sigma_m**2 * np.eye(8)), np.float64)
-    ways = [_lay(np.roll(shape, -shift, axis=0), candidates, information) for shift in (0, 1)]
-    best = np.argmin(np.stack([way[3] for way in ways]), axis=0)
+    alignments = [_lay(np.roll(shape, -shift, axis=0), candidates, information) for shift in (0, 1)]
+    best = np.argmin(np.stack([alignment.squared for alignment in alignments]), axis=0)
     rows = np.arange(len(candidates))
-    placed, rotation, centre = (np.stack([way[k] for way in ways]) for k in range(3))
+    placed = np.stack([alignment.corners_map for alignment in alignments])
+    rotation = np.stack([alignment.rotation for alignment in alignments])
+    centre = np.stack([alignment.centre for alignment in alignments])
     first, second = (
         Laid(placed[shift, rows], rotation[shift, rows], centre[shift, rows], shift)
         for shift in (best, 1 - best)
@@ -117,24 +119,30 @@ def lay(shape: FloatArray, sigma_m: float, candidates: Candidates) -> tuple[Laid
     return first, second
 
 
-def _lay(
-    shape: FloatArray, candidates: Candidates, information: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Aligned corners (N, 4, 2), rotations, centres (N, 2) and squared Mahalanobis distances (N,)."""
+class _Alignment(NamedTuple):
+    """A shape aligned with each of N candidates, from one of its corners."""
+
+    corners_map: FloatArray  # (N, 4, 2) m
+    rotation: FloatArray  # (N, 2, 2)
+    centre: FloatArray  # (N, 2) m
+    squared: FloatArray  # (N,) squared Mahalanobis distance of the candidate's corners
+
+
+def _lay(shape: FloatArray, candidates: Candidates, information: FloatArray) -> _Alignment:
+    """Align ``shape`` (4, 2), whose first corner belongs to the candidates' first."""
     corners = candidates.corners_map
     # A shift common to all corners is irrelevant to their weights.
-    apart = candidates.covariance_m2.reshape(-1, 4, 2, 4, 2)
-    common = np.einsum("naibi->n", apart) / 32
-    weight = 1 / np.maximum(candidates.sigma_m**2 / 2 - common[:, None], 1e-6)
+    by_corner_m2 = candidates.covariance_m2.reshape(-1, 4, 2, 4, 2)
+    common_m2 = np.einsum("naibi->n", by_corner_m2) / 32
+    weight = 1 / np.maximum(candidates.sigma_m**2 / 2 - common_m2[:, None], 1e-6)
     total = weight.sum(axis=1, keepdims=True)
     target_centre = np.einsum("nc,ncx->nx", weight, corners) / total
-    own_centre = weight @ shape / total
+    shape_centre = weight @ shape / total
     # With complex numbers the rotation is the argument of the weighted sum of targets over shapes.
-    a, b = (
-        (one - middle[:, None]) @ [1, 1j] for one, middle in ((shape, own_centre), (corners, target_centre))
-    )
-    turn = np.angle(np.sum(weight * b * a.conj(), axis=1))
-    centre = target_centre - (_turned(turn) @ own_centre[..., None])[..., 0]
+    arms = (shape - shape_centre[:, None]) @ [1, 1j]
+    target_arms = (corners - target_centre[:, None]) @ [1, 1j]
+    turn = np.angle(np.sum(weight * target_arms * arms.conj(), axis=1))
+    centre = target_centre - (_turned(turn) @ shape_centre[..., None])[..., 0]
     for _ in range(_GAUSS_NEWTON_STEPS):
         placed = shape @ np.swapaxes(_turned(turn), 1, 2) + centre[:, None]
         off = (corners - placed).reshape(-1, 8, 1)
@@ -146,7 +154,7 @@ def _lay(
     placed = shape @ np.swapaxes(_turned(turn), 1, 2) + centre[:, None]
     off = (corners - placed).reshape(-1, 8, 1)
     squared = (np.swapaxes(off, 1, 2) @ information @ off)[:, 0, 0]
-    return placed, _turned(turn), centre, squared
+    return _Alignment(placed, _turned(turn), centre, squared)
 
 
 def _turned(angle: FloatArray) -> FloatArray:
@@ -170,12 +178,12 @@ def learn_shapes(candidates: Candidates) -> tuple[Shape, ...]:
     least = max(_LEAST_MEMBERS, _LEAST_SHARE * len(whole))
     shapes: list[Shape] = []
     while len(whole) >= _FEWEST_MEMBERS:
-        left = candidates.subset(whole)
-        corners, members = _commonest(left)
+        unexplained = candidates.subset(whole)
+        corners, members = _commonest(unexplained)
         count = int(np.count_nonzero(members))
         if count < _FEWEST_MEMBERS:
             break
-        spread_m, about_m = _spread_m(corners, left.subset(members))
+        spread_m, about_m = _spread_m(corners, unexplained.subset(members))
         # With so few members, of five directions each, mean and variance are uncertain: sigma of Student's t
         # distribution about a mean (Gelman et al., Bayesian Data Analysis, section 3.2).
         freedom = 5 * (count - 1)
@@ -197,8 +205,10 @@ def _commonest(candidates: Candidates) -> tuple[FloatArray, BoolArray]:
     pairs = 0.5 * (side[:, :2] + side[:, 2:]), diagonals
     lengths = np.concatenate([np.sort(pair, axis=1) for pair in pairs], axis=1)
     limit_m = np.maximum(MEMBER_M, _MEMBER_SHARE * lengths.max(axis=1))
-    apart = np.abs(lengths[:, None] - lengths[None]).max(axis=2)
-    typical = int(np.argmax((apart <= limit_m[:, None]).sum(axis=1) - apart.mean(axis=1) / limit_m))
+    difference_m = np.abs(lengths[:, None] - lengths[None]).max(axis=2)
+    typical = int(
+        np.argmax((difference_m <= limit_m[:, None]).sum(axis=1) - difference_m.mean(axis=1) / limit_m)
+    )
     shape = parallelograms(candidates.corners_map[typical])
     members = np.zeros(len(candidates), dtype=bool)
     for _ in range(2):
@@ -216,16 +226,17 @@ def _spread_m(shape: FloatArray, candidates: Candidates) -> tuple[float, float]:
     laid = lay(shape, SHAPE_SIGMA_M, candidates)[0]
     directions = laid.directions
     off = directions @ (candidates.corners_map - laid.corners_map).reshape(-1, 8, 1)
-    own = directions @ candidates.covariance_m2 @ np.swapaxes(directions, 1, 2)
-    wanted = float(chi2.median(off.shape[1]))
+    formal = directions @ candidates.covariance_m2 @ np.swapaxes(directions, 1, 2)
+    expected = float(chi2.median(off.shape[1]))
     low = SHAPE_SIGMA_M
     high = float(np.abs(off).max()) + SHAPE_SIGMA_M
     for _ in range(20):
         sigma_m = np.sqrt(low * high)
-        innovation = own + sigma_m**2 * np.eye(off.shape[1])
+        innovation = formal + sigma_m**2 * np.eye(off.shape[1])
         squared = (np.swapaxes(off, 1, 2) @ np.linalg.solve(innovation, off))[:, 0, 0]
-        low, high = (sigma_m, high) if np.median(squared) > wanted else (low, sigma_m)
-    return float(low), float(np.sqrt(low**2 + np.median(np.trace(own, axis1=1, axis2=2)) / off.shape[1]))
+        low, high = (sigma_m, high) if np.median(squared) > expected else (low, sigma_m)
+    formal_m2 = np.median(np.trace(formal, axis1=1, axis2=2)) / off.shape[1]
+    return float(low), float(np.sqrt(low**2 + formal_m2))
 
 
 _FREEDOM_BOUNDS = (1.0, 30.0)
@@ -238,7 +249,7 @@ EDGE_SIGMA_M = 0.004
 """Largest sigma of a painted edge common to all images, m: the raggedness of a sprayed line. A class whose
 typical marking scatters by more was painted so: that scatter is no error of the map."""
 
-_START = (0.002, 3.0)  # initial scale, m, and degrees of freedom of the search
+_START = (0.002, 3.0)  # scale, m, and degrees of freedom with which the search for a paint error begins
 
 
 @dataclass(frozen=True)
@@ -255,8 +266,8 @@ class PaintError:
         errors.
         """
         count = len(deviation)
-        beyond = max(float(deviation @ deviation) - float(np.trace(formal)), 0.0)
-        posterior_m2 = (self.freedom * self.sigma_m**2 + beyond) / (self.freedom + count)
+        excess_m2 = max(float(deviation @ deviation) - float(np.trace(formal)), 0.0)
+        posterior_m2 = (self.freedom * self.sigma_m**2 + excess_m2) / (self.freedom + count)
         painted_m2 = max(self.sigma_m**2 - EDGE_SIGMA_M**2, 0.0)
         return max(posterior_m2 - painted_m2, 0.0)
 
@@ -267,20 +278,21 @@ def learn_paint_error(deviations: Sequence[FloatArray], formal: Sequence[FloatAr
     Without deviations, the start of the search.
     """
     if not deviations:
-        return PaintError(*_START)
-    count = np.array([len(one) for one in deviations])
-    squared = np.array([float(one @ one) for one in deviations])
-    own = np.array([float(np.trace(one)) for one in formal]) / count
+        start_m, start_freedom = _START
+        return PaintError(start_m, start_freedom)
+    count = np.array([len(deviation) for deviation in deviations])
+    squared = np.array([float(deviation @ deviation) for deviation in deviations])
+    formal_m2 = np.array([float(np.trace(covariance)) for covariance in formal]) / count
 
     def cost(parameters: FloatArray) -> float:
         sigma_m, freedom = np.exp(parameters)
-        variance = sigma_m**2 + own
+        variance = sigma_m**2 + formal_m2
         likelihood = gammaln((freedom + count) / 2) - gammaln(freedom / 2)
         likelihood -= count / 2 * np.log(freedom * np.pi * variance)
         likelihood -= (freedom + count) / 2 * np.log1p(squared / (freedom * variance))
         return -float(likelihood.sum())
 
     bounds = [np.log(_SIGMA_BOUNDS_M).tolist(), np.log(_FREEDOM_BOUNDS).tolist()]
-    found = minimize(cost, np.log(_START), method="L-BFGS-B", bounds=bounds)
-    sigma_m, freedom = np.exp(found.x)
+    optimum = minimize(cost, np.log(_START), method="L-BFGS-B", bounds=bounds)
+    sigma_m, freedom = np.exp(optimum.x)
     return PaintError(float(sigma_m), float(freedom))

@@ -21,13 +21,22 @@ from skimage.draw import polygon
 from skimage.measure import approximate_polygon, find_contours
 
 from v2hdm.adjust import PoseSigma
-from v2hdm.association.ground import BORDER_PX, OUTLINE_SIGMA_PX, outlines_on_ground
+from v2hdm.association.ground import BORDER_PX, outlines_on_ground
 from v2hdm.association.sightings import Rig, Symbols
 from v2hdm.association.tracks import LEAST_SIGHTINGS
 from v2hdm.geometry.ipm import apply_in_front, pinhole_px_from_ground, project_ground
 from v2hdm.geometry.planar import is_simple, signed_area
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.records import BoolArray, CameraInfo, Exclusion, FloatArray, IntArray, Marking, Symbol
+from v2hdm.records import (
+    OUTLINE_SIGMA_PX,
+    BoolArray,
+    CameraInfo,
+    Exclusion,
+    FloatArray,
+    IntArray,
+    Marking,
+    Symbol,
+)
 from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import PointViews, measure_parallax
@@ -67,43 +76,45 @@ def map_symbols(
     if not shapes:
         return (), ()
     places = np.array([marking.corners_map.mean(axis=0) for marking in markings]).reshape(-1, 2)
-    found = []
-    left_out = []
-    seen = []
-    for own in _groups(shapes):
-        at = np.stack([symbols.camera[rows[own]], symbols.frame[rows[own]]])
-        (camera, frame), image = np.unique(at, axis=1, return_inverse=True)
+    symbols_found = []
+    exclusions = []
+    traces = []
+    for members in _groups(shapes):
+        image_of_member = np.stack([symbols.camera[rows[members]], symbols.frame[rows[members]]])
+        (camera, frame), image = np.unique(image_of_member, axis=1, return_inverse=True)
         if len(camera) < LEAST_SIGHTINGS:
             continue
         eyes = _Eyes(camera, frame, rig, infos, jitter_rad)
-        outline = _fused_outline([shapes[n] for n in own], image.ravel(), eyes)
+        outlines = [shapes[n] for n in members]
+        outline = _fused_outline(outlines, image.ravel(), eyes)
         if outline is None:
             continue
         middle = outline.mean(axis=0)
         size_m = np.ptp(outline, axis=0).max()
         ring = (outline - middle).astype(np.float32)
-        near = np.linalg.norm(places - middle, axis=1) < size_m
-        if any(cv2.pointPolygonTest(ring, one.tolist(), False) >= 0 for one in places[near] - middle):
+        in_reach = np.linalg.norm(places - middle, axis=1) < size_m
+        if any(cv2.pointPolygonTest(ring, place.tolist(), False) >= 0 for place in places[in_reach] - middle):
             continue
-        kind = Counter(symbols.kinds[n] for n in rows[own]).most_common(1)[0][0]
+        kind = Counter(symbols.kinds[n] for n in rows[members]).most_common(1)[0][0]
         # The border or a shadow may hide one end in some images: then the other is used.
-        views = [_ends([shapes[n] for n in own], image.ravel(), eyes, sign) for sign in (1, -1)]
+        views = [_ends(outlines, image.ravel(), eyes, sign) for sign in (1, -1)]
         objections = [measure_parallax(view, 1).objections(options.min_probability)[0] for view in views]
         if None in objections:
-            found.append(Symbol(kind, outline, len(camera)))
-            sides = [symbols.seen[n] for n in rows[own]]
-            seen.append(eyes.traces([shapes[n] for n in own], sides, image.ravel()))
+            symbols_found.append(Symbol(kind, outline, len(camera)))
+            sides = [symbols.seen_sides[n] for n in rows[members]]
+            traces.append(eyes.traces(outlines, sides, image.ravel()))
         else:
-            left_out.append(Exclusion(kind, middle, len(camera), objections[0] or ""))
-    polygons = find_polygons([one.kind for one in found], seen, [one.outline_map for one in found])
-    kept = []
-    for symbol, one in zip(found, polygons, strict=True):
-        reason = _objection(one, options.max_sigma_m)
+            exclusions.append(Exclusion(kind, middle, len(camera), objections[0] or ""))
+    kinds = [symbol.kind for symbol in symbols_found]
+    polygons = find_polygons(kinds, traces, [symbol.outline_map for symbol in symbols_found])
+    accepted = []
+    for symbol, fitted in zip(symbols_found, polygons, strict=True):
+        reason = _objection(fitted, options.max_sigma_m)
         if reason is None:
-            kept.append(_with_vertices(symbol, one, markings))
+            accepted.append(_with_vertices(symbol, fitted, markings))
         else:
-            left_out.append(Exclusion(symbol.kind, one.vertices.mean(axis=0), symbol.sightings, reason))
-    return tuple(kept), tuple(left_out)
+            exclusions.append(Exclusion(symbol.kind, fitted.vertices.mean(axis=0), symbol.sightings, reason))
+    return tuple(accepted), tuple(exclusions)
 
 
 def _objection(polygon: Polygon, max_sigma_m: float) -> str | None:
@@ -119,10 +130,12 @@ def _objection(polygon: Polygon, max_sigma_m: float) -> str | None:
 def _with_vertices(symbol: Symbol, polygon: Polygon, markings: Sequence[Marking]) -> Symbol:
     """The symbol as the polygon, with the camera and pose errors of the nearest marking."""
     covariance = polygon.covariance
-    known = [one for one in markings if one.covariance_m2 is not None]
-    if known:
+    certain = [marking for marking in markings if marking.covariance_m2 is not None]
+    if certain:
         middle = polygon.vertices.mean(axis=0)
-        nearest = min(known, key=lambda one: float(np.linalg.norm(one.corners_map.mean(axis=0) - middle)))
+        nearest = min(
+            certain, key=lambda marking: float(np.linalg.norm(marking.corners_map.mean(axis=0) - middle))
+        )
         shared = np.asarray(nearest.covariance_m2).reshape(4, 2, 4, 2).mean(axis=(0, 2))
         covariance = covariance + np.tile(shared, 2 * (len(polygon.vertices),))
     sigma_m = float(np.sqrt(np.trace(covariance) / len(covariance)))
@@ -148,21 +161,25 @@ class _Eyes:
 
     def sigma_m(self, points_map: FloatArray) -> FloatArray:
         """Standard deviation (I, ...), m, along the ray, of an outline at points (..., 2)."""
-        many = (slice(None), *(None,) * (points_map.ndim - 1))
-        range_m = np.linalg.norm(points_map - self.centre_map[(*many, slice(2))], axis=-1)
-        height_m = self.rig.height_m[self.camera][many]
+        by_image = (slice(None), *(None,) * (points_map.ndim - 1))
+        range_m = np.linalg.norm(points_map - self.centre_map[(*by_image, slice(2))], axis=-1)
+        height_m = self.rig.height_m[self.camera][by_image]
         direction_rad = np.hypot(self.jitter_rad, OUTLINE_SIGMA_PX / self.rig.intrinsic[self.camera, 0, 0])
-        return np.asarray(direction_rad[many] * (range_m**2 + height_m**2) / height_m)
+        return np.asarray(direction_rad[by_image] * (range_m**2 + height_m**2) / height_m)
 
-    def traces(self, shapes: Sequence[FloatArray], seen: Sequence[BoolArray], image: IntArray) -> Traces:
+    def traces(
+        self, shapes: Sequence[FloatArray], seen_sides: Sequence[BoolArray], image: IntArray
+    ) -> Traces:
         """Ground outlines, each of an ``image`` (S,), as traces beside polygons in the images.
 
         Rolling shutters are treated as exposing all rows at the image's middle.
         """
         intrinsic = self.rig.intrinsic[self.camera]
         px_from_map = pinhole_px_from_ground(intrinsic, self.rig.cam_from_map(self.camera, self.frame))
-        outlines_px = [apply_in_front(px_from_map[k], one) for k, one in zip(image, shapes, strict=True)]
-        return Traces.of(outlines_px, seen, image, px_from_map, self.jitter_rad * intrinsic[:, 0, 0])
+        outlines_px = [
+            apply_in_front(px_from_map[k], outline) for k, outline in zip(image, shapes, strict=True)
+        ]
+        return Traces.of(outlines_px, seen_sides, image, px_from_map, self.jitter_rad * intrinsic[:, 0, 0])
 
     def shows(self, points_map: FloatArray) -> BoolArray:
         """Whether points (N, 2) lie inside images (I, N), away from the border."""
@@ -179,9 +196,10 @@ def _ends(shapes: Sequence[FloatArray], image: IntArray, eyes: _Eyes, sign: int)
     scatter gives their uncertainty besides jitter.
     """
     ends = np.zeros((len(eyes.camera), 2))
-    for number, at in enumerate(eyes.centre_map[:, :2]):
-        points = np.concatenate([one for one, own in zip(shapes, image, strict=True) if own == number])
-        ends[number] = points[(sign * np.linalg.norm(points - at, axis=1)).argmax()]
+    for number, eye in enumerate(eyes.centre_map[:, :2]):
+        outlines = [outline for outline, k in zip(shapes, image, strict=True) if k == number]
+        points = np.concatenate(outlines)
+        ends[number] = points[(sign * np.linalg.norm(points - eye, axis=1)).argmax()]
     ray_map = ends - eyes.centre_map[:, :2]
     sigma = PoseSigma(_CELL_M, eyes.jitter_rad, eyes.jitter_rad, _CELL_M).by_state()
     return PointViews(
@@ -201,17 +219,19 @@ def _groups(shapes: Sequence[FloatArray]) -> list[IntArray]:
     middle = np.array([(shape.min(axis=0) + shape.max(axis=0)) / 2 for shape in shapes])
     reach_m = np.array([np.ptp(shape, axis=0).max() for shape in shapes])
     pairs = cKDTree(middle).query_pairs(float(reach_m.max()), output_type="ndarray").reshape(-1, 2)
-    near = np.linalg.norm(middle[pairs[:, 0]] - middle[pairs[:, 1]], axis=1) < reach_m[pairs].max(axis=1)
-    linked = np.array([(a, b) for a, b in pairs[near] if _common(shapes[a], shapes[b]) >= _COMMON], np.int64)
+    in_reach = np.linalg.norm(middle[pairs[:, 0]] - middle[pairs[:, 1]], axis=1) < reach_m[pairs].max(axis=1)
+    linked = np.array(
+        [(a, b) for a, b in pairs[in_reach] if _common(shapes[a], shapes[b]) >= _COMMON], np.int64
+    )
     a, b = linked.reshape(-1, 2).T
     graph = coo_array((np.ones(len(a)), (a, b)), shape=(len(shapes), len(shapes)))
     count, label = connected_components(graph, directed=False)
     return [np.flatnonzero(label == group) for group in range(count)]
 
 
-def _common(one: FloatArray, other: FloatArray) -> float:
+def _common(shape: FloatArray, other: FloatArray) -> float:
     """Common area of two polygons, relative to the smaller."""
-    masks = _covered([one, other], _COARSE_M)[0]
+    masks = _covered([shape, other], _COARSE_M)[0]
     return float((masks[0] & masks[1]).sum() / max(min(mask.sum() for mask in masks), 1))
 
 

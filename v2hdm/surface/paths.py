@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -13,6 +14,21 @@ from v2hdm.records import FloatArray, IntArray
 _STATION_M = 1.0  # least distance of places on the path: the noise of a standing vehicle is no motion
 AHEAD_M = 30.0  # range along the path that a frame may see; beyond, the route may pass again
 _TURN_M = 10.0  # distance that a heading difference of 1 rad counts as
+
+
+class Beside(NamedTuple):
+    """K places beside a path."""
+
+    station_m: FloatArray  # (K,) arc length along the path
+    left_m: FloatArray  # (K,) offset to its left
+
+
+class OnPath(NamedTuple):
+    """A path at K stations."""
+
+    points_map: FloatArray  # (K, 2) m
+    ahead: FloatArray  # (K, 2) unit vectors of the vehicle's heading
+    sense: FloatArray  # (K,) 1 when driving forwards, -1 backwards
 
 
 @dataclass(frozen=True)
@@ -36,14 +52,15 @@ class Paths:
         first = [0]
         for frame in range(1, len(points)):
             last = first[-1]
-            if session[frame] != session[last] or np.hypot(*(points[frame] - points[last])) >= _STATION_M:
+            step_x_m, step_y_m = points[frame] - points[last]
+            if session[frame] != session[last] or np.hypot(step_x_m, step_y_m) >= _STATION_M:
                 first.append(frame)
         place = np.zeros(len(points), dtype=np.int64)
         place[first[1:]] = 1
         place = np.cumsum(place)
-        at = points[first]
+        places_map = points[first]
         ahead = map_from_vehicle[first][:, :2, 0]
-        step = np.diff(at, axis=0)
+        step = np.diff(places_map, axis=0)
         begins = np.append(True, np.diff(session[first]) != 0)
         # A gap between sessions keeps each out of the ground of the next.
         way_m = np.where(begins[1:], 2 * AHEAD_M, np.linalg.norm(step, axis=1))
@@ -51,46 +68,58 @@ class Paths:
         # A place has the sense of the step before it, at a session's start of the step after it.
         forwards = np.where(np.einsum("ni,ni->n", step, ahead[1:]) < 0, -1.0, 1.0)
         sense = np.where(begins, np.append(forwards, 1.0), np.append(1.0, forwards))
-        span = {v: station[session[first] == v][[0, -1]] for v in np.unique(session).tolist()}
-        here = station[place][:, None] + np.array([-AHEAD_M, AHEAD_M])
-        bounds = np.clip(here, *np.array([span[v] for v in session.tolist()]).T[:, :, None])
+        span_of_session = {v: station[session[first] == v][[0, -1]] for v in np.unique(session).tolist()}
+        range_m = station[place][:, None] + np.array([-AHEAD_M, AHEAD_M])
+        span = np.array([span_of_session[v] for v in session.tolist()])
         forward = map_from_vehicle[:, :2, 0]
         heading = forward / np.linalg.norm(forward, axis=1, keepdims=True)
-        spans = np.array([*span.values()])
-        return cls(place, at, heading[first], sense, station, bounds, points, heading, spans)
+        return cls(
+            place=place,
+            points_map=places_map,
+            ahead=heading[first],
+            sense=sense,
+            station_m=station,
+            bounds_m=np.clip(range_m, span[:, :1], span[:, 1:]),
+            position_map=points,
+            heading=heading,
+            session_ends=np.array(list(span_of_session.values())),
+        )
 
-    def beside(self, points_map: FloatArray, frame: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Stations (K,) and left offsets (K,), m, of points (K, 2) near frames (K,)."""
+    def beside(self, points_map: FloatArray, frame: IntArray) -> Beside:
+        """The places of points (K, 2) near frames (K,)."""
         station = self.station_m[self.place[frame]]
-        bounds = self.bounds_m[frame].T
+        least_m, most_m = self.bounds_m[frame].T
         for _ in range(4):
-            at, ahead, sense = self.at(station)
-            along = np.einsum("ki,ki->k", points_map - at, ahead) * sense
-            station = np.clip(station + along, *bounds)
-        at, ahead, sense = self.at(station)
-        off = points_map - at
+            points, ahead, sense = self.at(station)
+            along = np.einsum("ki,ki->k", points_map - points, ahead) * sense
+            station = np.clip(station + along, least_m, most_m)
+        points, ahead, sense = self.at(station)
+        off = points_map - points
         beyond = np.einsum("ki,ki->k", off, ahead) * sense
-        return station + beyond, cross(ahead, off)
+        return Beside(station + beyond, cross(ahead, off))
 
-    def at(self, station_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Points (K, 2), unit headings (K, 2) and senses (K,) of the path at stations (K,)."""
+    def at(self, station_m: FloatArray) -> OnPath:
+        """The path at stations (K,)."""
         columns = np.hstack([self.points_map, self.ahead])
         last = len(self.station_m) - 1
-        near = np.searchsorted(self.station_m, station_m).clip(max=last)
-        before = np.maximum(near - 1, 0)
+        after = np.searchsorted(self.station_m, station_m).clip(max=last)
+        before = np.maximum(after - 1, 0)
         begin_m = self.station_m[before]
-        way_m = self.station_m[near] - self.station_m[before]
+        way_m = self.station_m[after] - self.station_m[before]
         share = np.clip((station_m - begin_m) / np.where(way_m > 0, way_m, 1.0), 0.0, 1.0)[:, None]
-        at = (1 - share) * columns[before] + share * columns[near]
-        ahead = at[:, 2:] / np.maximum(np.linalg.norm(at[:, 2:], axis=1, keepdims=True), 1e-9)
-        return at[:, :2], ahead, self.sense[near]
+        interpolated = (1 - share) * columns[before] + share * columns[after]
+        ahead = interpolated[:, 2:] / np.maximum(
+            np.linalg.norm(interpolated[:, 2:], axis=1, keepdims=True), 1e-9
+        )
+        return OnPath(interpolated[:, :2], ahead, self.sense[after])
 
-    def places(self, station_m: FloatArray, left_m: FloatArray) -> FloatArray:
-        """Map points (K, 2) at stations (K,) and left offsets (K,); straight beyond the ends."""
-        at, ahead, sense = self.at(station_m)
-        beyond = sense * (station_m - np.clip(station_m, *self.station_m[[0, -1]]))
+    def points_at(self, beside: Beside) -> FloatArray:
+        """Map points (K, 2) of places beside the path, which goes on straight beyond its ends."""
+        station_m = beside.station_m
+        points, ahead, sense = self.at(station_m)
+        beyond = sense * (station_m - np.clip(station_m, self.station_m[0], self.station_m[-1]))
         left = turned_left(ahead)
-        return np.asarray(at + beyond[:, None] * ahead + left_m[:, None] * left)
+        return np.asarray(points + beyond[:, None] * ahead + beside.left_m[:, None] * left)
 
     def seen_from(self, map_from_vehicle: FloatArray) -> Paths:
         """The same paths for frames at poses (F, 4, 4), in any order."""

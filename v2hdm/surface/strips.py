@@ -7,22 +7,24 @@ from pathlib import Path
 
 import numpy as np
 
-from v2hdm.errors import ConfigError, MapFileError, need
+from v2hdm.errors import ConfigError, need
 from v2hdm.geometry.geodetic import crs_of
 from v2hdm.geometry.planar import cross
 from v2hdm.records import FloatArray, GroundStrip, HDMap
-from v2hdm.safe.pixels import check_raster
+from v2hdm.safe.rasters import mosaic_points
 from v2hdm.store.files import whole_file
 
-_CELL_M = 0.25
-_MOST_CELLS = 4e6  # of the rectangle about a map; beyond, cells are larger
-_NOTHING = -9999.0
+_CELL_M = 0.25  # size of a cell of the GeoTIFF, m
+_MOST_CELLS = 4e6  # most cells of the rectangle about a map; beyond, cells are larger
+_NOTHING = -9999.0  # value of cells without ground
 
 
 def write_ground_geotiff(hd_map: HDMap, path: Path) -> None:
     """Write the ground as GeoTIFF, heights above the origin and sigmas, m; the surer of two strips counts."""
     rasterio = need("rasterio", "gis", "the format geotiff", ConfigError)
-    edges = np.concatenate([one.points(m) for one in hd_map.ground for m in one.left_m[[0, -1]].tolist()])
+    edges = np.concatenate(
+        [strip.points(m) for strip in hd_map.ground for m in strip.left_m[[0, -1]].tolist()]
+    )
     low = edges.min(axis=0)
     high = edges.max(axis=0)
     cell_m = max(_CELL_M, float(np.sqrt(np.prod(high - low) / _MOST_CELLS)))
@@ -30,12 +32,12 @@ def write_ground_geotiff(hd_map: HDMap, path: Path) -> None:
     x = low[0] + cell_m * (np.arange(columns) + 0.5)
     y = high[1] - cell_m * (np.arange(rows) + 0.5)
     cells = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    found = np.full((2, len(cells)), np.inf)
+    surest = np.full((2, len(cells)), np.inf)
     for strip in hd_map.ground:
-        own = _sampled(strip, cells)
-        surer = own[1] < found[1]
-        found[:, surer] = own[:, surer]
-    bands = np.where(np.isfinite(found), found, _NOTHING).reshape(2, rows, columns).astype(np.float32)
+        of_strip = _sampled(strip, cells)
+        surer = of_strip[1] < surest[1]
+        surest[:, surer] = of_strip[:, surer]
+    bands = np.where(np.isfinite(surest), surest, _NOTHING).reshape(2, rows, columns).astype(np.float32)
     profile = {
         "driver": "GTiff", "width": columns, "height": rows, "count": 2, "dtype": "float32",
         "nodata": _NOTHING, "crs": rasterio.crs.CRS.from_user_input(crs_of(hd_map.origin)),
@@ -54,22 +56,22 @@ def _sampled(strip: GroundStrip, cells: FloatArray) -> FloatArray:
     from scipy.ndimage import map_coordinates  # of the map extra, whose runs alone have such a strip
     from scipy.spatial import cKDTree
 
-    out = np.full((2, len(cells)), np.inf)
-    (right_m, left_m) = strip.left_m[[0, -1]].tolist()
+    sampled = np.full((2, len(cells)), np.inf)
+    right_m, left_m = strip.left_m[[0, -1]].tolist()
     reach_m = max(-right_m, left_m)
-    distance_m, near = cKDTree(strip.points_map).query(
+    distance_m, place = cKDTree(strip.points_map).query(
         cells, distance_upper_bound=np.hypot(reach_m, strip.step_m)
     )
-    seen = np.flatnonzero(np.isfinite(distance_m))
-    off = cells[seen] - strip.points_map[near[seen]]
-    ahead = strip.ahead[near[seen]]
-    along = near[seen] + np.einsum("ki,ki->k", off, ahead) / strip.step_m
+    in_reach = np.flatnonzero(np.isfinite(distance_m))
+    off = cells[in_reach] - strip.points_map[place[in_reach]]
+    ahead = strip.ahead[place[in_reach]]
+    along = place[in_reach] + np.einsum("ki,ki->k", off, ahead) / strip.step_m
     side = cross(ahead, off)
     inside = (side >= right_m) & (side <= left_m) & (along >= 0) & (along <= len(strip.points_map) - 1)
-    at = np.stack([along, (side - right_m) / (strip.left_m[1] - right_m)])[:, inside]
-    for band, values in zip(out, (strip.heights_m, strip.sigma_m), strict=True):
-        band[seen[inside]] = map_coordinates(values, at, order=1)
-    return out
+    coordinates = np.stack([along, (side - right_m) / (strip.left_m[1] - right_m)])[:, inside]
+    for band, values in zip(sampled, (strip.heights_m, strip.sigma_m), strict=True):
+        band[in_reach[inside]] = map_coordinates(values, coordinates, order=1)
+    return sampled
 
 
 def write_opencrg(hd_map: HDMap, path: Path) -> None:
@@ -88,13 +90,13 @@ def write_opencrg(hd_map: HDMap, path: Path) -> None:
             z_start=base_m,
         )
         road.comments = ["ground by v2hdm; x, y and z are metres of the map's frame"]
-        own = path if number == 1 else path.with_stem(f"{path.stem}_{number}")
-        with whole_file(own) as partial:
+        session_path = path if number == 1 else path.with_stem(f"{path.stem}_{number}")
+        with whole_file(session_path) as partial:
             road.save(partial, fmt="KDBI")
 
 
-_SPACING_M = 0.05  # of the points: of an edge of paint, localisation needs no finer ones
-_STRIP_PX = 512
+_SPACING_M = 0.05  # spacing of a cloud's points, m: of an edge of paint, localisation needs no finer ones
+_STRIP_PX = 512  # rows of averaged pixels of the mosaic that are read at a time
 _HEADER = """# .PCD v0.7 - Point Cloud Data file format
 VERSION 0.7
 FIELDS x y z intensity
@@ -115,34 +117,11 @@ def write_cloud(mosaic: Path, path: Path, height_m: Callable[[FloatArray], Float
     ``height_m`` gives the heights (N,) of places (N, 2). The intensity is the grey value, 0 to 255. Raises
     MapFileError where the file is no mosaic of ours, ConfigError where rasterio is missing.
     """
-    rasterio = need("rasterio", "gis", "the format pcd", ConfigError)
-    if not mosaic.is_file():
-        raise MapFileError(f"{mosaic}: cannot be read as a GeoTIFF (no such file); restore it")
     strips = []
-    try:
-        with rasterio.open(mosaic, driver="GTiff") as data:
-            if data.count != 3 or data.dtypes[0] != "uint8" or data.transform.b or data.transform.e >= 0:
-                raise MapFileError(f"{mosaic}: not a mosaic that v2hdm wrote; give mosaic.tif of a result")
-            check_raster(data, mosaic, MapFileError)
-            factor = max(round(_SPACING_M / data.transform.a), 1)
-            for top in range(0, data.height, _STRIP_PX * factor):
-                rows = min(_STRIP_PX * factor, data.height - top)
-                window = rasterio.windows.Window(0, top, data.width, rows)
-                shape = (-(-rows // factor), -(-data.width // factor))
-                average = rasterio.enums.Resampling.average
-                seen = data.dataset_mask(window=window, out_shape=shape) > 0
-                if seen.any():
-                    pixels = data.read(window=window, out_shape=(3, *shape), resampling=average)
-                    row, column = np.nonzero(seen)
-                    step = np.array([data.width / shape[1], rows / shape[0]])
-                    at = (np.column_stack([column, row]) + 0.5) * step + [0, top]
-                    places = at * [data.transform.a, data.transform.e] + [data.transform.c, data.transform.f]
-                    grey = pixels.mean(axis=0)[seen]
-                    strips.append(np.column_stack([places, height_m(places), grey]).astype("<f4"))
-    except rasterio.errors.RasterioError as failure:
-        first = str(failure).splitlines()[0]
-        raise MapFileError(f"{mosaic}: cannot be read as a GeoTIFF ({first}); restore it") from None
-    points = np.concatenate([np.empty((0, 4), "<f4"), *strips])
+    for points in mosaic_points(mosaic, _SPACING_M, _STRIP_PX):
+        places = points[:, :2]
+        strips.append(np.column_stack([places, height_m(places), points[:, 2]]).astype("<f4"))
+    cloud = np.concatenate([np.empty((0, 4), "<f4"), *strips])
     with whole_file(path) as partial, partial.open("wb") as file:
-        file.write(_HEADER.format(len(points)).encode("ascii"))
-        file.write(points.tobytes())
+        file.write(_HEADER.format(len(cloud)).encode("ascii"))
+        file.write(cloud.tobytes())

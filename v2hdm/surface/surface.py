@@ -22,7 +22,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -36,7 +36,7 @@ from v2hdm.geometry.ipm import apply_homography, pinhole_px_from_ground
 from v2hdm.geometry.planar import cross, turned_left
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import BoolArray, FloatArray, GroundStrip, IntArray, PoseNoise, Road
-from v2hdm.surface.paths import AHEAD_M, Paths
+from v2hdm.surface.paths import AHEAD_M, Beside, Paths
 
 KNOTS_M = (1.75, 3.5, 5.25)
 """Offsets from the path at which the slope may change: every half lane of 3.5 m. A crown follows a lane line;
@@ -48,33 +48,39 @@ Policy on Geometric Design of Highways and Streets, 7th ed., section 4.2.2)."""
 
 _GRADE_SIGMA = 0.1  # standard deviation of the grade of the whole map: the steepest roads rise by 10 to 15 %
 
-_GRADES = 2
-_HINGES = 1 + 2 * len(KNOTS_M)
-_SHAPE = _GRADES + _HINGES  # parameters before the spline's
-_ALONG_M = 6.0
-_ACROSS_M = 5.0  # knot spacing of the spline: a third of a camera's range, a lane with margins
-_GRID_M = 0.5
-_STRIP_M = 8.0  # grid and half width of the ground as written
-_SIDE_M = 12.5  # farther beside the path the ground continues at this height, except for the grade
-_ACROSS = int(2 * _SIDE_M / _ACROSS_M) + 3  # functions of the spline across
+_GRADES = 2  # number of parameters of the grade, along map x and y
+_HINGES = 1 + 2 * len(KNOTS_M)  # number of slopes of the cross-section: at the path, at knots left and right
+_SHAPE = _GRADES + _HINGES  # number of parameters before the spline's
+
+_SIDE_M = 12.5  # farther beside the path the ground continues at this height, m, except for the grade
+_ALONG_M = 6.0  # knot spacing of the spline along the path, m: a third of a camera's range
+_ACROSS_M = 5.0  # knot spacing of the spline across the path, m: a lane with margins
+_ACROSS = int(2 * _SIDE_M / _ACROSS_M) + 3  # number of functions of the spline across
 _MOST_ALONG = 120  # largest number of knots along the route; longer routes have wider spacing
-_WHEELS_M = (2.8, 0.8)  # wheelbase and half the track; the vehicle's origin is under the rear axle
+
 _CURVATURE = 1e-3  # typical second difference, 1/m: a crest of 1 km radius, bank changing by 1 % in 10 m
-_SIZES = 2.0  # standard deviation of their logarithm, over all roads
-_REACH_M = 40.0  # ground farther from the camera is not corrected: H is known near the path alone
-_STEPS = 12  # of the secant method; four to six suffice
-_SURE_M = 1e-7  # its tolerance
-_STEP_PX = 0.5
-_TOUCH_M = 0.01  # finite differences: by pixel, and of heights by position
-_LEAN = (0.003, 1e4)  # roll of the sensor on the vehicle, constant: only turns separate it from bank
+_SIZES = 2.0  # standard deviation of the logarithm of second differences, over all roads
+_RIDGE_M = 30.0  # standard deviation, m, of the spline's coefficients: keeps the information matrix regular
+
+_GRID_M = 0.5  # cell size of the ground as written, m
+_STRIP_M = 8.0  # half width of the ground as written, m
+_WHEELS_M = (2.8, 0.8)  # wheelbase and half the track, m; the vehicle's origin is under the rear axle
+
+_REACH_M = 40.0  # ground farther from the camera, m, is not corrected: H is known near the path alone
+_STEPS = 12  # most steps of the secant method by which a ray meets the ground; four to six suffice
+_SURE_M = 1e-7  # tolerance of the secant method, m
+_STEP_PX = 0.5  # step of finite differences by pixel, px
+_TOUCH_M = 0.01  # step of finite differences of heights by position, m
+
+_LEAN = (0.003, 1e4)
+"""Sigma, rad, and correlation length, m, of the sensor's roll on the vehicle, which is constant: only turns
+separate it from bank."""
+
 _MOST_RECORDED = 500  # largest number of evenly spaced path points whose records are used
 _FORGOTTEN = 1e-2  # fraction of the total height variance that is dropped with the smallest errors
-_RIDGE_M = 30.0  # standard deviation of the spline's coefficients: keeps the information matrix regular
 
 Heights = Callable[[FloatArray], FloatArray]
 """Heights (K,) at points (K, 2)."""
-
-FILE = "ground.json"  # in a result folder
 
 _STORED = ("points_map", "ahead", "sense", "station_m", "session_ends")
 """Fields of the paths that are stored; frames are assigned on reading."""
@@ -105,10 +111,10 @@ class Recorded:
         """Heights (N,) and slopes (N, 2) along map x and y at points (N, 2) of the path."""
         if self.road is None:
             return np.zeros(len(points_map)), np.zeros((len(points_map), 2))
-        _, near = cKDTree(self.road.points_map).query(points_map)
-        slope = self.road.slope[near]
-        off = points_map - self.road.points_map[near]
-        return self.road.height_m[near] + np.einsum("ni,ni->n", slope, off), slope
+        _, nearest = cKDTree(self.road.points_map).query(points_map)
+        slope = self.road.slope[nearest]
+        off = points_map - self.road.points_map[nearest]
+        return self.road.height_m[nearest] + np.einsum("ni,ni->n", slope, off), slope
 
 
 def _hinges(left_m: FloatArray) -> FloatArray:
@@ -118,12 +124,47 @@ def _hinges(left_m: FloatArray) -> FloatArray:
     return -np.column_stack([np.abs(left_m), *sides])
 
 
-def _cubic(at: FloatArray, first: float, step: float, count: int) -> tuple[IntArray, FloatArray]:
-    """Indices and values (K, 4) of the four of ``count`` uniform cubic B-splines that cover ``at`` (K,)."""
-    within = np.clip(at, first, first + (count - 3 - 1e-9) * step)
-    knots = first + step * np.arange(-3.0, count + 1)
-    design = BSpline.design_matrix(within, knots, 3)
+class Knots(NamedTuple):
+    """Uniform knots of cubic B-splines."""
+
+    first_m: float
+    step_m: float
+    functions: int  # number of functions
+
+
+_ACROSS_KNOTS = Knots(-_SIDE_M, _ACROSS_M, _ACROSS)  # knots of the spline across the path
+
+
+def _cubic(at_m: FloatArray, knots: Knots) -> tuple[IntArray, FloatArray]:
+    """Indices and values (K, 4) of the four functions that cover ``at_m`` (K,)."""
+    first, step, count = knots
+    within = np.clip(at_m, first, first + (count - 3 - 1e-9) * step)
+    design = BSpline.design_matrix(within, first + step * np.arange(-3.0, count + 1), 3)
     return design.indices.reshape(-1, 4).astype(np.int64), design.data.reshape(-1, 4)
+
+
+class _Footprints(NamedTuple):
+    """Jacobians (F, B), by the parameters, of the planes on which vehicles stand at F frames."""
+
+    height: csr_array
+    forwards: csr_array  # of the slope ahead
+    sideways: csr_array  # of the slope to the left
+
+
+class _Stands(NamedTuple):
+    """The planes on which vehicles stand at F frames."""
+
+    height_m: FloatArray  # (F,)
+    forwards: FloatArray  # (F,) slope ahead
+    sideways: FloatArray  # (F,) slope to the left
+
+
+class _Records(NamedTuple):
+    """What is recorded of the ground on the path."""
+
+    information: FloatArray  # (B, B) on the parameters
+    vector: FloatArray  # (B,) information times parameters
+    datum_m: float  # mean height, m
 
 
 @dataclass(frozen=True)
@@ -133,13 +174,14 @@ class Surface:
     paths: Paths  # of all sessions
     parameters: FloatArray  # (B,) grade g, slopes a, left ones first, then c, across varying fastest
     covariance: FloatArray  # (B, B) of the parameters
-    knots: tuple[float, float, int]  # along the path: first and spacing, m, and number of functions
+    knots: Knots  # along the path
     datum_m: float = 0.0  # added to all heights
-    _stands: tuple[FloatArray, FloatArray, FloatArray] = field(init=False, repr=False)
+    _stands: _Stands = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Cache the plane of each frame's vehicle."""
-        object.__setattr__(self, "_stands", tuple(one @ self.parameters for one in self._footprints()))
+        height, forwards, sideways = (jacobian @ self.parameters for jacobian in self._footprints())
+        object.__setattr__(self, "_stands", _Stands(height, forwards, sideways))
 
     @classmethod
     def level(cls, paths: Paths) -> Surface:
@@ -148,43 +190,48 @@ class Surface:
         step_m = max(_ALONG_M, (end_m - begin_m) / _MOST_ALONG)
         along = int(np.ceil((end_m - begin_m) / step_m)) + 3
         size = _SHAPE + along * _ACROSS
-        return cls(paths, np.zeros(size), np.zeros((size, size)), (begin_m, step_m, along))
+        return cls(paths, np.zeros(size), np.zeros((size, size)), Knots(begin_m, step_m, along))
 
-    def _columns(self, station_m: FloatArray, left_m: FloatArray) -> csr_array:
-        """Jacobian (K, B) by the parameters of heights at stations (K,) and left offsets (K,)."""
-        i, by_way = _cubic(station_m, *self.knots)
-        j, by_side = _cubic(left_m, -_SIDE_M, _ACROSS_M, _ACROSS)
+    def _columns(self, beside: Beside) -> csr_array:
+        """Jacobian (K, B) by the parameters of heights at places beside the path."""
+        i, by_way = _cubic(beside.station_m, self.knots)
+        j, by_side = _cubic(beside.left_m, _ACROSS_KNOTS)
         index = (i[:, :, None] * _ACROSS + j[:, None, :]).reshape(-1)
         value = (by_way[:, :, None] * by_side[:, None, :]).reshape(-1)
-        bounds = 16 * np.arange(len(station_m) + 1)
-        spline = csr_array((value, index, bounds), (len(station_m), self.knots[2] * _ACROSS))
-        shape = np.hstack([self._off_middle(station_m, left_m), _hinges(left_m)])
+        places = len(beside.station_m)
+        bounds = 16 * np.arange(places + 1)
+        spline = csr_array((value, index, bounds), (places, self.knots.functions * _ACROSS))
+        shape = np.hstack([self._off_middle(beside), _hinges(beside.left_m)])
         return csr_array(hstack([csr_array(shape), spline]))
 
-    def _off_middle(self, station_m: FloatArray, left_m: FloatArray) -> FloatArray:
-        """Map x and y (K, 2), from the path's mean point, at stations (K,) and left offsets (K,)."""
-        return np.asarray(self.paths.places(station_m, left_m) - self.paths.points_map.mean(axis=0))
+    def _off_middle(self, beside: Beside) -> FloatArray:
+        """Map x and y (K, 2), from the path's mean point, of places beside the path."""
+        return np.asarray(self.paths.points_at(beside) - self.paths.points_map.mean(axis=0))
 
-    def _footprints(self) -> tuple[csr_array, csr_array, csr_array]:
-        """Jacobians (F, B) by the parameters of the height and slopes, ahead and left, of frames' planes.
+    def _footprints(self) -> _Footprints:
+        """The planes of all frames, by the parameters.
 
         A plane touches the ground under the wheels: on a crown its origin lies below the ground.
         """
         paths = self.paths
-        (long, wide) = _WHEELS_M
+        long, wide = _WHEELS_M
         frame = np.arange(len(paths.place))
         ahead = paths.heading
         left = turned_left(ahead)
+
+        def under_wheels(along: float, side: float) -> csr_array:
+            wheels_map = paths.position_map + along * ahead + side * left
+            return self._columns(paths.beside(wheels_map, frame))
+
         # In a bend the front wheels leave the path of the rear axle.
-        (right_rear, left_rear), (right_front, left_front) = (
-            [self._columns(*paths.beside(paths.position_map + along * ahead + side * left, frame))
-             for side in (-wide, wide)]
-            for along in (0.0, long)
-        )  # fmt: skip
+        right_rear = under_wheels(0.0, -wide)
+        left_rear = under_wheels(0.0, wide)
+        right_front = under_wheels(long, -wide)
+        left_front = under_wheels(long, wide)
         rear = (right_rear + left_rear) / 2
         front = (right_front + left_front) / 2
         sideways = (left_rear - right_rear + left_front - right_front) / (4 * wide)
-        return rear, (front - rear) / long, sideways
+        return _Footprints(rear, (front - rear) / long, sideways)
 
     def _from(self, points_map: FloatArray, frame: IntArray) -> FloatArray:
         """Forward and left offsets (K, 2), m, of points (K, 2) from the vehicle at frames (K,)."""
@@ -198,8 +245,9 @@ class Surface:
 
         A length along a slope exceeds its map length by half the slope squared; heights lean with the plane.
         """
-        forwards, sideways = (one[frame] for one in self._stands[1:])
-        (along, across) = self._from(points_map, frame).T
+        forwards = self._stands.forwards[frame]
+        sideways = self._stands.sideways[frame]
+        along, across = self._from(points_map, frame).T
         ahead = self.paths.heading[frame]
         by_along = forwards * (forwards * along / 2 + sideways * across + above_m)
         by_across = sideways * (sideways * across / 2 + above_m)
@@ -208,43 +256,44 @@ class Surface:
 
     def seen_columns(self, points_map: FloatArray, frame: IntArray) -> csr_array:
         """Jacobian (K, B) of :meth:`seen_height_m` by the parameters."""
-        stands = self._footprints()
+        footprints = self._footprints()
         away = self._from(points_map, frame)
-        plane = stands[0][frame]
-        for axis in (0, 1):
-            plane = plane + diags_array(away[:, axis]) @ stands[1 + axis][frame]
-        return csr_array(self._columns(*self.paths.beside(points_map, frame)) - plane)
+        plane = footprints.height[frame]
+        plane = plane + diags_array(away[:, 0]) @ footprints.forwards[frame]
+        plane = plane + diags_array(away[:, 1]) @ footprints.sideways[frame]
+        return csr_array(self._columns(self.paths.beside(points_map, frame)) - plane)
 
     def seen_errors_m(self, points_map: FloatArray, frame: IntArray) -> FloatArray:
         """Independent errors (K, B) of :meth:`seen_height_m`, one sigma each, the largest alone."""
         values, vectors = np.linalg.eigh(self.covariance)
         errors = self.seen_columns(points_map, frame) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
         squared, ways = np.linalg.eigh(errors.T @ errors)
-        rest = np.cumsum(squared) > _FORGOTTEN * squared.sum()
-        return np.asarray(errors @ ways[:, rest])
+        is_large = np.cumsum(squared) > _FORGOTTEN * squared.sum()
+        return np.asarray(errors @ ways[:, is_large])
 
     def seen_height_m(self, points_map: FloatArray, frame: IntArray) -> FloatArray:
         """Heights (K,) of the ground at points (K, 2) above the planes of the vehicle at frames (K,)."""
         away = self._from(points_map, frame)
-        (height, forwards, sideways) = self._stands
-        plane = height[frame] + away[:, 0] * forwards[frame] + away[:, 1] * sideways[frame]
-        return np.asarray(self._height_m(*self.paths.beside(points_map, frame)) - plane)
+        height_m, forwards, sideways = self._stands
+        plane = height_m[frame] + away[:, 0] * forwards[frame] + away[:, 1] * sideways[frame]
+        return np.asarray(self._height_m(self.paths.beside(points_map, frame)) - plane)
 
-    def _height_m(self, station_m: FloatArray, left_m: FloatArray) -> FloatArray:
-        """Heights (K,) at stations (K,) and left offsets (K,)."""
-        i, by_way = _cubic(station_m, *self.knots)
-        j, by_side = _cubic(left_m, -_SIDE_M, _ACROSS_M, _ACROSS)
+    def _height_m(self, beside: Beside) -> FloatArray:
+        """Heights (K,) at places beside the path."""
+        i, by_way = _cubic(beside.station_m, self.knots)
+        j, by_side = _cubic(beside.left_m, _ACROSS_KNOTS)
         around = self.parameters[_SHAPE:].reshape(-1, _ACROSS)[i[:, :, None], j[:, None, :]]
         spline = np.einsum("ki,kij,kj->k", by_way, around, by_side, optimize=True)
-        graded = self._off_middle(station_m, left_m) @ self.parameters[:_GRADES]
-        return np.asarray(graded + _hinges(left_m) @ self.parameters[_GRADES:_SHAPE] + spline)
+        graded = self._off_middle(beside) @ self.parameters[:_GRADES]
+        return np.asarray(graded + _hinges(beside.left_m) @ self.parameters[_GRADES:_SHAPE] + spline)
 
     def height_m(self, points_map: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Heights (K,) of the ground at points (K, 2) of the map, and their standard deviations (K,)."""
-        return self._at(*self.paths.beside(points_map, self.paths.nearest_frame(points_map)))
+        return self._at(self.paths.beside(points_map, self.paths.nearest_frame(points_map)))
 
-    def _at(self, station_m: FloatArray, left_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        columns = self._columns(station_m, left_m)
+    def _at(self, beside: Beside) -> tuple[FloatArray, FloatArray]:
+        """Heights and standard deviations (K,) at places beside the path."""
+        columns = self._columns(beside)
         variance = np.asarray((columns @ self.covariance * columns.toarray()).sum(axis=1))
         return columns @ self.parameters + self.datum_m, np.sqrt(np.maximum(variance, 0.0))
 
@@ -261,8 +310,8 @@ class Surface:
         for _ in range(4):
             points_map = place + self._leaning(points_map, height_m, frames)
         off = points_map - centre[:2]
-        known = (np.linalg.norm(off, axis=1) < _REACH_M) & (height_m < centre[2] / 2)
-        return points_map + off * np.where(known, height_m / (centre[2] - height_m), 0.0)[:, None]
+        is_corrected = (np.linalg.norm(off, axis=1) < _REACH_M) & (height_m < centre[2] / 2)
+        return points_map + off * np.where(is_corrected, height_m / (centre[2] - height_m), 0.0)[:, None]
 
     def stored(self) -> dict[str, Any]:
         """File content for :meth:`from_stored`, without the covariance."""
@@ -276,28 +325,39 @@ class Surface:
             points, ahead, sense, station, ends, parameters = (
                 np.array(content[name], dtype=np.float64) for name in (*_STORED, "parameters")
             )
-            begin_m, step_m, datum_m = (float(one) for one in (*content["knots"][:2], content["datum_m"]))
+            begin_m, step_m = (float(number) for number in content["knots"][:2])
+            datum_m = float(content["datum_m"])
             along = int(content["knots"][2])
         except (IndexError, KeyError, OverflowError, TypeError, ValueError):
             raise ValueError("not a ground surface: numbers are missing") from None
         places = len(station)
-        none = np.zeros((0, 2))
+        nothing = np.zeros((0, 2))
         shapes = (points.shape, ahead.shape, sense.shape, ends.shape[1:], parameters.shape)
         expected = ((places, 2), (places, 2), (places,), (2,), (_SHAPE + along * _ACROSS,))
         numbers = np.array([begin_m, step_m, datum_m])
         arrays = (numbers, points, ahead, sense, station, ends, parameters)
-        is_sound = shapes == expected and places and all(np.isfinite(one).all() for one in arrays)
+        is_sound = shapes == expected and places and all(np.isfinite(array).all() for array in arrays)
         if not is_sound or step_m <= 0 or (np.diff(station) <= 0).any() or station[-1] > ends[-1, 1]:
             raise ValueError("not a ground surface: its numbers are inconsistent")
-        paths = Paths(np.zeros(0, np.int64), points, ahead, sense, station, none, none, none, ends)
-        unknown = np.zeros((len(parameters), len(parameters)))
-        knots = (begin_m, step_m, along)
-        return cls(paths.seen_from(map_from_vehicle), parameters, unknown, knots, datum_m)
+        paths = Paths(
+            place=np.zeros(0, np.int64),
+            points_map=points,
+            ahead=ahead,
+            sense=sense,
+            station_m=station,
+            bounds_m=nothing,
+            position_map=nothing,
+            heading=nothing,
+            session_ends=ends,
+        )
+        no_covariance = np.zeros((len(parameters), len(parameters)))
+        knots = Knots(begin_m, step_m, along)
+        return cls(paths.seen_from(map_from_vehicle), parameters, no_covariance, knots, datum_m)
 
     def strips(self) -> tuple[GroundStrip, ...]:
         """The ground by session, on a grid of 0.5 m."""
         paths = self.paths
-        out = []
+        strips = []
         left_m = np.arange(-_STRIP_M, _STRIP_M + _GRID_M / 2, _GRID_M)
         for begin_m, end_m in paths.session_ends.tolist():
             station = np.arange(begin_m, end_m, _GRID_M)
@@ -305,10 +365,13 @@ class Surface:
                 continue
             points, ahead, sense = paths.at(station)
             ahead = ahead * sense[:, None]
-            grid = np.broadcast_arrays(station[:, None], (sense[:, None] * left_m))
-            height, sigma = (one.reshape(grid[0].shape) for one in self._at(*(g.ravel() for g in grid)))
-            out.append(GroundStrip(points, ahead, _GRID_M, left_m, height, sigma))
-        return tuple(out)
+            stations_m, offsets_m = np.broadcast_arrays(station[:, None], (sense[:, None] * left_m))
+            height, sigma = self._at(Beside(stations_m.ravel(), offsets_m.ravel()))
+            shape = stations_m.shape
+            strips.append(
+                GroundStrip(points, ahead, _GRID_M, left_m, height.reshape(shape), sigma.reshape(shape))
+            )
+        return tuple(strips)
 
     @property
     def sentence(self) -> str:
@@ -318,9 +381,9 @@ class Surface:
         frame = np.arange(len(self.paths.place))
         left = turned_left(ahead)
         ranges = []
-        ways = (10.0 * ahead, "10 m ahead"), (4.0 * left, "4 m to the left"), (-4.0 * left, "right")
-        for away, where in ways:
-            height_cm = 100 * self.seen_height_m(at + away, frame)
+        places = (10.0 * ahead, "10 m ahead"), (4.0 * left, "4 m to the left"), (-4.0 * left, "right")
+        for offset_map, where in places:
+            height_cm = 100 * self.seen_height_m(at + offset_map, frame)
             ranges.append(f"{height_cm.min():+.0f} to {height_cm.max():+.0f} cm {where}")
         return f"the ground around the vehicle is not a plane: {', '.join(ranges)}"
 
@@ -332,44 +395,42 @@ class Surface:
         ``information`` (B, B) and ``score`` (B,), the cost's gradient, hold at the present parameters, all
         else eliminated.
         """
-        known, towards, datum_m = self._recorded(recorded)
-        towards = towards + information @ self.parameters - score
+        records = self._recorded(recorded)
+        vector = records.vector + information @ self.parameters - score
         usual = np.full(3, np.log(_CURVATURE))
-        whole = information + known
+        total = information + records.information
 
         def cost(sizes: FloatArray) -> float:
             prior = self._smoothness(sizes)
             try:
-                lower, own = (cholesky(one, lower=True) for one in (whole + prior, prior))
+                lower, prior_lower = (cholesky(matrix, lower=True) for matrix in (total + prior, prior))
             except np.linalg.LinAlgError:  # so even that rounding leaves nothing of the ridge
                 return np.inf
-            fit = solve_triangular(lower, towards, lower=True)
-            odds = np.log(own.diagonal()).sum() - np.log(lower.diagonal()).sum() + fit @ fit / 2
+            fit = solve_triangular(lower, vector, lower=True)
+            odds = np.log(prior_lower.diagonal()).sum() - np.log(lower.diagonal()).sum() + fit @ fit / 2
             return float(np.sum((sizes - usual) ** 2) / (2 * _SIZES**2) - odds)
 
         search = {"maxfev": 60, "xatol": 0.2, "fatol": 0.2}
         best = minimize(cost, usual, method="Nelder-Mead", options=search).x
-        covariance = np.asarray(np.linalg.inv(whole + self._smoothness(best)), dtype=np.float64)
-        parameters = covariance @ towards
-        moved = parameters - self.parameters
-        gain = -score @ moved - moved @ information @ moved / 2 - np.sum(information * covariance)
-        found = replace(self, parameters=parameters, covariance=covariance, datum_m=datum_m)
-        return found, float(gain)
+        covariance = np.asarray(np.linalg.inv(total + self._smoothness(best)), dtype=np.float64)
+        parameters = covariance @ vector
+        step = parameters - self.parameters
+        gain = -score @ step - step @ information @ step / 2 - np.sum(information * covariance)
+        surface = replace(self, parameters=parameters, covariance=covariance, datum_m=records.datum_m)
+        return surface, float(gain)
 
     def _smoothness(self, sizes: FloatArray) -> FloatArray:
         """Prior information (B, B) for log standard deviations (3,) of the second differences."""
-        _, step_m, along = self.knots
-        ways = [[np.eye(n), np.diff(np.eye(n), axis=0) / h, np.diff(np.eye(n), 2, axis=0) / h**2]
-                for n, h in ((along, step_m), (_ACROSS, _ACROSS_M))]  # fmt: skip
-        grams = [[one.T @ one for one in way] for way in ways]
-        spline = np.eye(along * _ACROSS) / _RIDGE_M**2
+        along = _squared_differences(self.knots)
+        across = _squared_differences(_ACROSS_KNOTS)
+        spline = np.eye(self.knots.functions * _ACROSS) / _RIDGE_M**2
         for size, order in zip(np.exp(-2 * sizes).tolist(), (2, 1, 0), strict=True):
-            spline += size * np.kron(grams[0][order], grams[1][2 - order])
+            spline += size * np.kron(along[order], across[2 - order])
         slopes = np.repeat([_GRADE_SIGMA, _SLOPE_SIGMA], [_GRADES, _HINGES])
         return np.asarray(block_diag(np.diag(slopes**-2), spline))
 
-    def _recorded(self, recorded: Recorded) -> tuple[FloatArray, FloatArray, float]:
-        """Information (B, B) and information vector (B,) of the records on the path, and mean height, m."""
+    def _recorded(self, recorded: Recorded) -> _Records:
+        """The information of the records on the path."""
         size = len(self.parameters)
         frame = np.unique(np.linspace(0, len(self.paths.place) - 1, _MOST_RECORDED).astype(np.int64))
         height, slope = recorded.at(self.paths.position_map[frame])
@@ -378,20 +439,20 @@ class Surface:
         forwards = np.einsum("fi,fi->f", slope, ahead)
         sideways = cross(ahead, slope)
         datum_m = float(height.mean())
-        apart_m = np.abs(station[:, None] - station)
-        known = np.zeros((size, size))
-        towards = np.zeros(size)
+        distance_m = np.abs(station[:, None] - station)
+        information = np.zeros((size, size))
+        vector = np.zeros(size)
         values = (height - datum_m, forwards, sideways)
         noises = (recorded.heights, recorded.slopes, (*recorded.slopes, _LEAN))
         for columns, value, noise in zip(self._footprints(), values, noises, strict=True):
             covariance = 1e-6 * np.eye(len(frame))
             for sigma, over_m in noise:
-                covariance += sigma**2 * np.exp(-apart_m / over_m)
-            own = columns[frame].toarray()
-            weighted = np.linalg.solve(covariance, own).T
-            known += weighted @ own
-            towards += weighted @ value
-        return known, towards, datum_m
+                covariance += sigma**2 * np.exp(-distance_m / over_m)
+            jacobian = columns[frame].toarray()
+            weighted = np.linalg.solve(covariance, jacobian).T
+            information += weighted @ jacobian
+            vector += weighted @ value
+        return _Records(information, vector, datum_m)
 
     def _meet(
         self, view: _View, frame: IntArray, pixels: FloatArray, seen_height_m: Heights
@@ -404,34 +465,36 @@ class Surface:
         centre_map = view.centre
         with np.errstate(all="ignore"):
             plane = centre_map[:, :2] - (centre_map[:, 2:] / rays[:, 2:]) * rays[:, :2]
-            found = (rays[:, 2] < 0) & (np.linalg.norm(plane - centre_map[:, :2], axis=1) < _REACH_M)
-        down = np.where(found, rays[:, 2], -1.0)
-        out = np.zeros_like(plane)
-        last = np.where(found, -centre_map[:, 2] / down, 0.0)
+            is_met = (rays[:, 2] < 0) & (np.linalg.norm(plane - centre_map[:, :2], axis=1) < _REACH_M)
+        down = np.where(is_met, rays[:, 2], -1.0)
+        points_map = np.zeros_like(plane)
+        far_before = np.where(is_met, -centre_map[:, 2] / down, 0.0)
 
-        def on_map(far: FloatArray) -> FloatArray:
-            points = centre_map + far[:, None] * rays
+        def on_map(along_ray: FloatArray) -> FloatArray:
+            points = centre_map + along_ray[:, None] * rays
             return points[:, :2] - self._leaning(points[:, :2], points[:, 2], frame)
 
         def above(far: FloatArray) -> FloatArray:
             return np.asarray(centre_map[:, 2] + far * rays[:, 2] - seen_height_m(on_map(far)))
 
-        before = above(last)
-        far = last - before / down
+        above_before = above(far_before)
+        far = far_before - above_before / down
         for _ in range(_STEPS):
             off = above(far)
-            if (np.abs(off[found]) < _SURE_M).all():
+            if (np.abs(off[is_met]) < _SURE_M).all():
                 break
             with np.errstate(all="ignore"):
-                fall = np.where(np.abs(far - last) > 1e-12, (off - before) / (far - last), down)
-            last = far
-            before = off
+                fall = np.where(
+                    np.abs(far - far_before) > 1e-12, (off - above_before) / (far - far_before), down
+                )
+            far_before = far
+            above_before = off
             far = far - off / np.where(fall < 0, fall, down)
         else:
             off = above(far)
-        found &= (np.abs(off) < _SURE_M) & (far > 0)
-        out[found] = on_map(far)[found]
-        return np.where(found[:, None], out, plane), found
+        is_met &= (np.abs(off) < _SURE_M) & (far > 0)
+        points_map[is_met] = on_map(far)[is_met]
+        return np.where(is_met[:, None], points_map, plane), is_met
 
     def flattened_px(
         self, intrinsic: FloatArray, cam_from_map: FloatArray, frame: IntArray, pixels: FloatArray
@@ -440,8 +503,9 @@ class Surface:
         return self._flat_px(_View(intrinsic, cam_from_map), frame, pixels)
 
     def _flat_px(self, view: _View, frame: IntArray, pixels: FloatArray) -> FloatArray:
-        points, found = self._shown(view, frame, pixels)
-        return np.where(found[:, None], view.on_plane_px(points, found), pixels)
+        """``pixels`` (K, 2) as if their ground were z = 0; those without ground stay."""
+        points, is_met = self._shown(view, frame, pixels)
+        return np.where(is_met[:, None], view.on_plane_px(points, is_met), pixels)
 
     def _shown(self, view: _View, frame: IntArray, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Ground points (K, 2) at pixels (K, 2), and whether (K,) they exist."""
@@ -449,8 +513,8 @@ class Surface:
 
     def _flat_with_jacobian(self, view: _View, frame: IntArray, pixels: FloatArray) -> FloatArray:
         """Rows (K, 3, 2) of :meth:`flattened_px` and its Jacobian, for planes tangent to the ground."""
-        points, found = self._shown(view, frame, pixels)
-        flat = np.where(found[:, None], view.on_plane_px(points, found), pixels)
+        points, is_met = self._shown(view, frame, pixels)
+        flat = np.where(is_met[:, None], view.on_plane_px(points, is_met), pixels)
         height_m = self.seen_height_m(points, frame)
         slope = np.empty_like(points)
         for axis, step in enumerate(_TOUCH_M * np.eye(2)):
@@ -461,8 +525,8 @@ class Surface:
             return np.asarray(height_m + np.einsum("ki,ki->k", slope, at_map - points))
 
         def moved(to_px: FloatArray) -> FloatArray:
-            at, near = self._meet(view, frame, to_px, touching)
-            return np.where((found & near)[:, None], view.on_plane_px(at, near), to_px)
+            touched, is_touched = self._meet(view, frame, to_px, touching)
+            return np.where((is_met & is_touched)[:, None], view.on_plane_px(touched, is_touched), to_px)
 
         columns = [moved(pixels + step) - moved(pixels - step) for step in _STEP_PX * np.eye(2)]
         return np.concatenate([flat[:, None], np.stack(columns, axis=2) / (2 * _STEP_PX)], axis=1)
@@ -471,20 +535,23 @@ class Surface:
         """``sightings`` as if all paint lay on the plane z = 0, under the cameras of ``rig``."""
         pixels = sightings.corners_pinhole_px.reshape(-1, 2)
 
-        def known(
+        def of_finite(
             camera: IntArray, frame: IntArray, pixels: FloatArray, of: Callable[..., FloatArray]
         ) -> FloatArray:
             """``of`` the finite pixels (N, 2), nan for others."""
-            seen = np.isfinite(pixels).all(axis=1)
-            camera = camera[seen]
-            frame = frame[seen]
-            found = of(_View(rig.intrinsic[camera], rig.cam_from_map(camera, frame)), frame, pixels[seen])
-            out = np.full((len(pixels), *found.shape[1:]), np.nan)
-            out[seen] = found
-            return out
+            is_finite = np.isfinite(pixels).all(axis=1)
+            camera = camera[is_finite]
+            frame = frame[is_finite]
+            values = of(
+                _View(rig.intrinsic[camera], rig.cam_from_map(camera, frame)), frame, pixels[is_finite]
+            )
+            values_of_all = np.full((len(pixels), *values.shape[1:]), np.nan)
+            values_of_all[is_finite] = values
+            return values_of_all
 
-        corners = np.repeat(sightings.camera, 4), np.repeat(sightings.frame, 4), pixels
-        flat = known(*corners, self._flat_with_jacobian).reshape(-1, 4, 3, 2)
+        camera = np.repeat(sightings.camera, 4)
+        frame = np.repeat(sightings.frame, 4)
+        flat = of_finite(camera, frame, pixels, self._flat_with_jacobian).reshape(-1, 4, 3, 2)
         jacobian = flat[..., 1:, :]
 
         def moved(symbols: Symbols) -> Symbols:
@@ -492,7 +559,7 @@ class Surface:
                 return symbols
             of_point = symbols.symbol_of_point
             points_px = np.concatenate(symbols.outlines_pinhole_px)
-            flat_px = known(symbols.camera[of_point], symbols.frame[of_point], points_px, self._flat_px)
+            flat_px = of_finite(symbols.camera[of_point], symbols.frame[of_point], points_px, self._flat_px)
             return replace(symbols, outlines_pinhole_px=tuple(symbols.by_symbol(flat_px)))
 
         return replace(
@@ -502,6 +569,14 @@ class Surface:
             symbols=moved(sightings.symbols),
             lines=moved(sightings.lines),
         )
+
+
+def _squared_differences(knots: Knots) -> list[FloatArray]:
+    """By order 0, 1 and 2: the matrix (N, N) of the squared differences of N coefficients."""
+    unit = np.eye(knots.functions)
+    first = np.diff(unit, axis=0) / knots.step_m
+    second = np.diff(unit, 2, axis=0) / knots.step_m**2
+    return [difference.T @ difference for difference in (unit, first, second)]
 
 
 class _View:
@@ -517,7 +592,7 @@ class _View:
         homogeneous = np.column_stack([pixels, np.ones(len(pixels))])
         return np.asarray((self._map_from_px @ homogeneous[..., None])[..., 0])
 
-    def on_plane_px(self, points_map: FloatArray, found: BoolArray) -> FloatArray:
+    def on_plane_px(self, points_map: FloatArray, is_met: BoolArray) -> FloatArray:
         """Pixels (K, 2) of points (K, 2) of the plane; meaningless unless ``found``."""
-        shown = np.where(found[:, None], points_map, 0.0)
-        return np.asarray(apply_homography(self._px_from_plane, shown[:, None])[:, 0])
+        points_on_ground = np.where(is_met[:, None], points_map, 0.0)
+        return np.asarray(apply_homography(self._px_from_plane, points_on_ground[:, None])[:, 0])

@@ -85,7 +85,7 @@ class CheckTable:
     @property
     def off_m(self) -> FloatArray:
         """Differences (N, 2), map minus survey."""
-        return np.array([one.off_m for one in self.compared]).reshape(-1, 2)
+        return np.array([checked.off_m for checked in self.compared]).reshape(-1, 2)
 
     @property
     def rmse_m(self) -> float:
@@ -106,7 +106,9 @@ class CheckTable:
         degrees = 2 * len(self.compared)
         rmse_x_m, rmse_y_m = (float(np.sqrt(np.mean(off_m**2))) for off_m in self.off_m.T)
         mean_x_m, mean_y_m = self.off_m.mean(axis=0).tolist()
-        heights_m = np.array([one.off_height_m for one in self.compared if one.off_height_m is not None])
+        heights_m = np.array(
+            [checked.off_height_m for checked in self.compared if checked.off_height_m is not None]
+        )
         return out | {
             "rmse_m": self.rmse_m,
             "rmse_x_m": rmse_x_m,
@@ -114,8 +116,8 @@ class CheckTable:
             "mean_x_m": mean_x_m,
             "mean_y_m": mean_y_m,
             "percentile_95_m": self._percentile_m(),
-            "largest_m": max(one.distance_m for one in self.compared),
-            "inside_95_percent": sum(one.is_inside for one in self.compared),
+            "largest_m": max(checked.distance_m for checked in self.compared),
+            "inside_95_percent": sum(checked.is_inside for checked in self.compared),
             "chi_square": self.squared,
             "degrees_of_freedom": degrees,
             "nees": self.squared / degrees,
@@ -136,7 +138,7 @@ class CheckTable:
         if not self.compared:
             return f"check points: none of {total} has a map corner within reach"
         cm = 100 * self.off_m.mean(axis=0)
-        inside = sum(one.is_inside for one in self.compared)
+        inside = sum(checked.is_inside for checked in self.compared)
         return (
             f"check points: {len(self.compared)} of {total} compared, RMSE {100 * self.rmse_m:.1f} cm, mean "
             f"{cm[0]:+.1f} cm in x and {cm[1]:+.1f} cm in y, 95 % within {100 * self._percentile_m():.1f} "
@@ -144,7 +146,7 @@ class CheckTable:
         )
 
     def _percentile_m(self) -> float:
-        return float(np.percentile([one.distance_m for one in self.compared], 100 * INSIDE))
+        return float(np.percentile([checked.distance_m for checked in self.compared], 100 * INSIDE))
 
 
 def squared(off_m: FloatArray, covariance_m2: FloatArray) -> float:
@@ -165,51 +167,54 @@ def compare(
     off_m, nearest = KDTree(corners).query(positions)
     route_m = KDTree(route_map).query(positions)[0]
     ids = [feature.id for feature in features_of(hd_map)]
-    of_map = joint(*np.divmod(nearest, 4))
-    own = np.diag(np.concatenate([point.sigma_m**2 for point in points]))
-    matched = match(positions, corners, reach_m, of_map + own)
+    of_map = joint(nearest // 4, nearest % 4)
+    of_survey = np.diag(np.concatenate([point.sigma_m**2 for point in points]))
+    matched = match(positions, corners, reach_m, of_map + of_survey)
     compared = []
     unmatched = []
     for k, point in enumerate(points):
         if matched[k] < 0:
-            there = f"{hd_map.markings[nearest[k] // 4].kind} {ids[nearest[k] // 4]}"
+            corner_name = f"{hd_map.markings[nearest[k] // 4].kind} {ids[nearest[k] // 4]}"
             if off_m[k] > reach_m:
                 nearest_m = f"{off_m[k]:.2f} m away, the route {route_m[k]:.0f} m"
-                why = f"no corner within {reach_m:g} m: the nearest, of {there}, is {nearest_m}"
+                why = f"no corner within {reach_m:g} m: the nearest, of {corner_name}, is {nearest_m}"
             else:
                 better = points[int(np.argmax(matched == nearest[k]))].id
-                why = f"{better} fits the only corner within reach better, of {there}"
+                why = f"{better} fits the only corner within reach better, of {corner_name}"
             unmatched.append((point, why))
             continue
         marking, corner = divmod(int(matched[k]), 4)
-        found = hd_map.markings[marking]
+        mapped = hd_map.markings[marking]
         height_m = point.height_m
         off_height_m = None
-        if found.heights_m is not None and height_m is not None:
-            off_height_m = float(found.heights_m[corner] - height_m)
-        off = found.corners_map[corner] - point.position_map
+        if mapped.heights_m is not None and height_m is not None:
+            off_height_m = float(mapped.heights_m[corner] - height_m)
+        off = mapped.corners_map[corner] - point.position_map
         covariance = joint(np.array([marking]), np.array([corner]))
         compared.append(
-            CheckedPoint(point, marking, ids[marking], found.kind, corner, off, covariance, off_height_m)
+            CheckedPoint(point, marking, ids[marking], mapped.kind, corner, off, covariance, off_height_m)
         )
     if not compared:
         return CheckTable((), tuple(unmatched), np.zeros((0, 0)))
-    of_map = joint(*np.array([(one.marking, one.corner) for one in compared]).T)
-    own = np.diag(np.concatenate([one.point.sigma_m**2 for one in compared]))
-    return CheckTable(tuple(compared), tuple(unmatched), of_map + own)
+    marking_of = np.array([checked.marking for checked in compared])
+    corner_of = np.array([checked.corner for checked in compared])
+    of_map = joint(marking_of, corner_of)
+    of_survey = np.diag(np.concatenate([checked.point.sigma_m**2 for checked in compared]))
+    return CheckTable(tuple(compared), tuple(unmatched), of_map + of_survey)
 
 
 def write_check_points(table: CheckTable, path: Path) -> None:
     """Write the table as CSV to ``path``: one row per check point, compared ones first."""
     rows: list[Sequence[object]] = [COLUMNS]
-    for one in table.compared:
-        point = one.point
-        sigma, own_sigma = (np.sqrt(np.diag(of)) for of in (one.covariance_m2, one.map_covariance_m2))
+    for checked in table.compared:
+        point = checked.point
+        sigma_m = np.sqrt(np.diag(checked.covariance_m2))
+        map_sigma_m = np.sqrt(np.diag(checked.map_covariance_m2))
         cells: list[object] = [point.id, point.description, *_metres(point.position_map)]
-        cells += [one.marking_id, one.kind, one.corner + 1]
-        cells += _metres([*one.off_m, one.distance_m, *sigma, *own_sigma])
-        cells += [f"{one.normalised:.3f}", "yes" if one.is_inside else "no"]
-        height = [] if one.off_height_m is None else [one.off_height_m]
+        cells += [checked.marking_id, checked.kind, checked.corner + 1]
+        cells += _metres([*checked.off_m, checked.distance_m, *sigma_m, *map_sigma_m])
+        cells += [f"{checked.normalised:.3f}", "yes" if checked.is_inside else "no"]
+        height = [] if checked.off_height_m is None else [checked.off_height_m]
         rows.append([*cells, *(_metres(height) or [""]), ""])
     for point, why in table.unmatched:
         empty = [""] * (len(COLUMNS) - 5)

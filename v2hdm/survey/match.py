@@ -8,6 +8,8 @@ that the others agree with most is found first, and then always the surest one.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from v2hdm.records import FloatArray, IntArray
@@ -24,10 +26,11 @@ def match(
     from scipy.spatial import KDTree  # of the map extra, as its callers are
 
     count = len(points_map)
-    near = KDTree(corners_map).query_ball_point(points_map, reach_m)
-    corner = np.full((count, max([len(one) for one in near], default=0)), -1, dtype=np.int64)
-    for k, one in enumerate(near):
-        corner[k, : len(one)] = sorted(one)
+    in_reach = KDTree(corners_map).query_ball_point(points_map, reach_m)
+    most = max([len(corners) for corners in in_reach], default=0)
+    corner = np.full((count, most), -1, dtype=np.int64)
+    for k, corners in enumerate(in_reach):
+        corner[k, : len(corners)] = sorted(corners)
     off_m = corners_map[corner] - points_map[:, None]
     out = np.full(count, -1, dtype=np.int64)
     # Survey and poses may be of two datums: then all points are off alike, within reach at two sigmas.
@@ -36,40 +39,45 @@ def match(
     covariance = covariance_m2 + datum
     # A corner that is not the point's lies anywhere within reach of it.
     chance = 2 * float(np.log(np.pi * reach_m**2))
-    following = _first(corner, off_m, covariance, chance)
-    while following is not None:
-        k, choice, fits = following
-        out[k] = corner[k, choice]
-        if fits:
-            own = slice(2 * k, 2 * k + 2)
-            gain = np.linalg.solve(covariance[own, own], covariance[own]).T
-            mean = mean + (gain @ (off_m[k, choice] - mean[k])).reshape(-1, 2)
-            covariance = covariance - gain @ covariance[own]
+    choice = _first(corner, off_m, covariance, chance)
+    while choice is not None:
+        k = choice.point
+        out[k] = corner[k, choice.rank]
+        if choice.fits:
+            of_point = slice(2 * k, 2 * k + 2)
+            gain = np.linalg.solve(covariance[of_point, of_point], covariance[of_point]).T
+            mean = mean + (gain @ (off_m[k, choice.rank] - mean[k])).reshape(-1, 2)
+            covariance = covariance - gain @ covariance[of_point]
         corner[k] = -1
         corner[corner == out[k]] = -1
-        following = _surest(corner, off_m - mean[:, None], covariance, chance)
+        choice = _surest(corner, off_m - mean[:, None], covariance, chance)
     return out
 
 
-_Choice = tuple[int, int, bool]  # a point, which of its corners, and whether this is likelier than chance
+class _Choice(NamedTuple):
+    """A point and the corner that it is of."""
+
+    point: int
+    rank: int  # which of the point's corners
+    fits: bool  # whether it is likelier than chance
 
 
 def _first(corner: IntArray, off_m: FloatArray, covariance: FloatArray, chance: float) -> _Choice | None:
     """The choice under which all points together are likeliest, each of its best corner or of none."""
-    own = _own_blocks(covariance)
-    alone = _unlikely(corner, off_m, own)
+    blocks = _own_blocks(covariance)
+    alone = _unlikely(corner, off_m, blocks)
     best: tuple[float, _Choice] | None = None
-    for k, choice in np.argwhere(corner >= 0).tolist():
+    for k, rank in np.argwhere(corner >= 0).tolist():
         rows = slice(2 * k, 2 * k + 2)
         gain = np.linalg.solve(covariance[rows, rows], covariance[rows]).T.reshape(-1, 2, 2)
-        mean = gain @ off_m[k, choice]
-        left = own - gain @ covariance[rows].reshape(2, -1, 2).transpose(1, 0, 2)
+        mean = gain @ off_m[k, rank]
+        left = blocks - gain @ covariance[rows].reshape(2, -1, 2).transpose(1, 0, 2)
         others = np.arange(len(corner)) != k
-        free = np.where(corner == corner[k, choice], -1, corner)[others]
-        given = _unlikely(free, (off_m - mean[:, None])[others], left[others])
-        total = float(alone[k, choice] + np.minimum(given.min(axis=1), chance).sum())
+        free = np.where(corner == corner[k, rank], -1, corner)[others]
+        unlikely = _unlikely(free, (off_m - mean[:, None])[others], left[others])
+        total = float(alone[k, rank] + np.minimum(unlikely.min(axis=1), chance).sum())
         if best is None or total < best[0]:
-            best = total, (k, choice, total < chance * len(corner))
+            best = total, _Choice(k, rank, total < chance * len(corner))
     return None if best is None else best[1]
 
 
@@ -82,7 +90,8 @@ def _surest(corner: IntArray, off_m: FloatArray, covariance: FloatArray, chance:
     ranked = np.column_stack([np.sort(unlikely, axis=1), np.full(len(waiting), np.inf)])
     lead = np.minimum(ranked[:, 1], chance) - ranked[:, 0]
     row = int(np.argmax(lead))
-    return int(waiting[row]), int(np.argmin(unlikely[row])), bool(ranked[row, 0] < chance)
+    rank = int(np.argmin(unlikely[row]))
+    return _Choice(int(waiting[row]), rank, bool(ranked[row, 0] < chance))
 
 
 def _own_blocks(covariance: FloatArray) -> FloatArray:

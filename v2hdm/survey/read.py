@@ -20,7 +20,7 @@ from v2hdm.errors import DriveError
 from v2hdm.geometry import geodetic
 from v2hdm.io.importers.readings import read_rows
 from v2hdm.io.trajectory import parse_number
-from v2hdm.records import FloatArray, GeodeticOrigin
+from v2hdm.records import FOOT_M, FloatArray, GeodeticOrigin
 
 _log = logging.getLogger(__name__)
 
@@ -97,28 +97,30 @@ def read_survey(path: Path, crs: str | None, geoid_m: float | None, sigma_m: flo
     header, lines = read_rows(path, ";\t,", "point")
     names = _columns(header, path)
     rows = []
-    seen = dict[str, int]()
+    line_of = dict[str, int]()
     for line, cells in lines:
-        known = {name: cell for name, cell in zip(names, cells, strict=True) if name is not None}
-        rows.append(_Row(known, where := f"{path}: line {line}"))
-        if not (point := known["id"]):
+        cell_of = {name: cell for name, cell in zip(names, cells, strict=True) if name is not None}
+        where = f"{path}: line {line}"
+        rows.append(_Row(cell_of, where))
+        point = cell_of["id"]
+        if not point:
             raise DriveError(f"{where}: the point has no id; name it")
-        if point in seen:
-            raise DriveError(f"{where}: point {point} is already in line {seen[point]}; keep one")
-        seen[point] = line
+        if point in line_of:
+            raise DriveError(f"{where}: point {point} is already in line {line_of[point]}; keep one")
+        line_of[point] = line
     frame = _frame(names, crs, path)
     first, second = frame.columns
     return SurveyTable(
-        path,
-        frame,
-        np.array([[row.number(first), row.number(second)] for row in rows]),
-        np.array([row.number("height_m", np.nan) for row in rows]),
-        np.array([row.sigmas(sigma_m) for row in rows]),
-        tuple(seen),
-        tuple(row.is_check() for row in rows),
-        tuple(row.text("description") for row in rows),
-        crs,
-        geoid_m,
+        path=path,
+        frame=frame,
+        coordinates=np.array([[row.number(first), row.number(second)] for row in rows]),
+        height_m=np.array([row.number("height_m", np.nan) for row in rows]),
+        sigma_m=np.array([row.sigmas(sigma_m) for row in rows]),
+        ids=tuple(line_of),
+        is_check=tuple(row.is_check() for row in rows),
+        descriptions=tuple(row.text("description") for row in rows),
+        crs=crs,
+        geoid_m=geoid_m,
     )
 
 
@@ -134,8 +136,17 @@ def in_map(table: SurveyTable, origin: GeodeticOrigin | None) -> tuple[SurveyedP
     if table.frame is not Frame.MAP:
         positions, height_m = _on_earth(table, origin)
     heights = [float(height) if np.isfinite(height) else None for height in height_m]
-    columns = (table.ids, positions, table.sigma_m, heights, table.is_check, table.descriptions)
-    return tuple(SurveyedPoint(*row) for row in zip(*columns, strict=True))
+    return tuple(
+        SurveyedPoint(
+            id=name,
+            position_map=positions[k],
+            sigma_m=table.sigma_m[k],
+            height_m=heights[k],
+            is_check=table.is_check[k],
+            description=table.descriptions[k],
+        )
+        for k, name in enumerate(table.ids)
+    )
 
 
 def misreadings(table: SurveyTable, origin: GeodeticOrigin | None) -> dict[str, FloatArray]:
@@ -143,7 +154,7 @@ def misreadings(table: SurveyTable, origin: GeodeticOrigin | None) -> dict[str, 
     first, second = table.frame.columns
     others = {f"with {first} and {second} swapped": replace(table, coordinates=table.coordinates[:, ::-1])}
     if table.frame is not Frame.GEODETIC:
-        others["in feet"] = replace(table, coordinates=0.3048 * table.coordinates)
+        others["in feet"] = replace(table, coordinates=FOOT_M * table.coordinates)
         others["in millimetres"] = replace(table, coordinates=1e-3 * table.coordinates)
     if table.frame is Frame.GRID:
         others["as local metres (columns x_m, y_m)"] = replace(table, frame=Frame.MAP)
@@ -190,8 +201,8 @@ def _on_earth(table: SurveyTable, origin: GeodeticOrigin | None) -> tuple[FloatA
             unused = "%s: heights of %s are above sea level and not used: set mapping.survey.geoid_m"
             _log.warning(unused, where, crs)
             height_m = np.full_like(height_m, np.nan)
-    known = np.isfinite(height_m)
-    raised_m = np.where(known, height_m + (table.geoid_m or 0.0), origin.altitude_m)
+    is_known = np.isfinite(height_m)
+    raised_m = np.where(is_known, height_m + (table.geoid_m or 0.0), origin.altitude_m)
     points = np.column_stack([table.coordinates, raised_m])
     if table.frame is Frame.GEODETIC:
         for name, (latitude_deg, longitude_deg) in zip(table.ids, table.coordinates, strict=True):
@@ -204,7 +215,7 @@ def _on_earth(table: SurveyTable, origin: GeodeticOrigin | None) -> tuple[FloatA
         assert crs is not None
         points = geodetic.geodetic_from_grid(crs, points, where, DriveError)
     out = geodetic.enu_from_geodetic(origin, points)
-    return out[:, :2], np.where(known, out[:, 2], np.nan)
+    return out[:, :2], np.where(is_known, out[:, 2], np.nan)
 
 
 @dataclass(frozen=True)
@@ -239,14 +250,14 @@ class _Row:
 def _columns(header: Sequence[str], path: Path) -> list[str | None]:
     """Our name of each column, None for those that are not used."""
     ours = [NAMES.get(name.lower()) for name in header]
-    for name, own in zip(header, ours, strict=True):
-        if own is not None and ours.count(own) > 1:
-            twice = [other for other, its in zip(header, ours, strict=True) if its == own]
+    for name, our_name in zip(header, ours, strict=True):
+        if our_name is not None and ours.count(our_name) > 1:
+            twice = [other for other, meant in zip(header, ours, strict=True) if meant == our_name]
             raise DriveError(f"{path}: the columns {' and '.join(twice)} mean the same; keep one of them")
-        near = difflib.get_close_matches(name.lower(), NAMES, n=1, cutoff=_NEARLY)
-        if own is None and near:
-            raise DriveError(f"{path}: unknown column '{name}'; did you mean '{near[0]}'?")
-    unused = [name for name, own in zip(header, ours, strict=True) if own is None]
+        similar = difflib.get_close_matches(name.lower(), NAMES, n=1, cutoff=_NEARLY)
+        if our_name is None and similar:
+            raise DriveError(f"{path}: unknown column '{name}'; did you mean '{similar[0]}'?")
+    unused = [name for name, our_name in zip(header, ours, strict=True) if our_name is None]
     if unused:
         _log.info("%s: the columns %s are not used", path, ", ".join(unused))
     if "id" not in ours:
@@ -256,14 +267,14 @@ def _columns(header: Sequence[str], path: Path) -> list[str | None]:
 
 def _frame(names: Sequence[str | None], crs: str | None, path: Path) -> Frame:
     """The frame whose columns the file has, checked against ``crs``."""
-    found = [frame for frame in Frame if any(name in names for name in frame.columns)]
-    if len(found) != 1:
+    frames = [frame for frame in Frame if any(name in names for name in frame.columns)]
+    if len(frames) != 1:
         ways = " or ".join(frame.value for frame in Frame)
         raise DriveError(f"{path}: needs the columns {ways}, one of these pairs")
-    missing = [name for name in found[0].columns if name not in names]
+    missing = [name for name in frames[0].columns if name not in names]
     if missing:
         raise DriveError(f"{path}: has no column {missing[0]}; add it")
-    (frame,) = found
+    (frame,) = frames
     if frame is Frame.GRID and crs is None:
         raise DriveError(
             f"{path}: which system are east and north in? Set mapping.survey.crs, such as EPSG:32632, or "

@@ -22,7 +22,7 @@ from v2hdm.verdict.results.accuracy import check_frame, check_points
 
 _log = logging.getLogger(__name__)
 
-_NAMED = 5  # points that a line of the log names
+_NAMED = 5  # largest number of points that a line of the log names
 _NEAR_M = 22.0  # how far from the route, m, images may show a point: as far as the detector looks by default
 
 
@@ -38,9 +38,9 @@ class Survey:
     points: tuple[SurveyedPoint, ...] = ()
     elsewhere: dict[str, FloatArray] | None = None
 
-    def found(self, result: MethodResult) -> dict[str, int]:
+    def counts_in_reach(self, result: MethodResult) -> dict[str, int]:
         """How many points have a corner of the map within reach: as stated (""), and read otherwise."""
-        corners = KDTree(np.array([one.corners_map for one in result.hd_map.markings]).reshape(-1, 2))
+        corners = KDTree(np.array([marking.corners_map for marking in result.hd_map.markings]).reshape(-1, 2))
         ways = {"": _positions(self.points), **(self.elsewhere or {})}
         return {says: _places(corners, at, self.mapping.survey.reach_m) for says, at in ways.items()}
 
@@ -61,12 +61,12 @@ def take_survey(drive: Drive, options: MappingOptions) -> Survey:
     elsewhere = misreadings(table, drive.origin)
     _check_near(table, points, elsewhere, drive, min(_NEAR_M, options.max_range_m))
     control = [
-        ControlOptions(id=one.id, position_map=one.position_map.tolist(), sigma_m=one.sigma_m.tolist())
-        for one in points
-        if not one.is_check
+        ControlOptions(id=point.id, position_map=point.position_map.tolist(), sigma_m=point.sigma_m.tolist())
+        for point in points
+        if not point.is_check
     ]
     survey = options.survey.only([*options.survey.points, *control])
-    check = tuple(one for one in points if one.is_check)
+    check = tuple(point for point in points if point.is_check)
     _log.info("%s: %d control points and %d check points", table.path, len(control), len(check))
     return Survey(replace(options, survey=survey), check, points, elsewhere)
 
@@ -83,7 +83,7 @@ def compare_survey(survey: Survey, drive: Drive, best: MethodResult) -> CheckTab
 
 def check_survey(survey: Survey, best: MethodResult, compared: CheckTable | None) -> list[Finding]:
     """The findings on a survey, and on its check points where they were compared."""
-    findings = check_frame(survey.found(best)) if survey.points else []
+    findings = check_frame(survey.counts_in_reach(best)) if survey.points else []
     return findings if compared is None else [check_points(compared), *findings]
 
 
@@ -108,10 +108,10 @@ def _check_near(
             )  # fmt: skip
         return
     likeliest = max(elsewhere, key=lambda says: _places(route, elsewhere[says], range_m), default="")
-    near = int((route.query(elsewhere[likeliest])[0] <= range_m).sum()) if likeliest else 0
+    in_reach = int((route.query(elsewhere[likeliest])[0] <= range_m).sum()) if likeliest else 0
     advice = "check datum, zone, units, column order and the drive's origin"
-    if near:
-        advice = f"{near} would {likeliest}; fix the file or mapping.survey.crs"
+    if in_reach:
+        advice = f"{in_reach} would {likeliest}; fix the file or mapping.survey.crs"
     raise DriveError(
         f"{table.path}: none of its {len(points)} points lies within {range_m:g} m of the route, the nearest "
         f"is {away_m.min():.0f} m away: {advice}"
@@ -125,4 +125,4 @@ def _places(tree: KDTree, at: FloatArray, reach_m: float) -> int:
 
 
 def _positions(points: Sequence[SurveyedPoint]) -> FloatArray:
-    return np.array([one.position_map for one in points]).reshape(-1, 2)
+    return np.array([point.position_map for point in points]).reshape(-1, 2)

@@ -56,7 +56,7 @@ def _save_route(path: Path, trajectory: Trajectory) -> None:
             axes.add_collection(line)
             fig.colorbar(line, ax=axes, shrink=0.7, label="speed (m/s)")
         _draw_headings(axes, poses)
-        axes.plot(*place[0], "o", color="white", mec="#1b1e21", ms=9, zorder=4, label="start")
+        axes.plot(place[0, 0], place[0, 1], "o", color="white", mec="#1b1e21", ms=9, zorder=4, label="start")
         axes.set_aspect("equal", adjustable="datalim")
         axes.margins(0.08)
         axes.set(xlabel="x: east (m)", ylabel="y: north (m)")
@@ -71,5 +71,6 @@ def _draw_headings(axes: Axes, poses: FloatArray) -> None:
     chosen = np.unique(np.searchsorted(way, np.linspace(0, way[-1], _ARROWS)))
     length = 0.05 * max(float(np.ptp(place, axis=0).max()), 1e-9)
     look: dict[str, Any] = {"color": "white", "edgecolor": "#1b1e21", "linewidth": 0.7, "width": 0.0028}
-    arrows = (length * poses[chosen, :2, 0]).T
-    axes.quiver(*place[chosen].T, *arrows, angles="xy", scale_units="xy", scale=1, zorder=3, **look)
+    x, y = place[chosen].T
+    right, up = (length * poses[chosen, :2, 0]).T
+    axes.quiver(x, y, right, up, angles="xy", scale_units="xy", scale=1, zorder=3, **look)

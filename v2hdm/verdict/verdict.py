@@ -106,7 +106,8 @@ class Verdict:
         >>> result.verdict.headline.startswith("PASS: 95 % of ")
         True
         """
-        how_good = next((one.says for one in self.findings if (one.check, one.about) == (GOAL, "map")), "")
+        on_map = [f.says for f in self.findings if f.check == GOAL and f.about == "map"]
+        how_good = on_map[0] if on_map else ""
         if how_good and self.status is Status.FAIL:
             how_good = f"no accuracy can be promised, see {self.findings[0].check} ({self.findings[0].about})"
         return how_good and f"{self.status.value}: {how_good.split(': ')[0]}"
@@ -117,7 +118,7 @@ class Verdict:
             "status": self.status.value,
             "headline": self.headline,
             "findings": [finding.as_json() for finding in self.raised],
-            "untold": [finding.as_json() for finding in self.unobservable],
+            "unobservable": [finding.as_json() for finding in self.unobservable],
             "passed": [finding.as_json() for finding in self.passed],
         }
 

@@ -10,8 +10,7 @@ from omegaconf import OmegaConf
 
 from v2hdm.cli.compose import conf_dir
 from v2hdm.records import PoseNoise
-from v2hdm.simulate import PortConfig
-from v2hdm.simulate.port.config import CameraConfig
+from v2hdm.simulate.port.config import CameraConfig, PortConfig
 
 ROUTES = ("straight", "bends", "turning")
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from v2hdm.errors import DriveError
-from v2hdm.io.drive.folder import DRIVE_FILE, POSES_FILE
+from v2hdm.io.description import DRIVE_FILE, POSES_FILE
 from v2hdm.io.trajectory import read_tum, write_tum
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.records import FloatArray, Trajectory

@@ -61,9 +61,9 @@ def verdict(status: str = "PASS") -> dict[str, object]:
     }  # fmt: skip
     raised = [finding] if status != "PASS" else []
     passed = {**finding, "status": "PASS", "value": 0.0004, "says": "on one clock"}
-    untold = {**finding, "status": "PASS", "value": None, "says": "constant speed: drive a turn"}
+    unobservable = {**finding, "status": "PASS", "value": None, "says": "constant speed: include a turn"}
     headline = f"{status}: 95 % of 12 markings within 2.1 cm; goal 5 cm"
-    lists = {"findings": raised, "untold": [untold], "passed": [passed]}
+    lists = {"findings": raised, "unobservable": [unobservable], "passed": [passed]}
     return {"status": status, "headline": headline, **lists}
 
 

@@ -167,10 +167,20 @@ def test_without_its_drive_the_page_says_what_it_lacks(result):
     assert len(page.map_data["markings"]) == 4
 
 
+def test_a_result_of_an_older_version_shows_what_its_drive_cannot_tell_as_one_of_today_does(result):
+    metrics = json.loads((result / "metrics.json").read_text())
+    today = document(read_facts(result, None)).findings
+    assert today["unobservable"]
+    metrics["verdict"]["untold"] = metrics["verdict"].pop("unobservable")
+    write_json(result / "metrics.json", metrics)
+    assert document(read_facts(result, None)).findings == today
+    assert "Unobservable in this drive" in write_page(result, None).read_text()
+
+
 def test_a_run_without_a_map_has_a_page_with_its_verdict(tmp_path):
     finding = {"check": "map", "status": "FAIL", "value": None, "limit": None, "unit": "",
                "says": "this drive gave no map", "about": "map"}  # fmt: skip
-    verdict = {"status": "FAIL", "findings": [finding], "untold": [], "passed": []}
+    verdict = {"status": "FAIL", "findings": [finding], "unobservable": [], "passed": []}
     write_json(tmp_path / "metrics.json", {"name": "n", "verdict": verdict, "results": {}})
     text = write_page(tmp_path, None).read_text()
     assert "this drive gave no map" in text
@@ -271,13 +281,13 @@ def test_a_picture_of_the_users_own_lies_under_the_map_where_it_belongs(result, 
     assert (west + column * cell_m[0], north - row * cell_m[1]) == pytest.approx((8.0, -3.0), abs=0.05)
 
 
-def test_a_picture_that_cannot_lie_under_the_map_is_refused_with_its_reason(result, tmp_path, monkeypatch):
+def test_a_picture_that_cannot_lie_under_the_map_is_refused_with_its_reason(result, tmp_path):
     write_tif(tmp_path / "aerial.tif", in_grid(0.0, 0.0))
     write_tif(tmp_path / "elsewhere.tif", in_grid(5000.0, 0.0))
     write_tif(tmp_path / "nowhere.tif", in_grid(0.0, 0.0), crs=None)
     (tmp_path / "none.tif").write_bytes(b"no picture")
     os.mkfifo(tmp_path / "pipe.tif")
-    write_empty(tmp_path / "huge.tif", monkeypatch, crs="EPSG:32632")
+    write_empty(tmp_path / "huge.tif", crs="EPSG:32632")
     facts = read_facts(result, None)
     placed = replace(facts, hd_map=replace(facts.hd_map, origin=HAMBURG))
     for name, of, told in (

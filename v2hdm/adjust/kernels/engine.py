@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -33,7 +31,7 @@ from v2hdm.adjust.reduced import (
 )
 from v2hdm.adjust.threads import share
 from v2hdm.adjust.tiles import find_pattern
-from v2hdm.compiled import folder_of, kernel
+from v2hdm.compiled import kernel
 from v2hdm.errors import AdjustError
 from v2hdm.records import FloatArray, IntArray
 
@@ -383,11 +381,6 @@ class NumbaLinearised(Linearised):
             corners=np.empty_like(self.base.corners),
             whitened=np.empty(self.base.corners.size),
         )
-
-
-def kept_in() -> Path | None:
-    """Where compiled kernels are kept, if anywhere."""
-    return folder_of(sys.modules[__name__])
 
 
 def _kept_tiles(

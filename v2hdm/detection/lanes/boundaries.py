@@ -12,7 +12,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from enum import Enum, auto
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,35 +24,46 @@ from v2hdm.detection.network import as_probability
 from v2hdm.records import LANE_BOUNDARY, BoolArray, FloatArray, LaneDetection
 
 _DRAWN_STEP_PX = 8.0  # rows from one point of a drawn line to the next, px
+
+# Places of the states in the chain's arrays; a dash has several, its stages.
 _ENDED, _GAP, _SOLID, _DASH = range(4)
-_DASH_STAGES = 3  # of a dash: its length is Erlang distributed, with a deviation of 58 % of the mean
+_DASH_STAGES = 3  # stages of a dash: its length is Erlang distributed, with a deviation of 58 % of the mean
+_STATES = _DASH + _DASH_STAGES  # number of states
 
-_STATES = _DASH + _DASH_STAGES
-_DASH_M = 3.6
-_GAP_M = 5.1
-"""Mean lengths of dashes and of the gaps between them, m, in the renders (train/scenes/paint)."""
+# Mean lengths of what lies on one curve; those of dashes and gaps are in the renders (train/scenes/paint),
+# the others fitted to renders.
+_DASH_M = 3.6  # mean length of a dash, m
+_GAP_M = 5.1  # mean length of the gap between two dashes, m
+_SOLID_M = 100.0  # mean length of a solid line, m
+_DASHED_M = 120.0  # mean length of a row of dashes, m
+_ENDED_M = 60.0  # mean length of bare ground between lines, m; a solid line or a row of dashes may follow it
 
-_SOLID_M = 100.0
-_DASHED_M = 120.0
-_ENDED_M = 60.0
-"""Mean lengths, m, of solid lines, of rows of dashes, and of bare ground between lines on one curve; fitted
-to renders. After bare ground, a solid line is as likely as a row of dashes."""
 
-_CROSSING_WEIGHT = 0.05
-_CROSSING_EVEN = -2.7
-_CROSSING_RANGE = (-3.0, 6.7)
-"""A crossing of log odds x, clipped to the range, adds weight * (x - even) to a line's log likelihood. The
-weight is small since rows err together. Fitted to renders, as are those of paint."""
+class _Weighing(NamedTuple):
+    """How log odds x, clipped to a range, add ``weight * (x - even)`` to a log likelihood.
 
-_PAINT_WEIGHT = 0.3
-_PAINT_EVEN = -1.0
-_PAINT_RANGE = (-4.0, 4.0)
-"""The same for paint and the log likelihoods of *solid* and *dash*."""
+    The two below are fitted to renders.
+    """
 
-_HALF_WIDTH_M = 0.06
-_LEAST_HALF_WIDTH_PX = 4.0
-_ACROSS = np.linspace(-1.0, 1.0, 7)
-"""Half width, m and at least px, and relative places across a curve at which its paint is sought."""
+    weight: float
+    even: float
+    least: float
+    most: float
+
+    def log_likelihood(self, odds: FloatArray) -> FloatArray:
+        """What log odds (...) add."""
+        return np.asarray(self.weight * (np.clip(odds, self.least, self.most) - self.even))
+
+
+_CROSSING = _Weighing(weight=0.05, even=-2.7, least=-3.0, most=6.7)
+"""Evidence of a crossing for any state of a line; the weight is small since rows err together."""
+
+_PAINT = _Weighing(weight=0.3, even=-1.0, least=-4.0, most=4.0)
+"""Evidence of paint for *solid* and *dash*."""
+
+_HALF_WIDTH_M = 0.06  # half width, m, of the strip about a curve in which its paint is sought
+_LEAST_HALF_WIDTH_PX = 4.0  # least half width of that strip, px
+_ACROSS = np.linspace(-1.0, 1.0, 7)  # places across that strip, in half widths
 
 _CROSSING_M = 0.3  # lines cross if one lies this far to the left of the other and, elsewhere, to its right
 _DOUBLE_M = 0.75  # lines nearer than this are one boundary: two strands if both show paint abreast, else one
@@ -80,36 +93,34 @@ def with_spans(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> l
     across = along[..., None] + half_px[:, None] * _ACROSS
     places_px = image.places_px(across, below[:, None])
     likelihood = np.zeros((*along.shape, _STATES))
-    crossing = _crossings(lines, points, image, below)
-    likelihood[..., _GAP:] = _evidence(crossing, _CROSSING_WEIGHT, _CROSSING_EVEN, _CROSSING_RANGE)[..., None]
+    crossing_odds = _crossings(lines, points, image, below)
+    likelihood[..., _GAP:] = _CROSSING.log_likelihood(crossing_odds)[..., None]
     if image.output is not None:
-        paint = image.output.odds_at(places_px).max(axis=2)
-        paint = _evidence(paint, _PAINT_WEIGHT, _PAINT_EVEN, _PAINT_RANGE)
-        likelihood[..., _SOLID:] += paint[..., None]
+        paint_odds = image.output.odds_at(places_px).max(axis=2)
+        likelihood[..., _SOLID:] += _PAINT.log_likelihood(paint_odds)[..., None]
     middle_px = places_px[:, :, len(_ACROSS) // 2]
     likelihood *= camera.inside(middle_px, 0)[..., None]
     states, total = _forward_backward(likelihood, step_m)
     length_m = (np.pad(step_m, [(0, 0), (0, 1)]) + np.pad(step_m, [(0, 0), (1, 0)])) / 2
     present = 1 - states[..., _ENDED]
     painted = states[..., _SOLID:].sum(axis=2)
-    each = zip(lines, present, painted, length_m, total.tolist(), strict=True)
-    return [replace(line, span=Span(below, *rest)) for line, *rest in each]
-
-
-def _evidence(odds: FloatArray, weight: float, even: float, bounds: tuple[float, float]) -> FloatArray:
-    return np.asarray(weight * (np.clip(odds, *bounds) - even))
+    spans = [
+        Span(below, present[k], painted[k], length_m[k], log_likelihood)
+        for k, log_likelihood in enumerate(total.tolist())
+    ]
+    return [replace(line, span=span) for line, span in zip(lines, spans, strict=True)]
 
 
 def _crossings(lines: Sequence[Line], points: LinePoints, image: LaneImage, below: FloatArray) -> FloatArray:
     """Log odds (N, T) of the best crossing of each line near each row; -inf without one."""
-    out = np.full((len(lines), len(below)), -np.inf)
+    best = np.full((len(lines), len(below)), -np.inf)
     for k, line in enumerate(lines):
-        own = line.members[~points.is_paint[line.members]]
-        coarse = image.camera.coarse(points.points_px[own, 1])
-        reach_px = np.where(coarse, image.row_step_px, image.row_step_px / 2)
-        near = np.abs(below[:, None] - points.below[own]) <= reach_px + 1
-        out[k] = np.where(near, points.odds[own], -np.inf).max(axis=1, initial=-np.inf)
-    return out
+        crossings = line.members[~points.is_paint[line.members]]
+        is_coarse = image.camera.coarse(points.points_px[crossings, 1])
+        reach_px = np.where(is_coarse, image.row_step_px, image.row_step_px / 2)
+        in_reach = np.abs(below[:, None] - points.below[crossings]) <= reach_px + 1
+        best[k] = np.where(in_reach, points.odds[crossings], -np.inf).max(axis=1, initial=-np.inf)
+    return best
 
 
 def _rates() -> FloatArray:
@@ -124,25 +135,40 @@ def _rates() -> FloatArray:
     return np.asarray(rates - np.diag(rates.sum(axis=1)))
 
 
+class _Modes(NamedTuple):
+    """The modes in which the states of a line go over into each other."""
+
+    values: np.ndarray  # (S,) eigenvalues of the rates, 1/m
+    right: np.ndarray  # (S, S) right eigenvectors, as columns
+    left: np.ndarray  # (S, S) left eigenvectors, as rows
+    stationary: FloatArray  # (S,) shares of the states far along
+
+    def move(self, step_m: FloatArray) -> FloatArray:
+        """Probabilities (..., S, S) of going from one state to another within ``step_m`` (...)."""
+        decay = np.exp(self.values * step_m[..., None])[..., None, :]
+        return np.asarray(np.maximum(((self.right * decay) @ self.left).real, 0.0))
+
+
 @cache
-def _modes() -> tuple[np.ndarray, np.ndarray, np.ndarray, FloatArray]:
-    """Eigenvalues (S,), right and left eigenvectors (S, S) of the rates; stationary distribution (S,)."""
+def _modes() -> _Modes:
+    """The modes of the rates."""
     values, right = np.linalg.eig(_rates())
     left = np.linalg.inv(right)
     shares = left[np.argmax(values.real)].real
-    return values, right, left, shares / shares.sum()
+    return _Modes(values, right, left, shares / shares.sum())
 
 
 def _forward_backward(likelihood: FloatArray, step_m: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Probabilities (N, T, S) of the states, and log likelihood (N,), from those of rows ``step_m`` apart."""
-    values, right, left, shares = _modes()
-    move = np.maximum(((right * np.exp(values * step_m[..., None])[..., None, :]) @ left).real, 0.0)
+    move = _modes().move(step_m)
     evidence = np.exp(likelihood)
     forward = np.empty_like(evidence)
     scale = np.empty(evidence.shape[:2])
-    state = np.broadcast_to(shares, evidence[:, 0].shape)
+    state = np.broadcast_to(_modes().stationary, evidence[:, 0].shape)
     for t in range(evidence.shape[1]):
-        state = (state if t == 0 else (state[:, None] @ move[:, t - 1])[:, 0]) * evidence[:, t]
+        if t > 0:
+            state = (state[:, None] @ move[:, t - 1])[:, 0]
+        state = state * evidence[:, t]
         scale[:, t] = state.sum(axis=1)
         state = state / scale[:, t, None]
         forward[:, t] = state
@@ -155,51 +181,59 @@ def _forward_backward(likelihood: FloatArray, step_m: FloatArray) -> tuple[Float
 
 def boundaries(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> list[Line]:
     """The lines, best first, without repetitions and crossings of better ones; double lines get a strand."""
-    kept: list[Line] = []
+    separate: list[Line] = []
     for line in lines:
-        for k, other in enumerate(kept):
+        for k, other in enumerate(separate):
             relation = _relation(line, other, points, image)
-            if relation == _DOUBLES and other.strand is None:
-                kept[k] = replace(other, strand=line)
-            if relation != _APART:
+            if relation is _Relation.SECOND_STRAND and other.strand is None:
+                separate[k] = replace(other, strand=line)
+            if relation is not _Relation.SEPARATE:
                 break
         else:
-            kept.append(line)
-    return kept
+            separate.append(line)
+    return separate
 
 
-_APART, _REPEATS, _DOUBLES = range(3)
+class _Relation(Enum):
+    """What a line is to another."""
+
+    SEPARATE = auto()
+    REPETITION = auto()  # or it crosses the other
+    SECOND_STRAND = auto()
 
 
-def _relation(line: Line, other: Line, points: LinePoints, image: LaneImage) -> int:
-    """Whether a line is apart from another, repeats or crosses it, or is its second strand."""
+def _relation(line: Line, other: Line, points: LinePoints, image: LaneImage) -> _Relation:
+    """What a line is to another, on the rows of its span."""
     assert line.span is not None
     assert other.span is not None
-    phi = image.horizon.basis(line.span.below)
-    px_per_m = image.horizon.px_per_m * line.span.below
-    sigma_m, other_sigma_m = (each.curve.sigma(phi) / px_per_m for each in (line, other))
+    below = line.span.below
+    phi = image.horizon.basis(below)
+    px_per_m = image.horizon.px_per_m * below
+    sigma_m = line.curve.sigma(phi) / px_per_m
+    other_sigma_m = other.curve.sigma(phi) / px_per_m
     offset_m = (line.curve.along(phi) - other.curve.along(phi)) / px_per_m
-    known = np.maximum(sigma_m, other_sigma_m) < _CERTAIN_SIGMA_M
-    shown, other_shown = (_shown(each, points, line.span.below) for each in (line, other))
+    is_certain = np.maximum(sigma_m, other_sigma_m) < _CERTAIN_SIGMA_M
+    shown = _shown(line, points, below)
+    other_shown = _shown(other, points, below)
     from_row = max(int(np.argmax(shown)), int(np.argmax(other_shown)))
-    crossed = offset_m[from_row:][(known & (shown | other_shown))[from_row:]]
-    if (crossed < -_CROSSING_M).any() and (crossed > _CROSSING_M).any():
-        return _REPEATS
-    there = shown & other_shown if (shown & other_shown).any() else shown
-    there = there & (other_sigma_m < _CERTAIN_SIGMA_M)
-    if not there.any() or np.abs(offset_m[there]).max() > _DOUBLE_M:
-        return _APART
+    certain_offset_m = offset_m[from_row:][(is_certain & (shown | other_shown))[from_row:]]
+    if (certain_offset_m < -_CROSSING_M).any() and (certain_offset_m > _CROSSING_M).any():
+        return _Relation.REPETITION
+    compared = shown & other_shown if (shown & other_shown).any() else shown
+    compared = compared & (other_sigma_m < _CERTAIN_SIGMA_M)
+    if not compared.any() or np.abs(offset_m[compared]).max() > _DOUBLE_M:
+        return _Relation.SEPARATE
     abreast_m = float((line.span.length_m * line.span.painted) @ other.span.painted)
     abreast_m = min(abreast_m, line.paint_m, other.paint_m)
-    is_double = abreast_m >= _LEAST_ABREAST_M and abs(np.median(offset_m[there])) > _ONE_LINE_M
-    return _DOUBLES if is_double else _REPEATS
+    is_double = abreast_m >= _LEAST_ABREAST_M and abs(np.median(offset_m[compared])) > _ONE_LINE_M
+    return _Relation.SECOND_STRAND if is_double else _Relation.REPETITION
 
 
 def _shown(line: Line, points: LinePoints, below: FloatArray) -> BoolArray:
     """Flags (T,) of the rows between the nearest and the farthest point of a line; at least one."""
-    own = points.below[line.members]
+    points_below = points.below[line.members]
     rows = np.arange(len(below))
-    first, last = np.searchsorted(below, (own.min(), own.max()))
+    first, last = np.searchsorted(below, (points_below.min(), points_below.max()))
     return np.asarray((rows >= min(first, len(below) - 1)) & (rows <= last), dtype=np.bool_)
 
 
@@ -211,37 +245,38 @@ def draw(line: Line, points: LinePoints, image: LaneImage) -> LaneDetection | No
     present = line.span.present
     along, sigma = _followed(points, line, image, below)
     if line.strand is not None and line.strand.span is not None:
-        other = line.strand.span.present
-        beside, beside_sigma = _followed(points, line.strand, image, below)
-        share = other / np.maximum(present + other, 1e-9)
-        along = along + share * (beside - along)
-        sigma = sigma + share * (beside_sigma - sigma)
-        present = np.maximum(present, other)
+        strand_present = line.strand.span.present
+        strand_along, strand_sigma = _followed(points, line.strand, image, below)
+        share = strand_present / np.maximum(present + strand_present, 1e-9)
+        along = along + share * (strand_along - along)
+        sigma = sigma + share * (strand_sigma - sigma)
+        present = np.maximum(present, strand_present)
     rows = np.arange(len(below))
     drawn = np.flatnonzero(present > _EVEN)
     if not len(drawn):
         return None
     points_px = camera.distort(image.horizon.pinhole_px(along, below))
-    own = points.below[line.members]
-    kept = (rows >= drawn[0]) & (rows <= drawn[-1]) & camera.inside(points_px, -_DRAWN_STEP_PX)
-    kept &= (sigma < _EXTENSION_SIGMA * camera.info.width) | ((below >= own.min()) & (below <= own.max()))
-    if kept.sum() < 2:
+    points_below = points.below[line.members]
+    between = (below >= points_below.min()) & (below <= points_below.max())
+    shown = (rows >= drawn[0]) & (rows <= drawn[-1]) & camera.inside(points_px, -_DRAWN_STEP_PX)
+    shown &= (sigma < _EXTENSION_SIGMA * camera.info.width) | between
+    if shown.sum() < 2:
         return None
     score = float(as_probability(np.array(line.log_odds)))
-    return LaneDetection(LANE_BOUNDARY, score, points_px[kept][::-1], sigma_px=sigma[kept][::-1])
+    return LaneDetection(LANE_BOUNDARY, score, points_px[shown][::-1], sigma_px=sigma[shown][::-1])
 
 
 def _followed(
-    points: LinePoints, line: Line, image: LaneImage, at: FloatArray
+    points: LinePoints, line: Line, image: LaneImage, below: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Position of a line along the horizon and its sigma (N,), px, ``at`` (N,) px below it."""
-    phi = image.horizon.basis(at)
+    """Position of a line along the horizon and its sigma (N,), px, so far ``below`` (N,) it, px."""
+    phi = image.horizon.basis(below)
     curve_sigma = line.curve.sigma(phi)
     along = line.curve.along(phi)
     members = line.members
     off = points.along[members] - line.curve.along(points.phi[members])
-    near = np.maximum(1 - np.abs(at[:, None] - points.below[members]) / _SMOOTH_PX, 0)
-    weight = near / (NEIGHBOURS * points.sigma_px[members] ** 2)
-    own = 1 / (curve_sigma**2 + (_FREEDOM_M * image.horizon.px_per_m * at) ** 2)
-    total = weight.sum(axis=1) + own
+    window = np.maximum(1 - np.abs(below[:, None] - points.below[members]) / _SMOOTH_PX, 0)
+    weight = window / (NEIGHBOURS * points.sigma_px[members] ** 2)
+    curve_weight = 1 / (curve_sigma**2 + (_FREEDOM_M * image.horizon.px_per_m * below) ** 2)
+    total = weight.sum(axis=1) + curve_weight
     return along + weight @ off / total, np.sqrt(1 / total)

@@ -8,12 +8,15 @@ import numpy as np
 
 from v2hdm.records import FloatArray, IntArray
 
-_MIN_CHAIN = 3  # crossings
+_MIN_CHAIN = 3  # least number of crossings of a chain
 _CHAIN_ODDS = 0.0  # least log odds of a chain's crossings
-_MAX_GAP_PX = 40.0  # rows between crossings of a chain
+_MAX_GAP_PX = 40.0  # most rows between crossings of a chain
 _SLOPE_POINTS = 6  # last points of a chain that give its direction
-_MAX_SLOPE = 4.5  # columns per row from a chain's first crossing to its second
-_GATE_PX = 12.0  # distance of a crossing from a chain's continuation
+_MAX_SLOPE = 4.5  # most columns per row from a chain's first crossing to its second
+_GATE_PX = 12.0  # largest distance of a crossing from a chain's continuation, px, one row anchor farther
+_YOUNG = 1.5  # factor on that distance for a chain of fewer points than give its direction
+_WIDENING = 0.04  # share by which that distance grows with each further row
+_ROW_STEP_PX = 8  # rows between neighbouring row anchors in full resolution
 
 
 @dataclass
@@ -37,8 +40,9 @@ class _Chain:
         ahead = self.v_px[-1] - v_px
         if self.slope is None:
             return self.u_px[-1], _MAX_SLOPE * ahead
-        young = 1.5 if len(self.v_px) < _SLOPE_POINTS else 1.0
-        return self.u_px[-1] + self.slope * ahead, _GATE_PX * young * (1 + 0.04 * (ahead - 8))
+        young = _YOUNG if len(self.v_px) < _SLOPE_POINTS else 1.0
+        gate_px = _GATE_PX * young * (1 + _WIDENING * (ahead - _ROW_STEP_PX))
+        return self.u_px[-1] + self.slope * ahead, gate_px
 
 
 def find_chains(points_px: FloatArray, odds: FloatArray) -> list[IntArray]:
@@ -66,11 +70,11 @@ def _extend(chains: list[_Chain], row_px: float, columns: list[float], indices: 
     for c, chain in enumerate(chains):
         expected, gate = chain.expected(row_px)
         pairs += [(off / gate, c, p) for p, u in enumerate(columns) if (off := abs(u - expected)) <= gate]
-    taken: set[int] = set()
+    linked: set[int] = set()
     extended: set[int] = set()
     for _, c, p in sorted(pairs):
-        if c not in extended and p not in taken:
+        if c not in extended and p not in linked:
             chains[c].add(row_px, columns[p], indices[p])
             extended.add(c)
-            taken.add(p)
-    return [_Chain([row_px], [columns[p]], [indices[p]]) for p in range(len(columns)) if p not in taken]
+            linked.add(p)
+    return [_Chain([row_px], [columns[p]], [indices[p]]) for p in range(len(columns)) if p not in linked]

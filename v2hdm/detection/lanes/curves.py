@@ -49,7 +49,7 @@ class LaneImage:
         """Recorded px (..., 2) of places along and below the horizon, px, which broadcast."""
         rows = np.broadcast_to(below, along.shape)
         pinhole_px = self.horizon.pinhole_px(along.ravel(), rows.ravel())
-        return self.camera.distort(pinhole_px).reshape(*along.shape, 2)
+        return self.camera.distort(pinhole_px).reshape((*along.shape, 2))
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,8 @@ class Prior:
     @classmethod
     def several(cls, priors: Sequence[Prior]) -> Prior:
         """P priors at once."""
-        mean, information = (np.array([getattr(p, name) for p in priors]) for name in ("mean", "information"))
+        mean = np.array([prior.mean for prior in priors])
+        information = np.array([prior.information for prior in priors])
         return cls(mean[:, None], information[:, None])
 
     @cached_property
@@ -115,7 +116,7 @@ class Evidence:
         covariance = np.linalg.inv(self.information + information)
         moment = self.moment + (information @ expected[..., None])[..., 0]
         mean = (covariance @ moment[..., None])[..., 0] + (centre_px, 0.0, 0.0)
-        return [Curve(*curve) for curve in zip(mean, covariance, strict=True)]
+        return [Curve(mean[k], covariance[k]) for k in range(len(mean))]
 
 
 @dataclass(frozen=True)
@@ -180,9 +181,9 @@ class LinePoints:
         names = vars(parts[0])
         return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
-    def where(self, kept: BoolArray) -> LinePoints:
-        """The points that are ``kept`` (N,)."""
-        return LinePoints(**{name: value[kept] for name, value in vars(self).items()})
+    def where(self, is_chosen: BoolArray) -> LinePoints:
+        """Some of the points, by a mask (N,)."""
+        return LinePoints(**{name: value[is_chosen] for name, value in vars(self).items()})
 
     def slopes(self, groups: list[IntArray]) -> FloatArray:
         """Px along the horizon per px down (N,) of groups of points, roughly one line each."""
@@ -234,16 +235,19 @@ _FREE_SIGMAS = (0.5, 8.0, 0.008)
 """Sigmas of a free line: direction about the camera's, rad, offset from it, m, and curvature, 1/m."""
 
 _PARALLEL_SIGMAS = (0.012, 0.0, 0.001)
-"""Sigmas of one road's lines about each other: direction, rad, and curvature, 1/m. An error of half a degree
-in the camera's pitch turns lines 2 m to the side of a low camera as much."""
+"""Sigmas of one road's lines about each other: direction, rad, offset, m, and curvature, 1/m.
+
+An error of half a degree in the camera's pitch turns lines 2 m to the side of a low camera as much.
+"""
 
 _SHARE = 0.85  # fraction of lines along the road; kerbs and strokes of letters need not be
-_FREE_KEPT = np.diag([0.04, 0.04, 1.0])
-_ALONG_KEPT = np.array([[1.0, 0.0, 1.0], [0.0, 0.04, 0.0], [1.0, 0.0, 1.0]])
-"""Factors on a prior's information when a line is drawn: it tells which points are one line, not where."""
+
+# Factors on a prior's information when a line is drawn: it tells which points are one line, not where.
+_FREE_FACTORS = np.diag([0.04, 0.04, 1.0])  # of a free line
+_ALONG_FACTORS = np.array([[1.0, 0.0, 1.0], [0.0, 0.04, 0.0], [1.0, 0.0, 1.0]])  # of a line along the road
 
 _CANDIDATES = 4  # best known groups that are tried as the road's direction
-_SHARED = [0, 2]
+_SHARED = [0, 2]  # places of a and c, which lines along one road share, among a line's parameters
 _SHARED_BLOCK = np.ix_(_SHARED, _SHARED)
 
 
@@ -268,17 +272,18 @@ class Road:
 
     def drawn_by(self, log_ratio: float) -> Prior:
         """The prior under which to draw a line with this log likelihood ratio of :meth:`weigh`."""
-        keeps = log_ratio + np.log(_SHARE) > np.log1p(-_SHARE)
-        prior, kept = (self.along, _ALONG_KEPT) if keeps else (self.free, _FREE_KEPT)
-        return Prior(prior.mean, prior.information * kept)
+        is_along = log_ratio + np.log(_SHARE) > np.log1p(-_SHARE)
+        prior = self.along if is_along else self.free
+        factors = _ALONG_FACTORS if is_along else _FREE_FACTORS
+        return Prior(prior.mean, prior.information * factors)
 
 
 def find_road(evidence: Evidence, horizon: Horizon) -> Road:
     """The road on which most of N groups of points, roughly one line each, agree."""
-    free = Prior(np.zeros(3), np.diag(horizon.parameters(*_FREE_SIGMAS) ** -2.0))
+    free = Prior(np.zeros(3), np.diag(horizon.parameters(_FREE_SIGMAS) ** -2.0))
     covariance = np.linalg.inv(evidence.information + free.information)
     mean = np.einsum("nij,nj->ni", covariance, evidence.moment)[:, _SHARED]
-    spread = np.diag(horizon.parameters(*_PARALLEL_SIGMAS)[_SHARED] ** 2)
+    spread = np.diag(horizon.parameters(_PARALLEL_SIGMAS)[_SHARED] ** 2)
     # Covariance of the road about each line.
     doubt = covariance[:, [[0], [2]], _SHARED] + spread
     certain = np.argsort((np.diagonal(doubt, axis1=1, axis2=2) / np.diag(spread)).sum(axis=1))[:_CANDIDATES]
@@ -289,9 +294,10 @@ def find_road(evidence: Evidence, horizon: Horizon) -> Road:
     best = gains[agreement.argmax()]
     # The mean over all lines, each weighted by its probability of running along the road.
     weight = 1 / (1 + (1 - _SHARE) / _SHARE * np.exp(-np.clip(best, -50, 50)))
-    each = np.linalg.inv(doubt) * weight[:, None, None]
-    shared = np.linalg.inv(each.sum(axis=0) + free.information[_SHARED_BLOCK])
-    return Road(_along(shared @ np.einsum("nij,nj->i", each, mean), shared + spread, free), free)
+    weighted = np.linalg.inv(doubt) * weight[:, None, None]
+    shared = np.linalg.inv(weighted.sum(axis=0) + free.information[_SHARED_BLOCK])
+    along_prior = _along(shared @ np.einsum("nij,nj->i", weighted, mean), shared + spread, free)
+    return Road(along_prior, free)
 
 
 def _along(shared: FloatArray, covariance: FloatArray, free: Prior) -> Prior:
@@ -314,10 +320,11 @@ def find_lines(points: LinePoints, groups: list[IntArray], image: LaneImage) -> 
     priors = [road.drawn_by(log_ratio) for log_ratio in along]
     curves = evidence.curves(priors, horizon.centre_px)
     paint_m = [image.paint_step_m * float(points.is_paint[group].sum()) for group in groups]
-    return [Line(*parts) for parts in zip(curves, groups, paint_m, along, strict=True)]
+    return [Line(curves[k], groups[k], paint_m[k], along[k]) for k in range(len(groups))]
 
 
 def _join(evidence: Evidence, groups: list[IntArray], road: Road) -> list[IntArray]:
+    """The groups of points, those joined that are more likely one line than two."""
     groups = list(groups)
     alone = road.weigh(evidence)[0]
     count = len(groups)

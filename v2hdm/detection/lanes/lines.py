@@ -20,11 +20,12 @@ from v2hdm.detection.lanes.chains import find_chains
 from v2hdm.detection.lanes.curves import LaneImage, Line, LinePoints, find_lines
 from v2hdm.detection.lanes.score import log_odds, log_odds_alone
 from v2hdm.detection.network import crossings
-from v2hdm.detection.quads.propose import Blob, Proposal
+from v2hdm.detection.quads.blobs import Blob
+from v2hdm.detection.quads.propose import Proposal
 from v2hdm.records import FloatArray, IntArray, LaneDetection
 
 _CAP_WIDTH_RATIO = 0.7  # cuts whose width differs more from the median are through slanted ends
-_MIN_POINTS = 2
+_MIN_POINTS = 2  # least number of points of a centre line
 _ROWS_MIN_ASPECT = 0.35  # height over width from which a blob is cut by rows
 
 
@@ -63,7 +64,8 @@ def _branches(blob: Blob) -> list[FloatArray]:
     """Edge points (n, 2, 2), recorded px, of the cuts of each branch of a blob."""
     height, width = blob.level.shape
     by_rows = height >= _ROWS_MIN_ASPECT * width
-    level, order = (blob.level, [1, 0]) if by_rows else (blob.level.T, [0, 1])
+    level = blob.level if by_rows else blob.level.T
+    order = [1, 0] if by_rows else [0, 1]
     i, j = np.nonzero((level[:, :-1] > 0) != (level[:, 1:] > 0))
     crossing = j + level[i, j] / (level[i, j] - level[i, j + 1])
     runs = np.column_stack([i[::2], crossing[::2], crossing[1::2]]).astype(np.float64)
@@ -87,18 +89,18 @@ def _chains(runs: FloatArray) -> list[FloatArray]:
     closed: list[list[list[float]]] = []
     for _, cut in groupby(runs.tolist(), key=itemgetter(0)):
         following: list[list[list[float]]] = []
-        taken = set()
+        extended = set()
         for run in cut:
             _, begin, end = run
             meets = (chain[-1][1] < end and begin < chain[-1][2] for chain in open_chains)
-            match = next((c for c, met in enumerate(meets) if met and c not in taken), None)
+            match = next((c for c, met in enumerate(meets) if met and c not in extended), None)
             if match is None:
                 following.append([run])
             else:
-                taken.add(match)
+                extended.add(match)
                 open_chains[match].append(run)
                 following.append(open_chains[match])
-        closed += [chain for c, chain in enumerate(open_chains) if c not in taken]
+        closed += [chain for c, chain in enumerate(open_chains) if c not in extended]
         open_chains = following
     return [np.array(chain) for chain in closed + open_chains if len(chain) >= _MIN_POINTS]
 
@@ -138,9 +140,10 @@ _DOUBTFUL = 1.5  # log odds that a line may gain among the others
 _SIGMA_PX = (0.4, 2.7)
 """Crossings have the sigma s + t / exp(log odds), px of the resolution in use; measured on renders."""
 
-_PAINT_SIGMA_PX = 1.0  # of points of paint
-_LEAST_PAINT_LENGTH_M = 0.8  # of paint that shows a direction
+_PAINT_SIGMA_PX = 1.0  # standard deviation of points of paint, px
+_LEAST_PAINT_LENGTH_M = 0.8  # least length, m, of paint that shows a direction
 _MAX_PAINT_SLOPE = 8.0  # px along the horizon per px down: flatter paint runs across the view
+_LEAST_EXTENT_M = 0.5  # least extent ahead, m, of a line's near half that is extrapolated to the vehicle
 
 
 def find_boundaries(image: LaneImage) -> list[LaneDetection]:
@@ -172,6 +175,7 @@ def _surest(lines: Sequence[Line], odds: FloatArray, least_log_odds: float) -> l
 
 
 def _crossing_points(image: LaneImage) -> LinePoints:
+    """The crossings of an image's row anchors."""
     points_px, odds = crossings(image.rows)
     scale = np.where(image.camera.coarse(points_px[:, 1]), 2.0, 1.0)
     return LinePoints.of(image, points_px, odds, scale * crossing_sigma_px(odds), paint=False)
@@ -202,8 +206,11 @@ def _along_the_view(image: LaneImage) -> list[LaneDetection]:
     if not image.paint:
         return []
     ends_px = image.camera.undistort(np.concatenate([lane.points_px[[0, -1]] for lane in image.paint]))
-    length_m = np.linalg.norm(np.diff(image.camera.ground(ends_px).reshape(-1, 2, 2), axis=1)[:, 0], axis=1)
-    along, below = (np.abs(np.diff(at.reshape(-1, 2)))[:, 0] for at in image.horizon.coordinates(ends_px))
+    ends_vehicle = image.camera.ground(ends_px).reshape(-1, 2, 2)
+    length_m = np.linalg.norm(ends_vehicle[:, 1] - ends_vehicle[:, 0], axis=1)
+    along, below = (
+        np.abs(np.diff(coordinate.reshape(-1, 2)))[:, 0] for coordinate in image.horizon.coordinates(ends_px)
+    )
     # False where the length is nan.
     usable = (length_m >= _LEAST_PAINT_LENGTH_M) & (along <= _MAX_PAINT_SLOPE * below)
     return [lane for lane, use in zip(image.paint, usable, strict=True) if use]
@@ -216,21 +223,23 @@ def _identified(lanes: list[LaneDetection], camera: RoadCamera) -> list[LaneDete
     ground = _at_once(camera.unproject, [lane.points_px for lane in lanes])
     beside_m = np.array([_lateral_m(part, camera) for part in ground])
     order = np.argsort(beside_m).tolist()
-    identity = {k: n for n, k in enumerate((k for k in order if beside_m[k] >= 0), start=1)}
-    identity |= {k: -n for n, k in enumerate((k for k in order[::-1] if beside_m[k] < 0), start=1)}
+    to_the_left = [k for k in order if beside_m[k] >= 0]
+    to_the_right = [k for k in reversed(order) if beside_m[k] < 0]
+    identity = {k: n for n, k in enumerate(to_the_left, start=1)}
+    identity |= {k: -n for n, k in enumerate(to_the_right, start=1)}
     return [replace(lane, identity=identity.get(k)) for k, lane in enumerate(lanes)]
 
 
 def _lateral_m(ground: FloatArray, camera: RoadCamera) -> float:
     """Offset, m, of a line (N, 2) to the vehicle's left, extrapolated from its near half; nan if unknown."""
     ground = ground[np.isfinite(ground).all(axis=1)]
-    near = ground[: max(2, len(ground) // 2)]
-    if len(near) < 2:
+    near_half = ground[: max(2, len(ground) // 2)]
+    if len(near_half) < 2:
         return float("nan")
-    along = near[:, 0] - camera.foot_vehicle[0]
-    if np.ptp(along) < 0.5:
-        return float(near[0, 1])
-    apart = along - along.mean()
-    slope = float(apart @ near[:, 1] / (apart @ apart))
-    beside = float(near[:, 1].mean()) - slope * float(along.mean())
-    return float(beside if abs(slope) < 1 else near[0, 1])
+    along = near_half[:, 0] - camera.foot_vehicle[0]
+    if np.ptp(along) < _LEAST_EXTENT_M:
+        return float(near_half[0, 1])
+    from_mean = along - along.mean()
+    slope = float(from_mean @ near_half[:, 1] / (from_mean @ from_mean))
+    beside = float(near_half[:, 1].mean()) - slope * float(along.mean())
+    return float(beside if abs(slope) < 1 else near_half[0, 1])

@@ -40,15 +40,21 @@ _NO_PAINT = -3.0  # log odds of the best paint of a line without any
 _BEST = 3  # crossings whose log odds are averaged
 _MOST_LOG_RATIO = 6.0  # largest size of the log ratio along the road
 _UNKNOWN = (2.3, 0.4)  # features of the paint along a line without network output: true lines' medians
-_PLACES = 24  # along a line at which its paint is sampled
-_ON_M = np.linspace(-0.25, 0.25, 7)  # across it: paint, also of double lines, lies within
-_LEAST_WEIGHT = 0.05  # of places without paint, that of paint being one
-_LANE_M = 3.2
-_LANE_SIGMA_M = 0.65  # lanes of roads are 2.5 to 4 m wide
-_TOO_NEAR_M = 1.8  # lines nearer than this do not bound one lane
-_MOST_NEAR = 2.0  # more lines than this add nothing
-_CHANGE_M = 0.15
-_CHANGE_SHARE = 0.06  # sigma of the distance of parallel lines, m, and relative to it
+_LEAST_M = 0.1  # length, m, added to a line's before its logarithm
+_LEAST_PX_SHARE = 0.005  # length, in image widths, added to a line's before its logarithm
+
+_PLACES = 24  # places along a line at which its paint is sampled
+_ON_M = np.linspace(
+    -0.25, 0.25, 7
+)  # offsets across a line, m, within which paint, also of double lines, lies
+_LEAST_WEIGHT = 0.05  # weight of places without paint, that of paint being one
+
+_LANE_M = 3.2  # mean width of lanes, m
+_LANE_SIGMA_M = 0.65  # standard deviation of the width of lanes, m: those of roads are 2.5 to 4 m wide
+_TOO_NEAR_M = 1.8  # distance, m, below which lines do not bound one lane
+_MOST_NEAR = 2.0  # number of lines that are too near from which more add nothing
+_CHANGE_M = 0.15  # standard deviation of the change of the distance between parallel lines, m
+_CHANGE_SHARE = 0.06  # standard deviation of that change besides, in parts of the distance
 
 
 def log_odds_alone(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> FloatArray:
@@ -72,17 +78,18 @@ def features_among(lines: Sequence[Line], points: LinePoints, image: LaneImage) 
     return np.column_stack([[line.log_odds for line in lines], far, spans, _company(points, lines, image)])
 
 
-def _span_features(line: Line, points: LinePoints) -> tuple[float, float, float, float]:
+def _span_features(line: Line, points: LinePoints) -> list[float]:
+    """The features (4,) of a line's span, in the order of :data:`_SPAN`."""
     span = line.span
-    own = points.below[line.members]
+    points_below = points.below[line.members]
     assert span is not None
-    between = (span.below >= own.min()) & (span.below <= own.max())
-    return (
+    between = (span.below >= points_below.min()) & (span.below <= points_below.max())
+    return [
         float(np.sqrt(max(span.log_likelihood, 0.0))),
         float(span.length_m @ span.present),
         float(span.length_m[between] @ span.painted[between]),
         float(span.painted[between].sum() / max(between.sum(), 1)),
-    )
+    ]
 
 
 def features_alone(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> FloatArray:
@@ -94,19 +101,18 @@ def features_alone(lines: Sequence[Line], points: LinePoints, image: LaneImage) 
     begins = np.cumsum(count) - count
     is_paint = points.is_paint[members]
     odds = points.odds[members]
-    at_px = points.points_px[members]
+    points_px = points.points_px[members]
     ground = points.ground[members]
     size_m = np.maximum.reduceat(ground, begins) - np.minimum.reduceat(ground, begins)
-    size = np.maximum.reduceat(at_px, begins) - np.minimum.reduceat(at_px, begins)
-    size = size / image.camera.info.width
-    length_m = np.hypot(*size_m.T)
+    size_px = np.maximum.reduceat(points_px, begins) - np.minimum.reduceat(points_px, begins)
+    size = size_px / image.camera.info.width
     paint_odds = np.maximum.reduceat(np.where(is_paint, odds, -np.inf), begins)
     ratio = np.array([line.log_ratio for line in lines])
     columns = (
         _best_crossings(np.where(is_paint, -np.inf, odds), begins, count),
-        np.log(length_m + 0.1),
-        np.log(np.hypot(*size.T) + 0.005),
-        np.log(size[:, 1] + 0.005),
+        np.log(np.hypot(size_m[:, 0], size_m[:, 1]) + _LEAST_M),
+        np.log(np.hypot(size[:, 0], size[:, 1]) + _LEAST_PX_SHARE),
+        np.log(size[:, 1] + _LEAST_PX_SHARE),
         np.clip(ratio, -_MOST_LOG_RATIO, _MOST_LOG_RATIO),
         np.where(np.isfinite(paint_odds), paint_odds, _NO_PAINT),
         _paint_along(lines, points, image),
@@ -119,8 +125,8 @@ def _best_crossings(odds: FloatArray, begins: IntArray, count: IntArray) -> Floa
     order = np.lexsort((-odds, np.repeat(np.arange(len(count)), count)))
     first = begins[:, None] + np.minimum(np.arange(_BEST), count[:, None] - 1)
     best = odds[order[first]]
-    there = np.isfinite(best) & (np.arange(_BEST) < count[:, None])
-    return np.asarray(np.where(there, best, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1))
+    is_crossing = np.isfinite(best) & (np.arange(_BEST) < count[:, None])
+    return np.asarray(np.where(is_crossing, best, 0.0).sum(axis=1) / np.maximum(is_crossing.sum(axis=1), 1))
 
 
 def _paint_along(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> FloatArray:
@@ -129,8 +135,10 @@ def _paint_along(lines: Sequence[Line], points: LinePoints, image: LaneImage) ->
     horizon = image.horizon
     if output is None:
         return np.tile(_UNKNOWN, (len(lines), 1))
-    own = [points.below[line.members] for line in lines]
-    below = np.linspace([b.min() for b in own], [b.max() for b in own], _PLACES, axis=1)
+    members_below = [points.below[line.members] for line in lines]
+    farthest = [below.min() for below in members_below]
+    nearest = [below.max() for below in members_below]
+    below = np.linspace(farthest, nearest, _PLACES, axis=1)
     phi = horizon.basis(below.ravel()).reshape(len(lines), _PLACES, 3)
     along = np.einsum("npk,nk->np", phi, np.array([line.curve.parameters for line in lines]))
     across = along[..., None] + horizon.px_per_m * below[..., None] * _ON_M
@@ -145,17 +153,17 @@ def _company(points: LinePoints, lines: Sequence[Line], image: LaneImage) -> Flo
     """Weight of the best other line a lane away, and weighted number of lines too near (N, 2)."""
     if len(lines) < 2:
         return np.zeros((len(lines), 2))
-    apart = _apart_m(points, lines, image)
-    gap = np.abs(apart[1])
-    change = np.ptp(apart, axis=0) / (_CHANGE_M + _CHANGE_SHARE * gap)
+    distance_m = _distances_m(points, lines, image)
+    gap = np.abs(distance_m[1])
+    change = np.ptp(distance_m, axis=0) / (_CHANGE_M + _CHANGE_SHARE * gap)
     beside = as_probability(np.array([line.log_odds for line in lines])) * np.exp(-0.5 * change**2)
     np.fill_diagonal(beside, 0.0)
-    lane = beside * np.exp(-0.5 * ((gap - _LANE_M) / _LANE_SIGMA_M) ** 2)
-    near = np.where(gap < _TOO_NEAR_M, beside, 0.0).sum(axis=1)
-    return np.column_stack([lane.max(axis=1), np.minimum(near, _MOST_NEAR)])
+    a_lane_away = beside * np.exp(-0.5 * ((gap - _LANE_M) / _LANE_SIGMA_M) ** 2)
+    too_near = np.where(gap < _TOO_NEAR_M, beside, 0.0).sum(axis=1)
+    return np.column_stack([a_lane_away.max(axis=1), np.minimum(too_near, _MOST_NEAR)])
 
 
-def _apart_m(points: LinePoints, lines: Sequence[Line], image: LaneImage) -> FloatArray:
+def _distances_m(points: LinePoints, lines: Sequence[Line], image: LaneImage) -> FloatArray:
     """Distances (3, N, N), m, of lines along the horizon at the far end, middle and near end of each."""
     parameters = np.array([line.curve.parameters for line in lines])
     spans = np.array([np.ptp(points.below[line.members]) for line in lines])

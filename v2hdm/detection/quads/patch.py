@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -17,7 +18,8 @@ _GREY_WEIGHTS_BGR = (0.114, 0.587, 0.299)  # weights of ITU-R BT.601
 _CLIPPED = 250  # codes from here on are those of a sensor at its limit, noise and white balance allowed for
 _DARK = 0.01  # added to radiance before logarithms: in shade a step is as large as in the sun, noise is not
 
-_CODED = np.arange(256) / 255
+_CODED = np.arange(256) / 255  # grey values (256,) of the codes of 8 bits, 0 to 1
+
 _LINEAR_FROM_SRGB = np.where(_CODED <= 0.04045, _CODED / 12.92, ((_CODED + 0.055) / 1.055) ** 2.4)
 """Radiance of sRGB codes (IEC 61966-2-1).
 
@@ -49,12 +51,20 @@ def log_light(values: np.ndarray) -> np.ndarray:
     return np.asarray(np.log(np.maximum(values, 0) + np.float32(_DARK)))
 
 
+class Looked(NamedTuple):
+    """What an image shows at n pixels; of the pixels of a lattice n is (M, N)."""
+
+    light: np.ndarray  # (3, n) float32 logarithms of grey, red and blue
+    use: np.ndarray  # (n,) which take part
+    clipped: np.ndarray  # (n,) which of those are at the sensor's limit
+
+
 class Patches:
     """The pixels of an image (H, W, 3) uint8 about M markings.
 
     Fit and classifier look at these alone. ``owner`` (h, w) is 1 + the index of the piece of paint that each
-    element of the output's paint is of, and ``own`` (M, 2) the first and last piece of each marking: pixels
-    of others take no part.
+    element of the output's paint is of, and ``pieces`` (M, 2) the first and last piece of each marking:
+    pixels of others take no part.
     """
 
     def __init__(
@@ -63,33 +73,31 @@ class Patches:
         camera: RoadCamera,
         output: NetworkOutput,
         owner: np.ndarray,
-        own: np.ndarray,
+        pieces: np.ndarray,
     ):
         self.output = output
         self._last_px = np.array([image_bgr.shape[1] - 1, image_bgr.shape[0] - 1])
         self._image = np.ascontiguousarray(image_bgr)
         self._owner = owner
-        self._own = own
+        self._pieces = pieces
         self._linear_response = camera.camera.linear_response
 
-    def look(
-        self, u: np.ndarray, v: np.ndarray, marking: np.ndarray
-    ) -> tuple[np.ndarray, BoolArray, BoolArray]:
-        """Log grey, red and blue (3, n) of pixels of markings (n,), which take part, which are clipped."""
+    def look(self, u: np.ndarray, v: np.ndarray, marking: np.ndarray) -> Looked:
+        """What columns ``u`` and rows ``v`` (n,) show of the ``marking`` (n,) that each is looked at for."""
         last_u, last_v = self._last_px.tolist()
         use = (u >= 0) & (u <= last_u) & (v >= 0) & (v <= last_v)
         u = np.clip(u, 0, last_u)
         v = np.clip(v, 0, last_v)
         coded = self._image.reshape(-1, 3).take(v * (last_u + 1) + u, axis=0)
-        (rows, columns) = self._owner.shape
+        rows, columns = self._owner.shape
         stride = self.output.stride
         row = np.clip((v - self.output.top) // stride, 0, rows - 1)
         owner = self._owner.take(row * columns + np.minimum(u // stride, columns - 1))
-        first, last = self._own.take(marking, axis=0).T
+        first, last = self._pieces.take(marking, axis=0).T
         use &= (owner == 0) | ((owner >= first + 1) & (owner <= last + 1))
         radiance, logs = (_look_up(coded, table) for table in _light_tables(self._linear_response))
         light = np.stack([log_light(grey_of(radiance)), logs[:, 2], logs[:, 0]])
-        return light, use, use & (coded >= _CLIPPED).any(axis=1)
+        return Looked(light, use, use & (coded >= _CLIPPED).any(axis=1))
 
     def light_at(self, points_px: FloatArray) -> np.ndarray:
         """Radiance (..., 3), BGR, at points (..., 2), interpolated."""

@@ -22,6 +22,7 @@ from v2hdm.records import DISTORTION_COEFFICIENTS, BoolArray, Calibration, Camer
 from v2hdm.safe.fields import check_camera, recorded_distance, take_covariance, take_size_px
 from v2hdm.safe.texts import take_camera_name
 from v2hdm.store.files import check_keys, load_yaml, take_array, take_mapping, take_text
+from v2hdm.store.names import CALIBRATIONS
 
 _SIZE = ("image_width", "image_height")
 _INFO = ("camera_name", *_SIZE, "camera_matrix", "distortion_model", "distortion_coefficients")
@@ -85,9 +86,9 @@ def read_provenance(path: Path) -> Provenance:
 
 def trusted_calibrations(path: Path) -> dict[str, Calibration]:
     """The calibrations in a result folder, or of a file, by camera; MapFileError where none, or FAIL."""
-    files = sorted(path.glob("calibration_*.yaml")) if path.is_dir() else [path]
+    files = sorted(path.glob(CALIBRATIONS)) if path.is_dir() else [path]
     if not files:
-        raise MapFileError(f"{path}: has no calibration_*.yaml; give a result of map or calibrate ground")
+        raise MapFileError(f"{path}: has no {CALIBRATIONS}; give a result of map or calibrate ground")
     found = {}
     for file in files:
         calibration = read_calibration(file)

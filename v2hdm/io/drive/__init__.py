@@ -9,14 +9,12 @@ from typing import Any
 
 from v2hdm.errors import DriveError, MapFileError
 from v2hdm.geometry.rigid import with_clock_offsets
-from v2hdm.io.drive.folder import DRIVE_FILE, is_folder_drive, name_of, read_description, read_folder_drive
+from v2hdm.io.description import DRIVE_FILE, is_folder_drive, name_of
 from v2hdm.io.drive.images import KittiOptions, ReadOptions, part_of
 from v2hdm.io.drive.join import join_drives
-from v2hdm.io.drive.kitti import is_kitti_drive, read_kitti_drive
-from v2hdm.io.importers.bag.describe import describe_bag
-from v2hdm.io.importers.bag.reading import is_bag
 from v2hdm.records import Drive, Trajectory
 from v2hdm.store.files import load_json, load_yaml
+from v2hdm.store.names import METRICS
 
 __all__ = [
     "READERS", "KittiOptions", "ReadOptions", "Trajectory", "drive_name", "join_drives",
@@ -24,15 +22,45 @@ __all__ = [
 ]  # fmt: skip
 
 
+# Each of these loads what reads its format, when a drive of it is looked at.
+
+
+def _read_folder(path: Path, options: ReadOptions) -> Drive:
+    from v2hdm.io.drive.folder import read_folder_drive
+
+    return read_folder_drive(path, options)
+
+
+def _is_kitti(path: Path) -> bool:
+    from v2hdm.io.drive.kitti import is_kitti_drive
+
+    return is_kitti_drive(path)
+
+
+def _read_kitti(path: Path, options: ReadOptions) -> Drive:
+    from v2hdm.io.drive.kitti import read_kitti_drive
+
+    return read_kitti_drive(path, options)
+
+
+def _is_bag(path: Path) -> bool:
+    from v2hdm.io.importers.bag.reading import is_bag
+
+    return is_bag(path)
+
+
 def _read_bag(path: Path, options: ReadOptions) -> Drive:
+    from v2hdm.io.drive.folder import read_description
+    from v2hdm.io.importers.bag.describe import describe_bag
+
     path = path.resolve()
     return read_description(describe_bag(path, Path(options.cache)), path.parent, str(path), options)
 
 
 READERS: Mapping[str, tuple[Callable[[Path], bool], Callable[[Path, ReadOptions], Drive]]] = {
-    "folder": (is_folder_drive, read_folder_drive),
-    "kitti": (is_kitti_drive, read_kitti_drive),
-    "bag": (is_bag, _read_bag),
+    "folder": (is_folder_drive, _read_folder),
+    "kitti": (_is_kitti, _read_kitti),
+    "bag": (_is_bag, _read_bag),
 }
 """Formats by name: whether a path looks like one, and what makes a drive of it."""
 
@@ -77,10 +105,7 @@ def drive_name(path: Path) -> str:
     """The name of the drive at ``path``: that in its ``drive.yaml``, else its folder's."""
     if is_folder_drive(path):
         return name_of(load_yaml(path / DRIVE_FILE, DriveError), path)
-    return path.resolve().stem if is_bag(path) else path.resolve().name
-
-
-METRICS = "metrics.json"  # in a result folder
+    return path.resolve().stem if _is_bag(path) else path.resolve().name
 
 
 def told_of(drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[str, Any]:

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from v2hdm.errors import DriveError
+from v2hdm.io.description import DRIVE_FILE
 from v2hdm.io.drive import read_drive
-from v2hdm.io.drive.folder import DRIVE_FILE
 from v2hdm.io.drive.images import ReadOptions
 from v2hdm.io.drive.sources import SUFFIXES
 from v2hdm.io.importers.bag.describe import LENS, MOUNTING, BagDescription

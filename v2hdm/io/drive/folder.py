@@ -12,32 +12,15 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.io.calibration import reading
+from v2hdm.io.description import DRIVE_FILE, POSES_FILE, CameraEntry, DriveDescription, keys_in, name_of
 from v2hdm.io.drive.images import ImageFiles, ReadOptions, assemble_drive, select_cameras
 from v2hdm.io.drive.sources import Sources, plan_images, plan_info, plan_topic_poses
 from v2hdm.io.importers.poses import read_poses
 from v2hdm.records import DRIFTS, BoolArray, Camera, CameraInfo, Drive, FloatArray, PoseNoise
 from v2hdm.safe.fields import take_origin
 from v2hdm.safe.pixels import read_pixels
-from v2hdm.safe.texts import shown, take_camera_name, take_name
+from v2hdm.safe.texts import shown, take_camera_name
 from v2hdm.store.files import check_keys, load_yaml, take_mapping, take_number, take_text
-
-DRIVE_FILE = "drive.yaml"
-POSES_FILE = "poses.tum"
-TRUTH_FOLDER = "truth"
-
-_DRIVE_KEYS = (("cameras",), ("name", "bag", "poses", "pose_noise", "origin", "truth"))
-_CAMERA_KEYS = (
-    ("camera_info", "images"),
-    (
-        "mounting", "cam_from_vehicle", "ipm", "initial_ipm", "roi_vehicle", "centre_prior",
-        "linear_response", "mask", "read_out_s",
-    ),
-)  # fmt: skip
-
-
-def is_folder_drive(path: Path) -> bool:
-    """Whether ``path`` looks like a drive in this format."""
-    return (path / DRIVE_FILE).is_file()
 
 
 def read_folder_drive(path: Path, options: ReadOptions) -> Drive:
@@ -48,7 +31,8 @@ def read_folder_drive(path: Path, options: ReadOptions) -> Drive:
 
 def read_description(content: dict[str, Any], path: Path, where: str, options: ReadOptions) -> Drive:
     """Read the drive that the ``content`` of a ``drive.yaml`` describes, with files relative to ``path``."""
-    check_keys(content, *_DRIVE_KEYS, where, DriveError)
+    drive_keys = keys_in(DriveDescription)
+    check_keys(content, drive_keys.required, drive_keys.optional, where, DriveError)
     entries = take_mapping(content["cameras"], f"{where}: cameras", DriveError)
     entries = {take_camera_name(name, f"{where}: cameras", DriveError): one for name, one in entries.items()}
     if not entries:
@@ -60,10 +44,11 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
             raise DriveError(f"{where}: bag: {bag}: no such bag; check the path or drop the key")
     sources = Sources(path, Path(options.cache), bag, options.max_gap_s)
     planned = {}
+    camera_keys = keys_in(CameraEntry)
     for name in select_cameras(list(entries), options.cameras, Path(where)):
         place = f"{where}: camera '{name}'"
         entry = take_mapping(entries[name], place, DriveError)
-        check_keys(entry, *_CAMERA_KEYS, place, DriveError)
+        check_keys(entry, camera_keys.required, camera_keys.optional, place, DriveError)
         info = plan_info(entry["camera_info"], name, sources, f"{place}, camera_info")
         planned[name] = (entry, info, plan_images(entry["images"], name, sources, f"{place}, images"))
     poses_at = f"{where}: poses"
@@ -93,11 +78,6 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
     name = name_of(content, path)
     drive = Drive(name, path, cameras, (), pose_noise, recorded.origin, truth, recorded=recorded.trajectory)
     return assemble_drive(drive, files, options.max_gap_s, poses_at)
-
-
-def name_of(content: dict[str, Any], path: Path) -> str:
-    """The name that the ``content`` of a ``drive.yaml`` at ``path`` gives the drive, else its folder's."""
-    return take_name(content.get("name", path.resolve().name), f"{path / DRIVE_FILE}: name", DriveError)
 
 
 def _read_camera(entry: dict[str, Any], info: CameraInfo, root: Path, where: str) -> Camera:

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
@@ -16,45 +17,50 @@ from v2hdm.io.drive.road import lay_flat, log_road
 from v2hdm.io.trajectory import check_trajectory, span, why_no_pose
 from v2hdm.records import Camera, Drive, FloatArray, Image, Trajectory
 from v2hdm.safe.pixels import read_header
+from v2hdm.settings import COUNT, NOT_NEGATIVE, POSITIVE
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(kw_only=True)
 class KittiOptions:
-    """Facts about a drive that the KITTI raw format does not state.
+    """Facts about a drive that the KITTI raw format does not state."""
 
-    Attributes:
-        camera_height_m: height of the camera above the road (KITTI's nominal 1.65 m).
-        centre_sigma_m: standard deviation of the camera centre in the published calibration, per axis.
-    """
-
-    camera_height_m: float = 1.65
-    centre_sigma_m: float = 0.05
+    camera_height_m: Annotated[
+        float, POSITIVE, "height of the camera above the road (KITTI's nominal 1.65 m)."
+    ] = 1.65
+    centre_sigma_m: Annotated[
+        float, POSITIVE, "standard deviation of the camera centre in the published calibration, per axis."
+    ] = 0.05
 
 
 @dataclass(kw_only=True)
 class ReadOptions:
-    """How to read a drive.
+    """How to read a drive."""
 
-    Attributes:
-        format: name of a reader (see ``v2hdm.io.drive.READERS``), or ``auto`` to look at the folder.
-        cameras: names of the cameras to read; empty for all.
-        max_gap_s: longest gap between poses to interpolate across; images in a longer one are dropped.
-        limit: maximum number of images per camera, the first ones, for quick tries; None for all.
-        start_s: seconds to skip at the beginning of the drive, from its first image.
-        end_s: seconds after its first image at which the drive ends; None for its own end.
-        cache: folder for imports from bags and videos.
-        kitti: only used by the ``kitti`` reader.
-    """
-
-    format: str = "auto"
-    cameras: list[str] = field(default_factory=list)
-    max_gap_s: float = 0.5
-    limit: int | None = None
-    start_s: float = 0.0
-    end_s: float | None = None
-    cache: str = "cache"
+    format: Annotated[
+        str, "name of a reader (see v2hdm.io.drive.READERS), or auto to look at the folder."
+    ] = "auto"
+    cameras: Annotated[list[str], "names of the cameras to read; empty for all."] = field(
+        default_factory=list
+    )
+    max_gap_s: Annotated[
+        float,
+        POSITIVE,
+        "longest gap between poses to interpolate across; images in a longer one are dropped.",
+    ] = 0.5
+    limit: Annotated[
+        int | None,
+        COUNT,
+        "maximum number of images per camera, the first ones, for quick tries; null for all.",
+    ] = None
+    start_s: Annotated[
+        float, NOT_NEGATIVE, "seconds to skip at the beginning of the drive, from its first image."
+    ] = 0.0
+    end_s: Annotated[
+        float | None, POSITIVE, "seconds after its first image at which the drive ends; null for its own end."
+    ] = None
+    cache: Annotated[str, "folder for imports from bags and videos."] = "cache"
     kitti: KittiOptions = field(default_factory=KittiOptions)
 
 

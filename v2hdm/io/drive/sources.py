@@ -13,12 +13,14 @@ import numpy as np
 from v2hdm.errors import DriveError, need
 from v2hdm.io.calibration.intrinsics import read_intrinsics
 from v2hdm.io.calibration.reading import read_camera_info
+from v2hdm.io.description import FolderImages, InfoFile, TopicImages, VideoImages, keys_in
 from v2hdm.io.drive.images import ImageFiles
 from v2hdm.io.importers.bag import streams
 from v2hdm.io.importers.bag.messages import TF_TOPIC
 from v2hdm.io.importers.readings import Readings, read_stamps, readings_of_poses
 from v2hdm.io.trajectory import UNITS, read_image_list, write_image_list
 from v2hdm.records import CameraInfo
+from v2hdm.safe.child import Limits, in_child, next_step
 from v2hdm.safe.pixels import DECODER_OPTIONS, VIDEO_OPTIONS, png
 from v2hdm.store.files import check_keys, take_choice, take_mapping, take_number, take_text
 from v2hdm.store.folders import entry_folder, is_whole, new_entry
@@ -83,7 +85,8 @@ def plan_info(content: object, camera: str, sources: Sources, where: str) -> Cal
         path = sources.root / take_text(content, where, DriveError)
         return lambda: _read_info(path, None)
     if "file" in content:
-        check_keys(content, ("file",), ("camera",), where, DriveError)
+        info_keys = keys_in(InfoFile)
+        check_keys(content, info_keys.required, info_keys.optional, where, DriveError)
         named = sources.root / take_text(content["file"], f"{where}, file", DriveError)
         chosen = content.get("camera")
         if chosen is not None and not isinstance(chosen, int):  # COLMAP numbers its cameras
@@ -175,48 +178,55 @@ def _import_video(path: Path, cache: Path, where: str) -> Path:
     folder = entry_folder(cache, [path], "video", ["frames"])
     if is_whole(folder):
         return folder
-    av = need("av", "video", f"{where}: a video", DriveError)
+    need("av", "video", f"{where}: a video", DriveError)
     _log.info("%s: decoding its frames into %s, once", path, cache)
     with new_entry(folder) as partial:
-        stamps: list[float] = []
-        names: list[str] = []
-        complained = ""
-        av.logging.set_level(av.logging.ERROR)
-        try:
-            with (
-                av.logging.Capture(local=False) as complaints,
-                av.open(str(path), options=VIDEO_OPTIONS) as container,
-            ):
-                promised_s = (container.duration or 0) / av.time_base
-                container.streams.video[0].codec_context.options = DECODER_OPTIONS
-                for frame in container.decode(video=0):
-                    where = f"{path}: frame {len(stamps) + 1}"
-                    if frame.rotation:
-                        raise DriveError(
-                            f"{where} asks for a rotation, but a calibration is of stored pixels: "
-                            "take the rotation out of the video"
-                        )
-                    if (complaints or frame.is_corrupt) and not complained:
-                        complained = complaints[-1][2].strip() if complaints else "corrupt"
-                        _log.warning("%s: decoder error (%s); is it damaged?", where, complained)
-                    if frame.pts is None:
-                        raise DriveError(f"{where} has no time; give stamps, one per line")
-                    stamps.append(float(frame.pts * frame.time_base))
-                    if len(stamps) > 1 and stamps[-1] <= stamps[-2]:
-                        raise DriveError(f"{where}: its time does not increase; convert the video")
-                    names.append(f"{len(names):06d}.png")
-                    (partial / names[-1]).write_bytes(png(frame.to_ndarray(format="bgr24")))
-        except (av.error.FFmpegError, IndexError) as failure:
-            reason = " ".join(str(failure).split())
-            raise DriveError(f"{path}: not readable as a video ({reason}); convert or copy it") from None
-        finally:
-            av.logging.set_level(None)
-        if not stamps:
-            raise DriveError(f"{path}: has no frames; convert or copy it again")
-        if promised_s - (stamps[-1] - stamps[0]) > _TAIL_S + 2 * max(np.diff(stamps), default=0.0):
-            _log.warning("%s: its frames end before its %.1f s do; is it cut off?", path, promised_s)
-        write_image_list(np.array(stamps) - stamps[0], names, partial / streams.IMAGE_LIST)
+        in_child(decode_video, path, partial, limits=Limits.of(path), where=str(path), error=DriveError)
     return folder
+
+
+def decode_video(path: Path, folder: Path) -> None:
+    """Write the frames of a video as PNG files, and the list of their times."""
+    av = need("av", "video", f"{path}: a video", DriveError)
+    stamps: list[float] = []
+    names: list[str] = []
+    complaint = ""
+    av.logging.set_level(av.logging.ERROR)
+    try:
+        with (
+            av.logging.Capture(local=False) as complaints,
+            av.open(str(path), options=VIDEO_OPTIONS) as container,
+        ):
+            promised_s = (container.duration or 0) / av.time_base
+            container.streams.video[0].codec_context.options = DECODER_OPTIONS
+            for frame in container.decode(video=0):
+                next_step()
+                where = f"{path}: frame {len(stamps) + 1}"
+                if frame.rotation:
+                    raise DriveError(
+                        f"{where} asks for a rotation, but a calibration is of stored pixels: "
+                        "take the rotation out of the video"
+                    )
+                if (complaints or frame.is_corrupt) and not complaint:
+                    complaint = complaints[-1][2].strip() if complaints else "corrupt"
+                    _log.warning("%s: decoder error (%s); is it damaged?", where, complaint)
+                if frame.pts is None:
+                    raise DriveError(f"{where} has no time; give stamps, one per line")
+                stamps.append(float(frame.pts * frame.time_base))
+                if len(stamps) > 1 and stamps[-1] <= stamps[-2]:
+                    raise DriveError(f"{where}: its time does not increase; convert the video")
+                names.append(f"{len(names):06d}.png")
+                (folder / names[-1]).write_bytes(png(frame.to_ndarray(format="bgr24")))
+    except (av.error.FFmpegError, IndexError) as failure:
+        reason = " ".join(str(failure).split())
+        raise DriveError(f"{path}: not readable as a video ({reason}); convert or copy it") from None
+    finally:
+        av.logging.set_level(None)
+    if not stamps:
+        raise DriveError(f"{path}: has no frames; convert or copy it again")
+    if promised_s - (stamps[-1] - stamps[0]) > _TAIL_S + 2 * max(np.diff(stamps), default=0.0):
+        _log.warning("%s: its frames end before its %.1f s do; is it cut off?", path, promised_s)
+    write_image_list(np.array(stamps) - stamps[0], names, folder / streams.IMAGE_LIST)
 
 
 def _of_video(entry: dict[str, Any], camera: str, sources: Sources, where: str) -> _Lister:
@@ -244,8 +254,8 @@ def _of_video(entry: dict[str, Any], camera: str, sources: Sources, where: str) 
 IMAGE_SOURCES: Mapping[
     str, tuple[Callable[[dict[str, Any], str, Sources, str], _Lister], tuple[str, ...]]
 ] = {
-    "folder": (_of_folder, ("stamps", "unit")),
-    "video": (_of_video, ("start_s", "stamps")),
-    "topic": (_of_topic, ("stamps",)),
+    "folder": (_of_folder, keys_in(FolderImages).optional),
+    "video": (_of_video, keys_in(VideoImages).optional),
+    "topic": (_of_topic, keys_in(TopicImages).optional),
 }
 """Sources of images other than a list file, by the key that names them: how they are planned, other keys."""

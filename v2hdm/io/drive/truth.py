@@ -14,6 +14,7 @@ from v2hdm.io.maps.reading import read_geojson
 from v2hdm.io.trajectory import read_tum
 from v2hdm.records import BoolArray, Drive, FloatArray, HDMap, Image, Truth
 from v2hdm.store.files import check_keys, load_yaml, read_csv, take_mapping, take_number
+from v2hdm.store.names import MAP
 
 SIGHTINGS = ("camera", "timestamp", "marking", "visible_fraction")
 LANE_VISIBLE = ("lane", "vertex")
@@ -26,7 +27,7 @@ def read_truth(drive: Drive) -> Truth:
     folder = drive.truth_dir
     if folder is None:
         raise DriveError(f"{drive.root}: has no ground truth to compare with; drop the comparison")
-    hd_map = read_geojson(folder / "map.geojson")
+    hd_map = read_geojson(folder / MAP)
     noted = folder / "disturbances.yaml"
     named = load_yaml(noted, DriveError)
     return Truth(
@@ -46,7 +47,7 @@ def has_truth(drive: Drive) -> bool:
     folders = [session.truth_dir for session in drive.sessions if session.truth_dir is not None]
     if len(folders) < len(drive.sessions):
         return False
-    maps = [read_geojson(folder / "map.geojson") for folder in folders]
+    maps = [read_geojson(folder / MAP) for folder in folders]
     corners = [[one.corners_map for one in hd_map.markings] for hd_map in maps]
     same_origin = all(one.origin == maps[0].origin for one in maps)
     return same_origin and all(np.array_equal(corners[0], one) for one in corners)

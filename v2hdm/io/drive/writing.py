@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 
 from v2hdm.io.calibration.writing import write_camera_info
-from v2hdm.io.drive.folder import DRIVE_FILE, POSES_FILE
+from v2hdm.io.description import DRIVE_FILE, POSES_FILE
 from v2hdm.io.drive.truth import LANE_VISIBLE, SIGHTINGS
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.trajectory import write_image_list, write_tum
 from v2hdm.records import Drive, Image, Trajectory, Truth
 from v2hdm.store.files import dump_yaml, replace_text
+from v2hdm.store.names import MAP
 
 
 def write_drive(folder: Path, drive: Drive, trajectory: Trajectory) -> None:
@@ -58,7 +59,7 @@ def write_drive(folder: Path, drive: Drive, trajectory: Trajectory) -> None:
 
 def write_truth(folder: Path, truth: Truth, images: Sequence[Image]) -> None:
     """Write ``truth``, whose rows belong to ``images``, into ``folder``."""
-    write_geojson(truth.map, folder / "map.geojson")
+    write_geojson(truth.map, folder / MAP)
     cameras = {name: {"cam_from_vehicle": matrix.tolist()} for name, matrix in truth.cam_from_vehicle.items()}
     replace_text(folder / "cameras.yaml", dump_yaml(cameras))
     stamp_s, first = np.unique([image.stamp_s for image in images], return_index=True)

@@ -18,6 +18,7 @@ import numpy as np
 from v2hdm.errors import DriveError
 from v2hdm.geometry import geodetic as earth
 from v2hdm.geometry.rigid import interpolate, make_transform, rotation_from_euler
+from v2hdm.io.description import NmeaPoses, PoseKeys, TablePoses, TopicPoses, keys_in
 from v2hdm.io.importers import readings as logs
 from v2hdm.io.importers.readings import Readings
 from v2hdm.io.trajectory import check_geodetic, read_tum, span, why_no_pose
@@ -27,10 +28,8 @@ from v2hdm.store.files import check_keys, take_array, take_choice, take_mapping,
 _log = logging.getLogger(__name__)
 
 HEADINGS = ("true", "grid")
-COMMON_KEYS = (
-    "crs", "heading", "lever_arm_m", "mounting_rpy_deg", "max_sigma_m", "geoid_m", "epoch", "offset_s",
-)  # fmt: skip
-TOPIC_KEYS = ("heading_topic", "frame", "vehicle", "stamps")
+COMMON_KEYS = keys_in(PoseKeys).optional
+TOPIC_KEYS = keys_in(TopicPoses, PoseKeys).optional
 
 
 @dataclass(frozen=True)
@@ -60,8 +59,8 @@ _Reader = Callable[[Path, dict[str, Any], Path, str], Readings]
 
 POSE_FORMATS: Mapping[str, tuple[_Reader, tuple[str, ...]]] = {
     "tum": (lambda path, entry, root, where: logs.readings_of_poses(read_tum(path)), ()),
-    "csv": (logs.read_table, logs.TABLE_KEYS),
-    "nmea": (logs.read_nmea, logs.NMEA_KEYS),
+    "csv": (logs.read_table, keys_in(TablePoses, PoseKeys).optional),
+    "nmea": (logs.read_nmea, keys_in(NmeaPoses, PoseKeys).optional),
 }
 """Formats of files by the key that names the file: the reader, and keys of its own. ``topic`` is of a bag."""
 

@@ -29,8 +29,6 @@ from v2hdm.records import FloatArray, Trajectory
 from v2hdm.safe.texts import read_bytes, shown
 from v2hdm.store.files import check_keys, read_text, take_mapping, take_text
 
-TABLE_KEYS = ("columns",)
-
 SIGMA_OF_QUALITY_M: Mapping[int, float] = {
     0: np.inf,  # no fix
     1: 3.0,  # single
@@ -241,8 +239,6 @@ def _rotation(columns: Mapping[str, FloatArray], path: Path) -> FloatArray | Non
     pitch = -radians("pitch_up") if "pitch_up_deg" in columns else radians("pitch")
     return rotation_from_euler(radians("roll"), pitch, yaw)
 
-
-NMEA_KEYS = ("date",)
 
 _log = logging.getLogger(__name__)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -34,24 +34,26 @@ _HEAD = "# Corrections of a map by a person: map.corrections=THIS FILE in the ne
 _MOST = 100_000
 
 
+_KIND_AND_OUTLINE_MAP = (
+    "kind and outline_map are its class and corners (N, 2), m, in the map that they saw, one point if "
+    "left out."
+)
+
+
 @dataclass(kw_only=True)
 class Correction:
-    """A person's decision on one marking, symbol or candidate that was left out.
+    """A person's decision on one marking, symbol or candidate that was left out."""
 
-    ``says`` is accepted, rejected or corrected. ``reason`` is an optional comment. ``kind`` and
-    ``outline_map`` are its class and corners (N, 2), m, in the map that they saw, one point if left out.
-    ``new_kind`` is the corrected class. ``moved`` has new positions (2,) of corners, numbered from 1.
-    ``sigma_m`` is their standard deviation, m. ``marking`` is its id in that map, only for readers.
-    """
-
-    says: str
-    kind: str
-    outline_map: list[list[float]]
-    marking: int | None = None
-    new_kind: str | None = None
-    moved: dict[int, list[float]] = field(default_factory=dict)
-    sigma_m: float = SIGMA_M
-    reason: str = ""
+    says: Annotated[str, "accepted, rejected or corrected."]
+    kind: Annotated[str, _KIND_AND_OUTLINE_MAP]
+    outline_map: Annotated[list[list[float]], _KIND_AND_OUTLINE_MAP]
+    marking: Annotated[int | None, "its id in that map, only for readers."] = None
+    new_kind: Annotated[str | None, "the corrected class."] = None
+    moved: Annotated[dict[int, list[float]], "moved has new positions (2,) of corners, numbered from 1."] = (
+        field(default_factory=dict)
+    )
+    sigma_m: Annotated[float, "their standard deviation, m."] = SIGMA_M
+    reason: Annotated[str, "an optional comment."] = ""
 
     @property
     def place(self) -> str:

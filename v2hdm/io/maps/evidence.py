@@ -14,8 +14,6 @@ from v2hdm.io.maps.geojson import geojson_feature, geojson_positions, write_feat
 from v2hdm.records import BoolArray, Exclusion, FloatArray, GeodeticOrigin, IntArray, Road
 from v2hdm.store import files
 
-FILE = "residuals.csv"  # in a result folder
-
 COLUMNS = (
     *("image", "camera", "taken_s", "marking", "corner", "point"),
     *("u_px", "v_px", "du_px", "dv_px", "distance_sigma"),

@@ -30,6 +30,7 @@ from v2hdm.io.maps.features import CORNERS, PAINT, POINTS, Feature, features_of,
 from v2hdm.io.maps.reading import EXACT, GEOMETRY, LAYERS
 from v2hdm.records import CROSSWALK_BAR, DIAMOND, LANE_DASH, LANE_LINE, STOP_LINE, GeodeticOrigin, HDMap
 from v2hdm.store.files import replace_text, whole_file
+from v2hdm.store.names import MOSAIC
 
 LOCAL_CRS = (
     'ENGCRS["v2hdm map frame: metres east and north of the drive\'s own origin",'
@@ -185,7 +186,6 @@ def _style_row(layer: str, kinds: Sequence[str], closed: bool) -> dict[str, str]
     }
 
 
-MOSAIC = "mosaic.tif"  # beside the project, where the run has made one
 _AROUND_M = 5.0
 
 

@@ -14,9 +14,8 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
-from v2hdm.records import FloatArray, HDMap
+from v2hdm.records import SIGMAS_95, FloatArray, HDMap
 from v2hdm.report.page.facts import Facts, GroundResiduals, Route
-from v2hdm.report.page.layers import SIGMAS_95
 from v2hdm.report.style import OKABE_ITO, RC, draw_arrows
 
 INK = "#1b1e21"
@@ -26,13 +25,15 @@ PAPER = "#fdfdfd"
 """Colours of text, axes, grid and background, which ``page.css`` replaces by its theme's."""
 
 _ORDER = ("blue", "vermillion", "green", "purple", "orange", "sky")
+# Dashes of the series in matplotlib's words: lengths of ink and gap, in widths of the line.
 _DASHES: tuple[Any, ...] = ("-", (0, (5, 1.6)), (0, (1.2, 1.2)), (0, (6, 1.5, 1.2, 1.5)), "-", "--")
 _MARKERS = ("o", "s", "^", "D", "v", "P")
 
 CELLS = (9, 16)  # rows and columns of the cells for mean residuals
 _SINGLE_IN = 5.0  # width of a chart alone in its row: legible on a phone
-_LEAST_IN_CELL = 10  # least observations of a mean: its error is a third of a single one's
+_LEAST_IN_CELL = 10  # least number of observations of a mean, whose error is then a third of a single one's
 
+# Style of the charts beside that of all figures; sizes in points.
 _RC: dict[Any, Any] = RC | {
     "axes.titleweight": "normal",
     "svg.fonttype": "none",
@@ -81,22 +82,22 @@ def site_chart(hd_map: HDMap, route: Route | None, excluded: FloatArray) -> str:
     """Plan view of the map, for paper: markings, lane lines, route, excluded candidates (N, 2)."""
     way = np.empty((0, 2)) if route is None else route.map_from_vehicle[:, :2, 3]
     shapes = [m.corners_map for m in hd_map.markings]
-    lanes = [one.points_map for one in hd_map.lanes]
+    lanes = [lane.points_map for lane in hd_map.lanes]
     spread = np.ptp(np.concatenate([*shapes, *lanes, way]), axis=0) + 10.0
     height_in = float(np.clip(6.4 * spread[1] / spread[0] + 0.8, 2.4, 6.2))
     with _chart("site", 7.2, height_in) as (figure, out):
         axes = figure.subplots()
         if len(way):
-            axes.plot(*way.T, color=MUTED, lw=1.0, ls=(0, (4, 2)), label="route of the vehicle")
-            axes.plot(*way[0], "o", color=MUTED, ms=4)
+            axes.plot(way[:, 0], way[:, 1], color=MUTED, lw=1.0, ls=(0, (4, 2)), label="route of the vehicle")
+            axes.plot(way[0, 0], way[0, 1], "o", color=MUTED, ms=4)
         lines = LineCollection(lanes, colors=OKABE_ITO["sky"], linewidths=0.9, label="lane lines")
         axes.add_collection(lines)
-        shapes += [one.outline_map for one in hd_map.symbols]
+        shapes += [symbol.outline_map for symbol in hd_map.symbols]
         paint: dict[str, Any] = {"facecolors": OKABE_ITO["blue"], "edgecolors": OKABE_ITO["blue"]}
         axes.add_collection(PolyCollection(shapes, linewidths=0.8, label="markings", **paint))
         if len(excluded):
             cross: dict[str, Any] = {"color": OKABE_ITO["vermillion"], "ms": 4, "mew": 1.0}
-            axes.plot(*excluded.T, "x", label="left out", **cross)
+            axes.plot(excluded[:, 0], excluded[:, 1], "x", label="excluded", **cross)
         axes.set_aspect("equal", adjustable="datalim")
         axes.autoscale_view()
         axes.set(xlabel="east (m)", ylabel="north (m)")
@@ -106,11 +107,12 @@ def site_chart(hd_map: HDMap, route: Route | None, excluded: FloatArray) -> str:
 
 def residual_charts(facts: Facts, residuals: GroundResiduals) -> dict[str, str]:
     """Charts of residuals: histogram, over the image, over range, along the route."""
-    infos = {name: one.calibration.info for name, one in facts.cameras.items()}
+    infos = {name: camera.calibration.info for name, camera in facts.cameras.items()}
+    sizes = {name: (info.width, info.height) for name, info in infos.items()}
     assert facts.route is not None
     return {
         "histogram": _histogram_chart(residuals),
-        "field": _field_chart(residuals, {name: (one.width, one.height) for name, one in infos.items()}),
+        "field": _field_chart(residuals, sizes),
         "range": _range_chart(residuals),
         "route": _route_chart(facts.route, residuals),
     }
@@ -128,10 +130,10 @@ def _histogram_chart(residuals: GroundResiduals) -> str:
         edges_px = np.linspace(0, max(float(np.percentile(size_px, 99)) if len(size_px) else 1.0, 0.1), 41)
         edges_sigma = np.linspace(0, 5, 41)
         for number, name in enumerate(residuals.cameras):
-            own = residuals.camera == number
-            lengths = residuals.size_px[own & residuals.is_point]
+            in_camera = residuals.camera == number
+            lengths = residuals.size_px[in_camera & residuals.is_point]
             _steps(left, lengths, edges_px, f"{name} ({len(lengths)})", number)
-            _steps(right, residuals.distance_sigma[own], edges_sigma, name, number)
+            _steps(right, residuals.distance_sigma[in_camera], edges_sigma, name, number)
         ideal = edges_sigma * np.exp(-0.5 * edges_sigma**2)
         right.plot(edges_sigma, ideal, color=MUTED, lw=1.0, label="stated noise model")
         left.set(xlabel="reprojection error (px)", ylabel="fraction of corners per px")
@@ -167,7 +169,8 @@ def _field_chart(residuals: GroundResiduals, sizes: Mapping[str, tuple[int, int]
             # The longest arrow spans one and a half cells.
             span = 1.5 * width_px / CELLS[1]
             colour = OKABE_ITO[_ORDER[number % len(_ORDER)]]
-            draw_arrows(axes, *fields[number], longest, span, color=colour, width=0.005, headwidth=3.6)
+            places_px, means_px = fields[number]
+            draw_arrows(axes, places_px, means_px, longest, span, color=colour, width=0.005, headwidth=3.6)
             axes.set(
                 xlim=(0, width_px), ylim=(height_px, 0), xlabel="u (px)", ylabel="v (px)", aspect="equal"
             )
@@ -180,9 +183,9 @@ def _field_chart(residuals: GroundResiduals, sizes: Mapping[str, tuple[int, int]
 
 def _field(residuals: GroundResiduals, camera: int, size: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
     """Centres (N, 2) of image cells with enough observations, and mean residuals (N, 2), px."""
-    own = (residuals.camera == camera) & residuals.is_point
-    place = residuals.observed_px[own]
-    off = residuals.residual_px[own]
+    is_used = (residuals.camera == camera) & residuals.is_point
+    place = residuals.observed_px[is_used]
+    off = residuals.residual_px[is_used]
     rows, columns = CELLS
     column, row = np.floor(place / size * (columns, rows)).astype(np.int64).T
     inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
@@ -207,10 +210,11 @@ def _range_chart(residuals: GroundResiduals) -> str:
         edges = np.linspace(0, farthest, max(2, min(int(farthest), 24)) + 1)
         ground_cm = 100 * np.linalg.norm(residuals.ground_m, axis=1)
         for number, name in enumerate(residuals.cameras):
-            own = (residuals.camera == number) & residuals.is_point & np.isfinite(ground_cm)
+            is_used = (residuals.camera == number) & residuals.is_point & np.isfinite(ground_cm)
             look = {**_look(number), "marker": _MARKERS[number % len(_MARKERS)], "ms": 3.5}
             for axes, values in ((left, residuals.size_px), (right, ground_cm)):
-                axes.plot(*_rms_by(residuals.range_m[own], values[own], edges), label=name, **look)
+                middles_m, rms = _rms_by(residuals.range_m[is_used], values[is_used], edges)
+                axes.plot(middles_m, rms, label=name, **look)
         left.set_ylabel("RMS residual (px)")
         right.set_ylabel("RMS ground residual (cm)")
         for axes in (left, right):
@@ -242,9 +246,9 @@ def _route_chart(route: Route, residuals: GroundResiduals) -> str:
         edges = np.linspace(0, total, int(np.clip(total / 5, 4, 80)) + 1)
         taken_m = np.interp(residuals.taken_s, route.stamp_s, way_m)
         for number, name in enumerate(residuals.cameras):
-            own = (residuals.camera == number) & residuals.is_point
-            binned = _rms_by(taken_m[own], residuals.size_px[own], edges)
-            fit.plot(*binned, label=name, lw=1.1, **_look(number))
+            is_used = (residuals.camera == number) & residuals.is_point
+            middles_m, rms_px = _rms_by(taken_m[is_used], residuals.size_px[is_used], edges)
+            fit.plot(middles_m, rms_px, label=name, lw=1.1, **_look(number))
         fit.set_ylabel("RMS residual (px)")
         fit.set_ylim(bottom=0)
         fit.legend(loc="upper right", ncols=len(residuals.cameras), fontsize=8.5)

@@ -19,14 +19,18 @@ from v2hdm.report.page.facts import Facts, ground_residuals, read_facts
 from v2hdm.report.page.layers import background_layer, comparison, layers
 from v2hdm.report.page.pictures import overlays, pictures
 from v2hdm.report.page.tables import in_words
+from v2hdm.store import names
 from v2hdm.store.files import replace_text
 
 
 def document(facts: Facts) -> SimpleNamespace:
     """Content of the page by template names; missing parts are None or empty."""
-    metrics, verdict = facts.metrics, facts.metrics.get("verdict") or {}
+    metrics = facts.metrics
+    verdict = metrics.get("verdict") or {}
     residuals = ground_residuals(facts)
-    findings = {which: tables.finding_rows(verdict, which) for which in ("findings", "untold", "passed")}
+    findings = {
+        which: tables.finding_rows(verdict, which) for which in ("findings", "unobservable", "passed")
+    }
     return SimpleNamespace(
         facts=facts,
         name=str(metrics.get("name", facts.folder.name)),
@@ -75,18 +79,18 @@ def _summary(facts: Facts) -> str:
 def _site(facts: Facts) -> str:
     if facts.hd_map is None or not (facts.hd_map.markings or facts.hd_map.lanes):
         return ""
-    excluded = np.array([one.position_map for one in facts.excluded]).reshape(-1, 2)
+    excluded = np.array([candidate.position_map for candidate in facts.excluded]).reshape(-1, 2)
     return charts.site_chart(facts.hd_map, facts.route, excluded)
 
 
 def _ellipses(facts: Facts) -> str:
     markings = facts.hd_map.markings if facts.hd_map else ()
-    both = {"relative to neighbours": tables.relative_m, "absolute": tables.half_axes_m}
-    series = {name: 100 * values for name, of in both.items() if len(values := of(markings))}
+    measures = {"relative to neighbours": tables.relative_m, "absolute": tables.half_axes_m}
+    series = {name: 100 * measure(markings) for name, measure in measures.items()}
+    series = {name: values_cm for name, values_cm in series.items() if len(values_cm)}
     return charts.ellipse_chart(series) if series else ""
 
 
-FILE = "report.html"  # name of the page in a result folder
 _ASSETS = {"vendor": ("leaflet.js", "leaflet.css"), "templates": ("page.css", "map.js", "edit.js")}
 """Scripts and styles that the page embeds, by folder."""
 
@@ -98,8 +102,8 @@ def write_page(folder: Path, drive: Drive | None, background: Path | None = None
     tiles. If either is None, its content is taken from an existing report. Raises MapFileError for an invalid
     folder, file or background, DriveError for a damaged image or truth.
     """
-    replace_text(folder / FILE, page_text(folder, drive, background=background))
-    return folder / FILE
+    replace_text(folder / names.REPORT, page_text(folder, drive, background=background))
+    return folder / names.REPORT
 
 
 def page_text(
@@ -119,10 +123,12 @@ def page_text(
     here = files("v2hdm.report.page")
     facts = read_facts(folder, drive)
     page = document(facts)
-    page.pictures = page.pictures or _kept(folder / FILE, "pictures")
+    page.pictures = page.pictures or _earlier(folder / names.REPORT, "pictures")
     if page.map_data:
-        kept = _kept(folder / FILE, "map-data").get("background") if background is None else None
-        page.map_data["background"] = kept if background is None else background_layer(background, facts)
+        if background is None:
+            page.map_data["background"] = _earlier(folder / names.REPORT, "map-data").get("background")
+        else:
+            page.map_data["background"] = background_layer(background, facts)
     return environment.get_template("page.html").render(
         page=page,
         assets={
@@ -136,13 +142,13 @@ def page_text(
     )
 
 
-def _kept(path: Path, name: str) -> dict[str, Any]:
+def _earlier(path: Path, name: str) -> dict[str, Any]:
     """Data ``name`` of an earlier report, whose sources may be unavailable now."""
     # The old report is not an input: the new one replaces it.
     text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
-    kept = re.search(r'<script type="application/json" id="' + name + '">(.*?)</script>', text, re.DOTALL)
+    script = re.search(r'<script type="application/json" id="' + name + '">(.*?)</script>', text, re.DOTALL)
     try:
-        return dict(json.loads(kept[1])) if kept else {}
+        return dict(json.loads(script[1])) if script else {}
     except (ValueError, RecursionError):
         return {}
 
@@ -155,14 +161,14 @@ def json_text(content: object) -> str:
 
 def _suspicious(facts: Facts) -> dict[str, list[str]]:
     """Most suspicious markings, worst first: table cells by the key of their pictures."""
-    kinds = {one.id: one.kind for one in facts.hd_map.markings} if facts.hd_map else {}
+    kinds = {marking.id: marking.kind for marking in facts.hd_map.markings} if facts.hd_map else {}
     rows = {}
-    for one in facts.best.get("suspicious") or []:
-        number = one["marking"]
-        tests = {name: one[f"p_{name}"] for name in ("shape", "residuals", "sightings")}
+    for suspect in facts.best.get("suspicious") or []:
+        number = suspect["marking"]
+        tests = {name: suspect[f"p_{name}"] for name in ("shape", "residuals", "sightings")}
         if number in kinds:
-            cells = [str(number), tables.name_of(kinds[number]), f"{one['p']:.2g}"]
+            cells = [str(number), tables.name_of(kinds[number]), f"{suspect['p']:.2g}"]
             cells.append(min(tests, key=tests.__getitem__))
-            cells += [*(f"{p:.2g}" for p in tests.values()), f"{100 * one['disputed']:.0f}"]
+            cells += [*(f"{p:.2g}" for p in tests.values()), f"{100 * suspect['disputed']:.0f}"]
             rows[f"m{number}"] = cells
     return rows

@@ -15,17 +15,14 @@ from v2hdm.geometry.planar import length_along
 from v2hdm.geometry.rigid import camera_centre, interpolate, inverse
 from v2hdm.io.calibration.reading import read_calibration
 from v2hdm.io.drive.truth import read_truth
-from v2hdm.io.maps.evidence import FILE as RESIDUALS
 from v2hdm.io.maps.evidence import Residuals, read_exclusions, read_residuals
 from v2hdm.io.maps.features import features_of, map_of
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.io.trajectory import read_tum
-from v2hdm.records import BoolArray, Calibration, Drive, Exclusion, FloatArray, HDMap, IntArray, Truth
+from v2hdm.records import BEST, BoolArray, Calibration, Drive, Exclusion, FloatArray, HDMap, IntArray, Truth
+from v2hdm.store import names
 from v2hdm.store.files import load_json, load_yaml, read_csv, read_text, take_number
-from v2hdm.surface.surface import FILE as GROUND
 from v2hdm.surface.surface import Surface
-
-BEST = "Opt"  # method of the run's result, as in metrics.json
 
 
 @dataclass(frozen=True)
@@ -37,7 +34,6 @@ class Route:
     recorded: FloatArray | None  # (F, 4, 4) as recorded, None without the drive
     flat: FloatArray  # (F, 4, 4) adjusted, on the flattened road of the map, if there is a drive
     sigma: FloatArray  # (F, 6) forward, left, up in m, roll, pitch, heading in rad
-    seen: BoolArray  # (F,) whether a marking was seen
 
     @property
     def way_m(self) -> FloatArray:
@@ -91,24 +87,24 @@ class Facts:
 
 def read_facts(folder: Path, drive: Drive | None) -> Facts:
     """Read a run's result folder and the data of its ``drive``; MapFileError for damaged files."""
-    if not (folder / "metrics.json").is_file():
-        raise MapFileError(f"{folder}: not a result of v2hdm map (no metrics.json); give its folder")
-    metrics = load_json(folder / "metrics.json", MapFileError)
+    if not (folder / names.METRICS).is_file():
+        raise MapFileError(f"{folder}: not a result of v2hdm map (no {names.METRICS}); give its folder")
+    metrics = load_json(folder / names.METRICS, MapFileError)
     sets = list(metrics.get("results") or {})
-    hd_map = read_geojson(folder / "map.geojson") if (folder / "map.geojson").is_file() else None
-    excluded = read_exclusions(folder / "excluded.geojson") if (folder / "excluded.geojson").is_file() else []
+    hd_map = read_geojson(folder / names.MAP) if (folder / names.MAP).is_file() else None
+    excluded = read_exclusions(folder / names.EXCLUDED) if (folder / names.EXCLUDED).is_file() else []
     features = features_of(hd_map) if hd_map else []
-    residuals = folder / RESIDUALS
-    config = folder / "config.yaml"
-    points = folder / "check_points.csv"
+    residuals = folder / names.RESIDUALS
+    config = folder / names.CONFIG
+    points = folder / names.CHECK_POINTS
     route = _route(folder, drive)
     heading, *checked = (read_csv(points, MapFileError) if points.is_file() else []) or [[]]
     return Facts(
         folder=folder,
         metrics=metrics,
         config=read_text(config, MapFileError).strip() if config.is_file() else "",
-        hd_map=map_of(features, [one.id for one in features], hd_map.origin) if hd_map else None,
-        excluded=tuple(one for one in excluded if not sets or one.cameras == sets[-1]),
+        hd_map=map_of(features, [feature.id for feature in features], hd_map.origin) if hd_map else None,
+        excluded=tuple(candidate for candidate in excluded if not sets or candidate.cameras == sets[-1]),
         cameras=read_cameras(folder),
         route=route,
         surface=None if route is None else read_surface(folder, route.flat),
@@ -121,46 +117,46 @@ def read_facts(folder: Path, drive: Drive | None) -> Facts:
 
 def read_cameras(folder: Path) -> dict[str, CameraFacts]:
     """Calibrations of a result folder by camera; raises MapFileError for damaged files."""
-    found = {}
-    for path in sorted(folder.glob("calibration_*.yaml")):
+    cameras = {}
+    for path in sorted(folder.glob(names.CALIBRATIONS)):
         content = load_yaml(path, MapFileError)
         calibration = read_calibration(path)
-        times_s = (
-            take_number(content[key], f"{path}: {key}", MapFileError) if key in content else None
+        times_s = {
+            key: take_number(content[key], f"{path}: {key}", MapFileError) if key in content else None
             for key in ("clock_offset_s", "clock_sigma_s", "read_out_s", "read_out_sigma_s")
-        )
-        found[calibration.info.name] = CameraFacts(calibration, *times_s)
-    return found
+        }
+        cameras[calibration.info.name] = CameraFacts(calibration, **times_s)
+    return cameras
 
 
 def _route(folder: Path, drive: Drive | None) -> Route | None:
-    if not (folder / "trajectory.tum").is_file():
+    if not (folder / names.TRAJECTORY).is_file():
         return None
-    adjusted = read_tum(folder / "trajectory.tum")
-    path = folder / "trajectory_sigma.csv"
+    adjusted = read_tum(folder / names.TRAJECTORY)
+    path = folder / names.TRAJECTORY_SIGMA
     rows = [row for row in read_csv(path, MapFileError)[1:] if row]
     try:
         table = np.array(rows, dtype=np.float64).reshape(len(adjusted.stamp_s), 8)
     except ValueError:
-        raise MapFileError(f"{path}: not one line of 8 numbers per pose of trajectory.tum") from None
+        raise MapFileError(f"{path}: not one line of 8 numbers per pose of {names.TRAJECTORY}") from None
     stamp_s = adjusted.stamp_s
     poses = adjusted.map_from_vehicle
     recorded = None
     moved = poses
     if drive is not None and drive.trajectory is not None:
         recorded, flat = (
-            interpolate(one, stamp_s, float("inf"))[0]
-            for one in (drive.recorded or drive.trajectory, drive.trajectory)
+            interpolate(trajectory, stamp_s, float("inf"))[0]
+            for trajectory in (drive.recorded or drive.trajectory, drive.trajectory)
         )
         moved = flat @ inverse(recorded) @ poses
     elif drive is not None and drive.recorded is not None:
         recorded = interpolate(drive.recorded, stamp_s, float("inf"))[0]
-    return Route(stamp_s, poses, recorded, moved, table[:, 2:], table[:, 1] > 0)
+    return Route(stamp_s, poses, recorded, moved, table[:, 2:])
 
 
 def read_surface(folder: Path, map_from_vehicle: FloatArray) -> Surface | None:
     """The ground of a result under vehicle poses (F, 4, 4), None for a plane; MapFileError if damaged."""
-    path = folder / GROUND
+    path = folder / names.GROUND
     if not path.is_file():
         return None
     try:
@@ -196,27 +192,28 @@ def ground_residuals(facts: Facts) -> GroundResiduals | None:
     if facts.residuals is None or facts.route is None or not len(facts.residuals):
         return None
     residuals = facts.residuals
-    calibrations = {name: one.calibration for name, one in facts.cameras.items()}
-    names = tuple(sorted(set(residuals.camera) & calibrations.keys()))
-    if not names:
+    calibrations = {name: camera.calibration for name, camera in facts.cameras.items()}
+    cameras = tuple(sorted(set(residuals.camera) & calibrations.keys()))
+    if not cameras:
         return None
-    number = {name: n for n, name in enumerate(names)}
+    number = {name: n for n, name in enumerate(cameras)}
     of_image = np.array([number.get(name, -1) for name in residuals.camera])
     rows = np.flatnonzero(of_image[residuals.row_image] >= 0)
     row_image = residuals.row_image[rows]
     cam_from_map = cams_from_map(residuals, facts.route, calibrations)
     observed = residuals.observed_px[rows]
     off = residuals.residual_px[rows]
-    known = np.flatnonzero(of_image >= 0)
-    intrinsic = np.array([calibrations[residuals.camera[i]].info.intrinsic for i in known])
+    calibrated = np.flatnonzero(of_image >= 0)
+    intrinsic = np.array([calibrations[residuals.camera[i]].info.intrinsic for i in calibrated])
     map_from_px = np.full((len(of_image), 3, 3), np.nan)
     foot_map = np.full((len(of_image), 2), np.nan)
-    map_from_px[known] = ground_from_pinhole_px(intrinsic, cam_from_map[known])
-    foot_map[known] = camera_centre(cam_from_map[known])[:, :2]
+    map_from_px[calibrated] = ground_from_pinhole_px(intrinsic, cam_from_map[calibrated])
+    foot_map[calibrated] = camera_centre(cam_from_map[calibrated])[:, :2]
     ground = map_from_px[row_image]
-    seen, projected = (apply_in_front(ground, px[:, None])[:, 0] for px in (observed, observed + off))
+    observed_map = apply_in_front(ground, observed[:, None])[:, 0]
+    projected_map = apply_in_front(ground, (observed + off)[:, None])[:, 0]
     return GroundResiduals(
-        cameras=names,
+        cameras=cameras,
         camera=of_image[row_image],
         marking=residuals.marking[rows],
         corner=residuals.corner[rows],
@@ -225,8 +222,8 @@ def ground_residuals(facts: Facts) -> GroundResiduals | None:
         observed_px=observed,
         residual_px=off,
         distance_sigma=residuals.distance_sigma[rows],
-        range_m=np.linalg.norm(seen - foot_map[row_image], axis=1),
-        ground_m=projected - seen,
+        range_m=np.linalg.norm(observed_map - foot_map[row_image], axis=1),
+        ground_m=projected_map - observed_map,
     )
 
 

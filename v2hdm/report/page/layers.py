@@ -3,28 +3,28 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
-from xml.sax.saxutils import escape
 
 import cv2
 import numpy as np
 
-from v2hdm.errors import MapFileError, need
+from v2hdm.errors import MapFileError
 from v2hdm.geometry.geodetic import Grid, crs_of, geodetic_from_enu, utm_of
-from v2hdm.records import FloatArray, Lane, Marking, Symbol
+from v2hdm.records import SIGMAS_95, FloatArray, Lane, Marking, Symbol
 from v2hdm.report.metrics import corner_errors, match_markings, rms
 from v2hdm.report.page.facts import Facts, GroundResiduals
-from v2hdm.safe.pixels import check_raster, read_header, read_pixels
+from v2hdm.safe.pixels import read_pixels
+from v2hdm.safe.rasters import Window, background_pixels
+from v2hdm.store import names
 from v2hdm.store.files import load_json, take_array, take_text
 
 
 def jpeg(pixels: np.ndarray, quality: int) -> str:
     """An image (H, W, 3) BGR as JPEG in base64."""
     options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
-    return _coded(".jpg", pixels, *options)
+    return _coded(".jpg", pixels, options)
 
 
 def shrunk(pixels: np.ndarray, factor: float) -> np.ndarray:
@@ -39,23 +39,20 @@ def jpeg_of(path: Path, widest_px: int, quality: int) -> str | None:
     return None if pixels is None else jpeg(shrunk(pixels, min(1.0, widest_px / pixels.shape[1])), quality)
 
 
-def _coded(kind: str, pixels: np.ndarray, *options: int) -> str:
+def _coded(kind: str, pixels: np.ndarray, options: Sequence[int]) -> str:
     return base64.b64encode(cv2.imencode(kind, pixels, options)[1].tobytes()).decode("ascii")
 
 
-EXTENT = "mosaic.json"
-COMPARISON = "mosaic_before_after.png"
-
 LARGEST_BYTES = 3_500_000  # limit of the mosaic, as text in the page
-_QUALITY = 72
+_QUALITY = 72  # quality of the mosaic's WebP, of 100
 
 
 def mosaic_layer(folder: Path) -> dict[str, Any] | None:
     """The mosaic, if any: WebP in base64, bounds (west, south, east, north), m; MapFileError if damaged."""
-    if not (folder / EXTENT).is_file():
+    if not (folder / names.MOSAIC_EXTENT).is_file():
         return None
-    content = load_json(folder / EXTENT, MapFileError)
-    where = f"{folder / EXTENT}"
+    content = load_json(folder / names.MOSAIC_EXTENT, MapFileError)
+    where = f"{folder / names.MOSAIC_EXTENT}"
     bounds = take_array(content.get("bounds_m"), (4,), f"{where}: bounds_m", MapFileError)
     path = folder / Path(take_text(content.get("image"), f"{where}: image", MapFileError)).name
     coded = path.read_bytes() if path.is_file() else b""
@@ -69,99 +66,48 @@ def mosaic_layer(folder: Path) -> dict[str, Any] | None:
 
 def _webp(pixels: np.ndarray) -> str:
     """An image as WebP in base64, scaled down to the limit."""
-    while len(text := _coded(".webp", pixels, cv2.IMWRITE_WEBP_QUALITY, _QUALITY)) > LARGEST_BYTES:
+    while len(text := _coded(".webp", pixels, (cv2.IMWRITE_WEBP_QUALITY, _QUALITY))) > LARGEST_BYTES:
         pixels = shrunk(pixels, 0.9 * float(np.sqrt(LARGEST_BYTES / len(text))))
     return text
 
 
 _BACKGROUND_PX = 3000  # longer side of the background: 20 cm per pixel over 600 m
-_FINEST_M = 0.05
-_HALF_WORLD_M = 20037508.342789244  # half the side of Web Mercator's square
-_TILES = """<GDAL_WMS><Service name="TMS"><ServerUrl>{url}/${{z}}/${{x}}/${{y}}{ending}</ServerUrl></Service>
-<DataWindow><UpperLeftX>-{half}</UpperLeftX><UpperLeftY>{half}</UpperLeftY><LowerRightX>{half}</LowerRightX>
-<LowerRightY>-{half}</LowerRightY><TileLevel>{finest}</TileLevel><TileCountX>1</TileCountX>
-<TileCountY>1</TileCountY><YOrigin>top</YOrigin></DataWindow><Projection>EPSG:3857</Projection>
-<BlockSizeX>{px}</BlockSizeX><BlockSizeY>{px}</BlockSizeY><BandsCount>4</BandsCount>
-<OverviewCount>{coarser}</OverviewCount></GDAL_WMS>"""  # GDAL's description of tiles, here in a folder
-
-
-def _source(path: Path) -> dict[str, Any]:
-    """Source for rasterio: a GeoTIFF, or a folder ``z/x/y.png`` of XYZ tiles as one picture."""
-    levels = sorted(int(one.name) for one in path.glob("*") if one.name.isdecimal())
-    tile = next((path / str(levels[-1])).glob("*/*.*"), None) if levels else None
-    if tile is None:
-        if not path.is_file():
-            raise MapFileError(f"{path}: not a readable GeoTIFF or folder of XYZ tiles; check the path")
-        return {"fp": path, "driver": "GTiff"}
-    tiles = {"url": escape(path.resolve().as_uri()), "ending": tile.suffix, "half": _HALF_WORLD_M}
-    tiles |= {"px": read_header(tile).width, "finest": levels[-1], "coarser": levels[-1] - levels[0]}
-    return {"fp": _TILES.format(**tiles), "driver": "WMS"}
-
-
-@contextmanager
-def open_background(path: Path) -> Iterator[Any]:
-    """The user's GeoTIFF or XYZ tiles, open in rasterio; MapFileError if unusable."""
-    rasterio = need("rasterio", "gis", "a background", MapFileError)
-    try:
-        with rasterio.open(**_source(path)) as source:
-            if source.crs is None:
-                raise MapFileError(f"{path}: states no coordinate system; give a GeoTIFF that has one")
-            if path.is_file():
-                check_raster(source, path, MapFileError)
-            yield source
-    except (rasterio.errors.RasterioError, rasterio.errors.CRSError) as failure:
-        raise MapFileError(f"{path}: not a readable GeoTIFF or folder of XYZ tiles ({failure})") from None
+_FINEST_M = 0.05  # least side of a pixel of the background
 
 
 def background_layer(path: Path, facts: Facts) -> dict[str, Any]:
     """The user's GeoTIFF or XYZ tiles as a layer like :func:`mosaic_layer`; MapFileError if unusable."""
-    names = "rasterio", "rasterio.vrt"
-    rasterio, warped = (need(name, "gis", "a background", MapFileError) for name in names)
     origin = None if facts.hd_map is None else facts.hd_map.origin
     if origin is None:
         raise MapFileError(f"{path}: this map has no position on the earth; state the origin in drive.yaml")
     (west, south), (east, north) = _extent(facts)
-    step = max(float(max(east - west, north - south)) / _BACKGROUND_PX, _FINEST_M)
-    size = {"width": int(np.ceil((east - west) / step)), "height": int(np.ceil((north - south) / step))}
-    with open_background(path) as source:
-        # The mosaic's projection agrees with the map frame to a millimetre.
-        frame = {"crs": rasterio.crs.CRS.from_user_input(crs_of(origin))}
-        frame |= {"transform": rasterio.Affine(step, 0, west, 0, -step, north)}
-        frame["add_alpha"] = rasterio.enums.ColorInterp.alpha not in source.colorinterp
-        bilinear = rasterio.enums.Resampling.bilinear
-        with warped.WarpedVRT(source, **frame, **size, resampling=bilinear) as there:
-            bands = there.read([3, 2, 1] if source.count >= 3 else [1, 1, 1])
-            seen = there.dataset_mask()
-    if not seen.any():
-        raise MapFileError(f"{path}: does not cover this map; give a picture of its site")
-    if bands.dtype != np.uint8:
-        low, high = np.percentile(bands[:, seen > 0], (1, 99))
-        bands = np.clip((bands - low) * 255.0 / max(high - low, 1e-9), 0, 255).astype(np.uint8)
-    bounds = [west, north - step * size["height"], west + step * size["width"], north]
-    pixels = np.ascontiguousarray(np.moveaxis(np.concatenate([bands, seen[None]]), 0, 2))
-    return {"src": _webp(pixels), "type": "image/webp", "bounds": [float(one) for one in bounds]}
+    step_m = max(float(max(east - west, north - south)) / _BACKGROUND_PX, _FINEST_M)
+    width = int(np.ceil((east - west) / step_m))
+    height = int(np.ceil((north - south) / step_m))
+    # The mosaic's projection agrees with the map frame to a millimetre.
+    window = Window(crs_of(origin), float(west), float(north), step_m, width, height)
+    bounds = [west, north - step_m * height, west + step_m * width, north]
+    pixels = background_pixels(path, window)
+    return {"src": _webp(pixels), "type": "image/webp", "bounds": [float(edge) for edge in bounds]}
 
 
 def _extent(facts: Facts) -> tuple[FloatArray, FloatArray]:
     """South-west and north-east (2,), m, of the map with a margin of 50 m."""
     assert facts.hd_map is not None
-    places = [one.corners_map for one in facts.hd_map.markings]
-    places += [one.points_map for one in facts.hd_map.lanes]
-    places += [] if facts.route is None else [facts.route.map_from_vehicle[:, :2, 3]]
-    both = np.concatenate([*places, np.zeros((0 if places else 1, 2))])
-    return both.min(axis=0) - 50.0, both.max(axis=0) + 50.0
+    shapes = [marking.corners_map for marking in facts.hd_map.markings]
+    shapes += [lane.points_map for lane in facts.hd_map.lanes]
+    if facts.route is not None:
+        shapes.append(facts.route.map_from_vehicle[:, :2, 3])
+    points = np.concatenate(shapes or [np.zeros((1, 2))])
+    return points.min(axis=0) - 50.0, points.max(axis=0) + 50.0
 
 
 def comparison(folder: Path) -> str | None:
     """The ground before and after the optimisation, JPEG in base64; None if not in the folder."""
-    return jpeg_of(folder / COMPARISON, 1400, 84)
+    return jpeg_of(folder / names.COMPARISON, 1400, 84)
 
 
-SIGMAS_95 = 2.4477
-"""Semi-axes of the 95 % ellipse of a two-dimensional normal error, in standard deviations: the root of the
-chi-square quantile with two degrees of freedom."""
-
-_LEAST_ARROW_SIGHTINGS = 4
+_LEAST_ARROW_SIGHTINGS = 4  # least number of sightings of a marking whose mean residual is drawn
 _SHARED = (".geojson", ".gpkg", ".osm", ".dxf", ".csv", ".xodr", ".tif", ".tum", ".yaml", ".json", ".log")
 """Suffixes of the result files that the page links."""
 
@@ -183,43 +129,48 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
     if hd_map is None:
         return {}
     named: list[Marking | Symbol | Lane] = [*hd_map.markings, *hd_map.symbols, *hd_map.lanes]
-    kinds = sorted({one.kind for one in named})
+    kinds = sorted({feature.kind for feature in named})
     arrows = _arrows(residuals)
     errors = _errors(facts)
     markings = []
     for number, marking in enumerate(hd_map.markings):
-        found = _feature(marking, kinds, "c", marking.corners_map)
+        feature = _feature(marking, kinds, "c", marking.corners_map)
         axes = ellipses(marking)
         if axes is not None:
-            found["e"] = np.round(axes, 5).tolist()
+            feature["e"] = np.round(axes, 5).tolist()
         if marking.relative_sigma_m is not None:
-            found["r"] = round(SIGMAS_95 * marking.relative_sigma_m, 5)
+            feature["r"] = round(SIGMAS_95 * marking.relative_sigma_m, 5)
         if number in errors:
-            found["t"] = round(errors[number], 5)
+            feature["t"] = round(errors[number], 5)
         if marking.id in arrows:
-            found["a"] = arrows[marking.id]
-        markings.append(found)
+            feature["a"] = arrows[marking.id]
+        markings.append(feature)
     route = facts.route
     return {
         "kinds": kinds,
         "cameras": list(residuals.cameras) if residuals else [],
         "markings": markings,
-        "lanes": [_feature(one, kinds, "p", one.points_map) for one in hd_map.lanes],
+        "lanes": [_feature(lane, kinds, "p", lane.points_map) for lane in hd_map.lanes],
         "symbols": [
-            _feature(one, kinds, "p", one.outline_map)
-            | {"e": None if one.sigma_m is None else round(SIGMAS_95 * one.sigma_m, 5)}
-            for one in hd_map.symbols
+            _feature(symbol, kinds, "p", symbol.outline_map)
+            | {"e": None if symbol.sigma_m is None else round(SIGMAS_95 * symbol.sigma_m, 5)}
+            for symbol in hd_map.symbols
         ],
         "excluded": [
-            {"k": one.kind, "p": rounded(one.position_map[None])[0], "n": one.sightings, "why": one.reason}
-            for one in facts.excluded
+            {
+                "k": candidate.kind,
+                "p": rounded(candidate.position_map[None])[0],
+                "n": candidate.sightings,
+                "why": candidate.reason,
+            }
+            for candidate in facts.excluded
         ],
         "checks": _checks(facts),
         "changes": _changes(facts),
         "truth": facts.truth
         and {
-            "markings": [rounded(one.corners_map) for one in facts.truth.map.markings],
-            "lanes": [rounded(one.points_map) for one in facts.truth.map.lanes],
+            "markings": [rounded(marking.corners_map) for marking in facts.truth.map.markings],
+            "lanes": [rounded(lane.points_map) for lane in facts.truth.map.lanes],
         },
         "route": {
             "adjusted": [] if route is None else rounded(route.map_from_vehicle[:, :2, 3]),
@@ -227,8 +178,10 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
         },
         "mosaic": mosaic_layer(facts.folder),
         "systems": _systems(facts),
-        "suspicion": {str(one["marking"]): float(one["p"]) for one in facts.best.get("suspicious") or []},
-        "files": sorted(one.name for one in facts.folder.iterdir() if one.suffix in _SHARED),
+        "suspicion": {
+            str(suspect["marking"]): float(suspect["p"]) for suspect in facts.best.get("suspicious") or []
+        },
+        "files": sorted(path.name for path in facts.folder.iterdir() if path.suffix in _SHARED),
     }
 
 
@@ -237,7 +190,9 @@ def _systems(facts: Facts) -> list[dict[str, Any]]:
     hd_map = facts.hd_map
     if hd_map is None or hd_map.origin is None:
         return []
-    x, y = (grid.ravel() for grid in np.meshgrid(*np.linspace(*_extent(facts), 7).T))
+    south_west, north_east = _extent(facts)
+    east_m, north_m = np.linspace(south_west, north_east, 7).T
+    x, y = (grid.ravel() for grid in np.meshgrid(east_m, north_m))
     places_map = np.column_stack([x, y, np.zeros_like(x)])
     code = utm_of(hd_map.origin)
     earth = geodetic_from_enu(hd_map.origin, places_map)
@@ -256,9 +211,14 @@ def _systems(facts: Facts) -> list[dict[str, Any]]:
 
 
 def _feature(
-    one: Marking | Symbol | Lane, kinds: list[str], key: str, points_map: FloatArray
+    feature: Marking | Symbol | Lane, kinds: list[str], key: str, points_map: FloatArray
 ) -> dict[str, Any]:
-    return {"id": one.id, "k": kinds.index(one.kind), key: rounded(points_map), "n": one.sightings}
+    return {
+        "id": feature.id,
+        "k": kinds.index(feature.kind),
+        key: rounded(points_map),
+        "n": feature.sightings,
+    }
 
 
 def rounded(points: FloatArray, digits: int = 3) -> list[list[float]]:
@@ -273,29 +233,32 @@ def _errors(facts: Facts) -> dict[int, float]:
         return {}
     mapped = facts.hd_map.markings
     true = facts.truth.map.markings
-    pairs = zip(*match_markings(mapped, true), strict=True)
-    return {row: rms(corner_errors([mapped[row]], [true[column]])) for row, column in pairs}
+    rows, columns = match_markings(mapped, true)
+    return {
+        row: rms(corner_errors([mapped[row]], [true[column]]))
+        for row, column in zip(rows, columns, strict=True)
+    }
 
 
 def _checks(facts: Facts) -> list[dict[str, Any]]:
     """Surveyed check points: position, and map minus survey."""
     checks = []
-    for one in facts.check_points:
-        place = [_number(one.get(key)) for key in ("x_map_m", "y_map_m")]
-        off = [_number(one.get(key)) for key in ("dx_m", "dy_m")]
+    for point in facts.check_points:
+        place = [_number(point.get(key)) for key in ("x_map_m", "y_map_m")]
+        off = [_number(point.get(key)) for key in ("dx_m", "dy_m")]
         if None not in place:
-            inside = one.get("inside_95_percent", "")
-            checks.append({"id": one.get("id", ""), "p": place, "off": off, "inside": inside})
+            inside = point.get("inside_95_percent", "")
+            checks.append({"id": point.get("id", ""), "p": place, "off": off, "inside": inside})
     return checks
 
 
 def _changes(facts: Facts) -> list[dict[str, Any]]:
     """Changes from the base map, as listed in ``metrics.json``."""
     return [
-        {name: one[name] for name in ("id", "fate", "shift_m", "shift_sigma_m", "probability", "views")}
-        | {"k": one["class"], "n": one["found"], "p": one["after_map"] or one["before_map"]}
-        | {"before": one["before_map"] or []}
-        for one in (facts.metrics.get("changes") or {}).get("listed") or []
+        {name: change[name] for name in ("id", "fate", "shift_m", "shift_sigma_m", "probability", "views")}
+        | {"k": change["class"], "n": change["found"], "p": change["after_map"] or change["before_map"]}
+        | {"before": change["before_map"] or []}
+        for change in (facts.metrics.get("changes") or {}).get("listed") or []
     ]
 
 
@@ -315,13 +278,14 @@ def _arrows(residuals: GroundResiduals | None) -> dict[int, list[list[float]]]:
         return {}
     good = residuals.is_point & np.isfinite(residuals.ground_m).all(axis=1) & (residuals.marking > 0)
     weight = 1.0 / np.maximum(residuals.range_m[good], 1.0) ** 4
-    count = len(residuals.cameras)
-    cell = residuals.marking[good] * count + residuals.camera[good]
+    cameras = len(residuals.cameras)
+    cell = residuals.marking[good] * cameras + residuals.camera[good]
     total = np.bincount(cell, weight)
-    seen = np.bincount(cell)
+    count = np.bincount(cell)
     sums = np.stack([np.bincount(cell, weight * residuals.ground_m[good, a]) for a in (0, 1)], axis=1)
     out: dict[int, list[list[float]]] = {}
-    for one in np.flatnonzero(seen >= _LEAST_ARROW_SIGHTINGS).tolist():
-        mean = np.round(sums[one] / total[one], 5).tolist()
-        out.setdefault(one // count, []).append([one % count, *mean, int(seen[one])])
+    for index in np.flatnonzero(count >= _LEAST_ARROW_SIGHTINGS).tolist():
+        marking, camera = divmod(index, cameras)
+        mean = np.round(sums[index] / total[index], 5).tolist()
+        out.setdefault(marking, []).append([camera, *mean, int(count[index])])
     return out

@@ -14,17 +14,18 @@ from v2hdm.geometry.lens import distort_points
 from v2hdm.records import FloatArray, Image
 from v2hdm.report.page.facts import Facts, cams_from_map
 from v2hdm.report.page.layers import jpeg, jpeg_of, rounded, shrunk
+from v2hdm.store.names import overlay_file
 
 BUDGET_BYTES = 8_000_000  # limit of all pictures, as text in the page: reports stay below 15 MB
 PER_CAMERA = 2  # pictures per marking and camera: the nearest, and one from the middle of its sightings
-_USUAL_BYTES = 5_000  # of one picture, to estimate how many fit
-_LONGEST_PX = 320
-_LEAST_PX = 96
+_USUAL_BYTES = 5_000  # usual size of a picture, to estimate how many fit
+_LONGEST_PX = 320  # longer side of a picture at most
+_LEAST_PX = 96  # least side of a cut, px of the image
 _MARGIN = 0.45  # margin around a marking, relative to its size
-_QUALITY = 72
+_QUALITY = 72  # quality of a picture's JPEG, of 100
 
-_NEAR_M = 3.0
-_FAR_M = 14.0  # range ahead of a camera for features other than markings
+_NEAR_M = 3.0  # least depth at which a feature other than a marking is pictured
+_FAR_M = 14.0  # largest depth at which a feature other than a marking is pictured
 
 
 @dataclass(frozen=True)
@@ -49,29 +50,29 @@ def pictures(facts: Facts) -> dict[str, list[dict[str, Any]]]:
     if facts.drive is None or facts.residuals is None or facts.route is None or facts.hd_map is None:
         return {}
     images = {facts.drive.name_of(image.path): image for image in facts.drive.images}
-    calibrations = {name: one.calibration for name, one in facts.cameras.items()}
+    calibrations = {name: camera.calibration for name, camera in facts.cameras.items()}
     cam_from_map = cams_from_map(facts.residuals, facts.route, calibrations)
     cuts = [*_of_markings(facts)]
     for symbol in facts.hd_map.symbols:
         cuts += _of_place(facts, cam_from_map, f"s{symbol.id}", symbol.outline_map)
-    for number, one in enumerate(facts.excluded):
-        cuts += _of_place(facts, cam_from_map, f"x{number}", one.position_map[None])
+    for number, candidate in enumerate(facts.excluded):
+        cuts += _of_place(facts, cam_from_map, f"x{number}", candidate.position_map[None])
     cuts = [cut for cut in cuts if cut.image in images]
     by_image: dict[str, list[_Cut]] = {}
     for cut in sorted(cuts, key=lambda cut: cut.rank)[: BUDGET_BYTES // _USUAL_BYTES]:
         by_image.setdefault(cut.image, []).append(cut)
-    made: list[tuple[_Cut, dict[str, Any]]] = []
-    for name, wanted in by_image.items():
+    drawn: list[tuple[_Cut, dict[str, Any]]] = []
+    for name, cuts_of_image in by_image.items():
         image = images[name]
         pixels = read_image(image, facts.drive.cameras[image.camera])
-        for cut in wanted:
+        for cut in cuts_of_image:
             picture = _cut_out(pixels, facts, image, cam_from_map[cut.row], cut)
             if picture is not None:
-                made.append((cut, {**picture, "image": name}))
+                drawn.append((cut, {**picture, "image": name}))
     # The best picture of every feature first, then the second best, up to the limit.
     out: dict[str, list[dict[str, Any]]] = {}
     spent = 0
-    for cut, picture in sorted(made, key=lambda one: one[0].rank):
+    for cut, picture in sorted(drawn, key=lambda pair: pair[0].rank):
         spent += len(picture["src"])
         if spent > BUDGET_BYTES:
             break
@@ -84,12 +85,13 @@ def _of_markings(facts: Facts) -> Iterable[_Cut]:
     residuals = facts.residuals
     assert residuals is not None
     assert facts.hd_map is not None
-    infos = {name: one.calibration.info for name, one in facts.cameras.items()}
-    corners = {one.id: one.corners_map for one in facts.hd_map.markings}
+    infos = {name: camera.calibration.info for name, camera in facts.cameras.items()}
+    corners = {marking.id: marking.corners_map for marking in facts.hd_map.markings}
     pairs = np.stack([residuals.marking, residuals.row_image], axis=1)
     order = np.lexsort((pairs[:, 1], pairs[:, 0]))
     starts = np.flatnonzero(np.r_[True, (np.diff(pairs[order], axis=0) != 0).any(axis=1)])
-    found: dict[int, dict[str, list[tuple[float, int, FloatArray]]]] = {}
+    # By marking and camera: the sightings' sizes, their rows, and the corners that were detected, px.
+    sightings_of: dict[int, dict[str, list[tuple[float, int, FloatArray]]]] = {}
     for rows in np.split(order, starts[1:]):
         marking, row = pairs[rows[0]].tolist()
         camera = residuals.camera[row]
@@ -100,10 +102,10 @@ def _of_markings(facts: Facts) -> Iterable[_Cut]:
             continue
         seen_px = distort_points(infos[camera], points)
         size = float(np.ptp(seen_px, axis=0).prod()) * len(points)
-        found.setdefault(marking, {}).setdefault(camera, []).append((size, row, seen_px))
-    for marking, by_camera in found.items():
+        sightings_of.setdefault(marking, {}).setdefault(camera, []).append((size, row, seen_px))
+    for marking, by_camera in sightings_of.items():
         for number, sightings in enumerate(by_camera.values()):
-            ranked = sorted(sightings, key=lambda one: -one[0])
+            ranked = sorted(sightings, key=lambda sighting: -sighting[0])
             chosen = [ranked[0], ranked[len(ranked) // 2]][: min(PER_CAMERA, len(ranked))]
             for step, (_, row, seen_px) in enumerate(chosen):
                 rank = step * len(by_camera) + number
@@ -116,15 +118,15 @@ def _of_place(facts: Facts, cam_from_map: FloatArray, key: str, shape_map: Float
     assert residuals is not None
     centre = shape_map.mean(axis=0)
     rank = 0
-    for name, one in facts.cameras.items():
+    for name, camera_facts in facts.cameras.items():
         rows = np.flatnonzero([camera == name for camera in residuals.camera])
-        info = one.calibration.info
+        info = camera_facts.calibration.info
         px, depth_m = project_ground(info.intrinsic, cam_from_map[rows], centre[None])
         size = np.array([info.width, info.height])
         inside = ((px[:, 0] > 0.05 * size) & (px[:, 0] < size - 0.05 * size)).all(axis=1)
-        near = inside & (depth_m[:, 0] > _NEAR_M) & (depth_m[:, 0] < _FAR_M)
-        if near.any():
-            best = rows[near][np.argmin(depth_m[near, 0])]
+        in_range = inside & (depth_m[:, 0] > _NEAR_M) & (depth_m[:, 0] < _FAR_M)
+        if in_range.any():
+            best = rows[in_range][np.argmin(depth_m[in_range, 0])]
             yield _Cut(key, rank, residuals.image[best], int(best), shape_map, np.empty((0, 2)))
             rank += 1
 
@@ -170,5 +172,5 @@ def _cut_out(
 
 def overlays(facts: Facts) -> Mapping[str, str]:
     """The folder's ``overlay_<camera>.png`` by camera, as JPEG in base64."""
-    found = {name: jpeg_of(facts.folder / f"overlay_{name}.png", 1200, 82) for name in facts.cameras}
-    return {name: picture for name, picture in found.items() if picture is not None}
+    jpegs = {name: jpeg_of(facts.folder / overlay_file(name), 1200, 82) for name in facts.cameras}
+    return {name: picture for name, picture in jpegs.items() if picture is not None}

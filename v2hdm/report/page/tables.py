@@ -12,10 +12,10 @@ import numpy as np
 from v2hdm.geometry.ipm import angle_sigmas, centre_sigmas, mounting_angles
 from v2hdm.geometry.planar import length_along
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.records import FloatArray, Lane, Marking, Symbol
+from v2hdm.records import SIGMAS_95, FloatArray, Lane, Marking, Symbol
 from v2hdm.report.metrics import corner_errors, match_markings
 from v2hdm.report.page.facts import CameraFacts, Facts
-from v2hdm.report.page.layers import SIGMAS_95, ellipses
+from v2hdm.report.page.layers import ellipses
 from v2hdm.report.terminal import METHODS, figure_columns
 
 
@@ -68,7 +68,7 @@ def pair_table(content: Mapping[str, Any]) -> Table | None:
 
 def _plain(value: object) -> str:
     if isinstance(value, list | tuple):
-        return ", ".join(_plain(one) for one in value)
+        return ", ".join(_plain(part) for part in value)
     return number(value) if isinstance(value, float) else str(value)
 
 
@@ -79,8 +79,9 @@ _Mapped = TypeVar("_Mapped", bound=Marking | Symbol | Lane)
 
 def half_axes_m(markings: Iterable[Marking]) -> FloatArray:
     """Semi-major axis (4 M,), m, of the 95 % ellipse of every corner that has one."""
-    found = [ellipses(one) for one in markings]
-    return np.concatenate([one[:, 0] for one in found if one is not None] or [np.empty(0)])
+    of_markings = [ellipses(marking) for marking in markings]
+    axes = [of_corners[:, 0] for of_corners in of_markings if of_corners is not None]
+    return np.concatenate(axes or [np.empty(0)])
 
 
 def relative_m(markings: Iterable[Marking]) -> FloatArray:
@@ -125,12 +126,19 @@ def accuracy_table(facts: Facts) -> Table | None:
     """Formal corner accuracy by class: median and 95th percentile."""
     if facts.hd_map is None or not len(half_axes_m(facts.hd_map.markings)):
         return None
-    by_kind = _by_kind(facts.hd_map.markings)
+    by_kind: dict[str, Sequence[Marking]] = {**_by_kind(facts.hd_map.markings)}
+    if len(by_kind) > 1:
+        by_kind["all"] = facts.hd_map.markings
     rows = []
-    for name, own in [*by_kind.items(), *([("all", facts.hd_map.markings)] if len(by_kind) > 1 else [])]:
-        sizes_m = (relative_m(own), half_axes_m(own))
-        shares = [np.percentile(one, at) if len(one) else None for one in sizes_m for at in (50, 95)]
-        rows.append([name_of(name), str(len(own)), *(number(one, 1, 100) for one in shares)])
+    for name, markings in by_kind.items():
+        sizes_m = (relative_m(markings), half_axes_m(markings))
+        percentiles_m = [
+            np.percentile(values, percent) if len(values) else None
+            for values in sizes_m
+            for percent in (50, 95)
+        ]
+        cells = [number(value_m, 1, 100) for value_m in percentiles_m]
+        rows.append([name_of(name), str(len(markings)), *cells])
     kinds = ("relative, median", "relative, 95th", "absolute, median", "absolute, 95th")
     return table(("class", "markings", *kinds), rows)
 
@@ -141,13 +149,14 @@ def truth_table(facts: Facts) -> Table | None:
         return None
     by_class = facts.best.get("by_class", {})
     rows = []
-    for name, own in [*_by_kind(facts.hd_map.markings).items(), ("all", facts.hd_map.markings)]:
-        found = facts.best if name == "all" else by_class.get(name, {})
-        recall = None if name == "all" else found.get("recall")
-        errors = [number(found.get(key), 2, 100) for key in ("corner_rmse_m", "corner_bias_m")]
-        false = number(found.get("false_markings"), 0)
-        inside = number(_inside(own, facts), 0, 100)
-        rows.append([name_of(name), str(len(own)), false, number(recall, 1, 100), *errors, inside])
+    by_kind: dict[str, Sequence[Marking]] = {**_by_kind(facts.hd_map.markings)}
+    for name, markings in [*by_kind.items(), ("all", facts.hd_map.markings)]:
+        figures = facts.best if name == "all" else by_class.get(name, {})
+        recall = None if name == "all" else figures.get("recall")
+        errors = [number(figures.get(key), 2, 100) for key in ("corner_rmse_m", "corner_bias_m")]
+        false = number(figures.get("false_markings"), 0)
+        inside = number(_inside(markings, facts), 0, 100)
+        rows.append([name_of(name), str(len(markings)), false, number(recall, 1, 100), *errors, inside])
     errors_of = ("false", "recall (%)", "RMSE (cm)", "bias (cm)", "inside 95 % ellipse (%)")
     return table(("class", "markings", *errors_of), rows)
 
@@ -165,39 +174,45 @@ def _inside(markings: Sequence[Marking], facts: Facts) -> float | None:
     return None if len(squared) < _LEAST_FOR_SHARE else float(np.mean(np.array(squared) <= SIGMAS_95**2))
 
 
-_CHECK_COLUMNS: Mapping[str, tuple[str, float | None, int]] = {
-    "id": ("point", None, 0),
-    "description": ("description", None, 0),
-    "marking": ("marking", None, 0),
-    "class": ("class", None, 0),
-    "corner": ("corner", 1.0, 0),
-    "dx_m": ("east (cm)", 100.0, 1),
-    "dy_m": ("north (cm)", 100.0, 1),
-    "distance_m": ("distance (cm)", 100.0, 1),
-    "normalised_error": ("in σ", 1.0, 1),
-    "inside_95_percent": ("inside 95 %", None, 0),
-    "dz_m": ("up (cm)", 100.0, 1),
-    "not_compared_because": ("not compared because", None, 0),
+class _CheckColumn(NamedTuple):
+    heading: str
+    factor: float | None = None  # from the file's unit to the column's; None for text
+    digits: int = 0
+
+
+_CHECK_COLUMNS: Mapping[str, _CheckColumn] = {
+    "id": _CheckColumn("point"),
+    "description": _CheckColumn("description"),
+    "marking": _CheckColumn("marking"),
+    "class": _CheckColumn("class"),
+    "corner": _CheckColumn("corner", 1.0),
+    "dx_m": _CheckColumn("east (cm)", 100.0, 1),
+    "dy_m": _CheckColumn("north (cm)", 100.0, 1),
+    "distance_m": _CheckColumn("distance (cm)", 100.0, 1),
+    "normalised_error": _CheckColumn("in σ", 1.0, 1),
+    "inside_95_percent": _CheckColumn("inside 95 %"),
+    "dz_m": _CheckColumn("up (cm)", 100.0, 1),
+    "not_compared_because": _CheckColumn("not compared because"),
 }
-"""Heading, factor (None for text) and digits of columns of ``check_points.csv``."""
+"""How the page shows columns of ``check_points.csv``."""
 
 
 def check_point_table(facts: Facts) -> Table | None:
     """Independent surveyed points against the map, from ``check_points.csv``."""
     rows = facts.check_points
-    shown = {name: one for name, one in _CHECK_COLUMNS.items() if any(row.get(name) for row in rows)}
-    if not shown:
+    columns = {name: column for name, column in _CHECK_COLUMNS.items() if any(row.get(name) for row in rows)}
+    if not columns:
         return None
-    cells = [[_check_cell(row.get(name, ""), *one[1:]) for name, one in shown.items()] for row in rows]
-    headings, factors, _ = zip(*shown.values(), strict=True)
-    return Table(headings, cells, [factor is not None for factor in factors])
+    headings = [column.heading for column in columns.values()]
+    cells = [[_check_cell(row.get(name, ""), column) for name, column in columns.items()] for row in rows]
+    return Table(headings, cells, [column.factor is not None for column in columns.values()])
 
 
-def _check_cell(text: str, factor: float | None, digits: int) -> str:
-    if factor is None:
+def _check_cell(text: str, column: _CheckColumn) -> str:
+    if column.factor is None:
         return text
     try:
-        return number(float(text), digits, factor)
+        return number(float(text), column.digits, column.factor)
     except ValueError:
         return "–"
 
@@ -210,18 +225,18 @@ def content_table(facts: Facts) -> Table | None:
     drawn: dict[str, Sequence[Marking | Symbol | Lane]] = {
         "marking": facts.hd_map.markings, "symbol": facts.hd_map.symbols, "lane line": facts.hd_map.lanes
     }  # fmt: skip
-    for form, every in drawn.items():
-        for name, own in _by_kind(every).items():
-            lanes = [one for one in own if isinstance(one, Lane)]
-            length = number(sum(length_along(one.points_map)[-1] for one in lanes) if lanes else None, 1)
-            sightings = number(float(np.median([one.sightings for one in own])), 0)
-            rows.append([name_of(name), form, str(len(own)), length, sightings])
+    for form, drawn_as_form in drawn.items():
+        for name, features in _by_kind(drawn_as_form).items():
+            lanes = [feature for feature in features if isinstance(feature, Lane)]
+            length = number(sum(length_along(lane.points_map)[-1] for lane in lanes) if lanes else None, 1)
+            sightings = number(float(np.median([feature.sightings for feature in features])), 0)
+            rows.append([name_of(name), form, str(len(features)), length, sightings])
     return table(("class", "as", "count", "length (m)", "sightings"), rows, words=2)
 
 
 def reason_table(facts: Facts) -> Table:
     """Reasons for exclusion, most frequent first."""
-    counts = Counter(one.reason for one in facts.excluded).most_common()
+    counts = Counter(candidate.reason for candidate in facts.excluded).most_common()
     return table(("reason", "candidates"), [[reason, str(count)] for reason, count in counts])
 
 
@@ -238,15 +253,19 @@ def method_table(facts: Facts) -> Table | None:
     return table(("", "method", "markings", *columns), rows, words=2)
 
 
+_FORMERLY = {"unobservable": "untold"}
+"""What older results call a list of findings."""
+
+
 def finding_rows(verdict: Mapping[str, Any], which: str) -> tuple[tuple[str, ...], ...]:
     """Status, check, subject, measured value, limit and sentence of the findings ``which``."""
     rows = []
-    for one in verdict.get(which) or []:
-        unit = f" {one['unit']}" if one.get("unit") else ""
-        value, limit = (number(one.get(key)) for key in ("value", "limit"))
-        outcome = "untold" if which == "untold" else str(one["status"])
+    for finding in verdict.get(which) or verdict.get(_FORMERLY.get(which, which)) or []:
+        unit = f" {finding['unit']}" if finding.get("unit") else ""
+        value, limit = (number(finding.get(key)) for key in ("value", "limit"))
+        outcome = which if which == "unobservable" else str(finding["status"])
         measured = [text if text == "–" else f"{text}{unit}" for text in (value, limit)]
-        rows.append((outcome, str(one["check"]), str(one["about"]), *measured, str(one["says"])))
+        rows.append((outcome, str(finding["check"]), str(finding["about"]), *measured, str(finding["says"])))
     return tuple(rows)
 
 
@@ -255,16 +274,16 @@ def timing_table(facts: Facts) -> Table | None:
     seconds = facts.metrics.get("seconds") or {}
     if not seconds:
         return None
-    steps = seconds | {"total": sum(float(one) for one in seconds.values())}
+    steps = seconds | {"total": sum(float(duration_s) for duration_s in seconds.values())}
     return table(("step", "s"), [[name, number(float(value), 1)] for name, value in steps.items()])
 
 
-def _by_kind(own: Sequence[_Mapped]) -> dict[str, list[_Mapped]]:
+def _by_kind(features: Sequence[_Mapped]) -> dict[str, list[_Mapped]]:
     """Features by class, most frequent first."""
-    found: dict[str, list[_Mapped]] = {}
-    for one in own:
-        found.setdefault(one.kind, []).append(one)
-    return dict(sorted(found.items(), key=lambda pair: -len(pair[1])))
+    by_kind: dict[str, list[_Mapped]] = {}
+    for feature in features:
+        by_kind.setdefault(feature.kind, []).append(feature)
+    return dict(sorted(by_kind.items(), key=lambda pair: -len(pair[1])))
 
 
 class CameraPage(NamedTuple):
@@ -281,20 +300,21 @@ def camera_pages(facts: Facts, pictures: Mapping[str, str]) -> tuple[CameraPage,
     """One entry per calibrated camera."""
     extrinsics = facts.metrics.get("extrinsics") or {}
     out = []
-    for name, one in facts.cameras.items():
-        found = extrinsics.get(name, {})
-        info = one.calibration.info
-        words = str(found.get("certainty") or "").removeprefix(f"{name}: ")
+    for name, camera in facts.cameras.items():
+        extrinsic = extrinsics.get(name, {})
+        info = camera.calibration.info
+        words = str(extrinsic.get("certainty") or "").removeprefix(f"{name}: ")
         lens = (
             f"{info.width} × {info.height} px, focal length {info.intrinsic[0, 0]:.0f} px, "
             f"{name_of(info.distortion_model)}"
         )
-        out.append(CameraPage(name, words, lens, _mounting(one, found), pictures.get(name)))
+        out.append(CameraPage(name, words, lens, _mounting(camera, extrinsic), pictures.get(name)))
     return tuple(out)
 
 
-def _mounting(one: CameraFacts, found: Mapping[str, Any]) -> Table:
-    calibration = one.calibration
+def _mounting(camera: CameraFacts, extrinsic: Mapping[str, Any]) -> Table:
+    """A camera's calibration; ``extrinsic`` are its figures in ``metrics.json``."""
+    calibration = camera.calibration
     matrix = calibration.cam_from_vehicle
     covariance = calibration.covariance
     centre = camera_centre(matrix)
@@ -304,20 +324,20 @@ def _mounting(one: CameraFacts, found: Mapping[str, Any]) -> Table:
     angle_sigma = unknown if covariance is None else np.rad2deg(angle_sigmas(matrix, covariance))
     rows = []
     for n, (axis, key) in enumerate((("forward", "x"), ("left", "y"), ("up", "z"))):
-        changed = _change(found.get(f"{key}_change_m"), 1e3, 0, " mm")
+        changed = _change(extrinsic.get(f"{key}_change_m"), 1e3, 0, " mm")
         value = number(centre[n], 3)
         sigma = number(centre_sigma[n], 1, 1e3)
         rows.append([f"centre {axis}", f"{value} m", f"{sigma} mm", changed])
     for n, (axis, key) in enumerate((("roll", "roll"), ("pitch, down", "pitch"), ("yaw, left", "yaw"))):
-        changed = _change(found.get(f"{key}_change_deg"), 1.0, 2, "°")
+        changed = _change(extrinsic.get(f"{key}_change_deg"), 1.0, 2, "°")
         rows.append([axis, f"{number(angles[n], 3)}°", f"{number(angle_sigma[n], 3)}°", changed])
-    if one.clock_offset_s is not None:
-        offset = number(one.clock_offset_s, 1, 1e3)
-        sigma = number(one.clock_sigma_s, 1, 1e3)
+    if camera.clock_offset_s is not None:
+        offset = number(camera.clock_offset_s, 1, 1e3)
+        sigma = number(camera.clock_sigma_s, 1, 1e3)
         rows.append(["clock, images later", f"{offset} ms", f"{sigma} ms", "–"])
-    if one.read_out_s is not None:
-        read_out = number(one.read_out_s, 1, 1e3)
-        sigma = number(one.read_out_sigma_s, 1, 1e3)
+    if camera.read_out_s is not None:
+        read_out = number(camera.read_out_s, 1, 1e3)
+        sigma = number(camera.read_out_sigma_s, 1, 1e3)
         rows.append(["read-out, first row to last", f"{read_out} ms", f"{sigma} ms", "–"])
     return table(("", "value", "± 1 σ", "change"), rows)
 

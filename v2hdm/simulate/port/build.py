@@ -74,6 +74,8 @@ def calibrate(
 
 
 _IPMS = ("calibrated", "estimated")
+
+# The ports' place on the earth: chosen, on the coast of China; the epoch is that of the coordinates.
 ORIGIN = GeodeticOrigin(latitude_deg=29.95, longitude_deg=122.05, altitude_m=12.0, epoch=2026.0)
 
 # Independent random streams of one seed, so that a change to one part leaves the others alone.
@@ -147,7 +149,7 @@ class Port:
         return Motion(velocity_cam=(vx, vy, vz), angular_velocity_cam=(wx, wy, wz), exposure_s=exposure_s)
 
 
-_SHORTEST_ROUTE_M = 25.0  # obstacles keep 12 m from either end
+_SHORTEST_ROUTE_M = 25.0  # least length of a route: obstacles keep 12 m from either end
 
 
 def _session_seed(config: PortConfig, part: int) -> list[int]:
@@ -163,11 +165,11 @@ def _surveyed_cameras(config: PortConfig) -> dict[str, Camera]:
     for name, camera in sorted(config.cameras.items()):
         info = camera_info(name, camera)
         mount = camera.mount
-        own, own_roi = calibrate(info, mount, config.calibration, rng)
+        calibrated, calibrated_roi = calibrate(info, mount, config.calibration, rng)
         borrowed, borrowed_roi = calibrate(info, camera.borrowed_mount, config.calibration, rng)
         prior = CentrePrior(np.array([mount.x_m, mount.y_m, mount.z_m]) + rng.normal(0.0, sigma), sigma)
-        roi_vehicle = own_roi if config.initial_ipm == "calibrated" else borrowed_roi
-        ipm = {"calibrated": own, "estimated": borrowed}
+        roi_vehicle = calibrated_roi if config.initial_ipm == "calibrated" else borrowed_roi
+        ipm = {"calibrated": calibrated, "estimated": borrowed}
         surveyed[name] = Camera(info, ipm, config.initial_ipm, roi_vehicle, prior)
     return surveyed
 
@@ -206,14 +208,17 @@ def _raised(hd_map: HDMap, relief: Relief | None) -> HDMap:
     """The map with the heights of its ground."""
     if relief is None:
         return hd_map
-    markings = (replace(one, heights_m=relief.height_m(one.corners_map)) for one in hd_map.markings)
-    lanes = (replace(one, heights_m=relief.height_m(one.points_map)) for one in hd_map.lanes)
+    markings = (
+        replace(marking, heights_m=relief.height_m(marking.corners_map)) for marking in hd_map.markings
+    )
+    lanes = (replace(lane, heights_m=relief.height_m(lane.points_map)) for lane in hd_map.lanes)
     return replace(hd_map, markings=tuple(markings), lanes=tuple(lanes))
 
 
 def _check(config: PortConfig) -> None:
     """Refuse values that would fail far from their cause; raises ConfigError."""
-    route, pieces = config.route, config.route.pieces
+    route = config.route
+    pieces = route.pieces
     rules: list[tuple[Any, str]] = [
         (config.cameras, "cameras: none given; add at least one"),
         (config.initial_ipm in _IPMS, "initial_ipm: choose 'calibrated' or 'estimated'"),

@@ -20,7 +20,7 @@ from v2hdm.errors import DriveError
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.planar import inside_convex
 from v2hdm.geometry.rigid import camera_centre, ground_in_vehicle
-from v2hdm.io.drive.folder import DRIVE_FILE, TRUTH_FOLDER
+from v2hdm.io.description import DRIVE_FILE, TRUTH_FOLDER
 from v2hdm.io.drive.writing import write_drive, write_truth
 from v2hdm.io.trajectory import read_image_list
 from v2hdm.progress import Steps
@@ -36,8 +36,9 @@ from v2hdm.store.files import whole_file
 from v2hdm.store.folders import note_use
 from v2hdm.workers import share_out
 
+# By the truth, an image shows ground points as far from its camera as this, and of this depth or more.
 _FARTHEST_M = 40.0
-_NEAR_M = 0.3
+_NEAR_M = 0.3  # least depth
 
 
 def points_seen(
@@ -49,21 +50,22 @@ def points_seen(
 ) -> BoolArray:
     """Flags (N,) of ground points (N, 2) that an image shows: inside its border, within 40 m, not hidden."""
     centre = camera_centre(cam_from_map)
-    seen = np.hypot(*(points_map - centre[:2]).T) < _FARTHEST_M
-    seen[seen] = inside_image(info, cam_from_map, points_map[seen], relief)
-    near = []
+    offset_map = points_map - centre[:2]
+    visible = np.hypot(offset_map[:, 0], offset_map[:, 1]) < _FARTHEST_M
+    visible[visible] = inside_image(info, cam_from_map, points_map[visible], relief)
+    occluders = []
     for box in boxes:
         # Before the camera, near enough, and not above all its sight lines to the ground.
         reach = float(np.hypot(box.size_m[0], box.size_m[1])) / 2
-        depth = float(cam_from_map[2, :3] @ (*box.centre_map, box.beneath[0]) + cam_from_map[2, 3])
+        depth = float(cam_from_map[2, :3] @ (*box.centre_map, box.beneath.height_m) + cam_from_map[2, 3])
         above_m = centre[2] - ground_under(box, centre[:2])
         if box.base_m < above_m and -reach < depth < _FARTHEST_M + reach:
-            near.append(box)
-    if seen.any() and (near or relief is not None):
-        points = _on_ground(points_map[seen], relief)
-        hidden = hidden_by(near, centre, points)
-        seen[seen] = ~(hidden if relief is None else hidden | relief.hides(centre, points))
-    return np.asarray(seen)
+            occluders.append(box)
+    if visible.any() and (occluders or relief is not None):
+        points = _on_ground(points_map[visible], relief)
+        hidden = hidden_by(occluders, centre, points)
+        visible[visible] = ~(hidden if relief is None else hidden | relief.hides(centre, points))
+    return np.asarray(visible)
 
 
 def _on_ground(points_map: FloatArray, relief: Relief | None) -> FloatArray:
@@ -112,9 +114,9 @@ def hidden_by(boxes: Sequence[Box], centre_map: FloatArray, points_map: FloatArr
     return hidden
 
 
-_Job = tuple[str, int, str]
+_Job = tuple[str, int, str]  # camera, frame and path of an image
 
-_LANE_SIGHTINGS = 2
+_LANE_SIGHTINGS = 2  # least number of images that show a lane vertex which counts as seen
 _worker_port: Port | None = None
 
 
@@ -209,8 +211,8 @@ def _start_worker(config: PortConfig) -> None:
     _worker_port = build_port(config)
 
 
-def _write_picture(job: _Job, own: Port | None = None) -> None:
-    port = own or _worker_port
+def _write_picture(job: _Job, local_port: Port | None = None) -> None:
+    port = local_port or _worker_port
     (camera, frame, target) = job
     assert port is not None
     data = port.jpeg(port.picture(camera, frame).image)
@@ -233,15 +235,16 @@ def _truth(port: Port, images: list[Image]) -> Truth:
     vertices = [lane.points_map for lane in port.hd_map.lanes]
     points = np.vstack([samples.reshape(-1, 2), *vertices])
     visibility = np.zeros((len(images), len(corners)))
-    scene, relief = port.renderer.scene, port.renderer.scene.relief
+    scene = port.renderer.scene
+    relief = scene.relief
     passed = np.zeros(len(points) - samples.size // 2, dtype=int)
     for i, image in enumerate(images):
         frame = i // len(port.cameras)
         camera = port.cameras[image.camera]
         boxes = scene.boxes + port.moving_boxes(frame)
-        seen = points_seen(camera.info, port.cam_from_map(image.camera, frame), points, boxes, relief)
-        visibility[i] = seen[: samples.size // 2].reshape(-1, per_marking).mean(axis=1)
-        on_lanes = seen[samples.size // 2 :]
+        visible = points_seen(camera.info, port.cam_from_map(image.camera, frame), points, boxes, relief)
+        visibility[i] = visible[: samples.size // 2].reshape(-1, per_marking).mean(axis=1)
+        on_lanes = visible[samples.size // 2 :]
         on_lane = _on_ground(points[samples.size // 2 :][on_lanes], relief)
         vertices_vehicle = ground_in_vehicle(image.map_from_vehicle, on_lane)
         on_lanes[on_lanes] = inside_convex(camera.roi_vehicle, vertices_vehicle)

@@ -24,32 +24,44 @@ from v2hdm.records import (
     Marking,
 )
 from v2hdm.simulate.port.config import PaintConfig, StencilConfig
-from v2hdm.simulate.port.route import Route
+from v2hdm.simulate.port.route import Place, Route
 from v2hdm.simulate.render.scene import WHITE_PAINT, YELLOW_PAINT, Bgr, Paint, placed
 
-_VERTEX_SPACING_M = 0.5
-_PIECE_TURN_RAD = 0.015  # the first piece of a turn of 12 m is 4 mm off the straight line before it
-_PIECE_STEP_M = 0.1
-_PIECE_LENGTH_M = 25.0
-_PIECE_OVERLAP_M = 0.02  # as wide as the gap between two pieces on the outer side of a turn, and more
-_LEAST_GAP_M = 1.7
-_LINE_GAP_M = 1.1
-_STENCIL_TRIES = 10
+_VERTEX_SPACING_M = 0.5  # largest distance between neighbouring vertices of a lane
+
+# A solid line is painted in straight pieces. In each the route turns by this angle at most: the first piece
+# of a turn of 12 m radius is 4 mm off the straight line before it.
+_PIECE_TURN_RAD = 0.015
+_PIECE_STEP_M = 0.1  # distance between the stations at which a piece may end
+_PIECE_LENGTH_M = 25.0  # largest length of a piece
+_PIECE_OVERLAP_M = 0.02  # overlap of two pieces: more than their gap on the outer side of a turn
+
+_LEAST_GAP_M = 1.7  # least distance of a marking's centre from other paint, chosen
+_LINE_GAP_M = 1.1  # least distance of a marking's centre from the vertices of lanes, chosen
+_STENCIL_TRIES = 10  # number of places that are tried for a stencil within its spacing
 _STRAIGHT_PER_M = 1e-4  # curvature below which the route counts as straight
+
+# Corners of a diamond of unit length and width, ahead and to the left of its centre.
 _DIAMOND = np.array([[0.5, 0.0], [0.0, 0.5], [-0.5, 0.0], [0.0, -0.5]])
+
+# Shaft and head of an arrow, ahead and to the left of its centre, m.
 _ARROW_M = [
     np.array([[-1.5, -0.08], [0.55, -0.08], [0.55, 0.08], [-1.5, 0.08]]),
     np.array([[0.5, -0.35], [1.5, 0.0], [0.5, 0.35]]),
 ]
+
+# A stop line of 0.4 m by 3 m, ahead and to the left of its centre, m.
 _STOP_LINE_M = [np.array([[-0.2, -1.5], [0.2, -1.5], [0.2, 1.5], [-0.2, 1.5]])]
-# The bars (x0, x1, y0, y1) of a letter like an eight on a pocket calculator: two upright, three level.
+
+# The bars (x0, x1, y0, y1) of a letter like an eight on a pocket calculator, m: two upright, three level.
 _LETTER_BARS_M = (
-    *((-0.6, 0.6, 0.0, 0.1), (-0.6, 0.6, 0.3, 0.4)),
-    *((-0.6, -0.5, 0.1, 0.3), (-0.05, 0.05, 0.1, 0.3), (0.5, 0.6, 0.1, 0.3)),
+    (-0.6, 0.6, 0.0, 0.1),
+    (-0.6, 0.6, 0.3, 0.4),
+    (-0.6, -0.5, 0.1, 0.3),
+    (-0.05, 0.05, 0.1, 0.3),
+    (0.5, 0.6, 0.1, 0.3),
 )
 
-
-_Place = tuple[FloatArray | tuple[float, float], float]  # centre and yaw in rad
 _Worn = tuple[float, float]  # wear and dirt
 
 
@@ -211,7 +223,8 @@ class _Painter:
                     beside = float(route.distance_to(centre[None])[0]) >= abs(offset_m) - 0.5
                     if at < route.length_m - 2.0 and beside and self.layout.is_free(centre, lines):
                         yaw = float(route.yaw_at(np.array([at]))[0]) + turned
-                        self._place(kind, shapes, (centre, yaw), worn, colour)
+                        x, y = centre.tolist()
+                        self._place(kind, shapes, Place((x, y), yaw), worn, colour)
                         break
 
     def other_paint(self) -> None:
@@ -242,15 +255,13 @@ class _Painter:
                     bars.append(np.array([[x0, low], [x1, low], [x1, high], [x0, high]]))
         return bars
 
-    def _place(
-        self, kind: str, shapes: Sequence[FloatArray], place: _Place, worn: _Worn, colour: Bgr
-    ) -> None:
+    def _place(self, kind: str, shapes: Sequence[FloatArray], place: Place, worn: _Worn, colour: Bgr) -> None:
         for shape in shapes:
-            polygon = placed(shape, *place)
+            polygon = placed(shape, place.point_map, place.yaw_rad)
             self.layout.occupied_map.extend(polygon)
             self._paint(kind, polygon, worn, 7, colour)
-            own = kind not in PAINT_CLASSES and len(shapes) == 1 and len(shape) == 4
-            if kind in CORNERED_CLASSES or own:
+            is_stencil = kind not in PAINT_CLASSES and len(shapes) == 1 and len(shape) == 4
+            if kind in CORNERED_CLASSES or is_stencil:
                 self.layout.markings.append(Marking(kind, polygon, 0))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -15,10 +16,17 @@ from v2hdm.records import FloatArray, PoseNoise, Trajectory
 from v2hdm.simulate.port.config import DisturbanceConfig, ReliefConfig, RouteConfig
 from v2hdm.simulate.render.relief import Relief
 
-_STEP_M = 0.05
-_TRANSITION_M = 4.0
-_SPEED_SWING = 0.12
-_SPEED_PERIOD_S = 23.0
+_STEP_M = 0.05  # distance between the stations at which a route is integrated
+_TRANSITION_M = 4.0  # length over which the curvature changes from one piece of a route to the next
+_SPEED_SWING = 0.12  # amplitude of the speed about its mean, as a fraction of it
+_SPEED_PERIOD_S = 23.0  # period of the speed's swing
+
+
+class Place(NamedTuple):
+    """A point on the ground and a heading."""
+
+    point_map: tuple[float, float]  # m
+    yaw_rad: float
 
 
 @dataclass(frozen=True)
@@ -46,11 +54,11 @@ class Route:
         x, y = (np.interp(station_m, self.station_m, self.points_map[:, axis]) for axis in (0, 1))
         return np.column_stack([x - offset_m * np.sin(yaw), y + offset_m * np.cos(yaw)])
 
-    def pose_at(self, station_m: float, offset_m: float = 0.0) -> tuple[tuple[float, float], float]:
+    def pose_at(self, station_m: float, offset_m: float = 0.0) -> Place:
         """Point and heading at one station, ``offset_m`` to the left of the path."""
         at = np.array([station_m])
         x, y = self.points_at(at, offset_m)[0].tolist()
-        return (x, y), float(self.yaw_at(at)[0])
+        return Place((x, y), float(self.yaw_at(at)[0]))
 
     def station_at(self, stamp_s: FloatArray) -> FloatArray:
         """Stations (K,) reached at times (K,): the speed swings slowly by an eighth about its mean."""
@@ -87,7 +95,7 @@ def build_route(config: RouteConfig) -> Route:
     )
 
 
-_LEAD_S = 0.35
+_LEAD_S = 0.35  # time from the start of the drive to the first image, and from the last image to its end
 
 
 @dataclass(frozen=True)
@@ -178,7 +186,9 @@ def _poses(points: FloatArray, height: FloatArray, tilt: FloatArray, yaw: FloatA
 
 def pose_noise(config: DisturbanceConfig, speed_mps: float) -> PoseNoise:
     """The noise in the receiver's data sheet, and of a test drive of the suspension at ``speed_mps``."""
-    heading, roll_pitch = (float(np.deg2rad(one)) for one in (config.heading_deg, config.roll_pitch_deg))
+    heading, roll_pitch = (
+        float(np.deg2rad(sigma_deg)) for sigma_deg in (config.heading_deg, config.roll_pitch_deg)
+    )
     return PoseNoise(
         position_m=float(np.hypot(config.rtk_white_m, config.rtk_correlated_m)),
         heading_rad=heading,
@@ -214,16 +224,16 @@ def measured_disturbances(config: DisturbanceConfig, driven: DrivenPoses) -> dic
     }
 
 
-_GRID_M = 0.25
-_BORDER_M = 60.0
-_REACH_M = 20.0  # beside the route; farther out the ground knows nothing of it
-_CROWN_M = 10.0
-_BANK_M = 8.0  # to either side: as far as the ground falls, or leans undiminished
-_EASE_M = 12.0  # over which a ramp begins and ends
-_GULLY_M = 0.4
-_KERB_M = 0.3  # standard deviation of its section, and its width
+_GRID_M = 0.25  # distance between the knots of a relief
+_BORDER_M = 60.0  # width of the relief beyond the route's extent
+_REACH_M = 20.0  # distance from the route up to which its crown, bank, gullies and kerb shape the ground
+_CROWN_M = 10.0  # distance from the route up to which the crown falls
+_BANK_M = 8.0  # distance from the route up to which the bank keeps its full slope
+_EASE_M = 12.0  # length over which a ramp begins, and ends
+_GULLY_M = 0.4  # standard deviation of a gully's bell-shaped section
+_KERB_M = 0.3  # width over which a kerb rises
 _WHEELS_M = np.array([[2.8, 0.8], [2.8, -0.8], [0.0, 0.8], [0.0, -0.8]])
-"""Ahead of the vehicle's origin, which is under the rear axle, and to its left: front wheels first."""
+"""Wheels (4, 2), m, ahead of the vehicle's origin under the rear axle and to its left, front wheels first."""
 
 
 def build_relief(config: ReliefConfig, route: Route) -> Relief | None:

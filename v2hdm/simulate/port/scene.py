@@ -20,8 +20,9 @@ _CONTAINER_COLOURS: tuple[Bgr, ...] = (
     (0.06, 0.07, 0.27), (0.30, 0.13, 0.04), (0.07, 0.20, 0.38), (0.11, 0.22, 0.08),
     (0.45, 0.46, 0.46), (0.04, 0.12, 0.33), (0.19, 0.17, 0.16), (0.27, 0.26, 0.05),
 )  # fmt: skip
+
 _RASTER_M = 0.05  # side of an element of the ground marks' raster
-_RASTER_BORDER_M = 18.0  # of the raster beyond the route
+_RASTER_BORDER_M = 18.0  # width of that raster beyond the route's extent
 _SUBPIXEL_BITS = 3  # fractional bits of OpenCV's coordinates
 
 
@@ -145,7 +146,8 @@ def _keeps_clear(box: Box, route: Route, others: list[Box], clearance_m: float) 
         return False
     reach = np.hypot(box.size_m[0], box.size_m[1]) / 2
     for other in others:
-        gap = np.hypot(*(np.array(other.centre_map) - box.centre_map))
+        offset_map = np.array(other.centre_map) - box.centre_map
+        gap = np.hypot(offset_map[0], offset_map[1])
         along = abs(np.cos(other.yaw_rad - box.yaw_rad)) > 0.99
         if gap < (min(other.size_m[1], box.size_m[1]) if along else reach):
             return False
@@ -160,14 +162,14 @@ def _occluders(yard: YardConfig, route: Route, rng: np.random.Generator) -> list
         side = float(rng.choice([-1.0, 1.0]))
         centre, yaw = route.pose_at(station, side * rng.uniform(6.3, 7.4))
         boxes += _truck(centre, yaw, _colour(rng), int(rng.integers(1 << 20)))
-    for count, size, offsets, colour in (
+    for count, size, (nearest_m, farthest_m), colour in (
         (yard.barriers, (1.3, 0.5, 0.85), (2.6, 5.0), (0.5, 0.5, 0.5)),
         (yard.lamp_posts, (0.22, 0.22, 11.0), (5.9, 8.0), (0.3, 0.3, 0.3)),
     ):
         for _ in range(count):
             station = rng.uniform(8.0, route.length_m - 8.0)
             side = float(rng.choice([-1.0, 1.0]))
-            centre, yaw = route.pose_at(station, side * rng.uniform(*offsets))
+            centre, yaw = route.pose_at(station, side * rng.uniform(nearest_m, farthest_m))
             yaw += rng.normal(0.0, 0.3)
             boxes.append(Box(centre_map=centre, size_m=size, yaw_rad=yaw, albedo_bgr=colour))
     return [box for box in boxes if float(route.distance_to(box_footprint(box)).min()) > 1.9]

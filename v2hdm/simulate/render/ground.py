@@ -26,6 +26,7 @@ from v2hdm.simulate.render.scene import (
     smoothstep,
 )  # fmt: skip
 from v2hdm.simulate.render.view import (
+    NEAR_M,
     View,
     bands_of,
     edges_of,
@@ -34,10 +35,9 @@ from v2hdm.simulate.render.view import (
     outlines,
 )  # fmt: skip
 
-_FARTHEST_M = 400.0
-_SHADOWS_TO_M = 90.0
-_NEAR_M = 0.05
-_DRAPED_M = 1.0  # between points of an outline on a relief
+_FARTHEST_M = 400.0  # largest depth at which a pixel shows ground; sky lies beyond
+_SHADOWS_TO_M = 90.0  # largest distance of a shadow's first corner from a camera that sees it
+_DRAPED_M = 1.0  # largest distance between points of an outline that follows a relief
 
 
 @dataclass(frozen=True)
@@ -60,8 +60,8 @@ class GroundField:
     slope: tuple[Float32, Float32] | None = None
 
     @property
-    def planes(self) -> tuple[Float32, Float32, Float32]:
-        """``x_m``, ``y_m`` and ``footprint_m``."""
+    def planes(self) -> tuple[Float32, ...]:
+        """``x_m``, ``y_m`` and ``footprint_m``, as kernels take them."""
         return self.x_m, self.y_m, self.footprint_m
 
 
@@ -90,24 +90,34 @@ def intersect_ground(view: View) -> GroundField | None:
 def _intersect_relief(view: View, relief: Relief) -> GroundField | None:
     info = view.rays.info
     rays = (view.rays.u_pinhole_px, view.rays.v_pinhole_px)
-    found = np.empty((6, *rays[0].shape), dtype=np.float32)
+    ground = np.empty((6, *rays[0].shape), dtype=np.float32)
     below = np.empty(rays[0].shape, dtype=np.bool_)
     map_from_ray = view.cam_from_map[:3, :3].T @ np.linalg.inv(info.intrinsic)
     at = view.centre_map
     per_focal = float(1.0 / info.intrinsic[1, 1])
-    meet_ground(relief.placed, rays, map_from_ray, at, _FARTHEST_M, per_focal, found, below)
+    meet_ground(relief.placed, rays, map_from_ray, at, _FARTHEST_M, per_focal, ground, below)
     ground_rows = np.flatnonzero(below.any(axis=1))
     if len(ground_rows) == 0:
         return None
     # A homography of the plane: the images of its origin and of the points a metre along x and y.
     origin, along_x, along_y = view.homogeneous_px(view.on_plane(np.array([[0.0, 0], [1, 0], [0, 1]])))
     u, v, depth = (
-        found[0] * a + found[1] * b + c
+        ground[0] * a + ground[1] * b + c
         for a, b, c in np.column_stack([along_x - origin, along_y - origin, origin]).astype(np.float32)
     )
-    depth = np.where(depth > _NEAR_M, depth, np.float32(np.inf))
-    x, y, far, footprint, by_x, by_y = found[:, (first := int(ground_rows[0])) :]
-    return GroundField(first, x, y, far, footprint, below[first:], (u / depth, v / depth), (by_x, by_y))
+    depth = np.where(depth > NEAR_M, depth, np.float32(np.inf))
+    first = int(ground_rows[0])
+    x, y, ray_depth, footprint, by_x, by_y = ground[:, first:]
+    return GroundField(
+        first_row=first,
+        x_m=x,
+        y_m=y,
+        depth_m=ray_depth,
+        footprint_m=footprint,
+        below=below[first:],
+        rays=(u / depth, v / depth),
+        slope=(by_x, by_y),
+    )
 
 
 def _plane(view: View, row: NDArray[np.float64], rows: slice) -> Float32:
@@ -126,9 +136,9 @@ def fine_tile(texture: str | Tile) -> Tile:
     return noise_tile(12, 4.0, 0.1, finest_px=0.7, skew=0.5)
 
 
-MEDIUM_TILE = noise_tile(13, 19.0, 1.0)
-COARSE_TILE = noise_tile(14, 83.0, 1.5)
-WET_TILE = noise_tile(19, 47.0, 1.9, finest_px=3.0)
+MEDIUM_TILE = noise_tile(13, 19.0, 1.0)  # stains of the ground, repeating after 19 m
+COARSE_TILE = noise_tile(14, 83.0, 1.5)  # tones of the ground over metres, repeating after 83 m
+WET_TILE = noise_tile(19, 47.0, 1.9, finest_px=3.0)  # depth of water on the ground, repeating after 47 m
 
 
 def tone(ground: Ground, field: GroundField) -> Float32:
@@ -201,20 +211,24 @@ def sun_visibility(
 ) -> Float32:
     """Fraction (H, W) of the sun's light that reaches the ground."""
     out = np.ones_like(field.x_m)
-    near = [
-        shadow
-        for shadow in shadows
-        if float(np.hypot(*(shadow.polygon_map[0] - view.centre_map[:2]))) < _SHADOWS_TO_M
-    ]
-    for shadow, shape in zip(near, outlines(view, [_penumbra_px(one, view) for one in near]), strict=True):
+    shadows_near = [shadow for shadow in shadows if _distance_m(view, shadow) < _SHADOWS_TO_M]
+    shapes = outlines(view, [_penumbra_px(shadow, view) for shadow in shadows_near])
+    first = field.first_row
+    for shadow, shape in zip(shadows_near, shapes, strict=True):
         if shape is not None:
+            windows, count = bands_of(view, shape, first)
             lines = inward_lines(np.asarray(shadow.polygon_map, dtype=np.float64))
-            first = field.first_row
-            look = np.float32(shadow.softness_m), np.float32(1.0 - shadow.transmission)
-            kernels.cast_shadow(*bands_of(view, shape, first), first, lines, *look, field.planes, out)
+            softness_m = np.float32(shadow.softness_m)
+            darkness = np.float32(1.0 - shadow.transmission)
+            kernels.cast_shadow(windows, count, first, lines, softness_m, darkness, field.planes, out)
     for shade in shades:
         shade(view, field, out)
     return out
+
+
+def _distance_m(view: View, shadow: Shadow) -> float:
+    offset_map = shadow.polygon_map[0] - view.centre_map[:2]
+    return float(np.hypot(offset_map[0], offset_map[1]))
 
 
 def _penumbra_px(shadow: Shadow, view: View) -> FloatArray:
@@ -252,8 +266,8 @@ def texture_shift(seed: int) -> tuple[float, float]:
 
 Labels = NDArray[np.uint8]
 
-_WEAR_TILE = noise_tile(16, 5.0, 0.8, finest_px=0.8)
-_FARTHEST_PAINT_M = 60.0
+_WEAR_TILE = noise_tile(16, 5.0, 0.8, finest_px=0.8)  # wear of paint, repeating after 5 m
+_FARTHEST_PAINT_M = 60.0  # largest depth of paint that is drawn
 
 
 class PaintLayer:
@@ -271,11 +285,11 @@ class PaintLayer:
 
     def draw(self, view: View, field: GroundField, albedo: Float32, labels: Labels) -> None:
         """Paint onto the ground field's ``albedo`` (H', W, 3) and into ``labels`` (H, W)."""
-        seen = in_view(view, view.homogeneous_px(view.on_ground(self._vertices)), _FARTHEST_PAINT_M)
-        paints = [self._paints[index] for index in seen]
-        flat = view.homogeneous_px(view.on_plane(self._vertices[seen]))
-        polygons = [own[: len(one.polygon_map)] for own, one in zip(flat, paints, strict=True)]
-        draped = [on_ground_px(view, one.polygon_map) for one in paints] if view.relief else None
+        visible = in_view(view, view.homogeneous_px(view.on_ground(self._vertices)), _FARTHEST_PAINT_M)
+        paints = [self._paints[index] for index in visible]
+        flat = view.homogeneous_px(view.on_plane(self._vertices[visible]))
+        polygons = [points[: len(paint.polygon_map)] for points, paint in zip(flat, paints, strict=True)]
+        draped = [on_ground_px(view, paint.polygon_map) for paint in paints] if view.relief else None
         first = field.first_row
         tiles = [_WEAR_TILE, MEDIUM_TILE, fine_tile("asphalt")]
         padded = tuple(tile.padded for tile in tiles)
@@ -283,8 +297,9 @@ class PaintLayer:
             if shape is None:
                 continue
             shift = (float(paint.seed % 97) * 0.53, float(paint.seed % 89) * 0.71)
+            windows, count = bands_of(view, shape, first)
             kernels.draw_paint(
-                *bands_of(view, shape, first), first, edges_of(shape), field.rays, field.planes, padded,
+                windows, count, first, edges_of(shape), field.rays, field.planes, padded,
                 np.array([scale_of(tile, shift) for tile in tiles], dtype=np.float32), _look(paint),
                 self._label[paint.kind], albedo, labels,
             )  # fmt: skip

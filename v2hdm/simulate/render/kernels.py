@@ -14,18 +14,22 @@ from numpy.typing import NDArray
 
 from v2hdm.compiled import exact_kernel, exactly_inlined
 from v2hdm.records import FloatArray, IntArray
+from v2hdm.simulate.render.scene import TILE_PX
 
 _Plane = NDArray[np.float32]
 _f = np.float32
-_TILE_PX = 512.0
-_ONE = _f(1.0)
-_HALF = _f(0.5)
-_ZERO = _f(0.0)
+
+# Numbers in float32: an operand in float64 would widen what a kernel computes.
+_TILE = _f(TILE_PX)  # side of a tile, px
+_ONE = _f(1.0)  # a whole pixel, and a tone that changes nothing
+_HALF = _f(0.5)  # half a pixel, from which on it counts as covered
+_ZERO = _f(0.0)  # none of a pixel
 
 
 def _rounded_once(_: Any, a: Any, b: Any, c: Any) -> Any:
     def build(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
-        return builder.fma(*arguments)
+        factor, other, addend = arguments
+        return builder.fma(factor, other, addend)
 
     return types.float32(types.float32, types.float32, types.float32), build
 
@@ -43,7 +47,7 @@ def _wrap(metres: Any, per_metre: Any, turn: Any) -> Any:
     turns = metres * per_metre
     turns += turn
     turns -= _f(np.floor(turns))
-    return turns * _f(_TILE_PX)
+    return turns * _TILE
 
 
 @exactly_inlined
@@ -101,7 +105,7 @@ def bands(boundary: FloatArray, first_row: int, height: int, width: int, limits:
     begin = max(int(np.floor(top)) - 2, first_row)
     end = min(int(np.ceil(bottom)) + 3, height)
     step = limits[0] if (end - begin) * (right - left) > limits[1] else max(end - begin, 1)
-    found = 0
+    number = 0
     for row in range(begin, end, step):
         last = min(row + step, end)
         least = np.inf
@@ -123,12 +127,12 @@ def bands(boundary: FloatArray, first_row: int, height: int, width: int, limits:
         first_column = max(int(np.floor(least)) - 2, 0)
         end_column = min(int(np.ceil(most)) + 3, width)
         if first_column < end_column:
-            out[found, 0] = row
-            out[found, 1] = last
-            out[found, 2] = first_column
-            out[found, 3] = end_column
-            found += 1
-    return found
+            out[number, 0] = row
+            out[number, 1] = last
+            out[number, 2] = first_column
+            out[number, 3] = end_column
+            number += 1
+    return number
 
 
 @exact_kernel
@@ -156,15 +160,15 @@ def draw_paint(
                 x = x_m[at, column]
                 y = y_m[at, column]
                 footprint = footprint_m[at, column]
-                own = _sample(wear, x, y, scales[0, 0], scales[0, 1], scales[0, 2])
-                flaking = own * _fade(footprint, scales[0, 3])
-                own = _sample(stains, x, y, scales[1, 0], scales[1, 1], scales[1, 2])
-                flaking += _f(0.7) * (own * _fade(footprint, scales[1, 3]))
-                kept = (flaking - look[0]) / (_f(0.35) + footprint * _f(12.0)) + _HALF
-                own = _sample(grain, x, y, scales[2, 0], scales[2, 1], scales[2, 2])
-                tone = _ONE + _f(0.06) * (own * _fade(footprint, scales[2, 3]))
+                noise = _sample(wear, x, y, scales[0, 0], scales[0, 1], scales[0, 2])
+                flaking = noise * _fade(footprint, scales[0, 3])
+                noise = _sample(stains, x, y, scales[1, 0], scales[1, 1], scales[1, 2])
+                flaking += _f(0.7) * (noise * _fade(footprint, scales[1, 3]))
+                remainder = (flaking - look[0]) / (_f(0.35) + footprint * _f(12.0)) + _HALF
+                noise = _sample(grain, x, y, scales[2, 0], scales[2, 1], scales[2, 2])
+                tone = _ONE + _f(0.06) * (noise * _fade(footprint, scales[2, 3]))
                 dirt = look[1] * _clip(_f(0.8) - _f(0.4) * flaking, _ZERO, _f(1.6))
-                opacity = covered * _clip(kept, _ZERO, _ONE) * (_ONE - _f(0.6) * dirt)
+                opacity = covered * _clip(remainder, _ZERO, _ONE) * (_ONE - _f(0.6) * dirt)
                 tone *= _ONE - _f(0.4) * dirt
                 for c in range(3):
                     below = albedo[at, column, c]
@@ -183,15 +187,15 @@ def look_at_face(
         for column in range(window[2], window[3]):
             i = row - window[0]
             j = column - window[2]
-            own_u = u[row, column]
-            own_v = v[row, column]
-            covered = _coverage(edges, own_u, own_v)
+            u_px = u[row, column]
+            v_px = v[row, column]
+            covered = _coverage(edges, u_px, v_px)
             out[0, i, j] = covered
             covers |= covered > _ZERO
-            inverse = m[2, 0] * own_u + m[2, 1] * own_v + m[2, 2]
+            inverse = m[2, 0] * u_px + m[2, 1] * v_px + m[2, 2]
             depth = _ONE / (_f(1e-6) if abs(inverse) < _f(1e-6) else inverse)
-            out[1, i, j] = _clip((m[0, 0] * own_u + m[0, 1] * own_v + m[0, 2]) * depth, _f(-50.0), _f(50.0))
-            out[2, i, j] = _clip((m[1, 0] * own_u + m[1, 1] * own_v + m[1, 2]) * depth, _f(-50.0), _f(50.0))
+            out[1, i, j] = _clip((m[0, 0] * u_px + m[0, 1] * v_px + m[0, 2]) * depth, _f(-50.0), _f(50.0))
+            out[2, i, j] = _clip((m[1, 0] * u_px + m[1, 1] * v_px + m[1, 2]) * depth, _f(-50.0), _f(50.0))
             out[3, i, j] = abs(depth) * per_focal
     return covers
 
@@ -268,10 +272,10 @@ def ground_tone(
             x = x_m[row, column]
             y = y_m[row, column]
             footprint = footprint_m[row, column]
-            own = _sample(fine, x, y, scales[0, 0], scales[0, 1], scales[0, 2])
-            tone = own * (_fade(footprint, scales[0, 3]) * amplitudes[0])
-            own = _sample(medium, x, y, scales[1, 0], scales[1, 1], scales[1, 2])
-            tone += own * (_fade(footprint, scales[1, 3]) * amplitudes[1])
+            noise = _sample(fine, x, y, scales[0, 0], scales[0, 1], scales[0, 2])
+            tone = noise * (_fade(footprint, scales[0, 3]) * amplitudes[0])
+            noise = _sample(medium, x, y, scales[1, 0], scales[1, 1], scales[1, 2])
+            tone += noise * (_fade(footprint, scales[1, 3]) * amplitudes[1])
             tone += coarse[row, column] * amplitudes[2]
             out[row, column] = _clip(tone + _ONE, _f(0.25), _f(2.5))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,12 +11,31 @@ from numpy.typing import NDArray
 from v2hdm.compiled import exact_kernel, exactly_inlined
 from v2hdm.records import BoolArray, FloatArray
 
-_MOST_STEPS = 200
-_SURE_M = 1e-6  # of a height where a ray meets the ground: 0.1 mm along it, 100 times as far as high
+_MOST_STEPS = 200  # largest number of steps that follow a ray
+
+# Height at which a ray has met the ground, m: 0.1 mm along a ray whose camera is 100 times as far as high.
+_SURE_M = 1e-6
+
+# A step along a ray is at most this share of the way behind it and the first step's length, m, beside that.
 _STEP = 0.2
-_FIRST_STEP_M = 0.5  # a ray's steps, as a share of the way behind it and beside that, m
-_BACK = 0.98  # share of the way of the ray below at which one begins: no two are in one upright plane
+_FIRST_STEP_M = 0.5  # largest first step along a ray
+
+# A ray begins at this share of the way of the ray below it: the two are not quite in one upright plane.
+_BACK = 0.98
+
+# Shares of a line of sight at which the ground may rise above it.
 _ALONG_SIGHT = np.linspace(0.02, 0.98, 33)[:, None, None]
+
+
+class GroundPlane(NamedTuple):
+    """A plane on the ground: its height, m, at a place, and its slopes there along x and y."""
+
+    height_m: float
+    by_x: float
+    by_y: float
+
+
+LEVEL = GroundPlane(0.0, 0.0, 0.0)  # the ground of a scene without relief
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,17 +59,17 @@ class Relief:
         points = np.ascontiguousarray(points_map, dtype=np.float64).reshape(-1, 2)
         out = np.empty((len(points), 3))
         _heights(self.placed, points, out)
-        return out.reshape(*np.shape(points_map)[:-1], 3)
+        return out.reshape((*np.shape(points_map)[:-1], 3))
 
     def height_m(self, points_map: FloatArray) -> FloatArray:
         """Heights (...) at points (..., 2)."""
         return self.with_slopes(points_map)[..., 0]
 
-    def plane_of(self, corners_map: FloatArray) -> tuple[float, float, float]:
-        """Height at the middle and slopes by x and y of the plane nearest to the ground at corners (N, 2)."""
+    def plane_of(self, corners_map: FloatArray) -> GroundPlane:
+        """The plane nearest to the ground at corners (N, 2), its height that at their middle."""
         off = np.column_stack([np.ones(len(corners_map)), corners_map - corners_map.mean(axis=0)])
         height, by_x, by_y = np.linalg.lstsq(off, self.height_m(corners_map))[0].tolist()
-        return height, by_x, by_y
+        return GroundPlane(height, by_x, by_y)
 
     def hides(self, centre_map: FloatArray, points_map: FloatArray) -> BoolArray:
         """Whether the ground hides points of it (N, 3) from ``centre_map`` (3,)."""
@@ -114,20 +133,20 @@ def meet_ground(
             y = m[1, 0] * u[row, column] + m[1, 1] * v[row, column] + m[1, 2]
             z = m[2, 0] * u[row, column] + m[2, 1] * v[row, column] + m[2, 2]
             depth = _BACK * out[2, following, column] if rank else 0.0
-            found = False
+            hit = False
             height, by_x, by_y = _ground_at(placed, centre[0] + depth * x, centre[1] + depth * y)
             for _ in range(_MOST_STEPS):
                 above = centre[2] + depth * z - height
                 falls = z - by_x * x - by_y * y
                 if abs(above) < _SURE_M or depth > farthest_m:
-                    found = depth <= farthest_m
+                    hit = depth <= farthest_m
                     break
                 longest = _STEP * depth + _FIRST_STEP_M
                 step = -above / falls if falls < 0 else np.copysign(longest, above)
                 depth += min(max(step, -longest), longest)
                 height, by_x, by_y = _ground_at(placed, centre[0] + depth * x, centre[1] + depth * y)
-            below[row, column] = found
-            depth = depth if found else farthest_m
+            below[row, column] = hit
+            depth = depth if hit else farthest_m
             out[0, row, column] = centre[0] + depth * x
             out[1, row, column] = centre[1] + depth * y
             out[2, row, column] = depth

@@ -25,6 +25,7 @@ from v2hdm.simulate.render import kernels
 from v2hdm.simulate.render.ground import GroundField, PaintLayer
 from v2hdm.simulate.render.scene import (
     Backdrop,
+    Bgr,
     Box,
     Float32,
     Light,
@@ -39,9 +40,9 @@ from v2hdm.simulate.render.scene import (
 )
 from v2hdm.simulate.render.view import Outline, View, bands_of, camera_rays, edges_of, in_view, outlines
 
-_CORRUGATION_M = 0.28
-_DIRT_TILE = noise_tile(17, 6.0, 1.2)
-_FARTHEST_M = 250.0
+_CORRUGATION_M = 0.28  # length of a wave of a container's corrugated side
+_DIRT_TILE = noise_tile(17, 6.0, 1.2)  # dirt on boxes, repeating after 6 m
+_FARTHEST_M = 250.0  # largest depth of boxes that are drawn
 
 
 @dataclass(frozen=True)
@@ -70,12 +71,13 @@ def draw_boxes(
     visible = [boxes[k] for k in in_view(view, view.homogeneous_px(corners), _FARTHEST_M)]
 
     def distance(box: Box) -> float:
-        return float(np.hypot(*(np.array(box.centre_map) - centre[:2])))
+        offset_map = np.array(box.centre_map) - centre[:2]
+        return float(np.hypot(offset_map[0], offset_map[1]))
 
     # Of stacked boxes the upper comes first: its underside lies behind the one below.
     ordered = sorted(visible, key=lambda b: (distance(b), b.base_m), reverse=True)
     faces = [(box, face) for box in ordered for face in _faces(box)]
-    turned = [one for one in faces if (centre - one[1].corners_map[0]) @ one[1].normal > 1e-3]
+    turned = [(box, face) for box, face in faces if (centre - face.corners_map[0]) @ face.normal > 1e-3]
     shapes = outlines(view, [view.homogeneous_px(face.corners_map) for _, face in turned])
     for (box, face), shape in zip(turned, shapes, strict=True):
         if shape is not None:
@@ -120,18 +122,21 @@ def _draw_face(
     offset = (float(box.seed % 101) * 0.37, float(box.seed % 71) * 0.29)
     scale = np.array(scale_of(_DIRT_TILE, offset), dtype=np.float32)
     waves = np.empty((0, 0), np.float32)
-    found, count = bands_of(view, shape)
-    for window in found[:count]:
-        seen = np.empty((4, window[1] - window[0], window[3] - window[2]), dtype=np.float32)
-        if not kernels.look_at_face(window, edges, rays, face_from_pinhole, per_focal, seen):
+    windows, count = bands_of(view, shape)
+    for window in windows[:count]:
+        patch = np.empty((4, window[1] - window[0], window[3] - window[2]), dtype=np.float32)
+        if not kernels.look_at_face(window, edges, rays, face_from_pinhole, per_focal, patch):
             continue
         if box.corrugated and face.upright:
-            waves = np.sin(seen[1] * np.float32(2 * np.pi / _CORRUGATION_M))
-        albedo = box.albedo_bgr if face.picture is None else face.picture(face.sides_m, *seen[1:])
+            waves = np.sin(patch[1] * np.float32(2 * np.pi / _CORRUGATION_M))
+        albedo: Bgr | Float32 = box.albedo_bgr
+        if face.picture is not None:
+            along_m, up_m, footprint_m = patch[1:]
+            albedo = face.picture(face.sides_m, along_m, up_m, footprint_m)
         parts = [np.asarray(part * light, dtype=np.float32) for part, light in zip(albedo, lit, strict=True)]
-        colour = np.stack(parts).reshape(3, *(parts[0].shape or (1, 1)))  # (3, 1, 1) where it is one tone
-        look = _DIRT_TILE.padded, scale, waves, face.upright, colour
-        kernels.draw_face(window, seen, *look, radiance, hidden)
+        colour = np.stack(parts).reshape((3, *(parts[0].shape or (1, 1))))  # (3, 1, 1) where it is one tone
+        dirt = _DIRT_TILE.padded
+        kernels.draw_face(window, patch, dirt, scale, waves, face.upright, colour, radiance, hidden)
 
 
 def _plane_of(face: _Face, view: View) -> Float32:
@@ -147,7 +152,7 @@ def _plane_of(face: _Face, view: View) -> Float32:
     return np.linalg.inv(view.rays.info.intrinsic @ cam_from_face).astype(np.float32)
 
 
-_CLOUD_TILE = noise_tile(18, 3.0, 1.5)
+_CLOUD_TILE = noise_tile(18, 3.0, 1.5)  # clouds by azimuth and elevation, repeating after 3 rad
 
 
 @cache
@@ -277,15 +282,16 @@ class Renderer:
         if ground.slope is not None:
             east, north, up = scene.light.sun_direction_map
             sun *= np.maximum(1 - (ground.slope[0] * east + ground.slope[1] * north) / max(up, 0.1), 0)
-        light, height = scene.light, max(scene.light.sun_direction_map[2], 0.0)
+        light = scene.light
+        height = max(light.sun_direction_map[2], 0.0)
         lights = np.array([[s * height for s in light.sun_bgr], light.sky_bgr, light.horizon_bgr], np.float32)
         kernels.light_ground(albedo, sun, wet, (ground.x_m, ground.y_m), centre, lights)
         return albedo
 
 
-_CODE_STEPS = 16384
-_FLOW_STEP_PX = 16
-_NOISE_SHIFT_PX = 256
+_CODE_STEPS = 16384  # number of levels of linear light that the table of sRGB codes tells apart
+_FLOW_STEP_PX = 16  # distance of the pixels at which image flow is evaluated
+_NOISE_SHIFT_PX = 256  # largest shift of the window that cuts an image's noise out of the field of noise
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from v2hdm.records import FloatArray
-from v2hdm.simulate.render.relief import Relief
+from v2hdm.simulate.render.relief import LEVEL, GroundPlane, Relief
 
 Float32 = NDArray[np.float32]
 
-_TILE_PX = 512
+TILE_PX = 512  # side of a tile
 
 
 @dataclass(frozen=True)
@@ -46,11 +46,11 @@ class Tile:
 def noise_tile(seed: int, side_m: float, slope: float, finest_px: float = 2.0, skew: float = 0.0) -> Tile:
     """Noise of amplitude 1 / frequency^slope from ``finest_px`` upwards; ``skew`` > 0: bright specks."""
     rng = np.random.default_rng([seed, 77])
-    frequency = np.hypot(np.fft.fftfreq(_TILE_PX)[:, None], np.fft.rfftfreq(_TILE_PX)[None])
+    frequency = np.hypot(np.fft.fftfreq(TILE_PX)[:, None], np.fft.rfftfreq(TILE_PX)[None])
     frequency[0, 0] = np.inf
-    spectrum = np.fft.rfft2(rng.standard_normal((_TILE_PX, _TILE_PX)))
+    spectrum = np.fft.rfft2(rng.standard_normal((TILE_PX, TILE_PX)))
     spectrum *= frequency**-slope * np.exp(-0.5 * (frequency * finest_px) ** 2)
-    values = np.fft.irfft2(spectrum, s=(_TILE_PX, _TILE_PX))
+    values = np.fft.irfft2(spectrum, s=(TILE_PX, TILE_PX))
     values /= values.std()
     if skew:
         values = np.exp(skew * values)
@@ -72,7 +72,7 @@ def _wrapped(metres: Float32, side_m: float, offset_m: float) -> Float32:
     turns = metres * np.float32(1.0 / side_m)
     turns += np.float32(offset_m / side_m)
     turns -= np.floor(turns)
-    turns *= np.float32(_TILE_PX)
+    turns *= np.float32(TILE_PX)
     return turns
 
 
@@ -97,8 +97,8 @@ Picture = Callable[[FloatArray, Float32, Float32, Float32], Float32]
 """Reflectance (3, h, w) in blue, green and red of pixels on a side of a box: of that side's length and height
 (2,), and of each pixel's place (h, w) along and up it and the length that it covers; all m."""
 
-WHITE_PAINT: Bgr = (0.70, 0.74, 0.75)
-YELLOW_PAINT: Bgr = (0.07, 0.42, 0.62)
+WHITE_PAINT: Bgr = (0.70, 0.74, 0.75)  # reflectance of fresh white paint, chosen
+YELLOW_PAINT: Bgr = (0.07, 0.42, 0.62)  # reflectance of fresh yellow paint, chosen
 
 RECTANGLE = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
 """Corners of the square from -1 to 1, counter-clockwise."""
@@ -171,7 +171,7 @@ class Box:
     yaw_rad: float = 0.0
     albedo_bgr: Bgr = (0.3, 0.3, 0.3)
     base_m: float = 0.0
-    beneath: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    beneath: GroundPlane = LEVEL
     corrugated: bool = False
     pictures: tuple[Picture | None, ...] = ()
     seed: int = 0
@@ -242,7 +242,8 @@ def box_footprint(box: Box) -> FloatArray:
 
 def ground_under(box: Box, points_map: FloatArray) -> FloatArray:
     """Heights (N,) at points (N, 2) of the plane on which a box stands."""
-    return np.asarray(box.beneath[0] + (points_map - box.centre_map) @ box.beneath[1:])
+    plane = box.beneath
+    return np.asarray(plane.height_m + (points_map - box.centre_map) @ (plane.by_x, plane.by_y))
 
 
 def box_faces(box: Box) -> FloatArray:

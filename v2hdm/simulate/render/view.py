@@ -23,13 +23,13 @@ from v2hdm.simulate.render import kernels
 from v2hdm.simulate.render.relief import Relief
 from v2hdm.simulate.render.scene import Float32
 
-_GRID_STEP_PX = 8
-_BAND_ROWS = 32
-_BAND_AREA_PX = 4000
-_NEAR_M = 0.05
-_MARGIN_PX = 4.0
+_GRID_STEP_PX = 8  # distance of the pixels at which the lens is inverted
+_BAND_ROWS = 32  # rows of a window where an outline is covered by several
+_BAND_AREA_PX = 4000  # area of an outline's bounds from which on several windows cover it
+NEAR_M = 0.05  # least depth of what is drawn
+_MARGIN_PX = 4.0  # width of the band around an image in which shapes are still drawn
 _STEPS = [np.linspace(0.0, 1.0, 2 + more)[:-1, None, None] for more in range(9)]
-"""Shares of a side at which it has points, by its polygon's extent: a lens bends it."""
+"""Shares of a side at which its outline has points, by the polygon's extent: a lens bends it."""
 
 Window = tuple[slice, slice]
 
@@ -48,8 +48,9 @@ class Rays:
 def _rays(width: int, height: int, intrinsic: bytes, model: str, distortion: tuple[float, ...]) -> Rays:
     k = np.frombuffer(intrinsic, dtype=np.float64).reshape(3, 3)
     info = CameraInfo("", width, height, k, model, distortion)
-    sides = (np.arange(0, n + _GRID_STEP_PX, _GRID_STEP_PX, dtype=np.float64) for n in (width, height))
-    grid = np.stack(np.meshgrid(*sides), axis=-1)
+    columns = np.arange(0, width + _GRID_STEP_PX, _GRID_STEP_PX, dtype=np.float64)
+    rows = np.arange(0, height + _GRID_STEP_PX, _GRID_STEP_PX, dtype=np.float64)
+    grid = np.stack(np.meshgrid(columns, rows), axis=-1)
     shift = (undistort_points(info, grid.reshape(-1, 2)).reshape(grid.shape) - grid).astype(np.float32)
     u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     dense = cv2.remap(shift, u / _GRID_STEP_PX, v / _GRID_STEP_PX, cv2.INTER_LINEAR)
@@ -138,25 +139,27 @@ def outlines(
     edges /= np.where(usable, norms, 1.0)[:, None]
     corners = []
     for part in parts:
-        own = part[:, :2] / part[:, 2:]
-        steps = _STEPS[int(min(float(np.ptp(own, axis=0).max()) / 40.0, 8.0)) if len(own) else 0]
-        corners.append((own + steps * (following_row(own) - own)).transpose(1, 0, 2).reshape(-1, 2))
+        part_px = part[:, :2] / part[:, 2:]
+        extent_px = float(np.ptp(part_px, axis=0).max()) if len(part_px) else 0.0
+        steps = _STEPS[int(min(extent_px / 40.0, 8.0))]
+        sides = part_px + steps * (following_row(part_px) - part_px)
+        corners.append(sides.transpose(1, 0, 2).reshape(-1, 2))
     boundaries = distort_points(view.rays.info, np.concatenate(corners))
-    bounds = np.split(boundaries, np.cumsum([len(one) for one in corners])[:-1])
-    found: list[Outline | None] = []
+    bounds = np.split(boundaries, np.cumsum([len(points) for points in corners])[:-1])
+    shapes: list[Outline | None] = []
     for polygon, part, end, bound in zip(polygons, parts, ends.tolist(), bounds, strict=True):
-        own = edges[end - len(polygon) : end][usable[end - len(polygon) : end]]
-        inward = (own @ polygon.mean(axis=0)).sum() >= 0
-        shown = len(part) >= 3 and len(own) >= 3
-        found.append(Outline(own if inward else -own, bound) if shown else None)
-    return found
+        lines = edges[end - len(polygon) : end][usable[end - len(polygon) : end]]
+        inward = (lines @ polygon.mean(axis=0)).sum() >= 0
+        shown = len(part) >= 3 and len(lines) >= 3
+        shapes.append(Outline(lines if inward else -lines, bound) if shown else None)
+    return shapes
 
 
 def in_view(view: View, homogeneous_px: FloatArray, farthest_m: float) -> NDArray[np.intp]:
     """Which point sets (M, N, 3) of homogeneous pixels may reach into the image, within ``farthest_m``."""
     depth = homogeneous_px[..., 2]
     u0, v0, u1, v1 = view.rays.bounds
-    outside = (depth < _NEAR_M).all(axis=1) | (depth.min(axis=1, initial=np.inf) > farthest_m)
+    outside = (depth < NEAR_M).all(axis=1) | (depth.min(axis=1, initial=np.inf) > farthest_m)
     for axis, low, high in ((0, u0, u1), (1, v0, v1)):
         value = homogeneous_px[..., axis]
         outside |= (value < (low - _MARGIN_PX) * depth).all(axis=1)
@@ -176,11 +179,11 @@ def _visible_parts(view: View, polygons: Sequence[FloatArray]) -> list[FloatArra
     sides = [[1.0, 0.0, _MARGIN_PX - u0], [-1.0, 0.0, u1 + _MARGIN_PX]]
     sides += [[0.0, 1.0, _MARGIN_PX - v0], [0.0, -1.0, v1 + _MARGIN_PX]]
     limits = np.array([[0.0, 0.0, 1.0], *sides])
-    least = (_NEAR_M, 0.0, 0.0, 0.0, 0.0)
+    least = (NEAR_M, 0.0, 0.0, 0.0, 0.0)
     inside = np.concatenate(polygons) @ limits.T >= least
     whole = np.all(np.logical_and.reduceat(inside, begins), axis=1).tolist()
-    near = np.all(np.logical_or.reduceat(inside, begins), axis=1).tolist()
-    parts = [polygon if one else polygon[:0] for polygon, one in zip(polygons, near, strict=True)]
+    in_reach = np.all(np.logical_or.reduceat(inside, begins), axis=1).tolist()
+    parts = [polygon if reaches else polygon[:0] for polygon, reaches in zip(polygons, in_reach, strict=True)]
     for k in [k for k in range(len(parts)) if not whole[k]]:
         for line, level in zip(limits, least, strict=True):
             parts[k] = clip_half(parts[k], parts[k] @ line - level)
@@ -190,9 +193,9 @@ def _visible_parts(view: View, polygons: Sequence[FloatArray]) -> list[FloatArra
 def bands_of(view: View, shape: Outline, first_row: int = 0) -> tuple[IntArray, int]:
     """Image windows that cover an outline closely, bands of rows as wide as it is there, and their number."""
     height, width = view.rays.u_pinhole_px.shape
-    found = np.empty((height // _BAND_ROWS + 2, 4), dtype=np.int64)
+    windows = np.empty((height // _BAND_ROWS + 2, 4), dtype=np.int64)
     limits = (_BAND_ROWS, _BAND_AREA_PX)
-    return found, kernels.bands(shape.boundary_px, first_row, height, width, limits, found)
+    return windows, kernels.bands(shape.boundary_px, first_row, height, width, limits, windows)
 
 
 def edges_of(shape: Outline, grown_px: float = 0.0) -> Float32:

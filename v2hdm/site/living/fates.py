@@ -21,28 +21,30 @@ from v2hdm.records import FloatArray, IntArray, Marking
 from v2hdm.site.living.map_errors import SHIFT, Errors, Shift
 from v2hdm.site.shapes import rigid_motions
 
-_MOVED_SIGMA_M = 0.5  # per coordinate, m, of a repainted marking about its old place: a new line
-_TURNED_SIGMA_RAD = 0.2  # of its rotation, rad
+_MOVED_SIGMA_M = 0.5  # sigma of a coordinate, m, of a repainted marking about its old place: a new line
+_TURNED_SIGMA_RAD = 0.2  # sigma of the rotation of a repainted marking, rad
 _REACH_M = 4 * _MOVED_SIGMA_M  # largest distance of one marking in both maps, m
+
 _OTHER_SHAPE_M = 0.1
 """Standard deviation, m, of corners between two markings of a class: two shapes, or two lengths."""
 
 _MISREAD_M = 0.3  # standard deviation, m, of an end or corner that one drive took from another edge
 _MISREAD_SHARE = 0.05  # fraction of markings with an end or corner that one of two drives misread
+
 _PRIOR_COUNT = np.array([47.0, 1.0, 2.0])
 """Dirichlet prior: of fifty markings, the numbers that stay, are repainted elsewhere, are gone."""
 
 _PRIOR_NEW = (1.0, 50.0)  # Gamma prior: one new marking per fifty old ones
-_PASSES = 4  # of shift, odds and assignment; the assignment settles within three
+_PASSES = 4  # rounds of shift, odds and assignment; the assignment settles within three
 
-STAYED, MOVED = range(2)
+STAYED, MOVED = range(2)  # columns of the likelihoods of a pair
 
 
 @dataclass(frozen=True)
 class Watched:
     """Log-likelihoods (N,) of the images of unmapped places, with and without a marking there."""
 
-    there: FloatArray
+    painted: FloatArray
     bare: FloatArray
 
     @classmethod
@@ -94,7 +96,7 @@ class _Rates:
     stayed: float
     moved: float
     gone: float
-    kept: float
+    remains: float
     new_per_m2: float
     older_per_m2: float
 
@@ -121,15 +123,15 @@ def decide(
     fresh = np.zeros(len(new))
     for _ in range(_PASSES):
         likelihood = _likelihoods(candidates, shift, chosen, rates)
-        unseen = np.logaddexp(rates.gone + watched_now.bare, rates.kept + watched_now.there)
+        unseen = np.logaddexp(rates.gone + watched_now.bare, rates.remains + watched_now.painted)
         gone = np.exp(rates.gone + watched_now.bare - unseen)
         painted = rates.new_per_m2 + watched_before.bare
-        density = np.logaddexp(painted, rates.older_per_m2 + watched_before.there)
+        density = np.logaddexp(painted, rates.older_per_m2 + watched_before.painted)
         fresh = np.exp(painted - density)
-        both = logsumexp(likelihood, axis=1)
-        score = both - unseen[candidates.old] - _alone(candidates, density[candidates.new])
+        of_pair = logsumexp(likelihood, axis=1)
+        score = of_pair - unseen[candidates.old] - _alone(candidates, density[candidates.new])
         chosen = _assign(candidates, score)
-        moved = np.exp(likelihood[:, MOVED] - both)
+        moved = np.exp(likelihood[:, MOVED] - of_pair)
         stayed = chosen[moved[chosen] < 0.5]
         shift = _shift(of_old, of_new, candidates, stayed)
         alone_old = np.setdiff1d(np.arange(len(old)), candidates.old[chosen])
@@ -138,9 +140,17 @@ def decide(
         rates = _rates(
             _PRIOR_COUNT + counts, (_PRIOR_NEW[0] + fresh[alone_new].sum(), _PRIOR_NEW[1] + len(chosen))
         )
-    columns = candidates.old, candidates.new, candidates.turn, moved
+    pairs = [
+        Pair(
+            old=int(candidates.old[p]),
+            new=int(candidates.new[p]),
+            turn=int(candidates.turn[p]),
+            moved=float(moved[p]),
+        )
+        for p in chosen.tolist()
+    ]
     return Decision(
-        pairs=tuple(Pair(*row) for row in zip(*(one[chosen].tolist() for one in columns), strict=True)),
+        pairs=tuple(pairs),
         gone={k: float(gone[k]) for k in alone_old.tolist()},
         fresh={k: float(fresh[k]) for k in alone_new.tolist()},
         shift=shift,
@@ -152,17 +162,26 @@ def _rates(counts: FloatArray, new: tuple[float, float]) -> _Rates:
     stayed, moved, gone = np.log(counts / counts.sum())
     # About one older marking lies within reach of an old one: its density over that area.
     older = -float(np.log(np.pi * _REACH_M**2))
-    return _Rates(stayed, moved, gone, float(np.log1p(-np.exp(gone))), older + np.log(new[0] / new[1]), older)
+    return _Rates(
+        stayed=stayed,
+        moved=moved,
+        gone=gone,
+        remains=float(np.log1p(-np.exp(gone))),
+        new_per_m2=older + np.log(new[0] / new[1]),
+        older_per_m2=older,
+    )
 
 
 def _candidates(
     old: Sequence[Marking], new: Sequence[Marking], of_old: Errors, of_new: Errors
 ) -> _Candidates:
     """The pairs of one class within reach."""
-    near: list[list[int]] = [[] for _ in old]
+    in_reach: list[list[int]] = [[] for _ in old]
     if len(old) and len(new):
-        near = cKDTree(of_new.centres_map).query_ball_point(of_old.centres_map, _REACH_M).tolist()
-    pairs = [(a, b) for a, others in enumerate(near) for b in sorted(others) if old[a].kind == new[b].kind]
+        in_reach = cKDTree(of_new.centres_map).query_ball_point(of_old.centres_map, _REACH_M).tolist()
+    pairs = [
+        (a, b) for a, others in enumerate(in_reach) for b in sorted(others) if old[a].kind == new[b].kind
+    ]
     first, second = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
     before = np.array([old[a].corners_map for a in first]).reshape(-1, 4, 2)
     after = np.array([new[b].corners_map for b in second]).reshape(-1, 4, 2)
@@ -175,7 +194,15 @@ def _candidates(
     motions = rigid_motions(before)
     basis = np.swapaxes(np.linalg.qr(motions, mode="complete")[0], 1, 2)
     off = (turned - before).reshape(-1, 8)
-    return _Candidates(first, second, turn, off, noise, basis, np.linalg.norm(motions[..., 2], axis=1))
+    return _Candidates(
+        old=first,
+        new=second,
+        turn=turn,
+        off=off,
+        noise=noise,
+        basis=basis,
+        arm_m=np.linalg.norm(motions[..., 2], axis=1),
+    )
 
 
 def _shift(of_old: Errors, of_new: Errors, candidates: _Candidates, stayed: IntArray) -> Shift:
@@ -184,29 +211,34 @@ def _shift(of_old: Errors, of_new: Errors, candidates: _Candidates, stayed: IntA
     common = SHIFT.T @ information @ SHIFT
     pulled = SHIFT.T @ information @ candidates.off[stayed][..., None]
     spread = np.linalg.inv(common)
-    off = (spread @ pulled)[..., 0]
-    rows = candidates.old[stayed], candidates.new[stayed]
-    return Shift(of_old, of_new, *rows, off, np.asarray(spread, dtype=np.float64))
+    return Shift(
+        of_old=of_old,
+        of_new=of_new,
+        old=candidates.old[stayed],
+        new=candidates.new[stayed],
+        off_map=(spread @ pulled)[..., 0],
+        noise_m2=np.asarray(spread, dtype=np.float64),
+    )
 
 
 def _likelihoods(candidates: _Candidates, shift: Shift, chosen: IntArray, rates: _Rates) -> FloatArray:
     """Log-likelihood (P, 2) of each candidate pair having stayed or moved, prior included."""
     of_pair = {(int(a), int(b)): k for k, (a, b) in enumerate(zip(shift.old, shift.new, strict=True))}
-    out = np.empty((len(candidates), 2))
+    log_likelihood = np.empty((len(candidates), 2))
     for p in range(len(candidates)):
         old = int(candidates.old[p])
         new = int(candidates.new[p])
-        own = of_pair.get((old, new))
-        mean, spread = shift.at(old, new) if own is None else shift.without_itself(own)
+        pair = of_pair.get((old, new))
+        mean, spread = shift.at(old, new) if pair is None else shift.without_itself(pair)
         off = candidates.basis[p] @ (candidates.off[p] - SHIFT @ mean)
         noise = candidates.basis[p] @ (candidates.noise[p] + SHIFT @ spread @ SHIFT.T) @ candidates.basis[p].T
         # In this basis a shift counts twice its length, a rotation its arm.
         free = np.zeros(8)
         free[:2] = (2 * _MOVED_SIGMA_M) ** 2
         free[2] = (candidates.arm_m[p] * _TURNED_SIGMA_RAD) ** 2
-        out[p, STAYED] = rates.stayed + _read(off, noise)
-        out[p, MOVED] = rates.moved + _read(off, noise + np.diag(free))
-    return out
+        log_likelihood[p, STAYED] = rates.stayed + _read(off, noise)
+        log_likelihood[p, MOVED] = rates.moved + _read(off, noise + np.diag(free))
+    return log_likelihood
 
 
 def _read(off: FloatArray, noise: FloatArray) -> float:
@@ -217,6 +249,7 @@ def _read(off: FloatArray, noise: FloatArray) -> float:
 
 
 def _normal(off: FloatArray, covariance: FloatArray) -> float:
+    """Log density of a deviation (K,) under its covariance (K, K)."""
     root = np.linalg.cholesky(covariance)
     whitened = np.linalg.solve(root, off)
     return float(-0.5 * (whitened @ whitened + len(off) * np.log(2 * np.pi)) - np.log(np.diag(root)).sum())
@@ -227,7 +260,7 @@ def _alone(candidates: _Candidates, density: FloatArray) -> FloatArray:
     off = (candidates.basis @ candidates.off[..., None])[..., 0]
     noise = candidates.basis @ candidates.noise @ np.swapaxes(candidates.basis, 1, 2)
     noise = noise[:, 3:, 3:] + _OTHER_SHAPE_M**2 * np.eye(5)
-    shape = [_normal(*one) for one in zip(off[:, 3:], noise, strict=True)]
+    shape = [_normal(deformation, formal) for deformation, formal in zip(off[:, 3:], noise, strict=True)]
     return np.asarray(density - np.log(4) - np.log(np.pi * candidates.arm_m) + np.array(shape))
 
 

@@ -23,7 +23,7 @@ from v2hdm.association.sightings import Rig, Sightings, row_shares
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.planar import Quad, turned_left
-from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, Marking
+from v2hdm.records import SIGMA_OF_MAD, BoolArray, Camera, FloatArray, IntArray, Marking
 from v2hdm.site.living.fates import Watched
 from v2hdm.site.posterior import log_found, log_found_where_none_is
 
@@ -32,13 +32,14 @@ Grey = Callable[[int], NDArray[np.float32]]  # grey values (H, W) of an image, b
 _INSIDE = np.linspace(0.2, 0.8, 7)
 """Fractions along either side at which the inside is sampled: off the edges, which pose errors blur."""
 
-_BESIDE_M = (0.12, 0.25)  # offsets from its edges at which the ground is sampled, m
-_MOST_VIEWS = 6  # nearest views of a place in use: errors of more repeat
-_MOST_LEARNED = 40  # of a drive, for the contrast of paint and ground
+_BESIDE_M = (0.12, 0.25)  # offsets from an outline's edges at which the ground is sampled, m
+_MOST_VIEWS = 6  # most views of a place that are used, the nearest ones: errors of more repeat
+_MOST_LEARNED = 40  # most markings of a class from which a drive's contrast of paint and ground is learned
 _ASIDE_M = 1.3  # distance of bare ground from a marking, m
 _CLEAR_M = 1.0  # least distance of bare ground from all known paint, m
 _LEAST_LEARNED = 8  # least places for the drive's own contrast of paint or ground; with fewer it is unknown
-_HIDDEN_SIGMA = 0.5  # sigma of the contrast, log ratio of grey values, of anything that hides the ground
+
+HIDDEN_SIGMA = 0.5  # sigma of the contrast, log ratio of grey values, of anything that hides the ground
 _HIDDEN_SHARE = 0.5  # fraction of the existing, undetected markings that are hidden; the others are worn
 _STRANGE_SHARE = 0.05  # fraction of bare places with something else: a stain, the edge of a shadow
 _LEAST_SIGMA = 0.02  # floor of the sigma of bare ground's contrast: the grain of an image
@@ -51,25 +52,29 @@ class Paint:
     painted: tuple[float, float]
     bare: tuple[float, float]
 
-    def log_there(self, contrast: FloatArray) -> FloatArray:
+    def log_painted(self, contrast: FloatArray) -> FloatArray:
         """Log density (N,) of contrasts at undetected markings: worn, or hidden."""
-        worn = norm.logpdf(contrast, self.painted[0] / 2, abs(self.painted[0]) / 3 + self.painted[1])
-        hidden = norm.logpdf(contrast, 0.0, _HIDDEN_SIGMA)
+        mean, sigma = self.painted
+        worn = norm.logpdf(contrast, mean / 2, abs(mean) / 3 + sigma)
+        hidden = norm.logpdf(contrast, 0.0, HIDDEN_SIGMA)
         return _mixed(hidden, worn, _HIDDEN_SHARE)
 
     def log_bare(self, contrast: FloatArray) -> FloatArray:
         """Log density (N,) of contrasts of bare ground."""
-        strange = norm.logpdf(contrast, 0.0, _HIDDEN_SIGMA)
-        return _mixed(strange, norm.logpdf(contrast, *self.bare), _STRANGE_SHARE)
+        mean, sigma = self.bare
+        strange = norm.logpdf(contrast, 0.0, HIDDEN_SIGMA)
+        return _mixed(strange, norm.logpdf(contrast, mean, sigma), _STRANGE_SHARE)
 
 
 def _mixed(first: FloatArray, second: FloatArray, share: float) -> FloatArray:
+    """Log density of a mixture, a ``share`` of which is ``first``."""
     return np.asarray(logsumexp([np.log(share) + first, np.log1p(-share) + second], axis=0))
 
 
 def _samples(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Points within an outline (4, 2), and beside its four sides."""
-    inside = Quad(corners).at(*(grid.ravel() for grid in np.meshgrid(_INSIDE, _INSIDE)))
+    along, across = np.meshgrid(_INSIDE, _INSIDE)
+    inside = Quad(corners).at(along.ravel(), across.ravel())
     beside = []
     for first, second in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         side = second - first
@@ -83,32 +88,32 @@ def learn_paint(
     observer: Observer, markings: Sequence[Marking], paint_map: FloatArray
 ) -> Mapping[str, Paint]:
     """By class with enough markings, the contrast of paint at ``paint_map`` (N, 2), and of bare ground."""
-    out = {}
+    paint_of_kind = {}
     paint = cKDTree(paint_map)
-    for kind in sorted({one.kind for one in markings}):
-        own = np.stack([one.corners_map for one in markings if one.kind == kind])
-        own = own[np.linspace(0, len(own) - 1, min(len(own), _MOST_LEARNED)).astype(int)]
-        painted = observer.contrasts(own)
+    for kind in sorted({marking.kind for marking in markings}):
+        corners = np.stack([marking.corners_map for marking in markings if marking.kind == kind])
+        corners = corners[np.linspace(0, len(corners) - 1, min(len(corners), _MOST_LEARNED)).astype(int)]
+        painted = observer.contrasts(corners)
         # Across the longest side or diagonal of each.
-        every = own[:, [1, 2, 2, 3]] - own[:, [0, 1, 0, 1]]
-        extent_m = np.linalg.norm(every, axis=2)
-        rows = np.arange(len(every))
+        sides = corners[:, [1, 2, 2, 3]] - corners[:, [0, 1, 0, 1]]
+        extent_m = np.linalg.norm(sides, axis=2)
+        rows = np.arange(len(sides))
         longest = np.argmax(extent_m, axis=1)
-        along = every[rows, longest] / extent_m[rows, longest, None]
+        along = sides[rows, longest] / extent_m[rows, longest, None]
         across = _ASIDE_M * turned_left(along)[:, None]
-        aside = np.concatenate([own - across, own + across])
+        aside = np.concatenate([corners - across, corners + across])
         clear = paint.query(aside.reshape(-1, 2))[0].reshape(-1, 4).min(axis=1) > _CLEAR_M
         bare = observer.contrasts(aside[clear]) if clear.any() else np.zeros(0)
         samples = [values[np.isfinite(values)] for values in (painted, bare)]
         if min(len(values) for values in samples) >= _LEAST_LEARNED:
-            out[kind] = Paint(_robust(samples[0]), _robust(samples[1]))
-    return out
+            paint_of_kind[kind] = Paint(_robust(samples[0]), _robust(samples[1]))
+    return paint_of_kind
 
 
 def _robust(values: FloatArray) -> tuple[float, float]:
     """Median, and the standard deviation that its median deviation implies."""
     middle = float(np.median(values))
-    return middle, max(1.4826 * float(np.median(np.abs(values - middle))), _LEAST_SIGMA)
+    return middle, max(SIGMA_OF_MAD * float(np.median(np.abs(values - middle))), _LEAST_SIGMA)
 
 
 _MOST_SQUARED = 25.0
@@ -121,15 +126,15 @@ _REACH_M = 2.0  # largest distance, m, of a sighting's centre from a place's: it
 
 @dataclass(frozen=True)
 class Looks:
-    """Numbers of near ``views`` (N,) of N places, and of detections ``found`` in them (N,)."""
+    """Numbers of near ``views`` (N,) of N places, and of ``detections`` in them (N,)."""
 
     views: IntArray
-    found: IntArray
+    detections: IntArray
 
     def watched(self, rate: FloatArray) -> Watched:
         """Log-likelihoods with and without a marking, whose detection rate is ``rate`` (N,)."""
-        there = [log_found(k, n, r) for k, n, r in zip(self.found, self.views, rate, strict=True)]
-        return Watched(np.array(there), log_found_where_none_is(self.found, self.views))
+        painted = [log_found(k, n, r) for k, n, r in zip(self.detections, self.views, rate, strict=True)]
+        return Watched(np.array(painted), log_found_where_none_is(self.detections, self.views))
 
 
 @dataclass(frozen=True)
@@ -151,13 +156,13 @@ class Observer:
         """Views of ``markings``, and detections of them among the sightings ``free`` (S,)."""
         if not markings:
             return Looks(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
-        corners = np.stack([one.corners_map for one in markings])
+        corners = np.stack([marking.corners_map for marking in markings])
         count = len(markings)
         place, image = self.easy_views(corners)
         shown = self._shown(markings, corners, free)
-        found = [pair in shown for pair in zip(place.tolist(), image.tolist(), strict=True)]
+        is_shown = [pair in shown for pair in zip(place.tolist(), image.tolist(), strict=True)]
         views = np.bincount(place, minlength=count)
-        return Looks(views, np.bincount(place[found], minlength=count).astype(np.int64))
+        return Looks(views, np.bincount(place[is_shown], minlength=count).astype(np.int64))
 
     def _shown(
         self, markings: Sequence[Marking], corners: FloatArray, free: BoolArray
@@ -168,7 +173,7 @@ class Observer:
         if not len(rows):
             return set()
         row, place = near_pairs(located, rows, corners.mean(axis=1), _REACH_M)
-        kinds = np.array([one.kind for one in markings])
+        kinds = np.array([marking.kind for marking in markings])
         alike = kinds[place] == np.array(self.sightings.kinds)[self.sightings.kind[row]]
         row = row[alike]
         place = place[alike]
@@ -182,20 +187,22 @@ class Observer:
         """Median contrast (N,) of places (N, 4, 2) over their nearest views; nan without any."""
         assert self.grey is not None
         place, image = self.easy_views(corners_map)
-        row_of = {int(one): row for row, one in enumerate(self.views.image)}
-        wanted: dict[int, list[int]] = {}
+        row_of = {int(image_of_row): row for row, image_of_row in enumerate(self.views.image)}
+        places_of_row: dict[int, list[int]] = {}
         for number in range(len(corners_map)):
-            rows = np.array([row_of[int(one)] for one in image[place == number]], dtype=np.int64)
-            at = self.rig.map_from_vehicle[self.views.frame[rows]][:, :2, 3]
-            away_m = np.linalg.norm(at - corners_map[number].mean(axis=0), axis=1)
+            rows = np.array([row_of[int(index)] for index in image[place == number]], dtype=np.int64)
+            vehicle_map = self.rig.map_from_vehicle[self.views.frame[rows]][:, :2, 3]
+            away_m = np.linalg.norm(vehicle_map - corners_map[number].mean(axis=0), axis=1)
             for row in rows[np.argsort(away_m)[:_MOST_VIEWS]].tolist():
-                wanted.setdefault(row, []).append(number)
-        found: list[list[float]] = [[] for _ in corners_map]
-        for row, numbers in sorted(wanted.items()):
+                places_of_row.setdefault(row, []).append(number)
+        contrasts: list[list[float]] = [[] for _ in corners_map]
+        for row, numbers in sorted(places_of_row.items()):
             grey = self.grey(int(self.views.image[row]))
             for number in numbers:
-                found[number].append(self._contrast(grey, row, corners_map[number]))
-        return np.array([np.nanmedian(own) if np.isfinite(own).any() else np.nan for own in found])
+                contrasts[number].append(self._contrast(grey, row, corners_map[number]))
+        return np.array(
+            [np.nanmedian(values) if np.isfinite(values).any() else np.nan for values in contrasts]
+        )
 
     def _contrast(self, grey: NDArray[np.float32], row: int, corners: FloatArray) -> float:
         """Log ratio of mean grey values within an outline (4, 2) and beside it."""
@@ -204,8 +211,8 @@ class Observer:
         info = self.cameras[camera].info
         cam_from_map = self.rig.cam_from_map(camera, frame)
         if self.rig.read_out_s is not None:  # its middle's row gives the outline's read-out
-            seen, _ = project_ground(self.rig.intrinsic[camera], cam_from_map, corners)
-            middle = distort_points(info, seen.mean(axis=0, keepdims=True))
+            outline_px, _ = project_ground(self.rig.intrinsic[camera], cam_from_map, corners)
+            middle = distort_points(info, outline_px.mean(axis=0, keepdims=True))
             cam_from_map = self.rig.cam_from_map(camera, frame, row_shares(info, middle)[0])
         means = []
         for points in _samples(corners):
@@ -221,9 +228,9 @@ class Observer:
 def find_rates(observer: Observer, markings: Sequence[Marking]) -> Mapping[str, float]:
     """Detection rate by class in easy views of the drive's own markings."""
     looks = observer.looks(markings, np.ones(len(observer.sightings), dtype=bool))
-    kinds = np.array([one.kind for one in markings])
+    kinds = np.array([marking.kind for marking in markings])
     return {
-        str(kind): float((looks.found[kinds == kind].sum() + 1) / (looks.views[kinds == kind].sum() + 2))
+        str(kind): float((looks.detections[kinds == kind].sum() + 1) / (looks.views[kinds == kind].sum() + 2))
         for kind in np.unique(kinds)
     }
 
@@ -234,19 +241,22 @@ def with_paint(
     """``watched`` old markings with the images' evidence at places without a ``new`` one of the class."""
     if observer.grey is None or not old or not new:
         return watched
-    old_at, new_at = (np.array([one.corners_map.mean(axis=0) for one in some]) for some in (old, new))
-    paint_map = np.concatenate([one.corners_map for one in (*old, *new)] + [old_at, new_at])
-    there = watched.there.copy()
+    old_at = np.array([marking.corners_map.mean(axis=0) for marking in old])
+    new_at = np.array([marking.corners_map.mean(axis=0) for marking in new])
+    paint_map = np.concatenate([marking.corners_map for marking in (*old, *new)] + [old_at, new_at])
+    painted = watched.painted.copy()
     bare = watched.bare.copy()
     for kind, paint in learn_paint(observer, new, paint_map).items():
-        alike = np.array([one.kind == kind for one in new])
-        near_m = cKDTree(new_at[alike]).query(old_at)[0]
-        doubtful = [k for k, one in enumerate(old) if one.kind == kind and near_m[k] > _SAME_PLACE_M]
+        alike = np.array([marking.kind == kind for marking in new])
+        distance_m = cKDTree(new_at[alike]).query(old_at)[0]
+        doubtful = [
+            k for k, marking in enumerate(old) if marking.kind == kind and distance_m[k] > _SAME_PLACE_M
+        ]
         if not doubtful:
             continue
         contrast = observer.contrasts(np.stack([old[k].corners_map for k in doubtful]))
-        known = np.isfinite(contrast)
-        rows = np.array(doubtful)[known]
-        there[rows] += paint.log_there(contrast[known])
-        bare[rows] += paint.log_bare(contrast[known])
-    return Watched(there, bare)
+        is_visible = np.isfinite(contrast)
+        rows = np.array(doubtful)[is_visible]
+        painted[rows] += paint.log_painted(contrast[is_visible])
+        bare[rows] += paint.log_bare(contrast[is_visible])
+    return Watched(painted, bare)

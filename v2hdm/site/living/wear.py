@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -26,23 +27,38 @@ from v2hdm.geometry.rigid import inverse
 from v2hdm.records import Calibration, FloatArray, HDMap, Image, PaintLeft
 from v2hdm.surface.surface import Surface
 
-_CELL_M = 0.02
-_EDGE_M = 0.03  # margin inside the sides that is left out: blurred, and uncertain by pose errors
-_BESIDE_M = np.array([0.06, 0.10, 0.14, 0.18])  # from the long sides, where the ground is measured
-_MOST_CELLS = (60, 24)  # along and across
-_NEAR_M = 12.0  # largest range, at which images resolve flakes of paint
-_VIEWS = (2, 6)  # fewest and most images of a marking: errors of more repeat
-_GROUND_SIGMA = 0.08
-_PAINT_SIGMA = 0.09
-"""Sigmas of the contrast of bare ground, and of full paint as a share of its own (43 rendered markings)."""
+_CELL_M = 0.02  # size of a cell of a marking, m
+_EDGE_M = 0.03  # margin inside the sides that is left out, m: blurred, and uncertain by pose errors
+_BESIDE_M = np.array([0.06, 0.10, 0.14, 0.18])  # distances, m, from the long sides at which ground is sampled
+_MOST_CELLS = (60, 24)  # most cells of a marking along and across
 
+_NEAR_M = 12.0  # largest range, m, at which images resolve flakes of paint
+_VIEWS = (2, 6)  # fewest and most images of a marking: errors of more repeat
+
+_GROUND_SIGMA = 0.08  # sigma of the contrast of bare ground (43 rendered markings)
+_PAINT_SIGMA = 0.09  # sigma of the contrast of full paint, as a share of that contrast (the same markings)
 _INDEPENDENT = 12.0  # cells that count as independent: flakes, stains and the blur of images span many
-_CONTRASTS = np.exp(np.linspace(np.log(0.2), np.log(4.0), 28))  # of full paint over its ground
-_ROUNDS = 12
-_FITTED = 160  # of expectation and maximisation, and cells that take part
+_CONTRASTS = np.exp(np.linspace(np.log(0.2), np.log(4.0), 28))
+"""Contrasts of full paint over its ground that are tested."""
+
+_ROUNDS = 12  # rounds of expectation maximisation
+_FITTED = 160  # most cells of a marking that take part in the fit
+
+# Contrast of full paint of a class before its markings are seen; the prior is worth four markings.
+_USUAL_LOG_CONTRAST = np.log(1.3)  # mean of its logarithm
+_USUAL_SPREAD = 0.5  # standard deviation of its logarithm
+
 _MODEL_SIGMA = (0.045, 0.3)
 """Sigma of a fraction beside the fit's, and its growth with wear: flakes finer than a pixel look like dirt, a
 shadow narrower than a marking like wear (143 rendered markings of ports 5 to 8 and 11)."""
+
+
+class Fit(NamedTuple):
+    """A marking's paint under each of C contrasts of full paint, :data:`_CONTRASTS`."""
+
+    log_likelihood: FloatArray  # (C,)
+    share: FloatArray  # (C,) fraction of paint left
+    sigma: FloatArray  # (C,) its standard deviation, from cells and images
 
 
 @dataclass(frozen=True)
@@ -59,14 +75,14 @@ class Cells:
         if sides[1] + sides[3] > sides[0] + sides[2]:
             corners_map = np.roll(corners_map, -1, axis=0)
             sides = np.roll(sides, -1)
-        length, width = (max(float(sides[k] + sides[k + 2]) / 2, 4 * _EDGE_M) for k in (0, 1))
-        along, across = (
-            np.linspace(_EDGE_M / m, 1 - _EDGE_M / m, int(np.clip((m - 2 * _EDGE_M) / _CELL_M, least, most)))
-            for m, least, most in zip((length, width), (3, 2), _MOST_CELLS, strict=True)
-        )
-        across = np.concatenate([-_BESIDE_M[::-1] / width, across, 1 + _BESIDE_M / width])
+        length_m, width_m = (max(float(sides[k] + sides[k + 2]) / 2, 4 * _EDGE_M) for k in (0, 1))
+        most_along, most_across = _MOST_CELLS
+        along = _shares_of_side(length_m, 3, most_along)
+        across = _shares_of_side(width_m, 2, most_across)
+        across = np.concatenate([-_BESIDE_M[::-1] / width_m, across, 1 + _BESIDE_M / width_m])
         s, t = np.meshgrid(along, across, indexing="ij")
-        return cls(Quad(corners_map).at(s.ravel(), t.ravel()).reshape(*s.shape, 2), [])
+        places_map = Quad(corners_map).at(s.ravel(), t.ravel()).reshape(len(along), len(across), 2)
+        return cls(places_map, [])
 
     def add(self, light: FloatArray) -> None:
         """Add the light (along, across) of one image."""
@@ -77,15 +93,17 @@ class Cells:
         ground = np.stack([*ground, ground.mean(axis=0)])
         self.contrasts.append(light[:, count:-count] / np.maximum(ground, 1e-4)[..., None] - 1.0)
 
-    def fit(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Log-likelihoods by contrast, fractions of paint, and their sigmas from cells and images."""
-        every = np.clip(np.median(self.contrasts, axis=0), -0.5, 4.0)
+    def fit(self) -> Fit:
+        """The paint left, by the contrast of full paint."""
+        contrasts = np.clip(np.median(self.contrasts, axis=0), -0.5, 4.0)
         # A shadow's edge is anywhere between the sides.
-        far = np.broadcast_to((np.arange(every.shape[2]) + 0.5) / every.shape[2], every.shape[1:])
-        lit_like = np.stack([1 - far, far, np.full(far.shape, 0.5)]).reshape(3, 1, -1) / 1.5
-        every = every.reshape(3, 1, -1)
-        step = -(-far.size // _FITTED)
-        cells = every[..., ::step]
+        distance = np.broadcast_to(
+            (np.arange(contrasts.shape[2]) + 0.5) / contrasts.shape[2], contrasts.shape[1:]
+        )
+        lit_like = np.stack([1 - distance, distance, np.full(distance.shape, 0.5)]).reshape(3, 1, -1) / 1.5
+        contrasts = contrasts.reshape(3, 1, -1)
+        step = -(-distance.size // _FITTED)
+        cells = contrasts[..., ::step]
         lit_like = lit_like[..., ::step]
         paint = _CONTRASTS[:, None]
         sigma = np.hypot(_PAINT_SIGMA * _CONTRASTS, _GROUND_SIGMA)[:, None]
@@ -105,8 +123,14 @@ class Cells:
         log_likelihood = np.log((weight * densities).sum(axis=0)).sum(axis=1)
         doubt = 2 * (member[0] * member[1]).mean(axis=1)
         of_images = np.median(np.mean(self.contrasts, axis=1), axis=(1, 2)) / _CONTRASTS[:, None]
-        apart = np.median(np.abs(of_images - np.median(of_images, axis=1, keepdims=True)), axis=1)
-        return log_likelihood * min(1.0, _INDEPENDENT / cells.size), share, np.hypot(doubt, apart)
+        scatter = np.median(np.abs(of_images - np.median(of_images, axis=1, keepdims=True)), axis=1)
+        return Fit(log_likelihood * min(1.0, _INDEPENDENT / cells.size), share, np.hypot(doubt, scatter))
+
+
+def _shares_of_side(side_m: float, least: int, most: int) -> FloatArray:
+    """Cells along a side, as fractions of its length, ``least`` to ``most`` of them."""
+    count = int(np.clip((side_m - 2 * _EDGE_M) / _CELL_M, least, most))
+    return np.linspace(_EDGE_M / side_m, 1 - _EDGE_M / side_m, count)
 
 
 def with_wear(
@@ -126,50 +150,58 @@ def with_wear(
     ``shown`` are (image, marking) pairs without occlusion. A marking of the ``earlier`` map, by id, states
     the change, and keeps its earlier value if unseen here.
     """
-    cells = [Cells.of(one.corners_map) for one in hd_map.markings]
+    cells = [Cells.of(marking.corners_map) for marking in hd_map.markings]
     ground = None if surface is None else surface.seen_from(np.array(map_from_vehicle))
     footage = _Footage(images, map_from_vehicle, calibrations, ground)
     for number, light in _lights(cells, footage, _best_views(cells, footage, shown), grey, threads):
         cells[number].add(light)
-    known = [k for k, one in enumerate(cells) if len(one.contrasts) >= _VIEWS[0]]
-    shares = _shares([cells[k].fit() for k in known], [hd_map.markings[k].kind for k in known])
-    before = {} if earlier is None else {one.id: one.paint for one in earlier.markings}
-    found = dict(zip(known, shares, strict=True))
+    measured = [k for k, cells_of_marking in enumerate(cells) if len(cells_of_marking.contrasts) >= _VIEWS[0]]
+    shares = _shares([cells[k].fit() for k in measured], [hd_map.markings[k].kind for k in measured])
+    earlier_paint_of_id = (
+        {} if earlier is None else {marking.id: marking.paint for marking in earlier.markings}
+    )
+    paint_of_marking = dict(zip(measured, shares, strict=True))
     markings = []
-    for k, one in enumerate(hd_map.markings):
-        old = before.get(one.id) if one.id is not None else None
-        markings.append(replace(one, paint=found[k].since(old) if k in found else old))
+    for k, marking in enumerate(hd_map.markings):
+        earlier_paint = earlier_paint_of_id.get(marking.id) if marking.id is not None else None
+        paint = paint_of_marking[k].since(earlier_paint) if k in paint_of_marking else earlier_paint
+        markings.append(replace(marking, paint=paint))
     return replace(hd_map, markings=tuple(markings))
 
 
-def _shares(fits: Sequence[tuple[FloatArray, ...]], kinds: Sequence[str]) -> list[PaintLeft]:
+def _shares(fits: Sequence[Fit], kinds: Sequence[str]) -> list[PaintLeft]:
     """The fractions, with the contrast of full paint learned per class."""
-    out: dict[int, PaintLeft] = {}
+    paint_of_fit: dict[int, PaintLeft] = {}
     log_contrasts = np.log(_CONTRASTS)
     for kind in set(kinds):
-        mine = [k for k, one in enumerate(kinds) if one == kind]
-        likelihood, share, own_sigma = (np.stack([fits[k][part] for k in mine]) for part in range(3))
-        middle = np.log(1.3)
-        spread = 0.5
+        members = [k for k, kind_of_marking in enumerate(kinds) if kind_of_marking == kind]
+        likelihood = np.stack([fits[k].log_likelihood for k in members])
+        share = np.stack([fits[k].share for k in members])
+        own_sigma = np.stack([fits[k].sigma for k in members])
+        middle = _USUAL_LOG_CONTRAST
+        spread = _USUAL_SPREAD
         for _ in range(3):
             log_posterior = likelihood + norm.logpdf(log_contrasts, middle, spread)
             posterior = np.exp(log_posterior - log_posterior.max(axis=1, keepdims=True))
             posterior /= posterior.sum(axis=1, keepdims=True)
-            own = posterior @ log_contrasts
+            log_contrast = posterior @ log_contrasts
             # A small class keeps to the wide prior, which is worth four markings.
-            middle = (own.sum() + 4 * np.log(1.3)) / (len(mine) + 4)
-            spread = float(np.sqrt((((own - middle) ** 2).sum() + 4 * 0.5**2) / (len(mine) + 4)))
+            middle = (log_contrast.sum() + 4 * _USUAL_LOG_CONTRAST) / (len(members) + 4)
+            squared = ((log_contrast - middle) ** 2).sum() + 4 * _USUAL_SPREAD**2
+            spread = float(np.sqrt(squared / (len(members) + 4)))
         mean = (posterior * share).sum(axis=1)
         variance = (posterior * ((share - mean[:, None]) ** 2 + own_sigma**2)).sum(axis=1)
         floor, growth = _MODEL_SIGMA
         sigma = np.sqrt(variance + floor**2 + (growth * (1.0 - mean)) ** 2)
-        out |= {k: PaintLeft(float(m), float(s)) for k, m, s in zip(mine, mean, sigma, strict=True)}
-    return [out[k] for k in range(len(kinds))]
+        paint_of_fit |= {
+            k: PaintLeft(float(m), float(s)) for k, m, s in zip(members, mean, sigma, strict=True)
+        }
+    return [paint_of_fit[k] for k in range(len(kinds))]
 
 
-_LIGHT = np.arange(256, dtype=np.float32) / 255
-_LIGHT = np.where(_LIGHT <= 0.04045, _LIGHT / 12.92, ((_LIGHT + 0.055) / 1.055) ** 2.4).astype(np.float32)
-"""Linear light by the grey value of sRGB, an adequate model of cameras for a ratio."""
+_GREY = np.arange(256, dtype=np.float32) / 255  # grey values of sRGB, relative to white
+_LIGHT = np.where(_GREY <= 0.04045, _GREY / 12.92, ((_GREY + 0.055) / 1.055) ** 2.4).astype(np.float32)
+"""Linear light by the grey value (0 to 255) of sRGB, an adequate model of cameras for a ratio."""
 
 
 @dataclass(frozen=True)
@@ -183,11 +215,11 @@ class _Footage:
 
     def pinhole_px(self, index: int, places_map: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pinhole px (N, 2) and depth (N,), m, of ground points (N, 2) in an image."""
-        own = self.calibrations[self.images[index].camera]
-        cam_from_map = own.cam_from_vehicle @ inverse(self.map_from_vehicle[index])
+        calibration = self.calibrations[self.images[index].camera]
+        cam_from_map = calibration.cam_from_vehicle @ inverse(self.map_from_vehicle[index])
         if self.ground is not None:
             places_map = self.ground.on_plane(places_map, cam_from_map, index)
-        return project_ground(own.info.intrinsic, cam_from_map, places_map)
+        return project_ground(calibration.info.intrinsic, cam_from_map, places_map)
 
 
 def _best_views(
@@ -196,7 +228,7 @@ def _best_views(
     """By image, the markings that it shows whole, as one of the nearest images of each."""
     if not cells:
         return {}
-    tree = cKDTree([one.places_map.mean(axis=(0, 1)) for one in cells])
+    tree = cKDTree([cells_of_marking.places_map.mean(axis=(0, 1)) for cells_of_marking in cells])
     views: list[list[tuple[float, int]]] = [[] for _ in cells]
     for index, (image, pose) in enumerate(zip(footage.images, footage.map_from_vehicle, strict=True)):
         if image.camera not in footage.calibrations:
@@ -205,39 +237,42 @@ def _best_views(
         for number in tree.query_ball_point(pose[:2, 3], _NEAR_M):
             if (index, number) not in shown:
                 continue
-            edge = cells[number].places_map[[0, 0, -1, -1], [0, -1, 0, -1]]
-            pinhole, depth_m = footage.pinhole_px(index, edge)
+            corners = cells[number].places_map[[0, 0, -1, -1], [0, -1, 0, -1]]
+            pinhole, depth_m = footage.pinhole_px(index, corners)
             if (depth_m <= 0.3).any():
                 continue
             px = distort_points(info, pinhole)
             if (px >= 2).all() and (px <= (info.width - 3, info.height - 3)).all():
-                views[number].append((float(np.linalg.norm(edge.mean(axis=0) - pose[:2, 3])), index))
-    wanted: dict[int, list[int]] = {}
-    for number, found in enumerate(views):
-        for _, index in sorted(found)[: _VIEWS[1]] if len(found) >= _VIEWS[0] else ():
-            wanted.setdefault(index, []).append(number)
-    return wanted
+                views[number].append((float(np.linalg.norm(corners.mean(axis=0) - pose[:2, 3])), index))
+    markings_of_image: dict[int, list[int]] = {}
+    fewest, most = _VIEWS
+    for number, views_of_marking in enumerate(views):
+        if len(views_of_marking) < fewest:
+            continue
+        for _, index in sorted(views_of_marking)[:most]:
+            markings_of_image.setdefault(index, []).append(number)
+    return markings_of_image
 
 
 def _lights(
     cells: Sequence[Cells],
     footage: _Footage,
-    wanted: Mapping[int, Sequence[int]],
+    markings_of_image: Mapping[int, Sequence[int]],
     grey: Callable[[Image], NDArray[np.float32]],
     threads: int,
 ) -> Iterator[tuple[int, FloatArray]]:
     """Each wanted marking of each image, and the light of its cells (along, across) there."""
-    order = sorted(wanted)
+    order = sorted(markings_of_image)
     with ThreadPoolExecutor(threads) as readers:
         for start in range(0, len(order), 8 * threads):  # limits the decoded images in memory
-            some = order[start : start + 8 * threads]
-            read = readers.map(lambda one: grey(footage.images[one]), some)
-            for index, pixels in zip(some, read, strict=True):
+            batch = order[start : start + 8 * threads]
+            greys = readers.map(lambda index_to_read: grey(footage.images[index_to_read]), batch)
+            for index, pixels in zip(batch, greys, strict=True):
                 info = footage.calibrations[footage.images[index].camera].info
                 light = cv2.LUT(pixels.astype(np.uint8), _LIGHT)
-                for number in wanted[index]:
-                    places = cells[number].places_map
-                    px = distort_points(info, footage.pinhole_px(index, places.reshape(-1, 2))[0])
-                    at = px.reshape(places.shape).astype(np.float32)
-                    seen = cv2.remap(light, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
-                    yield number, np.asarray(seen, dtype=np.float64)
+                for number in markings_of_image[index]:
+                    places_map = cells[number].places_map
+                    px = distort_points(info, footage.pinhole_px(index, places_map.reshape(-1, 2))[0])
+                    places_px = px.reshape(places_map.shape).astype(np.float32)
+                    light_of_cells = cv2.remap(light, places_px[..., 0], places_px[..., 1], cv2.INTER_LINEAR)
+                    yield number, np.asarray(light_of_cells, dtype=np.float64)

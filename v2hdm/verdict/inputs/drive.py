@@ -15,11 +15,10 @@ from v2hdm.geometry.ipm import apply_homography, initial_extrinsic
 from v2hdm.geometry.lens import distort_points, has_distortion, undistort_points
 from v2hdm.geometry.planar import inside_convex, signed_area
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.ground.estimate import estimate_cameras
 from v2hdm.ground.results import GroundEstimate
 from v2hdm.io.drive import as_drive
 from v2hdm.io.drive.road import unevenness
-from v2hdm.records import Camera, CameraInfo, CentrePrior, Drive, FloatArray
+from v2hdm.records import FOOT_M, Camera, CameraInfo, CentrePrior, Drive, FloatArray
 from v2hdm.verdict.inputs import ground as ground_checks
 from v2hdm.verdict.inputs.ground import check_ground, find_cause, path_of
 from v2hdm.verdict.inputs.heading import check_heading
@@ -31,22 +30,21 @@ from v2hdm.verdict.verdict import Finding, Status, Verdict, judge, passed
 _OFF_CENTRE = 0.15
 # A principal point in the middle of an image smaller or larger by this is of another resolution.
 _OTHER_SIZE = 0.15
-# Focal lengths, in image widths, of lenses that map roads: 118 deg wide (fisheyes more) to 11 deg.
-_SHORTEST = 0.3
-_LONGEST = 5.0
+_SHORTEST = 0.3  # focal length, in image widths, of the widest lens for roads but fisheyes: 118 deg
+_LONGEST = 5.0  # focal length, in image widths, of the narrowest lens that maps roads: 11 deg
 _SQUARE = 0.03  # pixels are square to far less than this
 _MISSHAPEN = 0.03  # clicked homographies depart from K [r1 r2 t] by about one percent
 _BORROWED_M = 1.0  # a guess from another vehicle of the same type, or from a drawing, is decimetres off
 _NEAR_SURVEY_M = 0.6  # distance of survey and guess at which a changed sign or unit is the cause
 # Units that surveys come in, in 1/m.
-_SURVEY_UNITS = {"centimetres": 1e2, "millimetres": 1e3, "feet": 1 / 0.3048, "inches": 1 / 0.0254}
+_SURVEY_UNITS = {"centimetres": 1e2, "millimetres": 1e3, "feet": 1 / FOOT_M, "inches": 1 / 0.0254}
 _ROI_IN_VIEW = 0.5  # at least this share of the ROI must be in the image
 _ROI_AREA_M2 = 4.0  # a smaller ROI holds no whole marking: a dash alone is 3 m long
 # Ground per pixel, along the view, at the ROI's far end: beyond, a pixel of noise is half a metre.
 _COARSEST_M = 0.5
 _TILTED_DEG = 30.0  # cameras for roads are mounted upright
-_LOWEST_M = 0.3
-_HIGHEST_M = 12.0  # heights of cameras on vehicles, cranes' straddle carriers included
+_LOWEST_M = 0.3  # least height of a camera on a vehicle
+_HIGHEST_M = 12.0  # largest height of a camera on a vehicle, straddle carriers included
 
 
 def check_camera(name: str, camera: Camera) -> list[Finding]:
@@ -114,19 +112,19 @@ def check_roi(name: str, camera: Camera, cam_from_vehicle: FloatArray) -> list[F
             "rear camera's ROI has negative x); fix one of them"
         )
         return failed(before, _ROI_IN_VIEW, "", says)
-    seen = _share_in_image(camera, grid, depth)
-    if seen < _ROI_IN_VIEW:
+    share_in_view = _share_in_image(camera, grid, depth)
+    if share_in_view < _ROI_IN_VIEW:
         says = (
-            f"only {100 * seen:.0f} % of roi_vehicle is in the image, according to the guessed mounting: "
-            "fix roi_vehicle or the guess"
+            f"only {100 * share_in_view:.0f} % of roi_vehicle is in the image, according to the guessed "
+            "mounting: fix roi_vehicle or the guess"
         )
-        return failed(seen, _ROI_IN_VIEW, "", says)
+        return failed(share_in_view, _ROI_IN_VIEW, "", says)
     area = abs(float(signed_area(camera.roi_vehicle)))
     if area < _ROI_AREA_M2:
         says = f"roi_vehicle covers {area:.2g} m2, less than a marking; enlarge it (metres, not kilometres)"
         return failed(area, _ROI_AREA_M2, "m2", says)
     farthest = _farthest(name, camera, cam_from_vehicle, grid[depth > 0])
-    return [passed("roi", name, "the ROI is in the image", seen), farthest]
+    return [passed("roi", name, "the ROI is in the image", share_in_view), farthest]
 
 
 def check_survey(name: str, prior: CentrePrior, guess_vehicle: FloatArray) -> Finding:
@@ -220,8 +218,8 @@ def _share_in_image(camera: Camera, grid: FloatArray, depth: FloatArray) -> floa
     ipm = np.asarray(np.linalg.inv(camera.ipm[camera.initial_ipm]))
     pinhole = apply_homography(ipm, grid[depth > 0])
     # Lens models fold over far outside the image: points of the pinhole there are not in it.
-    near = inside_convex(_frame(info, 0.5), pinhole)
-    points_px = distort_points(info, pinhole[near])
+    in_view = inside_convex(_frame(info, 0.5), pinhole)
+    points_px = distort_points(info, pinhole[in_view])
     return float(inside_convex(_frame(info, 0.0), points_px).sum() / len(grid))
 
 
@@ -236,15 +234,16 @@ def _frame(info: CameraInfo, margin: float) -> FloatArray:
 
 def _grid(polygon: FloatArray) -> FloatArray:
     """A grid of points (N, 2) in a convex polygon, with its corners."""
-    axes = [np.linspace(*bounds, 15) for bounds in zip(polygon.min(axis=0), polygon.max(axis=0), strict=True)]
-    grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    left, low = polygon.min(axis=0)
+    right, high = polygon.max(axis=0)
+    x = np.linspace(left, right, 15)
+    y = np.linspace(low, high, 15)
+    grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     return np.vstack([polygon, grid[inside_convex(polygon, grid)]])
 
 
-# Sigmas of roll and pitch beyond which ground is bent, not noisy; and beyond which markings on it are wrong
-# by many times what the map states.
-_ROAD_SIGMAS = 3.0
-_ROAD_BENT = 10.0
+_ROAD_SIGMAS = 3.0  # sigmas of roll and pitch beyond which ground is bent, not noisy
+_ROAD_BENT = 10.0  # sigmas of roll and pitch beyond which the map errs by many times what it states
 _LEAST_SWAY_RAD = 0.003  # roll and pitch of every vehicle on its suspension, whatever pose_noise states
 _STEPS = ("position jumps", "height jumps", "pose scatter", "image spacing", "pose gaps", "pose rate")
 _MOUNTING = ("roi", "roi range", "ipm against camera matrix", "camera height", "survey against guess")
@@ -310,6 +309,8 @@ def check_drive(
     """
     drive = as_drive(drive)
     if isinstance(ground, bool):
+        from v2hdm.ground.estimate import estimate_cameras
+
         ground = estimate_cameras(drive, workers, progress) if ground else {}
     return Verdict.of(input_findings(drive, ground))
 
@@ -341,7 +342,9 @@ def check_road(drive: Drive) -> Iterator[Finding]:
     if drive.road is None or len(drive.road.points_map) < 2:
         yield passed("road", "poses", "the ground was recorded as the plane z = 0", 0.0, "deg")
         return
-    reach_m = max(float(np.linalg.norm(one.roi_vehicle, axis=1).max()) for one in drive.cameras.values())
+    reach_m = max(
+        float(np.linalg.norm(camera.roi_vehicle, axis=1).max()) for camera in drive.cameras.values()
+    )
     worst = unevenness(drive.road, reach_m)
     lean_rad = worst.value_m / worst.distance_m
     sigma_rad = max(drive.pose_noise.roll_pitch_rad, _LEAST_SWAY_RAD)
@@ -363,9 +366,11 @@ def causes(findings: Iterable[Finding]) -> list[Finding]:
     explained: set[int] = set()
     worst: dict[int, Status] = {}
     for cause in raised:
-        own = [finding for finding in raised if _explains(cause, finding)]
-        explained |= {id(finding) for finding in own}
-        worst[id(cause)] = max((finding.status for finding in (cause, *own)), key=lambda status: status.rank)
+        consequences = [finding for finding in raised if _explains(cause, finding)]
+        explained |= {id(finding) for finding in consequences}
+        worst[id(cause)] = max(
+            (finding.status for finding in (cause, *consequences)), key=lambda status: status.rank
+        )
     return [
         replace(finding, status=worst.get(id(finding), finding.status))
         for finding in findings

@@ -11,30 +11,28 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from v2hdm.ground import GroundEstimate, GroundOptions, GroundStatus, Parameter, Reading, estimate_ground
-from v2hdm.ground.estimate import STEEP_RAD
-from v2hdm.records import Camera, Drive, FloatArray, Trajectory
+from v2hdm.ground.results import STEEP_RAD, GroundEstimate, GroundOptions, GroundStatus, Parameter, Reading
+from v2hdm.records import FOOT_M, Camera, Drive, FloatArray, Trajectory
 from v2hdm.verdict.inputs.heading import Path
 from v2hdm.verdict.verdict import Finding, Status, judge, passed
 
-_SURE = 5.0  # sigmas that a quantity must be off
+_SURE = 5.0  # sigmas by which a quantity must be off to be reported
 _CLOCK_S = 0.015  # clocks of clean drives were found right to 7 ms; 15 ms at 5 m/s are 7 cm
 _CORRECTABLE_S = 0.25  # a clock error above this may lie beyond the search; it is not corrected
-# Focal lengths of clean drives were found right to .8 %; confusion with the pitch costs 1 to 2 %.
+# Focal lengths of clean drives were found right to 0.8 %; confusion with the pitch costs 1 to 2 %.
 _FOCAL = 0.025
-# Change of k1 that moves the corner of a lens 74 deg wide by 3 px; clean drives stay below .001.
+# Change of k1 that moves the corner of a lens 74 deg wide by 3 px; clean drives stay below 0.001.
 _DISTORTION = 0.02
-_GRADE = 0.001  # rise of the poses over the ground, m per m: clean drives stay below .0003
+_GRADE = 0.001  # rise of the poses over the ground, m per m: clean drives stay below 0.0003
 _UP_M = 0.08  # heights of clean drives were found right to 6 cm, mostly to 1
 _ALONG_M = 0.15  # places in the plane of clean drives were found right to 8 cm
 _VAGUE_M = 0.1  # largest sigma of a place in the plane that tests a survey
-# Median residual of matched patches: .23 to .46 on clean drives, 1.1 to 1.5 without a lens' distortion.
+# Median residual of matched patches: 0.23 to 0.46 on clean drives, 1.1 to 1.5 without a lens' distortion.
 _RESIDUAL = 0.8
 _POSE_SIGMAS = 3.0  # RMS of the poses' errors in their stated sigmas: up to 2.2 on clean drives
 # Lead of another reading over the one as given in the fraction of matching patches: on clean turning drives
-# others are .1 to .2 behind, and differ by .03 between pairs of images.
+# others are 0.1 to 0.2 behind, and differ by 0.03 between pairs of images.
 _LEADS = 0.05
-_FOOT_M = 0.3048
 # A third of the usual pairs suffices to see whether the ground matches.
 _QUICK = GroundOptions(pairs=12, free=(), readings=False)
 
@@ -153,12 +151,12 @@ def path_of(ground: Mapping[str, GroundEstimate]) -> Path | None:
         for estimate in ground.values()
         if estimate.status not in _NOT_CHECKED and max(estimate.shares.values(), default=0.0) > 0
     }
-    known = {
+    path_by_reading = {
         Reading.AS_GIVEN: Path.AS_GIVEN,
         Reading.HEADING_FROM_PATH: Path.RIGHT_YAW_WRONG,
         Reading.MIRRORED: Path.MIRRORED,
     }
-    return known.get(readings.pop()) if len(readings) == 1 else None
+    return path_by_reading.get(readings.pop()) if len(readings) == 1 else None
 
 
 def check_ground(
@@ -168,7 +166,9 @@ def check_ground(
     rival = rival_of(ground)
     if rival is not None:
         return [_read_as(name, estimate, rival) for name, estimate in ground.items()]
-    findings = [finding for name, one in ground.items() for finding in _camera(drive, name, one, cause)]
+    findings = [
+        finding for name, estimate in ground.items() for finding in _camera(drive, name, estimate, cause)
+    ]
     return [*findings, *_clocks(ground)]
 
 
@@ -188,23 +188,23 @@ def _camera(drive: Drive, name: str, estimate: GroundEstimate, cause: str | None
         return [Finding("ground match", Status.FAIL, as_given, None, "", cause or NO_MATCH, name)]
     matched = passed("ground match", name, "bare ground matches between the images", as_given)
     surveyed = drive.cameras[name].centre_prior is not None
-    own = [
+    judged = [
         _judge_parameter(name, parameter, _confounded(estimate, key))
         for key, parameter in estimate.parameters.items()
         if key in _CHECKS and (surveyed or not key.endswith("_m"))
     ]
-    return [matched, *own, *_fit(name, estimate, own)]
+    return [matched, *judged, *_fit(name, estimate, judged)]
 
 
 def _confounded(estimate: GroundEstimate, key: str) -> str:
     """Why this drive confuses a parameter of the lens with another quantity; empty if it does not.
 
     Clean drives: on a straight one, focal lengths came out 6 and 8 % wrong at 15 sigmas, since height and
-    focal length slide together; with a level camera, k1 came out .05 wrong at 10 sigmas.
+    focal length slide together; with a level camera, k1 came out 0.05 wrong at 10 sigmas.
     """
     ahead = estimate.parameters.get("forward_m")
     if key == "focal_scale" and ahead is not None and not ahead.observable:
-        return "on a straight road focal length and height slide together: drive a turn"
+        return "on a straight road focal length and height slide together: include a turn"
     calibration = estimate.calibration
     if key == "distortion_k1" and calibration is not None:
         down_rad = np.arcsin(-calibration.cam_from_vehicle[2, 2])
@@ -214,19 +214,21 @@ def _confounded(estimate: GroundEstimate, key: str) -> str:
 
 
 def _judge_parameter(name: str, parameter: Parameter, confounded: str) -> Finding:
-    one = _CHECKS[parameter.name]
+    check = _CHECKS[parameter.name]
     vague = parameter.name in ("forward_m", "left_m") and parameter.sigma > _VAGUE_M
     if not parameter.observable or vague or confounded:
-        why = parameter.why_not or confounded or "the route turns too little; drive a turn"
+        why = parameter.why_not or confounded or "the route turns too little; include a turn"
         says = f"this drive does not show it: {why}"
-        return Finding(one.name, Status.PASS, None, one.scale * one.limit, one.unit, says, name)
-    value = one.scale * parameter.value
-    limit = one.scale * max(one.limit, _SURE * parameter.sigma)
-    wrong = one.wrong.format(size=abs(value), way=one.ways[parameter.value < 0])
-    return judge(one.name, name, value, limit, one.unit, fine=one.fine, wrong=wrong, status=one.status)
+        return Finding(check.name, Status.PASS, None, check.scale * check.limit, check.unit, says, name)
+    value = check.scale * parameter.value
+    limit = check.scale * max(check.limit, _SURE * parameter.sigma)
+    wrong = check.wrong.format(size=abs(value), way=check.ways[parameter.value < 0])
+    return judge(
+        check.name, name, value, limit, check.unit, fine=check.fine, wrong=wrong, status=check.status
+    )
 
 
-def _fit(name: str, estimate: GroundEstimate, own: list[Finding]) -> Iterator[Finding]:
+def _fit(name: str, estimate: GroundEstimate, judged: list[Finding]) -> Iterator[Finding]:
     """Residuals and errors of poses: signs of faults that no parameter above explains."""
     yield judge(
         "ground residual", name, estimate.median_residual, _RESIDUAL, "",
@@ -234,7 +236,7 @@ def _fit(name: str, estimate: GroundEstimate, own: list[Finding]) -> Iterator[Fi
         wrong="matched ground does not lie where any mounting puts it: the lens' distortion or focal "
         "length in camera_info is wrong, or the road in the ROI is no plane",
     )  # fmt: skip
-    raised = any(finding.status is not Status.PASS for finding in own)
+    raised = any(finding.status is not Status.PASS for finding in judged)
     innovations = {part: sigmas for part, sigmas in estimate.innovations.items() if np.isfinite(sigmas)}
     if innovations and not raised and not _is_off(estimate.parameters.get("clock_s")):
         part = max(innovations, key=lambda key: innovations[key])
@@ -300,6 +302,8 @@ def find_cause(drive: Drive, ground: Mapping[str, GroundEstimate]) -> str | None
     ]
     if not lost or len(lost) < len(ground):
         return None
+    from v2hdm.ground.estimate import estimate_ground
+
     for undo, says in _MISTAKES:
         if estimate_ground(undo(drive), lost[0], _QUICK).status is GroundStatus.FOUND:
             return says
@@ -346,7 +350,7 @@ def _turned(camera: Camera) -> Camera:
 # Mistakes to try, the likelier first, and how to undo them; each costs seconds on a drive that fails anyway.
 _MISTAKES: tuple[tuple[Callable[[Drive], Drive], str], ...] = (
     (
-        lambda drive: scaled(drive, _FOOT_M),
+        lambda drive: scaled(drive, FOOT_M),
         "the ground matches if positions are in feet; multiply them by 0.3048 to get metres",
     ),
     (

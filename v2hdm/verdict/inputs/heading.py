@@ -164,8 +164,8 @@ def _lever(offset_rad: FloatArray, curvature: FloatArray, overlap: float) -> lis
     """Distance of the origin ahead of the axle, which does not slip sideways: tan(offset) / curvature."""
     turns = np.abs(curvature) > _CURVED_PER_M
     if turns.sum() < 30:
-        same = "a straight route looks the same in a mirrored world (x and y swapped, NED): drive a turn"
-        unknown = "straight poses do not show how far the origin (antenna?) is from the axle: drive a turn"
+        same = "a straight route looks the same in a mirrored world (x and y swapped, NED): include a turn"
+        unknown = "straight poses do not show how far the origin (antenna?) is from the axle: include a turn"
         return [passed("mirrored", "poses", same), passed("origin", "poses", unknown)]
     centred = offset_rad - np.median(offset_rad[~turns]) if (~turns).any() else offset_rad
     lever = np.tan(centred[turns]) / curvature[turns]
@@ -217,7 +217,7 @@ def _upright(rotation: FloatArray, chords: Chords) -> BoolArray:
 
 def _turns_too_fast(motion: Motion) -> bool:
     """Whether the heading turns about 180 / pi times as much as the path."""
-    course = np.unwrap(np.arctan2(*motion.course.T[::-1]))
+    course = np.unwrap(np.arctan2(motion.course[:, 1], motion.course[:, 0]))
     path_turn = np.abs(np.diff(course)).sum()
     steps = angle_between(motion.rotation[:-1, :2, 0], motion.rotation[1:, :2, 0])
     return bool(np.abs(steps).sum() > 10 * max(path_turn, 0.1))

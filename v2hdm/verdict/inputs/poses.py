@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from v2hdm.geometry.planar import angle_between, cross, length_along
 from v2hdm.ground.motion import trajectory_of_images
-from v2hdm.records import BoolArray, Drive, FloatArray, IntArray, PoseNoise
+from v2hdm.records import HEIGHT_NOISE, SIGMA_OF_MAD, BoolArray, Drive, FloatArray, IntArray, PoseNoise
 from v2hdm.verdict.verdict import Finding, Status, judge
 
 # Length of the chords whose direction is the course: RTK noise of 2 cm turns one by less than a degree.
@@ -28,22 +29,22 @@ _HARDEST_MPS2 = 9.0  # no tyre turns or brakes a road vehicle harder
 _EXTREME = 12.0
 _LEAST_JITTER_MS = 5.0  # stamps that scatter less are as good as a drive needs them
 # Four standard errors of the logarithm of a ratio of two robust sigmas of one offset: half the offsets count,
-# as neighbours share poses, and a median absolute deviation is worth .37 of a standard deviation.
+# as neighbours share poses, and a median absolute deviation is worth 0.37 of a standard deviation.
 _SURE_JITTER = 4 / (0.5 * 0.37) ** 0.5
-_HEIGHT_NOISE = 2.0  # RTK heights are about twice as noisy as positions in the plane
-# Metres in a unit that positions may be in by mistake; of an angle on the earth at the equator.
 _TOO_LARGE: Mapping[str, float] = {"centimetres": 1e2, "millimetres": 1e3}
+"""How many times too large positions are in a unit that they may be in by mistake."""
+
 _TOO_SMALL: Mapping[str, float] = {"kilometres": 1e3, "degrees": 1.113e5, "radians": 6.378e6}
+"""How many times too small positions are in a unit that they may be in by mistake; angles at the equator."""
+
 _GRADE_CHANGE_RAD = 0.02  # grades must spread over this (2 %) before the sign of the pitch is observable
 _PITCH_SIGMAS = 4.0  # that the pitch must go against the grade by: heights err, and grades with them
 _RTK_M = 0.3  # a position that is worse than this is no RTK, not even with a float solution
 # Two degrees: worse than any heading from two antennas a metre apart, or from a gyro compass.
 _HEADING_RAD = 0.035
 _ROLL_PITCH_RAD = 0.05  # three degrees: a vehicle that sways more than this on its suspension overturns
-# Scatter of the poses, relative to the stated noise, beyond which the map's sigmas are wrong by as much, and
-# beyond which the map itself is wrong.
-_UNDERSTATED = 3.0
-_USELESS = 10.0
+_UNDERSTATED = 3.0  # scatter of the poses over their stated noise beyond which the map's sigmas are wrong
+_USELESS = 10.0  # scatter of the poses over their stated noise beyond which the map itself is wrong
 # The fourth difference: driving at 10 Hz leaves millimetres in it, white noise sqrt(70) sigmas.
 _DIFFERENCES = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
 # Poses whose intervals vary less than this share are evenly spaced, as a fourth difference needs.
@@ -185,7 +186,7 @@ def check_jumps(motion: Motion, noise: PoseNoise) -> list[Finding]:
     heights = _off_neighbours(motion, motion.position[:, 2:])
     return [
         _jitter(motion, off) or _jump("position", motion, off, usual + spare),
-        _jump("height", motion, heights, _HEIGHT_NOISE * usual + spare),
+        _jump("height", motion, heights, HEIGHT_NOISE * usual + spare),
     ]
 
 
@@ -261,13 +262,13 @@ def _pitch_sign(motion: Motion, pitch_rad: FloatArray) -> Iterator[Finding]:
     rise_m = motion.position[chords.last, 2] - motion.position[chords.first, 2]
     grade_rad = np.arctan2(rise_m * np.sign(along), np.abs(along))
     middle = (pitch_rad[chords.first] + pitch_rad[chords.last]) / 2
-    spread = np.subtract(*np.percentile(grade_rad, [95, 5]))
+    spread = np.ptp(np.percentile(grade_rad, [95, 5]))
     if spread < _GRADE_CHANGE_RAD or np.std(middle) < 0.3 * np.std(grade_rad):
         return
     slope = float(np.cov(middle, -grade_rad)[0, 1] / np.var(grade_rad))
     # Chords overlap: this is the number of independent ones.
-    apart = max(float(motion.step_m[motion.moving].sum()) / _CHORD_M, 1.0)
-    sigma = float(np.std(middle + slope * grade_rad) / np.std(grade_rad) / np.sqrt(apart))
+    independent = max(float(motion.step_m[motion.moving].sum()) / _CHORD_M, 1.0)
+    sigma = float(np.std(middle + slope * grade_rad) / np.std(grade_rad) / np.sqrt(independent))
     yield judge(
         "pitch sign", "poses", 1 - slope - _PITCH_SIGMAS * sigma, 1.0, "",
         fine="the pitch follows the grade",
@@ -278,8 +279,8 @@ def _pitch_sign(motion: Motion, pitch_rad: FloatArray) -> Iterator[Finding]:
 
 def check_noise(motion: Motion, noise: PoseNoise) -> list[Finding]:
     """Whether the stated noise has the right units and the poses' own scatter."""
-    position_m, heading_rad = _white_noise(motion)
-    measured = "" if position_m is None else f"; from pose to pose they scatter by {position_m:.3f} m"
+    scatter = _white_noise(motion)
+    measured = "" if scatter is None else f"; from pose to pose they scatter by {scatter.position_m:.3f} m"
     if noise.position_m > 1:
         measured += f"; if millimetres were meant, it is {noise.position_m / 1e3:g} m"
     findings = [_unit("position_m", noise.position_m, _RTK_M, "m", f"no RTK position{measured}", "metres")]
@@ -287,12 +288,12 @@ def check_noise(motion: Motion, noise: PoseNoise) -> list[Finding]:
         value = getattr(noise, key)
         means = f"{np.rad2deg(value):.1f} deg; if degrees were meant, it is {np.deg2rad(value):.4f} rad"
         findings.append(_unit(key, value, limit, "rad", means, "radians"))
-    if position_m is not None and noise.position_m > 0:
-        findings.append(_against("position_m", position_m, noise.position_m, "m"))
-    if heading_rad is not None and noise.heading_rad > 0:
-        scatter = _against("heading_rad", heading_rad, noise.heading_rad, "rad")
-        by_course = scatter.status is not Status.PASS and _is_course(motion, heading_rad)
-        findings.append(_course(heading_rad) if by_course else scatter)
+    if scatter is not None and noise.position_m > 0:
+        findings.append(_against("position_m", scatter.position_m, noise.position_m, "m"))
+    if scatter is not None and noise.heading_rad > 0:
+        finding = _against("heading_rad", scatter.heading_rad, noise.heading_rad, "rad")
+        by_course = finding.status is not Status.PASS and _is_course(motion, scatter.heading_rad)
+        findings.append(_course(scatter.heading_rad) if by_course else finding)
     return findings
 
 
@@ -301,7 +302,7 @@ def _is_course(motion: Motion, scatter_rad: float) -> bool:
     ahead = motion.rotation[1:-1, :2, 0]
     at = motion.position[:, :2]
     courses = (at[1:-1] - at[:-2], at[2:] - at[1:-1], at[2:] - at[:-2])
-    return min(_robust_sigma(_fourth(angle_between(ahead, one))) for one in courses) < scatter_rad / 2
+    return min(_robust_sigma(_fourth(angle_between(ahead, course))) for course in courses) < scatter_rad / 2
 
 
 def _course(scatter_rad: float) -> Finding:
@@ -312,14 +313,14 @@ def _course(scatter_rad: float) -> Finding:
     return Finding("heading", Status.FAIL, scatter_rad, None, "rad", says, "poses")
 
 
-def _unit(key: str, value: float, limit: float, unit: str, means: str, wanted: str) -> Finding:
+def _unit(key: str, value: float, limit: float, unit: str, means: str, expected: str) -> Finding:
     if value == 0:
-        says = f"{key} is 0, which no receiver reaches; state its standard deviation in {wanted}"
+        says = f"{key} is 0, which no receiver reaches; state its standard deviation in {expected}"
         return Finding("pose noise", Status.WARN, value, limit, unit, says, f"pose_noise.{key}")
     return judge(
         "pose noise", f"pose_noise.{key}", value, limit, unit,
         fine=f"{key} is plausible for a good receiver",
-        wrong=f"{key} {value:g} is {means}; state it in {wanted}, as a standard deviation",
+        wrong=f"{key} {value:g} is {means}; state it in {expected}, as a standard deviation",
         status=Status.WARN,
     )  # fmt: skip
 
@@ -336,18 +337,25 @@ def _against(key: str, measured: float, stated: float, unit: str) -> Finding:
     )  # fmt: skip
 
 
-def _white_noise(motion: Motion) -> tuple[float, float] | tuple[None, None]:
-    """Standard deviations of a coordinate, m, and of the heading, rad, from pose to pose, if known."""
+class _Scatter(NamedTuple):
+    """Standard deviations of poses from pose to pose."""
+
+    position_m: float  # of a coordinate
+    heading_rad: float
+
+
+def _white_noise(motion: Motion) -> _Scatter | None:
+    """The scatter of poses at a high and even rate; None if it cannot be told from driving."""
     if len(motion.stamp_s) < 50:
-        return None, None
+        return None
     interval_s = float(np.median(motion.interval_s))
     uneven = np.abs(motion.interval_s / interval_s - 1) > _REGULAR
     if interval_s > 1 / _SLOWEST_HZ or uneven.mean() >= _REGULAR:
-        return None, None
+        return None
     forward = motion.rotation[:, :2, 0]
     heading = np.concatenate([[0.0], np.cumsum(angle_between(forward[:-1], forward[1:]))])
     position = np.column_stack([_fourth(axis) for axis in motion.position[:, :2].T])
-    return _robust_sigma(position.ravel()), _robust_sigma(_fourth(heading))
+    return _Scatter(_robust_sigma(position.ravel()), _robust_sigma(_fourth(heading)))
 
 
 def _fourth(values: FloatArray) -> FloatArray:
@@ -356,4 +364,4 @@ def _fourth(values: FloatArray) -> FloatArray:
 
 
 def _robust_sigma(values: FloatArray) -> float:
-    return float(1.4826 * np.median(np.abs(values)))
+    return float(SIGMA_OF_MAD * np.median(np.abs(values)))

@@ -33,8 +33,8 @@ _SAME_GREY = 0.5
 # Share of repeated images on the way that passes: a dropped frame now and then, filled by the one before.
 _FROZEN = 0.02
 _STUCK = 3  # repeats in a row that no single dropped frame makes
-_BRIGHTEST = 250
-_DARKEST = 5  # grey values at which an image of 8 bits is clipped
+_BRIGHTEST = 250  # grey value from which an image of 8 bits is clipped to white
+_DARKEST = 5  # grey value up to which an image of 8 bits is black
 _CLIPPED = 0.25  # share of clipped road that hides markings; paint itself takes a few percent
 
 
@@ -43,13 +43,15 @@ def check_clocks(drive: Drive, motion: Motion) -> Iterator[Finding]:
     if motion.moving.any():
         yield from _pose_rate(drive, motion)
         yield _held(motion)
-    stamps = {name: [one.stamp_s for one in drive.images if one.camera == name] for name in drive.cameras}
-    spans = {name: (own[0], own[-1]) for name, own in stamps.items() if own}
-    for name, own in stamps.items():
-        yield _posed(drive, name, len(own))
-        if own and len(stamps) > 1:
+    stamps = {
+        name: [image.stamp_s for image in drive.images if image.camera == name] for name in drive.cameras
+    }
+    spans = {name: (stamp_s[0], stamp_s[-1]) for name, stamp_s in stamps.items() if stamp_s}
+    for name, stamp_s in stamps.items():
+        yield _posed(drive, name, len(stamp_s))
+        if stamp_s and len(stamps) > 1:
             yield _overlap(spans, name)
-        if own:
+        if stamp_s:
             yield from _spacing(drive, motion, name)
 
 
@@ -173,7 +175,10 @@ def _frozen(name: str, images: Sequence[Image]) -> Finding:
             at = alike
     if share <= _FROZEN:
         # Within a run of successive numbers, number minus index is constant.
-        runs = [[k for _, k in run] for _, run in groupby(enumerate(copied), lambda one: one[1] - one[0])]
+        runs = [
+            [k for _, k in run]
+            for _, run in groupby(enumerate(copied), lambda numbered: numbered[1] - numbered[0])
+        ]
         longest = max(runs, key=len, default=[])
         if len(longest) >= _STUCK:
             says = (
@@ -192,12 +197,12 @@ def _frozen(name: str, images: Sequence[Image]) -> Finding:
 
 def _exposure(name: str, camera: Camera, images: Sequence[Image]) -> Iterator[Finding]:
     """The clipped fraction of the ROI in sampled images."""
-    first, *rest = _spread(images, _SAMPLES)
+    first, *others = _spread(images, _SAMPLES)
     greys = [_read(first.path)]
     mask = _roi_mask(camera, greys[0])
     if not mask.any():
         return
-    greys += [_read(image.path) for image in rest]
+    greys += [_read(image.path) for image in others]
     bright = [float((grey[mask] >= _BRIGHTEST).mean()) for grey in greys]
     dark = [float((grey[mask] <= _DARKEST).mean()) for grey in greys]
     for check, shares, how, cause in (
@@ -215,9 +220,9 @@ def _exposure(name: str, camera: Camera, images: Sequence[Image]) -> Iterator[Fi
 
 
 def _alike(first: Path, second: Path) -> bool:
-    one = _read(first)
+    grey = _read(first)
     other = _read(second)
-    return one.shape == other.shape and float(cv2.absdiff(one, other).mean()) < _SAME_GREY
+    return grey.shape == other.shape and float(cv2.absdiff(grey, other).mean()) < _SAME_GREY
 
 
 def _read(path: Path) -> np.ndarray:

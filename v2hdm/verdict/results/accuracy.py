@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import compress
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
@@ -19,16 +21,15 @@ from v2hdm.io.maps.corrections import Correction
 from v2hdm.mapping.bundle import known_lengths
 from v2hdm.mapping.options import SizeOptions
 from v2hdm.mapping.results import MethodResult, SolveEvidence
-from v2hdm.records import Calibration, FloatArray, Marking
+from v2hdm.records import SIGMAS_95, Calibration, FloatArray, Marking
 from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN
 from v2hdm.site.corrections import unmet
 from v2hdm.survey.check_points import CheckTable, squared
-from v2hdm.verdict.results.solution import CHECKS, doubted, relied_on
+from v2hdm.verdict.results.solution import doubted, relied_on
 from v2hdm.verdict.verdict import GOAL, Finding, Status, passed
 
-_AHEAD_M = 10.0  # within which a vehicle uses what it sees on the ground
-_SHARE = 0.95  # of the corners that have to meet the goal
-_CIRCLE_95 = 2.4477  # radius, in sigmas of a coordinate, where both have the same
+_AHEAD_M = 10.0  # distance, m, within which a vehicle uses what it sees on the ground
+_SHARE = 0.95  # share of the corners that have to meet the goal
 
 
 def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Finding]:
@@ -36,23 +37,24 @@ def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Findin
     markings = best.hd_map.markings
     goal = f"; goal {100 * goal_m:g} cm"
     if markings:
-        radius_m = np.array([_corner_radii_m(one) for one in markings])
+        radius_m = np.array([_corner_radii_m(marking) for marking in markings])
         reached_m = _radius_of_all_m(radius_m.ravel())
         corners = f"95 % of the corners of {len(markings)} markings"
         says = f"{corners} within {_cm(reached_m)} in the frame of the {frame}"
         says += "" if best.evidence is None else _conditions(best.evidence)
-        relative_m = [_CIRCLE_95 * m.relative_sigma_m for m in markings if m.relative_sigma_m is not None]
+        relative_m = [SIGMAS_95 * m.relative_sigma_m for m in markings if m.relative_sigma_m is not None]
         if relative_m:
             says += f", {_cm(_radius_of_all_m(np.array(relative_m)))} from marking to marking"
         # The map's own limit on sigmas leaves the worst out, so that the share alone would flatter.
-        uncertain = sum(one.reason in (TOO_UNCERTAIN, LACKS_A_CORNER) for one in best.excluded)
+        uncertain = sum(exclusion.reason in (TOO_UNCERTAIN, LACKS_A_CORNER) for exclusion in best.excluded)
         says += f"{goal}; {uncertain} more left out as too uncertain" if uncertain else goal
-        coarse = [one for one, own_m in zip(markings, radius_m.max(axis=1), strict=True) if own_m > goal_m]
+        is_coarse = radius_m.max(axis=1) > goal_m
+        coarse = list(compress(markings, is_coarse))
         met = 100 * (len(markings) - len(coarse)) // len(markings)
         helps = f"{met} % of the markings meet the goal; {_largest_part(best, coarse or markings)}"
         yield _judged("map", reached_m, goal_m, says, helps)
-    for name, one in best.calibrations.items():
-        left_m, helps = ground_ahead(one)
+    for name, calibration in best.calibrations.items():
+        left_m, helps = ground_ahead(calibration)
         says = f"the ground ahead is known, given its mounting, to {_cm(left_m)} (95 %){goal}"
         yield _judged(name, left_m, goal_m, says, helps)
 
@@ -62,7 +64,7 @@ def _conditions(evidence: SolveEvidence) -> str:
     doubtful = doubted(evidence)
     relied = relied_on(evidence)
     if doubtful is not None:
-        return f" (unless the {CHECKS[doubtful.fault][0]} is off, which is possible)"
+        return f" (unless the {doubtful.fault.check} is off, which is possible)"
     return f" (if {' and '.join(relied)} are right, which this drive cannot show)" if relied else ""
 
 
@@ -75,10 +77,10 @@ def _judged(about: str, radius_m: float, goal_m: float, says: str, helps: str) -
 
 def _largest_part(best: MethodResult, coarse: Sequence[Marking]) -> str:
     """The largest of the errors that are stated of the markings that miss the goal, and what helps."""
-    pose_m = [] if best.poses is None else _CIRCLE_95 * best.poses.sigma[best.poses.seen, :2].max(axis=1)
+    pose_m = [] if best.poses is None else SIGMAS_95 * best.poses.sigma[best.poses.seen, :2].max(axis=1)
     parts = [
         (_median(pose_m), "the poses: tie them down by mapping.survey"),
-        (_median([_own_m(one) for one in coarse]), "each marking's own views: pass them closer and again"),
+        (_median(list(map(_own_m, coarse))), "each marking's own views: pass them closer and again"),
     ]
     # What one camera leaves open, a better one settles.
     left_m, helps = min(map(ground_ahead, best.calibrations.values()), default=(np.inf, ""))
@@ -91,13 +93,13 @@ def _largest_part(best: MethodResult, coarse: Sequence[Marking]) -> str:
 def _corner_radii_m(marking: Marking) -> FloatArray:
     """The 95 % radii (4,) of a marking's corners, m; infinite where no covariance is stated."""
     covariances = marking.corner_covariances_m2
-    return np.full(4, np.inf) if covariances is None else np.array([_radius_m(one) for one in covariances])
+    return np.full(4, np.inf) if covariances is None else np.array(list(map(_radius_m, covariances)))
 
 
 def _radius_of_all_m(radius_m: FloatArray) -> float:
     """The radius that holds 95 % of all corners, given the radius (N,) that holds each with 95 %.
 
-    Errors are circular normal: with 1 - .05^((r / own)^2) a corner lies within r.
+    Errors are circular normal: with 1 - 0.05^((r / own)^2) a corner lies within r.
     """
     if np.mean(np.isfinite(radius_m)) < _SHARE:
         return float("inf")
@@ -114,7 +116,7 @@ def _own_m(marking: Marking) -> float:
         return 0.0
     centre_m = _radius_m(np.einsum("iajb->ab", marking.covariance_m2.reshape(4, 2, 4, 2)) / 16)
     shape_m2 = max(float(_corner_radii_m(marking).max()) ** 2 - centre_m**2, 0.0)
-    return float(np.hypot(_CIRCLE_95 * (marking.relative_sigma_m or 0.0), np.sqrt(shape_m2)))
+    return float(np.hypot(SIGMAS_95 * (marking.relative_sigma_m or 0.0), np.sqrt(shape_m2)))
 
 
 def ground_ahead(calibration: Calibration) -> tuple[float, str]:
@@ -126,11 +128,14 @@ def ground_ahead(calibration: Calibration) -> tuple[float, str]:
     covariance = calibration.covariance
     if covariance is None:
         return float("inf"), "it saw no marking of the map"
-    place_m, turn_m, left_m = (
-        _radius_m(moves[:, own] @ covariance[own, own] @ moves[:, own].T)
-        for own in (slice(0, 3), slice(3, 6), slice(6))
-    )
-    of_place = "drive a turn, or survey the camera's place"
+
+    def radius_of(part: slice) -> float:
+        return _radius_m(moves[:, part] @ covariance[part, part] @ moves[:, part].T)
+
+    place_m = radius_of(slice(0, 3))
+    turn_m = radius_of(slice(3, 6))
+    left_m = radius_of(slice(6))
+    of_place = "include a turn, or survey the camera's place"
     of_turn = "drive past more markings, near and far"
     return left_m, of_place if place_m > turn_m else of_turn
 
@@ -140,7 +145,7 @@ def _ground_jacobian(cam_from_vehicle: FloatArray) -> FloatArray:
     to_vehicle = cam_from_vehicle[:3, :3].T
     height_m = camera_centre(cam_from_vehicle)[2]
     axis = to_vehicle[:, 2]
-    level = float(np.hypot(*to_vehicle[:2, 2]))
+    level = float(np.hypot(axis[0], axis[1]))
     is_near = -axis[2] * _AHEAD_M > level * height_m
     x, y, z = axis * height_m / -axis[2] if is_near else (*axis[:2] * _AHEAD_M / level, -height_m)
     # exp(xi) moves a point p of the camera by -R'(v + w x p) in the vehicle; its ray meets the ground anew.
@@ -171,7 +176,8 @@ SIGNIFICANCE = 1e-3  # share of maps as good as they state that are contradicted
 def check_points(table: CheckTable) -> Finding:
     """Whether the check points contradict the sigmas that map and survey state, by their chi-square.
 
-    Where they do, the simpler fault that leaves the rest as stated is named: one point off, or all off alike.
+    Where they do, the simplest cause is named that leaves what it does not explain as stated: one point off,
+    or all off alike.
     """
     total = len(table.compared) + len(table.unmatched)
     if not table.compared:
@@ -189,11 +195,11 @@ def check_points(table: CheckTable) -> Finding:
     return Finding(CHECK, status, value, limit, "", says, "map")
 
 
-def check_frame(found: Mapping[str, int]) -> list[Finding]:
+def check_frame(corners: Mapping[str, int]) -> list[Finding]:
     """A survey that fits not at all, or better by another reading, by the counts of corners in reach."""
-    others = {says: count for says, count in found.items() if says}
+    others = {says: count for says, count in corners.items() if says}
     likeliest = max(others, key=lambda says: others[says], default="")
-    stated = found.get("", 0)
+    stated = corners.get("", 0)
     most = others.get(likeliest, 0)
     if stated and most <= stated:
         return [passed(FRAME, "survey", f"{stated} corners of the map have a point within reach", stated)]
@@ -207,14 +213,12 @@ def check_frame(found: Mapping[str, int]) -> list[Finding]:
 
 
 def _explained(table: CheckTable, off_m: FloatArray, covariance: FloatArray) -> tuple[Status, str]:
-    """The simplest fault that leaves the rest as good as stated."""
-    rest, cause = min(
-        [_all_alike(off_m, covariance), *(_without(table, k) for k in range(len(table.compared)))],
-        key=lambda fault: fault[0],
-    )
+    """The simplest fault that leaves what it does not explain as good as stated."""
+    causes = [_all_alike(off_m, covariance), *(_without(table, k) for k in range(len(table.compared)))]
+    likeliest = min(causes, key=lambda cause: cause.squared)
     degrees = len(off_m) - 2
-    if degrees and _ratio(rest, degrees) <= _limit(degrees):
-        return cause
+    if degrees and _ratio(likeliest.squared, degrees) <= _limit(degrees):
+        return likeliest.status, likeliest.says
     stated_m = float(np.sqrt(np.trace(covariance) / len(table.compared)))
     return Status.FAIL, (
         f"they lie {100 * table.rmse_m:.1f} cm off the map (RMSE), where map and survey state "
@@ -223,10 +227,15 @@ def _explained(table: CheckTable, off_m: FloatArray, covariance: FloatArray) -> 
     )
 
 
-_Fault = tuple[float, tuple[Status, str]]
+class _Cause(NamedTuple):
+    """Why check points may be off."""
+
+    squared: float  # chi-square of what it does not explain
+    status: Status
+    says: str
 
 
-def _all_alike(off_m: FloatArray, covariance: FloatArray) -> _Fault:
+def _all_alike(off_m: FloatArray, covariance: FloatArray) -> _Cause:
     """A shift of all points, by generalised least squares."""
     shift = np.tile(np.eye(2), (len(off_m) // 2, 1))
     weighed = np.linalg.solve(covariance, shift)
@@ -236,18 +245,22 @@ def _all_alike(off_m: FloatArray, covariance: FloatArray) -> _Fault:
         "and poses have another datum or origin, or the receiver drifts by more than pose_noise; make "
         "some of them control points"
     )
-    return squared(off_m - shift @ by_m, covariance), (Status.FAIL, says)
+    return _Cause(squared(off_m - shift @ by_m, covariance), Status.FAIL, says)
 
 
-def _without(table: CheckTable, k: int) -> _Fault:
-    kept = np.delete(np.arange(2 * len(table.compared)), [2 * k, 2 * k + 1])
-    one = table.compared[k]
+def _without(table: CheckTable, k: int) -> _Cause:
+    """One point that is off, and the others are not."""
+    others = np.delete(np.arange(2 * len(table.compared)), [2 * k, 2 * k + 1])
+    compared = table.compared[k]
+    corner = f"corner of {compared.kind} {compared.marking_id}"
     says = (
-        f"{one.point.id} lies {100 * one.distance_m:.1f} cm off its corner of {one.kind} {one.marking_id}, "
+        f"{compared.point.id} lies {100 * compared.distance_m:.1f} cm off its {corner}, "
         "the others where they should: survey it again, and look at the paint there"
     )
-    rest = squared(table.off_m.ravel()[kept], table.covariance_m2[np.ix_(kept, kept)]) if len(kept) else 0.0
-    return rest, (Status.WARN, says)
+    if not len(others):
+        return _Cause(0.0, Status.WARN, says)
+    covariance = table.covariance_m2[np.ix_(others, others)]
+    return _Cause(squared(table.off_m.ravel()[others], covariance), Status.WARN, says)
 
 
 def _ratio(value: float, degrees: int) -> float:
@@ -261,10 +274,10 @@ def _limit(degrees: int) -> float:
 
 def check_known_sizes(sizes: SizeOptions, best: MethodResult) -> list[Finding]:
     """A finding for each known size that no marking of the map is near to, and so was not used."""
-    found = []
+    findings = []
     for name, size in sizes.by_class_m.items():
-        markings = [one for one in best.hd_map.markings if one.kind == name]
-        corners_map = np.array([one.corners_map for one in markings]).reshape(-1, 4, 2)
+        markings = [marking for marking in best.hd_map.markings if marking.kind == name]
+        corners_map = np.array([marking.corners_map for marking in markings]).reshape(-1, 4, 2)
         numbers = np.arange(4 * len(markings)).reshape(-1, 4)
         alone = replace(sizes, by_class_m={name: size})
         if not known_lengths(alone, [name] * len(markings), corners_map, numbers):
@@ -273,8 +286,8 @@ def check_known_sizes(sizes: SizeOptions, best: MethodResult) -> list[Finding]:
                 f"{size[1]:g} m, so that the size was not used; fix or drop it"
             )
             about = f"mapping.known_sizes.by_class_m.{name}"
-            found.append(Finding("known size", Status.WARN, 0.0, None, "", says, about))
-    return found
+            findings.append(Finding("known size", Status.WARN, 0.0, None, "", says, about))
+    return findings
 
 
 def check_corrections(corrections: Sequence[Correction], best: MethodResult) -> list[Finding]:

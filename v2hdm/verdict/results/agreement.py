@@ -12,66 +12,73 @@ from scipy.spatial import KDTree
 from v2hdm.geometry.ipm import centre_sigmas
 from v2hdm.geometry.planar import length_along, turned_left
 from v2hdm.geometry.rigid import camera_centre, inverse, log
-from v2hdm.ground import GroundEstimate, GroundStatus
+from v2hdm.ground.results import GroundEstimate, GroundStatus
 from v2hdm.mapping.results import MethodResult
-from v2hdm.records import Calibration, Drive, FloatArray, Marking
+from v2hdm.records import HEIGHT_NOISE, SIGMA_OF_MAD, Calibration, Drive, FloatArray, Marking
 from v2hdm.verdict.verdict import Finding, Status, judge
 
 SAME_M = 1.0  # centres of one marking in the maps of two cameras lie closer than this
 _LEAST_SHARED = 8  # markings that two maps must share for their offset to be observable
-# Offset of two cameras' maps in the sigmas of their centres and markings: clean drives stay below 3.
+
 _OFFSET_LIMIT_SIGMAS = 5.0
-# An offset of less than this is no finding, however sure it is: corners are good to two centimetres.
-_LEAST_OFFSET_M = 0.03
-# A mounting by one camera alone against that by all, in the former's sigmas: below 2 on clean drives.
+"""Largest offset of two cameras' maps, in sigmas of their centres and markings: below 3 on clean drives."""
+
+_LEAST_OFFSET_M = 0.03  # a smaller offset is no finding, however sure it is: corners are good to 2 cm
+
 _MOUNTING_LIMIT_SIGMAS = 5.0
-# Root mean square of the six parameters' deviations, in the sigmas of both: one in a million by chance.
+"""Largest deviation of a camera's mounting, mapped alone, from that mapped with all cameras, in the sigmas of
+the former: below 2 on clean drives."""
+
 _GROUND_LIMIT_SIGMAS = 4.0
-# Where the mountings turn by less and their heights differ by less, the ground is no better judge.
-_LEAST_TURN_DEG = 0.2
-_LEAST_HEIGHT_M = 0.04
+"""Largest root mean square of six mounting parameters' deviations, in the sigmas of both: one in a million by
+chance."""
+
+_LEAST_TURN_DEG = 0.2  # smallest angle between two mountings at which bare ground is the better judge
+_LEAST_HEIGHT_M = (
+    0.04  # smallest difference of two mountings' heights at which bare ground is the better judge
+)
 _OVERLAP = 0.1  # share of the smaller of two markings of a class that both cover; paint does not lie on paint
-# Share of markings that overlap another: clean drives have none, one in a hundred may be on old paint.
-_DOUBLES_LIMIT = 0.02
-# Passes of one place drive within so much of each other, after so much of the way; on another storey of a
-# car park they are farther above. Heights are twice as noisy as positions.
-_SAME_PLACE_M = 2.0
-_ANOTHER_PASS_M = 20.0
-_STOREY_M = 1.8
-_HEIGHT_NOISE = 2.0
-_SURE_SIGMAS = 5.0
-# Added to a covariance's diagonal (m^2, rad^2): a tenth of a millimetre, a thousandth of a degree.
+_DOUBLES_LIMIT = 0.02  # share of markings that overlap another: none on clean drives, 0.01 on old paint
+
+_SAME_PLACE_M = 2.0  # largest distance between two passes of one place
+_ANOTHER_PASS_M = 20.0  # least way between two passes of one place
+_STOREY_M = 1.8  # least difference in height of two storeys of a car park
+_SURE_SIGMAS = 5.0  # deviation of two passes' heights, in sigmas, that is no noise
+
 _LEAST_VARIANCE = np.array([1e-8] * 3 + [1e-10] * 3)
+"""Variances (m^2, rad^2) added to a mounting's: a tenth of a millimetre, a thousandth of a degree."""
 
 
-def mounting_sigmas(one: Calibration, other: Calibration, of_both: bool = False) -> float:
-    """Distance of two mountings, root mean square of six parameters in sigmas of ``one``, or of both."""
-    assert one.covariance is not None
-    covariance = one.covariance + np.diag(_LEAST_VARIANCE)
+def mounting_sigmas(mounting: Calibration, other: Calibration, of_both: bool = False) -> float:
+    """Distance of two mountings, root mean square of six parameters in sigmas of ``mounting``, or of both."""
+    assert mounting.covariance is not None
+    covariance = mounting.covariance + np.diag(_LEAST_VARIANCE)
     if of_both and other.covariance is not None:
         covariance = covariance + other.covariance
-    off = _difference(one, other)
+    off = _difference(mounting, other)
     return float(np.sqrt(off @ np.linalg.solve(covariance, off) / len(off)))
 
 
-def _difference(one: Calibration, other: Calibration) -> FloatArray:
-    """The left tangent (6,) from ``other`` to ``one``: translation m, rotation rad."""
-    return log(one.cam_from_vehicle @ inverse(other.cam_from_vehicle))
+def _difference(mounting: Calibration, other: Calibration) -> FloatArray:
+    """The left tangent (6,) from ``other`` to ``mounting``: translation m, rotation rad."""
+    return log(mounting.cam_from_vehicle @ inverse(other.cam_from_vehicle))
 
 
 def check_agreement(results: Mapping[str, MethodResult], drive: Drive) -> Iterator[Finding]:
     """Single cameras, by their optimised results, against one another and, last, against all of them."""
     together = list(results.values())[-1]
-    alone = {name: one for name, one in results.items() if len(one.cameras) == 1}
+    alone = {name: result for name, result in results.items() if len(result.cameras) == 1}
     for (first, a), (second, b) in combinations(alone.items(), 2):
-        apart = shared_offsets(a, b, drive)
-        if len(apart) >= _LEAST_SHARED:
-            calibrations = a.calibrations[first], b.calibrations[second]
-            yield _offset(first, second, apart, *(_centre_sigma_m(one) for one in calibrations))
-    for name, one in alone.items():
-        if one.calibrations[name].covariance is None or together.calibrations[name].covariance is None:
+        offset_m = shared_offsets(a, b, drive)
+        if len(offset_m) >= _LEAST_SHARED:
+            sigma_m = np.hypot(
+                _centre_sigma_m(a.calibrations[first])[:2], _centre_sigma_m(b.calibrations[second])[:2]
+            )
+            yield _offset(first, second, offset_m, sigma_m)
+    for name, result in alone.items():
+        if result.calibrations[name].covariance is None or together.calibrations[name].covariance is None:
             continue
-        sigmas = mounting_sigmas(one.calibrations[name], together.calibrations[name])
+        sigmas = mounting_sigmas(result.calibrations[name], together.calibrations[name])
         yield judge(
             "alone and together", name, sigmas, _MOUNTING_LIMIT_SIGMAS, "sigmas",
             fine="mapped alone, it has the same mounting as with the others",
@@ -86,21 +93,19 @@ def _centre_sigma_m(calibration: Calibration) -> FloatArray:
     return centre_sigmas(calibration.cam_from_vehicle, calibration.covariance)
 
 
-def _offset(
-    first: str, second: str, apart: FloatArray, sigma_m: FloatArray, other_sigma_m: FloatArray
-) -> Finding:
-    """How far two cameras' maps are apart in the driving direction and across."""
-    middle = np.median(apart, axis=0)
-    spread = 1.4826 * np.median(np.abs(apart - middle), axis=0) / np.sqrt(len(apart))
-    sigma = np.hypot(sigma_m[:2], other_sigma_m[:2])
-    sigmas = np.where(np.abs(middle) > _LEAST_OFFSET_M, np.abs(middle) / np.hypot(sigma, spread), 0.0)
+def _offset(first: str, second: str, offset_m: FloatArray, sigma_m: FloatArray) -> Finding:
+    """How far two cameras' maps are apart (N, 2), forward and left, with the sigmas (2,) of their centres."""
+    count = len(offset_m)
+    middle = np.median(offset_m, axis=0)
+    spread = SIGMA_OF_MAD * np.median(np.abs(offset_m - middle), axis=0) / np.sqrt(count)
+    sigmas = np.where(np.abs(middle) > _LEAST_OFFSET_M, np.abs(middle) / np.hypot(sigma_m, spread), 0.0)
     axis = int(np.argmax(sigmas))
     where = (("behind", "ahead of"), ("right of", "left of"))[axis][int(middle[axis] > 0)]
     cause = ("clocks or forward surveys of a centre disagree", "headings or lateral surveys disagree")[axis]
     return judge(
         "cameras apart", f"{first}, {second}", float(sigmas[axis]), _OFFSET_LIMIT_SIGMAS, "sigmas",
-        fine=f"{len(apart)} markings that both saw coincide",
-        wrong=f"{second} maps {len(apart)} markings {100 * abs(middle[axis]):.0f} cm {where} where {first} "
+        fine=f"{count} markings that both saw coincide",
+        wrong=f"{second} maps {count} markings {100 * abs(middle[axis]):.0f} cm {where} where {first} "
         f"does: {cause}; synchronise and measure again",
     )  # fmt: skip
 
@@ -109,24 +114,26 @@ def shared_offsets(a: MethodResult, b: MethodResult, drive: Drive) -> FloatArray
     """Offsets (N, 2), forward and left, of the markings of ``b`` from the nearest same ones of ``a``."""
     if not a.hd_map.markings or not b.hd_map.markings:
         return np.empty((0, 2))
-    places = [np.array([one.corners_map.mean(axis=0) for one in r.hd_map.markings]) for r in (a, b)]
-    trees = [KDTree(one) for one in places]
-    there_m, there = trees[1].query(places[0])
-    _, back = trees[0].query(places[1])
+    places = [np.array([marking.corners_map.mean(axis=0) for marking in r.hd_map.markings]) for r in (a, b)]
+    trees = [KDTree(centres) for centres in places]
+    distance_m, nearest_of_b = trees[1].query(places[0])
+    _, nearest_of_a = trees[0].query(places[1])
     pairs = [
         (i, int(j))
-        for i, j in enumerate(there)
-        if back[j] == i and there_m[i] < SAME_M and a.hd_map.markings[i].kind == b.hd_map.markings[j].kind
+        for i, j in enumerate(nearest_of_b)
+        if nearest_of_a[j] == i
+        and distance_m[i] < SAME_M
+        and a.hd_map.markings[i].kind == b.hd_map.markings[j].kind
     ]
     if not pairs:
         return np.empty((0, 2))
     first, second = np.array(pairs).T
-    apart = places[1][second] - places[0][first]
+    offset_m = places[1][second] - places[0][first]
     poses = np.stack([image.map_from_vehicle for image in drive.images])
     _, nearest = KDTree(poses[:, :2, 3]).query(places[0][first])
     forward = poses[nearest, :2, 0]
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-    return np.stack([(apart * forward).sum(1), (apart * turned_left(forward)).sum(1)], axis=1)
+    return np.stack([(offset_m * forward).sum(1), (offset_m * turned_left(forward)).sum(1)], axis=1)
 
 
 def check_against_ground(
@@ -182,13 +189,13 @@ def overlapping(markings: tuple[Marking, ...]) -> list[tuple[int, int]]:
     """Pairs of markings of one class that share at least :data:`_OVERLAP` of the smaller one."""
     if len(markings) < 2:
         return []
-    corners = [np.ascontiguousarray(one.corners_map, dtype=np.float32) for one in markings]
-    centres = np.array([one.mean(axis=0) for one in corners])
-    longest_m = max(float(np.ptp(one, axis=0).max()) for one in corners)
-    near = KDTree(centres).query_pairs(longest_m, output_type="ndarray")
+    corners = [np.ascontiguousarray(marking.corners_map, dtype=np.float32) for marking in markings]
+    centres = np.array([outline.mean(axis=0) for outline in corners])
+    longest_m = max(float(np.ptp(outline, axis=0).max()) for outline in corners)
+    close = KDTree(centres).query_pairs(longest_m, output_type="ndarray")
     return [
         (int(a), int(b))
-        for a, b in near
+        for a, b in close
         if markings[a].kind == markings[b].kind and _overlap(corners[a], corners[b]) > _OVERLAP
     ]
 
@@ -204,22 +211,22 @@ def _overlap(first: FloatArray, second: FloatArray) -> float:
 def check_heights(drive: Drive) -> Iterator[Finding]:
     """Whether the heights that were recorded agree where a place was passed more than once."""
     road = drive.road
-    sigma_m = _HEIGHT_NOISE * drive.pose_noise.position_m
+    sigma_m = HEIGHT_NOISE * drive.pose_noise.position_m
     if road is None or len(road.points_map) < 2:
         return
     way_m = length_along(road.points_map)
-    one, other = KDTree(road.points_map).query_pairs(_SAME_PLACE_M, output_type="ndarray").T
-    again = np.abs(way_m[other] - way_m[one]) > _ANOTHER_PASS_M
-    one = one[again]
-    other = other[again]
-    between = road.points_map[other] - road.points_map[one]
-    rise = np.einsum("ni,ni->n", between, road.slope[one] + road.slope[other]) / 2
-    off_m = np.abs(road.height_m[other] - road.height_m[one] - rise)
+    first, second = KDTree(road.points_map).query_pairs(_SAME_PLACE_M, output_type="ndarray").T
+    again = np.abs(way_m[second] - way_m[first]) > _ANOTHER_PASS_M
+    first = first[again]
+    second = second[again]
+    between = road.points_map[second] - road.points_map[first]
+    rise = np.einsum("ni,ni->n", between, road.slope[first] + road.slope[second]) / 2
+    off_m = np.abs(road.height_m[second] - road.height_m[first] - rise)
     off_m[off_m > _STOREY_M] = 0.0
     if not len(off_m):
         return
     worst = int(off_m.argmax())
-    x, y = road.points_map[one[worst]]
+    x, y = road.points_map[first[worst]]
     yield judge(
         "heights", "poses", float(off_m[worst]), float(_SURE_SIGMAS * np.sqrt(2.0) * sigma_m), "m",
         fine="the recorded heights of all passes agree",

@@ -14,10 +14,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from v2hdm.faults import Fault
+from v2hdm.faults import Contradiction, Fault, table
 from v2hdm.faults.odds import (
     CLEAR_SIGMAS,
-    OBSERVABLE_SIGMA,
     RIVAL_LOG_ODDS,
     doubt,
     even_sigmas,
@@ -28,88 +27,43 @@ from v2hdm.faults.odds import (
     matters,
 )
 from v2hdm.faults.sensitivity import STRETCHES
-from v2hdm.ground import GroundEstimate
-from v2hdm.mapping.results import Contradiction, MethodResult, SolveEvidence
-from v2hdm.records import Drive
+from v2hdm.ground.results import GroundEstimate
+from v2hdm.mapping.results import MethodResult, SolveEvidence
+from v2hdm.records import BEST, Drive
 from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN
 from v2hdm.site.parallax import NOT_OBSERVED, NOT_ON_GROUND
 from v2hdm.verdict.results import agreement
 from v2hdm.verdict.verdict import Finding, Status, judge, passed
 
-BEST = "Opt"  # the method whose map is the result
-
-# Mean robust loss of held-out observations: clean drives reach 1.9 to 2.3, wrong inputs begin at 6.5.
 _HELD_OUT_LIMIT = 4.0
-# Share of candidate markings that were left out, but for those that are merely uncertain, two standard
-# errors taken off it: clean drives reach .05 of hundreds and .13 of 26, swapped axes .75 of 200.
+"""Largest mean robust loss of held-out observations: clean drives reach 1.9 to 2.3, wrong inputs begin at
+6.5."""
+
 _EXCLUDED_LIMIT = 0.2
-# Share of corner observations that the rest contradicts: clean drives reach .02, no distortion .14.
+"""Largest share of candidate markings that may be left out, not counting those that are merely uncertain, and
+two standard errors taken off: clean drives reach 0.05 of hundreds and 0.13 of 26, swapped axes 0.75 of
+200."""
+
 _REJECTED_LIMIT = 0.06
-# Variance of observations over the detector's statement: clean drives reach .2, no distortion 6.
+"""Largest share of corner observations that the others may contradict: clean drives reach 0.02, a drive
+without its distortion 0.14."""
+
 _VARIANCE_LIMIT = 3.0
-# Noise of the poses over what was stated, or is usual where nothing was: that may be off by three.
+"""Largest variance of observations over the one that the detector states: clean drives reach 0.2, a drive
+without its distortion 6."""
+
 _POSE_NOISE_LIMIT = 3.0
+"""Largest noise of the poses over the stated one; where none is stated, the usual one may be off by three."""
+
 _ODDS_LIMIT = CLEAR_SIGMAS**2 / 2  # log odds from which a cause is named that no score test looks for
-# Scatter of stamps, s, that does not matter, and that is usual where there is any.
-_LEAST_JITTER_S = 0.005
-_USUAL_JITTER_S = 0.02
+_LEAST_JITTER_S = 0.005  # scatter of stamps, s, that does not matter
+_USUAL_JITTER_S = 0.02  # scatter of stamps, s, that is usual where there is any
 _JUMP_LIMIT = 9.0  # largest single correction of a pose, in sigmas
 _CLOCK_OBSERVABLE_S = 0.004  # largest sigma of an observed clock offset, s: two are 8 ms
-# Sigma, m, of the point that the poses are of, up to which a drive observes it: twice that, at 95 %, is the
-# usual accuracy goal.
+
 _LEVER_OBSERVABLE_M = 0.025
-
-# The check that reports each fault, and the recovery.
-CHECKS: Mapping[Fault, tuple[str, str]] = {
-    Fault.CLOCK: (
-        "clock", "synchronise the clocks of cameras and receiver, or shift the stamps by that",
-    ),
-    Fault.CLOCK_DRIFT: (
-        "clock drift", "stamp images with their exposure time on the receiver's clock",
-    ),
-    Fault.CROWN: (
-        "crown", "leave mapping.ground at auto, or map the two sides of the crown separately",
-    ),
-    Fault.COURSE: ("heading", "record the vehicle's heading from two antennas or an INS"),
-    Fault.STEP: ("position step", "check the receiver's log there, and leave out poses without an RTK fix"),
-    Fault.KNOCK: ("mounting", "fasten the camera, and map what was driven before and after by themselves"),
-    Fault.FOCAL: (
-        "focal length",
-        "check fx and fy in camera_info against the resolution, or recalibrate the lens",
-    ),
-    Fault.DISTORTION: (
-        "distortion",
-        "check distortion_coefficients (and the focal length) in camera_info, or recalibrate",
-    ),
-    Fault.PRINCIPAL: (
-        "principal point",
-        "check cx and cy in camera_info against the image's size and crop, or recalibrate",
-    ),
-    Fault.SLOPE: ("slope", "record the height of the poses, or roll and pitch"),
-    Fault.SURVEY: (
-        "survey",
-        "survey the camera's centre again; check signs, axes and the origin on the ground under the axle",
-    ),
-    Fault.LEVER: (
-        "survey",
-        "measure the centres from the reference point of the poses, such as the antenna, or move the poses",
-    ),
-    Fault.SCALE: (
-        "scale", "give positions in metres on the ground, as in UTM or a local frame, not in Web Mercator",
-    ),
-    Fault.SIZE: ("known_sizes", "measure the paint, or leave it out of mapping.known_sizes"),
-    Fault.CONTROL: ("surveyed points", "survey it again, or leave it out of mapping.survey"),
-    Fault.DATUM: ("surveyed points", "check that survey and poses have the same datum and origin"),
-}  # fmt: skip
-
-# How an input was corrected, where it was not just left out.
-_CORRECTED_BY = {Fault.CLOCK: "images got poses at the corrected times", Fault.SIZE: "no known size was used"}
-
-_LIKE_CLOCK = (Fault.CLOCK_DRIFT, Fault.COURSE)  # faults that a constant clock offset may stand for
-_WAYS = (("behind", "ahead of"), ("to the right of", "to the left of"), ("below", "above"))
-# What units are shown as, and by what values are multiplied for it.
-_SHOWN = {"m": (100.0, "cm"), "s": (1e3, "ms"), "rad": (180 / np.pi, "deg"), "px": (1.0, "px"), "": (1.0, "")}
-_MAP_AXES = ("east", "north", "north-east", "north-west")
+"""Largest sigma, m, of the point that the poses are of, at which a drive observes it: twice that, at 95 %, is
+the usual accuracy goal."""
 
 
 def check_result(
@@ -124,9 +78,9 @@ def check_result(
     best = list(methods.values())[-1][BEST]
     findings = check_solution(drive, methods)
     for session, estimates in zip(drive.sessions, ground, strict=False):
-        own = agreement.check_against_ground(best.calibrations, estimates)
+        of_session = agreement.check_against_ground(best.calibrations, estimates)
         suffix = f" of {session.name}" if drive.joined else ""
-        findings += [replace(finding, about=f"{finding.about}{suffix}") for finding in own]
+        findings += [replace(finding, about=f"{finding.about}{suffix}") for finding in of_session]
     return findings
 
 
@@ -148,10 +102,10 @@ def over_ground(findings: Iterable[Finding], best: MethodResult, is_tried: bool)
         fine = "the recorded heights are curved, but the markings show a plane"
         answered = {"road": (Status.WARN,)} if is_tried else {}
     return [
-        replace(one, status=Status.PASS, says=fine, limit=None)
-        if one.status in answered.get(one.check, ())
-        else one
-        for one in findings
+        replace(finding, status=Status.PASS, says=fine, limit=None)
+        if finding.status in answered.get(finding.check, ())
+        else finding
+        for finding in findings
     ]
 
 
@@ -165,8 +119,8 @@ def check_solution(drive: Drive, methods: Mapping[str, Mapping[str, MethodResult
         symptoms = [*check_fit(best.evidence), _excluded(best)]
     symptoms += [*agreement.check_doubles(best), *agreement.check_heights(drive)]
     if len(methods) > 1:
-        found = {name: by_method[BEST] for name, by_method in methods.items()}
-        symptoms += agreement.check_agreement(found, drive)
+        by_cameras = {name: by_method[BEST] for name, by_method in methods.items()}
+        symptoms += agreement.check_agreement(by_cameras, drive)
     named = next((finding for finding in causes if finding.status is Status.FAIL), None)
     return [*causes, *(_explained(finding, named) for finding in symptoms)]
 
@@ -180,86 +134,95 @@ def _explained(finding: Finding, named: Finding | None) -> Finding:
 
 def check_inputs(evidence: SolveEvidence) -> list[Finding]:
     """Inputs that were dropped, inputs that are contradicted still, and what is not observable."""
-    findings = [_corrected(one) for one in evidence.corrected]
+    findings = [_corrected(error) for error in evidence.corrected]
     raised = {finding.check for finding in findings}
-    still = [one for one in evidence.score_tests if is_contradicted(one)]
-    still = still or [one for one in evidence.score_tests if _is_left(one, evidence.corrected)][:1]
+    contradicted = [test for test in evidence.score_tests if is_contradicted(test)]
+    if not contradicted:
+        contradicted = [test for test in evidence.score_tests if _is_left(test, evidence.corrected)][:1]
     foreign = _foreign(evidence)
     stamps = _stamps(evidence)
-    causes = {foreign: evidence.foreign[2], stamps: _jitter_odds(evidence)}
-    if still:
-        causes[_contradicted(still) if is_physical(still[0]) else _unknown(still[0])] = log_odds(still[0])
-    # Each would explain part of the same contradictions: the likeliest is named, and what nearly is.
-    causes = {one: odds for one, odds in causes.items() if one.status is Status.FAIL}
+    causes = {foreign: evidence.foreign.gain, stamps: _jitter_odds(evidence)}
+    if contradicted:
+        likeliest = contradicted[0]
+        finding = _contradicted(contradicted) if is_physical(likeliest) else _unknown(likeliest)
+        causes[finding] = log_odds(likeliest)
+    # Each cause would explain part of the same contradictions: the likeliest is named, and what nearly is.
+    causes = {cause: odds for cause, odds in causes.items() if cause.status is Status.FAIL}
     least = max(causes.values(), default=0.0) - RIVAL_LOG_ODDS
-    named = [one for one in sorted(causes, key=lambda one: -causes[one]) if causes[one] > least]
+    named = [cause for cause in sorted(causes, key=lambda cause: -causes[cause]) if causes[cause] > least]
     doubtful = doubted(evidence)
-    named = named or ([_doubtful(doubtful)] if doubtful is not None else [])
+    if not named and doubtful is not None:
+        named = [_doubtful(doubtful)]
     findings += named if foreign in causes else [*named, foreign]
     findings += [stamps] if stamps.status is Status.WARN else []
-    raised |= {one.check for one in named}
-    by_check: dict[str, list[Contradiction]] = {}
-    for one in evidence.score_tests:
-        by_check.setdefault(CHECKS[one.fault][0], []).append(one)
+    raised |= {finding.check for finding in named}
+    tests_of: dict[str, list[Contradiction]] = {}
+    for test in evidence.score_tests:
+        tests_of.setdefault(test.fault.check, []).append(test)
     unobservable = list(_unobservable(evidence, raised))
-    said = raised | {one.check for one in unobservable if not _observable(by_check[one.check])}
-    findings += [_agrees(check, tested) for check, tested in by_check.items() if check not in said]
+    answered = raised | {
+        finding.check for finding in unobservable if not _observable(tests_of[finding.check])
+    }
+    findings += [_agrees(check, tests) for check, tests in tests_of.items() if check not in answered]
     return [*findings, *unobservable]
 
 
 def _observable(tested: list[Contradiction]) -> list[Contradiction]:
     """The tests that this drive observes; none where an error that all cameras share may hide beside them."""
-    return [] if _hidden(tested) else [one for one in tested if _is_observable(one)]
+    return [] if _hidden(tested) else [test for test in tested if _is_observable(test)]
 
 
 def _hidden(tested: list[Contradiction]) -> list[Contradiction]:
     """Errors of single cameras that this drive observes, and that all may share without its seeing them."""
-    seen = {(one.fault, one.axis) for one in tested if len(one.cameras) == 1 and _is_observable(one)}
-    shared = [one for one in tested if len(one.cameras) > 1 and (one.fault, one.axis) in seen]
-    return [one for one in shared if not _is_observable(one)]
+    observed_faults = {
+        (test.fault, test.axis) for test in tested if len(test.cameras) == 1 and _is_observable(test)
+    }
+    shared = [test for test in tested if len(test.cameras) > 1 and (test.fault, test.axis) in observed_faults]
+    return [test for test in shared if not _is_observable(test)]
 
 
-def _is_observable(one: Contradiction) -> bool:
-    return _sigma(one) <= OBSERVABLE_SIGMA[one.fault]
+def _is_observable(test: Contradiction) -> bool:
+    return _sigma(test) <= test.fault.observable_sigma
 
 
-def _corrected(one: Contradiction) -> Finding:
-    done = _CORRECTED_BY.get(one.fault, "it was left out of the result")
-    says = f"{_words(one)} ({one.sigmas:.0f} sigmas); {done}: {CHECKS[one.fault][1]}"
-    return _input(one, Status.WARN, says)
+def _corrected(error: Contradiction) -> Finding:
+    fault = error.fault
+    says = f"{error.sentence} ({error.sigmas:.0f} sigmas); {fault.corrected_by}: {fault.remedy}"
+    return _input(error, Status.WARN, says)
 
 
-def _is_left(one: Contradiction, corrected: Sequence[Contradiction]) -> bool:
+def _is_left(test: Contradiction, corrected: Sequence[Contradiction]) -> bool:
     """Whether, a clock corrected, a drift or heading is likelier than none: even odds, once it is off."""
-    off = {camera for each in corrected if each.fault is Fault.CLOCK for camera in each.cameras}
-    return one.fault in _LIKE_CLOCK and off >= set(one.cameras) and matters(one) and log_odds(one) > 0
+    off = {camera for error in corrected if error.fault is table.CLOCK for camera in error.cameras}
+    return test.fault.like_clock and off >= set(test.cameras) and matters(test) and log_odds(test) > 0
 
 
-def _unknown(one: Contradiction) -> Finding:
+def _unknown(test: Contradiction) -> Finding:
     """No input can be off by as much as would explain the residuals."""
     says = (
         "the markings contradict the inputs, and no plausible input error explains them: compare "
         "images and poses in time and space"
     )
-    return Finding("cause unknown", Status.FAIL, one.sigmas, even_sigmas(one), "sigmas", says, "map")
+    return Finding("cause unknown", Status.FAIL, test.sigmas, even_sigmas(test), "sigmas", says, "map")
 
 
-def _contradicted(still: list[Contradiction]) -> Finding:
-    one = still[0]
-    rivals = [_words(other) for other in still if log_odds(other) > log_odds(one) - RIVAL_LOG_ODDS]
-    says = f"{' or '.join(rivals)} ({one.sigmas:.0f} sigmas)"
-    return _input(one, Status.FAIL, f"{says}, and the map is wrong by it: {CHECKS[one.fault][1]}")
+def _contradicted(tests: list[Contradiction]) -> Finding:
+    likeliest = tests[0]
+    least = log_odds(likeliest) - RIVAL_LOG_ODDS
+    rivals = [test.sentence for test in tests if log_odds(test) > least]
+    says = f"{' or '.join(rivals)} ({likeliest.sigmas:.0f} sigmas)"
+    return _input(likeliest, Status.FAIL, f"{says}, and the map is wrong by it: {likeliest.fault.remedy}")
 
 
-def _doubtful(one: Contradiction) -> Finding:
-    says = f"{_words(one)}, as far as the drive can tell ({one.sigmas:.1f} sigmas): {CHECKS[one.fault][1]}"
-    return _input(one, Status.WARN, says)
+def _doubtful(test: Contradiction) -> Finding:
+    says = f"{test.sentence}, as far as the drive can tell ({test.sigmas:.1f} sigmas): {test.fault.remedy}"
+    return _input(test, Status.WARN, says)
 
 
-def _input(one: Contradiction, status: Status, says: str) -> Finding:
-    check = CHECKS[one.fault][0]
-    about = ", ".join(one.cameras)
-    return Finding(check, status, one.sigmas, even_sigmas(one), "sigmas", says, about)
+def _input(test: Contradiction, status: Status, says: str) -> Finding:
+    check = test.fault.check
+    about = ", ".join(test.cameras)
+    return Finding(check, status, test.sigmas, even_sigmas(test), "sigmas", says, about)
 
 
 def _agrees(check: str, tested: list[Contradiction]) -> Finding:
@@ -270,8 +233,8 @@ def _agrees(check: str, tested: list[Contradiction]) -> Finding:
         below = f" below {_least_shown(least)}" if np.isfinite(_sigma(least)) else ""
         whose = " that all cameras share" if hidden else ""
         says = f"the markings of this drive do not reveal errors{whose}{below}"
-        return passed(check, ", ".join(least.cameras), f"{says}: drive a turn, and past more of them")
-    worst = max(observable, key=lambda one: one.sigmas)
+        return passed(check, ", ".join(least.cameras), f"{says}: include a turn, and drive past more of them")
+    worst = max(observable, key=lambda test: test.sigmas)
     if is_contradicted(worst):
         says = "not told apart from what is named as wrong: fix that first"
         return passed(check, ", ".join(worst.cameras), says)
@@ -280,37 +243,38 @@ def _agrees(check: str, tested: list[Contradiction]) -> Finding:
     return _input(worst, Status.PASS, says)
 
 
-def _sigma(one: Contradiction) -> float:
+def _sigma(test: Contradiction) -> float:
     """By the stretches or by the model, whichever is larger."""
-    return max(one.sigma, one.model_sigma)
+    return max(test.sigma, test.model_sigma)
 
 
-def _least_shown(one: Contradiction) -> str:
+def _least_shown(test: Contradiction) -> str:
     """The size from which on a drive shows an error, with its unit."""
-    scale, unit = _SHOWN[one.fault.unit]
-    return f"{CLEAR_SIGMAS * scale * _sigma(one):.2g} {unit}".rstrip()
+    return test.fault.shown(CLEAR_SIGMAS * _sigma(test))
 
 
 def doubted(evidence: SolveEvidence) -> Contradiction | None:
     """The input that is likeliest to be off, of those that may well be and do not surely fail the map."""
-    doubtful = [one for one in evidence.score_tests if is_doubtful(one) and not is_contradicted(one)]
+    doubtful = [test for test in evidence.score_tests if is_doubtful(test) and not is_contradicted(test)]
     return max(doubtful, key=doubt, default=None)
 
 
 def relied_on(evidence: SolveEvidence) -> list[str]:
     """The inputs that would move the whole map if they erred in all cameras alike, unseen by this drive."""
-    loose = {"the clocks": _loosest_clock_s(evidence) > _CLOCK_OBSERVABLE_S}
-    loose["the surveyed centres"] = bool(_loose_levers(evidence))
-    return [name for name, is_loose in loose.items() if is_loose]
+    is_loose = {
+        "the clocks": _loosest_clock_s(evidence) > _CLOCK_OBSERVABLE_S,
+        "the surveyed centres": bool(_loose_levers(evidence)),
+    }
+    return [name for name, loose in is_loose.items() if loose]
 
 
 def _loosest_clock_s(evidence: SolveEvidence) -> float:
-    return max((one.sigma for one in _of_all(evidence, Fault.CLOCK, Fault.CLOCK)), default=0.0)
+    return max((test.sigma for test in _of_all(evidence, table.CLOCK, table.CLOCK)), default=0.0)
 
 
 def _loose_levers(evidence: SolveEvidence) -> list[Contradiction]:
-    levers = _of_all(evidence, Fault.LEVER, Fault.SURVEY)
-    return [one for one in levers if one.axis < 2 and one.sigma > _LEVER_OBSERVABLE_M]
+    levers = _of_all(evidence, table.LEVER, table.SURVEY)
+    return [test for test in levers if test.axis < 2 and test.sigma > _LEVER_OBSERVABLE_M]
 
 
 def _unobservable(evidence: SolveEvidence, raised: set[str]) -> Iterator[Finding]:
@@ -319,23 +283,23 @@ def _unobservable(evidence: SolveEvidence, raised: set[str]) -> Iterator[Finding
     loose = _loose_levers(evidence)
     if loosest_s > _CLOCK_OBSERVABLE_S and "clock" not in raised:
         sure = f"to better than {2e3 * loosest_s:.0f} ms" if np.isfinite(loosest_s) else "at all"
-        says = f"the markings do not show {sure} whether all clocks are equally late: drive a turn"
+        says = f"the markings do not show {sure} whether all clocks are equally late: include a turn"
         yield passed("clock", "all cameras", says)
     if loose and "survey" not in raised:
-        names = " and ".join(("forward", "left")[axis] for axis in sorted({one.axis for one in loose}))
-        worst_m = max(one.sigma for one in loose)
+        names = " and ".join(("forward", "left")[axis] for axis in sorted({test.axis for test in loose}))
+        worst_m = max(test.sigma for test in loose)
         shows = f"shows only to {200 * worst_m:.0f} cm" if worst_m < 1 else "does not show"
         says = (
             f"this drive {shows} how far {names} the cameras are from the poses' reference point: "
-            "the result relies on the survey of centre and antenna; drive a turn"
+            "the result relies on the survey of centre and antenna; include a turn"
         )
         yield passed("survey", "all cameras", says)
 
 
 def _of_all(evidence: SolveEvidence, shared: Fault, single: Fault) -> list[Contradiction]:
     """The tests of all cameras together, those of the only one where there are no others."""
-    together = [one for one in evidence.score_tests if one.fault is shared and len(one.cameras) > 1]
-    return together or [one for one in evidence.score_tests if one.fault is single]
+    together = [test for test in evidence.score_tests if test.fault is shared and len(test.cameras) > 1]
+    return together or [test for test in evidence.score_tests if test.fault is single]
 
 
 def check_fit(evidence: SolveEvidence) -> Iterator[Finding]:
@@ -367,12 +331,12 @@ def check_fit(evidence: SolveEvidence) -> Iterator[Finding]:
 
 def _foreign(evidence: SolveEvidence) -> Finding:
     """Images of another place than those before and after them, and than their poses."""
-    begin_s, end_s, gain = evidence.foreign
+    segment = evidence.foreign
     return judge(
-        "foreign images", "map", max(gain, 0.0), _ODDS_LIMIT, "",
+        "foreign images", "map", max(segment.gain, 0.0), _ODDS_LIMIT, "",
         fine="no stretch has markings that the other images lack",
-        wrong=f"from {begin_s:.1f} to {end_s:.1f} s the images show other markings than before and after, as "
-        "those of another drive do: compare the lists of images and poses",
+        wrong=f"from {segment.begin_s:.1f} to {segment.end_s:.1f} s the images show other markings than "
+        "before and after, as those of another drive do: compare the lists of images and poses",
     )  # fmt: skip
 
 
@@ -420,7 +384,7 @@ def _poses(evidence: SolveEvidence) -> Iterator[Finding]:
 def _excluded(best: MethodResult) -> Finding:
     # What was too far off, too briefly in view, or no paint contradicts nothing.
     innocent = (TOO_UNCERTAIN, LACKS_A_CORNER, NOT_OBSERVED, NOT_ON_GROUND)
-    left_out = sum(one.reason not in innocent for one in best.excluded)
+    left_out = sum(exclusion.reason not in innocent for exclusion in best.excluded)
     count = left_out + len(best.hd_map.markings)
     share = left_out / max(count, 1)
     surely = share - 2 * float(np.sqrt(share * (1 - share) / max(count, 1)))
@@ -431,65 +395,3 @@ def _excluded(best: MethodResult) -> Finding:
         wrong=f"{says}: markings are seen, but not where others place them; see excluded.geojson",
         status=Status.WARN,
     )  # fmt: skip
-
-
-def _words(one: Contradiction) -> str:
-    """The error and its size, as a clause."""
-    whose = " and ".join(one.cameras)
-    size = abs(one.value)
-    cm = 100 * size
-    longer = "longer" if one.value > 0 else "shorter"
-    axis = _MAP_AXES[one.axis]
-    way = f"{cm:.0f} cm {_WAYS[min(one.axis, 2)][one.value > 0]}"
-    match one.fault:
-        case Fault.CLOCK:
-            late = "later" if one.value > 0 else "earlier"
-            where = f" {one.about}" if one.about else ""
-            return f"the images of {whose}{where} were taken {1e3 * size:.0f} ms {late} than their stamps say"
-        case Fault.CLOCK_DRIFT:
-            how = f"wanders, as counted stamps do: within {1e3 * size:.0f} ms"
-            if one.axis == 0:
-                how = f"runs {'slow' if one.value > 0 else 'fast'}: by {1e3 * size:.0f} ms over the drive"
-            return f"the clock of the images of {whose} {how}"
-        case Fault.CROWN:
-            way = "falls" if one.value > 0 else "rises"
-            side = ("both sides", "the left", "the right")[one.axis]
-            return f"the ground {way} by {100 * size:.1f} % to {side} of the route, as on a crown"
-        case Fault.COURSE:
-            return (
-                f"the heading is not the vehicle's, but the course of a point {size:.1f} m "
-                f"{'ahead of' if one.value > 0 else 'behind'} the rear axle"
-            )
-        case Fault.STEP:
-            return f"the position steps by {100 * one.value:+.0f} cm {axis} and stays there, {one.about}"
-        case Fault.KNOCK:
-            turned = ("in roll", "in pitch", "in yaw")[one.axis]
-            of_all = "as if the heading stepped" if one.axis == 2 else "as by load"
-            cause = of_all if len(one.cameras) > 1 else "as by a knock"
-            by = f"{np.rad2deg(size):.1f} deg {turned}"
-            return f"the mounting of {whose} is turned by {by} {one.about}, {cause}"
-        case Fault.FOCAL:
-            return f"the focal length of {whose} is {100 * size:.1f} % {longer} than camera_info says"
-        case Fault.DISTORTION:
-            return f"the lens distortion of {whose} is not that of camera_info (k1 off by {one.value:+.3f})"
-        case Fault.PRINCIPAL:
-            axis = ("right", "down")[one.axis]
-            return f"the principal point of {whose} lies {one.value:+.0f} px {axis} of where camera_info says"
-        case Fault.SLOPE:
-            return f"the ground rises by {100 * one.value:+.1f} % to the {axis} under the poses"
-        case Fault.SURVEY:
-            return f"the centre of {whose} lies {way} its survey"
-        case Fault.LEVER:
-            return (
-                f"the centres of {whose} all lie {way} their surveys, as if the poses were of another "
-                "point of the vehicle (antenna instead of axle)"
-            )
-        case Fault.SCALE:
-            apart = "close together" if one.value > 0 else "far apart"
-            return f"the recorded positions lie {cm:.1f} % too {apart}"
-        case Fault.SIZE:
-            return f"paint that known_sizes states as {one.about} is {cm:.1f} cm {longer}"
-        case Fault.CONTROL:
-            return f"the surveyed point {one.about} is {cm:.0f} cm off the marking's corner"
-        case Fault.DATUM:
-            return f"the surveyed points all lie {100 * one.value:+.0f} cm {axis} of the markings"

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from v2hdm.geometry.ipm import mounting_angles
 from v2hdm.geometry.rigid import euler_from_rotation, inverse
 from v2hdm.io.importers.bag import messages as kinds
 from v2hdm.io.importers.bag.messages import TF_STATIC, TF_TOPIC, Frames, frame_name
-from v2hdm.io.importers.bag.reading import Bag, Topic, bag_files, open_bag
+from v2hdm.io.importers.bag.reading import Bag, Topic, bag_files, in_child_of, open_bag
 from v2hdm.io.importers.bag.streams import INFO_KIND, TfStream, frame_of, import_streams
 from v2hdm.records import FloatArray
 from v2hdm.store.files import dump_yaml, load_yaml
@@ -53,42 +54,98 @@ def describe_bag(path: Path, cache: Path) -> dict[str, Any]:
 
 def list_topics(path: Path, cache: Path) -> str:
     """The topics of a bag with types and counts, and the ``drive.yaml`` for it as far as it is known."""
-    with open_bag(path) as bag:
-        topics = list(bag.topics.values())
+    outline = _outline_of(path)
+    topics = outline.topics.values()
     width = max((len(topic.name) for topic in topics), default=0)
     lines = [f"{topic.name:<{width}}  {topic.messages:>8}  {topic.kind}" for topic in topics]
     if not any(topic.kind in IMAGE_KINDS for topic in topics):
         return "\n".join([*lines, "", "# no image topic: not a drive"])
-    found = BagDescription(path, cache)
-    said = f"; missing: {', '.join(found.missing)}" if found.missing else ""
-    return "\n".join([*lines, "", f"# drive.yaml{said}", dump_yaml(found.content).rstrip()])
+    description = BagDescription(path, cache, outline)
+    gaps = f"; missing: {', '.join(description.missing)}" if description.missing else ""
+    return "\n".join([*lines, "", f"# drive.yaml{gaps}", dump_yaml(description.content).rstrip()])
+
+
+@dataclass(frozen=True)
+class _Outline:
+    """What a bag holds: its topics by name, and the frames that their first messages are of."""
+
+    topics: Mapping[str, Topic]
+    frame_of: Mapping[str, str]  # by the topics that a description needs the frame of
+
+    @property
+    def cameras(self) -> dict[str, Topic]:
+        """Topics of images by the camera's name; a camera's compressed ones rather than its raw ones."""
+        topics = [topic for topic in self.topics.values() if topic.kind in IMAGE_KINDS and topic.messages]
+        by_base: dict[str, Topic] = {}
+        for topic in sorted(topics, key=lambda topic: topic.kind != kinds.COMPRESSED):
+            by_base.setdefault(topic.name.removesuffix("/compressed"), topic)
+        names = {}
+        for base in by_base:
+            words = [word for word in base.split("/") if word and word not in _IMAGE_WORDS]
+            names[base] = words[-1] if words else "camera"
+        if len(set(names.values())) < len(names):
+            names = {base: base.strip("/").replace("/", "_") for base in by_base}
+        return {names[base]: topic for base, topic in sorted(by_base.items())}
+
+    def info_of(self, image: Topic) -> Topic | None:
+        """The ``camera_info`` beside the images, as ``image_transport`` names it."""
+        base = image.name.removesuffix("/compressed")
+        beside = f"{base.rsplit('/', 1)[0]}/camera_info"
+        topic = self.topics.get(beside) or self.topics.get(f"{base}/camera_info")
+        return topic if topic is not None and topic.kind == INFO_KIND and topic.messages else None
+
+    @property
+    def position(self) -> Topic | None:
+        """The only topic of positions."""
+        return self._only(kinds.POSE_KINDS[:-1])
+
+    @property
+    def heading(self) -> Topic | None:
+        """The only topic of headings, where positions lack them."""
+        if self.position is None or self.position.kind != kinds.FIX:
+            return None
+        return self._only([kinds.QUATERNION]) or self._only([kinds.IMU])
+
+    def _only(self, message_kinds: Sequence[str]) -> Topic | None:
+        recorded = [topic for topic in self.topics.values() if topic.messages > 1]
+        fitting = [topic for topic in recorded if topic.kind in message_kinds]
+        return fitting[0] if len(fitting) == 1 else None
+
+
+def _outline_of(path: Path) -> _Outline:
+    outline = in_child_of(path, outline_bag)
+    topics = [Topic(**fields) for fields in outline["topics"]]
+    return _Outline({topic.name: topic for topic in topics}, outline["frame_of"])
+
+
+def outline_bag(path: Path) -> dict[str, Any]:
+    """The topics of a bag, and frames by topic, in plain values."""
+    with open_bag(path) as bag:
+        outline = _Outline(bag.topics, {})
+        infos = [outline.info_of(topic) for topic in outline.cameras.values()]
+        names = {topic.name for topic in (*infos, outline.position, outline.heading) if topic is not None}
+        frame_of = _frames_of_topics(bag, names)
+        return {"topics": [asdict(topic) for topic in bag.topics.values()], "frame_of": frame_of}
 
 
 class BagDescription:
     """The ``content`` of a ``drive.yaml`` as far as a bag tells it, and the ``missing`` keys, dotted."""
 
-    def __init__(self, path: Path, cache: Path) -> None:
+    def __init__(self, path: Path, cache: Path, outline: _Outline | None = None) -> None:
         self.missing: dict[str, str] = {}
-        with open_bag(path) as bag:
-            images = _cameras(bag)
-            infos = {name: _info_topic(bag, topic) for name, topic in images.items()}
-            position = _only(bag, kinds.POSE_KINDS[:-1])
-            heading = None
-            if position is not None and position.kind == kinds.FIX:
-                heading = _only(bag, [kinds.QUATERNION]) or _only(bag, [kinds.IMU])
-            wanted = [*infos.values(), position, heading]
-            has_static = TF_STATIC in bag.topics
-            has_tf = TF_TOPIC in bag.topics
-            self._frame_of = _frames_of_topics(bag, {topic.name for topic in wanted if topic is not None})
+        outline = outline or _outline_of(path)
+        images = outline.cameras
         if not images:
             raise DriveError(f"{path}: has no image topic ({', '.join(IMAGE_KINDS)}); not a drive")
+        self._frame_of = outline.frame_of
         self._frames = Frames({})
-        if has_static or has_tf:
+        has_tf = TF_TOPIC in outline.topics
+        if has_tf or TF_STATIC in outline.topics:
             stream = TfStream(has_tf, f"{path}: tf")
             self._frames = stream.frames(import_streams(path, [stream], cache)[0])
         self._vehicle = next((name for name in _VEHICLES if name in self._frames.names), None)
-        poses = self._poses(position, heading)
-        cameras = {name: self._camera(name, topic, infos[name]) for name, topic in images.items()}
+        poses = self._poses(outline.position, outline.heading)
+        cameras = {name: self._camera(name, topic, outline.info_of(topic)) for name, topic in images.items()}
         about: dict[str, Any] = {"name": path.stem, "bag": path.name}
         self.content = about | {"poses": poses, "cameras": cameras}
 
@@ -160,28 +217,3 @@ def _frames_of_topics(bag: Bag, names: set[str]) -> dict[str, str]:
         if len(frames) == len(names):
             break
     return frames
-
-
-def _cameras(bag: Bag) -> dict[str, Topic]:
-    """Topics of images by the camera's name; a camera's compressed ones rather than its raw ones."""
-    topics = [topic for topic in bag.topics.values() if topic.kind in IMAGE_KINDS and topic.messages]
-    by_base: dict[str, Topic] = {}
-    for topic in sorted(topics, key=lambda topic: topic.kind != kinds.COMPRESSED):
-        by_base.setdefault(topic.name.removesuffix("/compressed"), topic)
-    words = {base: [one for one in base.split("/") if one and one not in _IMAGE_WORDS] for base in by_base}
-    names = {base: own[-1] if own else "camera" for base, own in words.items()}
-    if len(set(names.values())) < len(names):
-        names = {base: base.strip("/").replace("/", "_") for base in by_base}
-    return {names[base]: topic for base, topic in sorted(by_base.items())}
-
-
-def _info_topic(bag: Bag, image: Topic) -> Topic | None:
-    """The ``camera_info`` beside the images, as ``image_transport`` names it."""
-    base = image.name.removesuffix("/compressed")
-    topic = bag.topics.get(base.rsplit("/", 1)[0] + "/camera_info") or bag.topics.get(base + "/camera_info")
-    return topic if topic is not None and topic.kind == INFO_KIND and topic.messages else None
-
-
-def _only(bag: Bag, kinds: Sequence[str]) -> Topic | None:
-    found = [one for one in bag.topics.values() if one.kind in kinds and one.messages > 1]
-    return found[0] if len(found) == 1 else None

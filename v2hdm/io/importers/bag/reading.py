@@ -2,30 +2,29 @@
 
 from __future__ import annotations
 
-import os
 import re
-from bz2 import BZ2Decompressor
+import sys
 from collections import defaultdict, deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from contextvars import ContextVar
 from dataclasses import dataclass
-from functools import cache
 from itertools import chain
 from pathlib import Path
-from types import SimpleNamespace
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from v2hdm.errors import DriveError, need
-from v2hdm.safe.databases import limit_steps, opened, rows_of
+from v2hdm.safe.child import Limits, in_child, next_step
+from v2hdm.safe.databases import opened, rows_of
 from v2hdm.store.files import load_yaml, take_mapping
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"
-_TIMES = 10
-_SPARE_BYTES = 200_000_000  # what a piece may unpack to: so many times its bytes, and these
-_TIMES_IN_ALL = 100  # the same of all pieces: raw pictures of a simulator may pack twenty times
-_spare: ContextVar[int] = ContextVar("bytes beyond so many times its own that a bag may still unpack to")
+_TIMES = 10  # by which a message or a file may have more bytes than the bag that it is packed in
+_TIMES_IN_ALL = 100  # the same of all messages: raw pictures of a simulator may pack twenty times
+_SPARE_BYTES = 200_000_000  # which either may have beyond that
+_BLOCK_BYTES = 1 << 20  # that a compressed file is unpacked by
+_TRAP = "is cut off, or unpacks to more than a recording could; unpack it yourself"
 _MOST_LETTERS = 1_000_000  # of a type's definition
 _TEXTS = re.compile(r'"(?:[^"\\]|\\.)*(?:"|\Z)|//[^\n]*|#[^\n]*|/\*.*?(?:\*/|\Z)', re.DOTALL)
 _CONSTANT = re.compile(r"\bconst\b[^=;]*=([^;]*)")
@@ -99,23 +98,28 @@ class Bag:
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
         """The messages of some topics in the order received; DriveError where damaged, or some lack."""
         missing = sum(self.topics[name].messages for name in topics if name in self.topics)
+        size = sum(file.stat().st_size for file in bag_files(self.path))
+        spare_bytes = _TIMES_IN_ALL * size + _SPARE_BYTES
         streams = (
-            reader.messages(connections=wanted)
+            reader.messages(connections=connections)
             for reader in self._readers
-            if (wanted := [connection for connection in reader.connections if connection.topic in topics])
+            if (connections := [known for known in reader.connections if known.topic in topics])
         )
         stream = chain.from_iterable(streams)
         while True:
+            next_step()
             with _one_line(self.path):
-                item = next(stream, None)
-            if item is None:
+                packed = next(stream, None)
+            if packed is None:
                 break
             missing -= 1
-            connection, received_ns, data = item
+            connection, received_ns, data = packed
+            spare_bytes -= len(data)
+            if spare_bytes < 0 or len(data) > _TIMES * size + _SPARE_BYTES:
+                raise DriveError(f"{self.path}: {_TRAP}")
             with _one_line(self.path, f"topic {connection.topic}, type {connection.msgtype}: "):
-                message = connection.topic, connection.msgtype, received_ns / 1e9
                 fields = self._fields(connection, data)
-            yield Message(*message, fields)
+            yield Message(connection.topic, connection.msgtype, received_ns / 1e9, fields)
         if missing > 0:
             raise DriveError(
                 f"{self.path}: {missing} listed messages of {', '.join(sorted(topics))} are "
@@ -167,101 +171,71 @@ class Bag:
         return topic
 
 
+def in_child_of(path: Path, work: Callable[..., Any], *arguments: Any) -> Any:
+    """The answer of ``work`` on the bag at ``path`` and more ``arguments``, done in a child."""
+    need("rosbags", "ros", f"{path}: a bag", DriveError)
+    limits = Limits.of(*bag_files(path))
+    return in_child(work, path, *arguments, limits=limits, where=str(path), error=DriveError)
+
+
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
     """Open the bag at ``path``: a ROS 1 file, a ROS 2 folder, or one file of it."""
-    need("rosbags", "ros", f"{path}: a bag", DriveError)
-    _limit_rosbags()
-    _spare.set(_SPARE_BYTES)
     from rosbags import rosbag1, rosbag2
 
     files = bag_files(path)
-    for one in files:
-        if one.suffix == ".db3":
-            _check_database(one)
-    with ExitStack() as opened:
+    with TemporaryDirectory() as scratch, ExitStack() as opened_readers:
         with _one_line(path):
-            readers: list[Any] = []
-            # The files of a folder, or each of its messages, may be compressed.
             about = load_yaml(files[0], DriveError) if files[0].name == _METADATA else {}
             about = take_mapping(about.get("rosbag2_bagfile_information", {}), str(files[0]), DriveError)
-            if str(about.get("compression_mode") or "none").lower() not in ("none", "storage"):
-                readers.append(opened.enter_context(rosbag2.Reader(path)))
+            storages = files[files[0].name == _METADATA :]
+            plain = [_unpacked(file, Path(scratch)) if file.suffix == ".zstd" else file for file in storages]
+            for file in plain:
+                if file.suffix == ".db3":
+                    _check_database(file)
+                    _check_plain(file)
+            readers: list[Any] = []
+            # Each of its messages may be compressed, which the folder's description states.
+            if str(about.get("compression_mode")).lower() == "message":
+                readers.append(opened_readers.enter_context(rosbag2.Reader(path)))
             else:
                 # rosbags skips, without a word, topics of which the folder's description and the file state
                 # other qualities of service, as bags that were rewritten do. The files alone have them all.
-                for one in files[files[0].name == _METADATA :]:
-                    kind = rosbag1.Reader if one.suffix == ".bag" else rosbag2.Reader
-                    readers.append(opened.enter_context(kind(one)))
+                for file in plain:
+                    kind = rosbag1.Reader if file.suffix == ".bag" else rosbag2.Reader
+                    readers.append(opened_readers.enter_context(kind(file)))
                 readers.sort(key=lambda reader: reader.start_time)
+            _check_chunks(readers)
             bag = Bag(path, readers)
         yield bag
 
 
-@cache
-def _limit_rosbags() -> None:
-    """Let no bag make rosbags take more memory or time than its bytes need: a few can ask for all of both."""
-    import apsw
-    from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
-    from rosbags.rosbag1 import reader as reader1
-    from rosbags.rosbag2 import reader as reader2
-    from rosbags.rosbag2 import storage_mcap, storage_sqlite3
+def _unpacked(file: Path, folder: Path) -> Path:
+    """A file that is compressed as a whole, unpacked into ``folder``."""
+    if sys.version_info >= (3, 14):
+        from compression import zstd
+    else:
+        from backports import zstd
 
-    def limited(new: Callable[[], Any]) -> Callable[..., bytes]:
-        def unpack(data: bytes, *_: object) -> bytes:
-            stream = new()
-            most = _TIMES * len(data) + _spare.get()
-            out: bytes = stream.decompress(data, max_length=most)
-            if not stream.eof:
-                raise DriveError("is cut off, or unpacks to more than a recording could; unpack it yourself")
-            _spare.set(min(_spare.get() + _TIMES_IN_ALL * len(data) - len(out), _SPARE_BYTES))
-            return out
+    plain = folder / file.stem
+    spare_bytes = _TIMES * file.stat().st_size + _SPARE_BYTES
+    with zstd.open(file) as packed, plain.open("wb") as unpacked:
+        while block := packed.read(_BLOCK_BYTES):
+            spare_bytes -= len(block)
+            if spare_bytes < 0:
+                raise DriveError(f"{file.name}: {_TRAP}")
+            unpacked.write(block)
+    return plain
 
-        return unpack
 
-    @contextmanager
-    def limited_file(file: Any, mode: str) -> Iterator[Any]:
-        left = _TIMES * os.fstat(file.fileno()).st_size + _SPARE_BYTES
-
-        def read(count: int) -> bytes:
-            nonlocal left
-            left -= len(data := whole.read(count))
-            if left < 0:
-                raise DriveError(f"{file.name}: unpacks to more than a recording could; unpack it yourself")
-            return bytes(data)
-
-        with zstd.open(file, mode) as whole:
-            yield SimpleNamespace(read=read)
-
-    def connected(name: str, **how: Any) -> apsw.Connection:
-        limit_steps(data := apsw.Connection(name, **how), Path(data.filename))
-        return data
-
-    database = vars(storage_sqlite3)["Sqlite3Reader"]
-    mcap = vars(storage_mcap)["McapReader"]
-    open_any = database._open
-    read_any = mcap.read_index
-
-    def open_plain(self: Any) -> None:  # after a file that is compressed as a whole was unpacked, too
-        _check_plain(self.path)
-        open_any(self)
-
-    def read_index(self: Any) -> None:  # chunks of one time are held together
-        read_any(self)
-        if sum(chunk.compressed_size for chunk in self.chunks) > self.path.stat().st_size:
-            raise DriveError("its index lists a chunk twice; run 'mcap recover'")
-
-    database._open = open_plain
-    mcap.read_index = read_index
-    zstd = vars(reader2)["zstd"]
-    lz4 = limited(LZ4FrameDecompressor)
-    unpack = limited(zstd.ZstdDecompressor)
-    storage_mcap.DECOMPRESSORS.update(zstd=unpack, lz4=lz4)
-    reader1.decompressors.update(bz2=limited(BZ2Decompressor), lz4=lz4)
-    vars(reader2)["zstd"] = SimpleNamespace(open=limited_file, decompress=unpack)
-    vars(storage_sqlite3)["apsw"] = SimpleNamespace(**vars(apsw) | {"Connection": connected})
-    for module in (reader2, storage_mcap, storage_sqlite3):
-        vars(module)["parse_qos"] = lambda _: []  # nobody asks for them, and they are YAML
+def _check_chunks(readers: Sequence[Any]) -> None:
+    """Refuse an MCAP file whose index lists a chunk again and again: chunks of one time are held together."""
+    for reader in readers:
+        storage = getattr(reader, "storage", None)
+        for part in getattr(storage, "storages", [storage]):
+            chunks = getattr(part, "chunks", [])
+            if chunks and sum(chunk.compressed_size for chunk in chunks) > part.path.stat().st_size:
+                raise DriveError("its index lists a chunk twice; run 'mcap recover'")
 
 
 def _check_definition(text: str) -> None:
@@ -307,9 +281,11 @@ def _one_line(path: Path, what: str = "") -> Iterator[None]:
     except DriveError as refused:  # its own files are named already
         named = str(refused).startswith(str(path))
         raise refused if named else DriveError(f"{path}: {what}{refused}") from None
+    except MemoryError:
+        raise DriveError(f"{path}: {what}{_TRAP}") from None
     # Bytes that are not what they should be fail anywhere within rosbags, with any error.
     except Exception as failure:
-        if isinstance(failure, KeyError):
+        if isinstance(failure, KeyError) and what:
             raise DriveError(
                 f"{path}: {what}the bag does not define the type {failure}; convert it to MCAP, which holds "
                 "its types, where it was recorded: 'ros2 bag convert'"

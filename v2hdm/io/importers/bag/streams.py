@@ -10,7 +10,7 @@ import logging
 from abc import ABC, abstractmethod
 from array import array
 from collections import defaultdict
-from collections.abc import Collection, Generator, Sequence
+from collections.abc import Collection, Generator, Mapping, Sequence
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,7 +22,7 @@ from v2hdm.errors import DriveError
 from v2hdm.io.calibration.reading import info_of
 from v2hdm.io.calibration.writing import write_camera_info
 from v2hdm.io.importers.bag import messages as kinds
-from v2hdm.io.importers.bag.reading import Bag, Message, bag_files, open_bag
+from v2hdm.io.importers.bag.reading import Bag, Message, bag_files, in_child_of, open_bag
 from v2hdm.io.importers.readings import Readings, nmea_readings
 from v2hdm.io.trajectory import write_image_list
 from v2hdm.records import FloatArray
@@ -216,28 +216,38 @@ def import_streams(path: Path, streams: Sequence[Stream], cache: Path) -> list[P
     """The folders of ``streams``, imported now unless before; raises DriveError where that fails."""
     files = bag_files(path)
     folders = [entry_folder(cache, files, stream.label, stream.settings) for stream in streams]
-    missing = {folder: one for folder, one in zip(folders, streams, strict=True) if not is_whole(folder)}
+    missing = {
+        folder: stream for folder, stream in zip(folders, streams, strict=True) if not is_whole(folder)
+    }
     if not missing:
         return folders
     size_mb = sum(file.stat().st_size for file in files) / 1e6
     labels = ", ".join(stream.label for stream in missing.values())
     _log.info("%s: importing %s from %.0f MB into %s, once", path, labels, size_mb, cache)
+    with ExitStack() as entries:
+        partial = {entries.enter_context(new_entry(folder)): stream for folder, stream in missing.items()}
+        in_child_of(path, write_streams, partial)
+    return folders
+
+
+def write_streams(path: Path, streams: Mapping[Path, Stream]) -> None:
+    """Write streams of the bag at ``path`` into their folders, in one pass."""
+    takers: dict[str, list[Writer]] = defaultdict(list)
     writers: list[Writer] = []
-    with open_bag(path) as bag, ExitStack() as entries:
-        takers: dict[str, list[Writer]] = defaultdict(list)
-        for folder, stream in missing.items():
+    with open_bag(path) as bag, ExitStack() as unfinished:
+        for folder, stream in streams.items():
             topics = stream.topics(bag)
-            writers.append(stream.write(entries.enter_context(new_entry(folder))))
-            entries.callback(writers[-1].close)
-            next(writers[-1])
+            writer = stream.write(folder)
+            unfinished.callback(writer.close)
+            writers.append(writer)
+            next(writer)
             for topic in topics:
-                takers[topic].append(writers[-1])
+                takers[topic].append(writer)
         for message in bag.messages(takers):
             for writer in takers[message.topic]:
                 writer.send(message)
         for writer in writers:
             next(writer, None)  # sends None
-    return folders
 
 
 def _lens(fields: Any) -> list[float]:

@@ -176,7 +176,7 @@
   // ---- the panel ----
   const NAMES = {
     markings: "markings and symbols", lanes: "lane lines", truth: "ground truth", checks: "check points", ellipses: "95 % ellipses", adjusted: "route, adjusted",
-    recorded: "route, recorded", excluded: "left out", changes: "changes", arrows: "residual arrows", mosaic: "ground mosaic", background: "background picture",
+    recorded: "route, recorded", excluded: "excluded candidates", changes: "changes", arrows: "residual arrows", mosaic: "ground mosaic", background: "background picture",
   };
   const ON = ["markings", "lanes", "adjusted", "excluded", "checks", "changes", "ellipses", "mosaic", "background"];
   const swatch = (stroke, dashes, shape = "line") => {
@@ -234,7 +234,7 @@
   }
 
   // ---- pointing and selecting ----
-  const title = (about) => (about.what === "check" ? `Check point ${about.id}` : about.what === "excluded" ? `Left out: ${words(about.k)}` : about.what === "change" ? `${words(about.k)} ${about.id}: ${about.fate}` : `${about.what === "symbol" ? "Symbol" : "Marking"} ${about.id}, ${words(data.kinds[about.k])}`);
+  const title = (about) => (about.what === "check" ? `Check point ${about.id}` : about.what === "excluded" ? `Excluded: ${words(about.k)}` : about.what === "change" ? `${words(about.k)} ${about.id}: ${about.fate}` : `${about.what === "symbol" ? "Symbol" : "Marking"} ${about.id}, ${words(data.kinds[about.k])}`);
   function facts(about) {
     if (about.what === "check") return checked(about);
     const rows = [];

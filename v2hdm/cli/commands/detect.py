@@ -13,7 +13,7 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
-from v2hdm.cli.main import parser_of
+from v2hdm.cli.command import Command
 from v2hdm.errors import ConfigError, DriveError
 
 if TYPE_CHECKING:
@@ -25,17 +25,17 @@ _FIRST = b'{"source": '  # the beginning of every line of detections
 _STAGES = ("read", "horizon", "net", "propose", "lanes", "fit", "judge")
 
 
-def run(arguments: Sequence[str]) -> None:
+def _run(arguments: Sequence[str]) -> None:
     """Detect in every image of a source."""
-    parser = parser_of("detect")
+    parser = COMMAND.parser()
     parser.add_argument("source", help="an image, a folder, a drive, a video, or a camera's index")
-    known = "the camera's calibration, for metres; or its intrinsics from Kalibr, OpenCV, ROS or COLMAP"
-    parser.add_argument("--camera", type=Path, metavar="FILE", help=known)
+    calibration = "the camera's calibration, for metres; or its intrinsics from Kalibr, OpenCV, ROS or COLMAP"
+    parser.add_argument("--camera", type=Path, metavar="FILE", help=calibration)
     parser.add_argument("--camera-name", metavar="NAME", help="the camera to use if the file has several")
     rough = "without a calibration: approximate camera height, downward pitch and horizontal field of view "
     rough += "(default: 1.6 5 60; the images correct the pitch); intrinsics from --camera override the latter"
-    three = ("HEIGHT_M", "PITCH_DEG", "FOV_DEG")
-    parser.add_argument("--mounting", type=float, nargs=3, metavar=three, help=rough)
+    values = ("HEIGHT_M", "PITCH_DEG", "FOV_DEG")
+    parser.add_argument("--mounting", type=float, nargs=3, metavar=values, help=rough)
     parser.add_argument("--linear", action="store_true", help="grey values proportional to light, not sRGB")
     parser.add_argument("--model", metavar="FILE", help="the network, ONNX (default: the shipped one)")
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="for the network (default: 1)")
@@ -117,8 +117,8 @@ def _drawing(frame: Frame, road: Road) -> bytes:
 
     from v2hdm.detection.road import draw_detections
 
-    markings = [one.image for one in road.markings]
-    lanes = [one.image for one in road.lanes]
+    markings = [marking.image for marking in road.markings]
+    lanes = [lane.image for lane in road.lanes]
     drawn = draw_detections(frame.pixels, markings, lanes)
     return cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, 92])[1].tobytes()
 
@@ -180,3 +180,12 @@ def _peak_memory() -> str:
     lines = status.read_text().splitlines() if status.is_file() else []
     peak_kb = next((int(line.split()[1]) for line in lines if line.startswith("VmHWM")), None)
     return "" if peak_kb is None else f", peak memory {peak_kb * 1024 / 1e6:.0f} MB"
+
+
+COMMAND = Command(
+    "v2hdm detect",
+    "Find markings and lanes in images, one JSON object per image.",
+    _run,
+    extra=None,
+    interrupted="interrupted before the last image; no --output was written",
+)

@@ -1,4 +1,4 @@
-"""``v2hdm check`` and ``localize``: examine a drive before it is mapped, or in a map."""
+"""``v2hdm check DRIVE``: examine a drive before it is mapped (docs/check.md)."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from v2hdm.cli.main import add_drive, drive_of, exit_code, parser_of, result_of, steps_of
-from v2hdm.errors import EXIT_FAILED_VERDICT, EXIT_USER_ERROR, DriveError
+from v2hdm.cli.arguments import add_drive, drive_of, exit_code, result_of, steps_of
+from v2hdm.cli.command import Command
+from v2hdm.errors import EXIT_USER_ERROR, DriveError
 
 
-def check(arguments: Sequence[str]) -> int:
+def _run(arguments: Sequence[str]) -> int:
     """One line per finding, a verdict and pictures, without torch; 0 for PASS and WARN, 3 for FAIL."""
-    parser = parser_of("check")
+    parser = COMMAND.parser()
     add_drive(parser, "check")
     parser.add_argument("--no-ground", dest="ground", action="store_false", help="skip bare ground: faster")
     parser.add_argument("--list-topics", action="store_true", help="only print a bag's topics and drive.yaml")
@@ -28,8 +29,9 @@ def check(arguments: Sequence[str]) -> int:
 
         print(list_topics(parsed.drive, Path(ReadOptions().cache)))
         return 0
-    from v2hdm.ground import estimate_cameras
+    from v2hdm.ground.estimate import estimate_cameras
     from v2hdm.store.files import write_json
+    from v2hdm.store.names import VERDICT
     from v2hdm.verdict import check_drive
     from v2hdm.verdict.check import draw_check
 
@@ -52,7 +54,7 @@ def check(arguments: Sequence[str]) -> int:
         ground = estimate_cameras(drive, parsed.workers, matched) if parsed.ground else {}
         print("check the drive", file=sys.stderr, flush=True)
         verdict = check_drive(drive, ground=ground)
-        write_json(unfinished / "verdict.json", verdict.as_json())
+        write_json(unfinished / VERDICT, verdict.as_json())
         draw_check(drive, unfinished, ground)
     passed = [finding.line for finding in verdict.passed if parsed.all]
     print(*passed, *verdict.lines[1:], verdict.lines[0], f"pictures in {folder}", sep="\n")
@@ -61,35 +63,11 @@ def check(arguments: Sequence[str]) -> int:
 
 def _recording_of(drive: Path) -> Path:
     """The bag that a drive folder describes, so that both have one result; else the drive itself."""
-    from v2hdm.io.drive.folder import DRIVE_FILE
+    from v2hdm.io.description import DRIVE_FILE
     from v2hdm.safe.texts import read_yaml
 
     file = drive / DRIVE_FILE
     return (drive / (read_yaml(file, DriveError).get("bag", "") if file.is_file() else "")).resolve()
 
 
-def localize_drive(arguments: Sequence[str]) -> int:
-    """Localise a drive in a map; 3 if the map does not explain the drive.
-
-    Only the first recorded pose is used; the others show how far off it is.
-    """
-    parser = parser_of("localize")
-    parser.add_argument("map", type=Path, help="result folder of v2hdm map, or the map.geojson in it")
-    add_drive(parser, "localized")
-    parsed = parser.parse_args(arguments)
-    from v2hdm.io.calibration.reading import trusted_calibrations
-    from v2hdm.io.maps.reading import read_geojson
-    from v2hdm.localization.run import localize, summary_lines, write_localised
-
-    path = parsed.map / "map.geojson" if parsed.map.is_dir() else parsed.map
-    hd_map = read_geojson(path)
-    calibrations = trusted_calibrations(path.parent)
-    drive = drive_of(parsed)
-    folder = parsed.output or Path("outputs") / f"{drive.name}-localized"
-    settings = {"map": str(parsed.map), "drive": str(parsed.drive), "cameras": list(drive.cameras)}
-    made = f"v2hdm localize of {parsed.drive.resolve()} in {path.resolve()}"
-    with result_of(folder, made, settings) as unfinished:
-        found = localize(hd_map, drive, calibrations, workers=parsed.workers, progress=steps_of("images"))
-        write_localised(found, drive, unfinished)
-    print(*summary_lines(found), f"results in {folder}", sep="\n")
-    return 0 if found.explained else EXIT_FAILED_VERDICT
+COMMAND = Command("v2hdm check", "Find in seconds what is wrong with a drive.", _run)

@@ -9,7 +9,8 @@ import torch
 from tests.adjust.scene import PIXEL_SIGMA, Scene, exp, make_scene, project, with_late_clocks
 from v2hdm.adjust import ControlPoints, KnownLengths, PoseSigma, SolveOptions, pose_innovations, solve
 from v2hdm.adjust.problem import POSE_STATES
-from v2hdm.faults import Fault, score_faults
+from v2hdm.faults import Fault, table
+from v2hdm.faults.score_tests import score_faults
 from v2hdm.faults.sensitivity import Sensitivity
 
 OPTIONS = SolveOptions(coarse=False, loss="none")
@@ -42,7 +43,7 @@ def test_the_gain_and_the_value_of_a_focal_length_are_those_of_solving_for_it():
     step = 5e-4
     low, middle, high = (2 * solve(with_focal(problem, 1 + p), OPTIONS).cost for p in (-step, 0.0, step))
     curvature, slope = (high - 2 * middle + low) / step**2, (high - low) / (2 * step)
-    one = found_of(problem, Fault.FOCAL, -1)
+    one = found_of(problem, table.FOCAL, -1)
     assert one.value == pytest.approx(-slope / curvature, rel=0.05)
     assert one.sigma == pytest.approx((2 / curvature) ** 0.5, rel=0.3), "by what the stretches disagree"
     assert 0 < one.gain < slope**2 / (4 * curvature), "stretches that the others predict gain less"
@@ -52,7 +53,7 @@ def test_the_gain_and_the_value_of_a_focal_length_are_those_of_solving_for_it():
 def test_a_late_clock_is_found_and_named_first():
     late = with_late_clocks(scene(), np.array([0.06, 0.0])).problem
     found = score_faults(late, solve(late, OPTIONS))
-    assert (found[0].fault, found[0].camera) == (Fault.CLOCK, 0)
+    assert (found[0].fault, found[0].camera) == (table.CLOCK, 0)
     assert found[0].value == pytest.approx(0.06, abs=0.01)
     assert found[0].sigmas > 7
 
@@ -67,7 +68,7 @@ def test_a_survey_is_held_against_what_the_drive_says_without_it():
     free = solve(replace(wrong, centre_sigma_m=sigma), OPTIONS)
     rotation, translation = free.cam_from_vehicle[0, :3, :3], free.cam_from_vehicle[0, :3, 3]
     without_m = float((-rotation.T @ translation)[2])
-    one = found_of(wrong, Fault.SURVEY, 0, 2)
+    one = found_of(wrong, table.SURVEY, 0, 2)
     assert one.value == pytest.approx(without_m - centre[0, 2], abs=0.02)
     assert one.sigmas > 5
 
@@ -77,7 +78,7 @@ def test_centres_that_are_all_off_alike_are_laid_to_the_point_of_the_poses():
     assert problem.centre_vehicle is not None
     off = replace(problem, centre_vehicle=problem.centre_vehicle + np.array([1.2, 0.0, 0.0]))
     first = score_faults(off, solve(off, OPTIONS))[0]
-    assert (first.fault, first.axis) == (Fault.LEVER, 0)
+    assert (first.fault, first.axis) == (table.LEVER, 0)
     assert first.value == pytest.approx(-1.2, abs=0.1)
 
 
@@ -89,7 +90,7 @@ def test_known_sizes_that_the_paint_does_not_have_are_told_with_those_that_it_ha
     stated = KnownLengths(first, first + 1, np.full(len(first), side_m - 0.05), np.full(len(first), 0.005))
     problem = replace(street.problem, lengths=stated)
     one = score_faults(problem, solve(problem, OPTIONS))[0]
-    assert one.fault is Fault.SIZE
+    assert one.fault is table.SIZE
     assert one.value == pytest.approx(0.05, abs=0.005)
 
 
@@ -100,7 +101,7 @@ def test_one_surveyed_point_off_is_told_from_all_off():
     points[1] += (0.2, 0.0)
     control = ControlPoints(chosen, points, np.full((len(chosen), 2), 0.01))
     one = score_faults(p := replace(street.problem, control=control), solve(p, OPTIONS))[0]
-    assert (one.fault, one.item) == (Fault.CONTROL, 1)
+    assert (one.fault, one.item) == (table.CONTROL, 1)
     assert one.value == pytest.approx(0.2, abs=0.05)
 
 
@@ -230,13 +231,13 @@ def drifting(scene: Scene):
 @pytest.mark.parametrize(
     ("change", "fault", "value"),
     [
-        (knocked, Fault.KNOCK, 0.0105),
-        (loaded, Fault.KNOCK, 0.0105),
-        (stepped, Fault.STEP, 0.3),
-        (wandering, Fault.STEP, 0.3),
-        (scaled, Fault.SCALE, 0.13),
-        (crowned, Fault.CROWN, 0.03),
-        (drifting, Fault.CLOCK_DRIFT, 0.1),
+        (knocked, table.KNOCK, 0.0105),
+        (loaded, table.KNOCK, 0.0105),
+        (stepped, table.STEP, 0.3),
+        (wandering, table.STEP, 0.3),
+        (scaled, table.SCALE, 0.13),
+        (crowned, table.CROWN, 0.03),
+        (drifting, table.CLOCK_DRIFT, 0.1),
     ],
 )
 def test_a_fault_that_begins_or_grows_on_the_way_is_the_likeliest(change, fault: Fault, value: float):

@@ -11,17 +11,18 @@ import logging
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from v2hdm.cli.main import parser_of
+from v2hdm.cli.command import Command
 from v2hdm.errors import ConfigError, MapFileError
-from v2hdm.records import FloatArray
+
+if TYPE_CHECKING:
+    from v2hdm.records import FloatArray
 
 
-def run(arguments: Sequence[str]) -> None:
+def _run(arguments: Sequence[str]) -> None:
     """Convert a map or a calibration."""
-    parser = parser_of("export")
+    parser = COMMAND.parser()
     parser.add_argument("source", type=Path, metavar="MAP", help="map.geojson, .gpkg, or calibration_*.yaml")
     kinds = "for a map: geojson, csv, gpkg, lanelet2, dxf, qgis, opendrive, landxml; for mosaic.tif: pcd; "
     kinds += "for a calibration: camera_info, static_transform, urdf, kalibr, opencv; may be repeated"
@@ -56,7 +57,7 @@ def _export_map(parsed: argparse.Namespace, folder: Path, check: Callable[[Path]
     from v2hdm.io.maps import formats
     from v2hdm.io.maps.reading import read_map
 
-    if ground := [one for one in parsed.format if one in formats.GROUND_FORMATS]:
+    if ground := [form for form in parsed.format if form in formats.GROUND_FORMATS]:
         raise ConfigError(
             f"--format {ground[0]}: a map file does not hold the ground; let the run write it with "
             f"'export=[geojson,{ground[0]}]'"
@@ -67,27 +68,35 @@ def _export_map(parsed: argparse.Namespace, folder: Path, check: Callable[[Path]
     hd_map, verdict = read_map(parsed.source)
     grid = formats.check_crs(parsed.crs, chosen, hd_map.origin, "--crs").get("gpkg")
     # A project takes the GeoPackage that is there, whoever wrote it, where it is of this map.
-    there = folder / formats.FORMATS["gpkg"].file.format(name=name)
+    geopackage = folder / formats.FORMATS["gpkg"].file.format(name=name)
     crs = None if grid is None else grid.crs
-    kept = ["gpkg"] if "gpkg" not in parsed.format and formats.holds(there, hd_map, crs) else []
-    files = [folder / formats.FORMATS[one].file.format(name=name) for one in chosen if one not in kept]
+    is_kept = "gpkg" not in parsed.format and formats.holds(geopackage, hd_map, crs)
+    kept_formats = ["gpkg"] if is_kept else []
+    files = [
+        folder / formats.FORMATS[form].file.format(name=name) for form in chosen if form not in kept_formats
+    ]
     if parsed.source.resolve() in [file.resolve() for file in files]:
         raise ConfigError(f"{parsed.source} would be overwritten: set another --output or --format")
     for file in files:
         check(file)
-    return formats.write_map(hd_map, folder, name, parsed.format, verdict, parsed.projector, parsed.crs, kept)
+    return formats.write_map(
+        hd_map, folder, name, parsed.format, verdict, parsed.projector, parsed.crs, kept_formats
+    )
 
 
 def _export_mosaic(parsed: argparse.Namespace, folder: Path, *_: object) -> list[Path]:
+    import numpy as np
+
     from v2hdm.io.drive.road import lay_flat
     from v2hdm.io.maps.features import ground_height_m
     from v2hdm.io.trajectory import read_tum
+    from v2hdm.store.names import TRAJECTORY
     from v2hdm.surface.strips import write_cloud
 
     _refuse_crs(parsed, "a point cloud is in the map's own frame")
     if parsed.format != ["pcd"]:
         raise ConfigError("--format: a mosaic is already a GeoTIFF; its other format is pcd")
-    driven = lay_flat(read_tum(parsed.source.with_name("trajectory.tum")))
+    driven = lay_flat(read_tum(parsed.source.with_name(TRAJECTORY)))
 
     def height_m(places: FloatArray) -> FloatArray:
         return np.zeros(len(places)) if driven.road is None else ground_height_m(driven.road, places)
@@ -115,3 +124,12 @@ def _export_calibration(parsed: argparse.Namespace, folder: Path, *_: object) ->
     about = read_provenance(parsed.source)
     camera = calibration.info.name
     return [write_calibration_as(name, calibration, about, folder, camera) for name in parsed.format]
+
+
+COMMAND = Command(
+    "v2hdm export",
+    "Convert a map or a calibration to other formats.",
+    _run,
+    extra=None,
+    interrupted="interrupted; the files listed are complete",
+)

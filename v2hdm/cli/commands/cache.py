@@ -7,22 +7,22 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from v2hdm.cli.main import parser_of
+from v2hdm.cli.command import Command
 
 if TYPE_CHECKING:
     from v2hdm.store.cache import Item
 
-_GB = 1e9
+_GB = 1e9  # bytes
 
 
-def run(arguments: Sequence[str]) -> None:
+def _run(arguments: Sequence[str]) -> None:
     """List or prune a cache."""
-    parser = parser_of("cache")
+    parser = COMMAND.parser()
     actions = parser.add_subparsers(dest="what", metavar="{list,prune}", required=True)
-    shown = actions.add_parser("list", help="list entries, their size and last use")
-    pruned = actions.add_parser("prune", help="remove least recently used entries, and leftovers")
-    pruned.add_argument("--gb", type=float, required=True, help="size to keep, GB; 0 empties the cache")
-    for action in (shown, pruned):
+    listing = actions.add_parser("list", help="list entries, their size and last use")
+    pruning = actions.add_parser("prune", help="remove least recently used entries, and leftovers")
+    pruning.add_argument("--gb", type=float, required=True, help="size to keep, GB; 0 empties the cache")
+    for action in (listing, pruning):
         action.add_argument("--cache", default=Path("cache"), type=Path, metavar="DIR", help="default: cache")
     parsed = parser.parse_args(arguments)
     from v2hdm.errors import ConfigError
@@ -46,11 +46,21 @@ def _show(items: Sequence[Item]) -> None:
     kinds = sorted({item.kind for item in items})
     print(f"{'what':<20}{'entries':>8}{'size':>12}  last used")
     for kind in kinds:
-        own = [item for item in items if item.kind == kind]
-        used = time.strftime("%Y-%m-%d %H:%M", time.localtime(max(item.used_s for item in own)))
-        print(f"{kind:<20}{len(own):>8}{_size(sum(item.size for item in own)):>12}  {used}")
+        of_kind = [item for item in items if item.kind == kind]
+        size = _size(sum(item.size for item in of_kind))
+        last_used = time.strftime("%Y-%m-%d %H:%M", time.localtime(max(item.used_s for item in of_kind)))
+        print(f"{kind:<20}{len(of_kind):>8}{size:>12}  {last_used}")
     print(f"{'all':<20}{len(items):>8}{_size(sum(item.size for item in items)):>12}")
 
 
 def _size(size: int) -> str:
     return f"{size / _GB:.2f} GB" if size >= _GB else f"{size / 1e6:.1f} MB"
+
+
+COMMAND = Command(
+    "v2hdm cache",
+    "List or prune the cache of runs.",
+    _run,
+    extra=None,
+    interrupted="interrupted; entries removed so far are recomputed when needed",
+)

@@ -1,0 +1,72 @@
+"""What several commands share: arguments on a drive or a result, its folder, progress and the exit code."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from v2hdm.errors import EXIT_FAILED_VERDICT
+from v2hdm.progress import Steps, patient, progress_lines
+
+if TYPE_CHECKING:
+    from v2hdm.records import Drive
+    from v2hdm.verdict import Verdict
+
+
+def add_drive(parser: argparse.ArgumentParser, result: str) -> None:
+    """Add the arguments of commands that read a drive; ``result`` ends the name of the default folder."""
+    parser.add_argument("drive", type=Path, help="a drive folder or a bag; see docs/drive-format.md")
+    parser.add_argument("--camera", action="append", default=[], metavar="NAME", help="only this; repeatable")
+    parser.add_argument("--format", default="auto", metavar="NAME", help="folder, kitti, bag (default: auto)")
+    parser.add_argument("--output", type=Path, metavar="DIR", help=f"default: outputs/<drive>-{result}")
+    parser.add_argument("--workers", type=int, default=0, metavar="N", help="processes (default: all cores)")
+
+
+def drive_of(parsed: argparse.Namespace) -> Drive:
+    """Read the drive of :func:`add_drive`; ``parsed.workers``, if 0, becomes the number of cores."""
+    import cv2
+
+    from v2hdm.io.drive import ReadOptions, read_drive
+    from v2hdm.settings import check_workers
+
+    check_workers(parsed.workers)
+    parsed.workers = parsed.workers or os.cpu_count() or 1
+    logging.basicConfig(format="%(message)s")
+    logging.getLogger("v2hdm.io").setLevel(logging.INFO)  # an import may take minutes, and says so
+    cv2.setNumThreads(1)
+    return read_drive(parsed.drive, ReadOptions(format=parsed.format, cameras=parsed.camera))
+
+
+def add_result(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of commands on a finished result."""
+    parser.add_argument("result", type=Path, help="result folder of v2hdm map")
+    where = "the drive's folder (default: where it was when mapped)"
+    parser.add_argument("--drive", type=Path, metavar="DIR", help=where)
+
+
+@contextmanager
+def result_of(folder: Path, made: str, settings: Mapping[str, object]) -> Iterator[Path]:
+    """The unfinished folder of a command's results, with the settings that they were made of."""
+    from v2hdm.store.results import result_folder
+
+    with result_folder(folder, "--output", made) as unfinished:
+        (unfinished / "config.yaml").write_text(json.dumps(settings) + "\n", encoding="utf-8")
+        yield unfinished
+
+
+def steps_of(task: str) -> Steps:
+    """Progress of a task as lines on stderr."""
+    return partial(progress_lines(partial(print, file=patient(sys.stderr), flush=True)), task)
+
+
+def exit_code(verdict: Verdict) -> int:
+    """3 for FAIL, 0 for PASS and WARN."""
+    return EXIT_FAILED_VERDICT if verdict.status.value == "FAIL" else 0

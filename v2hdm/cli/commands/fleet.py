@@ -1,0 +1,59 @@
+"""``v2hdm fleet drives/*.yaml`` (docs/fleet.md)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from v2hdm.cli.command import GO_ON, Command
+from v2hdm.errors import ConfigError
+
+
+def _run(arguments: Sequence[str]) -> int:
+    """Map many drives on the cores of this machine, or a share of them.
+
+    A drive whose result is finished and was made of the same is not done again; one that fails is a row of
+    the table that says why. Returns 0, 2 where a drive gave no result, or 3 where a verdict is FAIL.
+    """
+    parser = COMMAND.parser()
+    parser.add_argument("drives", nargs="+", help="run files, as for v2hdm map; or key=value for all of them")
+    parser.add_argument("--workers", type=int, default=0, metavar="N", help="cores to use (default: all)")
+    tables = "folder for the verdicts, fleet.csv and fleet.json (default: outputs/fleet)"
+    parser.add_argument("--table", type=Path, default=Path("outputs/fleet"), metavar="DIR", help=tables)
+    every = "map every N-th drive, starting with the K-th; table in DIR-K-of-N"
+    parser.add_argument("--share", metavar="K/N", help=every)
+    parser.add_argument("--again", action="store_true", help="map finished drives again")
+    parsed = parser.parse_intermixed_args(arguments)
+    from v2hdm.fleet import FleetOptions, exit_code, fleet_on_terminal
+    from v2hdm.settings import check_workers
+
+    check_workers(parsed.workers)
+    overrides = [word for word in parsed.drives if "=" in word and not Path(word).exists()]
+    files = [Path(word) for word in dict.fromkeys(parsed.drives) if word not in overrides]
+    if not files:
+        raise ConfigError("no drives given: name run files, as in v2hdm fleet drives/*.yaml")
+    table = parsed.table
+    share = (1, 1)
+    if parsed.share is not None:
+        share = _share(parsed.share)
+        table = table.with_name(f"{table.name}-{share[0]}-of-{share[1]}")
+    options = FleetOptions(table, parsed.workers, parsed.again, share)
+    return exit_code(fleet_on_terminal(files, overrides, options))
+
+
+def _share(text: str) -> tuple[int, int]:
+    """K and N of ``K/N``."""
+    numbers = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text, re.ASCII)
+    k, n = (int(number) for number in numbers.groups()) if numbers else (0, 0)
+    if not 1 <= k <= n:
+        raise ConfigError(f"--share {text}: give K/N, such as 1/4 to 4/4")
+    return k, n
+
+
+COMMAND = Command(
+    "v2hdm fleet",
+    "Map many drives, each described by a run file.",
+    _run,
+    interrupted=f"interrupted; finished drives are kept, {GO_ON}",
+)

@@ -1,0 +1,43 @@
+"""``v2hdm simulate +run=port2``: render a port's drive, with its truth, where ``v2hdm map`` looks for it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from v2hdm.cli.arguments import steps_of
+from v2hdm.cli.command import GO_ON, Command
+
+if TYPE_CHECKING:
+    from v2hdm.cli.compose import Job
+
+_LISTED = ("simulate", "cache", "workers")  # keys, and those below them, that make a difference here
+
+
+def _run(arguments: Sequence[str]) -> int:
+    """Render a port."""
+    from v2hdm.cli.compose import Door, work_on
+    from v2hdm.pipeline.config import RunConfig
+
+    door = Door("map", RunConfig, "choose a port: +run=port2", lambda key: key.split(".")[0] in _LISTED)
+    return work_on(COMMAND, door, _render, arguments)
+
+
+def _render(job: Job) -> None:
+    from pathlib import Path
+
+    from v2hdm.pipeline.config import admit_port
+    from v2hdm.simulate.port.drive import rendered_drive
+
+    config = job.settings
+    workers = config.workers or os.cpu_count() or 1
+    print(rendered_drive(admit_port(config), Path(config.cache), workers, steps_of("render images")))
+
+
+COMMAND = Command(
+    "v2hdm simulate",
+    "Render a drive through a port, with its truth, into the cache.",
+    _run,
+    interrupted=f"interrupted; finished images are kept, {GO_ON}",
+)

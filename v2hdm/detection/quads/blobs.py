@@ -1,0 +1,267 @@
+"""Connected pieces of paint: found in the network's output, and split where two markings touch.
+
+Labels and outlines are found on the network's ``paint`` in a frame of no paint that is one element wide.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from v2hdm.catalogue import OTHER, SHIPPED, SYMBOL, Catalogue
+from v2hdm.detection.network import NetworkOutput, as_probability
+from v2hdm.records import BoolArray, FloatArray, IntArray
+
+_MIN_CELLS = 5  # blobs of fewer cells are noise: their outline is not worth four corners
+_LEAST_SHARE = 0.15  # share of a blob from which a group of classes is present: two groups are two markings
+_LEAST_SYMBOL_SHARE = 0.25  # that share for a group of symbols: the head is more of an arrow
+
+_SURE = 2.0  # log odds at which paint is sure: markings that nearly touch come apart in sure paint
+_DOUBTFUL = -2.0  # least log odds of doubtful paint, which joins parts of a marking that a shadow divides
+_LEAST_SURE = 0.2  # share of a piece of doubtful paint that is likely from which the piece is of use
+_MOST_SURE = 0.6  # share of it that is likely up to which the piece is news
+_MOST_PARTS = 12  # parts that are looked at of one piece: more are the grains of bad light
+
+Box = tuple[slice, slice]
+"""Rows and columns of the framed ``paint``."""
+
+
+@dataclass(frozen=True)
+class Blob:
+    """One connected piece of paint; one that may be several markings comes whole, followed by its parts."""
+
+    class_score: dict[str, float]  # mean probability of each class
+    level: np.ndarray  # (h, w) float32, positive inside
+    origin_px: FloatArray  # of element (0, 0), recorded px; others are ``stride`` apart
+    stride: int
+    outline_px: FloatArray  # (N, 2) zero crossings of ``level``, recorded px, in no order
+    touches_symbol: bool = False  # split off a piece another part of which is a symbol or other paint
+    parts: int = 0
+    traced: bool = True  # lanes are, in pieces of likely paint or parts of one class
+
+    @property
+    def kind(self) -> str:
+        """The likeliest class."""
+        return max(self.class_score, key=self.class_score.__getitem__)
+
+
+class _Groups:
+    """Groups of classes, the ``least_share`` (G,) of a blob for each to be present, and the ``symbols``."""
+
+    def __init__(self, classes: Sequence[str], catalogue: Catalogue) -> None:
+        names = [catalogue.classes[name].group for name in classes]
+        self.of_class = np.array([names.index(name) for name in names], dtype=np.int64)
+        self.symbols = catalogue.of_family(SYMBOL, OTHER)
+        self.least_share = np.full(len(names), _LEAST_SHARE)
+        self.least_share[self.of_class[np.isin(classes, self.symbols)]] = _LEAST_SYMBOL_SHARE
+
+
+def find_blobs(
+    output: NetworkOutput, reach_px: int = 0, catalogue: Catalogue = SHIPPED
+) -> tuple[list[Blob], np.ndarray]:
+    """Blobs of paint below image row ``reach_px``, and 1 + the index of each element's (h, w) int16."""
+    # A frame of no paint around it lets every outline close.
+    level = cv2.copyMakeBorder(output.paint, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=-1.0)
+    contours, piece = _connected(level, (reach_px - output.top) / output.stride + 1)
+    groups = _Groups(output.classes, catalogue)
+    scores = _class_scores(output, piece, level, len(contours), groups)
+    outlines = _outlines(level, piece, len(contours))
+    owner = np.zeros_like(piece)
+    blobs: list[Blob] = []
+    doubtful = _doubtful(level, contours, scores.cells)
+    first_of_area: dict[int, int] = {}
+    for index in np.argsort(doubtful.area_of_piece, kind="stable").tolist():
+        if scores.cells[index] < _MIN_CELLS:
+            continue
+        area = int(doubtful.area_of_piece[index])
+        if area and area not in first_of_area:
+            first_of_area[area] = len(blobs)
+            blobs.append(_doubtful_blob(doubtful, area, level, output))
+        box = _framed(cv2.boundingRect(contours[index]))
+        inside = piece[box] == index + 1
+        parts = _split(inside, level[box], output, box, groups, scores.votes[index])
+        whole = Blob(
+            class_score=dict(zip(output.classes, scores.score[:, index].tolist(), strict=True)),
+            level=_signed(inside, level[box]),
+            origin_px=_origin_px(output, box[0].start, box[1].start),
+            stride=output.stride,
+            outline_px=_origin_px(output, 0, 0) + output.stride * outlines[index],
+            parts=len(parts),
+            traced=not any(part.traced for part in parts),
+        )
+        blobs.append(whole)
+        owner[box][inside] = len(blobs)
+        for part in parts:
+            blobs.append(part)
+            owner[box][part.level > 0] = len(blobs)
+        if area:
+            first = first_of_area[area]
+            blobs[first] = replace(blobs[first], parts=len(blobs) - 1 - first)
+    return blobs, owner[1:-1, 1:-1]
+
+
+def _framed(rectangle: Sequence[int]) -> Box:
+    """Rows and columns of a rectangle (x, y, width, height) with one element around it."""
+    x, y, width, height = rectangle
+    return slice(y - 1, y + height + 1), slice(x - 1, x + width + 1)
+
+
+def _origin_px(output: NetworkOutput, row: int, column: int) -> FloatArray:
+    """Recorded px (2,) of an element of the framed ``paint``."""
+    first = (output.stride - 1) / 2 - output.stride
+    return np.array([first + output.stride * column, first + output.top + output.stride * row])
+
+
+class _Doubtful(NamedTuple):
+    """Connected areas of doubtful paint."""
+
+    labels: np.ndarray  # (h, w) the area of each element of the framed ``paint``
+    stats: np.ndarray  # (A, 5) OpenCV's statistics of the areas
+    area_of_piece: IntArray  # (B,) the area in which each piece of likely paint lies, 0 if it is the same
+
+
+def _doubtful(level: np.ndarray, contours: Sequence[np.ndarray], cells: np.ndarray) -> _Doubtful:
+    """The areas of doubtful paint about the B pieces of likely paint, which have so many ``cells`` (B,)."""
+    doubtful = (level > _DOUBTFUL).view(np.uint8)
+    doubtful[[0, -1]] = 0
+    doubtful[:, [0, -1]] = 0
+    # Labels of 16 bits take a third of the time.
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(doubtful, ltype=cv2.CV_16U)
+    if not contours:
+        return _Doubtful(labels, stats, np.zeros(0, dtype=np.int64))
+    first_point = np.array([contour[0, 0] for contour in contours])
+    area = labels[first_point[:, 1], first_point[:, 0]].astype(np.int64)
+    sure = np.bincount(area, cells, len(stats)) / np.maximum(stats[:, cv2.CC_STAT_AREA], 1)
+    holds_several = np.bincount(area, minlength=len(stats)) > 1
+    is_of_use = (holds_several | (sure < _MOST_SURE)) & (sure > _LEAST_SURE)
+    return _Doubtful(labels, stats, np.where(is_of_use[area], area, 0))
+
+
+def _doubtful_blob(doubtful: _Doubtful, area: int, level: np.ndarray, output: NetworkOutput) -> Blob:
+    """The blob of one area of doubtful paint."""
+    box = _framed(doubtful.stats[area, : cv2.CC_STAT_AREA].tolist())
+    raised = level[box] - np.float32(_DOUBTFUL)
+    return replace(_blob(doubtful.labels[box] == area, raised, output, box), traced=False)
+
+
+def _connected(level: np.ndarray, least_row: float) -> tuple[list[np.ndarray], np.ndarray]:
+    """Contours of paint that reaches ``least_row``, and a map of 1 + the number of each, holes filled."""
+    contours, _ = cv2.findContours((level > 0).view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    within_reach = [
+        contour for contour in contours if len(contour) >= 4 and contour[:, 0, 1].max() + 1 >= least_row
+    ]
+    piece = np.zeros(level.shape, dtype=np.int16)
+    for index, contour in enumerate(within_reach):
+        cv2.drawContours(piece, [contour], -1, index + 1, cv2.FILLED)
+    return within_reach, piece
+
+
+class _Scores(NamedTuple):
+    """What the network says of B pieces of paint."""
+
+    cells: np.ndarray  # (B,) elements of paint
+    score: FloatArray  # (K, B) mean probability of each class
+    votes: FloatArray  # (B, G) share of the elements that each group has
+
+
+def _class_scores(
+    output: NetworkOutput, piece: np.ndarray, level: np.ndarray, count: int, groups: _Groups
+) -> _Scores:
+    """The scores of ``count`` pieces, of which ``piece`` (h, w) is the map."""
+    element = np.flatnonzero(piece > 0)
+    of_piece = piece.ravel()[element] - 1
+    cells = np.bincount(of_piece, minlength=count)
+    share = 1 / np.maximum(cells, 1)
+    certainty = np.bincount(of_piece, as_probability(level.ravel()[element]), count) * share
+    i, j = np.divmod(element, piece.shape[1])
+    probability = output.class_probability(i - 1, j - 1)
+    score = np.stack([np.bincount(of_piece, plane, count) for plane in probability]) * share
+    group_count = len(groups.least_share)
+    best = of_piece * group_count + groups.of_class[probability.argmax(axis=0)]
+    votes = np.bincount(best, minlength=count * group_count).reshape(count, group_count)
+    return _Scores(cells, certainty * score, votes / np.maximum(cells, 1)[:, None])
+
+
+def _outlines(level: np.ndarray, piece: np.ndarray, count: int) -> list[FloatArray]:
+    """Points (N, 2), (column, row), of each piece's outline: where the level falls to zero beside it."""
+    pieces = piece.ravel()
+    levels = level.ravel()
+    columns = piece.shape[1]
+    points = []
+    owners = []
+    # The frame is empty, so that the step from the end of one row to the start of the next crosses nothing.
+    for step in (columns, 1):
+        border = np.flatnonzero(pieces[:-step] != pieces[step:])
+        fraction = levels[border] / (levels[border] - levels[border + step])
+        i, j = np.divmod(border, columns)
+        points.append(np.column_stack([j, i + fraction] if step == columns else [j + fraction, i]))
+        owners.append(np.maximum(pieces[border], pieces[border + step]))
+    owner = np.concatenate(owners)
+    order = np.argsort(owner, kind="stable")
+    ends = np.searchsorted(owner[order], np.arange(1, count + 2)).tolist()
+    ordered = np.concatenate(points).astype(np.float64)[order]
+    return [ordered[begin:end] for begin, end in pairwise(ends)]
+
+
+def _split(
+    inside: BoolArray,
+    level: np.ndarray,
+    output: NetworkOutput,
+    box: Box,
+    groups: _Groups,
+    votes: FloatArray,
+) -> list[Blob]:
+    """The parts of a piece (h, w) of different groups, by their ``votes`` (G,), or else of sure paint."""
+    present = np.flatnonzero(votes >= groups.least_share)
+    levels = [level - _SURE]
+    if len(present) > 1:
+        levels = [np.minimum(level, _lead(output, groups.of_class == group, box)) for group in present]
+    masks = []
+    for part_level in levels:
+        _, labels, stats, _ = cv2.connectedComponentsWithStats(((part_level > 0) & inside).view(np.uint8))
+        large = np.flatnonzero(stats[:, cv2.CC_STAT_AREA] >= _MIN_CELLS)[:_MOST_PARTS].tolist()
+        masks += [(labels == label, part_level) for label in large if label]
+    if len(masks) < 2:
+        return []
+    parts = [_blob(mask, part_level, output, box) for mask, part_level in masks]
+    touches = any(part.kind in groups.symbols for part in parts)
+    return [replace(part, touches_symbol=touches, traced=len(present) > 1) for part in parts]
+
+
+def _blob(mask: BoolArray, level: np.ndarray, output: NetworkOutput, box: Box) -> Blob:
+    """The blob of a mask (h, w), a box of the framed ``paint``."""
+    rows, columns = np.nonzero(mask)
+    probability = output.class_probability(rows + box[0].start - 1, columns + box[1].start - 1)
+    scores = probability.mean(axis=1) * as_probability(level[mask]).mean()
+    signed = _signed(mask, level)
+    origin_px = _origin_px(output, box[0].start, box[1].start)
+    outline_px = origin_px + output.stride * _outlines(signed, mask.astype(np.int16), 1)[0]
+    named = dict(zip(output.classes, scores.tolist(), strict=True))
+    return Blob(named, signed, origin_px, output.stride, outline_px)
+
+
+def _lead(output: NetworkOutput, is_of_group: BoolArray, box: Box) -> np.ndarray:
+    """By how many logits the best class of a group (K,) leads the rest, on the paint's elements in a box."""
+    scale = output.kind_scale
+    # The elements of ``kinds`` about the box, with a margin to interpolate in.
+    kind_box = tuple(
+        slice(max(int((part.start - 2) / scale) - 1, 0), int(part.stop / scale) + 2) for part in box
+    )
+    kinds = output.kinds[:, *kind_box]
+    lead = kinds[is_of_group].max(axis=0) - kinds[~is_of_group].max(axis=0)
+    v, u = (
+        (np.arange(part.start, part.stop, dtype=np.float32) - 0.5) / np.float32(scale) - (0.5 + first.start)
+        for part, first in zip(box, kind_box, strict=True)
+    )
+    map_u, map_v = np.meshgrid(u, v)
+    return np.asarray(cv2.remap(lead, map_u, map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+
+
+def _signed(mask: BoolArray, level: np.ndarray) -> np.ndarray:
+    """A level (h, w) that is positive in the mask only: holes filled, other blobs in the same box emptied."""
+    return np.asarray(np.where(mask, np.maximum(level, 1e-3), np.minimum(level, -1e-3)))
