@@ -114,7 +114,7 @@ def _calibrated(folder: Path) -> None:
 
 
 def _result(folder: Path, made: str) -> None:
-    with result_folder(folder, made=made) as partial:
+    with result_folder(folder, maker=made) as partial:
         write_geojson(make_map(), partial / "map.geojson")
         _calibrated(partial)
 

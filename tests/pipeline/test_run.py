@@ -206,7 +206,7 @@ def test_a_base_in_the_place_of_the_result_is_refused_before_any_work(tmp_path, 
     make_drive(tmp_path / "drive")
     base = MapConfig(base=str(tmp_path / "out" / "short"))
     config = run_config(tmp_path / "drive", tmp_path / "out", map=base)
-    with result_folder(tmp_path / "out" / "short", made=made_of(config)) as folder:
+    with result_folder(tmp_path / "out" / "short", maker=made_of(config)) as folder:
         write_geojson(make_map(), folder / "map.geojson")
     monkeypatch.setattr(map_drive, "map_drive", lambda *_, **__: pytest.fail("it worked"))
     with protected_inputs(), pytest.raises(ConfigError, match="is one of the inputs"):

@@ -293,7 +293,7 @@ def test_what_a_kill_has_left_aside_beside_the_new_result_is_given_to_it(tmp_pat
 
 
 def test_what_another_command_has_added_stays_its_own_and_what_is_stale_is_named(tmp_path, caplog):
-    with result_folder(tmp_path / "run", made=MADE) as folder:
+    with result_folder(tmp_path / "run", maker=MADE) as folder:
         (folder / "map").write_text("first")
     with added_to(tmp_path / "run", "RESULT") as folder:
         write_json(folder / "mosaic.json", {})
@@ -301,7 +301,7 @@ def test_what_another_command_has_added_stays_its_own_and_what_is_stale_is_named
     for _ in range(2):
         with listed_files(tmp_path / "run", "--output", export):
             replace_text(tmp_path / "run" / "map.csv", "exported")
-        with result_folder(tmp_path / "run", made=MADE) as folder:
+        with result_folder(tmp_path / "run", maker=MADE) as folder:
             (folder / "map").write_text("second")
     assert names(tmp_path / "run") == ["map", "map.csv"]
     assert "removed with the earlier result: mosaic.json" in caplog.text

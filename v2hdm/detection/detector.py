@@ -87,11 +87,12 @@ class Detector:
         mask = camera.own_vehicle
         if mask is None:
             return output
+        # The pixel in the middle of each element of paint.
         stride = output.stride
-        rows, columns = (
-            np.minimum(stride * np.arange(count) + stride // 2 + first, last - 1)
-            for count, first, last in zip(output.paint.shape, (output.top, 0), mask.shape, strict=True)
-        )
+        rows = output.top + stride * np.arange(output.paint.shape[0]) + stride // 2
+        columns = stride * np.arange(output.paint.shape[1]) + stride // 2
+        rows = np.minimum(rows, mask.shape[0] - 1)
+        columns = np.minimum(columns, mask.shape[1] - 1)
         paint = np.where(mask[np.ix_(rows, columns)], np.float32(_NO_PAINT), output.paint)
         return replace(output, paint=paint)
 

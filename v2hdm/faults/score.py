@@ -22,9 +22,7 @@ class ScoreTest:
 
     fault_name: str  # by its name alone a fault is cached and comes from another process
     camera: int  # index in the problem; -1 for all together
-    # axis, 0 to 2, of the vehicle (survey, lever, knock), map (slope, datum; step: east, north, north-east,
-    # north-west) or image (principal); side (crown: both, left, right); or shape of a drift
-    axis: int
+    axis: int  # which of the fault's axes, sides or shapes, as its record says; 0 if it has one
     item: int  # of what the fault's own ``item`` names; -1: of none, or of all
     value: float = 0.0  # true minus stated
     sigma: float = float("inf")  # from the segments' disagreement; inf if unobservable

@@ -208,7 +208,8 @@ CLOCK = Fault(
     corrected_by="images got poses at the corrected times",
 )  # fmt: skip
 
-# Images were taken increasingly later: the value is the total from first to last image.
+# Images were taken increasingly later: the value is the total from first to last image. Axis 0 is linear, the
+# others are waves.
 CLOCK_DRIFT = Fault(
     "clock drift", "s", least=0.01, observable_sigma=0.02, usual=0.05, most=5.0,
     check="clock drift",
@@ -235,7 +236,7 @@ DISTORTION = Fault(
     like_ground=True,
 )  # fmt: skip
 
-# Position of the principal point in the image.
+# Position of the principal point in the image; the axes are right and down.
 PRINCIPAL = Fault(
     "principal", "px", least=5.0, observable_sigma=10.0, usual=20.0, most=500.0,
     check="principal point",
@@ -244,7 +245,7 @@ PRINCIPAL = Fault(
     like_ground=True,
 )  # fmt: skip
 
-# Slope of the ground that the poses do not know.
+# Slope of the ground that the poses do not know; the axes are east and north.
 SLOPE = Fault(
     "slope", "rad", least=0.002, observable_sigma=0.003, usual=0.01, most=0.3,
     check="slope",
@@ -252,7 +253,7 @@ SLOPE = Fault(
     sentence=_slope,
 )  # fmt: skip
 
-# Fall of the ground to both sides of the route.
+# Fall of the ground to both sides of the route (axis 0), to the left or to the right.
 CROWN = Fault(
     "crown", "", least=0.005, observable_sigma=0.005, usual=0.02, most=0.15,
     check="crown",
@@ -270,7 +271,7 @@ COURSE = Fault(
     like_clock=True,
 )  # fmt: skip
 
-# Offset of recorded positions from some time on.
+# Offset of recorded positions from some time on; the axes are east, north, north-east and north-west.
 STEP = Fault(
     "step", "m", least=0.03, observable_sigma=0.02, usual=0.1, most=100.0,
     check="position step",
@@ -279,7 +280,7 @@ STEP = Fault(
     item=Item.FRAME,
 )  # fmt: skip
 
-# Rotation of a camera from some time on; of all cameras by load.
+# Rotation of a camera about an axis of the vehicle from some time on; of all cameras by load.
 KNOCK = Fault(
     "knock", "rad", least=0.002, observable_sigma=0.002, usual=0.01, most=1.0,
     check="mounting",
@@ -290,7 +291,7 @@ KNOCK = Fault(
 
 _CENTRE_RECOVERABLE_M = 0.1  # sigma of a centre above which a drive needs its survey: it shifts the map
 
-# Error of one camera's surveyed centre.
+# Error of one camera's surveyed centre along an axis of the vehicle.
 SURVEY = Fault(
     "survey", "m", least=0.03, observable_sigma=0.15, usual=0.1, most=20.0,
     check="survey",
@@ -301,7 +302,7 @@ SURVEY = Fault(
     needs_centres=True,
 )  # fmt: skip
 
-# Error of all surveyed centres, or of the point that the poses refer to.
+# Error of all surveyed centres, or of the point that the poses refer to, along an axis of the vehicle.
 LEVER = Fault(
     "lever", "m", least=0.03, observable_sigma=0.15, usual=0.5, most=20.0,
     check="survey",
@@ -343,7 +344,7 @@ CONTROL = Fault(
     recovery=Recovery.DROP_POINT,
 )  # fmt: skip
 
-# Error of all surveyed points.
+# Error of all surveyed points; the axes are east and north.
 DATUM = Fault(
     "datum", "m", least=0.02, observable_sigma=0.05, usual=0.1, most=1e3,
     check="surveyed points",

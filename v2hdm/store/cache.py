@@ -5,7 +5,8 @@ checksum whenever it is read: a damaged one counts as absent. Its time of change
 Several processes, on several machines, may share a cache. Its bytes hold no name of a class or function: the
 type that the reader asks for decides what they become, so that nothing in a file can choose code to run.
 
-Of what is ours in a cache folder, and not in use, that which was unused for longest goes first.
+Where a cache must shrink, only our own files are removed, and none that is in use: the least recently used
+of them go first.
 """
 
 from __future__ import annotations
@@ -42,13 +43,14 @@ LIBRARIES = (
 )  # fmt: skip
 """Libraries that the figures of a run depend on."""
 
-_HEAD = b"v2hdm entry 1\n"
-_START = len(_HEAD) + hashlib.sha256().digest_size
-_PACKAGE = Path(__file__).parents[1]
+_HEAD = b"v2hdm entry 1\n"  # an entry's first bytes: what it is, and the version of its layout
+_START = len(_HEAD) + hashlib.sha256().digest_size  # bytes before an entry's content: head and digest
+
+_PACKAGE = Path(__file__).parents[1]  # the folder of this package
 _CODE = {".py", ".yaml", ".json", ".onnx", ".html", ".js", ".css"}
 """Files of the package that decide what comes out: sources, catalogue, weights, templates."""
 
-_NUMBERS = "biufc"  # kinds of numpy's element types that are numbers; objects are none
+_NUMBERS = "biufc"  # numpy's kinds of element types that are numbers: bool, int, uint, float, complex
 
 
 class CodecError(ValueError):
@@ -118,11 +120,11 @@ def code_key() -> str:
 
 def library_versions() -> dict[str, str]:
     """Versions by name of Python, of the libraries that are installed, and the system."""
-    found = {"Python": platform.python_version()}
+    versions = {"Python": platform.python_version()}
     for package in LIBRARIES:
         with suppress(PackageNotFoundError):
-            found[package] = version(package)
-    return found | {"system": f"{platform.system()} {platform.machine()}"}
+            versions[package] = version(package)
+    return versions | {"system": f"{platform.system()} {platform.machine()}"}
 
 
 class StageCache:
@@ -139,7 +141,7 @@ class StageCache:
         """Stages whose entries were there."""
 
     def in_use(self) -> AbstractContextManager[None]:
-        """Protect from pruning what is read or written within."""
+        """Protect from pruning what is read or written within this block."""
         return nullcontext() if self.folder is None else in_use(self.folder)
 
     def key(self, *parts: object) -> str:
@@ -151,9 +153,9 @@ class StageCache:
         return (self.folder or Path()) / STAGES / stage / f"{key}{ENDING}"
 
     def get_or_make(self, stage: str, key: str, kind: type[_Value], make: Callable[[], _Value]) -> _Value:
-        """The result of a stage, of type ``kind``: its entry, or else what ``make`` makes."""
-        if (found := self.get(stage, key, kind)) is not None:
-            return found
+        """The result of a stage, of type ``kind``: its entry, or what ``make`` returns if there is none."""
+        if (cached := self.get(stage, key, kind)) is not None:
+            return cached
         with recorded() as lines:
             value = make()
         return self.put(stage, key, kind, value, lines)
@@ -165,8 +167,8 @@ class StageCache:
             return None
         try:
             content = checked(path.read_bytes())
-            lines, kept = decode(content or b"", tuple[list[Line], bytes])
-            value = decode(kept, kind)
+            lines, encoded = decode(content or b"", tuple[list[Line], bytes])
+            value = decode(encoded, kind)
         except FileNotFoundError:
             return None
         except OSError as failure:
@@ -225,14 +227,14 @@ class _Recorder(logging.Handler):
 
 
 def log_again(lines: Sequence[Line]) -> None:
-    """Log what was :func:`recorded`."""
+    """Log again the lines that were :func:`recorded`."""
     for name, level, message in lines:
         logging.getLogger(name).log(level, "%s", message)
 
 
 @contextmanager
 def recorded() -> Iterator[list[Line]]:
-    """Record what this library logs within."""
+    """Record what this library logs within this block."""
     recorder = _Recorder()
     logger = logging.getLogger("v2hdm")
     logger.addHandler(recorder)
@@ -245,24 +247,24 @@ def recorded() -> Iterator[list[Line]]:
 _ENTRY = re.compile(rf"[0-9a-f]{{64}}{re.escape(ENDING)}")
 _PARTIAL = re.compile(r"\.[\w.-]+[.-][0-9a-f]{8,16}\.part")
 
-DRIVES = "drives and imports"  # kind of the folders, beside the stages of the entries
-LEFT = "left by killed runs"  # kind of what was never finished
+DRIVES = "drives and imports"  # kind of an item that is a folder; that of an entry is its stage
+LEFT = "left by killed runs"  # kind of a file or folder that was never finished
 
 
 @dataclass(frozen=True)
 class Item:
-    """One thing that a cache keeps: its kind, size in bytes, last use (s since 1970), and its end."""
+    """One file or folder that a cache keeps."""
 
-    kind: str
+    kind: str  # its stage, :data:`DRIVES` or :data:`LEFT`
     path: Path
-    size: int
-    used_s: float
+    size: int  # bytes
+    used_s: float  # last use, s since 1970
     remove: Callable[[], None]
 
 
 def items_of(cache: Path) -> list[Item]:
-    """Everything that is ours in a cache, what was not used for longest first."""
-    found = []
+    """Everything that is ours in a cache, the least recently used first."""
+    items = []
     for path in (cache / STAGES).glob("*/*"):
         kind = path.parent.name if _ENTRY.fullmatch(path.name) else LEFT
         if (kind == LEFT and not _PARTIAL.fullmatch(path.name)) or not path.is_file():
@@ -270,24 +272,24 @@ def items_of(cache: Path) -> list[Item]:
         with suppress(OSError):  # another process has removed it
             about = path.stat()
             remove = partial(path.unlink, missing_ok=True)
-            found.append(Item(kind, path, about.st_size, about.st_mtime, remove))
+            items.append(Item(kind, path, about.st_size, about.st_mtime, remove))
     for folder in cache.glob(".*.part"):
         with suppress(OSError):
             if _PARTIAL.fullmatch(folder.name) and folder.is_dir() and is_stale(folder):
-                left = sum(one.stat().st_size for one in folder.rglob("*"))
-                found.append(Item(LEFT, folder, left, folder.stat().st_mtime, partial(shutil.rmtree, folder)))
+                left = sum(file.stat().st_size for file in folder.rglob("*"))
+                items.append(Item(LEFT, folder, left, folder.stat().st_mtime, partial(shutil.rmtree, folder)))
     for listing in cache.glob(f"*/{LIST}"):
         folder = listing.parent
         size = size_of(listing.parent)
         with suppress(OSError):
             if size is not None:
                 used_s = listing.stat().st_mtime
-                found.append(Item(DRIVES, folder, size, used_s, partial(remove_ours, folder)))
-    return sorted(found, key=lambda item: (item.used_s, item.path))
+                items.append(Item(DRIVES, folder, size, used_s, partial(remove_ours, folder)))
+    return sorted(items, key=lambda item: (item.used_s, item.path))
 
 
 def prune(cache: Path, limit: float) -> list[Item]:
-    """Remove what was unused longest until ``limit`` bytes are left, and killed runs' rests; returns it."""
+    """Remove the least recently used items down to ``limit`` bytes, and what killed runs left."""
     before_s = unused_before(cache)
     items = items_of(cache)
     removed = []

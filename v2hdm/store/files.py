@@ -32,7 +32,7 @@ from v2hdm.safe.texts import read_text as read_text
 from v2hdm.store.inputs import refuse_input
 
 _URL = re.compile(r"[a-z][a-z0-9+.-]+:/")
-_LARGEST = sys.float_info.max
+_LARGEST = sys.float_info.max  # a number beyond it is infinite as a float
 
 Observer = Callable[[Path, Path], None]
 _observer: ContextVar[Observer | None] = ContextVar("sees each file before it is there", default=None)
@@ -172,8 +172,8 @@ def check_keys(
     valid = [*required, *optional]
     for key in content:
         if key not in valid:
-            near = difflib.get_close_matches(str(key), valid, n=1, cutoff=0.5)
-            advice = f"did you mean '{near[0]}'?" if near else f"valid keys: {', '.join(valid)}"
+            matches = difflib.get_close_matches(str(key), valid, n=1, cutoff=0.5)
+            advice = f"did you mean '{matches[0]}'?" if matches else f"valid keys: {', '.join(valid)}"
             raise error(f"{where}: unknown key {shown(key)}; {advice}")
     missing = [key for key in required if key not in content]
     if missing:
@@ -182,17 +182,19 @@ def check_keys(
 
 def take_array(content: object, shape: tuple[int, ...], where: str, error: type[V2hdmError]) -> FloatArray:
     """``content`` as a finite float64 array of ``shape``, in which -1 is any length, else an ``error``."""
-    wanted = " x ".join("N" if length < 0 else str(length) for length in shape)
+    expected = " x ".join("N" if length < 0 else str(length) for length in shape)
     try:
         raw = np.array(content)
         if raw.dtype.kind not in "iuf" and raw.size:  # NumPy would make numbers of texts
             raise TypeError
         array = raw.astype(np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise error(f"{where}: expected {wanted} numbers, got {shown(content)}") from None
-    if array.ndim != len(shape) or any(w not in (-1, n) for w, n in zip(shape, array.shape, strict=True)):
+        raise error(f"{where}: expected {expected} numbers, got {shown(content)}") from None
+    if array.ndim != len(shape) or any(
+        length not in (-1, actual) for length, actual in zip(shape, array.shape, strict=True)
+    ):
         got = " x ".join(map(str, array.shape)) or "a single number"
-        raise error(f"{where}: expected {wanted} numbers, got {got}")
+        raise error(f"{where}: expected {expected} numbers, got {got}")
     if not np.isfinite(array).all():
         raise error(f"{where}: holds a number that is not finite; replace it")
     return array

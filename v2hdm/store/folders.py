@@ -33,11 +33,11 @@ from v2hdm.safe.texts import read_json
 from v2hdm.store.files import file_digest
 from v2hdm.store.inputs import note_input
 
-STAGES = "stages"  # folder within a cache of what runs keep, and of the locks of those in progress
-IN_USE = f"{STAGES}/in_use"
+STAGES = "stages"  # folder within a cache of the entries of stages
+IN_USE = f"{STAGES}/in_use"  # folder within a cache of the locks of runs in progress
 HOST = platform.node() or "this host"
-_ENDING = ".lock"
-_TRIES = 9
+_ENDING = ".lock"  # of the name of a lock in IN_USE
+_TRIES = 9  # tries to make a lock in a folder that others may remove meanwhile; chosen
 _used: Counter[Path] = Counter()
 
 
@@ -95,14 +95,14 @@ def unused_before(cache: Path) -> float:
     earliest = time.time()
     for path in (cache / IN_USE).glob(f"*{_ENDING}"):
         with suppress(OSError):  # given up meanwhile
-            began_s = path.stat().st_mtime
+            start_s = path.stat().st_mtime
             is_left = False
             with suppress(OSError), path.open(encoding="utf-8") as stream:  # unreadable counts as held
                 is_left = take_lock(stream)
             if is_left:
                 path.unlink(missing_ok=True)
             else:
-                earliest = min(earliest, began_s)
+                earliest = min(earliest, start_s)
     return earliest
 
 
@@ -112,9 +112,13 @@ LIST = ".v2hdm-cache.json"  # name of the list in a folder
 _ABOUT = "files that v2hdm wrote here, which it may remove to make room; touched when they are used"
 
 _VERSION = 3  # raised whenever an import comes out as other files
-_IMAGES = (".png", ".jpg", ".jpeg")
-_WRITER = f"{HOST}-{secrets.token_hex(4)}"
-_STALE_S = 3600.0  # a folder that nothing was written to for so long was left by a process that was killed
+_IMAGES = (".png", ".jpg", ".jpeg")  # endings of files that are listed without a digest
+_WRITER = (
+    f"{HOST}-{secrets.token_hex(4)}"  # this process in names of unfinished files: its host and 8 hex digits
+)
+_STALE_S = (
+    3600.0  # time without a write after which an unfinished folder counts as left by a killed process, s
+)
 
 
 def note_use(folder: Path) -> None:
@@ -146,10 +150,11 @@ def remove_ours(folder: Path) -> None:
 
 def remove_empty(folder: Path) -> None:
     """Remove the folders in a folder that hold nothing, and itself."""
-    below = sorted((one for one in folder.rglob("*") if one.is_dir()), key=lambda one: -len(one.parts))
-    for one in [*below, folder]:
+    folders = [path for path in folder.rglob("*") if path.is_dir()]
+    deepest_first = sorted(folders, key=lambda path: -len(path.parts))
+    for directory in [*deepest_first, folder]:
         with suppress(OSError):
-            one.rmdir()
+            directory.rmdir()
 
 
 def bring_over(old: Path, new: Path, is_ours: Callable[[str], bool]) -> None:
@@ -268,7 +273,7 @@ def _fill(folder: Path, new: Path) -> None:
 def is_stale(folder: Path) -> bool:
     """Whether nothing in an unfinished import was written for long: its process was killed."""
     with suppress(OSError):  # it is being written, or gone
-        return time.time() - max(one.stat().st_mtime for one in [folder, *folder.rglob("*")]) > _STALE_S
+        return time.time() - max(path.stat().st_mtime for path in [folder, *folder.rglob("*")]) > _STALE_S
     return False
 
 

@@ -1,4 +1,4 @@
-"""Files that a command reads: none is written over by it, and a result's file that was changed is reported.
+"""Files that a command reads: it overwrites none of them, and reports a result's file that was changed.
 
 Each reader notes what it reads and each writer asks before it replaces a file. Outside of a command nothing
 is noted: a program that reads a map, changes it and writes it back means to.
@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 LIST = ".v2hdm-results.jsonl"
 """Name of the list of our files in a folder of results: a head, then a line of JSON for each file written."""
 
-_DEEPEST = 3  # folders above a file that may have a list: ours lie at most two folders deep
+_DEEPEST = 3  # folders above a file in which its list may lie: our files lie at most two folders below it
 _noted: ContextVar[set[tuple[int, int]] | None] = ContextVar("inputs of this command", default=None)
 _reported: set[tuple[Path, str]] = set()
 
@@ -64,7 +64,7 @@ def warn_if_changed(path: Path, data: bytes) -> None:
         path = path.resolve()
         digest = hashlib.sha256(data).hexdigest()
         written = set()
-        folder = next((one for one in path.parents[:_DEEPEST] if (one / LIST).is_file()), None)
+        folder = next((parent for parent in path.parents[:_DEEPEST] if (parent / LIST).is_file()), None)
         if folder is None:
             return
         for line in (folder / LIST).read_text(encoding="utf-8", errors="replace").splitlines()[1:]:

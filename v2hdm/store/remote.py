@@ -1,11 +1,12 @@
 """Folders at object stores, by URL: a finished result is uploaded, its list last.
 
-A put replaces an object at once or not at all, and an object can be created once; nothing else is asked of a
-store. Whatever fails there is one line.
+A store must replace an object at once or not at all, and let an object be created only once; we rely on
+nothing else. Whatever fails there becomes an error of one line.
 
 The list, ``.v2hdm-results.jsonl``, names our objects with their hashes and versions. During an upload there
-is ``.v2hdm-unfinished.jsonl`` instead, which names its writer, what was ours and what will be: by the two our
-objects are known from those of others, which are never touched, and a second writer is refused.
+is ``.v2hdm-unfinished.jsonl`` instead, which names its writer, the objects that were ours and those that will
+be. From these lists we tell our objects from those of others, which are never touched. A second writer is
+refused.
 """
 
 from __future__ import annotations
@@ -36,7 +37,9 @@ _PACKAGES = {
 """Protocols of stores that replace an object at once, and the package that speaks each."""
 
 _TOKENS = ("ETag", "etag", "md5Hash", "modified", "created")
-_MESSAGE_LETTERS = 200
+"""Keys of a listing whose value changes with the object, the surest first."""
+
+_MESSAGE_LETTERS = 200  # longest text of a store's error in a line of ours, letters; chosen
 
 UNFINISHED = ".v2hdm-unfinished.jsonl"
 _ABOUT = {"about": "objects that v2hdm wrote here; a rerun replaces these and no others"}
@@ -54,10 +57,10 @@ def place_of(text: str, option: str) -> Path | RemoteFolder:
 
 @dataclass(frozen=True)
 class RemoteFile:
-    """An object as it is listed: bytes, and a token that changes with it."""
+    """An object as a store lists it."""
 
-    size: int
-    token: str
+    size: int  # bytes
+    token: str  # changes with the object; empty where the store names none
 
 
 class RemoteFolder:
@@ -73,11 +76,11 @@ class RemoteFolder:
     @classmethod
     def at(cls, url: str, option: str) -> RemoteFolder:
         """The objects below a URL; ConfigError where it names no store, or its package is missing."""
-        protocol, rest = url.split("://", 1)
+        protocol, path = url.split("://", 1)
         if protocol not in _PACKAGES:
-            known = ", ".join(f"{one}://" for one in _PACKAGES if one != _MEMORY)
-            raise ConfigError(f"{option} {url}: is not in a supported store; choose a folder or {known}")
-        parts = rest.rstrip("/").split("/")
+            schemes = ", ".join(f"{scheme}://" for scheme in _PACKAGES if scheme != _MEMORY)
+            raise ConfigError(f"{option} {url}: is not in a supported store; choose a folder or {schemes}")
+        parts = path.rstrip("/").split("/")
         if ":" in parts[0]:
             raise ConfigError(
                 f"{option} {protocol}://...: is not a bucket name; credentials belong where "
@@ -109,7 +112,7 @@ class RemoteFolder:
         return None
 
     def write(self, name: str, content: bytes | Path) -> None:
-        """Put an object, given as bytes or as a file, in whatever one of that name has been."""
+        """Put an object, given as bytes or as a file, in place of any other of that name."""
         self._put(name, content, "overwrite")
 
     def create(self, name: str, content: bytes | Path) -> bool:
@@ -131,9 +134,9 @@ class RemoteFolder:
         """All objects, by name; raises ConfigError where there is no such bucket."""
         with self._asked(in_bucket=True):
             self._files.invalidate_cache()
-            found = self._files.find(self._root, detail=True)
+            objects = self._files.find(self._root, detail=True)
         listed = {}
-        for path, about in found.items():
+        for path, about in objects.items():
             if path.startswith(f"{self._root}/"):
                 token = next((str(about[key]) for key in _TOKENS if about.get(key) is not None), "")
                 listed[path[len(self._root) + 1 :]] = RemoteFile(int(about["size"]), token.strip('"'))
@@ -146,7 +149,7 @@ class RemoteFolder:
 
     @contextmanager
     def _asked(self, name: str = "", in_bucket: bool = False) -> Iterator[None]:
-        """Make of what fails within one line; an object that is or is not there is raised as it is."""
+        """Turn errors within into one line; that an object exists, or is missing, is raised as it is."""
         try:
             yield
         except FileExistsError:
@@ -182,10 +185,12 @@ class _Entry:
             return cls(name, _digest(content), len(content))
         return cls(name, file_digest(content), content.stat().st_size)
 
-    def is_of(self, there: RemoteFile, place: RemoteFolder) -> bool:
+    def is_of(self, listed: RemoteFile, place: RemoteFolder) -> bool:
         """Whether an object there is this one: by its token, else by its content."""
-        known = self.token and there.token == self.token
-        return there.size == self.size and (known or _digest(place.read(self.file) or b"") == self.sha256)
+        if listed.size != self.size:
+            return False
+        has_its_token = bool(self.token) and listed.token == self.token
+        return has_its_token or _digest(place.read(self.file) or b"") == self.sha256
 
 
 def is_whole_at(place: RemoteFolder) -> bool:
@@ -193,31 +198,32 @@ def is_whole_at(place: RemoteFolder) -> bool:
     listing = place.read(LIST)
     if listing is None:
         return False
-    there = place.listed()
+    objects = place.listed()
     (_, entries) = _entries(place, LIST, listing)
     return bool(entries) and all(
-        one.file in there and (one.size, one.token) == (there[one.file].size, there[one.file].token)
-        for one in entries
+        entry.file in objects and objects[entry.file] == RemoteFile(entry.size, entry.token)
+        for entry in entries
     )
 
 
 def refuse_upload(place: RemoteFolder, writer: str) -> dict[str, _Entry]:
-    """Our objects at a place where ``writer`` may put a result; ConfigError where it may not."""
-    there = place.listed()
-    found = {name: _entries(place, name, place.read(name)) for name in (LIST, UNFINISHED) if name in there}
-    if there and not found:
+    """Our objects at a place, by name; ConfigError where ``writer`` may not put a result there."""
+    objects = place.listed()
+    names = [name for name in (LIST, UNFINISHED) if name in objects]
+    lists = {name: _entries(place, name, place.read(name)) for name in names}
+    if objects and not lists:
         raise ConfigError(f"{place} holds objects that are not results of V2HDM: give another place")
-    holder = found[UNFINISHED][0] if UNFINISHED in found else writer
+    holder = lists[UNFINISHED][0] if UNFINISHED in lists else writer
     if holder not in ("", writer):
         raise ConfigError(
             f"{place} is being written by {holder}, or was when it stopped; wait for it, start it "
             f"there again, or, where it is dead, remove {UNFINISHED}"
         )
-    entries = [one for _, listed in found.values() for one in listed]
+    entries = [entry for _, listed in lists.values() for entry in listed]
     ours: dict[str, _Entry] = {}
-    for name in {one.file for one in entries} & set(there):
-        known = (one for one in entries if one.file == name)
-        mine = next((one for one in known if one.is_of(there[name], place)), None)
+    for name in {entry.file for entry in entries} & set(objects):
+        entries_of_name = (entry for entry in entries if entry.file == name)
+        mine = next((entry for entry in entries_of_name if entry.is_of(objects[name], place)), None)
         if mine is None:
             raise ConfigError(f"{place}/{name}: was changed after we wrote it: move it or give another place")
         ours[name] = mine
@@ -235,10 +241,10 @@ def upload(place: RemoteFolder, contents: Mapping[str, bytes | Path], writer: st
     ours = refuse_upload(place, writer)
     for name in sorted(set(new) & set(place.listed()) - set(ours)):
         raise _foreign(place, name)
-    begun = _listing([*ours.values(), *new.values()], writer)
-    if not place.create(UNFINISHED, begun):
+    unfinished = _listing([*ours.values(), *new.values()], writer)
+    if not place.create(UNFINISHED, unfinished):
         refuse_upload(place, writer)  # where another has begun just now
-        place.write(UNFINISHED, begun)
+        place.write(UNFINISHED, unfinished)
     if place.read(LIST) != listing:
         place.remove(UNFINISHED)
         raise ConfigError(f"{place}: another process has just put a result there; start again")
@@ -248,13 +254,13 @@ def upload(place: RemoteFolder, contents: Mapping[str, bytes | Path], writer: st
         report(number, len(contents))
         if not place.create(name, content):
             raise _foreign(place, name)
-    there = place.listed()
-    put = []
-    for name, one in new.items():
-        if name not in there or there[name].size != one.size:
+    objects = place.listed()
+    uploaded = []
+    for name, entry in new.items():
+        if name not in objects or objects[name].size != entry.size:
             raise ConfigError(f"{place}/{name}: differs from what was uploaded; start again")
-        put.append(replace(one, token=there[name].token))
-    place.write(LIST, _listing(put))
+        uploaded.append(replace(entry, token=objects[name].token))
+    place.write(LIST, _listing(uploaded))
     place.remove(UNFINISHED)
     report(len(contents), len(contents))
 
@@ -270,7 +276,8 @@ def _entries(place: RemoteFolder, name: str, listing: bytes | None) -> tuple[str
     try:
         head, *lines = [json.loads(line) for line in (listing or b"{}").decode().splitlines()]
         return str(head.get("writer", "")), [
-            _Entry(str(one["file"]), str(one["sha256"]), int(one["size"]), str(one["token"])) for one in lines
+            _Entry(str(line["file"]), str(line["sha256"]), int(line["size"]), str(line["token"]))
+            for line in lines
         ]
     except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
         raise ConfigError(f"{place}/{name}: is damaged; give another place") from None
@@ -278,7 +285,7 @@ def _entries(place: RemoteFolder, name: str, listing: bytes | None) -> tuple[str
 
 def _listing(entries: Iterable[_Entry], writer: str = "") -> bytes:
     head = _ABOUT | ({"writer": writer} if writer else {})
-    return "".join(json.dumps(one) + "\n" for one in [head, *map(asdict, entries)]).encode()
+    return "".join(json.dumps(line) + "\n" for line in [head, *map(asdict, entries)]).encode()
 
 
 def _foreign(place: RemoteFolder, name: str) -> ConfigError:

@@ -1,9 +1,9 @@
 """Folders of results: each belongs to one process at a time, and only what is ours is ever replaced.
 
 A folder that we wrote holds a list of our files, ``.v2hdm-results.jsonl``, with their hashes and what made
-them, such as ``v2hdm map of /data/monday``. Only the same replaces them. Files that are not on the list are
-the user's and stay through a rerun; where a file on it was changed, the rerun is refused.
-A lock beside the folder is held by the process that writes and released by its end, whatever ends it.
+them, such as ``v2hdm map of /data/monday``. Only a rerun of the same replaces them. Files that are not
+on the list are the user's and stay through a rerun; where a file on it was changed, the rerun is refused.
+The process that writes holds a lock beside the folder, which its end releases, whatever ends it.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG)  # the
 
 
 class _Target:
-    """A folder of results, and the option that errors name it by."""
+    """A folder of results, and the option of the command that names it in errors."""
 
     def __init__(self, shown: Path, option: str) -> None:
-        """Where ``shown`` leads; what is no folder is refused before any work."""
+        """Resolve ``shown``; refuse what is no folder before any work."""
         refuse_url(shown)
         self.shown = shown
         self.option = option
@@ -46,12 +46,12 @@ class _Target:
             raise ConfigError(f"output folder {shown} is a file; give another {option}")
 
     def hidden(self, kind: str) -> Path:
-        """A name beside it."""
+        """A hidden path beside the folder."""
         return self.path.with_name(f".{self.path.name}.{kind}")
 
     @contextmanager
     def explained(self, only: tuple[int, ...] = ()) -> Iterator[None]:
-        """Make of an OSError, perhaps only of some kinds, the output folder's in one line."""
+        """Turn an OSError, of the numbers ``only`` if given, into one line on the output folder."""
         try:
             yield
         except OSError as failure:
@@ -62,8 +62,8 @@ class _Target:
                 f"free space or give another {self.option}"
             ) from None
 
-    def listed(self, made: str | None = None) -> dict[str, list[str]] | None:
-        """Digests of our files by name, of those ``made`` so if given; None if empty, else ConfigError."""
+    def listed(self, maker: str | None = None) -> dict[str, list[str]] | None:
+        """Digests of our files by name, of one ``maker`` if given; None if empty, else ConfigError."""
         if not self.path.exists() or not any(self.path.iterdir()):
             return None
         if not (self.path / LIST).is_file():
@@ -71,22 +71,22 @@ class _Target:
                 f"output folder {self.shown} holds files that V2HDM did not write: give another {self.option}"
             )
         head = self.read_list()[0]
-        if made not in (None, head):
-            maker = head or "an earlier version"
+        if maker not in (None, head):
+            creator = head or "an earlier version"
             raise ConfigError(
-                f"output folder {self.shown} holds a result of {maker}, not of {made}: move it, or give "
+                f"output folder {self.shown} holds a result of {creator}, not of {maker}: move it, or give "
                 f"another {self.option}"
             )
-        return self.digests(made)
+        return self.digests(maker)
 
-    def digests(self, made: str | None) -> dict[str, list[str]]:
-        """The entries of its list by name, only those that were ``made`` so where that is given."""
+    def digests(self, maker: str | None) -> dict[str, list[str]]:
+        """Digests on the folder's list by file name, only of those of one ``maker`` where it is given."""
         head, entries = self.read_list()
-        found: dict[str, list[str]] = {}
-        for one in entries:
-            if made in (None, one.get("made", head)):
-                found.setdefault(one["file"], []).append(one["sha256"])
-        return found
+        digests_of_name: dict[str, list[str]] = {}
+        for entry in entries:
+            if maker in (None, entry.get("made", head)):
+                digests_of_name.setdefault(entry["file"], []).append(entry["sha256"])
+        return digests_of_name
 
     def read_list(self) -> tuple[str, list[dict[str, str]]]:
         """Read the folder's maker and the entries of its list; nothing where there is no list."""
@@ -94,14 +94,14 @@ class _Target:
             return "", []
         try:
             head, *lines = map(json.loads, (self.path / LIST).read_text(encoding="utf-8").splitlines())
-            entries = [{key: str(one[key]) for key in one.keys() | {"file", "sha256"}} for one in lines]
+            entries = [{key: str(line[key]) for key in line.keys() | {"file", "sha256"}} for line in lines]
             return str(head.get("made", "")), entries
         except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
             raise ConfigError(f"{self.shown / LIST}: is damaged; give another {self.option}") from None
 
     @contextmanager
     def parents(self) -> Iterator[None]:
-        """Make the folders that it is to lie in; those that end up empty go again."""
+        """Make the folders above the result's; those that end up empty are removed again."""
         missing = [parent for parent in self.path.parents if not parent.exists()]
         with self.explained():
             self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -114,7 +114,7 @@ class _Target:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Hold its lock, a file beside it, until the block or the process ends."""
+        """Hold the folder's lock, a file beside it, until the block or the process ends."""
         path = self.hidden("lock")
         with self.explained():
             while True:
@@ -144,7 +144,7 @@ class _Target:
                 stream.close()
 
     def recover(self, unfinished: Path, previous: Path) -> None:
-        """Tidy up after a process that was killed: its work is dropped, an earlier result put back."""
+        """Tidy up after a killed process: drop its unfinished work and put an earlier result back."""
         for left in (unfinished, previous):
             if left.exists() and not (left / LIST).is_file() and any(left.iterdir()):
                 raise ConfigError(f"{left}: was not written by V2HDM; move it, or give another {self.option}")
@@ -158,14 +158,14 @@ class _Target:
 
 def _is_ours(folder: Path, ours: Mapping[str, Sequence[str]], name: str) -> bool:
     path = folder / name
-    known = name in ours and path.is_file() and not path.is_symlink()
-    return name == LIST or (known and file_digest(path) in ours[name])
+    is_listed_file = name in ours and path.is_file() and not path.is_symlink()
+    return name == LIST or (is_listed_file and file_digest(path) in ours[name])
 
 
 def _remove_previous(previous: Path, new: Path, ours: Mapping[str, Sequence[str]]) -> None:
-    """Remove a result that another has replaced; what was put there until now is given to that as well."""
+    """Remove a result that a ``new`` one has replaced; the user's files in it are given to the new one."""
     bring_over(previous, new, partial(_is_ours, previous, ours))
-    for path in [one for one in previous.rglob("*") if one.is_symlink() or not one.is_dir()]:
+    for path in [below for below in previous.rglob("*") if below.is_symlink() or not below.is_dir()]:
         name = path.relative_to(previous).as_posix()
         if name == LIST or name in ours or os.path.lexists(new / name):
             path.unlink()
@@ -173,21 +173,21 @@ def _remove_previous(previous: Path, new: Path, ours: Mapping[str, Sequence[str]
 
 
 @contextmanager
-def result_folder(folder: Path, option: str = "output=", made: str = "") -> Iterator[Path]:
+def result_folder(folder: Path, option: str = "output=", maker: str = "") -> Iterator[Path]:
     """A hidden folder beside ``folder`` to write into, which takes its place when the block succeeds.
 
-    ``made`` says what makes the result, of what. An earlier one of the same stays untouched until then; after
-    an error nothing new is left. What the user, or another command, has put into it is kept. Raises
-    ConfigError, which names the ``option`` of the folder, where it cannot be written, holds anything else or
-    an input, or another process is writing it.
+    ``maker`` says what makes the result, of what. An earlier result of the same maker stays untouched until
+    then; after an error nothing new is left. What the user, or another command, has put into it is kept.
+    Raises ConfigError, which names the ``option`` of the folder, where it cannot be written, holds anything
+    else or an input, or another process is writing it.
     """
-    with _locked(folder, option) as there:
-        target = there.path
-        unfinished = there.hidden("part")
-        previous = there.hidden("previous")
-        with there.explained():
-            there.recover(unfinished, previous)
-            listed = there.listed(made)
+    with _locked(folder, option) as output:
+        target = output.path
+        unfinished = output.hidden("part")
+        previous = output.hidden("previous")
+        with output.explained():
+            output.recover(unfinished, previous)
+            listed = output.listed(maker)
             for name, digests in (listed or {}).items():
                 refuse_input(target / name)
                 if (target / name).is_file() and file_digest(target / name) not in digests:
@@ -195,23 +195,23 @@ def result_folder(folder: Path, option: str = "output=", made: str = "") -> Iter
                         f"{folder / name}: was changed after we wrote it: move it, or give another {option}"
                     )
         try:
-            with there.explained():
+            with output.explained():
                 unfinished.mkdir()
-                _write_list(unfinished, made)
-            with there.explained(_FULL):
+                _write_list(unfinished, maker)
+            with output.explained(_FULL):
                 yield unfinished
-            with there.explained():
+            with output.explained():
                 files = sorted(path for path in unfinished.rglob("*") if path.is_file() and path.name != LIST)
-                _write_list(unfinished, made, files)
+                _write_list(unfinished, maker, files)
                 if listed is not None:
                     for name in listed:
                         refuse_input(target / name)
                     _report_dropped(folder, listed, unfinished)
                     bring_over(target, unfinished, partial(_is_ours, target, listed))
-                    others = [one for one in there.read_list()[1] if one.get("made", made) != made]
-                    for one in others:
-                        if (unfinished / one["file"]).is_file():
-                            _append(unfinished / LIST, json.dumps(one) + "\n")
+                    others = [entry for entry in output.read_list()[1] if entry.get("made", maker) != maker]
+                    for entry in others:
+                        if (unfinished / entry["file"]).is_file():
+                            _append(unfinished / LIST, json.dumps(entry) + "\n")
                     target.replace(previous)
                 elif target.exists():
                     target.rmdir()
@@ -226,7 +226,7 @@ def result_folder(folder: Path, option: str = "output=", made: str = "") -> Iter
 
 
 def _report_dropped(folder: Path, listed: Mapping[str, object], new: Path) -> None:
-    """Log what was added to the earlier result, such as its mosaic, and is not true of the new one."""
+    """Warn of files of the earlier result, such as its mosaic, that the new one does not have."""
     if dropped := [name for name in listed if (folder / name).is_file() and not (new / name).exists()]:
         _log.warning("%s: removed with the earlier result: %s", folder, ", ".join(sorted(dropped)))
 
@@ -234,39 +234,40 @@ def _report_dropped(folder: Path, listed: Mapping[str, object], new: Path) -> No
 @contextmanager
 def added_to(folder: Path, option: str) -> Iterator[Path]:
     """A finished result to write further files into, each listed before it is there; else ConfigError."""
-    with _locked(folder, option) as there:
-        with there.explained():
-            if there.listed() is None:
+    with _locked(folder, option) as output:
+        with output.explained():
+            if output.listed() is None:
                 raise ConfigError(f"{folder}: is not a result of V2HDM; give another {option}")
-            made = there.read_list()[0]
-        with listed_files(folder, option, made):
-            yield there.path
+            maker = output.read_list()[0]
+        with listed_files(folder, option, maker):
+            yield output.path
 
 
 @contextmanager
-def listed_files(folder: Path, option: str, made: str) -> Iterator[Callable[[Path], object]]:
+def listed_files(folder: Path, option: str, maker: str) -> Iterator[Callable[[Path], object]]:
     """Within, each file that is written whole into a folder is put on its list before it is there.
 
     Listed first, a file is ours whenever the work is cut off; its content before stays ours as well. Yields a
-    check of one file, for work that writes several or none. It and the writing raise ConfigError where what
-    is to be replaced was not ``made`` by the same, or the folder cannot be written.
+    check of one file, for work that writes several or none. It and the writing raise ConfigError where a file
+    to be replaced is not of the same ``maker``, or the folder cannot be written.
     """
-    there = _Target(folder, option)
-    ours = there.digests(made)
-    others = {} if there.read_list()[0] == made else {"made": made}
+    output = _Target(folder, option)
+    ours = output.digests(maker)
+    others = {} if output.read_list()[0] == maker else {"made": maker}
 
     def name_of(path: Path) -> str | None:
         """The file's name in the folder, None outside of it; refuses what must not be replaced."""
-        named = (Path(os.path.abspath(one)) for one in (folder, there.path))  # noqa: PTH100  # links stay
-        if not any(Path(os.path.abspath(path)).is_relative_to(one) for one in named):  # noqa: PTH100
+        absolute = Path(os.path.abspath(path))  # noqa: PTH100  # links stay
+        roots = (Path(os.path.abspath(root)) for root in (folder, output.path))  # noqa: PTH100
+        if not any(absolute.is_relative_to(root) for root in roots):
             return None
         place = path.parent.resolve() / path.name
-        if path.is_symlink() or not place.is_relative_to(there.path):
+        if path.is_symlink() or not place.is_relative_to(output.path):
             raise ConfigError(f"{path}: a link is not replaced; move it, or give another {option}")
-        name = place.relative_to(there.path).as_posix()
+        name = place.relative_to(output.path).as_posix()
         if path.exists() and file_digest(path) not in ours.get(name, ()):
-            maker = f"not an unchanged result of {made}" if made else "not a file of V2HDM"
-            raise ConfigError(f"{folder / name}: is {maker}; move it, or give another {option}")
+            owner = f"not an unchanged result of {maker}" if maker else "not a file of V2HDM"
+            raise ConfigError(f"{folder / name}: is {owner}; move it, or give another {option}")
         return name
 
     def list_file(new: Path, path: Path) -> None:
@@ -274,33 +275,33 @@ def listed_files(folder: Path, option: str, made: str) -> Iterator[Callable[[Pat
         if name is None:
             return
         digest = file_digest(new)
-        if not (there.path / LIST).exists():
-            _write_list(there.path, made)
+        if not (output.path / LIST).exists():
+            _write_list(output.path, maker)
         entry = {"file": name, "sha256": digest, **others}
-        _append(there.path / LIST, json.dumps(entry) + "\n")
+        _append(output.path / LIST, json.dumps(entry) + "\n")
         ours.setdefault(name, []).append(digest)
 
-    with there.explained(_FULL), observed_writes(list_file):
+    with output.explained(_FULL), observed_writes(list_file):
         yield name_of
 
 
 @contextmanager
-def growing_folder(folder: Path, option: str, made: str = "") -> Iterator[WriteFile]:
+def growing_folder(folder: Path, option: str, maker: str = "") -> Iterator[WriteFile]:
     """Yield what writes a named file into ``folder``, listed first; errors as :func:`listed_files`."""
-    with _locked(folder, option) as there:
-        target = there.path
+    with _locked(folder, option) as output:
+        target = output.path
 
         def write(name: str, data: bytes) -> None:
-            with there.explained(), whole_file(target / name) as partial:
+            with output.explained(), whole_file(target / name) as partial:
                 partial.write_bytes(data)
 
-        with there.explained():
-            is_new = there.listed() is None
+        with output.explained():
+            is_new = output.listed() is None
             target.mkdir(exist_ok=True)
             if is_new:
-                _write_list(target, made)
+                _write_list(target, maker)
         try:
-            with listed_files(folder, option, made):
+            with listed_files(folder, option, maker):
                 yield write
         finally:
             if is_new and not any((target / name).is_file() for name in files_of_result(target)):
@@ -311,18 +312,18 @@ def growing_folder(folder: Path, option: str, made: str = "") -> Iterator[WriteF
 
 @contextmanager
 def _locked(folder: Path, option: str) -> Iterator[_Target]:
-    there = _Target(folder, option)
-    if there.path.is_mount():
+    output = _Target(folder, option)
+    if output.path.is_mount():
         raise ConfigError(f"output folder {folder} is a mount point; give a folder within it")
-    with there.parents(), there.locked():
-        yield there
+    with output.parents(), output.locked():
+        yield output
 
 
 @contextmanager
 def locked_folder(folder: Path, option: str = "output=") -> Iterator[Path]:
     """Where ``folder`` leads, which no other process of ours writes within this block; else ConfigError."""
-    with _locked(folder, option) as there:
-        yield there.path
+    with _locked(folder, option) as output:
+        yield output.path
 
 
 def files_of_result(folder: Path) -> dict[str, str]:
@@ -345,9 +346,9 @@ def drop_result(folder: Path) -> None:
         remove_empty(folder)
 
 
-def _write_list(folder: Path, made: str, files: Sequence[Path] = ()) -> None:
+def _write_list(folder: Path, maker: str, files: Sequence[Path] = ()) -> None:
     entries = [{"file": path.relative_to(folder).as_posix(), "sha256": file_digest(path)} for path in files]
-    text = "".join(json.dumps(entry) + "\n" for entry in [_HEAD | {"made": made}, *entries])
+    text = "".join(json.dumps(entry) + "\n" for entry in [_HEAD | {"made": maker}, *entries])
     (folder / LIST).write_text(text, encoding="utf-8")
 
 

@@ -206,8 +206,11 @@ def _along_the_view(image: LaneImage) -> list[LaneDetection]:
     if not image.paint:
         return []
     ends_px = image.camera.undistort(np.concatenate([lane.points_px[[0, -1]] for lane in image.paint]))
-    length_m = np.linalg.norm(np.diff(image.camera.ground(ends_px).reshape(-1, 2, 2), axis=1)[:, 0], axis=1)
-    along, below = (np.abs(np.diff(at.reshape(-1, 2)))[:, 0] for at in image.horizon.coordinates(ends_px))
+    ends_vehicle = image.camera.ground(ends_px).reshape(-1, 2, 2)
+    length_m = np.linalg.norm(ends_vehicle[:, 1] - ends_vehicle[:, 0], axis=1)
+    along, below = (
+        np.abs(np.diff(coordinate.reshape(-1, 2)))[:, 0] for coordinate in image.horizon.coordinates(ends_px)
+    )
     # False where the length is nan.
     usable = (length_m >= _LEAST_PAINT_LENGTH_M) & (along <= _MAX_PAINT_SLOPE * below)
     return [lane for lane, use in zip(image.paint, usable, strict=True) if use]
@@ -220,8 +223,10 @@ def _identified(lanes: list[LaneDetection], camera: RoadCamera) -> list[LaneDete
     ground = _at_once(camera.unproject, [lane.points_px for lane in lanes])
     beside_m = np.array([_lateral_m(part, camera) for part in ground])
     order = np.argsort(beside_m).tolist()
-    identity = {k: n for n, k in enumerate((k for k in order if beside_m[k] >= 0), start=1)}
-    identity |= {k: -n for n, k in enumerate((k for k in order[::-1] if beside_m[k] < 0), start=1)}
+    to_the_left = [k for k in order if beside_m[k] >= 0]
+    to_the_right = [k for k in reversed(order) if beside_m[k] < 0]
+    identity = {k: n for n, k in enumerate(to_the_left, start=1)}
+    identity |= {k: -n for n, k in enumerate(to_the_right, start=1)}
     return [replace(lane, identity=identity.get(k)) for k, lane in enumerate(lanes)]
 
 

@@ -19,19 +19,19 @@ from v2hdm.verdict.verdict import Finding, Status, judge, passed
 _SURE = 5.0  # sigmas by which a quantity must be off to be reported
 _CLOCK_S = 0.015  # clocks of clean drives were found right to 7 ms; 15 ms at 5 m/s are 7 cm
 _CORRECTABLE_S = 0.25  # a clock error above this may lie beyond the search; it is not corrected
-# Focal lengths of clean drives were found right to .8 %; confusion with the pitch costs 1 to 2 %.
+# Focal lengths of clean drives were found right to 0.8 %; confusion with the pitch costs 1 to 2 %.
 _FOCAL = 0.025
-# Change of k1 that moves the corner of a lens 74 deg wide by 3 px; clean drives stay below .001.
+# Change of k1 that moves the corner of a lens 74 deg wide by 3 px; clean drives stay below 0.001.
 _DISTORTION = 0.02
-_GRADE = 0.001  # rise of the poses over the ground, m per m: clean drives stay below .0003
+_GRADE = 0.001  # rise of the poses over the ground, m per m: clean drives stay below 0.0003
 _UP_M = 0.08  # heights of clean drives were found right to 6 cm, mostly to 1
 _ALONG_M = 0.15  # places in the plane of clean drives were found right to 8 cm
 _VAGUE_M = 0.1  # largest sigma of a place in the plane that tests a survey
-# Median residual of matched patches: .23 to .46 on clean drives, 1.1 to 1.5 without a lens' distortion.
+# Median residual of matched patches: 0.23 to 0.46 on clean drives, 1.1 to 1.5 without a lens' distortion.
 _RESIDUAL = 0.8
 _POSE_SIGMAS = 3.0  # RMS of the poses' errors in their stated sigmas: up to 2.2 on clean drives
 # Lead of another reading over the one as given in the fraction of matching patches: on clean turning drives
-# others are .1 to .2 behind, and differ by .03 between pairs of images.
+# others are 0.1 to 0.2 behind, and differ by 0.03 between pairs of images.
 _LEADS = 0.05
 # A third of the usual pairs suffices to see whether the ground matches.
 _QUICK = GroundOptions(pairs=12, free=(), readings=False)
@@ -200,7 +200,7 @@ def _confounded(estimate: GroundEstimate, key: str) -> str:
     """Why this drive confuses a parameter of the lens with another quantity; empty if it does not.
 
     Clean drives: on a straight one, focal lengths came out 6 and 8 % wrong at 15 sigmas, since height and
-    focal length slide together; with a level camera, k1 came out .05 wrong at 10 sigmas.
+    focal length slide together; with a level camera, k1 came out 0.05 wrong at 10 sigmas.
     """
     ahead = estimate.parameters.get("forward_m")
     if key == "focal_scale" and ahead is not None and not ahead.observable:

@@ -29,7 +29,7 @@ _HARDEST_MPS2 = 9.0  # no tyre turns or brakes a road vehicle harder
 _EXTREME = 12.0
 _LEAST_JITTER_MS = 5.0  # stamps that scatter less are as good as a drive needs them
 # Four standard errors of the logarithm of a ratio of two robust sigmas of one offset: half the offsets count,
-# as neighbours share poses, and a median absolute deviation is worth .37 of a standard deviation.
+# as neighbours share poses, and a median absolute deviation is worth 0.37 of a standard deviation.
 _SURE_JITTER = 4 / (0.5 * 0.37) ** 0.5
 _TOO_LARGE: Mapping[str, float] = {"centimetres": 1e2, "millimetres": 1e3}
 """How many times too large positions are in a unit that they may be in by mistake."""

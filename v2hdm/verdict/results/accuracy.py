@@ -99,7 +99,7 @@ def _corner_radii_m(marking: Marking) -> FloatArray:
 def _radius_of_all_m(radius_m: FloatArray) -> float:
     """The radius that holds 95 % of all corners, given the radius (N,) that holds each with 95 %.
 
-    Errors are circular normal: with 1 - .05^((r / own)^2) a corner lies within r.
+    Errors are circular normal: with 1 - 0.05^((r / own)^2) a corner lies within r.
     """
     if np.mean(np.isfinite(radius_m)) < _SHARE:
         return float("inf")

@@ -9,6 +9,10 @@
   document.querySelector(".atlas").before(status);
 
   const outline = (about) => about.c ?? (about.what === "symbol" ? about.p : [about.p]);
+  const movedIn = ({ moved }) => {
+    const count = Object.keys(moved ?? {}).length;
+    return moved ? `, ${count} ${count === 1 ? "corner" : "corners"} moved` : "";
+  };
   const kindOf = (about) => (about.what === "excluded" ? about.k : kinds[about.k]);
   function tell(problem = "") {
     const count = Object.keys(said).length;
@@ -56,7 +60,7 @@
       button("Reject", () => ({ says: "rejected", reason: reason.value })), element("label", { for: "edit-reason" }, "because"), reason,
       element("label", { for: "edit-class" }, "class"), kind);
     form.addEventListener("submit", (event) => event.preventDefault());
-    if (said[about.key]) form.append(element("span", { class: "said" }, `${own.says}${own.moved ? `, ${Object.keys(own.moved).length} corner(s) moved` : ""}`), button("Undo", () => null));
+    if (said[about.key]) form.append(element("span", { class: "said" }, `${own.says}${movedIn(own)}`), button("Undo", () => null));
     text.querySelector("form.edit")?.remove();
     text.prepend(form);
     if (!about.c || own.says === "rejected") return;
