@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 LOADED = (
     "torch", "kornia", "scipy.optimize", "hydra", "matplotlib.pyplot", "rasterio", "pyogrio", "ezdxf",
     "v2hdm.cli.compose", "v2hdm.cli.commands.map", "v2hdm.verdict.check", "v2hdm.pipeline.detect_images",
-    "v2hdm.mosaic.result", "v2hdm.localization", "v2hdm.calibration", "v2hdm.adjust.engines.numba.engine",
+    "v2hdm.mosaic.result", "v2hdm.localization", "v2hdm.calibration", "v2hdm.adjust.kernels.engine",
     "rosbags.highlevel",
 )  # fmt: skip
 

@@ -77,8 +77,8 @@ def _detect(parsed: argparse.Namespace) -> None:
     )
     gc.freeze()  # modules and networks outlive every image: no collection need look at them again
     failure = None
-    made = f"v2hdm detect of {parsed.source if live else Path(parsed.source).resolve()}"
-    folder = nullcontext() if parsed.draw is None else growing_folder(parsed.draw, "--draw", made)
+    maker = f"v2hdm detect of {parsed.source if live else Path(parsed.source).resolve()}"
+    folder = nullcontext() if parsed.draw is None else growing_folder(parsed.draw, "--draw", maker)
     with folder as write_drawing, _lines(parsed.output) as stream:
         try:
             for frame, camera, road in frames:
