@@ -63,7 +63,7 @@ def results(tmp_path_factory):
         patch.setattr("v2hdm.ground.estimate.estimate_cameras", lambda *_: {})
         patch.chdir(folder)
         for command in ("v2hdm map drive.path=drives/monday name=monday", BOTH, LATER):
-            assert run(["map", *shlex.split(command)[2:], "workers=1"]) == 0
+            assert run(["map", *shlex.split(command)[2:], "workers=1", "mosaic=false"]) == 0
     return folder / "outputs"
 
 
