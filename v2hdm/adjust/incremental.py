@@ -27,7 +27,6 @@ from v2hdm.adjust.checks import check_observations
 from v2hdm.adjust.covariance import corner_gain
 from v2hdm.adjust.descent import narrowed
 from v2hdm.adjust.engines import make_engine
-from v2hdm.adjust.engines.numba.tables import move
 from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.model import Estimate, Loss
 from v2hdm.adjust.problem import ControlPoints, KnownLengths, Observations, Problem, SolveOptions
@@ -36,6 +35,7 @@ from v2hdm.adjust.solve import solve
 from v2hdm.adjust.tiles import TiledCholesky
 from v2hdm.adjust.whitening import factorise, whitened_gradient
 from v2hdm.errors import AdjustError
+from v2hdm.geometry.rigid import exp, left_jacobian
 from v2hdm.records import FloatArray, IntArray
 
 _GAP_TOLERANCE = 1e-9  # of a marking's solve: at a cost of a few hundred, within a thousandth of a sigma
@@ -320,7 +320,8 @@ def _moved(base: FloatArray, unknowns: FloatArray, device: str) -> tuple[Tensor,
     Then the chart: left tangents and clock offsets by the unknowns, (C (6 + Q), C (6 + Q)).
     """
     by_camera = unknowns.reshape(len(base), -1)
-    moved, turns = move(np.ascontiguousarray(by_camera[:, :6]), base)
+    moved = exp(by_camera[:, :6]) @ base
+    turns = left_jacobian(by_camera[:, :6])
     chart = np.eye(len(unknowns))
     each = by_camera.shape[1]
     for begin, turn in zip(range(0, len(unknowns), each), turns, strict=True):

@@ -196,13 +196,13 @@ def _corners_in_route_order(problem: Problem) -> tuple[IntArray, BoolArray]:
 
 def _sorted_observations(problem: Problem, rank: IntArray) -> tuple[NDArray[Any], ...]:
     """Observations (K,) by corner, camera, frame; then corner, pair and measurement of each."""
-    from v2hdm.adjust.engines.numba.layout import Seen, lay_out  # loads numba
+    from v2hdm.adjust.kernels.layout import Seen, lay_out  # loads numba
 
     seen = Seen.of(problem.observations.columns, problem.intrinsic)
     count = len(problem.observations.corner)
     frames = len(problem.map_from_vehicle)
     key = (rank[seen.corner] * len(seen.intrinsic) + seen.camera) * frames + seen.frame
-    order = np.argsort(key, kind="stable")
+    order = _stable_order(key)
     corner, pair = np.empty((2, count), dtype=np.int32)
     measured = np.empty((2, count))
     root = np.empty((3, count))
@@ -214,6 +214,14 @@ def _sorted_observations(problem: Problem, rank: IntArray) -> tuple[NDArray[Any]
             f"{seen.frame[first]} of camera {seen.camera[first]}: keep one of them"
         )
     return order.astype(np.int32), corner, pair, measured, root
+
+
+def _stable_order(keys: IntArray) -> IntArray:
+    """The stable order (K,) of keys from 0, digit by digit: numpy sorts numbers of 16 bits in linear time."""
+    order = np.argsort((keys & 0xFFFF).astype(np.uint16), kind="stable")
+    while (keys := keys >> 16).any():
+        order = order[np.argsort((keys[order] & 0xFFFF).astype(np.uint16), kind="stable")]
+    return order
 
 
 def _clock_twist(problem: Problem, clock_offset: bool) -> tuple[FloatArray, list[float]]:

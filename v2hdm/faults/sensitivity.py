@@ -118,33 +118,35 @@ class Sensitivity:
         """Derivatives of all residuals along a whitened step of the unknowns."""
         base = self.whitening.estimate
         arrays = self.arrays
-        _, tangents, _ = self.whitening.step(whitened)
+        step, tangents, whitened_corners = self.whitening.step(whitened)
         # Derivatives are linear, poses are not: take a step that moves no pair by more than 1 m or rad.
         size = max(float(tangents.abs().max()), 1.0)
-        step, tangents, whitened_corners = self.whitening.step(whitened / size)
+        if size > 1:
+            step, tangents, whitened_corners = self.whitening.step(whitened / size)
         # Corners move in proportion to the step: a whole step gives their derivative.
         stepped = self.whitening.linearised.evaluate(step, tangents, whitened_corners).estimate
         corners = stepped.corners_map - base.corners_map
         along = (self.poses[:, :3, :2] @ corners[arrays.corner.long(), :, None])[..., 0]
 
-        def priors_after(share: float) -> Rows:
+        def priors_after(share: float, motion: Tensor) -> Rows:
             moved = Estimate(
-                rigid(share * step.extrinsic) @ base.cam_from_vehicle,
+                motion @ base.cam_from_vehicle,
                 base.frame_state + share * step.frame_state,
                 base.corners_map + share * corners,
                 base.clock_s + share * step.clock_s,
             )
             return _rows(arrays, moved)
 
-        high = priors_after(_STEP)
-        low = priors_after(-_STEP)
+        forth, back = rigid(torch.stack([_STEP * step.extrinsic, -_STEP * step.extrinsic]))
+        high = priors_after(_STEP, forth)
+        low = priors_after(-_STEP, back)
         moved = {name: size * (row - low[name]) / (2 * _STEP) for name, row in high.items()}
         moved["observations"] = size * self.seen(self.turned(tangents) + along)
         return moved
 
-    def _coupling(self, column: Rows) -> Tensor:
-        """N_yp: inner products of the column with the whitened unknowns."""
-        engine = self.whitening.engine
+    @cached_property
+    def _priors(self) -> tuple[dict[str, Tensor], Rows]:
+        """The unknowns as leaves of a graph, by the names of :class:`Gradient`, and the priors' residuals."""
         estimate = self.whitening.estimate
         tangent = estimate.cam_from_vehicle.new_zeros(len(estimate.cam_from_vehicle), 6)
         variables = {
@@ -160,13 +162,19 @@ class Sensitivity:
             leaves["corners_map"],
             leaves["clock_s"],
         )
+        return leaves, _rows(self.whitening.engine.arrays, moved)
+
+    def _coupling(self, column: Rows) -> Tensor:
+        """N_yp: inner products of the column with the whitened unknowns."""
+        leaves, priors = self._priors
         of_priors = [name for name in column if name != "observations"]
-        by_variable = {name: torch.zeros_like(variable) for name, variable in variables.items()}
+        by_variable = {name: torch.zeros_like(leaf) for name, leaf in leaves.items()}
         if of_priors:
-            priors = _rows(engine.arrays, moved)
             ends = [priors[name] for name in of_priors]
             along = [column[name] for name in of_priors]
-            slopes = torch.autograd.grad(ends, list(leaves.values()), along, materialize_grads=True)
+            slopes = torch.autograd.grad(
+                ends, list(leaves.values()), along, retain_graph=True, materialize_grads=True
+            )
             by_variable = dict(zip(leaves, slopes, strict=True))
         if "observations" in column:
             of_observations = vars(self.whitening.pull(column["observations"] * self.root))

@@ -25,7 +25,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,7 +59,7 @@ class Limits:
     step_s: float  # processor time until it first calls :func:`next_step`, and between two calls
 
     @classmethod
-    def of(cls, *files: Path) -> Limits:
+    def of(cls, files: Iterable[Path]) -> Limits:
         """The limits of work on some files, by their size; those of the smallest where there are none."""
         size = sum(file.stat().st_size for file in files if file.is_file())
         most = _SPARE_BYTES + _TIMES * size
@@ -115,10 +115,11 @@ def in_child(
         refusal = getattr(errors, name, error)
         raise (refusal if issubclass(refusal, V2hdmError) else error)(message)
     if kind == "failed":
-        if content[0] == errno.EFBIG and not _is_limited("RLIMIT_FSIZE"):
+        number, reason, name = content
+        if number == errno.EFBIG and not _is_limited("RLIMIT_FSIZE"):
             most = f"{limits.file_bytes / 1e9:.1f} GB"
             raise error(f"{where}: becomes a file of more than {most}; it is damaged, or a trap")
-        raise OSError(*content)
+        raise OSError(number, reason, name)
     if kind == "memory":
         _refuse_memory(limits, where, error)
     raise RuntimeError(f"{where}: in the process that reads it:\n{content[0]}")
@@ -186,10 +187,10 @@ class _Forward(logging.Handler):
         self._pipe = pipe
 
     def emit(self, record: logging.LogRecord) -> None:
-        _send(self._pipe, "log", record.name, record.levelno, record.getMessage())
+        _send(self._pipe, ("log", record.name, record.levelno, record.getMessage()))
 
 
-def _send(pipe: IO[bytes], *message: Any) -> None:
+def _send(pipe: IO[bytes], message: tuple[Any, ...]) -> None:
     pipe.write(json.dumps(message).encode() + b"\n")
     pipe.flush()
 
@@ -206,7 +207,7 @@ def _serve() -> None:
         message = _outcome(job)
     except MemoryError:
         message = ("memory",)
-    _send(pipe, *message)
+    _send(pipe, message)
     sys.stderr.flush()
     os._exit(0)  # nothing here is worth tidying: threads of libraries might hang
 
@@ -244,8 +245,8 @@ def _begin(limits: Limits) -> None:
     _limit("RLIMIT_CORE", 0)
     _limit("RLIMIT_FSIZE", limits.file_bytes)
     statm = Path("/proc/self/statm")
-    taken = int(statm.read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE") if statm.is_file() else 0
-    _limit("RLIMIT_AS", taken + limits.memory_bytes)
+    baseline_bytes = int(statm.read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE") if statm.is_file() else 0
+    _limit("RLIMIT_AS", baseline_bytes + limits.memory_bytes)
     next_step()
 
 
