@@ -211,17 +211,8 @@ def solve_bundle(
     if knots is not None:
         of_markings = {name: getattr(solution, name)[: len(row)] for name in _OF_OBSERVATIONS}
         solution = replace(solution, **of_markings)
-    cam_from_vehicle = rig.cam_from_vehicle.copy()
-    map_from_vehicle = sightings.map_from_vehicle.copy()
-    cam_from_vehicle[used] = solution.cam_from_vehicle
-    map_from_vehicle[frames] = solution.map_from_vehicle
-    adjusted = replace(rig, cam_from_vehicle=cam_from_vehicle, map_from_vehicle=map_from_vehicle)
-    if rig.read_out_s is not None:
-        read_out_s = rig.read_out_s.copy()
-        read_out_s[used] = solution.read_out_s
-        adjusted = replace(adjusted, read_out_s=read_out_s)
     return Bundle(
-        rig=adjusted,
+        rig=_adjusted(rig, sightings, solution, used, frames),
         model=model,
         problem=problem,
         solution=solution,
@@ -234,6 +225,20 @@ def solve_bundle(
         frames=frames,
         knots=knots,
     )
+
+
+def _adjusted(rig: Rig, sightings: Sightings, solution: Solution, used: IntArray, frames: IntArray) -> Rig:
+    """``rig`` with the solution's extrinsics of the ``used`` cameras, and its poses of the ``frames``."""
+    cam_from_vehicle = rig.cam_from_vehicle.copy()
+    map_from_vehicle = sightings.map_from_vehicle.copy()
+    cam_from_vehicle[used] = solution.cam_from_vehicle
+    map_from_vehicle[frames] = solution.map_from_vehicle
+    adjusted = replace(rig, cam_from_vehicle=cam_from_vehicle, map_from_vehicle=map_from_vehicle)
+    if rig.read_out_s is None:
+        return adjusted
+    read_out_s = rig.read_out_s.copy()
+    read_out_s[used] = solution.read_out_s
+    return replace(adjusted, read_out_s=read_out_s)
 
 
 def observations_at(
