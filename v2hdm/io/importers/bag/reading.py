@@ -244,8 +244,8 @@ def _check_chunks(readers: Sequence[Any]) -> None:
 def _check_definition(text: str) -> None:
     """Refuse a type on which rosbags' parser, or what it generates, would take for ever."""
     plain = _TEXTS.sub("", text)
-    odd = any(not _LITERAL.fullmatch(constant[1]) for constant in _CONSTANT.finditer(plain))
-    if len(text) > _MOST_LETTERS or odd or _NESTED.search(plain) or _LONG.search(plain):
+    computes = any(not _LITERAL.fullmatch(constant[1]) for constant in _CONSTANT.finditer(plain))
+    if len(text) > _MOST_LETTERS or computes or _NESTED.search(plain) or _LONG.search(plain):
         raise DriveError(_NO_RECORDING)
 
 
@@ -263,16 +263,17 @@ def _check_database(path: Path) -> None:
 def _check_plain(path: Path) -> None:
     """Refuse an SQLite file that computes, or lists a row again and again: its rows need never end."""
     computes = "m.type = 'view' OR m.sql LIKE 'CREATE VIRTUAL%' OR x.hidden"
-    odd = f"{computes} OR m.type = 'index' AND m.tbl_name <> 'messages'"
-    query = f"SELECT m.name FROM sqlite_master m LEFT JOIN pragma_table_xinfo(m.name) x WHERE {odd}"
+    repeats = "m.type = 'index' AND m.tbl_name <> 'messages'"
+    columns = "sqlite_master m LEFT JOIN pragma_table_xinfo(m.name) x"
+    query = f"SELECT m.name FROM {columns} WHERE {computes} OR {repeats}"
     with opened(path, "immutable=1") as data:
         for (name,) in data.execute(query):
             raise DriveError(f"{path}: {name} is no plain table of a recording; convert it to MCAP")
         names = {name.lower() for (name,) in data.execute("SELECT name FROM sqlite_master")}
         for table in names & {"topics", "message_definitions"}:
             deque(rows_of(data, path, table), maxlen=0)
-        ((held,),) = data.execute("SELECT total(length(data) + 1) FROM messages")
-        if held > path.stat().st_size:
+        ((message_bytes,),) = data.execute("SELECT total(length(data) + 1) FROM messages")
+        if message_bytes > path.stat().st_size:
             raise DriveError(f"{path}: its messages have more bytes than it; convert it to MCAP")
 
 
@@ -281,9 +282,10 @@ def _one_line(path: Path, what: str = "") -> Iterator[None]:
     """Turn whatever goes wrong in a damaged bag into one line."""
     try:
         yield
-    except DriveError as refused:  # its own files are named already
-        named = str(refused).startswith(str(path))
-        raise refused if named else DriveError(f"{path}: {what}{refused}") from None
+    except DriveError as refusal:
+        if str(refusal).startswith(str(path)):
+            raise
+        raise DriveError(f"{path}: {what}{refusal}") from None
     except MemoryError:
         raise DriveError(f"{path}: {what}{_TRAP}") from None
     # Bytes that are not what they should be fail anywhere within rosbags, with any error.
