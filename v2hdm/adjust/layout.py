@@ -71,8 +71,8 @@ def state_prior(problem: Problem, pose_states: tuple[str, ...]) -> StatePrior:
     session = problem.session_of_frame
     chosen = [k for k, name in enumerate(POSE_STATES) if name in pose_states]
     if not chosen:
-        none = np.zeros((len(poses), 0))
-        return StatePrior(np.zeros(0, dtype=np.int64), none[:, :, None], none)
+        no_columns = np.zeros(0, dtype=np.int64)
+        return StatePrior(no_columns, np.zeros((len(poses), 0, 0)), np.zeros((len(poses), 0)))
     total = np.array([sigma.by_state() for sigma in problem.pose_sigmas])
     drifts = [[(d.sigma, d.over_m) for d in sigma.drift_by_state()] for sigma in problem.pose_sigmas]
     drift, over_m = np.array(drifts).transpose(2, 0, 1)

@@ -229,7 +229,7 @@ def solve_bundle(
 
 
 def _adjusted(rig: Rig, sightings: Sightings, solution: Solution, part: ProblemPart) -> Rig:
-    """``rig`` with the solution's extrinsics and poses of those cameras and frames that are ``part`` of it."""
+    """``rig`` with the solution's extrinsics and poses of the cameras and frames that are ``part`` of it."""
     cam_from_vehicle = rig.cam_from_vehicle.copy()
     map_from_vehicle = sightings.map_from_vehicle.copy()
     cam_from_vehicle[part.cameras] = solution.cam_from_vehicle
