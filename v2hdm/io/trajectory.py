@@ -24,6 +24,8 @@ _FARTHEST_FROM_ORIGIN_M = 1e5  # a map is flat, and there the ground is 800 m be
 _LATE_S = 1.0  # a reading that comes later than this after its successor is of another clock or recording
 
 _UNITS: Mapping[str, float] = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
+"""How many of each unit, in which stamps may be by mistake, make a second."""
+
 _LONGEST_S = 5.0  # longest time between two poses, or images, of a drive; chosen
 _QUICKEST_S = 5e-4  # shortest time between two poses, or images, of a drive; chosen
 _ALIKE = 5.0  # poses and images of one drive last equally long to within this factor
