@@ -39,30 +39,44 @@ __all__ = [
     "solve",
 ]  # fmt: skip
 
-_HOMES = {
-    "adjust.problem": "Problem", "adjust.solve": "solve", "calibration.from_ground": "calibrate_from_ground",
-    "calibration.from_points": "calibrate_from_points", "detection.detector": "Detector",
-    "detection.options": "DetectorOptions", "errors": "V2hdmError", "io.drive": "ReadOptions read_drive",
-    "library": "build_problem read_map simulate_port", "localization.run": "localize",
-    "mapping.options": "MappingOptions", "pipeline.detect_images": "detect_images",
-    "pipeline.map_drive": "map_drive", "pipeline.result": "Result", "records": "Calibration HDMap",
-    "verdict.inputs.drive": "check_drive", "verdict.verdict": "Verdict",
-}  # fmt: skip
+_MODULES = {
+    "Calibration": "v2hdm.records",
+    "Detector": "v2hdm.detection.detector",
+    "DetectorOptions": "v2hdm.detection.options",
+    "HDMap": "v2hdm.records",
+    "MappingOptions": "v2hdm.mapping.options",
+    "Problem": "v2hdm.adjust.problem",
+    "ReadOptions": "v2hdm.io.drive",
+    "Result": "v2hdm.pipeline.result",
+    "V2hdmError": "v2hdm.errors",
+    "Verdict": "v2hdm.verdict.verdict",
+    "build_problem": "v2hdm.library",
+    "calibrate_from_ground": "v2hdm.calibration.from_ground",
+    "calibrate_from_points": "v2hdm.calibration.from_points",
+    "check_drive": "v2hdm.verdict.inputs.drive",
+    "detect_images": "v2hdm.pipeline.detect_images",
+    "localize": "v2hdm.localization.run",
+    "map_drive": "v2hdm.pipeline.map_drive",
+    "read_drive": "v2hdm.io.drive",
+    "read_map": "v2hdm.library",
+    "simulate_port": "v2hdm.library",
+    "solve": "v2hdm.adjust.solve",
+}
+"""The module of each public name, which is imported when the name is first used."""
 
 
 def __getattr__(name: str) -> Any:
-    module = next((one for one, names in _HOMES.items() if name in names.split()), None)
-    if module is None:
+    if name not in _MODULES:
         raise AttributeError(f"module 'v2hdm' has no attribute '{name}'")
     try:
-        home = importlib.import_module(f"v2hdm.{module}")
+        module = importlib.import_module(_MODULES[name])
     except ModuleNotFoundError as missing:
         if (missing.name or "v2hdm").split(".")[0] == "v2hdm":
             raise
         line = f"v2hdm.{name} needs {missing.name}: install the map extra, pip install 'v2hdm[map]'"
         raise ModuleNotFoundError(line, name=missing.name) from None
-    globals()[name] = found = getattr(home, name)
-    return found
+    globals()[name] = getattr(module, name)
+    return globals()[name]
 
 
 def __dir__() -> list[str]:

@@ -36,9 +36,8 @@ _MOST_CLASSES = 254  # labels are bytes: 0 is no paint, 255 is unknown
 
 _KEYS = frozenset({"family", "length_m", "width_m", "softness", "group"})
 
-_STRIPE_ASPECT = 3.0
-_ASPECT_SOFTNESS = 0.1
-"""A stripe or a line is at least this many times as long as wide; the deviation of the logarithm of that."""
+_STRIPE_ASPECT = 3.0  # a stripe or a line is at least so many times as long as wide
+_ASPECT_SOFTNESS = 0.1  # standard deviation of the logarithm of that least aspect
 
 
 @dataclass(frozen=True)
@@ -71,14 +70,14 @@ class MarkingClass:
         Sizes are not a number where a piece shows no ground; then they say nothing.
         """
         length, width = (np.log(np.maximum(size, _TINY_M)) for size in (length_m, width_m))
-        softness, aspect = (np.hypot(one, log_sigma) for one in (self.softness, _ASPECT_SOFTNESS))
+        softness, aspect = (np.hypot(softness, log_sigma) for softness in (self.softness, _ASPECT_SOFTNESS))
         sizes = ((length, self.length_m), (width, self.width_m))
         off = [(size - math.log(high)) / softness for size, (_, high) in sizes if high < math.inf]
         below = [(math.log(max(low, _TINY_M)) - size) / softness for size, (low, _) in sizes]
         if self.family in (STRIPE, LINE):
             below.append((math.log(_STRIPE_ASPECT) + width - length) / aspect)
-        off += [np.where(whole, one, 0.0) for one in below]
-        total = sum(np.square(np.maximum(one, 0.0)) for one in off)
+        off += [np.where(whole, excess, 0.0) for excess in below]
+        total = sum(np.square(np.maximum(excess, 0.0)) for excess in off)
         return np.asarray(np.where(np.isfinite(length + width), -0.5 * total, 0.0))
 
 
@@ -102,43 +101,43 @@ class Catalogue:
     def lane_paint(self) -> tuple[str, ...]:
         """Names of the classes whose centre lines make up lanes: those in a group with a line."""
         groups = {self.classes[name].group for name in self.of_family(LINE)}
-        return tuple(name for name, one in self.classes.items() if one.group in groups)
+        return tuple(name for name, entry in self.classes.items() if entry.group in groups)
 
     def of_family(self, *families: str) -> tuple[str, ...]:
         """Names of the classes of some families."""
-        return tuple(name for name, one in self.classes.items() if one.family in families)
+        return tuple(name for name, entry in self.classes.items() if entry.family in families)
 
     def with_own(self, entries: Mapping[Any, Any], where: str) -> Catalogue:
         """This catalogue and a user's classes after it; ConfigError, from ``where``, if one is wrong."""
-        taken = {name.lower(): name for name in (*self.classes, LANE_BOUNDARY, NOT_PAINT)}
+        name_in_use = {name.lower(): name for name in (*self.classes, LANE_BOUNDARY, NOT_PAINT)}
         for name in entries:
             if not (isinstance(name, str) and _NAME.fullmatch(name)):
                 raise ConfigError(
                     f"{where}: class {shown(name)}: use at most 64 letters, digits and underscores"
                 )
-            if (other := taken.get(name.lower())) is not None:
+            if (other := name_in_use.get(name.lower())) is not None:
                 raise ConfigError(
                     f"{where}: {shown(name)} is already the name of {shown(other)}; choose another"
                 )
-            taken[name.lower()] = name
-        own = {name: _read_class(name, entry, where) for name, entry in entries.items()}
-        groups = {one.group for one in self.classes.values()}
+            name_in_use[name.lower()] = name
+        own_classes = {name: _read_class(name, entry, where) for name, entry in entries.items()}
+        groups = {shipped.group for shipped in self.classes.values()}
         lanes = {self.classes[name].group for name in self.of_family(LINE)}
-        for name, one in own.items():
-            if one.family == LINE or one.group in lanes:
+        for name, added in own_classes.items():
+            if added.family == LINE or added.group in lanes:
                 raise ConfigError(
                     f"{where}: {shown(name)} would be lane paint, which has fixed classes "
                     f"({', '.join(self.lane_paint)}); choose another family and group"
                 )
-            if one.group not in groups | set(own):
-                known = ", ".join(sorted(groups - lanes))
+            if added.group not in groups | set(own_classes):
+                shipped_groups = ", ".join(sorted(groups - lanes))
                 raise ConfigError(
-                    f"{where}: group of {shown(name)} is {shown(one.group)}; name one of {known}, "
+                    f"{where}: group of {shown(name)} is {shown(added.group)}; name one of {shipped_groups}, "
                     "or a class of your own"
                 )
-        if len(self.classes) + len(own) > _MOST_CLASSES:
+        if len(self.classes) + len(own_classes) > _MOST_CLASSES:
             raise ConfigError(f"{where}: more than {_MOST_CLASSES} classes in total; drop some")
-        return Catalogue({**self.classes, **own})
+        return Catalogue({**self.classes, **own_classes})
 
 
 def load_catalogue(path: Path | None = None) -> Catalogue:
@@ -157,25 +156,25 @@ def _read_entries(path: Path) -> dict[Any, Any]:
 def _read_class(name: str, entry: Any, where: str) -> MarkingClass:
     if not isinstance(entry, dict) or not set(entry) <= _KEYS:
         raise ConfigError(f"{where}: class {shown(name)} may have only {', '.join(sorted(_KEYS))}")
-    said = {"softness": _SOFTNESS, "group": name, **entry}
+    values = {"softness": _SOFTNESS, "group": name, **entry}
 
     def refuse(key: str, advice: str) -> ConfigError:
-        return ConfigError(f"{where}: {key} of {shown(name)} is {shown(said.get(key))}; {advice}")
+        return ConfigError(f"{where}: {key} of {shown(name)} is {shown(values.get(key))}; {advice}")
 
-    if said.get("family") not in FAMILIES:
+    if values.get("family") not in FAMILIES:
         raise refuse("family", f"choose from {', '.join(FAMILIES)}")
     for key in ("length_m", "width_m"):
-        value = said.get(key)
+        value = values.get(key)
         if not (isinstance(value, list) and len(value) == 2 and all(map(_is_number, value))):
             raise refuse(key, "give [from, to] in m")
         if not (0 <= value[0] <= value[1] and value[1] > 0):
             raise refuse(key, "give [from, to] in m")
-    if not (_is_number(said["softness"]) and 0 < said["softness"] < math.inf):
+    if not (_is_number(values["softness"]) and 0 < values["softness"] < math.inf):
         raise refuse("softness", "give a positive number")
-    if not isinstance(said["group"], str):
+    if not isinstance(values["group"], str):
         raise refuse("group", "give the name of a group")
-    length_m, width_m = ((float(low), float(high)) for low, high in (said["length_m"], said["width_m"]))
-    return MarkingClass(name, said["family"], length_m, width_m, said["group"], float(said["softness"]))
+    length_m, width_m = ((float(low), float(high)) for low, high in (values["length_m"], values["width_m"]))
+    return MarkingClass(name, values["family"], length_m, width_m, values["group"], float(values["softness"]))
 
 
 def _is_number(value: object) -> bool:

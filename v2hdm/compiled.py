@@ -1,4 +1,7 @@
-"""Compiles kernels when they are first called, and keeps the result beside them for the next process."""
+"""Compiles kernels when they are first called, and keeps the result beside them for the next process.
+
+Without numba a kernel runs as the Python function that it is.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,10 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar, cast
 
-import numba
+try:
+    import numba
+except ModuleNotFoundError:
+    numba = None  # type: ignore[assignment]
 
 PLACES = (
     Path(__file__).parent / "__pycache__",
@@ -35,13 +41,18 @@ _UNREADABLE = (OSError, EOFError, AttributeError, ImportError, pickle.Unpickling
 
 def inlined(function: _Function) -> _Function:
     """A part of kernels."""
-    part: _Function = numba.njit(forceinline=True, **_OPTIONS)(function)
-    return part
+    return _inlined(function, _OPTIONS)
 
 
 def exactly_inlined(function: _Function) -> _Function:
     """A part of exact kernels."""
-    part: _Function = numba.njit(forceinline=True, **_EXACT)(function)
+    return _inlined(function, _EXACT)
+
+
+def _inlined(function: _Function, options: dict[str, Any]) -> _Function:
+    if numba is None:
+        return function
+    part: _Function = numba.njit(forceinline=True, **options)(function)
     return part
 
 
@@ -56,6 +67,8 @@ def exact_kernel(function: _Function) -> _Function:
 
 
 def _kept(function: _Function, options: dict[str, Any]) -> _Function:
+    if numba is None:
+        return function
     folder = folder_of(sys.modules[function.__module__])
     settings = cast(Any, numba.config)
     usual = settings.CACHE_DIR

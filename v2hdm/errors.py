@@ -43,8 +43,8 @@ class AdjustError(V2hdmError):
     """A bundle adjustment problem is malformed: the message names the offending item."""
 
 
-EXIT_USER_ERROR = 2
-EXIT_FAILED_VERDICT = 3
+EXIT_USER_ERROR = 2  # exit code of a command after a mistake of the user's
+EXIT_FAILED_VERDICT = 3  # exit code of a command whose verdict is FAIL
 
 # From what torch, onnxruntime, OpenCV and the loader of libraries say of it, none by a MemoryError.
 _NO_MEMORY = ("bad_alloc", "llocate memory", "ailed to allocate", "map segment", "nsufficient memory")

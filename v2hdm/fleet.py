@@ -61,22 +61,39 @@ class Row:
         return cls(drive, ERROR, one_line(message), None, None, None, False, "", source)
 
     @classmethod
-    def of_result(cls, drive: str, source: str, place: str, metrics: Mapping[str, Any], kept: bool) -> Row:
+    def of_result(
+        cls, drive: str, source: str, place: str, metrics: Mapping[str, Any], is_reused: bool
+    ) -> Row:
         """The row of a finished run, from its ``metrics.json``."""
         verdict = metrics["verdict"]
         sets = list(metrics["results"].values())
-        worst = next((f"{one['check']} ({one['about']}): {one['says']}" for one in verdict["findings"]), "")
+        worst = next(
+            (
+                f"{finding['check']} ({finding['about']}): {finding['says']}"
+                for finding in verdict["findings"]
+            ),
+            "",
+        )
         markings = int(sets[-1]["Opt"]["markings"]) if sets else None
         images = int(metrics["drive"]["images"])
         seconds = sum(metrics.get("seconds", {}).values())
-        figures = (images, markings, round(seconds / 60, 3))
-        return cls(drive, str(verdict["status"]), one_line(worst), *figures, kept, place, source)
+        return cls(
+            drive=drive,
+            status=str(verdict["status"]),
+            says=one_line(worst),
+            images=images,
+            markings=markings,
+            minutes=round(seconds / 60, 3),
+            kept=is_reused,
+            folder=place,
+            source=source,
+        )
 
 
 def as_csv(rows: Sequence[Row]) -> bytes:
     """The rows as a spreadsheet."""
     out = io.StringIO()
-    writer = csv.DictWriter(out, [one.name for one in fields(Row)], lineterminator="\n")
+    writer = csv.DictWriter(out, [field.name for field in fields(Row)], lineterminator="\n")
     writer.writeheader()
     writer.writerows(asdict(row) for row in rows)
     return out.getvalue().encode()
@@ -91,16 +108,21 @@ def as_table(rows: Sequence[Row]) -> Table:
     """The rows for the terminal."""
     table = new_table(None, ("drive", "verdict"), ("images", "markings", "minutes"))
     for row in rows:
-        numbers = ["" if one is None else str(one) for one in (row.images, row.markings)]
-        minutes = "kept" if row.kept else "" if row.minutes is None else f"{row.minutes:.1f}"
-        table.add_row(Text(row.drive), Text(row.status, STYLES.get(row.status, "")), *numbers, minutes)
+        images, markings = ("" if figure is None else str(figure) for figure in (row.images, row.markings))
+        minutes = "" if row.minutes is None else f"{row.minutes:.1f}"
+        if row.kept:
+            minutes = "kept"
+        status = Text(row.status, STYLES.get(row.status, ""))
+        table.add_row(Text(row.drive), status, images, markings, minutes)
     return table
 
 
 def exit_code(rows: Sequence[Row]) -> int:
     """2 where a drive gave no result, else 3 where a verdict is FAIL, else 0."""
-    found = {row.status for row in rows}
-    return EXIT_USER_ERROR if ERROR in found else EXIT_FAILED_VERDICT if "FAIL" in found else 0
+    statuses = {row.status for row in rows}
+    if ERROR in statuses:
+        return EXIT_USER_ERROR
+    return EXIT_FAILED_VERDICT if "FAIL" in statuses else 0
 
 
 @dataclass(frozen=True)
@@ -115,8 +137,8 @@ class Job:
     @property
     def place(self) -> str:
         """The folder of the results, or its URL."""
-        there = place_of(self.config.output, "output=")
-        return str((there / self.name).resolve() if isinstance(there, Path) else there.below(self.name))
+        output = place_of(self.config.output, "output=")
+        return str((output / self.name).resolve() if isinstance(output, Path) else output.below(self.name))
 
 
 @dataclass(frozen=True)
@@ -136,24 +158,25 @@ def plan(files: Sequence[Path], overrides: Sequence[str], share: tuple[int, int]
     """
     jobs: list[Job] = []
     refused: list[Row] = []
-    taken: dict[str, Path] = {}
+    file_of_place: dict[str, Path] = {}
     for file in files:
         try:
             composed, config = _composed(file, overrides)
             take_name(run_name(config), "name", ConfigError)
             job = Job(run_name(config), str(file), config, to_yaml(composed))
             place = job.place
-            if place in taken:
+            if place in file_of_place:
                 raise ConfigError(
-                    f"{file}: its results go to {place}, as those of {taken[place]}; name one otherwise"
+                    f"{file}: its results go to {place}, as those of {file_of_place[place]}; "
+                    "name one otherwise"
                 )
-            taken[place] = file
+            file_of_place[place] = file
             jobs.append(job)
         except V2hdmError as error:
             refused.append(Row.of_error(file.stem, str(file), str(error)))
     sources = [str(file) for file in files][share[0] - 1 :: share[1]]
-    mine = [one for one in jobs if one.source in sources]
-    return Plan(mine, [one for one in refused if one.source in sources], sources)
+    mine = [job for job in jobs if job.source in sources]
+    return Plan(mine, [row for row in refused if row.source in sources], sources)
 
 
 def _composed(file: Path, overrides: Sequence[str]) -> tuple[DictConfig, RunConfig]:
@@ -218,7 +241,7 @@ class _Table:
     @property
     def rows(self) -> list[Row]:
         """In the order of the sources."""
-        return [self._rows[one] for one in self._sources if one in self._rows]
+        return [self._rows[source] for source in self._sources if source in self._rows]
 
     def add(self, row: Row, trace: str = "") -> None:
         """Add the row of a drive, and the traceback of a bug where there is one."""
@@ -234,21 +257,27 @@ class _Table:
 def _map_all(jobs: Sequence[Job], cores: int, table: _Table, progress: DriveProgress) -> None:
     """Map drives side by side; where they are fewer than cores, each takes several."""
     count = max(1, min(cores, len(jobs)))
-    todo = [replace(one, config=replace(one.config, workers=cores // count)) for one in jobs]
-    for number, found in side_by_side(_mapped, todo, count, lambda job, *step: progress(job.name, *step)):
-        if isinstance(found, WorkerError):
-            found = Row.of_error(jobs[number].name, jobs[number].source, str(found)), ""
-        table.add(*found)
+    todo = [replace(job, config=replace(job.config, workers=cores // count)) for job in jobs]
+
+    def advance(job: Job, task: str, done: int, total: int) -> None:
+        progress(job.name, task, done, total)
+
+    for number, outcome in side_by_side(_mapped, todo, count, advance):
+        if isinstance(outcome, WorkerError):
+            table.add(Row.of_error(jobs[number].name, jobs[number].source, str(outcome)))
+        else:
+            row, trace = outcome
+            table.add(row, trace)
 
 
 def _mapped(job: Job, progress: Progress) -> tuple[Row, str]:
     """Map one drive and write its results; its row, and the traceback where it met a bug of ours."""
     try:
-        result, kept = take_or_run(job.config, job.config_yaml, progress)
+        result, is_reused = take_or_run(job.config, job.config_yaml, progress)
     except Exception as error:  # a drive that fails is a row, and the others go on
         line = describe(error)
         if line is not None:
             return Row.of_error(job.name, job.source, line), ""
         line = f"a bug in V2HDM, {type(error).__name__}: {error}; its traceback is in the fleet's folder"
         return Row.of_error(job.name, job.source, line), traceback.format_exc()
-    return Row.of_result(job.name, job.source, result.place, result.metrics, kept), ""
+    return Row.of_result(job.name, job.source, result.place, result.metrics, is_reused), ""

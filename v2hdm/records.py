@@ -144,7 +144,7 @@ class PoseNoise:
 
 def largest_noise(noises: Sequence[PoseNoise]) -> PoseNoise:
     """The largest of each standard deviation, and of each distance over which a drift fades."""
-    names = [one.name for one in fields(PoseNoise)]
+    names = [field.name for field in fields(PoseNoise)]
     return PoseNoise(**{name: max(getattr(noise, name) for noise in noises) for name in names})
 
 
@@ -242,8 +242,18 @@ class Drive:
     @property
     def sessions(self) -> tuple[Session, ...]:
         """Its sessions: the drives that it was joined of, or itself alone."""
-        own = (self.name, self.root, self.pose_noise, self.truth_dir, self.trajectory, self.recorded)
-        return self.joined or (Session(*own, {name: name for name in self.cameras}),)
+        if self.joined:
+            return self.joined
+        alone = Session(
+            name=self.name,
+            root=self.root,
+            pose_noise=self.pose_noise,
+            truth_dir=self.truth_dir,
+            trajectory=self.trajectory,
+            recorded=self.recorded,
+            cameras={name: name for name in self.cameras},
+        )
+        return (alone,)
 
     @property
     def noises(self) -> tuple[PoseNoise, ...]:
@@ -431,11 +441,11 @@ class HDMap:
         rows = []
         for layer, features, name in layers:
             shape = shapely.LineString if layer == "lane" else shapely.Polygon
-            for one in features:
-                points = getattr(one, name)
-                heights_m = np.zeros(len(points)) if one.heights_m is None else one.heights_m
+            for feature in features:
+                points = getattr(feature, name)
+                heights_m = np.zeros(len(points)) if feature.heights_m is None else feature.heights_m
                 geometry = shape(np.column_stack([points, heights_m]))
-                rows.append((one.id, layer, one.kind, one.sightings, geometry))
+                rows.append((feature.id, layer, feature.kind, feature.sightings, geometry))
         columns = ["id", "layer", "kind", "sightings", "geometry"]
         frame = geopandas.GeoDataFrame(rows, columns=columns, geometry="geometry")
         if self.origin is None:
@@ -501,7 +511,7 @@ class Changes:
 
     def of(self, fate: Fate) -> tuple[Change, ...]:
         """The changes of one fate."""
-        return tuple(one for one in self.changes if one.fate is fate)
+        return tuple(change for change in self.changes if change.fate is fate)
 
 
 @dataclass(frozen=True)

@@ -44,11 +44,11 @@ NO_KEY = {"omegaconf_ignore": True}
 """Metadata of a field that no run file and no command line sets: another setting does."""
 
 ANY_NUMBER = Within()
-POSITIVE = Within(0, open=True)
-NOT_NEGATIVE = Within(0)
-SHARE = Within(0, 1)
-COUNT = Within(1, 10**12)
-SEED = Within(0, 2**63 - 1)
+POSITIVE = Within(0, open=True)  # above zero
+NOT_NEGATIVE = Within(0)  # zero or more
+SHARE = Within(0, 1)  # of a whole
+COUNT = Within(1, 10**12)  # chosen: more than any machine holds
+SEED = Within(0, 2**63 - 1)  # whole numbers of 64 bits with a sign
 
 
 @dataclass(frozen=True)

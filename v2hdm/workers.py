@@ -43,16 +43,16 @@ def share_out(
     take: Callable[[_Result], None],
 ) -> None:
     """Do short jobs in processes that call ``start`` first; results in order, their errors or WorkerError."""
-    found: dict[int, _Result] = {}
-    taken = 0
+    results: dict[int, _Result] = {}
+    taken_count = 0
     ready = _Prepared(work, start, arguments)
     for number, result in side_by_side(ready, jobs, min(processes, len(jobs)), lambda *_: None):
         if isinstance(result, WorkerError):
             raise result
-        found[number] = result
-        while taken in found:
-            take(found.pop(taken))
-            taken += 1
+        results[number] = result
+        while taken_count in results:
+            take(results.pop(taken_count))
+            taken_count += 1
 
 
 class _Prepared(Generic[_Job, _Result]):
@@ -120,7 +120,7 @@ def side_by_side(
                     raise failure from RuntimeError(trace)
                 yield number, message[0]
     finally:
-        ours = [one for one in multiprocessing.active_children() if one not in others]
+        ours = [process for process in multiprocessing.active_children() if process not in others]
         for process in ours:
             process.terminate()
         for process in ours:

@@ -7,8 +7,7 @@ import sys
 
 import pytest
 
-from v2hdm.adjust import ahead
-from v2hdm.adjust.engines import numba as kernels
+from v2hdm.adjust import ahead, kernels
 
 
 def test_the_small_problem_calls_every_kernel_of_the_engine(monkeypatch):
@@ -32,7 +31,7 @@ def test_the_small_problem_calls_every_kernel_of_the_engine(monkeypatch):
 @pytest.fixture
 def new_folder(tmp_path, monkeypatch):
     """A folder where no kernel is kept yet, and the program of the process that compiles."""
-    monkeypatch.setattr(ahead, "folder_of", lambda _: tmp_path)
+    monkeypatch.setattr(ahead, "kept_in", lambda: tmp_path)
     return tmp_path
 
 

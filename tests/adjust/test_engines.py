@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 from tests.adjust.scene import HEIGHT, make_scene, with_late_clocks
 from v2hdm.adjust import ControlPoints, Drift, KnownLengths, PoseSigma, SolveOptions, Status, model, solve
 from v2hdm.adjust.descent import Objective
+from v2hdm.adjust.engine import Pairs, TorchEngine, View
 from v2hdm.adjust.engines import make_engine
-from v2hdm.adjust.engines.autograd import TorchEngine
-from v2hdm.adjust.engines.numba import layout as kernel_layout
 from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.model import Estimate, Loss
 from v2hdm.adjust.problem import LOSSES, POSE_STATES
@@ -163,6 +162,22 @@ def test_engines_agree_on_a_step(pose_states, clock, loss):
     assert_same(one.coupled, other.coupled, 1e-9)
 
 
+@pytest.mark.parametrize("behind", [False, True])
+def test_torch_differentiates_an_observation_as_autograd_does(behind):
+    problem = example(frames=14)
+    _, engine = engines(problem, ())
+    estimate = estimate_of(engine, problem, torch.Generator().manual_seed(3), behind=behind)
+    run = engine.arrays.whole()
+    view = View.of(run, Pairs.of(engine.poses(estimate)), estimate.corners_map)
+    points = view.point.T.clone().requires_grad_()
+    residual = model.corner_residual(points, run.measured, run.root_information)
+    by_row = [torch.autograd.grad(row.sum(), points, retain_graph=True)[0].T for row in residual.unbind(1)]
+    assert_same(view.by_point(), torch.stack(by_row))
+    by_residual = torch.randn(view.residual.shape, generator=torch.Generator().manual_seed(4)).double()
+    (force,) = torch.autograd.grad(residual, points, by_residual.T)
+    assert_same(view.force(by_residual), force.T)
+
+
 @pytest.mark.parametrize(("pose_states", "clock"), MODELS)
 def test_engines_agree_on_the_start_and_on_the_report(pose_states, clock):
     problem = example(lengths=False)
@@ -204,7 +219,7 @@ def test_a_solve_ends_where_that_of_torch_ends(pose_states, clock):
 def test_results_do_not_depend_on_the_number_of_threads(pose_states, monkeypatch):
     """To the last bit: many small chunks, side by side or one after the other."""
     monkeypatch.setattr("v2hdm.adjust.arrays._RUN", 200)
-    monkeypatch.setattr(kernel_layout, "_WORTH_THREADS", 1)
+    monkeypatch.setattr("v2hdm.adjust.threads._WORTH_THREADS", 1)
     problem = example()
     options = SolveOptions(pose_states=pose_states)
     before, found = torch.get_num_threads(), []

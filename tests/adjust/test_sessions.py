@@ -138,8 +138,8 @@ def test_drives_whose_shared_corners_are_kept_are_adjusted_as_with_all_corners_e
     if known:
         problem = with_knowledge(problem)
     whole = solve(problem, options)
-    monkeypatch.setattr("v2hdm.adjust.engines.numba.engine._WORTH_ANOTHER_ORDER", 0.0)
-    monkeypatch.setattr("v2hdm.adjust.engines.numba.engine._CLEARLY_LESS", 1e9)
+    monkeypatch.setattr("v2hdm.adjust.kernels.engine._WORTH_ANOTHER_ORDER", 0.0)
+    monkeypatch.setattr("v2hdm.adjust.kernels.engine._CLEARLY_LESS", 1e9)
     kept = solve(problem, options)
     plans = [one.covariance.whitening.plan for one in (whole, kept)]
     assert not len(plans[0].kept)

@@ -19,7 +19,7 @@ import torch
 
 from tests.adjust.site import site
 from v2hdm.adjust import Solution, SolveOptions, solve
-from v2hdm.adjust.engines.numba import engine
+from v2hdm.adjust.kernels import engine
 from v2hdm.fleet import FleetOptions, run_fleet
 
 OPTIONS = SolveOptions(coarse=False)

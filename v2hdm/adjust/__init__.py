@@ -1,8 +1,8 @@
 """Bundle adjustment of marking corners, camera extrinsics and vehicle poses on the ground plane.
 
 ``solve(problem, options) -> solution``, numpy in and out, by torch's LBFGS on whitened variables.
-:mod:`v2hdm.adjust.problem` states unknowns and data, :mod:`v2hdm.adjust.model` every residual, which an
-engine of :mod:`v2hdm.adjust.engines` evaluates and linearises.
+:mod:`v2hdm.adjust.problem` states unknowns and data, :mod:`v2hdm.adjust.model` every residual, which
+:mod:`v2hdm.adjust.engine` evaluates and linearises; :mod:`v2hdm.adjust.kernels` does the same faster.
 """
 
 from v2hdm.adjust.problem import (

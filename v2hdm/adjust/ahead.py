@@ -13,10 +13,9 @@ import numpy as np
 import torch
 
 from v2hdm.adjust.covariance import corner_gain
-from v2hdm.adjust.engines import numba as kernels
+from v2hdm.adjust.kernels import are_compiled, kept_in
 from v2hdm.adjust.problem import Observations, Problem, SolveOptions
 from v2hdm.adjust.solve import solve
-from v2hdm.compiled import folder_of
 
 _DONE = "all"  # file beside the cached kernels: all of an adjustment's are there
 _PROGRAM = "from v2hdm.adjust import ahead; ahead.compile_kernels()"
@@ -25,7 +24,7 @@ _PROGRAM = "from v2hdm.adjust import ahead; ahead.compile_kernels()"
 @contextmanager
 def compiled_meanwhile(device: str) -> Iterator[None]:
     """Have the kernels of an adjustment on the CPU compiled by the end of the block, if cacheable."""
-    folder = folder_of(kernels)
+    folder = kept_in() if are_compiled() else None
     quiet = subprocess.DEVNULL
     if device != "cpu" or folder is None or (folder / _DONE).exists():
         yield
@@ -45,7 +44,7 @@ def compile_kernels() -> None:
     """Compile all kernels and mark them complete; ends with the process at the other end of stdin."""
     threading.Thread(target=lambda: (os.read(0, 1), os._exit(1)), daemon=True).start()
     use_kernels()
-    if (folder := folder_of(kernels)) is not None:
+    if (folder := kept_in()) is not None:
         (folder / _DONE).touch()
 
 

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import inspect
 import math
-import sys
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from v2hdm.adjust.engine import Engine
-from v2hdm.adjust.engines.numba.layout import one_thread_in_torch
+from v2hdm.adjust.engine import TorchEngine
 from v2hdm.adjust.model import Estimate, Loss
 from v2hdm.adjust.reduced import Plan
+from v2hdm.adjust.threads import one_thread_in_torch
+from v2hdm.adjust.torch_quirks import bare_step, leave_compiler_out
 from v2hdm.adjust.whitening import Whitening, factorise, whitened_gradient
 
 Evaluate = Callable[[Tensor], tuple[float, Tensor]]  # cost and gradient at whitened variables y
@@ -73,10 +71,9 @@ def minimise(
         # Differences to the start keep the digits of small improvements of a large cost.
         return (new_cost - cost) / scale**2
 
-    _leave_compiler_out()
+    leave_compiler_out()
     optimizer = torch.optim.LBFGS([u], line_search_fn="strong_wolfe", **_STEPWISE, **_LINE_SEARCH)
-    # Unwrapped: the profiler's hooks around it take as long as the step.
-    step = inspect.unwrap(torch.optim.LBFGS.step)
+    step = bare_step()
     best = cost
     best_gradient = gradient
     gap = predicted_gap(best, best_gradient)
@@ -143,18 +140,6 @@ class _Evaluations:
         return cost, gradient
 
 
-@cache
-def _leave_compiler_out() -> None:
-    """Keep torch from importing its compiler, 1 to 2.5 s, for the methods of the first optimiser."""
-    if "torch._dynamo" in sys.modules:
-        return
-    for name in dir(torch.optim.Optimizer):
-        method = getattr(getattr(torch.optim.Optimizer, name), "__wrapped__", None)
-        if method is not None:
-            with suppress(AttributeError, TypeError):
-                method.__dynamo_disable = method
-
-
 _ANNEALING_TOLERANCE = 1e-3  # while a robust loss is being narrowed, more digits are wasted
 _ANNEALING_STEP = 3.0
 _ITERATIONS_PER_WHITENING = 12
@@ -166,7 +151,7 @@ RENEWAL_WITH_STATES = 10.0
 class Descent:
     """The end of a descent."""
 
-    engine: Engine
+    engine: TorchEngine
     plan: Plan
     estimate: Estimate  # the optimum, under ``robust``, with the cost by name
     robust: Loss
@@ -229,7 +214,7 @@ class Objective:
         return sum(done.terms.values()), by_whitened
 
 
-def narrowed(engine: Engine, estimate: Estimate, robust: Loss, last: Loss | None = None) -> Loss:
+def narrowed(engine: TorchEngine, estimate: Estimate, robust: Loss, last: Loss | None = None) -> Loss:
     """The loss, with most residuals in its convex part, at most a third as wide as ``last``."""
     if robust.name == "none":
         return robust
@@ -241,7 +226,7 @@ def narrowed(engine: Engine, estimate: Estimate, robust: Loss, last: Loss | None
 
 
 def descend(
-    engine: Engine,
+    engine: TorchEngine,
     estimate: Estimate,
     robust: Loss,
     tolerance: float,
@@ -299,6 +284,6 @@ def descend(
         whitening = factorise(engine, plan, estimate, loss)
 
 
-def open_descent(engine: Engine, estimate: Estimate, robust: Loss) -> Whitening:
+def open_descent(engine: TorchEngine, estimate: Estimate, robust: Loss) -> Whitening:
     """First whitening of a descent, under a loss wide enough for the residuals."""
     return factorise(engine, engine.plan(), estimate, narrowed(engine, estimate, robust))

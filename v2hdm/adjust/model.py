@@ -16,8 +16,7 @@ alone, since t'(l - l0) along it is held at zero. The cost is half the sum of sq
 under a robust loss.
 
 Tangents are (translation, rotation), as in kornia's ``Se3``, and act from the left: exp(x) T.
-Derivatives are left to autograd (:mod:`v2hdm.adjust.engines.autograd`), against which the closed forms of
-:mod:`v2hdm.adjust.engines.numba` are tested.
+Derivatives are those of :mod:`v2hdm.adjust.engine`, against which :mod:`v2hdm.adjust.kernels` are tested.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from dataclasses import dataclass
 import torch
 from kornia.geometry.camera.perspective import project_points
 from kornia.geometry.liegroup import Se3, So3
-from kornia.geometry.linalg import transform_points
+from kornia.geometry.linalg import inverse_transformation, transform_points
 from torch import Tensor
 from torch.nn.functional import one_hot, pad
 
@@ -128,22 +127,55 @@ def points_in_camera(cam_from_map: Tensor, corners_map: Tensor) -> Tensor:
     return points_cam
 
 
+def reprojection_error(points_cam: Tensor, measured: Tensor) -> Tensor:
+    """Projected points (k, 3) minus the measured ones (2, k), at depth 1: (k, 2)."""
+    at_depth_one = torch.eye(3, dtype=points_cam.dtype, device=points_cam.device)
+    error: Tensor = project_points(before_camera(points_cam), at_depth_one) - measured.T
+    return error
+
+
 def corner_residual(points_cam: Tensor, measured: Tensor, root_information: Tensor) -> Tensor:
     """The paper's reprojection error (k, 2), whitened; ``measured`` (2, k) is at depth 1."""
-    at_depth_one = torch.eye(3, dtype=points_cam.dtype, device=points_cam.device)
-    x, y = (project_points(before_camera(points_cam), at_depth_one) - measured.T).unbind(1)
+    x, y = reprojection_error(points_cam, measured).unbind(1)
     a, b, c = root_information
     return torch.stack([a * x, b * x + c * y], dim=1)
 
 
-def ground_points(cam_from_map: Tensor, measured: Tensor) -> Tensor:
-    """Ground points (k, 2) of rays (2, k) at depth 1, by the inverse homography, the IPM.
+def ground_from_ray(cam_from_map: Tensor) -> Tensor:
+    """The inverse homographies (P, 3, 3) of pairs (P, 4, 4), the IPM: from rays (u, v, 1) to the ground.
 
-    They are meaningless above the horizon (:func:`depression_sine`).
+    The third coordinate is the drop of the ray, positive below the horizon.
     """
-    ipm, _ = torch.linalg.inv_ex(cam_from_map[:, :3, [0, 1, 3]])
-    points_map: Tensor = transform_points(ipm, measured.T[:, None])[:, 0]
-    return points_map
+    map_from_cam: Tensor = inverse_transformation(cam_from_map)
+    level, drop = map_from_cam[:, :2, :3], -map_from_cam[:, 2:3, :3]
+    centre, height = map_from_cam[:, :2, 3:], map_from_cam[:, 2:3, 3:]
+    return torch.cat([height * level + centre * drop, drop], dim=1)
+
+
+def back_projected(ground_from_ray: Tensor, measured: Tensor, root_information: Tensor) -> Tensor:
+    """Information (5, k) of rays (2, k) on where they meet the ground, 0 at and above the horizon.
+
+    Its rows are xx, yx and yy of J'J, with the derivative J of the whitened residual by the corner, and x and
+    y of J'J times the ground point. ``ground_from_ray`` (9, k) are the rays' homographies, row by row.
+    """
+    u, v = measured
+    xu, xv, x, yu, yv, y, du, dv, drop = ground_from_ray
+    drop = drop + du * u + dv * v
+    x = (x + xu * u + xv * v) / drop
+    y = (y + yu * u + yv * v) / drop
+    # A homography's derivative: of the ground point by the ray, times the drop.
+    xu, xv = xu - x * du, xv - x * dv
+    yu, yv = yu - y * du, yv - y * dv
+    # Its inverse is the residual's derivative, before whitening.
+    share = drop / (xu * yv - xv * yu)
+    a, b, c = root_information * share
+    first_x, first_y = a * yv, -a * xv
+    second_x, second_y = b * yv - c * yu, c * xu - b * xv
+    xx = first_x.square() + second_x.square()
+    yx = first_x * first_y + second_x * second_y
+    yy = first_y.square() + second_y.square()
+    is_met = drop > MIN_DEPRESSION_SINE * (1 + u.square() + v.square()).sqrt()
+    return torch.where(is_met, torch.stack([xx, yx, yy, xx * x + yx * y, yx * x + yy * y]), 0.0)
 
 
 def depression_sine(cam_from_map: Tensor, measured: Tensor) -> Tensor:

@@ -12,16 +12,17 @@ import torch
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
+from v2hdm.adjust.audit import audit
 from v2hdm.adjust.checks import check_model, check_options, check_problem
 from v2hdm.adjust.covariance import Covariance
 from v2hdm.adjust.descent import Descent, descend, open_descent
-from v2hdm.adjust.engine import Engine
+from v2hdm.adjust.engine import TorchEngine
 from v2hdm.adjust.engines import make_engine
-from v2hdm.adjust.engines.numba.layout import one_thread_in_torch
 from v2hdm.adjust.layout import make_arrays, nearby_origin, shifted
 from v2hdm.adjust.model import Estimate, Loss, depression_sine, frame_tangent
 from v2hdm.adjust.problem import Problem, SolveOptions
 from v2hdm.adjust.solution import Solution, Status, as_of_point, classify, noise_scale, variance_factors
+from v2hdm.adjust.threads import one_thread_in_torch
 from v2hdm.adjust.whitening import Whitening
 from v2hdm.errors import AdjustError
 from v2hdm.geometry.rigid import exp
@@ -54,7 +55,7 @@ def is_near(whitening: Whitening) -> bool:
     return float(step.extrinsic[:, 3:].norm(dim=1).max()) <= _NEAR_RAD
 
 
-def coarse_extrinsics(engine: Engine, cam_from_vehicle: Tensor) -> tuple[Tensor, int]:
+def coarse_extrinsics(engine: TorchEngine, cam_from_vehicle: Tensor) -> tuple[Tensor, int]:
     """Coarsely estimated extrinsics (C, 4, 4), and the number of evaluations.
 
     Near the horizon a small pitch error moves ground points by tens of metres; steep rays avoid that, and a
@@ -166,7 +167,7 @@ def _solve(problem: Problem, options: SolveOptions) -> Solution:
 
 
 def _start(
-    problem: Problem, engine: Engine, robust: Loss, options: SolveOptions
+    problem: Problem, engine: TorchEngine, robust: Loss, options: SolveOptions
 ) -> tuple[Estimate, Whitening | None, int]:
     """Start of the descent, its first whitening if known, and evaluations spent. Raises AdjustError."""
     cam_from_vehicle = torch.as_tensor(problem.cam_from_vehicle, dtype=torch.float64, device=options.device)
@@ -188,7 +189,7 @@ def _start(
     return estimate, None, spent
 
 
-def _estimate(problem: Problem, engine: Engine, cam_from_vehicle: Tensor) -> tuple[Estimate, int | None]:
+def _estimate(problem: Problem, engine: TorchEngine, cam_from_vehicle: Tensor) -> tuple[Estimate, int | None]:
     """The start under some extrinsics, and a corner that no ray determines, if any."""
     arrays = engine.arrays
     state = torch.zeros_like(arrays.state_information_root)
@@ -211,7 +212,9 @@ def _report(
     arrays = engine.arrays
     if descent.robust != robust:
         terms = engine.terms(estimate, robust)
-    residual_px, mahalanobis2, behind = engine.report(estimate, problem.intrinsic[:, :2])
+    report = engine.report(estimate, problem.intrinsic[:, :2])
+    audit(arrays, estimate, robust, problem.intrinsic[:, :2], report, terms)
+    residual_px, mahalanobis2, behind = report
     lines = problem.observations.on_line
     if lines.any():
         mahalanobis2[lines] = as_of_point(mahalanobis2[lines])

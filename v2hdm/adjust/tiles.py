@@ -8,12 +8,12 @@ Large Sparse Positive Definite Systems, 1981): time and memory grow linearly wit
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from heapq import heapify, heappop, heappush
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -22,8 +22,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from torch import Tensor
 
-from v2hdm.compiled import kernel
-from v2hdm.records import FloatArray, IntArray
+from v2hdm.adjust.kernels import are_compiled
+
+if TYPE_CHECKING:
+    from v2hdm.adjust.kernels.substitute import Flat
 
 TIP = -1  # the row of the tiles that border the others, and row and column of the last one
 
@@ -122,17 +124,6 @@ class TiledMatrix:
         return cls(pattern, values, columns, tiles[TIP, TIP], tiles, np.array(keys), np.array(at))
 
 
-class _Flat(NamedTuple):
-    """A factor as kernels read it."""
-
-    values: FloatArray  # all tiles but the tip
-    at: IntArray  # (G,) offset of each column among the values
-    rows: IntArray  # rows of the vector that the panels act on
-    begin: IntArray  # (G + 1,) first of each panel among ``rows``
-    size: int  # rows and columns of a tile
-    tip: FloatArray
-
-
 @dataclass(frozen=True)
 class TiledCholesky:
     """L of a positive definite matrix in tiles of ``size``, the tip last."""
@@ -154,26 +145,33 @@ class TiledCholesky:
         return torch.cat([tile.diagonal() for tile in (*self.diagonal, self.tip)]).square()
 
     @cached_property
-    def _flat(self) -> _Flat:
-        at = np.array([tile.storage_offset() for tile in self.diagonal])
-        begin = np.cumsum([0, *map(len, self.rows)])
-        tip = np.ascontiguousarray(self.tip.numpy())
-        rows = torch.cat(self.rows).numpy()
-        return _Flat(self.values.numpy(), at, rows, begin, len(self.diagonal[0]), tip)
+    def _flat(self) -> Flat:
+        from v2hdm.adjust.kernels.substitute import Flat  # loads numba
 
-    def _substitute(self, substitute: Callable[..., None], right: Tensor) -> Tensor:
+        return Flat(
+            values=self.values.numpy(),
+            at=np.array([tile.storage_offset() for tile in self.diagonal]),
+            rows=torch.cat(self.rows).numpy(),
+            begin=np.cumsum([0, *map(len, self.rows)]),
+            size=len(self.diagonal[0]),
+            tip=np.ascontiguousarray(self.tip.numpy()),
+        )
+
+    def _substitute(self, right: Tensor, transposed: bool) -> Tensor:
         """Solve for one column by a kernel: Python's loop over tiles takes ten times as long."""
+        from v2hdm.adjust.kernels.substitute import backward, forward  # loads numba
+
         out = right[:, 0].clone(memory_format=torch.contiguous_format)
-        substitute(self._flat, out.numpy())
+        (backward if transposed else forward)(self._flat, out.numpy())
         return out[:, None]
 
-    def _is_one_column(self, right: Tensor) -> bool:
-        return right.shape[1] == 1 and bool(self.diagonal) and not right.is_cuda
+    def _is_for_kernel(self, right: Tensor) -> bool:
+        return right.shape[1] == 1 and bool(self.diagonal) and not right.is_cuda and are_compiled()
 
     def solve(self, right: Tensor) -> Tensor:
         """L^-1 b for b (size, n)."""
-        if self._is_one_column(right):
-            return self._substitute(_substitute_forward, right)
+        if self._is_for_kernel(right):
+            return self._substitute(right, transposed=False)
         out = right.clone()
         begin = 0
         # Rows above the first nonzero one stay zero.
@@ -189,8 +187,8 @@ class TiledCholesky:
 
     def solve_transposed(self, right: Tensor) -> Tensor:
         """L^-T b for b (size, n)."""
-        if self._is_one_column(right):
-            return self._substitute(_substitute_backward, right)
+        if self._is_for_kernel(right):
+            return self._substitute(right, transposed=True)
         out = right.clone()
         end = self.size - len(self.tip)
         out[end:] = torch.linalg.solve_triangular(self.tip.mT, out[end:], upper=True)
@@ -232,55 +230,6 @@ def factorise_tiles(matrix: TiledMatrix, hold_tip: bool = False) -> TiledCholesk
     elif not _factorise_tile(tip):
         return None
     return TiledCholesky(tuple(diagonal), tuple(panels), tuple(rows), tip, matrix.values, held)
-
-
-@kernel
-def _substitute_forward(factor: _Flat, out: FloatArray) -> None:
-    """Overwrite b with L^-1 b."""
-    values, at, rows, begin, size, tip = factor
-    for g in range(len(at)):
-        own = g * size
-        for i in range(size):
-            row = at[g] + i * size
-            rest = out[own + i]
-            for j in range(i):
-                rest -= values[row + j] * out[own + j]
-            out[own + i] = rest / values[row + i]
-        for k in range(begin[g], begin[g + 1]):
-            row = at[g] + (size + k - begin[g]) * size
-            rest = 0.0
-            for j in range(size):
-                rest += values[row + j] * out[own + j]
-            out[rows[k]] -= rest
-    own = len(out) - len(tip)
-    for i in range(len(tip)):
-        rest = out[own + i]
-        for j in range(i):
-            rest -= tip[i, j] * out[own + j]
-        out[own + i] = rest / tip[i, i]
-
-
-@kernel
-def _substitute_backward(factor: _Flat, out: FloatArray) -> None:
-    """Overwrite b with L^-T b."""
-    values, at, rows, begin, size, tip = factor
-    own = len(out) - len(tip)
-    for i in range(len(tip) - 1, -1, -1):
-        out[own + i] /= tip[i, i]
-        for j in range(i):
-            out[own + j] -= tip[i, j] * out[own + i]
-    for g in range(len(at) - 1, -1, -1):
-        own = g * size
-        for k in range(begin[g], begin[g + 1]):
-            row = at[g] + (size + k - begin[g]) * size
-            known = out[rows[k]]
-            for j in range(size):
-                out[own + j] -= values[row + j] * known
-        for i in range(size - 1, -1, -1):
-            row = at[g] + i * size
-            out[own + i] /= values[row + i]
-            for j in range(i):
-                out[own + j] -= values[row + j] * out[own + i]
 
 
 def _factorise_tile(tile: Tensor) -> bool:

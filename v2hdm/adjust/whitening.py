@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from v2hdm.adjust.engine import Engine, Linearised
+from v2hdm.adjust.engine import Linearised, TorchEngine
 from v2hdm.adjust.model import Estimate, Gradient, Loss
 from v2hdm.adjust.reduced import Coupled, Plan, ReducedSystem, Spread, from_tiles, to_tiles
 from v2hdm.adjust.tiles import TiledCholesky
@@ -39,7 +39,7 @@ JITTER_STEPS = (0.0, 1e-12, 1e-9, 1e-6, 1e-3)
 class Whitening:
     """The factorised Hessian at one estimate."""
 
-    engine: Engine  # of the problem
+    engine: TorchEngine  # of the problem
     plan: Plan  # tiles of the reduced system
     estimate: Estimate  # the point of linearisation, under ``robust``
     robust: Loss
@@ -125,7 +125,7 @@ def _less_kept(plan: Plan, corners: Tensor) -> Tensor:
 
 
 def factorise(
-    engine: Engine, plan: Plan, estimate: Estimate, robust: Loss, hold_cameras: bool = False
+    engine: TorchEngine, plan: Plan, estimate: Estimate, robust: Loss, hold_cameras: bool = False
 ) -> Whitening:
     """Whitening at ``estimate`` under the loss's weights there; held cameras' unknowns stay fixed.
 

@@ -53,11 +53,11 @@ def add_result(parser: argparse.ArgumentParser) -> None:
 
 
 @contextmanager
-def result_of(folder: Path, made: str, settings: Mapping[str, object]) -> Iterator[Path]:
+def result_of(folder: Path, maker: str, settings: Mapping[str, object]) -> Iterator[Path]:
     """The unfinished folder of a command's results, with the settings that they were made of."""
     from v2hdm.store.results import result_folder
 
-    with result_folder(folder, "--output", made) as unfinished:
+    with result_folder(folder, "--output", maker) as unfinished:
         (unfinished / "config.yaml").write_text(json.dumps(settings) + "\n", encoding="utf-8")
         yield unfinished
 

@@ -31,7 +31,7 @@ from v2hdm.io.description import DRIVE_FILE
 from v2hdm.safe.texts import read_yaml
 from v2hdm.settings import NO_KEY, settings_of
 
-_PACKAGE = Path(__file__).resolve().parents[1]
+_PACKAGE = Path(__file__).resolve().parents[1]  # the folder of v2hdm
 _Schema = TypeVar("_Schema")
 
 
@@ -107,10 +107,11 @@ def _compose(
 ) -> DictConfig:
     """``conf/<name>.yaml`` with overrides; groups are looked for in further folders, too."""
     register(name, schema)
-    places = ",".join("'file://" + str(one.resolve()).replace("'", "\\'") + "'" for one in folders)
+    places = ",".join("'file://" + str(folder.resolve()).replace("'", "\\'") + "'" for folder in folders)
+    searching = [f"hydra.searchpath=[{places}]"] if places else []
     GlobalHydra.instance().clear()
     with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return hydra.compose(name, [*([f"hydra.searchpath=[{places}]"] if places else []), *overrides])
+        return hydra.compose(name, [*searching, *overrides])
 
 
 def compose_run_file(path: Path, name: str, schema: type[Any], overrides: Sequence[str] = ()) -> DictConfig:
@@ -131,8 +132,10 @@ def compose_run_file(path: Path, name: str, schema: type[Any], overrides: Sequen
             return _compose(name, schema, [f"+run={run.stem}", *overrides], [Path(folder), *searched])
         except Exception as error:  # as in work_on
             # What the line does not name is the file's.
-            named = [one for one in overrides if one.lstrip("+~").split("=")[0] in str(error)]
-            line = _OF_COPY.sub("", str(explain(error, schema, named)))
+            of_line = [
+                override for override in overrides if override.lstrip("+~").split("=")[0] in str(error)
+            ]
+            line = _OF_COPY.sub("", str(explain(error, schema, of_line)))
             raise ConfigError(f"{path}: {line}") from error
 
 
@@ -146,7 +149,7 @@ def _check_own_files(folders: Sequence[Path], overrides: Sequence[str]) -> None:
     for folder in folders:
         if not folder.is_dir():
             raise ConfigError(f"--config-dir {folder}: no such folder")
-        for group, _, chosen in (one.lstrip("+").partition("=") for one in overrides):
+        for group, _, chosen in (override.lstrip("+").partition("=") for override in overrides):
             if (path := folder / group / f"{chosen}.yaml").is_file():
                 read_yaml(path, ConfigError)
                 if group == "run":
@@ -188,16 +191,19 @@ def explain(error: Exception, schema: type[Any], overrides: list[str]) -> Config
     key = re.search(r"full_key: (\S+)", f"{error}\n{root}")
     place = f" of {key.group(1)}" if key and key.group(1) not in message else ""
     if "missing EQUAL" in message:
-        bare = [one for one in overrides if "=" not in one and not one.startswith(("-", "~"))]
-        named = " ".join(bare[-1:]) or "an argument"
-        return ConfigError(f"configuration: '{named}' is not key=value; write drive.path={named}, see --help")
+        bare = [
+            override for override in overrides if "=" not in override and not override.startswith(("-", "~"))
+        ]
+        word = " ".join(bare[-1:]) or "an argument"
+        return ConfigError(f"configuration: '{word}' is not key=value; write drive.path={word}, see --help")
     # Of a long command line only what the message is about: the override that has the key it names.
-    about = [one for one in overrides if one.lstrip("+~").split("=")[0] in message + place]
-    where = f" (in {' '.join(about or overrides)})" if 0 < len(about or overrides) <= _FEW_OVERRIDES else ""
+    relevant = [override for override in overrides if override.lstrip("+~").split("=")[0] in message + place]
+    repeated = relevant or overrides
+    where = f" (in {' '.join(repeated)})" if 0 < len(repeated) <= _FEW_OVERRIDES else ""
     return ConfigError(f"configuration{where}: {message}{place}; {_advice(message, schema)}")
 
 
-_FEW_OVERRIDES = 3
+_FEW_OVERRIDES = 3  # an error repeats the command line up to so many overrides
 
 _NOISE = re.compile(
     r"(\^$|full_key|To append to your config|reference_type|object_type|Config search path|provider="
@@ -219,10 +225,10 @@ def _advice(message: str, schema: type[Any]) -> str:
     unknown = re.search(r"[Kk]ey '([\w.]+)' (?:not in|is not in)", message)
     if unknown:
         leaves = [key.name.split(".") for key in keys_of(schema)]
-        known = dict.fromkeys(".".join(one[:end]) for one in leaves for end in range(1, len(one) + 1))
+        keys = dict.fromkeys(".".join(parts[:end]) for parts in leaves for end in range(1, len(parts) + 1))
         leaf = unknown.group(1).split(".")[-1]
-        near = difflib.get_close_matches(leaf, {key.split(".")[-1] for key in known}, n=1)
-        names = [key for key in known if near and key.split(".")[-1] == near[0]]
+        similar = difflib.get_close_matches(leaf, {key.split(".")[-1] for key in keys}, n=1)
+        names = [key for key in keys if similar and key.split(".")[-1] == similar[0]]
         if names:
             return f"did you mean {' or '.join(names[:3])}?"
     return "--help lists the keys"
@@ -299,21 +305,21 @@ def _is_schema(kind: Any) -> bool:
 
 
 def _kind(hint: Any) -> str:
-    parts = [one for one in get_args(hint) if one is not type(None)]
+    parts = [part for part in get_args(hint) if part is not type(None)]
     for word, kind in (("dict", "mapping"), ("list", "list")):
         if word in str(hint):
             return kind
     if parts:
         return f"{_kind(parts[0])} or null"
     if isinstance(hint, type) and issubclass(hint, Enum):
-        return " or ".join(str(one.value) for one in hint)
+        return " or ".join(str(choice.value) for choice in hint)
     return "mapping" if _is_schema(hint) else _KINDS.get(getattr(hint, "__name__", ""), "any")
 
 
-def _default(one: Field[Any]) -> str:
-    if one.default is MISSING and one.default_factory is MISSING:
+def _default(field: Field[Any]) -> str:
+    if field.default is MISSING and field.default_factory is MISSING:
         return "required"
-    value = one.default if one.default_factory is MISSING else one.default_factory()
+    value = field.default if field.default_factory is MISSING else field.default_factory()
     if is_dataclass(value) or isinstance(value, dict):
         return ""
     text = str(value.value if isinstance(value, Enum) else value)

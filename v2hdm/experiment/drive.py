@@ -49,11 +49,11 @@ def drive_record(job: Job, progress: Progress, workers: int = 1) -> dict[str, An
             survey = take_survey(drive, options)
             key = read.contents.key(drive)
             try:
-                found = map_camera_sets(drive, key, detections, survey, None, context)
+                mapped_sets = map_camera_sets(drive, key, detections, survey, None, context)
             except (MappingError, AdjustError) as failure:
                 record["failures"].append([recipe, "all cameras", str(failure)])
             else:
-                _add(record, recipe, {name: one.methods for name, one in found.items()})
+                _add(record, recipe, {name: mapped.methods for name, mapped in mapped_sets.items()})
     progress("finished", 1, 1)
     return record
 
@@ -133,11 +133,13 @@ def measure(record: Mapping[str, Any]) -> Measured:
     matched: dict[str, Mapping[str, Matched]] = {}
     for cameras, by_row in record["maps"].items():
         maps = {row: by_row[row] for row in ROWS if row in by_row}
-        found = {row: _matched(hd_map, true, passed) for row, hd_map in maps.items()}
-        shared = set(range(len(true))).intersection(*(one.true.tolist() for one in found.values()))
+        matched_rows = {row: _matched(hd_map, true, passed) for row, hd_map in maps.items()}
+        shared = set(range(len(true))).intersection(
+            *(in_row.true.tolist() for in_row in matched_rows.values())
+        )
         expected = np.array(record["expected"][cameras], dtype=np.bool_)
-        rows[cameras] = {row: _row(maps[row], truth, expected, found[row], shared) for row in maps}
-        matched[cameras] = found
+        rows[cameras] = {row: _row(maps[row], truth, expected, matched_rows[row], shared) for row in maps}
+        matched[cameras] = matched_rows
     failures = tuple((recipe, cameras, text) for recipe, cameras, text in record["failures"])
     title, port, seed, started_from = (record[name] for name in ("title", "port", "seed", "started_from"))
     return Measured(title, port, seed, started_from, rows, matched, failures)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 _NAME = "v2hdm.paper"
-_PACKAGE = Path(__file__).resolve().parents[1]
+_PACKAGE = Path(__file__).resolve().parents[1]  # the folder of v2hdm
 
 
 def load_paper() -> Any:

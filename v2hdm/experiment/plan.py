@@ -89,14 +89,16 @@ def jobs(config: ExperimentConfig) -> list[Job]:
     options = {
         name: replace(deepcopy(config.mapping), device=config.device, **changed[name]) for name in recipes
     }
-    found: list[tuple[str, int | None, Site]] = []
+    drives: list[tuple[str, int | None, Site]] = []
     for seed in config.seeds:
         for port, site in config.ports.items():
             if site.simulate is not None:
-                found.append((port, seed, replace(site, simulate=replace(site.simulate, seed=seed))))
+                drives.append((port, seed, replace(site, simulate=replace(site.simulate, seed=seed))))
             elif seed == config.seeds[0]:
-                found.append((port, None, site))
-    return [Job(port, seed, site, config.detector, options, Path(config.cache)) for port, seed, site in found]
+                drives.append((port, None, site))
+    return [
+        Job(port, seed, site, config.detector, options, Path(config.cache)) for port, seed, site in drives
+    ]
 
 
 def _check(config: ExperimentConfig) -> None:

@@ -51,12 +51,14 @@ def _records(todo: Sequence[Job], workers: int, progress: DriveProgress) -> list
     if workers <= 1 or len(todo) == 1:
         return [drive_record(job, partial(progress, job.title), workers) for job in todo]
     records: dict[int, dict[str, Any]] = {}
-    for number, found in side_by_side(
-        drive_record, todo, workers, lambda job, *step: progress(job.title, *step)
-    ):
-        if isinstance(found, WorkerError):
-            raise found
-        records[number] = found
+
+    def advance(job: Job, task: str, done: int, total: int) -> None:
+        progress(job.title, task, done, total)
+
+    for number, record in side_by_side(drive_record, todo, workers, advance):
+        if isinstance(record, WorkerError):
+            raise record
+        records[number] = record
     return [records[number] for number in range(len(todo))]
 
 

@@ -36,14 +36,16 @@ def read_base(path: Path) -> Base:
             f"map.base: {path}: the verdict on its drive is FAIL, so nothing can be built on it; fix "
             "that drive first (docs/verdict.md)"
         )
-    if all(one.covariance_m2 is None or one.relative_sigma_m is None for one in hd_map.markings):
+    if all(marking.covariance_m2 is None or marking.relative_sigma_m is None for marking in hd_map.markings):
         raise MapFileError(
             f"map.base: {path}: states no uncertainty of its markings, like maps of older versions and "
             "naive methods; map its drive again"
         )
-    poses = [lay_flat(read_tum(one)).trajectory.map_from_vehicle for one in trajectories]
+    poses = [lay_flat(read_tum(trajectory)).trajectory.map_from_vehicle for trajectory in trajectories]
     left_out = read_exclusions(excluded) if excluded.is_file() else []
-    candidates = tuple((one.kind, one.position_map, one.sightings) for one in left_out)
+    candidates = tuple(
+        (exclusion.kind, exclusion.position_map, exclusion.sightings) for exclusion in left_out
+    )
     return Base(hd_map, np.concatenate([np.zeros((0, 4, 4)), *poses]), candidates)
 
 
@@ -55,7 +57,7 @@ def check_together(base: Base, drive: Drive, path: str) -> None:
             f"{drive.origin}: their coordinates differ; bring the drive's poses into the map's frame"
         )
     route = cKDTree(drive.route_map)
-    centres = np.array([one.corners_map.mean(axis=0) for one in base.hd_map.markings])
+    centres = np.array([marking.corners_map.mean(axis=0) for marking in base.hd_map.markings])
     nearest_m = float(route.query(centres)[0].min())
     if nearest_m > _SITE_M:
         raise MapFileError(
@@ -73,12 +75,12 @@ def grey_reader(drive: Drive) -> Callable[[Image], NDArray[np.float32]]:
 
 def changes_json(changes: Changes) -> dict[str, Any]:
     """The changes in ``metrics.json``: counts, and each change with its evidence."""
-    counted = Counter(one.fate for one in changes.changes)
+    count_of_fate = Counter(change.fate for change in changes.changes)
     return {
-        "counts": {"same": changes.same, **{fate.value: counted[fate] for fate in Fate}},
+        "counts": {"same": changes.same, **{fate.value: count_of_fate[fate] for fate in Fate}},
         "shift_m": changes.shift_m.tolist(),
-        "listed": [change_json(one) for fate in LISTED for one in changes.of(fate)],
-        "unsure": [change_json(one) for one in changes.changes if one.fate not in LISTED],
+        "listed": [change_json(change) for fate in LISTED for change in changes.of(fate)],
+        "unsure": [change_json(change) for change in changes.changes if change.fate not in LISTED],
     }
 
 

@@ -46,10 +46,10 @@ class DriveConfig(ReadOptions):
         if not self.path:
             return ()
         listed = self.path if isinstance(self.path, list) else [self.path]
-        wrong = [one for one in listed if not isinstance(one, str | Path) or not str(one)]
+        wrong = [path for path in listed if not isinstance(path, str | Path) or not str(path)]
         if wrong:
             raise ConfigError(f"drive.path: {wrong[0]!r} is not a path; give one, or a list: [monday,friday]")
-        return tuple(Path(one) for one in listed)
+        return tuple(Path(path) for path in listed)
 
 
 @dataclass(kw_only=True)
@@ -252,7 +252,7 @@ def made_of_drives(paths: Sequence[str]) -> str:
 
 def result_key(config: RunConfig, drives: Sequence[Drive], contents: Contents, code: str) -> str:
     """The key of a run's whole result: all that it depends on, and nothing else; ``code`` is the code's."""
-    asked = replace(
+    settings = replace(
         config, name=run_name(config), output="", cache="", cache_gb=0.0, resume=True,
         workers=0, drive=replace(config.drive, path=None, cache=""),
     )  # fmt: skip
@@ -260,11 +260,11 @@ def result_key(config: RunConfig, drives: Sequence[Drive], contents: Contents, c
     if config.map.base is not None:
         hd_map, trajectories, excluded = base_files(Path(config.map.base))
         files += [hd_map, *trajectories, excluded]
-    named = (config.mapping.survey.file, config.map.corrections, config.report.background)
-    files += [Path(one) for one in named if one is not None]
+    named_files = (config.mapping.survey.file, config.map.corrections, config.report.background)
+    files += [Path(file) for file in named_files if file is not None]
     truths = [drive.truth_dir for drive in drives if drive.truth_dir is not None]
     files += [path for truth in truths for path in sorted(truth.rglob("*"))]
-    read = [(str(path), file_digest(path)) for path in files if path.is_file()]
+    digests = [(str(path), file_digest(path)) for path in files if path.is_file()]
     of_drives = [contents.key(drive) for drive in drives]
     roots = [drive.root.resolve() for drive in drives]
-    return key_of(code, asked, model_key(config.detector), roots, of_drives, read)
+    return key_of(code, settings, model_key(config.detector), roots, of_drives, digests)

@@ -35,12 +35,12 @@ from v2hdm.records import CameraInfo
 from v2hdm.store.inputs import note_input
 
 ROUGH_MOUNTING = (1.6, 5.0, 60.0)  # height (m), pitch, horizontal field of view (deg) where nothing is known
-_UNKNOWN_PITCH_DEG = 8.0
-_STATED_PITCH_DEG = 4.0
-_ROLL_DEG = 1.5
-_LOG_FOCAL = 0.3
-"""Standard deviations of an assumed and of a stated pitch, of the roll, and of the logarithm of an assumed
-focal length: within one are lenses of 46 to 76 degrees."""
+_UNKNOWN_PITCH_DEG = 8.0  # standard deviation of a pitch that nobody states, deg
+_STATED_PITCH_DEG = 4.0  # standard deviation of a pitch that the user states, deg
+_ROLL_DEG = 1.5  # standard deviation of a camera's roll about zero, deg
+_LOG_FOCAL = (
+    0.3  # standard deviation of the log of an assumed focal length: lenses of 46 to 76 deg are within
+)
 
 _LOOKS = 6
 """Images of a folder that are looked at for its horizon: four photographs gave it to within 17 px, eight to
@@ -144,7 +144,7 @@ class _Rough:
     _estimate: MountingEstimate | None = None
     _road: RoadDetector | None = None
     _shown: int = 0
-    _said: bool = False
+    _is_said: bool = False
 
     def road(self, frame: Frame) -> RoadDetector:
         """The detector for the next image; it says what the mounting is taken to be.
@@ -154,7 +154,8 @@ class _Rough:
         """
         self._shown += 1
         if self._estimate is None:
-            info, prior = self._prior(*frame.pixels.shape[1::-1])
+            rows, columns = frame.pixels.shape[:2]
+            info, prior = self._prior(columns, rows)
             self._estimate = MountingEstimate(info, prior)
         if self._road is None or not (self.folder or self._shown & (self._shown - 1)):
             with lap("horizon"):
@@ -174,10 +175,17 @@ class _Rough:
         for frame in frames:
             if frame.pixels.shape[:2] == (info.height, info.width):
                 estimate.add(image_lines(self.detector.network, frame.pixels, info))
-        found = estimate.mounting
-        angles_deg = np.rad2deg([found.pitch_rad, found.fov_rad, found.roll_rad])
-        rough = rough_calibration(info.name, info.width, info.height, found.height_m, *angles_deg.tolist())
-        sigma = float(np.hypot(found.sigma_rad[0], BODY_SIGMA_RAD)), found.log_focal_sigma
+        mounting = estimate.mounting
+        rough = rough_calibration(
+            info.name,
+            info.width,
+            info.height,
+            mounting.height_m,
+            float(np.rad2deg(mounting.pitch_rad)),
+            float(np.rad2deg(mounting.fov_rad)),
+            float(np.rad2deg(mounting.roll_rad)),
+        )
+        sigma = float(np.hypot(mounting.sigma_rad[0], BODY_SIGMA_RAD)), mounting.log_focal_sigma
         camera = camera_from_calibration(replace(rough, info=info), self.linear, sigma)
         return RoadDetector(self.detector, camera)
 
@@ -194,10 +202,11 @@ class _Rough:
             fov_deg = float(2 * np.degrees(np.arctan(lens.width / 2 / lens.intrinsic[0, 0])))
         sigma_deg = _UNKNOWN_PITCH_DEG if self.mounting is None else _STATED_PITCH_DEG
         if self.mounting is None:
-            known = "no --camera" if lens is None else f"no mounting in {self.file}"
+            knowledge = "no --camera" if lens is None else f"no mounting in {self.file}"
             print(
-                f"{known}: taking it to be {height_m:g} m up, {pitch_deg:g} deg down, {fov_deg:.3g} deg wide"
-                ", unless the images show another horizon (set --mounting); positions in px only",
+                f"{knowledge}: taking it to be {height_m:g} m up, {pitch_deg:g} deg down, "
+                f"{fov_deg:.3g} deg wide, unless the images show another horizon (set --mounting); "
+                "positions in px only",
                 file=sys.stderr,
             )
         pitch_rad, fov_rad, sigma_rad, roll_rad = np.deg2rad([pitch_deg, fov_deg, sigma_deg, _ROLL_DEG])
@@ -206,12 +215,14 @@ class _Rough:
         rough = rough_calibration("camera", columns, rows, height_m, pitch_deg, fov_deg)
         return lens or rough.info, prior
 
-    def _say(self, frame: Frame, found: Mounting) -> None:
+    def _say(self, frame: Frame, mounting: Mounting) -> None:
         """Say once where the horizon is: of a folder at once, of a stream when that is known."""
-        if self._said or (found.sigma_rad[0] > _KNOWN_RAD and not self.folder):
+        if self._is_said or (mounting.sigma_rad[0] > _KNOWN_RAD and not self.folder):
             return
-        self._said = True
-        angles = np.rad2deg([found.pitch_rad, found.sigma_rad[0], found.roll_rad, found.sigma_rad[1]])
+        self._is_said = True
+        angles = np.rad2deg(
+            [mounting.pitch_rad, mounting.sigma_rad[0], mounting.roll_rad, mounting.sigma_rad[1]]
+        )
         pitch, pitch_sigma, roll, roll_sigma = angles.tolist()
         where = "the folder's images" if self.folder else f"{frame.name} and earlier images"
         print(
@@ -302,8 +313,8 @@ def _found(frames: _Frames, rough: _Rough, stopwatch: Stopwatch) -> Iterator[Det
                 return
             road = road or rough.road(frame)
             _check_size(frame, road)
-            found = road.detect(frame.pixels)
-        yield Detected(frame, road.camera.info.name, found)
+            on_road = road.detect(frame.pixels)
+        yield Detected(frame, road.camera.info.name, on_road)
 
 
 def _check_size(frame: Frame, road: RoadDetector) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,8 +18,15 @@ from v2hdm.report.metrics import driven_past, extrinsic_figures, headline, map_f
 CameraSets = Mapping[str, Mapping[str, MethodResult]]  # by cameras (front, both), then method
 
 
-def evaluate(drive: Drive, methods: CameraSets) -> tuple[dict[str, Any], list[str]]:
-    """Compare methods by camera set with the truth, if any: figures for ``metrics.json``, and sentences."""
+class Evaluation(NamedTuple):
+    """Figures for ``metrics.json``, and sentences for a reader."""
+
+    metrics: dict[str, Any]
+    headlines: list[str]
+
+
+def evaluate(drive: Drive, methods: CameraSets) -> Evaluation:
+    """Compare methods by camera set with the truth, if any."""
     truth = read_truth(drive) if has_truth(drive) else None
     results: dict[str, dict[str, Any]] = {}
     for name, by_method in methods.items():
@@ -36,14 +43,15 @@ def evaluate(drive: Drive, methods: CameraSets) -> tuple[dict[str, Any], list[st
         disturbed = ", ".join(f"{name} {value:g}" for name, value in truth.disturbances.items())
         headlines.insert(0, f"disturbances: {disturbed}")
     headlines += list(methods.values())[-1]["Opt"].certainty.values()
-    return metrics, headlines
+    return Evaluation(metrics, headlines)
 
 
 def _own_figures(result: MethodResult) -> dict[str, Any]:
     """The figures of a method that need no truth."""
     reasons = Counter(exclusion.reason for exclusion in result.excluded)
-    covariances = [one.covariance_m2 for one in result.hd_map.markings]
-    variance = [np.trace(one) / 8 for one in covariances if one is not None]  # of a corner's coordinate
+    covariances = [marking.covariance_m2 for marking in result.hd_map.markings]
+    # The mean variance of a corner's coordinate, by marking.
+    variance = [np.trace(covariance) / 8 for covariance in covariances if covariance is not None]
     figures: dict[str, Any] = {
         "excluded": len(result.excluded),
         "excluded_for": dict(reasons.most_common()),
@@ -53,7 +61,7 @@ def _own_figures(result: MethodResult) -> dict[str, Any]:
         figures["reprojection_rmse_px"] = result.reprojection_rmse_px
         figures["initial_reprojection_rmse_px"] = result.initial_reprojection_rmse_px
     if result.suspicions:
-        figures["suspicious"] = [asdict(one) | {"p": one.p} for one in result.suspicions]
+        figures["suspicious"] = [asdict(suspicion) | {"p": suspicion.p} for suspicion in result.suspicions]
     if result.diagnostics:
         figures["diagnostics"] = dict(result.diagnostics)
     return figures
@@ -70,20 +78,20 @@ def _extrinsics(drive: Drive, methods: CameraSets, truth: Truth | None) -> dict[
             camera = drive.cameras[name]
             initial = initial_extrinsic(camera)
             true = truth.cam_from_vehicle[name] if truth else None
-            found: dict[str, Any] = extrinsic_figures(calibration.cam_from_vehicle, initial, true)
-            found["certainty"] = optimised.certainty.get(name, "")
-            found |= _clocks(drive, optimised, name)
+            extrinsic: dict[str, Any] = extrinsic_figures(calibration.cam_from_vehicle, initial, true)
+            extrinsic["certainty"] = optimised.certainty.get(name, "")
+            extrinsic |= _clocks(drive, optimised, name)
             if optimised.evidence is not None and name in optimised.evidence.read_out_s:
                 read_out = optimised.evidence.read_out_s[name]
-                found |= dict(zip(("read_out_s", "read_out_sigma_s"), read_out, strict=True))
+                extrinsic |= dict(zip(("read_out_s", "read_out_sigma_s"), read_out, strict=True))
             if calibration.covariance is not None:
                 sigma = np.sqrt(np.diag(calibration.covariance))
-                found["translation_sigma_m"] = float(np.linalg.norm(sigma[:3]))
-                found["rotation_sigma_deg"] = float(np.rad2deg(np.linalg.norm(sigma[3:])))
+                extrinsic["translation_sigma_m"] = float(np.linalg.norm(sigma[:3]))
+                extrinsic["rotation_sigma_deg"] = float(np.rad2deg(np.linalg.norm(sigma[3:])))
             if name in figures:
-                figures[name]["alone"] = found
+                figures[name]["alone"] = extrinsic
             else:
-                figures[name] = found
+                figures[name] = extrinsic
     return figures
 
 

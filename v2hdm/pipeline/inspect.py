@@ -13,7 +13,7 @@ from v2hdm.ground.results import GROUND_IPM, GroundEstimate, GroundStatus, bette
 from v2hdm.io.drive import join_drives, with_clock_offsets
 from v2hdm.pipeline.config import Contents
 from v2hdm.pipeline.context import Context
-from v2hdm.records import Camera, Drive
+from v2hdm.records import Calibration, Camera, Drive
 from v2hdm.verdict import Finding, Status, clock_corrections, input_findings
 
 log = logging.getLogger(__name__)
@@ -24,14 +24,14 @@ class Inspection:
     """A drive as it is mapped, its cameras as it describes them, and all findings before the run."""
 
     drive: Drive  # clocks corrected by the ground, cameras where it puts them
-    given: Mapping[str, Camera]
+    described_cameras: Mapping[str, Camera]
     ground: tuple[Mapping[str, GroundEstimate], ...]  # by session and camera, what bare ground says
     findings: tuple[Finding, ...]
 
     @property
     def drive_as_described(self) -> Drive:
         """The drive with corrected clocks, and its cameras as they were described."""
-        return replace(self.drive, cameras=self.given)
+        return replace(self.drive, cameras=self.described_cameras)
 
 
 def inspect(drive: Drive, max_gap_s: float, workers: int, progress: Callable[[int, int], None]) -> Inspection:
@@ -74,39 +74,49 @@ def join(inspections: Sequence[Inspection]) -> Inspection:
         return inspections[0]
     moved = [
         (number, name)
-        for number, one in enumerate(inspections)
-        for name in one.given
-        if any(_has_moved(name, before, one) for before in inspections[:number])
+        for number, inspection in enumerate(inspections)
+        for name in inspection.described_cameras
+        if any(_has_moved(name, before, inspection) for before in inspections[:number])
     ]
-    given = join_drives([one.drive_as_described for one in inspections], moved)
-    drive = replace(given, cameras=_started(given, inspections))
+    described = join_drives([inspection.drive_as_described for inspection in inspections], moved)
+    drive = replace(described, cameras=_started(described, inspections))
     ground = []
     findings = []
-    for session, one in zip(drive.joined, inspections, strict=True):
-        ground.append({session.cameras[name]: estimate for name, estimate in one.ground[0].items()})
-        findings += [replace(finding, about=f"{finding.about} of {session.name}") for finding in one.findings]
-    return Inspection(drive, given.cameras, tuple(ground), tuple(findings))
+    for session, inspection in zip(drive.joined, inspections, strict=True):
+        ground.append({session.cameras[name]: estimate for name, estimate in inspection.ground[0].items()})
+        findings += [
+            replace(finding, about=f"{finding.about} of {session.name}") for finding in inspection.findings
+        ]
+    return Inspection(drive, described.cameras, tuple(ground), tuple(findings))
 
 
 def _started(drive: Drive, inspections: Sequence[Inspection]) -> dict[str, Camera]:
     """Each camera with the start that the ground gave it on the first session where it did."""
-    started = dict(drive.cameras)
-    for session, one in reversed(list(zip(drive.joined, inspections, strict=True))):
-        for own, name in session.cameras.items():
-            camera = one.drive.cameras[own]
+    cameras = dict(drive.cameras)
+    for session, inspection in reversed(list(zip(drive.joined, inspections, strict=True))):
+        for own_name, name in session.cameras.items():
+            camera = inspection.drive.cameras[own_name]
             if camera.initial_ipm == GROUND_IPM:
                 described = drive.cameras[name]
                 ipm = {**described.ipm, GROUND_IPM: camera.ipm[GROUND_IPM]}
-                started[name] = replace(described, ipm=ipm, initial_ipm=GROUND_IPM)
-    return started
+                cameras[name] = replace(described, ipm=ipm, initial_ipm=GROUND_IPM)
+    return cameras
 
 
 def _has_moved(camera: str, before: Inspection, after: Inspection) -> bool:
     """Whether the ground of two drives says that a camera sits elsewhere, by the odds of the drift alarm."""
-    found = [one.ground[0].get(camera) for one in (before, after)]
-    known = [one.calibration for one in found if one is not None and one.status is GroundStatus.FOUND]
-    sure = [one for one in known if one is not None and one.covariance is not None]
+    earlier = _calibration_of(camera, before)
+    later = _calibration_of(camera, after)
     try:
-        return len(sure) == 2 and movement(*sure).moved
+        return earlier is not None and later is not None and movement(earlier, later).moved
     except MapFileError:  # the lenses differ, which the descriptions say as well
         return False
+
+
+def _calibration_of(camera: str, inspection: Inspection) -> Calibration | None:
+    """A camera's calibration by bare ground, with its covariance; None where the ground gives none."""
+    estimate = inspection.ground[0].get(camera)
+    if estimate is None or estimate.status is not GroundStatus.FOUND:
+        return None
+    calibration = estimate.calibration
+    return calibration if calibration is not None and calibration.covariance is not None else None

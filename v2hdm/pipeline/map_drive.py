@@ -6,7 +6,7 @@ import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch  # noqa: F401  # its absence is reported before that of what is built on it
 
@@ -93,8 +93,8 @@ def map_drive(
     >>> result.verdict.status.value, result.calibrations["front"].cam_from_vehicle.shape
     ('PASS', (4, 4))
     """
-    kept = StageCache(None if cache is None else Path(cache))
-    context = context or Context(kept, progress, workers=workers)
+    stages = StageCache(None if cache is None else Path(cache))
+    context = context or Context(stages, progress, workers=workers)
     options = options or MappingOptions()
     reading = reading or ReadOptions()
     if corrections is not None:
@@ -106,13 +106,12 @@ def map_drive(
     earlier = _earlier(base, read.whole, context)
     survey = take_survey(read.whole, options)
     with context.timed("check"):
-        checked = join(inspect_each(read.drives, read.contents, reading.max_gap_s, context))
-    paths = [one.root if isinstance(one, Drive) else Path(one) for one in sources]
+        inspection = join(inspect_each(read.drives, read.contents, reading.max_gap_s, context))
+    paths = [source.root if isinstance(source, Drive) else Path(source) for source in sources]
     about = describe_run(name or read.whole.name, read.whole, paths, reading)
-    described = checked.drive_as_described
-    seconds = context.seconds
-    begun = Result(about, read.drives, read.contents, described, seconds, options.device)
-    return _mapped(begun, checked, detector, survey, earlier, accuracy_goal_cm, context)
+    described = inspection.drive_as_described
+    mapped_so_far = Result(about, read.drives, read.contents, described, context.seconds, options.device)
+    return _mapped(mapped_so_far, inspection, detector, survey, earlier, accuracy_goal_cm, context)
 
 
 def _earlier(base: Path | str | None, drive: Drive, context: Context) -> Base | None:
@@ -126,8 +125,8 @@ def _earlier(base: Path | str | None, drive: Drive, context: Context) -> Base | 
 
 
 def _mapped(
-    begun: Result,
-    checked: Inspection,
+    mapped_so_far: Result,
+    inspection: Inspection,
     detector: Detector | DetectorOptions | None,
     survey: Survey,
     earlier: Base | None,
@@ -140,25 +139,25 @@ def _mapped(
     settings = detector if isinstance(detector, DetectorOptions) else detector.options
     try:
         with compiled_meanwhile(survey.mapping.device):
-            detections = _detect(checked.drive, begun.contents, settings, context)
+            detections = _detect(inspection.drive, mapped_so_far.contents, settings, context)
         with context.timed("map"):
-            key = begun.contents.key(checked.drive)
-            sets = map_camera_sets(checked.drive, key, detections, survey, earlier, context)
+            key = mapped_so_far.contents.key(inspection.drive)
+            sets = map_camera_sets(inspection.drive, key, detections, survey, earlier, context)
         with context.timed("wear"):
-            sets = _with_wear(sets, checked.drive, earlier, context)
+            sets = _with_wear(sets, inspection.drive, earlier, context)
     except (MappingError, AdjustError) as failure:
-        if all(one.status is not Status.FAIL for one in checked.findings):
+        if all(finding.status is not Status.FAIL for finding in inspection.findings):
             raise
         failed = Finding("map", Status.FAIL, None, None, "", f"this drive gave no map: {failure}", "map")
-        verdict = Verdict.of([*checked.findings, failed])
-        return replace(begun, verdict=verdict, figures={"results": {}})
-    return _judge(begun, checked, detections, sets, survey, goal_cm, context)
+        verdict = Verdict.of([*inspection.findings, failed])
+        return replace(mapped_so_far, verdict=verdict, figures={"results": {}})
+    return _judge(mapped_so_far, inspection, detections, sets, survey, goal_cm, context)
 
 
 def read_all(sources: Sequence[Source], options: ReadOptions, context: Context) -> Read:
     """Read several drives and join them; raises DriveError."""
     with context.timed("read"):
-        drives = tuple(as_drive(one, options) for one in sources)
+        drives = tuple(as_drive(source, options) for source in sources)
         contents = Contents.of(drives)
     for drive in drives:
         _log.info("drive %s: %d images of %s", drive.name, len(drive.images), ", ".join(drive.cameras))
@@ -173,8 +172,8 @@ def _detect(
         _log.warning("%s", unknown)
     with context.timed("detect"):
         detections = detect_in_pieces(drive, contents, options, context, context.detect)
-    markings = sum(len(found.markings) for found in detections)
-    lanes = sum(len(found.lanes) for found in detections)
+    markings = sum(len(in_image.markings) for in_image in detections)
+    lanes = sum(len(in_image.lanes) for in_image in detections)
     _log.info("detected %d markings, %d pieces of lane paint in %d images", markings, lanes, len(detections))
     return detections
 
@@ -193,9 +192,13 @@ def _with_wear(
     threads = context.processes
     whole = best.residuals.whole_views()
     index = {drive.name_of(image.path): k for k, image in enumerate(drive.images)}
-    ids = (k if one.id is None else one.id for k, one in enumerate(best.hd_map.markings, start=1))
-    number = {one: k for k, one in enumerate(ids)}
-    shown = {(index[image], number[marking]) for image, marking in whole if marking in number}
+    number_of_id = {
+        number + 1 if marking.id is None else marking.id: number
+        for number, marking in enumerate(best.hd_map.markings)
+    }
+    shown = {
+        (index[image], number_of_id[marking_id]) for image, marking_id in whole if marking_id in number_of_id
+    }
     worn = with_wear(
         best.hd_map, drive.images, poses, best.calibrations, grey, shown, before, threads, best.surface
     )
@@ -205,31 +208,40 @@ def _with_wear(
 
 def _judge(
     result: Result,
-    checked: Inspection,
+    inspection: Inspection,
     detections: Sequence[ImageDetections],
     sets: dict[str, MappedSet],
     survey: Survey,
     goal_cm: float,
     context: Context,
 ) -> Result:
-    methods = {name: one.methods for name, one in sets.items()}
+    methods = {name: mapped.methods for name, mapped in sets.items()}
     best = list(methods.values())[-1][BEST]
-    compared = list(sets.values())[-1].checked
+    check_points = list(sets.values())[-1].checked
     with context.timed("judge"):
-        found = check_result(checked.drive, methods, checked.ground)
-        unfit = check_known_sizes(survey.mapping.known_sizes, best)
-        unfit += check_corrections(survey.mapping.acceptance.corrections, best)
+        result_findings = check_result(inspection.drive, methods, inspection.ground)
+        unfit_findings = check_known_sizes(survey.mapping.known_sizes, best)
+        unfit_findings += check_corrections(survey.mapping.acceptance.corrections, best)
         frame = "survey" if best.diagnostics["control_points"] else "poses"
-        reached = check_goal(best, goal_cm / 100, frame)
-        surveyed = check_survey(survey, best, compared)
-        before = over_ground(checked.findings, best, survey.mapping.ground == AUTO)
-        verdict = Verdict.of([*before, *found, *unfit, *surveyed, *reached])
+        goal_findings = check_goal(best, goal_cm / 100, frame)
+        survey_findings = check_survey(survey, best, check_points)
+        input_findings = over_ground(inspection.findings, best, survey.mapping.ground == AUTO)
+        verdict = Verdict.of(
+            [*input_findings, *result_findings, *unfit_findings, *survey_findings, *goal_findings]
+        )
     with context.timed("evaluate"):
         metrics, headlines = evaluate(result.drive, methods)
     changes = {} if best.changes is None else {"changes": changes_json(best.changes)}
     figures = {**metrics, **changes, "seconds": context.seconds}
-    if compared is not None:
-        figures["check_points"] = compared.figures()
-        headlines.append(compared.headline)
-    judged: dict[str, Any] = {"verdict": verdict, "figures": figures, "headlines": headlines}
-    return replace(result, **judged, detections=tuple(detections), methods=methods, check_points=compared)
+    if check_points is not None:
+        figures["check_points"] = check_points.figures()
+        headlines.append(check_points.headline)
+    return replace(
+        result,
+        verdict=verdict,
+        figures=figures,
+        headlines=headlines,
+        detections=tuple(detections),
+        methods=methods,
+        check_points=check_points,
+    )

@@ -138,8 +138,8 @@ class Result:
         from v2hdm.store.results import result_folder
 
         outputs = Outputs(formats=formats, all_maps=all_maps, mosaic=mosaic, crs=crs)
-        made = made_of_drives(self.about["drive"]["paths"])
-        with result_folder(Path(folder), "folder", made) as unfinished:
+        maker = made_of_drives(self.about["drive"]["paths"])
+        with result_folder(Path(folder), "folder", maker) as unfinished:
             write_result(self, unfinished, outputs, Context(seconds=self.seconds))
         return Path(folder)
 

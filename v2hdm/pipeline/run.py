@@ -90,8 +90,8 @@ def take_or_make(config: RunConfig, work: Work, take: bool, progress: Progress) 
     stages = StageCache(Path(config.cache), config.resume)
     if isinstance(output, RemoteFolder):
         return _take_or_upload(config, output, stages, work, take, progress)
-    there = finished(config, stages) if take else None
-    return (work(config, stages), False) if there is None else (there, True)
+    earlier = finished(config, stages) if take else None
+    return (work(config, stages), False) if earlier is None else (earlier, True)
 
 
 def note_finished(result: RunResult, key: str, cache: StageCache) -> None:
@@ -107,8 +107,8 @@ def finished(config: RunConfig, cache: StageCache) -> RunResult | None:
         entry = _noted(folder, cache)
         if entry is None:
             return None
-        now = files_of_result(folder)  # a report may have been made again, and a mosaic added
-        if not is_whole(folder, {name: now.get(name, "") for name in entry.files}):
+        files = files_of_result(folder)  # a report may have been made again, and a mosaic added
+        if not is_whole(folder, {name: files.get(name, "") for name in entry.files}):
             return None
         if not _is_of(config, entry.key):
             return None
@@ -143,24 +143,24 @@ def _take_or_upload(
     take_name(name, "name", ConfigError)
     place = output.below(name)
     folder = Path(config.cache) / _UPLOADS / key_of(output.url)[:16]
-    if take and (there := _finished_at(place, config)) is not None:
-        return there, True
+    if take and (earlier := _finished_at(place, config)) is not None:
+        return earlier, True
     writer = f"{HOST}, {key_of(folder.resolve())[:8]}"
     remote.refuse_upload(place, writer)  # what is not ours is reported before any work
     local = replace(config, output=str(folder))
-    made = (finished(local, cache) if take else None) or work(local, cache)
-    there = _finished_at(place, config) if take else None  # of who was faster
-    with locked_folder(made.folder):
-        if there is None:
-            entry = _noted(made.folder, cache)
+    result = (finished(local, cache) if take else None) or work(local, cache)
+    earlier = _finished_at(place, config) if take else None  # of who was faster
+    with locked_folder(result.folder):
+        if earlier is None:
+            entry = _noted(result.folder, cache)
             record = {} if entry is None else {_RECORD: encode(entry)}
-            contents = remote.contents_of(made.folder) | record
+            contents = remote.contents_of(result.folder) | record
             remote.upload(place, contents, writer, partial(progress, "upload"))
-        drop_result(made.folder)
+        drop_result(result.folder)
     with suppress(OSError):  # other results wait there for their upload
         folder.rmdir()
         folder.parent.rmdir()
-    return (replace(made, url=place.url), False) if there is None else (there, True)
+    return (replace(result, url=place.url), False) if earlier is None else (earlier, True)
 
 
 def _finished_at(place: RemoteFolder, config: RunConfig) -> RunResult | None:
@@ -205,12 +205,12 @@ def made_of(config: RunConfig) -> str:
     """Name a run and its drives: only such a run replaces its result; ``config`` is the user's own."""
     if config.simulate is not None:
         return f"v2hdm map of the rendered {config.simulate.name}"
-    given = config.drive.path if isinstance(config.drive.path, list) else [config.drive.path]
-    return made_of_drives([str(Path(one).resolve()) for one in given if one])
+    paths = config.drive.path if isinstance(config.drive.path, list) else [config.drive.path]
+    return made_of_drives([str(Path(path).resolve()) for path in paths if path])
 
 
 def map_and_save(
-    config: RunConfig, cache: StageCache, config_yaml: str, context: Context, made: str
+    config: RunConfig, cache: StageCache, config_yaml: str, context: Context, maker: str
 ) -> RunResult:
     """Do what :func:`run` says, with what ``cache`` keeps, in place of an earlier result of the same."""
     from v2hdm.pipeline.map_drive import map_drive  # torch and much else, which takes seconds
@@ -221,15 +221,17 @@ def map_and_save(
     with cache.in_use():
         for path in () if config.map.base is None else base_files(Path(config.map.base))[:1]:
             note_input(path)  # before any work is done for nothing
-        with result_folder(place, maker=made) as folder, logging_to(log_file(folder / LOG)):
+        with result_folder(place, maker=maker) as folder, logging_to(log_file(folder / LOG)):
             _log.info("v2hdm %s, run %s", __version__, name)
             (folder / CONFIG).write_text(config_yaml or f"{config!r}\n", encoding="utf-8")
 
             def accept(drive: Drive) -> None:
-                check_crs(config.crs, [one for one in config.export if one != "geojson"], drive.origin, "crs")
+                check_crs(
+                    config.crs, [name for name in config.export if name != "geojson"], drive.origin, "crs"
+                )
 
             context = replace(context, cache=cache, workers=config.workers, accept=accept)
-            found = map_drive(
+            mapped = map_drive(
                 _drive_folders(config, context),
                 name=name,
                 options=config.mapping,
@@ -240,7 +242,7 @@ def map_and_save(
                 accuracy_goal_cm=config.accuracy_goal_cm,
                 context=context,
             )
-            key = result_key(config, found.drives, found.contents, context.cache.key())
+            key = result_key(config, mapped.drives, mapped.contents, context.cache.key())
             outputs = Outputs(
                 formats=config.export,
                 all_maps=config.all_maps,
@@ -248,10 +250,10 @@ def map_and_save(
                 crs=config.crs,
                 background=config.report.background,
             )
-            write_result(found, folder, outputs, context)
-            for line in found.verdict.lines:
+            write_result(mapped, folder, outputs, context)
+            for line in mapped.verdict.lines:
                 _log.info("%s", line)
-        result = RunResult(place, found.metrics, found.headlines, found.verdict)
+        result = RunResult(place, mapped.metrics, mapped.headlines, mapped.verdict)
         note_finished(result, key, cache)
         prune_to_limit(Path(config.cache), config.cache_gb)
     return result

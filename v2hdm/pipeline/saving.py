@@ -145,8 +145,8 @@ def write_trajectories(poses: AdjustedPoses, drive: Drive, folder: Path) -> None
             recorded, _ = interpolate(session.recorded, stamp_s, float("inf"))
         write_tum(Trajectory(stamp_s, recorded @ moved), folder / poses_file)
         rows = [
-            f"{stamp:.9f},{int(seen)}," + ",".join(f"{value:.6g}" for value in sigma)
-            for stamp, seen, sigma in zip(
+            f"{stamp:.9f},{int(is_seen)}," + ",".join(f"{value:.6g}" for value in sigma)
+            for stamp, is_seen, sigma in zip(
                 stamp_s, poses.seen[is_in_session], poses.sigma[is_in_session], strict=True
             )
         ]
@@ -192,7 +192,7 @@ def _save_overlay(path: Path, drive: Drive, image: Image, best: MethodResult) ->
 def _fullest_image(drive: Drive, name: str, detections: Sequence[ImageDetections]) -> Image:
     """The image of a camera in which most corners were found; its first one where there are none."""
     corners = {index: 0 for index, image in enumerate(drive.images) if image.camera == name}
-    for found in detections:
-        if found.image in corners:
-            corners[found.image] = sum(int(marking.corner_valid.sum()) for marking in found.markings)
+    for in_image in detections:
+        if in_image.image in corners:
+            corners[in_image.image] = sum(int(marking.corner_valid.sum()) for marking in in_image.markings)
     return drive.images[max(corners, key=corners.__getitem__)]

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import parent_process
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,22 +74,26 @@ def detect_in_pieces(
     if len(todo) < total:
         _log.info("detections in %d of %d images reused from an earlier run", total - len(todo), total)
     progress(total - len(todo), total)
-    begun: _Piece = []
+    piece_so_far: _Piece = []
     done = 0
 
-    def take(found: ImageDetections) -> None:
+    def take(detections: ImageDetections) -> None:
         nonlocal done
         done += 1
-        start = found.image - found.image % PIECE
-        begun.append(replace(found, image=found.image - start))
-        if len(begun) == min(PIECE, total - start):
-            pieces[start] = cache.put(_DETECT, keys[start], _Piece, begun)
-            begun.clear()
+        start = detections.image - detections.image % PIECE
+        piece_so_far.append(replace(detections, image=detections.image - start))
+        if len(piece_so_far) == min(PIECE, total - start):
+            pieces[start] = cache.put(_DETECT, keys[start], _Piece, piece_so_far)
+            piece_so_far.clear()
         progress(total - len(todo) + done, total)
 
     if todo:
         (detect or detect_images)(drive, options, todo, context.processes, take)
-    return [replace(one, image=start + one.image) for start, piece in pieces.items() for one in piece or ()]
+    return [
+        replace(detections, image=start + detections.image)
+        for start, piece in pieces.items()
+        for detections in piece or ()
+    ]
 
 
 def _keys(drive: Drive, contents: Contents, detector_key: str) -> dict[int, str]:
@@ -98,8 +102,8 @@ def _keys(drive: Drive, contents: Contents, detector_key: str) -> dict[int, str]
     keys = {}
     for start in range(0, len(drive.images), PIECE):
         images = drive.images[start : start + PIECE]
-        known = [cameras[image.camera] for image in images]
-        keys[start] = key_of(detector_key, known, contents.of_images(images))
+        camera_keys = [cameras[image.camera] for image in images]
+        keys[start] = key_of(detector_key, camera_keys, contents.of_images(images))
     return keys
 
 
@@ -141,38 +145,54 @@ def map_camera_sets(
     """
     cache = context.cache
     sets = camera_sets(drive)
-    begun = cache.key(drive_key, list(detections), survey.mapping)
+    common_key = cache.key(drive_key, list(detections), survey.mapping)
     *single, last = sets
-    keys = {name: cache.key(begun, name, sets[name], None) for name in single}
-    keys[last] = cache.key(begun, last, sets[last], (base, survey.check))
-    known = {name: cache.get(_MAP, key, MappedSet) for name, key in keys.items()}
-    found = {name: mapped for name, mapped in known.items() if mapped is not None}
-    context.progress("map", len(found), len(sets))
+    keys = {name: cache.key(common_key, name, sets[name], None) for name in single}
+    keys[last] = cache.key(common_key, last, sets[last], (base, survey.check))
+    cached = {name: cache.get(_MAP, key, MappedSet) for name, key in keys.items()}
+    mapped_sets = {name: mapped for name, mapped in cached.items() if mapped is not None}
+    context.progress("map", len(mapped_sets), len(sets))
 
-    def take(made: tuple[str, MappedSet, list[Line]]) -> None:
-        name, mapped, lines = made
-        found[name] = cache.put(_MAP, keys[name], MappedSet, mapped, lines)
-        context.progress("map", len(found), len(sets))
+    def take(outcome: _Outcome) -> None:
+        name = outcome.name
+        mapped_sets[name] = cache.put(_MAP, keys[name], MappedSet, outcome.mapped, outcome.lines)
+        context.progress("map", len(mapped_sets), len(sets))
 
     work = _Work(drive, detections, survey, base, last)
     # The largest first, so that processes end together.
     todo = [
-        (name, sets[name]) for name in sorted(sets, key=lambda name: -len(sets[name])) if name not in found
+        _Job(name, sets[name])
+        for name in sorted(sets, key=lambda name: -len(sets[name]))
+        if name not in mapped_sets
     ]
-    is_large = sum(len(one.markings) for one in detections) > _WORTH_PROCESSES
+    is_large = sum(len(in_image.markings) for in_image in detections) > _WORTH_PROCESSES
     if len(todo) > 1 and context.processes > 1 and survey.mapping.device == "cpu" and is_large:
-        for _, made in side_by_side(work, todo, context.processes, lambda *_: None):
-            if isinstance(made, WorkerError):
-                raise made
-            log_again(made[2])
-            take(made)
+        for _, outcome in side_by_side(work, todo, context.processes, lambda *_: None):
+            if isinstance(outcome, WorkerError):
+                raise outcome
+            log_again(outcome.lines)
+            take(outcome)
     else:
         for job in todo:
             take(work(job))
-    return {name: found[name] for name in sets}
+    return {name: mapped_sets[name] for name in sets}
 
 
-_Job = tuple[str, Sequence[str]]  # the name of a set, and its cameras
+class _Job(NamedTuple):
+    """A set of cameras to map."""
+
+    name: str
+    cameras: Sequence[str]
+
+
+class _Outcome(NamedTuple):
+    """A set of cameras that was mapped, and what was logged."""
+
+    name: str
+    mapped: MappedSet
+    lines: list[Line]
+
+
 _WORTH_PROCESSES = 4000  # detected markings whose mapping takes as long as processes take to start
 
 
@@ -186,12 +206,13 @@ class _Work:
     base: Base | None
     last: str
 
-    def __call__(self, job: _Job, _: Progress = silent) -> tuple[str, MappedSet, list[Line]]:
-        """Map one set of cameras; returns its name, the result and what was logged."""
+    def __call__(self, job: _Job, _: Progress = silent) -> _Outcome:
+        """Map one set of cameras."""
         if parent_process() is not None:
             logging.getLogger("v2hdm").setLevel(logging.DEBUG)
         with recorded() as lines:
-            return job[0], self._map(*job), lines
+            mapped = self._map(job.name, job.cameras)
+        return _Outcome(job.name, mapped, lines)
 
     def _map(self, name: str, cameras: Sequence[str]) -> MappedSet:
         begin_s = time.perf_counter()

@@ -46,7 +46,7 @@ LIBRARIES = (
 _HEAD = b"v2hdm entry 1\n"  # an entry's first bytes: what it is, and the version of its layout
 _START = len(_HEAD) + hashlib.sha256().digest_size  # bytes before an entry's content: head and digest
 
-_PACKAGE = Path(__file__).parents[1]
+_PACKAGE = Path(__file__).parents[1]  # the folder of this package
 _CODE = {".py", ".yaml", ".json", ".onnx", ".html", ".js", ".css"}
 """Files of the package that decide what comes out: sources, catalogue, weights, templates."""
 
@@ -136,7 +136,9 @@ class StageCache:
     """
 
     def __init__(self, folder: Path | None, resume: bool = True) -> None:
-        self.folder, self._resume, self._can_write = folder, resume, folder is not None
+        self.folder = folder
+        self._resume = resume
+        self._can_write = folder is not None
         self.hits: list[str] = []
         """Stages whose entries were there."""
 

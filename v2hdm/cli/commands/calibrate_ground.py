@@ -22,7 +22,7 @@ def _run(arguments: Sequence[str]) -> int:
     with result_of(folder, f"v2hdm calibrate ground of {parsed.drive.resolve()}", settings) as unfinished:
         calibrated = calibrate_from_ground(drive, workers=parsed.workers, progress=steps_of("match ground"))
         write_ground_calibration(calibrated, unfinished)
-    print(*summary_lines(calibrated), f"results in {folder}", sep="\n")
+    print("\n".join([*summary_lines(calibrated), f"results in {folder}"]))
     return exit_code(calibrated.verdict)
 
 

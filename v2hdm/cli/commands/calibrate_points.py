@@ -52,7 +52,7 @@ def _run(arguments: Sequence[str]) -> int:
     settings = {**files, "image": None if parsed.image is None else str(parsed.image), **sigmas}
     with result_of(folder, f"v2hdm calibrate points of {parsed.points.resolve()}", settings) as unfinished:
         write_point_calibration(calibrated, unfinished, image)
-    print(*summary_lines(calibrated), f"results in {folder}", sep="\n")
+    print("\n".join([*summary_lines(calibrated), f"results in {folder}"]))
     return exit_code(calibrated.verdict)
 
 

@@ -18,9 +18,9 @@ def _run(arguments: Sequence[str]) -> int:
     parser.add_argument("--no-ground", dest="ground", action="store_false", help="skip bare ground: faster")
     parser.add_argument("--list-topics", action="store_true", help="only print a bag's topics and drive.yaml")
     written = "write a drive.yaml for a bag, video or image folder"
-    wanted = "with --write: values that it asks for"
+    values = "with --write: values that it asks for"
     parser.add_argument("--write", type=Path, metavar="DIR", help=written)
-    parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="KEY=VALUE", help=wanted)
+    parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="KEY=VALUE", help=values)
     parser.add_argument("--all", action="store_true", help="also print passed checks")
     parsed = parser.parse_args(arguments)
     if parsed.list_topics:
@@ -42,7 +42,8 @@ def _run(arguments: Sequence[str]) -> int:
 
         if missing := draft_drive(parsed.drive, parsed.write, parsed.set):
             asked = [f"  --set {key}=... {why}" for key, why in missing.items()]
-            print(f"error: {parsed.drive}: nothing written; also give:", *asked, sep="\n", file=sys.stderr)
+            problem = f"error: {parsed.drive}: nothing written; also give:"
+            print("\n".join([problem, *asked]), file=sys.stderr)
             return EXIT_USER_ERROR
         print(f"{parsed.write / 'drive.yaml'} written", file=sys.stderr)
         parsed.drive = parsed.write
@@ -57,7 +58,8 @@ def _run(arguments: Sequence[str]) -> int:
         write_json(unfinished / VERDICT, verdict.as_json())
         draw_check(drive, unfinished, ground)
     passed = [finding.line for finding in verdict.passed if parsed.all]
-    print(*passed, *verdict.lines[1:], verdict.lines[0], f"pictures in {folder}", sep="\n")
+    summary, *findings = verdict.lines
+    print("\n".join([*passed, *findings, summary, f"pictures in {folder}"]))
     return exit_code(verdict)
 
 

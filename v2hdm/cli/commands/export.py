@@ -46,7 +46,7 @@ def _run(arguments: Sequence[str]) -> None:
             source = os.path.relpath(parsed.source.resolve(), folder.resolve())  # both may be moved together
             with listed_files(folder, "--output", f"v2hdm export of {source}") as check:
                 files = export(parsed, folder, check)
-            print(*files, sep="\n")
+            print("\n".join(map(str, files)))
     except BrokenPipeError:  # the reader of our output has had enough
         raise
     except OSError as error:
@@ -118,8 +118,10 @@ def _export_calibration(parsed: argparse.Namespace, folder: Path, *_: object) ->
     _refuse_crs(parsed, "a calibration has no position on the earth")
     unknown = [name for name in parsed.format if name not in CALIBRATION_FORMATS]
     if unknown:
-        known = ", ".join(CALIBRATION_FORMATS)
-        raise ConfigError(f"--format: unknown format '{unknown[0]}' for a calibration; choose from: {known}")
+        formats = ", ".join(CALIBRATION_FORMATS)
+        raise ConfigError(
+            f"--format: unknown format '{unknown[0]}' for a calibration; choose from: {formats}"
+        )
     calibration = read_calibration(parsed.source)
     about = read_provenance(parsed.source)
     camera = calibration.info.name

@@ -21,8 +21,8 @@ def _run(arguments: Sequence[str]) -> None:
 
     drive = single_drive_of(parsed.result, parsed.drive, "labels are")
     folder = parsed.output or Path("outputs") / f"{drive.name}-labels"
-    made = f"v2hdm labels of {parsed.result.resolve()}"
-    with result_of(folder, made, {"result": str(parsed.result), "range_m": parsed.range}) as unfinished:
+    maker = f"v2hdm labels of {parsed.result.resolve()}"
+    with result_of(folder, maker, {"result": str(parsed.result), "range_m": parsed.range}) as unfinished:
         counts = write_labels(parsed.result, drive, unfinished, parsed.range, steps_of("label images"))
     print(
         f"{counts['shown']} labels in {counts['images']} images, {counts['unsure']} of uncertain visibility; "

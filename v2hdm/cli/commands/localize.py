@@ -30,11 +30,11 @@ def _run(arguments: Sequence[str]) -> int:
     drive = drive_of(parsed)
     folder = parsed.output or Path("outputs") / f"{drive.name}-localized"
     settings = {"map": str(parsed.map), "drive": str(parsed.drive), "cameras": list(drive.cameras)}
-    made = f"v2hdm localize of {parsed.drive.resolve()} in {path.resolve()}"
-    with result_of(folder, made, settings) as unfinished:
+    maker = f"v2hdm localize of {parsed.drive.resolve()} in {path.resolve()}"
+    with result_of(folder, maker, settings) as unfinished:
         located = localize(hd_map, drive, calibrations, workers=parsed.workers, progress=steps_of("images"))
         write_localised(located, drive, unfinished)
-    print(*summary_lines(located), f"results in {folder}", sep="\n")
+    print("\n".join([*summary_lines(located), f"results in {folder}"]))
     return 0 if located.explained else EXIT_FAILED_VERDICT
 
 

@@ -1,10 +1,11 @@
-"""Lanes between lane lines that run beside each other, and how one goes over into the next."""
+"""Lanes between lane lines that run beside each other, and how one lane continues in the next."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,18 +17,25 @@ LANE_WIDTH_M = (2.55, 5.1)
 farther apart have room for two."""
 
 _LONGEST_CONNECTION_M = 40.0
-"""Ways from lane to lane that are longer are no longer evident from the line that bounds both: the taper of a
-lane that begins at 50 km/h is 30 to 40 m long (RASt 06, 6.1.4)."""
+"""Longest way from lane to lane of which the line that bounds both is evidence: the taper of a lane that
+begins at 50 km/h is 30 to 40 m long (RASt 06, 6.1.4)."""
 
-_AT_ONCE = 64  # neighbouring vertices that are compared with the segments around them together
+_AT_ONCE = 64  # neighbouring vertices that are compared with the segments around them at once; chosen
+
+
+class Bound(NamedTuple):
+    """A stretch of a line on one side of a lane, in the lane's direction."""
+
+    line: int  # number of the line
+    order: IntArray  # (N,) vertices of the line
 
 
 @dataclass(frozen=True)
 class ClosedLane:
-    """A stretch of a lane between two lines, each its number and vertices, in the first one's direction."""
+    """A stretch of a lane between two lines, in the direction of the one with the smaller number."""
 
-    left: tuple[int, IntArray]
-    right: tuple[int, IntArray]
+    left: Bound
+    right: Bound
 
 
 @dataclass(frozen=True)
@@ -40,8 +48,8 @@ class Connection:
 
     before: int
     after: int
-    left: tuple[int, IntArray] | None
-    right: tuple[int, IntArray] | None
+    left: Bound | None
+    right: Bound | None
 
 
 def connections(lanes: Sequence[ClosedLane], lines_map: Sequence[FloatArray]) -> list[Connection]:
@@ -50,13 +58,15 @@ def connections(lanes: Sequence[ClosedLane], lines_map: Sequence[FloatArray]) ->
     Lanes that end where no line of theirs goes on, as at a crossing, are left unconnected: nothing that is
     painted says how they continue.
     """
-    found = {}
+    connection_of_pair = {}
     for side in ("left", "right"):
         for before, after in _next_along(lanes, side).items():
-            bounds = {one: _bound_between(lanes[before], lanes[after], one) for one in ("left", "right")}
-            if _is_way(lanes[before], lanes[after], bounds[side], lines_map):
-                found[before, after] = Connection(before, after, **bounds)
-    return [found[key] for key in sorted(found)]
+            left = _bound_between(lanes[before], lanes[after], "left")
+            right = _bound_between(lanes[before], lanes[after], "right")
+            shared = left if side == "left" else right
+            if _is_way(lanes[before], lanes[after], shared, lines_map):
+                connection_of_pair[before, after] = Connection(before, after, left, right)
+    return [connection_of_pair[pair] for pair in sorted(connection_of_pair)]
 
 
 def _next_along(lanes: Sequence[ClosedLane], side: str) -> dict[int, int]:
@@ -76,32 +86,30 @@ def _next_along(lanes: Sequence[ClosedLane], side: str) -> dict[int, int]:
     return after
 
 
-def _bound_between(before: ClosedLane, after: ClosedLane, side: str) -> tuple[int, IntArray] | None:
+def _bound_between(before: ClosedLane, after: ClosedLane, side: str) -> Bound | None:
+    """The line on one ``side`` from the end of a lane to the start of another; None where there is no gap."""
     (line, end) = getattr(before, side)
     (other, start) = getattr(after, side)
     turn = 1 if end[-1] > end[0] else -1
     if line != other or (start[0] - end[-1]) * turn <= 0:
         return None
-    return line, np.arange(end[-1], start[0] + turn, turn)
+    return Bound(line, np.arange(end[-1], start[0] + turn, turn))
 
 
 def _is_way(
-    before: ClosedLane,
-    after: ClosedLane,
-    shared: tuple[int, IntArray] | None,
-    lines_map: Sequence[FloatArray],
+    before: ClosedLane, after: ClosedLane, shared: Bound | None, lines_map: Sequence[FloatArray]
 ) -> bool:
     """Whether the stretch of line that two lanes share is a lane's way, with both sides in its direction."""
     if shared is None:  # the lanes touch, or part where they touch
         return False
-    line, order = shared
-    stretch = lines_map[line][order]
+    stretch = lines_map[shared.line][shared.order]
     way = stretch[-1] - stretch[0]
     gaps = [
-        lines_map[start[0]][start[1][0]] - lines_map[end[0]][end[1][-1]]
+        lines_map[start.line][start.order[0]] - lines_map[end.line][end.order[-1]]
         for end, start in ((before.left, after.left), (before.right, after.right))
     ]
-    return bool(length_along(stretch)[-1] <= _LONGEST_CONNECTION_M and all(gap @ way > 0 for gap in gaps))
+    is_short = length_along(stretch)[-1] <= _LONGEST_CONNECTION_M
+    return bool(is_short and all(gap @ way > 0 for gap in gaps))
 
 
 def closed_lanes(lines_map: Sequence[FloatArray]) -> list[ClosedLane]:
@@ -114,8 +122,8 @@ def closed_lanes(lines_map: Sequence[FloatArray]) -> list[ClosedLane]:
     cuts = [_Cuts(line) for line in lines_map]
     for run in runs:
         for end in (0, -1):
-            cuts[run.line].at(run.own[end])
-            cuts[run.other].at(run.met[end])
+            cuts[run.line].at(run.vertices[end])
+            cuts[run.other].at(run.other_vertices[end])
     while sum(run.cut_alike(cuts) for run in runs):
         pass
     return [lane for run in runs for lane in run.lanes(cuts)]
@@ -139,39 +147,42 @@ class _Cuts:
 
 @dataclass(frozen=True)
 class _Run:
-    """Vertices ``own`` (N,) of a ``line`` near those ``met`` (N,) of an ``other`` on one ``side``."""
+    """A stretch of a line beside an ``other`` one."""
 
     line: int
-    own: IntArray
+    vertices: IntArray  # (N,) of the line, rising by one
     other: int
-    met: IntArray
-    side: int
+    other_vertices: IntArray  # (N,) of the other line, nearest across from each
+    side: int  # on which the other line lies: 1 left, -1 right
 
     def cut_alike(self, cuts: Sequence[_Cuts]) -> bool:
-        """Cut each line where the other is; whether there was anything to do."""
+        """Cut each line where the other one is cut; returns whether a cut was added."""
         before = len(cuts[self.line].vertices) + len(cuts[self.other].vertices)
         for vertex in cuts[self.line].vertices:
-            if self.own[0] < vertex < self.own[-1]:
-                cuts[self.other].at(self.met[vertex - self.own[0]])
+            if self.vertices[0] < vertex < self.vertices[-1]:
+                cuts[self.other].at(self.other_vertices[vertex - self.vertices[0]])
         for vertex in cuts[self.other].vertices:
-            if self.met.min() < vertex < self.met.max():
-                cuts[self.line].at(self.own[np.argmin(np.abs(self.met - vertex))])
+            if self.other_vertices.min() < vertex < self.other_vertices.max():
+                nearest = np.argmin(np.abs(self.other_vertices - vertex))
+                cuts[self.line].at(self.vertices[nearest])
         return len(cuts[self.line].vertices) + len(cuts[self.other].vertices) > before
 
     def lanes(self, cuts: Sequence[_Cuts]) -> list[ClosedLane]:
         """The lanes between one cut and the next."""
-        first, last = (cuts[self.line].at(self.own[end]) for end in (0, -1))
-        own = [vertex for vertex in cuts[self.line].vertices if first <= vertex <= last]
-        places = np.clip(np.array(own) - self.own[0], 0, len(self.met) - 1)
-        met = [cuts[self.other].at(vertex) for vertex in self.met[places]]
+        first = cuts[self.line].at(self.vertices[0])
+        last = cuts[self.line].at(self.vertices[-1])
+        line_cuts = [vertex for vertex in cuts[self.line].vertices if first <= vertex <= last]
+        places = np.clip(np.array(line_cuts) - self.vertices[0], 0, len(self.other_vertices) - 1)
+        other_cuts = [cuts[self.other].at(vertex) for vertex in self.other_vertices[places]]
         lanes = []
-        for (begin, end), (start, stop) in zip(pairwise(own), pairwise(met), strict=True):
+        for (begin, end), (start, stop) in zip(pairwise(line_cuts), pairwise(other_cuts), strict=True):
             if start == stop:
                 continue
             turn = 1 if start < stop else -1
-            own_bound = (self.line, np.arange(begin, end + 1))
-            bounds = (own_bound, (self.other, np.arange(start, stop + turn, turn)))
-            lanes.append(ClosedLane(*(bounds if self.side < 0 else bounds[::-1])))
+            bound = Bound(self.line, np.arange(begin, end + 1))
+            other_bound = Bound(self.other, np.arange(start, stop + turn, turn))
+            is_right = self.side < 0
+            lanes.append(ClosedLane(bound, other_bound) if is_right else ClosedLane(other_bound, bound))
         return lanes
 
 
@@ -183,26 +194,35 @@ def _runs(lines_map: Sequence[FloatArray]) -> list[_Run]:
         if len(line) < 2:
             continue
         for side in (1, -1):
-            other, nearest, gap_m = segments.across(number, line, side)
-            for begin, end in _stretches(other, gap_m):
-                if other[begin] < number:  # found from there
+            across = segments.across(number, line, side)
+            for begin, end in _stretches(across.line, across.gap_m):
+                other = int(across.line[begin])
+                if other < number:  # this pair was looked at from the other line
                     continue
                 run = slice(begin, end + 1)
-                met = lines_map[other[begin]][nearest[run]]
-                if min(length_along(line[run])[-1], length_along(met)[-1]) > gap_m[run].max():
-                    own = np.arange(begin, end + 1)
-                    runs.append(_Run(number, own, int(other[begin]), nearest[run], side))
+                beside = lines_map[other][across.vertex[run]]
+                length_m = min(length_along(line[run])[-1], length_along(beside)[-1])
+                if length_m > across.gap_m[run].max():
+                    runs.append(_Run(number, np.arange(begin, end + 1), other, across.vertex[run], side))
     return runs
+
+
+class _Across(NamedTuple):
+    """What lies across from each of N vertices of a line."""
+
+    line: IntArray  # (N,) number of the line first met, -1 for none
+    vertex: IntArray  # (N,) its vertex nearest to the place
+    gap_m: FloatArray  # (N,) distance to it, the upper LANE_WIDTH_M for none
 
 
 @dataclass(frozen=True)
 class _Segments:
-    """All lines' segments: both ends (S, 2) m, the line that each is of, and its place along it."""
+    """The S segments of all lines."""
 
-    start: FloatArray
-    end: FloatArray
-    line: IntArray
-    index: IntArray
+    start: FloatArray  # (S, 2) m
+    end: FloatArray  # (S, 2) m
+    line: IntArray  # (S,) number of the line that each is of
+    index: IntArray  # (S,) number of each along its line
 
     @classmethod
     def of(cls, lines_map: Sequence[FloatArray]) -> _Segments:
@@ -213,8 +233,8 @@ class _Segments:
         index = np.concatenate([np.arange(0), *map(np.arange, counts)])
         return cls(start, end, np.repeat(np.arange(len(lines_map)), counts), index)
 
-    def across(self, number: int, line: FloatArray, side: int) -> tuple[IntArray, IntArray, FloatArray]:
-        """The line first met left (1) or right (-1) of each vertex (N,), -1 for none; its vertex; m away."""
+    def across(self, number: int, line: FloatArray, side: int) -> _Across:
+        """What is met first left (1) or right (-1) of each vertex of a line (N, 2)."""
         tangent = np.gradient(line, axis=0)
         normal = side * turned_left(tangent)
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
@@ -222,20 +242,21 @@ class _Segments:
             self._met(number, line[at : at + _AT_ONCE], normal[at : at + _AT_ONCE])
             for at in range(0, len(line), _AT_ONCE)
         ]
-        other, nearest, gap_m = zip(*pieces, strict=True)
-        return np.concatenate(other), np.concatenate(nearest), np.concatenate(gap_m)
+        return _Across(
+            line=np.concatenate([piece.line for piece in pieces]),
+            vertex=np.concatenate([piece.vertex for piece in pieces]),
+            gap_m=np.concatenate([piece.gap_m for piece in pieces]),
+        )
 
-    def _met(
-        self, number: int, places: FloatArray, away: FloatArray
-    ) -> tuple[IntArray, IntArray, FloatArray]:
+    def _met(self, number: int, places: FloatArray, away: FloatArray) -> _Across:
         """The result of :meth:`across` for neighbouring places (N, 2) and directions ``away`` (N, 2)."""
         low = places.min(axis=0) - LANE_WIDTH_M[1]
         high = places.max(axis=0) + LANE_WIDTH_M[1]
-        near = (np.maximum(self.start, self.end) >= low) & (np.minimum(self.start, self.end) <= high)
-        candidates = np.flatnonzero(near.all(axis=1) & (self.line != number))
+        in_reach = (np.maximum(self.start, self.end) >= low) & (np.minimum(self.start, self.end) <= high)
+        candidates = np.flatnonzero(in_reach.all(axis=1) & (self.line != number))
         if not len(candidates):
             nothing = np.zeros(len(places), dtype=np.int64)
-            return nothing - 1, nothing, np.full(len(places), LANE_WIDTH_M[1])
+            return _Across(nothing - 1, nothing, np.full(len(places), LANE_WIDTH_M[1]))
         ahead = []
         beside = []
         for ends in (self.start, self.end):
@@ -251,12 +272,20 @@ class _Segments:
         met_at = candidates[best]
         gap_m = met_m[rows, best]
         reached = gap_m < LANE_WIDTH_M[1]
-        nearest = self.index[met_at] + np.rint(np.where(reached, part[rows, best], 0.0)).astype(np.int64)
-        return np.where(reached, self.line[met_at], -1), nearest, np.where(reached, gap_m, LANE_WIDTH_M[1])
+        nearest_end = np.rint(np.where(reached, part[rows, best], 0.0)).astype(np.int64)
+        return _Across(
+            line=np.where(reached, self.line[met_at], -1),
+            vertex=self.index[met_at] + nearest_end,
+            gap_m=np.where(reached, gap_m, LANE_WIDTH_M[1]),
+        )
 
 
 def _stretches(other: IntArray, gap_m: FloatArray) -> list[tuple[int, int]]:
     """First and last vertex of each run that meets the same line at a lane's width."""
     meets = np.where(gap_m > LANE_WIDTH_M[0], other, -1)
-    runs = [(key, list(group)) for key, group in groupby(range(len(meets)), key=lambda k: int(meets[k]))]
-    return [(run[0], run[-1]) for key, run in runs if key >= 0 and len(run) > 1]
+    stretches = []
+    for line, group in groupby(range(len(meets)), key=lambda vertex: int(meets[vertex])):
+        vertices = list(group)
+        if line >= 0 and len(vertices) > 1:
+            stretches.append((vertices[0], vertices[-1]))
+    return stretches

@@ -28,11 +28,10 @@ from v2hdm.store.files import (
 ACCEPTED = "accepted"
 REJECTED = "rejected"
 CORRECTED = "corrected"
-SIGMA_M = 0.02  # how well a person places a corner beside the others of its marking, m: a pixel of a mosaic
+SIGMA_M = 0.02  # sigma of a corner that a person places beside the others of its marking, m: a mosaic's pixel
 
 _HEAD = "# Corrections of a map by a person: map.corrections=THIS FILE in the next run (docs/report.md).\n"
-_MOST = 100_000
-
+_MOST = 100_000  # entries that a file of corrections may have; chosen
 
 _KIND_AND_OUTLINE_MAP = (
     "kind and outline_map are its class and corners (N, 2), m, in the map that they saw, one point if "
@@ -70,54 +69,54 @@ def read_corrections(path: Path) -> list[Correction]:
     entries = content["corrections"]
     if not isinstance(entries, list) or len(entries) > _MOST:
         raise MapFileError(f"{path}: corrections: expected a list; see docs/report.md")
-    return [correction_of(one, f"{path}: corrections[{number}]") for number, one in enumerate(entries)]
+    return [correction_of(entry, f"{path}: corrections[{number}]") for number, entry in enumerate(entries)]
 
 
-def correction_of(entry: object, where: str) -> Correction:
+def correction_of(content: object, where: str) -> Correction:
     """One entry, checked; raises MapFileError."""
-    found = take_mapping(entry, where, MapFileError)
+    entry = take_mapping(content, where, MapFileError)
     optional = ("marking", "new_class", "moved", "sigma_m", "reason")
-    check_keys(found, ("says", "class", "outline_map"), optional, where, MapFileError)
-    outline = take_array(found["outline_map"], (-1, 2), f"{where}: outline_map", MapFileError)
-    says = take_choice(found["says"], (ACCEPTED, REJECTED, CORRECTED), f"{where}: says", MapFileError)
+    check_keys(entry, ("says", "class", "outline_map"), optional, where, MapFileError)
+    outline = take_array(entry["outline_map"], (-1, 2), f"{where}: outline_map", MapFileError)
+    says = take_choice(entry["says"], (ACCEPTED, REJECTED, CORRECTED), f"{where}: says", MapFileError)
     moved: dict[int, list[float]] = {}
-    for corner, place in take_mapping(found.get("moved") or {}, f"{where}: moved", MapFileError).items():
+    for corner, place in take_mapping(entry.get("moved") or {}, f"{where}: moved", MapFileError).items():
         number = int(corner) if str(corner).isdecimal() else 0
         if len(outline) != 4 or not 1 <= number <= 4:
             raise MapFileError(f"{where}: moved: no corner {corner}; quadrilaterals have 1 to 4")
         moved[number] = take_array(place, (2,), f"{where}: moved: {corner}", MapFileError).tolist()
-    sigma_m = take_number(found.get("sigma_m", SIGMA_M), f"{where}: sigma_m", MapFileError)
+    sigma_m = take_number(entry.get("sigma_m", SIGMA_M), f"{where}: sigma_m", MapFileError)
     if not len(outline) or not 0 < sigma_m <= 1:
         raise MapFileError(f"{where}: needs a point in outline_map, and sigma_m above 0 and at most 1 m")
-    marking = found.get("marking")
-    new = found.get("new_class")
+    marking = entry.get("marking")
+    new = entry.get("new_class")
     return Correction(
         says=says,
-        kind=take_text(found["class"], f"{where}: class", MapFileError),
+        kind=take_text(entry["class"], f"{where}: class", MapFileError),
         outline_map=outline.tolist(),
         marking=None if marking is None else int(take_number(marking, f"{where}: marking", MapFileError)),
         new_kind=None if new is None else take_text(new, f"{where}: new_class", MapFileError),
         moved=moved,
         sigma_m=sigma_m,
-        reason=str(found.get("reason") or ""),
+        reason=str(entry.get("reason") or ""),
     )
 
 
 def write_corrections(corrections: Sequence[Correction], result: str, path: Path) -> None:
     """Write corrections of a ``result``, whole."""
-    content = {"result": result, "corrections": [entry_of(one) for one in corrections]}
+    content = {"result": result, "corrections": [entry_of(correction) for correction in corrections]}
     replace_text(path, _HEAD + dump_yaml(content))
 
 
-def entry_of(one: Correction) -> dict[str, Any]:
+def entry_of(correction: Correction) -> dict[str, Any]:
     """An entry as it is written."""
-    entry: dict[str, Any] = {"says": one.says, "class": one.kind}
-    named = {"marking": one.marking, "new_class": one.new_kind, "reason": one.reason}
+    entry: dict[str, Any] = {"says": correction.says, "class": correction.kind}
+    named = {"marking": correction.marking, "new_class": correction.new_kind, "reason": correction.reason}
     entry |= {key: value for key, value in named.items() if value}
-    entry["outline_map"] = [_rounded(place) for place in one.outline_map]
-    if one.moved:
-        moved = {corner: _rounded(place) for corner, place in sorted(one.moved.items())}
-        entry |= {"moved": moved, "sigma_m": one.sigma_m}
+    entry["outline_map"] = [_rounded(place) for place in correction.outline_map]
+    if correction.moved:
+        moved = {corner: _rounded(place) for corner, place in sorted(correction.moved.items())}
+        entry |= {"moved": moved, "sigma_m": correction.sigma_m}
     return entry
 
 

@@ -43,24 +43,24 @@ class Residuals:
         return len(self.row_image)
 
     def whole_views(self) -> set[tuple[str, int]]:
-        """The images, by path, that show all four corners of a marking of the map, and its id."""
+        """Pairs of an image, by path, and the id of a marking of the map whose four corners it shows."""
         pairs = np.column_stack([self.row_image, self.marking])[self.is_point & (self.marking > 0)]
         views, corners = np.unique(pairs, axis=0, return_counts=True)
         return {(self.image[image], marking) for image, marking in views[corners == 4].tolist()}
 
     def renamed(self, marking: IntArray, corner: IntArray) -> Residuals:
-        """The same with other ids (M,) of markings 1 to M, 0 for none, and other corners (M, 4)."""
-        known = self.marking > 0
-        of = np.maximum(self.marking - 1, 0)
+        """The same with new ids (M,) for markings 1 to M, 0 for none, and new corner numbers (M, 4)."""
+        has_id = self.marking > 0
+        row = np.maximum(self.marking - 1, 0)
         return replace(
             self,
-            marking=np.where(known, np.append(marking, 0)[of], 0),
-            corner=np.where(known, np.vstack([corner, np.arange(4)])[of, self.corner], self.corner),
+            marking=np.where(has_id, np.append(marking, 0)[row], 0),
+            corner=np.where(has_id, np.vstack([corner, np.arange(4)])[row, self.corner], self.corner),
         )
 
 
 def write_residuals(residuals: Residuals, path: Path) -> None:
-    """Write ``residuals`` to ``path``, atomically, a row an observation."""
+    """Write ``residuals`` to ``path``, atomically, one row for each observation."""
     rows: list[Sequence[object]] = [COLUMNS]
     for k, i in enumerate(residuals.row_image.tolist()):
         u, v = residuals.observed_px[k]
@@ -83,9 +83,9 @@ def read_residuals(path: Path) -> Residuals:
     numbers = []
     for line, row in enumerate(rows[1:], start=2):
         try:
-            image, camera, taken_s, marking, *rest = row
+            image, camera, taken_s, marking, *figures = row
             number, _, _ = images.setdefault(image, (len(images), camera, float(taken_s)))
-            numbers.append([float(marking or 0), *(float(value) for value in rest)])
+            numbers.append([float(marking or 0), *(float(figure) for figure in figures)])
             if len(numbers[-1]) != len(COLUMNS) - 3:
                 raise ValueError
         except ValueError:
@@ -95,8 +95,18 @@ def read_residuals(path: Path) -> Residuals:
     cameras = tuple(camera for _, camera, _ in images.values())
     stamps = np.array([stamp for _, _, stamp in images.values()])
     ids, corners = table[:, :2].astype(np.int64).T
-    known = (np.array(row_image, dtype=np.int64), ids, corners - 1, table[:, 2] > 0)
-    return Residuals(tuple(images), cameras, stamps, *known, table[:, 3:5], table[:, 5:7], table[:, 7])
+    return Residuals(
+        image=tuple(images),
+        camera=cameras,
+        taken_s=stamps,
+        row_image=np.array(row_image, dtype=np.int64),
+        marking=ids,
+        corner=corners - 1,
+        is_point=table[:, 2] > 0,
+        observed_px=table[:, 3:5],
+        residual_px=table[:, 5:7],
+        distance_sigma=table[:, 7],
+    )
 
 
 def write_exclusions(
@@ -104,11 +114,16 @@ def write_exclusions(
 ) -> None:
     """Write a FeatureCollection of points, atomically; ``cameras`` names the camera set of each."""
     features = []
-    for number, one in enumerate(excluded):
-        place = one.position_map.reshape(1, 2)
+    for number, exclusion in enumerate(excluded):
+        place = exclusion.position_map.reshape(1, 2)
         heights = None if road is None else ground_height_m(road, place)
-        properties = {"id": number, "class": one.kind, "reason": one.reason, "sightings": one.sightings}
-        properties |= {"cameras": one.cameras, "position_map": one.position_map.tolist()}
+        properties = {
+            "id": number,
+            "class": exclusion.kind,
+            "reason": exclusion.reason,
+            "sightings": exclusion.sightings,
+        }
+        properties |= {"cameras": exclusion.cameras, "position_map": exclusion.position_map.tolist()}
         (position,) = geojson_positions(place, heights, origin)
         features.append(geojson_feature(f"excluded/{number}", "Point", position, properties))
     write_features(path, features, origin, {})

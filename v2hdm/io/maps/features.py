@@ -20,12 +20,14 @@ OUTLINE = "outline_map"
 Heights = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 """Heights (N,) of points (N, 2), m, and their standard deviations (N,)."""
 
-T = TypeVar("T", Marking, Lane, Symbol)
-PAINT = ("paint_left", "paint_left_sigma", "paint_left_change", "paint_left_change_sigma")
-"""Properties of the paint that a marking has left: its share, what that was off an earlier map's, sigmas."""
+_Paint = Marking | Lane | Symbol
+_PaintT = TypeVar("_PaintT", Marking, Lane, Symbol)
 
-_ALONG_M = 3.0  # stations within about this of the nearest one share in a point's height: noise averages out
-_AT_ONCE = 1024  # points whose distances to all stations are held in memory together
+PAINT = ("paint_left", "paint_left_sigma", "paint_left_change", "paint_left_change_sigma")
+"""Properties of the paint that a marking has left: its share, the change since an earlier map, and sigmas."""
+
+_ALONG_M = 3.0  # distance within which stations share in a point's height, m: noise averages out; chosen
+_AT_ONCE = 1024  # points whose distances to all stations are held in memory at once; chosen
 
 
 @dataclass(frozen=True)
@@ -91,25 +93,35 @@ class Feature:
 
 def features_of(hd_map: HDMap) -> list[Feature]:
     """Markings, lanes, then symbols, each with its own id: that which it has, else the next free one."""
-    everything: list[Any] = [*hd_map.markings, *hd_map.lanes, *hd_map.symbols]
-    ids = unique_ids([one.id or 0 for one in everything], hd_map.largest_id)
-    features = []
-    for one, number in zip(everything, ids, strict=True):
-        if isinstance(one, Symbol):
-            points = one.outline_map
-            more = dict[str, Any](symbol=True, place_sigma_m=one.sigma_m)
-            more["covariance_m2"] = one.covariance_m2
-        elif isinstance(one, Lane):
-            points = one.points_map
-            more = {"vertex_sigma_m": one.sigma_m}
-        else:
-            sigma_m = one.relative_sigma_m
-            points = one.corners_map
-            more = {"covariance_m2": one.covariance_m2, "relative_sigma_m": sigma_m, "paint": one.paint}
-        closed = not isinstance(one, Lane)
-        more["heights_sigma_m"] = one.heights_sigma_m
-        features.append(Feature(number, one.kind, points, one.sightings, closed, one.heights_m, **more))
-    return features
+    paints: list[_Paint] = [*hd_map.markings, *hd_map.lanes, *hd_map.symbols]
+    ids = unique_ids([paint.id or 0 for paint in paints], hd_map.largest_id)
+    return [_feature_of(paint, number) for paint, number in zip(paints, ids, strict=True)]
+
+
+def _feature_of(paint: _Paint, number: int) -> Feature:
+    """A marking, lane or symbol as the feature of that ``number``."""
+    feature = Feature(
+        id=number,
+        kind=paint.kind,
+        points_map=_points_of(paint),
+        sightings=paint.sightings,
+        closed=not isinstance(paint, Lane),
+        heights_m=paint.heights_m,
+        heights_sigma_m=paint.heights_sigma_m,
+    )
+    if isinstance(paint, Lane):
+        return replace(feature, vertex_sigma_m=paint.sigma_m)
+    feature = replace(feature, covariance_m2=paint.covariance_m2)
+    if isinstance(paint, Symbol):
+        return replace(feature, symbol=True, place_sigma_m=paint.sigma_m)
+    return replace(feature, relative_sigma_m=paint.relative_sigma_m, paint=paint.paint)
+
+
+def _points_of(paint: _Paint) -> FloatArray:
+    """The corners, vertices or outline (N, 2) of a marking, lane or symbol."""
+    if isinstance(paint, Symbol):
+        return paint.outline_map
+    return paint.points_map if isinstance(paint, Lane) else paint.corners_map
 
 
 def map_of(features: Sequence[Feature], ids: Sequence[int], origin: GeodeticOrigin | None) -> HDMap:
@@ -117,16 +129,43 @@ def map_of(features: Sequence[Feature], ids: Sequence[int], origin: GeodeticOrig
     markings: list[Marking] = []
     lanes: list[Lane] = []
     symbols: list[Symbol] = []
-    for one, number in zip(features, ids, strict=True):
-        own = (one.kind, one.points_map, one.sightings)
-        if one.symbol:
-            symbol = Symbol(*own, one.place_sigma_m, one.heights_m, number, one.heights_sigma_m)
-            symbols.append(replace(symbol, covariance_m2=one.covariance_m2))
-        elif one.closed:
-            marking = Marking(*own, one.covariance_m2, one.relative_sigma_m, one.heights_m, number)
-            markings.append(replace(marking, paint=one.paint, heights_sigma_m=one.heights_sigma_m))
+    for feature, number in zip(features, ids, strict=True):
+        if feature.symbol:
+            symbol = Symbol(
+                kind=feature.kind,
+                outline_map=feature.points_map,
+                sightings=feature.sightings,
+                sigma_m=feature.place_sigma_m,
+                heights_m=feature.heights_m,
+                id=number,
+                heights_sigma_m=feature.heights_sigma_m,
+                covariance_m2=feature.covariance_m2,
+            )
+            symbols.append(symbol)
+        elif feature.closed:
+            marking = Marking(
+                kind=feature.kind,
+                corners_map=feature.points_map,
+                sightings=feature.sightings,
+                covariance_m2=feature.covariance_m2,
+                relative_sigma_m=feature.relative_sigma_m,
+                heights_m=feature.heights_m,
+                id=number,
+                paint=feature.paint,
+                heights_sigma_m=feature.heights_sigma_m,
+            )
+            markings.append(marking)
         else:
-            lanes.append(Lane(*own, one.heights_m, number, one.vertex_sigma_m, one.heights_sigma_m))
+            lane = Lane(
+                kind=feature.kind,
+                points_map=feature.points_map,
+                sightings=feature.sightings,
+                heights_m=feature.heights_m,
+                id=number,
+                sigma_m=feature.vertex_sigma_m,
+                heights_sigma_m=feature.heights_sigma_m,
+            )
+            lanes.append(lane)
     return HDMap(tuple(markings), tuple(lanes), origin, tuple(symbols))
 
 
@@ -144,7 +183,7 @@ def unique_ids(ids: Sequence[int], largest: int = 0) -> list[int]:
 
 def properties_of(feature: Feature) -> dict[str, Any]:
     """The properties of a feature in files, besides its geometry; arrays are lists."""
-    known = {
+    properties = {
         "id": feature.id,
         "class": feature.kind,
         "sightings": feature.sightings,
@@ -159,7 +198,7 @@ def properties_of(feature: Feature) -> dict[str, Any]:
     }
     return {
         key: value.tolist() if isinstance(value, np.ndarray) else value
-        for key, value in known.items()
+        for key, value in properties.items()
         if value is not None
     }
 
@@ -167,24 +206,25 @@ def properties_of(feature: Feature) -> dict[str, Any]:
 def with_heights(hd_map: HDMap, road: Road | None, surface: Heights | None = None) -> HDMap:
     """``hd_map`` with the height of every corner and vertex; as it is without a ``road`` or ``surface``.
 
-    What has heights already, of an earlier drive, keeps them. ``surface`` gives the heights (N,) of the
-    ground at points (N, 2) above the road's planes, with their standard deviations.
+    Features that have heights already, of an earlier drive, keep them. ``surface`` gives the heights (N,) of
+    the ground at points (N, 2) above the road's planes, with their standard deviations.
     """
     if road is None and surface is None:
         return hd_map
 
-    def raised(one: T, points_map: FloatArray) -> T:
-        if one.heights_m is not None:
-            return one
+    def raised(paint: _PaintT) -> _PaintT:
+        if paint.heights_m is not None:
+            return paint
+        points_map = _points_of(paint)
         heights_m = np.zeros(len(points_map)) if road is None else ground_height_m(road, points_map)
         above_m, sigma_m = (0.0, None) if surface is None else surface(points_map)
-        return replace(one, heights_m=heights_m + above_m, heights_sigma_m=sigma_m)
+        return replace(paint, heights_m=heights_m + above_m, heights_sigma_m=sigma_m)
 
     return replace(
         hd_map,
-        markings=tuple(raised(one, one.corners_map) for one in hd_map.markings),
-        lanes=tuple(raised(one, one.points_map) for one in hd_map.lanes),
-        symbols=tuple(raised(one, one.outline_map) for one in hd_map.symbols),
+        markings=tuple(raised(marking) for marking in hd_map.markings),
+        lanes=tuple(raised(lane) for lane in hd_map.lanes),
+        symbols=tuple(raised(symbol) for symbol in hd_map.symbols),
     )
 
 

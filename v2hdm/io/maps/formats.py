@@ -32,12 +32,12 @@ from v2hdm.surface.strips import write_ground_geotiff, write_opencrg
 _log = logging.getLogger(__name__)
 
 APPLICATION = "V2HDM"
-_TEXT = 1000
-_REAL = 1040
-_WHOLE = 1071
-"""Group codes of extended data (DXF reference, "Extended data"): string, real, whole number of 32 bits."""
+# Group codes of extended data (DXF reference, "Extended data"):
+_TEXT = 1000  # group code of a string
+_REAL = 1040  # group code of a real number
+_WHOLE = 1071  # group code of a whole number of 32 bits
 
-_COLOURS = 6  # AutoCAD's first colours, red to magenta, take turns
+_COLOURS = 6  # number of AutoCAD colours, 1 (red) to 6 (magenta), that the layers take in turn
 
 
 def write_dxf(hd_map: HDMap, path: Path, grid: Grid | None = None) -> None:
@@ -77,7 +77,7 @@ COLUMNS: tuple[str, ...] = (
     *("id", "class", "point", "x_map_m", "y_map_m", "height_m"),
     *("longitude_deg", "latitude_deg", "ellipsoidal_height_m"),
     *("sigma_x_m", "sigma_y_m", "sigma_z_m", "sightings", "relative_sigma_m"),
-    *(f"cov_{own}_{other}{k}_m2" for own in "xy" for k in range(1, 5) for other in "xy"),
+    *(f"cov_{axis}_{other}{k}_m2" for axis in "xy" for k in range(1, 5) for other in "xy"),
     *PAINT,
 )
 """``point`` counts from 1 along the feature. ``cov_x_y3_m2`` is the covariance of this point's x with the y
@@ -110,15 +110,14 @@ def _rows(feature: Feature, origin: GeodeticOrigin | Grid | None) -> list[list[A
     paint = [properties_of(feature).get(name, "") for name in PAINT]
     rows = []
     for k, (x, y) in enumerate(feature.points_map.tolist()):
-        z, sigma_z = (
-            "" if one is None else float(one[k]) for one in (feature.heights_m, feature.heights_sigma_m)
-        )
+        z = "" if feature.heights_m is None else float(feature.heights_m[k])
+        sigma_z = "" if feature.heights_sigma_m is None else float(feature.heights_sigma_m[k])
         sigmas: list[Any] = ["", ""]
         covariances: list[Any] = [""] * 16
         if feature.covariance_m2 is not None:
-            own = feature.covariance_m2[2 * k : 2 * k + 2]
-            sigmas = np.sqrt(np.diag(own[:, 2 * k : 2 * k + 2])).tolist()
-            covariances = own.ravel().tolist()
+            rows_m2 = feature.covariance_m2[2 * k : 2 * k + 2]
+            sigmas = np.sqrt(np.diag(rows_m2[:, 2 * k : 2 * k + 2])).tolist()
+            covariances = rows_m2.ravel().tolist()
         row = [feature.id, feature.kind, k + 1, x, y, z, *geodetic[k], *sigmas, sigma_z]
         rows.append([*row, feature.sightings, relative, *covariances, *paint])
     return rows
@@ -151,7 +150,7 @@ GROUND_FORMATS: Mapping[str, Format] = {
     "geotiff": Format("{name}_ground.tif", write_ground_geotiff, "rasterio", takes_crs=False),
     "opencrg": Format("{name}_ground.crg", write_opencrg, "pyopencrg", takes_crs=False),
 }
-"""Of the ground's surface, which a map has as the run's result, but not from its files."""
+"""Formats of the ground's surface, which a map has as the result of a run, but not when read from a file."""
 
 _ALL = {**FORMATS, **GROUND_FORMATS}
 
@@ -169,13 +168,18 @@ def holds(path: Path, hd_map: HDMap, crs: str | None) -> bool:
     """Whether the GeoPackage at ``path`` holds just this map's features, in the system ``crs``."""
     try:
         with protected_inputs():  # where it holds others, it may be written anew
-            there = read_geopackage(path)
+            stored = read_geopackage(path)
             stated = stated_in(path, "crs")
     except (V2hdmError, OSError):
         return False
-    mine, its = ([properties_of(one) for one in features_of(whole)] for whole in (hd_map, there))
-    same = sorted(mine, key=lambda one: one["id"]) == sorted(its, key=lambda one: one["id"])
-    return same and there.origin == hd_map.origin and stated == crs
+    same = _properties_by_id(hd_map) == _properties_by_id(stored)
+    return same and stored.origin == hd_map.origin and stated == crs
+
+
+def _properties_by_id(hd_map: HDMap) -> list[dict[str, Any]]:
+    """The properties of a map's features in order of their ids."""
+    rows = [properties_of(feature) for feature in features_of(hd_map)]
+    return sorted(rows, key=lambda row: int(row["id"]))
 
 
 def with_data(formats: Sequence[str]) -> list[str]:
@@ -189,7 +193,9 @@ def check_crs(
     """The grid of each format that takes the ``crs``; raises ConfigError where it cannot hold the site."""
     chosen = [name for name in formats if crs is not None and _ALL[name].takes_crs]
     if crs is not None and not chosen:
-        others = ", ".join(name for name, one in FORMATS.items() if one.takes_crs and name != "geojson")
+        others = ", ".join(
+            name for name, format_ in FORMATS.items() if format_.takes_crs and name != "geojson"
+        )
         raise ConfigError(f"{key}: no format to write uses it; add one of {others}, or leave it out")
     return {name: Grid.of(str(crs), origin, key, ConfigError, FORMATS[name].metres) for name in chosen}
 
@@ -202,19 +208,19 @@ def write_map(
     verdict: Verdict = None,
     projector: str | None = None,
     crs: str | None = None,
-    kept: Sequence[str] = (),
+    present: Sequence[str] = (),
 ) -> list[Path]:
     """Write a map in several of :data:`FORMATS` to ``folder``; returns the files, each written atomically.
 
     ``name`` is that of the files, ``verdict`` that on the run which made the map, as JSON, ``projector`` that
     of :func:`v2hdm.io.maps.lanelet2.write_lanelet2`, and ``crs`` the system of the other formats' coordinates
-    in place of their own; files of the formats ``kept`` are there already. Raises ConfigError when a format
-    is not known or lacks its package, or when the projector or the system does not suit the map.
+    in place of their own; files of the formats ``present`` are there already. Raises ConfigError when a
+    format is not known or lacks its package, or when the projector or the system does not suit the map.
     """
     check_formats(formats, "formats")
     grids = check_crs(crs, with_data(formats), hd_map.origin, "crs")
     written = []
-    for chosen in [one for one in with_data(formats) if one not in kept]:
+    for chosen in [chosen for chosen in with_data(formats) if chosen not in present]:
         path = folder / _ALL[chosen].file.format(name=name)
         if chosen in GROUND_FORMATS and not hd_map.ground:
             _log.warning(

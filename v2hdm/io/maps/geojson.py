@@ -25,8 +25,8 @@ from v2hdm.store.files import replace_text
 
 _WGS84 = "WGS84 longitude and latitude, degrees, and height above the ellipsoid, metres"
 _LOCAL = "local map frame, metres east and north, up where known; NOT longitude and latitude"
-_DEGREE_DECIMALS = 11
-_HEIGHT_DECIMALS = 5  # 0.001 mm on the ground
+_DEGREE_DECIMALS = 11  # decimals of a longitude or latitude in degrees: 0.001 mm on the ground
+_HEIGHT_DECIMALS = 5  # decimals of a height in m: 0.01 mm
 
 
 def write_geojson(
@@ -38,14 +38,17 @@ def write_geojson(
     made the map, as JSON, stands in the foreign member ``v2hdm``.
     """
     features = []
-    for one in features_of(hd_map):
-        positions = _rounded(one.positions(grid or hd_map.origin), grid or hd_map.origin)
-        shape, coordinates = (
-            ("Polygon", [[*positions, positions[0]]]) if one.closed else ("LineString", positions)
-        )
-        features.append(geojson_feature(one.id, shape, coordinates, properties_of(one)))
+    for feature in features_of(hd_map):
+        positions = _rounded(feature.positions(grid or hd_map.origin), grid or hd_map.origin)
+        if feature.closed:
+            shape = "Polygon"
+            coordinates: list[Any] = [[*positions, positions[0]]]
+        else:
+            shape = "LineString"
+            coordinates = positions
+        features.append(geojson_feature(feature.id, shape, coordinates, properties_of(feature)))
 
-    about: dict[str, Any] = {"largest_id": max([hd_map.largest_id, *(one["id"] for one in features)])}
+    about: dict[str, Any] = {"largest_id": max([hd_map.largest_id, *(feature["id"] for feature in features)])}
     if hd_map.drift_over_m is not None:
         about["drift_over_m"] = hd_map.drift_over_m
     if verdict is not None:
@@ -60,19 +63,19 @@ def write_features(
     about: Mapping[str, Any],
     grid: Grid | None = None,
 ) -> None:
-    """Write GeoJSON ``features`` a line each, atomically, with the frame and ``about`` under ``v2hdm``."""
+    """Write GeoJSON ``features``, one a line, atomically, with the frame and ``about`` under ``v2hdm``."""
     frame: dict[str, Any] = {"frame": "map", "coordinates": _LOCAL if origin is None else _WGS84}
     if origin is not None:
         frame["origin"] = asdict(origin)
     decimals = (_DEGREE_DECIMALS, _HEIGHT_DECIMALS)
-    known: dict[str, Any] = {}
+    members_of_gis: dict[str, Any] = {}
     if grid is not None:
         frame |= {"crs": grid.crs} | ({"coordinates": _LOCAL} if grid.is_local else {"coordinates": grid.crs})
         name = f"urn:ogc:def:crs:{grid.crs.upper().replace(':', '::')}"
-        known = {} if grid.is_local else {"crs": {"type": "name", "properties": {"name": name}}}
+        members_of_gis = {} if grid.is_local else {"crs": {"type": "name", "properties": {"name": name}}}
     elif origin is not None:
-        known = {k: 10.0**-n for k, n in zip(RESOLUTION, decimals, strict=True)}
-    members = {"type": "FeatureCollection", **known, "v2hdm": frame | dict(about)}
+        members_of_gis = {key: 10.0**-count for key, count in zip(RESOLUTION, decimals, strict=True)}
+    members = {"type": "FeatureCollection", **members_of_gis, "v2hdm": frame | dict(about)}
     head = json.dumps(members, allow_nan=False)
     lines = ",\n".join(json.dumps(feature, allow_nan=False) for feature in features)
     replace_text(path, f'{head[:-1]}, "features": [\n{lines}\n]}}\n')

@@ -57,7 +57,7 @@ type="Map">{}</Option>
 </layer></symbol>"""
 _OPTION = '<Option type="QString" name="{}" value="{}"/>'
 
-_MESSAGE_LETTERS = 200  # of an error of GDAL's, which may hold whole statements
+_MESSAGE_LETTERS = 200  # longest text of a GDAL error in ours, letters: it may hold whole statements; chosen
 
 AnyArray = NDArray[Any]
 
@@ -82,22 +82,27 @@ def write_geopackage(
     def write(
         place: Path, layer: str, columns: Mapping[str, Any], shapes: AnyArray | None = None, **options: Any
     ) -> None:
-        values = [np.array(v, dtype=object) if isinstance(v, list) else v for v in columns.values()]
+        values = [
+            np.array(column, dtype=object) if isinstance(column, list) else column
+            for column in columns.values()
+        ]
         raw.write(str(place), shapes, values, list(columns), layer=layer, driver="GPKG", **options)
 
     def write_all(place: Path) -> None:
         styles = []
         for key, layer in LAYERS.items():
-            mine = [feature for feature in features if feature.key == key]
+            features_of_layer = [feature for feature in features if feature.key == key]
             kind = "LineString Z" if key == POINTS else "Polygon Z"
-            shapes = _shapes(mine, grid or hd_map.origin)
-            write(place, layer, _columns(key, mine), shapes, geometry_type=kind, crs=crs)
-            styles.append(_style_row(layer, sorted({one.kind for one in mine}), key != POINTS))
+            shapes = _shapes(features_of_layer, grid or hd_map.origin)
+            write(place, layer, _columns(key, features_of_layer), shapes, geometry_type=kind, crs=crs)
+            styles.append(
+                _style_row(layer, sorted({feature.kind for feature in features_of_layer}), key != POINTS)
+            )
         write(place, "v2hdm", {key: [json.dumps(value)] for key, value in about.items()})
         # The table in which QGIS looks for the style of a GeoPackage's layers.
         texts = {name: [row[name] for row in styles] for name in styles[0]}
-        rest = {"useAsDefault": np.ones(len(styles), bool), "update_time": np.full(len(styles), now)}
-        write(place, "layer_styles", texts | rest, FID="id")
+        defaults = {"useAsDefault": np.ones(len(styles), bool), "update_time": np.full(len(styles), now)}
+        write(place, "layer_styles", texts | defaults, FID="id")
 
     with whole_file(path) as partial, TemporaryDirectory(".part", f".{path.name}.", path.parent) as folder:
         # GDAL goes on after some calls that fail: only two files that are alike are whole.
@@ -112,7 +117,7 @@ def write_geopackage(
 
 @contextmanager
 def _gdal_options(now: np.datetime64) -> Iterator[None]:
-    """Within, GDAL's GeoPackages are of this date, and made without what would undo a failure."""
+    """Within, GDAL's GeoPackages carry the date ``now`` and are written without a journal for failures."""
     gdal = need("pyogrio", "gis", "the format gpkg", ConfigError)
     options = {"OGR_CURRENT_DATE": f"{now}Z", "OGR_SQLITE_JOURNAL": "OFF", "OGR_SQLITE_SYNCHRONOUS": "OFF"}
     before = {name: gdal.get_gdal_config_option(name) for name in options}
@@ -129,35 +134,39 @@ def _gdal_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except (errors.DataSourceError, errors.DataLayerError, errors.FeatureError) as failure:
-        first = shorten(str(failure).splitlines()[0], _MESSAGE_LETTERS)
-        raise MapFileError(f"{path}: cannot be written ({first}); set another folder") from None
+        first_line = shorten(str(failure).splitlines()[0], _MESSAGE_LETTERS)
+        raise MapFileError(f"{path}: cannot be written ({first_line}); set another folder") from None
 
 
 def _columns(key: str, features: Sequence[Feature]) -> dict[str, Any]:
     rows = [properties_of(feature) for feature in features]
 
     def numbers(name: str, kind: type = np.float64) -> AnyArray:
-        return np.array([one.get(name, np.nan) for one in rows], dtype=kind)
+        return np.array([row.get(name, np.nan) for row in rows], dtype=kind)
+
+    def texts(name: str) -> list[str | None]:
+        return [json.dumps(row[name]) if name in row else None for row in rows]
 
     return {
         "id": numbers("id", np.int64),
-        "class": [one["class"] for one in rows],
+        "class": [row["class"] for row in rows],
         "sightings": numbers("sightings", np.int64),
         "sigma_m": numbers("sigma_m"),
         "relative_sigma_m": numbers("relative_sigma_m"),
         **{name: numbers(name) for name in PAINT if key == CORNERS},
-    } | {name: [json.dumps(one[name]) if name in one else None for one in rows] for name in (key, *EXACT)}
+        **{name: texts(name) for name in (key, *EXACT)},
+    }
 
 
 def _shapes(features: Sequence[Feature], origin: GeodeticOrigin | Grid | None) -> AnyArray:
     """Well-known binary of features, with heights."""
     shapely = need("shapely", "gis", "the format gpkg", ConfigError)
     shapes = np.empty(len(features), dtype=object)
-    for k, one in enumerate(features):
-        positions = one.positions(origin)
+    for k, feature in enumerate(features):
+        positions = feature.positions(origin)
         if positions.shape[1] == 2:
             positions = np.column_stack([positions, np.zeros(len(positions))])
-        shapes[k] = (shapely.Polygon if one.closed else shapely.LineString)(positions)
+        shapes[k] = (shapely.Polygon if feature.closed else shapely.LineString)(positions)
     return np.asarray(shapely.to_wkb(shapes, flavor="iso"))
 
 
@@ -186,7 +195,7 @@ def _style_row(layer: str, kinds: Sequence[str], closed: bool) -> dict[str, str]
     }
 
 
-_AROUND_M = 5.0
+_AROUND_M = 5.0  # margin of a QGIS project's first view around the features, m; chosen
 
 
 def write_qgis(hd_map: HDMap, path: Path, grid: Grid | None = None) -> None:
@@ -198,10 +207,12 @@ def write_qgis(hd_map: HDMap, path: Path, grid: Grid | None = None) -> None:
     pyproj = need("pyproj", "map", "the format qgis", ConfigError)
     features = features_of(hd_map)
     where = grid or Grid("local", hd_map.origin)
-    placed = hd_map.origin is not None and (grid is None or not grid.is_local)
-    ground = crs_of(hd_map.origin) if placed and hd_map.origin is not None else LOCAL_CRS
-    layers_crs = LOCAL_CRS if not placed else "EPSG:4326" if grid is None else grid.crs
-    canvas_crs = ground if grid is None else layers_crs
+    ground_crs = LOCAL_CRS
+    layers_crs = LOCAL_CRS
+    if hd_map.origin is not None and (grid is None or not grid.is_local):
+        ground_crs = crs_of(hd_map.origin)
+        layers_crs = "EPSG:4326" if grid is None else grid.crs
+    canvas_crs = ground_crs if grid is None else layers_crs
     system = pyproj.CRS.from_user_input(canvas_crs)
     root = ET.Element("qgis", {"version": "3.22.0", "projectname": path.stem})
     ET.SubElement(root, "title").text = path.stem
@@ -211,11 +222,13 @@ def write_qgis(hd_map: HDMap, path: Path, grid: Grid | None = None) -> None:
     tree = ET.SubElement(root, "layer-tree-group")
     canvas = ET.SubElement(root, "mapcanvas", {"name": "theMapCanvas"})
     ET.SubElement(canvas, "units").text = "degrees" if system.is_geographic else "meters"
-    places = np.concatenate([one.positions(where)[:, :2] for one in features] or [np.zeros((1, 2))])
-    around = _AROUND_M * (1e-5 if system.is_geographic else 1.0)
+    places = np.concatenate([feature.positions(where)[:, :2] for feature in features] or [np.zeros((1, 2))])
+    margin = _AROUND_M * (1e-5 if system.is_geographic else 1.0)  # 1e-5 deg is about 1 m
     extent = ET.SubElement(canvas, "extent")
-    corners = (*(places.min(axis=0) - around), *(places.max(axis=0) + around))
-    for name, value in zip(("xmin", "ymin", "xmax", "ymax"), corners, strict=True):
+    low = places.min(axis=0) - margin
+    high = places.max(axis=0) + margin
+    sides = {"xmin": low[0], "ymin": low[1], "xmax": high[0], "ymax": high[1]}
+    for name, value in sides.items():
         ET.SubElement(extent, name).text = repr(float(value))
     layers = ET.SubElement(root, "projectlayers")
     for key, layer in reversed(LAYERS.items()):
@@ -223,11 +236,11 @@ def write_qgis(hd_map: HDMap, path: Path, grid: Grid | None = None) -> None:
         source = f"./{path.stem}.gpkg|layername={layer}"
         element = _layer(tree, layers, layer, source, "ogr", {"type": "vector", "geometry": shape})
         _refer(ET.SubElement(element, "srs"), pyproj.CRS.from_user_input(layers_crs))
-        kinds = sorted({one.kind for one in features if one.key == key})
+        kinds = sorted({feature.kind for feature in features if feature.key == key})
         element.extend(ET.fromstring(layer_style(kinds, key != POINTS).split("\n", 1)[1]))
     if (path.parent / MOSAIC).is_file():
         element = _layer(tree, layers, "mosaic", f"./{MOSAIC}", "gdal", {"type": "raster"})
-        _refer(ET.SubElement(element, "srs"), pyproj.CRS.from_user_input(ground))
+        _refer(ET.SubElement(element, "srs"), pyproj.CRS.from_user_input(ground_crs))
     ET.indent(root, " ")
     doctype = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>"
     replace_text(path, f"{doctype}\n{ET.tostring(root, encoding='unicode')}\n")
@@ -244,7 +257,7 @@ def _refer(parent: ET.Element, system: Any) -> None:
 def _layer(
     tree: ET.Element, layers: ET.Element, name: str, source: str, provider: str, kind: Mapping[str, str]
 ) -> ET.Element:
-    """Add a layer below those that are there."""
+    """Add a layer below the layers so far; returns its element in ``layers``."""
     identity = f"v2hdm_layer_{name}"  # QGIS gives those of ten letters and fewer another
     entry = {"id": identity, "name": name, "source": source, "providerKey": provider}
     ET.SubElement(tree, "layer-tree-layer", entry | {"checked": "Qt::Checked", "expanded": "1"})

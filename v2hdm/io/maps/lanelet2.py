@@ -22,22 +22,23 @@ import numpy as np
 
 from v2hdm.errors import ConfigError, MapFileError, need
 from v2hdm.geometry.geodetic import geodetic_from_enu, position_of
-from v2hdm.io.maps.closed_lanes import closed_lanes, connections
+from v2hdm.io.maps.closed_lanes import Bound, closed_lanes, connections
 from v2hdm.io.maps.features import Feature, features_of
-from v2hdm.records import LANE_DASH, STOP_LINE, FloatArray, GeodeticOrigin, HDMap, IntArray
+from v2hdm.records import LANE_DASH, STOP_LINE, FloatArray, GeodeticOrigin, HDMap
 from v2hdm.store.files import dump_yaml, replace_text, xml_text
 
 LOCAL, LOCAL_CARTESIAN, MGRS = PROJECTORS = ("Local", "LocalCartesian", "MGRS")
 """Autoware's projectors that this format knows, by their names in ``map_projector_info.yaml``."""
 
-_DEGREE_DECIMALS = 12
-_HEIGHT_DECIMALS = 6  # 1e-7 m; JOSM writes 11
+_DEGREE_DECIMALS = 12  # decimals of a longitude or latitude in degrees: 1e-7 m; JOSM writes 11
+_HEIGHT_DECIMALS = 6  # decimals of a height in m
 
-# Ids of each feature's parts, above all ids of features and exact in every language; vertices take the lower
-# half.
-_FIRST_PART = 1 << 40
-_PARTS = 1 << 20
-_MOST_VERTICES = _PARTS // 2
+# Ids of nodes, ways and relations that are parts of a feature, such as its vertices:
+_FIRST_PART = 1 << 40  # smallest id of a part: above all ids of features, and exact in every language
+_PARTS = 1 << 20  # ids that each feature has for its parts
+_MOST_VERTICES = _PARTS // 2  # the lower half of a feature's parts, those of its vertices
+_LANELETS = _MOST_VERTICES + _PARTS // 4  # part of a line that those of the lanelets to its right follow
+_VIRTUALS = _MOST_VERTICES + 3 * _PARTS // 8  # part of a line that those of its bounds without paint follow
 
 # Lanelet2 reads no node without latitude and longitude: local maps lie where the equator meets Greenwich.
 _NOWHERE = GeodeticOrigin(0.0, 0.0, 0.0)
@@ -76,8 +77,9 @@ def write_lanelet2(hd_map: HDMap, path: Path, projector: str | None = None) -> N
     replace_text(path, document.text())
     info: dict[str, Any] = {"projector_type": projector}
     if projector != LOCAL and hd_map.origin is not None:
-        at = zip(("latitude", "longitude", "altitude"), position_of(hd_map.origin)[0].tolist(), strict=True)
-        where = {"map_origin": dict(at)} if square is None else {"mgrs_grid": square}
+        latitude, longitude, altitude = position_of(hd_map.origin)[0].tolist()
+        map_origin = {"latitude": latitude, "longitude": longitude, "altitude": altitude}
+        where = {"map_origin": map_origin} if square is None else {"mgrs_grid": square}
         info |= {"vertical_datum": "WGS84"} | where
     replace_text(path.with_name("map_projector_info.yaml"), dump_yaml(info))
 
@@ -91,11 +93,14 @@ def _write_marking(document: _Document, feature: Feature, lanes: _Lanes) -> None
     middle = corners[:, :2].mean(axis=0)
     lane = lanes.of(middle)
     stop, sign = _stop_edges(corners, None if lane is None else lanes.direction(lane, middle))
-    part = _MOST_VERTICES
-    stop_id, sign_id, rule_id = (_part(feature, part + k) for k in range(3))
-    document.way(stop_id, document.nodes(feature, stop, part + 10), {"type": "stop_line"})
+    stop_id = _part(feature, _MOST_VERTICES)
+    sign_id = _part(feature, _MOST_VERTICES + 1)
+    rule_id = _part(feature, _MOST_VERTICES + 2)
+    stop_nodes = document.nodes(feature, stop, _MOST_VERTICES + 10)
+    document.way(stop_id, stop_nodes, {"type": "stop_line"})
     sign_tags = {"type": "traffic_sign", "subtype": "stop_sign", "virtual": "yes"}
-    document.way(sign_id, document.nodes(feature, sign, part + 20), sign_tags)
+    sign_nodes = document.nodes(feature, sign, _MOST_VERTICES + 20)
+    document.way(sign_id, sign_nodes, sign_tags)
     members = [("way", sign_id, "refers"), ("way", stop_id, "ref_line")]
     document.relation(rule_id, members, {"type": "regulatory_element", "subtype": "traffic_sign"})
     if lane is not None:
@@ -109,11 +114,13 @@ def _stop_edges(corners: FloatArray, direction: FloatArray | None) -> tuple[Floa
     """
     length = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
     start = int(length[1] + length[3] > length[0] + length[2])
-    one = corners[[start, start + 1]]
-    two = corners[[(start + 3) % 4, (start + 2) % 4]]
+    edge = corners[[start, start + 1]]
+    other_edge = corners[[(start + 3) % 4, (start + 2) % 4]]
     if direction is None:
-        return (one + two) / 2, two
-    return (one, two) if (two - one)[:, :2].mean(axis=0) @ direction > 0 else (two, one)
+        return (edge + other_edge) / 2, other_edge
+    return (
+        (edge, other_edge) if (other_edge - edge)[:, :2].mean(axis=0) @ direction > 0 else (other_edge, edge)
+    )
 
 
 class _Lanes:
@@ -132,7 +139,8 @@ class _Lanes:
     def of(self, place_map: FloatArray) -> int | None:
         """The lane in which a place (2,) of the map lies."""
         for number, lane in enumerate(self._lanes):
-            left, right = (self._lines[n].points_map[order] for n, order in (lane.left, lane.right))
+            left = self._lines[lane.left.line].points_map[lane.left.order]
+            right = self._lines[lane.right.line].points_map[lane.right.order]
             outline = np.concatenate([left, right[::-1]]) - place_map
             if cv2.pointPolygonTest(outline.astype(np.float32), (0.0, 0.0), False) >= 0:
                 return number
@@ -140,56 +148,54 @@ class _Lanes:
 
     def direction(self, lane: int, place_map: FloatArray) -> FloatArray:
         """The direction (2,) in which a lane passes a place (2,) of the map."""
-        line, order = self._lanes[lane].left
-        left = self._lines[line].points_map[order]
+        bound = self._lanes[lane].left
+        left = self._lines[bound.line].points_map[bound.order]
         nearest = int(np.argmin(((left - place_map) ** 2).sum(axis=1)))
         return np.asarray(np.gradient(left, axis=0)[nearest])
 
     def write(self) -> None:
         """Write a lanelet of each lane and of each connection, with the lines that they need as bounds."""
         for lane, rules in zip(self._lanes, self.rules, strict=True):
-            self._lanelet(self._lines[lane.left[0]], self._bound(*lane.left), self._bound(*lane.right), rules)
-        for one in connections(self._lanes, [line.points_map for line in self._lines]):
-            before = self._lanes[one.before]
-            after = self._lanes[one.after]
-            left, right = (
-                self._virtual(end, start) if bound is None else self._bound(*bound)
-                for bound, end, start in (
-                    (one.left, before.left, after.left),
-                    (one.right, before.right, after.right),
-                )
-            )
-            self._lanelet(self._lines[before.left[0]], left, right, ())
+            owner = self._lines[lane.left.line]
+            self._lanelet(owner, self._bound(lane.left), self._bound(lane.right), rules)
+        for connection in connections(self._lanes, [line.points_map for line in self._lines]):
+            before = self._lanes[connection.before]
+            after = self._lanes[connection.after]
+            left = self._bound_between(connection.left, before.left, after.left)
+            right = self._bound_between(connection.right, before.right, after.right)
+            self._lanelet(self._lines[before.left.line], left, right, ())
 
     def _lanelet(self, owner: Feature, left: int, right: int, rules: Sequence[int]) -> None:
         self._counts[owner.id] += 1
-        lanelet_id = _part(owner, _MOST_VERTICES + _PARTS // 4 + self._counts[owner.id])
+        lanelet_id = _part(owner, _LANELETS + self._counts[owner.id])
         members = [("way", left, "left"), ("way", right, "right")]
         members += [("relation", rule, "regulatory_element") for rule in rules]
         tags = {"type": "lanelet", "subtype": "road", "location": "urban", "one_way": "yes"}
         self._document.relation(lanelet_id, members, tags | {"participant:vehicle": "yes"})
 
-    def _virtual(self, end: tuple[int, IntArray], start: tuple[int, IntArray]) -> int:
+    def _bound_between(self, bound: Bound | None, end: Bound, start: Bound) -> int:
+        """The line string of a connection's bound: virtual, from ``end`` to ``start``, where it has none."""
+        return self._virtual(end, start) if bound is None else self._bound(bound)
+
+    def _virtual(self, end: Bound, start: Bound) -> int:
         """A bound that no paint shows, from where one lane's ends to where another's starts."""
-        owner = self._lines[end[0]]
+        owner = self._lines[end.line]
         self._virtuals[owner.id] += 1
-        number = _part(owner, _MOST_VERTICES + 3 * _PARTS // 8 + self._virtuals[owner.id])
-        nodes = [
-            self.vertices[self._lines[line].id][at]
-            for line, at in ((end[0], end[1][-1]), (start[0], start[1][0]))
-        ]
-        self._document.way(number, nodes, {"type": "virtual"})
+        number = _part(owner, _VIRTUALS + self._virtuals[owner.id])
+        last = self.vertices[owner.id][end.order[-1]]
+        first = self.vertices[self._lines[start.line].id][start.order[0]]
+        self._document.way(number, [last, first], {"type": "virtual"})
         return number
 
-    def _bound(self, line: int, order: IntArray) -> int:
-        """The line string of a bound: the line itself where that is all of it, else a piece of its nodes."""
-        owner = self._lines[line]
-        first, last = sorted((int(order[0]), int(order[-1])))
+    def _bound(self, bound: Bound) -> int:
+        """The line string of a bound: that of the line where the bound is all of it, else that of a piece."""
+        owner = self._lines[bound.line]
+        first, last = sorted((int(bound.order[0]), int(bound.order[-1])))
         if last - first + 1 == len(owner.points_map):
             return owner.id
-        key = (line, first, last)
+        key = (bound.line, first, last)
         if key not in self._bounds:
-            pieces = sum(1 for other, _, _ in self._bounds if other == line)
+            pieces = sum(1 for line, _, _ in self._bounds if line == bound.line)
             self._bounds[key] = _part(owner, _MOST_VERTICES + 1 + pieces)
             nodes = self.vertices[owner.id][first : last + 1]
             self._document.way(self._bounds[key], nodes, _line_tags(owner) | {"part_of": str(owner.id)})
@@ -201,12 +207,13 @@ def grid_places(longitude_deg: FloatArray, latitude_deg: FloatArray) -> tuple[st
 
     Raises ConfigError when they lie in several squares or beyond the grid, or a package is missing.
     """
-    pyproj, mgrs = (need(one, "gis", "lanelet2 with MGRS", ConfigError) for one in ("pyproj", "mgrs"))
+    pyproj = need("pyproj", "gis", "lanelet2 with MGRS", ConfigError)
+    mgrs = need("mgrs", "gis", "lanelet2 with MGRS", ConfigError)
     if np.min(latitude_deg) < -80 or np.max(latitude_deg) >= 84:
         raise ConfigError("MGRS ends at 80 degrees south and 84 north: choose the projector LocalCartesian")
     grid = mgrs.MGRS()
     places = zip(latitude_deg.tolist(), longitude_deg.tolist(), strict=True)
-    squares = {grid.toMGRS(*place, MGRSPrecision=0).lstrip("0") for place in places}
+    squares = {grid.toMGRS(lat, lon, MGRSPrecision=0).lstrip("0") for lat, lon in places}
     if len(squares) > 1:
         raise ConfigError(
             f"the map spans the MGRS squares {', '.join(sorted(squares))}, and Autoware's MGRS projector "
@@ -230,18 +237,20 @@ class _Document:
 
     def nodes(self, owner: Feature, xyz_map: FloatArray, first: int = 0) -> list[int]:
         """Ids of new nodes at places (N, 3) of the map, from part ``first`` of their owner on."""
-        made = {_part(owner, first + number): place for number, place in enumerate(xyz_map)}
-        self._nodes |= made
-        return list(made)
+        place_of_node = {_part(owner, first + number): place for number, place in enumerate(xyz_map)}
+        self._nodes |= place_of_node
+        return list(place_of_node)
 
     def way(self, number: int, nodes: Sequence[int], tags: Mapping[str, str]) -> None:
-        self._elements.append(way := ET.Element("way", id=str(number)))
+        way = ET.Element("way", id=str(number))
+        self._elements.append(way)
         for node in nodes:
             ET.SubElement(way, "nd", ref=str(node))
         _add_tags(way, tags)
 
     def relation(self, number: int, members: Sequence[tuple[str, int, str]], tags: Mapping[str, str]) -> None:
-        self._elements.append(relation := ET.Element("relation", id=str(number)))
+        relation = ET.Element("relation", id=str(number))
+        self._elements.append(relation)
         for kind, ref, role in members:
             ET.SubElement(relation, "member", type=kind, ref=str(ref), role=role)
         _add_tags(relation, tags)
@@ -263,14 +272,14 @@ class _Document:
         ):
             lat, lon = (f"{degrees:.{_DEGREE_DECIMALS}f}" for degrees in (latitude, longitude))
             element = ET.SubElement(self._root, "node", id=str(node), lat=lat, lon=lon)
-            # To the metre, which the grid rounds down.
+            # An MGRS code to the metre is rounded down.
             tags = {} if square is None else {"mgrs_code": f"{square}{int(x):05d}{int(y):05d}"}
             tags |= {"local_x": repr(x), "local_y": repr(y), "ele": f"{height:.{_HEIGHT_DECIMALS}f}"}
             _add_tags(element, tags)
         return square
 
     def text(self) -> str:
-        self._root.extend(sorted(self._elements, key=lambda one: one.tag != "way"))
+        self._root.extend(sorted(self._elements, key=lambda element: element.tag != "way"))
         return xml_text(self._root)
 
 

@@ -31,29 +31,35 @@ _log = logging.getLogger(__name__)
 
 Verdict = Mapping[str, Any] | None
 
-_LARGEST_ID = _MOST_SIGHTINGS = 1_000_000_000  # every format and GIS holds it as a whole number of 32 bits
-_NAMED = 9  # edited features that the log names
+_LARGEST_ID = 1_000_000_000  # largest id: every format and GIS holds it as a whole number of 32 bits
+_MOST_SIGHTINGS = 1_000_000_000  # largest number of sightings, for the same reason as the largest id
+_NAMED = 9  # edited features that the log names; chosen
 
-# Degrees and m by which positions may be off without an edit. Of GeoJSON, GDAL takes a last digit after
-# several zeros for noise and drops it, and files of version 0.1 have nine and four decimals: 0.1 mm on the
-# ground. Local metres are written at full precision; a GIS that rewrites them keeps 15 digits.
+# Longitude and latitude, degrees, and height, m, by which a file's positions may be off without an edit:
 _TEXT_ROUNDING = (1e-9, 1e-9, 1e-4)
-_BINARY_ROUNDING = (1e-11, 1e-11, 1e-6)
-_LOCAL_ROUNDING_M = 1e-6
-_GRID_ROUNDING = (3e-9, 3e-9, 1.2e-4)  # of a grid's 0.1 mm, as far as 70 degrees north
+"""Rounding of GeoJSON in degrees: files of version 0.1 have nine and four decimals, 0.1 mm on the ground, and
+GDAL takes a last digit after several zeros for noise and drops it."""
+_BINARY_ROUNDING = (1e-11, 1e-11, 1e-6)  # rounding of a GeoPackage in degrees, which holds them in binary
+_GRID_ROUNDING = (3e-9, 3e-9, 1.2e-4)  # rounding of a grid's 0.1 mm in degrees, as far as 70 degrees north
+
+_GRID_ROUNDING_M = 1.2e-4  # rounding of a local grid's 0.1 mm, m
+_LOCAL_ROUNDING_M = 1e-6  # rounding of local metres, which have full precision: a GIS keeps 15 digits
 
 RESOLUTION = ("xy_coordinate_resolution", "z_coordinate_resolution")
 """Members of GeoJSON that state how coordinates are rounded, m or degrees, for GDAL since 3.9."""
 
-EXACT = (
-    "heights_m",
-    "heights_sigma_m",
-    "covariance_m2",
-)  # columns of a GeoPackage with JSON, beside the coordinates
+EXACT = ("heights_m", "heights_sigma_m", "covariance_m2")
+"""Columns of a GeoPackage with JSON, beside the coordinates."""
+
 LAYERS = {CORNERS: "markings", POINTS: "lanes", OUTLINE: "symbols"}
 """Layers of a GeoPackage by the property that holds the coordinates of their features."""
 
 GEOMETRY = "geom"  # the column of a GeoPackage's layer
+
+# Types of geometries in well-known binary, to which thousands are added for heights and measures:
+_LINE = 2  # type of a LineString
+_POLYGON = 3  # type of a Polygon
+_MULTIS = (5, 6)  # types of a MultiLineString and a MultiPolygon
 
 
 def read_map(path: Path) -> tuple[HDMap, Verdict]:
@@ -130,7 +136,7 @@ class Geometry:
 
 
 class _Reader:
-    """Reads the features of a file with positions off by ``rounding`` (3,), reports edits, gives ids."""
+    """Reads a file's features, whose positions are off by ``rounding`` (3,), reports edits and gives ids."""
 
     def __init__(
         self, path: Path, origin: GeodeticOrigin | None, rounding: FloatArray, crs: object = None
@@ -142,7 +148,7 @@ class _Reader:
         if crs is not None:
             text = take_text(crs, f"{path}: crs", MapFileError)
             self._grid = Grid.of(text, origin, str(path), MapFileError)
-            self._rounding = np.array(_GRID_ROUNDING if origin else (1.2e-4,) * 3)
+            self._rounding = np.array(_GRID_ROUNDING if origin else (_GRID_ROUNDING_M,) * 3)
         self._features: list[Feature] = []
         self._edited: list[int] = []
 
@@ -169,17 +175,17 @@ class _Reader:
         self._features.append(feature)
 
     def map(self) -> HDMap:
-        """All that was read, logging edits and new ids."""
+        """The map of the features that were added; logs edits and new ids."""
         before = [feature.id for feature in self._features]
         ids = unique_ids(before)
         if self._edited:
-            named = ", ".join(str(ids[index]) for index in self._edited[:_NAMED])
+            numbers = ", ".join(str(ids[index]) for index in self._edited[:_NAMED])
             more = ", ..." if len(self._edited) > _NAMED else ""
             edited = f"{len(self._edited)} features were edited and are taken as drawn"
-            _log.info("%s: %s: %s", self._path, edited, named + more)
-        new = sum(a != b for a, b in zip(before, ids, strict=True))
-        if new:
-            _log.info("%s: %d features had no id of their own and were given one", self._path, new)
+            _log.info("%s: %s: %s", self._path, edited, numbers + more)
+        new_ids = sum(stored != number for stored, number in zip(before, ids, strict=True))
+        if new_ids:
+            _log.info("%s: %d features had no id of their own and were given one", self._path, new_ids)
         return map_of(self._features, ids, self._origin)
 
 
@@ -188,26 +194,18 @@ def _believed(
 ) -> Feature:
     """``stored`` itself where the geometry says the same, else what the geometry says, point by point.
 
-    A ring may start at another corner and run the other way round. Points whose number has not changed keep
-    their order and covariance, and their heights unless these were edited, too.
+    A ring may start at another corner and run the other way round. Where the number of points has not
+    changed, they keep their order and covariance, and their heights unless these were edited, too.
     """
-    positions, size = geometry.positions, geometry.positions.shape[1]
+    positions = geometry.positions
     if len(positions) != len(stored.points_map):
-        xyz = _in_map(positions, None, origin)
-        if geometry.closed and signed_area(xyz[:, :2]) < 0:
-            xyz = xyz[::-1]
-        raised = np.abs(xyz[:, 2]).max(initial=0.0) > rounding[2]
-        heights_m = xyz[:, 2] if raised else None
-        moved = replace(stored, points_map=xyz[:, :2], heights_m=heights_m, vertex_sigma_m=None)
-        return replace(moved, covariance_m2=None, relative_sigma_m=None)
+        return _redrawn(stored, geometry, origin, rounding)
+    size = positions.shape[1]
     drawn = stored.positions(origin)
     expected = np.zeros((len(positions), 3))
     expected[stored.ring, : drawn.shape[1]] = drawn
     if geometry.closed:
-        order = np.arange(len(positions))
-        orders = [np.roll(one, -start) for one in (order, order[::-1]) for start in range(len(order))]
-        away = [float(((positions[one, :2] - expected[:, :2]) ** 2).sum()) for one in orders]
-        positions = positions[orders[int(np.argmin(away))]]
+        positions = _aligned(positions, expected)
     agree = np.abs(positions - expected[:, :size]) <= rounding[:size]
     if agree.all():
         return stored
@@ -219,12 +217,38 @@ def _believed(
     return replace(stored, points_map=points_map, heights_m=heights_m)
 
 
+def _redrawn(
+    stored: Feature, geometry: Geometry, origin: GeodeticOrigin | None, rounding: FloatArray
+) -> Feature:
+    """The feature with the points of a geometry that has more or fewer of them, and no covariance."""
+    xyz = _in_map(geometry.positions, None, origin)
+    if geometry.closed and signed_area(xyz[:, :2]) < 0:
+        xyz = xyz[::-1]
+    has_heights = np.abs(xyz[:, 2]).max(initial=0.0) > rounding[2]
+    return replace(
+        stored,
+        points_map=xyz[:, :2],
+        heights_m=xyz[:, 2] if has_heights else None,
+        vertex_sigma_m=None,
+        covariance_m2=None,
+        relative_sigma_m=None,
+    )
+
+
+def _aligned(positions: FloatArray, expected: FloatArray) -> FloatArray:
+    """A ring's positions (N, 2 or 3) from the corner, and in the turn, that come nearest to the expected."""
+    forward = np.arange(len(positions))
+    orders = [np.roll(turn, -start) for turn in (forward, forward[::-1]) for start in range(len(forward))]
+    misfits = [float(((positions[order, :2] - expected[:, :2]) ** 2).sum()) for order in orders]
+    return positions[orders[int(np.argmin(misfits))]]
+
+
 def _in_map(positions: FloatArray, heights_m: FloatArray | None, origin: GeodeticOrigin | None) -> FloatArray:
     """A file's positions (N, 2 or 3) in the map (N, 3), m; heights that they lack are ``heights_m`` or 0."""
-    known = np.zeros(len(positions)) if heights_m is None else heights_m
+    heights_or_zero_m = np.zeros(len(positions)) if heights_m is None else heights_m
     if origin is None:
-        return np.column_stack([positions, known])[:, :3]
-    above_m = np.column_stack([positions, origin.altitude_m + known])[:, 2]
+        return np.column_stack([positions, heights_or_zero_m])[:, :3]
+    above_m = np.column_stack([positions, origin.altitude_m + heights_or_zero_m])[:, 2]
     return enu_from_geodetic(origin, np.column_stack([positions[:, 1], positions[:, 0], above_m]))
 
 
@@ -239,13 +263,13 @@ def _stored(properties: Mapping[str, Any], closed: bool, where: str) -> Feature:
 
     def optional(key: str, take: Callable[..., Any], *how: Any) -> Any:
         # Properties of each point mean nothing without the points.
-        known = properties.get(key) if key not in EXACT or len(points) else None
-        value = None if known is None else take(known, *how, f"{where}, {key}", MapFileError)
+        stated = properties.get(key) if key not in EXACT or len(points) else None
+        value = None if stated is None else take(stated, *how, f"{where}, {key}", MapFileError)
         if value is not None and "sigma" in key and np.min(value, initial=0.0) < 0:
             raise MapFileError(f"{where}, {key}: a standard deviation is negative; fix it or leave it out")
         return value
 
-    left = [optional(name, take_number) for name in PAINT]
+    share, sigma, change, change_sigma = (optional(name, take_number) for name in PAINT)
     return Feature(
         id=optional("id", take_whole, -_LARGEST_ID, _LARGEST_ID) or 0,
         kind=take_name(properties.get("class"), f"{where}, class", MapFileError),
@@ -261,12 +285,12 @@ def _stored(properties: Mapping[str, Any], closed: bool, where: str) -> Feature:
         vertex_sigma_m=None
         if closed or not len(points)
         else optional("vertex_sigma_m", take_array, (len(points),)),
-        paint=None if left[0] is None or left[1] is None else PaintLeft(*left),
+        paint=None if share is None or sigma is None else PaintLeft(share, sigma, change, change_sigma),
     )
 
 
 def _of_geojson(content: object, where: str) -> Geometry | None:
-    """A Polygon of one ring, a LineString, or a Multi... of one of them, as a GIS may make of it."""
+    """A Polygon of one ring, a LineString, or what a GIS may make of one: a Multi... with one of them."""
     if content is None:
         return None
     entry = take_mapping(content, f"{where}, geometry", MapFileError)
@@ -293,17 +317,19 @@ def _of_wkb(blob: object, where: str) -> Geometry | None:
         return None
     try:
         data = bytes(memoryview(blob))  # type: ignore[arg-type]
-        kind = 5
+        kind = _MULTIS[0]
         count = 1
-        at = 8 + (0, 32, 48, 48, 64)[data[3] >> 1 & 7]
+        envelope_bytes = (0, 32, 48, 48, 64)[data[3] >> 1 & 7]
+        at = 8 + envelope_bytes
         for _ in range(2):  # a Multi..., and what is in it
-            if kind % 1000 in (5, 6) and count == 1:
+            if kind % 1000 in _MULTIS and count == 1:
                 order = "<" if data[at] else ">"
-                kind, count, at = (*struct.unpack_from(f"{order}II", data, at + 1), at + 9)
-        closed = kind % 1000 == 3
+                kind, count = struct.unpack_from(f"{order}II", data, at + 1)
+                at = at + 9
+        closed = kind % 1000 == _POLYGON
         dimensions = (2, 3, 3, 4)[kind // 1000]
-        if kind % 1000 not in (2, 3):
-            several = kind % 1000 in (5, 6)
+        if kind % 1000 not in (_LINE, _POLYGON):
+            several = kind % 1000 in _MULTIS
             problem = "has several parts; split it" if several else "is not one that maps have; draw another"
             raise MapFileError(f"{where}: its geometry {problem}")
         if closed and count != 1:

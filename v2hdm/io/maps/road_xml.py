@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,19 +30,28 @@ from v2hdm.io.maps.features import Feature, features_of, properties_of
 from v2hdm.records import LANE_DASH, FloatArray, HDMap
 from v2hdm.store.files import replace_text, xml_text
 
-_LEAST_STEP_M = 1e-3  # between vertices of a reference line: shorter geometries are refused by readers
+_LEAST_STEP_M = 1e-3  # least length of a piece of a reference line, m: readers refuse shorter geometries
+
+
+class _Place(NamedTuple):
+    """The place on a road's reference line that is nearest to a point."""
+
+    distance_m: float  # from the point
+    segment: int
+    along_m: float  # from the segment's start
 
 
 @dataclass(frozen=True)
 class _Road:
-    """A reference line ``xyz`` (N, 3) m, the lane's width at each vertex, and the marks left and right."""
+    """A road with one lane, to the right of its reference line."""
 
-    xyz: FloatArray
-    width_m: FloatArray
-    marks: tuple[str, str]
+    xyz: FloatArray  # (N, 3) m, the reference line
+    width_m: FloatArray  # (N,) of the lane at each vertex
+    marks: tuple[str, str]  # types of the marks left and right of the lane
 
     @property
     def steps(self) -> FloatArray:
+        """The way (N - 1, 2) from each vertex to the next, m."""
         return np.diff(self.xyz[:, :2], axis=0)
 
     @property
@@ -49,14 +59,14 @@ class _Road:
         """The distance of each vertex along the line (N,)."""
         return length_along(self.xyz[:, :2])
 
-    def nearest(self, point: FloatArray) -> tuple[float, int, float]:
-        """Distance of a point (2,), the segment that it is nearest to, and how far along that, m."""
+    def nearest(self, point: FloatArray) -> _Place:
+        """The place on the reference line nearest to a point (2,)."""
         length = np.diff(self.s_m)
         offset = point - self.xyz[:-1, :2]
         along = np.clip((offset * self.steps).sum(axis=1) / length, 0.0, length)
         away = np.linalg.norm(offset - self.steps * (along / length)[:, None], axis=1)
         segment = int(np.argmin(away))
-        return float(away[segment]), segment, float(along[segment])
+        return _Place(float(away[segment]), segment, float(along[segment]))
 
 
 def write_opendrive(hd_map: HDMap, path: Path) -> None:
@@ -65,53 +75,59 @@ def write_opendrive(hd_map: HDMap, path: Path) -> None:
     roads = _roads(features)
     root = ET.Element("OpenDRIVE")
     stamp = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S")
-    everything = np.concatenate([one.points_map for one in features] or [np.zeros((1, 2))])
-    (west, south) = everything.min(axis=0)
-    (east, north) = everything.max(axis=0)
-    bounds = {
-        key: f"{v:.4f}" for key, v in (("north", north), ("south", south), ("east", east), ("west", west))
-    }
+    everything = np.concatenate([feature.points_map for feature in features] or [np.zeros((1, 2))])
+    west, south = everything.min(axis=0)
+    east, north = everything.max(axis=0)
+    sides_m = {"north": north, "south": south, "east": east, "west": west}
+    bounds = {side: f"{value_m:.4f}" for side, value_m in sides_m.items()}
     about = {"revMajor": "1", "revMinor": "7", "name": path.stem, "date": stamp, "vendor": "v2hdm"}
     header = ET.SubElement(root, "header", about | bounds)
     if hd_map.origin is not None:
         ET.SubElement(header, "geoReference").text = crs_of(hd_map.origin)
     objects = [_write_road(root, number, road) for number, road in enumerate(roads, start=1)]
-    for one in features:
-        if one.closed:
-            centre = one.points_map.mean(axis=0)
-            found = [road.nearest(centre) for road in roads]
-            k = min(range(len(roads)), key=lambda number: found[number][0])
-            _write_object(objects[k], one, roads[k], *found[k][1:])
+    for feature in features:
+        if feature.closed:
+            centre = feature.points_map.mean(axis=0)
+            places = [road.nearest(centre) for road in roads]
+            k = min(range(len(roads)), key=lambda number: places[number].distance_m)
+            _write_object(objects[k], feature, roads[k], places[k])
     replace_text(path, xml_text(root))
 
 
 def _roads(features: Sequence[Feature]) -> list[_Road]:
-    lines = [one for one in features if not one.closed]
+    """A road for each closed lane, else one without width that carries all markings."""
+    lines = [feature for feature in features if not feature.closed]
     roads = []
-    for lane in closed_lanes([one.points_map for one in lines]):
-        left, right = (lines[number] for number, _ in (lane.left, lane.right))
-        xyz = _spaced(left.xyz_map[lane.left[1]])
-        across = _Road(_spaced(right.xyz_map[lane.right[1]]), np.zeros(0), ("", ""))
-        width_m = np.array([across.nearest(point)[0] for point in xyz[:, :2]])
+    for lane in closed_lanes([feature.points_map for feature in lines]):
+        left = lines[lane.left.line]
+        right = lines[lane.right.line]
+        xyz = _spaced(left.xyz_map[lane.left.order])
+        across = _Road(_spaced(right.xyz_map[lane.right.order]), np.zeros(0), ("", ""))
+        width_m = np.array([across.nearest(point).distance_m for point in xyz[:, :2]])
         roads.append(_Road(xyz, width_m, (_mark(left), _mark(right))))
     if roads:
         return roads
     if lines:
-        longest = max(lines, key=lambda one: float(np.linalg.norm(np.ptp(one.points_map, axis=0))))
+        longest = max(lines, key=lambda line: float(np.linalg.norm(np.ptp(line.points_map, axis=0))))
         xyz = _spaced(longest.xyz_map)
     else:
-        centres = np.array([one.xyz_map.mean(axis=0) for one in features]).reshape(-1, 3)
-        middle = centres.mean(axis=0) if len(centres) else np.zeros(3)
-        axis = np.linalg.svd(centres - middle)[2][0] if len(centres) > 1 else np.eye(3)[0]
-        reach_m = max(float(np.abs((centres - middle) @ axis).max(initial=0.0)), 1.0)
-        xyz = np.stack([middle - reach_m * axis, middle + reach_m * axis])
+        xyz = _through_centres(features)
     return [_Road(xyz, np.zeros(len(xyz)), ("none", "none"))]
+
+
+def _through_centres(features: Sequence[Feature]) -> FloatArray:
+    """A straight line (2, 3), m, through the centres of features, at least 2 m long."""
+    centres = np.array([feature.xyz_map.mean(axis=0) for feature in features]).reshape(-1, 3)
+    middle = centres.mean(axis=0) if len(centres) else np.zeros(3)
+    axis = np.linalg.svd(centres - middle)[2][0] if len(centres) > 1 else np.eye(3)[0]
+    reach_m = max(float(np.abs((centres - middle) @ axis).max(initial=0.0)), 1.0)
+    return np.stack([middle - reach_m * axis, middle + reach_m * axis])
 
 
 def _spaced(xyz: FloatArray) -> FloatArray:
     """A line without vertices that lie upon one another."""
-    apart = np.linalg.norm(np.diff(xyz[:, :2], axis=0), axis=1) > _LEAST_STEP_M
-    spaced: FloatArray = xyz[np.insert(apart, 0, True)]
+    is_next_apart = np.linalg.norm(np.diff(xyz[:, :2], axis=0), axis=1) > _LEAST_STEP_M
+    spaced: FloatArray = xyz[np.insert(is_next_apart, 0, True)]
     return spaced
 
 
@@ -150,19 +166,21 @@ def _write_road(root: ET.Element, number: int, road: _Road) -> ET.Element:
     return ET.SubElement(element, "objects")
 
 
-def _write_object(objects: ET.Element, one: Feature, road: _Road, segment: int, along_m: float) -> None:
-    """Write a marking or symbol as an object ``along_m`` along a segment of its road."""
+def _write_object(objects: ET.Element, feature: Feature, road: _Road, nearest: _Place) -> None:
+    """Write a marking or symbol as an object at the ``nearest`` place of its road."""
+    segment = nearest.segment
     ahead = road.steps[segment] / np.linalg.norm(road.steps[segment])
     axes = np.stack([ahead, [-ahead[1], ahead[0]]])
-    start = road.xyz[segment, :2] + along_m * ahead
-    height_m = np.interp(road.s_m[segment] + along_m, road.s_m, road.xyz[:, 2])
-    corners = one.xyz_map[one.ring]
+    start = road.xyz[segment, :2] + nearest.along_m * ahead
+    s_m = road.s_m[segment] + nearest.along_m
+    height_m = np.interp(s_m, road.s_m, road.xyz[:, 2])
+    corners = feature.xyz_map[feature.ring]
     t_m = float((corners[:, :2].mean(axis=0) - start) @ axes[1])
     local = (corners[:, :2] - start - t_m * axes[1]) @ axes.T
     length_m, width_m = np.ptp(local, axis=0)
-    place = {"s": _text(road.s_m[segment] + along_m), "t": _text(t_m), "zOffset": "0", "hdg": "0"}
+    place = {"s": _text(s_m), "t": _text(t_m), "zOffset": "0", "hdg": "0"}
     size = {"length": _text(length_m), "width": _text(width_m), "height": "0", "orientation": "none"}
-    about = {"id": str(one.id), "name": one.kind, "type": "roadMark"}
+    about = {"id": str(feature.id), "name": feature.kind, "type": "roadMark"}
     element = ET.SubElement(objects, "object", about | place | size)
     outline = ET.SubElement(ET.SubElement(element, "outlines"), "outline", {"id": "0", "closed": "true"})
     for k, ((u, v), z) in enumerate(zip(local.tolist(), (corners[:, 2] - height_m).tolist(), strict=True)):
@@ -196,17 +214,17 @@ def write_landxml(hd_map: HDMap, path: Path, grid: Grid | None = None) -> None:
     ET.SubElement(root, "CoordinateSystem", system)
     ET.SubElement(root, "Application", {"name": "v2hdm", "version": __version__})
     group = ET.SubElement(root, "PlanFeatures", {"name": "markings"})
-    for one in features_of(hd_map):
-        element = ET.SubElement(group, "PlanFeature", {"name": str(one.id), "desc": one.kind})
+    for feature in features_of(hd_map):
+        element = ET.SubElement(group, "PlanFeature", {"name": str(feature.id), "desc": feature.kind})
         geometry = ET.SubElement(element, "CoordGeom")
-        east_first = one.positions(grid).tolist()
+        east_first = feature.positions(grid).tolist()
         points = [f"{north:.4f} {east:.4f} {up:.4f}" for east, north, up in east_first]
-        for start, end in pairwise([*points, points[0]] if one.closed else points):
+        for start, end in pairwise([*points, points[0]] if feature.closed else points):
             line = ET.SubElement(geometry, "Line")
             ET.SubElement(line, "Start").text = start
             ET.SubElement(line, "End").text = end
         about = ET.SubElement(element, "Feature", {"code": "v2hdm"})
-        for key, value in properties_of(one).items():
+        for key, value in properties_of(feature).items():
             if not isinstance(value, list):
                 text = f"{value:.5g}" if isinstance(value, float) else str(value)
                 ET.SubElement(about, "Property", {"label": key, "value": text})

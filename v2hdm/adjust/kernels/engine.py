@@ -1,4 +1,4 @@
-"""The engine ``numba``: kernels work on observations, torch on tables of pairs and priors."""
+"""The engine ``numba``: torch's, its passes over the observations replaced by compiled kernels."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from scipy.sparse import csr_array, triu
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays, Run
-from v2hdm.adjust.engine import Engine, Evaluated, Linearised
-from v2hdm.adjust.engines.numba import evaluate, linearise
-from v2hdm.adjust.engines.numba.evaluate import Evaluation
-from v2hdm.adjust.engines.numba.layout import LOSS_CODES, Base, Layout, Scratch, make_layout, share
-from v2hdm.adjust.engines.numba.tables import cam_from_map, move, prior_blocks_of, spread_of, with_priors
+from v2hdm.adjust.engine import Evaluated, Linearised, Report, TorchEngine
+from v2hdm.adjust.kernels import evaluate, linearise
+from v2hdm.adjust.kernels.evaluate import Evaluation
+from v2hdm.adjust.kernels.layout import LOSS_CODES, Base, Layout, Scratch, make_layout
+from v2hdm.adjust.kernels.tables import cam_from_map, move, spread_of, with_priors
 from v2hdm.adjust.model import Estimate, Gradient, Loss
 from v2hdm.adjust.reduced import (
     INSEPARABLE,
@@ -25,15 +25,15 @@ from v2hdm.adjust.reduced import (
     Coupled,
     Joint,
     Plan,
-    PriorBlocks,
     ReducedSystem,
     Spread,
     frames_per_tile,
 )
+from v2hdm.adjust.threads import share
 from v2hdm.adjust.tiles import find_pattern
 from v2hdm.compiled import kernel
 from v2hdm.errors import AdjustError
-from v2hdm.records import BoolArray, FloatArray, IntArray
+from v2hdm.records import FloatArray, IntArray
 
 _COLUMN_RANGES = 8  # ranges of columns shared among threads
 # Multiplications of a factorisation above which other elimination orders are tried, and the fraction of them
@@ -43,8 +43,8 @@ _CLEARLY_LESS = 0.5
 _PAIR_BLOCK = torch.triu_indices(6, 6)
 
 
-class NumbaEngine(Engine):
-    """The kernels for one problem's arrays."""
+class NumbaEngine(TorchEngine):
+    """The model over one problem's arrays: linearised, evaluated, carried and pulled back by kernels."""
 
     @cached_property
     def _whole(self) -> Layout:
@@ -124,15 +124,13 @@ class NumbaEngine(Engine):
         """``cam_from_map`` of every pair, (C, M, 4, 4)."""
         return cam_from_map(self.arrays, estimate)
 
-    def back_project(self, cam_from_vehicle: Tensor) -> tuple[Tensor, Tensor]:
-        """Corners (N, 2) by weighted back-projection from recorded poses, and which (N,) are determined."""
-        arrays, count = self.arrays, self.arrays.corner_count
-        corners = np.empty((count, 2))
-        fixed = np.empty(count, dtype=np.bool_)
-        state = torch.zeros_like(arrays.state_information_root)
-        table = _table(self.poses(Estimate(cam_from_vehicle, state, arrays.control, arrays.no_clock())))
-        self.share(lambda b, e: evaluate.back_project(b, e, self._whole, table, corners, fixed))
-        return torch.from_numpy(corners), torch.from_numpy(fixed)
+    def meet_ground(self, ground_from_ray: Tensor) -> tuple[Tensor, Tensor]:
+        """:meth:`back_project` by the inverse homographies (P, 3, 3) of all pairs."""
+        corners = np.empty((self.arrays.corner_count, 2))
+        determined = np.empty(len(corners), dtype=np.bool_)
+        homographies = _rows(ground_from_ray.flatten(1))
+        self.share(lambda b, e: evaluate.meet_ground(b, e, self._whole, homographies, corners, determined))
+        return torch.from_numpy(corners), torch.from_numpy(determined)
 
     def residuals(self, cam_from_map: Tensor, corners_map: Tensor) -> Tensor:
         """Whitened residuals (2, K) of the observations."""
@@ -142,21 +140,16 @@ class NumbaEngine(Engine):
         self.share(lambda b, e: evaluate.residuals(b, e, self._whole, table, corners, out))
         return torch.from_numpy(out)
 
-    def report(self, estimate: Estimate, focal_px: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """In problem order: residuals (K, 2), px, squared Mahalanobis distances, points behind."""
+    def report(self, estimate: Estimate, focal_px: FloatArray) -> Report:
+        """The observations at an estimate, under focal lengths (C, 2), px."""
         table = _table(self.poses(estimate))
         corners = _rows(estimate.corners_map)
         count = len(self._whole.pair)
-        out = evaluate.Report(np.empty((count, 2)), np.empty(count), np.empty(count, dtype=np.bool_))
+        out = Report(np.empty((count, 2)), np.empty(count), np.empty(count, dtype=np.bool_))
         order = self.arrays.order.numpy()
         focal = np.ascontiguousarray(focal_px)
         self.share(lambda b, e: evaluate.report(b, e, self._whole, table, corners, order, focal, out))
         return out
-
-    def terms(self, estimate: Estimate, robust: Loss) -> dict[str, float]:
-        """The cost by name."""
-        system = ReducedSystem(self.arrays, self.plan(), self.spread(estimate))
-        return self.eliminate(system, estimate, robust).terms
 
     def pull(self, estimate: Estimate, spread: Spread, by_residual: Tensor) -> Gradient:
         """Gradient of a scalar from that by the whitened residuals (2, K)."""
@@ -172,10 +165,6 @@ class NumbaEngine(Engine):
     def spread(self, estimate: Estimate) -> Spread:
         """Jacobians of the pairs by frame states and clock offsets."""
         return spread_of(self.arrays, estimate)
-
-    def prior_blocks(self, estimate: Estimate) -> PriorBlocks:
-        """Gauss-Newton Hessian of the priors by the reduced unknowns."""
-        return prior_blocks_of(self.arrays, estimate)
 
     def eliminate(self, system: ReducedSystem, estimate: Estimate, robust: Loss) -> NumbaLinearised:
         """Linearise and eliminate the corners; raises AdjustError if a block of joined ones is singular."""
@@ -227,15 +216,17 @@ class NumbaEngine(Engine):
             self._subtract_frames(base, system)
         terms, gradient = with_priors(arrays, estimate, spread, out.costs.sum(0), self.pairs(out.wrench))
         return NumbaLinearised(
-            terms,
-            gradient,
-            _corner_factor(arrays, base),
-            torch.from_numpy(out.whitened).view(-1, 2),
-            self.coupled(out.coupled, out.carried, spread),
-            self,
-            base,
-            estimate,
-            spread,
+            engine=self,
+            estimate=estimate,
+            robust=robust,
+            spread=spread,
+            terms=terms,
+            gradient=gradient,
+            corner_factor=_corner_factor(arrays, base),
+            whitened=torch.from_numpy(out.whitened).view(-1, 2),
+            coupled=self.coupled(out.coupled, out.carried, spread),
+            couplings=gradient.extrinsic.new_empty(2, 6, 0),
+            base=base,
         )
 
     def _keep(self, system: ReducedSystem, base: Base) -> None:
@@ -330,8 +321,6 @@ class NumbaLinearised(Linearised):
 
     engine: NumbaEngine
     base: Base
-    estimate: Estimate
-    spread: Spread
 
     def evaluate(self, step: Gradient, tangents: Tensor, own: Tensor) -> Evaluated:
         """Evaluate after a step of the reduced unknowns, in one pass over the observations."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from v2hdm.adjust.engines.numba.inline import (
+from v2hdm.adjust.kernels.inline import (
     add_corner_priors,
     add_force,
     add_loss,
@@ -21,7 +21,7 @@ from v2hdm.adjust.engines.numba.inline import (
     weigh,
     whiten,
 )
-from v2hdm.adjust.engines.numba.layout import Base, Layout, Scratch
+from v2hdm.adjust.kernels.layout import Base, Layout, Scratch
 from v2hdm.compiled import inlined, kernel
 from v2hdm.records import FloatArray, IntArray
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from v2hdm.adjust.engines.numba.inline import (
+from v2hdm.adjust.engine import Report
+from v2hdm.adjust.kernels.inline import (
     add_corner_priors,
     add_force,
     add_loss,
@@ -18,16 +19,17 @@ from v2hdm.adjust.engines.numba.inline import (
     weigh,
     whiten,
 )
-from v2hdm.adjust.engines.numba.layout import Base, Layout, Scratch
-from v2hdm.adjust.engines.numba.linearise import couple, differentiate
+from v2hdm.adjust.kernels.layout import Base, Layout, Scratch
+from v2hdm.adjust.kernels.linearise import couple, differentiate
 from v2hdm.adjust.model import MIN_DEPRESSION_SINE
+from v2hdm.adjust.reduced import PIVOT_FLOOR
 from v2hdm.compiled import inlined, kernel
 from v2hdm.geometry.tensors import NEAR_M
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 
 class Evaluation(NamedTuple):
-    """Output of :func:`evaluate`, as in :class:`~v2hdm.adjust.engines.numba.linearise.Linearisation`.
+    """Output of :func:`evaluate`, as in :class:`~v2hdm.adjust.kernels.linearise.Linearisation`.
 
     ``corners`` (N, 2) have moved; ``whitened`` (2 N,) is the gradient by their whitened variables.
     """
@@ -237,65 +239,54 @@ def evaluate(
 
 
 @kernel
-def back_project(
-    begin: int, end: int, layout: Layout, table: FloatArray, corners: FloatArray, fixed: BoolArray
+def meet_ground(
+    begin: int, end: int, layout: Layout, homographies: FloatArray, corners: FloatArray, determined: BoolArray
 ) -> None:
-    """Start the corners (N, 2) of chunks ``begin`` to ``end``, flagging (N,) those that a ray determines."""
+    """Start the corners (N, 2) of chunks ``begin`` to ``end`` where their rays meet the ground.
+
+    ``homographies`` (P, 9) are the pairs' :func:`v2hdm.adjust.model.ground_from_ray`; ``determined`` (N,) are
+    corners with such a ray.
+    """
     for c in range(layout.unit[layout.chunk[begin]], layout.unit[layout.chunk[end]]):
         xx = yx = yy = x = y = 0.0
         for k in range(layout.begin[c], layout.begin[c + 1]):
-            t = layout.pair[k]
+            ground = homographies[layout.pair[k]]
             u = layout.measured[0, k]
             v = layout.measured[1, k]
-            # The ray in the map, by the transposed rotation.
-            dx = table[t, 0] * u + table[t, 4] * v + table[t, 8]
-            dy = table[t, 1] * u + table[t, 5] * v + table[t, 9]
-            dz = table[t, 2] * u + table[t, 6] * v + table[t, 10]
-            least = MIN_DEPRESSION_SINE * MIN_DEPRESSION_SINE * (dx * dx + dy * dy + dz * dz)
-            if not (dz < 0 and dz * dz > least):
+            drop = ground[6] * u + ground[7] * v + ground[8]
+            least = MIN_DEPRESSION_SINE * MIN_DEPRESSION_SINE * (1 + u * u + v * v)
+            if not (drop > 0 and drop * drop > least):
                 continue
-            sx = table[t, 3]
-            sy = table[t, 7]
-            sz = table[t, 11]
-            reach = (table[t, 2] * sx + table[t, 6] * sy + table[t, 10] * sz) / dz
-            gx = reach * dx - (table[t, 0] * sx + table[t, 4] * sy + table[t, 8] * sz)
-            gy = reach * dy - (table[t, 1] * sx + table[t, 5] * sy + table[t, 9] * sz)
-            px, py, _, inverse, slope, _, _ = see(layout, table, k, gx, gy)
-            xu = inverse * table[t, 0] + slope * px * table[t, 8]
-            yu = inverse * table[t, 1] + slope * px * table[t, 9]
-            xv = inverse * table[t, 4] + slope * py * table[t, 8]
-            yv = inverse * table[t, 5] + slope * py * table[t, 9]
-            j0, j2 = whiten(layout, k, xu, xv)
-            j1, j3 = whiten(layout, k, yu, yv)
+            gx = (ground[0] * u + ground[1] * v + ground[2]) / drop
+            gy = (ground[3] * u + ground[4] * v + ground[5]) / drop
+            xu = ground[0] - gx * ground[6]
+            xv = ground[1] - gx * ground[7]
+            yu = ground[3] - gy * ground[6]
+            yv = ground[4] - gy * ground[7]
+            share = drop / (xu * yv - xv * yu)
+            j0, j2 = whiten(layout, k, share * yv, -share * yu)
+            j1, j3 = whiten(layout, k, -share * xv, share * xu)
             a = j0 * j0 + j2 * j2
             b = j0 * j1 + j2 * j3
             d = j1 * j1 + j3 * j3
-            xx = xx + a
-            yx = yx + b
-            yy = yy + d
-            x = x + a * gx + b * gy
-            y = y + b * gx + d * gy
-        fixed[c] = xx > 0
+            xx += a
+            yx += b
+            yy += d
+            x += a * gx + b * gy
+            y += b * gx + d * gy
+        determined[c] = xx > 0
         if not xx > 0:
             corners[c, 0] = corners[c, 1] = 0.0
             continue
         first = math.sqrt(xx)
         below = yx / first
         rest = yy - below * below
-        least = 1e-12 * yy
+        least = PIVOT_FLOOR * yy
         last = math.sqrt(least if rest < least else rest)
         top = x / first
         low = (y - below * top) / last / last
         corners[c, 0] = (top - below * low) / first
         corners[c, 1] = low
-
-
-class Report(NamedTuple):
-    """The report on the problem's observations (K,), in its order: see :class:`v2hdm.adjust.Solution`."""
-
-    residual_px: FloatArray
-    mahalanobis2: FloatArray
-    behind: BoolArray
 
 
 @kernel

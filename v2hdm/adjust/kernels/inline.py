@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 from v2hdm.adjust.engine import WEIGHT_FLOOR
-from v2hdm.adjust.engines.numba.layout import Base, Layout
+from v2hdm.adjust.kernels.layout import Base, Layout
 from v2hdm.adjust.reduced import CORNER_FLOOR, PIVOT_FLOOR
 from v2hdm.compiled import inlined
 from v2hdm.geometry.tensors import NEAR_M

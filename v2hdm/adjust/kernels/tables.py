@@ -17,7 +17,7 @@ from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
 from v2hdm.adjust.model import Estimate, Gradient, clock_residual, frame_tangent, moved, state_residual
-from v2hdm.adjust.reduced import PriorBlocks, Spread
+from v2hdm.adjust.reduced import Spread
 from v2hdm.compiled import exact_kernel, inlined, kernel
 from v2hdm.geometry import rigid
 from v2hdm.geometry.rigid import EXP_SERIES, LEFT_JACOBIAN_SERIES
@@ -216,23 +216,3 @@ def with_priors(
     if clock.numel():
         gradient.clock_s.add_(clock * arrays.clock_information_root)
     return terms, gradient
-
-
-def prior_blocks_of(arrays: Arrays, estimate: Estimate) -> PriorBlocks:
-    """Gauss-Newton Hessian of the priors by the reduced unknowns."""
-    count = arrays.camera_count
-    each = arrays.camera_unknowns
-    by_camera = np.zeros((count, each, count, each))
-    root = arrays.centre_information_root.numpy()
-    clock_root = arrays.clock_information_root.numpy()
-    for c, turn in enumerate(estimate.cam_from_vehicle.numpy()[:, :3, :3]):
-        by_camera[c, :3, c, :3] = turn * root[c] ** 2 @ turn.T
-        by_camera[c, 6:, c, 6:] = np.diag(clock_root**2)
-    cameras = torch.from_numpy(by_camera).view(count * each, -1)
-    if not arrays.states:
-        none = cameras.new_zeros(arrays.frame_count, 0, 0)
-        return PriorBlocks(cameras, none, none)
-    carried = arrays.state_information_root[..., None] * arrays.state_transition
-    frame = torch.diag_embed(arrays.state_information_root.square())
-    frame[:-1] += (carried.mT @ carried)[1:]
-    return PriorBlocks(cameras, frame, -arrays.state_information_root[..., None] * carried)

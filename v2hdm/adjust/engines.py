@@ -1,0 +1,17 @@
+"""The engine of a solve by name: torch's, or its heir compiled by numba."""
+
+from __future__ import annotations
+
+from v2hdm.adjust.arrays import Arrays
+from v2hdm.adjust.engine import TorchEngine
+from v2hdm.adjust.kernels import are_compiled
+
+
+def make_engine(engine: str, arrays: Arrays) -> TorchEngine:
+    """The engine of this name for a problem; ``auto`` is numba on the CPU if it is installed, else torch."""
+    is_on_cpu = arrays.centre.device.type == "cpu"
+    if engine == "numba" or (engine == "auto" and is_on_cpu and are_compiled()):
+        from v2hdm.adjust.kernels.engine import NumbaEngine  # loads numba
+
+        return NumbaEngine(arrays)
+    return TorchEngine(arrays)
