@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.cameras import level
 from tests.mapping.scene import SceneOptions, make_scene
 from v2hdm.association.ground import Located, locate
 from v2hdm.association.groups import (
@@ -19,7 +18,6 @@ from v2hdm.association.groups import (
 from v2hdm.association.sightings import Rig, collect_sightings
 from v2hdm.association.tracks import build_tracks
 from v2hdm.geometry.planar import align
-from v2hdm.geometry.twists import vehicle_twists
 from v2hdm.mapping.optimise import initial_rig
 from v2hdm.records import PoseNoise
 
@@ -147,16 +145,3 @@ def test_merging_no_groups_gives_none(scene, sightings):
     )
     assert merged.count == 0
     assert (merged.group == -1).all()
-
-
-def test_a_steady_turn_has_one_twist_everywhere():
-    """5 m/s on a circle of 10 m radius: half a radian a second to the left."""
-    stamp_s = np.array([0.0, 0.2, 0.5, 0.6, 1.0])
-    heading = 0.5 * stamp_s
-    poses = level(10 * np.sin(heading), 10 * (1 - np.cos(heading)), heading)
-    expected = np.tile([5.0, 0.0, 0.0, 0.0, 0.0, 0.5], (5, 1))
-    np.testing.assert_allclose(vehicle_twists(poses, stamp_s), expected, atol=1e-9)
-
-
-def test_a_single_pose_stands_still():
-    np.testing.assert_array_equal(vehicle_twists(np.eye(4)[None], np.zeros(1)), np.zeros((1, 6)))
