@@ -237,15 +237,20 @@ class TorchEngine:
     def prior_blocks(self, estimate: Estimate) -> PriorBlocks:
         """Gauss-Newton Hessian of the priors by the reduced unknowns."""
         arrays = self.arrays
+        count = arrays.camera_count
         each = arrays.camera_unknowns
-        rotation = estimate.cam_from_vehicle[:, :3, :3]
-        blocks = rotation.new_zeros(arrays.camera_count, each, each)
+        by_camera = arrays.centre.new_zeros(count, each, count, each)
+        clock = arrays.clock_information_root.square().diag()
         # A left tangent moves the centre by minus its translation, in the vehicle's axes.
-        information = arrays.centre_information_root.square()
-        blocks[:, :3, :3] = (rotation * information[:, None]) @ rotation.mT
-        blocks[:, 6:, 6:] = arrays.clock_information_root.square().diag()
-        cameras = torch.block_diag(*blocks)  # type: ignore[no-untyped-call]
+        for camera, rotation in enumerate(estimate.cam_from_vehicle[:, :3, :3]):
+            turned = rotation * arrays.centre_information_root[camera]
+            by_camera[camera, :3, camera, :3] = turned @ turned.mT
+            by_camera[camera, 6:, camera, 6:] = clock
+        cameras = by_camera.view(count * each, -1)
         root = arrays.state_information_root
+        if not arrays.states:
+            empty = root.new_zeros(arrays.frame_count, 0, 0)
+            return PriorBlocks(cameras, empty, empty)
         by_before = -root[..., None] * arrays.state_transition
         frame = torch.diag_embed(root.square())
         frame[:-1] += (by_before.mT @ by_before)[1:]

@@ -117,8 +117,8 @@ def moved(arrays: Arrays, clock_s: Tensor) -> Tensor:
 def before_camera(points_cam: Tensor) -> Tensor:
     """Points (k, 3) for projection: below the depth ``NEAR_M``, 1 / z continues as in ``inverse_depth``."""
     depth = points_cam[:, 2:]
-    beyond = 1 + (NEAR_M - depth).clamp(min=0) / NEAR_M
-    return torch.cat([points_cam[:, :2] * beyond, depth.clamp(min=NEAR_M)], dim=1)
+    at_least = depth.clamp(min=NEAR_M)
+    return torch.cat([points_cam[:, :2] * (1 + (at_least - depth) / NEAR_M), at_least], dim=1)
 
 
 def points_in_camera(cam_from_map: Tensor, corners_map: Tensor) -> Tensor:

@@ -213,7 +213,7 @@ def _report(
     if descent.robust != robust:
         terms = engine.terms(estimate, robust)
     report = engine.report(estimate, problem.intrinsic[:, :2])
-    audit(arrays, estimate, robust, problem.intrinsic[:, :2], report, terms)
+    audit(arrays, estimate, robust, problem.intrinsic[:, :2], report, terms["observations"])
     residual_px, mahalanobis2, behind = report
     lines = problem.observations.on_line
     if lines.any():
