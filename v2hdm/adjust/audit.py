@@ -69,7 +69,7 @@ def _audit_observations(arrays: Arrays, estimate: Estimate, focal_px: FloatArray
     distance = torch.hypot(a * x, b * x + c * y)
     size = 1 + x.abs() + y.abs()
     agrees = (squared.sqrt() - distance).abs() <= _ROUNDING * size * (a + b.abs() + c)
-    agrees &= (residual_px - expected_px).abs().amax(1) <= _ROUNDING * size * focal.amax(1)
+    agrees &= (residual_px - expected_px).abs().amax(1) <= _ROUNDING * float(focal_px.max()) * size
     agrees &= (behind == (depth_m <= NEAR_M)) | ((depth_m - NEAR_M).abs() <= _ROUNDING)
     if not bool(agrees.all()):
         k = int(agrees.to(torch.uint8).argmin())

@@ -239,13 +239,13 @@ class TorchEngine:
         arrays = self.arrays
         count = arrays.camera_count
         each = arrays.camera_unknowns
-        by_camera = arrays.centre.new_zeros(count, each, count, each)
-        clock = arrays.clock_information_root.square().diag()
         # A left tangent moves the centre by minus its translation, in the vehicle's axes.
-        for camera, rotation in enumerate(estimate.cam_from_vehicle[:, :3, :3]):
-            turned = rotation * arrays.centre_information_root[camera]
-            by_camera[camera, :3, camera, :3] = turned @ turned.mT
-            by_camera[camera, 6:, camera, 6:] = clock
+        turned = estimate.cam_from_vehicle[:, :3, :3] * arrays.centre_information_root[:, None]
+        by_camera = arrays.centre.new_zeros(count, each, count, each)
+        blocks = by_camera.diagonal(dim1=0, dim2=2)
+        blocks[:3, :3] = (turned @ turned.mT).permute(1, 2, 0)
+        if each > 6:
+            blocks[6:, 6:] = arrays.clock_information_root.square().diag()[..., None]
         cameras = by_camera.view(count * each, -1)
         root = arrays.state_information_root
         if not arrays.states:
