@@ -26,7 +26,10 @@ from tests.docs.smaller import SMALL_PORT, smaller
 from v2hdm.cli.main import all_commands
 
 _NEEDS = re.compile(r"\*Needs `pip install '?\.(?:\[([a-z,]+)\])?'?`")
-_PIP = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "-c", str(ROOT / "constraints.txt")]
+_PIP = [
+    "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-compile",
+    "-c", str(ROOT / "constraints.txt"),
+]  # fmt: skip
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 
 PROMISES = {

@@ -17,4 +17,7 @@ def smaller(arguments: list[str]) -> list[str]:
     if name not in ("map", "simulate") or "--cfg=job" in given:
         return arguments
     ports = [one for one in given if one.startswith("+run=port")]
-    return [*arguments, *(SMALL_PORT if ports else ()), "workers=1"]
+    small = [*(SMALL_PORT if ports else ()), "workers=1"]
+    if name == "map" and given != ["+run=port2"]:  # that of `make map` shows the mosaic, once for all
+        small.append("mosaic=false")
+    return [*arguments, *small]

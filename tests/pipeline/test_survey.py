@@ -94,7 +94,7 @@ def site(small_drive, tmp_path_factory):
 def documented(site):
     """The result of the documented command, with every map, and what it printed."""
     (command,) = DOCUMENTED.lines
-    settings = ["all_maps=true", "workers=1", "output=outputs", "name=short"]
+    settings = ["all_maps=true", "mosaic=false", "workers=1", "output=outputs", "name=short"]
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()) as printed:
         patch.chdir(site.folder)
         assert run_command([*shlex.split(command)[1:], *settings]) in (0, 3)

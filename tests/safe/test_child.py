@@ -75,7 +75,7 @@ from tests.safe import work
 from v2hdm.errors import DriveError
 from v2hdm.safe.child import Limits, in_child
 print("once")
-in_child(work.wait, sys.argv[1], limits=Limits.of(), where="a.bag", error=DriveError)
+in_child(work.wait, sys.argv[1], limits=Limits.of([]), where="a.bag", error=DriveError)
 """
 
 

@@ -35,43 +35,10 @@ _SHIFT = 4
 class Hardships:
     """How much is added to random scenes; nothing else of them changes.
 
+    :class:`train.config.DataConfig` says what the others mean.
+
     Attributes:
         shadows_on_paint: mean number of shadows that have an edge across a marking.
-        things_beside: mean number of containers, barriers, cabinets and vehicles that stand right beside a
-            marking: what is bright, has corners and touches such a thing is a part of it in most scenes.
-        faint: share of scenes half of whose markings are so dirty that the ground is nearly as bright.
-        seams: share of lane lines that have a seam of the surface beside them, as paving leaves it there:
-            dark or bright, and going on where a dash ends.
-        side_seams: mean number of markings with a crack or a tar seam along one of their sides and beyond it.
-        pavements: share of scenes in which the surface changes its tone along a line, beside its paint.
-        bleached: share of scenes whose ground is nearly as light as its paint. Half of them are overexposed,
-            so that ground and paint are clipped together.
-        overexposed: share of images that are exposed several times too long, as the sunlit half of a scene
-            is by a camera set for its shade.
-        blue_shade: share of scenes whose shade is lit by a deep blue sky.
-        tight_bends: share of scenes whose way, and all paint with it, turns as sharply as in yards and
-            roundabouts; what would stand on the paint is left out.
-        kerbs: share of scenes with a bright kerb along a line of a lane, no wider than paint, that lies open
-            in stretches as long as dashes.
-        junctions: share of scenes with the whole approach to a junction: arrows, stop line, crosswalk.
-        mountings: share of cameras that sit lower than in cars (0.5 to 1.1 m) or higher than on most trucks
-            (3.6 to 5 m).
-        facing: share of the lanes whose arrows and writing face the camera.
-        stout: share of the lanes with arrows whose shafts are thick and tapered, their heads short.
-        hollow: share of ports whose diamonds are outlines, labelled as filled ones as photographs are; and
-            of streets with such diamonds in a lane.
-        crossings: share of scenes with a stop line that meets or crosses lines of lanes.
-        words: share of scenes with a word, a number or a hatched box in a lane.
-        erased: mean number of markings that were ground off, burnt off or painted over: no paint.
-        litter: mean number of sheets, boxes, bags and cans on the ground.
-        traffic: mean number of vehicles, boards and kerbs with stripes, windows, wheels, plates and writing.
-        own_vehicle: share of images with the own bonnet or dashboard, wipers, or drops and reflections on
-            the windscreen.
-        rain: share of scenes whose ground is wet all over and mirrors a bright sky.
-        low_sun: share of scenes with a sun at 3 to 11 degrees, half of them against it.
-        dusk: share of scenes after sunset, mostly in the light of the own headlights.
-        sun_flecks: share of scenes in deep shade with few spots of sun.
-        grounds: share of grounds of asphalt or concrete that are photographed ones.
         aside: share of cameras that look to the side of the vehicle. What they see is another scene's worth,
             and its dashes and stop lines have changed names: see
             :func:`~train.scenes.scenes.training_sample`.

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 _RUN = 1 << 14  # observations per run: intermediate results stay in the processor's cache
-_RUN_ON_DEVICE = 1 << 20
+_RUN_ON_DEVICE = 1 << 20  # observations per run on a graphics processor: few launches, and memory for each
 
 
 @dataclass(frozen=True)
@@ -177,8 +177,8 @@ class Arrays:
         if count <= size:
             return [(0, 0), (count, self.corner_count)]
         begins = torch.searchsorted(self.corner, self.units.to(self.corner.dtype))
-        wanted = torch.arange(0, count + size, size, device=begins.device)
-        chosen = torch.unique(torch.searchsorted(begins, wanted.clamp(max=count)))
+        multiples = torch.arange(0, count + size, size, device=begins.device)
+        chosen = torch.unique(torch.searchsorted(begins, multiples.clamp(max=count)))
         return list(zip(begins[chosen].tolist(), self.units[chosen].tolist(), strict=True))
 
     @cached_property
@@ -208,8 +208,14 @@ class Arrays:
         count = bounds[1] - bounds[0]
         corner = torch.repeat_interleave(count)
         rows = torch.arange(len(corner), device=corner.device) + (bounds[1] - count.cumsum(0))[corner]
-        seen = self.pair[rows].long(), corner, self.measured[:, rows], self.root_information[:, rows]
-        return Run(slice(0, len(rows)), slice(0, len(corners)), *seen)
+        return Run(
+            slice(0, len(rows)),
+            slice(0, len(corners)),
+            self.pair[rows].long(),
+            corner,
+            self.measured[:, rows],
+            self.root_information[:, rows],
+        )
 
     def whole(self) -> Run:
         """The whole problem as one run."""
@@ -226,7 +232,7 @@ class Arrays:
         rank[corners] = torch.arange(len(corners), device=rank.device)
         first = rank[self.lengths.first]
         second = rank[self.lengths.second]
-        both = (first >= 0) & (second >= 0)
+        have_both = (first >= 0) & (second >= 0)
         unit = (~self.joined).cumsum(0)[corners]
         part = replace(
             self,
@@ -240,7 +246,10 @@ class Arrays:
             control=self.control[corners],
             control_root=self.control_root[corners],
             lengths=Lengths(
-                first[both], second[both], self.lengths.length_m[both], self.lengths.information_root[both]
+                first[have_both],
+                second[have_both],
+                self.lengths.length_m[have_both],
+                self.lengths.information_root[have_both],
             ),
         )
         return part, corners

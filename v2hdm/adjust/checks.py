@@ -31,7 +31,7 @@ def _refuse(wrong: BoolArray | np.bool_, said: str, *values: FloatArray | IntArr
     """Raise for the first ``wrong`` item, if any, with its number and ``values`` filled in."""
     if wrong.any():
         k = int(np.argmax(wrong))
-        raise AdjustError(said.format(k, *(each[k] for each in values)))
+        raise AdjustError(said.format(k, *(column[k] for column in values)))
 
 
 def _check_control(problem: Problem) -> None:
@@ -42,8 +42,8 @@ def _check_control(problem: Problem) -> None:
     named = control.corner
     if np.shape(control.points_map) != (count, 2) or np.shape(control.sigma_m) != (count, 2):
         raise AdjustError(f"control points: {count} corners need as many points_map and sigma_m (x, y)")
-    there = (named >= 0) & (named < problem.corner_count)
-    _refuse(~there, "control point {} names corner {}, which does not exist", named)
+    exists = (named >= 0) & (named < problem.corner_count)
+    _refuse(~exists, "control point {} names corner {}, which does not exist", named)
     if len(np.unique(named)) < count:
         raise AdjustError("two control points name the same corner: keep one of them")
     sound = (np.isfinite(control.points_map) & (control.sigma_m > 0)).all(1)
@@ -51,17 +51,18 @@ def _check_control(problem: Problem) -> None:
 
 
 def _check_lengths(problem: Problem) -> None:
-    known = problem.lengths
-    if known is None:
+    lengths = problem.lengths
+    if lengths is None:
         return
-    count = len(known.first)
-    length_m = known.length_m
-    sigma_m = known.sigma_m
-    if any(np.shape(values) != (count,) for values in (known.second, length_m, sigma_m)):
+    count = len(lengths.first)
+    length_m = lengths.length_m
+    sigma_m = lengths.sigma_m
+    if any(np.shape(values) != (count,) for values in (lengths.second, length_m, sigma_m)):
         raise AdjustError(f"known lengths: {count} first corners need as many second, length_m and sigma_m")
-    first, second = ends = np.stack([known.first, known.second])
-    there = ((ends >= 0) & (ends < problem.corner_count)).all(0)
-    _refuse(~there, "known length {} names corners {} and {}; one does not exist", first, second)
+    ends = np.stack([lengths.first, lengths.second])
+    first, second = ends
+    exist = ((ends >= 0) & (ends < problem.corner_count)).all(0)
+    _refuse(~exist, "known length {} names corners {} and {}; one does not exist", first, second)
     _refuse(first == second, "known length {} is from corner {} to itself", first)
     (low, high), times = np.unique(np.sort(ends, axis=0), axis=1, return_counts=True)
     _refuse(times > 1, "the distance of corners {1} and {2} is given twice: keep one of them", low, high)
@@ -118,15 +119,15 @@ _ARRAYS: Mapping[str, Mapping[str, tuple[int, ...]]] = {
 
 def _check_arrays(problem: Problem) -> None:
     """Check types, shapes and finiteness, except that of centre sigmas and observations."""
-    seen = problem.observations
-    if len(seen.camera) == 0:
+    observations = problem.observations
+    if len(observations.camera) == 0:
         raise AdjustError("there are no observations to adjust: detect and associate markings first")
-    sizes = _sizes(problem) | {"observation": len(seen.camera)}
+    sizes = _sizes(problem) | {"observation": len(observations.camera)}
     for of, arrays in _ARRAYS.items():
-        owner, prefix = (seen, "observations.") if of == "observation" else (problem, "")
-        for name, each in arrays.items():
+        owner, prefix = (observations, "observations.") if of == "observation" else (problem, "")
+        for name, item_shape in arrays.items():
             values = getattr(owner, name)
-            shape = (sizes[of], *each)
+            shape = (sizes[of], *item_shape)
             if values is None:
                 continue
             if not isinstance(values, np.ndarray):
@@ -154,9 +155,9 @@ def check_observations(problem: Problem) -> None:
 
     by_corner = np.zeros(problem.corner_count, dtype=np.int64)
     by_camera = np.zeros(len(problem.intrinsic), dtype=np.int64)
-    seen = Seen.of(problem.observations.columns, problem.intrinsic)
-    limits = len(problem.map_from_vehicle), _SYMMETRIC_TO, _MAX_SLOPE
-    k = first_unsound(seen, *limits, by_corner, by_camera)
+    columns = Seen.of(problem.observations.columns, problem.intrinsic)
+    frame_count = len(problem.map_from_vehicle)
+    k = first_unsound(columns, frame_count, _SYMMETRIC_TO, _MAX_SLOPE, by_corner, by_camera)
     if k >= 0:
         raise AdjustError(_fault(problem, k))
     for name, times in (("corner", by_corner), ("camera", by_camera)):
@@ -166,17 +167,17 @@ def check_observations(problem: Problem) -> None:
 
 def _fault(problem: Problem, k: int) -> str:
     """The message for the unsound observation k."""
-    seen = problem.observations
+    observations = problem.observations
     for name, size in _sizes(problem).items():
-        index = getattr(seen, name)[k]
+        index = getattr(observations, name)[k]
         if not 0 <= index < size:
             return f"observation {k} names {name} {index}, but there are only {size}"
     for name in ("pinhole_px", "covariance_px"):
-        if not np.isfinite(getattr(seen, name)[k]).all():
+        if not np.isfinite(getattr(observations, name)[k]).all():
             return f"{name} of observation {k} is not finite: remove it or fix its source"
-    (xx, xy), (yx, yy) = seen.covariance_px[k].astype(np.float64)
-    intrinsic = problem.intrinsic[seen.camera[k]]
-    aside = np.abs((seen.pinhole_px[k] - intrinsic[2:]) / intrinsic[:2]).max()
+    (xx, xy), (yx, yy) = observations.covariance_px[k].astype(np.float64)
+    intrinsic = problem.intrinsic[observations.camera[k]]
+    aside = np.abs((observations.pinhole_px[k] - intrinsic[2:]) / intrinsic[:2]).max()
     if aside > _MAX_SLOPE:
         return (
             f"pinhole_px of observation {k} lies {aside:.3g} focal lengths "
@@ -207,11 +208,11 @@ def _check_priors(problem: Problem) -> None:
         said = "read_out_s of camera {} is {} s: give 0 (all rows at once) or more"
         _refuse(problem.read_out_s < 0, said, problem.read_out_s)
     _check_sessions(problem)
-    for one in problem.pose_sigmas:
-        sigma = one.by_state()
+    for pose_sigma in problem.pose_sigmas:
+        sigma = pose_sigma.by_state()
         if not (np.isfinite(sigma).all() and (sigma > 0).all()):
-            raise AdjustError(f"pose_sigma must be above 0 and finite: {one}")
-        for total, drift in zip(sigma, one.drift_by_state(), strict=True):
+            raise AdjustError(f"pose_sigma must be above 0 and finite: {pose_sigma}")
+        for total, drift in zip(sigma, pose_sigma.drift_by_state(), strict=True):
             if not (0 <= drift.sigma <= total and drift.over_m > 0):
                 raise AdjustError(
                     f"{drift} must be part of its pose_sigma {total:g} and fade over a distance"

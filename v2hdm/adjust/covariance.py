@@ -15,9 +15,8 @@ from v2hdm.adjust.reduced import reduced_coupling, to_tiles
 from v2hdm.adjust.whitening import Whitening
 from v2hdm.records import FloatArray
 
-# Right-hand sides solved together: enough corners for fast products, and a limit on their numbers.
-_CORNERS_AT_ONCE = 256
-_NUMBERS_AT_ONCE = 1 << 25
+_CORNERS_AT_ONCE = 256  # corners whose right-hand sides are solved together: enough for fast products
+_NUMBERS_AT_ONCE = 1 << 25  # most numbers, of 8 bytes, in the right-hand sides that are solved together
 _FRAMES_AT_ONCE = 64  # frames whose right-hand sides are solved together
 
 
@@ -48,8 +47,10 @@ class Covariance:
 
     def extrinsic(self) -> FloatArray:
         """Covariance (C, 6, 6) of each camera's left tangent: translation m, rotation rad."""
-        own = np.stack([block[:6, :6] for block in self._cameras()])
-        return own if self.held is None else own + self.held.extrinsic @ self.held.extrinsic.swapaxes(1, 2)
+        of_cameras = np.stack([block[:6, :6] for block in self._cameras()])
+        if self.held is None:
+            return of_cameras
+        return of_cameras + self.held.extrinsic @ self.held.extrinsic.swapaxes(1, 2)
 
     def clock_s2(self) -> FloatArray:
         """Variances (C, Q), s^2, of clock offsets by session and, if estimated, last the read-out time."""
@@ -59,8 +60,8 @@ class Covariance:
         """Covariances (6 + Q, 6 + Q) of each camera's unknowns."""
         # Cameras come last: the tip of L_S is the factor of their marginal information matrix.
         joint = torch.cholesky_inverse(self.whitening.reduced_factor.tip).cpu().numpy()
-        each = self.whitening.engine.arrays.camera_unknowns
-        return [joint[k : k + each, k : k + each] for k in range(0, len(joint), each)]
+        count = self.whitening.engine.arrays.camera_unknowns
+        return [joint[k : k + count, k : k + count] for k in range(0, len(joint), count)]
 
     def poses(self) -> FloatArray:
         """Variances (J, 6) of the frames' tangents; 0 without states."""
@@ -72,13 +73,13 @@ class Covariance:
         columns = torch.tensor(arrays.states, dtype=torch.int64, device=arrays.centre.device)
         acts = torch.nn.functional.one_hot(columns, 6).to(torch.float64)
         for begin in range(0, frames if states else 0, _FRAMES_AT_ONCE):
-            own = torch.arange(begin, min(begin + _FRAMES_AT_ONCE, frames), device=columns.device)
-            wanted = acts.new_zeros(frames, states, len(own), 6)
-            wanted[own, :, own - begin] = acts
-            tiles = to_tiles(whitening.plan, wanted.flatten(2))
+            chunk = torch.arange(begin, min(begin + _FRAMES_AT_ONCE, frames), device=columns.device)
+            selected = acts.new_zeros(frames, states, len(chunk), 6)
+            selected[chunk, :, chunk - begin] = acts
+            tiles = to_tiles(whitening.plan, selected.flatten(2))
             tip = tiles.new_zeros(len(whitening.reduced_factor.tip), tiles.shape[1])
             root = whitening.reduced_factor.solve(torch.cat([tiles, tip]))
-            out[own.cpu().numpy()] = root.square().sum(0).view(len(own), 6).cpu().numpy()
+            out[chunk.cpu().numpy()] = root.square().sum(0).view(len(chunk), 6).cpu().numpy()
         return out if self.held is None else out + np.square(self.held.poses).sum(axis=2)
 
     def camera_information(self) -> FloatArray:
@@ -89,31 +90,31 @@ class Covariance:
     def corners(self, groups: NDArray[np.int64]) -> FloatArray:
         """Joint covariances (M, 2 n, 2 n), m^2, of M groups (M, n) of corners."""
         parts = np.array_split(groups, min(max(-(-groups.size // _at_once(self.whitening)), 1), len(groups)))
-        own = np.concatenate([self._corners(part) for part in parts])
+        of_corners = np.concatenate([self._corners(part) for part in parts])
         if self.held is None:
-            return own
-        moved = self.held.corners[groups].reshape(*own.shape[:2], -1)
-        return own + moved @ moved.swapaxes(1, 2)
+            return of_corners
+        moved = self.held.corners[groups].reshape(*of_corners.shape[:2], -1)
+        return of_corners + moved @ moved.swapaxes(1, 2)
 
     def _corners(self, groups: NDArray[np.int64]) -> FloatArray:
         arrays = self.whitening.engine.arrays
         rank = torch.argsort(arrays.corner_order)
         chosen = rank[torch.as_tensor(groups, device=rank.device)]
         # Known lengths couple V^-1 of corners to others outside their group.
-        near = _with_joined(arrays, chosen)
-        corners = torch.unique(near)
-        by_near = _reduced_root(self.whitening, corners).T[_columns(corners, near)]
+        joined = _with_joined(arrays, chosen)
+        corners = torch.unique(joined)
+        by_near = _reduced_root(self.whitening, corners).T[_columns(corners, joined)]
         # V^-1 of the corners and all joined ones; 1 for kept corners.
         unit = torch.eye(2 * len(corners), dtype=torch.float64, device=corners.device)
         factor = self.whitening.linearised.corner_factor.take(corners)
         inverse = factor.solve_transposed(factor.solve(unit.view(len(corners), 2, -1))).flatten(0, 1)
-        own = inverse.clone()
-        own[torch.isin(corners, self.whitening.plan.kept).repeat_interleave(2)] = 0.0
+        of_factor = inverse.clone()
+        of_factor[torch.isin(corners, self.whitening.plan.kept).repeat_interleave(2)] = 0.0
         rows = _columns(corners, chosen)
-        once = ~(near[:, :, None] == near[:, None, :]).tril(-1).any(2).repeat_interleave(2, dim=1)
-        spread = inverse[rows[:, :, None], _columns(corners, near)[:, None, :]] * once[:, None]
-        own = own[rows[:, :, None], rows[:, None, :]]
-        return np.asarray((own + spread @ (by_near @ by_near.mT) @ spread.mT).cpu().numpy())
+        once = ~(joined[:, :, None] == joined[:, None, :]).tril(-1).any(2).repeat_interleave(2, dim=1)
+        spread = inverse[rows[:, :, None], _columns(corners, joined)[:, None, :]] * once[:, None]
+        of_factor = of_factor[rows[:, :, None], rows[:, None, :]]
+        return np.asarray((of_factor + spread @ (by_near @ by_near.mT) @ spread.mT).cpu().numpy())
 
 
 def corner_gain(whitening: Whitening) -> FloatArray:
@@ -155,9 +156,9 @@ def _with_joined(arrays: Arrays, chosen: Tensor) -> Tensor:
     return torch.stack([torch.cat([g, g[-1:].expand(longest - len(g))]) for g in groups])
 
 
-def _columns(corners: Tensor, wanted: Tensor) -> Tensor:
+def _columns(corners: Tensor, chosen: Tensor) -> Tensor:
     """Columns (M, 2 m) of x and y of the corners ``wanted`` (M, m) among ``corners``, ascending."""
-    place = 2 * torch.searchsorted(corners, wanted.contiguous())
+    place = 2 * torch.searchsorted(corners, chosen.contiguous())
     return torch.stack([place, place + 1], dim=-1).flatten(1)
 
 
@@ -170,13 +171,13 @@ def _reduced_root(whitening: Whitening, corners: Tensor) -> Tensor:
     coupling = whitening.linearised.coupling(run, estimate.corners_map[corners])
     if not len(plan.kept):
         return whitening.reduced_factor.solve(reduced_coupling(plan, whitening.spread, run, coupling))
-    kept = torch.isin(corners, plan.kept)
-    coupling[kept[run.corner]] = 0.0
+    is_kept = torch.isin(corners, plan.kept)
+    coupling[is_kept[run.corner]] = 0.0
     right = reduced_coupling(plan, whitening.spread, run, coupling)
-    number = torch.searchsorted(plan.kept, corners[kept])
+    number = torch.searchsorted(plan.kept, corners[is_kept])
     picked = right.new_zeros(len(plan.kept), 2, len(corners), 2)
     for axis in range(2):
-        picked[number, axis, kept.nonzero()[:, 0], axis] = -1.0
+        picked[number, axis, is_kept.nonzero()[:, 0], axis] = -1.0
     frames = right.new_zeros(0, len(arrays.states), right.shape[1])
     right[: len(right) - len(whitening.reduced_factor.tip)] += to_tiles(plan, frames, picked.flatten(2))
     return whitening.reduced_factor.solve(right)

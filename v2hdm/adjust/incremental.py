@@ -17,7 +17,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -38,7 +38,7 @@ from v2hdm.errors import AdjustError
 from v2hdm.geometry.rigid import exp, left_jacobian
 from v2hdm.records import FloatArray, IntArray
 
-_GAP_TOLERANCE = 1e-9  # of a marking's solve: at a cost of a few hundred, within a thousandth of a sigma
+_GAP_TOLERANCE = 1e-9  # gap of a marking's solve: at a cost of a few hundred, within a thousandth of a sigma
 _LEAST_LEFT = 1e-12  # fraction of an unknown's information, correlations included, below which it is rounding
 
 
@@ -69,7 +69,7 @@ class Sighted:
 
 
 @dataclass(frozen=True)
-class _Own:
+class _Contribution:
     """One marking's contribution to a :class:`_Quadratic`, in the unknowns ``rows`` of its cameras."""
 
     rows: IntArray
@@ -81,13 +81,13 @@ class _Own:
 class _Settled:
     """Corners (n, 2) at the unknowns ``at`` (D,) of all cameras; ``gain`` (n, 2, D) is their derivative.
 
-    ``own`` is their contribution to the quadratic, None if others were solved together with it.
+    ``contribution`` is theirs to the quadratic, None if others were solved together with it.
     """
 
     at: FloatArray
     corners_map: FloatArray
     gain: FloatArray
-    own: _Own | None
+    contribution: _Contribution | None
 
 
 @dataclass(frozen=True)
@@ -105,16 +105,42 @@ class _Quadratic:
 
     def rows(self, cameras: IntArray) -> IntArray:
         """Indices of the unknowns of some cameras."""
-        each = len(self.vector) // len(self.cameras)
-        return np.asarray((np.searchsorted(self.cameras, cameras)[:, None] * each + np.arange(each)).ravel())
+        unknown_count = len(self.vector) // len(self.cameras)
+        first = np.searchsorted(self.cameras, cameras) * unknown_count
+        return np.asarray((first[:, None] + np.arange(unknown_count)).ravel())
 
-    def plus(self, own: _Own, sign: float) -> _Quadratic:
+    def plus(self, contribution: _Contribution, sign: float) -> _Quadratic:
         """With a marking's contribution added, or subtracted with ``sign`` -1."""
         added = self.information.copy()
         moved = self.vector.copy()
-        added[own.rows[:, None], own.rows] += sign * own.information
-        moved[own.rows] += sign * own.vector
+        added[contribution.rows[:, None], contribution.rows] += sign * contribution.information
+        moved[contribution.rows] += sign * contribution.vector
         return replace(self, information=added, vector=moved)
+
+
+class _Linearised(NamedTuple):
+    """The map's quadratic with one more marking."""
+
+    joint: _Quadratic
+    contribution: _Contribution  # the marking's
+    settled: _Settled  # its corners
+
+
+class _Joined(NamedTuple):
+    """A marking joined to a quadratic, and the step to the minimum of the sum."""
+
+    contribution: _Contribution  # the marking's
+    joint: _Quadratic
+    whitened_step: Tensor
+    gained: float  # twice the decrease of the cost by that step
+
+
+class _Moved(NamedTuple):
+    """Cameras at given unknowns, of which each has six and Q of its clock."""
+
+    cam_from_vehicle: Tensor  # (C, 4, 4)
+    clock_s: Tensor  # (C, Q)
+    chart: FloatArray  # (C (6 + Q), C (6 + Q)) left tangents and clock offsets by the unknowns
 
 
 class IncrementalMap:
@@ -139,7 +165,9 @@ class IncrementalMap:
         """Extrinsics (C, 4, 4) from all markings; the start for cameras without any."""
         out = self._drive.cam_from_vehicle.copy()
         if self._earlier is not None:
-            out[self._earlier.cameras] = _moved(self._earlier.base, self._earlier.mean, "cpu")[0].numpy()
+            out[self._earlier.cameras] = _moved(
+                self._earlier.base, self._earlier.mean, "cpu"
+            ).cam_from_vehicle.numpy()
         return out
 
     def is_solved(self, marking: int) -> bool:
@@ -153,8 +181,8 @@ class IncrementalMap:
         engine = make_engine(self._options.engine, arrays)
         corners, fixed = engine.back_project(torch.from_numpy(problem.cam_from_vehicle))
         out = np.full(corners.shape, np.nan)
-        known = fixed.numpy()
-        out[arrays.corner_order.numpy()[known]] = corners.numpy()[known]
+        is_fixed = fixed.numpy()
+        out[arrays.corner_order.numpy()[is_fixed]] = corners.numpy()[is_fixed]
         return out
 
     def corners_map(self, marking: int) -> FloatArray:
@@ -185,7 +213,9 @@ class IncrementalMap:
             if earlier is None or due or not cameras.issubset(earlier.cameras.tolist()):
                 self.adjust()
             else:
-                self._earlier, _, self._settled[marking] = self._linearised(earlier, marking, joined)
+                linearised = self._linearised(earlier, marking, joined)
+                self._earlier = linearised.joint
+                self._settled[marking] = linearised.settled
         except UndeterminedError:
             # The first few of a camera leave its extrinsic undetermined; they wait for more.
             self._adjusted_count = 0
@@ -199,8 +229,11 @@ class IncrementalMap:
         """The quadratic without a marking; None if so little remains that all others must be solved again."""
         if self._earlier is None or marking not in self._settled:
             return self._earlier
-        own = self._settled[marking].own or self._linearised(self._earlier, marking, sighted)[1]
-        less = self._earlier.plus(own, -1.0)
+        contribution = (
+            self._settled[marking].contribution
+            or self._linearised(self._earlier, marking, sighted).contribution
+        )
+        less = self._earlier.plus(contribution, -1.0)
         least = np.linalg.eigvalsh(less.information / _scale(self._earlier.information)).min()
         return less if least > _LEAST_LEFT else None
 
@@ -227,14 +260,12 @@ class IncrementalMap:
         gain = corner_gain(solution.covariance.whitening)
         end = 0
         for marking, sighted in self._sighted.items():
-            own = slice(end, end := end + sighted.corner_count)
-            self._settled[marking] = _Settled(at.ravel(), solution.corners_map[own], gain[own], None)
+            corners = slice(end, end := end + sighted.corner_count)
+            self._settled[marking] = _Settled(at.ravel(), solution.corners_map[corners], gain[corners], None)
         return solution
 
-    def _linearised(
-        self, earlier: _Quadratic, marking: int, sighted: Sighted
-    ) -> tuple[_Quadratic, _Own, _Settled]:
-        """The quadratic ``earlier`` plus a marking, the marking's contribution, and its corners."""
+    def _linearised(self, earlier: _Quadratic, marking: int, sighted: Sighted) -> _Linearised:
+        """The quadratic ``earlier`` plus a marking."""
         # The quadratic contains the cameras' priors.
         without = {"centre_vehicle": None, "clock_sigma_s": np.inf, "read_out_sigma_s": np.inf}
         problem, cameras = self._problem([sighted], **without)
@@ -250,28 +281,31 @@ class IncrementalMap:
         plan = engine.plan()
         loss = None
         gap = np.inf
-        moved, clock_s, chart = _moved(base, at[rows], options.device)
-        corners, fixed = engine.back_project(moved)
+        moved = _moved(base, at[rows], options.device)
+        corners, fixed = engine.back_project(moved.cam_from_vehicle)
         if not bool(fixed.all()):
             raise AdjustError(f"marking {marking} cannot be solved for: no ray of a corner meets the ground")
-        estimate = Estimate(moved, torch.zeros_like(arrays.state_information_root), corners, clock_s)
+        no_state = torch.zeros_like(arrays.state_information_root)
+        estimate = Estimate(moved.cam_from_vehicle, no_state, corners, moved.clock_s)
         for _ in range(options.max_refreshes):
             loss = narrowed(engine, estimate, robust, loss)
             held = factorise(engine, plan, estimate, loss, hold_cameras=True)
-            share = partial(_joined, earlier, rows, held.reduced_factor, chart)
-            _, joint, whitened, _ = share(at, held.gradient)
-            step = held.step(whitened)
+            share = partial(_joined, earlier, rows, held.reduced_factor, moved.chart)
+            before = share(at, held.gradient)
+            step = held.step(before.whitened_step)
             if not float(step[1][..., 3:].norm(dim=-1).max()) <= math.pi:  # outside the chart
                 raise _unsolved(f"marking {marking}", Status.STALLED)
             done = held.linearised.evaluate(*step)
-            at = joint.mean
-            left = done.gradient, done.coupled, done.whitened
-            own, joint, _, gained = share(at, whitened_gradient(plan, held.reduced_factor, *left))
-            gap = gained / max(sum(done.terms.values()), 1.0)
+            at = before.joint.mean
+            gradient = whitened_gradient(
+                plan, held.reduced_factor, done.gradient, done.coupled, done.whitened
+            )
+            joined = share(at, gradient)
+            gap = joined.gained / max(sum(done.terms.values()), 1.0)
             if not gap > _GAP_TOLERANCE and loss.scale <= robust.scale:
                 break
-            moved, clock_s, chart = _moved(base, at[rows], options.device)
-            estimate = replace(done.estimate, cam_from_vehicle=moved, clock_s=clock_s)
+            moved = _moved(base, at[rows], options.device)
+            estimate = replace(done.estimate, cam_from_vehicle=moved.cam_from_vehicle, clock_s=moved.clock_s)
         behind = engine.report(done.estimate, problem.intrinsic[:, :2])[2].any()
         if behind or not gap <= _GAP_TOLERANCE:
             raise _unsolved(
@@ -280,53 +314,54 @@ class IncrementalMap:
         out = np.empty((problem.corner_count, 2))
         out[arrays.corner_order.cpu().numpy()] = done.estimate.corners_map.cpu().numpy()
         gain = np.zeros((len(out), 2, len(at)))
-        gain[:, :, rows] = corner_gain(held) @ chart
-        return joint, own, _Settled(at, out, gain, own)
+        gain[:, :, rows] = corner_gain(held) @ moved.chart
+        settled = _Settled(at, out, gain, joined.contribution)
+        return _Linearised(joined.joint, joined.contribution, settled)
 
     def _problem(self, sighted: Sequence[Sighted], **changes: Any) -> tuple[Problem, IntArray]:
         """Some markings as a problem of their cameras and frames, and the indices of these cameras."""
-        starts = np.cumsum([0, *(one.corner_count for one in sighted)])
-        seen = _stacked([one.observations for one in sighted])
-        corner = seen.corner + np.repeat(starts[:-1], [len(one.observations.corner) for one in sighted])
-        problem, cameras, _ = self._drive.seen_by(replace(seen, corner=corner))
-        changes["control"] = _known([one.control for one in sighted], starts)
-        changes["lengths"] = _known([one.lengths for one in sighted], starts)
-        return replace(problem, cam_from_vehicle=self.cam_from_vehicle[cameras], **changes), cameras
+        starts = np.cumsum([0, *(marking.corner_count for marking in sighted)])
+        observations = _stacked([marking.observations for marking in sighted])
+        counts = [len(marking.observations.corner) for marking in sighted]
+        corner = observations.corner + np.repeat(starts[:-1], counts)
+        part = self._drive.seen_by(replace(observations, corner=corner))
+        changes["control"] = _known([marking.control for marking in sighted], starts)
+        changes["lengths"] = _known([marking.lengths for marking in sighted], starts)
+        extrinsics = self.cam_from_vehicle[part.cameras]
+        return replace(part.problem, cam_from_vehicle=extrinsics, **changes), part.cameras
 
 
 def _joined(
     earlier: _Quadratic, rows: IntArray, factor: TiledCholesky, chart: FloatArray, at: FloatArray, by: Tensor
-) -> tuple[_Own, _Quadratic, Tensor, float]:
-    """A marking's contribution from its whitened gradient ``by`` at the unknowns ``at``, and the sum.
+) -> _Joined:
+    """A marking joined to ``earlier``, from its whitened gradient ``by`` at the unknowns ``at``.
 
-    Then the whitened step to the sum's minimum, and twice its decrease; ``factor`` is of a whitening with
-    held cameras, ``chart`` that of :func:`_moved`.
+    ``factor`` is of a whitening with held cameras, ``chart`` that of :func:`_moved`.
     """
     assert factor.held is not None
-    cameras = (step := -by)[factor.size - len(rows) : factor.size]
+    step = -by
+    cameras = step[factor.size - len(rows) : factor.size]
     information = chart.T @ factor.held.cpu().numpy() @ chart
-    own = _Own(rows, information, information @ at[rows] + chart.T @ cameras.cpu().numpy())
-    joint = earlier.plus(own, 1.0)
+    contribution = _Contribution(rows, information, information @ at[rows] + chart.T @ cameras.cpu().numpy())
+    joint = earlier.plus(contribution, 1.0)
     change = joint.mean - at
     cameras.zero_()
     gained = float(step @ step) + float(change @ joint.information @ change)
     cameras.copy_(torch.from_numpy(chart @ change[rows]))
-    return own, joint, step, gained
+    return _Joined(contribution, joint, step, gained)
 
 
-def _moved(base: FloatArray, unknowns: FloatArray, device: str) -> tuple[Tensor, Tensor, FloatArray]:
-    """Extrinsics (C, 4, 4) and clock offsets (C, Q) at the unknowns (C (6 + Q),) around ``base``.
-
-    Then the chart: left tangents and clock offsets by the unknowns, (C (6 + Q), C (6 + Q)).
-    """
+def _moved(base: FloatArray, unknowns: FloatArray, device: str) -> _Moved:
+    """The cameras at the unknowns (C (6 + Q),) around ``base`` (C, 4, 4)."""
     by_camera = unknowns.reshape(len(base), -1)
     moved = exp(by_camera[:, :6]) @ base
     turns = left_jacobian(by_camera[:, :6])
     chart = np.eye(len(unknowns))
-    each = by_camera.shape[1]
-    for begin, turn in zip(range(0, len(unknowns), each), turns, strict=True):
+    unknown_count = by_camera.shape[1]
+    for begin, turn in zip(range(0, len(unknowns), unknown_count), turns, strict=True):
         chart[begin : begin + 6, begin : begin + 6] = turn
-    return torch.as_tensor(moved, device=device), torch.as_tensor(by_camera[:, 6:], device=device), chart
+    clock_s = torch.as_tensor(by_camera[:, 6:], device=device)
+    return _Moved(torch.as_tensor(moved, device=device), clock_s, chart)
 
 
 def _scale(information: FloatArray) -> FloatArray:
@@ -345,17 +380,17 @@ _Known = TypeVar("_Known", Observations, ControlPoints, KnownLengths)
 
 def _stacked(parts: Sequence[_Known]) -> _Known:
     columns = zip(*(vars(part).values() for part in parts), strict=True)
-    stacked: list[Any] = [None if one[0] is None else np.concatenate(one) for one in columns]
+    stacked: list[Any] = [None if column[0] is None else np.concatenate(column) for column in columns]
     return type(parts[0])(*stacked)
 
 
 def _known(parts: Sequence[_Known | None], starts: IntArray) -> _Known | None:
     """Control and lengths of several markings, whose corners begin at ``starts`` in the concatenation."""
     shifted = []
-    for one, start in zip(parts, starts, strict=False):
-        if one is not None:
-            corners = {name: value + start for name, value in vars(one).items() if name in _CORNERS}
-            shifted.append(replace(one, **corners))
+    for values, start in zip(parts, starts, strict=False):
+        if values is not None:
+            corners = {name: value + start for name, value in vars(values).items() if name in _CORNERS}
+            shifted.append(replace(values, **corners))
     return _stacked(shifted) if shifted else None
 
 

@@ -7,7 +7,7 @@ states of the frames, each predicted from the frame before.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -52,21 +52,29 @@ MIN_STEP = 1e-4  # least step between frames, as a fraction of a drift's correla
 _MIN_WHITE_SHARE = 1e-3  # a smaller white fraction of an error is rounding of the drift
 
 
-def state_prior(problem: Problem, pose_states: tuple[str, ...]) -> tuple[IntArray, FloatArray, FloatArray]:
-    """States of a frame: of each error the white part, then the drift, where present.
+class StatePrior(NamedTuple):
+    """The prior of the frames' S states."""
+
+    columns: IntArray  # (S,) the tangent's column of each
+    transition: FloatArray  # (J, S, S) from the frame before
+    information_root: FloatArray  # (J, S) inverse sigma of the innovation
+
+
+def state_prior(problem: Problem, pose_states: tuple[str, ...]) -> StatePrior:
+    """The prior of a frame's states: of each error the white part, then the drift, where present.
 
     They are common to all sessions, and independent between them. A drift is a first-order Gauss-Markov
     process along the driven distance d: memory m = exp(-d / over_m), innovation variance sigma^2 (1 - m^2)
-    (Gelb, Applied Optimal Estimation, section 3.8). Returns the tangent's column (S,) of each, the transition
-    (J, S, S) and the inverse sigma (J, S) of its innovation.
+    (Gelb, Applied Optimal Estimation, section 3.8).
     """
     poses = problem.map_from_vehicle
     session = problem.session_of_frame
     chosen = [k for k, name in enumerate(POSE_STATES) if name in pose_states]
     if not chosen:
-        return np.zeros(0, dtype=np.int64), np.zeros((len(poses), 0, 0)), np.zeros((len(poses), 0))
-    total = np.array([one.by_state() for one in problem.pose_sigmas])
-    drifts = [[(each.sigma, each.over_m) for each in one.drift_by_state()] for one in problem.pose_sigmas]
+        no_columns = np.zeros(0, dtype=np.int64)
+        return StatePrior(no_columns, np.zeros((len(poses), 0, 0)), np.zeros((len(poses), 0)))
+    total = np.array([sigma.by_state() for sigma in problem.pose_sigmas])
+    drifts = [[(d.sigma, d.over_m) for d in sigma.drift_by_state()] for sigma in problem.pose_sigmas]
     drift, over_m = np.array(drifts).transpose(2, 0, 1)
     white = np.sqrt(np.maximum(total**2 - drift**2, 0.0))
     least = _MIN_WHITE_SHARE * total
@@ -84,7 +92,7 @@ def state_prior(problem: Problem, pose_states: tuple[str, ...]) -> tuple[IntArra
     turn[:, :2, :2] = poses[1:, :2, :2].transpose(0, 2, 1) @ poses[:-1, :2, :2]
     transition = np.zeros((len(poses), len(columns), len(columns)))
     transition[1:] = memory[1:, :, None] * turn[:, columns][:, :, columns] * fades
-    return columns, transition, 1 / (sigma[session] * np.sqrt(1 - memory**2))
+    return StatePrior(columns, transition, 1 / (sigma[session] * np.sqrt(1 - memory**2)))
 
 
 _MOST_JOINED = 256  # most corners joined by known lengths: time grows with the cube, memory the square
@@ -108,49 +116,66 @@ def make_arrays(
     corner_order, joined = _corners_in_route_order(problem)
     rank = np.empty_like(corner_order)
     rank[corner_order] = np.arange(len(corner_order))
-    order, corner, pair, measured, root = _sorted_observations(problem, rank)
-    states, transition, information_root = state_prior(problem, pose_states)
-    centre, centre_root, control, control_root = _surveys(problem)
-    known = _lengths(problem, rank)
+    observations = _sorted_observations(problem, rank)
+    pair = observations.pair
+    prior = state_prior(problem, pose_states)
+    surveys = _surveys(problem)
+    lengths = _lengths(problem)
     clock_twist, sigma_s = _clock_twist(problem, clock_offset)
     moments: IntArray | None = None
     motion: FloatArray | None = None
     if read_out or problem.read_out_s is not None:
-        moments, own, twist = _moments(problem)
-        pair = (pair // len(clock_twist) * len(moments) + own[order]).astype(np.int32)
+        read_outs = _moments(problem)
+        moments = read_outs.frame
+        of_observation = read_outs.of_observation[observations.order]
+        pair = (pair // len(clock_twist) * len(moments) + of_observation).astype(np.int32)
         clock_twist = clock_twist[moments]
         if problem.read_out_s is not None:
-            motion = problem.read_out_s[:, None, None] * twist
+            motion = problem.read_out_s[:, None, None] * read_outs.motion
         if read_out:
-            clock_twist = np.concatenate([clock_twist, twist[..., None]], axis=2)
+            clock_twist = np.concatenate([clock_twist, read_outs.motion[..., None]], axis=2)
             sigma_s = [*sigma_s, problem.read_out_sigma_s]
     return Arrays(
-        order=index(order),
+        order=index(observations.order),
         corner_order=index(corner_order),
         joined=index(joined),
         pair=index(pair),
-        corner=index(corner),
-        measured=real(measured),
-        root_information=real(root),
+        corner=index(observations.corner),
+        measured=real(observations.measured),
+        root_information=real(observations.root_information),
         vehicle_from_map=real(inverse(problem.map_from_vehicle)),
         session=index(np.asarray(problem.session_of_frame, dtype=np.int64)),
-        states=tuple(states.tolist()),
-        centre=real(centre),
-        centre_information_root=real(centre_root),
-        state_transition=real(transition),
-        state_information_root=real(information_root),
+        states=tuple(prior.columns.tolist()),
+        centre=real(surveys.centre),
+        centre_information_root=real(surveys.centre_root),
+        state_transition=real(prior.transition),
+        state_information_root=real(prior.information_root),
         clock_twist=real(clock_twist),
         clock_information_root=1 / real(np.array(sigma_s, dtype=np.float64)),
-        control=real(control[corner_order]),
-        control_root=real(control_root[corner_order]),
-        lengths=Lengths(*map(index, known[:2]), *map(real, known[2:])),
+        control=real(surveys.control[corner_order]),
+        control_root=real(surveys.control_root[corner_order]),
+        lengths=Lengths(
+            index(rank[lengths.first]),
+            index(rank[lengths.second]),
+            real(lengths.length_m),
+            real(1 / lengths.sigma_m),
+        ),
         frame_of_moment=None if moments is None else index(moments),
         read_out=None if motion is None else real(motion),
     )
 
 
-def _surveys(problem: Problem) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Surveyed centres (C, 3) and corners (N, 2), each with its root information, 0 without survey."""
+class _Surveys(NamedTuple):
+    """Surveyed centres and corners; root information is 0 where nothing is surveyed."""
+
+    centre: FloatArray  # (C, 3)
+    centre_root: FloatArray  # (C, 3) root information
+    control: FloatArray  # (N, 2)
+    control_root: FloatArray  # (N, 3) root information
+
+
+def _surveys(problem: Problem) -> _Surveys:
+    """What is surveyed of each camera and each corner."""
     centre, centre_root = np.zeros((2, len(problem.intrinsic), 3))
     if problem.centre_vehicle is not None and problem.centre_sigma_m is not None:
         centre = problem.centre_vehicle
@@ -160,24 +185,22 @@ def _surveys(problem: Problem) -> tuple[FloatArray, FloatArray, FloatArray, Floa
     if problem.control is not None:
         control[problem.control.corner] = problem.control.points_map
         control_root[problem.control.corner] = problem.control.root_information
-    return centre, centre_root, control, control_root
+    return _Surveys(centre, centre_root, control, control_root)
 
 
-def _lengths(problem: Problem, rank: IntArray) -> tuple[NDArray[Any], ...]:
-    """Known lengths: the ranks of their first and second corners, the lengths, m, and root information."""
+def _lengths(problem: Problem) -> KnownLengths:
+    """The known lengths; empty where there are none."""
     none = np.zeros(0)
-    known = problem.lengths or KnownLengths(none.astype(np.int64), none.astype(np.int64), none, none)
-    return rank[known.first], rank[known.second], known.length_m, 1 / known.sigma_m
+    return problem.lengths or KnownLengths(none.astype(np.int64), none.astype(np.int64), none, none)
 
 
 def _corners_in_route_order(problem: Problem) -> tuple[IntArray, BoolArray]:
     """Corners (N,) by first frame, joined ones contiguous, and whether (N,) each is joined to the last."""
     count = problem.corner_count
     lengths = problem.lengths
-    seen = problem.observations
     frames = len(problem.map_from_vehicle)
     first_frame = np.full(count, frames)
-    np.minimum.at(first_frame, seen.corner, seen.frame)
+    np.minimum.at(first_frame, problem.observations.corner, problem.observations.frame)
     if lengths is None or not len(lengths.first):
         return np.argsort(first_frame, kind="stable"), np.zeros(count, dtype=bool)
     edges = coo_matrix((np.ones(len(lengths.first)), (lengths.first, lengths.second)), shape=(count, count))
@@ -194,26 +217,36 @@ def _corners_in_route_order(problem: Problem) -> tuple[IntArray, BoolArray]:
     return order, np.concatenate([[False], np.diff(unit[order]) == 0])
 
 
-def _sorted_observations(problem: Problem, rank: IntArray) -> tuple[NDArray[Any], ...]:
-    """Observations (K,) by corner, camera, frame; then corner, pair and measurement of each."""
+class _Sorted(NamedTuple):
+    """Observations by corner, camera and frame."""
+
+    order: NDArray[np.int32]  # (K,) their indices in the problem
+    corner: NDArray[np.int32]  # (K,) rank of each one's corner
+    pair: NDArray[np.int32]  # (K,) its camera and frame
+    measured: FloatArray  # (2, K)
+    root_information: FloatArray  # (3, K)
+
+
+def _sorted_observations(problem: Problem, rank: IntArray) -> _Sorted:
+    """The observations in order; AdjustError where two are of one corner in one image."""
     from v2hdm.adjust.kernels.layout import Seen, lay_out  # loads numba
 
-    seen = Seen.of(problem.observations.columns, problem.intrinsic)
+    columns = Seen.of(problem.observations.columns, problem.intrinsic)
     count = len(problem.observations.corner)
     frames = len(problem.map_from_vehicle)
-    key = (rank[seen.corner] * len(seen.intrinsic) + seen.camera) * frames + seen.frame
+    key = (rank[columns.corner] * len(columns.intrinsic) + columns.camera) * frames + columns.frame
     order = _stable_order(key)
     corner, pair = np.empty((2, count), dtype=np.int32)
     measured = np.empty((2, count))
     root = np.empty((3, count))
-    again = lay_out(seen, rank, frames, order, corner, pair, measured, root)
-    if again >= 0:
-        first, second = order[again - 1 : again + 1].tolist()
+    repeated = lay_out(columns, rank, frames, order, corner, pair, measured, root)
+    if repeated >= 0:
+        first, second = order[repeated - 1 : repeated + 1].tolist()
         raise AdjustError(
-            f"observations {first} and {second} are the same corner {seen.corner[first]} in frame "
-            f"{seen.frame[first]} of camera {seen.camera[first]}: keep one of them"
+            f"observations {first} and {second} are the same corner {columns.corner[first]} in frame "
+            f"{columns.frame[first]} of camera {columns.camera[first]}: keep one of them"
         )
-    return order.astype(np.int32), corner, pair, measured, root
+    return _Sorted(order.astype(np.int32), corner, pair, measured, root)
 
 
 def _stable_order(keys: IntArray) -> IntArray:
@@ -228,19 +261,24 @@ def _clock_twist(problem: Problem, clock_offset: bool) -> tuple[FloatArray, list
     """Twists (J, 6, Q), one column per session if clock offsets are estimated; prior sigmas."""
     if not clock_offset or problem.twist_vehicle is None:
         return np.zeros((len(problem.map_from_vehicle), 6, 0)), []
-    own = problem.session_of_frame[:, None] == np.arange(problem.session_count)
+    is_in_session = problem.session_of_frame[:, None] == np.arange(problem.session_count)
     sigma_s = problem.session_count * [problem.clock_sigma_s]
-    return np.asarray(problem.twist_vehicle[:, :, None] * own[:, None]), sigma_s
+    return np.asarray(problem.twist_vehicle[:, :, None] * is_in_session[:, None]), sigma_s
 
 
-def _moments(problem: Problem) -> tuple[IntArray, IntArray, FloatArray]:
-    """Frames (M,) of the moments of row read-out, ascending, and each observation's moment (K,).
+class _Moments(NamedTuple):
+    """The M moments of row read-out, ascending."""
 
-    Then the vehicle's motion (M, 6) since its frame's stamp, per unit of read-out time.
-    """
-    seen = problem.observations
-    rows = np.column_stack([seen.frame, np.asarray(seen.row_share)])
-    moments, own = np.unique(rows, axis=0, return_inverse=True)
+    frame: IntArray  # (M,)
+    of_observation: IntArray  # (K,) each observation's moment
+    motion: FloatArray  # (M, 6) the vehicle's since its frame's stamp, per unit of read-out time
+
+
+def _moments(problem: Problem) -> _Moments:
+    """The moments at which the rows of observations were read out."""
+    observations = problem.observations
+    rows = np.column_stack([observations.frame, np.asarray(observations.row_share)])
+    moments, of_observation = np.unique(rows, axis=0, return_inverse=True)
     frame = moments[:, 0].astype(np.int64)
-    own = own.ravel().astype(np.int64)
-    return frame, own, np.asarray(problem.twist_vehicle)[frame] * moments[:, 1:]
+    motion = np.asarray(problem.twist_vehicle)[frame] * moments[:, 1:]
+    return _Moments(frame, of_observation.ravel().astype(np.int64), motion)

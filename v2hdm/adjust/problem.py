@@ -27,7 +27,7 @@ the rotation.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -77,13 +77,15 @@ class Observations:
 
     def take(self, rows: IntArray | BoolArray) -> Observations:
         """The observations at ``rows``, indices or a mask."""
-        taken: list[Any] = [None if one is None else one[rows] for one in vars(self).values()]
-        return Observations(*taken)
+        columns: list[Any] = [None if column is None else column[rows] for column in vars(self).values()]
+        return Observations(*columns)
 
     @property
     def on_line(self) -> BoolArray:
         """Observations (K,) of lines: the position along the line is unknown."""
-        xx, yx, yy = (self.covariance_px[:, row, column] for row, column in ((0, 0), (1, 0), (1, 1)))
+        xx = self.covariance_px[:, 0, 0]
+        yx = self.covariance_px[:, 1, 0]
+        yy = self.covariance_px[:, 1, 1]
         return np.asarray((xx + yy) ** 2 > (xx * yy - yx**2) * LINE_EXCESS)
 
 
@@ -120,13 +122,13 @@ class ControlPoints:
     def root_information(self) -> FloatArray:
         """Root information a, b, c (M, 3) of whitened residuals (a dx, b dx + c dy)."""
         t = np.array([[1.0, 0.0]]) if self.along is None else self.along
-        one, other = (1 / self.sigma_m**2).T
-        xx = one * t[:, 0] ** 2 + other * t[:, 1] ** 2
-        yy = one * t[:, 1] ** 2 + other * t[:, 0] ** 2
+        first, second = (1 / self.sigma_m**2).T
+        xx = first * t[:, 0] ** 2 + second * t[:, 1] ** 2
+        yy = first * t[:, 1] ** 2 + second * t[:, 0] ** 2
         c = np.sqrt(yy)
-        b = np.where(c > 0, (one - other) * t[:, 0] * t[:, 1] / np.where(c > 0, c, 1.0), 0.0)
-        left = xx - b**2
-        return np.column_stack([np.sqrt(np.where(left > _ROUNDED * xx, left, 0.0)), b, c])
+        b = np.where(c > 0, (first - second) * t[:, 0] * t[:, 1] / np.where(c > 0, c, 1.0), 0.0)
+        square = xx - b**2
+        return np.column_stack([np.sqrt(np.where(square > _ROUNDED * xx, square, 0.0)), b, c])
 
 
 @dataclass(frozen=True)
@@ -208,8 +210,8 @@ class Problem:
     lengths: KnownLengths | None = None
     session: IntArray | None = None
 
-    def seen_by(self, observations: Observations) -> tuple[Problem, IntArray, IntArray]:
-        """The problem of the cameras and frames of ``observations``, and their indices (C,), (J,) here.
+    def seen_by(self, observations: Observations) -> ProblemPart:
+        """The problem of the cameras and frames of ``observations``.
 
         Corners are those of the observations, without this problem's knowledge of its own.
         """
@@ -218,11 +220,14 @@ class Problem:
         of_cameras = "intrinsic", "cam_from_vehicle", "centre_vehicle", "centre_sigma_m", "read_out_s"
         of_frames = "map_from_vehicle", "twist_vehicle", "session"
         rows = dict.fromkeys(of_cameras, cameras) | dict.fromkeys(of_frames, frames)
-        own = {name: getattr(self, name)[at] for name, at in rows.items() if getattr(self, name) is not None}
-        seen = replace(observations, camera=camera, frame=frame)
-        own |= {"corners_start": None, "control": None, "lengths": None}
+        changes = {
+            name: getattr(self, name)[at] for name, at in rows.items() if getattr(self, name) is not None
+        }
+        renumbered = replace(observations, camera=camera, frame=frame)
+        changes |= {"corners_start": None, "control": None, "lengths": None}
         count = int(observations.corner.max(initial=-1)) + 1
-        return replace(self, observations=seen, corner_count=count, **own), cameras, frames
+        problem = replace(self, observations=renumbered, corner_count=count, **changes)
+        return ProblemPart(problem, cameras, frames)
 
     @property
     def session_of_frame(self) -> IntArray:
@@ -239,8 +244,16 @@ class Problem:
     @property
     def pose_sigmas(self) -> tuple[PoseSigma, ...]:
         """Standard deviations of each session's recorded poses."""
-        one = self.pose_sigma
-        return self.session_count * (one,) if isinstance(one, PoseSigma) else one
+        sigma = self.pose_sigma
+        return self.session_count * (sigma,) if isinstance(sigma, PoseSigma) else sigma
+
+
+class ProblemPart(NamedTuple):
+    """Some cameras and frames of a problem as one of their own."""
+
+    problem: Problem
+    cameras: IntArray  # (C,) indices in the whole
+    frames: IntArray  # (J,) indices in the whole
 
 
 @dataclass(kw_only=True)

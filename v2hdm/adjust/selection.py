@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -46,26 +47,28 @@ def restrict(problem: Problem, keep: BoolArray) -> tuple[Problem, IntArray]:
     Every camera must keep an observation. Frames are dropped before the first and after the last in use:
     drift continues through the others.
     """
-    seen = problem.observations
-    corners, corner = np.unique(seen.corner[keep], return_inverse=True)
-    frame = seen.frame[keep]
+    observations = problem.observations
+    corners, corner = np.unique(observations.corner[keep], return_inverse=True)
+    frame = observations.frame[keep]
     used = slice(int(frame.min()), int(frame.max()) + 1)
     start = problem.corners_start
     twist = problem.twist_vehicle
     control = problem.control
     if control is not None:
-        left = np.isin(control.corner, corners)
-        number = np.searchsorted(corners, control.corner[left])
-        control = control.take(left, number)
+        is_kept = np.isin(control.corner, corners)
+        number = np.searchsorted(corners, control.corner[is_kept])
+        control = control.take(is_kept, number)
     lengths = problem.lengths
     if lengths is not None:
-        left = np.isin(lengths.first, corners) & np.isin(lengths.second, corners)
-        first, second = (np.searchsorted(corners, ends[left]) for ends in (lengths.first, lengths.second))
-        lengths = KnownLengths(first, second, lengths.length_m[left], lengths.sigma_m[left])
+        is_kept = np.isin(lengths.first, corners) & np.isin(lengths.second, corners)
+        first, second = (np.searchsorted(corners, ends[is_kept]) for ends in (lengths.first, lengths.second))
+        lengths = KnownLengths(first, second, lengths.length_m[is_kept], lengths.sigma_m[is_kept])
     part = replace(
         problem,
         map_from_vehicle=problem.map_from_vehicle[used],
-        observations=replace(seen.take(keep), frame=frame - used.start, corner=corner.astype(np.int64)),
+        observations=replace(
+            observations.take(keep), frame=frame - used.start, corner=corner.astype(np.int64)
+        ),
         corner_count=len(corners),
         corners_start=None if start is None else start[corners],
         twist_vehicle=None if twist is None else twist[used],
@@ -93,13 +96,14 @@ MODELS: Mapping[str, Model] = {
 }
 """Models by name, the simplest first. ``paper`` trusts the recorded poses."""
 
-# Frames of the part of the drive that models are compared on, and the fraction of observations held out.
-_STRETCH_FRAMES = 120
-_HELD_OUT_SHARE = 0.2
-_MIN_HELD_OUT = 40  # with fewer, the residuals cannot separate models
+_STRETCH_FRAMES = 120  # number of frames of the part of the drive that models are compared on; chosen
+_HELD_OUT_SHARE = 0.2  # fraction of its observations that are held out; chosen
+_MIN_HELD_OUT = 40  # least number of held-out observations: with fewer, residuals cannot separate models
+
 # Standard errors by which a model that can absorb errors of other inputs, such as a clock offset, must
 # predict better than one without.
 _SURE_STANDARD_ERRORS = 3.0
+
 _LOSS_SCALE2 = 9.0  # squared sigmas at which the loss bends, lest wrong associations decide
 
 
@@ -140,7 +144,9 @@ def select_model(problem: Problem, options: SolveOptions, names: Sequence[str] =
     unknown = [name for name in names if name not in MODELS]
     if unknown:
         raise AdjustError(f"unknown model '{unknown[0]}': choose from {', '.join(MODELS)}")
-    candidates = [one for one in names if problem.twist_vehicle is not None or not MODELS[one].clock_offset]
+    candidates = [
+        name for name in names if problem.twist_vehicle is not None or not MODELS[name].clock_offset
+    ]
     punctual = [name for name in candidates if not MODELS[name].clock_offset] or candidates
     stretch, _ = restrict(problem, _stretch(problem))
     held_out = _held_out(stretch.observations)
@@ -163,9 +169,10 @@ def predicts_better(problem: Problem, rival: Problem, options: SolveOptions) -> 
     held_out = _held_out(restrict(problem, chosen)[0].observations)
     if np.count_nonzero(held_out) < _MIN_HELD_OUT:
         return False
-    own, other = (_losses(restrict(one, chosen)[0], held_out, options) for one in (problem, rival))
+    losses = _losses(restrict(problem, chosen)[0], held_out, options)
+    losses_of_rival = _losses(restrict(rival, chosen)[0], held_out, options)
     frame = problem.observations.frame[chosen][held_out]
-    return not _as_good(other - own, frame, _SURE_STANDARD_ERRORS)
+    return not _as_good(losses_of_rival - losses, frame, _SURE_STANDARD_ERRORS)
 
 
 def _losses(whole: Problem, held_out: BoolArray, options: SolveOptions) -> FloatArray:
@@ -180,54 +187,54 @@ def predicted_squared(
     whole: Problem, held_out: BoolArray, fitted: Problem, solution: Solution, corners: np.ndarray
 ) -> FloatArray:
     """Squared Mahalanobis distances of ``held_out`` observations from the solution of the others."""
-    seen = whole.observations
-    camera = seen.camera[held_out]
-    frame = seen.frame[held_out]
+    observations = whole.observations
+    camera = observations.camera[held_out]
+    frame = observations.frame[held_out]
     first = int(whole.observations.frame[~held_out].min())
     vehicle_from_map = np.linalg.inv(solution.map_from_vehicle)[frame - first]
     if fitted.twist_vehicle is not None:
         late_s = solution.clock_offset_s[camera, fitted.session_of_frame[frame - first]]
-        if seen.row_share is not None:
-            late_s = late_s + solution.read_out_s[camera] * seen.row_share[held_out]
-        moved = fitted.twist_vehicle[frame - first] * late_s[:, None]
-        vehicle_from_map = exp(-moved) @ vehicle_from_map
+        if observations.row_share is not None:
+            late_s = late_s + solution.read_out_s[camera] * observations.row_share[held_out]
+        motion = fitted.twist_vehicle[frame - first] * late_s[:, None]
+        vehicle_from_map = exp(-motion) @ vehicle_from_map
     cam_from_map = solution.cam_from_vehicle[camera] @ vehicle_from_map
-    points_map = solution.corners_map[np.searchsorted(corners, seen.corner[held_out])]
+    points_map = solution.corners_map[np.searchsorted(corners, observations.corner[held_out])]
     ground = np.column_stack([points_map, np.zeros(len(points_map)), np.ones(len(points_map))])
     points = (cam_from_map @ ground[..., None])[:, :3, 0]
     intrinsic = whole.intrinsic[camera]
     pixel = intrinsic[:, :2] * points[:, :2] / points[:, 2:] + intrinsic[:, 2:]
-    off = pixel - seen.pinhole_px[held_out]
-    solved = np.linalg.solve(seen.covariance_px[held_out], off[..., None])[..., 0]
-    return np.asarray(np.sum(off * solved, axis=1))
+    offset_px = pixel - observations.pinhole_px[held_out]
+    solved = np.linalg.solve(observations.covariance_px[held_out], offset_px[..., None])[..., 0]
+    return np.asarray(np.sum(offset_px * solved, axis=1))
 
 
 def _stretch(problem: Problem) -> BoolArray:
     """Observations (K,) of the run of frames with most of them, including every camera's."""
-    seen = problem.observations
+    observations = problem.observations
     frames = len(problem.map_from_vehicle)
     if frames <= _STRETCH_FRAMES:
-        return np.ones(len(seen.frame), dtype=bool)
+        return np.ones(len(observations.frame), dtype=bool)
     count = np.zeros(frames + 1)
-    count[1:] = np.cumsum(np.bincount(seen.frame, minlength=frames))
+    count[1:] = np.cumsum(np.bincount(observations.frame, minlength=frames))
     begin = int(np.argmax(count[_STRETCH_FRAMES:] - count[:-_STRETCH_FRAMES]))
-    keep = (seen.frame >= begin) & (seen.frame < begin + _STRETCH_FRAMES)
-    keep &= np.bincount(seen.corner[keep], minlength=problem.corner_count)[seen.corner] >= 2
-    everywhere = len(np.unique(seen.camera[keep])) == len(problem.intrinsic)
-    return keep if everywhere else np.ones(len(seen.frame), dtype=bool)
+    keep = (observations.frame >= begin) & (observations.frame < begin + _STRETCH_FRAMES)
+    keep &= np.bincount(observations.corner[keep], minlength=problem.corner_count)[observations.corner] >= 2
+    everywhere = len(np.unique(observations.camera[keep])) == len(problem.intrinsic)
+    return keep if everywhere else np.ones(len(observations.frame), dtype=bool)
 
 
-def _held_out(seen: Observations) -> BoolArray:
+def _held_out(observations: Observations) -> BoolArray:
     """Held-out observations (K,); two of each corner stay, and the first and last frames."""
     rng = np.random.default_rng(0)
-    order = rng.permutation(len(seen.corner))
+    order = rng.permutation(len(observations.corner))
     place = np.empty(len(order), dtype=np.int64)
-    by_corner = order[np.argsort(seen.corner[order], kind="stable")]
-    starts = np.flatnonzero(np.diff(seen.corner[by_corner], prepend=-1))
+    by_corner = order[np.argsort(observations.corner[order], kind="stable")]
+    starts = np.flatnonzero(np.diff(observations.corner[by_corner], prepend=-1))
     place[by_corner] = np.arange(len(order)) - np.repeat(starts, np.diff(starts, append=len(order)))
     held_out = (place >= 2) & (rng.random(len(order)) < _HELD_OUT_SHARE)
-    fitted = seen.frame[~held_out]
-    return np.asarray(held_out & (seen.frame >= fitted.min()) & (seen.frame <= fitted.max()))
+    fitted = observations.frame[~held_out]
+    return np.asarray(held_out & (observations.frame >= fitted.min()) & (observations.frame <= fitted.max()))
 
 
 def _as_good(excess: FloatArray, frame: np.ndarray, standard_errors: float = 1.0) -> bool:
@@ -240,11 +247,11 @@ def _as_good(excess: FloatArray, frame: np.ndarray, standard_errors: float = 1.0
 _SPREAD = math.log(2.0)
 """Prior sigma of the logarithm of a scale on a stated sigma or length: a factor of two."""
 
-_MOST = math.log(30.0)  # largest logarithm of such a scale
-_DRAWS = 8  # draws from the posterior, each with its mirror image about the mean
-_ROUNDS = 4  # of drawing and estimating: sigmas change by a tenth in the third
-_LEAST_STEP_M = 0.02  # smaller steps between frames are a standing vehicle
-_LEAST_LAGS = 8  # least steps of a route for a correlation length
+_MOST = math.log(30.0)  # largest logarithm of a scale on a stated sigma or length
+_DRAWS = 8  # number of draws from the posterior, each with its mirror image about the mean
+_ROUNDS = 4  # number of rounds of drawing and estimating: sigmas change by a tenth in the third
+_LEAST_STEP_M = 0.02  # distance, m, between frames below which a vehicle stands
+_LEAST_LAGS = 8  # least number of steps of a route that show a correlation length
 
 _GROUPS = {"position": (0, 1), "height": (2,), "roll_pitch": (3, 4), "heading": (5,)}
 """Axes of a frame's tangent with a common scale."""
@@ -273,20 +280,21 @@ def estimate_noise(problem: Problem, solution: Solution) -> tuple[PoseSigma, ...
     scales = dict.fromkeys(_GROUPS, _Scales())
     generator = torch.Generator()
     for _ in range(_ROUNDS):
-        sigmas = tuple(_scaled(one, scales) for one in stated)
-        _, *prior = state_prior(replace(problem, pose_sigma=sigmas), states_of)
-        transition, root = (arrays.state_transition.new_tensor(one) for one in prior)
+        sigmas = tuple(_scaled(sigma, scales) for sigma in stated)
+        prior = state_prior(replace(problem, pose_sigma=sigmas), states_of)
+        transition = arrays.state_transition.new_tensor(prior.transition)
+        root = arrays.state_transition.new_tensor(prior.information_root)
         scaled = replace(arrays, state_transition=transition, state_information_root=root)
         engine = descent.engine.over(scaled)
         whitening = factorise(engine, descent.plan, descent.estimate, descent.robust)
         noise = torch.randn(_DRAWS, whitening.size, generator=generator.manual_seed(0), dtype=torch.float64)
-        off = [whitening.step(y.to(whitening.gradient) - whitening.gradient)[0] for y in (*noise, *-noise)]
-        states = descent.estimate.frame_state + torch.stack([one.frame_state for one in off])
+        steps = [whitening.step(y.to(whitening.gradient) - whitening.gradient)[0] for y in (*noise, *-noise)]
+        states = descent.estimate.frame_state + torch.stack([step.frame_state for step in steps])
         errors = np.zeros((*states.shape[:2], 6))
         for column, axis in enumerate(arrays.states):
             errors[..., axis] += states[..., column].cpu().numpy()
         scales = {name: _scales(problem, errors, name) for name in _GROUPS}
-    return tuple(_scaled(one, scales) for one in stated)
+    return tuple(_scaled(sigma, scales) for sigma in stated)
 
 
 def _of_group(sigma: PoseSigma, name: str) -> tuple[float, Drift]:
@@ -315,7 +323,7 @@ def _scales(problem: Problem, drawn: FloatArray, name: str) -> _Scales:
     errors = drawn[:, :, _GROUPS[name]]
     if name == "position":  # its drift keeps its direction in the map
         errors = np.einsum("jab,djb->dja", problem.map_from_vehicle[:, :2, :2], errors)
-    stated = [_of_group(one, name) for one in problem.pose_sigmas]
+    stated = [_of_group(sigma, name) for sigma in problem.pose_sigmas]
     drift_m2, total_m2 = np.mean([[drift.sigma**2, sigma**2] for sigma, drift in stated], axis=0)
     over_m = float(np.mean([drift.over_m for _, drift in stated]))
     correlation, step_m, path_m = _autocorrelation(problem, errors)
@@ -339,8 +347,16 @@ def _scales(problem: Problem, drawn: FloatArray, name: str) -> _Scales:
     )
 
 
-def _autocorrelation(problem: Problem, errors: FloatArray) -> tuple[FloatArray, float, float]:
-    """Autocorrelation of errors (D, J, a) at lags of 0, 1, 2 ... steps, the step, m, and the path, m."""
+class _Autocorrelation(NamedTuple):
+    """How errors along a route resemble each other."""
+
+    products: FloatArray  # (L,) mean product of errors 0, 1, 2, ... steps apart
+    step_m: float
+    path_m: float  # length of the route
+
+
+def _autocorrelation(problem: Problem, errors: FloatArray) -> _Autocorrelation:
+    """The autocorrelation of errors (D, J, a) at a drive's frames."""
     poses = problem.map_from_vehicle
     session = problem.session_of_frame
     products = np.zeros(0)
@@ -349,21 +365,21 @@ def _autocorrelation(problem: Problem, errors: FloatArray) -> tuple[FloatArray, 
     moved = np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1)[np.diff(session) == 0]
     moved = moved[moved > _LEAST_STEP_M]
     step_m = float(np.median(moved)) if len(moved) else _LEAST_STEP_M
-    for own in (session == number for number in range(problem.session_count)):
-        place = length_along(poses[own][:, :2, 3])
+    for in_session in (session == number for number in range(problem.session_count)):
+        place = length_along(poses[in_session][:, :2, 3])
         grid = np.arange(0.0, place[-1] + step_m / 2, step_m)
         nearest = np.rint(np.interp(grid, place, np.arange(len(place)))).astype(np.int64)
-        even = errors[:, own][:, nearest]
+        even = errors[:, in_session][:, nearest]
         size = 2 * len(grid)
         spectrum = np.abs(np.fft.rfft(even, size, axis=1)) ** 2
-        found = np.fft.irfft(spectrum, size, axis=1)[:, : len(grid)].mean(axis=(0, 2))
-        lags = max(len(products), len(found))
-        products = np.pad(products, (0, lags - len(products))) + np.pad(found, (0, lags - len(found)))
+        product = np.fft.irfft(spectrum, size, axis=1)[:, : len(grid)].mean(axis=(0, 2))
+        lags = max(len(products), len(product))
+        products = np.pad(products, (0, lags - len(products))) + np.pad(product, (0, lags - len(product)))
         counts = np.pad(counts, (0, lags - len(counts))) + np.pad(
-            np.arange(len(grid), 0, -1), (0, lags - len(found))
+            np.arange(len(grid), 0, -1), (0, lags - len(product))
         )
         path_m += float(place[-1])
-    return products / counts, step_m, path_m
+    return _Autocorrelation(products / counts, step_m, path_m)
 
 
 def _shrunk(logarithm: float, variance: float) -> float:

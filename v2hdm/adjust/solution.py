@@ -19,7 +19,7 @@ from v2hdm.records import BoolArray, FloatArray, IntArray
 VerdictArray = NDArray[np.int8]
 
 _MEDIAN_SQUARED = 2 * float(np.log(2))  # median of a chi-square distribution with two degrees of freedom
-_ROWS = 1 << 18  # observations classified at once
+_ROWS = 1 << 18  # number of observations that are classified at once
 
 
 class Verdict(IntEnum):
@@ -58,19 +58,20 @@ def classify(
     verdict[mahalanobis2 > gate] = Verdict.CONTRADICTS
     verdict[behind] = Verdict.BEHIND_CAMERA
     count = int(observations.corner.max()) + 1
-    seen = np.bincount(observations.corner, minlength=count)
-    left = np.bincount(observations.corner[verdict == Verdict.ACCEPTED], minlength=count)
-    alone = (left == 1) & (seen > 1)
-    for begin in range(0, len(verdict) if alone.any() else 0, _ROWS):
+    observation_count = np.bincount(observations.corner, minlength=count)
+    accepted_count = np.bincount(observations.corner[verdict == Verdict.ACCEPTED], minlength=count)
+    is_last = (accepted_count == 1) & (observation_count > 1)
+    for begin in range(0, len(verdict) if is_last.any() else 0, _ROWS):
         part = slice(begin, begin + _ROWS)
-        verdict[part][alone[observations.corner[part]] & (verdict[part] == Verdict.ACCEPTED)] = (
+        verdict[part][is_last[observations.corner[part]] & (verdict[part] == Verdict.ACCEPTED)] = (
             Verdict.UNCONFIRMED
         )
     return verdict
 
 
-_OUTLIER_SQUARED = 13.8  # exceeded by one good observation in a thousand: chi-square, 2 degrees of freedom
-# Mean of half such a variable below that limit: truncating the tail reduces the chi-square a little.
+_OUTLIER_SQUARED = 13.8  # chi-square, 2 degrees of freedom, that one good observation in a thousand exceeds
+
+# Mean of half a chi-square variable below that limit: truncating the tail reduces the chi-square a little.
 _TRIMMED_MEAN = 1 - _OUTLIER_SQUARED / 2 / math.expm1(_OUTLIER_SQUARED / 2)
 
 
@@ -122,7 +123,7 @@ _ADVICE = {
     Status.EVALUATIONS_EXHAUSTED: "The optimum was not reached in time: start closer, or raise "
     "max_evaluations.",
     Status.UNDETERMINED: "The observations leave a direction free: add a prior on the camera centre, "
-    "drive a turn, or estimate fewer pose states.",
+    "include a turn, or estimate fewer pose states.",
     Status.BEHIND_CAMERA: "At the solution some corners lie behind the camera that saw them: their "
     "observations are wrong associations or the starting extrinsic points the wrong way.",
 }

@@ -24,8 +24,10 @@ _FARTHEST_FROM_ORIGIN_M = 1e5  # a map is flat, and there the ground is 800 m be
 _LATE_S = 1.0  # a reading that comes later than this after its successor is of another clock or recording
 
 _UNITS: Mapping[str, float] = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
-_LONGEST_S = 5.0
-_QUICKEST_S = 5e-4  # limits of the time between two poses, or images, of a drive
+"""How many of each unit, in which stamps may be by mistake, make a second."""
+
+_LONGEST_S = 5.0  # longest time between two poses, or images, of a drive; chosen
+_QUICKEST_S = 5e-4  # shortest time between two poses, or images, of a drive; chosen
 _ALIKE = 5.0  # poses and images of one drive last equally long to within this factor
 _LATEST_S = 1e11  # stamps in s since 1970 stay below this for three thousand years
 
@@ -198,11 +200,11 @@ def why_no_pose(
 
 def unit_of(stamp_s: FloatArray) -> str | None:
     """The unit of stamps (N,) that cannot be seconds, None where they can."""
-    apart = float(np.median(np.diff(stamp_s))) if len(stamp_s) > 1 else 0.0
-    if apart <= _LONGEST_S and stamp_s[-1] < _LATEST_S:
+    step_s = float(np.median(np.diff(stamp_s))) if len(stamp_s) > 1 else 0.0
+    if step_s <= _LONGEST_S and stamp_s[-1] < _LATEST_S:
         return None
     for unit, scale in _UNITS.items():
-        if _QUICKEST_S <= apart / scale <= 1.0 and stamp_s[-1] / scale < _LATEST_S:
+        if _QUICKEST_S <= step_s / scale <= 1.0 and stamp_s[-1] / scale < _LATEST_S:
             return unit
     return None
 

@@ -23,6 +23,7 @@ from v2hdm.adjust import (
     solve,
     with_model,
 )
+from v2hdm.adjust.problem import ProblemPart
 from v2hdm.association.ground import locate
 from v2hdm.association.groups import Association, fuse_groups, group_kinds, known_elsewhere, line_only
 from v2hdm.association.sightings import Rig, Sightings
@@ -205,23 +206,14 @@ def solve_bundle(
         axes = np.tile([1.0, 0.0], (0 if control is None else len(control.corner), 1))
         control = held if control is None else _joined(replace(control, along=axes), held)
         corners_start = np.concatenate([corners_start, held.points_map])
-    problem, used, frames = drive_problem(sightings, rig, cameras, model).seen_by(observations)
-    problem = replace(problem, lengths=lengths, control=control, corners_start=corners_start)
+    part = drive_problem(sightings, rig, cameras, model).seen_by(observations)
+    problem = replace(part.problem, lengths=lengths, control=control, corners_start=corners_start)
     solution = solve(problem, model.solver)
     if knots is not None:
         of_markings = {name: getattr(solution, name)[: len(row)] for name in _OF_OBSERVATIONS}
         solution = replace(solution, **of_markings)
-    cam_from_vehicle = rig.cam_from_vehicle.copy()
-    map_from_vehicle = sightings.map_from_vehicle.copy()
-    cam_from_vehicle[used] = solution.cam_from_vehicle
-    map_from_vehicle[frames] = solution.map_from_vehicle
-    adjusted = replace(rig, cam_from_vehicle=cam_from_vehicle, map_from_vehicle=map_from_vehicle)
-    if rig.read_out_s is not None:
-        read_out_s = rig.read_out_s.copy()
-        read_out_s[used] = solution.read_out_s
-        adjusted = replace(adjusted, read_out_s=read_out_s)
     return Bundle(
-        rig=adjusted,
+        rig=_adjusted(rig, sightings, solution, part),
         model=model,
         problem=problem,
         solution=solution,
@@ -230,10 +222,24 @@ def solve_bundle(
         group=group,
         corner=corner,
         corner_index=corner_index,
-        camera_index={sightings.cameras[c]: k for k, c in enumerate(used.tolist())},
-        frames=frames,
+        camera_index={sightings.cameras[c]: k for k, c in enumerate(part.cameras.tolist())},
+        frames=part.frames,
         knots=knots,
     )
+
+
+def _adjusted(rig: Rig, sightings: Sightings, solution: Solution, part: ProblemPart) -> Rig:
+    """``rig`` with the solution's extrinsics and poses of the cameras and frames that are ``part`` of it."""
+    cam_from_vehicle = rig.cam_from_vehicle.copy()
+    map_from_vehicle = sightings.map_from_vehicle.copy()
+    cam_from_vehicle[part.cameras] = solution.cam_from_vehicle
+    map_from_vehicle[part.frames] = solution.map_from_vehicle
+    adjusted = replace(rig, cam_from_vehicle=cam_from_vehicle, map_from_vehicle=map_from_vehicle)
+    if rig.read_out_s is None:
+        return adjusted
+    read_out_s = rig.read_out_s.copy()
+    read_out_s[part.cameras] = solution.read_out_s
+    return replace(adjusted, read_out_s=read_out_s)
 
 
 def observations_at(

@@ -29,11 +29,11 @@ from v2hdm.io.maps.features import with_heights
 from v2hdm.lanes.knots import draw_lanes
 from v2hdm.lanes.lines import map_lanes
 from v2hdm.lanes.points import ImageGround, collect_lane_points, ground_by_ipm, ground_by_rig
-from v2hdm.mapping.bundle import without_corner
+from v2hdm.mapping.bundle import Bundle, without_corner
 from v2hdm.mapping.conclusion import Optimised
 from v2hdm.mapping.inputs import Inputs
 from v2hdm.mapping.optimise import silent
-from v2hdm.mapping.options import MappingOptions, check_options
+from v2hdm.mapping.options import MappingOptions, SurveyOptions, check_options
 from v2hdm.mapping.recovery import Outcome, optimise
 from v2hdm.mapping.results import AdjustedPoses, ClockOffset, MethodResult
 from v2hdm.records import (
@@ -289,6 +289,17 @@ def _average(association: Association, corners_map: FloatArray) -> FusedGroups:
     )
 
 
+def _unused_points(survey: SurveyOptions, bundle: Bundle) -> list[str]:
+    """Names of the surveyed points that match no corner, with a warning if there are any."""
+    lost = without_corner(survey, bundle.problem.control)
+    if lost:
+        _log.warning(
+            "%d of %d surveyed points are not used, since no map corner matches them within %g m: %s",
+            len(lost), len(survey.points), survey.reach_m, ", ".join(lost),
+        )  # fmt: skip
+    return lost
+
+
 def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
     inputs = outcome.inputs
     options = inputs.options
@@ -300,12 +311,7 @@ def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
     if solution.status is not Status.CONVERGED:
         status = solution.status
         _log.warning("the joint optimisation ended early (%s): %s", status.value, status.advice)
-    lost = without_corner(options.survey, bundle.problem.control)
-    if len(lost):
-        _log.warning(
-            "%d of %d surveyed points are not used, since no map corner matches them within %g m: %s",
-            len(lost), len(options.survey.points), options.survey.reach_m, ", ".join(lost),
-        )  # fmt: skip
+    unused_points = _unused_points(options.survey, bundle)
     observed = observability(bundle.problem, solution)
     surface = inputs.optimiser.surface
     if bundle.knots is not None:
@@ -341,7 +347,7 @@ def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
         diagnostics={
             "observations": float(len(bundle.row)),
             "candidates": float(bundle.association.count),
-            "control_points": float(len(options.survey.points) - len(lost)),
+            "control_points": float(len(options.survey.points) - len(unused_points)),
             "evaluations": float(solution.evaluations),
             "gap": solution.gap,
             "chi2_per_dof": solution.chi2_per_dof,

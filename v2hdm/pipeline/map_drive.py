@@ -93,8 +93,8 @@ def map_drive(
     >>> result.verdict.status.value, result.calibrations["front"].cam_from_vehicle.shape
     ('PASS', (4, 4))
     """
-    cache_of_stages = StageCache(None if cache is None else Path(cache))
-    context = context or Context(cache_of_stages, progress, workers=workers)
+    stages = StageCache(None if cache is None else Path(cache))
+    context = context or Context(stages, progress, workers=workers)
     options = options or MappingOptions()
     reading = reading or ReadOptions()
     if corrections is not None:
@@ -110,8 +110,7 @@ def map_drive(
     paths = [source.root if isinstance(source, Drive) else Path(source) for source in sources]
     about = describe_run(name or read.whole.name, read.whole, paths, reading)
     described = inspection.drive_as_described
-    seconds = context.seconds
-    mapped_so_far = Result(about, read.drives, read.contents, described, seconds, options.device)
+    mapped_so_far = Result(about, read.drives, read.contents, described, context.seconds, options.device)
     return _mapped(mapped_so_far, inspection, detector, survey, earlier, accuracy_goal_cm, context)
 
 

@@ -25,7 +25,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,7 +59,7 @@ class Limits:
     step_s: float  # processor time until it first calls :func:`next_step`, and between two calls
 
     @classmethod
-    def of(cls, *files: Path) -> Limits:
+    def of(cls, files: Iterable[Path]) -> Limits:
         """The limits of work on some files, by their size; those of the smallest where there are none."""
         size = sum(file.stat().st_size for file in files if file.is_file())
         most = _SPARE_BYTES + _TIMES * size
@@ -104,9 +104,14 @@ def in_child(
                 child.stdin.close()
         said = _said(printed)
     if answer is None:
-        _refuse(child.returncode, said, limits, where, error)
+        _refuse_death(child.returncode, said, limits, where, error)
     if said:
         print(said, file=sys.stderr)  # what libraries print: no line of it is ours
+    return _outcome_of(answer, limits, where, error)
+
+
+def _outcome_of(answer: Sequence[Any], limits: Limits, where: str, error: type[V2hdmError]) -> Any:
+    """What a child has answered; raises what it has failed of."""
     kind, *content = answer
     if kind == "done":
         return content[0]
@@ -115,12 +120,16 @@ def in_child(
         refusal = getattr(errors, name, error)
         raise (refusal if issubclass(refusal, V2hdmError) else error)(message)
     if kind == "failed":
-        if content[0] == errno.EFBIG and not _is_limited("RLIMIT_FSIZE"):
+        number, reason, name = content
+        if number == errno.EFBIG and not _is_limited("RLIMIT_FSIZE"):
             most = f"{limits.file_bytes / 1e9:.1f} GB"
             raise error(f"{where}: becomes a file of more than {most}; it is damaged, or a trap")
-        raise OSError(*content)
+        raise OSError(number, reason, name)
     if kind == "memory":
-        _refuse_memory(limits, where, error)
+        if _is_limited("RLIMIT_AS"):
+            raise MemoryError
+        most = f"{limits.memory_bytes / 1e9:.1f} GB"
+        raise error(f"{where}: takes more than {most} of memory; it is damaged, or a trap")
     raise RuntimeError(f"{where}: in the process that reads it:\n{content[0]}")
 
 
@@ -148,27 +157,20 @@ def _said(printed: IO[bytes]) -> str:
     return printed.read(1 << 20).decode("utf-8", "replace").rstrip()
 
 
-def _refuse(code: int, said: str, limits: Limits, where: str, error: type[V2hdmError]) -> Never:
+def _refuse_death(code: int, said: str, limits: Limits, where: str, error: type[V2hdmError]) -> Never:
     """Raise what a child died of that has given no answer; ``code`` is its exit code or minus a signal."""
     if resource is not None and code == -signal.SIGXCPU:
         most = f"{limits.step_s:.0f} s of a processor"
         raise error(f"{where}: takes more than {most} for one piece; it is damaged, or a trap")
-    if _is_limited():  # by whoever started us: libraries die of it without a word
+    if _is_limited("RLIMIT_AS"):  # by whoever started us: libraries die of it without a word
         raise MemoryError
     reason = said.splitlines()[-1][:_LONGEST_REASON] if said else "without a word"
     ending = f"signal {-code}" if code < 0 else f"exit code {code}"
     raise error(f"{where}: the process that reads it ended by {ending} ({one_line(reason)}); copy it again")
 
 
-def _refuse_memory(limits: Limits, where: str, error: type[V2hdmError]) -> Never:
-    if _is_limited():
-        raise MemoryError
-    most = f"{limits.memory_bytes / 1e9:.1f} GB"
-    raise error(f"{where}: takes more than {most} of memory; it is damaged, or a trap")
-
-
-def _is_limited(name: str = "RLIMIT_AS") -> bool:
-    """Whether this process itself has a limit, of memory if no other is named."""
+def _is_limited(name: str) -> bool:
+    """Whether this process itself has a limit."""
     return resource is not None and resource.getrlimit(getattr(resource, name))[0] != resource.RLIM_INFINITY
 
 
@@ -186,10 +188,10 @@ class _Forward(logging.Handler):
         self._pipe = pipe
 
     def emit(self, record: logging.LogRecord) -> None:
-        _send(self._pipe, "log", record.name, record.levelno, record.getMessage())
+        _send(self._pipe, ("log", record.name, record.levelno, record.getMessage()))
 
 
-def _send(pipe: IO[bytes], *message: Any) -> None:
+def _send(pipe: IO[bytes], message: tuple[Any, ...]) -> None:
     pipe.write(json.dumps(message).encode() + b"\n")
     pipe.flush()
 
@@ -206,7 +208,7 @@ def _serve() -> None:
         message = _outcome(job)
     except MemoryError:
         message = ("memory",)
-    _send(pipe, *message)
+    _send(pipe, message)
     sys.stderr.flush()
     os._exit(0)  # nothing here is worth tidying: threads of libraries might hang
 
@@ -244,8 +246,8 @@ def _begin(limits: Limits) -> None:
     _limit("RLIMIT_CORE", 0)
     _limit("RLIMIT_FSIZE", limits.file_bytes)
     statm = Path("/proc/self/statm")
-    taken = int(statm.read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE") if statm.is_file() else 0
-    _limit("RLIMIT_AS", taken + limits.memory_bytes)
+    baseline_bytes = int(statm.read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE") if statm.is_file() else 0
+    _limit("RLIMIT_AS", baseline_bytes + limits.memory_bytes)
     next_step()
 
 

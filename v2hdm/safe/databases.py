@@ -6,8 +6,8 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-_STEPS = 10
-_SPARE_STEPS = 1_000_000  # of SQLite's machine, by byte and beyond: a row takes 4 to 16
+_STEPS = 10  # of SQLite's machine that a query may take by byte of its file: a row takes 4 to 16
+_SPARE_STEPS = 1_000_000  # steps that any query may take beyond those
 
 
 def limit_steps(data: Any, path: Path) -> None:
@@ -26,10 +26,10 @@ def opened(path: Path, how: str) -> Iterator[sqlite3.Connection]:
 def rows_of(data: sqlite3.Connection, path: Path, table: str) -> Iterator[dict[str, Any]]:
     """The rows of a table; raises sqlite3.Error where they have more bytes than the file and its journal."""
     files = (path, path.with_name(f"{path.name}-wal"))
-    left = sum(one.stat().st_size for one in files if one.is_file())
-    found = data.cursor()
-    for row in found.execute(f'SELECT * FROM "{table}"'):
-        left -= sum(len(value) for value in row if isinstance(value, str | bytes)) + 1
-        if left < 0:
+    spare_bytes = sum(file.stat().st_size for file in files if file.is_file())
+    cursor = data.cursor()
+    for row in cursor.execute(f'SELECT * FROM "{table}"'):
+        spare_bytes -= sum(len(value) for value in row if isinstance(value, str | bytes)) + 1
+        if spare_bytes < 0:
             raise sqlite3.DatabaseError("it has more rows than bytes")
-        yield dict(zip((name for name, *_ in found.description), row, strict=True))
+        yield dict(zip((name for name, *_ in cursor.description), row, strict=True))

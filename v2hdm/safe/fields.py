@@ -12,8 +12,8 @@ from v2hdm.store.files import check_keys, take_array, take_mapping, take_number,
 
 _log = logging.getLogger(__name__)
 
-_LARGEST_PX = 65535
-_LONGEST_FOCAL_PX = 1e6
+_LARGEST_PX = 65535  # side of an image: JPEG has no larger one
+_LONGEST_FOCAL_PX = 1e6  # focal length, or offset of the centre, of any camera; chosen
 _ROUNDING = 1e-3  # share by which a covariance may be off for having been rounded
 _MIDDLE = 1.0  # focal lengths from the axis to 45 degrees from it: farther out radial terms prevail
 _WIDEST_RAD = np.deg2rad(89.5)  # rays farther from the axis have no pixel in the pinhole image

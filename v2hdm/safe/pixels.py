@@ -30,23 +30,23 @@ _log = logging.getLogger(__name__)
 
 MOST_PX = 200_000_000  # the largest sensors of mapping cameras have 150 million
 LEAST_SIDE_PX = 16  # narrower images show no marking, and not one cell of the network
-_MOST_BYTES = 1 << 30
+_MOST_BYTES = 1 << 30  # of an image file; chosen
 _TIMES = 4000  # what a raster's byte may unpack to, beyond the largest image: ours hold up to 320 where empty
-_TAIL_BYTES = 4096
+_TAIL_BYTES = 4096  # at a file's end, in which its format's last marker must lie; cameras append to it
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
 _TIFF = (b"II*\0", b"MM\0*")
 # Start-of-frame markers; DHT, JPG and DAC lie in their midst and are none.
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-_JPEG_WITHOUT_LENGTH = frozenset([0x01, *range(0xD0, 0xD9)])
+_JPEG_WITHOUT_LENGTH = frozenset([0x01, *range(0xD0, 0xD9)])  # markers that no length follows (T.81, B.1.1.3)
 _SEGMENT = re.compile(rb"\xff([^\0\1\xd0-\xd8\xff])")  # of a JPEG, or its end
-_APP1 = 0xE1
-_START_OF_SCAN = 0xDA
+_APP1 = 0xE1  # a JPEG's marker of EXIF data
+_START_OF_SCAN = 0xDA  # a JPEG's marker of compressed pixels
 _MOST_SCANS = 64  # of a JPEG; progressive ones have about ten
-_WIDTH_TAG = 0x100
-_HEIGHT_TAG = 0x101
-_ORIENTATION_TAG = 0x112
-_UPRIGHT = 1
+_WIDTH_TAG = 0x100  # a TIFF's, as the next two
+_HEIGHT_TAG = 0x101  # a TIFF's
+_ORIENTATION_TAG = 0x112  # a TIFF's, and EXIF's
+_UPRIGHT = 1  # the orientation of an image that is shown as it is stored
 
 AS_STORED = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR  # OpenCV's flags for the depth and channels of the file
 _GREY_FLAGS = (cv2.IMREAD_GRAYSCALE, cv2.IMREAD_REDUCED_GRAYSCALE_4)
@@ -60,7 +60,7 @@ VIDEO_OPTIONS = {
 """FFmpeg's, without which a file of another format, such as a playlist, makes it open other files."""
 DECODER_OPTIONS = {"err_detect": "crccheck"}
 """FFmpeg's, without which hashes of pictures that a video of H.265 carries are not looked at."""
-_QUICK = (cv2.IMWRITE_PNG_COMPRESSION, 1)
+_QUICK = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # OpenCV's options of a PNG: zlib's fastest level
 
 
 @dataclass(frozen=True)
@@ -216,7 +216,8 @@ def _header(data: _Data) -> Header | None:
         return Header(tags[_WIDTH_TAG], tags[_HEIGHT_TAG], tags.get(_ORIENTATION_TAG, _UPRIGHT))
     if begin.startswith(b"BM"):
         if _unpack("<I", data, 14)[0] < 40:  # OS/2's header
-            return Header(*_unpack("<HH", data, 18))
+            width, height = _unpack("<HH", data, 18)
+            return Header(width, height)
         width, height = _unpack("<ii", data, 18)
         return Header(width, abs(height))
     return _webp_header(data)
@@ -250,9 +251,9 @@ def _jpeg_header(data: _Data) -> Header | None:
 def _scans(data: bytes) -> int:
     """How often a JPEG goes over all of its pixels, each time in a few bytes if it wants; 0 for others."""
     at = count = 0
-    while data.startswith(_JPEG) and (found := _SEGMENT.search(data, at)) and found[1] != b"\xd9":
-        count += found[1][0] == _START_OF_SCAN
-        at = found.end() + int.from_bytes(data[found.end() : found.end() + 2], "big")
+    while data.startswith(_JPEG) and (segment := _SEGMENT.search(data, at)) and segment[1] != b"\xd9":
+        count += segment[1][0] == _START_OF_SCAN
+        at = segment.end() + int.from_bytes(data[segment.end() : segment.end() + 2], "big")
     return count
 
 

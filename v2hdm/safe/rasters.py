@@ -64,7 +64,7 @@ def mosaic_points(mosaic: Path, spacing_m: float, strip_px: int) -> Iterator[Flo
 
 def _ask(work: Any, path: Path, *arguments: Any) -> None:
     files = path.rglob("*") if path.is_dir() else [path]
-    in_child(work, path, *arguments, limits=Limits.of(*files), where=str(path), error=MapFileError)
+    in_child(work, path, *arguments, limits=Limits.of(files), where=str(path), error=MapFileError)
 
 
 def _source(path: Path) -> dict[str, Any]:

@@ -25,10 +25,10 @@ MOST_YAML_BYTES = 1 << 24  # ours have kilobytes, and PyYAML takes a second for 
 MOST_DEPTH = 64  # of nested lists and mappings; ours are 8 deep
 MOST_ENTRIES = 1_000_000  # values in a YAML file, with everything that an alias repeats
 MOST_DIGITS = 64  # of a whole number; doubles end at 309 digits, and nothing here counts beyond 2**64
-MOST_NAME_LETTERS = 64
+MOST_NAME_LETTERS = 64  # of a camera, run, drive or class; chosen
 _MOST_NAME_BYTES = 200  # file systems end at 255 bytes
-_SHORT = 60
-_FEW = 4
+_SHORT = 60  # letters of a value that an error shows; chosen
+_FEW = 4  # entries of a list that an error shows in full; chosen
 ALL_CAMERAS = ("both", "all")  # names of results of all cameras together
 _HALF = "half a character (a lone surrogate)"
 _ESCAPED_HALF = re.compile(r"\\u[dD][89a-fA-F]")
@@ -178,13 +178,13 @@ def shown(content: object) -> str:
     if isinstance(content, dict):
         return "a mapping with " + shown(next(iter(content))) if content else "an empty mapping"
     if isinstance(content, list | tuple):
-        if 1 < len(content) <= _FEW and not any(isinstance(one, dict | list | tuple) for one in content):
+        if 1 < len(content) <= _FEW and not any(isinstance(part, dict | list | tuple) for part in content):
             return f"[{', '.join(map(shown, content))}]"
         return f"a list of {len(content)}" if len(content) != 1 else "a list of one"
     if isinstance(content, int) and abs(content) >= 10**MOST_DIGITS:
         return "a number with very many digits"
     letters = str(content)[: _SHORT + 1]
-    text = "".join(one if one.isprintable() else "\N{REPLACEMENT CHARACTER}" for one in letters)
+    text = "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in letters)
     if len(text) > _SHORT:
         text = f"{text[: _SHORT - 3]}..."
     return f"'{text}'" if isinstance(content, str) else text
@@ -203,7 +203,7 @@ class _Loader(yaml.SafeLoader):
         self._depth += 1
         if self._depth > MOST_DEPTH:
             _refuse(f"nested deeper than {MOST_DEPTH} levels", event.start_mark)
-        begun = self._entries
+        entries_before = self._entries
         self._entries += 1
         node = super().compose_node(parent, index)
         self._depth -= 1
@@ -213,7 +213,7 @@ class _Loader(yaml.SafeLoader):
             self._entries += self._sizes[id(node)]
         if self._entries > MOST_ENTRIES:
             _refuse(f"more than {MOST_ENTRIES} values, including aliases", event.start_mark)
-        self._sizes.setdefault(id(node), self._entries - begun)
+        self._sizes.setdefault(id(node), self._entries - entries_before)
         return node
 
     def construct_scalar(self, node: Any) -> Any:

@@ -136,7 +136,9 @@ class StageCache:
     """
 
     def __init__(self, folder: Path | None, resume: bool = True) -> None:
-        self.folder, self._resume, self._can_write = folder, resume, folder is not None
+        self.folder = folder
+        self._resume = resume
+        self._can_write = folder is not None
         self.hits: list[str] = []
         """Stages whose entries were there."""
 

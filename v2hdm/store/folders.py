@@ -116,9 +116,7 @@ _IMAGES = (".png", ".jpg", ".jpeg")  # endings of files that are listed without 
 _WRITER = (
     f"{HOST}-{secrets.token_hex(4)}"  # this process in names of unfinished files: its host and 8 hex digits
 )
-_STALE_S = (
-    3600.0  # time without a write after which an unfinished folder counts as left by a killed process, s
-)
+_STALE_S = 3600.0  # time without a write after which an unfinished folder counts as left by a killed run, s
 
 
 def note_use(folder: Path) -> None:

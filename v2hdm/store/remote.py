@@ -86,7 +86,8 @@ class RemoteFolder:
                 f"{option} {protocol}://...: is not a bucket name; credentials belong where "
                 f"{_PACKAGES[protocol]} looks for them, not into a URL"
             )
-        if not all(parts) or {".", ".."} & set(parts) or any(c in "?#*[" or not c.isprintable() for c in url):
+        is_plain = all(letter.isprintable() and letter not in "?#*[" for letter in url)
+        if not is_plain or not all(parts) or {".", ".."} & set(parts):
             raise ConfigError(f"{option} {url}: is not a path in a store; write it like s3://bucket/results")
         fsspec = need("fsspec", "map", f"{option} {url}", ConfigError)
         try:

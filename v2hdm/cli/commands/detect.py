@@ -90,11 +90,7 @@ def _detect(parsed: argparse.Namespace) -> None:
                     dropped += frame.dropped
                     age_s.append(time.time() - (frame.stamp_s or 0.0))
                 if write_drawing is not None:
-                    name = frame.name  # images of several folders or endings may share it
-                    while name.casefold() in drawn_as:
-                        name += "_"
-                    drawn_as.add(name.casefold())
-                    write_drawing(f"{name}.jpg", _drawing(frame, road))
+                    write_drawing(f"{_new_name(frame.name, drawn_as)}.jpg", _drawing(frame, road))
         except KeyboardInterrupt:
             if not live:
                 raise
@@ -110,6 +106,14 @@ def _detect(parsed: argparse.Namespace) -> None:
         print(unknown, file=sys.stderr)
     if failure:
         raise failure
+
+
+def _new_name(name: str, in_use: set[str]) -> str:
+    """A name that is not in use yet, and then is: images of several folders or endings may share theirs."""
+    while name.casefold() in in_use:
+        name += "_"
+    in_use.add(name.casefold())
+    return name
 
 
 def _drawing(frame: Frame, road: Road) -> bytes:

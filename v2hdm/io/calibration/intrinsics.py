@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,24 +24,35 @@ from v2hdm.store.files import take_array, take_text
 
 _XML = re.compile(r"<[?!\w]")  # YAML may begin with ``<<``
 _END_OF_MESSAGE = re.compile(r"\n---\s*$")  # ``ros2 topic echo`` ends with a second, empty document
-# OpenCV's lenses by their number of coefficients, and those beyond ours unless all further ones are zero.
+
 _BROWN_CONRADY = {4: "plumb_bob", 5: "plumb_bob", 8: "rational_polynomial"}
+"""Our lens for each number of OpenCV's coefficients."""
+
 _BEYOND = {14: (12, "tilted sensor"), 12: (8, "thin prism")}
+"""Lenses of OpenCV beyond ours, by their number of coefficients: how many the next simpler lens has, which
+it is if the others are zero, and the name of what the others describe."""
+
 _COLMAP_LINE = re.compile(r"^\d+\s+[A-Z][A-Z0-9_]+\s+\d+\s+\d+(\s|$)")
+_COLMAP_CENTRE_PX = 0.5  # COLMAP's coordinate of the centre of the first pixel, px
 _KALIBR_PROJECTIONS = {
     "omni": "omnidirectional (omni)", "ds": "double sphere (ds)", "eucm": "extended unified (eucm)",
 }  # fmt: skip
 
-_Lens = tuple[str, tuple[float, ...]]
+
+class _Lens(NamedTuple):
+    """A distortion model of ours and all of its coefficients."""
+
+    model: str
+    coefficients: tuple[float, ...]
 
 
 @dataclass(frozen=True)
 class Document:
-    """One calibration file: its ``text``, and the ``entries`` at its top, none where it is plain text."""
+    """One calibration file."""
 
     path: Path
     text: str
-    entries: dict[str, Any]
+    entries: dict[str, Any]  # at the top of the file, none where it is plain text
 
     @property
     def lower(self) -> dict[str, Any]:
@@ -49,17 +60,17 @@ class Document:
         return {str(key).lower(): value for key, value in self.entries.items()}
 
     def only_camera(self) -> list[str]:
-        """The name of its camera, the file's where it names none."""
+        """The name of its camera, or that of the file where it names none."""
         return [str(self.entries.get("camera_name", self.path.stem))]
 
 
 @dataclass(frozen=True)
 class IntrinsicsFormat:
-    """One format: ``accepts`` a file by a look at it, ``read`` one of the cameras that ``names`` lists."""
+    """One format of files with intrinsics."""
 
-    accepts: Callable[[Document], bool]
-    read: Callable[[Document, str], CameraInfo]
-    names: Callable[[Document], list[str]] = Document.only_camera
+    accepts: Callable[[Document], bool]  # whether a file looks like one of this format
+    read: Callable[[Document, str], CameraInfo]  # the camera of that name
+    names: Callable[[Document], list[str]] = Document.only_camera  # of the cameras in a file
 
 
 def read_intrinsics(path: Path, camera: str | None = None, name_by: str = "its name") -> CameraInfo:
@@ -71,7 +82,7 @@ def read_intrinsics(path: Path, camera: str | None = None, name_by: str = "its n
     if path.suffix.lower() == ".bin":
         raise DriveError(f"{path}: is binary; export the model as text (model_converter --output_type TXT)")
     document = _read_document(path)
-    chosen = next((one for one in INTRINSICS.values() if one.accepts(document)), None)
+    chosen = next((candidate for candidate in INTRINSICS.values() if candidate.accepts(document)), None)
     if chosen is None:
         raise DriveError(f"{path}: no intrinsics of a known format ({', '.join(INTRINSICS)}) in this file")
     names = chosen.names(document)
@@ -153,9 +164,9 @@ def _equidistant(coefficients: Sequence[float], where: str) -> _Lens:
 
 
 def _complete(model: str, coefficients: Sequence[float]) -> _Lens:
-    """A lens whose further coefficients are zero."""
+    """The lens with zeros for the coefficients that are missing."""
     missing = DISTORTION_COEFFICIENTS[model] - len(coefficients)
-    return model, (*map(float, coefficients), *(0.0,) * missing)
+    return _Lens(model, (*map(float, coefficients), *(0.0,) * missing))
 
 
 def _mapping(content: object) -> dict[str, Any]:
@@ -176,51 +187,66 @@ def _camera(
     name: str, size: Sequence[object], size_at: Sequence[str], matrix: FloatArray, lens: _Lens, where: str
 ) -> CameraInfo:
     """The checked camera; ``size_at`` names width and height in errors."""
-    width, height = (take_size_px(one, at, DriveError) for one, at in zip(size, size_at, strict=True))
-    return check_camera(CameraInfo(name, width, height, matrix, *lens), where, DriveError)
+    width, height = (take_size_px(side, at, DriveError) for side, at in zip(size, size_at, strict=True))
+    info = CameraInfo(name, width, height, matrix, lens.model, lens.coefficients)
+    return check_camera(info, where, DriveError)
 
 
 def _matrix(fx: float, fy: float, cx: float, cy: float) -> FloatArray:
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
-COLMAP_MODELS: Mapping[str, tuple[int, int, str]] = {
-    "SIMPLE_PINHOLE": (1, 0, "plumb_bob"),
-    "PINHOLE": (2, 0, "plumb_bob"),
-    "SIMPLE_RADIAL": (1, 1, "plumb_bob"),
-    "RADIAL": (1, 2, "plumb_bob"),
-    "OPENCV": (2, 4, "plumb_bob"),
-    "FULL_OPENCV": (2, 8, "rational_polynomial"),
-    "OPENCV_FISHEYE": (2, 4, "equidistant"),
-    "SIMPLE_RADIAL_FISHEYE": (1, 1, "equidistant"),
-    "RADIAL_FISHEYE": (1, 2, "equidistant"),
+class ColmapModel(NamedTuple):
+    """One of COLMAP's camera models, by the order of its parameters: focal lengths, centre, coefficients."""
+
+    focals: int  # number of focal lengths: one for both axes, or two
+    coefficients: int  # number of distortion coefficients
+    lens: str  # our distortion model that it is
+
+
+COLMAP_MODELS: Mapping[str, ColmapModel] = {
+    "SIMPLE_PINHOLE": ColmapModel(1, 0, "plumb_bob"),
+    "PINHOLE": ColmapModel(2, 0, "plumb_bob"),
+    "SIMPLE_RADIAL": ColmapModel(1, 1, "plumb_bob"),
+    "RADIAL": ColmapModel(1, 2, "plumb_bob"),
+    "OPENCV": ColmapModel(2, 4, "plumb_bob"),
+    "FULL_OPENCV": ColmapModel(2, 8, "rational_polynomial"),
+    "OPENCV_FISHEYE": ColmapModel(2, 4, "equidistant"),
+    "SIMPLE_RADIAL_FISHEYE": ColmapModel(1, 1, "equidistant"),
+    "RADIAL_FISHEYE": ColmapModel(1, 2, "equidistant"),
 }
-"""COLMAP's models: their numbers of focal lengths and coefficients, and the lens of ours that each is."""
+"""COLMAP's models by name."""
 
 
 def _colmap_lines(document: Document) -> list[tuple[int, str]]:
+    """The lines of a cameras.txt that are no comments, each with its number."""
     lines = ((number, line.strip()) for number, line in enumerate(document.text.splitlines(), 1))
     return [(number, line) for number, line in lines if line and not line.startswith("#")]
 
 
 def _read_colmap(document: Document, name: str) -> CameraInfo:
-    number, line = next(one for one in _colmap_lines(document) if one[1].split()[0] == name)
+    lines = _colmap_lines(document)
+    number, line = next((number, line) for number, line in lines if line.split()[0] == name)
     where = f"{document.path}: line {number}"
     if not _COLMAP_LINE.match(line):
         raise DriveError(f"{where}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS; restore the file")
     _, kind, width, height, *words = line.split()
     if kind not in COLMAP_MODELS:
-        known = ", ".join(COLMAP_MODELS)
-        raise DriveError(f"{where}: COLMAP's {kind} is not supported; choose one of: {known}")
-    focals, coefficients, model = COLMAP_MODELS[kind]
+        models = ", ".join(COLMAP_MODELS)
+        raise DriveError(f"{where}: COLMAP's {kind} is not supported; choose one of: {models}")
+    model = COLMAP_MODELS[kind]
+    centre_at = model.focals
+    lens_at = centre_at + 2
+    count = lens_at + model.coefficients
     try:
         values = np.array([float(word) for word in words])
     except ValueError:
         values = np.array([np.nan])
-    if len(values) != focals + 2 + coefficients or not np.isfinite(values).all():
-        raise DriveError(f"{where}: {kind} has {focals + 2 + coefficients} parameters; restore the file")
-    matrix = _matrix(values[0], values[focals - 1], *(values[focals : focals + 2] - 0.5))
-    lens = _complete(model, values[focals + 2 :].tolist())
+    if len(values) != count or not np.isfinite(values).all():
+        raise DriveError(f"{where}: {kind} has {count} parameters; restore the file")
+    cx, cy = values[centre_at:lens_at] - _COLMAP_CENTRE_PX
+    matrix = _matrix(values[0], values[model.focals - 1], cx, cy)
+    lens = _complete(model.lens, values[lens_at:].tolist())
     size = (int(width), int(height))
     size_at = [f"{where}: WIDTH", f"{where}: HEIGHT"]
     return _camera(name, size, size_at, matrix, lens, where)
@@ -244,9 +270,9 @@ def _read_kalibr(document: Document, name: str) -> CameraInfo:
         lens_name = _KALIBR_PROJECTIONS.get(projection, repr(projection))
         raise _beyond(where, lens_name, "pinhole-radtan or pinhole-equi")
     model = take_text(entry["distortion_model"], f"{where}, distortion_model", DriveError)
-    given = entry.get("distortion_coeffs")
+    stated = entry.get("distortion_coeffs")
     at = f"{where}, distortion_coeffs"
-    values = [] if given in (None, []) else take_array(given, (-1,), at, DriveError).tolist()
+    values = [] if stated in (None, []) else take_array(stated, (-1,), at, DriveError).tolist()
     if model in ("equidistant", "equi"):
         lens = _equidistant(values, at)
     elif model in ("radtan", "none"):
@@ -254,8 +280,8 @@ def _read_kalibr(document: Document, name: str) -> CameraInfo:
     else:
         raise _beyond(where, repr(model), "pinhole-radtan or pinhole-equi")
     size = take_array(entry["resolution"], (2,), f"{where}, resolution", DriveError).tolist()
-    numbers = take_array(entry["intrinsics"], (4,), f"{where}, intrinsics", DriveError)
-    return _camera(name, size, [f"{where}, resolution"] * 2, _matrix(*numbers.tolist()), lens, where)
+    fx, fy, cx, cy = take_array(entry["intrinsics"], (4,), f"{where}, intrinsics", DriveError).tolist()
+    return _camera(name, size, [f"{where}, resolution"] * 2, _matrix(fx, fy, cx, cy), lens, where)
 
 
 def _read_opencv(document: Document, name: str) -> CameraInfo:
@@ -315,21 +341,27 @@ def _read_message(document: Document, name: str) -> CameraInfo:
 
 INTRINSICS: Mapping[str, IntrinsicsFormat] = {
     "COLMAP cameras.txt": IntrinsicsFormat(
-        lambda one: any(_COLMAP_LINE.match(line) for _, line in _colmap_lines(one)[:1]),
+        lambda document: any(_COLMAP_LINE.match(line) for _, line in _colmap_lines(document)[:1]),
         _read_colmap,
-        lambda one: [line.split()[0] for _, line in _colmap_lines(one)],
+        lambda document: [line.split()[0] for _, line in _colmap_lines(document)],
     ),
-    "Kalibr camchain": IntrinsicsFormat(lambda one: bool(_kalibr_names(one)), _read_kalibr, _kalibr_names),
+    "Kalibr camchain": IntrinsicsFormat(
+        lambda document: bool(_kalibr_names(document)), _read_kalibr, _kalibr_names
+    ),
     "V2HDM calibration": IntrinsicsFormat(
-        lambda one: isinstance(one.entries.get("camera_matrix"), list), _read_own
+        lambda document: isinstance(document.entries.get("camera_matrix"), list), _read_own
     ),
-    "OpenCV": IntrinsicsFormat(lambda one: "dt" in _mapping(one.lower.get("camera_matrix")), _read_opencv),
+    "OpenCV": IntrinsicsFormat(
+        lambda document: "dt" in _mapping(document.lower.get("camera_matrix")), _read_opencv
+    ),
     "ROS CameraInfo message": IntrinsicsFormat(
-        lambda one: {"height", "width", "distortion_model"} <= set(one.entries), _read_message, _message_names
+        lambda document: {"height", "width", "distortion_model"} <= set(document.entries),
+        _read_message,
+        _message_names,
     ),
     "ROS camera_info": IntrinsicsFormat(
-        lambda one: bool({"camera_name", "distortion_model", "camera_matrix"} & set(one.entries)),
-        lambda one, name: take_camera_info(one.entries, str(one.path)),
+        lambda document: bool({"camera_name", "distortion_model", "camera_matrix"} & set(document.entries)),
+        lambda document, name: take_camera_info(document.entries, str(document.path)),
     ),
 }
 """The formats, by name; the first that accepts a file reads it."""

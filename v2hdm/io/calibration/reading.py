@@ -1,7 +1,7 @@
-"""Reading one camera's calibration, and the first guesses of its mounting.
+"""Reading one camera's calibration, and the first guess of its mounting.
 
-A calibration is our own YAML or ROS' ``camera_info``, as a file or message; a guess an IPM matrix or an
-extrinsic, with region of interest and survey.
+A calibration is our own YAML or ROS' ``camera_info``, as a file or message. A guess is an IPM matrix or an
+extrinsic, with a region of interest and a surveyed camera centre.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ _OPTIONAL = (
 )  # fmt: skip
 _IGNORED = ("rectification_matrix", "projection_matrix")  # of stereo rectification, not of recorded images
 _OF_OPENCV = ("dt", "type_id")  # OpenCV adds these to its matrices; numbers tell their type themselves
-_MODELS = {"": "plumb_bob", "radtan": "plumb_bob", "fisheye": "equidistant"}  # other names in messages
+_MODELS = {"": "plumb_bob", "radtan": "plumb_bob", "fisheye": "equidistant"}  # our lenses by other names
 
 
 @dataclass(frozen=True)
 class Provenance:
-    """The source of a calibration: the drive's name, an ISO date, the status of the run's verdict."""
+    """The source of a calibration."""
 
-    drive: str | None = None
-    date: str | None = None
-    verdict: str | None = None
+    drive: str | None = None  # name of the drive
+    date: str | None = None  # of the run, ISO 8601
+    verdict: str | None = None  # status of the run's verdict
 
     @classmethod
     def today(cls, drive: str, verdict: Mapping[str, Any]) -> Provenance:
@@ -73,31 +73,32 @@ def read_calibration(path: Path) -> Calibration:
 
 
 def read_provenance(path: Path) -> Provenance:
-    """The provenance that stands in our own calibration; errors as :func:`read_calibration`."""
+    """The provenance that our own calibration states; errors as :func:`read_calibration`."""
     content = load_yaml(path, MapFileError)
     verdict = content.get("verdict")
-    found = {key: content.get(key) for key in ("drive", "date")}
-    found["verdict"] = verdict.get("status") if isinstance(verdict, dict) else None
-    return Provenance(**{
+    stated = {key: content.get(key) for key in ("drive", "date")}
+    stated["verdict"] = verdict.get("status") if isinstance(verdict, dict) else None
+    texts = {
         key: None if value is None else take_text(value, f"{path}: {key}", MapFileError)
-        for key, value in found.items()
-    })  # fmt: skip
+        for key, value in stated.items()
+    }
+    return Provenance(**texts)
 
 
 def trusted_calibrations(path: Path) -> dict[str, Calibration]:
-    """The calibrations in a result folder, or of a file, by camera; MapFileError where none, or FAIL."""
+    """The calibrations of a result folder or a file, by camera; MapFileError if none, or one of a FAIL."""
     files = sorted(path.glob(CALIBRATIONS)) if path.is_dir() else [path]
     if not files:
         raise MapFileError(f"{path}: has no {CALIBRATIONS}; give a result of map or calibrate ground")
-    found = {}
+    calibration_of_camera = {}
     for file in files:
         calibration = read_calibration(file)
-        found[calibration.info.name] = calibration
+        calibration_of_camera[calibration.info.name] = calibration
         if read_provenance(file).verdict == "FAIL":
             raise MapFileError(
                 f"{file}: the verdict on its drive is FAIL, so it cannot be relied on: docs/verdict.md"
             )
-    return found
+    return calibration_of_camera
 
 
 def read_camera_info(path: Path) -> CameraInfo:
@@ -122,8 +123,9 @@ def take_camera_info(content: Mapping[str, Any], where: str) -> CameraInfo:
     intrinsic = take_matrix(content["camera_matrix"], at)
     if intrinsic.shape != (3, 3):
         raise DriveError(f"{at}: expected 3 x 3, got {intrinsic.shape[0]} x {intrinsic.shape[1]}; fix it")
+    has_focals = intrinsic[0, 0] > 0 and intrinsic[1, 1] > 0
     zeros = intrinsic[[0, 1, 2, 2], [1, 0, 0, 1]]
-    if intrinsic[0, 0] <= 0 or intrinsic[1, 1] <= 0 or zeros.any() or intrinsic[2, 2] != 1:
+    if not has_focals or zeros.any() or intrinsic[2, 2] != 1:
         raise DriveError(f"{at}: not of the form fx 0 cx, 0 fy cy, 0 0 1 with positive fx, fy; fix it")
     info = CameraInfo(name, width, height, intrinsic, model, tuple(distortion.tolist()))
     return check_camera(info, where, DriveError)
@@ -132,8 +134,8 @@ def take_camera_info(content: Mapping[str, Any], where: str) -> CameraInfo:
 def _coefficients_of(model: str, where: str, advice: str) -> int:
     """The number of coefficients of a distortion model of ours; else DriveError with ``advice``."""
     if model not in DISTORTION_COEFFICIENTS:
-        known = ", ".join(DISTORTION_COEFFICIENTS)
-        raise DriveError(f"{where}: unknown distortion_model '{model}'; {advice} one of: {known}")
+        models = ", ".join(DISTORTION_COEFFICIENTS)
+        raise DriveError(f"{where}: unknown distortion_model '{model}'; {advice} one of: {models}")
     return DISTORTION_COEFFICIENTS[model]
 
 
@@ -169,24 +171,31 @@ def info_of(fields: Any, name: str, where: str) -> CameraInfo:
 IPM_NAMES = ("calibrated", "estimated")
 
 _MOUNTING = ("xyz_m", "rpy_deg")
-_SINGULAR = 1e-12  # reciprocal condition number, rows and columns scaled to unit norm
-_ROTATION_TOLERANCE = 1e-4
-_ROI_SAMPLES = 8  # points along each edge of a region of interest that are looked for in the image
-_ROI_M = (2.0, 20.0)
-_ROI_HALF_WIDTH_M = 5.0  # default region of interest, ahead of a camera: from, to
-_STEEPEST_RAY = 0.999
+_SINGULAR = 1e-12  # least reciprocal condition number of an IPM, rows and columns scaled to unit norm; chosen
+_ROTATION_TOLERANCE = 1e-4  # largest error of an entry of a rotation times its transpose; chosen
+_LOWEST_CAMERA_M = 0.05  # least height of a camera above the ground, m: below, a transform seems inverted
+
+_ROI_SAMPLES = 8  # points along each edge of a region of interest that are looked for in the image; chosen
+_ROI_M = (2.0, 20.0)  # nearest and farthest distance ahead of the default region of interest, m; chosen
+_ROI_HALF_WIDTH_M = 5.0  # half the width of the default region of interest, m; chosen
+_STEEPEST_RAY = 0.999  # sine of the pitch, 87.4 deg, from which a camera counts as looking straight down
 
 
 def take_ipm(content: object, where: str) -> FloatArray:
     """An invertible 3 x 3 homography ``vehicle_from_pinhole_px``, scaled to unit norm."""
-    ipm = balanced = take_array(content, (3, 3), where, DriveError)
-    invertible = ipm.any(axis=0).all() and ipm.any(axis=1).all()
-    # Rows and columns of comparable norms: pixels and metres must not look singular.
-    for axis in (1, 0) * 4 if invertible else ():
-        balanced = balanced / np.linalg.norm(balanced, axis=axis, keepdims=True)
-    if not invertible or 1.0 / np.linalg.cond(balanced) < _SINGULAR:
+    ipm = take_array(content, (3, 3), where, DriveError)
+    if _is_singular(ipm):
         raise DriveError(f"{where}: IPM matrix is not invertible; calibrate it from 4 or more point pairs")
     return np.asarray(ipm / np.linalg.norm(ipm))
+
+
+def _is_singular(matrix: FloatArray) -> bool:
+    if not (matrix.any(axis=0).all() and matrix.any(axis=1).all()):
+        return True
+    # Rows and columns of comparable norms: pixels and metres must not look singular.
+    for axis in (1, 0) * 4:
+        matrix = matrix / np.linalg.norm(matrix, axis=axis, keepdims=True)
+    return bool(1.0 / np.linalg.cond(matrix) < _SINGULAR)
 
 
 def take_mounting(content: object, where: str) -> FloatArray:
@@ -201,7 +210,7 @@ def ipm_from_guess(info: CameraInfo, cam_from_vehicle: object, where: str) -> Fl
     """The IPM of a camera at the guessed rigid ``cam_from_vehicle`` (4 x 4), which is above the ground."""
     guess = take_rigid(cam_from_vehicle, where)
     centre_vehicle = camera_centre(guess)
-    if centre_vehicle[2] < 0.05:
+    if centre_vehicle[2] < _LOWEST_CAMERA_M:
         raise DriveError(
             f"{where}: puts the camera {centre_vehicle[2]:.3g} m above the ground; "
             "give cam_from_vehicle (vehicle points to camera points), not its inverse"
@@ -244,7 +253,8 @@ def check_roi_in_view(info: CameraInfo, ipm: FloatArray, roi_vehicle: FloatArray
     lowest = np.linalg.inv(cam_from_ground) @ np.linalg.solve(info.intrinsic, below_px)
     if (rays[:, 2] <= 0).all() and lowest[2] > 0:
         raise DriveError(f"{where}: lies behind the camera; give ground in its view, x forward and y left")
-    if not _in_image(info, rays if (rays[:, 2] > 0).any() else -rays).any():
+    ahead = rays if (rays[:, 2] > 0).any() else -rays
+    if not _in_image(info, ahead).any():
         raise DriveError(f"{where}: lies outside the image, according to the initial IPM; fix one of them")
 
 
@@ -267,9 +277,9 @@ def roi_of_ipm(info: CameraInfo, ipm: FloatArray) -> FloatArray:
     along = forward if np.linalg.norm(forward) > np.sqrt(1 - _STEEPEST_RAY**2) else -down
     along = along / np.linalg.norm(along)
     left = np.array([-along[1], along[0]])
-    (near, far) = _ROI_M
+    (nearest_m, farthest_m) = _ROI_M
     half = _ROI_HALF_WIDTH_M
-    corners = [(near, -half), (far, -half), (far, half), (near, half)]
+    corners = [(nearest_m, -half), (farthest_m, -half), (farthest_m, half), (nearest_m, half)]
     return np.array([vehicle_from_cam[:2, 3] + ahead * along + side * left for ahead, side in corners])
 
 

@@ -23,7 +23,7 @@ from v2hdm.records import Calibration, CameraInfo, FloatArray
 from v2hdm.store.files import dump_yaml, replace_text, xml_text
 
 VEHICLE_FRAME = "base_link"
-_UNUSED = 1e-12  # distortion coefficients and skews below this move no point by a millionth of a pixel
+_UNUSED = 1e-12  # largest distortion coefficient or skew that counts as zero: it moves no point by 1e-6 px
 
 
 def write_calibration(
@@ -51,10 +51,11 @@ def write_calibration(
         if np.isfinite(clock_s[1]):
             content["clock_sigma_s"] = float(clock_s[1])
     if read_out_s is not None:
-        content["read_out_s"], content["read_out_sigma_s"] = (float(one) for one in read_out_s)
+        content["read_out_s"] = float(read_out_s[0])
+        content["read_out_sigma_s"] = float(read_out_s[1])
     if about is not None:
-        known = {"drive": about.drive, "date": about.date}
-        content |= {key: value for key, value in known.items() if value is not None}
+        source = {"drive": about.drive, "date": about.date}
+        content |= {key: value for key, value in source.items() if value is not None}
     if verdict is not None:
         content["verdict"] = dict(verdict)
     replace_text(path, dump_yaml(content))
@@ -93,6 +94,10 @@ def _camera_info(info: CameraInfo) -> dict[str, Any]:
         "rectification_matrix": _matrix(np.eye(3)),
         "projection_matrix": _matrix(np.column_stack([info.intrinsic, np.zeros(3)])),
     }
+
+
+def _camera_info_yaml(calibration: Calibration, about: Provenance) -> str:
+    return _yaml(calibration, about, _camera_info(calibration.info))
 
 
 def static_transform_yaml(calibration: Calibration, about: Provenance) -> str:
@@ -157,7 +162,7 @@ def opencv_yaml(calibration: Calibration, about: Provenance) -> str:
 
 
 CALIBRATION_FORMATS: Mapping[str, tuple[str, Callable[[Calibration, Provenance], str]]] = {
-    "camera_info": ("camera_info.yaml", lambda one, about: _yaml(one, about, _camera_info(one.info))),
+    "camera_info": ("camera_info.yaml", _camera_info_yaml),
     "static_transform": ("static_transform.yaml", static_transform_yaml),
     "urdf": ("origin.urdf", urdf),
     "kalibr": ("kalibr.yaml", kalibr_yaml),
@@ -181,15 +186,17 @@ def _yaml(calibration: Calibration, about: Provenance, content: Mapping[str, Any
 
 
 def _comments(calibration: Calibration, about: Provenance) -> str:
-    known: dict[str, Any] = {"camera_name": calibration.info.name}
+    """The comments at the head of a file for another tool: YAML behind ``#``."""
+    header: dict[str, Any] = {"camera_name": calibration.info.name}
     if calibration.covariance is not None:
-        known["sigma_axes"] = "of the camera: right, down, forward"
-    known |= _sigmas(calibration) | {"drive": about.drive, "date": about.date, "verdict": about.verdict}
-    known = {key: value for key, value in known.items() if value is not None}
-    return "".join(f"# {line}\n" for line in dump_yaml(known).splitlines())
+        header["sigma_axes"] = "of the camera: right, down, forward"
+    header |= _sigmas(calibration) | {"drive": about.drive, "date": about.date, "verdict": about.verdict}
+    header = {key: value for key, value in header.items() if value is not None}
+    return "".join(f"# {line}\n" for line in dump_yaml(header).splitlines())
 
 
 def _sigmas(calibration: Calibration) -> dict[str, Any]:
+    """Standard deviations of a calibration's translation and rotation; none without a covariance."""
     if calibration.covariance is None:
         return {}
     sigma = np.sqrt(np.diag(calibration.covariance))

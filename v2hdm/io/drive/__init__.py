@@ -92,8 +92,8 @@ def read_drive(path: str | Path, options: ReadOptions | None = None) -> Drive:
     for name, (accepts, read) in READERS.items():
         if options.format == name or (options.format == "auto" and accepts(path)):
             return part_of(read(path, options), options)
-    known = ", ".join(READERS)
-    raise DriveError(f"{path}: not a drive in any known format ({known}); see docs/drive-format.md")
+    format_names = ", ".join(READERS)
+    raise DriveError(f"{path}: not a drive in any known format ({format_names}); see docs/drive-format.md")
 
 
 def as_drive(drive: Drive | str | Path, options: ReadOptions | None = None) -> Drive:
@@ -131,13 +131,14 @@ def drive_of(folder: Path, path: Path | None) -> Drive | None:
     stated = load_json(folder / METRICS, MapFileError).get("drive")
     stated = stated if isinstance(stated, dict) else {}
     try:
-        paths = [Path(str(one)) for one in stated.get("paths") or []] if path is None else [path]
+        stated_paths = stated.get("paths") or [] if path is None else [path]
+        paths = [Path(str(stated_path)) for stated_path in stated_paths]
         options = _options(stated)
     except (TypeError, ValueError) as failure:
         raise MapFileError(f"{folder / METRICS}: its data on the drive are damaged ({failure})") from None
-    if path is None and not (paths and all(one.exists() for one in paths)):
+    if path is None and not (paths and all(drive_path.exists() for drive_path in paths)):
         return None
-    drive = join_drives([read_drive(one, options) for one in paths])
+    drive = join_drives([read_drive(drive_path, options) for drive_path in paths])
     expected = (stated.get("name", drive.name), stated.get("images", len(drive.images)))
     if expected != (drive.name, len(drive.images)):
         raise DriveError(
@@ -160,8 +161,9 @@ def single_drive_of(folder: Path, path: Path | None, what: str) -> Drive:
 def _options(stated: Mapping[str, Any]) -> ReadOptions:
     import msgspec  # of the map extra, as results are
 
-    known = {one.name: stated[one.name] for one in fields(ReadOptions) if one.name in stated}
+    names = [option.name for option in fields(ReadOptions)]
+    stated_options = {name: stated[name] for name in names if name in stated}
     try:
-        return msgspec.convert(known, ReadOptions)
+        return msgspec.convert(stated_options, ReadOptions)
     except msgspec.ValidationError as failure:
         raise ValueError(str(failure)) from None

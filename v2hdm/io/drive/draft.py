@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from v2hdm.errors import DriveError
 from v2hdm.io.description import DRIVE_FILE
@@ -35,15 +35,18 @@ def draft_drive(source: Path, folder: Path, settings: Sequence[str]) -> dict[str
     where = folder / DRIVE_FILE
     if where.exists():
         raise DriveError(f"{where}: exists; edit it, or choose another folder for --write")
-    content, missing = _told(source, folder)
+    draft = _draft_of(source, folder)
+    content = draft.content
+    missing = draft.missing
     for setting in settings:
         key, equals, text = setting.partition("=")
         if not (key and equals):
             raise DriveError(f"--set {setting}: give KEY=VALUE, such as cameras.front.camera_info=front.yaml")
         value = parse_yaml(text, f"--set {key}", DriveError)
         _put(content, key.split("."), _beside(value, folder) if not key.endswith("topic") else value)
-        for asked in [one for one in missing if f"{key}.".startswith(f"{one}.") or one.startswith(f"{key}.")]:
-            del missing[asked]
+        for asked_key in list(missing):
+            if f"{key}.".startswith(f"{asked_key}.") or asked_key.startswith(f"{key}."):
+                del missing[asked_key]
     if missing:
         return missing
     folder.mkdir(parents=True, exist_ok=True)
@@ -56,11 +59,19 @@ def draft_drive(source: Path, folder: Path, settings: Sequence[str]) -> dict[str
     return {}
 
 
-def _told(source: Path, folder: Path) -> tuple[dict[str, Any], dict[str, str]]:
-    """The content of ``drive.yaml`` that the recording tells, and its missing keys with what to give."""
+class _Draft(NamedTuple):
+    """What a recording tells of its drive."""
+
+    content: dict[str, Any]  # of its drive.yaml
+    missing: dict[str, str]  # dotted keys, with what to give for each
+
+
+def _draft_of(source: Path, folder: Path) -> _Draft:
+    """The draft of a ``drive.yaml`` in ``folder`` for a recording."""
     if is_bag(source):
         bag = BagDescription(source, Path(ReadOptions().cache))
-        return bag.content | {"name": folder.resolve().name, "bag": _relative(source, folder)}, bag.missing
+        about = {"name": folder.resolve().name, "bag": _relative(source, folder)}
+        return _Draft(bag.content | about, bag.missing)
     name = source.stem or "camera"
     missing = {"poses": _POSES}
     missing |= {f"cameras.{name}.camera_info": LENS, f"cameras.{name}.mounting": MOUNTING}
@@ -81,7 +92,7 @@ def _told(source: Path, folder: Path) -> tuple[dict[str, Any], dict[str, str]]:
         missing[f"cameras.{name}.images.start_s"] = (
             "the first frame's time on the poses' clock, s: 1715934630.25"
         )
-    return {"name": folder.resolve().name, "cameras": {name: {"images": images}}}, missing
+    return _Draft({"name": folder.resolve().name, "cameras": {name: {"images": images}}}, missing)
 
 
 def _put(content: dict[str, Any], keys: Sequence[str], value: object) -> None:
@@ -95,7 +106,8 @@ def _put(content: dict[str, Any], keys: Sequence[str], value: object) -> None:
 def _beside(value: object, folder: Path) -> object:
     """``value`` with all names of files that exist relative to ``folder``."""
     if isinstance(value, dict):
-        return {key: one if key.endswith("topic") else _beside(one, folder) for key, one in value.items()}
+        topics = {key: entry for key, entry in value.items() if key.endswith("topic")}
+        return {key: _beside(entry, folder) for key, entry in value.items()} | topics
     exists = isinstance(value, str) and len(value) < 4096 and Path(value).exists()
     return _relative(Path(value), folder) if exists and isinstance(value, str) else value
 

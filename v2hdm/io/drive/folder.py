@@ -33,8 +33,9 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
     """Read the drive that the ``content`` of a ``drive.yaml`` describes, with files relative to ``path``."""
     drive_keys = keys_in(DriveDescription)
     check_keys(content, drive_keys.required, drive_keys.optional, where, DriveError)
-    entries = take_mapping(content["cameras"], f"{where}: cameras", DriveError)
-    entries = {take_camera_name(name, f"{where}: cameras", DriveError): one for name, one in entries.items()}
+    cameras_at = f"{where}: cameras"
+    entries = take_mapping(content["cameras"], cameras_at, DriveError)
+    entries = {take_camera_name(name, cameras_at, DriveError): entry for name, entry in entries.items()}
     if not entries:
         raise DriveError(f"{where}: has no camera; add one under 'cameras'")
     bag = None

@@ -73,12 +73,12 @@ class ImageFiles:
     paths: Sequence[Path]
 
 
-def select_cameras(available: Sequence[str], wanted: Sequence[str], where: Path) -> list[str]:
+def select_cameras(available: Sequence[str], chosen: Sequence[str], where: Path) -> list[str]:
     """The ``available`` cameras that are ``wanted``, all where none is named; refuses unknown ones."""
-    for name in wanted:
+    for name in chosen:
         if name not in available:
             raise DriveError(f"{where}: no camera '{name}'; choose from: {', '.join(available)}")
-    return [name for name in available if not wanted or name in wanted]
+    return [name for name in available if not chosen or name in chosen]
 
 
 def assemble_drive(
@@ -152,10 +152,13 @@ def part_of(drive: Drive, options: ReadOptions) -> Drive:
     end_s = float("inf") if options.end_s is None else options.end_s
     images: list[Image] = []
     for name in drive.cameras:
-        own = [image for image in drive.images if image.camera == name]
-        own = [image for image in own if options.start_s <= image.stamp_s - first_s <= end_s]
-        images += own[: options.limit]
-        if not own:
+        chosen = [
+            image
+            for image in drive.images
+            if image.camera == name and options.start_s <= image.stamp_s - first_s <= end_s
+        ]
+        images += chosen[: options.limit]
+        if not chosen:
             lasts_s = max(image.stamp_s for image in drive.images) - first_s
             raise DriveError(
                 f"{drive.root}: no image of camera '{name}' is left from {options.start_s:g} to {end_s:g} s; "

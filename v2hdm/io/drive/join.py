@@ -40,8 +40,12 @@ _SAME_LENS = 1e-3  # intrinsics that differ by less, px at the image's border, a
 _REACH_M = 40.0  # routes with a marking in common are no further apart: twice a camera's reach
 
 
-def _moved(one: Trajectory | None, motion: FloatArray) -> Trajectory | None:
-    return None if one is None else replace(one, map_from_vehicle=motion @ one.map_from_vehicle)
+def _moved(trajectory: Trajectory | None, motion: FloatArray) -> Trajectory | None:
+    return (
+        None
+        if trajectory is None
+        else replace(trajectory, map_from_vehicle=motion @ trajectory.map_from_vehicle)
+    )
 
 
 def _moved_road(road: Road | None, motion: FloatArray) -> Road | None:
@@ -54,7 +58,7 @@ def _moved_road(road: Road | None, motion: FloatArray) -> Road | None:
     return Road(moved[:, :2], moved[:, 2], road.slope @ motion[:2, :2].T + tilt)
 
 
-def join_drives(drives: Sequence[Drive], apart: Collection[tuple[int, str]] = ()) -> Drive:
+def join_drives(drives: Sequence[Drive], moved_cameras: Collection[tuple[int, str]] = ()) -> Drive:
     """The drives as sessions of one drive, in the frame of the first; one alone stays as it is.
 
     ``apart`` names (drive, camera) whose mounting is known to have changed. Raises DriveError when they are
@@ -72,17 +76,25 @@ def join_drives(drives: Sequence[Drive], apart: Collection[tuple[int, str]] = ()
     sessions = []
     roads = []
     for number, (drive, name) in enumerate(zip(drives, names, strict=True)):
-        moved = [camera for session, camera in apart if session == number]
-        own = {key: _name_of(key, one, name, cameras, key in moved) for key, one in drive.cameras.items()}
-        for camera, joined in own.items():
-            one = drive.cameras[camera]
-            cameras.setdefault(joined, replace(one, info=replace(one.info, name=joined)))
+        joined_names = {}
+        for camera_name, camera in drive.cameras.items():
+            is_moved = (number, camera_name) in moved_cameras
+            joined_name = _name_of(camera_name, camera, name, cameras, is_moved)
+            joined_names[camera_name] = joined_name
+        for camera_name, joined_name in joined_names.items():
+            camera = drive.cameras[camera_name]
+            cameras.setdefault(joined_name, replace(camera, info=replace(camera.info, name=joined_name)))
         whole, planar = _move(drives[0].origin, drive.origin)
         for image in drive.images:
             pose = planar @ image.map_from_vehicle
-            images.append(replace(image, camera=own[image.camera], session=number, map_from_vehicle=pose))
-        poses = (_moved(drive.trajectory, planar), _moved(drive.recorded, whole))
-        sessions.append(Session(name, drive.root, drive.pose_noise, drive.truth_dir, *poses, own))
+            joined_name = joined_names[image.camera]
+            images.append(replace(image, camera=joined_name, session=number, map_from_vehicle=pose))
+        sessions.append(
+            Session(
+                name, drive.root, drive.pose_noise, drive.truth_dir,
+                _moved(drive.trajectory, planar), _moved(drive.recorded, whole), joined_names,
+            )
+        )  # fmt: skip
         roads.append(_moved_road(drive.road, whole))
     _check_overlap(images, sessions)
     return Drive(
@@ -99,13 +111,15 @@ def join_drives(drives: Sequence[Drive], apart: Collection[tuple[int, str]] = ()
 
 def _same_rig(first: Camera, second: Camera) -> bool:
     """Whether two descriptions are of one camera on one mounting: lens exactly, guess by its sigmas."""
-    one = first.info
-    other = second.info
-    if (one.width, one.height, one.distortion_model) != (other.width, other.height, other.distortion_model):
+    lens = first.info
+    other_lens = second.info
+    if (lens.width, lens.height) != (other_lens.width, other_lens.height):
         return False
-    if not np.allclose(one.intrinsic, other.intrinsic, rtol=0, atol=_SAME_LENS):
+    if lens.distortion_model != other_lens.distortion_model:
         return False
-    if not np.allclose(one.distortion, other.distortion, rtol=0, atol=_SAME_LENS / one.width):
+    if not np.allclose(lens.intrinsic, other_lens.intrinsic, rtol=0, atol=_SAME_LENS):
+        return False
+    if not np.allclose(lens.distortion, other_lens.distortion, rtol=0, atol=_SAME_LENS / lens.width):
         return False
     guesses = [initial_extrinsic(camera) for camera in (first, second)]
     turn_rad = float(np.linalg.norm(log(guesses[0] @ np.linalg.inv(guesses[1]))[3:]))
@@ -119,13 +133,15 @@ def _same_rig(first: Camera, second: Camera) -> bool:
     return bool((apart_m <= _SAME_RIG_SIGMAS * np.hypot(centres[0].sigma_m, centres[1].sigma_m)).all())
 
 
-def _name_of(camera: str, one: Camera, session: str, so_far: Mapping[str, Camera], apart: bool) -> str:
+def _name_of(
+    camera: str, described: Camera, session: str, so_far: Mapping[str, Camera], is_moved: bool
+) -> str:
     """The joined drive's name for a camera of a session: that of the same rig, if there has been one."""
     if camera not in so_far:
         return camera
-    if not apart and _same_rig(so_far[camera], one):
+    if not is_moved and _same_rig(so_far[camera], described):
         return camera
-    why = "its mounting has changed" if apart else "its lens or guessed mounting differs"
+    why = "its mounting has changed" if is_moved else "its lens or guessed mounting differs"
     _log.warning(
         "camera %s of drive %s is not the earlier one (%s): it is calibrated separately, as %s@%s",
         camera, session, why, camera, session,
@@ -154,16 +170,17 @@ def _check_overlap(images: Sequence[Image], sessions: Sequence[Session]) -> None
     """Refuse a session that comes near to no other: they would have nothing in common."""
     places = np.array([image.map_from_vehicle[:2, 3] for image in images])
     number = np.array([image.session for image in images])
-    for session, one in enumerate(sessions):
-        own = places[number == session]
+    for session, drive_session in enumerate(sessions):
+        session_places = places[number == session]
         others = places[number != session]
 
         def away_m(place: FloatArray, others: FloatArray = others) -> float:
             return float(np.linalg.norm(others - place, axis=1).min())
 
-        if not any(away_m(place) <= _REACH_M for place in own):
+        if not any(away_m(place) <= _REACH_M for place in session_places):
+            nearest_m = min(map(away_m, session_places))
             raise DriveError(
-                f"{one.root}: comes no nearer than {min(map(away_m, own)):.0f} m to the other drives, "
+                f"{drive_session.root}: comes no nearer than {nearest_m:.0f} m to the other drives, "
                 "so they have nothing in common; map it separately, or check the frame of its poses"
             )
 
@@ -186,12 +203,15 @@ def _one_road(roads: Sequence[Road | None], sessions: Sequence[Session]) -> Road
     """The recorded ground of all sessions; one recorded as z = 0 counts where others have heights."""
     if all(road is None for road in roads):
         return None
-    known: list[Road] = []
+    ground: list[Road] = []
     for road, session in zip(roads, sessions, strict=True):
         if road is not None:
-            known.append(road)
+            ground.append(road)
         elif session.recorded is not None:
             places = session.recorded.map_from_vehicle[:, :3, 3]
-            known.append(Road(places[:, :2], places[:, 2], np.zeros((len(places), 2))))
-    columns = zip(*((one.points_map, one.height_m, one.slope) for one in known), strict=True)
-    return Road(*map(np.concatenate, columns))
+            ground.append(Road(places[:, :2], places[:, 2], np.zeros((len(places), 2))))
+    return Road(
+        np.concatenate([part.points_map for part in ground]),
+        np.concatenate([part.height_m for part in ground]),
+        np.concatenate([part.slope for part in ground]),
+    )

@@ -78,7 +78,7 @@ class _Entries:
 
 _CAMERAS = ("image_00", "image_01", "image_02", "image_03")
 _SUFFIXES = (".png", ".jpg", ".jpeg")
-_OXTS_COLUMNS = 30
+_OXTS_COLUMNS = 30  # numbers in a line of the IMU's files (KITTI's dataformat.txt)
 _ROI_M = np.array([[5.0, -6.0], [20.0, -6.0], [20.0, 6.0], [5.0, 6.0]])  # trusted ground, from the camera
 _POSE_NOISE = PoseNoise(
     position_m=0.032,
@@ -113,7 +113,8 @@ def read_kitti_drive(path: Path, options: ReadOptions) -> Drive:
     check_geodetic(oxts[:, :3], f"{path / 'oxts'}")
     origin_imu = GeodeticOrigin(float(oxts[0, 0]), float(oxts[0, 1]), float(oxts[0, 2]))
     position_enu = enu_from_geodetic(origin_imu, oxts[:, :3])
-    enu_from_imu = make_transform(rotation_from_euler(*oxts[:, 3:6].T), position_enu)
+    roll_imu, pitch_imu, yaw_imu = oxts[:, 3:6].T
+    enu_from_imu = make_transform(rotation_from_euler(roll_imu, pitch_imu, yaw_imu), position_enu)
     by_imu = lay_flat(Trajectory(stamp_s, enu_from_imu), _POSE_NOISE.position_m)
     # The IMU's turn on the vehicle, and its height from that of the camera.
     roll, pitch = by_imu.mount_rad[:, None]
@@ -129,7 +130,8 @@ def read_kitti_drive(path: Path, options: ReadOptions) -> Drive:
     on_road = geodetic_from_enu(origin_imu, np.array([[0.0, 0.0, -vehicle_from_imu[2, 3]]]))[0]
     recorded = Trajectory(stamp_s, enu_from_vehicle)
     where = f"{path / 'oxts'}"
-    origin = GeodeticOrigin(*on_road.tolist())
+    latitude_deg, longitude_deg, altitude_m = on_road.tolist()
+    origin = GeodeticOrigin(latitude_deg, longitude_deg, altitude_m)
     drive = Drive(path.name, path, cameras, (), _POSE_NOISE, origin, recorded=recorded)
     return assemble_drive(drive, files, options.max_gap_s, where, by_imu.mount_rad)
 
@@ -137,7 +139,7 @@ def read_kitti_drive(path: Path, options: ReadOptions) -> Drive:
 def _list_images(path: Path, camera: str) -> ImageFiles:
     """The images of one camera; the file number k is the line number of its time stamp."""
     folder = path / camera
-    paths = [one for one in _numbered(folder) if one.suffix.lower() in _SUFFIXES]
+    paths = [path for path in _numbered(folder) if path.suffix.lower() in _SUFFIXES]
     if not paths:
         raise DriveError(f"{folder / 'data'}: no PNG or JPEG image; restore KITTI's images")
     stamp_s = _stamps_of(paths, folder / "timestamps.txt", "image")
@@ -149,7 +151,7 @@ def _list_images(path: Path, camera: str) -> ImageFiles:
 def _read_oxts(path: Path, camera: str) -> tuple[FloatArray, FloatArray]:
     """Stamps (P,) and OXTS rows (P, 30); without stamps of its own, line k has those of image k."""
     folder = path / "oxts"
-    paths = [one for one in _numbered(folder) if one.suffix == ".txt"]
+    paths = [path for path in _numbered(folder) if path.suffix == ".txt"]
     if not paths:
         raise DriveError(f"{folder / 'data'}: no OXTS file; restore KITTI's oxts folder")
     stamps_path = folder / "timestamps.txt"

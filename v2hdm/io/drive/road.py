@@ -12,6 +12,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,24 +22,24 @@ from v2hdm.records import BoolArray, FloatArray, Road, Trajectory
 
 _log = logging.getLogger(__name__)
 
-# Standard deviations of Gaussians along the path, m. Under the first the recorded up-axis is the road's:
-# shorter waves are the suspension's, which at 1.5 Hz are 3 to 10 m long at 5 to 15 m/s. Under the second
-# heights are compared with the up-axis: short enough for a vehicle's squat at a start or stop, long enough
-# for heights of 2 cm to show 1 mrad.
 _ROAD_M = 5.0
-_HEIGHTS_M = 10.0
+"""Standard deviation of the Gaussian along the path, m, under which the recorded up-axis is the road's:
+shorter waves are the suspension's, which at 1.5 Hz are 3 to 10 m long at 5 to 15 m/s."""
 
-# Slow sway of a vehicle by acceleration and in bends: 0.17 deg, as on KITTI drives, over a few seconds.
-_SWAY_RAD = 0.003
-_SWAY_M = 10.0
-# GNSS heights are half again as uncertain as positions: no satellite is below the antenna.
-HEIGHT_SIGMAS = 1.5
+_HEIGHTS_M = 10.0
+"""Standard deviation of the Gaussian along the path, m, under which heights are compared with the up-axis:
+short enough for a vehicle's squat at a start or stop, long enough for heights of 2 cm to show 1 mrad."""
+
+_SWAY_RAD = 0.003  # slow sway of a vehicle by acceleration and in bends: 0.17 deg, as on KITTI drives
+_SWAY_M = 10.0  # way over which that sway is of one piece: a few seconds
+HEIGHT_SIGMAS = 1.5  # sigma of a GNSS height by that of a position: no satellite is below the antenna
 _HEIGHT_M = 5.0  # way over which an error of the height is of one piece
 _CROSS_FALL = 0.02  # slope of a road that drains, expected where only heights along a line are known
 
-# How far off level on its vehicle a sensor may be, in pitch and roll. Heights show the pitch whatever is
-# expected; only turns separate roll from the road's cross-fall, which is no more than 1 deg.
 _MOUNT_RAD = (0.1, 0.02)
+"""How far off level on its vehicle a sensor may be, in pitch and roll. Heights show the pitch whatever is
+expected; only turns separate roll from the road's cross-fall, which is no more than 1 deg."""
+
 _REPORTED_RAD = float(np.radians(0.3))  # a sensor that is further off level is reported
 _STEEPEST = 0.35  # no road has this slope; up-axes that lean further, in the median, are no ground vehicle's
 _ROUNDING = 1e-9  # slope below which a rotation that was made of the heading alone is level
@@ -83,18 +84,18 @@ def lay_flat(recorded: Trajectory, position_sigma_m: float = 0.02) -> Laid:
         trust_m2 = np.full(len(height_m), (height_sigma_m / _CROSS_FALL) ** 2 / pieces)
         level = np.zeros((len(height_m), 2, 1))
         by_heights = local_planes(stations, height_m[:, None], level, _HEIGHTS_M, trust_m2)[1][..., 0]
-        ground = stations.at_poses(by_heights)
-        lean[:, ~measured] = _turned(ground, -yaw)[:, ~measured]
+        slope_by_heights = stations.at_poses(by_heights)
+        lean[:, ~measured] = _turned(slope_by_heights, -yaw)[:, ~measured]
     leans = stations.mean(_with_mount(lean, yaw, measured))
-    ground_m, ground_slope, mount = _fit(stations, height_m, leans, height_sigma_m)
-    relative = lean - _turned(stations.at_poses(ground_slope), -yaw) - mount
+    ground = _fit(stations, height_m, leans, height_sigma_m)
+    relative = lean - _turned(stations.at_poses(ground.slope), -yaw) - ground.mount
     relative[:, ~measured] = 0.0
     flat = poses.copy()
     flat[:, 2, 3] = 0.0
     roll, pitch = roll_pitch(relative).T
     flat[:, :3, :3] = rotation_from_euler(roll, pitch, yaw)
-    road = Road(stations.points_map, ground_m, ground_slope)
-    return Laid(Trajectory(recorded.stamp_s, flat), road, roll_pitch(mount[None])[0])
+    road = Road(stations.points_map, ground.height_m, ground.slope)
+    return Laid(Trajectory(recorded.stamp_s, flat), road, roll_pitch(ground.mount[None])[0])
 
 
 def log_road(laid: Laid, where: Path) -> None:
@@ -110,14 +111,20 @@ def log_road(laid: Laid, where: Path) -> None:
         _log.info(
             "%s: on average the recorded attitude is off the road's by %.2f deg of roll (left side up), "
             "%.2f deg of pitch (nose down); this is taken off",
-            where, *np.degrees(laid.mount_rad),
+            where, np.degrees(laid.mount_rad[0]), np.degrees(laid.mount_rad[1]),
         )  # fmt: skip
 
 
-def _fit(
-    stations: Stations, height_m: FloatArray, leans: FloatArray, height_sigma_m: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Heights (N,), slopes (N, 2) of the ground and the mount (2,), by heights (N,) and leans (N, 2, 3)."""
+class _Ground(NamedTuple):
+    """The ground at N stations, and how the sensor stands on its vehicle."""
+
+    height_m: FloatArray  # (N,)
+    slope: FloatArray  # (N, 2) by map x and y
+    mount: FloatArray  # (2,) slopes of the sensor forward and left
+
+
+def _fit(stations: Stations, height_m: FloatArray, leans: FloatArray, height_sigma_m: float) -> _Ground:
+    """The ground that heights (N,) and leans (N, 2, 3) agree on."""
     road = local_lines(stations, leans.reshape(len(leans), 6), _ROAD_M).reshape(leans.shape)
     # Heights along the route over a ground of these slopes, from zero at its start.
     steps = np.diff(stations.points_map, axis=0)
@@ -134,7 +141,7 @@ def _fit(
         # Heights that leave the profile of the up-axes, as where a receiver loses its fix, weigh less.
         misfit = local_lines(stations, ((missing - offset) @ with_mount)[:, None] ** 2, _HEIGHTS_M)[:, 0]
         variance = np.maximum(variance, misfit)
-    return (offset + drawn) @ with_mount, (road + correction) @ with_mount, mount
+    return _Ground((offset + drawn) @ with_mount, (road + correction) @ with_mount, mount)
 
 
 def _mount(leans: FloatArray) -> FloatArray:
@@ -188,9 +195,9 @@ class Stations:
         """The stations within reach of a Gaussian around station ``k``, and their weights."""
         reach = _WINDOW_SIGMAS * width_m
         low, high = np.searchsorted(self.path_m, [self.path_m[k] - reach, self.path_m[k] + reach])
-        near = slice(int(low), max(int(high), k + 1))
-        weight = np.exp(-0.5 * ((self.path_m[near] - self.path_m[k]) / width_m) ** 2)
-        return near, weight
+        reach_slice = slice(int(low), max(int(high), k + 1))
+        weight = np.exp(-0.5 * ((self.path_m[reach_slice] - self.path_m[k]) / width_m) ** 2)
+        return reach_slice, weight
 
 
 def along_route(points_map: FloatArray) -> Stations:
@@ -211,13 +218,13 @@ def local_lines(stations: Stations, values: FloatArray, width_m: float) -> Float
     """``values`` (N, C) smoothed by the line fitted around each station."""
     smooth = np.empty_like(values)
     for k, here in enumerate(stations.path_m):
-        near, weight = stations.around(k, width_m)
+        window, weight = stations.around(k, width_m)
         weight = weight / weight.sum()
-        offset = stations.path_m[near] - here
+        offset = stations.path_m[window] - here
         centred = offset - weight @ offset
         spread = weight @ centred**2 + (_END_RIDGE * width_m) ** 2
-        mean = weight @ values[near]
-        smooth[k] = mean - (weight @ offset) * ((weight * centred) @ values[near]) / spread
+        mean = weight @ values[window]
+        smooth[k] = mean - (weight @ offset) * ((weight * centred) @ values[window]) / spread
     return smooth
 
 
@@ -232,15 +239,15 @@ def local_planes(
     fitted = np.empty_like(height)
     inclined = np.empty_like(slope)
     for k in range(len(height)):
-        near, weight = stations.around(k, width_m)
+        window, weight = stations.around(k, width_m)
         weight = weight / weight.sum()
-        offset = stations.points_map[near] - stations.points_map[k]
+        offset = stations.points_map[window] - stations.points_map[k]
         mean = weight @ offset
         lever = (offset - mean) * weight[:, None]
         normal = lever.T @ offset + trust_m2[k] * np.eye(2)
-        known = np.tensordot(weight, slope[near], axes=1)
-        inclined[k] = np.linalg.solve(normal, lever.T @ height[near] + trust_m2[k] * known)
-        fitted[k] = weight @ height[near] - mean @ inclined[k]
+        known_slope = np.tensordot(weight, slope[window], axes=1)
+        inclined[k] = np.linalg.solve(normal, lever.T @ height[window] + trust_m2[k] * known_slope)
+        fitted[k] = weight @ height[window] - mean @ inclined[k]
     return fitted, inclined
 
 
@@ -269,15 +276,15 @@ def unevenness(road: Road, reach_m: float) -> Unevenness:
     worst = Unevenness(0.0, reach_m, road.points_map[0], 0.0)
     for k, here_m in enumerate(station_m):
         low, high = np.searchsorted(station_m, [here_m - reach_m, here_m + reach_m])
-        near = slice(int(low), int(high))
-        offset = road.points_map[near] - road.points_map[k]
+        window = slice(int(low), int(high))
+        offset = road.points_map[window] - road.points_map[k]
         distance_m = np.linalg.norm(offset, axis=1)
         far = distance_m >= 0.5 * reach_m
         if not far.any():
             continue
-        change = road.slope[near] - road.slope[k]
-        along_m = road.height_m[near] - road.height_m[k] - offset @ road.slope[k]
-        across_m = _HALF_WIDTH_M * np.einsum("ni,ni->n", change, left[near])
+        change = road.slope[window] - road.slope[k]
+        along_m = road.height_m[window] - road.height_m[k] - offset @ road.slope[k]
+        across_m = _HALF_WIDTH_M * np.einsum("ni,ni->n", change, left[window])
         deviation_m = np.where(far, np.abs(along_m) + np.abs(across_m), 0.0)
         j = int(np.argmax(deviation_m / np.maximum(distance_m, 0.5 * reach_m)))
         if deviation_m[j] * worst.distance_m > worst.value_m * distance_m[j]:

@@ -181,7 +181,7 @@ def _import_video(path: Path, cache: Path, where: str) -> Path:
     need("av", "video", f"{where}: a video", DriveError)
     _log.info("%s: decoding its frames into %s, once", path, cache)
     with new_entry(folder) as partial:
-        in_child(decode_video, path, partial, limits=Limits.of(path), where=str(path), error=DriveError)
+        in_child(decode_video, path, partial, limits=Limits.of([path]), where=str(path), error=DriveError)
     return folder
 
 

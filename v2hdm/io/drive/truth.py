@@ -48,9 +48,9 @@ def has_truth(drive: Drive) -> bool:
     if len(folders) < len(drive.sessions):
         return False
     maps = [read_geojson(folder / MAP) for folder in folders]
-    corners = [[one.corners_map for one in hd_map.markings] for hd_map in maps]
-    same_origin = all(one.origin == maps[0].origin for one in maps)
-    return same_origin and all(np.array_equal(corners[0], one) for one in corners)
+    corners = [[marking.corners_map for marking in hd_map.markings] for hd_map in maps]
+    same_origin = all(hd_map.origin == maps[0].origin for hd_map in maps)
+    return same_origin and all(np.array_equal(corners[0], corners_of_map) for corners_of_map in corners)
 
 
 def _joined_truth(drive: Drive) -> Truth:
@@ -58,11 +58,11 @@ def _joined_truth(drive: Drive) -> Truth:
     parts = []
     rows = []
     for number, session in enumerate(drive.joined):
-        own_name = {joined: own for own, joined in session.cameras.items()}
-        own = [i for i, image in enumerate(drive.images) if image.session == number]
-        images = [replace(drive.images[i], camera=own_name[drive.images[i].camera]) for i in own]
+        own_name = {joined: name_of_session for name_of_session, joined in session.cameras.items()}
+        rows_of_session = [i for i, image in enumerate(drive.images) if image.session == number]
+        images = [replace(drive.images[i], camera=own_name[drive.images[i].camera]) for i in rows_of_session]
         cameras = {name: drive.cameras[joined] for name, joined in session.cameras.items()}
-        rows.append(own)
+        rows.append(rows_of_session)
         parts.append(
             read_truth(Drive(session.name, session.root, cameras, images, truth_dir=session.truth_dir))
         )
@@ -73,7 +73,7 @@ def _joined_truth(drive: Drive) -> Truth:
         disturbances |= {f"{session.name}: {key}": value for key, value in part.disturbances.items()}
         for name, matrix in part.cam_from_vehicle.items():
             cam_from_vehicle.setdefault(session.cameras[name], matrix)
-    lanes = zip(*(part.lane_visible for part in parts), strict=True)
+    lanes = zip(*[part.lane_visible for part in parts], strict=True)
     return Truth(
         map=parts[0].map,
         cam_from_vehicle=cam_from_vehicle,
@@ -90,15 +90,15 @@ def _microseconds(stamp_s: float) -> int:
 
 def _read_cameras(path: Path, drive: Drive) -> Mapping[str, FloatArray]:
     content = load_yaml(path, DriveError)
-    found = {}
+    cam_from_vehicle = {}
     for name in drive.cameras:
         where = f"{path}: camera '{name}'"
         if name not in content:
             raise DriveError(f"{where}: missing; add its cam_from_vehicle")
         entry = take_mapping(content[name], where, DriveError)
         check_keys(entry, ("cam_from_vehicle",), (), where, DriveError)
-        found[name] = take_rigid(entry["cam_from_vehicle"], where)
-    return found
+        cam_from_vehicle[name] = take_rigid(entry["cam_from_vehicle"], where)
+    return cam_from_vehicle
 
 
 def _read_poses(path: Path, images: Sequence[Image]) -> FloatArray:
@@ -132,8 +132,8 @@ def _read_sightings(path: Path, images: Sequence[Image], markings: int) -> Float
 def _read_lane_visible(path: Path, hd_map: HDMap) -> tuple[BoolArray, ...]:
     visible = tuple(np.zeros(len(lane.points_map), dtype=np.bool_) for lane in hd_map.lanes)
     for where, (lane, vertex) in _rows(path, LANE_VISIBLE):
-        known = lane.isdecimal() and vertex.isdecimal()
-        if not known or int(lane) >= len(visible) or int(vertex) >= len(visible[int(lane)]):
+        is_index = lane.isdecimal() and vertex.isdecimal()
+        if not is_index or int(lane) >= len(visible) or int(vertex) >= len(visible[int(lane)]):
             raise DriveError(f"{where}: no vertex {vertex} of a lane {lane} in the true map; fix that line")
         visible[int(lane)][int(vertex)] = True
     return visible

@@ -99,22 +99,22 @@ def read_poses(
 
 
 def _take_settings(entry: Mapping[str, Any], where: str) -> PoseSettings:
-    given: dict[str, Any] = {}
+    fields: dict[str, Any] = {}
     for key in filter(entry.__contains__, ("max_sigma_m", "geoid_m", "epoch", "offset_s")):
-        given[key] = take_number(entry[key], f"{where}, {key}", DriveError)
+        fields[key] = take_number(entry[key], f"{where}, {key}", DriveError)
     for key in filter(entry.__contains__, ("lever_arm_m", "mounting_rpy_deg")):
-        given[key] = take_array(entry[key], (3,), f"{where}, {key}", DriveError)
+        fields[key] = take_array(entry[key], (3,), f"{where}, {key}", DriveError)
     if entry.get("heading") is not None:
-        given["heading"] = take_choice(entry["heading"], HEADINGS, f"{where}, heading", DriveError)
-    if given.get("max_sigma_m", 1.0) <= 0:
+        fields["heading"] = take_choice(entry["heading"], HEADINGS, f"{where}, heading", DriveError)
+    if fields.get("max_sigma_m", 1.0) <= 0:
         raise DriveError(f"{where}, max_sigma_m: give a positive number of metres")
     crs = entry.get("crs")
     if isinstance(crs, int) and not isinstance(crs, bool):
         crs = f"EPSG:{crs}"
     if crs is not None:
-        given["crs"] = take_text(crs, f"{where}, crs", DriveError)
-    roll, pitch, yaw = np.radians(given.pop("mounting_rpy_deg", np.zeros(3)))[:, None]
-    return PoseSettings(rotation_from_euler(roll, pitch, yaw)[0], **given)
+        fields["crs"] = take_text(crs, f"{where}, crs", DriveError)
+    roll, pitch, yaw = np.radians(fields.pop("mounting_rpy_deg", np.zeros(3)))[:, None]
+    return PoseSettings(rotation_from_euler(roll, pitch, yaw)[0], **fields)
 
 
 def assemble(
@@ -137,13 +137,13 @@ def assemble(
         )
     heading_sigma_rad = readings.attitudes.sigma_rad
     sure = _sure_enough(readings, settings.max_sigma_m, where)
-    kept = {key: getattr(readings, key)[sure] for key in ("stamp_s", "points", "sigma_m")}
-    readings = replace(readings, **kept)
-    rotation, known = _rotation_at(readings, max_gap_s, where)
-    points = readings.points[known]
-    sigma_m = readings.sigma_m[known]
+    certain = {key: getattr(readings, key)[sure] for key in ("stamp_s", "points", "sigma_m")}
+    readings = replace(readings, **certain)
+    rotation, has_heading = _rotation_at(readings, max_gap_s, where)
+    points = readings.points[has_heading]
+    sigma_m = readings.sigma_m[has_heading]
     rotation = rotation @ settings.vehicle_from_sensor.T
-    stamp_s = readings.stamp_s[known] + settings.offset_s
+    stamp_s = readings.stamp_s[has_heading] + settings.offset_s
     if readings.geodetic or settings.crs is not None:
         if readings.geodetic:
             check_geodetic(points, where)
@@ -197,18 +197,20 @@ def _rotation_at(readings: Readings, max_gap_s: float, where: str) -> tuple[Floa
     if np.array_equal(attitudes.stamp_s, readings.stamp_s):
         return attitudes.rotation, np.ones(len(readings.stamp_s), dtype=bool)
     turns = Trajectory(attitudes.stamp_s, make_transform(attitudes.rotation, np.zeros(3)))
-    found, known = interpolate(turns, readings.stamp_s, max_gap_s)
-    if not known.any():
+    poses, has_heading = interpolate(turns, readings.stamp_s, max_gap_s)
+    if not has_heading.any():
         raise DriveError(
             f"{where}: no position ({span(readings.stamp_s)}) has a heading "
             f"({span(attitudes.stamp_s)}) within {max_gap_s:g} s "
             "(drive.max_gap_s): "
             f"{why_no_pose(readings.stamp_s, attitudes.stamp_s, max_gap_s, 'positions', 'headings')}"
         )
-    if not known.all():
-        lacking = int((~known).sum())
-        _log.warning("%s: left out %d of %d positions: no heading at their time", where, lacking, len(known))
-    return found[known, :3, :3], known
+    if not has_heading.all():
+        lacking = int((~has_heading).sum())
+        _log.warning(
+            "%s: left out %d of %d positions: no heading at their time", where, lacking, len(has_heading)
+        )
+    return poses[has_heading, :3, :3], has_heading
 
 
 def _on_earth(
@@ -239,14 +241,14 @@ def _on_earth(
 
 
 def _origin(
-    given: GeodeticOrigin | None, first: FloatArray, datum: str, settings: PoseSettings, where: str
+    stated: GeodeticOrigin | None, first: FloatArray, datum: str, settings: PoseSettings, where: str
 ) -> GeodeticOrigin:
-    if given is None:
+    if stated is None:
         return GeodeticOrigin(float(first[0]), float(first[1]), float(first[2]), datum, settings.epoch)
     # Without crs the source does not say its datum: that of a correction service is the origin's.
-    if settings.crs is not None and given.datum.replace(" ", "") != datum.replace(" ", ""):
+    if settings.crs is not None and stated.datum.replace(" ", "") != datum.replace(" ", ""):
         raise DriveError(
-            f"{where}: the poses are in {datum}, the origin in {given.datum}, which differ by decimetres; "
+            f"{where}: the poses are in {datum}, the origin in {stated.datum}, which differ by decimetres; "
             f"give the origin in {datum} (datum: {datum})"
         )
-    return given if given.epoch is not None else replace(given, epoch=settings.epoch)
+    return stated if stated.epoch is not None else replace(stated, epoch=settings.epoch)

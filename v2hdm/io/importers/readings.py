@@ -18,7 +18,7 @@ from datetime import UTC, date, datetime
 from functools import reduce
 from operator import xor
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -135,25 +135,32 @@ def _columns(path: Path, names: Mapping[str, str]) -> dict[str, FloatArray]:
         if header.count(theirs) != 1:
             problem = f"has no column '{theirs}' for {ours}, or two"
             raise DriveError(f"{path}: {problem}; it has: {', '.join(header)}")
-    found = {ours: header.index(theirs) for ours, theirs in names.items()}
+    place_of = {ours: header.index(theirs) for ours, theirs in names.items()}
     for place, name in enumerate(header):
-        if name in NAMES and place not in found.values() and name not in found:
-            found[name] = place
-    table: dict[str, list[float]] = {name: [] for name in found}
+        if name in NAMES and place not in place_of.values() and name not in place_of:
+            place_of[name] = place
+    table: dict[str, list[float]] = {name: [] for name in place_of}
     for number, cells in rows:
-        for name, place in found.items():
+        for name, place in place_of.items():
             table[name].append(_parse(name, cells[place], f"{path}: line {number}: {header[place]}"))
     return {name: np.array(values, dtype=np.float64) for name, values in table.items()}
 
 
-def read_rows(path: Path, separators: str, thing: str) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """The names in the first line of a CSV file, and the cells of each further line with its number.
+class Table(NamedTuple):
+    """A CSV file: the names in its first line, and the cells of each further line with its number."""
+
+    header: list[str]
+    rows: list[tuple[int, list[str]]]
+
+
+def read_rows(path: Path, separators: str, thing: str) -> Table:
+    """The names and the cells of a CSV file, each row as long as the line of names.
 
     The first of ``separators`` in the line of names separates cells, else blanks do; ``#`` begins a comment.
     """
     text = read_text(path, DriveError)
     lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
-    lines = [*lines[:1], *(one for one in lines[1:] if not one[1].lstrip().startswith("#"))]
+    lines = [*lines[:1], *(line for line in lines[1:] if not line[1].lstrip().startswith("#"))]
     if len(lines) < 2:
         raise DriveError(f"{path}: has no {thing}; expected a line of column names and one line per {thing}")
     title = lines[0][1].lstrip("\ufeff# ")
@@ -175,7 +182,7 @@ def read_rows(path: Path, separators: str, thing: str) -> tuple[list[str], list[
         if len(cells) != len(header):
             problem = f"{len(cells)} cells under {len(header)} columns"
             raise DriveError(f"{path}: line {number}: {problem}; fix that line")
-    return header, rows
+    return Table(header, rows)
 
 
 def _parse(name: str, cell: str, where: str) -> float:
@@ -201,9 +208,9 @@ def parse_sigma(cell: str) -> float:
 def _stamps(columns: Mapping[str, FloatArray], path: Path) -> FloatArray:
     named = [name for name in (*_STAMPS, "utc") if name in columns]
     if len(named) != 1:
-        wanted = ", ".join(_STAMPS)
+        accepted = ", ".join(_STAMPS)
         has = ", ".join(named) or "none"
-        raise DriveError(f"{path}: needs one time column, {wanted} or utc, has {has}; see columns")
+        raise DriveError(f"{path}: needs one time column, {accepted} or utc, has {has}; see columns")
     return columns[named[0]] / _STAMPS.get(named[0], 1.0)
 
 
@@ -242,7 +249,7 @@ def _rotation(columns: Mapping[str, FloatArray], path: Path) -> FloatArray | Non
 
 _log = logging.getLogger(__name__)
 
-_DAY_S = 86400.0
+_DAY_S = 86400.0  # seconds of a day
 
 
 def read_nmea(path: Path, entry: dict[str, Any], root: Path, where: str) -> Readings:

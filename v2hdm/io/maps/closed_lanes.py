@@ -283,5 +283,9 @@ class _Segments:
 def _stretches(other: IntArray, gap_m: FloatArray) -> list[tuple[int, int]]:
     """First and last vertex of each run that meets the same line at a lane's width."""
     meets = np.where(gap_m > LANE_WIDTH_M[0], other, -1)
-    runs = [(key, list(group)) for key, group in groupby(range(len(meets)), key=lambda k: int(meets[k]))]
-    return [(run[0], run[-1]) for key, run in runs if key >= 0 and len(run) > 1]
+    stretches = []
+    for line, group in groupby(range(len(meets)), key=lambda vertex: int(meets[vertex])):
+        vertices = list(group)
+        if line >= 0 and len(vertices) > 1:
+            stretches.append((vertices[0], vertices[-1]))
+    return stretches

@@ -57,9 +57,7 @@ type="Map">{}</Option>
 </layer></symbol>"""
 _OPTION = '<Option type="QString" name="{}" value="{}"/>'
 
-_MESSAGE_LETTERS = (
-    200  # longest text of a GDAL error in ours, letters: it may hold whole SQL statements; chosen
-)
+_MESSAGE_LETTERS = 200  # longest text of a GDAL error in ours, letters: it may hold whole statements; chosen
 
 AnyArray = NDArray[Any]
 
@@ -84,7 +82,10 @@ def write_geopackage(
     def write(
         place: Path, layer: str, columns: Mapping[str, Any], shapes: AnyArray | None = None, **options: Any
     ) -> None:
-        values = [np.array(v, dtype=object) if isinstance(v, list) else v for v in columns.values()]
+        values = [
+            np.array(column, dtype=object) if isinstance(column, list) else column
+            for column in columns.values()
+        ]
         raw.write(str(place), shapes, values, list(columns), layer=layer, driver="GPKG", **options)
 
     def write_all(place: Path) -> None:
@@ -206,10 +207,12 @@ def write_qgis(hd_map: HDMap, path: Path, grid: Grid | None = None) -> None:
     pyproj = need("pyproj", "map", "the format qgis", ConfigError)
     features = features_of(hd_map)
     where = grid or Grid("local", hd_map.origin)
-    placed = hd_map.origin is not None and (grid is None or not grid.is_local)
-    ground = crs_of(hd_map.origin) if placed and hd_map.origin is not None else LOCAL_CRS
-    layers_crs = LOCAL_CRS if not placed else "EPSG:4326" if grid is None else grid.crs
-    canvas_crs = ground if grid is None else layers_crs
+    ground_crs = LOCAL_CRS
+    layers_crs = LOCAL_CRS
+    if hd_map.origin is not None and (grid is None or not grid.is_local):
+        ground_crs = crs_of(hd_map.origin)
+        layers_crs = "EPSG:4326" if grid is None else grid.crs
+    canvas_crs = ground_crs if grid is None else layers_crs
     system = pyproj.CRS.from_user_input(canvas_crs)
     root = ET.Element("qgis", {"version": "3.22.0", "projectname": path.stem})
     ET.SubElement(root, "title").text = path.stem
@@ -220,10 +223,12 @@ def write_qgis(hd_map: HDMap, path: Path, grid: Grid | None = None) -> None:
     canvas = ET.SubElement(root, "mapcanvas", {"name": "theMapCanvas"})
     ET.SubElement(canvas, "units").text = "degrees" if system.is_geographic else "meters"
     places = np.concatenate([feature.positions(where)[:, :2] for feature in features] or [np.zeros((1, 2))])
-    around = _AROUND_M * (1e-5 if system.is_geographic else 1.0)
+    margin = _AROUND_M * (1e-5 if system.is_geographic else 1.0)  # 1e-5 deg is about 1 m
     extent = ET.SubElement(canvas, "extent")
-    corners = (*(places.min(axis=0) - around), *(places.max(axis=0) + around))
-    for name, value in zip(("xmin", "ymin", "xmax", "ymax"), corners, strict=True):
+    low = places.min(axis=0) - margin
+    high = places.max(axis=0) + margin
+    sides = {"xmin": low[0], "ymin": low[1], "xmax": high[0], "ymax": high[1]}
+    for name, value in sides.items():
         ET.SubElement(extent, name).text = repr(float(value))
     layers = ET.SubElement(root, "projectlayers")
     for key, layer in reversed(LAYERS.items()):
@@ -235,7 +240,7 @@ def write_qgis(hd_map: HDMap, path: Path, grid: Grid | None = None) -> None:
         element.extend(ET.fromstring(layer_style(kinds, key != POINTS).split("\n", 1)[1]))
     if (path.parent / MOSAIC).is_file():
         element = _layer(tree, layers, "mosaic", f"./{MOSAIC}", "gdal", {"type": "raster"})
-        _refer(ET.SubElement(element, "srs"), pyproj.CRS.from_user_input(ground))
+        _refer(ET.SubElement(element, "srs"), pyproj.CRS.from_user_input(ground_crs))
     ET.indent(root, " ")
     doctype = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>"
     replace_text(path, f"{doctype}\n{ET.tostring(root, encoding='unicode')}\n")

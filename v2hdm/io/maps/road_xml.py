@@ -108,15 +108,20 @@ def _roads(features: Sequence[Feature]) -> list[_Road]:
     if roads:
         return roads
     if lines:
-        longest = max(lines, key=lambda feature: float(np.linalg.norm(np.ptp(feature.points_map, axis=0))))
+        longest = max(lines, key=lambda line: float(np.linalg.norm(np.ptp(line.points_map, axis=0))))
         xyz = _spaced(longest.xyz_map)
     else:
-        centres = np.array([feature.xyz_map.mean(axis=0) for feature in features]).reshape(-1, 3)
-        middle = centres.mean(axis=0) if len(centres) else np.zeros(3)
-        main_axis = np.linalg.svd(centres - middle)[2][0] if len(centres) > 1 else np.eye(3)[0]
-        reach_m = max(float(np.abs((centres - middle) @ main_axis).max(initial=0.0)), 1.0)
-        xyz = np.stack([middle - reach_m * main_axis, middle + reach_m * main_axis])
+        xyz = _through_centres(features)
     return [_Road(xyz, np.zeros(len(xyz)), ("none", "none"))]
+
+
+def _through_centres(features: Sequence[Feature]) -> FloatArray:
+    """A straight line (2, 3), m, through the centres of features, at least 2 m long."""
+    centres = np.array([feature.xyz_map.mean(axis=0) for feature in features]).reshape(-1, 3)
+    middle = centres.mean(axis=0) if len(centres) else np.zeros(3)
+    axis = np.linalg.svd(centres - middle)[2][0] if len(centres) > 1 else np.eye(3)[0]
+    reach_m = max(float(np.abs((centres - middle) @ axis).max(initial=0.0)), 1.0)
+    return np.stack([middle - reach_m * axis, middle + reach_m * axis])
 
 
 def _spaced(xyz: FloatArray) -> FloatArray:

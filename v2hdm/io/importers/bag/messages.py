@@ -61,8 +61,8 @@ def file_of(kind: str, fields: Any, where: str) -> tuple[str, bytes]:
 
 def _pixels(fields: Any, where: str) -> np.ndarray:
     if fields.encoding not in _ENCODINGS:
-        known = ", ".join(_ENCODINGS)
-        raise DriveError(f"{where}: encoding '{fields.encoding}' is not known; record one of {known}")
+        supported = ", ".join(_ENCODINGS)
+        raise DriveError(f"{where}: encoding '{fields.encoding}' is not known; record one of {supported}")
     channels, to_bgr = _ENCODINGS[fields.encoding]
     height = int(fields.height)
     width = int(fields.width)
@@ -148,8 +148,8 @@ QUATERNION = "geometry_msgs/msg/QuaternionStamped"
 POSE_KINDS = (ODOMETRY, _WITH_COVARIANCE, _POSE, FIX, NMEA, TF)
 HEADING_KINDS = (IMU, QUATERNION, ODOMETRY, _WITH_COVARIANCE, _POSE)
 
-_NO_FIX = -1
-_NORM_TOLERANCE = 1e-2
+_NO_FIX = -1  # the status of a NavSatFix without a position (sensor_msgs/NavSatStatus)
+_NORM_TOLERANCE = 1e-2  # by which a recorded quaternion's norm may be off 1; chosen
 _YAW = 35  # place of the variance of yaw among the 36 numbers of a pose's covariance (REP-103)
 
 Row = tuple[float, ...]
@@ -198,12 +198,12 @@ def readings_of(
     if (rows[:, 3] < 0).any() or (turned[:, 4] < 0).any():
         raise DriveError(f"{where}: a message states a negative variance; record it again with 0 for unknown")
     # A dual antenna writes nan where it has none.
-    known = np.isfinite(turned[:, :4]).all(axis=1)
+    is_measured = np.isfinite(turned[:, :4]).all(axis=1)
     attitudes = None
-    if known.any():
+    if is_measured.any():
         advice = "it has no measured orientation: choose another topic for the heading"
-        rotation = checked_rotations(turned[known, :4], lambda k: where, advice, _NORM_TOLERANCE)
-        attitudes = Attitudes(heading_s[known], rotation, turned[known, 4])
+        rotation = checked_rotations(turned[is_measured, :4], lambda k: where, advice, _NORM_TOLERANCE)
+        attitudes = Attitudes(heading_s[is_measured], rotation, turned[is_measured, 4])
     geodetic = kind == FIX
     return Readings(stamp_s, rows[:, :3], geodetic, rows[:, 3], attitudes, antenna=geodetic)
 
@@ -286,8 +286,8 @@ class Frames:
         for track, forward in tracks:
             poses = np.broadcast_to(track.map_from_vehicle[0], (len(stamp_s), 4, 4))
             if len(track.stamp_s) > 1:
-                poses, known = interpolate(track, stamp_s, max_gap_s)
-                inside &= known
+                poses, has_pose = interpolate(track, stamp_s, max_gap_s)
+                inside &= has_pose
             out = out @ (poses if forward else inverse(poses))
         if not inside.any():
             problem = f"the transforms between {src} and {dst} are never known at the same time"
@@ -303,22 +303,22 @@ class Frames:
         paths: dict[str, list[tuple[Edge, bool]]] = {dst: []}
         queue = [dst]
         for here in queue:  # which grows
-            for there, edge, forward in neighbours[here]:
-                if there not in paths:
-                    paths[there] = [*paths[here], (edge, forward)]
-                    queue.append(there)
+            for neighbour, edge, forward in neighbours[here]:
+                if neighbour not in paths:
+                    paths[neighbour] = [*paths[here], (edge, forward)]
+                    queue.append(neighbour)
         return paths.get(src)
 
 
 def transform_rows(fields: Any) -> list[tuple[Edge, tuple[float, ...]]]:
     """Edges of a ``TFMessage`` with their rows of stamp, translation and quaternion."""
     rows: list[tuple[Edge, tuple[float, ...]]] = []
-    for one in fields.transforms:
-        move = one.transform.translation
-        turn = one.transform.rotation
-        stamp = one.header.stamp
+    for transform in fields.transforms:
+        move = transform.transform.translation
+        turn = transform.transform.rotation
+        stamp = transform.header.stamp
         row = (stamp.sec + stamp.nanosec / 1e9, move.x, move.y, move.z, turn.x, turn.y, turn.z, turn.w)
-        rows.append(((frame_name(one.header.frame_id), frame_name(one.child_frame_id)), row))
+        rows.append(((frame_name(transform.header.frame_id), frame_name(transform.child_frame_id)), row))
     return rows
 
 

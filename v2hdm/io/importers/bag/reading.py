@@ -100,12 +100,7 @@ class Bag:
         missing = sum(self.topics[name].messages for name in topics if name in self.topics)
         size = sum(file.stat().st_size for file in bag_files(self.path))
         spare_bytes = _TIMES_IN_ALL * size + _SPARE_BYTES
-        streams = (
-            reader.messages(connections=connections)
-            for reader in self._readers
-            if (connections := [known for known in reader.connections if known.topic in topics])
-        )
-        stream = chain.from_iterable(streams)
+        stream = chain.from_iterable(_messages_of(reader, topics) for reader in self._readers)
         while True:
             next_step()
             with _one_line(self.path):
@@ -148,8 +143,8 @@ class Bag:
             types = get_types_from_msg(definition.data, connection.msgtype)
         else:
             for part in filter(str.strip, definition.data.split("=" * 80 + "\n")):
-                head, _, rest = part.partition("\n")
-                types |= get_types_from_idl(rest if head.startswith("IDL: ") else part)
+                head, _, definition_below = part.partition("\n")
+                types |= get_types_from_idl(definition_below if head.startswith("IDL: ") else part)
         for _, fields in types.values():
             if all(kind == Nodetype.ARRAY and not what[1] for _, (kind, what) in fields):
                 raise DriveError(_NO_RECORDING)  # it has no bytes: any number of them fits in a message
@@ -159,12 +154,14 @@ class Bag:
     def need(self, name: str, kinds: Collection[str], where: str) -> Topic:
         """The topic ``name``, of one of the types ``kinds``; else DriveError names those that would do."""
         fitting = ", ".join(topic.name for topic in self.topics.values() if topic.kind in kinds) or "none"
-        wanted = ", ".join(sorted(kind.split("/")[-1] for kind in kinds))
+        expected = ", ".join(sorted(kind.split("/")[-1] for kind in kinds))
         topic = self.topics.get(name)
         if topic is None:
-            raise DriveError(f"{where}: {self.path} has no topic {name}; topics of type {wanted}: {fitting}")
+            raise DriveError(
+                f"{where}: {self.path} has no topic {name}; topics of type {expected}: {fitting}"
+            )
         if topic.kind not in kinds:
-            problem = f"topic {name} of {self.path} is of type {topic.kind}, expected {wanted}"
+            problem = f"topic {name} of {self.path} is of type {topic.kind}, expected {expected}"
             raise DriveError(f"{where}: {problem}; it has: {fitting}")
         if not topic.messages:
             raise DriveError(f"{where}: topic {name} of {self.path} has no messages; record it")
@@ -174,7 +171,7 @@ class Bag:
 def in_child_of(path: Path, work: Callable[..., Any], *arguments: Any) -> Any:
     """The answer of ``work`` on the bag at ``path`` and more ``arguments``, done in a child."""
     need("rosbags", "ros", f"{path}: a bag", DriveError)
-    limits = Limits.of(*bag_files(path))
+    limits = Limits.of(bag_files(path))
     return in_child(work, path, *arguments, limits=limits, where=str(path), error=DriveError)
 
 
@@ -210,6 +207,12 @@ def open_bag(path: Path) -> Iterator[Bag]:
         yield bag
 
 
+def _messages_of(reader: Any, topics: Collection[str]) -> Iterator[Any]:
+    """Connection, time received (ns) and bytes of each message of some topics in an open file."""
+    connections = [connection for connection in reader.connections if connection.topic in topics]
+    return reader.messages(connections=connections) if connections else iter(())
+
+
 def _unpacked(file: Path, folder: Path) -> Path:
     """A file that is compressed as a whole, unpacked into ``folder``."""
     if sys.version_info >= (3, 14):
@@ -241,8 +244,8 @@ def _check_chunks(readers: Sequence[Any]) -> None:
 def _check_definition(text: str) -> None:
     """Refuse a type on which rosbags' parser, or what it generates, would take for ever."""
     plain = _TEXTS.sub("", text)
-    odd = any(not _LITERAL.fullmatch(one[1]) for one in _CONSTANT.finditer(plain))
-    if len(text) > _MOST_LETTERS or odd or _NESTED.search(plain) or _LONG.search(plain):
+    computes = any(not _LITERAL.fullmatch(constant[1]) for constant in _CONSTANT.finditer(plain))
+    if len(text) > _MOST_LETTERS or computes or _NESTED.search(plain) or _LONG.search(plain):
         raise DriveError(_NO_RECORDING)
 
 
@@ -260,16 +263,17 @@ def _check_database(path: Path) -> None:
 def _check_plain(path: Path) -> None:
     """Refuse an SQLite file that computes, or lists a row again and again: its rows need never end."""
     computes = "m.type = 'view' OR m.sql LIKE 'CREATE VIRTUAL%' OR x.hidden"
-    odd = f"{computes} OR m.type = 'index' AND m.tbl_name <> 'messages'"
-    query = f"SELECT m.name FROM sqlite_master m LEFT JOIN pragma_table_xinfo(m.name) x WHERE {odd}"
+    repeats = "m.type = 'index' AND m.tbl_name <> 'messages'"
+    columns = "sqlite_master m LEFT JOIN pragma_table_xinfo(m.name) x"
+    query = f"SELECT m.name FROM {columns} WHERE {computes} OR {repeats}"
     with opened(path, "immutable=1") as data:
         for (name,) in data.execute(query):
             raise DriveError(f"{path}: {name} is no plain table of a recording; convert it to MCAP")
         names = {name.lower() for (name,) in data.execute("SELECT name FROM sqlite_master")}
         for table in names & {"topics", "message_definitions"}:
             deque(rows_of(data, path, table), maxlen=0)
-        ((held,),) = data.execute("SELECT total(length(data) + 1) FROM messages")
-        if held > path.stat().st_size:
+        ((message_bytes,),) = data.execute("SELECT total(length(data) + 1) FROM messages")
+        if message_bytes > path.stat().st_size:
             raise DriveError(f"{path}: its messages have more bytes than it; convert it to MCAP")
 
 
@@ -278,9 +282,10 @@ def _one_line(path: Path, what: str = "") -> Iterator[None]:
     """Turn whatever goes wrong in a damaged bag into one line."""
     try:
         yield
-    except DriveError as refused:  # its own files are named already
-        named = str(refused).startswith(str(path))
-        raise refused if named else DriveError(f"{path}: {what}{refused}") from None
+    except DriveError as refusal:
+        if str(refusal).startswith(str(path)):
+            raise
+        raise DriveError(f"{path}: {what}{refusal}") from None
     except MemoryError:
         raise DriveError(f"{path}: {what}{_TRAP}") from None
     # Bytes that are not what they should be fail anywhere within rosbags, with any error.

@@ -14,7 +14,7 @@ from collections.abc import Collection, Generator, Mapping, Sequence
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, NamedTuple, TextIO
 
 import numpy as np
 
@@ -43,12 +43,18 @@ _TRANSFORMS = "transforms.txt"
 Writer = Generator[None, Message | None, None]  # is sent its messages, then None; closing closes its files
 
 
+class Need(NamedTuple):
+    """A topic that a stream needs, the types of message that it may be of, and where it is asked for."""
+
+    topic: str
+    kinds: Collection[str]
+    where: str
+
+
 class Stream(ABC):
     """One stream of a bag, which ``label`` and ``settings`` tell from others; ``needs`` are its topics."""
 
-    def __init__(
-        self, label: str, settings: Any, where: str, *needs: tuple[str, Collection[str], str]
-    ) -> None:
+    def __init__(self, label: str, settings: Any, where: str, needs: Sequence[Need] = ()) -> None:
         self.label = label
         self.settings = settings
         self.where = where
@@ -56,7 +62,7 @@ class Stream(ABC):
 
     def topics(self, bag: Bag) -> Sequence[str]:
         """The topics to be read; raises DriveError where the bag lacks them or they are of another type."""
-        return [bag.need(*one).name for one in self.needs]
+        return [bag.need(need.topic, need.kinds, need.where).name for need in self.needs]
 
     @abstractmethod
     def write(self, folder: Path) -> Writer:
@@ -67,7 +73,8 @@ class ImageStream(Stream):
     """Images of a topic as files, with their list."""
 
     def __init__(self, topic: str, stamps: str, where: str) -> None:
-        super().__init__(topic, ["images", stamps], where, (topic, (*kinds.IMAGE_KINDS, kinds.VIDEO), where))
+        need = Need(topic, (*kinds.IMAGE_KINDS, kinds.VIDEO), where)
+        super().__init__(topic, ["images", stamps], where, [need])
         self._stamps = stamps
 
     def write(self, folder: Path) -> Writer:
@@ -98,7 +105,8 @@ class ImageStream(Stream):
                 decoder = decoder or kinds.VideoDecoder(message.fields.format, topic)
                 decode(decoder, message.fields.data.tobytes())
             else:
-                put(number, *kinds.file_of(message.kind, message.fields, where))
+                suffix, data = kinds.file_of(message.kind, message.fields, where)
+                put(number, suffix, data)
         if decoder is not None:
             decode(decoder, None)
         if len(names) < len(stamp_s):
@@ -116,7 +124,7 @@ class InfoStream(Stream):
     """Intrinsics of a topic, the same in each of its messages."""
 
     def __init__(self, topic: str, where: str) -> None:
-        super().__init__(topic, ["camera_info"], where, (topic, [INFO_KIND], where))
+        super().__init__(topic, ["camera_info"], where, [Need(topic, [INFO_KIND], where)])
 
     def write(self, folder: Path) -> Writer:
         """Write the first message as ``camera_info``."""
@@ -138,33 +146,33 @@ class PoseStream(Stream):
     """Positions of a topic, and headings of another one if need be, as rows of numbers."""
 
     def __init__(self, topic: str, heading_topic: str | None, stamps: str, where: str) -> None:
-        needs: list[tuple[str, Collection[str], str]] = [(topic, kinds.POSE_KINDS, where)]
+        needs = [Need(topic, kinds.POSE_KINDS, where)]
         if heading_topic is not None:
-            needs.append((heading_topic, kinds.HEADING_KINDS, f"{where}, heading_topic"))
-        super().__init__(topic, ["poses", heading_topic, stamps], where, *needs)
+            needs.append(Need(heading_topic, kinds.HEADING_KINDS, f"{where}, heading_topic"))
+        super().__init__(topic, ["poses", heading_topic, stamps], where, needs)
         self._heading = heading_topic
         self._stamps = stamps
 
     def write(self, folder: Path) -> Writer:
         """Write rows of positions and of headings, and the type of the messages."""
         kind = ""
-        begun = set[str]()
+        started_topics = set[str]()
         with (
             (folder / _POSES).open("w", encoding="utf-8") as positions,
             (folder / _HEADINGS).open("w", encoding="utf-8") as headings,
         ):
             while (message := (yield)) is not None:
-                first = message.topic not in begun
-                begun.add(message.topic)
+                first = message.topic not in started_topics
+                started_topics.add(message.topic)
                 stamp_s = stamp_of(message, self._stamps, first, f"{self.where}: topic {message.topic}")
                 if message.topic == self.label:
                     kind = message.kind
                     if kind == kinds.NMEA:
                         positions.write(f"{stamp_s!r} {message.fields.sentence.strip()}\n")
                     else:
-                        _write_row(positions, stamp_s, *kinds.position_row(kind, message.fields))
+                        _write_row(positions, stamp_s, kinds.position_row(kind, message.fields))
                 if message.topic == self._heading:
-                    _write_row(headings, stamp_s, *kinds.heading_row(message.kind, message.fields))
+                    _write_row(headings, stamp_s, kinds.heading_row(message.kind, message.fields))
         (folder / _KIND).write_text(kind, encoding="utf-8")
 
     def readings(self, folder: Path) -> Readings:
@@ -189,10 +197,10 @@ class TfStream(Stream):
 
     def topics(self, bag: Bag) -> Sequence[str]:
         """Its topics in the bag, at least one."""
-        there = [name for name in self._wanted if name in bag.topics]
-        if not there:
+        recorded = [name for name in self._wanted if name in bag.topics]
+        if not recorded:
             raise DriveError(f"{self.where}: {bag.path} has no topic {' or '.join(self._wanted)}")
-        return [bag.need(name, [kinds.TF, kinds.OLD_TF], self.where).name for name in there]
+        return [bag.need(name, [kinds.TF, kinds.OLD_TF], self.where).name for name in recorded]
 
     def write(self, folder: Path) -> Writer:
         """Write a row per transform."""
@@ -275,8 +283,8 @@ def frame_of(message: Message) -> str:
     return kinds.frame_name(message.fields.header.frame_id)
 
 
-def _write_row(file: TextIO, *row: float) -> None:
-    file.write(" ".join(map(repr, map(float, row))) + "\n")
+def _write_row(file: TextIO, stamp_s: float, row: kinds.Row) -> None:
+    file.write(" ".join(repr(float(number)) for number in (stamp_s, *row)) + "\n")
 
 
 def _read_rows(path: Path, columns: int) -> tuple[FloatArray, FloatArray]:
