@@ -36,11 +36,10 @@ from v2hdm.errors import AdjustError
 from v2hdm.records import FloatArray, IntArray
 
 _COLUMN_RANGES = 8  # ranges of columns shared among threads
-_WORTH_ANOTHER_ORDER = (
-    1e9  # multiplications of a factorisation above which other elimination orders are tried
-)
+# Multiplications of a factorisation above which other elimination orders are tried.
+_WORTH_ANOTHER_ORDER = 1e9
 _CLEARLY_LESS = 0.5  # fraction of the multiplications below which another order pays
-_PAIR_BLOCK = torch.triu_indices(6, 6)
+_PAIR_BLOCK = torch.triu_indices(6, 6)  # rows and columns of the upper triangle of a pair's block
 
 
 class NumbaEngine(TorchEngine):
