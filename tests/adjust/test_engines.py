@@ -126,7 +126,7 @@ def test_engines_agree_on_every_kind_of_residual(seed, model, loss, size, length
     for group, joint in zip(one.corner_factor.joint, other.corner_factor.joint, strict=True):
         assert torch.equal(group.begin, joint.begin)
         assert_same(group.factor, joint.factor)
-    assert_same(systems[0]._own, systems[1]._own)
+    assert_same(systems[0]._of_pairs, systems[1]._of_pairs)
     for place, tile in systems[0].matrix.tiles.items():
         lower = torch.ones_like(tile).tril() if place[0] == place[1] else 1.0
         assert_same(tile * lower, systems[1].matrix.tiles[place] * lower)

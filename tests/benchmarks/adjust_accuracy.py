@@ -115,7 +115,7 @@ def squared_bound_m2(scene: Scene, pose_states: tuple[str, ...] = POSE_STATES) -
         evaluations=0,
         progressing=False,
         is_singular=whitening.is_singular,
-        made=whitening,
+        last_whitening=whitening,
     )
     groups = np.arange(scene.problem.corner_count)[:, None]
     return float(np.trace(Covariance(at_truth).corners(groups), axis1=1, axis2=2).mean())

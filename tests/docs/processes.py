@@ -118,6 +118,10 @@ def _work(asked: socket.socket) -> None:
 def _run(arguments: list[str]) -> None:
     from tests.docs.smaller import smaller
 
+    if arguments[0] == "-c":
+        sys.argv = ["-c", *arguments[2:]]
+        exec(arguments[1], {"__name__": "__main__"})
+        return
     if arguments[0] != "-m":
         sys.argv = arguments
         runpy.run_path(arguments[0], run_name="__main__")

@@ -2,12 +2,10 @@
 
 A kernel that is wrong, or wrongly compiled, cannot end a solve unnoticed: residuals, squared distances and
 flags are compared with :mod:`v2hdm.adjust.model`, for all observations of a small problem and a sample of a
-large one, and the cost with the sum over the reported distances and with the model's priors.
+large one, and the cost of the observations with the sum over the reported distances.
 """
 
 from __future__ import annotations
-
-from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -31,7 +29,7 @@ _ROUNDING = 1e-7
 roundings of one. Chosen: a point 1 m ahead of a camera 10 km from the origin is rounded by some 1e-11."""
 
 _COST_ROUNDING = 1e-8
-"""The same for two values of a cost, as a fraction of the whole cost or, if that is less, of 1. Chosen."""
+"""The same for two values of a cost, relative to a cost above 1. Chosen."""
 
 
 def audit(
@@ -40,19 +38,17 @@ def audit(
     robust: Loss,
     focal_px: FloatArray,
     report: Report,
-    terms: Mapping[str, float],
+    cost: float,
 ) -> None:
-    """Raise AdjustError unless a report and the cost by name at an estimate are the model's, up to rounding.
+    """Raise AdjustError unless a report and the observations' cost at an estimate are the model's.
 
     ``focal_px`` (C, 2) are the focal lengths.
     """
     _audit_observations(arrays, estimate, focal_px, report)
     losses, _ = model.robustified(robust, torch.from_numpy(report.mahalanobis2))
-    expected = {"observations": losses.sum() / 2} | model.prior_terms(arrays, estimate)
-    tolerance = _COST_ROUNDING * max(sum(terms.values()), 1.0)
-    for name, term in expected.items():
-        if not abs(terms[name] - float(term)) <= tolerance:
-            raise _refusal(f"the cost of {name} is {terms[name]:.12g}, not {float(term):.12g}")
+    expected = float(losses.sum()) / 2
+    if not abs(cost - expected) <= _COST_ROUNDING * max(expected, 1.0):
+        raise _refusal(f"the cost of the observations is {cost:.12g}, not {expected:.12g}")
 
 
 def _audit_observations(arrays: Arrays, estimate: Estimate, focal_px: FloatArray, report: Report) -> None:
@@ -63,23 +59,21 @@ def _audit_observations(arrays: Arrays, estimate: Estimate, focal_px: FloatArray
     )
     error = model.reprojection_error(points, measured).cpu()
     depth_m = points[:, 2].cpu()
-    focal = torch.as_tensor(focal_px).index_select(0, arrays.camera_of(pair).cpu())
+    focal = torch.as_tensor(focal_px).repeat_interleave(arrays.moment_count, 0).index_select(0, pair.cpu())
     a, b, c = root_information.cpu()
     place = place.cpu()
 
-    x, y = error.unbind(1)
-    size = 1 + x.abs() + y.abs()
     residual_px, squared, behind = (torch.from_numpy(column).index_select(0, place) for column in report)
-    agree = [
-        (residual_px - error * focal).abs() <= _ROUNDING * size[:, None] * focal,
-        (squared.sqrt() - ((a * x).square() + (b * x + c * y).square()).sqrt()).abs()
-        <= _ROUNDING * size * (a + b.abs() + c),
-        (behind == (depth_m <= NEAR_M)) | ((depth_m - NEAR_M).abs() <= _ROUNDING),
-    ]
-    if not all(bool(agrees.all()) for agrees in agree):
-        agrees = agree[0].all(1) & agree[1] & agree[2]
+    expected_px = error * focal
+    x, y = error.unbind(1)
+    distance = torch.hypot(a * x, b * x + c * y)
+    size = 1 + x.abs() + y.abs()
+    agrees = (squared.sqrt() - distance).abs() <= _ROUNDING * size * (a + b.abs() + c)
+    agrees &= (residual_px - expected_px).abs().amax(1) <= _ROUNDING * float(focal_px.max()) * size
+    agrees &= (behind == (depth_m <= NEAR_M)) | ((depth_m - NEAR_M).abs() <= _ROUNDING)
+    if not bool(agrees.all()):
         k = int(agrees.to(torch.uint8).argmin())
-        reported, expected = (_px(residual[k].tolist()) for residual in (residual_px, error * focal))
+        reported, expected = (_px(residual[k].tolist()) for residual in (residual_px, expected_px))
         raise _refusal(f"the residual of observation {int(place[k])} is {reported}, not {expected}")
 
 

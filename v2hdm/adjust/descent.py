@@ -21,6 +21,7 @@ from v2hdm.adjust.whitening import Whitening, factorise, whitened_gradient
 
 Evaluate = Callable[[Tensor], tuple[float, Tensor]]  # cost and gradient at whitened variables y
 
+# Pairs of steps and gradients that LBFGS remembers, and most evaluations of a step: chosen.
 _LINE_SEARCH: dict[str, Any] = {"history_size": 20, "max_eval": 25}
 # One iteration per step: the surrounding loop decides when to stop.
 _STEPWISE: dict[str, Any] = {"max_iter": 1, "tolerance_grad": 0.0, "tolerance_change": 0.0}
@@ -60,10 +61,12 @@ def minimise(
     """
     scale = float(gradient.abs().sum())
     u = torch.zeros_like(gradient)
-    seen = _Evaluations(lambda point: objective(point * scale), torch.zeros_like(gradient), cost, gradient)
+    evaluations = _Evaluations(
+        lambda point: objective(point * scale), torch.zeros_like(gradient), cost, gradient
+    )
 
     def closure() -> float:
-        new_cost, new_gradient = seen.at(u)
+        new_cost, new_gradient = evaluations.at(u)
         # An infinite cost means an overshooting step, whatever its gradient.
         if math.isnan(new_cost) or not (math.isinf(new_cost) or bool(new_gradient.isfinite().all())):
             raise _NoNumberError
@@ -83,14 +86,14 @@ def minimise(
             break
         try:
             step(optimizer, closure)
-            reached, reached_gradient = seen.at(u)
+            reached, reached_gradient = evaluations.at(u)
         except _NoNumberError:
             reached = math.inf
         if not math.isfinite(reached):
             # A line search along a singular direction diverged; the point before it stands.
-            u.copy_(seen.start)
+            u.copy_(evaluations.start)
             break
-        seen.begin_step(u, reached, reached_gradient)
+        evaluations.begin_step(u, reached, reached_gradient)
         progress = best - reached
         best = reached
         best_gradient = reached_gradient
@@ -131,8 +134,8 @@ class _Evaluations:
 
     def at(self, point: Tensor) -> tuple[float, Tensor]:
         """Cost and gradient at a point, from the cache if possible."""
-        for known, cost, gradient in self._known:
-            if torch.equal(known, point):
+        for evaluated_point, cost, gradient in self._known:
+            if torch.equal(evaluated_point, point):
                 return cost, gradient
         with np.errstate(over="ignore", invalid="ignore"):  # an overshooting step may overflow
             cost, gradient = self._objective(point)
@@ -141,10 +144,10 @@ class _Evaluations:
 
 
 _ANNEALING_TOLERANCE = 1e-3  # while a robust loss is being narrowed, more digits are wasted
-_ANNEALING_STEP = 3.0
-_ITERATIONS_PER_WHITENING = 12
-RENEWAL = 2.0  # cost of a whitening, in evaluations
-RENEWAL_WITH_STATES = 10.0
+_ANNEALING_STEP = 3.0  # factor by which a robust loss is narrowed at least, from whitening to whitening
+_ITERATIONS_PER_WHITENING = 12  # most steps of LBFGS under one whitening
+RENEWAL = 2.0  # cost of a whitening, in evaluations, if frames have no states
+RENEWAL_WITH_STATES = 10.0  # cost of a whitening, in evaluations, if frames have states
 
 
 @dataclass(frozen=True)
@@ -160,13 +163,13 @@ class Descent:
     evaluations: int  # of cost and gradient
     progressing: bool  # the cost was still falling at the end
     is_singular: bool  # some direction of the reduced unknowns is undetermined
-    made: Whitening | None  # the whitening at the estimate, if the descent made it
+    last_whitening: Whitening | None  # the whitening at the estimate, if the descent made it
 
     @cached_property
     def whitening(self) -> Whitening:
         """The whitening at the estimate, computed on first use."""
-        if self.made is not None:
-            return self.made
+        if self.last_whitening is not None:
+            return self.last_whitening
         arrays = self.engine.arrays
         with one_thread_in_torch(len(arrays.pair), arrays.centre.device.type == "cpu"):
             return factorise(self.engine, self.plan, self.estimate, self.robust)
@@ -257,9 +260,9 @@ def descend(
         )
         whitened = torch.zeros_like(gradient)
         reached = cost
-        made = None
+        last_whitening = None
         if ended:
-            made = whitening
+            last_whitening = whitening
         else:
             inner = tolerance if final else _ANNEALING_TOLERANCE
             # After a slow whitening the next is near enough: the loss slows it, not the distance.
@@ -274,8 +277,18 @@ def descend(
         evaluations += objective.evaluations
         singular = whitening.is_singular
         if ended:
-            at = engine, plan, point.estimate, used, point.terms
-            return Descent(*at, gap, evaluations, progressing, singular, made)
+            return Descent(
+                engine=engine,
+                plan=plan,
+                estimate=point.estimate,
+                robust=used,
+                terms=point.terms,
+                gap=gap,
+                evaluations=evaluations,
+                progressing=progressing,
+                is_singular=singular,
+                last_whitening=last_whitening,
+            )
         estimate = point.estimate
         progressing = reached < cost or not final
         # Frees the memory of the old factor, and of what refers to it, before the new one is made.

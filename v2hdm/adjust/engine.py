@@ -237,15 +237,20 @@ class TorchEngine:
     def prior_blocks(self, estimate: Estimate) -> PriorBlocks:
         """Gauss-Newton Hessian of the priors by the reduced unknowns."""
         arrays = self.arrays
-        each = arrays.camera_unknowns
-        rotation = estimate.cam_from_vehicle[:, :3, :3]
-        blocks = rotation.new_zeros(arrays.camera_count, each, each)
+        count = arrays.camera_count
+        unknowns = arrays.camera_unknowns
         # A left tangent moves the centre by minus its translation, in the vehicle's axes.
-        information = arrays.centre_information_root.square()
-        blocks[:, :3, :3] = (rotation * information[:, None]) @ rotation.mT
-        blocks[:, 6:, 6:] = arrays.clock_information_root.square().diag()
-        cameras = torch.block_diag(*blocks)  # type: ignore[no-untyped-call]
+        turned = estimate.cam_from_vehicle[:, :3, :3] * arrays.centre_information_root[:, None]
+        by_camera = arrays.centre.new_zeros(count, unknowns, count, unknowns)
+        blocks = by_camera.diagonal(dim1=0, dim2=2)
+        blocks[:3, :3] = (turned @ turned.mT).permute(1, 2, 0)
+        if unknowns > 6:
+            blocks[6:, 6:] = arrays.clock_information_root.square().diag()[..., None]
+        cameras = by_camera.view(count * unknowns, -1)
         root = arrays.state_information_root
+        if not arrays.states:
+            empty = root.new_zeros(arrays.frame_count, 0, 0)
+            return PriorBlocks(cameras, empty, empty)
         by_before = -root[..., None] * arrays.state_transition
         frame = torch.diag_embed(root.square())
         frame[:-1] += (by_before.mT @ by_before)[1:]
@@ -328,7 +333,7 @@ class Linearised:
     coupled: Coupled
     couplings: Tensor  # (2, 6, K) W'; kernels compute it anew, and keep (2, 6, 0)
 
-    def evaluate(self, step: Gradient, tangents: Tensor, own: Tensor) -> Evaluated:
+    def evaluate(self, step: Gradient, tangents: Tensor, whitened_corners: Tensor) -> Evaluated:
         """Evaluate after a step of the reduced unknowns, the corners following: x_c = L^-T (y_c - B x_r).
 
         ``tangents`` (C, M, 6) are the pairs' under the step, ``own`` (N, 2) the corners' whitened variables.
@@ -341,7 +346,7 @@ class Linearised:
             for run in self.engine.arrays.runs()
         ]
         push = torch.cat(pushed, dim=1).T
-        corners = base.corners_map + factor.solve_transposed(own - factor.solve(push))
+        corners = base.corners_map + factor.solve_transposed(whitened_corners - factor.solve(push))
         state = base.frame_state + step.frame_state
         clock = base.clock_s + step.clock_s
         moved = Estimate(base.cam_from_vehicle, state, corners, clock)

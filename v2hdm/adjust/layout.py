@@ -121,19 +121,19 @@ def make_arrays(
     prior = state_prior(problem, pose_states)
     surveys = _surveys(problem)
     lengths = _lengths(problem)
+    first_rank = rank[lengths.first]
+    second_rank = rank[lengths.second]
     clock_twist, sigma_s = _clock_twist(problem, clock_offset)
-    moments: IntArray | None = None
+    moments = _moments(problem) if read_out or problem.read_out_s is not None else None
     motion: FloatArray | None = None
-    if read_out or problem.read_out_s is not None:
-        read_outs = _moments(problem)
-        moments = read_outs.frame
-        of_observation = read_outs.of_observation[observations.order]
-        pair = (pair // len(clock_twist) * len(moments) + of_observation).astype(np.int32)
-        clock_twist = clock_twist[moments]
+    if moments is not None:
+        of_observation = moments.of_observation[observations.order]
+        pair = (pair // len(clock_twist) * len(moments.frame) + of_observation).astype(np.int32)
+        clock_twist = clock_twist[moments.frame]
         if problem.read_out_s is not None:
-            motion = problem.read_out_s[:, None, None] * read_outs.motion
+            motion = problem.read_out_s[:, None, None] * moments.motion
         if read_out:
-            clock_twist = np.concatenate([clock_twist, read_outs.motion[..., None]], axis=2)
+            clock_twist = np.concatenate([clock_twist, moments.motion[..., None]], axis=2)
             sigma_s = [*sigma_s, problem.read_out_sigma_s]
     return Arrays(
         order=index(observations.order),
@@ -155,12 +155,9 @@ def make_arrays(
         control=real(surveys.control[corner_order]),
         control_root=real(surveys.control_root[corner_order]),
         lengths=Lengths(
-            index(rank[lengths.first]),
-            index(rank[lengths.second]),
-            real(lengths.length_m),
-            real(1 / lengths.sigma_m),
+            index(first_rank), index(second_rank), real(lengths.length_m), real(1 / lengths.sigma_m)
         ),
-        frame_of_moment=None if moments is None else index(moments),
+        frame_of_moment=None if moments is None else index(moments.frame),
         read_out=None if motion is None else real(motion),
     )
 

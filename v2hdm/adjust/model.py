@@ -117,8 +117,8 @@ def moved(arrays: Arrays, clock_s: Tensor) -> Tensor:
 def before_camera(points_cam: Tensor) -> Tensor:
     """Points (k, 3) for projection: below the depth ``NEAR_M``, 1 / z continues as in ``inverse_depth``."""
     depth = points_cam[:, 2:]
-    beyond = 1 + (NEAR_M - depth).clamp(min=0) / NEAR_M
-    return torch.cat([points_cam[:, :2] * beyond, depth.clamp(min=NEAR_M)], dim=1)
+    at_least = depth.clamp(min=NEAR_M)
+    return torch.cat([points_cam[:, :2] * (1 + (at_least - depth) / NEAR_M), at_least], dim=1)
 
 
 def points_in_camera(cam_from_map: Tensor, corners_map: Tensor) -> Tensor:
@@ -218,21 +218,21 @@ def control_residual(arrays: Arrays, corners_map: Tensor) -> Tensor:
 
 def length_residual(arrays: Arrays, first_map: Tensor, second_map: Tensor) -> Tensor:
     """Distances (M,) of corners (M, 2) minus the known lengths."""
-    known = arrays.lengths
+    lengths = arrays.lengths
     distance_m: Tensor = torch.linalg.vector_norm(first_map - second_map, dim=1)
-    return (distance_m - known.length_m) * known.information_root
+    return (distance_m - lengths.length_m) * lengths.information_root
 
 
 def prior_residuals(arrays: Arrays, estimate: Estimate) -> dict[str, Tensor]:
     """All residuals except those of observations, by name."""
     corners = estimate.corners_map
-    known = arrays.lengths
+    lengths = arrays.lengths
     return {
         "camera_centre": centre_residual(arrays, estimate.cam_from_vehicle),
         "frame_states": state_residual(arrays, estimate.frame_state),
         "clock_offsets": clock_residual(arrays, estimate.clock_s),
         "control_points": control_residual(arrays, corners),
-        "known_lengths": length_residual(arrays, corners[known.first], corners[known.second]),
+        "known_lengths": length_residual(arrays, corners[lengths.first], corners[lengths.second]),
     }
 
 

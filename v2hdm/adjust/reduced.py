@@ -119,13 +119,13 @@ def factorise_corners(arrays: Arrays, blocks: Tensor, by_length: tuple[Tensor, T
 
 def _add_lengths(arrays: Arrays, group: Joint, by_length: tuple[Tensor, Tensor], matrix: Tensor) -> None:
     """Add J'J of the lengths within the groups to their blocks (m, g, 2, g, 2)."""
-    known = arrays.lengths
-    which = torch.searchsorted(group.begin, known.first, right=True) - 1
-    inside = (which >= 0) & (known.first < group.begin[which.clamp(min=0)] + group.corners)
+    lengths = arrays.lengths
+    which = torch.searchsorted(group.begin, lengths.first, right=True) - 1
+    inside = (which >= 0) & (lengths.first < group.begin[which.clamp(min=0)] + group.corners)
     which = which[inside]
     ends = [
         (end[inside] - group.begin[which], by[inside])
-        for end, by in zip((known.first, known.second), by_length, strict=True)
+        for end, by in zip((lengths.first, lengths.second), by_length, strict=True)
     ]
     for row, by_row in ends:
         for column, by_column in ends:
@@ -178,19 +178,19 @@ def frames_per_tile(arrays: Arrays) -> int:
 
 def to_tiles(plan: Plan, by_frame: Tensor, by_kept: Tensor | None = None) -> Tensor:
     """Values by frame (J, S, ...) and by kept corner (n, 2, ...) as rows of tiles (G size, ...)."""
-    rest = by_frame.shape[2:]
-    out = by_frame.new_zeros(plan.tile_count, plan.size, *rest)
+    trailing = by_frame.shape[2:]
+    out = by_frame.new_zeros(plan.tile_count, plan.size, *trailing)
     if not plan.tile_count:
         return out.flatten(0, 1)
     frames = by_frame.new_zeros(plan.frame_tiles, plan.frames_per_tile, *by_frame.shape[1:])
     frames.flatten(0, 1)[: len(by_frame)] = by_frame
     out[plan.position[: plan.frame_tiles]] = frames.flatten(1, 2)
     if by_kept is not None and plan.kept_tiles:
-        each = plan.size // 2
-        corners = by_kept.new_zeros(plan.kept_tiles, each, 2, *rest)
+        per_tile = plan.size // 2
+        corners = by_kept.new_zeros(plan.kept_tiles, per_tile, 2, *trailing)
         corners.flatten(0, 1)[: len(by_kept)] = by_kept
-        padded = by_kept.new_zeros(plan.kept_tiles, plan.size, *rest)
-        padded[:, : 2 * each] = corners.flatten(1, 2)
+        padded = by_kept.new_zeros(plan.kept_tiles, plan.size, *trailing)
+        padded[:, : 2 * per_tile] = corners.flatten(1, 2)
         out[plan.position[plan.frame_tiles :]] = padded
     return out.flatten(0, 1)
 
@@ -275,13 +275,13 @@ class ReducedSystem:
         self.by_pair = bool(arrays.states) or arrays.camera_unknowns > 6
         self.tip = arrays.camera_count * arrays.camera_unknowns
         self.matrix = TiledMatrix.zeros(plan.pattern, plan.size, self.tip, arrays.centre)
-        self._own = arrays.centre.new_zeros(0)
+        self._of_pairs = arrays.centre.new_zeros(0)
         # U's diagonal; rows that pad a tile are 0 until they are fixed.
         self._diagonal = arrays.centre.new_zeros(plan.tile_count * plan.size)
 
-    def add(self, own: Tensor, cameras: Tensor) -> None:
+    def add(self, of_pairs: Tensor, cameras: Tensor) -> None:
         """Add U of all observations, (C, M or 1, 6, 6), and subtract the cameras' B' B."""
-        self._own = own
+        self._of_pairs = of_pairs
         self.matrix.tiles[TIP, TIP].sub_(cameras)
 
     def add_kept(self, run: Run, coupling: Tensor, index: Tensor, blocks: Tensor) -> None:
@@ -298,8 +298,8 @@ class ReducedSystem:
         self._scatter(rows[:, :, None], columns[:, None, :], by_state)
         first, second = self._kept_rows(index)[..., None] + axes
         self._scatter(first[:, :, None], second[:, None, :], blocks)
-        own = index[0] == index[1]
-        self._diagonal[first[own]] = blocks[own].diagonal(dim1=1, dim2=2)
+        on_diagonal = index[0] == index[1]
+        self._diagonal[first[on_diagonal]] = blocks[on_diagonal].diagonal(dim1=1, dim2=2)
         border = self.spread.by_camera(run, coupling).flatten(0, 1)
         for tile, part in enumerate(torch.split(border, plan.size // 2 * 2)):
             place = plan.pattern.position[plan.frame_tiles + tile]
@@ -307,8 +307,8 @@ class ReducedSystem:
 
     def _kept_rows(self, number: Tensor) -> Tensor:
         """First rows of kept corners, by their numbers."""
-        plan, each = self.plan, self.plan.size // 2
-        return plan.position[plan.frame_tiles + number // each] * plan.size + number % each * 2
+        plan, per_tile = self.plan, self.plan.size // 2
+        return plan.position[plan.frame_tiles + number // per_tile] * plan.size + number % per_tile * 2
 
     def _frame_rows(self, frame: Tensor) -> Tensor:
         """Rows (n, S) of the states of frames (n,)."""
@@ -326,7 +326,8 @@ class ReducedSystem:
         size = self.plan.size
         device = values.device
         tile = low // size * (self.plan.tile_count + 1) + high // size
-        keys, at = (torch.as_tensor(one, device=device) for one in (self.matrix.keys, self.matrix.at))
+        keys = torch.as_tensor(self.matrix.keys, device=device)
+        at = torch.as_tensor(self.matrix.at, device=device)
         places = at[torch.searchsorted(keys, tile)] + high % size * size + low % size
         self.matrix.values.index_add_(0, places.flatten(), values.flatten())
 
@@ -346,13 +347,13 @@ class ReducedSystem:
 
     def _add_cameras(self, priors: PriorBlocks) -> Tensor:
         """Add the cameras' own information and priors; returns its diagonal."""
-        by_pair = self._own
+        by_pair = self._of_pairs
         if self.arrays.camera_unknowns > 6:
             by_pair = self.spread.camera.mT @ by_pair @ self.spread.camera
         tip = priors.camera.clone()
-        each = self.arrays.camera_unknowns
-        for begin, own in zip(range(0, len(tip), each), by_pair.sum(1), strict=True):
-            tip[begin : begin + each, begin : begin + each] += own
+        unknowns = self.arrays.camera_unknowns
+        for begin, of_camera in zip(range(0, len(tip), unknowns), by_pair.sum(1), strict=True):
+            tip[begin : begin + unknowns, begin : begin + unknowns] += of_camera
         self.matrix.tiles[TIP, TIP].add_(tip)
         return torch.diagonal(tip)
 
@@ -363,7 +364,7 @@ class ReducedSystem:
         spread = self.spread
         if not arrays.states:
             return
-        by_state = self._own @ spread.state
+        by_state = self._of_pairs @ spread.state
         by_frame = arrays.over_moments((spread.state.mT @ by_state).sum(0)) + priors.frame
         border = arrays.over_moments((by_state.mT @ spread.camera).permute(1, 2, 0, 3).flatten(2))
         for column, part in enumerate(to_tiles(plan, border).chunk(plan.tile_count)):

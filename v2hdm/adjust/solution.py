@@ -33,8 +33,10 @@ class Verdict(IntEnum):
 
 def noise_scale(mahalanobis2: FloatArray) -> float:
     """Robust variance factor of the observations, from the median; at least 1."""
-    median = float(np.median(mahalanobis2.astype(np.float32), overwrite_input=True))
-    return max(1.0, median / _MEDIAN_SQUARED)
+    ordered = mahalanobis2.astype(np.float32)
+    middle = [(len(ordered) - 1) // 2, len(ordered) // 2]
+    ordered.partition(middle)
+    return max(1.0, float(ordered[middle].mean()) / _MEDIAN_SQUARED)
 
 
 def as_of_point(squared_of_line: FloatArray) -> FloatArray:

@@ -6,6 +6,7 @@ A distant start first uses steep rays of part of the route, which converges from
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -28,20 +29,25 @@ from v2hdm.errors import AdjustError
 from v2hdm.geometry.rigid import exp
 from v2hdm.records import FloatArray
 
-_MIN_DEPRESSION_SINES = (0.1, 0.2, 0.1)  # least of rays: the first from nearby, the others in turn from afar
-# Rotation of a camera, rad, up to which every start converged without steep rays: 3 degrees, of the 5 tried.
-# At ten degrees a first Newton step errs by a twentieth.
+_MIN_DEPRESSION_SINES = (0.1, 0.2, 0.1)
+"""Least depression sines of the coarse stage's rays: of the one from nearby, then of the two from afar."""
+
 _NEAR_RAD = 0.052
-_WORTH_CORNERS = 1000  # with more, a coarse stage saves more evaluations of all corners than it costs
-# Corners of the coarse stage from nearby, and from afar.
-_NEARBY_CORNERS = 100
-_CORNERS = 400
-_BLOCKS = 10
-_MIN_OBSERVATIONS = 24  # of a camera: with fewer, its six unknowns are not estimated from the subset
-_LOSS = Loss("huber", 1.0)
-_GAP_TOLERANCE = 1e-3
-_MAX_REFRESHES = 10
-_MAX_EVALUATIONS = 200
+"""Rotation of a camera, rad, up to which every start converged without steep rays: 3 degrees, of the 5 tried.
+At ten degrees a first Newton step errs by a twentieth."""
+
+_WORTH_CORNERS = (
+    1000  # corners above which a coarse stage saves more evaluations of all corners than it costs
+)
+_NEARBY_CORNERS = 100  # corners of the coarse stage from nearby
+_CORNERS = 400  # corners of each coarse stage from afar
+_BLOCKS = 10  # stretches of the route from which the coarse stage takes its corners
+_MIN_OBSERVATIONS = 24  # least observations of a camera whose six unknowns the coarse stage estimates
+
+_LOSS = Loss("huber", 1.0)  # of the coarse stage: convex
+_GAP_TOLERANCE = 1e-3  # gap at which the coarse stage ends, a fraction of the cost: it only makes a start
+_MAX_REFRESHES = 10  # most whitenings of a coarse stage
+_MAX_EVALUATIONS = 200  # most evaluations of a coarse stage
 
 
 def is_worth_a_look(arrays: Arrays) -> bool:
@@ -51,7 +57,7 @@ def is_worth_a_look(arrays: Arrays) -> bool:
 
 def is_near(whitening: Whitening) -> bool:
     """Whether the Newton step turns every camera by less than the descent's range of convergence."""
-    step, _, _ = whitening.step(-whitening.gradient)
+    step = whitening.step(-whitening.gradient).unknowns
     return float(step.extrinsic[:, 3:].norm(dim=1).max()) <= _NEAR_RAD
 
 
@@ -151,31 +157,43 @@ def solve(problem: Problem, options: SolveOptions | None = None) -> Solution:
 def _solve(problem: Problem, options: SolveOptions) -> Solution:
     """Solve a checked problem."""
     origin_map = nearby_origin(problem)
-    near = shifted(problem, -origin_map)
+    nearby = shifted(problem, -origin_map)
     states = tuple(options.pose_states)
-    estimated = (options.clock_offset, options.read_out)
-    arrays = make_arrays(near, states, options.device, *estimated)
+    arrays = make_arrays(nearby, states, options.device, options.clock_offset, options.read_out)
     engine = make_engine(options.engine, arrays)
     robust = Loss(options.loss, options.loss_scale)
-    start, opening, spent = _start(near, engine, robust, options)
-    del near
+    start = _start(nearby, engine, robust, options)
+    del nearby
     descent = descend(
-        engine, start, robust, options.gap_tolerance, options.max_refreshes, options.max_evaluations, opening
+        engine,
+        start.estimate,
+        robust,
+        options.gap_tolerance,
+        options.max_refreshes,
+        options.max_evaluations,
+        start.opening,
     )
-    del opening
+    spent = start.evaluations
+    del start
     return _report(problem, origin_map, options, descent, spent)
 
 
-def _start(
-    problem: Problem, engine: TorchEngine, robust: Loss, options: SolveOptions
-) -> tuple[Estimate, Whitening | None, int]:
-    """Start of the descent, its first whitening if known, and evaluations spent. Raises AdjustError."""
+class _Start(NamedTuple):
+    """Where the descent begins."""
+
+    estimate: Estimate
+    opening: Whitening | None  # its first whitening, if known
+    evaluations: int  # spent so far
+
+
+def _start(problem: Problem, engine: TorchEngine, robust: Loss, options: SolveOptions) -> _Start:
+    """Start of the descent. Raises AdjustError."""
     cam_from_vehicle = torch.as_tensor(problem.cam_from_vehicle, dtype=torch.float64, device=options.device)
     if options.coarse and not is_worth_a_look(engine.arrays):
         estimate, corner = _estimate(problem, engine, cam_from_vehicle)
         opening = open_descent(engine, estimate, robust) if corner is None else None
         if opening is not None and is_near(opening):
-            return estimate, opening, 0
+            return _Start(estimate, opening, 0)
         del opening
     spent = 0
     if options.coarse:
@@ -186,7 +204,7 @@ def _start(
             f"no ray of corner {corner} meets the ground under the starting extrinsics: its observations "
             "lie above the horizon; leave it out or give corners_start"
         )
-    return estimate, None, spent
+    return _Start(estimate, None, spent)
 
 
 def _estimate(problem: Problem, engine: TorchEngine, cam_from_vehicle: Tensor) -> tuple[Estimate, int | None]:
@@ -194,8 +212,10 @@ def _estimate(problem: Problem, engine: TorchEngine, cam_from_vehicle: Tensor) -
     arrays = engine.arrays
     state = torch.zeros_like(arrays.state_information_root)
     if problem.corners_start is not None:
-        given = torch.as_tensor(problem.corners_start, dtype=torch.float64, device=cam_from_vehicle.device)
-        return Estimate(cam_from_vehicle, state, given[arrays.corner_order], arrays.no_clock()), None
+        corners_start = torch.as_tensor(
+            problem.corners_start, dtype=torch.float64, device=cam_from_vehicle.device
+        )
+        return Estimate(cam_from_vehicle, state, corners_start[arrays.corner_order], arrays.no_clock()), None
     corners, fixed = engine.back_project(cam_from_vehicle)
     loose = None if bool(fixed.all()) else int(arrays.corner_order[~fixed].min())
     return Estimate(cam_from_vehicle, state, corners, arrays.no_clock()), loose
@@ -213,7 +233,7 @@ def _report(
     if descent.robust != robust:
         terms = engine.terms(estimate, robust)
     report = engine.report(estimate, problem.intrinsic[:, :2])
-    audit(arrays, estimate, robust, problem.intrinsic[:, :2], report, terms)
+    audit(arrays, estimate, robust, problem.intrinsic[:, :2], report, terms["observations"])
     residual_px, mahalanobis2, behind = report
     lines = problem.observations.on_line
     if lines.any():

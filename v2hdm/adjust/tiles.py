@@ -70,24 +70,24 @@ def _cuthill_mckee(tile_count: int, edges: set[tuple[int, int]]) -> NDArray[Any]
 
 def _least_degree(tile_count: int, edges: set[tuple[int, int]]) -> list[int]:
     """Elimination order by least degree; eliminating a tile couples all its neighbours."""
-    near: list[set[int]] = [set() for _ in range(tile_count)]
+    neighbours: list[set[int]] = [set() for _ in range(tile_count)]
     for first, second in edges:
-        near[first].add(second)
-        near[second].add(first)
-    queue = [(len(tiles), tile) for tile, tiles in enumerate(near)]
+        neighbours[first].add(second)
+        neighbours[second].add(first)
+    queue = [(len(tiles), tile) for tile, tiles in enumerate(neighbours)]
     heapify(queue)
     order: list[int] = []
     done = [False] * tile_count
     while queue:
         degree, tile = heappop(queue)
-        if done[tile] or degree != len(near[tile]):
+        if done[tile] or degree != len(neighbours[tile]):
             continue
         done[tile] = True
         order.append(tile)
-        for other in near[tile]:
-            near[other] |= near[tile]
-            near[other] -= {tile, other}
-            heappush(queue, (len(near[other]), other))
+        for other in neighbours[tile]:
+            neighbours[other] |= neighbours[tile]
+            neighbours[other] -= {tile, other}
+            heappush(queue, (len(neighbours[other]), other))
     return order
 
 
@@ -194,8 +194,8 @@ class TiledCholesky:
         out[end:] = torch.linalg.solve_triangular(self.tip.mT, out[end:], upper=True)
         for tile, panel, rows in zip(self.diagonal[::-1], self.panels[::-1], self.rows[::-1], strict=True):
             begin = end - len(tile)
-            rest = out[begin:end] - panel.mT @ out.index_select(0, rows)
-            out[begin:end] = torch.linalg.solve_triangular(tile.mT, rest, upper=True)
+            remainder = out[begin:end] - panel.mT @ out.index_select(0, rows)
+            out[begin:end] = torch.linalg.solve_triangular(tile.mT, remainder, upper=True)
             end = begin
         return out
 
@@ -209,18 +209,18 @@ def factorise_tiles(matrix: TiledMatrix, hold_tip: bool = False) -> TiledCholesk
     size = matrix.columns[0].shape[1] if matrix.columns else 0
     index = torch.arange(size * len(matrix.columns) + len(tip), device=tip.device)
     for column, below in enumerate(matrix.pattern.below):
-        own = matrix.tiles[column, column]
+        diagonal_tile = matrix.tiles[column, column]
         panel = matrix.columns[column][size:]
-        if not _factorise_tile(own):
+        if not _factorise_tile(diagonal_tile):
             return None
-        panel.copy_(torch.linalg.solve_triangular(own, panel.mT, upper=False).mT)
+        panel.copy_(torch.linalg.solve_triangular(diagonal_tile, panel.mT, upper=False).mT)
         keys = (*below, TIP)
         for n, first in enumerate(keys):
             for second in keys[n:]:
                 left = matrix.tiles[second, column]
                 right = matrix.tiles[first, column]
                 matrix.tiles[second, first].addmm_(left, right.mT, alpha=-1)
-        diagonal.append(own)
+        diagonal.append(diagonal_tile)
         panels.append(panel)
         tiles = [index[tile * size : (tile + 1) * size] for tile in below]
         rows.append(torch.cat([*tiles, index[-len(tip) :]]))

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -33,6 +34,14 @@ SINGULAR_PIVOT = 1e-13  # a smaller pivot is the rounding of zero
 # Added to a diagonal, relative to it, until it can be factorised; only a singular problem needs any. The
 # pivots left by elimination are rounding there, and do not show the size needed.
 JITTER_STEPS = (0.0, 1e-12, 1e-9, 1e-6, 1e-3)
+
+
+class Step(NamedTuple):
+    """A step of the unknowns, from whitened variables."""
+
+    unknowns: Gradient  # the step x, except of corners
+    tangents: Tensor  # (C, M, 6) left tangents of the pairs under it
+    corners: Tensor  # (N, 2) whitened variables of the corners, of kept corners the step itself
 
 
 @dataclass(frozen=True)
@@ -71,24 +80,21 @@ class Whitening:
 
     def whiten(self, gradients: Sequence[Gradient]) -> Tensor:
         """Gradients by x, as (n, size) by y under this Hessian's factors."""
-        carried = [self.linearised.carry(one.corners_map) for one in gradients]
-        rest = [
-            _less_corners(self.plan, one, coupled, corners)
-            for one, (corners, coupled) in zip(gradients, carried, strict=True)
+        carried = [self.linearised.carry(gradient.corners_map) for gradient in gradients]
+        reduced_gradients = [
+            _less_corners(self.plan, gradient, coupled, corners)
+            for gradient, (corners, coupled) in zip(gradients, carried, strict=True)
         ]
-        reduced = self.reduced_factor.solve(torch.stack(rest, dim=1))
-        own = torch.stack([_less_kept(self.plan, corners) for corners, _ in carried])
-        return torch.cat([reduced.mT, own.flatten(1)], dim=1)
+        reduced = self.reduced_factor.solve(torch.stack(reduced_gradients, dim=1))
+        corner_gradients = torch.stack([_less_kept(self.plan, corners) for corners, _ in carried])
+        return torch.cat([reduced.mT, corner_gradients.flatten(1)], dim=1)
 
-    def step(self, whitened: Tensor) -> tuple[Gradient, Tensor, Tensor]:
-        """Step x of whitened variables, except corners, and the pairs' left tangents (C, M, 6) under it.
-
-        Then the corners' whitened variables (N, 2), for kept corners the step itself.
-        """
+    def step(self, whitened: Tensor) -> Step:
+        """The step of whitened variables."""
         arrays = self.engine.arrays
         tip = len(self.reduced_factor.tip)
         solved = self.reduced_factor.solve_transposed(whitened[: self.reduced_factor.size, None])[:, 0]
-        states, kept = from_tiles(self.plan, solved[:-tip], arrays.frame_count, len(arrays.states))
+        states, kept_steps = from_tiles(self.plan, solved[:-tip], arrays.frame_count, len(arrays.states))
         by_camera = solved[-tip:].reshape(arrays.camera_count, -1)
         extrinsics = by_camera[:, :6]
         clock = by_camera[:, 6:]
@@ -97,27 +103,27 @@ class Whitening:
             motion = motion + (self.spread.state @ arrays.at_moments(states)[None, ..., None])[..., 0]
         if clock.shape[-1]:
             motion = motion + (self.spread.clock @ clock[:, None, :, None])[..., 0]
-        own = whitened[self.reduced_factor.size :].reshape(-1, 2)
-        if len(kept):
-            own = own.index_copy(0, self.plan.kept, kept)
-        return Gradient(extrinsics, states, motion.new_empty(0, 2), clock), motion, own
+        whitened_corners = whitened[self.reduced_factor.size :].reshape(-1, 2)
+        if len(kept_steps):
+            whitened_corners = whitened_corners.index_copy(0, self.plan.kept, kept_steps)
+        return Step(Gradient(extrinsics, states, motion.new_empty(0, 2), clock), motion, whitened_corners)
 
 
 def whitened_gradient(
     plan: Plan, factor: TiledCholesky, gradient: Gradient, coupled: Coupled, corners: Tensor
 ) -> Tensor:
     """Gradient by y from that by x, the corners' part (N, 2) and ``coupled``, W V^-1 g_c."""
-    rest = _less_corners(plan, gradient, coupled, corners)
-    return torch.cat([factor.solve(rest[:, None])[:, 0], _less_kept(plan, corners).flatten()])
+    reduced_gradient = _less_corners(plan, gradient, coupled, corners)
+    return torch.cat([factor.solve(reduced_gradient[:, None])[:, 0], _less_kept(plan, corners).flatten()])
 
 
 def _less_corners(plan: Plan, gradient: Gradient, coupled: Coupled, corners: Tensor) -> Tensor:
     """Gradient by the reduced unknowns, g_r - W V^-1 g_c."""
-    rest = (torch.cat([gradient.extrinsic, gradient.clock_s], dim=1) - coupled.camera).flatten()
+    reduced_gradient = (torch.cat([gradient.extrinsic, gradient.clock_s], dim=1) - coupled.camera).flatten()
     if plan.tile_count:
         by_state = gradient.frame_state - coupled.frame_state
-        rest = torch.cat([to_tiles(plan, by_state, corners[plan.kept]), rest])
-    return rest
+        reduced_gradient = torch.cat([to_tiles(plan, by_state, corners[plan.kept]), reduced_gradient])
+    return reduced_gradient
 
 
 def _less_kept(plan: Plan, corners: Tensor) -> Tensor:
@@ -140,14 +146,15 @@ def factorise(
         if factorised is None:
             continue
         factor, smallest_pivot = factorised
-        force = linearised.gradient, linearised.coupled, linearised.whitened
         return Whitening(
             engine=engine,
             plan=plan,
             estimate=estimate,
             robust=robust,
             linearised=linearised,
-            gradient=whitened_gradient(plan, factor, *force),
+            gradient=whitened_gradient(
+                plan, factor, linearised.gradient, linearised.coupled, linearised.whitened
+            ),
             spread=spread,
             reduced_factor=factor,
             smallest_pivot=smallest_pivot,

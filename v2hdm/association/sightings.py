@@ -211,12 +211,8 @@ def collect_sightings(
         for marking in detected.markings
         if not len(marking.outline_px)
     ]
-    nothing = (
-        f"no markings were found in the images of {', '.join(cameras)} of drive {drive.name}; check "
-        "that the detector knows this kind of paint and that the images show it within range."
-    )
     if not rows:
-        raise MappingError(nothing)
+        raise _no_markings(drive, cameras)
     kinds = tuple(sorted({marking.kind for _, marking in rows}))
     image = np.array([i for i, _ in rows], dtype=np.int64)
     camera = np.array([camera_index[drive.images[i].camera] for i in image], dtype=np.int64)
@@ -253,8 +249,15 @@ def collect_sightings(
     )
     sightings = sightings.subset(sightings.informs.sum(axis=1) >= 2)
     if not len(sightings):
-        raise MappingError(nothing)
+        raise _no_markings(drive, cameras)
     return sightings
+
+
+def _no_markings(drive: Drive, cameras: Sequence[str]) -> MappingError:
+    return MappingError(
+        f"no markings were found in the images of {', '.join(cameras)} of drive {drive.name}; check "
+        "that the detector knows this kind of paint and that the images show it within range."
+    )
 
 
 def camera_of(drive: Drive, name: str) -> Camera:

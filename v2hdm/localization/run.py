@@ -163,9 +163,8 @@ def localize(
     for frame, stamp_s in enumerate(sightings.stamp_s):
         if frame:
             state = predict(state, float(stamp_s - sightings.stamp_s[frame - 1]), attitude_rad)
-        state, markings_of_frame = locate(
-            state, _sightings_of(drive, sightings, frame, names, calibrations), markings
-        )
+        sighted = _sightings_of(drive, sightings, frame, names, calibrations)
+        state, markings_of_frame = locate(state, sighted, markings)
         states.append(state)
         matched.append(len(markings_of_frame))
     # The cameras' common turn about the vertical is that of their mean.

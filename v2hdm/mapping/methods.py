@@ -300,6 +300,13 @@ def _unused_points(survey: SurveyOptions, bundle: Bundle) -> list[str]:
     return lost
 
 
+def _warn_of_no_polygons(excluded: Sequence[Exclusion]) -> None:
+    """Warn, by class, of symbols whose vertices no polygon explains."""
+    kinds = Counter(exclusion.kind for exclusion in excluded if exclusion.reason == NO_POLYGON)
+    for kind, count in kinds.items():
+        _log.warning("class %s: %d left out: %s", kind, count, NO_POLYGON)
+
+
 def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
     inputs = outcome.inputs
     options = inputs.options
@@ -327,9 +334,7 @@ def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
         optimised.markings,
         options.acceptance,
     )
-    no_polygons = Counter(exclusion.kind for exclusion in no_symbols if exclusion.reason == NO_POLYGON)
-    for kind, count in no_polygons.items():
-        _log.warning("class %s: %d left out: %s", kind, count, NO_POLYGON)
+    _warn_of_no_polygons(no_symbols)
     hd_map = HDMap(optimised.markings, lanes, drive.origin, symbols, noise.position_drift_over_m)
     if surface is not None:
         # A spline already contains the recorded heights.

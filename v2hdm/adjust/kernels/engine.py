@@ -36,11 +36,10 @@ from v2hdm.errors import AdjustError
 from v2hdm.records import FloatArray, IntArray
 
 _COLUMN_RANGES = 8  # ranges of columns shared among threads
-# Multiplications of a factorisation above which other elimination orders are tried, and the fraction of them
-# below which another order pays.
+# Multiplications of a factorisation above which other elimination orders are tried.
 _WORTH_ANOTHER_ORDER = 1e9
-_CLEARLY_LESS = 0.5
-_PAIR_BLOCK = torch.triu_indices(6, 6)
+_CLEARLY_LESS = 0.5  # fraction of the multiplications below which another order pays
+_PAIR_BLOCK = torch.triu_indices(6, 6)  # rows and columns of the upper triangle of a pair's block
 
 
 class NumbaEngine(TorchEngine):
@@ -80,20 +79,20 @@ class NumbaEngine(TorchEngine):
         least = best.pattern.multiplications(size, tip)
         if least < _WORTH_ANOTHER_ORDER:
             return best
-        for kept in (none, self._shared_corners()):
-            edges, most = self._coupled_tiles(self._with_kept(kept), per_tile, count)
-            corner_tiles = _kept_tiles(arrays, kept, size // 2, count, per_tile)
-            total = count + -(-len(kept) // (size // 2))
+        for kept_corners in (none, self._shared_corners()):
+            edges, most = self._coupled_tiles(self._with_kept(kept_corners), per_tile, count)
+            corner_tiles = _kept_tiles(arrays, kept_corners, size // 2, count, per_tile)
+            total = count + -(-len(kept_corners) // (size // 2))
             pattern = find_pattern(total, [*edges, *along, *corner_tiles], least_degree=True)
             cost = pattern.multiplications(size, tip)
             if cost < _CLEARLY_LESS * least:
-                best = Plan(per_tile, size, count, pattern, kept, most)
+                best = Plan(per_tile, size, count, pattern, kept_corners, most)
                 least = cost
         return best
 
-    def _with_kept(self, kept: Tensor) -> Layout:
+    def _with_kept(self, kept_corners: Tensor) -> Layout:
         mask = np.zeros(self.arrays.corner_count, dtype=np.bool_)
-        mask[kept.numpy()] = True
+        mask[kept_corners.numpy()] = True
         return self._whole._replace(kept=mask[self._whole.unit[:-1]])
 
     def _shared_corners(self) -> Tensor:
@@ -112,8 +111,10 @@ class NumbaEngine(TorchEngine):
         """Pairs of tiles coupled by eliminated corners, and the largest number of tiles of a unit."""
         tile = layout.frame[layout.pair % layout.moments] // per_tile
         units = len(layout.kept)
-        seen = layout.begin[layout.unit]
-        touched = csr_array((np.ones(len(tile), dtype=np.int32), tile, seen), shape=(units, tile_count))
+        first_observation = layout.begin[layout.unit]
+        touched = csr_array(
+            (np.ones(len(tile), dtype=np.int32), tile, first_observation), shape=(units, tile_count)
+        )
         touched.sum_duplicates()
         touched = touched[~layout.kept]
         touched.data[:] = 1
@@ -194,7 +195,7 @@ class NumbaEngine(TorchEngine):
             coupled=np.zeros((touched if states else 0, 6)),
             carried=np.zeros((chunks, width)),
             whitened=np.empty(2 * arrays.corner_count),
-            own=np.zeros((owners, 21)),
+            squares=np.zeros((owners, 21)),
             tip=np.zeros((chunks, width, width)),
             failed=np.zeros(chunks),
         )
@@ -207,9 +208,9 @@ class NumbaEngine(TorchEngine):
         self.share(work)
         if out.failed.any():
             raise AdjustError(INSEPARABLE)
-        own = self.gather(out.own) if by_pair else out.own.reshape(chunks, -1, 21).sum(0)
+        of_pairs = self.gather(out.squares) if by_pair else out.squares.reshape(chunks, -1, 21).sum(0)
         tip = torch.from_numpy(out.tip.sum(0))
-        system.add(_symmetric(torch.from_numpy(own), arrays.camera_count), tip + tip.tril(-1).mT)
+        system.add(_symmetric(torch.from_numpy(of_pairs), arrays.camera_count), tip + tip.tril(-1).mT)
         if len(system.plan.kept):
             self._keep(system, base)
         if states:
@@ -232,9 +233,9 @@ class NumbaEngine(TorchEngine):
     def _keep(self, system: ReducedSystem, base: Base) -> None:
         """Add the kept corners' blocks, stored as factors, to the system; sets those factors to 1."""
         layout = self.layout
-        kept = system.plan.kept
+        kept_corners = system.plan.kept
         number = np.full(self.arrays.corner_count, -1)
-        number[kept.numpy()] = np.arange(len(kept))
+        number[kept_corners.numpy()] = np.arange(len(kept_corners))
         index = []
         blocks = []
         for u in np.flatnonzero(layout.kept):
@@ -253,8 +254,8 @@ class NumbaEngine(TorchEngine):
                     index.append((number[first + high], number[first + low]))
                     blocks.append(joint[high, :, low].copy())
             joint.reshape(2 * size, -1)[:] = np.eye(2 * size)
-        run = self.arrays.gather(kept)
-        coupling = self.coupling(run, base._replace(corners=base.corners[kept.numpy()]))
+        run = self.arrays.gather(kept_corners)
+        coupling = self.coupling(run, base._replace(corners=base.corners[kept_corners.numpy()]))
         system.add_kept(run, coupling, torch.tensor(np.array(index).T), torch.from_numpy(np.array(blocks)))
 
     def coupling(self, run: Run, base: Base) -> Tensor:
@@ -284,7 +285,7 @@ class NumbaEngine(TorchEngine):
         )
         by_state = _by_pair(spread.state)
         clock = _by_pair(spread.clock)
-        each = self.arrays.camera_unknowns
+        unknowns = self.arrays.camera_unknowns
         values = matrix.values.numpy()
         cuts = np.linspace(0, plan.tile_count, min(_COLUMN_RANGES, plan.tile_count) + 1).astype(int)
 
@@ -292,7 +293,7 @@ class NumbaEngine(TorchEngine):
             marks = np.full((5, plan.tile_count + 1), -1)
             room = Scratch.of(layout, 0, plan.most_tiles * plan.size + system.tip)
             linearise.subtract_frames(
-                cuts[begin], cuts[end], layout, base, tiles, by_state, clock, each, marks, room, values
+                cuts[begin], cuts[end], layout, base, tiles, by_state, clock, unknowns, marks, room, values
             )
 
         share(work, len(cuts) - 1, len(layout.pair))
@@ -322,7 +323,7 @@ class NumbaLinearised(Linearised):
     engine: NumbaEngine
     base: Base
 
-    def evaluate(self, step: Gradient, tangents: Tensor, own: Tensor) -> Evaluated:
+    def evaluate(self, step: Gradient, tangents: Tensor, whitened_corners: Tensor) -> Evaluated:
         """Evaluate after a step of the reduced unknowns, in one pass over the observations."""
         engine, base, before, arrays = self.engine, self.base, self.estimate, self.engine.arrays
         cameras, chart = move(_rows(step.extrinsic), _rows(before.cam_from_vehicle))
@@ -330,7 +331,7 @@ class NumbaLinearised(Linearised):
         clock = before.clock_s + step.clock_s
         at = Estimate(torch.from_numpy(cameras), state, before.corners_map, clock)
         table = _table(engine.poses(at))
-        whitened = _rows(own.reshape(-1))
+        whitened = _rows(whitened_corners.reshape(-1))
         moved = _rows(tangents.reshape(-1, 6)) if arrays.states else np.empty((0, 6))
         by_camera = _rows(torch.cat([step.extrinsic, step.clock_s], dim=1).ravel())
         layout = engine.layout
@@ -384,10 +385,10 @@ class NumbaLinearised(Linearised):
 
 
 def _kept_tiles(
-    arrays: Arrays, kept: Tensor, per_corner_tile: int, first: int, per_tile: int
+    arrays: Arrays, kept_corners: Tensor, per_corner_tile: int, first: int, per_tile: int
 ) -> list[Sequence[int]]:
     """Pairs of tiles coupled by observations of kept corners, or by corners joined to them."""
-    run = arrays.gather(kept)
+    run = arrays.gather(kept_corners)
     tile = first + run.corner // per_corner_tile
     pairs = torch.unique(torch.stack([arrays.frame_of(run.pair) // per_tile, tile]), dim=1).T.tolist()
     # Joined corners are adjacent: a unit may reach into the next tile.

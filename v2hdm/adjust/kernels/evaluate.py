@@ -43,18 +43,22 @@ class Evaluation(NamedTuple):
 
 
 @inlined
-def _oppose(known: FloatArray, i: int, mx: float, my: float, mz: float) -> tuple[float, float, float]:
+def _oppose(observed: FloatArray, i: int, mx: float, my: float, mz: float) -> tuple[float, float, float]:
     """Force with which the observation in row i of ``known`` opposes a motion of its point."""
-    along = known[i, 4] * mz
-    x = mx * known[i, 3] + known[i, 0] * along
-    y = my * known[i, 3] + known[i, 1] * along
-    fu = known[i, 5] * x + known[i, 6] * y
-    fv = known[i, 6] * x + known[i, 7] * y
-    return fu * known[i, 3], fv * known[i, 3], (fu * known[i, 0] + fv * known[i, 1]) * known[i, 4]
+    along = observed[i, 4] * mz
+    x = mx * observed[i, 3] + observed[i, 0] * along
+    y = my * observed[i, 3] + observed[i, 1] * along
+    fu = observed[i, 5] * x + observed[i, 6] * y
+    fv = observed[i, 6] * x + observed[i, 7] * y
+    return (
+        fu * observed[i, 3],
+        fv * observed[i, 3],
+        (fu * observed[i, 0] + fv * observed[i, 1]) * observed[i, 4],
+    )
 
 
 @inlined
-def _recall(layout: Layout, base: Base, k: int, c: int, known: FloatArray, i: int) -> None:
+def _recall(layout: Layout, base: Base, k: int, c: int, observed: FloatArray, i: int) -> None:
     """Write a linearised observation (8,): point, inverse depth, slope, weighted information at depth 1."""
     px, py, pz, inverse, slope, u, v = see(layout, base.table, k, base.corners[c, 0], base.corners[c, 1])
     a = layout.root[0, k]
@@ -64,14 +68,14 @@ def _recall(layout: Layout, base: Base, k: int, c: int, known: FloatArray, i: in
     if base.code:
         r0, r1 = whiten(layout, k, u, v)
         weight = floored(weigh(base, r0 * r0 + r1 * r1))
-    known[i, 0] = px
-    known[i, 1] = py
-    known[i, 2] = pz
-    known[i, 3] = inverse
-    known[i, 4] = slope
-    known[i, 5] = (a * a + b * b) * weight
-    known[i, 6] = b * d * weight
-    known[i, 7] = d * d * weight
+    observed[i, 0] = px
+    observed[i, 1] = py
+    observed[i, 2] = pz
+    observed[i, 3] = inverse
+    observed[i, 4] = slope
+    observed[i, 5] = (a * a + b * b) * weight
+    observed[i, 6] = b * d * weight
+    observed[i, 7] = d * d * weight
 
 
 @inlined
@@ -79,7 +83,7 @@ def _carry(
     layout: Layout, base: Base, q: int, u: int, coupled: bool, scratch: Scratch, out: Evaluation
 ) -> None:
     """Whiten the gradient of unit u of chunk q, and add W V^-1 g to the pairs' or to the cameras'."""
-    slot, _, _, known, _, _, gradient, _ = scratch
+    slot, _, _, observed, _, _, gradient, _ = scratch
     first = layout.unit[u]
     last = layout.unit[u + 1]
     solve_unit(layout, base, u, gradient)
@@ -99,8 +103,8 @@ def _carry(
             mx = base.table[t, 0] * x + base.table[t, 1] * y
             my = base.table[t, 4] * x + base.table[t, 5] * y
             mz = base.table[t, 8] * x + base.table[t, 9] * y
-            fx, fy, fz = _oppose(known, j, mx, my, mz)
-            add_force(out.coupled, slot[t], known[j, 0], known[j, 1], known[j, 2], fx, fy, fz)
+            fx, fy, fz = _oppose(observed, j, mx, my, mz)
+            add_force(out.coupled, slot[t], observed[j, 0], observed[j, 1], observed[j, 2], fx, fy, fz)
 
 
 @kernel
@@ -118,7 +122,7 @@ def carry(
                 scratch.gradient[i] = by_corner[c, 0]
                 scratch.gradient[i + 1] = by_corner[c, 1]
                 for k in range(layout.begin[c], layout.begin[c + 1] if coupled else layout.begin[c]):
-                    _recall(layout, base, k, c, scratch.known, k - layout.begin[first])
+                    _recall(layout, base, k, c, scratch.observed, k - layout.begin[first])
             _carry(layout, base, q, u, coupled, scratch, out)
 
 
@@ -131,7 +135,7 @@ def _pushed(
     motion: FloatArray,
     cameras: FloatArray,
     first: int,
-    known: FloatArray,
+    observed: FloatArray,
 ) -> tuple[float, float]:
     """Unwhitened push of a step of cameras and frames on corner c; its unit begins at ``first``."""
     sx = sy = 0.0
@@ -141,11 +145,11 @@ def _pushed(
     for k in range(layout.begin[c], layout.begin[c + 1] if coupled else layout.begin[c]):
         j = k - layout.begin[first]
         t = layout.pair[k]
-        _recall(layout, base, k, c, known, j)
-        mx = motion[t, 0] + motion[t, 4] * known[j, 2] - motion[t, 5] * known[j, 1]
-        my = motion[t, 1] + motion[t, 5] * known[j, 0] - motion[t, 3] * known[j, 2]
-        mz = motion[t, 2] + motion[t, 3] * known[j, 1] - motion[t, 4] * known[j, 0]
-        ax, ay = along_axes(base.table, t, *_oppose(known, j, mx, my, mz))
+        _recall(layout, base, k, c, observed, j)
+        mx = motion[t, 0] + motion[t, 4] * observed[j, 2] - motion[t, 5] * observed[j, 1]
+        my = motion[t, 1] + motion[t, 5] * observed[j, 0] - motion[t, 3] * observed[j, 2]
+        mz = motion[t, 2] + motion[t, 3] * observed[j, 1] - motion[t, 4] * observed[j, 0]
+        ax, ay = along_axes(base.table, t, *_oppose(observed, j, mx, my, mz))
         sx += ax
         sy += ay
     return sx, sy
@@ -193,7 +197,7 @@ def evaluate(
     table: FloatArray,
     motion: FloatArray,
     cameras: FloatArray,
-    own: FloatArray,
+    whitened: FloatArray,
     scratch: Scratch,
     out: Evaluation,
 ) -> None:
@@ -217,12 +221,12 @@ def evaluate(
             for c in range(first, last):
                 i = 2 * (c - first)
                 step[i], step[i + 1] = _pushed(
-                    layout, base, c, coupled, motion, cameras, first, scratch.known
+                    layout, base, c, coupled, motion, cameras, first, scratch.observed
                 )
             if coupled:
                 solve_unit(layout, base, u, step)
             for i in range(2 * (last - first)):
-                step[i] = own[2 * first + i] - step[i]
+                step[i] = whitened[2 * first + i] - step[i]
             solve_unit_transposed(layout, base, u, step)
             for c in range(first, last):
                 i = 2 * (c - first)
@@ -280,9 +284,9 @@ def meet_ground(
             continue
         first = math.sqrt(xx)
         below = yx / first
-        rest = yy - below * below
+        remainder = yy - below * below
         least = PIVOT_FLOOR * yy
-        last = math.sqrt(least if rest < least else rest)
+        last = math.sqrt(least if remainder < least else remainder)
         top = x / first
         low = (y - below * top) / last / last
         corners[c, 0] = (top - below * low) / first

@@ -27,10 +27,10 @@ def see(layout: Layout, table: FloatArray, k: int, x: float, y: float) -> _Seen:
     px = table[t, 0] * x + table[t, 1] * y + table[t, 3]
     py = table[t, 4] * x + table[t, 5] * y + table[t, 7]
     pz = table[t, 8] * x + table[t, 9] * y + table[t, 11]
-    near = pz if not pz < NEAR_M else NEAR_M
-    reciprocal = 1.0 / near
+    at_least = pz if not pz < NEAR_M else NEAR_M
+    reciprocal = 1.0 / at_least
     slope = -reciprocal * reciprocal
-    inverse = reciprocal + slope * (pz - near)
+    inverse = reciprocal + slope * (pz - at_least)
     u = px * inverse - layout.measured[0, k]
     v = py * inverse - layout.measured[1, k]
     return px, py, pz, inverse, slope, u, v
@@ -151,11 +151,11 @@ def factorise_unit(layout: Layout, base: Base, u: int, block: FloatArray) -> boo
     if n == 2:
         first = math.sqrt(block[0, 0])
         below = block[1, 0] / first
-        rest = block[1, 1] - below * below
+        remainder = block[1, 1] - below * below
         least = PIVOT_FLOOR * block[1, 1]
         lower[0, c] = first
         lower[1, c] = below
-        lower[2, c] = math.sqrt(least if rest < least else rest)
+        lower[2, c] = math.sqrt(least if remainder < least else remainder)
         return True
     for i in range(n // 2):
         lower[0, c + i] = 1.0
@@ -163,13 +163,13 @@ def factorise_unit(layout: Layout, base: Base, u: int, block: FloatArray) -> boo
         lower[2, c + i] = 1.0
     for i in range(n):
         for j in range(i + 1):
-            rest = block[i, j]
+            remainder = block[i, j]
             for m in range(j):
-                rest -= joint[at + i * n + m] * joint[at + j * n + m]
+                remainder -= joint[at + i * n + m] * joint[at + j * n + m]
             if j < i:
-                joint[at + i * n + j] = rest / joint[at + j * n + j]
-            elif rest > 0:
-                joint[at + i * n + i] = math.sqrt(rest)
+                joint[at + i * n + j] = remainder / joint[at + j * n + j]
+            elif remainder > 0:
+                joint[at + i * n + i] = math.sqrt(remainder)
             else:
                 return False
         for j in range(i + 1, n):
@@ -204,10 +204,10 @@ def solve_unit(layout: Layout, base: Base, u: int, right: FloatArray) -> None:
         right[1] = (right[1] - lower[1, c] * right[0]) / lower[2, c]
         return
     for i in range(n):
-        rest = right[i]
+        remainder = right[i]
         for m in range(i):
-            rest -= joint[at + i * n + m] * right[m]
-        right[i] = rest / joint[at + i * n + i]
+            remainder -= joint[at + i * n + m] * right[m]
+        right[i] = remainder / joint[at + i * n + i]
 
 
 @inlined
@@ -221,10 +221,10 @@ def solve_unit_transposed(layout: Layout, base: Base, u: int, right: FloatArray)
         right[0] = (right[0] - lower[1, c] * right[1]) / lower[0, c]
         return
     for i in range(n - 1, -1, -1):
-        rest = right[i]
+        remainder = right[i]
         for m in range(i + 1, n):
-            rest -= joint[at + m * n + i] * right[m]
-        right[i] = rest / joint[at + i * n + i]
+            remainder -= joint[at + m * n + i] * right[m]
+        right[i] = remainder / joint[at + i * n + i]
 
 
 @inlined

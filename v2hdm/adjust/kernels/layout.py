@@ -57,8 +57,8 @@ def make_layout(arrays: Arrays) -> Layout:
     pair = arrays.pair.numpy()
     touched = [_distinct(part, arrays.pair_count) for part in np.split(pair, begin[unit[chunk[1:-1]]])]
     joined = np.diff(unit)
-    known = arrays.lengths
-    of_length = np.searchsorted(unit, known.first.numpy(), side="right") - 1
+    lengths = arrays.lengths
+    of_length = np.searchsorted(unit, lengths.first.numpy(), side="right") - 1
     order = np.argsort(of_length, kind="stable")
     return Layout(
         pair=pair,
@@ -75,10 +75,10 @@ def make_layout(arrays: Arrays) -> Layout:
         control=arrays.control.numpy(),
         control_root=arrays.control_root.numpy(),
         length_at=np.searchsorted(of_length[order], np.arange(len(joined) + 1)),
-        length_first=known.first.numpy()[order],
-        length_second=known.second.numpy()[order],
-        length_m=known.length_m.numpy()[order],
-        length_root=known.information_root.numpy()[order],
+        length_first=lengths.first.numpy()[order],
+        length_second=lengths.second.numpy()[order],
+        length_m=lengths.length_m.numpy()[order],
+        length_root=lengths.information_root.numpy()[order],
         most_seen=int(np.diff(begin[unit]).max()),
         most_joined=int(joined.max()),
         kept=np.zeros(len(joined), dtype=np.bool_),
@@ -87,9 +87,9 @@ def make_layout(arrays: Arrays) -> Layout:
 
 def _distinct(pair: IntArray, pairs: int) -> IntArray:
     """The distinct pairs of a chunk, by a mask over all pairs, which is faster than sorting."""
-    there = np.zeros(pairs, dtype=np.bool_)
-    there[pair] = True
-    return np.flatnonzero(there).astype(np.int32)
+    is_touched = np.zeros(pairs, dtype=np.bool_)
+    is_touched[pair] = True
+    return np.flatnonzero(is_touched).astype(np.int32)
 
 
 def joint_offsets(joined: IntArray) -> IntArray:
@@ -121,7 +121,7 @@ class Scratch(NamedTuple):
     slot: IntArray
     jacobian: FloatArray
     coupling: FloatArray
-    known: FloatArray
+    observed: FloatArray
     block: FloatArray
     step: FloatArray
     gradient: FloatArray
@@ -148,42 +148,47 @@ class Seen(NamedTuple):
     @classmethod
     def of(cls, columns: Iterable[NDArray[Any]], intrinsic: FloatArray) -> Seen:
         """From columns in this order, copied only to change type or layout."""
-        both = zip((*columns, intrinsic), 3 * (np.int64,) + 3 * (np.float64,), strict=True)
-        made: list[Any] = [np.ascontiguousarray(values, dtype=kind) for values, kind in both]
-        return cls(*made)
+        typed = zip((*columns, intrinsic), 3 * (np.int64,) + 3 * (np.float64,), strict=True)
+        contiguous: list[Any] = [np.ascontiguousarray(values, dtype=kind) for values, kind in typed]
+        return cls(*contiguous)
 
 
 @kernel
 def first_unsound(
-    seen: Seen, frames: int, symmetric_to: float, max_slope: float, by_corner: IntArray, by_camera: IntArray
+    observations: Seen,
+    frames: int,
+    symmetric_to: float,
+    max_slope: float,
+    by_corner: IntArray,
+    by_camera: IntArray,
 ) -> int:
     """Index of the first unsound observation, or -1; counts the observations of each corner and camera."""
-    for k in range(len(seen.camera)):
-        c = seen.camera[k]
-        n = seen.corner[k]
-        if not (0 <= c < len(by_camera) and 0 <= seen.frame[k] < frames and 0 <= n < len(by_corner)):
+    for k in range(len(observations.camera)):
+        c = observations.camera[k]
+        n = observations.corner[k]
+        if not (0 <= c < len(by_camera) and 0 <= observations.frame[k] < frames and 0 <= n < len(by_corner)):
             return k
         by_corner[n] += 1
         by_camera[c] += 1
-        xx = seen.covariance_px[k, 0, 0]
-        xy = seen.covariance_px[k, 0, 1]
-        yx = seen.covariance_px[k, 1, 0]
-        yy = seen.covariance_px[k, 1, 1]
+        xx = observations.covariance_px[k, 0, 0]
+        xy = observations.covariance_px[k, 0, 1]
+        yx = observations.covariance_px[k, 1, 0]
+        yy = observations.covariance_px[k, 1, 1]
         if not (xx > 0 and xx * yy > yx * yx and xx * yy < math.inf):
             return k
         if not (xy - yx) * (xy - yx) <= symmetric_to * symmetric_to * xx * yy:
             return k
         for axis in range(2):
-            focal = seen.intrinsic[c, axis]
-            centre = seen.intrinsic[c, 2 + axis]
-            if not abs((seen.pinhole_px[k, axis] - centre) / focal) <= max_slope:
+            focal = observations.intrinsic[c, axis]
+            centre = observations.intrinsic[c, 2 + axis]
+            if not abs((observations.pinhole_px[k, axis] - centre) / focal) <= max_slope:
                 return k
     return -1
 
 
 @kernel
 def lay_out(
-    seen: Seen,
+    observations: Seen,
     rank: IntArray,
     frames: int,
     order: IntArray,
@@ -196,18 +201,18 @@ def lay_out(
     again = -1
     for i in range(len(order)):
         k = order[i]
-        c = seen.camera[k]
-        corner[i] = rank[seen.corner[k]]
-        pair[i] = c * frames + seen.frame[k]
+        c = observations.camera[k]
+        corner[i] = rank[observations.corner[k]]
+        pair[i] = c * frames + observations.frame[k]
         if i and corner[i] == corner[i - 1] and pair[i] == pair[i - 1] and again < 0:
             again = i
-        fx = seen.intrinsic[c, 0]
-        fy = seen.intrinsic[c, 1]
-        measured[0, i] = (seen.pinhole_px[k, 0] - seen.intrinsic[c, 2]) / fx
-        measured[1, i] = (seen.pinhole_px[k, 1] - seen.intrinsic[c, 3]) / fy
-        first = math.sqrt(seen.covariance_px[k, 0, 0])
-        below = seen.covariance_px[k, 1, 0] / first
-        last = math.sqrt(seen.covariance_px[k, 1, 1] - below * below)
+        fx = observations.intrinsic[c, 0]
+        fy = observations.intrinsic[c, 1]
+        measured[0, i] = (observations.pinhole_px[k, 0] - observations.intrinsic[c, 2]) / fx
+        measured[1, i] = (observations.pinhole_px[k, 1] - observations.intrinsic[c, 3]) / fy
+        first = math.sqrt(observations.covariance_px[k, 0, 0])
+        below = observations.covariance_px[k, 1, 0] / first
+        last = math.sqrt(observations.covariance_px[k, 1, 1] - below * below)
         root[0, i] = fx / first
         root[1, i] = -below * fx / (first * last)
         root[2, i] = fy / last

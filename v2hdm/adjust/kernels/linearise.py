@@ -34,7 +34,7 @@ class Linearisation(NamedTuple):
     coupled: FloatArray  # (R, 6) W V^-1 times the gradient by corners, by pair, if frames have states
     carried: FloatArray  # (Q, D) the same by the cameras' unknowns, if not
     whitened: FloatArray  # (2 N,) L^-1 g, gradient by the corners
-    own: FloatArray  # J'J by pair (R, 21), or by camera (Q C, 21) where pairs move with it alone
+    squares: FloatArray  # J'J by pair (R, 21), or by camera (Q C, 21) where pairs move with it alone
     tip: FloatArray  # (Q, D, D) B'B of the cameras' unknowns, lower triangle
     failed: FloatArray  # (Q,) units whose block is singular
 
@@ -86,14 +86,21 @@ def couple(jacobian: FloatArray, weight: float, out: FloatArray, i: int) -> None
 
 @inlined
 def add_camera(
-    coupling: FloatArray, j: int, clock: FloatArray, t: int, each: int, rows: FloatArray, i: int, column: int
+    coupling: FloatArray,
+    j: int,
+    clock: FloatArray,
+    t: int,
+    unknowns: int,
+    rows: FloatArray,
+    i: int,
+    column: int,
 ) -> None:
     """Add W' in row j of ``coupling``, of pair t, to rows i, i + 1 at its camera's ``each`` unknowns."""
     for p in range(6):
         rows[i, column + p] += coupling[j, p]
         rows[i + 1, column + p] += coupling[j, 6 + p]
-        for v in range(each - 6):
-            by_clock = clock[t, p * (each - 6) + v]
+        for v in range(unknowns - 6):
+            by_clock = clock[t, p * (unknowns - 6) + v]
             rows[i, column + 6 + v] += coupling[j, p] * by_clock
             rows[i + 1, column + 6 + v] += coupling[j, 6 + p] * by_clock
 
@@ -116,7 +123,7 @@ def _add_corner(
     slot, jacobian, coupling, _, block, _, gradient, rows = scratch
     cameras = len(base.table) // layout.moments
     i = 2 * (c - first)
-    each = out.tip.shape[1] // cameras
+    unknowns = out.tip.shape[1] // cameras
     states = len(base.rows) == 0
     gx = gy = xx = yx = yy = 0.0
     for k in range(layout.begin[c], layout.begin[c + 1]):
@@ -139,10 +146,10 @@ def _add_corner(
         xx += weight * (jacobian[12] * jacobian[12] + jacobian[14] * jacobian[14])
         yx += weight * (jacobian[13] * jacobian[12] + jacobian[15] * jacobian[14])
         yy += weight * (jacobian[13] * jacobian[13] + jacobian[15] * jacobian[15])
-        _add_square(jacobian, weight, out.own, at if by_pair else q * cameras + camera)
+        _add_square(jacobian, weight, out.squares, at if by_pair else q * cameras + camera)
         j = k - layout.begin[first] if states else 0
         couple(jacobian, weight, coupling, j)
-        add_camera(coupling, j, clock, layout.pair[k], each, rows, i, camera * each)
+        add_camera(coupling, j, clock, layout.pair[k], unknowns, rows, i, camera * unknowns)
     a = layout.control_root[c, 0]
     b = layout.control_root[c, 1]
     d = layout.control_root[c, 2]
@@ -155,14 +162,14 @@ def _add_corner(
 
 
 @inlined
-def _add_square(jacobian: FloatArray, weight: float, own: FloatArray, owner: int) -> None:
+def _add_square(jacobian: FloatArray, weight: float, squares: FloatArray, owner: int) -> None:
     """Add J'J of an observation by its pair, upper triangle row by row, to row ``owner`` of ``own``."""
     m = 0
     for p in range(6):
         top = weight * jacobian[p]
         low = weight * jacobian[6 + p]
         for s in range(p, 6):
-            own[owner, m] += top * jacobian[s] + low * jacobian[6 + s]
+            squares[owner, m] += top * jacobian[s] + low * jacobian[6 + s]
             m += 1
 
 
@@ -325,9 +332,9 @@ def _subtract_products(
             continue
         for b in range(a, count + 1):
             row = len(tiles.begin) if b == count else tiles.position[touched[b]]
-            found = tiles.begin[column]
-            while tiles.row[found] != row:
-                found += 1
+            place_of_tile = tiles.begin[column]
+            while tiles.row[place_of_tile] != row:
+                place_of_tile += 1
             for i in range(0, len(rows), 2):
                 for r in range(low[b], high[b]):
                     x = rows[i, b * size + r]
@@ -336,7 +343,7 @@ def _subtract_products(
                         continue
                     # Diagonal tiles are lower triangular.
                     stop = r + 1 if a == b else high[a]
-                    at = tiles.at[found] + r * size
+                    at = tiles.at[place_of_tile] + r * size
                     right = a * size
                     out = values[at + low[a] : at + stop]
                     top = rows[i, right + low[a] : right + stop]
@@ -354,7 +361,7 @@ def subtract_frames(
     tiles: TileMap,
     by_state: FloatArray,
     clock: FloatArray,
-    each: int,
+    unknowns: int,
     marks: IntArray,
     scratch: Scratch,
     values: FloatArray,
@@ -368,7 +375,7 @@ def subtract_frames(
     """
     states = by_state.shape[1] // 6
     size = tiles.size
-    width = len(base.table) // layout.moments * each
+    width = len(base.table) // layout.moments * unknowns
     place = marks[1]
     touched = marks[2]
     low = marks[3]
@@ -380,10 +387,10 @@ def subtract_frames(
         if layout.kept[u]:
             continue
         count = _touch(layout, u, tiles, marks)
-        wanted = False
+        is_wanted = False
         for a in range(count):
-            wanted |= begin <= tiles.position[touched[a]] < end
-        if not wanted:
+            is_wanted |= begin <= tiles.position[touched[a]] < end
+        if not is_wanted:
             continue
         low[:count] = size
         high[:count] = 0
@@ -411,7 +418,7 @@ def subtract_frames(
                     for s in range(states):
                         rows[i, column + s] += w[0, p] * by_state[t, p * states + s]
                         rows[i + 1, column + s] += w[0, 6 + p] * by_state[t, p * states + s]
-                add_camera(w, 0, clock, t, each, rows, i, tip + t // layout.moments * each)
+                add_camera(w, 0, clock, t, unknowns, rows, i, tip + t // layout.moments * unknowns)
         for a in range(count + 1):
             solve_unit_rows(layout, base, u, rows, a * size + low[a], a * size + high[a])
         _subtract_products(begin, end, tiles, marks, count, rows[: 2 * joined], values)

@@ -24,45 +24,45 @@ def forward(factor: Flat, out: FloatArray) -> None:
     """Overwrite b with L^-1 b."""
     values, at, rows, begin, size, tip = factor
     for g in range(len(at)):
-        own = g * size
+        first_row = g * size
         for i in range(size):
             row = at[g] + i * size
-            rest = out[own + i]
+            remainder = out[first_row + i]
             for j in range(i):
-                rest -= values[row + j] * out[own + j]
-            out[own + i] = rest / values[row + i]
+                remainder -= values[row + j] * out[first_row + j]
+            out[first_row + i] = remainder / values[row + i]
         for k in range(begin[g], begin[g + 1]):
             row = at[g] + (size + k - begin[g]) * size
-            rest = 0.0
+            remainder = 0.0
             for j in range(size):
-                rest += values[row + j] * out[own + j]
-            out[rows[k]] -= rest
-    own = len(out) - len(tip)
+                remainder += values[row + j] * out[first_row + j]
+            out[rows[k]] -= remainder
+    first_row = len(out) - len(tip)
     for i in range(len(tip)):
-        rest = out[own + i]
+        remainder = out[first_row + i]
         for j in range(i):
-            rest -= tip[i, j] * out[own + j]
-        out[own + i] = rest / tip[i, i]
+            remainder -= tip[i, j] * out[first_row + j]
+        out[first_row + i] = remainder / tip[i, i]
 
 
 @kernel
 def backward(factor: Flat, out: FloatArray) -> None:
     """Overwrite b with L^-T b."""
     values, at, rows, begin, size, tip = factor
-    own = len(out) - len(tip)
+    first_row = len(out) - len(tip)
     for i in range(len(tip) - 1, -1, -1):
-        out[own + i] /= tip[i, i]
+        out[first_row + i] /= tip[i, i]
         for j in range(i):
-            out[own + j] -= tip[i, j] * out[own + i]
+            out[first_row + j] -= tip[i, j] * out[first_row + i]
     for g in range(len(at) - 1, -1, -1):
-        own = g * size
+        first_row = g * size
         for k in range(begin[g], begin[g + 1]):
             row = at[g] + (size + k - begin[g]) * size
-            known = out[rows[k]]
+            solved = out[rows[k]]
             for j in range(size):
-                out[own + j] -= values[row + j] * known
+                out[first_row + j] -= values[row + j] * solved
         for i in range(size - 1, -1, -1):
             row = at[g] + i * size
-            out[own + i] /= values[row + i]
+            out[first_row + i] /= values[row + i]
             for j in range(i):
-                out[own + j] -= values[row + j] * out[own + i]
+                out[first_row + j] -= values[row + j] * out[first_row + i]

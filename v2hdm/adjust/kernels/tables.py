@@ -192,7 +192,8 @@ def with_priors(
     """
     cameras = estimate.cam_from_vehicle.numpy()
     centre_root = arrays.centre_information_root.numpy()
-    centre = (rigid.camera_centre(cameras) - arrays.centre.numpy()) * centre_root
+    towards_origin = (cameras[:, None, :3, 3] @ cameras[:, :3, :3])[:, 0]
+    centre = -(towards_origin + arrays.centre.numpy()) * centre_root
     state = state_residual(arrays, estimate.frame_state) if arrays.states else estimate.frame_state
     clock = clock_residual(arrays, estimate.clock_s) if arrays.camera_unknowns > 6 else estimate.clock_s
     terms = {
