@@ -70,10 +70,12 @@ def test_every_step_of_a_child_has_its_own_time():
 
 
 SCRIPT = """
-import sys
+import signal, sys
 from tests.safe import work
 from v2hdm.errors import DriveError
 from v2hdm.safe.child import Limits, in_child
+# A shell's background job, as this test may be part of, ignores Ctrl-C, and so would its processes.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 print("once")
 in_child(work.wait, sys.argv[1], limits=Limits.of([]), where="a.bag", error=DriveError)
 """
