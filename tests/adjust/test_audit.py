@@ -10,8 +10,12 @@ import torch
 
 from tests.adjust.scene import make_scene
 from v2hdm.adjust import SolveOptions, Status, model, solve
+from v2hdm.adjust.audit import audit
 from v2hdm.adjust.engine import TorchEngine
+from v2hdm.adjust.engines import make_engine
 from v2hdm.adjust.kernels import evaluate
+from v2hdm.adjust.layout import make_arrays
+from v2hdm.adjust.model import Estimate, Loss
 from v2hdm.adjust.problem import POSE_STATES
 from v2hdm.errors import AdjustError
 
@@ -145,3 +149,19 @@ def test_rays_above_the_horizon_say_nothing_of_the_ground():
     measured = torch.tensor([[0.0], [-1.0]], dtype=torch.float64)
     root = torch.tensor([[1.0], [0.0], [1.0]], dtype=torch.float64)
     assert not model.back_projected(model.ground_from_ray(poses).reshape(9, 1), measured, root).any()
+
+
+def test_an_estimate_that_is_not_finite_is_left_to_its_status():
+    scene = make_scene(0, frames=30)
+    arrays = make_arrays(scene.problem, (), "cpu")
+    engine = make_engine("auto", arrays)
+    corners, _ = engine.back_project(torch.from_numpy(scene.problem.cam_from_vehicle))
+    corners[3] = torch.nan
+    state = torch.zeros_like(arrays.state_information_root)
+    estimate = Estimate(torch.from_numpy(scene.problem.cam_from_vehicle), state, corners, arrays.no_clock())
+    focal_px = scene.problem.intrinsic[:, :2]
+    robust = Loss("cauchy", 2.0)
+    cost = engine.terms(estimate, robust)["observations"]
+    report = engine.report(estimate, focal_px)
+    assert np.isnan(report.mahalanobis2).any()
+    audit(arrays, estimate, robust, focal_px, report, cost)
