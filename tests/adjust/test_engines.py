@@ -85,6 +85,15 @@ def assert_same(one, other, share=1e-12):
         assert float((one - other).abs().max()) <= share * float(other.abs().max())
 
 
+def rounding_of(factor):
+    """The share by which rounding parts what two engines derive by a corner factor of some condition."""
+    lowers = [lower for group in factor.joint for lower in group.factor.tril()]
+    for xx, yx, yy in factor.lower.T:
+        lowers.append(torch.stack([xx, torch.zeros_like(xx), yx, yy]).view(2, 2))
+    worst = max(float(torch.linalg.cond(lower)) ** 2 for lower in lowers)
+    return max(1e-12, torch.finfo(torch.float64).eps * worst)
+
+
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 10_000),
@@ -96,7 +105,7 @@ def assert_same(one, other, share=1e-12):
     rolling=st.booleans(),
 )
 def test_engines_agree_on_every_kind_of_residual(seed, model, loss, size, lengths, behind, rolling):
-    """Cost, gradient and all blocks, of drives with everything that a model can know, to 1e-12."""
+    """Cost, gradient and all blocks, of drives with everything that a model can know, but for rounding."""
     (pose_states, clock), rng = model, np.random.default_rng(seed)
     problem = example(lengths=lengths, rolling=rolling, frames=14, seed=seed % 7)
     numba, by_torch = engines(problem, pose_states, clock, rolling and clock)
@@ -119,17 +128,19 @@ def test_engines_agree_on_every_kind_of_residual(seed, model, loss, size, length
     assert_same(by_torch.terms(estimate, robust), other.terms)
     for name in ("extrinsic", "frame_state", "clock_s"):
         assert_same(getattr(one.gradient, name), getattr(other.gradient, name))
-    assert_same(one.whitened, other.whitened)
-    assert_same(one.coupled, other.coupled)
+    # A robust loss may leave a corner next to no information: rounding grows with its factor's condition.
+    share = rounding_of(other.corner_factor)
+    assert_same(one.whitened, other.whitened, share)
+    assert_same(one.coupled, other.coupled, share)
     lone = ~numba.arrays.joined & ~numba.arrays.joined.roll(-1)
     assert_same(one.corner_factor.lower[:, lone], other.corner_factor.lower[:, lone])
     for group, joint in zip(one.corner_factor.joint, other.corner_factor.joint, strict=True):
         assert torch.equal(group.begin, joint.begin)
-        assert_same(group.factor, joint.factor)
+        assert_same(group.factor, joint.factor, share)
     assert_same(systems[0]._of_pairs, systems[1]._of_pairs)
     for place, tile in systems[0].matrix.tiles.items():
         lower = torch.ones_like(tile).tril() if place[0] == place[1] else 1.0
-        assert_same(tile * lower, systems[1].matrix.tiles[place] * lower)
+        assert_same(tile * lower, systems[1].matrix.tiles[place] * lower, share)
     run = numba.arrays.gather(torch.arange(3, 12))
     corners = estimate.corners_map[3:12]
     assert_same(one.coupling(run, corners), other.coupling(run, corners))
@@ -138,7 +149,7 @@ def test_engines_agree_on_every_kind_of_residual(seed, model, loss, size, length
     assert_same(*pulled)
     by_corner = torch.as_tensor(rng.normal(0, 1, estimate.corners_map.shape))
     for mine, theirs in zip(one.carry(by_corner), other.carry(by_corner), strict=True):
-        assert_same(mine, theirs)
+        assert_same(mine, theirs, share)
 
 
 @pytest.mark.parametrize("loss", LOSSES)
