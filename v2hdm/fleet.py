@@ -31,6 +31,7 @@ from v2hdm.errors import (
 from v2hdm.pipeline.config import RunConfig, run_name
 from v2hdm.pipeline.run import take_or_run
 from v2hdm.progress import Progress, patient
+from v2hdm.records import BEST
 from v2hdm.report.terminal import DriveProgress, drive_bars, new_table, plain
 from v2hdm.safe.texts import take_name
 from v2hdm.store.remote import place_of
@@ -74,7 +75,7 @@ class Row:
             ),
             "",
         )
-        markings = int(sets[-1]["Opt"]["markings"]) if sets else None
+        markings = int(sets[-1][BEST]["markings"]) if sets else None
         images = int(metrics["drive"]["images"])
         seconds = sum(metrics.get("seconds", {}).values())
         return cls(

@@ -24,7 +24,7 @@ from v2hdm.pipeline.inspect import inspect_each
 from v2hdm.pipeline.map_drive import read_all
 from v2hdm.pipeline.stages import camera_sets, detect_in_pieces, map_camera_sets
 from v2hdm.progress import Progress
-from v2hdm.records import DIAMOND, Drive, FloatArray, HDMap, IntArray, Marking, Truth
+from v2hdm.records import BEST, DIAMOND, Drive, FloatArray, HDMap, IntArray, Marking, Truth
 from v2hdm.report.metrics import corner_errors, driven_past, marking_metrics, match_markings, rms
 from v2hdm.report.terminal import METHODS
 from v2hdm.simulate.port.drive import rendered_drive
@@ -84,7 +84,7 @@ def _add(record: dict[str, Any], recipe: str, sets: Mapping[str, Mapping[str, Me
 
 ROWS: tuple[str, ...] = (
     *METHODS,
-    *(f"{method}, {recipe}" for recipe in RECIPES if recipe != OURS for method in ("Opt", "ONI")),
+    *(f"{method}, {recipe}" for recipe in RECIPES if recipe != OURS for method in (BEST, "ONI")),
 )
 """Rows of the tables: the paper's four methods, then ours under other recipes."""
 

@@ -12,7 +12,7 @@ import numpy as np
 from v2hdm.geometry.ipm import initial_extrinsic
 from v2hdm.io.drive.truth import has_truth, read_truth
 from v2hdm.mapping.results import MethodResult
-from v2hdm.records import Drive, Truth
+from v2hdm.records import BEST, Drive, Truth
 from v2hdm.report.metrics import driven_past, extrinsic_figures, headline, map_figures
 
 CameraSets = Mapping[str, Mapping[str, MethodResult]]  # by cameras (front, both), then method
@@ -42,7 +42,7 @@ def evaluate(drive: Drive, methods: CameraSets) -> Evaluation:
     if truth is not None and truth.disturbances:
         disturbed = ", ".join(f"{name} {value:g}" for name, value in truth.disturbances.items())
         headlines.insert(0, f"disturbances: {disturbed}")
-    headlines += list(methods.values())[-1]["Opt"].certainty.values()
+    headlines += list(methods.values())[-1][BEST].certainty.values()
     return Evaluation(metrics, headlines)
 
 
@@ -71,7 +71,7 @@ def _extrinsics(drive: Drive, methods: CameraSets, truth: Truth | None) -> dict[
     """Per camera the extrinsic found with all cameras together, and under ``alone`` by itself."""
     figures: dict[str, Any] = {}
     for by_method in reversed(list(methods.values())):
-        optimised = by_method.get("Opt")
+        optimised = by_method.get(BEST)
         if optimised is None:
             continue
         for name, calibration in optimised.calibrations.items():

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from v2hdm.catalogue import CORNERED_CLASSES
 from v2hdm.geometry.planar import inside_convex, length_along, points_along
 from v2hdm.geometry.rigid import camera_centre, ground_in_vehicle
-from v2hdm.records import DIAMOND, BoolArray, Drive, FloatArray, HDMap, Lane, Marking, Truth
+from v2hdm.records import BEST, DIAMOND, BoolArray, Drive, FloatArray, HDMap, Lane, Marking, Truth
 
 MATCH_GATE_M = 2.0  # a mapped marking farther from every true one of its class is false
 MIN_SIGHTINGS = 3  # images with the whole marking in the region of interest that count as driven past
@@ -272,7 +272,7 @@ def extrinsic_figures(estimate: FloatArray, initial: FloatArray, true: FloatArra
 
 def headline(cameras: str, results: Mapping[str, Mapping[str, Any]]) -> str:
     """One sentence on the result of one camera set."""
-    best = results.get("Opt", {})
+    best = results.get(BEST, {})
     start = next((results[m] for m in ("ENI", "CNI") if m in results), {})
     if "corner_rmse_m" not in best or "corner_rmse_m" not in start:
         return f"{cameras}: {_own_words(best)}"

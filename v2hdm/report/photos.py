@@ -15,7 +15,7 @@ from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.planar import length_along, points_along
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.records import BoolArray, Camera, CameraInfo, FloatArray, HDMap
+from v2hdm.records import BEST, BoolArray, Camera, CameraInfo, FloatArray, HDMap
 from v2hdm.report.metrics import runs
 from v2hdm.report.style import OKABE_ITO
 from v2hdm.store.files import whole_file
@@ -275,7 +275,7 @@ def _write(canvas: np.ndarray, text: str, at: tuple[int, int], colour: Bgr) -> N
 _OVERLAY_RANGE_M = 30.0  # largest distance from the vehicle of markings in an overlay
 
 _BEFORE = Pen(OKABE_ITO["orange"], dash_px=(9.0, 6.0))  # the map under the initial calibration
-OVERLAY = {"Opt": Pen(OKABE_ITO["sky"])}  # the map under the results
+OVERLAY = {BEST: Pen(OKABE_ITO["sky"])}  # the map under the results
 
 
 def save_overlay(

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from v2hdm.records import FloatArray
+from v2hdm.records import BEST, FloatArray
 from v2hdm.store.files import whole_file
 
 OKABE_ITO = {
@@ -31,7 +31,7 @@ PAINT = "#dfe4e8"  # filling of true markings
 GRID = "#e6eaed"
 TRUTH = "#9aa4ad"
 ROUTE = "#c9d3da"
-WORDS = {"CNI": "orange", "ENI": "vermillion", "Opt": "blue", "ONI": "green"}
+WORDS = {"CNI": "orange", "ENI": "vermillion", BEST: "blue", "ONI": "green"}
 """Colour name of each method, the same in every figure."""
 
 METHOD = {method: OKABE_ITO[colour] for method, colour in WORDS.items()}

@@ -12,6 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.table import Table
 
 from v2hdm.progress import progress_lines
+from v2hdm.records import BEST
 
 DriveProgress = Callable[[str, str, int, int], None]
 """Called with a drive, its stage, and the stage's completed and total steps."""
@@ -19,7 +20,7 @@ DriveProgress = Callable[[str, str, int, int], None]
 METHODS: Mapping[str, str] = {
     "CNI": "naive map, manually calibrated IPM",
     "ENI": "naive map, IPM estimated from another vehicle",
-    "Opt": "joint optimisation of extrinsics and corners",
+    BEST: "joint optimisation of extrinsics and corners",
     "ONI": "naive map, optimised IPM",
 }
 """The methods of the paper (IROS 2023), in the order of its tables."""
