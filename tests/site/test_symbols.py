@@ -279,7 +279,7 @@ def test_an_arrow_that_few_of_the_images_find_that_show_it_well_is_left_out_howe
 def test_an_arrow_known_to_decimetres_only_is_mapped_with_the_sigma_that_it_has():
     symbols, rig = seen([ARROW + np.array([13.0, 1.0])] * 4, ["arrow"] * 4, np.arange(4.0))
     (near, far) = (
-        map_symbols(symbols, rig, all_views(rig), CAMERAS, jitter_rad, (), AcceptanceOptions(max_sigma_m=0.0))
+        map_symbols(symbols, rig, all_views(rig), CAMERAS, jitter_rad, (), AcceptanceOptions())
         for jitter_rad in (JITTER_RAD, 4 * JITTER_RAD)
     )
     assert [len(found) for found, _ in (near, far)] == [1, 1]
