@@ -52,7 +52,7 @@ from v2hdm.verdict.inputs.drive import causes, check_camera, check_road
 from v2hdm.verdict.inputs.heading import check_heading
 from v2hdm.verdict.inputs.poses import Motion, check_attitude, check_jumps, check_noise, check_path
 from v2hdm.verdict.inputs.recording import check_clocks
-from v2hdm.verdict.results.solution import check_solution, over_ground
+from v2hdm.verdict.results.solution import check_solution, over_ground, told_by_poses
 from v2hdm.workers import share_out
 
 CLEAN = "nothing"
@@ -166,7 +166,7 @@ def map_one(job: Job) -> Row:
         methods = {name: run_methods(drive, detections, own, options) for name, own in sets.items()}
         best = list(methods.values())[-1][BEST]
         before = over_ground(findings_of_inputs(drive), best, job.ground == AUTO)
-        findings = [*before, *check_solution(drive, methods)]
+        findings = [*before, *told_by_poses(check_solution(drive, methods), before)]
     except V2hdmError as error:
         refusal = {"check": _REFUSED, "says": str(error), "status": _REFUSED}
         return Row(**about, status=_REFUSED, findings=[refusal], seconds=time.process_time() - begin_s)
