@@ -33,6 +33,9 @@ _CLUTTER_BY = (
 )
 """Reasons for clutter, in the order of :attr:`Posterior.evidence`."""
 
+_MAX_SIGMA_M = 0.06
+"""How far the sigma of a marking's worst corner, m, may exceed that of the map's best; goes with the gate."""
+
 
 @dataclass(frozen=True)
 class Classified:
@@ -122,7 +125,7 @@ def classify(
     sigma_m = judged.candidates.sigma_m.max(axis=1)
     seen_corners = solved.known.sum(axis=1)
     # The best one's uncertainty is common to all: a shift of the whole map speaks against no marking.
-    uncertain = sigma_m**2 > np.min(sigma_m, initial=np.inf) ** 2 + options.max_sigma_m**2
+    uncertain = sigma_m**2 > np.min(sigma_m, initial=np.inf) ** 2 + _MAX_SIGMA_M**2
     for group in np.flatnonzero(uncertain).tolist():
         verdict[group] = TOO_UNCERTAIN if seen_corners[group] == 4 else LACKS_A_CORNER
     objections = parallax.objections(options.min_probability)

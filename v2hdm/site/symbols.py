@@ -50,6 +50,8 @@ _PART = 0.3  # least weighted fraction of the images of a place that show paint 
 
 NO_POLYGON = "no simple polygon explains its outline"
 
+_MAX_SIGMA_M = 0.06  # largest sigma of a vertex, m; goes with the gate
+
 _COARSE_M = 0.05  # cells, m, of the raster for measuring overlap
 _COMMON = 0.5  # least overlap of outlines of one symbol, relative to the smaller area
 
@@ -109,7 +111,7 @@ def map_symbols(
     polygons = find_polygons(kinds, traces, [symbol.outline_map for symbol in symbols_found])
     accepted = []
     for symbol, fitted in zip(symbols_found, polygons, strict=True):
-        reason = _objection(fitted, options.max_sigma_m)
+        reason = _objection(fitted, _MAX_SIGMA_M)
         if reason is None:
             accepted.append(_with_vertices(symbol, fitted, markings))
         else:
