@@ -192,6 +192,10 @@ def test_a_drive_past_nothing_fails_and_says_that_no_marking_was_found(tiny_driv
         ({"mapping": MappingOptions(model_floor_px=-0.1)}, "mapping.model_floor_px is -0.1"),
         ({"mapping": MappingOptions(lanes=LaneOptions(max_range_m=float("nan")))}, "mapping.lanes.max_range"),
         ({"mapping": MappingOptions(acceptance=AcceptanceOptions(min_probability=50))}, "probability is 50"),
+        (
+            {"mapping": MappingOptions(acceptance=AcceptanceOptions(accuracy="D"))},
+            "mapping.acceptance.accuracy is 'D'; choose from A, B or C.",
+        ),
         ({"detector": DetectorOptions(model="no such.onnx")}, "no such.onnx"),
         ({"export": ["geojson", "shp"]}, "export: unknown format 'shp'"),
     ],

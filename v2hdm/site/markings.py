@@ -16,7 +16,15 @@ from scipy.stats import beta, f
 from v2hdm.errors import MappingError
 from v2hdm.geometry.planar import Quad
 from v2hdm.records import BoolArray, Exclusion, FloatArray, IntArray, Marking
-from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN, Candidates, Counts, variance_prior
+from v2hdm.site.candidates import (
+    FOUND_SELDOM,
+    LACKS_A_CORNER,
+    SEEN_SELDOM,
+    TOO_UNCERTAIN,
+    Candidates,
+    Counts,
+    variance_prior,
+)
 from v2hdm.site.corrections import MAX_OVERLAP, Stated, overlap
 from v2hdm.site.hypotheses import Kind
 from v2hdm.site.options import AcceptanceOptions
@@ -33,8 +41,8 @@ _LEAST_ODDS = -3.0  # log odds of being a marking from which a candidate's ends 
 
 _CLUTTER_BY = (
     "not shaped like a marking of its class",
-    "seen in too few images",
-    "found in too few of its images",
+    SEEN_SELDOM,
+    FOUND_SELDOM,
     "its sightings contradict each other",
     "does not look like its class",
 )
