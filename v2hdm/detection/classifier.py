@@ -22,9 +22,10 @@ from v2hdm.catalogue import Catalogue
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.company import COMPANY, company
 from v2hdm.detection.evidence import gather, rectified_views
+from v2hdm.detection.hidden import hidden_ends
 from v2hdm.detection.network import as_probability, open_session
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.quads.fit import TYPICAL_BLUR_PX, Fit, fit_quadrilaterals
+from v2hdm.detection.quads.fit import OPEN_SIGMA, TYPICAL_BLUR_PX, Fit, fit_quadrilaterals
 from v2hdm.detection.quads.patch import ImageQuads, Patches
 from v2hdm.detection.quads.propose import Proposal, Proposals, open_sides
 from v2hdm.detection.weights import CONFIDENCE_FILE, JUDGE_FILE
@@ -57,6 +58,7 @@ class Readings:
     views: np.ndarray  # (R, C, S, S) for the network
     ground: FloatArray  # (R, 4, 2) corners, m
     first_side: np.ndarray  # (R,) the quadrilateral's side that is the first in a view
+    hidden_ends: BoolArray  # (M, 4) ends of what is seen of it rather than of its paint
     # by quadrilateral around a piece, those around its parts: one or the others are markings
     parts: Mapping[int, Sequence[int]]
 
@@ -91,6 +93,7 @@ def read_markings(
         views=views,
         ground=ground.corners[quadrilateral],
         first_side=first_side,
+        hidden_ends=hidden_ends(patches, quads, ground),
         parts=_parts(pieces),
     )
 
@@ -121,6 +124,9 @@ def find_markings(
     turned = (np.arange(4) - readings.first_side[best, None]) % 4
     corners_px = readings.fit.corners_px
     side_sigma_px = np.take_along_axis(side_sigma_px[best], turned, axis=1)
+    # Its paint may go on behind the thing for any length.
+    length_px = readings.fit.quad.length.max(axis=1)[:, None]
+    side_sigma_px = np.where(readings.hidden_ends, OPEN_SIGMA * length_px, side_sigma_px)
     covariance = readings.fit.covariance_px(side_sigma_px)
     valid = _are_points(covariance, corners_px, camera) & camera.inside(corners_px, options.border_px)
     left_out = _left_out(readings.parts, score[best])
