@@ -33,7 +33,7 @@ from v2hdm.store.cache import StageCache
 from v2hdm.survey.run import Survey, check_survey, take_survey
 from v2hdm.verdict import Finding, Status, Verdict
 from v2hdm.verdict.results.accuracy import check_corrections, check_goal, check_known_sizes
-from v2hdm.verdict.results.solution import check_result, over_ground
+from v2hdm.verdict.results.solution import check_result, over_ground, told_by_poses
 
 if TYPE_CHECKING:
     from v2hdm.detection.detector import Detector
@@ -227,7 +227,8 @@ def _judge(
     best = list(methods.values())[-1][BEST]
     check_points = list(sets.values())[-1].checked
     with context.timed("judge"):
-        result_findings = check_result(inspection.drive, methods, inspection.ground)
+        solved_findings = check_result(inspection.drive, methods, inspection.ground)
+        result_findings = told_by_poses(solved_findings, inspection.findings)
         unfit_findings = check_known_sizes(survey.mapping.known_sizes, best)
         unfit_findings += check_corrections(survey.mapping.acceptance.corrections, best)
         frame = "survey" if best.diagnostics["control_points"] else "poses"

@@ -15,7 +15,15 @@ from scipy.stats import beta, f
 
 from v2hdm.errors import MappingError
 from v2hdm.records import Exclusion, FloatArray, IntArray, Marking
-from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN, Candidates, Counts, variance_prior
+from v2hdm.site.candidates import (
+    FOUND_SELDOM,
+    LACKS_A_CORNER,
+    SEEN_SELDOM,
+    TOO_UNCERTAIN,
+    Candidates,
+    Counts,
+    variance_prior,
+)
 from v2hdm.site.corrections import MAX_OVERLAP, Stated, overlap
 from v2hdm.site.hypotheses import Kind
 from v2hdm.site.options import AcceptanceOptions
@@ -26,8 +34,8 @@ OF_SYMBOL = "part of other paint, such as an arrow or a solid line"
 COVERED = "overlaps a better supported marking"
 _CLUTTER_BY = (
     "not shaped like a marking of its class",
-    "seen in too few images",
-    "found in too few of its images",
+    SEEN_SELDOM,
+    FOUND_SELDOM,
     "its sightings contradict each other",
     "does not look like its class",
 )
