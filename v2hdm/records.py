@@ -419,6 +419,12 @@ class HDMap:
     largest_id: int = 0
     ground: tuple[GroundStrip, ...] = ()
 
+    @property
+    def accuracies(self) -> list[str]:
+        """The accuracy of each marking and symbol that states one."""
+        graded: list[Marking | Symbol] = [*self.markings, *self.symbols]
+        return [paint.accuracy for paint in graded if paint.accuracy is not None]
+
     def to_geodataframe(self) -> Any:
         """The features as a ``geopandas.GeoDataFrame``, one row each.
 

@@ -49,11 +49,11 @@ from v2hdm.faults import FAULTS
 from v2hdm.geometry.rigid import inverse, log
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
-from v2hdm.mapping import conclusion, foreign, optimise
+from v2hdm.mapping import conclusion, foreign, methods, optimise
 from v2hdm.mapping.methods import run_methods
 from v2hdm.records import BoolArray, Drive, FloatArray, ImageDetections, IntArray, Marking, Truth
 from v2hdm.report.metrics import driven_past, marking_metrics, match_markings
-from v2hdm.site import hypotheses, markings, posterior
+from v2hdm.site import hypotheses, markings, posterior, symbols
 from v2hdm.verdict.results import solution
 
 SEED = 5_318_008
@@ -227,6 +227,7 @@ def terms() -> Iterator[Part]:
     yield "clutter shaped like its class", partial(patch.object, hypotheses, "_LIKE_CLASS", 1e-9)
     yield "how much clutter differs from it", partial(patch.object, hypotheses, "_LIKE_SHARE", 0.0)
     yield "markings seldom found", partial(patch.object, posterior, "_NEGLECTED_SHARE", 1e-9)
+    yield "symbols' presence", partial(patch.object, symbols, "symbols_presence", _all_present)
     yield "symbols on candidates", partial(patch.object, conclusion, "images_with_symbol", _no_images)
     yield "lines behind dashes", partial(patch.object, conclusion, "images_with_line", _no_images)
     yield "their sureness", partial(patch.object, ground, "_SURE_M", np.inf)
@@ -262,6 +263,10 @@ def _unknown(_: Any, weight: FloatArray) -> FloatArray:
     return np.zeros((len(weight), 4))
 
 
+def _all_present(images: IntArray, *_: Any) -> posterior.Presence:
+    return posterior.Presence(np.full(len(images), np.inf), np.zeros((len(images), 2)))
+
+
 def _no_images(_: Any, __: Any, corners_map: FloatArray) -> FloatArray:
     return np.zeros(len(corners_map), dtype=np.int64)
 
@@ -285,6 +290,7 @@ class Mapped:
     found: float = 0.0
     expected: int = 0
     wrong: int = 0
+    symbols: int = 0
     squared_m2: list[float] = field(default_factory=list)
 
     def add(self, mapped: Sequence[Marking], truth: Truth, expected: BoolArray) -> None:
@@ -309,7 +315,8 @@ class Mapped:
 
     def __str__(self) -> str:
         rmse_m, recall = np.sqrt(np.mean(self.squared_m2)), self.found / max(self.expected, 1)
-        return f"{self.markings:8d} {self.false:6d} {recall:7.3f} {100 * rmse_m:8.2f} {self.wrong:6d}"
+        counts = f"{self.markings:8d} {self.false:6d} {recall:7.3f} {100 * rmse_m:8.2f} {self.wrong:6d}"
+        return f"{counts} {self.symbols:7d}"
 
 
 def site_drives(
@@ -343,11 +350,21 @@ def rows_of_site(only: str, seeds: Sequence[int], folders: Sequence[Path]) -> It
             asked.append(given)
             return markings.classify(*given)
 
-        with patch.object(conclusion, "classify", classify):
+        asked_symbols: list[Any] = []
+
+        def map_symbols(*given: Any, asked: list[Any] = asked_symbols) -> Any:
+            asked.append(given)
+            return symbols.map_symbols(*given)
+
+        with (
+            patch.object(conclusion, "classify", classify),
+            patch.object(methods, "map_symbols", map_symbols),
+        ):
             run_methods(drive, detections, cameras)
         for name, off in wanted:
             with off():
                 tally[name].add(markings.classify(*asked[-1]).markings(), truth, expected)
+                tally[name].symbols += len(symbols.map_symbols(*asked_symbols[-1])[0])
     return (f"{name:38s} {own}" for name, own in tally.items())
 
 
@@ -362,7 +379,10 @@ def main() -> None:
     parsed = parser.parse_args()
     cv2.setNumThreads(1)
     if parsed.site or parsed.drives:
-        print(f"{'off':38s} {'markings':>8s} {'false':>6s} {'recall':>7s} {'RMSE, cm':>8s} {'wrong':>6s}")
+        print(
+            f"{'off':38s} {'markings':>8s} {'false':>6s} {'recall':>7s} {'RMSE, cm':>8s} {'wrong':>6s} "
+            f"{'symbols':>7s}"
+        )
         print(*rows_of_site(parsed.only, range(*(parsed.site or (0, 0))), parsed.drives), sep="\n")
         return
     if parsed.verdict:

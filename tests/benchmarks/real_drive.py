@@ -39,6 +39,7 @@ from v2hdm.mapping.options import MappingOptions
 from v2hdm.pipeline.map_drive import map_drive
 from v2hdm.pipeline.result import Result
 from v2hdm.records import (
+    ACCURACIES,
     ARROW,
     LANE_DASH,
     LANE_LINE,
@@ -361,7 +362,8 @@ def main() -> None:
     parser.add_argument("--camera", help="the camera to look through, if the drive has several")
     parser.add_argument("--reference", type=Path, required=True, help="file of what is painted there")
     worst = AcceptanceOptions().accuracy
-    parser.add_argument("--accuracy", default=worst, help=f"mapping.acceptance.accuracy, by default {worst}")
+    says = f"mapping.acceptance.accuracy, by default {worst}"
+    parser.add_argument("--accuracy", choices=ACCURACIES, default=worst, help=says)
     parser.add_argument("--overlays", type=Path, help="folder for a picture of every image")
     parser.add_argument("--model")
     parsed = parser.parse_args()

@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections import Counter
 from pathlib import Path
 
 import cv2
@@ -119,6 +120,8 @@ def test_the_files_of_a_result_can_be_read_back(result):
     metrics = json.loads((result / "metrics.json").read_text())
     assert len(hd_map.markings) == metrics["results"]["both"]["Opt"]["markings"]
     assert all(marking.covariance_m2 is not None for marking in hd_map.markings)
+    accuracies = Counter(paint.accuracy for paint in (*hd_map.markings, *hd_map.symbols))
+    assert accuracies == Counter(metrics["results"]["both"]["Opt"]["accuracy"])
     for camera in ("front", "rear"):
         calibration = read_calibration(result / f"calibration_{camera}.yaml")
         assert calibration.covariance is not None

@@ -284,3 +284,58 @@ def test_an_arrow_known_to_decimetres_only_is_mapped_with_the_sigma_that_it_has(
     )
     assert [len(found) for found, _ in (near, far)] == [1, 1]
     assert far[0][0].sigma_m > 2 * near[0][0].sigma_m > 0.02
+
+
+def with_sides(symbols, outlines_px, seen_sides):
+    """The symbols with outlines of forty points a side, and which sides lie along an edge of the paint."""
+    flags = tuple(np.repeat(is_seen, 40) for is_seen in seen_sides)
+    return replace(of_outlines(symbols, outlines_px), seen_sides=flags)
+
+
+def squared_sigmas(symbol, true):
+    """Squared Mahalanobis distances (N,) of true vertices (N, 2) from the nearest ones of a symbol."""
+    off_m = symbol.outline_map[:, None] - true
+    nearest = np.linalg.norm(off_m, axis=2).argmin(axis=0)
+    rows = 2 * nearest[:, None] + np.arange(2)
+    covariance = symbol.covariance_m2[rows[:, :, None], rows[:, None, :]]
+    off_m = off_m[nearest, np.arange(len(true))]
+    return np.einsum("ni,nij,nj->n", off_m, np.linalg.inv(covariance), off_m)
+
+
+INSIDE_95 = 5.99  # chi-squared of two degrees of freedom
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_foot_that_other_paint_hides_is_completed_by_the_template_within_its_stated_sigma(seed):
+    rng = np.random.default_rng(seed)
+    ways_m, places = [0.0, 0.7, 1.4, 2.1], [np.array([10.0, y]) for y in (1.0, -1.0, 2.0, 0.0, -2.0)]
+    painted = [
+        ARROW * np.exp(rng.normal(0, 0.01, 2)) + rng.normal(0, 0.01, ARROW.shape) + at for at in places
+    ]
+    hidden = np.maximum(painted[0], [places[0][0] - 1.0, -np.inf])
+    shapes = [shape for arrow in (hidden, *painted[1:]) for shape in [arrow] * 4]
+    symbols, rig = seen(shapes, ["arrow"] * len(shapes), 5 * ways_m)
+    sides = 4 * [cut(-1.0)[1]] + 16 * [np.ones(7, dtype=bool)]
+    symbols = with_sides(symbols, noisy(symbols.outlines_pinhole_px, rng), sides)
+    arrow = min(
+        mapped(symbols, rig), key=lambda one: np.linalg.norm(one.outline_map.mean(axis=0) - places[0])
+    )
+    feet = [0, 6]
+    assert corner_errors_m(arrow, painted[0])[feet].max() < 0.08
+    assert squared_sigmas(arrow, painted[0])[feet].max() < INSIDE_95
+    variance_m2 = np.diag(arrow.covariance_m2).reshape(-1, 2).sum(axis=1)
+    assert arrow.outline_map[variance_m2.argsort()[-2:], 0].max() < places[0][0] - 1.0
+    assert np.sqrt(variance_m2.max()) < 0.12
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_arrow_of_which_each_image_cuts_another_end_is_whole(seed):
+    true = ARROW + AT
+    front, front_sides = cut(-0.9)
+    back = rectangle(((0.45 - 1.5) / 2, 0.0), 0.45 + 1.5, 0.16)
+    back_sides = np.array([True, False, True, True])
+    symbols, rig = seen(4 * [front + AT, back + AT], ["arrow"] * 8, np.arange(8) * 0.4)
+    outlines_px = noisy(symbols.outlines_pinhole_px, np.random.default_rng(seed))
+    (arrow,) = mapped(with_sides(symbols, outlines_px, 4 * [front_sides, back_sides]), rig)
+    assert corner_errors_m(arrow, true).max() < 0.06
+    assert squared_sigmas(arrow, true).max() < 2 * INSIDE_95
