@@ -46,6 +46,8 @@ def test_every_shipped_run_composes_into_dataclasses(run):
         ("+run=port2 +mapping.known_sizes.by_class_m={diamond:[1,0.7]}", "write 1.0"),
         ("+run=port2 export=gpkg", "write export=[gpkg]"),
         ("+run=port2 drive.limit=0", "set 1 to 1e+12"),
+        ("+run=port2 mapping.acceptance.accuracy=D", "mapping.acceptance.accuracy is 'D'; choose from A, B"),
+        ("+run=port2 mapping.acceptance.max_sigma_m=0.1", "max_sigma_m"),
         ("drive.path = nowhere", "write drive.path=nowhere"),
         ("+run=kitti", "drive.path"),
         ("+run=kitti drive.path=nowhere", "nowhere"),

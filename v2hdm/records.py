@@ -322,6 +322,10 @@ class PaintLeft:
         return replace(self, change=self.share - before.share, change_sigma=sigma)
 
 
+ACCURACIES = ("A", "B", "C")
+"""Accuracy of a marking or symbol, the best first: the 95 % radius of its worst corner is within the accuracy
+goal, within twice the goal, or larger."""
+
 UNSTATED_SIGMA_M = 0.02
 """Standard deviation, m, of a corner's coordinate in a map that states none: drawn over an image."""
 
@@ -340,6 +344,7 @@ class Marking:
     id: int | None = None  # positive and unique; None until the map is written
     paint: PaintLeft | None = None  # None if no image shows enough of it
     heights_sigma_m: FloatArray | None = None  # (4,) where estimated
+    accuracy: str | None = None  # of :data:`ACCURACIES`; None without covariance, or before a goal was set
 
     @property
     def corner_covariances_m2(self) -> FloatArray | None:
@@ -361,6 +366,7 @@ class Symbol:
     heights_sigma_m: FloatArray | None = None
     # (2N, 2N), None where sightings share an outline that no polygon explains
     covariance_m2: FloatArray | None = None
+    accuracy: str | None = None
 
 
 @dataclass(frozen=True)
@@ -413,11 +419,18 @@ class HDMap:
     largest_id: int = 0
     ground: tuple[GroundStrip, ...] = ()
 
-    def to_geodataframe(self) -> Any:
-        """The features as a ``geopandas.GeoDataFrame``, one row each: id, layer, kind, sightings, geometry.
+    @property
+    def accuracies(self) -> list[str]:
+        """The accuracy of each marking and symbol that states one."""
+        graded: list[Marking | Symbol] = [*self.markings, *self.symbols]
+        return [paint.accuracy for paint in graded if paint.accuracy is not None]
 
-        Geometries are longitude, latitude and ellipsoidal height, m (EPSG:4326), where the map has an origin,
-        and metres of the frame ``map`` otherwise.
+    def to_geodataframe(self) -> Any:
+        """The features as a ``geopandas.GeoDataFrame``, one row each.
+
+        Columns are id, layer, kind, sightings, accuracy (None for a lane) and geometry: longitude, latitude
+        and ellipsoidal height, m (EPSG:4326), where the map has an origin, and metres of the frame ``map``
+        otherwise.
 
         Raises:
             ModuleNotFoundError: geopandas is not installed; the message names the extra.
@@ -445,8 +458,9 @@ class HDMap:
                 points = getattr(feature, name)
                 heights_m = np.zeros(len(points)) if feature.heights_m is None else feature.heights_m
                 geometry = shape(np.column_stack([points, heights_m]))
-                rows.append((feature.id, layer, feature.kind, feature.sightings, geometry))
-        columns = ["id", "layer", "kind", "sightings", "geometry"]
+                accuracy = getattr(feature, "accuracy", None)
+                rows.append((feature.id, layer, feature.kind, feature.sightings, accuracy, geometry))
+        columns = ["id", "layer", "kind", "sightings", "accuracy", "geometry"]
         frame = geopandas.GeoDataFrame(rows, columns=columns, geometry="geometry")
         if self.origin is None:
             return frame

@@ -10,7 +10,8 @@ leaves.
 
 With ``--verdict`` instead what each column of the table of fault sizes (faults/table.py) and each
 number of mapping/foreign.py earns, on made drives of these seeds, as they are and with every fault: right
-drives failed, wrong maps without a word, and of those with one how many are named rightly, first.
+drives failed, wrong maps without a word, and of those with one how many are named rightly, first. To the
+right drives belongs each as a straight one under a stream of poses, whose cameras fire in turn.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from tests.benchmarks.detector_quality import Tally
 from tests.benchmarks.made.boxes import detect_pieces, make_boxes
 from tests.benchmarks.made.detect import detect
 from tests.benchmarks.made.draw import draw
-from tests.benchmarks.made.faults import SPOILS
+from tests.benchmarks.made.faults import APART_S, SPOILS
 from tests.benchmarks.made.queue import detect_queue, make_queue
 from tests.benchmarks.made.world import drive_of, make, truth_of
 from tests.benchmarks.right_drives import CLEAN, Job, judge, map_one
@@ -45,13 +46,14 @@ from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.quads import fit, lattice, propose, robust, state
 from v2hdm.faults import FAULTS
+from v2hdm.geometry.rigid import inverse, log
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
-from v2hdm.mapping import conclusion, foreign
+from v2hdm.mapping import conclusion, foreign, methods, optimise
 from v2hdm.mapping.methods import run_methods
-from v2hdm.records import BoolArray, Drive, FloatArray, ImageDetections, Marking, Truth
+from v2hdm.records import BoolArray, Drive, FloatArray, ImageDetections, IntArray, Marking, Truth
 from v2hdm.report.metrics import driven_past, marking_metrics, match_markings
-from v2hdm.site import hypotheses, markings, posterior
+from v2hdm.site import hypotheses, markings, posterior, symbols
 from v2hdm.verdict.results import solution
 
 SEED = 5_318_008
@@ -178,7 +180,19 @@ def sizes() -> Iterator[Part]:
     yield "foreign: markings taken by mistake", partial(patch.object, foreign, "_BY_MISTAKE", 1e-6)
     yield "foreign: mixtures of two markings", partial(patch.object, foreign, "_CONFUSED", 1e-6)
     yield "foreign: misses weighed by distance", partial(patch.object, foreign, "_DISTANCES", 1)
+    yield (
+        "twists that noise averages out of",
+        partial(patch.object, optimise, "vehicle_twists", _by_neighbours),
+    )
     yield "jitter that does not matter", partial(patch.object, solution, "_LEAST_JITTER_S", 0.0)
+
+
+def _by_neighbours(map_from_vehicle: FloatArray, stamp_s: FloatArray, session: IntArray) -> FloatArray:
+    """Vehicle twists (F, 6) from the poses just before and just behind each, as of one ``session``."""
+    number = np.arange(len(stamp_s))
+    before, behind = np.maximum(number - 1, 0), np.minimum(number + 1, len(number) - 1)
+    moved = log(inverse(map_from_vehicle[before]) @ map_from_vehicle[behind])
+    return np.asarray(moved / (stamp_s[behind] - stamp_s[before])[:, None])
 
 
 def row_of_verdict(name: str, seeds: Sequence[int]) -> str:
@@ -186,7 +200,8 @@ def row_of_verdict(name: str, seeds: Sequence[int]) -> str:
     failed, judged = 0, []
     for seed in seeds:
         clean = map_one(Job(seed))
-        failed += clean.status == "FAIL"
+        in_turn = map_one(Job(seed, "straight", apart_s=APART_S, stated=True))
+        failed += sum(right.status == "FAIL" for right in (clean, in_turn))
         judged += [judge(map_one(Job(seed, spoil=spoil)), clean) for spoil in SPOILS if spoil != CLEAN]
     silent = sum(wrong and not told for wrong, told, _ in judged)
     told = [when for _, told, when in judged if told]
@@ -212,6 +227,7 @@ def terms() -> Iterator[Part]:
     yield "clutter shaped like its class", partial(patch.object, hypotheses, "_LIKE_CLASS", 1e-9)
     yield "how much clutter differs from it", partial(patch.object, hypotheses, "_LIKE_SHARE", 0.0)
     yield "markings seldom found", partial(patch.object, posterior, "_NEGLECTED_SHARE", 1e-9)
+    yield "symbols' presence", partial(patch.object, symbols, "symbols_presence", _all_present)
     yield "symbols on candidates", partial(patch.object, conclusion, "images_with_symbol", _no_images)
     yield "lines behind dashes", partial(patch.object, conclusion, "images_with_line", _no_images)
     yield "their sureness", partial(patch.object, ground, "_SURE_M", np.inf)
@@ -247,6 +263,10 @@ def _unknown(_: Any, weight: FloatArray) -> FloatArray:
     return np.zeros((len(weight), 4))
 
 
+def _all_present(images: IntArray, *_: Any) -> posterior.Presence:
+    return posterior.Presence(np.full(len(images), np.inf), np.zeros((len(images), 2)))
+
+
 def _no_images(_: Any, __: Any, corners_map: FloatArray) -> FloatArray:
     return np.zeros(len(corners_map), dtype=np.int64)
 
@@ -270,6 +290,7 @@ class Mapped:
     found: float = 0.0
     expected: int = 0
     wrong: int = 0
+    symbols: int = 0
     squared_m2: list[float] = field(default_factory=list)
 
     def add(self, mapped: Sequence[Marking], truth: Truth, expected: BoolArray) -> None:
@@ -294,7 +315,8 @@ class Mapped:
 
     def __str__(self) -> str:
         rmse_m, recall = np.sqrt(np.mean(self.squared_m2)), self.found / max(self.expected, 1)
-        return f"{self.markings:8d} {self.false:6d} {recall:7.3f} {100 * rmse_m:8.2f} {self.wrong:6d}"
+        counts = f"{self.markings:8d} {self.false:6d} {recall:7.3f} {100 * rmse_m:8.2f} {self.wrong:6d}"
+        return f"{counts} {self.symbols:7d}"
 
 
 def site_drives(
@@ -328,11 +350,21 @@ def rows_of_site(only: str, seeds: Sequence[int], folders: Sequence[Path]) -> It
             asked.append(given)
             return markings.classify(*given)
 
-        with patch.object(conclusion, "classify", classify):
+        asked_symbols: list[Any] = []
+
+        def map_symbols(*given: Any, asked: list[Any] = asked_symbols) -> Any:
+            asked.append(given)
+            return symbols.map_symbols(*given)
+
+        with (
+            patch.object(conclusion, "classify", classify),
+            patch.object(methods, "map_symbols", map_symbols),
+        ):
             run_methods(drive, detections, cameras)
         for name, off in wanted:
             with off():
                 tally[name].add(markings.classify(*asked[-1]).markings(), truth, expected)
+                tally[name].symbols += len(symbols.map_symbols(*asked_symbols[-1])[0])
     return (f"{name:38s} {own}" for name, own in tally.items())
 
 
@@ -347,7 +379,10 @@ def main() -> None:
     parsed = parser.parse_args()
     cv2.setNumThreads(1)
     if parsed.site or parsed.drives:
-        print(f"{'off':38s} {'markings':>8s} {'false':>6s} {'recall':>7s} {'RMSE, cm':>8s} {'wrong':>6s}")
+        print(
+            f"{'off':38s} {'markings':>8s} {'false':>6s} {'recall':>7s} {'RMSE, cm':>8s} {'wrong':>6s} "
+            f"{'symbols':>7s}"
+        )
         print(*rows_of_site(parsed.only, range(*(parsed.site or (0, 0))), parsed.drives), sep="\n")
         return
     if parsed.verdict:

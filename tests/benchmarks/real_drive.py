@@ -1,6 +1,6 @@
 """How well the shipped detector sees on a real drive, which no training ever showed.
 
-    python -m tests.benchmarks.real_drive --drive DRIVE --reference FILE [--max-sigma M] [--overlays FOLDER]
+    python -m tests.benchmarks.real_drive --drive DRIVE --reference FILE [--accuracy C] [--overlays FOLDER]
 
 The drive is mapped as ``v2hdm map`` maps it. The reference is a file of what is really painted there, see
 :func:`tests.benchmarks.real_reference.read_reference`: never a map of our own. Two tables are printed.
@@ -39,6 +39,7 @@ from v2hdm.mapping.options import MappingOptions
 from v2hdm.pipeline.map_drive import map_drive
 from v2hdm.pipeline.result import Result
 from v2hdm.records import (
+    ACCURACIES,
     ARROW,
     LANE_DASH,
     LANE_LINE,
@@ -360,15 +361,16 @@ def main() -> None:
     parser.add_argument("--drive", type=Path, required=True)
     parser.add_argument("--camera", help="the camera to look through, if the drive has several")
     parser.add_argument("--reference", type=Path, required=True, help="file of what is painted there")
-    usual_m = AcceptanceOptions().max_sigma_m
-    parser.add_argument("--max-sigma", type=float, default=usual_m, help="mapping.acceptance.max_sigma_m")
+    worst = AcceptanceOptions().accuracy
+    says = f"mapping.acceptance.accuracy, by default {worst}"
+    parser.add_argument("--accuracy", choices=ACCURACIES, default=worst, help=says)
     parser.add_argument("--overlays", type=Path, help="folder for a picture of every image")
     parser.add_argument("--model")
     parsed = parser.parse_args()
     cv2.setNumThreads(1)
     result = map_drive(
         parsed.drive,
-        options=MappingOptions(acceptance=AcceptanceOptions(max_sigma_m=parsed.max_sigma)),
+        options=MappingOptions(acceptance=AcceptanceOptions(accuracy=parsed.accuracy)),
         detector=replace(DetectorOptions.for_mapping(), model=parsed.model),
         reading=ReadOptions(cameras=[parsed.camera] if parsed.camera else []),
     )

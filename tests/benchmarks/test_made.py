@@ -7,8 +7,8 @@ import pytest
 
 from tests.benchmarks.made.boxes import _hidden, detect_pieces, largest, make_boxes
 from tests.benchmarks.made.detect import detect
-from tests.benchmarks.made.draw import Recipe, draw
-from tests.benchmarks.made.faults import SPOILS
+from tests.benchmarks.made.draw import Recipe, draw, draw_apart_s
+from tests.benchmarks.made.faults import APART_S, SPOILS
 from tests.benchmarks.made.queue import make_queue, rear_map
 from tests.benchmarks.made.world import beside, drive_of, make, smooth_noise
 from v2hdm.geometry.ipm import apply_homography, ground_from_pinhole_px
@@ -50,9 +50,26 @@ def test_smooth_noise_has_the_size_that_was_asked_for() -> None:
     assert drawn.std(axis=0) == pytest.approx(0.5, rel=0.05)
 
 
+def test_cameras_that_fire_in_turn_do_so_between_the_poses_of_a_stream() -> None:
+    drive = drive_of(make(_exact(5).in_turn(0.02)))
+    assert drive.recorded is not None
+    np.testing.assert_allclose(np.diff(drive.recorded.stamp_s), 0.05)
+    front_s, rear_s = (
+        np.array([image.stamp_s for image in drive.images if image.camera == name])
+        for name in ("front", "rear")
+    )
+    np.testing.assert_allclose(rear_s - front_s[: len(rear_s)], 0.02)
+
+
+def test_in_a_third_of_the_right_drives_the_cameras_fire_in_turn() -> None:
+    assert np.mean([draw_apart_s(seed) > 0 for seed in range(200)]) == pytest.approx(1 / 3, abs=0.07)
+
+
+@pytest.mark.parametrize("in_turn", [False, True], ids=["at once", "in turn"])
 @pytest.mark.parametrize("name", list(SPOILS))
-def test_every_fault_changes_the_drive_and_leaves_the_map_alone(name: str) -> None:
-    world = make(_exact(5))
+def test_every_fault_changes_the_drive_and_leaves_the_map_alone(name: str, in_turn: bool) -> None:
+    recipe = _exact(5)
+    world = make(recipe.in_turn(APART_S) if in_turn else recipe)
     spoilt = SPOILS[name].change(world)
     assert spoilt is not world
     assert spoilt.port.hd_map is world.port.hd_map

@@ -99,12 +99,14 @@ def _urls() -> Iterator[Case]:
 
 
 def _maps() -> Iterator[Case]:
-    """Sigmas and shares of a map, of the first feature that may have them."""
+    """Sigmas, shares and accuracies of a map, of the first feature that may have them."""
     one: tuple[object, ...] = (-1, -1e-9, "x", True, [], {}, [[1]], 10**400, float("nan"), float("-inf"))
     each: tuple[object, ...] = ([-0.01] * 4, [0.01] * 3, ["x"] * 4, [float("nan")] * 4, 7, "x", {}, [[1]] * 4)
     for key, values in {"relative_sigma_m": one, "heights_sigma_m": each}.items():
         for value in values:
             yield _map_with(f"{key} {json.dumps(value)[:12]}", "Polygon", {key: value}, key)
+    for value in ("D", "a", "", 1, True, [], ["A"], {}):
+        yield _map_with(f"accuracy {json.dumps(value)}", "Polygon", {"accuracy": value}, "accuracy is")
     for value in (-1, "x", float("nan"), [1]):
         paint = {"paint_left": 0.5, "paint_left_sigma": value}
         yield _map_with(f"paint_left_sigma {value}", "Polygon", paint, "paint_left_sigma")

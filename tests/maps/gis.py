@@ -9,7 +9,7 @@ import numpy as np
 import pyogrio
 import rasterio
 
-from v2hdm.records import GeodeticOrigin, HDMap, Lane, Marking, Symbol
+from v2hdm.records import ACCURACIES, GeodeticOrigin, HDMap, Lane, Marking, Symbol
 
 ORIGIN = GeodeticOrigin(latitude_deg=29.95, longitude_deg=122.05, altitude_m=12.0)
 
@@ -76,7 +76,8 @@ def _ogr() -> ctypes.CDLL:
 def street(origin: GeodeticOrigin | None = ORIGIN, with_heights: bool = True) -> HDMap:
     """A street bending left: three lane lines 3.5 m apart, a stop line across the right lane, and more.
 
-    Corners of one diamond run clockwise, and everything is known with correlated covariances.
+    Corners of one diamond run clockwise; everything is known with correlated covariances, and accuracies are
+    A, B and C in turn.
     """
     rng = np.random.default_rng(7)
     angle = np.linspace(0.0, 0.6, 121)
@@ -99,11 +100,10 @@ def street(origin: GeodeticOrigin | None = ORIGIN, with_heights: bool = True) ->
         corners = shape + place + rng.normal(scale=1e-3, size=(4, 2))
         half = rng.normal(scale=0.004, size=(8, 8))
         heights = 1.0 + 0.03 * corners[:, 0] if with_heights else None
-        markings.append(
-            Marking(
-                kind, corners, int(rng.integers(3, 20)), half @ half.T, 0.002 + rng.random() / 1e3, heights
-            )
+        marking = Marking(
+            kind, corners, int(rng.integers(3, 20)), half @ half.T, 0.002 + rng.random() / 1e3, heights
         )
+        markings.append(replace(marking, accuracy=ACCURACIES[len(markings) % len(ACCURACIES)]))
     return HDMap(tuple(markings), tuple(lanes), origin)
 
 

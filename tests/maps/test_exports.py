@@ -114,6 +114,7 @@ def test_csv_has_every_point_with_its_covariance(tmp_path, origin, with_heights)
         assert [row["point"] for row in mine] == [str(k + 1) for k in range(len(mine))]
         assert {row["class"] for row in mine} == {one.kind}
         assert {row["sightings"] for row in mine} == {str(one.sightings)}
+        assert {row["accuracy"] for row in mine} == {getattr(one, "accuracy", "")}
         got = np.array([[float(row["x_map_m"]), float(row["y_map_m"])] for row in mine])
         np.testing.assert_array_equal(got, xyz(one)[:, :2])
         heights = [row["height_m"] for row in mine]
@@ -134,13 +135,13 @@ def test_csv_has_every_point_with_its_covariance(tmp_path, origin, with_heights)
 def test_a_geopackage_is_read_by_sqlite_alone(tmp_path, origin):
     hd_map = street(origin)
     data = sqlite3.connect(exported(tmp_path, "gpkg", hd_map))
-    rows = data.execute("SELECT id, class, geom, covariance_m2 FROM markings").fetchall()
-    rows += data.execute("SELECT id, class, geom, NULL FROM lanes").fetchall()
+    rows = data.execute("SELECT id, class, geom, covariance_m2, accuracy FROM markings").fetchall()
+    rows += data.execute("SELECT id, class, geom, NULL, NULL FROM lanes").fetchall()
     assert [row[0] for row in rows] == list(range(1, 9))
     envelope_bytes = {0: 0, 1: 32, 2: 48, 3: 48, 4: 64}
-    for number, kind, blob, covariance in rows:
+    for number, kind, blob, covariance, accuracy in rows:
         one = features(hd_map)[number]
-        assert kind == one.kind
+        assert (kind, accuracy) == (one.kind, getattr(one, "accuracy", None))
         header = 8 + envelope_bytes[blob[3] >> 1 & 7]
         got = to_map(from_wkb(blob[header:]), origin)
         np.testing.assert_allclose(got, xyz(one)[ring(one)], atol=TENTH_OF_A_MM)
@@ -197,6 +198,7 @@ def test_a_dxf_is_read_by_gdal_and_holds_what_cad_does_not_know(tmp_path):
         assert features(hd_map)[told[told.index("id") + 1]] is one
         assert told[told.index("sightings") + 1] == one.sightings
         if isinstance(one, Marking) and one.covariance_m2 is not None:
+            assert told[told.index("accuracy") + 1] == one.accuracy
             matrix = np.reshape(told[told.index("covariance_m2") + 1 :], (8, 8))
             np.testing.assert_array_equal(matrix, in_ring_order(one.covariance_m2, one))
 
@@ -241,6 +243,7 @@ def test_every_marking_and_line_is_found_through_lanelet2(tmp_path, origin):
         covariance = yaml.safe_load(polygon.attributes["covariance_m2"])
         np.testing.assert_array_equal(covariance, in_ring_order(one.covariance_m2, one))
         assert polygon.attributes["sightings"] == str(one.sightings)
+        assert polygon.attributes["accuracy"] == one.accuracy
         heights = [float(point.attributes["local_x"]) for point in polygon]
         np.testing.assert_array_equal(heights, xyz(one)[ring(one), 0])
 

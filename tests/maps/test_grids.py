@@ -69,6 +69,8 @@ def test_csv_dxf_and_landxml_have_the_same_rounded_metres_and_state_datum_and_ep
     root = ET.parse(exported(tmp_path, "landxml")).getroot()
     spaces = {"x": "http://www.landxml.org/schema/LandXML-1.2"}
     assert root.find("x:CoordinateSystem", spaces).attrib["epsgCode"] == "25832"
+    labels = root.findall("x:PlanFeatures/x:PlanFeature[@name='1']//x:Property", spaces)
+    assert {one.get("label"): one.get("value") for one in labels}["accuracy"] == "A"
     starts = root.findall("x:PlanFeatures/x:PlanFeature[@name='1']//x:Start", spaces)
     of_landxml = np.array([[float(value) for value in one.text.split()] for one in starts])[:, [1, 0, 2]]
     for found in (of_csv, of_dxf, of_landxml):

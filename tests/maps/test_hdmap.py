@@ -60,7 +60,7 @@ def test_enu_agrees_with_pyproj_and_returns(latitude, longitude, altitude):
 def test_symbols_survive_their_file_and_are_polygons(tmp_path, origin):
     outline = np.array([[0.1, 0.0], [1.0, 0.2], [0.3, 0.7]])
     symbols = (
-        Symbol("parking_t", outline, 5, 0.1, np.array([0.1, 0.2, 0.3]), covariance_m2=0.01 * np.eye(6)),
+        Symbol("parking_t", outline, 5, 0.1, np.array([0.1, 0.2, 0.3]), None, None, 0.01 * np.eye(6), "C"),
         Symbol("arrow", 2 * outline, 3),
     )
     path = tmp_path / "map.geojson"
@@ -70,6 +70,7 @@ def test_symbols_survive_their_file_and_are_polygons(tmp_path, origin):
         np.testing.assert_array_equal(got.outline_map, expected.outline_map)
         np.testing.assert_array_equal(got.covariance_m2, expected.covariance_m2)
         np.testing.assert_array_equal(got.heights_m, expected.heights_m)
+        assert got.accuracy == expected.accuracy
     feature = json.loads(path.read_text())["features"][-1]
     assert (feature["id"], feature["geometry"]["type"]) == (4, "Polygon")
     assert feature["properties"]["class"] == "arrow"
@@ -80,7 +81,7 @@ def test_symbols_survive_their_file_and_are_polygons(tmp_path, origin):
 
 @pytest.mark.parametrize("ending", ["csv", "gpkg", "dxf", "osm"])
 def test_every_format_holds_a_symbol_of_three_corners(tmp_path, ending):
-    symbol = Symbol("parking_t", np.array([[0.1, 0.0], [1.0, 0.2], [0.3, 0.7]]), 5, 0.013)
+    symbol = Symbol("parking_t", np.array([[0.1, 0.0], [1.0, 0.2], [0.3, 0.7]]), 5, 0.013, accuracy="B")
     hd_map = HDMap((), (), ORIGIN, (symbol,))
     file_format = {"osm": "lanelet2"}.get(ending, ending)
     path = tmp_path / f"map.{ending}"
@@ -89,6 +90,7 @@ def test_every_format_holds_a_symbol_of_three_corners(tmp_path, ending):
     if ending == "gpkg":
         (got,) = read_geopackage(path).symbols
         assert (got.kind, got.sightings, got.sigma_m, got.id) == ("parking_t", 5, 0.013, 1)
+        assert got.accuracy == "B"
         np.testing.assert_allclose(got.outline_map, symbol.outline_map, atol=1e-12)
     elif ending in ("csv", "osm"):
         assert "parking_t" in path.read_text()
@@ -162,6 +164,8 @@ def damaged_map(origin=None, **properties):
         (damaged_map(sightings=2**70), "feature 0, sightings: expected a whole number"),
         (damaged_map(sightings=10**400), "feature 0, sightings: expected a finite number"),
         (damaged_map(corners_map=[[10**400, 0], [1, 0], [1, 1], [0, 1]]), "corners_map: holds a number that"),
+        (damaged_map(accuracy="D"), "feature 0, accuracy is 'D'; give one of A, B, C, or leave it out"),
+        (damaged_map(accuracy=["A"]), "feature 0, accuracy is a list of one; give one of A, B, C"),
         (damaged_map(covariance_m2=(-np.eye(8)).tolist()), "covariance_m2: not symmetric or negative"),
         (
             '{"v2hdm": {}, "features": [{"geometry": {"type": "Polygon", "coordinates": [[[0, 0, 0]]]}, '

@@ -70,7 +70,10 @@ def test_every_marking_is_an_object_with_its_corners_also_without_lanes(tmp_path
     hd_map = replace(street(), lanes=street().lanes[:lanes])
     path = written(tmp_path, hd_map)
     assert loaded(path)
-    found = corners_of(ET.parse(path).getroot())
+    root = ET.parse(path).getroot()
+    told = {one.get("id"): one.find("userData[@code='accuracy']").get("value") for one in root.iter("object")}
+    assert told == {str(number): one.accuracy for number, one in enumerate(hd_map.markings, start=1)}
+    found = corners_of(root)
     assert len(found) == len(hd_map.markings)
     for number, one in enumerate(hd_map.markings, start=1):
         gaps = np.linalg.norm(found[number][:, None] - one.corners_map, axis=2)

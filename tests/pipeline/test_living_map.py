@@ -19,7 +19,9 @@ from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.pipeline import map_drive as work
 from v2hdm.pipeline.base import check_together, read_base
+from v2hdm.pipeline.config import ACCURACY_GOAL_CM
 from v2hdm.records import Fate, GeodeticOrigin, ImageDetections, PoseNoise, Trajectory
+from v2hdm.site.accuracy import accuracy_of
 
 BOTH, LATER, _ = (" ".join(block.lines) for block in blocks("docs/living-map.md", "sh"))
 
@@ -88,6 +90,13 @@ def test_a_later_drive_lists_what_changed(results):
     gone = {one["id"] for one in changes["listed"] if one["fate"] == "vanished"}
     assert {one.id for one in before.markings} - gone <= {one.id for one in after.markings}
     assert after.largest_id >= before.largest_id
+
+
+def test_a_map_that_was_brought_up_to_date_is_graded_by_its_new_covariances(results):
+    before, after = (read_geojson(results / name / "map.geojson") for name in ("monday", "friday"))
+    for one in (*before.markings, *after.markings):
+        assert one.accuracy == accuracy_of(one.covariance_m2, ACCURACY_GOAL_CM / 100)
+    assert all(one.accuracy is not None for one in after.markings)
 
 
 def test_the_document_names_every_fate():

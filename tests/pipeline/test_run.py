@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections import Counter
 from pathlib import Path
 
 import cv2
@@ -119,6 +120,8 @@ def test_the_files_of_a_result_can_be_read_back(result):
     metrics = json.loads((result / "metrics.json").read_text())
     assert len(hd_map.markings) == metrics["results"]["both"]["Opt"]["markings"]
     assert all(marking.covariance_m2 is not None for marking in hd_map.markings)
+    accuracies = Counter(paint.accuracy for paint in (*hd_map.markings, *hd_map.symbols))
+    assert accuracies == Counter(metrics["results"]["both"]["Opt"]["accuracy"])
     for camera in ("front", "rear"):
         calibration = read_calibration(result / f"calibration_{camera}.yaml")
         assert calibration.covariance is not None
@@ -192,6 +195,10 @@ def test_a_drive_past_nothing_fails_and_says_that_no_marking_was_found(tiny_driv
         ({"mapping": MappingOptions(model_floor_px=-0.1)}, "mapping.model_floor_px is -0.1"),
         ({"mapping": MappingOptions(lanes=LaneOptions(max_range_m=float("nan")))}, "mapping.lanes.max_range"),
         ({"mapping": MappingOptions(acceptance=AcceptanceOptions(min_probability=50))}, "probability is 50"),
+        (
+            {"mapping": MappingOptions(acceptance=AcceptanceOptions(accuracy="D"))},
+            "mapping.acceptance.accuracy is 'D'; choose from A, B or C.",
+        ),
         ({"detector": DetectorOptions(model="no such.onnx")}, "no such.onnx"),
         ({"export": ["geojson", "shp"]}, "export: unknown format 'shp'"),
     ],

@@ -161,6 +161,14 @@ def test_a_mirrored_path_is_told_although_most_of_a_straight_route_matches_as_gi
     assert not clock_corrections(bent)
 
 
+def test_a_clock_that_runs_off_is_no_wrong_yaw_although_more_ground_matches_along_the_smooth_path():
+    smoother = {Reading.AS_GIVEN: 0.54, Reading.HEADING_FROM_PATH: 0.62}
+    fast = {name: replace(estimate(name, clock_s=-0.039), shares=smoother) for name in ("front", "rear")}
+    assert list(raised(check_ground(drive(poses(), ("front", "rear")), fast))) == ["clock"]
+    assert path_of(fast) is Path.AS_GIVEN
+    assert set(clock_corrections(fast)) == {"front", "rear"}
+
+
 def test_a_clean_drive_that_matches_mirrored_as_well_is_taken_as_given():
     alike = replace(estimate(), shares={Reading.AS_GIVEN: 0.41, Reading.MIRRORED: 0.52})
     assert not raised(check_ground(drive(poses()), {"front": alike}))

@@ -17,7 +17,7 @@ from v2hdm.records import Calibration, Exclusion, GroundStrip, HDMap
 from v2hdm.site.candidates import LACKS_A_CORNER
 from v2hdm.verdict import Finding, Status, Verdict
 from v2hdm.verdict.results.accuracy import SIGNIFICANCE, check_frame, check_goal, check_points
-from v2hdm.verdict.results.solution import check_inputs, check_solution, over_ground
+from v2hdm.verdict.results.solution import check_inputs, check_solution, over_ground, told_by_poses
 
 FIT = CameraFit(observations=2000, variance_factor=0.15, rejected_share=0.02)
 
@@ -55,6 +55,22 @@ def result(evidence=FINE, *markings, **changes):
 def raised(one, drive):
     found = check_solution(drive, {"both": {"Opt": one}})
     return {finding.check: finding for finding in found if finding.status is not Status.PASS}
+
+
+@pytest.mark.parametrize(
+    ("check", "status", "about", "kept"),
+    [
+        ("heading", Status.FAIL, "poses", False),
+        ("heading", Status.WARN, "poses", True),
+        ("focal length", Status.FAIL, "front", True),
+    ],
+    ids=["under poses that failed", "under poses that may be right", "beside a camera that failed"],
+)
+def test_what_a_solve_contradicts_is_told_but_under_poses_that_failed(check, status, about, kept):
+    before = Finding(check, status, 1.0, 0.5, "", "it is wrong", about)
+    passed = Finding("survey", Status.PASS, 1.0, 4.0, "sigmas", "it agrees", "front")
+    late = Finding("clock", Status.FAIL, 9.0, 4.0, "sigmas", "it is late", "front, rear")
+    assert told_by_poses([late, passed], [before]) == ([late, passed] if kept else [passed])
 
 
 def test_a_clean_result_raises_nothing(drive):

@@ -325,11 +325,11 @@ def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
         lanes = draw_lanes(bundle.knots, solution)
     else:
         lanes = _lanes(inputs, ground_by_rig(drive, cameras, bundle.rig, surface))
-    infos = [drive.cameras[name].info for name in inputs.sightings.cameras]
     symbols, no_symbols = map_symbols(
         inputs.optimiser.sightings.symbols,
         bundle.rig,
-        infos,
+        views_of(drive, inputs.sightings.cameras),
+        [drive.cameras[name] for name in inputs.sightings.cameras],
         noise.roll_pitch_rad,
         optimised.markings,
         options.acceptance,

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 from v2hdm.errors import ConfigError
+from v2hdm.records import ACCURACIES
+from v2hdm.safe.texts import shown
 from v2hdm.settings import NO_KEY, NOT_NEGATIVE, POSITIVE, Within, check_settings
 from v2hdm.site.options import AFTER, JOINT, AcceptanceOptions, LaneOptions
 
@@ -159,6 +161,12 @@ def check_options(options: MappingOptions, kinds: Sequence[str] | None = None) -
             raise ConfigError(f"{key} is '{value}'; choose {which}.")
     if options.lanes.model not in (AFTER, JOINT):
         raise ConfigError(f"mapping.lanes.model is '{options.lanes.model}'; choose {AFTER} or {JOINT}.")
+    if options.acceptance.accuracy not in ACCURACIES:
+        *better, worst = ACCURACIES
+        raise ConfigError(
+            f"mapping.acceptance.accuracy is {shown(options.acceptance.accuracy)}; "
+            f"choose from {', '.join(better)} or {worst}."
+        )
     check_settings(options, "mapping.")
     for kind, size in options.known_sizes.by_class_m.items():
         key = f"mapping.known_sizes.by_class_m.{kind}"

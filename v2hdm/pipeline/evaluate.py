@@ -12,7 +12,7 @@ import numpy as np
 from v2hdm.geometry.ipm import initial_extrinsic
 from v2hdm.io.drive.truth import has_truth, read_truth
 from v2hdm.mapping.results import MethodResult
-from v2hdm.records import BEST, Drive, Truth
+from v2hdm.records import ACCURACIES, BEST, Drive, Truth
 from v2hdm.report.metrics import driven_past, extrinsic_figures, headline, map_figures
 
 CameraSets = Mapping[str, Mapping[str, MethodResult]]  # by cameras (front, both), then method
@@ -52,11 +52,14 @@ def _own_figures(result: MethodResult) -> dict[str, Any]:
     covariances = [marking.covariance_m2 for marking in result.hd_map.markings]
     # The mean variance of a corner's coordinate, by marking.
     variance = [np.trace(covariance) / 8 for covariance in covariances if covariance is not None]
+    grades = Counter(result.hd_map.accuracies)
     figures: dict[str, Any] = {
         "excluded": len(result.excluded),
         "excluded_for": dict(reasons.most_common()),
         "median_sigma_m": float(np.sqrt(np.median(variance))) if variance else float("nan"),
     }
+    if grades:
+        figures["accuracy"] = {grade: grades[grade] for grade in ACCURACIES}
     if result.reprojection_rmse_px is not None:
         figures["reprojection_rmse_px"] = result.reprojection_rmse_px
         figures["initial_reprojection_rmse_px"] = result.initial_reprojection_rmse_px

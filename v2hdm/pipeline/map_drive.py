@@ -16,14 +16,15 @@ from v2hdm.detection.weights import unknown_network
 from v2hdm.errors import AdjustError, MappingError
 from v2hdm.io.drive import ReadOptions, as_drive, join_drives
 from v2hdm.io.maps.corrections import read_corrections
-from v2hdm.mapping.options import AUTO, MappingOptions
+from v2hdm.mapping.options import AUTO, MappingOptions, check_options
 from v2hdm.pipeline.base import changes_json, check_together, grey_reader, read_base
 from v2hdm.pipeline.config import ACCURACY_GOAL_CM, Contents, check_choice
 from v2hdm.pipeline.context import Context
-from v2hdm.pipeline.evaluate import evaluate
+from v2hdm.pipeline.evaluate import CameraSets, evaluate
+from v2hdm.pipeline.grades import accurate_enough, graded_sets, of_all_grades
 from v2hdm.pipeline.inspect import Inspection, inspect_each, join
 from v2hdm.pipeline.result import Result, describe_run
-from v2hdm.pipeline.stages import MappedSet, detect_in_pieces, map_camera_sets
+from v2hdm.pipeline.stages import MappedSet, detect_in_pieces, map_camera_sets, methods_of
 from v2hdm.progress import Progress, silent
 from v2hdm.records import BEST, Drive, ImageDetections
 from v2hdm.site.living.changes import Base
@@ -32,7 +33,7 @@ from v2hdm.store.cache import StageCache
 from v2hdm.survey.run import Survey, check_survey, take_survey
 from v2hdm.verdict import Finding, Status, Verdict
 from v2hdm.verdict.results.accuracy import check_corrections, check_goal, check_known_sizes
-from v2hdm.verdict.results.solution import check_result, over_ground
+from v2hdm.verdict.results.solution import check_result, over_ground, told_by_poses
 
 if TYPE_CHECKING:
     from v2hdm.detection.detector import Detector
@@ -75,7 +76,8 @@ def map_drive(
         reading: how folders are read.
         base: the map.geojson of an earlier result, which the drive brings up to date.
         corrections: the file of what a person says of an earlier map of the drive (``v2hdm view``).
-        accuracy_goal_cm: the 95 % radius, cm, within which map and calibrations have to be known for a PASS.
+        accuracy_goal_cm: the 95 % radius, cm, within which map and calibrations have to be known for a PASS;
+            it grades the accuracy of every marking.
         name: of the result; None takes that of the drive.
         cache: folder that keeps what each stage has found for the next call; None keeps nothing.
         progress: shows how far the long steps are, ``progress(task, done, total)``.
@@ -101,6 +103,7 @@ def map_drive(
         stated = read_corrections(Path(corrections))
         options = replace(options, acceptance=replace(options.acceptance, corrections=stated))
     sources = [drive] if isinstance(drive, Source) else list(drive)
+    check_options(options)
     check_choice(options, len(sources), base is not None, accuracy_goal_cm)
     read = read_all(sources, reading, context)
     earlier = _earlier(base, read.whole, context)
@@ -142,16 +145,19 @@ def _mapped(
             detections = _detect(inspection.drive, mapped_so_far.contents, settings, context)
         with context.timed("map"):
             key = mapped_so_far.contents.key(inspection.drive)
-            sets = map_camera_sets(inspection.drive, key, detections, survey, earlier, context)
+            all_grades = of_all_grades(survey)
+            mapped = map_camera_sets(inspection.drive, key, detections, all_grades, earlier, context)
+            sets = graded_sets(mapped, goal_cm / 100)
         with context.timed("wear"):
             sets = _with_wear(sets, inspection.drive, earlier, context)
+        chosen = accurate_enough(methods_of(sets), survey.mapping.acceptance.accuracy)
     except (MappingError, AdjustError) as failure:
         if all(finding.status is not Status.FAIL for finding in inspection.findings):
             raise
         failed = Finding("map", Status.FAIL, None, None, "", f"this drive gave no map: {failure}", "map")
         verdict = Verdict.of([*inspection.findings, failed])
         return replace(mapped_so_far, verdict=verdict, figures={"results": {}})
-    return _judge(mapped_so_far, inspection, detections, sets, survey, goal_cm, context)
+    return _judge(mapped_so_far, inspection, detections, sets, chosen, survey, goal_cm, context)
 
 
 def read_all(sources: Sequence[Source], options: ReadOptions, context: Context) -> Read:
@@ -211,26 +217,29 @@ def _judge(
     inspection: Inspection,
     detections: Sequence[ImageDetections],
     sets: dict[str, MappedSet],
+    chosen: CameraSets,
     survey: Survey,
     goal_cm: float,
     context: Context,
 ) -> Result:
-    methods = {name: mapped.methods for name, mapped in sets.items()}
+    """The result, of the maps ``chosen``; everything that was mapped is evidence on the inputs."""
+    methods = methods_of(sets)
     best = list(methods.values())[-1][BEST]
     check_points = list(sets.values())[-1].checked
     with context.timed("judge"):
-        result_findings = check_result(inspection.drive, methods, inspection.ground)
+        solved_findings = check_result(inspection.drive, methods, inspection.ground)
+        result_findings = told_by_poses(solved_findings, inspection.findings)
         unfit_findings = check_known_sizes(survey.mapping.known_sizes, best)
         unfit_findings += check_corrections(survey.mapping.acceptance.corrections, best)
         frame = "survey" if best.diagnostics["control_points"] else "poses"
-        goal_findings = check_goal(best, goal_cm / 100, frame)
+        goal_findings = check_goal(list(chosen.values())[-1][BEST], goal_cm / 100, frame)
         survey_findings = check_survey(survey, best, check_points)
         input_findings = over_ground(inspection.findings, best, survey.mapping.ground == AUTO)
         verdict = Verdict.of(
             [*input_findings, *result_findings, *unfit_findings, *survey_findings, *goal_findings]
         )
     with context.timed("evaluate"):
-        metrics, headlines = evaluate(result.drive, methods)
+        metrics, headlines = evaluate(result.drive, chosen)
     changes = {} if best.changes is None else {"changes": changes_json(best.changes)}
     figures = {**metrics, **changes, "seconds": context.seconds}
     if check_points is not None:
@@ -242,6 +251,6 @@ def _judge(
         figures=figures,
         headlines=headlines,
         detections=tuple(detections),
-        methods=methods,
+        methods=chosen,
         check_points=check_points,
     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import parent_process
@@ -118,6 +118,11 @@ class MappedSet:
 
     methods: dict[str, MethodResult]
     checked: CheckTable | None = None
+
+
+def methods_of(sets: Mapping[str, MappedSet]) -> dict[str, dict[str, MethodResult]]:
+    """Results by camera set, then by method."""
+    return {name: mapped.methods for name, mapped in sets.items()}
 
 
 def camera_sets(drive: Drive) -> dict[str, tuple[str, ...]]:

@@ -20,6 +20,8 @@ _KNOWN_SIGMA_M = 0.5  # largest sigma, m, of a known corner: a fraction of any m
 
 TOO_UNCERTAIN = "its position is too uncertain"
 LACKS_A_CORNER = "a corner was never seen twice"
+SEEN_SELDOM = "seen in too few images"
+FOUND_SELDOM = "found in too few of its images"
 
 _OTHER_EDGE_M = 0.3
 """Sigma, m, of a sighting's edge, such as a worn end's, about where others see it; what lies farther off is

@@ -15,7 +15,15 @@ from scipy.stats import beta, f
 
 from v2hdm.errors import MappingError
 from v2hdm.records import Exclusion, FloatArray, IntArray, Marking
-from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN, Candidates, Counts, variance_prior
+from v2hdm.site.candidates import (
+    FOUND_SELDOM,
+    LACKS_A_CORNER,
+    SEEN_SELDOM,
+    TOO_UNCERTAIN,
+    Candidates,
+    Counts,
+    variance_prior,
+)
 from v2hdm.site.corrections import MAX_OVERLAP, Stated, overlap
 from v2hdm.site.hypotheses import Kind
 from v2hdm.site.options import AcceptanceOptions
@@ -26,12 +34,15 @@ OF_SYMBOL = "part of other paint, such as an arrow or a solid line"
 COVERED = "overlaps a better supported marking"
 _CLUTTER_BY = (
     "not shaped like a marking of its class",
-    "seen in too few images",
-    "found in too few of its images",
+    SEEN_SELDOM,
+    FOUND_SELDOM,
     "its sightings contradict each other",
     "does not look like its class",
 )
 """Reasons for clutter, in the order of :attr:`Posterior.evidence`."""
+
+_MAX_SIGMA_M = 0.06
+"""How far the sigma of a marking's worst corner, m, may exceed that of the map's best; goes with the gate."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +133,7 @@ def classify(
     sigma_m = judged.candidates.sigma_m.max(axis=1)
     seen_corners = solved.known.sum(axis=1)
     # The best one's uncertainty is common to all: a shift of the whole map speaks against no marking.
-    uncertain = sigma_m**2 > np.min(sigma_m, initial=np.inf) ** 2 + options.max_sigma_m**2
+    uncertain = sigma_m**2 > np.min(sigma_m, initial=np.inf) ** 2 + _MAX_SIGMA_M**2
     for group in np.flatnonzero(uncertain).tolist():
         verdict[group] = TOO_UNCERTAIN if seen_corners[group] == 4 else LACKS_A_CORNER
     objections = parallax.objections(options.min_probability)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from v2hdm.io.maps.corrections import Correction
+from v2hdm.records import ACCURACIES
 from v2hdm.settings import NOT_NEGATIVE, Within
 
 
@@ -19,11 +20,9 @@ class AcceptanceOptions:
         "A candidate must be a marking (by shape and detections) and lie on the ground (by parallax) with "
         "at least min_probability.",
     ] = 0.9
-    max_sigma_m: Annotated[
-        float,
-        NOT_NEGATIVE,
-        "The sigma of its worst corner may exceed that of the map's best by max_sigma_m at most.",
-    ] = 0.06
+    accuracy: Annotated[
+        str, "markings of a worse grade are left out of the map: A, B or C (none is left out)."
+    ] = ACCURACIES[-1]
     corrections: Annotated[list[Correction], "a person's decisions, from the file map.corrections."] = field(
         default_factory=list
     )

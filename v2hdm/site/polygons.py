@@ -111,14 +111,14 @@ class Polygon:
     """The ``vertices`` (N, 2), m, of a symbol, counter-clockwise, in the order of its template.
 
     ``covariance`` (2N, 2N), m^2, is of the stacked vertices, ``data`` the information from images alone,
-    ``pull`` (2N,) the gradient of the log prior; ``evidence`` is the log marginal likelihood, ``explained``
-    the fraction of the outlines along its edges.
+    ``gradient`` (2N,) that of their log-likelihood; ``evidence`` is the log marginal likelihood,
+    ``explained`` the fraction of the outlines along its edges.
     """
 
     vertices: FloatArray
     covariance: FloatArray
     data: FloatArray
-    pull: FloatArray
+    gradient: FloatArray
     evidence: float
     explained: float
 
@@ -296,7 +296,7 @@ class _Template:
             # Information of the images on the template, the symbol's own deviations marginalised.
             gain = spread @ np.linalg.inv(data + spread)
             member_information = gain @ data
-            pull = gain @ (data @ vertices_of_template - turn.T @ member.pull)
+            pull = gain @ (data @ vertices_of_template + turn.T @ member.gradient)
             information.append(member_information)
             pulls.append(pull)
             # Second moments of those deviations given the images (expectation maximisation).
@@ -375,7 +375,8 @@ def _fit(traces: Traces, start: FloatArray, prior: Prior, steps: int = _STEPS) -
         vertices=vertices,
         covariance=np.linalg.inv(data + precision),
         data=data,
-        pull=precision @ off,
+        # Linear in the last step: nothing pulls a vertex that no image shows, converged or not.
+        gradient=equations.gradient - data @ step,
         evidence=float(evidence),
         explained=float(pieces.weight.sum() / max(traces.weight.sum(), 1e-9)),
     )

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import betaln, logsumexp
+from scipy.special import betaln, expit, logsumexp
 from scipy.stats import f, norm, t
 
 from v2hdm.records import FloatArray, IntArray
@@ -141,14 +141,8 @@ def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
 
 def _counted(counts: Counts, weight: FloatArray) -> FloatArray:
     """Log-likelihoods (4, N, 3) of images, easy views, others, appearance; marking, other paint, clutter."""
-    images = np.maximum(counts.images, 1)
-    stay = 1 - (weight.sum() + 1) / (weight @ images + 2)
-    repeated = _geometric(images, _CLUTTER_REPEATS)
-    shown = np.stack([_geometric(images, stay), repeated, repeated], axis=1)
-    rate = float((weight @ counts.detected_views + 1) / (weight @ counts.easy_views + 2))
-    of_marking = log_found(counts.detected_views, counts.easy_views, rate)
-    of_clutter = _rates(counts.detected_views, counts.easy_views, _CLUTTER_FOUND)
-    detected = np.stack([of_marking, of_clutter, of_clutter], axis=1)
+    repetition = _repetition(counts.images, counts.easy_views, counts.detected_views, weight)
+    shown, detected = repetition[..., [0, 1, 1]]
     agree = counts.agreeing
     differ = counts.observations - counts.agreeing
     right, wrong = (agree[:, None] * np.log(p) + differ[:, None] * np.log1p(-p) for p in _AGREEING)
@@ -167,6 +161,46 @@ def _counted(counts: Counts, weight: FloatArray) -> FloatArray:
     either = np.logaddexp(alike, unlike) - np.log(2)
     looks = np.stack([alike, either, unlike], axis=1) * is_in_images[:, None]
     return np.stack([shown, detected, agreement, looks])
+
+
+def _repetition(
+    images: IntArray, easy_views: IntArray, detected_views: IntArray, weight: FloatArray
+) -> FloatArray:
+    """Log-likelihoods (2, N, 2) of images and easy views, of paint and of clutter.
+
+    Paint, with ``weight`` (N,), is found in nearly every easy view, clutter in some.
+    """
+    images = np.maximum(images, 1)
+    stay = 1 - (weight.sum() + 1) / (weight @ images + 2)
+    shown = np.stack([_geometric(images, stay), _geometric(images, _CLUTTER_REPEATS)], axis=1)
+    rate = float((weight @ detected_views + 1) / (weight @ easy_views + 2))
+    of_paint = log_found(detected_views, easy_views, rate)
+    of_clutter = _rates(detected_views, easy_views, _CLUTTER_FOUND)
+    return np.stack([shown, np.stack([of_paint, of_clutter], axis=1)])
+
+
+class Presence(NamedTuple):
+    """Whether N symbols are paint."""
+
+    log_odds: FloatArray  # (N,)
+    evidence: FloatArray  # (N, 2) nats for paint, from the number of images and the detections in easy views
+
+
+def symbols_presence(images: IntArray, easy_views: IntArray, detected_views: IntArray) -> Presence:
+    """Posterior of N symbols of one class: painted, or clutter such as erased paint or an edge of shade.
+
+    Clutter may have the shape of a symbol, and repeats too, but in fewer of the ``easy_views`` (N,).
+    """
+    of_paint = _PRIOR_COUNT[: Kind.PART_OF_SYMBOL].sum()
+    of_clutter = _PRIOR_COUNT[Kind.PART_OF_SYMBOL :].sum()
+    weight = (2 * detected_views >= easy_views).astype(np.float64)
+    for _ in range(_PASSES):
+        painted, clutter = np.moveaxis(_repetition(images, easy_views, detected_views, weight), 2, 0)
+        evidence = (painted - clutter).T
+        prior = np.log((of_paint + weight.sum()) / (of_clutter + (1 - weight).sum()))
+        log_odds = prior + evidence.sum(axis=1)
+        weight = expit(log_odds)
+    return Presence(log_odds, evidence)
 
 
 def _vague_evidence(counts: Counts, weight: FloatArray) -> FloatArray:

@@ -14,6 +14,7 @@ from functools import cached_property
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -21,7 +22,7 @@ from skimage.draw import polygon
 from skimage.measure import approximate_polygon, find_contours
 
 from v2hdm.adjust import PoseSigma
-from v2hdm.association.ground import BORDER_PX, outlines_on_ground
+from v2hdm.association.ground import BORDER_PX, Views, easy_views, outlines_on_ground
 from v2hdm.association.sightings import Rig, Symbols
 from v2hdm.association.tracks import LEAST_SIGHTINGS
 from v2hdm.geometry.ipm import apply_in_front, pinhole_px_from_ground, project_ground
@@ -30,6 +31,7 @@ from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import (
     OUTLINE_SIGMA_PX,
     BoolArray,
+    Camera,
     CameraInfo,
     Exclusion,
     FloatArray,
@@ -37,10 +39,11 @@ from v2hdm.records import (
     Marking,
     Symbol,
 )
-from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN
+from v2hdm.site.candidates import FOUND_SELDOM, LACKS_A_CORNER, SEEN_SELDOM
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import PointViews, measure_parallax
 from v2hdm.site.polygons import LEAST_EXPLAINED, UNSEEN_M, Polygon, Traces, find_polygons
+from v2hdm.site.posterior import symbols_presence
 
 _CELL_M = 0.02
 """Cells of the average, m; its contour is interpolated between them and simplified by half a cell."""
@@ -57,28 +60,91 @@ _COMMON = 0.5  # least overlap of outlines of one symbol, relative to the smalle
 def map_symbols(
     symbols: Symbols,
     rig: Rig,
-    infos: Sequence[CameraInfo],
+    views: Views,
+    cameras: Sequence[Camera],
     jitter_rad: float,
     markings: Sequence[Marking],
     options: AcceptanceOptions,
 ) -> tuple[tuple[Symbol, ...], tuple[Exclusion, ...]]:
-    """Symbols in at least three images, and rejected ones that are no polygons on the ground.
+    """Symbols that are painted, in at least three images, and polygons on the ground; and rejected ones.
 
-    ``infos`` are the rig's cameras; ``jitter_rad``, the standard deviation of the viewing direction, makes
-    distant outlines uncertain. Paint of the map's ``markings`` is no symbol; ``options`` apply as to
-    markings.
+    ``views`` are all images of ``cameras``, the rig's; ``jitter_rad``, the standard deviation of the viewing
+    direction, makes distant outlines uncertain. Paint of the map's ``markings`` is no symbol; ``options``
+    apply as to markings. How well vertices are known is no reason against a symbol, unless it has no shape.
     """
+    infos = [camera.info for camera in cameras]
+    places = _places(symbols, rig, infos, jitter_rad, markings)
+    reasons = _absences(places, views, rig, cameras, options.min_probability)
+    for number, place in enumerate(places):
+        if reasons[number] is None:
+            # The border or a shadow may hide one end in some images: then the other is used.
+            ends = [_ends(place.outlines_map, place.image, place.eyes, sign) for sign in (1, -1)]
+            objections = [measure_parallax(end, 1).objections(options.min_probability)[0] for end in ends]
+            reasons[number] = None if None in objections else objections[0]
+    standing = [place for place, reason in zip(places, reasons, strict=True) if reason is None]
+    exclusions = [
+        Exclusion(place.kind, place.outline_map.mean(axis=0), place.images, reason)
+        for place, reason in zip(places, reasons, strict=True)
+        if reason is not None
+    ]
+    polygons = find_polygons(
+        [place.kind for place in standing],
+        [place.eyes.traces(place.outlines_map, place.seen_sides, place.image) for place in standing],
+        [place.outline_map for place in standing],
+    )
+    accepted = []
+    for place, fitted in zip(standing, polygons, strict=True):
+        reason = _objection(fitted)
+        if reason is None:
+            symbol = Symbol(place.kind, place.outline_map, place.images)
+            accepted.append(_with_vertices(symbol, fitted, markings))
+        else:
+            exclusions.append(Exclusion(place.kind, fitted.vertices.mean(axis=0), place.images, reason))
+    return tuple(accepted), tuple(exclusions)
+
+
+def _objection(polygon: Polygon) -> str | None:
+    """Reason why a polygon is not the shape of a symbol, or None."""
+    if polygon.explained < LEAST_EXPLAINED or not is_simple(polygon.vertices):
+        return NO_POLYGON
+    variance_m2 = np.diag(polygon.covariance).reshape(-1, 2).sum(axis=1)
+    return LACKS_A_CORNER if variance_m2.max() > UNSEEN_M**2 else None
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Outlines (K, 2), m, on the ground that overlap, S of them; ``image`` (S,) numbers those of ``eyes``."""
+
+    kind: str
+    outline_map: FloatArray  # (N, 2) m, what they have in common
+    outlines_map: Sequence[FloatArray]
+    seen_sides: Sequence[BoolArray]
+    image: IntArray
+    eyes: _Eyes
+
+    @property
+    def images(self) -> int:
+        """The number of images with such an outline."""
+        return len(self.eyes.camera)
+
+
+def _places(
+    symbols: Symbols,
+    rig: Rig,
+    infos: Sequence[CameraInfo],
+    jitter_rad: float,
+    markings: Sequence[Marking],
+) -> list[_Place]:
+    """Places with an outline in enough images for an average, except where a marking of the map lies."""
     grounds = {
         row: outline for row, outline in enumerate(outlines_on_ground(symbols, rig)) if outline is not None
     }
+    if not grounds:
+        return []
     rows = np.array(list(grounds), dtype=np.int64)
     shapes = list(grounds.values())
-    if not shapes:
-        return (), ()
-    places = np.array([marking.corners_map.mean(axis=0) for marking in markings]).reshape(-1, 2)
-    symbols_found = []
-    exclusions = []
-    traces = []
+    centres_map = np.array([marking.corners_map.mean(axis=0) for marking in markings]).reshape(-1, 2)
+    places = []
     for members in _groups(shapes):
         image_of_member = np.stack([symbols.camera[rows[members]], symbols.frame[rows[members]]])
         (camera, frame), image = np.unique(image_of_member, axis=1, return_inverse=True)
@@ -87,44 +153,55 @@ def map_symbols(
         eyes = _Eyes(camera, frame, rig, infos, jitter_rad)
         outlines = [shapes[n] for n in members]
         outline = _fused_outline(outlines, image.ravel(), eyes)
-        if outline is None:
-            continue
-        middle = outline.mean(axis=0)
-        size_m = np.ptp(outline, axis=0).max()
-        ring = (outline - middle).astype(np.float32)
-        in_reach = np.linalg.norm(places - middle, axis=1) < size_m
-        if any(cv2.pointPolygonTest(ring, place.tolist(), False) >= 0 for place in places[in_reach] - middle):
+        if outline is None or _holds_any(outline, centres_map):
             continue
         kind = Counter(symbols.kinds[n] for n in rows[members]).most_common(1)[0][0]
-        # The border or a shadow may hide one end in some images: then the other is used.
-        views = [_ends(outlines, image.ravel(), eyes, sign) for sign in (1, -1)]
-        objections = [measure_parallax(view, 1).objections(options.min_probability)[0] for view in views]
-        if None in objections:
-            symbols_found.append(Symbol(kind, outline, len(camera)))
-            sides = [symbols.seen_sides[n] for n in rows[members]]
-            traces.append(eyes.traces(outlines, sides, image.ravel()))
-        else:
-            exclusions.append(Exclusion(kind, middle, len(camera), objections[0] or ""))
-    kinds = [symbol.kind for symbol in symbols_found]
-    polygons = find_polygons(kinds, traces, [symbol.outline_map for symbol in symbols_found])
-    accepted = []
-    for symbol, fitted in zip(symbols_found, polygons, strict=True):
-        reason = _objection(fitted, options.max_sigma_m)
-        if reason is None:
-            accepted.append(_with_vertices(symbol, fitted, markings))
-        else:
-            exclusions.append(Exclusion(symbol.kind, fitted.vertices.mean(axis=0), symbol.sightings, reason))
-    return tuple(accepted), tuple(exclusions)
+        sides = [symbols.seen_sides[n] for n in rows[members]]
+        places.append(_Place(kind, outline, outlines, sides, image.ravel(), eyes))
+    return places
 
 
-def _objection(polygon: Polygon, max_sigma_m: float) -> str | None:
-    """Reason why a polygon is not the shape of a symbol, or None."""
-    if polygon.explained < LEAST_EXPLAINED or not is_simple(polygon.vertices):
-        return NO_POLYGON
-    variance_m2 = np.diag(polygon.covariance).reshape(-1, 2).sum(axis=1)
-    if variance_m2.max() > UNSEEN_M**2:
-        return LACKS_A_CORNER
-    return TOO_UNCERTAIN if variance_m2.max() > max_sigma_m**2 else None
+def _holds_any(outline: FloatArray, points_map: FloatArray) -> bool:
+    """Whether any of points (M, 2) lies within an outline (N, 2)."""
+    middle = outline.mean(axis=0)
+    ring = (outline - middle).astype(np.float32)
+    offset_m = points_map - middle
+    in_reach = np.linalg.norm(offset_m, axis=1) < np.ptp(outline, axis=0).max()
+    return any(cv2.pointPolygonTest(ring, offset.tolist(), False) >= 0 for offset in offset_m[in_reach])
+
+
+def _absences(
+    places: Sequence[_Place], views: Views, rig: Rig, cameras: Sequence[Camera], min_probability: float
+) -> list[str | None]:
+    """Why each place has no paint, or None: it is found in too few of the images that show it well."""
+    boxes = [cv2.boxPoints(cv2.minAreaRect(_about_middle(place))) for place in places]
+    corners_map = np.array(
+        [box + place.outline_map.mean(axis=0) for box, place in zip(boxes, places, strict=True)]
+    ).reshape(-1, 4, 2)
+    number, image = easy_views(views, rig, cameras, corners_map)
+    easy = np.bincount(number, minlength=len(places))
+    row_of_image = {index: row for row, index in enumerate(views.image.tolist())}
+    detected = np.zeros(len(places), dtype=np.int64)
+    shown = [set(zip(place.eyes.camera.tolist(), place.eyes.frame.tolist(), strict=True)) for place in places]
+    for place, index in zip(number.tolist(), image.tolist(), strict=True):
+        row = row_of_image[index]
+        detected[place] += (int(views.camera[row]), int(views.frame[row])) in shown[place]
+    least = np.log(min_probability / (1 - min_probability))
+    reasons: list[str | None] = [None] * len(places)
+    kinds = np.array([place.kind for place in places])
+    images = np.array([place.images for place in places])
+    for kind in np.unique(kinds):
+        members = np.flatnonzero(kinds == kind)
+        judged = symbols_presence(images[members], easy[members], detected[members])
+        for place, odds, evidence in zip(members, judged.log_odds, judged.evidence, strict=True):
+            if odds < least:
+                reasons[place] = (SEEN_SELDOM, FOUND_SELDOM)[int(evidence.argmin())]
+    return reasons
+
+
+def _about_middle(place: _Place) -> NDArray[np.float32]:
+    """The common outline (N, 2) about its middle."""
+    return np.asarray(place.outline_map - place.outline_map.mean(axis=0), dtype=np.float32)
 
 
 def _with_vertices(symbol: Symbol, polygon: Polygon, markings: Sequence[Marking]) -> Symbol:

@@ -14,9 +14,12 @@ from v2hdm.simulate.port.config import CameraConfig, PortConfig
 
 ROUTES = ("straight", "bends", "turning")
 
-_DRAWN, _ROAD = 31, 32  # streams of a seed; a port's own are small numbers
+_DRAWN, _ROAD, _TURNS = 31, 32, 33  # streams of a seed; a port's own are small numbers
 _LEAST_LEFT_M = 30.0  # of a route for another bend
 _ROAD_SHARE = 1 / 3  # of the drives that have one
+_IN_TURN_SHARE = 1 / 3  # of the drives whose cameras fire in turn
+_STREAM_HZ = 20.0  # rate of the poses of these, as receivers send them
+_APART_LOW_S, _APART_HIGH_S = 0.015, 0.05  # least and most time from camera to camera that is drawn
 
 
 @dataclass(frozen=True)
@@ -102,7 +105,8 @@ class Recipe:
     ``default_noise``: the user states no noise of the poses. ``road`` is None for level ground under a
     receiver that records neither height nor roll and pitch; else it records these, with the errors of roll
     and pitch that ``poses`` has, beside the vehicle's sway. ``relief`` is what the ground does beside:
-    ``grade``, ``ramp`` or ``crest``.
+    ``grade``, ``ramp`` or ``crest``. Cameras fire ``apart_s`` after each other: between poses of a stream, so
+    that neighbouring images share the noise of these.
     """
 
     seed: int
@@ -113,21 +117,32 @@ class Recipe:
     default_noise: bool
     road: RoadShape | None
     relief: str = ""
+    apart_s: float = 0.0
 
     def as_modelled(self) -> Recipe:
         """The same with all errors stated as they are, and none that the product does not reckon with."""
         poses = replace(self.poses, smooth=False)
         detector = replace(self.detector, sigma_spread=0.0, stated_factor=1.0, missed=0.0, false=0.0, cut=0.0)
-        return replace(self, poses=poses, detector=detector, default_noise=False, road=None)
+        return replace(self, poses=poses, detector=detector, default_noise=False, road=None, apart_s=0.0)
 
     def recorded(self, relief: str) -> Recipe:
         """The same under a receiver that records the road, which has this ``relief`` beside its own shape."""
         road = self.road or RoadShape(5e-4, 40.0, (0.002, -0.002), 1.5 * self.poses.position_drift_m)
         return replace(self, road=road, relief=relief)
 
+    def in_turn(self, apart_s: float) -> Recipe:
+        """The same by cameras that fire in turn, under a stream of poses."""
+        route = replace(self.port.route, pose_rate_hz=_STREAM_HZ)
+        return replace(self, port=replace(self.port, route=route), apart_s=apart_s)
+
     def as_figures(self) -> dict[str, Any]:
         """What was drawn, for the record."""
-        return {**asdict(self.poses), **asdict(self.detector), "road": self.road and asdict(self.road)}
+        return {
+            **asdict(self.poses),
+            **asdict(self.detector),
+            "road": self.road and asdict(self.road),
+            "apart_s": self.apart_s,
+        }
 
     @property
     def name(self) -> str:
@@ -157,6 +172,12 @@ def draw(seed: int, route: str | None = None) -> Recipe:
         cut=float(rng.uniform(0.0, 0.02)),
     )
     return Recipe(seed, route, _port(rng, seed, route), poses, detector, default_noise, _road(seed, poses))
+
+
+def draw_apart_s(seed: int) -> float:
+    """Time from camera to camera: none in two thirds of the drives."""
+    rng = np.random.default_rng([seed, _TURNS])
+    return float(rng.uniform(_APART_LOW_S, _APART_HIGH_S)) if rng.random() < _IN_TURN_SHARE else 0.0
 
 
 def _road(seed: int, poses: PoseErrors) -> RoadShape | None:

@@ -12,6 +12,9 @@ from tests.benchmarks.made.world import HALF_TRACK_M, World, beside, make
 from v2hdm.geometry.rigid import heading_rad, rotation_from_euler
 from v2hdm.records import FloatArray, Trajectory
 
+APART_S = 0.037
+"""Time from camera to camera where these fire in turn: that of a recorder of eight images a second."""
+
 
 @dataclass(frozen=True)
 class Spoil:
@@ -39,7 +42,7 @@ def _with_poses(world: World, change: Callable[[FloatArray], FloatArray]) -> Wor
 
 
 def _with_stamps(world: World, change: Callable[[FloatArray], FloatArray]) -> World:
-    """Other stamps of the images, of all cameras alike."""
+    """Other stamps (F,) of the images, of all cameras alike."""
     return replace(world, stamp_s={name: change(stamp_s) for name, stamp_s in world.stamp_s.items()})
 
 
@@ -56,7 +59,8 @@ def _step(shift_m: float, world: World) -> World:
 
 def _fast_clock(share: float, world: World) -> World:
     """The images' clock runs fast, and was right when the drive began."""
-    return _with_stamps(world, lambda stamp_s: stamp_s[0] + (1 + share) * (stamp_s - stamp_s[0]))
+    begin_s = world.taken_s[0]
+    return _with_stamps(world, lambda stamp_s: begin_s + (1 + share) * (stamp_s - begin_s))
 
 
 def _late(offset_s: float, world: World) -> World:
@@ -78,13 +82,20 @@ def _jitter_of_poses(sigma_s: float, world: World) -> World:
 
 
 def _rising(stamp_s: FloatArray) -> FloatArray:
-    """Stamps (N,) that rise by a microsecond at least, as those of a queue do."""
-    return np.maximum.accumulate(stamp_s) + 1e-6 * np.arange(len(stamp_s))
+    """Stamps (N,) that rise by a microsecond at least, as those of a queue do; nan where there is none."""
+    rising = np.fmax.accumulate(stamp_s) + 1e-6 * np.arange(len(stamp_s))
+    return np.where(np.isnan(stamp_s), np.nan, rising)
 
 
 def _counted(world: World) -> World:
     """Stamps are counted from the first at the mean rate, which varied with the vehicle's speed."""
-    return _with_stamps(world, lambda stamp_s: np.linspace(stamp_s[0], stamp_s[-1], len(stamp_s)))
+
+    def change(stamp_s: FloatArray) -> FloatArray:
+        counted_s, taken = stamp_s.copy(), np.flatnonzero(np.isfinite(stamp_s))
+        counted_s[taken] = np.linspace(*stamp_s[taken[[0, -1]]], len(taken))
+        return counted_s
+
+    return _with_stamps(world, change)
 
 
 def _knocked(camera: str, roll_pitch_yaw_deg: tuple[float, float, float], world: World) -> World:
@@ -148,11 +159,9 @@ def _relief(relief: str, fall: float, world: World) -> World:
     return _crown(fall, 0.0, shaped) if fall else shaped
 
 
-def _in_turn(pose_rate_hz: float, apart_s: float, world: World) -> World:
+def _in_turn(world: World) -> World:
     """Cameras that fire in turn, between the poses of a stream: neighbouring images share a pose's noise."""
-    port = world.recipe.port
-    streamed = replace(port, route=replace(port.route, pose_rate_hz=pose_rate_hz))
-    return make(replace(world.recipe, port=streamed), apart_s)
+    return make(world.recipe.in_turn(APART_S))
 
 
 def _grade(grade: float, world: World, heights: bool = True) -> World:
@@ -247,7 +256,7 @@ RELIEFS: Mapping[str, Spoil] = {
         Spoil("grade and crown", None, partial(_relief, "grade", 0.03)),
         Spoil("ramp", None, partial(_relief, "ramp", 0.0)),
         Spoil("crest", None, partial(_relief, "crest", 0.0)),
-        Spoil("cameras in turn", None, partial(_in_turn, 20.0, 0.037)),
+        Spoil("cameras in turn", None, _in_turn),
     )
 }
 """What is recorded as it is, but unusual: nothing is wrong, but that the mapper has to know of it.

@@ -94,14 +94,14 @@ class World:
         return int(image.path.stem)
 
 
-def make(recipe: Recipe, apart_s: float = 0.0) -> World:
-    """The world of a right drive, whose cameras take their images in turn, ``apart_s`` after each other."""
+def make(recipe: Recipe) -> World:
+    """The world of a right drive."""
     port = build_port(recipe.port)
     poses_s = port.driven.recorded.stamp_s
     taken_s = port.driven.stamp_s
     stamp_s = dict.fromkeys(port.cameras, taken_s)
-    if apart_s:
-        own_s = [taken_s + turn * apart_s for turn in range(len(port.cameras))]
+    if recipe.apart_s:
+        own_s = [taken_s + turn * recipe.apart_s for turn in range(len(port.cameras))]
         own_s = [times_s[times_s < poses_s[-1]] for times_s in own_s]
         taken_s = np.sort(np.concatenate(own_s))
         stamp_s = {

@@ -48,9 +48,12 @@ def covariance(sigma_m: float = 0.01) -> np.ndarray:
 
 
 def small_map(names: str = DIAMOND) -> HDMap:
-    markings = [Marking(names, DIAMOND_M + place, 4, covariance(), 0.004) for place in PLACES]
+    markings = [
+        Marking(names, DIAMOND_M + place, 4, covariance(), 0.004, accuracy=grade)
+        for place, grade in zip(PLACES, "AABC", strict=True)
+    ]
     lane = Lane(LANE_LINE, np.column_stack([np.linspace(0, 12, 25), np.full(25, 2.4)]), 4)
-    arrow = Symbol(ARROW, np.array([[4.5, -0.2], [5.2, 0.0], [4.5, 0.2]]), 3, 0.02)
+    arrow = Symbol(ARROW, np.array([[4.5, -0.2], [5.2, 0.0], [4.5, 0.2]]), 3, 0.02, accuracy="A")
     return HDMap(tuple(markings), (lane,), symbols=(arrow,))
 
 

@@ -105,6 +105,7 @@ def test_pointing_names_the_marking_and_selecting_shows_its_images(browser, repo
             assert tooltip.locator("b").inner_text() == f"Marking {number}, diamond"
             text = tooltip.inner_text()
             assert "sightings: 4 images" in text
+            assert f"accuracy: {'AABC'[number - 1]}" in text
             assert "95 %, relative: 1.0 cm" in text
             assert "95 %, absolute: 2.4 cm" in text
             assert f"1: {place[0] + 0.5:.3f} E" in text
@@ -212,7 +213,8 @@ def test_the_table_is_sorted_searched_and_leads_to_the_map(browser, report):
         with page.expect_download() as download:
             page.click("#save")
         lines = download.value.path().read_text().splitlines()
-        assert lines[0].startswith('"marking","class","sightings"')
+        assert lines[0].startswith('"marking","class","sightings","accuracy"')
+        assert [line.split(",")[3] for line in lines[1:]] == ['"C"', '"B"', '"A"', '"A"']
         assert len(lines) == 5
         assert page.locator("#files a").first.get_attribute("href") == "calibration_front.yaml"
         assert watched.said == []

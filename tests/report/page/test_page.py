@@ -102,6 +102,9 @@ def test_key_figures_and_tables_state_what_the_files_do(page):
     assert figures["Between neighbours"] == ("1.0", "cm")  # 2.45 x 0.004 m
     assert figures["In the map’s frame"] == ("2.4", "cm")  # 2.45 x 0.01 m
     assert figures["In the images"] == ("0.36", "px")
+    assert figures["Accuracy A"] == ("3", "of 5")
+    note = next(one.note for one in page.figures if one.name == "Accuracy A")
+    assert note == "within the accuracy goal; besides, 1 B, 1 C"
     mounting = {row[0]: row[1:] for row in page.cameras[0].mounting.rows}
     assert mounting["centre up"][:2] == ["2.000 m", "2.0 mm"]
     assert mounting["centre forward"][2] == "+100 mm"

@@ -42,6 +42,7 @@ class Feature:
     heights_m: FloatArray | None = None  # (N,) of the ground, None for z = 0
     covariance_m2: FloatArray | None = None  # (2N, 2N) stacked
     relative_sigma_m: float | None = None
+    accuracy: str | None = None
     heights_sigma_m: FloatArray | None = None  # (N,)
     symbol: bool = False
     place_sigma_m: float | None = None  # of a symbol
@@ -111,7 +112,7 @@ def _feature_of(paint: _Paint, number: int) -> Feature:
     )
     if isinstance(paint, Lane):
         return replace(feature, vertex_sigma_m=paint.sigma_m)
-    feature = replace(feature, covariance_m2=paint.covariance_m2)
+    feature = replace(feature, covariance_m2=paint.covariance_m2, accuracy=paint.accuracy)
     if isinstance(paint, Symbol):
         return replace(feature, symbol=True, place_sigma_m=paint.sigma_m)
     return replace(feature, relative_sigma_m=paint.relative_sigma_m, paint=paint.paint)
@@ -140,6 +141,7 @@ def map_of(features: Sequence[Feature], ids: Sequence[int], origin: GeodeticOrig
                 id=number,
                 heights_sigma_m=feature.heights_sigma_m,
                 covariance_m2=feature.covariance_m2,
+                accuracy=feature.accuracy,
             )
             symbols.append(symbol)
         elif feature.closed:
@@ -153,6 +155,7 @@ def map_of(features: Sequence[Feature], ids: Sequence[int], origin: GeodeticOrig
                 id=number,
                 paint=feature.paint,
                 heights_sigma_m=feature.heights_sigma_m,
+                accuracy=feature.accuracy,
             )
             markings.append(marking)
         else:
@@ -193,6 +196,7 @@ def properties_of(feature: Feature) -> dict[str, Any]:
         "sigma_m": feature.sigma_m,
         "covariance_m2": feature.covariance_m2,
         "relative_sigma_m": feature.relative_sigma_m,
+        "accuracy": feature.accuracy,
         "vertex_sigma_m": feature.vertex_sigma_m,
         **({} if feature.paint is None else dict(zip(PAINT, astuple(feature.paint), strict=True))),
     }

@@ -1,8 +1,8 @@
 """The formats that a map is written in: their registry, and DXF for CAD and CSV for surveyors.
 
 In DXF, extended data (XDATA) of the application ``V2HDM`` at each polyline hold what CAD has no word for:
-strings name the values after them, ``id``, ``sightings``, ``relative_sigma_m``, ``heights_sigma_m`` and
-the rows of ``covariance_m2``.
+strings name the values after them, ``id``, ``sightings``, ``relative_sigma_m``, ``accuracy``,
+``heights_sigma_m`` and the rows of ``covariance_m2``.
 """
 
 from __future__ import annotations
@@ -63,6 +63,8 @@ def write_dxf(hd_map: HDMap, path: Path, grid: Grid | None = None) -> None:
         data += [(_TEXT, "sightings"), (_WHOLE, feature.sightings)]
         if feature.relative_sigma_m is not None:
             data += [(_TEXT, "relative_sigma_m"), (_REAL, feature.relative_sigma_m)]
+        if feature.accuracy is not None:
+            data += [(_TEXT, "accuracy"), (_TEXT, feature.accuracy)]
         if feature.heights_sigma_m is not None:
             sigmas_m = feature.heights_sigma_m[feature.ring].tolist()
             data += [(_TEXT, "heights_sigma_m"), *((_REAL, value) for value in sigmas_m)]
@@ -76,7 +78,7 @@ def write_dxf(hd_map: HDMap, path: Path, grid: Grid | None = None) -> None:
 COLUMNS: tuple[str, ...] = (
     *("id", "class", "point", "x_map_m", "y_map_m", "height_m"),
     *("longitude_deg", "latitude_deg", "ellipsoidal_height_m"),
-    *("sigma_x_m", "sigma_y_m", "sigma_z_m", "sightings", "relative_sigma_m"),
+    *("sigma_x_m", "sigma_y_m", "sigma_z_m", "sightings", "relative_sigma_m", "accuracy"),
     *(f"cov_{axis}_{other}{k}_m2" for axis in "xy" for k in range(1, 5) for other in "xy"),
     *PAINT,
 )
@@ -119,7 +121,7 @@ def _rows(feature: Feature, origin: GeodeticOrigin | Grid | None) -> list[list[A
             sigmas = np.sqrt(np.diag(rows_m2[:, 2 * k : 2 * k + 2])).tolist()
             covariances = rows_m2.ravel().tolist()
         row = [feature.id, feature.kind, k + 1, x, y, z, *geodetic[k], *sigmas, sigma_z]
-        rows.append([*row, feature.sightings, relative, *covariances, *paint])
+        rows.append([*row, feature.sightings, relative, feature.accuracy or "", *covariances, *paint])
     return rows
 
 

@@ -153,6 +153,7 @@ def _columns(key: str, features: Sequence[Feature]) -> dict[str, Any]:
         "sightings": numbers("sightings", np.int64),
         "sigma_m": numbers("sigma_m"),
         "relative_sigma_m": numbers("relative_sigma_m"),
+        **({} if key == POINTS else {"accuracy": [row.get("accuracy") for row in rows]}),
         **{name: numbers(name) for name in PAINT if key == CORNERS},
         **{name: texts(name) for name in (key, *EXACT)},
     }

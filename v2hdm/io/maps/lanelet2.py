@@ -297,6 +297,8 @@ def _more_tags(feature: Feature) -> dict[str, str]:
     tags = {"class": feature.kind, "sightings": str(feature.sightings)}
     if feature.relative_sigma_m is not None:
         tags["relative_sigma_m"] = repr(feature.relative_sigma_m)
+    if feature.accuracy is not None:
+        tags["accuracy"] = feature.accuracy
     if feature.heights_sigma_m is not None:
         tags["heights_sigma_m"] = json.dumps(feature.heights_sigma_m[feature.ring].tolist())
     if (covariance := feature.ring_covariance_m2) is not None:

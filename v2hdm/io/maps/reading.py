@@ -16,14 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.errors import MapFileError
+from v2hdm.errors import MapFileError, V2hdmError
 from v2hdm.geometry.geodetic import Grid, enu_from_geodetic
 from v2hdm.geometry.planar import signed_area
 from v2hdm.io.maps.features import CORNERS, OUTLINE, PAINT, POINTS, Feature, map_of, unique_ids
-from v2hdm.records import FloatArray, GeodeticOrigin, HDMap, PaintLeft
+from v2hdm.records import ACCURACIES, FloatArray, GeodeticOrigin, HDMap, PaintLeft
 from v2hdm.safe.databases import opened, rows_of
 from v2hdm.safe.fields import take_covariance, take_origin, take_whole
-from v2hdm.safe.texts import parse_json, take_name
+from v2hdm.safe.texts import parse_json, shown, take_name
 from v2hdm.store.files import load_json, take_array, take_mapping, take_number, take_text
 from v2hdm.store.inputs import note_input
 
@@ -232,6 +232,7 @@ def _redrawn(
         vertex_sigma_m=None,
         covariance_m2=None,
         relative_sigma_m=None,
+        accuracy=None,
     )
 
 
@@ -280,6 +281,7 @@ def _stored(properties: Mapping[str, Any], closed: bool, where: str) -> Feature:
         heights_sigma_m=optional("heights_sigma_m", take_array, (len(points),)),
         covariance_m2=optional("covariance_m2", take_covariance, 2 * len(points)),
         relative_sigma_m=optional("relative_sigma_m", take_number),
+        accuracy=optional("accuracy", _take_accuracy) if closed else None,
         symbol=symbol,
         place_sigma_m=optional("sigma_m", take_number) if symbol else None,
         vertex_sigma_m=None
@@ -287,6 +289,12 @@ def _stored(properties: Mapping[str, Any], closed: bool, where: str) -> Feature:
         else optional("vertex_sigma_m", take_array, (len(points),)),
         paint=None if share is None or sigma is None else PaintLeft(share, sigma, change, change_sigma),
     )
+
+
+def _take_accuracy(value: object, where: str, error: type[V2hdmError]) -> str:
+    if value not in ACCURACIES:
+        raise error(f"{where} is {shown(value)}; give one of {', '.join(ACCURACIES)}, or leave it out")
+    return str(value)
 
 
 def _of_geojson(content: object, where: str) -> Geometry | None:

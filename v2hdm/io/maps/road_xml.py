@@ -3,8 +3,8 @@
 In OpenDRIVE every lane between two lane lines is a road of its own, without links, for a map of paint does
 not say how lanes connect: its reference line is the left line, straight from vertex to vertex, its only lane
 ``-1`` is as wide as the right line is away. Every marking and symbol is an object ``roadMark`` of the nearest
-road, its outline exact in the object's own axes. Where no two lines bound a lane, one road without width runs
-along the longest line or through the markings and carries them.
+road, its outline exact in the object's own axes, its accuracy in ``userData``. Where no two lines bound a
+lane, one road without width runs along the longest line or through the markings and carries them.
 
 In LandXML every feature is a ``PlanFeature`` named by its id, its class as ``desc``, made of straight lines
 between points ``northing easting height``. Its ``Feature`` of properties holds sightings and sigma.
@@ -186,6 +186,8 @@ def _write_object(objects: ET.Element, feature: Feature, road: _Road, nearest: _
     for k, ((u, v), z) in enumerate(zip(local.tolist(), (corners[:, 2] - height_m).tolist(), strict=True)):
         corner = {"u": _text(u), "v": _text(v), "z": _text(z), "height": "0", "id": str(k)}
         ET.SubElement(outline, "cornerLocal", corner)
+    if feature.accuracy is not None:
+        ET.SubElement(element, "userData", {"code": "accuracy", "value": feature.accuracy})
 
 
 def _cubic(start: float, growth: float) -> dict[str, str]:

@@ -140,6 +140,8 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
             feature["e"] = np.round(axes, 5).tolist()
         if marking.relative_sigma_m is not None:
             feature["r"] = round(SIGMAS_95 * marking.relative_sigma_m, 5)
+        if marking.accuracy is not None:
+            feature["g"] = marking.accuracy
         if number in errors:
             feature["t"] = round(errors[number], 5)
         if marking.id in arrows:
@@ -154,6 +156,7 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
         "symbols": [
             _feature(symbol, kinds, "p", symbol.outline_map)
             | {"e": None if symbol.sigma_m is None else round(SIGMAS_95 * symbol.sigma_m, 5)}
+            | ({} if symbol.accuracy is None else {"g": symbol.accuracy})
             for symbol in hd_map.symbols
         ],
         "excluded": [

@@ -12,7 +12,7 @@ import numpy as np
 from v2hdm.geometry.ipm import angle_sigmas, centre_sigmas, mounting_angles
 from v2hdm.geometry.planar import length_along
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.records import SIGMAS_95, FloatArray, Lane, Marking, Symbol
+from v2hdm.records import ACCURACIES, SIGMAS_95, FloatArray, Lane, Marking, Symbol
 from v2hdm.report.metrics import corner_errors, match_markings
 from v2hdm.report.page.facts import CameraFacts, Facts
 from v2hdm.report.page.layers import ellipses
@@ -108,6 +108,12 @@ def key_figures(facts: Facts) -> tuple[Figure, ...]:
     ):
         if len(values):
             figures.append(Figure(name, number(100 * float(np.median(values)), 1), "cm", note))
+    grades = facts.hd_map.accuracies
+    if grades:
+        top, *others = ACCURACIES
+        note = ", ".join(f"{grades.count(grade)} {grade}" for grade in others)
+        note = f"within the accuracy goal; besides, {note}"
+        figures.append(Figure(f"Accuracy {top}", str(grades.count(top)), f"of {len(grades)}", note))
     if "corner_rmse_m" in best:
         note = "RMSE of all corners"
         figures.append(Figure("Against the truth", number(best["corner_rmse_m"], 1, 100), "cm", note))

@@ -1,8 +1,9 @@
 """Whether a map is as good as the user asks, and as it states by check points, known sizes and corrections.
 
 A map meets ``accuracy_goal_cm`` where 95 % of its corners lie within that radius, by the covariances that it
-states in its own frame: what moves all markings alike counts in full. A mounting meets it where it leaves the
-ground ahead known as well.
+states in its own frame: what moves all markings alike counts in full. Markings of accuracy C, which the map
+states to be known less well, count where they are not fewer than the others. A mounting meets the goal where
+it leaves the ground ahead known as well.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from v2hdm.io.maps.corrections import Correction
 from v2hdm.mapping.bundle import known_lengths
 from v2hdm.mapping.options import SizeOptions
 from v2hdm.mapping.results import MethodResult, SolveEvidence
-from v2hdm.records import SIGMAS_95, Calibration, FloatArray, Marking
+from v2hdm.records import ACCURACIES, SIGMAS_95, Calibration, FloatArray, Marking
+from v2hdm.site.accuracy import LEFT_OUT_BY_GRADE, corner_radii_m, radius_95_m
 from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN
 from v2hdm.site.corrections import unmet
 from v2hdm.survey.check_points import CheckTable, squared
@@ -37,26 +39,43 @@ def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Findin
     markings = best.hd_map.markings
     goal = f"; goal {100 * goal_m:g} cm"
     if markings:
-        radius_m = np.array([_corner_radii_m(marking) for marking in markings])
-        reached_m = _radius_of_all_m(radius_m.ravel())
-        corners = f"95 % of the corners of {len(markings)} markings"
+        judged = _judged_by_goal(markings)
+        radii_m = np.array([_corner_radii_m(marking) for marking in judged])
+        reached_m = _radius_of_all_m(radii_m.ravel())
+        corners = f"95 % of the corners of {len(judged)} markings"
         says = f"{corners} within {_cm(reached_m)} in the frame of the {frame}"
         says += "" if best.evidence is None else _conditions(best.evidence)
-        relative_m = [SIGMAS_95 * m.relative_sigma_m for m in markings if m.relative_sigma_m is not None]
+        relative_m = [SIGMAS_95 * m.relative_sigma_m for m in judged if m.relative_sigma_m is not None]
         if relative_m:
             says += f", {_cm(_radius_of_all_m(np.array(relative_m)))} from marking to marking"
-        # The map's own limit on sigmas leaves the worst out, so that the share alone would flatter.
-        uncertain = sum(exclusion.reason in (TOO_UNCERTAIN, LACKS_A_CORNER) for exclusion in best.excluded)
-        says += f"{goal}; {uncertain} more left out as too uncertain" if uncertain else goal
-        is_coarse = radius_m.max(axis=1) > goal_m
-        coarse = list(compress(markings, is_coarse))
-        met = 100 * (len(markings) - len(coarse)) // len(markings)
-        helps = f"{met} % of the markings meet the goal; {_largest_part(best, coarse or markings)}"
+        says += goal + _beside(best, len(markings) - len(judged))
+        coarse = list(compress(judged, radii_m.max(axis=1) > goal_m))
+        met = 100 * (len(judged) - len(coarse)) // len(markings)
+        helps = f"{met} % of the markings meet the goal; {_largest_part(best, coarse or judged)}"
         yield _judged("map", reached_m, goal_m, says, helps)
     for name, calibration in best.calibrations.items():
         left_m, helps = ground_ahead(calibration)
         says = f"the ground ahead is known, given its mounting, to {_cm(left_m)} (95 %){goal}"
         yield _judged(name, left_m, goal_m, says, helps)
+
+
+def _judged_by_goal(markings: Sequence[Marking]) -> Sequence[Marking]:
+    """The markings but those of accuracy C as long as these are fewer, else all of them."""
+    known = [marking for marking in markings if marking.accuracy != ACCURACIES[-1]]
+    return known if 2 * len(known) > len(markings) else markings
+
+
+def _beside(best: MethodResult, coarse: int) -> str:
+    """What the statement on the map's corners is not about, without which the share alone would flatter."""
+    reasons = (TOO_UNCERTAIN, LACKS_A_CORNER, *LEFT_OUT_BY_GRADE)
+    uncertain = sum(exclusion.reason in reasons for exclusion in best.excluded)
+    says = ""
+    if coarse:
+        is_are = "is" if coarse == 1 else "are"
+        says += f"; {coarse} more {is_are} known less well (accuracy {ACCURACIES[-1]})"
+    if uncertain:
+        says += f"; {uncertain} more left out as too uncertain"
+    return says
 
 
 def _conditions(evidence: SolveEvidence) -> str:
@@ -92,8 +111,8 @@ def _largest_part(best: MethodResult, coarse: Sequence[Marking]) -> str:
 
 def _corner_radii_m(marking: Marking) -> FloatArray:
     """The 95 % radii (4,) of a marking's corners, m; infinite where no covariance is stated."""
-    covariances = marking.corner_covariances_m2
-    return np.full(4, np.inf) if covariances is None else np.array(list(map(_radius_m, covariances)))
+    covariance_m2 = marking.covariance_m2
+    return np.full(4, np.inf) if covariance_m2 is None else corner_radii_m(covariance_m2)
 
 
 def _radius_of_all_m(radius_m: FloatArray) -> float:
@@ -114,7 +133,7 @@ def _own_m(marking: Marking) -> float:
     """The 95 % radius, m, of a marking's part in a distance and of its worst corner beside its centre."""
     if marking.covariance_m2 is None:
         return 0.0
-    centre_m = _radius_m(np.einsum("iajb->ab", marking.covariance_m2.reshape(4, 2, 4, 2)) / 16)
+    centre_m = float(radius_95_m(np.einsum("iajb->ab", marking.covariance_m2.reshape(4, 2, 4, 2)) / 16))
     shape_m2 = max(float(_corner_radii_m(marking).max()) ** 2 - centre_m**2, 0.0)
     return float(np.hypot(SIGMAS_95 * (marking.relative_sigma_m or 0.0), np.sqrt(shape_m2)))
 
@@ -130,7 +149,7 @@ def ground_ahead(calibration: Calibration) -> tuple[float, str]:
         return float("inf"), "it saw no marking of the map"
 
     def radius_of(part: slice) -> float:
-        return _radius_m(moves[:, part] @ covariance[part, part] @ moves[:, part].T)
+        return float(radius_95_m(moves[:, part] @ covariance[part, part] @ moves[:, part].T))
 
     place_m = radius_of(slice(0, 3))
     turn_m = radius_of(slice(3, 6))
@@ -152,12 +171,6 @@ def _ground_jacobian(cam_from_vehicle: FloatArray) -> FloatArray:
     turned = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ to_vehicle
     moved = np.hstack([-to_vehicle, turned])
     return np.asarray(moved[:2] - np.outer([x / z, y / z], moved[2]))
-
-
-def _radius_m(covariance_m2: FloatArray) -> float:
-    """The largest radius, m, that holds 95 % of errors of covariances (..., 2, 2), by Leenhouts (1985)."""
-    minor, major = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance_m2), 1e-18)).T
-    return float(np.max(major * np.polyval((0.371625, 0.114276, 0.004071, 1.960790), minor / major)))
 
 
 def _median(values: Sequence[float] | FloatArray) -> float:

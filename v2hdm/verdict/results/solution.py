@@ -109,6 +109,16 @@ def over_ground(findings: Iterable[Finding], best: MethodResult, is_tried: bool)
     ]
 
 
+def told_by_poses(findings: Iterable[Finding], of_inputs: Iterable[Finding]) -> list[Finding]:
+    """The findings of a solve, without those raised under poses that failed before it (``of_inputs``).
+
+    A solve takes the poses' kind of error as stated. Under a heading that is none, or stamps that jitter, it
+    lays what they did to clocks, surveys and mountings: that follows, and says nothing of these.
+    """
+    failed = any(f.status is Status.FAIL and f.about == "poses" for f in of_inputs)
+    return [finding for finding in findings if not failed or finding.status is Status.PASS]
+
+
 def check_solution(drive: Drive, methods: Mapping[str, Mapping[str, MethodResult]]) -> list[Finding]:
     """All checks after the solve; arguments as for :func:`check_result`."""
     best = list(methods.values())[-1][BEST]

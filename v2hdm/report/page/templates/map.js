@@ -243,6 +243,7 @@
     if (change?.shift_m) rows.push(["moved by", `${cm(Math.hypot(...change.shift_m))} \u00b1 ${cm(Math.hypot(...change.shift_sigma_m) / Math.SQRT2)}`]);
     if (change) rows.push([change.fate, `with probability ${number(change.probability, 3)}; seen in ${change.n} of ${change.views} images`]);
     if (about.what !== "change") rows.push(["sightings", `${about.n} ${about.n === 1 ? "image" : "images"}`]);
+    if (about.g) rows.push(["accuracy", about.g]);
     if (Number.isFinite(about.r)) rows.push(["95 %, relative", cm(about.r)]);
     if (Number.isFinite(worst(about))) rows.push(["95 %, absolute", cm(worst(about))]);
     if (Number.isFinite(about.t)) rows.push(["error against truth", `${cm(about.t)} RMS`]);
@@ -342,16 +343,17 @@
 
   // ---- the table of markings ----
   const SHOWN = 200; // rows at once: thousands would be slow
+  const listed = things.filter((shape) => ["marking", "symbol"].includes(shape.about.what));
   const COLUMNS = [
     { name: "marking", of: (one) => one.id, digits: 0 },
     { name: "class", of: (one) => words(data.kinds[one.k]) },
     { name: "sightings", of: (one) => one.n, digits: 0 },
+    ...(listed.some(({ about }) => about.g) ? [{ name: "accuracy", of: (one) => one.g ?? "\u2013" }] : []),
     { name: "relative (cm)", of: (one) => 100 * (one.r ?? NaN), digits: 1 },
     { name: "absolute (cm)", of: (one) => 100 * worst(one), digits: 1 },
     { name: "error against truth (cm)", of: (one) => 100 * (one.t ?? NaN), digits: 1 },
     { name: "suspicion p", of: (one) => data.suspicion[one.id] ?? NaN, digits: 3 },
   ].filter((column) => !column.digits || things.some((shape) => Number.isFinite(column.of(shape.about))));
-  const listed = things.filter((shape) => ["marking", "symbol"].includes(shape.about.what));
   let order = { column: COLUMNS.at(-1).name === "suspicion p" ? COLUMNS.length - 1 : 0, down: false };
   function matching() {
     const wanted = byId("search").value.trim().toLowerCase().split(/\s+/);
