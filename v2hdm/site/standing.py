@@ -41,7 +41,7 @@ _DARK = 3.0  # added to grey values of 8 bits before logarithms: noise of dark p
 _LEAST_DEPTH_M = 1.0  # least depth of a point in front of a camera, m
 _MOST_CORRELATION = 0.995  # beyond it all correlations are alike
 
-# Logistic regression on 58 ends of dashes at the foot of boxes and 140 on bare ground, in twelve rendered ports
+# Logistic regression on 58 ends of dashes at the foot of boxes and 140 on bare ground, in 12 rendered ports
 # (tests/benchmarks/standing_ends.py), by how much better the ground matches, in differences of Fisher's z. It
 # ranks 99 % of the pairs of both kinds right.
 _BIAS = 0.7
