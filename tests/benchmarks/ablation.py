@@ -23,7 +23,7 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager, nullco
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from unittest.mock import patch
 
 import cv2
@@ -35,8 +35,9 @@ from tests.benchmarks.made.detect import detect
 from tests.benchmarks.made.draw import draw
 from tests.benchmarks.made.faults import APART_S, SPOILS
 from tests.benchmarks.made.queue import detect_queue, make_queue
-from tests.benchmarks.made.world import drive_of, make, truth_of
+from tests.benchmarks.made.world import World, drive_of, make, truth_of
 from tests.benchmarks.right_drives import CLEAN, Job, judge, map_one
+from tests.benchmarks.standing_ends import grey_of
 from tests.benchmarks.uncertainty import corner_errors, in_order_of
 from train.examples import Example, example
 from v2hdm.association import ground
@@ -51,9 +52,10 @@ from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.mapping import conclusion, foreign, methods, optimise
 from v2hdm.mapping.methods import run_methods
-from v2hdm.records import BoolArray, Drive, FloatArray, ImageDetections, IntArray, Marking, Truth
+from v2hdm.pipeline.base import grey_reader
+from v2hdm.records import BoolArray, Drive, FloatArray, Image, ImageDetections, IntArray, Marking, Truth
 from v2hdm.report.metrics import driven_past, marking_metrics, match_markings
-from v2hdm.site import hypotheses, markings, posterior, symbols
+from v2hdm.site import hypotheses, markings, posterior, standing, symbols
 from v2hdm.verdict.results import solution
 
 SEED = 5_318_008
@@ -223,6 +225,8 @@ def terms() -> Iterator[Part]:
     yield "ends that run on", partial(patch.object, hypotheses, "_RUN_ON_M", 0.0)
     yield "images' disagreement on worn ends", partial(patch.object, hypotheses, "_worn_evidence", _no_odds)
     yield "views that know a corner hidden", partial(patch.object, posterior, "_vague_evidence", _unknown)
+    yield "what stands beyond ends", partial(patch.object, standing.Watch, "standing_odds", _nothing_stands)
+    yield "examples at which nothing stands", partial(patch.object, posterior, "_examples", _likely)
     yield "lines of dashes", partial(patch.object, hypotheses, "in_series", _nothing)
     yield "clutter shaped like its class", partial(patch.object, hypotheses, "_LIKE_CLASS", 1e-9)
     yield "how much clutter differs from it", partial(patch.object, hypotheses, "_LIKE_SHARE", 0.0)
@@ -247,7 +251,7 @@ def _without_size(column: str, nothing: float) -> Iterator[None]:
 def _without_repeats() -> Iterator[None]:
     lengths = hypotheses.Hypotheses._other_lengths
 
-    def alone(space: Any, *given: Any) -> tuple[float, FloatArray]:
+    def alone(space: Any, *given: Any) -> tuple[FloatArray, FloatArray]:
         spread_m, again = lengths(space, *given)
         return spread_m, 0 * again
 
@@ -261,6 +265,14 @@ def _no_odds(_: Any, ends: Sequence[FloatArray], weight: FloatArray) -> FloatArr
 
 def _unknown(_: Any, weight: FloatArray) -> FloatArray:
     return np.zeros((len(weight), 4))
+
+
+def _nothing_stands(_: Any, corners_map: FloatArray, is_end: BoolArray) -> FloatArray:
+    return np.zeros(is_end.shape)
+
+
+def _likely(weight: FloatArray, _: FloatArray) -> BoolArray:
+    return np.asarray(weight > 0.5)
 
 
 def _all_present(images: IntArray, *_: Any) -> posterior.Presence:
@@ -319,31 +331,54 @@ class Mapped:
         return f"{counts} {self.symbols:7d}"
 
 
-def site_drives(
-    seeds: Sequence[int], folders: Sequence[Path]
-) -> Iterator[tuple[Drive, Sequence[ImageDetections], Truth, tuple[str, ...]]]:
-    """Drives, what is found in them, what is true, and the cameras to map with."""
+class SiteDrive(NamedTuple):
+    """A drive to map with some cameras, what is found in it and what is true; ``grey`` reads its images."""
+
+    drive: Drive
+    found: Sequence[ImageDetections]
+    truth: Truth
+    cameras: tuple[str, ...]
+    grey: Callable[[Image], np.ndarray] | None = None
+
+
+def site_drives(seeds: Sequence[int], folders: Sequence[Path]) -> Iterator[SiteDrive]:
+    """Made drives of some seeds, of which those past boxes have images, and those of folders."""
     for seed in seeds:
-        for world, see, cameras in (
-            (make(draw(seed)), detect, ("front", "rear")),
-            (make(draw(seed)), detect_pieces, ("front", "rear")),
-            (make_boxes(draw(seed, "straight")), partial(detect_pieces, known=_MOST_ENDS), ("front",)),
-            (make_queue(draw(seed, "straight")), detect_queue, ("front",)),
+        for world, see, cameras, has_images in (
+            (make(draw(seed)), detect, ("front", "rear"), False),
+            (make(draw(seed)), detect_pieces, ("front", "rear"), False),
+            (make_boxes(draw(seed, "straight")), detect_pieces, ("front",), True),
+            (make_boxes(draw(seed, "straight")), partial(detect_pieces, known=_MOST_ENDS), ("front",), False),
+            (make_queue(draw(seed, "straight")), detect_queue, ("front",), False),
         ):
             drive = drive_of(world)
             detections, visibility = see(world, drive)
-            yield drive, detections, truth_of(world, drive, visibility), cameras
+            truth = truth_of(world, drive, visibility)
+            grey = _rendered_once(world) if has_images else None
+            yield SiteDrive(drive, detections, truth, cameras, grey)
     for folder in folders:
         drive = read_drive(folder)
         found = detect_all(drive, DetectorOptions.for_mapping(), 1)
-        yield drive, found, read_truth(drive), tuple(drive.cameras)
+        yield SiteDrive(drive, found, read_truth(drive), tuple(drive.cameras), grey_reader(drive))
+
+
+def _rendered_once(world: World) -> Callable[[Image], np.ndarray]:
+    """Reads the images of a made drive, each of which is rendered once."""
+    images: dict[Path, np.ndarray] = {}
+
+    def grey(image: Image) -> np.ndarray:
+        if image.path not in images:
+            images[image.path] = grey_of(world, image)
+        return images[image.path]
+
+    return grey
 
 
 def rows_of_site(only: str, seeds: Sequence[int], folders: Sequence[Path]) -> Iterator[str]:
     """The table of the site model. Each drive is mapped once, and its candidates classified once a term."""
     wanted = [(name, off) for name, off in terms() if re.search(only, name) or name == "nothing off"]
     tally = {name: Mapped() for name, _ in wanted}
-    for drive, detections, truth, cameras in site_drives(seeds, folders):
+    for drive, detections, truth, cameras, grey in site_drives(seeds, folders):
         expected, asked = driven_past(drive, truth, cameras), []
 
         def classify(*given: Any, asked: list[Any] = asked) -> markings.Classified:
@@ -360,7 +395,7 @@ def rows_of_site(only: str, seeds: Sequence[int], folders: Sequence[Path]) -> It
             patch.object(conclusion, "classify", classify),
             patch.object(methods, "map_symbols", map_symbols),
         ):
-            run_methods(drive, detections, cameras)
+            run_methods(drive, detections, cameras, grey=grey)
         for name, off in wanted:
             with off():
                 tally[name].add(markings.classify(*asked[-1]).markings(), truth, expected)
