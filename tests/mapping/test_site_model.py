@@ -274,11 +274,11 @@ def test_what_one_image_shows_as_an_arrow_stays_a_marking():
     assert of_one_class(solved(painted([DIAMOND] * 40, rng), rng), counts).log_odds[7] > 5
 
 
-def verdict(candidates, counts=None):
+def verdict(candidates, counts=None, standing=None):
     kind, counts = np.zeros(len(candidates), dtype=np.int64), counts or well_seen(len(candidates))
     on_ground = Parallax(np.ones((len(candidates), 1)), np.full((len(candidates), 1, 1), 1e-4))
     return classify(
-        candidates, kind, ("diamond",), lambda corners_map: counts, on_ground, AcceptanceOptions()
+        candidates, kind, ("diamond",), lambda corners_map: counts, on_ground, AcceptanceOptions(), standing
     )
 
 
@@ -312,10 +312,47 @@ def test_a_shift_that_all_markings_share_speaks_against_none():
     assert not any(verdict(shared).verdict)
 
 
-def test_a_place_less_certain_than_allowed_is_left_out():
+def test_a_place_less_certain_than_others_is_no_reason_against_a_marking_of_known_shape():
     _, candidates = row(16, [DIAMOND] * 20)
     candidates.covariance_m2[3] += 0.3**2 * np.kron(np.ones((4, 4)), np.eye(2))
-    assert verdict(candidates).verdict[3] == "its position is too uncertain"
+    assert not any(verdict(candidates).verdict)
+
+
+def test_a_marking_is_left_out_where_neither_images_nor_others_of_its_class_tell_its_shape():
+    rng = np.random.default_rng(16)
+    true = painted([DASH] * 20, rng)
+    candidates = solved(true, rng)
+    candidates.covariance_m2[0, :4, :4] += 5.0**2 * np.eye(4)
+    assert not any(verdict(candidates).verdict)
+    assert verdict(candidates.subset([0])).verdict == ["a corner was never seen twice"]
+
+
+def test_an_end_at_which_something_stands_may_lie_behind_it():
+    rng = np.random.default_rng(22)
+    true = painted([DASH] * 20, rng)
+    candidates = solved(true, rng)
+    odds = np.full((20, 4), -4.0)
+    cut_ends = [(dash, cut_short(candidates, true, dash, cut)) for dash, cut in enumerate(CUTS_M)]
+    for dash, end in cut_ends:
+        odds[dash, end[0]] = 3.0
+    told = verdict(candidates, standing=lambda corners_map, is_end: is_end * odds)
+    assert not any(told.verdict)
+    for dash, end in cut_ends:
+        off_m = np.linalg.norm(told.candidates.corners_map[dash, end] - true[dash, end], axis=1)
+        assert (off_m < 0.4).all()
+        assert (off_m < 3 * told.candidates.sigma_m[dash, end]).all()
+    assert (told.candidates.sigma_m[len(CUTS_M) :] < 0.1).all()
+
+
+CUTS_M = np.linspace(0.45, 1.2, 8)
+
+
+def cut_short(candidates, true, dash, cut_m):
+    """Move an end of a dash inwards, which is returned as the indices of its two corners."""
+    end = [1, 2] if np.linalg.norm(true[dash, 1] - true[dash, 0]) > 1 else [2, 3]
+    along = true[dash, end[0]] - true[dash, end[0] - 1]
+    candidates.corners_map[dash, end] -= cut_m * along / np.linalg.norm(along)
+    return end
 
 
 def piece_of(corners):
@@ -377,29 +414,24 @@ def test_sightings_that_were_outvoted_widen_the_corner_that_they_contradict():
 LENGTHS_M = [2.0] * 76 + [1.3] * 6 + [2.26] * 6 + [2.74] * 4
 
 
-@pytest.mark.parametrize(
-    ("squared_at_the_end", "agreeing", "reason"),
-    [(14.0, 8, None), (140.0, 5, "its position is too uncertain")],
-)
-def test_a_dash_cut_at_the_usual_length_is_left_out_where_images_disagree_on_its_end(
-    squared_at_the_end, agreeing, reason
-):
+def test_a_dash_cut_at_the_usual_length_is_uncertain_where_images_disagree_on_its_end():
     rng = np.random.default_rng(21)
     true = painted([DASH * [length / 3.0, 1.0] for length in [2.74, *LENGTHS_M]], rng)
     candidates, degrees = solved(true, rng), np.full((len(true), 4), 14.0)
     squared = rng.chisquare(14, degrees.shape) * 5 / rng.chisquare(5, degrees.shape)  # heavy tails
     one_image, counts = np.tile(1e-4 * np.eye(2), (len(true), 4, 1, 1)), well_seen(len(true))
     # Boxes stand on an end of the first, which then is as long as most, and of fourteen of these.
+    odds = np.zeros((len(true), 4))
     for dash, cut_m in enumerate([0.74, *np.linspace(0.2, 1.2, 14)]):
-        end = [1, 2] if np.linalg.norm(true[dash, 1] - true[dash, 0]) > 1 else [2, 3]
-        along = true[dash, end[0]] - true[dash, end[0] - 1]
-        along = along / np.linalg.norm(along)
-        candidates.corners_map[dash, end] -= cut_m * along
+        end = cut_short(candidates, true, dash, cut_m)
+        along = (true[dash, end[0]] - true[dash, end[0] - 1]) / np.linalg.norm(true[dash, 1] - true[dash, 0])
         one_image[dash, end] += 0.1**2 * np.outer(along, along)
-        squared[dash, end], counts.pointed[dash, end] = squared_at_the_end, agreeing
+        squared[dash, end], counts.pointed[dash, end] = 140.0, 5
+        odds[dash, end[0]] = 3.0
     fused = FusedGroups(candidates.corners_map, one_image / 8, np.full((len(true), 4), 8))
-    found = verdict(with_shared_errors(candidates, fused, scatter_of(squared, degrees)), counts)
-    assert found.verdict[0] == reason
+    shared = with_shared_errors(candidates, fused, scatter_of(squared, degrees))
+    found = verdict(shared, counts, lambda corners_map, is_end: is_end * odds)
+    assert found.candidates.sigma_m[0].max() > 3 * found.candidates.sigma_m[0].min()
     assert not any(found.verdict[15:77])
 
 

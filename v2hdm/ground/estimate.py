@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -49,7 +49,6 @@ _CLOCK_APART_M = (
     0.8,
     4.0,
 )  # shortest and longest baseline of a pair for the clock, m: motion changes within it
-_CLOCK_LOOSENED = 2.0  # factor on the stated heading noise up to which a clock offset is separable from it
 
 _GRID_M = 0.04  # spacing of the resampled ground, m
 _LEAST_MATCHES = 60  # matches of a mounting at least: ten for each of its degrees of freedom
@@ -58,28 +57,20 @@ _LEAST_PATCHES = 200  # fewer patches than this in view of all pairs are no evid
 
 
 class _Stage(NamedTuple):
-    """One round: search radius, factor on the grid's spacing, and the step between the pairs used.
-
-    ``loosened`` scales the noise of heading and lateral position, so that the few pairs which show a clock
-    offset are no outliers.
-    """
+    """One round: search radius, factor on the grid's spacing, and the step between the pairs used."""
 
     search_m: float
     grids: float
     every: int
-    loosened: float
 
 
 # The rounds of an estimate, from coarse to fine.
 _STAGES = (
-    _Stage(search_m=0.9, grids=1.5, every=2, loosened=20.0),
-    _Stage(search_m=0.5, grids=1.5, every=2, loosened=8.0),
-    _Stage(search_m=0.24, grids=1.0, every=1, loosened=2.0),
-    _Stage(search_m=0.12, grids=1.0, every=1, loosened=1.0),
+    _Stage(search_m=0.9, grids=1.5, every=2),
+    _Stage(search_m=0.5, grids=1.5, every=2),
+    _Stage(search_m=0.24, grids=1.0, every=1),
+    _Stage(search_m=0.12, grids=1.0, every=1),
 )
-
-# The rounds of an estimate with few pairs, which cannot hold poses that may be far off.
-_HELD_STAGES = tuple(stage._replace(loosened=min(stage.loosened, 2.0)) for stage in _STAGES)
 
 
 def estimate_ground(drive: Drive, camera: str, options: GroundOptions | None = None) -> GroundEstimate:
@@ -99,9 +90,7 @@ def estimate_ground(drive: Drive, camera: str, options: GroundOptions | None = N
     if readings.best is Reading.AS_GIVEN:
         solved = None
         if start.mount is not None:
-            # Few pairs cannot hold poses that may be far off.
-            solved = _solve(matcher, stated, start.mount, options, _STAGES)
-            solved = solved or _solve(matcher, stated, start.mount, options, _HELD_STAGES)
+            solved = _solve(matcher, stated, start.mount, options)
         if solved is not None:
             out = _found(out, solved, options.free)
         elif out.status is GroundStatus.NO_MATCH and not contradicts(matcher, stated):
@@ -119,9 +108,7 @@ class _Solved:
     clock: Parameter | None
 
 
-def _solve(
-    matcher: Matcher, stated: Stated, mount: Mount, options: GroundOptions, stages: Sequence[_Stage]
-) -> _Solved | None:
+def _solve(matcher: Matcher, stated: Stated, mount: Mount, options: GroundOptions) -> _Solved | None:
     """Match and adjust in turn, each round from the last solution; None with too few matches."""
     path_m = stated.path_m()
     pairs = spread_pairs(path_m, options.pairs, _APART_M)
@@ -130,19 +117,16 @@ def _solve(
         moves = stated.motion.velocity_at_images() * [1.0, 1.0, ARM_M]  # of the ground in view, m/s
         pairs = np.vstack([pairs, changing_pairs(path_m, moves, options.clock_pairs, _CLOCK_APART_M)])
     poses = stated.poses()
-    for stage in stages:
+    for stage in _STAGES:
         matched = matcher.match(mount, poses, pairs[:: stage.every], stage.search_m, stage.grids * _GRID_M)
         if len(matched) < _LEAST_MATCHES:
             return None
-        observed = stated.prior_of(matched.observations, stage.loosened)
-        # With loose headings nothing would hold the camera's yaw against a free clock.
-        freed = free if stage.loosened <= _CLOCK_LOOSENED else None
-        tolerance = max(stage.loosened / 2, 1.0)
-        adjusted = adjust(observed.observations, observed.prior, mount, freed, tolerance)
+        observed = stated.prior_of(matched.observations)
+        adjusted = adjust(observed.observations, observed.prior, mount, free)
         if np.count_nonzero(adjusted.weight) < _LEAST_MATCHES:  # rays that miss the ground fix nothing
             return None
         mount = adjusted.mount
-        if freed is not None:
+        if free is not None:
             stated = replace(stated, clock_s=stated.clock_s + adjusted.extra)
         poses = stated.poses()
         poses[observed.rows] = adjusted.poses

@@ -9,7 +9,7 @@ import numpy as np
 from v2hdm.geometry.ipm import initial_extrinsic, project_ground
 from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.geometry.rigid import hat, rotation_from_vector
-from v2hdm.records import Camera, CameraInfo, FloatArray
+from v2hdm.records import BoolArray, Camera, CameraInfo, FloatArray
 
 _LENS_STEP = 1e-5  # step of finite differences: of the focal length, relative, and of k1
 
@@ -80,14 +80,18 @@ class Mount:
         size = np.array([self.info.width, self.info.height])
         with np.errstate(invalid="ignore"):
             # Far outside the image a lens model folds points back into it.
-            low = -0.5 * size
-            high = 1.5 * size
-            hidden = (depth_m <= 0) | ((pinhole < low) | (pinhole > high)).any(axis=1)
+            hidden = (depth_m <= 0) | _outside(pinhole, -0.5 * size, 1.5 * size)
             pinhole[hidden] = size / 2
             px = distort_points(self.info, pinhole)
-            outside = ((px < 0) | (px > size - 1)).any(axis=1)
+            outside = _outside(px, 0 * size, size - 1)
         px[hidden | outside] = np.nan
         return px
+
+
+def _outside(px: FloatArray, low: FloatArray, high: FloatArray) -> BoolArray:
+    """Which pixels (N, 2) lie outside a rectangle, given by two corners (2,)."""
+    u, v = px.T  # numpy reduces pairs slowly
+    return np.asarray((u < low[0]) | (u > high[0]) | (v < low[1]) | (v > high[1]))
 
 
 def guessed_mount(camera: Camera) -> Mount:

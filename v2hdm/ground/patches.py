@@ -109,16 +109,48 @@ class Sheet:
         return np.asarray(self.corner_map + self.grid_m * np.asarray(cells, dtype=np.float64) @ self.axes)
 
     def resample(self, view: View) -> tuple[Float32Array, BoolArray]:
-        """The rectified ground (rows, columns) of ``view``, float32, and a mask of its pixels in view."""
-        px = view.pixels(self.points()).astype(np.float32).reshape((*self.shape, 2))
-        in_view = ~np.isnan(px[..., 0])
-        px[~in_view] = -1
-        return cv2.remap(view.grey, px[..., 0], px[..., 1], cv2.INTER_LINEAR).astype(np.float32), in_view
+        """The rectified ground (rows, columns) of ``view``, float32, and a mask of its pixels in view.
+
+        Each value is the mean over its cell's extent in the image, a pixel at least: single pixels of a cell
+        that covers many are another sample of the texture in every image.
+        """
+        px = view.pixels(self.points()).reshape((*self.shape, 2))
+        extent_px = np.abs(np.gradient(px, axis=0)) + np.abs(np.gradient(px, axis=1))
+        in_view = ~np.isnan(extent_px[..., 0] + extent_px[..., 1])
+        px[~in_view] = px[in_view][:1].sum(axis=0)  # of any, as all are looked up
+        extent_px[~in_view] = 0.0
+        return box_means(view.grey, px, np.maximum(extent_px, 1.0)), in_view
 
     def texture(self, view: View) -> tuple[Float32Array, BoolArray]:
         """:meth:`resample`, high-pass filtered to the ground's texture."""
         grey, in_view = self.resample(view)
         return grey - cv2.GaussianBlur(grey, (0, 0), _COARSEST_M / self.grid_m), in_view
+
+
+def box_means(grey: ImageArray, centres_px: FloatArray, extent_px: FloatArray) -> Float32Array:
+    """Mean grey values (R, C) of boxes with ``centres_px`` and ``extent_px`` (R, C, 2), cut at the border.
+
+    Boxes of one pixel interpolate linearly. From a summed-area table (Crow, SIGGRAPH 1984).
+    """
+    edges = []
+    for axis, size in ((0, grey.shape[1]), (1, grey.shape[0])):
+        half = extent_px[..., axis] / 2
+        for edge in (centres_px[..., axis] + 0.5 - half, centres_px[..., axis] + 0.5 + half):
+            # OpenCV looks up at multiples of 1/32 px: rounded here, a box has the area of its sum.
+            edges.append(np.round(32 * np.clip(edge, 0, size)).astype(np.float32) / 32)
+    left, right, top, bottom = edges
+    corner_u = int(left.min())
+    corner_v = int(top.min())
+    used = grey[corner_v : int(np.ceil(bottom.max())), corner_u : int(np.ceil(right.max()))]
+    table = cv2.integral(used, sdepth=cv2.CV_64F)
+    lower_right, lower_left, upper_right, upper_left = (
+        cv2.remap(table, u - corner_u, v - corner_v, cv2.INTER_LINEAR)
+        for v in (bottom, top)
+        for u in (right, left)
+    )
+    total = lower_right - lower_left - upper_right + upper_left
+    area = np.maximum((right - left) * (bottom - top), 1 / 32**2)  # none beyond the border
+    return np.asarray(total / area, dtype=np.float32)
 
 
 def patch_centres(

@@ -15,7 +15,6 @@ STATES = ("roll", "pitch", "yaw", "forward", "left", "up")
 """Errors of a pose, rad and m, in vehicle axes."""
 
 _LEAST_POSE_SIGMA = 1e-6  # least sigma, m or rad: poses stated as exact would make the covariance singular
-_FORWARD_LOOSENED = 2.0  # largest factor on the error along the path; beyond, distance and height drift
 _UNSURVEYED_M = 0.5  # standard deviation of a camera centre from a guess, m
 _HEIGHT_SIGMA_M = 0.2  # least sigma of a height, m: the ground shows it better, a survey's would bias it
 
@@ -95,11 +94,8 @@ class Stated:
         """Distance driven (I,) at all images."""
         return self.motion.path_at_images(self.clock_s)
 
-    def prior_of(self, observations: Observations, loosened: float = 1.0) -> ObservedPrior:
-        """The prior of the images of observations.
-
-        ``loosened`` multiplies the stated errors of heading and lateral position.
-        """
+    def prior_of(self, observations: Observations) -> ObservedPrior:
+        """The prior of the images of observations."""
         images = np.concatenate([observations.first, observations.second])
         rows, place = np.unique(images, return_inverse=True)
         count = len(observations.first)
@@ -109,10 +105,9 @@ class Stated:
         sigma_m[2] = max(sigma_m[2], _HEIGHT_SIGMA_M)
         for axis, wider_m in self.centre_sigma_m.items():
             sigma_m[axis] = wider_m
-        factors = np.array([1.0, 1.0, loosened, min(loosened, _FORWARD_LOOSENED), loosened, 1.0])
         prior = Prior(
             poses=self.poses()[rows],
-            pose_information=pose_information(self.drive.pose_noise, path_m, factors),
+            pose_information=pose_information(self.drive.pose_noise, path_m),
             velocity=self.motion.velocity_at_images(self.clock_s)[rows],
             climb_m=path_m - path_m.mean(),
             course_map=self.motion.course_map(),
@@ -131,10 +126,10 @@ def state_sigmas(noise: PoseNoise) -> FloatArray:
     return np.asarray(np.maximum(np.array(sigmas), _LEAST_POSE_SIGMA))
 
 
-def pose_information(noise: PoseNoise, path_m: FloatArray, loosened: FloatArray) -> FloatArray:
+def pose_information(noise: PoseNoise, path_m: FloatArray) -> FloatArray:
     """Inverse covariance (6, I, I) of each state's errors at images after driving ``path_m`` (I,).
 
-    Drift correlates images that are close on the path; ``loosened`` (6,) multiplies standard deviations.
+    Drift correlates images that are close on the path.
     """
     apart_m = np.abs(path_m[:, None] - path_m[None])
     drifts = (
@@ -144,8 +139,8 @@ def pose_information(noise: PoseNoise, path_m: FloatArray, loosened: FloatArray)
         + [(0.0, 1.0)]
     )
     out = []
-    for sigma, (drift, over_m), factor in zip(state_sigmas(noise), drifts, loosened, strict=True):
+    for sigma, (drift, over_m) in zip(state_sigmas(noise), drifts, strict=True):
         white = np.sqrt(max(sigma**2 - drift**2, _LEAST_POSE_SIGMA**2))
         covariance = white**2 * np.eye(len(path_m)) + drift**2 * np.exp(-apart_m / over_m)
-        out.append(np.linalg.inv(factor**2 * covariance))
+        out.append(np.linalg.inv(covariance))
     return np.array(out)

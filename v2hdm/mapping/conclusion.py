@@ -17,6 +17,8 @@ from v2hdm.site.candidates import Candidates, Counts, scatter_of, with_dissent, 
 from v2hdm.site.markings import Suspicion, classify, most_suspicious, with_relative_sigma
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import PointViews, measure_parallax
+from v2hdm.site.standing import Grey, Watch
+from v2hdm.surface.surface import Surface
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,8 @@ class FinalSolve:
     cameras: Mapping[str, Camera]
     initial_rig: Rig
     jitter_rad: float  # of roll and pitch
+    grey: Grey | None = None  # reads the images; None for none
+    surface: Surface | None = None  # of the ground; None for the plane
 
     def candidates(self, located: Located) -> Candidates:
         """Solved candidates with the errors that their images share, and the dissent of outliers."""
@@ -94,6 +98,16 @@ class FinalSolve:
             + images_with_line(self.sightings.lines, rig, corners_map),
         )
 
+    def standing_odds(self, corners_map: FloatArray, is_end: BoolArray) -> FloatArray:
+        """Log-likelihood ratios (G, 4) that something stands beyond sides ``is_end`` (G, 4)."""
+        if self.grey is None:
+            return np.zeros(is_end.shape)
+        cameras = tuple(self.cameras.values())
+        surface = self.surface
+        height_m = None if surface is None else lambda points_map: surface.height_m(points_map)[0]
+        watch = Watch(self.views, self.bundle.rig, cameras, self.grey, height_m)
+        return watch.standing_odds(corners_map, is_end)
+
     def residual_px(self, rig: Rig) -> FloatArray:
         """Residuals (K, 2), px, of the accepted observations under ``rig`` with its own best corners."""
         bundle = self.bundle
@@ -127,7 +141,9 @@ def conclude(solve: FinalSolve, acceptance: AcceptanceOptions) -> Optimised:
     )
     parallax = measure_parallax(corners, bundle.association.count)
     kind = group_kinds(bundle.association, sightings)
-    classified = classify(solved, kind, sightings.kinds, solve.counts, parallax, acceptance)
+    classified = classify(
+        solved, kind, sightings.kinds, solve.counts, parallax, acceptance, solve.standing_odds
+    )
     scale = bundle.solution.variance_scale
     markings = with_relative_sigma(
         classified.markings(),

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
 
 from v2hdm.association.ground import views_of
 from v2hdm.association.groups import Association
@@ -13,8 +16,9 @@ from v2hdm.geometry.rigid import with_clock_offsets
 from v2hdm.lanes.knots import Knots, find_knots
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.records import Drive, ImageDetections
+from v2hdm.records import Drive, Image, ImageDetections
 from v2hdm.site.options import JOINT
+from v2hdm.site.standing import Grey
 from v2hdm.surface.surface import Surface
 
 _LOOSE_CENTRE_SIGMA_M = 10.0  # standard deviation of a surveyed axis after its contradiction: uninformative
@@ -28,6 +32,13 @@ class Inputs:
     detections: Sequence[ImageDetections]
     cameras: Sequence[str]
     options: MappingOptions
+    grey: Callable[[Image], NDArray[np.float32]] | None = None  # reads an image's grey values (H, W)
+
+    @property
+    def grey_of_image(self) -> Grey | None:
+        """Reads grey values by an image's index in the drive; None where images cannot be read."""
+        grey = self.grey
+        return None if grey is None else lambda image: grey(self.drive.images[image])
 
     @cached_property
     def sightings(self) -> Sightings:

@@ -173,17 +173,17 @@ def run_methods(
 ) -> dict[str, MethodResult]:
     """Map a drive, ignoring ground truth, by every method that the cameras' IPMs allow.
 
-    ``progress`` receives the name of each step at its start. ``Opt`` updates the earlier map ``base``,
-    inspecting images read by ``grey`` (grey values (H, W)). Results are by method: ``CNI`` and ``ENI`` where
-    every camera has such an IPM, ``Opt``, ``ONI``. Raises MappingError if there is nothing to map,
-    ConfigError for an option out of range.
+    ``progress`` receives the name of each step at its start. ``Opt`` updates the earlier map ``base``;
+    ``grey`` reads the images in which it looks at bare places and at ends (grey values (H, W)). Results are
+    by method: ``CNI`` and ``ENI`` where every camera has such an IPM, ``Opt``, ``ONI``. Raises MappingError
+    if there is nothing to map, ConfigError for an option out of range.
     """
     options = options or MappingOptions()
     check_options(options)
     if options.survey.file is not None:
         raise ConfigError(f"mapping.survey.file is {options.survey.file!r}: read it and give its points")
     progress("linking sightings")
-    inputs = Inputs(drive, detections, cameras, options)
+    inputs = Inputs(drive, detections, cameras, options, grey)
     results: dict[str, MethodResult] = {}
     for name, known_as in NAIVE_IPMS.items():
         ipms = {camera: camera_of(drive, camera).ipm for camera in cameras}
@@ -194,7 +194,7 @@ def run_methods(
     optimal = _optimised_result(outcome, optimised)
     if base is not None:
         progress("the earlier map")
-        optimal = _brought_up_to_date(base, optimal, outcome, optimised, grey)
+        optimal = _brought_up_to_date(base, optimal, outcome, optimised)
     results[BEST] = optimal
     progress("ONI")
     calibrations = optimal.calibrations
@@ -373,7 +373,6 @@ def _brought_up_to_date(
     result: MethodResult,
     outcome: Outcome,
     optimised: Optimised,
-    grey: Callable[[Image], NDArray[np.float32]] | None,
 ) -> MethodResult:
     drive = outcome.inputs.drive
     group = optimised.bundle.association.group
@@ -383,7 +382,7 @@ def _brought_up_to_date(
         tuple(drive.cameras[name] for name in result.cameras),
         optimised.bundle.rig,
         drive.pose_noise.roll_pitch_rad,
-        None if grey is None else lambda image: grey(drive.images[image]),
+        outcome.inputs.grey_of_image,
     )
     mapped = np.isin(group, optimised.groups)
     over_m = drive.pose_noise.position_drift_over_m

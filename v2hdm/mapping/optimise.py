@@ -37,6 +37,7 @@ from v2hdm.mapping.bundle import (
 from v2hdm.mapping.conclusion import FinalSolve, Optimised, conclude
 from v2hdm.mapping.options import AUTO, SURFACE, MappingOptions
 from v2hdm.records import BoolArray, Camera, FloatArray, PoseNoise, Road, largest_noise
+from v2hdm.site.standing import Grey
 from v2hdm.surface.paths import Paths
 from v2hdm.surface.surface import Recorded, Surface
 
@@ -138,6 +139,7 @@ class Optimiser:
         bundle: Bundle,
         progress: Callable[[str], None] = silent,
         find_knots: Callable[[Rig, Surface | None], Knots | None] = lambda rig, surface: None,
+        grey: Grey | None = None,
     ) -> Optimised:
         """Choose the pose model, drop outliers of ``bundle`` from :meth:`settle`, classify the candidates.
 
@@ -169,6 +171,8 @@ class Optimiser:
             cameras=self._cameras,
             initial_rig=self.initial_rig,
             jitter_rad=self._pose_noise.roll_pitch_rad,
+            grey=grey,
+            surface=self.surface,
         )
         return conclude(solve, self._options.acceptance)
 

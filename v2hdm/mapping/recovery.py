@@ -87,7 +87,7 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
         _log_correction(inputs, corrected[-1])
         inputs = remaining
     # 4. Choose the pose model, solve without outliers and classify the candidates.
-    optimised = optimiser.finish(settled, progress, inputs.find_knots)
+    optimised = optimiser.finish(settled, progress, inputs.find_knots, inputs.grey_of_image)
     corrected = [
         _as_solved(error, settled) for error in corrected if _is_of_the_map(error, survey, optimised)
     ]

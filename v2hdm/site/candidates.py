@@ -18,7 +18,7 @@ CORRELATION = 0.2
 
 _KNOWN_SIGMA_M = 0.5  # largest sigma, m, of a known corner: a fraction of any marking's length
 
-TOO_UNCERTAIN = "its position is too uncertain"
+TOO_UNCERTAIN = "its shape is too uncertain"
 LACKS_A_CORNER = "a corner was never seen twice"
 SEEN_SELDOM = "seen in too few images"
 FOUND_SELDOM = "found in too few of its images"

@@ -19,6 +19,8 @@ import numpy as np
 from scipy.special import logsumexp
 from scipy.stats import norm
 
+from v2hdm.association.groups import SHAPE_TOLERANCE
+from v2hdm.geometry.planar import diameters
 from v2hdm.records import BoolArray, FloatArray
 from v2hdm.site.candidates import Candidates
 from v2hdm.site.series import Series, in_series
@@ -69,6 +71,9 @@ _SECOND = np.array([-0.5, -0.5, 0.5, 0.5])  # offsets of the four corners along 
 # Covariance (8, 8), m^2, of the corners of a parallelogram whose sides have any length and direction.
 _OWN_SIZE = _SIZE_SIGMA_M**2 * np.kron(np.outer(_FIRST, _FIRST) + np.outer(_SECOND, _SECOND), np.eye(2))
 
+_FROM_CENTRE = np.eye(8) - np.kron(np.full((4, 4), 0.25), np.eye(2))
+"""Matrix (8, 8) that makes of stacked corners what they are from their centre."""
+
 _NOTHING = np.zeros((8, 8))  # covariance of no misplacement
 
 
@@ -85,6 +90,13 @@ class Fit(NamedTuple):
     innovation: FloatArray  # (N, 5, 5) covariance of the residual
     solved: FloatArray  # (N, 5) inverse of the covariance times the residual
     squared: FloatArray  # (N,) squared Mahalanobis distance
+
+
+class Mixture(NamedTuple):
+    """N candidates over all hypotheses that they are markings."""
+
+    candidates: Candidates  # mean and covariance of the corners
+    deformed: FloatArray  # (N,) probability of another shape than that of the mean corners
 
 
 @dataclass(frozen=True)
@@ -162,7 +174,8 @@ class Hypotheses:
 
     From the previous pass are their corners as ``believed``, the ``probability`` (N, K) and frequency
     ``share`` (K,) of each kind, and the errors of ``paint``. ``vague`` (N, 4) are log-likelihood ratios of a
-    worn or hidden corner, from views that disagree on it; ``series`` is the evidence of lines of dashes.
+    worn or hidden corner, from views that disagree on it, ``standing_odds`` (N, 4) of something that stands
+    beyond a side; ``series`` is the evidence of lines of dashes.
     """
 
     candidates: Candidates
@@ -171,6 +184,7 @@ class Hypotheses:
     share: FloatArray
     paint: PaintError
     vague: FloatArray
+    standing_odds: FloatArray
     members: list[Hypothesis] = field(default_factory=list)
     series: Series | None = None
 
@@ -235,6 +249,8 @@ class Hypotheses:
             worn = _worn_evidence(self.candidates, [end.inwards for end in ends], self.weight)
             at_end = np.stack([end.inwards.reshape(-1, 4, 2).any(axis=2) for end in ends])
             worn = worn + np.sum(at_end * self.vague, axis=2) / 2
+            is_end = at_end & np.roll(at_end, -1, axis=2)
+            worn = worn + np.sum(is_end * self.standing_odds, axis=2)
             shorter = (ends[0].inwards + ends[1].inwards) / 2
             alike = alike + (_WORN_SHARE * sides_m.max()) ** 2 * _outer(shorter)
             self._add_lengths(part, laid, shape.sigma_m, shorter, ends, worn)
@@ -259,7 +275,7 @@ class Hypotheses:
         """Add those on a shape rolled by the metre, which ``shorter`` (N, 8) shortens by 1 m."""
         scatter: FloatArray = sigma_m**2 * np.eye(8)
         spread_m, repeated = self._other_lengths(laid, shorter, sigma_m)
-        any_length = scatter + spread_m**2 * _outer(shorter)
+        any_length = scatter + spread_m[:, None, None] ** 2 * _outer(shorter)
         self.add(Kind.OTHER_LENGTH, part, laid, any_length, beside=repeated)
         of_other_length = self.share[Kind.OTHER_LENGTH] / (
             self.share[Kind.OF_CLASS] + self.share[Kind.OTHER_LENGTH]
@@ -279,16 +295,25 @@ class Hypotheses:
             lengths = (1 - of_other_length, scatter_at_length), (of_other_length, any_length)
             self._add_wrong_ends(part_of_length, laid_at_length, lengths, ends, worn, [0.0, _SLANT_OF_END])
 
-    def _other_lengths(self, laid: Laid, shorter: FloatArray, sigma_m: float) -> tuple[float, FloatArray]:
-        """Sigma, m, of other lengths, and the log-likelihood ratio (N,) of a repeated to a new one."""
+    def _other_lengths(
+        self, laid: Laid, shorter: FloatArray, sigma_m: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Sigmas (N,), m, of other lengths, and log-likelihood ratios (N,) of a repeated to a new one.
+
+        What a candidate is expected to be, the others alone tell.
+        """
         weight = self.probability[:, Kind.OTHER_LENGTH]
         off_m = np.sum((laid.corners_map - self.candidates.corners_map).reshape(-1, 8) * shorter, axis=1)
         own_m2 = self.candidates.along(shorter, shorter)
-        squared = _REPEATED_COUNT * _LENGTH_SIGMA_M**2 + weight @ np.maximum(off_m**2 - own_m2, 0.0)
-        spread_m = float(np.sqrt(squared / (_REPEATED_COUNT + weight.sum())))
+        squared = weight * np.maximum(off_m**2 - own_m2, 0.0)
+        squared_of_others = _REPEATED_COUNT * _LENGTH_SIGMA_M**2 + squared.sum() - squared
+        spread_m = np.sqrt(squared_of_others / (_REPEATED_COUNT + weight.sum() - weight))
         alone = norm.pdf(off_m, 0.0, np.sqrt(own_m2 + spread_m**2))
-        sigma_between = np.sqrt(own_m2 + own_m2[:, None] + 2 * sigma_m**2)
-        alike = weight * (1 - np.eye(len(weight))) * norm.pdf(off_m, off_m[:, None], sigma_between)
+        # One whose ends were never seen has any such length, and is no example of a certain one.
+        seen_share = spread_m**2 / (spread_m**2 + own_m2)
+        sigma_between = np.sqrt(own_m2[:, None] + seen_share * own_m2 + 2 * sigma_m**2)
+        density = norm.pdf(off_m[:, None], seen_share * off_m, sigma_between)
+        alike = weight * (1 - np.eye(len(weight))) * density
         drawn = (_REPEATED_COUNT * alone + alike.sum(axis=1)) / (_REPEATED_COUNT + weight.sum() - weight)
         return spread_m, np.asarray(np.log(np.maximum(drawn, 1e-300) / np.maximum(alone, 1e-300)))
 
@@ -340,8 +365,8 @@ class Hypotheses:
                 formal += [hypothesis.formal[k] for k in rows]
         return learn_paint_error(residuals, formal)
 
-    def mixture(self, joint: FloatArray, paint: PaintError) -> Candidates:
-        """Mean and covariance of the corners over the markings among ``members``, of ``joint`` (H, N)."""
+    def mixture(self, joint: FloatArray, paint: PaintError) -> Mixture:
+        """The corners over the markings among ``members``, of ``joint`` (H, N)."""
         markings = [k for k, hypothesis in enumerate(self.members) if hypothesis.kind < Kind.PART_OF_SYMBOL]
         weight = np.exp(joint[markings] - logsumexp(joint[markings], axis=0))[..., None, None]
         solved = [self.members[k].corners(paint) for k in markings]
@@ -349,7 +374,32 @@ class Hypotheses:
         spread = [
             corners.covariance_m2 + _outer((corners.corners_map - mean).reshape(-1, 8)) for corners in solved
         ]
-        return Candidates(mean, np.sum(weight * spread, axis=0))
+        tolerance_m = SHAPE_TOLERANCE * diameters(mean, np.ones(mean.shape[:2], dtype=np.bool_))
+        deformed = [_deformed(corners, mean, tolerance_m) for corners in solved]
+        return Mixture(
+            Candidates(mean, np.sum(weight * spread, axis=0)),
+            np.sum(weight[..., 0, 0] * np.array(deformed), axis=0),
+        )
+
+
+def _deformed(candidates: Candidates, mean_map: FloatArray, tolerance_m: FloatArray) -> FloatArray:
+    """Probability (N,) that a corner, seen from the centre, is farther than a tolerance (N,) from its mean.
+
+    It is that of the worst corner of the ``candidates``, whose errors count as if they all lay in the
+    direction of its offset.
+    """
+    off_m = np.linalg.norm(_about_centre(candidates.corners_map - mean_map), axis=2)
+    covariance = _FROM_CENTRE @ candidates.covariance_m2 @ _FROM_CENTRE
+    variance_m2 = np.diagonal(covariance, axis1=1, axis2=2).reshape(-1, 4, 2).sum(axis=2)
+    sigma_m = np.sqrt(np.maximum(variance_m2, 1e-12))
+    limit_m = tolerance_m[:, None]
+    beyond = norm.sf((limit_m - off_m) / sigma_m) + norm.sf((limit_m + off_m) / sigma_m)
+    return np.asarray(beyond.max(axis=1))
+
+
+def _about_centre(corners: FloatArray) -> FloatArray:
+    """Corners (N, 4, 2) from their centres."""
+    return np.asarray(corners - corners.mean(axis=1, keepdims=True))
 
 
 def _inwards(corners: FloatArray, elongated: bool) -> list[_End]:

@@ -14,7 +14,8 @@ from scipy.spatial import cKDTree
 from scipy.stats import beta, f
 
 from v2hdm.errors import MappingError
-from v2hdm.records import Exclusion, FloatArray, IntArray, Marking
+from v2hdm.geometry.planar import Quad
+from v2hdm.records import BoolArray, Exclusion, FloatArray, IntArray, Marking
 from v2hdm.site.candidates import (
     FOUND_SELDOM,
     LACKS_A_CORNER,
@@ -32,6 +33,12 @@ from v2hdm.site.posterior import CORNERS_OF_IMAGE, Posterior, posterior
 
 OF_SYMBOL = "part of other paint, such as an arrow or a solid line"
 COVERED = "overlaps a better supported marking"
+Standing = Callable[[FloatArray, BoolArray], FloatArray]
+"""Log-likelihood ratios (G, 4) that something stands beyond sides, flagged (G, 4), of corners (G, 4, 2)."""
+
+_LONG = 2.0  # least length over width of a candidate with ends, which things hide a part at a time
+_LEAST_ODDS = -3.0  # log odds of being a marking from which a candidate's ends are worth a look
+
 _CLUTTER_BY = (
     "not shaped like a marking of its class",
     SEEN_SELDOM,
@@ -40,9 +47,6 @@ _CLUTTER_BY = (
     "does not look like its class",
 )
 """Reasons for clutter, in the order of :attr:`Posterior.evidence`."""
-
-_MAX_SIGMA_M = 0.06
-"""How far the sigma of a marking's worst corner, m, may exceed that of the map's best; goes with the gate."""
 
 
 @dataclass(frozen=True)
@@ -102,11 +106,12 @@ def classify(
     counted: Callable[[FloatArray], Counts],
     parallax: Parallax,
     options: AcceptanceOptions,
+    standing: Standing | None = None,
 ) -> Classified:
     """Decide which ``solved`` candidates are markings of the map, and where their corners are.
 
     ``kind`` (G,) indexes the class names ``kinds``; ``counted`` counts their sightings, ``parallax`` tests
-    that they lie on the ground.
+    that they lie on the ground, ``standing`` looks for what stands beyond ends.
     """
     known_corners = np.where(solved.known[..., None], solved.corners_map, np.nan)
     uncorrected = posterior(solved, kind, counted(known_corners))
@@ -121,7 +126,10 @@ def classify(
     solved = stated.placed(solved, uncorrected.candidates)
     # With the class's shape, a missing corner has a place where it should have been visible.
     counts = counted(uncorrected.candidates.corners_map)
-    judged = posterior(solved, number, counts)
+    standing_odds = None
+    if standing is not None:
+        standing_odds = standing(solved.corners_map, _known_ends(solved, uncorrected))
+    judged = posterior(solved, number, counts, standing_odds)
     judged = replace(judged, candidates=stated.placed(judged.candidates, uncorrected.candidates))
     judged.log_odds[list(stated.confirmed)] = np.inf
     least = np.log(options.min_probability / (1 - options.min_probability))
@@ -130,21 +138,28 @@ def classify(
     for group, odds in enumerate(judged.log_odds):
         against = OF_SYMBOL if is_part[group] else _CLUTTER_BY[judged.evidence[group].argmin()]
         verdict.append(None if odds >= least else against)
-    sigma_m = judged.candidates.sigma_m.max(axis=1)
     seen_corners = solved.known.sum(axis=1)
-    # The best one's uncertainty is common to all: a shift of the whole map speaks against no marking.
-    uncertain = sigma_m**2 > np.min(sigma_m, initial=np.inf) ** 2 + _MAX_SIGMA_M**2
-    for group in np.flatnonzero(uncertain).tolist():
+    # How well its place is known is its accuracy, and no reason against a marking of known shape.
+    for group in np.flatnonzero(judged.deformed > 1 - options.min_probability).tolist():
         verdict[group] = TOO_UNCERTAIN if seen_corners[group] == 4 else LACKS_A_CORNER
     objections = parallax.objections(options.min_probability)
     verdict = [reason or objection for reason, objection in zip(verdict, objections, strict=True)]
     for group in stated.confirmed:
         verdict[group] = None
     verdict = [stated.rejected.get(group, reason) for group, reason in enumerate(verdict)]
-    standing = np.flatnonzero([reason is None for reason in verdict])
-    for group in _covered(judged, standing).tolist():
+    in_map = np.flatnonzero([reason is None for reason in verdict])
+    for group in _covered(judged, in_map).tolist():
         verdict[group] = COVERED
     return Classified(tuple(names), judged.candidates, counts, judged.misfit, verdict)
+
+
+def _known_ends(solved: Candidates, judged: Posterior) -> BoolArray:
+    """Sides (G, 4) that are ends of long candidates which may be markings, and known to be where they are."""
+    is_marking = judged.log_odds > _LEAST_ODDS
+    sides_m = Quad(solved.corners_map).length
+    is_end = np.roll(sides_m, 1, axis=1) + np.roll(sides_m, -1, axis=1) > 2 * _LONG * sides_m
+    is_known = solved.known & np.roll(solved.known, -1, axis=1)
+    return np.asarray(is_end & is_known & is_marking[:, None])
 
 
 def _covered(judged: Posterior, standing: IntArray) -> IntArray:

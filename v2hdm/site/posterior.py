@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import betaln, expit, logsumexp
 from scipy.stats import f, norm, t
 
-from v2hdm.records import FloatArray, IntArray
+from v2hdm.records import BoolArray, FloatArray, IntArray
 from v2hdm.site.candidates import Candidates, Counts
 from v2hdm.site.hypotheses import Hypotheses, Kind
 from v2hdm.site.shapes import learn_paint_error, learn_shapes
@@ -67,30 +67,39 @@ class Posterior:
     candidates: Candidates  # with the corners of a marking
     evidence: FloatArray  # (G, 5) nats for a marking, from shape, images, easy views, agreement, appearance
     misfit: FloatArray  # (G,) p-value of the deviation from the nearest shape of its class; 1 without
+    deformed: FloatArray  # (G,) probability that a marking there has another shape than its corners
 
 
-def posterior(candidates: Candidates, kind: IntArray, counts: Counts) -> Posterior:
-    """Posterior of G candidates of classes ``kind`` (G,), given their positions and counts."""
+def posterior(
+    candidates: Candidates, kind: IntArray, counts: Counts, standing_odds: FloatArray | None = None
+) -> Posterior:
+    """Posterior of G candidates of classes ``kind`` (G,), given their positions and counts.
+
+    ``standing_odds`` (G, 4) are log-likelihood ratios that something stands beyond a side and hides the rest.
+    """
     total = len(candidates)
+    odds = np.zeros((total, 4)) if standing_odds is None else standing_odds
     probability = np.zeros((total, len(Kind)))
     evidence = np.zeros((total, 5))
     log_odds = np.zeros(total)
     misfit = np.ones(total)
+    deformed = np.ones(total)
     corners = candidates.corners_map.copy()
     covariance = candidates.covariance_m2.copy()
     for class_index in np.unique(kind):
         members = np.flatnonzero(kind == class_index)
-        of_class = _of_class(candidates.subset(members), counts.subset(members))
+        of_class = _of_class(candidates.subset(members), counts.subset(members), odds[members])
         probability[members] = of_class.probability
         log_odds[members] = of_class.log_odds
         evidence[members] = of_class.evidence
         corners[members] = of_class.candidates.corners_map
         covariance[members] = of_class.candidates.covariance_m2
         misfit[members] = of_class.misfit
-    return Posterior(probability, log_odds, Candidates(corners, covariance), evidence, misfit)
+        deformed[members] = of_class.deformed
+    return Posterior(probability, log_odds, Candidates(corners, covariance), evidence, misfit, deformed)
 
 
-def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
+def _of_class(candidates: Candidates, counts: Counts, standing_odds: FloatArray) -> Posterior:
     """Posterior of the candidates of one class, which jointly determine its markings' distribution."""
     share = _PRIOR_COUNT / _PRIOR_COUNT.sum()
     paint = learn_paint_error([], [])
@@ -102,8 +111,8 @@ def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
     for number in range(1, _PASSES + 1):
         weight = probability[:, : Kind.PART_OF_SYMBOL].sum(axis=1)
         vague = _vague_evidence(counts, weight)
-        space = Hypotheses(candidates, believed, probability, share, paint, vague)
-        shapes = learn_shapes(candidates.subset(weight > 0.5))
+        space = Hypotheses(candidates, believed, probability, share, paint, vague, standing_odds)
+        shapes = learn_shapes(candidates.subset(_examples(weight, standing_odds)))
         space.add_all(shapes)
         by_kind = np.array([hypothesis.kind for hypothesis in space.members])
         sources = _counted(counts, weight)
@@ -125,7 +134,7 @@ def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
         share /= share.sum()
         paint = space.paint_error(responsibility, whole)
         if space.series is not None and number < _PASSES:
-            believed = space.mixture(joint, paint)
+            believed = space.mixture(joint, paint).candidates
     log_odds = logsumexp(joint[marking], axis=0) - logsumexp(joint[~marking], axis=0)
     by_shape = shaped[marking].max(axis=0) - shaped[by_kind == Kind.CLUTTER].max(axis=0)
     evidence = np.column_stack([by_shape, *(sources[:, :, 0] - sources[:, :, 2])])
@@ -136,7 +145,15 @@ def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
     ]
     # Paint errors follow Student's t distribution, their squares Fisher's F.
     misfit = f.sf(np.min(like_others, axis=0) / 5, 5, paint.freedom) if shapes else np.ones(len(candidates))
-    return Posterior(probability, log_odds, space.mixture(joint, paint), evidence, misfit)
+    mixture = space.mixture(joint, paint)
+    return Posterior(probability, log_odds, mixture.candidates, evidence, misfit, mixture.deformed)
+
+
+def _examples(weight: FloatArray, standing_odds: FloatArray) -> BoolArray:
+    """Likely markings (N,) to learn shapes from: those beyond which nothing seems to stand, if any."""
+    is_likely = weight > 0.5
+    is_clear = is_likely & (standing_odds <= 0).all(axis=1)
+    return is_clear if is_clear.any() else is_likely
 
 
 def _counted(counts: Counts, weight: FloatArray) -> FloatArray:

@@ -7,7 +7,7 @@ in this light, bare ground between them that of ground.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -26,8 +26,7 @@ from v2hdm.geometry.planar import Quad, turned_left
 from v2hdm.records import SIGMA_OF_MAD, BoolArray, Camera, FloatArray, IntArray, Marking
 from v2hdm.site.living.fates import Watched
 from v2hdm.site.posterior import log_found, log_found_where_none_is
-
-Grey = Callable[[int], NDArray[np.float32]]  # grey values (H, W) of an image, by its index in the drive
+from v2hdm.site.standing import Grey
 
 _INSIDE = np.linspace(0.2, 0.8, 7)
 """Fractions along either side at which the inside is sampled: off the edges, which pose errors blur."""
