@@ -8,10 +8,10 @@ false ones, the share of markings with four corners known well, the corners' err
 covariance holds (inner-95 mean of the normalised squared error; honest 1.60). A part that earns nothing
 leaves.
 
-With ``--verdict`` instead what each column of the table of fault sizes (faults/table.py) and each
-number of mapping/foreign.py earns, on made drives of these seeds, as they are and with every fault: right
-drives failed, wrong maps without a word, and of those with one how many are named rightly, first. To the
-right drives belongs each as a straight one under a stream of poses, whose cameras fire in turn.
+With ``--verdict`` instead what each column of the table of fault sizes (faults/table.py), each number of
+mapping/foreign.py and parts of the tests earn, on made drives of these seeds, as they are and with every
+fault: right drives failed, wrong maps without a word, and of those with one how many are named rightly,
+first. To the right drives belongs each as a straight one under a stream of poses, whose cameras fire in turn.
 """
 
 from __future__ import annotations
@@ -46,11 +46,12 @@ from v2hdm.detection.batch import detect_all
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.quads import fit, lattice, propose, robust, state
-from v2hdm.faults import FAULTS
+from v2hdm.faults import FAULTS, columns
+from v2hdm.faults.sensitivity import Sensitivity
 from v2hdm.geometry.rigid import inverse, log
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
-from v2hdm.mapping import conclusion, foreign, methods, optimise
+from v2hdm.mapping import conclusion, foreign, methods, optimise, recovery
 from v2hdm.mapping.methods import run_methods
 from v2hdm.pipeline.base import grey_reader
 from v2hdm.records import BoolArray, Drive, FloatArray, Image, ImageDetections, IntArray, Marking, Truth
@@ -187,6 +188,12 @@ def sizes() -> Iterator[Part]:
         partial(patch.object, optimise, "vehicle_twists", _by_neighbours),
     )
     yield "jitter that does not matter", partial(patch.object, solution, "_LEAST_JITTER_S", 0.0)
+    yield "a hypothesis of fy alone", partial(patch.object, columns, "_FOCAL_SHARES", ((1.0, 1.0),))
+    yield (
+        "distances between adjusted poses",
+        partial(patch.object, Sensitivity, "map_from_vehicle", property(_recorded)),
+    )
+    yield "sightings of rejected corners", partial(patch.object, recovery, "_effective_count", _countless)
 
 
 def _by_neighbours(map_from_vehicle: FloatArray, stamp_s: FloatArray, session: IntArray) -> FloatArray:
@@ -245,6 +252,14 @@ def _without_size(column: str, nothing: float) -> Iterator[None]:
             # Records are frozen: what they hold is replaced below their guard.
             stack.enter_context(patch.dict(vars(fault), {column: nothing}))
         yield
+
+
+def _recorded(solved: Sensitivity) -> Any:
+    return solved.arrays.vehicle_from_map.inverse()
+
+
+def _countless(*_: Any) -> float:
+    return 1e4
 
 
 @contextmanager

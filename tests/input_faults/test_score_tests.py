@@ -10,6 +10,7 @@ from tests.adjust.scene import PIXEL_SIGMA, Scene, exp, make_scene, project, wit
 from v2hdm.adjust import ControlPoints, KnownLengths, PoseSigma, SolveOptions, pose_innovations, solve
 from v2hdm.adjust.problem import POSE_STATES
 from v2hdm.faults import Fault, table
+from v2hdm.faults.odds import is_contradicted
 from v2hdm.faults.score_tests import score_faults
 from v2hdm.faults.sensitivity import Sensitivity
 
@@ -27,9 +28,9 @@ def found_of(problem, fault, camera, axis=0):
     return one
 
 
-def with_focal(problem, factor):
+def with_focal(problem, factor, axes=(0, 1)):
     intrinsic = problem.intrinsic.copy()
-    intrinsic[:, :2] *= factor
+    intrinsic[:, axes] *= factor
     return replace(problem, intrinsic=intrinsic)
 
 
@@ -50,12 +51,37 @@ def test_the_gain_and_the_value_of_a_focal_length_are_those_of_solving_for_it():
     assert one.value == pytest.approx(-0.002, abs=4 * one.sigma)
 
 
+def test_fy_is_contradicted_where_an_error_of_both_focal_lengths_would_be_too_small_to_matter():
+    street = make_scene(3, frames=150, every_m=3.0, jitter=POSES, start_error_deg=0.5)
+    problem = with_focal(street.problem, 1.02, (1,))
+    found = [one for one in score_faults(problem, solve(problem, OPTIONS)) if one.fault is table.FOCAL]
+    both, fy = (next(one for one in found if (one.camera, one.axis) == (-1, axis)) for axis in (0, 1))
+    assert both.sigmas > 5
+    assert not is_contradicted(both)
+    assert is_contradicted(fy)
+    assert fy.value == pytest.approx(-0.02, abs=3 * fy.sigma)
+
+
 def test_a_late_clock_is_found_and_named_first():
     late = with_late_clocks(scene(), np.array([0.06, 0.0])).problem
     found = score_faults(late, solve(late, OPTIONS))
     assert (found[0].fault, found[0].camera) == (table.CLOCK, 0)
     assert found[0].value == pytest.approx(0.06, abs=0.01)
     assert found[0].sigmas > 7
+
+
+def test_stamps_that_jitter_do_not_look_like_positions_that_are_stretched():
+    street = scene()
+    recorded = street.problem.map_from_vehicle.copy()
+    jitter_m = np.random.default_rng(1).normal(0.0, 6 * POSES.position_m, (len(recorded), 1))
+    recorded[:, :3, 3] += jitter_m * recorded[:, :3, 0]
+    one = found_of(replace(street.problem, map_from_vehicle=recorded), table.SCALE, -1)
+    assert one.sigmas < 2.5
+    stretched = street.problem.map_from_vehicle.copy()
+    stretched[:, :2, 3] *= 1.1
+    one = found_of(replace(street.problem, map_from_vehicle=stretched), table.SCALE, -1)
+    assert one.value == pytest.approx(-0.1, abs=0.02)
+    assert one.sigmas > 4
 
 
 def test_a_survey_is_held_against_what_the_drive_says_without_it():

@@ -54,7 +54,7 @@ def evidence(**changes):
         corrected=(),
         pose_model="none",
         held_out={},
-        fits={"front": CameraFit(100, 0.2, 0.0)},
+        fits={"front": CameraFit(100, 0.2, 0.0, 25.0)},
         variance_factor=0.2,
         pose_noise={},
         worst_innovation=1.0,

@@ -19,7 +19,7 @@ from v2hdm.verdict import Finding, Status, Verdict
 from v2hdm.verdict.results.accuracy import SIGNIFICANCE, check_frame, check_goal, check_points
 from v2hdm.verdict.results.solution import check_inputs, check_solution, over_ground, told_by_poses
 
-FIT = CameraFit(observations=2000, variance_factor=0.15, rejected_share=0.02)
+FIT = CameraFit(observations=2000, variance_factor=0.15, rejected_share=0.01, sightings=400.0)
 
 
 def contradiction(fault, cameras, axis, about, value, sigma, sigmas):
@@ -184,6 +184,38 @@ def test_an_input_that_may_well_be_wrong_is_a_warning(sigmas, is_told, drive):
     assert ("unless the focal length is off" in accuracy.says) is is_told
 
 
+def test_stamps_that_jitter_explain_a_step_that_they_are_likelier_than_and_no_doubt_stands_beside_them():
+    noisy = replace(FINE, pose_noise={"position_m": 2.0}, jitter_s=0.018, along_over_across=20.0)
+    step = replace(
+        contradiction(table.STEP, ("front", "rear"), 0, "from 9.0 s on", -0.09, 0.012, 5.0), gain=23.0
+    )
+    told = [f for f in check_inputs(replace(noisy, score_tests=(step,))) if f.status is not Status.PASS]
+    assert [(f.check, f.status) for f in told] == [("image stamps", Status.FAIL)], "the noise does harm"
+    scale = replace(contradiction(table.SCALE, ("front",), 0, "", -0.13, 0.025, 4.0), gain=13.5)
+    told = [f for f in check_inputs(replace(noisy, score_tests=(scale,))) if f.status is not Status.PASS]
+    assert [(f.check, f.status) for f in told] == [("image stamps", Status.WARN)]
+    clock = replace(contradiction(table.CLOCK, ("front",), 0, "", 0.03, 0.002, 12.0), gain=72.0)
+    told = [f for f in check_inputs(replace(noisy, score_tests=(clock,))) if f.status is not Status.PASS]
+    assert [f.check for f in told] == ["clock", "image stamps"], "what is likelier than them is told"
+
+
+@pytest.mark.parametrize(("value", "is_told"), [(0.0019, True), (0.0005, False)])
+def test_an_error_is_doubted_by_how_probably_it_is_larger_than_what_matters(value, is_told):
+    knock = contradiction(table.KNOCK, ("front",), 2, "from 9.0 s on", value, 0.0002, 5.4)
+    told = [f for f in check_inputs(replace(FINE, score_tests=(knock,))) if f.status is not Status.PASS]
+    assert [(f.check, f.status) for f in told] == [("mounting", Status.WARN)] * is_told
+
+
+def test_a_doubt_names_every_cause_that_is_nearly_as_likely():
+    focal = contradiction(table.FOCAL, ("front",), 1, "", -0.0077, 0.0019, 3.6)
+    principal = contradiction(table.PRINCIPAL, ("front", "rear"), 0, "", -13.0, 3.8, 3.1)
+    (told,) = [
+        f for f in check_inputs(replace(FINE, score_tests=(focal, principal))) if f.status is Status.WARN
+    ]
+    assert "focal length fy of front is 0.8 % shorter" in told.says
+    assert "or the principal point of front and rear lies -13 px" in told.says
+
+
 @pytest.mark.parametrize("recorded", [Status.WARN, Status.FAIL])
 @pytest.mark.parametrize(("is_curved", "is_tried"), [(True, True), (False, True), (False, False)])
 def test_a_bend_of_the_recorded_heights_matters_as_the_map_s_ground_says(recorded, is_curved, is_tried):
@@ -204,6 +236,21 @@ def test_a_bend_of_the_recorded_heights_matters_as_the_map_s_ground_says(recorde
 def test_a_small_contradiction_is_none_however_sure_it_is():
     tiny = replace(CLOCK, value=0.0008, sigma=0.0001, p_value=1e-15)
     assert all(f.status is Status.PASS for f in check_inputs(replace(FINE, score_tests=(tiny,))))
+
+
+@pytest.mark.parametrize(
+    ("sigmas", "says"),
+    [
+        (1.2, "the markings agree with the inputs, the largest deviation being 1.2 sigmas; they show errors"),
+        (5.8, "the markings fit better if the focal length of front is 0.1 % longer than camera_info says "
+              "(5.8 sigmas): too little to matter by itself; they show errors from 0.001"),
+    ],
+)  # fmt: skip
+def test_a_check_that_passes_says_of_its_largest_deviation_what_it_is(sigmas, says):
+    focal = contradiction(table.FOCAL, ("front",), 0, "", 0.0014, 0.00025, sigmas)
+    (finding,) = [f for f in check_inputs(replace(FINE, score_tests=(focal,))) if f.check == "focal length"]
+    assert finding.status is Status.PASS
+    assert finding.says.startswith(says)
 
 
 def test_a_straight_drive_says_what_it_cannot_tell():
@@ -231,6 +278,26 @@ def test_a_straight_drive_says_what_it_cannot_tell():
 )
 def test_a_bad_fit_is_raised_by_its_own_check(check, change, drive):
     assert set(raised(result(replace(FINE, **change)), drive)) == {check}  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("share", "sightings", "is_wrong"),
+    [
+        (0.06, 28, False),  # a map of four markings
+        (0.06, 88, False),
+        (0.06, 1000, True),
+        (0.14, 60, True),
+        (0.01, 1000, False),
+        (1.0, 6, True),
+    ],
+)
+def test_a_share_of_rejected_corners_is_judged_by_how_many_sightings_it_is_of(
+    share, sightings, is_wrong, drive
+):
+    fit = replace(FIT, rejected_share=share, sightings=float(sightings))
+    found = raised(result(replace(FINE, fits={"front": fit})), drive)
+    assert set(found) == ({"rejected"} if is_wrong else set())
+    assert not is_wrong or found["rejected"].value > found["rejected"].limit
 
 
 def test_markings_that_overlap_are_told_with_a_place_and_neighbours_are_no_doubles(drive):

@@ -32,6 +32,12 @@ _DRIFTS = 3  # shapes of a clock drift: linear, and cosines of two and three hal
 _STEPS = ((1.0, 0.0), (0.0, 1.0), (0.5**0.5, 0.5**0.5), (-(0.5**0.5), 0.5**0.5))
 """Directions of position steps in the map: no direction is more than 22.5 deg from one of them."""
 
+_FOCAL_SHARES = ((1.0, 1.0), (0.0, 1.0))
+"""Shares of fx and fy in an error of the focal length: in both, or in fy alone.
+
+One of fx alone looks like one of both: over a plane, fy is nearly the camera's height.
+"""
+
 _LEAST_SPEED_MPS = 0.5  # a slower vehicle has no course
 
 Column = Callable[[Sensitivity], Rows]
@@ -106,11 +112,12 @@ def _clock(setting: Setting, camera: int) -> Iterator[Hypothesis]:
 
 
 def _focal(_: Setting, camera: int) -> Iterator[Hypothesis]:
-    yield Hypothesis(table.FOCAL, partial(_lens, camera, 0), camera)
+    for axis, (in_x, in_y) in enumerate(_FOCAL_SHARES):
+        yield Hypothesis(table.FOCAL, partial(_zoomed, camera, in_x, in_y), camera, axis)
 
 
 def _distortion(_: Setting, camera: int) -> Iterator[Hypothesis]:
-    yield Hypothesis(table.DISTORTION, partial(_lens, camera, 1), camera)
+    yield Hypothesis(table.DISTORTION, partial(_bent, camera), camera)
 
 
 def _principal(setting: Setting, camera: int) -> Iterator[Hypothesis]:
@@ -175,7 +182,7 @@ def _lever(setting: Setting) -> Iterator[Hypothesis]:
 
 def _scale(setting: Setting) -> Iterator[Hypothesis]:
     if setting.has_centres:
-        yield Hypothesis(table.SCALE, _moving(_stretched))
+        yield Hypothesis(table.SCALE, _stretched)
 
 
 def _datum(setting: Setting) -> Iterator[Hypothesis]:
@@ -213,12 +220,19 @@ OF_DRIVE: dict[Fault, Callable[[Setting], Iterator[Hypothesis]]] = {
 """Hypotheses on everything else, by fault; surveyed points are tested one by one without a column."""
 
 
-def _lens(camera: int, power: int, solved: Sensitivity) -> Rows:
-    """Relative error p of a focal length or, with ``power`` 1, error p of the first radial coefficient."""
+def _zoomed(camera: int, in_x: float, in_y: float, solved: Sensitivity) -> Rows:
+    """Relative error of the focal lengths fx and fy, by the shares ``in_x`` and ``in_y`` of the value."""
     # Projected points rather than measured ones: pixels, whose noise is stated, do not scale.
+    is_of_camera = (solved.camera == camera) | (camera < 0)
+    shares = solved.projected.new_tensor([[in_x], [in_y]])
+    return {"observations": solved.whiten(solved.projected * shares * is_of_camera)}
+
+
+def _bent(camera: int, solved: Sensitivity) -> Rows:
+    """Error of the first radial coefficient."""
     projected = solved.projected
     is_of_camera = (solved.camera == camera) | (camera < 0)
-    return {"observations": solved.whiten(projected * projected.square().sum(0) ** power * is_of_camera)}
+    return {"observations": solved.whiten(projected * projected.square().sum(0) * is_of_camera)}
 
 
 def _shifted_image(problem: Problem, camera: int, axis: int, solved: Sensitivity) -> Rows:
@@ -269,11 +283,20 @@ def _stepped(axis: int, frame: int, until: int, arrays: Arrays, out: Tensor) -> 
     return out * _since(arrays, frame) * (after / (until - frame + 1)).clamp(max=1.0)
 
 
-def _stretched(arrays: Arrays, out: Tensor) -> Tensor:
-    """Positions recorded too close together, as those of a grid that shrinks the ground."""
-    position = arrays.vehicle_from_map.inverse()[:, :3, 3:]
-    out[..., :3] = (arrays.vehicle_from_map[:, :3, :3] @ (position - position.mean(dim=0)))[..., 0]
-    return out
+def _stretched(solved: Sensitivity) -> Rows:
+    """Positions recorded too close together, as those of a grid that shrinks the ground.
+
+    Distances are those between adjusted poses: noise would lengthen recorded ones, and be found in the
+    residuals again, which would look like a scale.
+    """
+    position = solved.map_from_vehicle[:, :3, 3:]
+
+    def motion(arrays: Arrays, out: Tensor) -> Tensor:
+        away = position - position.mean(dim=0)
+        out[..., :3] = (arrays.vehicle_from_map[:, :3, :3] @ away)[..., 0]
+        return out
+
+    return _moving(motion)(solved)
 
 
 def _knocked(camera: int, axis: int, frame: int, arrays: Arrays, out: Tensor) -> Tensor:

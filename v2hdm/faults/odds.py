@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import math
 
+from scipy.special import expit
+from scipy.stats import norm
+
 from v2hdm.faults.score import ScoreTest
 
 CLEAR_SIGMAS = 4.0  # of a visible error; in one of 400 correct drives one of its forty tests exceeds it
@@ -17,13 +20,26 @@ _DOUBT = 0.05  # probability of a wrong input that a PASS, stated at 95 %, leave
 
 
 def is_contradicted(test: ScoreTest) -> bool:
-    """Whether an input's error matters, is observable, and is more likely than not."""
-    return matters(test) and test.sigmas > even_sigmas(test)
+    """Whether an input is observable, and more likely than not wrong by more than a drive tolerates."""
+    return is_observable(test) and probability(test) > 0.5
 
 
 def is_doubtful(test: ScoreTest) -> bool:
-    """Whether an input's error matters, is observable, and has more than 5 % probability."""
-    return matters(test) and test.sigmas > even_sigmas(test, _DOUBT / (1 - _DOUBT))
+    """Whether an input is observable, and with more than 5 % wrong by more than a drive tolerates."""
+    return is_observable(test) and probability(test) > _DOUBT
+
+
+def is_possible(test: ScoreTest) -> bool:
+    """Whether an input's error of any size has more than 5 % probability."""
+    return test.sigmas > even_sigmas(test, _DOUBT / (1 - _DOUBT))
+
+
+def probability(test: ScoreTest) -> float:
+    """Posterior probability of an input's error that is larger than a drive tolerates."""
+    if not math.isfinite(test.sigma):
+        return 0.0
+    is_larger = sum(norm.cdf((side * test.value - test.fault.least) / test.sigma) for side in (1.0, -1.0))
+    return float(expit(doubt(test)) * is_larger)
 
 
 def even_sigmas(test: ScoreTest, odds: float = 1.0) -> float:
@@ -43,9 +59,14 @@ def _log_spread(test: ScoreTest) -> float:
     return math.log(max(size, 1e-300))
 
 
+def is_observable(test: ScoreTest) -> bool:
+    """Whether a drive shows errors of an input of the sizes that they have."""
+    return test.model_sigma <= test.fault.observable_sigma
+
+
 def matters(test: ScoreTest) -> bool:
-    """Whether an observable input's error is larger than a drive tolerates."""
-    return test.model_sigma <= test.fault.observable_sigma and abs(test.value) > test.fault.least
+    """Whether an observable input's estimated error is larger than a drive tolerates."""
+    return is_observable(test) and abs(test.value) > test.fault.least
 
 
 def is_physical(test: ScoreTest) -> bool:

@@ -46,6 +46,7 @@ class _Answer:
     hypothesis: Hypothesis
     score: FloatArray  # (G + 1,) s_g; the last is of priors of no segment
     information: FloatArray  # (G + 1,) w_g, likewise
+    of_surveys: tuple[float, float]  # score and information of the cameras' surveyed centres
     drawn: FloatArray  # (D, G + 1) scores of noise drawn from the model
     information_alone: float  # the fault's information with all else known
 
@@ -53,11 +54,16 @@ class _Answer:
     def to(cls, hypothesis: Hypothesis, solved: Sensitivity) -> _Answer:
         """The segments' scores at a solution."""
         column = hypothesis.column(solved)
-        efficient = solved.flat(solved.efficient(column))
+        rows = solved.efficient(column)
+        of_surveys = rows["camera_centre"].detach()
+        survey_score = -float((of_surveys * solved.residuals["camera_centre"]).sum())
+        survey_information = float(of_surveys.square().sum())
+        efficient = solved.flat(rows)
         information = solved.by_stretch(efficient, efficient)
         alone = sum(float(row.square().sum()) for row in column.values())
         score = -solved.by_stretch(efficient, solved.flat(solved.residuals))
-        return cls(hypothesis, score, information, solved.by_stretch(efficient, solved.noise).T, alone)
+        drawn = solved.by_stretch(efficient, solved.noise).T
+        return cls(hypothesis, score, information, (survey_score, survey_information), drawn, alone)
 
     @property
     def is_observable(self) -> bool:
@@ -112,6 +118,9 @@ class _Answer:
         # Each segment is predicted from the others, which include priors of no segment.
         predicted = (self.score.sum() - score) / np.maximum(total - information, _LEAST_OBSERVABLE * total)
         gain = float(np.sum(predicted * score - predicted**2 * information / 2)) / multiple
+        # Surveys belong to no segment: they are one more, and gain by the value itself.
+        survey_score, survey_information = self.of_surveys
+        gain += self.value * survey_score - self.value**2 * survey_information / 2
         return replace(
             blank,
             value=self.value,

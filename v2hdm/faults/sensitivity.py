@@ -13,7 +13,15 @@ from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
 from v2hdm.adjust.covariance import Moves
-from v2hdm.adjust.model import Estimate, Gradient, points_in_camera, prior_residuals, rigid, robustified
+from v2hdm.adjust.model import (
+    Estimate,
+    Gradient,
+    frame_tangent,
+    points_in_camera,
+    prior_residuals,
+    rigid,
+    robustified,
+)
 from v2hdm.adjust.solution import Solution
 from v2hdm.adjust.whitening import Whitening
 from v2hdm.geometry.tensors import NEAR_M
@@ -85,6 +93,13 @@ class Sensitivity:
         a, b, c = self.arrays.root_information
         first = self.whitened_px[0] / a
         return self.arrays.measured + torch.stack([first, (self.whitened_px[1] - b * first) / c])
+
+    @cached_property
+    def map_from_vehicle(self) -> Tensor:
+        """Adjusted poses (J, 4, 4)."""
+        tangent = frame_tangent(self.arrays, self.whitening.estimate.frame_state)
+        poses: Tensor = self.arrays.vehicle_from_map.inverse() @ rigid(tangent)
+        return poses.detach()
 
     @cached_property
     def poses(self) -> Tensor:

@@ -123,8 +123,9 @@ def _clock_drift(error: Error) -> str:
 
 
 def _focal(error: Error) -> str:
+    which = ("focal length", "focal length fy")[error.axis]
     longer = error.word("longer", "shorter")
-    return f"the focal length of {error.whose} is {100 * error.size:.1f} % {longer} than camera_info says"
+    return f"the {which} of {error.whose} is {100 * error.size:.1f} % {longer} than camera_info says"
 
 
 def _distortion(error: Error) -> str:
@@ -218,7 +219,7 @@ CLOCK_DRIFT = Fault(
     like_clock=True,
 )  # fmt: skip
 
-# Relative error of the focal length.
+# Relative error of the focal length: of fx and fy (axis 0), or of fy alone.
 FOCAL = Fault(
     "focal", "", least=0.003, observable_sigma=0.01, usual=0.02, most=1.0,
     check="focal length",

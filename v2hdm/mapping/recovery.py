@@ -38,7 +38,7 @@ from v2hdm.mapping.inputs import Inputs
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import AUTO, INCREMENTAL, SURFACE, SurveyOptions
 from v2hdm.mapping.results import CameraFit, ForeignSegment, SolveEvidence
-from v2hdm.records import Drive, FloatArray
+from v2hdm.records import Drive, FloatArray, IntArray
 
 _log = logging.getLogger(__name__)
 
@@ -350,8 +350,15 @@ def _camera_fits(bundle: Bundle) -> dict[str, CameraFit]:
             observations=int(of_camera.sum()),
             variance_factor=_factor(bundle, bundle.solution.mahalanobis2[of_camera]),
             rejected_share=float(1 - np.average(bundle.inliers[of_camera], weights=information[of_camera])),
+            sightings=_effective_count(bundle.row[of_camera], information[of_camera]),
         )
     return fits
+
+
+def _effective_count(group: IntArray, weight: FloatArray) -> float:
+    """Number of equally weighted groups with as uncertain a mean, of weights (K,) in groups (Kish, 1965)."""
+    weights = np.bincount(group, weight)
+    return float(weights.sum() ** 2 / np.sum(weights**2))
 
 
 def _factor(bundle: Bundle, mahalanobis2: FloatArray) -> float:

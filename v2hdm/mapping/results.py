@@ -32,7 +32,8 @@ class CameraFit:
 
     observations: int
     variance_factor: float
-    rejected_share: float
+    rejected_share: float  # weighted by the corners' information
+    sightings: float  # effective number: as many of equal information would tell as much about the share
 
 
 class ForeignSegment(NamedTuple):

@@ -199,12 +199,13 @@ def _lever(ahead_m: float, left_m: float, world: World) -> World:
     return _with_poses(world, change)
 
 
-def _lens(focal: float, right_px: float, world: World) -> World:
-    """``camera_info`` states another focal length and principal point than the lenses have."""
+def _lens(fx: float, fy: float, right_px: float, world: World) -> World:
+    """``camera_info`` states other focal lengths and another principal point than the lenses have."""
     cameras = {}
     for name, camera in world.cameras.items():
         intrinsic = camera.info.intrinsic.copy()
-        intrinsic[[0, 1], [0, 1]] *= 1 + focal
+        intrinsic[0, 0] *= 1 + fx
+        intrinsic[1, 1] *= 1 + fy
         intrinsic[0, 2] += right_px
         cameras[name] = replace(camera, info=replace(camera.info, intrinsic=intrinsic))
     return replace(world, cameras=cameras)
@@ -243,8 +244,9 @@ SPOILS: Mapping[str, Spoil] = {
         Spoil("survey height", r"survey|\bcentre|camera height", partial(_survey, (0.0, 0.0, 0.1))),
         Spoil("lever", _LEVER, partial(_lever, 1.2, 0.0), _LEVER),
         Spoil("lever left", _LEVER, partial(_lever, 0.0, 0.3), _LEVER),
-        Spoil("focal length", r"focal", partial(_lens, 0.02, 0.0)),
-        Spoil("principal point", r"principal", partial(_lens, 0.0, 20.0), r"principal"),
+        Spoil("focal length", r"focal", partial(_lens, 0.02, 0.02, 0.0)),
+        Spoil("fy", r"focal", partial(_lens, 0.0, 0.01, 0.0), r"focal"),
+        Spoil("principal point", r"principal", partial(_lens, 0.0, 0.0, 20.0), r"principal"),
     )
 }
 """All faults by their names."""

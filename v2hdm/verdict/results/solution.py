@@ -13,22 +13,25 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.special import betaln
 
 from v2hdm.faults import Contradiction, Fault, table
 from v2hdm.faults.odds import (
     CLEAR_SIGMAS,
     RIVAL_LOG_ODDS,
-    doubt,
     even_sigmas,
     is_contradicted,
     is_doubtful,
+    is_observable,
     is_physical,
+    is_possible,
     log_odds,
     matters,
+    probability,
 )
 from v2hdm.faults.sensitivity import STRETCHES
 from v2hdm.ground.results import GroundEstimate
-from v2hdm.mapping.results import MethodResult, SolveEvidence
+from v2hdm.mapping.results import CameraFit, MethodResult, SolveEvidence
 from v2hdm.records import BEST, Drive
 from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN
 from v2hdm.site.parallax import NOT_OBSERVED, NOT_ON_GROUND
@@ -44,9 +47,13 @@ _EXCLUDED_LIMIT = 0.2
 two standard errors taken off: clean drives reach 0.05 of hundreds and 0.13 of 26, swapped axes 0.75 of
 200."""
 
-_REJECTED_LIMIT = 0.06
-"""Largest share of corner observations that the others may contradict: clean drives reach 0.02, a drive
-without its distortion 0.14."""
+_REJECTED_OF_RIGHT = (2.0, 300.0)
+"""Beta distribution of the share of a camera's corners that the others contradict on right drives: its mean
+and standard deviation are a little above those of 50 cameras, rendered or made without pictures, 0.0055 and
+0.0035."""
+
+_REJECTED_OF_WRONG = (1.0, 6.0)
+"""That of cameras whose lens, clock or mounting is wrong: mean 0.14, as without distortion coefficients."""
 
 _VARIANCE_LIMIT = 3.0
 """Largest variance of observations over the one that the detector states: clean drives reach 0.2, a drive
@@ -150,21 +157,8 @@ def check_inputs(evidence: SolveEvidence) -> list[Finding]:
     if not contradicted:
         contradicted = [test for test in evidence.score_tests if _is_left(test, evidence.corrected)][:1]
     foreign = _foreign(evidence)
-    stamps = _stamps(evidence)
-    causes = {foreign: evidence.foreign.gain, stamps: _jitter_odds(evidence)}
-    if contradicted:
-        likeliest = contradicted[0]
-        finding = _contradicted(contradicted) if is_physical(likeliest) else _unknown(likeliest)
-        causes[finding] = log_odds(likeliest)
-    # Each cause would explain part of the same contradictions: the likeliest is named, and what nearly is.
-    causes = {cause: odds for cause, odds in causes.items() if cause.status is Status.FAIL}
-    least = max(causes.values(), default=0.0) - RIVAL_LOG_ODDS
-    named = [cause for cause in sorted(causes, key=lambda cause: -causes[cause]) if causes[cause] > least]
-    doubtful = doubted(evidence)
-    if not named and doubtful is not None:
-        named = [_doubtful(doubtful)]
-    findings += named if foreign in causes else [*named, foreign]
-    findings += [stamps] if stamps.status is Status.WARN else []
+    named = _named(evidence, contradicted, foreign)
+    findings += named if foreign.status is Status.FAIL else [*named, foreign]
     raised |= {finding.check for finding in named}
     tests_of: dict[str, list[Contradiction]] = {}
     for test in evidence.score_tests:
@@ -175,6 +169,30 @@ def check_inputs(evidence: SolveEvidence) -> list[Finding]:
     }
     findings += [_agrees(check, tests) for check, tests in tests_of.items() if check not in answered]
     return [*findings, *unobservable]
+
+
+def _named(evidence: SolveEvidence, contradicted: list[Contradiction], foreign: Finding) -> list[Finding]:
+    """The causes to be told, the likeliest first: each would explain part of the same contradictions.
+
+    Others are left out if less than a tenth as likely, but for stamps that jitter within the allowed noise.
+    """
+    stamps = _stamps(evidence)
+    causes = {foreign: evidence.foreign.gain} if foreign.status is Status.FAIL else {}
+    if contradicted:
+        likeliest = contradicted[0]
+        finding = _contradicted(contradicted) if is_physical(likeliest) else _unknown(likeliest)
+        causes[finding] = log_odds(likeliest)
+    doubtful = _doubtful(evidence)
+    if not causes and stamps.status is not Status.FAIL and doubtful:
+        causes[_doubted(doubtful)] = log_odds(doubtful[0])
+    jitter = stamps
+    if stamps.status is not Status.PASS:
+        # Noise that is allowed for contradicts no input: where one is, and they explain it, they do harm.
+        jitter = replace(stamps, status=Status.FAIL) if contradicted else stamps
+        causes[jitter] = _jitter_odds(evidence)
+    least = max(causes.values(), default=0.0) - RIVAL_LOG_ODDS
+    named = [cause for cause in sorted(causes, key=lambda cause: -causes[cause]) if causes[cause] > least]
+    return [*named, stamps] if stamps.status is Status.WARN and jitter not in named else named
 
 
 def _observable(tested: list[Contradiction]) -> list[Contradiction]:
@@ -224,9 +242,11 @@ def _contradicted(tests: list[Contradiction]) -> Finding:
     return _input(likeliest, Status.FAIL, f"{says}, and the map is wrong by it: {likeliest.fault.remedy}")
 
 
-def _doubtful(test: Contradiction) -> Finding:
-    says = f"{test.sentence}, as far as the drive can tell ({test.sigmas:.1f} sigmas): {test.fault.remedy}"
-    return _input(test, Status.WARN, says)
+def _doubted(tests: list[Contradiction]) -> Finding:
+    likeliest = tests[0]
+    says = " or ".join(test.sentence for test in tests)
+    says = f"{says}, as far as the drive can tell ({likeliest.sigmas:.1f} sigmas): {likeliest.fault.remedy}"
+    return _input(likeliest, Status.WARN, says)
 
 
 def _input(test: Contradiction, status: Status, says: str) -> Finding:
@@ -248,8 +268,13 @@ def _agrees(check: str, tested: list[Contradiction]) -> Finding:
     if is_contradicted(worst):
         says = "not told apart from what is named as wrong: fix that first"
         return passed(check, ", ".join(worst.cameras), says)
-    blind = _least_shown(max(observable, key=_sigma))
-    says = f"the markings agree with the inputs, to {worst.sigmas:.1f} sigmas; they show errors from {blind}"
+    shown = f"they show errors from {_least_shown(max(observable, key=_sigma))}"
+    says = (
+        f"the markings agree with the inputs, the largest deviation being {worst.sigmas:.1f} sigmas; {shown}"
+    )
+    if is_possible(worst):
+        why = "other causes are likelier" if matters(worst) else "too little to matter by itself"
+        says = f"the markings fit better if {worst.sentence} ({worst.sigmas:.1f} sigmas): {why}; {shown}"
     return _input(worst, Status.PASS, says)
 
 
@@ -265,8 +290,16 @@ def _least_shown(test: Contradiction) -> str:
 
 def doubted(evidence: SolveEvidence) -> Contradiction | None:
     """The input that is likeliest to be off, of those that may well be and do not surely fail the map."""
-    doubtful = [test for test in evidence.score_tests if is_doubtful(test) and not is_contradicted(test)]
-    return max(doubtful, key=doubt, default=None)
+    return next(iter(_doubtful(evidence)), None)
+
+
+def _doubtful(evidence: SolveEvidence) -> list[Contradiction]:
+    """That input, and those that are at least a tenth as likely to be off."""
+    possible = [test for test in evidence.score_tests if is_doubtful(test) and not is_contradicted(test)]
+    least = math.exp(-RIVAL_LOG_ODDS) * max(map(probability, possible), default=0.0)
+    rivals = [test for test in evidence.score_tests if is_observable(test) and not is_contradicted(test)]
+    likely = [test for test in rivals if possible and probability(test) > least]
+    return sorted(likely, key=probability, reverse=True)
 
 
 def relied_on(evidence: SolveEvidence) -> list[str]:
@@ -323,11 +356,12 @@ def check_fit(evidence: SolveEvidence) -> Iterator[Finding]:
         "check camera_info and the pose_noise first",
     )  # fmt: skip
     for name, fit in evidence.fits.items():
-        percent = 100 * fit.rejected_share
+        says = f"{100 * fit.rejected_share:.1f} % of its corners contradict the rest"
         yield judge(
-            "rejected", name, fit.rejected_share, _REJECTED_LIMIT, "",
-            fine=f"{percent:.1f} % of its corners contradict the rest",
-            wrong=f"{percent:.0f} % of its corners contradict the rest: its lens, clock or mounting is wrong",
+            "rejected", name, max(_rejected_odds(fit), 0.0), _ODDS_LIMIT, "",
+            fine=f"{says}, of {fit.sightings:.0f} independent sightings",
+            wrong=f"{says}, too many for {fit.sightings:.0f} independent sightings: its lens, clock or "
+            "mounting is wrong",
         )  # fmt: skip
     if evidence.held_out_loss is not None:
         yield judge(
@@ -337,6 +371,16 @@ def check_fit(evidence: SolveEvidence) -> Iterator[Finding]:
         )  # fmt: skip
     if evidence.pose_noise:
         yield from _poses(evidence)
+
+
+def _rejected_odds(fit: CameraFit) -> float:
+    """The log odds of a wrong camera, by how many of its sightings are rejected: beta-binomial of both."""
+    rejected = fit.rejected_share * fit.sightings
+    wrong, right = (
+        betaln(rejected + a, fit.sightings - rejected + b) - betaln(a, b)
+        for a, b in (_REJECTED_OF_WRONG, _REJECTED_OF_RIGHT)
+    )
+    return float(wrong - right)
 
 
 def _foreign(evidence: SolveEvidence) -> Finding:
