@@ -66,7 +66,7 @@ class Watch:
         """
         odds = np.zeros(is_end.shape)
         # Neighbouring ends are seen in the same images.
-        read = lru_cache(maxsize=64)(self._log_grey)
+        read = lru_cache(maxsize=16)(self._log_grey)
         for group, side in np.argwhere(is_end).tolist():
             end = _End.of(corners_map[group], side, self._height_m(corners_map[group]))
             better = [self._better_ground(end, far, near, read) for far, near in self._pairs(end)]
