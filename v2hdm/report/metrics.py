@@ -19,6 +19,7 @@ from v2hdm.catalogue import CORNERED_CLASSES
 from v2hdm.geometry.planar import inside_convex, length_along, points_along
 from v2hdm.geometry.rigid import camera_centre, ground_in_vehicle
 from v2hdm.records import BEST, DIAMOND, BoolArray, Drive, FloatArray, HDMap, Lane, Marking, Truth
+from v2hdm.site.accuracy import well_known
 
 MATCH_GATE_M = 2.0  # a mapped marking farther from every true one of its class is false
 MIN_SIGHTINGS = 3  # images with the whole marking in the region of interest that count as driven past
@@ -34,8 +35,9 @@ class MarkingMetrics:
     false_markings: int  # without a true counterpart
     expected: int  # true ones driven past within the region of interest
     recall: float  # mapped fraction of these
-    corner_rmse_m: float
-    corner_bias_m: float  # length of the corners' mean error vector
+    corner_rmse_m: float  # of the markings that are not of accuracy C, as long as these are most
+    corner_bias_m: float  # length of the mean error vector of the same corners
+    all_corners_rmse_m: float
 
 
 def driven_past(drive: Drive, truth: Truth, cameras: Sequence[str]) -> BoolArray:
@@ -66,7 +68,11 @@ def marking_metrics(
     rows, columns = match_markings(mapped, true)
     is_mapped = np.zeros(len(true), dtype=bool)
     is_mapped[columns] = True
-    errors = corner_errors([mapped[r] for r in rows], [true[c] for c in columns])
+    true_of = {id(mapped[r]): true[c] for r, c in zip(rows, columns, strict=True)}
+    found = [mapped[r] for r in rows]
+    known = well_known(found)
+    errors = corner_errors(known, [true_of[id(marking)] for marking in known])
+    all_errors = corner_errors(found, [true[c] for c in columns])
     return MarkingMetrics(
         markings=len(mapped),
         false_markings=len(mapped) - len(rows),
@@ -74,6 +80,7 @@ def marking_metrics(
         recall=float(is_mapped[is_expected].mean()) if is_expected.any() else float("nan"),
         corner_rmse_m=rms(errors),
         corner_bias_m=float(np.linalg.norm(errors.mean(axis=0))) if len(errors) else float("nan"),
+        all_corners_rmse_m=rms(all_errors),
     )
 
 

@@ -6,9 +6,11 @@ says nothing of whether the marking is there.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from v2hdm.records import ACCURACIES, FloatArray
+from v2hdm.records import ACCURACIES, FloatArray, Marking
 
 _B_OF_GOAL = 2.0  # largest radius of grade B over the goal; chosen
 
@@ -34,6 +36,12 @@ def accuracy_of(covariance_m2: FloatArray | None, goal_m: float) -> str | None:
     if radius_m <= goal_m:
         return best
     return middle if radius_m <= _B_OF_GOAL * goal_m else worst
+
+
+def well_known(markings: Sequence[Marking]) -> Sequence[Marking]:
+    """The markings but those of accuracy C as long as these are fewer, else all of them."""
+    known = [marking for marking in markings if marking.accuracy != ACCURACIES[-1]]
+    return known if 2 * len(known) > len(markings) else markings
 
 
 def objection_to(accuracy: str | None, asked: str) -> str | None:

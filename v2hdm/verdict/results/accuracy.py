@@ -23,7 +23,7 @@ from v2hdm.mapping.bundle import known_lengths
 from v2hdm.mapping.options import SizeOptions
 from v2hdm.mapping.results import MethodResult, SolveEvidence
 from v2hdm.records import ACCURACIES, SIGMAS_95, Calibration, FloatArray, Marking
-from v2hdm.site.accuracy import LEFT_OUT_BY_GRADE, corner_radii_m, radius_95_m
+from v2hdm.site.accuracy import LEFT_OUT_BY_GRADE, corner_radii_m, radius_95_m, well_known
 from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN
 from v2hdm.site.corrections import unmet
 from v2hdm.survey.check_points import CheckTable, squared
@@ -39,7 +39,7 @@ def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Findin
     markings = best.hd_map.markings
     goal = f"; goal {100 * goal_m:g} cm"
     if markings:
-        judged = _judged_by_goal(markings)
+        judged = well_known(markings)
         radii_m = np.array([_corner_radii_m(marking) for marking in judged])
         reached_m = _radius_of_all_m(radii_m.ravel())
         corners = f"95 % of the corners of {len(judged)} markings"
@@ -57,12 +57,6 @@ def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Findin
         left_m, helps = ground_ahead(calibration)
         says = f"the ground ahead is known, given its mounting, to {_cm(left_m)} (95 %){goal}"
         yield _judged(name, left_m, goal_m, says, helps)
-
-
-def _judged_by_goal(markings: Sequence[Marking]) -> Sequence[Marking]:
-    """The markings but those of accuracy C as long as these are fewer, else all of them."""
-    known = [marking for marking in markings if marking.accuracy != ACCURACIES[-1]]
-    return known if 2 * len(known) > len(markings) else markings
 
 
 def _beside(best: MethodResult, coarse: int) -> str:
