@@ -28,7 +28,17 @@ from v2hdm.geometry.lens import distort_points, has_distortion
 from v2hdm.geometry.planar import clip_convex, clip_half, densified, rectangle_size, signed_area
 from v2hdm.geometry.rigid import camera_centre, interpolate, inverse
 from v2hdm.progress import Steps
-from v2hdm.records import SIGMA_OF_MAD, BoolArray, CameraInfo, Drive, FloatArray, Image, IntArray, Trajectory
+from v2hdm.records import (
+    ACCURACIES,
+    SIGMA_OF_MAD,
+    BoolArray,
+    CameraInfo,
+    Drive,
+    FloatArray,
+    Image,
+    IntArray,
+    Trajectory,
+)
 from v2hdm.report.page.facts import CameraFacts, Facts, read_facts
 from v2hdm.site.living.looks import HIDDEN_SIGMA
 from v2hdm.store.files import write_json
@@ -198,10 +208,14 @@ def write_labels(
             "what is wrong; fix the drive (docs/verdict.md) and map it again"
         )
     outlines = [
-        _Outline.of(marking.id or 0, marking.kind, marking.corners_map) for marking in facts.hd_map.markings
+        _Outline.of(marking.id or 0, marking.kind, marking.corners_map)
+        for marking in facts.hd_map.markings
+        if marking.accuracy != ACCURACIES[-1]
     ]
     outlines += [
-        _Outline.of(symbol.id or 0, symbol.kind, symbol.outline_map) for symbol in facts.hd_map.symbols
+        _Outline.of(symbol.id or 0, symbol.kind, symbol.outline_map)
+        for symbol in facts.hd_map.symbols
+        if symbol.accuracy != ACCURACIES[-1]
     ]
     detected_in = _detected(facts)
     images: list[Image] = []
@@ -261,7 +275,10 @@ def _views(
 
 
 def _silent(eye: _Eye, facts: Facts, range_m: float) -> list[FloatArray]:
-    """Polygons of an image of which the map says nothing: ground beyond the range, candidates left out."""
+    """Polygons of an image of which the map says nothing: ground beyond the range, candidates left out.
+
+    Markings and symbols of accuracy C are candidates here: labels have to be right to some pixels.
+    """
     centre = camera_centre(eye.cam_from_map[:1])[0]
     view = eye.cam_from_map[0, 2, :2]
     ahead = np.arctan2(view[1], view[0]) + np.linspace(-1.2, 1.2, 25)
@@ -271,11 +288,23 @@ def _silent(eye: _Eye, facts: Facts, range_m: float) -> list[FloatArray]:
     disc = _CLEAR_M * np.column_stack([np.cos(turn), np.sin(turn)])
     places = [exclusion.position_map for exclusion in facts.excluded]
     in_range = [place for place in places if np.linalg.norm(place - centre[:2]) < range_m + _CLEAR_M]
-    outlines = [beyond, *(place + disc for place in in_range)]
+    coarse = _coarse_outlines(facts)
+    near = [outline for outline in coarse if np.linalg.norm(outline - centre[:2], axis=1).min() < range_m]
+    outlines = [beyond, *(place + disc for place in in_range), *near]
     polygons = [eye.polygon(outline)[0] for outline in outlines]
     return [
         polygon for polygon in polygons if len(polygon) > 2 and abs(float(signed_area(polygon))) >= _LEAST_PX2
     ]
+
+
+def _coarse_outlines(facts: Facts) -> list[FloatArray]:
+    """Outlines (N, 2) of the markings and symbols of accuracy C, m."""
+    hd_map = facts.hd_map
+    if hd_map is None:
+        return []
+    worst = ACCURACIES[-1]
+    corners = [marking.corners_map for marking in hd_map.markings if marking.accuracy == worst]
+    return corners + [symbol.outline_map for symbol in hd_map.symbols if symbol.accuracy == worst]
 
 
 def _states(views: Sequence[_View], outlines: int) -> IntArray:
