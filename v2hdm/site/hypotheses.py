@@ -300,9 +300,9 @@ class Hypotheses:
     ) -> tuple[FloatArray, FloatArray]:
         """Sigmas (N,), m, of other lengths, and log-likelihood ratios (N,) of a repeated to a new one.
 
-        What a candidate is expected to be, the others alone tell.
+        What a candidate is expected to be, the others alone tell: those at whose ends nothing seems to stand.
         """
-        weight = self.probability[:, Kind.OTHER_LENGTH]
+        weight = self.probability[:, Kind.OTHER_LENGTH] * (self.standing_odds <= 0).all(axis=1)
         off_m = np.sum((laid.corners_map - self.candidates.corners_map).reshape(-1, 8) * shorter, axis=1)
         own_m2 = self.candidates.along(shorter, shorter)
         squared = weight * np.maximum(off_m**2 - own_m2, 0.0)
