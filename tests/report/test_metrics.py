@@ -43,18 +43,18 @@ def test_a_shift_of_three_and_four_centimetres_is_an_error_and_a_bias_of_five():
     assert (result.markings, result.false_markings, result.expected, result.recall) == (1, 0, 1, 1.0)
 
 
-def test_corners_of_accuracy_c_count_apart_while_they_are_the_fewer():
+def test_one_rmse_leaves_out_accuracy_c_while_that_is_the_lesser_part():
     _, truth = make_truth()
     sure = [replace(diamond_at(10.03, y), accuracy="A") for y in (0, 40)]
     third = replace(truth, map=HDMap((*truth.map.markings, diamond_at(10, 80))))
     expected = np.array([True, True, True])
     vague = replace(diamond_at(10.5, 80), accuracy="C")
     figures = marking_metrics(HDMap((*sure, vague)), third, expected)
-    assert figures.corner_rmse_m == pytest.approx(0.03)
-    assert figures.all_corners_rmse_m == pytest.approx(np.sqrt((2 * 0.03**2 + 0.5**2) / 3))
+    assert figures.well_known_rmse_m == pytest.approx(0.03)
+    assert figures.corner_rmse_m == pytest.approx(np.sqrt((2 * 0.03**2 + 0.5**2) / 3))
     all_vague = HDMap(tuple(replace(marking, accuracy="C") for marking in (*sure, vague)))
     coarse = marking_metrics(all_vague, third, expected)
-    assert coarse.corner_rmse_m == pytest.approx(figures.all_corners_rmse_m)
+    assert coarse.well_known_rmse_m == pytest.approx(figures.corner_rmse_m)
 
 
 def test_the_cyclic_start_of_the_corners_does_not_matter():

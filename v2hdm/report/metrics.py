@@ -35,9 +35,9 @@ class MarkingMetrics:
     false_markings: int  # without a true counterpart
     expected: int  # true ones driven past within the region of interest
     recall: float  # mapped fraction of these
-    corner_rmse_m: float  # of the markings that are not of accuracy C, as long as these are most
-    corner_bias_m: float  # length of the mean error vector of the same corners
-    all_corners_rmse_m: float
+    corner_rmse_m: float
+    corner_bias_m: float  # length of the corners' mean error vector
+    well_known_rmse_m: float  # of the corners, but of markings of accuracy C while these are the fewer
 
 
 def driven_past(drive: Drive, truth: Truth, cameras: Sequence[str]) -> BoolArray:
@@ -68,11 +68,9 @@ def marking_metrics(
     rows, columns = match_markings(mapped, true)
     is_mapped = np.zeros(len(true), dtype=bool)
     is_mapped[columns] = True
-    true_of = {id(mapped[r]): true[c] for r, c in zip(rows, columns, strict=True)}
-    found = [mapped[r] for r in rows]
-    known = well_known(found)
-    errors = corner_errors(known, [true_of[id(marking)] for marking in known])
-    all_errors = corner_errors(found, [true[c] for c in columns])
+    errors = corner_errors([mapped[r] for r in rows], [true[c] for c in columns])
+    well_known_ids = {id(marking) for marking in well_known([mapped[r] for r in rows])}
+    is_well_known = np.repeat([id(mapped[r]) in well_known_ids for r in rows], 4).astype(bool)
     return MarkingMetrics(
         markings=len(mapped),
         false_markings=len(mapped) - len(rows),
@@ -80,7 +78,7 @@ def marking_metrics(
         recall=float(is_mapped[is_expected].mean()) if is_expected.any() else float("nan"),
         corner_rmse_m=rms(errors),
         corner_bias_m=float(np.linalg.norm(errors.mean(axis=0))) if len(errors) else float("nan"),
-        all_corners_rmse_m=rms(all_errors),
+        well_known_rmse_m=rms(errors[is_well_known]),
     )
 
 

@@ -115,7 +115,7 @@ def key_figures(facts: Facts) -> tuple[Figure, ...]:
         note = f"within the accuracy goal; besides, {note}"
         figures.append(Figure(f"Accuracy {top}", str(grades.count(top)), f"of {len(grades)}", note))
     if "corner_rmse_m" in best:
-        note = "RMSE of the corners, but of accuracy C"
+        note = "RMSE of all corners"
         figures.append(Figure("Against the truth", number(best["corner_rmse_m"], 1, 100), "cm", note))
     checked = facts.metrics.get("check_points") or {}
     if "rmse_m" in checked:
