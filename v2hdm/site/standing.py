@@ -44,8 +44,8 @@ _MOST_CORRELATION = 0.995  # beyond it all correlations are alike
 # Logistic regression on 58 ends of dashes at the foot of boxes and 140 on bare ground, in 12 rendered ports
 # (tests/benchmarks/standing_ends.py), by how much better the ground matches, in differences of Fisher's z. It
 # ranks 99 % of the pairs of both kinds right.
-_BIAS = 0.7
-_PER_BETTER_GROUND = -3.9
+_BIAS = 0.7  # log-likelihood ratio of something that stands where ground and face match alike
+_PER_BETTER_GROUND = -3.9  # log-likelihood ratio that a difference of one in z adds
 
 
 @dataclass(frozen=True)
@@ -69,10 +69,10 @@ class Watch:
         read = lru_cache(maxsize=16)(self._log_grey)
         for group, side in np.argwhere(is_end).tolist():
             end = _End.of(corners_map[group], side, self._height_m(corners_map[group]))
-            better = [self._better_ground(end, far, near, read) for far, near in self._pairs(end)]
-            told = [value for value in better if value is not None]
-            if told:
-                odds[group, side] = _BIAS + _PER_BETTER_GROUND * float(np.mean(told))
+            of_pairs = [self._better_ground(end, far, near, read) for far, near in self._pairs(end)]
+            differences_z = [value for value in of_pairs if value is not None]
+            if differences_z:
+                odds[group, side] = _BIAS + _PER_BETTER_GROUND * float(np.mean(differences_z))
         return odds
 
     def _log_grey(self, image: int) -> NDArray[np.float32]:
@@ -110,7 +110,7 @@ class Watch:
                 yield look._replace(depth_m=depth_m)
 
     def _better_ground(self, end: _End, far: _Look, near: _Look, read: Grey) -> float | None:
-        """How much better two images match as ground than as a face beyond an end; None where both are alike.
+        """How much better two images match as ground than as a face; None where too few points tell.
 
         It is the difference of the correlations of their log grey values, in Fisher's z.
         """
