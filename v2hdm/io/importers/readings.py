@@ -77,6 +77,12 @@ def readings_of_poses(poses: Trajectory) -> Readings:
     return Readings(poses.stamp_s, poses.map_from_vehicle[:, :3, 3], False, unknown, attitudes)
 
 
+def headings_only(attitudes: Attitudes | None) -> Readings:
+    """Readings without a position."""
+    none = np.zeros((0, 3))
+    return Readings(none[:, 0], none, True, none[:, 0], attitudes)
+
+
 def read_stamps(path: Path, count: int, things: str) -> FloatArray:
     """Times (``count``,) in s, one per line; raises DriveError where there are not as many as ``things``."""
     stamp_s = np.array(
@@ -118,7 +124,12 @@ def read_table(
     columns = {name: values[rows] for name, values in columns.items()}
     geodetic = _GEODETIC[0] in columns
     coordinates = _GEODETIC if geodetic else _MAP
+    rotation = _rotation(columns, path)
+    heading_sigma = np.radians(columns.get("heading_sigma_deg", np.full(len(rows), np.nan)))
+    attitudes = None if rotation is None else Attitudes(stamp_s[rows], rotation, heading_sigma)
     if geodetic == (_MAP[0] in columns):
+        if attitudes is not None and not geodetic:
+            return headings_only(attitudes)
         either = f"{', '.join(_MAP)} or {', '.join(_GEODETIC)}"
         raise DriveError(f"{path}: needs positions, as columns {either}, but not both")
     _check_there(columns, coordinates[:2], path)
