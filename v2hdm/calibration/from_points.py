@@ -28,6 +28,7 @@ from v2hdm.calibration.points import (
     residuals,
     scatter,
 )
+from v2hdm.doors import checked
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.geometry.ipm import centre_sigmas, ipm_from_extrinsic, mounting_angles, mounting_words
 from v2hdm.geometry.rigid import camera_centre
@@ -93,6 +94,7 @@ class PointCalibration:
         }
 
 
+@checked
 def calibrate_from_points(
     points: SurveyedPoints | Path | str,
     info: CameraInfo,
@@ -133,12 +135,12 @@ def calibrate_from_points(
 
 def solve(points: SurveyedPoints, info: CameraInfo, noise: Noise) -> list[Fit]:
     """The mountings that explain the points, the most likely first; DriveError, with why, where none does."""
-    fits = fit_mountings(SeenPoints.of(points.points_px, points.points_vehicle, info, noise))
+    fits = _above_ground(fit_mountings(SeenPoints.of(points.points_px, points.points_vehicle, info, noise)))
     if _doubtful(fits):
         cause = _misreading(points, info, noise)
         if cause is not None:
             raise DriveError(f"{points.path}: the points fit no mounting of this camera: {cause}")
-    if not fits or not np.isfinite(fits[0].covariance).all() or _height_m(fits[0]) <= 0:
+    if not fits or not np.isfinite(fits[0].covariance).all():
         raise DriveError(
             f"{points.path}: the points do not determine a camera: all, or all but one, lie about on a line; "
             "survey some to its left and right"
@@ -155,6 +157,11 @@ def solve(points: SurveyedPoints, info: CameraInfo, noise: Noise) -> list[Fit]:
             f"write metres, in which that is {height * UNITS[unit]:.2f} m"
         )
     return fits
+
+
+def _above_ground(fits: list[Fit]) -> list[Fit]:
+    """The mountings that a camera can have: from below, mirrored points look right."""
+    return [fit for fit in fits if _height_m(fit) > 0]
 
 
 def _height_m(fit: Fit) -> float:
@@ -178,11 +185,11 @@ def _misreading(points: SurveyedPoints, info: CameraInfo, noise: Noise) -> str |
     px = points.points_px[some]
     ground = points.points_vehicle[some]
 
-    as_given = _best_score(fit_mountings(SeenPoints.of(px, ground, info, noise)))
+    as_given = _best_score(_above_ground(fit_mountings(SeenPoints.of(px, ground, info, noise))))
     causes = {}
     for reading in _readings(px, ground, info):
         read_points = SeenPoints.of(reading.points_px, reading.points_vehicle, info, noise)
-        fits = fit_mountings(read_points, starts=_STARTS, rounds=_ROUNDS)
+        fits = _above_ground(fit_mountings(read_points, starts=_STARTS, rounds=_ROUNDS))
         # Pixels that are scaled have another density: by scale^2 each in those of the table.
         causes[reading.cause] = _best_score(fits) + 2 * len(px) * float(np.log(reading.scale))
     if as_given > -np.inf:
