@@ -53,7 +53,9 @@ def check_types(options: Any, prefix: str = "") -> None:
     dot = "" if not prefix or prefix.endswith(".") else "."
     for field in fields(options):
         value = getattr(options, field.name)
-        _check(value, _hints(type(options).__init__)[field.name], f"{prefix}{dot}{field.name}")
+        hint = _hints(type(options).__init__)[field.name]
+        kind = get_args(hint)[0] if get_origin(hint) is Annotated else hint  # ranges are another check
+        _check(value, kind, f"{prefix}{dot}{field.name}")
         if is_dataclass(value):
             check_types(value, f"{prefix}{dot}{field.name}")
 

@@ -98,6 +98,8 @@ def map_drive(
     >>> result.verdict.status.value, result.calibrations["front"].cam_from_vehicle.shape
     ('PASS', (4, 4))
     """
+    if cache is not None and Path(cache).is_file():
+        raise ConfigError(f"cache {cache}: is a file; give a folder")
     stages = StageCache(None if cache is None else Path(cache))
     context = context or Context(stages, progress, workers=workers)
     options = options or MappingOptions()

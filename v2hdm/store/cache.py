@@ -136,8 +136,6 @@ class StageCache:
     """
 
     def __init__(self, folder: Path | None, resume: bool = True) -> None:
-        if folder is not None and folder.exists() and not folder.is_dir():
-            raise ConfigError(f"cache {folder}: is a file; give a folder")
         self.folder = folder
         self._resume = resume
         self._can_write = folder is not None
