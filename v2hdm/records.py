@@ -340,7 +340,7 @@ class Marking:
     corners_map: FloatArray  # (4, 2) m, counter-clockwise from above
     sightings: int
     covariance_m2: FloatArray | None = None  # (8, 8) of the stacked corners, if known
-    # per coordinate of the distance to a marking about 10 m away, in which shared errors cancel
+    # of a coordinate of its centre, given those of its neighbours: what they share cancels
     relative_sigma_m: float | None = None
     heights_m: FloatArray | None = None  # (4,) of the ground, None for z = 0
     id: int | None = None  # positive and unique; None until the map is written

@@ -37,6 +37,19 @@ def enu_from_geodetic(origin: GeodeticOrigin, geodetic: FloatArray) -> FloatArra
     return np.asarray((_ecef_from_geodetic(geodetic) - _ecef_from_geodetic(here)[0]) @ enu_axes(here)[0])
 
 
+def geodetic_from_ecef(points: FloatArray) -> FloatArray:
+    """Latitude and longitude in degrees and height in m (N, 3) of earth-centred points (N, 3), m."""
+    return _geodetic_from_ecef(points)
+
+
+def metres_between(places: FloatArray, others: FloatArray) -> FloatArray:
+    """Distance (N,) along the ground, m, of latitudes and longitudes (N, 2), deg, that lie close together."""
+    north_m = np.radians(others[:, 0] - places[:, 0]) * _SEMI_MAJOR_M
+    turn_deg = (others[:, 1] - places[:, 1] + 180) % 360 - 180
+    east_m = np.radians(turn_deg) * _SEMI_MAJOR_M * np.cos(np.radians(places[:, 0]))
+    return np.asarray(np.hypot(north_m, east_m))
+
+
 def enu_axes(geodetic: FloatArray) -> FloatArray:
     """Rotations (N, 3, 3), earth-centred from local, with columns east, north, up at points (N, 3)."""
     lat = np.radians(geodetic[:, 0])

@@ -121,6 +121,7 @@ class StatedDrive(TypedDict, total=False):
     name: str
     paths: list[str] | None
     images: int
+    images_sha256: str
 
 
 class Metrics(TypedDict, total=False):

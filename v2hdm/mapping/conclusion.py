@@ -14,9 +14,10 @@ from v2hdm.geometry.ipm import project_ground
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.records import BoolArray, Calibration, Camera, Exclusion, FloatArray, IntArray, Marking
 from v2hdm.site.candidates import Candidates, Counts, scatter_of, with_dissent, with_shared_errors
-from v2hdm.site.markings import Suspicion, classify, most_suspicious, with_relative_sigma
+from v2hdm.site.markings import Suspicion, classify, most_suspicious
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import PointViews, measure_parallax
+from v2hdm.site.relative import with_relative_sigma
 from v2hdm.site.standing import Grey, Watch
 from v2hdm.surface.surface import Surface
 

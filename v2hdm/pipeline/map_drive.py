@@ -118,7 +118,7 @@ def map_drive(
     with context.timed("check"):
         inspection = join(inspect_each(read.drives, read.contents, reading.max_gap_s, context))
     paths = [source.root if isinstance(source, Drive) else Path(source) for source in sources]
-    about = describe_run(name or read.whole.name, read.whole, paths, reading)
+    about = describe_run(name or read.whole.name, read.whole, read.contents, paths, reading)
     described = inspection.drive_as_described
     mapped_so_far = Result(about, read.drives, read.contents, described, context.seconds, options.device)
     return _mapped(mapped_so_far, inspection, detector, survey, earlier, accuracy_goal_cm, context)

@@ -12,12 +12,13 @@ import hashlib
 import io
 import json
 import math
+import os
 import re
 import secrets
 import sys
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
@@ -75,6 +76,23 @@ def whole_file(path: Path) -> Iterator[Path]:
         raise
     finally:
         partial.unlink(missing_ok=True)
+
+
+def refuse_unwritable(path: Path) -> None:
+    """Raise ConfigError where :func:`whole_file` could not write ``path``; nothing is left by the trial."""
+    refuse_url(path)
+    try:
+        if path.exists() and not path.is_file():
+            raise ConfigError(f"{path}: is not a regular file and is not replaced; choose another output")
+        folder = next(parent for parent in path.absolute().parents if os.path.lexists(parent))
+        trial = folder / f".{path.name}.{secrets.token_hex(8)}.part"
+        try:
+            trial.touch(exist_ok=False)
+        finally:
+            with suppress(OSError):
+                trial.unlink()
+    except OSError as failure:
+        raise ConfigError(f"{path}: cannot be written ({failure.strerror}); choose another output") from None
 
 
 def refuse_url(path: Path) -> None:

@@ -34,7 +34,8 @@ class Finding:
         status: PASS within the limit. WARN where the result still holds, or was corrected. FAIL where the
             result is wrong or cannot be relied on.
         value: the measured value, in ``unit``; None where this drive does not make it observable.
-        limit: the largest ``value`` that passes, in ``unit``; None where there is none.
+        limit: the largest ``value`` that passes, or the least of one that must not be too small, in ``unit``;
+            None where there is none, or another figure decides.
         unit: of ``value`` and ``limit``, such as ``ms``; empty for a ratio or a count.
         says: one sentence that names the cause and the recovery.
         about: a camera's name, ``poses``, a setting, ``map``.

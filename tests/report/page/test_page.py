@@ -4,6 +4,7 @@ import base64
 import json
 import os
 import re
+import shutil
 from dataclasses import replace
 
 import cv2
@@ -26,7 +27,7 @@ from tests.report.page.folder import (
 from v2hdm.cli.main import run
 from v2hdm.errors import DriveError, MapFileError
 from v2hdm.geometry.geodetic import Grid, geodetic_from_enu
-from v2hdm.io.drive import drive_of, read_drive
+from v2hdm.io.drive import ReadOptions, drive_of, read_drive, told_of
 from v2hdm.io.maps.evidence import COLUMNS
 from v2hdm.records import DIAMOND, GeodeticOrigin, Marking
 from v2hdm.report.page import document as document_module
@@ -34,7 +35,7 @@ from v2hdm.report.page import pictures
 from v2hdm.report.page.document import document, write_page
 from v2hdm.report.page.facts import ground_residuals, read_facts
 from v2hdm.report.page.layers import background_layer, ellipses, layers
-from v2hdm.store.files import write_json
+from v2hdm.store.files import file_digest, write_json
 
 
 @pytest.fixture(scope="module")
@@ -403,3 +404,48 @@ def test_another_drive_than_that_of_the_result_is_refused(tmp_path):
     with pytest.raises(MapFileError, match=r"metrics\.json: its data on the drive are damaged"):
         drive_of(result, None)
     assert read_drive(tmp_path / "a" / "drive").cameras["front"].info.width == INFO.width
+
+
+def digests(folder):
+    return {path.name: file_digest(path) for path in folder.iterdir()}
+
+
+def with_digest(result, drive):
+    """Note in a result, as ``v2hdm map`` does, which images it is of."""
+    metrics = json.loads((result / "metrics.json").read_text())
+    metrics["drive"] |= told_of(drive, [drive.root], ReadOptions())
+    (result / "metrics.json").write_text(json.dumps(metrics))
+
+
+@pytest.mark.parametrize("what", ["all images", "one image", "two swapped"])
+@pytest.mark.parametrize("command", ["labels", "mosaic", "report", "view"])
+def test_other_images_than_those_that_were_mapped_are_refused(command, what, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    drive = make_result(tmp_path)
+    result = tmp_path / "result"
+    with_digest(result, drive)
+    shutil.copytree(drive.root, tmp_path / "other")
+    images = sorted((tmp_path / "other" / "front").glob("*.png"))
+    if what == "all images":
+        for image in images[1:]:
+            shutil.copyfile(images[0], image)
+    elif what == "one image":
+        cv2.imwrite(str(images[2]), cv2.imread(str(images[2])) + 1)
+    else:
+        images[0].rename(tmp_path / "kept.png")
+        images[1].rename(images[0])
+        (tmp_path / "kept.png").rename(images[1])
+    before = digests(result)
+    assert run([command, str(result), "--drive", str(tmp_path / "other")]) == 2
+    said = capsys.readouterr().err
+    assert f"{tmp_path / 'other'}: its images are not those that the result in {result} was made of" in said
+    assert said.count("\n") == 1
+    assert digests(result) == before
+
+
+def test_the_same_images_in_another_place_are_the_drive_of_the_result(tmp_path):
+    drive = make_result(tmp_path)
+    with_digest(tmp_path / "result", drive)
+    shutil.move(drive.root, tmp_path / "moved")
+    assert drive_of(tmp_path / "result", None) is None
+    assert drive_of(tmp_path / "result", tmp_path / "moved") is not None

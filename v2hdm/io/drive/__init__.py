@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -14,7 +15,7 @@ from v2hdm.io.description import DRIVE_FILE, is_folder_drive, name_of
 from v2hdm.io.drive.images import KittiOptions, ReadOptions, part_of
 from v2hdm.io.drive.join import join_drives
 from v2hdm.records import Drive, Trajectory
-from v2hdm.store.files import load_yaml
+from v2hdm.store.files import file_digest, load_yaml
 from v2hdm.store.names import METRICS
 
 __all__ = [
@@ -116,8 +117,13 @@ def drive_name(path: Path) -> str:
     return path.resolve().stem if _is_bag(path) else path.resolve().name
 
 
-def told_of(drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[str, Any]:
-    """The plain values that :func:`drive_of` needs."""
+_DIGEST = "images_sha256"  # in metrics.json, of :func:`images_digest`
+
+
+def told_of(
+    drive: Drive, paths: Sequence[Path], options: ReadOptions, digest_of: Callable[[Path], str] = file_digest
+) -> dict[str, Any]:
+    """The plain values that :func:`drive_of` needs; ``digest_of`` an image file is its SHA-256."""
     return {
         "name": drive.name,
         "paths": [str(path.resolve()) for path in paths],
@@ -126,13 +132,21 @@ def told_of(drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[s
         **({"kitti": asdict(options.kitti)} if options.format == "kitti" else {}),
         "cameras": list(drive.cameras),
         "images": len(drive.images),
+        _DIGEST: images_digest(drive, digest_of),
     }
+
+
+def images_digest(drive: Drive, digest_of: Callable[[Path], str]) -> str:
+    """One SHA-256 of all images of a drive: their cameras and ``digest_of`` each file, in their order."""
+    lines = [f"{image.camera} {digest_of(image.path)}\n" for image in drive.images]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
 def drive_of(folder: Path, path: Path | None) -> Drive | None:
     """The drive of the result in ``folder``: at ``path``, else where it was; None where it is gone.
 
-    Raises MapFileError when the folder is no result of a run, DriveError when the drive is no longer that.
+    Raises MapFileError when the folder is no result of a run, DriveError when the drive is no longer that,
+    or its images are not those that were mapped.
     """
     from v2hdm.io.metrics import read_metrics  # loads what the map extra brings, as results are
 
@@ -152,7 +166,20 @@ def drive_of(folder: Path, path: Path | None) -> Drive | None:
             f"{paths[0]}: drive {drive.name} of {len(drive.images)} images, but the result is of drive "
             f"{expected[0]} of {expected[1]}; give that drive with --drive"
         )
+    mapped = stated.get(_DIGEST)  # none in results of earlier versions
+    if mapped is not None and mapped != _digest_now(drive):
+        raise DriveError(
+            f"{paths[0]}: its images are not those that the result in {folder} was made of; give that "
+            "drive with --drive, or map this one again"
+        )
     return drive
+
+
+def _digest_now(drive: Drive) -> str:
+    try:
+        return images_digest(drive, file_digest)
+    except OSError as failure:
+        raise DriveError(f"{failure.filename}: cannot be read ({failure.strerror})") from None
 
 
 def single_drive_of(folder: Path, path: Path | None, what: str) -> Drive:

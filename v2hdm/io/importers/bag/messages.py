@@ -209,7 +209,7 @@ def readings_of(
         rotation = checked_rotations(turned[is_measured, :4], lambda k: where, advice, _NORM_TOLERANCE)
         attitudes = Attitudes(heading_s[is_measured], rotation, turned[is_measured, 4])
     geodetic = kind == FIX
-    return Readings(stamp_s, rows[:, :3], geodetic, rows[:, 3], attitudes, antenna=geodetic)
+    return Readings(stamp_s, rows[:, :3], geodetic, rows[:, 3], attitudes, "an antenna's" if geodetic else "")
 
 
 def _pose(pose: Any, covariance: Any) -> Row:
