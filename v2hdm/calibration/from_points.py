@@ -48,6 +48,7 @@ UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "kilometres": 1e3}  # units o
 _MISREAD = 0.01  # prior probability of each way to write the table wrongly
 _SURE = np.log(1e3)  # log odds from which a reading is reported as the cause
 _ROLL_RAD = np.radians(15.0)  # standard deviation of the roll of cameras on vehicles
+_ASIDE = float(np.log(3.0))  # log odds against a camera that looks aside: three look ahead or back; chosen
 _BESIDE_M = 1.5  # standard deviation of the place of cameras on vehicles to the left, m
 _HEIGHT_M = 2.0  # median height of cameras on vehicles, m
 _LOG_HEIGHT = 0.7  # standard deviation of the logarithm of that height
@@ -205,9 +206,9 @@ def _best_score(fits: list[Fit]) -> float:
 
 def _score(fit: Fit) -> float:
     """Log posterior, with how usual the mounting is."""
-    roll = mounting_angles(fit.cam_from_vehicle)[0]
+    roll, _, yaw = mounting_angles(fit.cam_from_vehicle)
     beside = camera_centre(fit.cam_from_vehicle)[1]
-    unusual = 0.5 * ((roll / _ROLL_RAD) ** 2 + (beside / _BESIDE_M) ** 2)
+    unusual = 0.5 * ((roll / _ROLL_RAD) ** 2 + (beside / _BESIDE_M) ** 2) + _ASIDE * np.sin(yaw) ** 2
     return fit.log_posterior - min(float(unusual), _UNUSUAL)
 
 

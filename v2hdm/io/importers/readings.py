@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from v2hdm.errors import DriveError, one_line
+from v2hdm.errors import DriveError, one_line, shown
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.io.trajectory import UNITS, checked_rotations, in_order, parse_number
 from v2hdm.records import BoolArray, FloatArray, Trajectory
