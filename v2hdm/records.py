@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from v2hdm.doors import checked_class
+
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
@@ -401,6 +403,7 @@ class GroundStrip:
         return self.points_map + left_m * np.column_stack([-self.ahead[:, 1], self.ahead[:, 0]])
 
 
+@checked_class
 @dataclass(frozen=True)
 class HDMap:
     """Markings, lanes and symbols of a site in its map frame.
@@ -543,6 +546,7 @@ class Truth:
     disturbances: Mapping[str, float]
 
 
+@checked_class
 @dataclass(frozen=True)
 class Calibration:
     """The calibration of one camera, with its extrinsic ``cam_from_vehicle`` (4, 4).

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
+from v2hdm.doors import checked
 from v2hdm.geometry.ipm import mounting_words
 from v2hdm.ground.estimate import estimate_cameras
 from v2hdm.ground.results import GroundEstimate, GroundStatus, Reading
@@ -13,6 +15,7 @@ from v2hdm.io.calibration.reading import Provenance
 from v2hdm.io.calibration.writing import write_calibration
 from v2hdm.io.drive import as_drive
 from v2hdm.records import Calibration, Drive
+from v2hdm.settings import PROCESSES
 from v2hdm.store.files import write_json
 from v2hdm.store.names import VERDICT, calibration_file
 from v2hdm.verdict import Finding, Status, Verdict, check_drive
@@ -51,8 +54,12 @@ class GroundCalibration:
         return {name: calibration for name, calibration in of_camera.items() if calibration is not None}
 
 
+@checked
 def calibrate_from_ground(
-    drive: Drive | str | Path, *, workers: int = 1, progress: Callable[[int, int], None] | None = None
+    drive: Drive | str | Path,
+    *,
+    workers: Annotated[int, PROCESSES] = 1,
+    progress: Callable[[int, int], None] | None = None,
 ) -> GroundCalibration:
     """Find every camera's mounting from bare ground, without a marking, and check the drive by it.
 

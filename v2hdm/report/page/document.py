@@ -16,8 +16,8 @@ import numpy as np
 from v2hdm.records import Drive
 from v2hdm.report.page import charts, tables
 from v2hdm.report.page.facts import Facts, ground_residuals, read_facts
-from v2hdm.report.page.layers import background_layer, comparison, layers
-from v2hdm.report.page.pictures import overlays, pictures
+from v2hdm.report.page.layers import background_layer, comparison, earlier_layer, layers
+from v2hdm.report.page.pictures import earlier_pictures, overlays, pictures
 from v2hdm.report.page.tables import in_words
 from v2hdm.site.accuracy import absolute_radii_m, relative_radii_m
 from v2hdm.store import names
@@ -127,10 +127,12 @@ def page_text(
     here = files("v2hdm.report.page")
     facts = read_facts(folder, drive)
     page = document(facts)
-    page.pictures = page.pictures or _earlier(folder / names.REPORT, "pictures")
+    page.pictures = page.pictures or earlier_pictures(_earlier(folder / names.REPORT, "pictures"))
     if page.map_data:
         if background is None:
-            page.map_data["background"] = _earlier(folder / names.REPORT, "map-data").get("background")
+            page.map_data["background"] = earlier_layer(
+                _earlier(folder / names.REPORT, "map-data").get("background")
+            )
         else:
             page.map_data["background"] = background_layer(background, facts)
     return environment.get_template("page.html").render(
@@ -153,7 +155,7 @@ def _earlier(path: Path, name: str) -> dict[str, Any]:
     script = re.search(r'<script type="application/json" id="' + name + '">(.*?)</script>', text, re.DOTALL)
     try:
         return dict(json.loads(script[1])) if script else {}
-    except (ValueError, RecursionError):
+    except (ValueError, TypeError, RecursionError):
         return {}
 
 

@@ -19,7 +19,7 @@ from v2hdm.safe.backgrounds import Window, background_pixels
 from v2hdm.safe.pixels import read_pixels
 from v2hdm.site.accuracy import corner_radii_m
 from v2hdm.store import names
-from v2hdm.store.files import load_json, take_array, take_text
+from v2hdm.store.files import load_json, take_array, take_mapping, take_text
 
 
 def jpeg(pixels: np.ndarray, quality: int) -> str:
@@ -70,6 +70,18 @@ def _webp(pixels: np.ndarray) -> str:
     while len(text := _coded(".webp", pixels, (cv2.IMWRITE_WEBP_QUALITY, _QUALITY))) > LARGEST_BYTES:
         pixels = shrunk(pixels, 0.9 * float(np.sqrt(LARGEST_BYTES / len(text))))
     return text
+
+
+def earlier_layer(content: object) -> dict[str, Any] | None:
+    """A layer as an earlier report has it; None where it has none, or none that is whole."""
+    try:
+        layer = take_mapping(content, "background", MapFileError)
+        bounds = take_array(layer.get("bounds"), (4,), "bounds", MapFileError).tolist()
+        source = take_text(layer.get("src"), "src", MapFileError)
+        base64.b64decode(source, validate=True)
+    except (MapFileError, ValueError):
+        return None
+    return {"src": source, "type": "image/webp", "bounds": bounds}
 
 
 _BACKGROUND_PX = 3000  # longer side of the background: 20 cm per pixel over 600 m
@@ -275,9 +287,10 @@ def _changes(facts: Facts) -> list[dict[str, Any]]:
 
 def _number(text: str | None) -> float | None:
     try:
-        return float(text or "")
+        number = float(text or "")
     except ValueError:
         return None
+    return number if np.isfinite(number) else None
 
 
 def _arrows(residuals: GroundResiduals | None) -> dict[int, list[list[float]]]:
