@@ -88,6 +88,8 @@ def test_what_the_map_follows_is_listed_beside_what_the_images_show(corrected):
     told = [line for line in corrected[2].headlines if line.startswith("correction followed: ")]
     assert len(told) == 4
     assert any("rejected" in line for line in told)
+    log = (corrected[2].folder / "run.log").read_text()
+    assert all(line in log for line in told)
     (finding,) = [f for f in corrected[2].verdict.findings if f.check == "corrections against images"]
     against = [says for says in listed.values() if says]
     assert finding.value == len(against)

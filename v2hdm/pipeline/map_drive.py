@@ -223,7 +223,9 @@ def _with_wear(
 
 
 def _told_of_corrections(heard: Sequence[Heard]) -> list[str]:
-    """Lines on the corrections that the map follows; metrics.json lists all."""
+    """Lines on the corrections that the map follows; the log and metrics.json list all."""
+    for correction in heard:
+        _log.info("%s", f"correction followed: {correction.sentence}")  # "%s": not in the terminal
     lines = [f"correction followed: {correction.sentence}" for correction in heard[:_TOLD_CORRECTIONS]]
     more = len(heard) - len(lines)
     return [*lines, f"and {more} more corrections, see metrics.json"] if more else lines
