@@ -8,11 +8,31 @@ else that is raised is a bug of ours and keeps its traceback.
 from __future__ import annotations
 
 import importlib
+import re
 from types import ModuleType
+
+_LOGIN = re.compile(r"(?P<scheme>[a-z][a-z0-9+.-]+):/+(?P<login>[^\s'\"<>]*)@", re.IGNORECASE)
+_QUERY = re.compile(r"([a-z][a-z0-9+.-]+:/+[^\s'\"<>?#]*[?#])[^\s'\"<>]*[^\s'\"<>:;,.)\]]", re.IGNORECASE)
+_AZURE = ("abfs", "abfss")  # whose URLs name a container where others have a login
+_MASK = "***"
+
+
+def masked(text: str) -> str:
+    """A text without what URLs in it, also those taken for paths, hold of logins, passwords and tokens."""
+
+    def without_login(url: re.Match[str]) -> str:
+        if url["scheme"].lower() in _AZURE and ":" not in url["login"]:
+            return url[0]
+        return url[0].removesuffix(f"{url['login']}@") + f"{_MASK}@"
+
+    return _QUERY.sub(rf"\1{_MASK}", _LOGIN.sub(without_login, text)) if ":/" in text else text
 
 
 class V2hdmError(Exception):
-    """Root of all errors that a user can cause and mend."""
+    """Root of all errors that a user can cause and mend; its message holds no secret of a URL."""
+
+    def __init__(self, *parts: object) -> None:
+        super().__init__(*(masked(part) if isinstance(part, str) else part for part in parts))
 
 
 class ConfigError(V2hdmError):
@@ -68,8 +88,11 @@ def describe(error: BaseException) -> str | None:
 
 
 def one_line(message: str) -> str:
-    """A message whose words come from files of strangers: none ends the line or moves the cursor."""
-    line = " ".join(message.split())
+    """A message whose words come from files of strangers: none ends the line or moves the cursor.
+
+    What its URLs hold of passwords is :func:`masked`.
+    """
+    line = masked(" ".join(message.split()))
     return line if line.isprintable() else "".join(c if c.isprintable() else "?" for c in line)
 
 

@@ -26,6 +26,7 @@ from v2hdm.errors import (
     V2hdmError,
     WorkerError,
     describe,
+    masked,
     one_line,
 )  # fmt: skip
 from v2hdm.pipeline.config import RunConfig, run_name
@@ -91,18 +92,23 @@ class Row:
         )
 
 
+def _shown(row: Row) -> dict[str, Any]:
+    """A row as others may see it."""
+    return {name: masked(value) if isinstance(value, str) else value for name, value in asdict(row).items()}
+
+
 def as_csv(rows: Sequence[Row]) -> bytes:
     """The rows as a spreadsheet."""
     out = io.StringIO()
     writer = csv.DictWriter(out, [field.name for field in fields(Row)], lineterminator="\n")
     writer.writeheader()
-    writer.writerows(asdict(row) for row in rows)
+    writer.writerows(_shown(row) for row in rows)
     return out.getvalue().encode()
 
 
 def as_json(rows: Sequence[Row]) -> bytes:
     """The rows as JSON."""
-    return (json.dumps({"drives": [asdict(row) for row in rows]}, indent=2) + "\n").encode()
+    return (json.dumps({"drives": [_shown(row) for row in rows]}, indent=2) + "\n").encode()
 
 
 def as_table(rows: Sequence[Row]) -> Table:
