@@ -171,7 +171,9 @@ def test_the_list_has_a_sentence_for_each_command_and_each_file_declares_its_own
     assert [command.name for command in COMMANDS.values()] == [f"v2hdm {name}" for name in COMMANDS]
     assert run(["calibrate", "pints"]) == 2
     assert (
-        capsys.readouterr().err == "error: v2hdm calibrate pints: no such command; v2hdm --help lists them\n"
+        capsys.readouterr().err
+        == "error: v2hdm calibrate pints: no such command; did you mean calibrate points? "
+        "v2hdm --help lists them\n"
     )
 
 

@@ -12,7 +12,8 @@ from v2hdm.detection.frames import read_bgr
 from v2hdm.errors import V2hdmError
 from v2hdm.io.calibration.reading import read_calibration, read_camera_info
 from v2hdm.io.calibration.writing import write_calibration, write_camera_info
-from v2hdm.io.importers.readings import read_nmea, read_table
+from v2hdm.io.importers.nmea import read_nmea
+from v2hdm.io.importers.readings import read_table
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.maps.geopackage import write_geopackage
 from v2hdm.io.maps.reading import read_geojson, read_geopackage

@@ -26,7 +26,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from v2hdm.cli.command import Command
-from v2hdm.errors import ConfigError, V2hdmError, masked
+from v2hdm.errors import ConfigError, V2hdmError, masked, shown
 from v2hdm.io.description import DRIVE_FILE
 from v2hdm.safe.texts import read_yaml
 from v2hdm.settings import NO_KEY, settings_of
@@ -195,7 +195,9 @@ def explain(error: Exception, schema: type[Any], overrides: list[str]) -> Config
             override for override in overrides if "=" not in override and not override.startswith(("-", "~"))
         ]
         word = " ".join(bare[-1:]) or "an argument"
-        return ConfigError(f"configuration: '{word}' is not key=value; write drive.path={word}, see --help")
+        return ConfigError(
+            f"configuration: {shown(word)} is not key=value; write drive.path={word}, see --help"
+        )
     # Of a long command line only what the message is about: the override that has the key it names.
     relevant = [override for override in overrides if override.lstrip("+~").split("=")[0] in message + place]
     repeated = relevant or overrides

@@ -6,6 +6,7 @@ Ctrl-C is one line while torch is still being loaded, too.
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import json
 import logging
@@ -22,7 +23,7 @@ from pathlib import Path
 from v2hdm import __version__
 from v2hdm.cli import commands
 from v2hdm.cli.command import Command, fail
-from v2hdm.errors import describe, one_line
+from v2hdm.errors import describe, one_line, shown
 
 _FIRST = ("map", "detect", "check")  # at the head of the list, for those who look at it for the first time
 
@@ -87,7 +88,10 @@ def run(arguments: Sequence[str]) -> int:
         return _overview(version_line)
     if not words or words[0] in ("-h", "--help") or (below and words[1:2] in ([], ["-h"], ["--help"])):
         return _overview(lambda: _list(below or names))
-    return fail(f"v2hdm {' '.join(words[: 2 if below else 1])}: no such command; v2hdm --help lists them")
+    typed = " ".join(words[: 2 if below else 1])
+    similar = difflib.get_close_matches(typed, names, n=1, cutoff=0.6)
+    meant = f"did you mean {similar[0]}? " if similar else ""
+    return fail(f"v2hdm {shown(typed)[1:-1]}: no such command; {meant}v2hdm --help lists them")
 
 
 def _overview(text: Callable[[], str]) -> int:

@@ -6,14 +6,15 @@ import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import torch  # noqa: F401  # its absence is reported before that of what is built on it
 
 from v2hdm.adjust.ahead import compiled_meanwhile
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.weights import unknown_network
-from v2hdm.errors import AdjustError, MappingError
+from v2hdm.doors import checked
+from v2hdm.errors import AdjustError, ConfigError, MappingError
 from v2hdm.io.drive import ReadOptions, as_drive, join_drives
 from v2hdm.io.maps.corrections import read_corrections
 from v2hdm.mapping.options import AUTO, MappingOptions, check_options
@@ -27,6 +28,7 @@ from v2hdm.pipeline.result import Result, describe_run
 from v2hdm.pipeline.stages import MappedSet, detect_in_pieces, map_camera_sets, methods_of
 from v2hdm.progress import Progress, silent
 from v2hdm.records import BEST, Drive, ImageDetections
+from v2hdm.settings import PROCESSES
 from v2hdm.site.living.changes import Base
 from v2hdm.site.living.wear import with_wear
 from v2hdm.store.cache import StageCache
@@ -52,6 +54,7 @@ class Read:
     contents: Contents
 
 
+@checked
 def map_drive(
     drive: Source | Iterable[Source],
     *,
@@ -64,7 +67,7 @@ def map_drive(
     name: str | None = None,
     cache: Path | str | None = None,
     progress: Progress = silent,
-    workers: int = 0,
+    workers: Annotated[int, PROCESSES] = 0,
     context: Context | None = None,
 ) -> Result:
     """Map a drive, or several through one site together; nothing is written, but what ``cache`` keeps.
@@ -95,6 +98,8 @@ def map_drive(
     >>> result.verdict.status.value, result.calibrations["front"].cam_from_vehicle.shape
     ('PASS', (4, 4))
     """
+    if cache is not None and Path(cache).is_file():
+        raise ConfigError(f"cache {cache}: is a file; give a folder")
     stages = StageCache(None if cache is None else Path(cache))
     context = context or Context(stages, progress, workers=workers)
     options = options or MappingOptions()
@@ -103,6 +108,8 @@ def map_drive(
         stated = read_corrections(Path(corrections))
         options = replace(options, acceptance=replace(options.acceptance, corrections=stated))
     sources = [drive] if isinstance(drive, Source) else list(drive)
+    if not sources:
+        raise ConfigError("map_drive: no drive is given; give one, or a list of them")
     check_options(options)
     check_choice(options, len(sources), base is not None, accuracy_goal_cm)
     read = read_all(sources, reading, context)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.errors import DriveError, MapFileError
+from v2hdm.errors import DriveError, MapFileError, shown
 from v2hdm.geometry.ipm import cam_from_mounting, extrinsic_from_ipm, ipm_from_extrinsic
 from v2hdm.geometry.planar import winding
 from v2hdm.geometry.rigid import camera_centre, inverse
@@ -135,7 +135,7 @@ def _coefficients_of(model: str, where: str, advice: str) -> int:
     """The number of coefficients of a distortion model of ours; else DriveError with ``advice``."""
     if model not in DISTORTION_COEFFICIENTS:
         models = ", ".join(DISTORTION_COEFFICIENTS)
-        raise DriveError(f"{where}: unknown distortion_model '{model}'; {advice} one of: {models}")
+        raise DriveError(f"{where}: unknown distortion_model {shown(model)}; {advice} one of: {models}")
     return DISTORTION_COEFFICIENTS[model]
 
 
@@ -304,5 +304,7 @@ def choose_initial(name: object, ipm: dict[str, FloatArray], where: str) -> str:
     initial = take_text(name, f"{where}, initial_ipm", DriveError)
     if initial not in ipm:
         names = ", ".join(ipm)
-        raise DriveError(f"{where}: initial_ipm '{initial}' is not given under ipm; choose from: {names}")
+        raise DriveError(
+            f"{where}: initial_ipm {shown(initial)} is not given under ipm; choose from: {names}"
+        )
     return initial
