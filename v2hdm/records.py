@@ -100,6 +100,9 @@ SIGMAS_95 = 2.4477
 """Semi-axes of the 95 % ellipse of a two-dimensional normal error, in standard deviations: the root of the
 chi-square quantile with two degrees of freedom."""
 
+TWO_SIDED_95 = 1.96
+"""Half the width of the band that holds 95 % of a normal error in one dimension, in standard deviations."""
+
 FOOT_M = 0.3048  # an international foot, m
 
 HEIGHT_NOISE = 2.0  # noise of heights by RTK over that of positions in the plane, about

@@ -413,6 +413,23 @@ def test_a_failed_drive_is_not_compared(tmp_path, capsys):
     assert "verdict on its drive is FAIL" in capsys.readouterr().err
 
 
+def test_a_camera_without_enough_ground_fails_as_its_line_says(tmp_path, capsys):
+    """One image matches no other."""
+    drive = make_drive(tmp_path / "drive")
+    listed = drive.root / "front" / "images.txt"
+    rows = [row for row in listed.read_text().splitlines(keepends=True) if not row.startswith("#")]
+    listed.write_text(rows[0])
+    given = ["calibrate", "ground", str(drive.root), "--camera", "front", "--output", str(tmp_path / "out")]
+    assert run_command(given) == 3
+    shown = capsys.readouterr().out
+    assert "front: too little ground appears in two images: drive farther" in shown
+    assert "verdict: FAIL" in shown
+    assert "FAIL ground match (front): no mounting: too little ground" in shown.replace("  ", " ")
+    verdict = json.loads((tmp_path / "out" / "verdict.json").read_text())
+    assert verdict["status"] == "FAIL"
+    assert not list((tmp_path / "out").glob("calibration_*"))
+
+
 GRID_MISREADINGS = {
     "x and y are exchanged": lambda u, v, x, y: (u, v, y, x),
     "y counts to the right, or x backward": lambda u, v, x, y: (u, v, x, -y),

@@ -18,7 +18,8 @@ from v2hdm.records import Calibration, Drive
 from v2hdm.settings import PROCESSES
 from v2hdm.store.files import write_json
 from v2hdm.store.names import VERDICT, calibration_file
-from v2hdm.verdict import Verdict, check_drive
+from v2hdm.verdict import Finding, Status, Verdict, check_drive
+from v2hdm.verdict.inputs.ground import MATCH, PATH
 
 # Each parameter's name, and the factor and unit that people read it in.
 _NAMES = {
@@ -81,7 +82,20 @@ def calibrate_from_ground(
     """
     drive = as_drive(drive)
     estimates = estimate_cameras(drive, workers, progress)
-    return GroundCalibration(drive, estimates, check_drive(drive, ground=estimates))
+    return GroundCalibration(drive, estimates, _judged(check_drive(drive, ground=estimates), estimates))
+
+
+def _judged(of_drive: Verdict, estimates: Mapping[str, GroundEstimate]) -> Verdict:
+    """The verdict on a drive, in which a camera without a mounting fails: it was asked for."""
+    missing = {name for name, estimate in estimates.items() if estimate.calibration is None}
+    told = {finding.about for finding in of_drive.raised if finding.check in (MATCH, PATH)}
+    others = [f for f in of_drive.findings if not (f.check == MATCH and f.about in missing - told)]
+    failures = [
+        Finding(MATCH, Status.FAIL, None, None, "", f"no mounting: {_WHY[estimates[name].status]}", name)
+        for name in estimates
+        if name in missing - told
+    ]
+    return Verdict.of([*failures, *others])
 
 
 def summary_lines(calibrated: GroundCalibration) -> list[str]:

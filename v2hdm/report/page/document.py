@@ -19,6 +19,7 @@ from v2hdm.report.page.facts import Facts, ground_residuals, read_facts
 from v2hdm.report.page.layers import background_layer, comparison, earlier_layer, layers
 from v2hdm.report.page.pictures import earlier_pictures, overlays, pictures
 from v2hdm.report.page.tables import in_words
+from v2hdm.site.accuracy import absolute_radii_m, relative_radii_m
 from v2hdm.store import names
 from v2hdm.store.files import replace_text
 
@@ -44,7 +45,7 @@ def document(facts: Facts) -> SimpleNamespace:
         site=_site(facts),
         accuracy=tables.accuracy_table(facts),
         against_truth=tables.truth_table(facts),
-        ellipses=_ellipses(facts),
+        radii=_radii(facts),
         check_points=tables.check_point_table(facts),
         map_data=layers(facts, residuals),
         pictures=pictures(facts),
@@ -83,12 +84,15 @@ def _site(facts: Facts) -> str:
     return charts.site_chart(facts.hd_map, facts.route, excluded)
 
 
-def _ellipses(facts: Facts) -> str:
+def _radii(facts: Facts) -> str:
     markings = facts.hd_map.markings if facts.hd_map else ()
-    measures = {"relative to neighbours": tables.relative_m, "absolute": tables.half_axes_m}
-    series = {name: 100 * measure(markings) for name, measure in measures.items()}
-    series = {name: values_cm for name, values_cm in series.items() if len(values_cm)}
-    return charts.ellipse_chart(series) if series else ""
+    absolute_m = absolute_radii_m(markings).ravel()
+    radii_m = {
+        "corners, in the map’s frame": absolute_m[np.isfinite(absolute_m)],
+        "markings, from marking to marking": relative_radii_m(markings),
+    }
+    series = {name: 100 * values_m for name, values_m in radii_m.items() if len(values_m)}
+    return charts.radius_chart(series) if series else ""
 
 
 _ASSETS = {"vendor": ("leaflet.js", "leaflet.css"), "templates": ("page.css", "map.js", "edit.js")}

@@ -17,6 +17,7 @@ from v2hdm.report.metrics import corner_errors, match_markings, rms
 from v2hdm.report.page.facts import Facts, GroundResiduals
 from v2hdm.safe.backgrounds import Window, background_pixels
 from v2hdm.safe.pixels import read_pixels
+from v2hdm.site.accuracy import corner_radii_m
 from v2hdm.store import names
 from v2hdm.store.files import load_json, take_array, take_mapping, take_text
 
@@ -135,6 +136,12 @@ def ellipses(marking: Marking) -> FloatArray | None:
     return np.column_stack([half, direction])
 
 
+def _radii(paint: Marking | Symbol) -> list[float] | None:
+    """The 95 % radii, m, of corners or vertices, of which the largest gives the grade."""
+    covariance_m2 = paint.covariance_m2
+    return None if covariance_m2 is None else np.round(corner_radii_m(covariance_m2), 5).tolist()
+
+
 def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
     """The map document: markings, lanes, symbols, truth, route, excluded candidates, mosaic."""
     hd_map = facts.hd_map
@@ -150,6 +157,7 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
         axes = ellipses(marking)
         if axes is not None:
             feature["e"] = np.round(axes, 5).tolist()
+            feature["w"] = _radii(marking)
         if marking.relative_sigma_m is not None:
             feature["r"] = round(SIGMAS_95 * marking.relative_sigma_m, 5)
         if marking.accuracy is not None:
@@ -167,7 +175,7 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
         "lanes": [_feature(lane, kinds, "p", lane.points_map) for lane in hd_map.lanes],
         "symbols": [
             _feature(symbol, kinds, "p", symbol.outline_map)
-            | {"e": None if symbol.sigma_m is None else round(SIGMAS_95 * symbol.sigma_m, 5)}
+            | {"w": _radii(symbol)}
             | ({} if symbol.accuracy is None else {"g": symbol.accuracy})
             for symbol in hd_map.symbols
         ],
