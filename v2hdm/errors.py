@@ -8,14 +8,36 @@ else that is raised is a bug of ours and keeps its traceback.
 from __future__ import annotations
 
 import importlib
+import re
 from types import ModuleType
+
+_LOGIN = re.compile(r"(?P<scheme>[a-z][a-z0-9+.-]{1,20}):/+(?P<login>[^\s'\"<>]*)@", re.IGNORECASE)
+_QUERY = re.compile(
+    r"([a-z][a-z0-9+.-]{1,20}:/+[^\s'\"<>?#]*[?#])[^\s'\"<>]*[^\s'\"<>:;,.)\]]", re.IGNORECASE
+)
+_AZURE = ("abfs", "abfss")  # whose URLs name a container where others have a login
+_MASK = "***"
+_MOST_MASKED = (
+    10_000  # letters of a message that are looked at for secrets; the middle of longer ones is cut out
+)
+
+
+def masked(text: str) -> str:
+    """A text without what URLs in it, also those taken for paths, hold of logins, passwords and tokens."""
+
+    def without_login(url: re.Match[str]) -> str:
+        if url["scheme"].lower() in _AZURE and ":" not in url["login"]:
+            return url[0]
+        return url[0].removesuffix(f"{url['login']}@") + f"{_MASK}@"
+
+    return _QUERY.sub(rf"\1{_MASK}", _LOGIN.sub(without_login, text)) if ":/" in text else text
 
 
 class V2hdmError(Exception):
-    """Root of all errors that a user can cause and mend; its message is bounded, whatever is quoted in it."""
+    """Root of all errors that a user can cause and mend; its message is bounded, and no secret."""
 
     def __init__(self, message: str = "") -> None:
-        super().__init__(bounded(message))
+        super().__init__(bounded(masked(bounded(message, _MOST_MASKED))))
 
 
 class ConfigError(V2hdmError):
@@ -102,8 +124,11 @@ def bounded(message: str, most: int = _MOST_LETTERS) -> str:
 
 
 def one_line(message: str) -> str:
-    """A message whose words come from files of strangers: none ends the line or moves the cursor."""
-    line = " ".join(bounded(message).split())
+    """A message whose words come from files of strangers: none ends the line or moves the cursor.
+
+    What its URLs hold of passwords is :func:`masked`.
+    """
+    line = " ".join(bounded(masked(bounded(message, _MOST_MASKED))).split())
     return line if line.isprintable() else "".join(c if c.isprintable() else "?" for c in line)
 
 

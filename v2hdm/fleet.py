@@ -7,7 +7,7 @@ import os
 import sys
 import traceback
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, astuple, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from v2hdm.errors import (
     V2hdmError,
     WorkerError,
     describe,
+    masked,
     one_line,
 )  # fmt: skip
 from v2hdm.pipeline.config import RunConfig, run_name
@@ -90,15 +91,20 @@ class Row:
         )
 
 
+def _shown(row: Row) -> dict[str, Any]:
+    """A row as others may see it."""
+    return {name: masked(value) if isinstance(value, str) else value for name, value in asdict(row).items()}
+
+
 def as_csv(rows: Sequence[Row]) -> bytes:
     """The rows as a spreadsheet."""
     heading = [field.name for field in fields(Row)]
-    return csv_text([heading, *(astuple(row) for row in rows)]).encode()
+    return csv_text([heading, *([*_shown(row).values()] for row in rows)]).encode()
 
 
 def as_json(rows: Sequence[Row]) -> bytes:
     """The rows as JSON."""
-    return (json.dumps({"drives": [asdict(row) for row in rows]}, indent=2) + "\n").encode()
+    return (json.dumps({"drives": [_shown(row) for row in rows]}, indent=2) + "\n").encode()
 
 
 def as_table(rows: Sequence[Row]) -> Table:

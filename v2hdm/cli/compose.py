@@ -26,7 +26,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from v2hdm.cli.command import Command
-from v2hdm.errors import ConfigError, V2hdmError, shown
+from v2hdm.errors import ConfigError, V2hdmError, masked, shown
 from v2hdm.io.description import DRIVE_FILE
 from v2hdm.safe.texts import read_yaml
 from v2hdm.settings import NO_KEY, settings_of
@@ -97,7 +97,7 @@ def work_on(command: Command, door: Door, work: Callable[[Job], int | None], arg
     except Exception as error:  # whatever Hydra, OmegaConf and PyYAML raise about texts that users wrote
         raise explain(error, door.schema, parsed.overrides) from error
     if parsed.cfg:
-        print(OmegaConf.to_yaml(composed))
+        print(masked(OmegaConf.to_yaml(composed)))
         return 0
     return work(Job(to_dataclass(composed, door.schema, door.advice), to_yaml(composed))) or 0
 

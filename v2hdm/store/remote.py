@@ -80,7 +80,7 @@ class RemoteFolder:
             schemes = ", ".join(f"{scheme}://" for scheme in _PACKAGES if scheme != _MEMORY)
             raise ConfigError(f"{option} {url}: is not in a supported store; choose a folder or {schemes}")
         parts = path.rstrip("/").split("/")
-        if ":" in parts[0]:
+        if ":" in parts[0] or ("@" in parts[0] and not protocol.startswith("abfs")):
             raise ConfigError(
                 f"{option} {protocol}://...: is not a bucket name; credentials belong where "
                 f"{_PACKAGES[protocol]} looks for them, not into a URL"
