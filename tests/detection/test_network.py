@@ -351,3 +351,11 @@ def test_a_model_newer_than_the_runtime_is_one_line_with_both_versions(change, s
         Network(tmp_path / "a.onnx")
     assert "onnxruntime_src" not in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+def test_the_hint_of_a_users_network_is_to_fit_with_that_network(tmp_path):
+    mine = tmp_path / "my network.onnx"
+    mine.write_bytes(b"another")
+    told = weights.unknown_network(mine)
+    assert told is not None
+    assert f"fit it with `python -m train.ship '{mine}'`" in told

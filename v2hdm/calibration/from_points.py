@@ -186,14 +186,15 @@ def _misreading(points: SurveyedPoints, info: CameraInfo, noise: Noise) -> str |
     px = points.points_px[some]
     ground = points.points_vehicle[some]
 
-    as_given = _best_score(_above_ground(fit_mountings(SeenPoints.of(px, ground, info, noise))))
+    given_fits = fit_mountings(SeenPoints.of(px, ground, info, noise))
+    as_given = _best_score(_above_ground(given_fits))
     causes = {}
     for reading in _readings(px, ground, info):
         read_points = SeenPoints.of(reading.points_px, reading.points_vehicle, info, noise)
         fits = _above_ground(fit_mountings(read_points, starts=_STARTS, rounds=_ROUNDS))
         # Pixels that are scaled have another density: by scale^2 each in those of the table.
         causes[reading.cause] = _best_score(fits) + 2 * len(px) * float(np.log(reading.scale))
-    if as_given > -np.inf:
+    if given_fits:
         causes[_UNRELATED] = -len(px) * float(np.log(info.width * info.height))
     cause = max(causes, key=lambda words: causes[words])
     return cause if causes[cause] > as_given + _SURE - np.log(_MISREAD) else None

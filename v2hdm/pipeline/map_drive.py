@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -29,6 +29,7 @@ from v2hdm.pipeline.stages import MappedSet, detect_in_pieces, map_camera_sets, 
 from v2hdm.progress import Progress, silent
 from v2hdm.records import BEST, Drive, ImageDetections
 from v2hdm.settings import PROCESSES
+from v2hdm.site.corrections import Heard
 from v2hdm.site.living.changes import Base
 from v2hdm.site.living.wear import with_wear
 from v2hdm.store.cache import StageCache
@@ -43,6 +44,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 Source = Drive | Path | str
+
+_TOLD_CORRECTIONS = 20  # corrections that the terminal lists: a screen
 
 
 @dataclass(frozen=True)
@@ -219,6 +222,15 @@ def _with_wear(
     return {**sets, name: replace(last, methods=methods)}
 
 
+def _told_of_corrections(heard: Sequence[Heard]) -> list[str]:
+    """Lines on the corrections that the map follows; the log and metrics.json list all."""
+    for correction in heard:
+        _log.info("%s", f"correction followed: {correction.sentence}")  # "%s": not in the terminal
+    lines = [f"correction followed: {correction.sentence}" for correction in heard[:_TOLD_CORRECTIONS]]
+    more = len(heard) - len(lines)
+    return [*lines, f"and {more} more corrections, see metrics.json"] if more else lines
+
+
 def _judge(
     result: Result,
     inspection: Inspection,
@@ -249,6 +261,9 @@ def _judge(
         metrics, headlines = evaluate(result.drive, chosen)
     changes = {} if best.changes is None else {"changes": changes_json(best.changes)}
     figures = {**metrics, **changes, "seconds": context.seconds}
+    if best.heard:
+        figures["corrections"] = [asdict(heard) for heard in best.heard]
+        headlines += _told_of_corrections(best.heard)
     if check_points is not None:
         figures["check_points"] = check_points.figures()
         headlines.append(check_points.headline)

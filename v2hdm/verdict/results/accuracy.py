@@ -282,13 +282,29 @@ def check_known_sizes(sizes: SizeOptions, best: MethodResult) -> list[Finding]:
     return findings
 
 
+_LISTED = 5  # corrections that a line names: as many as a reader takes in
+
+
 def check_corrections(corrections: Sequence[Correction], best: MethodResult) -> list[Finding]:
-    """A finding where a person's corrections have found nothing to correct."""
+    """The corrections that the map follows, those that the images contradict, and those of nothing."""
+    about = "map.corrections"
+    findings = []
     missing = unmet(corrections, best.hd_map)
-    if not missing:
-        return []
-    says = (
-        f"{len(missing)} of {len(corrections)} match no candidate and have no effect: "
-        f"{', '.join(missing[:5])}; correct a map of this drive, or drop them"
-    )
-    return [Finding("corrections", Status.WARN, float(len(missing)), 0.0, "", says, "map.corrections")]
+    if missing:
+        says = (
+            f"{len(missing)} of {len(corrections)} match no candidate and have no effect: "
+            f"{', '.join(missing[:_LISTED])}; correct a map of this drive, or drop them"
+        )
+        findings.append(Finding("corrections", Status.WARN, float(len(missing)), 0.0, "", says, about))
+    contradicted = [heard.sentence for heard in best.heard if heard.against]
+    if contradicted:
+        says = (
+            f"{len(contradicted)} of {len(corrections)} are followed against the images: "
+            f"{'; '.join(contradicted[:_LISTED])}: look at these again"
+        )
+        count = float(len(contradicted))
+        findings.append(Finding("corrections against images", Status.WARN, count, 0.0, "", says, about))
+    elif best.heard:
+        says = f"the images do not contradict {len(best.heard)} corrections that the map follows"
+        findings.append(passed("corrections against images", about, says, 0.0))
+    return findings
