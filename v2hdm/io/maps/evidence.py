@@ -116,7 +116,7 @@ def read_residuals(path: Path) -> Residuals:
 def _is_sound(numbers: Sequence[float], taken_s: float) -> bool:
     """Whether the numbers of a line, from ``marking`` on, and the time of its image can be."""
     marking, corner = numbers[:2]
-    is_whole = marking in range(_LARGEST_ID + 1) and corner in range(1, 5)
+    is_whole = 0 <= marking <= _LARGEST_ID and marking.is_integer() and corner in (1, 2, 3, 4)
     return is_whole and bool(np.abs([*numbers[2:], taken_s]).max() <= _LARGEST)
 
 
