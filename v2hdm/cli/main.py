@@ -14,6 +14,7 @@ import os
 import pkgutil
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -57,13 +58,32 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line of this process; returns the exit code."""
     answer_signals()
     logging.setLogRecordFactory(_Line)
-    child = os.fork() if _is_limited() else 0
+    words = sys.argv[1:] if arguments is None else arguments
+    if not _is_limited():
+        return run(words)
+    theirs, ours = os.pipe()  # which ends when this process does, whatever ends it
+    child = os.fork()
     if child == 0:
-        return run(sys.argv[1:] if arguments is None else arguments)
+        os.close(ours)
+        threading.Thread(target=_end_with, args=(theirs,), daemon=True).start()
+        return run(words)
+    os.close(theirs)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: os.kill(child, number))
     code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     return code if code >= 0 else fail(f"ended by signal {-code} under ulimit -v; {describe(MemoryError())}")
+
+
+_TIDY_S = 5.0  # a child without its parent may take this long to tidy up
+
+
+def _end_with(pipe: int) -> None:
+    """End this process, tidily if it can, when the other end of a pipe does."""
+    with suppress(OSError):
+        os.read(pipe, 1)
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(_TIDY_S)
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def _is_limited() -> bool:
