@@ -117,7 +117,10 @@ def _is_sound(numbers: Sequence[float], taken_s: float) -> bool:
     """Whether the numbers of a line, from ``marking`` on, and the time of its image can be."""
     marking, corner = numbers[:2]
     is_whole = 0 <= marking <= _LARGEST_ID and marking.is_integer() and corner in (1, 2, 3, 4)
-    return is_whole and bool(np.abs([*numbers[2:], taken_s]).max() <= _LARGEST)
+    # A corner behind the camera has a place in the image, and no finite residual.
+    residuals = np.abs(numbers[5:])
+    is_residual = (residuals <= _LARGEST) | ~np.isfinite(residuals)
+    return is_whole and bool(np.abs([*numbers[2:5], taken_s]).max() <= _LARGEST and is_residual.all())
 
 
 def write_exclusions(
