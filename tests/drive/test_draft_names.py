@@ -4,8 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.faults.readers import refusal
 from v2hdm.cli.main import run
 from v2hdm.errors import DriveError
+from v2hdm.io.calibration.reading import take_ipm
 from v2hdm.io.drive.draft import draft_drive
 
 
@@ -56,3 +58,12 @@ def test_a_folder_name_moves_no_cursor(tmp_path, capsys):
     error = capsys.readouterr().err
     assert all(line.isprintable() for line in error.split("\n"))
     assert error.startswith(f"error: {tmp_path}/a?[2J b: nothing written; also give:\n  --set ")
+
+
+@pytest.mark.parametrize("number", [1e308, -1e308, 1e200, 5e-324, 1e-160])
+def test_an_ipm_of_absurd_numbers_is_read_or_refused(number):
+    for place in range(9):
+        ipm = np.array([0.01, -0.3, 5.0, -0.02, 0.001, 8.0, 0.0001, -0.04, 1.0])
+        ipm[place] = number
+        said = refusal(lambda ipm=ipm: take_ipm(ipm.reshape(3, 3).tolist(), "drive.yaml"), DriveError)
+        assert said is None or said.startswith("drive.yaml: IPM matrix is not invertible")

@@ -215,6 +215,10 @@ _NOISE = re.compile(
 _UNQUOTED = re.compile(r"Lexer|no viable alternative|mismatched input|extraneous input|Unknown function")
 
 
+_INSTEAD = {"max_sigma_m": "mapping.acceptance.accuracy=A, B or C takes its place (docs/accuracy.md)"}
+"""Keys that are no more, and what to set now."""
+
+
 def _advice(message: str, schema: type[Any]) -> str:
     if _UNQUOTED.search(message):
         return "a value with special characters needs quotes: \"drive.path='müll (1)'\""
@@ -225,6 +229,8 @@ def _advice(message: str, schema: type[Any]) -> str:
     if listed:
         return f"write {listed.group(1)}=[{listed.group(2)}]"
     unknown = re.search(r"[Kk]ey '([\w.]+)' (?:not in|is not in)", message)
+    if unknown and unknown.group(1).split(".")[-1] in _INSTEAD:
+        return _INSTEAD[unknown.group(1).split(".")[-1]]
     if unknown:
         leaves = [key.name.split(".") for key in keys_of(schema)]
         keys = dict.fromkeys(".".join(parts[:end]) for parts in leaves for end in range(1, len(parts) + 1))

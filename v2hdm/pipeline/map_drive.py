@@ -160,7 +160,8 @@ def _mapped(
             sets = graded_sets(mapped, goal_cm / 100)
         with context.timed("wear"):
             sets = _with_wear(sets, inspection.drive, earlier, context)
-        chosen = accurate_enough(methods_of(sets), survey.mapping.acceptance.accuracy)
+        acceptance = survey.mapping.acceptance
+        chosen = accurate_enough(methods_of(sets), acceptance.accuracy, acceptance.corrections)
     except (MappingError, AdjustError) as failure:
         if all(finding.status is not Status.FAIL for finding in inspection.findings):
             raise

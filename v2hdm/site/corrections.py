@@ -159,6 +159,16 @@ def _same(correction: Correction, corners_map: FloatArray) -> IntArray:
     return in_reach[[overlap(corners_map[group], outline) > MAX_OVERLAP for group in in_reach]]
 
 
+def is_confirmed(outline_map: FloatArray, corrections: Sequence[Correction]) -> bool:
+    """Whether a person accepted or corrected the marking or symbol with that outline (N, 2)."""
+    confirmed = [correction for correction in corrections if correction.says != REJECTED]
+    if len(outline_map) == 4:
+        return any(len(_same(correction, outline_map[None])) for correction in confirmed)
+    middle = outline_map.mean(axis=0)
+    away_m = [np.linalg.norm(np.mean(correction.outline_map, axis=0) - middle) for correction in confirmed]
+    return bool(min(away_m, default=np.inf) < _SAME_M)
+
+
 def overlap(a: FloatArray, b: FloatArray) -> float:
     """Common area of two convex quadrilaterals, relative to the smaller."""
     common = abs(float(signed_area(clip_convex(a, b))))
