@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from v2hdm.errors import DriveError, need
+from v2hdm.errors import DriveError, need, shown
 from v2hdm.geometry.rigid import interpolate, inverse, make_transform, rotation_from_quaternion
 from v2hdm.io.importers.readings import Attitudes, Readings
 from v2hdm.io.trajectory import checked_rotations, in_order
@@ -56,13 +56,15 @@ def file_of(kind: str, fields: Any, where: str) -> tuple[str, bytes]:
         return ".jpg", data
     if data.startswith(_PNG_SIGNATURE):
         return ".png", data
-    raise DriveError(f"{where}: compressed as '{fields.format}'; record JPEG, PNG or raw images")
+    raise DriveError(f"{where}: compressed as {shown(fields.format)}; record JPEG, PNG or raw images")
 
 
 def _pixels(fields: Any, where: str) -> np.ndarray:
     if fields.encoding not in _ENCODINGS:
         supported = ", ".join(_ENCODINGS)
-        raise DriveError(f"{where}: encoding '{fields.encoding}' is not known; record one of {supported}")
+        raise DriveError(
+            f"{where}: encoding {shown(fields.encoding)} is not known; record one of {supported}"
+        )
     channels, to_bgr = _ENCODINGS[fields.encoding]
     height = int(fields.height)
     width = int(fields.width)
@@ -93,7 +95,9 @@ class VideoDecoder:
     def __init__(self, form: str, where: str) -> None:
         self._av = need("av", "video", f"{where}: video in a bag", DriveError)
         if form not in _FORMATS:
-            raise DriveError(f"{where}: video in the format '{form}', supported are {', '.join(_FORMATS)}")
+            raise DriveError(
+                f"{where}: video in the format {shown(form)}, supported are {', '.join(_FORMATS)}"
+            )
         self._where = where
         self._context: Any = self._av.CodecContext.create(_CODECS.get(form, form), "r")
         self._begun = False

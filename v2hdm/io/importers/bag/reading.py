@@ -13,7 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from v2hdm.errors import DriveError, need
+from v2hdm.errors import REASON_LETTERS, DriveError, bounded, need
 from v2hdm.io.importers.bag.mcap import ROS1, ROS2, mcap_reader
 from v2hdm.safe.child import Limits, in_child, next_step
 from v2hdm.safe.databases import opened, rows_of
@@ -303,8 +303,9 @@ def _one_line(path: Path, what: str = "") -> Iterator[None]:
                 f"{path}: {what}the bag does not define the type {failure}; convert it to MCAP, which holds "
                 "its types, where it was recorded: 'ros2 bag convert'"
             ) from None
-        reason = " ".join(str(failure).split()) or type(failure).__name__
+        said = " ".join(str(failure).split()) or type(failure).__name__
+        reason = bounded(said, REASON_LETTERS).rstrip(".")
         raise DriveError(
-            f"{path}: {what}not readable as a bag ({reason[:200].rstrip('.')}); copy it again, or fix it "
+            f"{path}: {what}not readable as a bag ({reason}); copy it again, or fix it "
             f"with '{_MEND.get(path.suffix, 'ros2 bag reindex')}' if the recording was cut off"
         ) from None
