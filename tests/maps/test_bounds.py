@@ -109,3 +109,14 @@ def test_a_cloud_of_a_large_mosaic_has_fewer_points_farther_apart(tmp_path, monk
     np.testing.assert_allclose(points[:, :2].mean(axis=0), [15.0, 17.5], atol=0.05)
     assert points[:, 3].tolist() == [90.0] * len(points)
     assert "so large that the points are 0.15 m apart" in caplog.text
+
+
+def test_a_point_beyond_the_earth_is_refused_by_its_feature(tmp_path):
+    write_geojson(make_map(), tmp_path / "map.geojson")
+    content = json.loads((tmp_path / "map.geojson").read_text())
+    corners = np.array(content["features"][0]["properties"]["corners_map"]) + 1e308
+    content["features"][0]["properties"]["corners_map"] = corners.tolist()
+    content["features"][0]["geometry"] = None
+    (tmp_path / "map.geojson").write_text(json.dumps(content))
+    with pytest.raises(MapFileError, match=r"feature 0: a point lies beyond the earth"):
+        read_geojson(tmp_path / "map.geojson")

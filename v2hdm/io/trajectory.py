@@ -47,7 +47,8 @@ def checked_rotations(
     quaternion: FloatArray, place: Callable[[int], str], advice: str = "normalise it", tolerance: float = 1e-3
 ) -> FloatArray:
     """Rotations (N, 3, 3) of quaternions (N, 4), xyzw; DriveError, at its ``place``, for a wrong norm."""
-    norm = np.linalg.norm(quaternion, axis=1, keepdims=True)
+    with np.errstate(over="ignore"):  # an infinite norm is a wrong one
+        norm = np.linalg.norm(quaternion, axis=1, keepdims=True)
     wrong = np.flatnonzero(np.abs(norm - 1) > tolerance)
     if len(wrong):
         k = int(wrong[0])

@@ -157,7 +157,9 @@ def info_of(fields: Any, name: str, where: str) -> CameraInfo:
     model = _MODELS.get(fields.distortion_model, fields.distortion_model)
     if not intrinsic.any():
         raise DriveError(f"{where}: the camera is not calibrated (K is zero); give camera_info as a file")
-    if max(fields.binning_x, fields.binning_y) > 1 or fields.roi.width or fields.roi.height:
+    region = (fields.roi.width, fields.roi.height)
+    is_cropped = region not in ((0, 0), (fields.width, fields.height))  # the whole image may be stated, too
+    if max(fields.binning_x, fields.binning_y) > 1 or is_cropped:
         raise DriveError(f"{where}: its images are binned or cropped; give camera_info as a file")
     count = _coefficients_of(model, where, "give camera_info as a file with")
     if distortion[count:].any():

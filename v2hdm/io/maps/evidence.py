@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from v2hdm.errors import MapFileError
-from v2hdm.io.maps.features import ground_height_m
+from v2hdm.io.maps.features import FARTHEST_M, ground_height_m
 from v2hdm.io.maps.geojson import geojson_feature, geojson_positions, write_features
 from v2hdm.records import BoolArray, Exclusion, FloatArray, GeodeticOrigin, IntArray, Road
 from v2hdm.store import files
@@ -158,6 +158,8 @@ def read_exclusions(path: Path) -> list[Exclusion]:
             for key in ("class", "reason", "cameras")
         )
         at = files.take_array(entry.get("position_map", np.nan), (2,), f"{where}: position_map", MapFileError)
+        if np.abs(at).max() > FARTHEST_M:
+            raise MapFileError(f"{where}: position_map: lies beyond the earth; map the drive again")
         sightings = files.take_number(entry.get("sightings"), f"{where}: sightings", MapFileError)
         excluded.append(Exclusion(kind, at, int(sightings), reason, cameras))
     return excluded

@@ -20,7 +20,7 @@ from v2hdm.errors import MapFileError, V2hdmError
 from v2hdm.geometry.geodetic import Grid, enu_from_geodetic
 from v2hdm.geometry.planar import signed_area
 from v2hdm.io.maps.corrections import SIGMA_M
-from v2hdm.io.maps.features import CORNERS, OUTLINE, PAINT, POINTS, Feature, map_of, unique_ids
+from v2hdm.io.maps.features import CORNERS, FARTHEST_M, OUTLINE, PAINT, POINTS, Feature, map_of, unique_ids
 from v2hdm.records import ACCURACIES, BoolArray, FloatArray, GeodeticOrigin, HDMap, PaintLeft
 from v2hdm.safe.databases import opened, rows_of
 from v2hdm.safe.fields import take_covariance, take_origin, take_whole
@@ -175,6 +175,10 @@ class _Reader:
             raise MapFileError(f"{where}: a marking has four corners, not {len(feature.points_map)}; fix it")
         if feature is not stored and len(stored.points_map):
             self._edited.append(len(self._features))
+        if np.abs(feature.points_map).max(initial=0.0) > FARTHEST_M:
+            raise MapFileError(
+                f"{where}: a point lies beyond the earth, in metres of the map; fix or drop it"
+            )
         self._features.append(feature)
 
     def map(self) -> HDMap:

@@ -206,7 +206,8 @@ def _range_chart(residuals: GroundResiduals) -> str:
     ):
         left = figure.subplots()
         right = other.subplots()
-        farthest = float(np.ceil(residuals.range_m.max(initial=1.0)))
+        on_ground_m = residuals.range_m[np.isfinite(residuals.range_m)]
+        farthest = float(np.ceil(on_ground_m.max(initial=1.0)))
         edges = np.linspace(0, farthest, max(2, min(int(farthest), 24)) + 1)
         ground_cm = 100 * np.linalg.norm(residuals.ground_m, axis=1)
         for number, name in enumerate(residuals.cameras):
