@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from v2hdm.errors import DriveError
+from v2hdm.errors import DriveError, shown
 from v2hdm.geometry.rigid import make_transform, quaternion_from_rotation, rotation_from_quaternion
 from v2hdm.records import FloatArray, GeodeticOrigin, IntArray, Trajectory
 from v2hdm.store.files import read_text, replace_text
@@ -47,7 +47,8 @@ def checked_rotations(
     quaternion: FloatArray, place: Callable[[int], str], advice: str = "normalise it", tolerance: float = 1e-3
 ) -> FloatArray:
     """Rotations (N, 3, 3) of quaternions (N, 4), xyzw; DriveError, at its ``place``, for a wrong norm."""
-    norm = np.linalg.norm(quaternion, axis=1, keepdims=True)
+    with np.errstate(over="ignore"):  # an infinite norm is a wrong one
+        norm = np.linalg.norm(quaternion, axis=1, keepdims=True)
     wrong = np.flatnonzero(np.abs(norm - 1) > tolerance)
     if len(wrong):
         k = int(wrong[0])
@@ -197,7 +198,7 @@ def read_image_list(path: Path) -> tuple[FloatArray, list[str]]:
         where = f"{path}: line {number}"
         parts = line.split(maxsplit=1)
         if len(parts) != 2:
-            raise DriveError(f"{where}: expected 'timestamp filename', got '{line}'; fix that line")
+            raise DriveError(f"{where}: expected 'timestamp filename', got {shown(line)}; fix that line")
         stamps[number] = parse_number(parts[0], where)
         names.append(parts[1])
     stamp_s = np.array(list(stamps.values()))
@@ -227,9 +228,9 @@ def parse_number(text: str, where: str) -> float:
         value = float(text)
     except ValueError:
         comma = "; write a decimal point" if "," in text else ""
-        raise DriveError(f"{where}: '{text}' is not a number{comma}; fix that line") from None
+        raise DriveError(f"{where}: {shown(text)} is not a number{comma}; fix that line") from None
     if not np.isfinite(value):
-        raise DriveError(f"{where}: '{text}' is not a finite number; drop or fix that line")
+        raise DriveError(f"{where}: {shown(text)} is not a finite number; drop or fix that line")
     return value
 
 

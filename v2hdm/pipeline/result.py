@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from v2hdm import __version__
+from v2hdm.doors import checked, checked_class
 from v2hdm.errors import MappingError
 from v2hdm.geometry.planar import length_along
 from v2hdm.io.drive import ReadOptions, told_of
@@ -45,6 +46,7 @@ def describe_run(
     }
 
 
+@checked_class
 @dataclass(frozen=True)
 class Result:
     """The map of a drive, its calibrations, trajectory and verdict.
@@ -116,6 +118,7 @@ class Result:
         assert poses is not None  # of the joint optimisation they always are
         return poses
 
+    @checked
     def save(
         self,
         folder: Path | str,

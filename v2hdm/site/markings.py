@@ -24,7 +24,7 @@ from v2hdm.site.candidates import (
     Counts,
     variance_prior,
 )
-from v2hdm.site.corrections import MAX_OVERLAP, Stated, overlap
+from v2hdm.site.corrections import MAX_OVERLAP, Heard, Stated, heard_of, overlap
 from v2hdm.site.hypotheses import Kind
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import Parallax
@@ -57,6 +57,7 @@ class Classified:
     counts: Counts
     misfit: FloatArray
     verdict: list[str | None]
+    heard: tuple[Heard, ...] = ()  # of a person's corrections
 
     @property
     def accepted(self) -> IntArray:
@@ -143,13 +144,14 @@ def classify(
         verdict[group] = TOO_UNCERTAIN if seen_corners[group] == 4 else LACKS_A_CORNER
     objections = parallax.objections(options.min_probability)
     verdict = [reason or objection for reason, objection in zip(verdict, objections, strict=True)]
+    heard = heard_of(stated, verdict, uncorrected.log_odds, counts.images, uncorrected.candidates)
     for group in stated.confirmed:
         verdict[group] = None
     verdict = [stated.rejected.get(group, reason) for group, reason in enumerate(verdict)]
     in_map = np.flatnonzero([reason is None for reason in verdict])
     for group in _covered(judged, in_map).tolist():
         verdict[group] = COVERED
-    return Classified(tuple(names), judged.candidates, counts, judged.misfit, verdict)
+    return Classified(tuple(names), judged.candidates, counts, judged.misfit, verdict, heard)
 
 
 def _known_ends(solved: Candidates, judged: Posterior) -> BoolArray:

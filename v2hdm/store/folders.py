@@ -30,7 +30,7 @@ from typing import IO, Any
 
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.safe.texts import read_json
-from v2hdm.store.files import file_digest
+from v2hdm.store.files import file_digest, refuse_url
 from v2hdm.store.inputs import note_input
 
 STAGES = "stages"  # folder within a cache of the entries of stages
@@ -227,6 +227,7 @@ def _listed(folder: Path) -> dict[str, Any]:
 
 def entry_folder(cache: Path, files: Sequence[Path], label: str, settings: Any) -> Path:
     """The folder of an import of some files, by a hash of all that it is made of; DriveError as by stat."""
+    refuse_url(cache)
     for file in files:
         note_input(file)
     try:

@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
+from v2hdm.doors import checked, checked_class
+
 GOAL = "coarse"  # the check whether map and calibrations are as good as accuracy_goal_cm asks
 
 
@@ -63,6 +65,7 @@ class Finding:
         return f"{outcome} {self.check} ({self.about}): {self.says}"
 
 
+@checked_class
 @dataclass(frozen=True)
 class Verdict:
     """All findings of a run, the worst first; those of equal rank keep the order of their checks.
@@ -76,6 +79,7 @@ class Verdict:
     findings: tuple[Finding, ...]
 
     @classmethod
+    @checked
     def of(cls, findings: Iterable[Finding]) -> Verdict:
         """The verdict that follows from ``findings``."""
         return cls(tuple(sorted(findings, key=lambda finding: -finding.status.rank)))

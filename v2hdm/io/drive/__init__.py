@@ -8,13 +8,14 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from v2hdm.errors import DriveError, MapFileError
+from v2hdm.doors import check_types, checked
+from v2hdm.errors import DriveError, MapFileError, shown
 from v2hdm.geometry.rigid import with_clock_offsets
 from v2hdm.io.description import DRIVE_FILE, is_folder_drive, name_of
 from v2hdm.io.drive.images import KittiOptions, ReadOptions, part_of
 from v2hdm.io.drive.join import join_drives
 from v2hdm.records import Drive, Trajectory
-from v2hdm.store.files import file_digest, load_json, load_yaml
+from v2hdm.store.files import file_digest, load_yaml
 from v2hdm.store.names import METRICS
 
 __all__ = [
@@ -66,6 +67,7 @@ READERS: Mapping[str, tuple[Callable[[Path], bool], Callable[[Path, ReadOptions]
 """Formats by name: whether a path looks like one, and what makes a drive of it."""
 
 
+@checked
 def read_drive(path: str | Path, options: ReadOptions | None = None) -> Drive:
     """Read a drive: a folder with ``drive.yaml``, KITTI raw or a bag.
 
@@ -84,12 +86,15 @@ def read_drive(path: str | Path, options: ReadOptions | None = None) -> Drive:
     """
     path = Path(path)
     options = options or ReadOptions()
+    check_types(options, "drive.")
     if not path.exists():
         raise DriveError(f"{path}: no such drive folder or bag; check the path")
     if options.max_gap_s <= 0:
         raise DriveError(f"max_gap_s is {options.max_gap_s:g}; give a positive number of seconds")
     if options.format not in ("auto", *READERS):
-        raise DriveError(f"unknown drive format '{options.format}'; choose from: auto, {', '.join(READERS)}")
+        raise DriveError(
+            f"unknown drive format {shown(options.format)}; choose from: auto, {', '.join(READERS)}"
+        )
     for name, (accepts, read) in READERS.items():
         if options.format == name or (options.format == "auto" and accepts(path)):
             return part_of(read(path, options), options)
@@ -99,7 +104,10 @@ def read_drive(path: str | Path, options: ReadOptions | None = None) -> Drive:
 
 def as_drive(drive: Drive | str | Path, options: ReadOptions | None = None) -> Drive:
     """The drive itself, or that in a folder, read."""
-    return drive if isinstance(drive, Drive) else read_drive(drive, options)
+    drive = drive if isinstance(drive, Drive) else read_drive(drive, options)
+    if not drive.images:
+        raise DriveError(f"drive {drive.name}: has no image; give one with images that have poses")
+    return drive
 
 
 def drive_name(path: Path) -> str:
@@ -140,10 +148,9 @@ def drive_of(folder: Path, path: Path | None) -> Drive | None:
     Raises MapFileError when the folder is no result of a run, DriveError when the drive is no longer that,
     or its images are not those that were mapped.
     """
-    if not (folder / METRICS).is_file():
-        raise MapFileError(f"{folder}: has no {METRICS}; give the result folder of v2hdm map")
-    stated = load_json(folder / METRICS, MapFileError).get("drive")
-    stated = stated if isinstance(stated, dict) else {}
+    from v2hdm.io.metrics import read_metrics  # loads what the map extra brings, as results are
+
+    stated = read_metrics(folder).get("drive") or {}
     try:
         stated_paths = stated.get("paths") or [] if path is None else [path]
         paths = [Path(str(stated_path)) for stated_path in stated_paths]

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from v2hdm.errors import DriveError, one_line
+from v2hdm.errors import DriveError, one_line, shown
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.io.trajectory import UNITS, checked_rotations, in_order, parse_number
 from v2hdm.records import BoolArray, FloatArray, Trajectory
@@ -152,7 +152,7 @@ def _columns(path: Path, names: Mapping[str, str]) -> dict[str, FloatArray]:
     header, rows = read_rows(path, ",;\t", "pose")
     for ours, theirs in names.items():
         if header.count(theirs) != 1:
-            problem = f"has no column '{theirs}' for {ours}, or two"
+            problem = f"has no column {shown(theirs)} for {ours}, or two"
             raise DriveError(f"{path}: {problem}; it has: {', '.join(header)}")
     place_of = {ours: header.index(theirs) for ours, theirs in names.items()}
     for place, name in enumerate(header):
@@ -213,7 +213,7 @@ def _parse(name: str, cell: str, where: str) -> float:
             return parse_sigma(cell)
     except ValueError:
         kind = "a time such as 2024-05-17T08:30:00.25Z" if name == "utc" else "a number, 0 or more"
-        raise DriveError(f"{where}: '{cell}' is not {kind}; fix that line") from None
+        raise DriveError(f"{where}: {shown(cell)} is not {kind}; fix that line") from None
     return parse_number(cell, where)
 
 
@@ -236,7 +236,9 @@ def _stamps(columns: Mapping[str, FloatArray], path: Path) -> FloatArray:
 def _check_there(columns: Mapping[str, FloatArray], names: Sequence[str], path: Path) -> None:
     for name in names:
         if name not in columns:
-            raise DriveError(f"{path}: has no column '{name}'; give the file's name for it under columns")
+            raise DriveError(
+                f"{path}: has no column {shown(name)}; give the file's name for it under columns"
+            )
 
 
 def _rotation(columns: Mapping[str, FloatArray], path: Path) -> FloatArray | None:
