@@ -10,8 +10,10 @@ import re
 from calendar import timegm
 from collections import defaultdict
 from collections.abc import Sequence
-from datetime import datetime, timedelta
+from datetime import timedelta
 from decimal import Decimal
+from itertools import pairwise
+from time import strptime
 from typing import NamedTuple
 
 import numpy as np
@@ -36,11 +38,13 @@ _DATE = re.compile(
     r"(?P<hour>[0-9]{2})(?P<b>[-_.:h]?)(?P<minute>[0-9]{2})(?:(?P=b)|(?<=h[0-9]{2})m)(?P<second>[0-9]{2})s?"
     r"(?:(?P<point>[-_.,]?)(?P<fraction>[0-9]{1,9}))?(?P<zone>[Zz]|[+-][0-9]{2}[-_:.]?[0-9]{2})?(?![0-9])"
 )
+_DATE_KEYS = ("year", "month", "day", "hour", "minute", "second")
 _SPLIT = re.compile(
     r"(?<![0-9.])(?P<whole>[0-9]{10})(?P<point>[._,-])(?P<fraction>[0-9]{1,9})(?![0-9]|\.[0-9])"
 )
 _WHOLE = re.compile(r"(?<![0-9.])(?:[0-9]{19}|[0-9]{16}|[0-9]{13})(?![0-9]|\.[0-9])")
 _PLAIN = re.compile(r"(?P<whole>-?[0-9]+)(?:\.(?P<fraction>[0-9]+))?")
+_SECONDS = re.compile(r"[12][0-9]{9}")  # since 1970, from 2001 to 2065
 _SPLIT_NS = re.compile(r"(?P<whole>[0-9]+)_(?P<fraction>[0-9]{9})")
 _DIGITS = re.compile(r"([0-9]+)")
 _TIME_OF_DAY = re.compile(r"[012][0-9][0-5][0-9][0-5][0-9]")
@@ -74,7 +78,7 @@ def number_order(stems: Sequence[str], where: str) -> list[int]:
         except DriveError:
             continue
         if len(np.unique(stamp_s)) == len(stems):
-            return np.argsort(stamp_s).tolist()
+            return sorted(range(len(stems)), key=stamp_s.tolist().__getitem__)
     return _order_of_numbers(stems, where)
 
 
@@ -148,9 +152,10 @@ def _dates(stems: Sequence[str], unit: str | None, where: str) -> list[float] | 
     matches = _matches(stems, _DATE)
     if matches is None:
         return None
-    keys = ("year", "month", "day", "hour", "minute", "second")
     try:
-        whole_s = [timegm(datetime(*(int(match[key]) for key in keys)).timetuple()) for match in matches]
+        whole_s = [
+            timegm(strptime("".join(match[key] for key in _DATE_KEYS), "%Y%m%d%H%M%S")) for match in matches
+        ]
     except ValueError:
         return None
     fractions = [match["fraction"] or "" for match in matches]
@@ -159,9 +164,10 @@ def _dates(stems: Sequence[str], unit: str | None, where: str) -> list[float] | 
         fractions = [fraction or "000000" for fraction in fractions]
         widths = {6}
     if 0 in widths:
-        raise DriveError(f"{where} state whole seconds, which leaves their times up to a second off; {_ADVICE}")
+        raise DriveError(
+            f"{where} state whole seconds, which leaves their times up to a second off; {_ADVICE}"
+        )
     _check_fractions(whole_s, fractions, {match["point"] for match in matches}, where)
-    (width,) = widths
     shift_s = _shifts([match["zone"] for match in matches], unit, where)
     return [
         float(f"{seconds - shift}.{fraction}")
@@ -216,7 +222,9 @@ def _since_1970(stems: Sequence[str], unit: str | None, where: str) -> list[floa
         return None
     told = _UNIT_OF_DIGITS[widths.pop()]
     if unit not in (None, told):
-        raise DriveError(f"{where} state times since 1970 in {told}, as {shown(stems[0])} does, not in {unit}")
+        raise DriveError(
+            f"{where} state times since 1970 in {told}, as {shown(stems[0])} does, not in {unit}"
+        )
     return [float(Decimal(match[0]).scaleb(-_POWERS[told])) for match in matches]
 
 
@@ -229,9 +237,13 @@ def _plain_times(
         stamps = _since_1970(stems, unit, where)
         if stamps is not None:
             return stamps
+        whole_s = np.sort([float(stem) for stem in stems])
+        is_pulse = len({*np.diff(whole_s).tolist()}) == 1  # as a receiver triggers a camera
+        if all(_SECONDS.fullmatch(stem) for stem in stems) and is_pulse:
+            return [float(stem) for stem in stems]
         raise DriveError(
-            f"{where} are named by whole numbers, such as {shown(stems[0])}, which may count them; {_ADVICE}, "
-            "or unit: s, ms, us or ns if they are times"
+            f"{where} are named by whole numbers, such as {shown(stems[0])}, which may count them; "
+            f"{_ADVICE}, or unit: s, ms, us or ns if they are times"
         )
     if not all(decimals):
         return [float(stem) for stem in stems] if unit == "s" else None
@@ -258,19 +270,20 @@ def _split_times(parts: Sequence[tuple[str, str]], points: set[str], where: str)
     return [float(f"{whole}.{fraction:0>{digits}}") for whole, fraction in parts]
 
 
-def _check_fractions(
-    whole_s: Sequence[int], fractions: Sequence[str], points: set[str], where: str
-) -> None:
+def _check_fractions(whole_s: Sequence[int], fractions: Sequence[str], points: set[str], where: str) -> None:
     """Refuse digits after the seconds that may count images: ``_1``, ``_2``, or ``_000``, ``_001``, ..."""
     if points <= {".", ","} and len({*map(len, fractions)}) == 1:
         return
     (width, *others) = {*map(len, fractions)}
-    stamps = sorted(whole + int(text) / 10 ** len(text) for whole, text in zip(whole_s, fractions, strict=True))
+    stamps = sorted(
+        whole + int(text) / 10 ** len(text) for whole, text in zip(whole_s, fractions, strict=True)
+    )
     if others or width not in _FRACTIONS or _counts(whole_s, fractions) or (
         len(stamps) > 2 and np.median(np.diff(stamps)) < _QUICKEST_S
     ):  # fmt: skip
         raise DriveError(
-            f"{where} have digits after the seconds, such as '{fractions[-1]}', which may count images; {_ADVICE}"
+            f"{where} have digits after the seconds, such as '{fractions[-1]}', which may count images; "
+            f"{_ADVICE}"
         )
 
 
@@ -302,7 +315,7 @@ def _order_of_numbers(stems: Sequence[str], where: str) -> list[int]:
     columns = [*zip(*(row[1::2] for row in parts), strict=True)]
     keys = [tuple(map(int, row[1::2])) for row in parts]
     order = sorted(range(len(stems)), key=keys.__getitem__)
-    for before, after in zip(order, order[1:], strict=False):
+    for before, after in pairwise(order):
         if keys[before] == keys[after]:
             pair = f"{shown(stems[before])} and {shown(stems[after])}"
             raise DriveError(f"{where} have no certain order: {pair} have the same numbers; {advice}")
@@ -330,9 +343,9 @@ def _unsure(
     last = columns[changing[-1]]
     numbers = {*map(int, last)}
     nines = 10 ** len(last[0]) - 1
-    if {*map(len, last)} == {len(last[0])} and nines in numbers and not numbers.isdisjoint({0, 1}):
-        if len(numbers) < nines:
-            return f"after {nines} their numbers may begin again"
+    is_padded = len({*map(len, last)}) == 1
+    if is_padded and nines in numbers and not numbers.isdisjoint({0, 1}) and len(numbers) < nines:
+        return f"after {nines} their numbers may begin again"
     series: dict[tuple[int, ...], set[int]] = defaultdict(set)
     for key in keys:
         series[tuple(key[place] for place in changing[1:])].add(key[changing[0]])

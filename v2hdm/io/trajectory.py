@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +23,7 @@ _log = logging.getLogger(__name__)
 
 UNITS: Mapping[str, float] = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}  # and how many of each make a second
 
+_APPLE_DOUBLE = "._"  # begins the names of files that macOS writes beside others
 _TIMECODES = ("# timecode format v2", "# timestamp format v2")
 _COLUMNS = "timestamp tx ty tz qx qy qz qw"
 _FARTHEST_M = 1e8  # coordinates on the earth end at ten thousand kilometres
@@ -114,15 +115,23 @@ def read_image_list(path: Path) -> ImageList:
     texts: list[str] = []
     names: list[str] = []
     numbers: list[int] = []
+    hidden = 0
     for number, line in _content_lines(path, "lists no image", "timestamp filename"):
         parts = line.split(maxsplit=1)
         if len(parts) != 2:
             raise DriveError(
                 f"{path}: line {number}: expected 'timestamp filename', got '{line}'; fix that line"
             )
+        if PurePath(parts[1]).name.startswith(_APPLE_DOUBLE):
+            hidden += 1
+            continue
         texts.append(parts[0])
         names.append(parts[1])
         numbers.append(number)
+    if hidden:
+        _log.warning("%s: left out %d files of macOS (%sNAME)", path, hidden, _APPLE_DOUBLE)
+    if not names:
+        raise DriveError(f"{path}: lists files of macOS alone ({_APPLE_DOUBLE}NAME); list the images")
     stamp_s = _times_of(texts, numbers, path)
     rows = image_order(stamp_s, str(path), "line", numbers, together=False)
     return ImageList(stamp_s[rows], [names[row] for row in rows])
@@ -215,8 +224,8 @@ def has_time(stamp_s: FloatArray, where: str, what: str) -> BoolArray:
         return np.ones(len(stamp_s), dtype=bool)
     if 2 * is_zero.sum() > len(stamp_s):
         raise DriveError(
-            f"{where}: {is_zero.sum()} of {len(stamp_s)} {what}s have no time (0); record them with times, or "
-            "set stamps: received for a topic, to use the recorder's, which are late by the computer's delay"
+            f"{where}: {is_zero.sum()} of {len(stamp_s)} {what}s have no time (0); record them with times, "
+            "or set stamps: received for a topic: its recorder's, late by the computer's delay"
         )
     return np.asarray(~is_zero)
 

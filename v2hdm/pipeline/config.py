@@ -14,7 +14,7 @@ from v2hdm.io.drive import ReadOptions, drive_name
 from v2hdm.io.maps.corrections import read_corrections
 from v2hdm.mapping.options import BATCH, INCREMENTAL, MappingOptions, check_options
 from v2hdm.records import Drive, Image
-from v2hdm.safe.rasters import check_background
+from v2hdm.safe.backgrounds import check_background
 from v2hdm.safe.texts import shown, take_camera_name, take_name
 from v2hdm.settings import MOST_PROCESSES, NOT_NEGATIVE, POSITIVE, Within, check_settings
 from v2hdm.simulate.port.config import PortConfig

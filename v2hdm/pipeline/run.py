@@ -229,6 +229,11 @@ def map_and_save(
                 check_crs(
                     config.crs, [name for name in config.export if name != "geojson"], drive.origin, "crs"
                 )
+                if config.report.background is not None and drive.origin is None:
+                    raise ConfigError(
+                        "report.background: this drive has no position on the earth; state its origin in "
+                        "drive.yaml, or leave the picture out"
+                    )
 
             context = replace(context, cache=cache, workers=config.workers, accept=accept)
             mapped = map_drive(

@@ -30,6 +30,7 @@ _MOST_NAME_BYTES = 200  # file systems end at 255 bytes
 _SHORT = 60  # letters of a value that an error shows; chosen
 _FEW = 4  # entries of a list that an error shows in full; chosen
 ALL_CAMERAS = ("both", "all")  # names of results of all cameras together
+_NUMBERS = re.compile("([0-9]+)")
 _HALF = "half a character (a lone surrogate)"
 _ESCAPED_HALF = re.compile(r"\\u[dD][89a-fA-F]")
 _QUOTED = re.compile(r'"(?:[^"\\]|\\.)*"')
@@ -167,6 +168,13 @@ def take_camera_name(content: object, where: str, error: type[V2hdmError]) -> st
     if name.lower() in ALL_CAMERAS:
         raise error(f"{where}: a camera is called {shown(name)}, as results of all are; choose another")
     return name
+
+
+def number_key(name: str) -> tuple[list[str | int], str]:
+    """A key that sorts names by the numbers in them, as numbers; names of equal numbers by their letters."""
+    parts: list[str | int] = [*_NUMBERS.split(name)]
+    parts[1::2] = [int(digits) for digits in _NUMBERS.findall(name)]
+    return parts, name
 
 
 def shown(content: object) -> str:

@@ -15,8 +15,8 @@ from v2hdm.geometry.geodetic import Grid, crs_of, geodetic_from_enu, utm_of
 from v2hdm.records import SIGMAS_95, FloatArray, Lane, Marking, Symbol
 from v2hdm.report.metrics import corner_errors, match_markings, rms
 from v2hdm.report.page.facts import Facts, GroundResiduals
+from v2hdm.safe.backgrounds import Window, background_pixels
 from v2hdm.safe.pixels import read_pixels
-from v2hdm.safe.rasters import Window, background_pixels
 from v2hdm.store import names
 from v2hdm.store.files import load_json, take_array, take_text
 
