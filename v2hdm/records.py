@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from v2hdm.doors import checked_class
+
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
@@ -97,6 +99,9 @@ SIGMA_OF_MAD = 1.4826
 SIGMAS_95 = 2.4477
 """Semi-axes of the 95 % ellipse of a two-dimensional normal error, in standard deviations: the root of the
 chi-square quantile with two degrees of freedom."""
+
+TWO_SIDED_95 = 1.96
+"""Half the width of the band that holds 95 % of a normal error in one dimension, in standard deviations."""
 
 FOOT_M = 0.3048  # an international foot, m
 
@@ -338,7 +343,7 @@ class Marking:
     corners_map: FloatArray  # (4, 2) m, counter-clockwise from above
     sightings: int
     covariance_m2: FloatArray | None = None  # (8, 8) of the stacked corners, if known
-    # per coordinate of the distance to a marking about 10 m away, in which shared errors cancel
+    # of a coordinate of its centre, given those of its neighbours: what they share cancels
     relative_sigma_m: float | None = None
     heights_m: FloatArray | None = None  # (4,) of the ground, None for z = 0
     id: int | None = None  # positive and unique; None until the map is written
@@ -398,6 +403,7 @@ class GroundStrip:
         return self.points_map + left_m * np.column_stack([-self.ahead[:, 1], self.ahead[:, 0]])
 
 
+@checked_class
 @dataclass(frozen=True)
 class HDMap:
     """Markings, lanes and symbols of a site in its map frame.
@@ -540,6 +546,7 @@ class Truth:
     disturbances: Mapping[str, float]
 
 
+@checked_class
 @dataclass(frozen=True)
 class Calibration:
     """The calibration of one camera, with its extrinsic ``cam_from_vehicle`` (4, 4).

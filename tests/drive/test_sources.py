@@ -161,6 +161,7 @@ def test_a_folder_asks_for_what_its_names_leave_open(folder, tmp_path):
     assert not [key for key in asked if "images" in key]
     (tmp_path / "front.h264").write_bytes(b"")
     assert "cameras.front.images.stamps" in draft_drive(tmp_path / "front.h264", tmp_path / "d", [])
+    (tmp_path / "front.mp4").write_bytes(b"")
     asked = draft_drive(tmp_path / "front.mp4", tmp_path / "d", ["cameras.front.images.stamps=a"])
     assert not [key for key in asked if "images" in key]
 

@@ -85,7 +85,7 @@ def test_a_geotiff_is_read_without_what_lies_beside_it(ending, asked, tmp_path):
     Path(f"{path}{ending}").write_text(beside(url)[ending])
     check_background(path)
     assert bright(background_pixels(path, WINDOW)) == pytest.approx((60.0, 100.0), abs=0.6)
-    points = np.concatenate(list(mosaic_points(path, 1.0, 100)))
+    points = np.concatenate(list(mosaic_points(path, 1.0, 10**6, 100)))
     assert points[:, 2].max() == 250
     assert paths == []
 

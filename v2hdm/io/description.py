@@ -97,6 +97,7 @@ class NmeaPoses(PoseKeys):
 
     nmea: Annotated[str, "the file."]
     date: Annotated[Any, "of the first sentence, such as 2024-05-17, if no sentence has it."] = None
+    talker: Annotated[str | None, "the receiver to take of several, such as GN."] = None
 
 
 @dataclass(kw_only=True)

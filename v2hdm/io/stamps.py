@@ -18,9 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from v2hdm.errors import DriveError
+from v2hdm.errors import DriveError, shown
 from v2hdm.records import FloatArray
-from v2hdm.safe.texts import shown
 
 _POWERS = {"s": 0, "ms": 3, "us": 6, "ns": 9}  # of ten, which divide a time in this unit into s
 _UNIT_OF_DIGITS = {13: "ms", 16: "us", 19: "ns"}  # whole times since 1970 have as many, from 2001 to 2286

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,18 +16,22 @@ from v2hdm.records import FloatArray
 from v2hdm.safe.child import Limits, in_child, next_step
 from v2hdm.safe.pixels import check_raster
 
+_log = logging.getLogger(__name__)
+
 _WORLD_FILES = (".tfw", ".tifw", ".tiffw", ".wld", ".TFW", ".TIFW", ".TIFFW", ".WLD")
 """Endings of the small files that say where a picture lies, in the place of its own."""
 
 
-def mosaic_points(mosaic: Path, spacing_m: float, strip_px: int) -> Iterator[FloatArray]:
-    """Places in the map frame and grey values, (N, 3), of a mosaic's strips.
+def mosaic_points(mosaic: Path, spacing_m: float, most: int, piece_px: int) -> Iterator[FloatArray]:
+    """Places in the map frame and grey values, (N, 3), of a mosaic's strips, of ``piece_px`` at most.
+
+    They are ``spacing_m`` apart, and farther, which is logged, where that makes more than ``most`` of them.
 
     Raises MapFileError where the file is no mosaic of ours, ConfigError where rasterio is missing.
     """
     with TemporaryDirectory() as folder:
-        ask(_write_points, mosaic, spacing_m, strip_px, Path(folder))
-        for strip in sorted(Path(folder).iterdir()):
+        ask(_write_points, mosaic, spacing_m, most, piece_px, Path(folder))
+        for strip in sorted(Path(folder).glob("*.npy")):
             yield np.load(strip, allow_pickle=False)
 
 
@@ -70,7 +75,26 @@ def _alone(path: Path, folder: Path) -> Path:
     return picture
 
 
-def _write_points(mosaic: Path, spacing_m: float, strip_px: int, folder: Path) -> None:
+def _pieces(data: Any, factor: int, piece_px: int) -> Iterator[tuple[Any, tuple[int, int]]]:
+    """Windows over a raster from its top, and their shapes when averaged by a factor."""
+    windows = need("rasterio.windows", "gis", "the format pcd", ConfigError)
+    columns = -(-data.width // factor)
+    rows_at_once = factor * max(piece_px // columns, 1)
+    for top in range(0, data.height, rows_at_once):
+        rows = min(rows_at_once, data.height - top)
+        yield windows.Window(0, top, data.width, rows), (-(-rows // factor), columns)
+
+
+def _shown_cells(data: Any, factor: int, piece_px: int) -> int:
+    """How many cells of so many pixels a side show ground."""
+    shown = 0
+    for window, shape in _pieces(data, factor, piece_px):
+        next_step()
+        shown += int(np.count_nonzero(data.dataset_mask(window=window, out_shape=shape)))
+    return shown
+
+
+def _write_points(mosaic: Path, spacing_m: float, most: int, piece_px: int, folder: Path) -> None:
     """Write a file of points (N, 3) into a folder for each strip of a mosaic that shows ground."""
     rasterio = need("rasterio", "gis", "the format pcd", ConfigError)
     with geotiff(mosaic) as data:
@@ -80,14 +104,18 @@ def _write_points(mosaic: Path, spacing_m: float, strip_px: int, folder: Path) -
         corner = [data.transform.c, data.transform.f]
         factor = max(round(spacing_m / data.transform.a), 1)
         average = rasterio.enums.Resampling.average
-        for number, top in enumerate(range(0, data.height, strip_px * factor)):
+        wider = 1 + int(np.sqrt(_shown_cells(data, factor, piece_px) / most))
+        if wider > 1:
+            factor *= wider
+            apart_m = factor * data.transform.a
+            _log.warning("%s: so large that the points are %.2f m apart", mosaic.name, apart_m)
+        for number, (window, shape) in enumerate(_pieces(data, factor, piece_px)):
             next_step()
-            rows = min(strip_px * factor, data.height - top)
-            window = rasterio.windows.Window(0, top, data.width, rows)
-            shape = (-(-rows // factor), -(-data.width // factor))
             is_shown = data.dataset_mask(window=window, out_shape=shape) > 0
             if not is_shown.any():
                 continue
+            top = window.row_off
+            rows = window.height
             pixels = data.read(window=window, out_shape=(3, *shape), resampling=average)
             row, column = np.nonzero(is_shown)
             step = np.array([data.width / shape[1], rows / shape[0]])

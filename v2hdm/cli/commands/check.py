@@ -8,7 +8,7 @@ from pathlib import Path
 
 from v2hdm.cli.arguments import add_drive, drive_of, exit_code, result_of, steps_of
 from v2hdm.cli.command import Command
-from v2hdm.errors import EXIT_USER_ERROR, DriveError
+from v2hdm.errors import EXIT_USER_ERROR, DriveError, one_line
 
 
 def _run(arguments: Sequence[str]) -> int:
@@ -41,11 +41,11 @@ def _run(arguments: Sequence[str]) -> int:
         from v2hdm.io.drive.draft import draft_drive
 
         if missing := draft_drive(parsed.drive, parsed.write, parsed.set):
-            asked = [f"  --set {key}=... {why}" for key, why in missing.items()]
-            problem = f"error: {parsed.drive}: nothing written; also give:"
+            asked = [f"  {one_line(f'--set {key}=... {why}')}" for key, why in missing.items()]
+            problem = one_line(f"error: {parsed.drive}: nothing written; also give:")
             print("\n".join([problem, *asked]), file=sys.stderr)
             return EXIT_USER_ERROR
-        print(f"{parsed.write / 'drive.yaml'} written", file=sys.stderr)
+        print(one_line(f"{parsed.write / 'drive.yaml'} written"), file=sys.stderr)
         parsed.drive = parsed.write
     drive = drive_of(parsed)
     folder = parsed.output or Path("outputs") / f"{drive.name}-check"
@@ -59,7 +59,7 @@ def _run(arguments: Sequence[str]) -> int:
         draw_check(drive, unfinished, ground)
     passed = [finding.line for finding in verdict.passed if parsed.all]
     summary, *findings = verdict.lines
-    print("\n".join([*passed, *findings, summary, f"pictures in {folder}"]))
+    print("\n".join([*passed, *findings, summary, one_line(f"pictures in {folder}")]))
     return exit_code(verdict)
 
 

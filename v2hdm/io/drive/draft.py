@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +16,7 @@ from v2hdm.io.drive.sources import list_folder
 from v2hdm.io.importers.bag.describe import LENS, MOUNTING, BagDescription
 from v2hdm.io.importers.bag.reading import is_bag
 from v2hdm.io.stamps import ZONES, times_of_names
-from v2hdm.safe.texts import parse_yaml
+from v2hdm.safe.texts import ALL_CAMERAS, MOST_NAME_LETTERS, parse_yaml
 from v2hdm.store.files import dump_yaml, replace_text
 
 _POSES = (
@@ -36,11 +37,12 @@ def draft_drive(source: Path, folder: Path, settings: Sequence[str]) -> dict[str
     that is none, a ``drive.yaml`` that exists.
     """
     where = folder / DRIVE_FILE
-    if where.exists():
+    if os.path.lexists(where):  # a link to a file that is gone is the user's, too
         raise DriveError(f"{where}: exists; edit it, or choose another folder for --write")
     draft = _draft_of(source, folder)
     content = draft.content
     missing = draft.missing
+    _refuse_unused(content, settings)
     for setting in settings:
         key, equals, text = setting.partition("=")
         if not (key and equals):
@@ -78,7 +80,9 @@ def _draft_of(source: Path, folder: Path) -> _Draft:
         bag = BagDescription(source, Path(ReadOptions().cache))
         about = {"name": folder.resolve().name, "bag": _relative(source, folder)}
         return _Draft(bag.content | about, bag.missing)
-    name = source.stem or "camera"
+    if not source.exists():
+        raise DriveError(f"{source}: no such bag, video or folder of images; check the path")
+    name = _camera_of(source)
     missing = {"poses": _POSES}
     missing |= {f"cameras.{name}.camera_info": LENS, f"cameras.{name}.mounting": MOUNTING}
     if source.is_dir():
@@ -114,6 +118,25 @@ def _tell_times(paths: Sequence[Path], unit: str | None) -> bool:
     except DriveError:
         return False
     return True
+
+
+def _refuse_unused(content: Mapping[str, Any], settings: Sequence[str]) -> None:
+    """Raise DriveError for settings of a camera that has no images, neither in the recording nor by them."""
+    paths = [setting.partition("=")[0].split(".") for setting in settings if "=" in setting]
+    of_cameras = [keys for keys in paths if len(keys) > 2 and keys[0] == "cameras"]
+    with_images = {keys[1] for keys in of_cameras if keys[2] == "images"} | set(content.get("cameras", {}))
+    unused = [".".join(keys) for keys in of_cameras if keys[1] not in with_images]
+    if unused:
+        raise DriveError(
+            f"--set {', '.join(unused)}: not used, for there is no camera of that name; name "
+            f"{' or '.join(content.get('cameras', {})) or 'its images, too'}"
+        )
+
+
+def _camera_of(source: Path) -> str:
+    """A name for the camera of a recording: its own, of letters that a key of ``--set`` may have."""
+    name = re.sub(r"[^\w-]+", "_", source.stem)[:MOST_NAME_LETTERS].strip("_")
+    return "camera" if not name or name.lower() in ALL_CAMERAS else name
 
 
 def _put(content: dict[str, Any], keys: Sequence[str], value: object) -> None:

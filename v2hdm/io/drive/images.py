@@ -11,7 +11,7 @@ from typing import Annotated
 
 import numpy as np
 
-from v2hdm.errors import DriveError
+from v2hdm.errors import DriveError, shown
 from v2hdm.geometry.rigid import in_order, interpolate
 from v2hdm.io.drive.road import lay_flat, log_road
 from v2hdm.io.trajectory import check_trajectory, span, why_no_pose
@@ -77,7 +77,7 @@ def select_cameras(available: Sequence[str], chosen: Sequence[str], where: Path)
     """The ``available`` cameras that are ``wanted``, all where none is named; refuses unknown ones."""
     for name in chosen:
         if name not in available:
-            raise DriveError(f"{where}: no camera '{name}'; choose from: {', '.join(available)}")
+            raise DriveError(f"{where}: no camera {shown(name)}; choose from: {', '.join(available)}")
     return [name for name in available if not chosen or name in chosen]
 
 
@@ -161,7 +161,7 @@ def part_of(drive: Drive, options: ReadOptions) -> Drive:
         if not chosen:
             lasts_s = max(image.stamp_s for image in drive.images) - first_s
             raise DriveError(
-                f"{drive.root}: no image of camera '{name}' is left from {options.start_s:g} to {end_s:g} s; "
-                f"the drive has images for {lasts_s:.1f} s: change drive.start_s or drive.end_s"
+                f"{drive.root}: no image of camera {shown(name)} is left from {options.start_s:g} to "
+                f"{end_s:g} s; the drive has images for {lasts_s:.1f} s: change drive.start_s or drive.end_s"
             )
     return replace(drive, images=tuple(sorted(images, key=in_order)))

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.errors import DriveError, need
+from v2hdm.errors import DriveError, need, shown
 from v2hdm.io.calibration.intrinsics import read_intrinsics
 from v2hdm.io.calibration.reading import read_camera_info
 from v2hdm.io.description import FolderImages, InfoFile, TopicImages, VideoImages, keys_in
@@ -23,7 +23,6 @@ from v2hdm.io.trajectory import UNITS, image_order, read_image_list, read_stamps
 from v2hdm.records import CameraInfo, FloatArray
 from v2hdm.safe.child import Limits, in_child, next_step
 from v2hdm.safe.pixels import DECODER_OPTIONS, IMAGE_SUFFIXES, VIDEO_OPTIONS, is_image_name, png
-from v2hdm.safe.texts import shown
 from v2hdm.store.files import check_keys, take_choice, take_mapping, take_number, take_text
 from v2hdm.store.folders import entry_folder, is_whole, new_entry
 
