@@ -17,6 +17,9 @@ from v2hdm.io.calibration.writing import write_calibration, write_camera_info
 from v2hdm.io.drive import read_drive
 from v2hdm.io.importers.nmea import read_nmea
 from v2hdm.io.importers.readings import read_table
+from v2hdm.io.importers.rtklib import read_pos
+from v2hdm.io.importers.sbet import read_sbet
+from v2hdm.io.importers.ubx import read_ubx
 from v2hdm.io.maps.corrections import Correction, read_corrections, write_corrections
 from v2hdm.io.maps.evidence import COLUMNS, read_exclusions, read_residuals, write_exclusions
 from v2hdm.io.maps.geojson import write_geojson
@@ -52,6 +55,34 @@ def nmea(path: Path) -> None:
     path.write_text(
         "$GPGGA,123519,4807.038,N,01131.000,E,4,08,0.9,545.4,M,46.9,M,,*42\n$GPHDT,274.07,T*03\n"
         "$GPRMC,123519,A,4807.038,N,01131.000,E,022.4,084.4,230394,003.1,W*6A\n"
+    )
+
+
+def sbet(path: Path) -> None:
+    table = np.zeros((4, 17))
+    table[:, 0] = 4e5 + np.arange(4)
+    table[:, 1:4] = 0.9, 0.1, 45.0
+    table.tofile(path)
+    rms = np.full((4, 10), 0.5)
+    rms[:, 0] = table[:, 0]
+    rms.tofile(path.with_name(path.name + ".rms"))
+
+
+def pos(path: Path) -> None:
+    path.write_text(
+        "% ref pos   : 53.5 9.9 44.0\n% (e/n/u-baseline=WGS84,Q=1:fix,2:float)\n"
+        "%  GPST e-baseline(m) n-baseline(m) u-baseline(m) Q ns sde(m) sdn(m) sdu(m) sden(m) sdnu(m)\n"
+        "2024/05/17 08:30:30.000 1.5 2.5 0.5 1 12 0.01 0.01 0.02 -0.001 0.001 0.0\n"
+        "2314 462631.000 2.5 2.5 0.5 2 12 0.01 0.01 0.02 -0.001 0.001 0.0\n"
+    )
+
+
+def ubx(path: Path) -> None:
+    path.write_text(
+        "<UBX(NAV-PVT, iTOW=08:29:53, year=2024, month=5, day=17, hour=8, min=29, second=53, validDate=1, "
+        "validTime=1, nano=-1234, fixType=3, gnssFixOk=1, lon=9.02, lat=53.5, height=45123, hAcc=14)>\n"
+        '{"identity": "NAV-ATT", "payload": {"iTOW": "08:29:53.100000", "roll": 1.2, "pitch": -0.5, '
+        '"heading": 91.2, "accRoll": 0.1, "accPitch": 0.2, "accHeading": 0.3}}\n'
     )
 
 
@@ -110,6 +141,9 @@ READERS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
     "tum": (tum, read_tum),
     "image list": (image_list, read_image_list),
     "table": (table, lambda path: read_table(path, {}, path.parent, "here")),
+    "sbet": (sbet, lambda path: read_sbet(path, {"rms": path.name + ".rms"}, path.parent, "here", 1.7e9)),
+    "pos": (pos, lambda path: read_pos(path, {}, path.parent, "here")),
+    "ubx": (ubx, lambda path: read_ubx(path, {}, path.parent, "here")),
     "nmea": (nmea, lambda path: read_nmea(path, {}, path.parent, "here")),
     "camera_info": (lambda path: write_camera_info(camera_info(), path), read_camera_info),
     "calibration": (calibration, read_calibration),

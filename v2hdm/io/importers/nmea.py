@@ -24,7 +24,13 @@ from v2hdm.errors import DriveError
 from v2hdm.geometry.geodetic import metres_between
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.io.importers.epochs import Untimed, time_headings
-from v2hdm.io.importers.readings import SIGMA_OF_QUALITY_M, Attitudes, Readings, parse_sigma
+from v2hdm.io.importers.gps_time import SINCE_1970_S
+from v2hdm.io.importers.readings import (
+    SIGMA_OF_QUALITY_M,
+    Attitudes,
+    Readings,
+    parse_sigma,
+)
 from v2hdm.io.trajectory import in_order
 from v2hdm.records import FloatArray
 from v2hdm.safe.texts import read_bytes, shown
@@ -33,7 +39,6 @@ from v2hdm.store.files import take_text
 _log = logging.getLogger(__name__)
 
 _DAY_S = 86400.0  # seconds of a day
-_SINCE_1970_S = 6e8  # times of images that are later count from 1970; earlier ones from anything
 _BELATED_S = 60.0  # a sentence from before midnight may come that long after one from behind it
 _APART_M = 0.05  # antennas of two receivers are farther apart; RTK noise and rounding are less
 _SWITCHES = 0.05  # share of positions before which one receiver changes its talker, as satellites come
@@ -65,7 +70,7 @@ def read_nmea(
     first = None
     if "date" in entry:
         first = take_date(entry["date"], f"{where}, date")
-    elif near_s is not None and near_s > _SINCE_1970_S:
+    elif near_s is not None and near_s > SINCE_1970_S:
         first = datetime.fromtimestamp(near_s, tz=UTC).date()
     talker = take_text(entry["talker"], f"{where}, talker", DriveError) if "talker" in entry else None
     return nmea_readings(lines, str(path), first, talker)

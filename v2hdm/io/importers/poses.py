@@ -19,12 +19,23 @@ from v2hdm.errors import DriveError
 from v2hdm.geometry import geodetic as earth
 from v2hdm.geometry.planar import angle_between
 from v2hdm.geometry.rigid import interpolate, make_transform, rotation_from_euler
-from v2hdm.io.description import NmeaPoses, PoseKeys, TablePoses, TopicPoses, keys_in
+from v2hdm.io.description import (
+    NmeaPoses,
+    PoseKeys,
+    SbetPoses,
+    TablePoses,
+    TopicPoses,
+    UbxPoses,
+    keys_in,
+)
 from v2hdm.io.importers import readings as logs
 from v2hdm.io.importers.nmea import read_nmea
 from v2hdm.io.importers.readings import Attitudes, Readings
+from v2hdm.io.importers.rtklib import read_pos
+from v2hdm.io.importers.sbet import read_sbet
 from v2hdm.io.importers.slip import driven
 from v2hdm.io.importers.strays import without_stray_turns, without_strays
+from v2hdm.io.importers.ubx import read_ubx
 from v2hdm.io.trajectory import check_geodetic, read_tum, span, why_no_pose
 from v2hdm.records import BoolArray, FloatArray, GeodeticOrigin, Trajectory
 from v2hdm.store.files import check_keys, take_array, take_choice, take_mapping, take_number, take_text
@@ -66,6 +77,9 @@ POSE_FORMATS: Mapping[str, tuple[_Reader, tuple[str, ...]]] = {
     "tum": (lambda path, entry, root, where, near_s: logs.readings_of_poses(read_tum(path)), ()),
     "csv": (logs.read_table, keys_in(TablePoses, PoseKeys).optional),
     "nmea": (read_nmea, keys_in(NmeaPoses, PoseKeys).optional),
+    "sbet": (read_sbet, keys_in(SbetPoses, PoseKeys).optional),
+    "pos": (read_pos, ()),
+    "ubx": (read_ubx, keys_in(UbxPoses, PoseKeys).optional),
 }
 """Formats of files by the key that names the file: the reader, and keys of its own. ``topic`` is of a bag."""
 
@@ -100,9 +114,33 @@ def read_poses(
     settings = _take_settings(entry, where)
     name = take_text(entry[kind], f"{where}, {kind}", DriveError)
     if read_topic is not None:
-        return assemble(read_topic(), settings, origin, max_gap_s, f"{where}, topic {name}")
-    readings = POSE_FORMATS[kind][0](root / name, entry, root, where, near_s)
-    return assemble(readings, settings, origin, max_gap_s, str(root / name))
+        readings = read_topic()
+        source = f"{where}, topic {name}"
+    else:
+        readings = POSE_FORMATS[kind][0](root / name, entry, root, where, near_s)
+        source = str(root / name)
+    if entry.get("heading_file") is not None:
+        attitudes = _headings(entry["heading_file"], root, f"{where}, heading_file", near_s)
+        readings = replace(readings, attitudes=attitudes)
+    return assemble(readings, settings, origin, max_gap_s, source)
+
+
+def _headings(content: object, root: Path, where: str, near_s: float | None) -> Attitudes:
+    """The attitudes of a second file."""
+    entry = {"tum": content} if isinstance(content, str) else take_mapping(content, where, DriveError)
+    named = [kind for kind in POSE_FORMATS if kind in entry]
+    if len(named) != 1:
+        raise DriveError(f"{where}: name one file by its format: {', '.join(POSE_FORMATS)}")
+    (kind,) = named
+    read, keys = POSE_FORMATS[kind]
+    check_keys(entry, (kind,), (*keys, "offset_s"), where, DriveError)
+    name = take_text(entry[kind], f"{where}, {kind}", DriveError)
+    attitudes = read(root / name, entry, root, where, near_s).attitudes
+    if attitudes is None:
+        raise DriveError(f"{where}: {root / name}: holds no headings; name a file that does")
+    offset_s = take_number(entry.get("offset_s", 0.0), f"{where}, offset_s", DriveError)
+    later_s = None if attitudes.later_s is None else attitudes.later_s + offset_s
+    return replace(attitudes, stamp_s=attitudes.stamp_s + offset_s, later_s=later_s)
 
 
 def _take_settings(entry: Mapping[str, Any], where: str) -> PoseSettings:
@@ -132,6 +170,9 @@ def assemble(
     Without an ``origin`` it is the first position. Raises DriveError for positions without a heading, of an
     antenna whose place is not stated, without a sufficient fix, or of an unsuitable system.
     """
+    if not len(readings.stamp_s):
+        only = "headings only; name it as heading_file" if readings.attitudes is not None else "none"
+        raise DriveError(f"{where}: needs positions, and holds {only}")
     if readings.point and settings.lever_arm_m is None:
         raise DriveError(
             f"{where}: holds {readings.point} positions: add lever_arm_m: [x, y, z], its place in the "
@@ -140,7 +181,8 @@ def assemble(
     if readings.attitudes is None:
         raise DriveError(
             f"{where}: holds positions without a heading, and the course over ground is not a heading when a "
-            "vehicle turns, stands or reverses; add a heading (HDT, THS, PASHR, a column, an Imu topic)"
+            "vehicle turns, stands or reverses; add a heading (HDT, THS, PASHR, a column, an Imu topic, or "
+            "heading_file, a second file)"
         )
     readings = _usable(readings, settings, where)
     attitudes = readings.attitudes

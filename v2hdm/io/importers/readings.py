@@ -77,6 +77,12 @@ def readings_of_poses(poses: Trajectory) -> Readings:
     return Readings(poses.stamp_s, poses.map_from_vehicle[:, :3, 3], False, unknown, attitudes)
 
 
+def headings_only(attitudes: Attitudes | None) -> Readings:
+    """Readings without a position."""
+    none = np.zeros((0, 3))
+    return Readings(none[:, 0], none, True, none[:, 0], attitudes)
+
+
 _STAMPS: Mapping[str, float] = {f"stamp_{unit}": scale for unit, scale in UNITS.items()}
 _MAP = ("x_m", "y_m", "z_m")
 _GEODETIC = ("latitude_deg", "longitude_deg", "altitude_m")
@@ -104,7 +110,12 @@ def read_table(
     columns = {name: values[rows] for name, values in columns.items()}
     geodetic = _GEODETIC[0] in columns
     coordinates = _GEODETIC if geodetic else _MAP
+    rotation = _rotation(columns, path)
+    heading_sigma = np.radians(columns.get("heading_sigma_deg", np.full(len(rows), np.nan)))
+    attitudes = None if rotation is None else Attitudes(stamp_s[rows], rotation, heading_sigma)
     if geodetic == (_MAP[0] in columns):
+        if attitudes is not None and not geodetic:
+            return headings_only(attitudes)
         either = f"{', '.join(_MAP)} or {', '.join(_GEODETIC)}"
         raise DriveError(f"{path}: needs positions, as columns {either}, but not both")
     _check_there(columns, coordinates[:2], path)
