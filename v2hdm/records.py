@@ -231,6 +231,8 @@ class Drive:
     recorded: Trajectory | None = None  # the same as recorded
     road: Road | None = None  # as recorded, None for the plane z = 0
     unposed: Mapping[str, int] = field(default_factory=dict)  # images left out, without a pose
+    # First and last time, s, of all images of a camera, left out or not.
+    listed_s: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     joined: tuple[Session, ...] = ()  # its sessions, if several: then it has no trajectory
 
     def name_of(self, path: Path) -> str:

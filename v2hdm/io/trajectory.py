@@ -44,6 +44,20 @@ _UNITS: Mapping[str, float] = {"milliseconds": 1e3, "microseconds": 1e6, "nanose
 _LONGEST_S = 5.0  # longest time between two poses, or images, of a drive; chosen
 _QUICKEST_S = 5e-4  # shortest time between two poses, or images, of a drive; chosen
 _ALIKE = 5.0  # poses and images of one drive last equally long to within this factor
+_SAME_SPAN_S = 1.5  # images and poses that one start and stop recorded begin and end so closely; chosen
+_SAME_START_S = 60.0  # and those on clocks of two time zones, where a minute more is no other cause
+_HALF_HOUR_S = 1800.0
+_ZONES_H = (*range(1, 15), 3.5, 4.5, 5.5, 5.75, 6.5, 8.75, 9.5, 10.5, 12.75)  # off UTC (IANA's tz database)
+_CLOCKS: Mapping[float, str] = {
+    18.0: "one is GPS time, the other UTC (18 s since 2017)",
+    19.0: "one is TAI, the other GPS time (19 s)",
+    37.0: "one is TAI (PTP), the other UTC (37 s since 2017)",
+    315964800.0: "one counts from 1970, the other from 1980, as GPS does",
+    315964782.0: "one is UTC since 1970, the other GPS time since 1980",
+    619315200.0: "the receiver's date is 1024 weeks early: its count of weeks has begun anew",
+}
+"""Differences of clocks that are mixed up, s (IERS Bulletin C; IS-GPS-200)."""
+
 _LATEST_S = 1e11  # stamps in s since 1970 stay below this for three thousand years
 
 
@@ -411,6 +425,8 @@ def why_no_pose(
             if scale / _ALIKE < size < scale * _ALIKE:
                 return f"the {longer}' stamps are in {unit}: divide them by {scale:g} to give seconds"
     if image_stamp_s[-1] < pose_stamp_s[0] or image_stamp_s[0] > pose_stamp_s[-1]:
+        if (clocks := known_offset(image_stamp_s, pose_stamp_s, asking, asked)) is not None:
+            return clocks
         offset_s = float(pose_stamp_s[0] - image_stamp_s[0])
         when = "later" if offset_s > 0 else "earlier"
         return (
@@ -421,6 +437,33 @@ def why_no_pose(
     return (
         f"the {asked} are {apart_s:.3g} s apart, more than max_gap_s {max_gap_s:g}: record more of them, "
         "or set drive.max_gap_s where the vehicle drives that evenly"
+    )
+
+
+def known_offset(
+    image_span_s: Sequence[float] | FloatArray,
+    pose_span_s: Sequence[float] | FloatArray,
+    asking: str = "images",
+    asked: str = "poses",
+) -> str | None:
+    """What two clocks are, where times of one begin and end as much later as such clocks differ."""
+    begins_s = float(image_span_s[0] - pose_span_s[0])
+    ends_s = float(image_span_s[-1] - pose_span_s[-1])
+    # Zones only shift times of a calendar.
+    dated = min(image_span_s[0], pose_span_s[0]) > _OLDEST_S
+    causes = dict(_CLOCKS) | {3600.0 * hours: "time zones apart" for hours in _ZONES_H if dated}
+
+    def off_s(apart_s: float) -> float:
+        return float(max(abs(abs(begins_s) - apart_s), abs(abs(ends_s) - apart_s)))
+
+    apart_s = min(causes, key=off_s)
+    tolerance_s = _SAME_SPAN_S if apart_s < _HALF_HOUR_S else _SAME_START_S
+    if off_s(apart_s) > tolerance_s or begins_s * ends_s < 0:
+        return None
+    sign = 1 if begins_s > 0 else -1
+    return (
+        f"the {asking}' times are {apart_s:.0f} s {'ahead of' if sign > 0 else 'behind'} the {asked}': "
+        f"{causes[apart_s]}; put both on one clock, as with offset_s: {sign * apart_s:.0f} under poses"
     )
 
 

@@ -97,7 +97,9 @@ def assemble_drive(
     _check_image_files(images, drive.cameras)
     posed = Counter(image.camera for image in images)
     unposed = {entry.camera: len(entry.paths) - posed[entry.camera] for entry in files}
-    return replace(drive, images=images, unposed=unposed, trajectory=laid.trajectory, road=laid.road)
+    listed_s = {entry.camera: (float(entry.stamp_s[0]), float(entry.stamp_s[-1])) for entry in files}
+    counted = replace(drive, images=images, unposed=unposed, listed_s=listed_s)
+    return replace(counted, trajectory=laid.trajectory, road=laid.road)
 
 
 def _pose_images(

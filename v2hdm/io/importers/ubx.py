@@ -50,8 +50,9 @@ def read_ubx(
     for message in _raw(data, path) if _SYNC in data else _texts(data, str(path)):
         try:
             identity = message["identity"]
-            numbers = {key: _value(value) for key, value in message.items() if key != "identity"}
-            messages[identity].append(numbers | {"key_s": _key_s(numbers["iTOW"])})
+            key_s = _key_s(message["iTOW"])
+            numbers = {key: number for key in message if (number := _number(message[key])) is not None}
+            messages[identity].append(numbers | {"key_s": key_s})
         except (KeyError, ValueError, TypeError, OverflowError):
             damaged += 1
     if damaged:
@@ -114,22 +115,25 @@ def _raw(data: bytes, path: Path) -> Iterator[dict[str, Any]]:
             }
 
 
-def _value(content: Any) -> Any:
-    """A number as one, a time as the text it is."""
-    if isinstance(content, str) and ":" in content:
-        return content
-    value = float(content)
-    if not np.isfinite(value):
-        raise ValueError(content)
-    return value
+def _number(content: Any) -> float | None:
+    """A field's number; None where it holds none."""
+    try:
+        value = float(content)
+    except (TypeError, ValueError, OverflowError):
+        return None
+    return value if np.isfinite(value) else None
 
 
 def _key_s(of_week: Any) -> float:
     """Seconds of the GPS week of a raw message, or of the day, UTC, of a printed one."""
-    if not isinstance(of_week, str):
-        return float(of_week) / 1e3
-    hours, minutes, seconds = of_week.split(":")
-    return 3600.0 * int(hours) + 60.0 * int(minutes) + float(seconds)
+    if not isinstance(of_week, str) or ":" not in of_week:
+        key_s = float(of_week) / 1e3
+    else:
+        hours, minutes, seconds = of_week.split(":")
+        key_s = 3600.0 * int(hours) + 60.0 * int(minutes) + float(seconds)
+    if not 0 <= key_s <= WEEK_S:
+        raise ValueError(of_week)
+    return key_s
 
 
 def _clock(
