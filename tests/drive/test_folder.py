@@ -33,9 +33,10 @@ from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.io.drive.sources import IMAGE_SOURCES
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.io.drive.writing import write_drive
+from v2hdm.io.image_lists import read_image_list
 from v2hdm.io.importers.poses import COMMON_KEYS, POSE_FORMATS, TOPIC_KEYS
 from v2hdm.io.importers.readings import NAMES
-from v2hdm.io.trajectory import read_image_list, read_tum, write_tum
+from v2hdm.io.trajectory import read_tum, write_tum
 from v2hdm.records import DISTORTION_COEFFICIENTS, CameraInfo, PoseNoise
 from v2hdm.safe.pixels import read_header
 

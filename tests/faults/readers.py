@@ -15,6 +15,7 @@ from v2hdm.errors import V2hdmError
 from v2hdm.io.calibration.reading import read_calibration, read_camera_info
 from v2hdm.io.calibration.writing import write_calibration, write_camera_info
 from v2hdm.io.drive import read_drive
+from v2hdm.io.image_lists import read_image_list
 from v2hdm.io.importers.nmea import read_nmea
 from v2hdm.io.importers.readings import read_table
 from v2hdm.io.importers.rtklib import read_pos
@@ -26,7 +27,7 @@ from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.maps.geopackage import write_geopackage
 from v2hdm.io.maps.reading import read_geojson, read_geopackage
 from v2hdm.io.metrics import read_metrics
-from v2hdm.io.trajectory import read_image_list, read_tum
+from v2hdm.io.trajectory import read_tum
 from v2hdm.records import Calibration, Exclusion
 
 

@@ -10,14 +10,13 @@ import logging
 import re
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from v2hdm.errors import DriveError, shown
 from v2hdm.geometry.rigid import make_transform, quaternion_from_rotation, rotation_from_quaternion
-from v2hdm.io.stamps import seconds_of
 from v2hdm.records import BoolArray, FloatArray, GeodeticOrigin, IntArray, Trajectory
 from v2hdm.store.files import read_text, replace_text
 
@@ -29,8 +28,6 @@ _NO_NUMBER = ("nan", "inf", "infinity", "null", "none", "na", "nan(ind)", "1.#in
 _UNIT = re.compile(r"[\[(](s|ms|us|ns)[\])]")
 _OLDEST_S = 9.5e8  # times since 1970 of recordings are later than this, February 2000
 _NEWEST_S = 4.1e9  # and earlier than this, December 2099
-_APPLE_DOUBLE = "._"  # begins the names of files that macOS writes beside others
-_TIMECODES = ("# timecode format v2", "# timestamp format v2")
 _MOST_DOUBLED = 0.25  # share of images whose time repeats, chosen: more are of two cameras
 _COLUMNS = "timestamp tx ty tz qx qy qz qw"
 _FARTHEST_M = 1e8  # coordinates on the earth end at ten thousand kilometres
@@ -46,7 +43,7 @@ _QUICKEST_S = 5e-4  # shortest time between two poses, or images, of a drive; ch
 _ALIKE = 5.0  # poses and images of one drive last equally long to within this factor
 _SAME_SPAN_S = 1.5  # images and poses that one start and stop recorded begin and end so closely; chosen
 _SAME_START_S = 60.0  # and those on clocks of two time zones, where a minute more is no other cause
-_HALF_HOUR_S = 1800.0
+_HALF_HOUR_S = 1800.0  # clocks that differ by this or more may be of two time zones, s
 _ZONES_H = (*range(1, 15), 3.5, 4.5, 5.5, 5.75, 6.5, 8.75, 9.5, 10.5, 12.75)  # off UTC (IANA's tz database)
 _CLOCKS: Mapping[float, str] = {
     18.0: "one is GPS time, the other UTC (18 s since 2017)",
@@ -156,7 +153,7 @@ class _Layout(NamedTuple):
 
 
 def _layout_of(path: Path) -> _Layout:
-    lines = _content_lines(path, "holds no pose", _COLUMNS)
+    lines = content_lines(path, "holds no pose", _COLUMNS)
     title = None
     if not any(part[:1].isdigit() for part in _cells(lines[0][1])) and len(_cells(lines[0][1])) >= 8:
         title = lines[0][1]
@@ -208,70 +205,7 @@ def write_tum(trajectory: Trajectory, path: Path) -> None:
     replace_text(path, "\n".join([f"# {_COLUMNS}", *(form.format(*row) for row in rows.tolist())]) + "\n")
 
 
-class ImageList(NamedTuple):
-    """The images of a list: stamps (N,) in s, strictly rising, and as many names."""
-
-    stamp_s: FloatArray
-    names: list[str]
-
-
-def read_image_list(path: Path) -> ImageList:
-    """Read ``timestamp filename`` lines by time; what is late, repeated or without a time is counted."""
-    texts: list[str] = []
-    names: list[str] = []
-    numbers: list[int] = []
-    hidden = 0
-    for number, line in _content_lines(path, "lists no image", "timestamp filename"):
-        parts = line.split(maxsplit=1)
-        if len(parts) != 2:
-            raise DriveError(
-                f"{path}: line {number}: expected 'timestamp filename', got {shown(line)}; fix that line"
-            )
-        if PurePath(parts[1]).name.startswith(_APPLE_DOUBLE):
-            hidden += 1
-            continue
-        texts.append(parts[0])
-        names.append(parts[1])
-        numbers.append(number)
-    if hidden:
-        _log.warning("%s: left out %d files of macOS (%sNAME)", path, hidden, _APPLE_DOUBLE)
-    if not names:
-        raise DriveError(f"{path}: lists files of macOS alone ({_APPLE_DOUBLE}NAME); list the images")
-    stamp_s = _times_of(texts, numbers, path)
-    rows = image_order(stamp_s, str(path), "line", numbers, together=False)
-    return ImageList(stamp_s[rows], [names[row] for row in rows])
-
-
-def read_stamps(path: Path, count: int, things: str) -> FloatArray:
-    """Times (``count``,) in s, one per line; raises DriveError where there are not as many as ``things``."""
-    lines = read_text(path, DriveError).splitlines()
-    rows = [
-        (number, line.strip())
-        for number, line in enumerate(lines, start=1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
-    if len(rows) != count:
-        raise DriveError(f"{path}: {len(rows)} times for {count} {things}; give one of each")
-    stamp_s = _times_of([line for _, line in rows], [number for number, _ in rows], path)
-    # Matroska's timecodes, which rpicam-apps and mkvextract write, are in ms.
-    is_timecodes = any(line.startswith(_TIMECODES) for line in lines)
-    return stamp_s / UNITS["ms"] if is_timecodes else stamp_s
-
-
-def _times_of(texts: Sequence[str], numbers: Sequence[int], path: Path) -> FloatArray:
-    stamp_s = np.array(
-        [parse_number(text, f"{path}: line {number}") for text, number in zip(texts, numbers, strict=True)]
-    )
-    return seconds_of(texts, stamp_s, str(path))
-
-
-def write_image_list(stamp_s: FloatArray, names: Sequence[str], path: Path) -> None:
-    """Write ``timestamp filename`` lines with nanoseconds, atomically."""
-    lines = [f"{stamp:.9f} {name}" for stamp, name in zip(stamp_s, names, strict=True)]
-    replace_text(path, "\n".join(["# timestamp filename", *lines]) + "\n")
-
-
-def _content_lines(path: Path, problem: str, expected: str) -> list[tuple[int, str]]:
+def content_lines(path: Path, problem: str, expected: str) -> list[tuple[int, str]]:
     """The lines that are neither empty nor comments, with their numbers; none of them is a ``problem``."""
     lines = ((k, line.strip()) for k, line in enumerate(read_text(path, DriveError).splitlines(), start=1))
     lines = ((k, line.lstrip("\ufeff")) for k, line in lines)

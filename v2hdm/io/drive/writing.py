@@ -12,8 +12,9 @@ import numpy as np
 from v2hdm.io.calibration.writing import write_camera_info
 from v2hdm.io.description import DRIVE_FILE, POSES_FILE
 from v2hdm.io.drive.truth import LANE_VISIBLE, SIGHTINGS
+from v2hdm.io.image_lists import write_image_list
 from v2hdm.io.maps.geojson import write_geojson
-from v2hdm.io.trajectory import write_image_list, write_tum
+from v2hdm.io.trajectory import write_tum
 from v2hdm.records import Drive, Image, Trajectory, Truth
 from v2hdm.store.files import dump_yaml, replace_text
 from v2hdm.store.names import MAP

@@ -9,7 +9,7 @@ import numpy as np
 from v2hdm.errors import DriveError
 from v2hdm.records import FloatArray
 
-WEEK_S = 604800.0
+WEEK_S = 604800.0  # length of a week of GPS time, which has no leap seconds, s
 GPS_EPOCH_S = 315964800.0  # midnight of 6 January 1980, s since 1970 (IS-GPS-200)
 SINCE_1970_S = 6e8  # times of images that are later count from 1970; earlier ones from anything
 

@@ -44,9 +44,12 @@ _APART_M = 0.05  # antennas of two receivers are farther apart; RTK noise and ro
 _SWITCHES = 0.05  # share of positions before which one receiver changes its talker, as satellites come
 _COMPASS_DEG = 2.0  # standard deviation of a magnetic compass with its variation; chosen
 
-# The quality of GGA for that of Trimble's GGK, AVR and VHD (BD9xx manual), and of Unicore's KSXT.
 _OF_TRIMBLE: Mapping[int, int] = {0: 0, 1: 1, 2: 5, 3: 4, 4: 2, 5: 9, 6: 5, 7: 4, 8: 5}
+"""The quality of GGA for that of Trimble's GGK, AVR and VHD (manual of the BD9xx receivers)."""
+
 _OF_UNICORE: Mapping[int, int] = {0: 0, 1: 1, 2: 5, 3: 4}
+"""The quality of GGA for that of Unicore's KSXT (its manual of sentences)."""
+
 _FIXED = 3  # quality of a heading by fixed ambiguities: Trimble's and Unicore's number
 _MODES: Mapping[str, int] = {"N": 0, "A": 1, "D": 2, "P": 3, "R": 4, "F": 5, "E": 6, "M": 7, "S": 8}
 """The quality of GGA for a mode of GNS, one letter per constellation (NMEA 0183, 4.11)."""

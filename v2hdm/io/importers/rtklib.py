@@ -33,7 +33,7 @@ _JST_S = 9 * 3600.0  # Japan's time is ahead of UTC by this
 _PPP_M = 0.1  # sigma of precise point positioning where none is stated; chosen
 # RTKLIB's numbers of the quality, as NMEA's GGA numbers them.
 _QUALITIES: Mapping[int, int] = {0: 0, 1: 4, 2: 5, 3: 9, 4: 2, 5: 1}
-_PPP = 6
+_PPP = 6  # RTKLIB's number of the quality of a precise point position
 
 _DMS = ("latitude(d'\")", "longitude(d'\")")
 _ON_EARTH = ("latitude(deg)", "longitude(deg)", "height(m)")

@@ -30,7 +30,7 @@ _RMS_FIELDS = 10  # time, north, east, down, 3 velocities, roll, pitch, heading
 _MOST = 0.9  # share of records that have to make sense
 _HIGHEST_M = 1e5  # no vehicle is higher, or deeper
 _LONGEST_S = 1.3e6  # two weeks: later times are no seconds of the week
-_MINUTE_RAD = float(np.radians(1 / 60))
+_MINUTE_RAD = float(np.radians(1 / 60))  # a minute of arc, the unit of the attitude's RMS, rad
 CLOCKS = ("gps", "utc")
 
 

@@ -22,7 +22,7 @@ from v2hdm.geometry.planar import inside_convex
 from v2hdm.geometry.rigid import camera_centre, ground_in_vehicle
 from v2hdm.io.description import DRIVE_FILE, TRUTH_FOLDER
 from v2hdm.io.drive.writing import write_drive, write_truth
-from v2hdm.io.trajectory import read_image_list
+from v2hdm.io.image_lists import read_image_list
 from v2hdm.progress import Steps
 from v2hdm.records import BoolArray, CameraInfo, Drive, FloatArray, Image, Truth
 from v2hdm.safe.pixels import read_header

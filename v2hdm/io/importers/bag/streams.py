@@ -21,11 +21,11 @@ import numpy as np
 from v2hdm.errors import DriveError
 from v2hdm.io.calibration.reading import info_of
 from v2hdm.io.calibration.writing import write_camera_info
+from v2hdm.io.image_lists import write_image_list
 from v2hdm.io.importers.bag import messages as kinds
 from v2hdm.io.importers.bag.reading import Bag, Message, bag_files, in_child_of, open_bag
 from v2hdm.io.importers.nmea import nmea_readings
 from v2hdm.io.importers.readings import Readings
-from v2hdm.io.trajectory import write_image_list
 from v2hdm.records import FloatArray
 from v2hdm.safe.pixels import png
 from v2hdm.store.folders import entry_folder, is_whole, new_entry
