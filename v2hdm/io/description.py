@@ -207,11 +207,11 @@ class Keys(NamedTuple):
 
 def keys_in(entry: type[Any], shared: type[Any] | None = None) -> Keys:
     """The keys that a dataclass declares, without those of one that it ``shared`` with others."""
-    own = [key for key in fields(entry) if shared is None or key not in fields(shared)]
-    is_required = [key.default is MISSING and key.default_factory is MISSING for key in own]
+    declared = [key for key in fields(entry) if shared is None or key not in fields(shared)]
+    is_required = [key.default is MISSING and key.default_factory is MISSING for key in declared]
     return Keys(
-        tuple(key.name for key, needed in zip(own, is_required, strict=True) if needed),
-        tuple(key.name for key, needed in zip(own, is_required, strict=True) if not needed),
+        tuple(key.name for key, needed in zip(declared, is_required, strict=True) if needed),
+        tuple(key.name for key, needed in zip(declared, is_required, strict=True) if not needed),
     )
 
 

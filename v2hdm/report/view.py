@@ -84,13 +84,16 @@ class Session:
             content = parse_json(sent.decode(), "correction", MapFileError)
             key = content["key"]
             entry = content["correction"]
-            known = content.get("before", self)  # whatever page it was made in
+            is_compared = "before" in content
+            corrected_before = content.get("before")
         except (ValueError, TypeError, LookupError, AttributeError):
             raise MapFileError("not a correction: expected a key and a correction") from None
         correction = None if entry is None else self._kept(entry)
         if correction is not None:
             key = _key(correction, self._facts)
-        before = self.corrections.get(key) if known is self else None if known is None else self._kept(known)
+        before = self.corrections.get(key)
+        if is_compared:
+            before = None if corrected_before is None else self._kept(corrected_before)
         self._place.parent.mkdir(parents=True, exist_ok=True)
         with self._lock, waited_for(self._place.with_name(f".{self._place.name}.lock")):
             self._follow()

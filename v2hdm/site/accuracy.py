@@ -46,8 +46,8 @@ def accuracy_of(covariance_m2: FloatArray | None, goal_m: float) -> str | None:
 
 def well_known(markings: Sequence[Marking]) -> Sequence[Marking]:
     """The markings but those of accuracy C as long as these are fewer, else all of them."""
-    known = [marking for marking in markings if marking.accuracy != ACCURACIES[-1]]
-    return known if 2 * len(known) > len(markings) else markings
+    better_known = [marking for marking in markings if marking.accuracy != ACCURACIES[-1]]
+    return better_known if 2 * len(better_known) > len(markings) else markings
 
 
 def objection_to(accuracy: str | None, asked: str) -> str | None:

@@ -41,7 +41,11 @@ def with_relative_sigma(
     for count in range(1, _NEIGHBOURS + 1):
         # The marking itself comes last.
         groups = np.array(
-            [[*near[:count], k] for k, near in enumerate(others) if min(len(near), _NEIGHBOURS) == count],
+            [
+                [*nearest[:count], k]
+                for k, nearest in enumerate(others)
+                if min(len(nearest), _NEIGHBOURS) == count
+            ],
             dtype=np.int64,
         )
         if not len(groups):
@@ -66,8 +70,8 @@ def neighbours(centres_map: FloatArray) -> Sequence[IntArray]:
 def _of_solution(corners: IntArray, joint: JointCovariance) -> FloatArray:
     """The covariances (P, n, 8, n, 8) of the solution for n markings with ``corners`` (P, n, 4) each."""
     groups, markings, _ = corners.shape
-    seen = np.where(corners >= 0, corners, corners.max(axis=2, keepdims=True))
-    joint_m2 = joint(seen.reshape(groups, -1))
+    solved_corners = np.where(corners >= 0, corners, corners.max(axis=2, keepdims=True))
+    joint_m2 = joint(solved_corners.reshape(groups, -1))
     unseen = np.repeat(corners.reshape(groups, -1) < 0, 2, axis=1)
     unknown_m2 = UNSEEN_M2 * np.eye(unseen.shape[1])
     joint_m2 = np.where(unseen[:, :, None] | unseen[:, None, :], unknown_m2, joint_m2)
@@ -80,14 +84,14 @@ def _as_stated(formal_m2: FloatArray, stated_m2: FloatArray) -> FloatArray:
     What was learned of a marking besides the solution, such as its shape, corrects its corners by what the
     solution knows of them, as in a Kalman filter; what is stated beyond the solution's is its own error.
     """
-    each = np.arange(formal_m2.shape[1])
-    root = np.linalg.cholesky(np.moveaxis(formal_m2[:, each, :, each, :], 0, 1))
+    number = np.arange(formal_m2.shape[1])
+    root = np.linalg.cholesky(np.moveaxis(formal_m2[:, number, :, number, :], 0, 1))
     whitened = np.linalg.solve(root, np.swapaxes(np.linalg.solve(root, stated_m2), -1, -2))
     share, axes = np.linalg.eigh((whitened + np.swapaxes(whitened, -1, -2)) / 2)
-    kept = (axes * np.clip(share, 0.0, 1.0)[..., None, :]) @ np.swapaxes(axes, -1, -2)
-    gain = root @ kept @ np.linalg.inv(root)
+    explained = (axes * np.clip(share, 0.0, 1.0)[..., None, :]) @ np.swapaxes(axes, -1, -2)
+    gain = root @ explained @ np.linalg.inv(root)
     joint_m2 = np.einsum("piab,pibjc,pjdc->piajd", gain, formal_m2, gain, optimize=True)
-    joint_m2[:, each, :, each, :] = np.moveaxis(stated_m2, 1, 0)
+    joint_m2[:, number, :, number, :] = np.moveaxis(stated_m2, 1, 0)
     return np.asarray(joint_m2)
 
 

@@ -285,8 +285,10 @@ def _length_of(container: Any, stream: Any, ticks_s: int) -> float:
     """How long the frames of a video last, s, as its container says; 0 if not, for sound may last longer."""
     if stream.duration is not None:
         return float(stream.duration * stream.time_base)
-    hours, _, rest = str(stream.metadata.get("DURATION", "")).partition(":")  # Matroska's hh:mm:ss.fraction
-    minutes, _, seconds = rest.partition(":")
+    hours, _, minutes_and_seconds = str(stream.metadata.get("DURATION", "")).partition(
+        ":"
+    )  # Matroska's hh:mm:ss.fraction
+    minutes, _, seconds = minutes_and_seconds.partition(":")
     try:
         return 3600.0 * float(hours) + 60.0 * float(minutes) + float(seconds)
     except ValueError:

@@ -65,18 +65,18 @@ def time_headings(headings: Sequence[Untimed], epochs: Sequence[Untimed], where:
     earlier_s, later_s = earlier_s[rows], later_s[rows]
     received = [headings[row] for row in rows]
     if usual == 1 and _enclosed(received, epochs) > _MOST:
-        return _known(earlier_s, values, epoch[rows] >= 0)
+        return _timed(earlier_s, values, epoch[rows] >= 0)
     if (is_later := _arrived_later(received, epochs, earlier_s, later_s)) is not None:
         return (
-            _known(later_s, values, earlier_s >= -np.inf)
+            _timed(later_s, values, earlier_s >= -np.inf)
             if is_later
-            else _known(earlier_s, values, ~before[rows])
+            else _timed(earlier_s, values, ~before[rows])
         )
     return Timed(earlier_s, values, later_s)
 
 
-def _known(stamp_s: FloatArray, values: FloatArray, kept: np.ndarray) -> Timed:
-    return Timed(stamp_s[kept], values[kept], None)
+def _timed(stamp_s: FloatArray, values: FloatArray, is_usable: np.ndarray) -> Timed:
+    return Timed(stamp_s[is_usable], values[is_usable], None)
 
 
 def _distinct(epochs: Sequence[Untimed]) -> tuple[FloatArray, FloatArray]:

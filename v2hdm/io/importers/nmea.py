@@ -456,12 +456,12 @@ class _Log:
             if self._magnetic:
                 _log.warning("%s: its HDG headings are magnetic and have no variation: not used", self._where)
             return None
-        own = {name: count for name, count in counts.items() if name[:2] not in others} or counts
-        most = max(own.values())
-        worth = [name for name in own if 2 * own[name] >= most]
-        compass = [name for name in worth if name.endswith("HDG")]
-        worth = sorted(set(worth) - set(compass)) or compass
-        chosen = max(worth, key=lambda name: (name in self._timed, own[name]))
+        count_of_source = {name: count for name, count in counts.items() if name[:2] not in others} or counts
+        most = max(count_of_source.values())
+        frequent = [name for name in count_of_source if 2 * count_of_source[name] >= most]
+        compass = [name for name in frequent if name.endswith("HDG")]
+        frequent = sorted(set(frequent) - set(compass)) or compass
+        chosen = max(frequent, key=lambda name: (name in self._timed, count_of_source[name]))
         if len(counts) > 1:
             _log.info("%s: headings of %s, of %s", self._where, chosen, ", ".join(counts))
         if chosen in self._timed:
@@ -556,9 +556,9 @@ def _apart(fix: _Fix, other: _Fix) -> float:
 
 def _apart_at_once(source: _Source, other: _Source) -> float | None:
     """How far apart two receivers are, m; None where both sources are of one receiver."""
-    both = sorted(set(source.fixes) & set(other.fixes))
-    if both:
-        pairs = np.array([(*source.fixes[stamp][:2], *other.fixes[stamp][:2]) for stamp in both])
+    shared_stamps = sorted(set(source.fixes) & set(other.fixes))
+    if shared_stamps:
+        pairs = np.array([(*source.fixes[stamp][:2], *other.fixes[stamp][:2]) for stamp in shared_stamps])
         apart_m = float(np.median(metres_between(pairs[:, :2], pairs[:, 2:])))
         return apart_m if apart_m > _APART_M else None
     owner = [stamp in source.fixes for stamp in sorted({*source.fixes, *other.fixes})]

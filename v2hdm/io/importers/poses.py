@@ -230,23 +230,23 @@ def _usable(readings: Readings, settings: PoseSettings, where: str) -> Readings:
     return replace(fixed, attitudes=attitudes)
 
 
-def _without(readings: Readings, kept: BoolArray) -> Readings:
+def _without(readings: Readings, is_usable: BoolArray) -> Readings:
     """The readings whose positions are ``kept`` (P,)."""
-    rows = {key: getattr(readings, key)[kept] for key in ("stamp_s", "points", "sigma_m")}
+    rows = {key: getattr(readings, key)[is_usable] for key in ("stamp_s", "points", "sigma_m")}
     return replace(readings, **rows)
 
 
 def _finite(values: FloatArray, sigma_m: FloatArray, where: str, things: str) -> BoolArray:
     """Flags (N,) of the rows of ``values`` (N, V) that are numbers; the others are counted."""
-    kept = np.asarray(np.isfinite(values).all(axis=1))
-    lost = ~kept & ~np.isinf(sigma_m)  # a position without a fix is told of as such
-    if not kept.any():
-        raise DriveError(f"{where}: none of its {len(kept)} {things} is a number; record it again")
+    is_number = np.asarray(np.isfinite(values).all(axis=1))
+    lost = ~is_number & ~np.isinf(sigma_m)  # a position without a fix is told of as such
+    if not is_number.any():
+        raise DriveError(f"{where}: none of its {len(is_number)} {things} is a number; record it again")
     if lost.any():
         _log.warning(
             "%s: left out %d of %d %s that are no numbers", where, int(lost.sum()), len(lost), things
         )
-    return kept
+    return is_number
 
 
 def _metres(readings: Readings, where: str) -> FloatArray:

@@ -106,18 +106,18 @@ def _header(comments: Sequence[str], where: str) -> _Header:
     names: tuple[str, ...] = _DEFAULT
     if titles:
         title = titles[-1].lstrip("% ")
-        known = next(name for name in firsts if name in title)
-        behind = title[title.index(known) + len(known) :][:1]
-        separator = behind if behind in ",;:|\t" and behind else " "
+        first_title = next(name for name in firsts if name in title)
+        letter_behind = title[title.index(first_title) + len(first_title) :][:1]
+        separator = letter_behind if letter_behind in ",;:|\t" and letter_behind else " "
         names = tuple(title.replace(separator, " ").split())
         if names[0] not in _SCALES:
             scales = ", ".join(_SCALES)
             raise DriveError(f"{where}: its times are {shown(names[0])}, not one of {scales}; export them so")
         values = _value_names(names)
         if tuple(values[:3]) not in (_ON_EARTH, _FROM_CENTRE, _BASELINE):
-            found = ", ".join(map(shown, values[:3]))
+            columns = ", ".join(map(shown, values[:3]))
             raise DriveError(
-                f"{where}: its first columns are {found}, no position of RTKLIB; export it again"
+                f"{where}: its first columns are {columns}, no position of RTKLIB; export it again"
             )
     else:
         _log.warning(

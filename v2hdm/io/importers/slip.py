@@ -53,9 +53,9 @@ def _cost(chords: _Chords, variance: float, lever_m: float) -> float:
     weight = 1 / np.sqrt(variance * (chords.overlap if np.isfinite(lever_m) else 1.0))
     columns = weight * np.column_stack([np.ones(len(chords.off_rad)), chords.curvature])
     columns = np.vstack([columns, [[0.0, 1 / lever_m]]])
-    wanted = np.append(weight * chords.off_rad, 0.0)
-    solved = np.linalg.lstsq(columns, wanted, rcond=None)[0]
-    return float(((wanted - columns @ solved) ** 2).sum())
+    target = np.append(weight * chords.off_rad, 0.0)
+    solved = np.linalg.lstsq(columns, target, rcond=None)[0]
+    return float(((target - columns @ solved) ** 2).sum())
 
 
 def _chords(trajectory: Trajectory) -> _Chords | None:
@@ -68,11 +68,11 @@ def _chords(trajectory: Trajectory) -> _Chords | None:
     forward = trajectory.map_from_vehicle[:, :2, 0]
     chord = points[stride:] - points[:-stride]
     length_m = np.linalg.norm(chord, axis=1)
-    kept = (length_m > _SHORTEST_M) & (stamp_s[stride:] - stamp_s[:-stride] < _LONGEST_S)
-    if kept.sum() < _LEAST_CHORDS:
+    is_driven = (length_m > _SHORTEST_M) & (stamp_s[stride:] - stamp_s[:-stride] < _LONGEST_S)
+    if is_driven.sum() < _LEAST_CHORDS:
         return None
-    begin = forward[:-stride][kept]
-    end = forward[stride:][kept]
-    off_rad = angle_between(begin + end, chord[kept])
+    begin = forward[:-stride][is_driven]
+    end = forward[stride:][is_driven]
+    off_rad = angle_between(begin + end, chord[is_driven])
     off_rad = np.where(np.abs(off_rad) > np.pi / 2, wrapped(off_rad + np.pi), off_rad)  # in reverse
-    return _Chords(off_rad, angle_between(begin, end) / length_m[kept], float(stride))
+    return _Chords(off_rad, angle_between(begin, end) / length_m[is_driven], float(stride))

@@ -37,7 +37,7 @@ def without_strays(stamp_s: FloatArray, points: FloatArray, where: str) -> BoolA
         expected = points[before] + part * (points[after] - points[before])
         return np.asarray(np.linalg.norm(points[middle] - expected, axis=1))
 
-    return _kept(
+    return _plausible(
         stamp_s, off_m, 0.5 * _HARDEST_MPS2, _LEAST_M, f"{where}: left out %d of %d positions that jump"
     )
 
@@ -56,42 +56,42 @@ def without_stray_turns(stamp_s: FloatArray, rotation: FloatArray, where: str) -
         return np.asarray(np.arccos(np.clip(cosine, -1, 1)))
 
     said = f"{where}: left out %d of %d headings that jump"
-    return _kept(stamp_s, off_rad, 0.5 * _HARDEST_RADPS2, _LEAST_RAD, said)
+    return _plausible(stamp_s, off_rad, 0.5 * _HARDEST_RADPS2, _LEAST_RAD, said)
 
 
-def _kept(stamp_s: FloatArray, off: _Off, hardest: float, least: float, said: str) -> BoolArray:
+def _plausible(stamp_s: FloatArray, off: _Off, hardest: float, least: float, said: str) -> BoolArray:
     count = len(stamp_s)
-    kept = np.ones(count, dtype=bool)
+    is_plausible = np.ones(count, dtype=bool)
     if count < 2 * _BESIDE:
-        return kept
+        return is_plausible
     inner = np.arange(1, count - 1)
-    size = off(inner - 1, inner, inner + 1)
-    usual = _EXTREME * max(SIGMA_OF_MAD * float(np.median(size)), least)
+    off_of_all = off(inner - 1, inner, inner + 1)
+    usual = _EXTREME * max(SIGMA_OF_MAD * float(np.median(off_of_all)), least)
 
     def fits(others: IntArray, strays: range) -> bool:
         """Whether the others lie between their neighbours, and far better than the strays do."""
         longest_s = np.maximum(np.diff(stamp_s[others])[:-1], np.diff(stamp_s[others])[1:])
-        rest = off(others[:-2], others[1:-1], others[2:])
-        if not (rest <= usual + hardest * longest_s**2).all():
+        off_of_others = off(others[:-2], others[1:-1], others[2:])
+        if not (off_of_others <= usual + hardest * longest_s**2).all():
             return False
         before, after = strays[0] - 1, strays[-1] + 1
         if before < 0 or after >= count:
             return True
         middle = np.array(strays)
         stray_off = off(np.full(len(middle), before), middle, np.full(len(middle), after))
-        return bool(stray_off.min() > _CLEARLY * rest.max())
+        return bool(stray_off.min() > _CLEARLY * off_of_others.max())
 
     longest_s = np.maximum(np.diff(stamp_s)[:-1], np.diff(stamp_s)[1:])
-    wrong = inner[size > usual + hardest * longest_s**2]
+    wrong = inner[off_of_all > usual + hardest * longest_s**2]
     clusters = np.split(wrong, np.flatnonzero(np.diff(wrong) > 2) + 1) if len(wrong) else []
     if len(clusters) > max(3, _FEW * count):
-        return kept
+        return is_plausible
     for cluster in clusters:
         if (strays := _strays(int(cluster[0]), int(cluster[-1]), count, fits)) is not None:
-            kept[strays] = False
-    if not kept.all():
-        _log.warning(f"{said} away from those around them", int((~kept).sum()), count)
-    return kept
+            is_plausible[strays] = False
+    if not is_plausible.all():
+        _log.warning(f"{said} away from those around them", int((~is_plausible).sum()), count)
+    return is_plausible
 
 
 def _strays(first: int, last: int, count: int, fits: Callable[[IntArray, range], bool]) -> range | None:

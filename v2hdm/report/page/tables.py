@@ -96,11 +96,11 @@ def key_figures(facts: Facts) -> tuple[Figure, ...]:
         Figure("Markings", str(len(markings)), "", f"and {symbols}"),
         Figure("Lane lines", str(len(facts.hd_map.lanes)), "", f"{length} m in total"),
     ]
-    known = well_known(markings)
-    but = "" if len(known) == len(markings) else f"; without accuracy {ACCURACIES[-1]}"
+    judged = well_known(markings)
+    exception = "" if len(judged) == len(markings) else f"; without accuracy {ACCURACIES[-1]}"
     for name, radii_m, note in (
-        ("In the map’s frame", absolute_radii_m(known).ravel(), f"holds 95 % of the corners{but}"),
-        ("From marking to marking", relative_radii_m(known), f"holds 95 % of the markings{but}"),
+        ("In the map’s frame", absolute_radii_m(judged).ravel(), f"holds 95 % of the corners{exception}"),
+        ("From marking to marking", relative_radii_m(judged), f"holds 95 % of the markings{exception}"),
     ):
         radius_m = radius_of_all_m(radii_m)
         if math.isfinite(radius_m):
@@ -133,9 +133,9 @@ def accuracy_table(facts: Facts) -> Table | None:
     by_kind: dict[str, Sequence[Marking]] = {**_by_kind(markings)}
     if len(by_kind) > 1:
         by_kind["all"] = markings
-    known = well_known(markings)
-    if len(known) < len(markings):
-        by_kind[f"all without accuracy {ACCURACIES[-1]}"] = known
+    judged = well_known(markings)
+    if len(judged) < len(markings):
+        by_kind[f"all without accuracy {ACCURACIES[-1]}"] = judged
     rows = []
     for name, of_kind in by_kind.items():
         radii_m = (absolute_radii_m(of_kind).ravel(), relative_radii_m(of_kind))

@@ -64,9 +64,11 @@ class _Schemas(dict[int, Any]):
 
     def __setitem__(self, number: int, schema: Any) -> None:
         language = _DEFINITIONS.get(schema.encoding, schema.encoding)
-        known = language if language in _KNOWN else ""
-        text = schema.data if known else ""
-        super().__setitem__(number, schema._replace(name=_kind(schema.name), encoding=known, data=text))
+        known_language = language if language in _KNOWN else ""
+        text = schema.data if known_language else ""
+        super().__setitem__(
+            number, schema._replace(name=_kind(schema.name), encoding=known_language, data=text)
+        )
 
 
 def _kind(name: str) -> str:
