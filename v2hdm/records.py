@@ -65,6 +65,33 @@ class CentrePrior:
 
 
 @dataclass(frozen=True)
+class FrameStep:
+    """An edge of a tree of frames; ``parent_from_child`` (4, 4) is None where the tree lacks it."""
+
+    parent: str
+    child: str
+    parent_from_child: FloatArray | None
+
+
+@dataclass(frozen=True)
+class CameraFrames:
+    """A camera's place in the tree of frames of its vehicle, by the tree's own names; empty if not stated.
+
+    ``vehicle`` is the frame that the drive's positions on the vehicle count from, ``height_m`` above the
+    ground, ``camera`` that of the images. ``steps`` lead from the one to the other, none where the vehicle
+    has no tree; ``problem`` says why they are not known. ``states_height`` is whether the drive states how
+    high the camera is above ``vehicle``, which a homography of the ground does not.
+    """
+
+    vehicle: str = ""
+    camera: str = ""
+    height_m: float = 0.0
+    steps: tuple[FrameStep, ...] = ()
+    problem: str = ""
+    states_height: bool = False
+
+
+@dataclass(frozen=True)
 class Camera:
     """One camera of a drive: its intrinsics and approximate mounting."""
 
@@ -78,6 +105,7 @@ class Camera:
     own_vehicle: BoolArray | None = None  # (height, width) pixels that show the vehicle
     mounting_sigma: tuple[float, float] = (0.0, 0.0)  # of a guessed horizon (rad) and log focal length
     read_out_s: float = 0.0  # first row to last, 0 for a global shutter; stamps are of the middle row
+    frames: CameraFrames = CameraFrames()
 
 
 @dataclass(frozen=True)
@@ -556,6 +584,7 @@ class Calibration:
     info: CameraInfo
     cam_from_vehicle: FloatArray
     covariance: FloatArray | None = None
+    frames: CameraFrames = CameraFrames()
 
     @property
     def centre_vehicle(self) -> FloatArray:

@@ -16,7 +16,7 @@ from v2hdm.io.calibration.reading import read_camera_info
 from v2hdm.io.description import FolderImages, InfoFile, TopicImages, VideoImages, keys_in
 from v2hdm.io.drive.images import ImageFiles
 from v2hdm.io.importers.bag import streams
-from v2hdm.io.importers.bag.messages import TF_TOPIC
+from v2hdm.io.importers.bag.frames import TF_TOPIC
 from v2hdm.io.importers.readings import Readings, read_stamps, readings_of_poses
 from v2hdm.io.trajectory import UNITS, read_image_list, write_image_list
 from v2hdm.records import CameraInfo
@@ -112,7 +112,7 @@ def plan_topic_poses(content: object, sources: Sources, where: str) -> Callable[
             if key not in content:
                 raise DriveError(f"{where}: add {key} for {TF_TOPIC}: the map's or the vehicle's frame")
         dst, src = (take_text(content[key], f"{where}, {key}", DriveError) for key in ("frame", "vehicle"))
-        tf = streams.TfStream(True, where)
+        tf = streams.TfStream(where)
         tf_folder = sources.want(tf)
         return lambda: readings_of_poses(tf.frames(tf_folder()).moving(dst, src, sources.max_gap_s, where))
     for key in ("frame", "vehicle"):
