@@ -11,7 +11,7 @@ import numpy as np
 from scipy.stats import chi2, f
 
 from v2hdm.calibration.fit import STATED_AS, UNKNOWNS, Fit, SeenPoints, fit_mountings
-from v2hdm.errors import DriveError
+from v2hdm.errors import DriveError, shown
 from v2hdm.geometry.ipm import (
     apply_in_front,
     facing_ipm,
@@ -105,7 +105,9 @@ def _columns(header: list[str], path: Path) -> list[str]:
     for name in columns:
         if name not in (*COLUMNS, _NAME):
             hint = "points must lie on the ground; drop it" if name in ("z", "z_m") else "drop it"
-            raise DriveError(f"{path}: column '{name}' is not one of {', '.join(COLUMNS)}, {_NAME}; {hint}")
+            raise DriveError(
+                f"{path}: column {shown(name)} is not one of {', '.join(COLUMNS)}, {_NAME}; {hint}"
+            )
     return columns
 
 

@@ -72,6 +72,9 @@ class PoseKeys:
     geoid_m: Annotated[float | None, "geoid above the ellipsoid, for heights above sea level."] = None
     epoch: Annotated[float | None, "of the coordinates, in years."] = None
     offset_s: Annotated[float, "added to the times of the poses."] = 0.0
+    heading_file: Annotated[
+        Any, "headings in a second file, by its format, such as {csv: imu.csv}; TUM's by its name."
+    ] = None
 
 
 @dataclass(kw_only=True)
@@ -95,6 +98,32 @@ class NmeaPoses(PoseKeys):
 
     nmea: Annotated[str, "the file."]
     date: Annotated[Any, "of the first sentence, such as 2024-05-17, if no sentence has it."] = None
+    talker: Annotated[str | None, "the receiver to take of several, such as GN."] = None
+
+
+@dataclass(kw_only=True)
+class SbetPoses(PoseKeys):
+    """Poses of Applanix POSPac."""
+
+    sbet: Annotated[str, "the file."]
+    rms: Annotated[str | None, "its RMS file (smrmsg), for the sigmas."] = None
+    date: Annotated[Any, "a day of the recording, if the images' times are no dates."] = None
+    clock: Annotated[str, "of its seconds of the week: gps, or utc with leap seconds."] = "gps"
+
+
+@dataclass(kw_only=True)
+class PosPoses(PoseKeys):
+    """Positions of RTKLIB."""
+
+    pos: Annotated[str, "the file."]
+
+
+@dataclass(kw_only=True)
+class UbxPoses(PoseKeys):
+    """Poses of a u-blox receiver."""
+
+    ubx: Annotated[str, "the log: pyubx2's text or JSON lines, or raw."]
+    date: Annotated[Any, "a day of the recording, if no NAV-PVT has it."] = None
 
 
 @dataclass(kw_only=True)
@@ -158,7 +187,8 @@ class DriveDescription:
     name: Annotated[str | None, "the drive's name; default: the folder's."] = None
     bag: Annotated[str | None, "the bag whose topics are named."] = None
     poses: Annotated[
-        str | TumPoses | TablePoses | NmeaPoses | TopicPoses, "the vehicle's poses: a file, or a topic."
+        str | TumPoses | TablePoses | NmeaPoses | SbetPoses | PosPoses | UbxPoses | TopicPoses,
+        "the vehicle's poses: a file, or a topic.",
     ] = POSES_FILE
     pose_noise: Annotated[
         PoseNoise | None, "standard deviations from the receiver's data sheet, and their drifts."

@@ -73,7 +73,13 @@ def write_result(result: Result, folder: Path, outputs: Outputs, context: Contex
         grid = check_crs(outputs.crs, ["qgis"], result.map.origin, "crs").get("qgis")
         write_qgis(result.map, folder / names.PROJECT, grid=grid)
     with context.timed("report"):
-        write_page(folder, drive, None if outputs.background is None else Path(outputs.background))
+        try:
+            write_page(folder, drive, None if outputs.background is None else Path(outputs.background))
+        except MapFileError as failure:
+            if outputs.background is None:
+                raise
+            _log.warning("no picture lies under the report's map: %s", failure)
+            write_page(folder, drive)
 
 
 def _write_all_maps(folder: Path, result: Result) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.errors import DriveError, MapFileError
+from v2hdm.errors import DriveError, MapFileError, shown
 from v2hdm.geometry.frames import nodes_of
 from v2hdm.geometry.ipm import cam_from_mounting, extrinsic_from_ipm, ipm_from_extrinsic
 from v2hdm.geometry.planar import winding
@@ -37,7 +37,7 @@ from v2hdm.safe.fields import (
     take_frame_height,
     take_size_px,
 )
-from v2hdm.safe.texts import shown, take_camera_name
+from v2hdm.safe.texts import take_camera_name
 from v2hdm.store.files import check_keys, load_yaml, take_array, take_mapping, take_number, take_text
 from v2hdm.store.names import CALIBRATIONS
 
@@ -199,7 +199,7 @@ def _coefficients_of(model: str, where: str, advice: str) -> int:
     """The number of coefficients of a distortion model of ours; else DriveError with ``advice``."""
     if model not in DISTORTION_COEFFICIENTS:
         models = ", ".join(DISTORTION_COEFFICIENTS)
-        raise DriveError(f"{where}: unknown distortion_model '{model}'; {advice} one of: {models}")
+        raise DriveError(f"{where}: unknown distortion_model {shown(model)}; {advice} one of: {models}")
     return DISTORTION_COEFFICIENTS[model]
 
 
@@ -221,7 +221,9 @@ def info_of(fields: Any, name: str, where: str) -> CameraInfo:
     model = _MODELS.get(fields.distortion_model, fields.distortion_model)
     if not intrinsic.any():
         raise DriveError(f"{where}: the camera is not calibrated (K is zero); give camera_info as a file")
-    if max(fields.binning_x, fields.binning_y) > 1 or fields.roi.width or fields.roi.height:
+    region = (fields.roi.width, fields.roi.height)
+    is_cropped = region not in ((0, 0), (fields.width, fields.height))  # the whole image may be stated, too
+    if max(fields.binning_x, fields.binning_y) > 1 or is_cropped:
         raise DriveError(f"{where}: its images are binned or cropped; give camera_info as a file")
     count = _coefficients_of(model, where, "give camera_info as a file with")
     if distortion[count:].any():
@@ -248,6 +250,7 @@ _STEEPEST_RAY = 0.999  # sine of the pitch, 87.4 deg, from which a camera counts
 def take_ipm(content: object, where: str) -> FloatArray:
     """An invertible 3 x 3 homography ``vehicle_from_pinhole_px``, scaled to unit norm."""
     ipm = take_array(content, (3, 3), where, DriveError)
+    ipm = ipm / max(float(np.abs(ipm).max()), np.finfo(float).tiny)  # squares of its numbers are numbers
     if _is_singular(ipm):
         raise DriveError(f"{where}: IPM matrix is not invertible; calibrate it from 4 or more point pairs")
     return np.asarray(ipm / np.linalg.norm(ipm))
@@ -257,8 +260,11 @@ def _is_singular(matrix: FloatArray) -> bool:
     if not (matrix.any(axis=0).all() and matrix.any(axis=1).all()):
         return True
     # Rows and columns of comparable norms: pixels and metres must not look singular.
-    for axis in (1, 0) * 4:
-        matrix = matrix / np.linalg.norm(matrix, axis=axis, keepdims=True)
+    with np.errstate(all="ignore"):  # numbers so unlike that their squares are 0
+        for axis in (1, 0) * 4:
+            matrix = matrix / np.linalg.norm(matrix, axis=axis, keepdims=True)
+    if not np.isfinite(matrix).all():
+        return True
     return bool(1.0 / np.linalg.cond(matrix) < _SINGULAR)
 
 
@@ -372,5 +378,7 @@ def choose_initial(name: object, ipm: dict[str, FloatArray], where: str) -> str:
     initial = take_text(name, f"{where}, initial_ipm", DriveError)
     if initial not in ipm:
         names = ", ".join(ipm)
-        raise DriveError(f"{where}: initial_ipm '{initial}' is not given under ipm; choose from: {names}")
+        raise DriveError(
+            f"{where}: initial_ipm {shown(initial)} is not given under ipm; choose from: {names}"
+        )
     return initial

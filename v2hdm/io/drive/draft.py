@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.io.description import DRIVE_FILE
@@ -15,7 +18,7 @@ from v2hdm.io.drive.sources import SUFFIXES
 from v2hdm.io.importers.bag.describe import LENS, MOUNTING, ORIGIN, BagDescription
 from v2hdm.io.importers.bag.reading import is_bag
 from v2hdm.safe.fields import take_frame
-from v2hdm.safe.texts import parse_yaml
+from v2hdm.safe.texts import ALL_CAMERAS, MOST_NAME_LETTERS, parse_yaml
 from v2hdm.store.files import dump_yaml, replace_text
 
 _POSES = (
@@ -34,12 +37,13 @@ def draft_drive(source: Path, folder: Path, settings: Sequence[str]) -> dict[str
     that is none, a ``drive.yaml`` that exists.
     """
     where = folder / DRIVE_FILE
-    if where.exists():
+    if os.path.lexists(where):  # a link to a file that is gone is the user's, too
         raise DriveError(f"{where}: exists; edit it, or choose another folder for --write")
     values = _values_of(settings)
     draft = _draft_of(source, folder, values.get("vehicle_frame"))
     content = draft.content
     missing = draft.missing
+    _refuse_unused(content, settings)
     for key, value in values.items():
         is_name = key.endswith(("topic", "frame"))
         _put(content, key.split("."), value if is_name else _beside(value, folder))
@@ -84,7 +88,9 @@ def _draft_of(source: Path, folder: Path, vehicle_frame: object) -> _Draft:
         bag = BagDescription(source, Path(ReadOptions().cache), vehicle_frame=vehicle_frame)
         about = {"name": folder.resolve().name, "bag": _relative(source, folder)}
         return _Draft(bag.content | about, bag.missing)
-    name = source.stem or "camera"
+    if not source.exists():
+        raise DriveError(f"{source}: no such bag, video or folder of images; check the path")
+    name = _camera_of(source)
     missing = {"poses": _POSES}
     missing |= {f"cameras.{name}.camera_info": LENS}
     missing |= {f"cameras.{name}.mounting": MOUNTING.format(origin=ORIGIN)}
@@ -96,7 +102,10 @@ def _draft_of(source: Path, folder: Path, vehicle_frame: object) -> _Draft:
                 f"{source}: not a bag, a video or a folder of images; --write needs one of these"
             )
         try:
-            latest = max(map(float, stems))
+            stamps = [float(stem) for stem in stems]
+            if not np.isfinite(stamps).all():  # "nan" and "inf" are numbers to Python, and no times
+                raise ValueError
+            latest = max(stamps)
             images["unit"] = next((unit for least, unit in _UNITS if latest >= least), "s")
         except ValueError:
             missing[f"cameras.{name}.images.stamps"] = "a file with a time in s per image: times.txt"
@@ -106,6 +115,25 @@ def _draft_of(source: Path, folder: Path, vehicle_frame: object) -> _Draft:
             "the first frame's time on the poses' clock, s: 1715934630.25"
         )
     return _Draft({"name": folder.resolve().name, "cameras": {name: {"images": images}}}, missing)
+
+
+def _refuse_unused(content: Mapping[str, Any], settings: Sequence[str]) -> None:
+    """Raise DriveError for settings of a camera that has no images, neither in the recording nor by them."""
+    paths = [setting.partition("=")[0].split(".") for setting in settings if "=" in setting]
+    of_cameras = [keys for keys in paths if len(keys) > 2 and keys[0] == "cameras"]
+    with_images = {keys[1] for keys in of_cameras if keys[2] == "images"} | set(content.get("cameras", {}))
+    unused = [".".join(keys) for keys in of_cameras if keys[1] not in with_images]
+    if unused:
+        raise DriveError(
+            f"--set {', '.join(unused)}: not used, for there is no camera of that name; name "
+            f"{' or '.join(content.get('cameras', {})) or 'its images, too'}"
+        )
+
+
+def _camera_of(source: Path) -> str:
+    """A name for the camera of a recording: its own, of letters that a key of ``--set`` may have."""
+    name = re.sub(r"[^\w-]+", "_", source.stem)[:MOST_NAME_LETTERS].strip("_")
+    return "camera" if not name or name.lower() in ALL_CAMERAS else name
 
 
 def _put(content: dict[str, Any], keys: Sequence[str], value: object) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -85,7 +85,8 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
         camera = _read_camera(entry, named, path, place, frames[name])
         cameras[name] = replace(camera, read_out_s=read_out_s)
         files.append(listed)
-    recorded = read_poses(poses, path, origin, options.max_gap_s, poses_at, read_topic)
+    near_s = _middle_of(files)
+    recorded = read_poses(poses, path, origin, options.max_gap_s, poses_at, read_topic, near_s)
     pose_noise = _read_pose_noise(content.get("pose_noise"), recorded.noise, f"{where}: pose_noise")
     truth = None
     if content.get("truth") is not None:
@@ -98,6 +99,13 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
     on_ground = Trajectory(poses_of_frame.stamp_s, poses_of_frame.map_from_vehicle @ frame_from_ground)
     drive = Drive(name, path, cameras, (), pose_noise, recorded.origin, truth, recorded=on_ground)
     return assemble_drive(drive, files, options.max_gap_s, poses_at)
+
+
+def _middle_of(files: Sequence[ImageFiles]) -> float | None:
+    """The time in the middle of a drive's images; None where there are none, or none is finite."""
+    stamps = np.concatenate([entry.stamp_s for entry in files])
+    middle_s = float(np.median(stamps)) if len(stamps) else np.nan
+    return middle_s if np.isfinite(middle_s) else None
 
 
 def _read_camera(

@@ -157,6 +157,8 @@ def _of_folder(entry: dict[str, Any], camera: str, sources: Sources, where: str)
         else:
             try:
                 stamp_s = np.array([float(path.stem) for path in paths])
+                if not np.isfinite(stamp_s).all():  # "nan" and "inf" are numbers to Python, and no times
+                    raise ValueError
             except ValueError:
                 raise DriveError(
                     f"{where}: the images of {folder} are not named by their times; add stamps, one per line"

@@ -8,9 +8,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
+from v2hdm.doors import checked
 from v2hdm.geometry.ipm import apply_homography, initial_extrinsic
 from v2hdm.geometry.lens import distort_points, has_distortion, undistort_points
 from v2hdm.geometry.planar import inside_convex, signed_area
@@ -19,6 +21,7 @@ from v2hdm.ground.results import GroundEstimate
 from v2hdm.io.drive import as_drive
 from v2hdm.io.drive.road import unevenness
 from v2hdm.records import FOOT_M, Camera, CameraInfo, CentrePrior, Drive, FloatArray
+from v2hdm.settings import PROCESSES
 from v2hdm.verdict.inputs import ground as ground_checks
 from v2hdm.verdict.inputs.ground import check_ground, find_cause, path_of
 from v2hdm.verdict.inputs.heading import check_heading
@@ -285,11 +288,12 @@ HIDES: Mapping[str, tuple[str, ...]] = {
 """Checks that fail because another one did: the cause is reported, its consequences are not."""
 
 
+@checked
 def check_drive(
     drive: Drive | str | Path,
     *,
     ground: bool | Mapping[str, GroundEstimate] = True,
-    workers: int = 1,
+    workers: Annotated[int, PROCESSES] = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> Verdict:
     """Check a drive before any long work: poses, clocks, noise, cameras, images, and bare ground.

@@ -19,6 +19,9 @@ from v2hdm.verdict.verdict import Finding, Status, Verdict, judge, passed
 CHECK = "origin height"
 """Name of this module's check."""
 
+HEIGHT = "vehicle_frame_height_m"
+"""The key of ``drive.yaml`` that states the height."""
+
 # Standard deviations, m, of a camera's stated height above the vehicle's frame.
 _DESIGNED_M = 0.03  # of a tree of frames: built as designed, on its tyres and springs
 _TYPED_M = 0.1  # of a mounting that someone measured by tape, or took from a drawing
@@ -40,6 +43,19 @@ def known_frames(camera: Camera, verdict: Verdict) -> CameraFrames:
     return replace(camera.frames, problem=raised[0].says) if raised else camera.frames
 
 
+def height_to_state(drive: Drive, verdict: Verdict) -> float | None:
+    """The height, m, of the vehicle's frame that its cameras show, where it contradicts the one stated."""
+    errors_m = [finding.value for finding in verdict.raised if finding.check == CHECK]
+    if not errors_m or errors_m[0] is None:
+        return None
+    return errors_m[0] + next(iter(drive.cameras.values())).frames.height_m
+
+
+def frame_of(drive: Drive) -> str:
+    """The frame that a drive's positions on the vehicle count from, in words."""
+    return next(iter(drive.cameras.values())).frames.vehicle or "the origin of mountings and poses"
+
+
 def check_origin_height(drive: Drive, ground: Mapping[str, GroundEstimate]) -> list[Finding]:
     """The common error of all stated heights of cameras; none where no camera states one."""
     stating = {name: camera for name, camera in drive.cameras.items() if _states_height(camera)}
@@ -53,7 +69,7 @@ def check_origin_height(drive: Drive, ground: Mapping[str, GroundEstimate]) -> l
         if name in ground and (height := _height_of(stating[name], ground[name])) is not None
     }
     frame = next(iter(stating.values())).frames
-    origin = frame.vehicle or "the origin of mountings and poses"
+    origin = frame_of(drive)
     if not heights:
         says = "the ground does not show how high the cameras are: drive farther, on rougher ground, by day"
         return [Finding(CHECK, Status.PASS, None, _LEAST_M, "m", says, "poses")]
@@ -71,7 +87,7 @@ def check_origin_height(drive: Drive, ground: Mapping[str, GroundEstimate]) -> l
         CHECK, "poses", common_m, limit_m, "m",
         fine=f"the ground is where the cameras' stated heights put it, below {origin}",
         wrong=f"all cameras show the ground {where} {stated}: heights of the map and calibrations in frames "
-        f"of the vehicle are wrong by that; state vehicle_frame_height_m: {state_m:.2f}, the height of "
+        f"of the vehicle are wrong by that; state {HEIGHT}: {state_m:.2f}, the height of "
         f"{origin} above the ground",
         status=Status.WARN,
     )  # fmt: skip

@@ -9,8 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from v2hdm.errors import DriveError, need
-from v2hdm.io.importers.readings import Attitudes, Readings
+from v2hdm.errors import DriveError, need, shown
+from v2hdm.io.importers.readings import SIGMA_OF_QUALITY_M, Attitudes, Readings
 from v2hdm.io.trajectory import checked_rotations, in_order
 from v2hdm.records import FloatArray
 from v2hdm.safe.pixels import png
@@ -54,13 +54,15 @@ def file_of(kind: str, fields: Any, where: str) -> tuple[str, bytes]:
         return ".jpg", data
     if data.startswith(_PNG_SIGNATURE):
         return ".png", data
-    raise DriveError(f"{where}: compressed as '{fields.format}'; record JPEG, PNG or raw images")
+    raise DriveError(f"{where}: compressed as {shown(fields.format)}; record JPEG, PNG or raw images")
 
 
 def _pixels(fields: Any, where: str) -> np.ndarray:
     if fields.encoding not in _ENCODINGS:
         supported = ", ".join(_ENCODINGS)
-        raise DriveError(f"{where}: encoding '{fields.encoding}' is not known; record one of {supported}")
+        raise DriveError(
+            f"{where}: encoding {shown(fields.encoding)} is not known; record one of {supported}"
+        )
     channels, to_bgr = _ENCODINGS[fields.encoding]
     height = int(fields.height)
     width = int(fields.width)
@@ -91,7 +93,9 @@ class VideoDecoder:
     def __init__(self, form: str, where: str) -> None:
         self._av = need("av", "video", f"{where}: video in a bag", DriveError)
         if form not in _FORMATS:
-            raise DriveError(f"{where}: video in the format '{form}', supported are {', '.join(_FORMATS)}")
+            raise DriveError(
+                f"{where}: video in the format {shown(form)}, supported are {', '.join(_FORMATS)}"
+            )
         self._where = where
         self._context: Any = self._av.CodecContext.create(_CODECS.get(form, form), "r")
         self._begun = False
@@ -147,6 +151,8 @@ POSE_KINDS = (ODOMETRY, _WITH_COVARIANCE, _POSE, FIX, NMEA, TF)
 HEADING_KINDS = (IMU, QUATERNION, ODOMETRY, _WITH_COVARIANCE, _POSE)
 
 _NO_FIX = -1  # the status of a NavSatFix without a position (sensor_msgs/NavSatStatus)
+# Quality of NMEA's GGA by the status of a NavSatFix: plain, satellite-based and ground-based augmentation.
+_QUALITY_OF_STATUS = {0: 1, 1: 2, 2: 4}
 _NORM_TOLERANCE = 1e-2  # by which a recorded quaternion's norm may be off 1; chosen
 _YAW = 35  # place of the variance of yaw among the 36 numbers of a pose's covariance (REP-103)
 
@@ -156,10 +162,13 @@ Row = tuple[float, ...]
 def position_row(kind: str, fields: Any) -> Row:
     """Position (3), standard deviation (1, nan if not stated), quaternion (4, nan if none), its sigma (1)."""
     if kind == FIX:
+        status = fields.status.status
         sigma_m = np.nan
         if fields.position_covariance_type:
             sigma_m = _sigma(fields.position_covariance[0], fields.position_covariance[4])
-        if fields.status.status <= _NO_FIX:
+        if np.isnan(sigma_m):
+            sigma_m = SIGMA_OF_QUALITY_M[_QUALITY_OF_STATUS.get(status, 0)]
+        if status == _NO_FIX:
             sigma_m = np.inf
         return (fields.latitude, fields.longitude, fields.altitude, sigma_m, *([np.nan] * 5))
     return _pose(fields.pose, None) if kind == _POSE else _pose(fields.pose.pose, fields.pose.covariance)
@@ -203,7 +212,7 @@ def readings_of(
         rotation = checked_rotations(turned[is_measured, :4], lambda k: where, advice, _NORM_TOLERANCE)
         attitudes = Attitudes(heading_s[is_measured], rotation, turned[is_measured, 4])
     geodetic = kind == FIX
-    return Readings(stamp_s, rows[:, :3], geodetic, rows[:, 3], attitudes, antenna=geodetic)
+    return Readings(stamp_s, rows[:, :3], geodetic, rows[:, 3], attitudes, "an antenna's" if geodetic else "")
 
 
 def _pose(pose: Any, covariance: Any) -> Row:

@@ -33,7 +33,8 @@ from v2hdm.io.importers.bag.frames import (
     transform_rows,
 )
 from v2hdm.io.importers.bag.reading import Bag, Message, bag_files, in_child_of, open_bag
-from v2hdm.io.importers.readings import Readings, nmea_readings
+from v2hdm.io.importers.nmea import nmea_readings
+from v2hdm.io.importers.readings import Readings
 from v2hdm.io.trajectory import write_image_list
 from v2hdm.records import FloatArray
 from v2hdm.safe.pixels import png
