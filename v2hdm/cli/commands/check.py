@@ -62,7 +62,7 @@ def _run(arguments: Sequence[str]) -> int:
             (parsed.write / DRIVE_FILE).unlink()
             raise DriveError(
                 f"{parsed.write / DRIVE_FILE}: not written: bare ground contradicts the cameras' heights; "
-                f"also give the height of {frame_of(drive)} above the ground (the axle's?), or 0 if it is on it: "
+                f"also give the height of {frame_of(drive)} above the ground, such as the axle's, or 0: "
                 f"--set {HEIGHT}={height_m:.2f}"
             )
         write_json(unfinished / VERDICT, verdict.as_json())
