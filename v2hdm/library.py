@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 from v2hdm.doors import check_types, checked
 from v2hdm.io.drive import as_drive, read_drive
 from v2hdm.io.maps.reading import read_map as _read
 from v2hdm.progress import Steps
 from v2hdm.records import Drive, HDMap, ImageDetections
-from v2hdm.settings import PROCESSES
+from v2hdm.settings import Processes
 from v2hdm.store.names import map_file
 
 if TYPE_CHECKING:  # load torch or scipy
@@ -77,7 +77,7 @@ def simulate_port(
     folder: str | Path,
     config: PortConfig | None = None,
     *,
-    workers: Annotated[int, PROCESSES] = 1,
+    workers: Processes = 1,
     progress: Steps | None = None,
 ) -> Drive:
     """Render a drive through a port, with ground truth, into a folder of its own below ``folder``, once.

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
 
 from v2hdm.doors import checked
 from v2hdm.geometry.ipm import mounting_words
@@ -15,7 +14,7 @@ from v2hdm.io.calibration.reading import Provenance
 from v2hdm.io.calibration.writing import write_calibration
 from v2hdm.io.drive import as_drive
 from v2hdm.records import Calibration, Drive
-from v2hdm.settings import PROCESSES
+from v2hdm.settings import Processes
 from v2hdm.store.files import write_json
 from v2hdm.store.names import VERDICT, calibration_file
 from v2hdm.verdict import Finding, Status, Verdict, check_drive, known_frames
@@ -58,7 +57,7 @@ class GroundCalibration:
 def calibrate_from_ground(
     drive: Drive | str | Path,
     *,
-    workers: Annotated[int, PROCESSES] = 1,
+    workers: Processes = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> GroundCalibration:
     """Find every camera's mounting from bare ground, without a marking, and check the drive by it.

@@ -36,11 +36,13 @@ class InfoTopic:
 
 @dataclass(kw_only=True)
 class FolderImages:
-    """Images of a folder, sorted by name."""
+    """Images of a folder, by the numbers or times in their names."""
 
     folder: Annotated[str, "folder of the images."]
     stamps: Annotated[str | None, "file with one time in s per line; without it, names are times."] = None
-    unit: Annotated[str, "of times that are names: s, ms, us or ns."] = "s"
+    unit: Annotated[
+        str | None, "of times that are names: s, ms, us, ns, utc or utc+hh:mm; default: as their digits tell."
+    ] = None
 
 
 @dataclass(kw_only=True)

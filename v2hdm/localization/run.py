@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 
@@ -32,7 +31,7 @@ from v2hdm.records import (
     Trajectory,
 )
 from v2hdm.report import style
-from v2hdm.settings import PROCESSES
+from v2hdm.settings import Processes
 from v2hdm.store.files import write_json
 
 _START_SIGMA_M = 0.5  # standard deviation, m, of a coordinate of the first pose: a place that RTK once fixed
@@ -126,7 +125,7 @@ def localize(
     calibrations: Mapping[str, Calibration],
     *,
     detections: Sequence[ImageDetections] | None = None,
-    workers: Annotated[int, PROCESSES] = 0,
+    workers: Processes = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Localised:
     """Follow the vehicle through a drive by a map's markings; only the first recorded pose is used.

@@ -14,7 +14,6 @@ from v2hdm.io.drive import ReadOptions, drive_name
 from v2hdm.io.maps.corrections import read_corrections
 from v2hdm.mapping.options import BATCH, INCREMENTAL, MappingOptions, check_options
 from v2hdm.records import Drive, Image
-from v2hdm.safe.backgrounds import check_background
 from v2hdm.safe.texts import shown, take_camera_name, take_name
 from v2hdm.settings import MOST_PROCESSES, NOT_NEGATIVE, POSITIVE, Within, check_settings
 from v2hdm.simulate.port.config import PortConfig
@@ -169,6 +168,8 @@ def admit(config: RunConfig) -> str:
         need("rasterio", "gis", "report.background", ConfigError)
         if not Path(config.report.background).exists():
             raise ConfigError(f"report.background: no file or folder {config.report.background}")
+        from v2hdm.safe.backgrounds import check_background  # reads rasters, which few runs need
+
         check_background(Path(config.report.background))  # before minutes of mapping
     has_base = config.map.base is not None
     check_choice(config.mapping, len(config.drive.paths), has_base, config.accuracy_goal_cm)

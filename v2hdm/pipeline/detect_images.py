@@ -15,7 +15,6 @@ import numpy as np
 from v2hdm.detection.camera import camera_from_calibration, rough_calibration
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.frames import (
-    IMAGE_SUFFIXES,
     Frame,
     NewestFrames,
     arriving_frames,
@@ -33,6 +32,7 @@ from v2hdm.errors import ConfigError, DriveError, shown
 from v2hdm.io.calibration.intrinsics import is_calibration, read_intrinsics
 from v2hdm.io.drive import READERS, read_drive
 from v2hdm.records import CameraInfo
+from v2hdm.safe.pixels import IMAGE_SUFFIXES
 from v2hdm.store.inputs import note_input
 
 ROUGH_MOUNTING = (1.6, 5.0, 60.0)  # height (m), pitch, horizontal field of view (deg) where nothing is known

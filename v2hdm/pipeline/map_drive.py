@@ -6,7 +6,7 @@ import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import torch  # noqa: F401  # its absence is reported before that of what is built on it
 
@@ -28,7 +28,7 @@ from v2hdm.pipeline.result import Result, describe_run
 from v2hdm.pipeline.stages import MappedSet, detect_in_pieces, map_camera_sets, methods_of
 from v2hdm.progress import Progress, silent
 from v2hdm.records import BEST, Drive, ImageDetections
-from v2hdm.settings import PROCESSES
+from v2hdm.settings import Processes
 from v2hdm.site.corrections import Heard
 from v2hdm.site.living.changes import Base
 from v2hdm.site.living.wear import with_wear
@@ -70,7 +70,7 @@ def map_drive(
     name: str | None = None,
     cache: Path | str | None = None,
     progress: Progress = silent,
-    workers: Annotated[int, PROCESSES] = 0,
+    workers: Processes = 0,
     context: Context | None = None,
 ) -> Result:
     """Map a drive, or several through one site together; nothing is written, but what ``cache`` keeps.

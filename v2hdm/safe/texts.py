@@ -28,6 +28,7 @@ MOST_ENTRIES = 1_000_000  # values in a YAML file, with everything that an alias
 MOST_NAME_LETTERS = 64  # of a camera, run, drive or class; chosen
 _MOST_NAME_BYTES = 200  # file systems end at 255 bytes
 ALL_CAMERAS = ("both", "all")  # names of results of all cameras together
+_NUMBERS = re.compile("([0-9]+)")
 _HALF = "half a character (a lone surrogate)"
 _ESCAPED_HALF = re.compile(r"\\u[dD][89a-fA-F]")
 _QUOTED = re.compile(r'"(?:[^"\\]|\\.)*"')
@@ -165,6 +166,13 @@ def take_camera_name(content: object, where: str, error: type[V2hdmError]) -> st
     if name.lower() in ALL_CAMERAS:
         raise error(f"{where}: a camera is called {shown(name)}, as results of all are; choose another")
     return name
+
+
+def number_key(name: str) -> tuple[list[str | int], str]:
+    """A key that sorts names by the numbers in them, as numbers; names of equal numbers by their letters."""
+    parts: list[str | int] = [*_NUMBERS.split(name)]
+    parts[1::2] = [int(digits) for digits in _NUMBERS.findall(name)]
+    return parts, name
 
 
 class _Loader(yaml.SafeLoader):

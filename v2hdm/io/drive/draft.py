@@ -8,15 +8,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from v2hdm.errors import DriveError
 from v2hdm.io.description import DRIVE_FILE
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.images import ReadOptions
-from v2hdm.io.drive.sources import SUFFIXES
+from v2hdm.io.drive.sources import list_folder
 from v2hdm.io.importers.bag.describe import LENS, MOUNTING, ORIGIN, BagDescription
 from v2hdm.io.importers.bag.reading import is_bag
+from v2hdm.io.stamps import ZONES, times_of_names
 from v2hdm.safe.fields import take_frame
 from v2hdm.safe.texts import ALL_CAMERAS, MOST_NAME_LETTERS, parse_yaml
 from v2hdm.store.files import dump_yaml, replace_text
@@ -25,7 +24,9 @@ _POSES = (
     "a log of poses, with the antenna's place, m forward, left, up of the ground under the rear axle: "
     "{nmea: route.nmea, lever_arm_m: [1.2, 0, 1.8]}"
 )
-_UNITS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))  # least times of this century, by their unit; smaller: s
+_EITHER = ("stamps", "start_s", "unit")  # keys of images of which one tells their times
+_RAW_SUFFIXES = (".h264", ".264", ".avc", ".h265", ".265", ".hevc", ".mjpeg", ".mjpg", ".obu")
+"""Suffixes of streams of frames without times."""
 
 
 def draft_drive(source: Path, folder: Path, settings: Sequence[str]) -> dict[str, str]:
@@ -48,7 +49,10 @@ def draft_drive(source: Path, folder: Path, settings: Sequence[str]) -> dict[str
         is_name = key.endswith(("topic", "frame"))
         _put(content, key.split("."), value if is_name else _beside(value, folder))
         for asked_key in list(missing):
-            if f"{key}.".startswith(f"{asked_key}.") or asked_key.startswith(f"{key}."):
+            entry, _, last = asked_key.rpartition(".")
+            is_same = f"{key}.".startswith(f"{asked_key}.") or asked_key.startswith(f"{key}.")
+            is_alternative = last in _EITHER and key in [f"{entry}.{name}" for name in _EITHER]
+            if is_same or is_alternative:
                 del missing[asked_key]
     if missing:
         return missing
@@ -96,25 +100,37 @@ def _draft_of(source: Path, folder: Path, vehicle_frame: object) -> _Draft:
     missing |= {f"cameras.{name}.mounting": MOUNTING.format(origin=ORIGIN)}
     if source.is_dir():
         images = {"folder": _relative(source, folder)}
-        stems = [path.stem for path in source.iterdir() if path.suffix.lower() in SUFFIXES]
-        if not stems:
+        paths = list_folder(source)
+        if not paths:
             raise DriveError(
                 f"{source}: not a bag, a video or a folder of images; --write needs one of these"
             )
-        try:
-            stamps = [float(stem) for stem in stems]
-            if not np.isfinite(stamps).all():  # "nan" and "inf" are numbers to Python, and no times
-                raise ValueError
-            latest = max(stamps)
-            images["unit"] = next((unit for least, unit in _UNITS if latest >= least), "s")
-        except ValueError:
-            missing[f"cameras.{name}.images.stamps"] = "a file with a time in s per image: times.txt"
+        if not _tell_times(paths, None):
+            if _tell_times(paths, "utc"):
+                missing[f"cameras.{name}.images.unit"] = (
+                    f"the clock of the dates in the images' names: {ZONES}"
+                )
+            else:
+                missing[f"cameras.{name}.images.stamps"] = (
+                    "a file with a time in s per image: times.txt, or unit: s, ms, us or ns of times as names"
+                )
     else:
         images = {"video": _relative(source, folder)}
-        missing[f"cameras.{name}.images.start_s"] = (
-            "the first frame's time on the poses' clock, s: 1715934630.25"
-        )
+        if source.suffix.lower() in _RAW_SUFFIXES:
+            missing[f"cameras.{name}.images.stamps"] = "a file with a time in s per frame: times.txt"
+        else:
+            missing[f"cameras.{name}.images.start_s"] = (
+                "the first frame's time on the poses' clock, s: 1715934630.25"
+            )
     return _Draft({"name": folder.resolve().name, "cameras": {name: {"images": images}}}, missing)
+
+
+def _tell_times(paths: Sequence[Path], unit: str | None) -> bool:
+    try:
+        times_of_names([path.stem for path in paths], unit, "")
+    except DriveError:
+        return False
+    return True
 
 
 def _refuse_unused(content: Mapping[str, Any], settings: Sequence[str]) -> None:

@@ -83,20 +83,6 @@ def headings_only(attitudes: Attitudes | None) -> Readings:
     return Readings(none[:, 0], none, True, none[:, 0], attitudes)
 
 
-def read_stamps(path: Path, count: int, things: str) -> FloatArray:
-    """Times (``count``,) in s, one per line; raises DriveError where there are not as many as ``things``."""
-    stamp_s = np.array(
-        [
-            parse_number(line, f"{path}: line {number}")
-            for number, line in enumerate(read_text(path, DriveError).splitlines(), start=1)
-            if line.strip() and not line.lstrip().startswith("#")
-        ]
-    )
-    if len(stamp_s) != count:
-        raise DriveError(f"{path}: {len(stamp_s)} times for {count} {things}; give one of each")
-    return stamp_s
-
-
 _STAMPS: Mapping[str, float] = {f"stamp_{unit}": scale for unit, scale in UNITS.items()}
 _MAP = ("x_m", "y_m", "z_m")
 _GEODETIC = ("latitude_deg", "longitude_deg", "altitude_m")

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 
@@ -21,7 +20,7 @@ from v2hdm.ground.results import GroundEstimate
 from v2hdm.io.drive import as_drive
 from v2hdm.io.drive.road import unevenness
 from v2hdm.records import FOOT_M, Camera, CameraInfo, CentrePrior, Drive, FloatArray
-from v2hdm.settings import PROCESSES
+from v2hdm.settings import Processes
 from v2hdm.verdict.inputs import ground as ground_checks
 from v2hdm.verdict.inputs.ground import check_ground, find_cause, path_of
 from v2hdm.verdict.inputs.heading import check_heading
@@ -293,7 +292,7 @@ def check_drive(
     drive: Drive | str | Path,
     *,
     ground: bool | Mapping[str, GroundEstimate] = True,
-    workers: Annotated[int, PROCESSES] = 1,
+    workers: Processes = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> Verdict:
     """Check a drive before any long work: poses, clocks, noise, cameras, images, and bare ground.

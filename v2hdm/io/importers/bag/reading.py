@@ -75,7 +75,8 @@ def bag_files(path: Path) -> list[Path]:
 
 def _parts(path: Path) -> list[Path]:
     endings = (*SUFFIXES, ".db3.zstd", ".mcap.zstd")
-    return sorted(file for file in path.iterdir() if file.is_file() and file.name.endswith(endings))
+    files = (file for file in path.iterdir() if file.is_file() and not file.name.startswith("."))
+    return sorted(file for file in files if file.name.endswith(endings))
 
 
 class Bag:
