@@ -67,6 +67,27 @@ class CentrePrior:
 
 
 @dataclass(frozen=True)
+class FrameStep:
+    """An edge of a tree of frames; ``parent_from_child`` (4, 4) is None where the tree lacks it."""
+
+    parent: str
+    child: str
+    parent_from_child: FloatArray | None
+
+
+@dataclass(frozen=True)
+class CameraFrames:
+    """A camera's place in the tree of frames of its vehicle, by the tree's own names; empty if not stated."""
+
+    vehicle: str = ""  # the frame that the drive's positions on the vehicle count from
+    camera: str = ""  # the frame of the images
+    height_m: float = 0.0  # of ``vehicle`` above the ground
+    steps: tuple[FrameStep, ...] = ()  # from ``vehicle`` to ``camera``; none where the vehicle has no tree
+    problem: str = ""  # why there are no steps
+    states_height: bool = False  # of the camera above ``vehicle``, which a homography of the ground does not
+
+
+@dataclass(frozen=True)
 class Camera:
     """One camera of a drive: its intrinsics and approximate mounting."""
 
@@ -80,6 +101,7 @@ class Camera:
     own_vehicle: BoolArray | None = None  # (height, width) pixels that show the vehicle
     mounting_sigma: tuple[float, float] = (0.0, 0.0)  # of a guessed horizon (rad) and log focal length
     read_out_s: float = 0.0  # first row to last, 0 for a global shutter; stamps are of the middle row
+    frames: CameraFrames = CameraFrames()
 
 
 @dataclass(frozen=True)
@@ -565,6 +587,7 @@ class Calibration:
     info: CameraInfo
     cam_from_vehicle: FloatArray
     covariance: FloatArray | None = None
+    frames: CameraFrames = CameraFrames()
 
     @property
     def centre_vehicle(self) -> FloatArray:

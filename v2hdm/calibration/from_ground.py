@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from v2hdm.doors import checked
@@ -17,7 +17,7 @@ from v2hdm.records import Calibration, Drive
 from v2hdm.settings import Processes
 from v2hdm.store.files import write_json
 from v2hdm.store.names import VERDICT, calibration_file
-from v2hdm.verdict import Finding, Status, Verdict, check_drive
+from v2hdm.verdict import Finding, Status, Verdict, check_drive, known_frames
 from v2hdm.verdict.inputs.ground import MATCH, PATH
 
 # Each parameter's name, and the factor and unit that people read it in.
@@ -133,4 +133,6 @@ def write_ground_calibration(calibrated: GroundCalibration, folder: Path) -> Non
     write_json(folder / VERDICT, verdict)
     about = Provenance.today(calibrated.drive.name, verdict)
     for name, calibration in calibrated.calibrations.items():
+        frames = known_frames(calibrated.drive.cameras[name], calibrated.verdict)
+        calibration = replace(calibration, frames=frames)
         write_calibration(calibration, folder / calibration_file(name), verdict=verdict, about=about)

@@ -178,6 +178,7 @@ class CameraEntry:
     linear_response: Annotated[bool, "whether grey values are proportional to light; else sRGB."] = False
     mask: Annotated[str | None, "image, white where the vehicle itself is visible."] = None
     read_out_s: Annotated[float, NOT_NEGATIVE, "read-out time of a rolling shutter."] = 0.0
+    frame: Annotated[str | None, "the vehicle's name for the frame of the images, x right, z ahead."] = None
 
 
 @dataclass(kw_only=True)
@@ -195,6 +196,10 @@ class DriveDescription:
         PoseNoise | None, "standard deviations from the receiver's data sheet, and their drifts."
     ] = None
     origin: Annotated[GeodeticOrigin | None, "the place of the map's origin on the earth."] = None
+    vehicle_frame: Annotated[
+        str | None, "the vehicle's name for the frame that positions on it count from."
+    ] = None
+    vehicle_frame_height_m: Annotated[float, "height of that frame's origin above the ground, m."] = 0.0
     truth: Annotated[str | None, "folder of the ground truth; only rendered drives have it."] = None
 
 

@@ -12,6 +12,8 @@ from v2hdm.store.files import check_keys, take_array, take_mapping, take_number,
 
 _log = logging.getLogger(__name__)
 
+_LONGEST_NAME = 255  # letters of a frame's name; chosen
+_HIGHEST_FRAME_M = 12.0  # of a vehicle above the ground, straddle carriers included
 _LONGEST_DATUM = 200  # letters of a datum's name; chosen
 _LARGEST_PX = 65535  # side of an image: JPEG has no larger one
 _LONGEST_FOCAL_PX = 1e6  # focal length, or offset of the centre, of any camera; chosen
@@ -31,6 +33,22 @@ def take_whole(content: object, least: int, most: int, where: str, error: type[V
     if value != int(value) or not least <= value <= most:
         raise error(f"{where}: expected a whole number of {least} to {most}, got {value:g}; fix it")
     return int(value)
+
+
+def take_frame(content: object, where: str, error: type[V2hdmError]) -> str:
+    """``content`` as the name of a frame of TF, without the slash that old recorders put before it."""
+    name = take_text(content, where, error).lstrip("/")
+    if not name or len(name) > _LONGEST_NAME or not name.isprintable() or " " in name:
+        raise error(f"{where}: {shown(content)} is not the name of a frame, such as base_link; fix it")
+    return name
+
+
+def take_frame_height(content: object, where: str, error: type[V2hdmError]) -> float:
+    """``content`` as the height, m, of a vehicle's frame above the ground."""
+    height_m = take_number(content, where, error)
+    if abs(height_m) > _HIGHEST_FRAME_M:
+        raise error(f"{where}: {height_m:g} m is not the height of a vehicle's frame; give metres")
+    return height_m
 
 
 def take_origin(content: object, where: str, error: type[V2hdmError]) -> GeodeticOrigin | None:

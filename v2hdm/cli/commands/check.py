@@ -30,10 +30,12 @@ def _run(arguments: Sequence[str]) -> int:
         print(list_topics(parsed.drive, Path(ReadOptions().cache)))
         return 0
     from v2hdm.ground.estimate import estimate_cameras
+    from v2hdm.io.description import DRIVE_FILE
     from v2hdm.store.files import write_json
     from v2hdm.store.names import VERDICT
     from v2hdm.verdict import check_drive
     from v2hdm.verdict.check import draw_check
+    from v2hdm.verdict.inputs.origin import HEIGHT, frame_of, height_to_state
 
     if parsed.set and not parsed.write:
         parser.error("--set is for --write")
@@ -55,6 +57,14 @@ def _run(arguments: Sequence[str]) -> int:
         ground = estimate_cameras(drive, parsed.workers, matched) if parsed.ground else {}
         print("check the drive", file=sys.stderr, flush=True)
         verdict = check_drive(drive, ground=ground)
+        is_asked = parsed.write and not any(given.startswith(f"{HEIGHT}=") for given in parsed.set)
+        if is_asked and (height_m := height_to_state(drive, verdict)) is not None:
+            (parsed.write / DRIVE_FILE).unlink()
+            raise DriveError(
+                f"{parsed.write / DRIVE_FILE}: not written: bare ground contradicts the cameras' heights; "
+                f"also give the height of {frame_of(drive)} above the ground, such as the axle's, or 0: "
+                f"--set {HEIGHT}={height_m:.2f}"
+            )
         write_json(unfinished / VERDICT, verdict.as_json())
         draw_check(drive, unfinished, ground)
     passed = [finding.line for finding in verdict.passed if parsed.all]

@@ -13,9 +13,10 @@ from v2hdm.io.description import DRIVE_FILE
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.images import ReadOptions
 from v2hdm.io.drive.sources import list_folder
-from v2hdm.io.importers.bag.describe import LENS, MOUNTING, BagDescription
+from v2hdm.io.importers.bag.describe import LENS, MOUNTING, ORIGIN, BagDescription
 from v2hdm.io.importers.bag.reading import is_bag
 from v2hdm.io.stamps import ZONES, times_of_names
+from v2hdm.safe.fields import take_frame
 from v2hdm.safe.texts import ALL_CAMERAS, MOST_NAME_LETTERS, parse_yaml
 from v2hdm.store.files import dump_yaml, replace_text
 
@@ -39,16 +40,14 @@ def draft_drive(source: Path, folder: Path, settings: Sequence[str]) -> dict[str
     where = folder / DRIVE_FILE
     if os.path.lexists(where):  # a link to a file that is gone is the user's, too
         raise DriveError(f"{where}: exists; edit it, or choose another folder for --write")
-    draft = _draft_of(source, folder)
+    values = _values_of(settings)
+    draft = _draft_of(source, folder, values.get("vehicle_frame"))
     content = draft.content
     missing = draft.missing
     _refuse_unused(content, settings)
-    for setting in settings:
-        key, equals, text = setting.partition("=")
-        if not (key and equals):
-            raise DriveError(f"--set {setting}: give KEY=VALUE, such as cameras.front.camera_info=front.yaml")
-        value = parse_yaml(text, f"--set {key}", DriveError)
-        _put(content, key.split("."), _beside(value, folder) if not key.endswith("topic") else value)
+    for key, value in values.items():
+        is_name = key.endswith(("topic", "frame"))
+        _put(content, key.split("."), value if is_name else _beside(value, folder))
         for asked_key in list(missing):
             entry, _, last = asked_key.rpartition(".")
             is_same = f"{key}.".startswith(f"{asked_key}.") or asked_key.startswith(f"{key}.")
@@ -67,6 +66,17 @@ def draft_drive(source: Path, folder: Path, settings: Sequence[str]) -> dict[str
     return {}
 
 
+def _values_of(settings: Sequence[str]) -> dict[str, object]:
+    """The values of ``KEY=VALUE`` by their dotted keys."""
+    values: dict[str, object] = {}
+    for setting in settings:
+        key, equals, text = setting.partition("=")
+        if not (key and equals):
+            raise DriveError(f"--set {setting}: give KEY=VALUE, such as cameras.front.camera_info=front.yaml")
+        values[key] = parse_yaml(text, f"--set {key}", DriveError)
+    return values
+
+
 class _Draft(NamedTuple):
     """What a recording tells of its drive."""
 
@@ -74,17 +84,20 @@ class _Draft(NamedTuple):
     missing: dict[str, str]  # dotted keys, with what to give for each
 
 
-def _draft_of(source: Path, folder: Path) -> _Draft:
-    """The draft of a ``drive.yaml`` in ``folder`` for a recording."""
+def _draft_of(source: Path, folder: Path, vehicle_frame: object) -> _Draft:
+    """The draft of a ``drive.yaml`` in ``folder`` for a recording; its user may name the vehicle's frame."""
     if is_bag(source):
-        bag = BagDescription(source, Path(ReadOptions().cache))
+        if vehicle_frame is not None:
+            vehicle_frame = take_frame(vehicle_frame, "--set vehicle_frame", DriveError)
+        bag = BagDescription(source, Path(ReadOptions().cache), vehicle_frame=vehicle_frame)
         about = {"name": folder.resolve().name, "bag": _relative(source, folder)}
         return _Draft(bag.content | about, bag.missing)
     if not source.exists():
         raise DriveError(f"{source}: no such bag, video or folder of images; check the path")
     name = _camera_of(source)
     missing = {"poses": _POSES}
-    missing |= {f"cameras.{name}.camera_info": LENS, f"cameras.{name}.mounting": MOUNTING}
+    missing |= {f"cameras.{name}.camera_info": LENS}
+    missing |= {f"cameras.{name}.mounting": MOUNTING.format(origin=ORIGIN)}
     if source.is_dir():
         images = {"folder": _relative(source, folder)}
         paths = list_folder(source)

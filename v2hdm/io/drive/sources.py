@@ -17,7 +17,7 @@ from v2hdm.io.description import FolderImages, InfoFile, TopicImages, VideoImage
 from v2hdm.io.drive.images import ImageFiles
 from v2hdm.io.image_lists import read_image_list, read_stamps
 from v2hdm.io.importers.bag import streams
-from v2hdm.io.importers.bag.messages import TF_TOPIC
+from v2hdm.io.importers.bag.frames import TF_TOPIC
 from v2hdm.io.importers.readings import Readings, readings_of_poses
 from v2hdm.io.stamps import ZONES, is_unit, number_order, times_of_names
 from v2hdm.io.trajectory import UNITS, image_order
@@ -117,7 +117,7 @@ def plan_topic_poses(content: object, sources: Sources, where: str) -> Callable[
             if key not in content:
                 raise DriveError(f"{where}: add {key} for {TF_TOPIC}: the map's or the vehicle's frame")
         dst, src = (take_text(content[key], f"{where}, {key}", DriveError) for key in ("frame", "vehicle"))
-        tf = streams.TfStream(True, where)
+        tf = streams.TfStream(where)
         tf_folder = sources.want(tf)
         return lambda: readings_of_poses(tf.frames(tf_folder()).moving(dst, src, sources.max_gap_s, where))
     for key in ("frame", "vehicle"):

@@ -46,6 +46,8 @@ def write_drive(folder: Path, drive: Drive, trajectory: Trajectory) -> None:
             entry["centre_prior"] = surveyed
         if camera.read_out_s:
             entry["read_out_s"] = camera.read_out_s
+        if camera.frames.camera:
+            entry["frame"] = camera.frames.camera
         entries[name] = entry
     write_tum(trajectory, folder / POSES_FILE)
     noise = asdict(drive.pose_noise)
@@ -54,6 +56,8 @@ def write_drive(folder: Path, drive: Drive, trajectory: Trajectory) -> None:
         content["origin"] = asdict(drive.origin)
     if drive.truth_dir is not None:
         content["truth"] = drive.truth_dir.relative_to(folder).as_posix()
+    if vehicle := next((camera.frames.vehicle for camera in drive.cameras.values()), ""):
+        content["vehicle_frame"] = vehicle
     content["cameras"] = entries
     replace_text(folder / DRIVE_FILE, dump_yaml(content))
 

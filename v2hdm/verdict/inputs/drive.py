@@ -24,6 +24,8 @@ from v2hdm.settings import Processes
 from v2hdm.verdict.inputs import ground as ground_checks
 from v2hdm.verdict.inputs.ground import check_ground, find_cause, path_of
 from v2hdm.verdict.inputs.heading import check_heading
+from v2hdm.verdict.inputs.origin import CHECK as ORIGIN_HEIGHT
+from v2hdm.verdict.inputs.origin import check_origin_height
 from v2hdm.verdict.inputs.poses import Motion, check_attitude, check_jumps, check_noise, check_path
 from v2hdm.verdict.inputs.recording import check_clocks, check_images
 from v2hdm.verdict.verdict import Finding, Status, Verdict, judge, passed
@@ -250,7 +252,7 @@ _LEAST_SWAY_RAD = 0.003  # roll and pitch of every vehicle on its suspension, wh
 _STEPS = ("position jumps", "height jumps", "pose scatter", "image spacing", "pose gaps", "pose rate")
 _MOUNTING = ("roi", "roi range", "ipm against camera matrix", "camera height", "survey against guess")
 _SURVEY = ("survey height", "survey forward", "survey left")
-_GROUND = ground_checks.CHECKS
+_GROUND = (*ground_checks.CHECKS, ORIGIN_HEIGHT)
 
 HIDES: Mapping[str, tuple[str, ...]] = {
     "path length": (*_STEPS, *_GROUND),
@@ -264,6 +266,7 @@ HIDES: Mapping[str, tuple[str, ...]] = {
     "pose noise": _GROUND,
     "height jumps": ("road", "grade", "ground match", "ground residual", "poses against ground"),
     "origin": ("survey forward", "poses against ground"),
+    ORIGIN_HEIGHT: ("survey height",),
     "own images": ("frozen images", *_GROUND),
     "bright images": ("frozen images", "ground match"),
     "dark images": ("frozen images", "ground match"),
@@ -337,6 +340,7 @@ def input_findings(drive: Drive, ground: Mapping[str, GroundEstimate] | None = N
     explained = any("ground match" in HIDES.get(f.check, ()) for f in findings if f.status is not Status.PASS)
     # Where the ground never matches and nothing else explains that, usual mistakes are tried.
     findings += check_ground(drive, ground, None if explained else find_cause(drive, ground))
+    findings += check_origin_height(drive, ground)
     return causes(findings)
 
 
