@@ -8,9 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from v2hdm.errors import DriveError
-from v2hdm.io.image_lists import read_image_list, read_stamps
+from v2hdm.io.image_lists import image_order, read_image_list, read_stamps
 from v2hdm.io.stamps import number_order, times_of_names
-from v2hdm.io.trajectory import image_order
 
 START_NS = 1_715_934_611_031_491_007
 STEP_NS = 33_300_217

@@ -21,7 +21,7 @@ from v2hdm.geometry.ipm import (
     project_ground,
 )
 from v2hdm.geometry.lens import distort_points, undistort_points
-from v2hdm.io.importers.readings import read_rows
+from v2hdm.io.rows import read_rows
 from v2hdm.io.trajectory import parse_number
 from v2hdm.records import BoolArray, CameraInfo, FloatArray
 from v2hdm.verdict.verdict import Finding, Status, judge, passed

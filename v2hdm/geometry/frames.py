@@ -31,8 +31,8 @@ def edges_of(frames: CameraFrames, cam_from_vehicle: FloatArray) -> list[FrameSt
     for place, (step, down) in enumerate(zip(frames.steps, is_down, strict=True)):
         near_from_frame = inverse(_chained(near_from_far[:place]))
         cam_from_far = inverse(_chained(near_from_far[place + 1 :]))
-        near = near_from_frame @ frame_from_cam @ cam_from_far
-        edge = FrameStep(step.parent, step.child, near if down else inverse(near))
+        near_from_far_end = near_from_frame @ frame_from_cam @ cam_from_far
+        edge = FrameStep(step.parent, step.child, near_from_far_end if down else inverse(near_from_far_end))
         if step.parent_from_child is None:
             return [edge]
         edges.append(edge)

@@ -1,4 +1,4 @@
-"""Lists of images and files of times: what a folder drive says of the times of its images."""
+"""Times of images: lists of images, files of times, and the order of images by them."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ import numpy as np
 
 from v2hdm.errors import DriveError, shown
 from v2hdm.io.stamps import seconds_of
-from v2hdm.io.trajectory import UNITS, content_lines, image_order, parse_number
-from v2hdm.records import FloatArray
+from v2hdm.io.trajectory import LATE_S, LONGEST_S, UNITS, content_lines, parse_number
+from v2hdm.records import BoolArray, FloatArray, IntArray
 from v2hdm.store.files import read_text, replace_text
 
 _log = logging.getLogger(__name__)
 
 _APPLE_DOUBLE = "._"  # begins the names of files that macOS writes beside others
 _TIMECODES = ("# timecode format v2", "# timestamp format v2")  # first lines of Matroska's, in ms
+_MOST_DOUBLED = 0.25  # share of images whose time repeats, chosen: more are of two cameras
 
 
 class ImageList(NamedTuple):
@@ -82,3 +83,61 @@ def write_image_list(stamp_s: FloatArray, names: Sequence[str], path: Path) -> N
     """Write ``timestamp filename`` lines with nanoseconds, atomically."""
     lines = [f"{stamp:.9f} {name}" for stamp, name in zip(stamp_s, names, strict=True)]
     replace_text(path, "\n".join(["# timestamp filename", *lines]) + "\n")
+
+
+def has_time(stamp_s: FloatArray, where: str, what: str) -> BoolArray:
+    """Which stamps (N,) are times: 0 is none but of a clock that begins there; refuses if most are none."""
+    is_zero = stamp_s == 0
+    others = stamp_s[~is_zero]
+    begins = is_zero.sum() == 1 and (not len(others) or np.abs(others).min() <= LONGEST_S)
+    if begins or not is_zero.any():
+        return np.ones(len(stamp_s), dtype=bool)
+    if 2 * is_zero.sum() > len(stamp_s):
+        raise DriveError(
+            f"{where}: {is_zero.sum()} of {len(stamp_s)} {what}s have no time (0); record them with times, "
+            "or set stamps: received for a topic: its recorder's, late by the computer's delay"
+        )
+    return np.asarray(~is_zero)
+
+
+def image_order(
+    stamp_s: FloatArray,
+    where: str,
+    what: str = "image",
+    numbers: Sequence[int] | None = None,
+    together: bool = True,
+) -> IntArray:
+    """Rows (K,) of images by time, the first of equal times, without those without a time; logs how many.
+
+    ``numbers`` are those of the rows in messages. Where images come ``together``, as they are taken, a second
+    or more too late is of another clock or recording. Raises DriveError for that, or if too many repeat.
+    """
+    numbers = range(1, len(stamp_s) + 1) if numbers is None else numbers
+    rows = np.flatnonzero(has_time(stamp_s, where, what))
+    kept_s = stamp_s[rows]
+    latest_s = np.maximum.accumulate(kept_s)
+    late = kept_s < latest_s
+    wrong = np.flatnonzero(latest_s - kept_s >= LATE_S)
+    if together and len(wrong):
+        k = int(wrong[0])
+        before = int(np.flatnonzero(kept_s == latest_s[k])[0])
+        raise DriveError(
+            f"{where}: {what} {numbers[rows[k]]}: its time {kept_s[k]:.6f} s is "
+            f"{latest_s[k] - kept_s[k]:.3f} s before that of {what} {numbers[rows[before]]} "
+            f"({latest_s[k]:.6f} s): two clocks or two recordings in one; keep one of them"
+        )
+    order = rows[np.unique(kept_s, return_index=True)[1]]
+    counts = {
+        f"sorted {what}s that were late": int(late.sum()),
+        f"dropped {what}s whose time repeats": len(rows) - len(order),
+        f"dropped {what}s without a time": len(stamp_s) - len(rows),
+    }
+    if len(rows) - len(order) > max(1, _MOST_DOUBLED * len(rows)):
+        raise DriveError(
+            f"{where}: the times of {len(rows) - len(order)} of {len(rows)} {what}s repeat; are they of two "
+            "cameras? Give each its own, with its times"
+        )
+    told = [f"{words}: {count}" for words, count in counts.items() if count]
+    if told:
+        _log.warning("%s: %s, of %d", where, ", ".join(told), len(stamp_s))
+    return order

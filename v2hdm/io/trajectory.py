@@ -17,7 +17,7 @@ import numpy as np
 
 from v2hdm.errors import DriveError, shown
 from v2hdm.geometry.rigid import make_transform, quaternion_from_rotation, rotation_from_quaternion
-from v2hdm.records import BoolArray, FloatArray, GeodeticOrigin, IntArray, Trajectory
+from v2hdm.records import FloatArray, GeodeticOrigin, IntArray, Trajectory
 from v2hdm.store.files import read_text, replace_text
 
 _log = logging.getLogger(__name__)
@@ -28,17 +28,16 @@ _NO_NUMBER = ("nan", "inf", "infinity", "null", "none", "na", "nan(ind)", "1.#in
 _UNIT = re.compile(r"[\[(](s|ms|us|ns)[\])]")
 _OLDEST_S = 9.5e8  # times since 1970 of recordings are later than this, February 2000
 _NEWEST_S = 4.1e9  # and earlier than this, December 2099
-_MOST_DOUBLED = 0.25  # share of images whose time repeats, chosen: more are of two cameras
 _COLUMNS = "timestamp tx ty tz qx qy qz qw"
 _FARTHEST_M = 1e8  # coordinates on the earth end at ten thousand kilometres
 _FARTHEST_FROM_ORIGIN_M = 1e5  # a map is flat, and there the ground is 800 m below it
 _STRAYS = 0.05  # share of times out of order up to which these are left out; more are of two recordings
-_LATE_S = 1.0  # a reading that comes later than this after its successor is of another clock or recording
+LATE_S = 1.0  # a reading that comes later than this after its successor is of another clock or recording
 
 _UNITS: Mapping[str, float] = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 """How many of each unit, in which stamps may be by mistake, make a second."""
 
-_LONGEST_S = 5.0  # longest time between two poses, or images, of a drive; chosen
+LONGEST_S = 5.0  # longest time between two poses, or images, of a drive; chosen
 _QUICKEST_S = 5e-4  # shortest time between two poses, or images, of a drive; chosen
 _ALIKE = 5.0  # poses and images of one drive last equally long to within this factor
 _SAME_SPAN_S = 1.5  # images and poses that one start and stop recorded begin and end so closely; chosen
@@ -249,13 +248,13 @@ def in_order(stamp_s: FloatArray, where: str, what: str = "line") -> IntArray:
         row = int(np.argmin(np.isfinite(stamp_s))) + 1
         raise DriveError(f"{where}: {what} {row}: its time is not finite")
     late_s = np.maximum.accumulate(stamp_s) - stamp_s
-    if late_s.max() < _LATE_S:
+    if late_s.max() < LATE_S:
         return np.unique(stamp_s, return_index=True)[1]
     rows = _longest_rising(stamp_s)
     strays = len(stamp_s) - len(rows)
     late_among_s = np.maximum.accumulate(stamp_s[rows]) - stamp_s[rows]
-    if strays > _STRAYS * len(stamp_s) or late_among_s.max() >= _LATE_S:
-        k = int(np.argmax(late_s >= _LATE_S))
+    if strays > _STRAYS * len(stamp_s) or late_among_s.max() >= LATE_S:
+        k = int(np.argmax(late_s >= LATE_S))
         raise DriveError(
             f"{where}: {what} {k + 1}: its time {stamp_s[k]:.3f} s is {late_s[k]:.3f} s before that of an "
             "earlier one: two clocks or two recordings in one; keep one of them"
@@ -280,64 +279,6 @@ def _longest_rising(stamp_s: FloatArray) -> IntArray:
         rows.append(row)
         row = before[row]
     return np.array(rows[::-1])
-
-
-def has_time(stamp_s: FloatArray, where: str, what: str) -> BoolArray:
-    """Which stamps (N,) are times: 0 is none but of a clock that begins there; refuses if most are none."""
-    is_zero = stamp_s == 0
-    others = stamp_s[~is_zero]
-    begins = is_zero.sum() == 1 and (not len(others) or np.abs(others).min() <= _LONGEST_S)
-    if begins or not is_zero.any():
-        return np.ones(len(stamp_s), dtype=bool)
-    if 2 * is_zero.sum() > len(stamp_s):
-        raise DriveError(
-            f"{where}: {is_zero.sum()} of {len(stamp_s)} {what}s have no time (0); record them with times, "
-            "or set stamps: received for a topic: its recorder's, late by the computer's delay"
-        )
-    return np.asarray(~is_zero)
-
-
-def image_order(
-    stamp_s: FloatArray,
-    where: str,
-    what: str = "image",
-    numbers: Sequence[int] | None = None,
-    together: bool = True,
-) -> IntArray:
-    """Rows (K,) of images by time, the first of equal times, without those without a time; logs how many.
-
-    ``numbers`` are those of the rows in messages. Where images come ``together``, as they are taken, a second
-    or more too late is of another clock or recording. Raises DriveError for that, or if too many repeat.
-    """
-    numbers = range(1, len(stamp_s) + 1) if numbers is None else numbers
-    rows = np.flatnonzero(has_time(stamp_s, where, what))
-    kept_s = stamp_s[rows]
-    latest_s = np.maximum.accumulate(kept_s)
-    late = kept_s < latest_s
-    wrong = np.flatnonzero(latest_s - kept_s >= _LATE_S)
-    if together and len(wrong):
-        k = int(wrong[0])
-        before = int(np.flatnonzero(kept_s == latest_s[k])[0])
-        raise DriveError(
-            f"{where}: {what} {numbers[rows[k]]}: its time {kept_s[k]:.6f} s is "
-            f"{latest_s[k] - kept_s[k]:.3f} s before that of {what} {numbers[rows[before]]} "
-            f"({latest_s[k]:.6f} s): two clocks or two recordings in one; keep one of them"
-        )
-    order = rows[np.unique(kept_s, return_index=True)[1]]
-    counts = {
-        f"sorted {what}s that were late": int(late.sum()),
-        f"dropped {what}s whose time repeats": len(rows) - len(order),
-        f"dropped {what}s without a time": len(stamp_s) - len(rows),
-    }
-    if len(rows) - len(order) > max(1, _MOST_DOUBLED * len(rows)):
-        raise DriveError(
-            f"{where}: the times of {len(rows) - len(order)} of {len(rows)} {what}s repeat; are they of two "
-            "cameras? Give each its own, with its times"
-        )
-    told = [f"{words}: {count}" for words, count in counts.items() if count]
-    if told:
-        _log.warning("%s: %s, of %d", where, ", ".join(told), len(stamp_s))
-    return order
 
 
 def why_no_pose(
@@ -404,7 +345,7 @@ def known_offset(
 def unit_of(stamp_s: FloatArray) -> str | None:
     """The unit of stamps (N,) that cannot be seconds, None where they can."""
     step_s = float(np.median(np.diff(stamp_s))) if len(stamp_s) > 1 else 0.0
-    if step_s <= _LONGEST_S and stamp_s[-1] < _LATEST_S:
+    if step_s <= LONGEST_S and stamp_s[-1] < _LATEST_S:
         return None
     for unit, scale in _UNITS.items():
         if _QUICKEST_S <= step_s / scale <= 1.0 and stamp_s[-1] / scale < _LATEST_S:

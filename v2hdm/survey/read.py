@@ -18,7 +18,7 @@ import numpy as np
 
 from v2hdm.errors import DriveError, shown
 from v2hdm.geometry import geodetic
-from v2hdm.io.importers.readings import read_rows
+from v2hdm.io.rows import read_rows
 from v2hdm.io.trajectory import parse_number
 from v2hdm.records import FOOT_M, FloatArray, GeodeticOrigin
 

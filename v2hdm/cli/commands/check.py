@@ -57,7 +57,7 @@ def _run(arguments: Sequence[str]) -> int:
         ground = estimate_cameras(drive, parsed.workers, matched) if parsed.ground else {}
         print("check the drive", file=sys.stderr, flush=True)
         verdict = check_drive(drive, ground=ground)
-        is_asked = parsed.write and not any(given.startswith(f"{HEIGHT}=") for given in parsed.set)
+        is_asked = parsed.write and not any(setting.startswith(f"{HEIGHT}=") for setting in parsed.set)
         if is_asked and (height_m := height_to_state(drive, verdict)) is not None:
             (parsed.write / DRIVE_FILE).unlink()
             raise DriveError(

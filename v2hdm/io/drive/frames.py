@@ -39,8 +39,10 @@ def plan_frames(
 
     def frames_of_cameras() -> Mapping[str, CameraFrames]:
         tree = Frames({}) if folder is None else stream.frames(folder())
-        own = tree.needed(vehicle, f"{where}: vehicle_frame") if vehicle else ""
-        return {camera: _frames_of(tree, own, names.get(camera, ""), height_m) for camera in entries}
+        vehicle_in_tree = tree.needed(vehicle, f"{where}: vehicle_frame") if vehicle else ""
+        return {
+            camera: _frames_of(tree, vehicle_in_tree, names.get(camera, ""), height_m) for camera in entries
+        }
 
     return frames_of_cameras
 
@@ -57,7 +59,7 @@ def _frames_of(tree: Frames, vehicle: str, name: str, height_m: float) -> Camera
         return CameraFrames(vehicle, camera, height_m, problem=link.problem)
     # The camera's driver knows its own frames alone: what they hang on is what the calibration tells.
     root = tree.root(camera)
-    own = tree.link(root, camera)
-    if own.steps is None:
-        return CameraFrames(vehicle, camera, height_m, problem=own.problem)
-    return CameraFrames(vehicle, camera, height_m, (FrameStep(vehicle, root, None), *own.steps))
+    driver_link = tree.link(root, camera)
+    if driver_link.steps is None:
+        return CameraFrames(vehicle, camera, height_m, problem=driver_link.problem)
+    return CameraFrames(vehicle, camera, height_m, (FrameStep(vehicle, root, None), *driver_link.steps))

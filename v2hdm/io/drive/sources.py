@@ -15,12 +15,12 @@ from v2hdm.io.calibration.intrinsics import read_intrinsics
 from v2hdm.io.calibration.reading import read_camera_info
 from v2hdm.io.description import FolderImages, InfoFile, TopicImages, VideoImages, keys_in
 from v2hdm.io.drive.images import ImageFiles
-from v2hdm.io.image_lists import read_image_list, read_stamps
+from v2hdm.io.image_lists import image_order, read_image_list, read_stamps
 from v2hdm.io.importers.bag import streams
 from v2hdm.io.importers.bag.frames import TF_TOPIC
 from v2hdm.io.importers.readings import Readings, readings_of_poses
 from v2hdm.io.stamps import ZONES, is_unit, number_order, times_of_names
-from v2hdm.io.trajectory import UNITS, image_order
+from v2hdm.io.trajectory import UNITS
 from v2hdm.records import CameraInfo, FloatArray
 from v2hdm.safe.child import Limits, in_child, next_step
 from v2hdm.safe.pixels import DECODER_OPTIONS, IMAGE_SUFFIXES, VIDEO_OPTIONS, is_image_name, png

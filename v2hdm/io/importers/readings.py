@@ -6,20 +6,20 @@ translates these names.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from v2hdm.errors import DriveError, one_line, shown
+from v2hdm.errors import DriveError, shown
 from v2hdm.geometry.rigid import rotation_from_euler
+from v2hdm.io.rows import read_rows
 from v2hdm.io.trajectory import UNITS, checked_rotations, in_order, parse_number
 from v2hdm.records import BoolArray, FloatArray, Trajectory
-from v2hdm.store.files import check_keys, read_text, take_mapping, take_text
+from v2hdm.store.files import check_keys, take_mapping, take_text
 
 SIGMA_OF_QUALITY_M: Mapping[int, float] = {
     0: np.inf,  # no fix
@@ -149,45 +149,6 @@ def _columns(path: Path, names: Mapping[str, str]) -> dict[str, FloatArray]:
         for name, place in place_of.items():
             table[name].append(_parse(name, cells[place], f"{path}: line {number}: {header[place]}"))
     return {name: np.array(values, dtype=np.float64) for name, values in table.items()}
-
-
-class Table(NamedTuple):
-    """A CSV file: the names in its first line, and the cells of each further line with its number."""
-
-    header: list[str]
-    rows: list[tuple[int, list[str]]]
-
-
-def read_rows(path: Path, separators: str, thing: str) -> Table:
-    """The names and the cells of a CSV file, each row as long as the line of names.
-
-    The first of ``separators`` in the line of names separates cells, else blanks do; ``#`` begins a comment.
-    """
-    text = read_text(path, DriveError)
-    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
-    lines = [*lines[:1], *(line for line in lines[1:] if not line[1].lstrip().startswith("#"))]
-    if len(lines) < 2:
-        raise DriveError(f"{path}: has no {thing}; expected a line of column names and one line per {thing}")
-    title = lines[0][1].lstrip("\ufeff# ")
-    separator = next((mark for mark in separators if mark in title), None)
-
-    def split(line: str) -> list[str]:
-        if separator is None:
-            cells = line.split()
-        else:
-            cells = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
-        return [one_line(cell) for cell in cells]
-
-    try:
-        header = split(title)
-        rows = [(number, split(line)) for number, line in lines[1:]]
-    except csv.Error as failure:
-        raise DriveError(f"{path}: is not a table ({failure}); fix its quotes or its longest cell") from None
-    for number, cells in rows:
-        if len(cells) != len(header):
-            problem = f"{len(cells)} cells under {len(header)} columns"
-            raise DriveError(f"{path}: line {number}: {problem}; fix that line")
-    return Table(header, rows)
 
 
 def _parse(name: str, cell: str, where: str) -> float:

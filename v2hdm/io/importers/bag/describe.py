@@ -238,15 +238,19 @@ class BagDescription:
             self.missing[f"cameras.{name}.camera_info"] = LENS
         else:
             entry["camera_info"] = {"topic": info.name}
-        known = self._frames.named(frame, self._vehicle) or frame
-        if known:
-            entry["frame"] = known
+        camera_frame = self._frames.named(frame, self._vehicle) or frame
+        if camera_frame:
+            entry["frame"] = camera_frame
         if "vehicle_frame" in self.missing:
             return entry
         vehicle_from_cam = self._vehicle_from(frame)
         if vehicle_from_cam is None:
             asked = MOUNTING.format(origin=self._origin)
-            problem = self._frames.link(self._vehicle, known).problem if known in self._frames.names else ""
+            problem = (
+                self._frames.link(self._vehicle, camera_frame).problem
+                if camera_frame in self._frames.names
+                else ""
+            )
             self.missing[f"cameras.{name}.mounting"] = f"{asked} ({problem})" if problem else asked
             return entry | {"mounting": "?"}
         angles_deg = np.degrees(mounting_angles(inverse(vehicle_from_cam)))
@@ -264,8 +268,8 @@ class BagDescription:
             return None
         if sensor == self._vehicle:
             return np.eye(4)
-        known = self._frames.named(sensor, self._vehicle)
-        return None if known is None else self._frames.fixed(self._vehicle, known)
+        sensor_frame = self._frames.named(sensor, self._vehicle)
+        return None if sensor_frame is None else self._frames.fixed(self._vehicle, sensor_frame)
 
 
 def _frames_of_topics(bag: Bag, names: set[str]) -> dict[str, str]:

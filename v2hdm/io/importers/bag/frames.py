@@ -25,9 +25,8 @@ ROW = 9
 
 _MOST_NAMES = 12  # of frames that a message lists
 
-# A joint that is held still moves by less, m and rad: noise of its encoder, play of a bracket.
-_STILL_M = 0.003
-_STILL_RAD = np.deg2rad(0.1)
+_STILL_M = 0.003  # largest shift of a joint that is held still, m: play of a bracket; chosen
+_STILL_RAD = np.deg2rad(0.1)  # largest turn of a joint that is held still, rad; chosen
 
 
 class Link(NamedTuple):
@@ -53,24 +52,24 @@ class Frames:
         """
         if name in self.names or not name:
             return name or None
-        alike = [known for known in self.names if known.endswith(f"/{name}") or name.endswith(f"/{known}")]
+        alike = [frame for frame in self.names if frame.endswith(f"/{name}") or name.endswith(f"/{frame}")]
         prefix = beside.rpartition("/")[0]
-        own = [known for known in alike if known.rpartition("/")[0] == prefix]
-        chosen = own if len(own) == 1 else alike
+        of_robot = [frame for frame in alike if frame.rpartition("/")[0] == prefix]
+        chosen = of_robot if len(of_robot) == 1 else alike
         return chosen[0] if len(chosen) == 1 else None
 
     def needed(self, name: str, where: str) -> str:
         """The tree's frame of that ``name``; DriveError where a tree has none, which says what it has."""
-        known = self.named(name) if self.names else name
-        if known is None:
+        frame = self.named(name) if self.names else name
+        if frame is None:
             first = ", ".join(self.names[:_MOST_NAMES])
             more = f" and {len(self.names) - _MOST_NAMES} more" if len(self.names) > _MOST_NAMES else ""
             raise DriveError(f"{where}: the bag's transforms have no frame '{name}'; they have {first}{more}")
-        return known
+        return frame
 
     def vehicles(self) -> list[str]:
         """Frames with the usual names of a vehicle's, with or without a prefix, the ground's ones first."""
-        return [known for name in VEHICLES for known in self.names if known.rpartition("/")[2] == name]
+        return [frame for name in VEHICLES for frame in self.names if frame.rpartition("/")[2] == name]
 
     def vehicle_of(self, cameras: Iterable[str]) -> str | None:
         """The vehicle's frame, by its usual names, that most of ``cameras`` hang on without moving."""
@@ -199,10 +198,10 @@ class Frames:
         around = self._path(dst, src, without=edge)
         if around is None or any(len(self._track(step).stamp_s) > 1 for step, _ in around):
             return ""
-        both = np.array([self._along(path), self._along(around)])
-        if _is_still(both):
+        poses_of_ways = np.array([self._along(path), self._along(around)])
+        if _is_still(poses_of_ways):
             return ""
-        shift_m, turn_rad = _spread(both)
+        shift_m, turn_rad = _spread(poses_of_ways)
         ways = " and on ".join(sorted({parent for parent, child in self._rows if child == edge[1]}))
         return (
             f"{edge[1]} hangs on {ways}, which puts {src} at two places on {dst}, {shift_m:.2g} m and "
