@@ -64,7 +64,7 @@ def vrt(source):
 
 
 def beside(url):
-    """What may lie beside a GeoTIFF, by the ending of its name."""
+    """Endings of the names of files that may lie beside a GeoTIFF."""
     files = f'<MDI key="X_DATASET">/vsicurl/{url}/x.tif</MDI><MDI key="Y_DATASET">/vsicurl/{url}/y.tif</MDI>'
     return {
         ".ovr": vrt(f"/vsicurl/{url}/overview.tif"),

@@ -1,4 +1,4 @@
-"""How well markings are known beside their neighbours."""
+"""Sigmas of markings beside their neighbours."""
 
 from dataclasses import replace
 

@@ -378,7 +378,7 @@ _OPSETS = re.compile(r"Opset (\d+) is under development.* support for domain (\S
 
 
 def _cause(error: Exception) -> str:
-    """What onnxruntime complains of, without where in its own code it does."""
+    """The complaint of onnxruntime, without the places of its own code."""
     text = one_line(_FRAME.sub("", str(error)))
     version = f"this onnxruntime {onnxruntime.__version__}"
     if match := _IR_VERSIONS.search(text):

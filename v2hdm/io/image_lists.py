@@ -86,7 +86,7 @@ def write_image_list(stamp_s: FloatArray, names: Sequence[str], path: Path) -> N
 
 
 def has_time(stamp_s: FloatArray, where: str, what: str) -> BoolArray:
-    """Which stamps (N,) are times: 0 is none but of a clock that begins there; refuses if most are none."""
+    """Flags (N,) of stamps that are times; 0 is one only of a clock that begins there. Refuses few times."""
     is_zero = stamp_s == 0
     others = stamp_s[~is_zero]
     begins = is_zero.sum() == 1 and (not len(others) or np.abs(others).min() <= LONGEST_S)

@@ -58,7 +58,7 @@ class Suspect(TypedDict):
 
 
 class LaneFigures(TypedDict, total=False):
-    """What is shown of the lane lines of a map."""
+    """The layer of the lane lines of a map."""
 
     length_m: Number
 
@@ -104,7 +104,7 @@ class CheckFigures(TypedDict, total=False):
 
 
 class ExtrinsicFigures(TypedDict, total=False):
-    """Where a camera sits, against what was stated before."""
+    """The place of a camera beside the one that was stated before."""
 
     certainty: str | None
     x_change_m: Number | None

@@ -108,7 +108,7 @@ def seconds_of(texts: Sequence[str], decimal_s: FloatArray, where: str) -> Float
 
 
 class _Kind(NamedTuple):
-    """What the digits after some points may be."""
+    """The kinds of numbers that the digits behind points may be."""
 
     may_be_decimal: bool
     digits: int  # of whole ms, us or ns written without the zeros before them; 0 where they are none
@@ -175,7 +175,7 @@ def _dates(stems: Sequence[str], unit: str | None, where: str) -> list[float] | 
 
 
 def _shifts(zones: Sequence[str | None], unit: str | None, where: str) -> list[int]:
-    """How far the clocks of dates are ahead of UTC, s."""
+    """The differences of the clocks of dates from UTC, s, positive where they are ahead."""
     if all(zones) and unit is None:
         return [_shift_of(re.sub("[^-+0-9]|(?<=.)-", "", zone or "")) for zone in zones]
     stated = _ZONE.fullmatch(unit or "")

@@ -321,7 +321,7 @@ def known_offset(
     asking: str = "images",
     asked: str = "poses",
 ) -> str | None:
-    """What two clocks are, where times of one begin and end as much later as such clocks differ."""
+    """The names of two clocks whose times begin and end as much apart as such clocks differ."""
     begins_s = float(image_span_s[0] - pose_span_s[0])
     ends_s = float(image_span_s[-1] - pose_span_s[-1])
     # Zones only shift times of a calendar.

@@ -102,7 +102,7 @@ def _warp(path: Path, window: Window, folder: Path) -> None:
 
 
 def _of_tiles(path: Path, window: Window) -> _Picture | None:
-    """What of a folder of tiles lies in a window; None where nothing does."""
+    """The pixels of a folder of tiles in a window; None where there are none."""
     rasterio = need("rasterio", "gis", "a background", MapFileError)
     places_m = _places_in(window, _WEB_MERCATOR, path)
     if not len(places_m):
@@ -118,7 +118,7 @@ def _of_tiles(path: Path, window: Window) -> _Picture | None:
 
 
 def _of_geotiff(path: Path, window: Window) -> _Picture | None:
-    """What of a GeoTIFF lies in a window, no finer than needed; None where nothing does."""
+    """The pixels of a GeoTIFF in a window, no finer than needed; None where there are none."""
     rasterio = need("rasterio", "gis", "a background", MapFileError)
     with _picture(path) as source:
         places = _places_in(window, source.crs, path)

@@ -86,7 +86,7 @@ def _pieces(data: Any, factor: int, piece_px: int) -> Iterator[tuple[Any, tuple[
 
 
 def _shown_cells(data: Any, factor: int, piece_px: int) -> int:
-    """How many cells of so many pixels a side show ground."""
+    """The number of cells, of so many pixels a side, that show ground."""
     shown = 0
     for window, shape in _pieces(data, factor, piece_px):
         next_step()

@@ -127,7 +127,7 @@ def heard_of(
 
 
 def _moved_off(stated: Stated, group: int, shown: Candidates) -> tuple[float, bool]:
-    """How far, m, the farthest moved corner is from where the images show it, and whether they exclude it."""
+    """The largest distance, m, of a moved corner from where the images show it, and if they exclude it."""
     correction = stated.confirmed[group]
     placed = stated.placed(shown, shown)
     off_m = placed.corners_map[group] - shown.corners_map[group]

@@ -282,7 +282,7 @@ def _stream_of(container: Any, path: Path) -> Any:
 
 
 def _length_of(container: Any, stream: Any, ticks_s: int) -> float:
-    """How long the frames of a video last, s, as its container says; 0 if not, for sound may last longer."""
+    """The duration of a video's frames, s, that its container states; 0 if none, as sound may last longer."""
     if stream.duration is not None:
         return float(stream.duration * stream.time_base)
     hours, _, minutes_and_seconds = str(stream.metadata.get("DURATION", "")).partition(

@@ -555,7 +555,7 @@ def _apart(fix: _Fix, other: _Fix) -> float:
 
 
 def _apart_at_once(source: _Source, other: _Source) -> float | None:
-    """How far apart two receivers are, m; None where both sources are of one receiver."""
+    """The distance of two receivers, m; None where both sources are of one receiver."""
     shared_stamps = sorted(set(source.fixes) & set(other.fixes))
     if shared_stamps:
         pairs = np.array([(*source.fixes[stamp][:2], *other.fixes[stamp][:2]) for stamp in shared_stamps])

@@ -52,11 +52,11 @@ _OF_CENTRE: Mapping[str, tuple[int, int]] = {
 _SCALES = ("GPST", "UTC", "JST")
 _SIGMAS = "sdn(m) sde(m) sdu(m) sdne(m) sdeu(m) sdun(m) age(s) ratio"
 _DEFAULT = ("GPST", *_ON_EARTH, "Q", "ns", *_SIGMAS.split())
-"""What RTKLIB takes a file without a line of names for."""
+"""Columns that RTKLIB assumes in a file without a line of names."""
 
 
 class _Header(NamedTuple):
-    """What the comments of a solution say."""
+    """The facts that the comments of a solution state."""
 
     names: tuple[str, ...]  # of the time scale, and of the columns behind the time's two
     separator: str

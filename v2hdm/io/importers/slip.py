@@ -1,4 +1,4 @@
-"""Which of two sets of poses a vehicle can have driven: its rear axle does not slip sideways."""
+"""The choice of the poses that a vehicle can have driven, as its rear axle does not slip sideways."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _LEAST_CHORDS = 10  # fewer say nothing; chosen
 
 
 class Choice(NamedTuple):
-    """Which of two trajectories a vehicle drives."""
+    """The likelier of two trajectories of a vehicle."""
 
     is_second: bool
     is_sure: bool

@@ -177,7 +177,7 @@ def _dated(solution: Message) -> float | None:
 
 
 class _Maker(NamedTuple):
-    """What makes a row of a message, given the NAV-PVT of its time, if any; None where it holds nothing."""
+    """The row of a message, made with the NAV-PVT of its time, if any; None if the message is empty."""
 
     identity: str
     row: Callable[[Message, Message], tuple[float, ...] | None]

@@ -93,7 +93,7 @@ def read_corrections(path: Path) -> list[Correction]:
 
 
 def _said(correction: Correction) -> tuple[object, ...]:
-    """What a correction says of its marking."""
+    """The sentence that a correction states of its marking."""
     return correction.says, correction.new_kind, correction.moved
 
 

@@ -31,7 +31,7 @@ _LEAST_M = 0.08  # lower origins are within what tyres and loads do, and as much
 
 
 class _Height(NamedTuple):
-    """How much higher a camera is above the ground than stated, and the sigma of that and the statement."""
+    """The excess, m, of a camera's height over the stated one, and the sigma of their difference."""
 
     value_m: float
     sigma_m: float
@@ -101,7 +101,7 @@ def _states_height(camera: Camera) -> bool:
 
 
 def _height_of(camera: Camera, estimate: GroundEstimate) -> _Height | None:
-    """What the ground shows of a camera's height; None where it does not."""
+    """The height of a camera by bare ground; None where that does not show it."""
     up = estimate.parameters.get("up_m")
     is_found = estimate.status is GroundStatus.FOUND and estimate.reading is Reading.AS_GIVEN
     if up is None or not up.observable or not is_found:

@@ -180,7 +180,7 @@ class Frames:
         return np.asarray(self._track(edge).map_from_vehicle[0])
 
     def _moves(self, edge: Edge) -> str:
-        """How an edge is not fixed, or nothing where it is."""
+        """The reason why an edge is not fixed; empty where it is."""
         poses = self._track(edge).map_from_vehicle
         if len(poses) == 1:
             return ""
