@@ -32,6 +32,9 @@ STOP_LINE = "stop_line"
 CROSSWALK_BAR = "crosswalk_bar"
 CHEVRON = "chevron"
 OTHER_PAINT = "other_paint"
+TEXT = "text"
+BOX = "box"
+BICYCLE = "bicycle"
 
 SEEN_ACROSS: Mapping[str, str] = {LANE_DASH: STOP_LINE, STOP_LINE: LANE_DASH}
 """Stripes that look like each other to a camera to the side: there a dash lies across the view."""
