@@ -43,7 +43,17 @@ from v2hdm.detection.camera import ASIDE_RAD
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.planar import clip_convex, inside_convex, signed_area
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.records import ARROW, CROSSWALK_BAR, DIAMOND, LANE_DASH, STOP_LINE, CameraInfo
+from v2hdm.records import (
+    ARROW,
+    BICYCLE,
+    BOX,
+    CROSSWALK_BAR,
+    DIAMOND,
+    LANE_DASH,
+    STOP_LINE,
+    TEXT,
+    CameraInfo,
+)
 from v2hdm.simulate.render.renderer import Motion, Optics, Renderer
 from v2hdm.simulate.render.scene import Box, Ground, Paint, Scene, box_footprint
 
@@ -74,7 +84,8 @@ def test_validation_shows_other_scenes_than_training():
 
 def test_all_classes_are_seen_in_a_hundred_or_so_samples():
     seen = {int(c) for index in range(150) for c in np.unique(training_sample(2, index, 160, 96).labels)}
-    assert seen == set(range(1 + len(PAINT_CLASSES)))
+    drawn = [name for name in PAINT_CLASSES if name not in (TEXT, BOX, BICYCLE)]  # those are hardships
+    assert seen >= {0, *(1 + PAINT_CLASSES.index(name) for name in drawn)}
 
 
 def test_painted_pixels_are_mostly_brighter_than_the_ground_around_them():
