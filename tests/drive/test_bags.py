@@ -264,14 +264,68 @@ def test_a_type_that_the_bag_does_not_define_is_named_only_if_it_is_wanted(folde
         read(tmp_path / "drive", topics_for(folder, bag, poses=poses))
 
 
-def test_images_on_two_clocks_and_without_a_time_are_named(folder, tmp_path):
-    for second, message in ((7, "image 3: its time .* two clocks"), (0, "image 3: its header has no time")):
-        made = messages_of(folder)
-        stamp = [row[2] for row in made.rows if row[1] == "/sensing/front/image_raw"][-1].header.stamp
-        stamp.sec, stamp.nanosec = second, stamp.nanosec if second else 0
-        bag = write_ros2(tmp_path / f"clocks_{second}", made)
-        with pytest.raises(DriveError, match=message):
-            read(tmp_path / "drive", topics_for(folder, bag))
+def _restamped(folder, topic, stamp_of_number):
+    """The messages of ``folder`` whose headers on ``topic`` have other times, s, by their numbers from 0."""
+    made = messages_of(folder)
+    headers = [row[2].header for row in made.rows if row[1] == topic]
+    for number, stamp_s in stamp_of_number.items():
+        stamp = headers[number].stamp
+        stamp.sec, stamp.nanosec = int(stamp_s), round(stamp_s % 1 * 1e9)
+    return made
+
+
+FRONT = "/sensing/front/image_raw"
+
+
+def _front_times(drive):
+    return [image.stamp_s for image in drive.images if image.camera == "front"]
+
+
+def test_images_on_two_clocks_are_named(folder, tmp_path):
+    bag = write_ros2(tmp_path / "clocks", _restamped(folder, FRONT, {2: 7}))
+    with pytest.raises(DriveError, match=r"image_raw: image 3: its time 7\.000000 s .* two clocks"):
+        read(tmp_path / "drive", topics_for(folder, bag))
+
+
+def test_images_that_come_late_or_twice_or_have_no_time_are_sorted_or_dropped_and_counted(
+    folder, tmp_path, caplog
+):
+    expected = read_drive(folder)
+    times = _front_times(expected)
+    pixels = {(image.camera, image.stamp_s): cv2.imread(str(image.path)) for image in expected.images}
+    for name, made, kept in (
+        ("late", messages_of(folder), times),
+        ("twice", messages_of(folder), times),
+        ("zero", _restamped(folder, FRONT, {0: 0}), times[1:]),
+    ):
+        places = [place for place, row in enumerate(made.rows) if row[1] == FRONT]
+        if name == "late":
+            first, second = (made.rows[place] for place in places[:2])
+            made.rows[places[0]] = (first[0], FRONT, second[2])
+            made.rows[places[1]] = (second[0], FRONT, first[2])
+        if name == "twice":
+            made.rows.insert(places[0], made.rows[places[0]])
+        got = read(tmp_path / name, topics_for(folder, write_ros2(tmp_path / f"bag_{name}", made)))
+        assert _front_times(got) == kept
+        for image in got.images:
+            np.testing.assert_array_equal(cv2.imread(str(image.path)), pixels[image.camera, image.stamp_s])
+    for words in ("sorted images that were late: 1", "whose time repeats: 1", "without a time: 1"):
+        assert words in caplog.text
+
+
+def test_poses_without_a_time_are_dropped_and_counted_or_refused(folder, tmp_path, caplog):
+    drive = read_drive(folder)
+    bag = write_ros2(tmp_path / "one", _restamped(folder, "/odom", {0: 0}))
+    got = read(tmp_path / "drive", topics_for(folder, bag))
+    np.testing.assert_array_equal(got.trajectory.stamp_s, drive.trajectory.stamp_s[1:])
+    assert "left out 1 of" in caplog.text
+    bag = write_ros2(
+        tmp_path / "all", _restamped(folder, "/odom", dict.fromkeys(range(len(drive.trajectory.stamp_s)), 0))
+    )
+    with pytest.raises(
+        DriveError, match=r"/odom: \d+ of \d+ messages have no time \(0\); .*stamps: received"
+    ):
+        read(tmp_path / "again", topics_for(folder, bag))
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,10 @@ import cv2
 import numpy as np
 
 from v2hdm.errors import DriveError, need, shown
+from v2hdm.io.image_lists import has_time
 from v2hdm.io.importers.readings import SIGMA_OF_QUALITY_M, Attitudes, Readings
 from v2hdm.io.trajectory import checked_rotations, in_order
-from v2hdm.records import FloatArray
+from v2hdm.records import FloatArray, IntArray
 from v2hdm.safe.pixels import png
 
 _log = logging.getLogger(__name__)
@@ -193,13 +194,13 @@ def readings_of(
 ) -> Readings:
     """Readings of a topic's stamps (P,) and rows (P, 9), and of rows (A, 5) of a topic of headings."""
     stamp_s, rows = positions
-    order = in_order(stamp_s, where, "message")
+    order = _timed_order(stamp_s, where, "message")
     stamp_s = stamp_s[order]
     rows = rows[order]
     if not np.isfinite(rows[:, :3][~np.isinf(rows[:, 3])]).all():
         raise DriveError(f"{where}: holds a position that is not finite; record it again")
     heading_s, turned = headings or (stamp_s, rows[:, 4:])
-    by_time = in_order(heading_s, where, "message of the heading")
+    by_time = _timed_order(heading_s, where, "message of the heading")
     heading_s = heading_s[by_time]
     turned = turned[by_time]
     if (rows[:, 3] < 0).any() or (turned[:, 4] < 0).any():
@@ -213,6 +214,14 @@ def readings_of(
         attitudes = Attitudes(heading_s[is_measured], rotation, turned[is_measured, 4])
     geodetic = kind == FIX
     return Readings(stamp_s, rows[:, :3], geodetic, rows[:, 3], attitudes, "an antenna's" if geodetic else "")
+
+
+def _timed_order(stamp_s: FloatArray, where: str, what: str) -> IntArray:
+    """Rows (K,) that have a time, by it; those without one are counted."""
+    rows = np.flatnonzero(has_time(stamp_s, where, what))
+    if len(rows) < len(stamp_s):
+        _log.warning("%s: left out %d of %d times that are 0", where, len(stamp_s) - len(rows), len(stamp_s))
+    return np.asarray(rows[in_order(stamp_s[rows], where, what)])
 
 
 def _pose(pose: Any, covariance: Any) -> Row:
