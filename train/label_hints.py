@@ -35,8 +35,8 @@ _SURE = 0.8
 """A class is taken from this posterior probability on, otherwise it stays unknown."""
 
 _ASKEW = -6.0
-"""Log odds of a lane's line that lies wholly across the vehicle's way, or of a stop line along it. Chosen: the
-network can say little of stop lines before it has learnt them."""
+"""Log odds of a lane's line that lies wholly across the vehicle's way, or of a stop line along it. Chosen:
+the network can say little of stop lines before it has learnt them."""
 
 _LABELLED_M = 30.0
 """Beyond this range nobody labels completely; a diamond of 2 m is 2 px tall there."""

@@ -73,7 +73,7 @@ def read_coco(
     if category_of:
         number, category = next(iter(category_of.items()))
         raise LabelError(
-            f"{config.coco_relabel[category]}: {path} has no annotation {shown(number)}; list those of that file"
+            f"{config.coco_relabel[category]}: {path} has no annotation {shown(number)}; list its own"
         )
     if not entries:
         raise LabelError(f"{path}: has no images; give another file")

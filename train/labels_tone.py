@@ -1,8 +1,8 @@
 """Paint inside outlines that are drawn around it: told from the ground by its brightness.
 
 People outline a whole crosswalk, a word or a box, and a line at several times its width. Paint is brighter
-than the ground beside it whatever the light, so each place is compared with its own surroundings: with what is
-left of the picture when all is taken away that is bright and narrower than the outline (a morphological
+than the ground beside it whatever the light, so each place is compared with its own surroundings: with what
+is left of the picture when all is taken away that is bright and narrower than the outline (a morphological
 opening; Serra, "Image Analysis and Mathematical Morphology", 1982).
 """
 
@@ -32,7 +32,7 @@ _BRIGHTEST = 95.0  # percentile of the contrast inside an outline that is that o
 
 
 class Tone(NamedTuple):
-    """Which pixels of a window of an image are ``paint`` and which ``ground``, packed rows; others are either."""
+    """Which pixels of a window are ``paint`` and which ``ground``, packed rows; others may be either."""
 
     left: int
     top: int
