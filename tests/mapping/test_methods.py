@@ -59,7 +59,7 @@ def test_each_camera_alone_finds_its_mounting_and_the_markings_that_it_saw(scene
         truth = scene.cam_from_vehicle[name]
         assert rotation_error_deg(result.calibrations[name].cam_from_vehicle, truth) < 0.1
         pairs, rmse_m = match(result.hd_map, scene.markings, MATCH_M)
-        assert len(pairs) == len(result.hd_map.markings) > 0.9 * len(scene.markings)
+        assert len(pairs) == len(result.hd_map.markings) > 0.8 * len(scene.markings)
         assert rmse_m < 0.03
 
 
