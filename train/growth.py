@@ -33,6 +33,9 @@ _STARTS_AS = {
 _STARTS_WITH = 0.05
 """Share of that class's odds that the new one starts with."""
 
+CLASS_HEADS = ("kinds.", "wide_kinds.")
+"""How the names of the weights of layers begin that only classes are read from."""
+
 _CLASS_HEADS = ("kinds", "wide_kinds.1")
 """Layers with an output channel for each class, whose sum is the logits."""
 

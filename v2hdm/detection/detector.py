@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from v2hdm.catalogue import SYMBOL, Catalogue
+from v2hdm.catalogue import PAINT_CLASSES, SYMBOL, Catalogue
 from v2hdm.detection.areas import find_areas
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.classifier import Readings, find_markings, read_markings
@@ -21,11 +23,13 @@ from v2hdm.detection.quads.blobs import find_blobs
 from v2hdm.detection.quads.outline import on_edges, outline_polygon
 from v2hdm.detection.quads.propose import Proposals, propose
 from v2hdm.detection.stopwatch import lap
-from v2hdm.detection.weights import check_weights
+from v2hdm.detection.weights import NETWORK_FILE, check_weights
 from v2hdm.doors import checked
 from v2hdm.errors import DetectorError
 from v2hdm.records import BoolArray, Camera, LaneDetection, MarkingDetection
 from v2hdm.safe.texts import shown
+
+_log = logging.getLogger(__name__)
 
 Markings = tuple[MarkingDetection, ...]
 
@@ -61,7 +65,9 @@ class Detector:
         options = options or DetectorOptions()
         check_weights()
         path = path if path is not None else options.model
-        return cls(Network(None if path is None else Path(path), options.threads, options.device), options)
+        network = Network(None if path is None else Path(path), options.threads, options.device)
+        _tell_lacking(network.path, tuple(name for name in PAINT_CLASSES if name not in network.info.classes))
+        return cls(network, options)
 
     @checked
     def detect(
@@ -205,6 +211,14 @@ def _not_of(areas: Sequence[MarkingDetection], found: Markings) -> Markings:
         )
 
     return tuple(marking for marking in found if not is_piece(marking))
+
+
+@cache
+def _tell_lacking(path: Path, names: tuple[str, ...]) -> None:
+    """Say once which shipped classes a network was trained without; of the shipped one only to who asks."""
+    if names:
+        level = logging.INFO if path == NETWORK_FILE else logging.WARNING
+        _log.log(level, "%s does not know %s: none of these will be found", path, ", ".join(names))
 
 
 def _likelier(quads: Sequence[MarkingDetection], symbols: Sequence[MarkingDetection]) -> Markings:

@@ -85,7 +85,7 @@ class ImageStream(Stream):
 
     def __init__(self, topic: str, stamps: str, where: str) -> None:
         need = Need(topic, (*kinds.IMAGE_KINDS, kinds.VIDEO), where)
-        super().__init__(topic, ["images", stamps], where, [need])
+        super().__init__(topic, ["images with colours", stamps], where, [need])
         self._stamps = stamps
 
     def write(self, folder: Path) -> Writer:
@@ -106,6 +106,8 @@ class ImageStream(Stream):
         while (message := (yield)) is not None:
             number = len(stamp_s)
             stamp_s.append(stamp_of(message, self._stamps))
+            if not len(message.fields.data):
+                continue
             if message.kind == kinds.VIDEO:
                 decoder = decoder or kinds.VideoDecoder(message.fields.format, topic)
                 decode(decoder, message.fields.data.tobytes())
@@ -114,13 +116,13 @@ class ImageStream(Stream):
                 put(number, suffix, data)
         if decoder is not None:
             decode(decoder, None)
+        is_video = decoder is not None
         if len(names) < len(stamp_s):
-            _log.warning(
-                "%s: left out %d of %d packets of video: no key frame before them",
-                topic, len(stamp_s) - len(names), len(stamp_s),
-            )  # fmt: skip
+            things = "packets of video: no key frame before them" if is_video else "images, which are empty"
+            _log.warning("%s: left out %d of %d %s", topic, len(stamp_s) - len(names), len(stamp_s), things)
         if not names:
-            raise DriveError(f"{topic}: its video has no key frame; record images")
+            problem = "its video has no key frame" if is_video else "all of its images are empty"
+            raise DriveError(f"{topic}: {problem}; record images")
         numbers = np.array(sorted(names))
         taken_s = np.array(stamp_s)[numbers]
         rows = image_order(taken_s, topic, numbers=(numbers + 1).tolist())
