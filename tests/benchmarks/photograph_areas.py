@@ -34,17 +34,21 @@ SEEN_SHARE = 0.5
 APART = {CROSSWALK_BAR: 1.5, TEXT: 1.5, BOX: 1.0}
 """Neighbouring pieces of one marking are at most so far apart, in sizes of the larger one along each side."""
 
-LEAST_CELLS = 6  # cells of 4 px that a piece has at least
+GROUND_PX = 260  # first row of 720 that shows ground: the camera stamps the time in the sky
+CELL_PX = 2.0
+LEAST_CELLS = 12  # points of a contour of cells that a marking has at least
 
 
 def kinds_of(output: RawOutput) -> np.ndarray:
-    """1 + class of each cell of 4 px that shows paint, 0 elsewhere."""
-    odds = cv2.resize(output.paint, output.kinds.shape[:0:-1], interpolation=cv2.INTER_AREA)
-    return np.where(odds > 0, output.kinds.argmax(axis=0) + 1, 0).astype(np.uint8)
+    """1 + class of each cell of 2 px that shows paint, 0 elsewhere."""
+    kinds = (output.kinds.argmax(axis=0) + 1).astype(np.uint8)
+    kinds = cv2.resize(kinds, output.paint.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    kinds[: int(GROUND_PX / CELL_PX)] = 0
+    return np.where(output.paint > 0, kinds, 0).astype(np.uint8)
 
 
 def hulls_of(mask: np.ndarray, apart: float) -> list[FloatArray]:
-    """Convex hulls (N, 2), px, of neighbouring pieces of a mask of cells of 4 px."""
+    """Convex hulls (N, 2), px, of neighbouring pieces of a mask of cells of 2 px."""
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     pieces = [piece for piece in contours if len(piece) >= 3]
     if not pieces:
@@ -55,13 +59,13 @@ def hulls_of(mask: np.ndarray, apart: float) -> list[FloatArray]:
     near = (gap <= apart * np.maximum(boxes[:, None, 2:], boxes[:, 2:]) + 1).all(axis=2)
     count, group = connected_components(near)
     joined = [np.vstack([pieces[k] for k in np.flatnonzero(group == number)]) for number in range(count)]
-    return [cv2.convexHull(points)[:, 0] * 4.0 + 1.5 for points in joined if len(points) >= LEAST_CELLS]
+    return [cv2.convexHull(points)[:, 0] * CELL_PX + 0.5 for points in joined if len(points) >= LEAST_CELLS]
 
 
 def seen_along(mask: np.ndarray, polygon: FloatArray) -> float:
     """Share of the columns of an outline in which cells of a mask lie inside."""
     inside = np.zeros(mask.shape, np.uint8)
-    cv2.fillPoly(inside, [np.round((polygon - 1.5) / 4).astype(np.int32)], 1)
+    cv2.fillPoly(inside, [np.round((polygon - 0.5) / CELL_PX).astype(np.int32)], 1)
     inside = cv2.dilate(inside, np.ones((3, 1), np.uint8))
     columns = inside.any(axis=0)
     return float((inside & mask).any(axis=0).sum() / max(columns.sum(), 1))
