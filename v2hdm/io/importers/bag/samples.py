@@ -8,7 +8,6 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from v2hdm.errors import DriveError
@@ -16,9 +15,9 @@ from v2hdm.io.calibration.reading import info_of
 from v2hdm.io.importers.bag import messages as kinds
 from v2hdm.io.importers.bag.frames import frame_name
 from v2hdm.io.importers.bag.reading import Bag, Message, Topic, in_child_of, open_bag
-from v2hdm.io.importers.bag.streams import INFO_KIND, frame_of
+from v2hdm.io.importers.bag.streams import INFO_KIND, STAMPS, frame_of, stamp_of
 from v2hdm.records import FloatArray
-from v2hdm.safe.pixels import pixels_of
+from v2hdm.safe.pixels import AS_STORED, pixels_of
 
 IMAGE_KINDS = (*kinds.IMAGE_KINDS, kinds.VIDEO)
 POSE_KINDS = kinds.POSE_KINDS[:-1]  # all but transforms, whose topic is not theirs alone
@@ -54,7 +53,7 @@ class ImageSample(Sample):
 
     form: str = ""  # encoding of raw ones, format of compressed ones
     size_px: list[int] | None = None  # width and height
-    is_wide: bool = False  # whether compressed pixels have more than 8 bits
+    is_wide: bool = False  # whether compressed pixels are numbers of more than 8 bits
     refusal: str = ""  # of its first image by the reader of images
 
 
@@ -137,9 +136,11 @@ def _image_sample(bag: Bag, topic: Topic) -> ImageSample:
     stamps: list[float] = []
     try:
         for message in _first(bag, topic, _IMAGES):
+            if not len(message.fields.data):
+                continue
             if not stamps:
                 about |= {"frame": frame_of(message)} | _look_of(message)
-            stamps.append(_stamp_of(message))
+            stamps.append(stamp_of(message, STAMPS[0]))
     except DriveError as refusal:
         about["problem"] = str(refusal)
     return ImageSample(**about, stamp_s=stamps)
@@ -156,9 +157,10 @@ def _look_of(message: Message) -> dict[str, Any]:
     look = {"form": fields.format}
 
     def decode() -> None:
+        pixels = pixels_of(fields.data.tobytes(), Path(_HERE), AS_STORED)
+        is_wide = pixels.dtype != np.uint8 and pixels.ndim == 2 and not fields.format.startswith("bayer")
+        look.update(size_px=[pixels.shape[1], pixels.shape[0]], is_wide=is_wide)
         kinds.file_of(message.kind, fields, _HERE)
-        pixels = pixels_of(fields.data.tobytes(), Path(_HERE), cv2.IMREAD_UNCHANGED)
-        look.update(size_px=[pixels.shape[1], pixels.shape[0]], is_wide=pixels.dtype != np.uint8)
 
     return _refusal_of(decode) | look
 
@@ -181,7 +183,7 @@ def _info_sample(bag: Bag, topic: Topic) -> InfoSample:
         for message in _first(bag, topic, _IMAGES):
             if not stamps:
                 about |= {"frame": frame_of(message)} | _lens_of(message.fields)
-            stamps.append(_stamp_of(message))
+            stamps.append(stamp_of(message, STAMPS[0]))
     except DriveError as refusal:
         about["problem"] = str(refusal)
     return InfoSample(**about, stamp_s=stamps)
@@ -204,7 +206,7 @@ def _pose_sample(bag: Bag, topic: Topic) -> PoseSample:
             fields = message.fields
             if not stamps:
                 about |= _frames_of(message)
-            stamps.append(_stamp_of(message))
+            stamps.append(stamp_of(message, STAMPS[0]))
             if topic.kind != kinds.NMEA:
                 rows.append(kinds.position_row(topic.kind, fields))
     except DriveError as refusal:
@@ -236,7 +238,7 @@ def _heading_sample(bag: Bag, topic: Topic) -> PoseSample:
         for message in _first(bag, topic, _POSES):
             if not stamps:
                 about |= {"frame": frame_of(message)}
-            stamps.append(_stamp_of(message))
+            stamps.append(stamp_of(message, STAMPS[0]))
             rows.append(kinds.heading_row(topic.kind, message.fields))
     except DriveError as refusal:
         about["problem"] = str(refusal)
@@ -272,12 +274,6 @@ def _metres(geodetic: FloatArray) -> FloatArray:
     """Latitudes, longitudes and altitudes (N, 3) as east, north, up, m, nearly."""
     north_m, east_m = geodetic[:, 0] * _DEG_M, geodetic[:, 1] * _DEG_M * np.cos(np.radians(geodetic[:, 0]))
     return np.column_stack([east_m, north_m, geodetic[:, 2]])
-
-
-def _stamp_of(message: Message) -> float:
-    fields = message.fields
-    stamp = fields.timestamp if message.kind == kinds.VIDEO else fields.header.stamp
-    return float(stamp.sec + stamp.nanosec / 1e9)
 
 
 def is_together(stamp_s: Sequence[float], other_s: Sequence[float], apart_s: float) -> bool:
