@@ -20,6 +20,7 @@ _OPTICAL = "optical"
 _HIGHEST = np.sin(
     np.deg2rad(30)
 )  # sine of the angle above the horizon from where a camera sees no ground; chosen
+_ABOVE = 0.01  # sine of the angle above the horizon from which an axis points up, not level; chosen
 _LEVEL = np.sin(np.deg2rad(20))  # sine of the angle up to which an axis counts as level; chosen
 _OPTICAL_FROM_BODY = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 _MOST_FRAMES = 4  # that are offered for a camera
@@ -77,7 +78,7 @@ def is_optical(vehicle_from_cam: FloatArray) -> bool:
     A frame whose x is ahead, of a camera that looks down steeply, has z nearly level, and y as well.
     """
     up = vehicle_from_cam[2, :3]
-    lies_on_its_side = up[2] > 0 and abs(up[1]) < _LEVEL and abs(up[0]) > _HIGHEST
+    lies_on_its_side = up[2] > _ABOVE and abs(up[1]) < _LEVEL and abs(up[0]) > _HIGHEST
     return bool(up[2] < _HIGHEST and not lies_on_its_side)
 
 
