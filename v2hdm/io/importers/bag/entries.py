@@ -94,7 +94,8 @@ def poses_entry(recording: Recording, given: object) -> Entry:
     stated = given or {}
     max_sigma_m = stated.get("max_sigma_m")
     limit_m = float(max_sigma_m) if isinstance(max_sigma_m, int | float) else _MAX_SIGMA_M
-    candidates = position_candidates(recording.samples, limit_m, recording.is_linked)
+    has_heading = bool({"heading_topic", "heading_file"} & set(stated))
+    candidates = position_candidates(recording.samples, limit_m, recording.is_linked, has_heading)
     world = _world_of(recording)
     topic = stated.get("topic")
     if topic is None:

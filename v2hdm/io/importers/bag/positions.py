@@ -63,19 +63,23 @@ class Candidate(NamedTuple):
 
 
 def position_candidates(
-    samples: Samples, max_sigma_m: float, is_linked: Callable[[str], bool]
+    samples: Samples, max_sigma_m: float, is_linked: Callable[[str], bool], has_heading: bool = False
 ) -> list[Candidate]:
     """All topics of poses, the best first; ``is_linked`` tells whether a frame is fixed on the vehicle.
 
-    A position with a larger sigma than ``max_sigma_m`` is of no use.
+    A position with a larger sigma than ``max_sigma_m`` is of no use, nor is an antenna's without a heading,
+    which is of another topic unless it is known, ``has_heading``.
     """
     poses = list(samples.poses.values())
     moved_m = max((pose.moved_m for pose in poses if np.isfinite(pose.moved_m)), default=0.0)
     most = max((pose.messages for pose in poses), default=0)
     is_any_linked = any(is_linked(pose.frame) for pose in poses if pose.frame)
+    has_heading = has_heading or any(not one.doubt for one in heading_candidates(samples, moved_m))
     candidates = []
     for pose in poses:
         doubt = pose.problem or _doubt_of(pose, moved_m, max_sigma_m)
+        if not doubt and pose.kind == kinds.FIX and not has_heading:
+            doubt = "no topic has its headings"
         if not doubt and pose.messages * _RARE < most:
             doubt = f"only {pose.messages} messages"
         if not doubt and pose.kind == kinds.ODOMETRY and is_any_linked and pose.frame:
@@ -114,8 +118,7 @@ def _doubt_of(pose: PoseSample, moved_m: float, max_sigma_m: float) -> str:
     if not is_antenna and not pose.is_turned and moved_m > _MOVES_M:
         return "its orientation is never set"
     if pose.sigma_m > max_sigma_m:
-        sigma = f"{pose.sigma_m:.3g} m" if np.isfinite(pose.sigma_m) else "no fix"
-        return f"its positions have a sigma of {sigma}, by their own account"
+        return f"more than {max_sigma_m:g} m" if np.isfinite(pose.sigma_m) else "no fix"
     if moved_m > _MOVES_M and pose.moved_m < _STANDS_M:
         return "it stays where it is while others move"
     return ""
