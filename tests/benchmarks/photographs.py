@@ -20,7 +20,7 @@ import json
 import random
 import tempfile
 from collections import Counter, defaultdict
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
 import cv2
@@ -34,7 +34,7 @@ from v2hdm.detection.detector import Detector
 from v2hdm.detection.network import NetworkOutput
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.pipeline.detect_images import detect_images
-from v2hdm.records import CROSSWALK_BAR, DIAMOND, Camera, FloatArray, MarkingDetection
+from v2hdm.records import CROSSWALK_BAR, DIAMOND, STOP_LINE, Camera, FloatArray, MarkingDetection
 
 WIDTH, HEIGHT = 1280, 720
 FOUND_IOU = 0.3
@@ -143,8 +143,8 @@ class Listening(Detector):
         return self.output
 
 
-def read(labels: Path, roles: tuple[str, ...]) -> dict[str, Labels]:
-    """The labels of the images of some roles, by file name."""
+def read(labels: Path, roles: tuple[str, ...], stop_lines: Collection[int] = ()) -> dict[str, Labels]:
+    """The labels of the images of some roles, by file name; ``stop_lines`` are ids of annotations."""
     content = json.loads(labels.read_text())
     names = {category["id"]: category["name"] for category in content["categories"]}
     files = {image["id"]: image["file_name"] for image in content["images"]}
@@ -154,7 +154,8 @@ def read(labels: Path, roles: tuple[str, ...]) -> dict[str, Labels]:
         if its[annotation["image_id"]] in roles:
             one = out[files[annotation["image_id"]]]
             for ring in annotation["segmentation"]:
-                one.names.append(names[annotation["category_id"]])
+                is_stop_line = annotation["id"] in stop_lines
+                one.names.append(STOP_LINE if is_stop_line else names[annotation["category_id"]])
                 one.polygons.append(np.reshape(ring, (-1, 2)) * (WIDTH / 640, HEIGHT / 640) - 0.5)
     return out
 

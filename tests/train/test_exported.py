@@ -15,7 +15,14 @@ from models import MarkingNet, NetConfig, Prediction
 from tests.export.graphs import graphs_made_once as graphs_made_once
 from tests.train.small import coco, tiny
 from train.average import mean_checkpoint, scored
-from train.checkpoint import Checkpoint, fresh_checkpoint, load_checkpoint, save_checkpoint
+from train.checkpoint import (
+    Checkpoint,
+    check_same_experiment,
+    fresh_checkpoint,
+    load_checkpoint,
+    own_entries,
+    save_checkpoint,
+)
 from train.config import DataConfig, LabelError
 from train.exported import read_exported, unfold
 from train.growth import with_classes
@@ -24,6 +31,7 @@ from train.loop import Trainer
 from train.metrics import Tally
 from train.targets import IGNORE, Targets
 from v2hdm.catalogue import PAINT_CLASSES, SHIPPED
+from v2hdm.detection.detector import Detector
 from v2hdm.detection.network import Network
 from v2hdm.errors import ConfigError, DetectorError
 
@@ -309,10 +317,11 @@ def test_known_classes_keep_their_shares_and_a_new_one_starts_small(shipped_run,
 
 def test_classes_go_by_name_where_the_order_of_a_catalogue_changes(shipped_run, catalogue):
     weights = with_classes(load_checkpoint(shipped_run).averaged, PAINT_CLASSES, catalogue, "here")
-    weights["kinds.bias"] = torch.arange(10.0)
+    weights["kinds.bias"] = torch.arange(float(len(CLASSES)))
     turned = SHIPPED.with_own({PAD: ENTRIES[PAD], T: ENTRIES[T]}, "test")
     again = with_classes(weights, catalogue.names, turned, "here")
-    assert again["kinds.bias"].tolist() == [*range(8), 9.0, 8.0]
+    last = len(PAINT_CLASSES)
+    assert again["kinds.bias"].tolist() == [*range(last), last + 1, last]
     with pytest.raises(ConfigError, match="here knows parking_t, pad"):
         with_classes(weights, catalogue.names, SHIPPED, "here")
 
@@ -377,3 +386,78 @@ def test_a_file_with_wrong_classes_is_refused(tmp_path, exported, own, words):
     onnx.save_model(model, str(path))
     with pytest.raises(DetectorError, match=words):
         Network(path)
+
+
+OLDEST = 8  # shipped classes of the networks before there were words and boxes
+
+
+def of_the_oldest(path):
+    """A checkpoint of a network that knows the oldest classes only."""
+    torch.manual_seed(0)
+    config = replace(tiny(path.parent), net=replace(tiny(path.parent).net, wide_kinds=True))
+    state = fresh_checkpoint(config)
+    state.averaged = MarkingNet(config.net, OLDEST).state_dict()
+    state.model = state.averaged
+    save_checkpoint(state, path)
+    return config
+
+
+def test_a_network_of_the_oldest_classes_is_exported_and_learns_the_others(tmp_path, image):
+    config = of_the_oldest(tmp_path / "old.pt")
+    old = load_checkpoint(tmp_path / "old.pt")
+    assert old.classes == PAINT_CLASSES[:OLDEST]
+    export_checkpoint(old, tmp_path / "old.onnx", opset=18, tolerance=1e-3)
+    assert Network(tmp_path / "old.onnx").info.classes == PAINT_CLASSES[:OLDEST]
+    for start in ("old.pt", "old.onnx"):
+        grown = fresh_checkpoint(replace(config, start=str(tmp_path / start)))
+        assert grown.classes == PAINT_CLASSES
+        with torch.inference_mode():
+            kinds = grown.network()(image).kinds[:, :OLDEST]
+            torch.testing.assert_close(kinds, old.network()(image).kinds, atol=1e-3, rtol=1e-3)
+
+
+def test_a_run_from_before_a_class_was_added_is_not_resumed_but_started_from(tmp_path):
+    config = of_the_oldest(tmp_path / "last.pt")
+    with pytest.raises(ConfigError, match=r"before .* text, box, bicycle: go on with start="):
+        check_same_experiment(load_checkpoint(tmp_path / "last.pt"), config, tmp_path / "last.pt")
+
+
+def test_the_mean_of_an_old_and_a_new_network_knows_all_classes(tmp_path):
+    of_the_oldest(tmp_path / "old.pt")
+    mean = mean_checkpoint(tmp_path / "old.pt", [tmp_path / "old.pt"])
+    assert mean.classes == PAINT_CLASSES
+
+
+def test_a_class_that_catalogue_and_start_define_differently_is_named_in_one_line(
+    tmp_path, shipped_run, catalogue
+):
+    state = load_checkpoint(shipped_run)
+    state.averaged = with_classes(state.averaged, PAINT_CLASSES, catalogue, "here")
+    state.own_classes = own_entries(catalogue)
+    save_checkpoint(state, tmp_path / "own.pt")
+    wide = {"length_m": [0.8, 1.4], "width_m": [0.4, 2.4]}
+    config = run_of(tmp_path, tmp_path / "own.pt")
+    written(tmp_path, ENTRIES | {PAD: ENTRIES[PAD] | wide})
+    with pytest.raises(
+        ConfigError, match=r"classes.yaml and start=.*own.pt define pad differently"
+    ) as refused:
+        fresh_checkpoint(config)
+    assert "\n" not in str(refused.value)
+
+
+def test_an_own_class_called_like_a_newly_shipped_one_is_named_in_one_line(tmp_path):
+    config = of_the_oldest(tmp_path / "old.pt")
+    state = load_checkpoint(tmp_path / "old.pt")
+    state.own_classes = {"text": ENTRIES[T]}
+    save_checkpoint(state, tmp_path / "own.pt")
+    with pytest.raises(ConfigError, match="'text' is already the name of 'text'"):
+        fresh_checkpoint(replace(config, start=str(tmp_path / "own.pt")))
+
+
+def test_a_network_without_some_classes_says_once_that_they_are_not_found(tmp_path, caplog):
+    of_the_oldest(tmp_path / "old.pt")
+    export_checkpoint(load_checkpoint(tmp_path / "old.pt"), tmp_path / "old.onnx", opset=18, tolerance=1e-3)
+    for _ in range(2):
+        Detector.load(tmp_path / "old.onnx")
+    (line,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert line.endswith("does not know text, box, bicycle: none of these will be found")

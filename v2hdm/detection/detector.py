@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from v2hdm.catalogue import SYMBOL, Catalogue
+from v2hdm.catalogue import PAINT_CLASSES, SYMBOL, Catalogue
+from v2hdm.detection.areas import find_areas
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.classifier import Readings, find_markings, read_markings
 from v2hdm.detection.lanes.curves import LaneImage
@@ -20,11 +23,13 @@ from v2hdm.detection.quads.blobs import find_blobs
 from v2hdm.detection.quads.outline import on_edges, outline_polygon
 from v2hdm.detection.quads.propose import Proposals, propose
 from v2hdm.detection.stopwatch import lap
-from v2hdm.detection.weights import check_weights
+from v2hdm.detection.weights import NETWORK_FILE, check_weights
 from v2hdm.doors import checked
 from v2hdm.errors import DetectorError
 from v2hdm.records import BoolArray, Camera, LaneDetection, MarkingDetection
 from v2hdm.safe.texts import shown
+
+_log = logging.getLogger(__name__)
 
 Markings = tuple[MarkingDetection, ...]
 
@@ -60,7 +65,9 @@ class Detector:
         options = options or DetectorOptions()
         check_weights()
         path = path if path is not None else options.model
-        return cls(Network(None if path is None else Path(path), options.threads, options.device), options)
+        network = Network(None if path is None else Path(path), options.threads, options.device)
+        _tell_lacking(network.path, tuple(name for name in PAINT_CLASSES if name not in network.info.classes))
+        return cls(network, options)
 
     @checked
     def detect(
@@ -85,7 +92,10 @@ class Detector:
             readings = self.read(image_bgr, proposals)
         with lap("judge"):
             markings = find_markings(readings, proposals.camera, self.options)
-        return _likelier(markings, self._symbols(image_bgr, proposals)), lanes
+        found = _likelier(markings, self._symbols(image_bgr, proposals))
+        with lap("areas"):
+            areas = self._areas(proposals)
+        return (*_not_of(areas, found), *areas), lanes
 
     def run_network(self, image_bgr: np.ndarray, camera: Camera, top: int | None = None) -> NetworkOutput:
         """Run the network on an image, less what shows the vehicle; raises as :meth:`detect`.
@@ -160,6 +170,15 @@ class Detector:
             self._cameras[camera.info.name] = (road_camera, reach_px)
         return road_camera
 
+    def _areas(self, proposals: Proposals) -> list[MarkingDetection]:
+        """The areas of an image, such as words."""
+        camera = proposals.camera
+        reach_px = self._cameras[camera.info.name][1]
+        options = self.options
+        return find_areas(
+            proposals.output, camera, self.catalogue, reach_px, options.min_score, options.max_range_m
+        )
+
     def _symbols(self, image_bgr: np.ndarray, proposals: Proposals) -> list[MarkingDetection]:
         """Markings within range with an outline but no four corners; of a piece and its parts only one."""
         names = self.catalogue.of_family(SYMBOL)
@@ -191,6 +210,28 @@ class Detector:
                 symbols.append(symbol)
                 parts_until = after
         return symbols
+
+
+def _not_of(areas: Sequence[MarkingDetection], found: Markings) -> Markings:
+    """What is no piece of an area, such as a letter: what lies in a likelier one is."""
+    hulls = [(area.outline_px.astype(np.float32), area.score) for area in areas]
+
+    def is_piece(marking: MarkingDetection) -> bool:
+        shape_px = marking.outline_px if len(marking.outline_px) else marking.corners_px
+        centre = shape_px.mean(axis=0).tolist()
+        return any(
+            score > marking.score and cv2.pointPolygonTest(hull, centre, False) > 0 for hull, score in hulls
+        )
+
+    return tuple(marking for marking in found if not is_piece(marking))
+
+
+@cache
+def _tell_lacking(path: Path, names: tuple[str, ...]) -> None:
+    """Say once which shipped classes a network was trained without; of the shipped one only to who asks."""
+    if names:
+        level = logging.INFO if path == NETWORK_FILE else logging.WARNING
+        _log.log(level, "%s does not know %s: none of these will be found", path, ", ".join(names))
 
 
 def _likelier(quads: Sequence[MarkingDetection], symbols: Sequence[MarkingDetection]) -> Markings:
