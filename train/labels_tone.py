@@ -47,6 +47,19 @@ class Tone(NamedTuple):
         return paint, ground
 
 
+def paint_rectangle(tone: Tone) -> FloatArray | None:
+    """Corners (4, 2), px, of the smallest rectangle around the paint; None where there is none."""
+    paint, _ = tone.planes()
+    rows, columns = np.nonzero(paint)
+    if not len(rows):
+        return None
+    places = np.column_stack([columns + tone.left, rows + tone.top])
+    corners = places[:, None] + np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+    return np.asarray(
+        cv2.boxPoints(cv2.minAreaRect(corners.reshape(-1, 2).astype(np.float32))), dtype=np.float64
+    )
+
+
 def log_light(pixels: np.ndarray) -> np.ndarray:
     """Logarithm (H, W) of an image's (H, W, 3) uint8 BGR light, without blue: paint may be yellow."""
     return np.asarray(np.log(_DARKNESS + pixels[..., 1:].mean(axis=2, dtype=np.float32)))

@@ -20,48 +20,53 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 
-from tests.benchmarks.photographs import FOUND_IOU, HEIGHT, WIDTH, Labels, read
+from tests.benchmarks.photographs import (
+    CLASS_OF,
+    FOUND_IOU,
+    HEIGHT,
+    STOP_LINE_PX,
+    WIDTH,
+    Labels,
+    joined,
+    read,
+)
 from train.examples import polygon_overlap
 from train.labels import JUDGING
 from v2hdm.detection.network import Network, RawOutput
 from v2hdm.records import BOX, CROSSWALK_BAR, STOP_LINE, TEXT, FloatArray
 
-CLASS_OF = {"crosswalk_outline": CROSSWALK_BAR, "slow": TEXT, "bus_lane": TEXT, "yellow_box": BOX}
-TALL_PX = 11.0
 SEEN_SHARE = 0.5
 APART = {CROSSWALK_BAR: 1.5, TEXT: 1.5, BOX: 1.0}
 """Neighbouring pieces of one marking are at most so far apart, in sizes of the larger one along each side."""
 
-LEAST_CELLS = 6  # cells of 4 px that a piece has at least
+GROUND_PX = 260  # first row of 720 that shows ground: the camera stamps the time in the sky
+CELL_PX = 2.0
+LEAST_CELLS = 6  # cells that a marking has at least, its width and height added up
 
 
 def kinds_of(output: RawOutput) -> np.ndarray:
-    """1 + class of each cell of 4 px that shows paint, 0 elsewhere."""
-    odds = cv2.resize(output.paint, output.kinds.shape[:0:-1], interpolation=cv2.INTER_AREA)
-    return np.where(odds > 0, output.kinds.argmax(axis=0) + 1, 0).astype(np.uint8)
+    """1 + class of each cell of 2 px that shows paint, 0 elsewhere."""
+    kinds = (output.kinds.argmax(axis=0) + 1).astype(np.uint8)
+    kinds = cv2.resize(kinds, output.paint.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    kinds[: int(GROUND_PX / CELL_PX)] = 0
+    return np.where(output.paint > 0, kinds, 0).astype(np.uint8)
 
 
 def hulls_of(mask: np.ndarray, apart: float) -> list[FloatArray]:
-    """Convex hulls (N, 2), px, of neighbouring pieces of a mask of cells of 4 px."""
+    """Convex hulls (N, 2), px, of neighbouring pieces of a mask of cells of 2 px."""
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     pieces = [piece for piece in contours if len(piece) >= 3]
     if not pieces:
         return []
-    boxes = np.array([cv2.boundingRect(piece) for piece in pieces], dtype=np.float64)
-    low, high = boxes[:, :2], boxes[:, :2] + boxes[:, 2:]
-    gap = np.maximum(low[:, None] - high, low - high[:, None])
-    near = (gap <= apart * np.maximum(boxes[:, None, 2:], boxes[:, 2:]) + 1).all(axis=2)
-    count, group = connected_components(near)
-    joined = [np.vstack([pieces[k] for k in np.flatnonzero(group == number)]) for number in range(count)]
-    return [cv2.convexHull(points)[:, 0] * 4.0 + 1.5 for points in joined if len(points) >= LEAST_CELLS]
+    long_enough = (hull for hull in joined([piece[:, 0] for piece in pieces], apart) if len(hull) > 2)
+    return [hull * CELL_PX + 0.5 for hull in long_enough if np.ptp(hull, axis=0).sum() >= LEAST_CELLS]
 
 
 def seen_along(mask: np.ndarray, polygon: FloatArray) -> float:
     """Share of the columns of an outline in which cells of a mask lie inside."""
     inside = np.zeros(mask.shape, np.uint8)
-    cv2.fillPoly(inside, [np.round((polygon - 1.5) / 4).astype(np.int32)], 1)
+    cv2.fillPoly(inside, [np.round((polygon - 0.5) / CELL_PX).astype(np.int32)], 1)
     inside = cv2.dilate(inside, np.ones((3, 1), np.uint8))
     columns = inside.any(axis=0)
     return float((inside & mask).any(axis=0).sum() / max(columns.sum(), 1))
@@ -91,7 +96,7 @@ class Counts:
                 self.alone[name] += not (mask & near).any()
         for label, polygon in zip(labels.names, labels.polygons, strict=True):
             if label == STOP_LINE:
-                size = "stop_line >= 11 px" if np.ptp(polygon[:, 1]) >= TALL_PX else "stop_line < 11 px"
+                size = "stop_line >= 11 px" if np.ptp(polygon[:, 1]) >= STOP_LINE_PX else "stop_line < 11 px"
                 self.all[size] += 1
                 share = {name: seen_along(mask, polygon) for name, mask in masks.items()}
                 self.seen[size] += share[STOP_LINE] >= SEEN_SHARE

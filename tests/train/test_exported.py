@@ -461,3 +461,17 @@ def test_a_network_without_some_classes_says_once_that_they_are_not_found(tmp_pa
         Detector.load(tmp_path / "old.onnx")
     (line,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert line.endswith("does not know text, box, bicycle: none of these will be found")
+
+
+def test_a_class_is_averaged_over_the_files_that_know_it(tmp_path):
+    config = of_the_oldest(tmp_path / "old.pt")
+    new = fresh_checkpoint(replace(config, start=str(tmp_path / "old.pt")))
+    new.averaged = {
+        name: value + 1 if value.is_floating_point() else value for name, value in new.averaged.items()
+    }
+    save_checkpoint(new, tmp_path / "new.pt")
+    mean = mean_checkpoint(tmp_path / "new.pt", [tmp_path / "old.pt"]).averaged
+    for name in ("kinds.weight", "kinds.bias"):
+        torch.testing.assert_close(mean[name][OLDEST:], new.averaged[name][OLDEST:])
+        torch.testing.assert_close(mean[name][:OLDEST], new.averaged[name][:OLDEST] - 0.5)
+    torch.testing.assert_close(mean["stem.0.weight"], new.averaged["stem.0.weight"] - 0.5)

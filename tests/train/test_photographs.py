@@ -10,6 +10,7 @@ import pytest
 
 from tests.train.small import coco, tiny
 from train.config import DataConfig, LabelError
+from train.examples import photograph
 from train.label_hints import with_hints
 from train.labels import Favour, Place, paint_labels, read_labels
 from train.labels_image import LabelledImage, Shape
@@ -173,3 +174,16 @@ def test_the_heads_of_classes_learn_alone_at_first(tmp_path):
     trainer.config.steps = 4
     trainer.run()
     assert (trainer.net.state_dict()["stem.0.weight"] != start["stem.0.weight"]).any()
+
+
+def test_the_judge_learns_a_stop_line_as_thin_as_its_paint(tmp_path):
+    image = np.full((720, 1280, 3), 90, np.uint8)
+    image[500:508, 300:900] = 190
+    cv2.imwrite(str(tmp_path / "a.png"), image)
+    ring = outline(300, 490, 900, 520)
+    shape = Shape((STOP_LINE,), (ring,), tone_of(log_light(image), [ring], False))
+    config = DataConfig(coco_camera=MOUNTING)
+    given = LabelledImage("", tmp_path / "a.png", shapes=(shape,))
+    (marking,) = photograph(given, config, np.random.default_rng(0)).markings
+    assert marking.kind == STOP_LINE
+    assert np.ptp(marking.polygon_px, axis=0).tolist() == pytest.approx([600, 8], abs=1)

@@ -23,6 +23,7 @@ from v2hdm.detection.areas import find_crosswalks
 from v2hdm.detection.camera import GroundPoints, camera_from_calibration
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.frames import Frame
+from v2hdm.detection.network import NetworkOutput
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.stopwatch import lap
 from v2hdm.errors import MapFileError
@@ -152,9 +153,15 @@ class RoadDetector:
         except MapFileError as error:
             raise MapFileError(f"{calibration}: {error}") from error
 
-    def detect(self, image_bgr: np.ndarray) -> Road:
-        """Find what an image (H, W, 3) uint8 BGR of the camera's size shows; else raises DetectorError."""
-        markings, lanes = self.detector.detect(image_bgr, self.camera)
+    def detect(self, image_bgr: np.ndarray, output: NetworkOutput | None = None) -> Road:
+        """Find what an image (H, W, 3) uint8 BGR of the camera's size shows; else raises DetectorError.
+
+        ``output`` is the network's, if it has looked at the image already.
+        """
+        if output is None:
+            markings, lanes = self.detector.detect(image_bgr, self.camera)
+        else:
+            markings, lanes = self.detector.detect_in(output, image_bgr, self.camera)
         with lap("metres"):
             crosswalks = find_crosswalks(markings, self.detector.road_camera(self.camera))
             road = self._on_ground((*markings, *(crosswalk for crosswalk, _ in crosswalks)), lanes)
