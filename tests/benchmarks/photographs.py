@@ -3,6 +3,7 @@
     python -m tests.benchmarks.photographs LABELS.json IMAGES [--mounting 1.3 -12 90] [--model FILE]
         [--stop-lines LIST.json]
 
+With ``--shuffled`` the folder's photographs are in any order, with ``--alone`` each is a source of its own.
 The files are those of ROAD MARK, see ``docs/labels.md``; judged are the blocks of places that the recipe
 keeps apart for it (:func:`train.labels.held_out`). Printed, for diamonds and arrows by their height in px of
 1280 x 720: the share that is found (overlap above .3 with a detection of any class) and named. Then, an
@@ -17,9 +18,10 @@ from __future__ import annotations
 
 import argparse
 import json
+import random
 import tempfile
 from collections import Counter, defaultdict
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
 import cv2
@@ -153,9 +155,9 @@ class Listening(Detector):
 
     output: NetworkOutput
 
-    def run_network(self, image_bgr: np.ndarray, camera: Camera) -> NetworkOutput:
+    def run_network(self, image_bgr: np.ndarray, camera: Camera, top: int | None = None) -> NetworkOutput:
         """Run the network on one image."""
-        self.output = super().run_network(image_bgr, camera)
+        self.output = super().run_network(image_bgr, camera, top)
         return self.output
 
 
@@ -273,6 +275,14 @@ class Tally:
         )
 
 
+def _ordered(names: Iterable[str], seed: int | None) -> list[str]:
+    """Names as they are, or shuffled."""
+    in_order = list(names)
+    if seed is not None:
+        random.Random(seed).shuffle(in_order)
+    return in_order
+
+
 def main() -> None:
     """Print the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -282,6 +292,8 @@ def main() -> None:
     parser.add_argument("--model")
     parser.add_argument("--role", nargs="+", default=[JUDGING])
     parser.add_argument("--limit", type=int)
+    parser.add_argument("--shuffled", type=int, metavar="SEED", help="one folder, its places in any order")
+    parser.add_argument("--alone", action="store_true", help="image by image, not as one folder")
     parser.add_argument("--stop-lines", type=Path)
     parsed = parser.parse_args()
     cv2.setNumThreads(1)
@@ -291,13 +303,19 @@ def main() -> None:
     detector = Listening.load(options=options)
     tally, areas = Tally(), np.zeros((3, 4), dtype=np.int64)
     with tempfile.TemporaryDirectory() as folder:
-        for name in labelled:
+        for number, name in enumerate(_ordered(labelled, parsed.shuffled)):
             image = cv2.imread(str(parsed.images / name))
             assert image is not None, name
             image = cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
-            cv2.imwrite(f"{folder}/{Path(name).stem}.png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-        for seen in detect_images(folder, mounting=parsed.mounting, detector=detector):
-            labels = labelled[Path(seen.frame.name).stem + ".jpg"]
+            path = Path(folder, f"{number:04d}_{Path(name).stem}.png")
+            cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        sources = sorted(Path(folder).iterdir()) if parsed.alone else [Path(folder)]
+        for seen in (
+            detected
+            for source in sources
+            for detected in detect_images(source, mounting=parsed.mounting, detector=detector)
+        ):
+            labels = labelled[Path(seen.frame.name).stem[5:] + ".jpg"]
             given = tuple(marking.image for marking in seen.road.markings)
             tally.add(labels, given)
             tally.add_areas(labels, given)

@@ -77,7 +77,12 @@ class Detector:
 
         Raises DetectorError where the image is not of that form or not of the camera's size.
         """
-        output = self.run_network(image_bgr, camera)
+        return self.detect_in(self.run_network(image_bgr, camera), image_bgr, camera)
+
+    def detect_in(
+        self, output: NetworkOutput, image_bgr: np.ndarray, camera: Camera
+    ) -> tuple[tuple[MarkingDetection, ...], tuple[LaneDetection, ...]]:
+        """Find the markings and lanes of an image of which the network's output is known."""
         with lap("propose"):
             proposals = self.propose(output, camera)
         with lap("lanes"):
@@ -92,12 +97,15 @@ class Detector:
             areas = self._areas(proposals)
         return (*_not_of(areas, found), *areas), lanes
 
-    def run_network(self, image_bgr: np.ndarray, camera: Camera) -> NetworkOutput:
-        """Run the network on an image, less what shows the vehicle; raises as :meth:`detect`."""
+    def run_network(self, image_bgr: np.ndarray, camera: Camera, top: int | None = None) -> NetworkOutput:
+        """Run the network on an image, less what shows the vehicle; raises as :meth:`detect`.
+
+        It looks from the row ``top`` on, see :func:`v2hdm.detection.network.run_on_road`.
+        """
         road_camera = self.road_camera(camera)
         _check_image(image_bgr, camera)
         with lap("net"):
-            output = run_on_road(self.network, image_bgr, road_camera, self.options.mirrored)
+            output = run_on_road(self.network, image_bgr, road_camera, self.options.mirrored, top)
         mask = camera.own_vehicle
         if mask is None:
             return output
@@ -115,7 +123,8 @@ class Detector:
         road_camera = self.road_camera(camera)
         reach_px = self._cameras[camera.info.name][1]
         blobs, owner = find_blobs(output, reach_px, self.catalogue)
-        pieces = propose(blobs, road_camera, self.catalogue, self.options.max_range_m)
+        reach_m = road_camera.perhaps_m(self.options.max_range_m)
+        pieces = propose(blobs, road_camera, self.catalogue, reach_m)
         return Proposals(road_camera, output, pieces, owner)
 
     def lane_image(self, proposals: Proposals) -> LaneImage:
@@ -131,7 +140,9 @@ class Detector:
         return LaneImage(
             camera=proposals.camera,
             rows=proposals.output.anchors,
-            paint=trace_lanes(paint, proposals.camera, step_m, self.options.max_range_m),
+            paint=trace_lanes(
+                paint, proposals.camera, step_m, proposals.camera.perhaps_m(self.options.max_range_m)
+            ),
             output=proposals.output,
             paint_step_m=step_m,
             row_step_px=self.network.info.lane_stride,
@@ -153,8 +164,9 @@ class Detector:
         """The tables of a camera, built at its first use."""
         road_camera, _ = self._cameras.get(camera.info.name, (None, 0))
         if road_camera is None or road_camera.camera is not camera:
-            road_camera = RoadCamera(camera, self.network.info.multiple)
-            reach_px = road_camera.first_row_within(self.options.max_range_m)
+            lens = None if road_camera is None else road_camera.lens
+            road_camera = RoadCamera(camera, self.network.info.multiple, lens)
+            reach_px = road_camera.first_row_within(road_camera.perhaps_m(self.options.max_range_m))
             self._cameras[camera.info.name] = (road_camera, reach_px)
         return road_camera
 
@@ -172,13 +184,14 @@ class Detector:
         names = self.catalogue.of_family(SYMBOL)
         symbols = []
         parts_until = 0
+        reach_m = proposals.camera.perhaps_m(self.options.max_range_m)
         for piece in proposals.pieces:
             if not names or piece.index < parts_until:
                 continue
             kind = max(names, key=lambda name: piece.share.get(name, 0.0))
             score = piece.symbol_score(kind)
             ground = piece.outline_vehicle
-            within = proposals.camera.range_m(ground.mean(axis=0)) <= self.options.max_range_m  # nan is not
+            within = proposals.camera.range_m(ground.mean(axis=0)) <= reach_m  # nan is not
             after = piece.index + 1 + piece.blob.parts
             if not within or score < self.options.min_score:
                 continue
