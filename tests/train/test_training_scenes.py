@@ -19,7 +19,7 @@ from train.scenes.hardships import (
     tight_bend,
     with_side_seams,
 )
-from train.scenes.letters import WORDS, Hand, random_hand, random_text, word
+from train.scenes.letters import WORDS, random_hand, random_text
 from train.scenes.paint import (
     Bend,
     Brush,
@@ -71,6 +71,7 @@ from v2hdm.records import (
     TEXT,
     CameraInfo,
 )
+from v2hdm.simulate.render.letters import Hand, word
 from v2hdm.simulate.render.renderer import Motion, Optics, Renderer
 from v2hdm.simulate.render.scene import Box, Ground, Paint, Scene, box_footprint
 
@@ -412,6 +413,75 @@ def test_scenes_without_hardships_show_words_boxes_and_symbols_too():
     new = [1 + PAINT_CLASSES.index(kind) for kind in (TEXT, BOX, BICYCLE)]
     shown = [np.isin(training_sample(11, k, 224, 128).labels, new).any() for k in range(60)]
     assert 0.05 < np.mean(shown) < 0.5
+
+
+PAINTED = (
+    (with_words, {TEXT}), (with_bays, {TEXT}), (with_boxes, {BOX}), (with_users, {BICYCLE}),
+    (with_other, {OTHER_PAINT}), (with_give_way, {STOP_LINE}), (with_far_stop, {STOP_LINE}),
+    (with_crosswalk, {CROSSWALK_BAR, STOP_LINE}), (with_double, {LANE_LINE, LANE_DASH}),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("lay", "kinds"), PAINTED)
+def test_paint_laid_on_a_bare_road_is_convex_and_of_the_class_that_labels_call_it(lay, kinds):
+    laid = 0
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        brush = random_brush(rng, 0.0)
+        assert lay(rng, bare := RoadPaint(), brush, Bend(0.0), 0.0) is bare
+        paints = lay(rng, bare, brush, Bend(0.01), 1.0).paints
+        laid += bool(paints)
+        assert {paint.kind for paint in paints} <= kinds
+        for paint in paints:
+            turn = turns_of(paint.polygon_map)
+            assert (turn > -1e-9).all() or (turn < 1e-9).all()
+    assert laid == 30
+
+
+def test_numbers_words_and_letters_have_strokes_in_every_hand():
+    rng = np.random.default_rng(0)
+    texts = [random_text(rng) for _ in range(200)]
+    assert {text.isdigit() for text in texts} == {True, False}
+    for text in texts:
+        strokes = list(word(text, 2.0, 0.5, 0.1, random_hand(rng)))
+        assert all(signed_area(stroke) > 0 and (turns_of(stroke) > -1e-9).all() for stroke in strokes)
+        assert np.vstack(strokes)[:, 0].max() == pytest.approx(
+            2.0 + 2.8 * text.count(" "), abs=0.3
+        ), "letters are as tall as asked for, whatever the hand"
+
+
+def test_a_stencil_leaves_bridges_and_a_round_hand_has_more_strokes():
+    plain, stencil, round_hand = (
+        list(word("B", 2.0, 0.5, 0.1, hand)) for hand in (Hand(), Hand(stencil=True), Hand(rounds=1))
+    )
+    assert len(stencil) > len(plain)
+    assert len(round_hand) > len(plain)
+    area = [sum(signed_area(stroke) for stroke in strokes) for strokes in (plain, stencil)]
+    assert area[1] < area[0]
+
+
+def test_the_strands_of_a_double_line_are_a_hand_apart():
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        double = double_line(rng, random_brush(rng, 0.0), Bend(0.0), 1.0)
+        across = np.array([[p.polygon_map[:, 1].min(), p.polygon_map[:, 1].max()] for p in double.paints])
+        right, left = across[across[:, 1] < 1.0], across[across[:, 0] > 1.0]
+        assert 0.08 <= left[:, 0].min() - right[:, 1].max() <= 0.35
+        assert len(double.lanes) == 1
+
+
+def test_a_stop_line_far_ahead_is_12_to_40_m_away():
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        brush = random_brush(rng, 0.0)
+        for paint in with_far_stop(rng, RoadPaint(), brush, Bend(0.0), 1.0).paints:
+            assert 6 < paint.polygon_map[:, 0].mean() < 44
+
+
+def test_half_of_the_validation_scenes_show_a_class_that_came_later():
+    new = [1 + PAINT_CLASSES.index(kind) for kind in (TEXT, BOX, BICYCLE)]
+    shown = [np.isin(training_sample(11, k, 224, 128).labels, new).any() for k in range(60)]
+    assert 0.15 < np.mean(shown) < 0.6
 
 
 def test_erased_markings_are_no_paint_and_vehicles_bear_pictures():
