@@ -72,6 +72,7 @@ def map_drive(
     progress: Progress = silent,
     workers: Processes = 0,
     context: Context | None = None,
+    all_maps: bool = False,
 ) -> Result:
     """Map a drive, or several through one site together; nothing is written, but what ``cache`` keeps.
 
@@ -88,7 +89,8 @@ def map_drive(
         cache: folder that keeps what each stage has found for the next call; None keeps nothing.
         progress: shows how far the long steps are, ``progress(task, done, total)``.
         workers: processes; 0 takes one per core.
-        context: takes the place of the last three.
+        context: takes the place of ``cache``, ``progress`` and ``workers``.
+        all_maps: whether to map with each camera alone and by the naive methods, too, for a comparison.
 
     Returns:
         Map (east, north, up; m), calibrations, trajectory, and the verdict as data: a FAIL raises nothing.
@@ -124,7 +126,7 @@ def map_drive(
     about = describe_run(name or read.whole.name, read.whole, read.contents, paths, reading)
     described = inspection.drive_as_described
     mapped_so_far = Result(about, read.drives, read.contents, described, context.seconds, options.device)
-    return _mapped(mapped_so_far, inspection, detector, survey, earlier, accuracy_goal_cm, context)
+    return _mapped(mapped_so_far, inspection, detector, survey, earlier, accuracy_goal_cm, context, all_maps)
 
 
 def _earlier(base: Path | str | None, drive: Drive, context: Context) -> Base | None:
@@ -145,6 +147,7 @@ def _mapped(
     earlier: Base | None,
     goal_cm: float,
     context: Context,
+    all_maps: bool,
 ) -> Result:
     """The result of a drive that was read and checked."""
     if detector is None:
@@ -156,7 +159,9 @@ def _mapped(
         with context.timed("map"):
             key = mapped_so_far.contents.key(inspection.drive)
             all_grades = of_all_grades(survey)
-            mapped = map_camera_sets(inspection.drive, key, detections, all_grades, earlier, context)
+            mapped = map_camera_sets(
+                inspection.drive, key, detections, all_grades, earlier, context, compare=all_maps
+            )
             sets = graded_sets(mapped, goal_cm / 100)
         with context.timed("wear"):
             sets = _with_wear(sets, inspection.drive, earlier, context)
@@ -248,7 +253,7 @@ def _judge(
     best = list(methods.values())[-1][BEST]
     check_points = list(sets.values())[-1].checked
     with context.timed("judge"):
-        solved_findings = check_result(inspection.drive, methods, inspection.ground)
+        solved_findings = check_result(inspection.drive, best, inspection.ground)
         result_findings = told_by_poses(solved_findings, inspection.findings)
         unfit_findings = check_known_sizes(survey.mapping.known_sizes, best)
         unfit_findings += check_corrections(survey.mapping.acceptance.corrections, best)

@@ -11,7 +11,7 @@
   // What is not zero never reads so.
   const small = (value, digits) => (value > 0 && value < 0.5 * 10 ** -digits ? `< ${10 ** -digits}` : number(value, digits));
   const cm = (metres) => `${small(100 * metres, 1)} cm`;
-  const SERIES = ["blue", "green", "vermillion", "purple", "orange", "sky"];
+  const SERIES = ["blue", "green", "vermillion", "purple", "orange", "sky", "wine", "teal", "olive", "indigo"];
   const DASHES = [null, "7 4", "2 4", "8 3 2 3"];
   const MOST_IN_DETAIL = 1200; // most markings in view with ellipses and arrows
   const LEAST_PX = 3; // least semi-axis of a drawn ellipse
@@ -72,8 +72,10 @@
     return shape;
   };
   layers.markings = L.featureGroup([
+    // Areas lie below the markings in them.
+    ...data.symbols.filter((one) => one.area).map((one) => feature(L.polygon(one.p.map(at), exact), { ...one, key: `s${one.id}`, what: "symbol" })),
     ...data.markings.map((one) => feature(L.polygon(one.c.map(at), exact), { ...one, key: `m${one.id}`, what: "marking" })),
-    ...data.symbols.map((one) => feature(L.polygon(one.p.map(at), exact), { ...one, key: `s${one.id}`, what: "symbol" })),
+    ...data.symbols.filter((one) => !one.area).map((one) => feature(L.polygon(one.p.map(at), exact), { ...one, key: `s${one.id}`, what: "symbol" })),
   ]);
   layers.excluded = L.featureGroup(data.excluded.map((one, n) =>
     feature(L.circleMarker(at(one.p), { radius: 4 }), { ...one, key: `x${n}`, what: "excluded" })));
@@ -121,7 +123,7 @@
     layers.lanes.eachLayer((line) => line.setStyle({ color: colour("sky"), weight: 2, dashArray: data.kinds[line.kind] === "lane_dash" ? "10 8" : null }));
     layers.recorded?.setStyle({ color: colour("vermillion"), weight: 1.2, dashArray: "2 5" });
     layers.adjusted?.setStyle({ color: ink, weight: 1.2, dashArray: null });
-    layers.markings.eachLayer((shape) => shape.setStyle({ color: fill(shape.about), weight: 1.2, fillOpacity: 0.55, dashArray: shape.about.what === "symbol" ? "4 2" : null }));
+    layers.markings.eachLayer((shape) => shape.setStyle({ color: fill(shape.about), weight: 1.2, fillOpacity: shape.about.area ? 0.2 : 0.55, dashArray: shape.about.what === "symbol" ? "4 2" : null }));
     layers.checks.setStyle({ color: ink, weight: 2, fillColor: colour("orange"), fillOpacity: 0.9 });
     layers.changes.eachLayer((shape) => shape.setStyle({ color: colour(FATES[shape.options.fate]), weight: 2.5, fillOpacity: 0 }));
     layers.excluded.setStyle({ color: colour("vermillion"), weight: 1.3, dashArray: "2 1.5", fill: true, fillOpacity: 0 });
@@ -195,7 +197,7 @@
     adjusted: ["var(--ink)"], recorded: ["var(--vermillion)", "2 4"], excluded: ["var(--vermillion)", "2 2", "ring"],
     arrows: ["var(--purple)", null, "arrow"], changes: ["var(--vermillion)", "5 4"], mosaic: ["var(--muted)", null, "box"], background: ["var(--muted)", null, "box"],
   };
-  const COUNTS = { changes: data.changes.length, markings: data.markings.length + data.symbols.length, checks: data.checks.length, lanes: data.lanes.length, excluded: data.excluded.length, truth: data.truth?.markings.length };
+  const COUNTS = { changes: data.changes.length, markings: data.markings.length + data.symbols.length, checks: data.checks.length, lanes: data.lane_lines, excluded: data.excluded.length, truth: data.truth?.markings.length };
   for (const name of Object.keys(NAMES)) {
     const empty = !layers[name] || (name === "arrows" && !data.markings.some((one) => one.a)) || COUNTS[name] === 0;
     if (empty) continue;
@@ -245,6 +247,8 @@
     if (change?.shift_m) rows.push(["moved by", `${cm(Math.hypot(...change.shift_m))} \u00b1 ${cm(Math.hypot(...change.shift_sigma_m) / Math.SQRT2)}`]);
     if (change) rows.push([change.fate, `with probability ${number(change.probability, 3)}; seen in ${change.n} of ${change.views} images`]);
     if (about.what !== "change") rows.push(["sightings", `${about.n} ${about.n === 1 ? "image" : "images"}`]);
+    if (about.kind) rows.push(["kind", words(about.kind)]);
+    if (about.parts) rows.push(["made of", `markings ${about.parts.join(", ")}`]);
     if (about.g) rows.push(["accuracy", about.g]);
     if (Number.isFinite(about.r)) rows.push(["95 % radius from marking to marking", cm(about.r)]);
     if (Number.isFinite(worst(about))) rows.push(["95 % radius in the map’s frame", `${cm(worst(about))} (worst corner)`]);
