@@ -51,7 +51,9 @@ _OPTIONAL = (
 _EDGE = ("frame_id", "child_frame_id")
 _IGNORED = ("rectification_matrix", "projection_matrix")  # of stereo rectification, not of recorded images
 _OF_OPENCV = ("dt", "type_id")  # OpenCV adds these to its matrices; numbers tell their type themselves
-_MODELS = {"": "plumb_bob", "radtan": "plumb_bob", "fisheye": "equidistant"}  # our lenses by other names
+_MODELS = dict.fromkeys(("", "none", "radtan", "brown_conrady"), "plumb_bob")
+_MODELS |= dict.fromkeys(("fisheye", "kannala_brandt", "kannala_brandt4", "kb4"), "equidistant")
+"""Our lenses by the names that drivers, OpenCV and Kalibr have for them."""
 
 
 @dataclass(frozen=True)
@@ -218,7 +220,10 @@ def info_of(fields: Any, name: str, where: str) -> CameraInfo:
     """The intrinsics of a ``CameraInfo`` message; DriveError if not calibrated, cut, or an unknown model."""
     intrinsic = np.array(getattr(fields, "k", getattr(fields, "K", None)), dtype=np.float64).reshape(3, 3)
     distortion = np.array(getattr(fields, "d", getattr(fields, "D", None)), dtype=np.float64).ravel()
-    model = _MODELS.get(fields.distortion_model, fields.distortion_model)
+    stated = fields.distortion_model
+    model = _MODELS.get(stated.strip().lower().replace("-", "_").replace(" ", "_"), stated)
+    if min(fields.width, fields.height) <= 0:
+        raise DriveError(f"{where}: states no size of the image; give camera_info as a file")
     if not intrinsic.any():
         raise DriveError(f"{where}: the camera is not calibrated (K is zero); give camera_info as a file")
     region = (fields.roi.width, fields.roi.height)
@@ -342,9 +347,27 @@ def _in_image(info: CameraInfo, rays_cam: FloatArray) -> BoolArray:
     return np.asarray(inside.all(axis=1) & (rays_cam[:, 2] > 0))
 
 
-def roi_of_ipm(info: CameraInfo, ipm: FloatArray) -> FloatArray:
-    """The region of interest (4, 2) of a camera for which none is stated: a rectangle where it looks."""
+def roi_where_it_looks(info: CameraInfo, ipm: FloatArray, where: str) -> FloatArray:
+    """The region of interest (4, 2) of a camera for which none is stated: a rectangle where it looks.
+
+    DriveError where it sees no ground there: then its direction is wrong, which ``where`` states.
+    """
     vehicle_from_cam = inverse(extrinsic_from_ipm(info, ipm))
+    roi_vehicle = _roi_ahead(vehicle_from_cam)
+    try:
+        check_roi_in_view(info, ipm, roi_vehicle, where)
+    except DriveError:
+        up_deg = np.degrees(np.arcsin(np.clip(vehicle_from_cam[2, 2], -1.0, 1.0)))
+        axis = f"{abs(up_deg):.0f} deg {'up' if up_deg > 0 else 'down'}"
+        raise DriveError(
+            f"{where}: its image shows no ground {_ROI_M[0]:g} to {_ROI_M[1]:g} m away, for its axis points "
+            f"{axis}: fix its angles, which are 0 for a level look ahead; of a matrix or a frame, z is the "
+            "way that the camera looks"
+        ) from None
+    return roi_vehicle
+
+
+def _roi_ahead(vehicle_from_cam: FloatArray) -> FloatArray:
     forward = vehicle_from_cam[:2, 2]
     down = vehicle_from_cam[:2, 1]
     # A camera that looks straight down has its image's top ahead.

@@ -137,9 +137,9 @@ def _read_camera(
     initial_ipm = reading.choose_initial(entry.get("initial_ipm"), ipm, where)
     if "roi_vehicle" in entry:
         roi_vehicle = reading.take_roi(entry["roi_vehicle"], f"{where}, roi_vehicle")
+        reading.check_roi_in_view(info, ipm[initial_ipm], roi_vehicle, f"{where}, roi_vehicle")
     else:
-        roi_vehicle = reading.roi_of_ipm(info, ipm[initial_ipm])
-    reading.check_roi_in_view(info, ipm[initial_ipm], roi_vehicle, f"{where}, roi_vehicle")
+        roi_vehicle = reading.roi_where_it_looks(info, ipm[initial_ipm], f"{where}, {guesses[0]}")
     return Camera(
         info=info,
         ipm=ipm,
