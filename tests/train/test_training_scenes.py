@@ -445,9 +445,9 @@ def test_numbers_words_and_letters_have_strokes_in_every_hand():
     for text in texts:
         strokes = list(word(text, 2.0, 0.5, 0.1, random_hand(rng)))
         assert all(signed_area(stroke) > 0 and (turns_of(stroke) > -1e-9).all() for stroke in strokes)
-        assert np.vstack(strokes)[:, 0].max() == pytest.approx(
-            2.0 + 2.8 * text.count(" "), abs=0.3
-        ), "letters are as tall as asked for, whatever the hand"
+        assert np.vstack(strokes)[:, 0].max() == pytest.approx(2.0 + 2.8 * text.count(" "), abs=0.3), (
+            "letters are as tall as asked for, whatever the hand"
+        )
 
 
 def test_a_stencil_leaves_bridges_and_a_round_hand_has_more_strokes():
