@@ -95,6 +95,7 @@ class CameraFrames:
     steps: tuple[FrameStep, ...] = ()  # from ``vehicle`` to ``camera``; none where the vehicle has no tree
     problem: str = ""  # why there are no steps
     states_height: bool = False  # of the camera above ``vehicle``, which a homography of the ground does not
+    rectified_from_camera: FloatArray | None = None  # (3, 3), turn of images that were rectified, else None
 
 
 @dataclass(frozen=True)
