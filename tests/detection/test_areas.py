@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from tests.detection.painted import hatched, network_output, word
-from tests.detection.pictures import make_camera, to_image
+from tests.detection.pictures import bar, make_camera, to_image
 from v2hdm.catalogue import SHIPPED
-from v2hdm.detection.areas import find_areas
+from v2hdm.detection.areas import find_areas, find_crosswalks
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.detector import _not_of
 from v2hdm.geometry.planar import rectangle_size
@@ -110,3 +110,21 @@ def test_a_letter_is_no_marking_and_a_surer_marking_in_a_box_stays():
     )
     beside = MarkingDetection("diamond", 0.3, corners + np.array([300, 0]), np.eye(8), np.ones(4, dtype=bool))
     assert [one.score for one in _not_of([area], (*markings, beside))] == [0.999, 0.3]
+
+
+def test_the_bars_of_an_image_are_its_crosswalk_s_parts():
+    bars = [bar(8.0, across, 2.0, 0.4) for across in (-1.6, -0.8, 0.0, 0.8, 1.6)]
+    valid = np.ones(4, dtype=bool)
+    stop = MarkingDetection("stop_line", 0.9, to_image(CAMERA, bar(5.5, 0, 0.3, 3.0)), np.eye(8), valid)
+    markings = [
+        MarkingDetection("crosswalk_bar", 0.8, to_image(CAMERA, one), np.eye(8), valid) for one in bars
+    ]
+    ((crosswalk, parts),) = find_crosswalks([stop, *markings], RoadCamera(CAMERA, 16))
+    assert (crosswalk.kind, crosswalk.score, sorted(parts)) == (
+        "crosswalk",
+        pytest.approx(0.8),
+        [1, 2, 3, 4, 5],
+    )
+    ground = RoadCamera(CAMERA, 16).unproject(crosswalk.outline_px)
+    np.testing.assert_allclose(np.ptp(ground, axis=0), [2.0, 3.6], atol=0.02)
+    assert find_crosswalks(markings[:2], RoadCamera(CAMERA, 16)) == []

@@ -35,7 +35,7 @@ def test_a_region_of_the_whole_image_is_no_crop():
     info = CameraInfo("cam", 64, 48, np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]))
     message = Messages().info(1.0, info, "cam")
     message.roi.width, message.roi.height = 64, 48
-    got = info_of(message, "cam", "here")
+    got = info_of(message, "cam", "here").info
     assert (got.width, got.height) == (64, 48)
     np.testing.assert_array_equal(got.intrinsic, info.intrinsic)
     message.roi.height = 24

@@ -1,7 +1,7 @@
 """Areas of paint: words, numbers and hatched boxes, each by the hull on the ground of all of its pieces.
 
 An area is made of pieces that do not touch: letters, hatching. Those of a class whose gap on the ground is a
-part of their own size are one area.
+part of their own size are one area. Crosswalks are composed of bars.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.network import NetworkOutput, as_probability
 from v2hdm.detection.quads.blobs import outlines_of
 from v2hdm.geometry.planar import rectangle_size
-from v2hdm.records import TEXT, BoolArray, FloatArray, IntArray, MarkingDetection
+from v2hdm.geometry.rows import outline_of_row, rows_of_bars
+from v2hdm.records import CROSSWALK, CROSSWALK_BAR, TEXT, BoolArray, FloatArray, IntArray, MarkingDetection
 
 _LEAST_CELLS = 5  # elements of paint of a piece: fewer are noise
 _LEAST_SHARE = 0.25
@@ -85,6 +86,30 @@ def find_areas(
             if within and area.score >= least_score:
                 areas.append(area)
     return areas
+
+
+def find_crosswalks(
+    markings: Sequence[MarkingDetection], camera: RoadCamera
+) -> list[tuple[MarkingDetection, tuple[int, ...]]]:
+    """The crosswalks of an image's bars, each with ``outline_px`` (4, 2) and the indices of its bars."""
+    bars = [k for k, marking in enumerate(markings) if marking.kind == CROSSWALK_BAR]
+    ground = camera.unproject(np.array([markings[k].corners_px for k in bars]).reshape(-1, 4, 2))
+    on_ground = np.flatnonzero(np.isfinite(ground).all(axis=(1, 2)))
+    crosswalks = []
+    for row in rows_of_bars(ground[on_ground]):
+        parts = tuple(bars[k] for k in on_ground[row].tolist())
+        outline_px = camera.project(outline_of_row(ground[on_ground[row]]).corners)
+        crosswalk = MarkingDetection(
+            kind=CROSSWALK,
+            score=float(np.mean([markings[k].score for k in parts])),
+            corners_px=np.full((4, 2), np.nan),
+            covariance_px=np.full((8, 8), np.nan),
+            corner_valid=np.zeros(4, dtype=np.bool_),
+            outline_px=outline_px,
+            outline_seen=np.ones(4, dtype=np.bool_),
+        )
+        crosswalks.append((crosswalk, parts))
+    return crosswalks
 
 
 def _pieces(output: NetworkOutput, camera: RoadCamera, share: np.ndarray, alike: np.ndarray) -> list[_Piece]:
