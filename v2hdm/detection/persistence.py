@@ -21,7 +21,7 @@ from v2hdm.geometry.rigid import inverse
 from v2hdm.records import BoolArray, FloatArray, MarkingDetection
 
 _PAINT_AGAIN = 0.75
-"""Probability that paint is found again as the same class: .94 and .99 on two drives, where nothing hides it."""
+"""Probability that paint is found again as its class: .94 and .99 on two drives, where nothing hides it."""
 
 _OTHER_AGAIN = 0.15  # probability that something else is found at that place: two of one sort in a row
 _EASY = 0.8  # share of the range within which paint is found so often
