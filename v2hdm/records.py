@@ -583,6 +583,8 @@ class Truth:
     visibility: FloatArray  # (I, J) fraction of marking j that image i shows, unoccluded
     lane_visible: tuple[BoolArray, ...]  # per lane, the vertices seen by some camera
     disturbances: Mapping[str, float]
+    symbol_visibility: FloatArray | None = None  # (I, S) of symbol s, as of markings
+    texts: Mapping[int, str] = field(default_factory=dict)  # what symbols say, by their number
 
 
 @checked_class
