@@ -106,6 +106,7 @@ def test_a_driver_that_states_no_p_or_r_is_taken_at_its_word_or_refused():
     with pytest.raises(DriveError, match="here: states no P for its rectified images; set rectified: false"):
         info_of(message, "cam", "here", rectified=True)
     message.p[:] = Messages().info(1.0, LENS, "cam").p
-    message.r[:] = np.diag([1.0, 1.0, 2.0]).ravel()
-    with pytest.raises(DriveError, match="here, R: is no rotation"):
-        info_of(message, "cam", "here", rectified=True)
+    for wrong in (2.0, 1e308, -1.0):
+        message.r[:] = np.diag([1.0, 1.0, wrong]).ravel()
+        with pytest.raises(DriveError, match="here, R: is no rotation"):
+            info_of(message, "cam", "here", rectified=True)

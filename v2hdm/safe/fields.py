@@ -103,8 +103,9 @@ def check_camera(info: CameraInfo, where: str, error: type[V2hdmError]) -> Camer
     if max(fx, fy, abs(skew), abs(cx), abs(cy)) > _LONGEST_FOCAL_PX:
         raise error(f"{where}: camera_matrix: beyond {_LONGEST_FOCAL_PX:g} px; fix it")
     # The image's reach from the axis to a side, and up or down, in focal lengths.
-    across = max(abs(cx + 0.5), abs(info.width - 0.5 - cx)) / fx
-    down = max(abs(cy + 0.5), abs(info.height - 0.5 - cy)) / fy
+    with np.errstate(over="ignore"):  # focal lengths may be of any size
+        across = max(abs(cx + 0.5), abs(info.width - 0.5 - cx)) / fx
+        down = max(abs(cy + 0.5), abs(info.height - 0.5 - cy)) / fy
     at = f"{where}: distortion_coefficients"
     k = info.distortion
     # The tangential part moves a point at r focal lengths by up to 3 p r^2, so that neighbours change places
