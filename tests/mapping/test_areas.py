@@ -14,12 +14,12 @@ from v2hdm.records import Marking, MarkingDetection
 from v2hdm.site.composed import composed
 
 STREET = SceneOptions(
-    length_m=36.0, turns=False, seed=3, false_rate=0.0, wild_rate=0.0, hidden_corner_rate=0.0,
-    rtk_m=0.0, heading_deg=0.0, jitter_deg=0.0,
+    length_m=24.0, turns=False, cameras=("front",), step_m=1.2, seed=3,
+    false_rate=0.0, wild_rate=0.0, hidden_corner_rate=0.0, rtk_m=0.0, heading_deg=0.0, jitter_deg=0.0,
 )  # fmt: skip
 BAR = np.array([[-1.5, -0.25], [1.5, -0.25], [1.5, 0.25], [-1.5, 0.25]])
 WAY = np.array([0.0, 0.0, 0.3])  # from the origin straight ahead
-LETTERS = _placed(word("EBH", (13.0, -2.0)).reshape(-1, 2), WAY)
+LETTERS = _placed(word("EBH", (13.0, 1.1), height_m=0.9).reshape(-1, 2), WAY)
 BARS = [_placed(BAR + np.array([22.0, across]), WAY) for across in np.arange(-1.5, 4.0)]
 BORDER = np.array([[0, 0], [1279, 0], [1279, 719], [0, 719]], dtype=np.float32)
 
@@ -62,12 +62,13 @@ def mapped():
     cut = [m for found in detections for m in found.markings if m.kind == "text" and not m.outline_seen.all()]
     assert len(cut) >= 2
     result = run_methods(scene.drive, detections, STREET.cameras, MappingOptions(pose_model="heave"))["Opt"]
+    assert [one.reason for one in result.excluded if one.kind in ("text", "crosswalk_bar")] == []
     return composed(result.hd_map)
 
 
 def test_a_word_is_mapped_as_the_rectangle_about_its_letters(mapped):
     (text,) = [symbol for symbol in mapped.symbols if symbol.kind == "text"]
-    points = word("EBH", (13.0, -2.0)).reshape(-1, 2)
+    points = word("EBH", (13.0, 1.1), height_m=0.9).reshape(-1, 2)
     (back, right), (front, left) = points.min(axis=0), points.max(axis=0)
     true = _placed(np.array([[back, right], [front, right], [front, left], [back, left]]), WAY)
     off = [np.linalg.norm(np.roll(text.outline_map, k, axis=0) - true, axis=1).max() for k in range(4)]
