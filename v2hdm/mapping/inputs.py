@@ -67,9 +67,7 @@ class Inputs:
         options = self.options.lanes
         jitter_rad = self.drive.pose_noise.roll_pitch_rad
         cloud = collect_lane_points(self.drive, self.detections, ground, options.max_range_m, jitter_rad)
-        from v2hdm.lanes.doubles import with_doubles  # checks of a drive need none
-
-        return with_doubles(map_lanes(cloud, options), cloud)
+        return map_lanes(cloud, options)
 
     @cached_property
     def tracks(self) -> Association:
