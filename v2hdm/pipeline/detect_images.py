@@ -5,10 +5,13 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import count, islice
+from itertools import chain, compress, count, islice
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
+from v2hdm.detection.batch import with_own_vehicle
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.frames import (
     Frame,
@@ -20,6 +23,7 @@ from v2hdm.detection.frames import (
     video_frames,
 )
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.detection.persistence import STATED_SIGMA_RAD, View, settled
 from v2hdm.detection.road import Road, RoadDetector
 from v2hdm.detection.stopwatch import Stopwatch, lap
 from v2hdm.doors import checked
@@ -27,7 +31,7 @@ from v2hdm.errors import ConfigError, DriveError, shown
 from v2hdm.io.calibration.intrinsics import is_calibration, read_intrinsics
 from v2hdm.io.drive import READERS, read_drive
 from v2hdm.pipeline.rough_camera import ROUGH_NAME, RoughCamera, check_size
-from v2hdm.records import CameraInfo
+from v2hdm.records import Calibration, CameraInfo
 from v2hdm.safe.pixels import IMAGE_SUFFIXES
 from v2hdm.store.inputs import note_input
 
@@ -102,7 +106,7 @@ def detect_images(
     rough = RoughCamera(detector, lens, path, mounting, linear)
     most = limit and min(limit, sys.maxsize)
     frames = islice((_live_frames if live else _frames)(str(source), road, rough), most)
-    return _found(frames, rough, stopwatch or Stopwatch())
+    return _on_ground(_found(frames, rough, stopwatch or Stopwatch()))
 
 
 def _lens(camera: Path | None, name: str | None, mounting: Sequence[float] | None) -> CameraInfo | None:
@@ -172,16 +176,29 @@ def _drive_frames(path: Path, road: RoadDetector | None, rough: RoughCamera) -> 
             "file as camera_info in drive.yaml"
         )
     drive = read_drive(path)
-    roads = {name: RoadDetector(rough.detector, camera) for name, camera in drive.cameras.items()}
+    calibration = None
     if road is not None:
         name = road.camera.info.name
         if name not in drive.cameras:
-            raise DriveError(f"{path}: no camera {shown(name)} in the calibration; it has {', '.join(roads)}")
-        roads = {name: road}
+            raise DriveError(
+                f"{path}: no camera {shown(name)} in the calibration; it has {', '.join(drive.cameras)}"
+            )
+        drive = replace(drive, cameras={name: road.camera})
+        calibration = road.calibration
+    drive = with_own_vehicle(drive, rough.detector)
+    roads = {
+        name: RoadDetector(rough.detector, camera, calibration) for name, camera in drive.cameras.items()
+    }
     numbers = {name: count() for name in roads}
     return (
         (
-            replace(frame, name=f"{name}_{frame.name}", index=next(numbers[name]), stamp_s=image.stamp_s),
+            replace(
+                frame,
+                name=f"{name}_{frame.name}",
+                index=next(numbers[name]),
+                stamp_s=image.stamp_s,
+                map_from_vehicle=image.map_from_vehicle,
+            ),
             roads[name],
         )
         for image in drive.images
@@ -190,7 +207,41 @@ def _drive_frames(path: Path, road: RoadDetector | None, rough: RoughCamera) -> 
     )
 
 
-def _found(frames: _Frames, rough: RoughCamera, stopwatch: Stopwatch) -> Iterator[Detected]:
+class _Found(NamedTuple):
+    """What an image shows, and from where, if that is known."""
+
+    detected: Detected
+    view: View | None
+
+
+def _on_ground(images: Iterator[_Found]) -> Iterator[Detected]:
+    """What images show, of a drive only what stays on the ground as the vehicle moves."""
+    first = next(images, None)
+    if first is None:
+        return
+    if first.view is None:
+        yield from (found.detected for found in chain([first], images))
+        return
+    for found, stays in settled(chain([first], images), _camera_and_view):
+        road = found.detected.road
+        kept = tuple(compress(road.markings, stays.tolist()))
+        yield found.detected._replace(road=replace(road, markings=kept))
+
+
+def _pitch_sigma_rad(calibration: Calibration | None) -> float:
+    """How far a camera's pitch may be off."""
+    if calibration is None or calibration.covariance is None:
+        return STATED_SIGMA_RAD
+    rotation = np.asarray(calibration.covariance)[3:, 3:]
+    return float(np.sqrt(np.trace(rotation)))
+
+
+def _camera_and_view(found: _Found) -> tuple[str, View]:
+    assert found.view is not None
+    return found.detected.camera, found.view
+
+
+def _found(frames: _Frames, rough: RoughCamera, stopwatch: Stopwatch) -> Iterator[_Found]:
     """Every frame with what it shows."""
     while True:
         with stopwatch.image():
@@ -206,4 +257,14 @@ def _found(frames: _Frames, rough: RoughCamera, stopwatch: Stopwatch) -> Iterato
                 check_size(frame, road.camera.info, "the calibration" if road.calibration else "the drive")
                 on_road = road.detect(frame.pixels)
                 name = road.camera.info.name
-        yield Detected(frame, name, on_road)
+        view = None
+        if road is not None and frame.map_from_vehicle is not None:
+            markings = [marking.image for marking in on_road.markings]
+            view = View(
+                frame.map_from_vehicle,
+                road.detector.road_camera(road.camera),
+                markings,
+                _pitch_sigma_rad(road.calibration),
+                road.detector.options.max_range_m,
+            )
+        yield _Found(Detected(frame, name, on_road), view)

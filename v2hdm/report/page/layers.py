@@ -183,6 +183,7 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
             _feature(symbol, kinds, "p", symbol.outline_map)
             | {"w": _radii(symbol)}
             | ({} if symbol.accuracy is None else {"g": symbol.accuracy})
+            | ({} if symbol.reading is None else {"says": list(symbol.reading)})
             | ({"parts": list(symbol.parts)} if symbol.parts else {})
             | ({"area": 1} if symbol.kind in (CROSSWALK, *SHIPPED.of_family(AREA)) else {})
             for symbol in hd_map.symbols

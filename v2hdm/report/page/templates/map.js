@@ -89,6 +89,8 @@
     if (one.fate === "vanished") return [feature(L.polygon(one.p.map(at), { ...exact, ...dashed }), { ...one, key: `d${one.id}`, what: "change" })];
     return [[before, dashed], [one.p, { fate: one.fate }]].map(([corners, look]) => L.polygon(corners.map(at), { ...still(above), ...exact, ...look, fill: false }));
   }));
+  const written = data.symbols.filter((one) => one.says);
+  if (written.length) layers.texts = L.layerGroup();
   layers.ellipses = L.layerGroup();
   layers.arrows = L.layerGroup();
   const selection = L.layerGroup().addTo(map);
@@ -150,6 +152,7 @@
   function detail() {
     layers.ellipses.clearLayers();
     layers.arrows.clearLayers();
+    label();
     const [ellipses, arrows] = [map.hasLayer(layers.ellipses), map.hasLayer(layers.arrows)];
     const shown = ellipses || arrows ? inView() : [];
     byId("map").dataset.detail = shown ? "drawn" : "too many";
@@ -166,6 +169,16 @@
     }
   }
 
+  function label() { // what words say, where there is room for it
+    layers.texts?.clearLayers();
+    if (!layers.texts || map.getZoomScale(map.getZoom(), 0) < NEAR_PX) return;
+    const bounds = map.getBounds().pad(0.1);
+    for (const one of written.filter(({ p }) => bounds.contains(at(p[0]))).slice(0, MOST_IN_DETAIL)) {
+      const made = L.tooltip({ permanent: true, direction: "center", className: "corner", interactive: false });
+      layers.texts.addLayer(made.setLatLng(L.latLngBounds(one.p.map(at)).getCenter()).setContent(element("span", {}, one.says[0])));
+    }
+  }
+
   function arrow(one, camera, dx, dy, times, px) {
     const x = one.c.reduce((sum, corner) => sum + corner[0], 0) / 4;
     const y = one.c.reduce((sum, corner) => sum + corner[1], 0) / 4;
@@ -179,10 +192,10 @@
 
   // ---- the panel ----
   const NAMES = {
-    markings: "markings and symbols", lanes: "lane lines", truth: "ground truth", checks: "check points", ellipses: "95 % ellipses", adjusted: "route, adjusted",
+    markings: "markings and symbols", texts: "what words say", lanes: "lane lines", truth: "ground truth", checks: "check points", ellipses: "95 % ellipses", adjusted: "route, adjusted",
     recorded: "route, recorded", excluded: "excluded candidates", changes: "changes", arrows: "residual arrows", mosaic: "ground mosaic", background: "background picture",
   };
-  const ON = ["markings", "lanes", "adjusted", "excluded", "checks", "changes", "ellipses", "mosaic", "background"];
+  const ON = ["markings", "texts", "lanes", "adjusted", "excluded", "checks", "changes", "ellipses", "mosaic", "background"];
   const swatch = (stroke, dashes, shape = "line") => {
     const made = element("svg", { viewBox: "0 0 26 14", "aria-hidden": "true" });
     const look = { style: `stroke:${stroke};stroke-width:2;fill:none`, ...(dashes ? { "stroke-dasharray": dashes } : {}) };
@@ -193,11 +206,11 @@
     return made;
   };
   const SWATCHES = {
-    markings: ["var(--blue)", null, "box"], lanes: ["var(--sky)"], truth: ["var(--muted)", "3 3"], checks: ["var(--orange)", null, "ring"], ellipses: ["var(--ink)", null, "ring"],
+    markings: ["var(--blue)", null, "box"], texts: ["var(--ink)", null, "box"], lanes: ["var(--sky)"], truth: ["var(--muted)", "3 3"], checks: ["var(--orange)", null, "ring"], ellipses: ["var(--ink)", null, "ring"],
     adjusted: ["var(--ink)"], recorded: ["var(--vermillion)", "2 4"], excluded: ["var(--vermillion)", "2 2", "ring"],
     arrows: ["var(--purple)", null, "arrow"], changes: ["var(--vermillion)", "5 4"], mosaic: ["var(--muted)", null, "box"], background: ["var(--muted)", null, "box"],
   };
-  const COUNTS = { changes: data.changes.length, markings: data.markings.length + data.symbols.length, checks: data.checks.length, lanes: data.lane_lines, excluded: data.excluded.length, truth: data.truth?.markings.length };
+  const COUNTS = { texts: written.length, changes: data.changes.length, markings: data.markings.length + data.symbols.length, checks: data.checks.length, lanes: data.lane_lines, excluded: data.excluded.length, truth: data.truth?.markings.length };
   for (const name of Object.keys(NAMES)) {
     const empty = !layers[name] || (name === "arrows" && !data.markings.some((one) => one.a)) || COUNTS[name] === 0;
     if (empty) continue;
@@ -238,7 +251,7 @@
   }
 
   // ---- pointing and selecting ----
-  const title = (about) => (about.what === "check" ? `Check point ${about.id}` : about.what === "excluded" ? `Excluded: ${words(about.k)}` : about.what === "change" ? `${words(about.k)} ${about.id}: ${about.fate}` : `${about.what === "symbol" ? "Symbol" : "Marking"} ${about.id}, ${words(data.kinds[about.k])}`);
+  const title = (about) => (about.what === "check" ? `Check point ${about.id}` : about.what === "excluded" ? `Excluded: ${words(about.k)}` : about.what === "change" ? `${words(about.k)} ${about.id}: ${about.fate}` : `${about.what === "symbol" ? "Symbol" : "Marking"} ${about.id}, ${words(data.kinds[about.k])}${about.says ? ` \u201c${about.says[0]}\u201d` : ""}`);
   function facts(about) {
     if (about.what === "check") return checked(about);
     const rows = [];
@@ -247,6 +260,11 @@
     if (change?.shift_m) rows.push(["moved by", `${cm(Math.hypot(...change.shift_m))} \u00b1 ${cm(Math.hypot(...change.shift_sigma_m) / Math.SQRT2)}`]);
     if (change) rows.push([change.fate, `with probability ${number(change.probability, 3)}; seen in ${change.n} of ${change.views} images`]);
     if (about.what !== "change") rows.push(["sightings", `${about.n} ${about.n === 1 ? "image" : "images"}`]);
+    if (about.says) {
+      const [text, sure, other, sureOfOther] = about.says;
+      rows.push(["says", `${text}, with probability ${number(sure, 2)}`]);
+      if (other !== null) rows.push(["or", `${other}, with probability ${number(sureOfOther, 2)}`]);
+    }
     if (about.kind) rows.push(["kind", words(about.kind)]);
     if (about.parts) rows.push(["made of", `markings ${about.parts.join(", ")}`]);
     if (about.g) rows.push(["accuracy", about.g]);
@@ -315,11 +333,14 @@
     return element("table", {}, element("thead", {}, element("tr", {}, ...head)), element("tbody", {}, ...rows));
   }
 
+  // A text and its alternative, as they are searched for.
+  const says = ({ says: said }) => (said ?? []).filter((part) => typeof part === "string").map((part) => part.toLowerCase());
   byId("find").addEventListener("submit", (event) => {
     event.preventDefault();
-    const wanted = Number(byId("find-id").value);
-    const found = things.find((shape) => shape.about.id === wanted && ["marking", "symbol"].includes(shape.about.what));
-    byId("find-id").setCustomValidity(found ? "" : "No marking of this number.");
+    const wanted = byId("find-id").value.trim();
+    const mapped = things.filter((shape) => ["marking", "symbol"].includes(shape.about.what));
+    const found = mapped.find(({ about }) => says(about).includes(wanted.toLowerCase())) ?? mapped.find(({ about }) => about.id === Number(wanted));
+    byId("find-id").setCustomValidity(found ? "" : "No marking of this number, and no such text.");
     byId("find-id").reportValidity();
     if (!found) return;
     show(found);
@@ -353,6 +374,7 @@
   const COLUMNS = [
     { name: "marking", of: (one) => one.id, digits: 0 },
     { name: "class", of: (one) => words(data.kinds[one.k]) },
+    ...(written.length ? [{ name: "text", of: (one) => one.says?.[0] ?? "\u2013" }] : []),
     { name: "sightings", of: (one) => one.n, digits: 0 },
     ...(listed.some(({ about }) => about.g) ? [{ name: "accuracy", of: (one) => one.g ?? "\u2013" }] : []),
     { name: "from marking to marking (cm)", of: (one) => 100 * (one.r ?? NaN), digits: 1 },
@@ -365,7 +387,7 @@
     const wanted = byId("search").value.trim().toLowerCase().split(/\s+/);
     const { of } = COLUMNS[order.column];
     const key = (shape) => { const value = of(shape.about); return typeof value === "string" || Number.isFinite(value) ? value : null; };
-    return listed.filter(({ about }) => wanted.every((word) => String(about.id) === word || words(data.kinds[about.k]).includes(word)))
+    return listed.filter(({ about }) => wanted.every((word) => String(about.id) === word || words(data.kinds[about.k]).includes(word) || says(about).some((text) => text.includes(word))))
       .map((shape) => [key(shape), shape])
       .sort(([a, one], [b, other]) => (a === null) - (b === null) || (order.down ? -1 : 1) * (a < b ? -1 : a > b ? 1 : 0) || one.about.id - other.about.id)
       .map(([, shape]) => shape);
