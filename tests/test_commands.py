@@ -5,8 +5,10 @@ import io
 import os
 import re
 import resource
+import signal
 import subprocess
 import sys
+import time
 import tomllib
 from contextlib import suppress
 from dataclasses import replace
@@ -128,6 +130,44 @@ def test_libraries_that_die_for_want_of_memory_are_one_line_and_exit_code_2(dies
     assert done.stderr.startswith(f"error: {says}")
 
 
+WAITS = """
+import os, pathlib, signal, time
+{}
+pathlib.Path("told").write_text(str(os.getpid()))
+while True:
+    time.sleep(1)
+"""
+
+
+@pytest.mark.parametrize("first", ["", "signal.signal(signal.SIGTERM, signal.SIG_IGN)"], ids=["tidy", "deaf"])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGHUP, signal.SIGQUIT, signal.SIGTERM])
+def test_a_command_under_a_limit_of_memory_ends_with_whoever_started_it(number, first, tmp_path):
+    if first and number != signal.SIGKILL:
+        pytest.skip("is the same whatever the signal")
+    (tmp_path / "cv2.py").write_text(WAITS.format(first))
+    _, most = resource.getrlimit(resource.RLIMIT_AS)
+    parent = subprocess.Popen(
+        [sys.executable, "-m", "v2hdm", "detect", "a.jpg"],
+        env=os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"}, cwd=tmp_path,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (2**40, most)),
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    told = tmp_path / "told"
+    wait_until(lambda: told.is_file() and told.read_text())
+    child = Path("/proc", told.read_text())
+    assert int(told.read_text()) != parent.pid
+    parent.send_signal(number)
+    assert parent.wait(30) in (-number, 2)
+    wait_until(lambda: not child.exists() or ") Z " in (child / "stat").read_text())
+
+
+def wait_until(is_so):
+    end_s = time.monotonic() + 60
+    while not is_so():
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
+
+
 class FullDisk(io.StringIO):
     def write(self, text):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -171,7 +211,9 @@ def test_the_list_has_a_sentence_for_each_command_and_each_file_declares_its_own
     assert [command.name for command in COMMANDS.values()] == [f"v2hdm {name}" for name in COMMANDS]
     assert run(["calibrate", "pints"]) == 2
     assert (
-        capsys.readouterr().err == "error: v2hdm calibrate pints: no such command; v2hdm --help lists them\n"
+        capsys.readouterr().err
+        == "error: v2hdm calibrate pints: no such command; did you mean calibrate points? "
+        "v2hdm --help lists them\n"
     )
 
 

@@ -25,12 +25,14 @@ def test_the_schemas_are_those_of_the_declarations():
 
 @pytest.mark.parametrize("path", RUN_FILES, ids=lambda path: path.stem)
 def test_the_shipped_run_files_are_accepted(path):
-    ACCEPTS["run"](yaml.safe_load(path.read_text()))
+    content = yaml.safe_load(path.read_text())
+    assert ACCEPTS["run"](content) == content
 
 
 @pytest.mark.parametrize("name", ["docs/drive-format.md", "docs/bags.md"])
 def test_the_documented_drives_are_accepted(name):
-    ACCEPTS["drive"](yaml.safe_load(blocks(name, "yaml")[0].text))
+    content = yaml.safe_load(blocks(name, "yaml")[0].text)
+    assert ACCEPTS["drive"](content) == content
 
 
 @pytest.mark.parametrize(

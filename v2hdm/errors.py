@@ -8,11 +8,36 @@ else that is raised is a bug of ours and keeps its traceback.
 from __future__ import annotations
 
 import importlib
+import re
 from types import ModuleType
+
+_LOGIN = re.compile(r"(?P<scheme>[a-z][a-z0-9+.-]{1,20}):/+(?P<login>[^\s'\"<>]*)@", re.IGNORECASE)
+_QUERY = re.compile(
+    r"([a-z][a-z0-9+.-]{1,20}:/+[^\s'\"<>?#]*[?#])[^\s'\"<>]*[^\s'\"<>:;,.)\]]", re.IGNORECASE
+)
+_AZURE = ("abfs", "abfss")  # whose URLs name a container where others have a login
+_MASK = "***"
+_MOST_MASKED = (
+    10_000  # letters of a message that are looked at for secrets; the middle of longer ones is cut out
+)
+
+
+def masked(text: str) -> str:
+    """A text without what URLs in it, also those taken for paths, hold of logins, passwords and tokens."""
+
+    def without_login(url: re.Match[str]) -> str:
+        if url["scheme"].lower() in _AZURE and ":" not in url["login"]:
+            return url[0]
+        return url[0].removesuffix(f"{url['login']}@") + f"{_MASK}@"
+
+    return _QUERY.sub(rf"\1{_MASK}", _LOGIN.sub(without_login, text)) if ":/" in text else text
 
 
 class V2hdmError(Exception):
-    """Root of all errors that a user can cause and mend."""
+    """Root of all errors that a user can cause and mend; its message is bounded, and no secret."""
+
+    def __init__(self, message: str = "") -> None:
+        super().__init__(bounded(masked(bounded(message, _MOST_MASKED))))
 
 
 class ConfigError(V2hdmError):
@@ -43,6 +68,11 @@ class AdjustError(V2hdmError):
     """A bundle adjustment problem is malformed: the message names the offending item."""
 
 
+MOST_DIGITS = 64  # of a whole number; doubles end at 309 digits, and nothing here counts beyond 2**64
+_SHORT = 60  # letters of a value that an error shows; chosen
+_FEW = 4  # entries of a list that an error shows in full; chosen
+_MOST_LETTERS = 1200  # of a message: two paths of the longest that a system knows as text, and what is said
+REASON_LETTERS = 300  # of what a library or a process says of its failure; chosen
 EXIT_USER_ERROR = 2  # exit code of a command after a mistake of the user's
 EXIT_FAILED_VERDICT = 3  # exit code of a command whose verdict is FAIL
 
@@ -67,9 +97,38 @@ def describe(error: BaseException) -> str | None:
     return None
 
 
+def shown(content: object) -> str:
+    """``content`` as a short piece of one line: what a user wrote, quoted where it is a text."""
+    if content is None:
+        return "nothing"
+    if isinstance(content, bool):
+        return str(content).lower()
+    if isinstance(content, dict):
+        return "a mapping with " + shown(next(iter(content))) if content else "an empty mapping"
+    if isinstance(content, list | tuple):
+        if 1 < len(content) <= _FEW and not any(isinstance(part, dict | list | tuple) for part in content):
+            return f"[{', '.join(map(shown, content))}]"
+        return f"a list of {len(content)}" if len(content) != 1 else "a list of one"
+    if isinstance(content, int) and abs(content) >= 10**MOST_DIGITS:
+        return "a number with very many digits"
+    letters = str(content)[: _SHORT + 1]
+    text = "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in letters)
+    if len(text) > _SHORT:
+        text = f"{text[: _SHORT - 3]}..."
+    return f"'{text}'" if isinstance(content, str) else text
+
+
+def bounded(message: str, most: int = _MOST_LETTERS) -> str:
+    """``message`` of ``most`` letters: without its middle, for cause and remedy are at its ends."""
+    return message if len(message) <= most else f"{message[: 2 * most // 3]} ... {message[-most // 3 :]}"
+
+
 def one_line(message: str) -> str:
-    """A message whose words come from files of strangers: none ends the line or moves the cursor."""
-    line = " ".join(message.split())
+    """A message whose words come from files of strangers: none ends the line or moves the cursor.
+
+    What its URLs hold of passwords is :func:`masked`.
+    """
+    line = " ".join(bounded(masked(bounded(message, _MOST_MASKED))).split())
     return line if line.isprintable() else "".join(c if c.isprintable() else "?" for c in line)
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import os
 import sys
@@ -26,6 +24,7 @@ from v2hdm.errors import (
     V2hdmError,
     WorkerError,
     describe,
+    masked,
     one_line,
 )  # fmt: skip
 from v2hdm.pipeline.config import RunConfig, run_name
@@ -34,6 +33,7 @@ from v2hdm.progress import Progress, patient
 from v2hdm.records import BEST
 from v2hdm.report.terminal import DriveProgress, drive_bars, new_table, plain
 from v2hdm.safe.texts import take_name
+from v2hdm.store.files import csv_text
 from v2hdm.store.remote import place_of
 from v2hdm.store.results import WriteFile, growing_folder
 from v2hdm.workers import side_by_side
@@ -91,18 +91,20 @@ class Row:
         )
 
 
+def _shown(row: Row) -> dict[str, Any]:
+    """A row as others may see it."""
+    return {name: masked(value) if isinstance(value, str) else value for name, value in asdict(row).items()}
+
+
 def as_csv(rows: Sequence[Row]) -> bytes:
     """The rows as a spreadsheet."""
-    out = io.StringIO()
-    writer = csv.DictWriter(out, [field.name for field in fields(Row)], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(asdict(row) for row in rows)
-    return out.getvalue().encode()
+    heading = [field.name for field in fields(Row)]
+    return csv_text([heading, *([*_shown(row).values()] for row in rows)]).encode()
 
 
 def as_json(rows: Sequence[Row]) -> bytes:
     """The rows as JSON."""
-    return (json.dumps({"drives": [asdict(row) for row in rows]}, indent=2) + "\n").encode()
+    return (json.dumps({"drives": [_shown(row) for row in rows]}, indent=2) + "\n").encode()
 
 
 def as_table(rows: Sequence[Row]) -> Table:

@@ -7,10 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from v2hdm.io.drive import read_drive
+from v2hdm.doors import check_types, checked
+from v2hdm.io.drive import as_drive, read_drive
 from v2hdm.io.maps.reading import read_map as _read
 from v2hdm.progress import Steps
 from v2hdm.records import Drive, HDMap, ImageDetections
+from v2hdm.settings import Processes
 from v2hdm.store.names import map_file
 
 if TYPE_CHECKING:  # load torch or scipy
@@ -19,6 +21,7 @@ if TYPE_CHECKING:  # load torch or scipy
     from v2hdm.simulate.port.config import PortConfig
 
 
+@checked
 def read_map(path: str | Path) -> HDMap:
     """Read a map: the folder of a result, or a ``map.geojson`` or ``map.gpkg``, edited or not.
 
@@ -34,6 +37,7 @@ def read_map(path: str | Path) -> HDMap:
     return _read(map_file(path))[0]
 
 
+@checked
 def build_problem(
     drive: Drive, detections: Sequence[ImageDetections], options: MappingOptions | None = None
 ) -> Problem:
@@ -48,7 +52,8 @@ def build_problem(
         Cameras, frames and corners with their observations (recorded pixels, the lens undone) and priors.
 
     Raises:
-        MappingError: there is nothing to map.
+        MappingError: there is nothing to map, or the detections are of another drive.
+        ConfigError: an option is wrong.
 
     >>> problem = build_problem(port, result.detections)
     >>> problem.map_from_vehicle.shape[1:], problem.cam_from_vehicle.shape
@@ -56,15 +61,24 @@ def build_problem(
     >>> solve(problem).status.value
     'converged'
     """
+    from v2hdm.association.sightings import check_detections
     from v2hdm.mapping.inputs import Inputs
-    from v2hdm.mapping.options import MappingOptions
+    from v2hdm.mapping.options import MappingOptions, check_options
 
-    inputs = Inputs(drive, detections, tuple(drive.cameras), options or MappingOptions())
+    options = options or MappingOptions()
+    check_options(options)
+    check_detections(as_drive(drive), detections)
+    inputs = Inputs(drive, detections, tuple(drive.cameras), options)
     return inputs.optimiser.settle(inputs.tracks).problem
 
 
+@checked
 def simulate_port(
-    folder: str | Path, config: PortConfig | None = None, *, workers: int = 1, progress: Steps | None = None
+    folder: str | Path,
+    config: PortConfig | None = None,
+    *,
+    workers: Processes = 1,
+    progress: Steps | None = None,
 ) -> Drive:
     """Render a drive through a port, with ground truth, into a folder of its own below ``folder``, once.
 
@@ -88,6 +102,7 @@ def simulate_port(
     from v2hdm.simulate.port.drive import rendered_drive
 
     config = config or _short_port()
+    check_types(config, "config.")
     return read_drive(rendered_drive(config, Path(folder), workers, progress or (lambda done, total: None)))
 
 

@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from v2hdm.doors import checked_class
+
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
@@ -65,6 +67,27 @@ class CentrePrior:
 
 
 @dataclass(frozen=True)
+class FrameStep:
+    """An edge of a tree of frames; ``parent_from_child`` (4, 4) is None where the tree lacks it."""
+
+    parent: str
+    child: str
+    parent_from_child: FloatArray | None
+
+
+@dataclass(frozen=True)
+class CameraFrames:
+    """A camera's place in the tree of frames of its vehicle, by the tree's own names; empty if not stated."""
+
+    vehicle: str = ""  # the frame that the drive's positions on the vehicle count from
+    camera: str = ""  # the frame of the images
+    height_m: float = 0.0  # of ``vehicle`` above the ground
+    steps: tuple[FrameStep, ...] = ()  # from ``vehicle`` to ``camera``; none where the vehicle has no tree
+    problem: str = ""  # why there are no steps
+    states_height: bool = False  # of the camera above ``vehicle``, which a homography of the ground does not
+
+
+@dataclass(frozen=True)
 class Camera:
     """One camera of a drive: its intrinsics and approximate mounting."""
 
@@ -78,6 +101,7 @@ class Camera:
     own_vehicle: BoolArray | None = None  # (height, width) pixels that show the vehicle
     mounting_sigma: tuple[float, float] = (0.0, 0.0)  # of a guessed horizon (rad) and log focal length
     read_out_s: float = 0.0  # first row to last, 0 for a global shutter; stamps are of the middle row
+    frames: CameraFrames = CameraFrames()
 
 
 @dataclass(frozen=True)
@@ -97,6 +121,9 @@ SIGMA_OF_MAD = 1.4826
 SIGMAS_95 = 2.4477
 """Semi-axes of the 95 % ellipse of a two-dimensional normal error, in standard deviations: the root of the
 chi-square quantile with two degrees of freedom."""
+
+TWO_SIDED_95 = 1.96
+"""Half the width of the band that holds 95 % of a normal error in one dimension, in standard deviations."""
 
 FOOT_M = 0.3048  # an international foot, m
 
@@ -226,6 +253,8 @@ class Drive:
     recorded: Trajectory | None = None  # the same as recorded
     road: Road | None = None  # as recorded, None for the plane z = 0
     unposed: Mapping[str, int] = field(default_factory=dict)  # images left out, without a pose
+    # First and last time, s, of all images of a camera, left out or not.
+    listed_s: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     joined: tuple[Session, ...] = ()  # its sessions, if several: then it has no trajectory
 
     def name_of(self, path: Path) -> str:
@@ -338,7 +367,7 @@ class Marking:
     corners_map: FloatArray  # (4, 2) m, counter-clockwise from above
     sightings: int
     covariance_m2: FloatArray | None = None  # (8, 8) of the stacked corners, if known
-    # per coordinate of the distance to a marking about 10 m away, in which shared errors cancel
+    # of a coordinate of its centre, given those of its neighbours: what they share cancels
     relative_sigma_m: float | None = None
     heights_m: FloatArray | None = None  # (4,) of the ground, None for z = 0
     id: int | None = None  # positive and unique; None until the map is written
@@ -398,6 +427,7 @@ class GroundStrip:
         return self.points_map + left_m * np.column_stack([-self.ahead[:, 1], self.ahead[:, 0]])
 
 
+@checked_class
 @dataclass(frozen=True)
 class HDMap:
     """Markings, lanes and symbols of a site in its map frame.
@@ -540,6 +570,7 @@ class Truth:
     disturbances: Mapping[str, float]
 
 
+@checked_class
 @dataclass(frozen=True)
 class Calibration:
     """The calibration of one camera, with its extrinsic ``cam_from_vehicle`` (4, 4).
@@ -556,6 +587,7 @@ class Calibration:
     info: CameraInfo
     cam_from_vehicle: FloatArray
     covariance: FloatArray | None = None
+    frames: CameraFrames = CameraFrames()
 
     @property
     def centre_vehicle(self) -> FloatArray:

@@ -48,6 +48,8 @@ POSITIVE = Within(0, open=True)  # above zero
 NOT_NEGATIVE = Within(0)  # zero or more
 SHARE = Within(0, 1)  # of a whole
 COUNT = Within(1, 10**12)  # chosen: more than any machine holds
+Processes = Annotated[int, Within(0, MOST_PROCESSES)]
+"""Number of processes; 0 is one per core."""
 SEED = Within(0, 2**63 - 1)  # whole numbers of 64 bits with a sign
 
 

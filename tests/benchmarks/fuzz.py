@@ -10,9 +10,32 @@ from __future__ import annotations
 
 import argparse
 import os
+import random
+import re
 import sys
 import tempfile
 from pathlib import Path
+
+_TOKEN = re.compile(rb'-?\d+\.?\d*(?:[eE][-+]?\d+)?|"[^"\n]*"|\b[A-Za-z_]\w*|[][{},:;]')
+_VALUES = (
+    *(b"nan", b"inf", b"1e308", b"-1e308", b"1e999", b"-1", b"0", b"1", b"5e-324", b"99999999999999999999"),
+    *(b"null", b"true", b'""', b'"\\ud800"', b"[]", b"{}", b"[[[[[[[[", b"{a: ", b"=1+1"),
+    *(b"\x1b[2J", b"\xff"),
+)  # fmt: skip
+
+
+def mutated(data: bytes, most: int, seed: int) -> bytes:
+    """``data`` with some of its numbers, texts, names and brackets replaced or dropped."""
+    chance = random.Random(seed)
+    for _ in range(chance.randint(1, 3)):
+        tokens = [match.span() for match in _TOKEN.finditer(data)]
+        if not tokens:
+            return data[:most]
+        begin, end = chance.choice(tokens)
+        other = slice(*chance.choice(tokens))
+        new = chance.choice([chance.choice(_VALUES), data[other], b"", 2 * data[begin:end]])
+        data = data[:begin] + new + data[end:]
+    return data[:most]
 
 
 def main() -> int:
@@ -21,6 +44,7 @@ def main() -> int:
     parser.add_argument("reader", nargs="?")
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--corpus", type=Path)
+    parser.add_argument("--most-mb", type=int, default=500, help="memory at which it ends")
     parsed = parser.parse_args()
     try:
         import atheris
@@ -50,8 +74,17 @@ def main() -> int:
             if "\n" in str(refused):
                 raise RuntimeError("an error of more than one line") from refused
 
-    limits = [f"-max_total_time={round(60 * parsed.minutes)}", "-timeout=30", "-rss_limit_mb=4096"]
-    atheris.Setup([sys.argv[0], *limits, "-print_final_stats=1", str(corpus)], one_input)
+    limits = [
+        f"-max_total_time={round(60 * parsed.minutes)}",
+        "-timeout=30",
+        f"-rss_limit_mb={parsed.most_mb}",
+    ]
+
+    def next_input(data: bytes, most: int, seed: int) -> bytes:
+        return mutated(data, most, seed) if seed % 4 else bytes(atheris.Mutate(data, most))
+
+    arguments = [sys.argv[0], *limits, "-print_final_stats=1", str(corpus)]
+    atheris.Setup(arguments, one_input, custom_mutator=next_input)
     atheris.Fuzz()
     return 0
 

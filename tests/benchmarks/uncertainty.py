@@ -31,7 +31,7 @@ from v2hdm.records import Calibration, Drive, FloatArray, Marking, PoseNoise, Tr
 from v2hdm.report.metrics import match_markings
 from v2hdm.simulate.port.config import PortConfig
 from v2hdm.simulate.port.drive import rendered_drive
-from v2hdm.site.markings import neighbours
+from v2hdm.site.relative import neighbours
 
 QUANTITIES = ("corners", "sides", "distances", "height", "roll", "pitch", "yaw")
 CACHE = Path("~/.cache/v2hdm/uncertainty").expanduser()
@@ -102,7 +102,9 @@ def distance_errors(mapped: Sequence[Marking], true: FloatArray) -> FloatArray:
     centres = np.array([marking.corners_map.mean(axis=0) for marking in mapped])
     true_centres = true.mean(axis=1)
     sigma = np.array([marking.relative_sigma_m or np.nan for marking in mapped])
-    first, second = neighbours(centres)
+    near = neighbours(centres)
+    first = np.array([k for k, others in enumerate(near) if len(others)], dtype=np.int64)
+    second = np.array([near[k][0] for k in first], dtype=np.int64)
     off = np.linalg.norm(centres[first] - centres[second], axis=1)
     off -= np.linalg.norm(true_centres[first] - true_centres[second], axis=1)
     squared = off**2 / (sigma[first] ** 2 + sigma[second] ** 2)

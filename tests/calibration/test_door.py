@@ -21,9 +21,9 @@ from v2hdm.calibration.compare import FALSE_ALARM, movement
 from v2hdm.calibration.from_points import calibrate_from_points
 from v2hdm.calibration.points import check_points, read_points
 from v2hdm.cli.main import run as run_command
-from v2hdm.detection.camera import camera_from_calibration
+from v2hdm.detection.camera import camera_from_calibration, rough_calibration
 from v2hdm.errors import DriveError, MapFileError
-from v2hdm.geometry.ipm import apply_homography
+from v2hdm.geometry.ipm import apply_homography, project_ground
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.rigid import exp
 from v2hdm.io.calibration.reading import read_calibration, read_provenance
@@ -411,3 +411,41 @@ def test_a_failed_drive_is_not_compared(tmp_path, capsys):
     write_calibration(looking_ahead(), path, verdict={"status": "FAIL"})
     assert run_command(["calibrate", "compare", str(path), str(path)]) == 2
     assert "verdict on its drive is FAIL" in capsys.readouterr().err
+
+
+def test_a_camera_without_enough_ground_fails_as_its_line_says(tmp_path, capsys):
+    """One image matches no other."""
+    drive = make_drive(tmp_path / "drive")
+    listed = drive.root / "front" / "images.txt"
+    rows = [row for row in listed.read_text().splitlines(keepends=True) if not row.startswith("#")]
+    listed.write_text(rows[0])
+    given = ["calibrate", "ground", str(drive.root), "--camera", "front", "--output", str(tmp_path / "out")]
+    assert run_command(given) == 3
+    shown = capsys.readouterr().out
+    assert "front: too little ground appears in two images: drive farther" in shown
+    assert "verdict: FAIL" in shown
+    assert "FAIL ground match (front): no mounting: too little ground" in shown.replace("  ", " ")
+    verdict = json.loads((tmp_path / "out" / "verdict.json").read_text())
+    assert verdict["status"] == "FAIL"
+    assert not list((tmp_path / "out").glob("calibration_*"))
+
+
+GRID_MISREADINGS = {
+    "x and y are exchanged": lambda u, v, x, y: (u, v, y, x),
+    "y counts to the right, or x backward": lambda u, v, x, y: (u, v, x, -y),
+}
+
+
+@pytest.mark.parametrize("cause", GRID_MISREADINGS)
+@pytest.mark.parametrize("step_m", [1.0, 2.0])
+def test_exchanged_axes_of_a_regular_grid_are_named(cause, step_m, tmp_path):
+    # A camera below the ground, which none is, would see them just so.
+    rough = rough_calibration("front", 1280, 720, 1.6, 12.0, 70.0)
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(5.0, 12.0, step_m), np.arange(-3.0, 3.5, step_m)))
+    px, _ = project_ground(rough.info.intrinsic, rough.cam_from_vehicle[None], np.column_stack([x, y]))
+    inside = ((px[0] > 0) & (px[0] < [1279, 719])).all(axis=1)
+    points = np.column_stack([px[0] + np.random.default_rng(1).normal(0, 0.3, px[0].shape), x, y])[inside]
+    rows = [GRID_MISREADINGS[cause](*point) for point in points]
+    (tmp_path / "points.csv").write_text("\n".join(["u,v,x,y", *(",".join(map(str, row)) for row in rows)]))
+    with pytest.raises(DriveError, match=f"the points fit no mounting of this camera: {cause}"):
+        calibrate_from_points(tmp_path / "points.csv", rough.info)

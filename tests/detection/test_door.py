@@ -7,6 +7,8 @@ import os
 import queue
 import re
 import shutil
+import subprocess
+import sys
 import threading
 import time
 from dataclasses import dataclass
@@ -458,3 +460,66 @@ def test_the_stopwatch_adds_up_laps_of_an_image_and_forgets_failed_ones():
     assert (stopwatch.images, stopwatch.stages) == (2, ("net", "lanes"))
     assert stopwatch.times_s("lanes")[0] == 0.0 < stopwatch.times_s("lanes")[1]
     assert (stopwatch.times_s(TOTAL) >= stopwatch.times_s("net") + stopwatch.times_s("lanes")).all()
+
+
+def started(bench, *arguments):
+    command = [sys.executable, "-m", "v2hdm", "detect", *map(str, arguments)]
+    command += ["--camera", str(bench.calibration), "--model", str(bench.model)]
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def wait_until(is_so):
+    end_s = time.monotonic() + 60
+    while not is_so():
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
+
+
+def test_lines_of_a_live_source_are_in_the_file_as_they_come_and_a_kill_loses_none(bench, tmp_path):
+    growing, output = tmp_path / "images", tmp_path / "out" / "found.jsonl"
+    growing.mkdir()
+    for run_number in (1, 2):
+        process = started(bench, growing, "--live", "--output", output)
+        number = 0
+
+        def another_line(run_number=run_number):
+            nonlocal number
+            number += 1
+            shutil.copyfile(bench.folder / "0.png", growing / f"{run_number}_{number:04d}.png")
+            time.sleep(0.1)
+            return output.is_file() and output.read_text().count("\n") >= 2 * run_number
+
+        wait_until(another_line)
+        process.kill()
+        process.wait()
+        assert [path.name for path in output.parent.iterdir()] == ["found.jsonl"]
+        known = output.read_text()
+        assert len(lines(known)) >= 2 * run_number
+        if run_number == 1:
+            output.write_text(known + '{"source": "half')
+    assert output.read_text().startswith(known[: known.index("\n")])
+    assert "half" not in output.read_text()
+
+
+def test_a_kill_leaves_nothing_hidden_beside_the_output_and_the_earlier_file(bench, tmp_path):
+    many = tmp_path / "images"
+    many.mkdir()
+    for n in range(400):
+        shutil.copyfile(bench.folder / "0.png", many / f"{n:04d}.png")
+    (tmp_path / "out").mkdir()
+    output = tmp_path / "out" / "found.jsonl"
+    output.write_text('{"source": "earlier"}\n')
+    drawn = tmp_path / "drawn"
+    process = started(bench, many, "--output", output, "--draw", drawn)
+    wait_until(lambda: drawn.is_dir() and len([*drawn.glob("*.jpg")]) > 2)
+    process.kill()
+    process.wait()
+    assert [path.name for path in output.parent.iterdir()] == ["found.jsonl"]
+    assert output.read_text() == '{"source": "earlier"}\n'
+
+
+def test_a_url_as_output_makes_no_folder_of_that_name(bench, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert bench.run(bench.folder, "--output", "s3://bucket/found.jsonl") == 2
+    assert "URLs are allowed only as output=" in capsys.readouterr().err
+    assert not [*tmp_path.iterdir()]

@@ -323,3 +323,39 @@ def test_the_user_of_an_own_network_is_told_whose_judge_scores_it(tmp_path):
     assert "\n" not in message
     with pytest.raises(DetectorError, match="no such detector model"):
         weights.unknown_network(tmp_path / "none.onnx")
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (
+            lambda model: setattr(model, "ir_version", 99),
+            r"its IR version is 99, and this onnxruntime [\d.]+ reads up to \d+",
+        ),
+        (
+            lambda model: setattr(model.opset_import[0], "version", 99),
+            r"its opset of ai.onnx is 99, and this onnxruntime [\d.]+ knows up to \d+",
+        ),
+        (
+            lambda model: setattr(model.graph.node[0], "op_type", "Frobnicate"),
+            "No Op registered for Frobnicate",
+        ),
+    ],
+    ids=["IR", "opset", "operator"],
+)
+def test_a_model_newer_than_the_runtime_is_one_line_with_both_versions(change, says, tmp_path):
+    model = onnx.load(str(weights.NETWORK_FILE))
+    change(model)
+    (tmp_path / "a.onnx").write_bytes(model.SerializeToString())
+    with pytest.raises(DetectorError, match=says) as refused:
+        Network(tmp_path / "a.onnx")
+    assert "onnxruntime_src" not in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_the_hint_of_a_users_network_is_to_fit_with_that_network(tmp_path):
+    mine = tmp_path / "my network.onnx"
+    mine.write_bytes(b"another")
+    told = weights.unknown_network(mine)
+    assert told is not None
+    assert f"fit it with `python -m train.ship '{mine}'`" in told

@@ -133,10 +133,10 @@ def test_a_bag_without_mounting_asks_for_it_and_becomes_a_drive(folder, tmp_path
     first = ["check", "site", "--no-ground", "--write", "mysite"]
     assert run(first) == 2
     asked = re.findall(r"--set (\S+)=", capsys.readouterr().err)
-    assert sorted(asked) == ["cameras.front.mounting", "cameras.rear.mounting", "poses.lever_arm_m"]
+    assert sorted(asked) == ["cameras.front.mounting", "cameras.rear.mounting"]
     assert not Path("mysite").exists()
     (tmp_path / "lens.yaml").write_bytes((folder / "front" / "camera_info.yaml").read_bytes())
-    said = {"poses.lever_arm_m": [0, 0, 0], "cameras.front.camera_info": "lens.yaml"}
+    said = {"cameras.front.camera_info": "lens.yaml"}
     for name, cam_from_vehicle in mountings().items():
         angles = np.degrees(mounting_angles(cam_from_vehicle)).round(9).tolist()
         said[f"cameras.{name}.mounting"] = {
@@ -588,7 +588,7 @@ def test_a_frame_whose_name_has_a_tab_is_refused(folder, tmp_path):
     made = messages_of(folder, mounted={**mountings(), "a\tb": mountings()["front"]})
     bag = write_ros2(tmp_path / "bag", made)
     with pytest.raises(DriveError, match="a frame is named") as refused:
-        import_streams(bag, [TfStream(False, "here")], tmp_path / "cache")
+        import_streams(bag, [TfStream("here")], tmp_path / "cache")
     assert "\t" not in str(refused.value)
 
 

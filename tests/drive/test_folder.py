@@ -33,9 +33,10 @@ from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.io.drive.sources import IMAGE_SOURCES
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.io.drive.writing import write_drive
+from v2hdm.io.image_lists import read_image_list
 from v2hdm.io.importers.poses import COMMON_KEYS, POSE_FORMATS, TOPIC_KEYS
 from v2hdm.io.importers.readings import NAMES
-from v2hdm.io.trajectory import read_image_list, read_tum, write_tum
+from v2hdm.io.trajectory import read_tum, write_tum
 from v2hdm.records import DISTORTION_COEFFICIENTS, CameraInfo, PoseNoise
 from v2hdm.safe.pixels import read_header
 
@@ -166,6 +167,77 @@ def test_comments_blank_lines_commas_and_rounded_quaternions_are_fine(tmp_path):
     poses = read_tum(path).map_from_vehicle
     np.testing.assert_allclose(poses[0, :2, :2], [[0, -1], [1, 0]], atol=1e-12)
     np.testing.assert_allclose(poses[1, :3, :3], np.eye(3), atol=1e-12)
+
+
+POSES = [(1.4e9 + k / 10, k / 2, -0.25 * k, 0.5, 0.0, 0.0, 0.6, 0.8) for k in range(21)]
+"""Rows of times, places and quaternions xyzw."""
+
+WAYS = {
+    "tum": ("", lambda row: " ".join(f"{value:.9f}" for value in row)),
+    "scientific, with tabs": ("", lambda row: "\t".join(f"{value:.18e}" for value in row)),
+    "double and trailing blanks": (
+        "# a\r\n",
+        lambda row: "  ".join(f"{value:.9f}" for value in row) + "  \r",
+    ),
+    "semicolons and decimal commas": ("", lambda row: "; ".join(f"{v:.9f}" for v in row).replace(".", ",")),
+    "blanks and decimal commas": (
+        "",
+        lambda row: " ".join(f"{value:.9f}" for value in row).replace(".", ","),
+    ),
+    "a byte order mark": ("\ufeff", lambda row: ",".join(f"{value:.9f}" for value in row)),
+    "a line of names": (
+        "timestamp tx ty tz qx qy qz qw\n",
+        lambda row: " ".join(f"{value:.9f}" for value in row),
+    ),
+    "EuRoC": (
+        "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []\n",
+        lambda row: ",".join([f"{row[0] * 1e9:.0f}", *map(str, [*row[1:4], row[7], *row[4:7]])]),
+    ),
+    "EuRoC with velocities": (
+        "#timestamp,p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z [],v\n",
+        lambda row: ",".join([f"{row[0] * 1e9:.0f}", *map(str, [*row[1:4], row[7], *row[4:7], 9.9])]),
+    ),
+    "nanoseconds": ("", lambda row: " ".join([f"{row[0] * 1e9:.0f}", *map(str, row[1:])])),
+    "microseconds": ("", lambda row: " ".join([f"{row[0] * 1e6:.0f}", *map(str, row[1:])])),
+}
+
+
+@pytest.mark.parametrize(("title", "line"), WAYS.values(), ids=WAYS)
+def test_trajectories_as_tools_write_them_are_the_same(title, line, tmp_path):
+    path = tmp_path / "poses.tum"
+    path.write_bytes((title + "\n".join(line(row) for row in POSES)).encode())
+    got = read_tum(path)
+    table = np.array(POSES)
+    np.testing.assert_allclose(got.stamp_s, table[:, 0], atol=1e-6)
+    np.testing.assert_allclose(got.map_from_vehicle[:, :3, 3], table[:, 1:4], atol=1e-9)
+    yaw = 2 * np.arctan2(0.6, 0.8)
+    np.testing.assert_allclose(got.map_from_vehicle[:, 0, 0], np.cos(yaw), atol=1e-9)
+    np.testing.assert_allclose(got.map_from_vehicle[:, 1, 0], np.sin(yaw), atol=1e-9)
+
+
+def test_poses_without_numbers_and_of_equal_times_are_left_out_and_counted(tmp_path, caplog):
+    lines = [" ".join(map(str, row)) for row in POSES]
+    lines[3] = f"{POSES[3][0]} NaN NaN NaN NaN NaN NaN NaN"
+    lines[7] = lines[6]
+    lines[9], lines[10] = lines[10], lines[9]
+    path = tmp_path / "poses.tum"
+    path.write_text("\n".join(lines))
+    got = read_tum(path)
+    kept = np.delete(np.array(POSES), (3, 7), axis=0)
+    np.testing.assert_allclose(got.stamp_s, kept[:, 0], atol=1e-6)
+    np.testing.assert_allclose(got.map_from_vehicle[:, 0, 3], kept[:, 1])
+    assert "left out 1 of 21 poses that are no numbers" in caplog.text
+    assert "left out 1 of 20 poses of equal or stray times" in caplog.text
+    assert "sorted its poses by time: 1 came late" in caplog.text
+
+
+def test_a_zero_time_among_good_ones_is_left_out_and_counted(tmp_path, caplog):
+    rows = [list(row) for row in POSES]
+    rows[5][0] = 0.0
+    path = tmp_path / "poses.tum"
+    path.write_text("\n".join(" ".join(map(str, row)) for row in rows))
+    np.testing.assert_allclose(read_tum(path).stamp_s, np.delete(np.array(POSES)[:, 0], 5))
+    assert "left out 1 of 21 times that are out of order" in caplog.text
 
 
 def test_file_names_may_hold_blanks(tmp_path):

@@ -13,7 +13,8 @@ from tests.drive.example import ORIGIN, description, make_drive
 from v2hdm.errors import DriveError
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.io.importers.poses import read_poses
-from v2hdm.io.importers.readings import read_rows, read_table
+from v2hdm.io.importers.readings import read_table
+from v2hdm.io.rows import read_rows
 from v2hdm.records import GeodeticOrigin
 
 START_S = 1715934630.0

@@ -10,8 +10,10 @@ import pytest
 
 from tests.drive.bags import assert_same_drive
 from tests.drive.example import description, make_drive
+from v2hdm.detection.frames import list_images
 from v2hdm.errors import DriveError
 from v2hdm.io.drive import ReadOptions, read_drive
+from v2hdm.io.drive.draft import draft_drive
 
 STAMPS = tuple(100.05 + 0.1 * n for n in range(6))
 
@@ -83,6 +85,85 @@ def test_an_image_folder_with_a_file_of_times_or_named_by_them(folder):
     for stamp_s, image in zip(STAMPS, sorted((folder / "front" / "images").iterdir()), strict=True):
         shutil.copy(image, named / f"{stamp_s * 1e3:.0f}.png")
     assert_same_drive(read(folder, {"folder": "front/named", "unit": "ms"}), expected)
+
+
+def test_images_numbered_without_zeros_get_their_own_times_and_hidden_files_none(folder, caplog):
+    images = sorted((folder / "front" / "images").iterdir())
+    numbered = folder / "front" / "numbered"
+    numbered.mkdir()
+    for number, image in enumerate(images):
+        shutil.copy(image, numbered / f"frame{number + 7}.png")
+        (numbered / f"._frame{number + 7}.png").write_bytes(b"\0\5\x16\7Mac OS X")
+    (numbered / ".DS_Store").write_bytes(b"\0")
+    (numbered / "Thumbs.db").write_bytes(b"\0")
+    np.savetxt(folder / "times.txt", STAMPS, fmt="%.9f")
+    expected = read_drive(folder)
+    assert_same_drive(read(folder, {"folder": "front/numbered", "stamps": "times.txt"}), expected)
+    assert [path.stem for path in list_images(numbered)] == [f"frame{number + 7}" for number in range(6)]
+    listed = (folder / "front" / "images.txt").read_text()
+    lines = [line.replace("images/", "numbered/._") for line in listed.splitlines()[1:]]
+    (folder / "front" / "images.txt").write_text("\n".join([*lines, listed]))
+    assert_same_drive(read(folder, "front/images.txt"), expected)
+    assert "left out 6 files of macOS" in caplog.text
+    by_letters = sorted(range(6), key=lambda number: f"frame{number + 7}")
+    np.savetxt(folder / "times.txt", [STAMPS[number] for number in by_letters], fmt="%.9f")
+    with pytest.raises(DriveError, match=r"in the order of letters, in which 'frame11' comes second"):
+        read(folder, {"folder": "front/numbered", "stamps": "times.txt"})
+
+
+@pytest.mark.parametrize(("codec", "suffix"), [("libx264", "h264"), ("libx265", "hevc")])
+def test_a_raw_stream_has_the_times_of_its_file_frame_by_frame(codec, suffix, folder):
+    """With B-frames, whose order in the file is not that of the pictures."""
+    raw = folder / f"front.{suffix}"
+    grey = [40 * number for number in range(6)]
+    with av.open(str(raw), "w", format=suffix) as container:
+        options = {"bf": "2", "b-adapt": "0", "x265-params": "bframes=2:b-adapt=0:log-level=none"}
+        stream = container.add_stream(codec, rate=10, options=options)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for value in grey:
+            picture = np.full((48, 64, 3), value, np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="bgr24")))
+        container.mux(stream.encode(None))
+    np.savetxt(folder / "times.txt", STAMPS, fmt="%.9f")
+    drive = read(folder, {"video": raw.name, "stamps": "times.txt"})
+    images = [image for image in by_camera(drive) if image.camera == "front"]
+    assert [image.stamp_s for image in images] == pytest.approx(STAMPS, abs=1e-9)
+    means = [float(cv2.imread(str(image.path)).mean()) for image in images]
+    np.testing.assert_allclose(means, grey, atol=6)
+    with pytest.raises(DriveError, match=r"is a raw stream, whose frames have no times.*give stamps"):
+        read(folder, {"video": raw.name, "start_s": 100.05})
+    np.savetxt(folder / "times.txt", STAMPS[:-1], fmt="%.9f")
+    with pytest.raises(DriveError, match=f"5 times for 6 frames of .*{suffix}"):
+        read(folder, {"video": raw.name, "stamps": "times.txt"})
+
+
+def test_a_frame_whose_time_is_late_or_repeats_is_sorted_dropped_and_counted(folder, caplog):
+    write_video(folder, folder / "front.mkv")
+    times = [*STAMPS[:2], STAMPS[3], STAMPS[2], STAMPS[2], STAMPS[5]]
+    np.savetxt(folder / "times.txt", times, fmt="%.9f")
+    drive = read(folder, {"video": "front.mkv", "stamps": "times.txt"})
+    images = [image for image in by_camera(drive) if image.camera == "front"]
+    assert [image.stamp_s for image in images] == pytest.approx([*STAMPS[:4], STAMPS[5]], abs=1e-9)
+    assert [image.path.stem for image in images] == ["000000", "000001", "000003", "000002", "000005"]
+    assert "sorted frames that were late: 2, dropped frames whose time repeats: 1, of 6" in caplog.text
+
+
+def test_a_folder_asks_for_what_its_names_leave_open(folder, tmp_path):
+    for number, image in enumerate(sorted((folder / "front" / "images").iterdir())):
+        for name, stem in (("dates", f"20240131_1015{number:02d}_125"), ("counts", f"{number:06d}")):
+            (tmp_path / name).mkdir(exist_ok=True)
+            shutil.copy(image, tmp_path / name / f"{stem}.png")
+    asked = draft_drive(tmp_path / "dates", tmp_path / "d", [])
+    assert "utc, or utc+01:00" in asked["cameras.dates.images.unit"]
+    asked = draft_drive(tmp_path / "counts", tmp_path / "d", [])
+    assert "a file with a time in s per image" in asked["cameras.counts.images.stamps"]
+    asked = draft_drive(tmp_path / "counts", tmp_path / "d", ["cameras.counts.images.unit=s"])
+    assert not [key for key in asked if "images" in key]
+    (tmp_path / "front.h264").write_bytes(b"")
+    assert "cameras.front.images.stamps" in draft_drive(tmp_path / "front.h264", tmp_path / "d", [])
+    (tmp_path / "front.mp4").write_bytes(b"")
+    asked = draft_drive(tmp_path / "front.mp4", tmp_path / "d", ["cameras.front.images.stamps=a"])
+    assert not [key for key in asked if "images" in key]
 
 
 def test_a_source_that_does_not_fit_is_named(folder):

@@ -37,7 +37,7 @@ from tests.faults.small import small
 from v2hdm.io.calibration.writing import write_calibration, write_camera_info
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.pipeline.config import PortConfig, RunConfig
-from v2hdm.records import Calibration
+from v2hdm.records import Calibration, CameraFrames
 
 
 def detects(name: str, line: str, prepare: Prepare, says: str, **more: object) -> Case:
@@ -530,7 +530,8 @@ def _folder_with(folder: str, name: str) -> Prepare:
 
 def _calibration(root: Path) -> None:
     info = camera_info("front", 320, 240)
-    write_calibration(Calibration(info, looking_forward()), root / "c.yaml")
+    frames = CameraFrames("base_link", "front_optical_frame")
+    write_calibration(Calibration(info, looking_forward(), frames=frames), root / "c.yaml")
 
 
 def _calibrated(name: object) -> Prepare:

@@ -17,12 +17,16 @@ def shrink_image(root: Path) -> None:
 IMAGE = "front/images/000001.jpg"
 SINGULAR = [[1.0, 2.0, 3.0], [2.0, 4.0, 6.0], [0.0, 0.1, 1.0]]
 ON_THE_GROUND, STRETCHED = np.eye(4).tolist(), np.diag([1, 2, 1, 1]).tolist()
+BACKWARDS = "".join(f"{110 - n / 10:.1f} {n} 0 0 0 0 0 1\n" for n in range(30))
 DAMAGES: dict[str, tuple[Change, str]] = {
     "no poses": (remove("poses.tum"), r"poses.tum: no such file"),
-    "nan pose": (edit("poses.tum", r"^(100\.2\S*) \S+", r"\1 nan"), r"poses.tum: line 4: 'nan' is not a"),
+    "nan poses": (write("poses.tum", "nan 0 0 0 0 0 0 1\n" * 9), r"poses.tum: line 9: .*no finite number"),
     "text in poses": (edit("poses.tum", r"^100\.2\S*", "soon"), r"line 4: 'soon' is not a number"),
-    "unsorted poses": (edit("poses.tum", r"^100\.3\S*", "99.5"), r"line 5: time 99.5\d* is earlier than"),
-    "repeated pose": (edit("poses.tum", r"^100\.3\S*", "100.200000000"), r"line 5: .* repeats .* line 4"),
+    "unsorted poses": (
+        write("poses.tum", BACKWARDS),
+        r"pose 11: its time 109.000 s is 1.000 s before that of",
+    ),
+    "poses of one time": (write("poses.tum", "1.7e+09 1 0 0 0 0 0 1\n" * 9), r"1700000000: .*too few digits"),
     "short pose": (edit("poses.tum", r"^(100\.2.*) \S+$", r"\1"), r"line 4: expected 8 columns .* got 7"),
     "long quaternion": (edit("poses.tum", r"^(100\.2.*) \S+$", r"\1 1.7"), r"line 4: quaternion of norm 1"),
     "empty poses": (write("poses.tum", "# nothing\n"), r"poses.tum: holds no pose"),

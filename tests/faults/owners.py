@@ -21,7 +21,7 @@ from v2hdm.io.calibration.writing import (
 )
 from v2hdm.io.maps.formats import FORMATS, write_map
 from v2hdm.io.maps.geojson import write_geojson
-from v2hdm.records import Calibration
+from v2hdm.records import Calibration, CameraFrames
 from v2hdm.store.results import listed_files, result_folder
 
 COMMANDS = {
@@ -139,7 +139,8 @@ def _exports() -> Iterator[tuple[str, Prepare, str]]:
     for name, (ending, _) in CALIBRATION_FORMATS.items():
 
         def put(root: Path, name: str = name) -> None:
-            calibration = Calibration(INFO, mounting())
+            frames = CameraFrames("base_link", "front_optical_frame")
+            calibration = Calibration(INFO, mounting(), frames=frames)
             write_calibration(calibration, root / "c.yaml")
             with listed_files(root / "there", "--output", "v2hdm export of ../c.yaml"):
                 about = read_provenance(root / "c.yaml")

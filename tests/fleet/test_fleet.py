@@ -126,6 +126,14 @@ def test_shares_are_all_drives_together_and_never_two_of_one_folder(tmp_path, dr
     assert not plan(files, [], (1, 2)).refused
 
 
+def test_a_pattern_that_matches_no_run_file_is_an_error_in_every_share(capsys, tmp_path):
+    for share in ("1/4", "2/4"):
+        given = ["fleet", f"{tmp_path}/TYPO/*.yaml", "--share", share, "--table", str(tmp_path / "t")]
+        assert command(given) == 2
+        assert "TYPO/*.yaml: no such run file; check the path" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("given", ["0/4", "5/4", "1/0", "2"])
 def test_a_share_that_cannot_be_is_one_line(given, capsys):
     assert command(["fleet", "a.yaml", "--share", *given.split()]) == 2

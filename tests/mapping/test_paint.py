@@ -1,4 +1,4 @@
-"""Errors of paint, how sure markings are beside one another, and whether paint is still there."""
+"""Errors of paint, and whether paint is still there."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,6 @@ from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.records import Camera, CameraInfo, Marking
 from v2hdm.site.living.looks import Observer, learn_paint
-from v2hdm.site.markings import neighbours, with_relative_sigma
 from v2hdm.site.shapes import PaintError, learn_paint_error
 
 FORMAL = (0.001**2) * np.eye(5)
@@ -48,51 +47,6 @@ def test_the_scatter_of_a_class_that_was_painted_by_hand_is_no_error_of_the_map(
     by_hand = PaintError(0.015, 30.0)
     typical = by_hand.variance_m2(0.015 * np.ones(5), FORMAL)
     assert np.sqrt(typical) < 0.006
-
-
-SQUARE = np.array([[1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.0, 0.0]])
-DRIFT_M, CORNER_M, PAINT_M = 0.05, 0.002, 0.006
-
-
-def covariance_of(corners):
-    """Corners of 2 mm each that a drift of 5 cm moves together."""
-    return DRIFT_M**2 * np.kron(np.ones((corners, corners)), np.eye(2)) + CORNER_M**2 * np.eye(2 * corners)
-
-
-def joint(pairs):
-    return np.tile(covariance_of(4), (len(pairs), 1, 1))
-
-
-def street(spacing_m, paint_m=0.0):
-    own = covariance_of(4) + paint_m**2 * np.eye(8)
-    return [Marking("diamond", SQUARE + np.array([spacing_m * k, 0.0]), 9, own) for k in range(5)]
-
-
-def test_a_drift_that_markings_share_is_no_part_of_what_they_contribute():
-    index = np.arange(20).reshape(5, 4)
-    for marking in with_relative_sigma(street(5.0), index, joint):
-        # Two corners of either marking stand for its centre.
-        assert marking.relative_sigma_m == pytest.approx(CORNER_M / np.sqrt(2))
-
-
-def test_errors_of_the_paint_are_a_markings_own():
-    index = np.arange(20).reshape(5, 4)
-    for marking in with_relative_sigma(street(5.0, PAINT_M), index, joint):
-        assert marking.relative_sigma_m == pytest.approx(np.hypot(CORNER_M, PAINT_M) / 2)
-
-
-def test_nothing_is_said_of_a_marking_alone_or_unseen():
-    index = np.arange(20).reshape(5, 4)
-    assert all(m.relative_sigma_m is None for m in with_relative_sigma(street(40.0), index, joint))
-    index[2] = -1
-    found = with_relative_sigma(street(5.0), index, joint)
-    assert [m.relative_sigma_m is None for m in found] == [False, False, True, False, False]
-
-
-def test_the_neighbour_is_the_one_nearest_to_ten_metres():
-    first, second = neighbours(np.array([[0.0, 0.0], [3.0, 0.0], [9.0, 0.0], [14.0, 0.0], [60.0, 0.0]]))
-    assert first.tolist() == [0, 1, 2, 3]
-    assert second.tolist() == [2, 3, 0, 1]
 
 
 INTRINSIC = np.array([[900.0, 0, 640], [0, 900, 350], [0, 0, 1]])

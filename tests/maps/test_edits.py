@@ -68,7 +68,9 @@ def test_what_was_moved_in_a_gis_comes_back_moved_and_all_else_as_it_was(
         assert np.ptp(moved_m, axis=0).max() < TENTH_OF_A_MM
         np.testing.assert_array_equal(new.heights_m, old.heights_m)
         if isinstance(old, Marking) and isinstance(new, Marking):
-            np.testing.assert_array_equal(new.covariance_m2, old.covariance_m2)
+            # A hand placed the whole marking once.
+            by_hand_m2 = 0.02**2 * np.kron(np.ones((4, 4)), np.eye(2))
+            np.testing.assert_allclose(new.covariance_m2, old.covariance_m2 + by_hand_m2, rtol=1e-12)
 
 
 def points(feature):
@@ -104,6 +106,31 @@ def test_a_height_that_was_edited_is_the_new_height(tmp_path):
     assert before.heights_m is not None
     np.testing.assert_allclose(after.heights_m, before.heights_m + 0.3, atol=TENTH_OF_A_MM)
     np.testing.assert_allclose(after.corners_map, before.corners_map, atol=2 * TENTH_OF_A_MM)
+
+
+def test_a_corner_that_was_moved_is_known_as_a_hand_places_it(tmp_path):
+    path = written(tmp_path, "geojson", street())
+    before = read_geojson(path).markings[0]
+    assert before.covariance_m2 is not None
+    by_deg = 0.14 / 111_320
+
+    def dragged(rings):
+        (ring,) = rings
+        ring[1][1] += by_deg
+        return [ring]
+
+    edited(path, 0, coordinates=dragged)
+    after = read_geojson(path).markings[0]
+    assert after.covariance_m2 is not None
+    off_m = np.linalg.norm(after.corners_map - before.corners_map, axis=1)
+    (moved,) = np.flatnonzero(off_m > 0.1)
+    assert off_m[moved] == pytest.approx(0.14, abs=0.005)
+    assert np.sqrt(np.diagonal(after.covariance_m2)[2 * moved : 2 * moved + 2]).min() >= 0.02
+    others = np.delete(np.arange(8), [2 * moved, 2 * moved + 1])
+    kept = np.ix_(others, others)
+    np.testing.assert_allclose(after.covariance_m2[kept], before.covariance_m2[kept])
+    assert after.accuracy is None
+    assert np.linalg.eigvalsh(after.covariance_m2).min() > 0
 
 
 def test_a_geometry_without_heights_keeps_those_of_the_map(tmp_path):

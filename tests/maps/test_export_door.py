@@ -22,7 +22,7 @@ from v2hdm.io.maps.formats import FORMATS
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.maps.geopackage import write_geopackage
 from v2hdm.io.maps.reading import read_geojson, read_map, read_verdict
-from v2hdm.records import Calibration
+from v2hdm.records import Calibration, CameraFrames
 
 VERDICT = {"status": "PASS"}
 
@@ -115,7 +115,8 @@ def test_what_a_user_must_mend_is_one_line(folder, arguments, message, capsys):
 
 SIGMAS = [0.01, 0.02, 0.03, *np.radians([0.1, 0.2, 0.3])]
 MOVED = exp(np.array([0.1, -0.2, 0.3, 0.05, 0.3, -0.1]))
-CALIBRATION = Calibration(camera_info("front"), MOVED @ looking_forward(), np.diag(np.square(SIGMAS)))
+FRAMES = CameraFrames("base_link", "front_optical_frame")
+CALIBRATION = Calibration(camera_info("front"), MOVED @ looking_forward(), np.diag(np.square(SIGMAS)), FRAMES)
 ABOUT = Provenance("yard: 7", "2026-05-04", "WARN")
 FORMS = list(CALIBRATION_FORMATS)
 

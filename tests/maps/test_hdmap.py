@@ -1,6 +1,7 @@
 """Maps and calibrations survive their files, with residuals, exclusions, verdict and clocks beside them."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pyproj
@@ -267,6 +268,14 @@ def test_residuals_are_read_back_as_written(tmp_path):
     for name, value in vars(written).items():
         np.testing.assert_array_equal(getattr(read, name), value, err_msg=name)
     assert len(read) == 3
+
+
+@pytest.mark.parametrize("distance", [np.inf, np.nan])
+def test_a_corner_behind_the_camera_has_no_finite_residual_and_is_read_back(distance, tmp_path):
+    written = replace(some_residuals(), distance_sigma=np.array([0.5, distance, 2.0]))
+    write_residuals(written, tmp_path / "residuals.csv")
+    read = read_residuals(tmp_path / "residuals.csv")
+    np.testing.assert_array_equal(read.distance_sigma, written.distance_sigma)
 
 
 @pytest.mark.parametrize("line", ["front/x.png,front,1.0,2,1", "front/x.png,front,late,2,1,1,0,0,0,0,0"])

@@ -19,7 +19,7 @@ from v2hdm.io.maps.reading import read_geojson
 from v2hdm.pipeline.config import MapConfig
 from v2hdm.pipeline.run import run
 from v2hdm.site.candidates import Candidates
-from v2hdm.site.corrections import Stated
+from v2hdm.site.corrections import Stated, heard_of
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +79,45 @@ def test_a_correction_of_nothing_is_a_finding_and_no_silence(corrected):
     (finding,) = [one for one in corrected[2].verdict.findings if one.check == "corrections"]
     assert "1 of 5 match no candidate" in finding.says
     assert "diamond at (500.00, 500.00)" in finding.says
+
+
+def test_what_the_map_follows_is_listed_beside_what_the_images_show(corrected):
+    listed = {heard["says"]: heard["against"] for heard in corrected[2].metrics["corrections"]}
+    assert set(listed) == {"rejected", "of class crosswalk_bar", "corner 2 moved", "accepted"}
+    assert listed["of class crosswalk_bar"] == ""
+    told = [line for line in corrected[2].headlines if line.startswith("correction followed: ")]
+    assert len(told) == 4
+    assert any("rejected" in line for line in told)
+    log = (corrected[2].folder / "run.log").read_text()
+    assert all(line in log for line in told)
+    (finding,) = [f for f in corrected[2].verdict.findings if f.check == "corrections against images"]
+    against = [says for says in listed.values() if says]
+    assert finding.value == len(against)
+    assert all(says in finding.says for says in against)
+
+
+@pytest.mark.parametrize(("by_m", "is_against"), [(0.14, True), (0.03, False)])
+def test_a_corner_that_is_dragged_off_the_paint_contradicts_the_images(by_m, is_against):
+    square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    common = 0.3**2 * np.tile(np.eye(2), (4, 4)) + 0.004**2 * np.eye(8)
+    shown = Candidates(square[None], common[None])
+    said = Correction(
+        says=CORRECTED, kind="diamond", outline_map=square.tolist(), moved={3: [1.0 + by_m, 1.0]}
+    )
+    (heard,) = heard_of(Stated({}, {0: said}), [None], np.array([9.0]), np.array([12]), shown)
+    assert heard.says == "corner 3 moved"
+    assert bool(heard.against) is is_against
+    assert not is_against or heard.against == "the images show the paint 14.0 cm from there"
+
+
+@pytest.mark.parametrize(("log_odds", "reason", "is_against"), [(9.0, None, True), (3.0, None, False)])
+def test_a_rejection_of_what_the_images_surely_show_contradicts_them(log_odds, reason, is_against):
+    square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    said = Correction(says=REJECTED, kind="diamond", outline_map=square.tolist())
+    stated = Stated.of([said], square[None], ["diamond"])
+    shown = Candidates(square[None], 1e-6 * np.eye(8)[None])
+    (heard,) = heard_of(stated, [reason], np.array([log_odds]), np.array([12]), shown)
+    assert heard.sentence == "diamond at (0.50, 0.50): rejected" + ", but 12 images show it" * is_against
 
 
 def test_a_dragged_corner_has_the_error_of_the_others_and_its_own():

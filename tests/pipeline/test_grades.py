@@ -7,6 +7,7 @@ import pytest
 
 from tests.verdict.drives import square_at
 from v2hdm.errors import ConfigError, MappingError
+from v2hdm.io.maps.corrections import ACCEPTED, REJECTED, Correction
 from v2hdm.io.maps.evidence import Residuals
 from v2hdm.io.maps.features import features_of
 from v2hdm.mapping.options import MappingOptions
@@ -151,3 +152,14 @@ def test_a_grade_that_does_not_exist_is_refused_before_anything_is_read():
     options = MappingOptions(acceptance=AcceptanceOptions(accuracy="D"))
     with pytest.raises(ConfigError, match=r"^mapping.acceptance.accuracy is 'D'; choose from A, B or C.$"):
         map_drive("no such drive", options=options)
+
+
+def test_what_a_person_accepted_stays_however_well_it_is_known():
+    coarse = mapped().hd_map.markings[1]
+    arrows = mapped().hd_map.symbols
+    said = [
+        Correction(says=ACCEPTED, kind=coarse.kind, outline_map=coarse.corners_map.tolist()),
+        Correction(says=REJECTED, kind="arrow", outline_map=arrows[1].outline_map.tolist()),
+    ]
+    left = without_worse(mapped(), "A", said)
+    assert [marking.accuracy for marking in left.hd_map.markings] == ["A", "C", None]

@@ -66,6 +66,25 @@ def test_a_picture_of_the_users_own_lies_under_the_map_of_the_report(result, sho
         admit(run_config(short_drive, tmp_path, report=table))
 
 
+def test_a_picture_of_another_place_costs_no_map_and_one_of_no_place_no_time(tiny_drive, tmp_path):
+    rasterio = pytest.importorskip("rasterio")
+    size = {"width": 40, "height": 40, "count": 3, "dtype": "uint8", "crs": "EPSG:32632"}
+    away = tmp_path / "away.tif"
+    with rasterio.open(
+        away, "w", transform=rasterio.Affine(1, 0, 400_000, 0, -1, 4_000_000), **size
+    ) as dataset:
+        dataset.write(np.full((3, 40, 40), 90, np.uint8))
+    report = ReportConfig(background=str(away))
+    done = run(run_config(tiny_drive, tmp_path / "out", report=report))
+    assert "no picture lies under the report's map: " in (done.folder / "run.log").read_text()
+    assert '"background":null' in (done.folder / "report.html").read_text()
+    lost = blind_copy(tiny_drive, tmp_path / "lost")
+    with description(lost) as content:
+        content.pop("origin")
+    with pytest.raises(ConfigError, match=r"report\.background: this drive has no position on the earth"):
+        run(run_config(lost, tmp_path / "lost_out", report=report))
+
+
 @pytest.mark.slow
 def test_every_method_is_judged_on_every_camera_set(result):
     metrics = json.loads((result / "metrics.json").read_text())

@@ -21,10 +21,10 @@ from v2hdm.pipeline.grades import graded
 from v2hdm.pipeline.map_drive import map_drive
 from v2hdm.pipeline.run import RunResult
 from v2hdm.records import Calibration, Exclusion, HDMap
-from v2hdm.site.accuracy import objection_to
+from v2hdm.site.accuracy import absolute_radii_m, objection_to
 from v2hdm.site.candidates import TOO_UNCERTAIN
 from v2hdm.verdict import Finding, Status, Verdict
-from v2hdm.verdict.results.accuracy import _corner_radii_m, check_goal, ground_ahead
+from v2hdm.verdict.results.accuracy import check_goal, ground_ahead
 
 SURE = np.diag([0.003**2] * 3 + [1e-4**2] * 3)
 
@@ -169,7 +169,7 @@ def test_of_a_hundred_corners_95_are_within_the_radius(ratio):
     worst = turn @ np.diag([0.02, 0.02 * ratio]) ** 2 @ turn.T
     covariance = np.zeros((8, 8))
     covariance[2:4, 2:4] = worst
-    radius_m = _corner_radii_m(replace(marking(0), covariance_m2=covariance)).max()
+    radius_m = absolute_radii_m([replace(marking(0), covariance_m2=covariance)]).max()
     errors = np.random.default_rng(1).normal(size=(400_000, 2)) * [0.02, 0.02 * ratio]
     assert np.mean(np.hypot(*errors.T) < radius_m) == pytest.approx(0.95, abs=0.002)
 

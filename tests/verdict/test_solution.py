@@ -251,6 +251,24 @@ def test_a_check_that_passes_says_of_its_largest_deviation_what_it_is(sigmas, sa
     (finding,) = [f for f in check_inputs(replace(FINE, score_tests=(focal,))) if f.check == "focal length"]
     assert finding.status is Status.PASS
     assert finding.says.startswith(says)
+    # It is below the limit, or the limit is not what decides.
+    assert (finding.limit is None) is (sigmas == 5.8)
+    assert finding.limit is None or finding.value < finding.limit
+
+
+def test_nothing_agrees_that_deviates_by_many_sigmas_however_rare_such_a_small_error_is():
+    sure = contradiction(table.FOCAL, ("front",), 0, "", 0.00006, 0.00001, 5.8)
+    (finding,) = [f for f in check_inputs(replace(FINE, score_tests=(sure,))) if f.check == "focal length"]
+    assert finding.status is Status.PASS
+    assert finding.limit is None or finding.value < finding.limit
+    assert "agree" not in finding.says
+    assert "too little to matter by itself" in finding.says
+
+
+def test_a_warning_states_the_limit_that_it_is_beyond():
+    focal = contradiction(table.FOCAL, ("front",), 1, "", -0.0077, 0.0019, 3.6)
+    (told,) = [f for f in check_inputs(replace(FINE, score_tests=(focal,))) if f.status is Status.WARN]
+    assert told.limit < told.value
 
 
 def test_a_straight_drive_says_what_it_cannot_tell():

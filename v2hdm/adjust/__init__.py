@@ -5,6 +5,7 @@
 :mod:`v2hdm.adjust.engine` evaluates and linearises; :mod:`v2hdm.adjust.kernels` does the same faster.
 """
 
+from v2hdm.adjust.model import MIN_DEPRESSION_SINE
 from v2hdm.adjust.problem import (
     ControlPoints,
     Drift,
@@ -19,7 +20,7 @@ from v2hdm.adjust.solution import Solution, Status, Verdict, observability, pose
 from v2hdm.adjust.solve import solve
 
 __all__ = [
-    "MODELS", "ControlPoints", "Drift", "KnownLengths", "Observations", "PoseSigma", "Problem", "Solution",
-    "SolveOptions", "Status", "Verdict", "estimate_noise", "observability", "pose_innovations",
-    "predicts_better", "select_model", "solve", "with_model",
+    "MIN_DEPRESSION_SINE", "MODELS", "ControlPoints", "Drift", "KnownLengths", "Observations", "PoseSigma",
+    "Problem", "Solution", "SolveOptions", "Status", "Verdict", "estimate_noise", "observability",
+    "pose_innovations", "predicts_better", "select_model", "solve", "with_model",
 ]  # fmt: skip

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+import torch
 
 from v2hdm.adjust.problem import ENGINES, LOSSES, POSE_STATES, Problem, SolveOptions
-from v2hdm.errors import AdjustError
+from v2hdm.doors import check_types
+from v2hdm.errors import AdjustError, shown
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 _SYMMETRIC_TO = 1e-5  # asymmetry of a covariance, relative to its diagonal: that of float32
@@ -85,13 +87,19 @@ def check_model(problem: Problem, options: SolveOptions) -> None:
 
 def check_options(options: SolveOptions) -> None:
     """Raise :class:`AdjustError` for an option out of range."""
+    check_types(options)
     unknown = [name for name in options.pose_states if name not in POSE_STATES]
     if unknown:
-        raise AdjustError(f"unknown pose state '{unknown[0]}': choose from {', '.join(POSE_STATES)}")
+        raise AdjustError(f"unknown pose state {shown(unknown[0])}: choose from {', '.join(POSE_STATES)}")
     for name, choices in (("loss", LOSSES), ("engine", ENGINES)):
         chosen = getattr(options, name)
         if chosen not in choices:
-            raise AdjustError(f"unknown {name} '{chosen}': choose from {', '.join(choices)}")
+            raise AdjustError(f"unknown {name} {shown(chosen)}: choose from {', '.join(choices)}")
+    try:
+        torch.empty(0, device=options.device)
+    except (RuntimeError, AssertionError) as failure:
+        reason = str(failure).splitlines()[0]
+        raise AdjustError(f"device is {shown(options.device)}, which torch cannot use: {reason}") from None
     if options.engine == "numba" and not options.on_cpu:
         raise AdjustError("engine=numba computes on the CPU: choose engine=torch, or device=cpu")
     if not 0 < options.gate_probability < 1:

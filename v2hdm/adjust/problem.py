@@ -27,11 +27,13 @@ the rotation.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
+from v2hdm.doors import checked_class
 from v2hdm.records import BoolArray, FloatArray, IntArray
+from v2hdm.settings import NOT_NEGATIVE
 
 POSE_STATES: tuple[str, ...] = ("x", "y", "height", "roll", "pitch", "heading")
 """Axes of a frame's error, in the order of its tangent."""
@@ -174,6 +176,7 @@ class PoseSigma:
         return (position, position, Drift(), attitude, attitude, self.heading_drift)
 
 
+@checked_class
 @dataclass(frozen=True)
 class Problem:
     """C cameras, J frames, N corners and the data that connect them.
@@ -197,7 +200,7 @@ class Problem:
     cam_from_vehicle: FloatArray
     map_from_vehicle: FloatArray
     observations: Observations
-    corner_count: int
+    corner_count: Annotated[int, NOT_NEGATIVE]
     centre_vehicle: FloatArray | None = None
     centre_sigma_m: FloatArray | None = None
     pose_sigma: PoseSigma | tuple[PoseSigma, ...] = PoseSigma()

@@ -35,7 +35,7 @@ from v2hdm.adjust.problem import (
 from v2hdm.adjust.solution import Solution
 from v2hdm.adjust.solve import solve
 from v2hdm.adjust.whitening import factorise
-from v2hdm.errors import AdjustError
+from v2hdm.errors import AdjustError, shown
 from v2hdm.geometry.planar import length_along
 from v2hdm.geometry.rigid import exp
 from v2hdm.records import BoolArray, FloatArray, IntArray
@@ -143,7 +143,7 @@ def select_model(problem: Problem, options: SolveOptions, names: Sequence[str] =
     """
     unknown = [name for name in names if name not in MODELS]
     if unknown:
-        raise AdjustError(f"unknown model '{unknown[0]}': choose from {', '.join(MODELS)}")
+        raise AdjustError(f"unknown model {shown(unknown[0])}: choose from {', '.join(MODELS)}")
     candidates = [
         name for name in names if problem.twist_vehicle is not None or not MODELS[name].clock_offset
     ]

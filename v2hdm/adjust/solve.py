@@ -25,6 +25,7 @@ from v2hdm.adjust.problem import Problem, SolveOptions
 from v2hdm.adjust.solution import Solution, Status, as_of_point, classify, noise_scale, variance_factors
 from v2hdm.adjust.threads import one_thread_in_torch
 from v2hdm.adjust.whitening import Whitening
+from v2hdm.doors import checked
 from v2hdm.errors import AdjustError
 from v2hdm.geometry.rigid import exp
 from v2hdm.records import FloatArray
@@ -136,6 +137,7 @@ def _seen_twice(arrays: Arrays, keep: Tensor) -> Arrays | None:
     return part
 
 
+@checked
 def solve(problem: Problem, options: SolveOptions | None = None) -> Solution:
     """Adjust extrinsics, poses and corners together; the default options suit a port vehicle.
 

@@ -45,6 +45,12 @@ class Located:
         """Horizontal distance (S, 4) of each corner from its camera."""
         return np.asarray(np.linalg.norm(self.ray_map, axis=-1))
 
+    @property
+    def depression_sine(self) -> FloatArray:
+        """Sine (S, 4) of the angle of each corner's ray below the horizontal; nan above the horizon."""
+        height_m = self.height_m[:, None]
+        return np.asarray(height_m / np.hypot(self.range_m, height_m))
+
 
 def ground_points(map_from_pinhole_px: FloatArray, pinhole_px: FloatArray) -> FloatArray:
     """Ground points (N, K, 2), m, of pixels (N, K, 2) under IPMs (N, 3, 3); nan on and above the horizon."""

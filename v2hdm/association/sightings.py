@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import logit
 
-from v2hdm.errors import MappingError
+from v2hdm.errors import MappingError, shown
 from v2hdm.geometry.lens import has_distortion, undistort_points
 from v2hdm.geometry.rigid import camera_centre, exp
 from v2hdm.records import (
@@ -194,6 +194,24 @@ def frames_of(drive: Drive) -> Frames:
     return Frames(frame, session, distinct[:, 1], poses.astype(np.float64))
 
 
+def check_detections(drive: Drive, detections: Sequence[ImageDetections]) -> None:
+    """Raise MappingError for detections of images that the drive does not have, or that lie beside them."""
+    for detected in detections:
+        problem = None
+        if not 0 <= detected.image < len(drive.images):
+            problem = f"the drive has images 0 to {len(drive.images) - 1}"
+        else:
+            info = drive.cameras[drive.images[detected.image].camera].info
+            seen_px = [marking.corners_px[marking.corner_valid] for marking in detected.markings]
+            beyond = [px for px in seen_px if ((px < -0.5) | (px > [info.width, info.height])).any()]
+            problem = f"its camera has {info.width} x {info.height} px" if beyond else None
+        if problem is not None:
+            raise MappingError(
+                f"detections of image {detected.image} are not of drive {drive.name}: {problem}; give those "
+                "of this drive, as a result has them"
+            )
+
+
 def collect_sightings(
     drive: Drive, detections: Sequence[ImageDetections], cameras: Sequence[str]
 ) -> Sightings:
@@ -264,7 +282,7 @@ def camera_of(drive: Drive, name: str) -> Camera:
     """The camera ``name`` of ``drive``; raises MappingError if unknown."""
     if name not in drive.cameras:
         names = ", ".join(drive.cameras)
-        raise MappingError(f"drive {drive.name} has no camera '{name}'; choose among {names}.")
+        raise MappingError(f"drive {drive.name} has no camera {shown(name)}; choose among {names}.")
     return drive.cameras[name]
 
 

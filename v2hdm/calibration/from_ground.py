@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from v2hdm.doors import checked
 from v2hdm.geometry.ipm import mounting_words
 from v2hdm.ground.estimate import estimate_cameras
 from v2hdm.ground.results import GroundEstimate, GroundStatus, Reading
@@ -13,9 +14,11 @@ from v2hdm.io.calibration.reading import Provenance
 from v2hdm.io.calibration.writing import write_calibration
 from v2hdm.io.drive import as_drive
 from v2hdm.records import Calibration, Drive
+from v2hdm.settings import Processes
 from v2hdm.store.files import write_json
 from v2hdm.store.names import VERDICT, calibration_file
-from v2hdm.verdict import Verdict, check_drive
+from v2hdm.verdict import Finding, Status, Verdict, check_drive, known_frames
+from v2hdm.verdict.inputs.ground import MATCH, PATH
 
 # Each parameter's name, and the factor and unit that people read it in.
 _NAMES = {
@@ -50,8 +53,12 @@ class GroundCalibration:
         return {name: calibration for name, calibration in of_camera.items() if calibration is not None}
 
 
+@checked
 def calibrate_from_ground(
-    drive: Drive | str | Path, *, workers: int = 1, progress: Callable[[int, int], None] | None = None
+    drive: Drive | str | Path,
+    *,
+    workers: Processes = 1,
+    progress: Callable[[int, int], None] | None = None,
 ) -> GroundCalibration:
     """Find every camera's mounting from bare ground, without a marking, and check the drive by it.
 
@@ -74,7 +81,20 @@ def calibrate_from_ground(
     """
     drive = as_drive(drive)
     estimates = estimate_cameras(drive, workers, progress)
-    return GroundCalibration(drive, estimates, check_drive(drive, ground=estimates))
+    return GroundCalibration(drive, estimates, _judged(check_drive(drive, ground=estimates), estimates))
+
+
+def _judged(of_drive: Verdict, estimates: Mapping[str, GroundEstimate]) -> Verdict:
+    """The verdict on a drive, in which a camera without a mounting fails: it was asked for."""
+    missing = {name for name, estimate in estimates.items() if estimate.calibration is None}
+    told = {finding.about for finding in of_drive.raised if finding.check in (MATCH, PATH)}
+    others = [f for f in of_drive.findings if not (f.check == MATCH and f.about in missing - told)]
+    failures = [
+        Finding(MATCH, Status.FAIL, None, None, "", f"no mounting: {_WHY[estimates[name].status]}", name)
+        for name in estimates
+        if name in missing - told
+    ]
+    return Verdict.of([*failures, *others])
 
 
 def summary_lines(calibrated: GroundCalibration) -> list[str]:
@@ -113,4 +133,6 @@ def write_ground_calibration(calibrated: GroundCalibration, folder: Path) -> Non
     write_json(folder / VERDICT, verdict)
     about = Provenance.today(calibrated.drive.name, verdict)
     for name, calibration in calibrated.calibrations.items():
+        frames = known_frames(calibrated.drive.cameras[name], calibrated.verdict)
+        calibration = replace(calibration, frames=frames)
         write_calibration(calibration, folder / calibration_file(name), verdict=verdict, about=about)

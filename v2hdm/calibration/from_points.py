@@ -28,6 +28,7 @@ from v2hdm.calibration.points import (
     residuals,
     scatter,
 )
+from v2hdm.doors import checked
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.geometry.ipm import centre_sigmas, ipm_from_extrinsic, mounting_angles, mounting_words
 from v2hdm.geometry.rigid import camera_centre
@@ -47,6 +48,7 @@ UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "kilometres": 1e3}  # units o
 _MISREAD = 0.01  # prior probability of each way to write the table wrongly
 _SURE = np.log(1e3)  # log odds from which a reading is reported as the cause
 _ROLL_RAD = np.radians(15.0)  # standard deviation of the roll of cameras on vehicles
+_ASIDE = float(np.log(3.0))  # log odds against a camera that looks aside: three look ahead or back; chosen
 _BESIDE_M = 1.5  # standard deviation of the place of cameras on vehicles to the left, m
 _HEIGHT_M = 2.0  # median height of cameras on vehicles, m
 _LOG_HEIGHT = 0.7  # standard deviation of the logarithm of that height
@@ -93,6 +95,7 @@ class PointCalibration:
         }
 
 
+@checked
 def calibrate_from_points(
     points: SurveyedPoints | Path | str,
     info: CameraInfo,
@@ -133,12 +136,12 @@ def calibrate_from_points(
 
 def solve(points: SurveyedPoints, info: CameraInfo, noise: Noise) -> list[Fit]:
     """The mountings that explain the points, the most likely first; DriveError, with why, where none does."""
-    fits = fit_mountings(SeenPoints.of(points.points_px, points.points_vehicle, info, noise))
+    fits = _above_ground(fit_mountings(SeenPoints.of(points.points_px, points.points_vehicle, info, noise)))
     if _doubtful(fits):
         cause = _misreading(points, info, noise)
         if cause is not None:
             raise DriveError(f"{points.path}: the points fit no mounting of this camera: {cause}")
-    if not fits or not np.isfinite(fits[0].covariance).all() or _height_m(fits[0]) <= 0:
+    if not fits or not np.isfinite(fits[0].covariance).all():
         raise DriveError(
             f"{points.path}: the points do not determine a camera: all, or all but one, lie about on a line; "
             "survey some to its left and right"
@@ -155,6 +158,11 @@ def solve(points: SurveyedPoints, info: CameraInfo, noise: Noise) -> list[Fit]:
             f"write metres, in which that is {height * UNITS[unit]:.2f} m"
         )
     return fits
+
+
+def _above_ground(fits: list[Fit]) -> list[Fit]:
+    """The mountings that a camera can have: from below, mirrored points look right."""
+    return [fit for fit in fits if _height_m(fit) > 0]
 
 
 def _height_m(fit: Fit) -> float:
@@ -178,14 +186,15 @@ def _misreading(points: SurveyedPoints, info: CameraInfo, noise: Noise) -> str |
     px = points.points_px[some]
     ground = points.points_vehicle[some]
 
-    as_given = _best_score(fit_mountings(SeenPoints.of(px, ground, info, noise)))
+    given_fits = fit_mountings(SeenPoints.of(px, ground, info, noise))
+    as_given = _best_score(_above_ground(given_fits))
     causes = {}
     for reading in _readings(px, ground, info):
         read_points = SeenPoints.of(reading.points_px, reading.points_vehicle, info, noise)
-        fits = fit_mountings(read_points, starts=_STARTS, rounds=_ROUNDS)
+        fits = _above_ground(fit_mountings(read_points, starts=_STARTS, rounds=_ROUNDS))
         # Pixels that are scaled have another density: by scale^2 each in those of the table.
         causes[reading.cause] = _best_score(fits) + 2 * len(px) * float(np.log(reading.scale))
-    if as_given > -np.inf:
+    if given_fits:
         causes[_UNRELATED] = -len(px) * float(np.log(info.width * info.height))
     cause = max(causes, key=lambda words: causes[words])
     return cause if causes[cause] > as_given + _SURE - np.log(_MISREAD) else None
@@ -198,9 +207,9 @@ def _best_score(fits: list[Fit]) -> float:
 
 def _score(fit: Fit) -> float:
     """Log posterior, with how usual the mounting is."""
-    roll = mounting_angles(fit.cam_from_vehicle)[0]
+    roll, _, yaw = mounting_angles(fit.cam_from_vehicle)
     beside = camera_centre(fit.cam_from_vehicle)[1]
-    unusual = 0.5 * ((roll / _ROLL_RAD) ** 2 + (beside / _BESIDE_M) ** 2)
+    unusual = 0.5 * ((roll / _ROLL_RAD) ** 2 + (beside / _BESIDE_M) ** 2) + _ASIDE * np.sin(yaw) ** 2
     return fit.log_posterior - min(float(unusual), _UNUSUAL)
 
 

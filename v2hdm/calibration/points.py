@@ -11,7 +11,7 @@ import numpy as np
 from scipy.stats import chi2, f
 
 from v2hdm.calibration.fit import STATED_AS, UNKNOWNS, Fit, SeenPoints, fit_mountings
-from v2hdm.errors import DriveError
+from v2hdm.errors import DriveError, shown
 from v2hdm.geometry.ipm import (
     apply_in_front,
     facing_ipm,
@@ -21,7 +21,7 @@ from v2hdm.geometry.ipm import (
     project_ground,
 )
 from v2hdm.geometry.lens import distort_points, undistort_points
-from v2hdm.io.importers.readings import read_rows
+from v2hdm.io.rows import read_rows
 from v2hdm.io.trajectory import parse_number
 from v2hdm.records import BoolArray, CameraInfo, FloatArray
 from v2hdm.verdict.verdict import Finding, Status, judge, passed
@@ -105,7 +105,9 @@ def _columns(header: list[str], path: Path) -> list[str]:
     for name in columns:
         if name not in (*COLUMNS, _NAME):
             hint = "points must lie on the ground; drop it" if name in ("z", "z_m") else "drop it"
-            raise DriveError(f"{path}: column '{name}' is not one of {', '.join(COLUMNS)}, {_NAME}; {hint}")
+            raise DriveError(
+                f"{path}: column {shown(name)} is not one of {', '.join(COLUMNS)}, {_NAME}; {hint}"
+            )
     return columns
 
 

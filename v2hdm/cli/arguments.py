@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from v2hdm.errors import EXIT_FAILED_VERDICT
+from v2hdm.errors import EXIT_FAILED_VERDICT, masked
 from v2hdm.progress import Steps, patient, progress_lines
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def result_of(folder: Path, maker: str, settings: Mapping[str, object]) -> Itera
     from v2hdm.store.results import result_folder
 
     with result_folder(folder, "--output", maker) as unfinished:
-        (unfinished / "config.yaml").write_text(json.dumps(settings) + "\n", encoding="utf-8")
+        (unfinished / "config.yaml").write_text(masked(json.dumps(settings)) + "\n", encoding="utf-8")
         yield unfinished
 
 

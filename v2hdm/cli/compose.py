@@ -26,7 +26,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from v2hdm.cli.command import Command
-from v2hdm.errors import ConfigError, V2hdmError
+from v2hdm.errors import ConfigError, V2hdmError, masked, shown
 from v2hdm.io.description import DRIVE_FILE
 from v2hdm.safe.texts import read_yaml
 from v2hdm.settings import NO_KEY, settings_of
@@ -97,7 +97,7 @@ def work_on(command: Command, door: Door, work: Callable[[Job], int | None], arg
     except Exception as error:  # whatever Hydra, OmegaConf and PyYAML raise about texts that users wrote
         raise explain(error, door.schema, parsed.overrides) from error
     if parsed.cfg:
-        print(OmegaConf.to_yaml(composed))
+        print(masked(OmegaConf.to_yaml(composed)))
         return 0
     return work(Job(to_dataclass(composed, door.schema, door.advice), to_yaml(composed))) or 0
 
@@ -195,7 +195,9 @@ def explain(error: Exception, schema: type[Any], overrides: list[str]) -> Config
             override for override in overrides if "=" not in override and not override.startswith(("-", "~"))
         ]
         word = " ".join(bare[-1:]) or "an argument"
-        return ConfigError(f"configuration: '{word}' is not key=value; write drive.path={word}, see --help")
+        return ConfigError(
+            f"configuration: {shown(word)} is not key=value; write drive.path={word}, see --help"
+        )
     # Of a long command line only what the message is about: the override that has the key it names.
     relevant = [override for override in overrides if override.lstrip("+~").split("=")[0] in message + place]
     repeated = relevant or overrides
@@ -213,6 +215,10 @@ _NOISE = re.compile(
 _UNQUOTED = re.compile(r"Lexer|no viable alternative|mismatched input|extraneous input|Unknown function")
 
 
+_INSTEAD = {"max_sigma_m": "mapping.acceptance.accuracy=A, B or C takes its place (docs/accuracy.md)"}
+"""Keys that are no more, and what to set now."""
+
+
 def _advice(message: str, schema: type[Any]) -> str:
     if _UNQUOTED.search(message):
         return "a value with special characters needs quotes: \"drive.path='müll (1)'\""
@@ -223,6 +229,8 @@ def _advice(message: str, schema: type[Any]) -> str:
     if listed:
         return f"write {listed.group(1)}=[{listed.group(2)}]"
     unknown = re.search(r"[Kk]ey '([\w.]+)' (?:not in|is not in)", message)
+    if unknown and unknown.group(1).split(".")[-1] in _INSTEAD:
+        return _INSTEAD[unknown.group(1).split(".")[-1]]
     if unknown:
         leaves = [key.name.split(".") for key in keys_of(schema)]
         keys = dict.fromkeys(".".join(parts[:end]) for parts in leaves for end in range(1, len(parts) + 1))

@@ -6,6 +6,7 @@ Ctrl-C is one line while torch is still being loaded, too.
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import json
 import logging
@@ -13,6 +14,7 @@ import os
 import pkgutil
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -22,7 +24,7 @@ from pathlib import Path
 from v2hdm import __version__
 from v2hdm.cli import commands
 from v2hdm.cli.command import Command, fail
-from v2hdm.errors import describe, one_line
+from v2hdm.errors import describe, one_line, shown
 
 _FIRST = ("map", "detect", "check")  # at the head of the list, for those who look at it for the first time
 
@@ -56,13 +58,32 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line of this process; returns the exit code."""
     answer_signals()
     logging.setLogRecordFactory(_Line)
-    child = os.fork() if _is_limited() else 0
+    words = sys.argv[1:] if arguments is None else arguments
+    if not _is_limited():
+        return run(words)
+    theirs, ours = os.pipe()  # which ends when this process does, whatever ends it
+    child = os.fork()
     if child == 0:
-        return run(sys.argv[1:] if arguments is None else arguments)
+        os.close(ours)
+        threading.Thread(target=_end_with, args=(theirs,), daemon=True).start()
+        return run(words)
+    os.close(theirs)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: os.kill(child, number))
     code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     return code if code >= 0 else fail(f"ended by signal {-code} under ulimit -v; {describe(MemoryError())}")
+
+
+_TIDY_S = 5.0  # a child without its parent may take this long to tidy up
+
+
+def _end_with(pipe: int) -> None:
+    """End this process, tidily if it can, when the other end of a pipe does."""
+    with suppress(OSError):
+        os.read(pipe, 1)
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(_TIDY_S)
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def _is_limited() -> bool:
@@ -87,7 +108,10 @@ def run(arguments: Sequence[str]) -> int:
         return _overview(version_line)
     if not words or words[0] in ("-h", "--help") or (below and words[1:2] in ([], ["-h"], ["--help"])):
         return _overview(lambda: _list(below or names))
-    return fail(f"v2hdm {' '.join(words[: 2 if below else 1])}: no such command; v2hdm --help lists them")
+    typed = " ".join(words[: 2 if below else 1])
+    similar = difflib.get_close_matches(typed, names, n=1, cutoff=0.6)
+    meant = f"did you mean {similar[0]}? " if similar else ""
+    return fail(f"v2hdm {shown(typed)[1:-1]}: no such command; {meant}v2hdm --help lists them")
 
 
 def _overview(text: Callable[[], str]) -> int:

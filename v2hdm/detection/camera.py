@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from v2hdm.errors import MapFileError
+from v2hdm.errors import MapFileError, shown
 from v2hdm.geometry.ipm import (
     apply_homography,
     apply_in_front,
@@ -374,7 +374,7 @@ def _problem(calibration: Calibration) -> str | None:
     count = DISTORTION_COEFFICIENTS.get(info.distortion_model)
     if count is None:
         models = ", ".join(DISTORTION_COEFFICIENTS)
-        return f"unknown distortion_model '{info.distortion_model}'; known are {models}"
+        return f"unknown distortion_model {shown(info.distortion_model)}; known are {models}"
     if len(info.distortion) != count:
         return f"{info.distortion_model} has {count} coefficients, not {len(info.distortion)}; fix them"
     if info.width < 1 or info.height < 1 or min(info.intrinsic[0, 0], info.intrinsic[1, 1]) <= 0:

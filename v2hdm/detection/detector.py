@@ -21,6 +21,7 @@ from v2hdm.detection.quads.outline import on_edges, outline_polygon
 from v2hdm.detection.quads.propose import Proposals, propose
 from v2hdm.detection.stopwatch import lap
 from v2hdm.detection.weights import check_weights
+from v2hdm.doors import checked
 from v2hdm.errors import DetectorError
 from v2hdm.records import BoolArray, Camera, LaneDetection, MarkingDetection
 from v2hdm.safe.texts import shown
@@ -41,6 +42,7 @@ class Detector:
     ((4, 2), (8, 8))
     """
 
+    @checked
     def __init__(self, network: Network, options: DetectorOptions, catalogue: Catalogue | None = None):
         self.network = network
         self.options = options
@@ -49,6 +51,7 @@ class Detector:
         self._cameras: dict[str, tuple[RoadCamera, int]] = {}
 
     @classmethod
+    @checked
     def load(cls, path: str | Path | None = None, options: DetectorOptions | None = None) -> Detector:
         """Load a model: ``path``, else ``options.model``, else the one that is shipped.
 
@@ -59,6 +62,7 @@ class Detector:
         path = path if path is not None else options.model
         return cls(Network(None if path is None else Path(path), options.threads, options.device), options)
 
+    @checked
     def detect(
         self, image_bgr: np.ndarray, camera: Camera
     ) -> tuple[tuple[MarkingDetection, ...], tuple[LaneDetection, ...]]:

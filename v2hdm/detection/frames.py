@@ -16,12 +16,12 @@ import cv2
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.safe.pixels import AS_STORED, VIDEO_OPTIONS, read_pixels
+from v2hdm.safe.pixels import AS_STORED, VIDEO_OPTIONS, is_image_name, read_pixels
+from v2hdm.safe.texts import number_key
 
 _log = logging.getLogger(__name__)
 
 _MOST_CAMERAS = 1 << 16  # OpenCV takes a larger index for something else
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")  # suffixes of images in a folder
 _POLL_S = 0.005  # a folder that grows is looked at this often
 _WRITTEN_S = 1.0  # an image is written within this time
 _SAME_DATE_S = (2.0, 0.05)
@@ -62,7 +62,7 @@ def image_frames(paths: Sequence[Path]) -> Iterator[Frame]:
 
 
 def list_images(folder: Path, left_out: AbstractSet[str] = frozenset()) -> list[Path]:
-    """The image files that lie in a folder itself, by name, but for those whose names are ``left_out``."""
+    """The image files in a folder itself, by the numbers in their names, without those ``left_out``."""
     try:
         # Names alone: of thousands of images paths would take longer than it takes to look at one.
         names = {*os.listdir(folder)} - left_out  # noqa: PTH208
@@ -70,7 +70,7 @@ def list_images(folder: Path, left_out: AbstractSet[str] = frozenset()) -> list[
         raise DriveError(
             f"{folder}: cannot read this folder ({error.strerror}); check its permissions"
         ) from error
-    return [folder / name for name in sorted(names) if name.lower().endswith(IMAGE_SUFFIXES)]
+    return [folder / name for name in sorted(filter(is_image_name, names), key=number_key)]
 
 
 def video_frames(path: Path) -> Iterator[Frame]:

@@ -7,6 +7,7 @@ resolution and near ground in half of it, which halves the time.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -20,7 +21,7 @@ import onnxruntime
 from v2hdm.catalogue import SHIPPED, Catalogue
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.weights import NETWORK_FILE
-from v2hdm.errors import ConfigError, DetectorError
+from v2hdm.errors import ConfigError, DetectorError, one_line
 from v2hdm.records import SEEN_ACROSS, FloatArray
 from v2hdm.safe.texts import parse_json
 
@@ -160,7 +161,7 @@ class Network:
             outputs = self._session.run(_OUTPUTS, {"image": np.ascontiguousarray(padded)[None]})
         except Exception as error:  # onnxruntime raises classes of its own that are not exported
             raise DetectorError(
-                f"{self.path}: the network failed on a {width}x{height} image ({_one_line(error)}); "
+                f"{self.path}: the network failed on a {width}x{height} image ({_cause(error)}); "
                 "export it again with dynamic sizes"
             ) from error
         planes = []
@@ -315,7 +316,7 @@ def open_session(path: Path, threads: int, device: str = "cpu") -> Any:
         providers = [_PROVIDERS[name] for name in dict.fromkeys((device, "cpu"))]
         session = onnxruntime.InferenceSession(str(path), options, providers)
     except Exception as error:
-        problem = f"{path}: not a usable ONNX model ({_one_line(error)}); export it again"
+        problem = f"{path}: not a usable ONNX model ({_cause(error)}); export it again"
         raise DetectorError(problem) from error
     # Where the driver or cuDNN fails, onnxruntime goes on without a word on the CPU.
     provider = _PROVIDERS[device][0]
@@ -343,7 +344,7 @@ def _read_info(session: Any, path: Path) -> NetworkInfo:
         raise DetectorError(f"{path}: {error}") from error
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise DetectorError(
-            f"{path}: no usable '{METADATA_KEY}' metadata ({_one_line(error)}); "
+            f"{path}: no usable '{METADATA_KEY}' metadata ({_cause(error)}); "
             "this is not a model written by `python -m export`"
         ) from error
     problem = None
@@ -371,5 +372,18 @@ def _read_info(session: Any, path: Path) -> NetworkInfo:
     return info
 
 
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__
+_FRAME = re.compile(r"/\S+:\d+ [^()]*\([^()]*(?:\([^()]*\)[^()]*)*\) ")  # where in onnxruntime's C++ it arose
+_IR_VERSIONS = re.compile(r"model IR version: (\d+), max supported IR version: (\d+)")
+_OPSETS = re.compile(r"Opset (\d+) is under development.* support for domain (\S+) is till opset (\d+)")
+
+
+def _cause(error: Exception) -> str:
+    """The complaint of onnxruntime, without the places of its own code."""
+    text = one_line(_FRAME.sub("", str(error)))
+    version = f"this onnxruntime {onnxruntime.__version__}"
+    if match := _IR_VERSIONS.search(text):
+        return f"its IR version is {match[1]}, and {version} reads up to {match[2]}: update onnxruntime"
+    if match := _OPSETS.search(text):
+        where, opset, most = match[2], match[1], match[3]
+        return f"its opset of {where} is {opset}, and {version} knows up to {most}: update onnxruntime"
+    return text.rpartition(" failed:")[2] or type(error).__name__

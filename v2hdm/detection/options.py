@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
+from v2hdm.doors import check_types
 from v2hdm.errors import ConfigError
 from v2hdm.safe.texts import shown
 from v2hdm.settings import NOT_NEGATIVE, POSITIVE, Within, check_settings
@@ -53,6 +54,7 @@ class DetectorOptions:
 
     def __post_init__(self) -> None:
         """Raise ConfigError if a value is out of range."""
+        check_types(self, "detector.")
         check_settings(self, "detector.")
         if self.device not in DEVICES:
             raise ConfigError(f"detector.device is {shown(self.device)}: choose {' or '.join(DEVICES)}")

@@ -31,7 +31,7 @@ def is_doubtful(test: ScoreTest) -> bool:
 
 def is_possible(test: ScoreTest) -> bool:
     """Whether an input's error of any size has more than 5 % probability."""
-    return test.sigmas > even_sigmas(test, _DOUBT / (1 - _DOUBT))
+    return test.sigmas > possible_sigmas(test)
 
 
 def probability(test: ScoreTest) -> float:
@@ -45,6 +45,11 @@ def probability(test: ScoreTest) -> float:
 def even_sigmas(test: ScoreTest, odds: float = 1.0) -> float:
     """Sigmas from which an input's error has at least these posterior ``odds``."""
     return math.sqrt(2 * max(math.log(odds / _PRIOR_ODDS) - _log_spread(test), 0.0))
+
+
+def possible_sigmas(test: ScoreTest) -> float:
+    """Sigmas from which an input's error of any size has more than 5 % probability."""
+    return even_sigmas(test, _DOUBT / (1 - _DOUBT))
 
 
 def doubt(test: ScoreTest) -> float:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.errors import MapFileError, V2hdmError, need
+from v2hdm.errors import MapFileError, V2hdmError, need, shown
 from v2hdm.records import FloatArray, GeodeticOrigin
 
 _SEMI_MAJOR_M = 6378137.0  # semi-major axis, m, of the ellipsoid WGS84 (NGA.STND.0036)
@@ -35,6 +35,19 @@ def enu_from_geodetic(origin: GeodeticOrigin, geodetic: FloatArray) -> FloatArra
     """The inverse of :func:`geodetic_from_enu`: (N, 3) degrees, degrees, m to map points (N, 3) in m."""
     here = position_of(origin)
     return np.asarray((_ecef_from_geodetic(geodetic) - _ecef_from_geodetic(here)[0]) @ enu_axes(here)[0])
+
+
+def geodetic_from_ecef(points: FloatArray) -> FloatArray:
+    """Latitude and longitude in degrees and height in m (N, 3) of earth-centred points (N, 3), m."""
+    return _geodetic_from_ecef(points)
+
+
+def metres_between(places: FloatArray, others: FloatArray) -> FloatArray:
+    """Distance (N,) along the ground, m, of latitudes and longitudes (N, 2), deg, that lie close together."""
+    north_m = np.radians(others[:, 0] - places[:, 0]) * _SEMI_MAJOR_M
+    turn_deg = (others[:, 1] - places[:, 1] + 180) % 360 - 180
+    east_m = np.radians(turn_deg) * _SEMI_MAJOR_M * np.cos(np.radians(places[:, 0]))
+    return np.asarray(np.hypot(north_m, east_m))
 
 
 def enu_axes(geodetic: FloatArray) -> FloatArray:
@@ -63,6 +76,7 @@ def geodetic_from_grid(crs: str, points: FloatArray, where: str, error: type[V2h
     return geodetic
 
 
+_LONGEST_CRS = 20_000  # letters of a system's description: WKT of a compound one has 5,000
 LOCAL = "local"  # name of the map's own frame as a coordinate system
 _GRID_DECIMALS = 4  # decimals of a coordinate in metres: 0.1 mm
 _DEGREE_DECIMALS = 9  # decimals of a latitude or longitude in degrees: 0.1 mm on the ground
@@ -101,7 +115,7 @@ class Grid:
             raise error(f"{where}: {crs} needs an origin on the earth, which the map lacks; give {LOCAL}")
         fit = utm_of(origin)
         if (code := system.to_authority(min_confidence=100)) is None:
-            raise error(f"{where}: '{crs}' has no code that other programs know; give {fit}")
+            raise error(f"{where}: {shown(crs)} has no code that other programs know; give {fit}")
         if system.is_compound or not (system.is_projected or system.is_geographic):
             raise error(f"{where}: {crs} has a vertical part or unusual axes; give its horizontal part")
         if datum.replace(" ", "") != origin.datum.replace(" ", ""):
@@ -213,9 +227,11 @@ def is_geographic(crs: str, where: str, error: type[V2hdmError]) -> bool:
 def _system(crs: str, where: str, error: type[V2hdmError]) -> Any:
     pyproj = need("pyproj", "map", f"{where}: crs", error)
     try:
+        if len(crs) > _LONGEST_CRS:
+            raise RecursionError
         system = pyproj.CRS.from_user_input(crs)
-    except pyproj.exceptions.CRSError:
-        raise error(f"{where}: unknown crs '{crs}'; give an EPSG code such as EPSG:25832") from None
+    except (pyproj.exceptions.CRSError, RecursionError):  # JSON of many levels
+        raise error(f"{where}: unknown crs {shown(crs)}; give an EPSG code such as EPSG:25832") from None
     ellipsoid = system.ellipsoid
     if (
         ellipsoid is None

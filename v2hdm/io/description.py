@@ -36,11 +36,13 @@ class InfoTopic:
 
 @dataclass(kw_only=True)
 class FolderImages:
-    """Images of a folder, sorted by name."""
+    """Images of a folder, by the numbers or times in their names."""
 
     folder: Annotated[str, "folder of the images."]
     stamps: Annotated[str | None, "file with one time in s per line; without it, names are times."] = None
-    unit: Annotated[str, "of times that are names: s, ms, us or ns."] = "s"
+    unit: Annotated[
+        str | None, "of times that are names: s, ms, us, ns, utc or utc+hh:mm; default: as their digits tell."
+    ] = None
 
 
 @dataclass(kw_only=True)
@@ -72,6 +74,9 @@ class PoseKeys:
     geoid_m: Annotated[float | None, "geoid above the ellipsoid, for heights above sea level."] = None
     epoch: Annotated[float | None, "of the coordinates, in years."] = None
     offset_s: Annotated[float, "added to the times of the poses."] = 0.0
+    heading_file: Annotated[
+        Any, "headings in a second file, by its format, such as {csv: imu.csv}; TUM's by its name."
+    ] = None
 
 
 @dataclass(kw_only=True)
@@ -95,6 +100,32 @@ class NmeaPoses(PoseKeys):
 
     nmea: Annotated[str, "the file."]
     date: Annotated[Any, "of the first sentence, such as 2024-05-17, if no sentence has it."] = None
+    talker: Annotated[str | None, "the receiver to take of several, such as GN."] = None
+
+
+@dataclass(kw_only=True)
+class SbetPoses(PoseKeys):
+    """Poses of Applanix POSPac."""
+
+    sbet: Annotated[str, "the file."]
+    rms: Annotated[str | None, "its RMS file (smrmsg), for the sigmas."] = None
+    date: Annotated[Any, "a day of the recording, if the images' times are no dates."] = None
+    clock: Annotated[str, "of its seconds of the week: gps, or utc with leap seconds."] = "gps"
+
+
+@dataclass(kw_only=True)
+class PosPoses(PoseKeys):
+    """Positions of RTKLIB."""
+
+    pos: Annotated[str, "the file."]
+
+
+@dataclass(kw_only=True)
+class UbxPoses(PoseKeys):
+    """Poses of a u-blox receiver."""
+
+    ubx: Annotated[str, "the log: pyubx2's text or JSON lines, or raw."]
+    date: Annotated[Any, "a day of the recording, if no NAV-PVT has it."] = None
 
 
 @dataclass(kw_only=True)
@@ -147,6 +178,7 @@ class CameraEntry:
     linear_response: Annotated[bool, "whether grey values are proportional to light; else sRGB."] = False
     mask: Annotated[str | None, "image, white where the vehicle itself is visible."] = None
     read_out_s: Annotated[float, NOT_NEGATIVE, "read-out time of a rolling shutter."] = 0.0
+    frame: Annotated[str | None, "the vehicle's name for the frame of the images, x right, z ahead."] = None
 
 
 @dataclass(kw_only=True)
@@ -157,12 +189,17 @@ class DriveDescription:
     name: Annotated[str | None, "the drive's name; default: the folder's."] = None
     bag: Annotated[str | None, "the bag whose topics are named."] = None
     poses: Annotated[
-        str | TumPoses | TablePoses | NmeaPoses | TopicPoses, "the vehicle's poses: a file, or a topic."
+        str | TumPoses | TablePoses | NmeaPoses | SbetPoses | PosPoses | UbxPoses | TopicPoses,
+        "the vehicle's poses: a file, or a topic.",
     ] = POSES_FILE
     pose_noise: Annotated[
         PoseNoise | None, "standard deviations from the receiver's data sheet, and their drifts."
     ] = None
     origin: Annotated[GeodeticOrigin | None, "the place of the map's origin on the earth."] = None
+    vehicle_frame: Annotated[
+        str | None, "the vehicle's name for the frame that positions on it count from."
+    ] = None
+    vehicle_frame_height_m: Annotated[float, "height of that frame's origin above the ground, m."] = 0.0
     truth: Annotated[str | None, "folder of the ground truth; only rendered drives have it."] = None
 
 
@@ -175,11 +212,11 @@ class Keys(NamedTuple):
 
 def keys_in(entry: type[Any], shared: type[Any] | None = None) -> Keys:
     """The keys that a dataclass declares, without those of one that it ``shared`` with others."""
-    own = [key for key in fields(entry) if shared is None or key not in fields(shared)]
-    is_required = [key.default is MISSING and key.default_factory is MISSING for key in own]
+    declared = [key for key in fields(entry) if shared is None or key not in fields(shared)]
+    is_required = [key.default is MISSING and key.default_factory is MISSING for key in declared]
     return Keys(
-        tuple(key.name for key, needed in zip(own, is_required, strict=True) if needed),
-        tuple(key.name for key, needed in zip(own, is_required, strict=True) if not needed),
+        tuple(key.name for key, needed in zip(declared, is_required, strict=True) if needed),
+        tuple(key.name for key, needed in zip(declared, is_required, strict=True) if not needed),
     )
 
 

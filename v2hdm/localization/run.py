@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from v2hdm.association.ground import easy_views, views_of
-from v2hdm.association.sightings import Rig, Sightings, collect_sightings
+from v2hdm.association.sightings import Rig, Sightings, check_detections, collect_sightings
 from v2hdm.detection.batch import detect_all
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.doors import checked
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.planar import wrapped
 from v2hdm.geometry.rigid import heading_rad
@@ -30,6 +31,7 @@ from v2hdm.records import (
     Trajectory,
 )
 from v2hdm.report import style
+from v2hdm.settings import Processes
 from v2hdm.store.files import write_json
 
 _START_SIGMA_M = 0.5  # standard deviation, m, of a coordinate of the first pose: a place that RTK once fixed
@@ -116,13 +118,14 @@ class Localised:
         }
 
 
+@checked
 def localize(
     hd_map: HDMap,
     drive: Drive | str | Path,
     calibrations: Mapping[str, Calibration],
     *,
     detections: Sequence[ImageDetections] | None = None,
-    workers: int = 0,
+    workers: Processes = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Localised:
     """Follow the vehicle through a drive by a map's markings; only the first recorded pose is used.
@@ -153,6 +156,7 @@ def localize(
     if detections is None:
         report = progress or (lambda done, total: None)
         detections = detect_all(drive, DetectorOptions.for_mapping(), workers, report)
+    check_detections(drive, detections)
     names = [name for name in drive.cameras if name in calibrations]
     sightings = collect_sightings(drive, detections, names)
     attitude_rad = drive.pose_noise.roll_pitch_rad

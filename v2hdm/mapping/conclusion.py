@@ -14,9 +14,11 @@ from v2hdm.geometry.ipm import project_ground
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.records import BoolArray, Calibration, Camera, Exclusion, FloatArray, IntArray, Marking
 from v2hdm.site.candidates import Candidates, Counts, scatter_of, with_dissent, with_shared_errors
-from v2hdm.site.markings import Suspicion, classify, most_suspicious, with_relative_sigma
+from v2hdm.site.corrections import Heard
+from v2hdm.site.markings import Suspicion, classify, most_suspicious
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import PointViews, measure_parallax
+from v2hdm.site.relative import with_relative_sigma
 from v2hdm.site.standing import Grey, Watch
 from v2hdm.surface.surface import Surface
 
@@ -33,6 +35,7 @@ class Optimised:
     reprojection_rmse_px: float  # under the optimised extrinsics
     initial_reprojection_rmse_px: float  # under the initial ones
     suspicions: Sequence[Suspicion] = ()  # the worst first
+    heard: tuple[Heard, ...] = ()  # of a person's corrections
 
 
 @dataclass(frozen=True)
@@ -161,6 +164,7 @@ def conclude(solve: FinalSolve, acceptance: AcceptanceOptions) -> Optimised:
         reprojection_rmse_px=_root_mean_square(bundle.solution.residual_px[used]),
         initial_reprojection_rmse_px=_root_mean_square(solve.residual_px(solve.initial_rig)[used]),
         suspicions=most_suspicious(classified.accepted, classified.misfit, squared, classified.counts),
+        heard=classified.heard,
     )
 
 

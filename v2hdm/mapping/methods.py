@@ -364,6 +364,7 @@ def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
         joint_covariance=partial(joint_covariance, optimised),
         residuals=residuals_of(outcome, optimised),
         suspicions=optimised.suspicions,
+        heard=optimised.heard,
         surface=surface,
     )
 

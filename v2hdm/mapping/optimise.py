@@ -14,7 +14,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from v2hdm.adjust import PoseSigma, Problem, Status, estimate_noise, predicts_better, select_model
+from v2hdm.adjust import (
+    MIN_DEPRESSION_SINE,
+    PoseSigma,
+    Problem,
+    Status,
+    estimate_noise,
+    predicts_better,
+    select_model,
+)
 from v2hdm.association.ground import Located, Views, locate
 from v2hdm.association.groups import Association, attach, fuse_groups, in_view, merge_groups, same_groups
 from v2hdm.association.sightings import Rig, Sightings
@@ -108,8 +116,7 @@ class Optimiser:
         """Alternate association and solves until the sightings' assignment to markings is stable."""
         progress("coarse solve")
         located = self._locate(self.initial_rig)
-        height_m = located.height_m[:, None]
-        sine = np.where(located.valid, height_m / np.hypot(located.range_m, height_m), -np.inf)
+        sine = np.where(located.valid, located.depression_sine, -np.inf)
         least = _STEEP_SINE
         if located.valid.any():
             least = min(least, float(np.median(sine[located.valid])))
@@ -281,9 +288,16 @@ class Optimiser:
         return replace(located, valid=located.valid & in_range, informs=located.informs & in_range)
 
     def _usable(self, association: Association, rig: Rig) -> BoolArray:
-        """Corners (S, 4) that a joint solve may use, given the groups' positions."""
+        """Corners (S, 4) that a joint solve may use, given the groups' positions.
+
+        Their rays meet the ground under the poses of ``rig`` and under the recorded ones, from which a solve
+        starts.
+        """
         jitter_rad = self._pose_noise.roll_pitch_rad
-        return in_view(association, locate(self.sightings, rig), self.sightings, rig, jitter_rad)
+        usable = in_view(association, locate(self.sightings, rig), self.sightings, rig, jitter_rad)
+        recorded = replace(rig, map_from_vehicle=self.sightings.map_from_vehicle)
+        meets_ground = locate(self.sightings, recorded).depression_sine > MIN_DEPRESSION_SINE
+        return np.asarray(usable & meets_ground)
 
     def _track(self, rig: Rig, located: Located, direction_rad: float) -> Association:
         return build_tracks(self.sightings, located, rig, direction_rad, self._pose_noise)

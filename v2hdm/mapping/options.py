@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated
 
+from v2hdm.doors import check_types
 from v2hdm.errors import ConfigError
 from v2hdm.records import ACCURACIES
 from v2hdm.safe.texts import shown
@@ -147,6 +148,7 @@ def check_options(options: MappingOptions, kinds: Sequence[str] | None = None) -
 
     ``kinds`` are the four-cornered classes that the detector knows; None accepts any.
     """
+    check_types(options, "mapping.")
     from v2hdm.adjust.problem import LOSSES  # brings torch, which settings as such do without
 
     choices = {
@@ -158,9 +160,9 @@ def check_options(options: MappingOptions, kinds: Sequence[str] | None = None) -
     for key, (value, allowed) in choices.items():
         if value not in allowed:
             which = " or ".join(allowed) if len(allowed) == 2 else f"from {', '.join(allowed)}"
-            raise ConfigError(f"{key} is '{value}'; choose {which}.")
+            raise ConfigError(f"{key} is {shown(value)}; choose {which}.")
     if options.lanes.model not in (AFTER, JOINT):
-        raise ConfigError(f"mapping.lanes.model is '{options.lanes.model}'; choose {AFTER} or {JOINT}.")
+        raise ConfigError(f"mapping.lanes.model is {shown(options.lanes.model)}; choose {AFTER} or {JOINT}.")
     if options.acceptance.accuracy not in ACCURACIES:
         *better, worst = ACCURACIES
         raise ConfigError(

@@ -22,6 +22,7 @@ from v2hdm.records import (
     IntArray,
     JointCovariance,
 )
+from v2hdm.site.corrections import Heard
 from v2hdm.site.markings import Suspicion
 from v2hdm.surface.surface import Surface
 
@@ -119,4 +120,5 @@ class MethodResult:
     residuals: Residuals | None = None  # of the accepted corner observations
     suspicions: Sequence[Suspicion] = ()  # worst markings first
     changes: Changes | None = None  # to an earlier map
+    heard: tuple[Heard, ...] = ()  # corrections of markings that the map follows
     surface: Surface | None = None  # of the ground, None for a plane

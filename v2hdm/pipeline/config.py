@@ -14,13 +14,12 @@ from v2hdm.io.drive import ReadOptions, drive_name
 from v2hdm.io.maps.corrections import read_corrections
 from v2hdm.mapping.options import BATCH, INCREMENTAL, MappingOptions, check_options
 from v2hdm.records import Drive, Image
-from v2hdm.safe.rasters import check_background
 from v2hdm.safe.texts import shown, take_camera_name, take_name
 from v2hdm.settings import MOST_PROCESSES, NOT_NEGATIVE, POSITIVE, Within, check_settings
 from v2hdm.simulate.port.config import PortConfig
 from v2hdm.store import names
 from v2hdm.store.cache import key_of
-from v2hdm.store.files import file_digest
+from v2hdm.store.files import file_digest, refuse_url
 
 ACCURACY_GOAL_CM = 5.0  # the 95 % radius, cm, that is asked of a map where nobody states another
 
@@ -49,6 +48,8 @@ class DriveConfig(ReadOptions):
         wrong = [path for path in listed if not isinstance(path, str | Path) or not str(path)]
         if wrong:
             raise ConfigError(f"drive.path: {wrong[0]!r} is not a path; give one, or a list: [monday,friday]")
+        for path in listed:
+            refuse_url(Path(path))
         return tuple(Path(path) for path in listed)
 
 
@@ -167,6 +168,8 @@ def admit(config: RunConfig) -> str:
         need("rasterio", "gis", "report.background", ConfigError)
         if not Path(config.report.background).exists():
             raise ConfigError(f"report.background: no file or folder {config.report.background}")
+        from v2hdm.safe.backgrounds import check_background  # reads rasters, which few runs need
+
         check_background(Path(config.report.background))  # before minutes of mapping
     has_base = config.map.base is not None
     check_choice(config.mapping, len(config.drive.paths), has_base, config.accuracy_goal_cm)

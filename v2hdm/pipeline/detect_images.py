@@ -15,7 +15,6 @@ import numpy as np
 from v2hdm.detection.camera import camera_from_calibration, rough_calibration
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.frames import (
-    IMAGE_SUFFIXES,
     Frame,
     NewestFrames,
     arriving_frames,
@@ -28,10 +27,12 @@ from v2hdm.detection.mounting import BODY_SIGMA_RAD, Mounting, MountingEstimate,
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.road import Road, RoadDetector
 from v2hdm.detection.stopwatch import Stopwatch, lap
-from v2hdm.errors import ConfigError, DriveError
+from v2hdm.doors import checked
+from v2hdm.errors import ConfigError, DriveError, shown
 from v2hdm.io.calibration.intrinsics import is_calibration, read_intrinsics
 from v2hdm.io.drive import READERS, read_drive
 from v2hdm.records import CameraInfo
+from v2hdm.safe.pixels import IMAGE_SUFFIXES
 from v2hdm.store.inputs import note_input
 
 ROUGH_MOUNTING = (1.6, 5.0, 60.0)  # height (m), pitch, horizontal field of view (deg) where nothing is known
@@ -61,6 +62,7 @@ class Detected(NamedTuple):
     road: Road
 
 
+@checked
 def detect_images(
     source: str | Path | int,
     *,
@@ -102,6 +104,10 @@ def detect_images(
     """
     path = None if camera is None else Path(camera)
     lens = _lens(path, camera_name, mounting)
+    if mounting is not None and len(mounting) != 3:
+        raise ConfigError(
+            f"--mounting: {len(mounting)} numbers; give height (m), pitch (deg) and field of view (deg)"
+        )
     if limit is not None and limit < 1:
         raise ConfigError(f"--limit {limit}: give a number of images, 1 or more")
     if not isinstance(detector, Detector):
@@ -288,7 +294,7 @@ def _drive_frames(path: Path, road: RoadDetector | None, rough: _Rough) -> _Fram
     if road is not None:
         name = road.camera.info.name
         if name not in drive.cameras:
-            raise DriveError(f"{path}: no camera '{name}' in the calibration; it has {', '.join(roads)}")
+            raise DriveError(f"{path}: no camera {shown(name)} in the calibration; it has {', '.join(roads)}")
         roads = {name: road}
     numbers = {name: count() for name in roads}
     return (

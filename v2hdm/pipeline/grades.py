@@ -6,19 +6,21 @@ asks for, and a verdict on inputs does not depend on what is left out.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
 
 from v2hdm.errors import MappingError
+from v2hdm.io.maps.corrections import Correction
 from v2hdm.io.maps.features import features_of
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.evaluate import CameraSets
 from v2hdm.pipeline.stages import MappedSet
 from v2hdm.records import ACCURACIES, BEST, Exclusion, FloatArray, HDMap, Marking, Symbol
 from v2hdm.site.accuracy import accuracy_of, objection_to
+from v2hdm.site.corrections import is_confirmed
 from v2hdm.survey.run import Survey
 
 _Paint = TypeVar("_Paint", Marking, Symbol)
@@ -57,14 +59,14 @@ def graded(hd_map: HDMap, goal_m: float) -> HDMap:
     )
 
 
-def accurate_enough(methods: CameraSets, asked: str) -> CameraSets:
-    """Results without what is of a worse grade than ``asked``.
+def accurate_enough(methods: CameraSets, asked: str, corrections: Sequence[Correction] = ()) -> CameraSets:
+    """Results without what is of a worse grade than ``asked``, but with what a person has confirmed.
 
     Raises:
         MappingError: nothing of the map of all cameras would be left.
     """
     chosen = {
-        name: {method: without_worse(result, asked) for method, result in by_method.items()}
+        name: {method: without_worse(result, asked, corrections) for method, result in by_method.items()}
         for name, by_method in methods.items()
     }
     name = list(methods)[-1]
@@ -78,23 +80,28 @@ def accurate_enough(methods: CameraSets, asked: str) -> CameraSets:
     return chosen
 
 
-def without_worse(result: MethodResult, asked: str) -> MethodResult:
+def without_worse(result: MethodResult, asked: str, corrections: Sequence[Correction] = ()) -> MethodResult:
     """The result without markings and symbols of a worse grade, which become exclusions.
 
-    The others keep the ids that they have in the whole map.
+    The others keep the ids that they have in the whole map. What a person accepted or corrected stays.
     """
+
+    def objection(paint: Marking | Symbol) -> str | None:
+        against = objection_to(paint.accuracy, asked)
+        return None if against and is_confirmed(_outline(paint), corrections) else against
+
     ids = [feature.id for feature in features_of(result.hd_map)]
     hd_map = _with_ids(result.hd_map, ids)
     paints: list[Marking | Symbol] = [*hd_map.markings, *hd_map.symbols]
     excluded = [
         Exclusion(paint.kind, _outline(paint).mean(axis=0), paint.sightings, reason)
         for paint in paints
-        if (reason := objection_to(paint.accuracy, asked)) is not None
+        if (reason := objection(paint)) is not None
     ]
     if not excluded:
         return result
-    markings = tuple(marking for marking in hd_map.markings if objection_to(marking.accuracy, asked) is None)
-    symbols = tuple(symbol for symbol in hd_map.symbols if objection_to(symbol.accuracy, asked) is None)
+    markings = tuple(marking for marking in hd_map.markings if objection(marking) is None)
+    symbols = tuple(symbol for symbol in hd_map.symbols if objection(symbol) is None)
     kept_ids = [marking.id or 0 for marking in markings]
     residuals = result.residuals
     if residuals is not None:

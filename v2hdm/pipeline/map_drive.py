@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +13,8 @@ import torch  # noqa: F401  # its absence is reported before that of what is bui
 from v2hdm.adjust.ahead import compiled_meanwhile
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.weights import unknown_network
-from v2hdm.errors import AdjustError, MappingError
+from v2hdm.doors import checked
+from v2hdm.errors import AdjustError, ConfigError, MappingError
 from v2hdm.io.drive import ReadOptions, as_drive, join_drives
 from v2hdm.io.maps.corrections import read_corrections
 from v2hdm.mapping.options import AUTO, MappingOptions, check_options
@@ -27,6 +28,8 @@ from v2hdm.pipeline.result import Result, describe_run
 from v2hdm.pipeline.stages import MappedSet, detect_in_pieces, map_camera_sets, methods_of
 from v2hdm.progress import Progress, silent
 from v2hdm.records import BEST, Drive, ImageDetections
+from v2hdm.settings import Processes
+from v2hdm.site.corrections import Heard
 from v2hdm.site.living.changes import Base
 from v2hdm.site.living.wear import with_wear
 from v2hdm.store.cache import StageCache
@@ -42,6 +45,8 @@ _log = logging.getLogger(__name__)
 
 Source = Drive | Path | str
 
+_TOLD_CORRECTIONS = 20  # corrections that the terminal lists: a screen
+
 
 @dataclass(frozen=True)
 class Read:
@@ -52,6 +57,7 @@ class Read:
     contents: Contents
 
 
+@checked
 def map_drive(
     drive: Source | Iterable[Source],
     *,
@@ -64,7 +70,7 @@ def map_drive(
     name: str | None = None,
     cache: Path | str | None = None,
     progress: Progress = silent,
-    workers: int = 0,
+    workers: Processes = 0,
     context: Context | None = None,
 ) -> Result:
     """Map a drive, or several through one site together; nothing is written, but what ``cache`` keeps.
@@ -95,6 +101,8 @@ def map_drive(
     >>> result.verdict.status.value, result.calibrations["front"].cam_from_vehicle.shape
     ('PASS', (4, 4))
     """
+    if cache is not None and Path(cache).is_file():
+        raise ConfigError(f"cache {cache}: is a file; give a folder")
     stages = StageCache(None if cache is None else Path(cache))
     context = context or Context(stages, progress, workers=workers)
     options = options or MappingOptions()
@@ -103,6 +111,8 @@ def map_drive(
         stated = read_corrections(Path(corrections))
         options = replace(options, acceptance=replace(options.acceptance, corrections=stated))
     sources = [drive] if isinstance(drive, Source) else list(drive)
+    if not sources:
+        raise ConfigError("map_drive: no drive is given; give one, or a list of them")
     check_options(options)
     check_choice(options, len(sources), base is not None, accuracy_goal_cm)
     read = read_all(sources, reading, context)
@@ -111,7 +121,7 @@ def map_drive(
     with context.timed("check"):
         inspection = join(inspect_each(read.drives, read.contents, reading.max_gap_s, context))
     paths = [source.root if isinstance(source, Drive) else Path(source) for source in sources]
-    about = describe_run(name or read.whole.name, read.whole, paths, reading)
+    about = describe_run(name or read.whole.name, read.whole, read.contents, paths, reading)
     described = inspection.drive_as_described
     mapped_so_far = Result(about, read.drives, read.contents, described, context.seconds, options.device)
     return _mapped(mapped_so_far, inspection, detector, survey, earlier, accuracy_goal_cm, context)
@@ -150,7 +160,8 @@ def _mapped(
             sets = graded_sets(mapped, goal_cm / 100)
         with context.timed("wear"):
             sets = _with_wear(sets, inspection.drive, earlier, context)
-        chosen = accurate_enough(methods_of(sets), survey.mapping.acceptance.accuracy)
+        acceptance = survey.mapping.acceptance
+        chosen = accurate_enough(methods_of(sets), acceptance.accuracy, acceptance.corrections)
     except (MappingError, AdjustError) as failure:
         if all(finding.status is not Status.FAIL for finding in inspection.findings):
             raise
@@ -212,6 +223,15 @@ def _with_wear(
     return {**sets, name: replace(last, methods=methods)}
 
 
+def _told_of_corrections(heard: Sequence[Heard]) -> list[str]:
+    """Lines on the corrections that the map follows; the log and metrics.json list all."""
+    for correction in heard:
+        _log.info("%s", f"correction followed: {correction.sentence}")  # "%s": not in the terminal
+    lines = [f"correction followed: {correction.sentence}" for correction in heard[:_TOLD_CORRECTIONS]]
+    more = len(heard) - len(lines)
+    return [*lines, f"and {more} more corrections, see metrics.json"] if more else lines
+
+
 def _judge(
     result: Result,
     inspection: Inspection,
@@ -242,6 +262,9 @@ def _judge(
         metrics, headlines = evaluate(result.drive, chosen)
     changes = {} if best.changes is None else {"changes": changes_json(best.changes)}
     figures = {**metrics, **changes, "seconds": context.seconds}
+    if best.heard:
+        figures["corrections"] = [asdict(heard) for heard in best.heard]
+        headlines += _told_of_corrections(best.heard)
     if check_points is not None:
         figures["check_points"] = check_points.figures()
         headlines.append(check_points.headline)

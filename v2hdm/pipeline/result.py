@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from v2hdm import __version__
+from v2hdm.doors import checked, checked_class
 from v2hdm.errors import MappingError
 from v2hdm.geometry.planar import length_along
 from v2hdm.io.drive import ReadOptions, told_of
@@ -25,7 +26,9 @@ from v2hdm.survey.check_points import CheckTable
 from v2hdm.verdict import Verdict
 
 
-def describe_run(name: str, drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[str, Any]:
+def describe_run(
+    name: str, drive: Drive, contents: Contents, paths: Sequence[Path], options: ReadOptions
+) -> dict[str, Any]:
     """The beginning of ``metrics.json``: name, version, date (UTC), the drive at ``paths`` as it was read."""
     stamp_s = [image.stamp_s for image in drive.images]
     return {
@@ -33,7 +36,7 @@ def describe_run(name: str, drive: Drive, paths: Sequence[Path], options: ReadOp
         "version": __version__,
         "date": datetime.now(UTC).strftime("%Y-%m-%d"),
         "drive": {
-            **told_of(drive, paths, options),
+            **told_of(drive, paths, options, contents.digests.__getitem__),
             "duration_s": round(float(np.ptp(stamp_s)), 3),
             "length_m": round(float(length_along(drive.route_map)[-1]), 2),
             "position_sigma_m": drive.pose_noise.position_m,
@@ -43,6 +46,7 @@ def describe_run(name: str, drive: Drive, paths: Sequence[Path], options: ReadOp
     }
 
 
+@checked_class
 @dataclass(frozen=True)
 class Result:
     """The map of a drive, its calibrations, trajectory and verdict.
@@ -114,6 +118,7 @@ class Result:
         assert poses is not None  # of the joint optimisation they always are
         return poses
 
+    @checked
     def save(
         self,
         folder: Path | str,

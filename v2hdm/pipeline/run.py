@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from v2hdm import __version__
-from v2hdm.errors import ConfigError, V2hdmError
+from v2hdm.errors import ConfigError, V2hdmError, masked
 from v2hdm.io.drive import read_drive
 from v2hdm.io.maps.formats import check_crs
 from v2hdm.pipeline.config import (
@@ -223,12 +223,17 @@ def map_and_save(
             note_input(path)  # before any work is done for nothing
         with result_folder(place, maker=maker) as folder, logging_to(log_file(folder / LOG)):
             _log.info("v2hdm %s, run %s", __version__, name)
-            (folder / CONFIG).write_text(config_yaml or f"{config!r}\n", encoding="utf-8")
+            (folder / CONFIG).write_text(masked(config_yaml or f"{config!r}\n"), encoding="utf-8")
 
             def accept(drive: Drive) -> None:
                 check_crs(
                     config.crs, [name for name in config.export if name != "geojson"], drive.origin, "crs"
                 )
+                if config.report.background is not None and drive.origin is None:
+                    raise ConfigError(
+                        "report.background: this drive has no position on the earth; state its origin in "
+                        "drive.yaml, or leave the picture out"
+                    )
 
             context = replace(context, cache=cache, workers=config.workers, accept=accept)
             mapped = map_drive(

@@ -36,6 +36,7 @@ from v2hdm.report.photos import save_overlay
 from v2hdm.store import names
 from v2hdm.store.files import replace_text, write_json
 from v2hdm.survey.check_points import write_check_points
+from v2hdm.verdict import known_frames
 
 if TYPE_CHECKING:
     from v2hdm.pipeline.result import Result
@@ -72,7 +73,13 @@ def write_result(result: Result, folder: Path, outputs: Outputs, context: Contex
         grid = check_crs(outputs.crs, ["qgis"], result.map.origin, "crs").get("qgis")
         write_qgis(result.map, folder / names.PROJECT, grid=grid)
     with context.timed("report"):
-        write_page(folder, drive, None if outputs.background is None else Path(outputs.background))
+        try:
+            write_page(folder, drive, None if outputs.background is None else Path(outputs.background))
+        except MapFileError as failure:
+            if outputs.background is None:
+                raise
+            _log.warning("no picture lies under the report's map: %s", failure)
+            write_page(folder, drive)
 
 
 def _write_all_maps(folder: Path, result: Result) -> None:
@@ -99,6 +106,7 @@ def _write_map(folder: Path, result: Result, outputs: Outputs) -> None:
         path = folder / names.calibration_file(name)
         read_out_s = None if best.evidence is None else best.evidence.read_out_s.get(name)
         noted: dict[str, Any] = {"clock_s": clock_s, "read_out_s": read_out_s, "verdict": verdict}
+        calibration = replace(calibration, frames=known_frames(drive.cameras[name], result.verdict))
         write_calibration(calibration, path, about=about, **noted)
         for form in CALIBRATION_FORMATS:  # of other tools, into a folder named like the file
             try:

@@ -18,12 +18,22 @@ from scipy.spatial.transform import Rotation
 from v2hdm.catalogue import CORNERED_CLASSES
 from v2hdm.geometry.planar import inside_convex, length_along, points_along
 from v2hdm.geometry.rigid import camera_centre, ground_in_vehicle
-from v2hdm.records import BEST, DIAMOND, BoolArray, Drive, FloatArray, HDMap, Lane, Marking, Truth
+from v2hdm.records import (
+    BEST,
+    DIAMOND,
+    TWO_SIDED_95,
+    BoolArray,
+    Drive,
+    FloatArray,
+    HDMap,
+    Lane,
+    Marking,
+    Truth,
+)
 from v2hdm.site.accuracy import well_known
 
 MATCH_GATE_M = 2.0  # a mapped marking farther from every true one of its class is false
 MIN_SIGHTINGS = 3  # images with the whole marking in the region of interest that count as driven past
-_TWO_SIDED_95 = 1.96  # standard deviations to either side
 FULLY_VISIBLE = 0.99  # visible fraction of an unoccluded marking
 
 
@@ -118,7 +128,7 @@ def height_figures(mapped: Sequence[Marking], true: Sequence[Marking]) -> dict[s
             continue
         errors_m.append(marking.heights_m - np.roll(counterpart.heights_m, -shift))
         if marking.heights_sigma_m is not None:
-            inside.append(np.abs(errors_m[-1]) < _TWO_SIDED_95 * marking.heights_sigma_m)
+            inside.append(np.abs(errors_m[-1]) < TWO_SIDED_95 * marking.heights_sigma_m)
     figures = {"height_rmse_m": float(np.sqrt(np.mean(np.square(errors_m))))} if errors_m else {}
     return figures | ({"heights_inside_95": float(np.mean(inside))} if inside else {})
 
@@ -188,7 +198,7 @@ def lane_metrics(lanes: Sequence[Lane], truth: Truth) -> LaneMetrics:
         length_m=mapped_m,
         mean_lateral_error_m=float(lateral[is_near].mean()) if is_near.any() else none,
         rms_lateral_error_m=float(np.sqrt((lateral[is_near] ** 2).mean())) if is_near.any() else none,
-        inside_95=float((sigmas <= _TWO_SIDED_95).mean()) if len(sigmas) else none,
+        inside_95=float((sigmas <= TWO_SIDED_95).mean()) if len(sigmas) else none,
         mapped_fraction=float(covered.mean()) if len(covered) else none,
         false_length_m=float((~is_near).sum() * SAMPLE_STEP_M),
     )

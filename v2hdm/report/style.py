@@ -38,6 +38,7 @@ METHOD = {method: OKABE_ITO[colour] for method, colour in WORDS.items()}
 
 RC: dict[Any, Any] = {
     "font.family": "sans-serif",
+    "text.parse_math": False,  # a $ in a name is a letter
     "font.size": 10,
     "axes.spines.top": False,
     "axes.spines.right": False,

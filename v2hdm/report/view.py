@@ -7,12 +7,13 @@ other pages (``Origin``) are refused.
 
 from __future__ import annotations
 
-import json
+import re
 import secrets
+import sys
 import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from contextvars import Context
-from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import NamedTuple
@@ -21,12 +22,23 @@ import numpy as np
 
 from v2hdm.catalogue import SHIPPED
 from v2hdm.errors import MapFileError, V2hdmError, one_line
-from v2hdm.io.maps.corrections import Correction, correction_of, entry_of, read_corrections, write_corrections
+from v2hdm.io.maps.corrections import (
+    Correction,
+    correction_of,
+    corrections_text,
+    entry_of,
+    read_corrections,
+    write_corrections,
+)
 from v2hdm.records import Drive
 from v2hdm.report.page.document import json_text, page_text
 from v2hdm.report.page.facts import Facts, read_facts
+from v2hdm.safe.texts import parse_json, parse_yaml
+from v2hdm.store.files import dump_yaml, load_yaml, refuse_unwritable, refuse_url
+from v2hdm.store.folders import waited_for
 
 _SAME_M = 0.01  # largest distance, m, between a correction and its feature
+_LENGTH = re.compile(r"[0-9]{1,9}")  # a header that states a number of bytes
 _MOST_BYTES = 100_000  # largest size of a correction that is sent
 
 
@@ -35,44 +47,110 @@ def file_beside(folder: Path) -> Path:
     return folder.resolve().with_name(f"{folder.resolve().name}.corrections.yaml")
 
 
-@dataclass
+class _MeanwhileError(MapFileError):
+    """Somebody else has corrected the same, or has edited the file."""
+
+
 class Session:
-    """Corrections of the result in ``folder`` by key of the feature, stored in the file ``path``."""
+    """Corrections of a result by key of the feature, in a file that others may write as well.
 
-    folder: Path
-    path: Path
-    corrections: dict[str, Correction] = field(default_factory=dict)
-    _lock: threading.Lock = field(default_factory=threading.Lock)
+    It is read before it is written: what another ``v2hdm view`` has put there is kept, and what a person
+    has written there by hand is not replaced before the page has shown it. A link stays one.
+    """
 
-    @classmethod
-    def start(cls, folder: Path, path: Path, facts: Facts) -> Session:
-        """Start from the file's content; raises MapFileError if it is no file of corrections."""
-        corrections = read_corrections(path) if path.exists() else []
-        return cls(
-            folder,
-            path,
-            {_key(correction, facts) or f"old{n}": correction for n, correction in enumerate(corrections)},
-        )
+    def __init__(self, folder: Path, path: Path, facts: Facts) -> None:
+        """Start from the file's content; MapFileError if that is something else, ConfigError if no place."""
+        refuse_url(path)
+        refuse_unwritable(path.resolve())
+        self.path = path
+        self.corrections: dict[str, Correction] = {}
+        self._folder = folder
+        self._facts = facts
+        self._place = path.resolve()
+        self._content: bytes | None = None  # of the file, as it was last read or written
+        self._lock = threading.Lock()
+        if self._place.exists():
+            self._read()
+
+    def refresh(self) -> None:
+        """Take over what is in the file now, if that can be read; else the next correction says why not."""
+        with self._lock, suppress(V2hdmError, OSError):
+            if self._place.read_bytes() != self._content:
+                self._read()
 
     def take(self, sent: bytes) -> None:
-        """Store or remove a correction and write the file; raises MapFileError if malformed."""
+        """Store or remove a correction and write the file; raises MapFileError if malformed, or outdated."""
         try:
-            content = json.loads(sent)
-            key = str(content["key"])
+            content = parse_json(sent.decode(), "correction", MapFileError)
+            key = content["key"]
             entry = content["correction"]
-        except (ValueError, TypeError, LookupError, RecursionError):
+            is_compared = "before" in content
+            corrected_before = content.get("before")
+        except (ValueError, TypeError, LookupError, AttributeError):
             raise MapFileError("not a correction: expected a key and a correction") from None
-        with self._lock:
+        correction = None if entry is None else self._kept(entry)
+        if correction is not None:
+            key = _key(correction, self._facts)
+        before = self.corrections.get(key)
+        if is_compared:
+            before = None if corrected_before is None else self._kept(corrected_before)
+        self._place.parent.mkdir(parents=True, exist_ok=True)
+        with self._lock, waited_for(self._place.with_name(f".{self._place.name}.lock")):
+            self._follow()
+            if not _is_same(self.corrections.get(key), before):
+                raise _MeanwhileError(f"{self.path}: this was corrected elsewhere meanwhile; reload the page")
             corrections = {name: other for name, other in self.corrections.items() if name != key}
-            if entry is not None:
-                corrections[key] = correction_of(entry, key)
+            if correction is not None:
+                corrections[key] = correction
             # This command read the file at its start, and continues after writing it.
-            Context().run(write_corrections, list(corrections.values()), str(self.folder), self.path)
+            Context().run(write_corrections, [*corrections.values()], str(self._folder), self._place)
+            self._content = self._place.read_bytes()
             self.corrections = corrections
 
+    def _kept(self, entry: object) -> Correction:
+        """A correction as it will be read again."""
+        where = f"{self.path}: the new correction"
+        text = dump_yaml(entry_of(correction_of(entry, where)))
+        return correction_of(parse_yaml(text, where, MapFileError), where)
 
-def _key(correction: Correction, facts: Facts) -> str | None:
-    """Key in the page of a correction's feature; None if not in the map."""
+    def _read(self) -> None:
+        content = self._place.read_bytes()
+        corrections: dict[str, Correction] = {}
+        for correction in Context().run(read_corrections, self._place):
+            key = _key(correction, self._facts)
+            if not _is_same(corrections.setdefault(key, correction), correction):
+                raise MapFileError(
+                    f"{self.path}: two corrections contradict each other on the {correction.place}; keep one"
+                )
+        self.corrections = corrections
+        self._content = content
+
+    def _follow(self) -> None:
+        """Take over what another view has written; refuse where anybody else has changed the file."""
+        try:
+            content = self._place.read_bytes()
+        except FileNotFoundError:
+            if self._content is None:
+                return
+            raise _MeanwhileError(
+                f"{self.path}: was removed meanwhile; put it back, or start view again"
+            ) from None
+        if content == self._content:
+            return
+        corrections = Context().run(read_corrections, self._place)
+        result = str(Context().run(load_yaml, self._place, MapFileError).get("result", ""))
+        if content != corrections_text(corrections, result).encode():
+            raise _MeanwhileError(f"{self.path}: was edited meanwhile; reload the page to go on from there")
+        self._read()
+
+
+def _is_same(correction: Correction | None, other: Correction | None) -> bool:
+    """Whether two corrections are written in the same way."""
+    return (correction and entry_of(correction)) == (other and entry_of(other))
+
+
+def _key(correction: Correction, facts: Facts) -> str:
+    """Key in the page of a correction's feature; its outline, if that is not in the map."""
     hd_map = facts.hd_map
     places = {f"x{n}": out.position_map[None] for n, out in enumerate(facts.excluded)}
     if hd_map is not None:
@@ -82,7 +160,26 @@ def _key(correction: Correction, facts: Facts) -> str | None:
     for key, place in places.items():
         if place.shape == outline.shape and np.abs(place - outline).max() < _SAME_M:
             return key
-    return None
+    return str(outline.round(3).tolist())
+
+
+_HEADERS = {
+    "Cache-Control": "no-store",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "Content-Security-Policy": "frame-ancestors 'none'",
+    "X-Frame-Options": "DENY",
+}
+"""Headers of every answer: no other page may show ours within itself."""
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """Say nothing of a reader who hangs up."""
+        if not isinstance(sys.exception(), OSError):
+            super().handle_error(request, client_address)  # type: ignore[arg-type]
 
 
 class Viewing(NamedTuple):
@@ -98,7 +195,7 @@ def server_of(folder: Path, drive: Drive | None, path: Path) -> Viewing:
     facts = read_facts(folder, drive)
     if facts.hd_map is None:
         raise MapFileError(f"{folder}: has no map to view; fix its drive and map it again")
-    session = Session.start(folder, path, facts)
+    session = Session(folder, path, facts)
     secret = secrets.token_urlsafe(16)
     text = page_text(folder, drive, {"secret": secret})
     place = json_text({"secret": secret})
@@ -113,6 +210,7 @@ def server_of(folder: Path, drive: Drive | None, path: Path) -> Viewing:
         def do_GET(self) -> None:
             if not self._is_ours() or self.path != f"/{secret}/":
                 return self._answer(404, "no such page")
+            session.refresh()
             entries = {key: entry_of(correction) for key, correction in session.corrections.items()}
             editing = {"file": path.name, "corrections": entries, "kinds": kinds}
             return self._answer(200, text.replace(place, json_text(editing), 1), "text/html")
@@ -122,10 +220,12 @@ def server_of(folder: Path, drive: Drive | None, path: Path) -> Viewing:
             elsewhere = self.headers.get("Origin") not in (None, base)
             if elsewhere or not self._is_ours() or self.path != f"/{secret}/correct":
                 return self._answer(404, "no such page")
-            if not length.isdecimal() or int(length) > _MOST_BYTES:
+            if not _LENGTH.fullmatch(length) or int(length) > _MOST_BYTES:
                 return self._answer(400, "a correction has at most 100 kB")
             try:
                 session.take(self.rfile.read(int(length)))
+            except _MeanwhileError as error:
+                return self._answer(409, one_line(str(error)))
             except (V2hdmError, OSError) as error:
                 return self._answer(400, one_line(str(error)))
             return self._answer(200, "kept")
@@ -138,12 +238,14 @@ def server_of(folder: Path, drive: Drive | None, path: Path) -> Viewing:
             self.send_response(status)
             self.send_header("Content-Type", f"{kind}; charset=utf-8")
             self.send_header("Content-Length", str(len(content)))
-            self.send_header("Cache-Control", "no-store")
-            self.send_header("Referrer-Policy", "no-referrer")
             self.end_headers()
             self.wfile.write(content)
 
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    server.daemon_threads = True
+        def end_headers(self) -> None:
+            for name, value in _HEADERS.items():
+                self.send_header(name, value)
+            super().end_headers()
+
+    server = _Server(("127.0.0.1", 0), Handler)
     base = f"http://127.0.0.1:{server.server_address[1]}"
     return Viewing(server, f"{base}/{secret}/", session)

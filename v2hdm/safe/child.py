@@ -33,7 +33,7 @@ from tempfile import TemporaryDirectory
 from typing import IO, Any, Never
 
 from v2hdm import errors
-from v2hdm.errors import V2hdmError, describe, one_line
+from v2hdm.errors import REASON_LETTERS, V2hdmError, bounded, describe, one_line
 
 try:
     import resource
@@ -47,7 +47,6 @@ _SPARE_BYTES = 2_000_000_000  # memory and largest file of work on the smallest 
 _TIMES = 10  # by which memory and largest file grow with the input's bytes
 _STEP_S = 20.0  # processor time of a step of work on the smallest input; chosen
 _STEP_S_PER_MB = 1.0  # by which that grows with the input: the index of a bag is one step
-_LONGEST_REASON = 200  # letters of what a child that died printed last
 
 
 @dataclass(frozen=True)
@@ -164,9 +163,10 @@ def _refuse_death(code: int, said: str, limits: Limits, where: str, error: type[
         raise error(f"{where}: takes more than {most} for one piece; it is damaged, or a trap")
     if _is_limited("RLIMIT_AS"):  # by whoever started us: libraries die of it without a word
         raise MemoryError
-    reason = said.splitlines()[-1][:_LONGEST_REASON] if said else "without a word"
+    last_words = said.splitlines()[-1] if said else "without a word"
+    reason = bounded(one_line(last_words), REASON_LETTERS)
     ending = f"signal {-code}" if code < 0 else f"exit code {code}"
-    raise error(f"{where}: the process that reads it ended by {ending} ({one_line(reason)}); copy it again")
+    raise error(f"{where}: the process that reads it ended by {ending} ({reason}); copy it again")
 
 
 def _is_limited(name: str) -> bool:

@@ -6,12 +6,15 @@ import logging
 
 import numpy as np
 
-from v2hdm.errors import V2hdmError
+from v2hdm.errors import V2hdmError, shown
 from v2hdm.records import CameraInfo, FloatArray, GeodeticOrigin
 from v2hdm.store.files import check_keys, take_array, take_mapping, take_number, take_text
 
 _log = logging.getLogger(__name__)
 
+_LONGEST_NAME = 255  # letters of a frame's name; chosen
+_HIGHEST_FRAME_M = 12.0  # of a vehicle above the ground, straddle carriers included
+_LONGEST_DATUM = 200  # letters of a datum's name; chosen
 _LARGEST_PX = 65535  # side of an image: JPEG has no larger one
 _LONGEST_FOCAL_PX = 1e6  # focal length, or offset of the centre, of any camera; chosen
 _ROUNDING = 1e-3  # share by which a covariance may be off for having been rounded
@@ -32,6 +35,22 @@ def take_whole(content: object, least: int, most: int, where: str, error: type[V
     return int(value)
 
 
+def take_frame(content: object, where: str, error: type[V2hdmError]) -> str:
+    """``content`` as the name of a frame of TF, without the slash that old recorders put before it."""
+    name = take_text(content, where, error).lstrip("/")
+    if not name or len(name) > _LONGEST_NAME or not name.isprintable() or " " in name:
+        raise error(f"{where}: {shown(content)} is not the name of a frame, such as base_link; fix it")
+    return name
+
+
+def take_frame_height(content: object, where: str, error: type[V2hdmError]) -> float:
+    """``content`` as the height, m, of a vehicle's frame above the ground."""
+    height_m = take_number(content, where, error)
+    if abs(height_m) > _HIGHEST_FRAME_M:
+        raise error(f"{where}: {height_m:g} m is not the height of a vehicle's frame; give metres")
+    return height_m
+
+
 def take_origin(content: object, where: str, error: type[V2hdmError]) -> GeodeticOrigin | None:
     """``content`` as the map's place on the earth; None where there is none."""
     if content is None:
@@ -46,11 +65,14 @@ def take_origin(content: object, where: str, error: type[V2hdmError]) -> Geodeti
     longitude_deg = number("longitude_deg")
     if abs(latitude_deg) > 90 or abs(longitude_deg) > 180:
         raise error(f"{where}: latitude must lie within +-90 and longitude within +-180 degrees; fix them")
+    datum = take_text(entry.get("datum", "WGS84"), f"{where}, datum", error)
+    if not datum.isprintable() or len(datum) > _LONGEST_DATUM:
+        raise error(f"{where}, datum: {shown(datum)} is no name of a datum; give one such as ETRS89")
     return GeodeticOrigin(
         latitude_deg=latitude_deg,
         longitude_deg=longitude_deg,
         altitude_m=number("altitude_m"),
-        datum=take_text(entry.get("datum", "WGS84"), f"{where}, datum", error),
+        datum=datum,
         epoch=None if entry.get("epoch") is None else number("epoch"),
     )
 

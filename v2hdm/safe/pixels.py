@@ -48,6 +48,7 @@ _HEIGHT_TAG = 0x101  # a TIFF's
 _ORIENTATION_TAG = 0x112  # a TIFF's, and EXIF's
 _UPRIGHT = 1  # the orientation of an image that is shown as it is stored
 
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")  # suffixes of images in a folder
 AS_STORED = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR  # OpenCV's flags for the depth and channels of the file
 _GREY_FLAGS = (cv2.IMREAD_GRAYSCALE, cv2.IMREAD_REDUCED_GRAYSCALE_4)
 _PRINTERS_SPACES = ("CMYK", "YCCK")  # which TurboJPEG turns into no other
@@ -72,6 +73,11 @@ class Header:
     orientation: int = _UPRIGHT
 
 
+def is_image_name(name: str) -> bool:
+    """Whether a file is an image by its name; hidden ones, such as macOS's ``._NAME.jpg``, are none."""
+    return not name.startswith(".") and name.lower().endswith(IMAGE_SUFFIXES)
+
+
 def read_header(path: Path) -> Header:
     """The header of a PNG, JPEG, TIFF, BMP or WebP file; refuses truncated, tiny and huge ones."""
     with _opened(path) as data:
@@ -82,6 +88,11 @@ def read_pixels(path: Path, flags: int) -> np.ndarray:
     """The decoded pixels of an image, with OpenCV's ``flags``; errors as :func:`read_header`, or damage."""
     with _opened(path) as stored:
         data = stored[:]
+    return pixels_of(data, path, flags)
+
+
+def pixels_of(data: bytes, path: Path, flags: int) -> np.ndarray:
+    """The pixels of the image file ``data``, which errors call ``path``; as :func:`read_pixels`."""
     header = _checked(data, path)
     if not (_is_whole_png(data) if data.startswith(_PNG) else _scans(data) <= _MOST_SCANS):
         raise DriveError(f"{path}: the image is damaged; copy it again or drop it from the list")

@@ -17,19 +17,18 @@ from typing import Any, Never
 import numpy as np
 import yaml
 
-from v2hdm.errors import V2hdmError
+from v2hdm.errors import MOST_DIGITS, V2hdmError
+from v2hdm.errors import shown as shown
 from v2hdm.store.inputs import note_input, warn_if_changed
 
 MOST_BYTES = 1 << 30  # of a text file; an hour of poses at 100 Hz is 30 MB
 MOST_YAML_BYTES = 1 << 24  # ours have kilobytes, and PyYAML takes a second for half a megabyte
 MOST_DEPTH = 64  # of nested lists and mappings; ours are 8 deep
 MOST_ENTRIES = 1_000_000  # values in a YAML file, with everything that an alias repeats
-MOST_DIGITS = 64  # of a whole number; doubles end at 309 digits, and nothing here counts beyond 2**64
 MOST_NAME_LETTERS = 64  # of a camera, run, drive or class; chosen
 _MOST_NAME_BYTES = 200  # file systems end at 255 bytes
-_SHORT = 60  # letters of a value that an error shows; chosen
-_FEW = 4  # entries of a list that an error shows in full; chosen
 ALL_CAMERAS = ("both", "all")  # names of results of all cameras together
+_NUMBERS = re.compile("([0-9]+)")
 _HALF = "half a character (a lone surrogate)"
 _ESCAPED_HALF = re.compile(r"\\u[dD][89a-fA-F]")
 _QUOTED = re.compile(r'"(?:[^"\\]|\\.)*"')
@@ -169,25 +168,11 @@ def take_camera_name(content: object, where: str, error: type[V2hdmError]) -> st
     return name
 
 
-def shown(content: object) -> str:
-    """``content`` as a short piece of one line: what a user wrote, quoted where it is a text."""
-    if content is None:
-        return "nothing"
-    if isinstance(content, bool):
-        return str(content).lower()
-    if isinstance(content, dict):
-        return "a mapping with " + shown(next(iter(content))) if content else "an empty mapping"
-    if isinstance(content, list | tuple):
-        if 1 < len(content) <= _FEW and not any(isinstance(part, dict | list | tuple) for part in content):
-            return f"[{', '.join(map(shown, content))}]"
-        return f"a list of {len(content)}" if len(content) != 1 else "a list of one"
-    if isinstance(content, int) and abs(content) >= 10**MOST_DIGITS:
-        return "a number with very many digits"
-    letters = str(content)[: _SHORT + 1]
-    text = "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in letters)
-    if len(text) > _SHORT:
-        text = f"{text[: _SHORT - 3]}..."
-    return f"'{text}'" if isinstance(content, str) else text
+def number_key(name: str) -> tuple[list[str | int], str]:
+    """A key that sorts names by the numbers in them, as numbers; names of equal numbers by their letters."""
+    parts: list[str | int] = [*_NUMBERS.split(name)]
+    parts[1::2] = [int(digits) for digits in _NUMBERS.findall(name)]
+    return parts, name
 
 
 class _Loader(yaml.SafeLoader):

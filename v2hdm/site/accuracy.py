@@ -1,4 +1,7 @@
-"""The accuracy of markings and symbols: a grade by the 95 % radius of the worst corner and the user's goal.
+"""The accuracy of markings and symbols: radii, and a grade by that of the worst corner and the user's goal.
+
+Two figures are stated everywhere. The **95 % radius** of a corner holds the true corner with a probability of
+95 %, that of a marking beside its neighbours its true centre. A radius **of all** holds 95 % of them.
 
 A grade says how well a corner's place in the map frame is known, with all that the map's markings share; it
 says nothing of whether the marking is there.
@@ -9,8 +12,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.optimize import brentq
 
-from v2hdm.records import ACCURACIES, FloatArray, Marking
+from v2hdm.records import ACCURACIES, SIGMAS_95, FloatArray, Marking
+
+_SHARE = 0.95  # share of all corners, and probability for each, of every stated radius
 
 _B_OF_GOAL = 2.0  # largest radius of grade B over the goal; chosen
 
@@ -40,8 +46,8 @@ def accuracy_of(covariance_m2: FloatArray | None, goal_m: float) -> str | None:
 
 def well_known(markings: Sequence[Marking]) -> Sequence[Marking]:
     """The markings but those of accuracy C as long as these are fewer, else all of them."""
-    known = [marking for marking in markings if marking.accuracy != ACCURACIES[-1]]
-    return known if 2 * len(known) > len(markings) else markings
+    better_known = [marking for marking in markings if marking.accuracy != ACCURACIES[-1]]
+    return better_known if 2 * len(better_known) > len(markings) else markings
 
 
 def objection_to(accuracy: str | None, asked: str) -> str | None:
@@ -64,3 +70,31 @@ def radius_95_m(covariance_m2: FloatArray) -> FloatArray:
     minor = sigma_m[..., 0]
     major = sigma_m[..., 1]
     return np.asarray(major * np.polyval((0.371625, 0.114276, 0.004071, 1.960790), minor / major))
+
+
+def absolute_radii_m(markings: Sequence[Marking]) -> FloatArray:
+    """The 95 % radii (M, 4), m, of the markings' corners; infinite where no covariance is stated."""
+    radii_m = [
+        np.full(4, np.inf) if marking.covariance_m2 is None else corner_radii_m(marking.covariance_m2)
+        for marking in markings
+    ]
+    return np.array(radii_m).reshape(-1, 4)
+
+
+def relative_radii_m(markings: Sequence[Marking]) -> FloatArray:
+    """The 95 % radii, m, of the centres of those markings whose place beside their neighbours is stated."""
+    return SIGMAS_95 * np.array([m.relative_sigma_m for m in markings if m.relative_sigma_m is not None])
+
+
+def radius_of_all_m(radius_m: FloatArray) -> float:
+    """The radius that holds 95 % of all points, given the radius (N,) that holds each with 95 %.
+
+    Errors are circular normal: with 1 - 0.05^((r / own)^2) a point lies within r. Infinite for no points.
+    """
+    if not len(radius_m) or np.mean(np.isfinite(radius_m)) < _SHARE:
+        return float("inf")
+
+    def missing(radius: float) -> float:
+        return float(np.mean((1 - _SHARE) ** ((radius / radius_m) ** 2))) - (1 - _SHARE)
+
+    return float(brentq(missing, 0.0, 5.0 * float(radius_m[np.isfinite(radius_m)].max())))

@@ -12,7 +12,7 @@ from v2hdm.association.groups import FusedGroups, line_only
 from v2hdm.geometry.planar import block_diagonal
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
-_UNSEEN_M2 = 1e4  # variance of an unseen corner, m^2: effectively infinite at the size of a site
+UNSEEN_M2 = 1e4  # variance of an unseen corner, m^2: effectively infinite at the size of a site
 CORRELATION = 0.2
 """Correlation of a corner's errors between images: 0.3 overstates sides' sigmas, 0.1 understates corners'."""
 
@@ -30,7 +30,7 @@ something else."""
 
 @dataclass(frozen=True)
 class Candidates:
-    """Corners (G, 4, 2), m, and joint covariances (G, 8, 8), m^2; :data:`_UNSEEN_M2` for unseen corners."""
+    """Corners (G, 4, 2), m, and joint covariances (G, 8, 8), m^2; :data:`UNSEEN_M2` for unseen corners."""
 
     corners_map: FloatArray
     covariance_m2: FloatArray
@@ -45,7 +45,7 @@ class Candidates:
         centre = np.where(unseen[..., None], 0.0, corners_map).sum(axis=1) / count[:, None]
         centre = np.where(np.all(unseen, axis=1)[:, None], about, centre)
         rows = np.repeat(unseen, 2, axis=1)
-        covariance = np.where(rows[:, :, None] | rows[:, None, :], _UNSEEN_M2 * np.eye(8), covariance_m2)
+        covariance = np.where(rows[:, :, None] | rows[:, None, :], UNSEEN_M2 * np.eye(8), covariance_m2)
         return cls(np.where(unseen[..., None], centre[:, None], corners_map), covariance)
 
     def __len__(self) -> int:
@@ -141,7 +141,7 @@ def with_shared_errors(candidates: Candidates, fused: FusedGroups, scatter: Floa
     shared = np.where(unseen[..., None, None], 0.0, share[..., None, None] * fused.covariance_m2)
     # Images that are cut alike share one error: their number does not locate the corner.
     no_point = (fused.point_sightings == 0) & ~unseen
-    shared[no_point] = line_only(shared[no_point], _UNSEEN_M2**0.5)
+    shared[no_point] = line_only(shared[no_point], UNSEEN_M2**0.5)
     return Candidates(candidates.corners_map, candidates.covariance_m2 + block_diagonal(shared))
 
 

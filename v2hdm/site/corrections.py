@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import chi2
 
 from v2hdm.geometry.planar import clip_convex, signed_area
 from v2hdm.io.maps.corrections import ACCEPTED, REJECTED, Correction
@@ -13,6 +14,10 @@ from v2hdm.records import Exclusion, FloatArray, HDMap, IntArray
 from v2hdm.site.candidates import Candidates
 
 _SAME_M = 0.4  # largest distance, m, between a candidate's centre and the one that a person corrected
+_SURE = float(
+    np.log(999.0)
+)  # log odds of a marking, or against it, from which the images contradict a person
+_CONTRADICTS = float(chi2.isf(1e-3, 2))  # squared distance, in sigmas, that one of 1000 right corners exceeds
 MAX_OVERLAP = 0.2  # overlap of outlines, relative to the smaller, from which they are one paint
 
 
@@ -22,22 +27,26 @@ class Stated:
 
     rejected: dict[int, str]
     confirmed: dict[int, Correction]
+    rejections: tuple[tuple[int, Correction], ...] = ()  # each with a candidate that it is of
 
     @classmethod
     def of(cls, corrections: Sequence[Correction], corners_map: FloatArray, kinds: Sequence[str]) -> Stated:
         """Corrections of the nearest candidates (G, 4, 2), own class first; rejections are of all there."""
         rejected: dict[int, str] = {}
         confirmed: dict[int, Correction] = {}
+        rejections: list[tuple[int, Correction]] = []
         for correction in corrections:
             same = _same(correction, corners_map)
             if correction.says == REJECTED:
+                rejections += [(group, correction) for group in same.tolist()]
                 rejected |= dict.fromkeys(same.tolist(), reason_of(correction))
             elif len(same):
                 middle = np.mean(correction.outline_map, axis=0)
                 away_m = np.linalg.norm(corners_map[same].mean(axis=1) - middle, axis=1)
                 away_m = away_m + [0.0 if kinds[group] == correction.kind else _SAME_M for group in same]
                 confirmed[int(same[np.argmin(away_m)])] = correction
-        return cls({group: why for group, why in rejected.items() if group not in confirmed}, confirmed)
+        rejected = {group: why for group, why in rejected.items() if group not in confirmed}
+        return cls(rejected, confirmed, tuple(pair for pair in rejections if pair[0] in rejected))
 
     def placed(self, candidates: Candidates, uncorrected: Candidates) -> Candidates:
         """The candidates with the corners that a person moved.
@@ -71,6 +80,69 @@ class Stated:
         return Candidates(corners, covariance)
 
 
+@dataclass(frozen=True)
+class Heard:
+    """A correction that the map follows, and how the images contradict it; empty where they do not."""
+
+    place: str
+    says: str
+    against: str = ""
+
+    @property
+    def sentence(self) -> str:
+        """Both in a line."""
+        return f"{self.place}: {self.says}" + (f", but {self.against}" if self.against else "")
+
+
+def heard_of(
+    stated: Stated, reasons: Sequence[str | None], log_odds: FloatArray, images: IntArray, shown: Candidates
+) -> tuple[Heard, ...]:
+    """What the map follows of the corrections of candidates (G,), beside what the images alone say.
+
+    By the images ``reasons`` (G,) speak against them, or None, their ``log_odds`` (G,) are of being markings,
+    ``images`` (G,) show them, and their corners are those ``shown``.
+    """
+    heard: dict[str, Heard] = {}
+    for group, correction in stated.rejections:
+        is_sure = reasons[group] is None and log_odds[group] > _SURE
+        against = f"{images[group]} images show it" if is_sure else ""
+        if against or correction.place not in heard:
+            heard[correction.place] = Heard(correction.place, "rejected", against)
+    for group, correction in stated.confirmed.items():
+        says = []
+        against = ""
+        reason = reasons[group]
+        if correction.new_kind:
+            says.append(f"of class {correction.new_kind}")
+        if correction.moved:
+            off_m, is_off = _moved_off(stated, group, shown)
+            corners = ", ".join(map(str, sorted(correction.moved)))
+            says.append(f"corner {corners} moved")
+            if is_off:
+                against = f"the images show the paint {100 * off_m:.1f} cm from there"
+        if not against and reason is not None and log_odds[group] < -_SURE:
+            against = f"by the images it is left out: {reason}"
+        heard[correction.place] = Heard(correction.place, ", ".join(says) or "accepted", against)
+    return tuple(heard.values())
+
+
+def _moved_off(stated: Stated, group: int, shown: Candidates) -> tuple[float, bool]:
+    """The largest distance, m, of a moved corner from where the images show it, and if they exclude it."""
+    correction = stated.confirmed[group]
+    placed = stated.placed(shown, shown)
+    off_m = placed.corners_map[group] - shown.corners_map[group]
+    moved = np.flatnonzero(np.any(off_m != 0.0, axis=1))
+    others = np.setdiff1d(np.arange(4), moved) if len(moved) < 4 else np.arange(4)
+    is_off = False
+    for corner in moved.tolist():
+        # Beside the other corners: what all share is no difference.
+        beside = np.kron(np.eye(4)[corner] - np.isin(np.arange(4), others) / len(others), np.eye(2))
+        covariance_m2 = beside @ shown.covariance_m2[group] @ beside.T + correction.sigma_m**2 * np.eye(2)
+        squared = float(off_m[corner] @ np.linalg.solve(covariance_m2, off_m[corner]))
+        is_off = is_off or squared > _CONTRADICTS
+    return float(np.linalg.norm(off_m, axis=1).max()), is_off
+
+
 def reason_of(correction: Correction) -> str:
     """The reason for a marking that a person rejected."""
     return "rejected by a person" + (f": {correction.reason}" if correction.reason else "")
@@ -85,6 +157,16 @@ def _same(correction: Correction, corners_map: FloatArray) -> IntArray:
     reach_m = float(np.ptp(outline, axis=0).max()) + _SAME_M
     in_reach = np.flatnonzero(away_m < reach_m)
     return in_reach[[overlap(corners_map[group], outline) > MAX_OVERLAP for group in in_reach]]
+
+
+def is_confirmed(outline_map: FloatArray, corrections: Sequence[Correction]) -> bool:
+    """Whether a person accepted or corrected the marking or symbol with that outline (N, 2)."""
+    confirmed = [correction for correction in corrections if correction.says != REJECTED]
+    if len(outline_map) == 4:
+        return any(len(_same(correction, outline_map[None])) for correction in confirmed)
+    middle = outline_map.mean(axis=0)
+    away_m = [np.linalg.norm(np.mean(correction.outline_map, axis=0) - middle) for correction in confirmed]
+    return bool(min(away_m, default=np.inf) < _SAME_M)
 
 
 def overlap(a: FloatArray, b: FloatArray) -> float:

@@ -1,7 +1,6 @@
 """The choice of candidates that become markings of the map, with reasons against the others.
 
-Also the relative precision of neighbouring markings, free of drift and survey, and suspicion: unlike others
-of their class in shape, residuals or disputed observations.
+Also suspicion: unlike others of their class in shape, residuals or disputed observations.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from v2hdm.site.candidates import (
     Counts,
     variance_prior,
 )
-from v2hdm.site.corrections import MAX_OVERLAP, Stated, overlap
+from v2hdm.site.corrections import MAX_OVERLAP, Heard, Stated, heard_of, overlap
 from v2hdm.site.hypotheses import Kind
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import Parallax
@@ -58,6 +57,7 @@ class Classified:
     counts: Counts
     misfit: FloatArray
     verdict: list[str | None]
+    heard: tuple[Heard, ...] = ()  # of a person's corrections
 
     @property
     def accepted(self) -> IntArray:
@@ -144,13 +144,14 @@ def classify(
         verdict[group] = TOO_UNCERTAIN if seen_corners[group] == 4 else LACKS_A_CORNER
     objections = parallax.objections(options.min_probability)
     verdict = [reason or objection for reason, objection in zip(verdict, objections, strict=True)]
+    heard = heard_of(stated, verdict, uncorrected.log_odds, counts.images, uncorrected.candidates)
     for group in stated.confirmed:
         verdict[group] = None
     verdict = [stated.rejected.get(group, reason) for group, reason in enumerate(verdict)]
     in_map = np.flatnonzero([reason is None for reason in verdict])
     for group in _covered(judged, in_map).tolist():
         verdict[group] = COVERED
-    return Classified(tuple(names), judged.candidates, counts, judged.misfit, verdict)
+    return Classified(tuple(names), judged.candidates, counts, judged.misfit, verdict, heard)
 
 
 def _known_ends(solved: Candidates, judged: Posterior) -> BoolArray:
@@ -176,62 +177,6 @@ def _covered(judged: Posterior, standing: IntArray) -> IntArray:
         if a not in covered and b not in covered and overlap(corners[a], corners[b]) > MAX_OVERLAP:
             covered.add(b if odds[a] >= odds[b] else a)
     return np.array(sorted(covered), dtype=np.int64)
-
-
-JointCovariance = Callable[[IntArray], FloatArray]
-"""Covariances (P, 8, 8), m^2, of the stacked corners of pairs of diagonals (P, 4), two corners of each."""
-
-_NEIGHBOUR_M = 10.0  # distance at which markings are compared, m: a vehicle's length, for manoeuvres
-_FARTHEST_M = 15.0  # largest distance to another marking, m, for a relative standard deviation
-_CENTRES = np.kron(np.array([[0.5, 0.5, -0.5, -0.5]]), np.eye(2))
-"""Matrix (2, 8) that makes of two diagonals (four corners) the difference of their centres."""
-
-
-def with_relative_sigma(
-    markings: Sequence[Marking], corner_index: IntArray, joint: JointCovariance
-) -> tuple[Marking, ...]:
-    """The markings (M,), each with its contribution to the error of the distance to one about 10 m away.
-
-    Paint error is added to the adjustment's. ``corner_index`` (M, 4) numbers the corners in the solution, -1
-    for unseen ones; ``joint`` is the solution's.
-    """
-    rows = np.flatnonzero((corner_index >= 0).sum(axis=1) >= 3)
-    if not len(rows):
-        return tuple(markings)
-    chosen = [markings[m] for m in rows.tolist()]
-    # Opposite corners: of a marking at least three are known.
-    even = corner_index[rows][:, [0, 2]]
-    odd = corner_index[rows][:, [1, 3]]
-    diagonal = np.where((even >= 0).all(axis=1, keepdims=True), even, odd)
-    first, second = neighbours(np.array([marking.corners_map.mean(axis=0) for marking in chosen]))
-    if not len(first):
-        return tuple(markings)
-    covariance = joint(np.concatenate([diagonal[first], diagonal[second]], axis=1))
-    covariance_of_difference = _CENTRES @ covariance @ _CENTRES.T
-    formal = _CENTRES[:, :4] @ covariance[:, :4, :4] @ _CENTRES[:, :4].T
-    stated_m2 = np.array([chosen[k].covariance_m2 for k in first]).reshape(-1, 4, 2, 4, 2)
-    stated = np.array([np.einsum("iaja->", covariance_m2) for covariance_m2 in stated_m2]) / 32
-    paint_m2 = np.maximum(stated - np.trace(formal, axis1=1, axis2=2) / 2, 0.0)
-    # A difference of two centres has both errors.
-    sigma_m = np.sqrt(np.trace(covariance_of_difference, axis1=1, axis2=2) / 4 + paint_m2)
-    improved = list(markings)
-    for marking, sigma in zip(rows[first].tolist(), sigma_m.tolist(), strict=True):
-        improved[marking] = replace(markings[marking], relative_sigma_m=sigma)
-    return tuple(improved)
-
-
-def neighbours(centres_map: FloatArray) -> tuple[IntArray, IntArray]:
-    """Pairs of points (N, 2): each with neighbours, and its neighbour at the distance nearest to 10 m."""
-    first = []
-    second = []
-    tree = cKDTree(centres_map)
-    for k, in_reach in enumerate(tree.query_ball_point(centres_map, _FARTHEST_M)):
-        others = np.array([other for other in in_reach if other != k], dtype=np.int64)
-        if len(others):
-            distance_m = np.linalg.norm(centres_map[others] - centres_map[k], axis=1)
-            first.append(k)
-            second.append(int(others[np.argmin(np.abs(distance_m - _NEIGHBOUR_M))]))
-    return np.array(first, dtype=np.int64), np.array(second, dtype=np.int64)
 
 
 _LISTED = 10  # length of the list: as many as a user looks at

@@ -115,13 +115,13 @@ class Watch:
         It is the difference of the correlations of their log grey values, in Fisher's z.
         """
         face = end.face()
-        seen = far.project(face)
-        on_ground = np.column_stack([far.ground(seen.px, end.middle_map[2]), face[:, 2] * 0])
+        as_seen = far.project(face)
+        on_ground = np.column_stack([far.ground(as_seen.px, end.middle_map[2]), face[:, 2] * 0])
         on_ground[:, 2] = end.middle_map[2]
         as_face = near.project(face)
         as_ground = near.project(np.nan_to_num(on_ground))
         away_m = np.linalg.norm(on_ground - end.middle_map, axis=1)
-        usable = seen.inside & as_face.inside & as_ground.inside
+        usable = as_seen.inside & as_face.inside & as_ground.inside
         with np.errstate(invalid="ignore"):
             usable &= away_m < _FAR_M
         usable &= np.linalg.norm(as_face.px - as_ground.px, axis=1) > _APART_PX
@@ -130,7 +130,7 @@ class Watch:
         # The nearer image is blurred to what the farther one resolves.
         blur_px = 0.5 * float(np.sqrt((far.depth_m / near.depth_m) ** 2 - 1))
         blurred = cv2.GaussianBlur(read(near.image), (0, 0), max(blur_px, 0.1))
-        light = _sample(read(far.image), seen.px[usable])
+        light = _sample(read(far.image), as_seen.px[usable])
         matches = [_sample(blurred, points.px[usable]) for points in (as_ground, as_face)]
         ground_z, face_z = (_fisher_z(light, match) for match in matches)
         return ground_z - face_z

@@ -29,7 +29,7 @@ from typing import Any, TypeVar, get_origin
 import numpy as np
 
 from v2hdm.errors import ConfigError, need
-from v2hdm.store.files import file_digest
+from v2hdm.store.files import file_digest, refuse_url
 from v2hdm.store.folders import HOST, LIST, STAGES, in_use, is_stale, remove_ours, size_of, unused_before
 
 _log = logging.getLogger(__name__)
@@ -132,10 +132,12 @@ class StageCache:
 
     The results of a stage have always been through the codec, and the log lines of their making are logged
     again: a run that goes on with entries cannot tell them from results of its own. No ``folder`` keeps
-    nothing; without ``resume`` everything is made anew, and kept.
+    nothing; without ``resume`` everything is made anew, and kept. Raises ConfigError for a URL.
     """
 
     def __init__(self, folder: Path | None, resume: bool = True) -> None:
+        if folder is not None:
+            refuse_url(folder)
         self.folder = folder
         self._resume = resume
         self._can_write = folder is not None

@@ -12,12 +12,13 @@ import hashlib
 import io
 import json
 import math
+import os
 import re
 import secrets
 import sys
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,7 @@ from v2hdm.safe.texts import read_text as read_text
 from v2hdm.store.inputs import refuse_input
 
 _URL = re.compile(r"[a-z][a-z0-9+.-]+:/")
+_BOUND = re.compile(r"Expected float [<>]=")  # what msgspec says of a number that is not finite
 _LARGEST = sys.float_info.max  # a number beyond it is infinite as a float
 
 Observer = Callable[[Path, Path], None]
@@ -76,6 +78,23 @@ def whole_file(path: Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
+def refuse_unwritable(path: Path) -> None:
+    """Raise ConfigError where :func:`whole_file` could not write ``path``; nothing is left by the trial."""
+    refuse_url(path)
+    try:
+        if path.exists() and not path.is_file():
+            raise ConfigError(f"{path}: is not a regular file and is not replaced; choose another output")
+        folder = next(parent for parent in path.absolute().parents if os.path.lexists(parent))
+        trial = folder / f".{path.name}.{secrets.token_hex(8)}.part"
+        try:
+            trial.touch(exist_ok=False)
+        finally:
+            with suppress(OSError):
+                trial.unlink()
+    except OSError as failure:
+        raise ConfigError(f"{path}: cannot be written ({failure.strerror}); choose another output") from None
+
+
 def refuse_url(path: Path) -> None:
     """Raise ConfigError for a URL that was taken for a path: it would be a folder called ``s3:``."""
     if _URL.match(str(path)):
@@ -91,17 +110,51 @@ def replace_text(path: Path, text: str) -> None:
         partial.write_text(text, encoding="utf-8")
 
 
+_NOT_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+"""Letters that no XML file can hold, escaped or not (XML 1.0, 2.2)."""
+
+
 def xml_text(root: ET.Element, blanks: str = " ", before: str = "") -> str:
-    """An XML file of ``root``, indented by ``blanks`` a level; ``before`` stands in front of it."""
+    """An XML file of ``root``, indented by ``blanks`` a level; ``before`` stands in front of it.
+
+    Letters that XML cannot hold, such as those that move a terminal's cursor, become U+FFFD.
+    """
     ET.indent(root, blanks)
+    for element in root.iter():
+        element.text = element.text and _NOT_XML.sub("\N{REPLACEMENT CHARACTER}", element.text)
+        for key, value in element.items():
+            element.set(key, _NOT_XML.sub("\N{REPLACEMENT CHARACTER}", value))
+    before = _NOT_XML.sub("\N{REPLACEMENT CHARACTER}", before)
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{before}{ET.tostring(root, encoding="unicode")}\n'
 
 
 def replace_csv(path: Path, rows: Iterable[Sequence[object]]) -> None:
     """Write ``rows`` to ``path`` as CSV, as :func:`whole_file` does."""
+    replace_text(path, csv_text(rows))
+
+
+_FORMULA = re.compile(r"'*[=+\-@\t\r]")  # what begins a cell that a spreadsheet would compute
+
+
+def csv_text(rows: Iterable[Sequence[object]]) -> str:
+    """``rows`` as CSV; a text that a spreadsheet would compute begins with the apostrophe of its texts."""
     text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    replace_text(path, text.getvalue())
+    csv.writer(text, lineterminator="\n").writerows([_cell(value) for value in row] for row in rows)
+    return text.getvalue()
+
+
+def _cell(value: object) -> object:
+    return (
+        f"'{value}" if isinstance(value, str) and _FORMULA.match(value) and not _is_number(value) else value
+    )
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return text.isprintable()
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
@@ -133,10 +186,12 @@ def load_yaml(path: Path, error: type[V2hdmError]) -> dict[str, Any]:
 
 
 def read_csv(path: Path, error: type[V2hdmError]) -> list[list[str]]:
-    """The rows of a CSV file; raises ``error``, with the line, where it is none."""
+    """The rows of a CSV file, texts as :func:`csv_text` was given them; else ``error``, with the line."""
     reader = csv.reader(io.StringIO(read_text(path, error)))
     try:
-        return list(reader)
+        return [
+            [cell[1:] if cell[:1] == "'" and _FORMULA.match(cell) else cell for cell in row] for row in reader
+        ]
     except csv.Error as failure:
         raise error(f"{path}: line {reader.line_num}: {failure}; fix that line") from None
 
@@ -151,6 +206,20 @@ def load_json(path: Path, error: type[V2hdmError]) -> dict[str, Any]:
     content = read_json(path, error)
     if not isinstance(content, dict):
         raise error(f"{path}: expected a JSON object, got {shown(content)}")
+    return content
+
+
+def take_typed(content: object, kind: Any, where: str, error: type[V2hdmError]) -> Any:
+    """``content`` itself if it has the types of ``kind``, else an ``error`` that names the place."""
+    import msgspec  # of the map extra, as are the commands that read what they have written
+
+    try:
+        msgspec.convert(content, kind)
+    except msgspec.ValidationError as failure:
+        problem, _, place = str(failure).replace("`", "").partition(" - at $")
+        at = f"{where}: {place.lstrip('.')}" if place else where
+        said = "expected a finite number" if _BOUND.search(problem) else f"{problem[:1].lower()}{problem[1:]}"
+        raise error(f"{at}: {said}; restore the file, or make it again") from None
     return content
 
 

@@ -30,7 +30,7 @@ from typing import IO, Any
 
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.safe.texts import read_json
-from v2hdm.store.files import file_digest
+from v2hdm.store.files import file_digest, refuse_url
 from v2hdm.store.inputs import note_input
 
 STAGES = "stages"  # folder within a cache of the entries of stages
@@ -38,6 +38,8 @@ IN_USE = f"{STAGES}/in_use"  # folder within a cache of the locks of runs in pro
 HOST = platform.node() or "this host"
 _ENDING = ".lock"  # of the name of a lock in IN_USE
 _TRIES = 9  # tries to make a lock in a folder that others may remove meanwhile; chosen
+_LONGEST_WAIT_S = 10.0  # for a lock that others hold for milliseconds; chosen
+_POLL_S = 0.01  # how often a lock is tried
 _used: Counter[Path] = Counter()
 
 
@@ -57,6 +59,27 @@ def take_lock(stream: IO[str]) -> bool:
     except OSError as failure:
         _log.warning("%s: no lock is possible here (%s); do not write it twice at once", stream.name, failure)
     return True
+
+
+@contextmanager
+def waited_for(path: Path) -> Iterator[None]:
+    """Hold the lock ``path``, a file that is there meanwhile; ConfigError where others hold it for long."""
+    end_s = time.monotonic() + _LONGEST_WAIT_S
+    while True:
+        stream = path.open("a+", encoding="utf-8")
+        # The last holder may have removed the file between our opening and locking it.
+        with suppress(OSError):
+            if take_lock(stream) and os.path.samestat(os.fstat(stream.fileno()), path.stat()):
+                break
+        stream.close()
+        if time.monotonic() > end_s:
+            raise ConfigError(f"{path}: another process holds this lock; try again, or end that process")
+        time.sleep(_POLL_S)
+    try:
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+        stream.close()
 
 
 @contextmanager
@@ -204,6 +227,7 @@ def _listed(folder: Path) -> dict[str, Any]:
 
 def entry_folder(cache: Path, files: Sequence[Path], label: str, settings: Any) -> Path:
     """The folder of an import of some files, by a hash of all that it is made of; DriveError as by stat."""
+    refuse_url(cache)
     for file in files:
         note_input(file)
     try:

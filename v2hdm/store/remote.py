@@ -20,7 +20,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from v2hdm.errors import ConfigError, need
+from v2hdm.errors import REASON_LETTERS, ConfigError, bounded, need, one_line
 from v2hdm.store.files import file_digest
 from v2hdm.store.inputs import LIST
 
@@ -39,7 +39,6 @@ _PACKAGES = {
 _TOKENS = ("ETag", "etag", "md5Hash", "modified", "created")
 """Keys of a listing whose value changes with the object, the surest first."""
 
-_MESSAGE_LETTERS = 200  # longest text of a store's error in a line of ours, letters; chosen
 
 UNFINISHED = ".v2hdm-unfinished.jsonl"
 _ABOUT = {"about": "objects that v2hdm wrote here; a rerun replaces these and no others"}
@@ -81,7 +80,7 @@ class RemoteFolder:
             schemes = ", ".join(f"{scheme}://" for scheme in _PACKAGES if scheme != _MEMORY)
             raise ConfigError(f"{option} {url}: is not in a supported store; choose a folder or {schemes}")
         parts = path.rstrip("/").split("/")
-        if ":" in parts[0]:
+        if ":" in parts[0] or ("@" in parts[0] and not protocol.startswith("abfs")):
             raise ConfigError(
                 f"{option} {protocol}://...: is not a bucket name; credentials belong where "
                 f"{_PACKAGES[protocol]} looks for them, not into a URL"
@@ -168,7 +167,7 @@ class RemoteFolder:
 
 
 def _first_line(failure: Exception) -> str:
-    return " ".join(str(failure).split())[:_MESSAGE_LETTERS] or type(failure).__name__
+    return bounded(one_line(str(failure)), REASON_LETTERS) or type(failure).__name__
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from v2hdm.errors import DriveError
+from v2hdm.errors import DriveError, shown
 from v2hdm.geometry import geodetic
-from v2hdm.io.importers.readings import read_rows
+from v2hdm.io.rows import read_rows
 from v2hdm.io.trajectory import parse_number
 from v2hdm.records import FOOT_M, FloatArray, GeodeticOrigin
 
@@ -243,7 +243,7 @@ class _Row:
     def is_check(self) -> bool:
         role = self.text("role").lower() or "control"
         if role not in ("control", "check"):
-            raise DriveError(f"{self.where}: role '{role}' is neither control nor check; fix that line")
+            raise DriveError(f"{self.where}: role {shown(role)} is neither control nor check; fix that line")
         return role == "check"
 
 
@@ -256,7 +256,7 @@ def _columns(header: Sequence[str], path: Path) -> list[str | None]:
             raise DriveError(f"{path}: the columns {' and '.join(twice)} mean the same; keep one of them")
         similar = difflib.get_close_matches(name.lower(), NAMES, n=1, cutoff=_NEARLY)
         if our_name is None and similar:
-            raise DriveError(f"{path}: unknown column '{name}'; did you mean '{similar[0]}'?")
+            raise DriveError(f"{path}: unknown column {shown(name)}; did you mean '{similar[0]}'?")
     unused = [name for name, our_name in zip(header, ours, strict=True) if our_name is None]
     if unused:
         _log.info("%s: the columns %s are not used", path, ", ".join(unused))

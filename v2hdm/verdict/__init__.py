@@ -6,6 +6,15 @@
 
 from v2hdm.verdict.inputs.drive import check_drive, input_findings
 from v2hdm.verdict.inputs.ground import clock_corrections
+from v2hdm.verdict.inputs.origin import known_frames
 from v2hdm.verdict.verdict import Finding, Status, Verdict
 
-__all__ = ["Finding", "Status", "Verdict", "check_drive", "clock_corrections", "input_findings"]
+__all__ = [
+    "Finding",
+    "Status",
+    "Verdict",
+    "check_drive",
+    "clock_corrections",
+    "input_findings",
+    "known_frames",
+]

@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
+from v2hdm.doors import checked, checked_class
+
 GOAL = "coarse"  # the check whether map and calibrations are as good as accuracy_goal_cm asks
 
 
@@ -32,7 +34,8 @@ class Finding:
         status: PASS within the limit. WARN where the result still holds, or was corrected. FAIL where the
             result is wrong or cannot be relied on.
         value: the measured value, in ``unit``; None where this drive does not make it observable.
-        limit: the largest ``value`` that passes, in ``unit``; None where there is none.
+        limit: the largest ``value`` that passes, or the least of one that must not be too small, in ``unit``;
+            None where there is none, or another figure decides.
         unit: of ``value`` and ``limit``, such as ``ms``; empty for a ratio or a count.
         says: one sentence that names the cause and the recovery.
         about: a camera's name, ``poses``, a setting, ``map``.
@@ -62,6 +65,7 @@ class Finding:
         return f"{outcome} {self.check} ({self.about}): {self.says}"
 
 
+@checked_class
 @dataclass(frozen=True)
 class Verdict:
     """All findings of a run, the worst first; those of equal rank keep the order of their checks.
@@ -75,6 +79,7 @@ class Verdict:
     findings: tuple[Finding, ...]
 
     @classmethod
+    @checked
     def of(cls, findings: Iterable[Finding]) -> Verdict:
         """The verdict that follows from ``findings``."""
         return cls(tuple(sorted(findings, key=lambda finding: -finding.status.rank)))

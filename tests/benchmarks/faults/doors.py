@@ -13,7 +13,7 @@ from tests.benchmarks.faults.situations import Situation, calibrating
 from tests.faults.judge import Case, Prepare
 from tests.ports import short_port
 from v2hdm.errors import DriveError
-from v2hdm.io.trajectory import read_image_list, write_image_list
+from v2hdm.io.image_lists import read_image_list, write_image_list
 from v2hdm.simulate.port.drive import render_drive
 from v2hdm.store.cache import DRIVES, LEFT, checked, code_key, items_of
 from v2hdm.store.files import dump_yaml, load_yaml, replace_text

@@ -14,7 +14,7 @@ import numpy as np
 from tests.benchmarks.wrong.fault import CAMERAS, Fault, edit, edit_cameras, edit_lens
 from v2hdm.errors import DriveError
 from v2hdm.geometry.rigid import rotation_from_euler
-from v2hdm.io.trajectory import read_image_list, write_image_list
+from v2hdm.io.image_lists import read_image_list, write_image_list
 from v2hdm.mapping.options import MappingOptions, SizeOptions
 from v2hdm.records import FloatArray
 from v2hdm.store.files import load_yaml

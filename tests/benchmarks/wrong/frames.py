@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from tests.benchmarks.wrong.fault import CAMERAS, Fault, edit_poses
-from v2hdm.io.trajectory import read_image_list, write_image_list
+from v2hdm.io.image_lists import read_image_list, write_image_list
 from v2hdm.records import FloatArray
 
 _Names = list[str]

@@ -11,7 +11,7 @@ import numpy as np
 from tests.benchmarks.wrong.fault import CAMERAS, Fault, edit, edit_poses
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.io.description import POSES_FILE
-from v2hdm.io.trajectory import read_image_list, write_image_list
+from v2hdm.io.image_lists import read_image_list, write_image_list
 from v2hdm.records import FloatArray
 from v2hdm.store.files import replace_text
 

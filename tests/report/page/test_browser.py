@@ -106,8 +106,8 @@ def test_pointing_names_the_marking_and_selecting_shows_its_images(browser, repo
             text = tooltip.inner_text()
             assert "sightings: 4 images" in text
             assert f"accuracy: {'AABC'[number - 1]}" in text
-            assert "95 %, relative: 1.0 cm" in text
-            assert "95 %, absolute: 2.4 cm" in text
+            assert "95 % radius from marking to marking: 1.0 cm" in text
+            assert "95 % radius in the map’s frame: 2.5 cm (worst corner)" in text
             assert f"1: {place[0] + 0.5:.3f} E" in text
             page.mouse.down()
             page.mouse.up()
@@ -189,7 +189,7 @@ def test_colours_by_accuracy_have_a_scale_in_centimetres(browser, report):
     with opened(browser, report) as watched:
         page = watched.page
         page.select_option("#colour", "absolute")
-        assert page.locator("#legend .ends").inner_text().startswith("2.4 cm")
+        assert page.locator("#legend .ends").inner_text().startswith("2.5 cm")
         is_quiet(watched)
 
 

@@ -4,6 +4,7 @@ import base64
 import json
 import os
 import re
+import shutil
 from dataclasses import replace
 
 import cv2
@@ -26,15 +27,17 @@ from tests.report.page.folder import (
 from v2hdm.cli.main import run
 from v2hdm.errors import DriveError, MapFileError
 from v2hdm.geometry.geodetic import Grid, geodetic_from_enu
-from v2hdm.io.drive import drive_of, read_drive
+from v2hdm.io.drive import ReadOptions, drive_of, read_drive, told_of
 from v2hdm.io.maps.evidence import COLUMNS
+from v2hdm.mapping.results import MethodResult
 from v2hdm.records import DIAMOND, GeodeticOrigin, Marking
 from v2hdm.report.page import document as document_module
-from v2hdm.report.page import pictures
+from v2hdm.report.page import pictures, tables
 from v2hdm.report.page.document import document, write_page
 from v2hdm.report.page.facts import ground_residuals, read_facts
 from v2hdm.report.page.layers import background_layer, ellipses, layers
-from v2hdm.store.files import write_json
+from v2hdm.store.files import file_digest, write_json
+from v2hdm.verdict.results.accuracy import check_goal
 
 
 @pytest.fixture(scope="module")
@@ -99,8 +102,8 @@ def test_the_stated_ellipses_hold_95_of_100_true_corners_of_right_covariances(re
 def test_key_figures_and_tables_state_what_the_files_do(page):
     figures = {one.name: (one.value, one.unit) for one in page.figures}
     assert figures["Markings"] == ("4", "")
-    assert figures["Between neighbours"] == ("1.0", "cm")  # 2.45 x 0.004 m
-    assert figures["In the map’s frame"] == ("2.4", "cm")  # 2.45 x 0.01 m
+    assert figures["From marking to marking"] == ("1.0", "cm")  # 2.45 x 0.004 m
+    assert figures["In the map’s frame"] == ("2.5", "cm")  # 2.451 x 0.01 m
     assert figures["In the images"] == ("0.36", "px")
     assert figures["Accuracy A"] == ("3", "of 5")
     note = next(one.note for one in page.figures if one.name == "Accuracy A")
@@ -403,3 +406,71 @@ def test_another_drive_than_that_of_the_result_is_refused(tmp_path):
     with pytest.raises(MapFileError, match=r"metrics\.json: its data on the drive are damaged"):
         drive_of(result, None)
     assert read_drive(tmp_path / "a" / "drive").cameras["front"].info.width == INFO.width
+
+
+def test_tiles_table_and_verdict_state_the_same_radii(result, drive):
+    facts = read_facts(result, drive)
+    of_page = {figure.name: figure.value for figure in tables.key_figures(facts)}
+    *_, last = tables.accuracy_table(facts).rows
+    assert last[-2:] == [of_page["In the map’s frame"], of_page["From marking to marking"]]
+    assert last[0] == "all without accuracy C"
+    best = MethodResult("Opt", ("front",), facts.hd_map)
+    (of_map,) = [finding for finding in check_goal(best, 0.05, "poses") if finding.about == "map"]
+    in_frame, relative = last[-2:]
+    assert (
+        f"within {in_frame} cm in the frame of the poses, {relative} cm from marking to marking"
+        in of_map.says
+    )
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "text"),
+    [(0.0004, 1, "0.0004"), (0.04, 1, "0.04"), (0.06, 1, "0.1"), (0.0, 1, "0.0"), (3e-9, None, "3e−09")],
+)
+def test_what_is_not_zero_never_reads_so(value, digits, text):
+    assert tables.number(value, digits) == text
+
+
+def digests(folder):
+    return {path.name: file_digest(path) for path in folder.iterdir()}
+
+
+def with_digest(result, drive):
+    """Note in a result, as ``v2hdm map`` does, which images it is of."""
+    metrics = json.loads((result / "metrics.json").read_text())
+    metrics["drive"] |= told_of(drive, [drive.root], ReadOptions())
+    (result / "metrics.json").write_text(json.dumps(metrics))
+
+
+@pytest.mark.parametrize("what", ["all images", "one image", "two swapped"])
+@pytest.mark.parametrize("command", ["labels", "mosaic", "report", "view"])
+def test_other_images_than_those_that_were_mapped_are_refused(command, what, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    drive = make_result(tmp_path)
+    result = tmp_path / "result"
+    with_digest(result, drive)
+    shutil.copytree(drive.root, tmp_path / "other")
+    images = sorted((tmp_path / "other" / "front").glob("*.png"))
+    if what == "all images":
+        for image in images[1:]:
+            shutil.copyfile(images[0], image)
+    elif what == "one image":
+        cv2.imwrite(str(images[2]), cv2.imread(str(images[2])) + 1)
+    else:
+        images[0].rename(tmp_path / "kept.png")
+        images[1].rename(images[0])
+        (tmp_path / "kept.png").rename(images[1])
+    before = digests(result)
+    assert run([command, str(result), "--drive", str(tmp_path / "other")]) == 2
+    said = capsys.readouterr().err
+    assert f"{tmp_path / 'other'}: its images are not those that the result in {result} was made of" in said
+    assert said.count("\n") == 1
+    assert digests(result) == before
+
+
+def test_the_same_images_in_another_place_are_the_drive_of_the_result(tmp_path):
+    drive = make_result(tmp_path)
+    with_digest(tmp_path / "result", drive)
+    shutil.move(drive.root, tmp_path / "moved")
+    assert drive_of(tmp_path / "result", None) is None
+    assert drive_of(tmp_path / "result", tmp_path / "moved") is not None

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from v2hdm.cli.arguments import add_drive, drive_of, exit_code, result_of, steps_of
 from v2hdm.cli.command import Command
-from v2hdm.errors import EXIT_USER_ERROR, DriveError
+from v2hdm.errors import EXIT_USER_ERROR, DriveError, one_line
 
 
 def _run(arguments: Sequence[str]) -> int:
@@ -30,10 +30,12 @@ def _run(arguments: Sequence[str]) -> int:
         print(list_topics(parsed.drive, Path(ReadOptions().cache)))
         return 0
     from v2hdm.ground.estimate import estimate_cameras
+    from v2hdm.io.description import DRIVE_FILE
     from v2hdm.store.files import write_json
     from v2hdm.store.names import VERDICT
     from v2hdm.verdict import check_drive
     from v2hdm.verdict.check import draw_check
+    from v2hdm.verdict.inputs.origin import HEIGHT, frame_of, height_to_state
 
     if parsed.set and not parsed.write:
         parser.error("--set is for --write")
@@ -41,11 +43,11 @@ def _run(arguments: Sequence[str]) -> int:
         from v2hdm.io.drive.draft import draft_drive
 
         if missing := draft_drive(parsed.drive, parsed.write, parsed.set):
-            asked = [f"  --set {key}=... {why}" for key, why in missing.items()]
-            problem = f"error: {parsed.drive}: nothing written; also give:"
+            asked = [f"  {one_line(f'--set {key}=... {why}')}" for key, why in missing.items()]
+            problem = one_line(f"error: {parsed.drive}: nothing written; also give:")
             print("\n".join([problem, *asked]), file=sys.stderr)
             return EXIT_USER_ERROR
-        print(f"{parsed.write / 'drive.yaml'} written", file=sys.stderr)
+        print(one_line(f"{parsed.write / 'drive.yaml'} written"), file=sys.stderr)
         parsed.drive = parsed.write
     drive = drive_of(parsed)
     folder = parsed.output or Path("outputs") / f"{drive.name}-check"
@@ -55,11 +57,19 @@ def _run(arguments: Sequence[str]) -> int:
         ground = estimate_cameras(drive, parsed.workers, matched) if parsed.ground else {}
         print("check the drive", file=sys.stderr, flush=True)
         verdict = check_drive(drive, ground=ground)
+        is_asked = parsed.write and not any(setting.startswith(f"{HEIGHT}=") for setting in parsed.set)
+        if is_asked and (height_m := height_to_state(drive, verdict)) is not None:
+            (parsed.write / DRIVE_FILE).unlink()
+            raise DriveError(
+                f"{parsed.write / DRIVE_FILE}: not written: bare ground contradicts the cameras' heights; "
+                f"also give the height of {frame_of(drive)} above the ground, such as the axle's, or 0: "
+                f"--set {HEIGHT}={height_m:.2f}"
+            )
         write_json(unfinished / VERDICT, verdict.as_json())
         draw_check(drive, unfinished, ground)
     passed = [finding.line for finding in verdict.passed if parsed.all]
     summary, *findings = verdict.lines
-    print("\n".join([*passed, *findings, summary, f"pictures in {folder}"]))
+    print("\n".join([*passed, *findings, summary, one_line(f"pictures in {folder}")]))
     return exit_code(verdict)
 
 

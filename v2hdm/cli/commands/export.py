@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from v2hdm.cli.command import Command
-from v2hdm.errors import ConfigError, MapFileError
+from v2hdm.errors import ConfigError, MapFileError, shown
 
 if TYPE_CHECKING:
     from v2hdm.records import FloatArray
@@ -120,7 +120,7 @@ def _export_calibration(parsed: argparse.Namespace, folder: Path, *_: object) ->
     if unknown:
         formats = ", ".join(CALIBRATION_FORMATS)
         raise ConfigError(
-            f"--format: unknown format '{unknown[0]}' for a calibration; choose from: {formats}"
+            f"--format: unknown format {shown(unknown[0])} for a calibration; choose from: {formats}"
         )
     calibration = read_calibration(parsed.source)
     about = read_provenance(parsed.source)

@@ -38,6 +38,10 @@ def _run(arguments: Sequence[str]) -> int:
     if parsed.share is not None:
         share = _share(parsed.share)
         table = table.with_name(f"{table.name}-{share[0]}-of-{share[1]}")
+    missing = [file for file in files if not file.exists()]
+    # A pattern that matches nothing comes as it is, and a part of a fleet would not miss the others.
+    if unmatched := [file for file in missing if missing == files or set("*?[") & set(str(file))]:
+        raise ConfigError(f"{unmatched[0]}: no such run file; check the path")
     options = FleetOptions(table, parsed.workers, parsed.again, share)
     return exit_code(fleet_on_terminal(files, overrides, options))
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shlex
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
@@ -49,7 +50,7 @@ def unknown_network(model: str | Path, folder: Path = FOLDER) -> str | None:
         return None
     return (
         f"{path}: scores come from the judge of the shipped network, which was not fitted to this one; "
-        f"fit it with `{COMMANDS[JUDGE_FILE.name]}`"
+        f"fit it with `python -m train.ship {shlex.quote(str(path))}`"
     )
 
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from v2hdm.errors import DriveError, MapFileError
+from v2hdm.errors import DriveError, MapFileError, shown
 from v2hdm.io.calibration.reading import info_of, read_calibration, take_camera_info, take_matrix
 from v2hdm.records import DISTORTION_COEFFICIENTS, CameraInfo, FloatArray
 from v2hdm.safe.fields import check_camera, take_size_px
@@ -89,7 +89,7 @@ def read_intrinsics(path: Path, camera: str | None = None, name_by: str = "its n
     if camera is None and len(names) > 1:
         raise DriveError(f"{path}: holds the cameras {', '.join(names)}; choose one with {name_by}")
     if camera is not None and camera not in names:
-        raise DriveError(f"{path}: no camera '{camera}' in this file; it holds: {', '.join(names)}")
+        raise DriveError(f"{path}: no camera {shown(camera)} in this file; it holds: {', '.join(names)}")
     return chosen.read(document, names[0] if camera is None else camera)
 
 

@@ -14,14 +14,31 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.errors import DriveError, MapFileError
+from v2hdm.errors import DriveError, MapFileError, shown
+from v2hdm.geometry.frames import nodes_of
 from v2hdm.geometry.ipm import cam_from_mounting, extrinsic_from_ipm, ipm_from_extrinsic
 from v2hdm.geometry.planar import winding
-from v2hdm.geometry.rigid import camera_centre, inverse
-from v2hdm.records import DISTORTION_COEFFICIENTS, BoolArray, Calibration, CameraInfo, CentrePrior, FloatArray
-from v2hdm.safe.fields import check_camera, recorded_distance, take_covariance, take_size_px
+from v2hdm.geometry.rigid import camera_centre, inverse, make_transform, rotation_from_quaternion
+from v2hdm.records import (
+    DISTORTION_COEFFICIENTS,
+    BoolArray,
+    Calibration,
+    CameraFrames,
+    CameraInfo,
+    CentrePrior,
+    FloatArray,
+    FrameStep,
+)
+from v2hdm.safe.fields import (
+    check_camera,
+    recorded_distance,
+    take_covariance,
+    take_frame,
+    take_frame_height,
+    take_size_px,
+)
 from v2hdm.safe.texts import take_camera_name
-from v2hdm.store.files import check_keys, load_yaml, take_array, take_mapping, take_text
+from v2hdm.store.files import check_keys, load_yaml, take_array, take_mapping, take_number, take_text
 from v2hdm.store.names import CALIBRATIONS
 
 _SIZE = ("image_width", "image_height")
@@ -29,7 +46,9 @@ _INFO = ("camera_name", *_SIZE, "camera_matrix", "distortion_model", "distortion
 _OPTIONAL = (
     "vehicle_from_pinhole_px", "translation_sigma_m", "rotation_sigma_deg", "covariance", "clock_offset_s",
     "clock_sigma_s", "read_out_s", "read_out_sigma_s", "drive", "date", "verdict",
+    "vehicle_frame", "vehicle_frame_height_m", "frame", "transforms",
 )  # fmt: skip
+_EDGE = ("frame_id", "child_frame_id")
 _IGNORED = ("rectification_matrix", "projection_matrix")  # of stereo rectification, not of recorded images
 _OF_OPENCV = ("dt", "type_id")  # OpenCV adds these to its matrices; numbers tell their type themselves
 _MODELS = {"": "plumb_bob", "radtan": "plumb_bob", "fisheye": "equidistant"}  # our lenses by other names
@@ -69,7 +88,52 @@ def read_calibration(path: Path) -> Calibration:
     covariance = None
     if "covariance" in content:
         covariance = take_covariance(content["covariance"], 6, f"{path}: covariance", MapFileError)
-    return Calibration(info=info, cam_from_vehicle=array("cam_from_vehicle", 4, 4), covariance=covariance)
+    return Calibration(info, array("cam_from_vehicle", 4, 4), covariance, _take_frames(content, str(path)))
+
+
+def _take_frames(content: Mapping[str, Any], where: str) -> CameraFrames:
+    """The frames that a calibration states, and the edges between them."""
+    names = {
+        key: take_frame(content[key], f"{where}: {key}", MapFileError)
+        for key in ("vehicle_frame", "frame")
+        if content.get(key) is not None
+    }
+    height_m = take_frame_height(
+        content.get("vehicle_frame_height_m", 0.0), f"{where}: vehicle_frame_height_m", MapFileError
+    )
+    entries = content.get("transforms") or []
+    if not isinstance(entries, list):
+        raise MapFileError(f"{where}: transforms: expected a list, got {shown(entries)}; leave it out")
+    steps = tuple(
+        _take_step(entry, f"{where}: transforms, {number}") for number, entry in enumerate(entries, start=1)
+    )
+    frames = CameraFrames(names.get("vehicle_frame", ""), names.get("frame", ""), height_m, steps)
+    if steps and nodes_of(frames)[-1] != frames.camera:
+        raise MapFileError(
+            f"{where}: transforms do not lead from vehicle_frame to frame; keep them as the run wrote them"
+        )
+    return frames
+
+
+def _take_step(content: object, where: str) -> FrameStep:
+    """An edge of a tree, as :func:`v2hdm.io.calibration.writing.edge_entry` writes it."""
+    entry = take_mapping(content, where, MapFileError)
+    check_keys(entry, ("frame_id", "child_frame_id"), ("translation", "rotation"), where, MapFileError)
+    parent, child = (take_frame(entry[key], f"{where}, {key}", MapFileError) for key in _EDGE)
+    if "translation" not in entry and "rotation" not in entry:
+        return FrameStep(parent, child, None)
+    numbers = {}
+    for key, axes in (("translation", "xyz"), ("rotation", "xyzw")):
+        values = take_mapping(entry.get(key), f"{where}, {key}", MapFileError)
+        check_keys(values, axes, (), f"{where}, {key}", MapFileError)
+        numbers[key] = np.array(
+            [take_number(values[axis], f"{where}, {key}, {axis}", MapFileError) for axis in axes]
+        )
+    norm = float(np.linalg.norm(numbers["rotation"]))
+    if abs(norm - 1) > _ROTATION_TOLERANCE:
+        raise MapFileError(f"{where}, rotation: quaternion of norm {norm:.6g} instead of 1; fix it")
+    rotation = rotation_from_quaternion(numbers["rotation"][None] / norm)[0]
+    return FrameStep(parent, child, make_transform(rotation, numbers["translation"]))
 
 
 def read_provenance(path: Path) -> Provenance:
@@ -135,7 +199,7 @@ def _coefficients_of(model: str, where: str, advice: str) -> int:
     """The number of coefficients of a distortion model of ours; else DriveError with ``advice``."""
     if model not in DISTORTION_COEFFICIENTS:
         models = ", ".join(DISTORTION_COEFFICIENTS)
-        raise DriveError(f"{where}: unknown distortion_model '{model}'; {advice} one of: {models}")
+        raise DriveError(f"{where}: unknown distortion_model {shown(model)}; {advice} one of: {models}")
     return DISTORTION_COEFFICIENTS[model]
 
 
@@ -157,7 +221,9 @@ def info_of(fields: Any, name: str, where: str) -> CameraInfo:
     model = _MODELS.get(fields.distortion_model, fields.distortion_model)
     if not intrinsic.any():
         raise DriveError(f"{where}: the camera is not calibrated (K is zero); give camera_info as a file")
-    if max(fields.binning_x, fields.binning_y) > 1 or fields.roi.width or fields.roi.height:
+    region = (fields.roi.width, fields.roi.height)
+    is_cropped = region not in ((0, 0), (fields.width, fields.height))  # the whole image may be stated, too
+    if max(fields.binning_x, fields.binning_y) > 1 or is_cropped:
         raise DriveError(f"{where}: its images are binned or cropped; give camera_info as a file")
     count = _coefficients_of(model, where, "give camera_info as a file with")
     if distortion[count:].any():
@@ -184,6 +250,7 @@ _STEEPEST_RAY = 0.999  # sine of the pitch, 87.4 deg, from which a camera counts
 def take_ipm(content: object, where: str) -> FloatArray:
     """An invertible 3 x 3 homography ``vehicle_from_pinhole_px``, scaled to unit norm."""
     ipm = take_array(content, (3, 3), where, DriveError)
+    ipm = ipm / max(float(np.abs(ipm).max()), np.finfo(float).tiny)  # squares of its numbers are numbers
     if _is_singular(ipm):
         raise DriveError(f"{where}: IPM matrix is not invertible; calibrate it from 4 or more point pairs")
     return np.asarray(ipm / np.linalg.norm(ipm))
@@ -193,8 +260,11 @@ def _is_singular(matrix: FloatArray) -> bool:
     if not (matrix.any(axis=0).all() and matrix.any(axis=1).all()):
         return True
     # Rows and columns of comparable norms: pixels and metres must not look singular.
-    for axis in (1, 0) * 4:
-        matrix = matrix / np.linalg.norm(matrix, axis=axis, keepdims=True)
+    with np.errstate(all="ignore"):  # numbers so unlike that their squares are 0
+        for axis in (1, 0) * 4:
+            matrix = matrix / np.linalg.norm(matrix, axis=axis, keepdims=True)
+    if not np.isfinite(matrix).all():
+        return True
     return bool(1.0 / np.linalg.cond(matrix) < _SINGULAR)
 
 
@@ -206,13 +276,17 @@ def take_mounting(content: object, where: str) -> FloatArray:
     return cam_from_mounting(xyz_m, np.deg2rad(rpy_deg))
 
 
-def ipm_from_guess(info: CameraInfo, cam_from_vehicle: object, where: str) -> FloatArray:
-    """The IPM of a camera at the guessed rigid ``cam_from_vehicle`` (4 x 4), which is above the ground."""
+def ipm_from_guess(info: CameraInfo, cam_from_vehicle: object, where: str, frame: str = "") -> FloatArray:
+    """The IPM of a camera at the guessed rigid ``cam_from_vehicle`` (4 x 4), which is above the ground.
+
+    ``frame`` is the vehicle's name for the frame that the guess counts from.
+    """
     guess = take_rigid(cam_from_vehicle, where)
     centre_vehicle = camera_centre(guess)
     if centre_vehicle[2] < _LOWEST_CAMERA_M:
         raise DriveError(
-            f"{where}: puts the camera {centre_vehicle[2]:.3g} m above the ground; "
+            f"{where}: puts the camera {centre_vehicle[2]:.3g} m above the ground; if "
+            f"{frame or 'the vehicle frame'} is higher than that, state vehicle_frame_height_m, its height; "
             "give cam_from_vehicle (vehicle points to camera points), not its inverse"
         )
     return ipm_from_extrinsic(info, guess)
@@ -304,5 +378,7 @@ def choose_initial(name: object, ipm: dict[str, FloatArray], where: str) -> str:
     initial = take_text(name, f"{where}, initial_ipm", DriveError)
     if initial not in ipm:
         names = ", ".join(ipm)
-        raise DriveError(f"{where}: initial_ipm '{initial}' is not given under ipm; choose from: {names}")
+        raise DriveError(
+            f"{where}: initial_ipm {shown(initial)} is not given under ipm; choose from: {names}"
+        )
     return initial

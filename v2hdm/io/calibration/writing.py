@@ -1,8 +1,8 @@
 """Writing the calibration of one camera: our own YAML, and the formats that other tools read as they are.
 
 Files for other tools begin with comments on the camera, its sigmas, its drive and date and the verdict on
-that run; without their ``#`` these lines are YAML. The vehicle's frame is ROS' ``base_link`` (REP 105), x
-forward and y left, the camera's that of its images (REP 103's ``_optical``), z forward and x right.
+that run; without their ``#`` these lines are YAML. Frames have the names that the vehicle's own tree gives
+them: that of the images is the optical one (REP 103), z forward and x right.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ import cv2
 import numpy as np
 
 from v2hdm.errors import MapFileError
+from v2hdm.geometry.frames import edges_of
 from v2hdm.geometry.ipm import ipm_from_extrinsic
-from v2hdm.geometry.rigid import euler_from_rotation, inverse, quaternion_from_rotation
+from v2hdm.geometry.rigid import euler_from_rotation, quaternion_from_rotation
 from v2hdm.io.calibration.reading import Provenance
-from v2hdm.records import Calibration, CameraInfo, FloatArray
+from v2hdm.records import Calibration, CameraFrames, CameraInfo, FloatArray, FrameStep
 from v2hdm.store.files import dump_yaml, replace_text, xml_text
 
-VEHICLE_FRAME = "base_link"
 _UNUSED = 1e-12  # largest distortion coefficient or skew that counts as zero: it moves no point by 1e-6 px
 
 
@@ -46,6 +46,8 @@ def write_calibration(
     content = {key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in entries}
     content["distortion_coefficients"] = list(calibration.info.distortion)
     content |= _sigmas(calibration)
+    if steps := calibration.frames.steps:
+        content["transforms"] = [edge_entry(step) for step in steps]
     if clock_s is not None:
         content["clock_offset_s"] = float(clock_s[0])
         if np.isfinite(clock_s[1]):
@@ -59,6 +61,28 @@ def write_calibration(
     if verdict is not None:
         content["verdict"] = dict(verdict)
     replace_text(path, dump_yaml(content))
+
+
+def _frames(frames: CameraFrames) -> dict[str, Any]:
+    """The names of the vehicle's own frames, as far as they are stated, and how high the vehicle's is."""
+    names = {"vehicle_frame": frames.vehicle, "frame": frames.camera}
+    height = {"vehicle_frame_height_m": frames.height_m} if frames.height_m else {}
+    return {key: name for key, name in names.items() if name} | height
+
+
+def edge_entry(step: FrameStep) -> dict[str, Any]:
+    """An edge of a tree of frames as plain values; its ends alone where its transform is not known."""
+    ends = {"frame_id": step.parent, "child_frame_id": step.child}
+    return ends if step.parent_from_child is None else ends | _transform(step.parent_from_child)
+
+
+def _transform(parent_from_child: FloatArray) -> dict[str, Any]:
+    translation = dict(zip("xyz", parent_from_child[:3, 3].tolist(), strict=True))
+    quaternion = quaternion_from_rotation(parent_from_child[None, :3, :3])[0]
+    return {
+        "translation": translation,
+        "rotation": dict(zip("xyzw", quaternion.tolist(), strict=True)),
+    }
 
 
 def _entries(calibration: Calibration) -> dict[str, Any]:
@@ -75,6 +99,7 @@ def _entries(calibration: Calibration) -> dict[str, Any]:
         "cam_from_vehicle": calibration.cam_from_vehicle,
         "vehicle_from_pinhole_px": ipm_from_extrinsic(info, calibration.cam_from_vehicle),
         **({} if covariance is None else {"covariance": covariance}),
+        **_frames(calibration.frames),
     }
 
 
@@ -100,35 +125,57 @@ def _camera_info_yaml(calibration: Calibration, about: Provenance) -> str:
     return _yaml(calibration, about, _camera_info(calibration.info))
 
 
+def replaced_edge(calibration: Calibration) -> FrameStep:
+    """The edge of the vehicle's tree nearest to the camera, as the calibration has it.
+
+    Raises MapFileError where the tree, or the frames' names, are not known.
+    """
+    frames = calibration.frames
+    where = f"camera '{calibration.info.name}'"
+    if frames.problem:
+        raise MapFileError(f"{where}: no place in the frames of its vehicle is known: {frames.problem}")
+    stated = {"vehicle_frame": frames.vehicle, "frame": frames.camera}
+    if missing := [key for key, name in stated.items() if not name]:
+        raise MapFileError(
+            f"{where}: its vehicle's own frames are not stated: add {' and '.join(missing)} to drive.yaml, "
+            f"or to calibration_{calibration.info.name}.yaml (docs/exports.md)"
+        )
+    return edges_of(frames, calibration.cam_from_vehicle)[-1]
+
+
 def static_transform_yaml(calibration: Calibration, about: Provenance) -> str:
-    """A ``tf2_msgs/TFMessage``, as ``/tf_static`` takes it: where the camera sits on the vehicle."""
-    vehicle_from_cam = inverse(calibration.cam_from_vehicle)
-    translation = dict(zip("xyz", vehicle_from_cam[:3, 3].tolist(), strict=True))
-    quaternion = quaternion_from_rotation(vehicle_from_cam[None, :3, :3])[0]
-    rotation = dict(zip("xyzw", quaternion.tolist(), strict=True))
+    """A ``tf2_msgs/TFMessage``, as ``/tf_static`` takes it: the edge that the calibration replaces."""
+    edge = replaced_edge(calibration)
+    assert edge.parent_from_child is not None
     transform = {
-        "header": {"frame_id": VEHICLE_FRAME},
-        "child_frame_id": f"{calibration.info.name}_optical_frame",
-        "transform": {"translation": translation, "rotation": rotation},
+        "header": {"frame_id": edge.parent},
+        "child_frame_id": edge.child,
+        "transform": _transform(edge.parent_from_child),
     }
-    return _yaml(calibration, about, {"transforms": [transform]})
+    return _instead(calibration, about) + dump_yaml({"transforms": [transform]})
 
 
 def urdf(calibration: Calibration, about: Provenance) -> str:
-    """A URDF robot: the vehicle's link, the camera's, and the fixed joint whose origin is the calibration."""
-    vehicle_from_cam = inverse(calibration.cam_from_vehicle)
-    frame = f"{calibration.info.name}_optical_frame"
+    """A URDF robot: two links, and the fixed joint between them whose origin the calibration replaces."""
+    edge = replaced_edge(calibration)
+    assert edge.parent_from_child is not None
     robot = ET.Element("robot", name="vehicle")
-    for link in (VEHICLE_FRAME, frame):
+    for link in (edge.parent, edge.child):
         ET.SubElement(robot, "link", name=link)
-    joint = ET.SubElement(robot, "joint", name=f"{frame}_joint", type="fixed")
-    ET.SubElement(joint, "parent", link=VEHICLE_FRAME)
-    ET.SubElement(joint, "child", link=frame)
-    xyz = vehicle_from_cam[:3, 3].tolist()
-    rpy = euler_from_rotation(vehicle_from_cam[:3, :3]).tolist()
+    joint = ET.SubElement(robot, "joint", name=f"{edge.child}_joint", type="fixed")
+    ET.SubElement(joint, "parent", link=edge.parent)
+    ET.SubElement(joint, "child", link=edge.child)
+    xyz = edge.parent_from_child[:3, 3].tolist()
+    rpy = euler_from_rotation(edge.parent_from_child[:3, :3]).tolist()
     ET.SubElement(joint, "origin", xyz=" ".join(map(repr, xyz)), rpy=" ".join(map(repr, rpy)))
-    comment = _comments(calibration, about).replace("--", "- -")
+    comment = _instead(calibration, about).replace("--", "- -")
     return xml_text(robot, "  ", f"<!--\n{comment}-->\n")
+
+
+def _instead(calibration: Calibration, about: Provenance) -> str:
+    """The comments at the head, with the other edges that could be replaced, one alone, to the same end."""
+    others = edges_of(calibration.frames, calibration.cam_from_vehicle)[:-1]
+    return _comments(calibration, about, {"instead": [edge_entry(edge) for edge in others]} if others else {})
 
 
 def kalibr_yaml(calibration: Calibration, about: Provenance) -> str:
@@ -185,11 +232,12 @@ def _yaml(calibration: Calibration, about: Provenance, content: Mapping[str, Any
     return _comments(calibration, about) + dump_yaml(content)
 
 
-def _comments(calibration: Calibration, about: Provenance) -> str:
+def _comments(calibration: Calibration, about: Provenance, more: Mapping[str, Any] | None = None) -> str:
     """The comments at the head of a file for another tool: YAML behind ``#``."""
     header: dict[str, Any] = {"camera_name": calibration.info.name}
     if calibration.covariance is not None:
         header["sigma_axes"] = "of the camera: right, down, forward"
+    header |= _frames(calibration.frames) | dict(more or {})
     header |= _sigmas(calibration) | {"drive": about.drive, "date": about.date, "verdict": about.verdict}
     header = {key: value for key, value in header.items() if value is not None}
     return "".join(f"# {line}\n" for line in dump_yaml(header).splitlines())

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from v2hdm.errors import DriveError, MapFileError
+from v2hdm.doors import check_types, checked
+from v2hdm.errors import DriveError, MapFileError, shown
 from v2hdm.geometry.rigid import with_clock_offsets
 from v2hdm.io.description import DRIVE_FILE, is_folder_drive, name_of
 from v2hdm.io.drive.images import KittiOptions, ReadOptions, part_of
 from v2hdm.io.drive.join import join_drives
 from v2hdm.records import Drive, Trajectory
-from v2hdm.store.files import load_json, load_yaml
+from v2hdm.store.files import file_digest, load_yaml
 from v2hdm.store.names import METRICS
 
 __all__ = [
@@ -65,6 +67,7 @@ READERS: Mapping[str, tuple[Callable[[Path], bool], Callable[[Path, ReadOptions]
 """Formats by name: whether a path looks like one, and what makes a drive of it."""
 
 
+@checked
 def read_drive(path: str | Path, options: ReadOptions | None = None) -> Drive:
     """Read a drive: a folder with ``drive.yaml``, KITTI raw or a bag.
 
@@ -83,12 +86,15 @@ def read_drive(path: str | Path, options: ReadOptions | None = None) -> Drive:
     """
     path = Path(path)
     options = options or ReadOptions()
+    check_types(options, "drive.")
     if not path.exists():
         raise DriveError(f"{path}: no such drive folder or bag; check the path")
     if options.max_gap_s <= 0:
         raise DriveError(f"max_gap_s is {options.max_gap_s:g}; give a positive number of seconds")
     if options.format not in ("auto", *READERS):
-        raise DriveError(f"unknown drive format '{options.format}'; choose from: auto, {', '.join(READERS)}")
+        raise DriveError(
+            f"unknown drive format {shown(options.format)}; choose from: auto, {', '.join(READERS)}"
+        )
     for name, (accepts, read) in READERS.items():
         if options.format == name or (options.format == "auto" and accepts(path)):
             return part_of(read(path, options), options)
@@ -98,7 +104,10 @@ def read_drive(path: str | Path, options: ReadOptions | None = None) -> Drive:
 
 def as_drive(drive: Drive | str | Path, options: ReadOptions | None = None) -> Drive:
     """The drive itself, or that in a folder, read."""
-    return drive if isinstance(drive, Drive) else read_drive(drive, options)
+    drive = drive if isinstance(drive, Drive) else read_drive(drive, options)
+    if not drive.images:
+        raise DriveError(f"drive {drive.name}: has no image; give one with images that have poses")
+    return drive
 
 
 def drive_name(path: Path) -> str:
@@ -108,8 +117,13 @@ def drive_name(path: Path) -> str:
     return path.resolve().stem if _is_bag(path) else path.resolve().name
 
 
-def told_of(drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[str, Any]:
-    """The plain values that :func:`drive_of` needs."""
+_DIGEST = "images_sha256"  # in metrics.json, of :func:`images_digest`
+
+
+def told_of(
+    drive: Drive, paths: Sequence[Path], options: ReadOptions, digest_of: Callable[[Path], str] = file_digest
+) -> dict[str, Any]:
+    """The plain values that :func:`drive_of` needs; ``digest_of`` an image file is its SHA-256."""
     return {
         "name": drive.name,
         "paths": [str(path.resolve()) for path in paths],
@@ -118,18 +132,25 @@ def told_of(drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[s
         **({"kitti": asdict(options.kitti)} if options.format == "kitti" else {}),
         "cameras": list(drive.cameras),
         "images": len(drive.images),
+        _DIGEST: images_digest(drive, digest_of),
     }
+
+
+def images_digest(drive: Drive, digest_of: Callable[[Path], str]) -> str:
+    """One SHA-256 of all images of a drive: their cameras and ``digest_of`` each file, in their order."""
+    lines = [f"{image.camera} {digest_of(image.path)}\n" for image in drive.images]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
 def drive_of(folder: Path, path: Path | None) -> Drive | None:
     """The drive of the result in ``folder``: at ``path``, else where it was; None where it is gone.
 
-    Raises MapFileError when the folder is no result of a run, DriveError when the drive is no longer that.
+    Raises MapFileError when the folder is no result of a run, DriveError when the drive is no longer that,
+    or its images are not those that were mapped.
     """
-    if not (folder / METRICS).is_file():
-        raise MapFileError(f"{folder}: has no {METRICS}; give the result folder of v2hdm map")
-    stated = load_json(folder / METRICS, MapFileError).get("drive")
-    stated = stated if isinstance(stated, dict) else {}
+    from v2hdm.io.metrics import read_metrics  # loads what the map extra brings, as results are
+
+    stated = read_metrics(folder).get("drive") or {}
     try:
         stated_paths = stated.get("paths") or [] if path is None else [path]
         paths = [Path(str(stated_path)) for stated_path in stated_paths]
@@ -145,7 +166,20 @@ def drive_of(folder: Path, path: Path | None) -> Drive | None:
             f"{paths[0]}: drive {drive.name} of {len(drive.images)} images, but the result is of drive "
             f"{expected[0]} of {expected[1]}; give that drive with --drive"
         )
+    mapped = stated.get(_DIGEST)  # none in results of earlier versions
+    if mapped is not None and mapped != _digest_now(drive):
+        raise DriveError(
+            f"{paths[0]}: its images are not those that the result in {folder} was made of; give that "
+            "drive with --drive, or map this one again"
+        )
     return drive
+
+
+def _digest_now(drive: Drive) -> str:
+    try:
+        return images_digest(drive, file_digest)
+    except OSError as failure:
+        raise DriveError(f"{failure.filename}: cannot be read ({failure.strerror})") from None
 
 
 def single_drive_of(folder: Path, path: Path | None, what: str) -> Drive:

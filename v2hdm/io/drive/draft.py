@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,17 +12,21 @@ from v2hdm.errors import DriveError
 from v2hdm.io.description import DRIVE_FILE
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.images import ReadOptions
-from v2hdm.io.drive.sources import SUFFIXES
-from v2hdm.io.importers.bag.describe import LENS, MOUNTING, BagDescription
+from v2hdm.io.drive.sources import list_folder
+from v2hdm.io.importers.bag.describe import LENS, MOUNTING, ORIGIN, BagDescription
 from v2hdm.io.importers.bag.reading import is_bag
-from v2hdm.safe.texts import parse_yaml
+from v2hdm.io.stamps import ZONES, times_of_names
+from v2hdm.safe.fields import take_frame
+from v2hdm.safe.texts import ALL_CAMERAS, MOST_NAME_LETTERS, parse_yaml
 from v2hdm.store.files import dump_yaml, replace_text
 
 _POSES = (
     "a log of poses, with the antenna's place, m forward, left, up of the ground under the rear axle: "
     "{nmea: route.nmea, lever_arm_m: [1.2, 0, 1.8]}"
 )
-_UNITS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))  # least times of this century, by their unit; smaller: s
+_EITHER = ("stamps", "start_s", "unit")  # keys of images of which one tells their times
+_RAW_SUFFIXES = (".h264", ".264", ".avc", ".h265", ".265", ".hevc", ".mjpeg", ".mjpg", ".obu")
+"""Suffixes of streams of frames without times."""
 
 
 def draft_drive(source: Path, folder: Path, settings: Sequence[str]) -> dict[str, str]:
@@ -33,19 +38,21 @@ def draft_drive(source: Path, folder: Path, settings: Sequence[str]) -> dict[str
     that is none, a ``drive.yaml`` that exists.
     """
     where = folder / DRIVE_FILE
-    if where.exists():
+    if os.path.lexists(where):  # a link to a file that is gone is the user's, too
         raise DriveError(f"{where}: exists; edit it, or choose another folder for --write")
-    draft = _draft_of(source, folder)
+    values = _values_of(settings)
+    draft = _draft_of(source, folder, values.get("vehicle_frame"))
     content = draft.content
     missing = draft.missing
-    for setting in settings:
-        key, equals, text = setting.partition("=")
-        if not (key and equals):
-            raise DriveError(f"--set {setting}: give KEY=VALUE, such as cameras.front.camera_info=front.yaml")
-        value = parse_yaml(text, f"--set {key}", DriveError)
-        _put(content, key.split("."), _beside(value, folder) if not key.endswith("topic") else value)
+    _refuse_unused(content, settings)
+    for key, value in values.items():
+        is_name = key.endswith(("topic", "frame"))
+        _put(content, key.split("."), value if is_name else _beside(value, folder))
         for asked_key in list(missing):
-            if f"{key}.".startswith(f"{asked_key}.") or asked_key.startswith(f"{key}."):
+            entry, _, last = asked_key.rpartition(".")
+            is_same = f"{key}.".startswith(f"{asked_key}.") or asked_key.startswith(f"{key}.")
+            is_alternative = last in _EITHER and key in [f"{entry}.{name}" for name in _EITHER]
+            if is_same or is_alternative:
                 del missing[asked_key]
     if missing:
         return missing
@@ -59,6 +66,17 @@ def draft_drive(source: Path, folder: Path, settings: Sequence[str]) -> dict[str
     return {}
 
 
+def _values_of(settings: Sequence[str]) -> dict[str, object]:
+    """The values of ``KEY=VALUE`` by their dotted keys."""
+    values: dict[str, object] = {}
+    for setting in settings:
+        key, equals, text = setting.partition("=")
+        if not (key and equals):
+            raise DriveError(f"--set {setting}: give KEY=VALUE, such as cameras.front.camera_info=front.yaml")
+        values[key] = parse_yaml(text, f"--set {key}", DriveError)
+    return values
+
+
 class _Draft(NamedTuple):
     """What a recording tells of its drive."""
 
@@ -66,33 +84,72 @@ class _Draft(NamedTuple):
     missing: dict[str, str]  # dotted keys, with what to give for each
 
 
-def _draft_of(source: Path, folder: Path) -> _Draft:
-    """The draft of a ``drive.yaml`` in ``folder`` for a recording."""
+def _draft_of(source: Path, folder: Path, vehicle_frame: object) -> _Draft:
+    """The draft of a ``drive.yaml`` in ``folder`` for a recording; its user may name the vehicle's frame."""
     if is_bag(source):
-        bag = BagDescription(source, Path(ReadOptions().cache))
+        if vehicle_frame is not None:
+            vehicle_frame = take_frame(vehicle_frame, "--set vehicle_frame", DriveError)
+        bag = BagDescription(source, Path(ReadOptions().cache), vehicle_frame=vehicle_frame)
         about = {"name": folder.resolve().name, "bag": _relative(source, folder)}
         return _Draft(bag.content | about, bag.missing)
-    name = source.stem or "camera"
+    if not source.exists():
+        raise DriveError(f"{source}: no such bag, video or folder of images; check the path")
+    name = _camera_of(source)
     missing = {"poses": _POSES}
-    missing |= {f"cameras.{name}.camera_info": LENS, f"cameras.{name}.mounting": MOUNTING}
+    missing |= {f"cameras.{name}.camera_info": LENS}
+    missing |= {f"cameras.{name}.mounting": MOUNTING.format(origin=ORIGIN)}
     if source.is_dir():
         images = {"folder": _relative(source, folder)}
-        stems = [path.stem for path in source.iterdir() if path.suffix.lower() in SUFFIXES]
-        if not stems:
+        paths = list_folder(source)
+        if not paths:
             raise DriveError(
                 f"{source}: not a bag, a video or a folder of images; --write needs one of these"
             )
-        try:
-            latest = max(map(float, stems))
-            images["unit"] = next((unit for least, unit in _UNITS if latest >= least), "s")
-        except ValueError:
-            missing[f"cameras.{name}.images.stamps"] = "a file with a time in s per image: times.txt"
+        if not _tell_times(paths, None):
+            if _tell_times(paths, "utc"):
+                missing[f"cameras.{name}.images.unit"] = (
+                    f"the clock of the dates in the images' names: {ZONES}"
+                )
+            else:
+                missing[f"cameras.{name}.images.stamps"] = (
+                    "a file with a time in s per image: times.txt, or unit: s, ms, us or ns of times as names"
+                )
     else:
         images = {"video": _relative(source, folder)}
-        missing[f"cameras.{name}.images.start_s"] = (
-            "the first frame's time on the poses' clock, s: 1715934630.25"
-        )
+        if source.suffix.lower() in _RAW_SUFFIXES:
+            missing[f"cameras.{name}.images.stamps"] = "a file with a time in s per frame: times.txt"
+        else:
+            missing[f"cameras.{name}.images.start_s"] = (
+                "the first frame's time on the poses' clock, s: 1715934630.25"
+            )
     return _Draft({"name": folder.resolve().name, "cameras": {name: {"images": images}}}, missing)
+
+
+def _tell_times(paths: Sequence[Path], unit: str | None) -> bool:
+    try:
+        times_of_names([path.stem for path in paths], unit, "")
+    except DriveError:
+        return False
+    return True
+
+
+def _refuse_unused(content: Mapping[str, Any], settings: Sequence[str]) -> None:
+    """Raise DriveError for settings of a camera that has no images, neither in the recording nor by them."""
+    paths = [setting.partition("=")[0].split(".") for setting in settings if "=" in setting]
+    of_cameras = [keys for keys in paths if len(keys) > 2 and keys[0] == "cameras"]
+    with_images = {keys[1] for keys in of_cameras if keys[2] == "images"} | set(content.get("cameras", {}))
+    unused = [".".join(keys) for keys in of_cameras if keys[1] not in with_images]
+    if unused:
+        raise DriveError(
+            f"--set {', '.join(unused)}: not used, for there is no camera of that name; name "
+            f"{' or '.join(content.get('cameras', {})) or 'its images, too'}"
+        )
+
+
+def _camera_of(source: Path) -> str:
+    """A name for the camera of a recording: its own, of letters that a key of ``--set`` may have."""
+    name = re.sub(r"[^\w-]+", "_", source.stem)[:MOST_NAME_LETTERS].strip("_")
+    return "camera" if not name or name.lower() in ALL_CAMERAS else name
 
 
 def _put(content: dict[str, Any], keys: Sequence[str], value: object) -> None:

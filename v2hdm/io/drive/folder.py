@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -11,12 +11,24 @@ import cv2
 import numpy as np
 
 from v2hdm.errors import DriveError
+from v2hdm.geometry.frames import frame_from_vehicle
 from v2hdm.io.calibration import reading
 from v2hdm.io.description import DRIVE_FILE, POSES_FILE, CameraEntry, DriveDescription, keys_in, name_of
+from v2hdm.io.drive.frames import plan_frames
 from v2hdm.io.drive.images import ImageFiles, ReadOptions, assemble_drive, select_cameras
 from v2hdm.io.drive.sources import Sources, plan_images, plan_info, plan_topic_poses
 from v2hdm.io.importers.poses import read_poses
-from v2hdm.records import DRIFTS, BoolArray, Camera, CameraInfo, Drive, FloatArray, PoseNoise
+from v2hdm.records import (
+    DRIFTS,
+    BoolArray,
+    Camera,
+    CameraFrames,
+    CameraInfo,
+    Drive,
+    FloatArray,
+    PoseNoise,
+    Trajectory,
+)
 from v2hdm.safe.fields import take_origin
 from v2hdm.safe.pixels import read_pixels
 from v2hdm.safe.texts import shown, take_camera_name
@@ -58,18 +70,23 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
         poses = take_text(poses, poses_at, DriveError)
     read_topic = plan_topic_poses(poses, sources, poses_at)
     origin = take_origin(content.get("origin"), f"{where}: origin", DriveError)
+    entries = {name: entry for name, (entry, _, _) in planned.items()}
+    read_frames = plan_frames(content, entries, sources, where)
 
     cameras: dict[str, Camera] = {}
     files: list[ImageFiles] = []
+    frames = read_frames()
     for name, (entry, read_info, list_images) in planned.items():
         # Many tools call every camera they calibrate alike: the drive's own name for it holds.
         named = replace(read_info(), name=name)
         listed = list_images()
         place = f"{where}: camera '{name}'"
         read_out_s = _take_read_out(entry, listed.stamp_s, f"{place}, read_out_s")
-        cameras[name] = replace(_read_camera(entry, named, path, place), read_out_s=read_out_s)
+        camera = _read_camera(entry, named, path, place, frames[name])
+        cameras[name] = replace(camera, read_out_s=read_out_s)
         files.append(listed)
-    recorded = read_poses(poses, path, origin, options.max_gap_s, poses_at, read_topic)
+    near_s = _middle_of(files)
+    recorded = read_poses(poses, path, origin, options.max_gap_s, poses_at, read_topic, near_s)
     pose_noise = _read_pose_noise(content.get("pose_noise"), recorded.noise, f"{where}: pose_noise")
     truth = None
     if content.get("truth") is not None:
@@ -77,11 +94,24 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
         if not truth.is_dir():
             raise DriveError(f"{where}: truth: no such folder {truth}; restore it or drop the key")
     name = name_of(content, path)
-    drive = Drive(name, path, cameras, (), pose_noise, recorded.origin, truth, recorded=recorded.trajectory)
+    frame_from_ground = frame_from_vehicle(next(iter(frames.values())).height_m)
+    poses_of_frame = recorded.trajectory
+    on_ground = Trajectory(poses_of_frame.stamp_s, poses_of_frame.map_from_vehicle @ frame_from_ground)
+    drive = Drive(name, path, cameras, (), pose_noise, recorded.origin, truth, recorded=on_ground)
     return assemble_drive(drive, files, options.max_gap_s, poses_at)
 
 
-def _read_camera(entry: dict[str, Any], info: CameraInfo, root: Path, where: str) -> Camera:
+def _middle_of(files: Sequence[ImageFiles]) -> float | None:
+    """The time in the middle of a drive's images; None where there are none, or none is finite."""
+    stamps = np.concatenate([entry.stamp_s for entry in files])
+    middle_s = float(np.median(stamps)) if len(stamps) else np.nan
+    return middle_s if np.isfinite(middle_s) else None
+
+
+def _read_camera(
+    entry: dict[str, Any], info: CameraInfo, root: Path, where: str, frames: CameraFrames
+) -> Camera:
+    frame_from_ground = frame_from_vehicle(frames.height_m)
     guesses = [key for key in ("mounting", "cam_from_vehicle", "ipm") if key in entry]
     if len(guesses) != 1:
         raise DriveError(f"{where}: give one of 'mounting', 'cam_from_vehicle' and 'ipm'; got {len(guesses)}")
@@ -94,12 +124,16 @@ def _read_camera(entry: dict[str, Any], info: CameraInfo, root: Path, where: str
     else:
         (key,) = guesses
         guess = entry[guesses[0]]
-        guess = reading.take_mounting(guess, f"{where}, mounting") if key == "mounting" else guess
-        ipm = {"estimated": reading.ipm_from_guess(info, guess, f"{where}, {key}")}
+        take = reading.take_mounting if key == "mounting" else reading.take_rigid
+        guess = take(guess, f"{where}, {key}") @ frame_from_ground
+        ipm = {"estimated": reading.ipm_from_guess(info, guess, f"{where}, {key}", frames.vehicle)}
     linear = entry.get("linear_response", False)
     if not isinstance(linear, bool):
         raise DriveError(f"{where}, linear_response: expected true or false, got {shown(linear)}")
-    prior = entry.get("centre_prior")
+    prior = None
+    if entry.get("centre_prior") is not None:
+        prior = reading.take_centre_prior(entry["centre_prior"], f"{where}, centre_prior")
+        prior = replace(prior, centre_vehicle=prior.centre_vehicle - frame_from_ground[:3, 3])
     initial_ipm = reading.choose_initial(entry.get("initial_ipm"), ipm, where)
     if "roi_vehicle" in entry:
         roi_vehicle = reading.take_roi(entry["roi_vehicle"], f"{where}, roi_vehicle")
@@ -111,9 +145,10 @@ def _read_camera(entry: dict[str, Any], info: CameraInfo, root: Path, where: str
         ipm=ipm,
         initial_ipm=initial_ipm,
         roi_vehicle=roi_vehicle,
-        centre_prior=None if prior is None else reading.take_centre_prior(prior, f"{where}, centre_prior"),
+        centre_prior=prior,
         linear_response=linear,
         own_vehicle=_read_mask(entry, root, info, where),
+        frames=replace(frames, states_height="ipm" not in entry),
     )
 
 

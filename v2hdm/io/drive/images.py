@@ -11,7 +11,7 @@ from typing import Annotated
 
 import numpy as np
 
-from v2hdm.errors import DriveError
+from v2hdm.errors import DriveError, shown
 from v2hdm.geometry.rigid import in_order, interpolate
 from v2hdm.io.drive.road import lay_flat, log_road
 from v2hdm.io.trajectory import check_trajectory, span, why_no_pose
@@ -77,7 +77,7 @@ def select_cameras(available: Sequence[str], chosen: Sequence[str], where: Path)
     """The ``available`` cameras that are ``wanted``, all where none is named; refuses unknown ones."""
     for name in chosen:
         if name not in available:
-            raise DriveError(f"{where}: no camera '{name}'; choose from: {', '.join(available)}")
+            raise DriveError(f"{where}: no camera {shown(name)}; choose from: {', '.join(available)}")
     return [name for name in available if not chosen or name in chosen]
 
 
@@ -97,7 +97,9 @@ def assemble_drive(
     _check_image_files(images, drive.cameras)
     posed = Counter(image.camera for image in images)
     unposed = {entry.camera: len(entry.paths) - posed[entry.camera] for entry in files}
-    return replace(drive, images=images, unposed=unposed, trajectory=laid.trajectory, road=laid.road)
+    listed_s = {entry.camera: (float(entry.stamp_s[0]), float(entry.stamp_s[-1])) for entry in files}
+    counted = replace(drive, images=images, unposed=unposed, listed_s=listed_s)
+    return replace(counted, trajectory=laid.trajectory, road=laid.road)
 
 
 def _pose_images(
@@ -161,7 +163,7 @@ def part_of(drive: Drive, options: ReadOptions) -> Drive:
         if not chosen:
             lasts_s = max(image.stamp_s for image in drive.images) - first_s
             raise DriveError(
-                f"{drive.root}: no image of camera '{name}' is left from {options.start_s:g} to {end_s:g} s; "
-                f"the drive has images for {lasts_s:.1f} s: change drive.start_s or drive.end_s"
+                f"{drive.root}: no image of camera {shown(name)} is left from {options.start_s:g} to "
+                f"{end_s:g} s; the drive has images for {lasts_s:.1f} s: change drive.start_s or drive.end_s"
             )
     return replace(drive, images=tuple(sorted(images, key=in_order)))

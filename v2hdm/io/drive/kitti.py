@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from v2hdm.errors import DriveError
+from v2hdm.errors import DriveError, shown
 from v2hdm.geometry.geodetic import enu_from_geodetic, geodetic_from_enu
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.rigid import make_transform, rotation_from_euler
@@ -197,7 +197,7 @@ def _read_stamps(path: Path) -> FloatArray:
             seconds = datetime.fromisoformat(whole).replace(tzinfo=UTC).timestamp()
             stamps.append(seconds + float(f"0.{fraction or 0}"))
         except ValueError:
-            problem = f"expected 'YYYY-MM-DD hh:mm:ss.fraction', got '{line}'"
+            problem = f"expected 'YYYY-MM-DD hh:mm:ss.fraction', got {shown(line)}"
             raise DriveError(f"{path}: line {number}: {problem}; fix it") from None
     return np.array(stamps)
 

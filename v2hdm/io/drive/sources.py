@@ -3,34 +3,39 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from v2hdm.errors import DriveError, need
+from v2hdm.errors import DriveError, need, shown
 from v2hdm.io.calibration.intrinsics import read_intrinsics
 from v2hdm.io.calibration.reading import read_camera_info
 from v2hdm.io.description import FolderImages, InfoFile, TopicImages, VideoImages, keys_in
 from v2hdm.io.drive.images import ImageFiles
+from v2hdm.io.image_lists import image_order, read_image_list, read_stamps
 from v2hdm.io.importers.bag import streams
-from v2hdm.io.importers.bag.messages import TF_TOPIC
-from v2hdm.io.importers.readings import Readings, read_stamps, readings_of_poses
-from v2hdm.io.trajectory import UNITS, read_image_list, write_image_list
-from v2hdm.records import CameraInfo
+from v2hdm.io.importers.bag.frames import TF_TOPIC
+from v2hdm.io.importers.readings import Readings, readings_of_poses
+from v2hdm.io.stamps import ZONES, is_unit, number_order, times_of_names
+from v2hdm.io.trajectory import UNITS
+from v2hdm.records import CameraInfo, FloatArray
 from v2hdm.safe.child import Limits, in_child, next_step
-from v2hdm.safe.pixels import DECODER_OPTIONS, VIDEO_OPTIONS, png
+from v2hdm.safe.pixels import DECODER_OPTIONS, IMAGE_SUFFIXES, VIDEO_OPTIONS, is_image_name, png
 from v2hdm.store.files import check_keys, take_choice, take_mapping, take_number, take_text
 from v2hdm.store.folders import entry_folder, is_whole, new_entry
 
 _log = logging.getLogger(__name__)
 
 _TAIL_S = 1.0  # sound may go on after the last frame
+_WITHOUT_TIMES = frozenset({"h264", "hevc", "m4v", "mpegvideo", "mjpeg", "obu"})
+"""FFmpeg's names of formats that are frames alone: it invents times for some of them."""
+_UNTIMED = "untimed.txt"  # why the frames of an import have no times of their own
+_PREVIEW = "attached_pic"  # a picture of the video's cover, not the video
 
 _Lister = Callable[[], ImageFiles]
-SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
 
 @dataclass
@@ -112,7 +117,7 @@ def plan_topic_poses(content: object, sources: Sources, where: str) -> Callable[
             if key not in content:
                 raise DriveError(f"{where}: add {key} for {TF_TOPIC}: the map's or the vehicle's frame")
         dst, src = (take_text(content[key], f"{where}, {key}", DriveError) for key in ("frame", "vehicle"))
-        tf = streams.TfStream(True, where)
+        tf = streams.TfStream(where)
         tf_folder = sources.want(tf)
         return lambda: readings_of_poses(tf.frames(tf_folder()).moving(dst, src, sources.max_gap_s, where))
     for key in ("frame", "vehicle"):
@@ -127,8 +132,9 @@ def plan_topic_poses(content: object, sources: Sources, where: str) -> Callable[
 
 
 def _of_list(camera: str, path: Path, start_s: float = 0.0) -> ImageFiles:
-    stamp_s, names = read_image_list(path)
-    return ImageFiles(camera=camera, stamp_s=stamp_s + start_s, paths=[path.parent / name for name in names])
+    listed = read_image_list(path)
+    paths = [path.parent / name for name in listed.names]
+    return ImageFiles(camera=camera, stamp_s=listed.stamp_s + start_s, paths=paths)
 
 
 def _of_topic(entry: dict[str, Any], camera: str, sources: Sources, where: str) -> _Lister:
@@ -143,39 +149,57 @@ def _take_stamps(entry: Mapping[str, Any], where: str) -> str:
 
 def _of_folder(entry: dict[str, Any], camera: str, sources: Sources, where: str) -> _Lister:
     folder = sources.root / take_text(entry["folder"], f"{where}, folder", DriveError)
-    unit = take_choice(entry.get("unit", "s"), UNITS, f"{where}, unit", DriveError)
+    unit = None
+    if entry.get("unit") is not None:
+        unit = take_text(entry["unit"], f"{where}, unit", DriveError)
+        if not is_unit(unit):
+            units = ", ".join(UNITS)
+            raise DriveError(f"{where}, unit: expected one of {units}, {ZONES}; got {shown(unit)}")
 
     def images() -> ImageFiles:
         if not folder.is_dir():
             raise DriveError(f"{where}: {folder}: no such folder; check the path")
-        paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+        paths = list_folder(folder)
         if not paths:
-            raise DriveError(f"{where}: {folder}: no images ({', '.join(SUFFIXES)}) in this folder")
+            raise DriveError(f"{where}: {folder}: no images ({', '.join(IMAGE_SUFFIXES)}) in this folder")
+        stems = [path.stem for path in paths]
+        about = f"{where}: the images of {folder}"
         if "stamps" in entry:
             stamps = sources.root / take_text(entry["stamps"], f"{where}, stamps", DriveError)
-            stamp_s = read_stamps(stamps, len(paths), f"images in {folder}")
-        else:
-            try:
-                stamp_s = np.array([float(path.stem) for path in paths])
-            except ValueError:
-                raise DriveError(
-                    f"{where}: the images of {folder} are not named by their times; add stamps, one per line"
-                ) from None
-            order = np.argsort(stamp_s, kind="stable")
-            stamp_s = stamp_s[order]
-            paths = [paths[n] for n in order.tolist()]
-        if (np.diff(stamp_s) <= 0).any():
-            raise DriveError(f"{where}: the image times of {folder} do not increase strictly; fix them")
-        return ImageFiles(camera=camera, stamp_s=stamp_s / UNITS[unit], paths=paths)
+            stamp_s = read_stamps(stamps, len(paths), f"images in {folder}") / UNITS.get(unit or "s", 1.0)
+            places = number_order(stems, about)
+            _check_lines(stamp_s, [stems[place] for place in places], stamps)
+            by_time = image_order(stamp_s, str(stamps), "line")
+            rows = [places[row] for row in by_time]
+            return ImageFiles(camera=camera, stamp_s=stamp_s[by_time], paths=[paths[row] for row in rows])
+        stamp_s = times_of_names(stems, unit, about)
+        by_time = image_order(np.sort(stamp_s), about.removeprefix(f"{where}: "))
+        rows = np.argsort(stamp_s, kind="stable")[by_time].tolist()
+        return ImageFiles(camera=camera, stamp_s=stamp_s[rows], paths=[paths[row] for row in rows])
 
     return images
+
+
+def list_folder(folder: Path) -> list[Path]:
+    """The images that lie in a folder itself, by name."""
+    return sorted(path for path in folder.iterdir() if is_image_name(path.name))
+
+
+def _check_lines(stamp_s: FloatArray, stems: Sequence[str], stamps: Path) -> None:
+    """Refuse times that rise only if images are sorted by letters: frame1, frame10, ..., frame2."""
+    by_letters = sorted(range(len(stems)), key=stems.__getitem__)
+    if (np.diff(stamp_s) < 0).any() and not (np.diff(stamp_s[np.argsort(by_letters)]) <= 0).any():
+        raise DriveError(
+            f"{stamps}: its lines are in the order of letters, in which {shown(stems[by_letters[1]])} comes "
+            f"second, but images are in that of numbers, where {shown(stems[1])} does; sort its lines by time"
+        )
 
 
 def _import_video(path: Path, cache: Path, where: str) -> Path:
     """The folder of a video's frames as PNG files and of their times, decoded by PyAV unless they were."""
     if not path.is_file():
         raise DriveError(f"{where}: {path}: no such video; check the path")
-    folder = entry_folder(cache, [path], "video", ["frames"])
+    folder = entry_folder(cache, [path], "video", ["frames in order"])
     if is_whole(folder):
         return folder
     need("av", "video", f"{where}: a video", DriveError)
@@ -186,20 +210,22 @@ def _import_video(path: Path, cache: Path, where: str) -> Path:
 
 
 def decode_video(path: Path, folder: Path) -> None:
-    """Write the frames of a video as PNG files, and the list of their times."""
+    """Write the frames of a video, in the order that they are shown in, as PNG files, and their times."""
     av = need("av", "video", f"{path}: a video", DriveError)
     stamps: list[float] = []
-    names: list[str] = []
-    complaint = ""
+    complaint = untimed = ""
     av.logging.set_level(av.logging.ERROR)
     try:
         with (
             av.logging.Capture(local=False) as complaints,
             av.open(str(path), options=VIDEO_OPTIONS) as container,
         ):
-            promised_s = (container.duration or 0) / av.time_base
-            container.streams.video[0].codec_context.options = DECODER_OPTIONS
-            for frame in container.decode(video=0):
+            stream = _stream_of(container, path)
+            promised_s = _length_of(container, stream, av.time_base)
+            stream.codec_context.options = DECODER_OPTIONS
+            if container.format.name in _WITHOUT_TIMES:
+                untimed = "it is a raw stream, whose frames have no times"
+            for frame in container.decode(stream):
                 next_step()
                 where = f"{path}: frame {len(stamps) + 1}"
                 if frame.rotation:
@@ -210,13 +236,11 @@ def decode_video(path: Path, folder: Path) -> None:
                 if (complaints or frame.is_corrupt) and not complaint:
                     complaint = complaints[-1][2].strip() if complaints else "corrupt"
                     _log.warning("%s: decoder error (%s); is it damaged?", where, complaint)
-                if frame.pts is None:
-                    raise DriveError(f"{where} has no time; give stamps, one per line")
-                stamps.append(float(frame.pts * frame.time_base))
-                if len(stamps) > 1 and stamps[-1] <= stamps[-2]:
-                    raise DriveError(f"{where}: its time does not increase; convert the video")
-                names.append(f"{len(names):06d}.png")
-                (folder / names[-1]).write_bytes(png(frame.to_ndarray(format="bgr24")))
+                if frame.pts is None and not untimed:
+                    untimed = f"its frame {len(stamps) + 1} has no time"
+                stamps.append(len(stamps) if untimed else float(frame.pts * frame.time_base))
+                name = folder / _FRAME_NAME.format(len(stamps) - 1)
+                name.write_bytes(png(frame.to_ndarray(format="bgr24")))
     except (av.error.FFmpegError, IndexError) as failure:
         reason = " ".join(str(failure).split())
         raise DriveError(f"{path}: not readable as a video ({reason}); convert or copy it") from None
@@ -224,9 +248,51 @@ def decode_video(path: Path, folder: Path) -> None:
         av.logging.set_level(None)
     if not stamps:
         raise DriveError(f"{path}: has no frames; convert or copy it again")
-    if promised_s - (stamps[-1] - stamps[0]) > _TAIL_S + 2 * max(np.diff(stamps), default=0.0):
+    stamp_s = np.array(stamps)
+    if not untimed and promised_s - np.ptp(stamp_s) > _TAIL_S + 2 * np.diff(stamp_s).max(initial=0.0):
         _log.warning("%s: its frames end before its %.1f s do; is it cut off?", path, promised_s)
-    write_image_list(np.array(stamps) - stamps[0], names, folder / streams.IMAGE_LIST)
+    _write_frames(stamp_s, untimed, folder)
+
+
+_FRAME_NAME = "{:06d}.png"
+_FRAME_TIMES = "times.txt"  # of all frames, in the order that they are shown in
+
+
+def _write_frames(stamp_s: FloatArray, untimed: str, folder: Path) -> None:
+    """Write the times of frames (N,) since the first, or why they have none."""
+    (folder / _FRAME_TIMES).write_text(
+        "".join(f"{stamp:.9f}\n" for stamp in stamp_s - stamp_s[0]), encoding="utf-8"
+    )
+    if untimed:
+        (folder / _UNTIMED).write_text(untimed, encoding="utf-8")
+
+
+def _stream_of(container: Any, path: Path) -> Any:
+    """The video in a container: its first, said where there are several."""
+    streams_of_video = [
+        stream for stream in container.streams.video if _PREVIEW not in (stream.disposition.name or "")
+    ]
+    stream = (streams_of_video or container.streams.video)[0]
+    if len(streams_of_video) > 1:
+        _log.warning(
+            "%s: holds %d videos; the first, of %d x %d px, is read",
+            path, len(streams_of_video), stream.width, stream.height,
+        )  # fmt: skip
+    return stream
+
+
+def _length_of(container: Any, stream: Any, ticks_s: int) -> float:
+    """The duration of a video's frames, s, that its container states; 0 if none, as sound may last longer."""
+    if stream.duration is not None:
+        return float(stream.duration * stream.time_base)
+    hours, _, minutes_and_seconds = str(stream.metadata.get("DURATION", "")).partition(
+        ":"
+    )  # Matroska's hh:mm:ss.fraction
+    minutes, _, seconds = minutes_and_seconds.partition(":")
+    try:
+        return 3600.0 * float(hours) + 60.0 * float(minutes) + float(seconds)
+    except ValueError:
+        return (container.duration or 0) / ticks_s if len(container.streams) == 1 else 0.0
 
 
 def _of_video(entry: dict[str, Any], camera: str, sources: Sources, where: str) -> _Lister:
@@ -238,15 +304,24 @@ def _of_video(entry: dict[str, Any], camera: str, sources: Sources, where: str) 
         )
 
     def images() -> ImageFiles:
-        frames = _import_video(path, sources.cache, where) / streams.IMAGE_LIST
+        folder = _import_video(path, sources.cache, where)
+        frame_s = np.loadtxt(folder / _FRAME_TIMES, ndmin=1)
+        about = str(path)
         if "start_s" in entry:
-            return _of_list(camera, frames, take_number(entry["start_s"], f"{where}, start_s", DriveError))
-        listed = _of_list(camera, frames)
-        stamps = sources.root / take_text(entry["stamps"], f"{where}, stamps", DriveError)
-        stamp_s = read_stamps(stamps, len(listed.paths), f"frames of {path}")
-        if (np.diff(stamp_s) <= 0).any():
-            raise DriveError(f"{stamps}: times do not increase strictly; fix them")
-        return replace(listed, stamp_s=stamp_s)
+            start_s = take_number(entry["start_s"], f"{where}, start_s", DriveError)
+            if (folder / _UNTIMED).is_file():
+                reason = (folder / _UNTIMED).read_text(encoding="utf-8")
+                raise DriveError(
+                    f"{path}: {reason}, and start_s is the first one's alone; give stamps, one per line"
+                )
+            stamp_s = start_s + frame_s
+        else:
+            stamps = sources.root / take_text(entry["stamps"], f"{where}, stamps", DriveError)
+            stamp_s = read_stamps(stamps, len(frame_s), f"frames of {path}")
+            about = str(stamps)
+        rows = image_order(stamp_s, about, "frame")
+        paths = [folder / _FRAME_NAME.format(row) for row in rows.tolist()]
+        return ImageFiles(camera=camera, stamp_s=stamp_s[rows], paths=paths)
 
     return images
 

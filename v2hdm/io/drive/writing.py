@@ -12,8 +12,9 @@ import numpy as np
 from v2hdm.io.calibration.writing import write_camera_info
 from v2hdm.io.description import DRIVE_FILE, POSES_FILE
 from v2hdm.io.drive.truth import LANE_VISIBLE, SIGHTINGS
+from v2hdm.io.image_lists import write_image_list
 from v2hdm.io.maps.geojson import write_geojson
-from v2hdm.io.trajectory import write_image_list, write_tum
+from v2hdm.io.trajectory import write_tum
 from v2hdm.records import Drive, Image, Trajectory, Truth
 from v2hdm.store.files import dump_yaml, replace_text
 from v2hdm.store.names import MAP
@@ -45,6 +46,8 @@ def write_drive(folder: Path, drive: Drive, trajectory: Trajectory) -> None:
             entry["centre_prior"] = surveyed
         if camera.read_out_s:
             entry["read_out_s"] = camera.read_out_s
+        if camera.frames.camera:
+            entry["frame"] = camera.frames.camera
         entries[name] = entry
     write_tum(trajectory, folder / POSES_FILE)
     noise = asdict(drive.pose_noise)
@@ -53,6 +56,8 @@ def write_drive(folder: Path, drive: Drive, trajectory: Trajectory) -> None:
         content["origin"] = asdict(drive.origin)
     if drive.truth_dir is not None:
         content["truth"] = drive.truth_dir.relative_to(folder).as_posix()
+    if vehicle := next((camera.frames.vehicle for camera in drive.cameras.values()), ""):
+        content["vehicle_frame"] = vehicle
     content["cameras"] = entries
     replace_text(folder / DRIVE_FILE, dump_yaml(content))
 

@@ -17,10 +17,25 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.geometry import geodetic as earth
+from v2hdm.geometry.planar import angle_between
 from v2hdm.geometry.rigid import interpolate, make_transform, rotation_from_euler
-from v2hdm.io.description import NmeaPoses, PoseKeys, TablePoses, TopicPoses, keys_in
+from v2hdm.io.description import (
+    NmeaPoses,
+    PoseKeys,
+    SbetPoses,
+    TablePoses,
+    TopicPoses,
+    UbxPoses,
+    keys_in,
+)
 from v2hdm.io.importers import readings as logs
-from v2hdm.io.importers.readings import Readings
+from v2hdm.io.importers.nmea import read_nmea
+from v2hdm.io.importers.readings import Attitudes, Readings
+from v2hdm.io.importers.rtklib import read_pos
+from v2hdm.io.importers.sbet import read_sbet
+from v2hdm.io.importers.slip import driven
+from v2hdm.io.importers.strays import without_stray_turns, without_strays
+from v2hdm.io.importers.ubx import read_ubx
 from v2hdm.io.trajectory import check_geodetic, read_tum, span, why_no_pose
 from v2hdm.records import BoolArray, FloatArray, GeodeticOrigin, Trajectory
 from v2hdm.store.files import check_keys, take_array, take_choice, take_mapping, take_number, take_text
@@ -28,6 +43,7 @@ from v2hdm.store.files import check_keys, take_array, take_choice, take_mapping,
 _log = logging.getLogger(__name__)
 
 HEADINGS = ("true", "grid")
+_SAME_HEADING_DEG = 0.2  # headings closer than this are one: the noise of two antennas a metre apart
 COMMON_KEYS = keys_in(PoseKeys).optional
 TOPIC_KEYS = keys_in(TopicPoses, PoseKeys).optional
 
@@ -55,12 +71,15 @@ class Recorded:
     origin: GeodeticOrigin | None  # None where the poses are the map's own
 
 
-_Reader = Callable[[Path, dict[str, Any], Path, str], Readings]
+_Reader = Callable[[Path, dict[str, Any], Path, str, float | None], Readings]
 
 POSE_FORMATS: Mapping[str, tuple[_Reader, tuple[str, ...]]] = {
-    "tum": (lambda path, entry, root, where: logs.readings_of_poses(read_tum(path)), ()),
+    "tum": (lambda path, entry, root, where, near_s: logs.readings_of_poses(read_tum(path)), ()),
     "csv": (logs.read_table, keys_in(TablePoses, PoseKeys).optional),
-    "nmea": (logs.read_nmea, keys_in(NmeaPoses, PoseKeys).optional),
+    "nmea": (read_nmea, keys_in(NmeaPoses, PoseKeys).optional),
+    "sbet": (read_sbet, keys_in(SbetPoses, PoseKeys).optional),
+    "pos": (read_pos, ()),
+    "ubx": (read_ubx, keys_in(UbxPoses, PoseKeys).optional),
 }
 """Formats of files by the key that names the file: the reader, and keys of its own. ``topic`` is of a bag."""
 
@@ -72,14 +91,16 @@ def read_poses(
     max_gap_s: float,
     where: str,
     read_topic: Callable[[], Readings] | None,
+    near_s: float | None = None,
 ) -> Recorded:
     """The poses of ``poses`` in ``drive.yaml``: a TUM file's name, or a mapping with a format or a topic.
 
     File names are relative to ``root``, ``origin`` is the map's place on the earth as the drive states it,
-    and ``read_topic`` reads the named topic of the drive's bag.
+    and ``read_topic`` reads the named topic of the drive's bag. ``near_s`` is a time of the drive, from its
+    images, by which seconds of a day or a week find theirs.
     """
     if isinstance(content, str):
-        return Recorded(read_tum(root / content), {}, origin)
+        content = {"tum": content}
     entry = take_mapping(content, where, DriveError)
     named = [key for key in (*POSE_FORMATS, "topic") if key in entry]
     if len(named) != 1:
@@ -93,9 +114,33 @@ def read_poses(
     settings = _take_settings(entry, where)
     name = take_text(entry[kind], f"{where}, {kind}", DriveError)
     if read_topic is not None:
-        return assemble(read_topic(), settings, origin, max_gap_s, f"{where}, topic {name}")
-    readings = POSE_FORMATS[kind][0](root / name, entry, root, where)
-    return assemble(readings, settings, origin, max_gap_s, str(root / name))
+        readings = read_topic()
+        source = f"{where}, topic {name}"
+    else:
+        readings = POSE_FORMATS[kind][0](root / name, entry, root, where, near_s)
+        source = str(root / name)
+    if entry.get("heading_file") is not None:
+        attitudes = _headings(entry["heading_file"], root, f"{where}, heading_file", near_s)
+        readings = replace(readings, attitudes=attitudes)
+    return assemble(readings, settings, origin, max_gap_s, source)
+
+
+def _headings(content: object, root: Path, where: str, near_s: float | None) -> Attitudes:
+    """The attitudes of a second file."""
+    entry = {"tum": content} if isinstance(content, str) else take_mapping(content, where, DriveError)
+    named = [kind for kind in POSE_FORMATS if kind in entry]
+    if len(named) != 1:
+        raise DriveError(f"{where}: name one file by its format: {', '.join(POSE_FORMATS)}")
+    (kind,) = named
+    read, keys = POSE_FORMATS[kind]
+    check_keys(entry, (kind,), (*keys, "offset_s"), where, DriveError)
+    name = take_text(entry[kind], f"{where}, {kind}", DriveError)
+    attitudes = read(root / name, entry, root, where, near_s).attitudes
+    if attitudes is None:
+        raise DriveError(f"{where}: {root / name}: holds no headings; name a file that does")
+    offset_s = take_number(entry.get("offset_s", 0.0), f"{where}, offset_s", DriveError)
+    later_s = None if attitudes.later_s is None else attitudes.later_s + offset_s
+    return replace(attitudes, stamp_s=attitudes.stamp_s + offset_s, later_s=later_s)
 
 
 def _take_settings(entry: Mapping[str, Any], where: str) -> PoseSettings:
@@ -125,23 +170,105 @@ def assemble(
     Without an ``origin`` it is the first position. Raises DriveError for positions without a heading, of an
     antenna whose place is not stated, without a sufficient fix, or of an unsuitable system.
     """
-    if readings.antenna and settings.lever_arm_m is None:
+    if not len(readings.stamp_s):
+        only = "headings only; name it as heading_file" if readings.attitudes is not None else "none"
+        raise DriveError(f"{where}: needs positions, and holds {only}")
+    if readings.point and settings.lever_arm_m is None:
         raise DriveError(
-            f"{where}: holds an antenna's positions: add lever_arm_m: [x, y, z], the antenna's position in "
-            "the vehicle frame (m forward, left, up); [0, 0, 0] only if it is above the rear axle"
+            f"{where}: holds {readings.point} positions: add lever_arm_m: [x, y, z], its place in the "
+            "vehicle frame (m forward, left, up); [0, 0, 0] only if it is above the rear axle"
         )
     if readings.attitudes is None:
         raise DriveError(
             f"{where}: holds positions without a heading, and the course over ground is not a heading when a "
-            "vehicle turns, stands or reverses; add a heading (HDT, THS, PASHR, a column, an Imu topic)"
+            "vehicle turns, stands or reverses; add a heading (HDT, THS, PASHR, a column, an Imu topic, or "
+            "heading_file, a second file)"
         )
-    heading_sigma_rad = readings.attitudes.sigma_rad
-    sure = _sure_enough(readings, settings.max_sigma_m, where)
-    certain = {key: getattr(readings, key)[sure] for key in ("stamp_s", "points", "sigma_m")}
-    readings = replace(readings, **certain)
+    readings = _usable(readings, settings, where)
+    attitudes = readings.attitudes
+    assert attitudes is not None
+    recorded = _recorded(readings, settings, origin, max_gap_s, where)
+    if attitudes.later_s is None:
+        return recorded
+    later = replace(attitudes, stamp_s=attitudes.later_s, later_s=None)
+    recorded_later = _recorded(replace(readings, attitudes=later), settings, origin, max_gap_s, where)
+    choice = driven(recorded.trajectory, recorded_later.trajectory)
+    if not choice.is_sure:
+        _warn_of_time(recorded.trajectory, recorded_later.trajectory, attitudes, choice.is_second, where)
+    return recorded_later if choice.is_second else recorded
+
+
+def _warn_of_time(
+    first: Trajectory, second: Trajectory, attitudes: Attitudes, is_second: bool, where: str
+) -> None:
+    """Say that the time of headings is open, where that matters."""
+    assert attitudes.later_s is not None
+    _, rows_of_first, rows_of_second = np.intersect1d(first.stamp_s, second.stamp_s, return_indices=True)
+    forward = first.map_from_vehicle[rows_of_first, :2, 0]
+    off_deg = np.degrees(np.abs(angle_between(forward, second.map_from_vehicle[rows_of_second, :2, 0])))
+    worst_deg = float(off_deg.max(initial=0.0))
+    if worst_deg < _SAME_HEADING_DEG:
+        return
+    off_s = float(np.median(attitudes.later_s - attitudes.stamp_s))
+    _log.warning(
+        "%s: its headings have no time, and may be %.3g s %s than taken, which is up to %.1f deg: log them "
+        "between two sentences of their epoch (GGA, HDT, RMC), or with times (PASHR)",
+        where, off_s, "earlier" if is_second else "later", worst_deg,
+    )  # fmt: skip
+
+
+def _usable(readings: Readings, settings: PoseSettings, where: str) -> Readings:
+    """The readings without those that are no numbers, not sure enough, or strays."""
+    attitudes = readings.attitudes
+    assert attitudes is not None
+    fixed = _without(readings, _finite(readings.points, readings.sigma_m, where, "positions"))
+    fixed = _without(fixed, _sure_enough(fixed, settings.max_sigma_m, where))
+    fixed = _without(fixed, without_strays(fixed.stamp_s, _metres(fixed, where), where))
+    turned = _finite(attitudes.rotation.reshape(-1, 9), np.zeros(len(attitudes.stamp_s)), where, "headings")
+    attitudes = attitudes.at(turned)
+    attitudes = attitudes.at(without_stray_turns(attitudes.stamp_s, attitudes.rotation, where))
+    return replace(fixed, attitudes=attitudes)
+
+
+def _without(readings: Readings, is_usable: BoolArray) -> Readings:
+    """The readings whose positions are ``kept`` (P,)."""
+    rows = {key: getattr(readings, key)[is_usable] for key in ("stamp_s", "points", "sigma_m")}
+    return replace(readings, **rows)
+
+
+def _finite(values: FloatArray, sigma_m: FloatArray, where: str, things: str) -> BoolArray:
+    """Flags (N,) of the rows of ``values`` (N, V) that are numbers; the others are counted."""
+    is_number = np.asarray(np.isfinite(values).all(axis=1))
+    lost = ~is_number & ~np.isinf(sigma_m)  # a position without a fix is told of as such
+    if not is_number.any():
+        raise DriveError(f"{where}: none of its {len(is_number)} {things} is a number; record it again")
+    if lost.any():
+        _log.warning(
+            "%s: left out %d of %d %s that are no numbers", where, int(lost.sum()), len(lost), things
+        )
+    return is_number
+
+
+def _metres(readings: Readings, where: str) -> FloatArray:
+    """The positions (P, 3) in m, in any frame."""
+    if not readings.geodetic:
+        return readings.points
+    middle = np.median(readings.points, axis=0)
+    # Strays off the earth stay far away.
+    limited = np.clip(readings.points, [-90.0, -540.0, -1e7], [90.0, 540.0, 1e7])
+    return earth.enu_from_geodetic(
+        GeodeticOrigin(*np.clip(middle, [-90, -180, -1e7], [90, 180, 1e7])), limited
+    )
+
+
+def _recorded(
+    readings: Readings, settings: PoseSettings, origin: GeodeticOrigin | None, max_gap_s: float, where: str
+) -> Recorded:
+    """The vehicle's poses in the map, of sure readings with headings."""
+    attitudes = readings.attitudes
+    assert attitudes is not None
     rotation, has_heading = _rotation_at(readings, max_gap_s, where)
     points = readings.points[has_heading]
-    sigma_m = readings.sigma_m[has_heading]
     rotation = rotation @ settings.vehicle_from_sensor.T
     stamp_s = readings.stamp_s[has_heading] + settings.offset_s
     if readings.geodetic or settings.crs is not None:
@@ -162,13 +289,23 @@ def assemble(
                 raise DriveError(f"{where}, {key}: {only}")
     if settings.lever_arm_m is not None:
         points = points - rotation @ settings.lever_arm_m
-    # Root mean squares of the sigmas that are stated.
-    noise = {
+    noise = _noise(readings.sigma_m[has_heading], attitudes)
+    return Recorded(Trajectory(stamp_s, make_transform(rotation, points)), noise, origin)
+
+
+def _noise(sigma_m: FloatArray, attitudes: Attitudes) -> dict[str, float]:
+    """Root mean squares of the sigmas that are stated."""
+    tilt_sigma_rad = np.array([]) if attitudes.tilt_sigma_rad is None else attitudes.tilt_sigma_rad
+    values_of = {
+        "position_m": sigma_m,
+        "heading_rad": attitudes.sigma_rad,
+        "roll_pitch_rad": tilt_sigma_rad,
+    }
+    return {
         key: float(np.sqrt(np.mean(np.square(stated))))
-        for key, values in (("position_m", sigma_m), ("heading_rad", heading_sigma_rad))
+        for key, values in values_of.items()
         if len(stated := values[np.isfinite(values) & (values > 0)])
     }
-    return Recorded(Trajectory(stamp_s, make_transform(rotation, points)), noise, origin)
 
 
 def _sure_enough(readings: Readings, max_sigma_m: float, where: str) -> BoolArray:

@@ -1,33 +1,25 @@
-"""Readings of a pose file or topic, before frames, antenna and noise; from CSV files and NMEA 0183 logs.
+"""Readings of a pose file or topic, before frames, antenna and noise; and those of CSV files.
 
 The columns of tables say by their names what they hold and in which unit; ``columns`` in ``drive.yaml``
 translates these names.
-
-In a receiver's log, GGA gives positions and their quality, GST their standard deviations, RMC or ZDA the
-date, HDT, THS or PASHR the heading; HDT and THS, which have no time, belong to the sentence before them. A
-course over ground is no heading.
 """
 
 from __future__ import annotations
 
-import csv
-import logging
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from datetime import UTC, date, datetime
-from functools import reduce
-from operator import xor
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from v2hdm.errors import DriveError, one_line
+from v2hdm.errors import DriveError, shown
 from v2hdm.geometry.rigid import rotation_from_euler
+from v2hdm.io.rows import read_rows
 from v2hdm.io.trajectory import UNITS, checked_rotations, in_order, parse_number
-from v2hdm.records import FloatArray, Trajectory
-from v2hdm.safe.texts import read_bytes, shown
-from v2hdm.store.files import check_keys, read_text, take_mapping, take_text
+from v2hdm.records import BoolArray, FloatArray, Trajectory
+from v2hdm.store.files import check_keys, take_mapping, take_text
 
 SIGMA_OF_QUALITY_M: Mapping[int, float] = {
     0: np.inf,  # no fix
@@ -51,6 +43,18 @@ class Attitudes:
     stamp_s: FloatArray  # (A,) rising strictly
     rotation: FloatArray  # (A, 3, 3) from the sensor to east, north, up of the place, or the map
     sigma_rad: FloatArray  # (A,) of the heading, nan if not stated
+    tilt_sigma_rad: FloatArray | None = None  # (A,) of roll and pitch, nan if not stated
+    later_s: FloatArray | None = (
+        None  # (A,) the times that they have instead, where the source leaves it open
+    )
+
+    def at(self, rows: BoolArray) -> Attitudes:
+        """Those of some ``rows`` (A,)."""
+        more = {
+            key: None if (values := getattr(self, key)) is None else values[rows]
+            for key in ("tilt_sigma_rad", "later_s")
+        }
+        return Attitudes(self.stamp_s[rows], self.rotation[rows], self.sigma_rad[rows], **more)
 
 
 @dataclass(frozen=True)
@@ -63,7 +67,7 @@ class Readings:
     geodetic: bool
     sigma_m: FloatArray  # (P,) of a horizontal coordinate, nan where not stated, infinite without a fix
     attitudes: Attitudes | None
-    antenna: bool = field(default=False)  # which seldom sits at the vehicle's origin
+    point: str = ""  # what the positions are of, which seldom sits at the vehicle's origin: an antenna's
 
 
 def readings_of_poses(poses: Trajectory) -> Readings:
@@ -73,18 +77,10 @@ def readings_of_poses(poses: Trajectory) -> Readings:
     return Readings(poses.stamp_s, poses.map_from_vehicle[:, :3, 3], False, unknown, attitudes)
 
 
-def read_stamps(path: Path, count: int, things: str) -> FloatArray:
-    """Times (``count``,) in s, one per line; raises DriveError where there are not as many as ``things``."""
-    stamp_s = np.array(
-        [
-            parse_number(line, f"{path}: line {number}")
-            for number, line in enumerate(read_text(path, DriveError).splitlines(), start=1)
-            if line.strip() and not line.lstrip().startswith("#")
-        ]
-    )
-    if len(stamp_s) != count:
-        raise DriveError(f"{path}: {len(stamp_s)} times for {count} {things}; give one of each")
-    return stamp_s
+def headings_only(attitudes: Attitudes | None) -> Readings:
+    """Readings without a position."""
+    none = np.zeros((0, 3))
+    return Readings(none[:, 0], none, True, none[:, 0], attitudes)
 
 
 _STAMPS: Mapping[str, float] = {f"stamp_{unit}": scale for unit, scale in UNITS.items()}
@@ -101,7 +97,9 @@ from x or east; roll is positive with the left side up, ``pitch_...`` with the n
 up."""
 
 
-def read_table(path: Path, entry: dict[str, Any], root: Path, where: str) -> Readings:
+def read_table(
+    path: Path, entry: dict[str, Any], root: Path, where: str, near_s: float | None = None
+) -> Readings:
     """Read the CSV file at ``path``, separated by commas, semicolons, tabs or blanks."""
     names = take_mapping(entry.get("columns", {}), f"{where}, columns", DriveError)
     check_keys(names, (), NAMES, f"{where}, columns", DriveError)
@@ -112,7 +110,12 @@ def read_table(path: Path, entry: dict[str, Any], root: Path, where: str) -> Rea
     columns = {name: values[rows] for name, values in columns.items()}
     geodetic = _GEODETIC[0] in columns
     coordinates = _GEODETIC if geodetic else _MAP
+    rotation = _rotation(columns, path)
+    heading_sigma = np.radians(columns.get("heading_sigma_deg", np.full(len(rows), np.nan)))
+    attitudes = None if rotation is None else Attitudes(stamp_s[rows], rotation, heading_sigma)
     if geodetic == (_MAP[0] in columns):
+        if attitudes is not None and not geodetic:
+            return headings_only(attitudes)
         either = f"{', '.join(_MAP)} or {', '.join(_GEODETIC)}"
         raise DriveError(f"{path}: needs positions, as columns {either}, but not both")
     _check_there(columns, coordinates[:2], path)
@@ -125,7 +128,9 @@ def read_table(path: Path, entry: dict[str, Any], root: Path, where: str) -> Rea
     heading_sigma = np.radians(columns.get("heading_sigma_deg", np.full(count, np.nan)))
     rotation = _rotation(columns, path)
     attitudes = None if rotation is None else Attitudes(stamp_s[rows], rotation, heading_sigma)
-    return Readings(stamp_s[rows], points, geodetic, sigma_m, attitudes, antenna=geodetic)
+    return Readings(
+        stamp_s[rows], points, geodetic, sigma_m, attitudes, point="an antenna's" if geodetic else ""
+    )
 
 
 def _columns(path: Path, names: Mapping[str, str]) -> dict[str, FloatArray]:
@@ -133,7 +138,7 @@ def _columns(path: Path, names: Mapping[str, str]) -> dict[str, FloatArray]:
     header, rows = read_rows(path, ",;\t", "pose")
     for ours, theirs in names.items():
         if header.count(theirs) != 1:
-            problem = f"has no column '{theirs}' for {ours}, or two"
+            problem = f"has no column {shown(theirs)} for {ours}, or two"
             raise DriveError(f"{path}: {problem}; it has: {', '.join(header)}")
     place_of = {ours: header.index(theirs) for ours, theirs in names.items()}
     for place, name in enumerate(header):
@@ -146,45 +151,6 @@ def _columns(path: Path, names: Mapping[str, str]) -> dict[str, FloatArray]:
     return {name: np.array(values, dtype=np.float64) for name, values in table.items()}
 
 
-class Table(NamedTuple):
-    """A CSV file: the names in its first line, and the cells of each further line with its number."""
-
-    header: list[str]
-    rows: list[tuple[int, list[str]]]
-
-
-def read_rows(path: Path, separators: str, thing: str) -> Table:
-    """The names and the cells of a CSV file, each row as long as the line of names.
-
-    The first of ``separators`` in the line of names separates cells, else blanks do; ``#`` begins a comment.
-    """
-    text = read_text(path, DriveError)
-    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
-    lines = [*lines[:1], *(line for line in lines[1:] if not line[1].lstrip().startswith("#"))]
-    if len(lines) < 2:
-        raise DriveError(f"{path}: has no {thing}; expected a line of column names and one line per {thing}")
-    title = lines[0][1].lstrip("\ufeff# ")
-    separator = next((mark for mark in separators if mark in title), None)
-
-    def split(line: str) -> list[str]:
-        if separator is None:
-            cells = line.split()
-        else:
-            cells = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
-        return [one_line(cell) for cell in cells]
-
-    try:
-        header = split(title)
-        rows = [(number, split(line)) for number, line in lines[1:]]
-    except csv.Error as failure:
-        raise DriveError(f"{path}: is not a table ({failure}); fix its quotes or its longest cell") from None
-    for number, cells in rows:
-        if len(cells) != len(header):
-            problem = f"{len(cells)} cells under {len(header)} columns"
-            raise DriveError(f"{path}: line {number}: {problem}; fix that line")
-    return Table(header, rows)
-
-
 def _parse(name: str, cell: str, where: str) -> float:
     try:
         if name == "utc":
@@ -194,7 +160,7 @@ def _parse(name: str, cell: str, where: str) -> float:
             return parse_sigma(cell)
     except ValueError:
         kind = "a time such as 2024-05-17T08:30:00.25Z" if name == "utc" else "a number, 0 or more"
-        raise DriveError(f"{where}: '{cell}' is not {kind}; fix that line") from None
+        raise DriveError(f"{where}: {shown(cell)} is not {kind}; fix that line") from None
     return parse_number(cell, where)
 
 
@@ -217,7 +183,9 @@ def _stamps(columns: Mapping[str, FloatArray], path: Path) -> FloatArray:
 def _check_there(columns: Mapping[str, FloatArray], names: Sequence[str], path: Path) -> None:
     for name in names:
         if name not in columns:
-            raise DriveError(f"{path}: has no column '{name}'; give the file's name for it under columns")
+            raise DriveError(
+                f"{path}: has no column {shown(name)}; give the file's name for it under columns"
+            )
 
 
 def _rotation(columns: Mapping[str, FloatArray], path: Path) -> FloatArray | None:
@@ -245,152 +213,3 @@ def _rotation(columns: Mapping[str, FloatArray], path: Path) -> FloatArray | Non
     yaw = np.pi / 2 - radians("heading") if "heading_deg" in columns else radians("yaw")
     pitch = -radians("pitch_up") if "pitch_up_deg" in columns else radians("pitch")
     return rotation_from_euler(radians("roll"), pitch, yaw)
-
-
-_log = logging.getLogger(__name__)
-
-_DAY_S = 86400.0  # seconds of a day
-
-
-def read_nmea(path: Path, entry: dict[str, Any], root: Path, where: str) -> Readings:
-    """Read the log at ``path``; damaged sentences are left out and counted, and refused if they prevail."""
-    lines = read_bytes(path, DriveError).decode("ascii", errors="replace").splitlines()
-    first = None
-    if "date" in entry:
-        day = take_text(entry["date"], f"{where}, date", DriveError)
-        try:
-            first = date.fromisoformat(day)
-        except ValueError:
-            raise DriveError(f"{where}, date: expected a day such as 2024-05-17, got {shown(day)}") from None
-    return nmea_readings(lines, str(path), first)
-
-
-def nmea_readings(lines: Iterable[str], where: str, first_day: date | None = None) -> Readings:
-    """Readings of sentences in the order of the log, from ``first_day`` on where none has a date."""
-    log = _Log(where)
-    total = bad = 0
-    for line in lines:
-        start = line.find("$")
-        if start < 0:
-            continue
-        total += 1
-        try:
-            log.take(_fields(line[start:]))
-        except (ValueError, IndexError):
-            bad += 1
-    if bad:
-        _log.warning("%s: left out %d of %d damaged sentences", where, bad, total)
-    if 2 * bad > total:
-        raise DriveError(f"{where}: {bad} of {total} NMEA sentences are damaged; record the log again")
-    return log.readings(first_day)
-
-
-class _Log:
-    """Sentences so far; times are seconds of the day until the date is known."""
-
-    def __init__(self, where: str) -> None:
-        self._where = where
-        self._day = 0
-        self._above_sea = False
-        self._time_s: float | None = None
-        self._first_date: date | None = None
-        self._fixes: dict[float, tuple[float, ...]] = {}
-        self._attitudes: dict[float, tuple[float, ...]] = {}
-        self._sigma_m: dict[float, float] = {}
-
-    def take(self, fields: list[str]) -> None:
-        """One sentence, its fields without ``$`` and checksum."""
-        kind = fields[0] if fields[0] == "PASHR" else fields[0][-3:]
-        if kind == "GGA":
-            stamp = self._time(fields[1])
-            if int(fields[6] or 0) == 0 or not fields[2]:
-                return
-            self._above_sea |= not fields[11]
-            height_m = float(fields[9]) + float(fields[11] or 0.0)
-            place = (_angle(fields[2], fields[3]), _angle(fields[4], fields[5]), height_m)
-            self._fixes[stamp] = (*place, SIGMA_OF_QUALITY_M.get(int(fields[6]), np.inf))
-        elif kind == "RMC":
-            self._time(fields[1])
-            if fields[9]:
-                self._dated(datetime.strptime(fields[9], "%d%m%y").replace(tzinfo=UTC).date())
-        elif kind == "ZDA":
-            self._time(fields[1])
-            self._dated(date(int(fields[4]), int(fields[3]), int(fields[2])))
-        elif kind == "GST":
-            stamp = self._time(fields[1])
-            sigma_m = np.hypot(parse_sigma(fields[6]), parse_sigma(fields[7])) / np.sqrt(2)
-            self._sigma_m[stamp] = float(sigma_m)
-        # The modes of THS: autonomous, estimated, manual, simulated, and V for invalid.
-        elif kind == "HDT" or (kind == "THS" and fields[2] != "V"):
-            if fields[1] and self._time_s is not None:
-                self._attitudes[self._time_s] = (float(fields[1]), 0.0, 0.0, np.nan)
-        elif kind == "PASHR" and fields[2] and fields[3] == "T":
-            # Roll to starboard is left side up, as ours; pitch counts bow up, ours nose down.
-            sigma_deg = parse_sigma(fields[9])
-            values = (float(fields[2]), float(fields[4] or 0), -float(fields[5] or 0), sigma_deg)
-            self._attitudes[self._time(fields[1])] = values
-
-    def readings(self, first_day: date | None) -> Readings:
-        """All of it on one clock, seconds since 1970 UTC."""
-        if not self._fixes:
-            raise DriveError(f"{self._where}: no GGA sentence with a position; log GGA and HDT, THS or PASHR")
-        day = self._first_date or first_day
-        if day is None:
-            advice = "add date, the day of the first sentence"
-            raise DriveError(f"{self._where}: no RMC or ZDA sentence states the date: {advice}")
-        if self._above_sea:
-            _log.warning(
-                "%s: its heights count from the sea, and GGA does not say where that is; add geoid_m if the "
-                "map is to have heights above the ellipsoid", self._where,
-            )  # fmt: skip
-        begin_s = datetime(day.year, day.month, day.day, tzinfo=UTC).timestamp()
-        stamp_s, fixes = _table(self._fixes, begin_s, self._where)
-        sigma_m = np.array([self._sigma_m.get(stamp, np.nan) for stamp in self._fixes])
-        sigma_m = sigma_m[in_order(np.array(list(self._fixes)), self._where, "fix")]
-        # The receiver's own figure counts as far as there is a fix at all.
-        sigma_m = np.where(np.isfinite(sigma_m) & np.isfinite(fixes[:, 3]), sigma_m, fixes[:, 3])
-        attitudes = None
-        if self._attitudes:
-            attitude_s, angles = _table(self._attitudes, begin_s, self._where)
-            heading, roll, pitch, sigma = np.radians(angles).T
-            rotation = rotation_from_euler(roll, pitch, np.pi / 2 - heading)
-            attitudes = Attitudes(attitude_s, rotation, sigma)
-        return Readings(stamp_s, fixes[:, :3], True, sigma_m, attitudes, antenna=True)
-
-    def _time(self, text: str) -> float:
-        """``hhmmss.sss`` in s since the first day's midnight; past midnight a new day begins."""
-        of_day = 3600.0 * int(text[:2]) + 60.0 * int(text[2:4]) + float(text[4:])
-        stamp = of_day + self._day * _DAY_S
-        if self._time_s is not None and stamp < self._time_s - _DAY_S / 2:
-            self._day += 1
-            stamp += _DAY_S
-        self._time_s = stamp
-        return stamp
-
-    def _dated(self, today: date) -> None:
-        if self._first_date is None:
-            self._first_date = date.fromordinal(today.toordinal() - self._day)
-
-
-def _table(rows: dict[float, tuple[float, ...]], begin_s: float, where: str) -> tuple[FloatArray, FloatArray]:
-    stamp_s = np.array(list(rows))
-    order = in_order(stamp_s, where, "sentence")
-    return begin_s + stamp_s[order], np.array(list(rows.values()))[order]
-
-
-def _fields(sentence: str) -> list[str]:
-    """The fields of a sentence; ValueError where its checksum is wrong."""
-    body, star, check = sentence[1:].strip().partition("*")
-    if star and f"{reduce(xor, map(ord, body), 0):02X}" != check[:2].upper():
-        raise ValueError(check)
-    return body.split(",")
-
-
-def _angle(text: str, side: str) -> float:
-    """Degrees of ``dddmm.mmmm`` and N, S, E or W."""
-    point = text.index(".") if "." in text else len(text)
-    minutes = float(text[point - 2 :])
-    degrees = float(text[: point - 2] or 0) + minutes / 60
-    if side not in ("N", "S", "E", "W"):
-        raise ValueError(side)
-    return -degrees if side in ("S", "W") else degrees

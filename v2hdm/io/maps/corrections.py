@@ -13,6 +13,10 @@ from typing import Annotated, Any
 import numpy as np
 
 from v2hdm.errors import MapFileError
+from v2hdm.geometry.planar import is_simple, signed_area
+from v2hdm.records import FloatArray
+from v2hdm.safe.fields import take_whole
+from v2hdm.safe.texts import MOST_YAML_BYTES, shown, take_name
 from v2hdm.store.files import (
     check_keys,
     dump_yaml,
@@ -22,7 +26,6 @@ from v2hdm.store.files import (
     take_choice,
     take_mapping,
     take_number,
-    take_text,
 )
 
 ACCEPTED = "accepted"
@@ -32,6 +35,11 @@ SIGMA_M = 0.02  # sigma of a corner that a person places beside the others of it
 
 _HEAD = "# Corrections of a map by a person: map.corrections=THIS FILE in the next run (docs/report.md).\n"
 _MOST = 100_000  # entries that a file of corrections may have; chosen
+_LONGEST_REASON = 1000  # letters of a reason; chosen
+_FARTHEST_M = 1e7  # from a map's origin to any place in it, m: a quarter of the earth
+_LARGEST_ID = 1_000_000_000  # of a marking, as in maps
+_CORNERS = ("1", "2", "3", "4")
+_SAME_DIGITS = 3  # decimals, m, up to which the outlines of two corrections of one marking are the same
 
 _KIND_AND_OUTLINE_MAP = (
     "kind and outline_map are its class and corners (N, 2), m, in the map that they saw, one point if "
@@ -69,7 +77,24 @@ def read_corrections(path: Path) -> list[Correction]:
     entries = content["corrections"]
     if not isinstance(entries, list) or len(entries) > _MOST:
         raise MapFileError(f"{path}: corrections: expected a list; see docs/report.md")
-    return [correction_of(entry, f"{path}: corrections[{number}]") for number, entry in enumerate(entries)]
+    corrections = [
+        correction_of(entry, f"{path}: corrections[{number}]") for number, entry in enumerate(entries)
+    ]
+    number_of_outline: dict[tuple[float, ...], int] = {}
+    for number, correction in enumerate(corrections):
+        outline_m = tuple(np.round(np.ravel(correction.outline_map), _SAME_DIGITS).tolist())
+        first = number_of_outline.setdefault(outline_m, number)
+        if _said(correction) != _said(corrections[first]):
+            raise MapFileError(
+                f"{path}: corrections[{first}] and corrections[{number}] contradict each other on the "
+                f"{correction.place}; keep one of them"
+            )
+    return corrections
+
+
+def _said(correction: Correction) -> tuple[object, ...]:
+    """The sentence that a correction states of its marking."""
+    return correction.says, correction.new_kind, correction.moved
 
 
 def correction_of(content: object, where: str) -> Correction:
@@ -77,35 +102,70 @@ def correction_of(content: object, where: str) -> Correction:
     entry = take_mapping(content, where, MapFileError)
     optional = ("marking", "new_class", "moved", "sigma_m", "reason")
     check_keys(entry, ("says", "class", "outline_map"), optional, where, MapFileError)
-    outline = take_array(entry["outline_map"], (-1, 2), f"{where}: outline_map", MapFileError)
+    outline = _take_places(entry["outline_map"], f"{where}: outline_map")
     says = take_choice(entry["says"], (ACCEPTED, REJECTED, CORRECTED), f"{where}: says", MapFileError)
-    moved: dict[int, list[float]] = {}
-    for corner, place in take_mapping(entry.get("moved") or {}, f"{where}: moved", MapFileError).items():
-        number = int(corner) if str(corner).isdecimal() else 0
-        if len(outline) != 4 or not 1 <= number <= 4:
-            raise MapFileError(f"{where}: moved: no corner {corner}; quadrilaterals have 1 to 4")
-        moved[number] = take_array(place, (2,), f"{where}: moved: {corner}", MapFileError).tolist()
     sigma_m = take_number(entry.get("sigma_m", SIGMA_M), f"{where}: sigma_m", MapFileError)
     if not len(outline) or not 0 < sigma_m <= 1:
         raise MapFileError(f"{where}: needs a point in outline_map, and sigma_m above 0 and at most 1 m")
     marking = entry.get("marking")
     new = entry.get("new_class")
+    reason = entry.get("reason") or ""
+    if not isinstance(reason, str | int | float) or len(str(reason)) > _LONGEST_REASON:
+        raise MapFileError(f"{where}: reason: expected a text of at most {_LONGEST_REASON} letters")
     return Correction(
         says=says,
-        kind=take_text(entry["class"], f"{where}: class", MapFileError),
+        kind=take_name(entry["class"], f"{where}: class", MapFileError),
         outline_map=outline.tolist(),
-        marking=None if marking is None else int(take_number(marking, f"{where}: marking", MapFileError)),
-        new_kind=None if new is None else take_text(new, f"{where}: new_class", MapFileError),
-        moved=moved,
+        marking=None if marking is None else _take_id(marking, f"{where}: marking"),
+        new_kind=None if new is None else take_name(new, f"{where}: new_class", MapFileError),
+        moved=_take_moved(entry.get("moved"), outline, where),
         sigma_m=sigma_m,
-        reason=str(entry.get("reason") or ""),
+        reason=str(reason),
     )
 
 
+def _take_id(content: object, where: str) -> int:
+    return take_whole(content, -_LARGEST_ID, _LARGEST_ID, where, MapFileError)
+
+
+def _take_places(content: object, where: str) -> FloatArray:
+    """``content`` as places (N, 2) of a map."""
+    places = take_array(content, (-1, 2), where, MapFileError)
+    if np.abs(places).max(initial=0.0) > _FARTHEST_M:
+        raise MapFileError(f"{where}: a place lies more than {_FARTHEST_M:.0e} m away; fix it")
+    return places
+
+
+def _take_moved(content: object, outline: FloatArray, where: str) -> dict[int, list[float]]:
+    """``content`` as new places of corners, which leave an ``outline`` (N, 2) one that goes once around."""
+    moved: dict[int, list[float]] = {}
+    for corner, place in take_mapping(content or {}, f"{where}: moved", MapFileError).items():
+        if len(outline) != 4 or str(corner) not in _CORNERS:
+            raise MapFileError(f"{where}: moved: no corner {shown(corner)[1:-1]}; quadrilaterals have 1 to 4")
+        moved[int(corner)] = _take_places([place], f"{where}: moved: {corner}")[0].tolist()
+    corners = outline.copy()
+    for number, place in moved.items():
+        corners[number - 1] = place
+    if moved and (not is_simple(corners) or signed_area(corners) * signed_area(outline) <= 0):
+        numbers = ", ".join(map(str, sorted(moved)))
+        raise MapFileError(
+            f"{where}: moved: with corner {numbers} there, the outline crosses itself; swap them back"
+        )
+    return moved
+
+
 def write_corrections(corrections: Sequence[Correction], result: str, path: Path) -> None:
-    """Write corrections of a ``result``, whole."""
+    """Write corrections of a ``result``, whole; MapFileError where they could not be read again."""
+    text = corrections_text(corrections, result)
+    if len(corrections) > _MOST or len(text.encode()) > MOST_YAML_BYTES:
+        raise MapFileError(f"{path}: would become too large to be read; begin another file")
+    replace_text(path, text)
+
+
+def corrections_text(corrections: Sequence[Correction], result: str) -> str:
+    """The file that :func:`write_corrections` writes."""
     content = {"result": result, "corrections": [entry_of(correction) for correction in corrections]}
-    replace_text(path, _HEAD + dump_yaml(content))
+    return _HEAD + dump_yaml(content)
 
 
 def entry_of(correction: Correction) -> dict[str, Any]:

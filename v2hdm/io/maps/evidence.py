@@ -9,10 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from v2hdm.errors import MapFileError
-from v2hdm.io.maps.features import ground_height_m
+from v2hdm.io.maps.features import FARTHEST_M, ground_height_m
 from v2hdm.io.maps.geojson import geojson_feature, geojson_positions, write_features
 from v2hdm.records import BoolArray, Exclusion, FloatArray, GeodeticOrigin, IntArray, Road
 from v2hdm.store import files
+
+_LARGEST_ID = 1_000_000_000  # of a marking, as in its map
+_LARGEST = 1e12  # pixel, standard deviation or time, s: chosen, beyond any that was
 
 COLUMNS = (
     *("image", "camera", "taken_s", "marking", "corner", "point"),
@@ -86,10 +89,11 @@ def read_residuals(path: Path) -> Residuals:
             image, camera, taken_s, marking, *figures = row
             number, _, _ = images.setdefault(image, (len(images), camera, float(taken_s)))
             numbers.append([float(marking or 0), *(float(figure) for figure in figures)])
-            if len(numbers[-1]) != len(COLUMNS) - 3:
+            if len(numbers[-1]) != len(COLUMNS) - 3 or not _is_sound(numbers[-1], images[image][2]):
                 raise ValueError
         except ValueError:
-            raise MapFileError(f"{path}: line {line}: not {len(COLUMNS)} fields as in the header") from None
+            problem = f"not {len(COLUMNS)} fields as in the header, with possible numbers"
+            raise MapFileError(f"{path}: line {line}: {problem}; map the drive again") from None
         row_image.append(number)
     table = np.array(numbers, dtype=np.float64).reshape(-1, len(COLUMNS) - 3)
     cameras = tuple(camera for _, camera, _ in images.values())
@@ -107,6 +111,16 @@ def read_residuals(path: Path) -> Residuals:
         residual_px=table[:, 5:7],
         distance_sigma=table[:, 7],
     )
+
+
+def _is_sound(numbers: Sequence[float], taken_s: float) -> bool:
+    """Whether the numbers of a line, from ``marking`` on, and the time of its image can be."""
+    marking, corner = numbers[:2]
+    is_whole = 0 <= marking <= _LARGEST_ID and marking.is_integer() and corner in (1, 2, 3, 4)
+    # A corner behind the camera has a place in the image, and no finite residual.
+    residuals = np.abs(numbers[5:])
+    is_residual = (residuals <= _LARGEST) | ~np.isfinite(residuals)
+    return is_whole and bool(np.abs([*numbers[2:5], taken_s]).max() <= _LARGEST and is_residual.all())
 
 
 def write_exclusions(
@@ -144,6 +158,8 @@ def read_exclusions(path: Path) -> list[Exclusion]:
             for key in ("class", "reason", "cameras")
         )
         at = files.take_array(entry.get("position_map", np.nan), (2,), f"{where}: position_map", MapFileError)
+        if np.abs(at).max() > FARTHEST_M:
+            raise MapFileError(f"{where}: position_map: lies beyond the earth; map the drive again")
         sightings = files.take_number(entry.get("sightings"), f"{where}: sightings", MapFileError)
         excluded.append(Exclusion(kind, at, int(sightings), reason, cameras))
     return excluded

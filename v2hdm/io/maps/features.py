@@ -26,6 +26,7 @@ _PaintT = TypeVar("_PaintT", Marking, Lane, Symbol)
 PAINT = ("paint_left", "paint_left_sigma", "paint_left_change", "paint_left_change_sigma")
 """Properties of the paint that a marking has left: its share, the change since an earlier map, and sigmas."""
 
+FARTHEST_M = 1e7  # largest coordinate of a map's point, m: a quarter of a meridian
 _ALONG_M = 3.0  # distance within which stations share in a point's height, m: noise averages out; chosen
 _AT_ONCE = 1024  # points whose distances to all stations are held in memory at once; chosen
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.errors import ConfigError, V2hdmError, need
+from v2hdm.errors import ConfigError, V2hdmError, need, shown
 from v2hdm.geometry.geodetic import Grid
 from v2hdm.io.maps.features import PAINT, Feature, features_of, properties_of
 from v2hdm.io.maps.geojson import write_geojson
@@ -161,7 +161,7 @@ def check_formats(names: Sequence[str], key: str) -> None:
     """Refuse unknown formats, given by ``key``, and those whose packages are not installed."""
     for name in names:
         if name not in _ALL:
-            raise ConfigError(f"{key}: unknown format '{name}'; choose from: {', '.join(_ALL)}")
+            raise ConfigError(f"{key}: unknown format {shown(name)}; choose from: {', '.join(_ALL)}")
         if (package := _ALL[name].needs) is not None:
             need(package, "gis", f"the format {name}", ConfigError)
 

@@ -29,7 +29,7 @@ from v2hdm.geometry.geodetic import Grid, crs_of
 from v2hdm.io.maps.features import CORNERS, PAINT, POINTS, Feature, features_of, properties_of
 from v2hdm.io.maps.reading import EXACT, GEOMETRY, LAYERS
 from v2hdm.records import CROSSWALK_BAR, DIAMOND, LANE_DASH, LANE_LINE, STOP_LINE, GeodeticOrigin, HDMap
-from v2hdm.store.files import replace_text, whole_file
+from v2hdm.store.files import replace_text, whole_file, xml_text
 from v2hdm.store.names import MOSAIC
 
 LOCAL_CRS = (
@@ -242,9 +242,8 @@ def write_qgis(hd_map: HDMap, path: Path, grid: Grid | None = None) -> None:
     if (path.parent / MOSAIC).is_file():
         element = _layer(tree, layers, "mosaic", f"./{MOSAIC}", "gdal", {"type": "raster"})
         _refer(ET.SubElement(element, "srs"), pyproj.CRS.from_user_input(ground_crs))
-    ET.indent(root, " ")
     doctype = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>"
-    replace_text(path, f"{doctype}\n{ET.tostring(root, encoding='unicode')}\n")
+    replace_text(path, xml_text(root, before=f"{doctype}\n"))
 
 
 def _refer(parent: ET.Element, system: Any) -> None:

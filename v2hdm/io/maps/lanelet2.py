@@ -20,7 +20,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from v2hdm.errors import ConfigError, MapFileError, need
+from v2hdm.errors import ConfigError, MapFileError, need, shown
 from v2hdm.geometry.geodetic import geodetic_from_enu, position_of
 from v2hdm.io.maps.closed_lanes import Bound, closed_lanes, connections
 from v2hdm.io.maps.features import Feature, features_of
@@ -53,7 +53,7 @@ def write_lanelet2(hd_map: HDMap, path: Path, projector: str | None = None) -> N
     """
     projector = projector or (LOCAL if hd_map.origin is None else LOCAL_CARTESIAN)
     if projector not in PROJECTORS:
-        raise ConfigError(f"unknown projector '{projector}'; choose from: {', '.join(PROJECTORS)}")
+        raise ConfigError(f"unknown projector {shown(projector)}; choose from: {', '.join(PROJECTORS)}")
     if hd_map.origin is None and projector != LOCAL:
         problem = f"the map has no origin on the earth, which the projector {projector} needs"
         raise ConfigError(f"{problem}: choose {LOCAL}")

@@ -19,8 +19,9 @@ import numpy as np
 from v2hdm.errors import MapFileError, V2hdmError
 from v2hdm.geometry.geodetic import Grid, enu_from_geodetic
 from v2hdm.geometry.planar import signed_area
-from v2hdm.io.maps.features import CORNERS, OUTLINE, PAINT, POINTS, Feature, map_of, unique_ids
-from v2hdm.records import ACCURACIES, FloatArray, GeodeticOrigin, HDMap, PaintLeft
+from v2hdm.io.maps.corrections import SIGMA_M
+from v2hdm.io.maps.features import CORNERS, FARTHEST_M, OUTLINE, PAINT, POINTS, Feature, map_of, unique_ids
+from v2hdm.records import ACCURACIES, BoolArray, FloatArray, GeodeticOrigin, HDMap, PaintLeft
 from v2hdm.safe.databases import opened, rows_of
 from v2hdm.safe.fields import take_covariance, take_origin, take_whole
 from v2hdm.safe.texts import parse_json, shown, take_name
@@ -126,6 +127,8 @@ def read_geopackage(path: Path) -> HDMap:
 
 _READERS: Mapping[str, Callable[[Path], HDMap]] = {".geojson": read_geojson, ".gpkg": read_geopackage}
 
+_RIGID_M = 1e-3  # largest difference, m, between the motions of a feature's points that moved as a whole
+
 
 @dataclass(frozen=True)
 class Geometry:
@@ -172,6 +175,10 @@ class _Reader:
             raise MapFileError(f"{where}: a marking has four corners, not {len(feature.points_map)}; fix it")
         if feature is not stored and len(stored.points_map):
             self._edited.append(len(self._features))
+        if np.abs(feature.points_map).max(initial=0.0) > FARTHEST_M:
+            raise MapFileError(
+                f"{where}: a point lies beyond the earth, in metres of the map; fix or drop it"
+            )
         self._features.append(feature)
 
     def map(self) -> HDMap:
@@ -195,7 +202,7 @@ def _believed(
     """``stored`` itself where the geometry says the same, else what the geometry says, point by point.
 
     A ring may start at another corner and run the other way round. Where the number of points has not
-    changed, they keep their order and covariance, and their heights unless these were edited, too.
+    changed, they keep their order, and their heights unless these were edited, too.
     """
     positions = geometry.positions
     if len(positions) != len(stored.points_map):
@@ -210,11 +217,43 @@ def _believed(
     if agree.all():
         return stored
     xyz = _in_map(positions, stored.heights_m, origin)
-    points_map = np.where(agree[:, :2].all(axis=1, keepdims=True), stored.points_map, xyz[:, :2])
+    is_moved = np.logical_not(agree[:, :2].all(axis=1))
+    points_map = np.where(is_moved[:, None], xyz[:, :2], stored.points_map)
     heights_m = stored.heights_m
     if not agree[:, 2:].all():
         heights_m = np.where(agree[:, 2], stored.xyz_map[:, 2], xyz[:, 2])
-    return replace(stored, points_map=points_map, heights_m=heights_m)
+    moved_m = points_map - stored.points_map
+    return replace(_placed_by_hand(stored, is_moved, moved_m), points_map=points_map, heights_m=heights_m)
+
+
+def _placed_by_hand(stored: Feature, is_moved: BoolArray, moved_m: FloatArray) -> Feature:
+    """The feature with the sigmas of points (N,) that a person moved by ``moved_m`` (N, 2), and no accuracy.
+
+    Beside the others they have these's common error and a hand's own, as corrections do (docs/report.md). A
+    feature that was moved as a whole keeps its shape, and a hand placed it once.
+    """
+    if not is_moved.any():
+        return stored
+    count = len(is_moved)
+    as_whole = is_moved.all() and np.ptp(moved_m, axis=0).max() < _RIGID_M
+    mixing = np.eye(count)
+    if not as_whole:
+        beside = is_moved if is_moved.all() else np.logical_not(is_moved)
+        mixing[is_moved] = beside / beside.sum()
+    hand_m2 = SIGMA_M**2 * (np.ones((count, count)) if as_whole else np.diag(is_moved.astype(np.float64)))
+    covariance_m2 = stored.covariance_m2
+    if covariance_m2 is not None:
+        by_axis = np.kron(mixing, np.eye(2))
+        covariance_m2 = by_axis @ covariance_m2 @ by_axis.T + np.kron(hand_m2, np.eye(2))
+    relative_m, place_m, vertex_m = stored.relative_sigma_m, stored.place_sigma_m, stored.vertex_sigma_m
+    return replace(
+        stored,
+        covariance_m2=covariance_m2,
+        relative_sigma_m=None if relative_m is None else float(np.hypot(relative_m, np.sqrt(hand_m2.mean()))),
+        place_sigma_m=None if place_m is None else float(np.hypot(place_m, np.sqrt(np.diag(hand_m2).mean()))),
+        vertex_sigma_m=None if vertex_m is None else np.sqrt(vertex_m**2 + np.diag(hand_m2)),
+        accuracy=None,
+    )
 
 
 def _redrawn(

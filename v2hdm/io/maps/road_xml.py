@@ -96,13 +96,17 @@ def write_opendrive(hd_map: HDMap, path: Path) -> None:
 
 def _roads(features: Sequence[Feature]) -> list[_Road]:
     """A road for each closed lane, else one without width that carries all markings."""
-    lines = [feature for feature in features if not feature.closed]
+    open_features = [feature for feature in features if not feature.closed]
+    lines = [line for line in open_features if len(_spaced(line.xyz_map)) > 1]
     roads = []
     for lane in closed_lanes([feature.points_map for feature in lines]):
         left = lines[lane.left.line]
         right = lines[lane.right.line]
         xyz = _spaced(left.xyz_map[lane.left.order])
-        across = _Road(_spaced(right.xyz_map[lane.right.order]), np.zeros(0), ("", ""))
+        beside = _spaced(right.xyz_map[lane.right.order])
+        if min(len(xyz), len(beside)) < 2:
+            continue
+        across = _Road(beside, np.zeros(0), ("", ""))
         width_m = np.array([across.nearest(point).distance_m for point in xyz[:, :2]])
         roads.append(_Road(xyz, width_m, (_mark(left), _mark(right))))
     if roads:
@@ -125,7 +129,7 @@ def _through_centres(features: Sequence[Feature]) -> FloatArray:
 
 
 def _spaced(xyz: FloatArray) -> FloatArray:
-    """A line without vertices that lie upon one another."""
+    """A line without vertices that lie upon one another: a single one where all do."""
     is_next_apart = np.linalg.norm(np.diff(xyz[:, :2], axis=0), axis=1) > _LEAST_STEP_M
     spaced: FloatArray = xyz[np.insert(is_next_apart, 0, True)]
     return spaced

@@ -14,7 +14,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
-from v2hdm.records import SIGMAS_95, FloatArray, HDMap
+from v2hdm.records import TWO_SIDED_95, FloatArray, HDMap
 from v2hdm.report.page.facts import Facts, GroundResiduals, Route
 from v2hdm.report.style import OKABE_ITO, RC, draw_arrows
 
@@ -206,7 +206,8 @@ def _range_chart(residuals: GroundResiduals) -> str:
     ):
         left = figure.subplots()
         right = other.subplots()
-        farthest = float(np.ceil(residuals.range_m.max(initial=1.0)))
+        on_ground_m = residuals.range_m[np.isfinite(residuals.range_m)]
+        farthest = float(np.ceil(on_ground_m.max(initial=1.0)))
         edges = np.linspace(0, farthest, max(2, min(int(farthest), 24)) + 1)
         ground_cm = 100 * np.linalg.norm(residuals.ground_m, axis=1)
         for number, name in enumerate(residuals.cameras):
@@ -256,7 +257,7 @@ def _route_chart(route: Route, residuals: GroundResiduals) -> str:
             moved_cm = 100 * (np.linalg.inv(route.recorded) @ route.map_from_vehicle)[:, :2, 3]
             for axis, name in enumerate(("forward", "left")):
                 shift = moved_cm[:, axis]
-                band = SIGMAS_95 * 100 * route.sigma[:, axis]
+                band = TWO_SIDED_95 * 100 * route.sigma[:, axis]
                 look = _look(axis)
                 shade = {"color": look["color"], "alpha": 0.15, "lw": 0}
                 panels[1].fill_between(way_m, shift - band, shift + band, **shade)
@@ -271,20 +272,20 @@ def _route_chart(route: Route, residuals: GroundResiduals) -> str:
     return out[0]
 
 
-def ellipse_chart(semi_axes_cm: Mapping[str, FloatArray]) -> str:
-    """Cumulative distribution of corners by semi-major axis of the 95 % ellipse."""
-    with _chart("ellipse", _SINGLE_IN, 2.2) as (figure, out):
+def radius_chart(radii_cm: Mapping[str, FloatArray]) -> str:
+    """Cumulative distribution of corners and markings by their 95 % radius."""
+    with _chart("radius", _SINGLE_IN, 2.2) as (figure, out):
         axes = figure.subplots()
-        top = max((float(values.max(initial=0.0)) for values in semi_axes_cm.values()), default=1.0)
-        for number, (name, values) in enumerate(semi_axes_cm.items()):
+        top = max((float(values.max(initial=0.0)) for values in radii_cm.values()), default=1.0)
+        for number, (name, values) in enumerate(radii_cm.items()):
             order = np.sort(values)
             share = 100 * np.arange(1, len(order) + 1) / max(len(order), 1)
             axes.step(
                 np.concatenate([[0], order, [top]]), np.concatenate([[0], share, [100]]), where="post",
                 label=name, **_look(number),
             )  # fmt: skip
-        axes.set(xlabel="95 % error (cm)", xlim=(0, max(top, 1e-3)))
-        axes.set(ylabel="fraction of corners (%)", ylim=(0, 102))
+        axes.set(xlabel="95 % radius (cm)", xlim=(0, max(top, 1e-3)))
+        axes.set(ylabel="share (%)", ylim=(0, 102))
         axes.grid()
         axes.legend(loc="lower right", fontsize=8.5)
     return out[0]

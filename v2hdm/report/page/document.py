@@ -16,9 +16,10 @@ import numpy as np
 from v2hdm.records import Drive
 from v2hdm.report.page import charts, tables
 from v2hdm.report.page.facts import Facts, ground_residuals, read_facts
-from v2hdm.report.page.layers import background_layer, comparison, layers
-from v2hdm.report.page.pictures import overlays, pictures
+from v2hdm.report.page.layers import background_layer, comparison, earlier_layer, layers
+from v2hdm.report.page.pictures import earlier_pictures, overlays, pictures
 from v2hdm.report.page.tables import in_words
+from v2hdm.site.accuracy import absolute_radii_m, relative_radii_m
 from v2hdm.store import names
 from v2hdm.store.files import replace_text
 
@@ -44,7 +45,7 @@ def document(facts: Facts) -> SimpleNamespace:
         site=_site(facts),
         accuracy=tables.accuracy_table(facts),
         against_truth=tables.truth_table(facts),
-        ellipses=_ellipses(facts),
+        radii=_radii(facts),
         check_points=tables.check_point_table(facts),
         map_data=layers(facts, residuals),
         pictures=pictures(facts),
@@ -83,12 +84,15 @@ def _site(facts: Facts) -> str:
     return charts.site_chart(facts.hd_map, facts.route, excluded)
 
 
-def _ellipses(facts: Facts) -> str:
+def _radii(facts: Facts) -> str:
     markings = facts.hd_map.markings if facts.hd_map else ()
-    measures = {"relative to neighbours": tables.relative_m, "absolute": tables.half_axes_m}
-    series = {name: 100 * measure(markings) for name, measure in measures.items()}
-    series = {name: values_cm for name, values_cm in series.items() if len(values_cm)}
-    return charts.ellipse_chart(series) if series else ""
+    absolute_m = absolute_radii_m(markings).ravel()
+    radii_m = {
+        "corners, in the map’s frame": absolute_m[np.isfinite(absolute_m)],
+        "markings, from marking to marking": relative_radii_m(markings),
+    }
+    series = {name: 100 * values_m for name, values_m in radii_m.items() if len(values_m)}
+    return charts.radius_chart(series) if series else ""
 
 
 _ASSETS = {"vendor": ("leaflet.js", "leaflet.css"), "templates": ("page.css", "map.js", "edit.js")}
@@ -123,10 +127,12 @@ def page_text(
     here = files("v2hdm.report.page")
     facts = read_facts(folder, drive)
     page = document(facts)
-    page.pictures = page.pictures or _earlier(folder / names.REPORT, "pictures")
+    page.pictures = page.pictures or earlier_pictures(_earlier(folder / names.REPORT, "pictures"))
     if page.map_data:
         if background is None:
-            page.map_data["background"] = _earlier(folder / names.REPORT, "map-data").get("background")
+            page.map_data["background"] = earlier_layer(
+                _earlier(folder / names.REPORT, "map-data").get("background")
+            )
         else:
             page.map_data["background"] = background_layer(background, facts)
     return environment.get_template("page.html").render(
@@ -149,7 +155,7 @@ def _earlier(path: Path, name: str) -> dict[str, Any]:
     script = re.search(r'<script type="application/json" id="' + name + '">(.*?)</script>', text, re.DOTALL)
     try:
         return dict(json.loads(script[1])) if script else {}
-    except (ValueError, RecursionError):
+    except (ValueError, TypeError, RecursionError):
         return {}
 
 

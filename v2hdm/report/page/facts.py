@@ -18,6 +18,7 @@ from v2hdm.io.drive.truth import read_truth
 from v2hdm.io.maps.evidence import Residuals, read_exclusions, read_residuals
 from v2hdm.io.maps.features import features_of, map_of
 from v2hdm.io.maps.reading import read_geojson
+from v2hdm.io.metrics import read_metrics
 from v2hdm.io.trajectory import read_tum
 from v2hdm.records import BEST, BoolArray, Calibration, Drive, Exclusion, FloatArray, HDMap, IntArray, Truth
 from v2hdm.store import names
@@ -87,9 +88,7 @@ class Facts:
 
 def read_facts(folder: Path, drive: Drive | None) -> Facts:
     """Read a run's result folder and the data of its ``drive``; MapFileError for damaged files."""
-    if not (folder / names.METRICS).is_file():
-        raise MapFileError(f"{folder}: not a result of v2hdm map (no {names.METRICS}); give its folder")
-    metrics = load_json(folder / names.METRICS, MapFileError)
+    metrics = read_metrics(folder)
     sets = list(metrics.get("results") or {})
     hd_map = read_geojson(folder / names.MAP) if (folder / names.MAP).is_file() else None
     excluded = read_exclusions(folder / names.EXCLUDED) if (folder / names.EXCLUDED).is_file() else []
@@ -137,6 +136,8 @@ def _route(folder: Path, drive: Drive | None) -> Route | None:
     rows = [row for row in read_csv(path, MapFileError)[1:] if row]
     try:
         table = np.array(rows, dtype=np.float64).reshape(len(adjusted.stamp_s), 8)
+        if not np.isfinite(table).all():
+            raise ValueError
     except ValueError:
         raise MapFileError(f"{path}: not one line of 8 numbers per pose of {names.TRAJECTORY}") from None
     stamp_s = adjusted.stamp_s

@@ -15,10 +15,11 @@ from v2hdm.geometry.geodetic import Grid, crs_of, geodetic_from_enu, utm_of
 from v2hdm.records import SIGMAS_95, FloatArray, Lane, Marking, Symbol
 from v2hdm.report.metrics import corner_errors, match_markings, rms
 from v2hdm.report.page.facts import Facts, GroundResiduals
+from v2hdm.safe.backgrounds import Window, background_pixels
 from v2hdm.safe.pixels import read_pixels
-from v2hdm.safe.rasters import Window, background_pixels
+from v2hdm.site.accuracy import corner_radii_m
 from v2hdm.store import names
-from v2hdm.store.files import load_json, take_array, take_text
+from v2hdm.store.files import load_json, take_array, take_mapping, take_text
 
 
 def jpeg(pixels: np.ndarray, quality: int) -> str:
@@ -69,6 +70,18 @@ def _webp(pixels: np.ndarray) -> str:
     while len(text := _coded(".webp", pixels, (cv2.IMWRITE_WEBP_QUALITY, _QUALITY))) > LARGEST_BYTES:
         pixels = shrunk(pixels, 0.9 * float(np.sqrt(LARGEST_BYTES / len(text))))
     return text
+
+
+def earlier_layer(content: object) -> dict[str, Any] | None:
+    """A layer as an earlier report has it; None where it has none, or none that is whole."""
+    try:
+        layer = take_mapping(content, "background", MapFileError)
+        bounds = take_array(layer.get("bounds"), (4,), "bounds", MapFileError).tolist()
+        source = take_text(layer.get("src"), "src", MapFileError)
+        base64.b64decode(source, validate=True)
+    except (MapFileError, ValueError):
+        return None
+    return {"src": source, "type": "image/webp", "bounds": bounds}
 
 
 _BACKGROUND_PX = 3000  # longer side of the background: 20 cm per pixel over 600 m
@@ -123,6 +136,12 @@ def ellipses(marking: Marking) -> FloatArray | None:
     return np.column_stack([half, direction])
 
 
+def _radii(paint: Marking | Symbol) -> list[float] | None:
+    """The 95 % radii, m, of corners or vertices, of which the largest gives the grade."""
+    covariance_m2 = paint.covariance_m2
+    return None if covariance_m2 is None else np.round(corner_radii_m(covariance_m2), 5).tolist()
+
+
 def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
     """The map document: markings, lanes, symbols, truth, route, excluded candidates, mosaic."""
     hd_map = facts.hd_map
@@ -138,6 +157,7 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
         axes = ellipses(marking)
         if axes is not None:
             feature["e"] = np.round(axes, 5).tolist()
+            feature["w"] = _radii(marking)
         if marking.relative_sigma_m is not None:
             feature["r"] = round(SIGMAS_95 * marking.relative_sigma_m, 5)
         if marking.accuracy is not None:
@@ -155,7 +175,7 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
         "lanes": [_feature(lane, kinds, "p", lane.points_map) for lane in hd_map.lanes],
         "symbols": [
             _feature(symbol, kinds, "p", symbol.outline_map)
-            | {"e": None if symbol.sigma_m is None else round(SIGMAS_95 * symbol.sigma_m, 5)}
+            | {"w": _radii(symbol)}
             | ({} if symbol.accuracy is None else {"g": symbol.accuracy})
             for symbol in hd_map.symbols
         ],
@@ -267,9 +287,10 @@ def _changes(facts: Facts) -> list[dict[str, Any]]:
 
 def _number(text: str | None) -> float | None:
     try:
-        return float(text or "")
+        number = float(text or "")
     except ValueError:
         return None
+    return number if np.isfinite(number) else None
 
 
 def _arrows(residuals: GroundResiduals | None) -> dict[int, list[list[float]]]:

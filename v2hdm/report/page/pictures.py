@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 
 from v2hdm.detection.batch import read_image
+from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
+from v2hdm.io.metrics import Number
 from v2hdm.records import FloatArray, Image
 from v2hdm.report.page.facts import Facts, cams_from_map
 from v2hdm.report.page.layers import jpeg, jpeg_of, rounded, shrunk
+from v2hdm.store.files import take_typed
 from v2hdm.store.names import overlay_file
 
 BUDGET_BYTES = 8_000_000  # limit of all pictures, as text in the page: reports stay below 15 MB
@@ -78,6 +81,32 @@ def pictures(facts: Facts) -> dict[str, list[dict[str, Any]]]:
             break
         out.setdefault(cut.key, []).append(picture)
     return out
+
+
+Place = tuple[Number, Number]
+
+
+class Picture(TypedDict):
+    """One picture in the page, as :func:`pictures` makes it."""
+
+    src: str
+    size: tuple[int, int]
+    camera: str
+    image: str
+    t: Number
+    map: list[Place]
+    seen: list[Place]
+
+
+def earlier_pictures(content: object) -> dict[str, list[dict[str, Any]]]:
+    """The pictures of an earlier report; none where somebody has made something else of them."""
+    try:
+        pictures: dict[str, list[dict[str, Any]]] = take_typed(
+            content, dict[str, list[Picture]], "pictures", MapFileError
+        )
+    except MapFileError:
+        return {}
+    return pictures
 
 
 def _of_markings(facts: Facts) -> Iterable[_Cut]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -12,11 +12,11 @@ import numpy as np
 from v2hdm.geometry.ipm import angle_sigmas, centre_sigmas, mounting_angles
 from v2hdm.geometry.planar import length_along
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.records import ACCURACIES, SIGMAS_95, FloatArray, Lane, Marking, Symbol
+from v2hdm.records import ACCURACIES, SIGMAS_95, Lane, Marking, Symbol
 from v2hdm.report.metrics import corner_errors, match_markings
 from v2hdm.report.page.facts import CameraFacts, Facts
-from v2hdm.report.page.layers import ellipses
 from v2hdm.report.terminal import METHODS, figure_columns
+from v2hdm.site.accuracy import absolute_radii_m, radius_of_all_m, relative_radii_m, well_known
 
 
 class Table(NamedTuple):
@@ -42,12 +42,18 @@ def table(headings: Sequence[str], rows: Sequence[Sequence[str]], words: int = 1
 
 
 def number(value: object, digits: int | None = None, factor: float = 1.0) -> str:
-    """A number as text, with three significant digits by default; a dash if there is none."""
+    """A number as text, with three significant digits by default; a dash if there is none.
+
+    What is not zero never reads so: it has one digit then, as 0.04 or 3e-05.
+    """
     if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
         return "–"
     if digits is None:
         digits = min(max(0, 2 - math.floor(math.log10(abs(value)))), 6) if value else 0
-    return f"{factor * value:.{digits}f}".replace("-", "−")
+    text = f"{factor * value:.{digits}f}"
+    if value and not float(text):
+        text = f"{factor * value:.1g}"
+    return text.replace("-", "−")
 
 
 def name_of(kind: str) -> str:
@@ -77,18 +83,6 @@ _LEAST_FOR_SHARE = 20  # least number of corners for a percentage
 _Mapped = TypeVar("_Mapped", bound=Marking | Symbol | Lane)
 
 
-def half_axes_m(markings: Iterable[Marking]) -> FloatArray:
-    """Semi-major axis (4 M,), m, of the 95 % ellipse of every corner that has one."""
-    of_markings = [ellipses(marking) for marking in markings]
-    axes = [of_corners[:, 0] for of_corners in of_markings if of_corners is not None]
-    return np.concatenate(axes or [np.empty(0)])
-
-
-def relative_m(markings: Iterable[Marking]) -> FloatArray:
-    """95 % radius (M,), m, of a marking's contribution to the error of a distance to neighbours."""
-    return np.array([SIGMAS_95 * m.relative_sigma_m for m in markings if m.relative_sigma_m is not None])
-
-
 def key_figures(facts: Facts) -> tuple[Figure, ...]:
     """Key figures at the top of the page."""
     if facts.hd_map is None:
@@ -102,12 +96,15 @@ def key_figures(facts: Facts) -> tuple[Figure, ...]:
         Figure("Markings", str(len(markings)), "", f"and {symbols}"),
         Figure("Lane lines", str(len(facts.hd_map.lanes)), "", f"{length} m in total"),
     ]
-    for name, values, note in (
-        ("Between neighbours", relative_m(markings), "median 95 % error of corners, relative"),
-        ("In the map’s frame", half_axes_m(markings), "median 95 % error of corners, absolute"),
+    judged = well_known(markings)
+    exception = "" if len(judged) == len(markings) else f"; without accuracy {ACCURACIES[-1]}"
+    for name, radii_m, note in (
+        ("In the map’s frame", absolute_radii_m(judged).ravel(), f"holds 95 % of the corners{exception}"),
+        ("From marking to marking", relative_radii_m(judged), f"holds 95 % of the markings{exception}"),
     ):
-        if len(values):
-            figures.append(Figure(name, number(100 * float(np.median(values)), 1), "cm", note))
+        radius_m = radius_of_all_m(radii_m)
+        if math.isfinite(radius_m):
+            figures.append(Figure(name, number(radius_m, 1, 100), "cm", note))
     grades = facts.hd_map.accuracies
     if grades:
         top, *others = ACCURACIES
@@ -129,24 +126,22 @@ def key_figures(facts: Facts) -> tuple[Figure, ...]:
 
 
 def accuracy_table(facts: Facts) -> Table | None:
-    """Formal corner accuracy by class: median and 95th percentile."""
-    if facts.hd_map is None or not len(half_axes_m(facts.hd_map.markings)):
+    """The radii that hold 95 % of corners and markings, by class, and of those that the verdict is about."""
+    markings = () if facts.hd_map is None else facts.hd_map.markings
+    if all(marking.covariance_m2 is None for marking in markings):
         return None
-    by_kind: dict[str, Sequence[Marking]] = {**_by_kind(facts.hd_map.markings)}
+    by_kind: dict[str, Sequence[Marking]] = {**_by_kind(markings)}
     if len(by_kind) > 1:
-        by_kind["all"] = facts.hd_map.markings
+        by_kind["all"] = markings
+    judged = well_known(markings)
+    if len(judged) < len(markings):
+        by_kind[f"all without accuracy {ACCURACIES[-1]}"] = judged
     rows = []
-    for name, markings in by_kind.items():
-        sizes_m = (relative_m(markings), half_axes_m(markings))
-        percentiles_m = [
-            np.percentile(values, percent) if len(values) else None
-            for values in sizes_m
-            for percent in (50, 95)
-        ]
-        cells = [number(value_m, 1, 100) for value_m in percentiles_m]
-        rows.append([name_of(name), str(len(markings)), *cells])
-    kinds = ("relative, median", "relative, 95th", "absolute, median", "absolute, 95th")
-    return table(("class", "markings", *kinds), rows)
+    for name, of_kind in by_kind.items():
+        radii_m = (absolute_radii_m(of_kind).ravel(), relative_radii_m(of_kind))
+        cells = [number(radius_of_all_m(values_m), 1, 100) for values_m in radii_m]
+        rows.append([name_of(name), str(len(of_kind)), *cells])
+    return table(("class", "markings", "in the map’s frame (cm)", "from marking to marking (cm)"), rows)
 
 
 def truth_table(facts: Facts) -> Table | None:

@@ -16,7 +16,7 @@ from v2hdm.geometry.ipm import cam_from_mounting, project_ground
 from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.geometry.planar import winding
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.records import Camera, CameraInfo, CentrePrior, FloatArray, GeodeticOrigin, HDMap
+from v2hdm.records import Camera, CameraFrames, CameraInfo, CentrePrior, FloatArray, GeodeticOrigin, HDMap
 from v2hdm.simulate.port.config import CalibrationConfig, CameraConfig, MountConfig, PortConfig
 from v2hdm.simulate.port.paint import build_layout
 from v2hdm.simulate.port.route import DrivenPoses, Route, build_relief, build_route, drive_along, stands
@@ -170,7 +170,10 @@ def _surveyed_cameras(config: PortConfig) -> dict[str, Camera]:
         prior = CentrePrior(np.array([mount.x_m, mount.y_m, mount.z_m]) + rng.normal(0.0, sigma), sigma)
         roi_vehicle = calibrated_roi if config.initial_ipm == "calibrated" else borrowed_roi
         ipm = {"calibrated": calibrated, "estimated": borrowed}
-        surveyed[name] = Camera(info, ipm, config.initial_ipm, roi_vehicle, prior)
+        surveyed[name] = Camera(
+            info, ipm, config.initial_ipm, roi_vehicle, prior,
+            frames=CameraFrames("base_link", f"{name}_optical_frame"),
+        )  # fmt: skip
     return surveyed
 
 

@@ -22,7 +22,7 @@ from v2hdm.geometry.planar import inside_convex
 from v2hdm.geometry.rigid import camera_centre, ground_in_vehicle
 from v2hdm.io.description import DRIVE_FILE, TRUTH_FOLDER
 from v2hdm.io.drive.writing import write_drive, write_truth
-from v2hdm.io.trajectory import read_image_list
+from v2hdm.io.image_lists import read_image_list
 from v2hdm.progress import Steps
 from v2hdm.records import BoolArray, CameraInfo, Drive, FloatArray, Image, Truth
 from v2hdm.safe.pixels import read_header
@@ -32,7 +32,7 @@ from v2hdm.simulate.port.route import measured_disturbances, pose_noise
 from v2hdm.simulate.render.relief import Relief
 from v2hdm.simulate.render.renderer import RENDERER_VERSION
 from v2hdm.simulate.render.scene import Box, ground_under
-from v2hdm.store.files import whole_file
+from v2hdm.store.files import refuse_url, whole_file
 from v2hdm.store.folders import note_use
 from v2hdm.workers import share_out
 
@@ -136,6 +136,7 @@ def rendered_drive(config: PortConfig, cache: Path, workers: int, progress: Step
 
 def folder_of_port(config: PortConfig, cache: Path) -> Path:
     """The folder of a port's drive in a cache, named by the port and a hash of its configuration."""
+    refuse_url(cache)
     content = asdict(config)
     # Ports that were rendered before there were sessions, stencils and reliefs stay the same.
     if not config.session:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from v2hdm.doors import checked
 from v2hdm.geometry.ipm import apply_homography, initial_extrinsic
 from v2hdm.geometry.lens import distort_points, has_distortion, undistort_points
 from v2hdm.geometry.planar import inside_convex, signed_area
@@ -19,9 +20,12 @@ from v2hdm.ground.results import GroundEstimate
 from v2hdm.io.drive import as_drive
 from v2hdm.io.drive.road import unevenness
 from v2hdm.records import FOOT_M, Camera, CameraInfo, CentrePrior, Drive, FloatArray
+from v2hdm.settings import Processes
 from v2hdm.verdict.inputs import ground as ground_checks
 from v2hdm.verdict.inputs.ground import check_ground, find_cause, path_of
 from v2hdm.verdict.inputs.heading import check_heading
+from v2hdm.verdict.inputs.origin import CHECK as ORIGIN_HEIGHT
+from v2hdm.verdict.inputs.origin import check_origin_height
 from v2hdm.verdict.inputs.poses import Motion, check_attitude, check_jumps, check_noise, check_path
 from v2hdm.verdict.inputs.recording import check_clocks, check_images
 from v2hdm.verdict.verdict import Finding, Status, Verdict, judge, passed
@@ -248,7 +252,7 @@ _LEAST_SWAY_RAD = 0.003  # roll and pitch of every vehicle on its suspension, wh
 _STEPS = ("position jumps", "height jumps", "pose scatter", "image spacing", "pose gaps", "pose rate")
 _MOUNTING = ("roi", "roi range", "ipm against camera matrix", "camera height", "survey against guess")
 _SURVEY = ("survey height", "survey forward", "survey left")
-_GROUND = ground_checks.CHECKS
+_GROUND = (*ground_checks.CHECKS, ORIGIN_HEIGHT)
 
 HIDES: Mapping[str, tuple[str, ...]] = {
     "path length": (*_STEPS, *_GROUND),
@@ -262,6 +266,7 @@ HIDES: Mapping[str, tuple[str, ...]] = {
     "pose noise": _GROUND,
     "height jumps": ("road", "grade", "ground match", "ground residual", "poses against ground"),
     "origin": ("survey forward", "poses against ground"),
+    ORIGIN_HEIGHT: ("survey height",),
     "own images": ("frozen images", *_GROUND),
     "bright images": ("frozen images", "ground match"),
     "dark images": ("frozen images", "ground match"),
@@ -282,11 +287,12 @@ HIDES: Mapping[str, tuple[str, ...]] = {
 """Checks that fail because another one did: the cause is reported, its consequences are not."""
 
 
+@checked
 def check_drive(
     drive: Drive | str | Path,
     *,
     ground: bool | Mapping[str, GroundEstimate] = True,
-    workers: int = 1,
+    workers: Processes = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> Verdict:
     """Check a drive before any long work: poses, clocks, noise, cameras, images, and bare ground.
@@ -334,6 +340,7 @@ def input_findings(drive: Drive, ground: Mapping[str, GroundEstimate] | None = N
     explained = any("ground match" in HIDES.get(f.check, ()) for f in findings if f.status is not Status.PASS)
     # Where the ground never matches and nothing else explains that, usual mistakes are tried.
     findings += check_ground(drive, ground, None if explained else find_cause(drive, ground))
+    findings += check_origin_height(drive, ground)
     return causes(findings)
 
 

@@ -36,8 +36,11 @@ _LEADS = 0.05
 # A third of the usual pairs suffices to see whether the ground matches.
 _QUICK = GroundOptions(pairs=12, free=(), readings=False)
 
+MATCH = "ground match"  # the check whether bare ground matches between the images of a camera
+PATH = "path"  # the check whether it does as the poses are given
+
 CHECKS = (
-    "ground match", "path", "clock", "focal length from ground", "distortion", "grade", "survey height",
+    MATCH, PATH, "clock", "focal length from ground", "distortion", "grade", "survey height",
     "survey forward", "survey left", "ground residual", "poses against ground",
 )  # fmt: skip
 """Names of the checks of this module."""
@@ -182,7 +185,7 @@ def check_ground(
 def _read_as(name: str, estimate: GroundEstimate, reading: Reading) -> Finding:
     as_given = estimate.shares.get(Reading.AS_GIVEN, 0.0)
     best = estimate.shares.get(reading, 0.0)
-    return Finding("path", Status.FAIL, as_given, best, "", _READ_AS[reading], name)
+    return Finding(PATH, Status.FAIL, as_given, best, "", _READ_AS[reading], name)
 
 
 def _camera(drive: Drive, name: str, estimate: GroundEstimate, cause: str | None) -> list[Finding]:
@@ -190,10 +193,10 @@ def _camera(drive: Drive, name: str, estimate: GroundEstimate, cause: str | None
     if estimate.reading is not Reading.AS_GIVEN:
         return [_read_as(name, estimate, estimate.reading)]
     if estimate.status in _NOT_CHECKED and cause is None:
-        return [passed("ground match", name, _NOT_CHECKED[estimate.status])]
+        return [passed(MATCH, name, _NOT_CHECKED[estimate.status])]
     if estimate.status is not GroundStatus.FOUND:
-        return [Finding("ground match", Status.FAIL, as_given, None, "", cause or NO_MATCH, name)]
-    matched = passed("ground match", name, "bare ground matches between the images", as_given)
+        return [Finding(MATCH, Status.FAIL, as_given, None, "", cause or NO_MATCH, name)]
+    matched = passed(MATCH, name, "bare ground matches between the images", as_given)
     surveyed = drive.cameras[name].centre_prior is not None
     judged = [
         _judge_parameter(name, parameter, _confounded(estimate, key))

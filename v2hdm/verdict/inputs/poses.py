@@ -49,6 +49,7 @@ _USELESS = 10.0  # scatter of the poses over their stated noise beyond which the
 _DIFFERENCES = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
 # Poses whose intervals vary less than this share are evenly spaced, as a fourth difference needs.
 _REGULAR = 0.2
+_LEAST_DIFFERENCES = 20  # fewer fourth differences show no scatter; chosen
 _SLOWEST_HZ = 8.0  # below this rate driving itself shows in a fourth difference
 
 
@@ -352,10 +353,14 @@ def _white_noise(motion: Motion) -> _Scatter | None:
     uneven = np.abs(motion.interval_s / interval_s - 1) > _REGULAR
     if interval_s > 1 / _SLOWEST_HZ or uneven.mean() >= _REGULAR:
         return None
+    # A difference over a gap is no noise.
+    even = np.convolve(uneven, np.ones(len(_DIFFERENCES) - 1), mode="valid") == 0
+    if even.sum() < _LEAST_DIFFERENCES:
+        return None
     forward = motion.rotation[:, :2, 0]
     heading = np.concatenate([[0.0], np.cumsum(angle_between(forward[:-1], forward[1:]))])
     position = np.column_stack([_fourth(axis) for axis in motion.position[:, :2].T])
-    return _Scatter(_robust_sigma(position.ravel()), _robust_sigma(_fourth(heading)))
+    return _Scatter(_robust_sigma(position[even].ravel()), _robust_sigma(_fourth(heading)[even]))
 
 
 def _fourth(values: FloatArray) -> FloatArray:

@@ -13,6 +13,7 @@ import numpy as np
 
 from v2hdm.geometry.ipm import apply_homography
 from v2hdm.geometry.lens import distort_points
+from v2hdm.io.trajectory import known_offset
 from v2hdm.records import Camera, Drive, Image
 from v2hdm.safe.pixels import read_pixels
 from v2hdm.verdict.inputs.poses import Motion
@@ -94,12 +95,17 @@ def _held(motion: Motion) -> Finding:
 def _posed(drive: Drive, name: str, posed: int) -> Finding:
     without = drive.unposed.get(name, 0)
     share = without / max(1, posed + without)
+    cause = (
+        "poses and images overlap only in part, or the poses have gaps; check that both are from the same "
+        "drive and on one clock"
+    )
+    if name in drive.listed_s and drive.recorded is not None:
+        clocks = known_offset(drive.listed_s[name], drive.recorded.stamp_s)
+        cause = clocks or cause
     return judge(
         "images without pose", name, share, _WITHOUT_POSE, "",
         fine="the images have poses",
-        wrong=f"{without} of {posed + without} images have no pose at their time: poses and images "
-        "overlap only in part, or the poses have gaps; check that both are from the same drive and on "
-        "one clock",
+        wrong=f"{without} of {posed + without} images have no pose at their time: {cause}",
         status=Status.FAIL if share > _HALF else Status.WARN,
     )  # fmt: skip
 

@@ -14,7 +14,6 @@ from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.stats import chi2
 
 from v2hdm.geometry.rigid import camera_centre
@@ -23,7 +22,14 @@ from v2hdm.mapping.bundle import known_lengths
 from v2hdm.mapping.options import SizeOptions
 from v2hdm.mapping.results import MethodResult, SolveEvidence
 from v2hdm.records import ACCURACIES, SIGMAS_95, Calibration, FloatArray, Marking
-from v2hdm.site.accuracy import LEFT_OUT_BY_GRADE, corner_radii_m, radius_95_m, well_known
+from v2hdm.site.accuracy import (
+    LEFT_OUT_BY_GRADE,
+    absolute_radii_m,
+    radius_95_m,
+    radius_of_all_m,
+    relative_radii_m,
+    well_known,
+)
 from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN
 from v2hdm.site.corrections import unmet
 from v2hdm.survey.check_points import CheckTable, squared
@@ -31,7 +37,6 @@ from v2hdm.verdict.results.solution import doubted, relied_on
 from v2hdm.verdict.verdict import GOAL, Finding, Status, passed
 
 _AHEAD_M = 10.0  # distance, m, within which a vehicle uses what it sees on the ground
-_SHARE = 0.95  # share of the corners that have to meet the goal
 
 
 def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Finding]:
@@ -40,14 +45,14 @@ def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Findin
     goal = f"; goal {100 * goal_m:g} cm"
     if markings:
         judged = well_known(markings)
-        radii_m = np.array([_corner_radii_m(marking) for marking in judged])
-        reached_m = _radius_of_all_m(radii_m.ravel())
+        radii_m = absolute_radii_m(judged)
+        reached_m = radius_of_all_m(radii_m.ravel())
         corners = f"95 % of the corners of {len(judged)} markings"
         says = f"{corners} within {_cm(reached_m)} in the frame of the {frame}"
         says += "" if best.evidence is None else _conditions(best.evidence)
-        relative_m = [SIGMAS_95 * m.relative_sigma_m for m in judged if m.relative_sigma_m is not None]
-        if relative_m:
-            says += f", {_cm(_radius_of_all_m(np.array(relative_m)))} from marking to marking"
+        relative_m = relative_radii_m(judged)
+        if len(relative_m):
+            says += f", {_cm(radius_of_all_m(relative_m))} from marking to marking"
         says += goal + _beside(best, len(markings) - len(judged))
         coarse = list(compress(judged, radii_m.max(axis=1) > goal_m))
         met = 100 * (len(judged) - len(coarse)) // len(markings)
@@ -103,32 +108,12 @@ def _largest_part(best: MethodResult, coarse: Sequence[Marking]) -> str:
     return f"the largest part, {_cm(size_m)}, is {part}"
 
 
-def _corner_radii_m(marking: Marking) -> FloatArray:
-    """The 95 % radii (4,) of a marking's corners, m; infinite where no covariance is stated."""
-    covariance_m2 = marking.covariance_m2
-    return np.full(4, np.inf) if covariance_m2 is None else corner_radii_m(covariance_m2)
-
-
-def _radius_of_all_m(radius_m: FloatArray) -> float:
-    """The radius that holds 95 % of all corners, given the radius (N,) that holds each with 95 %.
-
-    Errors are circular normal: with 1 - 0.05^((r / own)^2) a corner lies within r.
-    """
-    if np.mean(np.isfinite(radius_m)) < _SHARE:
-        return float("inf")
-
-    def missing(radius: float) -> float:
-        return float(np.mean((1 - _SHARE) ** ((radius / radius_m) ** 2))) - (1 - _SHARE)
-
-    return float(brentq(missing, 0.0, 5.0 * float(radius_m[np.isfinite(radius_m)].max())))
-
-
 def _own_m(marking: Marking) -> float:
     """The 95 % radius, m, of a marking's part in a distance and of its worst corner beside its centre."""
     if marking.covariance_m2 is None:
         return 0.0
     centre_m = float(radius_95_m(np.einsum("iajb->ab", marking.covariance_m2.reshape(4, 2, 4, 2)) / 16))
-    shape_m2 = max(float(_corner_radii_m(marking).max()) ** 2 - centre_m**2, 0.0)
+    shape_m2 = max(float(absolute_radii_m([marking]).max()) ** 2 - centre_m**2, 0.0)
     return float(np.hypot(SIGMAS_95 * (marking.relative_sigma_m or 0.0), np.sqrt(shape_m2)))
 
 
@@ -297,13 +282,29 @@ def check_known_sizes(sizes: SizeOptions, best: MethodResult) -> list[Finding]:
     return findings
 
 
+_LISTED = 5  # corrections that a line names: as many as a reader takes in
+
+
 def check_corrections(corrections: Sequence[Correction], best: MethodResult) -> list[Finding]:
-    """A finding where a person's corrections have found nothing to correct."""
+    """The corrections that the map follows, those that the images contradict, and those of nothing."""
+    about = "map.corrections"
+    findings = []
     missing = unmet(corrections, best.hd_map)
-    if not missing:
-        return []
-    says = (
-        f"{len(missing)} of {len(corrections)} match no candidate and have no effect: "
-        f"{', '.join(missing[:5])}; correct a map of this drive, or drop them"
-    )
-    return [Finding("corrections", Status.WARN, float(len(missing)), 0.0, "", says, "map.corrections")]
+    if missing:
+        says = (
+            f"{len(missing)} of {len(corrections)} match no candidate and have no effect: "
+            f"{', '.join(missing[:_LISTED])}; correct a map of this drive, or drop them"
+        )
+        findings.append(Finding("corrections", Status.WARN, float(len(missing)), 0.0, "", says, about))
+    contradicted = [heard.sentence for heard in best.heard if heard.against]
+    if contradicted:
+        says = (
+            f"{len(contradicted)} of {len(corrections)} are followed against the images: "
+            f"{'; '.join(contradicted[:_LISTED])}: look at these again"
+        )
+        count = float(len(contradicted))
+        findings.append(Finding("corrections against images", Status.WARN, count, 0.0, "", says, about))
+    elif best.heard:
+        says = f"the images do not contradict {len(best.heard)} corrections that the map follows"
+        findings.append(passed("corrections against images", about, says, 0.0))
+    return findings

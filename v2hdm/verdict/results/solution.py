@@ -27,6 +27,7 @@ from v2hdm.faults.odds import (
     is_possible,
     log_odds,
     matters,
+    possible_sigmas,
     probability,
 )
 from v2hdm.faults.sensitivity import STRETCHES
@@ -250,9 +251,11 @@ def _doubted(tests: list[Contradiction]) -> Finding:
 
 
 def _input(test: Contradiction, status: Status, says: str) -> Finding:
-    check = test.fault.check
     about = ", ".join(test.cameras)
-    return Finding(check, status, test.sigmas, even_sigmas(test), "sigmas", says, about)
+    limit = even_sigmas(test) if status is Status.FAIL else possible_sigmas(test)
+    # It is one on errors that matter: what is too small to matter passes beyond it, and has none.
+    decides = (test.sigmas > limit) is (status is not Status.PASS)
+    return Finding(test.fault.check, status, test.sigmas, limit if decides else None, "sigmas", says, about)
 
 
 def _agrees(check: str, tested: list[Contradiction]) -> Finding:
@@ -272,7 +275,7 @@ def _agrees(check: str, tested: list[Contradiction]) -> Finding:
     says = (
         f"the markings agree with the inputs, the largest deviation being {worst.sigmas:.1f} sigmas; {shown}"
     )
-    if is_possible(worst):
+    if is_possible(worst) or worst.sigmas > CLEAR_SIGMAS:
         why = "other causes are likelier" if matters(worst) else "too little to matter by itself"
         says = f"the markings fit better if {worst.sentence} ({worst.sigmas:.1f} sigmas): {why}; {shown}"
     return _input(worst, Status.PASS, says)

@@ -1,20 +1,18 @@
-"""Messages of bags: images and video as image files, poses and headings as readings, and moving frames."""
+"""Messages of bags: images and video as image files, poses and headings as readings."""
 
 from __future__ import annotations
 
 import logging
-from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 import cv2
 import numpy as np
 
-from v2hdm.errors import DriveError, need
-from v2hdm.geometry.rigid import interpolate, inverse, make_transform, rotation_from_quaternion
-from v2hdm.io.importers.readings import Attitudes, Readings
+from v2hdm.errors import DriveError, need, shown
+from v2hdm.io.importers.readings import SIGMA_OF_QUALITY_M, Attitudes, Readings
 from v2hdm.io.trajectory import checked_rotations, in_order
-from v2hdm.records import FloatArray, Trajectory
+from v2hdm.records import FloatArray
 from v2hdm.safe.pixels import png
 
 _log = logging.getLogger(__name__)
@@ -56,13 +54,15 @@ def file_of(kind: str, fields: Any, where: str) -> tuple[str, bytes]:
         return ".jpg", data
     if data.startswith(_PNG_SIGNATURE):
         return ".png", data
-    raise DriveError(f"{where}: compressed as '{fields.format}'; record JPEG, PNG or raw images")
+    raise DriveError(f"{where}: compressed as {shown(fields.format)}; record JPEG, PNG or raw images")
 
 
 def _pixels(fields: Any, where: str) -> np.ndarray:
     if fields.encoding not in _ENCODINGS:
         supported = ", ".join(_ENCODINGS)
-        raise DriveError(f"{where}: encoding '{fields.encoding}' is not known; record one of {supported}")
+        raise DriveError(
+            f"{where}: encoding {shown(fields.encoding)} is not known; record one of {supported}"
+        )
     channels, to_bgr = _ENCODINGS[fields.encoding]
     height = int(fields.height)
     width = int(fields.width)
@@ -93,7 +93,9 @@ class VideoDecoder:
     def __init__(self, form: str, where: str) -> None:
         self._av = need("av", "video", f"{where}: video in a bag", DriveError)
         if form not in _FORMATS:
-            raise DriveError(f"{where}: video in the format '{form}', supported are {', '.join(_FORMATS)}")
+            raise DriveError(
+                f"{where}: video in the format {shown(form)}, supported are {', '.join(_FORMATS)}"
+            )
         self._where = where
         self._context: Any = self._av.CodecContext.create(_CODECS.get(form, form), "r")
         self._begun = False
@@ -149,6 +151,8 @@ POSE_KINDS = (ODOMETRY, _WITH_COVARIANCE, _POSE, FIX, NMEA, TF)
 HEADING_KINDS = (IMU, QUATERNION, ODOMETRY, _WITH_COVARIANCE, _POSE)
 
 _NO_FIX = -1  # the status of a NavSatFix without a position (sensor_msgs/NavSatStatus)
+# Quality of NMEA's GGA by the status of a NavSatFix: plain, satellite-based and ground-based augmentation.
+_QUALITY_OF_STATUS = {0: 1, 1: 2, 2: 4}
 _NORM_TOLERANCE = 1e-2  # by which a recorded quaternion's norm may be off 1; chosen
 _YAW = 35  # place of the variance of yaw among the 36 numbers of a pose's covariance (REP-103)
 
@@ -158,10 +162,13 @@ Row = tuple[float, ...]
 def position_row(kind: str, fields: Any) -> Row:
     """Position (3), standard deviation (1, nan if not stated), quaternion (4, nan if none), its sigma (1)."""
     if kind == FIX:
+        status = fields.status.status
         sigma_m = np.nan
         if fields.position_covariance_type:
             sigma_m = _sigma(fields.position_covariance[0], fields.position_covariance[4])
-        if fields.status.status <= _NO_FIX:
+        if np.isnan(sigma_m):
+            sigma_m = SIGMA_OF_QUALITY_M[_QUALITY_OF_STATUS.get(status, 0)]
+        if status == _NO_FIX:
             sigma_m = np.inf
         return (fields.latitude, fields.longitude, fields.altitude, sigma_m, *([np.nan] * 5))
     return _pose(fields.pose, None) if kind == _POSE else _pose(fields.pose.pose, fields.pose.covariance)
@@ -205,7 +212,7 @@ def readings_of(
         rotation = checked_rotations(turned[is_measured, :4], lambda k: where, advice, _NORM_TOLERANCE)
         attitudes = Attitudes(heading_s[is_measured], rotation, turned[is_measured, 4])
     geodetic = kind == FIX
-    return Readings(stamp_s, rows[:, :3], geodetic, rows[:, 3], attitudes, antenna=geodetic)
+    return Readings(stamp_s, rows[:, :3], geodetic, rows[:, 3], attitudes, "an antenna's" if geodetic else "")
 
 
 def _pose(pose: Any, covariance: Any) -> Row:
@@ -227,103 +234,3 @@ def _sigma(*variances: float) -> float:
     if (least := min(variances)) < 0 and least != -1:
         return least
     return float(np.sqrt(np.mean(variances))) if least >= 0 and max(variances) > 0 else np.nan
-
-
-Edge = tuple[str, str]  # parent and child
-TF_TOPIC = "/tf"
-TF_STATIC = "/tf_static"
-
-_FIXED = 1e-9  # elements of a transform, m or 1, that change by less do so by rounding
-
-
-class Frames:
-    """A tree of frames; each edge holds ``parent_from_child`` over time, one alone where it is fixed."""
-
-    def __init__(self, edges: Mapping[Edge, Trajectory]) -> None:
-        self._edges = edges
-        self.names = sorted({name for edge in edges for name in edge})
-
-    @classmethod
-    def of(cls, rows: Mapping[Edge, FloatArray], where: str) -> Frames:
-        """Frames of rows (N, 8) of stamp, translation and quaternion."""
-        edges = {}
-        for (parent, child), table in rows.items():
-            table = table[in_order(table[:, 0], f"{where}, {parent} to {child}", "transform")]
-            norm = np.linalg.norm(table[:, 4:], axis=1, keepdims=True)
-            if not np.isfinite(table).all() or (norm < 0.5).any():
-                raise DriveError(f"{where}: the transform of {child} in {parent} is invalid; record it again")
-            poses = make_transform(rotation_from_quaternion(table[:, 4:] / norm), table[:, 1:4])
-            # Old recorders publish fixed frames again and again.
-            moves = len(poses) > 1 and bool(np.ptp(poses, axis=0).max() > _FIXED)
-            count = len(poses) if moves else 1
-            edges[parent, child] = Trajectory(table[:count, 0], poses[:count])
-        return cls(edges)
-
-    def fixed(self, dst: str, src: str) -> FloatArray | None:
-        """``dst_from_src`` (4 x 4) where all edges between them are fixed, else None."""
-        path = self._path(dst, src)
-        if path is None or any(len(self._edges[edge].stamp_s) > 1 for edge, _ in path):
-            return None
-        out = np.eye(4)
-        for edge, forward in path:
-            step = self._edges[edge].map_from_vehicle[0]
-            out = out @ (step if forward else inverse(step))
-        return out
-
-    def moving(self, dst: str, src: str, max_gap_s: float, where: str) -> Trajectory:
-        """``dst_from_src`` at the times of the busiest edge between them; DriveError where there are none."""
-        path = self._path(dst, src)
-        if path is None:
-            names = ", ".join(self.names)
-            raise DriveError(f"{where}: no transforms lead from {src} to {dst}; available: {names}")
-        tracks = [(self._edges[edge], forward) for edge, forward in path]
-        busiest = max((track for track, _ in tracks), key=lambda track: len(track.stamp_s), default=None)
-        if busiest is None or len(busiest.stamp_s) < 2:
-            raise DriveError(f"{where}: {src} does not move in {dst}; give the map's frame and the vehicle's")
-        stamp_s = busiest.stamp_s
-        inside = np.ones(len(stamp_s), dtype=bool)
-        out = np.tile(np.eye(4), (len(stamp_s), 1, 1))
-        for track, forward in tracks:
-            poses = np.broadcast_to(track.map_from_vehicle[0], (len(stamp_s), 4, 4))
-            if len(track.stamp_s) > 1:
-                poses, has_pose = interpolate(track, stamp_s, max_gap_s)
-                inside &= has_pose
-            out = out @ (poses if forward else inverse(poses))
-        if not inside.any():
-            problem = f"the transforms between {src} and {dst} are never known at the same time"
-            raise DriveError(f"{where}: {problem}; record them again")
-        return Trajectory(stamp_s[inside], out[inside])
-
-    def _path(self, dst: str, src: str) -> list[tuple[Edge, bool]] | None:
-        """Edges from ``dst`` to ``src``, each with whether it leads from parent to child."""
-        neighbours: dict[str, list[tuple[str, Edge, bool]]] = defaultdict(list)
-        for parent, child in self._edges:
-            neighbours[parent].append((child, (parent, child), True))
-            neighbours[child].append((parent, (parent, child), False))
-        paths: dict[str, list[tuple[Edge, bool]]] = {dst: []}
-        queue = [dst]
-        for here in queue:  # which grows
-            for neighbour, edge, forward in neighbours[here]:
-                if neighbour not in paths:
-                    paths[neighbour] = [*paths[here], (edge, forward)]
-                    queue.append(neighbour)
-        return paths.get(src)
-
-
-def transform_rows(fields: Any) -> list[tuple[Edge, tuple[float, ...]]]:
-    """Edges of a ``TFMessage`` with their rows of stamp, translation and quaternion."""
-    rows: list[tuple[Edge, tuple[float, ...]]] = []
-    for transform in fields.transforms:
-        move = transform.transform.translation
-        turn = transform.transform.rotation
-        stamp = transform.header.stamp
-        row = (stamp.sec + stamp.nanosec / 1e9, move.x, move.y, move.z, turn.x, turn.y, turn.z, turn.w)
-        rows.append(((frame_name(transform.header.frame_id), frame_name(transform.child_frame_id)), row))
-    return rows
-
-
-def frame_name(name: str) -> str:
-    """A frame's name without the slash that old recorders put before it."""
-    if not name.isprintable():
-        raise DriveError(f"a frame is named {name!r}: names need visible characters; rename it in the bag")
-    return name.lstrip("/")

@@ -13,7 +13,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from v2hdm.errors import DriveError, need
+from v2hdm.errors import REASON_LETTERS, DriveError, bounded, need
+from v2hdm.io.importers.bag.mcap import ROS1, ROS2, mcap_reader
 from v2hdm.safe.child import Limits, in_child, next_step
 from v2hdm.safe.databases import opened, rows_of
 from v2hdm.store.files import load_yaml, take_mapping
@@ -74,7 +75,8 @@ def bag_files(path: Path) -> list[Path]:
 
 def _parts(path: Path) -> list[Path]:
     endings = (*SUFFIXES, ".db3.zstd", ".mcap.zstd")
-    return sorted(file for file in path.iterdir() if file.is_file() and file.name.endswith(endings))
+    files = (file for file in path.iterdir() if file.is_file() and not file.name.startswith("."))
+    return sorted(file for file in files if file.name.endswith(endings))
 
 
 class Bag:
@@ -83,8 +85,7 @@ class Bag:
     def __init__(self, path: Path, readers: Sequence[Any]) -> None:
         self.path = path
         self._readers = readers
-        self._is_ros1 = path.suffix == ".bag" or any(reader.path.suffix == ".bag" for reader in readers)
-        self._stores: dict[str, Any] = {}
+        self._stores: dict[tuple[str, bool], Any] = {}
         kinds: dict[str, set[str]] = defaultdict(set)
         counts: dict[str, int] = defaultdict(int)
         for reader in readers:
@@ -123,12 +124,19 @@ class Bag:
 
     def _fields(self, connection: Any, data: bytes) -> Any:
         kind = connection.msgtype
-        if kind not in self._stores:
-            store = self._store_of(connection)
-            self._stores[kind] = store.deserialize_ros1 if self._is_ros1 else store.deserialize_cdr
-        return self._stores[kind](data, kind)
+        # Connections of a ROS 1 bag do not name their encoding, for there is no other.
+        encoding = getattr(connection.ext, "serialization_format", ROS1)
+        if encoding not in (ROS1, ROS2):
+            raise DriveError(
+                f"its messages are encoded as {encoding or 'nothing'}; convert it to ROS 2's cdr"
+            )
+        is_ros1 = encoding == ROS1
+        if (kind, is_ros1) not in self._stores:
+            store = self._store_of(connection, is_ros1)
+            self._stores[kind, is_ros1] = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
+        return self._stores[kind, is_ros1](data, kind)
 
-    def _store_of(self, connection: Any) -> Any:
+    def _store_of(self, connection: Any, is_ros1: bool) -> Any:
         """The types of one connection: as the bag defines them, else the common ones."""
         from rosbags.interfaces import MessageDefinitionFormat, Nodetype
         from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
@@ -136,7 +144,7 @@ class Bag:
         definition = connection.msgdef
         _check_definition(definition.data)
         if definition.format == MessageDefinitionFormat.NONE:
-            return get_typestore(Stores.ROS1_NOETIC if self._is_ros1 else Stores.LATEST)
+            return get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.LATEST)
         store = get_typestore(Stores.EMPTY)
         types: dict[str, Any] = {}
         if definition.format == MessageDefinitionFormat.MSG:
@@ -199,8 +207,9 @@ def open_bag(path: Path) -> Iterator[Bag]:
                 # rosbags skips, without a word, topics of which the folder's description and the file state
                 # other qualities of service, as bags that were rewritten do. The files alone have them all.
                 for file in plain:
-                    kind = rosbag1.Reader if file.suffix == ".bag" else rosbag2.Reader
-                    readers.append(opened_readers.enter_context(kind(file)))
+                    reader_of = {".bag": rosbag1.Reader, ".mcap": mcap_reader}
+                    open_file = reader_of.get(file.suffix, rosbag2.Reader)
+                    readers.append(opened_readers.enter_context(open_file(file)))
                 readers.sort(key=lambda reader: reader.start_time)
             _check_chunks(readers)
             bag = Bag(path, readers)
@@ -295,8 +304,9 @@ def _one_line(path: Path, what: str = "") -> Iterator[None]:
                 f"{path}: {what}the bag does not define the type {failure}; convert it to MCAP, which holds "
                 "its types, where it was recorded: 'ros2 bag convert'"
             ) from None
-        reason = " ".join(str(failure).split()) or type(failure).__name__
+        said = " ".join(str(failure).split()) or type(failure).__name__
+        reason = bounded(said, REASON_LETTERS).rstrip(".")
         raise DriveError(
-            f"{path}: {what}not readable as a bag ({reason[:200].rstrip('.')}); copy it again, or fix it "
+            f"{path}: {what}not readable as a bag ({reason}); copy it again, or fix it "
             f"with '{_MEND.get(path.suffix, 'ros2 bag reindex')}' if the recording was cut off"
         ) from None

@@ -21,10 +21,21 @@ import numpy as np
 from v2hdm.errors import DriveError
 from v2hdm.io.calibration.reading import info_of
 from v2hdm.io.calibration.writing import write_camera_info
+from v2hdm.io.image_lists import write_image_list
 from v2hdm.io.importers.bag import messages as kinds
+from v2hdm.io.importers.bag.frames import (
+    ROW,
+    TF_STATIC,
+    TF_TOPIC,
+    Edge,
+    Frames,
+    frame_name,
+    tf_topics,
+    transform_rows,
+)
 from v2hdm.io.importers.bag.reading import Bag, Message, bag_files, in_child_of, open_bag
-from v2hdm.io.importers.readings import Readings, nmea_readings
-from v2hdm.io.trajectory import write_image_list
+from v2hdm.io.importers.nmea import nmea_readings
+from v2hdm.io.importers.readings import Readings
 from v2hdm.records import FloatArray
 from v2hdm.safe.pixels import png
 from v2hdm.store.folders import entry_folder, is_whole, new_entry
@@ -189,35 +200,38 @@ class PoseStream(Stream):
 
 
 class TfStream(Stream):
-    """Transforms of ``/tf_static``, and of ``/tf`` where frames that move are asked for."""
+    """Transforms of ``/tf`` and ``/tf_static``; of a bag without them none, unless they are ``needed``."""
 
-    def __init__(self, moving: bool, where: str) -> None:
-        super().__init__("tf" if moving else "tf_static", ["tf"], where)
-        self._wanted = [kinds.TF_TOPIC, kinds.TF_STATIC] if moving else [kinds.TF_STATIC]
+    def __init__(self, where: str, *, needed: bool = True) -> None:
+        super().__init__("tf", ["tf", ROW], where)
+        self._needed = needed
 
     def topics(self, bag: Bag) -> Sequence[str]:
-        """Its topics in the bag, at least one."""
-        recorded = [name for name in self._wanted if name in bag.topics]
+        """Its topics in the bag."""
+        types = (kinds.TF, kinds.OLD_TF)
+        recorded = tf_topics(topic.name for topic in bag.topics.values() if topic.messages)
+        if not self._needed:
+            return [name for name in recorded if bag.topics[name].kind in types]
         if not recorded:
-            raise DriveError(f"{self.where}: {bag.path} has no topic {' or '.join(self._wanted)}")
-        return [bag.need(name, [kinds.TF, kinds.OLD_TF], self.where).name for name in recorded]
+            raise DriveError(f"{self.where}: {bag.path} has no transforms on {TF_TOPIC} or {TF_STATIC}")
+        return [bag.need(name, types, self.where).name for name in recorded]
 
     def write(self, folder: Path) -> Writer:
         """Write a row per transform."""
         with (folder / _TRANSFORMS).open("w", encoding="utf-8") as file:
             while (message := (yield)) is not None:
-                for edge, row in kinds.transform_rows(message.fields):
+                for edge, row in transform_rows(message.fields, message.topic):
                     file.write("\t".join([*edge, *map(repr, map(float, row))]) + "\n")
 
-    def frames(self, folder: Path) -> kinds.Frames:
+    def frames(self, folder: Path) -> Frames:
         """The frames that the entry in ``folder`` holds."""
-        rows: dict[kinds.Edge, array[float]] = defaultdict(lambda: array("d"))
+        rows: dict[Edge, array[float]] = defaultdict(lambda: array("d"))
         with (folder / _TRANSFORMS).open(encoding="utf-8") as lines:
             for line in lines:
                 parent, child, *values = line.rstrip("\n").split("\t")
                 rows[parent, child].extend(map(float, values))
-        edges = {edge: np.array(flat).reshape(-1, 8) for edge, flat in rows.items()}
-        return kinds.Frames.of(edges, self.where)
+        edges = {edge: np.array(flat).reshape(-1, ROW) for edge, flat in rows.items()}
+        return Frames(edges, self.where)
 
 
 def import_streams(path: Path, streams: Sequence[Stream], cache: Path) -> list[Path]:
@@ -280,7 +294,8 @@ def stamp_of(message: Message, stamps: str, first: bool, where: str) -> float:
 
 def frame_of(message: Message) -> str:
     """The frame that a message's header names."""
-    return kinds.frame_name(message.fields.header.frame_id)
+    fields = message.fields
+    return frame_name(fields.frame_id if message.kind == kinds.VIDEO else fields.header.frame_id)
 
 
 def _write_row(file: TextIO, stamp_s: float, row: kinds.Row) -> None:

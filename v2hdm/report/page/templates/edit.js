@@ -24,17 +24,25 @@
     }
   }
 
+  function place(shape) { // where it is drawn, as far as that is saved
+    const { about } = shape;
+    const moved = said[about.key]?.moved ?? {};
+    if (about.c) shape.setLatLngs(about.c.map(([x, y], n) => { const [east, north] = moved[n + 1] ?? [x, y]; return [north, east]; }));
+  }
+
   async function send(shape, change) {
     const { about } = shape;
     const entry = change && { says: "corrected", class: kindOf(about), outline_map: outline(about), ...(about.id === undefined ? {} : { marking: about.id }), ...said[about.key], ...change };
     try {
-      const answer = await fetch("correct", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ key: about.key, correction: entry }) });
+      const answer = await fetch("correct", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ key: about.key, correction: entry, before: said[about.key] ?? null }) });
       if (!answer.ok) throw new Error(await answer.text());
       if (entry) said[about.key] = entry; else delete said[about.key];
       if (!entry) location.reload();
       tell();
       offer(shape, shape.form);
     } catch (error) {
+      place(shape);
+      offer(shape, shape.form);
       tell(`Not saved: ${error.message || "v2hdm view does not answer; is it still running?"}`);
     }
   }
@@ -82,9 +90,6 @@
   }
 
   addEventListener("v2hdm-selected", ({ detail }) => offer(detail.shape, detail.text));
-  for (const shape of things) {
-    const moved = said[shape.about.key]?.moved;
-    if (moved) shape.setLatLngs(shape.about.c.map(([x, y], n) => { const [east, north] = moved[n + 1] ?? [x, y]; return [north, east]; }));
-  }
+  for (const shape of things) if (said[shape.about.key]?.moved) place(shape);
   tell();
 })();

@@ -8,7 +8,9 @@
   const at = ([x, y]) => [y, x];
   const words = (kind) => kind.replaceAll("_", " ");
   const number = (value, digits) => value.toFixed(digits).replace("-", "\u2212");
-  const cm = (metres) => `${number(100 * metres, 1)} cm`;
+  // What is not zero never reads so.
+  const small = (value, digits) => (value > 0 && value < 0.5 * 10 ** -digits ? `< ${10 ** -digits}` : number(value, digits));
+  const cm = (metres) => `${small(100 * metres, 1)} cm`;
   const SERIES = ["blue", "green", "vermillion", "purple", "orange", "sky"];
   const DASHES = [null, "7 4", "2 4", "8 3 2 3"];
   const MOST_IN_DETAIL = 1200; // most markings in view with ellipses and arrows
@@ -46,7 +48,7 @@
 
   // ---- layers ----
   const layers = {};
-  const small = { noClip: true, smoothFactor: 0 }; // clipping and simplifying do not pay for four corners
+  const exact = { noClip: true, smoothFactor: 0 }; // clipping and simplifying do not pay for four corners
   const still = (renderer) => ({ renderer, interactive: false, smoothFactor: 0.3 });
   for (const [zIndex, name] of ["background", "mosaic"].entries()) {
     if (!data[name]) continue;
@@ -55,7 +57,7 @@
   }
   if (data.truth) {
     layers.truth = L.featureGroup([
-      ...data.truth.markings.map((corners) => L.polygon(corners.map(at), { ...still(below), ...small })),
+      ...data.truth.markings.map((corners) => L.polygon(corners.map(at), { ...still(below), ...exact })),
       ...data.truth.lanes.map((line) => L.polyline(line.map(at), still(below))),
     ]);
   }
@@ -70,8 +72,8 @@
     return shape;
   };
   layers.markings = L.featureGroup([
-    ...data.markings.map((one) => feature(L.polygon(one.c.map(at), small), { ...one, key: `m${one.id}`, what: "marking" })),
-    ...data.symbols.map((one) => feature(L.polygon(one.p.map(at), small), { ...one, key: `s${one.id}`, what: "symbol" })),
+    ...data.markings.map((one) => feature(L.polygon(one.c.map(at), exact), { ...one, key: `m${one.id}`, what: "marking" })),
+    ...data.symbols.map((one) => feature(L.polygon(one.p.map(at), exact), { ...one, key: `s${one.id}`, what: "symbol" })),
   ]);
   layers.excluded = L.featureGroup(data.excluded.map((one, n) =>
     feature(L.circleMarker(at(one.p), { radius: 4 }), { ...one, key: `x${n}`, what: "excluded" })));
@@ -82,18 +84,18 @@
   // Existing markings react themselves; vanished ones need a shape of their own.
   layers.changes = L.featureGroup(data.changes.flatMap(({ before, ...one }) => {
     const dashed = { fate: one.fate, dashArray: "5 4" };
-    if (one.fate === "vanished") return [feature(L.polygon(one.p.map(at), { ...small, ...dashed }), { ...one, key: `d${one.id}`, what: "change" })];
-    return [[before, dashed], [one.p, { fate: one.fate }]].map(([corners, look]) => L.polygon(corners.map(at), { ...still(above), ...small, ...look, fill: false }));
+    if (one.fate === "vanished") return [feature(L.polygon(one.p.map(at), { ...exact, ...dashed }), { ...one, key: `d${one.id}`, what: "change" })];
+    return [[before, dashed], [one.p, { fate: one.fate }]].map(([corners, look]) => L.polygon(corners.map(at), { ...still(above), ...exact, ...look, fill: false }));
   }));
   layers.ellipses = L.layerGroup();
   layers.arrows = L.layerGroup();
   const selection = L.layerGroup().addTo(map);
 
-  const worst = (one) => (one.e && Array.isArray(one.e) ? Math.max(...one.e.map((ellipse) => ellipse[0])) : one.e ?? NaN);
+  const worst = (one) => (one.w ? Math.max(...one.w) : NaN);
   const SHADES = {
     class: { name: "class" },
-    absolute: { name: "95 % error, absolute", of: worst, unit: "cm" },
-    relative: { name: "95 % error, relative", of: (one) => one.r ?? NaN, unit: "cm" },
+    absolute: { name: "95 % radius in the map’s frame", of: worst, unit: "cm" },
+    relative: { name: "95 % radius from marking to marking", of: (one) => one.r ?? NaN, unit: "cm" },
     truth: { name: "error against ground truth", of: (one) => one.t ?? NaN, unit: "cm" },
     sightings: { name: "sightings", of: (one) => one.n, unit: "" },
   };
@@ -156,7 +158,7 @@
     for (const one of shown) {
       if (ellipses && one.e) one.c.forEach((corner, n) => {
         if (one.e[n][0] * times * px >= LEAST_PX) layers.ellipses.addLayer(
-          L.polygon(ring(corner, one.e[n], times), { ...still(above), ...small, color: colour("ink"), weight: 1, fill: false }));
+          L.polygon(ring(corner, one.e[n], times), { ...still(above), ...exact, color: colour("ink"), weight: 1, fill: false }));
       });
       if (arrows) for (const [camera, dx, dy] of one.a ?? []) layers.arrows.addLayer(arrow(one, camera, dx, dy, times, px));
     }
@@ -244,8 +246,8 @@
     if (change) rows.push([change.fate, `with probability ${number(change.probability, 3)}; seen in ${change.n} of ${change.views} images`]);
     if (about.what !== "change") rows.push(["sightings", `${about.n} ${about.n === 1 ? "image" : "images"}`]);
     if (about.g) rows.push(["accuracy", about.g]);
-    if (Number.isFinite(about.r)) rows.push(["95 %, relative", cm(about.r)]);
-    if (Number.isFinite(worst(about))) rows.push(["95 %, absolute", cm(worst(about))]);
+    if (Number.isFinite(about.r)) rows.push(["95 % radius from marking to marking", cm(about.r)]);
+    if (Number.isFinite(worst(about))) rows.push(["95 % radius in the map’s frame", `${cm(worst(about))} (worst corner)`]);
     if (Number.isFinite(about.t)) rows.push(["error against truth", `${cm(about.t)} RMS`]);
     return rows;
   }
@@ -301,10 +303,10 @@
   }
 
   function corners(about) {
-    const head = ["corner", "east (m)", "north (m)", "95 % ellipse (cm)"].map((name, n) => element("th", { scope: "col", ...(n ? { class: "n" } : {}) }, name));
+    const head = ["corner", "east (m)", "north (m)", "95 % radius (cm)"].map((name, n) => element("th", { scope: "col", ...(n ? { class: "n" } : {}) }, name));
     const rows = about.c.map(([x, y], n) => {
-      const ellipse = about.e ? `${(100 * about.e[n][0]).toFixed(1)} × ${(100 * about.e[n][1]).toFixed(1)}` : "–";
-      return element("tr", {}, element("th", { scope: "row" }, String(n + 1)), ...[number(x, 3), number(y, 3), ellipse].map((cell) => element("td", { class: "n" }, cell)));
+      const radius = about.w ? (100 * about.w[n]).toFixed(1) : "–";
+      return element("tr", {}, element("th", { scope: "row" }, String(n + 1)), ...[number(x, 3), number(y, 3), radius].map((cell) => element("td", { class: "n" }, cell)));
     });
     return element("table", {}, element("thead", {}, element("tr", {}, ...head)), element("tbody", {}, ...rows));
   }
@@ -349,8 +351,8 @@
     { name: "class", of: (one) => words(data.kinds[one.k]) },
     { name: "sightings", of: (one) => one.n, digits: 0 },
     ...(listed.some(({ about }) => about.g) ? [{ name: "accuracy", of: (one) => one.g ?? "\u2013" }] : []),
-    { name: "relative (cm)", of: (one) => 100 * (one.r ?? NaN), digits: 1 },
-    { name: "absolute (cm)", of: (one) => 100 * worst(one), digits: 1 },
+    { name: "from marking to marking (cm)", of: (one) => 100 * (one.r ?? NaN), digits: 1 },
+    { name: "in the map’s frame (cm)", of: (one) => 100 * worst(one), digits: 1 },
     { name: "error against truth (cm)", of: (one) => 100 * (one.t ?? NaN), digits: 1 },
     { name: "suspicion p", of: (one) => data.suspicion[one.id] ?? NaN, digits: 3 },
   ].filter((column) => !column.digits || things.some((shape) => Number.isFinite(column.of(shape.about))));
@@ -366,7 +368,7 @@
   }
   const cell = (column, about) => {
     const value = column.of(about);
-    return column.digits === undefined ? value : Number.isFinite(value) ? number(value, column.digits) : "\u2013";
+    return column.digits === undefined ? value : Number.isFinite(value) ? small(value, column.digits) : "\u2013";
   };
   function list() {
     const found = matching();
