@@ -40,7 +40,7 @@ def read_source(path: Path) -> Source:
 def of_checkpoint(checkpoint: Checkpoint) -> Source:
     """The averaged weights of a checkpoint."""
     label = {
-        "classes": list(checkpoint.catalogue.names),
+        "classes": list(checkpoint.classes),
         "own_classes": checkpoint.own_classes,
         "multiple": MULTIPLE,
         "strides": STRIDES,
@@ -63,7 +63,7 @@ def _of_exported(path: Path) -> Source:
             f"{path} holds weights that were rounded to int8 already: give the checkpoint, or the float32 "
             "file, that it was made from"
         )
-    net = MarkingNet(recorded_net(exported.config["net"]), len(exported.catalogue.names)).fold()
+    net = MarkingNet(recorded_net(exported.config["net"]), len(exported.classes)).fold()
     try:
         net.load_state_dict({name: exported.weights[name] for name in net.state_dict()})
     except (KeyError, RuntimeError) as error:

@@ -210,3 +210,33 @@ def test_labels_have_room_for_all_classes(tmp_path):
     many = "".join(f"  c{n}: {{family: other, {SIZES}}}\n" for n in range(255))
     with pytest.raises(ConfigError, match="more than 254"):
         load_catalogue(written(tmp_path, "classes:\n" + many))
+
+
+WHEEL_M = (1.2, 0.3)  # seen from the side on the ground behind: measured on a real front camera's wheels
+STANDARD_M = {
+    "arrow": [(2.9, 0.6), (2.44, 0.9), (5.0, 0.75), (7.5, 0.9), (1.2, 0.5)],  # MUTCD, RMS-1, a car park's
+    "diamond": [(0.54, 0.27), (1.2, 0.6), (3.7, 1.0)],  # yards, MUTCD
+    "text": [(1.8, 1.2), (4.0, 2.6), (9.0, 5.0), (0.5, 0.3)],  # MUTCD, RMS-1, ICAO Annex 14, a bay's number
+    "box": [(3.0, 3.0), (12.0, 8.0), (40.0, 20.0)],
+    "bicycle": [(1.8, 1.0), (2.8, 1.0), (1.2, 0.75)],  # MUTCD's cycle and shared lane, a small one
+}
+
+
+@pytest.mark.parametrize("kind", STANDARD_M)
+def test_markings_of_the_sizes_of_standards_are_of_likely_size(kind):
+    length_m, width_m = np.array(STANDARD_M[kind]).T
+    assert (SHIPPED.classes[kind].size_log_likelihood(length_m, width_m, whole=True) == 0).all()
+
+
+def test_what_is_as_narrow_as_a_wheel_is_of_no_size_of_an_arrow():
+    assert SHIPPED.classes["arrow"].size_log_likelihood(*WHEEL_M, whole=True) < -1
+    assert SHIPPED.classes["arrow"].size_log_likelihood(*WHEEL_M, whole=False) == 0
+
+
+def test_a_stub_of_a_double_line_is_of_no_size_of_a_diamond():
+    assert SHIPPED.classes["diamond"].size_log_likelihood(0.5, 0.12, whole=True) < -1
+
+
+def test_the_channels_of_older_networks_keep_their_classes():
+    oldest = "diamond lane_dash lane_line arrow stop_line crosswalk_bar chevron other_paint"
+    assert list(PAINT_CLASSES) == [*oldest.split(), "text", "box", "bicycle"]

@@ -19,7 +19,7 @@ import torch
 from train.checkpoint import Checkpoint, fresh_checkpoint, load_checkpoint, save_checkpoint
 from train.config import DataConfig, TrainConfig
 from train.data import validation_pairs
-from train.growth import recorded_net
+from train.growth import recorded_net, with_classes
 from train.loop import metrics
 from train.metrics import Tally
 from train.targets import Targets
@@ -45,6 +45,7 @@ def mean_checkpoint(
             f"{len(shares)} weights for {1 + len(others)} files: give one for each, none below 0"
         )
     mean = load_checkpoint(first)
+    mean.averaged = with_classes(mean.averaged, mean.classes, mean.catalogue, str(first))
     asked = TrainConfig(net=recorded_net(mean.config["net"]), data=DataConfig(**mean.config["data"]))
     states = [mean.averaged]
     for path in others:

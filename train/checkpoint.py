@@ -70,6 +70,14 @@ class Checkpoint:
     own_classes: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     @property
+    def classes(self) -> tuple[str, ...]:
+        """The classes of the network's channels: a network may be older than the last of the shipped ones."""
+        own = tuple(self.own_classes)
+        weights = self.averaged or self.model
+        shipped = class_count(weights) - len(own) if weights else len(SHIPPED.names)
+        return SHIPPED.names[:shipped] + own
+
+    @property
     def catalogue(self) -> Catalogue:
         """The classes that the network tells apart."""
         return SHIPPED.with_own(self.own_classes, "the checkpoint")
@@ -108,7 +116,7 @@ def fresh_checkpoint(config: TrainConfig, catalogue: Catalogue | None = None) ->
         )
     catalogue = catalogue or earlier.catalogue
     state.own_classes = own_entries(catalogue)
-    classes = earlier.catalogue.names
+    classes = earlier.classes
     where = f"start={config.start}"
     if isinstance(earlier, Checkpoint) and then == config.net:
         state.averaged = with_classes(earlier.averaged, classes, catalogue, where)
@@ -171,6 +179,12 @@ def check_same_experiment(checkpoint: Checkpoint, config: TrainConfig, path: Pat
     if changed:
         raise ConfigError(
             f"{path} was trained with another {', '.join(changed)}: set it back, or choose a new `output`"
+        )
+    if checkpoint.classes != checkpoint.catalogue.names:
+        later = [name for name in checkpoint.catalogue.names if name not in checkpoint.classes]
+        raise ConfigError(
+            f"{path} was trained before there were the classes {', '.join(later)}: go on with start={path} "
+            "and a new `output`"
         )
     if config.catalogue is not None:
         own_classes = own_entries(load_catalogue(Path(config.catalogue)))

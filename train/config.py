@@ -87,7 +87,7 @@ class DataConfig:
         Within(0, 100),
         "share of scenes whose ground is nearly as light as its paint. Half of them are overexposed, so "
         "that ground and paint are clipped together.",
-    ] = 0.08
+    ] = 0.14
     overexposed: Annotated[
         float,
         Within(0, 100),
@@ -109,6 +109,14 @@ class DataConfig:
         "share of scenes with a bright kerb along a line of a lane, no wider than paint, that lies open in "
         "stretches as long as dashes.",
     ] = 0.2
+    gutters: Annotated[
+        float,
+        Within(0, 100),
+        "share of scenes with a strip of stones or concrete along the way, level with the ground.",
+    ] = 0.06
+    joints: Annotated[
+        float, Within(0, 100), "mean number of long seams along the way, apart from all lines of lanes."
+    ] = 0.5
     junctions: Annotated[
         float,
         Within(0, 100),
@@ -137,9 +145,37 @@ class DataConfig:
     crossings: Annotated[
         float, Within(0, 100), "share of scenes with a stop line that meets or crosses lines of lanes."
     ] = 0.12
-    words: Annotated[
-        float, Within(0, 100), "share of scenes with a word, a number or a hatched box in a lane."
+    words: Annotated[float, Within(0, 100), "share of scenes with words or a number in lanes."] = 0.15
+    bays: Annotated[
+        float, Within(0, 100), "share of scenes with a row of numbers of bays or slots along the way."
+    ] = 0.12
+    boxes: Annotated[
+        float,
+        Within(0, 100),
+        "share of scenes with an area to be kept clear: yellow boxes, hatched aisles, crossed rectangles.",
+    ] = 0.15
+    users: Annotated[
+        float, Within(0, 100), "share of scenes with bicycles, people or wheelchairs painted in lanes."
     ] = 0.1
+    others: Annotated[
+        float,
+        Within(0, 100),
+        "share of scenes with paint that has no class of its own: rings, crosses, zigzags, corners of bays.",
+    ] = 0.06
+    give_way: Annotated[
+        float,
+        Within(0, 100),
+        "share of scenes with a give-way line of short dashes or teeth, labelled as a stop line.",
+    ] = 0.1
+    far_stops: Annotated[float, Within(0, 100), "share of scenes with a stop line 12 to 40 m ahead."] = 0.25
+    crosswalks: Annotated[
+        float,
+        Within(0, 100),
+        "share of scenes with a whole crosswalk: bars, bars between two lines, or the two lines alone.",
+    ] = 0.15
+    doubles: Annotated[
+        float, Within(0, 100), "share of scenes with a double line, half of them yellow ones."
+    ] = 0.15
     erased: Annotated[
         float,
         Within(0, 100),

@@ -40,8 +40,13 @@ class Exported:
     label: dict[str, Any]
 
     @property
+    def classes(self) -> tuple[str, ...]:
+        """The classes of its channels: a network may be older than the last of the shipped ones."""
+        return tuple(self.label["classes"])
+
+    @property
     def catalogue(self) -> Catalogue:
-        """The classes of its channels."""
+        """The shipped classes and its own."""
         return read_catalogue(self.label)
 
 
@@ -58,6 +63,7 @@ def read_exported(path: Path) -> Exported:
         label = json.loads({entry.key: entry.value for entry in model.metadata_props}[METADATA_KEY])
         config = dict(label["training"])
         renders = int(label.get("renders", 0))
+        label["classes"] = [str(name) for name in label["classes"]]
         NetConfig(**config["net"])
         arrays = _constants(model.graph)
     except Exception as error:

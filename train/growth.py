@@ -14,14 +14,20 @@ import torch
 from torch import Tensor
 
 from models import MarkingNet, NetConfig
-from v2hdm.catalogue import OTHER, QUADRILATERAL, STRIPE, SYMBOL, Catalogue
+from v2hdm.catalogue import AREA, OTHER, QUADRILATERAL, STRIPE, SYMBOL, Catalogue
 from v2hdm.errors import ConfigError
 from v2hdm.records import CROSSWALK_BAR, OTHER_PAINT, STOP_LINE
 
 _OFF_BEFORE = {"wide_kinds": False}
 """Switches of networks that files may be older than, and what they were then."""
 
-_STARTS_AS = {QUADRILATERAL: CROSSWALK_BAR, STRIPE: STOP_LINE, SYMBOL: OTHER_PAINT, OTHER: OTHER_PAINT}
+_STARTS_AS = {
+    QUADRILATERAL: CROSSWALK_BAR,
+    STRIPE: STOP_LINE,
+    SYMBOL: OTHER_PAINT,
+    AREA: OTHER_PAINT,
+    OTHER: OTHER_PAINT,
+}
 """By family, the class that a network takes a new one for before it has learnt it."""
 
 _STARTS_WITH = 0.05

@@ -25,8 +25,9 @@ QUADRILATERAL = "quadrilateral"
 STRIPE = "stripe"
 LINE = "line"
 SYMBOL = "symbol"
+AREA = "area"
 OTHER = "other"
-FAMILIES = (QUADRILATERAL, STRIPE, LINE, SYMBOL, OTHER)
+FAMILIES = (QUADRILATERAL, STRIPE, LINE, SYMBOL, AREA, OTHER)
 
 _SOFTNESS = 0.25  # standard deviation of a log size about its range, where the catalogue gives none
 _TINY_M = 1e-3  # least size that differs from nothing, m
@@ -102,6 +103,11 @@ class Catalogue:
         """Names of the classes whose centre lines make up lanes: those in a group with a line."""
         groups = {self.classes[name].group for name in self.of_family(LINE)}
         return tuple(name for name, entry in self.classes.items() if entry.group in groups)
+
+    @property
+    def of_any_shape(self) -> tuple[str, ...]:
+        """Names of the classes whose paint is neither a quadrilateral nor a line."""
+        return self.of_family(SYMBOL, AREA, OTHER)
 
     def of_family(self, *families: str) -> tuple[str, ...]:
         """Names of the classes of some families."""
@@ -186,7 +192,9 @@ SHIPPED = Catalogue({name: _read_class(name, entry, str(CATALOGUE_FILE)) for nam
 """The shipped classes."""
 
 PAINT_CLASSES = SHIPPED.names
-"""The classes of the shipped detector, in the order of its class channels. Chevrons are the bars and angles
-that fill an area; other paint is writing, teeth and whatever else is no marking to map."""
+"""The shipped classes, in the order of a network's class channels. Chevrons are the bars and angles of
+traffic islands, a box is an area to be kept clear: its frame and hatching; a bicycle is any symbol of who may
+go there. Other paint is whatever else is no marking to map. A network that was trained before a class was
+added has the channels before it, and finds none of that class."""
 
 CORNERED_CLASSES = SHIPPED.cornered  # shipped classes that are mapped as quadrilaterals by their four corners

@@ -32,9 +32,19 @@ STOP_LINE = "stop_line"
 CROSSWALK_BAR = "crosswalk_bar"
 CHEVRON = "chevron"
 OTHER_PAINT = "other_paint"
+TEXT = "text"
+BOX = "box"
+BICYCLE = "bicycle"
 
 SEEN_ACROSS: Mapping[str, str] = {LANE_DASH: STOP_LINE, STOP_LINE: LANE_DASH}
 """Stripes that look like each other to a camera to the side: there a dash lies across the view."""
+
+# Composed of other paint, without a class of the network:
+CROSSWALK = "crosswalk"
+DOUBLE_LINE = "double_line"
+
+GIVE_WAY = "give_way"
+"""The variety of a stop line that is a row of pieces: of short, broad dashes or of triangles."""
 
 LANE_BOUNDARY = "lane_boundary"
 """Kind of a lane detection that is a whole line, gaps between dashes and hidden parts included."""
@@ -374,6 +384,7 @@ class Marking:
     paint: PaintLeft | None = None  # None if no image shows enough of it
     heights_sigma_m: FloatArray | None = None  # (4,) where estimated
     accuracy: str | None = None  # of :data:`ACCURACIES`; None without covariance, or before a goal was set
+    variety: str | None = None  # within its class, as :data:`GIVE_WAY`
 
     @property
     def corner_covariances_m2(self) -> FloatArray | None:
@@ -384,7 +395,10 @@ class Marking:
 
 @dataclass(frozen=True)
 class Symbol:
-    """One mapped symbol, as a :class:`Marking`; ``covariance_m2`` (2N, 2N), if known, is of its vertices."""
+    """One mapped symbol or area, as a :class:`Marking`; ``covariance_m2`` (2N, 2N), if known, is of vertices.
+
+    Areas are rectangles. The outline of a crosswalk is four corners, the first two along ends of its bars.
+    """
 
     kind: str
     outline_map: FloatArray  # (N, 2) m, counter-clockwise from above, in one order for all of a template
@@ -396,11 +410,16 @@ class Symbol:
     # (2N, 2N), None where sightings share an outline that no polygon explains
     covariance_m2: FloatArray | None = None
     accuracy: str | None = None
+    parts: tuple[int, ...] = ()  # ids of the markings that it is composed of
 
 
 @dataclass(frozen=True)
 class Lane:
-    """One mapped lane line: a polyline along its centre; heights and id as of a :class:`Marking`."""
+    """One mapped lane line: a polyline along its centre; heights and id as of a :class:`Marking`.
+
+    A :data:`DOUBLE_LINE` runs midway between its two ``lines``, the classes of the left and the right one,
+    whose centres are ``apart_m`` apart.
+    """
 
     kind: str
     points_map: FloatArray  # (N, 2) m
@@ -409,6 +428,21 @@ class Lane:
     id: int | None = None
     sigma_m: FloatArray | None = None  # (N,) of each vertex across, None unless adjusted
     heights_sigma_m: FloatArray | None = None
+    lines: tuple[str, str] | None = None
+    apart_m: float | None = None
+
+    @property
+    def painted(self) -> tuple[Lane, ...]:
+        """The lines as they are painted: of a double one the left one, with its id, and the right one."""
+        if self.lines is None or self.apart_m is None or len(self.points_map) < 2:
+            return (self,)
+        x, y = np.gradient(self.points_map, axis=0).T
+        left = self.apart_m / 2 * np.column_stack([-y, x]) / np.maximum(np.hypot(x, y), 1e-9)[:, None]
+        single = replace(self, lines=None, apart_m=None)
+        return (
+            replace(single, kind=self.lines[0], points_map=self.points_map + left),
+            replace(single, kind=self.lines[1], points_map=self.points_map - left, id=None),
+        )
 
 
 @dataclass(frozen=True)
@@ -469,40 +503,9 @@ class HDMap:
         >>> len(frame) == len(result.map.markings) + len(result.map.lanes) + len(result.map.symbols)
         True
         """
-        try:
-            import geopandas
-            import pyproj
-            import shapely
-        except ModuleNotFoundError as missing:
-            what = "to_geodataframe needs geopandas: install the gis extra, pip install 'v2hdm[gis]'"
-            raise ModuleNotFoundError(what, name=missing.name) from None
-        layers = (
-            ("marking", self.markings, "corners_map"),
-            ("lane", self.lanes, "points_map"),
-            ("symbol", self.symbols, "outline_map"),
-        )
-        rows = []
-        for layer, features, name in layers:
-            shape = shapely.LineString if layer == "lane" else shapely.Polygon
-            for feature in features:
-                points = getattr(feature, name)
-                heights_m = np.zeros(len(points)) if feature.heights_m is None else feature.heights_m
-                geometry = shape(np.column_stack([points, heights_m]))
-                accuracy = getattr(feature, "accuracy", None)
-                rows.append((feature.id, layer, feature.kind, feature.sightings, accuracy, geometry))
-        columns = ["id", "layer", "kind", "sightings", "accuracy", "geometry"]
-        frame = geopandas.GeoDataFrame(rows, columns=columns, geometry="geometry")
-        if self.origin is None:
-            return frame
-        at = f"+lon_0={self.origin.longitude_deg!r} +lat_0={self.origin.latitude_deg!r}"
-        on_earth = pyproj.Transformer.from_pipeline(
-            f"+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 {at} +h_0={self.origin.altitude_m!r} "
-            "+step +inv +proj=cart +ellps=WGS84 +step +proj=unitconvert +xy_in=rad +xy_out=deg"
-        )
-        geometry = shapely.transform(
-            frame.geometry.values, lambda xyz: np.column_stack(on_earth.transform(*xyz.T)), include_z=True
-        )
-        return frame.set_geometry(geometry, crs="EPSG:4326")
+        from v2hdm.dataframe import geodataframe  # only those who ask for one load it
+
+        return geodataframe(self)
 
 
 @dataclass(frozen=True)

@@ -264,14 +264,68 @@ def test_a_type_that_the_bag_does_not_define_is_named_only_if_it_is_wanted(folde
         read(tmp_path / "drive", topics_for(folder, bag, poses=poses))
 
 
-def test_images_on_two_clocks_and_without_a_time_are_named(folder, tmp_path):
-    for second, message in ((7, "image 3: its time .* two clocks"), (0, "image 3: its header has no time")):
-        made = messages_of(folder)
-        stamp = [row[2] for row in made.rows if row[1] == "/sensing/front/image_raw"][-1].header.stamp
-        stamp.sec, stamp.nanosec = second, stamp.nanosec if second else 0
-        bag = write_ros2(tmp_path / f"clocks_{second}", made)
-        with pytest.raises(DriveError, match=message):
-            read(tmp_path / "drive", topics_for(folder, bag))
+def _restamped(folder, topic, stamp_of_number):
+    """The messages of ``folder`` whose headers on ``topic`` have other times, s, by their numbers from 0."""
+    made = messages_of(folder)
+    headers = [row[2].header for row in made.rows if row[1] == topic]
+    for number, stamp_s in stamp_of_number.items():
+        stamp = headers[number].stamp
+        stamp.sec, stamp.nanosec = int(stamp_s), round(stamp_s % 1 * 1e9)
+    return made
+
+
+FRONT = "/sensing/front/image_raw"
+
+
+def _front_times(drive):
+    return [image.stamp_s for image in drive.images if image.camera == "front"]
+
+
+def test_images_on_two_clocks_are_named(folder, tmp_path):
+    bag = write_ros2(tmp_path / "clocks", _restamped(folder, FRONT, {2: 7}))
+    with pytest.raises(DriveError, match=r"image_raw: image 3: its time 7\.000000 s .* two clocks"):
+        read(tmp_path / "drive", topics_for(folder, bag))
+
+
+def test_images_that_come_late_or_twice_or_have_no_time_are_sorted_or_dropped_and_counted(
+    folder, tmp_path, caplog
+):
+    expected = read_drive(folder)
+    times = _front_times(expected)
+    pixels = {(image.camera, image.stamp_s): cv2.imread(str(image.path)) for image in expected.images}
+    for name, made, kept in (
+        ("late", messages_of(folder), times),
+        ("twice", messages_of(folder), times),
+        ("zero", _restamped(folder, FRONT, {0: 0}), times[1:]),
+    ):
+        places = [place for place, row in enumerate(made.rows) if row[1] == FRONT]
+        if name == "late":
+            first, second = (made.rows[place] for place in places[:2])
+            made.rows[places[0]] = (first[0], FRONT, second[2])
+            made.rows[places[1]] = (second[0], FRONT, first[2])
+        if name == "twice":
+            made.rows.insert(places[0], made.rows[places[0]])
+        got = read(tmp_path / name, topics_for(folder, write_ros2(tmp_path / f"bag_{name}", made)))
+        assert _front_times(got) == kept
+        for image in got.images:
+            np.testing.assert_array_equal(cv2.imread(str(image.path)), pixels[image.camera, image.stamp_s])
+    for words in ("sorted images that were late: 1", "whose time repeats: 1", "without a time: 1"):
+        assert words in caplog.text
+
+
+def test_poses_without_a_time_are_dropped_and_counted_or_refused(folder, tmp_path, caplog):
+    drive = read_drive(folder)
+    bag = write_ros2(tmp_path / "one", _restamped(folder, "/odom", {0: 0}))
+    got = read(tmp_path / "drive", topics_for(folder, bag))
+    np.testing.assert_array_equal(got.trajectory.stamp_s, drive.trajectory.stamp_s[1:])
+    assert "left out 1 of" in caplog.text
+    bag = write_ros2(
+        tmp_path / "all", _restamped(folder, "/odom", dict.fromkeys(range(len(drive.trajectory.stamp_s)), 0))
+    )
+    with pytest.raises(
+        DriveError, match=r"/odom: \d+ of \d+ messages have no time \(0\); .*stamps: received"
+    ):
+        read(tmp_path / "again", topics_for(folder, bag))
 
 
 @pytest.mark.parametrize(
@@ -297,6 +351,85 @@ def test_a_bayer_pattern_is_read_as_ros_names_it(pattern):
     made = Messages().raw_image(1.0, np.tile(tile, (4, 4))[..., None], f"bayer_{pattern}8", "cam")
     got = cv2.imdecode(np.frombuffer(file_of("sensor_msgs/msg/Image", made, "here")[1], np.uint8), 1)
     np.testing.assert_array_equal(got, np.broadcast_to([30, 120, 200], got.shape))
+
+
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
+TILE = np.array([[200, 120], [120, 30]], np.uint8)  # red, green; green, blue
+
+
+def _unpacked(form, data):
+    suffix, content = file_of(COMPRESSED, Messages().compressed(1.0, data, form, "cam"), "here")
+    return suffix, cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+
+
+@pytest.mark.parametrize(
+    "form",
+    ["bayer_rggb8; jpeg compressed ", "bayer_rggb8; jpeg compressed", "bayer_rggb8;png", "bayer_rggb8"],
+)
+@pytest.mark.parametrize("ending", [".jpg", ".png"])
+def test_a_mosaic_that_was_compressed_as_it_is_gets_its_colours(form, ending):
+    mosaic = np.tile(TILE, (16, 16))
+    suffix, got = _unpacked(form, cv2.imencode(ending, mosaic, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes())
+    assert suffix == ".png"
+    np.testing.assert_allclose(got, np.broadcast_to([30, 120, 200], got.shape), atol=3)
+
+
+@pytest.mark.parametrize(
+    ("form", "shape"),
+    [
+        ("bayer_rggb8; jpeg compressed bgr8", (32, 32, 3)),
+        ("bayer_rggb8; jpeg compressed mono8", (32, 32)),
+        ("mono8; jpeg compressed ", (32, 32)),
+        ("bayer_rggb8; jpeg compressed ", (32, 32, 3)),  # whatever it says, it has colours
+        ("jpeg", (32, 32, 3)),
+        ("", (32, 32)),
+    ],
+)
+@pytest.mark.parametrize("ending", [".jpg", ".png", ".webp", ".tif", ".bmp"])
+def test_other_compressed_images_are_kept_as_they_are(form, shape, ending):
+    pixels = np.random.default_rng(2).integers(0, 255, shape, np.uint8)
+    data = cv2.imencode(ending, pixels)[1].tobytes()
+    suffix, content = file_of(COMPRESSED, Messages().compressed(1.0, data, form, "cam"), "here")
+    assert (suffix, content) == (ending, data)
+
+
+@pytest.mark.parametrize("encoding", ["nv12", "nv21"])
+def test_colours_of_half_a_size_stand_below_the_brightness(encoding):
+    planes = np.full((12, 8, 1), 128, np.uint8)
+    planes[:8, :, 0] = 90
+    planes[8:, 1::2, 0] = 180  # V of NV12, U of NV21: much red, or much blue
+    message = Messages().raw_image(1.0, planes, encoding, "cam")
+    message.height = 8
+    got = cv2.imdecode(np.frombuffer(file_of("sensor_msgs/msg/Image", message, "here")[1], np.uint8), 1)
+    assert got.shape == (8, 8, 3)
+    strongest = got[0, 0].argmax()
+    assert strongest == (2 if encoding == "nv12" else 0)
+
+
+@pytest.mark.parametrize(("encoding", "width"), [("yuv422", 5), ("nv12", 5)])
+def test_sizes_that_an_encoding_cannot_have_are_named(encoding, width):
+    channels = 2 if encoding == "yuv422" else 1
+    message = Messages().raw_image(1.0, np.zeros((9, width, channels), np.uint8), encoding, "cam")
+    message.height = 6
+    with pytest.raises(DriveError, match="here: "):
+        file_of("sensor_msgs/msg/Image", message, "here")
+
+
+def test_compressed_images_of_16_bits_or_of_depth_are_named():
+    sixteen = cv2.imencode(".png", np.zeros((20, 20), np.uint16))[1].tobytes()
+    with pytest.raises(DriveError, match="here: its PNG has 16 bits per channel"):
+        _unpacked("mono16; png compressed ", sixteen)
+    with pytest.raises(DriveError, match=r"compressed as '16UC1; compressedDepth png'; record JPEG"):
+        _unpacked("16UC1; compressedDepth png", bytes(12) + sixteen)
+
+
+def test_messages_without_an_image_are_left_out_and_counted(folder, tmp_path, caplog):
+    made = messages_of(folder)
+    empty = next(row[2] for row in made.rows if row[1] == FRONT)
+    empty.data, empty.width, empty.height, empty.step = empty.data[:0], 0, 0, 0
+    got = read(tmp_path / "drive", topics_for(folder, write_ros2(tmp_path / "site", made)))
+    assert _front_times(got) == _front_times(read_drive(folder))[1:]
+    assert "left out 1 of 3 images, which are empty" in caplog.text
 
 
 def test_images_of_an_unknown_encoding_are_named(folder, tmp_path):

@@ -15,7 +15,13 @@ from models import MarkingNet, NetConfig, Prediction
 from tests.export.graphs import graphs_made_once as graphs_made_once
 from tests.train.small import coco, tiny
 from train.average import mean_checkpoint, scored
-from train.checkpoint import Checkpoint, fresh_checkpoint, load_checkpoint, save_checkpoint
+from train.checkpoint import (
+    Checkpoint,
+    check_same_experiment,
+    fresh_checkpoint,
+    load_checkpoint,
+    save_checkpoint,
+)
 from train.config import DataConfig, LabelError
 from train.exported import read_exported, unfold
 from train.growth import with_classes
@@ -309,10 +315,11 @@ def test_known_classes_keep_their_shares_and_a_new_one_starts_small(shipped_run,
 
 def test_classes_go_by_name_where_the_order_of_a_catalogue_changes(shipped_run, catalogue):
     weights = with_classes(load_checkpoint(shipped_run).averaged, PAINT_CLASSES, catalogue, "here")
-    weights["kinds.bias"] = torch.arange(10.0)
+    weights["kinds.bias"] = torch.arange(float(len(CLASSES)))
     turned = SHIPPED.with_own({PAD: ENTRIES[PAD], T: ENTRIES[T]}, "test")
     again = with_classes(weights, catalogue.names, turned, "here")
-    assert again["kinds.bias"].tolist() == [*range(8), 9.0, 8.0]
+    last = len(PAINT_CLASSES)
+    assert again["kinds.bias"].tolist() == [*range(last), last + 1, last]
     with pytest.raises(ConfigError, match="here knows parking_t, pad"):
         with_classes(weights, catalogue.names, SHIPPED, "here")
 
@@ -377,3 +384,43 @@ def test_a_file_with_wrong_classes_is_refused(tmp_path, exported, own, words):
     onnx.save_model(model, str(path))
     with pytest.raises(DetectorError, match=words):
         Network(path)
+
+
+OLDEST = 8  # shipped classes of the networks before there were words and boxes
+
+
+def of_the_oldest(path):
+    """A checkpoint of a network that knows the oldest classes only."""
+    torch.manual_seed(0)
+    config = replace(tiny(path.parent), net=replace(tiny(path.parent).net, wide_kinds=True))
+    state = fresh_checkpoint(config)
+    state.averaged = MarkingNet(config.net, OLDEST).state_dict()
+    state.model = state.averaged
+    save_checkpoint(state, path)
+    return config
+
+
+def test_a_network_of_the_oldest_classes_is_exported_and_learns_the_others(tmp_path, image):
+    config = of_the_oldest(tmp_path / "old.pt")
+    old = load_checkpoint(tmp_path / "old.pt")
+    assert old.classes == PAINT_CLASSES[:OLDEST]
+    export_checkpoint(old, tmp_path / "old.onnx", opset=18, tolerance=1e-3)
+    assert Network(tmp_path / "old.onnx").info.classes == PAINT_CLASSES[:OLDEST]
+    for start in ("old.pt", "old.onnx"):
+        grown = fresh_checkpoint(replace(config, start=str(tmp_path / start)))
+        assert grown.classes == PAINT_CLASSES
+        with torch.inference_mode():
+            kinds = grown.network()(image).kinds[:, :OLDEST]
+            torch.testing.assert_close(kinds, old.network()(image).kinds, atol=1e-3, rtol=1e-3)
+
+
+def test_a_run_from_before_a_class_was_added_is_not_resumed_but_started_from(tmp_path):
+    config = of_the_oldest(tmp_path / "last.pt")
+    with pytest.raises(ConfigError, match=r"before .* text, box, bicycle: go on with start="):
+        check_same_experiment(load_checkpoint(tmp_path / "last.pt"), config, tmp_path / "last.pt")
+
+
+def test_the_mean_of_an_old_and_a_new_network_knows_all_classes(tmp_path):
+    of_the_oldest(tmp_path / "old.pt")
+    mean = mean_checkpoint(tmp_path / "old.pt", [tmp_path / "old.pt"])
+    assert mean.classes == PAINT_CLASSES

@@ -19,11 +19,13 @@ from train.scenes.hardships import (
     tight_bend,
     with_side_seams,
 )
-from train.scenes.letters import WORDS, word
+from train.scenes.letters import WORDS, Hand, random_hand, random_text, word
 from train.scenes.paint import (
     Bend,
     Brush,
     Facing,
+    RoadPaint,
+    double_line,
     port_paint,
     random_brush,
     rectangle,
@@ -33,7 +35,20 @@ from train.scenes.paint import (
 )
 from train.scenes.remains import with_erased
 from train.scenes.scenes import TrainingSample, image_line, image_points, random_scene, training_sample
-from train.scenes.symbols import hollow_diamond, lines_across, with_crossing
+from train.scenes.symbols import (
+    hollow_diamond,
+    lines_across,
+    with_bays,
+    with_boxes,
+    with_crossing,
+    with_crosswalk,
+    with_double,
+    with_far_stop,
+    with_give_way,
+    with_other,
+    with_users,
+    with_words,
+)
 from train.scenes.traffic import reflectance, traffic
 from train.scenes.views import TrainingView, looking, mounted_otherwise, random_view, turned_aside
 from train.scenes.weather import GROUNDS, photo_tile
@@ -43,7 +58,19 @@ from v2hdm.detection.camera import ASIDE_RAD
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.planar import clip_convex, inside_convex, signed_area
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.records import ARROW, CROSSWALK_BAR, DIAMOND, LANE_DASH, STOP_LINE, CameraInfo
+from v2hdm.records import (
+    ARROW,
+    BICYCLE,
+    BOX,
+    CROSSWALK_BAR,
+    DIAMOND,
+    LANE_DASH,
+    LANE_LINE,
+    OTHER_PAINT,
+    STOP_LINE,
+    TEXT,
+    CameraInfo,
+)
 from v2hdm.simulate.render.renderer import Motion, Optics, Renderer
 from v2hdm.simulate.render.scene import Box, Ground, Paint, Scene, box_footprint
 
@@ -73,7 +100,7 @@ def test_validation_shows_other_scenes_than_training():
 
 
 def test_all_classes_are_seen_in_a_hundred_or_so_samples():
-    seen = {int(c) for index in range(150) for c in np.unique(training_sample(2, index, 160, 96).labels)}
+    seen = {int(c) for index in range(120) for c in np.unique(training_sample(2, index, 320, 192).labels)}
     assert seen == set(range(1 + len(PAINT_CLASSES)))
 
 
@@ -206,8 +233,9 @@ def test_tight_bends_turn_the_lines_and_keep_the_way_clear():
 
 
 ELSEWHERE = (
-    "things_beside", "tight_bends", "kerbs", "junctions", "mountings", "aside", "facing", "stout", "hollow",
-    "crossings", "words", "litter", "traffic", "own_vehicle",
+    "things_beside", "tight_bends", "kerbs", "gutters", "junctions", "mountings", "aside", "facing", "stout",
+    "hollow", "crossings", "words", "bays", "boxes", "users", "others", "give_way", "far_stops", "crosswalks",
+    "doubles", "litter", "traffic", "own_vehicle",
 )  # fmt: skip
 
 
@@ -226,12 +254,19 @@ def test_hardships_change_what_paint_looks_like_and_not_where_it_is(name):
     assert any((plain.image != hard.image).any() for plain, hard in seen)
 
 
-CROWDS = {"things_beside": 4.0, "kerbs": 1.0, "litter": 8.0, "traffic": 4.0, "own_vehicle": 1.0}
+CROWDS = {
+    "things_beside": 4.0,
+    "kerbs": 1.0,
+    "gutters": 1.0,
+    "litter": 8.0,
+    "traffic": 4.0,
+    "own_vehicle": 1.0,
+}
 
 
 @pytest.mark.parametrize(("name", "much"), CROWDS.items())
 def test_things_beside_markings_hide_paint_and_add_none(name, much):
-    seen = pairs(Hardships(**{name: much}), 8)
+    seen = pairs(Hardships(**{name: much}), 12)
     for plain, crowded in seen:
         changed = plain.labels != crowded.labels
         assert (crowded.labels[changed] == 0).all()
@@ -307,6 +342,76 @@ def test_words_are_strokes_of_their_size_in_the_order_in_which_they_are_read():
     left_i, right_l = (np.vstack(list(word(text, 2.0, 0.5, 0.1)))[:, 1] for text in ("I", "LI"))
     assert right_l.max() > left_i.max()
     assert all(list(word(text, 2.0, 0.5, 0.1)) for text in WORDS)
+
+
+PAINTED = (
+    (with_words, {TEXT}), (with_bays, {TEXT}), (with_boxes, {BOX}), (with_users, {BICYCLE}),
+    (with_other, {OTHER_PAINT}), (with_give_way, {STOP_LINE}), (with_far_stop, {STOP_LINE}),
+    (with_crosswalk, {CROSSWALK_BAR, STOP_LINE}), (with_double, {LANE_LINE, LANE_DASH}),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("lay", "kinds"), PAINTED)
+def test_paint_laid_on_a_bare_road_is_convex_and_of_the_class_that_labels_call_it(lay, kinds):
+    laid = 0
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        brush = random_brush(rng, 0.0)
+        bare = RoadPaint()
+        assert lay(rng, bare, brush, Bend(0.0), 0.0) is bare
+        paints = lay(rng, bare, brush, Bend(0.01), 1.0).paints
+        laid += bool(paints)
+        assert {paint.kind for paint in paints} <= kinds
+        for paint in paints:
+            turn = turns_of(paint.polygon_map)
+            assert (turn > -1e-9).all() or (turn < 1e-9).all()
+    assert laid == 30
+
+
+def test_numbers_words_and_letters_have_strokes_in_every_hand():
+    rng = np.random.default_rng(0)
+    texts = [random_text(rng) for _ in range(200)]
+    assert {text.isdigit() for text in texts} == {True, False}
+    for text in texts:
+        strokes = list(word(text, 2.0, 0.5, 0.1, random_hand(rng)))
+        assert all(signed_area(stroke) > 0 and (turns_of(stroke) > -1e-9).all() for stroke in strokes)
+        assert np.vstack(strokes)[:, 0].max() == pytest.approx(2.0 + 2.8 * text.count(" "), abs=0.3), (
+            "letters are as tall as asked for, whatever the hand"
+        )
+
+
+def test_a_stencil_leaves_bridges_and_a_round_hand_has_more_strokes():
+    plain, stencil, round_hand = (
+        list(word("B", 2.0, 0.5, 0.1, hand)) for hand in (Hand(), Hand(stencil=True), Hand(rounds=1))
+    )
+    assert len(stencil) > len(plain)
+    assert len(round_hand) > len(plain)
+    area = [sum(signed_area(stroke) for stroke in strokes) for strokes in (plain, stencil)]
+    assert area[1] < area[0]
+
+
+def test_the_strands_of_a_double_line_are_a_hand_apart():
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        double = double_line(rng, random_brush(rng, 0.0), Bend(0.0), 1.0)
+        across = np.array([[p.polygon_map[:, 1].min(), p.polygon_map[:, 1].max()] for p in double.paints])
+        right, left = across[across[:, 1] < 1.0], across[across[:, 0] > 1.0]
+        assert 0.08 <= left[:, 0].min() - right[:, 1].max() <= 0.35
+        assert len(double.lanes) == 1
+
+
+def test_a_stop_line_far_ahead_is_12_to_40_m_away():
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        brush = random_brush(rng, 0.0)
+        for paint in with_far_stop(rng, RoadPaint(), brush, Bend(0.0), 1.0).paints:
+            assert 6 < paint.polygon_map[:, 0].mean() < 44
+
+
+def test_scenes_without_hardships_show_words_boxes_and_symbols_too():
+    new = [1 + PAINT_CLASSES.index(kind) for kind in (TEXT, BOX, BICYCLE)]
+    shown = [np.isin(training_sample(11, k, 224, 128).labels, new).any() for k in range(60)]
+    assert 0.05 < np.mean(shown) < 0.5
 
 
 def test_erased_markings_are_no_paint_and_vehicles_bear_pictures():

@@ -22,6 +22,7 @@ _CROSSED_M = 22.0  # distance ahead, m, within which a shadow may cross a markin
 _LONGEST_LEVEL = 0.9  # highest mean level of an overexposed image, of 1
 _CAMERA_CLEARANCE_M = 3.5  # least distance of things beside markings from the camera, m
 _KERB_M = 45.0  # distance ahead to which kerbs reach, m
+_GUTTER_ALBEDO = (0.13, 0.3)  # of weathered concrete and stone, chosen; paint has 0.6 to 0.9
 _SEAM_STEP_M = 0.25  # distance between the points of a seam, m
 _BLEACHED_ALBEDO = (0.37, 0.52)
 """Of sun-bleached concrete; fresh paint has 0.6 to 0.9."""
@@ -55,6 +56,8 @@ class Hardships:
     blue_shade: float = 0.0
     tight_bends: float = 0.0
     kerbs: float = 0.0
+    gutters: float = 0.0
+    joints: float = 0.0
     junctions: float = 0.0
     mountings: float = 0.0
     facing: float = 0.0
@@ -62,6 +65,14 @@ class Hardships:
     hollow: float = 0.0
     crossings: float = 0.0
     words: float = 0.0
+    bays: float = 0.0
+    boxes: float = 0.0
+    users: float = 0.0
+    others: float = 0.0
+    give_way: float = 0.0
+    far_stops: float = 0.0
+    crosswalks: float = 0.0
+    doubles: float = 0.0
     erased: float = 0.0
     litter: float = 0.0
     traffic: float = 0.0
@@ -170,6 +181,38 @@ def kerbs(rng: np.random.Generator, lines_map: Sequence[FloatArray], share: floa
         *_along(rng, edge, (0.8, 7.0), (0.02, 3.0), (wide_m, tall_m + 0.01), stone),
     ]
     return tuple(box for box in out if float(box_footprint(box)[:, 0].min()) > _CAMERA_CLEARANCE_M)
+
+
+def gutters(rng: np.random.Generator, lines_map: Sequence[FloatArray], share: float) -> tuple[Box, ...]:
+    """In a ``share`` of cases a strip of stones or concrete, level with the ground, along the way.
+
+    It runs beside one of the lines (N, 2, map), or straight on where there are none, duller than paint, which
+    it would be if it were as bright; joints part it.
+    """
+    if rng.random() >= share:
+        return ()
+    straight = np.column_stack([np.arange(0.0, _KERB_M, 0.5), np.zeros(int(_KERB_M * 2))])
+    line = lines_map[int(rng.integers(len(lines_map)))] if lines_map else straight
+    offset_m = rng.choice([-1.0, 1.0]) * rng.uniform(0.4, 5.0)
+    blue, green, red = (float(c) for c in rng.uniform(*_GUTTER_ALBEDO) * np.exp(rng.normal(0, 0.04, 3)))
+    piece_m = rng.uniform(0.5, 4.0)
+    section_m = (float(rng.uniform(0.2, 0.6)), float(rng.uniform(0.004, 0.02)))
+    strip = _beside(line, np.full(len(line), offset_m))
+    return tuple(_along(rng, strip, (piece_m, piece_m), (0.01, 0.05), section_m, (blue, green, red)))
+
+
+def with_joints(
+    rng: np.random.Generator, marks: GroundMarks | None, lines_map: Sequence[FloatArray], mean: float
+) -> GroundMarks | None:
+    """The marks of a ground and ``mean`` long seams along the way, apart from all lines of lanes."""
+    along_m = np.arange(0.0, 50.0, 0.5)
+    seams = []
+    for _ in range(int(rng.poisson(mean))):
+        straight = np.column_stack([along_m, rng.normal(0, 0.03) * along_m])
+        line = lines_map[int(rng.integers(len(lines_map)))] if lines_map else straight
+        wavy_m = rng.uniform(0, 0.02) * np.cumsum(rng.normal(0, 1, len(line)))
+        seams.append(_beside(line, rng.choice([-1, 1]) * rng.uniform(0.4, 5) + wavy_m))
+    return _with_strips(rng, marks, seams) if seams else marks
 
 
 def _along(

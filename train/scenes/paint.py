@@ -17,8 +17,8 @@ from v2hdm.records import (
     DIAMOND,
     LANE_DASH,
     LANE_LINE,
-    OTHER_PAINT,
     STOP_LINE,
+    TEXT,
     FloatArray,
 )
 from v2hdm.simulate.render.scene import WHITE_PAINT, YELLOW_PAINT, Bgr, Paint
@@ -254,6 +254,27 @@ def _lane_line(
     return _LaneLine(paints, bend.to_map(_centre(strands)), [at for at, _ in strands])
 
 
+def double_line(rng: np.random.Generator, brush: Brush, bend: Bend, left: float) -> RoadPaint:
+    """Two strands beside each other, each solid or dashed, 0.08 to 0.35 m of ground between them."""
+    width_m = float(rng.uniform(0.09, 0.2))
+    apart_m = width_m + float(rng.uniform(0.08, 0.35))
+    dash = _dash_pattern(rng)
+    dashed = rng.choice(4, p=[0.6, 0.15, 0.15, 0.1])
+    paints: list[Paint] = []
+    strands: list[tuple[float, tuple[float, float]]] = []
+    extent = _solid_extent(rng)
+    phase = rng.uniform(0, dash[1])
+    for number, side in enumerate((-1, 1)):
+        at = left + side * apart_m / 2
+        strands.append((at, extent))
+        if not dashed & (1 << number):
+            paints += _solid(rng, brush, bend, extent, at, width_m)
+            continue
+        for start in np.arange(extent[0] - phase, extent[1], dash[1]):
+            paints.append(brush.paint(rng, LANE_DASH, _strip(bend, start, start + dash[0], at, width_m)))
+    return RoadPaint(paints, [bend.to_map(_centre(strands))])
+
+
 def _centre(strands: list[tuple[float, tuple[float, float]]]) -> FloatArray:
     """The centre (N, 2), along and beside the way, of strands at a place beside it, each of such an extent.
 
@@ -319,7 +340,7 @@ def _lane_symbols(
     rng: np.random.Generator, brush: Brush, bend: Bend, left: float, lane_m: float, facing: Facing | None
 ) -> list[Paint]:
     """An arrow or a line of writing in a lane, perhaps repeated."""
-    draw, kind = (arrow, ARROW) if rng.random() < 0.6 else (_writing, OTHER_PAINT)
+    draw, kind = (arrow, ARROW) if rng.random() < 0.6 else (_writing, TEXT)
     out: list[Paint] = []
     turn = facing.turn() if facing else 1
     stout = facing is not None and kind == ARROW and facing.rng.random() < facing.stout
@@ -411,7 +432,7 @@ def _junction(rng: np.random.Generator, brush: Brush, bend: Bend, lane_m: float)
     draw, kind = [
         (stop_line, STOP_LINE),
         (crosswalk, CROSSWALK_BAR),
-        (_teeth, OTHER_PAINT),
+        (_teeth, STOP_LINE),
         (_chevrons, CHEVRON),
     ][int(rng.choice(4, p=[0.27, 0.27, 0.13, 0.33]))]
     return [

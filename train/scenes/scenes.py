@@ -19,11 +19,13 @@ from train.scenes.hardships import (
     blue_shade,
     clear_of,
     faint,
+    gutters,
     kerbs,
     overexposed,
     shadows_on_paint,
     things_beside,
     tight_bend,
+    with_joints,
     with_junction,
     with_pavements,
     with_seams,
@@ -40,7 +42,20 @@ from train.scenes.paint import (
     street_paint,
 )
 from train.scenes.remains import litter, with_erased
-from train.scenes.symbols import with_crossing, with_hollow, with_words
+from train.scenes.symbols import (
+    with_bays,
+    with_boxes,
+    with_crossing,
+    with_crosswalk,
+    with_double,
+    with_far_stop,
+    with_give_way,
+    with_hollow,
+    with_other,
+    with_sign,
+    with_users,
+    with_words,
+)
 from train.scenes.traffic import traffic
 from train.scenes.views import TrainingView, mounted_otherwise, random_view, turned_aside
 from train.scenes.weather import (
@@ -211,7 +226,9 @@ def random_scene(
         8
     )
     # Streams of their own for what came later leave what was drawn before as it is.
-    for_facing, for_symbols, for_remains, for_traffic, for_weather, for_grounds = for_junction.spawn(6)
+    for_facing, for_symbols, for_remains, for_traffic, for_weather, for_grounds, for_signs, for_edges = (
+        for_junction.spawn(8)
+    )
     tight = tight_bend(for_bend, hardships.tight_bends)
     bend = tight or bend
     brush = random_brush(rng, difficulty)
@@ -231,9 +248,11 @@ def random_scene(
     road = junction
     if place != "bare":
         road = _with_symbols(for_symbols, road, brush, bend, hardships)
+        road = _with_signs(for_signs, road, brush, bend, hardships)
     ground = _ground(rng, place == "port", difficulty)
     shadows = _shadows(rng, difficulty)
     marks = _marked(for_ground, for_remains, ground.marks, road, hardships)
+    marks = with_joints(for_edges, marks, road.lanes, hardships.joints)
     ground = photographed(for_grounds, bleached(for_ground, ground, hardships.bleached), hardships.grounds)
     dapples = _dapples(rng, difficulty)
     light = blue_shade(for_light, _light(rng), hardships.blue_shade)
@@ -247,6 +266,7 @@ def random_scene(
             *boxes,
             *things_beside(for_things, road.paints, hardships.things_beside),
             *clear_of(kerbs(for_kerbs, road.lanes, hardships.kerbs), road.paints),
+            *clear_of(gutters(for_edges, road.lanes, hardships.gutters), road.paints),
             *litter(for_remains, hardships.litter),
             *traffic(for_traffic, hardships.traffic),
         ),
@@ -264,6 +284,22 @@ def _with_symbols(
     road = with_hollow(rng, road, brush, bend, hardships.hollow)
     road = with_words(rng, road, brush, bend, hardships.words)
     return with_crossing(rng, road, brush, bend, hardships.crossings)
+
+
+def _with_signs(
+    rng: np.random.Generator, road: RoadPaint, brush: Brush, bend: Bend, hardships: Hardships
+) -> RoadPaint:
+    # Each from a stream of its own: what one lays does not depend on the shares of the others.
+    shares = (
+        (with_double, hardships.doubles), (with_crosswalk, hardships.crosswalks),
+        (with_far_stop, hardships.far_stops), (with_give_way, hardships.give_way),
+        (with_boxes, hardships.boxes), (with_users, hardships.users), (with_bays, hardships.bays),
+        (with_other, hardships.others),
+    )  # fmt: skip
+    for_sign, *streams = rng.spawn(1 + len(shares))
+    for (lay, share), stream in zip(shares, streams, strict=True):
+        road = lay(stream, road, brush, bend, share)
+    return with_sign(for_sign, road, brush, bend)
 
 
 def _marked(

@@ -143,13 +143,50 @@ def _plate(rng: np.random.Generator, picture: Picture, middle: float, low: float
         )
 
 
-def _wheel(picture: Picture, middle: float, radius: float, rim: Bgr) -> None:
-    """A tyre that stands on the ground, its arch and its rim."""
+def _wheel(rng: np.random.Generator, picture: Picture, middle: float, radius: float, rim: Bgr) -> None:
+    """A tyre that stands on the ground, its arch and its rim: a plate, or spokes with dark gaps."""
     turn = np.linspace(0, 2 * np.pi, 20)
     circle = np.column_stack([np.cos(turn), np.sin(turn)])
-    _fill(picture, circle * radius * 1.15 + (middle, radius), (0.03, 0.03, 0.03))
-    _fill(picture, circle * radius * 0.6 + (middle, radius), rim)
-    _fill(picture, circle * radius * 0.25 + (middle, radius), (0.05, 0.05, 0.05))
+    hub = np.array([middle, radius])
+    _fill(picture, circle * radius * 1.15 + hub, (0.03, 0.03, 0.03))
+    spokes = int(rng.choice([0, 5, 6, 7, 8, 10], p=[0.4, 0.25, 0.1, 0.1, 0.05, 0.1]))
+    reach = radius * rng.uniform(0.55, 0.75)
+    _fill(picture, circle * reach + hub, rim)
+    if spokes:
+        _fill(picture, circle * 0.88 * reach + hub, (0.03, 0.03, 0.03))
+        foot, tip = reach * rng.uniform([0.06, 0.06], [0.2, 0.3])
+        for angle in rng.uniform(0, 2 * np.pi) + np.arange(spokes) * 2 * np.pi / spokes:
+            spoke = np.array([[0, -foot], [0.95 * reach, -tip], [0.95 * reach, tip], [0, foot]])
+            cos, sin = np.cos(angle), np.sin(angle)
+            _fill(picture, spoke @ np.array([[cos, sin], [-sin, cos]]) + hub, rim)
+    if not spokes or rng.random() < 0.5:
+        _fill(picture, circle * radius * rng.uniform(0.1, 0.27) + hub, (0.05, 0.05, 0.05))
+
+
+def _rim(rng: np.random.Generator) -> Bgr:
+    """Bright aluminium half of the time."""
+    grey = float(rng.uniform(0.4, 0.8) if rng.random() < 0.5 else rng.uniform(0.05, 0.4))
+    return grey, grey, grey
+
+
+def _bars(
+    rng: np.random.Generator, picture: Picture, left: float, low: float, wide: float, tall: float
+) -> None:
+    """Upright bars side by side, as the straps of a curtain, the rods of doors, slats, or a plate."""
+    bright = _WHITE if rng.random() < 0.5 else _colour(rng)
+    if rng.random() < 0.5:
+        _rectangle(picture, left, low, wide, tall, tuple(0.3 * c for c in _colour(rng)))  # type: ignore[arg-type]
+    pitch = rng.uniform(0.12, 0.7)
+    broad = pitch * rng.uniform(0.15, 0.6)
+    for at in np.arange(left, left + wide - broad, pitch):
+        _rectangle(picture, at, low, broad, tall, bright)
+
+
+def _guard(rng: np.random.Generator, side: Picture, length: float) -> None:
+    """The rails between the wheels of a lorry, before what is dark beneath it."""
+    bright = _WHITE if rng.random() < 0.6 else _colour(rng)
+    for low in rng.uniform(0.3, 0.5) + np.arange(int(rng.integers(1, 4))) * rng.uniform(0.15, 0.25):
+        _rectangle(side, 0.32 * length, low, 0.4 * length, rng.uniform(0.05, 0.14), bright)
 
 
 def _colour(rng: np.random.Generator) -> Bgr:
@@ -206,7 +243,7 @@ def _lorry(rng: np.random.Generator, x: float, y: float, yaw: float) -> list[Box
     if rng.random() < 0.5:
         _writing(rng, rear, 0.1 * wide, rng.uniform(0.4, 0.8) * tall, 0.9 * wide, rng.uniform(0.15, 0.6))
     _lights(rng, rear, wide, bumper - 0.3, front=False)
-    kind = rng.integers(5)
+    kind = rng.integers(6)
     if kind == 0:
         _stripes(rng, rear, 0.0, bumper, wide, rng.uniform(0.5, 1.0) * (tall - bumper))
     elif kind == 1:
@@ -217,10 +254,25 @@ def _lorry(rng: np.random.Generator, x: float, y: float, yaw: float) -> list[Box
             _stripes(rng, rear, left, bumper, broad, min(rng.uniform(0.5, 2.0), tall - bumper))
     elif kind == 3:
         _stripes(rng, rear, 0.1, rng.uniform(0.3, 0.8) * tall, wide - 0.2, rng.uniform(0.2, 0.5))
+    elif kind == 4:
+        broad, low = rng.uniform([0.4, bumper - 0.4], [1.0, bumper + 1.0])
+        _bars(rng, rear, wide * rng.uniform(0, 0.2), low, wide * min(broad, 0.8), rng.uniform(0.12, 1.5))
     _plate(rng, rear, wide / 2, bumper - 0.35)
     _rectangle(side, 0, 0, length, 0.85, (0.03, 0.03, 0.03))
+    rim = _rim(rng)
     for middle in (0.12 * length, 0.12 * length + 1.3, 0.82 * length):
-        _wheel(side, middle, 0.5, (0.25, 0.25, 0.25))
+        _wheel(rng, side, middle, 0.5, rim)
+    if rng.random() < 0.4:
+        _guard(rng, side, length)
+    if rng.random() < 0.3:
+        _bars(
+            rng,
+            side,
+            0.05 * length,
+            rng.uniform(0.9, 1.2),
+            0.8 * length,
+            rng.uniform(0.3, 1.0) * (tall - 1.2),
+        )
     _tape(rng, side, length, 0.9)
     if rng.random() < 0.5:
         _writing(rng, side, 0.1 * length, rng.uniform(0.4, 0.7) * tall, 0.8 * length, rng.uniform(0.3, 1.2))
@@ -254,11 +306,11 @@ def _car(rng: np.random.Generator, x: float, y: float, yaw: float) -> list[Box]:
     tall = float(rng.uniform(0.75, 1.0))
     up = float(rng.uniform(0.45, 0.8))
     colour = _colour(rng)
-    rim = float(rng.uniform(0.05, 0.6))
+    rim = _rim(rng)
     side = _plain((length, tall), colour)
     _rectangle(side, 0, 0, length, 0.25, (0.02, 0.02, 0.02))
     for middle in (0.18 * length, 0.8 * length):
-        _wheel(side, middle, 0.31, (rim, rim, rim))
+        _wheel(rng, side, middle, 0.31, rim)
     _rectangle(side, 0.5 * length, 0.25, 0.015, tall - 0.25, tuple(0.4 * c for c in colour))  # type: ignore[arg-type]
     ends = []
     for front in (False, True):
@@ -301,8 +353,9 @@ def _bus(rng: np.random.Generator, x: float, y: float, yaw: float) -> list[Box]:
     _rectangle(end, 0.08 * wide, 0.52 * tall, 0.84 * wide, 0.33 * tall, glass)
     for picture in (side, end):
         _rectangle(picture, 0, 0, 20, 0.25, (0.02, 0.02, 0.02))
+    rim = _rim(rng)
     for middle in (0.2 * length, 0.78 * length):
-        _wheel(side, middle, 0.42, (0.2, 0.2, 0.2))
+        _wheel(rng, side, middle, 0.42, rim)
     if rng.random() < 0.6:
         _writing(rng, side, 0.15 * length, 0.3 * tall, 0.6 * length, 0.3)
     rear = end.copy()

@@ -168,6 +168,8 @@ def _bonnet(rng: np.random.Generator, radiance: Float32, hidden: Hidden) -> None
         if rng.random() < 0.6:
             mirrored = cv2.GaussianBlur(mirrored, (0, 0), float(rng.uniform(0.7, 4)))
         body = body + np.float32(rng.uniform(0.1, 0.8)) * mirrored
+        if rng.random() < 0.5:
+            body += np.float32(level * rng.uniform(0.3, 2.5)) * _clouds(rng, len(rows), width)[..., None]
     for _ in range(int(rng.poisson(1.5))):
         middle = width * (0.5 + rng.normal(0, 0.3)) + rng.normal(0, 1.5) * (rows - height)
         crease = np.exp(-(((column - middle) / rng.uniform(1, 6)) ** 2))[..., None]
@@ -183,6 +185,20 @@ def _bonnet(rng: np.random.Generator, radiance: Float32, hidden: Hidden) -> None
             _mix(body, mask, level * np.full(3, rng.uniform(0.0, 2.5)))
     _mix(radiance[first:], share, body)
     hidden[first:] |= share > 0.5
+
+
+def _clouds(rng: np.random.Generator, rows: int, columns: int) -> Float32:
+    """Cover (rows, columns) of clouds, or of gaps in leaves, by the sky that lacquer mirrors."""
+    cells = int(rng.integers(2, 12))
+    aspect = rng.uniform(1.0, 4.0)
+    noise = np.zeros((rows, columns), dtype=np.float32)
+    for octave in range(3):
+        across = cells << octave
+        down = max(int(across * rows / columns * aspect), 2)
+        grains = rng.standard_normal((down, across)).astype(np.float32)
+        noise += np.float32(0.5**octave) * cv2.resize(grains, (columns, rows), interpolation=cv2.INTER_CUBIC)
+    edge = rng.uniform(0.05, 0.8)
+    return np.asarray(np.clip((noise / noise.std() - rng.uniform(-0.3, 1.5)) / edge, 0, 1), dtype=np.float32)
 
 
 def _quads(

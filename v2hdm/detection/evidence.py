@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 
-from v2hdm.catalogue import LINE, OTHER, SYMBOL, Catalogue
+from v2hdm.catalogue import LINE, Catalogue
 from v2hdm.detection.company import LEAST_SIZE_M, MOST_SIZE_M
 from v2hdm.detection.network import NetworkOutput
 from v2hdm.detection.quads.fit import STATISTICS, Fit
@@ -78,7 +78,7 @@ def gather(
     log_sides = np.log(np.clip(sides, LEAST_SIZE_M, MOST_SIZE_M))
     inside, beside = _paint_odds(output, quads)
     lines = catalogue.of_family(LINE)
-    symbols = catalogue.of_family(SYMBOL, OTHER)
+    symbols = catalogue.of_any_shape
     of_quadrilateral = {
         "odds_inside": inside.mean(axis=1),
         "surest_inside": np.sort(inside, axis=1)[:, _SUREST],
@@ -137,7 +137,7 @@ def rectified_views(
     logs = log_light(bgr)
     odds = output.odds_at(points)
     shares = output.shares_at(points)
-    symbol_names = catalogue.of_family(SYMBOL, OTHER)
+    symbol_names = catalogue.of_any_shape
     symbols = [k for k, name in enumerate(output.classes) if name in symbol_names]
     planes_of = {
         "log_grey": np.float32(_GREY_GAIN) * _over_median(log_light(grey_of(bgr))),

@@ -47,11 +47,11 @@ from v2hdm.records import (
     IntArray,
     Lane,
     Marking,
+    Symbol,
 )
 from v2hdm.site.corrections import with_symbols_corrected
 from v2hdm.site.living.changes import Base, update_map
 from v2hdm.site.living.looks import Observer
-from v2hdm.site.symbols import NO_POLYGON, map_symbols
 
 
 def adjusted_poses(outcome: Outcome) -> AdjustedPoses:
@@ -300,11 +300,27 @@ def _unused_points(survey: SurveyOptions, bundle: Bundle) -> list[str]:
     return lost
 
 
-def _warn_of_no_polygons(excluded: Sequence[Exclusion]) -> None:
-    """Warn, by class, of symbols whose vertices no polygon explains."""
+def _symbols(inputs: Inputs, optimised: Optimised) -> tuple[tuple[Symbol, ...], tuple[Exclusion, ...]]:
+    """Symbols of the map, and those left out, with a warning by class of those that no polygon explains."""
+    symbols = inputs.optimiser.sightings.symbols
+    if not symbols.kinds:
+        return (), ()
+    from v2hdm.site.symbols import NO_POLYGON, map_symbols
+
+    cameras = inputs.sightings.cameras
+    mapped, excluded = map_symbols(
+        symbols,
+        optimised.bundle.rig,
+        views_of(inputs.drive, cameras),
+        [inputs.drive.cameras[name] for name in cameras],
+        inputs.drive.pose_noise.roll_pitch_rad,
+        optimised.markings,
+        inputs.options.acceptance,
+    )
     kinds = Counter(exclusion.kind for exclusion in excluded if exclusion.reason == NO_POLYGON)
     for kind, count in kinds.items():
         _log.warning("class %s: %d left out: %s", kind, count, NO_POLYGON)
+    return mapped, excluded
 
 
 def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
@@ -325,16 +341,7 @@ def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
         lanes = draw_lanes(bundle.knots, solution)
     else:
         lanes = _lanes(inputs, ground_by_rig(drive, cameras, bundle.rig, surface))
-    symbols, no_symbols = map_symbols(
-        inputs.optimiser.sightings.symbols,
-        bundle.rig,
-        views_of(drive, inputs.sightings.cameras),
-        [drive.cameras[name] for name in inputs.sightings.cameras],
-        noise.roll_pitch_rad,
-        optimised.markings,
-        options.acceptance,
-    )
-    _warn_of_no_polygons(no_symbols)
+    symbols, no_symbols = _symbols(inputs, optimised)
     hd_map = HDMap(optimised.markings, lanes, drive.origin, symbols, noise.position_drift_over_m)
     if surface is not None:
         # A spline already contains the recorded heights.

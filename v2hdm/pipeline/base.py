@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,7 @@ def read_base(path: Path) -> Base:
     candidates = tuple(
         (exclusion.kind, exclusion.position_map, exclusion.sightings) for exclusion in left_out
     )
+    hd_map = replace(hd_map, lanes=tuple(line for lane in hd_map.lanes for line in lane.painted))
     return Base(hd_map, np.concatenate([np.zeros((0, 4, 4)), *poses]), candidates)
 
 

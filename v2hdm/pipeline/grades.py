@@ -117,6 +117,21 @@ def without_worse(result: MethodResult, asked: str, corrections: Sequence[Correc
     )
 
 
+def with_composed(methods: CameraSets, goal_m: float) -> CameraSets:
+    """Results whose best maps hold crosswalks and double lines, too, with grades by ``goal_m``."""
+    from v2hdm.site.composed import composed  # heavy for those who only check a drive
+
+    return {
+        name: {
+            method: result
+            if method != BEST
+            else replace(result, hd_map=graded(composed(result.hd_map), goal_m))
+            for method, result in by_method.items()
+        }
+        for name, by_method in methods.items()
+    }
+
+
 def _with_ids(hd_map: HDMap, ids: list[int]) -> HDMap:
     """The map with these ids of its markings, lanes, and symbols, in this order."""
     number = iter(ids)

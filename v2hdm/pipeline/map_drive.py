@@ -22,7 +22,7 @@ from v2hdm.pipeline.base import changes_json, check_together, grey_reader, read_
 from v2hdm.pipeline.config import ACCURACY_GOAL_CM, Contents, check_choice
 from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.evaluate import CameraSets, evaluate
-from v2hdm.pipeline.grades import accurate_enough, graded_sets, of_all_grades
+from v2hdm.pipeline.grades import accurate_enough, graded_sets, of_all_grades, with_composed
 from v2hdm.pipeline.inspect import Inspection, inspect_each, join
 from v2hdm.pipeline.result import Result, describe_run
 from v2hdm.pipeline.stages import MappedSet, detect_in_pieces, map_camera_sets, methods_of
@@ -162,6 +162,7 @@ def _mapped(
             sets = _with_wear(sets, inspection.drive, earlier, context)
         acceptance = survey.mapping.acceptance
         chosen = accurate_enough(methods_of(sets), acceptance.accuracy, acceptance.corrections)
+        chosen = with_composed(chosen, goal_cm / 100)
     except (MappingError, AdjustError) as failure:
         if all(finding.status is not Status.FAIL for finding in inspection.findings):
             raise

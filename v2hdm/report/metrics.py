@@ -175,11 +175,13 @@ class LaneMetrics:
 
 def lane_metrics(lanes: Sequence[Lane], truth: Truth) -> LaneMetrics:
     """Compare mapped lanes with the truth; see :class:`LaneMetrics`."""
-    true_all = _stack(resample(lane.points_map) for lane in truth.map.lanes)
+    lanes = [line for lane in lanes for line in lane.painted]
+    true_all = _stack(resample(line.points_map) for lane in truth.map.lanes for line in lane.painted)
     true_visible = _stack(
         resample(piece)
         for lane, visible in zip(truth.map.lanes, truth.lane_visible, strict=True)
-        for piece in runs(lane.points_map, visible)
+        for line in lane.painted
+        for piece in runs(line.points_map, visible)
     )
     mapped = _stack(resample(lane.points_map) for lane in lanes)
     mapped_m = len(mapped) * SAMPLE_STEP_M

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from v2hdm.catalogue import OTHER, SHIPPED, SYMBOL, Catalogue
+from v2hdm.catalogue import SHIPPED, Catalogue
 from v2hdm.detection.network import NetworkOutput, as_probability
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
@@ -56,7 +56,7 @@ class _Groups:
     def __init__(self, classes: Sequence[str], catalogue: Catalogue) -> None:
         names = [catalogue.classes[name].group for name in classes]
         self.of_class = np.array([names.index(name) for name in names], dtype=np.int64)
-        self.symbols = catalogue.of_family(SYMBOL, OTHER)
+        self.symbols = catalogue.of_any_shape
         self.least_share = np.full(len(names), _LEAST_SHARE)
         self.least_share[self.of_class[np.isin(classes, self.symbols)]] = _LEAST_SYMBOL_SHARE
 

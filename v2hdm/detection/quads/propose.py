@@ -15,7 +15,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from v2hdm.catalogue import OTHER, SYMBOL, Catalogue
+from v2hdm.catalogue import Catalogue
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.network import NetworkOutput, as_probability
 from v2hdm.detection.quads.blobs import Blob
@@ -100,7 +100,7 @@ class Proposal:
         """
         cells = np.count_nonzero(self.blob.level > 0)
         odds = -_TOUCHING
-        alike = catalogue.of_family(SYMBOL, OTHER)
+        alike = catalogue.of_any_shape
         for part in parts:
             if not part.blob.parts and part.blob.kind not in alike:
                 named = _NAMED_OF_SYMBOL.get(catalogue.classes[part.blob.kind].group, _SELDOM_NAMED)

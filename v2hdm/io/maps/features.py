@@ -26,6 +26,9 @@ _PaintT = TypeVar("_PaintT", Marking, Lane, Symbol)
 PAINT = ("paint_left", "paint_left_sigma", "paint_left_change", "paint_left_change_sigma")
 """Properties of the paint that a marking has left: its share, the change since an earlier map, and sigmas."""
 
+COMPOSITION = ("kind", "parts", "lines", "apart_m")
+"""Properties of a marking's variety, a symbol's parts, and a double line's lines and their distance."""
+
 FARTHEST_M = 1e7  # largest coordinate of a map's point, m: a quarter of a meridian
 _ALONG_M = 3.0  # distance within which stations share in a point's height, m: noise averages out; chosen
 _AT_ONCE = 1024  # points whose distances to all stations are held in memory at once; chosen
@@ -49,6 +52,10 @@ class Feature:
     place_sigma_m: float | None = None  # of a symbol
     vertex_sigma_m: FloatArray | None = None  # (N,) of a lane, across it
     paint: PaintLeft | None = None
+    variety: str | None = None  # of a marking
+    parts: tuple[int, ...] = ()  # of a symbol
+    lines: tuple[str, str] | None = None  # of a double line
+    apart_m: float | None = None
 
     @property
     def key(self) -> str:
@@ -112,11 +119,11 @@ def _feature_of(paint: _Paint, number: int) -> Feature:
         heights_sigma_m=paint.heights_sigma_m,
     )
     if isinstance(paint, Lane):
-        return replace(feature, vertex_sigma_m=paint.sigma_m)
+        return replace(feature, vertex_sigma_m=paint.sigma_m, lines=paint.lines, apart_m=paint.apart_m)
     feature = replace(feature, covariance_m2=paint.covariance_m2, accuracy=paint.accuracy)
     if isinstance(paint, Symbol):
-        return replace(feature, symbol=True, place_sigma_m=paint.sigma_m)
-    return replace(feature, relative_sigma_m=paint.relative_sigma_m, paint=paint.paint)
+        return replace(feature, symbol=True, place_sigma_m=paint.sigma_m, parts=paint.parts)
+    return replace(feature, relative_sigma_m=paint.relative_sigma_m, paint=paint.paint, variety=paint.variety)
 
 
 def _points_of(paint: _Paint) -> FloatArray:
@@ -143,6 +150,7 @@ def map_of(features: Sequence[Feature], ids: Sequence[int], origin: GeodeticOrig
                 heights_sigma_m=feature.heights_sigma_m,
                 covariance_m2=feature.covariance_m2,
                 accuracy=feature.accuracy,
+                parts=feature.parts,
             )
             symbols.append(symbol)
         elif feature.closed:
@@ -157,6 +165,7 @@ def map_of(features: Sequence[Feature], ids: Sequence[int], origin: GeodeticOrig
                 paint=feature.paint,
                 heights_sigma_m=feature.heights_sigma_m,
                 accuracy=feature.accuracy,
+                variety=feature.variety,
             )
             markings.append(marking)
         else:
@@ -168,6 +177,8 @@ def map_of(features: Sequence[Feature], ids: Sequence[int], origin: GeodeticOrig
                 id=number,
                 sigma_m=feature.vertex_sigma_m,
                 heights_sigma_m=feature.heights_sigma_m,
+                lines=feature.lines,
+                apart_m=feature.apart_m,
             )
             lanes.append(lane)
     return HDMap(tuple(markings), tuple(lanes), origin, tuple(symbols))
@@ -199,6 +210,10 @@ def properties_of(feature: Feature) -> dict[str, Any]:
         "relative_sigma_m": feature.relative_sigma_m,
         "accuracy": feature.accuracy,
         "vertex_sigma_m": feature.vertex_sigma_m,
+        "kind": feature.variety,
+        "parts": list(feature.parts) or None,
+        "lines": feature.lines and list(feature.lines),
+        "apart_m": feature.apart_m,
         **({} if feature.paint is None else dict(zip(PAINT, astuple(feature.paint), strict=True))),
     }
     return {
@@ -206,6 +221,11 @@ def properties_of(feature: Feature) -> dict[str, Any]:
         for key, value in properties.items()
         if value is not None
     }
+
+
+def in_words(value: object) -> str:
+    """A property of :data:`COMPOSITION` as the text of a format that has no lists."""
+    return " ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
 def with_heights(hd_map: HDMap, road: Road | None, surface: Heights | None = None) -> HDMap:

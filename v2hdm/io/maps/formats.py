@@ -1,8 +1,8 @@
 """The formats that a map is written in: their registry, and DXF for CAD and CSV for surveyors.
 
 In DXF, extended data (XDATA) of the application ``V2HDM`` at each polyline hold what CAD has no word for:
-strings name the values after them, ``id``, ``sightings``, ``relative_sigma_m``, ``accuracy``,
-``heights_sigma_m`` and the rows of ``covariance_m2``.
+strings name the values after them, ``id``, ``sightings``, ``relative_sigma_m``, ``accuracy``, ``kind``,
+``parts``, ``lines``, ``apart_m``, ``heights_sigma_m`` and the rows of ``covariance_m2``.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 
 from v2hdm.errors import ConfigError, V2hdmError, need, shown
 from v2hdm.geometry.geodetic import Grid
-from v2hdm.io.maps.features import PAINT, Feature, features_of, properties_of
+from v2hdm.io.maps.features import COMPOSITION, PAINT, Feature, features_of, in_words, properties_of
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.maps.geopackage import write_geopackage, write_qgis
 from v2hdm.io.maps.lanelet2 import write_lanelet2
@@ -65,6 +65,9 @@ def write_dxf(hd_map: HDMap, path: Path, grid: Grid | None = None) -> None:
             data += [(_TEXT, "relative_sigma_m"), (_REAL, feature.relative_sigma_m)]
         if feature.accuracy is not None:
             data += [(_TEXT, "accuracy"), (_TEXT, feature.accuracy)]
+        for key in COMPOSITION:
+            if (stated := properties_of(feature).get(key)) is not None:
+                data += [(_TEXT, key), (_TEXT, in_words(stated))]
         if feature.heights_sigma_m is not None:
             sigmas_m = feature.heights_sigma_m[feature.ring].tolist()
             data += [(_TEXT, "heights_sigma_m"), *((_REAL, value) for value in sigmas_m)]
@@ -81,9 +84,10 @@ COLUMNS: tuple[str, ...] = (
     *("sigma_x_m", "sigma_y_m", "sigma_z_m", "sightings", "relative_sigma_m", "accuracy"),
     *(f"cov_{axis}_{other}{k}_m2" for axis in "xy" for k in range(1, 5) for other in "xy"),
     *PAINT,
+    *COMPOSITION,
 )
 """``point`` counts from 1 along the feature. ``cov_x_y3_m2`` is the covariance of this point's x with the y
-of point 3 of the same feature. Empty where it is not known."""
+of point 3 of the same feature, of four points. Empty where it is not known."""
 
 
 def write_csv(hd_map: HDMap, path: Path, grid: Grid | None = None) -> None:
@@ -109,7 +113,9 @@ def _rows(feature: Feature, origin: GeodeticOrigin | Grid | None) -> list[list[A
         positions[feature.ring] = feature.positions(origin)
         geodetic = positions.tolist()
     relative = "" if feature.relative_sigma_m is None else feature.relative_sigma_m
-    paint = [properties_of(feature).get(name, "") for name in PAINT]
+    properties = properties_of(feature)
+    paint = [properties.get(name, "") for name in PAINT]
+    paint += [in_words(properties.get(name, "")) for name in COMPOSITION]
     rows = []
     for k, (x, y) in enumerate(feature.points_map.tolist()):
         z = "" if feature.heights_m is None else float(feature.heights_m[k])
@@ -119,7 +125,7 @@ def _rows(feature: Feature, origin: GeodeticOrigin | Grid | None) -> list[list[A
         if feature.covariance_m2 is not None:
             rows_m2 = feature.covariance_m2[2 * k : 2 * k + 2]
             sigmas = np.sqrt(np.diag(rows_m2[:, 2 * k : 2 * k + 2])).tolist()
-            covariances = rows_m2.ravel().tolist()
+            covariances = rows_m2.ravel().tolist() if count == 4 else covariances
         row = [feature.id, feature.kind, k + 1, x, y, z, *geodetic[k], *sigmas, sigma_z]
         rows.append([*row, feature.sightings, relative, feature.accuracy or "", *covariances, *paint])
     return rows

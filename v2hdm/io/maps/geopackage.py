@@ -26,9 +26,22 @@ from numpy.typing import NDArray
 
 from v2hdm.errors import ConfigError, MapFileError, need
 from v2hdm.geometry.geodetic import Grid, crs_of
-from v2hdm.io.maps.features import CORNERS, PAINT, POINTS, Feature, features_of, properties_of
+from v2hdm.io.maps.features import CORNERS, OUTLINE, PAINT, POINTS, Feature, features_of, properties_of
 from v2hdm.io.maps.reading import EXACT, GEOMETRY, LAYERS
-from v2hdm.records import CROSSWALK_BAR, DIAMOND, LANE_DASH, LANE_LINE, STOP_LINE, GeodeticOrigin, HDMap
+from v2hdm.records import (
+    BICYCLE,
+    BOX,
+    CROSSWALK,
+    CROSSWALK_BAR,
+    DIAMOND,
+    DOUBLE_LINE,
+    LANE_DASH,
+    LANE_LINE,
+    STOP_LINE,
+    TEXT,
+    GeodeticOrigin,
+    HDMap,
+)
 from v2hdm.store.files import replace_text, whole_file, xml_text
 from v2hdm.store.names import MOSAIC
 
@@ -44,6 +57,11 @@ _COLOURS: Mapping[str, str] = {
     LANE_LINE: "44,160,44,255",
     STOP_LINE: "214,39,40,255",
     CROSSWALK_BAR: "148,103,189,255",
+    CROSSWALK: "197,176,213,255",
+    DOUBLE_LINE: "140,86,75,255",
+    TEXT: "227,119,194,255",
+    BOX: "188,189,34,255",
+    BICYCLE: "23,190,207,255",
 }
 _OTHER_COLOUR = "127,127,127,255"
 _FILL = {"color": "{}", "outline_color": "35,35,35,255", "outline_width": "0.1", "style": "solid"}
@@ -155,6 +173,9 @@ def _columns(key: str, features: Sequence[Feature]) -> dict[str, Any]:
         "relative_sigma_m": numbers("relative_sigma_m"),
         **({} if key == POINTS else {"accuracy": [row.get("accuracy") for row in rows]}),
         **{name: numbers(name) for name in PAINT if key == CORNERS},
+        **({"kind": [row.get("kind") for row in rows]} if key == CORNERS else {}),
+        **({"lines": texts("lines"), "apart_m": numbers("apart_m")} if key == POINTS else {}),
+        **({"parts": texts("parts")} if key == OUTLINE else {}),
         **{name: texts(name) for name in (key, *EXACT)},
     }
 

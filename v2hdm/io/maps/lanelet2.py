@@ -5,7 +5,9 @@ lane lines are line strings, with a lanelet where two of them bound a lane, and 
 splits or merges along a line that bounds both: its other bound is ``virtual`` where no paint shows it. A stop
 line is a line string as well, with the regulatory element that Autoware's map validator asks for: a
 ``traffic_sign``, as Lanelet2 has no word for paint alone, whose sign is a line beside the paint, tagged
-``virtual``. Other ids follow from the map's, so that they stay when it is written again.
+``virtual``. A crosswalk is a polygon ``crosswalk_polygon`` and a lanelet ``crosswalk`` between two
+``zebra_marking`` lines along the ends of its bars; other symbols, and the areas of text and boxes, are
+polygons ``road_symbol``. Other ids follow from the map's, so that they stay when it is written again.
 """
 
 from __future__ import annotations
@@ -23,8 +25,8 @@ import numpy as np
 from v2hdm.errors import ConfigError, MapFileError, need, shown
 from v2hdm.geometry.geodetic import geodetic_from_enu, position_of
 from v2hdm.io.maps.closed_lanes import Bound, closed_lanes, connections
-from v2hdm.io.maps.features import Feature, features_of
-from v2hdm.records import LANE_DASH, STOP_LINE, FloatArray, GeodeticOrigin, HDMap
+from v2hdm.io.maps.features import COMPOSITION, Feature, features_of, in_words, properties_of
+from v2hdm.records import CROSSWALK, LANE_DASH, STOP_LINE, FloatArray, GeodeticOrigin, HDMap
 from v2hdm.store.files import dump_yaml, replace_text, xml_text
 
 LOCAL, LOCAL_CARTESIAN, MGRS = PROJECTORS = ("Local", "LocalCartesian", "MGRS")
@@ -64,7 +66,9 @@ def write_lanelet2(hd_map: HDMap, path: Path, projector: str | None = None) -> N
     document = _Document(hd_map.origin, projector)
     lanes = _Lanes(document, [feature for feature in features if not feature.closed])
     for feature in features:
-        if feature.symbol:
+        if feature.kind == CROSSWALK and len(feature.points_map) == 4:
+            _write_crosswalk(document, feature)
+        elif feature.symbol:
             outline = document.nodes(feature, feature.xyz_map[feature.ring])
             tags = {"type": "road_symbol", "subtype": feature.kind, "area": "yes"}
             document.way(feature.id, outline, tags | _more_tags(feature))
@@ -105,6 +109,22 @@ def _write_marking(document: _Document, feature: Feature, lanes: _Lanes) -> None
     document.relation(rule_id, members, {"type": "regulatory_element", "subtype": "traffic_sign"})
     if lane is not None:
         lanes.rules[lane].append(rule_id)
+
+
+def _write_crosswalk(document: _Document, feature: Feature) -> None:
+    """The polygon and the lanelet of Autoware's vm-05-01; its rule, Lanelet2 itself would not read."""
+    corners = feature.xyz_map  # the ends of its bars are the first two, and the last two
+    nodes = document.nodes(feature, corners)
+    ring = [nodes[k] for k in feature.ring]
+    document.way(feature.id, ring, {"type": "crosswalk_polygon", "area": "yes"} | _more_tags(feature))
+    ends = ((nodes[3], nodes[2]), (nodes[0], nodes[1]))
+    numbers = [_part(feature, _MOST_VERTICES + k) for k in range(3)]
+    for number, way in zip(numbers, ends, strict=False):
+        document.way(number, way, {"type": "zebra_marking"})
+    left, right, lanelet_id = numbers
+    tags = {"type": "lanelet", "subtype": "crosswalk", "location": "urban", "one_way": "no"}
+    bounds = [("way", left, "left"), ("way", right, "right")]
+    document.relation(lanelet_id, bounds, tags | {"participant:pedestrian": "yes"})
 
 
 def _stop_edges(corners: FloatArray, direction: FloatArray | None) -> tuple[FloatArray, FloatArray]:
@@ -288,8 +308,16 @@ def _part(owner: Feature, number: int) -> int:
 
 
 def _line_tags(feature: Feature) -> dict[str, str]:
-    subtype, lane_change = ("dashed", "yes") if feature.kind == LANE_DASH else ("solid", "no")
-    return {"type": "line_thin", "subtype": subtype, "lane_change": lane_change}
+    """Type, subtype and lane change of a line; the subtype of a double one goes from left to right."""
+    dashed = [kind == LANE_DASH for kind in feature.lines or (feature.kind,)]
+    if dashed[0] == dashed[-1]:
+        words = ["dashed" if dashed[0] else "solid"]  # Lanelet2 has no word for two dashed ones
+        subtype = "_".join(words if dashed[0] else words * len(dashed))
+        return {"type": "line_thin", "subtype": subtype, "lane_change": "yes" if dashed[0] else "no"}
+    subtype = "_".join("dashed" if is_dashed else "solid" for is_dashed in dashed)
+    to_right, to_left = ("yes" if is_dashed else "no" for is_dashed in dashed)
+    changes = {"lane_change:left": to_left, "lane_change:right": to_right}
+    return {"type": "line_thin", "subtype": subtype} | changes
 
 
 def _more_tags(feature: Feature) -> dict[str, str]:
@@ -299,6 +327,8 @@ def _more_tags(feature: Feature) -> dict[str, str]:
         tags["relative_sigma_m"] = repr(feature.relative_sigma_m)
     if feature.accuracy is not None:
         tags["accuracy"] = feature.accuracy
+    properties = properties_of(feature)
+    tags |= {key: in_words(properties[key]) for key in COMPOSITION if key in properties}
     if feature.heights_sigma_m is not None:
         tags["heights_sigma_m"] = json.dumps(feature.heights_sigma_m[feature.ring].tolist())
     if (covariance := feature.ring_covariance_m2) is not None:

@@ -20,7 +20,17 @@ from v2hdm.errors import MapFileError, V2hdmError
 from v2hdm.geometry.geodetic import Grid, enu_from_geodetic
 from v2hdm.geometry.planar import signed_area
 from v2hdm.io.maps.corrections import SIGMA_M
-from v2hdm.io.maps.features import CORNERS, FARTHEST_M, OUTLINE, PAINT, POINTS, Feature, map_of, unique_ids
+from v2hdm.io.maps.features import (
+    COMPOSITION,
+    CORNERS,
+    FARTHEST_M,
+    OUTLINE,
+    PAINT,
+    POINTS,
+    Feature,
+    map_of,
+    unique_ids,
+)
 from v2hdm.records import ACCURACIES, BoolArray, FloatArray, GeodeticOrigin, HDMap, PaintLeft
 from v2hdm.safe.databases import opened, rows_of
 from v2hdm.safe.fields import take_covariance, take_origin, take_whole
@@ -61,6 +71,32 @@ GEOMETRY = "geom"  # the column of a GeoPackage's layer
 _LINE = 2  # type of a LineString
 _POLYGON = 3  # type of a Polygon
 _MULTIS = (5, 6)  # types of a MultiLineString and a MultiPolygon
+
+
+def _composition(properties: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """The variety of a marking, the parts of a symbol, and the lines of a double line, as far as stated."""
+    stated = {key: properties[key] for key in COMPOSITION if properties.get(key) is not None}
+    stated |= {
+        key: _json(stated[key], f"{where}, {key}")
+        for key in stated
+        if isinstance(stated[key], str) and key in ("parts", "lines")
+    }
+    out: dict[str, Any] = {}
+    if "kind" in stated:
+        out["variety"] = take_name(stated["kind"], f"{where}, kind", MapFileError)
+    if "parts" in stated:
+        parts = take_array(stated["parts"], (-1,), f"{where}, parts", MapFileError)
+        out["parts"] = tuple(int(part) for part in parts)
+    if "lines" in stated:
+        lines = stated["lines"]
+        if not isinstance(lines, list) or len(lines) != 2:
+            raise MapFileError(f"{where}, lines: not two classes of lines, left and right; fix or drop them")
+        out["lines"] = tuple(take_name(line, f"{where}, lines", MapFileError) for line in lines)
+    if "apart_m" in stated:
+        out["apart_m"] = take_number(stated["apart_m"], f"{where}, apart_m", MapFileError)
+        if out["apart_m"] <= 0:
+            raise MapFileError(f"{where}, apart_m: a distance is not positive; fix or drop it")
+    return out
 
 
 def read_map(path: Path) -> tuple[HDMap, Verdict]:
@@ -327,6 +363,7 @@ def _stored(properties: Mapping[str, Any], closed: bool, where: str) -> Feature:
         if closed or not len(points)
         else optional("vertex_sigma_m", take_array, (len(points),)),
         paint=None if share is None or sigma is None else PaintLeft(share, sigma, change, change_sigma),
+        **_composition(properties, where),
     )
 
 

@@ -2,9 +2,10 @@
 
 In OpenDRIVE every lane between two lane lines is a road of its own, without links, for a map of paint does
 not say how lanes connect: its reference line is the left line, straight from vertex to vertex, its only lane
-``-1`` is as wide as the right line is away. Every marking and symbol is an object ``roadMark`` of the nearest
-road, its outline exact in the object's own axes, its accuracy in ``userData``. Where no two lines bound a
-lane, one road without width runs along the longest line or through the markings and carries them.
+``-1`` is as wide as the right line is away. Every marking and symbol is an object ``roadMark``, and every
+crosswalk a ``crosswalk``, of the nearest road, its class as its name, its outline exact in the object's own
+axes, its accuracy in ``userData``. Double lines are marks such as ``solid broken``. Where no two lines bound
+a lane, one road without width runs along the longest line or through the markings and carries them.
 
 In LandXML every feature is a ``PlanFeature`` named by its id, its class as ``desc``, made of straight lines
 between points ``northing easting height``. Its ``Feature`` of properties holds sightings and sigma.
@@ -25,9 +26,9 @@ import numpy as np
 from v2hdm import __version__
 from v2hdm.geometry.geodetic import LOCAL, Grid, crs_of
 from v2hdm.geometry.planar import length_along
-from v2hdm.io.maps.closed_lanes import closed_lanes
-from v2hdm.io.maps.features import Feature, features_of, properties_of
-from v2hdm.records import LANE_DASH, FloatArray, HDMap
+from v2hdm.io.maps.closed_lanes import Bound, closed_lanes
+from v2hdm.io.maps.features import COMPOSITION, Feature, features_of, in_words, properties_of
+from v2hdm.records import CROSSWALK, LANE_DASH, FloatArray, HDMap
 from v2hdm.store.files import replace_text, xml_text
 
 _LEAST_STEP_M = 1e-3  # least length of a piece of a reference line, m: readers refuse shorter geometries
@@ -108,7 +109,7 @@ def _roads(features: Sequence[Feature]) -> list[_Road]:
             continue
         across = _Road(beside, np.zeros(0), ("", ""))
         width_m = np.array([across.nearest(point).distance_m for point in xyz[:, :2]])
-        roads.append(_Road(xyz, width_m, (_mark(left), _mark(right))))
+        roads.append(_Road(xyz, width_m, (_mark(left, lane.left), _mark(right, lane.right))))
     if roads:
         return roads
     if lines:
@@ -135,8 +136,15 @@ def _spaced(xyz: FloatArray) -> FloatArray:
     return spaced
 
 
-def _mark(line: Feature) -> str:
-    return "broken" if line.kind == LANE_DASH else "solid"
+def _mark(line: Feature, bound: Bound) -> str:
+    """The type of a bound's mark; that of a double line goes from left to right in its lane's direction.
+
+    OpenDRIVE 1.7: in the centre from left to right, else from the inside out, here on the right of a road.
+    """
+    left_to_right = line.lines or (line.kind,)
+    if bound.order[-1] < bound.order[0]:
+        left_to_right = left_to_right[::-1]
+    return " ".join("broken" if kind == LANE_DASH else "solid" for kind in left_to_right)
 
 
 def _write_road(root: ET.Element, number: int, road: _Road) -> ET.Element:
@@ -184,7 +192,8 @@ def _write_object(objects: ET.Element, feature: Feature, road: _Road, nearest: _
     length_m, width_m = np.ptp(local, axis=0)
     place = {"s": _text(s_m), "t": _text(t_m), "zOffset": "0", "hdg": "0"}
     size = {"length": _text(length_m), "width": _text(width_m), "height": "0", "orientation": "none"}
-    about = {"id": str(feature.id), "name": feature.kind, "type": "roadMark"}
+    kind = "crosswalk" if feature.kind == CROSSWALK else "roadMark"
+    about = {"id": str(feature.id), "name": feature.kind, "type": kind}
     element = ET.SubElement(objects, "object", about | place | size)
     outline = ET.SubElement(ET.SubElement(element, "outlines"), "outline", {"id": "0", "closed": "true"})
     for k, ((u, v), z) in enumerate(zip(local.tolist(), (corners[:, 2] - height_m).tolist(), strict=True)):
@@ -192,6 +201,9 @@ def _write_object(objects: ET.Element, feature: Feature, road: _Road, nearest: _
         ET.SubElement(outline, "cornerLocal", corner)
     if feature.accuracy is not None:
         ET.SubElement(element, "userData", {"code": "accuracy", "value": feature.accuracy})
+    for key in COMPOSITION:
+        if (value := properties_of(feature).get(key)) is not None:
+            ET.SubElement(element, "userData", {"code": key, "value": in_words(value)})
 
 
 def _cubic(start: float, growth: float) -> dict[str, str]:
@@ -231,7 +243,7 @@ def write_landxml(hd_map: HDMap, path: Path, grid: Grid | None = None) -> None:
             ET.SubElement(line, "End").text = end
         about = ET.SubElement(element, "Feature", {"code": "v2hdm"})
         for key, value in properties_of(feature).items():
-            if not isinstance(value, list):
-                text = f"{value:.5g}" if isinstance(value, float) else str(value)
+            if not isinstance(value, list) or key in COMPOSITION:
+                text = f"{value:.5g}" if isinstance(value, float) else in_words(value)
                 ET.SubElement(about, "Property", {"label": key, "value": text})
     replace_text(path, xml_text(root))

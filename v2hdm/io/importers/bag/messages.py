@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
 from v2hdm.errors import DriveError, need, shown
+from v2hdm.io.image_lists import has_time
 from v2hdm.io.importers.readings import SIGMA_OF_QUALITY_M, Attitudes, Readings
 from v2hdm.io.trajectory import checked_rotations, in_order
-from v2hdm.records import FloatArray
-from v2hdm.safe.pixels import png
+from v2hdm.records import FloatArray, IntArray
+from v2hdm.safe.pixels import AS_STORED, pixels_of, png
 
 _log = logging.getLogger(__name__)
 
@@ -21,8 +23,17 @@ RAW = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 IMAGE_KINDS = (RAW, COMPRESSED)
 
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_JPEG_START = b"\xff\xd8"
+_SUFFIXES: Mapping[bytes, str] = {
+    b"\xff\xd8": ".jpg",
+    b"\x89PNG\r\n\x1a\n": ".png",
+    b"RIFF": ".webp",
+    b"II*\0": ".tif",
+    b"MM\0*": ".tif",
+    b"BM": ".bmp",
+}
+"""The suffix of a compressed image by its first bytes."""
+_PNG_DEPTH = slice(24, 25)  # the place of the bits per channel in a PNG (third edition, section 11.2.1)
+_BAYER = len("bayer_rggb")  # letters of a mosaic's encoding before its bits
 
 # Channels, and OpenCV's conversion to BGR.
 _ENCODINGS: Mapping[str, tuple[int, int | None]] = {
@@ -30,6 +41,7 @@ _ENCODINGS: Mapping[str, tuple[int, int | None]] = {
     "8UC1": (1, None),
     "bgr8": (3, None),
     "8UC3": (3, None),
+    "8UC4": (4, cv2.COLOR_BGRA2BGR),
     "rgb8": (3, cv2.COLOR_RGB2BGR),
     "bgra8": (4, cv2.COLOR_BGRA2BGR),
     "rgba8": (4, cv2.COLOR_RGBA2BGR),
@@ -43,31 +55,57 @@ _ENCODINGS: Mapping[str, tuple[int, int | None]] = {
     "yuv422_yuy2": (2, cv2.COLOR_YUV2BGR_YUYV),
     "yuyv": (2, cv2.COLOR_YUV2BGR_YUYV),
 }
+_HALF_COLOURS: Mapping[str, int] = {"nv12": cv2.COLOR_YUV2BGR_NV12, "nv21": cv2.COLOR_YUV2BGR_NV21}
+"""OpenCV's conversion of encodings that state the colours of 2 x 2 px once, below the rows of brightness."""
 
 
 def file_of(kind: str, fields: Any, where: str) -> tuple[str, bytes]:
-    """Suffix and content of an image message's file: compressed ones as they are, raw ones as PNG."""
+    """Suffix and content of an image message's file: raw ones and mosaics as PNG, others as they are."""
     if kind == RAW:
         return ".png", png(_pixels(fields, where))
     data = fields.data.tobytes()
-    if data.startswith(_JPEG_START):
-        return ".jpg", data
-    if data.startswith(_PNG_SIGNATURE):
-        return ".png", data
-    raise DriveError(f"{where}: compressed as {shown(fields.format)}; record JPEG, PNG or raw images")
+    suffix = next((suffix for begin, suffix in _SUFFIXES.items() if data.startswith(begin)), None)
+    if suffix is None:
+        raise DriveError(
+            f"{where}: compressed as {shown(fields.format)}; record JPEG, PNG, TIFF, WebP or raw images"
+        )
+    if suffix == ".png" and data[_PNG_DEPTH] == b"\x10":
+        raise DriveError(f"{where}: its PNG has 16 bits per channel; record 8 bits")
+    return _coloured(fields.format, data, where) or (suffix, data)
+
+
+def _coloured(form: str, data: bytes, where: str) -> tuple[str, bytes] | None:
+    """Suffix and content of a compressed mosaic's file with colours; None of an image that is none.
+
+    ``image_transport`` states the encoding before compression and, only if it made one of them, its colours.
+    """
+    encoding, _, compression = form.strip().partition(";")
+    if not encoding.startswith("bayer_") or any(word in _ENCODINGS for word in compression.split()):
+        return None
+    pixels = pixels_of(data, Path(where), AS_STORED)
+    if pixels.ndim > 2:
+        return None
+    _, to_bgr = _encoding_of(f"{encoding[:_BAYER]}8", where)
+    assert to_bgr is not None
+    return ".png", png(_turned(pixels, to_bgr, where))
+
+
+def _encoding_of(name: str, where: str) -> tuple[int, int | None]:
+    """Channels, and OpenCV's conversion to BGR, of the encoding ``name``."""
+    if name not in _ENCODINGS:
+        supported = ", ".join((*_ENCODINGS, *_HALF_COLOURS))
+        raise DriveError(f"{where}: encoding {shown(name)} is not known; record one of {supported}")
+    return _ENCODINGS[name]
 
 
 def _pixels(fields: Any, where: str) -> np.ndarray:
-    if fields.encoding not in _ENCODINGS:
-        supported = ", ".join(_ENCODINGS)
-        raise DriveError(
-            f"{where}: encoding {shown(fields.encoding)} is not known; record one of {supported}"
-        )
-    channels, to_bgr = _ENCODINGS[fields.encoding]
     height = int(fields.height)
     width = int(fields.width)
-    step = int(fields.step)
+    half = _HALF_COLOURS.get(fields.encoding)
+    channels, to_bgr = _encoding_of(fields.encoding, where) if half is None else (1, half)
+    height += 0 if half is None else height // 2
     row = width * channels
+    step = int(fields.step) or row  # which some drivers leave open
     if not height or not width or step < row or len(fields.data) < step * (height - 1) + row:
         raise DriveError(
             f"{where}: {len(fields.data)} bytes are not an image of {width} x {height} in {fields.encoding} "
@@ -76,9 +114,15 @@ def _pixels(fields: Any, where: str) -> np.ndarray:
     data = np.zeros(step * height, dtype=np.uint8)
     data[: len(fields.data)] = fields.data[: len(data)]
     pixels = data.reshape(height, step)[:, :row].reshape((height, width, channels)[: 2 + (channels > 1)])
-    if to_bgr is not None:
-        pixels = np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), to_bgr), dtype=np.uint8)
-    return pixels
+    return pixels if to_bgr is None else _turned(pixels, to_bgr, where)
+
+
+def _turned(pixels: np.ndarray, to_bgr: int, where: str) -> np.ndarray:
+    """Pixels in BGR, by one of OpenCV's conversions."""
+    try:
+        return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), to_bgr), dtype=np.uint8)
+    except cv2.error:
+        raise DriveError(f"{where}: its size does not fit its encoding (odd?); record it again") from None
 
 
 VIDEO = "foxglove_msgs/msg/CompressedVideo"
@@ -193,13 +237,13 @@ def readings_of(
 ) -> Readings:
     """Readings of a topic's stamps (P,) and rows (P, 9), and of rows (A, 5) of a topic of headings."""
     stamp_s, rows = positions
-    order = in_order(stamp_s, where, "message")
+    order = _timed_order(stamp_s, where, "message")
     stamp_s = stamp_s[order]
     rows = rows[order]
     if not np.isfinite(rows[:, :3][~np.isinf(rows[:, 3])]).all():
         raise DriveError(f"{where}: holds a position that is not finite; record it again")
     heading_s, turned = headings or (stamp_s, rows[:, 4:])
-    by_time = in_order(heading_s, where, "message of the heading")
+    by_time = _timed_order(heading_s, where, "message of the heading")
     heading_s = heading_s[by_time]
     turned = turned[by_time]
     if (rows[:, 3] < 0).any() or (turned[:, 4] < 0).any():
@@ -213,6 +257,14 @@ def readings_of(
         attitudes = Attitudes(heading_s[is_measured], rotation, turned[is_measured, 4])
     geodetic = kind == FIX
     return Readings(stamp_s, rows[:, :3], geodetic, rows[:, 3], attitudes, "an antenna's" if geodetic else "")
+
+
+def _timed_order(stamp_s: FloatArray, where: str, what: str) -> IntArray:
+    """Rows (K,) that have a time, by it; those without one are counted."""
+    rows = np.flatnonzero(has_time(stamp_s, where, what))
+    if len(rows) < len(stamp_s):
+        _log.warning("%s: left out %d of %d times that are 0", where, len(stamp_s) - len(rows), len(stamp_s))
+    return np.asarray(rows[in_order(stamp_s[rows], where, what)])
 
 
 def _pose(pose: Any, covariance: Any) -> Row:

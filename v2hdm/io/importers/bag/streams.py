@@ -21,7 +21,7 @@ import numpy as np
 from v2hdm.errors import DriveError
 from v2hdm.io.calibration.reading import info_of
 from v2hdm.io.calibration.writing import write_camera_info
-from v2hdm.io.image_lists import write_image_list
+from v2hdm.io.image_lists import image_order, write_image_list
 from v2hdm.io.importers.bag import messages as kinds
 from v2hdm.io.importers.bag.frames import (
     ROW,
@@ -85,7 +85,7 @@ class ImageStream(Stream):
 
     def __init__(self, topic: str, stamps: str, where: str) -> None:
         need = Need(topic, (*kinds.IMAGE_KINDS, kinds.VIDEO), where)
-        super().__init__(topic, ["images", stamps], where, [need])
+        super().__init__(topic, ["images with colours", stamps], where, [need])
         self._stamps = stamps
 
     def write(self, folder: Path) -> Writer:
@@ -105,30 +105,28 @@ class ImageStream(Stream):
 
         while (message := (yield)) is not None:
             number = len(stamp_s)
-            where = f"{topic}, image {number + 1}"
-            stamp_s.append(stamp_of(message, self._stamps, not number, where))
-            if number and stamp_s[-1] <= stamp_s[-2]:
-                raise DriveError(
-                    f"{where}: its time {stamp_s[-1]:.6f} s is not after the previous one "
-                    f"({stamp_s[-2]:.6f} s): two clocks or two recordings in one topic; keep one of them"
-                )
+            stamp_s.append(stamp_of(message, self._stamps))
+            if not len(message.fields.data):
+                continue
             if message.kind == kinds.VIDEO:
                 decoder = decoder or kinds.VideoDecoder(message.fields.format, topic)
                 decode(decoder, message.fields.data.tobytes())
             else:
-                suffix, data = kinds.file_of(message.kind, message.fields, where)
+                suffix, data = kinds.file_of(message.kind, message.fields, f"{topic}, image {number + 1}")
                 put(number, suffix, data)
         if decoder is not None:
             decode(decoder, None)
+        is_video = decoder is not None
         if len(names) < len(stamp_s):
-            _log.warning(
-                "%s: left out %d of %d packets of video: no key frame before them",
-                topic, len(stamp_s) - len(names), len(stamp_s),
-            )  # fmt: skip
+            things = "packets of video: no key frame before them" if is_video else "images, which are empty"
+            _log.warning("%s: left out %d of %d %s", topic, len(stamp_s) - len(names), len(stamp_s), things)
         if not names:
-            raise DriveError(f"{topic}: its video has no key frame; record images")
-        numbers = sorted(names)
-        write_image_list(np.array(stamp_s)[numbers], [names[k] for k in numbers], folder / IMAGE_LIST)
+            problem = "its video has no key frame" if is_video else "all of its images are empty"
+            raise DriveError(f"{topic}: {problem}; record images")
+        numbers = np.array(sorted(names))
+        taken_s = np.array(stamp_s)[numbers]
+        rows = image_order(taken_s, topic, numbers=(numbers + 1).tolist())
+        write_image_list(taken_s[rows], [names[k] for k in numbers[rows]], folder / IMAGE_LIST)
 
 
 class InfoStream(Stream):
@@ -167,15 +165,12 @@ class PoseStream(Stream):
     def write(self, folder: Path) -> Writer:
         """Write rows of positions and of headings, and the type of the messages."""
         kind = ""
-        started_topics = set[str]()
         with (
             (folder / _POSES).open("w", encoding="utf-8") as positions,
             (folder / _HEADINGS).open("w", encoding="utf-8") as headings,
         ):
             while (message := (yield)) is not None:
-                first = message.topic not in started_topics
-                started_topics.add(message.topic)
-                stamp_s = stamp_of(message, self._stamps, first, f"{self.where}: topic {message.topic}")
+                stamp_s = stamp_of(message, self._stamps)
                 if message.topic == self.label:
                     kind = message.kind
                     if kind == kinds.NMEA:
@@ -193,7 +188,8 @@ class PoseStream(Stream):
         if kind == kinds.NMEA:
             text = (folder / _POSES).read_text(encoding="utf-8")
             rows = [line.split(" ", 1) for line in text.splitlines()]
-            first_day = datetime.fromtimestamp(float(rows[0][0]), tz=UTC).date()
+            first_s = next((stamp_s for stamp, _ in rows if (stamp_s := float(stamp))), None)
+            first_day = None if first_s is None else datetime.fromtimestamp(first_s, tz=UTC).date()
             return nmea_readings([sentence for _, sentence in rows], where, first_day)
         headings = None if self._heading is None else _read_rows(folder / _HEADINGS, 6)
         return kinds.readings_of(kind, _read_rows(folder / _POSES, 10), headings, where)
@@ -278,17 +274,12 @@ def _lens(fields: Any) -> list[float]:
     return [fields.width, fields.height, *matrix, *distortion]
 
 
-def stamp_of(message: Message, stamps: str, first: bool, where: str) -> float:
-    """The time of a message, s; only that of the ``first`` one, of a simulation, may be zero."""
+def stamp_of(message: Message, stamps: str) -> float:
+    """The time of a message, s, as one of ``STAMPS``; 0 in a header without one."""
     if stamps == "received":
         return message.received_s
     fields = message.fields
     stamp = fields.timestamp if message.kind == kinds.VIDEO else fields.header.stamp
-    if not stamp.sec and not stamp.nanosec and not first:
-        raise DriveError(
-            f"{where}: its header has no time; set stamps: received to use the recorder's, which are late "
-            "by the computer's delay"
-        )
     return float(stamp.sec + stamp.nanosec / 1e9)
 
 

@@ -1,0 +1,146 @@
+"""Rows of parallel bars of one size at even steps, as those of a crosswalk, and the outline about one."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from v2hdm.geometry.planar import following, turned_left
+from v2hdm.records import FloatArray, IntArray
+
+LEAST_BARS = 3  # least number of bars of a row: fewer show no even steps
+_LOG_LENGTH_SIGMA = (
+    0.15  # standard deviation of the logarithm of a bar's length beside its neighbour's: worn ends
+)
+_LOG_WIDTH_SIGMA = 0.25  # standard deviation of the logarithm of a bar's width beside its neighbour's
+_TURNED_SIGMA_RAD = 0.05  # standard deviation of a bar's direction beside its neighbour's
+_MOST_SQUARED = (
+    16.3  # largest sum of these three, squared, in sigmas: one pair of neighbours in 1000 has more
+)
+_STEP_WIDTHS = (1.2, 4.5)
+"""Least and largest step from bar to bar, in widths of a bar: Zeichen 293 of the StVO has gaps as wide as
+bars, MUTCD 3C.05 gaps of 0.3 to 1.5 m between bars of 0.3 to 0.6 m."""
+_STEP_SIGMA = 0.2  # largest deviation, RMS, of bars from an even row, in steps
+_MOST_MISSING = 2  # bars that may be missing between two of a row
+
+
+class _Bars(NamedTuple):
+    """N bars."""
+
+    centre: FloatArray  # (N, 2)
+    way: FloatArray  # (N, 2) unit, along the bar, of either sign
+    length: FloatArray  # (N,)
+    width: FloatArray  # (N,)
+
+
+def _bars_of(corners: FloatArray) -> _Bars:
+    """The bars of corners (N, 4, 2)."""
+    sides = (corners + following(corners)) / 2
+    middle_lines = sides[:, 2:] - sides[:, :2]
+    size = np.linalg.norm(middle_lines, axis=2)
+    longer = middle_lines[np.arange(len(corners)), size.argmax(axis=1)]
+    length = np.maximum(size.max(axis=1), 1e-9)
+    return _Bars(corners.mean(axis=1), longer / length[:, None], length, np.maximum(size.min(axis=1), 1e-9))
+
+
+def rows_of_bars(corners: FloatArray) -> list[IntArray]:
+    """The rows among quadrilaterals (N, 4, 2) on the ground, m: indices of each row's bars, in order.
+
+    At least three bars are parallel and of one size, at even steps in which some may be missing.
+    """
+    if len(corners) < LEAST_BARS:
+        return []
+    bars = _bars_of(corners)
+    cosine = np.abs(bars.way @ bars.way.T)
+    log_length = np.log(bars.length)
+    log_width = np.log(bars.width)
+    squared = ((log_length[:, None] - log_length) / _LOG_LENGTH_SIGMA) ** 2
+    squared += ((log_width[:, None] - log_width) / _LOG_WIDTH_SIGMA) ** 2
+    squared += (np.arccos(np.minimum(cosine, 1.0)) / _TURNED_SIGMA_RAD) ** 2
+    offset = bars.centre - bars.centre[:, None]
+    along = np.abs(np.einsum("ijk,ik->ij", offset, bars.way))
+    widths = np.abs(np.einsum("ijk,ik->ij", offset, turned_left(bars.way))) / bars.width
+    is_next = (squared < _MOST_SQUARED) & (along < bars.length / 2)
+    is_next &= (widths > _STEP_WIDTHS[0]) & (widths < _STEP_WIDTHS[1] * (1 + _MOST_MISSING))
+    is_next &= is_next.T
+    rows = []
+    left = np.ones(len(corners), dtype=np.bool_)
+    for first in range(len(corners)):
+        if not left[first]:
+            continue
+        members = _connected(first, is_next)
+        left[members] = False
+        if (row := _even_row(members, bars)) is not None:
+            rows.append(row)
+    return rows
+
+
+def _connected(first: int, is_next: np.ndarray) -> IntArray:
+    """The indices that neighbours (N, N) connect with ``first``."""
+    reached = np.arange(len(is_next)) == first
+    while (grown := reached | is_next[reached].any(axis=0)).sum() > reached.sum():
+        reached = grown
+    return np.flatnonzero(reached)
+
+
+def _even_row(members: IntArray, bars: _Bars) -> IntArray | None:
+    """The bars in order where they make an even row; None where they do not."""
+    if len(members) < LEAST_BARS:
+        return None
+    centres = bars.centre[members]
+    course = np.linalg.svd(centres - centres.mean(axis=0), full_matrices=False)[2][0]
+    course = course * np.sign(course[np.abs(course).argmax()])  # its sign is arbitrary
+    along = centres @ course
+    order = np.argsort(along)
+    along = along[order]
+    steps = np.diff(along)
+    step = float(np.median(steps[steps < 1.5 * steps.min()])) if steps.min() > 0 else 0.0
+    if not _STEP_WIDTHS[0] < step / float(np.median(bars.width[members])) < _STEP_WIDTHS[1]:
+        return None
+    number = np.concatenate([[0], np.cumsum(np.maximum(np.round(steps / step), 1))])
+    off = along - np.polyval(np.polyfit(number, along, 1), number)
+    beside = (centres - centres.mean(axis=0)) @ turned_left(course)
+    is_even = np.sqrt(np.mean(off**2)) < _STEP_SIGMA * step
+    is_straight = np.sqrt(np.mean(beside**2)) < _STEP_SIGMA * float(np.median(bars.length[members]))
+    return members[order] if is_even and is_straight else None
+
+
+class RowOutline(NamedTuple):
+    """The outline about a row of N bars."""
+
+    corners: FloatArray  # (4, 2) counter-clockwise, the first two along the bars' ends
+    by_corner: FloatArray  # (8, 8 N) its derivative by the stacked corners of the bars
+    corner_of_bars: IntArray  # (4,) that of the 4 N stacked ones which each is nearest to
+
+
+def outline_of_row(corners: FloatArray) -> RowOutline:
+    """The parallelogram about bars (N, 4, 2) in order along their row.
+
+    Two sides are lines through the ends of all bars, the others the outer sides of the first and last one.
+    """
+    centres = corners.mean(axis=1)
+    course = centres[-1] - centres[0]
+    way = _bars_of(corners).way[0]
+    way = way * np.sign(turned_left(course) @ way)
+    across = -turned_left(way)
+    points = corners.reshape(-1, 2)
+    bar = np.repeat(np.arange(len(corners)), 4)
+    is_far = (points - centres[bar]) @ way > 0
+    beside = points @ across
+    out = np.zeros((4, 2))
+    by_corner = np.zeros((8, 2 * len(points)))
+    nearest = np.zeros(4, dtype=np.int64)
+    for number, (at_first, far) in enumerate(((True, False), (False, False), (False, True), (True, True))):
+        ends = np.flatnonzero(is_far == far)
+        candidates = ends[bar[ends] == (0 if at_first else len(corners) - 1)]
+        outer = candidates[np.argmin(beside[candidates]) if at_first else np.argmax(beside[candidates])]
+        design = np.column_stack([np.ones(len(ends)), beside[ends]])
+        weight = np.array([1.0, beside[outer]]) @ np.linalg.pinv(design)
+        rows = slice(2 * number, 2 * number + 2)
+        by_corner[rows, 2 * outer : 2 * outer + 2] += np.outer(across, across)
+        for end, share in zip(ends.tolist(), weight.tolist(), strict=True):
+            by_corner[rows, 2 * end : 2 * end + 2] += share * np.outer(way, way)
+        out[number] = by_corner[rows] @ points.ravel()
+        nearest[number] = outer
+    return RowOutline(out, by_corner, nearest)
