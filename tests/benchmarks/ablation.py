@@ -244,7 +244,7 @@ def terms() -> Iterator[Part]:
     yield "their sureness", partial(patch.object, ground, "_SURE_M", np.inf)
     yield "their direction", partial(patch.object, ground, "_PARALLEL", -1.0)
     yield "sightings of something else", partial(patch.object, parallax, "_OFF_SHARE", 1e-9)
-    yield "corners of paint in one plane", partial(patch.object, parallax, "_BENT", parallax._UNEVEN)
+    yield "corners of paint in one plane", partial(patch.object, parallax, "_GROUND", (1.0, 0.07, 0.07))
 
 
 @contextmanager

@@ -88,7 +88,7 @@ def test_stripes_on_an_upright_rear_are_not_on_the_ground():
 def test_a_rear_that_came_nearer_before_the_vehicle_stood_behind_it_is_not_on_the_ground(seed):
     way_m = np.concatenate([np.linspace(-6.0, -1.0, 5), np.zeros(90)])
     bumper = np.array([[8.0, 0.5], [8.0, -0.5], [8.0, -0.5], [8.0, 0.5]])
-    assert objection(sighted(way_m, bumper, np.array([0.45, 0.45, 0.55, 0.55]), seed=seed)) == NOT_ON_GROUND
+    assert objection(sighted(way_m, bumper, np.array([0.6, 0.6, 0.7, 0.7]), seed=seed)) == NOT_ON_GROUND
 
 
 def test_what_moves_off_before_the_vehicle_that_stood_long_does_is_not_on_the_ground():

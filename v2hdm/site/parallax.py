@@ -25,11 +25,15 @@ from v2hdm.site.candidates import CORRELATION
 NOT_OBSERVED = "not observed to be on the ground"
 NOT_ON_GROUND = "stands above the ground, or moves"
 
-_ELSEWHERE = ((2.0, 0.5), (0.0, 0.5))
-"""Mean and standard deviation of s of other things: at half the camera's height, or moving along."""
+_GROUND = (1.0, 0.1, 0.03)
+_ELSEWHERE = ((2.0, 0.35, 0.35), (0.0, 0.5, 0.1))
+"""Mean of s, its standard deviation shared by a candidate's points and that of each point, by hypothesis.
 
-_UNEVEN = 0.1  # sigma of s on the ground: a bump of a tenth of the camera's height, or poor fits from afar
-_BENT = 0.03  # sigma of s of a marking's corners about their mean: the ground's bend (measured: up to 0.008)
+On the ground: a bump of a tenth of the camera's height, and how far the ground bends within a marking
+(measured on right drives: 0.003, on KITTI 0.008). At half the camera's height: upright things, whose points
+differ in height. Moving along: nearer and farther, all points together.
+"""
+
 _OFF_SHARE = 0.07  # fraction of a marking's sightings that are of something else, as of its observations
 _OFF_M = 1.0  # sigma, m, of such sightings about the marking: association reaches 1.5 m
 _WIDENED = (256.0, 64.0, 16.0, 4.0, 1.0, 1.0, 1.0, 1.0)
@@ -138,14 +142,12 @@ def _measure(views: PointViews, count: int) -> Parallax:
     points = views.used.shape[1]
     alone = np.eye(points)
     together = np.ones((points, points))
-    free = model.fit(1.0, _ANY_SLOPE**2 * alone)
-    ground = model.fit(1.0, _UNEVEN**2 * together + _BENT**2 * alone, free.scale)
-    # Points of an upright object differ in height: half of the variance is each point's own.
-    raised, moving_along = (
-        model.fit(mean, sigma**2 * (together + alone) / 2, free.scale).log_evidence
-        for mean, sigma in _ELSEWHERE
+    free = model.fit(1.0, _ANY_SLOPE**2 * alone, np.ones(count))
+    ground, raised, moving_along = (
+        model.fit(mean, shared**2 * together + single**2 * alone, free.scale).log_evidence
+        for mean, shared, single in (_GROUND, *_ELSEWHERE)
     )
-    log_odds = ground.log_evidence - np.logaddexp(raised, moving_along) + np.log(len(_ELSEWHERE))
+    log_odds = ground - np.logaddexp(raised, moving_along) + np.log(len(_ELSEWHERE))
     return Parallax(free.slope, free.scale[:, None, None] * free.covariance, log_odds)
 
 
@@ -237,11 +239,11 @@ class _Model:
             sigma=np.repeat([_ANYWHERE_M, _ANY_SLOPE, tilt_rad], [total, points_each, 2]),
         )
 
-    def fit(self, mean: float, covariance: FloatArray, scale: FloatArray | None = None) -> _Fit:
+    def fit(self, mean: float, covariance: FloatArray, scale: FloatArray) -> _Fit:
         """Candidates whose s have a prior of ``mean`` and ``covariance`` (P, P); Laplace's evidence.
 
-        Without ``scale`` (G,), that is estimated. Expectation maximisation decides which sightings are of
-        something else.
+        ``scale`` (G,) multiplies the sightings' covariances. Expectation maximisation decides which of them
+        are of something else.
         """
         points = len(covariance)
         slopes = slice(2 * points, 3 * points)
@@ -250,10 +252,9 @@ class _Model:
         expected = np.zeros(len(prior))
         expected[slopes] = 1 - mean
         count = len(self.freedom)
-        spread = np.ones(count)
         share = np.ones(len(self.group))
         for factor in _WIDENED:
-            variance = (np.maximum(spread, factor) if scale is None else factor * scale)[self.group]
+            variance = factor * scale[self.group]
             weight = self.effective * share / variance
             other = self.effective * (1 - share)
             by_image = weight[:, None, None] * self.inlier.information
@@ -268,8 +269,8 @@ class _Model:
             far = self.outlier.at(solved[self.group]) + self.outlier.log_det
             either = np.logaddexp(inlier, np.log(_OFF_SHARE) - far / 2)
             share = np.exp(inlier - either)
-            freedom = _sum(self.effective * share * self.coordinates, self.group, count) - self.freedom
-            spread = _sum(self.effective * share * squared, self.group, count) / np.maximum(freedom, 1.0)
+        freedom = _sum(self.effective * share * self.coordinates, self.group, count) - self.freedom
+        spread = _sum(self.effective * share * squared, self.group, count) / np.maximum(freedom, 1.0)
         away = solved - expected
         log_evidence = _sum(self.effective * either, self.group, count)
         log_evidence -= np.einsum("gi,ij,gj->g", away, prior, away) / 2
