@@ -142,13 +142,13 @@ def _measure(views: PointViews, count: int) -> Parallax:
     points = views.used.shape[1]
     alone = np.eye(points)
     together = np.ones((points, points))
-    free = model.fit(1.0, _ANY_SLOPE**2 * alone, np.ones(count))
+    free = model.fit(1.0, _ANY_SLOPE**2 * alone)
     ground, raised, moving_along = (
-        model.fit(mean, shared**2 * together + single**2 * alone, free.scale).log_evidence
+        model.fit(mean, shared**2 * together + single**2 * alone).log_evidence
         for mean, shared, single in (_GROUND, *_ELSEWHERE)
     )
     log_odds = ground - np.logaddexp(raised, moving_along) + np.log(len(_ELSEWHERE))
-    return Parallax(free.slope, free.scale[:, None, None] * free.covariance, log_odds)
+    return Parallax(free.slope, free.covariance, log_odds)
 
 
 class _Distances(NamedTuple):
@@ -181,8 +181,7 @@ class _Fit(NamedTuple):
     """G candidates under one prior of s."""
 
     slope: FloatArray  # (G, P)
-    covariance: FloatArray  # (G, P, P) at a scale of 1
-    scale: FloatArray  # (G,) variance of the sightings over the stated one, at least 1
+    covariance: FloatArray  # (G, P, P)
     log_evidence: FloatArray  # (G,)
 
 
@@ -239,11 +238,10 @@ class _Model:
             sigma=np.repeat([_ANYWHERE_M, _ANY_SLOPE, tilt_rad], [total, points_each, 2]),
         )
 
-    def fit(self, mean: float, covariance: FloatArray, scale: FloatArray) -> _Fit:
+    def fit(self, mean: float, covariance: FloatArray) -> _Fit:
         """Candidates whose s have a prior of ``mean`` and ``covariance`` (P, P); Laplace's evidence.
 
-        ``scale`` (G,) multiplies the sightings' covariances. Expectation maximisation decides which of them
-        are of something else.
+        Expectation maximisation decides which sightings are of something else, and how large the noise is.
         """
         points = len(covariance)
         slopes = slice(2 * points, 3 * points)
@@ -253,8 +251,9 @@ class _Model:
         expected[slopes] = 1 - mean
         count = len(self.freedom)
         share = np.ones(len(self.group))
+        spread = np.ones(count)
         for factor in _WIDENED:
-            variance = factor * scale[self.group]
+            variance = np.maximum(factor, spread)[self.group]
             weight = self.effective * share / variance
             other = self.effective * (1 - share)
             by_image = weight[:, None, None] * self.inlier.information
@@ -269,14 +268,16 @@ class _Model:
             far = self.outlier.at(solved[self.group]) + self.outlier.log_det
             either = np.logaddexp(inlier, np.log(_OFF_SHARE) - far / 2)
             share = np.exp(inlier - either)
-        freedom = _sum(self.effective * share * self.coordinates, self.group, count) - self.freedom
-        spread = _sum(self.effective * share * squared, self.group, count) / np.maximum(freedom, 1.0)
+            if factor == _WIDENED[-1]:
+                steady = self.effective * share
+                freedom = np.maximum(_sum(steady * self.coordinates, self.group, count) - self.freedom, 1.0)
+                spread = np.maximum(_sum(steady * squared, self.group, count) / freedom, 1.0)
         away = solved - expected
         log_evidence = _sum(self.effective * either, self.group, count)
         log_evidence -= np.einsum("gi,ij,gj->g", away, prior, away) / 2
         log_evidence += (np.linalg.slogdet(prior)[1] - np.linalg.slogdet(information)[1]) / 2
         inverse = np.linalg.inv(information)[:, slopes, slopes]
-        return _Fit(1 - solved[:, slopes], inverse, np.maximum(spread, 1.0), log_evidence)
+        return _Fit(1 - solved[:, slopes], inverse, log_evidence)
 
 
 def _covariance(views: PointViews, by_pose: FloatArray) -> FloatArray:
