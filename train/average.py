@@ -15,11 +15,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from train.checkpoint import Checkpoint, fresh_checkpoint, load_checkpoint, save_checkpoint
 from train.config import DataConfig, TrainConfig
 from train.data import validation_pairs
-from train.growth import recorded_net, with_classes
+from train.exported import read_exported
+from train.growth import CLASS_CHANNELS, recorded_net, with_classes
 from train.loop import metrics
 from train.metrics import Tally
 from train.targets import Targets
@@ -45,16 +47,20 @@ def mean_checkpoint(
             f"{len(shares)} weights for {1 + len(others)} files: give one for each, none below 0"
         )
     mean = load_checkpoint(first)
+    known = [mean.classes]
     mean.averaged = with_classes(mean.averaged, mean.classes, mean.catalogue, str(first))
     asked = TrainConfig(net=recorded_net(mean.config["net"]), data=DataConfig(**mean.config["data"]))
     states = [mean.averaged]
     for path in others:
         torch.manual_seed(mean.config["seed"])  # what a smaller network grows by is drawn as that run drew it
         states.append(fresh_checkpoint(replace(asked, start=str(path)), mean.catalogue).averaged)
+        known.append(classes_of(path))
+    knows = torch.tensor([[name in classes for name in mean.catalogue.names] for classes in known])
+    of_class = _shares_of_classes(torch.tensor(shares, dtype=torch.float64), knows)
     mean.averaged = {
-        name: sum(s * state[name].double() for s, state in zip(shares, states, strict=True))
-        .div(sum(shares))
-        .to(value.dtype)
+        name: _mean(
+            [state[name] for state in states], of_class if name in CLASS_CHANNELS else of_class[:, :1]
+        )
         if value.is_floating_point()
         else value
         for name, value in mean.averaged.items()
@@ -63,6 +69,29 @@ def mean_checkpoint(
     mean.optimizer = {}
     mean.metrics = {}
     return mean
+
+
+def classes_of(path: Path) -> tuple[str, ...]:
+    """The classes that a checkpoint or an exported file knows."""
+    return read_exported(path).classes if path.suffix == ".onnx" else load_checkpoint(path).classes
+
+
+def _shares_of_classes(shares: Tensor, knows: Tensor) -> Tensor:
+    """What each file counts (F, K) for the channel of each class: nothing where it does not know the class.
+
+    The first class is one that all know. A class that no file knows is averaged as if all did.
+    """
+    of_class = shares[:, None] * knows
+    of_class = torch.where(of_class.sum(dim=0) > 0, of_class, shares[:, None])
+    return of_class / of_class.sum(dim=0)
+
+
+def _mean(values: Sequence[Tensor], shares: Tensor) -> Tensor:
+    """The mean of tensors (K, ...) by their shares (F, K or 1) along the first axis."""
+    total = torch.zeros_like(values[0], dtype=torch.float64)
+    for value, share in zip(values, shares, strict=True):
+        total += value.double() * share.reshape(-1, *[1] * (value.ndim - 1))
+    return total.to(values[0].dtype)
 
 
 @torch.inference_mode()

@@ -115,9 +115,15 @@ def fresh_checkpoint(config: TrainConfig, catalogue: Catalogue | None = None) ->
             "give its `net` settings"
         )
     catalogue = catalogue or earlier.catalogue
+    where = f"start={config.start}"
+    for name, entry in earlier.catalogue.classes.items():
+        if catalogue.classes.get(name, entry) != entry:
+            raise ConfigError(
+                f"{config.catalogue} and {where} define {name} differently: "
+                "make them alike, or choose another name"
+            )
     state.own_classes = own_entries(catalogue)
     classes = earlier.classes
-    where = f"start={config.start}"
     if isinstance(earlier, Checkpoint) and then == config.net:
         state.averaged = with_classes(earlier.averaged, classes, catalogue, where)
     else:

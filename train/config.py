@@ -234,6 +234,22 @@ class DataConfig:
         "the classes of which all within reach is labelled; paint of others that the shipped network sees "
         "outside of the labels is unknown, not bare;",
     ] = None
+    coco_relabel: Annotated[
+        dict[str, str],
+        "by the name of a category: a JSON file that lists, under annotations or alone, the ids of those "
+        "annotations that are of that category whatever they are called.",
+    ] = field(default_factory=dict)
+    coco_tone: Annotated[
+        bool,
+        "coco_tone takes of outlines of many pieces, stripes and lines only what is brighter than the ground "
+        "beside it for paint, and what is as dark for ground.",
+    ] = False
+    coco_balance: Annotated[
+        float,
+        SHARE,
+        "how much oftener than others images with a rare class are shown: 0 not at all, 1 so often that "
+        "each class is shown alike, but at most eight times.",
+    ] = 0.0
     coco_camera: Annotated[
         list[float] | None,
         Within(-90, 180),
@@ -306,6 +322,12 @@ class TrainConfig:
     learning_rate: Annotated[float, Within(0, 10, open=True), _LEARNING_RATE_AND_WARMUP] = 2e-3
     weight_decay: Annotated[float, Within(0, 10), "of AdamW."] = 0.01
     warmup: Annotated[float, Within(0, 0.9), _LEARNING_RATE_AND_WARMUP] = 0.03
+    head_updates: Annotated[
+        int,
+        NOT_NEGATIVE,
+        "In the first head_updates only the heads that name classes learn, ten times as fast: those of new "
+        "classes catch up before what they read is changed.",
+    ] = 0
     ema_updates: Annotated[
         int,
         COUNT,

@@ -15,6 +15,7 @@ import numpy as np
 from train.config import DataConfig
 from train.labels import Place, paint_labels
 from train.labels_image import ANY, LabelledImage
+from train.labels_tone import paint_rectangle
 from train.scenes.hardships import NONE, Hardships
 from train.scenes.scenes import drawn_scene, image_line, image_points
 from train.scenes.views import TrainingView
@@ -124,7 +125,8 @@ def photograph(image: LabelledImage, config: DataConfig, rng: np.random.Generato
         if NOT_PAINT in shape.kinds:
             continue
         kind = shape.kinds[0] if shape.kinds[0] in names else ANY
-        for ring_px in shape.rings_px:
+        thin_px = paint_rectangle(shape.tone) if shape.tone is not None and kind != ANY else None
+        for ring_px in shape.rings_px if thin_px is None else (thin_px,):
             # Where labels are silent on a class they do not tell it from others either.
             markings.append(TrueMarking(kind, ring_px, np.nan, kind != ANY and kind not in silent))
     return Example(pixels, camera, markings, [], [], unknown & (labels == 0), tuple(silent))

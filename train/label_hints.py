@@ -2,8 +2,9 @@
 
 A label set may leave far or worn paint out, may call all lines alike, and may draw one outline about a whole
 crosswalk. There the shipped network is asked: paint that it sees and that nobody labelled is unknown rather
-than bare, a line is of the class that network and size on the ground agree on, and only what it takes for
-paint is a bar of a crosswalk.
+than bare, a line is of the class that network, size and direction on the ground agree on, and only what it
+takes for paint is a bar of a crosswalk. Brightness says that better, where it is asked
+(:mod:`train.labels_tone`).
 """
 
 from __future__ import annotations
@@ -17,10 +18,11 @@ import numpy as np
 from train.config import DataConfig
 from train.labels_image import ANY, LabelledImage, Shape, Silence
 from train.labels_raster import coverage
-from v2hdm.catalogue import NOT_PAINT, SHIPPED
+from train.labels_tone import log_light, tone_of
+from v2hdm.catalogue import LINE, NOT_PAINT, SHIPPED, STRIPE
 from v2hdm.detection.camera import RoadCamera, camera_from_calibration, rough_calibration
 from v2hdm.detection.network import Network, as_probability
-from v2hdm.records import BoolArray, FloatArray
+from v2hdm.records import STOP_LINE, BoolArray, FloatArray
 
 CELL_PX = 4
 """Planes of hints have a cell for so many px, as the network's classes do."""
@@ -31,6 +33,10 @@ Chosen, not measured."""
 
 _SURE = 0.8
 """A class is taken from this posterior probability on, otherwise it stays unknown."""
+
+_ASKEW = -6.0
+"""Log odds of a lane's line that lies wholly across the vehicle's way, or of a stop line along it. Chosen:
+the network can say little of stop lines before it has learnt them."""
 
 _LABELLED_M = 30.0
 """Beyond this range nobody labels completely; a diamond of 2 m is 2 px tall there."""
@@ -71,6 +77,9 @@ class _Hints:
         kinds -= np.log(np.exp(kinds).sum(axis=0))
         camera = self._camera(pixels.shape[1], pixels.shape[0])
         shapes = tuple(self._resolved(shape, kinds, camera) for shape in image.shapes or ())
+        if self.config.coco_tone:
+            light = log_light(pixels)
+            shapes = tuple(_toned(shape, light) for shape in shapes)
         is_paint = paint > _HINT
         silence = Silence(
             np.packbits(is_paint, axis=1),
@@ -110,15 +119,44 @@ class _Hints:
         rows, columns = kinds.shape[1:]
         inside = sum(coverage((r + 0.5) / CELL_PX - 0.5, 0, 0, columns, rows) for r in shape.rings_px) > 0.5
         odds = np.zeros(len(shape.kinds))
+        across = 0.5 if camera is None else _across(shape.rings_px, camera)
         for k, name in enumerate(shape.kinds):
             if name in names and np.any(inside):
                 odds[k] += kinds[names.index(name)][inside].mean()
             if camera is not None:
-                odds[k] += _size_odds(name, shape.rings_px, camera)
+                odds[k] += _size_odds(name, shape.rings_px, camera) + _way_odds(name, across)
         share = np.exp(odds - odds.max())
         share /= share.sum()
         best = int(share.argmax())
         return replace(shape, kinds=(shape.kinds[best],) if share[best] >= _SURE else (ANY,))
+
+
+def _toned(shape: Shape, light: np.ndarray) -> Shape:
+    """The shape with what of it is bright, if it is a stripe or a line or holds many pieces.
+
+    Other markings are labelled along their edges, and as if they were whole.
+    """
+    of_pieces = len(shape.kinds) > 1
+    drawn_wide = (*SHIPPED.of_family(STRIPE, LINE), ANY)
+    if not of_pieces and shape.kinds[0] not in drawn_wide:
+        return shape
+    return replace(shape, tone=tone_of(light, shape.rings_px, of_pieces))
+
+
+def _across(rings_px: Sequence[FloatArray], camera: RoadCamera) -> float:
+    """How far (0 to 1) a piece runs across the vehicle's way; 1/2 where that cannot be told."""
+    ground = camera.ground(camera.undistort(np.concatenate(rings_px)))
+    if not np.isfinite(ground).all():
+        return 0.5
+    _, axes = np.linalg.eigh(np.cov((ground - ground.mean(axis=0)).T))
+    return float(axes[1, 1] ** 2)
+
+
+def _way_odds(name: str, across: float) -> float:
+    """Log likelihood of a class by how far a piece runs across the way: lanes along it, stop lines across."""
+    if name in SHIPPED.lane_paint:
+        return _ASKEW * across
+    return _ASKEW * (1 - across) if name == STOP_LINE else 0.0
 
 
 def _size_odds(name: str, rings_px: Sequence[FloatArray], camera: RoadCamera) -> float:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -18,6 +20,7 @@ from train.label_hints import CELL_PX, with_hints
 from train.labels_coco import UNKNOWN, read_coco
 from train.labels_image import PAINT_ONLY, LabelledImage
 from train.labels_raster import coverage
+from train.labels_tone import Tone
 from train.labels_tusimple import read_tusimple
 from train.scenes.scenes import TrainingSample
 from train.targets import IGNORE, Targets, targets
@@ -40,6 +43,8 @@ _ZOOM = (0.6, 1.5)
 
 _LEAST_CORE = 0.35
 """Of the half width of a piece so much at most is edge: thin ones are paint in their middle all the same."""
+
+_MOST_FAVOUR = 8.0  # times that an image with the rarest class is shown for one with the commonest, at most
 
 _NEAR_A_LABEL = 0.75
 """How often a view is taken around something that is labelled; the rest is taken anywhere."""
@@ -115,6 +120,30 @@ def _is_open(image: LabelledImage) -> bool:
 
 
 @dataclass(frozen=True)
+class Favour:
+    """How much oftener than others what is rare is shown: ``of_class``, and the share ``of_images`` (N,)."""
+
+    of_class: Mapping[tuple[str, ...], float]
+    of_images: FloatArray
+
+    @classmethod
+    def of(cls, images: Sequence[LabelledImage], balance: float) -> Favour:
+        """The favour of images whose classes are balanced so much, 0 to 1."""
+        classes = [{shape.kinds for shape in image.shapes or ()} for image in images]
+        count = Counter(kinds for of_image in classes for kinds in of_image)
+        most = max(count.values(), default=1)
+        of_class = {kinds: min((most / number) ** balance, _MOST_FAVOUR) for kinds, number in count.items()}
+        weight = np.array([max((of_class[kinds] for kinds in of_image), default=1.0) for of_image in classes])
+        return cls(of_class, weight / weight.sum())
+
+    def of_points(self, image: LabelledImage) -> FloatArray:
+        """The share (N,) of each of the image's labelled points."""
+        weight = [self.of_class[shape.kinds] for shape in image.shapes or () for _ in shape.rings_px]
+        weight += [1.0] * (len(image.points_px) - len(weight))
+        return np.array(weight) / sum(weight)
+
+
+@dataclass(frozen=True)
 class LabelledImages:
     """Labelled images (at least one), shown as crops like those of the renders, in other light each time."""
 
@@ -122,13 +151,18 @@ class LabelledImages:
     config: DataConfig
     classes: Sequence[str] = PAINT_CLASSES
 
+    @cached_property
+    def favour(self) -> Favour:
+        """How often each image is shown."""
+        return Favour.of(self.images, self.config.coco_balance)
+
     def view(self, rng: np.random.Generator) -> tuple[torch.Tensor, Targets]:
         """A crop (height, width, 3) uint8 of some image, and the answers; the unknown carries no loss.
 
         Raises:
             DriveError: the image cannot be read.
         """
-        image = self.images[int(rng.integers(len(self.images)))]
+        image = self.images[int(rng.choice(len(self.images), p=self.favour.of_images))]
         sample = random_crop(rng, self._window(rng, image), self.config.width, self.config.height)
         answers = self._answers(image, sample)
         return torch.from_numpy(random_photometry(rng, sample.image)), answers
@@ -167,7 +201,9 @@ class LabelledImages:
         corner = rng.integers(0, (columns - width + 1, rows - height + 1))
         points_px = image.points_px
         if len(points_px) and rng.random() < _NEAR_A_LABEL:
-            centre = points_px[int(rng.integers(len(points_px)))] + rng.normal(0, 0.15, 2) * (width, height)
+            centre = points_px[int(rng.choice(len(points_px), p=self.favour.of_points(image)))] + rng.normal(
+                0, 0.15, 2
+            ) * (width, height)
             corner = np.clip(centre - (width / 2, height / 2), 0, (columns - width, rows - height))
         left, top = (int(c) for c in corner)
         return self._part(image, pixels, (left, top, width, height), zoom)
@@ -217,6 +253,25 @@ class Place:
         row = np.minimum((v / CELL_PX).astype(np.intp), cells.shape[0] - 1)
         return np.asarray(cells[row[:, None], column] > 0)
 
+    def toned(self, tone: Tone) -> tuple[BoolArray, BoolArray]:
+        """What is paint and what is ground of the window (height, width), by the brightness of the image."""
+        u = (
+            np.floor((np.arange(self.width) + 0.5) / self.scale[0]).astype(np.intp)
+            + self.corner_px[0]
+            - tone.left
+        )
+        v = (
+            np.floor((np.arange(self.height) + 0.5) / self.scale[1]).astype(np.intp)
+            + self.corner_px[1]
+            - tone.top
+        )
+        planes = tone.planes()
+        rows, columns = planes[0].shape
+        here = ((v >= 0) & (v < rows))[:, None] & ((u >= 0) & (u < columns))
+        place = np.clip(v, 0, rows - 1)[:, None], np.clip(u, 0, columns - 1)
+        bright, ground = (np.asarray(plane[place] & here) for plane in planes)
+        return bright, ground
+
 
 def paint_labels(
     image: LabelledImage, place: Place, classes: Sequence[str] = PAINT_CLASSES
@@ -242,6 +297,13 @@ def paint_labels(
         for ring_px in shape.rings_px:
             inside = coverage(place.moved(ring_px), 0, 0, place.width, place.height) > 0.5
             if not inside.any():
+                continue
+            if shape.tone is not None and kinds != [UNKNOWN]:
+                bright, ground = place.toned(shape.tone)
+                known = inside & (bright | (ground & (labels == 0)))
+                unknown[inside & (labels == 0)] = True
+                labels[inside & bright] = value
+                unknown[known] = False
                 continue
             if in_part or kinds == [UNKNOWN]:
                 unknown |= inside

@@ -12,7 +12,7 @@ from train.config import DataConfig, LabelError
 from train.labels_image import LabelledImage, Shape
 from v2hdm.catalogue import NOT_PAINT, PAINT_CLASSES
 from v2hdm.records import FloatArray
-from v2hdm.safe.texts import shown
+from v2hdm.safe.texts import read_json, shown
 from v2hdm.store.files import load_json
 
 EITHER = "|"
@@ -49,7 +49,8 @@ def read_coco(
         if entry["id"] in shapes:
             raise LabelError(f"{path}: two images have the id {entry['id']}; give each its own")
         shapes[entry["id"]] = []
-    kinds = _kinds(names, config.coco_classes, own_classes, path)
+    category_of = _relabelled(config.coco_relabel)
+    kinds = _kinds((*names.values(), *config.coco_relabel), config.coco_classes, own_classes, path)
     shown_size = None if config.coco_size is None else (config.coco_size[0], config.coco_size[1])
     scales = {entry["id"]: _scale(entry, shown_size, path) for entry in entries}
     for number, entry in enumerate(
@@ -64,10 +65,16 @@ def read_coco(
             raise LabelError(f"{where}: its image {shown(entry['image_id'])} is not in the file; add it")
         # What COCO calls a crowd is of no score there: nobody knows what of it is one of the category.
         unsure = bool(entry.get("iscrowd"))
-        kind = (UNKNOWN,) if unsure else _kind(names[entry["category_id"]], kinds, own_classes, where)
+        category = category_of.pop(entry.get("id"), names[entry["category_id"]])
+        kind = (UNKNOWN,) if unsure else _kind(category, kinds, own_classes, where)
         if kind != (NOT_PAINT,):
             rings = _rings(entry["segmentation"], where, scales[entry["image_id"]])
             shapes[entry["image_id"]].append(Shape(kind, rings))
+    if category_of:
+        number, category = next(iter(category_of.items()))
+        raise LabelError(
+            f"{config.coco_relabel[category]}: {path} has no annotation {shown(number)}; list its own"
+        )
     if not entries:
         raise LabelError(f"{path}: has no images; give another file")
     return [
@@ -83,15 +90,32 @@ def read_coco(
     ]
 
 
+def _relabelled(files: Mapping[str, str]) -> dict[Any, str]:
+    """The category that each annotation of some lists is of, by its id."""
+    category_of: dict[Any, str] = {}
+    for category, name in files.items():
+        content = read_json(Path(name), LabelError)
+        ids = content.get("annotations") if isinstance(content, dict) else content
+        if not isinstance(ids, list) or not all(isinstance(number, int | str) for number in ids):
+            raise LabelError(f'{name}: is no list of ids of annotations; write {{"annotations": [3, 17]}}')
+        for number in ids:
+            if category_of.setdefault(number, category) != category:
+                raise LabelError(
+                    f"{name}: annotation {shown(number)} is to be {category}, but "
+                    f"{files[category_of[number]]} says {category_of[number]}; take it out of one"
+                )
+    return category_of
+
+
 def _kinds(
-    names: Mapping[Any, str], classes: Mapping[str, str], own_classes: Sequence[str], path: Path
+    names: Sequence[str], classes: Mapping[str, str], own_classes: Sequence[str], path: Path
 ) -> dict[str, tuple[str, ...]]:
     """The classes that each category may be, complete with the names that are classes."""
     for name, kind in classes.items():
-        if name not in names.values():
+        if name not in names:
             raise LabelError(
-                f"data.coco_classes: {path} has no category {shown(name)}, only "
-                f"{', '.join(names.values())}; mend it"
+                f"data.coco_classes: {path} has no category {shown(name)}, only {', '.join(names)}; list its "
+                f"annotations in data.coco_relabel, or drop it: '~data.coco_classes.{name}'"
             )
         for name_of_class in kind.split(EITHER):
             if name_of_class not in (*own_classes, NOT_PAINT, UNKNOWN):
@@ -99,7 +123,7 @@ def _kinds(
                     f"data.coco_classes: {shown(name)} is to be {shown(name_of_class)}; choose from: "
                     f"{', '.join(own_classes)}, {NOT_PAINT}, {UNKNOWN}"
                 )
-    alike = {name: name.strip().lower().replace(" ", "_").replace("-", "_") for name in names.values()}
+    alike = {name: name.strip().lower().replace(" ", "_").replace("-", "_") for name in names}
     by_name = {kind.lower(): (kind,) for kind in own_classes}
     mapped = {name: tuple(kind.split(EITHER)) for name, kind in classes.items()}
     return {name: by_name[kind] for name, kind in alike.items() if kind in by_name} | mapped

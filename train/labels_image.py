@@ -10,6 +10,7 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
+from train.labels_tone import Tone
 from v2hdm.detection.frames import read_bgr
 from v2hdm.records import FloatArray
 
@@ -28,11 +29,12 @@ class Shape:
 
     Several classes are candidates of which one is true. With :data:`~v2hdm.catalogue.NOT_PAINT` among them,
     what lies within is in part paint of the other, such as the bars of a crosswalk; alone it is ground of
-    which nothing is known.
+    which nothing is known. ``tone`` says which of it is brighter than the ground beside it.
     """
 
     kinds: tuple[str, ...]
     rings_px: tuple[FloatArray, ...]
+    tone: Tone | None = None
 
 
 @dataclass(frozen=True)

@@ -27,10 +27,14 @@ from train.checkpoint import (
 from train.config import TrainConfig, check_training
 from train.data import Pair, training_batches, validation_pairs
 from train.distributed import Team, choose_device, has_bfloat16
+from train.growth import CLASS_HEADS
 from train.labels import VALIDATION, read_labels
 from train.losses import total_loss
 from train.metrics import Score, Tally
 from train.targets import Targets
+
+_HEADS_FASTER = 10.0
+"""Heads that learn alone take steps so many times as large: the rest cannot be torn about."""
 
 _LOG = logging.getLogger(__name__)
 
@@ -127,11 +131,24 @@ class Trainer:
         return max(by_time, by_step)
 
     def _learning_rate(self) -> float:
+        if self._heads_alone():
+            return _HEADS_FASTER * self.config.learning_rate
         share = min(self._share(), 1.0)
         warmup = self.config.warmup
         if share < warmup:
             return self.config.learning_rate * (0.05 + 0.95 * share / warmup)
         return self.config.learning_rate * 0.5 * (1 + math.cos(math.pi * (share - warmup) / (1 - warmup)))
+
+    def _heads_alone(self) -> bool:
+        """Whether only the heads of classes learn."""
+        return self.state.step < self.config.head_updates
+
+    def _set_what_learns(self) -> None:
+        """Let the heads of classes learn alone, or everything."""
+        alone = self._heads_alone()
+        self.net.train(not alone)
+        for name, parameter in self.net.named_parameters():
+            parameter.requires_grad_(not alone or name.startswith(CLASS_HEADS))
 
     def _average(self, averaged: Any, current: Any, count: Any) -> None:
         """Move averaged weights towards the current ones, the farther the fewer updates there were.
@@ -146,7 +163,7 @@ class Trainer:
         image, targets = self._to_device(batch)
         for group in self.optimizer.param_groups:
             group["lr"] = self._learning_rate()
-        self.net.train()
+        self._set_what_learns()
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self._halves):
             prediction = self.net(image)
         prediction = Prediction(*(output.float() for output in prediction))

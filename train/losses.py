@@ -8,6 +8,7 @@ from torch.nn.functional import (
     binary_cross_entropy_with_logits,
     cross_entropy,
     interpolate,
+    max_pool2d,
     smooth_l1_loss,
 )
 
@@ -18,7 +19,8 @@ from train.targets import IGNORE, Targets
 
 def total_loss(prediction: Prediction, targets: Targets, config: LossConfig) -> Tensor:
     """The weighted sum of the terms, a scalar."""
-    worth = interpolate(targets.paint_weight[:, None], scale_factor=2.0, mode="nearest")[:, 0]
+    cells = targets.paint_weight * rare_paint(targets.kinds, targets.kind_weight)
+    worth = interpolate(cells[:, None], scale_factor=2.0, mode="nearest")[:, 0]
     loss = paint_loss(prediction.paint[:, 0], targets.paint, worth, config.paint_weight, config.dice)
     loss = loss + config.kinds * kind_loss(prediction.kinds, targets.kinds, targets.kind_weight)
     if config.lanes:
@@ -64,11 +66,31 @@ def kind_loss(logits: Tensor, labels: Tensor, weight: Tensor) -> Tensor:
         return logits.sum() * 0
     cells = labels[is_labelled].long()
     weight = weight[is_labelled]
-    total = torch.zeros(logits.shape[1], dtype=weight.dtype, device=weight.device).index_add(0, cells, weight)
-    rarity = (total.sum() / total.clamp(min=1e-6)).sqrt().clamp(max=6.0)
-    weight = weight * rarity[cells]
+    weight = weight * _rarity(cells, weight, logits.shape[1]).clamp(max=6.0)[cells]
     loss = cross_entropy(logits.movedim(1, -1)[is_labelled], cells, reduction="none")
     return (weight * loss).sum() / weight.sum()
+
+
+def rare_paint(kinds: Tensor, weight: Tensor) -> Tensor:
+    """What the paint in and around each cell (B, H, W) weighs by its class: 1 for the commonest, 4 at most.
+
+    Stop lines are seldom, and of the thinnest paint: their class alone would be learnt, not their paint.
+    Around them too, so that no edge is learnt outside of the true one.
+    """
+    is_labelled = kinds != IGNORE
+    if not is_labelled.any():
+        return torch.ones_like(weight)
+    cells = kinds[is_labelled].long()
+    rarity = _rarity(cells, weight[is_labelled], int(cells.max()) + 1)
+    worth = torch.ones_like(weight)
+    worth[is_labelled] = (rarity / rarity[cells].min()).clamp(max=4.0)[cells]
+    return max_pool2d(worth[:, None], 5, 1, 2)[:, 0]
+
+
+def _rarity(cells: Tensor, weight: Tensor, classes: int) -> Tensor:
+    """The root of how many times the weight (N,) of each class's cells (N,) goes into that of all."""
+    total = torch.zeros(classes, dtype=weight.dtype, device=weight.device).index_add(0, cells, weight)
+    return (total.sum() / total.clamp(min=1e-6)).sqrt()
 
 
 def lane_loss(logits: Tensor, targets: Targets, positive_weight: float) -> Tensor:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,6 +95,7 @@ class CameraFrames:
     steps: tuple[FrameStep, ...] = ()  # from ``vehicle`` to ``camera``; none where the vehicle has no tree
     problem: str = ""  # why there are no steps
     states_height: bool = False  # of the camera above ``vehicle``, which a homography of the ground does not
+    rectified_from_camera: FloatArray | None = None  # (3, 3), turn of images that were rectified, else None
 
 
 @dataclass(frozen=True)
@@ -369,6 +370,15 @@ UNSTATED_SIGMA_M = 0.02
 """Standard deviation, m, of a corner's coordinate in a map that states none: drawn over an image."""
 
 
+class Reading(NamedTuple):
+    """A word's ``text`` and, where it may be another, its ``alternative``, with their probabilities."""
+
+    text: str
+    confidence: float
+    alternative: str | None = None
+    alternative_confidence: float | None = None
+
+
 @dataclass(frozen=True)
 class Marking:
     """One mapped marking."""
@@ -410,6 +420,8 @@ class Symbol:
     # (2N, 2N), None where sightings share an outline that no polygon explains
     covariance_m2: FloatArray | None = None
     accuracy: str | None = None
+    # of a text, None where it is not read; then the outline begins at the lower left, as it is read
+    reading: Reading | None = None
     parts: tuple[int, ...] = ()  # ids of the markings that it is composed of
 
 
@@ -571,6 +583,8 @@ class Truth:
     visibility: FloatArray  # (I, J) fraction of marking j that image i shows, unoccluded
     lane_visible: tuple[BoolArray, ...]  # per lane, the vertices seen by some camera
     disturbances: Mapping[str, float]
+    symbol_visibility: FloatArray | None = None  # (I, S) of symbol s, as of markings
+    texts: Mapping[int, str] = field(default_factory=dict)  # what symbols say, by their number
 
 
 @checked_class

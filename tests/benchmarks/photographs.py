@@ -1,7 +1,9 @@
 """How well the shipped detector sees on labelled photographs that no training ever showed.
 
     python -m tests.benchmarks.photographs LABELS.json IMAGES [--mounting 1.3 -12 90] [--model FILE]
+        [--stop-lines LIST.json]
 
+With ``--shuffled`` the folder's photographs are in any order, with ``--alone`` each is a source of its own.
 The files are those of ROAD MARK, see ``docs/labels.md``; judged are the blocks of places that the recipe
 keeps apart for it (:func:`train.labels.held_out`). Printed, for diamonds and arrows by their height in px of
 1280 x 720: the share that is found (overlap above .3 with a detection of any class) and named. Then, an
@@ -16,8 +18,10 @@ from __future__ import annotations
 
 import argparse
 import json
+import random
 import tempfile
 from collections import Counter, defaultdict
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
 import cv2
@@ -26,12 +30,21 @@ from scipy.sparse.csgraph import connected_components
 
 from train.examples import polygon_overlap
 from train.labels import JUDGING, held_out
-from v2hdm.catalogue import OTHER, SHIPPED, SYMBOL
+from v2hdm.catalogue import AREA, OTHER, SHIPPED, SYMBOL
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.network import NetworkOutput
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.pipeline.detect_images import detect_images
-from v2hdm.records import CROSSWALK_BAR, DIAMOND, Camera, FloatArray, MarkingDetection
+from v2hdm.records import (
+    BOX,
+    CROSSWALK_BAR,
+    DIAMOND,
+    STOP_LINE,
+    TEXT,
+    Camera,
+    FloatArray,
+    MarkingDetection,
+)
 
 WIDTH, HEIGHT = 1280, 720
 FOUND_IOU = 0.3
@@ -47,11 +60,17 @@ PUBLISHED = ".628 / .747"
 OF_PIECES = frozenset({"crosswalk_outline", "bus_lane", "yellow_box", "slow", "bicycle"})
 """Labels that outline many pieces of paint and the bare ground between them."""
 
-OUTLINED_TOGETHER = (CROSSWALK_BAR, *SHIPPED.of_family(OTHER))
+OUTLINED_TOGETHER = (CROSSWALK_BAR, *SHIPPED.of_family(OTHER, AREA))
 """Classes whose neighbouring pieces the label set encloses by one outline: crosswalks, writing, boxes."""
 
 _APART = 1.0
 """Neighbouring pieces are at most so far apart, in sizes of the larger one along each side of the image."""
+
+CLASS_OF = {"crosswalk_outline": CROSSWALK_BAR, "slow": TEXT, "bus_lane": TEXT, "yellow_box": BOX}
+"""What labels of many pieces show."""
+
+STOP_LINE_PX = 11.0  # height of a stop line's outline from which it is no thin one
+COVERED_SHARE = 0.5  # of a stop line's length is covered where it is found
 
 _SYMBOLS = ("diamond", *SHIPPED.of_family(SYMBOL))
 
@@ -114,6 +133,8 @@ def regions(output: NetworkOutput) -> np.ndarray:
     enclosed = {DIAMOND: 0.0, **dict.fromkeys(OUTLINED_TOGETHER, _APART)}
     of_its_own = painted.copy()
     for name, apart in enclosed.items():
+        if name not in output.classes:
+            continue
         own = painted & (kinds == output.classes.index(name))
         of_its_own &= ~own
         for ring in small_outlines(own, scale, output.top, apart):
@@ -134,14 +155,14 @@ class Listening(Detector):
 
     output: NetworkOutput
 
-    def run_network(self, image_bgr: np.ndarray, camera: Camera) -> NetworkOutput:
+    def run_network(self, image_bgr: np.ndarray, camera: Camera, top: int | None = None) -> NetworkOutput:
         """Run the network on one image."""
-        self.output = super().run_network(image_bgr, camera)
+        self.output = super().run_network(image_bgr, camera, top)
         return self.output
 
 
-def read(labels: Path, roles: tuple[str, ...]) -> dict[str, Labels]:
-    """The labels of the images of some roles, by file name."""
+def read(labels: Path, roles: tuple[str, ...], stop_lines: Collection[int] = ()) -> dict[str, Labels]:
+    """The labels of the images of some roles, by file name; ``stop_lines`` are ids of annotations."""
     content = json.loads(labels.read_text())
     names = {category["id"]: category["name"] for category in content["categories"]}
     files = {image["id"]: image["file_name"] for image in content["images"]}
@@ -151,15 +172,41 @@ def read(labels: Path, roles: tuple[str, ...]) -> dict[str, Labels]:
         if its[annotation["image_id"]] in roles:
             one = out[files[annotation["image_id"]]]
             for ring in annotation["segmentation"]:
-                one.names.append(names[annotation["category_id"]])
+                is_stop_line = annotation["id"] in stop_lines
+                one.names.append(STOP_LINE if is_stop_line else names[annotation["category_id"]])
                 one.polygons.append(np.reshape(ring, (-1, 2)) * (WIDTH / 640, HEIGHT / 640) - 0.5)
     return out
+
+
+def joined(pieces: Sequence[FloatArray], apart: float) -> list[FloatArray]:
+    """Convex hulls (N, 2) of neighbouring pieces (N, 2), px, ``apart`` as of :data:`_APART`."""
+    if not pieces:
+        return []
+    low, high = (np.array([end(piece, axis=0) for piece in pieces]) for end in (np.min, np.max))
+    size = high - low + 1
+    gap = np.maximum(low[:, None] - high, low - high[:, None])
+    near = (gap <= apart * np.maximum(size[:, None], size)).all(axis=2)
+    count, group = connected_components(near)
+    together = (np.vstack([pieces[k] for k in np.flatnonzero(group == number)]) for number in range(count))
+    return [
+        np.asarray(cv2.convexHull(points.astype(np.float32))[:, 0], dtype=np.float64) for points in together
+    ]
+
+
+def covered(polygon: FloatArray, pieces: Sequence[FloatArray]) -> float:
+    """Share of the columns of an outline in which pieces lie inside."""
+    inside, painted = np.zeros((2, HEIGHT, WIDTH), np.uint8)
+    cv2.fillPoly(inside, [np.round(polygon).astype(np.int32)], 1)
+    cv2.fillPoly(painted, [np.round(piece).astype(np.int32) for piece in pieces], 1)
+    return float((inside & painted).any(axis=0).sum() / max(inside.any(axis=0).sum(), 1))
 
 
 class Tally:
     """Counts over images, added up one by one."""
 
     def __init__(self) -> None:
+        self.areas: Counter[str] = Counter()
+        self.areas_found: Counter[str] = Counter()
         self.count: Counter[tuple[str, int]] = Counter()
         self.found: Counter[tuple[str, int]] = Counter()
         self.named: Counter[tuple[str, int]] = Counter()
@@ -195,8 +242,28 @@ class Tally:
             if over and not any(given[k].kind == kind for k in over):
                 self.taken_for[kind][given[max(over, key=overlap.__getitem__)].kind] += 1
 
+    def add_areas(self, labels: Labels, given: tuple[MarkingDetection, ...]) -> None:
+        """Count the stop lines, crosswalks, words and boxes of one image."""
+        outlines = [(d.kind, d.outline_px if len(d.outline_px) else d.corners_px) for d in given]
+        stop_lines = [outline for kind, outline in outlines if kind == STOP_LINE]
+        for name, polygon in zip(labels.names, labels.polygons, strict=True):
+            if name == STOP_LINE:
+                size = f"{name} of {STOP_LINE_PX:g} px or more"
+                if np.ptp(polygon[:, 1]) < STOP_LINE_PX:
+                    size = f"{name} of less"
+                self.areas[size] += 1
+                self.areas_found[size] += covered(polygon, stop_lines) >= COVERED_SHARE
+            elif name in CLASS_OF:
+                hulls = joined([o for kind, o in outlines if kind == CLASS_OF[name]], _APART)
+                self.areas[name] += 1
+                self.areas_found[name] += (
+                    max((polygon_overlap(h, polygon) for h in hulls), default=0) > FOUND_IOU
+                )
+
     def print(self) -> None:
         """Say it."""
+        for name, count in sorted(self.areas.items()):
+            print(f"{name}: {self.areas_found[name]} of {count} found as what they are")
         for (kind, size), count in sorted(self.count.items()):
             low, high = TALL_PX[size]
             found, named = self.found[kind, size] / count, self.named[kind, size] / count
@@ -208,6 +275,14 @@ class Tally:
         )
 
 
+def _ordered(names: Iterable[str], seed: int | None) -> list[str]:
+    """Names as they are, or shuffled."""
+    in_order = list(names)
+    if seed is not None:
+        random.Random(seed).shuffle(in_order)
+    return in_order
+
+
 def main() -> None:
     """Print the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -217,21 +292,33 @@ def main() -> None:
     parser.add_argument("--model")
     parser.add_argument("--role", nargs="+", default=[JUDGING])
     parser.add_argument("--limit", type=int)
+    parser.add_argument("--shuffled", type=int, metavar="SEED", help="one folder, its places in any order")
+    parser.add_argument("--alone", action="store_true", help="image by image, not as one folder")
+    parser.add_argument("--stop-lines", type=Path)
     parsed = parser.parse_args()
     cv2.setNumThreads(1)
-    labelled = dict(list(read(parsed.labels, tuple(parsed.role)).items())[: parsed.limit])
+    stop_lines = json.loads(parsed.stop_lines.read_text())["annotations"] if parsed.stop_lines else ()
+    labelled = dict(list(read(parsed.labels, tuple(parsed.role), stop_lines).items())[: parsed.limit])
     options = DetectorOptions(model=parsed.model, max_range_m=ROUGH_RANGE_M)
     detector = Listening.load(options=options)
     tally, areas = Tally(), np.zeros((3, 4), dtype=np.int64)
     with tempfile.TemporaryDirectory() as folder:
-        for name in labelled:
+        for number, name in enumerate(_ordered(labelled, parsed.shuffled)):
             image = cv2.imread(str(parsed.images / name))
             assert image is not None, name
             image = cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
-            cv2.imwrite(f"{folder}/{Path(name).stem}.png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-        for seen in detect_images(folder, mounting=parsed.mounting, detector=detector):
-            labels = labelled[Path(seen.frame.name).stem + ".jpg"]
-            tally.add(labels, tuple(marking.image for marking in seen.road.markings))
+            path = Path(folder, f"{number:04d}_{Path(name).stem}.png")
+            cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        sources = sorted(Path(folder).iterdir()) if parsed.alone else [Path(folder)]
+        for seen in (
+            detected
+            for source in sources
+            for detected in detect_images(source, mounting=parsed.mounting, detector=detector)
+        ):
+            labels = labelled[Path(seen.frame.name).stem[5:] + ".jpg"]
+            given = tuple(marking.image for marking in seen.road.markings)
+            tally.add(labels, given)
+            tally.add_areas(labels, given)
             truth, of_pieces = labels.small()
             paint, drawn = as_it_is(detector.output), regions(detector.output)
             for row, (said, known) in enumerate(((paint, True), (paint, ~of_pieces), (drawn, True))):

@@ -44,7 +44,6 @@ from v2hdm.errors import V2hdmError
 from v2hdm.faults.odds import doubt, log_odds, matters
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import AUTO, GROUNDS, MappingOptions
-from v2hdm.pipeline.stages import camera_sets
 from v2hdm.records import BEST, Drive, FloatArray, HDMap
 from v2hdm.report.metrics import driven_past, marking_metrics
 from v2hdm.verdict import Finding, Verdict
@@ -106,7 +105,6 @@ class Job:
         seed: of all that is drawn.
         route: one of :data:`ROUTES`; None draws one.
         spoil: name of the fault.
-        alone: whether each camera is mapped by itself, too.
         ground: as ``mapping.ground``.
         control: whether errors are of the kind and the size that the product reckons with.
         read_out_s: of the cameras; stated, unless it is to be estimated.
@@ -119,7 +117,6 @@ class Job:
     seed: int
     route: str | None = None
     spoil: str = CLEAN
-    alone: bool = False
     control: bool = False
     read_out_s: float = 0.0
     estimate: bool = False
@@ -156,17 +153,12 @@ def map_one(job: Job) -> Row:
         "drawn": recipe.as_figures(),
     }  # fmt: skip
     begin_s = time.process_time()
-    sets = camera_sets(drive)
-    if job.camera:
-        sets = {job.camera: sets[job.camera]}
-    elif not job.alone:
-        sets = dict(list(sets.items())[-1:])
+    cameras = (job.camera,) if job.camera else tuple(drive.cameras)
     try:
         options = MappingOptions(ground=job.ground, estimate_read_out=job.estimate)
-        methods = {name: run_methods(drive, detections, own, options) for name, own in sets.items()}
-        best = list(methods.values())[-1][BEST]
+        best = run_methods(drive, detections, cameras, options, naive=False)[BEST]
         before = over_ground(findings_of_inputs(drive), best, job.ground == AUTO)
-        findings = [*before, *told_by_poses(check_solution(drive, methods), before)]
+        findings = [*before, *told_by_poses(check_solution(drive, best), before)]
     except V2hdmError as error:
         refusal = {"check": _REFUSED, "says": str(error), "status": _REFUSED}
         return Row(**about, status=_REFUSED, findings=[refusal], seconds=time.process_time() - begin_s)
@@ -415,9 +407,6 @@ def main() -> None:
     parser.add_argument("--spoil", nargs="+", default=[], choices=["all", *SPOILS, *RELIEFS], metavar="KIND")
     parser.add_argument("--only", default="", help="pattern of 'port route seed' of the drives to map")
     parser.add_argument(
-        "--alone", action="store_true", help="map each camera by itself, too, as the product does"
-    )
-    parser.add_argument(
         "--control", action="store_true", help="draw no errors but those that the product reckons with"
     )
     parser.add_argument("--read-out", type=float, default=0.0, help="of rolling shutters, s")
@@ -432,7 +421,7 @@ def main() -> None:
     parsed = parser.parse_args()
     seeds = [s for s in range(*parsed.seeds) if re.search(parsed.only, Job(s, parsed.route).recipe.name)]
     kinds = [CLEAN, *(spoil.name for spoil in wanted_spoils(parsed.spoil))]
-    rest = parsed.alone, parsed.control, parsed.read_out, parsed.estimate, parsed.ground
+    rest = parsed.control, parsed.read_out, parsed.estimate, parsed.ground
     apart_s = {seed: APART_S if parsed.in_turn else draw_apart_s(seed) for seed in seeds}
     taken = parsed.stated, parsed.camera
     jobs = [Job(seed, parsed.route, kind, *rest, apart_s[seed], *taken) for seed in seeds for kind in kinds]

@@ -8,8 +8,9 @@ from tests.benchmarks.detector_mounting import SEED, rendered
 from v2hdm.catalogue import SHIPPED
 from v2hdm.cli.main import run
 from v2hdm.detection.camera import RoadCamera, camera_from_calibration, rough_calibration
-from v2hdm.detection.mounting import BODY_SIGMA_RAD, Lines, Mounting, MountingEstimate, image_lines
-from v2hdm.detection.network import Network
+from v2hdm.detection.horizons import BODY_SIGMA_RAD, Horizons
+from v2hdm.detection.mounting import Lines, Mounting, image_lines, output_lines
+from v2hdm.detection.network import Network, run_on_road
 
 FOV_DEG = 60.0
 LEFT_M = (-5.0, -1.7, 1.8, 5.0)
@@ -28,11 +29,22 @@ def lines_of(pitch_deg, left_m=LEFT_M, turned_deg=0.0, roll_deg=0.0):
     return Lines((near + far) / 2, along, 0.5 * count, 0.002 * count, count)
 
 
-def estimate(*images):
-    found = MountingEstimate(rough_calibration("c", 1280, 720, 1.6, 5.0, FOV_DEG).info, PRIOR)
+NO_LINES = Lines(np.zeros((0, 2)), np.zeros((0, 2)), *[np.zeros(0)] * 3)
+
+
+def horizons(*images):
+    found = Horizons(rough_calibration("c", 1280, 720, 1.6, 5.0, FOV_DEG).info, PRIOR)
     for lines in images:
         found.add(lines)
-    return found.mounting
+    return found
+
+
+def estimate(*images):
+    return horizons(*images).mounting
+
+
+def pitch_deg_of(mounting):
+    return np.rad2deg(mounting.pitch_rad), np.rad2deg(mounting.sigma_rad[0])
 
 
 @pytest.mark.parametrize("pitch_deg", [-10.0, 5.0, 20.0])
@@ -76,6 +88,62 @@ def test_roads_that_lead_aside_show_the_roll(roll_deg):
     assert ahead.sigma_rad[1] > 0.8 * PRIOR.sigma_rad[1], "one vanishing point does not show it"
 
 
+def test_an_image_without_lines_has_the_horizon_of_the_others_as_far_as_they_agree():
+    pitch_deg, sigma_deg = pitch_deg_of(horizons(*[lines_of(12.0)] * 12).next(NO_LINES))
+    assert pitch_deg == pytest.approx(12.0, abs=0.5)
+    unrelated = horizons(*[lines_of(pitch) for pitch in np.linspace(-12.0, 20.0, 12)]).next(NO_LINES)
+    assert pitch_deg_of(unrelated)[1] > 2 * sigma_deg, "unrelated photographs narrow nothing"
+    alone_deg, alone_sigma_deg = pitch_deg_of(horizons().next(NO_LINES))
+    assert alone_deg == pytest.approx(5.0, abs=0.5)
+    assert alone_sigma_deg == pytest.approx(8.0, abs=0.6)
+
+
+def test_images_of_two_mountings_keep_their_own_horizons():
+    found = horizons(*[lines_of(-8.0), lines_of(14.0)] * 6)
+    for pitch_deg in (-8.0, 14.0):
+        mounting = found.next(lines_of(pitch_deg))
+        assert np.rad2deg(mounting.pitch_rad) == pytest.approx(pitch_deg, abs=0.5)
+        assert mounting.sigma_rad[0] < np.deg2rad(2.0)
+    assert found.of_mounting == pytest.approx(0.5, abs=0.1)
+
+
+def test_images_of_one_camera_share_it_tightly_and_keep_the_pitch_of_their_body():
+    found = horizons(*[lines_of(10.0)] * 10)
+    assert pitch_deg_of(found.next(lines_of(10.0)))[1] < 0.6 * pitch_deg_of(estimate(lines_of(10.0)))[1]
+    pitched = found.next(lines_of(11.2))
+    assert 10.4 < np.rad2deg(pitched.pitch_rad) < 11.3
+
+
+def test_an_image_after_one_of_a_mounting_is_expected_to_be_of_that():
+    """Photographs of two days come one day after the other."""
+    found = horizons()
+    for pitch_deg in (-8.0, 14.0):
+        for _ in range(8):
+            found.next(lines_of(pitch_deg))
+    mounting = found.next(NO_LINES)
+    assert np.rad2deg(mounting.pitch_rad) == pytest.approx(14.0, abs=1.0)
+
+
+def test_an_image_that_was_looked_at_before_counts_once():
+    found = horizons()
+    found.add(lines_of(12.0), key="first")
+    others = horizons()
+    assert pitch_deg_of(found.earlier("first")) == pytest.approx(pitch_deg_of(others.next(lines_of(12.0))))
+    assert found.earlier("first") is None
+
+
+def test_of_many_mountings_those_of_the_fewest_images_are_given_up():
+    found = horizons(*[lines_of(5.0)] * 3, *[lines_of(pitch) for pitch in np.linspace(-14, 26, 25)])
+    assert found.images == 28
+    assert np.rad2deg(found.mounting.pitch_rad) == pytest.approx(5.0, abs=1.5)
+
+
+def test_the_expected_horizon_lies_where_the_images_show_ground():
+    """A pitch of 20 degrees up would show the sky alone."""
+    expected, highest_rad = horizons().coming(0.99)
+    assert np.deg2rad(-17) < expected.pitch_rad < highest_rad < np.deg2rad(35)
+
+
 def test_sizes_are_as_uncertain_as_the_mounting():
     calibration = rough_calibration("c", 1280, 720, 1.5, 5.0, FOV_DEG)
     known, guessed = (
@@ -103,5 +171,19 @@ def test_a_folder_without_a_mounting_is_seen_from_where_its_lines_meet(tmp_path,
     assert len(said) == 1
     found, sigma = (float(word) for word in said[0].split("looks ")[1].split(" deg")[0].split(" +- "))
     assert abs(found - pitch_deg) < 3 * np.hypot(sigma, np.rad2deg(BODY_SIGMA_RAD) / 2)
-    lines = image_lines(Network(), cv2.imread(str(folder.path / "000.png")), info)
+    image, network = cv2.imread(str(folder.path / "000.png")), Network()
+    lines = image_lines(network, image, info)
     assert np.allclose(np.linalg.norm(lines.direction, axis=1), 1)
+    view = RoadCamera(camera_from_calibration(rough_calibration("c", 1280, 720, *folder.mounting)))
+    again = output_lines(run_on_road(network, image, view), info)
+    pitches = [np.rad2deg(estimate(found).pitch_rad) for found in (lines, again)]
+    assert abs(pitches[0] - pitches[1]) < 1.5, "the output on the road's rows shows the same horizon"
+
+
+def test_photographs_of_different_sizes_have_a_horizon_each(tmp_path):
+    """Only a stated camera has a size."""
+    rng = np.random.default_rng(1)
+    for number, size in enumerate([(64, 96, 3), (96, 64, 3)]):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), rng.integers(90, 110, size, dtype=np.uint8))
+    assert run(["detect", str(tmp_path), "--output", str(tmp_path / "out.jsonl")]) == 0
+    assert len((tmp_path / "out.jsonl").read_text().splitlines()) == 2

@@ -142,6 +142,7 @@ TIMED = {
     "PASHR": lambda t, at, yaw: checksum(
         f"PASHR,{hms(t)},{heading_of(yaw):.4f},T,1.0,-2.0,0.0,0.1,0.2,0.05,2,1"
     ),
+    "PSAT": lambda t, at, yaw: checksum(f"PSAT,HPR,{hms(t)},{heading_of(yaw):.4f},-2.0,1.0,N"),
     "HDG": lambda t, at, yaw: checksum(f"HCHDG,{(heading_of(yaw) - 3.5 + 1.0) % 360:.4f},1.0,W,3.5,E"),
 }
 

@@ -251,7 +251,8 @@ def test_a_table_in_the_map_frame_with_angles(tmp_path):
         ("", "has no pose"),
         ("stamp_s,x_m,y_m\n1,2\n", "line 2: 2 cells under 3 columns"),
         ("stamp_s,x_m,y_m,yaw_deg\n1,2,x,0\n", "line 2: y_m: 'x' is not a number"),
-        ("stamp_s,x_m,y_m,yaw_deg\n1,2,nan,0\n", "line 2: y_m: 'nan' is not a finite"),
+        ("stamp_s,x_m,y_m,yaw_deg\n1,2,nan,0\n", "none of its 1 positions is a number"),
+        ("stamp_s,x_m,y_m,yaw_deg\n,2,3,0\nnan,2,3,0\n", "route.csv: no line has a time"),
         ("x_m,y_m,yaw_deg\n1,2,0\n", "needs one time column"),
         ("stamp_s,stamp_ns,x_m,y_m,yaw_deg\n1,1,2,0,0\n", "has stamp_s, stamp_ns"),
         ("stamp_s,x_m,yaw_deg\n1,2,0\n", "has no column 'y_m'"),
@@ -268,6 +269,20 @@ def test_a_damaged_table_is_refused_in_one_line(text, message, tmp_path):
     with pytest.raises(DriveError, match=message) as caught:
         read({"csv": "route.csv"}, tmp_path)
     assert "\n" not in str(caught.value)
+
+
+def test_lines_of_no_numbers_in_a_table_are_left_out_and_counted(tmp_path, caplog):
+    lines = [f"{k / 10},{k / 10},0,0,1" for k in range(20)]
+    lines[3] = "0.3,nan,0,0,1"
+    lines[5] = "0.5,,NaN,0,1"
+    lines[7] = "0.7,0.7,0,0,"
+    lines[9] = ",0.9,0,0,1"
+    (tmp_path / "route.csv").write_text("\n".join(["stamp_s,x_m,y_m,z_m,yaw_deg", *lines]))
+    got = read({"csv": "route.csv"}, tmp_path)
+    kept = np.delete(np.arange(20) / 10, [3, 5, 9])
+    np.testing.assert_allclose(got.trajectory.map_from_vehicle[:, 0, 3], kept, atol=1e-12)
+    for words in ("1 of 20 lines without a time", "2 of 19 positions", "1 of 19 headings"):
+        assert words in caplog.text
 
 
 def test_names_in_a_table_move_no_cursor(tmp_path):

@@ -51,6 +51,18 @@ def test_the_extrinsics_are_recovered(scene, results):
         assert np.linalg.norm(centre + truth[:3, :3].T @ truth[:3, 3]) < 0.02
 
 
+def test_each_camera_alone_finds_its_mounting_and_the_markings_that_it_saw(scene, results):
+    alone = results["Opt"].alone
+    assert set(alone) == {"front", "rear"}
+    for name, result in alone.items():
+        assert result.cameras == (name,)
+        truth = scene.cam_from_vehicle[name]
+        assert rotation_error_deg(result.calibrations[name].cam_from_vehicle, truth) < 0.1
+        pairs, rmse_m = match(result.hd_map, scene.markings, MATCH_M)
+        assert len(pairs) == len(result.hd_map.markings) > 0.8 * len(scene.markings)
+        assert rmse_m < 0.03
+
+
 def test_corner_errors_are_as_large_as_their_covariances_say(scene, results):
     mapped = results["Opt"].hd_map
     pairs, _ = match(mapped, scene.markings, MATCH_M)

@@ -51,10 +51,17 @@ def elsewhere(monkeypatch):
     return jobs
 
 
-def mapped_sets(cache, workers, detections):
+def mapped_sets(cache, workers, detections, compare=True):
     survey = Survey(MappingOptions(), ())
     context = Context(StageCache(cache), workers=workers)
-    return map_camera_sets(Cameras(), "drive", [detections], survey, None, context)
+    return map_camera_sets(Cameras(), "drive", [detections], survey, None, context, compare=compare)
+
+
+def test_a_drive_is_mapped_with_all_cameras_alone_unless_sets_are_compared(elsewhere, tmp_path):
+    found = mapped_sets(tmp_path, 2, Images([0] * 5000), compare=False)
+    assert list(found) == ["all"]
+    assert found["all"].methods["Opt"].cameras == ("front", "left", "rear")
+    assert elsewhere == []
 
 
 @pytest.mark.parametrize(("workers", "count"), [(1, 5000), (2, 3), (2, 5000)])

@@ -43,7 +43,8 @@ from v2hdm.verdict import Status
 def result(short_drive, tmp_path_factory):
     output = tmp_path_factory.mktemp("outputs")
     report = ReportConfig(background=str(aerial_picture(output / "aerial.tif", read_drive(short_drive))))
-    return run(run_config(short_drive, output, export=list(FORMATS), mosaic=True, report=report)).folder
+    config = run_config(short_drive, output, export=list(FORMATS), mosaic=True, report=report, all_maps=True)
+    return run(config).folder
 
 
 def aerial_picture(path, drive):

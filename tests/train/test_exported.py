@@ -20,6 +20,7 @@ from train.checkpoint import (
     check_same_experiment,
     fresh_checkpoint,
     load_checkpoint,
+    own_entries,
     save_checkpoint,
 )
 from train.config import DataConfig, LabelError
@@ -30,6 +31,7 @@ from train.loop import Trainer
 from train.metrics import Tally
 from train.targets import IGNORE, Targets
 from v2hdm.catalogue import PAINT_CLASSES, SHIPPED
+from v2hdm.detection.detector import Detector
 from v2hdm.detection.network import Network
 from v2hdm.errors import ConfigError, DetectorError
 
@@ -424,3 +426,52 @@ def test_the_mean_of_an_old_and_a_new_network_knows_all_classes(tmp_path):
     of_the_oldest(tmp_path / "old.pt")
     mean = mean_checkpoint(tmp_path / "old.pt", [tmp_path / "old.pt"])
     assert mean.classes == PAINT_CLASSES
+
+
+def test_a_class_that_catalogue_and_start_define_differently_is_named_in_one_line(
+    tmp_path, shipped_run, catalogue
+):
+    state = load_checkpoint(shipped_run)
+    state.averaged = with_classes(state.averaged, PAINT_CLASSES, catalogue, "here")
+    state.own_classes = own_entries(catalogue)
+    save_checkpoint(state, tmp_path / "own.pt")
+    wide = {"length_m": [0.8, 1.4], "width_m": [0.4, 2.4]}
+    config = run_of(tmp_path, tmp_path / "own.pt")
+    written(tmp_path, ENTRIES | {PAD: ENTRIES[PAD] | wide})
+    with pytest.raises(
+        ConfigError, match=r"classes.yaml and start=.*own.pt define pad differently"
+    ) as refused:
+        fresh_checkpoint(config)
+    assert "\n" not in str(refused.value)
+
+
+def test_an_own_class_called_like_a_newly_shipped_one_is_named_in_one_line(tmp_path):
+    config = of_the_oldest(tmp_path / "old.pt")
+    state = load_checkpoint(tmp_path / "old.pt")
+    state.own_classes = {"text": ENTRIES[T]}
+    save_checkpoint(state, tmp_path / "own.pt")
+    with pytest.raises(ConfigError, match="'text' is already the name of 'text'"):
+        fresh_checkpoint(replace(config, start=str(tmp_path / "own.pt")))
+
+
+def test_a_network_without_some_classes_says_once_that_they_are_not_found(tmp_path, caplog):
+    of_the_oldest(tmp_path / "old.pt")
+    export_checkpoint(load_checkpoint(tmp_path / "old.pt"), tmp_path / "old.onnx", opset=18, tolerance=1e-3)
+    for _ in range(2):
+        Detector.load(tmp_path / "old.onnx")
+    (line,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert line.endswith("does not know text, box, bicycle: none of these will be found")
+
+
+def test_a_class_is_averaged_over_the_files_that_know_it(tmp_path):
+    config = of_the_oldest(tmp_path / "old.pt")
+    new = fresh_checkpoint(replace(config, start=str(tmp_path / "old.pt")))
+    new.averaged = {
+        name: value + 1 if value.is_floating_point() else value for name, value in new.averaged.items()
+    }
+    save_checkpoint(new, tmp_path / "new.pt")
+    mean = mean_checkpoint(tmp_path / "new.pt", [tmp_path / "old.pt"]).averaged
+    for name in ("kinds.weight", "kinds.bias"):
+        torch.testing.assert_close(mean[name][OLDEST:], new.averaged[name][OLDEST:])
+        torch.testing.assert_close(mean[name][:OLDEST], new.averaged[name][:OLDEST] - 0.5)
+    torch.testing.assert_close(mean["stem.0.weight"], new.averaged["stem.0.weight"] - 0.5)

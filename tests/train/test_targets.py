@@ -23,7 +23,7 @@ from train.label_hints import with_hints
 from train.labels import JUDGING, LEARNT, VALIDATION, Place, held_out, paint_labels, read_labels
 from train.labels_image import ANY, PAINT_ONLY, LabelledImage, Shape
 from train.labels_raster import coverage
-from train.losses import dice_loss, kind_loss, lane_loss, paint_loss, total_loss
+from train.losses import dice_loss, kind_loss, lane_loss, paint_loss, rare_paint, total_loss
 from train.metrics import Tally
 from train.scenes.scenes import TrainingSample
 from train.targets import (
@@ -532,3 +532,14 @@ def test_damaged_and_missing_files_and_settings_that_cannot_be_are_named(tmp_pat
             read_labels(config(**files))
     with pytest.raises(ConfigError, match=r"labelled_share is 0"):
         read_labels(config(coco=path, labelled_share=0))
+
+
+def test_the_paint_of_a_rare_class_weighs_more_in_and_around_it():
+    kinds = torch.full((1, 8, 32), IGNORE, dtype=torch.uint8)
+    kinds[0, :, :9] = 1
+    kinds[0, 4, 20] = 4
+    worth = rare_paint(kinds, torch.ones((1, 8, 32)))
+    assert (worth[0, :, :9] == 1).all()
+    assert worth[0, 4, 20] == worth[0, 2, 22] == 4  # 72 times rarer: at most
+    assert worth[0, 4, 27] == 1
+    assert (rare_paint(torch.full_like(kinds, IGNORE), torch.ones((1, 8, 32))) == 1).all()

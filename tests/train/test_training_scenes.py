@@ -19,7 +19,7 @@ from train.scenes.hardships import (
     tight_bend,
     with_side_seams,
 )
-from train.scenes.letters import WORDS, Hand, random_hand, random_text, word
+from train.scenes.letters import WORDS, random_hand, random_text
 from train.scenes.paint import (
     Bend,
     Brush,
@@ -71,6 +71,7 @@ from v2hdm.records import (
     TEXT,
     CameraInfo,
 )
+from v2hdm.simulate.render.letters import Hand, word
 from v2hdm.simulate.render.renderer import Motion, Optics, Renderer
 from v2hdm.simulate.render.scene import Box, Ground, Paint, Scene, box_footprint
 

@@ -53,7 +53,7 @@ def result(evidence=FINE, *markings, **changes):
 
 
 def raised(one, drive):
-    found = check_solution(drive, {"both": {"Opt": one}})
+    found = check_solution(drive, one)
     return {finding.check: finding for finding in found if finding.status is not Status.PASS}
 
 
@@ -340,22 +340,20 @@ def test_maps_of_two_cameras_that_are_apart_along_the_route_are_told(drive):
     ahead = drive.images[0].map_from_vehicle[:2, 0] * 0.3
     front = tuple(square_at(3.0 * n, 0.0) for n in range(12))
     rear = tuple(replace(m, corners_map=m.corners_map + ahead) for m in front)
-    sets = {
-        "front": {"Opt": result(FINE, *front, cameras=("front",), calibrations=calibrations)},
-        "rear": {"Opt": result(FINE, *rear, cameras=("rear",), calibrations=calibrations)},
-        "both": {"Opt": result(FINE, *front, calibrations=calibrations)},
+    alone = {
+        "front": result(FINE, *front, cameras=("front",), calibrations=calibrations),
+        "rear": result(FINE, *rear, cameras=("rear",), calibrations=calibrations),
     }
-    found = [f for f in check_solution(drive, sets) if f.status is not Status.PASS]
+    together = result(FINE, *front, calibrations=calibrations, alone=alone)
+    found = [f for f in check_solution(drive, together) if f.status is not Status.PASS]
     assert [f.check for f in found] == ["cameras apart"]
     assert "30 cm ahead of where front does" in found[0].says
 
 
 def test_a_mounting_that_differs_alone_and_together_is_told(drive):
-    sets = {
-        "front": {"Opt": result(cameras=("front",), calibrations={"front": calibrated(0.2)})},
-        "both": {"Opt": result(calibrations={"front": calibrated(0.0)})},
-    }
-    found = [f.check for f in check_solution(drive, sets) if f.status is not Status.PASS]
+    alone = {"front": result(cameras=("front",), calibrations={"front": calibrated(0.2)})}
+    together = result(calibrations={"front": calibrated(0.0)}, alone=alone)
+    found = [f.check for f in check_solution(drive, together) if f.status is not Status.PASS]
     assert found == ["alone and together"]
 
 

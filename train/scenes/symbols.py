@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from train.scenes.areas import give_way, hatched_area, whole_crosswalk
-from train.scenes.letters import LETTERS, Hand, random_hand, random_text, word
+from train.scenes.letters import CAPITALS, random_hand, random_text
 from train.scenes.paint import Bend, Brush, RoadPaint, double_line, rectangle, rhombus
 from train.scenes.signs import other_sign, user
 from v2hdm.geometry.planar import inside_convex
@@ -24,6 +24,7 @@ from v2hdm.records import (
     TEXT,
     FloatArray,
 )
+from v2hdm.simulate.render.letters import Hand, word
 from v2hdm.simulate.render.scene import WHITE_PAINT, YELLOW_PAINT, Paint, placed
 
 _ACROSS_M = 9.0  # distance to either side, m, within which lines meet a stop line
@@ -133,7 +134,7 @@ def with_bays(rng: np.random.Generator, road: RoadPaint, brush: Brush, bend: Ben
     turn_rad = float(rng.choice([0.0, np.pi, np.pi / 2, -np.pi / 2], p=[0.35, 0.35, 0.15, 0.15]))
     first = int(np.exp(rng.uniform(0, np.log(900))))
     step = int(rng.choice([-2, -1, 1, 2]))
-    prefix = "" if rng.random() < 0.6 else str(rng.choice(LETTERS)) + str(rng.choice(["", "-"]))
+    prefix = "" if rng.random() < 0.6 else str(rng.choice(CAPITALS)) + str(rng.choice(["", "-"]))
     other_brush = _another(rng, brush)
     for k, along in enumerate(np.arange(rng.uniform(1.5, 8), 30, pitch_m)):
         strokes, size_m = _written(rng, f"{prefix}{abs(first + k * step)}", tall_m, wide_m, hand)

@@ -17,7 +17,7 @@ from v2hdm.geometry.ipm import apply_homography, flat_motion, ground_from_pinhol
 from v2hdm.geometry.planar import cross, inside_convex
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.geometry.tensors import back_project, back_project_with_jacobian
-from v2hdm.records import OUTLINE_SIGMA_PX, BoolArray, Camera, Drive, FloatArray, IntArray
+from v2hdm.records import BOX, OUTLINE_SIGMA_PX, BoolArray, Camera, Drive, FloatArray, IntArray
 
 _HORIZON_M2 = 1e4  # smaller variance of a ground point, m^2, from which it counts as on the horizon
 
@@ -111,8 +111,8 @@ def images_with_symbol(symbols: Symbols, rig: Rig, corners_map: FloatArray) -> I
     centre = corners_map.mean(axis=1)
     way = _middle_lines(corners_map).way
     points = centre[:, None] + np.linspace(-0.4, 0.4, 5)[:, None] * way[:, None]
-    for ground in outlines_on_ground(symbols, rig):
-        if ground is None:
+    for ground, kind in zip(outlines_on_ground(symbols, rig), symbols.kinds, strict=True):
+        if ground is None or kind == BOX:  # which may hold other markings
             continue
         middle = ground.mean(axis=0)
         size_m = float(np.ptp(ground, axis=0).max())

@@ -39,10 +39,15 @@ def drive_of(parsed: argparse.Namespace) -> Drive:
 
     check_workers(parsed.workers)
     parsed.workers = parsed.workers or os.cpu_count() or 1
-    logging.basicConfig(format="%(message)s")
-    logging.getLogger("v2hdm.io").setLevel(logging.INFO)  # an import may take minutes, and says so
+    log_to_terminal()
     cv2.setNumThreads(1)
     return read_drive(parsed.drive, ReadOptions(format=parsed.format, cameras=parsed.camera))
+
+
+def log_to_terminal() -> None:
+    """Show warnings, and what reading a drive takes and decides, on stderr."""
+    logging.basicConfig(format="%(message)s")
+    logging.getLogger("v2hdm.io").setLevel(logging.INFO)  # an import may take minutes, and says so
 
 
 def add_result(parser: argparse.ArgumentParser) -> None:

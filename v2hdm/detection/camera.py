@@ -38,8 +38,31 @@ _CURVE_UNIT_PX = 100.0  # unit of the distance below the horizon in lanes' curve
 _PROBE_PX = 50.0  # distance below the horizon, px, at which the width of a metre of ground is measured
 
 _ROTATION_TOLERANCE = 1e-6  # largest error of R R' - 1 of a stated rotation R
+_SIGMAS = 2.0  # standard deviations of a guessed focal length within which it surely is
 _BELOW_M = 0.1  # half the side, m, of the region of interest about the ground that the lowest pixel shows
 _FARTHEST_MOUNT_M = 100.0  # largest coordinate of a camera on its vehicle, m
+
+
+class Lens:
+    """A lens with a table of its distortion, which cameras of one lens share."""
+
+    def __init__(self, info: CameraInfo):
+        self.info = info
+
+    @cached_property
+    def table(self) -> FloatArray:
+        """The pinhole pixel of every few recorded ones and its slopes (2, 4, rows, columns).
+
+        The last are one cell beyond the image's border.
+        """
+        columns = np.arange(0.0, self.info.width + _LUT_STEP_PX, _LUT_STEP_PX)
+        rows = np.arange(0.0, self.info.height + _LUT_STEP_PX, _LUT_STEP_PX)
+        grid_px = np.stack(np.meshgrid(columns, rows), axis=-1)
+        node = undistort_points(self.info, grid_px.reshape(-1, 2)).reshape(grid_px.shape)
+        by_right = np.diff(node, axis=1)[:-1]
+        by_down = np.diff(node, axis=0)
+        tables = np.stack([node[:-1, :-1], by_right, by_down[:, :-1], np.diff(by_down, axis=1)])
+        return np.asarray(tables.transpose(3, 0, 1, 2).copy())
 
 
 class RoadCamera:
@@ -53,21 +76,13 @@ class RoadCamera:
     way that the vehicle drives. ``foot_vehicle`` (2,) lies below the camera.
     """
 
-    def __init__(self, camera: Camera, multiple: int = 16):
+    def __init__(self, camera: Camera, multiple: int = 16, lens: Lens | None = None):
         self.camera = camera
         self.info = camera.info
+        self.lens = lens if lens is not None and lens.info is camera.info else Lens(camera.info)
         self.vehicle_from_pinhole_px: FloatArray = camera.ipm[camera.initial_ipm]
         self.pinhole_px_from_vehicle: FloatArray = np.asarray(np.linalg.inv(self.vehicle_from_pinhole_px))
         self.distorted = has_distortion(camera.info)
-        # The pinhole pixel of every few recorded ones, one cell beyond the image's border, and its slopes.
-        columns = np.arange(0.0, self.info.width + _LUT_STEP_PX, _LUT_STEP_PX)
-        rows = np.arange(0.0, self.info.height + _LUT_STEP_PX, _LUT_STEP_PX)
-        grid_px = np.stack(np.meshgrid(columns, rows), axis=-1)
-        node = undistort_points(self.info, grid_px.reshape(-1, 2)).reshape(grid_px.shape)
-        by_right = np.diff(node, axis=1)[:-1]
-        by_down = np.diff(node, axis=0)
-        tables = np.stack([node[:-1, :-1], by_right, by_down[:, :-1], np.diff(by_down, axis=1)])
-        self._pinhole_lut: FloatArray = tables.transpose(3, 0, 1, 2).copy()
         self._ground_from_pinhole_px = facing_ipm(
             self.vehicle_from_pinhole_px, camera.roi_vehicle.mean(axis=0)
         )
@@ -80,7 +95,7 @@ class RoadCamera:
         on_ground = np.any(np.isfinite(self._row_grid_vehicle()).all(axis=2), axis=1)
         height = self.info.height - max(0, int(np.argmax(on_ground)) - _HORIZON_MARGIN_PX)
         self.top = self.info.height - min(-(-height // multiple) * multiple, self.info.height)
-        spare = max(self.first_row_within(FARTHEST_M) - _SURROUNDINGS_PX - self.top, 0)
+        spare = max(self.first_row_within(self.perhaps_m(FARTHEST_M)) - _SURROUNDINGS_PX - self.top, 0)
         self.far_row = self.top + spare // multiple * multiple
         self.fine_row = self._fine_row()
 
@@ -89,7 +104,8 @@ class RoadCamera:
         points = np.array(points_px, dtype=np.float64).reshape(-1, 2)
         if not self.distorted or not len(points):
             return points
-        rows, columns = self._pinhole_lut.shape[2:]
+        table = self.lens.table
+        rows, columns = table.shape[2:]
         u, v = points.T / _LUT_STEP_PX
         column = np.clip(u.astype(np.intp), 0, columns - 1)
         row = np.clip(v.astype(np.intp), 0, rows - 1)
@@ -97,8 +113,8 @@ class RoadCamera:
         down = v - row
         cell = columns * row + column
         # Plane by plane numpy takes a sixth of the time.
-        for axis, table in enumerate(self._pinhole_lut.reshape(2, 4, -1)):
-            corner, by_right, by_down, by_right_and_down = (plane.take(cell) for plane in table)
+        for axis, planes in enumerate(table.reshape(2, 4, -1)):
+            corner, by_right, by_down, by_right_and_down = (plane.take(cell) for plane in planes)
             points[:, axis] = corner + by_right * right + (by_down + by_right_and_down * right) * down
         return points
 
@@ -132,6 +148,10 @@ class RoadCamera:
     def range_m(self, points_vehicle: FloatArray) -> FloatArray:
         """Distance on the ground from below the camera; NaN stays NaN."""
         return np.asarray(np.linalg.norm(points_vehicle - self.foot_vehicle, axis=-1))
+
+    def perhaps_m(self, range_m: float) -> float:
+        """The distance of what may lie within a range, as the focal length is known."""
+        return float(range_m * np.exp(_SIGMAS * self.camera.mounting_sigma[1]))
 
     def log_size_sigma(self, range_m: FloatArray) -> FloatArray:
         """Standard deviation of the logarithm of lengths on the ground at distances, m.

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from v2hdm.catalogue import SYMBOL, Catalogue
+from v2hdm.catalogue import PAINT_CLASSES, SYMBOL, Catalogue
+from v2hdm.detection.areas import find_areas
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.classifier import Readings, find_markings, read_markings
 from v2hdm.detection.lanes.curves import LaneImage
@@ -20,11 +23,13 @@ from v2hdm.detection.quads.blobs import find_blobs
 from v2hdm.detection.quads.outline import on_edges, outline_polygon
 from v2hdm.detection.quads.propose import Proposals, propose
 from v2hdm.detection.stopwatch import lap
-from v2hdm.detection.weights import check_weights
+from v2hdm.detection.weights import NETWORK_FILE, check_weights
 from v2hdm.doors import checked
 from v2hdm.errors import DetectorError
 from v2hdm.records import BoolArray, Camera, LaneDetection, MarkingDetection
 from v2hdm.safe.texts import shown
+
+_log = logging.getLogger(__name__)
 
 Markings = tuple[MarkingDetection, ...]
 
@@ -60,7 +65,9 @@ class Detector:
         options = options or DetectorOptions()
         check_weights()
         path = path if path is not None else options.model
-        return cls(Network(None if path is None else Path(path), options.threads, options.device), options)
+        network = Network(None if path is None else Path(path), options.threads, options.device)
+        _tell_lacking(network.path, tuple(name for name in PAINT_CLASSES if name not in network.info.classes))
+        return cls(network, options)
 
     @checked
     def detect(
@@ -70,7 +77,12 @@ class Detector:
 
         Raises DetectorError where the image is not of that form or not of the camera's size.
         """
-        output = self.run_network(image_bgr, camera)
+        return self.detect_in(self.run_network(image_bgr, camera), image_bgr, camera)
+
+    def detect_in(
+        self, output: NetworkOutput, image_bgr: np.ndarray, camera: Camera
+    ) -> tuple[tuple[MarkingDetection, ...], tuple[LaneDetection, ...]]:
+        """Find the markings and lanes of an image of which the network's output is known."""
         with lap("propose"):
             proposals = self.propose(output, camera)
         with lap("lanes"):
@@ -80,14 +92,20 @@ class Detector:
             readings = self.read(image_bgr, proposals)
         with lap("judge"):
             markings = find_markings(readings, proposals.camera, self.options)
-        return _likelier(markings, self._symbols(image_bgr, proposals)), lanes
+        found = _likelier(markings, self._symbols(image_bgr, proposals))
+        with lap("areas"):
+            areas = self._areas(proposals)
+        return (*_not_of(areas, found), *areas), lanes
 
-    def run_network(self, image_bgr: np.ndarray, camera: Camera) -> NetworkOutput:
-        """Run the network on an image, less what shows the vehicle; raises as :meth:`detect`."""
+    def run_network(self, image_bgr: np.ndarray, camera: Camera, top: int | None = None) -> NetworkOutput:
+        """Run the network on an image, less what shows the vehicle; raises as :meth:`detect`.
+
+        It looks from the row ``top`` on, see :func:`v2hdm.detection.network.run_on_road`.
+        """
         road_camera = self.road_camera(camera)
         _check_image(image_bgr, camera)
         with lap("net"):
-            output = run_on_road(self.network, image_bgr, road_camera, self.options.mirrored)
+            output = run_on_road(self.network, image_bgr, road_camera, self.options.mirrored, top)
         mask = camera.own_vehicle
         if mask is None:
             return output
@@ -105,7 +123,8 @@ class Detector:
         road_camera = self.road_camera(camera)
         reach_px = self._cameras[camera.info.name][1]
         blobs, owner = find_blobs(output, reach_px, self.catalogue)
-        pieces = propose(blobs, road_camera, self.catalogue, self.options.max_range_m)
+        reach_m = road_camera.perhaps_m(self.options.max_range_m)
+        pieces = propose(blobs, road_camera, self.catalogue, reach_m)
         return Proposals(road_camera, output, pieces, owner)
 
     def lane_image(self, proposals: Proposals) -> LaneImage:
@@ -121,7 +140,9 @@ class Detector:
         return LaneImage(
             camera=proposals.camera,
             rows=proposals.output.anchors,
-            paint=trace_lanes(paint, proposals.camera, step_m, self.options.max_range_m),
+            paint=trace_lanes(
+                paint, proposals.camera, step_m, proposals.camera.perhaps_m(self.options.max_range_m)
+            ),
             output=proposals.output,
             paint_step_m=step_m,
             row_step_px=self.network.info.lane_stride,
@@ -143,23 +164,34 @@ class Detector:
         """The tables of a camera, built at its first use."""
         road_camera, _ = self._cameras.get(camera.info.name, (None, 0))
         if road_camera is None or road_camera.camera is not camera:
-            road_camera = RoadCamera(camera, self.network.info.multiple)
-            reach_px = road_camera.first_row_within(self.options.max_range_m)
+            lens = None if road_camera is None else road_camera.lens
+            road_camera = RoadCamera(camera, self.network.info.multiple, lens)
+            reach_px = road_camera.first_row_within(road_camera.perhaps_m(self.options.max_range_m))
             self._cameras[camera.info.name] = (road_camera, reach_px)
         return road_camera
+
+    def _areas(self, proposals: Proposals) -> list[MarkingDetection]:
+        """The areas of an image, such as words."""
+        camera = proposals.camera
+        reach_px = self._cameras[camera.info.name][1]
+        options = self.options
+        return find_areas(
+            proposals.output, camera, self.catalogue, reach_px, options.min_score, options.max_range_m
+        )
 
     def _symbols(self, image_bgr: np.ndarray, proposals: Proposals) -> list[MarkingDetection]:
         """Markings within range with an outline but no four corners; of a piece and its parts only one."""
         names = self.catalogue.of_family(SYMBOL)
         symbols = []
         parts_until = 0
+        reach_m = proposals.camera.perhaps_m(self.options.max_range_m)
         for piece in proposals.pieces:
             if not names or piece.index < parts_until:
                 continue
             kind = max(names, key=lambda name: piece.share.get(name, 0.0))
             score = piece.symbol_score(kind)
             ground = piece.outline_vehicle
-            within = proposals.camera.range_m(ground.mean(axis=0)) <= self.options.max_range_m  # nan is not
+            within = proposals.camera.range_m(ground.mean(axis=0)) <= reach_m  # nan is not
             after = piece.index + 1 + piece.blob.parts
             if not within or score < self.options.min_score:
                 continue
@@ -178,6 +210,28 @@ class Detector:
                 symbols.append(symbol)
                 parts_until = after
         return symbols
+
+
+def _not_of(areas: Sequence[MarkingDetection], found: Markings) -> Markings:
+    """What is no piece of an area, such as a letter: what lies in a likelier one is."""
+    hulls = [(area.outline_px.astype(np.float32), area.score) for area in areas]
+
+    def is_piece(marking: MarkingDetection) -> bool:
+        shape_px = marking.outline_px if len(marking.outline_px) else marking.corners_px
+        centre = shape_px.mean(axis=0).tolist()
+        return any(
+            score > marking.score and cv2.pointPolygonTest(hull, centre, False) > 0 for hull, score in hulls
+        )
+
+    return tuple(marking for marking in found if not is_piece(marking))
+
+
+@cache
+def _tell_lacking(path: Path, names: tuple[str, ...]) -> None:
+    """Say once which shipped classes a network was trained without; of the shipped one only to who asks."""
+    if names:
+        level = logging.INFO if path == NETWORK_FILE else logging.WARNING
+        _log.log(level, "%s does not know %s: none of these will be found", path, ", ".join(names))
 
 
 def _likelier(quads: Sequence[MarkingDetection], symbols: Sequence[MarkingDetection]) -> Markings:

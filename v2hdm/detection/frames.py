@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from v2hdm.errors import DriveError
+from v2hdm.records import FloatArray
 from v2hdm.safe.pixels import AS_STORED, VIDEO_OPTIONS, is_image_name, read_pixels
 from v2hdm.safe.texts import number_key
 
@@ -50,6 +51,7 @@ class Frame:
     stamp_s: float | None  # within a video, Unix time of a live camera, None of a file
     pixels: np.ndarray  # (H, W, 3) uint8 BGR
     dropped: int = 0  # live images before it that nobody has looked at, since newer ones came
+    map_from_vehicle: FloatArray | None = None  # (4, 4) when it was taken, of a drive
 
 
 def image_frames(paths: Sequence[Path]) -> Iterator[Frame]:

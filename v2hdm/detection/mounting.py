@@ -1,16 +1,15 @@
-"""How a camera of which little is known is mounted, from the lines that its images show.
+"""What the lines that an image shows say of its horizon.
 
 Lines along a road are parallel on the ground and meet in one point of the horizon: points of several images,
-beside each other, also show the roll. A first network run on half the resolution finds crossings of lanes'
-lines and the edges of paint; each is one of the road's or any other. The horizon has a posterior on a grid of
-pitch and roll, whose prior is the stated or a usual mounting; an image's own moves about it with the
-vehicle's body. Focal length and height stay as uncertain as their priors.
+beside each other, also show the roll. The network finds crossings of lanes' lines and the edges of paint;
+each is one of the road's or any other. What several images say together is in :mod:`.horizons`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -18,13 +17,9 @@ import numpy as np
 from v2hdm.detection.lanes.chains import find_chains
 from v2hdm.detection.lanes.curves import NEIGHBOURS
 from v2hdm.detection.lanes.lines import crossing_sigma_px
-from v2hdm.detection.network import Network, anchor_rows, as_probability, crossings
+from v2hdm.detection.network import AnchorRow, Network, NetworkOutput, anchor_rows, as_probability, crossings
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.records import BoolArray, CameraInfo, FloatArray
-
-BODY_SIGMA_RAD = np.deg2rad(0.35)
-"""Standard deviation of a body's pitch on its suspension: .3 to .4 degrees in 106 photographs of one camera,
-and .1 to .4 in `docs/kitti.md`."""
 
 _SCALE = 2  # factor by which an image is reduced: a sixth of the time, and a third less certain
 _LEAST_CROSSINGS = 4  # least number of crossings that are a line
@@ -43,6 +38,8 @@ _SILENT = 0.05  # share of images whose lines are of something else
 _AHEAD_RAD = np.deg2rad(6.0)  # standard deviation of a road's direction about the camera's axis
 _AHEAD_SHARE = 0.85  # share of the images in which the road leads ahead so closely
 _ASIDE_RAD = np.deg2rad(30.0)  # standard deviation of a road's direction in the other images
+
+_LEAST_GROUND = 0.05  # share of an image's height that shows ground at least
 
 _PITCH_STEP_RAD = np.deg2rad(0.4)  # distance between the pitches of the grid
 _ROLL_STEP_RAD = np.deg2rad(0.75)  # distance between the rolls of the grid
@@ -87,25 +84,42 @@ class Lines:
 
 
 def image_lines(network: Network, image_bgr: np.ndarray, info: CameraInfo) -> Lines:
-    """The lines that the network shows in an image (H, W, 3) uint8; DetectorError where it cannot be run."""
+    """The lines that a look in half the resolution shows of an image (H, W, 3) uint8.
+
+    Raises DetectorError where the network cannot be run.
+    """
     half = cv2.resize(image_bgr, None, fx=1 / _SCALE, fy=1 / _SCALE, interpolation=cv2.INTER_AREA)
     output = network.run(half)
-    points_px, odds = crossings(anchor_rows(output.lanes, network, 0, _SCALE))
+    rows = anchor_rows(output.lanes, network, 0, _SCALE)
+    return _lines(rows, output.paint, _SCALE * network.info.paint_stride, 0, info)
+
+
+def output_lines(output: NetworkOutput, info: CameraInfo) -> Lines:
+    """The lines in the network's output on the rows of an image that show road."""
+    paint = cv2.resize(output.paint, None, fx=1 / _SCALE, fy=1 / _SCALE, interpolation=cv2.INTER_AREA)
+    return _lines(output.anchors, paint, _SCALE * output.stride, output.top, info)
+
+
+def _lines(
+    rows: Sequence[AnchorRow], paint: np.ndarray, unit_px: float, top_px: int, info: CameraInfo
+) -> Lines:
+    """The lines of crossings and of edges of paint (h, w), log odds ``unit_px`` apart from a row on."""
+    points_px, odds = crossings(rows)
     pinhole_px = undistort_points(info, points_px)
     chains = [chain for chain in find_chains(points_px, odds) if len(chain) >= _LEAST_CROSSINGS]
     lines = [_fitted(pinhole_px[chain], _SCALE * crossing_sigma_px(odds[chain])) for chain in chains]
-    edges = _edges(output.paint, _SCALE * network.info.paint_stride, info)
-    all_lines = Lines.joined([*lines, edges])
+    all_lines = Lines.joined([*lines, _edges(paint, unit_px, top_px, info)])
     return all_lines.where(np.abs(all_lines.direction[:, 1]) > _FLAT)
 
 
-def _edges(paint: np.ndarray, unit_px: float, info: CameraInfo) -> Lines:
+def _edges(paint: np.ndarray, unit_px: float, top_px: int, info: CameraInfo) -> Lines:
     """The straight edges of paint, of which there are log odds (h, w), ``unit_px`` to an element."""
     level = np.round(255 * as_probability(paint)).astype(np.uint8)
     segments = cv2.createLineSegmentDetector(cv2.LSD_REFINE_NONE).detect(level)[0]
     ends = np.zeros((0, 2, 2)) if segments is None else segments.reshape(-1, 2, 2).astype(np.float64)
     long = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > _LEAST_EDGE_PX
-    ends_px = undistort_points(info, (unit_px * (ends[long] + 0.5) - 0.5).reshape(-1, 2)).reshape(-1, 2, 2)
+    recorded_px = unit_px * (ends[long] + 0.5) - 0.5 + (0, top_px)
+    ends_px = undistort_points(info, recorded_px.reshape(-1, 2)).reshape(-1, 2, 2)
     along = ends_px[:, 1] - ends_px[:, 0]
     length = np.maximum(np.linalg.norm(along, axis=1), 1.0)
     sigma_px = np.full(len(length), _EDGE_SIGMA_PX * unit_px)
@@ -137,61 +151,83 @@ def _fitted(points_px: FloatArray, sigma_px: FloatArray) -> Lines:
     )
 
 
-class MountingEstimate:
-    """The posterior of a camera's pitch and roll, from image to image."""
+class HorizonGrid:
+    """Pitches (P,) and rolls (R,) of a camera about a ``prior``, and how likely lines make each."""
 
     def __init__(self, info: CameraInfo, prior: Mounting):
         self.info = info
-        self._prior = prior
-        self._centre_px = info.intrinsic[:2, 2]
-        self._focal_px = float(info.intrinsic[1, 1])
-        pitch_sigma, roll_sigma = prior.sigma_rad
-        self._pitch = _grid(prior.pitch_rad, pitch_sigma, _PITCH_STEP_RAD)
-        self._roll = _grid(prior.roll_rad, roll_sigma, _ROLL_STEP_RAD)
-        pitch_off = (self._pitch - prior.pitch_rad)[:, None] / pitch_sigma
-        roll_off = (self._roll - prior.roll_rad) / roll_sigma
-        self._log_belief: FloatArray = -0.5 * (pitch_off**2 + roll_off**2)
+        self.prior = prior
+        self.pitch_rad = _grid(prior.pitch_rad, prior.sigma_rad[0], _PITCH_STEP_RAD)
+        self.roll_rad = _grid(prior.roll_rad, prior.sigma_rad[1], _ROLL_STEP_RAD)
+        self.variance_rad2 = _PITCH_STEP_RAD**2 / 12, _ROLL_STEP_RAD**2 / 12  # within a step
 
-    @property
-    def mounting(self) -> Mounting:
-        """The mounting as known by now; its standard deviations leave out an image's own pitch."""
-        belief = np.exp(self._log_belief - self._log_belief.max())
-        belief /= belief.sum()
-        pitch, pitch_sigma = _moments(belief.sum(axis=1), self._pitch, _PITCH_STEP_RAD)
-        roll, roll_sigma = _moments(belief.sum(axis=0), self._roll, _ROLL_STEP_RAD)
-        return replace(self._prior, pitch_rad=pitch, roll_rad=roll, sigma_rad=(pitch_sigma, roll_sigma))
+    @cached_property
+    def prior_share(self) -> FloatArray:
+        """The prior (P, R), whose sum is 1."""
+        pitch_sigma, roll_sigma = self.prior.sigma_rad
+        pitch_off = (self.pitch_rad - self.prior.pitch_rad)[:, None] / pitch_sigma
+        roll_off = (self.roll_rad - self.prior.roll_rad) / roll_sigma
+        share = np.exp(-0.5 * (pitch_off**2 + roll_off**2)) * self.shows_ground[:, None]
+        return np.asarray(share / share.sum())
 
-    def add(self, lines: Lines) -> None:
-        """Take in an image's lines."""
+    @cached_property
+    def shows_ground(self) -> FloatArray:
+        """1 for pitches (P,) at which an image shows ground, 0 for others; 1 for all if it is none."""
+        info = self.info
+        steepest = np.clip(self.pitch_rad, -_STEEPEST_RAD, _STEEPEST_RAD)
+        horizon_px = info.intrinsic[1, 2] - info.intrinsic[1, 1] * np.tan(steepest)
+        is_shown = horizon_px < (1 - _LEAST_GROUND) * info.height
+        return np.asarray(is_shown if is_shown.any() else ~is_shown, dtype=np.float64)
+
+    def likelihood(self, lines: Lines) -> FloatArray:
+        """How likely (P, R) pitch and roll make an image's lines; 1 in the mean, also for none."""
         if not len(lines.weight):
-            return
-        bearing = np.arange(-_REACH_RAD, _REACH_RAD + _COLUMN_STEP_RAD / 2, _COLUMN_STEP_RAD)
-        columns = self._focal_px * np.tan(bearing)
+            return np.ones((len(self.pitch_rad), len(self.roll_rad)))
+        bearing = self._bearing_rad
         ahead, aside = (np.exp(-0.5 * (bearing / sigma) ** 2) / sigma for sigma in (_AHEAD_RAD, _ASIDE_RAD))
         prior = _AHEAD_SHARE * ahead + (1 - _AHEAD_SHARE) * aside
-        rise = np.abs(np.tan(self._roll)).max() * columns.max() / self._focal_px
-        spare = int(np.ceil(rise / _PITCH_STEP_RAD))
-        pitch_of_row = self._pitch[0] + _PITCH_STEP_RAD * np.arange(-spare, len(self._pitch) + spare)
-        rows = -self._focal_px * np.tan(np.clip(pitch_of_row, -_STEEPEST_RAD, _STEEPEST_RAD))
-        points = self._log_likelihood(lines, columns, rows) + np.log(prior)
-        # The horizon of each pitch and roll, through the columns.
-        level = np.tan(np.clip(self._pitch, -_STEEPEST_RAD, _STEEPEST_RAD))
-        up = level[:, None, None] + np.tan(self._roll)[:, None] * columns / self._focal_px
-        place = (np.arctan(up) - pitch_of_row[0]) / _PITCH_STEP_RAD
-        first = np.clip(np.floor(place).astype(np.intp), 0, len(pitch_of_row) - 2)
-        share = np.clip(place - first, 0, 1)
-        column = np.arange(len(columns))
-        on_horizon = (1 - share) * points[first, column] + share * points[first + 1, column]
-        likelihood = np.exp(on_horizon - on_horizon.max()).sum(axis=2)
-        body = np.exp(-0.5 * ((self._pitch[:, None] - self._pitch) / BODY_SIGMA_RAD) ** 2)
-        moved = (body / body.sum(axis=1, keepdims=True)) @ likelihood
-        self._log_belief = self._log_belief + np.log((1 - _SILENT) * moved / moved.mean() + _SILENT)
+        focal_px = float(self.info.intrinsic[1, 1])
+        rows = -focal_px * np.tan(np.clip(self._pitch_of_row_rad, -_STEEPEST_RAD, _STEEPEST_RAD))
+        log_points = self._of_points(lines, focal_px * np.tan(bearing), rows)
+        points = (np.exp(log_points - log_points.max()) * prior).astype(np.float32)
+        above, share = self._horizons
+        steps = np.diff(points, axis=0).ravel()
+        likelihood = (points.ravel()[above] + share * steps[above]).sum(axis=2, dtype=np.float64)
+        return np.asarray((1 - _SILENT) * likelihood / likelihood.mean() + _SILENT)
 
-    def _log_likelihood(self, lines: Lines, columns: FloatArray, rows: FloatArray) -> FloatArray:
+    @cached_property
+    def _bearing_rad(self) -> FloatArray:
+        """Bearings (C,) of the vanishing points that are looked at."""
+        return np.arange(-_REACH_RAD, _REACH_RAD + _COLUMN_STEP_RAD / 2, _COLUMN_STEP_RAD)
+
+    @cached_property
+    def _pitch_of_row_rad(self) -> FloatArray:
+        """Elevations (Y,) of the vanishing points that are looked at, those of horizons of every roll."""
+        rise = np.abs(np.tan(self.roll_rad)).max() * np.tan(self._bearing_rad).max()
+        spare = int(np.ceil(rise / _PITCH_STEP_RAD))
+        return np.asarray(
+            self.pitch_rad[0] + _PITCH_STEP_RAD * np.arange(-spare, len(self.pitch_rad) + spare)
+        )
+
+    @cached_property
+    def _horizons(self) -> tuple[np.ndarray, np.ndarray]:
+        """Where the horizon of each pitch and roll (P, R, C) meets each bearing.
+
+        First the flat index (Y, C) of the vanishing point above, then the share of the way to the next one.
+        """
+        level = np.tan(np.clip(self.pitch_rad, -_STEEPEST_RAD, _STEEPEST_RAD))
+        up = level[:, None, None] + np.tan(self.roll_rad)[:, None] * np.tan(self._bearing_rad)
+        place = (np.arctan(up) - self._pitch_of_row_rad[0]) / _PITCH_STEP_RAD
+        above = np.clip(np.floor(place).astype(np.intp), 0, len(self._pitch_of_row_rad) - 2)
+        share = np.clip(place - above, 0, 1).astype(np.float32)
+        return above * len(self._bearing_rad) + np.arange(len(self._bearing_rad)), share
+
+    def _of_points(self, lines: Lines, columns: FloatArray, rows: FloatArray) -> FloatArray:
         """Log likelihood (R, C) of vanishing points, px from the principal point, over that of none."""
         total = np.zeros((len(rows), len(columns)), dtype=np.float32)
-        point = (lines.point_px - self._centre_px).astype(np.float32)
-        parallel_px = _PARALLEL_SIGMA_RAD * self._focal_px * lines.direction[:, 1]
+        focal_px = float(self.info.intrinsic[1, 1])
+        point = (lines.point_px - self.info.intrinsic[:2, 2]).astype(np.float32)
+        parallel_px = _PARALLEL_SIGMA_RAD * focal_px * lines.direction[:, 1]
         variance_px2 = (lines.sigma_px**2 + _POINT_SIGMA_PX**2 + parallel_px**2).astype(np.float32)
         direction = lines.direction.astype(np.float32)
         turned = (lines.sigma_rad**2).astype(np.float32)
@@ -200,12 +236,13 @@ class MountingEstimate:
         for k, weight in enumerate(lines.weight.tolist()):
             across = u - point[k, 0]
             down = v - point[k, 1]
-            nearer = 1 / np.maximum(across**2 + down**2, np.float32(1))
-            variance = turned[k] + variance_px2[k] * nearer
-            sine2 = (across * direction[k, 1] - down * direction[k, 0]) ** 2 * nearer
+            distance2 = np.maximum(across**2 + down**2, np.float32(1))
+            variance = turned[k] * distance2 + variance_px2[k]  # across the line, at the point
+            off2 = (across * direction[k, 1] - down * direction[k, 0]) ** 2
             # Over directions that are all alike likely: pi / sqrt(2 pi).
-            ratio = np.exp(-0.5 * sine2 / variance) * np.float32(np.sqrt(np.pi / 2)) / np.sqrt(variance)
-            total += np.float32(weight) * np.log(np.float32(_SHARE) * ratio + np.float32(1 - _SHARE))
+            scale = np.float32(_SHARE * np.sqrt(np.pi / 2))
+            ratio = np.exp(np.float32(-0.5) * off2 / variance) * np.sqrt(distance2 / variance)
+            total += np.float32(weight) * np.log(scale * ratio + np.float32(1 - _SHARE))
         return total.astype(np.float64)
 
 
@@ -213,10 +250,3 @@ def _grid(mean: float, sigma: float, step: float) -> FloatArray:
     """Values ``step`` apart, as many to either side of a mean as reach ``_SIGMAS`` standard deviations."""
     reach = int(np.ceil(_SIGMAS * sigma / step))
     return np.asarray(mean + step * np.arange(-reach, reach + 1))
-
-
-def _moments(share: FloatArray, values: FloatArray, step: float) -> tuple[float, float]:
-    """Mean and standard deviation of values ``step`` apart, of which each has a share (N,)."""
-    mean = float(share @ values)
-    square = float(share @ values**2)
-    return mean, float(np.sqrt(max(square - mean**2, 0) + step**2 / 12))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -105,6 +105,17 @@ class NetworkOutput:
         """Elements of ``paint`` per element of ``kinds``, in each direction."""
         return float(self.paint.shape[1] / self.kinds.shape[2])
 
+    def from_row(self, row: int) -> NetworkOutput:
+        """The output from an image row on that is some network's multiples below ``top``, or all of it."""
+        first = max(row - self.top, 0) // self.stride
+        return replace(
+            self,
+            paint=self.paint[first:],
+            kinds=self.kinds[:, round(first / self.kind_scale) :],
+            anchors=[anchor for anchor in self.anchors if anchor.v_px >= row],
+            top=self.top + first * self.stride,
+        )
+
     def odds_at(self, points_px: FloatArray) -> np.ndarray:
         """Log odds of paint, at most 6 either way, at recorded px (..., 2); outside, those of the border."""
         (odds,) = self._sample(self.paint[None], self.stride, points_px)
@@ -183,14 +194,21 @@ class Network:
 
 
 def run_on_road(
-    network: Network, image_bgr: np.ndarray, camera: RoadCamera, mirrored: bool = False
+    network: Network,
+    image_bgr: np.ndarray,
+    camera: RoadCamera,
+    mirrored: bool = False,
+    top: int | None = None,
 ) -> NetworkOutput:
-    """Run the network on the rows that show ground in reach, and take the mean with the mirror image's."""
+    """Run the network on the rows that show ground in reach, and take the mean with the mirror image's.
+
+    ``top`` is the first row, else the camera's ``far_row``, whole multiples of the network's away.
+    """
     info = network.info
-    top = camera.far_row
+    top = camera.far_row if top is None else top
     band = image_bgr[top:]
     run = partial(_run_twice, network) if mirrored else network.run
-    seam = _seam_row(network, camera)
+    seam = _seam_row(network, camera, top)
     if seam is None:
         output = run(band)
         paint = output.paint
@@ -235,13 +253,13 @@ def _run_twice(network: Network, image_bgr: np.ndarray) -> RawOutput:
     )
 
 
-def _seam_row(network: Network, camera: RoadCamera) -> int | None:
-    """Row of the band from which half the resolution will do; None if that saves nothing."""
+def _seam_row(network: Network, camera: RoadCamera, top: int) -> int | None:
+    """Row of the band from ``top`` from which half the resolution will do; None if that saves nothing."""
     grid = max(_GRID_PX, network.info.multiple)
-    height = camera.info.height - camera.far_row
+    height = camera.info.height - top
     if camera.fine_row is None or camera.info.width % (2 * grid) or height % grid:
         return None
-    seam = -(-max(camera.fine_row - camera.far_row, 0) // grid) * grid
+    seam = -(-max(camera.fine_row - top, 0) // grid) * grid
     seam += (height - seam) % (2 * grid)
     is_worth_it = height - seam >= 3 * _OVERLAP_PX
     return seam if is_worth_it and seam >= _OVERLAP_PX else None

@@ -11,7 +11,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -19,22 +19,28 @@ from typing import Any
 import cv2
 import numpy as np
 
+from v2hdm.detection.areas import find_crosswalks
 from v2hdm.detection.camera import GroundPoints, camera_from_calibration
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.frames import Frame
+from v2hdm.detection.network import NetworkOutput
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.stopwatch import lap
 from v2hdm.errors import MapFileError
 from v2hdm.io.calibration.reading import read_calibration
 from v2hdm.records import (
     ARROW,
+    BICYCLE,
+    BOX,
     CHEVRON,
+    CROSSWALK,
     CROSSWALK_BAR,
     DIAMOND,
     LANE_BOUNDARY,
     LANE_DASH,
     LANE_LINE,
     STOP_LINE,
+    TEXT,
     Calibration,
     Camera,
     FloatArray,
@@ -58,6 +64,10 @@ _COLOUR_BGR = {
     STOP_LINE: (120, 120, 255),
     CROSSWALK_BAR: (230, 230, 90),
     CHEVRON: (160, 220, 160),
+    TEXT: (250, 170, 250),
+    BOX: (80, 210, 250),
+    BICYCLE: (200, 250, 120),
+    CROSSWALK: (250, 250, 190),
 }
 _OTHER_BGR = (200, 200, 200)  # colour of all other classes
 _INVALID_BGR = (60, 60, 230)  # colour of corners that are not valid
@@ -82,6 +92,7 @@ class RoadMarking:
     corners_vehicle: FloatArray
     covariance_m2: FloatArray
     outline_vehicle: FloatArray
+    parts: tuple[int, ...] = ()  # of a crosswalk: its bars, by their place among the markings
 
     @property
     def kind(self) -> str:
@@ -142,11 +153,21 @@ class RoadDetector:
         except MapFileError as error:
             raise MapFileError(f"{calibration}: {error}") from error
 
-    def detect(self, image_bgr: np.ndarray) -> Road:
-        """Find what an image (H, W, 3) uint8 BGR of the camera's size shows; else raises DetectorError."""
-        markings, lanes = self.detector.detect(image_bgr, self.camera)
+    def detect(self, image_bgr: np.ndarray, output: NetworkOutput | None = None) -> Road:
+        """Find what an image (H, W, 3) uint8 BGR of the camera's size shows; else raises DetectorError.
+
+        ``output`` is the network's, if it has looked at the image already.
+        """
+        if output is None:
+            markings, lanes = self.detector.detect(image_bgr, self.camera)
+        else:
+            markings, lanes = self.detector.detect_in(output, image_bgr, self.camera)
         with lap("metres"):
-            return self._on_ground(markings, lanes)
+            crosswalks = find_crosswalks(markings, self.detector.road_camera(self.camera))
+            road = self._on_ground((*markings, *(crosswalk for crosswalk, _ in crosswalks)), lanes)
+            parts = (*(() for _ in markings), *(parts for _, parts in crosswalks))
+            with_parts = zip(road.markings, parts, strict=True)
+            return replace(road, markings=tuple(replace(marking, parts=of) for marking, of in with_parts))
 
     def _on_ground(self, markings: Sequence[MarkingDetection], lanes: Sequence[LaneDetection]) -> Road:
         """The detections with their places on the ground, if the camera is calibrated."""
@@ -193,6 +214,8 @@ def as_record(frame: Frame, camera: str, road: Road) -> dict[str, Any]:
 def _marking_record(marking: RoadMarking) -> dict[str, Any]:
     image = marking.image
     record: dict[str, Any] = {"class": image.kind, "score": round(image.score, 4)}
+    if marking.parts:
+        record["parts"] = list(marking.parts)
     if len(image.outline_px):
         record["outline_px"] = _plain(np.round(image.outline_px, _PX_DIGITS))
         if len(marking.outline_vehicle):

@@ -17,7 +17,7 @@ import numpy as np
 from v2hdm.errors import AdjustError, MappingError
 from v2hdm.experiment.plan import OURS, RECIPES, Job
 from v2hdm.io.drive.truth import read_truth
-from v2hdm.mapping.methods import NAIVE_IPMS
+from v2hdm.mapping.naive import NAIVE_IPMS
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.inspect import inspect_each
@@ -49,7 +49,7 @@ def drive_record(job: Job, progress: Progress, workers: int = 1) -> dict[str, An
             survey = take_survey(drive, options)
             key = read.contents.key(drive)
             try:
-                mapped_sets = map_camera_sets(drive, key, detections, survey, None, context)
+                mapped_sets = map_camera_sets(drive, key, detections, survey, None, context, compare=True)
             except (MappingError, AdjustError) as failure:
                 record["failures"].append([recipe, "all cameras", str(failure)])
             else:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from v2hdm.geometry.rigid import inverse
+from v2hdm.geometry.rigid import inverse, make_transform
 from v2hdm.records import CameraFrames, FloatArray, FrameStep
 
 
@@ -22,6 +22,8 @@ def edges_of(frames: CameraFrames, cam_from_vehicle: FloatArray) -> list[FrameSt
     lacks is the only one: without it the tree has no place for the calibration.
     """
     frame_from_cam = frame_from_vehicle(frames.height_m) @ inverse(cam_from_vehicle)
+    if frames.rectified_from_camera is not None:  # the tree's frame is that of the camera as it is built
+        frame_from_cam = frame_from_cam @ make_transform(frames.rectified_from_camera, np.zeros(3))
     if not frames.steps:
         return [FrameStep(frames.vehicle, frames.camera, frame_from_cam)]
     nodes = nodes_of(frames)

@@ -32,6 +32,9 @@ class InfoTopic:
     """Intrinsics in the bag."""
 
     topic: Annotated[str, "topic of sensor_msgs/CameraInfo."]
+    rectified: Annotated[
+        bool | None, "whether the images are rectified: P counts; default: as their topic's name says."
+    ] = None
 
 
 @dataclass(kw_only=True)

@@ -76,6 +76,7 @@ class MethodFigures(TypedDict, total=False):
     initial_reprojection_rmse_px: Number | None
     lanes: LaneFigures
     by_class: dict[str, dict[str, Any]]
+    areas: dict[str, dict[str, Any]]
     suspicious: list[Suspect] | None
 
 

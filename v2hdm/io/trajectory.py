@@ -24,7 +24,7 @@ _log = logging.getLogger(__name__)
 
 UNITS: Mapping[str, float] = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}  # and how many of each make a second
 
-_NO_NUMBER = ("nan", "inf", "infinity", "null", "none", "na", "nan(ind)", "1.#ind", "1.#qnan")
+NO_NUMBER = ("", "nan", "inf", "infinity", "null", "none", "na", "nan(ind)", "1.#ind", "1.#qnan")
 _UNIT = re.compile(r"[\[(](s|ms|us|ns)[\])]")
 _OLDEST_S = 9.5e8  # times since 1970 of recordings are later than this, February 2000
 _NEWEST_S = 4.1e9  # and earlier than this, December 2099
@@ -112,7 +112,7 @@ def read_tum(path: Path) -> Trajectory:
             kitti = " (poses of KITTI have no times: add them)" if len(parts) == 12 else ""
             expected = f"expected 8 columns '{_COLUMNS}', got {len(parts)}{kitti}; fix that line"
             raise DriveError(f"{where}: {expected}")
-        if any(part.lower().lstrip("+-") in _NO_NUMBER for part in parts[:8]):
+        if any(part.lower().lstrip("+-") in NO_NUMBER for part in parts[:8]):
             lost += 1
             if lost == len(layout.lines):
                 raise DriveError(f"{where}: it and all others hold no finite number; record the poses again")

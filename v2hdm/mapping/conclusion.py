@@ -162,7 +162,7 @@ def conclude(solve: FinalSolve, acceptance: AcceptanceOptions) -> Optimised:
         groups=classified.accepted,
         markings=markings,
         excluded=classified.exclusions(),
-        calibrations=_calibrations(bundle, solve.cameras),
+        calibrations=calibrations_of(bundle, solve.cameras),
         reprojection_rmse_px=_root_mean_square(bundle.solution.residual_px[used]),
         initial_reprojection_rmse_px=_root_mean_square(solve.residual_px(solve.initial_rig)[used]),
         suspicions=most_suspicious(classified.accepted, classified.misfit, squared, classified.counts),
@@ -170,7 +170,7 @@ def conclude(solve: FinalSolve, acceptance: AcceptanceOptions) -> Optimised:
     )
 
 
-def _calibrations(bundle: Bundle, cameras: Mapping[str, Camera]) -> dict[str, Calibration]:
+def calibrations_of(bundle: Bundle, cameras: Mapping[str, Camera]) -> dict[str, Calibration]:
     """Adjusted calibrations; a camera without markings keeps its start and has no covariance."""
     covariance = bundle.solution.extrinsic_covariance * bundle.solution.variance_scale
     return {

@@ -14,9 +14,11 @@ from v2hdm.association.groups import Association
 from v2hdm.association.sightings import Rig, Sightings, collect_sightings
 from v2hdm.geometry.rigid import with_clock_offsets
 from v2hdm.lanes.knots import Knots, find_knots
+from v2hdm.lanes.lines import map_lanes
+from v2hdm.lanes.points import ImageGround, collect_lane_points
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.records import Drive, Image, ImageDetections
+from v2hdm.records import Drive, Image, ImageDetections, Lane
 from v2hdm.site.options import JOINT
 from v2hdm.site.standing import Grey
 from v2hdm.surface.surface import Surface
@@ -59,6 +61,13 @@ class Inputs:
         if options.model != JOINT:
             return None
         return find_knots(self.drive, self.detections, self.sightings.cameras, rig, surface, options)
+
+    def find_lanes(self, ground: ImageGround) -> tuple[Lane, ...]:
+        """Lane lines of what these cameras detected, on a given ground."""
+        options = self.options.lanes
+        jitter_rad = self.drive.pose_noise.roll_pitch_rad
+        cloud = collect_lane_points(self.drive, self.detections, ground, options.max_range_m, jitter_rad)
+        return map_lanes(cloud, options)
 
     @cached_property
     def tracks(self) -> Association:

@@ -1,14 +1,10 @@
-"""The four methods of the paper on one set of cameras.
-
-CNI and ENI are the naive strategy under a calibrated and an estimated IPM; Opt is the joint optimisation; ONI
-is the naive strategy under the IPM of Opt.
-"""
+"""The joint optimisation of one set of cameras as a result, and beside it the paper's naive methods."""
 
 from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -16,19 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.adjust import Status, observability
-from v2hdm.association.ground import ground_points, views_of
-from v2hdm.association.groups import Association, FusedGroups, group_kinds, keep_rows, merge_groups
-from v2hdm.association.sightings import camera_of, frames_of
-from v2hdm.association.tracks import LEAST_SIGHTINGS
+from v2hdm.association.ground import views_of
+from v2hdm.association.sightings import frames_of
 from v2hdm.errors import ConfigError
 from v2hdm.faults import table
-from v2hdm.geometry.ipm import extrinsic_from_ipm, facing_ipm, flat_motion, ipm_from_extrinsic
-from v2hdm.geometry.planar import inside_convex, is_convex
 from v2hdm.io.maps.evidence import Residuals
 from v2hdm.io.maps.features import with_heights
 from v2hdm.lanes.knots import draw_lanes
-from v2hdm.lanes.lines import map_lanes
-from v2hdm.lanes.points import ImageGround, collect_lane_points, ground_by_ipm, ground_by_rig
+from v2hdm.lanes.points import ground_by_rig
+from v2hdm.mapping.alone import map_alone
 from v2hdm.mapping.bundle import Bundle, without_corner
 from v2hdm.mapping.conclusion import Optimised
 from v2hdm.mapping.inputs import Inputs
@@ -45,7 +37,6 @@ from v2hdm.records import (
     Image,
     ImageDetections,
     IntArray,
-    Lane,
     Marking,
     Symbol,
 )
@@ -156,9 +147,6 @@ def residuals_of(outcome: Outcome, optimised: Optimised) -> Residuals:
     )
 
 
-NAIVE_IPMS: Mapping[str, str] = {"CNI": "calibrated", "ENI": "estimated"}
-"""Name of the IPM that each naive method uses."""
-
 _log = logging.getLogger(__name__)
 
 
@@ -170,123 +158,36 @@ def run_methods(
     progress: Callable[[str], None] = silent,
     base: Base | None = None,
     grey: Callable[[Image], NDArray[np.float32]] | None = None,
+    *,
+    naive: bool = True,
 ) -> dict[str, MethodResult]:
     """Map a drive, ignoring ground truth, by every method that the cameras' IPMs allow.
 
     ``progress`` receives the name of each step at its start. ``Opt`` updates the earlier map ``base``;
     ``grey`` reads the images in which it looks at bare places and at ends (grey values (H, W)). Results are
-    by method: ``CNI`` and ``ENI`` where every camera has such an IPM, ``Opt``, ``ONI``. Raises MappingError
-    if there is nothing to map, ConfigError for an option out of range.
+    by method: ``CNI`` and ``ENI`` where every camera has such an IPM, ``Opt``, ``ONI``; without ``naive``
+    ``Opt`` alone. Raises MappingError if there is nothing to map, ConfigError for an option out of range.
     """
     options = options or MappingOptions()
     check_options(options)
     if options.survey.file is not None:
         raise ConfigError(f"mapping.survey.file is {options.survey.file!r}: read it and give its points")
+    if naive:
+        from v2hdm.mapping.naive import run_optimised, run_stated  # only a comparison needs them
+
     progress("linking sightings")
     inputs = Inputs(drive, detections, cameras, options, grey)
-    results: dict[str, MethodResult] = {}
-    for name, known_as in NAIVE_IPMS.items():
-        ipms = {camera: camera_of(drive, camera).ipm for camera in cameras}
-        if all(known_as in ipm for ipm in ipms.values()):
-            progress(name)
-            results[name] = run_naive(name, inputs, {camera: ipm[known_as] for camera, ipm in ipms.items()})
+    results = run_stated(inputs, progress) if naive else {}
     outcome, optimised = optimise(inputs, progress)
     optimal = _optimised_result(outcome, optimised)
     if base is not None:
         progress("the earlier map")
         optimal = _brought_up_to_date(base, optimal, outcome, optimised)
     results[BEST] = optimal
-    progress("ONI")
-    calibrations = optimal.calibrations
-    in_order = [(camera, calibrations[camera]) for camera in cameras]
-    optimised_ipm = {camera: ipm_from_extrinsic(at.info, at.cam_from_vehicle) for camera, at in in_order}
-    results["ONI"] = replace(run_naive("ONI", outcome.inputs, optimised_ipm), calibrations=calibrations)
+    if naive:
+        progress("ONI")
+        results["ONI"] = run_optimised(outcome.inputs, optimal.calibrations)
     return results
-
-
-def run_naive(name: str, inputs: Inputs, ipm: Mapping[str, FloatArray]) -> MethodResult:
-    """The naive strategy under one IPM per camera, such as that of a known extrinsic."""
-    drive = inputs.drive
-    sightings = inputs.sightings
-    extrinsic = {c: extrinsic_from_ipm(drive.cameras[c].info, matrix) for c, matrix in ipm.items()}
-    ground = ground_by_ipm(drive, ipm, extrinsic, inputs.optimiser.initial_rig)
-    markings, excluded = _naive_markings(inputs, ipm, ground)
-    lanes = _lanes(inputs, ground)
-    return MethodResult(
-        name=name,
-        cameras=sightings.cameras,
-        hd_map=HDMap(tuple(markings), lanes, drive.origin),
-        excluded=tuple(excluded),
-    )
-
-
-_NAIVE_MERGE_M = 1.0  # largest distance of two tracks of one marking in the naive methods
-_NAIVE_SHAPE_TOLERANCE = 0.5  # largest deviation of the corners of two such tracks over a marking's diameter
-
-
-def _naive_markings(
-    inputs: Inputs, ipm: Mapping[str, FloatArray], ground: ImageGround
-) -> tuple[list[Marking], list[Exclusion]]:
-    """The paper's baseline: back-projection by an IPM within its region of interest, then averaging.
-
-    Recorded poses are taken as exact. Tracks merge if their averages are within a metre: where IPMs disagree
-    by more, a marking is mapped twice, as is inherent to the method.
-    """
-    sightings = inputs.sightings
-    cameras = [inputs.drive.cameras[name] for name in sightings.cameras]
-    rois = [camera.roi_vehicle for camera in cameras]
-    forward = [facing_ipm(ipm[c.info.name], c.roi_vehicle.mean(axis=0)) for c in cameras]
-    homographies = np.stack(forward)[sightings.camera]
-    corners_vehicle = ground_points(homographies, sightings.corners_pinhole_px)
-    to_map = flat_motion(sightings.map_from_vehicle[sightings.frame]) @ homographies
-    corners_map = ground_points(to_map, sightings.corners_pinhole_px)
-    corners_map = ground.at_rows(corners_map, sightings.image[:, None], sightings.row_share)
-    usable = (inputs.tracks.group >= 0) & sightings.valid.all(axis=1)
-    for c, roi in enumerate(rois):
-        of_camera = sightings.camera == c
-        usable[of_camera] &= inside_convex(roi, corners_vehicle[of_camera]).all(axis=1)
-    tracks = keep_rows(inputs.tracks, usable)
-    association = merge_groups(
-        tracks,
-        sightings,
-        _average(tracks, corners_map),
-        floor_m=_NAIVE_MERGE_M,
-        gate_sigmas=np.inf,
-        max_distance_m=_NAIVE_MERGE_M,
-        shape_tolerance=_NAIVE_SHAPE_TOLERANCE,
-    )
-    average = _average(association, corners_map)
-    markings: list[Marking] = []
-    excluded: list[Exclusion] = []
-    groups = zip(
-        group_kinds(association, sightings),
-        average.corners_map,
-        is_convex(average.corners_map),
-        average.point_sightings[:, 0].tolist(),
-        strict=True,
-    )
-    for kind, corners, convex, count in groups:
-        name = sightings.kinds[kind]
-        if count >= LEAST_SIGHTINGS and convex:
-            markings.append(Marking(name, corners, count))
-        else:
-            reason = "not a convex quadrilateral" if count >= LEAST_SIGHTINGS else "too few sightings"
-            excluded.append(Exclusion(name, corners.mean(axis=0), count, reason))
-    return markings, excluded
-
-
-def _average(association: Association, corners_map: FloatArray) -> FusedGroups:
-    """Mean of each group's corners, without covariance."""
-    rows = np.flatnonzero(association.group >= 0)
-    corners = association.in_group_order(corners_map)[rows]
-    sightings = np.bincount(association.group[rows], minlength=association.count)
-    total = np.zeros((association.count, 4, 2))
-    np.add.at(total, association.group[rows], corners)
-    return FusedGroups(
-        corners_map=total / np.maximum(sightings, 1)[:, None, None],
-        covariance_m2=np.zeros((association.count, 4, 2, 2)),
-        point_sightings=np.repeat(sightings[:, None], 4, axis=1),
-    )
 
 
 def _unused_points(survey: SurveyOptions, bundle: Bundle) -> list[str]:
@@ -340,7 +241,7 @@ def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
     if bundle.knots is not None:
         lanes = draw_lanes(bundle.knots, solution)
     else:
-        lanes = _lanes(inputs, ground_by_rig(drive, cameras, bundle.rig, surface))
+        lanes = inputs.find_lanes(ground_by_rig(drive, cameras, bundle.rig, surface))
     symbols, no_symbols = _symbols(inputs, optimised)
     hd_map = HDMap(optimised.markings, lanes, drive.origin, symbols, noise.position_drift_over_m)
     if surface is not None:
@@ -373,6 +274,7 @@ def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
         suspicions=optimised.suspicions,
         heard=optimised.heard,
         surface=surface,
+        alone=map_alone(outcome, optimised),
     )
 
 
@@ -408,11 +310,3 @@ def _brought_up_to_date(
         residuals=residuals,
         suspicions=suspicions,
     )
-
-
-def _lanes(inputs: Inputs, ground: ImageGround) -> tuple[Lane, ...]:
-    drive = inputs.drive
-    options = inputs.options.lanes
-    jitter_rad = drive.pose_noise.roll_pitch_rad
-    cloud = collect_lane_points(drive, inputs.detections, ground, options.max_range_m, jitter_rad)
-    return map_lanes(cloud, options)

@@ -183,6 +183,16 @@ class Optimiser:
         )
         return conclude(solve, self._options.acceptance)
 
+    def solve_alone(self, settled: Bundle, camera: str) -> Bundle:
+        """The solve of what one camera observed of ``settled``, without the others.
+
+        Raises MappingError where that camera saw no marking twice, AdjustError where the solve fails.
+        """
+        of_camera = self.sightings.camera[settled.row] == self.camera_names.index(camera)
+        usable = np.zeros_like(self.sightings.valid)
+        usable[settled.row[of_camera], settled.own_corner[of_camera]] = True
+        return self._solve(settled.association, usable, settled.rig)
+
     def _with_errors_of_ground(self, bundle: Bundle) -> Bundle:
         """``bundle`` with covariances inflated by the uncertainty of its ground's heights."""
         if self.surface is None:

@@ -57,7 +57,8 @@ class Outcome:
     """An optimised camera set with its inputs, adjusted poses and evidence for the checks."""
 
     inputs: Inputs
-    bundle: Bundle
+    settled: Bundle  # of all observations
+    bundle: Bundle  # of the accepted ones
     evidence: SolveEvidence
 
 
@@ -93,7 +94,7 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
     ]
     suspected = _contradictions(settled, tested.tests, inputs.sightings, sessions)
     evidence = _evidence(settled, suspected, corrected, optimiser, optimised.bundle, inputs.sightings)
-    return Outcome(inputs, optimised.bundle, replace(evidence, foreign=foreign)), optimised
+    return Outcome(inputs, settled, optimised.bundle, replace(evidence, foreign=foreign)), optimised
 
 
 def _log_correction(inputs: Inputs, error: Contradiction) -> None:

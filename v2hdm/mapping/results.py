@@ -122,3 +122,4 @@ class MethodResult:
     changes: Changes | None = None  # to an earlier map
     heard: tuple[Heard, ...] = ()  # corrections of markings that the map follows
     surface: Surface | None = None  # of the ground, None for a plane
+    alone: Mapping[str, MethodResult] = field(default_factory=dict)  # by camera, its observations alone

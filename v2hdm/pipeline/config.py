@@ -116,7 +116,11 @@ class RunConfig:
         "95 % of the corners, and the calibrations, must be known to this radius, cm, at 95 %, else the "
         "verdict is WARN (docs/verdict.md).",
     ] = ACCURACY_GOAL_CM
-    all_maps: Annotated[bool, "whether to write the map of every method and camera set, into maps/."] = False
+    all_maps: Annotated[
+        bool,
+        "whether to map with each camera alone and by the naive methods, too, and to write every map, into "
+        "maps/; a rendered port is compared so in any case.",
+    ] = False
     mosaic: Annotated[bool, "whether to show the ground of a single drive from above (docs/report.md)."] = (
         True
     )

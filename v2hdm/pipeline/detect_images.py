@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
-from itertools import count, islice
+from dataclasses import replace
+from itertools import chain, compress, count, islice
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from v2hdm.detection.camera import camera_from_calibration, rough_calibration
+from v2hdm.detection.batch import with_own_vehicle
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.frames import (
     Frame,
@@ -23,31 +22,19 @@ from v2hdm.detection.frames import (
     list_images,
     video_frames,
 )
-from v2hdm.detection.mounting import BODY_SIGMA_RAD, Mounting, MountingEstimate, image_lines
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.detection.persistence import STATED_SIGMA_RAD, View, settled
 from v2hdm.detection.road import Road, RoadDetector
 from v2hdm.detection.stopwatch import Stopwatch, lap
 from v2hdm.doors import checked
 from v2hdm.errors import ConfigError, DriveError, shown
 from v2hdm.io.calibration.intrinsics import is_calibration, read_intrinsics
 from v2hdm.io.drive import READERS, read_drive
-from v2hdm.records import CameraInfo
+from v2hdm.pipeline.rough_camera import ROUGH_NAME, RoughCamera, check_size
+from v2hdm.records import Calibration, CameraInfo
 from v2hdm.safe.pixels import IMAGE_SUFFIXES
 from v2hdm.store.inputs import note_input
 
-ROUGH_MOUNTING = (1.6, 5.0, 60.0)  # height (m), pitch, horizontal field of view (deg) where nothing is known
-_UNKNOWN_PITCH_DEG = 8.0  # standard deviation of a pitch that nobody states, deg
-_STATED_PITCH_DEG = 4.0  # standard deviation of a pitch that the user states, deg
-_ROLL_DEG = 1.5  # standard deviation of a camera's roll about zero, deg
-_LOG_FOCAL = (
-    0.3  # standard deviation of the log of an assumed focal length: lenses of 46 to 76 deg are within
-)
-
-_LOOKS = 6
-"""Images of a folder that are looked at for its horizon: four photographs gave it to within 17 px, eight to
-within 6 px."""
-
-_KNOWN_RAD = np.deg2rad(0.5)  # a stream's horizon is said when its standard deviation is this
 _ROUGH_RANGE_M = 40.0  # distances may be wrong by two without a calibration: none is too far
 
 _Frames = Iterator[tuple[Frame, RoadDetector | None]]
@@ -116,10 +103,10 @@ def detect_images(
             options.max_range_m = _ROUGH_RANGE_M
         detector = Detector.load(options=options)
     road = None if path is None or lens is not None else RoadDetector.calibrated(detector, path, linear)
-    rough = _Rough(detector, lens, path, mounting, linear)
+    rough = RoughCamera(detector, lens, path, mounting, linear)
     most = limit and min(limit, sys.maxsize)
     frames = islice((_live_frames if live else _frames)(str(source), road, rough), most)
-    return _found(frames, rough, stopwatch or Stopwatch())
+    return _on_ground(_found(frames, rough, stopwatch or Stopwatch()))
 
 
 def _lens(camera: Path | None, name: str | None, mounting: Sequence[float] | None) -> CameraInfo | None:
@@ -137,108 +124,7 @@ def _lens(camera: Path | None, name: str | None, mounting: Sequence[float] | Non
     return None
 
 
-@dataclass
-class _Rough:
-    """The detector for the images of a camera without a calibration, whose mounting they show."""
-
-    detector: Detector
-    lens: CameraInfo | None
-    file: Path | None
-    mounting: Sequence[float] | None
-    linear: bool
-    folder: Sequence[Path] = ()
-    _estimate: MountingEstimate | None = None
-    _road: RoadDetector | None = None
-    _shown: int = 0
-    _is_said: bool = False
-
-    def road(self, frame: Frame) -> RoadDetector:
-        """The detector for the next image; it says what the mounting is taken to be.
-
-        Of a ``folder``, some images all over it show the horizon before the first; else the 1st, 2nd, 4th,
-        8th, ... do.
-        """
-        self._shown += 1
-        if self._estimate is None:
-            rows, columns = frame.pixels.shape[:2]
-            info, prior = self._prior(columns, rows)
-            self._estimate = MountingEstimate(info, prior)
-        if self._road is None or not (self.folder or self._shown & (self._shown - 1)):
-            with lap("horizon"):
-                self._road = self._look(self._estimate, [frame, *self._ahead(frame)])
-            self._say(frame, self._estimate.mounting)
-        return self._road
-
-    def _ahead(self, first: Frame) -> Iterator[Frame]:
-        """Further images of the folder; one that cannot be read is refused when its turn comes."""
-        places = np.linspace(0, len(self.folder) - 1, min(_LOOKS, len(self.folder))).round().astype(int)
-        for place in places[1:].tolist():
-            with suppress(DriveError):
-                yield from image_frames([self.folder[place]])
-
-    def _look(self, estimate: MountingEstimate, frames: Sequence[Frame]) -> RoadDetector:
-        info = estimate.info
-        for frame in frames:
-            if frame.pixels.shape[:2] == (info.height, info.width):
-                estimate.add(image_lines(self.detector.network, frame.pixels, info))
-        mounting = estimate.mounting
-        rough = rough_calibration(
-            info.name,
-            info.width,
-            info.height,
-            mounting.height_m,
-            float(np.rad2deg(mounting.pitch_rad)),
-            float(np.rad2deg(mounting.fov_rad)),
-            float(np.rad2deg(mounting.roll_rad)),
-        )
-        sigma = float(np.hypot(mounting.sigma_rad[0], BODY_SIGMA_RAD)), mounting.log_focal_sigma
-        camera = camera_from_calibration(replace(rough, info=info), self.linear, sigma)
-        return RoadDetector(self.detector, camera)
-
-    def _prior(self, columns: int, rows: int) -> tuple[CameraInfo, Mounting]:
-        """The camera's lens, and what its mounting is taken to be before its first image."""
-        height_m, pitch_deg, fov_deg = self.mounting or ROUGH_MOUNTING
-        if not (0 < height_m < np.inf and -45 < pitch_deg < 85 and 10 <= fov_deg <= 150):
-            raise ConfigError(
-                f"--mounting {height_m:g} {pitch_deg:g} {fov_deg:g}: give a height above 0 m, a pitch "
-                "of -45 to 85 deg (down is positive) and a field of view of 10 to 150 deg"
-            )
-        lens = self.lens
-        if lens is not None:
-            fov_deg = float(2 * np.degrees(np.arctan(lens.width / 2 / lens.intrinsic[0, 0])))
-        sigma_deg = _UNKNOWN_PITCH_DEG if self.mounting is None else _STATED_PITCH_DEG
-        if self.mounting is None:
-            knowledge = "no --camera" if lens is None else f"no mounting in {self.file}"
-            print(
-                f"{knowledge}: taking it to be {height_m:g} m up, {pitch_deg:g} deg down, "
-                f"{fov_deg:.3g} deg wide, unless the images show another horizon (set --mounting); "
-                "positions in px only",
-                file=sys.stderr,
-            )
-        pitch_rad, fov_rad, sigma_rad, roll_rad = np.deg2rad([pitch_deg, fov_deg, sigma_deg, _ROLL_DEG])
-        log_focal = _LOG_FOCAL if self.mounting is None and lens is None else 0.0
-        prior = Mounting(height_m, pitch_rad, 0.0, fov_rad, (sigma_rad, roll_rad), log_focal)
-        rough = rough_calibration("camera", columns, rows, height_m, pitch_deg, fov_deg)
-        return lens or rough.info, prior
-
-    def _say(self, frame: Frame, mounting: Mounting) -> None:
-        """Say once where the horizon is: of a folder at once, of a stream when that is known."""
-        if self._is_said or (mounting.sigma_rad[0] > _KNOWN_RAD and not self.folder):
-            return
-        self._is_said = True
-        angles = np.rad2deg(
-            [mounting.pitch_rad, mounting.sigma_rad[0], mounting.roll_rad, mounting.sigma_rad[1]]
-        )
-        pitch, pitch_sigma, roll, roll_sigma = angles.tolist()
-        where = "the folder's images" if self.folder else f"{frame.name} and earlier images"
-        print(
-            f"from the lines of {where} the camera looks {pitch:.1f} +- {pitch_sigma:.1f} deg down, roll "
-            f"{roll:.1f} +- {roll_sigma:.1f} deg",
-            file=sys.stderr,
-        )
-
-
-def _frames(source: str, road: RoadDetector | None, rough: _Rough) -> _Frames:
+def _frames(source: str, road: RoadDetector | None, rough: RoughCamera) -> _Frames:
     """The frames of whatever the source is."""
     path = Path(source)
     if source.isdecimal():
@@ -265,12 +151,12 @@ def _frames(source: str, road: RoadDetector | None, rough: _Rough) -> _Frames:
     return ((frame, road) for frame in (video_frames(path) if is_video else image_frames(paths)))
 
 
-def _of_camera(number: int, road: RoadDetector | None, rough: _Rough) -> Iterator[Frame]:
+def _of_camera(number: int, road: RoadDetector | None, rough: RoughCamera) -> Iterator[Frame]:
     info = rough.lens or (road and road.camera.info)
     return camera_frames(number, (info.width, info.height) if info else None)
 
 
-def _live_frames(source: str, road: RoadDetector | None, rough: _Rough) -> _Frames:
+def _live_frames(source: str, road: RoadDetector | None, rough: RoughCamera) -> _Frames:
     """The newest frame each time, of a camera or a folder."""
     path = Path(source)
     if source.isdecimal() and not path.exists():
@@ -282,7 +168,7 @@ def _live_frames(source: str, road: RoadDetector | None, rough: _Rough) -> _Fram
     return ((frame, road) for frame in frames)
 
 
-def _drive_frames(path: Path, road: RoadDetector | None, rough: _Rough) -> _Frames:
+def _drive_frames(path: Path, road: RoadDetector | None, rough: RoughCamera) -> _Frames:
     """The images of a drive, each read when its turn comes; if a calibration was given, of its camera."""
     if rough.lens is not None:
         raise ConfigError(
@@ -290,16 +176,29 @@ def _drive_frames(path: Path, road: RoadDetector | None, rough: _Rough) -> _Fram
             "file as camera_info in drive.yaml"
         )
     drive = read_drive(path)
-    roads = {name: RoadDetector(rough.detector, camera) for name, camera in drive.cameras.items()}
+    calibration = None
     if road is not None:
         name = road.camera.info.name
         if name not in drive.cameras:
-            raise DriveError(f"{path}: no camera {shown(name)} in the calibration; it has {', '.join(roads)}")
-        roads = {name: road}
+            raise DriveError(
+                f"{path}: no camera {shown(name)} in the calibration; it has {', '.join(drive.cameras)}"
+            )
+        drive = replace(drive, cameras={name: road.camera})
+        calibration = road.calibration
+    drive = with_own_vehicle(drive, rough.detector)
+    roads = {
+        name: RoadDetector(rough.detector, camera, calibration) for name, camera in drive.cameras.items()
+    }
     numbers = {name: count() for name in roads}
     return (
         (
-            replace(frame, name=f"{name}_{frame.name}", index=next(numbers[name]), stamp_s=image.stamp_s),
+            replace(
+                frame,
+                name=f"{name}_{frame.name}",
+                index=next(numbers[name]),
+                stamp_s=image.stamp_s,
+                map_from_vehicle=image.map_from_vehicle,
+            ),
             roads[name],
         )
         for image in drive.images
@@ -308,7 +207,41 @@ def _drive_frames(path: Path, road: RoadDetector | None, rough: _Rough) -> _Fram
     )
 
 
-def _found(frames: _Frames, rough: _Rough, stopwatch: Stopwatch) -> Iterator[Detected]:
+class _Found(NamedTuple):
+    """What an image shows, and from where, if that is known."""
+
+    detected: Detected
+    view: View | None
+
+
+def _on_ground(images: Iterator[_Found]) -> Iterator[Detected]:
+    """What images show, of a drive only what stays on the ground as the vehicle moves."""
+    first = next(images, None)
+    if first is None:
+        return
+    if first.view is None:
+        yield from (found.detected for found in chain([first], images))
+        return
+    for found, stays in settled(chain([first], images), _camera_and_view):
+        road = found.detected.road
+        kept = tuple(compress(road.markings, stays.tolist()))
+        yield found.detected._replace(road=replace(road, markings=kept))
+
+
+def _pitch_sigma_rad(calibration: Calibration | None) -> float:
+    """How far a camera's pitch may be off."""
+    if calibration is None or calibration.covariance is None:
+        return STATED_SIGMA_RAD
+    rotation = np.asarray(calibration.covariance)[3:, 3:]
+    return float(np.sqrt(np.trace(rotation)))
+
+
+def _camera_and_view(found: _Found) -> tuple[str, View]:
+    assert found.view is not None
+    return found.detected.camera, found.view
+
+
+def _found(frames: _Frames, rough: RoughCamera, stopwatch: Stopwatch) -> Iterator[_Found]:
     """Every frame with what it shows."""
     while True:
         with stopwatch.image():
@@ -317,18 +250,21 @@ def _found(frames: _Frames, rough: _Rough, stopwatch: Stopwatch) -> Iterator[Det
             if frame is None:
                 stopwatch.discard()
                 return
-            road = road or rough.road(frame)
-            _check_size(frame, road)
-            on_road = road.detect(frame.pixels)
-        yield Detected(frame, road.camera.info.name, on_road)
-
-
-def _check_size(frame: Frame, road: RoadDetector) -> None:
-    info = road.camera.info
-    height, width = frame.pixels.shape[:2]
-    if (width, height) != (info.width, info.height):
-        where = "the calibration" if road.calibration else "what is known"
-        raise DriveError(
-            f"{frame.source}: the image is {width}x{height}, but {where} of camera '{info.name}' is for "
-            f"{info.width}x{info.height}; give images of that size, or a calibration for these"
-        )
+            if road is None:
+                on_road = rough.detect(frame)
+                name = ROUGH_NAME if rough.lens is None else rough.lens.name
+            else:
+                check_size(frame, road.camera.info, "the calibration" if road.calibration else "the drive")
+                on_road = road.detect(frame.pixels)
+                name = road.camera.info.name
+        view = None
+        if road is not None and frame.map_from_vehicle is not None:
+            markings = [marking.image for marking in on_road.markings]
+            view = View(
+                frame.map_from_vehicle,
+                road.detector.road_camera(road.camera),
+                markings,
+                _pitch_sigma_rad(road.calibration),
+                road.detector.options.max_range_m,
+            )
+        yield _Found(Detected(frame, name, on_road), view)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
@@ -13,7 +13,13 @@ from v2hdm.geometry.ipm import initial_extrinsic
 from v2hdm.io.drive.truth import has_truth, read_truth
 from v2hdm.mapping.results import MethodResult
 from v2hdm.records import ACCURACIES, BEST, Drive, Truth
-from v2hdm.report.metrics import driven_past, extrinsic_figures, headline, map_figures
+from v2hdm.report.metrics import (
+    driven_past,
+    extrinsic_figures,
+    headline,
+    map_figures,
+    symbols_driven_past,
+)
 
 CameraSets = Mapping[str, Mapping[str, MethodResult]]  # by cameras (front, both), then method
 
@@ -35,6 +41,10 @@ def evaluate(drive: Drive, methods: CameraSets) -> Evaluation:
             method: map_figures(result.hd_map, truth, expected) | _own_figures(result)
             for method, result in by_method.items()
         }
+        if truth is not None and truth.map.symbols:
+            cameras = next(iter(by_method.values())).cameras
+            for method, figures in _areas(drive, truth, by_method, cameras).items():
+                results[name][method]["areas"] = figures
     metrics: dict[str, Any] = {"results": results, "extrinsics": _extrinsics(drive, methods, truth)}
     if truth is not None:
         metrics["disturbances"] = truth.disturbances
@@ -44,6 +54,16 @@ def evaluate(drive: Drive, methods: CameraSets) -> Evaluation:
         headlines.insert(0, f"disturbances: {disturbed}")
     headlines += list(methods.values())[-1][BEST].certainty.values()
     return Evaluation(metrics, headlines)
+
+
+def _areas(
+    drive: Drive, truth: Truth, by_method: Mapping[str, MethodResult], cameras: Sequence[str]
+) -> dict[str, dict[str, Any]]:
+    """The figures of words, boxes, crosswalks and double lines, by method."""
+    from v2hdm.report.areas import area_figures  # only drives with such a truth load it
+
+    expected = symbols_driven_past(drive, truth, cameras)
+    return {method: area_figures(result.hd_map, truth, expected) for method, result in by_method.items()}
 
 
 def _own_figures(result: MethodResult) -> dict[str, Any]:

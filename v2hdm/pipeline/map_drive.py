@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,7 +18,7 @@ from v2hdm.errors import AdjustError, ConfigError, MappingError
 from v2hdm.io.drive import ReadOptions, as_drive, join_drives
 from v2hdm.io.maps.corrections import read_corrections
 from v2hdm.mapping.options import AUTO, MappingOptions, check_options
-from v2hdm.pipeline.base import changes_json, check_together, grey_reader, read_base
+from v2hdm.pipeline.base import changes_json, check_together, read_base
 from v2hdm.pipeline.config import ACCURACY_GOAL_CM, Contents, check_choice
 from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.evaluate import CameraSets, evaluate
@@ -31,7 +31,6 @@ from v2hdm.records import BEST, Drive, ImageDetections
 from v2hdm.settings import Processes
 from v2hdm.site.corrections import Heard
 from v2hdm.site.living.changes import Base
-from v2hdm.site.living.wear import with_wear
 from v2hdm.store.cache import StageCache
 from v2hdm.survey.run import Survey, check_survey, take_survey
 from v2hdm.verdict import Finding, Status, Verdict
@@ -72,6 +71,7 @@ def map_drive(
     progress: Progress = silent,
     workers: Processes = 0,
     context: Context | None = None,
+    all_maps: bool = False,
 ) -> Result:
     """Map a drive, or several through one site together; nothing is written, but what ``cache`` keeps.
 
@@ -88,7 +88,8 @@ def map_drive(
         cache: folder that keeps what each stage has found for the next call; None keeps nothing.
         progress: shows how far the long steps are, ``progress(task, done, total)``.
         workers: processes; 0 takes one per core.
-        context: takes the place of the last three.
+        context: takes the place of ``cache``, ``progress`` and ``workers``.
+        all_maps: whether to map with each camera alone and by the naive methods, too, for a comparison.
 
     Returns:
         Map (east, north, up; m), calibrations, trajectory, and the verdict as data: a FAIL raises nothing.
@@ -124,7 +125,7 @@ def map_drive(
     about = describe_run(name or read.whole.name, read.whole, read.contents, paths, reading)
     described = inspection.drive_as_described
     mapped_so_far = Result(about, read.drives, read.contents, described, context.seconds, options.device)
-    return _mapped(mapped_so_far, inspection, detector, survey, earlier, accuracy_goal_cm, context)
+    return _mapped(mapped_so_far, inspection, detector, survey, earlier, accuracy_goal_cm, context, all_maps)
 
 
 def _earlier(base: Path | str | None, drive: Drive, context: Context) -> Base | None:
@@ -145,8 +146,11 @@ def _mapped(
     earlier: Base | None,
     goal_cm: float,
     context: Context,
+    all_maps: bool,
 ) -> Result:
     """The result of a drive that was read and checked."""
+    from v2hdm.pipeline.paint import with_paint  # those who only check a drive do without
+
     if detector is None:
         detector = DetectorOptions.for_mapping()
     settings = detector if isinstance(detector, DetectorOptions) else detector.options
@@ -156,10 +160,11 @@ def _mapped(
         with context.timed("map"):
             key = mapped_so_far.contents.key(inspection.drive)
             all_grades = of_all_grades(survey)
-            mapped = map_camera_sets(inspection.drive, key, detections, all_grades, earlier, context)
+            mapped = map_camera_sets(
+                inspection.drive, key, detections, all_grades, earlier, context, compare=all_maps
+            )
             sets = graded_sets(mapped, goal_cm / 100)
-        with context.timed("wear"):
-            sets = _with_wear(sets, inspection.drive, earlier, context)
+        sets = with_paint(sets, inspection.drive, earlier, context)
         acceptance = survey.mapping.acceptance
         chosen = accurate_enough(methods_of(sets), acceptance.accuracy, acceptance.corrections)
         chosen = with_composed(chosen, goal_cm / 100)
@@ -196,34 +201,6 @@ def _detect(
     return detections
 
 
-def _with_wear(
-    sets: Mapping[str, MappedSet], drive: Drive, earlier: Base | None, context: Context
-) -> dict[str, MappedSet]:
-    """The same with the paint that is left of each marking of the best map."""
-    name, last = list(sets.items())[-1]
-    best = last.methods[BEST]
-    if best.poses is None or best.residuals is None:
-        return dict(sets)
-    poses = [best.poses.of_image(image) for image in drive.images]
-    before = None if earlier is None else earlier.hd_map
-    grey = grey_reader(drive)
-    threads = context.processes
-    whole = best.residuals.whole_views()
-    index = {drive.name_of(image.path): k for k, image in enumerate(drive.images)}
-    number_of_id = {
-        number + 1 if marking.id is None else marking.id: number
-        for number, marking in enumerate(best.hd_map.markings)
-    }
-    shown = {
-        (index[image], number_of_id[marking_id]) for image, marking_id in whole if marking_id in number_of_id
-    }
-    worn = with_wear(
-        best.hd_map, drive.images, poses, best.calibrations, grey, shown, before, threads, best.surface
-    )
-    methods = {**last.methods, BEST: replace(best, hd_map=worn)}
-    return {**sets, name: replace(last, methods=methods)}
-
-
 def _told_of_corrections(heard: Sequence[Heard]) -> list[str]:
     """Lines on the corrections that the map follows; the log and metrics.json list all."""
     for correction in heard:
@@ -248,7 +225,7 @@ def _judge(
     best = list(methods.values())[-1][BEST]
     check_points = list(sets.values())[-1].checked
     with context.timed("judge"):
-        solved_findings = check_result(inspection.drive, methods, inspection.ground)
+        solved_findings = check_result(inspection.drive, best, inspection.ground)
         result_findings = told_by_poses(solved_findings, inspection.findings)
         unfit_findings = check_known_sizes(survey.mapping.known_sizes, best)
         unfit_findings += check_corrections(survey.mapping.acceptance.corrections, best)

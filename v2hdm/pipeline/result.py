@@ -132,7 +132,7 @@ class Result:
         Args:
             folder: is made, or has an earlier result, which is replaced; nobody else's file is.
             formats: of the map: ``geojson``, ``csv``, ``gpkg``, ``lanelet2``, ``dxf``, ...
-            all_maps: whether the map of every method and camera set is written, into ``maps/``.
+            all_maps: whether every map that was made is written, into ``maps/``.
             mosaic: whether the ground of a single drive is shown from above, too.
             crs: the system of coordinates of the formats but ``geojson``, as ``EPSG:25832`` or ``local``.
 

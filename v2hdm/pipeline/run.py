@@ -246,6 +246,7 @@ def map_and_save(
                 corrections=config.map.corrections,
                 accuracy_goal_cm=config.accuracy_goal_cm,
                 context=context,
+                all_maps=config.all_maps or config.simulate is not None,
             )
             key = result_key(config, mapped.drives, mapped.contents, context.cache.key())
             outputs = Outputs(

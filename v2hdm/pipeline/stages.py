@@ -141,16 +141,21 @@ def map_camera_sets(
     survey: Survey,
     base: Base | None,
     context: Context,
+    *,
+    compare: bool = False,
 ) -> dict[str, MappedSet]:
-    """Map a drive with each set of cameras, where that is not known yet.
+    """Map a drive with all cameras by the joint optimisation, where that is not known yet.
 
-    ``drive_key`` is that of the drive and of what its images show. The check points of the survey are held
-    against the finished map of all cameras, which alone brings ``base`` up to date. Raises MappingError where
-    no map can be made, AdjustError where the adjustment fails.
+    ``compare`` maps it with each camera alone and by the naive methods as well. ``drive_key`` is that of the
+    drive and of what its images show. The check points of the survey are held against the finished map of all
+    cameras, which alone brings ``base`` up to date. Raises MappingError where no map can be made, AdjustError
+    where the adjustment fails.
     """
     cache = context.cache
     sets = camera_sets(drive)
-    common_key = cache.key(drive_key, list(detections), survey.mapping)
+    if not compare:
+        sets = dict([list(sets.items())[-1]])
+    common_key = cache.key(drive_key, list(detections), survey.mapping, compare)
     *single, last = sets
     keys = {name: cache.key(common_key, name, sets[name], None) for name in single}
     keys[last] = cache.key(common_key, last, sets[last], (base, survey.check))
@@ -163,7 +168,7 @@ def map_camera_sets(
         mapped_sets[name] = cache.put(_MAP, keys[name], MappedSet, outcome.mapped, outcome.lines)
         context.progress("map", len(mapped_sets), len(sets))
 
-    work = _Work(drive, detections, survey, base, last)
+    work = _Work(drive, detections, survey, base, last, compare)
     # The largest first, so that processes end together.
     todo = [
         _Job(name, sets[name])
@@ -203,13 +208,17 @@ _WORTH_PROCESSES = 4000  # detected markings whose mapping takes as long as proc
 
 @dataclass(frozen=True)
 class _Work:
-    """Everything that the sets of cameras of a drive are mapped from; ``last`` is the one of all cameras."""
+    """Everything that the sets of cameras of a drive are mapped from; ``last`` is the one of all cameras.
+
+    ``compare`` says whether by the naive methods, too.
+    """
 
     drive: Drive
     detections: Sequence[ImageDetections]
     survey: Survey
     base: Base | None
     last: str
+    compare: bool
 
     def __call__(self, job: _Job, _: Progress = silent) -> _Outcome:
         """Map one set of cameras."""
@@ -225,7 +234,10 @@ class _Work:
         survey = self.survey
         log = partial(_log.debug, "%s: %s", name)
         base = self.base if name == self.last else None
-        methods = run_methods(drive, self.detections, cameras, survey.mapping, log, base, grey_reader(drive))
+        grey = grey_reader(drive)
+        methods = run_methods(
+            drive, self.detections, cameras, survey.mapping, log, base, grey, naive=self.compare
+        )
         best = methods[BEST]
         checked = compare_survey(survey, drive, best) if name == self.last else None
         # The factors of the adjustment are large; whoever needs more of them asks while they are here.

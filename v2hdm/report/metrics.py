@@ -52,15 +52,32 @@ class MarkingMetrics:
 
 def driven_past(drive: Drive, truth: Truth, cameras: Sequence[str]) -> BoolArray:
     """True markings (J,) that the cameras saw whole in their ROI in :data:`MIN_SIGHTINGS` images."""
-    corners = np.zeros((len(truth.map.markings), 4, 3))
-    for j, marking in enumerate(truth.map.markings):
-        corners[j, :, :2] = marking.corners_map
-        corners[j, :, 2] = 0.0 if marking.heights_m is None else marking.heights_m
+    outlines = [(marking.corners_map, marking.heights_m) for marking in truth.map.markings]
+    return _seen_whole(drive, truth, cameras, outlines, truth.visibility)
+
+
+def symbols_driven_past(drive: Drive, truth: Truth, cameras: Sequence[str]) -> BoolArray:
+    """True symbols (S,) of four corners of which :func:`driven_past` would say so."""
+    outlines = [(symbol.outline_map, symbol.heights_m) for symbol in truth.map.symbols]
+    if truth.symbol_visibility is None or any(len(outline) != 4 for outline, _ in outlines):
+        return np.zeros(len(outlines), dtype=np.bool_)
+    return _seen_whole(drive, truth, cameras, outlines, truth.symbol_visibility)
+
+
+def _seen_whole(
+    drive: Drive, truth: Truth, cameras: Sequence[str],
+    outlines: Sequence[tuple[FloatArray, FloatArray | None]], visibility: FloatArray,
+) -> BoolArray:  # fmt: skip
+    """Outlines (J,) with heights that the cameras saw whole in their ROI in enough images."""
+    corners = np.zeros((len(outlines), 4, 3))
+    for j, (corners_map, heights_m) in enumerate(outlines):
+        corners[j, :, :2] = corners_map
+        corners[j, :, 2] = 0.0 if heights_m is None else heights_m
     sightings = np.zeros(len(corners), dtype=int)
     for i, image in enumerate(drive.images):
         if image.camera not in cameras:
             continue
-        candidates = np.flatnonzero(truth.visibility[i] >= FULLY_VISIBLE)
+        candidates = np.flatnonzero(visibility[i] >= FULLY_VISIBLE)
         corners_vehicle = ground_in_vehicle(truth.map_from_vehicle[i], corners[candidates])
         inside = inside_convex(drive.cameras[image.camera].roi_vehicle, corners_vehicle).all(axis=1)
         sightings[candidates[inside]] += 1

@@ -295,7 +295,7 @@ def save_overlay(
     outlines = [marking.corners_map for marking in hd_map.markings]
     outlines += [symbol.outline_map for symbol in hd_map.symbols]
     lines = [np.vstack([outline, outline[:1]]) for outline in outlines]
-    lines += [lane.points_map for lane in hd_map.lanes]
+    lines += [line.points_map for lane in hd_map.lanes for line in lane.painted]
     legend: list[tuple[Pen | None, str]] = []
     for name, view in views.items():
         pen = OVERLAY.get(name, _BEFORE)

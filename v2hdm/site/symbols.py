@@ -1,4 +1,4 @@
-"""Symbols of the map (arrows, chevrons, users' own), as polygons from most of their sightings.
+"""Symbols of the map (arrows, chevrons, users' own), as polygons from most of their sightings; and areas.
 
 Under known cameras and poses every sighting's outline is projected to the ground; overlapping outlines are
 one symbol. Ground that a good part of the images shows as paint, weighted towards near ones, gives the
@@ -25,10 +25,12 @@ from v2hdm.adjust import PoseSigma
 from v2hdm.association.ground import BORDER_PX, Views, easy_views, outlines_on_ground
 from v2hdm.association.sightings import Rig, Symbols
 from v2hdm.association.tracks import LEAST_SIGHTINGS
+from v2hdm.catalogue import AREA, SHIPPED
 from v2hdm.geometry.ipm import apply_in_front, pinhole_px_from_ground, project_ground
 from v2hdm.geometry.planar import is_simple, signed_area
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import (
+    BOX,
     OUTLINE_SIGMA_PX,
     BoolArray,
     Camera,
@@ -39,6 +41,7 @@ from v2hdm.records import (
     Marking,
     Symbol,
 )
+from v2hdm.site.areas import LEAST_IMAGES, Rectangle, fit_rectangle
 from v2hdm.site.candidates import FOUND_SELDOM, LACKS_A_CORNER, SEEN_SELDOM
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import PointViews, measure_parallax
@@ -49,7 +52,13 @@ _CELL_M = 0.02
 """Cells of the average, m; its contour is interpolated between them and simplified by half a cell."""
 
 _MOST_CELLS = 500  # most cells along the longer side of the average; larger symbols have larger cells
+_MOST_CELLS_OF_AREA = 120  # the same of an area, of which it gives the direction and the images' common part
 _PART = 0.3  # least weighted fraction of the images of a place that show paint there: some miss a part
+
+_CORE_M = 2.0  # extent of the middle of an area, m, whose view shows it: a box may be larger than any view
+_USUAL = 0.85  # least area of a hull, in parts of the usual, that nothing hides
+
+AREAS = SHIPPED.of_family(AREA)
 
 NO_POLYGON = "no simple polygon explains its outline"
 
@@ -73,12 +82,17 @@ def map_symbols(
     apply as to markings. How well vertices are known is no reason against a symbol, unless it has no shape.
     """
     infos = [camera.info for camera in cameras]
-    places = _places(symbols, rig, infos, jitter_rad, markings)
+    kinds = np.array([kind if kind in AREAS else "" for kind in symbols.kinds])
+    places = [
+        place
+        for kind in np.unique(kinds)
+        for place in _places(symbols, kinds == kind, rig, infos, jitter_rad, () if kind else markings)
+    ]
     reasons = _absences(places, views, rig, cameras, options.min_probability)
     for number, place in enumerate(places):
-        if reasons[number] is None:
+        if reasons[number] is None and place.kind != BOX:  # of a box each image shows other ends
             # The border or a shadow may hide one end in some images: then the other is used.
-            ends = [_ends(place.outlines_map, place.image, place.eyes, sign) for sign in (1, -1)]
+            ends = [_middle(place)] if place.kind in AREAS else [_ends(place, sign) for sign in (1, -1)]
             objections = [measure_parallax(end, 1).objections(options.min_probability)[0] for end in ends]
             reasons[number] = None if None in objections else objections[0]
     standing = [place for place, reason in zip(places, reasons, strict=True) if reason is None]
@@ -87,13 +101,8 @@ def map_symbols(
         for place, reason in zip(places, reasons, strict=True)
         if reason is not None
     ]
-    polygons = find_polygons(
-        [place.kind for place in standing],
-        [place.eyes.traces(place.outlines_map, place.seen_sides, place.image) for place in standing],
-        [place.outline_map for place in standing],
-    )
     accepted = []
-    for place, fitted in zip(standing, polygons, strict=True):
+    for place, fitted in _fitted(standing):
         reason = _objection(fitted)
         if reason is None:
             symbol = Symbol(place.kind, place.outline_map, place.images)
@@ -103,8 +112,29 @@ def map_symbols(
     return tuple(accepted), tuple(exclusions)
 
 
-def _objection(polygon: Polygon) -> str | None:
+def _fitted(places: Sequence[_Place]) -> list[tuple[_Place, Polygon | Rectangle]]:
+    """The places with their polygons, or their rectangles where they are areas."""
+    symbols = [place for place in places if place.kind not in AREAS]
+    polygons = find_polygons(
+        [place.kind for place in symbols],
+        [place.eyes.traces(place.outlines_map, place.seen_sides, place.image) for place in symbols],
+        [place.outline_map for place in symbols],
+    )
+    fitted: list[tuple[_Place, Polygon | Rectangle]] = list(zip(symbols, polygons, strict=True))
+    for place in places:
+        if place.kind in AREAS:
+            eyes = place.eyes
+            rectangle = fit_rectangle(
+                place.outline_map, place.outlines_map, place.seen_sides, place.image, eyes.shows, eyes.sigma_m
+            )
+            fitted.append((place, rectangle))
+    return fitted
+
+
+def _objection(polygon: Polygon | Rectangle) -> str | None:
     """Reason why a polygon is not the shape of a symbol, or None."""
+    if isinstance(polygon, Rectangle):
+        return None if polygon.seen.min() >= LEAST_IMAGES else LACKS_A_CORNER
     if polygon.explained < LEAST_EXPLAINED or not is_simple(polygon.vertices):
         return NO_POLYGON
     variance_m2 = np.diag(polygon.covariance).reshape(-1, 2).sum(axis=1)
@@ -130,14 +160,17 @@ class _Place:
 
 def _places(
     symbols: Symbols,
+    chosen: BoolArray,
     rig: Rig,
     infos: Sequence[CameraInfo],
     jitter_rad: float,
     markings: Sequence[Marking],
 ) -> list[_Place]:
-    """Places with an outline in enough images for an average, except where a marking of the map lies."""
+    """Places with a ``chosen`` outline (N,) in enough images for an average, except where a marking lies."""
     grounds = {
-        row: outline for row, outline in enumerate(outlines_on_ground(symbols, rig)) if outline is not None
+        row: outline
+        for row, outline in enumerate(outlines_on_ground(symbols, rig))
+        if outline is not None and chosen[row]
     }
     if not grounds:
         return []
@@ -152,10 +185,11 @@ def _places(
             continue
         eyes = _Eyes(camera, frame, rig, infos, jitter_rad)
         outlines = [shapes[n] for n in members]
-        outline = _fused_outline(outlines, image.ravel(), eyes)
+        kind = Counter(symbols.kinds[n] for n in rows[members]).most_common(1)[0][0]
+        most_cells = _MOST_CELLS_OF_AREA if kind in AREAS else _MOST_CELLS
+        outline = _fused_outline(outlines, image.ravel(), eyes, most_cells)
         if outline is None or _holds_any(outline, centres_map):
             continue
-        kind = Counter(symbols.kinds[n] for n in rows[members]).most_common(1)[0][0]
         sides = [symbols.seen_sides[n] for n in rows[members]]
         places.append(_Place(kind, outline, outlines, sides, image.ravel(), eyes))
     return places
@@ -174,7 +208,7 @@ def _absences(
     places: Sequence[_Place], views: Views, rig: Rig, cameras: Sequence[Camera], min_probability: float
 ) -> list[str | None]:
     """Why each place has no paint, or None: it is found in too few of the images that show it well."""
-    boxes = [cv2.boxPoints(cv2.minAreaRect(_about_middle(place))) for place in places]
+    boxes = [_core(place) for place in places]
     corners_map = np.array(
         [box + place.outline_map.mean(axis=0) for box, place in zip(boxes, places, strict=True)]
     ).reshape(-1, 4, 2)
@@ -199,12 +233,21 @@ def _absences(
     return reasons
 
 
+def _core(place: _Place) -> FloatArray:
+    """The corners (4, 2) about its middle of what shows a place: its box, of a large area the middle."""
+    box = cv2.boxPoints(cv2.minAreaRect(_about_middle(place))).astype(np.float64)
+    if place.kind not in AREAS:
+        return box
+    middle = box.mean(axis=0)
+    return np.asarray(middle + (box - middle) * min(1.0, _CORE_M / float(np.ptp(box, axis=0).max())))
+
+
 def _about_middle(place: _Place) -> NDArray[np.float32]:
     """The common outline (N, 2) about its middle."""
     return np.asarray(place.outline_map - place.outline_map.mean(axis=0), dtype=np.float32)
 
 
-def _with_vertices(symbol: Symbol, polygon: Polygon, markings: Sequence[Marking]) -> Symbol:
+def _with_vertices(symbol: Symbol, polygon: Polygon | Rectangle, markings: Sequence[Marking]) -> Symbol:
     """The symbol as the polygon, with the camera and pose errors of the nearest marking."""
     covariance = polygon.covariance
     certain = [marking for marking in markings if marking.covariance_m2 is not None]
@@ -266,28 +309,52 @@ class _Eyes:
         return np.asarray(((pixel > BORDER_PX) & (pixel < limit)).all(axis=2) & (depth_m > 0))
 
 
-def _ends(shapes: Sequence[FloatArray], image: IntArray, eyes: _Eyes, sign: int) -> PointViews:
-    """One end of a symbol in each of I images, ``image`` (S,) of the shapes.
+def _ends(place: _Place, sign: int) -> PointViews:
+    """One end of a symbol in each of its images; seen from the other side it is another point.
 
-    ``sign`` 1 is the far end, -1 the near one; seen from the other side it is another point. The points'
-    scatter gives their uncertainty besides jitter.
+    ``sign`` 1 is the far end, -1 the near one.
     """
-    ends = np.zeros((len(eyes.camera), 2))
-    for number, eye in enumerate(eyes.centre_map[:, :2]):
-        outlines = [outline for outline, k in zip(shapes, image, strict=True) if k == number]
-        points = np.concatenate(outlines)
+    ends = np.zeros((place.images, 2))
+    for number, eye in enumerate(place.eyes.centre_map[:, :2]):
+        outlines = zip(place.outlines_map, place.image, strict=True)
+        points = np.concatenate([outline for outline, k in outlines if k == number])
         ends[number] = points[(sign * np.linalg.norm(points - eye, axis=1)).argmax()]
-    ray_map = ends - eyes.centre_map[:, :2]
+    ray_map = ends - place.eyes.centre_map[:, :2]
+    return _point_views(ends, np.arange(place.images), place.eyes, ray_map @ ray_map[0] < 0)
+
+
+def _middle(place: _Place) -> PointViews:
+    """The middle of an area in its images, as far as none is cut or smaller than usual."""
+    area = np.array([abs(float(signed_area(outline))) for outline in place.outlines_map])
+    is_whole = np.array([is_seen.all() for is_seen in place.seen_sides])
+    is_usual = is_whole & (area > _USUAL * np.median(area[is_whole] if is_whole.any() else area))
+    chosen = np.flatnonzero(is_usual) if is_usual.sum() > 1 else np.arange(len(area))
+    middles = np.array([_centroid(place.outlines_map[k]) for k in chosen])
+    return _point_views(middles, place.image[chosen], place.eyes, np.zeros(len(chosen), dtype=np.bool_))
+
+
+def _centroid(outline: FloatArray) -> FloatArray:
+    """The middle (2,) of a polygon's area."""
+    moments = cv2.moments((outline - outline[0]).astype(np.float32))
+    return np.asarray(outline[0] + np.array([moments["m10"], moments["m01"]]) / max(moments["m00"], 1e-9))
+
+
+def _point_views(points: FloatArray, image: IntArray, eyes: _Eyes, is_other: BoolArray) -> PointViews:
+    """A point (N, 2) of a symbol in each of N images, in some of them the other one of two.
+
+    The points' scatter gives their uncertainty besides jitter.
+    """
+    ray_map = points - eyes.centre_map[image, :2]
     sigma = PoseSigma(_CELL_M, eyes.jitter_rad, eyes.jitter_rad, _CELL_M).by_state()
     return PointViews(
-        group=np.zeros(len(ends), dtype=np.int64),
-        camera=eyes.camera,
-        points_map=np.repeat(ends[:, None], 2, axis=1),
+        group=np.zeros(len(points), dtype=np.int64),
+        camera=eyes.camera[image],
+        points_map=np.repeat(points[:, None], 2, axis=1),
         ray_map=np.repeat(ray_map[:, None], 2, axis=1),
-        covariance_m2=np.tile(_CELL_M**2 * np.eye(2), (len(ends), 2, 1, 1)),
-        used=np.eye(2, dtype=np.bool_)[(ray_map @ ray_map[0] < 0).astype(np.int64)],
-        height_m=np.maximum(eyes.centre_map[:, 2], _COARSE_M),
-        pose_sigma=np.tile(sigma, (len(ends), 1)),
+        covariance_m2=np.tile(_CELL_M**2 * np.eye(2), (len(points), 2, 1, 1)),
+        used=np.eye(2, dtype=np.bool_)[is_other.astype(np.int64)],
+        height_m=np.maximum(eyes.centre_map[image, 2], _COARSE_M),
+        pose_sigma=np.tile(sigma, (len(points), 1)),
     )
 
 
@@ -326,14 +393,16 @@ def _covered(shapes: Sequence[FloatArray], cell_m: float) -> tuple[list[np.ndarr
     return masks, first
 
 
-def _fused_outline(shapes: Sequence[FloatArray], image: IntArray, eyes: _Eyes) -> FloatArray | None:
+def _fused_outline(
+    shapes: Sequence[FloatArray], image: IntArray, eyes: _Eyes, most_cells: int
+) -> FloatArray | None:
     """Counter-clockwise outline (N, 2) of the paint in the images, or None.
 
     Each of I images, ``image`` (S,) of the shapes, votes on the ground in its view, weighted by its
     precision.
     """
     extent_m = float(np.ptp(np.concatenate(shapes), axis=0).max())
-    cell_m = max(_CELL_M, extent_m / _MOST_CELLS)
+    cell_m = max(_CELL_M, extent_m / most_cells)
     masks, first = _covered(shapes, cell_m)
     size = masks[0].shape
     painted = np.zeros((len(eyes.camera), *size), dtype=np.bool_)

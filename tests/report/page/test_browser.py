@@ -1,10 +1,15 @@
 """The report in a browser: it draws, answers the pointer, and asks for nothing beyond itself."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tests.report.page.browser import browser_path, opened
 from tests.report.page.folder import NASTY, NASTY_NAME, PLACES, make_result
+from v2hdm.io.maps.geojson import write_geojson
+from v2hdm.io.maps.reading import read_geojson
+from v2hdm.records import Reading, Symbol
 from v2hdm.report.page.document import write_page
 
 WINDOWS = [(1280, 800, "light"), (1280, 800, "dark"), (390, 844, "light"), (390, 844, "dark")]
@@ -218,3 +223,28 @@ def test_the_table_is_sorted_searched_and_leads_to_the_map(browser, report):
         assert len(lines) == 5
         assert page.locator("#files a").first.get_attribute("href") == "calibration_front.yaml"
         assert watched.said == []
+
+
+def test_a_word_is_labelled_found_and_searched_by_what_it_says_or_may_say(browser, tmp_path):
+    drive = make_result(tmp_path)
+    path = tmp_path / "result" / "map.geojson"
+    hd_map = read_geojson(path)
+    word = Symbol("text", np.array([[6.0, 2.0], [6.0, 1.0], [7.0, 1.0], [7.0, 2.0]])[::-1], 5, id=70)
+    said = replace(word, reading=Reading("EBH", 0.9, NASTY, 0.07))
+    write_geojson(replace(hd_map, symbols=(*hd_map.symbols, said)), path)
+    with opened(browser, write_page(tmp_path / "result", drive)) as watched:
+        page = watched.page
+        page.fill("#find-id", "ebh")
+        page.press("#find-id", "Enter")
+        assert page.locator("#details h3").inner_text() == "Symbol 70, text \u201cEBH\u201d"
+        assert "EBH, with probability 0.90" in page.locator("#details").inner_text()
+        assert NASTY in page.locator("#details").inner_text()
+        page.wait_for_function("document.querySelectorAll('.leaflet-tooltip.corner').length > 0")
+        assert "EBH" in page.locator(".leaflet-tooltip.corner").all_inner_texts()
+        page.fill("#search", "ebh")
+        assert page.locator("#list tbody th").all_inner_texts() == ["70"]
+        assert "EBH" in page.locator("#list tbody tr").inner_text()
+        page.fill("#find-id", "no such")
+        page.press("#find-id", "Enter")
+        assert page.evaluate("document.getElementById('find-id').validationMessage").startswith("No marking")
+        is_quiet(watched)

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from v2hdm.cli.arguments import add_drive, drive_of, exit_code, result_of, steps_of
+from v2hdm.cli.arguments import add_drive, drive_of, exit_code, log_to_terminal, result_of, steps_of
 from v2hdm.cli.command import Command
 from v2hdm.errors import EXIT_USER_ERROR, DriveError, one_line
 
@@ -42,7 +42,8 @@ def _run(arguments: Sequence[str]) -> int:
     if parsed.write:
         from v2hdm.io.drive.draft import draft_drive
 
-        if missing := draft_drive(parsed.drive, parsed.write, parsed.set):
+        log_to_terminal()
+        if missing := draft_drive(parsed.drive, parsed.write, parsed.set, parsed.camera):
             asked = [f"  {one_line(f'--set {key}=... {why}')}" for key, why in missing.items()]
             problem = one_line(f"error: {parsed.drive}: nothing written; also give:")
             print("\n".join([problem, *asked]), file=sys.stderr)

@@ -70,7 +70,7 @@ def find_blobs(
     contours, piece = _connected(level, (reach_px - output.top) / output.stride + 1)
     groups = _Groups(output.classes, catalogue)
     scores = _class_scores(output, piece, level, len(contours), groups)
-    outlines = _outlines(level, piece, len(contours))
+    outlines = outlines_of(level, piece, len(contours))
     owner = np.zeros_like(piece)
     blobs: list[Blob] = []
     doubtful = _doubtful(level, contours, scores.cells)
@@ -187,7 +187,7 @@ def _class_scores(
     return _Scores(cells, certainty * score, votes / np.maximum(cells, 1)[:, None])
 
 
-def _outlines(level: np.ndarray, piece: np.ndarray, count: int) -> list[FloatArray]:
+def outlines_of(level: np.ndarray, piece: np.ndarray, count: int) -> list[FloatArray]:
     """Points (N, 2), (column, row), of each piece's outline: where the level falls to zero beside it."""
     pieces = piece.ravel()
     levels = level.ravel()
@@ -240,7 +240,7 @@ def _blob(mask: BoolArray, level: np.ndarray, output: NetworkOutput, box: Box) -
     scores = probability.mean(axis=1) * as_probability(level[mask]).mean()
     signed = _signed(mask, level)
     origin_px = _origin_px(output, box[0].start, box[1].start)
-    outline_px = origin_px + output.stride * _outlines(signed, mask.astype(np.int16), 1)[0]
+    outline_px = origin_px + output.stride * outlines_of(signed, mask.astype(np.int16), 1)[0]
     named = dict(zip(output.classes, scores.tolist(), strict=True))
     return Blob(named, signed, origin_px, output.stride, outline_px)
 

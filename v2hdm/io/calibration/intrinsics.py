@@ -336,7 +336,7 @@ def _read_message(document: Document, name: str) -> CameraInfo:
         binning_y=entries.get("binning_y") or 0,
         roi=SimpleNamespace(width=region.get("width", 0), height=region.get("height", 0)),
     )
-    return info_of(fields, name, where)
+    return info_of(fields, name, where).info
 
 
 INTRINSICS: Mapping[str, IntrinsicsFormat] = {

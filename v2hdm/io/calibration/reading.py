@@ -10,11 +10,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from v2hdm.errors import DriveError, MapFileError, shown
+from v2hdm.errors import DriveError, MapFileError, V2hdmError, shown
 from v2hdm.geometry.frames import nodes_of
 from v2hdm.geometry.ipm import cam_from_mounting, extrinsic_from_ipm, ipm_from_extrinsic
 from v2hdm.geometry.planar import winding
@@ -46,12 +46,14 @@ _INFO = ("camera_name", *_SIZE, "camera_matrix", "distortion_model", "distortion
 _OPTIONAL = (
     "vehicle_from_pinhole_px", "translation_sigma_m", "rotation_sigma_deg", "covariance", "clock_offset_s",
     "clock_sigma_s", "read_out_s", "read_out_sigma_s", "drive", "date", "verdict",
-    "vehicle_frame", "vehicle_frame_height_m", "frame", "transforms",
+    "vehicle_frame", "vehicle_frame_height_m", "frame", "transforms", "rectification",
 )  # fmt: skip
 _EDGE = ("frame_id", "child_frame_id")
 _IGNORED = ("rectification_matrix", "projection_matrix")  # of stereo rectification, not of recorded images
 _OF_OPENCV = ("dt", "type_id")  # OpenCV adds these to its matrices; numbers tell their type themselves
-_MODELS = {"": "plumb_bob", "radtan": "plumb_bob", "fisheye": "equidistant"}  # our lenses by other names
+_MODELS = dict.fromkeys(("", "none", "radtan", "brown_conrady"), "plumb_bob")
+_MODELS |= dict.fromkeys(("fisheye", "kannala_brandt", "kannala_brandt4", "kb4"), "equidistant")
+"""Our lenses by the names that drivers, OpenCV and Kalibr have for them."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,12 @@ def _take_frames(content: Mapping[str, Any], where: str) -> CameraFrames:
     steps = tuple(
         _take_step(entry, f"{where}: transforms, {number}") for number, entry in enumerate(entries, start=1)
     )
-    frames = CameraFrames(names.get("vehicle_frame", ""), names.get("frame", ""), height_m, steps)
+    turn = content.get("rectification")
+    rectification = None if turn is None else take_rotation(turn, f"{where}: rectification", MapFileError)
+    frames = CameraFrames(
+        names.get("vehicle_frame", ""), names.get("frame", ""), height_m, steps,
+        rectified_from_camera=rectification,
+    )  # fmt: skip
     if steps and nodes_of(frames)[-1] != frames.camera:
         raise MapFileError(
             f"{where}: transforms do not lead from vehicle_frame to frame; keep them as the run wrote them"
@@ -214,13 +221,38 @@ def take_matrix(content: object, where: str) -> FloatArray:
     return data.reshape(rows, cols)
 
 
-def info_of(fields: Any, name: str, where: str) -> CameraInfo:
-    """The intrinsics of a ``CameraInfo`` message; DriveError if not calibrated, cut, or an unknown model."""
-    intrinsic = np.array(getattr(fields, "k", getattr(fields, "K", None)), dtype=np.float64).reshape(3, 3)
-    distortion = np.array(getattr(fields, "d", getattr(fields, "D", None)), dtype=np.float64).ravel()
-    model = _MODELS.get(fields.distortion_model, fields.distortion_model)
+class Intrinsics(NamedTuple):
+    """The lens of a camera, and the turn (3, 3) of its images from its frame where they were rectified."""
+
+    info: CameraInfo
+    rectified_from_camera: FloatArray | None = None
+
+
+def info_of(fields: Any, name: str, where: str, rectified: bool = False) -> Intrinsics:
+    """The intrinsics of a ``CameraInfo`` message; DriveError if not calibrated, cut, or an unknown model.
+
+    Of images that were ``rectified`` they are those of P, without a distortion, and R is their turn.
+    """
+    intrinsic = _numbers(fields, "k", 3)
+    distortion = _numbers(fields, "d", 1).ravel()
+    stated = fields.distortion_model
+    model = _MODELS.get(stated.strip().lower().replace("-", "_").replace(" ", "_"), stated)
+    if min(fields.width, fields.height) <= 0:
+        raise DriveError(f"{where}: states no size of the image; give camera_info as a file")
     if not intrinsic.any():
         raise DriveError(f"{where}: the camera is not calibrated (K is zero); give camera_info as a file")
+    turn = None
+    if rectified:
+        projection = _numbers(fields, "p", 3)[:, :3]
+        if not projection.any() and distortion.any():
+            raise DriveError(
+                f"{where}: states no P for its rectified images; set rectified: false if they are as the "
+                "lens makes them, or give camera_info as a file"
+            )
+        intrinsic = projection if projection.any() else intrinsic
+        model, distortion = "plumb_bob", np.zeros(0)
+        turn = _numbers(fields, "r", 3)
+        turn = take_rotation(turn.tolist(), f"{where}, R", DriveError) if turn.any() else np.eye(3)
     region = (fields.roi.width, fields.roi.height)
     is_cropped = region not in ((0, 0), (fields.width, fields.height))  # the whole image may be stated, too
     if max(fields.binning_x, fields.binning_y) > 1 or is_cropped:
@@ -231,7 +263,28 @@ def info_of(fields: Any, name: str, where: str) -> CameraInfo:
     # k3 and those after it are zero where they are not given.
     padded = (*distortion[:count].tolist(), *(0.0,) * (count - len(distortion)))
     info = CameraInfo(name, int(fields.width), int(fields.height), intrinsic, model, padded)
-    return check_camera(info, where, DriveError)
+    return Intrinsics(check_camera(info, where, DriveError), turn)
+
+
+def _numbers(fields: Any, key: str, rows: int) -> FloatArray:
+    """A matrix of a ``CameraInfo`` message by its name in ROS 2, or in ROS 1."""
+    values = getattr(fields, key, None)
+    values = getattr(fields, key.upper()) if values is None else values
+    return np.array(values, dtype=np.float64).reshape(rows, -1)
+
+
+def read_rectification(path: Path) -> FloatArray:
+    """The turn (3, 3) of rectified images in a ``camera_info`` file that we wrote of a message."""
+    content = load_yaml(path, DriveError)
+    return take_matrix(content["rectification_matrix"], f"{path}: rectification_matrix")
+
+
+def take_rotation(content: object, where: str, error: type[V2hdmError]) -> FloatArray:
+    """``content`` as a rotation (3, 3); ``error`` where it is none."""
+    rotation = take_array(content, (3, 3), where, error)
+    if not (np.abs(rotation @ rotation.T - np.eye(3)).max() < _ROTATION_TOLERANCE < np.linalg.det(rotation)):
+        raise error(f"{where}: is no rotation (rows of length 1, at right angles); fix it")
+    return np.asarray(rotation)
 
 
 IPM_NAMES = ("calibrated", "estimated")
@@ -342,9 +395,27 @@ def _in_image(info: CameraInfo, rays_cam: FloatArray) -> BoolArray:
     return np.asarray(inside.all(axis=1) & (rays_cam[:, 2] > 0))
 
 
-def roi_of_ipm(info: CameraInfo, ipm: FloatArray) -> FloatArray:
-    """The region of interest (4, 2) of a camera for which none is stated: a rectangle where it looks."""
+def roi_where_it_looks(info: CameraInfo, ipm: FloatArray, where: str) -> FloatArray:
+    """The region of interest (4, 2) of a camera for which none is stated: a rectangle where it looks.
+
+    DriveError where it sees no ground there: then its direction is wrong, which ``where`` states.
+    """
     vehicle_from_cam = inverse(extrinsic_from_ipm(info, ipm))
+    roi_vehicle = _roi_ahead(vehicle_from_cam)
+    try:
+        check_roi_in_view(info, ipm, roi_vehicle, where)
+    except DriveError:
+        up_deg = np.degrees(np.arcsin(np.clip(vehicle_from_cam[2, 2], -1.0, 1.0)))
+        axis = f"{abs(up_deg):.0f} deg {'up' if up_deg > 0 else 'down'}"
+        raise DriveError(
+            f"{where}: its image shows no ground {_ROI_M[0]:g} to {_ROI_M[1]:g} m away, for its axis points "
+            f"{axis}: fix its angles, which are 0 for a level look ahead; of a matrix or a frame, z is the "
+            "way that the camera looks"
+        ) from None
+    return roi_vehicle
+
+
+def _roi_ahead(vehicle_from_cam: FloatArray) -> FloatArray:
     forward = vehicle_from_cam[:2, 2]
     down = vehicle_from_cam[:2, 1]
     # A camera that looks straight down has its image's top ahead.

@@ -48,6 +48,8 @@ def write_calibration(
     content |= _sigmas(calibration)
     if steps := calibration.frames.steps:
         content["transforms"] = [edge_entry(step) for step in steps]
+    if calibration.frames.rectified_from_camera is not None:
+        content["rectification"] = calibration.frames.rectified_from_camera.tolist()
     if clock_s is not None:
         content["clock_offset_s"] = float(clock_s[0])
         if np.isfinite(clock_s[1]):
@@ -103,12 +105,12 @@ def _entries(calibration: Calibration) -> dict[str, Any]:
     }
 
 
-def write_camera_info(info: CameraInfo, path: Path) -> None:
-    """Write ``info`` as ROS' ``camera_info`` with the identity as rectification, atomically."""
-    replace_text(path, dump_yaml(_camera_info(info)))
+def write_camera_info(info: CameraInfo, path: Path, rectification: FloatArray | None = None) -> None:
+    """Write ``info`` as ROS' ``camera_info``, with the ``rectification`` (3, 3) of its images, atomically."""
+    replace_text(path, dump_yaml(_camera_info(info, rectification)))
 
 
-def _camera_info(info: CameraInfo) -> dict[str, Any]:
+def _camera_info(info: CameraInfo, rectification: FloatArray | None = None) -> dict[str, Any]:
     return {
         "image_width": info.width,
         "image_height": info.height,
@@ -116,7 +118,7 @@ def _camera_info(info: CameraInfo) -> dict[str, Any]:
         "camera_matrix": _matrix(info.intrinsic),
         "distortion_model": info.distortion_model,
         "distortion_coefficients": _matrix(np.array([info.distortion])),
-        "rectification_matrix": _matrix(np.eye(3)),
+        "rectification_matrix": _matrix(np.eye(3) if rectification is None else rectification),
         "projection_matrix": _matrix(np.column_stack([info.intrinsic, np.zeros(3)])),
     }
 

@@ -56,7 +56,8 @@ def _read_bag(path: Path, options: ReadOptions) -> Drive:
     from v2hdm.io.importers.bag.describe import describe_bag
 
     path = path.resolve()
-    return read_description(describe_bag(path, Path(options.cache)), path.parent, str(path), options)
+    content = describe_bag(path, Path(options.cache), options.cameras)
+    return read_description(content, path.parent, str(path), options)
 
 
 READERS: Mapping[str, tuple[Callable[[Path], bool], Callable[[Path, ReadOptions], Drive]]] = {

@@ -13,7 +13,8 @@ from v2hdm.io.description import DRIVE_FILE
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.images import ReadOptions
 from v2hdm.io.drive.sources import list_folder
-from v2hdm.io.importers.bag.describe import LENS, MOUNTING, ORIGIN, BagDescription
+from v2hdm.io.importers.bag.describe import BagDescription, log_notes
+from v2hdm.io.importers.bag.entries import LENS, MOUNTING, ORIGIN
 from v2hdm.io.importers.bag.reading import is_bag
 from v2hdm.io.stamps import ZONES, times_of_names
 from v2hdm.safe.fields import take_frame
@@ -29,11 +30,14 @@ _RAW_SUFFIXES = (".h264", ".264", ".avc", ".h265", ".265", ".hevc", ".mjpeg", ".
 """Suffixes of streams of frames without times."""
 
 
-def draft_drive(source: Path, folder: Path, settings: Sequence[str]) -> dict[str, str]:
+def draft_drive(
+    source: Path, folder: Path, settings: Sequence[str], cameras: Sequence[str] = ()
+) -> dict[str, str]:
     """Write the ``drive.yaml`` of a bag, a video or a folder of images, or say what is missing.
 
     ``settings`` are ``KEY=VALUE`` with dotted keys and values in YAML, in which names of files count from the
-    working directory. What is missing is returned by its key, with what to give; nothing is written into
+    working directory; null takes a key, or a camera, out. ``cameras`` are those wanted of a bag, all where
+    none is named. What is missing is returned by its key, with what to give; nothing is written into
     ``folder`` then, nor where the drive cannot be read. Raises DriveError for a source of no kind, a setting
     that is none, a ``drive.yaml`` that exists.
     """
@@ -41,7 +45,7 @@ def draft_drive(source: Path, folder: Path, settings: Sequence[str]) -> dict[str
     if os.path.lexists(where):  # a link to a file that is gone is the user's, too
         raise DriveError(f"{where}: exists; edit it, or choose another folder for --write")
     values = _values_of(settings)
-    draft = _draft_of(source, folder, values.get("vehicle_frame"))
+    draft = _draft_of(source, folder, values, cameras)
     content = draft.content
     missing = draft.missing
     _refuse_unused(content, settings)
@@ -84,12 +88,16 @@ class _Draft(NamedTuple):
     missing: dict[str, str]  # dotted keys, with what to give for each
 
 
-def _draft_of(source: Path, folder: Path, vehicle_frame: object) -> _Draft:
-    """The draft of a ``drive.yaml`` in ``folder`` for a recording; its user may name the vehicle's frame."""
+def _draft_of(source: Path, folder: Path, values: Mapping[str, object], cameras: Sequence[str]) -> _Draft:
+    """The draft of a ``drive.yaml`` in ``folder`` for a recording, of which its user states ``values``."""
     if is_bag(source):
-        if vehicle_frame is not None:
-            vehicle_frame = take_frame(vehicle_frame, "--set vehicle_frame", DriveError)
-        bag = BagDescription(source, Path(ReadOptions().cache), vehicle_frame=vehicle_frame)
+        given: dict[str, Any] = {}
+        for key, value in values.items():
+            if key.endswith("frame") and value is not None:
+                take_frame(value, f"--set {key}", DriveError)
+            _put(given, key.split("."), value, keep_null=True)
+        bag = BagDescription(source, Path(ReadOptions().cache), given, cameras)
+        log_notes(source, bag.notes)
         about = {"name": folder.resolve().name, "bag": _relative(source, folder)}
         return _Draft(bag.content | about, bag.missing)
     if not source.exists():
@@ -152,12 +160,16 @@ def _camera_of(source: Path) -> str:
     return "camera" if not name or name.lower() in ALL_CAMERAS else name
 
 
-def _put(content: dict[str, Any], keys: Sequence[str], value: object) -> None:
+def _put(content: dict[str, Any], keys: Sequence[str], value: object, *, keep_null: bool = False) -> None:
+    """Put ``value`` under dotted ``keys`` of ``content``; None takes what is there out, unless it is kept."""
     for key in keys[:-1]:
         if not isinstance(content.get(key), dict):
             content[key] = {}
         content = content[key]
-    content[keys[-1]] = value
+    if value is None and not keep_null:
+        content.pop(keys[-1], None)
+    else:
+        content[keys[-1]] = value
 
 
 def _beside(value: object, folder: Path) -> object:

@@ -12,6 +12,7 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.geometry.frames import frame_from_vehicle
+from v2hdm.geometry.rigid import make_transform
 from v2hdm.io.calibration import reading
 from v2hdm.io.description import DRIVE_FILE, POSES_FILE, CameraEntry, DriveDescription, keys_in, name_of
 from v2hdm.io.drive.frames import plan_frames
@@ -62,7 +63,7 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
         place = f"{where}: camera '{name}'"
         entry = take_mapping(entries[name], place, DriveError)
         check_keys(entry, camera_keys.required, camera_keys.optional, place, DriveError)
-        info = plan_info(entry["camera_info"], name, sources, f"{place}, camera_info")
+        info = plan_info(entry["camera_info"], name, entry["images"], sources, f"{place}, camera_info")
         planned[name] = (entry, info, plan_images(entry["images"], name, sources, f"{place}, images"))
     poses_at = f"{where}: poses"
     poses = content.get("poses", POSES_FILE)
@@ -78,11 +79,13 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
     frames = read_frames()
     for name, (entry, read_info, list_images) in planned.items():
         # Many tools call every camera they calibrate alike: the drive's own name for it holds.
-        named = replace(read_info(), name=name)
+        intrinsics = read_info()
+        named = replace(intrinsics.info, name=name)
         listed = list_images()
         place = f"{where}: camera '{name}'"
         read_out_s = _take_read_out(entry, listed.stamp_s, f"{place}, read_out_s")
-        camera = _read_camera(entry, named, path, place, frames[name])
+        turned = replace(frames[name], rectified_from_camera=intrinsics.rectified_from_camera)
+        camera = _read_camera(entry, named, path, place, turned)
         cameras[name] = replace(camera, read_out_s=read_out_s)
         files.append(listed)
     near_s = _middle_of(files)
@@ -126,6 +129,8 @@ def _read_camera(
         guess = entry[guesses[0]]
         take = reading.take_mounting if key == "mounting" else reading.take_rigid
         guess = take(guess, f"{where}, {key}") @ frame_from_ground
+        if frames.rectified_from_camera is not None:
+            guess = make_transform(frames.rectified_from_camera, np.zeros(3)) @ guess
         ipm = {"estimated": reading.ipm_from_guess(info, guess, f"{where}, {key}", frames.vehicle)}
     linear = entry.get("linear_response", False)
     if not isinstance(linear, bool):
@@ -137,9 +142,9 @@ def _read_camera(
     initial_ipm = reading.choose_initial(entry.get("initial_ipm"), ipm, where)
     if "roi_vehicle" in entry:
         roi_vehicle = reading.take_roi(entry["roi_vehicle"], f"{where}, roi_vehicle")
+        reading.check_roi_in_view(info, ipm[initial_ipm], roi_vehicle, f"{where}, roi_vehicle")
     else:
-        roi_vehicle = reading.roi_of_ipm(info, ipm[initial_ipm])
-    reading.check_roi_in_view(info, ipm[initial_ipm], roi_vehicle, f"{where}, roi_vehicle")
+        roi_vehicle = reading.roi_where_it_looks(info, ipm[initial_ipm], f"{where}, {guesses[0]}")
     return Camera(
         info=info,
         ipm=ipm,

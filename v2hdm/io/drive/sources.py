@@ -12,8 +12,8 @@ import numpy as np
 
 from v2hdm.errors import DriveError, need, shown
 from v2hdm.io.calibration.intrinsics import read_intrinsics
-from v2hdm.io.calibration.reading import read_camera_info
-from v2hdm.io.description import FolderImages, InfoFile, TopicImages, VideoImages, keys_in
+from v2hdm.io.calibration.reading import Intrinsics, read_camera_info, read_rectification
+from v2hdm.io.description import FolderImages, InfoFile, InfoTopic, TopicImages, VideoImages, keys_in
 from v2hdm.io.drive.images import ImageFiles
 from v2hdm.io.image_lists import image_order, read_image_list, read_stamps
 from v2hdm.io.importers.bag import streams
@@ -33,6 +33,7 @@ _TAIL_S = 1.0  # sound may go on after the last frame
 _WITHOUT_TIMES = frozenset({"h264", "hevc", "m4v", "mpegvideo", "mjpeg", "obu"})
 """FFmpeg's names of formats that are frames alone: it invents times for some of them."""
 _UNTIMED = "untimed.txt"  # why the frames of an import have no times of their own
+_RECTIFIED = "image_rect"  # begins the names of such topics (image_proc, stereo_image_proc)
 _PREVIEW = "attached_pic"  # a picture of the video's cover, not the video
 
 _Lister = Callable[[], ImageFiles]
@@ -84,11 +85,17 @@ def plan_images(content: object, camera: str, sources: Sources, where: str) -> _
     return plan(entry, camera, sources, where)
 
 
-def plan_info(content: object, camera: str, sources: Sources, where: str) -> Callable[[], CameraInfo]:
-    """The function that reads the intrinsics of a camera's ``camera_info``, a file or a topic."""
+def plan_info(
+    content: object, camera: str, images: object, sources: Sources, where: str
+) -> Callable[[], Intrinsics]:
+    """The function that reads the intrinsics in a camera's ``camera_info``, a file or a topic.
+
+    Its ``images`` are rectified if it says so, else if a word of their topic begins ``image_rect``, as ROS
+    names them.
+    """
     if not isinstance(content, dict):
         path = sources.root / take_text(content, where, DriveError)
-        return lambda: _read_info(path, None)
+        return lambda: Intrinsics(_read_info(path, None))
     if "file" in content:
         info_keys = keys_in(InfoFile)
         check_keys(content, info_keys.required, info_keys.optional, where, DriveError)
@@ -96,11 +103,25 @@ def plan_info(content: object, camera: str, sources: Sources, where: str) -> Cal
         chosen = content.get("camera")
         if chosen is not None and not isinstance(chosen, int):  # COLMAP numbers its cameras
             chosen = take_text(chosen, f"{where}, camera", DriveError)
-        return lambda: _read_info(named, None if chosen is None else str(chosen))
-    check_keys(content, ("topic",), (), where, DriveError)
+        return lambda: Intrinsics(_read_info(named, None if chosen is None else str(chosen)))
+    info_keys = keys_in(InfoTopic)
+    check_keys(content, info_keys.required, info_keys.optional, where, DriveError)
     topic = take_text(content["topic"], f"{where}, topic", DriveError)
-    folder = sources.want(streams.InfoStream(topic, where))
-    return lambda: replace(read_camera_info(folder() / streams.INFO_FILE), name=camera)
+    rectified = content.get("rectified")
+    if rectified is None:
+        words = str(images.get("topic", "")).split("/") if isinstance(images, dict) else []
+        rectified = any(word.startswith(_RECTIFIED) for word in words)
+    if not isinstance(rectified, bool):
+        raise DriveError(f"{where}, rectified: expected true or false, got {shown(rectified)}")
+    folder = sources.want(streams.InfoStream(topic, where, rectified=rectified))
+
+    def intrinsics() -> Intrinsics:
+        path = folder() / streams.INFO_FILE
+        return Intrinsics(
+            replace(read_camera_info(path), name=camera), read_rectification(path) if rectified else None
+        )
+
+    return intrinsics
 
 
 def _read_info(path: Path, camera: str | None) -> CameraInfo:

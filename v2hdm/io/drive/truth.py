@@ -18,6 +18,9 @@ from v2hdm.store.names import MAP
 
 SIGHTINGS = ("camera", "timestamp", "marking", "visible_fraction")
 LANE_VISIBLE = ("lane", "vertex")
+TEXTS = ("symbol", "text")
+TEXTS_FILE = "texts.csv"
+"""What symbols of the true map say, by their number among its symbols; left out where none says anything."""
 
 
 def read_truth(drive: Drive) -> Truth:
@@ -30,13 +33,17 @@ def read_truth(drive: Drive) -> Truth:
     hd_map = read_geojson(folder / MAP)
     noted = folder / "disturbances.yaml"
     named = load_yaml(noted, DriveError)
+    markings = len(hd_map.markings)
+    visibility = _read_sightings(folder / "sightings.csv", drive.images, markings + len(hd_map.symbols))
     return Truth(
         map=hd_map,
         cam_from_vehicle=_read_cameras(folder / "cameras.yaml", drive),
         map_from_vehicle=_read_poses(folder / "poses.tum", drive.images),
-        visibility=_read_sightings(folder / "sightings.csv", drive.images, len(hd_map.markings)),
+        visibility=visibility[:, :markings],
         lane_visible=_read_lane_visible(folder / "lane_visible.csv", hd_map),
         disturbances={key: take_number(value, f"{noted}: {key}", DriveError) for key, value in named.items()},
+        symbol_visibility=visibility[:, markings:],
+        texts=_read_texts(folder / TEXTS_FILE, len(hd_map.symbols)),
     )
 
 
@@ -81,7 +88,15 @@ def _joined_truth(drive: Drive) -> Truth:
         visibility=np.concatenate([part.visibility for part in parts])[order],
         lane_visible=tuple(np.logical_or.reduce(flags) for flags in lanes),
         disturbances=disturbances,
+        symbol_visibility=np.concatenate([_of_symbols(part) for part in parts])[order],
+        texts=parts[0].texts,
     )
+
+
+def _of_symbols(truth: Truth) -> FloatArray:
+    """What the images show of the symbols (I, S)."""
+    known = truth.symbol_visibility
+    return np.zeros((len(truth.visibility), len(truth.map.symbols))) if known is None else known
 
 
 def _microseconds(stamp_s: float) -> int:
@@ -112,7 +127,7 @@ def _read_poses(path: Path, images: Sequence[Image]) -> FloatArray:
 
 
 def _read_sightings(path: Path, images: Sequence[Image], markings: int) -> FloatArray:
-    """Fractions (I, J) without the sightings of images that were dropped or not selected."""
+    """Fractions (I, J) of markings, then symbols, without the sightings of images that were left out."""
     row_of = {(image.camera, _microseconds(image.stamp_s)): i for i, image in enumerate(images)}
     visibility = np.zeros((len(images), markings))
     for where, (camera, stamp, marking, fraction) in _rows(path, SIGHTINGS):
@@ -127,6 +142,16 @@ def _read_sightings(path: Path, images: Sequence[Image], markings: int) -> Float
         if key in row_of:
             visibility[row_of[key], j] = value
     return visibility
+
+
+def _read_texts(path: Path, symbols: int) -> Mapping[int, str]:
+    """What the symbols of a map say, by their number."""
+    texts: dict[int, str] = {}
+    for where, (symbol, text) in _rows(path, TEXTS) if path.is_file() else ():
+        if not symbol.isdecimal() or int(symbol) >= symbols or not text:
+            raise DriveError(f"{where}: no text of a symbol below {symbols}; fix that line")
+        texts[int(symbol)] = text
+    return texts
 
 
 def _read_lane_visible(path: Path, hd_map: HDMap) -> tuple[BoolArray, ...]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from v2hdm.io.calibration.writing import write_camera_info
 from v2hdm.io.description import DRIVE_FILE, POSES_FILE
-from v2hdm.io.drive.truth import LANE_VISIBLE, SIGHTINGS
+from v2hdm.io.drive.truth import LANE_VISIBLE, SIGHTINGS, TEXTS, TEXTS_FILE
 from v2hdm.io.image_lists import write_image_list
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.trajectory import write_tum
@@ -69,13 +69,19 @@ def write_truth(folder: Path, truth: Truth, images: Sequence[Image]) -> None:
     replace_text(folder / "cameras.yaml", dump_yaml(cameras))
     stamp_s, first = np.unique([image.stamp_s for image in images], return_index=True)
     write_tum(Trajectory(stamp_s, truth.map_from_vehicle[first]), folder / "poses.tum")
+    visibility = truth.visibility
+    if truth.symbol_visibility is not None:
+        visibility = np.hstack([visibility, truth.symbol_visibility])
     sightings = (
-        f"{images[i].camera},{images[i].stamp_s:.9f},{j},{truth.visibility[i, j]:.4f}"
-        for i, j in np.argwhere(truth.visibility > 0)
+        f"{images[i].camera},{images[i].stamp_s:.9f},{j},{visibility[i, j]:.4f}"
+        for i, j in np.argwhere(visibility > 0)
     )
     replace_text(folder / "sightings.csv", "\n".join([",".join(SIGHTINGS), *sightings]) + "\n")
     lanes = enumerate(map(np.flatnonzero, truth.lane_visible))
     visible = (f"{lane},{vertex}" for lane, vertices in lanes for vertex in vertices)
     replace_text(folder / "lane_visible.csv", "\n".join([",".join(LANE_VISIBLE), *visible]) + "\n")
+    if truth.texts:
+        texts = [f"{symbol},{text}" for symbol, text in truth.texts.items()]
+        replace_text(folder / TEXTS_FILE, "\n".join([",".join(TEXTS), *texts]) + "\n")
     disturbances = {key: float(value) for key, value in truth.disturbances.items()}
     replace_text(folder / "disturbances.yaml", dump_yaml(disturbances))

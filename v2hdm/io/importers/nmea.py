@@ -1,8 +1,8 @@
 """Receivers' logs of NMEA 0183 sentences: positions, headings and their sigmas on one clock.
 
 GGA, GNS, GGK or KSXT give positions, GST their standard deviations, RMC, ZDA and others the date, HDT, THS,
-HDG, PASHR, AVR, VHD or KSXT headings. A course over ground is no heading. HDT, THS and HDG have no time:
-:mod:`v2hdm.io.importers.epochs` finds it from the sentences around them.
+HDG, PASHR, PSAT, AVR, VHD or KSXT headings. A course over ground is no heading. HDT, THS and HDG have no
+time: :mod:`v2hdm.io.importers.epochs` finds it from the sentences around them.
 """
 
 from __future__ import annotations
@@ -210,7 +210,7 @@ class _Log:
         self._takers: Mapping[str, Callable[[_Sentence], None]] = {
             "GGA": self._gga, "GNS": self._gns, "RMC": self._rmc, "ZDA": self._zda, "GST": self._gst,
             "HDT": self._hdt, "THS": self._ths, "HDG": self._hdg, "PASHR": self._pashr, "KSXT": self._ksxt,
-            "PTNL": self._ptnl,
+            "PTNL": self._ptnl, "PSAT": self._psat,
         }  # fmt: skip
 
     def take(self, sentence: _Sentence) -> None:
@@ -296,6 +296,14 @@ class _Log:
         pitch = _angle(fields[5] or "0")
         attitude = _Attitude(_angle(fields[2]), roll, pitch, parse_sigma(fields[9]), tilt_sigma)
         self._timed[sentence.address][stamp] = attitude
+
+    def _psat(self, sentence: _Sentence) -> None:
+        if sentence.fields[1] != "HPR":
+            return
+        time, heading, pitch, roll = sentence.fields[2:6]
+        stamp = self._time(time, sentence)
+        if heading:  # Hemisphere's manual counts roll and pitch as PASHR does
+            self._timed["PSAT,HPR"][stamp] = _tilted(heading, roll, pitch)
 
     def _ksxt(self, sentence: _Sentence) -> None:
         fields = sentence.fields

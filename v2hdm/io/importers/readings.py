@@ -6,6 +6,7 @@ translates these names.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -17,9 +18,11 @@ import numpy as np
 from v2hdm.errors import DriveError, shown
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.io.rows import read_rows
-from v2hdm.io.trajectory import UNITS, checked_rotations, in_order, parse_number
+from v2hdm.io.trajectory import NO_NUMBER, UNITS, checked_rotations, in_order, parse_number
 from v2hdm.records import BoolArray, FloatArray, Trajectory
 from v2hdm.store.files import check_keys, take_mapping, take_text
+
+_log = logging.getLogger(__name__)
 
 SIGMA_OF_QUALITY_M: Mapping[int, float] = {
     0: np.inf,  # no fix
@@ -106,6 +109,13 @@ def read_table(
     texts = {ours: take_text(name, f"{where}, columns, {ours}", DriveError) for ours, name in names.items()}
     columns = _columns(path, texts)
     stamp_s = _stamps(columns, path)
+    if not (is_timed := np.isfinite(stamp_s)).any():
+        raise DriveError(f"{path}: no line has a time; record it again, or give another column")
+    if not is_timed.all():
+        lost = int((~is_timed).sum())
+        _log.warning("%s: left out %d of %d lines without a time", path, lost, len(stamp_s))
+        columns = {name: values[is_timed] for name, values in columns.items()}
+        stamp_s = stamp_s[is_timed]
     rows = in_order(stamp_s, str(path), "pose")
     columns = {name: values[rows] for name, values in columns.items()}
     geodetic = _GEODETIC[0] in columns
@@ -152,6 +162,8 @@ def _columns(path: Path, names: Mapping[str, str]) -> dict[str, FloatArray]:
 
 
 def _parse(name: str, cell: str, where: str) -> float:
+    if name not in _SURENESS and cell.lower().lstrip("+-") in NO_NUMBER:
+        return np.nan
     try:
         if name == "utc":
             moment = datetime.fromisoformat(cell)

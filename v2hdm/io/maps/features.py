@@ -10,7 +10,18 @@ import numpy as np
 
 from v2hdm.geometry.geodetic import Grid, geodetic_from_enu
 from v2hdm.geometry.planar import signed_area
-from v2hdm.records import FloatArray, GeodeticOrigin, HDMap, IntArray, Lane, Marking, PaintLeft, Road, Symbol
+from v2hdm.records import (
+    FloatArray,
+    GeodeticOrigin,
+    HDMap,
+    IntArray,
+    Lane,
+    Marking,
+    PaintLeft,
+    Reading,
+    Road,
+    Symbol,
+)
 
 CORNERS = "corners_map"
 POINTS = "points_map"
@@ -26,6 +37,8 @@ _PaintT = TypeVar("_PaintT", Marking, Lane, Symbol)
 PAINT = ("paint_left", "paint_left_sigma", "paint_left_change", "paint_left_change_sigma")
 """Properties of the paint that a marking has left: its share, the change since an earlier map, and sigmas."""
 
+TEXT_READ = ("text", "text_confidence", "text_alternative", "text_alternative_confidence")
+"""Properties of a text that was read: what it says, what else it may say, and their probabilities."""
 COMPOSITION = ("kind", "parts", "lines", "apart_m")
 """Properties of a marking's variety, a symbol's parts, and a double line's lines and their distance."""
 
@@ -52,6 +65,7 @@ class Feature:
     place_sigma_m: float | None = None  # of a symbol
     vertex_sigma_m: FloatArray | None = None  # (N,) of a lane, across it
     paint: PaintLeft | None = None
+    reading: Reading | None = None
     variety: str | None = None  # of a marking
     parts: tuple[int, ...] = ()  # of a symbol
     lines: tuple[str, str] | None = None  # of a double line
@@ -122,7 +136,8 @@ def _feature_of(paint: _Paint, number: int) -> Feature:
         return replace(feature, vertex_sigma_m=paint.sigma_m, lines=paint.lines, apart_m=paint.apart_m)
     feature = replace(feature, covariance_m2=paint.covariance_m2, accuracy=paint.accuracy)
     if isinstance(paint, Symbol):
-        return replace(feature, symbol=True, place_sigma_m=paint.sigma_m, parts=paint.parts)
+        feature = replace(feature, symbol=True, place_sigma_m=paint.sigma_m)
+        return replace(feature, parts=paint.parts, reading=paint.reading)
     return replace(feature, relative_sigma_m=paint.relative_sigma_m, paint=paint.paint, variety=paint.variety)
 
 
@@ -150,6 +165,7 @@ def map_of(features: Sequence[Feature], ids: Sequence[int], origin: GeodeticOrig
                 heights_sigma_m=feature.heights_sigma_m,
                 covariance_m2=feature.covariance_m2,
                 accuracy=feature.accuracy,
+                reading=feature.reading,
                 parts=feature.parts,
             )
             symbols.append(symbol)
@@ -215,6 +231,7 @@ def properties_of(feature: Feature) -> dict[str, Any]:
         "lines": feature.lines and list(feature.lines),
         "apart_m": feature.apart_m,
         **({} if feature.paint is None else dict(zip(PAINT, astuple(feature.paint), strict=True))),
+        **dict(zip(TEXT_READ, feature.reading or (), strict=False)),
     }
     return {
         key: value.tolist() if isinstance(value, np.ndarray) else value

@@ -2,7 +2,8 @@
 
 In DXF, extended data (XDATA) of the application ``V2HDM`` at each polyline hold what CAD has no word for:
 strings name the values after them, ``id``, ``sightings``, ``relative_sigma_m``, ``accuracy``, ``kind``,
-``parts``, ``lines``, ``apart_m``, ``heights_sigma_m`` and the rows of ``covariance_m2``.
+``parts``, ``lines``, ``apart_m``, ``heights_sigma_m``, the rows of ``covariance_m2``, and what a text
+says, which is also a TEXT there.
 """
 
 from __future__ import annotations
@@ -18,13 +19,21 @@ import numpy as np
 
 from v2hdm.errors import ConfigError, V2hdmError, need, shown
 from v2hdm.geometry.geodetic import Grid
-from v2hdm.io.maps.features import COMPOSITION, PAINT, Feature, features_of, in_words, properties_of
+from v2hdm.io.maps.features import (
+    COMPOSITION,
+    PAINT,
+    TEXT_READ,
+    Feature,
+    features_of,
+    in_words,
+    properties_of,
+)
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.maps.geopackage import write_geopackage, write_qgis
 from v2hdm.io.maps.lanelet2 import write_lanelet2
 from v2hdm.io.maps.reading import Verdict, read_geopackage, stated_in
 from v2hdm.io.maps.road_xml import write_landxml, write_opendrive
-from v2hdm.records import GeodeticOrigin, HDMap
+from v2hdm.records import FloatArray, GeodeticOrigin, HDMap
 from v2hdm.store.files import replace_csv, whole_file
 from v2hdm.store.inputs import protected_inputs
 from v2hdm.surface.strips import write_ground_geotiff, write_opencrg
@@ -65,7 +74,7 @@ def write_dxf(hd_map: HDMap, path: Path, grid: Grid | None = None) -> None:
             data += [(_TEXT, "relative_sigma_m"), (_REAL, feature.relative_sigma_m)]
         if feature.accuracy is not None:
             data += [(_TEXT, "accuracy"), (_TEXT, feature.accuracy)]
-        for key in COMPOSITION:
+        for key in (*COMPOSITION, *TEXT_READ):
             if (stated := properties_of(feature).get(key)) is not None:
                 data += [(_TEXT, key), (_TEXT, in_words(stated))]
         if feature.heights_sigma_m is not None:
@@ -73,9 +82,20 @@ def write_dxf(hd_map: HDMap, path: Path, grid: Grid | None = None) -> None:
             data += [(_TEXT, "heights_sigma_m"), *((_REAL, value) for value in sigmas_m)]
         if (covariance := feature.ring_covariance_m2) is not None:
             data += [(_TEXT, "covariance_m2"), *((_REAL, value) for value in covariance.ravel().tolist())]
+        if feature.reading is not None:
+            _add_text(space, feature.reading.text, np.array(points), layer)
         line.set_xdata(APPLICATION, data)
     with whole_file(path) as partial:
         document.saveas(partial)
+
+
+def _add_text(space: Any, text: str, corners: FloatArray, layer: str) -> None:
+    """Write a text between the lower left and the upper right of its outline (N, 3), which begin there."""
+    along = (corners[1] - corners[0])[:2]
+    height_m = float(np.linalg.norm(corners[-1] - corners[0]))
+    turned_deg = float(np.rad2deg(np.arctan2(along[1], along[0])))
+    about = {"layer": layer, "rotation": turned_deg, "insert": corners[0].tolist()}
+    space.add_text(text, height=height_m, dxfattribs=about)
 
 
 COLUMNS: tuple[str, ...] = (
@@ -85,6 +105,7 @@ COLUMNS: tuple[str, ...] = (
     *(f"cov_{axis}_{other}{k}_m2" for axis in "xy" for k in range(1, 5) for other in "xy"),
     *PAINT,
     *COMPOSITION,
+    *TEXT_READ,
 )
 """``point`` counts from 1 along the feature. ``cov_x_y3_m2`` is the covariance of this point's x with the y
 of point 3 of the same feature, of four points. Empty where it is not known."""
@@ -114,8 +135,9 @@ def _rows(feature: Feature, origin: GeodeticOrigin | Grid | None) -> list[list[A
         geodetic = positions.tolist()
     relative = "" if feature.relative_sigma_m is None else feature.relative_sigma_m
     properties = properties_of(feature)
-    paint = [properties.get(name, "") for name in PAINT]
-    paint += [in_words(properties.get(name, "")) for name in COMPOSITION]
+    more = [properties.get(name, "") for name in PAINT]
+    more += [in_words(properties.get(name, "")) for name in COMPOSITION]
+    more += [properties.get(name, "") for name in TEXT_READ]
     rows = []
     for k, (x, y) in enumerate(feature.points_map.tolist()):
         z = "" if feature.heights_m is None else float(feature.heights_m[k])
@@ -127,7 +149,7 @@ def _rows(feature: Feature, origin: GeodeticOrigin | Grid | None) -> list[list[A
             sigmas = np.sqrt(np.diag(rows_m2[:, 2 * k : 2 * k + 2])).tolist()
             covariances = rows_m2.ravel().tolist() if count == 4 else covariances
         row = [feature.id, feature.kind, k + 1, x, y, z, *geodetic[k], *sigmas, sigma_z]
-        rows.append([*row, feature.sightings, relative, feature.accuracy or "", *covariances, *paint])
+        rows.append([*row, feature.sightings, relative, feature.accuracy or "", *covariances, *more])
     return rows
 
 

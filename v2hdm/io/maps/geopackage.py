@@ -26,7 +26,16 @@ from numpy.typing import NDArray
 
 from v2hdm.errors import ConfigError, MapFileError, need
 from v2hdm.geometry.geodetic import Grid, crs_of
-from v2hdm.io.maps.features import CORNERS, OUTLINE, PAINT, POINTS, Feature, features_of, properties_of
+from v2hdm.io.maps.features import (
+    CORNERS,
+    OUTLINE,
+    PAINT,
+    POINTS,
+    TEXT_READ,
+    Feature,
+    features_of,
+    properties_of,
+)
 from v2hdm.io.maps.reading import EXACT, GEOMETRY, LAYERS
 from v2hdm.records import (
     BICYCLE,
@@ -173,6 +182,8 @@ def _columns(key: str, features: Sequence[Feature]) -> dict[str, Any]:
         "relative_sigma_m": numbers("relative_sigma_m"),
         **({} if key == POINTS else {"accuracy": [row.get("accuracy") for row in rows]}),
         **{name: numbers(name) for name in PAINT if key == CORNERS},
+        **{name: [row.get(name) for row in rows] for name in TEXT_READ[::2] if key == OUTLINE},
+        **{name: numbers(name) for name in TEXT_READ[1::2] if key == OUTLINE},
         **({"kind": [row.get("kind") for row in rows]} if key == CORNERS else {}),
         **({"lines": texts("lines"), "apart_m": numbers("apart_m")} if key == POINTS else {}),
         **({"parts": texts("parts")} if key == OUTLINE else {}),

@@ -25,7 +25,7 @@ import numpy as np
 from v2hdm.errors import ConfigError, MapFileError, need, shown
 from v2hdm.geometry.geodetic import geodetic_from_enu, position_of
 from v2hdm.io.maps.closed_lanes import Bound, closed_lanes, connections
-from v2hdm.io.maps.features import COMPOSITION, Feature, features_of, in_words, properties_of
+from v2hdm.io.maps.features import COMPOSITION, TEXT_READ, Feature, features_of, in_words, properties_of
 from v2hdm.records import CROSSWALK, LANE_DASH, STOP_LINE, FloatArray, GeodeticOrigin, HDMap
 from v2hdm.store.files import dump_yaml, replace_text, xml_text
 
@@ -329,6 +329,7 @@ def _more_tags(feature: Feature) -> dict[str, str]:
         tags["accuracy"] = feature.accuracy
     properties = properties_of(feature)
     tags |= {key: in_words(properties[key]) for key in COMPOSITION if key in properties}
+    tags |= {key: str(properties[key]) for key in TEXT_READ if key in properties}
     if feature.heights_sigma_m is not None:
         tags["heights_sigma_m"] = json.dumps(feature.heights_sigma_m[feature.ring].tolist())
     if (covariance := feature.ring_covariance_m2) is not None:

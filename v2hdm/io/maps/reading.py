@@ -27,11 +27,12 @@ from v2hdm.io.maps.features import (
     OUTLINE,
     PAINT,
     POINTS,
+    TEXT_READ,
     Feature,
     map_of,
     unique_ids,
 )
-from v2hdm.records import ACCURACIES, BoolArray, FloatArray, GeodeticOrigin, HDMap, PaintLeft
+from v2hdm.records import ACCURACIES, BoolArray, FloatArray, GeodeticOrigin, HDMap, PaintLeft, Reading
 from v2hdm.safe.databases import opened, rows_of
 from v2hdm.safe.fields import take_covariance, take_origin, take_whole
 from v2hdm.safe.texts import parse_json, shown, take_name
@@ -346,6 +347,7 @@ def _stored(properties: Mapping[str, Any], closed: bool, where: str) -> Feature:
         return value
 
     share, sigma, change, change_sigma = (optional(name, take_number) for name in PAINT)
+    read = [optional(name, take) for name, take in zip(TEXT_READ, 2 * (take_text, _take_share), strict=True)]
     return Feature(
         id=optional("id", take_whole, -_LARGEST_ID, _LARGEST_ID) or 0,
         kind=take_name(properties.get("class"), f"{where}, class", MapFileError),
@@ -363,8 +365,16 @@ def _stored(properties: Mapping[str, Any], closed: bool, where: str) -> Feature:
         if closed or not len(points)
         else optional("vertex_sigma_m", take_array, (len(points),)),
         paint=None if share is None or sigma is None else PaintLeft(share, sigma, change, change_sigma),
+        reading=None if not symbol or None in read[:2] else Reading(*read),
         **_composition(properties, where),
     )
+
+
+def _take_share(value: object, where: str, error: type[V2hdmError]) -> float:
+    share = take_number(value, where, error)
+    if not 0.0 <= share <= 1.0:
+        raise error(f"{where} is {shown(value)}; give a probability from 0 to 1, or leave it out")
+    return share
 
 
 def _take_accuracy(value: object, where: str, error: type[V2hdmError]) -> str:

@@ -27,7 +27,7 @@ from v2hdm import __version__
 from v2hdm.geometry.geodetic import LOCAL, Grid, crs_of
 from v2hdm.geometry.planar import length_along
 from v2hdm.io.maps.closed_lanes import Bound, closed_lanes
-from v2hdm.io.maps.features import COMPOSITION, Feature, features_of, in_words, properties_of
+from v2hdm.io.maps.features import COMPOSITION, TEXT_READ, Feature, features_of, in_words, properties_of
 from v2hdm.records import CROSSWALK, LANE_DASH, FloatArray, HDMap
 from v2hdm.store.files import replace_text, xml_text
 
@@ -192,8 +192,9 @@ def _write_object(objects: ET.Element, feature: Feature, road: _Road, nearest: _
     length_m, width_m = np.ptp(local, axis=0)
     place = {"s": _text(s_m), "t": _text(t_m), "zOffset": "0", "hdg": "0"}
     size = {"length": _text(length_m), "width": _text(width_m), "height": "0", "orientation": "none"}
+    name = feature.kind if feature.reading is None else feature.reading.text
     kind = "crosswalk" if feature.kind == CROSSWALK else "roadMark"
-    about = {"id": str(feature.id), "name": feature.kind, "type": kind}
+    about = {"id": str(feature.id), "name": name, "type": kind}
     element = ET.SubElement(objects, "object", about | place | size)
     outline = ET.SubElement(ET.SubElement(element, "outlines"), "outline", {"id": "0", "closed": "true"})
     for k, ((u, v), z) in enumerate(zip(local.tolist(), (corners[:, 2] - height_m).tolist(), strict=True)):
@@ -201,7 +202,8 @@ def _write_object(objects: ET.Element, feature: Feature, road: _Road, nearest: _
         ET.SubElement(outline, "cornerLocal", corner)
     if feature.accuracy is not None:
         ET.SubElement(element, "userData", {"code": "accuracy", "value": feature.accuracy})
-    for key in COMPOSITION:
+    keys = COMPOSITION if feature.reading is None else (*COMPOSITION, "class", *TEXT_READ)
+    for key in keys:
         if (value := properties_of(feature).get(key)) is not None:
             ET.SubElement(element, "userData", {"code": key, "value": in_words(value)})
 

@@ -10,9 +10,10 @@ from typing import Any
 import cv2
 import numpy as np
 
+from v2hdm.catalogue import AREA, SHIPPED
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.geodetic import Grid, crs_of, geodetic_from_enu, utm_of
-from v2hdm.records import SIGMAS_95, FloatArray, Lane, Marking, Symbol
+from v2hdm.records import CROSSWALK, SIGMAS_95, FloatArray, Lane, Marking, Symbol
 from v2hdm.report.metrics import corner_errors, match_markings, rms
 from v2hdm.report.page.facts import Facts, GroundResiduals
 from v2hdm.safe.backgrounds import Window, background_pixels
@@ -147,8 +148,10 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
     hd_map = facts.hd_map
     if hd_map is None:
         return {}
-    named: list[Marking | Symbol | Lane] = [*hd_map.markings, *hd_map.symbols, *hd_map.lanes]
-    kinds = sorted({feature.kind for feature in named})
+    named: list[Marking | Symbol] = [*hd_map.markings, *hd_map.symbols]
+    lines = [line for lane in hd_map.lanes for line in lane.painted]  # a double one is drawn as both
+    kinds = sorted({feature.kind for feature in named})  # colours go by the place here, lines have their own
+    kinds += sorted({line.kind for line in lines} - set(kinds))
     arrows = _arrows(residuals)
     errors = _errors(facts)
     markings = []
@@ -162,6 +165,8 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
             feature["r"] = round(SIGMAS_95 * marking.relative_sigma_m, 5)
         if marking.accuracy is not None:
             feature["g"] = marking.accuracy
+        if marking.variety is not None:
+            feature["kind"] = marking.variety
         if number in errors:
             feature["t"] = round(errors[number], 5)
         if marking.id in arrows:
@@ -172,11 +177,15 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
         "kinds": kinds,
         "cameras": list(residuals.cameras) if residuals else [],
         "markings": markings,
-        "lanes": [_feature(lane, kinds, "p", lane.points_map) for lane in hd_map.lanes],
+        "lanes": [_feature(line, kinds, "p", line.points_map) for line in lines],
+        "lane_lines": len(hd_map.lanes),
         "symbols": [
             _feature(symbol, kinds, "p", symbol.outline_map)
             | {"w": _radii(symbol)}
             | ({} if symbol.accuracy is None else {"g": symbol.accuracy})
+            | ({} if symbol.reading is None else {"says": list(symbol.reading)})
+            | ({"parts": list(symbol.parts)} if symbol.parts else {})
+            | ({"area": 1} if symbol.kind in (CROSSWALK, *SHIPPED.of_family(AREA)) else {})
             for symbol in hd_map.symbols
         ],
         "excluded": [

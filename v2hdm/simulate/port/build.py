@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -17,13 +18,15 @@ from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.geometry.planar import winding
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import Camera, CameraFrames, CameraInfo, CentrePrior, FloatArray, GeodeticOrigin, HDMap
-from v2hdm.simulate.port.config import CalibrationConfig, CameraConfig, MountConfig, PortConfig
+from v2hdm.simulate.port.config import CalibrationConfig, CameraConfig, MountConfig, PortConfig, SignsConfig
 from v2hdm.simulate.port.paint import build_layout
 from v2hdm.simulate.port.route import DrivenPoses, Route, build_relief, build_route, drive_along, stands
 from v2hdm.simulate.port.scene import MovingTruck, build_scene, moving_trucks
+from v2hdm.simulate.port.signs import add_signs
+from v2hdm.simulate.render.letters import LETTERS
 from v2hdm.simulate.render.relief import Relief
 from v2hdm.simulate.render.renderer import Motion, Optics, Rendered, Renderer
-from v2hdm.simulate.render.scene import Box, convex_hull, standing
+from v2hdm.simulate.render.scene import Box, box_footprint, convex_hull, standing
 
 
 def camera_info(name: str, config: CameraConfig) -> CameraInfo:
@@ -79,7 +82,7 @@ _IPMS = ("calibrated", "estimated")
 ORIGIN = GeodeticOrigin(latitude_deg=29.95, longitude_deg=122.05, altitude_m=12.0, epoch=2026.0)
 
 # Independent random streams of one seed, so that a change to one part leaves the others alone.
-_LAYOUT, _YARD, _TRUCKS, _POSES, _CALIBRATION, _IMAGES = range(6)
+_LAYOUT, _YARD, _TRUCKS, _POSES, _CALIBRATION, _IMAGES, _SIGNS = range(7)
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,7 @@ class Port:
     renderer: Renderer
     trucks: tuple[MovingTruck, ...]
     hd_map: HDMap
+    texts: Mapping[int, str]  # what the map's symbols say, by their number
     cameras: dict[str, Camera]
     cam_from_vehicle: dict[str, FloatArray]
     driven: DrivenPoses
@@ -190,6 +194,9 @@ def build_port(config: PortConfig) -> Port:
     scene = build_scene(config.surface, config.yard, route, streams[_YARD], config.seed)
     relief = build_relief(config.relief, route)
     boxes = tuple(standing(box, relief) for box in scene.boxes)
+    if config.paint.signs != SignsConfig():
+        footprints = [box_footprint(box) for box in boxes]
+        add_signs(layout, config.paint, route, footprints, np.random.default_rng([config.seed, _SIGNS]))
     scene = replace(scene, paints=tuple(layout.paints), boxes=boxes, relief=relief)
     cameras = _surveyed_cameras(config)
     classes = (*PAINT_CLASSES, *config.paint.stencils)
@@ -199,6 +206,7 @@ def build_port(config: PortConfig) -> Port:
         renderer=Renderer(scene, classes),
         trucks=moving_trucks(config.yard, route, anew[_TRUCKS]),
         hd_map=_raised(layout.hd_map(ORIGIN), relief),
+        texts=layout.texts,
         cameras=cameras,
         cam_from_vehicle={name: cam_from_vehicle(config.cameras[name].mount) for name in cameras},
         driven=drive_along(
@@ -215,7 +223,8 @@ def _raised(hd_map: HDMap, relief: Relief | None) -> HDMap:
         replace(marking, heights_m=relief.height_m(marking.corners_map)) for marking in hd_map.markings
     )
     lanes = (replace(lane, heights_m=relief.height_m(lane.points_map)) for lane in hd_map.lanes)
-    return replace(hd_map, markings=tuple(markings), lanes=tuple(lanes))
+    symbols = (replace(symbol, heights_m=relief.height_m(symbol.outline_map)) for symbol in hd_map.symbols)
+    return replace(hd_map, markings=tuple(markings), lanes=tuple(lanes), symbols=tuple(symbols))
 
 
 def _check(config: PortConfig) -> None:
@@ -237,6 +246,9 @@ def _check(config: PortConfig) -> None:
         (len(config.calibration.points_ahead_m) >= 4, "calibration.points_ahead_m: give at least 4 points"),
         (50 <= config.exposure.jpeg_quality <= 100, "exposure.jpeg_quality: must be within 50 and 100"),
     ]
+    for text in config.paint.signs.words:
+        unknown = "".join(sorted(set(text) - {*LETTERS, " "})) or ("" if text.split() else "nothing")
+        rules.append((not unknown, f"paint.signs.words: '{text}' has {unknown}; use A to Z, 0 to 9 and -"))
     for name, stencil in config.paint.stencils.items():
         key = f"paint.stencils.{name}"
         rules += [

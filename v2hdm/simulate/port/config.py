@@ -121,6 +121,29 @@ class StencilConfig:
     offsets_m: Annotated[list[float], _SPACING_M_AND_OFFSETS_M] = field(default_factory=lambda: [-3.4, 3.4])
 
 
+@dataclass(kw_only=True)
+class SignsConfig:
+    """Words, bay numbers, hatched areas, crosswalks and double lines, where the ground is free of all else.
+
+    They are painted after all other paint, which stays where it is. The truth has them as symbols and lanes.
+    """
+
+    words: Annotated[list[str], "words of capital letters, digits and -, each painted once."] = field(
+        default_factory=list
+    )
+    numbers: Annotated[int, Within(0, 1000), "how many bay numbers are painted, counting up."] = 0
+    first_number: Annotated[int, Within(0, 100_000), "the first of the bay numbers."] = 101
+    word_height_m: Annotated[float, Within(0.2, 5), "height of the letters of words."] = 1.5
+    number_height_m: Annotated[float, Within(0.2, 5), "height of the digits of bay numbers."] = 0.9
+    hatched: Annotated[int, Within(0, 1000), "how many hatched areas there are."] = 0
+    crosswalks: Annotated[int, Within(0, 1000), "how many crosswalks there are."] = 0
+    double_lines: Annotated[
+        int,
+        Within(0, 1000),
+        "along how many stretches of 15 to 25 m a second line runs beside a lane's line.",
+    ] = 0
+
+
 _WEAR_AND_DIRT = "wear and dirt are mean values, which vary from marking to marking."
 
 
@@ -162,6 +185,7 @@ class PaintConfig:
     stencils: Annotated[dict[str, StencilConfig], "paint of users' own classes, by name."] = field(
         default_factory=dict
     )
+    signs: SignsConfig = field(default_factory=SignsConfig)
 
 
 @dataclass(kw_only=True)

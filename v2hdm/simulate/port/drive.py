@@ -27,7 +27,7 @@ from v2hdm.progress import Steps
 from v2hdm.records import BoolArray, CameraInfo, Drive, FloatArray, Image, Truth
 from v2hdm.safe.pixels import read_header
 from v2hdm.simulate.port.build import Port, build_port
-from v2hdm.simulate.port.config import PortConfig, ReliefConfig
+from v2hdm.simulate.port.config import PortConfig, ReliefConfig, SignsConfig
 from v2hdm.simulate.port.route import measured_disturbances, pose_noise
 from v2hdm.simulate.render.relief import Relief
 from v2hdm.simulate.render.renderer import RENDERER_VERSION
@@ -145,6 +145,8 @@ def folder_of_port(config: PortConfig, cache: Path) -> Path:
         del content["relief"]
     if not config.paint.stencils:
         del content["paint"]["stencils"]
+    if config.paint.signs == SignsConfig():
+        del content["paint"]["signs"]
     text = json.dumps([RENDERER_VERSION, content], sort_keys=True)
     return cache / f"{config.name}-{hashlib.sha256(text.encode()).hexdigest()[:10]}"
 
@@ -222,11 +224,13 @@ def _write_picture(job: _Job, local_port: Port | None = None) -> None:
 
 
 def _truth(port: Port, images: list[Image]) -> Truth:
-    """Ground truth for the report: what each image shows of each marking, which lane vertices were passed.
+    """Ground truth for the report: what images show of markings and symbols, which lane vertices were passed.
 
     A lane vertex counts as seen when two images show it within their camera's region of interest.
     """
-    corners = np.array([m.corners_map for m in port.hd_map.markings]).reshape(-1, 4, 2)
+    outlines = [marking.corners_map for marking in port.hd_map.markings]
+    outlines += [symbol.outline_map for symbol in port.hd_map.symbols]
+    corners = np.array(outlines).reshape(-1, 4, 2)
     # A grid of points (J, 25, 2), each standing for an equal share of its quadrilateral.
     steps = (np.arange(5) + 0.5) / 5
     s, t = (axis.ravel()[None, :, None] for axis in np.meshgrid(steps, steps))
@@ -250,12 +254,15 @@ def _truth(port: Port, images: list[Image]) -> Truth:
         vertices_vehicle = ground_in_vehicle(image.map_from_vehicle, on_lane)
         on_lanes[on_lanes] = inside_convex(camera.roi_vehicle, vertices_vehicle)
         passed += on_lanes
+    markings = len(port.hd_map.markings)
     flags = np.split(passed >= _LANE_SIGHTINGS, np.cumsum([len(v) for v in vertices])[:-1])
     return Truth(
         map=port.hd_map,
         cam_from_vehicle=port.cam_from_vehicle,
         map_from_vehicle=np.array([image.map_from_vehicle for image in images]),
-        visibility=visibility,
+        visibility=visibility[:, :markings],
+        symbol_visibility=visibility[:, markings:],
+        texts=port.texts,
         lane_visible=tuple(flags),
         disturbances=measured_disturbances(port.config.disturbance, port.driven),
     )

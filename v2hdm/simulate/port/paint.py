@@ -15,13 +15,14 @@ from v2hdm.records import (
     DIAMOND,
     LANE_DASH,
     LANE_LINE,
-    OTHER_PAINT,
     STOP_LINE,
+    TEXT,
     FloatArray,
     GeodeticOrigin,
     HDMap,
     Lane,
     Marking,
+    Symbol,
 )
 from v2hdm.simulate.port.config import PaintConfig, StencilConfig
 from v2hdm.simulate.port.route import Place, Route
@@ -73,10 +74,14 @@ class Layout:
     markings: list[Marking] = field(default_factory=list)
     lanes: list[Lane] = field(default_factory=list)
     occupied_map: list[FloatArray] = field(default_factory=list)
+    symbols: list[Symbol] = field(default_factory=list)
+    texts: dict[int, str] = field(default_factory=dict)  # of symbols, by their place among these
+    lettering: list[FloatArray] = field(default_factory=list)  # rectangles (4, 2) about what cannot be read
 
     def hd_map(self, origin: GeodeticOrigin | None) -> HDMap:
         """The true map."""
-        return HDMap(markings=tuple(self.markings), lanes=tuple(self.lanes), origin=origin)
+        symbols = tuple(self.symbols)
+        return HDMap(tuple(self.markings), tuple(self.lanes), origin=origin, symbols=symbols)
 
     def vertices(self) -> FloatArray:
         """The vertices (N, 2) of all lanes."""
@@ -235,13 +240,17 @@ class _Painter:
         for kind, spacing, shapes in (
             (ARROW, config.arrow_spacing_m, _ARROW_M),
             (STOP_LINE, config.stop_line_spacing_m, _STOP_LINE_M),
-            (OTHER_PAINT, config.lettering_spacing_m, None),
+            (TEXT, config.lettering_spacing_m, None),
         ):
             for station in np.arange(spacing * 0.6, route.length_m - 5.0, spacing):
                 at = station + rng.uniform(-2.0, 2.0)
                 offset = 0.0 if shapes is not None else float(rng.choice([-7.2, -3.5, 3.5, 7.2]))
                 drawn = shapes if shapes is not None else self._lettering()
-                self._place(kind, drawn, route.pose_at(at, offset), self._worn(), self._colour())
+                place = route.pose_at(at, offset)
+                self._place(kind, drawn, place, self._worn(), self._colour())
+                if kind == TEXT and drawn:
+                    outline = placed(around(drawn), place.point_map, place.yaw_rad)
+                    self.layout.lettering.append(outline)
 
     def _lettering(self) -> list[FloatArray]:
         """Block letters of upright and level bars, as bay numbers are painted."""
@@ -263,6 +272,16 @@ class _Painter:
             is_stencil = kind not in PAINT_CLASSES and len(shapes) == 1 and len(shape) == 4
             if kind in CORNERED_CLASSES or is_stencil:
                 self.layout.markings.append(Marking(kind, polygon, 0))
+
+
+def around(shapes: Sequence[FloatArray]) -> FloatArray:
+    """The rectangle (4, 2) about shapes (N, 2), ahead and to the left, from the lower left counter-clockwise.
+
+    That is where a word begins as it is read by who drives ahead.
+    """
+    points = np.vstack(shapes)
+    (back, right), (front, left) = points.min(axis=0), points.max(axis=0)
+    return np.array([[back, left], [back, right], [front, right], [front, left]])
 
 
 def _shares(length_m: float) -> FloatArray:

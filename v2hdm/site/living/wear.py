@@ -152,7 +152,7 @@ def with_wear(
     """
     cells = [Cells.of(marking.corners_map) for marking in hd_map.markings]
     ground = None if surface is None else surface.seen_from(np.array(map_from_vehicle))
-    footage = _Footage(images, map_from_vehicle, calibrations, ground)
+    footage = Footage(images, map_from_vehicle, calibrations, ground)
     for number, light in _lights(cells, footage, _best_views(cells, footage, shown), grey, threads):
         cells[number].add(light)
     measured = [k for k, cells_of_marking in enumerate(cells) if len(cells_of_marking.contrasts) >= _VIEWS[0]]
@@ -205,7 +205,7 @@ _LIGHT = np.where(_GREY <= 0.04045, _GREY / 12.92, ((_GREY + 0.055) / 1.055) ** 
 
 
 @dataclass(frozen=True)
-class _Footage:
+class Footage:
     """Images with their poses (4, 4) on the flat road, their calibrations, and the ground unless a plane."""
 
     images: Sequence[Image]
@@ -223,7 +223,7 @@ class _Footage:
 
 
 def _best_views(
-    cells: Sequence[Cells], footage: _Footage, shown: Set[tuple[int, int]]
+    cells: Sequence[Cells], footage: Footage, shown: Set[tuple[int, int]]
 ) -> dict[int, list[int]]:
     """By image, the markings that it shows whole, as one of the nearest images of each."""
     if not cells:
@@ -256,7 +256,7 @@ def _best_views(
 
 def _lights(
     cells: Sequence[Cells],
-    footage: _Footage,
+    footage: Footage,
     markings_of_image: Mapping[int, Sequence[int]],
     grey: Callable[[Image], NDArray[np.float32]],
     threads: int,

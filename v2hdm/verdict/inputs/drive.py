@@ -55,7 +55,7 @@ def check_camera(name: str, camera: Camera) -> list[Finding]:
     """All checks of one camera's description."""
     cam_from_vehicle = initial_extrinsic(camera)
     findings = [
-        *check_intrinsics(name, camera.info),
+        *check_intrinsics(name, camera.info, is_rectified=camera.frames.rectified_from_camera is not None),
         *check_roi(name, camera, cam_from_vehicle),
         _shape(name, camera.info, camera.ipm[camera.initial_ipm]),
         *_mounting(name, cam_from_vehicle),
@@ -65,8 +65,8 @@ def check_camera(name: str, camera: Camera) -> list[Finding]:
     return findings
 
 
-def check_intrinsics(name: str, info: CameraInfo) -> Iterator[Finding]:
-    """Camera matrix against image size."""
+def check_intrinsics(name: str, info: CameraInfo, *, is_rectified: bool = False) -> Iterator[Finding]:
+    """Camera matrix against image size; images that were rectified have whatever focal lengths P states."""
     (fx, _, cx), (_, fy, cy), _ = info.intrinsic
     off = max(abs(cx + 0.5 - info.width / 2), abs(cy + 0.5 - info.height / 2)) / info.width
     scale_u = (2 * cx + 1) / info.width
@@ -91,13 +91,14 @@ def check_intrinsics(name: str, info: CameraInfo) -> Iterator[Finding]:
         fine="the focal length is plausible for road cameras",
         wrong=f"fx is {focal:.2g} image widths, implausible; give it in px of these images, not in mm",
     )  # fmt: skip
-    yield judge(
-        "square pixels", name, fx / fy - 1, _SQUARE, "",
-        fine="fx and fy agree",
-        wrong=f"the focal lengths fx {fx:.0f} and fy {fy:.0f} differ by {100 * abs(fx / fy - 1):.0f} %, but "
-        "pixels are square; check both in camera_info",
-        status=Status.WARN,
-    )  # fmt: skip
+    if not is_rectified:
+        yield judge(
+            "square pixels", name, fx / fy - 1, _SQUARE, "",
+            fine="fx and fy agree",
+            wrong=f"the focal lengths fx {fx:.0f} and fy {fy:.0f} differ by {100 * abs(fx / fy - 1):.0f} %, "
+            "but pixels are square; check both in camera_info",
+            status=Status.WARN,
+        )  # fmt: skip
     yield _lens(name, info)
 
 

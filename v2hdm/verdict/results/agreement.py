@@ -64,10 +64,9 @@ def _difference(mounting: Calibration, other: Calibration) -> FloatArray:
     return log(mounting.cam_from_vehicle @ inverse(other.cam_from_vehicle))
 
 
-def check_agreement(results: Mapping[str, MethodResult], drive: Drive) -> Iterator[Finding]:
-    """Single cameras, by their optimised results, against one another and, last, against all of them."""
-    together = list(results.values())[-1]
-    alone = {name: result for name, result in results.items() if len(result.cameras) == 1}
+def check_agreement(together: MethodResult, drive: Drive) -> Iterator[Finding]:
+    """Single cameras, by what each observed alone, against one another and, last, against all of them."""
+    alone = together.alone
     for (first, a), (second, b) in combinations(alone.items(), 2):
         offset_m = shared_offsets(a, b, drive)
         if len(offset_m) >= _LEAST_SHARED:

@@ -33,7 +33,7 @@ from v2hdm.faults.odds import (
 from v2hdm.faults.sensitivity import STRETCHES
 from v2hdm.ground.results import GroundEstimate
 from v2hdm.mapping.results import CameraFit, MethodResult, SolveEvidence
-from v2hdm.records import BEST, Drive
+from v2hdm.records import Drive
 from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN
 from v2hdm.site.parallax import NOT_OBSERVED, NOT_ON_GROUND
 from v2hdm.verdict.results import agreement
@@ -75,16 +75,10 @@ the usual accuracy goal."""
 
 
 def check_result(
-    drive: Drive,
-    methods: Mapping[str, Mapping[str, MethodResult]],
-    ground: Sequence[Mapping[str, GroundEstimate]] = (),
+    drive: Drive, best: MethodResult, ground: Sequence[Mapping[str, GroundEstimate]] = ()
 ) -> list[Finding]:
-    """The checks after the solve, and the mapper's mountings against those of bare ground, by session.
-
-    ``methods`` are results by camera set, that of all cameras last, then by method.
-    """
-    best = list(methods.values())[-1][BEST]
-    findings = check_solution(drive, methods)
+    """The checks after the solve ``best``, and its mountings against those of bare ground, by session."""
+    findings = check_solution(drive, best)
     for session, estimates in zip(drive.sessions, ground, strict=False):
         of_session = agreement.check_against_ground(best.calibrations, estimates)
         suffix = f" of {session.name}" if drive.joined else ""
@@ -127,18 +121,15 @@ def told_by_poses(findings: Iterable[Finding], of_inputs: Iterable[Finding]) -> 
     return [finding for finding in findings if not failed or finding.status is Status.PASS]
 
 
-def check_solution(drive: Drive, methods: Mapping[str, Mapping[str, MethodResult]]) -> list[Finding]:
+def check_solution(drive: Drive, best: MethodResult) -> list[Finding]:
     """All checks after the solve; arguments as for :func:`check_result`."""
-    best = list(methods.values())[-1][BEST]
     causes: list[Finding] = []
     symptoms: list[Finding] = []
     if best.evidence is not None:
         causes = check_inputs(best.evidence)
         symptoms = [*check_fit(best.evidence), _excluded(best)]
     symptoms += [*agreement.check_doubles(best), *agreement.check_heights(drive)]
-    if len(methods) > 1:
-        by_cameras = {name: by_method[BEST] for name, by_method in methods.items()}
-        symptoms += agreement.check_agreement(by_cameras, drive)
+    symptoms += agreement.check_agreement(best, drive)
     named = next((finding for finding in causes if finding.status is Status.FAIL), None)
     return [*causes, *(_explained(finding, named) for finding in symptoms)]
 

@@ -130,6 +130,13 @@ class Frames:
             passed.add(name)
         return name
 
+    def below(self, name: str) -> list[str]:
+        """The frames that hang on ``name``, nearest ones first."""
+        found = [name]
+        for here in found:  # which grows
+            found += [child for parent, child in self._rows if parent == here and child not in found]
+        return found[1:]
+
     def moving(self, dst: str, src: str, max_gap_s: float, where: str) -> Trajectory:
         """``dst_from_src`` at the times of the busiest edge between them; DriveError where there are none."""
         path = self._path(dst, src)

@@ -198,6 +198,7 @@ _NO_FIX = -1  # the status of a NavSatFix without a position (sensor_msgs/NavSat
 # Quality of NMEA's GGA by the status of a NavSatFix: plain, satellite-based and ground-based augmentation.
 _QUALITY_OF_STATUS = {0: 1, 1: 2, 2: 4}
 _NORM_TOLERANCE = 1e-2  # by which a recorded quaternion's norm may be off 1; chosen
+_ANY_HEADING_RAD = np.pi / np.sqrt(3)  # standard deviation of a heading of which nothing is known
 _YAW = 35  # place of the variance of yaw among the 36 numbers of a pose's covariance (REP-103)
 
 Row = tuple[float, ...]
@@ -223,7 +224,7 @@ def heading_row(kind: str, fields: Any) -> Row:
     if kind == IMU:
         if fields.orientation_covariance[0] < 0:  # sensor_msgs: this Imu measures no orientation
             return (np.nan,) * 5
-        return (*_quaternion(fields.orientation), _sigma(fields.orientation_covariance[8]))
+        return (*_quaternion(fields.orientation), _heading_sigma(fields.orientation_covariance[8]))
     if kind == QUATERNION:
         return (*_quaternion(fields.quaternion), np.nan)
     return position_row(kind, fields)[4:]
@@ -240,22 +241,31 @@ def readings_of(
     order = _timed_order(stamp_s, where, "message")
     stamp_s = stamp_s[order]
     rows = rows[order]
-    if not np.isfinite(rows[:, :3][~np.isinf(rows[:, 3])]).all():
-        raise DriveError(f"{where}: holds a position that is not finite; record it again")
+    geodetic = kind == FIX
+    has_fix = ~np.isinf(rows[:, 3])
+    if geodetic and has_fix.any() and np.isnan(rows[has_fix, 2]).all():  # sensor_msgs: nan if no altitude
+        _log.warning("%s: its positions have no heights; taken as 0 m", where)
+        rows[:, 2] = 0.0
     heading_s, turned = headings or (stamp_s, rows[:, 4:])
     by_time = _timed_order(heading_s, where, "message of the heading")
     heading_s = heading_s[by_time]
     turned = turned[by_time]
     if (rows[:, 3] < 0).any() or (turned[:, 4] < 0).any():
         raise DriveError(f"{where}: a message states a negative variance; record it again with 0 for unknown")
-    # A dual antenna writes nan where it has none.
-    is_measured = np.isfinite(turned[:, :4]).all(axis=1)
+    # A dual antenna writes nan where it has none, others leave all four numbers 0.
+    is_measured = np.asarray(np.isfinite(turned[:, :4]).all(axis=1) & turned[:, :4].any(axis=1))
     attitudes = None
+    advice = "it has no measured orientation: choose another topic for the heading"
+    if headings is not None and not is_measured.any():
+        raise DriveError(
+            f"{where}: all quaternions of its heading are 0 or nan, or their covariance is -1; {advice}"
+        )
+    if not is_measured.all() and (headings is not None or not geodetic):
+        lost = int((~is_measured).sum())
+        _log.warning("%s: left out %d of %d orientations: not measured", where, lost, len(is_measured))
     if is_measured.any():
-        advice = "it has no measured orientation: choose another topic for the heading"
         rotation = checked_rotations(turned[is_measured, :4], lambda k: where, advice, _NORM_TOLERANCE)
         attitudes = Attitudes(heading_s[is_measured], rotation, turned[is_measured, 4])
-    geodetic = kind == FIX
     return Readings(stamp_s, rows[:, :3], geodetic, rows[:, 3], attitudes, "an antenna's" if geodetic else "")
 
 
@@ -273,12 +283,18 @@ def _pose(pose: Any, covariance: Any) -> Row:
     sigma_rad = np.nan
     if covariance is not None:
         sigma_m = _sigma(covariance[0], covariance[7])
-        sigma_rad = _sigma(covariance[_YAW])
+        sigma_rad = _heading_sigma(covariance[_YAW])
     return (place.x, place.y, place.z, sigma_m, *_quaternion(pose.orientation), sigma_rad)
 
 
 def _quaternion(orientation: Any) -> Row:
     return (orientation.x, orientation.y, orientation.z, orientation.w)
+
+
+def _heading_sigma(variance: float) -> float:
+    """The standard deviation of a heading, rad; nan where it says nothing: 1e6 rad2 stands for that."""
+    sigma_rad = _sigma(variance)
+    return np.nan if sigma_rad > _ANY_HEADING_RAD else sigma_rad
 
 
 def _sigma(*variances: float) -> float:

@@ -130,16 +130,19 @@ class ImageStream(Stream):
 
 
 class InfoStream(Stream):
-    """Intrinsics of a topic, the same in each of its messages."""
+    """Intrinsics of a topic, the same in each of its messages, for images that are ``rectified`` or not."""
 
-    def __init__(self, topic: str, where: str) -> None:
-        super().__init__(topic, ["camera_info"], where, [Need(topic, [INFO_KIND], where)])
+    def __init__(self, topic: str, where: str, *, rectified: bool = False) -> None:
+        settings = ["camera_info", "rectified"] if rectified else ["camera_info"]
+        super().__init__(topic, settings, where, [Need(topic, [INFO_KIND], where)])
+        self._rectified = rectified
 
     def write(self, folder: Path) -> Writer:
         """Write the first message as ``camera_info``."""
         if (first := (yield)) is not None:
             where = f"{self.where}: topic {self.label}"
-            write_camera_info(info_of(first.fields, self.label, where), folder / INFO_FILE)
+            intrinsics = info_of(first.fields, self.label, where, self._rectified)
+            write_camera_info(intrinsics.info, folder / INFO_FILE, intrinsics.rectified_from_camera)
             number = 1
             lens = _lens(first.fields)
             while (later := (yield)) is not None:

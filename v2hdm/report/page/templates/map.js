@@ -11,7 +11,7 @@
   // What is not zero never reads so.
   const small = (value, digits) => (value > 0 && value < 0.5 * 10 ** -digits ? `< ${10 ** -digits}` : number(value, digits));
   const cm = (metres) => `${small(100 * metres, 1)} cm`;
-  const SERIES = ["blue", "green", "vermillion", "purple", "orange", "sky"];
+  const SERIES = ["blue", "green", "vermillion", "purple", "orange", "sky", "wine", "teal", "olive", "indigo"];
   const DASHES = [null, "7 4", "2 4", "8 3 2 3"];
   const MOST_IN_DETAIL = 1200; // most markings in view with ellipses and arrows
   const LEAST_PX = 3; // least semi-axis of a drawn ellipse
@@ -72,8 +72,10 @@
     return shape;
   };
   layers.markings = L.featureGroup([
+    // Areas lie below the markings in them.
+    ...data.symbols.filter((one) => one.area).map((one) => feature(L.polygon(one.p.map(at), exact), { ...one, key: `s${one.id}`, what: "symbol" })),
     ...data.markings.map((one) => feature(L.polygon(one.c.map(at), exact), { ...one, key: `m${one.id}`, what: "marking" })),
-    ...data.symbols.map((one) => feature(L.polygon(one.p.map(at), exact), { ...one, key: `s${one.id}`, what: "symbol" })),
+    ...data.symbols.filter((one) => !one.area).map((one) => feature(L.polygon(one.p.map(at), exact), { ...one, key: `s${one.id}`, what: "symbol" })),
   ]);
   layers.excluded = L.featureGroup(data.excluded.map((one, n) =>
     feature(L.circleMarker(at(one.p), { radius: 4 }), { ...one, key: `x${n}`, what: "excluded" })));
@@ -87,6 +89,8 @@
     if (one.fate === "vanished") return [feature(L.polygon(one.p.map(at), { ...exact, ...dashed }), { ...one, key: `d${one.id}`, what: "change" })];
     return [[before, dashed], [one.p, { fate: one.fate }]].map(([corners, look]) => L.polygon(corners.map(at), { ...still(above), ...exact, ...look, fill: false }));
   }));
+  const written = data.symbols.filter((one) => one.says);
+  if (written.length) layers.texts = L.layerGroup();
   layers.ellipses = L.layerGroup();
   layers.arrows = L.layerGroup();
   const selection = L.layerGroup().addTo(map);
@@ -121,7 +125,7 @@
     layers.lanes.eachLayer((line) => line.setStyle({ color: colour("sky"), weight: 2, dashArray: data.kinds[line.kind] === "lane_dash" ? "10 8" : null }));
     layers.recorded?.setStyle({ color: colour("vermillion"), weight: 1.2, dashArray: "2 5" });
     layers.adjusted?.setStyle({ color: ink, weight: 1.2, dashArray: null });
-    layers.markings.eachLayer((shape) => shape.setStyle({ color: fill(shape.about), weight: 1.2, fillOpacity: 0.55, dashArray: shape.about.what === "symbol" ? "4 2" : null }));
+    layers.markings.eachLayer((shape) => shape.setStyle({ color: fill(shape.about), weight: 1.2, fillOpacity: shape.about.area ? 0.2 : 0.55, dashArray: shape.about.what === "symbol" ? "4 2" : null }));
     layers.checks.setStyle({ color: ink, weight: 2, fillColor: colour("orange"), fillOpacity: 0.9 });
     layers.changes.eachLayer((shape) => shape.setStyle({ color: colour(FATES[shape.options.fate]), weight: 2.5, fillOpacity: 0 }));
     layers.excluded.setStyle({ color: colour("vermillion"), weight: 1.3, dashArray: "2 1.5", fill: true, fillOpacity: 0 });
@@ -148,6 +152,7 @@
   function detail() {
     layers.ellipses.clearLayers();
     layers.arrows.clearLayers();
+    label();
     const [ellipses, arrows] = [map.hasLayer(layers.ellipses), map.hasLayer(layers.arrows)];
     const shown = ellipses || arrows ? inView() : [];
     byId("map").dataset.detail = shown ? "drawn" : "too many";
@@ -164,6 +169,16 @@
     }
   }
 
+  function label() { // what words say, where there is room for it
+    layers.texts?.clearLayers();
+    if (!layers.texts || map.getZoomScale(map.getZoom(), 0) < NEAR_PX) return;
+    const bounds = map.getBounds().pad(0.1);
+    for (const one of written.filter(({ p }) => bounds.contains(at(p[0]))).slice(0, MOST_IN_DETAIL)) {
+      const made = L.tooltip({ permanent: true, direction: "center", className: "corner", interactive: false });
+      layers.texts.addLayer(made.setLatLng(L.latLngBounds(one.p.map(at)).getCenter()).setContent(element("span", {}, one.says[0])));
+    }
+  }
+
   function arrow(one, camera, dx, dy, times, px) {
     const x = one.c.reduce((sum, corner) => sum + corner[0], 0) / 4;
     const y = one.c.reduce((sum, corner) => sum + corner[1], 0) / 4;
@@ -177,10 +192,10 @@
 
   // ---- the panel ----
   const NAMES = {
-    markings: "markings and symbols", lanes: "lane lines", truth: "ground truth", checks: "check points", ellipses: "95 % ellipses", adjusted: "route, adjusted",
+    markings: "markings and symbols", texts: "what words say", lanes: "lane lines", truth: "ground truth", checks: "check points", ellipses: "95 % ellipses", adjusted: "route, adjusted",
     recorded: "route, recorded", excluded: "excluded candidates", changes: "changes", arrows: "residual arrows", mosaic: "ground mosaic", background: "background picture",
   };
-  const ON = ["markings", "lanes", "adjusted", "excluded", "checks", "changes", "ellipses", "mosaic", "background"];
+  const ON = ["markings", "texts", "lanes", "adjusted", "excluded", "checks", "changes", "ellipses", "mosaic", "background"];
   const swatch = (stroke, dashes, shape = "line") => {
     const made = element("svg", { viewBox: "0 0 26 14", "aria-hidden": "true" });
     const look = { style: `stroke:${stroke};stroke-width:2;fill:none`, ...(dashes ? { "stroke-dasharray": dashes } : {}) };
@@ -191,11 +206,11 @@
     return made;
   };
   const SWATCHES = {
-    markings: ["var(--blue)", null, "box"], lanes: ["var(--sky)"], truth: ["var(--muted)", "3 3"], checks: ["var(--orange)", null, "ring"], ellipses: ["var(--ink)", null, "ring"],
+    markings: ["var(--blue)", null, "box"], texts: ["var(--ink)", null, "box"], lanes: ["var(--sky)"], truth: ["var(--muted)", "3 3"], checks: ["var(--orange)", null, "ring"], ellipses: ["var(--ink)", null, "ring"],
     adjusted: ["var(--ink)"], recorded: ["var(--vermillion)", "2 4"], excluded: ["var(--vermillion)", "2 2", "ring"],
     arrows: ["var(--purple)", null, "arrow"], changes: ["var(--vermillion)", "5 4"], mosaic: ["var(--muted)", null, "box"], background: ["var(--muted)", null, "box"],
   };
-  const COUNTS = { changes: data.changes.length, markings: data.markings.length + data.symbols.length, checks: data.checks.length, lanes: data.lanes.length, excluded: data.excluded.length, truth: data.truth?.markings.length };
+  const COUNTS = { texts: written.length, changes: data.changes.length, markings: data.markings.length + data.symbols.length, checks: data.checks.length, lanes: data.lane_lines, excluded: data.excluded.length, truth: data.truth?.markings.length };
   for (const name of Object.keys(NAMES)) {
     const empty = !layers[name] || (name === "arrows" && !data.markings.some((one) => one.a)) || COUNTS[name] === 0;
     if (empty) continue;
@@ -236,7 +251,7 @@
   }
 
   // ---- pointing and selecting ----
-  const title = (about) => (about.what === "check" ? `Check point ${about.id}` : about.what === "excluded" ? `Excluded: ${words(about.k)}` : about.what === "change" ? `${words(about.k)} ${about.id}: ${about.fate}` : `${about.what === "symbol" ? "Symbol" : "Marking"} ${about.id}, ${words(data.kinds[about.k])}`);
+  const title = (about) => (about.what === "check" ? `Check point ${about.id}` : about.what === "excluded" ? `Excluded: ${words(about.k)}` : about.what === "change" ? `${words(about.k)} ${about.id}: ${about.fate}` : `${about.what === "symbol" ? "Symbol" : "Marking"} ${about.id}, ${words(data.kinds[about.k])}${about.says ? ` \u201c${about.says[0]}\u201d` : ""}`);
   function facts(about) {
     if (about.what === "check") return checked(about);
     const rows = [];
@@ -245,6 +260,13 @@
     if (change?.shift_m) rows.push(["moved by", `${cm(Math.hypot(...change.shift_m))} \u00b1 ${cm(Math.hypot(...change.shift_sigma_m) / Math.SQRT2)}`]);
     if (change) rows.push([change.fate, `with probability ${number(change.probability, 3)}; seen in ${change.n} of ${change.views} images`]);
     if (about.what !== "change") rows.push(["sightings", `${about.n} ${about.n === 1 ? "image" : "images"}`]);
+    if (about.says) {
+      const [text, sure, other, sureOfOther] = about.says;
+      rows.push(["says", `${text}, with probability ${number(sure, 2)}`]);
+      if (other !== null) rows.push(["or", `${other}, with probability ${number(sureOfOther, 2)}`]);
+    }
+    if (about.kind) rows.push(["kind", words(about.kind)]);
+    if (about.parts) rows.push(["made of", `markings ${about.parts.join(", ")}`]);
     if (about.g) rows.push(["accuracy", about.g]);
     if (Number.isFinite(about.r)) rows.push(["95 % radius from marking to marking", cm(about.r)]);
     if (Number.isFinite(worst(about))) rows.push(["95 % radius in the map’s frame", `${cm(worst(about))} (worst corner)`]);
@@ -311,11 +333,14 @@
     return element("table", {}, element("thead", {}, element("tr", {}, ...head)), element("tbody", {}, ...rows));
   }
 
+  // A text and its alternative, as they are searched for.
+  const says = ({ says: said }) => (said ?? []).filter((part) => typeof part === "string").map((part) => part.toLowerCase());
   byId("find").addEventListener("submit", (event) => {
     event.preventDefault();
-    const wanted = Number(byId("find-id").value);
-    const found = things.find((shape) => shape.about.id === wanted && ["marking", "symbol"].includes(shape.about.what));
-    byId("find-id").setCustomValidity(found ? "" : "No marking of this number.");
+    const wanted = byId("find-id").value.trim();
+    const mapped = things.filter((shape) => ["marking", "symbol"].includes(shape.about.what));
+    const found = mapped.find(({ about }) => says(about).includes(wanted.toLowerCase())) ?? mapped.find(({ about }) => about.id === Number(wanted));
+    byId("find-id").setCustomValidity(found ? "" : "No marking of this number, and no such text.");
     byId("find-id").reportValidity();
     if (!found) return;
     show(found);
@@ -349,6 +374,7 @@
   const COLUMNS = [
     { name: "marking", of: (one) => one.id, digits: 0 },
     { name: "class", of: (one) => words(data.kinds[one.k]) },
+    ...(written.length ? [{ name: "text", of: (one) => one.says?.[0] ?? "\u2013" }] : []),
     { name: "sightings", of: (one) => one.n, digits: 0 },
     ...(listed.some(({ about }) => about.g) ? [{ name: "accuracy", of: (one) => one.g ?? "\u2013" }] : []),
     { name: "from marking to marking (cm)", of: (one) => 100 * (one.r ?? NaN), digits: 1 },
@@ -361,7 +387,7 @@
     const wanted = byId("search").value.trim().toLowerCase().split(/\s+/);
     const { of } = COLUMNS[order.column];
     const key = (shape) => { const value = of(shape.about); return typeof value === "string" || Number.isFinite(value) ? value : null; };
-    return listed.filter(({ about }) => wanted.every((word) => String(about.id) === word || words(data.kinds[about.k]).includes(word)))
+    return listed.filter(({ about }) => wanted.every((word) => String(about.id) === word || words(data.kinds[about.k]).includes(word) || says(about).some((text) => text.includes(word))))
       .map((shape) => [key(shape), shape])
       .sort(([a, one], [b, other]) => (a === null) - (b === null) || (order.down ? -1 : 1) * (a < b ? -1 : a > b ? 1 : 0) || one.about.id - other.about.id)
       .map(([, shape]) => shape);

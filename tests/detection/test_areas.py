@@ -1,0 +1,130 @@
+"""Words and boxes of single images, from outputs drawn of the truth."""
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.detection.painted import hatched, network_output, word
+from tests.detection.pictures import bar, make_camera, to_image
+from v2hdm.catalogue import SHIPPED
+from v2hdm.detection.areas import find_areas, find_crosswalks
+from v2hdm.detection.camera import RoadCamera
+from v2hdm.detection.detector import _not_of
+from v2hdm.geometry.planar import rectangle_size
+from v2hdm.records import MarkingDetection
+
+CAMERA = make_camera("pinhole")
+
+
+def areas_of(*paints, camera=CAMERA):
+    road = RoadCamera(camera, 16)
+    return find_areas(network_output(camera, paints), road, SHIPPED, 0, 0.5, 22.0), road
+
+
+def overlap(outline_px, polygons):
+    """Intersection over union of a detected hull and that of true polygons, in the image."""
+    true = cv2.convexHull(to_image(CAMERA, polygons.reshape(-1, 2)).astype(np.float32))
+    common, _ = cv2.intersectConvexConvex(outline_px.astype(np.float32), true)
+    return common / (cv2.contourArea(outline_px.astype(np.float32)) + cv2.contourArea(true) - common)
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 25.0, 180.0])
+def test_the_letters_of_a_word_are_one_area_with_the_hull_of_all(yaw_deg):
+    at = (7.0, 0.8) if yaw_deg < 90 else (8.2, -1.2)
+    letters = word("EBH", at, yaw_deg=yaw_deg)
+    (area,), road = areas_of(("text", letters))
+    assert area.kind == "text"
+    assert area.score > 0.8
+    assert overlap(area.outline_px, letters) > 0.9
+    assert area.outline_seen.all()
+    size_m = rectangle_size(road.unproject(area.outline_px))
+    np.testing.assert_allclose(size_m, rectangle_size(letters.reshape(-1, 2)), atol=0.1)
+
+
+def test_two_words_are_two_areas_and_two_letters_of_one_are_one():
+    first, second = word("EB", (7.0, 2.2)), word("HO", (7.0, -0.8))
+    areas, _ = areas_of(("text", first), ("text", second))
+    found = sorted(max(overlap(area.outline_px, one) for one in (first, second)) for area in areas)
+    assert len(found) == 2
+    assert found[0] > 0.85
+
+
+def test_a_hatched_box_is_one_area_with_its_frame():
+    box = hatched((6.5, -1.5))
+    (area,), _ = areas_of(("box", box))
+    assert area.kind == "box"
+    assert overlap(area.outline_px, box) > 0.9
+
+
+def test_sides_that_the_image_s_border_cuts_are_no_sides_of_the_word():
+    letters = word("EBHO", (3.6, 2.6), height_m=1.6)
+    (area,), road = areas_of(("text", letters))
+    assert not area.outline_seen.all()
+    assert area.outline_seen.any()
+    cut = ~area.outline_seen
+    at_border = ~road.inside(area.outline_px, 6.0)
+    assert (cut == (at_border | np.roll(at_border, -1))).all()
+    assert area.score > 0.5  # half a word is a word all the same
+
+
+def test_the_vehicle_s_own_mask_cuts_a_word_like_the_border():
+    from dataclasses import replace
+
+    letters = word("EBH", (5.5, 0.8))
+    mask = np.zeros((CAMERA.info.height, CAMERA.info.width), dtype=bool)
+    low = int(to_image(CAMERA, letters.reshape(-1, 2))[:, 1].max()) - 15
+    mask[low:] = True
+    masked = replace(CAMERA, own_vehicle=mask)
+    output = network_output(masked, [("text", letters)])
+    output.paint[low // 2 :] = -20.0
+    (area,) = find_areas(output, RoadCamera(masked, 16), SHIPPED, 0, 0.5, 22.0)
+    bottom = area.outline_px[:, 1] > low - 8
+    assert not area.outline_seen[bottom & np.roll(bottom, -1)].any()
+    assert area.outline_seen.any()
+
+
+def test_a_network_that_does_not_know_areas_finds_none():
+    from dataclasses import replace
+
+    output = network_output(CAMERA, [("text", word("EBH", (7.0, 0.8)))])
+    old = replace(output, kinds=output.kinds[:8], classes=output.classes[:8])
+    assert find_areas(old, RoadCamera(CAMERA, 16), SHIPPED, 0, 0.5, 22.0) == []
+
+
+def test_a_foot_of_an_arrow_that_is_named_text_is_no_word():
+    arrow = np.array([[[6.0, -0.15], [8.0, -0.15], [8.0, 0.15], [6.0, 0.15]]])
+    foot = np.array([[[7.7, -0.15], [8.0, -0.15], [8.0, 0.15], [7.7, 0.15]]])
+    output = network_output(CAMERA, [("arrow", arrow)])
+    named = network_output(CAMERA, [("text", foot)])
+    output.kinds[:] = np.where(named.kinds.max(axis=0) > 0, named.kinds, output.kinds)
+    assert find_areas(output, RoadCamera(CAMERA, 16), SHIPPED, 0, 0.5, 22.0) == []
+
+
+def test_a_letter_is_no_marking_and_a_surer_marking_in_a_box_stays():
+    letters = word("EBH", (7.0, 0.8))
+    (area,), _ = areas_of(("text", letters))
+    corners = to_image(CAMERA, letters[0])
+    markings = tuple(
+        MarkingDetection("lane_dash", score, corners, np.eye(8), np.ones(4, dtype=bool))
+        for score in (0.4, 0.999)
+    )
+    beside = MarkingDetection("diamond", 0.3, corners + np.array([300, 0]), np.eye(8), np.ones(4, dtype=bool))
+    assert [one.score for one in _not_of([area], (*markings, beside))] == [0.999, 0.3]
+
+
+def test_the_bars_of_an_image_are_its_crosswalk_s_parts():
+    bars = [bar(8.0, across, 2.0, 0.4) for across in (-1.6, -0.8, 0.0, 0.8, 1.6)]
+    valid = np.ones(4, dtype=bool)
+    stop = MarkingDetection("stop_line", 0.9, to_image(CAMERA, bar(5.5, 0, 0.3, 3.0)), np.eye(8), valid)
+    markings = [
+        MarkingDetection("crosswalk_bar", 0.8, to_image(CAMERA, one), np.eye(8), valid) for one in bars
+    ]
+    ((crosswalk, parts),) = find_crosswalks([stop, *markings], RoadCamera(CAMERA, 16))
+    assert (crosswalk.kind, crosswalk.score, sorted(parts)) == (
+        "crosswalk",
+        pytest.approx(0.8),
+        [1, 2, 3, 4, 5],
+    )
+    ground = RoadCamera(CAMERA, 16).unproject(crosswalk.outline_px)
+    np.testing.assert_allclose(np.ptp(ground, axis=0), [2.0, 3.6], atol=0.02)
+    assert find_crosswalks(markings[:2], RoadCamera(CAMERA, 16)) == []

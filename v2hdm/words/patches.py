@@ -1,0 +1,206 @@
+"""Patches of images that show a word best, upright in each of four directions.
+
+A word is a rectangle on the ground. A patch is its ground, sampled from one image, with one of its four sides
+above.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from v2hdm.geometry.lens import distort_points
+from v2hdm.geometry.planar import signed_area
+from v2hdm.records import Camera, FloatArray, Image
+from v2hdm.site.living.wear import Footage
+from v2hdm.words.recogniser import HEIGHT_PX
+
+Grey = NDArray[np.uint8]
+
+DIRECTIONS = 4  # sides of a word's rectangle that may be above
+
+_NEAR_M = 16.0  # largest range, m, at which an image resolves letters: half a metre is 15 px at 1280 px
+_MOST_VIEWS = 5  # most images of a word; errors of more repeat
+_APART_M = 1.0  # least distance of the cameras of two images of a word, m: what hides it moves with the view
+_BORDER_PX = 2  # least distance of a word from the border of an image, px
+_MARGIN = 0.12  # ground around a word on each side, in shares of its shorter side
+_STRETCH = 1.5
+"""Width of a patch over its true one: letters on roads are one to four times as tall as usual, and the
+network reads those of half the usual width to twice as well (75 words drawn so)."""
+_WIDTHS_PX = (48, 960)  # least and largest width of a patch, px
+_NEAR_DEPTH_M = 0.3  # least depth, m, of a word's corners
+_WIDEST_STROKE_PX = (
+    15,
+    23,
+)  # rows and columns of a patch: a third of a letter's height, which no stroke reaches
+_GROUND_BLUR_PX = 1.0  # smooths the ground between strokes, px of a patch
+_DARK = 3.0  # added to grey values of 8 bits before their ratio: noise of dark pixels
+_LEAST_RATIO = 0.1  # least ratio over ground that is full contrast: less is its texture
+_QUANTILES = (2.0, 98.0)  # per cent of a patch's ratios that become its darkest and its brightest
+_GREYS = (30.0, 225.0)  # those values in the patch, chosen
+
+
+@dataclass(frozen=True)
+class Word:
+    """A word's rectangle: ``corners_map`` (4, 2) m, counter-clockwise from above."""
+
+    corners_map: FloatArray
+
+    @classmethod
+    def around(cls, outline_map: FloatArray) -> Word:
+        """The smallest rectangle around an outline (N, 2)."""
+        middle = outline_map.mean(axis=0)
+        corners = cv2.boxPoints(cv2.minAreaRect((outline_map - middle).astype(np.float32)))
+        corners_map = corners.astype(np.float64) + middle
+        return cls(corners_map if signed_area(corners_map) > 0 else corners_map[::-1])
+
+    @property
+    def middle_map(self) -> FloatArray:
+        """Its centre (2,)."""
+        return np.asarray(self.corners_map.mean(axis=0))
+
+    @property
+    def up_map(self) -> FloatArray:
+        """The unit vectors (4, 2) that may be above."""
+        sides = np.roll(self.corners_map, -1, axis=0) - self.corners_map
+        return np.asarray(sides / np.linalg.norm(sides, axis=1, keepdims=True))
+
+    @property
+    def size_m(self) -> FloatArray:
+        """The height (4,) in each direction; its width is that of the next."""
+        return np.asarray(np.linalg.norm(np.roll(self.corners_map, -1, axis=0) - self.corners_map, axis=1))
+
+    def grid(self, direction: int, finer: int) -> FloatArray:
+        """The ground (rows, columns, 2) under a patch with ``finer`` rows a px, with that side above."""
+        height_m, width_m = self.size_m[[direction, (direction + 1) % DIRECTIONS]]
+        margin_m = _MARGIN * min(height_m, width_m)
+        height_m, width_m = height_m + 2 * margin_m, width_m + 2 * margin_m
+        columns = round(float(np.clip(_STRETCH * HEIGHT_PX * width_m / height_m, *_WIDTHS_PX))) * finer
+        rows = HEIGHT_PX * finer
+        up = self.up_map[direction]
+        right = np.array([up[1], -up[0]])
+        down_m = ((np.arange(rows) + 0.5) / rows - 0.5) * height_m
+        right_m = ((np.arange(columns) + 0.5) / columns - 0.5) * width_m
+        return np.asarray(self.middle_map + right_m[:, None] * right - down_m[:, None, None] * up)
+
+
+class Patch(NamedTuple):
+    """The patches (48, W) of a word in one image, by the direction that is above."""
+
+    word: int
+    image: int
+    upright: list[Grey]
+
+
+def patches_of(
+    words: Sequence[Word],
+    footage: Footage,
+    cameras: Mapping[str, Camera],
+    light: Callable[[Image], NDArray[np.float32]],
+    threads: int = 1,
+) -> Iterator[Patch]:
+    """The patches of each word in the images that show it best, whole and not under the own vehicle.
+
+    ``light`` reads an image as grey values (H, W), 0 to 255, in which paint of any colour is bright.
+    """
+    words_of_image = _best_views(words, footage, cameras)
+    order = sorted(words_of_image)
+    with ThreadPoolExecutor(threads) as readers:
+        for start in range(0, len(order), 8 * threads):  # limits the decoded images in memory
+            batch = order[start : start + 8 * threads]
+            lights = readers.map(lambda index_to_read: light(footage.images[index_to_read]), batch)
+            for index, pixels in zip(batch, lights, strict=True):
+                for number in words_of_image[index]:
+                    yield Patch(number, index, _cut(words[number], footage, index, pixels))
+
+
+def _cut(word: Word, footage: Footage, index: int, pixels: NDArray[np.float32]) -> list[Grey]:
+    info = footage.calibrations[footage.images[index].camera].info
+    patches = []
+    for direction in range(DIRECTIONS):
+        places_map = word.grid(direction, 1)
+        px = distort_points(info, footage.pinhole_px(index, places_map[:, 0])[0])
+        # As many samples a px of the patch as the image has: none of its px is skipped.
+        finer = max(math.ceil(np.linalg.norm(np.diff(px, axis=0), axis=1).max()), 1)
+        places_map = word.grid(direction, finer)
+        px = distort_points(info, footage.pinhole_px(index, places_map.reshape(-1, 2))[0])
+        places_px = px.reshape(places_map.shape).astype(np.float32)
+        sampled = cv2.remap(pixels, places_px[..., 0], places_px[..., 1], cv2.INTER_LINEAR)
+        size = (sampled.shape[1] // finer, HEIGHT_PX)
+        patches.append(_levelled(cv2.resize(sampled, size, interpolation=cv2.INTER_AREA)))
+    return patches
+
+
+def _levelled(patch: np.ndarray) -> Grey:
+    """A patch as its ratio to the ground beside the strokes, in full contrast: in sun and shade alike.
+
+    The ground is what remains when all that is bright and narrower than a stroke may be is taken away
+    (morphological opening): the edge of a shadow stays where it is.
+    """
+    ground = cv2.morphologyEx(patch, cv2.MORPH_OPEN, np.ones(_WIDEST_STROKE_PX))
+    ratio = (patch + _DARK) / (cv2.GaussianBlur(ground, (0, 0), _GROUND_BLUR_PX) + _DARK)
+    low, high = np.percentile(ratio, _QUANTILES)
+    share = (ratio - low) / max(float(high - low), _LEAST_RATIO)
+    return np.asarray(np.clip(_GREYS[0] + share * (_GREYS[1] - _GREYS[0]), 0.0, 255.0), dtype=np.uint8)
+
+
+def _best_views(
+    words: Sequence[Word], footage: Footage, cameras: Mapping[str, Camera]
+) -> dict[int, list[int]]:
+    """By image, the words of which it is one of those with the most pixels a metre."""
+    if not words:
+        return {}
+    tree = cKDTree([word.middle_map for word in words])
+    views: list[list[tuple[float, int]]] = [[] for _ in words]
+    for index, (image, pose) in enumerate(zip(footage.images, footage.map_from_vehicle, strict=True)):
+        if image.camera not in footage.calibrations:
+            continue
+        info = footage.calibrations[image.camera].info
+        own = cameras[image.camera].own_vehicle
+        for number in tree.query_ball_point(pose[:2, 3], _NEAR_M):
+            corners_map = words[number].corners_map
+            pinhole, depth_m = footage.pinhole_px(index, corners_map)
+            if (depth_m <= _NEAR_DEPTH_M).any():
+                continue
+            px = distort_points(info, pinhole)
+            last_px = (info.width - 1 - _BORDER_PX, info.height - 1 - _BORDER_PX)
+            if (px < _BORDER_PX).any() or (px > last_px).any() or (own is not None and _covers(own, px)):
+                continue
+            sides_px = np.linalg.norm(np.roll(px, -1, axis=0) - px, axis=1)
+            views[number].append((float((sides_px / words[number].size_m).min()), index))
+    words_of_image: dict[int, list[int]] = {}
+    for number, views_of_word in enumerate(views):
+        for index in _apart([index for _, index in sorted(views_of_word, reverse=True)], footage):
+            words_of_image.setdefault(index, []).append(number)
+    return words_of_image
+
+
+def _apart(indices: Sequence[int], footage: Footage) -> list[int]:
+    """The first images of a list that were taken at other places than those before them."""
+    chosen: list[int] = []
+    centres: list[FloatArray] = []
+    for index in indices:
+        calibration = footage.calibrations[footage.images[index].camera]
+        centre = footage.map_from_vehicle[index][:3, :3] @ calibration.centre_vehicle
+        centre = centre + footage.map_from_vehicle[index][:3, 3]
+        if all(np.linalg.norm(centre - other) >= _APART_M for other in centres):
+            chosen.append(index)
+            centres.append(centre)
+        if len(chosen) == _MOST_VIEWS:
+            break
+    return chosen
+
+
+def _covers(own: NDArray[np.bool_], px: FloatArray) -> bool:
+    """Whether the own vehicle hides part of a quadrilateral (4, 2)."""
+    word = np.zeros(own.shape, dtype=np.uint8)
+    cv2.fillConvexPoly(word, np.round(px).astype(np.int32), 1)
+    return bool((own & (word > 0)).any())

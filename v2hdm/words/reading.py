@@ -1,0 +1,169 @@
+"""Readings of a word, weighed: which side is above, and what stands there.
+
+The side that is above is one of four, or none can be read. Before a look it is the one along the direction of
+driving, for words are painted for those who drive up to them; of a yard that is driven both ways, half of it
+each. A look says more: of letters that are upright the network is sure, of others it seldom is. What stands
+there has the probability of each string in all images, given that side. Images of one word repeat each
+other's errors; together they count as if fewer were independent.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import i0e, logsumexp
+
+from v2hdm.records import TEXT, Camera, FloatArray, HDMap, Image, Reading, Symbol
+from v2hdm.site.living.wear import Footage
+from v2hdm.words.patches import DIRECTIONS, Grey, Word, patches_of
+from v2hdm.words.recogniser import Letters, Recogniser
+
+_log = logging.getLogger(__name__)
+
+# The direction that is above, by its angle to that of driving: along it, against it, or any.
+_ALONG, _AGAINST, _ANY = 0.75, 0.1, 0.15  # probability of each, chosen
+_CONCENTRATION = 4.0  # of the first two, von Mises: one sigma is 30 deg, chosen
+_READABLE = 0.9  # probability that some side can be read: paint may be worn off, or no text, chosen
+
+_SURENESS = (-1.6, -1.0, 0.01)
+"""How much likelier the network is as sure as it is of letters that are upright than of anything else, by
+what its best string lacks in log probability, x: the exponential of the first, plus the second times the
+logarithm of x and the third. Read off 260 words drawn upright and turned."""
+
+_CORRELATION = 0.5  # of the errors of two images of a word
+_HIDDEN = 0.2  # probability that an image shows something else, such as what stands before the word, chosen
+_FEWEST_OF_MEDIAN = 3  # fewest images whose median is looked at, too
+_LEAST_OF_TWO = 0.5  # least probability that one of the two likeliest strings is right
+_WORTH_TELLING = 0.05  # least probability of an alternative that is kept
+
+_NEAR_M = 15.0  # distance, m, within which the vehicle's way counts as the direction of driving at a word
+
+_View = list[Letters]  # of one image, by the direction that is above
+
+
+def with_readings(
+    hd_map: HDMap,
+    footage: Footage,
+    cameras: Mapping[str, Camera],
+    light: Callable[[Image], NDArray[np.float32]],
+    recogniser: Recogniser,
+    threads: int = 1,
+) -> HDMap:
+    """``hd_map`` with what each of its words says, of those that images show.
+
+    ``light`` reads an image as :func:`~v2hdm.words.patches.patches_of` takes it.
+    """
+    places = [k for k, symbol in enumerate(hd_map.symbols) if symbol.kind == TEXT]
+    words = [Word.around(hd_map.symbols[k].outline_map) for k in places]
+    patches: list[list[list[Grey]]] = [[] for _ in words]
+    for patch in patches_of(words, footage, cameras, light, threads):
+        patches[patch.word].append(patch.upright)
+    views = [views_of(patches_of_word, recogniser) for patches_of_word in patches]
+    symbols = list(hd_map.symbols)
+    for place, word, views_of_word in zip(places, words, views, strict=True):
+        read = reading_of(views_of_word, side_prior(word, footage.map_from_vehicle))
+        if read is not None:
+            symbols[place] = _upright(symbols[place], word.up_map[read.side], read.reading)
+    _log.info("read %d of %d words", sum(symbol.reading is not None for symbol in symbols), len(words))
+    return replace(hd_map, symbols=tuple(symbols))
+
+
+def views_of(patches: Sequence[list[Grey]], recogniser: Recogniser) -> list[_View]:
+    """The letters in the patches of a word, and in the median of several: what hid it in some is gone."""
+    medians = []
+    if len(patches) >= _FEWEST_OF_MEDIAN:
+        by_side = zip(*patches, strict=True)
+        medians = [[np.asarray(np.median(side, axis=0), dtype=np.uint8) for side in by_side]]
+    return [[recogniser.read(upright) for upright in patch] for patch in (*patches, *medians)]
+
+
+def _upright(symbol: Symbol, up_map: FloatArray, reading: Reading) -> Symbol:
+    """A text with its reading, its outline from the lower left corner on if ``up_map`` (2,) is above."""
+    right_map = np.array([up_map[1], -up_map[0]])
+    first = int(np.argmin(symbol.outline_map @ (up_map + right_map)))
+    order = np.roll(np.arange(len(symbol.outline_map)), -first)
+    stacked = (2 * order[:, None] + [0, 1]).ravel()
+    heights_m, sigma_m, covariance_m2 = symbol.heights_m, symbol.heights_sigma_m, symbol.covariance_m2
+    return replace(
+        symbol,
+        outline_map=symbol.outline_map[order],
+        heights_m=None if heights_m is None else heights_m[order],
+        heights_sigma_m=None if sigma_m is None else sigma_m[order],
+        covariance_m2=None if covariance_m2 is None else covariance_m2[np.ix_(stacked, stacked)],
+        reading=reading,
+    )
+
+
+def side_prior(word: Word, map_from_vehicle: Sequence[FloatArray]) -> FloatArray:
+    """The probability (4,) of each side to be above, by the poses (4, 4) that pass the word."""
+    poses = np.array(map_from_vehicle)
+    is_near = np.linalg.norm(poses[:, :2, 3] - word.middle_map, axis=1) < _NEAR_M
+    ahead = poses[is_near][:, :2, 0] if is_near.any() else np.zeros((0, 2))
+    if not len(ahead):
+        return np.full(DIRECTIONS, 1.0 / DIRECTIONS)
+    cosine = ahead @ word.up_map.T
+    share = _ALONG * _around(cosine) + _AGAINST * _around(-cosine) + _ANY / (2 * np.pi)
+    return np.asarray((share / share.sum(axis=1, keepdims=True)).mean(axis=0))
+
+
+def _around(cosine: FloatArray) -> FloatArray:
+    """The density of von Mises by the cosine of an angle from its middle."""
+    return np.asarray(np.exp(_CONCENTRATION * (cosine - 1.0)) / (2 * np.pi * i0e(_CONCENTRATION)))
+
+
+class Upright(NamedTuple):
+    """A reading, and the side that is above in it."""
+
+    reading: Reading
+    side: int
+
+
+def reading_of(views: Sequence[_View], prior: FloatArray) -> Upright | None:
+    """What a word says by its images and the ``prior`` (4,) of the sides that may be above.
+
+    None where neither of the two likeliest strings is likelier than not.
+    """
+    if not views:
+        return None
+    by_text: dict[str, FloatArray] = {}  # the log odds of a string, over that nothing can be read, by side
+    others = []
+    for side in range(DIRECTIONS):
+        odds = _log_odds([view[side] for view in views])
+        readable = np.log(_READABLE / (1.0 - _READABLE) * prior[side])
+        others.append(odds.pop("") + readable)
+        for text, value in odds.items():
+            by_text.setdefault(text, np.full(DIRECTIONS, -np.inf))[side] = value + readable
+    total = logsumexp([0.0, *others, *np.ravel(list(by_text.values()))])
+    share_of = {text: np.exp(odds_of_sides - total) for text, odds_of_sides in by_text.items()}
+    ranked = sorted(share_of.items(), key=lambda item: -item[1].sum())
+    if sum(shares_of_sides.sum() for _, shares_of_sides in ranked[:2]) < _LEAST_OF_TWO:
+        return None
+    (text, shares_of_sides), *rest = ranked
+    reading = Reading(text, float(shares_of_sides.sum()))
+    if rest and rest[0][1].sum() >= _WORTH_TELLING:
+        reading = Reading(*reading[:2], rest[0][0], float(rest[0][1].sum()))
+    return Upright(reading, int(shares_of_sides.argmax()))
+
+
+def _log_odds(letters: Sequence[Letters]) -> dict[str, float]:
+    """The log odds of each string, over that nothing can be read, if this side is above.
+
+    The empty string stands for all strings that no image prefers.
+    """
+    weight = 1.0 / (1.0 + _CORRELATION * (len(letters) - 1))
+    first, slope, least = _SURENESS
+    best = [of_image.best.strip() for of_image in letters]
+    lacks = -np.array([of_image.log_of(of_image.best) for of_image in letters])
+    sureness = np.exp(first + slope * np.log(lacks + least)) * np.array([text != "" for text in best])
+    candidates = sorted({*best} - {""})
+    shares = np.exp([[of_image.log_of(text) for text in candidates] for of_image in letters])
+    shares = shares.reshape(len(letters), -1)
+    rest = np.maximum(1.0 - shares.sum(axis=1), 0.0)
+    shares = np.column_stack([shares, rest])
+    log_odds = weight * np.log((1.0 - _HIDDEN) * sureness[:, None] * shares + _HIDDEN).sum(axis=0)
+    return dict(zip([*candidates, ""], log_odds.tolist(), strict=True))

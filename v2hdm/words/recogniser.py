@@ -1,0 +1,127 @@
+"""The network of the extra ``text``: probabilities of letters along a patch, and of a string in them.
+
+The network is PP-OCRv6 (small) from the wheel of ``rapidocr``; its file also lists its letters. It was
+trained with connectionist temporal classification (Graves et al., ICML 2006), CTC: each column of the output
+is a distribution of letters and of "no new letter", and a string is as probable as all columns that spell it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+from numpy.typing import NDArray
+
+from v2hdm.errors import ConfigError, one_line
+from v2hdm.records import FloatArray, IntArray
+
+HEIGHT_PX = 48  # height of the network's input, px
+_GREY_HALF = 127.5  # grey value that the network takes for 0; it takes 255 for 1
+_FILES = "models/*rec*.onnx"  # the network's file in the package
+_LETTERS = "character"  # key of the file's metadata with its letters, a line each
+_NO_LETTER = 0  # channel of "no new letter"
+
+# Weights of letters on roads and in yards before any is seen: most words are capitals and digits, signs are
+# rare, and the network takes what it cannot read for one of its 18,000 Chinese signs. Chosen.
+_SMALL_LETTER = 0.2
+_OTHER_SIGN = 0.02
+
+_FAINTEST = 1e-12  # least probability of a letter: none is impossible
+
+MISSING = "words are mapped but not read: install the text extra, pip install 'v2hdm[text]'"
+
+
+@dataclass(frozen=True)
+class Letters:
+    """The log probabilities (T, C) of letters along a patch."""
+
+    log_probability: FloatArray
+    alphabet: str
+
+    @cached_property
+    def best(self) -> str:
+        """The string of the likeliest column after column."""
+        channels = self.log_probability.argmax(axis=1)
+        is_new = np.append(True, channels[1:] != channels[:-1])
+        return "".join(self.alphabet[channel] for channel in channels[is_new] if channel != _NO_LETTER)
+
+    def log_of(self, text: str) -> float:
+        """The log probability of a string, over all ways to spell it (the forward pass of CTC)."""
+        if not text:
+            return float(self.log_probability[:, _NO_LETTER].sum())
+        letters = self._channels(text)
+        states = np.full(2 * len(letters) + 1, _NO_LETTER)
+        states[1::2] = letters
+        # A letter follows the one before it without a gap, unless it repeats it.
+        skips = np.zeros(len(states), dtype=bool)
+        skips[3::2] = letters[1:] != letters[:-1]
+        forward = np.full(len(states), -np.inf)
+        forward[:2] = self.log_probability[0, states[:2]]
+        for column in self.log_probability[1:]:
+            stepped = np.logaddexp(forward, np.append(-np.inf, forward[:-1]))
+            skipped = np.append([-np.inf, -np.inf], forward[:-2])
+            forward = np.where(skips, np.logaddexp(stepped, skipped), stepped) + column[states]
+        return float(np.logaddexp(forward[-1], forward[-2]))
+
+    def _channels(self, text: str) -> IntArray:
+        return np.array([self.alphabet.index(letter) for letter in text])
+
+
+@dataclass(frozen=True)
+class Recogniser:
+    """The network and its alphabet, by the channels of its output."""
+
+    session: onnxruntime.InferenceSession
+    alphabet: str
+
+    def read(self, patch: NDArray[np.uint8]) -> Letters:
+        """The letters of a patch (48, W) of grey values, 0 to 255, whose text runs from left to right."""
+        grey = np.asarray(patch / np.float32(_GREY_HALF) - 1, dtype=np.float32)
+        batch = np.broadcast_to(grey, (1, 3, *grey.shape))
+        (output,) = self.session.run(None, {self.session.get_inputs()[0].name: np.ascontiguousarray(batch)})
+        weighted = np.asarray(output[0], dtype=np.float64) * self._weights + _FAINTEST
+        return Letters(np.log(weighted / weighted.sum(axis=1, keepdims=True)), self.alphabet)
+
+    @cached_property
+    def _weights(self) -> FloatArray:
+        """The weight (C,) of each channel before anything is seen."""
+        weights = np.full(len(self.alphabet), _OTHER_SIGN)
+        for channel, letter in enumerate(self.alphabet):
+            if letter.isascii() and letter.isalnum():
+                weights[channel] = _SMALL_LETTER if letter.islower() else 1.0
+        weights[_NO_LETTER] = 1.0
+        return weights
+
+
+def load_recogniser(threads: int) -> Recogniser | None:
+    """The network of the extra ``text``, None where that is not installed.
+
+    Raises ConfigError where the installed package has no such network.
+    """
+    package = find_spec("rapidocr")
+    if package is None or not package.submodule_search_locations:
+        return None
+    folder = Path(package.submodule_search_locations[0])
+    advice = "install rapidocr as the text extra does, pip install 'v2hdm[text]'"
+    files = sorted(folder.glob(_FILES))
+    if len(files) != 1:
+        raise ConfigError(f"{folder}: {len(files)} networks {_FILES}, not one; {advice}")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.log_severity_level = 3
+    try:
+        session = onnxruntime.InferenceSession(str(files[0]), options, providers=["CPUExecutionProvider"])
+        lines = session.get_modelmeta().custom_metadata_map[_LETTERS].split("\n")
+    except KeyError:
+        raise ConfigError(f"{files[0]}: does not list its letters; {advice}") from None
+    except Exception as error:  # onnxruntime's own are of many kinds
+        raise ConfigError(f"{files[0]}: cannot be loaded ({one_line(str(error))}); {advice}") from None
+    channels = session.get_outputs()[0].shape[-1]
+    alphabet = "\0" + "".join(line if len(line) == 1 else "\ufffd" for line in lines) + " "
+    if len(alphabet) != channels:
+        raise ConfigError(f"{files[0]}: {channels} channels for {len(alphabet)} letters; {advice}")
+    return Recogniser(session, alphabet)
