@@ -1,8 +1,9 @@
 """Each extra keeps what the documents promise: ``make installs`` installs the wheel and tries it.
 
-The wheel is built once. An environment begins with the base install and grows to ``[map]``; ``[map,ros]`` and
-``[map,video]`` stand beside it, each on top of ``[map]`` alone. A page, or a section, begins with what it
-needs; its commands run in the environment with just that, on the small drive of the documents' tests.
+The wheel is built once. An environment begins with the base install and grows to ``[map]``; ``[map,ros]``,
+``[map,video]`` and ``[map,text]`` stand beside it, each on top of ``[map]`` alone. A page, or a section,
+begins with what it needs; its commands run in the environment with just that, on the small drive of the
+documents' tests.
 """
 
 from __future__ import annotations
@@ -61,6 +62,10 @@ MORE = {
     "map,video": (
         "v2hdm check drives/film --no-ground --workers 1 --output outputs/film-check",
         "v2hdm detect drives/film --limit 1",
+    ),
+    "map,text": (
+        "python -c 'from v2hdm.words.recogniser import load_recogniser; assert load_recogniser(1)'",
+        f"v2hdm map +run=port2 workers=1 {' '.join(map(repr, SMALL_PORT))}",
     ),
 }
 """What no page has as a short command of its own, by extras."""
@@ -205,6 +210,8 @@ def main() -> int:
         failed += tried("map,ros", ros, lines_of("map,ros"), here)
         video = base.beside(packages / "video", *EXTRAS["video"])
         failed += tried("map,video", video, lines_of("map,video"), here)
+        text = base.beside(packages / "text", *EXTRAS["text"])
+        failed += tried("map,text", text, lines_of("map,text"), here)
     print(f"{failed} failed" if failed else "every promise is kept")
     return failed
 

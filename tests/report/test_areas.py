@@ -1,12 +1,12 @@
 """Figures of words, boxes, crosswalks and double lines, by hand."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tests.report.scene import make_truth
-from v2hdm.records import BOX, DOUBLE_LINE, LANE_LINE, TEXT, HDMap, Lane, Symbol
+from v2hdm.records import BOX, DOUBLE_LINE, LANE_LINE, TEXT, HDMap, Lane, Reading, Symbol
 from v2hdm.report.areas import area_figures, area_metrics, double_metrics
 from v2hdm.report.metrics import symbols_driven_past
 
@@ -17,22 +17,8 @@ def area(kind, east_m, north_m):
     return Symbol(kind, SQUARE + np.array([east_m, north_m]), 3)
 
 
-@dataclass(frozen=True)
-class Word(Symbol):
-    """A symbol that says what it was read as."""
-
-    reading: object = None
-
-
-@dataclass(frozen=True)
-class Said:
-    """What a word was read as."""
-
-    text: str
-
-
 def read_as(text, east_m, north_m):
-    return Word(TEXT, SQUARE + np.array([east_m, north_m]), 3, reading=Said(text))
+    return Symbol(TEXT, SQUARE + np.array([east_m, north_m]), 3, reading=Reading(text, 0.9))
 
 
 @pytest.fixture

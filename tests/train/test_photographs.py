@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.benchmarks.photographs import covered, joined
 from tests.train.small import coco, tiny
 from train.config import DataConfig, LabelError
 from train.examples import photograph
@@ -187,3 +188,17 @@ def test_the_judge_learns_a_stop_line_as_thin_as_its_paint(tmp_path):
     (marking,) = photograph(given, config, np.random.default_rng(0)).markings
     assert marking.kind == STOP_LINE
     assert np.ptp(marking.polygon_px, axis=0).tolist() == pytest.approx([600, 8], abs=1)
+
+
+def test_neighbouring_pieces_have_one_hull_and_a_far_one_its_own():
+    bars = [outline(left, 50, left + 10, 90) for left in (20, 40, 60, 300)]
+    hulls = sorted(joined(bars, 1.0), key=lambda hull: hull[:, 0].min())
+    assert [np.ptp(hull, axis=0).tolist() for hull in hulls] == [[50, 40], [10, 40]]
+    assert joined([], 1.0) == []
+
+
+def test_a_stop_line_is_covered_as_far_as_pieces_lie_inside_its_outline():
+    line = outline(100, 400, 499, 420)
+    assert covered(line, [outline(100, 405, 299, 412)]) == pytest.approx(0.5)
+    assert covered(line, [outline(100, 430, 499, 440)]) == 0
+    assert covered(line, []) == 0

@@ -75,7 +75,11 @@ def area_metrics(hd_map: HDMap, truth: Truth, expected: BoolArray, kind: str) ->
     known = [
         (mapped[row], truth.texts.get(number[column])) for row, column in zip(rows, columns, strict=True)
     ]
-    right = [_says(symbol) == text for symbol, text in known if text is not None]
+    right = [
+        symbol.reading is not None and symbol.reading.text == text
+        for symbol, text in known
+        if text is not None
+    ]
     return TextMetrics(
         **asdict(counted), readable=len(right), read=float(np.mean(right)) if right else np.nan
     )
@@ -95,12 +99,6 @@ def double_metrics(hd_map: HDMap, truth: Truth) -> DoubleMetrics:
         mapped_fraction=float(covered.mean()) if len(covered) else float("nan"),
         false_length_m=float(false.sum() * SAMPLE_STEP_M),
     )
-
-
-def _says(symbol: Symbol) -> str | None:
-    """What a mapped word was read as, None where it was not."""
-    reading = getattr(symbol, "reading", None)
-    return None if reading is None else str(reading.text)
 
 
 def _overlaps(mapped: Sequence[Symbol], true: Sequence[Symbol]) -> FloatArray:

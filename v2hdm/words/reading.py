@@ -38,6 +38,7 @@ logarithm of x and the third. Read off 260 words drawn upright and turned."""
 _CORRELATION = 0.5  # of the errors of two images of a word
 _HIDDEN = 0.2  # probability that an image shows something else, such as what stands before the word, chosen
 _FEWEST_OF_MEDIAN = 3  # fewest images whose median is looked at, too
+_LEAST_OF_TWO = 0.5  # least probability that one of the two likeliest strings is right
 _WORTH_TELLING = 0.05  # least probability of an alternative that is kept
 
 _NEAR_M = 15.0  # distance, m, within which the vehicle's way counts as the direction of driving at a word
@@ -125,7 +126,7 @@ class Upright(NamedTuple):
 def reading_of(views: Sequence[_View], prior: FloatArray) -> Upright | None:
     """What a word says by its images and the ``prior`` (4,) of the sides that may be above.
 
-    None where it is likelier that it cannot be read than that it says any one string.
+    None where neither of the two likeliest strings is likelier than not.
     """
     if not views:
         return None
@@ -138,10 +139,9 @@ def reading_of(views: Sequence[_View], prior: FloatArray) -> Upright | None:
         for text, value in odds.items():
             by_text.setdefault(text, np.full(DIRECTIONS, -np.inf))[side] = value + readable
     total = logsumexp([0.0, *others, *np.ravel(list(by_text.values()))])
-    unknown = float(np.exp(-total))
     share_of = {text: np.exp(odds_of_sides - total) for text, odds_of_sides in by_text.items()}
     ranked = sorted(share_of.items(), key=lambda item: -item[1].sum())
-    if not ranked or ranked[0][1].sum() < unknown:
+    if sum(shares_of_sides.sum() for _, shares_of_sides in ranked[:2]) < _LEAST_OF_TWO:
         return None
     (text, shares_of_sides), *rest = ranked
     reading = Reading(text, float(shares_of_sides.sum()))

@@ -222,24 +222,19 @@ class _Log:
             taker(sentence)
 
     def _gga(self, sentence: _Sentence) -> None:
-        fields = sentence.fields
-        stamp = self._time(fields[1], sentence)
-        quality = int(fields[6] or 0)
-        if quality == 0 or not fields[2]:
-            return
-        self._positions["GGA"][sentence.address[:2]].put(
-            stamp, _above(fields[2:6], fields[9], fields[11], quality)
-        )
+        self._position(sentence, int(sentence.fields[6] or 0), 11)
 
     def _gns(self, sentence: _Sentence) -> None:
+        quality = max((_MODES[mode] for mode in sentence.fields[6]), default=0, key=_sureness)
+        self._position(sentence, quality, 10)
+
+    def _position(self, sentence: _Sentence, quality: int, geoid: int) -> None:
+        """That of a GGA or GNS, whose field ``geoid`` is the geoid's height."""
         fields = sentence.fields
         stamp = self._time(fields[1], sentence)
-        quality = max((_MODES[mode] for mode in fields[6]), default=0, key=_sureness)
-        if quality == 0 or not fields[2]:
-            return
-        self._positions["GNS"][sentence.address[:2]].put(
-            stamp, _above(fields[2:6], fields[9], fields[10], quality)
-        )
+        if quality and fields[2]:
+            source = self._positions[sentence.address[-3:]][sentence.address[:2]]
+            source.put(stamp, _above(fields[2:6], fields[9], fields[geoid], quality))
 
     def _rmc(self, sentence: _Sentence) -> None:
         fields = sentence.fields
