@@ -21,6 +21,7 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 
 from v2hdm.association.sightings import row_shares
+from v2hdm.catalogue import AREA, SHIPPED
 from v2hdm.detection.batch import read_grey
 from v2hdm.errors import ConfigError, MapFileError
 from v2hdm.geometry.ipm import project_ground
@@ -30,6 +31,7 @@ from v2hdm.geometry.rigid import camera_centre, interpolate, inverse
 from v2hdm.progress import Steps
 from v2hdm.records import (
     ACCURACIES,
+    CROSSWALK,
     SIGMA_OF_MAD,
     BoolArray,
     CameraInfo,
@@ -47,6 +49,8 @@ from v2hdm.surface.surface import Surface
 FILE = "instances.json"
 RANGE_M = 16.0  # how far from a camera markings are labelled: farther ones need not be in the map
 UNKNOWN = "unknown"  # the category of what nobody knows, as `data.coco_classes` calls it
+
+_AREAS = SHIPPED.of_family(AREA)
 
 # States of a marking in an image, and their places in arrays of probabilities.
 SHOWN, HIDDEN, PARTLY = range(3)
@@ -215,7 +219,7 @@ def write_labels(
     outlines += [
         _Outline.of(symbol.id or 0, symbol.kind, symbol.outline_map)
         for symbol in facts.hd_map.symbols
-        if symbol.accuracy != ACCURACIES[-1]
+        if symbol.accuracy != ACCURACIES[-1] and symbol.kind not in (CROSSWALK, *_AREAS)
     ]
     detected_in = _detected(facts)
     images: list[Image] = []
@@ -298,13 +302,14 @@ def _silent(eye: _Eye, facts: Facts, range_m: float) -> list[FloatArray]:
 
 
 def _coarse_outlines(facts: Facts) -> list[FloatArray]:
-    """Outlines (N, 2) of the markings and symbols of accuracy C, m."""
+    """Outlines (N, 2), m, of the markings and symbols of accuracy C, and of areas: paint and ground."""
     hd_map = facts.hd_map
     if hd_map is None:
         return []
     worst = ACCURACIES[-1]
     corners = [marking.corners_map for marking in hd_map.markings if marking.accuracy == worst]
-    return corners + [symbol.outline_map for symbol in hd_map.symbols if symbol.accuracy == worst]
+    symbols = [symbol for symbol in hd_map.symbols if symbol.accuracy == worst or symbol.kind in _AREAS]
+    return corners + [symbol.outline_map for symbol in symbols if symbol.kind != CROSSWALK]
 
 
 def _states(views: Sequence[_View], outlines: int) -> IntArray:

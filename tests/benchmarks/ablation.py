@@ -56,7 +56,7 @@ from v2hdm.mapping.methods import run_methods
 from v2hdm.pipeline.base import grey_reader
 from v2hdm.records import BoolArray, Drive, FloatArray, Image, ImageDetections, IntArray, Marking, Truth
 from v2hdm.report.metrics import driven_past, marking_metrics, match_markings
-from v2hdm.site import hypotheses, markings, posterior, standing, symbols
+from v2hdm.site import hypotheses, markings, parallax, posterior, standing, symbols
 from v2hdm.verdict.results import solution
 
 SEED = 5_318_008
@@ -243,6 +243,8 @@ def terms() -> Iterator[Part]:
     yield "lines behind dashes", partial(patch.object, conclusion, "images_with_line", _no_images)
     yield "their sureness", partial(patch.object, ground, "_SURE_M", np.inf)
     yield "their direction", partial(patch.object, ground, "_PARALLEL", -1.0)
+    yield "sightings of something else", partial(patch.object, parallax, "_OFF_SHARE", 1e-9)
+    yield "corners of paint in one plane", partial(patch.object, parallax, "_GROUND", (1.0, 0.07, 0.07))
 
 
 @contextmanager
@@ -406,14 +408,24 @@ def rows_of_site(only: str, seeds: Sequence[int], folders: Sequence[Path]) -> It
             asked.append(given)
             return symbols.map_symbols(*given)
 
+        asked_parallax: list[Any] = []
+
+        def measure(*given: Any, asked: list[Any] = asked_parallax) -> parallax.Parallax:
+            asked.append(given)
+            return parallax.measure_parallax(*given)
+
         with (
             patch.object(conclusion, "classify", classify),
+            patch.object(conclusion, "measure_parallax", measure),
             patch.object(methods, "map_symbols", map_symbols),
         ):
             run_methods(drive, detections, cameras, grey=grey)
         for name, off in wanted:
             with off():
-                tally[name].add(markings.classify(*asked[-1]).markings(), truth, expected)
+                solved, kind, kinds, counted, _, *others = asked[-1]
+                on_ground = parallax.measure_parallax(*asked_parallax[-1])
+                classified = markings.classify(solved, kind, kinds, counted, on_ground, *others)
+                tally[name].add(classified.markings(), truth, expected)
                 tally[name].symbols += len(symbols.map_symbols(*asked_symbols[-1])[0])
     return (f"{name:38s} {own}" for name, own in tally.items())
 

@@ -81,6 +81,13 @@ def test_a_frame_that_is_not_optical_is_named_with_the_mounting_that_its_turn_gi
     assert offer == {"xyz_m": [3.4, -0.1, 2.6], "rpy_deg": [0.0, 17.0, 5.0]}
 
 
+def test_images_that_name_the_vehicle_are_not_given_another_camera_s_frame():
+    frames = tree({(BASE, "rear_optical"): at(-1, 0, 2, 0, 17, 180) @ OPTICAL})
+    mount = mount_of(frames, BASE, [BASE], "front")
+    assert (mount.frame, mount.vehicle_from_cam) == ("", None)
+    assert "name base_link, the vehicle's own frame" in mount.problem
+
+
 def test_an_info_s_frame_counts_where_the_images_name_none_that_is_known():
     frames = tree({(BASE, "front_optical"): at(1, 0, 2, 0, 17, 0) @ OPTICAL})
     mount = mount_of(frames, BASE, ["camera", "front_optical"], "camera")

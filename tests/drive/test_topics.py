@@ -133,6 +133,10 @@ PAIRS = {
     "one frame by default, without intrinsics": [
         image("/a/image_raw", "camera"), image("/b/image_raw", "camera", times=LATER),
     ],
+    "one frame by default, at one time": [image("/a/image_raw", "camera"), image("/b/image_raw", "camera")],
+    "one frame by default, one calibrated": [
+        image("/a/image_raw"), info("/a/camera_info"), image("/b/image_raw"),
+    ],
     "no frames, two clocks": [image("/a/image_raw", ""), image("/b/image_raw", "", times=LATER)],
 }  # fmt: skip
 

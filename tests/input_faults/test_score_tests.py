@@ -291,6 +291,26 @@ def test_noise_that_goes_together_along_the_route_contradicts_nothing():
     assert max(worst) < 5
 
 
+def narrowing(found, fault: Fault, axis: int) -> float:
+    """Median of what the tests of a change take off the sigma under the stated noise."""
+    tests = [one for one in found if (one.fault, one.axis) == (fault, axis) and np.isfinite(one.sigma)]
+    return float(np.median([one.sigma / one.model_sigma for one in tests]))
+
+
+def test_positions_and_headings_that_err_less_than_stated_leave_the_noise_of_pitch_as_it_is():
+    true = PoseSigma(0.0025, 0.00025, 0.004, 0.005)
+    stated = replace(true, position_m=0.02, heading_rad=0.002)
+    of_pitch, of_position = [], []
+    for seed in range(3):
+        street = make_scene(seed, frames=80, every_m=3.0, jitter=true, start_error_deg=0.3)
+        problem = replace(street.problem, pose_sigma=stated)
+        found = score_faults(problem, solve(problem, OPTIONS))
+        of_pitch.append(narrowing(found, table.KNOCK, 1))
+        of_position.append(narrowing(found, table.STEP, 0))
+    assert np.median(of_position) < 0.7
+    assert np.median(of_pitch) > 0.8
+
+
 def test_an_answer_grows_with_its_column_however_large():
     # Where almost nothing determines a camera, a fault turns it by far more than poses can be turned.
     solved = Sensitivity.at(solve(scene().problem, OPTIONS).covariance.whitening)

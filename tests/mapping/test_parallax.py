@@ -84,6 +84,37 @@ def test_stripes_on_an_upright_rear_are_not_on_the_ground():
     assert objection(sighted(np.linspace(0.0, 1.5, 8), rear, np.array([0.5, 0.5, 1.0, 1.0]))) == NOT_ON_GROUND
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_rear_that_came_nearer_before_the_vehicle_stood_behind_it_is_not_on_the_ground(seed):
+    way_m = np.concatenate([np.linspace(-6.0, -1.0, 5), np.zeros(90)])
+    bumper = np.array([[8.0, 0.5], [8.0, -0.5], [8.0, -0.5], [8.0, 0.5]])
+    assert objection(sighted(way_m, bumper, np.array([0.6, 0.6, 0.7, 0.7]), seed=seed)) == NOT_ON_GROUND
+
+
+def test_what_moves_off_before_the_vehicle_that_stood_long_does_is_not_on_the_ground():
+    way_m = np.concatenate([np.zeros(90), np.linspace(0.1, 1.2, 13)])
+    moved_m = np.concatenate([np.zeros(88), np.linspace(0.1, 1.5, 15)])
+    assert objection(sighted(way_m, AHEAD + QUAD, moved_m=moved_m)) == NOT_ON_GROUND
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_paint_stays_paint_where_some_sightings_are_of_something_else(seed):
+    views = sighted(np.linspace(0.0, 3.0, 16), AHEAD + QUAD, seed=seed)
+    off = np.random.default_rng(seed).normal(0.0, 0.8, (2, 1, 2))
+    views.points_map[[1, 12]] += off
+    views.ray_map[[1, 12]] += off
+    assert objection(views) is None
+
+
+def test_of_many_candidates_each_has_the_odds_that_it_has_alone():
+    alone = [sighted(np.linspace(0.0, 2.0, 8), AHEAD + QUAD, height, seed=5) for height in (0.0, 0.3, 0.8)]
+    group = np.repeat(np.arange(3), 8)
+    fields = [name for name in vars(alone[0]) if name != "group"]
+    joint = {name: np.concatenate([getattr(views, name) for views in alone]) for name in fields}
+    odds = [measure_parallax(views, 1).log_odds[0] for views in alone]
+    assert measure_parallax(PointViews(group=group, **joint), 3).log_odds == pytest.approx(odds)
+
+
 def test_corners_that_were_not_used_say_nothing():
     views = sighted(np.linspace(0.0, 2.0, 8), AHEAD + QUAD)
     known = measure_parallax(views, 1)

@@ -276,7 +276,8 @@ def test_what_one_image_shows_as_an_arrow_stays_a_marking():
 
 def verdict(candidates, counts=None, standing=None):
     kind, counts = np.zeros(len(candidates), dtype=np.int64), counts or well_seen(len(candidates))
-    on_ground = Parallax(np.ones((len(candidates), 1)), np.full((len(candidates), 1, 1), 1e-4))
+    count = len(candidates)
+    on_ground = Parallax(np.ones((count, 1)), np.full((count, 1, 1), 1e-4), np.full(count, 9.0))
     return classify(
         candidates, kind, ("diamond",), lambda corners_map: counts, on_ground, AcceptanceOptions(), standing
     )

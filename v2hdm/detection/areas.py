@@ -28,7 +28,7 @@ arrow may be named so."""
 _GAP = 0.35
 """Largest gap between pieces of one area, in parts of the larger one's longest extent: letters stand a fifth
 of their height apart, words two thirds or more (DIN 1451-3, FHWA Series D)."""
-_GAP_OF_CUT = 1.0  # the same of a piece that the image cuts, whose whole extent is not seen
+_GAP_OF_CUT = 0.5  # the same of a piece that the image cuts, whose whole extent is not seen
 _MOST_GAP_M = {TEXT: 1.0}  # largest gap by class, m: lines of letters of 4 m are as far apart
 _OTHER_GAP_M = 2.0  # largest gap in any other area, m: hatching is 1 to 2 m apart
 _MOST_POINTS = 80  # points of an outline, evenly along it, by which gaps are measured

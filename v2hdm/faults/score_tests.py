@@ -12,9 +12,11 @@ and of the ground under the wheels are smooth along the route. So each segment g
 s_g = z_g' r_g and an information w_g = z_g' z_g of its own, and the segments' disagreement e_g = s_g + p w_g
 is the noise that the fault is tested against: a cluster-robust variance (Liang and Zeger, Biometrika 73,
 1986; corrected by Bell and McCaffrey, Survey Methodology 28, 2002; neighbours by Bartlett's weights, Newey
-and West, Econometrica 55, 1987). With few segments it is noisy, hence shrunk towards that of the drive's
-other faults (Smyth, Statistical Applications in Genetics and Molecular Biology 3, 2004). A fault costs about
-four evaluations of the gradient, and no solve.
+and West, Econometrica 55, 1987). With few segments it is noisy, hence shrunk (Smyth, Statistical Applications
+in Genetics and Molecular Biology 3, 2004) towards what the drive's noise makes of it: positions may err less
+than stated where angles err more, so that each kind of noise has a variance of its own over the stated one,
+estimated from the disagreements of all faults (variance components; Rao, Journal of Multivariate Analysis 1,
+1971). A fault costs about four evaluations of the gradient, and no solve.
 """
 
 from __future__ import annotations
@@ -30,13 +32,19 @@ from v2hdm.adjust.solution import Solution
 from v2hdm.faults import table
 from v2hdm.faults.columns import Hypothesis, hypotheses
 from v2hdm.faults.score import ScoreTest
-from v2hdm.faults.sensitivity import Sensitivity
+from v2hdm.faults.sensitivity import NOISES, POSITION_NOISE, Sensitivity
 from v2hdm.faults.table import Fault
 from v2hdm.records import FloatArray
 
 _LEAST_OBSERVABLE = 1e-9  # fraction of a fault's own information, net of all else, below which it is rounding
 _LAGS = 1  # neighbouring segments with correlated errors
 _PRIOR_FREEDOM = 15.0  # degrees of freedom of the prior on each test's disagreement
+
+_STATED_FREEDOM = 6.0
+"""Degrees of freedom of the prior that a kind of noise has the stated variance: within a factor of 1.6 either
+way in two of three drives."""
+
+_ROUNDS = 50  # towards the variances of the noise, which settle to 1 %
 
 
 @dataclass(frozen=True)
@@ -48,6 +56,7 @@ class _Answer:
     information: FloatArray  # (G + 1,) w_g, likewise
     of_surveys: tuple[float, float]  # score and information of the cameras' surveyed centres
     drawn: FloatArray  # (D, G + 1) scores of noise drawn from the model
+    by_noise: FloatArray  # (N,) information by the kind of noise
     information_alone: float  # the fault's information with all else known
 
     @classmethod
@@ -55,15 +64,24 @@ class _Answer:
         """The segments' scores at a solution."""
         column = hypothesis.column(solved)
         rows = solved.efficient(column)
-        of_surveys = rows["camera_centre"].detach()
-        survey_score = -float((of_surveys * solved.residuals["camera_centre"]).sum())
-        survey_information = float(of_surveys.square().sum())
+        centres = rows["camera_centre"].detach()
+        survey_score = -float((centres * solved.residuals["camera_centre"]).sum())
+        survey_information = float(centres.square().sum())
         efficient = solved.flat(rows)
         information = solved.by_stretch(efficient, efficient)
         alone = sum(float(row.square().sum()) for row in column.values())
         score = -solved.by_stretch(efficient, solved.flat(solved.residuals))
         drawn = solved.by_stretch(efficient, solved.noise).T
-        return cls(hypothesis, score, information, (survey_score, survey_information), drawn, alone)
+        of_surveys = (survey_score, survey_information)
+        return cls(hypothesis, score, information, of_surveys, drawn, solved.by_noise(efficient), alone)
+
+    def column(self, solved: Sensitivity) -> FloatArray:
+        """The fault's column (R,) net of the estimated unknowns, again."""
+        return solved.flat(solved.efficient(self.hypothesis.column(solved)))
+
+    def without(self, effect: FloatArray, solved: Sensitivity) -> _Answer:
+        """The answer without another fault, whose ``effect`` (R,) on the residuals is known."""
+        return replace(self, score=self.score - solved.by_stretch(self.column(solved), effect))
 
     @property
     def is_observable(self) -> bool:
@@ -97,14 +115,20 @@ class _Answer:
             1 + 2 * sum((1 - lag / (_LAGS + 1)) ** 2 for lag in range(1, _LAGS + 1))
         )
 
-    def test(self, usual: float) -> ScoreTest:
-        """The test, shrinking the variance factor towards the drive's ``usual`` one."""
+    @property
+    def noise_shares(self) -> FloatArray:
+        """Shares (N,) of the kinds of noise in the score's variance under the model."""
+        return np.asarray(self.by_noise / self.by_noise.sum())
+
+    def test(self, variances: FloatArray) -> ScoreTest:
+        """The test, shrinking its variance factor towards that of noise with ``variances`` (N,)."""
         hypothesis = self.hypothesis
         fault = hypothesis.fault
         blank = ScoreTest(fault.name, hypothesis.camera, hypothesis.axis, hypothesis.item)
         if not self.is_observable:
             return blank
         freedom = self.freedom
+        usual = float(self.noise_shares @ variances)
         multiple = (_PRIOR_FREEDOM * usual + freedom * self.disagreement) / (_PRIOR_FREEDOM + freedom)
         if not fault.is_change:
             # Noise as lasting as the fault is common to all segments, and no disagreement of theirs: they may
@@ -135,13 +159,43 @@ def score_faults(problem: Problem, solution: Solution) -> tuple[ScoreTest, ...]:
     """Tests at ``solution`` of every fault that ``problem`` can have, largest gain first."""
     solved = Sensitivity.at(solution.covariance.whitening)
     answers = [_Answer.to(hypothesis, solved) for hypothesis in hypotheses(problem, solved.arrays)]
-    # Sudden and gradual steps from one frame count as one test: the sudden one, which comes first.
-    observable = [answer for answer in reversed(answers) if answer.is_observable]
-    disagreements = {answer.hypothesis.key: answer.disagreement for answer in observable}
-    usual = float(np.median(list(disagreements.values()))) if disagreements else 1.0
-    tests = _likeliest_changes([(answer, answer.test(usual)) for answer in answers])
-    tests += _control_points(problem, solution, usual)
+    variances = _noise_variances(answers, solved)
+    tests = _likeliest_changes([(answer, answer.test(variances)) for answer in answers])
+    tests += _control_points(problem, solution, float(variances[POSITION_NOISE]))
     return tuple(sorted(tests, key=lambda test: -test.gain))
+
+
+def _noise_variances(answers: list[_Answer], solved: Sensitivity) -> FloatArray:
+    """Variance (N,) of each kind of noise over the stated one, likeliest under the faults' disagreements.
+
+    A true fault is noise to all other faults, and would hide itself: it is the one of the largest gain, and
+    disagreements are those without it; of a change they are those of its likeliest frame. A disagreement
+    varies as a chi-square about the mean of the variances, by their shares in the fault's score. The
+    likelihood rises with each round (Fevotte and Idier, Neural Computation 23, 2011).
+    """
+    stated = np.ones(NOISES)
+    likeliest: dict[tuple[Fault, int, int], tuple[float, _Answer]] = {}
+    for answer in answers:
+        if answer.is_observable:
+            test = answer.test(stated)
+            best = likeliest.setdefault((test.fault, test.camera, test.axis), (test.gain, answer))
+            if test.gain > best[0]:
+                likeliest[test.fault, test.camera, test.axis] = test.gain, answer
+    if not likeliest:
+        return stated
+    first = max(likeliest.values(), key=lambda rated: rated[0])[1]
+    effect = first.value * first.column(solved)
+    tested = [answer.without(effect, solved) for _, answer in likeliest.values()]
+    # The prior is a fault of each kind of noise alone, whose segments disagree as stated.
+    shares = np.stack([*(answer.noise_shares for answer in tested), *np.eye(NOISES)])
+    disagreement = np.array([*(answer.disagreement for answer in tested), *stated])
+    freedom = np.array([*(answer.freedom for answer in tested), *(_STATED_FREEDOM * stated)])
+    variances = stated
+    for _ in range(_ROUNDS):
+        expected = shares @ variances
+        observed = shares.T @ (freedom * disagreement / expected**2)
+        variances = variances * np.sqrt(observed / (shares.T @ (freedom / expected)))
+    return np.asarray(variances)
 
 
 def _likeliest_changes(tested: list[tuple[_Answer, ScoreTest]]) -> list[ScoreTest]:
@@ -171,11 +225,12 @@ def _independent(changes: list[tuple[_Answer, ScoreTest]]) -> float:
     return float(len(drawn) ** 2 / np.sum((drawn @ drawn.T) ** 2))
 
 
-def _control_points(problem: Problem, solution: Solution, usual: float) -> Iterator[ScoreTest]:
+def _control_points(problem: Problem, solution: Solution, variance: float) -> Iterator[ScoreTest]:
     """Test each surveyed point against everything else on its corner.
 
     The residual between a point and its corner has the point's covariance minus the corner's; both axes are
-    tested together, with two degrees of freedom.
+    tested together, with two degrees of freedom. ``variance`` is that of positions over the stated one: they
+    place the corner.
     """
     control = problem.control
     if control is None or not len(control.corner):
@@ -186,7 +241,7 @@ def _control_points(problem: Problem, solution: Solution, usual: float) -> Itera
         expected = np.diag(sigma_m**2) - covariance[item]
         if np.linalg.eigvalsh(expected).min() <= _LEAST_OBSERVABLE * np.max(sigma_m) ** 2:
             continue
-        squared = float(off @ np.linalg.solve(expected, off)) / max(usual, 1.0)
+        squared = float(off @ np.linalg.solve(expected, off)) / max(variance, 1.0)
         # Without the point, its corner would lie farther away, by the point's share of the information.
         distance_m = float(np.linalg.norm(sigma_m**2 * np.linalg.solve(expected, off)))
         test_sigma_m = distance_m / max(squared, 1e-12) ** 0.5

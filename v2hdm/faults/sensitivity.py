@@ -32,6 +32,15 @@ _STEP = (
 )
 STRETCHES = 24  # segments of a session's route: metres each, longer than the correlation of most errors
 _DRAWS = 16  # draws of the model's noise, which give the expected disagreement to a tenth
+_ERRORS_OF_POSES = ((0, 1), (2,), (3, 4), (5,))
+"""Axes of a frame's tangent with errors of a common size: position, height, roll and pitch, heading."""
+
+NOISES = len(_ERRORS_OF_POSES) + 2
+"""Kinds of noise: that of observations, the errors of poses, and that of all other priors."""
+
+POSITION_NOISE = 1
+"""The kind that is of positions."""
+
 _AT_ONCE = 64  # columns whose gradients are in memory at a time
 
 Rows = dict[str, Tensor]
@@ -210,6 +219,20 @@ class Sensitivity:
         stretch = self.flat(by_kind)
         order = np.argsort(stretch, kind="stable")
         return order, np.searchsorted(stretch[order], np.arange(count + 2))
+
+    @cached_property
+    def _noise_of(self) -> IntArray:
+        """Kind of noise (R,) of each residual: of observations, of an error of the poses, of other priors."""
+        kind_of_axis = [1 + number for number, axes in enumerate(_ERRORS_OF_POSES) for _ in axes]
+        of_states = [kind_of_axis[axis] for axis in self.arrays.states]
+        by_kind = {name: torch.full_like(row, NOISES - 1) for name, row in self.residuals.items()}
+        by_kind["observations"][:] = 0
+        by_kind["frame_states"][:] = self.arrays.centre.new_tensor(of_states)
+        return self.flat(by_kind).astype(np.int64)
+
+    def by_noise(self, column: FloatArray) -> FloatArray:
+        """Information (N,) of a column (R,), by the kind of noise that limits it."""
+        return np.bincount(self._noise_of, np.square(column), minlength=NOISES).astype(np.float64)
 
     def by_stretch(self, column: FloatArray, others: FloatArray) -> FloatArray:
         """Products (G + 1, ...) of a column (R,) and others (R, ...) by segment; last, priors of none."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -139,8 +139,10 @@ def conclude(solve: FinalSolve, acceptance: AcceptanceOptions) -> Optimised:
     located.informs[:] &= solve.usable
     solved = solve.candidates(located)
     model = bundle.model
+    # Of all observations, from the poses as recorded: something that moves moves the adjusted ones.
+    recorded = locate(sightings, replace(bundle.rig, map_from_vehicle=sightings.map_from_vehicle))
     corners = PointViews.of_corners(
-        bundle.association, sightings, located, model.variance_factor, model.pose_sigma
+        bundle.association, sightings, recorded, model.variance_factor, model.pose_sigma
     )
     parallax = measure_parallax(corners, bundle.association.count)
     kind = group_kinds(bundle.association, sightings)

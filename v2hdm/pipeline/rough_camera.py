@@ -32,7 +32,9 @@ _LOG_FOCAL = (
 )
 
 _LOOKS = 6  # images of a folder that are looked at before the first, so that it has a prior from others
-_SURE = 0.99  # probability that a horizon is not above the rows that the network is run on
+_SURE = (
+    0.9  # probability that a horizon is not above the rows that the network is run on; else it is run again
+)
 _LOOK_SHARE = 0.25  # time of a look in half the resolution, of one in full
 _KNOWN_RAD = np.deg2rad(0.5)  # a stream's horizon is said when its standard deviation is this
 
@@ -76,7 +78,9 @@ class RoughCamera:
         with lap("horizon"):
             road = RoadDetector(self.detector, self._camera(horizons.info, looked.mounting))
             top = self.detector.road_camera(road.camera).far_row
-        return road.detect(frame.pixels, looked.output and looked.output.from_row(top))
+        output = looked.output
+        is_whole = output is not None and output.top <= top
+        return road.detect(frame.pixels, output.from_row(top) if output is not None and is_whole else None)
 
     def _look(self, horizons: Horizons, frame: Frame) -> _Looked:
         """The next image's horizon, by the way that takes the network less time.
@@ -89,12 +93,12 @@ class RoughCamera:
             if mounting is not None:
                 return _Looked(mounting, None)
             expected, highest_rad = horizons.coming(_SURE)
-            camera = self._camera(info, expected)
-            road_camera = self.detector.road_camera(camera)
             more_px = info.intrinsic[1, 1] * (np.tan(highest_rad) - np.tan(expected.pitch_rad))
             if not more_px < _LOOK_SHARE * info.height:  # nan is not
                 lines = image_lines(self.detector.network, frame.pixels, info)
                 return _Looked(horizons.next(lines), None)
+            camera = self._camera(info, expected)
+            road_camera = self.detector.road_camera(camera)
         multiple = self.detector.network.info.multiple
         above = min(max(int(np.ceil(more_px / multiple)), 0), road_camera.far_row // multiple)
         top = road_camera.far_row - above * multiple

@@ -2,13 +2,16 @@
 
 Projected to the ground, a ground point approaches by the vehicle's motion, one at half the camera's height by
 twice that, one moving with the vehicle not at all. With camera c, the ray from its nadir to the projected
-point is r = a - s c, with s = 1 on the ground; images determine s by the motion between them.
+point is r = a - s c, with s = 1 on the ground; images determine s by the motion between them. Where a vehicle
+stood, what moves or stands up contradicts itself in a few images only, which a robust solve drops. So paint
+and anything else are compared by how likely *all* sightings are, each of which may be of something else.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,10 +25,25 @@ from v2hdm.site.candidates import CORRELATION
 NOT_OBSERVED = "not observed to be on the ground"
 NOT_ON_GROUND = "stands above the ground, or moves"
 
-_ELSEWHERE = ((2.0, 0.5), (0.0, 0.5))
-"""Mean and standard deviation of s of other things: at half the camera's height, or moving along."""
+_GROUND = (1.0, 0.1, 0.03)
+_ELSEWHERE = ((2.0, 0.35, 0.35), (0.0, 0.5, 0.1))
+"""Mean of s, its standard deviation shared by a candidate's points and that of each point, by hypothesis.
 
-_UNEVEN = 0.1  # sigma of s on the ground: a bump of a tenth of the camera's height, or poor fits from afar
+On the ground: a bump of a tenth of the camera's height, and how far the ground bends within a marking
+(measured on right drives: 0.003, on KITTI 0.008). At half the camera's height: upright things, whose points
+differ in height. Moving along: nearer and farther, all points together.
+"""
+
+_OFF_SHARE = 0.07  # fraction of a marking's sightings that are of something else, as of its observations
+_OFF_M = 1.0  # sigma, m, of such sightings about the marking: association reaches 1.5 m
+_WIDENED = (256.0, 64.0, 16.0, 4.0, 1.0, 1.0, 1.0, 1.0)
+"""Factors of the sightings' variance, from fit to fit.
+
+The many images of a standing vehicle, which agree, must not make outliers of all others at once (graduated
+non-convexity; Blake and Zisserman, Visual Reconstruction, 1987).
+"""
+
+_AT_ONCE = 100  # candidates in memory at a time
 _ONE_VIEW_M = 0.1  # motion, m, within which images are one view with one error: the same texture by an edge
 _POSE_SIGMAS = 4.0  # largest distance, in sigmas, of recorded positions of one place
 
@@ -76,27 +94,20 @@ class PointViews:
             pose_sigma=by_session[sightings.session[sightings.frame[rows]]],
         )
 
+    def of_groups(self, begin: int, end: int) -> PointViews:
+        """The sightings of the candidates from ``begin`` to before ``end``, which count from 0."""
+        rows = np.flatnonzero((self.group >= begin) & (self.group < end))
+        views = PointViews(**{name: values[rows] for name, values in vars(self).items()})
+        return replace(views, group=views.group - begin)
+
 
 @dataclass(frozen=True)
 class Parallax:
-    """Apparent motion of G candidates: ``slope`` (G, P), s of each point, 1 on the ground, and covariance."""
+    """Apparent motion of G candidates."""
 
-    slope: FloatArray
-    covariance: FloatArray
-
-    @property
-    def log_odds(self) -> FloatArray:
-        """Log-odds (G,) of a candidate lying on the ground, from even prior odds."""
-        count = self.slope.shape[1]
-        # Points of an upright object differ in height: half of the variance is each point's own.
-        correlation = (np.ones((count, count)) + np.eye(count)) / 2
-        elsewhere = [
-            _log_normal(self.slope - mean, self.covariance + sigma**2 * correlation)
-            for mean, sigma in _ELSEWHERE
-        ]
-        ground = _log_normal(self.slope - 1, self.covariance + _UNEVEN**2 * correlation)
-        raised, moving_along = elsewhere
-        return np.asarray(ground - np.logaddexp(raised, moving_along) + np.log(len(_ELSEWHERE)))
+    slope: FloatArray  # (G, P) s of each point, 1 on the ground
+    covariance: FloatArray  # (G, P, P)
+    log_odds: FloatArray  # (G,) of lying on the ground, from even prior odds
 
     def objections(self, min_probability: float) -> list[str | None]:
         """Objection to each candidate; None if it lies on the ground with this probability."""
@@ -108,68 +119,184 @@ class Parallax:
 
 
 def measure_parallax(views: PointViews, count: int) -> Parallax:
-    """Estimate s of the points of ``count`` candidates by weighted least squares.
+    """Compare how likely the sightings of ``count`` candidates are on the ground, above it and moving along.
 
-    Unknown as well: their positions, and a roll and pitch error common to all images.
+    Each hypothesis has its own prior of s, and one of all s gives ``slope``. Unknown as well: positions, and
+    a roll and pitch error common to all images. A sighting may be of something else, under each hypothesis
+    alike; so what a solve would drop counts for the hypothesis that explains it.
     """
-    group = views.group
-    used = views.used
-    points_each = used.shape[1]
-    total = 2 * points_each
-    slopes = slice(2 * points_each, 3 * points_each)
-    points, ray = (np.where(used[..., None], values, 0.0) for values in (views.points_map, views.ray_map))
-    centre = (points - ray).sum(axis=1) / used.sum(axis=1)[:, None]
-    sightings = _sum(used, group, count)
-    middle = _sum(points, group, count) / np.maximum(sightings, 1)[..., None]
-    view, images = _views(views, centre)
-    # Recorded positions of a standing vehicle wander; its images are one view, from their mean.
-    centre = (_sum(centre, view, len(images)) / images[:, None])[view]
-    reference = _sum(centre, group, count) / np.maximum(np.bincount(group, minlength=count), 1)[:, None]
-
-    # Evaluated at the mean: derivatives at the ray itself would correlate with its error.
-    by_pose = _by_pose(middle[group] - centre[:, None], views.height_m) * used[..., None, None]
-    by_pose = by_pose.reshape(len(group), total, 6)
-    is_used = np.repeat(used, 2, axis=1)
-    spread = by_pose * views.pose_sigma[:, None]
-    covariance = spread @ np.swapaxes(spread, 1, 2)
-    for k in range(points_each):
-        image_m2 = np.where(used[:, k, None, None], views.covariance_m2[:, k], np.eye(2))
-        image_m2 += _LEAST_SIGMA_M**2 * np.eye(2)
-        covariance[:, 2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += image_m2
-    effective = 1 / (1 + CORRELATION * (images[view] - 1))
-    weight = np.linalg.inv(covariance) * effective[:, None, None]
-
-    by_slope = np.einsum("ij,nk->nikj", np.eye(points_each), centre - reference[group]).reshape(
-        -1, total, points_each
+    parts = [
+        _measure(views.of_groups(begin, min(begin + _AT_ONCE, count)), min(_AT_ONCE, count - begin))
+        for begin in range(0, max(count, 1), _AT_ONCE)
+    ]
+    return Parallax(
+        slope=np.concatenate([part.slope for part in parts]),
+        covariance=np.concatenate([part.covariance for part in parts]),
+        log_odds=np.concatenate([part.log_odds for part in parts]),
     )
-    by_place = np.broadcast_to(np.eye(total), (len(group), total, total))
-    design = np.concatenate([by_place, by_slope, by_pose[..., 3:5]], axis=2) * is_used[..., None]
-    off_m = np.where(is_used, (points - middle[group]).reshape(-1, total), 0.0)[..., None]
-    weighted = np.swapaxes(design, 1, 2) @ weight
-    tilt_rad = np.max(views.pose_sigma[:, 3:5], initial=_LEVEL_RAD)
-    sigma = np.repeat([_ANYWHERE_M, _ANY_SLOPE, tilt_rad], [total, points_each, 2])
-    information = _sum(weighted @ design, group, count) + np.diag(sigma**-2.0)
-    gradient = _sum(weighted @ off_m, group, count)
-    inverse = np.linalg.inv(information)
-    solved = (inverse @ gradient)[..., 0]
-
-    squared = _sum(np.swapaxes(off_m, 1, 2) @ weight @ off_m, group, count)[:, 0, 0]
-    squared -= np.sum(solved * gradient[..., 0], axis=1)
-    freedom = _sum(2 * effective * used.sum(axis=1), group, count) - 3 * (sightings > 0).sum(axis=1)
-    scale = np.maximum(1.0, squared / np.maximum(freedom, 1.0))
-    return Parallax(1 - solved[:, slopes], scale[:, None, None] * inverse[:, slopes, slopes])
 
 
-def _log_normal(off: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Log density (G,) of deviations (G, P), up to a constant."""
-    squared = np.sum(off * np.linalg.solve(covariance, off[..., None])[..., 0], axis=1)
-    return np.asarray(-0.5 * (squared + np.linalg.slogdet(covariance)[1]))
+def _measure(views: PointViews, count: int) -> Parallax:
+    """:func:`measure_parallax` of all candidates at once."""
+    model = _Model.of(views, count)
+    points = views.used.shape[1]
+    alone = np.eye(points)
+    together = np.ones((points, points))
+    free = model.fit(1.0, _ANY_SLOPE**2 * alone)
+    ground, raised, moving_along = (
+        model.fit(mean, shared**2 * together + single**2 * alone).log_evidence
+        for mean, shared, single in (_GROUND, *_ELSEWHERE)
+    )
+    log_odds = ground - np.logaddexp(raised, moving_along) + np.log(len(_ELSEWHERE))
+    return Parallax(free.slope, free.covariance, log_odds)
+
+
+class _Distances(NamedTuple):
+    """Squared distances x' A x - 2 b' x + c, in sigmas, of N sightings from candidates with unknowns x."""
+
+    information: FloatArray  # A (N, U, U)
+    gradient: FloatArray  # b (N, U)
+    squared: FloatArray  # c (N,)
+    log_det: FloatArray  # (N,) of the covariances
+
+    @classmethod
+    def of(cls, design: FloatArray, off_m: FloatArray, covariance_m2: FloatArray) -> _Distances:
+        """Distances of ``off_m`` (N, R) from ``design`` (N, R, U) times the unknowns."""
+        weight = np.linalg.inv(covariance_m2)
+        weighted = np.swapaxes(design, 1, 2) @ weight
+        return cls(
+            information=weighted @ design,
+            gradient=(weighted @ off_m[..., None])[..., 0],
+            squared=np.einsum("ni,nij,nj->n", off_m, weight, off_m),
+            log_det=np.linalg.slogdet(covariance_m2)[1],
+        )
+
+    def at(self, unknowns: FloatArray) -> FloatArray:
+        """The squared distances (N,) at ``unknowns`` (N, U)."""
+        square = np.einsum("ni,nij,nj->n", unknowns, self.information, unknowns)
+        return np.maximum(square - 2 * np.sum(self.gradient * unknowns, axis=1) + self.squared, 0.0)
+
+
+class _Fit(NamedTuple):
+    """G candidates under one prior of s."""
+
+    slope: FloatArray  # (G, P)
+    covariance: FloatArray  # (G, P, P)
+    log_evidence: FloatArray  # (G,)
+
+
+@dataclass(frozen=True)
+class _Model:
+    """N sightings of G candidates, linear functions of the unknowns of these: places, 1 - s, tilt."""
+
+    group: IntArray  # (N,)
+    effective: FloatArray  # (N,) images that each is worth
+    coordinates: IntArray  # (N,) informative ones
+    freedom: FloatArray  # (G,) that places and s use up
+    inlier: _Distances
+    outlier: _Distances
+    sigma: FloatArray  # (U,) of the unknowns before any image; that of s is another under each hypothesis
+
+    @classmethod
+    def of(cls, views: PointViews, count: int) -> _Model:
+        """The model of the sightings of ``count`` candidates."""
+        group = views.group
+        used = views.used
+        points_each = used.shape[1]
+        total = 2 * points_each
+        points, ray = (np.where(used[..., None], at, 0.0) for at in (views.points_map, views.ray_map))
+        centre = (points - ray).sum(axis=1) / used.sum(axis=1)[:, None]
+        sightings = _sum(used, group, count)
+        middle = _sum(points, group, count) / np.maximum(sightings, 1)[..., None]
+        view, images = _views(views, centre)
+        # Recorded positions of a standing vehicle wander; its images are one view, from their mean.
+        centre = (_sum(centre, view, len(images)) / images[:, None])[view]
+        reference = _sum(centre, group, count) / np.maximum(np.bincount(group, minlength=count), 1)[:, None]
+
+        # Evaluated at the mean: derivatives at the ray itself would correlate with its error.
+        by_pose = _by_pose(middle[group] - centre[:, None], views.height_m) * used[..., None, None]
+        by_pose = by_pose.reshape(len(group), total, 6)
+        is_used = np.repeat(used, 2, axis=1)
+        by_slope = np.einsum("ij,nk->nikj", np.eye(points_each), centre - reference[group])
+        by_slope = by_slope.reshape(-1, total, points_each)
+        by_place = np.broadcast_to(np.eye(total), (len(group), total, total))
+        design = np.concatenate([by_place, by_slope, by_pose[..., 3:5]], axis=2) * is_used[..., None]
+        off_m = np.where(is_used, (points - middle[group]).reshape(-1, total), 0.0)
+        covariance_m2 = _covariance(views, by_pose)
+        both = is_used[:, :, None] & is_used[:, None, :]
+        # Half of what something else is off, such as a cut end or a neighbour, is common to its corners.
+        apart = (np.ones((points_each, points_each)) + np.eye(points_each)) / 2
+        elsewhere_m2 = covariance_m2 + _OFF_M**2 * np.kron(apart, np.eye(2)) * both
+        tilt_rad = np.max(views.pose_sigma[:, 3:5], initial=_LEVEL_RAD)
+        return cls(
+            group=group,
+            effective=1 / (1 + CORRELATION * (images[view] - 1)),
+            coordinates=is_used.sum(axis=1),
+            freedom=3.0 * (sightings > 0).sum(axis=1),
+            inlier=_Distances.of(design, off_m, covariance_m2),
+            outlier=_Distances.of(design, off_m, elsewhere_m2),
+            sigma=np.repeat([_ANYWHERE_M, _ANY_SLOPE, tilt_rad], [total, points_each, 2]),
+        )
+
+    def fit(self, mean: float, covariance: FloatArray) -> _Fit:
+        """Candidates whose s have a prior of ``mean`` and ``covariance`` (P, P); Laplace's evidence.
+
+        Expectation maximisation decides which sightings are of something else, and how large the noise is.
+        """
+        points = len(covariance)
+        slopes = slice(2 * points, 3 * points)
+        prior = np.diag(self.sigma**-2.0)
+        prior[slopes, slopes] = np.linalg.inv(covariance)
+        expected = np.zeros(len(prior))
+        expected[slopes] = 1 - mean
+        count = len(self.freedom)
+        share = np.ones(len(self.group))
+        spread = np.ones(count)
+        for factor in _WIDENED:
+            variance = np.maximum(factor, spread)[self.group]
+            weight = self.effective * share / variance
+            other = self.effective * (1 - share)
+            by_image = weight[:, None, None] * self.inlier.information
+            by_image += other[:, None, None] * self.outlier.information
+            information = _sum(by_image, self.group, count) + prior
+            pull = weight[:, None] * self.inlier.gradient + other[:, None] * self.outlier.gradient
+            gradient = _sum(pull, self.group, count) + prior @ expected
+            solved = np.linalg.solve(information, gradient[..., None])[..., 0]
+            squared = self.inlier.at(solved[self.group])
+            size = self.coordinates * np.log(variance) + self.inlier.log_det
+            inlier = np.log1p(-_OFF_SHARE) - (squared / variance + size) / 2
+            far = self.outlier.at(solved[self.group]) + self.outlier.log_det
+            either = np.logaddexp(inlier, np.log(_OFF_SHARE) - far / 2)
+            share = np.exp(inlier - either)
+            if factor == _WIDENED[-1]:
+                steady = self.effective * share
+                freedom = np.maximum(_sum(steady * self.coordinates, self.group, count) - self.freedom, 1.0)
+                spread = np.maximum(_sum(steady * squared, self.group, count) / freedom, 1.0)
+        away = solved - expected
+        log_evidence = _sum(self.effective * either, self.group, count)
+        log_evidence -= np.einsum("gi,ij,gj->g", away, prior, away) / 2
+        log_evidence += (np.linalg.slogdet(prior)[1] - np.linalg.slogdet(information)[1]) / 2
+        inverse = np.linalg.inv(information)[:, slopes, slopes]
+        return _Fit(1 - solved[:, slopes], inverse, log_evidence)
+
+
+def _covariance(views: PointViews, by_pose: FloatArray) -> FloatArray:
+    """Covariance (N, 2P, 2P), m^2, of sightings with derivatives ``by_pose`` (N, 2P, 6); 1 where not used."""
+    spread = by_pose * views.pose_sigma[:, None]
+    covariance = np.asarray(spread @ np.swapaxes(spread, 1, 2))
+    for k in range(views.used.shape[1]):
+        image_m2 = np.where(views.used[:, k, None, None], views.covariance_m2[:, k], np.eye(2))
+        covariance[:, 2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += image_m2 + _LEAST_SIGMA_M**2 * np.eye(2)
+    return covariance
 
 
 def _sum(values: FloatArray | BoolArray, group: IntArray, count: int) -> FloatArray:
     """Sums (G, ...) of values (N, ...) by group (N,)."""
     totals = np.zeros((count, *values.shape[1:]))
-    np.add.at(totals, group, values)
+    order = np.argsort(group, kind="stable")
+    groups, first = np.unique(group[order], return_index=True)
+    if len(groups):
+        totals[groups] = np.add.reduceat(values[order].astype(np.float64), first, axis=0)
     return totals
 
 

@@ -329,7 +329,7 @@ def _middle(place: _Place) -> PointViews:
     is_whole = np.array([is_seen.all() for is_seen in place.seen_sides])
     is_usual = is_whole & (area > _USUAL * np.median(area[is_whole] if is_whole.any() else area))
     chosen = np.flatnonzero(is_usual) if is_usual.sum() > 1 else np.arange(len(area))
-    middles = np.array([_centroid(place.outlines_map[k]) for k in chosen])
+    middles = np.array([_centroid(place.outlines_map[k]) for k in chosen.tolist()])
     return _point_views(middles, place.image[chosen], place.eyes, np.zeros(len(chosen), dtype=np.bool_))
 
 

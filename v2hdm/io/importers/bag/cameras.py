@@ -134,7 +134,9 @@ def _is_same_sensor(topic: CameraTopic, chosen: CameraTopic, frames: Frames) -> 
     if not image.frame and not is_together_:
         return False
     if topic.info is None or chosen.info is None:
-        return is_together_ or chosen.info is not None
+        # What a node makes of images is not called raw; two drivers may both name the frame that is default.
+        are_drivers = all(_base(name).endswith("/image_raw") for name in (image.name, other.name))
+        return not are_drivers and (is_together_ or chosen.info is not None)
     if topic.info.name == chosen.info.name:
         return True
     # Two cameras of a stereo rig may name one frame; the second one's P has their baseline.

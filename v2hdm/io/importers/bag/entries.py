@@ -73,6 +73,10 @@ class Recording(NamedTuple):
         sensor_frame = self.frames.named(sensor, self.vehicle)
         return None if sensor_frame is None else self.frames.fixed(self.vehicle, sensor_frame)
 
+    def will_tell(self, sensor: str) -> bool:
+        """Whether the answer to the question for the vehicle's frame may tell where a sensor is."""
+        return self.vehicle is None and self.frames.named(sensor) is not None
+
     def is_linked(self, frame: str) -> bool:
         """Whether a frame is fixed on the vehicle."""
         try:
@@ -114,8 +118,9 @@ def _best_poses(
 ) -> Entry:
     best = the_one(candidates)
     is_known = [not one.doubt and one.reference > Reference.START for one in candidates]
-    if world is not None and not (best and not world.is_of_earth) and not any(is_known):
-        notes = [f"poses of transforms from {world.content['frame']}"] if candidates else []
+    if world is not None and not any(is_known) and (world.is_of_earth or not candidates):
+        says = "" if world.is_of_earth else ", which drifts if nothing but wheels and an IMU moves it"
+        notes = [f"poses of transforms from {world.content['frame']}{says}"]
         return Entry({"topic": TF_TOPIC} | world.content, notes=notes)
     if best is not None:
         entry = _entry_of(recording, best.sample, stated)
@@ -161,9 +166,9 @@ def _entry_of(recording: Recording, position: PoseSample, stated: Mapping[str, A
     heading: PoseSample | None = None
     if position.kind == kinds.FIX and "heading_file" not in stated:
         heading = _heading_of(recording, position, stated, entry)
-    if recording.vehicle is None:
-        return entry
     vehicle_from_sensor = recording.vehicle_from(position.frame)
+    if vehicle_from_sensor is None and recording.will_tell(position.frame):
+        return entry
     if vehicle_from_sensor is None:
         entry.missing["poses.lever_arm_m"] = _lever_arm(recording, position)
         entry.content["lever_arm_m"] = "?"
@@ -173,12 +178,14 @@ def _entry_of(recording: Recording, position: PoseSample, stated: Mapping[str, A
     if heading is not None:
         turned = recording.vehicle_from(heading.frame)
     if turned is None:
-        if heading is not None:
+        if heading is not None and not recording.will_tell(heading.frame):
             entry.missing["poses.mounting_rpy_deg"] = (
                 f"roll, pitch and yaw of the heading sensor '{heading.frame}', deg: [0, 0, 0]"
             )
             entry.content["mounting_rpy_deg"] = "?"
-    elif np.abs(turned[:3, :3] - np.eye(3)).max() > _TURNED and position.kind != kinds.NMEA:
+    elif position.kind == kinds.FIX and heading is None:
+        return entry  # a file's headings are not of the antenna's frame
+    elif np.abs(turned[:3, :3] - np.eye(3)).max() > _TURNED:
         entry.content["mounting_rpy_deg"] = np.degrees(euler_from_rotation(turned[:3, :3])).tolist()
     return entry
 
@@ -247,7 +254,7 @@ def camera_entry(
     mount = mount_of(recording.frames, recording.vehicle or "", names, name)
     if mount.frame:
         entry.content["frame"] = mount.frame
-    if recording.vehicle is None or set(given) & set(_PLACES):
+    if recording.will_tell(mount.frame) or set(given) & set(_PLACES):
         return entry
     if mount.vehicle_from_cam is not None:
         entry.content["mounting"] = mounting_of(mount.vehicle_from_cam)
@@ -270,10 +277,12 @@ def _mounting(recording: Recording, name: str, mount: Mount) -> str:
     asked = MOUNTING.format(origin=recording.origin)
     if mount.offer:
         return f"{mount.problem}; if the images are of a camera that looks along its x axis: {mount.offer}"
-    if mount.problem:
-        return f"{asked} ({mount.problem})"
     offers = frames_like(recording.frames, recording.vehicle, name) if recording.vehicle else []
-    if not offers:
-        return asked
-    named = f"'{mount.frame}', which is not in the transforms" if mount.frame else "no frame"
-    return f"{asked} (its images name {named}; --set cameras.{name}.frame={' or '.join(offers)} takes one)"
+    takes = f"--set cameras.{name}.frame={' or '.join(offers)} takes one"
+    reason = mount.problem
+    if not reason and offers:
+        reason = (
+            f"its images name {f'{mount.frame!r}, which no transform has' if mount.frame else 'no frame'}"
+        )
+    reasons = [reason] * bool(reason) + [takes] * bool(offers)
+    return f"{asked} ({'; '.join(reasons)})" if reasons else asked

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from v2hdm.errors import DriveError
 from v2hdm.geometry.ipm import mounting_angles
 from v2hdm.geometry.rigid import inverse
 from v2hdm.io.importers.bag.frames import Frames
@@ -46,7 +47,9 @@ def mount_of(frames: Frames, vehicle: str, names: Sequence[str], camera: str) ->
     frame = in_tree[0]
     if not vehicle:
         return Mount(frame, None)
-    vehicle_from_cam = np.eye(4) if frame == vehicle else frames.fixed(vehicle, frame)
+    if frame == vehicle:
+        return Mount("", None, f"its images name {frame}, the vehicle's own frame")
+    vehicle_from_cam = frames.fixed(vehicle, frame)
     if vehicle_from_cam is None:
         return Mount(frame, None, frames.link(vehicle, frame).problem)
     if is_optical(vehicle_from_cam):
@@ -55,7 +58,7 @@ def mount_of(frames: Frames, vehicle: str, names: Sequence[str], camera: str) ->
         name: child
         for name in frames.below(frame)
         if _OPTICAL in name.lower()
-        and (child := frames.fixed(vehicle, name)) is not None
+        and (child := _pose_of(frames, vehicle, name)) is not None
         and is_optical(child)
     }
     if len(children) > 1:
@@ -98,6 +101,14 @@ def mounting_text(vehicle_from_cam: FloatArray) -> str:
     return f"'{{xyz_m: {values['xyz_m']}, rpy_deg: {values['rpy_deg']}}}'"
 
 
+def _pose_of(frames: Frames, vehicle: str, name: str) -> FloatArray | None:
+    """``vehicle_from_frame`` where fixed and sound transforms lead there."""
+    try:
+        return frames.fixed(vehicle, name)
+    except DriveError:
+        return None
+
+
 def frames_like(frames: Frames, vehicle: str, camera: str) -> list[str]:
     """Frames fixed on the vehicle that may be a camera's by name and direction, the likeliest ones first."""
     fitting = [
@@ -105,7 +116,7 @@ def frames_like(frames: Frames, vehicle: str, camera: str) -> list[str]:
         for name in frames.names
         if name != vehicle
         and (_OPTICAL in name.lower() or camera.lower() in name.lower())
-        and (pose := frames.fixed(vehicle, name)) is not None
+        and (pose := _pose_of(frames, vehicle, name)) is not None
         and is_optical(pose)
     ]
     fitting.sort(key=lambda name: (camera.lower() not in name.lower(), _OPTICAL not in name.lower(), name))
