@@ -124,7 +124,7 @@ class Horizons:
         counts |= {name: group.weight for name, group in groups.items()}
         total = sum(counts.values())
         stays = self._stayed[0] / self._stayed[1] if self._previous else 0.0
-        stayed: dict[int | None, float] = {**self._previous}
+        stayed: dict[int | None, float] = dict(self._previous.items())
         return {
             name: (1 - stays) * count / total + stays * stayed.get(name, 0.0)
             for name, count in counts.items()

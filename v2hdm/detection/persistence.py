@@ -27,7 +27,7 @@ _OTHER_AGAIN = 0.15  # probability that something else is found at that place: t
 _EASY = 0.8  # share of the range within which paint is found so often
 _SIGMAS = 3.0  # standard deviations within which something is found near a place
 _SIZE_SIGMA = 0.12  # standard deviation of a marking's centre in its size: a part of it may be hidden
-STATED_SIGMA_RAD = np.deg2rad(1.0)  # standard deviation of the pitch that a drive states of a camera
+STATED_SIGMA_RAD = float(np.deg2rad(1.0))  # standard deviation of the pitch that a drive states of a camera
 
 _APART_M = 1.0  # way of the vehicle, m, from which another image votes
 _VOTES = 6  # images that vote at most: more err together

@@ -174,7 +174,8 @@ class _Distances(NamedTuple):
     def at(self, unknowns: FloatArray) -> FloatArray:
         """The squared distances (N,) at ``unknowns`` (N, U)."""
         square = np.einsum("ni,nij,nj->n", unknowns, self.information, unknowns)
-        return np.maximum(square - 2 * np.sum(self.gradient * unknowns, axis=1) + self.squared, 0.0)
+        squared = square - 2 * np.sum(self.gradient * unknowns, axis=1) + self.squared
+        return np.asarray(np.maximum(squared, 0.0))
 
 
 class _Fit(NamedTuple):
@@ -261,7 +262,7 @@ class _Model:
             information = _sum(by_image, self.group, count) + prior
             pull = weight[:, None] * self.inlier.gradient + other[:, None] * self.outlier.gradient
             gradient = _sum(pull, self.group, count) + prior @ expected
-            solved = np.linalg.solve(information, gradient[..., None])[..., 0]
+            solved = np.asarray(np.linalg.solve(information, gradient[..., None])[..., 0], dtype=np.float64)
             squared = self.inlier.at(solved[self.group])
             size = self.coordinates * np.log(variance) + self.inlier.log_det
             inlier = np.log1p(-_OFF_SHARE) - (squared / variance + size) / 2
@@ -276,7 +277,7 @@ class _Model:
         log_evidence = _sum(self.effective * either, self.group, count)
         log_evidence -= np.einsum("gi,ij,gj->g", away, prior, away) / 2
         log_evidence += (np.linalg.slogdet(prior)[1] - np.linalg.slogdet(information)[1]) / 2
-        inverse = np.linalg.inv(information)[:, slopes, slopes]
+        inverse = np.asarray(np.linalg.inv(information)[:, slopes, slopes], dtype=np.float64)
         return _Fit(1 - solved[:, slopes], inverse, log_evidence)
 
 
