@@ -175,7 +175,7 @@ def lens(model, distortion=(0.1, 0.0, 0.0, 0.0), width=1280):
      ("equidistant", "equidistant"), ("kannala_brandt4", "equidistant"), ("Kannala-Brandt4", "equidistant")],
 )  # fmt: skip
 def test_lenses_are_known_by_the_names_that_drivers_have_for_them(stated, model):
-    assert info_of(lens(stated), "front", "here").distortion_model == model
+    assert info_of(lens(stated), "front", "here").info.distortion_model == model
 
 
 @pytest.mark.parametrize(

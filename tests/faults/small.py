@@ -41,14 +41,25 @@ ROUTE |= {"heading_sigma_deg": ".1"}
 ROUTES = [
     *(("sigma_m", cell, "sigma_m|cells under|not a table") for cell in NO_NUMBERS),
     *(("heading_sigma_deg", cell, "heading_sigma_deg|cells under|not a table") for cell in NO_NUMBERS),
-    *(("x_m", cell, "x_m|cells under|not a table") for cell in ("nan", "inf", "", "x", LONG)),
-    *(("stamp_s", cell, "stamp_s|cells under|not a table") for cell in ("nan", "inf", "", "x", LONG)),
-    *(("yaw_deg", cell, "yaw_deg|cells under|not a table") for cell in ("nan", "inf", "", "x", LONG)),
+    *(("x_m", cell, "x_m|cells under|not a table") for cell in ("x", LONG)),
+    *(("stamp_s", cell, "stamp_s|cells under|not a table") for cell in ("x", LONG)),
+    *(("yaw_deg", cell, "yaw_deg|cells under|not a table") for cell in ("x", LONG)),
     *(("sigma_m", cell, "no position is known") for cell in ("inf", "1e300", "0.2")),
 ]  # fmt: skip
+OPEN = {"x_m": "positions that are no numbers", "stamp_s": "lines without a time"}
+OPEN |= {"yaw_deg": "headings that are no numbers"}
 
 
 def _routes() -> Iterator[Case]:
+    for column, says in OPEN.items():
+        for cell in ("nan", "inf", ""):
+            rows = [ROUTE | {"stamp_s": f"{100 + k / 10:.1f}", "x_m": str(k)} for k in range(20)]
+            rows[-1][column] = cell
+            text = "\n".join(",".join(row.values()) for row in (dict(zip(ROUTE, ROUTE, strict=True)), *rows))
+            changes = entries(poses={"csv": "route.csv"}), write("route.csv", text)
+            told = f"left out 1 of 20 {says}"
+            more = {"code": 0, "leaves": "/out(/|$)", "tells": True}
+            yield checked(f"route: {column} {cell[:9]}", told, *changes, **more)
     for column, cell, says in ROUTES:
         lines = [ROUTE | {"stamp_s": f"{100 + k / 10:.1f}", "x_m": str(k)} for k in range(20)]
         wrong = range(20) if "known" in says else [19]
