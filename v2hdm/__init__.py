@@ -36,8 +36,8 @@ __version__ = "1.0.0"
 __all__ = [
     "Calibration", "Detector", "DetectorOptions", "HDMap", "Localizer", "MappingOptions", "Problem",
     "ReadOptions", "Result", "V2hdmError", "Verdict", "build_problem", "calibrate_from_ground",
-    "calibrate_from_points", "check_drive", "detect_images", "localize", "map_drive", "read_drive", "read_map", "simulate_port",
-    "solve",
+    "calibrate_from_points", "check_drive", "detect_images", "localize", "map_drive", "read_drive",
+    "read_map", "simulate_port", "solve",
 ]  # fmt: skip
 
 _MODULES = {
