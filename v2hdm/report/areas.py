@@ -72,12 +72,12 @@ def area_metrics(hd_map: HDMap, truth: Truth, expected: BoolArray, kind: str) ->
     )
     if kind != TEXT:
         return counted
-    known = [
+    matches = [
         (mapped[row], truth.texts.get(number[column])) for row, column in zip(rows, columns, strict=True)
     ]
     right = [
         symbol.reading is not None and symbol.reading.text == text
-        for symbol, text in known
+        for symbol, text in matches
         if text is not None
     ]
     return TextMetrics(

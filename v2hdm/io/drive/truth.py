@@ -95,8 +95,10 @@ def _joined_truth(drive: Drive) -> Truth:
 
 def _of_symbols(truth: Truth) -> FloatArray:
     """What the images show of the symbols (I, S)."""
-    known = truth.symbol_visibility
-    return np.zeros((len(truth.visibility), len(truth.map.symbols))) if known is None else known
+    visibility = truth.symbol_visibility
+    if visibility is None:
+        return np.zeros((len(truth.visibility), len(truth.map.symbols)))
+    return visibility
 
 
 def _microseconds(stamp_s: float) -> int:

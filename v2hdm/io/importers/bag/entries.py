@@ -91,11 +91,11 @@ def part_of(content: object, key: str) -> Mapping[str, Any]:
     return part if isinstance(part, Mapping) else {}
 
 
-def poses_entry(recording: Recording, given: object) -> Entry:
+def poses_entry(recording: Recording, answers: object) -> Entry:
     """The entry of poses: of the topic that its user names, else of the one that states them best."""
-    if given is not None and (not isinstance(given, Mapping) or set(given) & set(_OF_FILES)):
+    if answers is not None and (not isinstance(answers, Mapping) or set(answers) & set(_OF_FILES)):
         return Entry({})
-    stated = given or {}
+    stated = answers or {}
     max_sigma_m = stated.get("max_sigma_m")
     limit_m = float(max_sigma_m) if isinstance(max_sigma_m, int | float) else _MAX_SIGMA_M
     has_heading = bool({"heading_topic", "heading_file"} & set(stated))
@@ -117,14 +117,14 @@ def _best_poses(
     recording: Recording, candidates: Sequence[Candidate], world: _World | None, stated: Mapping[str, Any]
 ) -> Entry:
     best = the_one(candidates)
-    is_known = [not one.doubt and one.reference > Reference.START for one in candidates]
+    is_known = [not candidate.doubt and candidate.reference > Reference.START for candidate in candidates]
     if world is not None and not any(is_known) and (world.is_of_earth or not candidates):
         says = "" if world.is_of_earth else ", which drifts if nothing but wheels and an IMU moves it"
         notes = [f"poses of transforms from {world.content['frame']}{says}"]
         return Entry({"topic": TF_TOPIC} | world.content, notes=notes)
     if best is not None:
         entry = _entry_of(recording, best.sample, stated)
-        others = [one.about for one in candidates if one != best]
+        others = [candidate.about for candidate in candidates if candidate != best]
         if others or best.doubt or best.reference is Reference.START:
             beside = f", not of {'; '.join(others[:MOST_NAMES])}" if others else ""
             entry.notes.append(f"poses of {best.about}{beside}")
@@ -203,10 +203,10 @@ def _heading_of(
     best = the_one(candidates)
     if best is not None and not best.doubt:
         entry.content["heading_topic"] = best.sample.name
-        if others := [one.about for one in candidates if one != best]:
+        if others := [candidate.about for candidate in candidates if candidate != best]:
             entry.notes.append(f"headings of {best.about}, not of {'; '.join(others[:MOST_NAMES])}")
         return best.sample
-    offers = "; ".join(one.about for one in candidates[:MOST_NAMES]) or "none"
+    offers = "; ".join(candidate.about for candidate in candidates[:MOST_NAMES]) or "none"
     asked = f"the topic of headings, such as /imu; the bag has {offers}"
     entry.missing["poses.heading_topic"] = asked
     entry.content["heading_topic"] = "?"
@@ -237,9 +237,9 @@ def _lever_arm(recording: Recording, position: PoseSample) -> str:
 
 
 def camera_entry(
-    recording: Recording, name: str, topic: CameraTopic, names: Sequence[str], given: Mapping[str, Any]
+    recording: Recording, name: str, topic: CameraTopic, names: Sequence[str], answers: Mapping[str, Any]
 ) -> Entry:
-    """The entry of a camera, whose messages name the frames ``names``; its user states ``given``."""
+    """The entry of a camera, whose messages name the frames ``names``; its user states ``answers`` of it."""
     entry = Entry({"camera_info": {"topic": "?"}, "images": {"topic": topic.image.name}})
     key = f"cameras.{name}"
     if refusal := topic.image.problem or topic.image.refusal:
@@ -249,12 +249,12 @@ def camera_entry(
         )
     if topic.info is not None and not topic.info.problem:
         entry.content["camera_info"] = {"topic": topic.info.name}
-    elif "camera_info" not in given:
+    elif "camera_info" not in answers:
         entry.missing[f"{key}.camera_info"] = _lens(recording, topic.info)
     mount = mount_of(recording.frames, recording.vehicle or "", names, name)
     if mount.frame:
         entry.content["frame"] = mount.frame
-    if recording.will_tell(mount.frame) or set(given) & set(_PLACES):
+    if recording.will_tell(mount.frame) or set(answers) & set(_PLACES):
         return entry
     if mount.vehicle_from_cam is not None:
         entry.content["mounting"] = mounting_of(mount.vehicle_from_cam)

@@ -132,10 +132,10 @@ class Frames:
 
     def below(self, name: str) -> list[str]:
         """The frames that hang on ``name``, nearest ones first."""
-        found = [name]
-        for here in found:  # which grows
-            found += [child for parent, child in self._rows if parent == here and child not in found]
-        return found[1:]
+        frames = [name]
+        for frame in frames:  # which grows
+            frames += [child for parent, child in self._rows if parent == frame and child not in frames]
+        return frames[1:]
 
     def moving(self, dst: str, src: str, max_gap_s: float, where: str) -> Trajectory:
         """``dst_from_src`` at the times of the busiest edge between them; DriveError where there are none."""
@@ -251,9 +251,9 @@ def _is_still(poses: FloatArray) -> bool:
 
 def _spread(poses: FloatArray) -> tuple[float, float]:
     """The largest shift, m, and turn, rad, of poses (N, 4, 4) from the first one."""
-    apart = log(inverse(poses[0]) @ poses)
+    tangents = log(inverse(poses[0]) @ poses)
     shift_m = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1)
-    return float(shift_m.max()), float(np.linalg.norm(apart[:, 3:], axis=1).max())
+    return float(shift_m.max()), float(np.linalg.norm(tangents[:, 3:], axis=1).max())
 
 
 def tf_topics(names: Iterable[str]) -> list[str]:

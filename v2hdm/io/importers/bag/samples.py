@@ -278,11 +278,11 @@ def _metres(geodetic: FloatArray) -> FloatArray:
 
 def is_together(stamp_s: Sequence[float], other_s: Sequence[float], apart_s: float) -> bool:
     """Whether two topics' messages are of the same times, where both were recorded; False without any."""
-    one, other = sorted(stamp_s), sorted(other_s)
-    if not one or not other:
+    if not len(stamp_s) or not len(other_s):
         return False
-    begin_s, end_s = max(one[0], other[0]) - apart_s, min(one[-1], other[-1]) + apart_s
-    shared = [[stamp for stamp in stamps if begin_s <= stamp <= end_s] for stamps in (one, other)]
+    begin_s = max(min(stamp_s), min(other_s)) - apart_s
+    end_s = min(max(stamp_s), max(other_s)) + apart_s
+    shared = [[stamp for stamp in stamps if begin_s <= stamp <= end_s] for stamps in (stamp_s, other_s)]
     fewer, more = sorted(shared, key=len)
     if not fewer or not any(fewer):  # or none has a time
         return False
