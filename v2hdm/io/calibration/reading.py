@@ -233,8 +233,8 @@ def info_of(fields: Any, name: str, where: str, rectified: bool = False) -> Intr
 
     Of images that were ``rectified`` they are those of P, without a distortion, and R is their turn.
     """
-    intrinsic = _numbers(fields, "k", 3)
-    distortion = _numbers(fields, "d", 1).ravel()
+    intrinsic = info_numbers(fields, "k").reshape(3, -1)
+    distortion = info_numbers(fields, "d")
     stated = fields.distortion_model
     model = _MODELS.get(stated.strip().lower().replace("-", "_").replace(" ", "_"), stated)
     if min(fields.width, fields.height) <= 0:
@@ -243,7 +243,7 @@ def info_of(fields: Any, name: str, where: str, rectified: bool = False) -> Intr
         raise DriveError(f"{where}: the camera is not calibrated (K is zero); give camera_info as a file")
     turn = None
     if rectified:
-        projection = _numbers(fields, "p", 3)[:, :3]
+        projection = info_numbers(fields, "p").reshape(3, -1)[:, :3]
         if not projection.any() and distortion.any():
             raise DriveError(
                 f"{where}: states no P for its rectified images; set rectified: false if they are as the "
@@ -251,7 +251,7 @@ def info_of(fields: Any, name: str, where: str, rectified: bool = False) -> Intr
             )
         intrinsic = projection if projection.any() else intrinsic
         model, distortion = "plumb_bob", np.zeros(0)
-        turn = _numbers(fields, "r", 3)
+        turn = info_numbers(fields, "r").reshape(3, -1)
         turn = take_rotation(turn.tolist(), f"{where}, R", DriveError) if turn.any() else np.eye(3)
     region = (fields.roi.width, fields.roi.height)
     is_cropped = region not in ((0, 0), (fields.width, fields.height))  # the whole image may be stated, too
@@ -266,11 +266,11 @@ def info_of(fields: Any, name: str, where: str, rectified: bool = False) -> Intr
     return Intrinsics(check_camera(info, where, DriveError), turn)
 
 
-def _numbers(fields: Any, key: str, rows: int) -> FloatArray:
-    """A matrix of a ``CameraInfo`` message by its name in ROS 2, or in ROS 1."""
+def info_numbers(fields: Any, key: str) -> FloatArray:
+    """The numbers (N,) that a ``CameraInfo`` message has under a key of ROS 2, such as k, or of ROS 1: K."""
     values = getattr(fields, key, None)
     values = getattr(fields, key.upper()) if values is None else values
-    return np.array(values, dtype=np.float64).reshape(rows, -1)
+    return np.array(values, dtype=np.float64).reshape(-1)
 
 
 def read_rectification(path: Path) -> FloatArray:

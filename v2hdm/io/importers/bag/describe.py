@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import DriveError
+from v2hdm.io.importers.bag import messages as kinds
 from v2hdm.io.importers.bag.cameras import CameraTopic, Choice, choose_cameras, info_of_images
-from v2hdm.io.importers.bag.entries import MOST_NAMES, Entry, Recording, camera_entry, part_of, poses_entry
-from v2hdm.io.importers.bag.frames import VEHICLES
+from v2hdm.io.importers.bag.entries import Entry, Recording, camera_entry, part_of, poses_entry
+from v2hdm.io.importers.bag.frames import MOST_NAMES, VEHICLES
 from v2hdm.io.importers.bag.positions import position_candidates, the_one
 from v2hdm.io.importers.bag.reading import bag_files
-from v2hdm.io.importers.bag.samples import IMAGE_KINDS, InfoSample, Samples, samples_of
+from v2hdm.io.importers.bag.samples import InfoSample, Samples, samples_of
 from v2hdm.io.importers.bag.streams import TfStream, import_streams
 from v2hdm.store.files import dump_yaml, load_yaml
 from v2hdm.store.folders import entry_folder, is_whole, new_entry
@@ -90,7 +91,7 @@ class BagDescription:
         self._answers = answers or {}
         self._samples = samples or samples_of(path)
         if not self._samples.images:
-            raise DriveError(f"{path}: has no image topic ({', '.join(IMAGE_KINDS)}); not a drive")
+            raise DriveError(f"{path}: has no image topic ({', '.join(kinds.IMAGE_KINDS)}); not a drive")
         stream = TfStream(f"{path}: tf", needed=False)
         self._frames = stream.frames(import_streams(path, [stream], cache)[0])
         topics = self._cameras(chosen)

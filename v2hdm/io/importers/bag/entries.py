@@ -12,9 +12,10 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.geometry.rigid import euler_from_rotation
+from v2hdm.io.description import PoseKeys
 from v2hdm.io.importers.bag import messages as kinds
 from v2hdm.io.importers.bag.cameras import CameraTopic
-from v2hdm.io.importers.bag.frames import TF_TOPIC, Frames
+from v2hdm.io.importers.bag.frames import MOST_NAMES, TF_TOPIC, Frames
 from v2hdm.io.importers.bag.mountings import Mount, frames_like, mount_of, mounting_of
 from v2hdm.io.importers.bag.positions import (
     Candidate,
@@ -33,10 +34,8 @@ MOUNTING = (
     "ten degrees: {{xyz_m: [2.1, 0, 1.6], rpy_deg: [0, 12, 0]}}"
 )
 LEVER_ARM = "m forward, left, up from {origin}: [1.2, 0, 1.8]"
-MOST_NAMES = 12  # of frames and topics that a question lists
 _MAPS = ("map", "odom")
 _TURNED = 1e-6  # elements of a rotation that are closer to the identity's are so by rounding
-_MAX_SIGMA_M = 0.1  # of the positions that are used, unless ``poses.max_sigma_m`` is given
 _ANTENNA = re.compile(r"gps|gnss|antenna|rtk|navsat", re.IGNORECASE)
 _PLACES = ("mounting", "cam_from_vehicle", "ipm")  # keys of which one says where a camera is
 _OF_FILES = ("tum", "csv", "nmea", "sbet", "pos", "ubx")  # keys of poses that are not of the bag
@@ -97,7 +96,7 @@ def poses_entry(recording: Recording, answers: object) -> Entry:
         return Entry({})
     stated = answers or {}
     max_sigma_m = stated.get("max_sigma_m")
-    limit_m = float(max_sigma_m) if isinstance(max_sigma_m, int | float) else _MAX_SIGMA_M
+    limit_m = float(max_sigma_m) if isinstance(max_sigma_m, int | float) else PoseKeys.max_sigma_m
     has_heading = bool({"heading_topic", "heading_file"} & set(stated))
     candidates = position_candidates(recording.samples, limit_m, recording.is_linked, has_heading)
     world = _world_of(recording)

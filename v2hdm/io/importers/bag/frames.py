@@ -23,7 +23,7 @@ VEHICLES = ("base_footprint", "base_link")
 ROW = 9
 """Numbers of a row: stamp, translation (3), quaternion (4), and 1 for one of ``/tf_static``."""
 
-_MOST_NAMES = 12  # of frames that a message lists
+MOST_NAMES = 12  # of frames or topics that a message lists; chosen
 
 _STILL_M = 0.003  # largest shift of a joint that is held still, m: play of a bracket; chosen
 _STILL_RAD = np.deg2rad(0.1)  # largest turn of a joint that is held still, rad; chosen
@@ -62,8 +62,8 @@ class Frames:
         """The tree's frame of that ``name``; DriveError where a tree has none, which says what it has."""
         frame = self.named(name) if self.names else name
         if frame is None:
-            first = ", ".join(self.names[:_MOST_NAMES])
-            more = f" and {len(self.names) - _MOST_NAMES} more" if len(self.names) > _MOST_NAMES else ""
+            first = ", ".join(self.names[:MOST_NAMES])
+            more = f" and {len(self.names) - MOST_NAMES} more" if len(self.names) > MOST_NAMES else ""
             raise DriveError(f"{where}: the bag's transforms have no frame '{name}'; they have {first}{more}")
         return frame
 

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, TextIO
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.io.calibration.reading import info_of
+from v2hdm.io.calibration.reading import info_numbers, info_of
 from v2hdm.io.calibration.writing import write_camera_info
 from v2hdm.io.image_lists import image_order, write_image_list
 from v2hdm.io.importers.bag import messages as kinds
@@ -84,7 +84,7 @@ class ImageStream(Stream):
     """Images of a topic as files, with their list."""
 
     def __init__(self, topic: str, stamps: str, where: str) -> None:
-        need = Need(topic, (*kinds.IMAGE_KINDS, kinds.VIDEO), where)
+        need = Need(topic, kinds.IMAGE_KINDS, where)
         super().__init__(topic, ["images with colours", stamps], where, [need])
         self._stamps = stamps
 
@@ -272,9 +272,8 @@ def write_streams(path: Path, streams: Mapping[Path, Stream]) -> None:
 
 
 def _lens(fields: Any) -> list[float]:
-    """Size, camera matrix and distortion, by the names of ROS 2 or ROS 1."""
-    matrix, distortion = (fields.k, fields.d) if hasattr(fields, "k") else (fields.K, fields.D)
-    return [fields.width, fields.height, *matrix, *distortion]
+    """Size, camera matrix and distortion."""
+    return [fields.width, fields.height, *info_numbers(fields, "k"), *info_numbers(fields, "d")]
 
 
 def stamp_of(message: Message, stamps: str) -> float:
