@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from tests.drive.bags import Messages, messages_of, mountings, topics_for, write_ros2
-from tests.drive.example import make_drive
 from tests.drive.test_bags import read
 from v2hdm.errors import DriveError
 from v2hdm.geometry.frames import edges_of
@@ -22,13 +21,6 @@ TURN = rotation_from_euler(*np.radians([[0.4], [0.9], [-0.3]]))[0]
 LENS = CameraInfo(
     "cam", 64, 48, np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]), "plumb_bob", (-0.2, 0, 0, 0, 0)
 )
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    root = tmp_path_factory.mktemp("folder")
-    make_drive(root)
-    return root
 
 
 def rectified_bag(folder, path, topic):

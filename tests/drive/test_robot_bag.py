@@ -8,7 +8,6 @@ import pytest
 import yaml
 
 from tests.drive.bags import assert_same_poses, messages_of, write_ros1, write_ros2
-from tests.drive.example import make_drive
 from tests.drive.test_frames import AXLE_M, at, composed, tree_of
 from v2hdm.cli.main import run
 from v2hdm.errors import DriveError
@@ -18,19 +17,9 @@ from v2hdm.io.calibration.reading import info_of
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.io.drive.draft import draft_drive
 
+pytestmark = pytest.mark.usefixtures("working_directory")
+
 PREFIX = "tractor_07/"
-
-
-@pytest.fixture(autouse=True)
-def working_directory(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    root = tmp_path_factory.mktemp("folder")
-    make_drive(root)
-    return root
 
 
 def robot(folder, infos="none", ros1=False, footprint=False):
