@@ -1,4 +1,4 @@
-"""What several commands share: arguments on a drive or a result, its folder, progress and the exit code."""
+"""Parts that several commands share: arguments on a drive or result, its folder, progress, the exit code."""
 
 from __future__ import annotations
 

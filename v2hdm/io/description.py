@@ -1,4 +1,4 @@
-"""What a ``drive.yaml`` says (docs/drive-format.md): its keys and their meanings, and names of files.
+"""The keys of a ``drive.yaml`` (docs/drive-format.md) with their meanings, and names of files.
 
 The readers take their keys from here, and so does the schema with which editors complete the file.
 """

@@ -82,7 +82,7 @@ def _values_of(settings: Sequence[str]) -> dict[str, object]:
 
 
 class _Draft(NamedTuple):
-    """What a recording tells of its drive."""
+    """The drive as far as a recording tells."""
 
     content: dict[str, Any]  # of its drive.yaml
     missing: dict[str, str]  # dotted keys, with what to give for each

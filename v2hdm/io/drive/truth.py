@@ -94,7 +94,7 @@ def _joined_truth(drive: Drive) -> Truth:
 
 
 def _of_symbols(truth: Truth) -> FloatArray:
-    """What the images show of the symbols (I, S)."""
+    """The visible shares (I, S) of the symbols in each image."""
     visibility = truth.symbol_visibility
     if visibility is None:
         return np.zeros((len(truth.visibility), len(truth.map.symbols)))
@@ -147,7 +147,7 @@ def _read_sightings(path: Path, images: Sequence[Image], markings: int) -> Float
 
 
 def _read_texts(path: Path, symbols: int) -> Mapping[int, str]:
-    """What the symbols of a map say, by their number."""
+    """The texts of a map's symbols, by their number."""
     texts: dict[int, str] = {}
     for where, (symbol, text) in _rows(path, TEXTS) if path.is_file() else ():
         if not symbol.isdecimal() or int(symbol) >= symbols or not text:

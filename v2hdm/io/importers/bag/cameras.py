@@ -107,7 +107,7 @@ def _why_no_camera(image: ImageSample) -> str:
 
 
 def _order(topic: CameraTopic, most: int) -> tuple[object, ...]:
-    """What puts a sensor's best topic first: readable, calibrated, frequent, as the sensor has it."""
+    """A key that sorts a sensor's best topic first: readable, calibrated, frequent, as the sensor has it."""
     image = topic.image
     last = _base(image.name).rpartition("/")[2]
     rarity = round(math.log(most / image.messages, _OFTEN))

@@ -60,7 +60,7 @@ class Recording(NamedTuple):
 
     @property
     def origin(self) -> str:
-        """What positions on the vehicle count from, in words."""
+        """The origin of positions on the vehicle, in words."""
         return self.vehicle or ORIGIN
 
     def vehicle_from(self, sensor: str) -> FloatArray | None:
@@ -213,7 +213,7 @@ def _heading_of(
 
 
 def _lever_arm(recording: Recording, position: PoseSample) -> str:
-    """What is asked where nothing tells where on the vehicle positions are of."""
+    """The question for the place on the vehicle that positions are of, where nothing tells."""
     if not position.frame and position.kind not in (kinds.FIX, kinds.NMEA):
         return (
             f"{position.name} does not say of which frame its poses are: that frame's origin, m "
@@ -264,7 +264,7 @@ def camera_entry(
 
 
 def _lens(recording: Recording, info: InfoSample | None) -> str:
-    """What is asked where the bag has no intrinsics of a camera."""
+    """The question for the intrinsics of a camera, where the bag has none."""
     if info is not None:
         return f"{LENS} ({info.name}: {info.problem})"
     others = [sample.name for sample in recording.samples.infos.values() if not sample.problem]
@@ -272,7 +272,7 @@ def _lens(recording: Recording, info: InfoSample | None) -> str:
 
 
 def _mounting(recording: Recording, name: str, mount: Mount) -> str:
-    """What is asked where the bag does not tell where a camera is."""
+    """The question for the mounting of a camera, where the bag does not tell."""
     asked = MOUNTING.format(origin=recording.origin)
     if mount.offer:
         return f"{mount.problem}; if the images are of a camera that looks along its x axis: {mount.offer}"

@@ -198,7 +198,7 @@ class Frames:
         return f"{edge[1]} moves on {edge[0]} while recorded, by up to {much}"
 
     def _contradicts(self, edge: Edge, dst: str, src: str, path: Path) -> str:
-        """That a way around an edge of ``path`` leads elsewhere; nothing where there is none, or it agrees.
+        """The complaint if a way around an edge of ``path`` leads elsewhere; empty where none does.
 
         A frame that hangs on two others is no tree, and TF keeps whichever was stated last.
         """

@@ -32,7 +32,7 @@ _SURE_HEADING_RAD = np.deg2rad(20)  # a heading with a larger sigma is none; cho
 
 
 class Reference(enum.IntEnum):
-    """What a topic's poses count from, as far as its type, frame and name tell."""
+    """The origin that a topic's poses count from, as far as its type, frame and name tell."""
 
     START = 0
     OPEN = 1

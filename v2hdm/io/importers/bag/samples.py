@@ -1,4 +1,4 @@
-"""What the first messages of a bag's topics show of them: images, lenses, poses and headings."""
+"""Samples of a bag's topics, from their first messages: images, lenses, poses and headings."""
 
 from __future__ import annotations
 
