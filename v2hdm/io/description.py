@@ -25,6 +25,9 @@ class InfoFile:
 
     file: Annotated[str, "file of ROS, Kalibr, OpenCV or COLMAP."]
     camera: Annotated[str | int | None, "the camera to use if the file has several."] = None
+    rectified: Annotated[
+        bool | None, "whether the images are rectified: P counts; default: as their topic's name says."
+    ] = None
 
 
 @dataclass(kw_only=True)

@@ -39,6 +39,7 @@ from v2hdm.io.importers.readings import Readings
 from v2hdm.records import FloatArray
 from v2hdm.safe.pixels import png
 from v2hdm.store.folders import entry_folder, is_whole, new_entry
+from v2hdm.store.remarks import keeping_warnings, tell_again
 
 _log = logging.getLogger(__name__)
 
@@ -240,6 +241,9 @@ def import_streams(path: Path, streams: Sequence[Stream], cache: Path) -> list[P
     missing = {
         folder: stream for folder, stream in zip(folders, streams, strict=True) if not is_whole(folder)
     }
+    for folder, stream in zip(folders, streams, strict=True):
+        if folder not in missing:
+            tell_again(folder, stream.where)
     if not missing:
         return folders
     size_mb = sum(file.stat().st_size for file in files) / 1e6
@@ -253,22 +257,32 @@ def import_streams(path: Path, streams: Sequence[Stream], cache: Path) -> list[P
 
 def write_streams(path: Path, streams: Mapping[Path, Stream]) -> None:
     """Write streams of the bag at ``path`` into their folders, in one pass."""
-    takers: dict[str, list[Writer]] = defaultdict(list)
-    writers: list[Writer] = []
-    with open_bag(path) as bag, ExitStack() as unfinished:
+    takers: dict[str, list[_Taker]] = defaultdict(list)
+    everyone: list[_Taker] = []
+    with open_bag(path) as bag, keeping_warnings() as keeper, ExitStack() as unfinished:
         for folder, stream in streams.items():
             topics = stream.topics(bag)
-            writer = stream.write(folder)
-            unfinished.callback(writer.close)
-            writers.append(writer)
-            next(writer)
+            taker = _Taker(stream.write(folder), folder, stream.where)
+            unfinished.callback(taker.writer.close)
+            everyone.append(taker)
+            next(taker.writer)
             for topic in topics:
-                takers[topic].append(writer)
+                takers[topic].append(taker)
         for message in bag.messages(takers):
-            for writer in takers[message.topic]:
-                writer.send(message)
-        for writer in writers:
-            next(writer, None)  # sends None
+            for taker in takers[message.topic]:
+                keeper.turn_to(taker.folder, taker.where)
+                taker.writer.send(message)
+        for taker in everyone:
+            keeper.turn_to(taker.folder, taker.where)
+            next(taker.writer, None)  # sends None
+
+
+class _Taker(NamedTuple):
+    """The writer of a stream, its folder, and where its topic is named."""
+
+    writer: Writer
+    folder: Path
+    where: str
 
 
 def _lens(fields: Any) -> list[float]:
