@@ -128,14 +128,32 @@ def _best_poses(
             beside = f", not of {'; '.join(others[:MOST_NAMES])}" if others else ""
             entry.notes.append(f"poses of {best.about}{beside}")
         return entry
-    offers = []
-    for candidate in candidates:
-        also = [key for key in _entry_of(recording, candidate.sample, stated).missing if not candidate.doubt]
-        offers.append(candidate.about + (f", then also {' and '.join(also)}" if also else ""))
+    offers = [candidate.about for candidate in candidates]
     if world is not None:
         offers.append(f"{TF_TOPIC} (from {world.content['frame']})")
     asked = "the topic of poses on the Earth, best RTK; the bag has "
-    return Entry({"topic": "?"}, {"poses.topic": asked + ("; ".join(offers[:MOST_NAMES]) or "none")})
+    question = {"poses.topic": asked + ("; ".join(offers[:MOST_NAMES]) or "none")}
+    possible = [candidate for candidate in candidates if not candidate.doubt] or candidates
+    positions = [candidate.sample for candidate in possible[:MOST_NAMES]]
+    return Entry({"topic": "?"}, question | _further(recording, positions, stated))
+
+
+def _further(
+    recording: Recording, positions: Sequence[PoseSample], stated: Mapping[str, Any]
+) -> dict[str, str]:
+    """Further questions by their keys, of all topics that may be chosen or of some, which they name."""
+    topics_by_question: dict[str, dict[str, list[str]]] = {}
+    for position in positions:
+        for key, asked in _entry_of(recording, position, stated).missing.items():
+            topics_by_question.setdefault(key, {}).setdefault(asked, []).append(position.name)
+    missing = {}
+    for key, topics in topics_by_question.items():
+        is_of_all = len(topics) == 1 and len(*topics.values()) == len(positions)
+        texts = [
+            asked if is_of_all else f"for {' or '.join(names)}: {asked}" for asked, names in topics.items()
+        ]
+        missing[key] = "; ".join(texts)
+    return missing
 
 
 class _World(NamedTuple):
