@@ -148,10 +148,10 @@ def _further(
             topics_by_question.setdefault(key, {}).setdefault(asked, []).append(position.name)
     missing = {}
     for key, topics in topics_by_question.items():
-        is_of_all = len(topics) == 1 and len(*topics.values()) == len(positions)
-        texts = [
-            asked if is_of_all else f"for {' or '.join(names)}: {asked}" for asked, names in topics.items()
-        ]
+        texts = []
+        for asked, names in topics.items():
+            is_of_all = len(names) == len(positions)
+            texts.append(asked if is_of_all else f"for {' or '.join(names)}: {asked}")
         missing[key] = "; ".join(texts)
     return missing
 

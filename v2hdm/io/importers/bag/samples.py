@@ -115,8 +115,9 @@ def sample_bag(path: Path) -> dict[str, list[dict[str, Any]]]:
     with open_bag(path) as bag:
         recorded = [topic for topic in bag.topics.values() if topic.messages]
         tracks = [topic for topic in recorded if topic.messages > 1]
+        cameras = [topic for topic in recorded if topic.kind in kinds.IMAGE_KINDS]
         samples: dict[str, Sequence[Sample]] = {
-            "images": [_image_sample(bag, topic) for topic in recorded if topic.kind in kinds.IMAGE_KINDS],
+            "images": [_image_sample(bag, topic) for topic in cameras],
             "infos": [_info_sample(bag, topic) for topic in recorded if topic.kind == INFO_KIND],
             "poses": [_pose_sample(bag, topic) for topic in tracks if topic.kind in POSE_KINDS],
             "headings": [
