@@ -134,8 +134,9 @@ def test_arrays_that_do_not_belong_together_are_refused():
 
 def _told(folder, *program, **environment):
     """What a new process tells, with the package from a folder."""
+    environment = {native.SWITCH: "1", "PYTHONPATH": str(folder), **environment}
     told = subprocess.run(
-        [sys.executable, *program], cwd=folder, env={**os.environ, "PYTHONPATH": str(folder), **environment},
+        [sys.executable, *program], cwd=folder, env=os.environ | environment,
         capture_output=True, text=True, timeout=60, check=True,
     )  # fmt: skip
     return told.stdout + told.stderr
@@ -157,8 +158,10 @@ def copied(tmp_path_factory):
 
 
 def test_without_kernels_numpy_detects_and_one_line_says_so(copied):
-    line = "nothing is compiled: detection runs in numpy, at half the speed; with a C++ compiler, install v2hdm again"
-    assert _told(copied, "-c", LOAD) == f"{line}\n"
+    assert _told(copied, "-c", LOAD) == (
+        "nothing is compiled: detection runs in numpy, at half the speed; "
+        "with a C++ compiler, install v2hdm again\n"
+    )
     assert _told(copied, "-m", "v2hdm", "--version").endswith("detector in numpy (nothing is compiled)\n")
 
 
