@@ -18,7 +18,6 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from importlib import metadata
 from pathlib import Path
 
 from v2hdm import __version__
@@ -146,6 +145,8 @@ def answer_signals() -> None:
 
 def version_line() -> str:
     """The versions of this package, its libraries and weights, in one line; nothing of it is imported."""
+    from importlib import metadata
+
     parts = [f"v2hdm {__version__}"]
     for packages in (("torch",), ("onnxruntime", "onnxruntime-gpu"), ("numba",)):
         versions = []
