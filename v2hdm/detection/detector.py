@@ -26,6 +26,7 @@ from v2hdm.detection.stopwatch import lap
 from v2hdm.detection.weights import NETWORK_FILE, check_weights
 from v2hdm.doors import checked
 from v2hdm.errors import DetectorError
+from v2hdm.native import tell_missing
 from v2hdm.records import BoolArray, Camera, LaneDetection, MarkingDetection
 from v2hdm.safe.texts import shown
 
@@ -63,6 +64,7 @@ class Detector:
         Raises DetectorError where the model cannot be used, or the shipped files do not belong together.
         """
         options = options or DetectorOptions()
+        tell_missing()
         check_weights()
         path = path if path is not None else options.model
         network = Network(None if path is None else Path(path), options.threads, options.device)

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from v2hdm.records import BoolArray, FloatArray, IntArray
@@ -129,6 +128,8 @@ def rectangle_size(points: FloatArray) -> tuple[float, float]:
     finite = points[np.isfinite(points[:, 0])]
     if len(finite) < 3:
         return float("nan"), float("nan")
+    import cv2  # as in rigid.rotation_from_vector
+
     _, size, _ = cv2.minAreaRect(finite.astype(np.float32))
     return float(max(size)), float(min(size))
 
@@ -240,6 +241,8 @@ class Alignment(NamedTuple):
 
 def quad_from_hull(hull: np.ndarray) -> FloatArray | None:
     """The tightest quadrilateral (4, 2) about a hull (N, 1, 2), or None (Low and Ilie 2003, approxPolyN)."""
+    import cv2  # as in rigid.rotation_from_vector
+
     if len(hull) < 4 or cv2.contourArea(hull) < 1.0:
         return None
     quad = np.asarray(cv2.approxPolyN(hull, 4), dtype=np.float64).reshape(-1, 2)
