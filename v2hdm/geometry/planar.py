@@ -136,6 +136,8 @@ def rectangle_size(points: FloatArray) -> tuple[float, float]:
 
 def smallest_rectangle(points: FloatArray) -> FloatArray:
     """Corners (4, 2) of the smallest rectangle around points (N, 2)."""
+    import cv2  # as in rigid.rotation_from_vector
+
     middle = points.mean(axis=0)  # OpenCV computes in float32: far from the origin that is too coarse
     box = cv2.boxPoints(cv2.minAreaRect((points - middle).astype(np.float32)))
     return np.asarray(box.astype(np.float64) + middle)
