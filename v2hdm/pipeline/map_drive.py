@@ -103,12 +103,9 @@ def map_drive(
     ('PASS', (4, 4))
     """
     context = context or _context_of(cache, progress, workers)
-    options = _with_corrections(options or MappingOptions(), corrections)
+    options = _options_of(options or MappingOptions(), corrections)
     reading = reading or ReadOptions()
-    sources = [drive] if isinstance(drive, Source) else list(drive)
-    if not sources:
-        raise ConfigError("map_drive: no drive is given; give one, or a list of them")
-    check_options(options)
+    sources = _sources_of(drive)
     check_choice(options, len(sources), base is not None, accuracy_goal_cm)
     read = read_all(sources, reading, context)
     earlier = _earlier(base, read.whole, context)
@@ -128,11 +125,20 @@ def _context_of(cache: Path | str | None, progress: Progress, workers: int) -> C
     return Context(StageCache(None if cache is None else Path(cache)), progress, workers=workers)
 
 
-def _with_corrections(options: MappingOptions, path: Path | str | None) -> MappingOptions:
-    if path is None:
-        return options
-    stated = read_corrections(Path(path))
-    return replace(options, acceptance=replace(options.acceptance, corrections=stated))
+def _options_of(options: MappingOptions, corrections: Path | str | None) -> MappingOptions:
+    """The checked options, with the corrections in a file."""
+    if corrections is not None:
+        stated = read_corrections(Path(corrections))
+        options = replace(options, acceptance=replace(options.acceptance, corrections=stated))
+    check_options(options)
+    return options
+
+
+def _sources_of(drive: Source | Iterable[Source]) -> list[Source]:
+    sources = [drive] if isinstance(drive, Source) else list(drive)
+    if not sources:
+        raise ConfigError("map_drive: no drive is given; give one, or a list of them")
+    return sources
 
 
 def _earlier(base: Path | str | None, drive: Drive, context: Context) -> Base | None:
