@@ -16,6 +16,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from v2hdm.association.ground import BORDER_PX, Views
 from v2hdm.association.sightings import Rig
@@ -65,9 +66,12 @@ class Watch:
         no two images tell, the ratio is 0.
         """
         odds = np.zeros(is_end.shape)
-        # Neighbouring ends are seen in the same images.
+        # Neighbouring ends are seen in the same images: along the route each of these is read about once.
         read = lru_cache(maxsize=16)(self._log_grey)
-        for group, side in np.argwhere(is_end).tolist():
+        route = cKDTree(self.rig.map_from_vehicle[:, :2, 3])
+        frame = route.query(np.nan_to_num(corners_map.mean(axis=1)))[1]
+        ends = np.argwhere(is_end)
+        for group, side in ends[np.argsort(frame[ends[:, 0]], kind="stable")].tolist():
             end = _End.of(corners_map[group], side, self._height_m(corners_map[group]))
             of_pairs = [self._better_ground(end, far, near, read) for far, near in self._pairs(end)]
             differences_z = [value for value in of_pairs if value is not None]
