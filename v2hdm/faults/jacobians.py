@@ -117,7 +117,8 @@ class Jacobians:
         solved = whitening.reduced_factor.solve_transposed(whitened.reduced)
         states, kept_steps = from_tiles(plan, solved[:-tip], arrays.frame_count, len(arrays.states))
         by_camera = solved[-tip:].reshape(arrays.camera_count, arrays.camera_unknowns, -1)
-        extrinsic, clock = by_camera[:, :6], by_camera[:, 6:]
+        extrinsic = by_camera[:, :6]
+        clock = by_camera[:, 6:]
         tangents = extrinsic[:, None].expand(-1, arrays.moment_count, -1, -1)
         if arrays.states:
             by_moment = arrays.at_moments(states)
@@ -161,11 +162,11 @@ def _coupling_matrix(arrays: Arrays, coupled: Tensor) -> csr_array:
     """W' of all observations (K, 2, 6), ascending by corner, as a matrix (2 N, 6 P)."""
     corner = arrays.corner.cpu().numpy()
     pair = arrays.pair.cpu().numpy().astype(np.int64)
-    seen = np.bincount(corner, minlength=arrays.corner_count)  # observations of each corner
+    sightings = np.bincount(corner, minlength=arrays.corner_count)  # observations of each corner
     # A corner's row along x has all of its observations, then that along y.
     order = np.argsort(np.concatenate([2 * corner, 2 * corner + 1]), kind="stable")
     blocks = coupled.transpose(0, 1).reshape(-1, 6).cpu().numpy()[order]
     columns = 6 * np.tile(pair, 2)[order, None] + np.arange(6)
-    begin = 6 * np.concatenate([[0], np.cumsum(np.repeat(seen, 2))])
+    begin = 6 * np.concatenate([[0], np.cumsum(np.repeat(sightings, 2))])
     shape = (2 * arrays.corner_count, 6 * arrays.pair_count)
     return csr_array((blocks.ravel(), columns.ravel(), begin), shape=shape)

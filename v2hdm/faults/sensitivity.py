@@ -153,8 +153,8 @@ class Sensitivity:
     def in_parts(self, columns: Iterable[_Item]) -> Iterator[list[_Item]]:
         """Columns, or what has one, in lists of as many as are in memory at a time."""
         most = max(min(_AT_ONCE, _NUMBERS_AT_ONCE // sum(row.numel() for row in self.residuals.values())), 1)
-        rest = iter(columns)
-        while part := list(islice(rest, most)):
+        iterator = iter(columns)
+        while part := list(islice(iterator, most)):
             yield part
 
     def efficient_columns(self, columns: Sequence[Rows]) -> FloatArray:
@@ -324,8 +324,8 @@ def height_information(solution: Solution, heights: Any) -> tuple[FloatArray, Fl
     lifted = unit.cpu().numpy()[:, :, None]
     for begin in range(0, len(observed), _AT_ONCE):
         heights_m = by_column[:, begin : begin + _AT_ONCE].toarray()
-        seen = (lifted * heights_m).reshape(-1, heights_m.shape[1])
-        whitened = solved.jacobians.whiten(seen, [None] * heights_m.shape[1])
+        by_height = (lifted * heights_m).reshape(-1, heights_m.shape[1])
+        whitened = solved.jacobians.whiten(by_height, [None] * heights_m.shape[1])
         coupled[begin : begin + _AT_ONCE] = torch.cat([whitened.reduced, whitened.corners.flatten(0, 1)]).mT
     information[np.ix_(observed, observed)] -= (coupled @ coupled.mT).cpu().numpy()
     gradient = columns.T @ (unit * solved.residuals["observations"]).sum(0).cpu().numpy()

@@ -414,7 +414,8 @@ def _explained(traces: Traces, vertices: FloatArray, shift_px: FloatArray, sigma
     # By coordinate: sums over an axis of two are slow.
     along_u, along_v = np.moveaxis(side / length[..., None], -1, 0)[:, image]
     point_u, point_v = (traces.points_px - shift_px[image]).T[..., None]
-    offset_u, offset_v = point_u - pixel[image, :, 0], point_v - pixel[image, :, 1]
+    offset_u = point_u - pixel[image, :, 0]
+    offset_v = point_v - pixel[image, :, 1]
     along_px = offset_u * along_u + offset_v * along_v
     off = along_u * offset_v - along_v * offset_u
     end = np.nan_to_num(np.minimum(along_px, length[image] - along_px))
