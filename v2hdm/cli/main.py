@@ -24,6 +24,7 @@ from v2hdm import __version__
 from v2hdm.cli import commands
 from v2hdm.cli.command import Command, fail
 from v2hdm.errors import describe, one_line, shown
+from v2hdm.native import which_runs
 
 _FIRST = ("map", "detect", "check")  # at the head of the list, for those who look at it for the first time
 
@@ -159,4 +160,5 @@ def version_line() -> str:
         parts.append(f"weights {network[:8]}")
     except (OSError, ValueError, KeyError, TypeError):
         parts.append("no weights")
+    parts.append(which_runs())
     return ", ".join(parts)

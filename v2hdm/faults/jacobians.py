@@ -61,8 +61,8 @@ class Jacobians:
         by_point = torch.stack([of_u, of_v])
         by_tangent = torch.cat([by_point, torch.linalg.cross(points.expand_as(by_point), by_point)], dim=2)
         coupled = whitening.linearised.coupling(arrays.whole(), whitening.estimate.corners_map).clone()
-        if len(whitening.plan.kept):
-            coupled[torch.isin(arrays.corner.long(), whitening.plan.kept)] = 0.0
+        if len(whitening.plan.kept_corners):
+            coupled[torch.isin(arrays.corner.long(), whitening.plan.kept_corners)] = 0.0
         return cls(
             whitening,
             _matrix(by_tangent, arrays.pair, 6, arrays.pair_count),
@@ -91,10 +91,10 @@ class Jacobians:
                 cameras[:, :, number] += torch.cat([gradient.extrinsic, gradient.clock_s], dim=1)
         reduced = cameras.flatten(0, 1)
         if whitening.plan.tile_count:
-            tiles = to_tiles(whitening.plan, states, corners[whitening.plan.kept])
+            tiles = to_tiles(whitening.plan, states, corners[whitening.plan.kept_corners])
             reduced = torch.cat([tiles, reduced])
-        if len(whitening.plan.kept):
-            corners = corners.index_fill(0, whitening.plan.kept, 0.0)
+        if len(whitening.plan.kept_corners):
+            corners = corners.index_fill(0, whitening.plan.kept_corners, 0.0)
         return Whitened(whitening.reduced_factor.solve(reduced), corners)
 
     def _gathered(self, by_pair: Tensor) -> tuple[Tensor, Tensor]:
@@ -126,8 +126,8 @@ class Jacobians:
         if clock.shape[1]:
             tangents = tangents + torch.einsum("cmpq,cqn->cmpn", whitening.spread.clock, clock)
         corners = whitened.corners
-        if len(plan.kept):
-            corners = corners.index_copy(0, plan.kept, kept_steps)
+        if len(plan.kept_corners):
+            corners = corners.index_copy(0, plan.kept_corners, kept_steps)
         factor = whitening.linearised.corner_factor
         push = torch.as_tensor(self.coupling @ _matrix_of(tangents)).to(corners).view_as(corners)
         corners = factor.solve_transposed(corners - factor.solve(push))
