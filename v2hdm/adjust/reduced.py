@@ -202,8 +202,8 @@ def from_tiles(plan: Plan, rows: Tensor, frame_count: int, states: int) -> tuple
         return rows.new_zeros(frame_count, states, *trailing), rows.new_zeros(0, 2, *trailing)
     tiles = rows.view(plan.tile_count, plan.size, *trailing)[plan.position]
     frames = tiles[: plan.frame_tiles].reshape(-1, states, *trailing)[:frame_count]
-    corners = tiles[plan.frame_tiles :, : plan.size // 2 * 2].reshape(-1, 2, *trailing)[: len(plan.kept_corners)]
-    return frames, corners
+    corners = tiles[plan.frame_tiles :, : plan.size // 2 * 2].reshape(-1, 2, *trailing)
+    return frames, corners[: len(plan.kept_corners)]
 
 
 @dataclass(frozen=True)
