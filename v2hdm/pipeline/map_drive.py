@@ -102,19 +102,10 @@ def map_drive(
     >>> result.verdict.status.value, result.calibrations["front"].cam_from_vehicle.shape
     ('PASS', (4, 4))
     """
-    if cache is not None and Path(cache).is_file():
-        raise ConfigError(f"cache {cache}: is a file; give a folder")
-    stages = StageCache(None if cache is None else Path(cache))
-    context = context or Context(stages, progress, workers=workers)
-    options = options or MappingOptions()
+    context = context or _context_of(cache, progress, workers)
+    options = _options_of(options or MappingOptions(), corrections)
     reading = reading or ReadOptions()
-    if corrections is not None:
-        stated = read_corrections(Path(corrections))
-        options = replace(options, acceptance=replace(options.acceptance, corrections=stated))
-    sources = [drive] if isinstance(drive, Source) else list(drive)
-    if not sources:
-        raise ConfigError("map_drive: no drive is given; give one, or a list of them")
-    check_options(options)
+    sources = _sources_of(drive)
     check_choice(options, len(sources), base is not None, accuracy_goal_cm)
     read = read_all(sources, reading, context)
     earlier = _earlier(base, read.whole, context)
@@ -126,6 +117,28 @@ def map_drive(
     described = inspection.drive_as_described
     mapped_so_far = Result(about, read.drives, read.contents, described, context.seconds, options.device)
     return _mapped(mapped_so_far, inspection, detector, survey, earlier, accuracy_goal_cm, context, all_maps)
+
+
+def _context_of(cache: Path | str | None, progress: Progress, workers: int) -> Context:
+    if cache is not None and Path(cache).is_file():
+        raise ConfigError(f"cache {cache}: is a file; give a folder")
+    return Context(StageCache(None if cache is None else Path(cache)), progress, workers=workers)
+
+
+def _options_of(options: MappingOptions, corrections: Path | str | None) -> MappingOptions:
+    """The checked options, with the corrections in a file."""
+    if corrections is not None:
+        stated = read_corrections(Path(corrections))
+        options = replace(options, acceptance=replace(options.acceptance, corrections=stated))
+    check_options(options)
+    return options
+
+
+def _sources_of(drive: Source | Iterable[Source]) -> list[Source]:
+    sources = [drive] if isinstance(drive, Source) else list(drive)
+    if not sources:
+        raise ConfigError("map_drive: no drive is given; give one, or a list of them")
+    return sources
 
 
 def _earlier(base: Path | str | None, drive: Drive, context: Context) -> Base | None:
