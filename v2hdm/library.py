@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 from v2hdm.doors import check_types, checked
 from v2hdm.errors import MapFileError
@@ -13,7 +13,7 @@ from v2hdm.io.drive import as_drive, read_drive
 from v2hdm.io.maps.reading import read_map as _read
 from v2hdm.progress import Steps
 from v2hdm.records import Drive, HDMap, ImageDetections
-from v2hdm.settings import TOLERANCE_M, Processes
+from v2hdm.settings import Processes, Tolerance
 from v2hdm.store.names import map_file
 
 if TYPE_CHECKING:  # load torch or scipy
@@ -44,7 +44,7 @@ def compare_maps(
     built: HDMap,
     design: HDMap | str | Path,
     *,
-    tolerance_m: Annotated[float, TOLERANCE_M] = 0.05,
+    tolerance_m: Tolerance = 0.05,
     results: str | Path | None = None,
 ) -> Comparison:
     """Compare the paint of a map with its design: each shape right, off, missing or not inspected.
@@ -65,7 +65,7 @@ def compare_maps(
     (True, 0)
     """
     from v2hdm.asbuilt.comparison import compare_with_design
-    from v2hdm.asbuilt.decisions import Tolerance
+    from v2hdm.asbuilt.decisions import Tolerances
     from v2hdm.asbuilt.design import design_of_map
     from v2hdm.asbuilt.ground import read_mosaic
     from v2hdm.asbuilt.reading import read_design
@@ -77,7 +77,7 @@ def compare_maps(
     else:
         meant = read_design(Path(design), built)
     mosaic = None if results is None else read_mosaic(Path(results))
-    return compare_with_design(built, meant, Tolerance(tolerance_m, tolerance_m), mosaic)
+    return compare_with_design(built, meant, Tolerances(tolerance_m, tolerance_m), mosaic)
 
 
 @checked

@@ -8,7 +8,7 @@ import pytest
 
 from tests.asbuilt.site import DASH, layout, mapped, moved, turned
 from v2hdm.asbuilt.comparison import compare_with_design
-from v2hdm.asbuilt.decisions import Fate, Tolerance, decided
+from v2hdm.asbuilt.decisions import Fate, Tolerances, decided
 from v2hdm.asbuilt.design import Design, DesignShape
 from v2hdm.asbuilt.ground import Mosaic, read_mosaic
 from v2hdm.errors import MapFileError
@@ -16,7 +16,7 @@ from v2hdm.records import HDMap
 from v2hdm.store.files import write_json
 from v2hdm.store.names import MOSAIC_EXTENT, MOSAIC_PICTURE
 
-TOLERANCE = Tolerance(0.05, 0.05)
+TOLERANCE = Tolerances(0.05, 0.05)
 
 
 def fates(comparison):

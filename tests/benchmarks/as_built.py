@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from v2hdm.asbuilt.comparison import Comparison, compare_with_design
-from v2hdm.asbuilt.decisions import Fate, Tolerance, axes_of, sizes_of
+from v2hdm.asbuilt.decisions import Fate, Tolerances, axes_of, sizes_of
 from v2hdm.asbuilt.design import Design, DesignShape, outline_of
 from v2hdm.asbuilt.ground import read_mosaic
 from v2hdm.asbuilt.reading import read_design
@@ -51,7 +51,7 @@ def turned(points: FloatArray, turn_deg: float) -> FloatArray:
     return points @ np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
 
 
-def case_of(shapes: Sequence[DesignShape], tolerance: Tolerance, seed: int, motion: Sequence[float]) -> Case:
+def case_of(shapes: Sequence[DesignShape], tolerance: Tolerances, seed: int, motion: Sequence[float]) -> Case:
     """Shapes moved by known amounts, and the whole by a ``motion``."""
     rng = np.random.default_rng(seed)
     *_, turn_deg = motion
@@ -82,7 +82,7 @@ def case_of(shapes: Sequence[DesignShape], tolerance: Tolerance, seed: int, moti
     return Case(Design(tuple(out)), conforms, taken)
 
 
-def within(outline: FloatArray, off_m: FloatArray, turn_deg: float, tolerance: Tolerance) -> bool:
+def within(outline: FloatArray, off_m: FloatArray, turn_deg: float, tolerance: Tolerances) -> bool:
     """Whether paint that lies ``off_m`` (2,) from a shape, and turned, conforms to it."""
     corners = outline_of(outline).corners_map
     sizes = sizes_of(corners, axes_of(corners))
@@ -120,7 +120,7 @@ def main() -> None:
     hd_map = read_map(parsed.result)
     shapes = read_design(parsed.design, hd_map).shapes
     mosaic = read_mosaic(parsed.result)
-    tolerance = Tolerance()
+    tolerance = Tolerances()
     for motion in MOTIONS:
         for seed in range(parsed.seeds):
             case = case_of(shapes, tolerance, seed, motion)

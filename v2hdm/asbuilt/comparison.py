@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.asbuilt.decisions import Fate, Quantity, Tolerance, decided, judge
+from v2hdm.asbuilt.decisions import Fate, Quantity, Tolerances, decided, judge
 from v2hdm.asbuilt.design import (
     BuiltShape,
     Design,
@@ -67,7 +67,7 @@ class Comparison:
 
 
 def compare_with_design(
-    hd_map: HDMap, design: Design, tolerance: Tolerance, mosaic: Mosaic | None = None
+    hd_map: HDMap, design: Design, tolerance: Tolerances, mosaic: Mosaic | None = None
 ) -> Comparison:
     """Compare a map with a design in its frame.
 
@@ -122,7 +122,7 @@ def _judged(
     built: Sequence[BuiltShape],
     errors: Errors,
     misfit: Misfit,
-    tolerance: Tolerance,
+    tolerance: Tolerances,
 ) -> Finding:
     """The finding on the pair of number ``k``."""
     number = int(pairs.shape[k])

@@ -52,7 +52,7 @@ class Quantity:
         return decided(self.probability)
 
 
-class Tolerance(NamedTuple):
+class Tolerances(NamedTuple):
     """The largest differences from a design that conform.
 
     A marking may be turned until an end of it lies as far aside as its place may.
@@ -128,7 +128,7 @@ def judge(
     corners: FloatArray,
     covariance_m2: FloatArray,
     turn: int,
-    tolerance: Tolerance,
+    tolerance: Tolerances,
     has_size: bool,
 ) -> Judged:
     """Judge corners (4, 2) with a covariance (8, 8), m^2, against those of a shape (4, 2) of the design.
@@ -145,7 +145,7 @@ def judge(
     return result._replace(probability=max(result.probability, _MISREAD * misread))
 
 
-def _one_end_conforms(shape: FloatArray, every: FloatArray, axes: Axes, tolerance: Tolerance) -> float:
+def _one_end_conforms(shape: FloatArray, every: FloatArray, axes: Axes, tolerance: Tolerances) -> float:
     """The probability that all conforms but how far one end reaches, which the map may have misread."""
     ahead = sizes_of(shape, axes).ahead
     ends = np.maximum(np.stack([axes.length, -axes.length]), 0.0)  # weights of the corners of either end
@@ -156,7 +156,7 @@ def _one_end_conforms(shape: FloatArray, every: FloatArray, axes: Axes, toleranc
 
 
 def _against(
-    shape: FloatArray, every: FloatArray, axes: Axes, tolerance: Tolerance, has_size: bool
+    shape: FloatArray, every: FloatArray, axes: Axes, tolerance: Tolerances, has_size: bool
 ) -> Judged:
     """The quantities of corners and draws of them (1 + D, 4, 2) against a shape's."""
     meant = sizes_of(shape, axes)

@@ -37,7 +37,8 @@ _UNITS: Mapping[str, tuple[str, float]] = {
 
 _MOST_ASIDE_M = 0.5  # largest distance, m, of the next marking of a row from the line of the one before
 _MOST_TURNED = np.sin(np.deg2rad(20))  # sine of the largest turn from a marking of a row to the next; chosen
-_AHEAD_M = 30.0  # largest distance, m, from a marking of a row to the next
+_AHEAD_M = 100.0  # largest distance, m, in which the next marking of a row is looked for
+_BROKEN = 3.0  # times the usual spacing of a class beyond which a row has ended, and another begins; chosen
 
 
 class Rule(NamedTuple):
@@ -209,15 +210,21 @@ def _following(shapes: Sequence[BuiltShape]) -> list[int | None]:
     # Directions have no sign of their own: all point to the same half of the plane, along their row.
     main = np.linalg.eigh(np.einsum("ni,nj->ij", ahead, ahead))[1][:, 1]
     ahead = ahead * np.where(ahead @ main < 0, -1.0, 1.0)[:, None]
-    out: list[int | None] = []
+    next_shape = np.full(len(shapes), -1)
+    spacing_m = np.full(len(shapes), np.nan)
     for k, near in enumerate(cKDTree(centres).query_ball_point(centres, _AHEAD_M)):
         way = centres[near] - centres[k]
         along_m = way @ ahead[k]
         aside_m = np.abs(way @ turned_left(ahead[k]))
         turned = np.abs(cross(ahead[near], ahead[k][None]))
         fits = (along_m > 0) & (aside_m < _MOST_ASIDE_M) & (turned < _MOST_TURNED)
-        out.append(int(near[int(np.argmin(np.where(fits, along_m, np.inf)))]) if fits.any() else None)
-    return out
+        if fits.any():
+            nearest = int(np.argmin(np.where(fits, along_m, np.inf)))
+            next_shape[k] = near[nearest]
+            spacing_m[k] = along_m[nearest]
+    if np.isfinite(spacing_m).any():
+        next_shape[spacing_m > _BROKEN * np.nanmedian(spacing_m)] = -1
+    return [int(number) if number >= 0 else None for number in next_shape]
 
 
 def _finding(measured: _Measured, rules: Sequence[Rule]) -> Finding:

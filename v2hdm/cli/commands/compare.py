@@ -12,7 +12,7 @@ from v2hdm.errors import EXIT_FAILED_VERDICT, ConfigError
 
 if TYPE_CHECKING:
     from v2hdm.asbuilt.comparison import Finding
-    from v2hdm.asbuilt.decisions import Tolerance
+    from v2hdm.asbuilt.decisions import Tolerances
     from v2hdm.asbuilt.misfit import Misfit
     from v2hdm.asbuilt.reading import Source
     from v2hdm.records import HDMap
@@ -41,7 +41,7 @@ def _run(arguments: Sequence[str]) -> int:
     )
     parser.add_argument("--output", type=Path, metavar="DIR", help="default: outputs/<result>-compared")
     parsed = parser.parse_args(arguments)
-    from v2hdm.asbuilt.decisions import Tolerance
+    from v2hdm.asbuilt.decisions import Tolerances
     from v2hdm.asbuilt.reading import Source
     from v2hdm.asbuilt.writing import summary_lines, write_comparison
     from v2hdm.io.maps.reading import read_map
@@ -57,7 +57,7 @@ def _run(arguments: Sequence[str]) -> int:
     source = Source(parsed.crs, parsed.unit, _kinds_of(parsed.kinds))
     path = map_file(parsed.map)
     hd_map = read_map(path)[0]
-    tolerance = Tolerance(parsed.tolerance, size_m)
+    tolerance = Tolerances(parsed.tolerance, size_m)
     findings, misfit, conforms = _compared(hd_map, path.parent, parsed.design, tolerance, source)
     name = path.parent.resolve().name if parsed.map.is_dir() else path.stem
     folder = parsed.output or Path("outputs") / f"{name}-compared"
@@ -70,7 +70,7 @@ def _run(arguments: Sequence[str]) -> int:
 
 
 def _compared(
-    hd_map: HDMap, folder: Path, path: Path, tolerance: Tolerance, source: Source
+    hd_map: HDMap, folder: Path, path: Path, tolerance: Tolerances, source: Source
 ) -> tuple[Sequence[Finding], Misfit | None, bool]:
     """The findings, the misfit of the whole design, and whether all of it conforms."""
     from v2hdm.asbuilt.comparison import compare_with_design
