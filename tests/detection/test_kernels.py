@@ -100,6 +100,30 @@ def test_a_step_is_the_same_compiled_and_in_numpy(seed):
 
 @compiled
 @pytest.mark.parametrize("lens", sorted(LENSES))
+def test_the_same_pixels_are_looked_at_compiled_and_in_numpy(lens):
+    scene = Scene(3, lens)
+    # One marking is partly outside of the image, one so large that its pixels are thinned.
+    scene.start[0] += [scene.view.info.width - scene.start[0, 0, 0], 0.0]
+    scene.start[1] = np.array([[-150, 90], [140, 120], [150, -60], [-140, -90]]) + scene.start[1].mean(axis=0)
+
+    def lattices():
+        grid = lay_grid(scene.patches, scene.frames, scene.start)
+        return grid.lattice, lay_lattice(scene.patches, scene.frames, scene.start)
+
+    for lattice, lattice_too in zip(*twice(lattices), strict=True):
+        np.testing.assert_array_equal(lattice.count, lattice_too.count)
+        there = np.arange(lattice.use.shape[1]) < lattice.count
+        for name, array in vars(lattice).items():
+            array_too = getattr(lattice_too, name)
+            assert (array.shape, array.dtype) == (array_too.shape, array_too.dtype), name
+            if array.shape[-1] == there.shape[-1]:
+                shown = np.broadcast_to(there.reshape(len(there), *[1] * (array.ndim - 2), -1), array.shape)
+                array, array_too = array[shown], array_too[shown]
+            np.testing.assert_allclose(array, array_too, atol=2e-5, err_msg=name)
+
+
+@compiled
+@pytest.mark.parametrize("lens", sorted(LENSES))
 def test_corners_are_the_same_compiled_and_in_numpy(lens):
     scene = Scene(7, lens)
     cut = open_sides(scene.start, scene.view)

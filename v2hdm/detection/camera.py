@@ -21,7 +21,7 @@ from v2hdm.geometry.lens import distort_jacobian, distort_points, has_distortion
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import DISTORTION_COEFFICIENTS, BoolArray, Calibration, Camera, CameraInfo, FloatArray
 
-_LUT_STEP_PX = 4  # distance between the nodes of the table of the lens, px
+LUT_STEP_PX = 4  # distance between the nodes of the table of the lens, px
 _HORIZON_MARGIN_PX = 16  # rows above the horizon of the initial IPM that are looked at
 
 FARTHEST_M = 60.0  # distance, m, beyond which nothing is looked for: networks are shown none beyond 50 m
@@ -55,8 +55,8 @@ class Lens:
 
         The last are one cell beyond the image's border.
         """
-        columns = np.arange(0.0, self.info.width + _LUT_STEP_PX, _LUT_STEP_PX)
-        rows = np.arange(0.0, self.info.height + _LUT_STEP_PX, _LUT_STEP_PX)
+        columns = np.arange(0.0, self.info.width + LUT_STEP_PX, LUT_STEP_PX)
+        rows = np.arange(0.0, self.info.height + LUT_STEP_PX, LUT_STEP_PX)
         grid_px = np.stack(np.meshgrid(columns, rows), axis=-1)
         node = undistort_points(self.info, grid_px.reshape(-1, 2)).reshape(grid_px.shape)
         by_right = np.diff(node, axis=1)[:-1]
@@ -106,7 +106,7 @@ class RoadCamera:
             return points
         table = self.lens.table
         rows, columns = table.shape[2:]
-        u, v = points.T / _LUT_STEP_PX
+        u, v = points.T / LUT_STEP_PX
         column = np.clip(u.astype(np.intp), 0, columns - 1)
         row = np.clip(v.astype(np.intp), 0, rows - 1)
         right = u - column
