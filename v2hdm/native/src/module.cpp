@@ -5,4 +5,5 @@ NB_MODULE(_kernels, module) {
     module.attr("SOURCES") = V2HDM_SOURCES;
     v2hdm::add_settle(module);
     v2hdm::add_lattice(module);
+    v2hdm::add_lanes(module);
 }
