@@ -6,4 +6,5 @@ NB_MODULE(_kernels, module) {
     v2hdm::add_settle(module);
     v2hdm::add_lattice(module);
     v2hdm::add_lanes(module);
+    v2hdm::add_paint(module);
 }

@@ -8,5 +8,6 @@ namespace v2hdm {
 void add_settle(nanobind::module_& module);
 void add_lattice(nanobind::module_& module);
 void add_lanes(nanobind::module_& module);
+void add_paint(nanobind::module_& module);
 
 }  // namespace v2hdm
