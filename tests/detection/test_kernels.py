@@ -22,11 +22,12 @@ from tests.detection.pictures import (
 )
 from tests.docs.blocks import ROOT
 from v2hdm import __version__, native
+from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.lanes.boundaries import _STATES, _forward_backward
 from v2hdm.detection.lanes.chains import find_chains
 from v2hdm.detection.lanes.lines import trace_lanes
-from v2hdm.detection.quads.blobs import Blob
+from v2hdm.detection.quads.blobs import Blob, find_blobs
 from v2hdm.detection.quads.fit import fit_quadrilaterals
 from v2hdm.detection.quads.lattice import lay_grid, lay_lattice
 from v2hdm.detection.quads.patch import LensFrames
@@ -173,6 +174,38 @@ def test_paint_is_traced_alike_compiled_and_in_numpy(seed):
     assert len(traced) == len(traced_too) > 1
     for lane, lane_too in zip(traced, traced_too, strict=True):
         np.testing.assert_allclose(lane.points_px, lane_too.points_px, atol=1e-9)
+
+
+@compiled
+@pytest.mark.parametrize("seed", range(3))
+def test_pieces_of_paint_are_found_alike_compiled_and_in_numpy(seed):
+    rng = np.random.default_rng(seed)
+    odds = cv2.GaussianBlur(rng.standard_normal((120, 160)).astype(np.float32), (0, 0), 3.0) * 30 - 1
+    kinds = rng.normal(0, 2, (len(PAINT_CLASSES), 60, 80)).astype(np.float32)
+    (blobs, owner), (blobs_too, owner_too) = twice(lambda: find_blobs(output_of(odds, kinds)))
+    assert len(blobs) == len(blobs_too) > 5
+    assert any(blob.parts for blob in blobs)
+    np.testing.assert_array_equal(owner, owner_too)
+    for blob, blob_too in zip(blobs, blobs_too, strict=True):
+        for kind, score in blob.class_score.items():
+            assert score == pytest.approx(blob_too.class_score[kind], abs=1e-6)
+        np.testing.assert_allclose(blob.outline_px, blob_too.outline_px, atol=1e-5)
+        np.testing.assert_array_equal(blob.level, blob_too.level)
+        assert (blob.parts, blob.traced) == (blob_too.parts, blob_too.traced)
+
+
+@compiled
+@pytest.mark.parametrize("lens", sorted(LENSES))
+def test_lenses_are_undone_alike_compiled_and_in_numpy(lens):
+    view = RoadCamera(make_camera(lens), 16)
+    points_px = np.random.default_rng(0).uniform(-500, 2000, (200, 2))
+    points_px[:3] = [[np.nan, 5.0], [np.nan, np.nan], [1e300, -1e300]]
+    with np.errstate(invalid="ignore", over="ignore"):
+        pinhole_px, pinhole_px_too = twice(lambda: view.undistort(points_px))
+    np.testing.assert_allclose(pinhole_px[3:], pinhole_px_too[3:], rtol=1e-12)
+    recorded_px, recorded_px_too = twice(lambda: view.distort(pinhole_px[3:]))
+    np.testing.assert_allclose(recorded_px, recorded_px_too, rtol=1e-12)
+    np.testing.assert_array_equal(np.isfinite(pinhole_px), np.isfinite(pinhole_px_too))
 
 
 @compiled

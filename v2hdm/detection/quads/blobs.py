@@ -242,7 +242,7 @@ def outlines_of(level: np.ndarray, piece: np.ndarray, count: int) -> list[FloatA
 
 
 def _may_split(piece: np.ndarray, level: np.ndarray, present: BoolArray) -> BoolArray:
-    """Which of the pieces are of several groups, by those ``present`` (B, G), or have several parts of sure paint.
+    """Which pieces are of several groups, by those ``present`` (B, G), or have several parts of sure paint.
 
     Sure paint of two pieces never touches: it is labelled for all of them at once.
     """

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import NamedTuple
 
 import cv2
@@ -151,6 +151,11 @@ class LensFrames:
         middle = camera.undistort(within)
         return cls(camera, middle, camera.distort_jacobian(middle))
 
+    @cached_property
+    def from_px(self) -> FloatArray:
+        """Inverses (M, 2, 2) of the scales."""
+        return np.asarray(np.linalg.inv(self.scale))
+
     def take(self, rows: np.ndarray) -> LensFrames:
         """Some of the frames, which may come several times."""
         return LensFrames(self.camera, self.middle[rows], self.scale[rows])
@@ -162,7 +167,7 @@ class LensFrames:
 
     def to_pinhole(self, points: FloatArray) -> FloatArray:
         """Pinhole px (M, N, 2) of points (M, N, 2) of each marking."""
-        return np.asarray(points @ np.linalg.inv(self.scale).swapaxes(1, 2) + self.middle[:, None])
+        return np.asarray(points @ self.from_px.swapaxes(1, 2) + self.middle[:, None])
 
     def to_px(self, points: FloatArray) -> FloatArray:
         """Recorded px (M, N, 2) of points (M, N, 2) of each marking."""
@@ -171,7 +176,7 @@ class LensFrames:
     def jacobian(self, corners: FloatArray) -> FloatArray:
         """Derivative (M, 8, 8) of the recorded px of corners (M, 4, 2) by the corners."""
         slope = self.camera.distort_jacobian(self.to_pinhole(corners).reshape(-1, 2)).reshape(-1, 4, 2, 2)
-        return block_diagonal(slope @ np.linalg.inv(self.scale)[:, None])
+        return block_diagonal(slope @ self.from_px[:, None])
 
     def bow_px(self, corners_px: FloatArray) -> FloatArray:
         """By how much (M,) the lens bows the sides of quadrilaterals with recorded corners (M, 4, 2)."""

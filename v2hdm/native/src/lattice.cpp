@@ -10,22 +10,6 @@ namespace {
 
 constexpr int COLOURS = 3;  // in which a marking is looked for: grey, red and blue
 
-// A recorded pixel as a pinhole pixel; camera.RoadCamera.undistort.
-void undistort(const Source& source, double u, double v, double pinhole[2]) {
-    pinhole[0] = u;
-    pinhole[1] = v;
-    if (source.lens == nullptr) return;
-    const double across = u / source.lens_step_px, down = v / source.lens_step_px;
-    const int column = std::clamp(static_cast<int>(across), 0, source.lens_width - 1);
-    const int row = std::clamp(static_cast<int>(down), 0, source.lens_height - 1);
-    const double right = across - column, below = down - row;
-    const size_t plane = static_cast<size_t>(source.lens_width) * source.lens_height;
-    const double* cell = source.lens + static_cast<size_t>(row) * source.lens_width + column;
-    for (int axis = 0; axis < 2; ++axis, cell += 4 * plane) {
-        pinhole[axis] = cell[0] + cell[plane] * right + (cell[2 * plane] + cell[3 * plane] * right) * below;
-    }
-}
-
 struct Seen {
     float light[COLOURS];
     bool use, clipped;
@@ -117,7 +101,7 @@ void look(
         const Seen seen = see(source, marking, u[i], v[i]);
         std::copy(seen.light, seen.light + COLOURS, light.begin() + static_cast<size_t>(COLOURS) * i);
         double pinhole[2];
-        undistort(source, static_cast<double>(u[i]), static_cast<double>(v[i]), pinhole);
+        source.lens.undistort(static_cast<double>(u[i]), static_cast<double>(v[i]), pinhole);
         const double off[2] = {pinhole[0] - marking.middle[0], pinhole[1] - marking.middle[1]};
         const float x = static_cast<float>(off[0] * marking.scale[0] + off[1] * marking.scale[1]);
         const float y = static_cast<float>(off[0] * marking.scale[2] + off[1] * marking.scale[3]);

@@ -4,6 +4,8 @@
 #include <cstdint>
 #include <vector>
 
+#include "lens.h"
+
 namespace v2hdm {
 
 // An image, whose paint each element of the network's output is, and a camera's lens; patch.Source says more.
@@ -16,9 +18,7 @@ struct Source {
     int clipped;                   // least code of a sensor at its limit
     float dark;
     float grey[3];        // weights of blue, green and red
-    const double* lens;   // a table of camera.Lens, null where nothing is distorted
-    int lens_width, lens_height;
-    double lens_step_px;
+    LensTable lens;
 };
 
 // A marking: its frame, its sides, and the axes of its light.

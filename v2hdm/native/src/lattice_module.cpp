@@ -35,15 +35,15 @@ struct SourceArrays {
             nb::cast<int>(object.attr("top")), nb::cast<int>(object.attr("stride")),
             radiance.data(), logs.data(), nb::cast<int>(object.attr("clipped")),
             nb::cast<float>(object.attr("dark")), {grey.data()[0], grey.data()[1], grey.data()[2]},
-            nullptr, 0, 0, nb::cast<double>(object.attr("lens_step_px")),
+            {nullptr, 0, 0, nb::cast<double>(object.attr("lens_step_px"))},
         };
         if (lens_object.is_none()) return;
         const auto lens = array_of<const double, 4>(lens_object, "lens");
         if (lens.shape(0) != 2 || lens.shape(1) != 4) throw std::invalid_argument("lens: of another shape");
         lens_array_ = lens;
-        source.lens = lens_array_.data();
-        source.lens_height = static_cast<int>(lens.shape(2));
-        source.lens_width = static_cast<int>(lens.shape(3));
+        source.lens.values = lens_array_.data();
+        source.lens.height = static_cast<int>(lens.shape(2));
+        source.lens.width = static_cast<int>(lens.shape(3));
     }
 
   private:

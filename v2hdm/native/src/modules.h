@@ -9,5 +9,6 @@ void add_settle(nanobind::module_& module);
 void add_lattice(nanobind::module_& module);
 void add_lanes(nanobind::module_& module);
 void add_paint(nanobind::module_& module);
+void add_lens(nanobind::module_& module);
 
 }  // namespace v2hdm
