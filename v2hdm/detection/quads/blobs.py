@@ -211,7 +211,7 @@ def _tally(
     return _Tally(
         cells=np.bincount(of_piece, minlength=count),
         best=np.bincount(likeliest, minlength=count * classes).reshape(count, classes),
-        certainty=np.bincount(of_piece, as_probability(level.ravel()[element]), count),
+        certainty=np.bincount(of_piece, as_probability(level.ravel()[element]), count).astype(np.float64),
         probability=np.stack([np.bincount(of_piece, plane, count) for plane in probability], axis=1),
     )
 
