@@ -3,6 +3,8 @@
 #   docker run --rm -u "$(id -u):$(id -g)" -v "$PWD:/work" v2hdm map drive.path=drives/mysite
 FROM python:3.11-slim AS build
 WORKDIR /src
+# The detector's kernels are compiled; the image itself needs no compiler.
+RUN apt-get update && apt-get install -y --no-install-recommends g++ && rm -rf /var/lib/apt/lists/*
 COPY . .
 # The constraints name a torch without CUDA on this index: with it the image has gigabytes less.
 RUN python -m venv /opt/v2hdm \

@@ -20,6 +20,8 @@ ADVISORIES := https://pypi.org/pypi/PyYAML/5.3/json
 # An empty file per set of packages: while it is newer than what it depends on, nothing is installed.
 MAP_INSTALLED := $(VENV)/.installed-map
 DEV_INSTALLED := $(VENV)/.installed-dev
+# What an installation is made of: the kernels are compiled by it.
+INSTALLED_FROM := pyproject.toml constraints.txt hatch_build.py $(wildcard v2hdm/native/src/*)
 
 .PHONY: map test check docs audit installs clean
 
@@ -49,19 +51,19 @@ installs: $(DEV_INSTALLED)
 	PYTHONPATH=. $(BIN)/python .ci/installs.py
 
 clean:
-	rm -rf $(VENV) build dist site .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
+	rm -rf $(VENV) build dist site v2hdm/native/_kernels* .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.12 ...")'
 	$(PYTHON) -m venv $(VENV)
 
-$(MAP_INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
+$(MAP_INSTALLED): $(INSTALLED_FROM) | $(BIN)/python
 	@echo "installing into $(VENV): some minutes"
 	$(INSTALL) -e '.[map]'
 	@touch $@
 
 # The development packages include those for mapping.
-$(DEV_INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
+$(DEV_INSTALLED): $(INSTALLED_FROM) | $(BIN)/python
 	@echo "installing into $(VENV): some minutes"
 	$(INSTALL) -e '.[dev]'
 	@touch $(MAP_INSTALLED) $@

@@ -109,7 +109,7 @@ class Covariance:
         factor = self.whitening.linearised.corner_factor.take(corners)
         inverse = factor.solve_transposed(factor.solve(unit.view(len(corners), 2, -1))).flatten(0, 1)
         of_factor = inverse.clone()
-        of_factor[torch.isin(corners, self.whitening.plan.kept).repeat_interleave(2)] = 0.0
+        of_factor[torch.isin(corners, self.whitening.plan.kept_corners).repeat_interleave(2)] = 0.0
         rows = _columns(corners, chosen)
         once = ~(joined[:, :, None] == joined[:, None, :]).tril(-1).any(2).repeat_interleave(2, dim=1)
         spread = inverse[rows[:, :, None], _columns(corners, joined)[:, None, :]] * once[:, None]
@@ -169,13 +169,13 @@ def _reduced_root(whitening: Whitening, corners: Tensor) -> Tensor:
     arrays = whitening.engine.arrays
     run = arrays.whole() if len(corners) == arrays.corner_count else arrays.gather(corners)
     coupling = whitening.linearised.coupling(run, estimate.corners_map[corners])
-    if not len(plan.kept):
+    if not len(plan.kept_corners):
         return whitening.reduced_factor.solve(reduced_coupling(plan, whitening.spread, run, coupling))
-    is_kept = torch.isin(corners, plan.kept)
+    is_kept = torch.isin(corners, plan.kept_corners)
     coupling[is_kept[run.corner]] = 0.0
     right = reduced_coupling(plan, whitening.spread, run, coupling)
-    number = torch.searchsorted(plan.kept, corners[is_kept])
-    picked = right.new_zeros(len(plan.kept), 2, len(corners), 2)
+    number = torch.searchsorted(plan.kept_corners, corners[is_kept])
+    picked = right.new_zeros(len(plan.kept_corners), 2, len(corners), 2)
     for axis in range(2):
         picked[number, axis, is_kept.nonzero()[:, 0], axis] = -1.0
     frames = right.new_zeros(0, len(arrays.states), right.shape[1])

@@ -18,13 +18,13 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from importlib import metadata
 from pathlib import Path
 
 from v2hdm import __version__
 from v2hdm.cli import commands
 from v2hdm.cli.command import Command, fail
 from v2hdm.errors import describe, one_line, shown
+from v2hdm.native import which_runs
 
 _FIRST = ("map", "detect", "check")  # at the head of the list, for those who look at it for the first time
 
@@ -145,6 +145,8 @@ def answer_signals() -> None:
 
 def version_line() -> str:
     """The versions of this package, its libraries and weights, in one line; nothing of it is imported."""
+    from importlib import metadata
+
     parts = [f"v2hdm {__version__}"]
     for packages in (("torch",), ("onnxruntime", "onnxruntime-gpu"), ("numba",)):
         versions = []
@@ -158,4 +160,5 @@ def version_line() -> str:
         parts.append(f"weights {network[:8]}")
     except (OSError, ValueError, KeyError, TypeError):
         parts.append("no weights")
+    parts.append(which_runs())
     return ", ".join(parts)

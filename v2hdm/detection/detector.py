@@ -26,6 +26,7 @@ from v2hdm.detection.stopwatch import lap
 from v2hdm.detection.weights import NETWORK_FILE, check_weights
 from v2hdm.doors import checked
 from v2hdm.errors import DetectorError
+from v2hdm.native import tell_missing
 from v2hdm.records import BoolArray, Camera, LaneDetection, MarkingDetection
 from v2hdm.safe.texts import shown
 
@@ -63,6 +64,7 @@ class Detector:
         Raises DetectorError where the model cannot be used, or the shipped files do not belong together.
         """
         options = options or DetectorOptions()
+        tell_missing()
         check_weights()
         path = path if path is not None else options.model
         network = Network(None if path is None else Path(path), options.threads, options.device)
@@ -91,11 +93,11 @@ class Detector:
         with lap("fit"):
             readings = self.read(image_bgr, proposals)
         with lap("judge"):
-            markings = find_markings(readings, proposals.camera, self.options)
-        found = _likelier(markings, self._symbols(image_bgr, proposals))
+            quads = find_markings(readings, proposals.camera, self.options)
+        markings = _likelier(quads, self._symbols(image_bgr, proposals))
         with lap("areas"):
             areas = self._areas(proposals)
-        return (*_not_of(areas, found), *areas), lanes
+        return (*_not_of(areas, markings), *areas), lanes
 
     def run_network(self, image_bgr: np.ndarray, camera: Camera, top: int | None = None) -> NetworkOutput:
         """Run the network on an image, less what shows the vehicle; raises as :meth:`detect`.
@@ -212,8 +214,8 @@ class Detector:
         return symbols
 
 
-def _not_of(areas: Sequence[MarkingDetection], found: Markings) -> Markings:
-    """What is no piece of an area, such as a letter: what lies in a likelier one is."""
+def _not_of(areas: Sequence[MarkingDetection], markings: Markings) -> Markings:
+    """The markings that are no piece of an area; a marking inside a likelier area, as a letter is, is one."""
     hulls = [(area.outline_px.astype(np.float32), area.score) for area in areas]
 
     def is_piece(marking: MarkingDetection) -> bool:
@@ -223,7 +225,7 @@ def _not_of(areas: Sequence[MarkingDetection], found: Markings) -> Markings:
             score > marking.score and cv2.pointPolygonTest(hull, centre, False) > 0 for hull, score in hulls
         )
 
-    return tuple(marking for marking in found if not is_piece(marking))
+    return tuple(marking for marking in markings if not is_piece(marking))
 
 
 @cache

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from v2hdm.records import BoolArray, FloatArray, IntArray
@@ -129,8 +128,19 @@ def rectangle_size(points: FloatArray) -> tuple[float, float]:
     finite = points[np.isfinite(points[:, 0])]
     if len(finite) < 3:
         return float("nan"), float("nan")
+    import cv2  # as in rigid.rotation_from_vector
+
     _, size, _ = cv2.minAreaRect(finite.astype(np.float32))
     return float(max(size)), float(min(size))
+
+
+def smallest_rectangle(points: FloatArray) -> FloatArray:
+    """Corners (4, 2) of the smallest rectangle around points (N, 2)."""
+    import cv2  # as in rigid.rotation_from_vector
+
+    middle = points.mean(axis=0)  # OpenCV computes in float32: far from the origin that is too coarse
+    box = cv2.boxPoints(cv2.minAreaRect((points - middle).astype(np.float32)))
+    return np.asarray(box.astype(np.float64) + middle)
 
 
 # Much faster than np.roll, which the fit of a few markings would call very often.
@@ -233,6 +243,8 @@ class Alignment(NamedTuple):
 
 def quad_from_hull(hull: np.ndarray) -> FloatArray | None:
     """The tightest quadrilateral (4, 2) about a hull (N, 1, 2), or None (Low and Ilie 2003, approxPolyN)."""
+    import cv2  # as in rigid.rotation_from_vector
+
     if len(hull) < 4 or cv2.contourArea(hull) < 1.0:
         return None
     quad = np.asarray(cv2.approxPolyN(hull, 4), dtype=np.float64).reshape(-1, 2)

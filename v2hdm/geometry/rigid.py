@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from math import factorial
 
-import cv2
 import numpy as np
 
 from v2hdm.errors import DriveError
@@ -118,6 +117,8 @@ def left_jacobian(tangents: FloatArray) -> FloatArray:
 
 def rotation_from_vector(vector_rad: FloatArray) -> FloatArray:
     """The rotation matrix (3, 3) of a rotation vector (3,)."""
+    import cv2  # which reading settings does without
+
     return np.asarray(cv2.Rodrigues(np.asarray(vector_rad, dtype=np.float64))[0])
 
 

@@ -66,7 +66,7 @@ class MapConfig:
 
 @dataclass(kw_only=True)
 class ReportConfig:
-    """What the report shows."""
+    """Settings of the report."""
 
     background: Annotated[str | None, "a GeoTIFF or a folder of XYZ tiles under its map, null for none."] = (
         None

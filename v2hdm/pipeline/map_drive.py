@@ -104,17 +104,9 @@ def map_drive(
     >>> result.verdict.status.value, result.calibrations["front"].cam_from_vehicle.shape
     ('PASS', (4, 4))
     """
-    if cache is not None and Path(cache).is_file():
-        raise ConfigError(f"cache {cache}: is a file; give a folder")
-    options = options or MappingOptions()
+    options = _options_of(options or MappingOptions(), corrections)
     reading = reading or ReadOptions()
-    if corrections is not None:
-        stated = read_corrections(Path(corrections))
-        options = replace(options, acceptance=replace(options.acceptance, corrections=stated))
-    sources = [drive] if isinstance(drive, Source) else list(drive)
-    if not sources:
-        raise ConfigError("map_drive: no drive is given; give one, or a list of them")
-    check_options(options)
+    sources = _sources_of(drive)
     check_choice(options, len(sources), base is not None, accuracy_goal_cm)
     with nullcontext(context) if context else _own_context(cache, progress, workers) as context:
         read = read_all(sources, reading, context)
@@ -132,9 +124,27 @@ def map_drive(
 @contextmanager
 def _own_context(cache: Path | str | None, progress: Progress, workers: int) -> Iterator[Context]:
     """The surroundings of a run that is given none."""
+    if cache is not None and Path(cache).is_file():
+        raise ConfigError(f"cache {cache}: is a file; give a folder")
     stages = StageCache(None if cache is None else Path(cache))
     with open_executor(workers) as executor:
         yield Context(stages, progress, executor=executor, workers=workers)
+
+
+def _options_of(options: MappingOptions, corrections: Path | str | None) -> MappingOptions:
+    """The checked options, with the corrections in a file."""
+    if corrections is not None:
+        stated = read_corrections(Path(corrections))
+        options = replace(options, acceptance=replace(options.acceptance, corrections=stated))
+    check_options(options)
+    return options
+
+
+def _sources_of(drive: Source | Iterable[Source]) -> list[Source]:
+    sources = [drive] if isinstance(drive, Source) else list(drive)
+    if not sources:
+        raise ConfigError("map_drive: no drive is given; give one, or a list of them")
+    return sources
 
 
 def _earlier(base: Path | str | None, drive: Drive, context: Context) -> Base | None:

@@ -1,4 +1,4 @@
-"""What the images show of mapped paint: how much of each marking is left, and what words say."""
+"""Mapped paint in the images: how much of each marking is left, and what words say."""
 
 from __future__ import annotations
 

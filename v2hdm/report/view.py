@@ -2,7 +2,7 @@
 
 The page is the report plus a script. Corrections are validated and written atomically to a file beside the
 result, which is never changed. The address has a secret; requests under other host names (``Host``) or from
-other pages (``Origin``) are refused.
+other pages (``Origin``) are refused. The page is drawn after its address is told, while the browser starts.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import re
 import secrets
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from contextvars import Context
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -30,9 +30,10 @@ from v2hdm.io.maps.corrections import (
     read_corrections,
     write_corrections,
 )
-from v2hdm.records import Drive
-from v2hdm.report.page.document import json_text, page_text
-from v2hdm.report.page.facts import Facts, read_facts
+from v2hdm.io.metrics import read_metrics
+from v2hdm.records import Drive, Exclusion, FloatArray, HDMap
+from v2hdm.report.page.embedding import json_text
+from v2hdm.report.page.facts import read_excluded, read_map_of
 from v2hdm.safe.texts import parse_json, parse_yaml
 from v2hdm.store.files import dump_yaml, load_yaml, refuse_unwritable, refuse_url
 from v2hdm.store.folders import waited_for
@@ -58,14 +59,17 @@ class Session:
     has written there by hand is not replaced before the page has shown it. A link stays one.
     """
 
-    def __init__(self, folder: Path, path: Path, facts: Facts) -> None:
-        """Start from the file's content; MapFileError if that is something else, ConfigError if no place."""
+    def __init__(self, folder: Path, path: Path, places: Mapping[str, FloatArray]) -> None:
+        """Start from the file's content; MapFileError if that is something else, ConfigError if no place.
+
+        ``places`` (N, 2) are those of the result's features, m, by their key in the page.
+        """
         refuse_url(path)
         refuse_unwritable(path.resolve())
         self.path = path
         self.corrections: dict[str, Correction] = {}
         self._folder = folder
-        self._facts = facts
+        self._places = places
         self._place = path.resolve()
         self._content: bytes | None = None  # of the file, as it was last read or written
         self._lock = threading.Lock()
@@ -90,7 +94,7 @@ class Session:
             raise MapFileError("not a correction: expected a key and a correction") from None
         correction = None if entry is None else self._kept(entry)
         if correction is not None:
-            key = _key(correction, self._facts)
+            key = _key(correction, self._places)
         before = self.corrections.get(key)
         if is_compared:
             before = None if corrected_before is None else self._kept(corrected_before)
@@ -117,7 +121,7 @@ class Session:
         content = self._place.read_bytes()
         corrections: dict[str, Correction] = {}
         for correction in Context().run(read_corrections, self._place):
-            key = _key(correction, self._facts)
+            key = _key(correction, self._places)
             if not _is_same(corrections.setdefault(key, correction), correction):
                 raise MapFileError(
                     f"{self.path}: two corrections contradict each other on the {correction.place}; keep one"
@@ -149,13 +153,16 @@ def _is_same(correction: Correction | None, other: Correction | None) -> bool:
     return (correction and entry_of(correction)) == (other and entry_of(other))
 
 
-def _key(correction: Correction, facts: Facts) -> str:
+def _places(hd_map: HDMap, excluded: Sequence[Exclusion]) -> dict[str, FloatArray]:
+    """Places (N, 2) of a result's features, m, by their key in the page."""
+    places = {f"x{n}": out.position_map[None] for n, out in enumerate(excluded)}
+    places |= {f"m{marking.id}": marking.corners_map for marking in hd_map.markings}
+    places |= {f"s{symbol.id}": symbol.outline_map for symbol in hd_map.symbols}
+    return places
+
+
+def _key(correction: Correction, places: Mapping[str, FloatArray]) -> str:
     """Key in the page of a correction's feature; its outline, if that is not in the map."""
-    hd_map = facts.hd_map
-    places = {f"x{n}": out.position_map[None] for n, out in enumerate(facts.excluded)}
-    if hd_map is not None:
-        places |= {f"m{marking.id}": marking.corners_map for marking in hd_map.markings}
-        places |= {f"s{symbol.id}": symbol.outline_map for symbol in hd_map.symbols}
     outline = np.array(correction.outline_map)
     for key, place in places.items():
         if place.shape == outline.shape and np.abs(place - outline).max() < _SAME_M:
@@ -173,8 +180,22 @@ _HEADERS = {
 """Headers of every answer: no other page may show ours within itself."""
 
 
-class _Server(ThreadingHTTPServer):
+class PageServer(ThreadingHTTPServer):
+    """A server of a page that is drawn once, by whoever asks for it first."""
+
     daemon_threads = True
+
+    def __init__(self, handler: type[BaseHTTPRequestHandler], draw: Callable[[], str]) -> None:
+        super().__init__(("127.0.0.1", 0), handler)
+        self._draw = draw
+        self._drawing = threading.Lock()
+        self._text = ""
+
+    def text(self) -> str:
+        """The page; raises V2hdmError where the result is damaged."""
+        with self._drawing:
+            self._text = self._text or self._draw()
+        return self._text
 
     def handle_error(self, request: object, client_address: object) -> None:
         """Say nothing of a reader who hangs up."""
@@ -185,21 +206,25 @@ class _Server(ThreadingHTTPServer):
 class Viewing(NamedTuple):
     """A server of a result on a free port of 127.0.0.1, not yet running."""
 
-    server: ThreadingHTTPServer
+    server: PageServer
     address: str
     session: Session
 
 
 def server_of(folder: Path, drive: Drive | None, path: Path) -> Viewing:
     """Serve the result in ``folder`` and its corrections in the file ``path``; MapFileError without a map."""
-    facts = read_facts(folder, drive)
-    if facts.hd_map is None:
+    metrics = read_metrics(folder)
+    hd_map = read_map_of(folder)
+    if hd_map is None:
         raise MapFileError(f"{folder}: has no map to view; fix its drive and map it again")
-    session = Session(folder, path, facts)
+    session = Session(folder, path, _places(hd_map, read_excluded(folder, metrics)))
     secret = secrets.token_urlsafe(16)
-    text = page_text(folder, drive, {"secret": secret})
-    place = json_text({"secret": secret})
-    kinds: Sequence[str] = sorted({*SHIPPED.names, *(marking.kind for marking in facts.hd_map.markings)})
+    kinds: Sequence[str] = sorted({*SHIPPED.names, *(marking.kind for marking in hd_map.markings)})
+
+    def draw() -> str:
+        from v2hdm.report.page.document import page_text  # loads the libraries of the charts
+
+        return page_text(folder, drive, {"secret": secret})
 
     class Handler(BaseHTTPRequestHandler):
         timeout = 30
@@ -210,9 +235,14 @@ def server_of(folder: Path, drive: Drive | None, path: Path) -> Viewing:
         def do_GET(self) -> None:
             if not self._is_ours() or self.path != f"/{secret}/":
                 return self._answer(404, "no such page")
+            try:
+                text = server.text()
+            except (V2hdmError, OSError) as error:
+                return self._answer(500, one_line(str(error)))
             session.refresh()
             entries = {key: entry_of(correction) for key, correction in session.corrections.items()}
             editing = {"file": path.name, "corrections": entries, "kinds": kinds}
+            place = json_text({"secret": secret})
             return self._answer(200, text.replace(place, json_text(editing), 1), "text/html")
 
         def do_POST(self) -> None:
@@ -246,6 +276,6 @@ def server_of(folder: Path, drive: Drive | None, path: Path) -> Viewing:
                 self.send_header(name, value)
             super().end_headers()
 
-    server = _Server(("127.0.0.1", 0), Handler)
+    server = PageServer(Handler, draw)
     base = f"http://127.0.0.1:{server.server_address[1]}"
     return Viewing(server, f"{base}/{secret}/", session)

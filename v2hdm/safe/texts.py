@@ -10,7 +10,8 @@ import codecs
 import json
 import re
 import stat
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Never
 
@@ -32,6 +33,8 @@ _NUMBERS = re.compile("([0-9]+)")
 _HALF = "half a character (a lone surrogate)"
 _ESCAPED_HALF = re.compile(r"\\u[dD][89a-fA-F]")
 _QUOTED = re.compile(r'"(?:[^"\\]|\\.)*"')
+_READ_OTHERWISE = re.compile("[\\t?!\ufeff]|[|>]#")
+"""What libyaml reads and PyYAML refuses, or reads as something else (found by comparing mutated files)."""
 _OPENING = [ord("["), ord("{")]
 _CLOSING = [ord("]"), ord("}")]
 
@@ -82,6 +85,10 @@ def read_yaml(path: Path, error: type[V2hdmError]) -> Any:
 
 def parse_yaml(text: str, where: str, error: type[V2hdmError]) -> Any:
     """The content of a YAML text from ``where``, as :func:`read_yaml`."""
+    if _BY_LIBYAML is not None and not _READ_OTHERWISE.search(text):
+        # What it refuses is read once more, by the loader whose errors name the line.
+        with suppress(yaml.YAMLError, UnicodeError, RecursionError):
+            return _BY_LIBYAML(text).get_single_data()
     try:
         return _Loader(text).get_single_data()  # looks for letters that are none at once
     except yaml.YAMLError as failure:
@@ -175,16 +182,18 @@ def number_key(name: str) -> tuple[list[str | int], str]:
     return parts, name
 
 
-class _Loader(yaml.SafeLoader):
-    """PyYAML's own, for plain values: it counts its nodes and refuses tags, duplicates and bombs."""
+class _Plain(yaml.composer.Composer, yaml.constructor.SafeConstructor, yaml.resolver.Resolver):
+    """A loader's half that makes plain values: it counts nodes and refuses tags, duplicates and bombs."""
 
-    def __init__(self, text: str) -> None:
-        super().__init__(text)
+    def __init__(self) -> None:
+        yaml.composer.Composer.__init__(self)
+        yaml.constructor.SafeConstructor.__init__(self)
+        yaml.resolver.Resolver.__init__(self)
         self._depth = self._entries = 0
         self._sizes: dict[int, int] = {}
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        event: yaml.Event = self.peek_event()  # type: ignore[no-untyped-call]
+        event: yaml.Event = self.peek_event()  # type: ignore[attr-defined]  # of the other half
         self._depth += 1
         if self._depth > MOST_DEPTH:
             _refuse(f"nested deeper than {MOST_DEPTH} levels", event.start_mark)
@@ -240,7 +249,33 @@ def _refuse(problem: str, mark: Any) -> Never:
 _TAG = "tag:yaml.org,2002:"
 _TEXT, _INT, _MERGE, _DATE = (f"{_TAG}{kind}" for kind in ("str", "int", "merge", "timestamp"))
 _PLAIN = frozenset(f"{_TAG}{kind}" for kind in ("null", "bool", "int", "float", "str", "seq", "map"))
-_Loader.yaml_implicit_resolvers = {
+_Plain.yaml_implicit_resolvers = {
     first: [(tag, pattern) for tag, pattern in resolvers if tag != _DATE]
     for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
 }
+
+
+class _Loader(_Plain, yaml.reader.Reader, yaml.scanner.Scanner, yaml.parser.Parser):
+    """PyYAML in Python alone."""
+
+    def __init__(self, text: str) -> None:
+        yaml.reader.Reader.__init__(self, text)
+        yaml.scanner.Scanner.__init__(self)
+        yaml.parser.Parser.__init__(self)
+        _Plain.__init__(self)
+
+
+def _by_libyaml() -> Callable[[str], Any] | None:
+    """The loader whose parser is libyaml, four times as quick; None where PyYAML was built without it."""
+    if not yaml.__with_libyaml__:
+        return None
+
+    class Loader(_Plain, yaml.cyaml.CParser):  # type: ignore[misc, name-defined]
+        def __init__(self, text: str) -> None:
+            yaml.cyaml.CParser.__init__(self, text)  # type: ignore[attr-defined]
+            _Plain.__init__(self)
+
+    return Loader
+
+
+_BY_LIBYAML = _by_libyaml()

@@ -69,7 +69,7 @@ class Watch:
         read = lru_cache(maxsize=16)(self._log_grey)
         for group, side in np.argwhere(is_end).tolist():
             end = _End.of(corners_map[group], side, self._height_m(corners_map[group]))
-            of_pairs = [self._better_ground(end, far, near, read) for far, near in self._pairs(end)]
+            of_pairs = [self._better_ground(end, look, nearer, read) for look, nearer in self._pairs(end)]
             differences_z = [value for value in of_pairs if value is not None]
             if differences_z:
                 odds[group, side] = _BIAS + _PER_BETTER_GROUND * float(np.mean(differences_z))
@@ -86,12 +86,12 @@ class Watch:
         """Pairs of images of one camera, a far and a near one, that see an end over its paint."""
         for camera in range(len(self.cameras)):
             looks = sorted(self._looks(end, camera), key=lambda look: look.depth_m)
-            near = looks[0] if looks else None
+            nearer = looks[0] if looks else None
             pairs = 0
-            for far in looks[1:]:
-                if near is not None and far.depth_m > _LEAST_RATIO * near.depth_m and pairs < _MOST_PAIRS:
-                    yield far, near
-                    near = far
+            for look in looks[1:]:
+                if pairs < _MOST_PAIRS and nearer and look.depth_m > _LEAST_RATIO * nearer.depth_m:
+                    yield look, nearer
+                    nearer = look
                     pairs += 1
 
     def _looks(self, end: _End, camera: int) -> Iterator[_Look]:
@@ -109,17 +109,17 @@ class Watch:
             if looks_outwards and _RANGE_M[0] < depth_m < _RANGE_M[1] and corners.inside.all():
                 yield look._replace(depth_m=depth_m)
 
-    def _better_ground(self, end: _End, far: _Look, near: _Look, read: Grey) -> float | None:
+    def _better_ground(self, end: _End, farther: _Look, nearer: _Look, read: Grey) -> float | None:
         """How much better two images match as ground than as a face; None where too few points tell.
 
         It is the difference of the correlations of their log grey values, in Fisher's z.
         """
         face = end.face()
-        as_seen = far.project(face)
-        on_ground = np.column_stack([far.ground(as_seen.px, end.middle_map[2]), face[:, 2] * 0])
+        as_seen = farther.project(face)
+        on_ground = np.column_stack([farther.ground(as_seen.px, end.middle_map[2]), face[:, 2] * 0])
         on_ground[:, 2] = end.middle_map[2]
-        as_face = near.project(face)
-        as_ground = near.project(np.nan_to_num(on_ground))
+        as_face = nearer.project(face)
+        as_ground = nearer.project(np.nan_to_num(on_ground))
         away_m = np.linalg.norm(on_ground - end.middle_map, axis=1)
         usable = as_seen.inside & as_face.inside & as_ground.inside
         with np.errstate(invalid="ignore"):
@@ -128,9 +128,9 @@ class Watch:
         if np.count_nonzero(usable) < _LEAST_POINTS:
             return None
         # The nearer image is blurred to what the farther one resolves.
-        blur_px = 0.5 * float(np.sqrt((far.depth_m / near.depth_m) ** 2 - 1))
-        blurred = cv2.GaussianBlur(read(near.image), (0, 0), max(blur_px, 0.1))
-        light = _sample(read(far.image), as_seen.px[usable])
+        blur_px = 0.5 * float(np.sqrt((farther.depth_m / nearer.depth_m) ** 2 - 1))
+        blurred = cv2.GaussianBlur(read(nearer.image), (0, 0), max(blur_px, 0.1))
+        light = _sample(read(farther.image), as_seen.px[usable])
         matches = [_sample(blurred, points.px[usable]) for points in (as_ground, as_face)]
         ground_z, face_z = (_fisher_z(light, match) for match in matches)
         return ground_z - face_z

@@ -22,7 +22,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import cache, partial
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeVar, get_origin
 
@@ -120,6 +119,8 @@ def code_key() -> str:
 
 def library_versions() -> dict[str, str]:
     """Versions by name of Python, of the libraries that are installed, and the system."""
+    from importlib.metadata import PackageNotFoundError, version
+
     versions = {"Python": platform.python_version()}
     for package in LIBRARIES:
         with suppress(PackageNotFoundError):

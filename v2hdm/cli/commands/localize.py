@@ -21,7 +21,6 @@ def _run(arguments: Sequence[str]) -> int:
     parsed = parser.parse_args(arguments)
     from v2hdm.io.calibration.reading import trusted_calibrations
     from v2hdm.io.maps.reading import read_geojson
-    from v2hdm.localization.run import localize, summary_lines, write_localised
     from v2hdm.store.names import map_file
 
     path = map_file(parsed.map)
@@ -31,8 +30,12 @@ def _run(arguments: Sequence[str]) -> int:
     folder = parsed.output or Path("outputs") / f"{drive.name}-localized"
     settings = {"map": str(parsed.map), "drive": str(parsed.drive), "cameras": list(drive.cameras)}
     maker = f"v2hdm localize of {parsed.drive.resolve()} in {path.resolve()}"
+    steps = steps_of("images")
     with result_of(folder, maker, settings) as unfinished:
-        located = localize(hd_map, drive, calibrations, workers=parsed.workers, progress=steps_of("images"))
+        steps(0, len(drive.images))
+        from v2hdm.localization.run import localize, summary_lines, write_localised  # torch, among others
+
+        located = localize(hd_map, drive, calibrations, workers=parsed.workers, progress=steps)
         write_localised(located, drive, unfinished)
     print("\n".join([*summary_lines(located), f"results in {folder}"]))
     return 0 if located.explained else EXIT_FAILED_VERDICT

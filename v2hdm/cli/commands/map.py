@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import logging
 import sys
+import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from v2hdm import __version__
 from v2hdm.cli.arguments import exit_code
 from v2hdm.cli.command import Command
+from v2hdm.errors import one_line
+from v2hdm.progress import patient
 
 if TYPE_CHECKING:
     from v2hdm.cli.compose import Job
@@ -28,16 +32,21 @@ def _run(arguments: Sequence[str]) -> int:
 
 
 def _map(job: Job) -> int:
+    config = job.settings
+    out = patient(sys.stdout)
+    of_drives = [str(path) for path in config.drive.paths]
+    mapped = config.simulate.name if config.simulate is not None else ", ".join(of_drives)
+    if mapped:  # before the libraries of all that follows are loaded, which takes seconds
+        print(f"{time.strftime('%X')} v2hdm {__version__} maps {one_line(mapped)}", file=out, flush=True)
     from rich.console import Console
     from rich.logging import RichHandler
 
     from v2hdm.pipeline.context import logging_to
     from v2hdm.pipeline.run import run
-    from v2hdm.progress import patient, progress_bars
+    from v2hdm.progress import progress_bars
     from v2hdm.report.terminal import changes_table, results_table
 
-    config = job.settings
-    console = Console(file=patient(sys.stdout))
+    console = Console(file=out)
     handler = RichHandler(logging.INFO, console, show_path=False, show_level=False, log_time_format="%X")
     # The verdict's lines, which stand at the end, once and unbroken.
     handler.addFilter(lambda record: record.levelno > logging.INFO or record.msg != "%s")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,11 +17,16 @@ def _run(arguments: Sequence[str]) -> None:
     under = "picture under the map: a GeoTIFF, such as an aerial photograph, or a folder of XYZ tiles"
     parser.add_argument("--background", type=Path, metavar="PATH", help=under)
     parsed = parser.parse_args(arguments)
+    import cv2  # noqa: F401  # the absence of these is reported before anything is read
+    import jinja2  # noqa: F401
+
     from v2hdm.io.drive import drive_of
-    from v2hdm.report.page.document import write_page
     from v2hdm.store.results import added_to
 
     drive = drive_of(parsed.result, parsed.drive)
+    print("draw the report", file=sys.stderr, flush=True)
+    from v2hdm.report.page.document import write_page  # the libraries of its charts, which takes seconds
+
     with added_to(parsed.result, "RESULT") as folder:
         path = write_page(folder, drive, parsed.background)
     without = "" if drive else ", without the drive's images"

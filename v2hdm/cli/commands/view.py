@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -20,13 +21,18 @@ def _run(arguments: Sequence[str]) -> None:
 
     path = parsed.corrections or file_beside(parsed.result)
     server, address, session = server_of(parsed.result, drive_of(parsed.result, parsed.drive), path)
+    serving = threading.Thread(target=server.serve_forever, daemon=True)
     try:
         print(f"open {address}; Ctrl-C ends it", flush=True)
-        server.serve_forever()
+        serving.start()
+        server.text()  # drawn while the browser starts; a damaged result ends the command here
+        serving.join()
     except KeyboardInterrupt:
         count = len(session.corrections)
         print(f"{count} corrections in {path}: map.corrections={path} in the next run" if count else "ended")
     finally:
+        if serving.is_alive():
+            server.shutdown()
         server.server_close()
 
 

@@ -19,6 +19,16 @@ _SHARED_PIXELS = 20.0  # a side's variance is drawn to that of all sides as if b
 _CAUCHY = 2.385  # Cauchy's scale for 95 % efficiency (Holland and Welsch, 1977)
 _MAX_CORRELATION = 0.7  # largest correlation of neighbouring residuals: beyond it few pixels would settle all
 
+RULES = {
+    "sigma_of_mad": SIGMA_OF_MAD,
+    "min_scatter": _MIN_SCATTER,
+    "shared_pixels": _SHARED_PIXELS,
+    "cauchy": _CAUCHY,
+    "max_correlation": _MAX_CORRELATION,
+    "paint_sigma": _PAINT_SIGMA,
+}
+"""The constants of this module, for the compiled kernel."""
+
 
 def variance_inflation(first: np.ndarray, second: np.ndarray, weight: np.ndarray, most: float) -> FloatArray:
     """Factor (...) by which a fit's variance grows if residuals (..., N) correlate with their neighbours.

@@ -11,11 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.detection.quads.coverage import blurred_coverage
+from v2hdm.detection.quads import robust
+from v2hdm.detection.quads.coverage import TABLE, blurred_coverage, owen_table
 from v2hdm.detection.quads.lattice import KNOTS, Lattice
 from v2hdm.detection.quads.patch import LensFrames
 from v2hdm.detection.quads.robust import add_paint, pixel_weights
 from v2hdm.geometry.planar import Quad, following
+from v2hdm.native import kernels
 from v2hdm.records import FloatArray
 
 _BLUR_SIGMA_PX = 0.2  # how far one marking's blur is from the typical one, px: motion, focus, frayed paint
@@ -72,6 +74,24 @@ def _prior() -> FloatArray:
 
 
 _PRIOR = _prior()
+
+_RULES = {
+    "least_blur_px": _LEAST_BLUR_PX,
+    "most_blur_px": _MOST_BLUR_PX,
+    "blur_sigma_px": _BLUR_SIGMA_PX,
+    "contrast": _CONTRAST,
+    "contrast_sigma": _CONTRAST_SIGMA,
+    "most_contrast": _MOST_CONTRAST,
+    "light_step": _LIGHT_STEP,
+    "most_step": _MAX_STEP,
+    "most_contrast_step": _MAX_CONTRAST_STEP,
+    "insignificant": _INSIGNIFICANT,
+    "held": _HELD,
+    "roughness": _ROUGHNESS,
+    **robust.RULES,
+    **TABLE,
+}
+"""The constants of a step, for the compiled kernel."""
 
 
 @dataclass
@@ -133,9 +153,9 @@ class State:
         closure, gap = _closure(quad.corners, frames)
         return cls(
             quad=Quad(quad.corners.copy()),
-            blur_px=blur_px,
+            blur_px=blur_px.copy(),
             expected_blur_px=expected_blur_px,
-            outline=quad.corners,
+            outline=np.ascontiguousarray(quad.corners),
             outline_sigma_px=outline_sigma_px,
             closure=closure,
             gap=gap,
@@ -154,6 +174,12 @@ class State:
         settled_px = _SETTLED_PX if paint is None else _FOUND_PX
         count = len(self.blur_px)
         system = System.empty(count)
+        compiled = kernels()
+        if compiled is not None:
+            rules = _RULES | {"settled_px": settled_px}
+            compiled.settle(self, system, lattice, paint, owen_table(), rules, steps, scatter)
+            self.quad = Quad(self.quad.corners)
+            return system
         running = np.arange(count)
         for number in range(steps):
             running_state = self._take(running)
@@ -171,6 +197,11 @@ class State:
                 paint = None if paint is None else paint[moving]
         self.quad = Quad(self.quad.corners)
         return system
+
+    @property
+    def corners(self) -> FloatArray:
+        """The corners (M, 4, 2)."""
+        return self.quad.corners
 
     def _take(self, rows: np.ndarray) -> State:
         """Some of the markings."""

@@ -16,7 +16,6 @@ from v2hdm.geometry.rigid import in_order, interpolate
 from v2hdm.io.drive.road import lay_flat, log_road
 from v2hdm.io.trajectory import check_trajectory, span, why_no_pose
 from v2hdm.records import Camera, Drive, FloatArray, Image, Trajectory
-from v2hdm.safe.pixels import read_header
 from v2hdm.settings import COUNT, NOT_NEGATIVE, POSITIVE
 
 _log = logging.getLogger(__name__)
@@ -129,6 +128,8 @@ def _pose_images(
 
 def _check_image_files(images: Sequence[Image], cameras: Mapping[str, Camera]) -> None:
     """Refuse missing, truncated and wrongly sized images before any long work begins."""
+    from v2hdm.safe.pixels import read_header  # OpenCV, which reading settings does without
+
     for image in images:
         header = read_header(image.path)
         info = cameras[image.camera].info

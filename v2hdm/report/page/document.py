@@ -15,6 +15,7 @@ import numpy as np
 
 from v2hdm.records import Drive
 from v2hdm.report.page import charts, tables
+from v2hdm.report.page.embedding import json_text
 from v2hdm.report.page.facts import Facts, ground_residuals, read_facts
 from v2hdm.report.page.layers import background_layer, comparison, earlier_layer, layers
 from v2hdm.report.page.pictures import earlier_pictures, overlays, pictures
@@ -157,12 +158,6 @@ def _earlier(path: Path, name: str) -> dict[str, Any]:
         return dict(json.loads(script[1])) if script else {}
     except (ValueError, TypeError, RecursionError):
         return {}
-
-
-def json_text(content: object) -> str:
-    """JSON that is safe in a script element: it neither ends the element nor opens a comment."""
-    text = json.dumps(content, allow_nan=False, separators=(",", ":"))
-    return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
 
 
 def _suspicious(facts: Facts) -> dict[str, list[str]]:

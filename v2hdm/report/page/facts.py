@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,7 +23,9 @@ from v2hdm.io.trajectory import read_tum
 from v2hdm.records import BEST, BoolArray, Calibration, Drive, Exclusion, FloatArray, HDMap, IntArray, Truth
 from v2hdm.store import names
 from v2hdm.store.files import load_json, load_yaml, read_csv, read_text, take_number
-from v2hdm.surface.surface import Surface
+
+if TYPE_CHECKING:  # loads scipy, for the few results with a ground of their own
+    from v2hdm.surface.surface import Surface
 
 
 @dataclass(frozen=True)
@@ -89,10 +91,6 @@ class Facts:
 def read_facts(folder: Path, drive: Drive | None) -> Facts:
     """Read a run's result folder and the data of its ``drive``; MapFileError for damaged files."""
     metrics = read_metrics(folder)
-    sets = list(metrics.get("results") or {})
-    hd_map = read_geojson(folder / names.MAP) if (folder / names.MAP).is_file() else None
-    excluded = read_exclusions(folder / names.EXCLUDED) if (folder / names.EXCLUDED).is_file() else []
-    features = features_of(hd_map) if hd_map else []
     residuals = folder / names.RESIDUALS
     config = folder / names.CONFIG
     points = folder / names.CHECK_POINTS
@@ -102,8 +100,8 @@ def read_facts(folder: Path, drive: Drive | None) -> Facts:
         folder=folder,
         metrics=metrics,
         config=read_text(config, MapFileError).strip() if config.is_file() else "",
-        hd_map=map_of(features, [feature.id for feature in features], hd_map.origin) if hd_map else None,
-        excluded=tuple(candidate for candidate in excluded if not sets or candidate.cameras == sets[-1]),
+        hd_map=read_map_of(folder),
+        excluded=read_excluded(folder, metrics),
         cameras=read_cameras(folder),
         route=route,
         surface=None if route is None else read_surface(folder, route.flat),
@@ -112,6 +110,24 @@ def read_facts(folder: Path, drive: Drive | None) -> Facts:
         drive=drive,
         truth=read_truth(drive) if drive is not None and drive.truth_dir is not None else None,
     )
+
+
+def read_map_of(folder: Path) -> HDMap | None:
+    """The map of a result folder, None where it has none; MapFileError if damaged."""
+    if not (folder / names.MAP).is_file():
+        return None
+    hd_map = read_geojson(folder / names.MAP)
+    features = features_of(hd_map)
+    return map_of(features, [feature.id for feature in features], hd_map.origin)
+
+
+def read_excluded(folder: Path, metrics: Mapping[str, Any]) -> tuple[Exclusion, ...]:
+    """The candidates of a result folder that the map of all cameras left out; MapFileError if damaged."""
+    if not (folder / names.EXCLUDED).is_file():
+        return ()
+    sets = list(metrics.get("results") or {})
+    excluded = read_exclusions(folder / names.EXCLUDED)
+    return tuple(candidate for candidate in excluded if not sets or candidate.cameras == sets[-1])
 
 
 def read_cameras(folder: Path) -> dict[str, CameraFacts]:
@@ -160,6 +176,8 @@ def read_surface(folder: Path, map_from_vehicle: FloatArray) -> Surface | None:
     path = folder / names.GROUND
     if not path.is_file():
         return None
+    from v2hdm.surface.surface import Surface
+
     try:
         return Surface.from_stored(load_json(path, MapFileError), map_from_vehicle)
     except ValueError as damage:

@@ -1,0 +1,197 @@
+"""The compiled kernels do what numpy does, and where there are none numpy does it."""
+
+import os
+import shutil
+import subprocess
+import sys
+from importlib.machinery import EXTENSION_SUFFIXES
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.detection.pictures import (
+    LENSES,
+    bar,
+    diamond,
+    make_camera,
+    output_of,
+    patches_of,
+    picture,
+    to_image,
+)
+from tests.docs.blocks import ROOT
+from v2hdm import __version__, native
+from v2hdm.detection.camera import RoadCamera
+from v2hdm.detection.quads.fit import fit_quadrilaterals
+from v2hdm.detection.quads.lattice import lay_grid, lay_lattice
+from v2hdm.detection.quads.patch import LensFrames
+from v2hdm.detection.quads.propose import open_sides
+from v2hdm.detection.quads.state import State
+from v2hdm.geometry.planar import Quad, order_corners
+
+compiled = pytest.mark.skipif(native.kernels() is None, reason=native.which_runs())
+
+
+def twice(function):
+    """What a function gives with the kernels, and what with numpy alone."""
+    by_kernels = function()
+    with native.numpy_alone():
+        return by_kernels, function()
+
+
+class Scene:
+    """Random markings on a random picture of them, and quadrilaterals near their sides."""
+
+    def __init__(self, seed, lens="plumb_bob"):
+        rng = np.random.default_rng(seed)
+        camera = make_camera(lens)
+        self.view = RoadCamera(camera, 16)
+        ahead_m = np.arange(5.0, 17.0, 2.5)
+        shapes = [
+            bar(x, rng.uniform(-2, 2), rng.uniform(0.5, 2), rng.uniform(0.12, 0.4), rng.uniform(0, 180))
+            if rng.random() < 0.5
+            else diamond(x, rng.uniform(-2, 2), rng.uniform(0.8, 1.4), 0.7, rng.uniform(0, 180))
+            for x in ahead_m
+        ]
+        self.image = picture(camera, shapes, seed=seed)
+        true_px = np.stack([order_corners(to_image(camera, shape)) for shape in shapes])
+        self.start = true_px + 0.7 * rng.standard_normal(true_px.shape)
+        odds = rng.normal(0, 0.5, (self.image.shape[0] // 2, self.image.shape[1] // 2)).astype(np.float32) - 4
+        for outline in true_px:
+            cv2.fillConvexPoly(odds, np.round(outline / 2).astype(np.int32), 4.0)
+        self.patches = patches_of(self.image, self.view, output_of(odds), self.start)
+        self.frames = LensFrames.about(self.view, self.start)
+
+    def state(self):
+        count = len(self.start)
+        quad = Quad(self.frames.from_image(self.start))
+        return State.at(quad, np.full(count, 0.8), 0.8, np.full((count, 8), 2.0), self.frames)
+
+
+@compiled
+@pytest.mark.parametrize("seed", range(4))
+def test_a_step_is_the_same_compiled_and_in_numpy(seed):
+    scene = Scene(seed)
+    grid = lay_grid(scene.patches, scene.frames, scene.start)
+    for lattice, paint in (
+        (lay_lattice(scene.patches, scene.frames, scene.start), None),
+        (grid.lattice, grid.paint),
+    ):
+
+        def step(lattice=lattice, paint=paint):
+            state = scene.state()
+            return state, state.settle(lattice, 1, paint)
+
+        (state, system), (state_too, system_too) = twice(step)
+        size = np.abs(system_too.information).max(axis=(1, 2), keepdims=True)
+        np.testing.assert_allclose(system.information / size, system_too.information / size, atol=2e-4)
+        # A table of OpenCV's is read to a thirty-second of its cells.
+        for name in ("scatter", "inliers"):
+            np.testing.assert_allclose(
+                getattr(system, name), getattr(system_too, name), rtol=3e-3, err_msg=name
+            )
+        np.testing.assert_allclose(system.side_step, system_too.side_step, atol=3e-3)
+        for name in ("corners", "blur_px", "contrast", "expected_contrast", "light", "slope"):
+            np.testing.assert_allclose(
+                getattr(state, name), getattr(state_too, name), atol=3e-3, err_msg=name
+            )
+
+
+@compiled
+@pytest.mark.parametrize("lens", sorted(LENSES))
+def test_corners_are_the_same_compiled_and_in_numpy(lens):
+    scene = Scene(7, lens)
+    cut = open_sides(scene.start, scene.view)
+
+    def fit():
+        found = fit_quadrilaterals(scene.patches, scene.view, scene.start, cut)
+        return (
+            found.corners_px,
+            np.sqrt(np.diagonal(found.covariance_px(), axis1=1, axis2=2)),
+            found.statistics,
+        )
+
+    (corners_px, sigma_px, statistics), (corners_px_too, sigma_px_too, statistics_too) = twice(fit)
+    np.testing.assert_allclose(corners_px, corners_px_too, atol=0.01)
+    np.testing.assert_allclose(sigma_px, sigma_px_too, rtol=0.02)
+    np.testing.assert_allclose(statistics, statistics_too, atol=0.05)
+
+
+@compiled
+def test_arrays_that_do_not_belong_together_are_refused():
+    scene = Scene(0)
+    lattice = lay_lattice(scene.patches, scene.frames, scene.start)
+    state = scene.state()
+    state.contrast = state.contrast[:-1]
+    with pytest.raises(ValueError, match="contrast: of another shape"):
+        state.settle(lattice, 1)
+    state = scene.state()
+    state.slope = state.slope.astype(np.float32)
+    with pytest.raises(ValueError, match="slope: of another type"):
+        state.settle(lattice, 1)
+
+
+def _told(folder, *program, **environment):
+    """What a new process tells, with the package from a folder."""
+    environment = {native.SWITCH: "1", "PYTHONPATH": str(folder), **environment}
+    told = subprocess.run(
+        [sys.executable, *program], cwd=folder, env=os.environ | environment,
+        capture_output=True, text=True, timeout=60, check=True,
+    )  # fmt: skip
+    return told.stdout + told.stderr
+
+
+LOAD = "from v2hdm.detection.detector import Detector; Detector.load(); Detector.load()"
+
+
+@pytest.fixture(scope="module")
+def copied(tmp_path_factory):
+    """A folder with the package as it comes where nothing could be compiled."""
+    folder = tmp_path_factory.mktemp("copied")
+    shutil.copytree(
+        ROOT / "v2hdm", folder / "v2hdm", ignore=shutil.ignore_patterns("_kernels*", "__pycache__")
+    )
+    for name in ("hatch_build.py", "pyproject.toml", "README.md", "LICENSE", "conf", "examples"):
+        (shutil.copytree if (ROOT / name).is_dir() else shutil.copy)(ROOT / name, folder / name)
+    return folder
+
+
+def test_without_kernels_numpy_detects_and_one_line_says_so(copied):
+    assert _told(copied, "-c", LOAD) == (
+        "nothing is compiled: detection runs in numpy, at half the speed; "
+        "with a C++ compiler, install v2hdm again\n"
+    )
+    assert _told(copied, "-m", "v2hdm", "--version").endswith("detector in numpy (nothing is compiled)\n")
+
+
+def test_numpy_that_was_asked_for_is_not_complained_about(copied):
+    assert _told(ROOT, "-c", LOAD, V2HDM_NATIVE="0") == ""
+    assert _told(ROOT, "-m", "v2hdm", "--version", V2HDM_NATIVE="0").endswith("numpy (V2HDM_NATIVE is 0)\n")
+
+
+def test_kernels_of_another_processor_are_not_loaded_and_the_line_says_why(copied, tmp_path):
+    shutil.copytree(copied / "v2hdm", tmp_path / "v2hdm")
+    suffix = next(s for s in EXTENSION_SUFFIXES if s.endswith("so"))
+    (tmp_path / "v2hdm" / "native" / f"_kernels{suffix}").write_bytes(b"\x7fELF of another processor")
+    told = _told(tmp_path, "-c", LOAD)
+    assert told.startswith("the compiled kernels do not load (")
+    assert told.count("\n") == 1
+
+
+@compiled
+def test_kernels_older_than_their_sources_are_not_used(copied, tmp_path):
+    shutil.copytree(ROOT / "v2hdm", tmp_path / "v2hdm", ignore=shutil.ignore_patterns("__pycache__"))
+    with (tmp_path / "v2hdm" / "native" / "src" / "settle.cpp").open("a") as source:
+        source.write("// changed\n")
+    assert _told(tmp_path, "-m", "v2hdm", "--version").endswith(
+        "(the compiled kernels are older than their sources)\n"
+    )
+
+
+def test_a_compiler_that_fails_does_not_fail_the_install(copied, tmp_path):
+    program = f"from hatchling import build; print(build.build_wheel({str(tmp_path)!r}))"
+    told = _told(copied, "-c", program, CXX="false", CC="false")
+    assert "v2hdm: detection will run in numpy, nothing was compiled: Command '['false'" in told
+    assert told.count("\n") == 2
+    assert [path.name for path in tmp_path.iterdir()] == [f"v2hdm-{__version__}-py3-none-any.whl"]

@@ -1,0 +1,460 @@
+// The steps, for the processor that the file which includes this is compiled for, as V2HDM_SETTLE.
+namespace v2hdm {
+namespace {
+
+constexpr int BLOCK = 16;         // pixels that are worked on together; a row of a buffer is padded to these
+constexpr int MEDIAN_STRIDE = 3;  // lattice.py: a median is taken over every third value
+constexpr float FAR_BLURS = 6.0f; // blurs from a side beyond which it changes nothing: its density is 6e-9
+constexpr float LOG_SQRT_2PI = 0.91893853f;
+
+using Matrix = double[UNKNOWNS][UNKNOWNS];
+using Vector = double[UNKNOWNS];
+
+float normal_pdf(float x) { return exponential(-0.5f * x * x - LOG_SQRT_2PI); }
+
+// Share of the standard normal between 0 and x; coverage.py names the source.
+float normal_share(float x) {
+    const float odds = 2.0f * x * (0.7988f + 0.03528f * x * x);
+    return 0.5f - 1.0f / (exponential(odds) + 1.0f);
+}
+
+double dot(const float* a, const float* b, int count) {
+    float sum = 0.0f;
+    for (int i = 0; i < count; ++i) sum += a[i] * b[i];
+    return sum;
+}
+
+double sum(const float* a, int count) {
+    float total = 0.0f;
+    for (int i = 0; i < count; ++i) total += a[i];
+    return total;
+}
+
+// Factor by which variance grows if residuals correlate with their neighbours; robust.variance_inflation.
+struct Correlation {
+    float power = 0.0f, product = 0.0f;
+
+    double inflation(double most_correlation) const {
+        const double correlation = product / std::max(power / 2.0, 1e-12);
+        const double r = std::clamp(correlation, 0.0, most_correlation);
+        return (1 + r) / (1 - r);
+    }
+};
+
+// A marking's pixels and what is computed of them, in rows of equal length.
+class Fit {
+  public:
+    Fit(const Pixels& pixels, const OwenTable& table, const FitRules& rules)
+        : pixels_(pixels), table_(table), rules_(rules), count_(pixels.count) {
+        row_ = (count_ + BLOCK - 1) / BLOCK * BLOCK;
+        buffer_.assign(static_cast<size_t>(row_) * ROWS, 0.0f);
+        copy(pixels.points, X);
+        copy(pixels.points + pixels.stride, Y);
+        copy(pixels.values, VALUES);
+        copy(pixels.use, USE);
+        copy(pixels.across, ACROSS);
+        for (int s = 0; s < SIDES; ++s) copy(pixels.of_side + s * pixels.stride, OF_SIDE + s);
+        for (int k = 0; k < KNOTS; ++k) copy(pixels.hats + k * pixels.stride, HATS + k);
+        if (pixels.paint != nullptr) copy(pixels.paint, PAINT);
+    }
+
+    void step(Unknowns& unknowns, double least_scatter, Equations& equations) {
+        const Quad quad(unknowns.corners);
+        cover(quad, *unknowns.blur_px);
+        if (std::isnan(unknowns.light[0])) first_light(unknowns);
+        explain(unknowns);
+        weigh(least_scatter, equations);
+        build_design(*unknowns.contrast);
+        Matrix information;
+        Vector gradient;
+        square(information, gradient);
+        if (pixels_.paint != nullptr) add_paint(information, gradient);
+        add_priors(quad, unknowns, information, gradient);
+        Vector step;
+        std::copy(gradient, gradient + UNKNOWNS, step);
+        solve_symmetric(information, step);
+        move(quad, step, unknowns, equations);
+        *equations.decrement = 0.0;
+        for (int u = 0; u < UNKNOWNS; ++u) *equations.decrement += gradient[u] * step[u];
+        for (int u = 0; u < UNKNOWNS; ++u) {
+            std::copy(information[u], information[u] + UNKNOWNS, equations.information + u * UNKNOWNS);
+        }
+    }
+
+  private:
+    // Rows of the buffer.
+    enum Row {
+        X, Y, VALUES, USE, ACROSS, PAINT,
+        OF_SIDE,
+        HATS = OF_SIDE + SIDES,
+        COVERAGE = HATS + KNOTS,
+        BY_SHAPE,  // the coverage's derivatives by the sides' starts and ends, and by the blur
+        DESIGN = BY_SHAPE + BLUR + 1,
+        RESIDUAL = DESIGN + UNKNOWNS,
+        USED, ROBUST, WEIGHT, RATIO, WEIGHTED, SCRATCH,
+        ROWS
+    };
+
+    float* row(int number) { return buffer_.data() + static_cast<size_t>(number) * row_; }
+
+    void copy(const float* from, int number) { std::copy(from, from + count_, row(number)); }
+
+    // The coverage and its derivatives; coverage.blurred_coverage.
+    void cover(const Quad& quad, double blur_px) {
+        float matrix[3][SIDES][3];
+        float per_length[SIDES];
+        for (int s = 0; s < SIDES; ++s) {
+            const double along = quad.tangent[s][0] * quad.corner[s][0] + quad.tangent[s][1] * quad.corner[s][1];
+            const double off = quad.normal[s][0] * quad.corner[s][0] + quad.normal[s][1] * quad.corner[s][1];
+            const double placed[3][3] = {
+                {quad.normal[s][0], quad.normal[s][1], -off},
+                {-quad.tangent[s][0], -quad.tangent[s][1], along},
+                {-quad.tangent[s][0], -quad.tangent[s][1], along + quad.length[s]},
+            };
+            for (int p = 0; p < 3; ++p) {
+                for (int axis = 0; axis < 3; ++axis) matrix[p][s][axis] = static_cast<float>(placed[p][axis] / blur_px);
+            }
+            per_length[s] = static_cast<float>(1 / std::max(quad.length[s] / blur_px, 1e-3));
+        }
+        const float per_blur = static_cast<float>(1 / blur_px);
+        for (int begin = 0; begin < row_; begin += BLOCK) cover_block(begin, matrix, per_length, per_blur);
+    }
+
+    void cover_block(int begin, const float (&matrix)[3][SIDES][3], const float (&per_length)[SIDES], float per_blur) {
+        const float* x = row(X) + begin;
+        const float* y = row(Y) + begin;
+        float inside[BLOCK], coverage[BLOCK] = {}, by_blur[BLOCK] = {};
+        std::fill(inside, inside + BLOCK, 1.0f);
+        for (int s = 0; s < SIDES; ++s) {
+            float across[BLOCK], start[BLOCK], end[BLOCK];
+            float nearest = FAR_BLURS;
+            for (int i = 0; i < BLOCK; ++i) {
+                across[i] = matrix[0][s][0] * x[i] + matrix[0][s][1] * y[i] + matrix[0][s][2];
+                start[i] = matrix[1][s][0] * x[i] + matrix[1][s][1] * y[i] + matrix[1][s][2];
+                end[i] = matrix[2][s][0] * x[i] + matrix[2][s][1] * y[i] + matrix[2][s][2];
+                inside[i] = across[i] < 0.0f ? inside[i] : 0.0f;
+                const float size = across[i] < 0.0f ? -across[i] : across[i];
+                nearest = size < nearest ? size : nearest;
+            }
+            float* by_start = row(BY_SHAPE + s) + begin;
+            float* by_end = row(BY_SHAPE + SIDES + s) + begin;
+            if (!(nearest < FAR_BLURS)) {
+                std::fill(by_start, by_start + BLOCK, 0.0f);
+                std::fill(by_end, by_end + BLOCK, 0.0f);
+                continue;
+            }
+            for (int i = 0; i < BLOCK; ++i) {
+                const float density = normal_pdf(across[i]) * per_blur;
+                const float share = normal_share(end[i]) - normal_share(start[i]);
+                const float at_end = (normal_pdf(start[i]) - normal_pdf(end[i]) - start[i] * share) * per_length[s];
+                by_end[i] = density * at_end;
+                by_blur[i] += density * share * across[i];
+                by_start[i] = density * share - by_end[i];
+            }
+            for (int i = 0; i < BLOCK; ++i) {
+                const float size = across[i] < 0.0f ? -across[i] : across[i];
+                const float beyond = triangles(size, start[i], end[i]);
+                coverage[i] += std::signbit(across[i]) ? -beyond : beyond;
+            }
+        }
+        std::copy(by_blur, by_blur + BLOCK, row(BY_SHAPE + BLUR) + begin);
+        float* covered = row(COVERAGE) + begin;
+        for (int i = 0; i < BLOCK; ++i) covered[i] = coverage[i] + inside[i];
+    }
+
+    // Mass between the pixel and a side's line, from its start to its end: T(h, end) - T(h, start).
+    float triangles(float across, float start, float end) const {
+        const float last_row = table_.cells_per_blur * table_.reach - 1.01f;
+        const float last_column = table_.cells_per_blur * table_.reach * 2 - 1.01f;
+        const float v = least(most(across * table_.cells_per_blur, 0.0f), last_row);
+        const int i = static_cast<int>(v);
+        const float* line = table_.values + i * table_.columns;
+        const float down = v - static_cast<float>(i);
+        float at[2];
+        const float along[2] = {start, end};
+        for (int p = 0; p < 2; ++p) {
+            const float u = least(most((along[p] + table_.reach) * table_.cells_per_blur, 0.0f), last_column);
+            const int j = static_cast<int>(u);
+            const float right = u - static_cast<float>(j);
+            const float* above = line + j;
+            const float* below = above + table_.columns;
+            const float upper = above[0] + right * (above[1] - above[0]);
+            const float lower = below[0] + right * (below[1] - below[0]);
+            at[p] = upper + down * (lower - upper);
+        }
+        return at[1] - at[0];
+    }
+
+    // Light and contrast of least squares, the logarithm taken as linear in the coverage.
+    void first_light(Unknowns& unknowns) {
+        double matrix[KNOTS + 1][KNOTS + 1], solution[KNOTS + 1];
+        float* weighted = row(WEIGHTED);
+        for (int k = 0; k <= KNOTS; ++k) {
+            const float* basis = row(k < KNOTS ? HATS + k : static_cast<int>(COVERAGE));
+            const float* use = row(USE);
+            for (int i = 0; i < row_; ++i) weighted[i] = basis[i] * use[i];
+            for (int other = 0; other <= k; ++other) {
+                matrix[k][other] = dot(weighted, row(other < KNOTS ? HATS + other : static_cast<int>(COVERAGE)), row_);
+                if (k < KNOTS) matrix[k][other] += rules_.roughness[k][other];
+                matrix[other][k] = matrix[k][other];
+            }
+            matrix[k][k] += 1e-6;
+            solution[k] = dot(weighted, row(VALUES), row_);
+        }
+        matrix[KNOTS][KNOTS] += 1 / (rules_.contrast_sigma * rules_.contrast_sigma);
+        solve_symmetric(matrix, solution);
+        const double contrast = solution[KNOTS];
+        *unknowns.expected_contrast = contrast < 0 ? -rules_.contrast : rules_.contrast;
+        std::copy(solution, solution + KNOTS, unknowns.light);
+        *unknowns.contrast = std::clamp(contrast, -rules_.most_contrast, rules_.most_contrast);
+    }
+
+    // The residuals of log grey, in units of the light on the ground, and which pixels are used.
+    void explain(const Unknowns& unknowns) {
+        const float gain = std::exp(static_cast<float>(*unknowns.contrast)) - 1;
+        const float slope = static_cast<float>(*unknowns.slope);
+        float* model = row(SCRATCH);
+        std::fill(model, model + row_, 0.0f);
+        for (int k = 0; k < KNOTS; ++k) {
+            const float light = static_cast<float>(unknowns.light[k]);
+            const float* hat = row(HATS + k);
+            for (int i = 0; i < row_; ++i) model[i] += light * hat[i];
+        }
+        const float *coverage = row(COVERAGE), *values = row(VALUES), *across = row(ACROSS), *use = row(USE);
+        float *ratio = row(RATIO), *residual = row(RESIDUAL), *used = row(USED);
+        for (int i = 0; i < row_; ++i) {
+            ratio[i] = 1 + gain * least(most(coverage[i], 0.0f), 1.0f);
+            const float expected = model[i] + slope * across[i] + logarithm(ratio[i]);
+            residual[i] = (values[i] - expected) * ratio[i];
+            used[i] = use[i];
+        }
+        // Where the sensor was at its limit the truth is as bright or brighter.
+        for (int i = 0; i < count_; ++i) {
+            if (pixels_.limited[i] && residual[i] < 0) used[i] = 0.0f;
+        }
+        for (int i = 0; i < row_; ++i) residual[i] *= used[i];
+    }
+
+    // The median size of every few residuals of pixels that are used; 0 where there is none.
+    float median_size() {
+        const float *residual = row(RESIDUAL), *used = row(USED);
+        float* sizes = row(SCRATCH);
+        int count = 0;
+        for (int i = 0; i < count_; i += MEDIAN_STRIDE) {
+            if (used[i] > 0) sizes[count++] = std::abs(residual[i]);
+        }
+        if (count == 0) return 0.0f;
+        const int middle = std::max(count / 2 - 1, 0);
+        std::nth_element(sizes, sizes + middle, sizes + count);
+        return sizes[middle];
+    }
+
+    // How much every pixel counts; robust.pixel_weights.
+    void weigh(double least_scatter, Equations& equations) {
+        const float *residual = row(RESIDUAL), *used = row(USED);
+        float *robust = row(ROBUST), *square = row(SCRATCH);
+        const double scale = std::max(rules_.sigma_of_mad * median_size(), std::max(rules_.min_scatter, least_scatter));
+        const float per_scale = static_cast<float>(1 / (rules_.cauchy * scale));
+        for (int i = 0; i < row_; ++i) {
+            const float size = residual[i] * per_scale;
+            robust[i] = used[i] / (1 + size * size);
+            square[i] = robust[i] * residual[i] * residual[i];
+        }
+        const double counted = sum(robust, row_);
+        const double shared = sum(square, row_) / std::max(counted, 1.0);
+        double inflation = 1.0;
+        for (int axis = 0; axis < pixels_.neighbour_rows; ++axis) {
+            inflation *= correlation(pixels_.neighbours + static_cast<int64_t>(axis) * pixels_.stride)
+                             .inflation(rules_.max_correlation);
+        }
+        float* weight = row(WEIGHT);
+        std::fill(weight, weight + row_, 0.0f);
+        for (int s = 0; s < SIDES; ++s) {
+            const float* of_side = row(OF_SIDE + s);
+            const double variance = std::max(
+                (dot(square, of_side, row_) + rules_.shared_pixels * shared)
+                    / (dot(robust, of_side, row_) + rules_.shared_pixels),
+                rules_.min_scatter * rules_.min_scatter);
+            equations.scatter[s] = std::sqrt(variance);
+            const float per_pixel = static_cast<float>(1 / (variance * inflation));
+            for (int i = 0; i < row_; ++i) weight[i] += robust[i] * of_side[i] * per_pixel;
+        }
+        *equations.inliers = counted / std::max(sum(used, row_), 1.0);
+    }
+
+    // How far residuals are alike at neighbours, of which 0 is none.
+    Correlation correlation(const int64_t* neighbours) {
+        const float *residual = row(RESIDUAL), *robust = row(ROBUST);
+        Correlation total;
+        for (int i = 0; i < count_; ++i) {
+            const int64_t other = neighbours[i];
+            const float weight = other > 0 ? robust[i] * robust[other] : 0.0f;
+            const float first = residual[i], second = residual[other];
+            total.power += weight * (first * first + second * second);
+            total.product += weight * first * second;
+        }
+        return total;
+    }
+
+    // The derivatives of the residuals by the unknowns.
+    void build_design(double contrast) {
+        const float gain = std::exp(static_cast<float>(contrast)) - 1;
+        const float *coverage = row(COVERAGE), *ratio = row(RATIO), *across = row(ACROSS);
+        for (int u = 0; u <= BLUR; ++u) {
+            const float* by_shape = row(BY_SHAPE + u);
+            float* design = row(DESIGN + u);
+            for (int i = 0; i < row_; ++i) design[i] = by_shape[i] * gain;
+        }
+        for (int k = 0; k < KNOTS; ++k) {
+            const float* hat = row(HATS + k);
+            float* design = row(DESIGN + LIGHT + k);
+            for (int i = 0; i < row_; ++i) design[i] = hat[i] * ratio[i];
+        }
+        float *by_contrast = row(DESIGN + CONTRAST), *by_slope = row(DESIGN + SLOPE);
+        for (int i = 0; i < row_; ++i) {
+            by_contrast[i] = (gain + 1) * coverage[i];
+            by_slope[i] = across[i] * ratio[i];
+        }
+    }
+
+    // The normal equations of the weighted residuals.
+    void square(Matrix& information, Vector& gradient) {
+        const float *weight = row(WEIGHT), *residual = row(RESIDUAL);
+        float* weighted = row(WEIGHTED);
+        for (int u = 0; u < UNKNOWNS; ++u) {
+            const float* design = row(DESIGN + u);
+            for (int i = 0; i < row_; ++i) weighted[i] = design[i] * weight[i];
+            for (int other = 0; other <= u; ++other) {
+                information[u][other] = information[other][u] = dot(weighted, row(DESIGN + other), row_);
+            }
+            gradient[u] = dot(weighted, residual, row_);
+        }
+    }
+
+    // Add that the network's probability of paint is the coverage; robust.add_paint.
+    void add_paint(Matrix& information, Vector& gradient) {
+        const float *paint = row(PAINT), *coverage = row(COVERAGE), *use = row(USE);
+        float *residual = row(SCRATCH), *weight = row(WEIGHT), *weighted = row(WEIGHTED);
+        const float per_sigma = static_cast<float>(1 / (rules_.cauchy * rules_.paint_sigma));
+        const float per_variance = static_cast<float>(1 / (rules_.paint_sigma * rules_.paint_sigma));
+        for (int i = 0; i < row_; ++i) {
+            residual[i] = paint[i] - coverage[i];
+            const float size = residual[i] * per_sigma;
+            weight[i] = use[i] * per_variance / (1 + size * size);
+        }
+        for (int u = 0; u < BLUR; ++u) {
+            const float* by_side = row(BY_SHAPE + u);
+            for (int i = 0; i < row_; ++i) weighted[i] = by_side[i] * weight[i];
+            for (int other = 0; other < BLUR; ++other) {
+                information[u][other] += dot(weighted, row(BY_SHAPE + other), row_);
+            }
+            gradient[u] += dot(weighted, residual, row_);
+        }
+    }
+
+    // Add the outline, the typical blur and contrast, and that light changes little; State._add_priors.
+    void add_priors(const Quad& quad, const Unknowns& unknowns, Matrix& information, Vector& gradient) const {
+        add_outline(quad, unknowns, information, gradient);
+        add_closure(quad, unknowns, information, gradient);
+        const double per_blur = 1 / (rules_.blur_sigma_px * rules_.blur_sigma_px);
+        information[BLUR][BLUR] += per_blur;
+        if (pixels_.paint != nullptr) {
+            information[BLUR][BLUR] += rules_.held;
+        } else {
+            gradient[BLUR] += (unknowns.expected_blur_px - *unknowns.blur_px) * per_blur;
+        }
+        const double per_contrast = 1 / (rules_.contrast_sigma * rules_.contrast_sigma);
+        information[CONTRAST][CONTRAST] += per_contrast;
+        gradient[CONTRAST] += (*unknowns.expected_contrast - *unknowns.contrast) * per_contrast;
+        for (int k = 0; k < KNOTS; ++k) {
+            for (int other = 0; other < KNOTS; ++other) {
+                information[LIGHT + k][LIGHT + other] += rules_.roughness[k][other];
+                gradient[LIGHT + k] -= rules_.roughness[k][other] * unknowns.light[other];
+            }
+        }
+        const double per_slope = 1 / (rules_.light_step * rules_.light_step);
+        information[SLOPE][SLOPE] += per_slope;
+        gradient[SLOPE] -= *unknowns.slope * per_slope;
+    }
+
+    static void add_outline(const Quad& quad, const Unknowns& unknowns, Matrix& information, Vector& gradient) {
+        for (int s = 0; s < SIDES; ++s) {
+            for (int end = 0; end < 2; ++end) {
+                const int c = (s + end) % SIDES;
+                const int place = s + end * SIDES;
+                double off = 0.0;
+                for (int axis = 0; axis < 2; ++axis) {
+                    off += (unknowns.outline[2 * c + axis] - quad.corner[c][axis]) * quad.normal[s][axis];
+                }
+                const double sigma_px = unknowns.outline_sigma_px[place];
+                information[place][place] += 1 / (sigma_px * sigma_px);
+                gradient[place] += off / (sigma_px * sigma_px);
+            }
+        }
+    }
+
+    static void add_closure(const Quad& quad, const Unknowns& unknowns, Matrix& information, Vector& gradient) {
+        for (int axis = 0; axis < 2; ++axis) {
+            const double* by_corner = unknowns.closure + axis * 2 * SIDES;
+            double by_side[2 * SIDES];
+            double gap = unknowns.gap[axis];
+            for (int c = 0; c < SIDES; ++c) {
+                double by_start[2], by_end[2];
+                quad.slides(c, by_start, by_end);
+                const double* by_place = by_corner + 2 * c;
+                by_side[c] = by_place[0] * by_start[0] + by_place[1] * by_start[1];
+                by_side[SIDES + (c + SIDES - 1) % SIDES] = by_place[0] * by_end[0] + by_place[1] * by_end[1];
+                for (int d = 0; d < 2; ++d) gap += by_place[d] * (quad.corner[c][d] - unknowns.outline[2 * c + d]);
+            }
+            for (int u = 0; u < 2 * SIDES; ++u) {
+                for (int other = 0; other < 2 * SIDES; ++other) information[u][other] += by_side[u] * by_side[other];
+                gradient[u] -= gap * by_side[u];
+            }
+        }
+    }
+
+    void move(const Quad& quad, const Vector& step, Unknowns& unknowns, Equations& equations) const {
+        const double most_px = rules_.most_step * *unknowns.blur_px;
+        for (int u = 0; u < BLUR; ++u) equations.side_step[u] = std::clamp(step[u], -most_px, most_px);
+        quad.moved(equations.side_step, unknowns.corners);
+        if (pixels_.paint == nullptr) {
+            *unknowns.blur_px = std::clamp(*unknowns.blur_px + step[BLUR], rules_.least_blur_px, rules_.most_blur_px);
+        }
+        *unknowns.contrast += std::clamp(step[CONTRAST], -rules_.most_contrast_step, rules_.most_contrast_step);
+        for (int k = 0; k < KNOTS; ++k) unknowns.light[k] += step[LIGHT + k];
+        *unknowns.slope += step[SLOPE];
+    }
+
+    const Pixels& pixels_;
+    const OwenTable& table_;
+    const FitRules& rules_;
+    int count_;
+    int row_;  // floats from one row of the buffer to the next
+    std::vector<float> buffer_;
+};
+
+}  // namespace
+
+void V2HDM_SETTLE(
+    const Pixels& pixels,
+    const OwenTable& table,
+    const FitRules& rules,
+    int steps,
+    double scatter,
+    Unknowns& unknowns,
+    Equations& equations) {
+    Fit fit(pixels, table, rules);
+    for (int number = 0; number < steps; ++number) {
+        fit.step(unknowns, scatter, equations);
+        scatter /= 2;
+        double longest_px = 0.0;
+        for (int u = 0; u < 2 * SIDES; ++u) {
+            const double size_px = std::abs(equations.side_step[u]);
+            if (!(size_px <= longest_px)) longest_px = size_px;
+        }
+        // Not-a-number is not longer.
+        if (!(longest_px > rules.settled_px) || !(*equations.decrement > rules.insignificant)) break;
+    }
+}
+
+}  // namespace v2hdm
