@@ -46,7 +46,9 @@ _LOCAL = {
 
 def quiet() -> None:
     """Keep what Dask logs off the terminal: what matters of it are our errors."""
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    for name in list(logging.root.manager.loggerDict):
+        if name.split(".")[0] in ("distributed", "tornado"):  # each has a level of its own
+            logging.getLogger(name).setLevel(logging.CRITICAL + 1)
 
 
 def local_cluster(workers: int, memory_gb: float) -> Cluster:
