@@ -77,7 +77,7 @@ def classes_of(path: Path) -> tuple[str, ...]:
 
 
 def _shares_of_classes(shares: Tensor, knows: Tensor) -> Tensor:
-    """What each file counts (F, K) for the channel of each class: nothing where it does not know the class.
+    """Shares (F, K) of each file in the channel of each class: nothing where it does not know the class.
 
     The first class is one that all know. A class that no file knows is averaged as if all did.
     """

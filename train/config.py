@@ -23,6 +23,7 @@ _COCO_AND_TUSIMPLE = (
 
 _SIDE = Within(MULTIPLE, 2**13, step=MULTIPLE)  # of an image that the network sees, px
 _RENDER_SIDE = Within(MULTIPLE, 2**14)  # of an image that views are cut out of, px
+_Amount = Annotated[float, Within(0, 100)]  # a share or mean number per scene; chosen: above any need
 
 _COCO_IMAGES_AND_TUSIMPLE_IMAGES = (
     "The images' names in them start from coco_images and tusimple_images, or else from the folder of "
@@ -54,163 +55,116 @@ class DataConfig:
     easy_samples: Annotated[
         int, NOT_NEGATIVE, "easy_samples renders pass until scenes are as hard as they get."
     ] = 1000
-    shadows_on_paint: Annotated[float, Within(0, 100), _SHADOWS_ON_PAINT_AND_ASIDE] = 3.0
+    shadows_on_paint: Annotated[_Amount, _SHADOWS_ON_PAINT_AND_ASIDE] = 3.0
     things_beside: Annotated[
-        float,
-        Within(0, 100),
+        _Amount,
         "mean number of containers, barriers, cabinets and vehicles that stand right beside a marking: what "
         "is bright, has corners and touches such a thing is a part of it in most scenes.",
     ] = 0.8
     faint: Annotated[
-        float,
-        Within(0, 100),
-        "share of scenes half of whose markings are so dirty that the ground is nearly as bright.",
+        _Amount, "share of scenes half of whose markings are so dirty that the ground is nearly as bright."
     ] = 0.25
     seams: Annotated[
-        float,
-        Within(0, 100),
+        _Amount,
         "share of lane lines that have a seam of the surface beside them, as paving leaves it there: dark "
         "or bright, and going on where a dash ends.",
     ] = 0.25
     side_seams: Annotated[
-        float,
-        Within(0, 100),
-        "mean number of markings with a crack or a tar seam along one of their sides and beyond it.",
+        _Amount, "mean number of markings with a crack or a tar seam along one of their sides and beyond it."
     ] = 1.5
     pavements: Annotated[
-        float,
-        Within(0, 100),
-        "share of scenes in which the surface changes its tone along a line, beside its paint.",
+        _Amount, "share of scenes in which the surface changes its tone along a line, beside its paint."
     ] = 0.3
     bleached: Annotated[
-        float,
-        Within(0, 100),
+        _Amount,
         "share of scenes whose ground is nearly as light as its paint. Half of them are overexposed, so "
         "that ground and paint are clipped together.",
     ] = 0.14
     overexposed: Annotated[
-        float,
-        Within(0, 100),
+        _Amount,
         "share of images that are exposed several times too long, as the sunlit half of a scene is by a "
         "camera set for its shade.",
     ] = 0.15
-    blue_shade: Annotated[float, Within(0, 100), "share of scenes whose shade is lit by a deep blue sky."] = (
-        0.3
-    )
+    blue_shade: Annotated[_Amount, "share of scenes whose shade is lit by a deep blue sky."] = 0.3
     tight_bends: Annotated[
-        float,
-        Within(0, 100),
+        _Amount,
         "share of scenes whose way, and all paint with it, turns as sharply as in yards and roundabouts; "
         "what would stand on the paint is left out.",
     ] = 0.15
     kerbs: Annotated[
-        float,
-        Within(0, 100),
+        _Amount,
         "share of scenes with a bright kerb along a line of a lane, no wider than paint, that lies open in "
         "stretches as long as dashes.",
     ] = 0.2
     gutters: Annotated[
-        float,
-        Within(0, 100),
-        "share of scenes with a strip of stones or concrete along the way, level with the ground.",
+        _Amount, "share of scenes with a strip of stones or concrete along the way, level with the ground."
     ] = 0.06
-    joints: Annotated[
-        float, Within(0, 100), "mean number of long seams along the way, apart from all lines of lanes."
-    ] = 0.5
+    joints: Annotated[_Amount, "mean number of long seams along the way, apart from all lines of lanes."] = (
+        0.5
+    )
     junctions: Annotated[
-        float,
-        Within(0, 100),
-        "share of scenes with the whole approach to a junction: arrows, stop line, crosswalk.",
+        _Amount, "share of scenes with the whole approach to a junction: arrows, stop line, crosswalk."
     ] = 0.12
     mountings: Annotated[
-        float,
-        Within(0, 100),
+        _Amount,
         "share of cameras that sit lower than in cars (0.5 to 1.1 m) or higher than on most trucks (3.6 to "
         "5 m).",
     ] = 0.15
-    facing: Annotated[
-        float, Within(0, 100), "share of the lanes whose arrows and writing face the camera."
-    ] = 0.5
+    facing: Annotated[_Amount, "share of the lanes whose arrows and writing face the camera."] = 0.5
     stout: Annotated[
-        float,
-        Within(0, 100),
-        "share of the lanes with arrows whose shafts are thick and tapered, their heads short.",
+        _Amount, "share of the lanes with arrows whose shafts are thick and tapered, their heads short."
     ] = 0.4
     hollow: Annotated[
-        float,
-        Within(0, 100),
+        _Amount,
         "share of ports whose diamonds are outlines, labelled as filled ones as photographs are; and of "
         "streets with such diamonds in a lane.",
     ] = 0.25
     crossings: Annotated[
-        float, Within(0, 100), "share of scenes with a stop line that meets or crosses lines of lanes."
+        _Amount, "share of scenes with a stop line that meets or crosses lines of lanes."
     ] = 0.12
-    words: Annotated[float, Within(0, 100), "share of scenes with words or a number in lanes."] = 0.15
-    bays: Annotated[
-        float, Within(0, 100), "share of scenes with a row of numbers of bays or slots along the way."
-    ] = 0.12
+    words: Annotated[_Amount, "share of scenes with words or a number in lanes."] = 0.15
+    bays: Annotated[_Amount, "share of scenes with a row of numbers of bays or slots along the way."] = 0.12
     boxes: Annotated[
-        float,
-        Within(0, 100),
+        _Amount,
         "share of scenes with an area to be kept clear: yellow boxes, hatched aisles, crossed rectangles.",
     ] = 0.15
-    users: Annotated[
-        float, Within(0, 100), "share of scenes with bicycles, people or wheelchairs painted in lanes."
-    ] = 0.1
+    users: Annotated[_Amount, "share of scenes with bicycles, people or wheelchairs painted in lanes."] = 0.1
     others: Annotated[
-        float,
-        Within(0, 100),
+        _Amount,
         "share of scenes with paint that has no class of its own: rings, crosses, zigzags, corners of bays.",
     ] = 0.06
     give_way: Annotated[
-        float,
-        Within(0, 100),
-        "share of scenes with a give-way line of short dashes or teeth, labelled as a stop line.",
+        _Amount, "share of scenes with a give-way line of short dashes or teeth, labelled as a stop line."
     ] = 0.1
-    far_stops: Annotated[float, Within(0, 100), "share of scenes with a stop line 12 to 40 m ahead."] = 0.25
+    far_stops: Annotated[_Amount, "share of scenes with a stop line 12 to 40 m ahead."] = 0.25
     crosswalks: Annotated[
-        float,
-        Within(0, 100),
+        _Amount,
         "share of scenes with a whole crosswalk: bars, bars between two lines, or the two lines alone.",
     ] = 0.15
-    doubles: Annotated[
-        float, Within(0, 100), "share of scenes with a double line, half of them yellow ones."
-    ] = 0.15
+    doubles: Annotated[_Amount, "share of scenes with a double line, half of them yellow ones."] = 0.15
     erased: Annotated[
-        float,
-        Within(0, 100),
-        "mean number of markings that were ground off, burnt off or painted over: no paint.",
+        _Amount, "mean number of markings that were ground off, burnt off or painted over: no paint."
     ] = 0.7
-    litter: Annotated[float, Within(0, 100), "mean number of sheets, boxes, bags and cans on the ground."] = (
-        1.2
-    )
+    litter: Annotated[_Amount, "mean number of sheets, boxes, bags and cans on the ground."] = 1.2
     traffic: Annotated[
-        float,
-        Within(0, 100),
+        _Amount,
         "mean number of vehicles, boards and kerbs with stripes, windows, wheels, plates and writing.",
     ] = 0.5
     own_vehicle: Annotated[
-        float,
-        Within(0, 100),
+        _Amount,
         "share of images with the own bonnet or dashboard, wipers, or drops and reflections on the "
         "windscreen.",
     ] = 0.2
-    rain: Annotated[
-        float, Within(0, 100), "share of scenes whose ground is wet all over and mirrors a bright sky."
-    ] = 0.08
-    low_sun: Annotated[
-        float, Within(0, 100), "share of scenes with a sun at 3 to 11 degrees, half of them against it."
-    ] = 0.1
-    dusk: Annotated[
-        float, Within(0, 100), "share of scenes after sunset, mostly in the light of the own headlights."
-    ] = 0.06
-    sun_flecks: Annotated[float, Within(0, 100), "share of scenes in deep shade with few spots of sun."] = (
-        0.08
+    rain: Annotated[_Amount, "share of scenes whose ground is wet all over and mirrors a bright sky."] = 0.08
+    low_sun: Annotated[_Amount, "share of scenes with a sun at 3 to 11 degrees, half of them against it."] = (
+        0.1
     )
-    grounds: Annotated[
-        float, Within(0, 100), "share of grounds of asphalt or concrete that are photographed ones."
-    ] = 0.4
-    aside: Annotated[float, Within(0, 100), _SHADOWS_ON_PAINT_AND_ASIDE] = 0.08
+    dusk: Annotated[_Amount, "share of scenes after sunset, mostly in the light of the own headlights."] = (
+        0.06
+    )
+    sun_flecks: Annotated[_Amount, "share of scenes in deep shade with few spots of sun."] = 0.08
+    grounds: Annotated[_Amount, "share of grounds of asphalt or concrete that are photographed ones."] = 0.4
+    aside: Annotated[_Amount, _SHADOWS_ON_PAINT_AND_ASIDE] = 0.08
     workers: Annotated[int | None, Within(0, MOST_PROCESSES), "workers processes render;"] = 1
     coco: Annotated[str | None, _COCO_AND_TUSIMPLE] = None
     coco_images: Annotated[str | None, _COCO_IMAGES_AND_TUSIMPLE_IMAGES] = None

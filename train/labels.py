@@ -254,7 +254,7 @@ class Place:
         return np.asarray(cells[row[:, None], column] > 0)
 
     def toned(self, tone: Tone) -> tuple[BoolArray, BoolArray]:
-        """What is paint and what is ground of the window (height, width), by the brightness of the image."""
+        """Masks (height, width) of the window's paint and of its ground, by the brightness of the image."""
         u = (
             np.floor((np.arange(self.width) + 0.5) / self.scale[0]).astype(np.intp)
             + self.corner_px[0]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -57,12 +57,7 @@ def read_coco(
         _entries(content, "annotations", ("image_id", "category_id", "segmentation"), path)
     ):
         where = f"{path}: annotation {entry.get('id', number)}"
-        if entry["category_id"] not in names:
-            raise LabelError(
-                f"{where}: its category {shown(entry['category_id'])} is not in the file; add it"
-            )
-        if entry["image_id"] not in shapes:
-            raise LabelError(f"{where}: its image {shown(entry['image_id'])} is not in the file; add it")
+        _check_references(entry, names, shapes, where)
         # What COCO calls a crowd is of no score there: nobody knows what of it is one of the category.
         unsure = bool(entry.get("iscrowd"))
         category = category_of.pop(entry.get("id"), names[entry["category_id"]])
@@ -88,6 +83,15 @@ def read_coco(
         )
         for entry in entries
     ]
+
+
+def _check_references(
+    entry: Mapping[str, Any], categories: Container[Any], images: Container[Any], where: str
+) -> None:
+    if entry["category_id"] not in categories:
+        raise LabelError(f"{where}: its category {shown(entry['category_id'])} is not in the file; add it")
+    if entry["image_id"] not in images:
+        raise LabelError(f"{where}: its image {shown(entry['image_id'])} is not in the file; add it")
 
 
 def _relabelled(files: Mapping[str, str]) -> dict[Any, str]:

@@ -72,7 +72,7 @@ def kind_loss(logits: Tensor, labels: Tensor, weight: Tensor) -> Tensor:
 
 
 def rare_paint(kinds: Tensor, weight: Tensor) -> Tensor:
-    """What the paint in and around each cell (B, H, W) weighs by its class: 1 for the commonest, 4 at most.
+    """Weights of the paint in and around each cell (B, H, W) by its class: 1 for the commonest, 4 at most.
 
     Stop lines are seldom, and of the thinnest paint: their class alone would be learnt, not their paint.
     Around them too, so that no edge is learnt outside of the true one.

@@ -293,8 +293,10 @@ def _silent(eye: _Eye, facts: Facts, range_m: float) -> list[FloatArray]:
     places = [exclusion.position_map for exclusion in facts.excluded]
     in_range = [place for place in places if np.linalg.norm(place - centre[:2]) < range_m + _CLEAR_M]
     coarse = _coarse_outlines(facts)
-    near = [outline for outline in coarse if np.linalg.norm(outline - centre[:2], axis=1).min() < range_m]
-    outlines = [beyond, *(place + disc for place in in_range), *near]
+    coarse_in_range = [
+        outline for outline in coarse if np.linalg.norm(outline - centre[:2], axis=1).min() < range_m
+    ]
+    outlines = [beyond, *(place + disc for place in in_range), *coarse_in_range]
     polygons = [eye.polygon(outline)[0] for outline in outlines]
     return [
         polygon for polygon in polygons if len(polygon) > 2 and abs(float(signed_area(polygon))) >= _LEAST_PX2

@@ -1,4 +1,4 @@
-"""What the settings of all commands say of themselves: type, range and meaning, beside each of them.
+"""The type, range and meaning of each setting of all commands, which stand beside it.
 
 A setting is a field of a dataclass, ``max_gap_s: Annotated[float, POSITIVE, "longest gap, s."] = 0.5``. The
 check before any work, ``--help``, the schemas for editors and the library's pages are made of these.
@@ -55,7 +55,7 @@ SEED = Within(0, 2**63 - 1)  # whole numbers of 64 bits with a sign
 
 @dataclass(frozen=True)
 class Setting:
-    """What a field of a dataclass declares: its type, the numbers it takes, and what it means."""
+    """A setting as a field of a dataclass declares it: type, the numbers that it takes, and its meaning."""
 
     hint: Any
     allowed: Within = ANY_NUMBER

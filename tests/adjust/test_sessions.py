@@ -142,8 +142,8 @@ def test_drives_whose_shared_corners_are_kept_are_adjusted_as_with_all_corners_e
     monkeypatch.setattr("v2hdm.adjust.kernels.engine._CLEARLY_LESS", 1e9)
     kept = solve(problem, options)
     plans = [one.covariance.whitening.plan for one in (whole, kept)]
-    assert not len(plans[0].kept)
-    assert 0 < len(plans[1].kept) <= problem.corner_count
+    assert not len(plans[0].kept_corners)
+    assert 0 < len(plans[1].kept_corners) <= problem.corner_count
     assert whole.status is kept.status is Status.CONVERGED
     assert whole.evaluations == kept.evaluations
     for name in ("corners_map", "cam_from_vehicle", "map_from_vehicle", "clock_offset_s"):
@@ -167,9 +167,9 @@ def test_many_drives_of_one_way_take_less_with_their_corners_kept():
     crowd = make_engine("numba", make_arrays(site(6, 100, 100), POSE_STATES, "cpu"))
     plan = crowd.plan()
     eliminated = make_engine("torch", crowd.arrays).plan()
-    assert len(plan.kept) == crowd.arrays.corner_count
+    assert len(plan.kept_corners) == crowd.arrays.corner_count
     tip = crowd.arrays.camera_count * crowd.arrays.camera_unknowns
     spent = [one.pattern.multiplications(one.size, tip) for one in (plan, eliminated)]
     assert spent[0] < 0.15 * spent[1]
     chain = make_engine("numba", make_arrays(site(2, 60, 10), POSE_STATES, "cpu"))
-    assert not len(chain.plan().kept)
+    assert not len(chain.plan().kept_corners)

@@ -44,7 +44,7 @@ def crowd(frames: int) -> None:
             cpu = time.process_time()
             found.append(solve(problem, OPTIONS))
             spent.append(time.process_time() - cpu)
-        kept = len(found[1].covariance.whitening.plan.kept)
+        kept = len(found[1].covariance.whitening.plan.kept_corners)
         print(
             f"{drives} drives of one way: {spent[0]:.2f} s CPU with corners first, {spent[1]:.2f} s with "
             f"{kept} kept; {off_m(*found):.1e} m apart",

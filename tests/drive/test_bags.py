@@ -745,8 +745,10 @@ def test_a_flipped_bit_in_a_video_whose_pictures_carry_hashes_is_reported(tmp_pa
     assert "decoder error" not in caplog.text
     flipped[len(flipped) // 2] ^= 16
     path.write_bytes(flipped)
-    _import_video(path, tmp_path / "flipped", "here")
-    assert re.search(r"a\.mkv: frame \d+: decoder error", caplog.text)
+    for _ in range(2):  # the second time it is not decoded again
+        caplog.clear()
+        _import_video(path, tmp_path / "flipped", "here")
+        assert len(re.findall(r"a\.mkv: frame \d+: decoder error", caplog.text)) == 1
 
 
 def test_damage_that_the_decoder_of_a_topics_video_conceals_is_reported_once(tmp_path, caplog):

@@ -14,7 +14,6 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from tests.drive.bags import Messages, messages_of, mountings, write_ros1, write_ros2
-from tests.drive.example import make_drive
 from v2hdm.cli.main import run
 from v2hdm.errors import DriveError, MapFileError
 from v2hdm.geometry.ipm import initial_extrinsic
@@ -23,6 +22,8 @@ from v2hdm.io.calibration.reading import Provenance, read_calibration
 from v2hdm.io.calibration.writing import write_calibration, write_calibration_as
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.records import Calibration, CameraFrames, FloatArray, FrameStep
+
+pytestmark = pytest.mark.usefixtures("working_directory")
 
 Tree = dict[tuple[str, str], FloatArray]
 OPTICAL = make_transform(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.zeros(3))
@@ -93,18 +94,6 @@ def recorded(folder: Path, tree: Tree, prefix: str, child: str = "base_link", ro
         made.add(made.rows[0][0], "/tf_static", made.transforms(made.rows[0][0], tree))
     made.rows.sort(key=lambda row: row[0])
     return made
-
-
-@pytest.fixture(autouse=True)
-def working_directory(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    root = tmp_path_factory.mktemp("folder")
-    make_drive(root)
-    return root
 
 
 def read(path, **options):

@@ -7,19 +7,11 @@ from typing import Any
 import pytest
 
 from tests.drive.bags import ROS1, ROS2, Messages, assert_same_drive, messages_of, topics_for
-from tests.drive.example import make_drive
 from tests.drive.test_bags import read
 from v2hdm.errors import DriveError
 from v2hdm.io.drive import read_drive
 
 _MAGIC = b"\x89MCAP0\r\n"
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    root = tmp_path_factory.mktemp("folder")
-    make_drive(root)
-    return root
 
 
 def _text(text: str) -> bytes:

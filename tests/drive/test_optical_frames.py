@@ -8,7 +8,6 @@ import pytest
 import yaml
 
 from tests.drive.bags import messages_of, write_ros2
-from tests.drive.example import make_drive
 from tests.drive.test_frames import OPTICAL, at
 from v2hdm.cli.main import run
 from v2hdm.errors import DriveError
@@ -16,6 +15,8 @@ from v2hdm.geometry.rigid import quaternion_from_rotation
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.io.importers.bag.frames import Frames
 from v2hdm.io.importers.bag.mountings import is_optical, mount_of, mounting_of
+
+pytestmark = pytest.mark.usefixtures("working_directory")
 
 BASE = "base_link"
 PITCHES_DEG = [0.0, 17.0, 45.0, 60.0, 75.0, 89.0]
@@ -93,18 +94,6 @@ def test_an_info_s_frame_counts_where_the_images_name_none_that_is_known():
     mount = mount_of(frames, BASE, ["camera", "front_optical"], "camera")
     assert mount.frame == "front_optical"
     np.testing.assert_allclose(mounting_of(mount.vehicle_from_cam)["rpy_deg"], [0, 17, 0], atol=1e-6)
-
-
-@pytest.fixture(autouse=True)
-def working_directory(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    root = tmp_path_factory.mktemp("folder")
-    make_drive(root)
-    return root
 
 
 def front_alone(folder, edges, frame="camera_link", infos=True):

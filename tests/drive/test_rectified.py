@@ -4,16 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 
 from tests.drive.bags import Messages, messages_of, mountings, topics_for, write_ros2
-from tests.drive.example import make_drive
 from tests.drive.test_bags import read
 from v2hdm.errors import DriveError
 from v2hdm.geometry.frames import edges_of
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.rigid import inverse, make_transform, rotation_from_euler
-from v2hdm.io.calibration.reading import info_of, read_calibration
-from v2hdm.io.calibration.writing import write_calibration
+from v2hdm.io.calibration.intrinsics import read_rectified_intrinsics
+from v2hdm.io.calibration.reading import Provenance, info_of, read_calibration
+from v2hdm.io.calibration.writing import write_calibration, write_calibration_as, write_camera_info
 from v2hdm.records import Calibration, CameraFrames, CameraInfo
 from v2hdm.verdict.inputs.drive import check_camera
 
@@ -24,17 +25,16 @@ LENS = CameraInfo(
 )
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    root = tmp_path_factory.mktemp("folder")
-    make_drive(root)
-    return root
+def renamed(folder, topic):
+    """The messages of ``folder`` with its front images on ``topic``."""
+    made = messages_of(folder)
+    made.rows = [(at, topic if name == RAW else name, message) for at, name, message in made.rows]
+    return made
 
 
 def rectified_bag(folder, path, topic):
     """The bag of ``folder`` whose front images are on ``topic``, turned by TURN, of a lens that bends."""
-    made = messages_of(folder)
-    made.rows = [(at, topic if name == RAW else name, message) for at, name, message in made.rows]
+    made = renamed(folder, topic)
     for _, name, message in made.rows:
         if name == "/sensing/front/camera_info":
             message.d[:] = LENS.distortion
@@ -110,3 +110,86 @@ def test_a_driver_that_states_no_p_or_r_is_taken_at_its_word_or_refused():
         message.r[:] = np.diag([1.0, 1.0, wrong]).ravel()
         with pytest.raises(DriveError, match="here, R: is no rotation"):
             info_of(message, "cam", "here", rectified=True)
+
+
+def as_file(path, form):
+    """The front camera's calibration in a file of ROS: as ``camera_calibration`` writes it, or a message."""
+    projection = [47.0, 0, 32, -9.4, 0, 47.5, 24, 0, 0, 0, 1, 0]
+    if form == "message":
+        message = {
+            "header": {"frame_id": "cam"}, "height": 48, "width": 64, "distortion_model": "plumb_bob",
+            "d": list(LENS.distortion), "k": LENS.intrinsic.ravel().tolist(), "r": TURN.ravel().tolist(),
+            "p": projection,
+        }  # fmt: skip
+        path.write_text(yaml.safe_dump(message))
+        return path
+    write_camera_info(LENS, path, TURN)
+    content = yaml.safe_load(path.read_text())
+    content["projection_matrix"]["data"] = projection
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+def with_file(folder, tmp_path, topic, file, **info):
+    """The front camera of a bag that states no P, with its intrinsics in ``file``."""
+    bag = write_ros2(tmp_path / "site", renamed(folder, topic))
+    content = topics_for(folder, bag, vehicle_frame="base_link")
+    front = content["cameras"]["front"]
+    front.pop("ipm", None)
+    guess = mountings()["front"].tolist()
+    front |= {"images": {"topic": topic}, "cam_from_vehicle": guess, "frame": "front_optical"}
+    front["camera_info"] = {"file": str(file), **info} if info else str(file)
+    return read(tmp_path / "drive", content).cameras["front"]
+
+
+@pytest.mark.parametrize("form", ["camera_info", "message"])
+@pytest.mark.parametrize(("topic", "info"), [("/front/image_rect", {}), (RAW, {"rectified": True})])
+def test_a_file_says_of_rectified_images_what_a_topic_does(topic, info, form, folder, tmp_path):
+    camera = with_file(folder, tmp_path, topic, as_file(tmp_path / "front.yaml", form), **info)
+    np.testing.assert_array_equal(camera.info.intrinsic, [[47.0, 0, 32], [0, 47.5, 24], [0, 0, 1]])
+    assert not any(camera.info.distortion)
+    np.testing.assert_allclose(camera.frames.rectified_from_camera, TURN, atol=1e-12)
+
+
+@pytest.mark.parametrize(("topic", "info"), [(RAW, {}), ("/front/image_rect", {"rectified": False})])
+def test_a_file_of_other_images_keeps_its_lens(topic, info, folder, tmp_path):
+    camera = with_file(folder, tmp_path, topic, as_file(tmp_path / "front.yaml", "camera_info"), **info)
+    assert camera.info.distortion == LENS.distortion
+    assert camera.frames.rectified_from_camera is None
+
+
+def write_lens(path, form, distortion):
+    calibration = Calibration(replace(LENS, distortion=distortion), mountings()["front"])
+    if form == "own":
+        frames = CameraFrames(rectified_from_camera=TURN)
+        write_calibration(replace(calibration, frames=frames), path)
+        return path
+    return write_calibration_as(form, calibration, Provenance(), path.parent, "front")
+
+
+@pytest.mark.parametrize(("form", "turn"), [("kalibr", np.eye(3)), ("opencv", np.eye(3)), ("own", TURN)])
+def test_files_without_p_are_of_the_rectified_images_if_their_lens_has_no_distortion(form, turn, tmp_path):
+    plain = write_lens(tmp_path / "front.yaml", form, (0.0,) * 5)
+    got = read_rectified_intrinsics(plain)
+    np.testing.assert_allclose(got.info.intrinsic, LENS.intrinsic)
+    np.testing.assert_allclose(got.rectified_from_camera, turn, atol=1e-12)
+    bent = write_lens(tmp_path / "front.yaml", form, LENS.distortion)
+    with pytest.raises(DriveError, match=r"states no P for its rectified images; set rectified: false"):
+        read_rectified_intrinsics(bent)
+
+
+@pytest.mark.parametrize(
+    ("key", "matrix", "problem"),
+    [("projection_matrix", np.eye(3), "projection_matrix: expected 3 x 4"),
+     ("projection_matrix", np.zeros((3, 4)), "states no P"),
+     ("projection_matrix", -np.eye(3, 4), "front.yaml"),
+     ("rectification_matrix", 2 * np.eye(3), "rectification_matrix: is no rotation")],
+)  # fmt: skip
+def test_a_file_whose_p_or_r_cannot_be_is_refused(key, matrix, problem, tmp_path):
+    path = as_file(tmp_path / "front.yaml", "camera_info")
+    content = yaml.safe_load(path.read_text())
+    rows, cols = matrix.shape
+    content[key] = {"rows": rows, "cols": cols, "data": matrix.ravel().tolist()}
+    path.write_text(yaml.safe_dump(content))
+    with pytest.raises(DriveError, match=problem):
+        read_rectified_intrinsics(path)

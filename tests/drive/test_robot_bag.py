@@ -8,7 +8,6 @@ import pytest
 import yaml
 
 from tests.drive.bags import assert_same_poses, messages_of, write_ros1, write_ros2
-from tests.drive.example import make_drive
 from tests.drive.test_frames import AXLE_M, at, composed, tree_of
 from v2hdm.cli.main import run
 from v2hdm.errors import DriveError
@@ -18,19 +17,9 @@ from v2hdm.io.calibration.reading import info_of
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.io.drive.draft import draft_drive
 
+pytestmark = pytest.mark.usefixtures("working_directory")
+
 PREFIX = "tractor_07/"
-
-
-@pytest.fixture(autouse=True)
-def working_directory(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    root = tmp_path_factory.mktemp("folder")
-    make_drive(root)
-    return root
 
 
 def robot(folder, infos="none", ros1=False, footprint=False):
@@ -140,15 +129,37 @@ def test_all_that_a_bag_lacks_is_asked_for_at_once_with_what_it_offers(folder, t
     bag = write_ros2(tmp_path / "site", made)
     missing = draft_drive(bag, tmp_path / "drive", [])
     cameras = [f"cameras.{name}.{key}" for name in ("front", "rear") for key in ("camera_info", "mounting")]
-    assert list(missing) == ["poses.topic", *cameras]
+    of_poses = ["poses.topic", "poses.heading_topic", "poses.lever_arm_m"]
+    assert list(missing) == [*of_poses, *cameras]
     assert "/bow/fix (NavSatFix" in missing["poses.topic"]
+    assert missing["poses.heading_topic"] == "the topic of headings, such as /imu; the bag has none"
+    assert re.match(
+        r"for /bow/fix: position of 'bow' .*; for /stern/fix: position of 'stern' ",
+        missing["poses.lever_arm_m"],
+    )
     assert "/stern/fix" in missing["poses.topic"]
     assert "/calibration/sensing/front/camera_info" in missing["cameras.front.camera_info"]
     again = draft_drive(bag, tmp_path / "drive", ["poses.topic=/bow/fix"])
+    assert list(again) == [*of_poses[1:], *cameras], "nothing is asked that was not asked before"
     assert "position of 'bow'" in again["poses.lever_arm_m"]
     assert "gnss_antenna is at [1.5, 0.0, 2.0]" in again["poses.lever_arm_m"]
     with pytest.raises(DriveError, match="no poses on /none; it has: /bow/fix, /stern/fix"):
         draft_drive(bag, tmp_path / "drive", ["poses.topic=/none"])
+
+
+def test_what_one_topic_of_poses_alone_needs_is_asked_for_together_with_the_topic(folder, tmp_path):
+    """Odometry of the vehicle's frame, and the same as poses that do not say of which frame they are."""
+    made = messages_of(folder)
+    for stamp_s, topic, message in list(made.rows):
+        if topic == "/odom":
+            pose = made.make("geometry_msgs/msg/PoseStamped", header=message.header, pose=message.pose.pose)
+            made.add(stamp_s, "/fused", pose)
+    bag = write_ros2(tmp_path / "site", made)
+    missing = draft_drive(bag, tmp_path / "drive", [])
+    assert list(missing) == ["poses.topic", "poses.lever_arm_m"]
+    assert missing["poses.lever_arm_m"].startswith("for /fused: /fused does not say of which frame its poses")
+    assert not draft_drive(bag, tmp_path / "drive", ["poses.topic=/fused", "poses.lever_arm_m=[0, 0, 0]"])
+    assert not draft_drive(bag, tmp_path / "other", ["poses.topic=/odom"])
 
 
 def test_poses_of_a_file_go_with_the_images_of_a_bag(folder, tmp_path):

@@ -5,13 +5,14 @@ import pytest
 import yaml
 
 from tests.drive.bags import messages_of, write_ros2
-from tests.drive.example import make_drive
 from v2hdm.cli.main import run
 from v2hdm.errors import DriveError
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.io.importers.bag.cameras import choose_cameras
 from v2hdm.io.importers.bag.frames import ROW, Frames
 from v2hdm.io.importers.bag.samples import ImageSample, InfoSample, Samples
+
+pytestmark = pytest.mark.usefixtures("working_directory")
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
@@ -153,18 +154,6 @@ def test_intrinsics_elsewhere_are_a_camera_s_if_they_are_of_its_frame_and_size()
     choice = chosen(images, info("/calibration/front"), info("/calibration/left", "left"))
     assert choice.cameras["front"].info.name == "/calibration/front"
     assert chosen(images, info("/calibration/front", size=(640, 360))).cameras["front"].info is None
-
-
-@pytest.fixture(autouse=True)
-def working_directory(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    root = tmp_path_factory.mktemp("folder")
-    make_drive(root)
-    return root
 
 
 def read(path, **options):

@@ -74,7 +74,7 @@ from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.records import SEEN_ACROSS, FloatArray
 from v2hdm.simulate.render.renderer import Rendered, Renderer
-from v2hdm.simulate.render.scene import Backdrop, Bgr, Ground, GroundMarks, Light, Scene, Shadow
+from v2hdm.simulate.render.scene import Backdrop, Bgr, Box, Ground, GroundMarks, Light, Scene, Shadow
 
 # The renderer keeps one tile per fleck size, so sizes come from a short list.
 _NEAR_M = 0.3
@@ -232,17 +232,8 @@ def random_scene(
     tight = tight_bend(for_bend, hardships.tight_bends)
     bend = tight or bend
     brush = random_brush(rng, difficulty)
-    road_half_m = float(rng.uniform(2, 9))
     facing = Facing(for_facing, hardships.facing, hardships.stout)
-    if place == "port":
-        road = port_paint(rng, brush, bend, facing)
-        boxes = port_boxes(rng)
-    elif place == "street":
-        road = street_paint(rng, brush, bend, facing)
-        boxes = street_boxes(rng, road_half_m)
-    else:
-        road = RoadPaint()
-        boxes = street_boxes(rng, road_half_m) if rng.random() < 0.7 else port_boxes(rng)
+    road, boxes = _road_and_boxes(rng, place, brush, bend, facing)
     junction = with_junction(for_junction, road, brush, bend, hardships.junctions)
     boxes = clear_of(boxes, junction.paints) if tight or junction is not road else boxes
     road = junction
@@ -276,6 +267,18 @@ def random_scene(
         backdrop=_backdrop(rng),
     )
     return scene, road.lanes
+
+
+def _road_and_boxes(
+    rng: np.random.Generator, place: str, brush: Brush, bend: Bend, facing: Facing
+) -> tuple[RoadPaint, tuple[Box, ...]]:
+    """The paint of a port, a street or bare ground, and the boxes that stand about it."""
+    road_half_m = float(rng.uniform(2, 9))
+    if place == "port":
+        return port_paint(rng, brush, bend, facing), port_boxes(rng)
+    if place == "street":
+        return street_paint(rng, brush, bend, facing), street_boxes(rng, road_half_m)
+    return RoadPaint(), street_boxes(rng, road_half_m) if rng.random() < 0.7 else port_boxes(rng)
 
 
 def _with_symbols(

@@ -93,8 +93,8 @@ def with_words(
         wide_m = min(broad, 0.62 * lane_m / letters)
         strokes, size_m = _written(rng, text, tall_m, wide_m, hand)
         ground = _placed(bend, along, middle, rectangle(np.zeros(2), *(size_m + 0.3)))
-        placed = (_placed(bend, along, middle, turn * stroke) for stroke in strokes)
-        road = laid(road, [other_brush.paint(rng, TEXT, stroke) for stroke in placed], ground)
+        parts = (_placed(bend, along, middle, turn * stroke) for stroke in strokes)
+        road = laid(road, [other_brush.paint(rng, TEXT, part) for part in parts], ground)
     return road
 
 
@@ -102,10 +102,15 @@ def _written(
     rng: np.random.Generator, text: str, tall_m: float, wide_m: float, hand: Hand
 ) -> tuple[list[FloatArray], FloatArray]:
     """The strokes (4, 2) of words about their middle, and the length and width (2,) of them all, m."""
-    strokes = list(word(text, tall_m, wide_m, rng.uniform(0.13, 0.32) * wide_m + 0.02, hand))
-    points = np.vstack(strokes)
+    return _about_middle(word(text, tall_m, wide_m, rng.uniform(0.13, 0.32) * wide_m + 0.02, hand))
+
+
+def _about_middle(shapes: Iterable[FloatArray]) -> tuple[list[FloatArray], FloatArray]:
+    """Shapes (N, 2) about the middle of them all, and their length and width (2,), m."""
+    shapes = list(shapes)
+    points = np.vstack(shapes)
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
-    return [stroke - centre for stroke in strokes], np.ptp(points, axis=0)
+    return [shape - centre for shape in shapes], np.ptp(points, axis=0)
 
 
 def _another(rng: np.random.Generator, brush: Brush) -> Brush:
@@ -184,12 +189,10 @@ def _with_shapes(
         return road
     along = float(np.exp(rng.uniform(np.log(2.5), np.log(16))))
     turn = int(rng.choice([-1, 1]))
-    shapes = list(draw(rng))
-    points = np.vstack(shapes)
-    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    shapes, size_m = _about_middle(draw(rng))
     for middle, _ in _some_lanes(rng, road, bend, along):
-        ground = _placed(bend, along, middle, rectangle(np.zeros(2), *(np.ptp(points, axis=0) + 0.3)))
-        parts = (_placed(bend, along, middle, turn * (shape - centre)) for shape in shapes)
+        ground = _placed(bend, along, middle, rectangle(np.zeros(2), *(size_m + 0.3)))
+        parts = (_placed(bend, along, middle, turn * shape) for shape in shapes)
         road = laid(road, [brush.paint(rng, kind, part) for part in parts], ground)
     return road
 
@@ -370,11 +373,7 @@ def _some_lanes(
 
 def _placed(bend: Bend, along: float, left: float, shape: FloatArray) -> FloatArray:
     """A shape (N, 2) in the map, its origin at a place of the way and its first axis along it."""
-    heading = float(bend.heading(along))
-    cos = np.cos(heading)
-    sin = np.sin(heading)
-    centre = bend.to_map(np.array([along, left]))
-    return np.asarray(centre + shape @ np.array([[cos, sin], [-sin, cos]]))
+    return placed(shape, bend.to_map(np.array([along, left])), float(bend.heading(along)))
 
 
 def laid(road: RoadPaint, paints: Sequence[Paint], ground_map: FloatArray) -> RoadPaint:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,12 +90,32 @@ class Covariance:
 
     def corners(self, groups: NDArray[np.int64]) -> FloatArray:
         """Joint covariances (M, 2 n, 2 n), m^2, of M groups (M, n) of corners."""
-        parts = np.array_split(groups, min(max(-(-groups.size // _at_once(self.whitening)), 1), len(groups)))
-        of_corners = np.concatenate([self._corners(part) for part in parts])
+        of_corners = np.empty((len(groups), 2 * groups.shape[1], 2 * groups.shape[1]))
+        for part in self._parts(groups):
+            of_corners[part] = self._corners(groups[part])
         if self.held is None:
             return of_corners
         moved = self.held.corners[groups].reshape(*of_corners.shape[:2], -1)
         return of_corners + moved @ moved.swapaxes(1, 2)
+
+    def _parts(self, groups: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
+        """Indices of groups that are looked at together: neighbours, which share most of their corners."""
+        rank = torch.argsort(self.whitening.engine.arrays.corner_order).cpu().numpy()
+        most_corners = max(_at_once(self.whitening), groups.shape[1])
+        numbers = 2 * groups.shape[1] * self.whitening.reduced_factor.size
+        most_groups = max(_NUMBERS_AT_ONCE // numbers, 1)
+        part: list[int] = []
+        corners: set[int] = set()
+        for number in np.argsort(np.median(rank[groups], axis=1), kind="stable").tolist():
+            joined = corners | set(groups[number].tolist())
+            if part and (len(joined) > most_corners or len(part) == most_groups):
+                yield np.array(part)
+                part = []
+                joined = set(groups[number].tolist())
+            part.append(number)
+            corners = joined
+        if part:
+            yield np.array(part)
 
     def _corners(self, groups: NDArray[np.int64]) -> FloatArray:
         arrays = self.whitening.engine.arrays
@@ -109,7 +130,7 @@ class Covariance:
         factor = self.whitening.linearised.corner_factor.take(corners)
         inverse = factor.solve_transposed(factor.solve(unit.view(len(corners), 2, -1))).flatten(0, 1)
         of_factor = inverse.clone()
-        of_factor[torch.isin(corners, self.whitening.plan.kept).repeat_interleave(2)] = 0.0
+        of_factor[torch.isin(corners, self.whitening.plan.kept_corners).repeat_interleave(2)] = 0.0
         rows = _columns(corners, chosen)
         once = ~(joined[:, :, None] == joined[:, None, :]).tril(-1).any(2).repeat_interleave(2, dim=1)
         spread = inverse[rows[:, :, None], _columns(corners, joined)[:, None, :]] * once[:, None]
@@ -169,13 +190,13 @@ def _reduced_root(whitening: Whitening, corners: Tensor) -> Tensor:
     arrays = whitening.engine.arrays
     run = arrays.whole() if len(corners) == arrays.corner_count else arrays.gather(corners)
     coupling = whitening.linearised.coupling(run, estimate.corners_map[corners])
-    if not len(plan.kept):
+    if not len(plan.kept_corners):
         return whitening.reduced_factor.solve(reduced_coupling(plan, whitening.spread, run, coupling))
-    is_kept = torch.isin(corners, plan.kept)
+    is_kept = torch.isin(corners, plan.kept_corners)
     coupling[is_kept[run.corner]] = 0.0
     right = reduced_coupling(plan, whitening.spread, run, coupling)
-    number = torch.searchsorted(plan.kept, corners[is_kept])
-    picked = right.new_zeros(len(plan.kept), 2, len(corners), 2)
+    number = torch.searchsorted(plan.kept_corners, corners[is_kept])
+    picked = right.new_zeros(len(plan.kept_corners), 2, len(corners), 2)
     for axis in range(2):
         picked[number, axis, is_kept.nonzero()[:, 0], axis] = -1.0
     frames = right.new_zeros(0, len(arrays.states), right.shape[1])

@@ -172,7 +172,7 @@ class _Surveys(NamedTuple):
 
 
 def _surveys(problem: Problem) -> _Surveys:
-    """What is surveyed of each camera and each corner."""
+    """The surveys of each camera and each corner."""
     centre, centre_root = np.zeros((2, len(problem.intrinsic), 3))
     if problem.centre_vehicle is not None and problem.centre_sigma_m is not None:
         centre = problem.centre_vehicle

@@ -147,8 +147,10 @@ def ground_from_ray(cam_from_map: Tensor) -> Tensor:
     The third coordinate is the drop of the ray, positive below the horizon.
     """
     map_from_cam: Tensor = inverse_transformation(cam_from_map)
-    level, drop = map_from_cam[:, :2, :3], -map_from_cam[:, 2:3, :3]
-    centre, height = map_from_cam[:, :2, 3:], map_from_cam[:, 2:3, 3:]
+    level = map_from_cam[:, :2, :3]
+    drop = -map_from_cam[:, 2:3, :3]
+    centre = map_from_cam[:, :2, 3:]
+    height = map_from_cam[:, 2:3, 3:]
     return torch.cat([height * level + centre * drop, drop], dim=1)
 
 
@@ -164,13 +166,17 @@ def back_projected(ground_from_ray: Tensor, measured: Tensor, root_information: 
     x = (x + xu * u + xv * v) / drop
     y = (y + yu * u + yv * v) / drop
     # A homography's derivative: of the ground point by the ray, times the drop.
-    xu, xv = xu - x * du, xv - x * dv
-    yu, yv = yu - y * du, yv - y * dv
+    xu = xu - x * du
+    xv = xv - x * dv
+    yu = yu - y * du
+    yv = yv - y * dv
     # Its inverse is the residual's derivative, before whitening.
     share = drop / (xu * yv - xv * yu)
     a, b, c = root_information * share
-    first_x, first_y = a * yv, -a * xv
-    second_x, second_y = b * yv - c * yu, c * xu - b * xv
+    first_x = a * yv
+    first_y = -a * xv
+    second_x = b * yv - c * yu
+    second_y = c * xu - b * xv
     xx = first_x.square() + second_x.square()
     yx = first_x * first_y + second_x * second_y
     yy = first_y.square() + second_y.square()

@@ -152,7 +152,7 @@ class Plan:
     size: int  # rows per tile
     frame_tiles: int  # number of frame tiles; those of kept corners follow
     pattern: Pattern  # nonzero tiles and their elimination order
-    kept: Tensor  # (n,) corners not eliminated before the frames, ascending
+    kept_corners: Tensor  # (n,) corners not eliminated before the frames, ascending
     most_tiles: int = 0  # largest number of tiles that the observations of a unit of corners touch
 
     @property
@@ -168,7 +168,7 @@ class Plan:
     @cached_property
     def position(self) -> Tensor:
         """Position of each tile in the elimination order."""
-        return torch.tensor(self.pattern.position, dtype=torch.int64, device=self.kept.device)
+        return torch.tensor(self.pattern.position, dtype=torch.int64, device=self.kept_corners.device)
 
 
 def frames_per_tile(arrays: Arrays) -> int:
@@ -196,13 +196,14 @@ def to_tiles(plan: Plan, by_frame: Tensor, by_kept: Tensor | None = None) -> Ten
 
 
 def from_tiles(plan: Plan, rows: Tensor, frame_count: int, states: int) -> tuple[Tensor, Tensor]:
-    """Inverse of :func:`to_tiles` for vectors (G size,): by frame (J, S) and by kept corner (n, 2)."""
+    """Inverse of :func:`to_tiles` for rows (G size, ...): by frame (J, S, ...), kept corner (n, 2, ...)."""
+    trailing = rows.shape[1:]
     if not plan.tile_count:
-        return rows.new_zeros(frame_count, states), rows.new_zeros(0, 2)
-    tiles = rows.view(plan.tile_count, plan.size)[plan.position]
-    frames = tiles[: plan.frame_tiles].reshape(-1, states)[:frame_count]
-    corners = tiles[plan.frame_tiles :, : plan.size // 2 * 2].reshape(-1, 2)[: len(plan.kept)]
-    return frames, corners
+        return rows.new_zeros(frame_count, states, *trailing), rows.new_zeros(0, 2, *trailing)
+    tiles = rows.view(plan.tile_count, plan.size, *trailing)[plan.position]
+    frames = tiles[: plan.frame_tiles].reshape(-1, states, *trailing)[:frame_count]
+    corners = tiles[plan.frame_tiles :, : plan.size // 2 * 2].reshape(-1, 2, *trailing)
+    return frames, corners[: len(plan.kept_corners)]
 
 
 @dataclass(frozen=True)
@@ -307,7 +308,8 @@ class ReducedSystem:
 
     def _kept_rows(self, number: Tensor) -> Tensor:
         """First rows of kept corners, by their numbers."""
-        plan, per_tile = self.plan, self.plan.size // 2
+        plan = self.plan
+        per_tile = plan.size // 2
         return plan.position[plan.frame_tiles + number // per_tile] * plan.size + number % per_tile * 2
 
     def _frame_rows(self, frame: Tensor) -> Tensor:

@@ -251,7 +251,8 @@ def _report(
     clock_s = estimate.clock_s.cpu().numpy()
     read_out_s = np.zeros(len(clock_s)) if problem.read_out_s is None else problem.read_out_s
     if options.read_out:
-        clock_s, read_out_s = clock_s[:, :-1], read_out_s + clock_s[:, -1]
+        read_out_s = read_out_s + clock_s[:, -1]
+        clock_s = clock_s[:, :-1]
     if arrays.states:
         map_from_vehicle = map_from_vehicle @ exp(frame_tangent(arrays, estimate.frame_state).cpu().numpy())
     return Solution(

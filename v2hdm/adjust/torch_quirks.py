@@ -1,4 +1,4 @@
-"""What works around torch's internals, all in one place; a test notices when torch changes."""
+"""Ways around torch's internals, all in one place; a test notices when torch changes."""
 
 from __future__ import annotations
 

@@ -105,7 +105,7 @@ class Whitening:
             motion = motion + (self.spread.clock @ clock[:, None, :, None])[..., 0]
         whitened_corners = whitened[self.reduced_factor.size :].reshape(-1, 2)
         if len(kept_steps):
-            whitened_corners = whitened_corners.index_copy(0, self.plan.kept, kept_steps)
+            whitened_corners = whitened_corners.index_copy(0, self.plan.kept_corners, kept_steps)
         return Step(Gradient(extrinsics, states, motion.new_empty(0, 2), clock), motion, whitened_corners)
 
 
@@ -122,12 +122,12 @@ def _less_corners(plan: Plan, gradient: Gradient, coupled: Coupled, corners: Ten
     reduced_gradient = (torch.cat([gradient.extrinsic, gradient.clock_s], dim=1) - coupled.camera).flatten()
     if plan.tile_count:
         by_state = gradient.frame_state - coupled.frame_state
-        reduced_gradient = torch.cat([to_tiles(plan, by_state, corners[plan.kept]), reduced_gradient])
+        reduced_gradient = torch.cat([to_tiles(plan, by_state, corners[plan.kept_corners]), reduced_gradient])
     return reduced_gradient
 
 
 def _less_kept(plan: Plan, corners: Tensor) -> Tensor:
-    return corners.index_fill(0, plan.kept, 0.0) if len(plan.kept) else corners
+    return corners.index_fill(0, plan.kept_corners, 0.0) if len(plan.kept_corners) else corners
 
 
 def factorise(

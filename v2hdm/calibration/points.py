@@ -273,7 +273,7 @@ def _freed(fit: Fit) -> Lens:
 
 
 class _Gain(NamedTuple):
-    """What K further unknowns beside a mounting would gain."""
+    """The gain by K further unknowns beside a mounting."""
 
     decrease: float  # of the cost
     step: FloatArray  # (K,) their values

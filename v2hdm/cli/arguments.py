@@ -1,4 +1,4 @@
-"""What several commands share: arguments on a drive or a result, its folder, progress and the exit code."""
+"""Parts that several commands share: arguments on a drive or result, its folder, progress, the exit code."""
 
 from __future__ import annotations
 
@@ -46,8 +46,25 @@ def drive_of(parsed: argparse.Namespace) -> Drive:
 
 def log_to_terminal() -> None:
     """Show warnings, and what reading a drive takes and decides, on stderr."""
-    logging.basicConfig(format="%(message)s")
+    terminal = logging.StreamHandler()
+    terminal.setFormatter(logging.Formatter("%(message)s"))
+    terminal.addFilter(_Once())
+    logging.basicConfig(handlers=[terminal])
     logging.getLogger("v2hdm.io").setLevel(logging.INFO)  # an import may take minutes, and says so
+
+
+class _Once(logging.Filter):
+    """Lets each line pass once: a command that writes a drive.yaml reads the recording twice."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._lines: set[str] = set()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        line = record.getMessage()
+        is_new = line not in self._lines
+        self._lines.add(line)
+        return is_new
 
 
 def add_result(parser: argparse.ArgumentParser) -> None:

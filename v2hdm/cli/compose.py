@@ -55,7 +55,7 @@ class Job(NamedTuple):
 
 @dataclass(frozen=True)
 class Door:
-    """What a command takes: overrides of ``conf/<name>.yaml``, which ``schema`` checks.
+    """The settings that a command takes: overrides of ``conf/<name>.yaml``, which ``schema`` checks.
 
     Attributes:
         name: of the configuration.

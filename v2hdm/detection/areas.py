@@ -1,12 +1,13 @@
 """Areas of paint: words, numbers and hatched boxes, each by the hull on the ground of all of its pieces.
 
-An area is made of pieces that do not touch: letters, hatching. Those of a class whose gap on the ground is a
-part of their own size are one area. Crosswalks are composed of bars.
+An area is made of pieces that do not touch: letters, hatching. Pieces of one class are one area where the gap
+between them on the ground is small beside their own size. Crosswalks are composed of bars.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 from typing import NamedTuple
 
 import cv2
@@ -17,18 +18,18 @@ from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.network import NetworkOutput, as_probability
 from v2hdm.detection.quads.blobs import outlines_of
 from v2hdm.geometry.planar import rectangle_size
-from v2hdm.geometry.rows import outline_of_row, rows_of_bars
+from v2hdm.geometry.rows import linked_groups, outline_of_row, rows_of_bars
 from v2hdm.records import CROSSWALK, CROSSWALK_BAR, TEXT, BoolArray, FloatArray, IntArray, MarkingDetection
 
 _LEAST_CELLS = 5  # elements of paint of a piece: fewer are noise
 _LEAST_SHARE = 0.25
-"""Least share of a connected piece's paint of its group of classes that is of the area's class: a foot of an
-arrow may be named so."""
+"""Least share of the area's class in a connected piece of paint of its group of classes: the network may give
+the foot of an arrow such a name."""
 
 _GAP = 0.35
 """Largest gap between pieces of one area, in parts of the larger one's longest extent: letters stand a fifth
 of their height apart, words two thirds or more (DIN 1451-3, FHWA Series D)."""
-_GAP_OF_CUT = 0.5  # the same of a piece that the image cuts, whose whole extent is not seen
+_GAP_OF_CUT = 0.5  # the same for a piece that the image cuts: its extent is larger than what is seen
 _MOST_GAP_M = {TEXT: 1.0}  # largest gap by class, m: lines of letters of 4 m are as far apart
 _OTHER_GAP_M = 2.0  # largest gap in any other area, m: hatching is 1 to 2 m apart
 _MOST_POINTS = 80  # points of an outline, evenly along it, by which gaps are measured
@@ -40,7 +41,7 @@ class _Piece(NamedTuple):
 
     points_px: FloatArray  # (N, 2) of its outline, recorded px, in no order
     ground: FloatArray  # (N, 2) the same on the ground, m
-    extent_m: float  # its longest
+    extent_m: float  # length of the smallest rectangle around it
     cells: int  # elements of paint
     certainty: float  # mean probability of paint of its class
     is_cut: bool  # by the image, its road or the vehicle's own mask
@@ -56,14 +57,16 @@ def find_areas(
 ) -> list[MarkingDetection]:
     """The areas of an image below row ``reach_px``, each with the polygon ``outline_px`` of its hull.
 
-    Sides of ``outline_seen`` lie where the image, its road, or the vehicle's own mask do not cut the paint.
+    ``outline_seen`` is true for sides at which neither the image, nor its road, nor the vehicle's own mask
+    cuts the paint.
     """
     names = [name for name in catalogue.of_family(AREA) if name in output.classes]
     if not names:
         return []
     rows, columns = np.nonzero(output.paint > 0)
     is_in_reach = output.top + output.stride * (rows + 1) > reach_px
-    rows, columns = rows[is_in_reach], columns[is_in_reach]
+    rows = rows[is_in_reach]
+    columns = columns[is_in_reach]
     probability = output.class_probability(rows, columns)
     best = probability.argmax(axis=0)
     of_group = {catalogue.classes[name].group for name in names}
@@ -113,7 +116,7 @@ def find_crosswalks(
 
 
 def _pieces(output: NetworkOutput, camera: RoadCamera, share: np.ndarray, alike: np.ndarray) -> list[_Piece]:
-    """The pieces of a class: its ``share`` (h, w) of paint, 0 elsewhere; ``alike`` (h, w) is of its group."""
+    """The pieces of a class with this ``share`` (h, w) of the paint; ``alike`` (h, w) is 1 for its group."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats((share > 0).view(np.uint8), ltype=cv2.CV_16U)
     _, whole, whole_stats, _ = cv2.connectedComponentsWithStats(alike, ltype=cv2.CV_16U)
     framed = cv2.copyMakeBorder(output.paint, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=-1.0)
@@ -124,8 +127,8 @@ def _pieces(output: NetworkOutput, camera: RoadCamera, share: np.ndarray, alike:
     for number, points in enumerate(outlines_of(level, piece, count - 1), start=1):
         cells = int(stats[number, cv2.CC_STAT_AREA])
         is_of_piece = labels == number
-        around = whole_stats[np.bincount(whole[is_of_piece]).argmax(), cv2.CC_STAT_AREA]
-        if cells < max(_LEAST_CELLS, _LEAST_SHARE * around):
+        whole_cells = whole_stats[np.bincount(whole[is_of_piece]).argmax(), cv2.CC_STAT_AREA]
+        if cells < max(_LEAST_CELLS, _LEAST_SHARE * whole_cells):
             continue
         points_px = first_px + output.stride * points
         ground = camera.unproject(points_px)
@@ -135,8 +138,9 @@ def _pieces(output: NetworkOutput, camera: RoadCamera, share: np.ndarray, alike:
         certainty = float((as_probability(output.paint[is_of_piece]) * share[is_of_piece]).mean())
         extent_m = rectangle_size(ground[is_on_ground])[0]
         is_cut = bool(_cut(points_px, output, camera).any())
-        points_px, ground = points_px[is_on_ground], ground[is_on_ground]
-        pieces.append(_Piece(points_px, ground, extent_m, cells, certainty, is_cut))
+        pieces.append(
+            _Piece(points_px[is_on_ground], ground[is_on_ground], extent_m, cells, certainty, is_cut)
+        )
     return pieces
 
 
@@ -146,24 +150,13 @@ def _together(pieces: Sequence[_Piece], most_gap_m: float) -> list[IntArray]:
         piece.ground[np.linspace(0, len(piece.ground) - 1, min(len(piece.ground), _MOST_POINTS)).astype(int)]
         for piece in pieces
     ]
-    linked = np.eye(len(pieces), dtype=np.bool_)
-    for one in range(len(pieces)):
-        for other in range(one):
-            either = (pieces[one], pieces[other])
-            reach_m = max((_GAP_OF_CUT if piece.is_cut else _GAP) * piece.extent_m for piece in either)
-            gap_m = min(reach_m, most_gap_m)
-            apart = np.linalg.norm(points[one][:, None] - points[other], axis=2).min()
-            linked[one, other] = linked[other, one] = apart <= gap_m
-    areas = []
-    left = np.ones(len(pieces), dtype=np.bool_)
-    for first in range(len(pieces)):
-        if left[first]:
-            reached = linked[first]
-            while (grown := linked[reached].any(axis=0)).sum() > reached.sum():
-                reached = grown
-            left &= ~reached
-            areas.append(np.flatnonzero(reached))
-    return areas
+    is_linked = np.zeros((len(pieces), len(pieces)), dtype=np.bool_)
+    for first, second in combinations(range(len(pieces)), 2):
+        pair = (pieces[first], pieces[second])
+        reach_m = max((_GAP_OF_CUT if piece.is_cut else _GAP) * piece.extent_m for piece in pair)
+        gap_m = np.linalg.norm(points[first][:, None] - points[second], axis=2).min()
+        is_linked[first, second] = is_linked[second, first] = gap_m <= min(reach_m, most_gap_m)
+    return linked_groups(is_linked)
 
 
 def _area(
@@ -202,6 +195,6 @@ def _cut(points_px: FloatArray, output: NetworkOutput, camera: RoadCamera) -> Bo
     mask = camera.camera.own_vehicle
     if mask is None:
         return is_cut
-    near = cv2.dilate(mask.astype(np.uint8), np.ones((2 * int(_CUT_PX) + 1,) * 2, dtype=np.uint8))
+    widened = cv2.dilate(mask.astype(np.uint8), np.ones((2 * int(_CUT_PX) + 1,) * 2, dtype=np.uint8))
     column, row = np.clip(np.rint(points_px), 0, np.array(mask.shape[::-1]) - 1).astype(np.int64).T
-    return np.asarray(is_cut | (near[row, column] > 0))
+    return np.asarray(is_cut | (widened[row, column] > 0))

@@ -1,4 +1,4 @@
-"""What the other markings of an image say of one: how many are like it, and whether it lies in a line.
+"""Evidence on a marking by the others of its image: how many are like it, and whether it lies in a line.
 
 A site's markings are painted from few stencils: the diamonds of a field are of one size and lie one way,
 dashes are as long as each other and follow one another in a row, or an arc where the way bends.

@@ -93,11 +93,11 @@ class Detector:
         with lap("fit"):
             readings = self.read(image_bgr, proposals)
         with lap("judge"):
-            markings = find_markings(readings, proposals.camera, self.options)
-        found = _likelier(markings, self._symbols(image_bgr, proposals))
+            quads = find_markings(readings, proposals.camera, self.options)
+        markings = _likelier(quads, self._symbols(image_bgr, proposals))
         with lap("areas"):
             areas = self._areas(proposals)
-        return (*_not_of(areas, found), *areas), lanes
+        return (*_not_of(areas, markings), *areas), lanes
 
     def run_network(self, image_bgr: np.ndarray, camera: Camera, top: int | None = None) -> NetworkOutput:
         """Run the network on an image, less what shows the vehicle; raises as :meth:`detect`.
@@ -215,8 +215,8 @@ class Detector:
         return symbols
 
 
-def _not_of(areas: Sequence[MarkingDetection], found: Markings) -> Markings:
-    """What is no piece of an area, such as a letter: what lies in a likelier one is."""
+def _not_of(areas: Sequence[MarkingDetection], markings: Markings) -> Markings:
+    """The markings that are no piece of an area; a marking inside a likelier area, as a letter is, is one."""
     hulls = [(area.outline_px.astype(np.float32), area.score) for area in areas]
 
     def is_piece(marking: MarkingDetection) -> bool:
@@ -226,7 +226,7 @@ def _not_of(areas: Sequence[MarkingDetection], found: Markings) -> Markings:
             score > marking.score and cv2.pointPolygonTest(hull, centre, False) > 0 for hull, score in hulls
         )
 
-    return tuple(marking for marking in found if not is_piece(marking))
+    return tuple(marking for marking in markings if not is_piece(marking))
 
 
 @cache

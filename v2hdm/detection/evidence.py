@@ -1,4 +1,4 @@
-"""What the classifier looks at: numbers about a fitted quadrilateral, and a picture of it in its frame."""
+"""Inputs of the classifier: numbers about a fitted quadrilateral, and a picture of it in its frame."""
 
 from __future__ import annotations
 

@@ -1,11 +1,11 @@
 """The horizon of each image of a source, from its own lines and from the other images.
 
-Images are of some mountings, of one or of many: a Dirichlet process mixture (Ferguson, Ann. Statist. 1973),
-found image by image (Wang and Dunson, J. Comput. Graph. Statist. 2011). About its mounting the pitch of an
-image varies with the vehicle's body and the road, by a standard deviation that the mounting's images show.
-Images of one camera so narrow each other's horizons, unrelated photographs do not, and one that shows
-no lines has the horizons of the others. How often an image is of the mounting of the one before is found as
-well. Focal length and height stay as uncertain as their priors.
+Images come from one mounting or from several, nobody says how many: a Dirichlet process mixture (Ferguson,
+Ann. Statist. 1973), estimated image by image (Wang and Dunson, J. Comput. Graph. Statist. 2011). The pitch of
+an image differs from that of its mounting with the vehicle's body and the road; its standard deviation is
+estimated from the mounting's images. So images of one camera narrow each other's horizons, unrelated
+photographs do not, and an image without lines has the horizons of the others. How often an image has the same
+mounting as the one before is estimated as well. Focal length and height stay as uncertain as their priors.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ class _Group:
 
 
 @dataclass(frozen=True)
-class _Said:
-    """What one image has said of the mountings."""
+class _Statement:
+    """The information on the mountings that came from one image."""
 
     likelihood: FloatArray  # (P, R)
     share: dict[int, float]  # probability of each group, by its number
@@ -66,24 +66,24 @@ class Horizons:
         self._groups: dict[int, _Group] = {}
         self._previous: dict[int, float] = {}  # probability of each group for the image before
         self._stayed = 1.0, 2.0  # images of the mounting of the one before, of how many
-        self._said: dict[Hashable, _Said] = {}
+        self._statements: dict[Hashable, _Statement] = {}
         self._numbers = 0  # groups so far
 
     @property
     def mounting(self) -> Mounting:
-        """The mounting of most images as known by now; its standard deviations leave out an image's own."""
+        """The mounting of most images so far; its standard deviations leave out how one image differs."""
         group = max(self._groups.values(), key=lambda group: group.weight, default=None)
         belief = (self._base if group is None else group.belief).sum(axis=0)
         return self._summary(belief, np.ones(len(self._grid.pitch_rad)))
 
     @property
     def of_mounting(self) -> float:
-        """Share of the images that are of that mounting."""
+        """Share of the images with that mounting."""
         weights = [group.weight for group in self._groups.values()]
         return max(weights, default=0.0) / max(sum(weights), 1e-9)
 
     def add(self, lines: Lines, key: Hashable | None = None) -> None:
-        """Take in the lines of an image that is not the next one; asked for by its ``key`` later."""
+        """Take in the lines of an image out of order; :meth:`earlier` asks for it by its ``key``."""
         self._previous = {}
         self._take(self._grid.likelihood(lines), key)
         self._previous = {}
@@ -96,18 +96,18 @@ class Horizons:
         return self._likeliest(belief)
 
     def earlier(self, key: Hashable) -> Mounting | None:
-        """The mounting of an image that was added by this ``key``, by the others and itself once."""
-        said = self._said.pop(key, None)
-        if said is None:
+        """The mounting of an image that was added under this ``key``, or None; its lines count once."""
+        statement = self._statements.pop(key, None)
+        if statement is None:
             return None
         without = dict(self._groups)
-        for name, factor in said.factor.items():
+        for name, factor in statement.factor.items():
             if name in without:
                 belief = without[name].belief / factor
-                weight = max(without[name].weight - said.share[name], 0.0)
+                weight = max(without[name].weight - statement.share[name], 0.0)
                 without[name] = _Group(belief / belief.sum(), weight)
-        belief = said.likelihood * self._expected(self._weights(without), without)
-        self._previous = {name: part for name, part in said.share.items() if name in self._groups}
+        belief = statement.likelihood * self._expected(self._weights(without), without)
+        self._previous = {name: part for name, part in statement.share.items() if name in self._groups}
         return self._likeliest(belief)
 
     def coming(self, share: float) -> tuple[Mounting, float]:
@@ -118,7 +118,7 @@ class Horizons:
         return self._likeliest(belief), float(self._grid.pitch_rad[at])
 
     def _weights(self, groups: dict[int, _Group] | None = None) -> dict[int | None, float]:
-        """Prior probability of each group for the next image; that of a new one is by None."""
+        """Prior probability of each group for the next image; None stands for a new group."""
         groups = self._groups if groups is None else groups
         counts: dict[int | None, float] = {None: _NEW}
         counts |= {name: group.weight for name, group in groups.items()}
@@ -136,38 +136,38 @@ class Horizons:
     def _expected(
         self, weights: dict[int | None, float], groups: dict[int, _Group] | None = None
     ) -> FloatArray:
-        """Prior (P, R) of the pitch and roll of an image that is of each group with such a probability."""
+        """Prior (P, R) of the pitch and roll of an image, by the probability of each group."""
         groups = self._groups if groups is None else groups
         mixed = np.sum([weight * self._belief(name, groups) for name, weight in weights.items()], axis=0)
         return np.asarray((self._moved @ mixed).sum(axis=0) * self._grid.shows_ground[:, None])
 
     def _take(self, likelihood: FloatArray, key: Hashable | None = None) -> None:
-        """Let an image's likelihood (P, R) narrow the mountings that it may be of, or begin a new one."""
+        """Narrow the mountings that an image may have by its likelihood (P, R), or begin a new mounting."""
         weights = self._weights()
         of_mounting = self._moved.swapaxes(1, 2) @ likelihood  # (S, P, R)
         fit = {name: float((self._belief(name, self._groups) * of_mounting).sum()) for name in weights}
         total = sum(weights[name] * fit[name] for name in weights)
         if self._previous:
             stays = self._stayed[0] / self._stayed[1]
-            stayed = sum(stays * share * fit[name] for name, share in self._previous.items()) / total
+            stayed = sum(stays * part * fit[name] for name, part in self._previous.items()) / total
             self._stayed = self._stayed[0] + stayed, self._stayed[1] + 1
-        share = {name: weights[name] * fit[name] / total for name in weights}
-        is_new = share.pop(None)
-        known: dict[int, float] = {name: part for name, part in share.items() if name is not None}
-        if is_new >= max(known.values(), default=0.0):
-            known[self._new_group()] = is_new
-            known = {name: part for name, part in known.items() if name in self._groups}
-        factor = {name: 1 - part + part * of_mounting for name, part in known.items()}
-        for name, part in known.items():
+        posterior = {name: weights[name] * fit[name] / total for name in weights}
+        new_share = posterior.pop(None)
+        share: dict[int, float] = {name: part for name, part in posterior.items() if name is not None}
+        if new_share >= max(share.values(), default=0.0):
+            share[self._new_group()] = new_share
+            share = {name: part for name, part in share.items() if name in self._groups}
+        factor = {name: 1 - part + part * of_mounting for name, part in share.items()}
+        for name, part in share.items():
             belief = self._groups[name].belief * factor[name]
             self._groups[name] = _Group(belief / belief.sum(), self._groups[name].weight + part)
         self.images += 1
-        self._previous = known
+        self._previous = share
         if key is not None:
-            self._said[key] = _Said(likelihood, known, factor)
+            self._statements[key] = _Statement(likelihood, share, factor)
 
     def _new_group(self) -> int:
-        """The number of a group without images, in whose place that of the fewest may go."""
+        """The number of a new group without images; where there are too many, the smallest group goes."""
         if len(self._groups) == _MOST:
             del self._groups[min(self._groups, key=lambda name: self._groups[name].weight)]
         self._numbers += 1
@@ -175,20 +175,21 @@ class Horizons:
         return self._numbers
 
     def _likeliest(self, belief: FloatArray) -> Mounting:
-        """The mounting with the pitch that most of a belief (P, R) is near to."""
+        """The mounting whose pitch has the most of a belief (P, R) about it."""
         pitch = self._grid.pitch_rad
         alike = np.exp(-0.5 * ((pitch[:, None] - pitch) / _ALIKE_RAD) ** 2)
         return self._summary(belief, alike[int((alike @ belief.sum(axis=1)).argmax())])
 
     def _summary(self, belief: FloatArray, window: FloatArray) -> Mounting:
-        """Means of a belief (P, R) in a ``window`` (P,) of pitches, and standard deviations about them."""
-        near = belief * window[:, None]
-        near = near / near.sum()
+        """Means of a belief (P, R) within a ``window`` (P,) of pitches; about them, sigmas of all of it."""
+        windowed = belief * window[:, None]
+        windowed = windowed / windowed.sum()
         belief = belief / belief.sum()
-        means, sigmas = [], []
+        means = []
+        sigmas = []
         values = (self._grid.pitch_rad, self._grid.roll_rad)
         for axis, (value, within) in enumerate(zip(values, self._grid.variance_rad2, strict=True)):
-            means.append(float(near.sum(axis=1 - axis) @ value))
+            means.append(float(windowed.sum(axis=1 - axis) @ value))
             sigmas.append(float(np.sqrt(belief.sum(axis=1 - axis) @ (value - means[-1]) ** 2 + within)))
         pitch_sigma, roll_sigma = sigmas
         return replace(

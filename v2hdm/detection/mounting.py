@@ -1,4 +1,4 @@
-"""What the lines that an image shows say of its horizon.
+"""The horizon of an image by the lines that it shows.
 
 Lines along a road are parallel on the ground and meet in one point of the horizon: points of several images,
 beside each other, also show the roll. The network finds crossings of lanes' lines and the edges of paint;

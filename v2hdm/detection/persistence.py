@@ -1,9 +1,9 @@
 """Whether markings of a drive's images stay where they are on the ground as the vehicle moves.
 
-Paint is seen again at its place from the next poses. What stands up moves otherwise in the image, as in plane
-and parallax (Irani and Anandan, PAMI 20, 1998), what drives or lies on the vehicle itself moves along with
-something else: wheels, clouds mirrored in a bonnet, reflections on a windscreen. Each other image that should
-show a marking is a vote by how often paint and other things are found where they should be.
+Paint is seen again at its place from the next poses. Upright things move otherwise in the image, as in plane
+and parallax (Irani and Anandan, PAMI 20, 1998); wheels move with their vehicle, clouds mirrored in a bonnet
+and reflections on a windscreen with the camera. Each other image that should show a marking is a vote, by how
+often paint, and how often other things, are detected again where a marking should be.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from v2hdm.geometry.rigid import inverse
 from v2hdm.records import BoolArray, FloatArray, MarkingDetection
 
 _PAINT_AGAIN = 0.75
-"""Probability that paint is found again as its class: .94 and .99 on two drives, where nothing hides it."""
+"""Probability that paint is detected again as its class: .94 and .99 on two drives, unless things hide it."""
 
-_OTHER_AGAIN = 0.15  # probability that something else is found at that place: two of one sort in a row
-_EASY = 0.8  # share of the range within which paint is found so often
-_SIGMAS = 3.0  # standard deviations within which something is found near a place
+_OTHER_AGAIN = 0.15  # probability that something else is detected at that place: two of one sort in a row
+_EASY = 0.8  # share of the range within which paint is detected so often
+_SIGMAS = 3.0  # standard deviations within which a marking counts as the one at a place
 _SIZE_SIGMA = 0.12  # standard deviation of a marking's centre in its size: a part of it may be hidden
 STATED_SIGMA_RAD = float(np.deg2rad(1.0))  # standard deviation of the pitch that a drive states of a camera
 
@@ -38,7 +38,7 @@ _BORDER_PX = 20.0  # a marking this near to the border of another image may be c
 
 @dataclass(frozen=True)
 class View:
-    """What one image shows, and from where."""
+    """The markings of one image, with its camera and pose."""
 
     map_from_vehicle: FloatArray  # (4, 4)
     camera: RoadCamera
@@ -53,31 +53,31 @@ class View:
 
     def stay(self, others: Iterable[View]) -> BoolArray:
         """Which markings (M,) likelier lie on the ground than not, by ``others`` of the same camera."""
-        apart = [view for view in others if self._distance_m(view) >= _APART_M]
-        return np.array([self._stays(number, apart) for number in range(len(self.markings))], dtype=np.bool_)
+        voters = [view for view in others if self._distance_m(view) >= _APART_M]
+        return np.array([self._stays(number, voters) for number in range(len(self.markings))], dtype=np.bool_)
 
     def _distance_m(self, other: View) -> float:
         return float(np.linalg.norm(self.map_from_vehicle[:3, 3] - other.map_from_vehicle[:3, 3]))
 
-    def _stays(self, number: int, apart: Sequence[View]) -> bool:
-        votes = [vote for view in apart if (vote := self._vote(number, view)) is not None]
+    def _stays(self, number: int, voters: Sequence[View]) -> bool:
+        votes = [vote for view in voters if (vote := self._vote(number, view)) is not None]
         chosen = np.linspace(0, len(votes) - 1, min(_VOTES, len(votes))).round().astype(int)
         score = float(np.clip(self.markings[number].score, 0.01, 0.99))
         odds = np.log(score / (1 - score)) + sum(votes[k] for k in chosen.tolist())
         return bool(odds > 0)
 
     def _vote(self, number: int, view: View) -> float | None:
-        """Log likelihood ratio of paint, by what another image shows at its place; None where it cannot."""
+        """Log likelihood ratio of paint, by what another image shows at its place; None if it cannot tell."""
         polygon_px = self.polygon_px(number)
         ground = self.camera.unproject(polygon_px[np.isfinite(polygon_px).all(axis=1)])
         if not len(ground) or not np.isfinite(ground).all():
             return None
-        there = inverse(view.map_from_vehicle) @ self.map_from_vehicle
-        moved = (ground @ there[:2, :2].T) + there[:2, 3]
+        other_from_vehicle = inverse(view.map_from_vehicle) @ self.map_from_vehicle
+        moved = (ground @ other_from_vehicle[:2, :2].T) + other_from_vehicle[:2, 3]
         expected_px = view.camera.project(moved)
-        seen = view.camera.unproject(expected_px)
         # Behind the camera the projection comes back elsewhere, above the horizon as nan.
-        if not (np.abs(seen - moved).max() < 0.1 and view.camera.inside(expected_px, _BORDER_PX).all()):
+        returned = np.abs(view.camera.unproject(expected_px) - moved).max() < 0.1
+        if not (returned and view.camera.inside(expected_px, _BORDER_PX).all()):
             return None
         mask = view.camera.camera.own_vehicle
         column, row = np.round(expected_px.mean(axis=0)).astype(int).tolist()
@@ -110,9 +110,9 @@ Image = TypeVar("Image")
 def settled(
     images: Iterable[Image], view_of: Callable[[Image], tuple[str, View]]
 ) -> Iterator[tuple[Image, BoolArray]]:
-    """The images of a drive in order, each with which of its markings (M,) stay on the ground.
+    """The images of a drive in order, and of each which markings (M,) stay on the ground.
 
-    ``view_of`` tells an image's camera and what it shows; an image waits for a few after it.
+    ``view_of`` tells an image's camera and view. An image waits until a few of its camera have followed it.
     """
     waiting: deque[tuple[Image, str, View]] = deque()
     before: dict[str, deque[View]] = {}

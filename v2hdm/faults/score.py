@@ -1,4 +1,4 @@
-"""What a score test says of one fault: in a problem's indices, and in the user's terms."""
+"""The score test of one fault: in a problem's indices, and in the user's terms."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ _MAP_AXES = ("east", "north", "north-east", "north-west")
 
 
 class Item(Enum):
-    """What the ``item`` of a test counts."""
+    """The things that the ``item`` of a test counts."""
 
     NOTHING = auto()
     SESSION = auto()

@@ -135,6 +135,15 @@ def rectangle_size(points: FloatArray) -> tuple[float, float]:
     return float(max(size)), float(min(size))
 
 
+def smallest_rectangle(points: FloatArray) -> FloatArray:
+    """Corners (4, 2) of the smallest rectangle around points (N, 2)."""
+    import cv2  # as in rigid.rotation_from_vector
+
+    middle = points.mean(axis=0)  # OpenCV computes in float32: far from the origin that is too coarse
+    box = cv2.boxPoints(cv2.minAreaRect((points - middle).astype(np.float32)))
+    return np.asarray(box.astype(np.float64) + middle)
+
+
 # Much faster than np.roll, which the fit of a few markings would call very often.
 _NEXT = np.array([1, 2, 3, 0])  # index of the corner that follows each of four
 _LAST = np.array([3, 0, 1, 2])  # index of the corner before each of four

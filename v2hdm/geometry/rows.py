@@ -1,4 +1,4 @@
-"""Rows of parallel bars of one size at even steps, as those of a crosswalk, and the outline about one."""
+"""Rows of parallel bars of one size at even steps, such as crosswalks, and the outline about a row."""
 
 from __future__ import annotations
 
@@ -7,17 +7,18 @@ from typing import NamedTuple
 import numpy as np
 
 from v2hdm.geometry.planar import following, turned_left
-from v2hdm.records import FloatArray, IntArray
+from v2hdm.records import BoolArray, FloatArray, IntArray
 
 LEAST_BARS = 3  # least number of bars of a row: fewer show no even steps
-_LOG_LENGTH_SIGMA = (
-    0.15  # standard deviation of the logarithm of a bar's length beside its neighbour's: worn ends
-)
+
+_LOG_LENGTH_SIGMA = 0.15
+"""Standard deviation of the logarithm of a bar's length beside its neighbour's: ends are worn."""
+
 _LOG_WIDTH_SIGMA = 0.25  # standard deviation of the logarithm of a bar's width beside its neighbour's
 _TURNED_SIGMA_RAD = 0.05  # standard deviation of a bar's direction beside its neighbour's
-_MOST_SQUARED = (
-    16.3  # largest sum of these three, squared, in sigmas: one pair of neighbours in 1000 has more
-)
+_MOST_SQUARED = 16.3
+"""Largest sum of these three, squared, in sigmas: one pair of neighbours in 1000 has more."""
+
 _STEP_WIDTHS = (1.2, 4.5)
 """Least and largest step from bar to bar, in widths of a bar: Zeichen 293 of the StVO has gaps as wide as
 bars, MUTCD 3C.05 gaps of 0.3 to 1.5 m between bars of 0.3 to 0.6 m."""
@@ -45,9 +46,9 @@ def _bars_of(corners: FloatArray) -> _Bars:
 
 
 def rows_of_bars(corners: FloatArray) -> list[IntArray]:
-    """The rows among quadrilaterals (N, 4, 2) on the ground, m: indices of each row's bars, in order.
+    """The rows among quadrilaterals (N, 4, 2) on the ground, m: the indices of each row's bars, in order.
 
-    At least three bars are parallel and of one size, at even steps in which some may be missing.
+    A row has three or more parallel bars of one size at even steps; some of its bars may be missing.
     """
     if len(corners) < LEAST_BARS:
         return []
@@ -64,24 +65,23 @@ def rows_of_bars(corners: FloatArray) -> list[IntArray]:
     is_next = (squared < _MOST_SQUARED) & (along < bars.length / 2)
     is_next &= (widths > _STEP_WIDTHS[0]) & (widths < _STEP_WIDTHS[1] * (1 + _MOST_MISSING))
     is_next &= is_next.T
-    rows = []
-    left = np.ones(len(corners), dtype=np.bool_)
-    for first in range(len(corners)):
-        if not left[first]:
+    rows = (_even_row(members, bars) for members in linked_groups(is_next))
+    return [row for row in rows if row is not None]
+
+
+def linked_groups(is_linked: BoolArray) -> list[IntArray]:
+    """The groups that links (N, N), each in both directions, connect: the ascending indices of each."""
+    groups = []
+    is_left = np.ones(len(is_linked), dtype=np.bool_)
+    for first in range(len(is_linked)):
+        if not is_left[first]:
             continue
-        members = _connected(first, is_next)
-        left[members] = False
-        if (row := _even_row(members, bars)) is not None:
-            rows.append(row)
-    return rows
-
-
-def _connected(first: int, is_next: np.ndarray) -> IntArray:
-    """The indices that neighbours (N, N) connect with ``first``."""
-    reached = np.arange(len(is_next)) == first
-    while (grown := reached | is_next[reached].any(axis=0)).sum() > reached.sum():
-        reached = grown
-    return np.flatnonzero(reached)
+        reached = np.arange(len(is_linked)) == first
+        while (grown := reached | is_linked[reached].any(axis=0)).sum() > reached.sum():
+            reached = grown
+        is_left &= ~reached
+        groups.append(np.flatnonzero(reached))
+    return groups
 
 
 def _even_row(members: IntArray, bars: _Bars) -> IntArray | None:
@@ -111,13 +111,13 @@ class RowOutline(NamedTuple):
 
     corners: FloatArray  # (4, 2) counter-clockwise, the first two along the bars' ends
     by_corner: FloatArray  # (8, 8 N) its derivative by the stacked corners of the bars
-    corner_of_bars: IntArray  # (4,) that of the 4 N stacked ones which each is nearest to
+    corner_of_bars: IntArray  # (4,) the nearest of the bars' 4 N stacked corners
 
 
 def outline_of_row(corners: FloatArray) -> RowOutline:
     """The parallelogram about bars (N, 4, 2) in order along their row.
 
-    Two sides are lines through the ends of all bars, the others the outer sides of the first and last one.
+    Two of its sides are fitted to the ends of all bars; the others run along the first and the last bar.
     """
     centres = corners.mean(axis=1)
     course = centres[-1] - centres[0]

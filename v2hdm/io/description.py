@@ -1,4 +1,4 @@
-"""What a ``drive.yaml`` says (docs/drive-format.md): its keys and their meanings, and names of files.
+"""The keys of a ``drive.yaml`` (docs/drive-format.md) with their meanings, and names of files.
 
 The readers take their keys from here, and so does the schema with which editors complete the file.
 """
@@ -25,6 +25,9 @@ class InfoFile:
 
     file: Annotated[str, "file of ROS, Kalibr, OpenCV or COLMAP."]
     camera: Annotated[str | int | None, "the camera to use if the file has several."] = None
+    rectified: Annotated[
+        bool | None, "whether the images are rectified: P counts; default: as their topic's name says."
+    ] = None
 
 
 @dataclass(kw_only=True)

@@ -134,7 +134,8 @@ def read_tum(path: Path) -> Trajectory:
         _log.warning("%s: left out %d of %d poses of equal or stray times", path, left_out, len(table))
     if late := int((np.diff(order) < 0).sum()):
         _log.warning("%s: sorted its poses by time: %d came late", path, late)
-    table, numbers = table[order], numbers[order]
+    table = table[order]
+    numbers = numbers[order]
     if layout.w_first:
         table = table[:, [0, 1, 2, 3, 5, 6, 7, 4]]
     advice = "normalise it, order qx qy qz qw"

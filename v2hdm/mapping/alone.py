@@ -1,4 +1,4 @@
-"""What each camera's observations say without the others: whether cameras agree shows only so.
+"""Each camera solved without the others: only so does it show whether cameras agree.
 
 Sightings stay linked as all cameras together have linked them. Only the last solve is done again, camera by
 camera, with all observations, which the loss weighs anew.

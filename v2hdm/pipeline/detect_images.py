@@ -106,7 +106,7 @@ def detect_images(
     rough = RoughCamera(detector, lens, path, mounting, linear)
     most = limit and min(limit, sys.maxsize)
     frames = islice((_live_frames if live else _frames)(str(source), road, rough), most)
-    return _on_ground(_found(frames, rough, stopwatch or Stopwatch()))
+    return _on_ground(_glances(frames, rough, stopwatch or Stopwatch()))
 
 
 def _lens(camera: Path | None, name: str | None, mounting: Sequence[float] | None) -> CameraInfo | None:
@@ -207,25 +207,25 @@ def _drive_frames(path: Path, road: RoadDetector | None, rough: RoughCamera) -> 
     )
 
 
-class _Found(NamedTuple):
-    """What an image shows, and from where, if that is known."""
+class _Glance(NamedTuple):
+    """The road of an image, and the view of it if its pose is known."""
 
     detected: Detected
     view: View | None
 
 
-def _on_ground(images: Iterator[_Found]) -> Iterator[Detected]:
-    """What images show, of a drive only what stays on the ground as the vehicle moves."""
-    first = next(images, None)
+def _on_ground(glances: Iterator[_Glance]) -> Iterator[Detected]:
+    """The roads of images; where poses are known, of the markings only those that stay on the ground."""
+    first = next(glances, None)
     if first is None:
         return
     if first.view is None:
-        yield from (found.detected for found in chain([first], images))
+        yield from (glance.detected for glance in chain([first], glances))
         return
-    for found, stays in settled(chain([first], images), _camera_and_view):
-        road = found.detected.road
-        kept = tuple(compress(road.markings, stays.tolist()))
-        yield found.detected._replace(road=replace(road, markings=kept))
+    for glance, stays in settled(chain([first], glances), _camera_and_view):
+        road = glance.detected.road
+        paint = tuple(compress(road.markings, stays.tolist()))
+        yield glance.detected._replace(road=replace(road, markings=paint))
 
 
 def _pitch_sigma_rad(calibration: Calibration | None) -> float:
@@ -236,13 +236,13 @@ def _pitch_sigma_rad(calibration: Calibration | None) -> float:
     return float(np.sqrt(np.trace(rotation)))
 
 
-def _camera_and_view(found: _Found) -> tuple[str, View]:
-    assert found.view is not None
-    return found.detected.camera, found.view
+def _camera_and_view(glance: _Glance) -> tuple[str, View]:
+    assert glance.view is not None
+    return glance.detected.camera, glance.view
 
 
-def _found(frames: _Frames, rough: RoughCamera, stopwatch: Stopwatch) -> Iterator[_Found]:
-    """Every frame with what it shows."""
+def _glances(frames: _Frames, rough: RoughCamera, stopwatch: Stopwatch) -> Iterator[_Glance]:
+    """The road of every frame."""
     while True:
         with stopwatch.image():
             with lap("read"):
@@ -267,4 +267,4 @@ def _found(frames: _Frames, rough: RoughCamera, stopwatch: Stopwatch) -> Iterato
                 _pitch_sigma_rad(road.calibration),
                 road.detector.options.max_range_m,
             )
-        yield _Found(Detected(frame, name, on_road), view)
+        yield _Glance(Detected(frame, name, on_road), view)

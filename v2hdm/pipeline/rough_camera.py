@@ -40,7 +40,7 @@ _KNOWN_RAD = np.deg2rad(0.5)  # a stream's horizon is said when its standard dev
 
 
 class _Looked(NamedTuple):
-    """What is known of an image before its markings are looked for."""
+    """An image's mounting and network output, before its markings are looked for."""
 
     mounting: Mounting
     output: NetworkOutput | None  # of the network, if it was run on all rows of the road
@@ -164,10 +164,10 @@ class RoughCamera:
         pitch, pitch_sigma, roll, roll_sigma = angles.tolist()
         where = "the folder's images" if self.folder else f"{frame.name} and earlier images"
         others = round(horizons.images * (1 - horizons.of_mounting))
-        rest = f"; {others} of the {horizons.images} looked at are of other mountings" if others else ""
+        exceptions = f"; {others} of the {horizons.images} looked at are of other mountings" if others else ""
         print(
             f"from the lines of {where} the camera looks {pitch:.1f} +- {pitch_sigma:.1f} deg down, roll "
-            f"{roll:.1f} +- {roll_sigma:.1f} deg{rest}",
+            f"{roll:.1f} +- {roll_sigma:.1f} deg{exceptions}",
             file=sys.stderr,
         )
 

@@ -46,7 +46,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class Outputs:
-    """What of a result is written: see :meth:`v2hdm.pipeline.result.Result.save`."""
+    """Parts of a result that are written: see :meth:`v2hdm.pipeline.result.Result.save`."""
 
     formats: Sequence[str] = ("geojson",)
     all_maps: bool = False

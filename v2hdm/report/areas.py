@@ -9,11 +9,14 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from v2hdm.catalogue import AREA, SHIPPED
 from v2hdm.geometry.planar import clip_convex, signed_area
-from v2hdm.records import BOX, CROSSWALK, DOUBLE_LINE, TEXT, BoolArray, FloatArray, HDMap, Symbol, Truth
+from v2hdm.records import CROSSWALK, DOUBLE_LINE, TEXT, BoolArray, FloatArray, HDMap, Symbol, Truth
 from v2hdm.report.metrics import LATERAL_GATE_M, SAMPLE_STEP_M, distance_to_points, resample, runs
 
-AREAS = (TEXT, BOX, CROSSWALK)
+AREAS = (*SHIPPED.of_family(AREA), CROSSWALK)
+"""Classes of symbols that are areas: those of the catalogue, and what is composed of bars."""
+
 LEAST_IOU = 0.3  # least intersection over union of a mapped area and a true one that are the same
 
 
@@ -46,20 +49,20 @@ class DoubleMetrics:
 
 
 def area_figures(hd_map: HDMap, truth: Truth, expected: BoolArray) -> dict[str, Any]:
-    """Figures of the areas by class, and of double lines; ``expected`` (S,) are true symbols driven past."""
+    """Figures of the areas by class, and of double lines; ``expected`` (S,) are the symbols driven past."""
     figures = {kind: asdict(area_metrics(hd_map, truth, expected, kind)) for kind in AREAS}
     return figures | {DOUBLE_LINE: asdict(double_metrics(hd_map, truth))}
 
 
 def area_metrics(hd_map: HDMap, truth: Truth, expected: BoolArray, kind: str) -> AreaMetrics:
-    """Compare areas of ``kind`` with the truth; see :class:`AreaMetrics`, of words :class:`TextMetrics`."""
+    """Compare areas of ``kind`` with the truth; see :class:`AreaMetrics`, for words :class:`TextMetrics`."""
     mapped = [symbol for symbol in hd_map.symbols if symbol.kind == kind]
     number = [k for k, symbol in enumerate(truth.map.symbols) if symbol.kind == kind]
     iou = _overlaps(mapped, [truth.map.symbols[k] for k in number])
     rows, columns = linear_sum_assignment(-iou)
-    keep = iou[rows, columns] >= LEAST_IOU
-    rows = rows[keep]
-    columns = columns[keep]
+    is_match = iou[rows, columns] >= LEAST_IOU
+    rows = rows[is_match]
+    columns = columns[is_match]
     is_mapped = np.zeros(len(number), dtype=bool)
     is_mapped[columns] = True
     is_expected = expected[number]
@@ -72,12 +75,12 @@ def area_metrics(hd_map: HDMap, truth: Truth, expected: BoolArray, kind: str) ->
     )
     if kind != TEXT:
         return counted
-    known = [
+    words = [
         (mapped[row], truth.texts.get(number[column])) for row, column in zip(rows, columns, strict=True)
     ]
     right = [
         symbol.reading is not None and symbol.reading.text == text
-        for symbol, text in known
+        for symbol, text in words
         if text is not None
     ]
     return TextMetrics(

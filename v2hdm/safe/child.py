@@ -51,7 +51,7 @@ _STEP_S_PER_MB = 1.0  # by which that grows with the input: the index of a bag i
 
 @dataclass(frozen=True)
 class Limits:
-    """What a child may take."""
+    """Limits of a child."""
 
     memory_bytes: int  # beyond what it has when its work begins
     file_bytes: int  # of each file that it writes
@@ -110,7 +110,7 @@ def in_child(
 
 
 def _outcome_of(answer: Sequence[Any], limits: Limits, where: str, error: type[V2hdmError]) -> Any:
-    """What a child has answered; raises what it has failed of."""
+    """The result that a child has answered with; raises the error that it has failed of."""
     kind, *content = answer
     if kind == "done":
         return content[0]
@@ -175,7 +175,7 @@ def _is_limited(name: str) -> bool:
 
 
 class _Child:
-    """What a child knows of itself; ``step_s`` is None in any other process."""
+    """A child's knowledge of itself; ``step_s`` is None in any other process."""
 
     step_s: float | None = None
 

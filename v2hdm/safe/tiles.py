@@ -84,7 +84,8 @@ def _side_by_side(tiles: dict[tuple[int, int], Path], side_m: float, step_m: flo
     pixels = np.zeros((down * side_px, across * side_px, 4), np.uint8)
     for (column, row), tile in tiles.items():
         next_step()
-        top, left = (row - rows[0]) * side_px, (column - columns[0]) * side_px
+        top = (row - rows[0]) * side_px
+        left = (column - columns[0]) * side_px
         pixels[top : top + side_px, left : left + side_px] = _scaled(_pixels(tile), side_px)
     west_m = columns[0] * side_m - _HALF_WORLD_M
     north_m = _HALF_WORLD_M - rows[0] * side_m

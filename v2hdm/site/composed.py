@@ -31,13 +31,13 @@ APART_M = (0.15, 0.5)
 """Distance between the centres of a double line's two lines, m: gaps of .08 to .35 m (RMS-1 4.1, MUTCD 3A.06)
 between lines of .1 to .15 m."""
 _LEAST_BESIDE_M = 3.0  # least length of a double line, m: of one pair of dashes beside each other
-_LEAST_REST_M = 1.0  # shorter rests of its lines, m, are dropped: their ends are as uncertain
+_LEAST_REST_M = 1.0  # shorter remnants of its lines, m, are dropped: their ends are as uncertain
 _PARALLEL = 0.98  # least cosine between the two lines
 _STEP_M = 0.5  # distance between the vertices of a double line, m
 
 
 def composed(hd_map: HDMap) -> HDMap:
-    """The map with the crosswalks and double lines of what it holds; earlier crosswalks keep their ids."""
+    """The map with crosswalks of its bars and double lines of its lines; known crosswalks keep their ids."""
     places = [k for k, marking in enumerate(hd_map.markings) if marking.kind == CROSSWALK_BAR]
     corners = np.array([hd_map.markings[k].corners_map for k in places]).reshape(-1, 4, 2)
     rows = rows_of_bars(corners)
@@ -61,7 +61,7 @@ def _free_ids(hd_map: HDMap) -> Iterator[int]:
 
 
 def _crosswalk(bars: Sequence[Marking], earlier: Sequence[Symbol]) -> Symbol:
-    """The crosswalk of bars in order; one of ``earlier`` ones about its middle gives it its id."""
+    """The crosswalk of bars in order, with the id of the one of ``earlier`` crosswalks about its middle."""
     outline = outline_of_row(np.array([bar.corners_map for bar in bars]))
     covariance_m2 = _joint(bars)
     if covariance_m2 is not None:
@@ -85,9 +85,9 @@ def _crosswalk(bars: Sequence[Marking], earlier: Sequence[Symbol]) -> Symbol:
 
 
 def _joint(bars: Sequence[Marking]) -> FloatArray | None:
-    """Joint covariance (8N, 8N) of the corners of N bars, None where it is not known of all.
+    """Joint covariance (8N, 8N) of the corners of N bars, None where one bar has none.
 
-    What neighbours share, of a centre's error all but its ``relative_sigma_m``, shifts all bars alike.
+    Neighbours share the error of their centres, all but its ``relative_sigma_m``: it shifts all bars alike.
     """
     covariances = [bar.covariance_m2 for bar in bars if bar.covariance_m2 is not None]
     if len(covariances) < len(bars):
@@ -96,8 +96,8 @@ def _joint(bars: Sequence[Marking]) -> FloatArray | None:
     relative_m2 = float(np.mean([(bar.relative_sigma_m or 0.0) ** 2 for bar in bars]))
     values, vectors = np.linalg.eigh(centre_m2 - relative_m2 * np.eye(2))
     shared_m2 = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    own = block_diag(*(_without(whole, shared_m2) for whole in covariances))
-    return np.asarray(own + np.tile(shared_m2, (4 * len(bars), 4 * len(bars))))
+    by_bar = block_diag(*(_without(whole, shared_m2) for whole in covariances))
+    return np.asarray(by_bar + np.tile(shared_m2, (4 * len(bars), 4 * len(bars))))
 
 
 def _without(covariance_m2: FloatArray, shared_m2: FloatArray) -> FloatArray:
@@ -107,22 +107,22 @@ def _without(covariance_m2: FloatArray, shared_m2: FloatArray) -> FloatArray:
 
 
 def with_double_lines(lanes: Sequence[Lane]) -> tuple[Lane, ...]:
-    """The lane lines, in which two that run beside each other are one double line for as long as they do."""
+    """The lane lines; two that run beside each other become one double line for as long as they do."""
     pieces = list(lanes)
     doubles: list[Lane] = []
     number = 0
     while number < len(pieces):
-        found = _beside(pieces[number], pieces[number + 1 :])
-        if found is None:
+        neighbour = _beside(pieces[number], pieces[number + 1 :])
+        if neighbour is None:
             number += 1
             continue
-        other, is_beside = found
+        other, is_beside = neighbour
         line = pieces[number]
         second = pieces.pop(number + 1 + other)
         begin, end = np.flatnonzero(is_beside)[[0, -1]]
-        double, rest = _double(line, second, int(begin), int(end))
+        double, remnants = _double(line, second, int(begin), int(end))
         doubles.append(double)
-        pieces[number : number + 1] = _rests(line, int(begin), int(end)) + rest
+        pieces[number : number + 1] = _remnants(line, int(begin), int(end)) + remnants
     return (*pieces, *doubles)
 
 
@@ -132,7 +132,7 @@ def _directions(points: FloatArray) -> FloatArray:
 
 
 def _beside(line: Lane, others: Sequence[Lane]) -> tuple[int, BoolArray] | None:
-    """Which of the others runs beside a line the longest, and the line's vertices (N,) there, in one run."""
+    """The index of the line that runs beside a line the longest, and the run of vertices (N,) it passes."""
     if line.kind == DOUBLE_LINE or len(line.points_map) < 2:
         return None
     arc_m = length_along(line.points_map)
@@ -157,7 +157,7 @@ def _beside(line: Lane, others: Sequence[Lane]) -> tuple[int, BoolArray] | None:
 def _apart(line: Lane, other: Lane) -> bool:
     """Whether two lines are nowhere near each other."""
     (low, high), (other_low, other_high) = (
-        (each.points_map.min(axis=0), each.points_map.max(axis=0)) for each in (line, other)
+        (lane.points_map.min(axis=0), lane.points_map.max(axis=0)) for lane in (line, other)
     )
     return bool((low > other_high + APART_M[1]).any() or (other_low > high + APART_M[1]).any())
 
@@ -181,7 +181,7 @@ def _offsets(points: FloatArray, other: FloatArray) -> tuple[FloatArray, FloatAr
 
 
 def _double(line: Lane, other: Lane, begin: int, end: int) -> tuple[Lane, list[Lane]]:
-    """The double line of a line's vertices ``begin`` to ``end`` and another one, and the rests of that."""
+    """The double line along a line's vertices ``begin`` to ``end``, and the remnants of the other line."""
     part = slice(begin, end + 1)
     points = line.points_map[part]
     off_m, _ = _offsets(points, other.points_map)
@@ -204,16 +204,16 @@ def _double(line: Lane, other: Lane, begin: int, end: int) -> tuple[Lane, list[L
         lines=(line.kind, other.kind) if is_left else (other.kind, line.kind),
         apart_m=apart_m,
     )
-    return double, _rests(other, int(within[0]), int(within[-1]))
+    return double, _remnants(other, int(within[0]), int(within[-1]))
 
 
-def _rests(line: Lane, begin: int, end: int) -> list[Lane]:
-    """What is left of a line before vertex ``begin`` and after vertex ``end``, without an id."""
-    rests = []
+def _remnants(line: Lane, begin: int, end: int) -> list[Lane]:
+    """The remnants of a line before vertex ``begin`` and after vertex ``end``, without an id."""
+    remnants = []
     for part in (slice(0, begin + 1), slice(end, None)):
         points = line.points_map[part]
         if len(points) > 1 and length_along(points)[-1] >= _LEAST_REST_M:
-            rest = replace(
+            remnant = replace(
                 line,
                 points_map=points,
                 id=None,
@@ -221,8 +221,8 @@ def _rests(line: Lane, begin: int, end: int) -> list[Lane]:
                 sigma_m=_part(line.sigma_m, part),
                 heights_sigma_m=_part(line.heights_sigma_m, part),
             )
-            rests.append(rest)
-    return rests
+            remnants.append(remnant)
+    return remnants
 
 
 def _part(values: FloatArray | None, part: slice) -> FloatArray | None:

@@ -97,7 +97,7 @@ class Heard:
 def heard_of(
     stated: Stated, reasons: Sequence[str | None], log_odds: FloatArray, images: IntArray, shown: Candidates
 ) -> tuple[Heard, ...]:
-    """What the map follows of the corrections of candidates (G,), beside what the images alone say.
+    """The corrections of candidates (G,) that the map follows, beside what the images alone say.
 
     By the images ``reasons`` (G,) speak against them, or None, their ``log_odds`` (G,) are of being markings,
     ``images`` (G,) show them, and their corners are those ``shown``.

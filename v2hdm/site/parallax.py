@@ -3,8 +3,9 @@
 Projected to the ground, a ground point approaches by the vehicle's motion, one at half the camera's height by
 twice that, one moving with the vehicle not at all. With camera c, the ray from its nadir to the projected
 point is r = a - s c, with s = 1 on the ground; images determine s by the motion between them. Where a vehicle
-stood, what moves or stands up contradicts itself in a few images only, which a robust solve drops. So paint
-and anything else are compared by how likely *all* sightings are, each of which may be of something else.
+stood, most images of a moving or upright thing agree, and a robust solve drops the few that contradict them.
+So paint and anything else are compared by how likely *all* sightings are, each of which may be of something
+else.
 """
 
 from __future__ import annotations
@@ -26,12 +27,17 @@ NOT_OBSERVED = "not observed to be on the ground"
 NOT_ON_GROUND = "stands above the ground, or moves"
 
 _GROUND = (1.0, 0.1, 0.03)
-_ELSEWHERE = ((2.0, 0.35, 0.35), (0.0, 0.5, 0.1))
-"""Mean of s, its standard deviation shared by a candidate's points and that of each point, by hypothesis.
+"""Mean of s on the ground, its standard deviation shared by a candidate's points and that of each point.
 
-On the ground: a bump of a tenth of the camera's height, and how far the ground bends within a marking
-(measured on right drives: 0.003, on KITTI 0.008). At half the camera's height: upright things, whose points
-differ in height. Moving along: nearer and farther, all points together.
+They have no unit. Chosen: shared is a bump of a tenth of the camera's height; of each point it is more than
+the ground bends within a marking, which was measured as 0.003 on right drives and 0.008 on KITTI.
+"""
+
+_ELSEWHERE = ((2.0, 0.35, 0.35), (0.0, 0.5, 0.1))
+"""The same of what is above the ground and of what moves along, chosen.
+
+Above, at half the camera's height, are upright things, whose points differ in height. What moves along comes
+nearer or goes farther with all its points together.
 """
 
 _OFF_SHARE = 0.07  # fraction of a marking's sightings that are of something else, as of its observations
@@ -224,10 +230,10 @@ class _Model:
         design = np.concatenate([by_place, by_slope, by_pose[..., 3:5]], axis=2) * is_used[..., None]
         off_m = np.where(is_used, (points - middle[group]).reshape(-1, total), 0.0)
         covariance_m2 = _covariance(views, by_pose)
-        both = is_used[:, :, None] & is_used[:, None, :]
+        is_used_pair = is_used[:, :, None] & is_used[:, None, :]
         # Half of what something else is off, such as a cut end or a neighbour, is common to its corners.
-        apart = (np.ones((points_each, points_each)) + np.eye(points_each)) / 2
-        elsewhere_m2 = covariance_m2 + _OFF_M**2 * np.kron(apart, np.eye(2)) * both
+        correlation = (np.ones((points_each, points_each)) + np.eye(points_each)) / 2
+        elsewhere_m2 = covariance_m2 + _OFF_M**2 * np.kron(correlation, np.eye(2)) * is_used_pair
         tilt_rad = np.max(views.pose_sigma[:, 3:5], initial=_LEVEL_RAD)
         return cls(
             group=group,

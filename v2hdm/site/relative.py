@@ -58,7 +58,7 @@ def with_relative_sigma(
 
 
 def neighbours(centres_map: FloatArray) -> Sequence[IntArray]:
-    """Of each point (N, 2), m, the others within reach, first that whose distance is nearest to 10 m."""
+    """The others within reach of each point (N, 2), m, the one whose distance is nearest to 10 m first."""
     out = []
     for k, in_reach in enumerate(cKDTree(centres_map).query_ball_point(centres_map, _FARTHEST_M)):
         others = np.array([other for other in in_reach if other != k], dtype=np.int64)

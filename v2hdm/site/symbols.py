@@ -14,7 +14,6 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -27,7 +26,7 @@ from v2hdm.association.sightings import Rig, Symbols
 from v2hdm.association.tracks import LEAST_SIGHTINGS
 from v2hdm.catalogue import AREA, SHIPPED
 from v2hdm.geometry.ipm import apply_in_front, pinhole_px_from_ground, project_ground
-from v2hdm.geometry.planar import is_simple, signed_area
+from v2hdm.geometry.planar import is_simple, signed_area, smallest_rectangle
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import (
     BOX,
@@ -134,7 +133,7 @@ def _fitted(places: Sequence[_Place]) -> list[tuple[_Place, Polygon | Rectangle]
 def _objection(polygon: Polygon | Rectangle) -> str | None:
     """Reason why a polygon is not the shape of a symbol, or None."""
     if isinstance(polygon, Rectangle):
-        return None if polygon.seen.min() >= LEAST_IMAGES else LACKS_A_CORNER
+        return None if polygon.images.min() >= LEAST_IMAGES else LACKS_A_CORNER
     if polygon.explained < LEAST_EXPLAINED or not is_simple(polygon.vertices):
         return NO_POLYGON
     variance_m2 = np.diag(polygon.covariance).reshape(-1, 2).sum(axis=1)
@@ -208,10 +207,7 @@ def _absences(
     places: Sequence[_Place], views: Views, rig: Rig, cameras: Sequence[Camera], min_probability: float
 ) -> list[str | None]:
     """Why each place has no paint, or None: it is found in too few of the images that show it well."""
-    boxes = [_core(place) for place in places]
-    corners_map = np.array(
-        [box + place.outline_map.mean(axis=0) for box, place in zip(boxes, places, strict=True)]
-    ).reshape(-1, 4, 2)
+    corners_map = np.array([_core(place) for place in places]).reshape(-1, 4, 2)
     number, image = easy_views(views, rig, cameras, corners_map)
     easy = np.bincount(number, minlength=len(places))
     row_of_image = {index: row for row, index in enumerate(views.image.tolist())}
@@ -234,17 +230,12 @@ def _absences(
 
 
 def _core(place: _Place) -> FloatArray:
-    """The corners (4, 2) about its middle of what shows a place: its box, of a large area the middle."""
-    box = cv2.boxPoints(cv2.minAreaRect(_about_middle(place))).astype(np.float64)
+    """Corners (4, 2) of the ground that shows a place: its smallest rectangle, of a large area the middle."""
+    box = smallest_rectangle(place.outline_map)
     if place.kind not in AREAS:
         return box
     middle = box.mean(axis=0)
     return np.asarray(middle + (box - middle) * min(1.0, _CORE_M / float(np.ptp(box, axis=0).max())))
-
-
-def _about_middle(place: _Place) -> NDArray[np.float32]:
-    """The common outline (N, 2) about its middle."""
-    return np.asarray(place.outline_map - place.outline_map.mean(axis=0), dtype=np.float32)
 
 
 def _with_vertices(symbol: Symbol, polygon: Polygon | Rectangle, markings: Sequence[Marking]) -> Symbol:

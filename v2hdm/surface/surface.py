@@ -160,7 +160,7 @@ class _Stands(NamedTuple):
 
 
 class _Records(NamedTuple):
-    """What is recorded of the ground on the path."""
+    """Records of the ground on the path."""
 
     information: FloatArray  # (B, B) on the parameters
     vector: FloatArray  # (B,) information times parameters

@@ -1,7 +1,7 @@
 """Patches of images that show a word best, upright in each of four directions.
 
-A word is a rectangle on the ground. A patch is its ground, sampled from one image, with one of its four sides
-above.
+A word is a rectangle on the ground. A patch is that ground, sampled from one image and turned so that one of
+its four sides is above.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from v2hdm.geometry.lens import distort_points
-from v2hdm.geometry.planar import signed_area
+from v2hdm.geometry.planar import side_frames, signed_area, smallest_rectangle, turned_left
 from v2hdm.records import Camera, FloatArray, Image
 from v2hdm.site.living.wear import Footage
 from v2hdm.words.recogniser import HEIGHT_PX
@@ -29,7 +29,7 @@ DIRECTIONS = 4  # sides of a word's rectangle that may be above
 
 _NEAR_M = 16.0  # largest range, m, at which an image resolves letters: half a metre is 15 px at 1280 px
 _MOST_VIEWS = 5  # most images of a word; errors of more repeat
-_APART_M = 1.0  # least distance of the cameras of two images of a word, m: what hides it moves with the view
+_APART_M = 1.0  # least distance of the cameras of two images, m: things before a word move with the view
 _BORDER_PX = 2  # least distance of a word from the border of an image, px
 _MARGIN = 0.12  # ground around a word on each side, in shares of its shorter side
 _STRETCH = 1.5
@@ -37,10 +37,9 @@ _STRETCH = 1.5
 network reads those of half the usual width to twice as well (75 words drawn so)."""
 _WIDTHS_PX = (48, 960)  # least and largest width of a patch, px
 _NEAR_DEPTH_M = 0.3  # least depth, m, of a word's corners
-_WIDEST_STROKE_PX = (
-    15,
-    23,
-)  # rows and columns of a patch: a third of a letter's height, which no stroke reaches
+_WIDEST_STROKE_PX = (15, 23)
+"""Rows and columns of a patch: a third of a letter's height, which no stroke reaches."""
+
 _GROUND_BLUR_PX = 1.0  # smooths the ground between strokes, px of a patch
 _DARK = 3.0  # added to grey values of 8 bits before their ratio: noise of dark pixels
 _LEAST_RATIO = 0.1  # least ratio over ground that is full contrast: less is its texture
@@ -57,9 +56,7 @@ class Word:
     @classmethod
     def around(cls, outline_map: FloatArray) -> Word:
         """The smallest rectangle around an outline (N, 2)."""
-        middle = outline_map.mean(axis=0)
-        corners = cv2.boxPoints(cv2.minAreaRect((outline_map - middle).astype(np.float32)))
-        corners_map = corners.astype(np.float64) + middle
+        corners_map = smallest_rectangle(outline_map)
         return cls(corners_map if signed_area(corners_map) > 0 else corners_map[::-1])
 
     @property
@@ -70,23 +67,21 @@ class Word:
     @property
     def up_map(self) -> FloatArray:
         """The unit vectors (4, 2) that may be above."""
-        sides = np.roll(self.corners_map, -1, axis=0) - self.corners_map
-        return np.asarray(sides / np.linalg.norm(sides, axis=1, keepdims=True))
+        return side_frames(self.corners_map).tangent
 
     @property
     def size_m(self) -> FloatArray:
         """The height (4,) in each direction; its width is that of the next."""
-        return np.asarray(np.linalg.norm(np.roll(self.corners_map, -1, axis=0) - self.corners_map, axis=1))
+        return side_frames(self.corners_map).length
 
     def grid(self, direction: int, finer: int) -> FloatArray:
         """The ground (rows, columns, 2) under a patch with ``finer`` rows a px, with that side above."""
-        height_m, width_m = self.size_m[[direction, (direction + 1) % DIRECTIONS]]
-        margin_m = _MARGIN * min(height_m, width_m)
-        height_m, width_m = height_m + 2 * margin_m, width_m + 2 * margin_m
+        size_m = self.size_m[[direction, (direction + 1) % DIRECTIONS]]
+        height_m, width_m = size_m + 2 * _MARGIN * size_m.min()
         columns = round(float(np.clip(_STRETCH * HEIGHT_PX * width_m / height_m, *_WIDTHS_PX))) * finer
         rows = HEIGHT_PX * finer
         up = self.up_map[direction]
-        right = np.array([up[1], -up[0]])
+        right = -turned_left(up)
         down_m = ((np.arange(rows) + 0.5) / rows - 0.5) * height_m
         right_m = ((np.arange(columns) + 0.5) / columns - 0.5) * width_m
         return np.asarray(self.middle_map + right_m[:, None] * right - down_m[:, None, None] * up)
@@ -142,8 +137,8 @@ def _cut(word: Word, footage: Footage, index: int, pixels: NDArray[np.float32]) 
 def _levelled(patch: np.ndarray) -> Grey:
     """A patch as its ratio to the ground beside the strokes, in full contrast: in sun and shade alike.
 
-    The ground is what remains when all that is bright and narrower than a stroke may be is taken away
-    (morphological opening): the edge of a shadow stays where it is.
+    The ground remains when everything bright that is narrow enough to be a stroke is taken away
+    (morphological opening). The edge of a shadow stays where it is.
     """
     ground = cv2.morphologyEx(patch, cv2.MORPH_OPEN, np.ones(_WIDEST_STROKE_PX))
     ratio = (patch + _DARK) / (cv2.GaussianBlur(ground, (0, 0), _GROUND_BLUR_PX) + _DARK)
@@ -155,7 +150,7 @@ def _levelled(patch: np.ndarray) -> Grey:
 def _best_views(
     words: Sequence[Word], footage: Footage, cameras: Mapping[str, Camera]
 ) -> dict[int, list[int]]:
-    """By image, the words of which it is one of those with the most pixels a metre."""
+    """The words by image, each in those of its images that have the most pixels a metre."""
     if not words:
         return {}
     tree = cKDTree([word.middle_map for word in words])
@@ -164,7 +159,7 @@ def _best_views(
         if image.camera not in footage.calibrations:
             continue
         info = footage.calibrations[image.camera].info
-        own = cameras[image.camera].own_vehicle
+        mask = cameras[image.camera].own_vehicle
         for number in tree.query_ball_point(pose[:2, 3], _NEAR_M):
             corners_map = words[number].corners_map
             pinhole, depth_m = footage.pinhole_px(index, corners_map)
@@ -172,7 +167,7 @@ def _best_views(
                 continue
             px = distort_points(info, pinhole)
             last_px = (info.width - 1 - _BORDER_PX, info.height - 1 - _BORDER_PX)
-            if (px < _BORDER_PX).any() or (px > last_px).any() or (own is not None and _covers(own, px)):
+            if (px < _BORDER_PX).any() or (px > last_px).any() or (mask is not None and _covers(mask, px)):
                 continue
             sides_px = np.linalg.norm(np.roll(px, -1, axis=0) - px, axis=1)
             views[number].append((float((sides_px / words[number].size_m).min()), index))
@@ -184,7 +179,7 @@ def _best_views(
 
 
 def _apart(indices: Sequence[int], footage: Footage) -> list[int]:
-    """The first images of a list that were taken at other places than those before them."""
+    """The first images of a list that were taken at least ``_APART_M`` from all chosen before them."""
     chosen: list[int] = []
     centres: list[FloatArray] = []
     for index in indices:
@@ -199,8 +194,8 @@ def _apart(indices: Sequence[int], footage: Footage) -> list[int]:
     return chosen
 
 
-def _covers(own: NDArray[np.bool_], px: FloatArray) -> bool:
-    """Whether the own vehicle hides part of a quadrilateral (4, 2)."""
-    word = np.zeros(own.shape, dtype=np.uint8)
+def _covers(mask: NDArray[np.bool_], px: FloatArray) -> bool:
+    """Whether a mask (H, W) of the own vehicle hides part of a quadrilateral (4, 2)."""
+    word = np.zeros(mask.shape, dtype=np.uint8)
     cv2.fillConvexPoly(word, np.round(px).astype(np.int32), 1)
-    return bool((own & (word > 0)).any())
+    return bool((mask & (word > 0)).any())

@@ -1,10 +1,10 @@
-"""Readings of a word, weighed: which side is above, and what stands there.
+"""Readings of a word, weighed: which side is above, and which text stands there.
 
-The side that is above is one of four, or none can be read. Before a look it is the one along the direction of
-driving, for words are painted for those who drive up to them; of a yard that is driven both ways, half of it
-each. A look says more: of letters that are upright the network is sure, of others it seldom is. What stands
-there has the probability of each string in all images, given that side. Images of one word repeat each
-other's errors; together they count as if fewer were independent.
+One of four sides is above, or none can be read. Beforehand it is most likely the side along the direction of
+driving, for words are painted for those who drive up to them; where a yard is driven both ways, either of the
+two. The images say more: the network is sure of letters that are upright, and seldom of others. Given a side,
+each string has a probability by all images. Images of one word repeat each other's errors; together they
+count as if fewer were independent.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import i0e, logsumexp
 
+from v2hdm.geometry.planar import turned_left
 from v2hdm.records import TEXT, Camera, FloatArray, HDMap, Image, Reading, Symbol
 from v2hdm.site.living.wear import Footage
 from v2hdm.words.patches import DIRECTIONS, Grey, Word, patches_of
@@ -31,13 +32,15 @@ _CONCENTRATION = 4.0  # of the first two, von Mises: one sigma is 30 deg, chosen
 _READABLE = 0.9  # probability that some side can be read: paint may be worn off, or no text, chosen
 
 _SURENESS = (-1.6, -1.0, 0.01)
-"""How much likelier the network is as sure as it is of letters that are upright than of anything else, by
-what its best string lacks in log probability, x: the exponential of the first, plus the second times the
-logarithm of x and the third. Read off 260 words drawn upright and turned."""
+"""Parameters a, b, c of the likelihood ratio of upright letters over anything else: exp(a + b log(x + c)).
+
+x is how unsure the network is, minus the log probability of its best string. Read off 260 words drawn upright
+and turned.
+"""
 
 _CORRELATION = 0.5  # of the errors of two images of a word
-_HIDDEN = 0.2  # probability that an image shows something else, such as what stands before the word, chosen
-_FEWEST_OF_MEDIAN = 3  # fewest images whose median is looked at, too
+_HIDDEN = 0.2  # probability that an image shows something else, such as a thing before the word, chosen
+_FEWEST_OF_MEDIAN = 3  # fewest images whose median is read, too
 _LEAST_OF_TWO = 0.5  # least probability that one of the two likeliest strings is right
 _WORTH_TELLING = 0.05  # least probability of an alternative that is kept
 
@@ -54,7 +57,7 @@ def with_readings(
     recogniser: Recogniser,
     threads: int = 1,
 ) -> HDMap:
-    """``hd_map`` with what each of its words says, of those that images show.
+    """``hd_map`` with the readings of those of its words that images show.
 
     ``light`` reads an image as :func:`~v2hdm.words.patches.patches_of` takes it.
     """
@@ -74,7 +77,7 @@ def with_readings(
 
 
 def views_of(patches: Sequence[list[Grey]], recogniser: Recogniser) -> list[_View]:
-    """The letters in the patches of a word, and in the median of several: what hid it in some is gone."""
+    """The letters in the patches of a word, and in their median, from which passing things are gone."""
     medians = []
     if len(patches) >= _FEWEST_OF_MEDIAN:
         by_side = zip(*patches, strict=True)
@@ -83,8 +86,8 @@ def views_of(patches: Sequence[list[Grey]], recogniser: Recogniser) -> list[_Vie
 
 
 def _upright(symbol: Symbol, up_map: FloatArray, reading: Reading) -> Symbol:
-    """A text with its reading, its outline from the lower left corner on if ``up_map`` (2,) is above."""
-    right_map = np.array([up_map[1], -up_map[0]])
+    """A text with its reading; its outline begins at the lower left corner where ``up_map`` (2,) is above."""
+    right_map = -turned_left(up_map)
     first = int(np.argmin(symbol.outline_map @ (up_map + right_map)))
     order = np.roll(np.arange(len(symbol.outline_map)), -first)
     stacked = (2 * order[:, None] + [0, 1]).ravel()
@@ -124,7 +127,7 @@ class Upright(NamedTuple):
 
 
 def reading_of(views: Sequence[_View], prior: FloatArray) -> Upright | None:
-    """What a word says by its images and the ``prior`` (4,) of the sides that may be above.
+    """The reading of a word by its images and the ``prior`` (4,) of the side that is above.
 
     None where neither of the two likeliest strings is likelier than not.
     """
@@ -134,19 +137,19 @@ def reading_of(views: Sequence[_View], prior: FloatArray) -> Upright | None:
     others = []
     for side in range(DIRECTIONS):
         odds = _log_odds([view[side] for view in views])
-        readable = np.log(_READABLE / (1.0 - _READABLE) * prior[side])
-        others.append(odds.pop("") + readable)
+        prior_odds = np.log(_READABLE / (1.0 - _READABLE) * prior[side])
+        others.append(odds.pop("") + prior_odds)
         for text, value in odds.items():
-            by_text.setdefault(text, np.full(DIRECTIONS, -np.inf))[side] = value + readable
+            by_text.setdefault(text, np.full(DIRECTIONS, -np.inf))[side] = value + prior_odds
     total = logsumexp([0.0, *others, *np.ravel(list(by_text.values()))])
     share_of = {text: np.exp(odds_of_sides - total) for text, odds_of_sides in by_text.items()}
     ranked = sorted(share_of.items(), key=lambda item: -item[1].sum())
     if sum(shares_of_sides.sum() for _, shares_of_sides in ranked[:2]) < _LEAST_OF_TWO:
         return None
-    (text, shares_of_sides), *rest = ranked
+    (text, shares_of_sides), *alternatives = ranked
     reading = Reading(text, float(shares_of_sides.sum()))
-    if rest and rest[0][1].sum() >= _WORTH_TELLING:
-        reading = Reading(*reading[:2], rest[0][0], float(rest[0][1].sum()))
+    if alternatives and alternatives[0][1].sum() >= _WORTH_TELLING:
+        reading = Reading(*reading[:2], alternatives[0][0], float(alternatives[0][1].sum()))
     return Upright(reading, int(shares_of_sides.argmax()))
 
 
@@ -163,7 +166,7 @@ def _log_odds(letters: Sequence[Letters]) -> dict[str, float]:
     candidates = sorted({*best} - {""})
     shares = np.exp([[of_image.log_of(text) for text in candidates] for of_image in letters])
     shares = shares.reshape(len(letters), -1)
-    rest = np.maximum(1.0 - shares.sum(axis=1), 0.0)
-    shares = np.column_stack([shares, rest])
+    remainder = np.maximum(1.0 - shares.sum(axis=1), 0.0)
+    shares = np.column_stack([shares, remainder])
     log_odds = weight * np.log((1.0 - _HIDDEN) * sureness[:, None] * shares + _HIDDEN).sum(axis=0)
     return dict(zip([*candidates, ""], log_odds.tolist(), strict=True))

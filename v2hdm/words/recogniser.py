@@ -1,4 +1,4 @@
-"""The network of the extra ``text``: probabilities of letters along a patch, and of a string in them.
+"""The network of the extra ``text``: probabilities of letters along a patch, and those of whole strings.
 
 The network is PP-OCRv6 (small) from the wheel of ``rapidocr``; its file also lists its letters. It was
 trained with connectionist temporal classification (Graves et al., ICML 2006), CTC: each column of the output
@@ -25,10 +25,9 @@ _FILES = "models/*rec*.onnx"  # the network's file in the package
 _LETTERS = "character"  # key of the file's metadata with its letters, a line each
 _NO_LETTER = 0  # channel of "no new letter"
 
-# Weights of letters on roads and in yards before any is seen: most words are capitals and digits, signs are
-# rare, and the network takes what it cannot read for one of its 18,000 Chinese signs. Chosen.
-_SMALL_LETTER = 0.2
-_OTHER_SIGN = 0.02
+# Weights of letters on roads and in yards before any is seen, relative to those of capitals and digits.
+_SMALL_LETTER = 0.2  # chosen: most words are capitals
+_OTHER_SIGN = 0.02  # chosen: rare, and the network takes illegible paint for one of its 18,000 Chinese signs
 
 _FAINTEST = 1e-12  # least probability of a letter: none is impossible
 

@@ -52,7 +52,7 @@ class NumbaEngine(TorchEngine):
     @cached_property
     def layout(self) -> Layout:
         """The problem as kernels read it, with the corners that the plan keeps marked."""
-        return self._with_kept(self._plan.kept)
+        return self._with_kept(self._plan.kept_corners)
 
     def share(self, work: Callable[[int, int], None]) -> None:
         """Call ``work(begin, end)`` for ranges that partition the chunks."""
@@ -65,7 +65,8 @@ class NumbaEngine(TorchEngine):
     @cached_property
     def _plan(self) -> Plan:
         """The cheapest: all corners eliminated first, in either order, or those of several drives kept."""
-        arrays, per_tile = self.arrays, frames_per_tile(self.arrays)
+        arrays = self.arrays
+        per_tile = frames_per_tile(arrays)
         none = arrays.corner_order[:0]
         states = len(arrays.states)
         if not states:
@@ -93,7 +94,7 @@ class NumbaEngine(TorchEngine):
     def _with_kept(self, kept_corners: Tensor) -> Layout:
         mask = np.zeros(self.arrays.corner_count, dtype=np.bool_)
         mask[kept_corners.numpy()] = True
-        return self._whole._replace(kept=mask[self._whole.unit[:-1]])
+        return self._whole._replace(is_kept=mask[self._whole.unit[:-1]])
 
     def _shared_corners(self) -> Tensor:
         """Corners (n,) that several drives observed, and all that known lengths join to them."""
@@ -110,13 +111,13 @@ class NumbaEngine(TorchEngine):
     def _coupled_tiles(self, layout: Layout, per_tile: int, tile_count: int) -> tuple[list[list[int]], int]:
         """Pairs of tiles coupled by eliminated corners, and the largest number of tiles of a unit."""
         tile = layout.frame[layout.pair % layout.moments] // per_tile
-        units = len(layout.kept)
+        units = len(layout.is_kept)
         first_observation = layout.begin[layout.unit]
         touched = csr_array(
             (np.ones(len(tile), dtype=np.int32), tile, first_observation), shape=(units, tile_count)
         )
         touched.sum_duplicates()
-        touched = touched[~layout.kept]
+        touched = touched[~layout.is_kept]
         touched.data[:] = 1
         edges = np.stack(triu(touched.T @ touched, 1).nonzero(), axis=1)
         return edges.tolist(), int(np.diff(touched.indptr).max(initial=0))
@@ -211,7 +212,7 @@ class NumbaEngine(TorchEngine):
         of_pairs = self.gather(out.squares) if by_pair else out.squares.reshape(chunks, -1, 21).sum(0)
         tip = torch.from_numpy(out.tip.sum(0))
         system.add(_symmetric(torch.from_numpy(of_pairs), arrays.camera_count), tip + tip.tril(-1).mT)
-        if len(system.plan.kept):
+        if len(system.plan.kept_corners):
             self._keep(system, base)
         if states:
             self._subtract_frames(base, system)
@@ -233,12 +234,12 @@ class NumbaEngine(TorchEngine):
     def _keep(self, system: ReducedSystem, base: Base) -> None:
         """Add the kept corners' blocks, stored as factors, to the system; sets those factors to 1."""
         layout = self.layout
-        kept_corners = system.plan.kept
+        kept_corners = system.plan.kept_corners
         number = np.full(self.arrays.corner_count, -1)
         number[kept_corners.numpy()] = np.arange(len(kept_corners))
         index = []
         blocks = []
-        for u in np.flatnonzero(layout.kept):
+        for u in np.flatnonzero(layout.is_kept):
             first = layout.unit[u]
             size = layout.unit[u + 1] - layout.unit[u]
             if size == 1:

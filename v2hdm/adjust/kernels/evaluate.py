@@ -116,7 +116,7 @@ def carry(
         number_touched(layout, q, scratch.slot)
         for u in range(layout.chunk[q], layout.chunk[q + 1]):
             first = layout.unit[u]
-            coupled = len(base.rows) == 0 and not layout.kept[u]
+            coupled = len(base.rows) == 0 and not layout.is_kept[u]
             for c in range(first, layout.unit[u + 1]):
                 i = 2 * (c - first)
                 scratch.gradient[i] = by_corner[c, 0]
@@ -217,7 +217,7 @@ def evaluate(
         for u in range(layout.chunk[q], layout.chunk[q + 1]):
             first = layout.unit[u]
             last = layout.unit[u + 1]
-            coupled = states and not layout.kept[u]
+            coupled = states and not layout.is_kept[u]
             for c in range(first, last):
                 i = 2 * (c - first)
                 step[i], step[i + 1] = _pushed(

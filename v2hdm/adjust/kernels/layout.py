@@ -46,7 +46,7 @@ class Layout(NamedTuple):
     length_root: FloatArray
     most_seen: int  # largest number of observations, and of corners, of a unit
     most_joined: int
-    kept: BoolArray  # (M,) units that are not eliminated: their factor is 1, and nothing couples to them
+    is_kept: BoolArray  # (M,) units that are not eliminated: their factor is 1, and nothing couples to them
 
 
 def make_layout(arrays: Arrays) -> Layout:
@@ -81,7 +81,7 @@ def make_layout(arrays: Arrays) -> Layout:
         length_root=lengths.information_root.numpy()[order],
         most_seen=int(np.diff(begin[unit]).max()),
         most_joined=int(joined.max()),
-        kept=np.zeros(len(joined), dtype=np.bool_),
+        is_kept=np.zeros(len(joined), dtype=np.bool_),
     )
 
 

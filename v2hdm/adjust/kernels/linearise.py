@@ -238,7 +238,7 @@ def linearise(
                 )
             add_corner_priors(layout, u, base.corners, gradient, out.costs[q])
             _add_lengths(layout, u, base.corners, block)
-            if layout.kept[u]:
+            if layout.is_kept[u]:
                 keep_unit(layout, base, u, block)
                 for i in range(2 * size):
                     out.whitened[2 * first + i] = gradient[i]
@@ -303,7 +303,8 @@ def _touch(layout: Layout, u: int, tiles: TileMap, marks: IntArray) -> int:
     for k in range(layout.begin[layout.unit[u]], layout.begin[layout.unit[u + 1]]):
         tile = layout.frame[layout.pair[k] % layout.moments] // tiles.per_tile
         if mark[tile] != u:
-            mark[tile], touched[count] = u, tile
+            mark[tile] = u
+            touched[count] = tile
             count += 1
     for a in range(1, count):
         tile = touched[a]
@@ -384,7 +385,7 @@ def subtract_frames(
     w = scratch.coupling
     rows = scratch.rows
     for u in range(len(layout.unit) - 1):
-        if layout.kept[u]:
+        if layout.is_kept[u]:
             continue
         count = _touch(layout, u, tiles, marks)
         is_wanted = False
@@ -412,7 +413,8 @@ def subtract_frames(
                 frame = layout.frame[t % layout.moments]
                 a = place[frame // tiles.per_tile]
                 within = frame % tiles.per_tile * states
-                low[a], high[a] = min(low[a], within), max(high[a], within + states)
+                low[a] = min(low[a], within)
+                high[a] = max(high[a], within + states)
                 column = a * size + within
                 for p in range(6):
                     for s in range(states):

@@ -52,7 +52,7 @@ class _Weighing(NamedTuple):
     most: float
 
     def log_likelihood(self, odds: FloatArray) -> FloatArray:
-        """What log odds (...) add."""
+        """The log likelihood that log odds (...) add."""
         return np.asarray(self.weight * (np.clip(odds, self.least, self.most) - self.even))
 
 
@@ -199,7 +199,7 @@ def boundaries(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> l
 
 
 class _Relation(Enum):
-    """What a line is to another."""
+    """Kinds of relation of a line to another."""
 
     SEPARATE = auto()
     REPETITION = auto()  # or it crosses the other
@@ -207,7 +207,7 @@ class _Relation(Enum):
 
 
 def _relation(line: Line, other: Line, points: LinePoints, image: LaneImage) -> _Relation:
-    """What a line is to another, on the rows of its span."""
+    """The relation of a line to another, on the rows of its span."""
     assert line.span is not None
     assert other.span is not None
     below = line.span.below

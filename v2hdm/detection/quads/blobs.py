@@ -166,7 +166,7 @@ def _connected(level: np.ndarray, least_row: float) -> tuple[list[np.ndarray], n
 
 
 class _Scores(NamedTuple):
-    """What the network says of B pieces of paint."""
+    """The network's scores of B pieces of paint."""
 
     cells: np.ndarray  # (B,) elements of paint
     score: FloatArray  # (K, B) mean probability of each class

@@ -52,7 +52,7 @@ def log_light(values: np.ndarray) -> np.ndarray:
 
 
 class Looked(NamedTuple):
-    """What an image shows at n pixels; of the pixels of a lattice n is (M, N)."""
+    """The light of an image at n pixels; for the pixels of a lattice n is (M, N)."""
 
     light: np.ndarray  # (3, n) float32 logarithms of grey, red and blue
     use: np.ndarray  # (n,) which take part
@@ -106,7 +106,7 @@ class Patches:
         self._last_px = np.array([image_bgr.shape[1] - 1, image_bgr.shape[0] - 1])
 
     def look(self, u: np.ndarray, v: np.ndarray, marking: np.ndarray) -> Looked:
-        """What columns ``u`` and rows ``v`` (n,) show of the ``marking`` (n,) that each is looked at for."""
+        """The light at columns ``u`` and rows ``v`` (n,), each looked at for its ``marking`` (n,)."""
         last_u, last_v = self._last_px.tolist()
         use = (u >= 0) & (u <= last_u) & (v >= 0) & (v <= last_v)
         u = np.clip(u, 0, last_u)

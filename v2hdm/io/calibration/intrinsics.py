@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -16,7 +16,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from v2hdm.errors import DriveError, MapFileError, shown
-from v2hdm.io.calibration.reading import info_of, read_calibration, take_camera_info, take_matrix
+from v2hdm.io.calibration.reading import (
+    Intrinsics,
+    info_of,
+    read_calibration,
+    rectified_matrix,
+    rectifying_turn,
+    take_camera_info,
+    take_matrix,
+)
 from v2hdm.records import DISTORTION_COEFFICIENTS, CameraInfo, FloatArray
 from v2hdm.safe.fields import check_camera, take_size_px
 from v2hdm.safe.texts import parse_json, parse_yaml, read_text
@@ -71,6 +79,7 @@ class IntrinsicsFormat:
     accepts: Callable[[Document], bool]  # whether a file looks like one of this format
     read: Callable[[Document, str], CameraInfo]  # the camera of that name
     names: Callable[[Document], list[str]] = Document.only_camera  # of the cameras in a file
+    read_rectified: Callable[[Document, str], Intrinsics] | None = None  # where files may state P
 
 
 def read_intrinsics(path: Path, camera: str | None = None, name_by: str = "its name") -> CameraInfo:
@@ -79,6 +88,34 @@ def read_intrinsics(path: Path, camera: str | None = None, name_by: str = "its n
     ``camera`` is needed where there are several; ``name_by`` says how the user names it. Raises DriveError
     when the file is damaged or of no known format, the camera not in it, or its lens beyond ours.
     """
+    chosen, document, name = _chosen(path, camera, name_by)
+    return chosen.read(document, name)
+
+
+def read_rectified_intrinsics(path: Path, camera: str | None = None, name_by: str = "its name") -> Intrinsics:
+    """Those of images that were rectified by a camera's calibration: P without a distortion, turned by R.
+
+    A file of a format without P is of the rectified images themselves, whose lens has no distortion.
+    Arguments and errors are those of :func:`read_intrinsics`.
+    """
+    chosen, document, name = _chosen(path, camera, name_by)
+    if chosen.read_rectified is not None:
+        return chosen.read_rectified(document, name)
+    info = chosen.read(document, name)
+    unstated = np.zeros((3, 4))
+    rectified_matrix(info.intrinsic, np.array(info.distortion), unstated, str(path))
+    return Intrinsics(info, np.eye(3))
+
+
+class _Chosen(NamedTuple):
+    """A file, its format, and the name of a camera in it."""
+
+    format: IntrinsicsFormat
+    document: Document
+    name: str
+
+
+def _chosen(path: Path, camera: str | None, name_by: str) -> _Chosen:
     if path.suffix.lower() == ".bin":
         raise DriveError(f"{path}: is binary; export the model as text (model_converter --output_type TXT)")
     document = _read_document(path)
@@ -90,7 +127,7 @@ def read_intrinsics(path: Path, camera: str | None = None, name_by: str = "its n
         raise DriveError(f"{path}: holds the cameras {', '.join(names)}; choose one with {name_by}")
     if camera is not None and camera not in names:
         raise DriveError(f"{path}: no camera {shown(camera)} in this file; it holds: {', '.join(names)}")
-    return chosen.read(document, names[0] if camera is None else camera)
+    return _Chosen(chosen, document, names[0] if camera is None else camera)
 
 
 def is_calibration(path: Path) -> bool:
@@ -322,13 +359,25 @@ def _message_names(document: Document) -> list[str]:
 
 
 def _read_message(document: Document, name: str) -> CameraInfo:
+    return info_of(_fields_of_message(document), name, str(document.path)).info
+
+
+def _read_rectified_message(document: Document, name: str) -> Intrinsics:
+    return info_of(_fields_of_message(document), name, str(document.path), rectified=True)
+
+
+def _fields_of_message(document: Document) -> SimpleNamespace:
     where = str(document.path)
     entries = document.lower
     _need(entries, ("k", "d"), where, "write the message to the file again")
     region = _mapping(entries.get("roi"))
-    fields = SimpleNamespace(
+    turn = entries.get("r") or [0.0] * 9
+    projection = entries.get("p") or [0.0] * 12
+    return SimpleNamespace(
         k=take_array(entries["k"], (9,), f"{where}: k", DriveError),
         d=take_array(entries["d"], (-1,), f"{where}: d", DriveError) if entries["d"] else np.empty(0),
+        r=take_array(turn, (9,), f"{where}: r", DriveError),
+        p=take_array(projection, (12,), f"{where}: p", DriveError),
         distortion_model=take_text(entries["distortion_model"], f"{where}: distortion_model", DriveError),
         width=take_size_px(entries["width"], f"{where}: width", DriveError),
         height=take_size_px(entries["height"], f"{where}: height", DriveError),
@@ -336,7 +385,33 @@ def _read_message(document: Document, name: str) -> CameraInfo:
         binning_y=entries.get("binning_y") or 0,
         roi=SimpleNamespace(width=region.get("width", 0), height=region.get("height", 0)),
     )
-    return info_of(fields, name, where).info
+
+
+def _read_rectified_file(document: Document, name: str) -> Intrinsics:
+    """The intrinsics of rectified images, of a file as ROS' ``camera_calibration`` writes it."""
+    where = str(document.path)
+    info = take_camera_info(document.entries, where)
+    stated = {"projection_matrix": np.zeros((3, 4)), "rectification_matrix": np.zeros((3, 3))}
+    for key, unstated in stated.items():
+        if document.entries.get(key) is not None:
+            stated[key] = take_matrix(document.entries[key], f"{where}: {key}")
+            if stated[key].shape != unstated.shape:
+                rows, columns = unstated.shape
+                raise DriveError(f"{where}: {key}: expected {rows} x {columns}; restore the file")
+    projection, rectification = stated.values()
+    intrinsic = rectified_matrix(info.intrinsic, np.array(info.distortion), projection, where)
+    lens = _brown_conrady([], where)
+    rectified = replace(info, intrinsic=intrinsic, distortion_model=lens.model, distortion=lens.coefficients)
+    turn = rectifying_turn(rectification, f"{where}: rectification_matrix")
+    return Intrinsics(check_camera(rectified, where, DriveError), turn)
+
+
+def _read_rectified_own(document: Document, name: str) -> Intrinsics:
+    """Those of our own calibration, which is of the rectified images themselves."""
+    info = _read_own(document, name)
+    rectified_matrix(info.intrinsic, np.array(info.distortion), np.zeros((3, 4)), str(document.path))
+    turn = read_calibration(document.path).frames.rectified_from_camera
+    return Intrinsics(info, np.eye(3) if turn is None else turn)
 
 
 INTRINSICS: Mapping[str, IntrinsicsFormat] = {
@@ -349,7 +424,9 @@ INTRINSICS: Mapping[str, IntrinsicsFormat] = {
         lambda document: bool(_kalibr_names(document)), _read_kalibr, _kalibr_names
     ),
     "V2HDM calibration": IntrinsicsFormat(
-        lambda document: isinstance(document.entries.get("camera_matrix"), list), _read_own
+        lambda document: isinstance(document.entries.get("camera_matrix"), list),
+        _read_own,
+        read_rectified=_read_rectified_own,
     ),
     "OpenCV": IntrinsicsFormat(
         lambda document: "dt" in _mapping(document.lower.get("camera_matrix")), _read_opencv
@@ -358,10 +435,12 @@ INTRINSICS: Mapping[str, IntrinsicsFormat] = {
         lambda document: {"height", "width", "distortion_model"} <= set(document.entries),
         _read_message,
         _message_names,
+        _read_rectified_message,
     ),
     "ROS camera_info": IntrinsicsFormat(
         lambda document: bool({"camera_name", "distortion_model", "camera_matrix"} & set(document.entries)),
         lambda document, name: take_camera_info(document.entries, str(document.path)),
+        read_rectified=_read_rectified_file,
     ),
 }
 """The formats, by name; the first that accepts a file reads it."""

@@ -233,8 +233,8 @@ def info_of(fields: Any, name: str, where: str, rectified: bool = False) -> Intr
 
     Of images that were ``rectified`` they are those of P, without a distortion, and R is their turn.
     """
-    intrinsic = _numbers(fields, "k", 3)
-    distortion = _numbers(fields, "d", 1).ravel()
+    intrinsic = info_numbers(fields, "k").reshape(3, -1)
+    distortion = info_numbers(fields, "d")
     stated = fields.distortion_model
     model = _MODELS.get(stated.strip().lower().replace("-", "_").replace(" ", "_"), stated)
     if min(fields.width, fields.height) <= 0:
@@ -243,16 +243,11 @@ def info_of(fields: Any, name: str, where: str, rectified: bool = False) -> Intr
         raise DriveError(f"{where}: the camera is not calibrated (K is zero); give camera_info as a file")
     turn = None
     if rectified:
-        projection = _numbers(fields, "p", 3)[:, :3]
-        if not projection.any() and distortion.any():
-            raise DriveError(
-                f"{where}: states no P for its rectified images; set rectified: false if they are as the "
-                "lens makes them, or give camera_info as a file"
-            )
-        intrinsic = projection if projection.any() else intrinsic
-        model, distortion = "plumb_bob", np.zeros(0)
-        turn = _numbers(fields, "r", 3)
-        turn = take_rotation(turn.tolist(), f"{where}, R", DriveError) if turn.any() else np.eye(3)
+        projection = info_numbers(fields, "p").reshape(3, -1)
+        intrinsic = rectified_matrix(intrinsic, distortion, projection, where)
+        distortion = np.zeros(0)
+        model = "plumb_bob"
+        turn = rectifying_turn(info_numbers(fields, "r").reshape(3, -1), f"{where}, R")
     region = (fields.roi.width, fields.roi.height)
     is_cropped = region not in ((0, 0), (fields.width, fields.height))  # the whole image may be stated, too
     if max(fields.binning_x, fields.binning_y) > 1 or is_cropped:
@@ -266,11 +261,30 @@ def info_of(fields: Any, name: str, where: str, rectified: bool = False) -> Intr
     return Intrinsics(check_camera(info, where, DriveError), turn)
 
 
-def _numbers(fields: Any, key: str, rows: int) -> FloatArray:
-    """A matrix of a ``CameraInfo`` message by its name in ROS 2, or in ROS 1."""
+def rectified_matrix(
+    intrinsic: FloatArray, distortion: FloatArray, projection: FloatArray, where: str
+) -> FloatArray:
+    """The camera matrix (3, 3) of rectified images: of P (3, 4), or K of a lens without a distortion."""
+    if projection.any():
+        return projection[:, :3]
+    if distortion.any():
+        raise DriveError(
+            f"{where}: states no P for its rectified images; set rectified: false beside it if they are as "
+            "the lens makes them, or give a camera_info file that states P"
+        )
+    return intrinsic
+
+
+def rectifying_turn(rotation: FloatArray, where: str) -> FloatArray:
+    """The turn (3, 3) of rectified images, of R; none where R is zeros, for not stated."""
+    return take_rotation(rotation.tolist(), where, DriveError) if rotation.any() else np.eye(3)
+
+
+def info_numbers(fields: Any, key: str) -> FloatArray:
+    """The numbers (N,) that a ``CameraInfo`` message has under a key of ROS 2, such as k, or of ROS 1: K."""
     values = getattr(fields, key, None)
     values = getattr(fields, key.upper()) if values is None else values
-    return np.array(values, dtype=np.float64).reshape(rows, -1)
+    return np.array(values, dtype=np.float64).reshape(-1)
 
 
 def read_rectification(path: Path) -> FloatArray:

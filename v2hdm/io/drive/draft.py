@@ -82,7 +82,7 @@ def _values_of(settings: Sequence[str]) -> dict[str, object]:
 
 
 class _Draft(NamedTuple):
-    """What a recording tells of its drive."""
+    """The drive as far as a recording tells."""
 
     content: dict[str, Any]  # of its drive.yaml
     missing: dict[str, str]  # dotted keys, with what to give for each
@@ -91,12 +91,12 @@ class _Draft(NamedTuple):
 def _draft_of(source: Path, folder: Path, values: Mapping[str, object], cameras: Sequence[str]) -> _Draft:
     """The draft of a ``drive.yaml`` in ``folder`` for a recording, of which its user states ``values``."""
     if is_bag(source):
-        given: dict[str, Any] = {}
+        answers: dict[str, Any] = {}
         for key, value in values.items():
             if key.endswith("frame") and value is not None:
                 take_frame(value, f"--set {key}", DriveError)
-            _put(given, key.split("."), value, keep_null=True)
-        bag = BagDescription(source, Path(ReadOptions().cache), given, cameras)
+            _put(answers, key.split("."), value, keep_null=True)
+        bag = BagDescription(source, Path(ReadOptions().cache), answers, cameras)
         log_notes(source, bag.notes)
         about = {"name": folder.resolve().name, "bag": _relative(source, folder)}
         return _Draft(bag.content | about, bag.missing)

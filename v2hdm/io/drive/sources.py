@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import DriveError, need, shown
-from v2hdm.io.calibration.intrinsics import read_intrinsics
+from v2hdm.io.calibration.intrinsics import read_intrinsics, read_rectified_intrinsics
 from v2hdm.io.calibration.reading import Intrinsics, read_camera_info, read_rectification
 from v2hdm.io.description import FolderImages, InfoFile, InfoTopic, TopicImages, VideoImages, keys_in
 from v2hdm.io.drive.images import ImageFiles
@@ -21,11 +21,12 @@ from v2hdm.io.importers.bag.frames import TF_TOPIC
 from v2hdm.io.importers.readings import Readings, readings_of_poses
 from v2hdm.io.stamps import ZONES, is_unit, number_order, times_of_names
 from v2hdm.io.trajectory import UNITS
-from v2hdm.records import CameraInfo, FloatArray
+from v2hdm.records import FloatArray
 from v2hdm.safe.child import Limits, in_child, next_step
 from v2hdm.safe.pixels import DECODER_OPTIONS, IMAGE_SUFFIXES, VIDEO_OPTIONS, is_image_name, png
 from v2hdm.store.files import check_keys, take_choice, take_mapping, take_number, take_text
 from v2hdm.store.folders import entry_folder, is_whole, new_entry
+from v2hdm.store.remarks import keeping_warnings, tell_again
 
 _log = logging.getLogger(__name__)
 
@@ -93,26 +94,17 @@ def plan_info(
     Its ``images`` are rectified if it says so, else if a word of their topic begins ``image_rect``, as ROS
     names them.
     """
-    if not isinstance(content, dict):
-        path = sources.root / take_text(content, where, DriveError)
-        return lambda: Intrinsics(_read_info(path, None))
-    if "file" in content:
-        info_keys = keys_in(InfoFile)
-        check_keys(content, info_keys.required, info_keys.optional, where, DriveError)
-        named = sources.root / take_text(content["file"], f"{where}, file", DriveError)
-        chosen = content.get("camera")
+    entry = content if isinstance(content, dict) else {"file": take_text(content, where, DriveError)}
+    info_keys = keys_in(InfoFile if "file" in entry else InfoTopic)
+    check_keys(entry, info_keys.required, info_keys.optional, where, DriveError)
+    rectified = _take_rectified(entry, images, where)
+    if "file" in entry:
+        path = sources.root / take_text(entry["file"], f"{where}, file", DriveError)
+        chosen = entry.get("camera")
         if chosen is not None and not isinstance(chosen, int):  # COLMAP numbers its cameras
             chosen = take_text(chosen, f"{where}, camera", DriveError)
-        return lambda: Intrinsics(_read_info(named, None if chosen is None else str(chosen)))
-    info_keys = keys_in(InfoTopic)
-    check_keys(content, info_keys.required, info_keys.optional, where, DriveError)
-    topic = take_text(content["topic"], f"{where}, topic", DriveError)
-    rectified = content.get("rectified")
-    if rectified is None:
-        words = str(images.get("topic", "")).split("/") if isinstance(images, dict) else []
-        rectified = any(word.startswith(_RECTIFIED) for word in words)
-    if not isinstance(rectified, bool):
-        raise DriveError(f"{where}, rectified: expected true or false, got {shown(rectified)}")
+        return lambda: _read_info(path, None if chosen is None else str(chosen), rectified)
+    topic = take_text(entry["topic"], f"{where}, topic", DriveError)
     folder = sources.want(streams.InfoStream(topic, where, rectified=rectified))
 
     def intrinsics() -> Intrinsics:
@@ -124,8 +116,23 @@ def plan_info(
     return intrinsics
 
 
-def _read_info(path: Path, camera: str | None) -> CameraInfo:
-    return read_intrinsics(path, camera, f"camera_info: {{file: {path.name}, camera: NAME}}")
+def _take_rectified(entry: Mapping[str, Any], images: object, where: str) -> bool:
+    rectified = entry.get("rectified")
+    if rectified is None:
+        words = str(images.get("topic", "")).split("/") if isinstance(images, dict) else []
+        rectified = any(word.startswith(_RECTIFIED) for word in words)
+        if rectified and "file" in entry:
+            _log.info("%s: P of its file, for the images' topic is called rectified", where)
+    if not isinstance(rectified, bool):
+        raise DriveError(f"{where}, rectified: expected true or false, got {shown(rectified)}")
+    return rectified
+
+
+def _read_info(path: Path, camera: str | None, rectified: bool) -> Intrinsics:
+    name_by = f"camera_info: {{file: {path.name}, camera: NAME}}"
+    if rectified:
+        return read_rectified_intrinsics(path, camera, name_by)
+    return Intrinsics(read_intrinsics(path, camera, name_by))
 
 
 def plan_topic_poses(content: object, sources: Sources, where: str) -> Callable[[], Readings] | None:
@@ -222,10 +229,12 @@ def _import_video(path: Path, cache: Path, where: str) -> Path:
         raise DriveError(f"{where}: {path}: no such video; check the path")
     folder = entry_folder(cache, [path], "video", ["frames in order"])
     if is_whole(folder):
+        tell_again(folder, str(path))
         return folder
     need("av", "video", f"{where}: a video", DriveError)
     _log.info("%s: decoding its frames into %s, once", path, cache)
-    with new_entry(folder) as partial:
+    with new_entry(folder) as partial, keeping_warnings() as keeper:
+        keeper.turn_to(partial, str(path))
         in_child(decode_video, path, partial, limits=Limits.of([path]), where=str(path), error=DriveError)
     return folder
 

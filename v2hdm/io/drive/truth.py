@@ -94,9 +94,11 @@ def _joined_truth(drive: Drive) -> Truth:
 
 
 def _of_symbols(truth: Truth) -> FloatArray:
-    """What the images show of the symbols (I, S)."""
-    known = truth.symbol_visibility
-    return np.zeros((len(truth.visibility), len(truth.map.symbols))) if known is None else known
+    """The visible shares (I, S) of the symbols in each image."""
+    visibility = truth.symbol_visibility
+    if visibility is None:
+        return np.zeros((len(truth.visibility), len(truth.map.symbols)))
+    return visibility
 
 
 def _microseconds(stamp_s: float) -> int:
@@ -145,7 +147,7 @@ def _read_sightings(path: Path, images: Sequence[Image], markings: int) -> Float
 
 
 def _read_texts(path: Path, symbols: int) -> Mapping[int, str]:
-    """What the symbols of a map say, by their number."""
+    """The texts of a map's symbols, by their number."""
     texts: dict[int, str] = {}
     for where, (symbol, text) in _rows(path, TEXTS) if path.is_file() else ():
         if not symbol.isdecimal() or int(symbol) >= symbols or not text:

@@ -62,7 +62,8 @@ def time_headings(headings: Sequence[Untimed], epochs: Sequence[Untimed], where:
     later_s = begin_s + length_s * (number + 1) / parts
     rows = np.unique(earlier_s, return_index=True)[1]
     values = np.array([heading.values for heading in headings])[rows]
-    earlier_s, later_s = earlier_s[rows], later_s[rows]
+    earlier_s = earlier_s[rows]
+    later_s = later_s[rows]
     received = [headings[row] for row in rows]
     if usual == 1 and _enclosed(received, epochs) > _MOST:
         return _timed(earlier_s, values, epoch[rows] >= 0)

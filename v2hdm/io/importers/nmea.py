@@ -229,7 +229,7 @@ class _Log:
         self._position(sentence, quality, 10)
 
     def _position(self, sentence: _Sentence, quality: int, geoid: int) -> None:
-        """That of a GGA or GNS, whose field ``geoid`` is the geoid's height."""
+        """Take the position of a GGA or GNS, whose field ``geoid`` is the geoid's height."""
         fields = sentence.fields
         stamp = self._time(fields[1], sentence)
         if quality and fields[2]:

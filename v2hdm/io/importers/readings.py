@@ -52,7 +52,7 @@ class Attitudes:
     )
 
     def at(self, rows: BoolArray) -> Attitudes:
-        """Those of some ``rows`` (A,)."""
+        """The attitudes of some ``rows`` (A,)."""
         more = {
             key: None if (values := getattr(self, key)) is None else values[rows]
             for key in ("tilt_sigma_rad", "later_s")

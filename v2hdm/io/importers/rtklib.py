@@ -192,7 +192,8 @@ def _numbers(row: str, header: _Header) -> list[float]:
 def _time(day: str, clock: str) -> float:
     """Seconds since 1970 by the file's own scale, of a day and a time, or a week and its seconds."""
     if "/" not in day:
-        week, of_week_s = int(day), float(clock)
+        week = int(day)
+        of_week_s = float(clock)
         if not (0 < week < 10000 and 0 <= of_week_s <= WEEK_S):
             raise ValueError(day)
         return GPS_EPOCH_S + week * WEEK_S + of_week_s

@@ -74,7 +74,8 @@ def _plausible(stamp_s: FloatArray, off: _Off, hardest: float, least: float, sai
         off_of_others = off(others[:-2], others[1:-1], others[2:])
         if not (off_of_others <= usual + hardest * longest_s**2).all():
             return False
-        before, after = strays[0] - 1, strays[-1] + 1
+        before = strays[0] - 1
+        after = strays[-1] + 1
         if before < 0 or after >= count:
             return True
         middle = np.array(strays)

@@ -208,7 +208,7 @@ def _runs(lines_map: Sequence[FloatArray]) -> list[_Run]:
 
 
 class _Across(NamedTuple):
-    """What lies across from each of N vertices of a line."""
+    """The lines across from each of N vertices of a line."""
 
     line: IntArray  # (N,) number of the line first met, -1 for none
     vertex: IntArray  # (N,) its vertex nearest to the place
@@ -234,7 +234,7 @@ class _Segments:
         return cls(start, end, np.repeat(np.arange(len(lines_map)), counts), index)
 
     def across(self, number: int, line: FloatArray, side: int) -> _Across:
-        """What is met first left (1) or right (-1) of each vertex of a line (N, 2)."""
+        """The first line left (1) or right (-1) of each vertex of a line (N, 2)."""
         tangent = np.gradient(line, axis=0)
         normal = side * turned_left(tangent)
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)

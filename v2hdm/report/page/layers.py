@@ -10,10 +10,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from v2hdm.catalogue import AREA, SHIPPED
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.geodetic import Grid, crs_of, geodetic_from_enu, utm_of
-from v2hdm.records import CROSSWALK, SIGMAS_95, FloatArray, Lane, Marking, Symbol
+from v2hdm.records import SIGMAS_95, FloatArray, Lane, Marking, Symbol
+from v2hdm.report.areas import AREAS
 from v2hdm.report.metrics import corner_errors, match_markings, rms
 from v2hdm.report.page.facts import Facts, GroundResiduals
 from v2hdm.safe.backgrounds import Window, background_pixels
@@ -156,17 +156,7 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
     errors = _errors(facts)
     markings = []
     for number, marking in enumerate(hd_map.markings):
-        feature = _feature(marking, kinds, "c", marking.corners_map)
-        axes = ellipses(marking)
-        if axes is not None:
-            feature["e"] = np.round(axes, 5).tolist()
-            feature["w"] = _radii(marking)
-        if marking.relative_sigma_m is not None:
-            feature["r"] = round(SIGMAS_95 * marking.relative_sigma_m, 5)
-        if marking.accuracy is not None:
-            feature["g"] = marking.accuracy
-        if marking.variety is not None:
-            feature["kind"] = marking.variety
+        feature = _marking(marking, kinds)
         if number in errors:
             feature["t"] = round(errors[number], 5)
         if marking.id in arrows:
@@ -179,15 +169,7 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
         "markings": markings,
         "lanes": [_feature(line, kinds, "p", line.points_map) for line in lines],
         "lane_lines": len(hd_map.lanes),
-        "symbols": [
-            _feature(symbol, kinds, "p", symbol.outline_map)
-            | {"w": _radii(symbol)}
-            | ({} if symbol.accuracy is None else {"g": symbol.accuracy})
-            | ({} if symbol.reading is None else {"says": list(symbol.reading)})
-            | ({"parts": list(symbol.parts)} if symbol.parts else {})
-            | ({"area": 1} if symbol.kind in (CROSSWALK, *SHIPPED.of_family(AREA)) else {})
-            for symbol in hd_map.symbols
-        ],
+        "symbols": [_symbol(symbol, kinds) for symbol in hd_map.symbols],
         "excluded": [
             {
                 "k": candidate.kind,
@@ -215,6 +197,35 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
         },
         "files": sorted(path.name for path in facts.folder.iterdir() if path.suffix in _SHARED),
     }
+
+
+def _marking(marking: Marking, kinds: list[str]) -> dict[str, Any]:
+    feature = _feature(marking, kinds, "c", marking.corners_map)
+    axes = ellipses(marking)
+    if axes is not None:
+        feature["e"] = np.round(axes, 5).tolist()
+        feature["w"] = _radii(marking)
+    if marking.relative_sigma_m is not None:
+        feature["r"] = round(SIGMAS_95 * marking.relative_sigma_m, 5)
+    if marking.accuracy is not None:
+        feature["g"] = marking.accuracy
+    if marking.variety is not None:
+        feature["kind"] = marking.variety
+    return feature
+
+
+def _symbol(symbol: Symbol, kinds: list[str]) -> dict[str, Any]:
+    feature = _feature(symbol, kinds, "p", symbol.outline_map)
+    feature["w"] = _radii(symbol)
+    if symbol.accuracy is not None:
+        feature["g"] = symbol.accuracy
+    if symbol.reading is not None:
+        feature["says"] = list(symbol.reading)
+    if symbol.parts:
+        feature["parts"] = list(symbol.parts)
+    if symbol.kind in AREAS:
+        feature["area"] = 1
+    return feature
 
 
 def _systems(facts: Facts) -> list[dict[str, Any]]:

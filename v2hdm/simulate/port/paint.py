@@ -277,10 +277,11 @@ class _Painter:
 def around(shapes: Sequence[FloatArray]) -> FloatArray:
     """The rectangle (4, 2) about shapes (N, 2), ahead and to the left, from the lower left counter-clockwise.
 
-    That is where a word begins as it is read by who drives ahead.
+    There a word begins for those who drive ahead.
     """
     points = np.vstack(shapes)
-    (back, right), (front, left) = points.min(axis=0), points.max(axis=0)
+    back, right = points.min(axis=0)
+    front, left = points.max(axis=0)
     return np.array([[back, left], [back, right], [front, right], [front, left]])
 
 

@@ -28,7 +28,7 @@ from v2hdm.records import (
 from v2hdm.simulate.port.config import PaintConfig
 from v2hdm.simulate.port.paint import Layout, around
 from v2hdm.simulate.port.route import Place, Route
-from v2hdm.simulate.render.letters import Hand, word
+from v2hdm.simulate.render.letters import Hand, stroke, word
 from v2hdm.simulate.render.scene import RECTANGLE, WHITE_PAINT, YELLOW_PAINT, Bgr, Paint, placed
 
 _TRIES = 400  # number of places that are tried for a sign
@@ -37,7 +37,7 @@ _BESIDE_M = 0.1  # least ground between the lines of a double line, m: national 
 _REACH_M = 5.0  # largest offset of a sign's middle from the route, m
 _FROM_ENDS_M = 8.0  # distance of signs from the ends of the route, m
 _STRAIGHT_RAD = 0.02  # largest turn of the route along a sign, rad
-_HAND = Hand(stretch=1.5)
+_HAND = Hand(stretch=1.5)  # level strokes 1.5 times as thick as upright ones: drawn out along the way, chosen
 _STEP_M = 0.5  # distance between the vertices of a lane, m
 
 
@@ -50,7 +50,7 @@ class _Sign(NamedTuple):
 
 
 class _Ground:
-    """What stands or is painted already, as convex polygons (N, 2)."""
+    """The ground of things and paint that are there already, as convex polygons (N, 2)."""
 
     def __init__(self, polygons: Sequence[FloatArray]) -> None:
         self._polygons: list[FloatArray] = []
@@ -66,8 +66,8 @@ class _Ground:
         """Whether nothing lies on a convex outline (N, 2)."""
         x, y, radius = _disc(outline_map)
         away = np.hypot(self._discs[:, 0] - x, self._discs[:, 1] - y)
-        near = np.flatnonzero(away < self._discs[:, 2] + radius)
-        return not any(len(clip_convex(self._polygons[k], outline_map)) > 2 for k in near)
+        neighbours = np.flatnonzero(away < self._discs[:, 2] + radius)
+        return not any(len(clip_convex(self._polygons[k], outline_map)) > 2 for k in neighbours)
 
 
 def _disc(polygon: FloatArray) -> FloatArray:
@@ -127,7 +127,7 @@ class _SignPainter:
         thick_m = float(rng.uniform(0.1, 0.15))
         outline = RECTANGLE * half
         parts = [
-            _bar(start, end, thick_m) for start, end in zip(outline, np.roll(outline, -1, 0), strict=True)
+            stroke(start, end, thick_m) for start, end in zip(outline, np.roll(outline, -1, 0), strict=True)
         ]
         pitch_m = float(rng.uniform(0.5, 0.8))
         for yaw in (0.8, -0.8)[: int(rng.integers(1, 3))]:
@@ -135,7 +135,7 @@ class _SignPainter:
             along = np.array([np.cos(yaw), np.sin(yaw)])
             reach_m = float(np.abs(outline @ across).max())
             for at in np.arange(-reach_m + pitch_m / 2, reach_m, pitch_m):
-                line = _bar(at * across - 4 * along, at * across + 4 * along, thick_m)
+                line = stroke(at * across - 4 * along, at * across + 4 * along, thick_m)
                 part = clip_convex(line, outline)
                 parts += [part] if len(part) > 2 else []
         sign = _about_middle(BOX, parts)
@@ -235,12 +235,3 @@ def _about_middle(kind: str, parts: Sequence[FloatArray]) -> _Sign:
     outline = around(parts)
     middle = outline.mean(axis=0)
     return _Sign(kind, [part - middle for part in parts], outline - middle)
-
-
-def _bar(start: FloatArray, end: FloatArray, thick_m: float) -> FloatArray:
-    """A bar (4, 2) from point to point and half its thickness beyond both, counter-clockwise."""
-    ahead = (end - start) * (thick_m / 2 / np.linalg.norm(end - start))
-    left = np.array([-ahead[1], ahead[0]])
-    start = start - ahead
-    end = end + ahead
-    return np.array([start - left, end - left, end + left, start + left])

@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from v2hdm.geometry.planar import turned_left
 from v2hdm.records import FloatArray
 
 _STROKES = {
@@ -66,13 +67,13 @@ def word(
             foot = np.array([line * _LINE_GAP * tall_m, left_m])
             for start, end in _pen(letter, hand):
                 scale = np.array([low_m, wide_m])
-                yield foot + _stroke(start * scale, end * scale, stroke_m) @ drawn_out
+                yield foot + stroke(start * scale, end * scale, stroke_m) @ drawn_out
 
 
 def _pen(letter: str, hand: Hand) -> Iterator[tuple[FloatArray, FloatArray]]:
     """From where to where a pen goes, up and to the left, for a letter of unit height and width."""
-    for stroke in _STROKES[letter].split(","):
-        grid = np.array([[int(at[1]), int(at[0])] for at in stroke.split()])
+    for line in _STROKES[letter].split(","):
+        grid = np.array([[int(at[1]), int(at[0])] for at in line.split()])
         points = (grid - (0, 1)) * (0.25, -0.5)
         for _ in range(hand.rounds):
             points = _rounder(points)
@@ -92,10 +93,10 @@ def _rounder(points: FloatArray) -> FloatArray:
     return np.vstack([cut, cut[:1]] if is_closed else [points[:1], cut[1:-1], points[-1:]])
 
 
-def _stroke(start: FloatArray, end: FloatArray, thick_m: float) -> FloatArray:
-    """A bar (4, 2) from point to point and half its thickness beyond both."""
+def stroke(start: FloatArray, end: FloatArray, thick_m: float) -> FloatArray:
+    """A bar (4, 2) from point to point and half its thickness beyond both, counter-clockwise."""
     ahead = (end - start) * (thick_m / 2 / np.linalg.norm(end - start))
-    left = np.array([-ahead[1], ahead[0]])
+    left = turned_left(ahead)
     start = start - ahead
     end = end + ahead
     return np.array([start - left, end - left, end + left, start + left])

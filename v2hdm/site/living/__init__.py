@@ -1,1 +1,1 @@
-"""What changed since an earlier map: fates of its markings, looks at them, its errors, and wear."""
+"""Changes since an earlier map: fates of its markings, looks at them, its errors, and wear."""

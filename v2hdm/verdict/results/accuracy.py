@@ -65,7 +65,7 @@ def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Findin
 
 
 def _beside(best: MethodResult, coarse: int) -> str:
-    """What the statement on the map's corners is not about, without which the share alone would flatter."""
+    """Markings beside those of the statement on the map's corners, without which the share would flatter."""
     reasons = (TOO_UNCERTAIN, LACKS_A_CORNER, *LEFT_OUT_BY_GRADE)
     uncertain = sum(exclusion.reason in reasons for exclusion in best.excluded)
     says = ""

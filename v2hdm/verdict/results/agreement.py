@@ -26,7 +26,7 @@ _OFFSET_LIMIT_SIGMAS = 5.0
 _LEAST_OFFSET_M = 0.03  # a smaller offset is no finding, however sure it is: corners are good to 2 cm
 
 _MOUNTING_LIMIT_SIGMAS = 5.0
-"""Largest deviation of a camera's mounting, mapped alone, from that mapped with all cameras, in the sigmas of
+"""Largest deviation of a camera's mounting, solved alone, from that solved with all cameras, in the sigmas of
 the former: below 2 on clean drives."""
 
 _GROUND_LIMIT_SIGMAS = 4.0
@@ -80,8 +80,8 @@ def check_agreement(together: MethodResult, drive: Drive) -> Iterator[Finding]:
         sigmas = mounting_sigmas(result.calibrations[name], together.calibrations[name])
         yield judge(
             "alone and together", name, sigmas, _MOUNTING_LIMIT_SIGMAS, "sigmas",
-            fine="mapped alone, it has the same mounting as with the others",
-            wrong=f"mapped alone, its mounting is {sigmas:.0f} sigmas from that with the others"
+            fine="solved alone, it has the same mounting as with the others",
+            wrong=f"solved alone, its mounting is {sigmas:.0f} sigmas from that with the others"
             ": cameras do not agree; check its clock, its survey and camera_info",
         )  # fmt: skip
 

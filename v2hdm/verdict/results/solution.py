@@ -288,7 +288,7 @@ def doubted(evidence: SolveEvidence) -> Contradiction | None:
 
 
 def _doubtful(evidence: SolveEvidence) -> list[Contradiction]:
-    """That input, and those that are at least a tenth as likely to be off."""
+    """The input likeliest to be off, and those at least a tenth as likely."""
     possible = [test for test in evidence.score_tests if is_doubtful(test) and not is_contradicted(test)]
     least = math.exp(-RIVAL_LOG_ODDS) * max(map(probability, possible), default=0.0)
     rivals = [test for test in evidence.score_tests if is_observable(test) and not is_contradicted(test)]

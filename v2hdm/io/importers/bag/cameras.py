@@ -79,14 +79,16 @@ def info_of_images(image: ImageSample, samples: Samples) -> InfoSample | None:
     """The ``camera_info`` beside images, else the only one of their frame and size beside no others."""
     if (beside := _info_beside(image, samples)) is not None:
         return beside
-    taken = {info.name for other in samples.images.values() if (info := _info_beside(other, samples))}
+    names_beside_others = {
+        info.name for other in samples.images.values() if (info := _info_beside(other, samples))
+    }
     of_frame = [
         info
         for info in samples.infos.values()
         if info.frame == image.frame
         and image.frame
         and image.size_px in (None, info.size_px)
-        and info.name not in taken
+        and info.name not in names_beside_others
     ]
     return of_frame[0] if len(of_frame) == 1 else None
 
@@ -105,7 +107,7 @@ def _why_no_camera(image: ImageSample) -> str:
 
 
 def _order(topic: CameraTopic, most: int) -> tuple[object, ...]:
-    """What puts a sensor's best topic first: readable, calibrated, frequent, as the sensor has it."""
+    """A key that sorts a sensor's best topic first: readable, calibrated, frequent, as the sensor has it."""
     image = topic.image
     last = _base(image.name).rpartition("/")[2]
     rarity = round(math.log(most / image.messages, _OFTEN))
@@ -123,25 +125,26 @@ def is_rectified(image: ImageSample) -> bool:
 
 def _is_same_sensor(topic: CameraTopic, chosen: CameraTopic, frames: Frames) -> bool:
     """Whether a topic shows again, or has drawn over, the images of a topic that comes before it."""
-    image, other = topic.image, chosen.image
+    image = topic.image
+    other = chosen.image
     if _base(image.name) == _base(other.name):
         return True
-    is_together_ = is_together(image.stamp_s, other.stamp_s, _SAME_TIME_S)
+    is_simultaneous = is_together(image.stamp_s, other.stamp_s, _SAME_TIME_S)
     if image.frame != other.frame:
         # A node that draws over an image keeps its time, and may forget its frame.
         is_somewhere = bool(image.frame) and frames.named(image.frame) is not None
-        return is_together_ and topic.info is None and chosen.info is not None and not is_somewhere
-    if not image.frame and not is_together_:
+        return is_simultaneous and topic.info is None and chosen.info is not None and not is_somewhere
+    if not image.frame and not is_simultaneous:
         return False
     if topic.info is None or chosen.info is None:
         # What a node makes of images is not called raw; two drivers may both name the frame that is default.
         are_drivers = all(_base(name).endswith("/image_raw") for name in (image.name, other.name))
-        return not are_drivers and (is_together_ or chosen.info is not None)
+        return not are_drivers and (is_simultaneous or chosen.info is not None)
     if topic.info.name == chosen.info.name:
         return True
     # Two cameras of a stereo rig may name one frame; the second one's P has their baseline.
     has_baseline = not math.isclose(topic.info.baseline, chosen.info.baseline)
-    if not is_together_ or has_baseline:
+    if not is_simultaneous or has_baseline:
         return False
     return is_rectified(image) != is_rectified(other) or _is_same_lens(topic.info, chosen.info)
 
@@ -166,7 +169,7 @@ def _base(name: str) -> str:
     return name
 
 
-def _names_of(topics: Sequence[str], taken: Collection[str]) -> dict[str, str]:
+def _names_of(topics: Sequence[str], other_names: Collection[str]) -> dict[str, str]:
     """Names of cameras by their topics: the last word that is one of its own, else all of them."""
     short_names: dict[str, str] = {}
     for topic in topics:
@@ -178,5 +181,7 @@ def _names_of(topics: Sequence[str], taken: Collection[str]) -> dict[str, str]:
         whole_names = [part.strip("/").replace("/", "_") for part in (_base(topic), topic)]
         numbered = (f"{whole_names[-1]}_{number}" for number in count(2))
         options = chain([short_names[topic]] if is_unique else [], whole_names, numbered)
-        names[topic] = next(name for name in options if name not in taken and name not in names.values())
+        names[topic] = next(
+            name for name in options if name not in other_names and name not in names.values()
+        )
     return names

@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import DriveError
+from v2hdm.io.importers.bag import messages as kinds
 from v2hdm.io.importers.bag.cameras import CameraTopic, Choice, choose_cameras, info_of_images
-from v2hdm.io.importers.bag.entries import MOST_NAMES, Entry, Recording, camera_entry, part_of, poses_entry
-from v2hdm.io.importers.bag.frames import VEHICLES
+from v2hdm.io.importers.bag.entries import Entry, Recording, camera_entry, part_of, poses_entry
+from v2hdm.io.importers.bag.frames import MOST_NAMES, VEHICLES
 from v2hdm.io.importers.bag.positions import position_candidates, the_one
 from v2hdm.io.importers.bag.reading import bag_files
-from v2hdm.io.importers.bag.samples import IMAGE_KINDS, InfoSample, Samples, samples_of
+from v2hdm.io.importers.bag.samples import InfoSample, Samples, samples_of
 from v2hdm.io.importers.bag.streams import TfStream, import_streams
 from v2hdm.store.files import dump_yaml, load_yaml
 from v2hdm.store.folders import entry_folder, is_whole, new_entry
@@ -72,7 +73,7 @@ def list_topics(path: Path, cache: Path) -> str:
 class BagDescription:
     """The ``content`` of a ``drive.yaml`` as far as a bag tells it, and the ``missing`` keys, dotted.
 
-    ``given`` is what its user states of that content already, ``chosen`` are the cameras that are wanted.
+    ``answers`` are what its user states of that content already, ``chosen`` the cameras that are wanted.
     ``notes`` say what was decided that may be wrong.
     """
 
@@ -80,27 +81,27 @@ class BagDescription:
         self,
         path: Path,
         cache: Path,
-        given: Mapping[str, Any] | None = None,
+        answers: Mapping[str, Any] | None = None,
         chosen: Sequence[str] = (),
         samples: Samples | None = None,
     ) -> None:
         self.missing: dict[str, str] = {}
         self.notes: list[str] = []
         self._path = path
-        self._given = given or {}
+        self._answers = answers or {}
         self._samples = samples or samples_of(path)
         if not self._samples.images:
-            raise DriveError(f"{path}: has no image topic ({', '.join(IMAGE_KINDS)}); not a drive")
+            raise DriveError(f"{path}: has no image topic ({', '.join(kinds.IMAGE_KINDS)}); not a drive")
         stream = TfStream(f"{path}: tf", needed=False)
         self._frames = stream.frames(import_streams(path, [stream], cache)[0])
         topics = self._cameras(chosen)
         names_of_camera = {name: self._frame_names(name, topic) for name, topic in topics.items()}
         vehicle = self._choose_vehicle(names_of_camera.values())
         recording = Recording(path, self._samples, self._frames, vehicle)
-        poses = self._taken(poses_entry(recording, self._given.get("poses")))
+        poses = self._taken(poses_entry(recording, self._answers.get("poses")))
         cameras = {
             name: self._taken(
-                camera_entry(recording, name, topic, names_of_camera[name], self._given_of(name))
+                camera_entry(recording, name, topic, names_of_camera[name], self._answers_for(name))
             )
             for name, topic in topics.items()
         }
@@ -111,7 +112,7 @@ class BagDescription:
             is_ground = vehicle.rpartition("/")[2] == VEHICLES[0]
             if height_m is not None:
                 about[HEIGHT] = round(height_m, 4)
-            elif self.missing and not is_ground and HEIGHT not in self._given:
+            elif self.missing and not is_ground and HEIGHT not in self._answers:
                 self.notes.append(
                     f"{vehicle} is taken to be on the ground; else also set {HEIGHT}, its height in m"
                 )
@@ -126,9 +127,9 @@ class BagDescription:
     def _cameras(self, chosen: Sequence[str]) -> dict[str, CameraTopic]:
         """The topics of the cameras that are wanted."""
         choice = choose_cameras(self._samples, self._frames)
-        given = part_of(self._given, "cameras")
+        answers = part_of(self._answers, "cameras")
         cameras = dict(choice.cameras)
-        for name, entry in given.items():
+        for name, entry in answers.items():
             if entry is None:
                 if name not in choice.cameras and name not in choice.left_out:
                     self._refuse_camera(f"cameras.{name}", choice)
@@ -146,20 +147,20 @@ class BagDescription:
         for name in chosen:
             if name not in cameras:
                 self._refuse_camera(f"--camera {name}", choice)
-        wanted = {name: topic for name, topic in cameras.items() if not chosen or name in chosen}
-        if not wanted:
+        selection = {name: topic for name, topic in cameras.items() if not chosen or name in chosen}
+        if not selection:
             reasons = [
                 f"{left.image.name}: {left.reason}" for left in choice.left_out.values() if left.reason
             ]
             raise DriveError(f"{self._path}: no camera is left; {'; '.join(reasons) or 'leave fewer out'}")
-        taken = {topic.image.name for topic in wanted.values()}
+        image_topics = {topic.image.name for topic in selection.values()}
         for name, left in choice.left_out.items():
-            if left.reason and left.image.name not in taken and given.get(name, {}) is not None:
+            if left.reason and left.image.name not in image_topics and answers.get(name, {}) is not None:
                 self.notes.append(f"{left.image.name} left out: {left.reason}")
-        return wanted
+        return selection
 
-    def _given_of(self, name: str) -> Mapping[str, Any]:
-        return part_of(part_of(self._given, "cameras"), name)
+    def _answers_for(self, name: str) -> Mapping[str, Any]:
+        return part_of(part_of(self._answers, "cameras"), name)
 
     def _refuse_camera(self, what: str, choice: Choice) -> None:
         name = re.split(r"[. ]", what)[-1]
@@ -173,23 +174,23 @@ class BagDescription:
 
     def _frame_names(self, name: str, topic: CameraTopic) -> list[str]:
         """The frames that a camera's messages name, or its user."""
-        given = self._given_of(name).get("frame")
-        if isinstance(given, str):
-            return [self._frames.needed(given, f"{self._path}: cameras.{name}.frame")]
+        answer = self._answers_for(name).get("frame")
+        if isinstance(answer, str):
+            return [self._frames.needed(answer, f"{self._path}: cameras.{name}.frame")]
         info = self._info_of(name, topic)
         named = [topic.image.frame, "" if info is None else info.frame]
         return [frame for frame in dict.fromkeys(named) if frame]
 
     def _info_of(self, name: str, topic: CameraTopic) -> InfoSample | None:
         """The intrinsics of a camera in the bag, as its user chooses them."""
-        info_topic = part_of(self._given_of(name), "camera_info").get("topic")
+        info_topic = part_of(self._answers_for(name), "camera_info").get("topic")
         return topic.info if info_topic is None else self._samples.infos.get(str(info_topic))
 
     def _choose_vehicle(self, names_of_cameras: Collection[Sequence[str]]) -> str | None:
         """The vehicle's frame as the bag tells it; empty where it has none, None where it is asked for."""
-        given = self._given.get("vehicle_frame")
-        if isinstance(given, str):
-            return self._frames.needed(given, f"{self._path}: vehicle_frame")
+        answer = self._answers.get("vehicle_frame")
+        if isinstance(answer, str):
+            return self._frames.needed(answer, f"{self._path}: vehicle_frame")
         frames = [[self._frames.named(name) for name in names] for names in names_of_cameras]
         in_tree = [next(filter(None, named)) for named in frames if any(named)]
         vehicle = self._frames.vehicle_of(in_tree)

@@ -12,9 +12,10 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.geometry.rigid import euler_from_rotation
+from v2hdm.io.description import PoseKeys
 from v2hdm.io.importers.bag import messages as kinds
 from v2hdm.io.importers.bag.cameras import CameraTopic
-from v2hdm.io.importers.bag.frames import TF_TOPIC, Frames
+from v2hdm.io.importers.bag.frames import MOST_NAMES, TF_TOPIC, Frames
 from v2hdm.io.importers.bag.mountings import Mount, frames_like, mount_of, mounting_of
 from v2hdm.io.importers.bag.positions import (
     Candidate,
@@ -33,10 +34,8 @@ MOUNTING = (
     "ten degrees: {{xyz_m: [2.1, 0, 1.6], rpy_deg: [0, 12, 0]}}"
 )
 LEVER_ARM = "m forward, left, up from {origin}: [1.2, 0, 1.8]"
-MOST_NAMES = 12  # of frames and topics that a question lists
 _MAPS = ("map", "odom")
 _TURNED = 1e-6  # elements of a rotation that are closer to the identity's are so by rounding
-_MAX_SIGMA_M = 0.1  # of the positions that are used, unless ``poses.max_sigma_m`` is given
 _ANTENNA = re.compile(r"gps|gnss|antenna|rtk|navsat", re.IGNORECASE)
 _PLACES = ("mounting", "cam_from_vehicle", "ipm")  # keys of which one says where a camera is
 _OF_FILES = ("tum", "csv", "nmea", "sbet", "pos", "ubx")  # keys of poses that are not of the bag
@@ -61,7 +60,7 @@ class Recording(NamedTuple):
 
     @property
     def origin(self) -> str:
-        """What positions on the vehicle count from, in words."""
+        """The origin of positions on the vehicle, in words."""
         return self.vehicle or ORIGIN
 
     def vehicle_from(self, sensor: str) -> FloatArray | None:
@@ -91,13 +90,13 @@ def part_of(content: object, key: str) -> Mapping[str, Any]:
     return part if isinstance(part, Mapping) else {}
 
 
-def poses_entry(recording: Recording, given: object) -> Entry:
+def poses_entry(recording: Recording, answers: object) -> Entry:
     """The entry of poses: of the topic that its user names, else of the one that states them best."""
-    if given is not None and (not isinstance(given, Mapping) or set(given) & set(_OF_FILES)):
+    if answers is not None and (not isinstance(answers, Mapping) or set(answers) & set(_OF_FILES)):
         return Entry({})
-    stated = given or {}
+    stated = answers or {}
     max_sigma_m = stated.get("max_sigma_m")
-    limit_m = float(max_sigma_m) if isinstance(max_sigma_m, int | float) else _MAX_SIGMA_M
+    limit_m = float(max_sigma_m) if isinstance(max_sigma_m, int | float) else PoseKeys.max_sigma_m
     has_heading = bool({"heading_topic", "heading_file"} & set(stated))
     candidates = position_candidates(recording.samples, limit_m, recording.is_linked, has_heading)
     world = _world_of(recording)
@@ -117,26 +116,44 @@ def _best_poses(
     recording: Recording, candidates: Sequence[Candidate], world: _World | None, stated: Mapping[str, Any]
 ) -> Entry:
     best = the_one(candidates)
-    is_known = [not one.doubt and one.reference > Reference.START for one in candidates]
+    is_known = [not candidate.doubt and candidate.reference > Reference.START for candidate in candidates]
     if world is not None and not any(is_known) and (world.is_of_earth or not candidates):
         says = "" if world.is_of_earth else ", which drifts if nothing but wheels and an IMU moves it"
         notes = [f"poses of transforms from {world.content['frame']}{says}"]
         return Entry({"topic": TF_TOPIC} | world.content, notes=notes)
     if best is not None:
         entry = _entry_of(recording, best.sample, stated)
-        others = [one.about for one in candidates if one != best]
+        others = [candidate.about for candidate in candidates if candidate != best]
         if others or best.doubt or best.reference is Reference.START:
             beside = f", not of {'; '.join(others[:MOST_NAMES])}" if others else ""
             entry.notes.append(f"poses of {best.about}{beside}")
         return entry
-    offers = []
-    for candidate in candidates:
-        also = [key for key in _entry_of(recording, candidate.sample, stated).missing if not candidate.doubt]
-        offers.append(candidate.about + (f", then also {' and '.join(also)}" if also else ""))
+    offers = [candidate.about for candidate in candidates]
     if world is not None:
         offers.append(f"{TF_TOPIC} (from {world.content['frame']})")
     asked = "the topic of poses on the Earth, best RTK; the bag has "
-    return Entry({"topic": "?"}, {"poses.topic": asked + ("; ".join(offers[:MOST_NAMES]) or "none")})
+    question = {"poses.topic": asked + ("; ".join(offers[:MOST_NAMES]) or "none")}
+    possible = [candidate for candidate in candidates if not candidate.doubt] or candidates
+    positions = [candidate.sample for candidate in possible[:MOST_NAMES]]
+    return Entry({"topic": "?"}, question | _further(recording, positions, stated))
+
+
+def _further(
+    recording: Recording, positions: Sequence[PoseSample], stated: Mapping[str, Any]
+) -> dict[str, str]:
+    """Further questions by their keys, of all topics that may be chosen or of some, which they name."""
+    topics_by_question: dict[str, dict[str, list[str]]] = {}
+    for position in positions:
+        for key, asked in _entry_of(recording, position, stated).missing.items():
+            topics_by_question.setdefault(key, {}).setdefault(asked, []).append(position.name)
+    missing = {}
+    for key, topics in topics_by_question.items():
+        texts = []
+        for asked, names in topics.items():
+            is_of_all = len(names) == len(positions)
+            texts.append(asked if is_of_all else f"for {' or '.join(names)}: {asked}")
+        missing[key] = "; ".join(texts)
+    return missing
 
 
 class _World(NamedTuple):
@@ -203,10 +220,10 @@ def _heading_of(
     best = the_one(candidates)
     if best is not None and not best.doubt:
         entry.content["heading_topic"] = best.sample.name
-        if others := [one.about for one in candidates if one != best]:
+        if others := [candidate.about for candidate in candidates if candidate != best]:
             entry.notes.append(f"headings of {best.about}, not of {'; '.join(others[:MOST_NAMES])}")
         return best.sample
-    offers = "; ".join(one.about for one in candidates[:MOST_NAMES]) or "none"
+    offers = "; ".join(candidate.about for candidate in candidates[:MOST_NAMES]) or "none"
     asked = f"the topic of headings, such as /imu; the bag has {offers}"
     entry.missing["poses.heading_topic"] = asked
     entry.content["heading_topic"] = "?"
@@ -214,7 +231,7 @@ def _heading_of(
 
 
 def _lever_arm(recording: Recording, position: PoseSample) -> str:
-    """What is asked where nothing tells where on the vehicle positions are of."""
+    """The question for the place on the vehicle that positions are of, where nothing tells."""
     if not position.frame and position.kind not in (kinds.FIX, kinds.NMEA):
         return (
             f"{position.name} does not say of which frame its poses are: that frame's origin, m "
@@ -237,9 +254,9 @@ def _lever_arm(recording: Recording, position: PoseSample) -> str:
 
 
 def camera_entry(
-    recording: Recording, name: str, topic: CameraTopic, names: Sequence[str], given: Mapping[str, Any]
+    recording: Recording, name: str, topic: CameraTopic, names: Sequence[str], answers: Mapping[str, Any]
 ) -> Entry:
-    """The entry of a camera, whose messages name the frames ``names``; its user states ``given``."""
+    """The entry of a camera, whose messages name the frames ``names``; its user states ``answers`` of it."""
     entry = Entry({"camera_info": {"topic": "?"}, "images": {"topic": topic.image.name}})
     key = f"cameras.{name}"
     if refusal := topic.image.problem or topic.image.refusal:
@@ -249,12 +266,12 @@ def camera_entry(
         )
     if topic.info is not None and not topic.info.problem:
         entry.content["camera_info"] = {"topic": topic.info.name}
-    elif "camera_info" not in given:
+    elif "camera_info" not in answers:
         entry.missing[f"{key}.camera_info"] = _lens(recording, topic.info)
     mount = mount_of(recording.frames, recording.vehicle or "", names, name)
     if mount.frame:
         entry.content["frame"] = mount.frame
-    if recording.will_tell(mount.frame) or set(given) & set(_PLACES):
+    if recording.will_tell(mount.frame) or set(answers) & set(_PLACES):
         return entry
     if mount.vehicle_from_cam is not None:
         entry.content["mounting"] = mounting_of(mount.vehicle_from_cam)
@@ -265,7 +282,7 @@ def camera_entry(
 
 
 def _lens(recording: Recording, info: InfoSample | None) -> str:
-    """What is asked where the bag has no intrinsics of a camera."""
+    """The question for the intrinsics of a camera, where the bag has none."""
     if info is not None:
         return f"{LENS} ({info.name}: {info.problem})"
     others = [sample.name for sample in recording.samples.infos.values() if not sample.problem]
@@ -273,7 +290,7 @@ def _lens(recording: Recording, info: InfoSample | None) -> str:
 
 
 def _mounting(recording: Recording, name: str, mount: Mount) -> str:
-    """What is asked where the bag does not tell where a camera is."""
+    """The question for the mounting of a camera, where the bag does not tell."""
     asked = MOUNTING.format(origin=recording.origin)
     if mount.offer:
         return f"{mount.problem}; if the images are of a camera that looks along its x axis: {mount.offer}"

@@ -23,7 +23,7 @@ VEHICLES = ("base_footprint", "base_link")
 ROW = 9
 """Numbers of a row: stamp, translation (3), quaternion (4), and 1 for one of ``/tf_static``."""
 
-_MOST_NAMES = 12  # of frames that a message lists
+MOST_NAMES = 12  # of frames or topics that a message lists; chosen
 
 _STILL_M = 0.003  # largest shift of a joint that is held still, m: play of a bracket; chosen
 _STILL_RAD = np.deg2rad(0.1)  # largest turn of a joint that is held still, rad; chosen
@@ -62,8 +62,8 @@ class Frames:
         """The tree's frame of that ``name``; DriveError where a tree has none, which says what it has."""
         frame = self.named(name) if self.names else name
         if frame is None:
-            first = ", ".join(self.names[:_MOST_NAMES])
-            more = f" and {len(self.names) - _MOST_NAMES} more" if len(self.names) > _MOST_NAMES else ""
+            first = ", ".join(self.names[:MOST_NAMES])
+            more = f" and {len(self.names) - MOST_NAMES} more" if len(self.names) > MOST_NAMES else ""
             raise DriveError(f"{where}: the bag's transforms have no frame '{name}'; they have {first}{more}")
         return frame
 
@@ -132,10 +132,10 @@ class Frames:
 
     def below(self, name: str) -> list[str]:
         """The frames that hang on ``name``, nearest ones first."""
-        found = [name]
-        for here in found:  # which grows
-            found += [child for parent, child in self._rows if parent == here and child not in found]
-        return found[1:]
+        frames = [name]
+        for frame in frames:  # which grows
+            frames += [child for parent, child in self._rows if parent == frame and child not in frames]
+        return frames[1:]
 
     def moving(self, dst: str, src: str, max_gap_s: float, where: str) -> Trajectory:
         """``dst_from_src`` at the times of the busiest edge between them; DriveError where there are none."""
@@ -198,7 +198,7 @@ class Frames:
         return f"{edge[1]} moves on {edge[0]} while recorded, by up to {much}"
 
     def _contradicts(self, edge: Edge, dst: str, src: str, path: Path) -> str:
-        """That a way around an edge of ``path`` leads elsewhere; nothing where there is none, or it agrees.
+        """The complaint if a way around an edge of ``path`` leads elsewhere; empty where none does.
 
         A frame that hangs on two others is no tree, and TF keeps whichever was stated last.
         """
@@ -251,9 +251,9 @@ def _is_still(poses: FloatArray) -> bool:
 
 def _spread(poses: FloatArray) -> tuple[float, float]:
     """The largest shift, m, and turn, rad, of poses (N, 4, 4) from the first one."""
-    apart = log(inverse(poses[0]) @ poses)
+    tangents = log(inverse(poses[0]) @ poses)
     shift_m = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1)
-    return float(shift_m.max()), float(np.linalg.norm(apart[:, 3:], axis=1).max())
+    return float(shift_m.max()), float(np.linalg.norm(tangents[:, 3:], axis=1).max())
 
 
 def tf_topics(names: Iterable[str]) -> list[str]:

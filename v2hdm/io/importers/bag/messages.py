@@ -21,7 +21,8 @@ _log = logging.getLogger(__name__)
 
 RAW = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
-IMAGE_KINDS = (RAW, COMPRESSED)
+VIDEO = "foxglove_msgs/msg/CompressedVideo"
+IMAGE_KINDS = (RAW, COMPRESSED, VIDEO)
 
 _SUFFIXES: Mapping[bytes, str] = {
     b"\xff\xd8": ".jpg",
@@ -124,8 +125,6 @@ def _turned(pixels: np.ndarray, to_bgr: int, where: str) -> np.ndarray:
     except cv2.error:
         raise DriveError(f"{where}: its size does not fit its encoding (odd?); record it again") from None
 
-
-VIDEO = "foxglove_msgs/msg/CompressedVideo"
 
 _FORMATS = ("h264", "h265", "vp9", "av1")
 _CODECS = {"h265": "hevc"}  # FFmpeg's other names of formats

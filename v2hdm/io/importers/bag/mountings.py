@@ -12,19 +12,16 @@ from typing import NamedTuple
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.geometry.ipm import mounting_angles
-from v2hdm.geometry.rigid import inverse
+from v2hdm.geometry.ipm import LEVEL, mounting_angles
+from v2hdm.geometry.rigid import inverse, make_transform
 from v2hdm.io.importers.bag.frames import Frames
 from v2hdm.records import FloatArray
 
 _OPTICAL = "optical"
-_HIGHEST = np.sin(
-    np.deg2rad(30)
-)  # sine of the angle above the horizon from where a camera sees no ground; chosen
+_HIGHEST = np.sin(np.deg2rad(30))  # sine of an optical axis' angle up from where no ground is seen; chosen
 _ABOVE = 0.01  # sine of the angle above the horizon from which an axis points up, not level; chosen
 _LEVEL = np.sin(np.deg2rad(20))  # sine of the angle up to which an axis counts as level; chosen
-_OPTICAL_FROM_BODY = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
-_MOST_FRAMES = 4  # that are offered for a camera
+_MOST_FRAMES = 4  # most frames that a question for a camera's frame offers; chosen
 
 
 class Mount(NamedTuple):
@@ -71,8 +68,9 @@ def mount_of(frames: Frames, vehicle: str, names: Sequence[str], camera: str) ->
     problem += f"{abs(elevation_deg):.0f} deg {'up' if elevation_deg > 0 else 'down'}"
     if children:
         return Mount("", None, f"{problem}; several hang on it: {', '.join(children)}")
-    turned = vehicle_from_cam @ inverse(_OPTICAL_FROM_BODY)
-    return Mount("", None, problem, mounting_text(turned) if is_optical(turned) else "")
+    # Of a camera that looks along the frame's x.
+    ahead = vehicle_from_cam @ make_transform(LEVEL, np.zeros(3))
+    return Mount("", None, problem, _mounting_text(ahead) if is_optical(ahead) else "")
 
 
 def is_optical(vehicle_from_cam: FloatArray) -> bool:
@@ -92,7 +90,7 @@ def mounting_of(vehicle_from_cam: FloatArray) -> dict[str, list[float]]:
     return {"xyz_m": xyz_m, "rpy_deg": np.round(angles_deg, 9).tolist()}
 
 
-def mounting_text(vehicle_from_cam: FloatArray) -> str:
+def _mounting_text(vehicle_from_cam: FloatArray) -> str:
     """A pose (4, 4) as a short value of ``--set cameras.NAME.mounting``."""
     values = {
         key: [round(value, 3) + 0.0 for value in numbers]

@@ -32,7 +32,7 @@ _SURE_HEADING_RAD = np.deg2rad(20)  # a heading with a larger sigma is none; cho
 
 
 class Reference(enum.IntEnum):
-    """What a topic's poses count from, as far as its type, frame and name tell."""
+    """The origin that a topic's poses count from, as far as its type, frame and name tell."""
 
     START = 0
     OPEN = 1
@@ -74,7 +74,7 @@ def position_candidates(
     moved_m = max((pose.moved_m for pose in poses if np.isfinite(pose.moved_m)), default=0.0)
     most = max((pose.messages for pose in poses), default=0)
     is_any_linked = any(is_linked(pose.frame) for pose in poses if pose.frame)
-    has_heading = has_heading or any(not one.doubt for one in heading_candidates(samples, moved_m))
+    has_heading = has_heading or any(not heading.doubt for heading in heading_candidates(samples, moved_m))
     candidates = []
     for pose in poses:
         doubt = pose.problem or _doubt_of(pose, moved_m, max_sigma_m)

@@ -1,4 +1,4 @@
-"""What the first messages of a bag's topics show of them: images, lenses, poses and headings."""
+"""Samples of a bag's topics, from their first messages: images, lenses, poses and headings."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.io.calibration.reading import info_of
+from v2hdm.geometry.geodetic import enu_from_geodetic
+from v2hdm.io.calibration.reading import info_numbers, info_of
 from v2hdm.io.importers.bag import messages as kinds
 from v2hdm.io.importers.bag.frames import frame_name
 from v2hdm.io.importers.bag.reading import Bag, Message, Topic, in_child_of, open_bag
 from v2hdm.io.importers.bag.streams import INFO_KIND, STAMPS, frame_of, stamp_of
-from v2hdm.records import FloatArray
+from v2hdm.records import FloatArray, GeodeticOrigin
 from v2hdm.safe.pixels import AS_STORED, pixels_of
 
-IMAGE_KINDS = (*kinds.IMAGE_KINDS, kinds.VIDEO)
 POSE_KINDS = kinds.POSE_KINDS[:-1]  # all but transforms, whose topic is not theirs alone
 
 _IMAGES = 40  # images and lenses that are looked at per topic: times enough to compare two topics
@@ -115,8 +115,9 @@ def sample_bag(path: Path) -> dict[str, list[dict[str, Any]]]:
     with open_bag(path) as bag:
         recorded = [topic for topic in bag.topics.values() if topic.messages]
         tracks = [topic for topic in recorded if topic.messages > 1]
+        cameras = [topic for topic in recorded if topic.kind in kinds.IMAGE_KINDS]
         samples: dict[str, Sequence[Sample]] = {
-            "images": [_image_sample(bag, topic) for topic in recorded if topic.kind in IMAGE_KINDS],
+            "images": [_image_sample(bag, topic) for topic in cameras],
             "infos": [_info_sample(bag, topic) for topic in recorded if topic.kind == INFO_KIND],
             "poses": [_pose_sample(bag, topic) for topic in tracks if topic.kind in POSE_KINDS],
             "headings": [
@@ -190,8 +191,7 @@ def _info_sample(bag: Bag, topic: Topic) -> InfoSample:
 
 
 def _lens_of(fields: Any) -> dict[str, Any]:
-    names = ("k", "r", "p", "d") if hasattr(fields, "k") else ("K", "R", "P", "D")
-    lens = [float(number) for name in names for number in getattr(fields, name)]
+    lens = np.concatenate([info_numbers(fields, key) for key in ("k", "r", "p", "d")]).tolist()
     size_px = [int(fields.width), int(fields.height)]
     refusal = _refusal_of(lambda: info_of(fields, "camera", _HERE))
     return {"size_px": size_px, "lens": lens, "problem": refusal.get("refusal", "")}
@@ -213,8 +213,10 @@ def _pose_sample(bag: Bag, topic: Topic) -> PoseSample:
         about["problem"] = str(refusal)
     if rows:
         table = np.array(rows, dtype=np.float64)
-        places_m = _metres(table[:, :3]) if topic.kind == kinds.FIX else table[:, :3]
-        moved_m = np.linalg.norm(places_m - places_m[0], axis=1)
+        positions = table[:, :3]
+        if topic.kind == kinds.FIX:
+            positions = enu_from_geodetic(GeodeticOrigin(*positions[0].tolist()), positions)
+        moved_m = np.linalg.norm(positions - positions[0], axis=1)
         about |= {"moved_m": _most(moved_m), "sigma_m": _best(table[:, 3])}
         about |= _turns_of(table[:, 4:8]) | {"sigma_rad": _best(table[:, 8])}
     return PoseSample(**about, stamp_s=stamps)
@@ -267,22 +269,13 @@ def _most(distances_m: FloatArray) -> float:
     return float(finite_m.max()) if len(finite_m) else np.nan
 
 
-_DEG_M = 111_195.0  # metres of a degree of latitude, of a sphere: enough to see whether a vehicle moves
-
-
-def _metres(geodetic: FloatArray) -> FloatArray:
-    """Latitudes, longitudes and altitudes (N, 3) as east, north, up, m, nearly."""
-    north_m, east_m = geodetic[:, 0] * _DEG_M, geodetic[:, 1] * _DEG_M * np.cos(np.radians(geodetic[:, 0]))
-    return np.column_stack([east_m, north_m, geodetic[:, 2]])
-
-
 def is_together(stamp_s: Sequence[float], other_s: Sequence[float], apart_s: float) -> bool:
     """Whether two topics' messages are of the same times, where both were recorded; False without any."""
-    one, other = sorted(stamp_s), sorted(other_s)
-    if not one or not other:
+    if not len(stamp_s) or not len(other_s):
         return False
-    begin_s, end_s = max(one[0], other[0]) - apart_s, min(one[-1], other[-1]) + apart_s
-    shared = [[stamp for stamp in stamps if begin_s <= stamp <= end_s] for stamps in (one, other)]
+    begin_s = max(min(stamp_s), min(other_s)) - apart_s
+    end_s = min(max(stamp_s), max(other_s)) + apart_s
+    shared = [[stamp for stamp in stamps if begin_s <= stamp <= end_s] for stamps in (stamp_s, other_s)]
     fewer, more = sorted(shared, key=len)
     if not fewer or not any(fewer):  # or none has a time
         return False

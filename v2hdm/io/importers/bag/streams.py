@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, TextIO
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.io.calibration.reading import info_of
+from v2hdm.io.calibration.reading import info_numbers, info_of
 from v2hdm.io.calibration.writing import write_camera_info
 from v2hdm.io.image_lists import image_order, write_image_list
 from v2hdm.io.importers.bag import messages as kinds
@@ -39,6 +39,7 @@ from v2hdm.io.importers.readings import Readings
 from v2hdm.records import FloatArray
 from v2hdm.safe.pixels import png
 from v2hdm.store.folders import entry_folder, is_whole, new_entry
+from v2hdm.store.remarks import keeping_warnings, tell_again
 
 _log = logging.getLogger(__name__)
 
@@ -84,7 +85,7 @@ class ImageStream(Stream):
     """Images of a topic as files, with their list."""
 
     def __init__(self, topic: str, stamps: str, where: str) -> None:
-        need = Need(topic, (*kinds.IMAGE_KINDS, kinds.VIDEO), where)
+        need = Need(topic, kinds.IMAGE_KINDS, where)
         super().__init__(topic, ["images with colours", stamps], where, [need])
         self._stamps = stamps
 
@@ -240,6 +241,9 @@ def import_streams(path: Path, streams: Sequence[Stream], cache: Path) -> list[P
     missing = {
         folder: stream for folder, stream in zip(folders, streams, strict=True) if not is_whole(folder)
     }
+    for folder, stream in zip(folders, streams, strict=True):
+        if folder not in missing:
+            tell_again(folder, stream.where)
     if not missing:
         return folders
     size_mb = sum(file.stat().st_size for file in files) / 1e6
@@ -253,28 +257,37 @@ def import_streams(path: Path, streams: Sequence[Stream], cache: Path) -> list[P
 
 def write_streams(path: Path, streams: Mapping[Path, Stream]) -> None:
     """Write streams of the bag at ``path`` into their folders, in one pass."""
-    takers: dict[str, list[Writer]] = defaultdict(list)
-    writers: list[Writer] = []
-    with open_bag(path) as bag, ExitStack() as unfinished:
+    takers: dict[str, list[_Taker]] = defaultdict(list)
+    everyone: list[_Taker] = []
+    with open_bag(path) as bag, keeping_warnings() as keeper, ExitStack() as unfinished:
         for folder, stream in streams.items():
             topics = stream.topics(bag)
-            writer = stream.write(folder)
-            unfinished.callback(writer.close)
-            writers.append(writer)
-            next(writer)
+            taker = _Taker(stream.write(folder), folder, stream.where)
+            unfinished.callback(taker.writer.close)
+            everyone.append(taker)
+            next(taker.writer)
             for topic in topics:
-                takers[topic].append(writer)
+                takers[topic].append(taker)
         for message in bag.messages(takers):
-            for writer in takers[message.topic]:
-                writer.send(message)
-        for writer in writers:
-            next(writer, None)  # sends None
+            for taker in takers[message.topic]:
+                keeper.turn_to(taker.folder, taker.where)
+                taker.writer.send(message)
+        for taker in everyone:
+            keeper.turn_to(taker.folder, taker.where)
+            next(taker.writer, None)  # sends None
+
+
+class _Taker(NamedTuple):
+    """The writer of a stream, its folder, and where its topic is named."""
+
+    writer: Writer
+    folder: Path
+    where: str
 
 
 def _lens(fields: Any) -> list[float]:
-    """Size, camera matrix and distortion, by the names of ROS 2 or ROS 1."""
-    matrix, distortion = (fields.k, fields.d) if hasattr(fields, "k") else (fields.K, fields.D)
-    return [fields.width, fields.height, *matrix, *distortion]
+    """Size, camera matrix and distortion."""
+    return [fields.width, fields.height, *info_numbers(fields, "k"), *info_numbers(fields, "d")]
 
 
 def stamp_of(message: Message, stamps: str) -> float:

@@ -1,0 +1,19 @@
+"""Fixtures of tests that read drives."""
+
+import pytest
+
+from tests.drive.example import make_drive
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The example drive as a folder."""
+    root = tmp_path_factory.mktemp("folder")
+    make_drive(root)
+    return root
+
+
+@pytest.fixture
+def working_directory(tmp_path, monkeypatch):
+    """The test's own folder as the working directory, so that nothing is cached beside the repository."""
+    monkeypatch.chdir(tmp_path)
