@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from v2hdm.errors import V2hdmError
     from v2hdm.io.drive import ReadOptions, read_drive
     from v2hdm.library import build_problem, compare_maps, read_map, simulate_port
+    from v2hdm.localization.localizer import Localizer
     from v2hdm.localization.run import localize
     from v2hdm.mapping.options import MappingOptions
     from v2hdm.pipeline.detect_images import detect_images
@@ -33,10 +34,10 @@ if TYPE_CHECKING:
 
 __version__ = "1.0.0"
 __all__ = [
-    "Calibration", "Detector", "DetectorOptions", "HDMap", "MappingOptions", "Problem", "ReadOptions",
-    "Result", "V2hdmError", "Verdict", "build_problem", "calibrate_from_ground", "calibrate_from_points",
-    "check_drive", "compare_maps", "detect_images", "localize", "map_drive", "read_drive", "read_map",
-    "simulate_port", "solve",
+    "Calibration", "Detector", "DetectorOptions", "HDMap", "Localizer", "MappingOptions", "Problem",
+    "ReadOptions", "Result", "V2hdmError", "Verdict", "build_problem", "calibrate_from_ground",
+    "calibrate_from_points", "check_drive", "compare_maps", "detect_images", "localize", "map_drive",
+    "read_drive", "read_map", "simulate_port", "solve",
 ]  # fmt: skip
 
 _MODULES = {
@@ -44,6 +45,7 @@ _MODULES = {
     "Detector": "v2hdm.detection.detector",
     "DetectorOptions": "v2hdm.detection.options",
     "HDMap": "v2hdm.records",
+    "Localizer": "v2hdm.localization.localizer",
     "MappingOptions": "v2hdm.mapping.options",
     "Problem": "v2hdm.adjust.problem",
     "ReadOptions": "v2hdm.io.drive",

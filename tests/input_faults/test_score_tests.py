@@ -322,3 +322,36 @@ def test_an_answer_grows_with_its_column_however_large():
     one = solved.flat(solved.efficient(column))
     many = solved.flat(solved.efficient({name: 1e25 * row for name, row in column.items()}))
     np.testing.assert_allclose(many / 1e25, one, atol=1e-6 * np.abs(one).max())
+
+
+def test_columns_that_are_solved_for_together_are_those_of_each_alone():
+    problem = scene().problem
+    solution = solve(problem, OPTIONS)
+    solved = Sensitivity.at(solution.covariance.whitening)
+    generator = torch.Generator().manual_seed(5)
+    columns = [
+        {name: torch.randn(row.shape, generator=generator, dtype=row.dtype) for name, row in kinds}
+        for kinds in (solved.residuals.items(), [("observations", solved.residuals["observations"])])
+    ]
+    together = solved.efficient_columns(columns)
+    for column, row in zip(columns, together, strict=True):
+        np.testing.assert_allclose(row, solved.flat(solved.efficient(column)), atol=1e-10)
+        # What is left of a column is at right angles to all that the unknowns explain.
+        again = solved.efficient_columns([dict(zip(solved.places, split(solved, row), strict=True))])
+        np.testing.assert_allclose(again[0], row, atol=1e-6 * np.abs(row).max())
+
+
+def split(solved, row):
+    """A row (R,) by the kinds of residuals."""
+    return [
+        torch.as_tensor(row[place].copy()).view_as(solved.residuals[name])
+        for name, place in solved.places.items()
+    ]
+
+
+def test_covariances_of_many_groups_are_those_of_each_alone():
+    solution = solve(scene().problem, OPTIONS)
+    corners = np.random.default_rng(3).permutation(len(solution.corners_map))[:24].reshape(6, 4)
+    groups = np.concatenate([corners, corners[:, ::-1]])
+    alone = np.concatenate([solution.covariance.corners(group[None]) for group in groups])
+    np.testing.assert_allclose(solution.covariance.corners(groups), alone, rtol=1e-9, atol=1e-15)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,12 +90,32 @@ class Covariance:
 
     def corners(self, groups: NDArray[np.int64]) -> FloatArray:
         """Joint covariances (M, 2 n, 2 n), m^2, of M groups (M, n) of corners."""
-        parts = np.array_split(groups, min(max(-(-groups.size // _at_once(self.whitening)), 1), len(groups)))
-        of_corners = np.concatenate([self._corners(part) for part in parts])
+        of_corners = np.empty((len(groups), 2 * groups.shape[1], 2 * groups.shape[1]))
+        for part in self._parts(groups):
+            of_corners[part] = self._corners(groups[part])
         if self.held is None:
             return of_corners
         moved = self.held.corners[groups].reshape(*of_corners.shape[:2], -1)
         return of_corners + moved @ moved.swapaxes(1, 2)
+
+    def _parts(self, groups: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
+        """Indices of groups that are looked at together: neighbours, which share most of their corners."""
+        rank = torch.argsort(self.whitening.engine.arrays.corner_order).cpu().numpy()
+        most_corners = max(_at_once(self.whitening), groups.shape[1])
+        numbers = 2 * groups.shape[1] * self.whitening.reduced_factor.size
+        most_groups = max(_NUMBERS_AT_ONCE // numbers, 1)
+        part: list[int] = []
+        corners: set[int] = set()
+        for number in np.argsort(np.median(rank[groups], axis=1), kind="stable").tolist():
+            joined = corners | set(groups[number].tolist())
+            if part and (len(joined) > most_corners or len(part) == most_groups):
+                yield np.array(part)
+                part = []
+                joined = set(groups[number].tolist())
+            part.append(number)
+            corners = joined
+        if part:
+            yield np.array(part)
 
     def _corners(self, groups: NDArray[np.int64]) -> FloatArray:
         arrays = self.whitening.engine.arrays

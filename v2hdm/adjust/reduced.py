@@ -196,13 +196,14 @@ def to_tiles(plan: Plan, by_frame: Tensor, by_kept: Tensor | None = None) -> Ten
 
 
 def from_tiles(plan: Plan, rows: Tensor, frame_count: int, states: int) -> tuple[Tensor, Tensor]:
-    """Inverse of :func:`to_tiles` for vectors (G size,): by frame (J, S) and by kept corner (n, 2)."""
+    """Inverse of :func:`to_tiles` for rows (G size, ...): by frame (J, S, ...), kept corner (n, 2, ...)."""
+    trailing = rows.shape[1:]
     if not plan.tile_count:
-        return rows.new_zeros(frame_count, states), rows.new_zeros(0, 2)
-    tiles = rows.view(plan.tile_count, plan.size)[plan.position]
-    frames = tiles[: plan.frame_tiles].reshape(-1, states)[:frame_count]
-    corners = tiles[plan.frame_tiles :, : plan.size // 2 * 2].reshape(-1, 2)[: len(plan.kept_corners)]
-    return frames, corners
+        return rows.new_zeros(frame_count, states, *trailing), rows.new_zeros(0, 2, *trailing)
+    tiles = rows.view(plan.tile_count, plan.size, *trailing)[plan.position]
+    frames = tiles[: plan.frame_tiles].reshape(-1, states, *trailing)[:frame_count]
+    corners = tiles[plan.frame_tiles :, : plan.size // 2 * 2].reshape(-1, 2, *trailing)
+    return frames, corners[: len(plan.kept_corners)]
 
 
 @dataclass(frozen=True)

@@ -255,7 +255,7 @@ def _moving(motion: Callable[[Arrays, Tensor], Tensor]) -> Column:
         shift = (extrinsic[..., :3, :3] @ tangent[..., :3, None])[..., 0]
         turn = (extrinsic[..., :3, :3] @ tangent[..., 3:, None])[..., 0]
         shift = shift + torch.linalg.cross(extrinsic[..., :3, 3].expand_as(turn), turn)
-        return {"observations": solved.seen(solved.turned(-torch.cat([shift, turn], dim=-1)))}
+        return {"observations": solved.jacobians.along_tangents(-torch.cat([shift, turn], dim=-1))}
 
     return column
 

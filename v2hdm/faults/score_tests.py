@@ -21,7 +21,7 @@ estimated from the disagreements of all faults (variance components; Rao, Journa
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -60,28 +60,31 @@ class _Answer:
     information_alone: float  # the fault's information with all else known
 
     @classmethod
-    def to(cls, hypothesis: Hypothesis, solved: Sensitivity) -> _Answer:
-        """The segments' scores at a solution."""
-        column = hypothesis.column(solved)
-        rows = solved.efficient(column)
-        centres = rows["camera_centre"].detach()
-        survey_score = -float((centres * solved.residuals["camera_centre"]).sum())
-        survey_information = float(centres.square().sum())
-        efficient = solved.flat(rows)
-        information = solved.by_stretch(efficient, efficient)
-        alone = sum(float(row.square().sum()) for row in column.values())
-        score = -solved.by_stretch(efficient, solved.flat(solved.residuals))
-        drawn = solved.by_stretch(efficient, solved.noise).T
-        of_surveys = (survey_score, survey_information)
-        return cls(hypothesis, score, information, of_surveys, drawn, solved.by_noise(efficient), alone)
+    def to(cls, hypotheses: Sequence[Hypothesis], solved: Sensitivity) -> list[_Answer]:
+        """The segments' scores at a solution, on some faults."""
+        columns = [hypothesis.column(solved) for hypothesis in hypotheses]
+        efficient = solved.efficient_columns(columns)
+        centres = efficient[:, solved.places["camera_centre"]]
+        survey_scores = -centres @ solved.residuals["camera_centre"].detach().flatten().cpu().numpy()
+        information = solved.information_by_stretch(efficient)
+        noise = np.column_stack([-solved.flat(solved.residuals), solved.noise])
+        scores = solved.by_stretch(efficient, noise)
+        return [
+            cls(
+                hypothesis,
+                scores[number, :, 0],
+                information[number],
+                (float(survey_scores[number]), float(np.square(centres[number]).sum())),
+                scores[number, :, 1:].T,
+                solved.by_noise(efficient[number]),
+                sum(float(row.square().sum()) for row in columns[number].values()),
+            )
+            for number, hypothesis in enumerate(hypotheses)
+        ]
 
-    def column(self, solved: Sensitivity) -> FloatArray:
-        """The fault's column (R,) net of the estimated unknowns, again."""
-        return solved.flat(solved.efficient(self.hypothesis.column(solved)))
-
-    def without(self, effect: FloatArray, solved: Sensitivity) -> _Answer:
-        """The answer without another fault, whose ``effect`` (R,) on the residuals is known."""
-        return replace(self, score=self.score - solved.by_stretch(self.column(solved), effect))
+    def without(self, effect: FloatArray) -> _Answer:
+        """The answer without the ``effect`` (G + 1,) of another fault on the scores."""
+        return replace(self, score=self.score - effect)
 
     @property
     def is_observable(self) -> bool:
@@ -158,7 +161,8 @@ class _Answer:
 def score_faults(problem: Problem, solution: Solution) -> tuple[ScoreTest, ...]:
     """Tests at ``solution`` of every fault that ``problem`` can have, largest gain first."""
     solved = Sensitivity.at(solution.covariance.whitening)
-    answers = [_Answer.to(hypothesis, solved) for hypothesis in hypotheses(problem, solved.arrays)]
+    parts = solved.in_parts(hypotheses(problem, solved.arrays))
+    answers = [answer for part in parts for answer in _Answer.to(part, solved)]
     variances = _noise_variances(answers, solved)
     tests = _likeliest_changes([(answer, answer.test(variances)) for answer in answers])
     tests += _control_points(problem, solution, float(variances[POSITION_NOISE]))
@@ -184,8 +188,7 @@ def _noise_variances(answers: list[_Answer], solved: Sensitivity) -> FloatArray:
     if not likeliest:
         return stated
     first = max(likeliest.values(), key=lambda rated: rated[0])[1]
-    effect = first.value * first.column(solved)
-    tested = [answer.without(effect, solved) for _, answer in likeliest.values()]
+    tested = _without(first, [answer for _, answer in likeliest.values()], solved)
     # The prior is a fault of each kind of noise alone, whose segments disagree as stated.
     shares = np.stack([*(answer.noise_shares for answer in tested), *np.eye(NOISES)])
     disagreement = np.array([*(answer.disagreement for answer in tested), *stated])
@@ -196,6 +199,17 @@ def _noise_variances(answers: list[_Answer], solved: Sensitivity) -> FloatArray:
         observed = shares.T @ (freedom * disagreement / expected**2)
         variances = variances * np.sqrt(observed / (shares.T @ (freedom / expected)))
     return np.asarray(variances)
+
+
+def _without(fault: _Answer, answers: Sequence[_Answer], solved: Sensitivity) -> list[_Answer]:
+    """The answers without a fault of its estimated value, whose residuals are known."""
+    (effect,) = fault.value * solved.efficient_columns([fault.hypothesis.column(solved)])
+    out = []
+    for part in solved.in_parts(answers):
+        columns = solved.efficient_columns([answer.hypothesis.column(solved) for answer in part])
+        effects = solved.by_stretch(columns, effect)
+        out += [answer.without(of_scores) for answer, of_scores in zip(part, effects, strict=True)]
+    return out
 
 
 def _likeliest_changes(tested: list[tuple[_Answer, ScoreTest]]) -> list[ScoreTest]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from itertools import islice, pairwise
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from scipy.sparse import csr_array
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
@@ -24,6 +25,7 @@ from v2hdm.adjust.model import (
 )
 from v2hdm.adjust.solution import Solution
 from v2hdm.adjust.whitening import Whitening
+from v2hdm.faults.jacobians import Jacobians, Steps
 from v2hdm.geometry.tensors import NEAR_M
 from v2hdm.records import FloatArray, IntArray
 
@@ -42,7 +44,9 @@ POSITION_NOISE = 1
 """The kind that is of positions."""
 
 _AT_ONCE = 64  # columns whose gradients are in memory at a time
+_NUMBERS_AT_ONCE = 1 << 25  # most numbers, of 8 bytes, in columns that are solved for together
 
+_Item = TypeVar("_Item")
 Rows = dict[str, Tensor]
 """Whitened residuals, or their derivatives by one parameter, by kind: ``observations`` (2, K), and the
 priors' of :func:`v2hdm.adjust.model.prior_residuals`; untouched kinds may be absent."""
@@ -83,8 +87,8 @@ class Sensitivity:
             return torch.randn(row.shape, generator=generator, dtype=row.dtype).to(row.device)
 
         residuals = self.residuals.items()
-        drawn = [self.efficient({name: like(row) for name, row in residuals}) for _ in range(_DRAWS)]
-        return np.stack([self.flat(rows) for rows in drawn], axis=1)
+        drawn = [{name: like(row) for name, row in residuals} for _ in range(_DRAWS)]
+        return np.concatenate([self.efficient_columns(part) for part in self.in_parts(drawn)]).T
 
     @property
     def camera(self) -> Tensor:
@@ -133,40 +137,71 @@ class Sensitivity:
         motion: Tensor = tangent[:, :3] + torch.linalg.cross(tangent[:, 3:], self.points)
         return motion
 
+    @cached_property
+    def jacobians(self) -> Jacobians:
+        """The observations' derivatives by the unknowns."""
+        return Jacobians.of(self.whitening, self.root, self.poses, self.points)
+
     def efficient(self, column: Rows) -> Rows:
         """A fault's column net of the estimated unknowns: z = J_p - J_y H^-1 J_y' J_p."""
-        estimated = self._along(self._coupling(column))
-        return {name: column.get(name, torch.zeros_like(row)) - row for name, row in estimated.items()}
+        (flat,) = self.efficient_columns([column])
+        return {
+            name: torch.as_tensor(flat[place]).to(row).view_as(row)
+            for (name, row), place in zip(self.residuals.items(), self.places.values(), strict=True)
+        }
 
-    def _along(self, whitened: Tensor) -> Rows:
-        """Derivatives of all residuals along a whitened step of the unknowns."""
+    def in_parts(self, columns: Iterable[_Item]) -> Iterator[list[_Item]]:
+        """Columns, or what has one, in lists of as many as are in memory at a time."""
+        most = max(min(_AT_ONCE, _NUMBERS_AT_ONCE // sum(row.numel() for row in self.residuals.values())), 1)
+        iterator = iter(columns)
+        while part := list(islice(iterator, most)):
+            yield part
+
+    def efficient_columns(self, columns: Sequence[Rows]) -> FloatArray:
+        """Columns (n, R) as :meth:`flat` puts them, each net of the estimated unknowns."""
+        jacobians = self.jacobians
+        flat = np.zeros((len(columns), sum(row.numel() for row in self.residuals.values())))
+        for number, column in enumerate(columns):
+            for name, row in column.items():
+                flat[number, self.places[name]] = row.detach().flatten().cpu().numpy()
+        of_observations = np.ascontiguousarray(flat[:, self.places["observations"]].T)
+        of_priors = [self._pulled(column) for column in columns]
+        steps = jacobians.steps(jacobians.whiten(of_observations, of_priors))
+        flat[:, self.places["observations"]] -= jacobians.along(steps).T
+        for number, numbers in enumerate(flat):
+            for name, along in self._priors_along(steps, number).items():
+                numbers[self.places[name]] -= along.detach().flatten().cpu().numpy()
+        return flat
+
+    @cached_property
+    def places(self) -> dict[str, slice]:
+        """Where each kind of residuals is in :meth:`flat`."""
+        ends = np.cumsum([row.numel() for row in self.residuals.values()]).tolist()
+        return {
+            name: slice(end - row.numel(), end)
+            for (name, row), end in zip(self.residuals.items(), ends, strict=True)
+        }
+
+    def _priors_along(self, steps: Steps, number: int) -> Rows:
+        """Derivatives of the priors' residuals along the step of column ``number``."""
         base = self.whitening.estimate
-        arrays = self.arrays
-        step, tangents, whitened_corners = self.whitening.step(whitened)
+        extrinsic, states, clock, tangents, corners = (part[..., number] for part in steps)
         # Derivatives are linear, poses are not: take a step that moves no pair by more than 1 m or rad.
-        size = max(float(tangents.abs().max()), 1.0)
-        if size > 1:
-            step, tangents, whitened_corners = self.whitening.step(whitened / size)
-        # Corners move in proportion to the step: a whole step gives their derivative.
-        stepped = self.whitening.linearised.evaluate(step, tangents, whitened_corners).estimate
-        corners = stepped.corners_map - base.corners_map
-        along = (self.poses[:, :3, :2] @ corners[arrays.corner.long(), :, None])[..., 0]
+        share = _STEP / max(float(tangents.abs().max()), 1.0)
 
-        def priors_after(share: float, motion: Tensor) -> Rows:
+        def after(share: float, motion: Tensor) -> Rows:
             moved = Estimate(
                 motion @ base.cam_from_vehicle,
-                base.frame_state + share * step.frame_state,
+                base.frame_state + share * states,
                 base.corners_map + share * corners,
-                base.clock_s + share * step.clock_s,
+                base.clock_s + share * clock,
             )
-            return _rows(arrays, moved)
+            return _rows(self.arrays, moved)
 
-        forth, back = rigid(torch.stack([_STEP * step.extrinsic, -_STEP * step.extrinsic]))
-        high = priors_after(_STEP, forth)
-        low = priors_after(-_STEP, back)
-        moved = {name: size * (row - low[name]) / (2 * _STEP) for name, row in high.items()}
-        moved["observations"] = size * self.seen(self.turned(tangents) + along)
-        return moved
+        forth, back = rigid(torch.stack([share * extrinsic, -share * extrinsic]))
+        high = after(share, forth)
+        low = after(-share, back)
+        return {name: (row - low[name]) / (2 * share) for name, row in high.items()}
 
     @cached_property
     def _priors(self) -> tuple[dict[str, Tensor], Rows]:
@@ -188,22 +223,18 @@ class Sensitivity:
         )
         return leaves, _rows(self.whitening.engine.arrays, moved)
 
-    def _coupling(self, column: Rows) -> Tensor:
-        """N_yp: inner products of the column with the whitened unknowns."""
+    def _pulled(self, column: Rows) -> Gradient | None:
+        """The priors' part of a column, by the unknowns; None where it has none."""
         leaves, priors = self._priors
         of_priors = [name for name in column if name != "observations"]
-        by_variable = {name: torch.zeros_like(leaf) for name, leaf in leaves.items()}
-        if of_priors:
-            ends = [priors[name] for name in of_priors]
-            along = [column[name] for name in of_priors]
-            slopes = torch.autograd.grad(
-                ends, list(leaves.values()), along, retain_graph=True, materialize_grads=True
-            )
-            by_variable = dict(zip(leaves, slopes, strict=True))
-        if "observations" in column:
-            of_observations = vars(self.whitening.pull(column["observations"] * self.root))
-            by_variable = {name: slope + of_observations[name] for name, slope in by_variable.items()}
-        return self.whitening.whiten([Gradient(**by_variable)])[0]
+        if not of_priors:
+            return None
+        ends = [priors[name] for name in of_priors]
+        along = [column[name] for name in of_priors]
+        slopes = torch.autograd.grad(
+            ends, list(leaves.values()), along, retain_graph=True, materialize_grads=True
+        )
+        return Gradient(**dict(zip(leaves, slopes, strict=True)))
 
     def flat(self, rows: Rows) -> FloatArray:
         """All residuals, or derivatives, concatenated, (R,)."""
@@ -234,11 +265,20 @@ class Sensitivity:
         """Information (N,) of a column (R,), by the kind of noise that limits it."""
         return np.bincount(self._noise_of, np.square(column), minlength=NOISES).astype(np.float64)
 
-    def by_stretch(self, column: FloatArray, others: FloatArray) -> FloatArray:
-        """Products (G + 1, ...) of a column (R,) and others (R, ...) by segment; last, priors of none."""
+    def by_stretch(self, columns: FloatArray, others: FloatArray) -> FloatArray:
+        """Products (n, G + 1, ...) of columns (n, R) and others (R, ...) by segment; last, priors of none."""
         order, begin = self._stretch_of
-        shape = len(begin) - 1, len(column)
-        return np.asarray(csr_array((column[order], order, begin), shape=shape) @ others)
+        columns = columns[:, order]
+        others = others[order]
+        parts = [slice(first, end) for first, end in pairwise(begin.tolist())]
+        return np.stack([columns[:, part] @ others[part] for part in parts], axis=1)
+
+    def information_by_stretch(self, columns: FloatArray) -> FloatArray:
+        """Squared lengths (n, G + 1) of columns (n, R) by segment; last, priors of none."""
+        order, begin = self._stretch_of
+        squares = np.square(columns[:, order])
+        parts = [slice(first, end) for first, end in pairwise(begin.tolist())]
+        return np.stack([squares[:, part].sum(1) for part in parts], axis=1)
 
 
 def _rows(arrays: Arrays, estimate: Estimate, observations: Tensor | None = None) -> Rows:
@@ -281,11 +321,12 @@ def height_information(solution: Solution, heights: Any) -> tuple[FloatArray, Fl
     observed = np.flatnonzero(information.diagonal() > 0)
     by_column = columns[:, observed].tocsc()
     coupled = solved.root.new_zeros(len(observed), solved.whitening.size)
-    weighted = unit * solved.root
+    lifted = unit.cpu().numpy()[:, :, None]
     for begin in range(0, len(observed), _AT_ONCE):
-        lifted = torch.as_tensor(by_column[:, begin : begin + _AT_ONCE].toarray().T).to(unit)
-        pulled = [solved.whitening.pull(weighted * height_m) for height_m in lifted]
-        coupled[begin : begin + _AT_ONCE] = solved.whitening.whiten(pulled)
+        heights_m = by_column[:, begin : begin + _AT_ONCE].toarray()
+        by_height = (lifted * heights_m).reshape(-1, heights_m.shape[1])
+        whitened = solved.jacobians.whiten(by_height, [None] * heights_m.shape[1])
+        coupled[begin : begin + _AT_ONCE] = torch.cat([whitened.reduced, whitened.corners.flatten(0, 1)]).mT
     information[np.ix_(observed, observed)] -= (coupled @ coupled.mT).cpu().numpy()
     gradient = columns.T @ (unit * solved.residuals["observations"]).sum(0).cpu().numpy()
     gradient[observed] -= (coupled @ solved.whitening.gradient).cpu().numpy()

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from v2hdm.association.ground import BORDER_PX, Views
 from v2hdm.association.sightings import Rig
@@ -65,9 +66,12 @@ class Watch:
         no two images tell, the ratio is 0.
         """
         odds = np.zeros(is_end.shape)
-        # Neighbouring ends are seen in the same images.
+        # Neighbouring ends are seen in the same images: along the route each of these is read about once.
         read = lru_cache(maxsize=16)(self._log_grey)
-        for group, side in np.argwhere(is_end).tolist():
+        route = cKDTree(self.rig.map_from_vehicle[:, :2, 3])
+        frame = route.query(np.nan_to_num(corners_map.mean(axis=1)))[1]
+        ends = np.argwhere(is_end)
+        for group, side in ends[np.argsort(frame[ends[:, 0]], kind="stable")].tolist():
             end = _End.of(corners_map[group], side, self._height_m(corners_map[group]))
             of_pairs = [self._better_ground(end, look, nearer, read) for look, nearer in self._pairs(end)]
             differences_z = [value for value in of_pairs if value is not None]
@@ -99,15 +103,15 @@ class Watch:
         info = self.cameras[camera].info
         rows = np.flatnonzero(self.views.camera == camera)
         vehicle_map = self.rig.map_from_vehicle[self.views.frame[rows]][:, :2, 3]
-        in_reach = np.linalg.norm(vehicle_map - end.middle_map[:2], axis=1) < 2 * _RANGE_M[1]
-        for row in rows[in_reach].tolist():
-            cam_from_map = self.rig.cam_from_map(self.views.camera[row], self.views.frame[row])
-            look = _Look(int(self.views.image[row]), info, cam_from_map, 0.0)
-            corners = look.project(end.corners_map)
-            depth_m = float(corners.depth_m.mean())
-            looks_outwards = (end.middle_map - camera_centre(cam_from_map))[:2] @ end.outwards > 0
-            if looks_outwards and _RANGE_M[0] < depth_m < _RANGE_M[1] and corners.inside.all():
-                yield look._replace(depth_m=depth_m)
+        rows = rows[np.linalg.norm(vehicle_map - end.middle_map[:2], axis=1) < 2 * _RANGE_M[1]]
+        cam_from_map = self.rig.cam_from_map(self.views.camera[rows], self.views.frame[rows])
+        corners = _project(info, cam_from_map, end.corners_map)
+        depth_m = corners.depth_m.mean(axis=1)
+        looks_outwards = (end.middle_map - camera_centre(cam_from_map))[:, :2] @ end.outwards > 0
+        in_range = (depth_m > _RANGE_M[0]) & (depth_m < _RANGE_M[1])
+        for number in np.flatnonzero(looks_outwards & in_range & corners.inside.all(axis=1)).tolist():
+            image = int(self.views.image[rows[number]])
+            yield _Look(image, info, cam_from_map[number], float(depth_m[number]))
 
     def _better_ground(self, end: _End, farther: _Look, nearer: _Look, read: Grey) -> float | None:
         """How much better two images match as ground than as a face; None where too few points tell.
@@ -137,11 +141,23 @@ class Watch:
 
 
 class _Points(NamedTuple):
-    """Where N points are in an image."""
+    """Where N points are in images (...)."""
 
-    px: FloatArray  # (N, 2) recorded px
-    depth_m: FloatArray  # (N,)
-    inside: BoolArray  # (N,) in front of the camera and off the image's border
+    px: FloatArray  # (..., N, 2) recorded px
+    depth_m: FloatArray  # (..., N)
+    inside: BoolArray  # (..., N) in front of the camera and off the image's border
+
+
+def _project(info: CameraInfo, cam_from_map: FloatArray, points_map: FloatArray) -> _Points:
+    """Where points (N, 3) are in images of a camera at poses (..., 4, 4)."""
+    cam = points_map @ cam_from_map[..., :3, :3].swapaxes(-1, -2) + cam_from_map[..., None, :3, 3]
+    depth_m = cam[..., 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pinhole = (cam / depth_m[..., None]) @ info.intrinsic.T
+        px = distort_points(info, pinhole[..., :2].reshape(-1, 2)).reshape(pinhole[..., :2].shape)
+        limit = np.array([info.width, info.height]) - BORDER_PX
+        inside = (depth_m > _LEAST_DEPTH_M) & ((px > BORDER_PX) & (px < limit)).all(axis=-1)
+    return _Points(px, depth_m, np.asarray(inside))
 
 
 class _Look(NamedTuple):
@@ -154,14 +170,7 @@ class _Look(NamedTuple):
 
     def project(self, points_map: FloatArray) -> _Points:
         """Where points (N, 3) are in the image."""
-        cam = points_map @ self.cam_from_map[:3, :3].T + self.cam_from_map[:3, 3]
-        depth_m = cam[:, 2]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            pinhole = (cam / depth_m[:, None]) @ self.info.intrinsic.T
-            px = distort_points(self.info, pinhole[:, :2])
-            limit = np.array([self.info.width, self.info.height]) - BORDER_PX
-            inside = (depth_m > _LEAST_DEPTH_M) & ((px > BORDER_PX) & (px < limit)).all(axis=1)
-        return _Points(px, depth_m, np.asarray(inside))
+        return _project(self.info, self.cam_from_map, points_map)
 
     def ground(self, px: FloatArray, height_m: float) -> FloatArray:
         """Ground points (N, 2) at a height of recorded pixels (N, 2), nan on and above the horizon."""

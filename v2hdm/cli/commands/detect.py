@@ -5,18 +5,16 @@ from __future__ import annotations
 import argparse
 import gc
 import json
-import shutil
 import sys
-import tempfile
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING
 
 from v2hdm.cli.command import Command
-from v2hdm.errors import ConfigError, DriveError
+from v2hdm.errors import DriveError
 
 if TYPE_CHECKING:
     from v2hdm.detection.frames import Frame
@@ -24,7 +22,6 @@ if TYPE_CHECKING:
     from v2hdm.detection.stopwatch import Stopwatch
 
 _FIRST = b'{"source": '  # the beginning of every line of detections
-_BLOCK_BYTES = 1 << 16  # of a file that are looked at for its last line's end
 _STAGES = ("read", "horizon", "net", "propose", "lanes", "fit", "judge")
 
 
@@ -59,6 +56,7 @@ def _detect(parsed: argparse.Namespace) -> None:
     from v2hdm.detection.stopwatch import KEPT, Stopwatch
     from v2hdm.detection.weights import unknown_network
     from v2hdm.pipeline.detect_images import detect_images
+    from v2hdm.store.lines import lines_to
     from v2hdm.store.results import growing_folder
 
     cv2.setNumThreads(1)
@@ -82,7 +80,7 @@ def _detect(parsed: argparse.Namespace) -> None:
     failure = None
     maker = f"v2hdm detect of {parsed.source if live else Path(parsed.source).resolve()}"
     folder = nullcontext() if parsed.draw is None else growing_folder(parsed.draw, "--draw", maker)
-    with folder as write_drawing, _lines(parsed.output, live) as stream:
+    with folder as write_drawing, lines_to(parsed.output, _FIRST, "detections", grows=live) as stream:
         try:
             for frame, camera, road in frames:
                 record = as_record(frame, camera, road)
@@ -128,70 +126,6 @@ def _drawing(frame: Frame, road: Road) -> bytes:
     lanes = [lane.image for lane in road.lanes]
     drawn = draw_detections(frame.pixels, markings, lanes)
     return cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, 92])[1].tobytes()
-
-
-@contextmanager
-def _lines(output: Path | None, live: bool) -> Iterator[TextIO]:
-    """The stream of JSON lines: a file appears when it is complete, a live one grows from line to line."""
-    from v2hdm.store.files import refuse_url
-    from v2hdm.store.inputs import refuse_input
-
-    try:
-        if output is None:
-            yield sys.stdout
-            sys.stdout.flush()
-            return
-        refuse_url(output)
-        refuse_input(output)
-        if output.is_file():
-            with output.open("rb") as earlier:
-                if earlier.read(len(_FIRST)) not in (b"", _FIRST):
-                    raise ConfigError(f"{output}: exists and holds no detections; give another --output")
-        if output.exists() and not output.is_file():  # a pipe, or /dev/null
-            with output.open("w", encoding="utf-8") as stream:
-                yield stream
-        else:
-            with (_growing if live else _at_once)(output.resolve()) as stream:
-                yield stream
-    except OSError as error:
-        if output is not None:
-            line = f"{output}: cannot write there ({error.strerror}); give another --output"
-        elif isinstance(error, BrokenPipeError):
-            raise
-        else:
-            line = f"standard output: cannot be written ({error.strerror}); give an --output with room for it"
-        raise DriveError(line) from error
-
-
-@contextmanager
-def _growing(path: Path) -> Iterator[TextIO]:
-    """A file to add lines to, after those of earlier runs; half a line that a kill has left is dropped."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a+b") as stream:
-        end = stream.tell()
-        while end > 0:
-            begin = max(end - _BLOCK_BYTES, 0)
-            stream.seek(begin)
-            after_line = stream.read(end - begin).rfind(b"\n") + 1
-            end = begin + after_line
-            if after_line:
-                break
-        stream.truncate(end)
-    with path.open("a", encoding="utf-8") as lines:
-        yield lines
-
-
-@contextmanager
-def _at_once(path: Path) -> Iterator[TextIO]:
-    """A file without a name to write to, whose content then becomes that of ``path``."""
-    from v2hdm.store.files import whole_file
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryFile("w+", encoding="utf-8", dir=path.parent) as stream:
-        yield stream
-        stream.seek(0)
-        with whole_file(path) as partial, partial.open("w", encoding="utf-8") as copy:
-            shutil.copyfileobj(stream, copy)
 
 
 def _report(stopwatch: Stopwatch, age_s: Sequence[float]) -> None:

@@ -1,13 +1,18 @@
-"""``v2hdm localize MAP DRIVE``: find a drive's poses in a map (docs/living-map.md)."""
+"""``v2hdm localize MAP DRIVE``: find poses in a map (docs/living-map.md), live too (docs/live.md)."""
 
 from __future__ import annotations
 
+import argparse
+import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from v2hdm.cli.arguments import add_drive, drive_of, result_of, steps_of
 from v2hdm.cli.command import Command
-from v2hdm.errors import EXIT_FAILED_VERDICT
+from v2hdm.errors import EXIT_FAILED_VERDICT, ConfigError
+
+_MAP = "result folder of v2hdm map, or the map.geojson in it"
 
 
 def _run(arguments: Sequence[str]) -> int:
@@ -15,9 +20,12 @@ def _run(arguments: Sequence[str]) -> int:
 
     Only the first recorded pose is used; the others show how far off it is.
     """
+    if "--live" in arguments:
+        return _run_live(arguments)
     parser = COMMAND.parser()
-    parser.add_argument("map", type=Path, help="result folder of v2hdm map, or the map.geojson in it")
+    parser.add_argument("map", type=Path, help=_MAP)
     add_drive(parser, "localized")
+    parser.add_argument("--live", action="store_true", help="of a vehicle as it drives: see --live --help")
     parsed = parser.parse_args(arguments)
     from v2hdm.io.calibration.reading import trusted_calibrations
     from v2hdm.io.maps.reading import read_geojson
@@ -39,6 +47,91 @@ def _run(arguments: Sequence[str]) -> int:
         write_localised(located, drive, unfinished)
     print("\n".join([*summary_lines(located), f"results in {folder}"]))
     return 0 if located.explained else EXIT_FAILED_VERDICT
+
+
+def _run_live(arguments: Sequence[str]) -> int:
+    """Localise a vehicle as it drives, until Ctrl-C."""
+    parser = COMMAND.parser()
+    parser.add_argument("map", type=Path, help=_MAP)
+    parser.add_argument("--live", action="store_true", required=True, help="of a vehicle as it drives")
+    image = "a camera's name, and a folder that its images are written to, or its index; repeatable"
+    parser.add_argument("--images", action="append", required=True, metavar="CAMERA=SOURCE", help=image)
+    motion = "speeds and yaw rates, and positions if there are any: a file that grows, or - for stdin"
+    parser.add_argument("--motion", required=True, metavar="FILE", help=motion)
+    begin = "where it starts, to 5 m and 20 deg: m and deg from east to north (default: anywhere)"
+    parser.add_argument("--start", type=float, nargs=3, metavar=("EAST", "NORTH", "HEADING"), help=begin)
+    calibration = "calibration of a camera (default: those beside the map); repeatable"
+    parser.add_argument(
+        "--calibration", action="append", type=Path, default=[], metavar="FILE", help=calibration
+    )
+    parser.add_argument(
+        "--delay", type=float, default=0.0, metavar="S", help="from a picture to its file's date"
+    )
+    parser.add_argument("--limit", type=int, metavar="N", help="stop after N images")
+    parser.add_argument("--output", type=Path, metavar="FILE", help="for the JSON lines (default: stdout)")
+    mcap = "a new folder for an MCAP of ROS 2 messages (extra ros)"
+    parser.add_argument("--mcap", type=Path, metavar="DIR", help=mcap)
+    parsed = parser.parse_args(arguments)
+    from v2hdm.io.calibration.reading import trusted_calibrations
+    from v2hdm.io.maps.reading import read_geojson
+    from v2hdm.localization.live import localize_live
+    from v2hdm.localization.localizer import Localizer, Pose
+    from v2hdm.localization.messages import pose_bag
+    from v2hdm.localization.places import rough_position
+    from v2hdm.localization.stream import MotionLines, pose_record
+    from v2hdm.store.lines import lines_to
+    from v2hdm.store.names import CALIBRATIONS, map_file
+
+    path = map_file(parsed.map)
+    hd_map = read_geojson(path)
+    files = parsed.calibration or sorted(path.parent.glob(CALIBRATIONS)) or [path.parent]
+    content = {file: calibration for file in files for calibration in trusted_calibrations(file).values()}
+    by_camera = {calibration.info.name: file for file, calibration in content.items()}
+    sources = _sources(parsed, by_camera)
+    calibrations = {name: content[by_camera[name]] for name in sources}
+    prior = None if parsed.start is None else rough_position(*parsed.start)
+    localizer = Localizer(hd_map, calibrations, prior)
+    is_stdin = parsed.motion == "-"
+    lines = MotionLines("standard input" if is_stdin else parsed.motion, hd_map.origin)
+    stream_in = sys.stdin if is_stdin else Path(parsed.motion)
+
+    lines_of_poses = lines_to(parsed.output, b'{"stamp_s": ', "poses", grows=True)
+    with pose_bag(parsed.mcap) as write_message, lines_of_poses as stream:
+
+        def write(pose: Pose) -> None:
+            print(json.dumps(pose_record(pose)), file=stream, flush=True)
+            write_message(pose)
+
+        try:
+            localize_live(
+                localizer,
+                sources,
+                by_camera,
+                stream_in,
+                lines,
+                write,
+                delay_s=parsed.delay,
+                limit=parsed.limit,
+            )
+        except KeyboardInterrupt:
+            return 0
+    return 0
+
+
+def _sources(parsed: argparse.Namespace, calibrations: dict[str, Path]) -> dict[str, str]:
+    """The source of each camera; ConfigError for one that is not calibrated."""
+    sources = {}
+    for stated in parsed.images:
+        name, equals, source = stated.partition("=")
+        if not equals or not source:
+            raise ConfigError(
+                f"--images {stated}: give a camera's name and its folder, as front=images/front"
+            )
+        if name not in calibrations:
+            names = ", ".join(calibrations) or "none"
+            raise ConfigError(f"--images {stated}: no calibration of camera '{name}'; there are: {names}")
+        sources[name] = source
+    return sources
 
 
 COMMAND = Command("v2hdm localize", "Find the vehicle's poses from the markings of a map.", _run)

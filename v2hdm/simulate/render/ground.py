@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -206,37 +207,64 @@ def wetness(ground: Ground, field: GroundField) -> Float32:
     return smoothstep(values, level - 0.1, level + 0.3)
 
 
+class ShadowLayer:
+    """Shadows of a scene, prepared once, so that those out of view are cheaply skipped."""
+
+    def __init__(self, shadows: Sequence[Shadow]) -> None:
+        self._shadows = shadows
+        self._lines = [inward_lines(np.asarray(shadow.polygon_map, dtype=np.float64)) for shadow in shadows]
+        self._wider = [_with_penumbra(shadow) for shadow in shadows]
+        self._vertices = padded_vertices(self._wider)
+        self._first_map = np.array([shadow.polygon_map[0] for shadow in shadows]).reshape(-1, 2)
+
+    def cast(self, view: View, field: GroundField, out: Float32) -> None:
+        """Lower the sun's visibility ``out`` (H', W) to that in the shadows."""
+        first = field.first_row
+        offset_map = self._first_map - view.centre_map[:2]
+        numbers = np.flatnonzero(np.hypot(offset_map[:, 0], offset_map[:, 1]) < _SHADOWS_TO_M)
+        if view.relief is None:  # on a relief a shadow is where its vertices need not be
+            numbers = numbers[
+                in_view(view, view.homogeneous_px(view.on_ground(self._vertices[numbers])), np.inf)
+            ]
+        shapes = outlines(view, [on_ground_px(view, self._wider[number]) for number in numbers])
+        for number, shape in zip(numbers.tolist(), shapes, strict=True):
+            if shape is not None:
+                shadow = self._shadows[number]
+                windows, count = bands_of(view, shape, first)
+                softness_m = np.float32(shadow.softness_m)
+                darkness = np.float32(1.0 - shadow.transmission)
+                lines = self._lines[number]
+                kernels.cast_shadow(windows, count, first, lines, softness_m, darkness, field.planes, out)
+
+
 def sun_visibility(
-    shadows: tuple[Shadow, ...], shades: tuple[Shade, ...], view: View, field: GroundField
+    shadows: Sequence[ShadowLayer], shades: tuple[Shade, ...], view: View, field: GroundField
 ) -> Float32:
     """Fraction (H, W) of the sun's light that reaches the ground."""
     out = np.ones_like(field.x_m)
-    shadows_near = [shadow for shadow in shadows if _distance_m(view, shadow) < _SHADOWS_TO_M]
-    shapes = outlines(view, [_penumbra_px(shadow, view) for shadow in shadows_near])
-    first = field.first_row
-    for shadow, shape in zip(shadows_near, shapes, strict=True):
-        if shape is not None:
-            windows, count = bands_of(view, shape, first)
-            lines = inward_lines(np.asarray(shadow.polygon_map, dtype=np.float64))
-            softness_m = np.float32(shadow.softness_m)
-            darkness = np.float32(1.0 - shadow.transmission)
-            kernels.cast_shadow(windows, count, first, lines, softness_m, darkness, field.planes, out)
+    for layer in shadows:
+        layer.cast(view, field, out)
     for shade in shades:
         shade(view, field, out)
     return out
 
 
-def _distance_m(view: View, shadow: Shadow) -> float:
-    offset_map = shadow.polygon_map[0] - view.centre_map[:2]
-    return float(np.hypot(offset_map[0], offset_map[1]))
+def padded_vertices(polygons: Sequence[FloatArray]) -> FloatArray:
+    """Vertices (P, N, 2) of polygons in one array; those with fewer repeat their last."""
+    most = max((len(polygon) for polygon in polygons), default=3)
+    out = np.zeros((len(polygons), most, 2))
+    for row, polygon in zip(out, polygons, strict=True):
+        row[: len(polygon)] = polygon
+        row[len(polygon) :] = polygon[-1]
+    return out
 
 
-def _penumbra_px(shadow: Shadow, view: View) -> FloatArray:
-    """A shadow's polygon, half its penumbra wider, as homogeneous pinhole pixels (N, 3)."""
+def _with_penumbra(shadow: Shadow) -> FloatArray:
+    """A shadow's polygon (N, 2), half its penumbra wider."""
     polygon = np.asarray(shadow.polygon_map, dtype=np.float64)
     away = polygon - polygon.mean(axis=0)
     away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
-    return on_ground_px(view, polygon + 0.5 * shadow.softness_m * away)
+    return np.asarray(polygon + 0.5 * shadow.softness_m * away)
 
 
 def on_ground_px(view: View, polygon_map: FloatArray) -> FloatArray:
@@ -276,12 +304,8 @@ class PaintLayer:
     def __init__(self, paints: tuple[Paint, ...], classes: tuple[str, ...]) -> None:
         self._paints = paints
         self._label = {kind: label for label, kind in enumerate(classes, start=1)}
-        most = max((len(p.polygon_map) for p in paints), default=3)
-        self._vertices = np.zeros((len(paints), most, 2))
-        for row, paint in zip(self._vertices, paints, strict=True):
-            polygon = np.asarray(paint.polygon_map, dtype=np.float64)
-            row[: len(polygon)] = polygon
-            row[len(polygon) :] = polygon[-1]
+        polygons = [np.asarray(paint.polygon_map, dtype=np.float64) for paint in paints]
+        self._vertices = padded_vertices(polygons)
 
     def draw(self, view: View, field: GroundField, albedo: Float32, labels: Labels) -> None:
         """Paint onto the ground field's ``albedo`` (H', W, 3) and into ``labels`` (H, W)."""

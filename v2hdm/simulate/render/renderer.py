@@ -9,9 +9,9 @@ From radiance to a recorded image: blur of lens and motion, exposure, noise, sRG
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cache, lru_cache
+from functools import cache, cached_property, lru_cache
 from typing import Any
 
 import cv2
@@ -22,7 +22,7 @@ from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.records import CameraInfo, FloatArray
 from v2hdm.simulate.render import ground as on_ground
 from v2hdm.simulate.render import kernels
-from v2hdm.simulate.render.ground import GroundField, PaintLayer
+from v2hdm.simulate.render.ground import GroundField, PaintLayer, ShadowLayer
 from v2hdm.simulate.render.scene import (
     Backdrop,
     Bgr,
@@ -31,7 +31,6 @@ from v2hdm.simulate.render.scene import (
     Light,
     Picture,
     Scene,
-    Shadow,
     box_faces,
     box_shadow,
     noise_tile,
@@ -54,30 +53,57 @@ class _Face:
     upright: bool
     picture: Picture | None = None
 
+    @cached_property
+    def axes(self) -> FloatArray:
+        """Unit vectors (3, 2) from the first corner to the second and to the last."""
+        sides = self.corners_map[[1, 3]] - self.corners_map[0]
+        return np.column_stack([side / max(float(np.linalg.norm(side)), 1e-9) for side in sides])
+
     @property
     def sides_m(self) -> FloatArray:
         """Lengths (2,) of the edges from the first corner to the second and to the last."""
         return np.asarray(np.linalg.norm(self.corners_map[[1, 3]] - self.corners_map[0], axis=1))
 
 
+@dataclass(frozen=True)
+class _Standing:
+    """Boxes with their faces, prepared once."""
+
+    boxes: tuple[Box, ...]
+    corners_map: FloatArray  # (B, 8, 3)
+    faces: list[list[_Face]]
+
+    @classmethod
+    def of(cls, boxes: tuple[Box, ...]) -> _Standing:
+        """All that does not depend on the camera."""
+        corners_map = np.array([box_faces(box).reshape(8, 3) for box in boxes]).reshape(-1, 8, 3)
+        return cls(boxes, corners_map, [_faces(box) for box in boxes])
+
+    def visible(self, view: View) -> list[tuple[Box, list[_Face]]]:
+        """The boxes that may reach into the image."""
+        chosen = in_view(view, view.homogeneous_px(self.corners_map), _FARTHEST_M).tolist()
+        return [(self.boxes[number], self.faces[number]) for number in chosen]
+
+
 def draw_boxes(
-    boxes: tuple[Box, ...], light: Light, view: View, radiance: Float32, hidden: NDArray[np.bool_]
+    standing: Sequence[_Standing], light: Light, view: View, radiance: Float32, hidden: NDArray[np.bool_]
 ) -> None:
     """Draw boxes over ``radiance`` (H, W, 3) and mark in ``hidden`` (H, W) what lies behind them."""
     centre = view.centre_map
-    if not boxes:
-        return
-    corners = np.array([box_faces(box).reshape(8, 3) for box in boxes])
-    visible = [boxes[k] for k in in_view(view, view.homogeneous_px(corners), _FARTHEST_M)]
+    visible = [box for boxes in standing for box in boxes.visible(view)]
 
     def distance(box: Box) -> float:
         offset_map = np.array(box.centre_map) - centre[:2]
         return float(np.hypot(offset_map[0], offset_map[1]))
 
     # Of stacked boxes the upper comes first: its underside lies behind the one below.
-    ordered = sorted(visible, key=lambda b: (distance(b), b.base_m), reverse=True)
-    faces = [(box, face) for box in ordered for face in _faces(box)]
-    turned = [(box, face) for box, face in faces if (centre - face.corners_map[0]) @ face.normal > 1e-3]
+    ordered = sorted(visible, key=lambda b: (distance(b[0]), b[0].base_m), reverse=True)
+    turned = [
+        (box, face)
+        for box, faces in ordered
+        for face in faces
+        if (centre - face.corners_map[0]) @ face.normal > 1e-3
+    ]
     shapes = outlines(view, [view.homogeneous_px(face.corners_map) for _, face in turned])
     for (box, face), shape in zip(turned, shapes, strict=True):
         if shape is not None:
@@ -142,13 +168,9 @@ def _draw_face(
 def _plane_of(face: _Face, view: View) -> Float32:
     """Metres along a face's first and last edge, and the inverse depth, from pinhole pixels (3, 3)."""
     origin = face.corners_map[0]
-    first = face.corners_map[1]
-    last = face.corners_map[3]
-    sides = (first - origin, last - origin)
-    axes = np.column_stack([side / max(float(np.linalg.norm(side)), 1e-9) for side in sides])
     rotation = view.cam_from_map[:3, :3]
     translation = view.cam_from_map[:3, 3]
-    cam_from_face = np.column_stack([rotation @ axes, rotation @ origin + translation])
+    cam_from_face = np.column_stack([rotation @ face.axes, rotation @ origin + translation])
     return np.linalg.inv(view.rays.info.intrinsic @ cam_from_face).astype(np.float32)
 
 
@@ -211,12 +233,14 @@ class Renderer:
     scene: Scene
     classes: tuple[str, ...] = PAINT_CLASSES
     _paint: PaintLayer = field(init=False)
-    _shadows: tuple[Shadow, ...] = field(init=False)
+    _shadows: ShadowLayer = field(init=False)
+    _standing: _Standing = field(init=False)
 
     def __post_init__(self) -> None:
         self._paint = PaintLayer(self.scene.paints, self.classes)
         cast = tuple(box_shadow(box, self.scene.light) for box in self.scene.boxes)
-        self._shadows = self.scene.shadows + cast
+        self._shadows = ShadowLayer(self.scene.shadows + cast)
+        self._standing = _Standing.of(self.scene.boxes)
 
     def render(
         self,
@@ -237,17 +261,17 @@ class Renderer:
         view = View(camera_rays(info), np.asarray(cam_from_map, dtype=np.float64), self.scene.relief)
         labels = np.zeros((info.height, info.width), dtype=np.uint8)
         hidden = np.zeros((info.height, info.width), dtype=np.bool_)
-        boxes = self.scene.boxes + moving_boxes
-        shadows = self._shadows + tuple(box_shadow(box, self.scene.light) for box in moving_boxes)
-        radiance = self._surroundings(view, shadows, labels)
-        draw_boxes(boxes, self.scene.light, view, radiance, hidden)
+        moving_shadows = ShadowLayer([box_shadow(box, self.scene.light) for box in moving_boxes])
+        standing = (self._standing, _Standing.of(moving_boxes))
+        radiance = self._surroundings(view, (self._shadows, moving_shadows), labels)
+        draw_boxes(standing, self.scene.light, view, radiance, hidden)
         radiance = _motion_blur(radiance, view, motion or Motion())
         if before_lens is not None:
             before_lens(view, radiance, hidden)
         labels[hidden] = 0
         return Rendered(expose(radiance, optics or Optics(), rng), labels, hidden)
 
-    def _surroundings(self, view: View, shadows: tuple[Shadow, ...], labels: NDArray[np.uint8]) -> Float32:
+    def _surroundings(self, view: View, shadows: Sequence[ShadowLayer], labels: NDArray[np.uint8]) -> Float32:
         """Radiance (H, W, 3) of sky and ground."""
         scene = self.scene
         height, width = labels.shape
@@ -270,7 +294,7 @@ class Renderer:
         return radiance
 
     def _ground(
-        self, view: View, ground: GroundField, shadows: tuple[Shadow, ...], labels: NDArray[np.uint8]
+        self, view: View, ground: GroundField, shadows: Sequence[ShadowLayer], labels: NDArray[np.uint8]
     ) -> Float32:
         scene = self.scene
         bare = on_ground.tone(scene.ground, ground)

@@ -28,8 +28,8 @@ _BAND_ROWS = 32  # rows of a window where an outline is covered by several
 _BAND_AREA_PX = 4000  # area of an outline's bounds from which on several windows cover it
 NEAR_M = 0.05  # least depth of what is drawn
 _MARGIN_PX = 4.0  # width of the band around an image in which shapes are still drawn
-_STEPS = [np.linspace(0.0, 1.0, 2 + more)[:-1, None, None] for more in range(9)]
-"""Shares of a side at which its outline has points, by the polygon's extent: a lens bends it."""
+_STEPS = np.array([np.pad(np.linspace(0.0, 1.0, 2 + more)[:-1], (0, 8 - more)) for more in range(9)])
+"""Shares of a side at which its outline has points, by how many more it has: a lens bends it."""
 
 Window = tuple[slice, slice]
 
@@ -137,22 +137,45 @@ def outlines(
     norms = np.hypot(edges[:, 0], edges[:, 1])
     usable = norms > 1e-12
     edges /= np.where(usable, norms, 1.0)[:, None]
-    corners = []
-    for part in parts:
-        part_px = part[:, :2] / part[:, 2:]
-        extent_px = float(np.ptp(part_px, axis=0).max()) if len(part_px) else 0.0
-        steps = _STEPS[int(min(extent_px / 40.0, 8.0))]
-        sides = part_px + steps * (following_row(part_px) - part_px)
-        corners.append(sides.transpose(1, 0, 2).reshape(-1, 2))
-    boundaries = distort_points(view.rays.info, np.concatenate(corners))
-    bounds = np.split(boundaries, np.cumsum([len(points) for points in corners])[:-1])
+    boundaries = _boundaries(view, parts)
+    means = np.add.reduceat(points, ends - count) / count[:, None]
+    towards = np.where(usable, (edges * np.repeat(means, count, axis=0)).sum(axis=1), 0.0)
+    outward = np.add.reduceat(towards, ends - count) < 0
+    edges[np.repeat(outward, count)] *= -1.0
+    usable_counts = np.add.reduceat(usable, ends - count, dtype=np.int64).tolist()
     shapes: list[Outline | None] = []
-    for polygon, part, end, bound in zip(polygons, parts, ends.tolist(), bounds, strict=True):
-        lines = edges[end - len(polygon) : end][usable[end - len(polygon) : end]]
-        inward = (lines @ polygon.mean(axis=0)).sum() >= 0
-        shown = len(part) >= 3 and len(lines) >= 3
-        shapes.append(Outline(lines if inward else -lines, bound) if shown else None)
+    for number, (part, boundary, end) in enumerate(zip(parts, boundaries, ends.tolist(), strict=True)):
+        if len(part) < 3 or usable_counts[number] < 3:
+            shapes.append(None)
+            continue
+        rows = slice(end - len(polygons[number]), end)
+        lines = edges[rows] if usable_counts[number] == len(polygons[number]) else edges[rows][usable[rows]]
+        shapes.append(Outline(lines, boundary))
     return shapes
+
+
+def _boundaries(view: View, parts: Sequence[FloatArray]) -> list[FloatArray]:
+    """Boundaries (M, 2) of visible parts (N, 3) in recorded pixels, with points along long sides."""
+    size = np.array([len(part) for part in parts])
+    ends = np.cumsum(size)
+    corners = np.concatenate(parts)
+    corners_px = corners[:, :2] / corners[:, 2:]
+    begin = (ends - size)[size > 0]
+    extent_px = np.zeros(len(parts))
+    if len(begin):
+        extents_px = np.maximum.reduceat(corners_px, begin) - np.minimum.reduceat(corners_px, begin)
+        extent_px[size > 0] = extents_px.max(axis=1)
+    more = np.minimum(extent_px / 40.0, 8.0).astype(np.int64)  # points of a side besides its first
+    following = np.arange(1, len(corners) + 1)
+    following[ends[size > 0] - 1] = begin
+    points = np.repeat(more, size) + 1  # of each side
+    last = np.cumsum(points)
+    number = np.arange(last[-1] if len(last) else 0) - np.repeat(last - points, points)
+    share = _STEPS[np.repeat(points - 1, points), number][:, None]
+    first_px = np.repeat(corners_px, points, axis=0)
+    along_px = np.repeat(corners_px[following] - corners_px, points, axis=0)
+    boundaries = distort_points(view.rays.info, first_px + share * along_px)
+    return np.split(boundaries, np.cumsum(size * (more + 1))[:-1])
 
 
 def in_view(view: View, homogeneous_px: FloatArray, farthest_m: float) -> NDArray[np.intp]:

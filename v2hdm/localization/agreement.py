@@ -1,0 +1,197 @@
+"""Whether map, calibration and odometry explain what is seen: counted by markings, and tested as it comes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from v2hdm.localization.belief import Plane
+from v2hdm.localization.motion import Piece, moved
+from v2hdm.localization.seeing import Look, Sighted, ground_points
+from v2hdm.records import BoolArray, Calibration, FloatArray
+
+_WAY_M = 12.0  # way, m, over which agreement is counted
+_SAME_M = 0.6  # distance, m, of sightings that are one object
+_FROM = 6  # objects from which a share says something
+_LEAST_SHARE = 0.67
+"""Least share of what is seen that the map explains: of a right one it is 0.86 and more, with half of the
+markings moved about 0.5, of another site's 0.04."""
+# Log likelihood ratios of an object by a map with half of the markings moved and by a right one.
+_NOT_EXPLAINED = np.log(0.5 / 0.15)
+_EXPLAINED = np.log(0.5 / 0.85)
+_DIFFERS_LIMIT = 6.0  # sum of these, since it began to rise, from which a map differs (Page 1954)
+_LOST_SHARE = 0.34  # share below which the map explains next to nothing
+
+# Log likelihood ratio at which the odometry counts as off by a factor: one in e^9 of right ones comes so far.
+_PACE_LIMIT = 9.0
+_PACE_STEP_M = 0.5  # least way between two looks that are compared, m
+_PACE_SAME_M = 0.2  # distance, m, of two sightings of one marking, when the way is right
+_PACE_RANGE_M = 10.0
+_PACE_MATCH = 1.0  # log likelihood of a detection that fits over one that does not: neighbours share a cause
+_PACES = {
+    1 / 3.6: "its speeds look like km/h; state m/s",
+    0.44704: "its speeds look like miles per hour; state m/s",
+    3.6: "its speeds are too low by 3.6; state m/s",
+    -1.0: "its speeds have the wrong sign; forward is positive",
+    0.1: "its speeds are ten times too high; state m/s",
+    0.0: "it moves while the images stand still",
+}
+"""By true over stated speed, what is wrong."""
+
+
+@dataclass
+class _Object:
+    place_map: FloatArray
+    kind: str
+    way_m: float
+    explained: int = 0
+    not_explained: int = 0
+
+
+@dataclass
+class Agreement:
+    """What was seen within the last metres, by object, and whether the map has it."""
+
+    objects: list[_Object] = field(default_factory=list)
+
+    def note(
+        self, places_map: FloatArray, kinds: tuple[str, ...], explained: BoolArray, way_m: float
+    ) -> None:
+        """Take the detections (D) of an image, which lie at ``places_map`` (D, 2)."""
+        self.objects = [own for own in self.objects if way_m - own.way_m < _WAY_M]
+        for place, kind, is_explained in zip(places_map, kinds, explained.tolist(), strict=True):
+            own = self._of(place, kind)
+            if own is None:
+                own = _Object(place, kind, way_m)
+                self.objects.append(own)
+            own.explained += is_explained
+            own.not_explained += not is_explained
+
+    def _of(self, place: FloatArray, kind: str) -> _Object | None:
+        for own in self.objects:
+            if own.kind == kind and float(np.abs(own.place_map - place).max()) < _SAME_M:
+                return own
+        return None
+
+    @property
+    def _several(self) -> list[_Object]:
+        return [own for own in self.objects if own.explained + own.not_explained > 1]
+
+    @property
+    def seen(self) -> int:
+        """The number of objects that more than one image showed."""
+        return len(self._several)
+
+    @property
+    def share(self) -> float:
+        """The share of these that the map explains; 1 where too few were seen to say."""
+        several = self._several
+        if len(several) < _FROM:
+            return 1.0
+        explained = [own.explained >= own.not_explained for own in several]
+        return float(np.mean(explained))
+
+    @property
+    def differs(self) -> bool:
+        """Whether the map has too little of what is seen: of all in the last metres, or of what came last."""
+        evidence = 0.0
+        for own in self._several:
+            gain = _EXPLAINED if own.explained >= own.not_explained else _NOT_EXPLAINED
+            evidence = max(0.0, evidence + float(gain))
+        return self.share < _LEAST_SHARE or evidence > _DIFFERS_LIMIT
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether the map explains next to nothing."""
+        return self.share < _LOST_SHARE
+
+
+class _Seen(NamedTuple):
+    stamp_s: float
+    kinds: tuple[str, ...]
+    middles: FloatArray  # (D,) complex, in the vehicle's frame
+
+
+@dataclass
+class Pace:
+    """A test of the odometry by markings that two images of a camera show, whatever the map says."""
+
+    before: dict[str, _Seen] = field(default_factory=dict)
+    evidence: dict[float, float] = field(default_factory=dict)
+
+    def note(self, look: Look, seen: Sighted, calibration: Calibration, pieces: list[Piece]) -> str | None:
+        """Take a look; ``pieces`` lead to it from :meth:`since` of its camera. A sentence once it is off."""
+        ground = ground_points(seen.corners_px, np.eye(4), Plane(), calibration)
+        middles = ground.mean(axis=1) @ np.array([1.0, 1.0j])
+        is_near = seen.valid.all(axis=1) & np.isfinite(middles.real) & (np.abs(middles) < _PACE_RANGE_M)
+        kinds = tuple(kind for kind, near in zip(seen.kinds, is_near.tolist(), strict=True) if near)
+        now = _Seen(look.stamp_s, kinds, middles[is_near])
+        before = self.before.get(look.camera)
+        if before is None or not pieces:
+            self.before[look.camera] = now
+            return None
+        way = moved(pieces)
+        if abs(complex(way[0], way[1])) < _PACE_STEP_M and look.stamp_s - before.stamp_s < 1.0:
+            return None
+        self.before[look.camera] = now
+        right = _fitting(before, now, way, 1.0)
+        for factor in _PACES:
+            gain = _PACE_MATCH * (_fitting(before, now, way, factor) - right)
+            self.evidence[factor] = max(0.0, self.evidence.get(factor, 0.0) + gain)
+        factor = max(self.evidence, key=lambda one: self.evidence[one])
+        return _PACES[factor] if self.evidence[factor] > _PACE_LIMIT else None
+
+    def since(self, camera: str) -> float | None:
+        """When the look was taken with which the next one of a camera is compared."""
+        return self.before[camera].stamp_s if camera in self.before else None
+
+
+def _fitting(before: _Seen, now: _Seen, way: FloatArray, factor: float) -> int:
+    """How many detections are where they were before, if the vehicle moved by a factor of a way."""
+    if not len(before.middles) or not len(now.middles):
+        return 0
+    expected = (before.middles - factor * complex(way[0], way[1])) * np.exp(-1j * way[2])
+    alike = np.array(before.kinds)[:, None] == np.array(now.kinds)[None]
+    apart = np.where(alike, np.abs(expected[:, None] - now.middles[None]), np.inf)
+    return int((apart.min(axis=1) < _PACE_SAME_M).sum())
+
+
+# Log likelihood ratio from which a mounting counts as turned (Page 1954): of right images one in e^10.
+_TURNED_LIMIT = 10.0
+_MATCHED = 3.0  # log likelihood of a detection that the turned mounting explains over one that nothing does
+_TURNED_DRIFT = 1.5  # and what each image takes from it
+_SUSPICIOUS = 3.0  # log likelihood ratio from which no bound is stated
+
+
+@dataclass
+class RigTest:
+    """For each camera a sequential test of whether its mounting has turned since the calibration."""
+
+    evidence: dict[str, float] = field(default_factory=dict)
+    begun_s: dict[str, float] = field(default_factory=dict)
+
+    def note(self, look: Look, gained: int) -> float | None:
+        """Take how many more detections a turned mounting explains; since when, once that is sure."""
+        before = self.evidence.get(look.camera, 0.0)
+        if before == 0.0:
+            self.begun_s[look.camera] = look.stamp_s
+        now = max(0.0, before + _MATCHED * gained - _TURNED_DRIFT)
+        self.evidence[look.camera] = now
+        if now < _TURNED_LIMIT:
+            return None
+        begun_s = self.begun_s[look.camera]
+        self.evidence.clear()
+        return begun_s
+
+    @property
+    def is_suspicious(self) -> bool:
+        """Whether the last images spoke for a turned mounting, surely or not."""
+        return any(evidence > _SUSPICIOUS for evidence in self.evidence.values())
+
+
+def sigmas_off(turn_rad: FloatArray, prior_rad2: FloatArray, posterior_rad2: FloatArray) -> float:
+    """How surely a mounting has turned (3,): in sigmas of its calibration and, if fewer, of the estimate."""
+    squared = [float(turn_rad @ np.linalg.solve(own, turn_rad)) for own in (prior_rad2, posterior_rad2)]
+    return float(np.sqrt(min(squared)))

@@ -1,0 +1,223 @@
+"""What a localiser believes: vehicle, cameras and the markings in view, as a square-root filter.
+
+The states are the vehicle's (:data:`VEHICLE`), for each camera the tangent (6) of its mounting's error
+(:class:`~v2hdm.records.Calibration`), and for each marking that was seen lately its place's error (2), m:
+what a map and a calibration are wrong by does not average out over the images. The covariance is
+``root @ root.T``; updates work on the whitened state, where the information is never less than one, so that
+rounding cannot make it indefinite (Bierman, Factorization Methods for Discrete Sequential Estimation, 1977,
+chapter V).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from v2hdm.geometry.rigid import make_transform, rotation_from_euler
+from v2hdm.localization.motion import MotionNoise, Piece
+from v2hdm.records import HEAVE_SIGMA_M, FloatArray
+
+X, Y, HEADING, SCALE, BIAS, HEIGHT, ROLL, PITCH, SLOW_ROLL, SLOW_PITCH = range(10)
+"""The vehicle's states: place, m, heading, rad, log of true over stated speed, bias of the yaw rate, rad/s,
+and above the ground of the map height, m, roll and pitch, rad, in a part that changes fast and one that
+lasts."""
+
+VEHICLE = 10  # number of the vehicle's states
+CAMERA = 6  # number of a camera's
+
+# Roll and pitch of a body on its springs, standard deviations, rad, and the times, s, over which they fade:
+# what the road shakes, and what a bend, a brake or a load holds.
+_FAST_RAD = 0.003
+_FAST_S = 0.25
+_SLOW_RAD = 0.003
+_SLOW_S = 4.0
+_HEAVE_S = 0.5
+# Change of a mounting within a second, m and rad (one sigma): 0.06 deg within an hour.
+_CREEP_M = 1e-5
+_CREEP_RAD = 1.7e-5
+
+_SPRINGS = (
+    (HEIGHT, HEAVE_SIGMA_M, _HEAVE_S),
+    (ROLL, _FAST_RAD, _FAST_S),
+    (PITCH, _FAST_RAD, _FAST_S),
+    (SLOW_ROLL, _SLOW_RAD, _SLOW_S),
+    (SLOW_PITCH, _SLOW_RAD, _SLOW_S),
+)
+
+
+@dataclass(frozen=True)
+class Plane:
+    """The map's ground about a place: height, m, and slopes by x and y there."""
+
+    height_m: float = 0.0
+    slope: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Belief:
+    """Mean (n,) and root (n, n) of the states at a time; ``markings`` are the map's numbers, in order."""
+
+    stamp_s: float
+    mean: FloatArray
+    root: FloatArray
+    cameras: int
+    markings: tuple[int, ...] = ()
+
+    @property
+    def first_marking(self) -> int:
+        """The number of the first state of a marking."""
+        return VEHICLE + CAMERA * self.cameras
+
+    def state_of(self, marking: int) -> int | None:
+        """The first of a marking's two states."""
+        if marking not in self.markings:
+            return None
+        return self.first_marking + 2 * self.markings.index(marking)
+
+    def covariance(self, states: Sequence[int]) -> FloatArray:
+        """The covariance of some states."""
+        rows = self.root[list(states)]
+        return np.asarray(rows @ rows.T)
+
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation of the place, both directions together."""
+        return float(np.linalg.norm(self.root[:2]))
+
+    def map_from_vehicle(self, plane: Plane) -> FloatArray:
+        """The pose (4, 4) over the map's ground."""
+        c, s = np.cos(self.mean[HEADING]), np.sin(self.mean[HEADING])
+        along, left = plane.slope[0] * c + plane.slope[1] * s, plane.slope[1] * c - plane.slope[0] * s
+        roll = np.arctan(left) + self.mean[ROLL] + self.mean[SLOW_ROLL]
+        pitch = -np.arctan(along) + self.mean[PITCH] + self.mean[SLOW_PITCH]
+        rotation = rotation_from_euler(*(np.array([angle]) for angle in (roll, pitch, self.mean[HEADING])))
+        place = np.array([self.mean[X], self.mean[Y], plane.height_m + self.mean[HEIGHT]])
+        return make_transform(rotation[0], place)
+
+
+def start(
+    stamp_s: float,
+    pose: FloatArray,
+    sigma: FloatArray,
+    mountings: Sequence[FloatArray],
+    noise: MotionNoise,
+) -> Belief:
+    """The belief at a pose (3,) of x, y and heading with standard deviations (3,).
+
+    ``mountings`` are the covariances (6, 6) of the cameras' calibrations.
+    """
+    vehicle = [*sigma, noise.scale, noise.bias_rad_s, *(spring[1] for spring in _SPRINGS)]
+    count = VEHICLE + CAMERA * len(mountings)
+    root = np.zeros((count, count))
+    root[range(VEHICLE), range(VEHICLE)] = vehicle
+    for camera, covariance in enumerate(mountings):
+        begin = VEHICLE + CAMERA * camera
+        values, axes = np.linalg.eigh(covariance)
+        root[begin : begin + CAMERA, begin : begin + CAMERA] = axes * np.sqrt(np.maximum(values, 0.0))
+    mean = np.zeros(count)
+    mean[:3] = pose
+    return Belief(stamp_s, mean, root, len(mountings))
+
+
+def predict(belief: Belief, pieces: Sequence[Piece], noise: MotionNoise) -> Belief:
+    """The belief after pieces of motion."""
+    if not pieces:
+        return belief
+    mean = belief.mean.copy()
+    change = np.eye(VEHICLE)
+    spread = np.zeros((VEHICLE, VEHICLE))
+    for piece in pieces:
+        step, by_state, pushed = _step(mean, piece, noise)
+        mean[:VEHICLE] = step
+        change = by_state @ change
+        spread = by_state @ spread @ by_state.T + pushed
+    length_s = sum(piece.length_s for piece in pieces)
+    count = len(mean)
+    creep = np.tile(np.repeat([_CREEP_M, _CREEP_RAD], 3), belief.cameras) * np.sqrt(length_s)
+    values, axes = np.linalg.eigh(spread)
+    grown = np.zeros((count, count + belief.first_marking))
+    grown[:, :count] = belief.root
+    grown[:VEHICLE, :count] = change @ belief.root[:VEHICLE]
+    grown[:VEHICLE, count : count + VEHICLE] = axes * np.sqrt(np.maximum(values, 0.0))
+    mountings = np.arange(VEHICLE, belief.first_marking)
+    grown[mountings, count + mountings] = creep
+    return replace(belief, stamp_s=belief.stamp_s + length_s, mean=mean, root=_square(grown))
+
+
+def _step(mean: FloatArray, piece: Piece, noise: MotionNoise) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Means of the vehicle's states after a piece, their derivatives, and the noise's covariance."""
+    length_s = piece.length_s
+    out = mean[:VEHICLE].copy()
+    turn = piece.yaw_rate_rad_s - mean[BIAS]
+    speed = piece.speed_m_s * np.exp(mean[SCALE])
+    middle = mean[HEADING] + 0.5 * turn * length_s
+    ahead = np.array([np.cos(middle), np.sin(middle)])
+    left = np.array([-ahead[1], ahead[0]])
+    way_m = speed * length_s
+    out[:2] += way_m * ahead
+    out[HEADING] += turn * length_s
+    change = np.eye(VEHICLE)
+    change[:2, HEADING] = way_m * left
+    change[:2, SCALE] = way_m * ahead
+    change[:2, BIAS] = -0.5 * length_s * way_m * left
+    change[HEADING, BIAS] = -length_s
+    way_m2 = noise.speed_m_sqrt_s**2 * length_s + (piece.speed_sigma_m_s * length_s) ** 2
+    yaw_rad2 = noise.yaw_rad_sqrt_s**2 * length_s + (piece.yaw_rate_sigma_rad_s * length_s) ** 2
+    pushed = np.zeros((VEHICLE, VEHICLE))
+    pushed[:2, :2] = way_m2 * np.outer(ahead, ahead) + noise.slip_m_sqrt_s**2 * length_s * np.outer(
+        left, left
+    )
+    pushed[HEADING, HEADING] = yaw_rad2
+    pushed[BIAS, BIAS] = noise.bias_walk_rad_s**2 * length_s
+    for state, sigma, fades_s in _SPRINGS:
+        keeps = np.exp(-length_s / fades_s)
+        out[state] *= keeps
+        change[state, state] = keeps
+        pushed[state, state] = sigma**2 * (1 - keeps**2)
+    return out, change, pushed
+
+
+def with_markings(belief: Belief, markings: Sequence[int], priors: Sequence[FloatArray]) -> Belief:
+    """The belief with the places' errors of more markings, of covariances (2, 2) each."""
+    if not markings:
+        return belief
+    count = len(belief.mean)
+    root = np.zeros((count + 2 * len(markings),) * 2)
+    root[:count, :count] = belief.root
+    for number, prior in enumerate(priors):
+        begin = count + 2 * number
+        values, axes = np.linalg.eigh(prior)
+        root[begin : begin + 2, begin : begin + 2] = axes * np.sqrt(np.maximum(values, 1e-12))
+    mean = np.concatenate([belief.mean, np.zeros(2 * len(markings))])
+    return replace(belief, mean=mean, root=root, markings=(*belief.markings, *markings))
+
+
+def only_markings(belief: Belief, markings: Sequence[int]) -> Belief:
+    """The belief without the states of all other markings."""
+    kept = [number for number, marking in enumerate(belief.markings) if marking in set(markings)]
+    if len(kept) == len(belief.markings):
+        return belief
+    first = belief.first_marking
+    rows = [*range(first), *(first + 2 * number + axis for number in kept for axis in (0, 1))]
+    return replace(
+        belief,
+        mean=belief.mean[rows],
+        root=_square(belief.root[rows]),
+        markings=tuple(belief.markings[number] for number in kept),
+    )
+
+
+def loosened(belief: Belief, cameras: Sequence[int], sigma_rad: float) -> Belief:
+    """The belief in which the mountings of cameras may each have turned by so much since."""
+    rows = [VEHICLE + CAMERA * camera + axis for camera in cameras for axis in (3, 4, 5)]
+    count = len(belief.mean)
+    grown = np.concatenate([belief.root, np.zeros((count, len(rows)))], axis=1)
+    grown[rows, range(count, count + len(rows))] = sigma_rad
+    return replace(belief, root=_square(grown))
+
+
+def _square(root: FloatArray) -> FloatArray:
+    """A square root (n, n) of the covariance that a wide one (n, m) has."""
+    return np.asarray(np.linalg.qr(root.T, mode="reduced")[1].T, dtype=np.float64)

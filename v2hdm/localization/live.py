@@ -1,0 +1,156 @@
+"""``v2hdm localize --live``: a process per camera detects, this one localises, image by image."""
+
+from __future__ import annotations
+
+import json
+import math
+import queue
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import IO, NamedTuple
+
+from v2hdm.errors import ConfigError, DriveError
+from v2hdm.localization.localizer import Fix, Localizer, Pose
+from v2hdm.localization.motion import Motion
+from v2hdm.localization.seeing import Look
+from v2hdm.localization.stream import MotionLines, look_of
+
+_QUIET_S = 0.5  # without an image, a pose comes after this time all the same
+_POLL_S = 0.01  # a file that grows is looked at this often
+
+
+class _Ended(NamedTuple):
+    """A source that gives no more, and why."""
+
+    source: str
+    error: str | None
+
+
+_Item = Look | Motion | Fix | _Ended
+_Queue = queue.SimpleQueue[_Item]
+
+
+def localize_live(
+    localizer: Localizer,
+    sources: Mapping[str, str],
+    calibrations: Mapping[str, Path],
+    motion: IO[str] | Path,
+    lines: MotionLines,
+    take: Callable[[Pose], None],
+    delay_s: float = 0.0,
+    limit: int | None = None,
+) -> None:
+    """Localise until the cameras end, ``limit`` images were taken, or Ctrl-C.
+
+    Args:
+        localizer: of the map.
+        sources: by camera a folder that somebody writes images to, or a camera's index.
+        calibrations: files by camera.
+        motion: the odometry's lines, a stream or a file that grows.
+        lines: reads them.
+        take: called with each pose.
+        delay_s: time from a picture to the stamp of its file, s.
+        limit: stop after so many images.
+
+    Raises:
+        DriveError: a camera or the odometry ended in an error.
+    """
+    items: _Queue = queue.SimpleQueue()
+    with ExitStack() as stack:
+        for name, source in sources.items():
+            stack.enter_context(_camera(name, source, calibrations[name], items, delay_s))
+        threading.Thread(target=_follow_motion, args=(motion, lines, items), daemon=True).start()
+        running = set(sources)
+        images = 0
+        written_s = -math.inf
+        while running and (limit is None or images < limit):
+            looks: list[Look] = []
+            motions: list[Motion] = []
+            fixes: list[Fix] = []
+            for item in _available(items):
+                if isinstance(item, _Ended):
+                    running.discard(item.source)
+                    if item.error is not None:
+                        raise DriveError(item.error)
+                elif isinstance(item, Look):
+                    looks.append(item)
+                elif isinstance(item, Motion):
+                    motions.append(item)
+                else:
+                    fixes.append(item)
+            images += len(looks)
+            if looks or motions or fixes:
+                pose = localizer.update(looks, motions, fixes)
+                if looks or pose.stamp_s - written_s > _QUIET_S:
+                    written_s = pose.stamp_s
+                    take(pose)
+
+
+def _available(items: _Queue) -> Iterator[_Item]:
+    """All that has come, at least one."""
+    try:
+        yield items.get(timeout=1.0)
+    except queue.Empty:
+        return
+    while True:
+        try:
+            yield items.get_nowait()
+        except queue.Empty:
+            return
+
+
+@contextmanager
+def _camera(name: str, source: str, calibration: Path, items: _Queue, delay_s: float) -> Iterator[None]:
+    """A process that detects in the newest images of a camera, as ``v2hdm detect --live`` does."""
+    command = [sys.executable, "-m", "v2hdm.detect", source, "--camera", str(calibration), "--live"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        arguments = (name, process, items, delay_s)
+        reader = threading.Thread(target=_follow_camera, args=arguments, daemon=True)
+        reader.start()
+        try:
+            yield
+        finally:
+            process.terminate()
+            reader.join()
+
+
+def _follow_camera(name: str, process: subprocess.Popen[str], items: _Queue, delay_s: float) -> None:
+    assert process.stdout is not None
+    assert process.stderr is not None
+    for line in process.stdout:
+        look = look_of(json.loads(line), name)
+        items.put(Look(look.camera, look.stamp_s - delay_s, look.markings))
+    said = process.stderr.read()
+    error = next((line for line in said.splitlines() if line.startswith("error: ")), None)
+    items.put(_Ended(name, None if error is None else f"camera {name}: {error.removeprefix('error: ')}"))
+
+
+def _follow_motion(motion: IO[str] | Path, lines: MotionLines, items: _Queue) -> None:
+    try:
+        for line in _growing(motion) if isinstance(motion, Path) else motion:
+            item = lines.read(line)
+            if item is not None:
+                items.put(item)
+    except ConfigError as error:
+        items.put(_Ended("motion", str(error)))
+    except OSError as error:
+        items.put(_Ended("motion", f"{motion}: cannot be read ({error.strerror}); check the path"))
+
+
+def _growing(path: Path) -> Iterator[str]:
+    """The lines of a file that somebody appends to; never ends."""
+    rest = ""
+    with path.open(encoding="utf-8") as stream:
+        while True:
+            part = stream.readline()
+            rest += part
+            if rest.endswith("\n"):
+                yield rest
+                rest = ""
+            elif not part:
+                time.sleep(_POLL_S)

@@ -1,0 +1,555 @@
+"""The localiser: the newest looks and the odometry in, the vehicle's pose and what it is worth out."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from typing import NamedTuple
+
+import numpy as np
+
+from v2hdm.doors import checked
+from v2hdm.errors import MapFileError
+from v2hdm.localization.agreement import Agreement, Pace, RigTest, sigmas_off
+from v2hdm.localization.belief import (
+    CAMERA,
+    HEADING,
+    VEHICLE,
+    Belief,
+    loosened,
+    only_markings,
+    predict,
+    start,
+)
+from v2hdm.localization.joint import Located, Scene, locate, paired
+from v2hdm.localization.motion import Motion, MotionLog, MotionNoise, moved
+from v2hdm.localization.paint import Paint
+from v2hdm.localization.places import Patch, Prior, search, vehicle_at
+from v2hdm.localization.seeing import Look, Sighted, ground_points, sighted
+from v2hdm.records import BoolArray, Calibration, FloatArray, HDMap
+
+_LAG_S = 1.0  # images may be so late
+_FUTURE_S = 2.0  # a stamp farther ahead of the odometry, s, is of another clock
+# With a larger standard deviation of the place the vehicle does not know where it is: half a dash's gap.
+_LOST_M = 0.3
+_PROTECTION_SIGMAS = 3.717  # radius, in sigmas, that one error in a thousand in a plane exceeds
+_MOST_MARKINGS = 28  # whose places' errors are states: those seen last
+_STARTED = 4  # images from the start on whose agreement makes it sure
+# Log likelihood by which one place must explain what is seen better than any other: one wrong in e^10.
+_SURER_BY = 10.0
+_LEAST_MATCHED = 4  # markings of the place
+_LEAST_SHARE = 0.6  # of what is seen
+_SEARCH_S = 0.3  # time between searches
+_LOST_S, _LOST_WAY_M = 0.9, 8.0  # after so long, or so far, without a place nothing fits
+_STILL_M = 0.5  # a vehicle that has moved less stands: it may not have seen enough
+_START_SIGMA = np.array([0.25, 0.25, np.deg2rad(1.5)])  # of a place that was found, m, m and rad
+_UNSTATED = np.diag(np.square([0.01, 0.01, 0.01, *(3 * [np.deg2rad(0.05)])]))  # of a calibration without one
+_AGAIN_SIGMA_M = (
+    4.0  # standard deviation of the place, m, and of the heading, rad, from which a lost one is sought
+)
+_AGAIN_SIGMA_RAD = 0.2
+_ANYWHERE_M = 80.0  # way, m, after which a lost one is sought everywhere
+# The detector's covariances: how many times too small they may be at first, and of how many coordinates that
+# is known; after how many coordinates half of it is forgotten.
+_FACTOR = 2.0
+_FACTOR_COUNT = 60.0
+_FORGET = 600.0
+_FACTORS = (0.3, 12.0)
+_JUDGED_M = 14.0  # distance, m, of detections that are counted for the map or against it
+_TURNED_RAD = np.deg2rad(1.0)  # standard deviation of what a camera that was pushed has turned
+_TURNED_SIGMAS = 5.0  # from which a mounting has surely turned
+_BEFORE_S = 0.25  # so long before it was noticed, s, a mounting may have turned
+_FEW = 0.7  # share of an image's detections under which a turned mounting is tried
+
+
+class Status(Enum):
+    """Whether the pose can be relied on: only while ``TRACKING``."""
+
+    INITIALISING = "initialising"
+    TRACKING = "tracking"
+    LOST = "lost"
+
+
+class Fix(NamedTuple):
+    """A position (2,) of the vehicle's origin in the map by RTK, m, and its standard deviation."""
+
+    stamp_s: float
+    place_map: FloatArray
+    sigma_m: float
+
+
+class Turned(NamedTuple):
+    """A camera whose mounting is no longer that of its calibration."""
+
+    camera: str
+    since_s: float
+    turn_deg: tuple[float, float, float]  # about the camera's axes right, down and forward
+    sigma_deg: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where the vehicle is at a time.
+
+    Attributes:
+        stamp_s: of the newest motion or image.
+        status: only a tracked pose can be relied on.
+        map_from_vehicle: (4, 4); None before any place was found.
+        covariance: (3, 3) of x, y, m, and heading, rad, in the map; infinite before the place is sure.
+        protection_m: ahead and to the left, bounds that one error in a thousand exceeds; else infinite.
+        protection_rad: the same of the heading.
+        motion: true over stated speed, and the yaw rate's bias, rad/s.
+        matched: markings that the last look showed.
+        reasons: sentences: why there is no pose, or what differs from map, calibration or odometry.
+        turned: cameras whose mountings have changed.
+    """
+
+    stamp_s: float
+    status: Status
+    map_from_vehicle: FloatArray | None
+    covariance: FloatArray
+    protection_m: tuple[float, float]
+    protection_rad: float
+    motion: tuple[float, float]
+    matched: int
+    reasons: tuple[str, ...] = ()
+    turned: tuple[Turned, ...] = ()
+
+
+class _Past(NamedTuple):
+    """A look, and the belief before it."""
+
+    before: Belief
+    look: Look
+
+
+@dataclass
+class _Noise:
+    """How many times larger a detector's covariances are than stated, estimated from what fits the map."""
+
+    squared: float = _FACTOR * _FACTOR_COUNT
+    count: float = _FACTOR_COUNT
+
+    @property
+    def factor(self) -> float:
+        return float(np.clip(self.squared / self.count, *_FACTORS))
+
+    def note(self, located: Located, factor: float) -> None:
+        keeps = 0.5 ** (located.misfit_freedom / _FORGET)
+        self.squared = keeps * self.squared + factor * located.misfit
+        self.count = keeps * self.count + located.misfit_freedom
+
+
+@dataclass
+class _Search:
+    """The search for a place: the rough one and where the odometry was then, since when, and the last one."""
+
+    prior: Prior | None
+    local: FloatArray = field(default_factory=lambda: np.zeros(3))
+    since_s: float | None = None
+    since_m: float = 0.0
+    last_s: float = -np.inf
+    patch: Patch = field(default_factory=Patch)
+
+
+class Localizer:
+    """Finds a vehicle in a map, image by image; needs no more than the base install.
+
+    >>> from v2hdm.localization.motion import Motion
+    >>> localizer = Localizer(result.map, result.calibrations)
+    >>> localizer.update([], [Motion(0.0, 4.0, 0.0)]).status.value
+    'initialising'
+    """
+
+    @checked
+    def __init__(
+        self,
+        hd_map: HDMap,
+        calibrations: Mapping[str, Calibration],
+        prior: Prior | None = None,
+        noise: MotionNoise | None = None,
+    ) -> None:
+        """Start in a map (frame ``map``, m) with calibrated cameras, by name.
+
+        ``prior`` is a rough position; without one, the whole map is searched.
+        ``noise`` is the odometry's. Raises MapFileError for a map without markings, or without cameras.
+        """
+        if not hd_map.markings:
+            raise MapFileError("the map has no markings; nothing can be localised in it")
+        if not calibrations:
+            raise MapFileError("no camera is calibrated; give calibration_<camera>.yaml of the map's result")
+        self.calibrations = dict(calibrations)
+        self.paint = Paint(hd_map)
+        self.noise = noise or MotionNoise()
+        self._numbers = {name: number for number, name in enumerate(self.calibrations)}
+        stated = [own.covariance for own in self.calibrations.values()]
+        self._mountings = [_UNSTATED if own is None else np.asarray(own) for own in stated]
+        self._log = MotionLog()
+        self._belief: Belief | None = None
+        self._past: deque[_Past] = deque()
+        self._search = _Search(prior)
+        self._is_sure = False
+        self._is_lost = False
+        self._confirmed = 0
+        self._noise = {name: _Noise() for name in self.calibrations}
+        self._agreement = Agreement()
+        self._pace = Pace()
+        self._rig = RigTest()
+        self._turned_s: float | None = None
+        self._rig_since_s: float | None = None
+        self._turned: dict[str, float] = {}
+        self._local = np.zeros(3)
+        self._local_s: float | None = None
+        self._way_m = 0.0
+        self._pace_reason: str | None = None
+        self._reasons: dict[str, str] = {}
+        self._matched = 0
+
+    def update(
+        self, images: Sequence[Look] = (), motion: Sequence[Motion] = (), fixes: Sequence[Fix] = ()
+    ) -> Pose:
+        """Take what is new, in any order, and say where the vehicle is at the newest stamp of all."""
+        for sample in motion:
+            problem = self._log.add(Motion(*(float(value) for value in sample)))
+            if problem is not None:
+                self._forget(problem)
+        if self._log.refused:
+            self._reasons["odometry"] = (
+                f"{self._log.refused} samples of the odometry are no motion of a road vehicle; "
+                "state m/s and rad/s"
+            )
+        for fix in sorted(fixes, key=lambda own: own.stamp_s):
+            self._fix(fix)
+        for look in sorted(images, key=lambda own: own.stamp_s):
+            self._take(look)
+        return self._pose()
+
+    def _take(self, look: Look) -> None:
+        """Take a look in its place among those that came before it."""
+        if look.camera not in self._numbers:
+            names = ", ".join(self._numbers)
+            self._reasons["camera"] = (
+                f"images of camera '{look.camera}', which has no calibration; there are {names}"
+            )
+            return
+        newest_s = self._log.newest_s
+        if newest_s is not None and look.stamp_s > newest_s + _FUTURE_S:
+            self._reasons["clock"] = (
+                f"an image of {look.camera} is {look.stamp_s - newest_s:.1f} s ahead of the odometry: "
+                "is it on the same clock, and still coming?"
+            )
+            return
+        self._reasons.pop("clock", None)
+        later = [past for past in self._past if past.look.stamp_s > look.stamp_s]
+        latest_s = max([look.stamp_s, *(past.look.stamp_s for past in self._past)])
+        if latest_s - look.stamp_s > _LAG_S:
+            self._reasons["late"] = (
+                f"an image of {look.camera} came {latest_s - look.stamp_s:.1f} s late; left out"
+            )
+            return
+        if self._belief is None or not later:
+            self._see(look, is_new=True)
+            return
+        self._belief = later[0].before
+        while self._past and self._past[-1].look.stamp_s > look.stamp_s:
+            self._past.pop()
+        self._see(look, is_new=True)
+        for past in later:
+            self._see(past.look, is_new=False)
+
+    def _see(self, look: Look, is_new: bool) -> None:
+        """Move the belief to a look, and take what that shows."""
+        calibration = self.calibrations[look.camera]
+        seen = sighted(look, calibration)
+        if is_new:
+            self._count_way(look.stamp_s)
+            if self._belief is None:
+                local = self._local_at(look.stamp_s)
+                self._search.patch.add(seen, look.camera, calibration, local, self._way_m)
+            since_s = self._pace.since(look.camera)
+            pieces = [] if since_s is None else self._log.pieces(since_s, look.stamp_s)
+            self._pace_reason = self._pace.note(look, seen, calibration, pieces) or self._pace_reason
+        if self._belief is None:
+            if is_new:
+                self._find(look)
+            return
+        if look.stamp_s < self._belief.stamp_s:  # of before the place was found
+            return
+        belief = self._moved_to(self._belief, look.stamp_s)
+        self._past.append(_Past(self._belief, look))
+        while self._past[-1].look.stamp_s - self._past[0].look.stamp_s > _LAG_S:
+            self._past.popleft()
+        self._rig_since_s = None
+        self._belief = self._located(belief, look, seen, is_new)
+        if self._rig_since_s is not None:
+            self._let_turn(self._rig_since_s)
+        if is_new:
+            self._judge(look)
+
+    def _let_turn(self, since_s: float) -> None:
+        """Go back to before a mounting turned, and see again what came since with mountings that are free.
+
+        Which of them has turned is not known: what one image took for the vehicle's own roll, free
+        mountings and the vehicle's springs, which fade, explain better and better.
+        """
+        self._turned_s = since_s
+        again = [past for past in self._past if past.look.stamp_s >= since_s - _BEFORE_S]
+        self._belief = loosened(again[0].before, list(self._numbers.values()), _TURNED_RAD)
+        while self._past and self._past[-1].look.stamp_s >= since_s - _BEFORE_S:
+            self._past.pop()
+        for past in again:
+            self._see(past.look, is_new=False)
+
+    def _moved_to(self, belief: Belief, stamp_s: float) -> Belief:
+        if stamp_s <= belief.stamp_s:
+            return belief
+        return predict(belief, self._log.pieces(belief.stamp_s, stamp_s), self.noise)
+
+    def _count_way(self, stamp_s: float) -> None:
+        """Lay the odometry's way out to a time."""
+        if self._local_s is None:
+            self._local_s = stamp_s
+        if stamp_s > self._local_s:
+            step = moved(self._log.pieces(self._local_s, stamp_s))
+            self._local = vehicle_at(self._local, step)
+            self._way_m += float(np.hypot(step[0], step[1]))
+            self._local_s = stamp_s
+
+    def _local_at(self, stamp_s: float) -> FloatArray:
+        """The odometry's pose at a time that it has passed."""
+        if self._local_s is None or stamp_s >= self._local_s:
+            return self._local
+        x, y, turn = moved(self._log.pieces(stamp_s, self._local_s))
+        c, s = np.cos(turn), np.sin(turn)
+        return vehicle_at(self._local, np.array([-c * x - s * y, s * x - c * y, -turn]))
+
+    def _located(self, belief: Belief, look: Look, seen: Sighted, is_new: bool) -> Belief:
+        """The belief after a look; another mounting is tried where the calibration's explains little."""
+        camera = self._numbers[look.camera]
+        noise = self._noise[look.camera]
+        plane = self.paint.ground(belief.mean[:2])
+        scene = Scene(seen, self.paint, plane, camera, self.calibrations[look.camera], noise.factor)
+        located = locate(belief, scene)
+        if not is_new:
+            return located.belief
+        pose = located.belief.map_from_vehicle(plane)
+        places = ground_points(seen.corners_px, pose, plane, self.calibrations[look.camera])
+        near = self._judged(places, pose, seen)
+        explained = paired(located, len(seen.kinds))
+        gained = 0
+        if self._is_sure and near.sum() >= 2 and explained[near].mean() < _FEW:
+            turned = locate(loosened(belief, list(self._numbers.values()), _TURNED_RAD), scene)
+            gained = int(paired(turned, len(seen.kinds))[near].sum() - explained[near].sum())
+            self._rig_since_s = self._rig.note(look, gained)
+        elif self._is_sure:
+            self._rig.note(look, 0)
+        rows = np.flatnonzero(near)
+        kinds = tuple(seen.kinds[row] for row in rows.tolist())
+        self._agreement.note(places[near].mean(axis=1), kinds, explained[near], self._way_m)
+        if located.misfit_freedom > 0:
+            noise.note(located, noise.factor)
+        self._matched = len(located.pairs.detection)
+        return self._kept(located)
+
+    def _judged(self, places: FloatArray, pose: FloatArray, seen: Sighted) -> BoolArray:
+        """Which detections (D,) lie whole, near, and where the map has been mapped."""
+        finite: BoolArray = np.asarray(np.isfinite(places).all(axis=(1, 2)) & seen.valid.all(axis=1))
+        middle = np.where(finite[:, None], places.mean(axis=1), np.inf)
+        return np.asarray(finite & (np.linalg.norm(middle - pose[:2, 3], axis=1) < _JUDGED_M))
+
+    def _kept(self, located: Located) -> Belief:
+        """The belief with the markings that were seen last."""
+        belief = located.belief
+        latest = [
+            marking for marking in belief.markings if marking not in set(located.pairs.marking.tolist())
+        ]
+        order = [*latest, *located.pairs.marking.tolist()]
+        if len(order) <= _MOST_MARKINGS:
+            return belief
+        return only_markings(belief, order[-_MOST_MARKINGS:])
+
+    def _find(self, look: Look) -> None:
+        """Search for a place that explains the patch as no other does."""
+        quest = self._search
+        if quest.since_s is None and quest.patch.objects:
+            quest.since_s, quest.since_m = look.stamp_s, self._way_m
+        if quest.since_s is None or 0 <= look.stamp_s - quest.last_s < _SEARCH_S:
+            return
+        quest.last_s = look.stamp_s
+        local = self._local_at(look.stamp_s)
+        places = search(quest.patch, self.paint, self.calibrations, quest.local, quest.prior)
+        if places:
+            best = places[0]
+            second = places[1].score if len(places) > 1 else 0.0
+            share = best.matched / max(best.seen, 1)
+            if (
+                best.matched >= _LEAST_MATCHED
+                and share >= _LEAST_SHARE
+                and best.score - max(second, 0.0) > _SURER_BY
+            ):
+                self._begin(look.stamp_s, vehicle_at(best.map_from_local, local))
+                return
+        waited_s, waited_m = look.stamp_s - quest.since_s, self._way_m - quest.since_m
+        is_long = (waited_s > _LOST_S and waited_m > _STILL_M) or waited_m > _LOST_WAY_M
+        if is_long and len(quest.patch.sure) >= _LEAST_MATCHED + 2:
+            share = places[0].matched / max(places[0].seen, 1) if places else 0.0
+            if share < _LEAST_SHARE:
+                self._is_lost = True
+                self._reasons["lost"] = (
+                    f"no place there explains more than {100 * share:.0f} % of the markings seen: is it the "
+                    "map of this site, as painted today, in these coordinates, and are these its cameras?"
+                )
+
+    def _begin(self, stamp_s: float, pose: FloatArray) -> None:
+        self._belief = start(stamp_s, pose, _START_SIGMA, self._mountings, self.noise)
+        self._past.clear()
+        self._agreement = Agreement()
+        self._confirmed = 0
+        self._is_sure = self._is_lost = False
+        self._turned_s = None
+        self._reasons.pop("lost", None)
+
+    def _judge(self, look: Look) -> None:
+        """Whether the belief still holds, by what it explains."""
+        assert self._belief is not None
+        if not self._is_sure:
+            self._confirmed += self._matched >= 2
+            if self._confirmed >= _STARTED and self._belief.sigma_m < _LOST_M and not self._agreement.differs:
+                self._is_sure = True
+            elif self._agreement.differs:
+                self._forget("what is seen after the start does not fit the map")
+            return
+        if self._agreement.is_lost:
+            self._forget(
+                f"the map explains {100 * self._agreement.share:.0f} % of the markings seen in the last "
+                "metres"
+            )
+        elif self._belief.sigma_m > 3.0:
+            self._forget("no marking of the map was seen for too long")
+
+    def _forget(self, reason: str) -> None:
+        """Give the belief up, and search about where it was."""
+        prior = self._search.prior
+        if self._belief is not None and self._is_sure:
+            pose = self._belief.mean[:3].copy()
+            sigma_m = max(_AGAIN_SIGMA_M, self._belief.sigma_m)
+            prior = Prior(pose, sigma_m, _AGAIN_SIGMA_RAD)
+        local = self._local if self._belief is None else self._local_at(self._belief.stamp_s)
+        self._search = _Search(prior, local)
+        self._belief = None
+        self._past.clear()
+        self._agreement = Agreement()
+        self._is_lost = True
+        self._is_sure = False
+        self._reasons["lost"] = reason
+
+    def _fix(self, fix: Fix) -> None:
+        """Take a position by RTK."""
+        belief = self._belief
+        if belief is None or abs(fix.stamp_s - belief.stamp_s) > _LAG_S:
+            if self._belief is None:
+                heading = self._search.prior.pose[2] if self._search.prior else 0.0
+                turn = self._search.prior.sigma_rad if self._search.prior else np.pi
+                pose = np.array([*fix.place_map, heading])
+                self._search.prior = Prior(pose, max(fix.sigma_m, 0.5), turn)
+                self._search.local = self._local_at(fix.stamp_s)
+            return
+        belief = self._moved_to(belief, fix.stamp_s)
+        total = fix.sigma_m**2 + self.paint.shared_m2
+        slope = belief.root[:2]
+        gain = belief.root @ slope.T @ np.linalg.inv(slope @ slope.T + total * np.eye(2))
+        off = fix.place_map - belief.mean[:2]
+        spread = slope @ slope.T + total * np.eye(2)
+        if off @ np.linalg.solve(spread, off) > _PROTECTION_SIGMAS**2:
+            self._reasons["fix"] = (
+                f"RTK is {np.linalg.norm(off):.2f} m from where the markings put the vehicle: is the map in "
+                "its datum?"
+            )
+            return
+        self._reasons.pop("fix", None)
+        inner = np.linalg.cholesky(np.eye(len(belief.mean)) + slope.T @ slope / total)
+        root = np.linalg.solve(inner, belief.root.T).T
+        self._belief = replace(belief, mean=belief.mean + gain @ off, root=root)
+
+    def _pose(self) -> Pose:
+        """The pose at the newest stamp."""
+        stamps = [own for own in (self._log.newest_s, self._local_s) if own is not None]
+        stamp_s = max(stamps, default=0.0)
+        reasons = dict(self._reasons)
+        if self._pace_reason is not None:
+            reasons["odometry"] = f"the odometry does not fit the images: {self._pace_reason}"
+        if self._belief is None:
+            if (quest := self._search.prior) is not None and not len(self.paint.near(quest.pose[:2], 60.0)):
+                reasons["place"] = (
+                    "no marking of the map lies within 60 m of where the vehicle should be: is it the map of "
+                    "this site, in these coordinates?"
+                )
+                self._is_lost = True
+            status = Status.LOST if self._is_lost or self._pace_reason else Status.INITIALISING
+            nothing = np.full((3, 3), np.inf)
+            infinite = (np.inf, np.inf)
+            return Pose(
+                stamp_s, status, None, nothing, infinite, np.inf, (1.0, 0.0), 0, tuple(reasons.values())
+            )
+        belief = self._moved_to(self._belief, stamp_s)
+        plane = self.paint.ground(belief.mean[:2])
+        covariance = belief.covariance([0, 1, 2])
+        covariance += np.diag([self.paint.shared_m2, self.paint.shared_m2, self.paint.shared_rad2])
+        status = Status.TRACKING if self._is_sure else Status.INITIALISING
+        if belief.sigma_m > _LOST_M and self._is_sure:
+            status = Status.LOST
+            reasons["blind"] = f"no marking was matched for {stamp_s - self._belief.stamp_s:.1f} s or more"
+        if self._pace_reason is not None:
+            status = Status.LOST
+        if self._agreement.differs:
+            reasons["map"] = (
+                f"the map explains {100 * self._agreement.share:.0f} % of the markings seen in the last m, "
+                "and too few of the latest"
+            )
+        turned = self._turned_cameras(belief)
+        protection = _protection(covariance, float(belief.mean[HEADING]))
+        if status != Status.TRACKING or self._rig.is_suspicious:
+            protection = (np.inf, np.inf, np.inf)
+        if status == Status.INITIALISING:
+            covariance = np.full((3, 3), np.inf)
+        if self._turned_s is not None:
+            reasons["rig"] = f"a camera's mounting has turned since {self._turned_s:.1f} s"
+        motion = (float(np.exp(belief.mean[3])), float(belief.mean[4]))
+        return Pose(
+            stamp_s=stamp_s,
+            status=status,
+            map_from_vehicle=belief.map_from_vehicle(plane),
+            covariance=covariance,
+            protection_m=protection[:2],
+            protection_rad=protection[2],
+            motion=motion,
+            matched=self._matched,
+            reasons=tuple(reasons.values()),
+            turned=turned,
+        )
+
+    def _turned_cameras(self, belief: Belief) -> tuple[Turned, ...]:
+        """The cameras whose mountings are surely no longer their calibrations'."""
+        out = []
+        for name, number in self._numbers.items():
+            begin = VEHICLE + CAMERA * number + 3
+            turn_rad = belief.mean[begin : begin + 3]
+            posterior = belief.covariance(range(begin, begin + 3))
+            if sigmas_off(turn_rad, self._mountings[number][3:, 3:], posterior) < _TURNED_SIGMAS:
+                self._turned.pop(name, None)
+                continue
+            since_s = self._turned.setdefault(name, self._turned_s or belief.stamp_s)
+            turn, sigma = np.degrees(turn_rad).tolist(), np.degrees(np.sqrt(np.diag(posterior))).tolist()
+            out.append(Turned(name, since_s, (turn[0], turn[1], turn[2]), (sigma[0], sigma[1], sigma[2])))
+        return tuple(out)
+
+
+def _protection(covariance: FloatArray, heading_rad: float) -> tuple[float, float, float]:
+    """Bounds ahead, to the left and of the heading that one error in a thousand exceeds."""
+    c, s = np.cos(heading_rad), np.sin(heading_rad)
+    turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    sigma = np.sqrt(np.diag(turn @ covariance @ turn.T))
+    ahead, left, heading = (_PROTECTION_SIGMAS * sigma).tolist()
+    return ahead, left, heading

@@ -1,0 +1,151 @@
+"""The vehicle's own motion: an odometry of speeds and yaw rates, and what may be wrong with it."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from v2hdm.records import FloatArray
+
+_KEPT_S = 5.0  # time for which samples are kept: longer than any image is late
+_LARGEST_SPEED_M_S = 60.0  # largest speed, m/s, of a road vehicle
+_LARGEST_YAW_RATE_RAD_S = 3.0  # largest yaw rate, rad/s: full lock at a crawl is under 1
+_GAP_S = 0.3  # time without a sample, s, from which the last one says little
+_ACCELERATION_M_S2 = 1.5  # standard deviation of the acceleration in a gap: a yard truck brakes with 2 to 3
+_TURN_ACCELERATION_RAD_S2 = 0.3  # the same of the yaw rate: full lock within two seconds
+_CLOCK_BACK_S = 1.0  # a stamp that lies farther back than this, s, is of a clock that was set
+
+
+class Motion(NamedTuple):
+    """One sample of an odometry: of the vehicle's origin, forward and to the left positive."""
+
+    stamp_s: float
+    speed_m_s: float
+    yaw_rate_rad_s: float
+
+
+@dataclass(frozen=True)
+class MotionNoise:
+    """What an odometry may be wrong by; standard deviations, of data sheets of wheels and MEMS gyros.
+
+    Attributes:
+        scale: of the logarithm of true over stated speed.
+        bias_rad_s: of the yaw rate at rest.
+        speed_m_sqrt_s: of the way after a second, that is m per root of a second.
+        yaw_rad_sqrt_s: of the heading after a second.
+        slip_m_sqrt_s: of the way sideways after a second.
+        bias_walk_rad_s: of the change of the bias after a second.
+    """
+
+    scale: float = 0.02
+    bias_rad_s: float = 0.003
+    speed_m_sqrt_s: float = 0.02
+    yaw_rad_sqrt_s: float = 5e-4
+    slip_m_sqrt_s: float = 0.01
+    bias_walk_rad_s: float = 1e-5
+
+
+class Piece(NamedTuple):
+    """A time over which the motion is taken for constant."""
+
+    length_s: float
+    speed_m_s: float
+    yaw_rate_rad_s: float
+    speed_sigma_m_s: float  # beside the noise of samples: of a gap
+    yaw_rate_sigma_rad_s: float
+
+
+@dataclass
+class MotionLog:
+    """The last seconds of an odometry, in order; what does not belong is left out and counted."""
+
+    stamps_s: list[float] = field(default_factory=list)
+    samples: list[Motion] = field(default_factory=list)
+    refused: int = 0
+    late: int = 0
+
+    def add(self, sample: Motion) -> str | None:
+        """Take a sample; a sentence where the clock was set back, so that nothing before it counts."""
+        if not (
+            np.isfinite(sample).all()
+            and abs(sample.speed_m_s) <= _LARGEST_SPEED_M_S
+            and abs(sample.yaw_rate_rad_s) <= _LARGEST_YAW_RATE_RAD_S
+        ):
+            self.refused += 1
+            return None
+        problem = None
+        if self.stamps_s and sample.stamp_s <= self.stamps_s[-1]:
+            back_s = self.stamps_s[-1] - sample.stamp_s
+            if back_s <= _CLOCK_BACK_S:
+                self._insert(sample)
+                return None
+            problem = f"the odometry's clock went back by {back_s:.1f} s"
+            self.stamps_s.clear()
+            self.samples.clear()
+        self.stamps_s.append(sample.stamp_s)
+        self.samples.append(sample)
+        old = bisect_left(self.stamps_s, sample.stamp_s - _KEPT_S) - 1
+        if old > 0:
+            del self.stamps_s[:old], self.samples[:old]
+        return problem
+
+    def _insert(self, sample: Motion) -> None:
+        """Put a late sample in its place; one with a stamp that is there already is left out."""
+        place = bisect_left(self.stamps_s, sample.stamp_s)
+        self.late += 1
+        if self.stamps_s[place] != sample.stamp_s:
+            self.stamps_s.insert(place, sample.stamp_s)
+            self.samples.insert(place, sample)
+
+    @property
+    def newest_s(self) -> float | None:
+        """The stamp of the newest sample."""
+        return self.stamps_s[-1] if self.stamps_s else None
+
+    def pieces(self, begin_s: float, end_s: float) -> list[Piece]:
+        """The motion from one time to a later one; before and after all samples the nearest one holds."""
+        first = bisect_right(self.stamps_s, begin_s)
+        last = bisect_left(self.stamps_s, end_s)
+        times = [begin_s, *self.stamps_s[first:last], end_s]
+        out = []
+        for start_s, stop_s in pairwise(times):
+            if stop_s > start_s:
+                out.append(self._piece(start_s, stop_s))
+        return out
+
+    def _piece(self, start_s: float, stop_s: float) -> Piece:
+        length_s = stop_s - start_s
+        if not self.samples:
+            return Piece(length_s, 0.0, 0.0, 5.0, 0.3)  # a yard's usual speeds and turns
+        after = bisect_left(self.stamps_s, stop_s)
+        before = max(bisect_right(self.stamps_s, start_s) - 1, 0)
+        nearest_s = self.stamps_s[before]
+        if after < len(self.samples) and self.stamps_s[after] > nearest_s:
+            share = (0.5 * (start_s + stop_s) - nearest_s) / (self.stamps_s[after] - nearest_s)
+            share = min(max(share, 0.0), 1.0)
+            one, two = self.samples[before], self.samples[after]
+            speed = one.speed_m_s + share * (two.speed_m_s - one.speed_m_s)
+            turn = one.yaw_rate_rad_s + share * (two.yaw_rate_rad_s - one.yaw_rate_rad_s)
+            gap_s = self.stamps_s[after] - nearest_s
+        else:
+            speed, turn = self.samples[before][1:]
+            gap_s = max(stop_s - nearest_s, nearest_s - start_s)
+        unknown_s = max(gap_s - _GAP_S, 0.0)
+        return Piece(
+            length_s, speed, turn, _ACCELERATION_M_S2 * unknown_s, _TURN_ACCELERATION_RAD_S2 * unknown_s
+        )
+
+
+def moved(pieces: list[Piece]) -> FloatArray:
+    """The pose (3,) of x, y and heading after pieces of motion, from the one before."""
+    x, y, heading = 0.0, 0.0, 0.0
+    for piece in pieces:
+        middle = heading + 0.5 * piece.yaw_rate_rad_s * piece.length_s
+        x += piece.speed_m_s * piece.length_s * np.cos(middle)
+        y += piece.speed_m_s * piece.length_s * np.sin(middle)
+        heading += piece.yaw_rate_rad_s * piece.length_s
+    return np.array([x, y, heading])

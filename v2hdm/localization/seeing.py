@@ -1,0 +1,148 @@
+"""Where the map's markings should be in an image, and how that depends on every state."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from v2hdm.geometry.lens import has_distortion, undistort_points
+from v2hdm.geometry.rigid import exp, hat
+from v2hdm.localization.belief import CAMERA, HEADING, HEIGHT, VEHICLE, Belief, Plane
+from v2hdm.records import BoolArray, Calibration, FloatArray, IntArray, LaneDetection, MarkingDetection
+
+_NEAREST_M = 0.3  # least depth, m, at which a corner can be seen
+_LARGEST_PX = 1e4  # standard deviation, px, from which a corner says nothing
+_STEP_PX = 0.5
+
+
+@dataclass(frozen=True)
+class Look:
+    """What one image shows: the camera's name, when it was taken, and its detections."""
+
+    camera: str
+    stamp_s: float
+    markings: Sequence[MarkingDetection] = ()
+    lanes: Sequence[LaneDetection] = ()
+
+
+class Sighted(NamedTuple):
+    """The quadrilaterals (D) of a look without lens distortion."""
+
+    kinds: tuple[str, ...]
+    corners_px: FloatArray  # (D, 4, 2) pinhole px
+    covariance_px2: FloatArray  # (D, 8, 8), large where ``informs`` is not set
+    informs: BoolArray  # (D, 4) corners that say anything
+    valid: BoolArray  # (D, 4) corners that are points
+
+    def subset(self, rows: IntArray) -> Sighted:
+        """Some of them."""
+        return Sighted(
+            tuple(self.kinds[row] for row in rows.tolist()),
+            self.corners_px[rows],
+            self.covariance_px2[rows],
+            self.informs[rows],
+            self.valid[rows],
+        )
+
+
+def sighted(look: Look, calibration: Calibration) -> Sighted:
+    """The quadrilaterals of a look of which two corners or more say anything."""
+    quads = [marking for marking in look.markings if not len(marking.outline_px)]
+    corners = np.array([quad.corners_px for quad in quads], dtype=np.float64).reshape(-1, 4, 2)
+    covariance = np.array([quad.covariance_px for quad in quads], dtype=np.float64).reshape(-1, 8, 8)
+    valid = np.array([quad.corner_valid for quad in quads], dtype=bool).reshape(-1, 4)
+    info = calibration.info
+    if len(quads) and has_distortion(info):
+        flat = corners.reshape(-1, 2)
+        steps = np.array([[0.0, 0.0], [_STEP_PX, 0.0], [-_STEP_PX, 0.0], [0.0, _STEP_PX], [0.0, -_STEP_PX]])
+        moved = undistort_points(info, (flat[:, None] + steps).reshape(-1, 2)).reshape(-1, 5, 2)
+        by_px = np.stack([moved[:, 1] - moved[:, 2], moved[:, 3] - moved[:, 4]], axis=2) / (2 * _STEP_PX)
+        corners = moved[:, 0].reshape(-1, 4, 2)
+        blocks = by_px.reshape(-1, 4, 2, 2)
+        spread = np.zeros((len(quads), 8, 8))
+        for corner in range(4):
+            spread[:, 2 * corner : 2 * corner + 2, 2 * corner : 2 * corner + 2] = blocks[:, corner]
+        covariance = spread @ covariance @ spread.swapaxes(1, 2)
+    variance = np.diagonal(covariance, axis1=1, axis2=2).reshape(-1, 4, 2)
+    informs: BoolArray = np.asarray(np.isfinite(corners).all(axis=2) & np.isfinite(variance).all(axis=2))
+    informs &= (variance > 0).all(axis=2) & (variance < _LARGEST_PX**2).all(axis=2)
+    silent = ~np.repeat(informs, 2, axis=1)
+    covariance = np.where(silent[:, :, None] | silent[:, None, :], 0.0, np.nan_to_num(covariance))
+    covariance += silent[:, :, None] * (_LARGEST_PX**2 * np.eye(8))
+    corners = np.where(informs[..., None], corners, 0.0)
+    kinds = tuple(quad.kind for quad in quads)
+    found = Sighted(kinds, corners, covariance, informs, valid & informs)
+    return found.subset(np.flatnonzero(informs.sum(axis=1) >= 2))
+
+
+class Expected(NamedTuple):
+    """Markings (M) as a camera should see them at a belief's mean."""
+
+    px: FloatArray  # (M, 4, 2) pinhole px, nan behind the camera
+    depth_m: FloatArray  # (M, 4)
+    by_vehicle: FloatArray  # (M, 8, 10)
+    by_camera: FloatArray  # (M, 8, 6)
+    by_place: FloatArray  # (M, 4, 2, 2) by each corner's place in the map
+
+
+def expect(
+    belief: Belief, plane: Plane, camera: int, calibration: Calibration, corners_map: FloatArray
+) -> Expected:
+    """Where corners (M, 4, 3) should be in an image of a camera, and the derivatives."""
+    pose = belief.map_from_vehicle(plane)
+    begin = VEHICLE + CAMERA * camera
+    cam_from_vehicle = exp(belief.mean[begin : begin + CAMERA]) @ calibration.cam_from_vehicle
+    rotation = pose[:3, :3]
+    turn = cam_from_vehicle[:3, :3]
+    vehicle = (corners_map - pose[:3, 3]) @ rotation
+    cam = vehicle @ turn.T + cam_from_vehicle[:3, 3]
+    depth_m = cam[..., 2]
+    intrinsic = calibration.info.intrinsic
+    safe = np.where(depth_m > _NEAREST_M, depth_m, np.nan)
+    px = (cam @ intrinsic[:2].T) / safe[..., None]
+    by_cam = (intrinsic[:2] - px[..., None] * np.array([0.0, 0.0, 1.0])) / safe[..., None, None]
+    by_vehicle_point = by_cam @ turn
+    by_map = by_vehicle_point @ rotation.T
+    by_vehicle = np.zeros((*px.shape, VEHICLE))
+    by_vehicle[..., :2] = -by_map[..., :2]
+    by_vehicle[..., HEIGHT] = -by_map[..., 2]
+    # About the axis up in the map, the vehicle's own axis ahead, and its axis to the left before it rolls.
+    up = rotation[2]
+    left = np.array([0.0, up[2], -up[1]]) / max(float(np.hypot(up[1], up[2])), 1e-9)
+    for states, axis in (((HEADING,), up), ((6, 8), np.array([1.0, 0.0, 0.0])), ((7, 9), left)):
+        slope = (by_vehicle_point @ -(vehicle @ hat(axis).T)[..., None])[..., 0]
+        for state in states:
+            by_vehicle[..., state] = slope
+    by_camera = np.concatenate([by_cam, by_cam @ -hat(cam)], axis=-1)
+    count = len(corners_map)
+    return Expected(
+        px,
+        depth_m,
+        by_vehicle.reshape(count, 8, VEHICLE),
+        by_camera.reshape(count, 8, CAMERA),
+        by_map[..., :2],
+    )
+
+
+def ground_points(
+    corners_px: FloatArray, map_from_vehicle: FloatArray, plane: Plane, calibration: Calibration
+) -> FloatArray:
+    """Where pinhole pixels (..., 2) meet the map's ground (..., 2); nan on and above the horizon."""
+    map_from_cam = map_from_vehicle @ np.linalg.inv(calibration.cam_from_vehicle)
+    homogeneous = np.concatenate([corners_px, np.ones((*corners_px.shape[:-1], 1))], axis=-1)
+    rays = homogeneous @ np.linalg.inv(calibration.info.intrinsic).T @ map_from_cam[:3, :3].T
+    centre = map_from_cam[:3, 3]
+    normal = np.array([-plane.slope[0], -plane.slope[1], 1.0])
+    place = np.array([map_from_vehicle[0, 3], map_from_vehicle[1, 3], plane.height_m])
+    down = rays @ normal
+    with np.errstate(divide="ignore", invalid="ignore"):
+        far = ((place - centre) @ normal) / np.where(down < 0, down, np.nan)
+        return np.asarray((centre + far[..., None] * rays)[..., :2])
+
+
+def index_of(calibrations: Mapping[str, Calibration]) -> dict[str, int]:
+    """The cameras' numbers."""
+    return {name: number for number, name in enumerate(calibrations)}
