@@ -152,8 +152,8 @@ class _Course:
             failure = future.exception()
             if not isinstance(failure, KilledWorker):
                 return tasks.Outcome(tasks.FAILED, failure)
-            begun = self._cluster.client.get_metadata(tasks.begun_key(self._name.token, number), 0)
-            kind = tasks.DEAD if begun >= tasks.MOST_BEGUN else tasks.STOPPED
+            begins = self._cluster.client.get_metadata(tasks.begun_key(self._name.token, number), 0)
+            kind = tasks.DEAD if begins >= tasks.MOST_BEGUN else tasks.STOPPED
             return tasks.Outcome(kind, TWICE_DEAD)
         raise WorkerError(_GONE.format(self._cluster.name))
 

@@ -197,9 +197,9 @@ def _problem_of(answer: Any, local_versions: Mapping[str, str], code: str) -> st
     if isinstance(answer, Exception):
         return f"cannot be asked ({type(answer).__name__}: {one_line(str(answer))}); install the same V2HDM"
     for library, version in local_versions.items():
-        other = answer.versions.get(library, "none")
-        if other != version:
-            return f"has {library} {other}, and this machine {version}; install the same on both"
+        there = answer.versions.get(library, "none")
+        if there != version:
+            return f"has {library} {there}, and this machine {version}; install the same on both"
     if answer.code != code:
         return "has another V2HDM than this machine; install the same on both"
     if answer.threads != 1:
