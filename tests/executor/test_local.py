@@ -113,6 +113,16 @@ def test_each_process_has_one_thread(two):
     assert os.getpid() not in {outcome[2] for outcome in done.values()}
 
 
+def test_no_more_processes_start_than_there_are_jobs():
+    with open_executor(3) as executor:
+        counts = []
+        for jobs in (1, 2):
+            dict(executor.side_by_side(variables, range(jobs)))
+            counts.append(len(multiprocessing.active_children()))
+    assert counts[1] == counts[0] + 1
+    assert executor.workers == 3
+
+
 def test_jobs_tell_their_steps_and_processes_stay_for_the_next_stage():
     told = []
     with open_executor(2) as executor:

@@ -37,6 +37,8 @@ class Cluster:
     client: Client
     name: str
     leave: Callable[[], None]
+    grow: Callable[[int], None] = lambda workers: None
+    """Start processes until there are so many, where they are ours to start."""
 
 
 class ClusterExecutor(Executor):
@@ -50,6 +52,10 @@ class ClusterExecutor(Executor):
     def workers(self) -> int:
         """How many jobs are done at a time."""
         return self._workers
+
+    def grow(self, workers: int) -> None:
+        """Start processes until there are so many, where they are ours to start."""
+        self._cluster.grow(workers)
 
     def close(self) -> None:
         """Leave the cluster; processes of this machine end."""
