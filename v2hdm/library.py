@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from v2hdm.doors import check_types, checked
+from v2hdm.executor import open_executor
 from v2hdm.io.drive import as_drive, read_drive
 from v2hdm.io.maps.reading import read_map as _read
 from v2hdm.progress import Steps
@@ -103,7 +104,9 @@ def simulate_port(
 
     config = config or _short_port()
     check_types(config, "config.")
-    return read_drive(rendered_drive(config, Path(folder), workers, progress or (lambda done, total: None)))
+    steps = progress or (lambda done, total: None)
+    with open_executor(workers) as executor:
+        return read_drive(rendered_drive(config, Path(folder), executor, steps))
 
 
 def _short_port() -> PortConfig:

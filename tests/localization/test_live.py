@@ -3,16 +3,22 @@
 import json
 import subprocess
 import sys
+import threading
+import time
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 
 from tests.localization.driven import MOUNT, cameras, drive, mapped, moved, yard
+from v2hdm.cli.main import run
 from v2hdm.detection.frames import Frame
 from v2hdm.detection.road import Road, RoadMarking, as_record
 from v2hdm.errors import ConfigError, MapFileError
 from v2hdm.geometry.rigid import exp
-from v2hdm.localization import belief
+from v2hdm.io.calibration.writing import write_calibration
+from v2hdm.io.maps.geojson import write_geojson
+from v2hdm.localization import belief, live
 from v2hdm.localization.localizer import Fix, Localizer, Status
 from v2hdm.localization.motion import Motion, MotionLog, MotionNoise
 from v2hdm.localization.seeing import Look, expect
@@ -350,3 +356,51 @@ def test_the_localiser_needs_no_more_than_the_base_install():
     program += "import v2hdm.localization.live, v2hdm.localization.stream, v2hdm.localization.localizer"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_lines_come_as_images_do_and_end_with_the_cameras(monkeypatch, tmp_path):
+    painted = yard(18)
+    driven = drive(painted, 18, seconds=2.0)
+    localizer = Localizer(mapped(painted, 18), driven.calibrations, driven.rough(np.random.default_rng(0)))
+    motion = tmp_path / "odometry.csv"
+    rows = [",".join(map(str, sample)) for part in driven.motion for sample in part]
+    motion.write_text("\n".join(["stamp_s,speed_m_s,yaw_rate_rad_s", *rows, ""]))
+    looks = [look for moment in driven.looks for look in moment]
+
+    @contextmanager
+    def camera(name, source, calibration, items, delay_s):
+        def play():
+            time.sleep(0.2)  # the odometry is read first
+            for look in looks:
+                if look.camera == name:
+                    items.put(look)
+                    time.sleep(0.002)
+            items.put(live._Ended(name, None))
+
+        threading.Thread(target=play, daemon=True).start()
+        yield
+
+    monkeypatch.setattr(live, "_camera", camera)
+    poses = []
+    files = dict.fromkeys(driven.calibrations, tmp_path)
+    sources = dict.fromkeys(driven.calibrations, "folder")
+    live.localize_live(localizer, sources, files, motion, MotionLines("odometry", None), poses.append)
+    assert poses[-1].status == Status.TRACKING
+    assert np.hypot(*driven.errors(poses[-1], len(driven.looks) - 1)[:2]) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ("--images front", "give a camera's name and its folder"),
+        ("--images side=images", "no calibration of camera 'side'"),
+        ("--images front=nowhere", "camera front: --live: nowhere is not a camera's index or a folder"),
+    ],
+)
+def test_sources_that_are_none_are_one_line(arguments, says, tmp_path, capsys):
+    write_geojson(yard(0), tmp_path / "map.geojson")
+    write_calibration(cameras()["front"], tmp_path / "calibration_front.yaml")
+    (tmp_path / "motion.csv").write_text("")
+    given = f"localize {tmp_path} --live {arguments} --motion {tmp_path / 'motion.csv'}"
+    assert run(given.split()) == 2
+    assert says in capsys.readouterr().err

@@ -18,6 +18,10 @@ _FROM = 6  # objects from which a share says something
 _LEAST_SHARE = 0.67
 """Least share of what is seen that the map explains: of a right one it is 0.86 and more, with half of the
 markings moved about 0.5, of another site's 0.04."""
+# Log likelihood ratios of an object by a map with half of the markings moved and by a right one.
+_NOT_EXPLAINED = np.log(0.5 / 0.15)
+_EXPLAINED = np.log(0.5 / 0.85)
+_DIFFERS_LIMIT = 6.0  # sum of these, since it began to rise, from which a map differs (Page 1954)
 _LOST_SHARE = 0.34  # share below which the map explains next to nothing
 
 # Log likelihood ratio at which the odometry counts as off by a factor: one in e^9 of right ones comes so far.
@@ -91,8 +95,12 @@ class Agreement:
 
     @property
     def differs(self) -> bool:
-        """Whether the map has too little of what is seen."""
-        return self.share < _LEAST_SHARE
+        """Whether the map has too little of what is seen: of all in the last metres, or of what came last."""
+        evidence = 0.0
+        for own in self._several:
+            gain = _EXPLAINED if own.explained >= own.not_explained else _NOT_EXPLAINED
+            evidence = max(0.0, evidence + float(gain))
+        return self.share < _LEAST_SHARE or evidence > _DIFFERS_LIMIT
 
     @property
     def is_lost(self) -> bool:

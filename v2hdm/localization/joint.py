@@ -22,7 +22,7 @@ _GATE = 3.3  # one in two thousand right pairs, or right sets of them, fits wors
 _CLEARER_BY = 9.0
 _ROUNDS = 3  # of pairing what is clear once the clearer pairs are known
 _STEPS = 4  # of an update: half a metre off at the first, a few millimetres at the third
-_SETTLED = 1e-3  # longest step, in sigmas of the prior belief, that changes nothing any more
+_SETTLED = 0.02  # longest step, in sigmas of the prior belief, that changes nothing any more
 # Degrees of freedom of the t distribution of a detection's error: shadow and wear misplace one in fifty.
 _TAIL = 12.0
 _SHIFT_ROWS = (2 * SHIFTS[..., None] + np.arange(2)).reshape(4, 8)
@@ -164,7 +164,14 @@ def _order(seen: Sighted, detection: IntArray, px: FloatArray, state_px2: FloatA
     return np.asarray(_SHIFT_ROWS[squared.argmin(axis=1)])
 
 
-def clear_pairs(pairs: Pairs, loss: FloatArray) -> Pairs:
+class Clear(NamedTuple):
+    """Pairs that are clear, and whether others are not: that may be told once the clear ones are known."""
+
+    pairs: Pairs
+    is_all: bool
+
+
+def clear_pairs(pairs: Pairs, loss: FloatArray) -> Clear:
     """Of all pairs the ones that are the only explanation of a detection, one for each marking."""
     order = np.argsort(loss, kind="stable")
     best: dict[int, int] = {}
@@ -182,7 +189,7 @@ def clear_pairs(pairs: Pairs, loss: FloatArray) -> Pairs:
         if detection not in doubted and marking not in taken:
             rows.append(row)
             taken.add(marking)
-    return pairs.subset(np.array(sorted(rows), dtype=np.int64))
+    return Clear(pairs.subset(np.array(sorted(rows), dtype=np.int64)), not doubted)
 
 
 def update(belief: Belief, scene: Scene, pairs: Pairs) -> Located:
@@ -224,15 +231,17 @@ def update(belief: Belief, scene: Scene, pairs: Pairs) -> Located:
 def locate(belief: Belief, scene: Scene) -> Located:
     """The belief after an image, whose detections are paired by individual and joint compatibility."""
     pairs, loss = candidates(belief, scene)
-    chosen = clear_pairs(pairs, loss)
+    chosen, is_all = clear_pairs(pairs, loss)
     nothing = Located(belief, chosen, 0.0, 0.0, 0.0, 0.0)
     if not len(chosen.detection):
         return nothing
     located = update(belief, scene, chosen)
     for _ in range(_ROUNDS - 1):
+        if is_all:
+            break
         pairs, loss = candidates(located.belief, scene)
         is_new = ~np.isin(pairs.detection, chosen.detection) & ~np.isin(pairs.marking, chosen.marking)
-        more = clear_pairs(pairs.subset(is_new), loss[is_new])
+        more, is_all = clear_pairs(pairs.subset(is_new), loss[is_new])
         if not len(more.detection):
             break
         chosen = Pairs(*(np.concatenate(both) for both in zip(chosen, more, strict=True)))

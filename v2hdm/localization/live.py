@@ -108,13 +108,15 @@ def _available(items: _Queue) -> Iterator[_Item]:
 def _camera(name: str, source: str, calibration: Path, items: _Queue, delay_s: float) -> Iterator[None]:
     """A process that detects in the newest images of a camera, as ``v2hdm detect --live`` does."""
     command = [sys.executable, "-m", "v2hdm.detect", source, "--camera", str(calibration), "--live"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    threading.Thread(target=_follow_camera, args=(name, process, items, delay_s), daemon=True).start()
-    try:
-        yield
-    finally:
-        process.terminate()
-        process.wait()
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        arguments = (name, process, items, delay_s)
+        reader = threading.Thread(target=_follow_camera, args=arguments, daemon=True)
+        reader.start()
+        try:
+            yield
+        finally:
+            process.terminate()
+            reader.join()
 
 
 def _follow_camera(name: str, process: subprocess.Popen[str], items: _Queue, delay_s: float) -> None:

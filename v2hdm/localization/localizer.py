@@ -265,7 +265,9 @@ class Localizer:
         seen = sighted(look, calibration)
         if is_new:
             self._count_way(look.stamp_s)
-            self._search.patch.add(seen, look.camera, calibration, self._local_at(look.stamp_s), self._way_m)
+            if self._belief is None:
+                local = self._local_at(look.stamp_s)
+                self._search.patch.add(seen, look.camera, calibration, local, self._way_m)
             since_s = self._pace.since(look.camera)
             pieces = [] if since_s is None else self._log.pieces(since_s, look.stamp_s)
             self._pace_reason = self._pace.note(look, seen, calibration, pieces) or self._pace_reason
@@ -494,7 +496,7 @@ class Localizer:
         belief = self._moved_to(self._belief, stamp_s)
         plane = self.paint.ground(belief.mean[:2])
         covariance = belief.covariance([0, 1, 2])
-        covariance[:2, :2] += self.paint.shared_m2 * np.eye(2)
+        covariance += np.diag([self.paint.shared_m2, self.paint.shared_m2, self.paint.shared_rad2])
         status = Status.TRACKING if self._is_sure else Status.INITIALISING
         if belief.sigma_m > _LOST_M and self._is_sure:
             status = Status.LOST
@@ -503,8 +505,8 @@ class Localizer:
             status = Status.LOST
         if self._agreement.differs:
             reasons["map"] = (
-                f"the map explains only {100 * self._agreement.share:.0f} % of the markings seen in the last "
-                "metres"
+                f"the map explains {100 * self._agreement.share:.0f} % of the markings seen in the last m, "
+                "and too few of the latest"
             )
         turned = self._turned_cameras(belief)
         protection = _protection(covariance, float(belief.mean[HEADING]))

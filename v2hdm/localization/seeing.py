@@ -113,7 +113,7 @@ def expect(
     up = rotation[2]
     left = np.array([0.0, up[2], -up[1]]) / max(float(np.hypot(up[1], up[2])), 1e-9)
     for states, axis in (((HEADING,), up), ((6, 8), np.array([1.0, 0.0, 0.0])), ((7, 9), left)):
-        slope = (by_vehicle_point @ -np.cross(axis, vehicle)[..., None])[..., 0]
+        slope = (by_vehicle_point @ -(vehicle @ hat(axis).T)[..., None])[..., 0]
         for state in states:
             by_vehicle[..., state] = slope
     by_camera = np.concatenate([by_cam, by_cam @ -hat(cam)], axis=-1)

@@ -69,11 +69,14 @@ def _run_live(arguments: Sequence[str]) -> int:
     )
     parser.add_argument("--limit", type=int, metavar="N", help="stop after N images")
     parser.add_argument("--output", type=Path, metavar="FILE", help="for the JSON lines (default: stdout)")
+    mcap = "a new folder for an MCAP of ROS 2 messages (extra ros)"
+    parser.add_argument("--mcap", type=Path, metavar="DIR", help=mcap)
     parsed = parser.parse_args(arguments)
     from v2hdm.io.calibration.reading import trusted_calibrations
     from v2hdm.io.maps.reading import read_geojson
     from v2hdm.localization.live import localize_live
     from v2hdm.localization.localizer import Localizer, Pose
+    from v2hdm.localization.messages import pose_bag
     from v2hdm.localization.places import rough_position
     from v2hdm.localization.stream import MotionLines, pose_record
     from v2hdm.store.lines import lines_to
@@ -92,10 +95,12 @@ def _run_live(arguments: Sequence[str]) -> int:
     lines = MotionLines("standard input" if is_stdin else parsed.motion, hd_map.origin)
     stream_in = sys.stdin if is_stdin else Path(parsed.motion)
 
-    with lines_to(parsed.output, b'{"stamp_s": ', "poses", grows=True) as stream:
+    lines_of_poses = lines_to(parsed.output, b'{"stamp_s": ', "poses", grows=True)
+    with pose_bag(parsed.mcap) as write_message, lines_of_poses as stream:
 
         def write(pose: Pose) -> None:
             print(json.dumps(pose_record(pose)), file=stream, flush=True)
+            write_message(pose)
 
         try:
             localize_live(

@@ -1,0 +1,231 @@
+"""How well a vehicle finds itself live on both ports, and whether it says so where it cannot.
+
+    python -m tests.benchmarks.live_localizer --seeds 3 --seconds 30 --starts 40
+
+Maps with errors as the mapping states them, drives of another day, detections with the errors of detectors on
+renders, drawn anew (:mod:`tests.benchmarks.made.live`). An odometry is off by 1 % and .01 deg/s (one sigma).
+For each drive: errors of the tracked poses, shares inside the 95 % ellipse and inside the bounds, CPU time of
+the localiser alone. Then starts from random places known to 5 m and 20 deg, and from nothing; a map of the
+other port; half of the markings repainted 30 cm off, from the start and from the middle on; a camera that was
+pushed by half a degree about each axis.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from tests.benchmarks.made.live import LiveDrive, bumped, drive, looks_of, moved, port_recipe
+from v2hdm.geometry.planar import wrapped
+from v2hdm.geometry.rigid import heading_rad
+from v2hdm.localization.localizer import Localizer, Pose, Status
+from v2hdm.localization.places import Prior, rough_position
+from v2hdm.localization.seeing import Look
+from v2hdm.records import FloatArray, HDMap
+
+PORTS = ("port1", "port2")
+_ROUGH_M, _ROUGH_RAD = 5.0, np.deg2rad(20.0)
+_SQUARE_95 = 5.991  # chi-square quantile of two coordinates
+_WRONG_M = 0.3  # a tracked pose so far off is confidently wrong
+_START_FRAMES = 30
+_PUSHED_RAD = np.deg2rad(0.5)
+
+
+class Run(NamedTuple):
+    """The poses of a drive (F), and the CPU time of an image, s."""
+
+    poses: list[Pose]
+    frames: range
+    cpu_s: float
+
+
+class Errors(NamedTuple):
+    """Of tracked poses (K)."""
+
+    errors: FloatArray  # (K, 3) ahead, left, m, and heading, rad
+    bounds: FloatArray  # (K, 3)
+    squared: FloatArray  # (K,) of the place, in sigmas
+    sigma_rad: FloatArray  # (K,)
+
+
+def rough(driven: LiveDrive, frame: int, rng: np.random.Generator) -> Prior:
+    """Where a vehicle is at a moment, within 5 m and 20 deg."""
+    true = driven.map_from_vehicle[frame]
+    angle, radius = rng.uniform(0, 2 * np.pi), _ROUGH_M * np.sqrt(rng.random())
+    x, y = true[:2, 3] + radius * np.array([np.cos(angle), np.sin(angle)])
+    heading = float(heading_rad(true)) + rng.uniform(-_ROUGH_RAD, _ROUGH_RAD)
+    return rough_position(float(x), float(y), float(np.degrees(heading)))
+
+
+def follow(
+    driven: LiveDrive,
+    prior: Prior | None,
+    frames: range,
+    maps: Mapping[int, HDMap] | HDMap | None = None,
+    looks: Sequence[list[Look]] | None = None,
+) -> Run:
+    """Localise through some moments of a drive."""
+    hd_map = maps if isinstance(maps, HDMap) else driven.hd_map
+    localizer = Localizer(hd_map, driven.calibrations, prior)
+    begin_s = time.process_time()
+    shown = driven.looks if looks is None else looks
+    poses = [localizer.update(shown[frame], driven.motion[frame]) for frame in frames]
+    images = sum(len(shown[frame]) for frame in frames)
+    return Run(poses, frames, (time.process_time() - begin_s) / max(images, 1))
+
+
+def errors_of(driven: LiveDrive, run: Run) -> Errors:
+    """The errors of the tracked poses."""
+    rows = []
+    for frame, pose in zip(run.frames, run.poses, strict=True):
+        if pose.status != Status.TRACKING or pose.map_from_vehicle is None:
+            continue
+        true = driven.map_from_vehicle[frame]
+        off = pose.map_from_vehicle[:2, 3] - true[:2, 3]
+        heading = float(heading_rad(true))
+        c, s = np.cos(heading), np.sin(heading)
+        turn = float(wrapped(heading_rad(pose.map_from_vehicle) - heading))
+        squared = float(off @ np.linalg.solve(pose.covariance[:2, :2], off))
+        sigma_rad = float(np.sqrt(pose.covariance[2, 2]))
+        place = [c * off[0] + s * off[1], c * off[1] - s * off[0], turn]
+        rows.append([*place, *pose.protection_m, pose.protection_rad, squared, sigma_rad])
+    table = np.array(rows).reshape(-1, 8)
+    return Errors(table[:, :3], table[:, 3:6], table[:, 6], table[:, 7])
+
+
+def tracking_line(parts: Sequence[Errors], count: int, cpu_s: float) -> str:
+    """The figures of drives as one line."""
+    errors, bounds, squared, sigma = (np.concatenate(own) for own in zip(*parts, strict=True))
+    rmse = np.sqrt((errors**2).mean(axis=0)) * [100, 100, np.degrees(1)]
+    inside = (squared < _SQUARE_95).mean()
+    heading = (np.abs(errors[:, 2]) < 1.96 * sigma).mean()
+    held = (np.abs(errors) < bounds).all(axis=1).mean()
+    return (
+        f"tracked {len(errors) / count:.3f}, along {rmse[0]:.2f} cm, lateral {rmse[1]:.2f} cm, "
+        f"heading {rmse[2]:.3f} deg, inside 95 %: {inside:.3f}, heading {heading:.3f}, "
+        f"inside the bounds {held:.4f} of {len(errors)}, CPU {1e3 * cpu_s:.1f} ms an image"
+    )
+
+
+def starts(driven: LiveDrive, count: int, rng: np.random.Generator, known: bool) -> tuple[int, int, int]:
+    """Right, wrong and no starts from random places."""
+    right = wrong = 0
+    for begin in rng.integers(0, len(driven.stamp_s) - _START_FRAMES, count).tolist():
+        frames = range(begin, begin + (_START_FRAMES if known else 75))
+        frames = range(begin, min(frames.stop, len(driven.stamp_s)))
+        found = errors_of(driven, follow(driven, rough(driven, begin, rng) if known else None, frames))
+        if not len(found.errors):
+            continue
+        is_wrong = np.hypot(*found.errors[:, :2].T).max() > _WRONG_M
+        wrong += bool(is_wrong)
+        right += not is_wrong
+    return right, wrong, count - right - wrong
+
+
+def said(run: Run, since: int) -> float:
+    """How long after a moment a reason, a camera or the loss was said, s; infinite if never."""
+    for frame, pose in zip(run.frames, run.poses, strict=True):
+        if frame >= since and (pose.reasons or pose.turned or pose.status == Status.LOST):
+            return (frame - since) / 10.0
+    return float("inf")
+
+
+def wrong_map_line(driven: LiveDrive, other: HDMap, rng: np.random.Generator) -> str:
+    """Drives in the map of another port."""
+    times, confident, ways = [], 0, []
+    for begin in range(0, len(driven.stamp_s) - 40, 40):
+        run = follow(driven, rough(driven, begin, rng), range(begin, begin + 40), other)
+        confident += any(pose.status == Status.TRACKING for pose in run.poses)
+        times.append(said(run, begin))
+        ways.append(4.0 * times[-1])
+    return (
+        f"wrong map: said after {np.median(times):.1f} s, at most {max(times):.1f} s; confident {confident}"
+    )
+
+
+def repainted_line(driven: LiveDrive, rng: np.random.Generator, seed: int) -> str:
+    """Half of the markings 30 cm off."""
+    hd_map = moved(driven.hd_map, 0.5, 0.3, seed)
+    run = follow(driven, rough(driven, 0, rng), range(100), hd_map)
+    at_start = errors_of(driven, run)
+    middle = len(driven.stamp_s) // 2
+    place = driven.map_from_vehicle[middle, :2, 3]
+    ahead = driven.map_from_vehicle[middle, :2, 0]
+    later = tuple(
+        new if (new.corners_map.mean(axis=0) - place) @ ahead > 0 else old
+        for new, old in zip(hd_map.markings, driven.hd_map.markings, strict=True)
+    )
+    run_on = follow(
+        driven, rough(driven, 0, rng), range(len(driven.stamp_s)), replace(hd_map, markings=later)
+    )
+    on = errors_of(driven, run_on)
+    outside = sum(int((np.abs(own.errors) > own.bounds).any(axis=1).sum()) for own in (at_start, on))
+    count = len(at_start.errors) + len(on.errors)
+    return (
+        f"half repainted: from the start said after {said(run, 0):.1f} s; from the middle on after "
+        f"{said(run_on, middle):.1f} s; poses outside their bounds {outside} of {count}"
+    )
+
+
+def pushed_line(driven: LiveDrive, rng: np.random.Generator, seed: int) -> str:
+    """A camera turned by half a degree."""
+    middle = len(driven.stamp_s) // 2
+    parts = []
+    for axis in range(3):
+        turn = _PUSHED_RAD * np.eye(3)[axis]
+        world = bumped(driven.world, "front", middle, turn)
+        frames = range(middle, len(driven.stamp_s))
+        looks = [*driven.looks[:middle], *looks_of(world, seed, frames)]
+        run = follow(driven, rough(driven, 0, rng), range(len(driven.stamp_s)), looks=looks)
+        found = errors_of(driven, run)
+        outside = int((np.abs(found.errors) > found.bounds).any(axis=1).sum())
+        named = [own.camera for own in run.poses[-1].turned]
+        parts.append(f"{'xyz'[axis]}: said after {said(run, middle):.1f} s, {named}, outside {outside}")
+    return f"pushed by .5 deg about {'; '.join(parts)}"
+
+
+def main() -> None:
+    """Run the benchmark and print its lines."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--first", type=int, default=0, help="the first seed")
+    parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--starts", type=int, default=40, help="of each drive")
+    parser.add_argument("--only", nargs="*", default=[], metavar="PART", help="starts, wrong, moved, pushed")
+    parsed = parser.parse_args()
+    parts, counts, cpu_s = [], 0, []
+    totals = np.zeros((2, 3), dtype=int)
+    for seed in range(parsed.first, parsed.first + parsed.seeds):
+        driven = {name: drive(port_recipe(name, seed), seed, parsed.seconds) for name in PORTS}
+        for name, own in driven.items():
+            rng = np.random.default_rng([seed, 99])
+            run = follow(own, rough(own, 0, rng), range(len(own.stamp_s)))
+            parts.append(errors_of(own, run))
+            counts += len(run.poses)
+            cpu_s.append(run.cpu_s)
+            print(f"{name}, seed {seed}: {tracking_line(parts[-1:], len(run.poses), run.cpu_s)}", flush=True)
+            only = parsed.only
+            if not only or "starts" in only:
+                totals[0] += starts(own, parsed.starts, rng, known=True)
+                totals[1] += starts(own, max(parsed.starts // 4, 1), rng, known=False)
+            if not only or "wrong" in only:
+                other = driven[PORTS[1 - PORTS.index(name)]].hd_map
+                print(f"  {wrong_map_line(own, other, rng)}", flush=True)
+            if not only or "moved" in only:
+                print(f"  {repainted_line(own, rng, seed)}", flush=True)
+            if not only or "pushed" in only:
+                print(f"  {pushed_line(own, rng, seed)}", flush=True)
+    print(f"all: {tracking_line(parts, counts, float(np.mean(cpu_s)))}")
+    print(
+        f"starts from 5 m and 20 deg: {totals[0, 0]} right, {totals[0, 1]} wrong, {totals[0, 2]} none in 3 s"
+    )
+    print(f"starts from nothing: {totals[1, 0]} right, {totals[1, 1]} wrong, {totals[1, 2]} none within 30 m")
+
+
+if __name__ == "__main__":
+    main()
