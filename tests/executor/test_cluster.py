@@ -8,7 +8,9 @@ import threading
 import time
 from pathlib import Path
 
+import dask
 import pytest
+from distributed import Security
 
 from tests.executor.machines import Machines, free_port
 from tests.executor.test_local import nothing, refuse, slowly_doubled, step_by_step
@@ -116,6 +118,37 @@ def test_a_worker_of_many_threads_is_one_line_with_the_right_command(tmp_path):
         refused = pytest.raises(ConfigError, match="has 3 threads; start it with dask worker --nthreads 1")
         with refused, open_executor(0, machines.address):
             pass
+    finally:
+        machines.close()
+
+
+def certificates(folder):
+    """The files of a cluster of its own: the arguments of its processes, and Dask's settings for a client."""
+    security = Security.temporary()
+    folder.mkdir()
+    for name in ("tls_ca_file", "tls_client_cert", "tls_client_key"):
+        (folder / name).write_text(getattr(security, name))
+    ca, cert, key = (str(folder / name) for name in ("tls_ca_file", "tls_client_cert", "tls_client_key"))
+    tls = "distributed.comm.tls"
+    settings = {f"{tls}.ca-file": ca, f"{tls}.client.cert": cert, f"{tls}.client.key": key}
+    return ["--tls-ca-file", ca, "--tls-cert", cert, "--tls-key", key], settings
+
+
+def test_certificates_that_fit_open_a_cluster_and_others_are_one_line(tmp_path):
+    arguments, settings = certificates(tmp_path / "ours")
+    _, others = certificates(tmp_path / "others")
+    machines = Machines(tmp_path, "tls", arguments)
+    try:
+        machines.worker()
+        with dask.config.set(settings):
+            machines.wait_for(1)
+            with open_executor(0, machines.address) as executor:
+                assert dict(executor.side_by_side(step_by_step, [5])) == {0: -5}
+        for wrong in (others, {}):
+            refused = pytest.raises(ConfigError, match=r"the certificates do not fit .*distributed.comm.tls")
+            with dask.config.set(wrong), refused as caught, open_executor(0, machines.address):
+                pass
+            assert "\n" not in str(caught.value)
     finally:
         machines.close()
 

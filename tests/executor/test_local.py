@@ -8,6 +8,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from v2hdm.errors import ConfigError, DriveError, WorkerError
@@ -112,6 +113,16 @@ def test_each_process_has_one_thread(two):
     assert os.getpid() not in {outcome[2] for outcome in done.values()}
 
 
+def test_no_more_processes_start_than_there_are_jobs():
+    with open_executor(3) as executor:
+        counts = []
+        for jobs in (1, 2):
+            dict(executor.side_by_side(variables, range(jobs)))
+            counts.append(len(multiprocessing.active_children()))
+    assert counts[1] == counts[0] + 1
+    assert executor.workers == 3
+
+
 def test_jobs_tell_their_steps_and_processes_stay_for_the_next_stage():
     told = []
     with open_executor(2) as executor:
@@ -123,6 +134,20 @@ def test_jobs_tell_their_steps_and_processes_stay_for_the_next_stage():
     assert first == {-5, -6}
     assert {(5, "count", 3, 3), (6, "count", 3, 3)} <= set(told)
     assert len(processes[0] | processes[1]) <= 2
+
+
+def take_a_gigabyte(job, progress):
+    taken = np.ones(125_000_000)
+    time.sleep(5.0)
+    return taken.nbytes
+
+
+def test_a_process_that_takes_more_memory_than_it_may_is_an_error_of_its_job_alone():
+    with open_executor(1, isolated=True, memory_gb=0.5) as executor:
+        ((_, outcome),) = executor.side_by_side(take_a_gigabyte, [None])
+        assert isinstance(outcome, WorkerError)
+        assert "perhaps for lack of memory" in str(outcome)
+        assert list(executor.side_by_side(step_by_step, [5])) == [(0, -5)]
 
 
 def share_out_further(numbers, progress):

@@ -37,6 +37,8 @@ class Cluster:
     client: Client
     name: str
     leave: Callable[[], None]
+    grow: Callable[[int], None] = lambda workers: None
+    """Start processes until there are so many, where they are ours to start."""
 
 
 class ClusterExecutor(Executor):
@@ -50,6 +52,10 @@ class ClusterExecutor(Executor):
     def workers(self) -> int:
         """How many jobs are done at a time."""
         return self._workers
+
+    def grow(self, workers: int) -> None:
+        """Start processes until there are so many, where they are ours to start."""
+        self._cluster.grow(workers)
 
     def close(self) -> None:
         """Leave the cluster; processes of this machine end."""
@@ -152,8 +158,8 @@ class _Course:
             failure = future.exception()
             if not isinstance(failure, KilledWorker):
                 return tasks.Outcome(tasks.FAILED, failure)
-            begun = self._cluster.client.get_metadata(tasks.begun_key(self._name.token, number), 0)
-            kind = tasks.DEAD if begun >= tasks.MOST_BEGUN else tasks.STOPPED
+            begins = self._cluster.client.get_metadata(tasks.begun_key(self._name.token, number), 0)
+            kind = tasks.DEAD if begins >= tasks.MOST_BEGUN else tasks.STOPPED
             return tasks.Outcome(kind, TWICE_DEAD)
         raise WorkerError(_GONE.format(self._cluster.name))
 

@@ -16,6 +16,7 @@ from typing import Any
 
 import dask
 from distributed import Client, LocalCluster, Security, get_worker, rpc, worker_client
+from distributed.system import MEMORY_LIMIT
 
 from v2hdm.errors import ConfigError, one_line
 from v2hdm.executor import tasks
@@ -51,10 +52,13 @@ def quiet() -> None:
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)
 
 
-def local_cluster(workers: int, memory_gb: float) -> Cluster:
-    """Processes of this machine with one thread each, which only this machine can reach."""
+def local_cluster(workers: int, most: int, memory_gb: float) -> Cluster:
+    """Processes of this machine with one thread each, which only this machine can reach.
+
+    Each may take ``memory_gb``, or where that is 0 the share of one of the ``most`` that there will be.
+    """
     quiet()
-    limit = round(memory_gb * 1e9) or "auto"
+    limit = round(memory_gb * 1e9) or MEMORY_LIMIT // most
     stack = ExitStack()
     stack.enter_context(dask.config.set(_LOCAL))  # is looked at as long as the cluster is there
     with undisturbed_starts(), warnings.catch_warnings():
@@ -69,6 +73,11 @@ def local_cluster(workers: int, memory_gb: float) -> Cluster:
         )
         client = Client(cluster)
 
+    def grow(workers: int) -> None:
+        if workers > len(cluster.workers):
+            cluster.scale(workers)
+            client.wait_for_workers(workers)
+
     def leave() -> None:
         with suppress(Exception):
             client.close(timeout=_CLOSE_S)
@@ -76,7 +85,7 @@ def local_cluster(workers: int, memory_gb: float) -> Cluster:
             cluster.close(timeout=_CLOSE_S)
         stack.close()
 
-    return Cluster(client, "processes of this machine", leave)
+    return Cluster(client, "processes of this machine", leave, grow)
 
 
 def distant_cluster(address: str) -> Cluster:
@@ -197,9 +206,9 @@ def _problem_of(answer: Any, local_versions: Mapping[str, str], code: str) -> st
     if isinstance(answer, Exception):
         return f"cannot be asked ({type(answer).__name__}: {one_line(str(answer))}); install the same V2HDM"
     for library, version in local_versions.items():
-        other = answer.versions.get(library, "none")
-        if other != version:
-            return f"has {library} {other}, and this machine {version}; install the same on both"
+        there = answer.versions.get(library, "none")
+        if there != version:
+            return f"has {library} {there}, and this machine {version}; install the same on both"
     if answer.code != code:
         return "has another V2HDM than this machine; install the same on both"
     if answer.threads != 1:

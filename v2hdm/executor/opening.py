@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from v2hdm.errors import ConfigError
 from v2hdm.executor.executor import HERE, Executor, JobProgress, Outcomes, Stage
@@ -14,6 +14,9 @@ from v2hdm.executor.processes import ProcessExecutor
 
 _SCHEMES = ("tcp://", "tls://")
 _BATCH_SYSTEMS = ("slurm", "pbs", "sge", "lsf", "oar", "moab", "htcondor")
+
+if TYPE_CHECKING:  # loads Dask
+    from v2hdm.executor.cluster import ClusterExecutor
 
 _Job = TypeVar("_Job")
 _Result = TypeVar("_Result")
@@ -63,7 +66,7 @@ def open_executor(
     if cluster:
         executor = _connected(cluster, workers, readable, writable)
     elif has_dask:
-        executor = _WhenNeeded(workers, memory_gb)
+        executor = _WhenNeeded(workers, memory_gb, isolated)
     else:
         executor = ProcessExecutor(workers)
     try:
@@ -91,10 +94,11 @@ def _connected(cluster: str, workers: int, readable: Sequence[str], writable: Se
 class _WhenNeeded(Executor):
     """Processes of this machine, or of the cluster that does this job; Dask is loaded by the first stage."""
 
-    def __init__(self, workers: int, memory_gb: float) -> None:
+    def __init__(self, workers: int, memory_gb: float, at_once: bool) -> None:
         self._workers = workers
         self._memory_gb = memory_gb
-        self._executor: Executor | None = None
+        self._at_once = at_once  # whether all processes are started, as jobs may share their work out further
+        self._executor: ClusterExecutor | None = None
 
     @property
     def workers(self) -> int:
@@ -103,6 +107,7 @@ class _WhenNeeded(Executor):
     def outcomes(
         self, stage: Stage[_Job, _Result], jobs: Sequence[_Job], progress: JobProgress, at_once: int
     ) -> Outcomes[_Result]:
+        needed = self._workers if self._at_once else max(1, min(self._workers, len(jobs)))
         if self._executor is None:
             from v2hdm.executor import connecting
             from v2hdm.executor.cluster import ClusterExecutor
@@ -110,8 +115,9 @@ class _WhenNeeded(Executor):
             if connecting.is_in_job():
                 cluster = connecting.cluster_of_this_job()
             else:
-                cluster = connecting.local_cluster(self._workers, self._memory_gb)
+                cluster = connecting.local_cluster(needed, self._workers, self._memory_gb)
             self._executor = ClusterExecutor(cluster, self._workers)
+        self._executor.grow(needed)
         yield from self._executor.outcomes(stage, jobs, progress, at_once)
 
     def close(self) -> None:

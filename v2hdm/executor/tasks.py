@@ -137,8 +137,8 @@ def _stoppable(token: str) -> Iterator[None]:
 
 
 def _raise_in(thread: int, exception: type[BaseException] | None) -> None:
-    given = None if exception is None else ctypes.py_object(exception)
-    ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), given)
+    pointer = None if exception is None else ctypes.py_object(exception)
+    ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), pointer)
 
 
 async def stop(token: str) -> None:

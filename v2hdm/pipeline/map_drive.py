@@ -117,8 +117,10 @@ def map_drive(
         paths = [source.root if isinstance(source, Drive) else Path(source) for source in sources]
         about = describe_run(name or read.whole.name, read.whole, read.contents, paths, reading)
         described = inspection.drive_as_described
-        begun = Result(about, read.drives, read.contents, described, context.seconds, options.device)
-        return _mapped(begun, inspection, detector, survey, earlier, accuracy_goal_cm, context, all_maps)
+        mapped_so_far = Result(about, read.drives, read.contents, described, context.seconds, options.device)
+        return _mapped(
+            mapped_so_far, inspection, detector, survey, earlier, accuracy_goal_cm, context, all_maps
+        )
 
 
 @contextmanager
