@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.drive.example import description
+from v2hdm.executor import HERE
 from v2hdm.pipeline.config import DriveConfig, RunConfig
 from v2hdm.simulate.port.config import PortConfig, RouteConfig, YardConfig
 from v2hdm.simulate.port.drive import rendered_drive
@@ -65,7 +66,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Callable[[PortConfig],
     def drive_of(port: PortConfig) -> Path:
         with (shared / "lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
-            return rendered_drive(port, shared, 1, lambda done, total: None)
+            return rendered_drive(port, shared, HERE, lambda done, total: None)
 
     return drive_of
 

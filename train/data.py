@@ -18,7 +18,7 @@ from train.labels import LabelledImages
 from train.scenes.hardships import Hardships
 from train.scenes.scenes import TrainingSample, training_sample
 from train.targets import Targets, targets
-from v2hdm.workers import undisturbed_starts
+from v2hdm.executor.processes import undisturbed_starts
 
 _VALIDATION_SEED_OFFSET = 1_000_003  # distance of the validation's seeds from the training's
 

@@ -7,7 +7,6 @@ of renders and the code. A run that was stopped finds there what it has done; af
 from __future__ import annotations
 
 import hashlib
-import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -28,8 +27,8 @@ from train.fit_judge import Gathered
 from train.labels import LabelledImages, read_labels
 from v2hdm.detection import weights
 from v2hdm.errors import ConfigError
+from v2hdm.executor import open_executor
 from v2hdm.store.files import whole_file
-from v2hdm.workers import share_out
 
 _ROOT = Path(__file__).resolve().parents[1]
 _CODE = ("v2hdm", "models", "train", "export")
@@ -187,7 +186,8 @@ def _fit_judge(order: Order, folder: Path, tell: Share) -> None:
         tell(share, f"judge: {done * _PART_IMAGES} images seen")
 
     tell(_EXPORTED, "judge: looking at images")
-    share_out(fit_judge.gather, left, _workers(order), cv2.setNumThreads, (1,), take)
+    with open_executor(order.workers, isolated=True) as executor:
+        executor.share_out(fit_judge.gather, left, cv2.setNumThreads, (1,), take)
 
     def learnt(share: float) -> None:
         tell(_GATHERED + (_JUDGED - _GATHERED) * share, "judge: learning")
@@ -230,16 +230,13 @@ def _fit_lane_score(order: Order, folder: Path, tell: Share) -> None:
         tell(share, f"lane score: {len(images)} renders seen")
 
     tell(_JUDGED, "lane score: looking at renders")
-    share_out(fit_lane_score.see, parts, _workers(order), cv2.setNumThreads, (1,), take)
+    with open_executor(order.workers, isolated=True) as executor:
+        executor.share_out(fit_lane_score.see, parts, cv2.setNumThreads, (1,), take)
     fit_lane_score.write(fit_lane_score.fit_to(images), folder)
 
 
 def _in_parts(images: int) -> list[range]:
     return [range(k, min(k + _PART_IMAGES, images)) for k in range(0, images, _PART_IMAGES)]
-
-
-def _workers(order: Order) -> int:
-    return order.workers or os.cpu_count() or 1
 
 
 def _copy(source: Path, destination: Path) -> None:

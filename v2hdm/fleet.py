@@ -1,12 +1,12 @@
-"""A fleet from its run files to its table: drives side by side, each in a process of this machine."""
+"""A fleet from its run files to its table: drives side by side, by workers of this machine or others."""
 
 from __future__ import annotations
 
 import json
-import os
 import sys
 import traceback
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from v2hdm.errors import (
     masked,
     one_line,
 )  # fmt: skip
+from v2hdm.executor import Executor, open_executor
 from v2hdm.pipeline.config import RunConfig, run_name
 from v2hdm.pipeline.run import take_or_run
 from v2hdm.progress import Progress, patient
@@ -34,9 +35,8 @@ from v2hdm.records import BEST
 from v2hdm.report.terminal import DriveProgress, drive_bars, new_table, plain
 from v2hdm.safe.texts import take_name
 from v2hdm.store.files import csv_text
-from v2hdm.store.remote import place_of
+from v2hdm.store.remote import is_url, place_of
 from v2hdm.store.results import WriteFile, growing_folder
-from v2hdm.workers import side_by_side
 
 ERROR = "ERROR"  # status of a drive of which there is no result
 STYLES = {"PASS": "bold green", "WARN": "bold yellow", "FAIL": "bold red", ERROR: "bold red"}
@@ -153,11 +153,10 @@ class Plan:
     sources: list[str]
 
 
-def plan(files: Sequence[Path], overrides: Sequence[str], share: tuple[int, int] = (1, 1)) -> Plan:
+def plan(files: Sequence[Path], overrides: Sequence[str]) -> Plan:
     """The drives of run files, each by itself; ``overrides`` are ``key=value`` for all of them.
 
-    Of ``share`` = (k, n) every n-th file, from the k-th on, is planned; results of all must go to different
-    places.
+    Results of all must go to different places.
     """
     jobs: list[Job] = []
     refused: list[Row] = []
@@ -177,9 +176,7 @@ def plan(files: Sequence[Path], overrides: Sequence[str], share: tuple[int, int]
             jobs.append(job)
         except V2hdmError as error:
             refused.append(Row.of_error(file.stem, str(file), str(error)))
-    sources = [str(file) for file in files][share[0] - 1 :: share[1]]
-    mine = [job for job in jobs if job.source in sources]
-    return Plan(mine, [row for row in refused if row.source in sources], sources)
+    return Plan(jobs, refused, [str(file) for file in files])
 
 
 def _composed(file: Path, overrides: Sequence[str]) -> tuple[DictConfig, RunConfig]:
@@ -199,10 +196,8 @@ class FleetOptions:
     """The choices of a user beside the drives."""
 
     folder: Path  # takes the table
-    workers: int = 0  # cores that are used, 0 for all
+    workers: int = 0  # processes of this machine, or jobs of a batch system; 0 for one per core
     again: bool = False  # does what is finished again
-    # (k, n): every n-th drive, from the k-th on; other machines map the others
-    share: tuple[int, int] = (1, 1)
 
 
 def fleet_on_terminal(files: Sequence[Path], overrides: Sequence[str], options: FleetOptions) -> list[Row]:
@@ -223,12 +218,12 @@ def run_fleet(
 ) -> list[Row]:
     """Map the drives of run files: a row for each, in order; the table is written after each drive."""
     settings = [*overrides, "resume=false"] if options.again else overrides
-    todo = plan(files, settings, options.share)
+    todo = plan(files, settings)
     with growing_folder(options.folder, "--table", "v2hdm fleet") as write:
         table = _Table(write, todo.sources, progress)
         for row in todo.refused:
             table.add(row)
-        _map_all(todo.jobs, options.workers or os.cpu_count() or 1, table, progress)
+        _map_all(todo.jobs, options.workers, table, progress)
         return table.rows
 
 
@@ -257,20 +252,47 @@ class _Table:
         self._progress(ALL, "drives", len(self._rows), len(self._sources))
 
 
-def _map_all(jobs: Sequence[Job], cores: int, table: _Table, progress: DriveProgress) -> None:
-    """Map drives side by side; where they are fewer than cores, each takes several."""
-    count = max(1, min(cores, len(jobs)))
-    todo = [replace(job, config=replace(job.config, workers=cores // count)) for job in jobs]
+def _map_all(jobs: Sequence[Job], workers: int, table: _Table, progress: DriveProgress) -> None:
+    """Map drives side by side; where they are fewer than workers, each takes several."""
+    if not jobs:
+        return
 
     def advance(job: Job, task: str, done: int, total: int) -> None:
         progress(job.name, task, done, total)
 
-    for number, outcome in side_by_side(_mapped, todo, count, advance):
-        if isinstance(outcome, WorkerError):
-            table.add(Row.of_error(jobs[number].name, jobs[number].source, str(outcome)))
-        else:
-            row, trace = outcome
-            table.add(row, trace)
+    with _opened(jobs, workers) as executor:
+        several = max(1, executor.workers // len(jobs))
+        todo = [
+            replace(job, config=replace(job.config, workers=several, cluster="", worker_gb=0.0))
+            for job in jobs
+        ]
+        for number, outcome in executor.side_by_side(_mapped, todo, advance):
+            if isinstance(outcome, WorkerError):
+                table.add(Row.of_error(jobs[number].name, jobs[number].source, str(outcome)))
+            else:
+                row, trace = outcome
+                table.add(row, trace)
+
+
+def _opened(jobs: Sequence[Job], workers: int) -> AbstractContextManager[Executor]:
+    """The executor that the settings of all drives name."""
+    for setting in ("cluster", "worker_gb"):
+        values = {getattr(job.config, setting) for job in jobs}
+        if len(values) > 1:
+            raise ConfigError(
+                f"{setting} differs between the run files ({', '.join(sorted(map(str, values)))}); give one "
+                f"for all, {setting}=..."
+            )
+    first = jobs[0].config
+    places = {place for job in jobs for place in (job.config.cache, job.config.output) if not is_url(place)}
+    return open_executor(
+        workers,
+        first.cluster,
+        memory_gb=first.worker_gb,
+        readable=[str(path) for job in jobs for path in job.config.drive.paths],
+        writable=sorted(places),
+        isolated=True,
+    )
 
 
 def _mapped(job: Job, progress: Progress) -> tuple[Row, str]:

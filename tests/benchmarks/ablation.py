@@ -375,7 +375,7 @@ def site_drives(seeds: Sequence[int], folders: Sequence[Path]) -> Iterator[SiteD
             yield SiteDrive(drive, detections, truth, cameras, grey)
     for folder in folders:
         drive = read_drive(folder)
-        found = detect_all(drive, DetectorOptions.for_mapping(), 1)
+        found = detect_all(drive, DetectorOptions.for_mapping())
         yield SiteDrive(drive, found, read_truth(drive), tuple(drive.cameras), grey_reader(drive))
 
 

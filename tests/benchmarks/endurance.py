@@ -26,6 +26,7 @@ import numpy as np
 
 from v2hdm.detection.batch import detect_all
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.executor import Executor, open_executor
 from v2hdm.io.drive import read_drive
 from v2hdm.pipeline.config import DriveConfig
 from v2hdm.pipeline.context import Context
@@ -76,10 +77,11 @@ def detecting(drive: Path, images: int, every: int) -> Iterator[Sample]:
 def mapping(drive: Path, images: int, cameras: tuple[str, ...]) -> Iterator[Sample]:
     """Samples of this process while it maps one drive again and again, after each round."""
     read = read_drive(drive, DriveConfig(cameras=list(cameras)))
-    found = detect_all(read, DetectorOptions(), os.cpu_count() or 1)
+    with open_executor() as executor:
+        found = detect_all(read, DetectorOptions(), executor)
 
     def replay(
-        drive: Drive, options: DetectorOptions, images: Sequence[int], workers: int, take: Any
+        drive: Drive, options: DetectorOptions, images: Sequence[int], executor: Executor, take: Any
     ) -> None:
         for index in images:
             take(found[index])

@@ -27,6 +27,7 @@ import numpy as np
 
 import v2hdm.pipeline.map_drive  # noqa: F401  # loaded once, before any run is forked
 from tests.ports import short_port
+from v2hdm.executor import HERE
 from v2hdm.pipeline.config import DriveConfig, RunConfig
 from v2hdm.pipeline.run import run
 from v2hdm.simulate.port.drive import render_drive
@@ -106,7 +107,7 @@ def main() -> int:
     scratch = parsed.scratch.resolve()
     rendered = scratch / "drive"
     if not (rendered / "drive.yaml").is_file():
-        render_drive(short_port(), rendered, 1, lambda done, total: None)
+        render_drive(short_port(), rendered, HERE, lambda done, total: None)
     cameras = ["front"] if parsed.one_camera else []
     drive = DriveConfig(path=str(rendered), limit=parsed.images, cameras=cameras)
 

@@ -24,6 +24,7 @@ from omegaconf import OmegaConf
 from tests.benchmarks.made.altered import Alteration, altered
 from v2hdm.detection.batch import detect_all
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.executor import HERE, open_executor
 from v2hdm.io.drive import join_drives, read_drive
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.io.maps.geojson import write_geojson
@@ -62,9 +63,10 @@ def port(full: bool, session: int) -> PortConfig:
 
 def seen(config: PortConfig, cache: Path, workers: int) -> Seen:
     """A drive and its detections."""
-    drive = read_drive(rendered_drive(config, cache, workers, lambda _, __: None))
-    drive = replace(drive, name=f"{drive.name} {config.session}")
-    return drive, detect_all(drive, DetectorOptions.for_mapping(), workers, lambda _, __: None)
+    with open_executor(workers) as executor:
+        drive = read_drive(rendered_drive(config, cache, executor, lambda _, __: None))
+        drive = replace(drive, name=f"{drive.name} {config.session}")
+        return drive, detect_all(drive, DetectorOptions.for_mapping(), executor)
 
 
 def mapped(one: Seen, base: Base | None = None) -> MethodResult:
@@ -211,7 +213,7 @@ def main() -> None:
     config = replace(config, name=f"{config.name}-altered")
     with altered(count, config.seed) as alterations:  # in this process alone, which renders them
         build_port(config)
-        rendered_drive(config, arguments.cache, 1, lambda _, __: None)
+        rendered_drive(config, arguments.cache, HERE, lambda _, __: None)
     third = seen(config, arguments.cache, arguments.workers)
     renewed = mapped(third, base)
     assert renewed.changes is not None

@@ -41,6 +41,7 @@ from tests.benchmarks.made.world import World, drive_of, make, truth_of
 from tests.benchmarks.uncertainty import QUANTITIES, squared_errors
 from tests.benchmarks.wrong_inputs import RIGHT_FACTOR
 from v2hdm.errors import V2hdmError
+from v2hdm.executor import open_executor
 from v2hdm.faults.odds import doubt, log_odds, matters
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import AUTO, GROUNDS, MappingOptions
@@ -52,7 +53,6 @@ from v2hdm.verdict.inputs.heading import check_heading
 from v2hdm.verdict.inputs.poses import Motion, check_attitude, check_jumps, check_noise, check_path
 from v2hdm.verdict.inputs.recording import check_clocks
 from v2hdm.verdict.results.solution import check_solution, over_ground, told_by_poses
-from v2hdm.workers import share_out
 
 CLEAN = "nothing"
 _INSIDE = float(chi2.ppf(0.95, 1))
@@ -388,7 +388,8 @@ def measure(jobs: Sequence[Job], workers: int, verbose: bool) -> list[Row]:
         for job in jobs:
             take(map_one(job))
     else:
-        share_out(map_one, jobs, workers, _start_worker, (), take)
+        with open_executor(workers) as executor:
+            executor.share_out(map_one, jobs, _start_worker, (), take)
     return rows
 
 

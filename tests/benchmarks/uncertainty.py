@@ -22,6 +22,7 @@ from scipy.stats import chi2
 
 from v2hdm.detection.batch import detect_all
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.executor import open_executor
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.mapping.methods import run_methods
@@ -141,7 +142,8 @@ def drives(arguments: argparse.Namespace) -> Iterator[tuple[str, Drive]]:
         for seed in arguments.seeds:
             run = OmegaConf.load(Path(__file__).parents[2] / "conf/run" / f"{port}.yaml").simulate
             config = OmegaConf.merge(OmegaConf.structured(PortConfig), run, {"seed": seed})
-            folder = rendered_drive(OmegaConf.to_object(config), CACHE, arguments.workers, lambda _, __: None)
+            with open_executor(arguments.workers) as executor:
+                folder = rendered_drive(OmegaConf.to_object(config), CACHE, executor, lambda _, __: None)
             yield f"{port}, seed {seed}", read_drive(folder)
 
 
@@ -159,7 +161,8 @@ def main() -> None:
     found: list[Errors] = []
     for name, recorded in drives(arguments):
         drive = replace(recorded, pose_noise=PoseNoise.from_stated()) if arguments.no_noise else recorded
-        detections = detect_all(drive, DetectorOptions.for_mapping(), arguments.workers)
+        with open_executor(arguments.workers) as executor:
+            detections = detect_all(drive, DetectorOptions.for_mapping(), executor)
         result = run_methods(drive, detections, list(drive.cameras), MappingOptions(mode=arguments.mode))[
             "Opt"
         ]

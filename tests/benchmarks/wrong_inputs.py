@@ -28,6 +28,7 @@ from tests.benchmarks.wrong.fault import Fault, copy_of
 from tests.benchmarks.wrong.poses import poses_faults
 from v2hdm.cli import compose as hydra_config
 from v2hdm.errors import V2hdmError
+from v2hdm.executor import open_executor
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.pipeline.config import DriveConfig, RunConfig
@@ -35,7 +36,6 @@ from v2hdm.pipeline.run import run
 from v2hdm.report.metrics import marking_metrics
 from v2hdm.simulate.port.config import PortConfig
 from v2hdm.simulate.port.drive import rendered_drive
-from v2hdm.workers import share_out
 
 ROUTES = {
     "turning": [[24.0, 0.0], [18.0, -80.0], [16.0, 0.0], [16.0, 60.0], [14.0, 0.0]],
@@ -195,7 +195,8 @@ def measure(ports: Sequence[PortConfig], only: str, workers: int, cache: Path, s
     wanted = [k for k, fault in enumerate(faults) if k == 0 or re.search(only, fault.name)]
     jobs: list[_Job] = []
     for port in ports:
-        good = rendered_drive(port, cache, workers, lambda done, total: None).resolve()
+        with open_executor(workers) as executor:
+            good = rendered_drive(port, cache, executor, lambda done, total: None).resolve()
         jobs += [(f"{port.name}_{port.seed}", k, str(good), str(scratch.resolve())) for k in wanted]
     pending, clean = iter(jobs), {}
 
@@ -206,7 +207,8 @@ def measure(ports: Sequence[PortConfig], only: str, workers: int, cache: Path, s
         rows.append(row)
         print(_line(row), flush=True)
 
-    share_out(_work, jobs, workers, _start_worker, (), take)
+    with open_executor(workers, isolated=True) as executor:
+        executor.share_out(_work, jobs, _start_worker, (), take)
     return rows
 
 

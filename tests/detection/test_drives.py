@@ -20,6 +20,7 @@ from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.detection.batch import detect_all, with_own_vehicle
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.executor import open_executor
 from v2hdm.geometry.planar import order_corners
 from v2hdm.records import Drive, Image
 
@@ -46,8 +47,9 @@ def model(tmp_path_factory):
 def test_the_result_does_not_depend_on_the_number_of_workers(drive, model):
     seen = []
     options = DetectorOptions(model=str(model))
-    alone = detect_all(drive, options, workers=1, progress=lambda done, total: seen.append((done, total)))
-    together = detect_all(drive, options, workers=2)
+    alone = detect_all(drive, options, progress=lambda done, total: seen.append((done, total)))
+    with open_executor(2) as executor:
+        together = detect_all(drive, options, executor)
     assert seen == [(n, 10) for n in range(1, 11)]
     assert [found.image for found in together] == list(range(10))
     for a, b in zip(alone, together, strict=True):

@@ -22,11 +22,16 @@ from tests.detection.pictures import (
 )
 from tests.docs.blocks import ROOT
 from v2hdm import __version__, native
+from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.detection.camera import RoadCamera
+from v2hdm.detection.lanes.boundaries import _STATES, _forward_backward
+from v2hdm.detection.lanes.chains import find_chains
+from v2hdm.detection.lanes.lines import trace_lanes
+from v2hdm.detection.quads.blobs import Blob, find_blobs
 from v2hdm.detection.quads.fit import fit_quadrilaterals
 from v2hdm.detection.quads.lattice import lay_grid, lay_lattice
 from v2hdm.detection.quads.patch import LensFrames
-from v2hdm.detection.quads.propose import open_sides
+from v2hdm.detection.quads.propose import Proposal, open_sides
 from v2hdm.detection.quads.state import State
 from v2hdm.geometry.planar import Quad, order_corners
 
@@ -100,6 +105,30 @@ def test_a_step_is_the_same_compiled_and_in_numpy(seed):
 
 @compiled
 @pytest.mark.parametrize("lens", sorted(LENSES))
+def test_the_same_pixels_are_looked_at_compiled_and_in_numpy(lens):
+    scene = Scene(3, lens)
+    # One marking is partly outside of the image, one so large that its pixels are thinned.
+    scene.start[0] += [scene.view.info.width - scene.start[0, 0, 0], 0.0]
+    scene.start[1] = np.array([[-150, 90], [140, 120], [150, -60], [-140, -90]]) + scene.start[1].mean(axis=0)
+
+    def lattices():
+        grid = lay_grid(scene.patches, scene.frames, scene.start)
+        return grid.lattice, lay_lattice(scene.patches, scene.frames, scene.start)
+
+    for lattice, lattice_too in zip(*twice(lattices), strict=True):
+        np.testing.assert_array_equal(lattice.count, lattice_too.count)
+        there = np.arange(lattice.use.shape[1]) < lattice.count
+        for name, array in vars(lattice).items():
+            array_too = getattr(lattice_too, name)
+            assert (array.shape, array.dtype) == (array_too.shape, array_too.dtype), name
+            if array.shape[-1] == there.shape[-1]:
+                shown = np.broadcast_to(there.reshape(len(there), *[1] * (array.ndim - 2), -1), array.shape)
+                array, array_too = array[shown], array_too[shown]
+            np.testing.assert_allclose(array, array_too, atol=2e-5, err_msg=name)
+
+
+@compiled
+@pytest.mark.parametrize("lens", sorted(LENSES))
 def test_corners_are_the_same_compiled_and_in_numpy(lens):
     scene = Scene(7, lens)
     cut = open_sides(scene.start, scene.view)
@@ -116,6 +145,77 @@ def test_corners_are_the_same_compiled_and_in_numpy(lens):
     np.testing.assert_allclose(corners_px, corners_px_too, atol=0.01)
     np.testing.assert_allclose(sigma_px, sigma_px_too, rtol=0.02)
     np.testing.assert_allclose(statistics, statistics_too, atol=0.05)
+
+
+@compiled
+@pytest.mark.parametrize("seed", range(4))
+def test_the_same_crossings_are_linked_compiled_and_in_numpy(seed):
+    rng = np.random.default_rng(seed)
+    v_px = np.repeat(np.arange(700.0, 300.0, -8.0), 4)
+    lines = np.array([200.0, 400.0, 700.0, 900.0]) + np.outer(np.arange(50), rng.uniform(-6, 6, 4))
+    points_px = np.column_stack([lines.ravel() + rng.normal(0, 2, 200), v_px])[rng.random(200) < 0.8]
+    odds = rng.normal(1.5, 2.0, len(points_px))
+    chains, chains_too = twice(lambda: find_chains(points_px, odds))
+    assert [chain.tolist() for chain in chains] == [chain.tolist() for chain in chains_too]
+    assert len(chains) > 3
+
+
+@compiled
+@pytest.mark.parametrize("seed", range(4))
+def test_paint_is_traced_alike_compiled_and_in_numpy(seed):
+    """Of a random mask, framed by no paint, with branches that meet and part."""
+    rng = np.random.default_rng(seed)
+    noise = cv2.GaussianBlur(rng.standard_normal((60, 50)).astype(np.float32), (0, 0), 3.0) * 20
+    level = cv2.copyMakeBorder(noise, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=-1.0)
+    blob = Blob({"lane_line": 0.9}, level, np.array([400.0, 500.0]), 2, np.zeros((0, 2)))
+    piece = Proposal(blob, 0, {"lane_line": 0.9}, np.zeros((0, 2)), None, 0.0)
+    view = RoadCamera(make_camera(), 16)
+    traced, traced_too = twice(lambda: trace_lanes([(piece, 0.9)], view, 0.05, 20.0))
+    assert len(traced) == len(traced_too) > 1
+    for lane, lane_too in zip(traced, traced_too, strict=True):
+        np.testing.assert_allclose(lane.points_px, lane_too.points_px, atol=1e-9)
+
+
+@compiled
+@pytest.mark.parametrize("seed", range(3))
+def test_pieces_of_paint_are_found_alike_compiled_and_in_numpy(seed):
+    rng = np.random.default_rng(seed)
+    odds = cv2.GaussianBlur(rng.standard_normal((120, 160)).astype(np.float32), (0, 0), 3.0) * 30 - 1
+    kinds = rng.normal(0, 2, (len(PAINT_CLASSES), 60, 80)).astype(np.float32)
+    (blobs, owner), (blobs_too, owner_too) = twice(lambda: find_blobs(output_of(odds, kinds)))
+    assert len(blobs) == len(blobs_too) > 5
+    assert any(blob.parts for blob in blobs)
+    np.testing.assert_array_equal(owner, owner_too)
+    for blob, blob_too in zip(blobs, blobs_too, strict=True):
+        for kind, score in blob.class_score.items():
+            assert score == pytest.approx(blob_too.class_score[kind], abs=1e-6)
+        np.testing.assert_allclose(blob.outline_px, blob_too.outline_px, atol=1e-5)
+        np.testing.assert_array_equal(blob.level, blob_too.level)
+        assert (blob.parts, blob.traced) == (blob_too.parts, blob_too.traced)
+
+
+@compiled
+@pytest.mark.parametrize("lens", sorted(LENSES))
+def test_lenses_are_undone_alike_compiled_and_in_numpy(lens):
+    view = RoadCamera(make_camera(lens), 16)
+    points_px = np.random.default_rng(0).uniform(-500, 2000, (200, 2))
+    points_px[:3] = [[np.nan, 5.0], [np.nan, np.nan], [1e300, -1e300]]
+    with np.errstate(invalid="ignore", over="ignore"):
+        pinhole_px, pinhole_px_too = twice(lambda: view.undistort(points_px))
+    np.testing.assert_allclose(pinhole_px[3:], pinhole_px_too[3:], rtol=1e-12)
+    recorded_px, recorded_px_too = twice(lambda: view.distort(pinhole_px[3:]))
+    np.testing.assert_allclose(recorded_px, recorded_px_too, rtol=1e-12)
+    np.testing.assert_array_equal(np.isfinite(pinhole_px), np.isfinite(pinhole_px_too))
+
+
+@compiled
+def test_boundaries_end_alike_compiled_and_in_numpy():
+    rng = np.random.default_rng(0)
+    likelihood = rng.normal(0, 1.5, (3, 40, _STATES))
+    step_m = rng.uniform(0.1, 2.0, (3, 39))
+    (states, total), (states_too, total_too) = twice(lambda: _forward_backward(likelihood, step_m))
+    np.testing.assert_allclose(states, states_too, atol=1e-12)
+    np.testing.assert_allclose(total, total_too, rtol=1e-12)
 
 
 @compiled

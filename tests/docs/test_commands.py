@@ -40,7 +40,7 @@ NOT_RUN = [block for block in SHELL if block.not_run_because is not None]
 COMPOSED = ("map", "simulate", "experiment", "train", "export")
 """Commands whose arguments are checked by composing their configuration."""
 
-FOREIGN = ("pip",)
+FOREIGN = ("pip", "dask")
 """Programs of others that blocks call which are not run here."""
 
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]

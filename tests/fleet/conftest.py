@@ -4,7 +4,10 @@ from dataclasses import replace
 
 import pytest
 
+from tests.fleet.runs import written
 from tests.stores import s3 as s3
+from v2hdm.fleet import plan
+from v2hdm.pipeline.run import run
 from v2hdm.simulate.port.config import PortConfig, RouteConfig, YardConfig
 
 
@@ -16,3 +19,12 @@ def drive(rendered):
     front = replace(PortConfig().cameras["front"], width=640, height=360, focal_px=450.0)
     port = PortConfig(name="tiny", seed=3, initial_ipm="calibrated", route=route, yard=yard)
     return rendered(replace(port, cameras={"front": front}))
+
+
+@pytest.fixture(scope="session")
+def alone(drive, tmp_path_factory):
+    """The result of the drive by the mapping door, in one process, of one thread as a fleet's are."""
+    folder = tmp_path_factory.mktemp("alone")
+    settings = [f"output={folder / 'out'}", f"cache={folder / 'cache'}", "workers=1"]
+    (job,) = plan([written(folder, "good", drive)], settings).jobs
+    return run(job.config, job.config_yaml).folder

@@ -8,36 +8,22 @@ import re
 import signal
 import subprocess
 import sys
+from contextlib import nullcontext
 from io import StringIO
 from pathlib import Path
 
 import pytest
 
+from tests.fleet.runs import written
 from v2hdm import fleet
 from v2hdm.cli.main import run as command
+from v2hdm.errors import ConfigError
+from v2hdm.executor import HERE
 from v2hdm.fleet import FleetOptions, Row, exit_code, plan, run_fleet
 from v2hdm.io.drive import read_drive
-from v2hdm.pipeline.run import run, take_or_run
+from v2hdm.pipeline.run import take_or_run
 
 ROOT = Path(__file__).parents[2]
-
-
-def written(folder, name, drive):
-    """The run file of one drive, which may be too short for a map of centimetres."""
-    path = folder / f"{name}.yaml"
-    path.write_text(
-        f"# @package _global_\nname: {name}\naccuracy_goal_cm: 100\nmosaic: false\ndrive:\n  path: {drive}\n"
-    )
-    return path
-
-
-@pytest.fixture(scope="session")
-def alone(drive, tmp_path_factory):
-    """The result of the drive by the mapping door, in one process, of one thread as a fleet's are."""
-    folder = tmp_path_factory.mktemp("alone")
-    settings = [f"output={folder / 'out'}", f"cache={folder / 'cache'}", "workers=1"]
-    (job,) = plan([written(folder, "good", drive)], settings).jobs
-    return run(job.config, job.config_yaml).folder
 
 
 @pytest.mark.slow
@@ -80,7 +66,7 @@ def test_a_fleet_outlives_its_processes_keeps_what_is_finished_and_goes_on_past_
     assert [row.status for row in rows] == ["PASS", "ERROR", "ERROR", "ERROR"], rows
     assert (rows[0].images, rows[0].kept) == (images, False)
     assert "no such drive folder" in rows[1].says
-    assert "died twice over the same work (exit code -9)" in rows[2].says
+    assert "died twice over the same work" in rows[2].says
     assert re.search("did you mean .*mapping.max_range_m", rows[3].says)
     assert ("good", "detect", images, images) in told
     table = list(csv.DictReader(StringIO((tmp_path / "table" / "fleet.csv").read_text())))
@@ -103,7 +89,7 @@ def test_a_fleet_that_is_ended_takes_its_processes_with_it(end, drive, tmp_path)
     assert begun.stdout.readline().startswith("good: check")  # a process is at work
     os.kill(begun.pid, end)
     _, errors = begun.communicate(timeout=60)  # returns when the last process has closed its end
-    assert (begun.returncode, errors[:18]) in [(2, "error: interrupted"), (-9, "")]
+    assert (begun.returncode, errors[:18]) in [(2, "error: interrupted"), (-9, "")], errors
     assert errors.count("\n") == (end == signal.SIGTERM)
     assert not list((tmp_path / "out").glob("*"))
 
@@ -116,28 +102,29 @@ def test_two_run_files_never_write_one_folder(tmp_path, drive):
     assert "name one otherwise" in planned.refused[0].says
 
 
-def test_shares_are_all_drives_together_and_never_two_of_one_folder(tmp_path, drive):
-    files = [written(tmp_path, name, drive) for name in ("a", "b", "c", "d", "e")]
-    shares = [plan(files, [], (k, 2)) for k in (1, 2)]
-    assert [[job.name for job in one.jobs] for one in shares] == [["a", "c", "e"], ["b", "d"]]
-    assert shares[1].sources == [str(files[1]), str(files[3])]
-    files[3].write_text(files[0].read_text())
-    assert "name one otherwise" in plan(files, [], (2, 2)).refused[0].says
-    assert not plan(files, [], (1, 2)).refused
-
-
-def test_a_pattern_that_matches_no_run_file_is_an_error_in_every_share(capsys, tmp_path):
-    for share in ("1/4", "2/4"):
-        given = ["fleet", f"{tmp_path}/TYPO/*.yaml", "--share", share, "--table", str(tmp_path / "t")]
-        assert command(given) == 2
-        assert "TYPO/*.yaml: no such run file; check the path" in capsys.readouterr().err
+@pytest.mark.parametrize("files", [["TYPO/*.yaml"], ["TYPO/a.yaml", "TYPO/b.yaml"], []])
+def test_a_fleet_without_a_run_file_is_an_error(files, capsys, tmp_path):
+    given = ["fleet", *(f"{tmp_path}/{file}" for file in files), "output=x", "--table", str(tmp_path / "t")]
+    assert command(given) == 2
+    problem = "no such run file; check the path" if files else "no drives given: name run files"
+    assert problem in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("given", ["0/4", "5/4", "1/0", "2"])
-def test_a_share_that_cannot_be_is_one_line(given, capsys):
-    assert command(["fleet", "a.yaml", "--share", *given.split()]) == 2
-    assert re.fullmatch("error: .*--share.*\n", capsys.readouterr().err)
+def test_run_files_that_name_different_clusters_are_refused(tmp_path, drive):
+    files = [written(tmp_path, name, drive) for name in ("a", "b")]
+    files[1].write_text(files[1].read_text() + "cluster: tcp://127.0.0.1:1\n")
+    with pytest.raises(ConfigError, match=r"cluster differs between the run files .*; give one for all"):
+        run_fleet(files, [], FleetOptions(tmp_path / "table"), lambda *_: None)
+
+
+def test_a_fleet_on_a_cluster_that_is_not_there_is_one_line(capsys, tmp_path, drive):
+    file = written(tmp_path, "a", drive)
+    given = ["fleet", str(file), "--cluster", "tcp://127.0.0.1:9", "--table", str(tmp_path / "table")]
+    assert command(given) == 2
+    assert re.fullmatch(
+        r"error: cluster=tcp://127.0.0.1:9: no Dask scheduler answers .*\n", capsys.readouterr().err
+    )
 
 
 def test_what_would_be_gone_with_a_worker_is_refused(tmp_path, drive):
@@ -163,11 +150,8 @@ def test_a_bug_is_a_row_whose_traceback_lies_beside_the_table(tmp_path, drive, m
     def broken(*_):
         raise ZeroDivisionError("a bug")
 
-    def in_turn(work, jobs, count, tell):
-        return enumerate(work(job, lambda *_: None) for job in jobs)
-
     monkeypatch.setattr(fleet, "take_or_run", broken)
-    monkeypatch.setattr(fleet, "side_by_side", in_turn)
+    monkeypatch.setattr(fleet, "open_executor", lambda *_, **__: nullcontext(HERE))
     files = [written(tmp_path, name, drive) for name in ("one", "two")]
     options = FleetOptions(tmp_path / "table")
     rows = run_fleet(files, [f"output={tmp_path / 'out'}"], options, lambda *_: None)

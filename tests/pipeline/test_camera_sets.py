@@ -7,11 +7,13 @@ from dataclasses import dataclass, field
 
 import pytest
 
+from v2hdm.executor import HERE, Executor
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline import stages
 from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.stages import MappedSet, map_camera_sets
+from v2hdm.progress import silent
 from v2hdm.records import HDMap
 from v2hdm.store.cache import StageCache
 from v2hdm.survey.run import Survey
@@ -36,32 +38,35 @@ def mapped(work, name, cameras):
 
 @pytest.fixture
 def elsewhere(monkeypatch):
-    """The sets that processes have mapped, in their order; what reaches or leaves one is pickled."""
+    """The sets that processes have mapped, in their order, and executors; what reaches one is pickled."""
     jobs = []
 
-    def share(work, given, processes, progress):
-        assert processes == 2
-        for number, job in enumerate(given):
-            jobs.append(job[0])
-            there, job = pickle.loads(pickle.dumps((work, job)))
-            yield number, pickle.loads(pickle.dumps(there(job, progress)))
+    class Elsewhere(Executor):
+        workers = 2
+
+        def outcomes(self, stage, given, progress, at_once):
+            assert at_once == 2
+            for number, job in enumerate(given):
+                jobs.append(job[0])
+                there, job = pickle.loads(pickle.dumps((stage, job)))
+                yield number, pickle.loads(pickle.dumps(there.work(job, silent)))
 
     monkeypatch.setattr(stages._Work, "_map", mapped)
-    monkeypatch.setattr(stages, "side_by_side", share)
-    return jobs
+    return jobs, {1: HERE, 2: Elsewhere()}
 
 
-def mapped_sets(cache, workers, detections, compare=True):
+def mapped_sets(cache, executor, detections, compare=True):
     survey = Survey(MappingOptions(), ())
-    context = Context(StageCache(cache), workers=workers)
+    context = Context(StageCache(cache), executor=executor)
     return map_camera_sets(Cameras(), "drive", [detections], survey, None, context, compare=compare)
 
 
 def test_a_drive_is_mapped_with_all_cameras_alone_unless_sets_are_compared(elsewhere, tmp_path):
-    found = mapped_sets(tmp_path, 2, Images([0] * 5000), compare=False)
+    jobs, executors = elsewhere
+    found = mapped_sets(tmp_path, executors[2], Images([0] * 5000), compare=False)
     assert list(found) == ["all"]
     assert found["all"].methods["Opt"].cameras == ("front", "left", "rear")
-    assert elsewhere == []
+    assert jobs == []
 
 
 @pytest.mark.parametrize(("workers", "count"), [(1, 5000), (2, 3), (2, 5000)])
@@ -69,14 +74,15 @@ def test_large_drives_are_mapped_by_processes_the_largest_set_first(
     workers, count, elsewhere, tmp_path, caplog
 ):
     caplog.set_level(logging.INFO, "v2hdm")
-    found = mapped_sets(tmp_path, workers, Images([0] * count))
+    jobs, executors = elsewhere
+    found = mapped_sets(tmp_path, executors[workers], Images([0] * count))
     assert list(found) == ["front", "left", "rear", "all"]
     assert found["all"].methods["Opt"].cameras == ("front", "left", "rear")
-    assert elsewhere == (["all", "front", "left", "rear"] if workers * count == 10_000 else [])
+    assert jobs == (["all", "front", "left", "rear"] if workers * count == 10_000 else [])
     # What stands for processes logs here, too.
-    assert Counter(caplog.messages) == {f"mapped with {name}": 2 if elsewhere else 1 for name in found}
+    assert Counter(caplog.messages) == {f"mapped with {name}": 2 if jobs else 1 for name in found}
     caplog.clear()
-    elsewhere.clear()
-    assert mapped_sets(tmp_path, 3 - workers, Images([0] * count)) == found
-    assert not elsewhere
+    jobs.clear()
+    assert mapped_sets(tmp_path, executors[3 - workers], Images([0] * count)) == found
+    assert not jobs
     assert Counter(caplog.messages) == {f"mapped with {name}": 1 for name in found}

@@ -1,5 +1,6 @@
 import pytest
 
+from v2hdm.executor import HERE
 from v2hdm.simulate.port.config import (
     CalibrationConfig,
     CameraConfig,
@@ -39,5 +40,5 @@ FRONT_MIRRORED = MountConfig(x_m=-0.9, y_m=0.1, z_m=2.47, yaw_deg=180.9, pitch_d
 @pytest.fixture(scope="session")
 def tiny_drive(tmp_path_factory):
     folder = tmp_path_factory.mktemp("simulate") / "tiny"
-    render_drive(tiny_port(), folder, 1, lambda done, total: None)
+    render_drive(tiny_port(), folder, HERE, lambda done, total: None)
     return folder

@@ -8,6 +8,7 @@ import pytest
 from tests.simulate.conftest import FRONT, tiny_port
 from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.errors import ConfigError
+from v2hdm.executor import HERE
 from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic, project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.planar import signed_area
@@ -286,10 +287,10 @@ def test_stencils_that_cannot_be_painted_are_refused(stencils, words):
 
 def test_ports_without_stencils_keep_their_folder_in_the_cache(tmp_path, monkeypatch):
     monkeypatch.setattr(drive, "render_drive", lambda *_: None)
-    plain = drive.rendered_drive(PortConfig(), tmp_path, 1, lambda done, total: None)
+    plain = drive.rendered_drive(PortConfig(), tmp_path, HERE, lambda done, total: None)
     stencilled = PortConfig(paint=PaintConfig(stencils=STENCILS))
     assert plain.name == "port1-5152c55c71"
-    assert drive.rendered_drive(stencilled, tmp_path, 1, lambda done, total: None) != plain
+    assert drive.rendered_drive(stencilled, tmp_path, HERE, lambda done, total: None) != plain
 
 
 def test_a_port_is_rendered_once_per_seed_and_has_its_truth(tmp_path):

@@ -6,6 +6,7 @@ import pytest
 from tests.simulate.conftest import tiny_port
 from tests.simulate.test_rendering import BARE, CAM_FROM_MAP, CLEAN, INFO, edge_offset_px
 from v2hdm.errors import ConfigError
+from v2hdm.executor import HERE
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.rigid import euler_from_rotation
 from v2hdm.io.drive import read_drive
@@ -101,7 +102,7 @@ def test_a_vehicle_stands_on_its_wheels():
 @pytest.fixture(scope="module")
 def hill(tmp_path_factory):
     folder = tmp_path_factory.mktemp("relief") / "tiny"
-    render_drive(HILL, folder, 1, lambda done, total: None)
+    render_drive(HILL, folder, HERE, lambda done, total: None)
     return folder
 
 

@@ -5,6 +5,7 @@ import pytest
 
 from tests.simulate.conftest import tiny_port
 from v2hdm.errors import DriveError
+from v2hdm.executor import HERE, open_executor
 from v2hdm.geometry.lens import distort_points
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
@@ -24,7 +25,8 @@ def ignore(done, total):
 
 
 def test_two_workers_write_the_same_bytes_as_one(tiny_drive, tmp_path):
-    render_drive(tiny_port(), tmp_path / "tiny", 2, ignore)
+    with open_executor(2) as executor:
+        render_drive(tiny_port(), tmp_path / "tiny", executor, ignore)
     assert contents(tmp_path / "tiny") == contents(tiny_drive)
 
 
@@ -36,13 +38,13 @@ def test_a_stopped_render_is_no_drive_and_goes_on_where_it_was(tiny_drive, tmp_p
             raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        render_drive(tiny_port(), folder, 1, stop)
+        render_drive(tiny_port(), folder, HERE, stop)
     with pytest.raises(DriveError):
         read_drive(folder)
     kept = {path: path.stat().st_mtime_ns for path in folder.rglob("*.jpg")}
     assert len(kept) == 7
     seen: list[int] = []
-    render_drive(tiny_port(), folder, 1, lambda done, total: seen.append(done))
+    render_drive(tiny_port(), folder, HERE, lambda done, total: seen.append(done))
     assert seen[0] == 7
     assert all(path.stat().st_mtime_ns == stamp for path, stamp in kept.items())
     assert contents(folder) == contents(tiny_drive)

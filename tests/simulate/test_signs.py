@@ -7,6 +7,7 @@ import pytest
 
 from tests.simulate.conftest import tiny_port
 from v2hdm.errors import ConfigError
+from v2hdm.executor import HERE
 from v2hdm.geometry.planar import clip_convex, inside_convex, signed_area
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
@@ -87,7 +88,7 @@ def test_ports_without_signs_keep_their_folder_in_the_cache(tmp_path, monkeypatc
     monkeypatch.setattr(drive, "render_drive", lambda *_: None)
     folders = [
         drive.rendered_drive(
-            PortConfig(paint=PaintConfig(signs=signs)), tmp_path, 1, lambda done, total: None
+            PortConfig(paint=PaintConfig(signs=signs)), tmp_path, HERE, lambda done, total: None
         )
         for signs in (SignsConfig(), SIGNS)
     ]
@@ -103,7 +104,7 @@ def test_words_that_cannot_be_painted_are_refused(words):
 
 def test_the_truth_of_signs_is_read_as_it_was_written(tmp_path):
     config = tiny_port(paint=PaintConfig(signs=SignsConfig(numbers=2, hatched=1)))
-    render_drive(config, tmp_path, 1, lambda done, total: None)
+    render_drive(config, tmp_path, HERE, lambda done, total: None)
     port, truth = build_port(config), read_truth(read_drive(tmp_path))
     assert truth.texts == port.texts
     assert len(truth.map.symbols) == len(port.hd_map.symbols) > 0

@@ -1,6 +1,7 @@
 """What teaches the detector its scores, and the command that ships a trained network."""
 
 import shutil
+from contextlib import nullcontext
 from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -34,8 +35,8 @@ from v2hdm.detection.detector import Detector
 from v2hdm.detection.evidence import CHANNELS, FEATURES
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import DetectorError
+from v2hdm.executor import HERE, open_executor
 from v2hdm.records import ARROW, DIAMOND, LANE_DASH
-from v2hdm.workers import share_out
 
 SEED = 4711
 
@@ -128,7 +129,8 @@ def test_readings_that_were_gathered_in_parts_are_those_gathered_at_once(tmp_pat
 def test_what_is_seen_of_lanes_comes_back_from_another_process():
     seen_there: list[fit_lane_score.Seen] = []
     part = fit_lane_score.Part(range(3), 100, weights.NETWORK_FILE)
-    share_out(fit_lane_score.see, [part], 1, cv2.setNumThreads, (1,), seen_there.extend)
+    with open_executor(1, isolated=True) as executor:
+        executor.share_out(fit_lane_score.see, [part], cv2.setNumThreads, (1,), seen_there.extend)
     lines = [found.lines for image in seen_there if (found := proposed(image)) is not None]
     assert len(seen_there) == 3
     assert sum(map(len, lines)) > 0
@@ -277,10 +279,6 @@ def quick(monkeypatch):
     """Nothing is looked at and what is learnt is anything; returns the parts that were gathered."""
     gathered: list[range] = []
 
-    def in_this_process(work, jobs, processes, start, arguments, take):
-        for job in jobs:
-            take(work(job))
-
     def gather(part):
         fit_judge.Gathered().save(part.path)
         gathered.append(part.numbers)
@@ -288,7 +286,7 @@ def quick(monkeypatch):
     judge = Judge(len(CHANNELS), len(FEATURES), len(SHAPES), width=4, dropout=0.0).eval()
     among = {name: {"bias": 0.0, "weights": dict.fromkeys(AMONG, 0.5)} for name in COMPANIES}
     lines = {name: (np.ones(len(keys)), 0.0) for name, keys in fit_lane_score.KEYS.items()}
-    monkeypatch.setattr(shipment, "share_out", in_this_process)
+    monkeypatch.setattr(shipment, "open_executor", lambda *_, **__: nullcontext(HERE))
     monkeypatch.setattr(fit_judge, "gather", gather)
     monkeypatch.setattr(fit_judge, "fit_all", lambda gathered, tell, start: (tell(0.5), (judge, among))[1])
     monkeypatch.setattr(fit_lane_score, "see", lambda part: [None] * len(part.numbers))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from v2hdm.doors import checked
+from v2hdm.executor import open_executor
 from v2hdm.geometry.ipm import mounting_words
 from v2hdm.ground.estimate import estimate_cameras
 from v2hdm.ground.results import GroundEstimate, GroundStatus, Reading
@@ -80,7 +81,8 @@ def calibrate_from_ground(
     [(4, 4)]
     """
     drive = as_drive(drive)
-    estimates = estimate_cameras(drive, workers, progress)
+    with open_executor(workers) as executor:
+        estimates = estimate_cameras(drive, executor, progress)
     return GroundCalibration(drive, estimates, _judged(check_drive(drive, ground=estimates), estimates))
 
 

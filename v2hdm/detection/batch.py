@@ -18,14 +18,14 @@ from v2hdm.detection.detector import Detector
 from v2hdm.detection.frames import read_bgr
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import DriveError
+from v2hdm.executor import HERE, Executor
 from v2hdm.records import BoolArray, Camera, Drive, Image, ImageDetections
-from v2hdm.workers import share_out
 
 _log = logging.getLogger(__name__)
 _worker: tuple[Detector, Drive] | None = None
 _WORKERS_A_GPU = 8  # processes that share a GPU: each takes memory of its own there
 
-Detect = Callable[[Drive, DetectorOptions, Sequence[int], int, Callable[[ImageDetections], None]], None]
+Detect = Callable[[Drive, DetectorOptions, Sequence[int], Executor, Callable[[ImageDetections], None]], None]
 """A function that does what :func:`detect_images` does."""
 
 _FEW_IMAGES = 8  # fewer images than this are looked at before a process has started
@@ -90,10 +90,10 @@ def read_grey(image: Image, camera: Camera) -> np.ndarray:
 def detect_all(
     drive: Drive,
     options: DetectorOptions | None = None,
-    workers: int = 1,
+    executor: Executor = HERE,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[ImageDetections]:
-    """Detect in every image of a drive, in the drive's order, whatever the number of ``workers`` (processes).
+    """Detect in every image of a drive, in the drive's order, whatever the ``executor``.
 
     Raises DriveError where an image is missing, damaged or of the wrong size, DetectorError where the model
     cannot be used, WorkerError where a process died.
@@ -107,7 +107,7 @@ def detect_all(
         if progress:
             progress(len(results), len(drive.images))
 
-    detect_images(drive, options, range(len(drive.images)), workers, collect)
+    detect_images(drive, options, range(len(drive.images)), executor, collect)
     return results
 
 
@@ -115,18 +115,17 @@ def detect_images(
     drive: Drive,
     options: DetectorOptions,
     images: Sequence[int],
-    workers: int,
+    executor: Executor,
     take: Callable[[ImageDetections], None],
 ) -> None:
     """Detect in the images of these indices; ``take`` is called with each in order. Raises as detect_all."""
-    if options.device != "cpu":
-        workers = min(workers, _WORKERS_A_GPU)
-    if workers <= 1 or len(images) < _FEW_IMAGES:
+    if executor.workers <= 1 or len(images) < _FEW_IMAGES:
         detector = Detector.load(options=options)
         for index in images:
             take(detect_image(detector, drive, index))
         return
-    share_out(_work, images, workers, _start_worker, (drive, options), take)
+    processes = 0 if options.device == "cpu" else _WORKERS_A_GPU
+    executor.share_out(_work, images, _start_worker, (drive, options), take, processes)
 
 
 def own_vehicles(drive: Drive, detector: Detector) -> dict[str, BoolArray]:

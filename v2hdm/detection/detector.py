@@ -192,10 +192,11 @@ class Detector:
                 continue
             kind = max(names, key=lambda name: piece.share.get(name, 0.0))
             score = piece.symbol_score(kind)
-            ground = piece.outline_vehicle
-            within = proposals.camera.range_m(ground.mean(axis=0)) <= reach_m  # nan is not
+            if score < self.options.min_score:
+                continue
+            range_m = proposals.camera.range_m(piece.outline_vehicle.mean(axis=0))
             after = piece.index + 1 + piece.blob.parts
-            if not within or score < self.options.min_score:
+            if not range_m <= reach_m:  # nan is not
                 continue
             parts = [part for part in proposals.pieces if piece.index < part.index < after]
             if piece.is_one_symbol(parts, self.catalogue):

@@ -35,7 +35,7 @@ _PROVIDERS: dict[str, tuple[str, dict[str, str]]] = {
     "cuda": ("CUDAExecutionProvider", {"use_tf32": "0", "cudnn_conv_algo_search": "HEURISTIC"}),
 }
 
-_OVERLAP_PX = 64  # overlap of the two resolutions, so that either has its surroundings where they are joined
+_OVERLAP_PX = 32  # overlap of the two resolutions, so that either has its surroundings where they are joined
 _MOST_MULTIPLE = 1024  # largest multiple of px that images are padded to: an encoder halves them ten times
 _GRID_PX = 16  # least grid, px, of the rows that the seam may be at: it is that of all outputs
 _MIRRORED = np.array([1.0, -1.0], dtype=np.float32)[:, None, None]

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import AdjustError, MappingError
+from v2hdm.executor import HERE, Executor
 from v2hdm.experiment.plan import OURS, RECIPES, Job
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.mapping.naive import NAIVE_IPMS
@@ -32,12 +33,12 @@ from v2hdm.store.cache import StageCache
 from v2hdm.survey.run import take_survey
 
 
-def drive_record(job: Job, progress: Progress, workers: int = 1) -> dict[str, Any]:
+def drive_record(job: Job, progress: Progress, executor: Executor = HERE) -> dict[str, Any]:
     """The record of a drive and its maps by recipe, for :func:`measure`. V2hdmError without a truth."""
     folder = Path(job.site.drive.path or "")
     if job.site.simulate is not None:
-        folder = rendered_drive(job.site.simulate, job.cache, workers, partial(progress, "render"))
-    context = Context(StageCache(job.cache), progress, workers=workers)
+        folder = rendered_drive(job.site.simulate, job.cache, executor, partial(progress, "render"))
+    context = Context(StageCache(job.cache), progress, executor=executor, workers=executor.workers)
     with context.cache.in_use():
         read = read_all([folder], job.site.drive, context)
         truth = read_truth(read.whole)

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError
+from v2hdm.executor import check_cluster
 from v2hdm.mapping.options import INCREMENTAL, MappingOptions, check_options
 from v2hdm.pipeline.config import DriveConfig
 from v2hdm.simulate.port.config import PortConfig
@@ -60,6 +61,11 @@ class ExperimentConfig:
     workers: Annotated[
         int, "number of processes, each of which maps one drive at a time; 0 for one per core."
     ] = 0
+    cluster: Annotated[
+        str,
+        "machines to work on: the address of a Dask scheduler (tcp://host:8786), or a batch system (slurm); "
+        "empty for this one (docs/fleet.md).",
+    ] = ""
 
 
 @dataclass(frozen=True)
@@ -111,6 +117,7 @@ def _check(config: ExperimentConfig) -> None:
         raise ConfigError("ports is empty: name one, as in +run@ports.port1=port1")
     if not config.seeds or len(set(config.seeds)) < len(config.seeds) or min(config.seeds) < 0:
         raise ConfigError(f"seeds is {config.seeds}: give different whole numbers, 0 or more")
+    check_cluster(config.cluster)
     if config.workers < 0:
         raise ConfigError(f"workers is {config.workers}: set 0 for one per core, or a positive number")
     for recipe in config.recipes:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Sequence
 from functools import partial
@@ -12,6 +11,7 @@ from typing import Any
 from rich.console import Console
 
 from v2hdm.errors import ConfigError, WorkerError
+from v2hdm.executor import Executor, open_executor
 from v2hdm.experiment.drive import Measured, drive_record, measure
 from v2hdm.experiment.paper import load_paper
 from v2hdm.experiment.plan import ExperimentConfig, Job, jobs
@@ -20,7 +20,6 @@ from v2hdm.report.terminal import DriveProgress, drive_bars, plain
 from v2hdm.store.files import replace_text
 from v2hdm.store.names import CONFIG
 from v2hdm.store.results import growing_folder
-from v2hdm.workers import side_by_side
 
 _paper = load_paper()
 _OPTION = "output="
@@ -36,7 +35,8 @@ def run_experiment(
     try:
         with growing_folder(folder, _OPTION, _MADE):
             replace_text(folder / CONFIG, config_yaml or f"{config!r}\n")
-            records = _records(todo, config.workers or os.cpu_count() or 1, progress)
+            with open_executor(config.workers, config.cluster, writable=[config.cache]) as executor:
+                records = _records(todo, executor, progress)
             measured = [measure(record) for record in records]
             captions = _paper.save_figures(folder, records, measured, partial(progress, "figures", "draw"))
             _paper.write_tables(folder, measured)
@@ -47,15 +47,15 @@ def run_experiment(
     return folder, measured
 
 
-def _records(todo: Sequence[Job], workers: int, progress: DriveProgress) -> list[dict[str, Any]]:
-    if workers <= 1 or len(todo) == 1:
-        return [drive_record(job, partial(progress, job.title), workers) for job in todo]
+def _records(todo: Sequence[Job], executor: Executor, progress: DriveProgress) -> list[dict[str, Any]]:
+    if executor.workers <= 1 or len(todo) == 1:
+        return [drive_record(job, partial(progress, job.title), executor) for job in todo]
     records: dict[int, dict[str, Any]] = {}
 
     def advance(job: Job, task: str, done: int, total: int) -> None:
         progress(job.title, task, done, total)
 
-    for number, record in side_by_side(drive_record, todo, workers, advance):
+    for number, record in executor.side_by_side(drive_record, todo, advance):
         if isinstance(record, WorkerError):
             raise record
         records[number] = record

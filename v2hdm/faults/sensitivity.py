@@ -336,21 +336,12 @@ def height_information(solution: Solution, heights: Any) -> tuple[FloatArray, Fl
 def moves_with_heights(solution: Solution, heights: FloatArray) -> Moves:
     """Motion of a solution under B errors of the observed ground's heights (K, B), m."""
     solved = Sensitivity.at(solution.covariance.whitening)
-    whitening = solved.whitening
     arrays = solved.arrays
-    weighted = raised(solved, torch.ones_like(solved.root))["observations"] * solved.root
-    corners = []
-    extrinsic = []
-    poses = []
-    for column in torch.as_tensor(heights[arrays.order.cpu().numpy()].T).to(weighted):
-        whitened = whitening.whiten([whitening.pull(weighted * column)])[0]
-        step, tangents, whitened_corners = whitening.step(whitened)
-        stepped = whitening.linearised.evaluate(step, tangents, whitened_corners).estimate
-        corners.append(whitening.estimate.corners_map - stepped.corners_map)
-        extrinsic.append(-step.extrinsic)
-        poses.append(-step.frame_state)
-    of_corners = np.empty((*whitening.estimate.corners_map.shape, len(corners)))
-    of_corners[arrays.corner_order.cpu().numpy()] = torch.stack(corners, dim=-1).cpu().numpy()
-    of_poses = np.zeros((arrays.frame_count, 6, len(poses)))
-    of_poses[:, list(arrays.states)] = torch.stack(poses, dim=-1).cpu().numpy()
-    return Moves(of_corners, torch.stack(extrinsic, dim=-1).cpu().numpy(), of_poses)
+    unit = raised(solved, torch.ones_like(solved.root))["observations"].cpu().numpy()
+    by_height = (unit[:, :, None] * heights[arrays.order.cpu().numpy()]).reshape(-1, heights.shape[1])
+    steps = solved.jacobians.steps(solved.jacobians.whiten(by_height, [None] * heights.shape[1]))
+    of_corners = np.empty(tuple(steps.corners_map.shape))
+    of_corners[arrays.corner_order.cpu().numpy()] = -steps.corners_map.cpu().numpy()
+    of_poses = np.zeros((arrays.frame_count, 6, heights.shape[1]))
+    of_poses[:, list(arrays.states)] = -steps.frame_state.cpu().numpy()
+    return Moves(of_corners, -steps.extrinsic.cpu().numpy(), of_poses)

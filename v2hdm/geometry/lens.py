@@ -9,6 +9,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from v2hdm.native import kernels
 from v2hdm.records import CameraInfo, FloatArray
 
 # OpenCV's default of 5 iterations errs by 0.16 px and more near the image corners.
@@ -57,7 +58,13 @@ def _brown_conrady(info: CameraInfo, points_pinhole_px: FloatArray) -> FloatArra
 
     OpenCV's own function also computes derivatives, which takes several times as long.
     """
-    k1, k2, p1, p2, k3, k4, k5, k6 = (*info.distortion, *(0.0,) * (8 - len(info.distortion)))
+    coefficients = (*info.distortion, *(0.0,) * (8 - len(info.distortion)))
+    compiled = kernels()
+    if compiled is not None:
+        points_px = points_pinhole_px.copy()
+        compiled.distort(points_px, info.intrinsic, np.array(coefficients, dtype=np.float64))
+        return points_px
+    k1, k2, p1, p2, k3, k4, k5, k6 = coefficients
     (fx, skew, cx), (_, fy, cy), _ = info.intrinsic
     y = (points_pinhole_px[:, 1] - cy) / fy
     x = (points_pinhole_px[:, 0] - cx - skew * y) / fx

@@ -8,6 +8,7 @@ here. Side ``e`` runs from corner ``e`` to ``e + 1``.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -241,22 +242,33 @@ class Alignment(NamedTuple):
     deformation_m: FloatArray  # largest deviation from ``offset``, infinite for fewer than two common corners
 
 
-def quad_from_hull(hull: np.ndarray) -> FloatArray | None:
-    """The tightest quadrilateral (4, 2) about a hull (N, 1, 2), or None (Low and Ilie 2003, approxPolyN)."""
+def quads_from_hulls(hulls: Sequence[np.ndarray]) -> list[FloatArray | None]:
+    """The tightest quadrilateral (4, 2) about each hull (N, 1, 2), or None (Low and Ilie 2003)."""
     import cv2  # as in rigid.rotation_from_vector
 
-    if len(hull) < 4 or cv2.contourArea(hull) < 1.0:
-        return None
-    quad = np.asarray(cv2.approxPolyN(hull, 4), dtype=np.float64).reshape(-1, 2)
-    if len(quad) != 4 or not np.isfinite(quad).all():
-        return None
-    return order_corners(quad)
+    quads: list[FloatArray | None] = [None] * len(hulls)
+    large = [k for k, hull in enumerate(hulls) if len(hull) >= 4 and cv2.contourArea(hull) >= 1.0]
+    approximate = {k: np.asarray(cv2.approxPolyN(hulls[k], 4), dtype=np.float64) for k in large}
+    of_four = [k for k in large if approximate[k].size == 8]
+    if not of_four:
+        return quads
+    corners = order_corners(np.array([approximate[k].reshape(4, 2) for k in of_four]))
+    known = np.asarray(np.isfinite(corners).all(axis=(1, 2))).tolist()
+    for k, quad, is_known in zip(of_four, corners, known, strict=True):
+        quads[k] = quad if is_known else None
+    return quads
+
+
+def quad_from_hull(hull: np.ndarray) -> FloatArray | None:
+    """The tightest quadrilateral (4, 2) about a hull (N, 1, 2), or None."""
+    return quads_from_hulls([hull])[0]
 
 
 def order_corners(corners: FloatArray) -> FloatArray:
-    """Corners (4, 2) of a convex quadrilateral of an image, sorted counter-clockwise on the screen."""
-    outward = corners - corners.mean(axis=0)
-    return np.asarray(corners[np.argsort(np.arctan2(-outward[:, 1], outward[:, 0]))])
+    """Corners (..., 4, 2) of convex quadrilaterals of an image, sorted counter-clockwise on the screen."""
+    outward = corners - corners.mean(axis=-2, keepdims=True)
+    order = np.argsort(np.arctan2(-outward[..., 1], outward[..., 0]), axis=-1)
+    return np.asarray(np.take_along_axis(corners, order[..., None], axis=-2))
 
 
 def following(values: np.ndarray, axis: int = -2) -> np.ndarray:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from v2hdm.executor import HERE, Executor
 from v2hdm.ground.adjust import CENTRE, Adjusted, adjust
 from v2hdm.ground.model import Mount, guessed_mount
 from v2hdm.ground.motion import ARM_M, Motion, changing_pairs, motion_of, spread_pairs
@@ -18,7 +19,6 @@ from v2hdm.ground.prior import Observations, Stated, state_sigmas
 from v2hdm.ground.results import STEEP_RAD, GroundEstimate, GroundOptions, GroundStatus, Parameter, Reading
 from v2hdm.ground.start import Readings, contradicts, try_readings
 from v2hdm.records import Calibration, Drive, PoseNoise
-from v2hdm.workers import share_out
 
 _FREE_CENTRE = {"forward_m": (0, 2.0), "left_m": (1, 2.0), "up_m": (2, 0.3)}  # axis, prior sigma, m
 _STRAIGHT = "the vehicle drives straight: include a turn"
@@ -282,11 +282,11 @@ _worker_drive: Drive | None = None
 
 
 def estimate_cameras(
-    drive: Drive, workers: int = 1, progress: Callable[[int, int], None] | None = None
+    drive: Drive, executor: Executor = HERE, progress: Callable[[int, int], None] | None = None
 ) -> dict[str, GroundEstimate]:
-    """Estimate every camera's mounting from bare ground, in up to ``workers`` single-threaded processes.
+    """Estimate every camera's mounting from bare ground, as many at a time as an executor can.
 
-    ``progress(done, total)`` is called before the first camera and after each; 1 worker is this process.
+    ``progress(done, total)`` is called before the first camera and after each.
     Raises DriveError for an unreadable image, WorkerError if a process died.
     """
     estimates: dict[str, GroundEstimate] = {}
@@ -299,11 +299,11 @@ def estimate_cameras(
     names = list(drive.cameras)
     if progress:
         progress(0, len(names))
-    if workers <= 1 or len(names) == 1:
+    if executor.workers <= 1 or len(names) == 1:
         for name in names:
             take(estimate_ground(drive, name))
     else:
-        share_out(_work, names, workers, _start_worker, (drive,), take)
+        executor.share_out(_work, names, _start_worker, (drive,), take)
     return estimates
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from v2hdm.detection.batch import detect_all
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.doors import checked
 from v2hdm.errors import MapFileError
+from v2hdm.executor import open_executor
 from v2hdm.geometry.planar import wrapped
 from v2hdm.geometry.rigid import heading_rad
 from v2hdm.io.drive import as_drive
@@ -151,11 +151,11 @@ def localize(
     True
     """
     drive = as_drive(drive)
-    workers = workers or os.cpu_count() or 1
     check_together(hd_map, calibrations, drive)
     if detections is None:
         report = progress or (lambda done, total: None)
-        detections = detect_all(drive, DetectorOptions.for_mapping(), workers, report)
+        with open_executor(workers) as executor:
+            detections = detect_all(drive, DetectorOptions.for_mapping(), executor, report)
     check_detections(drive, detections)
     names = [name for name in drive.cameras if name in calibrations]
     sightings = collect_sightings(drive, detections, names)

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError, DriveError, need
+from v2hdm.executor import check_cluster
 from v2hdm.io.drive import ReadOptions, drive_name
 from v2hdm.io.maps.corrections import read_corrections
 from v2hdm.mapping.options import BATCH, INCREMENTAL, MappingOptions, check_options
@@ -104,8 +105,18 @@ class RunConfig:
         "everything.",
     ] = True
     workers: Annotated[
-        int, Within(0, MOST_PROCESSES), "number of processes for rendering and detection; 0 for one per core."
+        int,
+        Within(0, MOST_PROCESSES),
+        "number of processes for rendering, checks, detection and maps; 0 for one per core.",
     ] = 0
+    cluster: Annotated[
+        str,
+        "machines to work on: the address of a Dask scheduler (tcp://host:8786), or a batch system (slurm); "
+        "empty for this one (docs/fleet.md).",
+    ] = ""
+    worker_gb: Annotated[
+        float, NOT_NEGATIVE, "most memory of a process of this machine, GB; 0 for an even share of it."
+    ] = 0.0
     device: Annotated[str, "where the adjustment runs, cpu or cuda."] = "cpu"
     mode: Annotated[
         str, "batch; or incremental, marking by marking as on the vehicle, then solved like batch."
@@ -161,6 +172,7 @@ def admit(config: RunConfig) -> str:
     if config.simulate is not None:
         _check_names(config.simulate)
     check_settings(config)
+    check_cluster(config.cluster)
     # Wherever the detector will run, it can be looked at here.
     detector = Detector.load(options=replace(config.detector, device="cpu"))
     check_options(config.mapping, detector.catalogue.cornered)
@@ -261,7 +273,7 @@ def result_key(config: RunConfig, drives: Sequence[Drive], contents: Contents, c
     """The key of a run's whole result: all that it depends on, and nothing else; ``code`` is the code's."""
     settings = replace(
         config, name=run_name(config), output="", cache="", cache_gb=0.0, resume=True,
-        workers=0, drive=replace(config.drive, path=None, cache=""),
+        workers=0, cluster="", worker_gb=0.0, drive=replace(config.drive, path=None, cache=""),
     )  # fmt: skip
     files: list[Path] = []
     if config.map.base is not None:

@@ -1,4 +1,4 @@
-"""The surroundings of a run: cache, progress, workers, times, the log."""
+"""The surroundings of a run: cache, progress, executor, times, the log."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from v2hdm.executor import HERE, Executor
 from v2hdm.progress import Progress, Steps, silent
 from v2hdm.records import Drive
 from v2hdm.store.cache import StageCache
@@ -31,12 +32,13 @@ class Context:
     detect: Detect | None = None  # in place of processes of this machine
     # refuses a drive that does not suit what is to be written
     accept: Callable[[Drive], None] = lambda drive: None
-    workers: int = 0  # 0 takes one per core
+    executor: Executor = HERE  # of the stages that are shared out
+    workers: int = 0  # threads of this process, 0 for one per core
     seconds: dict[str, float] = field(default_factory=dict)  # how long each step took
 
     @property
-    def processes(self) -> int:
-        """The number of processes to work in."""
+    def threads(self) -> int:
+        """The number of threads of this process to work in."""
         return self.workers or os.cpu_count() or 1
 
     def steps(self, task: str) -> Steps:

@@ -9,6 +9,7 @@ from functools import partial
 
 from v2hdm.calibration.compare import movement
 from v2hdm.errors import MapFileError
+from v2hdm.executor import Executor
 from v2hdm.ground.results import GROUND_IPM, GroundEstimate, GroundStatus, better_start
 from v2hdm.io.drive import join_drives, with_clock_offsets
 from v2hdm.pipeline.config import Contents
@@ -34,11 +35,13 @@ class Inspection:
         return replace(self.drive, cameras=self.described_cameras)
 
 
-def inspect(drive: Drive, max_gap_s: float, workers: int, progress: Callable[[int, int], None]) -> Inspection:
+def inspect(
+    drive: Drive, max_gap_s: float, executor: Executor, progress: Callable[[int, int], None]
+) -> Inspection:
     """Check a drive and correct what can be corrected; ``max_gap_s`` bounds the gaps between poses."""
     from v2hdm.ground.estimate import estimate_cameras
 
-    ground = estimate_cameras(drive, workers, progress)
+    ground = estimate_cameras(drive, executor, progress)
     findings = tuple(input_findings(drive, ground))
     for finding in findings:
         if finding.status is not Status.PASS:
@@ -58,7 +61,7 @@ def inspect_each(
     cache = context.cache
     for drive in drives:
         steps = context.steps("check" if len(drives) == 1 else f"check {drive.name}")
-        work = partial(inspect, drive, max_gap_s, context.processes, steps)
+        work = partial(inspect, drive, max_gap_s, context.executor, steps)
         key = cache.key(contents.key(drive), max_gap_s)
         inspections.append(cache.get_or_make("check", key, Inspection, work))
     return inspections

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +16,7 @@ from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.weights import unknown_network
 from v2hdm.doors import checked
 from v2hdm.errors import AdjustError, ConfigError, MappingError
+from v2hdm.executor import open_executor
 from v2hdm.io.drive import ReadOptions, as_drive, join_drives
 from v2hdm.io.maps.corrections import read_corrections
 from v2hdm.mapping.options import AUTO, MappingOptions, check_options
@@ -102,27 +104,33 @@ def map_drive(
     >>> result.verdict.status.value, result.calibrations["front"].cam_from_vehicle.shape
     ('PASS', (4, 4))
     """
-    context = context or _context_of(cache, progress, workers)
     options = _options_of(options or MappingOptions(), corrections)
     reading = reading or ReadOptions()
     sources = _sources_of(drive)
     check_choice(options, len(sources), base is not None, accuracy_goal_cm)
-    read = read_all(sources, reading, context)
-    earlier = _earlier(base, read.whole, context)
-    survey = take_survey(read.whole, options)
-    with context.timed("check"):
-        inspection = join(inspect_each(read.drives, read.contents, reading.max_gap_s, context))
-    paths = [source.root if isinstance(source, Drive) else Path(source) for source in sources]
-    about = describe_run(name or read.whole.name, read.whole, read.contents, paths, reading)
-    described = inspection.drive_as_described
-    mapped_so_far = Result(about, read.drives, read.contents, described, context.seconds, options.device)
-    return _mapped(mapped_so_far, inspection, detector, survey, earlier, accuracy_goal_cm, context, all_maps)
+    with nullcontext(context) if context else _own_context(cache, progress, workers) as context:
+        read = read_all(sources, reading, context)
+        earlier = _earlier(base, read.whole, context)
+        survey = take_survey(read.whole, options)
+        with context.timed("check"):
+            inspection = join(inspect_each(read.drives, read.contents, reading.max_gap_s, context))
+        paths = [source.root if isinstance(source, Drive) else Path(source) for source in sources]
+        about = describe_run(name or read.whole.name, read.whole, read.contents, paths, reading)
+        described = inspection.drive_as_described
+        mapped_so_far = Result(about, read.drives, read.contents, described, context.seconds, options.device)
+        return _mapped(
+            mapped_so_far, inspection, detector, survey, earlier, accuracy_goal_cm, context, all_maps
+        )
 
 
-def _context_of(cache: Path | str | None, progress: Progress, workers: int) -> Context:
+@contextmanager
+def _own_context(cache: Path | str | None, progress: Progress, workers: int) -> Iterator[Context]:
+    """The surroundings of a run that is given none."""
     if cache is not None and Path(cache).is_file():
         raise ConfigError(f"cache {cache}: is a file; give a folder")
-    return Context(StageCache(None if cache is None else Path(cache)), progress, workers=workers)
+    stages = StageCache(None if cache is None else Path(cache))
+    with open_executor(workers) as executor:
+        yield Context(stages, progress, executor=executor, workers=workers)
 
 
 def _options_of(options: MappingOptions, corrections: Path | str | None) -> MappingOptions:

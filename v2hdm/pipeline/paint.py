@@ -66,7 +66,7 @@ def _with_wear(
         grey,
         shown,
         before,
-        context.processes,
+        context.threads,
         best.surface,
     )
 
@@ -76,11 +76,11 @@ def _with_words(hd_map: HDMap, footage: Footage, drive: Drive, context: Context)
     from v2hdm.words.reading import with_readings
     from v2hdm.words.recogniser import MISSING, load_recogniser
 
-    recogniser = load_recogniser(context.processes)
+    recogniser = load_recogniser(context.threads)
     if recogniser is None:
         _log.warning("%s", MISSING)
         return hd_map
-    return with_readings(hd_map, footage, drive.cameras, _light(drive), recogniser, context.processes)
+    return with_readings(hd_map, footage, drive.cameras, _light(drive), recogniser, context.threads)
 
 
 def _light(drive: Drive) -> Callable[[Image], NDArray[np.float32]]:

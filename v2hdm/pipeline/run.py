@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -17,6 +17,7 @@ from typing import Any
 
 from v2hdm import __version__
 from v2hdm.errors import ConfigError, V2hdmError, masked
+from v2hdm.executor import Executor, open_executor
 from v2hdm.io.drive import read_drive
 from v2hdm.io.maps.formats import check_crs
 from v2hdm.pipeline.config import (
@@ -196,9 +197,23 @@ def take_or_run(config: RunConfig, config_yaml: str, progress: Progress) -> tupl
         from v2hdm.detection.network import check_device
 
         check_device(local.detector.device)
-        return map_and_save(local, cache, config_yaml, Context(progress=progress), made_of(config))
+        with open_run_executor(local) as executor:
+            context = Context(progress=progress, executor=executor)
+            return map_and_save(local, cache, config_yaml, context, made_of(config))
 
     return take_or_make(config, work, config.resume, progress)
+
+
+def open_run_executor(config: RunConfig, isolated: bool = False) -> AbstractContextManager[Executor]:
+    """The executor of a run, whose workers can read its drives and write to its cache."""
+    return open_executor(
+        config.workers,
+        config.cluster,
+        memory_gb=config.worker_gb,
+        readable=[str(path) for path in config.drive.paths],
+        writable=[config.cache],
+        isolated=isolated,
+    )
 
 
 def made_of(config: RunConfig) -> str:
@@ -278,4 +293,4 @@ def _drive_folders(config: RunConfig, context: Context) -> tuple[Path, ...]:
     with context.timed("render"):
         folder = Path(config.cache)
         steps = context.steps("render")
-        return (rendered_drive(config.simulate, folder, context.processes, steps),)
+        return (rendered_drive(config.simulate, folder, context.executor, steps),)

@@ -11,7 +11,6 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from multiprocessing import parent_process
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -30,7 +29,6 @@ from v2hdm.site.living.changes import Base
 from v2hdm.store.cache import Line, key_of, log_again, recorded
 from v2hdm.survey.check_points import CheckTable
 from v2hdm.survey.run import Survey, compare_survey
-from v2hdm.workers import side_by_side
 
 if TYPE_CHECKING:
     from v2hdm.detection.batch import Detect
@@ -88,7 +86,7 @@ def detect_in_pieces(
         progress(total - len(todo) + done, total)
 
     if todo:
-        (detect or detect_images)(drive, options, todo, context.processes, take)
+        (detect or detect_images)(drive, options, todo, context.executor, take)
     return [
         replace(detections, image=start + detections.image)
         for start, piece in pieces.items()
@@ -176,8 +174,8 @@ def map_camera_sets(
         if name not in mapped_sets
     ]
     is_large = sum(len(in_image.markings) for in_image in detections) > _WORTH_PROCESSES
-    if len(todo) > 1 and context.processes > 1 and survey.mapping.device == "cpu" and is_large:
-        for _, outcome in side_by_side(work, todo, context.processes, lambda *_: None):
+    if len(todo) > 1 and context.executor.workers > 1 and survey.mapping.device == "cpu" and is_large:
+        for _, outcome in context.executor.side_by_side(work, todo):
             if isinstance(outcome, WorkerError):
                 raise outcome
             log_again(outcome.lines)
@@ -222,8 +220,6 @@ class _Work:
 
     def __call__(self, job: _Job, _: Progress = silent) -> _Outcome:
         """Map one set of cameras."""
-        if parent_process() is not None:
-            logging.getLogger("v2hdm").setLevel(logging.DEBUG)
         with recorded() as lines:
             mapped = self._map(job.name, job.cameras)
         return _Outcome(job.name, mapped, lines)

@@ -13,6 +13,7 @@ from tests.benchmarks.faults.situations import Situation, calibrating
 from tests.faults.judge import Case, Prepare
 from tests.ports import short_port
 from v2hdm.errors import DriveError
+from v2hdm.executor import HERE
 from v2hdm.io.image_lists import read_image_list, write_image_list
 from v2hdm.simulate.port.drive import render_drive
 from v2hdm.store.cache import DRIVES, LEFT, checked, code_key, items_of
@@ -29,7 +30,7 @@ def small_drive(scratch: Path, cameras: Sequence[str] = ("front",), images: int 
     """A drive with so many images of each camera, rendered where it is not there yet."""
     rendered, folder = scratch / "rendered", scratch / f"drive-{'-'.join(cameras)}-{images}"
     if not (rendered / "drive.yaml").is_file():
-        render_drive(short_port(), rendered, 1, lambda done, total: None)
+        render_drive(short_port(), rendered, HERE, lambda done, total: None)
     if not (folder / "drive.yaml").is_file():
         shutil.rmtree(folder, ignore_errors=True)
         shutil.copytree(rendered, folder, ignore=shutil.ignore_patterns("front", "rear", "drive.yaml"))

@@ -29,6 +29,7 @@ def _run(arguments: Sequence[str]) -> int:
 
         print(list_topics(parsed.drive, Path(ReadOptions().cache)))
         return 0
+    from v2hdm.executor import open_executor
     from v2hdm.ground.estimate import estimate_cameras
     from v2hdm.io.description import DRIVE_FILE
     from v2hdm.store.files import write_json
@@ -55,7 +56,8 @@ def _run(arguments: Sequence[str]) -> int:
     settings = {"drive": str(parsed.drive), "cameras": list(drive.cameras), "ground": parsed.ground}
     with result_of(folder, f"v2hdm check of {_recording_of(parsed.drive)}", settings) as unfinished:
         matched = steps_of("match bare ground, cameras")
-        ground = estimate_cameras(drive, parsed.workers, matched) if parsed.ground else {}
+        with open_executor(parsed.workers) as executor:
+            ground = estimate_cameras(drive, executor, matched) if parsed.ground else {}
         print("check the drive", file=sys.stderr, flush=True)
         verdict = check_drive(drive, ground=ground)
         is_asked = parsed.write and not any(setting.startswith(f"{HEIGHT}=") for setting in parsed.set)

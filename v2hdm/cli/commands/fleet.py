@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,7 +10,7 @@ from v2hdm.errors import ConfigError
 
 
 def _run(arguments: Sequence[str]) -> int:
-    """Map many drives on the cores of this machine, or a share of them.
+    """Map many drives on the cores of this machine, or on a Dask cluster.
 
     A drive whose result is finished and was made of the same is not done again; one that fails is a row of
     the table that says why. Returns 0, 2 where a drive gave no result, or 3 where a verdict is FAIL.
@@ -21,8 +20,8 @@ def _run(arguments: Sequence[str]) -> int:
     parser.add_argument("--workers", type=int, default=0, metavar="N", help="cores to use (default: all)")
     tables = "folder for the verdicts, fleet.csv and fleet.json (default: outputs/fleet)"
     parser.add_argument("--table", type=Path, default=Path("outputs/fleet"), metavar="DIR", help=tables)
-    every = "map every N-th drive, starting with the K-th; table in DIR-K-of-N"
-    parser.add_argument("--share", metavar="K/N", help=every)
+    machines = "machines to work on: the address of a Dask scheduler, or a batch system; as cluster=ADDRESS"
+    parser.add_argument("--cluster", metavar="ADDRESS", help=machines)
     parser.add_argument("--again", action="store_true", help="map finished drives again")
     parsed = parser.parse_intermixed_args(arguments)
     from v2hdm.fleet import FleetOptions, exit_code, fleet_on_terminal
@@ -33,26 +32,14 @@ def _run(arguments: Sequence[str]) -> int:
     files = [Path(word) for word in dict.fromkeys(parsed.drives) if word not in overrides]
     if not files:
         raise ConfigError("no drives given: name run files, as in v2hdm fleet drives/*.yaml")
-    table = parsed.table
-    share = (1, 1)
-    if parsed.share is not None:
-        share = _share(parsed.share)
-        table = table.with_name(f"{table.name}-{share[0]}-of-{share[1]}")
+    if parsed.cluster is not None:
+        overrides.append(f"cluster={parsed.cluster}")
     missing = [file for file in files if not file.exists()]
-    # A pattern that matches nothing comes as it is, and a part of a fleet would not miss the others.
+    # A pattern that matches nothing comes as it is.
     if unmatched := [file for file in missing if missing == files or set("*?[") & set(str(file))]:
         raise ConfigError(f"{unmatched[0]}: no such run file; check the path")
-    options = FleetOptions(table, parsed.workers, parsed.again, share)
+    options = FleetOptions(parsed.table, parsed.workers, parsed.again)
     return exit_code(fleet_on_terminal(files, overrides, options))
-
-
-def _share(text: str) -> tuple[int, int]:
-    """K and N of ``K/N``."""
-    numbers = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text, re.ASCII)
-    k, n = (int(number) for number in numbers.groups()) if numbers else (0, 0)
-    if not 1 <= k <= n:
-        raise ConfigError(f"--share {text}: give K/N, such as 1/4 to 4/4")
-    return k, n
 
 
 COMMAND = Command(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -27,12 +26,14 @@ def _run(arguments: Sequence[str]) -> int:
 def _render(job: Job) -> None:
     from pathlib import Path
 
+    from v2hdm.executor import open_executor
     from v2hdm.pipeline.config import admit_port
     from v2hdm.simulate.port.drive import rendered_drive
 
     config = job.settings
-    workers = config.workers or os.cpu_count() or 1
-    print(rendered_drive(admit_port(config), Path(config.cache), workers, steps_of("render images")))
+    port = admit_port(config)
+    with open_executor(config.workers, config.cluster, writable=[config.cache]) as executor:
+        print(rendered_drive(port, Path(config.cache), executor, steps_of("render images")))
 
 
 COMMAND = Command(

@@ -21,6 +21,7 @@ import numpy as np
 from v2hdm.detection.camera import FARTHEST_M
 from v2hdm.detection.lanes.curves import NEIGHBOURS, LaneImage, Line, LinePoints, Span
 from v2hdm.detection.network import as_probability
+from v2hdm.native import kernels
 from v2hdm.records import LANE_BOUNDARY, BoolArray, FloatArray, LaneDetection
 
 _DRAWN_STEP_PX = 8.0  # rows from one point of a drawn line to the next, px
@@ -162,6 +163,9 @@ def _forward_backward(likelihood: FloatArray, step_m: FloatArray) -> tuple[Float
     """Probabilities (N, T, S) of the states, and log likelihood (N,), from those of rows ``step_m`` apart."""
     move = _modes().move(step_m)
     evidence = np.exp(likelihood)
+    compiled = kernels()
+    if compiled is not None:
+        return evidence, compiled.forward_backward(evidence, move, _modes().stationary)
     forward = np.empty_like(evidence)
     scale = np.empty(evidence.shape[:2])
     state = np.broadcast_to(_modes().stationary, evidence[:, 0].shape)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from v2hdm.native import kernels
 from v2hdm.records import FloatArray, IntArray
 
 _MIN_CHAIN = 3  # least number of crossings of a chain
@@ -17,6 +18,18 @@ _GATE_PX = 12.0  # largest distance of a crossing from a chain's continuation, p
 _YOUNG = 1.5  # factor on that distance for a chain of fewer points than give its direction
 _WIDENING = 0.04  # share by which that distance grows with each further row
 _ROW_STEP_PX = 8  # rows between neighbouring row anchors in full resolution
+
+_RULES = {
+    "min_chain": _MIN_CHAIN,
+    "max_gap_px": _MAX_GAP_PX,
+    "slope_points": _SLOPE_POINTS,
+    "max_slope": _MAX_SLOPE,
+    "gate_px": _GATE_PX,
+    "young": _YOUNG,
+    "widening": _WIDENING,
+    "row_step_px": _ROW_STEP_PX,
+}
+"""The constants of this module, for the compiled kernel."""
 
 
 @dataclass
@@ -51,6 +64,9 @@ def find_chains(points_px: FloatArray, odds: FloatArray) -> list[IntArray]:
     u_px, v_px = points_px[likely].T
     if not len(likely):
         return []
+    compiled = kernels()
+    if compiled is not None:
+        return [likely[members] for members in compiled.find_chains(u_px, v_px, _RULES)]
     begins = np.flatnonzero(np.diff(v_px, prepend=np.nan)).tolist()  # nan differs from any row
     columns = u_px.tolist()
     indices = likely.tolist()

@@ -22,6 +22,7 @@ from v2hdm.detection.lanes.score import log_odds, log_odds_alone
 from v2hdm.detection.network import crossings
 from v2hdm.detection.quads.blobs import Blob
 from v2hdm.detection.quads.propose import Proposal
+from v2hdm.native import kernels
 from v2hdm.records import FloatArray, IntArray, LaneDetection
 
 _CAP_WIDTH_RATIO = 0.7  # cuts whose width differs more from the median are through slanted ends
@@ -41,10 +42,15 @@ def trace_lanes(
     if not branches:
         return []
     edges_vehicle = _at_once(camera.unproject, [edges for _, edges in branches])
+    compiled = kernels()
+    if compiled is not None:
+        lines = compiled.centre_lines(
+            edges_vehicle, camera.foot_vehicle, step_m, max_range_m, _CAP_WIDTH_RATIO, _MIN_POINTS
+        )
+    else:
+        lines = [_resample(_centre(edges), camera, step_m, max_range_m) for edges in edges_vehicle]
     traced = [
-        (paint, points)
-        for (paint, _), edges in zip(branches, edges_vehicle, strict=True)
-        if len(points := _resample(_centre(edges), camera, step_m, max_range_m)) >= _MIN_POINTS
+        (paint, line) for (paint, _), line in zip(branches, lines, strict=True) if len(line) >= _MIN_POINTS
     ]
     if not traced:
         return []
@@ -66,13 +72,19 @@ def _branches(blob: Blob) -> list[FloatArray]:
     by_rows = height >= _ROWS_MIN_ASPECT * width
     level = blob.level if by_rows else blob.level.T
     order = [1, 0] if by_rows else [0, 1]
-    i, j = np.nonzero((level[:, :-1] > 0) != (level[:, 1:] > 0))
-    crossing = j + level[i, j] / (level[i, j] - level[i, j + 1])
-    runs = np.column_stack([i[::2], crossing[::2], crossing[1::2]]).astype(np.float64)
+    compiled = kernels()
+    chains = _chains(_runs(level)) if compiled is None else compiled.branches(level, _MIN_POINTS)
     return [
         blob.origin_px + blob.stride * np.stack([chain[:, [0, 1]], chain[:, [0, 2]]], axis=1)[..., order]
-        for chain in _chains(runs)
+        for chain in chains
     ]
+
+
+def _runs(level: np.ndarray) -> FloatArray:
+    """Runs (R, 3) of paint: row, start and end column."""
+    i, j = np.nonzero((level[:, :-1] > 0) != (level[:, 1:] > 0))
+    crossing = j + level[i, j] / (level[i, j] - level[i, j + 1])
+    return np.column_stack([i[::2], crossing[::2], crossing[1::2]]).astype(np.float64)
 
 
 def _chains(runs: FloatArray) -> list[FloatArray]:

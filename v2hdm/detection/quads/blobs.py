@@ -15,6 +15,7 @@ import numpy as np
 
 from v2hdm.catalogue import SHIPPED, Catalogue
 from v2hdm.detection.network import NetworkOutput, as_probability
+from v2hdm.native import kernels
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 _MIN_CELLS = 5  # blobs of fewer cells are noise: their outline is not worth four corners
@@ -70,6 +71,7 @@ def find_blobs(
     contours, piece = _connected(level, (reach_px - output.top) / output.stride + 1)
     groups = _Groups(output.classes, catalogue)
     scores = _class_scores(output, piece, level, len(contours), groups)
+    may_split = _may_split(piece, level, scores.votes >= groups.least_share)
     outlines = outlines_of(level, piece, len(contours))
     owner = np.zeros_like(piece)
     blobs: list[Blob] = []
@@ -84,7 +86,9 @@ def find_blobs(
             blobs.append(_doubtful_blob(doubtful, area, level, output))
         box = _framed(cv2.boundingRect(contours[index]))
         inside = piece[box] == index + 1
-        parts = _split(inside, level[box], output, box, groups, scores.votes[index])
+        parts: list[Blob] = []
+        if may_split[index]:
+            parts = _split(inside, level[box], output, box, groups, scores.votes[index])
         whole = Blob(
             class_score=dict(zip(output.classes, scores.score[:, index].tolist(), strict=True)),
             level=_signed(inside, level[box]),
@@ -173,22 +177,51 @@ def _class_scores(
     output: NetworkOutput, piece: np.ndarray, level: np.ndarray, count: int, groups: _Groups
 ) -> _Scores:
     """The scores of ``count`` pieces, of which ``piece`` (h, w) is the map."""
+    tally = _tally(output, piece, level, count, (-1, -1))
+    number = np.maximum(tally.cells, 1)
+    score = (tally.certainty / number) * (tally.probability / number[:, None]).T
+    votes = np.zeros((count, len(groups.least_share)))
+    for group in np.unique(groups.of_class):
+        votes[:, group] = tally.best[:, groups.of_class == group].sum(axis=1)
+    return _Scores(tally.cells, score, votes / number[:, None])
+
+
+class _Tally(NamedTuple):
+    """What the network says of the elements of ``count`` pieces, added up."""
+
+    cells: IntArray  # (count,) elements
+    best: IntArray  # (count, K) of which each class is the likeliest
+    certainty: FloatArray  # (count,) sum of the probabilities of paint
+    probability: FloatArray  # (count, K) sums of those of the classes, were it paint
+
+
+def _tally(
+    output: NetworkOutput, piece: np.ndarray, level: np.ndarray, count: int, first: tuple[int, int]
+) -> _Tally:
+    """The sums over the pieces of a map (h, w), whose first element is that row and column of the paint."""
+    compiled = kernels()
+    if compiled is not None:
+        return _Tally(*compiled.tally(level, piece, count, output.kinds, output.kind_scale, *first))
     element = np.flatnonzero(piece > 0)
     of_piece = piece.ravel()[element] - 1
-    cells = np.bincount(of_piece, minlength=count)
-    share = 1 / np.maximum(cells, 1)
-    certainty = np.bincount(of_piece, as_probability(level.ravel()[element]), count) * share
     i, j = np.divmod(element, piece.shape[1])
-    probability = output.class_probability(i - 1, j - 1)
-    score = np.stack([np.bincount(of_piece, plane, count) for plane in probability]) * share
-    group_count = len(groups.least_share)
-    best = of_piece * group_count + groups.of_class[probability.argmax(axis=0)]
-    votes = np.bincount(best, minlength=count * group_count).reshape(count, group_count)
-    return _Scores(cells, certainty * score, votes / np.maximum(cells, 1)[:, None])
+    probability = output.class_probability(i + first[0], j + first[1])
+    classes = len(probability)
+    likeliest = of_piece * classes + probability.argmax(axis=0)
+    return _Tally(
+        cells=np.bincount(of_piece, minlength=count),
+        best=np.bincount(likeliest, minlength=count * classes).reshape(count, classes),
+        certainty=np.bincount(of_piece, as_probability(level.ravel()[element]), count).astype(np.float64),
+        probability=np.stack([np.bincount(of_piece, plane, count) for plane in probability], axis=1),
+    )
 
 
 def outlines_of(level: np.ndarray, piece: np.ndarray, count: int) -> list[FloatArray]:
     """Points (N, 2), (column, row), of each piece's outline: where the level falls to zero beside it."""
+    compiled = kernels()
+    if compiled is not None:
+        outlines: list[FloatArray] = compiled.outlines(level, piece, count)
+        return outlines
     pieces = piece.ravel()
     levels = level.ravel()
     columns = piece.shape[1]
@@ -206,6 +239,21 @@ def outlines_of(level: np.ndarray, piece: np.ndarray, count: int) -> list[FloatA
     ends = np.searchsorted(owner[order], np.arange(1, count + 2)).tolist()
     ordered = np.concatenate(points).astype(np.float64)[order]
     return [ordered[begin:end] for begin, end in pairwise(ends)]
+
+
+def _may_split(piece: np.ndarray, level: np.ndarray, present: BoolArray) -> BoolArray:
+    """Which pieces are of several groups, by those ``present`` (B, G), or have several parts of sure paint.
+
+    Sure paint of two pieces never touches: it is labelled for all of them at once.
+    """
+    sure = ((level > _SURE) & (piece > 0)).view(np.uint8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(sure, ltype=cv2.CV_16U)
+    large = np.flatnonzero(stats[1:, cv2.CC_STAT_AREA] >= _MIN_CELLS) + 1
+    # The piece of a part is that at any of its elements: on its first row there is one.
+    rows = stats[large, cv2.CC_STAT_TOP]
+    firsts = (labels[rows] == large[:, None]).argmax(axis=1) if len(large) else rows
+    parts = np.bincount(piece[rows, firsts], minlength=len(present) + 1)[1:]
+    return np.asarray((present.sum(axis=1) > 1) | (parts > 1))
 
 
 def _split(
@@ -235,12 +283,12 @@ def _split(
 
 def _blob(mask: BoolArray, level: np.ndarray, output: NetworkOutput, box: Box) -> Blob:
     """The blob of a mask (h, w), a box of the framed ``paint``."""
-    rows, columns = np.nonzero(mask)
-    probability = output.class_probability(rows + box[0].start - 1, columns + box[1].start - 1)
-    scores = probability.mean(axis=1) * as_probability(level[mask]).mean()
+    piece = mask.astype(np.int16)
+    tally = _tally(output, piece, level, 1, (box[0].start - 1, box[1].start - 1))
+    scores = tally.probability[0] * tally.certainty[0] / tally.cells[0] ** 2
     signed = _signed(mask, level)
     origin_px = _origin_px(output, box[0].start, box[1].start)
-    outline_px = origin_px + output.stride * outlines_of(signed, mask.astype(np.int16), 1)[0]
+    outline_px = origin_px + output.stride * outlines_of(signed, piece, 1)[0]
     named = dict(zip(output.classes, scores.tolist(), strict=True))
     return Blob(named, signed, origin_px, output.stride, outline_px)
 

@@ -14,6 +14,7 @@ import numpy as np
 from v2hdm.detection.network import as_probability
 from v2hdm.detection.quads.patch import LensFrames, Looked, Patches
 from v2hdm.geometry.planar import Quad
+from v2hdm.native import kernels
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 KNOTS = 6  # knots of the light along a marking: its two ends are as many fifths of it apart as a shadow needs
@@ -91,6 +92,25 @@ class Lattice:
             count=count[:, None],
         )
 
+    @classmethod
+    def seen(cls, patches: Patches, frames: LensFrames, quad: Quad, pixels: IntArray) -> Lattice:
+        """The lattice of pixels (2, M, N), columns and rows, about quadrilaterals in their frames."""
+        u, v = pixels
+        compiled = kernels()
+        if compiled is not None:
+            return cls(**compiled.look(patches.source, _placed(patches, frames, quad), u, v, _GREY_FIRST))
+        flat = patches.look(u.ravel(), v.ravel(), np.repeat(np.arange(len(u)), u.shape[1]))
+        looked = Looked(
+            light=flat.light.reshape(3, *u.shape),
+            use=flat.use.reshape(u.shape).astype(np.float32),
+            clipped=flat.clipped.reshape(u.shape),
+        )
+        no_neighbours = np.zeros((len(u), 0, u.shape[1]), dtype=np.intp)
+        count = np.full(len(u), u.shape[1])
+        return cls.about(
+            frames, quad, np.stack([u, v], axis=2).astype(np.float64), looked, no_neighbours, count
+        )
+
     def take(self, rows: IntArray) -> Lattice:
         """Some of the markings, in lists that are no longer than they need."""
         most = int(self.count[rows].max(initial=1))
@@ -120,18 +140,11 @@ def lay_grid(patches: Patches, frames: LensFrames, corners_px: FloatArray) -> Gr
     across = np.linspace(-_MARGIN_ACROSS, 1 + _MARGIN_ACROSS, _SEARCH_ACROSS)
     a, b = (part.ravel() for part in np.meshgrid(along, across))
     pixels = np.clip(np.round(frames.to_px(quad.long_first().at(a, b))), -(10**6), 10**6)
-    shape = pixels.shape[:2]
-    u, v = pixels.reshape(-1, 2).astype(np.intp).T
-    flat = patches.look(u, v, np.repeat(np.arange(shape[0]), shape[1]))
-    looked = Looked(
-        light=flat.light.reshape(3, *shape),
-        use=flat.use.reshape(shape).astype(np.float32),
-        clipped=flat.clipped.reshape(shape),
-    )
     paint = as_probability(patches.output.odds_at(pixels)).astype(np.float32)
     spacing_px = quad.length.max(axis=1) * (1 + 2 * _MARGIN_ALONG) / _SEARCH_ALONG
-    no_neighbours = np.zeros((shape[0], 0, shape[1]), dtype=np.intp)
-    lattice = Lattice.about(frames, quad, pixels, looked, no_neighbours, np.full(shape[0], shape[1]))
+    lattice = Lattice.seen(
+        patches, frames, quad, np.ascontiguousarray(np.moveaxis(pixels, 2, 0), dtype=np.intp)
+    )
     return Grid(lattice, paint, spacing_px)
 
 
@@ -143,6 +156,20 @@ def lay_lattice(patches: Patches, frames: LensFrames, corners_px: FloatArray) ->
     size = np.ceil(corners_px.max(axis=1)).astype(np.intp) + spare + 1 - low
     in_box = Quad(corners_px - low[:, None])
     columns, rows = _columns_and_rows(in_box, size)
+    compiled = kernels()
+    if compiled is not None:
+        band = _Band(
+            columns=columns,
+            rows=rows,
+            size=size,
+            low=low,
+            near_right=_near_the_next(columns, size[:, 0]),
+            near_below=_near_the_next(rows, size[:, 1]),
+            outward=in_box.outward.astype(np.float32),
+            spare_px=bow_px.astype(np.float32),
+        )
+        placed = _placed(patches, frames, Quad(frames.from_image(corners_px)))
+        return Lattice(**compiled.lay_lattice(patches.source, placed, band, _GREY_FIRST))
     chosen = _chosen_pixels(_in_band(in_box, bow_px, columns, rows, size))
     marking = chosen.marking
     place = chosen.place
@@ -163,6 +190,39 @@ def lay_lattice(patches: Patches, frames: LensFrames, corners_px: FloatArray) ->
     looked.clipped[marking, place] = flat.clipped
     quad = Quad(frames.from_image(corners_px))
     return Lattice.about(frames, quad, pixels, looked, neighbours, chosen.list_length)
+
+
+class _Placed(NamedTuple):
+    """Where M markings are, for the compiled kernels."""
+
+    pieces: IntArray  # (M, 2) first and last piece of paint of each
+    middle: FloatArray  # (M, 2) of their frames
+    scale: FloatArray  # (M, 2, 2)
+    outward: np.ndarray  # (M, 4, 3) float32 to distances outside their sides
+    axes: np.ndarray  # (M, 2, 3) float32 of the light
+
+
+def _placed(patches: Patches, frames: LensFrames, quad: Quad) -> _Placed:
+    """Where quadrilaterals in their frames are."""
+    return _Placed(
+        patches.pieces, frames.middle, frames.scale, quad.outward.astype(np.float32), _light_axes(quad)
+    )
+
+
+class _Band(NamedTuple):
+    """Where the bands about the sides of M markings are, for the compiled kernel."""
+
+    columns: IntArray  # (M, W) places that are looked at
+    rows: IntArray  # (M, H)
+    size: IntArray  # (M, 2) of the box that they lie in, px
+    low: IntArray  # (M, 2) its first pixel
+    near_right: BoolArray  # (M, W) whether the next place is as near as any
+    near_below: BoolArray  # (M, H)
+    outward: np.ndarray  # (M, 4, 3) float32 to distances outside the sides, in the box
+    spare_px: np.ndarray  # (M,) float32 by which the sides are bowed
+    outside_px: float = _OUTSIDE_PX
+    inside_px: float = _INSIDE_PX
+    most: int = _MOST_PIXELS
 
 
 class _Chosen(NamedTuple):
@@ -241,16 +301,20 @@ def _clearest(light: np.ndarray, use: np.ndarray, inside: np.ndarray) -> np.ndar
 
 def _light_basis(quad: Quad, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Hat functions (M, KNOTS, N) along the longest side, and a slope (M, N) across it."""
-    along = quad.tangent[np.arange(len(points)), quad.length.argmax(axis=1)]
+    placed = np.clip(_light_axes(quad) @ points, -1, 1)
+    knot = (placed[:, :1] + 1) * np.float32((KNOTS - 1) / 2)
+    hats = np.maximum(1 - np.abs(knot - np.arange(KNOTS, dtype=np.float32)[:, None]), 0)
+    return hats, placed[:, 1]
+
+
+def _light_axes(quad: Quad) -> np.ndarray:
+    """Rows (M, 2, 3), float32, that take (x, y, 1) to places along and across, -1 to 1 within the marking."""
+    along = quad.tangent[np.arange(len(quad.corners)), quad.length.argmax(axis=1)]
     axes = np.stack([along, along[:, ::-1] * [-1.0, 1.0]], axis=1)
     within = quad.corners @ axes.swapaxes(1, 2)
     middle = (within.max(axis=1) + within.min(axis=1)) / 2
     half = np.ptp(within, axis=1) / 2 + _OUTSIDE_PX
-    rows = np.concatenate([axes / half[..., None], -(middle / half)[..., None]], axis=-1).astype(np.float32)
-    placed = np.clip(rows @ points, -1, 1)
-    knot = (placed[:, :1] + 1) * np.float32((KNOTS - 1) / 2)
-    hats = np.maximum(1 - np.abs(knot - np.arange(KNOTS, dtype=np.float32)[:, None]), 0)
-    return hats, placed[:, 1]
+    return np.concatenate([axes / half[..., None], -(middle / half)[..., None]], axis=-1).astype(np.float32)
 
 
 def _near_the_next(places: np.ndarray, size: np.ndarray) -> BoolArray:

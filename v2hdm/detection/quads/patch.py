@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from v2hdm.detection.camera import RoadCamera
+from v2hdm.detection.camera import LUT_STEP_PX, RoadCamera
 from v2hdm.detection.network import NetworkOutput
 from v2hdm.geometry.planar import Quad, block_diagonal, following
 from v2hdm.records import BoolArray, FloatArray
@@ -59,6 +59,22 @@ class Looked(NamedTuple):
     clipped: np.ndarray  # (n,) which of those are at the sensor's limit
 
 
+class Source(NamedTuple):
+    """What pixels are looked up in."""
+
+    image: np.ndarray  # (H, W, 3) uint8 BGR
+    owner: np.ndarray  # (h, w) int16: 1 + the index of the piece of paint that an element is of, 0 for none
+    top: int  # the image row of the first element
+    stride: int  # px per element
+    radiance: np.ndarray  # (256,) float32 of each code
+    logs: np.ndarray  # (256,) float32 logarithms of that
+    lens: FloatArray | None  # table of the lens, None where nothing is distorted
+    lens_step_px: float = float(LUT_STEP_PX)
+    grey_weights: np.ndarray = np.array(_GREY_WEIGHTS_BGR, dtype=np.float32)
+    clipped: int = _CLIPPED
+    dark: float = _DARK
+
+
 class Patches:
     """The pixels of an image (H, W, 3) uint8 about M markings.
 
@@ -76,11 +92,18 @@ class Patches:
         pieces: np.ndarray,
     ):
         self.output = output
+        self.pieces = pieces
+        radiance, logs = _light_tables(camera.camera.linear_response)
+        self.source = Source(
+            image=np.ascontiguousarray(image_bgr),
+            owner=owner,
+            top=output.top,
+            stride=output.stride,
+            radiance=radiance,
+            logs=logs,
+            lens=camera.lens.table if camera.distorted else None,
+        )
         self._last_px = np.array([image_bgr.shape[1] - 1, image_bgr.shape[0] - 1])
-        self._image = np.ascontiguousarray(image_bgr)
-        self._owner = owner
-        self._pieces = pieces
-        self._linear_response = camera.camera.linear_response
 
     def look(self, u: np.ndarray, v: np.ndarray, marking: np.ndarray) -> Looked:
         """The light at columns ``u`` and rows ``v`` (n,), each looked at for its ``marking`` (n,)."""
@@ -88,22 +111,22 @@ class Patches:
         use = (u >= 0) & (u <= last_u) & (v >= 0) & (v <= last_v)
         u = np.clip(u, 0, last_u)
         v = np.clip(v, 0, last_v)
-        coded = self._image.reshape(-1, 3).take(v * (last_u + 1) + u, axis=0)
-        rows, columns = self._owner.shape
+        coded = self.source.image.reshape(-1, 3).take(v * (last_u + 1) + u, axis=0)
+        rows, columns = self.source.owner.shape
         stride = self.output.stride
         row = np.clip((v - self.output.top) // stride, 0, rows - 1)
-        owner = self._owner.take(row * columns + np.minimum(u // stride, columns - 1))
-        first, last = self._pieces.take(marking, axis=0).T
+        owner = self.source.owner.take(row * columns + np.minimum(u // stride, columns - 1))
+        first, last = self.pieces.take(marking, axis=0).T
         use &= (owner == 0) | ((owner >= first + 1) & (owner <= last + 1))
-        radiance, logs = (_look_up(coded, table) for table in _light_tables(self._linear_response))
+        radiance, logs = (_look_up(coded, table) for table in (self.source.radiance, self.source.logs))
         light = np.stack([log_light(grey_of(radiance)), logs[:, 2], logs[:, 0]])
         return Looked(light, use, use & (coded >= _CLIPPED).any(axis=1))
 
     def light_at(self, points_px: FloatArray) -> np.ndarray:
         """Radiance (..., 3), BGR, at points (..., 2), interpolated."""
         u, v = np.moveaxis(points_px, -1, 0).astype(np.float32).reshape(2, len(points_px), -1)
-        coded = cv2.remap(self._image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        radiance = _look_up(coded, _light_tables(self._linear_response)[0])
+        coded = cv2.remap(self.source.image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        radiance = _look_up(coded, self.source.radiance)
         return radiance.reshape(*points_px.shape[:-1], 3)
 
     def outside(self, points_px: FloatArray) -> BoolArray:
@@ -128,6 +151,11 @@ class LensFrames:
         middle = camera.undistort(within)
         return cls(camera, middle, camera.distort_jacobian(middle))
 
+    @cached_property
+    def from_px(self) -> FloatArray:
+        """Inverses (M, 2, 2) of the scales."""
+        return np.asarray(np.linalg.inv(self.scale))
+
     def take(self, rows: np.ndarray) -> LensFrames:
         """Some of the frames, which may come several times."""
         return LensFrames(self.camera, self.middle[rows], self.scale[rows])
@@ -139,7 +167,7 @@ class LensFrames:
 
     def to_pinhole(self, points: FloatArray) -> FloatArray:
         """Pinhole px (M, N, 2) of points (M, N, 2) of each marking."""
-        return np.asarray(points @ np.linalg.inv(self.scale).swapaxes(1, 2) + self.middle[:, None])
+        return np.asarray(points @ self.from_px.swapaxes(1, 2) + self.middle[:, None])
 
     def to_px(self, points: FloatArray) -> FloatArray:
         """Recorded px (M, N, 2) of points (M, N, 2) of each marking."""
@@ -148,7 +176,7 @@ class LensFrames:
     def jacobian(self, corners: FloatArray) -> FloatArray:
         """Derivative (M, 8, 8) of the recorded px of corners (M, 4, 2) by the corners."""
         slope = self.camera.distort_jacobian(self.to_pinhole(corners).reshape(-1, 2)).reshape(-1, 4, 2, 2)
-        return block_diagonal(slope @ np.linalg.inv(self.scale)[:, None])
+        return block_diagonal(slope @ self.from_px[:, None])
 
     def bow_px(self, corners_px: FloatArray) -> FloatArray:
         """By how much (M,) the lens bows the sides of quadrilaterals with recorded corners (M, 4, 2)."""

@@ -7,8 +7,10 @@ classifier.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import compress
 from typing import NamedTuple
 
@@ -17,9 +19,9 @@ import numpy as np
 
 from v2hdm.catalogue import Catalogue
 from v2hdm.detection.camera import RoadCamera
-from v2hdm.detection.network import NetworkOutput, as_probability
+from v2hdm.detection.network import NetworkOutput
 from v2hdm.detection.quads.blobs import Blob
-from v2hdm.geometry.planar import following, is_convex_px, quad_from_hull, rectangle_size
+from v2hdm.geometry.planar import following, is_convex_px, quads_from_hulls, rectangle_size
 from v2hdm.records import BoolArray, FloatArray
 
 _LEAST_CERTAINTY = 0.3  # least mean probability of paint of a piece; below it one in fifty is a marking
@@ -73,7 +75,7 @@ class Proposal:
         """The likeliest class."""
         return max(self.share, key=self.share.__getitem__)
 
-    @property
+    @cached_property
     def certainty(self) -> float:
         """Mean probability of paint."""
         return sum(self.blob.class_score.values())
@@ -91,7 +93,7 @@ class Proposal:
         """
         share = min(self.score_of([kind]), self.certainty * self.share.get(kind, 0.0))
         odds = _SYMBOL_ODDS + _VOTES * (share * _NAMED_ODDS - (1 - share) * _MISSED_ODDS)
-        return float(self.certainty * as_probability(np.array(odds)))
+        return self.certainty / (1 + math.exp(-odds))
 
     def is_one_symbol(self, parts: Sequence[Proposal], catalogue: Catalogue) -> bool:
         """Whether it is likelier to be a symbol as a whole than with a part that is another marking.
@@ -193,7 +195,7 @@ class _Tightest(NamedTuple):
 def _tightest(outlines_px: Sequence[FloatArray], camera: RoadCamera, max_range_m: float) -> list[_Tightest]:
     """The tightest quadrilateral around each outline (N, 2), pinhole px."""
     hulls = [cv2.convexHull((outline - outline[0]).astype(np.float32)) for outline in outlines_px]
-    quads = [quad_from_hull(hull) for hull in hulls]
+    quads = quads_from_hulls(hulls)
     of_outline = [k for k, quad in enumerate(quads) if quad is not None]
     tightest = [_Tightest()] * len(outlines_px)
     if not of_outline:

@@ -300,7 +300,7 @@ def _closure(corners: FloatArray, frames: LensFrames) -> tuple[FloatArray, Float
     flat = pinhole.reshape(-1, 2)
     ground = frames.camera.ground(flat).reshape(corners.shape)
     by_pinhole = frames.camera.ground_jacobian(flat).reshape(-1, 4, 2, 2)
-    by_corner = by_pinhole @ np.linalg.inv(frames.scale)[:, None]
+    by_corner = by_pinhole @ frames.from_px[:, None]
     size_m = np.sqrt(Quad(ground).area)
     sigma_m = np.asarray(np.maximum(_CLOSURE_SHARE * size_m, _CLOSURE_M))[:, None, None]
     derivative = (_ALTERNATING[:, None, None] * by_corner).transpose(0, 2, 1, 3).reshape(-1, 2, 8) / sigma_m

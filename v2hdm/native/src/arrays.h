@@ -37,4 +37,19 @@ Array<Value, DIMENSIONS> member(nb::handle object, const char* name, std::initia
     return array;
 }
 
+// An array of Python, of zeros.
+template <typename Value>
+struct Made {
+    Value* data;
+    nb::object array;
+
+    explicit Made(std::initializer_list<size_t> shape) {
+        size_t size = 1;
+        for (const size_t axis : shape) size *= axis;
+        data = new Value[size]();
+        nb::capsule owner(data, [](void* memory) noexcept { delete[] static_cast<Value*>(memory); });
+        array = nb::cast(nb::ndarray<nb::numpy, Value>(data, shape, owner));
+    }
+};
+
 }  // namespace v2hdm

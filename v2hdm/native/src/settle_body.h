@@ -4,7 +4,7 @@ namespace {
 
 constexpr int BLOCK = 16;         // pixels that are worked on together; a row of a buffer is padded to these
 constexpr int MEDIAN_STRIDE = 3;  // lattice.py: a median is taken over every third value
-constexpr float FAR_BLURS = 6.0f; // blurs from a side beyond which it changes nothing: its density is 6e-9
+constexpr float FAR_BLURS = 5.0f; // blurs from a side beyond which it changes nothing: its density is 1.5e-6
 constexpr float LOG_SQRT_2PI = 0.91893853f;
 
 using Matrix = double[UNKNOWNS][UNKNOWNS];
@@ -127,18 +127,17 @@ class Fit {
         std::fill(inside, inside + BLOCK, 1.0f);
         for (int s = 0; s < SIDES; ++s) {
             float across[BLOCK], start[BLOCK], end[BLOCK];
-            float nearest = FAR_BLURS;
+            int near = 0;
             for (int i = 0; i < BLOCK; ++i) {
                 across[i] = matrix[0][s][0] * x[i] + matrix[0][s][1] * y[i] + matrix[0][s][2];
                 start[i] = matrix[1][s][0] * x[i] + matrix[1][s][1] * y[i] + matrix[1][s][2];
                 end[i] = matrix[2][s][0] * x[i] + matrix[2][s][1] * y[i] + matrix[2][s][2];
                 inside[i] = across[i] < 0.0f ? inside[i] : 0.0f;
-                const float size = across[i] < 0.0f ? -across[i] : across[i];
-                nearest = size < nearest ? size : nearest;
             }
+            for (int i = 0; i < BLOCK; ++i) near |= (across[i] < FAR_BLURS) & (across[i] > -FAR_BLURS);
             float* by_start = row(BY_SHAPE + s) + begin;
             float* by_end = row(BY_SHAPE + SIDES + s) + begin;
-            if (!(nearest < FAR_BLURS)) {
+            if (near == 0) {
                 std::fill(by_start, by_start + BLOCK, 0.0f);
                 std::fill(by_end, by_end + BLOCK, 0.0f);
                 continue;
@@ -151,38 +150,45 @@ class Fit {
                 by_blur[i] += density * share * across[i];
                 by_start[i] = density * share - by_end[i];
             }
-            for (int i = 0; i < BLOCK; ++i) {
-                const float size = across[i] < 0.0f ? -across[i] : across[i];
-                const float beyond = triangles(size, start[i], end[i]);
-                coverage[i] += std::signbit(across[i]) ? -beyond : beyond;
-            }
+            add_triangles(across, start, end, coverage);
         }
         std::copy(by_blur, by_blur + BLOCK, row(BY_SHAPE + BLUR) + begin);
         float* covered = row(COVERAGE) + begin;
         for (int i = 0; i < BLOCK; ++i) covered[i] = coverage[i] + inside[i];
     }
 
-    // Mass between the pixel and a side's line, from its start to its end: T(h, end) - T(h, start).
-    float triangles(float across, float start, float end) const {
-        const float last_row = table_.cells_per_blur * table_.reach - 1.01f;
-        const float last_column = table_.cells_per_blur * table_.reach * 2 - 1.01f;
-        const float v = least(most(across * table_.cells_per_blur, 0.0f), last_row);
-        const int i = static_cast<int>(v);
-        const float* line = table_.values + i * table_.columns;
-        const float down = v - static_cast<float>(i);
-        float at[2];
-        const float along[2] = {start, end};
-        for (int p = 0; p < 2; ++p) {
-            const float u = least(most((along[p] + table_.reach) * table_.cells_per_blur, 0.0f), last_column);
-            const int j = static_cast<int>(u);
-            const float right = u - static_cast<float>(j);
-            const float* above = line + j;
-            const float* below = above + table_.columns;
-            const float upper = above[0] + right * (above[1] - above[0]);
-            const float lower = below[0] + right * (below[1] - below[0]);
-            at[p] = upper + down * (lower - upper);
+    // Add the mass between pixels and a side's line, from its start to its end: T(h, end) - T(h, start).
+    void add_triangles(const float* across, const float* start, const float* end, float* coverage) const {
+        const float cells = table_.cells_per_blur;
+        const float last_row = cells * table_.reach - 1.01f, last_column = cells * table_.reach * 2 - 1.01f;
+        int32_t at_start[BLOCK], at_end[BLOCK];
+        float down[BLOCK], right_of_start[BLOCK], right_of_end[BLOCK];
+        for (int i = 0; i < BLOCK; ++i) {
+            const float size = across[i] < 0.0f ? -across[i] : across[i];
+            const float v = least(most(size * cells, 0.0f), last_row);
+            const float u_start = least(most((start[i] + table_.reach) * cells, 0.0f), last_column);
+            const float u_end = least(most((end[i] + table_.reach) * cells, 0.0f), last_column);
+            const int32_t row = static_cast<int32_t>(v);
+            const int32_t start_column = static_cast<int32_t>(u_start), end_column = static_cast<int32_t>(u_end);
+            at_start[i] = row * table_.columns + start_column;
+            at_end[i] = row * table_.columns + end_column;
+            down[i] = v - static_cast<float>(row);
+            right_of_start[i] = u_start - static_cast<float>(start_column);
+            right_of_end[i] = u_end - static_cast<float>(end_column);
         }
-        return at[1] - at[0];
+        for (int i = 0; i < BLOCK; ++i) {
+            const float beyond =
+                read(at_end[i], right_of_end[i], down[i]) - read(at_start[i], right_of_start[i], down[i]);
+            coverage[i] += across[i] < 0.0f ? -beyond : beyond;
+        }
+    }
+
+    float read(int32_t place, float right, float down) const {
+        const float* above = table_.values + place;
+        const float* below = above + table_.columns;
+        const float upper = above[0] + right * (above[1] - above[0]);
+        const float lower = below[0] + right * (below[1] - below[0]);
+        return upper + down * (lower - upper);
     }
 
     // Light and contrast of least squares, the logarithm taken as linear in the coverage.

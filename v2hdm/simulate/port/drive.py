@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from v2hdm.errors import DriveError
+from v2hdm.executor import Executor
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.planar import inside_convex
 from v2hdm.geometry.rigid import camera_centre, ground_in_vehicle
@@ -34,7 +35,6 @@ from v2hdm.simulate.render.renderer import RENDERER_VERSION
 from v2hdm.simulate.render.scene import Box, ground_under
 from v2hdm.store.files import refuse_url, whole_file
 from v2hdm.store.folders import note_use
-from v2hdm.workers import share_out
 
 # By the truth, an image shows ground points as far from its camera as this, and of this depth or more.
 _FARTHEST_M = 40.0
@@ -120,16 +120,16 @@ _LANE_SIGHTINGS = 2  # least number of images that show a lane vertex which coun
 _worker_port: Port | None = None
 
 
-def rendered_drive(config: PortConfig, cache: Path, workers: int, progress: Steps) -> Path:
+def rendered_drive(config: PortConfig, cache: Path, executor: Executor, progress: Steps) -> Path:
     """The folder of a port's drive in a ``cache`` of such, rendered now unless it was rendered before.
 
-    ``workers`` processes render, 1 in this one; ``progress`` is called with the number of finished images and
-    of all. Raises ConfigError when the configuration makes no port, DriveError when the cache cannot be
-    written, WorkerError when a process died; what it had rendered is kept.
+    ``progress`` is called with the number of finished images and of all. Raises ConfigError when the
+    configuration makes no port, DriveError when the cache cannot be written, WorkerError when a process died;
+    what it had rendered is kept.
     """
     folder = folder_of_port(config, cache)
     if not (folder / DRIVE_FILE).is_file() or _drop_damaged(folder):
-        render_drive(config, folder, workers, progress)
+        render_drive(config, folder, executor, progress)
     note_use(folder)
     return folder
 
@@ -165,7 +165,7 @@ def _drop_damaged(folder: Path) -> bool:
     return missing
 
 
-def render_drive(config: PortConfig, folder: Path, workers: int, progress: Steps) -> None:
+def render_drive(config: PortConfig, folder: Path, executor: Executor, progress: Steps) -> None:
     """Render a port's drive into ``folder`` with its truth; see :func:`rendered_drive`."""
     port = build_port(config)
     driven = zip(port.driven.stamp_s, port.driven.map_from_vehicle, strict=True)
@@ -177,7 +177,7 @@ def render_drive(config: PortConfig, folder: Path, workers: int, progress: Steps
     try:
         for name in port.cameras:
             (folder / name / "images").mkdir(parents=True, exist_ok=True)
-        _render_all(port, images, workers, progress)
+        _render_all(port, images, executor, progress)
         noise = pose_noise(config.disturbance, config.route.speed_mps)
         truth_dir = folder / TRUTH_FOLDER
         drive = Drive(config.name, folder, port.cameras, images, noise, port.hd_map.origin, truth_dir)
@@ -188,7 +188,7 @@ def render_drive(config: PortConfig, folder: Path, workers: int, progress: Steps
         raise DriveError(f"{folder}: {problem}; free space or choose another cache") from None
 
 
-def _render_all(port: Port, images: list[Image], workers: int, progress: Steps) -> None:
+def _render_all(port: Port, images: list[Image], executor: Executor, progress: Steps) -> None:
     jobs = [
         (image.camera, k // len(port.cameras), str(image.path))
         for k, image in enumerate(images)
@@ -200,12 +200,12 @@ def _render_all(port: Port, images: list[Image], workers: int, progress: Steps) 
         progress(next(done), len(images))
 
     report()
-    if workers <= 1 or len(jobs) < 2 * workers:
+    if executor.workers <= 1 or len(jobs) < 2 * executor.workers:
         for job in jobs:
             _write_picture(job, port)
             report()
     else:
-        share_out(_write_picture, jobs, workers, _start_worker, (port.config,), report)
+        executor.share_out(_write_picture, jobs, _start_worker, (port.config,), report)
 
 
 def _start_worker(config: PortConfig) -> None:

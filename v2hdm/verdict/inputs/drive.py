@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from v2hdm.doors import checked
+from v2hdm.executor import open_executor
 from v2hdm.geometry.ipm import apply_homography, initial_extrinsic
 from v2hdm.geometry.lens import distort_points, has_distortion, undistort_points
 from v2hdm.geometry.planar import inside_convex, signed_area
@@ -318,7 +319,8 @@ def check_drive(
     if isinstance(ground, bool):
         from v2hdm.ground.estimate import estimate_cameras
 
-        ground = estimate_cameras(drive, workers, progress) if ground else {}
+        with open_executor(workers) as executor:
+            ground = estimate_cameras(drive, executor, progress) if ground else {}
     return Verdict.of(input_findings(drive, ground))
 
 

@@ -1,0 +1,14 @@
+// The parts of the module that Python imports.
+#pragma once
+
+#include <nanobind/nanobind.h>
+
+namespace v2hdm {
+
+void add_settle(nanobind::module_& module);
+void add_lattice(nanobind::module_& module);
+void add_lanes(nanobind::module_& module);
+void add_paint(nanobind::module_& module);
+void add_lens(nanobind::module_& module);
+
+}  // namespace v2hdm
