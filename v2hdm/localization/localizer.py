@@ -510,7 +510,7 @@ class Localizer:
             )
         turned = self._turned_cameras(belief)
         protection = _protection(covariance, float(belief.mean[HEADING]))
-        if status != Status.TRACKING or self._rig.is_suspicious:
+        if status != Status.TRACKING or self._rig.is_suspicious or self._agreement.differs:
             protection = (np.inf, np.inf, np.inf)
         if status == Status.INITIALISING:
             covariance = np.full((3, 3), np.inf)
