@@ -116,14 +116,14 @@ def ground(shapes, hidden=()):
     """A mosaic of bright paint on grey ground, without what is hidden."""
     rng = np.random.default_rng(0)
     grey = rng.normal(90, 3, (800, 4200)).astype(np.uint8)
-    seen = np.full_like(grey, 255)
+    is_seen = np.ones(grey.shape, dtype=np.bool_)
     for shape in shapes:
         px = ((shape.outline_map - [-10, 30]) / [0.05, -0.05]).astype(np.int32)
         cv2.fillPoly(grey, [px], 190)
     for shape in hidden:
         column, row = ((shape.outline_map.mean(axis=0) - [-10, 30]) / [0.05, -0.05]).astype(int)
-        seen[row - 60 : row + 60, column - 60 : column + 60] = 0
-    return Mosaic(grey, seen, -10.0, 30.0, 0.05)
+        is_seen[row - 60 : row + 60, column - 60 : column + 60] = False
+    return Mosaic(grey, is_seen, -10.0, 30.0, 0.05)
 
 
 def test_a_shape_is_missing_where_the_ground_is_bare_and_not_inspected_where_nothing_shows_it():
@@ -200,8 +200,8 @@ def test_the_mosaic_of_a_folder_is_read_with_what_it_does_not_show(tmp_path):
     cv2.imwrite(str(tmp_path / MOSAIC_PICTURE), picture)
     write_json(tmp_path / MOSAIC_EXTENT, {"bounds_m": [0, 0, 4, 2], "resolution_m": 0.1})
     mosaic = read_mosaic(tmp_path)
-    assert mosaic.grey.shape == mosaic.seen.shape == (20, 40)
-    assert not mosaic.seen[:, :10].any()
+    assert mosaic.grey.shape == mosaic.is_seen.shape == (20, 40)
+    assert not mosaic.is_seen[:, :10].any()
     write_json(tmp_path / MOSAIC_EXTENT, {"bounds_m": [0, 0, 4, 2], "resolution_m": 0})
     with pytest.raises(MapFileError, match="resolution_m is not positive"):
         read_mosaic(tmp_path)

@@ -127,17 +127,17 @@ def _judged(
     """The finding on the pair of number ``k``."""
     number = int(pairs.shape[k])
     marking = built[pairs.marking[k]]
-    found = marking.corners_map - misfit.common_m[k]
+    corners_map = marking.corners_map - misfit.common_m[k]
     covariance = errors.own_m2[k] + SHIFT @ misfit.common_m2[k] @ SHIFT.T
     has_size = marking.has_size and outlines[number].has_size
-    result = judge(placed[number], found, covariance, int(pairs.turn[k]), tolerance, has_size)
+    result = judge(placed[number], corners_map, covariance, int(pairs.turn[k]), tolerance, has_size)
     return Finding(
         fate=decided(result.probability),
         kind=marking.kind,
         name=shapes[number].name,
         id=marking.id,
         meant_map=placed[number],
-        found_map=found,
+        found_map=corners_map,
         probability=result.probability,
         quantities=result.quantities,
     )

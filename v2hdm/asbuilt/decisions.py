@@ -84,8 +84,8 @@ class Sizes(NamedTuple):
     ahead: FloatArray
 
 
-_SIDES = np.array([[-0.5, 0.5, 0.5, -0.5], [-0.5, -0.5, 0.5, 0.5]])
-_DIAGONALS = np.array([[-1.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 1.0]])
+_SIDES = np.array([[-0.5, 0.5, 0.5, -0.5], [-0.5, -0.5, 0.5, 0.5]])  # weights of corners: means of two sides
+_DIAGONALS = np.array([[-1.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 1.0]])  # weights of corners: both diagonals
 _ALIKE_SIDES = 1.2  # largest ratio of the sides of a rhombus, which is measured along its diagonals
 _ALIKE_DIAGONALS = 1.1  # largest ratio of the diagonals of a square, which is measured along its sides
 
@@ -160,10 +160,10 @@ def _against(
 ) -> Judged:
     """The quantities of corners and draws of them (1 + D, 4, 2) against a shape's."""
     meant = sizes_of(shape, axes)
-    found = sizes_of(every, axes)
+    built = sizes_of(every, axes)
     off_m = every.mean(axis=1) - shape.mean(axis=0)
     across = turned_left(meant.ahead)
-    turned_deg = np.rad2deg(np.arctan2(found.ahead @ across, found.ahead @ meant.ahead))
+    turned_deg = np.rad2deg(np.arctan2(built.ahead @ across, built.ahead @ meant.ahead))
     most_deg = float(np.rad2deg(np.arctan(2 * tolerance.place_m / meant.length_m)))
     values = [
         ("along", off_m @ meant.ahead, -tolerance.place_m, tolerance.place_m, "m"),
@@ -172,8 +172,8 @@ def _against(
     ]
     if has_size:
         values += [
-            ("length", found.length_m - meant.length_m, -tolerance.size_m, tolerance.size_m, "m"),
-            ("width", found.width_m - meant.width_m, -tolerance.size_m, tolerance.size_m, "m"),
+            ("length", built.length_m - meant.length_m, -tolerance.size_m, tolerance.size_m, "m"),
+            ("width", built.width_m - meant.width_m, -tolerance.size_m, tolerance.size_m, "m"),
         ]
     return judged(values)
 

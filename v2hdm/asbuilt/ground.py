@@ -38,10 +38,10 @@ _LEAST_SIGMA = 0.02  # floor of the standard deviation of bare ground's contrast
 
 @dataclass(frozen=True)
 class Mosaic:
-    """The ground from above: ``grey`` (H, W), ``seen`` (H, W), the first row's and column's corner, m."""
+    """The ground from above: ``grey`` (H, W), ``is_seen`` (H, W), the first row's and column's corner, m."""
 
     grey: NDArray[np.uint8]
-    seen: NDArray[np.uint8]
+    is_seen: NDArray[np.bool_]
     west_m: float
     north_m: float
     resolution_m: float
@@ -71,7 +71,7 @@ class Mosaic:
         height, width = self.grey.shape
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         row, column = (np.clip(index, 0, most - 1) for index, most in ((row, height), (column, width)))
-        is_seen = inside & (self.seen[row, column] > 0)
+        is_seen = inside & (self.is_seen[row, column])
         return np.where(is_seen, self.grey[row, column].astype(np.float64), np.nan)
 
 
@@ -91,8 +91,8 @@ def read_mosaic(folder: Path) -> Mosaic | None:
         raise MapFileError(f"{picture}: is not a coloured picture; run v2hdm mosaic again")
     grey = np.asarray(cv2.cvtColor(pixels[..., :3], cv2.COLOR_BGR2GRAY), dtype=np.uint8)
     opaque = np.full(grey.shape, 255, dtype=np.uint8)
-    seen = np.asarray(pixels[..., 3] if pixels.shape[2] == 4 else opaque, dtype=np.uint8)
-    return Mosaic(grey, seen, float(west_m), float(north_m), resolution_m)
+    alpha = np.asarray(pixels[..., 3] if pixels.shape[2] == 4 else opaque, dtype=np.uint8)
+    return Mosaic(grey, alpha > 0, float(west_m), float(north_m), resolution_m)
 
 
 def bare_probabilities(

@@ -56,19 +56,19 @@ def find_misfit(built: FloatArray, design: FloatArray, errors: Errors, start: Mo
     motions = _motions(start.apply(design) - start.apply(start.about_map))
     is_alike, painted_m = _alike(off_m, errors, motions)
     chosen = _spread_out(np.flatnonzero(is_alike))
-    taken = _Joint(errors, chosen, chosen, painted_m, motions)
-    rest = taken.motion(off_m[chosen])
-    turn_rad = start.turn_rad + float(rest[2])
-    whole = Motion(turn_rad, np.asarray(start.shift_m + rest[:2]), start.about_map)
+    joint = _Joint(errors, chosen, chosen, painted_m, motions)
+    step = joint.motion(off_m[chosen])
+    turn_rad = start.turn_rad + float(step[2])
+    whole = Motion(turn_rad, np.asarray(start.shift_m + step[:2]), start.about_map)
     estimate = np.append(whole.shift_m, turn_rad)
-    squared = float(estimate @ np.linalg.solve(taken.spread, estimate))
+    squared = float(estimate @ np.linalg.solve(joint.spread, estimate))
     probability = float(chi2.sf(squared, 3)) if len(chosen) >= _FEWEST else 1.0
     if probability >= _SIGNIFICANT:
         off_m = built - design
         motions = motions[:, :, :0]
         is_alike, painted_m = _alike(off_m, errors, motions)
     apart_m, spread = _apart(off_m, errors, motions, is_alike, painted_m)
-    return Misfit(whole, taken.spread, probability, painted_m, off_m - apart_m, spread)
+    return Misfit(whole, joint.spread, probability, painted_m, off_m - apart_m, spread)
 
 
 def _motions(arms: FloatArray) -> FloatArray:
@@ -99,14 +99,14 @@ def _alike(off_m: FloatArray, errors: Errors, motions: FloatArray) -> tuple[Bool
         known_m2 = spread + own_m2
         inverse = np.linalg.inv(known_m2 + painted_m**2 * np.eye(2))
         squared = np.einsum("pi,pij,pj->p", apart_m, inverse, apart_m)
-        near = squared < _APART
-        if near.sum() < len(near) / 2:  # most is painted rightly, or nothing can be said of the rest
-            near = squared <= np.median(squared)
-        left_m2 = float(np.mean(apart_m[near] ** 2 - np.diagonal(known_m2, axis1=1, axis2=2)[near]))
+        fits = squared < _APART
+        if fits.sum() < len(fits) / 2:  # most is painted rightly, or nothing can be said of the rest
+            fits = squared <= np.median(squared)
+        left_m2 = float(np.mean(apart_m[fits] ** 2 - np.diagonal(known_m2, axis1=1, axis2=2)[fits]))
         painted_m = float(np.sqrt(np.clip(left_m2, _LEAST_PAINTED_M**2, _MOST_PAINTED_M**2)))
-        if (near == is_alike).all():
+        if (fits == is_alike).all():
             break
-        is_alike = near
+        is_alike = fits
     return is_alike, painted_m
 
 
@@ -177,15 +177,15 @@ class _Joint:
         unexplained = np.asarray(trend - across @ self._weighed)
         of_trend = _carried(unexplained, self.spread)
         prior = errors.shared_m2[rows][:, None, None] * np.eye(2)
-        rest = off_m[rows] - foretold.reshape(-1, 2)
+        beyond_m = off_m[rows] - foretold.reshape(-1, 2)
         spread = _positive(prior - of_known + of_trend)
         number = {marking: k for k, marking in enumerate(rows.tolist())}
         for k, marking in enumerate(self._part.tolist()):  # from all others: leave one out
             block = slice(2 * k, 2 * k + 2)
             total_m2 = np.linalg.inv(self._projected[block, block])
-            rest[number[marking]] = total_m2 @ weights[block]
+            beyond_m[number[marking]] = total_m2 @ weights[block]
             spread[number[marking]] = _positive(total_m2 - self._alone_m2[marking])
-        return rest, spread
+        return beyond_m, spread
 
 
 def _carried(rows: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -134,12 +134,12 @@ def _place(pieces: list[_Piece], s_m: float) -> _Pose:
 def _outlines(entry: ET.Element, pieces: list[_Piece]) -> list[ObjectOutline]:
     called = entry.get("name") or entry.get("type")
     name = f"object {entry.get('id', '')[:40]} ({(called or '')[:40]})"
-    found = entry.findall("outlines/outline") or entry.findall("outline")
+    outline_entries = entry.findall("outlines/outline") or entry.findall("outline")
     place = _place(pieces, _number(entry, "s"))
     centre = place.beside(np.array([[0.0, _number(entry, "t", 0.0)]]))[0]
     frame = _Pose(centre, place.heading_rad + _number(entry, "hdg", 0.0))
     outlines = []
-    for outline in found:
+    for outline in outline_entries:
         local = [(_number(corner, "u"), _number(corner, "v")) for corner in outline.findall("cornerLocal")]
         on_road = [
             _place(pieces, _number(corner, "s")).beside(np.array([[0.0, _number(corner, "t")]]))[0]

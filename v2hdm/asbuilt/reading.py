@@ -122,20 +122,20 @@ def _is_ours(path: Path) -> bool:
 
 
 def _of_known_kinds(
-    shapes: Iterable[_Drawn], known: Collection[str], source: Source, path: Path
+    shapes: Iterable[_Drawn], classes: Collection[str], source: Source, path: Path
 ) -> list[tuple[_Drawn, str | None]]:
     """Shapes with their classes; those with names of no class are left out, with one line that says so."""
     stated_kinds = source.kinds or {}
     for name, stated in stated_kinds.items():
-        if stated not in known:
-            classes = ", ".join(sorted(known))
-            raise ConfigError(f"--class {name}={shown(stated)}: is no class; choose from: {classes}")
+        if stated not in classes:
+            choices = ", ".join(sorted(classes))
+            raise ConfigError(f"--class {name}={shown(stated)}: is no class; choose from: {choices}")
     meant = {_plain(name): stated for name, stated in stated_kinds.items()}
     out: list[tuple[_Drawn, str | None]] = []
     unknown = dict[str, int]()
     for shape in shapes:
         called = None if shape.called is None else _plain(shape.called)
-        kind = called if called in known else meant.get(called or "")
+        kind = called if called in classes else meant.get(called or "")
         if called is not None and kind is None:
             unknown[shape.called or ""] = unknown.get(shape.called or "", 0) + 1
         else:

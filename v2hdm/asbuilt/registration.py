@@ -40,7 +40,8 @@ class Motion(NamedTuple):
 
     def apply(self, points: FloatArray) -> FloatArray:
         """Points (..., 2) after the motion."""
-        cos, sin = np.cos(self.turn_rad), np.sin(self.turn_rad)
+        cos = np.cos(self.turn_rad)
+        sin = np.sin(self.turn_rad)
         rotation = np.array([[cos, -sin], [sin, cos]])
         return np.asarray((points - self.about_map) @ rotation.T + self.about_map + self.shift_m)
 
@@ -66,15 +67,16 @@ def register(
     for shift in (np.zeros(2), *_named_shifts(centres, kinds, built_centres, built_kinds)):
         motion = still._replace(shift_m=shift)
         for _ in range(_ROUNDS):
-            near = _near_pairs(motion.apply(centres), kinds, built_centres, built_kinds)
-            if len(near.shape) < _FEWEST:
+            pairs = _near_pairs(motion.apply(centres), kinds, built_centres, built_kinds)
+            if len(pairs.shape) < _FEWEST:
                 break
-            motion = _fitted(centres[near.shape], built_centres[near.marking], about)
+            motion = _fitted(centres[pairs.shape], built_centres[pairs.marking], about)
         off_m = _near_pairs(motion.apply(centres), kinds, built_centres, built_kinds).off_m
         unlikely = float(motion.shift_m @ motion.shift_m) / (2 * _SHIFT_SIGMA_M**2)
         score = float(np.sum(1 - (off_m / _NEAR_M) ** 2)) - unlikely
         if score > best_score:
-            best, best_score = motion, score
+            best = motion
+            best_score = score
     return best
 
 
@@ -134,16 +136,16 @@ def paired(design: FloatArray, kinds: list[str | None], built: FloatArray, built
     neighbours = cKDTree(built.mean(axis=1)).query_ball_point(centres, REACH_M)
     couples = [
         (k, j)
-        for k, near in enumerate(neighbours)
-        for j in sorted(near)
+        for k, candidates in enumerate(neighbours)
+        for j in sorted(candidates)
         if kinds[k] in (None, built_kinds[j])
     ]
     if not couples:
         nothing = np.zeros(0, dtype=np.int64)
         return Pairs(nothing, nothing, nothing)
     shape, marking = np.array(couples, dtype=np.int64).T
-    known = np.ones((len(shape), 4), dtype=np.bool_)
-    aligned = align(design[shape], known, built[marking], known)
+    every_corner = np.ones((len(shape), 4), dtype=np.bool_)
+    aligned = align(design[shape], every_corner, built[marking], every_corner)
     turned = np.take_along_axis(built[marking], ((np.arange(4) + aligned.shift[:, None]) % 4)[..., None], 1)
     squared = np.sum((turned - design[shape]) ** 2, axis=(1, 2)) / 4
     return _cheapest(shape, marking, aligned.shift, squared, len(design), len(built))

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from v2hdm.asbuilt.comparison import Finding
-from v2hdm.asbuilt.decisions import axes_of, decided, drawn, judged, sizes_of
+from v2hdm.asbuilt.decisions import Sizes, axes_of, decided, drawn, judged, sizes_of
 from v2hdm.asbuilt.design import BuiltShape, built_shapes
 from v2hdm.errors import MapFileError, shown
 from v2hdm.geometry.planar import cross, turned_left
@@ -60,14 +60,14 @@ class _Measured:
     corners: FloatArray
     following: FloatArray | None
 
-    def sizes(self, corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def sizes(self, corners: FloatArray) -> Sizes:
         return sizes_of(corners, axes_of(corners[0]))
 
     def length_m(self) -> FloatArray:
-        return self.sizes(self.corners)[0]
+        return self.sizes(self.corners).length_m
 
     def width_m(self) -> FloatArray:
-        return self.sizes(self.corners)[1]
+        return self.sizes(self.corners).width_m
 
     def angle_deg(self) -> FloatArray:
         """The largest difference of a corner's angle from a right one."""
@@ -86,7 +86,7 @@ class _Measured:
     def gap_m(self) -> FloatArray | None:
         if self.following is None:
             return None
-        lengths_m = (self.sizes(self.corners)[0] + self.sizes(self.following)[0]) / 2
+        lengths_m = (self.sizes(self.corners).length_m + self.sizes(self.following).length_m) / 2
         return np.asarray(self._ahead()[0] - lengths_m)
 
     def spacing_m(self) -> FloatArray | None:
@@ -98,7 +98,7 @@ class _Measured:
     def _ahead(self) -> tuple[FloatArray, FloatArray]:
         """How far the next marking lies ahead and, either way, aside."""
         assert self.following is not None
-        along = self.sizes(self.corners)[2]
+        along = self.sizes(self.corners).ahead
         way = self.following.mean(axis=1) - self.corners.mean(axis=1)
         return np.abs((way * along).sum(axis=1)), np.abs((way * turned_left(along)).sum(axis=1))
 
@@ -186,10 +186,10 @@ def _beside(shapes: Sequence[BuiltShape], draws: Sequence[FloatArray], first: in
         np.einsum("iaja->", shapes[k].covariance_m2.reshape(4, 2, 4, 2)) / 32 for k in (first, second)
     ]
     moved = draws[first].mean(axis=1) - shapes[first].corners_map.mean(axis=0)
-    own = shapes[second].covariance_m2 - shared_m2 * np.kron(np.ones((4, 4)), np.eye(2))
+    alone_m2 = shapes[second].covariance_m2 - shared_m2 * np.kron(np.ones((4, 4)), np.eye(2))
     gain = shared_m2 / total_m2[0] if total_m2[0] > 0 else 0.0
     corners = shapes[second].corners_map
-    reverse = drawn(corners, own)[::-1]  # other draws than those of the first
+    reverse = drawn(corners, alone_m2)[::-1]  # other draws than those of the first
     return np.concatenate([corners[None], reverse + gain * moved[1:, None]])
 
 
@@ -212,15 +212,15 @@ def _following(shapes: Sequence[BuiltShape]) -> list[int | None]:
     ahead = ahead * np.where(ahead @ main < 0, -1.0, 1.0)[:, None]
     next_shape = np.full(len(shapes), -1)
     spacing_m = np.full(len(shapes), np.nan)
-    for k, near in enumerate(cKDTree(centres).query_ball_point(centres, _AHEAD_M)):
-        way = centres[near] - centres[k]
+    for k, neighbours in enumerate(cKDTree(centres).query_ball_point(centres, _AHEAD_M)):
+        way = centres[neighbours] - centres[k]
         along_m = way @ ahead[k]
         aside_m = np.abs(way @ turned_left(ahead[k]))
-        turned = np.abs(cross(ahead[near], ahead[k][None]))
+        turned = np.abs(cross(ahead[neighbours], ahead[k][None]))
         fits = (along_m > 0) & (aside_m < _MOST_ASIDE_M) & (turned < _MOST_TURNED)
         if fits.any():
             nearest = int(np.argmin(np.where(fits, along_m, np.inf)))
-            next_shape[k] = near[nearest]
+            next_shape[k] = neighbours[nearest]
             spacing_m[k] = along_m[nearest]
     if np.isfinite(spacing_m).any():
         next_shape[spacing_m > _BROKEN * np.nanmedian(spacing_m)] = -1
