@@ -28,8 +28,8 @@ _HORIZON_MARGIN_PX = 16  # rows above the horizon of the initial IPM that are lo
 FARTHEST_M = 60.0  # distance, m, beyond which nothing is looked for: networks are shown none beyond 50 m
 _SURROUNDINGS_PX = 24  # rows above the farthest ground that help to classify what lies on it
 
-_FINE_ENOUGH_M = 0.0085
-"""Ground per pixel, across the view, of which half the resolution shows enough: 9 px of a dash of 15 cm."""
+_FINE_ENOUGH_M = 0.007
+"""Ground per pixel, across the view, of which half the resolution shows enough: a dash stays 10 px wide."""
 
 ASIDE_RAD = np.deg2rad(60)
 """A camera that looks farther than this off the way that its vehicle drives, ahead or back, looks aside."""
