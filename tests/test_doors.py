@@ -47,6 +47,7 @@ TAKEN = {
     "all_maps": {"a truth"},
     "mosaic": {"a truth"},
     "accuracy_goal_cm": {"a number", "a fraction"},
+    "tolerance_m": {"a number", "a fraction"},
     "pixel_sigma": {"a number", "a fraction"},
     "survey_sigma": {"a number", "a fraction"},
     "max_gap_s": {"a number", "a fraction"},
@@ -70,11 +71,23 @@ TAKEN = {
 }
 OPTIONAL = {
     "options", "detector", "reading", "base", "corrections", "progress", "config", "detections", "camera",
-    "stopwatch", "path", "model", "blur_px",
+    "stopwatch", "path", "model", "blur_px", "results",
 }  # fmt: skip
 """Arguments that None leaves out."""
 
-FILES = {"drive", "path", "points", "folder", "source", "base", "corrections", "camera", "model"}
+FILES = {
+    "drive",
+    "path",
+    "points",
+    "folder",
+    "source",
+    "base",
+    "corrections",
+    "camera",
+    "model",
+    "design",
+    "results",
+}
 """Arguments that may be a path: that of no file is refused as such."""
 
 
@@ -90,6 +103,9 @@ def doors(tmp_path_factory) -> Mapping[str, Door]:
     return {
         "read_drive": Door(v2hdm.read_drive, {"path": drive.root, "options": None}),
         "read_map": Door(v2hdm.read_map, {"path": folder}),
+        "compare_maps": Door(
+            v2hdm.compare_maps, {"built": empty, "design": empty, "tolerance_m": 0.05, "results": None}
+        ),
         "check_drive": Door(
             v2hdm.check_drive, {"drive": drive, "ground": False, "workers": 1, "progress": None}
         ),
@@ -145,6 +161,7 @@ def doors(tmp_path_factory) -> Mapping[str, Door]:
 NAMES = {
     "read_drive": ("path", "options"),
     "read_map": ("path",),
+    "compare_maps": ("built", "design", "tolerance_m", "results"),
     "check_drive": ("drive", "ground", "workers", "progress"),
     "calibrate_from_ground": ("drive", "workers", "progress"),
     "calibrate_from_points": ("points", "info", "pixel_sigma", "survey_sigma"),

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from v2hdm.detection.options import DetectorOptions
     from v2hdm.errors import V2hdmError
     from v2hdm.io.drive import ReadOptions, read_drive
-    from v2hdm.library import build_problem, read_map, simulate_port
+    from v2hdm.library import build_problem, compare_maps, read_map, simulate_port
     from v2hdm.localization.localizer import Localizer
     from v2hdm.localization.run import localize
     from v2hdm.mapping.options import MappingOptions
@@ -36,8 +36,8 @@ __version__ = "1.0.0"
 __all__ = [
     "Calibration", "Detector", "DetectorOptions", "HDMap", "Localizer", "MappingOptions", "Problem",
     "ReadOptions", "Result", "V2hdmError", "Verdict", "build_problem", "calibrate_from_ground",
-    "calibrate_from_points", "check_drive", "detect_images", "localize", "map_drive", "read_drive",
-    "read_map", "simulate_port", "solve",
+    "calibrate_from_points", "check_drive", "compare_maps", "detect_images", "localize", "map_drive",
+    "read_drive", "read_map", "simulate_port", "solve",
 ]  # fmt: skip
 
 _MODULES = {
@@ -56,6 +56,7 @@ _MODULES = {
     "calibrate_from_ground": "v2hdm.calibration.from_ground",
     "calibrate_from_points": "v2hdm.calibration.from_points",
     "check_drive": "v2hdm.verdict.inputs.drive",
+    "compare_maps": "v2hdm.library",
     "detect_images": "v2hdm.pipeline.detect_images",
     "localize": "v2hdm.localization.run",
     "map_drive": "v2hdm.pipeline.map_drive",

@@ -8,16 +8,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from v2hdm.doors import check_types, checked
+from v2hdm.errors import MapFileError
 from v2hdm.executor import open_executor
 from v2hdm.io.drive import as_drive, read_drive
 from v2hdm.io.maps.reading import read_map as _read
 from v2hdm.progress import Steps
 from v2hdm.records import Drive, HDMap, ImageDetections
-from v2hdm.settings import Processes
+from v2hdm.settings import Processes, Tolerance
 from v2hdm.store.names import map_file
 
 if TYPE_CHECKING:  # load torch or scipy
     from v2hdm.adjust.problem import Problem
+    from v2hdm.asbuilt.comparison import Comparison
     from v2hdm.mapping.options import MappingOptions
     from v2hdm.simulate.port.config import PortConfig
 
@@ -36,6 +38,47 @@ def read_map(path: str | Path) -> HDMap:
     """
     path = Path(path)
     return _read(map_file(path))[0]
+
+
+@checked
+def compare_maps(
+    built: HDMap,
+    design: HDMap | str | Path,
+    *,
+    tolerance_m: Tolerance = 0.05,
+    results: str | Path | None = None,
+) -> Comparison:
+    """Compare the paint of a map with its design: each shape right, off, missing or not inspected.
+
+    Args:
+        built: the map.
+        design: another map, or a file that holds the design: DXF, GeoJSON, GeoPackage or OpenDRIVE.
+        tolerance_m: the largest offset, and difference of length or width, that conforms, m.
+        results: the folder of the map's results, whose mosaic shows where paint is missing.
+
+    Raises:
+        MapFileError: the design is damaged, of another site, or in another datum.
+        ConfigError: the design does not say its system, or what reads its format is not installed.
+
+    >>> from v2hdm.asbuilt.decisions import Fate
+    >>> comparison = compare_maps(result.map, result.map)
+    >>> comparison.conforms, comparison.count(Fate.OFF)
+    (True, 0)
+    """
+    from v2hdm.asbuilt.comparison import compare_with_design
+    from v2hdm.asbuilt.decisions import Tolerances
+    from v2hdm.asbuilt.design import design_of_map
+    from v2hdm.asbuilt.ground import read_mosaic
+    from v2hdm.asbuilt.reading import read_design
+
+    if results is not None and not Path(results).is_dir():
+        raise MapFileError(f"{results}: is no folder of results; give one, or leave results out")
+    if isinstance(design, HDMap):
+        meant = design_of_map(design, built.origin, "the design")
+    else:
+        meant = read_design(Path(design), built)
+    mosaic = None if results is None else read_mosaic(Path(results))
+    return compare_with_design(built, meant, Tolerances(tolerance_m, tolerance_m), mosaic)
 
 
 @checked

@@ -50,6 +50,9 @@ SHARE = Within(0, 1)  # of a whole
 COUNT = Within(1, 10**12)  # chosen: more than any machine holds
 Processes = Annotated[int, Within(0, MOST_PROCESSES)]
 """Number of processes; 0 is one per core."""
+TOLERANCE_M = Within(1e-4, 10.0)  # from the rounding of a survey to more than any paint is judged by
+Tolerance = Annotated[float, TOLERANCE_M]
+"""Largest difference from a design that conforms, m."""
 SEED = Within(0, 2**63 - 1)  # whole numbers of 64 bits with a sign
 
 

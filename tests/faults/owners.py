@@ -30,6 +30,7 @@ COMMANDS = {
     "v2hdm calibrate points": "points.csv --intrinsics camera_info.yaml --output out",
     "v2hdm localize": "map.geojson drive --workers 1 --output out",
     "v2hdm map": "drive.path=drive output=. name=out workers=1",
+    "v2hdm compare": "map.geojson map.geojson --output out",
 }
 """Each makes a result in the folder ``out``."""
 
@@ -71,6 +72,8 @@ CIRCLES = (
     "calibrate points points.csv --intrinsics circle --output out",
     "calibrate points points.csv --intrinsics camera_info.yaml --output circle",
     "calibrate ground circle --output out", "calibrate compare circle calibration_front.yaml",
+    "compare circle map.geojson", "compare map.geojson circle",
+    "compare map.geojson map.geojson --output circle",
     "localize circle drive --output out", "localize map.geojson circle --output out",
     "map drive.path=circle output=. name=out", "map drive.path=drive output=circle name=out workers=1",
     "report circle", "view circle", "labels circle", "mosaic circle",

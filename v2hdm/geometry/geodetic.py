@@ -210,8 +210,10 @@ def convergence_rad(crs: str, points: FloatArray, where: str, error: type[V2hdmE
 
 def datum_of(crs: str, where: str, error: type[V2hdmError]) -> str:
     """Satellite datum of the coordinates of ``crs``, WGS84 spelt ``WGS84``."""
-    name = str(_system(crs, where, error).geodetic_crs.name)
-    return "WGS84" if name.replace(" ", "") == "WGS84" else name
+    system = _system(crs, where, error).geodetic_crs
+    # A system by its parameters alone, as OpenDRIVE has it, is "unknown", but its datum has a name.
+    name = str(system.datum.name if system.name == "unknown" and system.datum is not None else system.name)
+    return "WGS84" if name.replace(" ", "") in ("WGS84", "WorldGeodeticSystem1984") else name
 
 
 def has_height_datum(crs: str, where: str, error: type[V2hdmError]) -> bool:

@@ -20,7 +20,7 @@ _LEAST_SHARE = 0.67
 markings moved about 0.5, of another site's 0.04."""
 # Log likelihood ratios of an object by a map with half of the markings moved and by a right one.
 _NOT_EXPLAINED = np.log(0.5 / 0.15)
-_EXPLAINED = np.log(0.5 / 0.85)
+_EXPLAINED = np.log(0.5 / 0.85)  # the same of one that is explained
 _DIFFERS_LIMIT = 6.0  # sum of these, since it began to rise, from which a map differs (Page 1954)
 _LOST_SHARE = 0.34  # share below which the map explains next to nothing
 
@@ -28,7 +28,7 @@ _LOST_SHARE = 0.34  # share below which the map explains next to nothing
 _PACE_LIMIT = 9.0
 _PACE_STEP_M = 0.5  # least way between two looks that are compared, m
 _PACE_SAME_M = 0.2  # distance, m, of two sightings of one marking, when the way is right
-_PACE_RANGE_M = 10.0
+_PACE_RANGE_M = 10.0  # distance, m, of the detections that are compared
 _PACE_MATCH = 1.0  # log likelihood of a detection that fits over one that does not: neighbours share a cause
 _PACES = {
     1 / 3.6: "its speeds look like km/h; state m/s",
@@ -60,27 +60,27 @@ class Agreement:
         self, places_map: FloatArray, kinds: tuple[str, ...], explained: BoolArray, way_m: float
     ) -> None:
         """Take the detections (D) of an image, which lie at ``places_map`` (D, 2)."""
-        self.objects = [own for own in self.objects if way_m - own.way_m < _WAY_M]
+        self.objects = [spot for spot in self.objects if way_m - spot.way_m < _WAY_M]
         for place, kind, is_explained in zip(places_map, kinds, explained.tolist(), strict=True):
-            own = self._of(place, kind)
-            if own is None:
-                own = _Object(place, kind, way_m)
-                self.objects.append(own)
-            own.explained += is_explained
-            own.not_explained += not is_explained
+            spot = self._of(place, kind)
+            if spot is None:
+                spot = _Object(place, kind, way_m)
+                self.objects.append(spot)
+            spot.explained += is_explained
+            spot.not_explained += not is_explained
 
     def _of(self, place: FloatArray, kind: str) -> _Object | None:
-        for own in self.objects:
-            if own.kind == kind and float(np.abs(own.place_map - place).max()) < _SAME_M:
-                return own
+        for spot in self.objects:
+            if spot.kind == kind and float(np.abs(spot.place_map - place).max()) < _SAME_M:
+                return spot
         return None
 
     @property
     def _several(self) -> list[_Object]:
-        return [own for own in self.objects if own.explained + own.not_explained > 1]
+        return [spot for spot in self.objects if spot.explained + spot.not_explained > 1]
 
     @property
-    def seen(self) -> int:
+    def quads(self) -> int:
         """The number of objects that more than one image showed."""
         return len(self._several)
 
@@ -90,15 +90,15 @@ class Agreement:
         several = self._several
         if len(several) < _FROM:
             return 1.0
-        explained = [own.explained >= own.not_explained for own in several]
+        explained = [spot.explained >= spot.not_explained for spot in several]
         return float(np.mean(explained))
 
     @property
     def differs(self) -> bool:
         """Whether the map has too little of what is seen: of all in the last metres, or of what came last."""
         evidence = 0.0
-        for own in self._several:
-            gain = _EXPLAINED if own.explained >= own.not_explained else _NOT_EXPLAINED
+        for spot in self._several:
+            gain = _EXPLAINED if spot.explained >= spot.not_explained else _NOT_EXPLAINED
             evidence = max(0.0, evidence + float(gain))
         return self.share < _LEAST_SHARE or evidence > _DIFFERS_LIMIT
 
@@ -121,12 +121,12 @@ class Pace:
     before: dict[str, _Seen] = field(default_factory=dict)
     evidence: dict[float, float] = field(default_factory=dict)
 
-    def note(self, look: Look, seen: Sighted, calibration: Calibration, pieces: list[Piece]) -> str | None:
+    def note(self, look: Look, quads: Sighted, calibration: Calibration, pieces: list[Piece]) -> str | None:
         """Take a look; ``pieces`` lead to it from :meth:`since` of its camera. A sentence once it is off."""
-        ground = ground_points(seen.corners_px, np.eye(4), Plane(), calibration)
+        ground = ground_points(quads.corners_px, np.eye(4), Plane(), calibration)
         middles = ground.mean(axis=1) @ np.array([1.0, 1.0j])
-        is_near = seen.valid.all(axis=1) & np.isfinite(middles.real) & (np.abs(middles) < _PACE_RANGE_M)
-        kinds = tuple(kind for kind, near in zip(seen.kinds, is_near.tolist(), strict=True) if near)
+        is_near = quads.valid.all(axis=1) & np.isfinite(middles.real) & (np.abs(middles) < _PACE_RANGE_M)
+        kinds = tuple(kind for kind, near in zip(quads.kinds, is_near.tolist(), strict=True) if near)
         now = _Seen(look.stamp_s, kinds, middles[is_near])
         before = self.before.get(look.camera)
         if before is None or not pieces:
@@ -193,5 +193,5 @@ class RigTest:
 
 def sigmas_off(turn_rad: FloatArray, prior_rad2: FloatArray, posterior_rad2: FloatArray) -> float:
     """How surely a mounting has turned (3,): in sigmas of its calibration and, if fewer, of the estimate."""
-    squared = [float(turn_rad @ np.linalg.solve(own, turn_rad)) for own in (prior_rad2, posterior_rad2)]
+    squared = [float(turn_rad @ np.linalg.solve(spot, turn_rad)) for spot in (prior_rad2, posterior_rad2)]
     return float(np.sqrt(min(squared)))

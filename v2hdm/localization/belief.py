@@ -27,16 +27,15 @@ lasts."""
 VEHICLE = 10  # number of the vehicle's states
 CAMERA = 6  # number of a camera's
 
-# Roll and pitch of a body on its springs, standard deviations, rad, and the times, s, over which they fade:
-# what the road shakes, and what a bend, a brake or a load holds.
-_FAST_RAD = 0.003
-_FAST_S = 0.25
-_SLOW_RAD = 0.003
-_SLOW_S = 4.0
-_HEAVE_S = 0.5
+# Roll and pitch of a body on its springs, for vehicles of 1 to 6 mrad:
+_FAST_RAD = 0.003  # standard deviation, rad, of what a road shakes
+_FAST_S = 0.25  # time, s, over which that fades
+_SLOW_RAD = 0.003  # standard deviation, rad, of what a bend, a brake or a load holds
+_SLOW_S = 4.0  # time, s, over which that fades
+_HEAVE_S = 0.5  # time, s, over which a heave fades
 # Change of a mounting within a second, m and rad (one sigma): 0.06 deg within an hour.
 _CREEP_M = 1e-5
-_CREEP_RAD = 1.7e-5
+_CREEP_RAD = 1.7e-5  # of a mounting's angles
 
 _SPRINGS = (
     (HEIGHT, HEAVE_SIGMA_M, _HEAVE_S),

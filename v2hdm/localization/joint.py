@@ -51,7 +51,7 @@ class Pairs(NamedTuple):
 class Scene:
     """One image before a map: what :func:`locate` works on."""
 
-    seen: Sighted
+    quads: Sighted
     paint: Paint
     plane: Plane
     camera: int
@@ -82,7 +82,7 @@ class Scene:
     def noise(self, pairs: Pairs, expected: Expected, belief: Belief | None) -> FloatArray:
         """The covariance (P, 8, 8) of pairs: detections, shapes, and places that ``belief`` does not hold."""
         rows = pairs.order
-        cov = self.seen.covariance_px2[pairs.detection]
+        cov = self.quads.covariance_px2[pairs.detection]
         out = self.noise_factor * np.take_along_axis(
             np.take_along_axis(cov, rows[:, :, None], axis=1), rows[:, None, :], axis=2
         )
@@ -98,12 +98,12 @@ class Scene:
 
     def residual(self, pairs: Pairs, expected: Expected) -> FloatArray:
         """Detected less expected pixels (P, 8)."""
-        stacked = self.seen.corners_px.reshape(-1, 8)[pairs.detection]
+        stacked = self.quads.corners_px.reshape(-1, 8)[pairs.detection]
         return np.asarray(np.take_along_axis(stacked, pairs.order, axis=1) - expected.px.reshape(-1, 8))
 
     def freedom(self, pairs: Pairs) -> FloatArray:
         """Numbers (P,) of a pair's coordinates that say anything."""
-        return np.asarray(2.0 * self.seen.informs[pairs.detection].sum(axis=1))
+        return np.asarray(2.0 * self.quads.informs[pairs.detection].sum(axis=1))
 
 
 class Located(NamedTuple):
@@ -119,21 +119,21 @@ class Located(NamedTuple):
 
 def candidates(belief: Belief, scene: Scene) -> tuple[Pairs, FloatArray]:
     """All pairs that the belief allows, and minus twice their log likelihoods (P,)."""
-    seen = scene.seen
+    quads = scene.quads
     none = Pairs(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 8), np.int64)), np.zeros(0)
     near = scene.paint.near(belief.mean[:2], _RANGE_M)
-    if not len(seen.kinds) or not len(near):
+    if not len(quads.kinds) or not len(near):
         return none
     pose = belief.map_from_vehicle(scene.plane)
-    ground = ground_points(seen.corners_px, pose, scene.plane, scene.calibration)
-    is_on_ground: BoolArray = np.asarray(seen.informs & np.isfinite(ground).all(axis=2))
+    ground = ground_points(quads.corners_px, pose, scene.plane, scene.calibration)
+    is_on_ground: BoolArray = np.asarray(quads.informs & np.isfinite(ground).all(axis=2))
     share = is_on_ground / np.maximum(is_on_ground.sum(axis=1, keepdims=True), 1)
     middle = (np.where(is_on_ground[..., None], ground, 0.0) * share[..., None]).sum(axis=1)
     arm_m = np.linalg.norm(middle - belief.mean[:2], axis=1)
     turn_rad = float(np.linalg.norm(belief.root[HEADING]))
     reach_m = _REACH_M + _REACH_SIGMAS * (belief.sigma_m + arm_m * turn_rad)
     apart_m = np.linalg.norm(middle[:, None] - scene.paint.centres_map[near][None], axis=2)
-    alike = np.array([scene.paint.looks_like(near, kind) for kind in seen.kinds])
+    alike = np.array([scene.paint.looks_like(near, kind) for kind in quads.kinds])
     reach_m = np.where(is_on_ground.sum(axis=1) > 0, reach_m, -1.0)
     detection, row = np.nonzero(alike & (apart_m < reach_m[:, None]))
     used, place = np.unique(row, return_inverse=True)
@@ -145,7 +145,7 @@ def candidates(belief: Belief, scene: Scene) -> tuple[Pairs, FloatArray]:
     spread = scene.spread(belief, expected, near[used])[place]
     expected = Expected(*(array[place] for array in expected))
     state_px2 = (spread**2).sum(axis=2)
-    order = _order(seen, detection, expected.px.reshape(-1, 8), state_px2.mean(axis=1) + 1.0)
+    order = _order(quads, detection, expected.px.reshape(-1, 8), state_px2.mean(axis=1) + 1.0)
     pairs = Pairs(detection, near[used][place], order)
     total = spread @ spread.swapaxes(1, 2) + scene.noise(pairs, expected, belief)
     residual = scene.residual(pairs, expected)
@@ -155,11 +155,11 @@ def candidates(belief: Belief, scene: Scene) -> tuple[Pairs, FloatArray]:
     return pairs.subset(fits), loss[fits]
 
 
-def _order(seen: Sighted, detection: IntArray, px: FloatArray, state_px2: FloatArray) -> IntArray:
+def _order(quads: Sighted, detection: IntArray, px: FloatArray, state_px2: FloatArray) -> IntArray:
     """The corners' orders (P, 8) in which detections lie nearest to markings at ``px`` (P, 8)."""
     turned = _SHIFT_ROWS[None]  # (1, 4, 8)
-    stacked = seen.corners_px.reshape(-1, 8)[detection][:, turned[0]]
-    variance = np.diagonal(seen.covariance_px2, axis1=1, axis2=2)[detection][:, turned[0]]
+    stacked = quads.corners_px.reshape(-1, 8)[detection][:, turned[0]]
+    variance = np.diagonal(quads.covariance_px2, axis1=1, axis2=2)[detection][:, turned[0]]
     squared = ((stacked - px[:, None]) ** 2 / (variance + state_px2[:, None, None])).sum(axis=2)
     return np.asarray(_SHIFT_ROWS[squared.argmin(axis=1)])
 

@@ -49,13 +49,12 @@ _UNSTATED = np.diag(np.square([0.01, 0.01, 0.01, *(3 * [np.deg2rad(0.05)])]))  #
 _AGAIN_SIGMA_M = (
     4.0  # standard deviation of the place, m, and of the heading, rad, from which a lost one is sought
 )
-_AGAIN_SIGMA_RAD = 0.2
-_ANYWHERE_M = 80.0  # way, m, after which a lost one is sought everywhere
+_AGAIN_SIGMA_RAD = 0.2  # of its heading
 # The detector's covariances: how many times too small they may be at first, and of how many coordinates that
 # is known; after how many coordinates half of it is forgotten.
-_FACTOR = 2.0
-_FACTOR_COUNT = 60.0
-_FORGET = 600.0
+_FACTOR = 2.0  # times at first
+_FACTOR_COUNT = 60.0  # coordinates that say so
+_FORGET = 600.0  # coordinates
 _FACTORS = (0.3, 12.0)
 _JUDGED_M = 14.0  # distance, m, of detections that are counted for the map or against it
 _TURNED_RAD = np.deg2rad(1.0)  # standard deviation of what a camera that was pushed has turned
@@ -184,8 +183,8 @@ class Localizer:
         self.paint = Paint(hd_map)
         self.noise = noise or MotionNoise()
         self._numbers = {name: number for number, name in enumerate(self.calibrations)}
-        stated = [own.covariance for own in self.calibrations.values()]
-        self._mountings = [_UNSTATED if own is None else np.asarray(own) for own in stated]
+        covariances = [item.covariance for item in self.calibrations.values()]
+        self._mountings = [_UNSTATED if item is None else np.asarray(item) for item in covariances]
         self._log = MotionLog()
         self._belief: Belief | None = None
         self._past: deque[_Past] = deque()
@@ -220,9 +219,9 @@ class Localizer:
                 f"{self._log.refused} samples of the odometry are no motion of a road vehicle; "
                 "state m/s and rad/s"
             )
-        for fix in sorted(fixes, key=lambda own: own.stamp_s):
+        for fix in sorted(fixes, key=lambda item: item.stamp_s):
             self._fix(fix)
-        for look in sorted(images, key=lambda own: own.stamp_s):
+        for look in sorted(images, key=lambda item: item.stamp_s):
             self._take(look)
         return self._pose()
 
@@ -242,35 +241,35 @@ class Localizer:
             )
             return
         self._reasons.pop("clock", None)
-        later = [past for past in self._past if past.look.stamp_s > look.stamp_s]
+        later_looks = [past for past in self._past if past.look.stamp_s > look.stamp_s]
         latest_s = max([look.stamp_s, *(past.look.stamp_s for past in self._past)])
         if latest_s - look.stamp_s > _LAG_S:
             self._reasons["late"] = (
                 f"an image of {look.camera} came {latest_s - look.stamp_s:.1f} s late; left out"
             )
             return
-        if self._belief is None or not later:
+        if self._belief is None or not later_looks:
             self._see(look, is_new=True)
             return
-        self._belief = later[0].before
+        self._belief = later_looks[0].before
         while self._past and self._past[-1].look.stamp_s > look.stamp_s:
             self._past.pop()
         self._see(look, is_new=True)
-        for past in later:
+        for past in later_looks:
             self._see(past.look, is_new=False)
 
     def _see(self, look: Look, is_new: bool) -> None:
         """Move the belief to a look, and take what that shows."""
         calibration = self.calibrations[look.camera]
-        seen = sighted(look, calibration)
+        quads = sighted(look, calibration)
         if is_new:
             self._count_way(look.stamp_s)
             if self._belief is None:
                 local = self._local_at(look.stamp_s)
-                self._search.patch.add(seen, look.camera, calibration, local, self._way_m)
+                self._search.patch.add(quads, look.camera, calibration, local, self._way_m)
             since_s = self._pace.since(look.camera)
             pieces = [] if since_s is None else self._log.pieces(since_s, look.stamp_s)
-            self._pace_reason = self._pace.note(look, seen, calibration, pieces) or self._pace_reason
+            self._pace_reason = self._pace.note(look, quads, calibration, pieces) or self._pace_reason
         if self._belief is None:
             if is_new:
                 self._find(look)
@@ -282,7 +281,7 @@ class Localizer:
         while self._past[-1].look.stamp_s - self._past[0].look.stamp_s > _LAG_S:
             self._past.popleft()
         self._rig_since_s = None
-        self._belief = self._located(belief, look, seen, is_new)
+        self._belief = self._located(belief, look, quads, is_new)
         if self._rig_since_s is not None:
             self._let_turn(self._rig_since_s)
         if is_new:
@@ -295,11 +294,11 @@ class Localizer:
         mountings and the vehicle's springs, which fade, explain better and better.
         """
         self._turned_s = since_s
-        again = [past for past in self._past if past.look.stamp_s >= since_s - _BEFORE_S]
-        self._belief = loosened(again[0].before, list(self._numbers.values()), _TURNED_RAD)
+        since_then = [past for past in self._past if past.look.stamp_s >= since_s - _BEFORE_S]
+        self._belief = loosened(since_then[0].before, list(self._numbers.values()), _TURNED_RAD)
         while self._past and self._past[-1].look.stamp_s >= since_s - _BEFORE_S:
             self._past.pop()
-        for past in again:
+        for past in since_then:
             self._see(past.look, is_new=False)
 
     def _moved_to(self, belief: Belief, stamp_s: float) -> Belief:
@@ -325,37 +324,37 @@ class Localizer:
         c, s = np.cos(turn), np.sin(turn)
         return vehicle_at(self._local, np.array([-c * x - s * y, s * x - c * y, -turn]))
 
-    def _located(self, belief: Belief, look: Look, seen: Sighted, is_new: bool) -> Belief:
+    def _located(self, belief: Belief, look: Look, quads: Sighted, is_new: bool) -> Belief:
         """The belief after a look; another mounting is tried where the calibration's explains little."""
         camera = self._numbers[look.camera]
         noise = self._noise[look.camera]
         plane = self.paint.ground(belief.mean[:2])
-        scene = Scene(seen, self.paint, plane, camera, self.calibrations[look.camera], noise.factor)
+        scene = Scene(quads, self.paint, plane, camera, self.calibrations[look.camera], noise.factor)
         located = locate(belief, scene)
         if not is_new:
             return located.belief
         pose = located.belief.map_from_vehicle(plane)
-        places = ground_points(seen.corners_px, pose, plane, self.calibrations[look.camera])
-        near = self._judged(places, pose, seen)
-        explained = paired(located, len(seen.kinds))
+        places = ground_points(quads.corners_px, pose, plane, self.calibrations[look.camera])
+        near = self._judged(places, pose, quads)
+        explained = paired(located, len(quads.kinds))
         gained = 0
         if self._is_sure and near.sum() >= 2 and explained[near].mean() < _FEW:
             turned = locate(loosened(belief, list(self._numbers.values()), _TURNED_RAD), scene)
-            gained = int(paired(turned, len(seen.kinds))[near].sum() - explained[near].sum())
+            gained = int(paired(turned, len(quads.kinds))[near].sum() - explained[near].sum())
             self._rig_since_s = self._rig.note(look, gained)
         elif self._is_sure:
             self._rig.note(look, 0)
         rows = np.flatnonzero(near)
-        kinds = tuple(seen.kinds[row] for row in rows.tolist())
+        kinds = tuple(quads.kinds[row] for row in rows.tolist())
         self._agreement.note(places[near].mean(axis=1), kinds, explained[near], self._way_m)
         if located.misfit_freedom > 0:
             noise.note(located, noise.factor)
         self._matched = len(located.pairs.detection)
         return self._kept(located)
 
-    def _judged(self, places: FloatArray, pose: FloatArray, seen: Sighted) -> BoolArray:
+    def _judged(self, places: FloatArray, pose: FloatArray, quads: Sighted) -> BoolArray:
         """Which detections (D,) lie whole, near, and where the map has been mapped."""
-        finite: BoolArray = np.asarray(np.isfinite(places).all(axis=(1, 2)) & seen.valid.all(axis=1))
+        finite: BoolArray = np.asarray(np.isfinite(places).all(axis=(1, 2)) & quads.valid.all(axis=1))
         middle = np.where(finite[:, None], places.mean(axis=1), np.inf)
         return np.asarray(finite & (np.linalg.norm(middle - pose[:2, 3], axis=1) < _JUDGED_M))
 
@@ -383,7 +382,7 @@ class Localizer:
         if places:
             best = places[0]
             second = places[1].score if len(places) > 1 else 0.0
-            share = best.matched / max(best.seen, 1)
+            share = best.matched / max(best.quads, 1)
             if (
                 best.matched >= _LEAST_MATCHED
                 and share >= _LEAST_SHARE
@@ -394,7 +393,7 @@ class Localizer:
         waited_s, waited_m = look.stamp_s - quest.since_s, self._way_m - quest.since_m
         is_long = (waited_s > _LOST_S and waited_m > _STILL_M) or waited_m > _LOST_WAY_M
         if is_long and len(quest.patch.sure) >= _LEAST_MATCHED + 2:
-            share = places[0].matched / max(places[0].seen, 1) if places else 0.0
+            share = places[0].matched / max(places[0].quads, 1) if places else 0.0
             if share < _LEAST_SHARE:
                 self._is_lost = True
                 self._reasons["lost"] = (
@@ -475,7 +474,7 @@ class Localizer:
 
     def _pose(self) -> Pose:
         """The pose at the newest stamp."""
-        stamps = [own for own in (self._log.newest_s, self._local_s) if own is not None]
+        stamps = [item for item in (self._log.newest_s, self._local_s) if item is not None]
         stamp_s = max(stamps, default=0.0)
         reasons = dict(self._reasons)
         if self._pace_reason is not None:
@@ -510,7 +509,7 @@ class Localizer:
             )
         turned = self._turned_cameras(belief)
         protection = _protection(covariance, float(belief.mean[HEADING]))
-        if status != Status.TRACKING or self._rig.is_suspicious:
+        if status != Status.TRACKING or self._rig.is_suspicious or self._agreement.differs:
             protection = (np.inf, np.inf, np.inf)
         if status == Status.INITIALISING:
             covariance = np.full((3, 3), np.inf)

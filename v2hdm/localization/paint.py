@@ -33,15 +33,17 @@ class Paint:
         self.centres_map: FloatArray = flat.mean(axis=1)
         self.kinds = np.array([marking.kind for marking in markings])
         unstated_m2 = UNSTATED_SIGMA_M**2 * np.eye(8)
-        stated = [marking.covariance_m2 for marking in markings]
-        total_m2 = np.array([unstated_m2 if own is None else own for own in stated]).reshape(-1, 8, 8)
+        covariances = [marking.covariance_m2 for marking in markings]
+        total_m2 = np.array(
+            [unstated_m2 if covariance is None else covariance for covariance in covariances]
+        ).reshape(-1, 8, 8)
         mean = np.tile(np.eye(2), 4) / 4
         variance_m2 = np.trace(mean @ total_m2 @ mean.T, axis1=1, axis2=2) / 2
         relative_m2 = np.array([marking.relative_sigma_m or np.inf for marking in markings]) ** 2
         share = np.minimum(relative_m2 / np.maximum(variance_m2, 1e-12), 1.0)
         self.shared_m2 = float(np.median((1 - share) * variance_m2)) if len(markings) else 0.0
-        apart = np.exp(-_VIEW_M / (hd_map.drift_over_m or _DRIFT_OVER_M))
-        self.shared_rad2 = 2 * (1 - apart) * self.shared_m2 / _VIEW_M**2
+        ratio = _VIEW_M / (hd_map.drift_over_m or _DRIFT_OVER_M)
+        self.shared_rad2 = 2 * (1 - np.exp(-ratio)) * self.shared_m2 / _VIEW_M**2
         self.centre_m2: FloatArray = share[:, None, None] * (mean @ total_m2 @ mean.T)
         about = np.eye(8) - np.tile(mean, (4, 1))
         self.shape_m2: FloatArray = about @ total_m2 @ about.T
@@ -63,8 +65,8 @@ class Paint:
             numbers = np.arange(len(self))
         else:
             columns, rows = range(low[0], high[0] + 1), range(low[1], high[1] + 1)
-            found = [n for column in columns for row in rows for n in self._cells.get((column, row), ())]
-            numbers = np.array(sorted(found), dtype=np.int64)
+            finding = [n for column in columns for row in rows for n in self._cells.get((column, row), ())]
+            numbers = np.array(sorted(finding), dtype=np.int64)
         distance_m = np.linalg.norm(self.centres_map[numbers] - place_map, axis=1)
         return np.asarray(numbers[distance_m <= radius_m])
 

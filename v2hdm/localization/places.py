@@ -30,7 +30,7 @@ _ANCHORS = 8  # of these that are put on the map's markings
 _SHAPE_M = 0.25  # deviation of corners, m, of what may be one marking
 _SLACK_M = 0.7  # distance, m, of a detection from its marking at a place of one pair
 _SIGMA_M = 0.12  # standard deviation, m, of a detection's place in a patch that is in place
-_SLACK_SIGMAS = 3.0
+_SLACK_SIGMAS = 3.0  # of these, within which it lies on its marking
 _REFINED = 60  # places that are refined
 _APART_M, _APART_RAD = 0.5, 0.05  # between two places
 _PARTS = 4_000_000  # distances that are computed at once
@@ -64,7 +64,7 @@ class Place(NamedTuple):
     map_from_local: FloatArray  # (3,) x, y, m, and turn, rad
     score: float  # log likelihood over that of chance
     matched: int
-    seen: int
+    quads: int
 
 
 @dataclass
@@ -91,43 +91,43 @@ class Patch:
 
     def add(
         self,
-        seen: Sighted,
+        quads: Sighted,
         camera: str,
         calibration: Calibration,
         local_from_vehicle: FloatArray,
         way_m: float,
     ) -> None:
         """Take the whole detections near the camera in an image taken at a pose (3,) of the odometry."""
-        self.objects = [own for own in self.objects if way_m - own.way_m < _PATCH_M]
+        self.objects = [piece for piece in self.objects if way_m - piece.way_m < _PATCH_M]
         self.views = [view for view in self.views if way_m - view.way_m < _PATCH_M]
         if not self.views or way_m - self.views[-1].way_m > 1.0 or self.views[-1].camera != camera:
             self.views.append(_View(camera, local_from_vehicle, way_m))
-        ground = ground_points(seen.corners_px, np.eye(4), Plane(), calibration)
-        is_whole = seen.valid.all(axis=1) & np.isfinite(ground).all(axis=(1, 2))
+        ground = ground_points(quads.corners_px, np.eye(4), Plane(), calibration)
+        is_whole = quads.valid.all(axis=1) & np.isfinite(ground).all(axis=(1, 2))
         turn = np.exp(1j * local_from_vehicle[2])
         for row in np.flatnonzero(is_whole).tolist():
             corners = ground[row, :, 0] + 1j * ground[row, :, 1]
             range_m = float(abs(corners.mean()))
             if range_m < _RANGE_M:
                 place = complex(local_from_vehicle[0], local_from_vehicle[1])
-                self._take(_Object(seen.kinds[row], turn * corners + place, range_m, way_m))
+                self._take(_Object(quads.kinds[row], turn * corners + place, range_m, way_m))
         self.objects = self.objects[-_MOST:]
 
-    def _take(self, new: _Object) -> None:
+    def _take(self, newer: _Object) -> None:
         """Of what was seen before, keep what was seen from nearer."""
-        for own in self.objects:
-            if own.kind == new.kind and abs(own.corners.mean() - new.corners.mean()) < _SAME_M:
-                own.views += 1
-                own.way_m = new.way_m
-                if new.range_m <= own.range_m:
-                    own.corners, own.range_m = new.corners, new.range_m
+        for piece in self.objects:
+            if piece.kind == newer.kind and abs(piece.corners.mean() - newer.corners.mean()) < _SAME_M:
+                piece.views += 1
+                piece.way_m = newer.way_m
+                if newer.range_m <= piece.range_m:
+                    piece.corners, piece.range_m = newer.corners, newer.range_m
                 return
-        self.objects.append(new)
+        self.objects.append(newer)
 
     @property
     def sure(self) -> list[_Object]:
         """What two images or more showed; a single image's where there is no other."""
-        several = [own for own in self.objects if own.views > 1]
+        several = [piece for piece in self.objects if piece.views > 1]
         return several or self.objects
 
 
@@ -147,7 +147,9 @@ def search(
     else:
         numbers = paint.near(prior.pose[:2], 3 * prior.sigma_m + _PATCH_M + _RANGE_M)
     corners_map = paint.corners_map[numbers, :, 0] + 1j * paint.corners_map[numbers, :, 1]
-    stacks = _Stacks(objects, corners_map, np.array([paint.looks_like(numbers, own.kind) for own in objects]))
+    stacks = _Stacks(
+        objects, corners_map, np.array([paint.looks_like(numbers, piece.kind) for piece in objects])
+    )
     poses = stacks.by_pairs()
     poses = _allowed(poses, local_from_vehicle, prior)
     if not len(poses):
@@ -179,22 +181,22 @@ class _Stacks:
     def by_pairs(self) -> FloatArray:
         """Places (C, 3) that put one object on one marking."""
         rare = [len(np.flatnonzero(row)) for row in self.alike]
-        order = np.lexsort(([own.range_m for own in self.objects], rare))[:_ANCHORS]
+        order = np.lexsort(([piece.range_m for piece in self.objects], rare))[:_ANCHORS]
         detection, marking = np.nonzero(self.alike[order])
         corners = np.array([self.objects[n].corners for n in order.tolist()])[detection][:, SHIFTS]
         onto = self.corners_map[marking][:, None]
         middle, centre = corners.mean(axis=2), onto.mean(axis=2)
-        one, two = corners - middle[..., None], onto - centre[..., None]
-        cross = (one.conj() * two).sum(axis=2)
+        centred, onto_centred = corners - middle[..., None], onto - centre[..., None]
+        cross = (centred.conj() * onto_centred).sum(axis=2)
         turn = cross / np.maximum(np.abs(cross), 1e-12)
-        off = np.sqrt((np.abs(two - turn[..., None] * one) ** 2).mean(axis=2))
+        off = np.sqrt((np.abs(onto_centred - turn[..., None] * centred) ** 2).mean(axis=2))
         fits = off < _SHAPE_M
         moved = (centre - turn * middle)[fits]
         return np.column_stack([moved.real, moved.imag, np.angle(turn[fits])])
 
     def count(self, poses: FloatArray, slack_m: float) -> IntArray:
         """How many objects lie on a marking at each place."""
-        centres = np.array([own.corners.mean() for own in self.objects])
+        centres = np.array([piece.corners.mean() for piece in self.objects])
         markings = self.corners_map.mean(axis=1)
         out = np.zeros(len(poses), dtype=np.int64)
         size = max(1, _PARTS // max(1, len(markings)))
@@ -209,7 +211,7 @@ class _Stacks:
 
     def nearest(self, pose: FloatArray) -> tuple[FloatArray, IntArray]:
         """The squared distance (D,), m2, of each object's corners from the nearest marking's, and its row."""
-        corners = np.array([own.corners for own in self.objects])
+        corners = np.array([piece.corners for piece in self.objects])
         at = np.exp(1j * pose[2]) * corners + complex(pose[0], pose[1])
         apart = np.abs(at.mean(axis=1)[:, None] - self.corners_map.mean(axis=1)[None])
         apart = np.where(self.alike, apart, np.inf)
@@ -220,7 +222,7 @@ class _Stacks:
 
     def refined(self, pose: FloatArray, slack_m: float) -> FloatArray:
         """The place (3,) at which the objects lie best on the markings that they lie on."""
-        corners = np.array([own.corners for own in self.objects])
+        corners = np.array([piece.corners for piece in self.objects])
         squared, row = self.nearest(pose)
         is_on = squared < slack_m**2
         if not is_on.any():
@@ -228,11 +230,11 @@ class _Stacks:
         at = np.exp(1j * pose[2]) * corners[is_on] + complex(pose[0], pose[1])
         onto = self.corners_map[row[is_on]]
         shift = (np.abs(at[:, SHIFTS] - onto[:, None]) ** 2).sum(axis=2).argmin(axis=1)
-        one = np.take_along_axis(corners[is_on], SHIFTS[shift], axis=1).ravel()
-        two = onto.ravel()
-        cross = ((one - one.mean()).conj() * (two - two.mean())).sum()
+        centred = np.take_along_axis(corners[is_on], SHIFTS[shift], axis=1).ravel()
+        onto_centred = onto.ravel()
+        cross = ((centred - centred.mean()).conj() * (onto_centred - onto_centred.mean())).sum()
         turn = cross / max(abs(cross), 1e-12)
-        moved = two.mean() - turn * one.mean()
+        moved = onto_centred.mean() - turn * centred.mean()
         return np.array([moved.real, moved.imag, np.angle(turn)])
 
 
@@ -274,7 +276,7 @@ def _distinct(poses: FloatArray, stacks: _Stacks) -> list[FloatArray]:
     if not len(poses):
         return []
     count = stacks.count(poses, _SLACK_SIGMAS * _SIGMA_M)
-    middle = np.mean([own.corners.mean() for own in stacks.objects])
+    middle = np.mean([piece.corners.mean() for piece in stacks.objects])
     at = np.exp(1j * poses[:, 2]) * middle + poses[:, 0] + 1j * poses[:, 1]
     kept: list[int] = []
     for row in np.argsort(-count, kind="stable").tolist():

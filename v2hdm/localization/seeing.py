@@ -15,7 +15,7 @@ from v2hdm.records import BoolArray, Calibration, FloatArray, IntArray, LaneDete
 
 _NEAREST_M = 0.3  # least depth, m, at which a corner can be seen
 _LARGEST_PX = 1e4  # standard deviation, px, from which a corner says nothing
-_STEP_PX = 0.5
+_STEP_PX = 0.5  # step, px, of the lens's differences
 
 
 @dataclass(frozen=True)
@@ -74,8 +74,8 @@ def sighted(look: Look, calibration: Calibration) -> Sighted:
     covariance += silent[:, :, None] * (_LARGEST_PX**2 * np.eye(8))
     corners = np.where(informs[..., None], corners, 0.0)
     kinds = tuple(quad.kind for quad in quads)
-    found = Sighted(kinds, corners, covariance, informs, valid & informs)
-    return found.subset(np.flatnonzero(informs.sum(axis=1) >= 2))
+    finding = Sighted(kinds, corners, covariance, informs, valid & informs)
+    return finding.subset(np.flatnonzero(informs.sum(axis=1) >= 2))
 
 
 class Expected(NamedTuple):

@@ -141,8 +141,13 @@ def pose_record(pose: Pose) -> dict[str, Any]:
     record["matched"] = pose.matched
     record["reasons"] = list(pose.reasons)
     record["turned"] = [
-        {"camera": own.camera, "since_s": own.since_s, "deg": own.turn_deg, "sigma_deg": own.sigma_deg}
-        for own in pose.turned
+        {
+            "camera": camera_turn.camera,
+            "since_s": camera_turn.since_s,
+            "deg": camera_turn.turn_deg,
+            "sigma_deg": camera_turn.sigma_deg,
+        }
+        for camera_turn in pose.turned
     ]
     return record
 

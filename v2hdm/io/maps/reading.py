@@ -130,7 +130,7 @@ def read_geojson(path: Path) -> HDMap:
         where = f"{path}: feature {number}"
         entry = take_mapping(feature, where, MapFileError)
         properties = take_mapping(entry.get("properties"), where, MapFileError)
-        reader.add(properties, _of_geojson(entry.get("geometry"), where), where)
+        reader.add(properties, geometry_of_geojson(entry.get("geometry"), where), where)
     hd_map = reader.map()
     over_m = about.get("drift_over_m")
     largest = take_whole(about.get("largest_id") or 0, 0, _LARGEST_ID, f"{path}: largest_id", MapFileError)
@@ -158,7 +158,7 @@ def read_geopackage(path: Path) -> HDMap:
         for number, properties in enumerate(_layer(path, layer)):
             where = f"{path}: {layer}, row {number + 1}"
             exact = {name: _json(properties.get(name), f"{where}, {name}") for name in (key, *EXACT)}
-            reader.add(properties | exact, _of_wkb(properties.get(GEOMETRY), where), where)
+            reader.add(properties | exact, geometry_of_wkb(properties.get(GEOMETRY), where), where)
     return reader.map()
 
 
@@ -384,7 +384,7 @@ def _take_accuracy(value: object, where: str, error: type[V2hdmError]) -> str:
     return str(value)
 
 
-def _of_geojson(content: object, where: str) -> Geometry | None:
+def geometry_of_geojson(content: object, where: str) -> Geometry | None:
     """A Polygon of one ring, a LineString, or what a GIS may make of one: a Multi... with one of them."""
     if content is None:
         return None
@@ -403,7 +403,7 @@ def _of_geojson(content: object, where: str) -> Geometry | None:
     return Geometry(positions[:-1] if closed else positions, closed)
 
 
-def _of_wkb(blob: object, where: str) -> Geometry | None:
+def geometry_of_wkb(blob: object, where: str) -> Geometry | None:
     """A polygon of one ring, a line, or a Multi... of one, from GeoPackage's binary (OGC 12-128r19, 2.1.3).
 
     By hand: GEOS dies of a geometry that holds another, which holds another, and so on.
@@ -447,20 +447,28 @@ def stated_in(path: Path, key: str) -> object:
 
 
 def _layer(path: Path, layer: str) -> list[dict[str, Any]]:
-    """The rows of a GeoPackage's layer, by SQLite alone: GDAL would open whatever a file says that it is."""
+    """The rows of a layer of our own GeoPackage."""
+    return geopackage_rows(path, layer, "not a map written by v2hdm")
+
+
+def geopackage_rows(path: Path, table: str, otherwise: str = "not a GeoPackage") -> list[dict[str, Any]]:
+    """The rows of a GeoPackage's table, by SQLite alone: GDAL would open whatever a file says that it is.
+
+    Raises MapFileError, which says that the file is ``otherwise``, where it is damaged or lacks the table.
+    """
     note_input(path)
     if not path.is_file():
         raise MapFileError(f"{path}: no such file; check the path or restore it")
-    others = f"{path}: not a map written by v2hdm"
+    others = f"{path}: {otherwise}"
     try:
         with opened(path, "mode=ro") as data:
             # A view, a virtual table and a generated column would compute without end.
-            about = data.execute("SELECT type, sql FROM sqlite_master WHERE name = ?", [layer]).fetchall()
-            hidden = data.execute("SELECT 1 FROM pragma_table_xinfo(?) WHERE hidden", [layer]).fetchall()
+            about = data.execute("SELECT type, sql FROM sqlite_master WHERE name = ?", [table]).fetchall()
+            hidden = data.execute("SELECT 1 FROM pragma_table_xinfo(?) WHERE hidden", [table]).fetchall()
             plain = [kind == "table" and "VIRTUAL" not in sql.upper()[:20] for kind, sql in about]
             if plain != [True] or hidden:
-                raise MapFileError(f"{others} (it has no plain table '{layer}'); give one that is")
-            return list(rows_of(data, path, layer))
+                raise MapFileError(f"{others} (it has no plain table '{table}'); give one that is")
+            return list(rows_of(data, path, table))
     except (sqlite3.Error, UnicodeError, AttributeError) as failure:
         raise MapFileError(f"{others} ({failure}); give one that is") from None
 

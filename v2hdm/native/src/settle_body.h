@@ -127,18 +127,17 @@ class Fit {
         std::fill(inside, inside + BLOCK, 1.0f);
         for (int s = 0; s < SIDES; ++s) {
             float across[BLOCK], start[BLOCK], end[BLOCK];
-            float nearest = FAR_BLURS;
+            int near = 0;
             for (int i = 0; i < BLOCK; ++i) {
                 across[i] = matrix[0][s][0] * x[i] + matrix[0][s][1] * y[i] + matrix[0][s][2];
                 start[i] = matrix[1][s][0] * x[i] + matrix[1][s][1] * y[i] + matrix[1][s][2];
                 end[i] = matrix[2][s][0] * x[i] + matrix[2][s][1] * y[i] + matrix[2][s][2];
                 inside[i] = across[i] < 0.0f ? inside[i] : 0.0f;
-                const float size = across[i] < 0.0f ? -across[i] : across[i];
-                nearest = size < nearest ? size : nearest;
             }
+            for (int i = 0; i < BLOCK; ++i) near |= (across[i] < FAR_BLURS) & (across[i] > -FAR_BLURS);
             float* by_start = row(BY_SHAPE + s) + begin;
             float* by_end = row(BY_SHAPE + SIDES + s) + begin;
-            if (!(nearest < FAR_BLURS)) {
+            if (near == 0) {
                 std::fill(by_start, by_start + BLOCK, 0.0f);
                 std::fill(by_end, by_end + BLOCK, 0.0f);
                 continue;

@@ -1,0 +1,174 @@
+"""The outlines of objects in an OpenDRIVE file (ASAM OpenDRIVE 1.7, chapters 9 and 13)."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from v2hdm.errors import MapFileError
+from v2hdm.records import FloatArray
+from v2hdm.store.files import read_text
+
+_SAME_PLACE_M = 1e-6  # distance, m, of a last corner that repeats the first
+_STEP_M = 0.05  # step, m, by which a spiral is integrated: it is exact to a micrometre in bends of roads
+
+
+class ObjectOutline(NamedTuple):
+    """The outline of an object: positions (N, 2), m, what names it in messages, and what it is called."""
+
+    positions: FloatArray
+    name: str
+    called: str | None
+
+
+class ObjectOutlines(NamedTuple):
+    """The outlines in a file, and the system of its coordinates, None if it is not stated."""
+
+    outlines: list[ObjectOutline]
+    crs: str | None
+
+
+class _Pose(NamedTuple):
+    """A place on a reference line: x, y and heading."""
+
+    position: FloatArray
+    heading_rad: float
+
+    def beside(self, points: FloatArray) -> FloatArray:
+        """Points (N, 2), ahead and left of it, in the file's coordinates."""
+        cos = np.cos(self.heading_rad)
+        sin = np.sin(self.heading_rad)
+        return np.asarray(self.position + points @ np.array([[cos, sin], [-sin, cos]]))
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """A geometry of a reference line, from ``s_m`` on."""
+
+    s_m: float
+    length_m: float
+    start: _Pose
+    shape: ET.Element
+
+    def at(self, along_m: float) -> _Pose:
+        """The place ``along_m`` from its start."""
+        kind = self.shape.tag
+        if kind == "paramPoly3":
+            return self._of_polynomials(along_m)
+        if kind == "poly3":
+            across = _cubic(self.shape, "", along_m)
+            heading = np.arctan(_slope(self.shape, "", along_m))
+            return _Pose(
+                self.start.beside(np.array([[along_m, across]]))[0], self.start.heading_rad + float(heading)
+            )
+        if kind not in ("line", "arc", "spiral"):
+            raise MapFileError(f"a geometry {kind} is none of OpenDRIVE's; fix the file")
+        begin = _number(self.shape, "curvature" if kind == "arc" else "curvStart", 0.0)
+        end = _number(self.shape, "curvature" if kind == "arc" else "curvEnd", begin)
+        steps = 1 if kind == "line" else max(1, int(np.ceil(abs(along_m) / _STEP_M)))
+        middle = (np.arange(steps) + 0.5) * along_m / steps
+        change = (end - begin) / self.length_m
+        turned = begin * middle + change * middle**2 / 2
+        ahead = np.array([np.cos(turned).sum(), np.sin(turned).sum()]) * along_m / steps
+        heading_rad = self.start.heading_rad + begin * along_m + change * along_m**2 / 2
+        return _Pose(self.start.beside(ahead[None])[0], heading_rad)
+
+    def _of_polynomials(self, along_m: float) -> _Pose:
+        is_normalised = self.shape.get("pRange", "normalized") == "normalized"
+        parameter = along_m / self.length_m if is_normalised else along_m
+        place = np.array([[_cubic(self.shape, axis, parameter) for axis in "UV"]])
+        slope = [_slope(self.shape, axis, parameter) for axis in "UV"]
+        heading_rad = self.start.heading_rad + float(np.arctan2(slope[1], slope[0]))
+        return _Pose(self.start.beside(place)[0], heading_rad)
+
+
+def outlines_of(path: Path) -> ObjectOutlines:
+    """The closed outlines of the objects in a file; MapFileError where it is damaged."""
+    text = read_text(path, MapFileError)
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise MapFileError(f"{path}: declares a document type, which OpenDRIVE has not; take it out")
+    try:
+        root = ET.fromstring(text.encode())
+    except (ET.ParseError, ValueError) as failure:
+        raise MapFileError(f"{path}: is no XML that can be read ({failure}); save it again") from None
+    if root.tag != "OpenDRIVE":
+        raise MapFileError(f"{path}: is no OpenDRIVE file (its root is {root.tag[:40]}); give one")
+    reference = root.findtext("header/geoReference")
+    outlines = []
+    for road in root.findall("road"):
+        where = f"{path}: road {road.get('id', '')[:40]}"
+        try:
+            pieces = _pieces(road)
+            outlines += [
+                outline for entry in road.findall("objects/object") for outline in _outlines(entry, pieces)
+            ]
+        except (TypeError, ValueError, ZeroDivisionError, LookupError) as failure:
+            raise MapFileError(f"{where}: {failure}; fix the file") from None
+        except MapFileError as failure:
+            raise MapFileError(f"{where}: {failure}") from None
+    return ObjectOutlines(outlines, reference.strip() if reference and reference.strip() else None)
+
+
+def _pieces(road: ET.Element) -> list[_Piece]:
+    pieces = []
+    for entry in road.findall("planView/geometry"):
+        start = _Pose(np.array([_number(entry, "x"), _number(entry, "y")]), _number(entry, "hdg"))
+        if not len(entry):
+            raise MapFileError("a geometry has no shape; fix the file")
+        pieces.append(_Piece(_number(entry, "s"), _number(entry, "length"), start, entry[0]))
+    return sorted(pieces, key=lambda piece: piece.s_m)
+
+
+def _place(pieces: list[_Piece], s_m: float) -> _Pose:
+    """The place at ``s_m`` along a reference line, which its last piece goes on."""
+    if not pieces:
+        raise MapFileError("has no reference line; fix the file")
+    before = [piece for piece in pieces if piece.s_m <= s_m] or pieces[:1]
+    return before[-1].at(s_m - before[-1].s_m)
+
+
+def _outlines(entry: ET.Element, pieces: list[_Piece]) -> list[ObjectOutline]:
+    called = entry.get("name") or entry.get("type")
+    name = f"object {entry.get('id', '')[:40]} ({(called or '')[:40]})"
+    outline_entries = entry.findall("outlines/outline") or entry.findall("outline")
+    place = _place(pieces, _number(entry, "s"))
+    centre = place.beside(np.array([[0.0, _number(entry, "t", 0.0)]]))[0]
+    frame = _Pose(centre, place.heading_rad + _number(entry, "hdg", 0.0))
+    outlines = []
+    for outline in outline_entries:
+        local = [(_number(corner, "u"), _number(corner, "v")) for corner in outline.findall("cornerLocal")]
+        on_road = [
+            _place(pieces, _number(corner, "s")).beside(np.array([[0.0, _number(corner, "t")]]))[0]
+            for corner in outline.findall("cornerRoad")
+        ]
+        points = frame.beside(np.array(local)) if local else np.array(on_road).reshape(-1, 2)
+        if len(points) > 1 and np.abs(points[0] - points[-1]).max() < _SAME_PLACE_M:
+            points = points[:-1]
+        if len(points) > 2 and outline.get("closed", "true") != "false":
+            outlines.append(ObjectOutline(points, name, called))
+    return outlines
+
+
+def _number(entry: ET.Element, key: str, missing: float | None = None) -> float:
+    text = entry.get(key)
+    if text is None and missing is not None:
+        return missing
+    if text is None:
+        raise MapFileError(f"a {entry.tag[:40]} has no {key}; fix the file")
+    value = float(text)
+    if not np.isfinite(value):
+        raise MapFileError(f"{key} of a {entry.tag[:40]} is not finite; fix the file")
+    return value
+
+
+def _cubic(entry: ET.Element, axis: str, parameter: float) -> float:
+    return sum(_number(entry, f"{letter}{axis}") * parameter**power for power, letter in enumerate("abcd"))
+
+
+def _slope(entry: ET.Element, axis: str, parameter: float) -> float:
+    slopes = [(_number(entry, f"{letter}{axis}"), power) for power, letter in enumerate("abcd") if power]
+    return sum(power * factor * parameter ** (power - 1) for factor, power in slopes)
