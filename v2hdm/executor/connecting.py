@@ -21,14 +21,9 @@ from distributed.system import MEMORY_LIMIT
 from v2hdm.errors import ConfigError, one_line
 from v2hdm.executor import tasks
 from v2hdm.executor.cluster import Cluster
+from v2hdm.executor.opening import BATCH_SYSTEMS
 from v2hdm.executor.processes import undisturbed_starts
 from v2hdm.store.cache import code_key, library_versions
-
-BATCH_SYSTEMS = {
-    "slurm": "SLURMCluster", "pbs": "PBSCluster", "sge": "SGECluster", "lsf": "LSFCluster",
-    "oar": "OARCluster", "moab": "MoabCluster", "htcondor": "HTCondorCluster",
-}  # fmt: skip
-"""Names of batch systems and of the classes of dask-jobqueue for them."""
 
 _CONNECT_S = 10.0  # for a scheduler to answer, and then for its first worker to be there; chosen
 _QUEUE_S = 600.0  # for a batch system to start its first job; chosen
@@ -52,13 +47,14 @@ def quiet() -> None:
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)
 
 
-def local_cluster(workers: int, most: int, memory_gb: float) -> Cluster:
+def local_cluster(workers: int, jobs: int, memory_gb: float) -> Cluster:
     """Processes of this machine with one thread each, which only this machine can reach.
 
-    Each may take ``memory_gb``, or where that is 0 the share of one of the ``most`` that there will be.
+    Each may take ``memory_gb``, or where that is 0 the memory divided by the ``jobs`` that are done at a
+    time: a process that has nothing to do leaves others its part.
     """
     quiet()
-    limit = round(memory_gb * 1e9) or MEMORY_LIMIT // most
+    limit = round(memory_gb * 1e9) or MEMORY_LIMIT // jobs
     stack = ExitStack()
     stack.enter_context(dask.config.set(_LOCAL))  # is looked at as long as the cluster is there
     with undisturbed_starts(), warnings.catch_warnings():

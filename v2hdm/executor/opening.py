@@ -13,7 +13,11 @@ from v2hdm.executor.executor import HERE, Executor, JobProgress, Outcomes, Stage
 from v2hdm.executor.processes import ProcessExecutor
 
 _SCHEMES = ("tcp://", "tls://")
-_BATCH_SYSTEMS = ("slurm", "pbs", "sge", "lsf", "oar", "moab", "htcondor")
+BATCH_SYSTEMS = {
+    "slurm": "SLURMCluster", "pbs": "PBSCluster", "sge": "SGECluster", "lsf": "LSFCluster",
+    "oar": "OARCluster", "moab": "MoabCluster", "htcondor": "HTCondorCluster",
+}  # fmt: skip
+"""Names of batch systems and of the classes of dask-jobqueue for them."""
 
 if TYPE_CHECKING:  # loads Dask
     from v2hdm.executor.cluster import ClusterExecutor
@@ -24,10 +28,10 @@ _Result = TypeVar("_Result")
 
 def check_cluster(cluster: str) -> None:
     """Raise ConfigError for what is neither an address nor a batch system."""
-    if cluster and not cluster.startswith(_SCHEMES) and cluster not in _BATCH_SYSTEMS:
+    if cluster and not cluster.startswith(_SCHEMES) and cluster not in BATCH_SYSTEMS:
         raise ConfigError(
             f"cluster={cluster}: give the address of a Dask scheduler, such as tcp://host:8786 or "
-            f"tls://host:8786, or a batch system: {', '.join(_BATCH_SYSTEMS)}"
+            f"tls://host:8786, or a batch system: {', '.join(BATCH_SYSTEMS)}"
         )
 
 
@@ -80,7 +84,7 @@ def _connected(cluster: str, workers: int, readable: Sequence[str], writable: Se
     from v2hdm.executor import connecting
     from v2hdm.executor.cluster import ClusterExecutor
 
-    if cluster in _BATCH_SYSTEMS:
+    if cluster in BATCH_SYSTEMS:
         connected = connecting.batch_cluster(cluster, workers)
     else:
         connected = connecting.distant_cluster(cluster)
@@ -107,7 +111,8 @@ class _WhenNeeded(Executor):
     def outcomes(
         self, stage: Stage[_Job, _Result], jobs: Sequence[_Job], progress: JobProgress, at_once: int
     ) -> Outcomes[_Result]:
-        needed = self._workers if self._at_once else max(1, min(self._workers, len(jobs)))
+        side_by_side = max(1, min(self._workers, len(jobs)))
+        needed = self._workers if self._at_once else side_by_side
         if self._executor is None:
             from v2hdm.executor import connecting
             from v2hdm.executor.cluster import ClusterExecutor
@@ -115,7 +120,7 @@ class _WhenNeeded(Executor):
             if connecting.is_in_job():
                 cluster = connecting.cluster_of_this_job()
             else:
-                cluster = connecting.local_cluster(needed, self._workers, self._memory_gb)
+                cluster = connecting.local_cluster(needed, side_by_side, self._memory_gb)
             self._executor = ClusterExecutor(cluster, self._workers)
         self._executor.grow(needed)
         yield from self._executor.outcomes(stage, jobs, progress, at_once)

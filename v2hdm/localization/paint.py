@@ -44,8 +44,6 @@ class Paint:
         self.shared_m2 = float(np.median((1 - share) * variance_m2)) if len(markings) else 0.0
         ratio = _VIEW_M / (hd_map.drift_over_m or _DRIFT_OVER_M)
         self.shared_rad2 = 2 * (1 - np.exp(-ratio)) * self.shared_m2 / _VIEW_M**2
-        # What is in view drifts apart: the variance of a Gauss-Markov process's mean over a length.
-        self.shared_m2 *= 2 * (ratio - 1 + np.exp(-ratio)) / ratio**2
         self.centre_m2: FloatArray = share[:, None, None] * (mean @ total_m2 @ mean.T)
         about = np.eye(8) - np.tile(mean, (4, 1))
         self.shape_m2: FloatArray = about @ total_m2 @ about.T
