@@ -184,8 +184,8 @@ def inspect_workers(cluster: Cluster, readable: Sequence[str], writable: Sequenc
     client = cluster.client
     folder = str(Path.cwd())
     # What this machine cannot read either is no matter of the workers.
-    known = tuple(path for path in readable if os.access(path, os.R_OK))
-    answers = client.run(tasks.look, folder, known, tuple(writable), on_error="return")
+    paths = tuple(path for path in readable if os.access(path, os.R_OK))
+    answers = client.run(tasks.look, folder, paths, tuple(writable), on_error="return")
     local_versions = library_versions()
     code = code_key()
     for address, answer in sorted(answers.items()):
@@ -202,9 +202,9 @@ def _problem_of(answer: Any, local_versions: Mapping[str, str], code: str) -> st
     if isinstance(answer, Exception):
         return f"cannot be asked ({type(answer).__name__}: {one_line(str(answer))}); install the same V2HDM"
     for library, version in local_versions.items():
-        there = answer.versions.get(library, "none")
-        if there != version:
-            return f"has {library} {there}, and this machine {version}; install the same on both"
+        version_of_worker = answer.versions.get(library, "none")
+        if version_of_worker != version:
+            return f"has {library} {version_of_worker}, and this machine {version}; install the same on both"
     if answer.code != code:
         return "has another V2HDM than this machine; install the same on both"
     if answer.threads != 1:

@@ -253,8 +253,8 @@ def quads_from_hulls(hulls: Sequence[np.ndarray]) -> list[FloatArray | None]:
     if not of_four:
         return quads
     corners = order_corners(np.array([approximate[k].reshape(4, 2) for k in of_four]))
-    known = np.asarray(np.isfinite(corners).all(axis=(1, 2))).tolist()
-    for k, quad, is_known in zip(of_four, corners, known, strict=True):
+    are_known = np.asarray(np.isfinite(corners).all(axis=(1, 2))).tolist()
+    for k, quad, is_known in zip(of_four, corners, are_known, strict=True):
         quads[k] = quad if is_known else None
     return quads
 

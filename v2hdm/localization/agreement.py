@@ -126,7 +126,7 @@ class Pace:
         ground = ground_points(quads.corners_px, np.eye(4), Plane(), calibration)
         middles = ground.mean(axis=1) @ np.array([1.0, 1.0j])
         is_near = quads.valid.all(axis=1) & np.isfinite(middles.real) & (np.abs(middles) < _PACE_RANGE_M)
-        kinds = tuple(kind for kind, near in zip(quads.kinds, is_near.tolist(), strict=True) if near)
+        kinds = tuple(kind for kind, is_kept in zip(quads.kinds, is_near.tolist(), strict=True) if is_kept)
         now = _Seen(look.stamp_s, kinds, middles[is_near])
         before = self.before.get(look.camera)
         if before is None or not pieces:
@@ -140,7 +140,7 @@ class Pace:
         for factor in _PACES:
             gain = _PACE_MATCH * (_fitting(before, now, way, factor) - right)
             self.evidence[factor] = max(0.0, self.evidence.get(factor, 0.0) + gain)
-        factor = max(self.evidence, key=lambda one: self.evidence[one])
+        factor = max(self.evidence, key=lambda factor: self.evidence[factor])
         return _PACES[factor] if self.evidence[factor] > _PACE_LIMIT else None
 
     def since(self, camera: str) -> float | None:
@@ -154,8 +154,8 @@ def _fitting(before: _Seen, now: _Seen, way: FloatArray, factor: float) -> int:
         return 0
     expected = (before.middles - factor * complex(way[0], way[1])) * np.exp(-1j * way[2])
     alike = np.array(before.kinds)[:, None] == np.array(now.kinds)[None]
-    apart = np.where(alike, np.abs(expected[:, None] - now.middles[None]), np.inf)
-    return int((apart.min(axis=1) < _PACE_SAME_M).sum())
+    apart_m = np.where(alike, np.abs(expected[:, None] - now.middles[None]), np.inf)
+    return int((apart_m.min(axis=1) < _PACE_SAME_M).sum())
 
 
 # Log likelihood ratio from which a mounting counts as turned (Page 1954): of right images one in e^10.

@@ -87,8 +87,10 @@ class Belief:
 
     def map_from_vehicle(self, plane: Plane) -> FloatArray:
         """The pose (4, 4) over the map's ground."""
-        c, s = np.cos(self.mean[HEADING]), np.sin(self.mean[HEADING])
-        along, left = plane.slope[0] * c + plane.slope[1] * s, plane.slope[1] * c - plane.slope[0] * s
+        cos = np.cos(self.mean[HEADING])
+        sin = np.sin(self.mean[HEADING])
+        along = plane.slope[0] * cos + plane.slope[1] * sin
+        left = plane.slope[1] * cos - plane.slope[0] * sin
         roll = np.arctan(left) + self.mean[ROLL] + self.mean[SLOW_ROLL]
         pitch = -np.arctan(along) + self.mean[PITCH] + self.mean[SLOW_PITCH]
         rotation = rotation_from_euler(*(np.array([angle]) for angle in (roll, pitch, self.mean[HEADING])))
@@ -195,16 +197,16 @@ def with_markings(belief: Belief, markings: Sequence[int], priors: Sequence[Floa
 
 def only_markings(belief: Belief, markings: Sequence[int]) -> Belief:
     """The belief without the states of all other markings."""
-    kept = [number for number, marking in enumerate(belief.markings) if marking in set(markings)]
-    if len(kept) == len(belief.markings):
+    numbers = [number for number, marking in enumerate(belief.markings) if marking in set(markings)]
+    if len(numbers) == len(belief.markings):
         return belief
     first = belief.first_marking
-    rows = [*range(first), *(first + 2 * number + axis for number in kept for axis in (0, 1))]
+    rows = [*range(first), *(first + 2 * number + axis for number in numbers for axis in (0, 1))]
     return replace(
         belief,
         mean=belief.mean[rows],
         root=_square(belief.root[rows]),
-        markings=tuple(belief.markings[number] for number in kept),
+        markings=tuple(belief.markings[number] for number in numbers),
     )
 
 

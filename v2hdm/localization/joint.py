@@ -25,7 +25,7 @@ _STEPS = 4  # of an update: half a metre off at the first, a few millimetres at 
 _SETTLED = 0.02  # longest step, in sigmas of the prior belief, that changes nothing any more
 # Degrees of freedom of the t distribution of a detection's error: shadow and wear misplace one in fifty.
 _TAIL = 12.0
-_SHIFT_ROWS = (2 * SHIFTS[..., None] + np.arange(2)).reshape(4, 8)
+_SHIFT_ROWS = (2 * SHIFTS[..., None] + np.arange(2)).reshape(4, 8)  # rows of stacked corners by their shift
 
 
 def largest_square(count: FloatArray, sigmas: float = _GATE) -> FloatArray:
@@ -92,8 +92,8 @@ class Scene:
             map_m2[is_free] += np.tile(self.paint.centre_m2[pairs.marking[is_free]], (1, 4, 4))
         by_place = np.zeros((len(rows), 8, 8))
         for corner in range(4):
-            both = slice(2 * corner, 2 * corner + 2)
-            by_place[:, both, both] = expected.by_place[:, corner]
+            rows = slice(2 * corner, 2 * corner + 2)
+            by_place[:, rows, rows] = expected.by_place[:, corner]
         return np.asarray(out + by_place @ map_m2 @ by_place.swapaxes(1, 2))
 
     def residual(self, pairs: Pairs, expected: Expected) -> FloatArray:
@@ -121,8 +121,8 @@ def candidates(belief: Belief, scene: Scene) -> tuple[Pairs, FloatArray]:
     """All pairs that the belief allows, and minus twice their log likelihoods (P,)."""
     quads = scene.quads
     none = Pairs(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 8), np.int64)), np.zeros(0)
-    near = scene.paint.near(belief.mean[:2], _RANGE_M)
-    if not len(quads.kinds) or not len(near):
+    neighbours = scene.paint.near(belief.mean[:2], _RANGE_M)
+    if not len(quads.kinds) or not len(neighbours):
         return none
     pose = belief.map_from_vehicle(scene.plane)
     ground = ground_points(quads.corners_px, pose, scene.plane, scene.calibration)
@@ -132,21 +132,22 @@ def candidates(belief: Belief, scene: Scene) -> tuple[Pairs, FloatArray]:
     arm_m = np.linalg.norm(middle - belief.mean[:2], axis=1)
     turn_rad = float(np.linalg.norm(belief.root[HEADING]))
     reach_m = _REACH_M + _REACH_SIGMAS * (belief.sigma_m + arm_m * turn_rad)
-    apart_m = np.linalg.norm(middle[:, None] - scene.paint.centres_map[near][None], axis=2)
-    alike = np.array([scene.paint.looks_like(near, kind) for kind in quads.kinds])
+    apart_m = np.linalg.norm(middle[:, None] - scene.paint.centres_map[neighbours][None], axis=2)
+    alike = np.array([scene.paint.looks_like(neighbours, kind) for kind in quads.kinds])
     reach_m = np.where(is_on_ground.sum(axis=1) > 0, reach_m, -1.0)
     detection, row = np.nonzero(alike & (apart_m < reach_m[:, None]))
     used, place = np.unique(row, return_inverse=True)
-    expected = scene.expect(belief, near[used])
+    expected = scene.expect(belief, neighbours[used])
     is_ahead = (np.isfinite(expected.px).sum(axis=(1, 2)) == 8)[place]
-    detection, place = detection[is_ahead], place[is_ahead]
+    detection = detection[is_ahead]
+    place = place[is_ahead]
     if not len(detection):
         return none
-    spread = scene.spread(belief, expected, near[used])[place]
+    spread = scene.spread(belief, expected, neighbours[used])[place]
     expected = Expected(*(array[place] for array in expected))
     state_px2 = (spread**2).sum(axis=2)
     order = _order(quads, detection, expected.px.reshape(-1, 8), state_px2.mean(axis=1) + 1.0)
-    pairs = Pairs(detection, near[used][place], order)
+    pairs = Pairs(detection, neighbours[used][place], order)
     total = spread @ spread.swapaxes(1, 2) + scene.noise(pairs, expected, belief)
     residual = scene.residual(pairs, expected)
     squared = (residual * np.linalg.solve(total, residual[..., None])[..., 0]).sum(axis=1)
@@ -182,13 +183,13 @@ def clear_pairs(pairs: Pairs, loss: FloatArray) -> Clear:
             best[detection] = row
         elif loss[row] < loss[best[detection]] + _CLEARER_BY:
             doubted.add(detection)
-    taken: set[int] = set()
+    paired: set[int] = set()
     rows = []
     for detection, row in sorted(best.items(), key=lambda item: float(loss[item[1]])):
         marking = int(pairs.marking[row])
-        if detection not in doubted and marking not in taken:
+        if detection not in doubted and marking not in paired:
             rows.append(row)
-            taken.add(marking)
+            paired.add(marking)
     return Clear(pairs.subset(np.array(sorted(rows), dtype=np.int64)), not doubted)
 
 
@@ -244,7 +245,7 @@ def locate(belief: Belief, scene: Scene) -> Located:
         more, is_all = clear_pairs(pairs.subset(is_new), loss[is_new])
         if not len(more.detection):
             break
-        chosen = Pairs(*(np.concatenate(both) for both in zip(chosen, more, strict=True)))
+        chosen = Pairs(*(np.concatenate(parts) for parts in zip(chosen, more, strict=True)))
         located = update(belief, scene, chosen)
     while located.squared > largest_square(np.array(located.freedom)):
         if len(chosen.detection) <= 1:

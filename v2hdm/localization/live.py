@@ -144,13 +144,13 @@ def _follow_motion(motion: IO[str] | Path, lines: MotionLines, items: _Queue) ->
 
 def _growing(path: Path) -> Iterator[str]:
     """The lines of a file that somebody appends to; never ends."""
-    rest = ""
+    line = ""
     with path.open(encoding="utf-8") as stream:
         while True:
             part = stream.readline()
-            rest += part
-            if rest.endswith("\n"):
-                yield rest
-                rest = ""
+            line += part
+            if line.endswith("\n"):
+                yield line
+                line = ""
             elif not part:
                 time.sleep(_POLL_S)

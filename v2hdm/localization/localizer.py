@@ -55,7 +55,7 @@ _AGAIN_SIGMA_RAD = 0.2  # of its heading
 _FACTOR = 2.0  # times at first
 _FACTOR_COUNT = 60.0  # coordinates that say so
 _FORGET = 600.0  # coordinates
-_FACTORS = (0.3, 12.0)
+_FACTORS = (0.3, 12.0)  # least and largest, times
 _JUDGED_M = 14.0  # distance, m, of detections that are counted for the map or against it
 _TURNED_RAD = np.deg2rad(1.0)  # standard deviation of what a camera that was pushed has turned
 _TURNED_SIGMAS = 5.0  # from which a mounting has surely turned
@@ -321,7 +321,8 @@ class Localizer:
         if self._local_s is None or stamp_s >= self._local_s:
             return self._local
         x, y, turn = moved(self._log.pieces(stamp_s, self._local_s))
-        c, s = np.cos(turn), np.sin(turn)
+        c = np.cos(turn)
+        s = np.sin(turn)
         return vehicle_at(self._local, np.array([-c * x - s * y, s * x - c * y, -turn]))
 
     def _located(self, belief: Belief, look: Look, quads: Sighted, is_new: bool) -> Belief:
@@ -335,18 +336,18 @@ class Localizer:
             return located.belief
         pose = located.belief.map_from_vehicle(plane)
         places = ground_points(quads.corners_px, pose, plane, self.calibrations[look.camera])
-        near = self._judged(places, pose, quads)
+        is_judged = self._judged(places, pose, quads)
         explained = paired(located, len(quads.kinds))
         gained = 0
-        if self._is_sure and near.sum() >= 2 and explained[near].mean() < _FEW:
+        if self._is_sure and is_judged.sum() >= 2 and explained[is_judged].mean() < _FEW:
             turned = locate(loosened(belief, list(self._numbers.values()), _TURNED_RAD), scene)
-            gained = int(paired(turned, len(quads.kinds))[near].sum() - explained[near].sum())
+            gained = int(paired(turned, len(quads.kinds))[is_judged].sum() - explained[is_judged].sum())
             self._rig_since_s = self._rig.note(look, gained)
         elif self._is_sure:
             self._rig.note(look, 0)
-        rows = np.flatnonzero(near)
+        rows = np.flatnonzero(is_judged)
         kinds = tuple(quads.kinds[row] for row in rows.tolist())
-        self._agreement.note(places[near].mean(axis=1), kinds, explained[near], self._way_m)
+        self._agreement.note(places[is_judged].mean(axis=1), kinds, explained[is_judged], self._way_m)
         if located.misfit_freedom > 0:
             noise.note(located, noise.factor)
         self._matched = len(located.pairs.detection)
@@ -373,7 +374,8 @@ class Localizer:
         """Search for a place that explains the patch as no other does."""
         quest = self._search
         if quest.since_s is None and quest.patch.objects:
-            quest.since_s, quest.since_m = look.stamp_s, self._way_m
+            quest.since_s = look.stamp_s
+            quest.since_m = self._way_m
         if quest.since_s is None or 0 <= look.stamp_s - quest.last_s < _SEARCH_S:
             return
         quest.last_s = look.stamp_s
@@ -390,7 +392,8 @@ class Localizer:
             ):
                 self._begin(look.stamp_s, vehicle_at(best.map_from_local, local))
                 return
-        waited_s, waited_m = look.stamp_s - quest.since_s, self._way_m - quest.since_m
+        waited_s = look.stamp_s - quest.since_s
+        waited_m = self._way_m - quest.since_m
         is_long = (waited_s > _LOST_S and waited_m > _STILL_M) or waited_m > _LOST_WAY_M
         if is_long and len(quest.patch.sure) >= _LEAST_MATCHED + 2:
             share = places[0].matched / max(places[0].quads, 1) if places else 0.0
@@ -540,14 +543,16 @@ class Localizer:
                 self._turned.pop(name, None)
                 continue
             since_s = self._turned.setdefault(name, self._turned_s or belief.stamp_s)
-            turn, sigma = np.degrees(turn_rad).tolist(), np.degrees(np.sqrt(np.diag(posterior))).tolist()
+            turn = np.degrees(turn_rad).tolist()
+            sigma = np.degrees(np.sqrt(np.diag(posterior))).tolist()
             out.append(Turned(name, since_s, (turn[0], turn[1], turn[2]), (sigma[0], sigma[1], sigma[2])))
         return tuple(out)
 
 
 def _protection(covariance: FloatArray, heading_rad: float) -> tuple[float, float, float]:
     """Bounds ahead, to the left and of the heading that one error in a thousand exceeds."""
-    c, s = np.cos(heading_rad), np.sin(heading_rad)
+    c = np.cos(heading_rad)
+    s = np.sin(heading_rad)
     turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     sigma = np.sqrt(np.diag(turn @ covariance @ turn.T))
     ahead, left, heading = (_PROTECTION_SIGMAS * sigma).tolist()

@@ -127,7 +127,8 @@ class MotionLog:
         if after < len(self.samples) and self.stamps_s[after] > nearest_s:
             share = (0.5 * (start_s + stop_s) - nearest_s) / (self.stamps_s[after] - nearest_s)
             share = min(max(share, 0.0), 1.0)
-            earlier, later_sample = self.samples[before], self.samples[after]
+            earlier = self.samples[before]
+            later_sample = self.samples[after]
             speed = earlier.speed_m_s + share * (later_sample.speed_m_s - earlier.speed_m_s)
             turn = earlier.yaw_rate_rad_s + share * (later_sample.yaw_rate_rad_s - earlier.yaw_rate_rad_s)
             gap_s = self.stamps_s[after] - nearest_s

@@ -64,7 +64,8 @@ class Paint:
         if (high[0] - low[0]) * (high[1] - low[1]) > len(self._cells):
             numbers = np.arange(len(self))
         else:
-            columns, rows = range(low[0], high[0] + 1), range(low[1], high[1] + 1)
+            columns = range(low[0], high[0] + 1)
+            rows = range(low[1], high[1] + 1)
             finding = [n for column in columns for row in rows for n in self._cells.get((column, row), ())]
             numbers = np.array(sorted(finding), dtype=np.int64)
         distance_m = np.linalg.norm(self.centres_map[numbers] - place_map, axis=1)
@@ -86,5 +87,6 @@ class Paint:
         design = np.column_stack([np.ones(len(points)), offset])
         normal = design.T @ (weight[:, None] * design) + np.diag([1e-6, *(2 * [_GROUND_SIGMA**-2])])
         height_m, by_x, by_y = np.linalg.solve(normal, design.T @ (weight * points[:, 2])).tolist()
-        self._plane, self._plane_at = Plane(height_m, (by_x, by_y)), place_map.copy()
+        self._plane = Plane(height_m, (by_x, by_y))
+        self._plane_at = place_map.copy()
         return self._plane

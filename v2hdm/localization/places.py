@@ -120,7 +120,8 @@ class Patch:
                 piece.views += 1
                 piece.way_m = newer.way_m
                 if newer.range_m <= piece.range_m:
-                    piece.corners, piece.range_m = newer.corners, newer.range_m
+                    piece.corners = newer.corners
+                    piece.range_m = newer.range_m
                 return
         self.objects.append(newer)
 
@@ -185,8 +186,10 @@ class _Stacks:
         detection, marking = np.nonzero(self.alike[order])
         corners = np.array([self.objects[n].corners for n in order.tolist()])[detection][:, SHIFTS]
         onto = self.corners_map[marking][:, None]
-        middle, centre = corners.mean(axis=2), onto.mean(axis=2)
-        centred, onto_centred = corners - middle[..., None], onto - centre[..., None]
+        middle = corners.mean(axis=2)
+        centre = onto.mean(axis=2)
+        centred = corners - middle[..., None]
+        onto_centred = onto - centre[..., None]
         cross = (centred.conj() * onto_centred).sum(axis=2)
         turn = cross / np.maximum(np.abs(cross), 1e-12)
         off = np.sqrt((np.abs(onto_centred - turn[..., None] * centred) ** 2).mean(axis=2))
@@ -205,20 +208,20 @@ class _Stacks:
             for place, alike in zip(centres, self.alike, strict=True):
                 at = np.exp(1j * part[:, 2]) * place + part[:, 0] + 1j * part[:, 1]
                 if alike.any():
-                    apart = np.abs(at[:, None] - markings[alike][None]).min(axis=1)
-                    out[begin : begin + size] += apart < slack_m
+                    apart_m = np.abs(at[:, None] - markings[alike][None]).min(axis=1)
+                    out[begin : begin + size] += apart_m < slack_m
         return out
 
     def nearest(self, pose: FloatArray) -> tuple[FloatArray, IntArray]:
         """The squared distance (D,), m2, of each object's corners from the nearest marking's, and its row."""
         corners = np.array([piece.corners for piece in self.objects])
         at = np.exp(1j * pose[2]) * corners + complex(pose[0], pose[1])
-        apart = np.abs(at.mean(axis=1)[:, None] - self.corners_map.mean(axis=1)[None])
-        apart = np.where(self.alike, apart, np.inf)
-        row = apart.argmin(axis=1)
+        apart_m = np.abs(at.mean(axis=1)[:, None] - self.corners_map.mean(axis=1)[None])
+        apart_m = np.where(self.alike, apart_m, np.inf)
+        row = apart_m.argmin(axis=1)
         shifted = at[:, SHIFTS] - self.corners_map[row][:, None]
         squared = (np.abs(shifted) ** 2).mean(axis=2).min(axis=1)
-        return np.where(np.isfinite(apart.min(axis=1)), squared, np.inf), row
+        return np.where(np.isfinite(apart_m.min(axis=1)), squared, np.inf), row
 
     def refined(self, pose: FloatArray, slack_m: float) -> FloatArray:
         """The place (3,) at which the objects lie best on the markings that they lie on."""
@@ -240,7 +243,8 @@ class _Stacks:
 
 def vehicle_at(map_from_local: FloatArray, local_from_vehicle: FloatArray) -> FloatArray:
     """The vehicle's pose (..., 3) in the map of places (..., 3) of a patch."""
-    c, s = np.cos(map_from_local[..., 2]), np.sin(map_from_local[..., 2])
+    c = np.cos(map_from_local[..., 2])
+    s = np.sin(map_from_local[..., 2])
     x, y, turn = local_from_vehicle
     return np.stack(
         [
@@ -266,9 +270,9 @@ def _surprise(pose: FloatArray, local_from_vehicle: FloatArray, prior: Prior | N
     if prior is None:
         return 0.0
     at = vehicle_at(pose, local_from_vehicle)
-    apart = float(np.linalg.norm(at[:2] - prior.pose[:2])) / prior.sigma_m
+    off_sigmas = float(np.linalg.norm(at[:2] - prior.pose[:2])) / prior.sigma_m
     turned = float(_wrapped(at[2] - prior.pose[2])) / prior.sigma_rad
-    return 0.5 * (apart**2 + turned**2)
+    return 0.5 * (off_sigmas**2 + turned**2)
 
 
 def _distinct(poses: FloatArray, stacks: _Stacks) -> list[FloatArray]:
@@ -278,13 +282,13 @@ def _distinct(poses: FloatArray, stacks: _Stacks) -> list[FloatArray]:
     count = stacks.count(poses, _SLACK_SIGMAS * _SIGMA_M)
     middle = np.mean([piece.corners.mean() for piece in stacks.objects])
     at = np.exp(1j * poses[:, 2]) * middle + poses[:, 0] + 1j * poses[:, 1]
-    kept: list[int] = []
+    chosen: list[int] = []
     for row in np.argsort(-count, kind="stable").tolist():
-        apart_m = [abs(at[row] - at[other]) for other in kept]
-        turned = [abs(float(_wrapped(poses[row, 2] - poses[other, 2]))) for other in kept]
+        apart_m = [abs(at[row] - at[other]) for other in chosen]
+        turned = [abs(float(_wrapped(poses[row, 2] - poses[other, 2]))) for other in chosen]
         if not any(a < _APART_M and t < _APART_RAD for a, t in zip(apart_m, turned, strict=True)):
-            kept.append(row)
-    return [poses[row] for row in kept[:12]]
+            chosen.append(row)
+    return [poses[row] for row in chosen[:12]]
 
 
 def _missed(
@@ -300,7 +304,8 @@ def _missed(
             continue
         calibration = calibrations[view.camera]
         offset = paint.corners_map[numbers, :, :2] - at[:2]
-        c, s = np.cos(at[2]), np.sin(at[2])
+        c = np.cos(at[2])
+        s = np.sin(at[2])
         vehicle = np.stack(
             [c * offset[..., 0] + s * offset[..., 1], c * offset[..., 1] - s * offset[..., 0]], axis=-1
         )
@@ -310,8 +315,8 @@ def _missed(
         size = np.array([calibration.info.width, calibration.info.height])
         inside = ahead & ((px > 0.05 * size) & (px < 0.95 * size)).all(axis=2)
         foot = inverse(calibration.cam_from_vehicle)[:2, 3]
-        near = np.linalg.norm(vehicle - foot, axis=2) < _VIEW_M
-        in_view |= set(numbers[(inside & near).all(axis=1)].tolist())
+        is_near = np.linalg.norm(vehicle - foot, axis=2) < _VIEW_M
+        in_view |= set(numbers[(inside & is_near).all(axis=1)].tolist())
     return len(in_view - set(matched.tolist()))
 
 
