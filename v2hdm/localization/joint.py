@@ -92,8 +92,8 @@ class Scene:
             map_m2[is_free] += np.tile(self.paint.centre_m2[pairs.marking[is_free]], (1, 4, 4))
         by_place = np.zeros((len(rows), 8, 8))
         for corner in range(4):
-            rows = slice(2 * corner, 2 * corner + 2)
-            by_place[:, rows, rows] = expected.by_place[:, corner]
+            axes = slice(2 * corner, 2 * corner + 2)
+            by_place[:, axes, axes] = expected.by_place[:, corner]
         return np.asarray(out + by_place @ map_m2 @ by_place.swapaxes(1, 2))
 
     def residual(self, pairs: Pairs, expected: Expected) -> FloatArray:
