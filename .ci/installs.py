@@ -183,7 +183,8 @@ def missing(environment: Environment, here: Path) -> int:
             "check": "drives/mysite",
         }
         words = arguments.get(name) or given.get(name, "outputs/port2")
-        words += " outputs/friday" * (name in ("calibrate compare", "localize"))
+        words += " outputs/friday" * (name in ("calibrate compare", "compare"))
+        words += " drives/mysite" * (name == "localize")
         done = environment.run(f"v2hdm {name} {words}", here)
         good = done.returncode == 2 and re.fullmatch(f"error: v2hdm {name} {MISSING}\n", done.stderr)
         failed += not good

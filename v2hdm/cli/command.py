@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import NoReturn
 
 from v2hdm.errors import EXIT_USER_ERROR, describe, one_line
@@ -85,6 +86,13 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         sys.exit(fail(f"{message}; see {self.prog} --help"))
+
+
+def need_installed(*modules: str) -> None:
+    """Raise ModuleNotFoundError for the first of ``modules`` that is not installed; imports none of them."""
+    for module in modules:
+        if find_spec(module) is None:
+            raise ModuleNotFoundError(f"No module named '{module}'", name=module)
 
 
 def fail(message: str) -> int:

@@ -58,7 +58,7 @@ def is_quiet(watched):
 def test_the_map_is_drawn_and_fits_its_window(browser, report, width, height, scheme):
     with opened(browser, report, width, height, scheme) as watched:
         page = watched.page
-        assert page.evaluate(PAINTED) > 300
+        page.wait_for_function(f"({PAINTED})() > 300")  # the map is drawn a frame after the page has loaded
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         paper = page.evaluate("getComputedStyle(document.body).backgroundColor")
         assert (paper == "rgb(255, 255, 255)") == (scheme == "light")
@@ -90,6 +90,7 @@ def test_every_layer_changes_the_picture_when_it_is_switched(browser, report):
                 boxes.nth(number).check()
         page.wait_for_timeout(100)
         for number in range(boxes.count()):
+            page.wait_for_function(f"({PAINTED})() > 0")
             before = page.evaluate(PAINTED)
             boxes.nth(number).uncheck()
             page.wait_for_timeout(100)

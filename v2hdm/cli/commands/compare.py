@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from v2hdm.cli.arguments import log_to_terminal, result_of
-from v2hdm.cli.command import Command
+from v2hdm.cli.command import Command, need_installed
 from v2hdm.errors import EXIT_FAILED_VERDICT, ConfigError
 
 if TYPE_CHECKING:
@@ -41,6 +41,7 @@ def _run(arguments: Sequence[str]) -> int:
     )
     parser.add_argument("--output", type=Path, metavar="DIR", help="default: outputs/<result>-compared")
     parsed = parser.parse_args(arguments)
+    need_installed("scipy")
     from v2hdm.asbuilt.decisions import Tolerances
     from v2hdm.asbuilt.reading import Source
     from v2hdm.asbuilt.writing import summary_lines, write_comparison

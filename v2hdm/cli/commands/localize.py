@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from v2hdm.cli.arguments import add_drive, drive_of, result_of, steps_of
-from v2hdm.cli.command import Command
+from v2hdm.cli.command import Command, need_installed
 from v2hdm.errors import EXIT_FAILED_VERDICT, ConfigError
 
 _MAP = "result folder of v2hdm map, or the map.geojson in it"
@@ -27,6 +27,7 @@ def _run(arguments: Sequence[str]) -> int:
     add_drive(parser, "localized")
     parser.add_argument("--live", action="store_true", help="of a vehicle as it drives: see --live --help")
     parsed = parser.parse_args(arguments)
+    need_installed("torch")  # before the drive is read, and long before it is loaded
     from v2hdm.io.calibration.reading import trusted_calibrations
     from v2hdm.io.maps.reading import read_geojson
     from v2hdm.store.names import map_file
