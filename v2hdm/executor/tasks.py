@@ -58,12 +58,16 @@ def perform(name: StageName, number: int, job: Any) -> Outcome:
     worker = get_worker()
     try:
         with _stoppable(name.token):
-            if _begun(worker, name.token, number) >= MOST_BEGUN:
+            before = _begun(worker, name.token, number)
+            if before >= MOST_BEGUN:
                 return Outcome(DEAD, TWICE_DEAD)
             with suppress(OSError):  # where all paths are absolute, nobody misses it
                 os.chdir(name.folder)
             stage = _ready(worker, name.token)
-            return Outcome(DONE, stage.work(job, _Messages(worker, name.token, number)))
+            result = stage.work(job, _Messages(worker, name.token, number))
+            # Its worker may yet die of another job, with this result: that is no death of this one.
+            _note_begun(worker, name.token, number, before)
+            return Outcome(DONE, result)
     except Stopped:
         return Outcome(STOPPED, None)
     except Exception as failure:
@@ -71,16 +75,21 @@ def perform(name: StageName, number: int, job: Any) -> Outcome:
 
 
 def begun_key(token: str, number: int) -> list[str]:
-    """Where the scheduler keeps how often a job was begun."""
+    """Where the scheduler keeps how often a job was begun and not done."""
     return [token, f"begun {number}"]
 
 
 def _begun(worker: Worker, token: str, number: int) -> int:
-    """How often this job was begun before; one more is noted where no worker's death can erase it."""
+    """How often this job was begun and not done before; one more is noted where no death can erase it."""
     key = begun_key(token, number)
     before: int = sync(worker.loop, worker.scheduler.get_metadata, keys=key, default=0)
-    sync(worker.loop, worker.scheduler.set_metadata, keys=key, value=before + 1)
+    _note_begun(worker, token, number, before + 1)
     return before
+
+
+def _note_begun(worker: Worker, token: str, number: int, count: int) -> None:
+    key = begun_key(token, number)
+    sync(worker.loop, worker.scheduler.set_metadata, keys=key, value=count)
 
 
 def _ready(worker: Worker, token: str) -> Stage[Any, Any]:
