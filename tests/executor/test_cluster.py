@@ -153,7 +153,8 @@ def test_certificates_that_fit_open_a_cluster_and_others_are_one_line(tmp_path):
         machines.close()
 
 
-def test_an_address_where_nothing_listens_is_one_line():
+def test_an_address_where_nothing_listens_is_one_line(monkeypatch):
+    monkeypatch.setattr("v2hdm.executor.connecting._CONNECT_S", 1.0)
     address = f"tcp://127.0.0.1:{free_port()}"
     refused = pytest.raises(ConfigError, match=rf"cluster={address}: no Dask scheduler answers there")
     with refused as caught, open_executor(0, address):

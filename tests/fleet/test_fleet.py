@@ -118,7 +118,8 @@ def test_run_files_that_name_different_clusters_are_refused(tmp_path, drive):
         run_fleet(files, [], FleetOptions(tmp_path / "table"), lambda *_: None)
 
 
-def test_a_fleet_on_a_cluster_that_is_not_there_is_one_line(capsys, tmp_path, drive):
+def test_a_fleet_on_a_cluster_that_is_not_there_is_one_line(capsys, tmp_path, drive, monkeypatch):
+    monkeypatch.setattr("v2hdm.executor.connecting._CONNECT_S", 1.0)
     file = written(tmp_path, "a", drive)
     given = ["fleet", str(file), "--cluster", "tcp://127.0.0.1:9", "--table", str(tmp_path / "table")]
     assert command(given) == 2
