@@ -51,7 +51,7 @@ from v2hdm.faults.sensitivity import Sensitivity
 from v2hdm.geometry.rigid import inverse, log
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
-from v2hdm.mapping import conclusion, foreign, methods, optimise, recovery
+from v2hdm.mapping import conclusion, foreign, optimise, recovery
 from v2hdm.mapping.methods import run_methods
 from v2hdm.pipeline.base import grey_reader
 from v2hdm.records import BoolArray, Drive, FloatArray, Image, ImageDetections, IntArray, Marking, Truth
@@ -404,9 +404,11 @@ def rows_of_site(only: str, seeds: Sequence[int], folders: Sequence[Path]) -> It
 
         asked_symbols: list[Any] = []
 
-        def map_symbols(*given: Any, asked: list[Any] = asked_symbols) -> Any:
+        original = symbols.map_symbols
+
+        def map_symbols(*given: Any, asked: list[Any] = asked_symbols, call: Any = original) -> Any:
             asked.append(given)
-            return symbols.map_symbols(*given)
+            return call(*given)
 
         asked_parallax: list[Any] = []
 
@@ -417,7 +419,7 @@ def rows_of_site(only: str, seeds: Sequence[int], folders: Sequence[Path]) -> It
         with (
             patch.object(conclusion, "classify", classify),
             patch.object(conclusion, "measure_parallax", measure),
-            patch.object(methods, "map_symbols", map_symbols),
+            patch.object(symbols, "map_symbols", map_symbols),
         ):
             run_methods(drive, detections, cameras, grey=grey)
         for name, off in wanted:
@@ -426,7 +428,8 @@ def rows_of_site(only: str, seeds: Sequence[int], folders: Sequence[Path]) -> It
                 on_ground = parallax.measure_parallax(*asked_parallax[-1])
                 classified = markings.classify(solved, kind, kinds, counted, on_ground, *others)
                 tally[name].add(classified.markings(), truth, expected)
-                tally[name].symbols += len(symbols.map_symbols(*asked_symbols[-1])[0])
+                if asked_symbols:  # a drive without a symbol asks for none
+                    tally[name].symbols += len(symbols.map_symbols(*asked_symbols[-1])[0])
     return (f"{name:38s} {own}" for name, own in tally.items())
 
 
