@@ -366,6 +366,9 @@ ACCURACIES = ("A", "B", "C")
 """Accuracy of a marking or symbol, the best first: the 95 % radius of its worst corner is within the accuracy
 goal, within twice the goal, or larger."""
 
+UNSTATED_DRIFT_OVER_M = 30.0
+"""Correlation length, m, of the error that a map's neighbouring markings share, in a map that states none."""
+
 UNSTATED_SIGMA_M = 0.02
 """Standard deviation, m, of a corner's coordinate in a map that states none: drawn over an image."""
 

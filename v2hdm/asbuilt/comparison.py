@@ -19,13 +19,12 @@ from v2hdm.asbuilt.design import (
     outline_of,
 )
 from v2hdm.asbuilt.ground import Mosaic, bare_probabilities
-from v2hdm.asbuilt.misfit import SHIFT, Misfit, find_misfit
+from v2hdm.asbuilt.misfit import Misfit, find_misfit
 from v2hdm.asbuilt.registration import Pairs, paired, register
 from v2hdm.errors import MapFileError
-from v2hdm.records import FloatArray, HDMap, Marking
-from v2hdm.site.living.map_errors import Errors
+from v2hdm.records import UNSTATED_DRIFT_OVER_M, FloatArray, HDMap, Marking
+from v2hdm.site.living.map_errors import SHIFT, Errors
 
-_DRIFT_OVER_M = 30.0  # correlation length, m, of the error that neighbours share, where a map states none
 _LEAST_FOUND = 0.2  # least share of the design's shapes that must lie on markings, or it is another site's
 
 _BARE = 0.99  # probability of bare ground from which on a shape of the design is missing
@@ -33,7 +32,7 @@ _BARE = 0.99  # probability of bare ground from which on a shape of the design i
 
 @dataclass(frozen=True)
 class Finding:
-    """What became of a shape of the design, or of a marking that the design does not have."""
+    """The decision on a shape of the design, or on a marking that the design does not have."""
 
     fate: Fate
     kind: str
@@ -44,6 +43,11 @@ class Finding:
     probability: float | None = None  # that all quantities conform
     quantities: tuple[Quantity, ...] = ()
     bare: float | None = None  # probability of bare ground at a shape without a marking, None if not seen
+
+    @property
+    def shape_map(self) -> FloatArray | None:
+        """The corners (4, 2) to draw, m: the marking's, or the shape's where there is no marking."""
+        return self.meant_map if self.found_map is None else self.found_map
 
 
 @dataclass(frozen=True)
@@ -91,7 +95,9 @@ def compare_with_design(
     start = register(meant, kinds, corners, built_kinds)
     pairs = paired(start.apply(meant), kinds, corners, built_kinds)
     _check_found(pairs, design)
-    errors = _errors_of([built[number] for number in pairs.marking], hd_map.drift_over_m or _DRIFT_OVER_M)
+    errors = _errors_of(
+        [built[number] for number in pairs.marking], hd_map.drift_over_m or UNSTATED_DRIFT_OVER_M
+    )
     places = meant[pairs.shape].mean(axis=1)
     misfit = find_misfit(corners[pairs.marking].mean(axis=1), places, errors, start)
     placed = start.apply(meant) if misfit.is_significant else meant

@@ -24,7 +24,7 @@ _STANDARD = np.random.default_rng(106).standard_normal((_DRAWS, 8))  # the same 
 
 
 class Fate(Enum):
-    """What is decided of a shape of a design, a marking of a map, or one of its quantities."""
+    """The decision on a shape of a design, a marking of a map, or one of its quantities."""
 
     RIGHT = "right"
     OFF = "off"

@@ -1,4 +1,4 @@
-"""What a site's paint is meant to be, and the paint of a map, as shapes that can be compared."""
+"""The paint that a site is meant to have, and the paint of its map, as shapes that can be compared."""
 
 from __future__ import annotations
 

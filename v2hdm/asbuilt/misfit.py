@@ -1,4 +1,4 @@
-"""What of the differences between a map and its design all share, what neighbours share, and what is left.
+"""Differences between a map and its design, split: common to all, common to neighbours, and a marking's own.
 
 A difference is the sum of a rigid motion of the whole design, the map's error that neighbouring markings
 share (a Gaussian process, :mod:`v2hdm.site.living.map_errors`), the marking's own error, and what it is
@@ -25,9 +25,6 @@ _ROUNDS = 10  # of finding what takes no part, which settles within five
 _SIGNIFICANT = 1e-3  # probability, if there were no motion of the whole, of one that is said to be
 _FEWEST = 8  # markings that can tell a motion of the whole
 _AT_ONCE = 400  # markings of one joint distribution: its cost grows with their cube
-
-SHIFT = np.tile(np.eye(2), (4, 1))
-"""Derivative (8, 2) of stacked corners by a shift."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +110,7 @@ def _alike(off_m: FloatArray, errors: Errors, motions: FloatArray) -> tuple[Bool
 def _apart(
     off_m: FloatArray, errors: Errors, motions: FloatArray, is_alike: BoolArray, painted_m: float
 ) -> tuple[FloatArray, FloatArray]:
-    """What each difference (P, 2) has beyond what the others near it foretell, and the covariance of that."""
+    """Differences (P, 2), less the values that others near it foretell, and the covariances."""
     apart_m = np.empty_like(off_m)
     spread = np.empty((len(off_m), 2, 2))
     for rows in _neighbourhoods(errors.centres_map, np.arange(len(off_m))):
@@ -165,7 +162,7 @@ class _Joint:
         return np.asarray(self.spread @ (self._weighed.T @ off_m.ravel()))
 
     def apart(self, off_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What differences (R, 2) have beyond what the others foretell, and its covariance (R, 2, 2)."""
+        """Differences (R, 2), less the values that the others foretell, and their covariances (R, 2, 2)."""
         errors = self._errors
         rows = self._rows
         of_part = off_m[self._part]

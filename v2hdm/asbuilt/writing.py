@@ -14,7 +14,7 @@ from v2hdm.asbuilt.decisions import Fate, Quantity
 from v2hdm.asbuilt.misfit import Misfit
 from v2hdm.geometry.planar import signed_area
 from v2hdm.io.maps.geojson import geojson_feature, geojson_positions, write_features
-from v2hdm.records import FloatArray, GeodeticOrigin, HDMap
+from v2hdm.records import GeodeticOrigin, HDMap
 from v2hdm.store.files import replace_csv, write_json
 
 REPORT = "comparison.json"
@@ -36,7 +36,7 @@ _COLOURS: Mapping[Fate, str] = {
 
 
 def summary_lines(findings: Sequence[Finding], misfit: Misfit | None, source: str) -> list[str]:
-    """What the terminal says: the misfit of the whole, the counts, and the worst findings."""
+    """Lines for the terminal: the misfit of the whole, the counts, and the worst findings."""
     lines = []
     if misfit is not None:
         lines.append(misfit_line(misfit))
@@ -120,7 +120,7 @@ def _rows(findings: Sequence[Finding]) -> list[list[object]]:
     head += ["low", "high", "unit", "probability", "decision"]
     rows = [head]
     for finding in findings:
-        shape = finding.found_map if finding.found_map is not None else finding.meant_map
+        shape = finding.shape_map
         place = ["", ""] if shape is None else [round(float(value), 4) for value in shape.mean(axis=0)]
         identity = "" if finding.id is None else finding.id
         about: list[object] = [finding.fate.value, finding.kind, identity, finding.name, *place]
@@ -135,7 +135,7 @@ def _rows(findings: Sequence[Finding]) -> list[list[object]]:
 def _write_layer(path: Path, findings: Sequence[Finding], origin: GeodeticOrigin | None) -> None:
     features = []
     for number, finding in enumerate(findings, 1):
-        shape = finding.found_map if finding.found_map is not None else finding.meant_map
+        shape = finding.shape_map
         if shape is None:
             continue
         ring = shape if signed_area(shape) > 0 else shape[::-1]
@@ -157,7 +157,7 @@ def _write_picture(path: Path, findings: Sequence[Finding], source: str) -> None
     handles = []
     for fate in Fate:
         of_fate = [finding for finding in findings if finding.fate is fate]
-        shapes = [_drawn_shape(finding) for finding in of_fate]
+        shapes = [finding.shape_map for finding in of_fate]
         outlines = [shape for shape in shapes if shape is not None]
         if not outlines:
             continue
@@ -191,7 +191,3 @@ def _draw_arrows(axes: Any, findings: Sequence[Finding], colour: str) -> None:
             "", xy=start + way, xytext=start, arrowprops={"arrowstyle": "->", "color": colour, "lw": 1.0}
         )
     axes.text(0.01, 0.01, f"arrows: offsets, {_TIMES:.0f} times longer", transform=axes.transAxes, fontsize=8)
-
-
-def _drawn_shape(finding: Finding) -> FloatArray | None:
-    return finding.found_map if finding.found_map is not None else finding.meant_map

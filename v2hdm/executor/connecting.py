@@ -108,7 +108,7 @@ async def _ask(address: str) -> None:
 
 
 def _reason(failure: BaseException) -> str:
-    """What keeps a client from a scheduler, from the innermost cause on, and what to do."""
+    """The reason why a client does not reach a scheduler, the innermost cause first, and a remedy."""
     causes = [failure]
     while (cause := causes[-1].__cause__ or causes[-1].__context__) is not None:
         causes.append(cause)

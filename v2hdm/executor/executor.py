@@ -1,4 +1,4 @@
-"""What every executor does, and the one that needs no other process."""
+"""The interface of every executor, and the one that needs no other process."""
 
 from __future__ import annotations
 

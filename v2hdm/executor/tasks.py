@@ -1,4 +1,4 @@
-"""What a Dask worker does of a stage: jobs, one at a time, in a thread that can be stopped."""
+"""The part of a Dask worker in a stage: it does jobs one at a time, in a thread that can be stopped."""
 
 from __future__ import annotations
 
@@ -177,7 +177,7 @@ class _TidyEnd:
 
 
 class Look(NamedTuple):
-    """What a worker sees: its versions, threads, and the first of the paths that it cannot read."""
+    """A worker's versions, its threads, and the first of the paths that it cannot read."""
 
     versions: Mapping[str, str]
     code: str

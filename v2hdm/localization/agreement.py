@@ -52,7 +52,7 @@ class _Object:
 
 @dataclass
 class Agreement:
-    """What was seen within the last metres, by object, and whether the map has it."""
+    """Objects that images showed within the last metres, and whether the map has them."""
 
     objects: list[_Object] = field(default_factory=list)
 

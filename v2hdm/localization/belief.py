@@ -1,4 +1,4 @@
-"""What a localiser believes: vehicle, cameras and the markings in view, as a square-root filter.
+"""The belief of a localiser on vehicle, cameras and markings in view, as a square-root filter.
 
 The states are the vehicle's (:data:`VEHICLE`), for each camera the tangent (6) of its mounting's error
 (:class:`~v2hdm.records.Calibration`), and for each marking that was seen lately its place's error (2), m:

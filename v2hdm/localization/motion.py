@@ -30,7 +30,7 @@ class Motion(NamedTuple):
 
 @dataclass(frozen=True)
 class MotionNoise:
-    """What an odometry may be wrong by; standard deviations, of data sheets of wheels and MEMS gyros.
+    """Errors of an odometry: standard deviations, from data sheets of wheels and MEMS gyros.
 
     Attributes:
         scale: of the logarithm of true over stated speed.

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from v2hdm.localization.belief import Plane
-from v2hdm.records import SEEN_ACROSS, UNSTATED_SIGMA_M, FloatArray, HDMap, IntArray
+from v2hdm.records import SEEN_ACROSS, UNSTATED_DRIFT_OVER_M, UNSTATED_SIGMA_M, FloatArray, HDMap, IntArray
 
 _VIEW_M = 20.0  # distance, m, between what a vehicle sees ahead and behind
-_DRIFT_OVER_M = 30.0  # correlation length, m, of a map's drift where it states none
 _CELL_M = 10.0  # side of the squares by which markings are looked up
 _GROUND_M = 8.0  # distance, m, over which the ground counts as a plane: a truck's length
 _GROUND_SIGMA = 0.1  # standard deviation of a slope before any height is known, m/m
@@ -42,7 +41,7 @@ class Paint:
         relative_m2 = np.array([marking.relative_sigma_m or np.inf for marking in markings]) ** 2
         share = np.minimum(relative_m2 / np.maximum(variance_m2, 1e-12), 1.0)
         self.shared_m2 = float(np.median((1 - share) * variance_m2)) if len(markings) else 0.0
-        ratio = _VIEW_M / (hd_map.drift_over_m or _DRIFT_OVER_M)
+        ratio = _VIEW_M / (hd_map.drift_over_m or UNSTATED_DRIFT_OVER_M)
         self.shared_rad2 = 2 * (1 - np.exp(-ratio)) * self.shared_m2 / _VIEW_M**2
         self.centre_m2: FloatArray = share[:, None, None] * (mean @ total_m2 @ mean.T)
         about = np.eye(8) - np.tile(mean, (4, 1))

@@ -127,7 +127,7 @@ class Patch:
 
     @property
     def sure(self) -> list[_Object]:
-        """What two images or more showed; a single image's where there is no other."""
+        """Objects that two images or more showed; those of a single image where there are no others."""
         several = [piece for piece in self.objects if piece.views > 1]
         return several or self.objects
 

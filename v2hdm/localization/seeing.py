@@ -20,7 +20,7 @@ _STEP_PX = 0.5  # step, px, of the lens's differences
 
 @dataclass(frozen=True)
 class Look:
-    """What one image shows: the camera's name, when it was taken, and its detections."""
+    """One image's content: the camera's name, the time of exposure, and the detections."""
 
     camera: str
     stamp_s: float

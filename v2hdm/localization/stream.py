@@ -39,7 +39,7 @@ class MotionLines:
         self._number = 0
 
     def read(self, line: str) -> _Item | None:
-        """What a line says; None for an empty one and the header. ConfigError where it says nothing."""
+        """The content of a line; None for an empty one and the header. ConfigError where it is unreadable."""
         self._number += 1
         line = line.strip()
         if not line:

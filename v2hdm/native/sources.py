@@ -1,4 +1,4 @@
-"""What the compiled kernels were compiled from."""
+"""The sources of the compiled kernels, and their digest."""
 
 from __future__ import annotations
 

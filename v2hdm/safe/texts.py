@@ -34,7 +34,7 @@ _HALF = "half a character (a lone surrogate)"
 _ESCAPED_HALF = re.compile(r"\\u[dD][89a-fA-F]")
 _QUOTED = re.compile(r'"(?:[^"\\]|\\.)*"')
 _READ_OTHERWISE = re.compile("[\\t?!\ufeff]|[|>]#")
-"""What libyaml reads and PyYAML refuses, or reads as something else (found by comparing mutated files)."""
+"""Texts that libyaml reads and PyYAML refuses, or reads as something else (from mutated files)."""
 _OPENING = [ord("["), ord("{")]
 _CLOSING = [ord("]"), ord("}")]
 

@@ -52,7 +52,7 @@ _CELLS_PER_BLUR = 32  # cells of the table of T to a blur, in either direction
 _REACH = 4.5  # blurs from which T is constant: 3e-6 of a normal distribution lies beyond
 
 TABLE = {"cells_per_blur": _CELLS_PER_BLUR, "reach": _REACH}
-"""What the axes of :func:`owen_table` are, for the compiled kernel."""
+"""The axes of :func:`owen_table`, for the compiled kernel."""
 
 # Largest row and columns that the table is read at, to leave a cell for the interpolation.
 _LAST_CELL = (_CELLS_PER_BLUR * _REACH * np.array([1, 2, 2])[:, None, None, None] - 1.01).astype(np.float32)

@@ -60,7 +60,7 @@ class Looked(NamedTuple):
 
 
 class Source(NamedTuple):
-    """What pixels are looked up in."""
+    """The image that pixels are looked up in."""
 
     image: np.ndarray  # (H, W, 3) uint8 BGR
     owner: np.ndarray  # (h, w) int16: 1 + the index of the piece of paint that an element is of, 0 for none

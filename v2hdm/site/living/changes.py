@@ -19,7 +19,17 @@ from v2hdm.association.ground import Views
 from v2hdm.association.sightings import Rig
 from v2hdm.errors import MappingError
 from v2hdm.geometry.planar import SHIFTS
-from v2hdm.records import BoolArray, Change, Changes, Fate, FloatArray, HDMap, IntArray, Marking
+from v2hdm.records import (
+    UNSTATED_DRIFT_OVER_M,
+    BoolArray,
+    Change,
+    Changes,
+    Fate,
+    FloatArray,
+    HDMap,
+    IntArray,
+    Marking,
+)
 from v2hdm.site.living.fates import Decision, Pair, Watched, decide
 from v2hdm.site.living.looks import Looks, Observer, find_rates, with_paint
 from v2hdm.site.living.map_errors import SHIFT, Errors, Shift, updated_lanes, updated_symbols
@@ -102,7 +112,6 @@ def fused_markings(old: Sequence[Marking], new: Sequence[Marking], decision: Dec
     return Fused(by_old, by_new)
 
 
-_DRIFT_OVER_M = 30.0  # correlation length of markings' common error, m, if the map does not state it
 _LIKELY = 0.5  # probability at which a marking is reported as moved, gone or new
 _LEAST_PAIRED = 0.3  # least fraction of inspected markings that a drive of the same site finds again
 _LOOKED = 3  # least number of easy views of a place that is counted as inspected
@@ -136,7 +145,7 @@ def update_map(
     """
     old = base.hd_map.markings
     new = drive_map.markings
-    of_old = Errors.of(old, base.hd_map.drift_over_m or _DRIFT_OVER_M)
+    of_old = Errors.of(old, base.hd_map.drift_over_m or UNSTATED_DRIFT_OVER_M)
     of_new = Errors.of(new, drift_over_m)
     rates = find_rates(observer, new)
     now = observer.looks(old, ~mapped)
