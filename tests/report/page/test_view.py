@@ -23,7 +23,8 @@ from v2hdm.cli.main import run
 from v2hdm.errors import MapFileError
 from v2hdm.io.maps.corrections import Correction, read_corrections, write_corrections
 from v2hdm.report.page.document import write_page
-from v2hdm.report.view import file_beside, server_of
+from v2hdm.report.view.server import server_of
+from v2hdm.report.view.session import file_beside
 from v2hdm.store.files import file_digest
 
 

@@ -17,7 +17,8 @@ def _run(arguments: Sequence[str]) -> None:
     parser.add_argument("--corrections", type=Path, metavar="FILE", help="default: RESULT.corrections.yaml")
     parsed = parser.parse_args(arguments)
     from v2hdm.io.drive import drive_of
-    from v2hdm.report.view import file_beside, server_of
+    from v2hdm.report.view.server import server_of
+    from v2hdm.report.view.session import file_beside
 
     path = parsed.corrections or file_beside(parsed.result)
     server, address, session = server_of(parsed.result, drive_of(parsed.result, parsed.drive), path)
@@ -25,7 +26,7 @@ def _run(arguments: Sequence[str]) -> None:
     try:
         print(f"open {address}; Ctrl-C ends it", flush=True)
         serving.start()
-        server.text()  # drawn while the browser starts; a damaged result ends the command here
+        server.prepare()  # drawn while the browser starts; a damaged result ends the command here
         serving.join()
     except KeyboardInterrupt:
         count = len(session.corrections)
