@@ -213,7 +213,7 @@ export class Drawing {
       const [x, y] = this.view.toScreen(feature.places[0]);
       path.arc(x, y, 9, 0, 7);
     } else trace(path, feature.places, this.view);
-    stroke(context, path, "rgb(0 0 0 / .6)", width + 2.5, []);
+    stroke(context, path, "rgb(255 255 255 / .85)", width + 1.6, []);
     stroke(context, path, ink, width, isGone(feature) ? [4, 4] : []);
   }
 

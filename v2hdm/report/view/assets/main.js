@@ -287,7 +287,7 @@ drawing.extras.push((context) => {
   if (hovered && hovered !== selected) drawing.outline(context, hovered, colour("ink"), 2);
   if (!selected) return;
   const shown = drag?.now ? { ...selected, places: drag.now } : selected;
-  drawing.outline(context, shown, colour("accent"), 2.2);
+  drawing.outline(context, shown, colour("accent"), 1.8);
   if (tool === "select") drawing.handles(context, shown, corner);
 });
 drawing.extras.push((context) => {
@@ -295,7 +295,7 @@ drawing.extras.push((context) => {
   if (places.length) drawing.line(context, view, places, { stroke: colour("wine"), width: 2.5 });
   const metres = places.slice(1).reduce((sum, [x, y], n) => sum + Math.hypot(x - places[n][0], y - places[n][1]), 0);
   if (places.length > 1) tell(`Measured: ${metres.toFixed(2)} m`);
-  if (pointer === null && document.activeElement === canvas) {
+  if (pointer === null && document.activeElement === canvas && (!selected || tool !== "select")) {
     const [x, y] = [view.width / 2, view.height / 2];
     context.strokeStyle = colour("ink");
     context.lineWidth = 1.5;
@@ -451,6 +451,7 @@ byId("verdict").replaceChildren(element("b", { class: scene.status }, scene.stat
 panel.layers(LAYERS, drawing.show, () => drawing.change());
 panel.legend(drawing);
 panel.select(null);
+drawing.resize();
 home();
 if (scene.mosaic && drawing.show.mosaic) {
   const picture = new Image();
