@@ -200,7 +200,7 @@ def _against_paint(marking: Marking) -> str:
     """How the images contradict that a marking is painted; empty where they do not."""
     if marking.paint is None:
         return "no two images show its place whole from near"
-    if marking.paint.share + 2 * marking.paint.sigma < _LEAST_PAINT:
+    if marking.paint.share + marking.paint.sigma < _LEAST_PAINT:
         return f"the images show paint on {100 * marking.paint.share:.0f} % of it"
     return ""
 

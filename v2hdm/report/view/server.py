@@ -81,6 +81,8 @@ class PageServer:
         self._socket = socket.create_server(("127.0.0.1", 0))
         self._server: uvicorn.Server | None = None
         self._prepare: Callable[[], object] = lambda: None
+        self._is_idle = threading.Event()
+        self._is_idle.set()
         self.server_address = self._socket.getsockname()
         self.base = f"http://127.0.0.1:{self.server_address[1]}"
 
@@ -111,12 +113,17 @@ class PageServer:
     def serve_forever(self) -> None:
         """Answer requests until :meth:`shutdown`, in a thread of its own."""
         assert self._server is not None
-        self._server.run(sockets=[self._socket])
+        self._is_idle.clear()
+        try:
+            self._server.run(sockets=[self._socket])
+        finally:
+            self._is_idle.set()
 
     def shutdown(self) -> None:
-        """End :meth:`serve_forever`, which a thread runs."""
+        """End :meth:`serve_forever`, which a thread runs, and wait for that."""
         assert self._server is not None
         self._server.should_exit = True
+        self._is_idle.wait(_PATIENCE_S)
 
     def server_close(self) -> None:
         """Give the port back."""
