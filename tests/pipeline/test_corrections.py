@@ -172,7 +172,7 @@ def test_a_dragged_corner_has_the_error_of_the_others_and_its_own():
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"says": "maybe"}, "expected one of accepted, rejected, corrected, got 'maybe'"),
+        ({"says": "maybe"}, "expected one of accepted, rejected, corrected, added, got 'maybe'"),
         ({"moved": {5: [0, 0]}}, "no corner 5; quadrilaterals have 1 to 4"),
         ({"outline_map": [[0]]}, "outline_map: expected N x 2 numbers"),
         ({"reasons": "x"}, "unknown key 'reasons'; did you mean 'reason'"),

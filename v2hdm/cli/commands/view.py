@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from v2hdm.cli.arguments import add_result
@@ -25,8 +26,12 @@ def _run(arguments: Sequence[str]) -> None:
     serving = threading.Thread(target=server.serve_forever, daemon=True)
     try:
         print(f"open {address}; Ctrl-C ends it", flush=True)
-        serving.start()
-        server.prepare()  # drawn while the browser starts; a damaged result ends the command here
+        # Loaded and drawn while the browser starts; a damaged result ends the command here. In a thread of its
+        # own: Ctrl-C within an import would end Python with the signal's code, even where it is caught.
+        with ThreadPoolExecutor(1) as preparing:
+            preparing.submit(server.load).result()
+            serving.start()
+            preparing.submit(server.prepare).result()
         serving.join()
     except KeyboardInterrupt:
         count = len(session.corrections)
