@@ -48,10 +48,13 @@ export class Panel {
     const section = byId("selected");
     const focused = document.activeElement?.id;
     if (!feature) {
+      this.feature = null;
       section.replaceChildren(element("h2", {}, "Nothing selected"), element("p", { class: "hint", id: "keys-hint" }, "Select a marking with the mouse, or press N for the next suspicious one. Press ? for all keys."));
       return;
     }
     const { act } = this;
+    const isSame = feature === this.feature;
+    this.feature = feature;
     const facts = factsOf(feature).flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, value)]);
     const kind = element("select", { id: "edit-class" });
     const choices = feature.what === "added" ? this.model.scene.cornered : this.model.scene.choices;
@@ -67,8 +70,12 @@ export class Panel {
       element("div", { class: "row" }, element("label", { for: "edit-class" }, "Class"), kind),
     ];
     if (feature.what !== "added") rows.push(element("div", { class: "row" }, element("label", { for: "edit-reason" }, "Reason"), reason));
-    const said = saidOf(feature);
-    section.replaceChildren(element("h2", {}, nameOf(feature)), ...(said ? [element("p", { class: "said" }, said)] : []), element("dl", {}, ...facts), ...rows);
+    const head = [element("h2", {}, nameOf(feature)), element("p", { class: "said" }, saidOf(feature)), element("dl", {}, ...facts)];
+    if (isSame && ["edit-class", "edit-reason"].includes(focused)) { // a field that is being used stays
+      head.forEach((part, n) => section.children[n].replaceWith(part));
+      return;
+    }
+    section.replaceChildren(...head, ...rows);
     if (focused && section.querySelector(`#${focused}`)) byId(focused).focus();
   }
 
