@@ -171,7 +171,11 @@ def test_what_another_editor_corrects_is_shown_and_neither_loses_anything(browse
         saved(other.page, 3)
         press(one.page, "n a")
         one.page.locator("#saved.problem", has_text="corrected elsewhere meanwhile").wait_for()
-        assert [correction.says for correction in read_corrections(path)] == ["rejected", "accepted", "rejected"]
+        assert [correction.says for correction in read_corrections(path)] == [
+            "rejected",
+            "accepted",
+            "rejected",
+        ]
 
 
 def test_a_file_that_a_person_edits_is_shown_in_the_page(browser, served):
@@ -196,7 +200,11 @@ def test_handles_do_not_overlap_whatever_the_marking_is(browser, served):
     added = []
     for number, (length, width) in enumerate(shapes.values()):
         corners = np.array([[-length, -width], [length, -width], [length, width], [-length, width]]) / 2
-        added.append(Correction(says="added", kind="diamond", outline_map=(corners + [0, 6 + 3 * number]).tolist()))
+        added.append(
+            Correction(
+                says="added", kind="diamond", outline_map=(corners + np.array([0, 6 + 3 * number])).tolist()
+            )
+        )
     write_corrections(added, "result", path)
     with opened(browser, address) as watched:
         page = watched.page

@@ -26,8 +26,9 @@ def _run(arguments: Sequence[str]) -> None:
     serving = threading.Thread(target=server.serve_forever, daemon=True)
     try:
         print(f"open {address}; Ctrl-C ends it", flush=True)
-        # Loaded and drawn while the browser starts; a damaged result ends the command here. In a thread of its
-        # own: Ctrl-C within an import would end Python with the signal's code, even where it is caught.
+        # Loaded and drawn while the browser starts; a damaged result ends the command here. In a
+        # thread of its own: Ctrl-C within an import would end Python with the signal's
+        # code, even where it is caught.
         with ThreadPoolExecutor(1) as preparing:
             preparing.submit(server.load).result()
             serving.start()

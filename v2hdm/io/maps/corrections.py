@@ -133,7 +133,7 @@ def correction_of(content: object, where: str) -> Correction:
 
 
 def _check_added(entry: Mapping[str, Any], outline: FloatArray, where: str) -> None:
-    """Refuse a new marking that is not four corners around some paint, or that states a correction as well."""
+    """Refuse a new marking that is not four corners around some paint, or that is corrected as well."""
     if not is_quadrilateral(outline):
         raise MapFileError(
             f"{where}: outline_map: an added marking has four corners, counter-clockwise from above, whose "
