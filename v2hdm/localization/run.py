@@ -17,6 +17,7 @@ from v2hdm.errors import MapFileError
 from v2hdm.executor import open_executor
 from v2hdm.geometry.planar import wrapped
 from v2hdm.geometry.rigid import heading_rad
+from v2hdm.io.detections import detections_of
 from v2hdm.io.drive import as_drive
 from v2hdm.io.trajectory import write_tum
 from v2hdm.localization.filter import Markings, Sighting, State, locate, predict, start
@@ -152,6 +153,8 @@ def localize(
     """
     drive = as_drive(drive)
     check_together(hd_map, calibrations, drive)
+    if detections is None and not drive.has_pictures:
+        detections = detections_of(drive)
     if detections is None:
         report = progress or (lambda done, total: None)
         with open_executor(workers) as executor:

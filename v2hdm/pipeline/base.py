@@ -68,8 +68,10 @@ def check_together(base: Base, drive: Drive, path: str) -> None:
         )
 
 
-def grey_reader(drive: Drive) -> Callable[[Image], NDArray[np.float32]]:
-    """Reads the grey values of a drive's images."""
+def grey_reader(drive: Drive) -> Callable[[Image], NDArray[np.float32]] | None:
+    """Reads the grey values of a drive's images; None where it has no pictures."""
+    if not drive.has_pictures:
+        return None
     from v2hdm.detection.batch import read_grey
 
     return lambda image: read_grey(image, drive.cameras[image.camera])

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import WorkerError
+from v2hdm.io.detections import detections_of
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.base import grey_reader
@@ -48,8 +49,10 @@ def detect_in_pieces(
 ) -> list[ImageDetections]:
     """Detect in every image of a drive, in its order, where that is not known yet.
 
-    ``detect`` does so in place of processes of this machine.
+    ``detect`` does so in place of processes of this machine. A drive without pictures brings its detections.
     """
+    if not drive.has_pictures:
+        return detections_of(drive)
     from v2hdm.detection.batch import detect_images, own_vehicles, with_masks
     from v2hdm.detection.detector import Detector
 
