@@ -177,7 +177,7 @@ def localize(
 def _follow(
     drive: Drive,
     sightings: Sightings,
-    names: Sequence[str],
+    names: list[str],
     calibrations: Mapping[str, Calibration],
     markings: Markings,
 ) -> tuple[tuple[State, ...], IntArray]:
