@@ -162,8 +162,30 @@ def localize(
     check_detections(drive, detections)
     names = [name for name in drive.cameras if name in calibrations]
     sightings = collect_sightings(drive, detections, names)
-    attitude_rad = drive.pose_noise.roll_pitch_rad
     markings = Markings(hd_map)
+    states, matched = _follow(drive, sightings, names, calibrations, markings)
+    # The cameras' common turn about the vertical is that of their mean.
+    yaw_rad2 = [_yaw_variance(calibration) for calibration in calibrations.values()]
+    return Localised(
+        stamp_s=sightings.stamp_s,
+        recorded=sightings.map_from_vehicle,
+        states=states,
+        matched=matched,
+        in_view=_in_view(drive, sightings, hd_map, calibrations),
+        shared=np.array([markings.shared_m2, markings.shared_m2, np.mean(yaw_rad2)]),
+        detections=len(sightings),
+    )
+
+
+def _follow(
+    drive: Drive,
+    sightings: Sightings,
+    names: list[str],
+    calibrations: Mapping[str, Calibration],
+    markings: Markings,
+) -> tuple[tuple[State, ...], IntArray]:
+    """The vehicle after each of F frames, and the number of markings matched in each (F,)."""
+    attitude_rad = drive.pose_noise.roll_pitch_rad
     state = start(sightings.map_from_vehicle[0], _START_SIGMA_M, _START_SIGMA_RAD, attitude_rad)
     states = []
     matched = []
@@ -174,17 +196,7 @@ def localize(
         state, markings_of_frame = locate(state, sighted, markings)
         states.append(state)
         matched.append(len(markings_of_frame))
-    # The cameras' common turn about the vertical is that of their mean.
-    yaw_rad2 = [_yaw_variance(calibration) for calibration in calibrations.values()]
-    return Localised(
-        stamp_s=sightings.stamp_s,
-        recorded=sightings.map_from_vehicle,
-        states=tuple(states),
-        matched=np.array(matched),
-        in_view=_in_view(drive, sightings, hd_map, calibrations),
-        shared=np.array([markings.shared_m2, markings.shared_m2, np.mean(yaw_rad2)]),
-        detections=len(sightings),
-    )
+    return tuple(states), np.array(matched)
 
 
 def _yaw_variance(calibration: Calibration) -> float:
