@@ -11,7 +11,7 @@ def make_engine(engine: str, arrays: Arrays) -> TorchEngine:
     """The engine of this name for a problem; ``auto`` is numba on the CPU if it is installed, else torch."""
     is_on_cpu = arrays.centre.device.type == "cpu"
     if engine == "numba" or (engine == "auto" and is_on_cpu and are_compiled()):
-        from v2hdm.adjust.kernels.engine import NumbaEngine  # loads numba
+        from v2hdm.adjust.kernels.engine import NumbaEngine
 
         return NumbaEngine(arrays)
     return TorchEngine(arrays)
