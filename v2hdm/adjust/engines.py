@@ -1,4 +1,4 @@
-"""The engine of a solve by name: torch's, or its heir compiled by numba."""
+"""The engine of a solve by name: torch's, or its heir by compiled kernels."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from v2hdm.adjust.kernels import are_compiled
 
 
 def make_engine(engine: str, arrays: Arrays) -> TorchEngine:
-    """The engine of this name for a problem; ``auto`` is numba on the CPU if it is installed, else torch."""
+    """The engine of this name for a problem; ``auto`` is ``numba`` on the CPU if anything compiles kernels."""
     is_on_cpu = arrays.centre.device.type == "cpu"
     if engine == "numba" or (engine == "auto" and is_on_cpu and are_compiled()):
         from v2hdm.adjust.kernels.engine import NumbaEngine
