@@ -42,7 +42,7 @@ def test_blocks_of_the_inverse_are_those_of_the_inverse():
 
 def test_drives_along_one_street_are_in_one_part():
     street = np.column_stack([np.linspace(0.0, 1000.0, 501), np.zeros(501)])
-    there_and_back = np.concatenate([street, street[::-1] + (0.0, 3.0)])
+    there_and_back = np.concatenate([street, street[::-1] + np.array([0.0, 3.0])])
     part = parts_of_way(there_and_back, np.repeat([0, 1], 501), 600.0)
     assert len(set(part.tolist())) == 4
     np.testing.assert_array_equal(part[:501], part[501:][::-1])

@@ -63,19 +63,32 @@ def _cut(problem: Problem, states: tuple[str, ...], is_start: BoolArray) -> Stat
     return state_prior(replace(problem, session=chain, pose_sigma=(*of_chain, *sigmas)), states)
 
 
+class Chains(NamedTuple):
+    """How the states of J frames follow each other from part to part."""
+
+    is_start: BoolArray  # (J,) frames whose states no frame before in their part predicts
+    in_border: BoolArray  # (J,) frames that a link has
+    links: tuple[Link, ...]
+
+
+def chains_of(problem: Problem, part_of_frame: IntArray, states: tuple[str, ...]) -> Chains:
+    """The chains of a problem's frames, of which only poses, sessions and their sigmas count."""
+    session = problem.session_of_frame
+    follows = np.concatenate([[False], session[1:] == session[:-1]])
+    is_start = ~follows | np.concatenate([[True], part_of_frame[1:] != part_of_frame[:-1]])
+    linked = np.flatnonzero(is_start & follows) if states else np.zeros(0, dtype=np.int64)
+    in_border = np.zeros(len(session), dtype=np.bool_)
+    in_border[linked] = in_border[linked - 1] = True
+    return Chains(is_start, in_border, tuple(_link(problem, frame, states) for frame in linked.tolist()))
+
+
 def cut(problem: Problem, part_of_frame: IntArray, states: tuple[str, ...]) -> tuple[list[Part], list[Link]]:
     """The parts of a problem by the part (J,) of each frame, numbered from 0, and their links.
 
     A surveyed corner, and a known length, is a matter of the first part that saw all its corners.
     """
     count = int(part_of_frame.max(initial=-1)) + 1
-    session = problem.session_of_frame
-    follows = np.concatenate([[False], session[1:] == session[:-1]])
-    is_start = ~follows | np.concatenate([[True], part_of_frame[1:] != part_of_frame[:-1]])
-    linked = np.flatnonzero(is_start & follows) if states else np.zeros(0, dtype=np.int64)
-    links = [_link(problem, frame, states) for frame in linked.tolist()]
-    in_border = np.zeros(len(session), dtype=np.bool_)
-    in_border[linked] = in_border[linked - 1] = True
+    chains = chains_of(problem, part_of_frame, states)
     observations = problem.observations
     part = part_of_frame[observations.frame]
     saw = np.zeros((count, problem.corner_count), dtype=np.bool_)
@@ -95,12 +108,12 @@ def cut(problem: Problem, part_of_frame: IntArray, states: tuple[str, ...]) -> t
                 cameras=cameras,
                 frames=frames,
                 corners=corners,
-                is_start=is_start[frames],
-                border_frames=np.flatnonzero(in_border[frames]),
+                is_start=chains.is_start[frames],
+                border_frames=np.flatnonzero(chains.in_border[frames]),
                 border_corners=np.flatnonzero(shared[corners]),
             )
         )
-    return parts, links
+    return parts, list(chains.links)
 
 
 def _with_joined(lengths: KnownLengths | None, saw: BoolArray) -> BoolArray:

@@ -198,7 +198,7 @@ class _Work:
             is_singular=False,
             last_whitening=None,
         )
-        options = self.shape.options
+        options = replace(self.shape.options, gap_tolerance=GAP)
         solution = report_of(part.problem, self.shape.origin_map, options, descent, 0)
         held = replace(descent, engine=opened.engine)
         return self.finish(
