@@ -10,7 +10,7 @@ import numpy as np
 
 from v2hdm.association.sightings import frames_of
 from v2hdm.faults import Contradiction
-from v2hdm.faults.odds import log_odds
+from v2hdm.faults.odds import is_doubtful, log_odds
 from v2hdm.io.maps.evidence import Residuals
 from v2hdm.mapping.results import AdjustedPoses, CameraFit, MethodResult, SolveEvidence
 from v2hdm.records import Drive, IntArray
@@ -129,8 +129,10 @@ def _evidence(parts: Sequence[SolveEvidence], weight: Sequence[float]) -> SolveE
     names = [name for name in parts[0].held_out if all(name in part.held_out for part in parts)]
     return replace(
         parts[int(np.argmax(weight))],
-        score_tests=_most_doubtful([test for part in parts for test in part.score_tests]),
-        held_out={name: mean(lambda part, name=name: part.held_out[name]) for name in names},
+        score_tests=_most_telling([test for part in parts for test in part.score_tests]),
+        held_out={
+            name: float(np.average([part.held_out[name] for part in parts], weights=weight)) for name in names
+        },
         fits=_fits([part.fits for part in parts]),
         variance_factor=mean(lambda part: part.variance_factor),
         pose_noise={kind: max(part.pose_noise[kind] for part in parts) for kind in parts[0].pose_noise},
@@ -142,12 +144,15 @@ def _evidence(parts: Sequence[SolveEvidence], weight: Sequence[float]) -> SolveE
     )
 
 
-def _most_doubtful(tests: Sequence[Contradiction]) -> tuple[Contradiction, ...]:
-    """Of each input's tests the one with the highest odds, these first."""
+def _most_telling(tests: Sequence[Contradiction]) -> tuple[Contradiction, ...]:
+    """Of each input's tests the most doubtful one, or where none is, that which would show the least error.
+
+    The most doubtful come first.
+    """
     found: dict[object, Contradiction] = {}
-    for test in sorted(tests, key=log_odds, reverse=True):
+    for test in sorted(tests, key=lambda test: (-log_odds(test) if is_doubtful(test) else 0.0, test.sigma)):
         found.setdefault((test.fault.name, test.axis, test.cameras, test.about), test)
-    return tuple(found.values())
+    return tuple(sorted(found.values(), key=log_odds, reverse=True))
 
 
 def _fits(parts: Sequence[Mapping[str, CameraFit]]) -> dict[str, CameraFit]:

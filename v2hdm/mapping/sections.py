@@ -15,7 +15,7 @@ from __future__ import annotations
 import logging
 import pickle
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -26,12 +26,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from v2hdm.adjust import MODELS, Observations, PoseSigma, Problem, Solution
+from v2hdm.adjust import Observations, PoseSigma, Problem, Solution
 from v2hdm.adjust.sections.parts import Part, chains_of, parts_of_way
 from v2hdm.adjust.sections.solve import Shape, save_part, solve_parts
 from v2hdm.association.groups import known_elsewhere
 from v2hdm.association.sightings import Sightings, frames_of
-from v2hdm.errors import ConfigError, MappingError, WorkerError
+from v2hdm.errors import MappingError, WorkerError
 from v2hdm.executor import Executor
 from v2hdm.lanes.points import ground_by_rig
 from v2hdm.mapping.bundle import Bundle, Model, drive_problem, full_model, observations_at
@@ -40,18 +40,17 @@ from v2hdm.mapping.inputs import Inputs
 from v2hdm.mapping.merging import merged
 from v2hdm.mapping.methods import optimised_result
 from v2hdm.mapping.optimise import initial_rig, larger_noise
-from v2hdm.mapping.options import AUTO, INCREMENTAL, SURFACE, MappingOptions
+from v2hdm.mapping.options import MappingOptions, check_sections
 from v2hdm.mapping.recovery import Outcome, optimise
 from v2hdm.mapping.results import MethodResult
 from v2hdm.progress import Progress, silent
 from v2hdm.records import BoolArray, Drive, FloatArray, Image, ImageDetections, IntArray
-from v2hdm.site.options import JOINT
 
 _log = logging.getLogger(__name__)
 
 OVERLAP_M = 40.0
-"""Distance from a section's frames within which its neighbours' images are its overlap: twice a camera's reach,
-so that all who see a marking of the section are there."""
+"""Distance from a section's frames within which its neighbours' images are its overlap: twice a camera's
+reach, so that all who see a marking of the section are there."""
 
 GreyOf = Callable[[Image], NDArray[np.float32]]
 DetectionsOf = Callable[[Drive, Sequence[int]], Sequence[ImageDetections]]
@@ -96,7 +95,6 @@ class _Own:
     own_rows: IntArray
     model: Model
     pose_model: str
-    held_out: Mapping[str, float]
     observations: int
     chi2_per_dof: float
 
@@ -158,7 +156,6 @@ class _Work:
             own_rows=np.bincount(association.group[rows][is_own], minlength=association.count),
             model=bundle.model,
             pose_model=outcome.inputs.optimiser.pose_model,
-            held_out=outcome.inputs.optimiser.held_out,
             observations=len(bundle.row),
             chi2_per_dof=bundle.solution.chi2_per_dof,
         )
@@ -450,7 +447,7 @@ def map_in_sections(
     where a section cannot be mapped or would correct an input, AdjustError where sections contradict each
     other, WorkerError where a process died.
     """
-    _check(options)
+    check_sections(options)
     sections = tuple(sections_of(drive, most_m))
     _log.info("%d sections of at most %.0f m of way", len(sections), most_m)
     work = _Work(drive, detections_of, tuple(cameras), options, folder, sections, grey)
@@ -470,20 +467,6 @@ def map_in_sections(
         folder, len(sections), chains.links, shape, work.finish, executor, partial(progress, "join sections")
     )
     return merged(results, drive, [section.images[section.is_own] for section in sections])
-
-
-def _check(options: MappingOptions) -> None:
-    """Raise ConfigError for settings that the sections of a drive cannot have each for itself."""
-    unfit = {
-        "mapping.survey": bool(options.survey.points) or options.survey.file is not None,
-        "mapping.known_sizes": bool(options.known_sizes.by_class_m),
-        "mapping.lanes.model=joint": options.lanes.model == JOINT,
-        "mapping.ground=surface": options.ground == SURFACE,
-        "mode=incremental": options.mode == INCREMENTAL,
-    }
-    for key, is_set in unfit.items():
-        if is_set:
-            raise ConfigError(f"{key}: not with sections; leave it out, or set map.section_m=0")
 
 
 def _all(
@@ -509,15 +492,10 @@ def _in_common(
 ) -> tuple[_Common, IntArray]:
     """What the sections have in common, and the names of the markings that several of them have."""
     weight = np.array([own.observations for own in alone], dtype=np.float64)
-    pose_model = alone[0].pose_model
-    if options.pose_model == AUTO:
-        losses = {
-            name: np.average([own.held_out[name] for own in alone], weights=weight)
-            for name in MODELS
-            if all(name in own.held_out for own in alone)
-        }
-        if losses:
-            pose_model = min(losses, key=losses.__getitem__)
+    votes: Counter[str] = Counter()
+    for own in alone:
+        votes[own.pose_model] += own.observations
+    pose_model = votes.most_common(1)[0][0]
     noise: tuple[PoseSigma, ...] = alone[0].model.pose_sigma
     for own in alone[1:]:
         noise = tuple(map(larger_noise, noise, own.model.pose_sigma))

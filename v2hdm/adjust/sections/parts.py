@@ -175,11 +175,11 @@ def _local(
 
 
 def _control(control: ControlPoints | None, corners: IntArray, own: BoolArray) -> ControlPoints | None:
-    if control is None:
+    if control is None or not len(corners):
         return None
-    place = np.minimum(np.searchsorted(corners, control.corner), max(len(corners) - 1, 0))
-    rows = np.flatnonzero((corners[place] == control.corner) & own[place]) if len(corners) else []
-    return control.take(np.asarray(rows, dtype=np.int64), place[rows]) if len(rows) else None
+    place = np.minimum(np.searchsorted(corners, control.corner), len(corners) - 1)
+    rows = np.flatnonzero((corners[place] == control.corner) & own[place])
+    return control.take(rows, place[rows]) if len(rows) else None
 
 
 def _lengths(lengths: KnownLengths | None, corners: IntArray, own: BoolArray) -> KnownLengths | None:

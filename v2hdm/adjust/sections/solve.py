@@ -40,13 +40,13 @@ GAP = 1e-8
 """Twice the predicted decrease of the cost, as a fraction of it, at which the rounds end."""
 
 _MOST_ROUNDS = 15
-_HELD_SIGMA_M = 1.0  # standard deviation, m, of what holds a border's corners in a part: weaker than any ray
+_HELD_SIGMA_M = 1.0  # standard deviation, m, of what holds border corners in a part: any ray tells more
 _CONTRADICTION = 9.0
-"""Chi-square per shared coordinate from which parts contradict each other; 1 is expected, this is 3 sigmas."""
+"""Chi-square per shared coordinate from which parts contradict each other: 1 is usual, this is 3 sigmas."""
 
 
 class Shape(NamedTuple):
-    """What all parts have in common: ``cameras`` of the whole, the origin (2,) of the arrays, options."""
+    """What all parts have in common: cameras and priors of the whole, the arrays' origin (2,), options."""
 
     problem: Problem  # without observations: the cameras and priors of the whole
     origin_map: FloatArray
@@ -166,8 +166,8 @@ class _Work:
         if descent.is_singular:
             x, y = part.problem.map_from_vehicle[:, :2, 3].mean(axis=0)
             raise AdjustError(
-                f"section {number + 1}, about x {x:.0f} m, y {y:.0f} m: its {part.problem.corner_count} corners "
-                "leave a direction of a camera free; make sections longer"
+                f"section {number + 1}, about x {x:.0f} m, y {y:.0f} m: its {part.problem.corner_count} "
+                "corners leave a direction of a camera free; make sections longer"
             )
         return descent.estimate
 

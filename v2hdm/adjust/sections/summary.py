@@ -237,7 +237,7 @@ class JoinedCovariance(Covariance):
         """Marginal information (C (6 + Q), C (6 + Q)) of the cameras' left tangents and clock offsets."""
         assert self.joint is not None
         tip = len(self.whitening.reduced_factor.tip)
-        return np.linalg.inv(self.joint[:tip, :tip])
+        return np.asarray(np.linalg.inv(self.joint[:tip, :tip]), dtype=np.float64)
 
     def poses(self) -> FloatArray:
         """Variances (J, 6) of the frames' tangents; 0 without states."""
