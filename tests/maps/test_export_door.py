@@ -1,5 +1,6 @@
 """``v2hdm export``: calibrations in the forms of other tools, and what a user may get wrong."""
 
+import json
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 
@@ -9,10 +10,10 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
+from examples.lanes.site import made_site
 from tests.docs.blocks import blocks
 from tests.drive.example import camera_info, looking_forward
 from tests.maps.gis import street
-from tests.topology.scenes import made_site
 from v2hdm.cli.main import run
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import ipm_from_extrinsic
@@ -263,3 +264,33 @@ def test_a_path_far_from_the_map_is_one_line(tmp_path, monkeypatch, capsys):
     assert "far.tum: no pose is near a lane of the map" in line
     assert run(["export", "map.geojson", "--format", "csv", "--path", "far.tum"]) == 2
     assert "--path" in capsys.readouterr().err
+
+
+def answered(folder, source, answer):
+    """The file of questions with an answer to each of those about ways."""
+    content = yaml.safe_load((folder / source).read_text())
+    for feature in content["features"]:
+        if feature["properties"]["subject"] == "connection":
+            feature["properties"]["answer"] = answer
+    (folder / "answers.geojson").write_text(json.dumps(content))
+
+
+def test_questions_that_were_answered_in_their_file_are_followed(tmp_path, monkeypatch, capsys):
+    site = made_site()
+    write_geojson(site.hd_map, tmp_path / "map.geojson", VERDICT)
+    for number, trajectory in enumerate(site.trajectories):
+        write_tum(trajectory, tmp_path / f"trajectory_{number}.tum")
+    monkeypatch.chdir(tmp_path)
+    assert run(["export", "map.geojson", "--format", "opendrive"]) == 0
+    answered(tmp_path, "map_questions.geojson", "yes")
+    again = ["export", "map.geojson", "--format", "opendrive"]
+    assert run([*again, "--answers", "map_questions.geojson"]) == 2  # the answers would be lost
+    assert "map_questions.geojson would be overwritten" in capsys.readouterr().err
+    assert run([*again, "--answers", "answers.geojson", "--output", "answered"]) == 0
+    root = ET.parse(tmp_path / "answered" / "map.xodr").getroot()
+    assert len(root.findall("junction/connection")) == 18 + 8
+    answered(tmp_path, "map_questions.geojson", "yes")
+    text = (tmp_path / "answers.geojson").read_text().replace('"connection"', '"colour"')
+    (tmp_path / "answers.geojson").write_text(text)
+    assert run([*again, "--answers", "answers.geojson", "--output", "there"]) == 2
+    assert "'colour' is no subject of a question" in capsys.readouterr().err

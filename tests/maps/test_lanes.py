@@ -9,18 +9,9 @@ import lanelet2
 import numpy as np
 import pytest
 
-from tests.topology.scenes import (
-    CONNECTIONS,
-    EAST,
-    ENDS,
-    NEAR_M,
-    NORTH,
-    ORIGIN,
-    SOUTH,
-    WEST,
-    height_m,
-    made_site,
-)
+from examples.lanes.route import route
+from examples.lanes.site import EAST, NORTH, ORIGIN, SOUTH, WEST, height_m, made_site
+from tests.topology.scenes import CONNECTIONS, ENDS, NEAR_M
 from v2hdm.io.maps.formats import write_map
 from v2hdm.io.maps.road_curves import Course, thinned
 from v2hdm.records import HDMap
@@ -217,3 +208,10 @@ def test_asam_s_checker_has_nothing_to_say(files, tmp_path):
 def test_an_empty_map_has_no_questions(tmp_path):
     paths = write_map(HDMap((), (), ORIGIN), tmp_path, "map", ["lanelet2", "opendrive"])
     assert [Path(path).suffix for path in paths] == [".osm", ".xodr"]
+
+
+def test_the_example_prints_the_turns_of_a_route_and_none_where_no_drive_went(files):
+    folder = files[".osm"].parent
+    steps = route(folder, (NORTH, -79), (NORTH, 79))
+    assert [step.split()[1:] for step in steps] == [[], ["straight"], []]
+    assert route(folder, (NORTH, -79), (199, EAST)) == []

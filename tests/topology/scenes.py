@@ -1,67 +1,20 @@
-"""A made site: two port lanes that cross, and a T with turn lanes, with what truly leads where.
-
-::
-
-                 N
-                 |
-      W ---------+---------------------- T ------ E       y = 0, lanes 3.65 m wide, driven on the right
-                 |                       |
-                 S (x = 0)               M (x = 98)
-
-Lines end 10 m before the crossing and where the T opens. On the way east a lane for right turns begins 30 m
-before the T; the minor road M has one lane for each turn.
-"""
+"""What truly leads where in the made site of ``examples/lanes``: a crossing, and a T with turn lanes."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
 
-from v2hdm.records import GIVE_WAY, STOP_LINE, FloatArray, GeodeticOrigin, HDMap, Lane, Marking, Trajectory
-
-WIDTH_M = 3.65
-ORIGIN = GeodeticOrigin(latitude_deg=29.95, longitude_deg=122.05, altitude_m=12.0)
-
-LINES = (
-    # The road from west to east, west of the crossing, then from there to the T, then beyond it:
-    ("lane_line", [(-80, 3.65), (-10, 3.65)]),
-    ("lane_dash", [(-80, 0), (-10, 0)]),
-    ("lane_line", [(-80, -3.65), (-10, -3.65)]),
-    ("lane_line", [(10, 3.65), (200, 3.65)]),
-    ("lane_line", [(10, 0), (92, 0)]),
-    ("lane_line", [(10, -3.65), (30, -3.65), (60, -7.3), (92, -7.3)]),
-    ("lane_dash", [(62, -3.65), (92, -3.65)]),
-    ("lane_line", [(108, 0), (200, 0)]),
-    ("lane_line", [(108, -3.65), (200, -3.65)]),
-    # The road from south to north:
-    *((kind, [(x, y), (x, y + 70)]) for y in (-80, 10) for kind, x in
-      (("lane_line", -3.65), ("lane_dash", 0), ("lane_line", 3.65))),
-    # The minor road, which splits into a lane for each turn:
-    ("lane_line", [(94.5, -100), (94.5, -16)]),
-    ("lane_line", [(98.15, -100), (98.15, -16)]),
-    ("lane_line", [(101.8, -100), (101.8, -75), (105.45, -50), (105.45, -16)]),
-    ("lane_dash", [(101.8, -48), (101.8, -16)]),
-)  # fmt: skip
-
-EAST, WEST, NORTH, SOUTH = (-1.825, 1.825, 1.825, -1.825)  # y, or x, of the middle of a lane that way
-TURN_LANE = -5.475  # y of the middle of the lane for right turns
-DOWN, UP, UP_LEFT, UP_RIGHT = 96.325, 99.975, 99.975, 103.625  # x of lanes of the minor road
-
-DRIVES = (
-    [(-80, EAST), (200, EAST)],
-    [(200, WEST), (-80, WEST)],
-    [(NORTH, -80), (NORTH, 80)],
-    [(SOUTH, 80), (SOUTH, -80)],
-    [(-80, EAST), (NORTH, EAST), (NORTH, 80)],
-    [(-80, EAST), (SOUTH, EAST), (SOUTH, -80)],
-    [(SOUTH, 80), (SOUTH, EAST), (30, EAST), (60, TURN_LANE), (DOWN, TURN_LANE), (DOWN, -100)],
-    [(200, WEST), (DOWN, WEST), (DOWN, -100)],
-    [(UP, -100), (UP_LEFT, -50), (UP_LEFT, WEST), (SOUTH, WEST), (SOUTH, -80)],
-    [(UP, -100), (UP, -75), (UP_RIGHT, -50), (UP_RIGHT, EAST), (200, EAST)],
+from examples.lanes.site import (
+    DOWN,
+    EAST,
+    NORTH,
+    SOUTH,
+    TURN_LANE,
+    UP,
+    UP_LEFT,
+    UP_RIGHT,
+    WEST,
 )
-"""Corners of the paths driven, rounded by arcs."""
 
 ENDS = {
     "west in": (-10, EAST), "west out": (-10, WEST), "east in": (10, WEST), "east out": (10, EAST),
@@ -86,100 +39,6 @@ UNDRIVEN = {
     ("minor left in", "T east out"), ("minor right in", "T west out"),
 }  # fmt: skip
 """The other ways that do not lead back."""
-
-STOPS = (
-    ("north in", STOP_LINE, None), ("south in", STOP_LINE, None),
-    ("minor left in", STOP_LINE, GIVE_WAY), ("minor right in", STOP_LINE, GIVE_WAY),
-)  # fmt: skip
-"""Where lines across lanes are painted."""
-
-
-@dataclass(frozen=True)
-class Site:
-    """A made map and the drives that passed it."""
-
-    hd_map: HDMap
-    trajectories: tuple[Trajectory, ...]
-
-
-def made_site(seed: int = 0, sigma_m: float = 0.01, drives=tuple(range(10)), wander_m: float = 0.15) -> Site:
-    """The site as mapped with errors of ``sigma_m`` by drives that wander within their lanes."""
-    rng = np.random.default_rng(seed)
-    lanes = tuple(
-        _line(kind, corners, rng, sigma_m, number) for number, (kind, corners) in enumerate(LINES, 1)
-    )
-    stops = tuple(_stop(name, kind, variety, 100 + k) for k, (name, kind, variety) in enumerate(STOPS))
-    hd_map = HDMap(stops, lanes, ORIGIN)
-    return Site(hd_map, tuple(trajectory(DRIVES[k], rng, wander_m) for k in drives))
-
-
-def height_m(points: FloatArray) -> FloatArray:
-    """The site's true heights: a slope of 1 % to the east, and a swell."""
-    return np.asarray(0.01 * points[:, 0] + 0.3 * np.sin(points[:, 1] / 40.0))
-
-
-def _line(kind, corners, rng, sigma_m, number) -> Lane:
-    points = _even(np.array(corners, dtype=float), 0.5)
-    noise = gaussian_filter1d(rng.normal(size=points.shape), 4.0, axis=0, mode="nearest")
-    points += sigma_m * noise / noise.std()
-    return Lane(kind, points, 9, height_m(points), id=number)
-
-
-def _stop(name, kind, variety, number) -> Marking:
-    place = np.array(ENDS[name], dtype=float)
-    is_across_x = abs(place[1]) in (10.0, 16.0)
-    half = np.array([1.6, 0.2]) if is_across_x else np.array([0.2, 1.6])
-    back = np.array([0.0, np.sign(place[1])]) if is_across_x else np.array([-1.0, 0.0])
-    corners = place + back + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    return Marking(kind, corners, 9, np.eye(8) * 1e-4, id=number, variety=variety)
-
-
-def _even(corners: FloatArray, step_m: float) -> FloatArray:
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
-    at = np.linspace(0.0, along[-1], round(along[-1] / step_m) + 1)
-    return np.column_stack([np.interp(at, along, axis) for axis in corners.T])
-
-
-def trajectory(corners, rng, wander_m: float = 0.15, speed_mps: float = 5.0) -> Trajectory:
-    """A drive along corners rounded by arcs of 9 m radius, at 10 Hz, noise 1.5 cm."""
-    points = _even(_rounded(np.array(corners, dtype=float), 9.0), speed_mps / 10)
-    wander = gaussian_filter1d(rng.normal(size=points.shape), 20.0, axis=0, mode="nearest")
-    points = points + wander_m * wander / wander.std() + rng.normal(scale=0.015, size=points.shape)
-    ahead = gaussian_filter1d(np.gradient(points, axis=0), 3.0, axis=0)
-    yaw = np.arctan2(ahead[:, 1], ahead[:, 0])
-    map_from_vehicle = np.tile(np.eye(4), (len(points), 1, 1))
-    map_from_vehicle[:, 0, 0] = map_from_vehicle[:, 1, 1] = np.cos(yaw)
-    map_from_vehicle[:, 1, 0] = np.sin(yaw)
-    map_from_vehicle[:, 0, 1] = -np.sin(yaw)
-    map_from_vehicle[:, :2, 3] = points
-    map_from_vehicle[:, 2, 3] = height_m(points)
-    return Trajectory(np.arange(len(points)) / 10.0, map_from_vehicle)
-
-
-def _rounded(corners: FloatArray, radius_m: float) -> FloatArray:
-    """The corners with an arc in place of each that turns by more than 30 degrees."""
-    points = [corners[0]]
-    for before, corner, after in zip(corners, corners[1:], corners[2:], strict=False):
-        into = (corner - before) / np.linalg.norm(corner - before)
-        out = (after - corner) / np.linalg.norm(after - corner)
-        turn = np.arctan2(into[0] * out[1] - into[1] * out[0], into @ out)
-        if abs(turn) < np.deg2rad(30):
-            points.append(corner)
-            continue
-        reach = radius_m * np.tan(abs(turn) / 2)
-        left = np.array([-into[1], into[0]]) * np.sign(turn)
-        centre = corner - reach * into + radius_m * left
-        angles = np.linspace(0, turn, 40)
-        spoke = -radius_m * left
-        points += [
-            centre
-            + np.array(
-                [spoke[0] * np.cos(a) - spoke[1] * np.sin(a), spoke[0] * np.sin(a) + spoke[1] * np.cos(a)]
-            )
-            for a in angles
-        ]
-    return np.array([*points, corners[-1]])
-
 
 LANES = {
     ((-10, WEST), (-80, WEST)), ((-80, EAST), (-10, EAST)),

@@ -5,19 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.topology.scenes import (
-    DRIVES,
-    ENDS,
-    LANES,
-    NEAR_M,
-    UNDRIVEN,
-    WAYS,
-    lanes_of,
-    made_site,
-    matched,
-    trajectory,
-    ways_of,
-)
+from examples.lanes.site import DRIVES, made_site, trajectory
+from tests.topology.scenes import ENDS, LANES, NEAR_M, UNDRIVEN, WAYS, lanes_of, matched, ways_of
 from v2hdm.records import HDMap, Lane, Trajectory
 from v2hdm.topology.build import lane_graph
 from v2hdm.topology.graph import Direction, Right, Turn

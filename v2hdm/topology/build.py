@@ -4,19 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import compress
 
 import numpy as np
 
 from v2hdm.geometry.planar import length_along
 from v2hdm.records import FloatArray, HDMap, Trajectory
+from v2hdm.topology.answers import Answer, stated_pair
 from v2hdm.topology.closed_lanes import Bound, ClosedLane, Connection, closed_lanes, connections
-from v2hdm.topology.curves import End, side_along
+from v2hdm.topology.curves import End, arc_between, side_along
 from v2hdm.topology.directions import DirectedLanes, directed, end_of, start_of
 from v2hdm.topology.graph import Border, Direction, LaneGraph, LaneOfGraph, Link, Question
 from v2hdm.topology.junctions import TURN_RAD, joined, turn_rad
 from v2hdm.topology.lines import tangents, usable_lines
 from v2hdm.topology.paths import Path, paths_of
 from v2hdm.topology.questions import questions_of
+from v2hdm.topology.stays import LaneShape
 from v2hdm.topology.stop_lines import tied
 from v2hdm.topology.ways import Cut, DrivenWays, Way, WayFinder
 
@@ -25,27 +28,39 @@ _LONGEST_IN_JUNCTION_M = 40.0  # longest lane, m, that lies in a junction as a w
 _IN_JUNCTION_M = 10.0  # length of the piece of a longer one that does, m; chosen
 
 
-def lane_graph(hd_map: HDMap, trajectories: Sequence[Trajectory] = ()) -> LaneGraph:
+def lane_graph(
+    hd_map: HDMap, trajectories: Sequence[Trajectory] = (), answers: Sequence[Answer] = ()
+) -> LaneGraph:
     """The lanes between a map's lines, directed and linked as the drives that are ``trajectories`` went.
 
     Without trajectories lanes have the direction of their lines, and no ways through crossings are known:
-    only lines that bound two lanes lead from one to the other.
+    only lines that bound two lanes lead from one to the other. ``answers`` are those of a person to the
+    questions of such a graph; MapFileError where they contradict the drives.
     """
     lines = usable_lines(hd_map.lanes)
     paths = paths_of(trajectories)
-    builder = _Builder(lines.xyz_map, paths, has_drives=bool(trajectories))
+    builder = _Builder(lines.xyz_map, paths, bool(trajectories), answers)
     graph = builder.graph()
     tied_lines = tied(graph, hd_map.markings)
     graph = replace(graph, stop_lines=tuple(tied_lines.stop_lines))
     asked = [*lines.asked, *graph.questions, *tied_lines.asked]
-    return replace(graph, questions=(*asked, *questions_of(graph, bool(trajectories))))
+    asked += questions_of(graph, bool(trajectories))
+    is_open = [not any(answer.closes(question) for answer in answers) for question in asked]
+    return replace(graph, questions=tuple(compress(asked, is_open)))
 
 
 class _Builder:
     """Cuts lines into lanes, and lanes again where paths leave them, until nothing is left to cut."""
 
-    def __init__(self, lines_xyz: Sequence[FloatArray], paths: Sequence[Path], has_drives: bool) -> None:
+    def __init__(
+        self,
+        lines_xyz: Sequence[FloatArray],
+        paths: Sequence[Path],
+        has_drives: bool,
+        answers: Sequence[Answer],
+    ) -> None:
         self._has_drives = has_drives
+        self._answers = answers
         self._xyz = lines_xyz
         self._lines = [xyz[:, :2] for xyz in lines_xyz]
         self._ahead = [tangents(line) for line in self._lines]
@@ -56,7 +71,7 @@ class _Builder:
         cuts: list[Cut] = []
         for number in range(_ROUNDS):
             closed = closed_lanes(self._lines, cuts)
-            lanes = directed(closed, self._lines, self._paths, self._has_drives)
+            lanes = directed(closed, self._lines, self._paths, self._has_drives, self._answers)
             painted = connections(lanes.lanes, self._lines)
             links = [(connection.before, connection.after) for connection in painted]
             ways = WayFinder(lanes, self._lines, self._paths, links).find()
@@ -95,6 +110,16 @@ class _Builder:
         for way in ways.ways:
             drives = tuple(sorted(ways.followed[way.before, way.after]))
             self._add(lanes, links, replace(self._along_path(way, closed), drives=drives), way[:2])
+        for answer in self._answers:
+            if answer.subject == "connection" and answer.answer == "yes":
+                pair = stated_pair([LaneShape(lane, self._lines) for lane in closed], answer)
+                if not {after for before, after in links if before == pair[0]} & {
+                    before for before, after in links if after == pair[1]
+                }:
+                    self._add(lanes, links, self._stated(pair, closed), pair)
+        for answer in self._answers:
+            if answer.subject == "speed":
+                lanes = [replace(lane, speed_kmh=answer.speed_kmh) for lane in lanes]
         result = joined(lanes, links)
         return LaneGraph(tuple(result.lanes), tuple(links), tuple(result.junctions), (), tuple(asked))
 
@@ -137,6 +162,18 @@ class _Builder:
             z = np.interp(share / share[-1], [0.0, 1.0], heights_m)
             sides.append(Border(np.column_stack([curve, z])))
         return LaneOfGraph(sides[0], sides[1], Direction.DRIVEN, is_connecting=True)
+
+    def _stated(self, pair: tuple[int, int], closed: Sequence[ClosedLane]) -> LaneOfGraph:
+        """The connecting lane that a person states: each side a cubic from one lane to the other."""
+        sides = []
+        for side in ("left", "right"):
+            end: Bound = getattr(closed[pair[0]], side)
+            start: Bound = getattr(closed[pair[1]], side)
+            curve = arc_between(self._end(end, -1), self._end(start, 0))
+            heights_m = [self._xyz[end.line][end.order[-1], 2], self._xyz[start.line][start.order[0], 2]]
+            z = np.linspace(heights_m[0], heights_m[1], len(curve))
+            sides.append(Border(np.column_stack([curve, z])))
+        return LaneOfGraph(sides[0], sides[1], Direction.STATED, is_connecting=True)
 
     def _end(self, bound: Bound, which: int) -> End:
         """The first (0) or last (-1) vertex of a bound, and the direction in which it passes it."""

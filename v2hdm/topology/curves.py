@@ -8,7 +8,7 @@ import numpy as np
 
 from v2hdm.geometry.planar import cross, length_along, turned_left
 from v2hdm.records import FloatArray
-from v2hdm.topology.paths import smoothed
+from v2hdm.topology.paths import STEP_M, smoothed
 
 _STEEPEST = 0.5  # largest slope, to the path, with which a side begins or ends; chosen
 _NEAR_END = 0.75  # share of a curve from which on its points lie before its end; chosen
@@ -44,6 +44,21 @@ def side_along(path_map: FloatArray, start: End, end: End) -> FloatArray:
     curve[0] = start.place
     curve[-1] = end.place
     return _without_backward(curve, ahead)
+
+
+def arc_between(start: End, end: End) -> FloatArray:
+    """The cubic (N, 2), m, from one end to another in their directions: nearly an arc where one can be."""
+    way = end.place - start.place
+    chord_m = float(np.linalg.norm(way))
+    half_cosine = float(np.sqrt(max((1 + float(start.ahead @ end.ahead)) / 2, 0.0)))
+    speed_m = 2 * chord_m / (1 + half_cosine)
+    share = np.linspace(0.0, 1.0, max(int(np.ceil(chord_m / STEP_M)), 2) + 1)[:, None]
+    return np.asarray(
+        start.place * (1 + 2 * share) * (1 - share) ** 2
+        + end.place * share**2 * (3 - 2 * share)
+        + speed_m * start.ahead * share * (1 - share) ** 2
+        - speed_m * end.ahead * share**2 * (1 - share)
+    )
 
 
 def _slope(path: FloatArray, side: FloatArray) -> float:

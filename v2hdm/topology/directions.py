@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from v2hdm.records import FloatArray
+from v2hdm.topology.answers import Answer, stated_directions
 from v2hdm.topology.closed_lanes import ClosedLane, connections
 from v2hdm.topology.graph import Direction, Question
 from v2hdm.topology.paths import Path
@@ -34,15 +33,21 @@ def directed(
     lines_map: Sequence[FloatArray],
     paths: Sequence[Path],
     has_drives: bool,
+    answers: Sequence[Answer] = (),
 ) -> DirectedLanes:
     """Turn ``lanes`` into the direction of the drives; one driven both ways becomes two lanes, one each way.
 
     A lane that no drive passed goes on as the one that it touches, or that a line leads to it from.
+    ``answers`` state the directions of others; MapFileError where they contradict the drives.
     """
-    if not has_drives:
-        return DirectedLanes(list(lanes), [Direction.DRAWN] * len(lanes), [()] * len(lanes))
     shapes = [LaneShape(lane, lines_map) for lane in lanes]
     ways = _driven(shapes, paths)
+    driven_ways = [_ways(way.is_forward, way.is_backward) for way in ways]
+    stated = stated_directions(shapes, driven_ways, answers)
+    if not has_drives and not stated:
+        return DirectedLanes(list(lanes), [Direction.DRAWN] * len(lanes), [()] * len(lanes))
+    for number, directions in stated.items():
+        ways[number].stated |= directions
     known = {number: way for number, way in enumerate(ways) if way.is_forward or way.is_backward}
     result = DirectedLanes([], [], [])
     turned = {number: way.is_backward and not way.is_forward for number, way in known.items()}
@@ -57,21 +62,30 @@ def directed(
     for number, (lane, way) in enumerate(zip(lanes, ways, strict=True)):
         is_known = number in driven
         result.lanes.append(lane.turned if turned[number] else lane)
-        result.direction.append(Direction.DRIVEN if is_known else Direction.ASKED)
+        says = Direction.STATED if way.stated else Direction.DRIVEN
+        result.direction.append(says if is_known else Direction.ASKED)
         drives = way.backward_drives if turned[number] else way.forward_drives
         result.drives.append(tuple(sorted(drives)))
         place = shapes[number].centre[len(shapes[number].centre) // 2]
         if number in asked:
-            text = "no drive went along this lane; which way is it driven?"
-            result.asked.append(Question("direction", text, place, (len(result.lanes) - 1,)))
+            text = "no drive went along this lane; is it driven along, against, or both ways of this line?"
+            to = shapes[number].centre[
+                min(len(shapes[number].centre) // 2 + 10, len(shapes[number].centre) - 1)
+            ]
+            result.asked.append(Question("direction", text, place, (len(result.lanes) - 1,), to))
         if way.is_forward and way.is_backward:
             result.lanes.append(lane.turned)
-            result.direction.append(Direction.DRIVEN)
+            result.direction.append(says)
             result.drives.append(tuple(sorted(way.backward_drives)))
             numbers = (len(result.lanes) - 2, len(result.lanes) - 1)
             text = "drives went both ways along this lane; is it open both ways?"
             result.asked.append(Question("two ways", text, place, numbers))
     return result
+
+
+def _ways(is_forward: bool, is_backward: bool) -> set[bool]:
+    """The ways of a lane as answers state them."""
+    return {way for way, is_driven in ((True, is_forward), (False, is_backward)) if is_driven}
 
 
 @dataclass
@@ -81,6 +95,7 @@ class _Driven:
     enough_m: float
     forward_m: dict[int, float] = field(default_factory=dict)
     backward_m: dict[int, float] = field(default_factory=dict)
+    stated: set[bool] = field(default_factory=set)  # True along it, False against it
 
     @property
     def forward_drives(self) -> set[int]:
@@ -92,11 +107,11 @@ class _Driven:
 
     @property
     def is_forward(self) -> bool:
-        return bool(self.forward_drives)
+        return bool(self.forward_drives) or True in self.stated
 
     @property
     def is_backward(self) -> bool:
-        return bool(self.backward_drives)
+        return bool(self.backward_drives) or False in self.stated
 
 
 def _driven(shapes: Sequence[LaneShape], paths: Sequence[Path]) -> list[_Driven]:
@@ -161,8 +176,3 @@ def _along_lines(
         for (_, is_turned), (other, other_turned) in (pair, pair[::-1]):
             if is_turned is None and other_turned is not None:
                 yield other, other_turned
-
-
-def unit(vector: FloatArray) -> FloatArray:
-    """A vector (2,) of length one."""
-    return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-12))

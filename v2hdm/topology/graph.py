@@ -18,6 +18,8 @@ class Direction(Enum):
 
     DRIVEN = "driven"
     """A drive went along it, or along the lane that it continues."""
+    STATED = "stated"
+    """A person said so."""
     DRAWN = "drawn"
     """Its lines run that way, and no path of a drive is known at all."""
     ASKED = "asked"
@@ -112,6 +114,10 @@ class StopLine:
     yields_to: tuple[int, ...] = ()  # lanes of the junction whose way a give-way line's lanes cross
 
 
+SUBJECTS = ("direction", "connection", "speed", "two ways", "stop line", "right of way", "line")
+"""What questions are about."""
+
+
 @dataclass(frozen=True)
 class Question:
     """What neither paint nor drives say: ``place_map`` (2,), m, and the ``lanes`` that it is about.
@@ -119,7 +125,7 @@ class Question:
     A question about a connection also has the place ``to_map`` (2,), m, where the other lane begins.
     """
 
-    subject: str  # "direction", "connection", "stop line", "two ways", "line", "speed" or "right of way"
+    subject: str  # one of :data:`SUBJECTS`
     text: str
     place_map: FloatArray
     lanes: tuple[int, ...] = ()

@@ -18,6 +18,7 @@ from v2hdm.errors import ConfigError, MapFileError, shown
 
 if TYPE_CHECKING:
     from v2hdm.records import FloatArray, HDMap, Trajectory
+    from v2hdm.topology.answers import Answer
 
 
 def _run(arguments: Sequence[str]) -> None:
@@ -37,6 +38,8 @@ def _run(arguments: Sequence[str]) -> None:
     )
     paths += "be repeated (default: trajectory*.tum beside MAP)"
     parser.add_argument("--path", action="append", type=Path, metavar="FILE", help=paths)
+    answered = "for lanelet2 and opendrive: map_questions.geojson of an export, with answers"
+    parser.add_argument("--answers", type=Path, metavar="FILE", help=answered)
     parsed = parser.parse_args(arguments)
     from v2hdm.pipeline.context import logging_to
     from v2hdm.store.results import listed_files
@@ -60,7 +63,7 @@ def _run(arguments: Sequence[str]) -> None:
 
 def _export_map(parsed: argparse.Namespace, folder: Path, check: Callable[[Path], object]) -> list[Path]:
     from v2hdm.io.maps import formats
-    from v2hdm.io.maps.questions import questions_file
+    from v2hdm.io.maps.questions import questions_file, read_answers
     from v2hdm.io.maps.reading import read_map
 
     if ground := [form for form in parsed.format if form in formats.GROUND_FORMATS]:
@@ -82,13 +85,20 @@ def _export_map(parsed: argparse.Namespace, folder: Path, check: Callable[[Path]
         folder / formats.FORMATS[form].file.format(name=name) for form in chosen if form not in kept_formats
     ]
     trajectories = []
+    answers: list[Answer] = []
     if set(formats.LANE_FORMATS) & set(chosen):
         trajectories = _driven(parsed, hd_map)
+        answers = [] if parsed.answers is None else read_answers(parsed.answers, hd_map.origin)
         files.append(folder / questions_file(name))
-    elif parsed.path:
-        raise ConfigError(f"--path: only the formats {' and '.join(formats.LANE_FORMATS)} have a use for it")
+    elif parsed.path or parsed.answers:
+        option = "--path" if parsed.path else "--answers"
+        raise ConfigError(
+            f"{option}: only the formats {' and '.join(formats.LANE_FORMATS)} have a use for it"
+        )
     if parsed.source.resolve() in [file.resolve() for file in files]:
         raise ConfigError(f"{parsed.source} would be overwritten: set another --output or --format")
+    if parsed.answers is not None and parsed.answers.resolve() in [file.resolve() for file in files]:
+        raise ConfigError(f"{parsed.answers} would be overwritten: set another --output")
     for file in files:
         check(file)
     return formats.write_map(
@@ -101,6 +111,7 @@ def _export_map(parsed: argparse.Namespace, folder: Path, check: Callable[[Path]
         parsed.crs,
         kept_formats,
         trajectories,
+        answers,
     )
 
 

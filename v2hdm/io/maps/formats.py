@@ -39,6 +39,7 @@ from v2hdm.records import FloatArray, GeodeticOrigin, HDMap, Trajectory
 from v2hdm.store.files import replace_csv, whole_file
 from v2hdm.store.inputs import protected_inputs
 from v2hdm.surface.strips import write_ground_geotiff, write_opencrg
+from v2hdm.topology.answers import Answer
 from v2hdm.topology.build import lane_graph
 from v2hdm.topology.graph import LaneGraph
 
@@ -247,6 +248,7 @@ def write_map(
     crs: str | None = None,
     present: Sequence[str] = (),
     trajectories: Sequence[Trajectory] = (),
+    answers: Sequence[Answer] = (),
 ) -> list[Path]:
     """Write a map in several of :data:`FORMATS` to ``folder``; returns the files, each written atomically.
 
@@ -254,7 +256,7 @@ def write_map(
     of :func:`v2hdm.io.maps.lanelet2.write_lanelet2`, and ``crs`` the system of the other formats' coordinates
     in place of their own; files of the formats ``present`` are there already. ``trajectories`` are of the
     drives whose paths say where lanes lead, for :data:`LANE_FORMATS`, with which what paint and paths leave
-    open is written as ``{name}_questions.geojson``. Raises ConfigError when a
+    open is written as ``{name}_questions.geojson``, but for what ``answers`` state. Raises ConfigError when a
     format is not known or lacks its package, or when the projector or the system does not suit the map.
     """
     check_formats(formats, "formats")
@@ -262,7 +264,7 @@ def write_map(
     written = []
     graph = None
     if set(LANE_FORMATS) & set(formats) - set(present):
-        graph = lane_graph(hd_map, trajectories)
+        graph = lane_graph(hd_map, trajectories, answers)
     for chosen in [chosen for chosen in with_data(formats) if chosen not in present]:
         path = folder / _ALL[chosen].file.format(name=name)
         if chosen in GROUND_FORMATS and not hd_map.ground:
