@@ -1,7 +1,7 @@
 """How much of a made site's lane graph is found, by the errors of map and drives: a crossing and a T.
 
-``python -m tests.benchmarks.lane_graph --seeds 20 [--checker qc_opendrive] [--converter PYTHON]``: lanes, ways
-and questions found of the true ones, and false ones; the issues that ASAM's checker has with the OpenDRIVE;
+``python -m tests.benchmarks.lane_graph --seeds 20 [--checker qc_opendrive] [--converter PYTHON]``: the lanes,
+ways and questions found of the true ones, and false ones; the issues that ASAM's checker has with the OpenDRIVE;
 and, where ``opendrive2lanelet`` is installed for that PYTHON, how many pairs of a first and a last lane its
 lanelets lead from and to, beside those of the graph. The site's lines are made, not mapped from images.
 """
@@ -49,7 +49,7 @@ def counts(found: list, truth: set) -> np.ndarray:
 
 
 def pairs(graph: LaneGraph) -> int:
-    """How many pairs of a lane that none leads to, and one that leads nowhere, have a way from one to other."""
+    """How many pairs of a lane that none leads to and one that leads nowhere have a way between them."""
     reached = 0
     for start in range(len(graph.lanes)):
         pending, seen = [start] if not graph.before(start) else [], set()
@@ -107,7 +107,8 @@ def main() -> None:
         )
         issued = f", issues {checked}" if parsed.checker else ""
         print(
-            f"lines {sigma_m} m, drives {wander_m} m: {figures}{issued}, {seconds / parsed.seeds:.2f} s a graph"
+            f"lines {sigma_m} m, drives {wander_m} m: {figures}{issued}, "
+            f"{seconds / parsed.seeds:.2f} s a graph"
         )
 
 
