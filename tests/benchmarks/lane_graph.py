@@ -1,7 +1,7 @@
 """How much of a made site's lane graph is found, by the errors of map and drives: a crossing and a T.
 
 ``python -m tests.benchmarks.lane_graph --seeds 20 [--checker qc_opendrive] [--converter PYTHON]``: the lanes,
-ways and questions found of the true ones, and false ones; the issues that ASAM's checker has with the OpenDRIVE;
+ways and questions found of the true ones, and false ones; the issues that ASAM's checker has with OpenDRIVE;
 and, where ``opendrive2lanelet`` is installed for that PYTHON, how many pairs of a first and a last lane its
 lanelets lead from and to, beside those of the graph. The site's lines are made, not mapped from images.
 """
