@@ -8,7 +8,7 @@ from v2hdm.adjust.kernels import are_compiled
 
 
 def make_engine(engine: str, arrays: Arrays) -> TorchEngine:
-    """The engine of this name for a problem; ``auto`` is ``numba`` on the CPU if anything compiles kernels."""
+    """The engine of this name for a problem; ``auto`` is ``numba`` on the CPU if kernels are compiled."""
     is_on_cpu = arrays.centre.device.type == "cpu"
     if engine == "numba" or (engine == "auto" and is_on_cpu and are_compiled()):
         from v2hdm.adjust.kernels.engine import NumbaEngine

@@ -1,8 +1,8 @@
-"""The engine ``compiled``: kernels for all work per observation, compiled from C++ or by numba.
+"""The engine ``numba``: kernels for all work per observation, compiled from C++ or by numba.
 
 States, clocks, drifts and extrinsics act through the table of pairs, so that kernels are independent of the
-model. Each kernel is written twice: here, for numba, which compiles it on first use, and in ``native/src``, from
-which an installation compiles it if it can.
+model. Each kernel is written twice: here, for numba, which compiles it on first use, and in ``native/src``,
+from which an installation compiles it if it can.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from v2hdm.compiled import folder_of, is_numba_there
 
 
 def are_compiled() -> bool:
-    """Whether kernels are compiled, or numba is there to do it; else they run as Python, for small problems."""
+    """Whether kernels are compiled, or numba is there to do it; as Python they suit small problems."""
     return native.kernels() is not None or is_numba_there()
 
 
