@@ -2,9 +2,9 @@
 
 :func:`build` makes it with CMake, a C++ compiler and Ceres (Debian: ``cmake g++ libceres-dev``), or says why
 it cannot. It has two forms: a residual block for each observation, and ``batched``, one for all observations
-of a corner by a camera, which is what a rival would write who wanted the paper's model fast. The unknowns are
-the extrinsics, the corners and, if wanted, six states a frame: the very cost of :mod:`v2hdm.adjust` with white
-pose errors.
+of a corner by a camera, which is what a rival would write who wanted the paper's model fast. The unknowns
+are the extrinsics, the corners and, if wanted, six states a frame: the very cost of :mod:`v2hdm.adjust` with
+white pose errors.
 """
 
 from __future__ import annotations
