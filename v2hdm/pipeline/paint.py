@@ -36,7 +36,7 @@ def with_paint(
     """
     name, last = list(sets.items())[-1]
     best = last.methods[BEST]
-    if best.poses is None or best.residuals is None:
+    if best.poses is None or best.residuals is None or not drive.has_pictures:
         return dict(sets)
     poses = [best.poses.of_image(image) for image in drive.images]
     ground = None if best.surface is None else best.surface.seen_from(np.array(poses))
@@ -71,6 +71,7 @@ def _with_wear(
     unseen = [number for number, marking in enumerate(best.hd_map.markings) if not marking.sightings]
     shown |= {(image, number) for image in range(len(drive.images)) for number in unseen}
     grey = grey_reader(drive)
+    assert grey is not None
     return with_wear(
         best.hd_map,
         footage.images,
