@@ -32,7 +32,7 @@ _FAR_M = 14.0  # largest depth at which a feature other than a marking is pictur
 
 
 @dataclass(frozen=True)
-class _Cut:
+class Cut:
     """A cut of an image for the feature ``key``; ``rank`` 0 is its best."""
 
     key: str
@@ -63,15 +63,15 @@ def pictures(facts: Facts) -> dict[str, list[dict[str, Any]]]:
     for number, candidate in enumerate(facts.excluded):
         cuts += _of_place(facts, cam_from_map, f"x{number}", candidate.position_map[None])
     cuts = [cut for cut in cuts if cut.image in images]
-    by_image: dict[str, list[_Cut]] = {}
+    by_image: dict[str, list[Cut]] = {}
     for cut in sorted(cuts, key=lambda cut: cut.rank)[: BUDGET_BYTES // _USUAL_BYTES]:
         by_image.setdefault(cut.image, []).append(cut)
-    drawn: list[tuple[_Cut, dict[str, Any]]] = []
+    drawn: list[tuple[Cut, dict[str, Any]]] = []
     for name, cuts_of_image in by_image.items():
         image = images[name]
         pixels = read_image(image, facts.drive.cameras[image.camera])
         for cut in cuts_of_image:
-            picture = _cut_out(pixels, facts, image, cam_from_map[cut.row], cut)
+            picture = cut_out(pixels, facts, image, cam_from_map[cut.row], cut)
             if picture is not None:
                 drawn.append((cut, {**picture, "image": name}))
     # The best picture of every feature first, then the second best, up to the limit.
@@ -111,7 +111,7 @@ def earlier_pictures(content: object) -> dict[str, list[dict[str, Any]]]:
     return pictures
 
 
-def _of_markings(facts: Facts) -> Iterable[_Cut]:
+def _of_markings(facts: Facts) -> Iterable[Cut]:
     """Cuts of the markings' sightings: nearest first, alternating cameras."""
     residuals = facts.residuals
     assert residuals is not None
@@ -140,10 +140,10 @@ def _of_markings(facts: Facts) -> Iterable[_Cut]:
             chosen = [ranked[0], ranked[len(ranked) // 2]][: min(PER_CAMERA, len(ranked))]
             for step, (_, row, seen_px) in enumerate(chosen):
                 rank = step * len(by_camera) + number
-                yield _Cut(f"m{marking}", rank, residuals.image[row], row, corners[marking], seen_px)
+                yield Cut(f"m{marking}", rank, residuals.image[row], row, corners[marking], seen_px)
 
 
-def _of_place(facts: Facts, cam_from_map: FloatArray, key: str, shape_map: FloatArray) -> Iterable[_Cut]:
+def _of_place(facts: Facts, cam_from_map: FloatArray, key: str, shape_map: FloatArray) -> Iterable[Cut]:
     """Cuts of a place from near, one per camera, occluded or not."""
     residuals = facts.residuals
     assert residuals is not None
@@ -158,12 +158,12 @@ def _of_place(facts: Facts, cam_from_map: FloatArray, key: str, shape_map: Float
         in_range = inside & (depth_m[:, 0] > _NEAR_M) & (depth_m[:, 0] < _FAR_M)
         if in_range.any():
             best = rows[in_range][np.argmin(depth_m[in_range, 0])]
-            yield _Cut(key, rank, residuals.image[best], int(best), shape_map, np.empty((0, 2)))
+            yield Cut(key, rank, residuals.image[best], int(best), shape_map, np.empty((0, 2)))
             rank += 1
 
 
-def _cut_out(
-    pixels: np.ndarray, facts: Facts, image: Image, cam_from_map: FloatArray, cut: _Cut
+def cut_out(
+    pixels: np.ndarray, facts: Facts, image: Image, cam_from_map: FloatArray, cut: Cut
 ) -> dict[str, Any] | None:
     """The smallest useful cut around a feature; None if it is out of the image."""
     info = facts.cameras[image.camera].calibration.info

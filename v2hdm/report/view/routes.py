@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -24,14 +24,22 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from v2hdm.errors import V2hdmError, one_line
+from v2hdm.errors import MapFileError, V2hdmError, one_line
 from v2hdm.records import Drive, Exclusion, HDMap
 from v2hdm.report.view.session import MeanwhileError, Session
+from v2hdm.safe.texts import parse_json
+from v2hdm.store.files import take_array
+
+if TYPE_CHECKING:  # loads what decodes images
+    from v2hdm.report.view.shots import Shots
 
 Value = TypeVar("Value")
 
 _LENGTH = re.compile(r"[0-9]{1,9}")  # a header that states a number of bytes
 _MOST_BYTES = 100_000  # largest size of a correction that is sent
+_MOST_CORNERS = 1000  # of an outline whose images are asked for
+_NUMBER = re.compile(r"[0-9]{1,9}")
+_SHOTS = 6  # images at a time: a screen
 _TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
 
 _HEADERS = {
@@ -101,6 +109,7 @@ class Pages:
         self._shown = shown
         self.scene = Once(self._draw_scene)
         self._report = Once(self._draw_report)
+        self._shots = Once(self._find_shots)
 
     def _draw_scene(self) -> bytes:
         from v2hdm.report.view.scene import scene_bytes  # loads what states accuracies
@@ -112,6 +121,11 @@ class Pages:
         from v2hdm.report.page.document import page_text  # loads the libraries of the charts
 
         return page_text(self._shown.folder, self._shown.drive)
+
+    def _find_shots(self) -> Shots:
+        from v2hdm.report.view.shots import Shots  # loads what decodes images
+
+        return Shots.of(self._shown.folder, self._shown.drive)
 
     def page(self, _: Request) -> Response:
         """The editor; from here on it knows what the file has now."""
@@ -143,6 +157,25 @@ class Pages:
             raise HTTPException(404)
         return Response(base64.b64decode(layer["src"]), media_type=layer["type"])
 
+    def shots(self, request: Request) -> Response:
+        """The images that show an outline, some at a time."""
+        query = request.query_params
+        text = query.get("outline", "")
+        if len(text) > _MOST_BYTES:
+            raise MapFileError("outline: too long")
+        outline_map = take_array(
+            parse_json(f'{{"outline":{text}}}', "outline", MapFileError)["outline"], (-1, 2), "outline", MapFileError
+        )
+        if not 0 < len(outline_map) <= _MOST_CORNERS:
+            raise MapFileError(f"outline: expected 1 to {_MOST_CORNERS} places")
+        start = query.get("start", "0")
+        marking = query.get("marking", "")
+        if not _NUMBER.fullmatch(start) or not (marking == "" or _NUMBER.fullmatch(marking)):
+            raise MapFileError("start and marking: expected numbers")
+        shots = self._shots.value()
+        number = int(marking) if marking else None
+        return JSONResponse(shots.showing(outline_map, int(start), _SHOTS, number))
+
     async def correct(self, request: Request) -> Response:
         """Write corrections to the file."""
         length = request.headers.get("Content-Length", "")
@@ -162,6 +195,7 @@ def app_of(pages: Pages, base: str, secret: str) -> ASGIApp:
         Route(f"{begin}state.json", pages.state),
         Route(f"{begin}report", pages.report),
         Route(f"{begin}mosaic", pages.mosaic),
+        Route(f"{begin}shots.json", pages.shots),
         Route(f"{begin}correct", pages.correct, methods=["POST"]),
         Route(f"{begin}{{name}}", pages.asset),
     ]

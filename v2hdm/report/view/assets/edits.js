@@ -1,6 +1,6 @@
 // Corrections on their way to the file: shown at once, sent in order, and taken back where they were refused.
 
-const WAIT_MS = 350; // steps of the keyboard within this time become one correction
+const WAIT_MS = 350; // steps of the keyboard within this time are undone as one
 const LOOK_MS = 2500; // how often the page looks for what others have corrected
 const same = (a, b) => JSON.stringify(a ?? null) === JSON.stringify(b ?? null);
 
@@ -39,12 +39,9 @@ export class Edits {
     if (!goesOn) this.done.push(step);
     this.undone = [];
     this.show(step.changes.map(({ feature, after }) => [feature, after]));
-    if (!goesOn) this.queue.push({ step, changes: step.changes });
-    else if (!this.queue.some((waiting) => waiting.step === step)) {
-      // The first part of it is on its way: the rest is a correction of its own.
-      this.queue.push({ step, changes: step.changes.map(({ feature, after }) => ({ feature, before: feature.saved, after })) });
-    }
-    this.send(tag ? WAIT_MS : 0);
+    // While an earlier part of the step is on its way, the rest waits as one correction.
+    if (!this.queue.some((waiting) => waiting.step === step)) this.queue.push({ step, changes: step.changes });
+    this.send();
   }
 
   undo() {
@@ -67,7 +64,7 @@ export class Edits {
     step.tag = null;
     this.show(changes.map(({ feature, after }) => [feature, after]));
     this.queue.push({ step: {}, changes: changes.map((change) => ({ ...change })) });
-    this.send(0);
+    this.send();
   }
 
   show(changes) {
@@ -75,10 +72,9 @@ export class Edits {
     this.changed(changes.map(([feature]) => feature));
   }
 
-  send(afterMs) {
+  send() {
     this.tell("saving\u2026");
-    clearTimeout(this.timer);
-    this.timer = setTimeout(() => this.drain(), afterMs);
+    this.drain();
   }
 
   // One request after another, so that each is compared with what the file has.
@@ -105,7 +101,8 @@ export class Edits {
   async deliver(changes) {
     const parts = [];
     const named = []; // the feature whose key each part gives
-    for (const { feature, after } of changes) {
+    const sent = changes.map(({ feature, after }) => ({ feature, after })); // as it is now: it may go on
+    for (const { feature, after } of sent) {
       const before = feature.saved ?? null;
       if (same(before, after)) continue;
       const moves = before && after && !same(before.outline_map, after.outline_map);
@@ -121,7 +118,7 @@ export class Edits {
     if (!answer.ok) throw new Error((await answer.text()).replace("; reload the page", ""));
     const { keys } = await answer.json();
     named.forEach((feature, n) => { if (feature) this.model.rename(feature, keys[n]); });
-    for (const { feature, after } of changes) feature.saved = after;
+    for (const { feature, after } of sent) feature.saved = after;
   }
 
   // What is in the file, with what others have corrected meanwhile.

@@ -3,7 +3,7 @@
 import { Drawing, HANDLE_PX, View, colour, handlesOf } from "./drawing.js";
 import { Edits } from "./edits.js";
 import { Model, isGone, isMovable, kindOf, middleOf, nameOf, saidOf } from "./model.js";
-import { Panel, byId, element, placeTip } from "./panel.js";
+import { Images, Panel, byId, element, placeTip } from "./panel.js";
 
 const NEAR_PX = 8; // how near to an outline the pointer selects it
 const STEP_M = 0.01; // an arrow key moves the selection by this; with Shift by ten times as much
@@ -36,16 +36,24 @@ function saved(text, isProblem = false) {
 function changed(features) {
   drawing.change();
   if (features.includes(selected) || !selected) panel.select(selected);
+  if (features.includes(selected)) look();
   panel.lists(looks, selected);
   buttons();
 }
 
 // ---- the selection ----
+const images = new Images();
+let waiting = null;
+function look() { // once the outline rests
+  clearTimeout(waiting);
+  waiting = setTimeout(() => images.show(selected), 250);
+}
 function select(feature, at = null) {
   selected = feature;
   corner = null;
   drawing.lifted = null;
   panel.select(feature);
+  look();
   panel.lists(looks, selected);
   drawing.change();
   tell(feature ? [nameOf(feature), saidOf(feature), at].filter(Boolean).join("; ") : "Nothing selected");

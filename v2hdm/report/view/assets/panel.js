@@ -105,6 +105,39 @@ export class Panel {
   }
 }
 
+// The images that show a feature, with its outline as it is now; `start` is the first of them.
+export class Images {
+  async show(feature, start = 0) {
+    this.feature = feature;
+    byId("images").hidden = !feature;
+    if (!feature) return;
+    const outline = feature.places;
+    const query = new URLSearchParams({ outline: JSON.stringify(outline), start, ...(feature.what === "marking" ? { marking: feature.id } : {}) });
+    const answer = await fetch(`shots.json?${query}`);
+    if (feature !== this.feature || outline !== feature.places) return; // something else by now
+    if (!answer.ok) {
+      byId("shots").replaceChildren(element("p", { class: "hint" }, await answer.text()));
+      return;
+    }
+    const { count, shots, says } = await answer.json();
+    const figures = shots.map((shot) => this.figure(shot));
+    if (start > 0) figures.unshift(...byId("shots").querySelectorAll("figure"));
+    const shown = start + shots.length;
+    const more = element("button", { type: "button" }, `More (${shown} of ${count})`);
+    more.addEventListener("click", () => this.show(feature, shown));
+    const hint = says || (count ? `${count} images, the nearest first. Blue: the outline as it is now. Crosses: detected corners.` : "No image shows it whole.");
+    byId("shots").replaceChildren(element("p", { class: "hint" }, hint), ...figures, ...(shown < count ? [more] : []));
+  }
+
+  figure({ src, size: [width, height], camera, image, map, seen }) {
+    const drawn = element("svg", { viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `${camera}, ${image}` }, element("image", { href: `data:image/jpeg;base64,${src}`, width, height }));
+    const outline = map.map((point) => point.join(",")).join(" ");
+    if (map.length > 1) for (const look of ["halo", "mapped"]) drawn.append(element("polygon", { class: look, points: outline }));
+    for (const [x, y] of map.length > 1 ? seen : map) drawn.append(element("path", { class: "seen", d: `M${x - 4} ${y}h8M${x} ${y - 4}v8` }));
+    return element("figure", {}, drawn, element("figcaption", {}, image));
+  }
+}
+
 // A card beside the outline of a feature, never over it.
 export function placeTip(tip, feature, view) {
   const shown = feature.places.map((place) => view.toScreen(place));
