@@ -9,6 +9,7 @@ from pathlib import Path
 
 from v2hdm.cli.arguments import add_result
 from v2hdm.cli.command import Command
+from v2hdm.errors import one_line
 
 
 def _run(arguments: Sequence[str]) -> None:
@@ -16,6 +17,9 @@ def _run(arguments: Sequence[str]) -> None:
     parser = COMMAND.parser()
     add_result(parser)
     parser.add_argument("--corrections", type=Path, metavar="FILE", help="default: RESULT.corrections.yaml")
+    parser.add_argument(
+        "--edited", type=Path, metavar="MAP", help="a copy of the map, edited in a GIS: its edits are corrections"
+    )
     parsed = parser.parse_args(arguments)
     from v2hdm.io.drive import drive_of
     from v2hdm.report.view.server import server_of
@@ -23,6 +27,11 @@ def _run(arguments: Sequence[str]) -> None:
 
     path = parsed.corrections or file_beside(parsed.result)
     server, address, session = server_of(parsed.result, drive_of(parsed.result, parsed.drive), path)
+    if parsed.edited is not None:
+        count, ignored = server.take_edits(parsed.edited)
+        for sentence in ignored:
+            print(one_line(sentence))
+        print(f"{count} new corrections from {parsed.edited} in {path}")
     serving = threading.Thread(target=server.serve_forever, daemon=True)
     try:
         print(f"open {address}; Ctrl-C ends it", flush=True)

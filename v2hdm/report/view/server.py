@@ -50,6 +50,17 @@ class PageServer:
         self._is_idle = threading.Event()
         self._is_idle.set()
 
+    def take_edits(self, path: Path) -> tuple[int, list[str]]:
+        """Take the edits in a copy of the map as corrections: how many are new, and what is none.
+
+        Raises:
+            MapFileError: the file is no copy of the map, or contradicts the corrections that there are.
+        """
+        from v2hdm.io.maps.edits import read_edits  # for those who give a copy
+
+        edits = read_edits(path, self._hd_map)
+        return self.session.merge(edits.corrections), edits.ignored
+
     def load(self) -> uvicorn.Server:
         """Load the libraries of the server; ModuleNotFoundError where they are not installed."""
         if self._server is not None:

@@ -107,6 +107,30 @@ class Session:
             self.corrections = corrections
         return [change.key for change in changes]
 
+    def merge(self, corrections: Sequence[Correction]) -> int:
+        """Take over corrections from elsewhere, all of them or none; returns how many are new.
+
+        Raises:
+            MapFileError: one contradicts a correction that is in the file.
+        """
+        self._place.parent.mkdir(parents=True, exist_ok=True)
+        with self._lock, waited_for(self._place.with_name(f".{self._place.name}.lock")):
+            self._follow()
+            merged = dict(self.corrections)
+            for correction in corrections:
+                kept = self._kept(entry_of(correction))
+                key = self._keys.of(kept)
+                if not _is_same(merged.setdefault(key, kept), kept):
+                    raise MapFileError(
+                        f"{self.path}: has another correction of the {kept.place} already; take one of them back"
+                    )
+            count = len(merged) - len(self.corrections)
+            if count:
+                Context().run(write_corrections, [*merged.values()], str(self._folder), self._place)
+                self._content = self._place.read_bytes()
+                self.corrections = merged
+        return count
+
     def _changes(self, sent: bytes) -> list[_Change]:
         """The corrections that a page has sent: one, or a list under ``changes``."""
         try:
