@@ -49,6 +49,7 @@ COMMANDS = {
     "export": ["export", "{}", "--format", "csv"],
     "exports": ["export", "map.geojson", "--format", "csv", "--output", "{}"],
     "view": ["view", "result", "--corrections", "{}"],
+    "view background": ["view", "result", "--background", "{}"],
     "cache list": ["cache", "list", "--cache", "{}"],
     "no command": ["{}"],
     "no option": ["map", "--{}"],

@@ -18,7 +18,15 @@ def _run(arguments: Sequence[str]) -> None:
     add_result(parser)
     parser.add_argument("--corrections", type=Path, metavar="FILE", help="default: RESULT.corrections.yaml")
     parser.add_argument(
-        "--edited", type=Path, metavar="MAP", help="a copy of the map, edited in a GIS: its edits are corrections"
+        "--edited",
+        type=Path,
+        metavar="MAP",
+        help="a copy of the map, edited in a GIS: its edits are corrections",
+    )
+    parser.add_argument(
+        "--background",
+        metavar="ADDRESS",
+        help="tiles under the map: https://.../{z}/{x}/{y}.png, or WMTS' names",
     )
     parsed = parser.parse_args(arguments)
     from v2hdm.io.drive import drive_of
@@ -26,7 +34,9 @@ def _run(arguments: Sequence[str]) -> None:
     from v2hdm.report.view.session import file_beside
 
     path = parsed.corrections or file_beside(parsed.result)
-    server, address, session = server_of(parsed.result, drive_of(parsed.result, parsed.drive), path)
+    server, address, session = server_of(
+        parsed.result, drive_of(parsed.result, parsed.drive), path, parsed.background
+    )
     if parsed.edited is not None:
         count, ignored = server.take_edits(parsed.edited)
         for sentence in ignored:

@@ -84,7 +84,9 @@ def _refuse_elsewhere(hd_map: HDMap, marking_of_id: Mapping[int | None, Marking]
     shared = [(before, after) for before, after in pairs if after is not None]
     if not shared:
         if hd_map.markings:
-            raise MapFileError(f"{where}: none of its markings has an id of this map; give a copy of this map")
+            raise MapFileError(
+                f"{where}: none of its markings has an id of this map; give a copy of this map"
+            )
         return
     away_m = [
         np.linalg.norm(before.corners_map.mean(axis=0) - after.corners_map.mean(axis=0))
@@ -159,7 +161,9 @@ def _lane_edits(hd_map: HDMap, edited: HDMap, where: str) -> list[str]:
     ]
     if not changed:
         return []
-    return [f"{where}: {len(changed)} lane lines were edited, which no run reads: {', '.join(changed[:_NAMED])}"]
+    return [
+        f"{where}: {len(changed)} lane lines were edited, which no run reads: {', '.join(changed[:_NAMED])}"
+    ]
 
 
 def _foreign_layers(path: Path) -> list[str]:

@@ -32,6 +32,7 @@ from v2hdm.store.files import take_array
 
 if TYPE_CHECKING:  # loads what decodes images
     from v2hdm.report.view.shots import Shots
+    from v2hdm.report.view.tiles import TileSource
 
 Value = TypeVar("Value")
 
@@ -64,7 +65,9 @@ class Guard:
 
         async def send_guarded(message: Message) -> None:
             if message["type"] == "http.response.start":
-                MutableHeaders(scope=message).update(_HEADERS)
+                headers_of_answer = MutableHeaders(scope=message)
+                for name, value in _HEADERS.items():
+                    headers_of_answer.setdefault(name, value)
             await send(message)
 
         headers = Headers(scope=scope)
@@ -100,6 +103,7 @@ class Shown:
     excluded: tuple[Exclusion, ...]
     drive: Drive | None
     session: Session
+    tiles: TileSource | None = None  # a background from the web
 
 
 class Pages:
@@ -115,7 +119,8 @@ class Pages:
         from v2hdm.report.view.scene import scene_bytes  # loads what states accuracies
 
         shown = self._shown
-        return scene_bytes(shown.folder, shown.metrics, shown.hd_map, shown.excluded)
+        host = None if shown.tiles is None else shown.tiles.host
+        return scene_bytes(shown.folder, shown.metrics, shown.hd_map, shown.excluded, host)
 
     def _draw_report(self) -> str:
         from v2hdm.report.page.document import page_text  # loads the libraries of the charts
@@ -157,6 +162,17 @@ class Pages:
             raise HTTPException(404)
         return Response(base64.b64decode(layer["src"]), media_type=layer["type"])
 
+    def tile(self, request: Request) -> Response:
+        """A tile of the background."""
+        tiles = self._shown.tiles
+        if tiles is None:
+            raise HTTPException(404)
+        place = request.path_params
+        tile = tiles.fetch(place["level"], place["column"], place["row"])
+        return Response(
+            tile.content, media_type=tile.type, headers={"Cache-Control": "private, max-age=3600"}
+        )
+
     def shots(self, request: Request) -> Response:
         """The images that show an outline, some at a time."""
         query = request.query_params
@@ -164,7 +180,10 @@ class Pages:
         if len(text) > _MOST_BYTES:
             raise MapFileError("outline: too long")
         outline_map = take_array(
-            parse_json(f'{{"outline":{text}}}', "outline", MapFileError)["outline"], (-1, 2), "outline", MapFileError
+            parse_json(f'{{"outline":{text}}}', "outline", MapFileError)["outline"],
+            (-1, 2),
+            "outline",
+            MapFileError,
         )
         if not 0 < len(outline_map) <= _MOST_CORNERS:
             raise MapFileError(f"outline: expected 1 to {_MOST_CORNERS} places")
@@ -196,6 +215,7 @@ def app_of(pages: Pages, base: str, secret: str) -> ASGIApp:
         Route(f"{begin}report", pages.report),
         Route(f"{begin}mosaic", pages.mosaic),
         Route(f"{begin}shots.json", pages.shots),
+        Route(f"{begin}background/{{level:int}}/{{column:int}}/{{row:int}}", pages.tile),
         Route(f"{begin}correct", pages.correct, methods=["POST"]),
         Route(f"{begin}{{name}}", pages.asset),
     ]

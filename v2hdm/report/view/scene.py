@@ -23,12 +23,18 @@ _MM = 1000.0  # millimetres in a metre: places are whole numbers of them, which 
 
 
 def scene_bytes(
-    folder: Path, metrics: Mapping[str, Any], hd_map: HDMap, excluded: Sequence[Exclusion]
+    folder: Path,
+    metrics: Mapping[str, Any],
+    hd_map: HDMap,
+    excluded: Sequence[Exclusion],
+    background: str | None = None,
 ) -> bytes:
-    """The document as JSON; raises MapFileError where a file of the result is damaged."""
-    return json.dumps(
-        scene_of(folder, metrics, hd_map, excluded), allow_nan=False, separators=(",", ":")
-    ).encode()
+    """The document as JSON; raises MapFileError where a file of the result is damaged.
+
+    ``background`` names where tiles come from, None without any.
+    """
+    scene = scene_of(folder, metrics, hd_map, excluded) | {"background": background}
+    return json.dumps(scene, allow_nan=False, separators=(",", ":")).encode()
 
 
 def scene_of(

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import uvicorn
 
     from v2hdm.report.view.routes import Pages
+    from v2hdm.report.view.tiles import TileSource
 
 _PATIENCE_S = 30  # time after which a connection without requests is closed, s
 _MOST_CONNECTIONS = 256  # requests in work at a time, chosen: some pages, each with a browser's six
@@ -29,8 +30,11 @@ _MOST_CONNECTIONS = 256  # requests in work at a time, chosen: some pages, each 
 class PageServer:
     """A server on a free port of 127.0.0.1, not yet running."""
 
-    def __init__(self, folder: Path, drive: Drive | None, path: Path) -> None:
-        """Read the result; MapFileError without a map, or where the corrections in ``path`` are none."""
+    def __init__(self, folder: Path, drive: Drive | None, path: Path, background: str | None = None) -> None:
+        """Read the result; MapFileError without a map, or where the corrections in ``path`` are none.
+
+        ``background`` is an address of tiles; ConfigError where it does not answer.
+        """
         self._folder = folder
         self._drive = drive
         self._metrics = read_metrics(folder)
@@ -40,6 +44,11 @@ class PageServer:
         self._hd_map = hd_map
         self._excluded = read_excluded(folder, self._metrics)
         self.session = Session(folder, path, places_of(hd_map, self._excluded))
+        self._tiles: TileSource | None = None
+        if background is not None:
+            from v2hdm.report.view.tiles import TileSource  # for those who give an address
+
+            self._tiles = TileSource.of(background, hd_map.origin)
         self._secret = secrets.token_urlsafe(16)
         self._socket = socket.create_server(("127.0.0.1", 0))
         self.server_address = self._socket.getsockname()
@@ -69,7 +78,15 @@ class PageServer:
 
         from v2hdm.report.view.routes import Pages, Shown, app_of
 
-        shown = Shown(self._folder, self._metrics, self._hd_map, self._excluded, self._drive, self.session)
+        shown = Shown(
+            self._folder,
+            self._metrics,
+            self._hd_map,
+            self._excluded,
+            self._drive,
+            self.session,
+            self._tiles,
+        )
         self._pages = Pages(shown)
         config = uvicorn.Config(
             app_of(self._pages, self._base, self._secret),
@@ -122,7 +139,7 @@ class Viewing(NamedTuple):
     session: Session
 
 
-def server_of(folder: Path, drive: Drive | None, path: Path) -> Viewing:
-    """Serve the result in ``folder`` and its corrections in the file ``path``; MapFileError without a map."""
-    server = PageServer(folder, drive, path)
+def server_of(folder: Path, drive: Drive | None, path: Path, background: str | None = None) -> Viewing:
+    """Serve the result in ``folder`` and its corrections in the file ``path``, as :class:`PageServer`."""
+    server = PageServer(folder, drive, path, background)
     return Viewing(server, server.address, server.session)

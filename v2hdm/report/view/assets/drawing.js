@@ -73,7 +73,7 @@ export function handlesOf(feature, view) {
 
 export class Drawing {
   constructor(canvas, model, view) {
-    Object.assign(this, { canvas, model, view, dirty: true, show: { before: false, mosaic: true, candidates: true, route: true }, backdrops: [] });
+    Object.assign(this, { canvas, model, view, dirty: true, show: { before: false, mosaic: true, background: true, candidates: true, route: true }, backdrops: [] });
     this.context = canvas.getContext("2d");
     this.kept = document.createElement("canvas");
     this.keptContext = this.kept.getContext("2d");

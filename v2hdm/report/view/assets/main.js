@@ -3,6 +3,7 @@
 import { Drawing, HANDLE_PX, View, colour, handlesOf } from "./drawing.js";
 import { Edits } from "./edits.js";
 import { Model, isGone, isMovable, kindOf, middleOf, nameOf, saidOf } from "./model.js";
+import { Tiles } from "./tiles.js";
 import { Images, Panel, byId, element, placeTip } from "./panel.js";
 
 const NEAR_PX = 8; // how near to an outline the pointer selects it
@@ -426,7 +427,7 @@ addEventListener("keydown", (event) => {
 
 // ---- the panel ----
 const panel = new Panel(model, { accept, remove, classify, restore, link, choose: (feature) => show(feature) });
-const LAYERS = { before: "before the corrections", candidates: "left-out candidates", route: "route", ...(scene.mosaic ? { mosaic: "ground mosaic" } : {}) };
+const LAYERS = { before: "before the corrections", candidates: "left-out candidates", route: "route", ...(scene.mosaic ? { mosaic: "ground mosaic" } : {}), ...(scene.background ? { background: `background: ${scene.background}` } : {}) };
 const pressed = { i: () => tool === "add", m: () => tool === "measure", b: () => drawing.show.before };
 const usable = { z: () => edits.done.length, y: () => edits.undone.length, Delete: () => selected && !isGone(selected) };
 function buttons() {
@@ -461,6 +462,12 @@ panel.legend(drawing);
 panel.select(null);
 drawing.resize();
 home();
+if (scene.background) {
+  const system = scene.systems.find(({ name }) => name === "");
+  const failed = () => tell(`${scene.background} has no tile here, or does not answer`);
+  const tiles = new Tiles((x, y) => within(system, x, y), () => drawing.change(), failed);
+  drawing.backdrops.push((context, wide) => drawing.show.background && tiles.draw(context, wide));
+}
 if (scene.mosaic && drawing.show.mosaic) {
   const picture = new Image();
   picture.onload = () => drawing.change();
