@@ -29,7 +29,7 @@ def edited(hd_map):
     _, second, third, fourth = hd_map.markings
     corners = third.corners_map.copy()
     corners[1] += [0.05, -0.02]
-    new = Marking("diamond", DIAMOND_M + [3.0, 5.0], 0)
+    new = Marking("diamond", DIAMOND_M + np.array([3.0, 5.0]), 0)
     markings = (replace(second, kind="stop_line"), replace(third, corners_map=corners), fourth, new)
     return replace(hd_map, markings=markings)
 
@@ -55,7 +55,7 @@ def test_deleting_reclassifying_moving_and_adding_are_corrections(name, hd_map, 
     assert (moved.marking, list(moved.moved)) == (3, [2])
     assert np.subtract(moved.moved[2], moved.outline_map[1]) == pytest.approx([0.05, -0.02], abs=2e-3)
     assert (added.says, added.kind) == ("added", "diamond")
-    assert np.array(added.outline_map) == pytest.approx(DIAMOND_M + [3.0, 5.0], abs=2e-3)
+    assert np.array(added.outline_map) == pytest.approx(DIAMOND_M + np.array([3.0, 5.0]), abs=2e-3)
 
 
 def test_what_no_run_reads_is_told(hd_map, tmp_path):
@@ -89,7 +89,7 @@ def test_a_map_of_another_place_or_system_is_refused(hd_map, tmp_path):
     path = tmp_path / "map.geojson"
     far = [replace(marking, corners_map=marking.corners_map + 5e5) for marking in hd_map.markings]
     write_geojson(replace(hd_map, markings=tuple(far), origin=None), path)
-    with pytest.raises(MapFileError, match="its markings lie .* m from those of this map"):
+    with pytest.raises(MapFileError, match=r"its markings lie .* m from those of this map"):
         read_edits(path, replace(hd_map, origin=None))
     others = [replace(marking, id=number + 900) for number, marking in enumerate(hd_map.markings)]
     write_geojson(replace(hd_map, markings=tuple(others)), path)

@@ -110,7 +110,7 @@ def test_what_is_no_tile_is_refused(content, status, told):
 
 
 def test_a_map_without_a_place_on_the_earth_has_no_background():
-    with pytest.raises(ConfigError, match="state the origin in drive.yaml"):
+    with pytest.raises(ConfigError, match=r"state the origin in drive\.yaml"):
         TileSource.of("https://host/{z}/{x}/{y}", None)
 
 

@@ -122,7 +122,7 @@ class Session:
                 key = self._keys.of(kept)
                 if not _is_same(merged.setdefault(key, kept), kept):
                     raise MapFileError(
-                        f"{self.path}: has another correction of the {kept.place} already; take one of them back"
+                        f"{self.path}: corrects the {kept.place} otherwise already; take one back"
                     )
             count = len(merged) - len(self.corrections)
             if count:

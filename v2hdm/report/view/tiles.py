@@ -1,7 +1,7 @@
 """A background from the web: tiles of an XYZ or WMTS address in Web Mercator, fetched for the page.
 
-The page itself asks nobody but this server, so that no other one learns its address. What is fetched is passed
-on if it is an image, and is decoded by the browser alone.
+The page itself asks nobody but this server, so that no other one learns its address. What is fetched is
+passed on if it is an image, and is decoded by the browser alone.
 """
 
 from __future__ import annotations
@@ -45,19 +45,17 @@ class TileSource:
 
     @classmethod
     def of(cls, address: str, origin: GeodeticOrigin | None) -> TileSource:
-        """The source at an address that answers; raises ConfigError, without what the address keeps secret."""
+        """The source at an address that answers; raises ConfigError, without the secrets of the address."""
         parts = urlsplit(address)
         names = [_name(place) for place in _PLACE.findall(address)]
         if parts.scheme not in ("http", "https") or not parts.hostname:
             raise ConfigError("--background: give an address that begins with https:// or http://")
         if parts.username or parts.password:
-            raise ConfigError(
-                "--background: leave user and password out of the address; use a key of the service"
-            )
+            raise ConfigError("--background: leave user and password out of the address; use a key")
         if not {"z", "x"} <= set(names) or not {"y", "-y"} & set(names):
             raise ConfigError(
-                f"--background {parts.hostname}: lacks the places of a tile; write {{z}}, {{x}} and {{y}} into the "
-                "address (for WMTS {TileMatrix}, {TileCol} and {TileRow}, in Web Mercator)"
+                f"--background {parts.hostname}: lacks the places of a tile; write {{z}}, {{x}} and {{y}} "
+                "into it (for WMTS {TileMatrix}, {TileCol} and {TileRow}, in Web Mercator)"
             )
         unknown = sorted(set(names) - {"z", "x", "y", "-y"})
         if unknown:
@@ -93,14 +91,12 @@ class TileSource:
             raise ConfigError(f"--background {self.host}: answers {error.code}; check the address") from None
         except (OSError, HTTPException, ValueError):
             raise ConfigError(
-                f"--background {self.host}: does not answer within {_TIMEOUT_S:.0f} s; check the address and the "
-                "network, or leave it out"
+                f"--background {self.host}: does not answer within {_TIMEOUT_S:.0f} s; check the address and "
+                "the network, or leave it out"
             ) from None
         kind = next((name for begin, name in _IMAGES.items() if content.startswith(begin)), None)
         if kind is None or len(content) > _MOST_BYTES:
-            raise ConfigError(
-                f"--background {self.host}: its tile is no PNG, JPEG or WebP image; check the address"
-            )
+            raise ConfigError(f"--background {self.host}: its tile is no PNG, JPEG or WebP; check it")
         return Tile(content, kind)
 
 
