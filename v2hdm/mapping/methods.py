@@ -41,6 +41,7 @@ from v2hdm.records import (
     Symbol,
 )
 from v2hdm.site.corrections import added_markings, with_symbols_corrected
+from v2hdm.site.line_corrections import with_lines_corrected
 from v2hdm.site.living.changes import Base, update_map
 from v2hdm.site.living.looks import Observer
 
@@ -252,6 +253,7 @@ def optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
         hd_map = with_heights(hd_map, None, surface.height_m)
         hd_map = replace(hd_map, ground=surface.strips())
     hd_map, rejected = with_symbols_corrected(hd_map, options.acceptance.corrections)
+    hd_map, heard_of_lines = with_lines_corrected(hd_map, options.acceptance.corrections)
     return MethodResult(
         name=BEST,
         cameras=tuple(cameras),
@@ -278,7 +280,7 @@ def optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
         else partial(joint_covariance, optimised),
         residuals=residuals_of(outcome, optimised),
         suspicions=optimised.suspicions,
-        heard=(*optimised.heard, *heard),
+        heard=(*optimised.heard, *heard, *heard_of_lines),
         surface=surface,
         alone=map_alone(outcome, optimised),
     )

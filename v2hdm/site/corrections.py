@@ -37,7 +37,7 @@ class Stated:
         rejected: dict[int, str] = {}
         confirmed: dict[int, Correction] = {}
         rejections: list[tuple[int, Correction]] = []
-        for correction in corrections:
+        for correction in of_paint(corrections):
             same = _same(correction, corners_map)
             if correction.says == REJECTED:
                 rejections += [(group, correction) for group in same.tolist()]
@@ -157,7 +157,7 @@ def added_markings(
     corners = np.array([marking.corners_map for marking in markings]).reshape(-1, 4, 2)
     added = []
     heard = []
-    for correction in corrections:
+    for correction in of_paint(corrections):
         if correction.says != ADDED or len(_same(correction, corners)):
             continue
         outline = np.array(correction.outline_map)
@@ -186,7 +186,7 @@ def with_paint_of_added(
     """What the map follows, with what the images show of the paint that a person added and nothing saw."""
     corners = np.array([marking.corners_map for marking in markings]).reshape(-1, 4, 2)
     against_of_place = {}
-    for correction in corrections:
+    for correction in of_paint(corrections):
         if correction.says != ADDED:
             continue
         for group in _same(correction, corners):
@@ -203,6 +203,11 @@ def _against_paint(marking: Marking) -> str:
     if marking.paint.share + marking.paint.sigma < _LEAST_PAINT:
         return f"the images show paint on {100 * marking.paint.share:.0f} % of it"
     return ""
+
+
+def of_paint(corrections: Sequence[Correction]) -> list[Correction]:
+    """Those of markings, symbols and candidates, without those of lane lines."""
+    return [correction for correction in corrections if not correction.is_line]
 
 
 def reason_of(correction: Correction) -> str:
@@ -223,7 +228,7 @@ def _same(correction: Correction, corners_map: FloatArray) -> IntArray:
 
 def is_confirmed(outline_map: FloatArray, corrections: Sequence[Correction]) -> bool:
     """Whether a person accepted or corrected the marking or symbol with that outline (N, 2)."""
-    confirmed = [correction for correction in corrections if correction.says != REJECTED]
+    confirmed = [correction for correction in of_paint(corrections) if correction.says != REJECTED]
     if len(outline_map) == 4:
         return any(len(_same(correction, outline_map[None])) for correction in confirmed)
     middle = outline_map.mean(axis=0)
@@ -245,7 +250,7 @@ def with_symbols_corrected(
     exclusions = []
     for symbol in hd_map.symbols:
         middle = symbol.outline_map.mean(axis=0)
-        for correction in corrections:
+        for correction in of_paint(corrections):
             if len(correction.outline_map) < 5 and symbol.kind != correction.kind:
                 continue
             if np.linalg.norm(np.mean(correction.outline_map, axis=0) - middle) < _SAME_M:
@@ -262,7 +267,7 @@ def unmet(corrections: Sequence[Correction], hd_map: HDMap) -> list[str]:
     """Corrections that found nothing at their position in a finished map."""
     corners = np.array([marking.corners_map for marking in hd_map.markings]).reshape(-1, 4, 2)
     missing = []
-    for correction in corrections:
+    for correction in of_paint(corrections):
         same = _same(correction, corners)
         kinds = {hd_map.markings[k].kind for k in same}
         middle = np.mean(correction.outline_map, axis=0)

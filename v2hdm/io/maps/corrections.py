@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from v2hdm.errors import MapFileError
-from v2hdm.geometry.planar import is_simple, signed_area
+from v2hdm.geometry.planar import cross, is_simple, signed_area
 from v2hdm.records import FloatArray
 from v2hdm.safe.fields import take_whole
 from v2hdm.safe.texts import MOST_YAML_BYTES, shown, take_name
@@ -62,6 +62,7 @@ class Correction:
     )
     sigma_m: Annotated[float, "their standard deviation, m."] = SIGMA_M
     reason: Annotated[str, "an optional comment."] = ""
+    is_line: Annotated[bool, "whether outline_map is the course of a lane line, of two points or more."] = False
 
     @property
     def stated_kind(self) -> str | None:
@@ -100,13 +101,15 @@ def read_corrections(path: Path) -> list[Correction]:
 
 def _said(correction: Correction) -> tuple[object, ...]:
     """The sentence that a correction states of its marking."""
-    return correction.says, correction.new_kind, correction.moved
+    return correction.says, correction.new_kind, correction.moved, correction.is_line
 
 
 def correction_of(content: object, where: str) -> Correction:
     """One entry, checked; raises MapFileError."""
     entry = take_mapping(content, where, MapFileError)
     optional = ("marking", "new_class", "moved", "sigma_m", "reason")
+    if "line_map" in entry:
+        return _line_correction(entry, where)
     check_keys(entry, ("says", "class", "outline_map"), optional, where, MapFileError)
     outline = _take_places(entry["outline_map"], f"{where}: outline_map")
     says = take_choice(entry["says"], (ACCEPTED, REJECTED, CORRECTED, ADDED), f"{where}: says", MapFileError)
@@ -130,6 +133,39 @@ def correction_of(content: object, where: str) -> Correction:
         sigma_m=sigma_m,
         reason=str(reason),
     )
+
+
+def _line_correction(entry: Mapping[str, Any], where: str) -> Correction:
+    """An entry on a lane line: one that was drawn, or one to leave out."""
+    check_keys(entry, ("says", "class", "line_map"), ("sigma_m", "reason"), where, MapFileError)
+    line = _take_places(entry["line_map"], f"{where}: line_map")
+    sigma_m = take_number(entry.get("sigma_m", SIGMA_M), f"{where}: sigma_m", MapFileError)
+    if len(line) < 2 or not 0 < sigma_m <= 1:
+        raise MapFileError(f"{where}: needs two points in line_map, and sigma_m above 0 and at most 1 m")
+    if crosses_itself(line):
+        raise MapFileError(f"{where}: line_map crosses itself; draw it again")
+    reason = entry.get("reason") or ""
+    if not isinstance(reason, str) or len(reason) > _LONGEST_REASON:
+        raise MapFileError(f"{where}: reason: expected a text of at most {_LONGEST_REASON} letters")
+    return Correction(
+        says=take_choice(entry["says"], (REJECTED, ADDED), f"{where}: says", MapFileError),
+        kind=take_name(entry["class"], f"{where}: class", MapFileError),
+        outline_map=line.tolist(),
+        sigma_m=sigma_m,
+        reason=reason,
+        is_line=True,
+    )
+
+
+def crosses_itself(line: FloatArray) -> bool:
+    """Whether two pieces of a line (N, 2) cross each other."""
+    start = line[:-1]
+    piece = np.diff(line, axis=0)
+    # Signed areas (N-1, N-1) of the ends of a piece beside another: of opposite signs where they cross.
+    begin = cross(start[:, None] - start, piece)
+    end = cross(line[1:, None] - start, piece)
+    crossing = begin * end < 0
+    return bool((crossing & crossing.T).any())
 
 
 def _check_added(entry: Mapping[str, Any], outline: FloatArray, where: str) -> None:
@@ -198,7 +234,9 @@ def entry_of(correction: Correction) -> dict[str, Any]:
     entry: dict[str, Any] = {"says": correction.says, "class": correction.kind}
     named = {"marking": correction.marking, "new_class": correction.new_kind, "reason": correction.reason}
     entry |= {key: value for key, value in named.items() if value}
-    entry["outline_map"] = [_rounded(place) for place in correction.outline_map]
+    entry["line_map" if correction.is_line else "outline_map"] = [
+        _rounded(place) for place in correction.outline_map
+    ]
     if correction.moved:
         moved = {corner: _rounded(place) for corner, place in sorted(correction.moved.items())}
         entry |= {"moved": moved, "sigma_m": correction.sigma_m}
