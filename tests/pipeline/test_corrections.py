@@ -29,6 +29,7 @@ def corrected(small_mapped, small_drive, tmp_path_factory):
     """The map before, what a person says of it, and the folder and verdict of the next run."""
     folder, (result, cache) = tmp_path_factory.mktemp("corrected"), small_mapped
     before = read_geojson(result / "map.geojson").markings
+    lane = longest_lane(result)
     (left_out, *_) = read_exclusions(result / "excluded.geojson")
     manhole, bar, dragged = before[:3]
     place = (dragged.corners_map[1] + [0.04, -0.03]).tolist()
@@ -45,12 +46,22 @@ def corrected(small_mapped, small_drive, tmp_path_factory):
         Correction(says=CORRECTED, kind="diamond", outline_map=[[500.0, 500.0]]),
         Correction(says=ADDED, kind="diamond", outline_map=bare.tolist()),
         Correction(says=ADDED, kind=again.kind, outline_map=(again.corners_map + 0.02).tolist()),
+        Correction(says=REJECTED, kind=lane.kind, outline_map=lane.points_map.tolist(), is_line=True),
+        Correction(says=ADDED, kind=lane.kind, outline_map=half_of(lane).tolist(), is_line=True),
     ]  # fmt: skip
     path = folder / "corrections.yaml"
     write_corrections(said, str(result), path)
     changes = {"cache": str(cache), "map": MapConfig(corrections=str(path))}
     made = run(run_config(small_drive, folder / "out", **changes))
     return before, left_out, made
+
+
+def longest_lane(folder):
+    return max(read_geojson(folder / "map.geojson").lanes, key=lambda lane: len(lane.points_map))
+
+
+def half_of(lane):
+    return lane.points_map[: len(lane.points_map) // 2] + 0.05
 
 
 SQUARE = np.array([[-0.3, -0.3], [0.3, -0.3], [0.3, 0.3], [-0.3, 0.3]])
@@ -101,6 +112,20 @@ def test_an_added_marking_is_in_the_map_and_the_images_say_that_nothing_is_paint
     assert sorted(entry["against"] for entry in heard) == ["", "the images show paint on 0 % of it"]
 
 
+def test_half_of_a_lane_line_that_was_split_and_deleted_is_left_where_the_images_show_it(
+    corrected, small_mapped
+):
+    lane = longest_lane(small_mapped[0])
+    expected = lane.points_map[: len(lane.points_map) // 2]
+    lanes = read_geojson(corrected[2].folder / "map.geojson").lanes
+    (left,) = [other for other in lanes if np.abs(other.points_map[0] - expected[0]).max() < 0.2]
+    assert left.points_map[-1] == pytest.approx(expected[-1], abs=0.1)
+    beside_m = np.linalg.norm(left.points_map[:, None] - expected, axis=2).min(axis=1)
+    assert beside_m.max() < 0.35
+    heard = {entry["says"]: entry["against"] for entry in corrected[2].metrics["corrections"]}
+    assert heard["drawn"] == ""
+
+
 def test_an_added_marking_on_paint_that_the_images_show_is_where_they_show_it(corrected):
     before, _, made = corrected
     after = read_geojson(made.folder / "map.geojson").markings
@@ -111,16 +136,24 @@ def test_an_added_marking_on_paint_that_the_images_show_is_where_they_show_it(co
 
 def test_a_correction_of_nothing_is_a_finding_and_no_silence(corrected):
     (finding,) = [one for one in corrected[2].verdict.findings if one.check == "corrections"]
-    assert "1 of 7 match no candidate" in finding.says
+    assert "1 of 9 match no candidate" in finding.says
     assert "diamond at (500.00, 500.00)" in finding.says
 
 
 def test_what_the_map_follows_is_listed_beside_what_the_images_show(corrected):
     listed = {heard["says"]: heard["against"] for heard in corrected[2].metrics["corrections"]}
-    assert set(listed) == {"rejected", "of class crosswalk_bar", "corner 2 moved", "accepted", "added"}
+    assert set(listed) == {
+        "rejected",
+        "of class crosswalk_bar",
+        "corner 2 moved",
+        "accepted",
+        "added",
+        "drawn",
+        "deleted",
+    }
     assert listed["of class crosswalk_bar"] == ""
     told = [line for line in corrected[2].headlines if line.startswith("correction followed: ")]
-    assert len(told) == 6
+    assert len(told) == 8
     assert any("rejected" in line for line in told)
     log = (corrected[2].folder / "run.log").read_text()
     assert all(line in log for line in told)

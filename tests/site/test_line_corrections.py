@@ -15,7 +15,9 @@ def straight(begin, end, y=0.0):
 
 
 def said(says, *places):
-    return Correction(says=says, kind="lane_line", outline_map=[list(place) for place in places], is_line=True)
+    return Correction(
+        says=says, kind="lane_line", outline_map=[list(place) for place in places], is_line=True
+    )
 
 
 def corrected(lanes, *corrections):

@@ -18,9 +18,7 @@ _LEAST_M = 2.0  # least length, m, of what is left of a line beside a deleted pa
 _MOSTLY = 0.5  # share of a line's length, from which the images show it, or another line takes its place
 
 
-def with_lines_corrected(
-    hd_map: HDMap, corrections: Sequence[Correction]
-) -> tuple[HDMap, tuple[Heard, ...]]:
+def with_lines_corrected(hd_map: HDMap, corrections: Sequence[Correction]) -> tuple[HDMap, tuple[Heard, ...]]:
     """The map with a person's corrections of its lane lines, and what it follows.
 
     A drawn line lies on the lines that the images show where they are within 0.4 m of it, with their sigma.
@@ -40,7 +38,9 @@ def with_lines_corrected(
         images = max((lane.sightings for lane in lanes if _is_along(lane.points_map, line).any()), default=0)
         lanes = [part for lane in lanes for part in _without(lane, line)]
         is_replaced = any(_is_along(line, added.points_map).mean() >= _MOSTLY for added in added_lines)
-        against = f"{images} images show it" if images and not is_replaced else ""
+        against = (
+            "" if is_replaced else f"{images} images show it" if images else "no line of the map is there"
+        )
         heard.append(Heard(correction.place, "deleted", against))
     for added in added_lines:
         # What is drawn over a line that stays takes its place.

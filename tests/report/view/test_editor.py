@@ -249,3 +249,55 @@ def test_a_distance_is_measured(browser, served):
         page.mouse.click(left, top)
         page.mouse.click(left + 180, top)
         page.locator("#told", has_text="Measured: 2.00 m").wait_for()
+
+
+def test_a_lane_line_is_drawn_split_joined_and_deleted_by_keys(browser, served):
+    address, _, path = served
+    with opened(browser, address) as watched:
+        page = watched.page
+        ready(page)
+        press(page, "ArrowDown l Enter ArrowRight Enter ArrowRight ArrowUp Enter l")
+        page.locator("#selected h2", has_text="Drawn lane line").wait_for()
+        saved(page, 1)
+        (drawn,) = read_corrections(path)
+        assert (drawn.says, drawn.is_line, drawn.kind, len(drawn.outline_map)) == (
+            "added",
+            True,
+            "lane_line",
+            3,
+        )
+        press(page, "Delete")
+        saved(page, 0)
+        page.mouse.click(*page.evaluate(ON_SCREEN, [5.0, 2.4]))  # the lane line of the map
+        page.locator("#selected h2", has_text="Lane line").wait_for()
+        press(page, "s")
+        saved(page, 3)
+        cut, first, second = read_corrections(path)
+        assert [cut.says, first.says, second.says] == ["rejected", "added", "added"]
+        assert first.outline_map[-1] == pytest.approx([5.0, 2.4], abs=0.02)
+        assert second.outline_map[0] == first.outline_map[-1]
+        press(page, "j")
+        saved(page, 2)
+        _, joined = read_corrections(path)
+        assert [joined.outline_map[0], joined.outline_map[-1]] == [[0.0, 2.4], [12.0, 2.4]]
+        press(page, "z z")
+        saved(page, 0)
+        assert read_corrections(path) == []
+        assert watched.said == []
+
+
+def test_a_lane_line_that_crosses_itself_is_refused_at_once_and_is_not_lost(browser, served):
+    address, _, path = served
+    with opened(browser, address) as watched:
+        page = watched.page
+        ready(page)
+        left, top = page.evaluate(ON_SCREEN, [6.0, 4.5])
+        page.keyboard.press("l")
+        for across, down in ((0, 0), (200, 0), (200, 100), (100, -80)):
+            page.mouse.click(left + across, top + down)
+        page.keyboard.press("l")
+        page.locator("#told", has_text="crosses itself").wait_for()
+        assert not path.exists()
+        press(page, "Backspace l")
+        saved(page, 1)
+        assert len(read_corrections(path)[0].outline_map) == 3

@@ -62,7 +62,9 @@ class Correction:
     )
     sigma_m: Annotated[float, "their standard deviation, m."] = SIGMA_M
     reason: Annotated[str, "an optional comment."] = ""
-    is_line: Annotated[bool, "whether outline_map is the course of a lane line, of two points or more."] = False
+    is_line: Annotated[bool, "whether outline_map is the course of a lane line, of two points or more."] = (
+        False
+    )
 
     @property
     def stated_kind(self) -> str | None:

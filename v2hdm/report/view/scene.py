@@ -15,6 +15,7 @@ from v2hdm.io.trajectory import read_tum
 from v2hdm.records import BEST, Exclusion, FloatArray, HDMap, Marking, Symbol
 from v2hdm.report.areas import AREAS
 from v2hdm.report.page.layers import map_extent, systems_of
+from v2hdm.report.view.session import painted_lines, thinned
 from v2hdm.site.accuracy import corner_radii_m
 from v2hdm.store import names
 from v2hdm.store.files import load_json, take_array
@@ -42,7 +43,7 @@ def scene_of(
 ) -> dict[str, Any]:
     """Markings, symbols, lane lines, route, candidates that were left out, and what to look at first."""
     named: list[Marking | Symbol] = [*hd_map.markings, *hd_map.symbols]
-    lines = [line for lane in hd_map.lanes for line in lane.painted]
+    lines = painted_lines(hd_map)
     # In the report's order, which gives the colours.
     kinds = sorted({feature.kind for feature in named})
     kinds += sorted({line.kind for line in lines} - set(kinds))
@@ -57,10 +58,11 @@ def scene_of(
         "kinds": kinds,
         "choices": sorted({*SHIPPED.names, *(feature.kind for feature in named)}),
         "cornered": sorted({*SHIPPED.cornered, *(marking.kind for marking in hd_map.markings)}),
+        "line_kinds": list(SHIPPED.lane_paint),
         "markings": [_marking(marking, index) for marking in hd_map.markings],
         "symbols": [_symbol(symbol, index) for symbol in hd_map.symbols],
         "lanes": [
-            {"id": line.id, "k": index[line.kind], "p": _flat(line.points_map), "n": line.sightings}
+            {"id": line.id, "k": index[line.kind], "p": _flat(thinned(line.points_map)), "n": line.sightings}
             for line in lines
         ],
         "excluded": [

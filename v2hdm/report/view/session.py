@@ -8,6 +8,7 @@ from contextvars import Context
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 
 from v2hdm.errors import MapFileError, V2hdmError, one_line
@@ -19,7 +20,7 @@ from v2hdm.io.maps.corrections import (
     read_corrections,
     write_corrections,
 )
-from v2hdm.records import Exclusion, FloatArray, HDMap
+from v2hdm.records import Exclusion, FloatArray, HDMap, Lane
 from v2hdm.safe.texts import parse_json, parse_yaml
 from v2hdm.store.files import dump_yaml, load_yaml, refuse_unwritable, refuse_url
 from v2hdm.store.folders import waited_for
@@ -200,7 +201,23 @@ def places_of(hd_map: HDMap, excluded: Sequence[Exclusion]) -> dict[str, FloatAr
     places = {f"x{n}": candidate.position_map[None] for n, candidate in enumerate(excluded)}
     places |= {f"m{marking.id}": marking.corners_map for marking in hd_map.markings}
     places |= {f"s{symbol.id}": symbol.outline_map for symbol in hd_map.symbols}
+    places |= {f"l{n}": thinned(line.points_map) for n, line in enumerate(painted_lines(hd_map))}
     return places
+
+
+def painted_lines(hd_map: HDMap) -> list[Lane]:
+    """The lane lines as they are painted, in the order of their keys."""
+    return [line for lane in hd_map.lanes for line in lane.painted if len(line.points_map) > 1]
+
+
+_THIN_M = 0.02  # largest distance, m, of a thinned line from the line
+
+
+def thinned(line_map: FloatArray) -> FloatArray:
+    """A line (N, 2), m, by fewer of its vertices."""
+    # OpenCV's single precision is that of the distance from the first vertex.
+    offset_m = (line_map - line_map[0]).astype(np.float32)
+    return np.asarray(cv2.approxPolyDP(offset_m, _THIN_M, False)[:, 0], np.float64) + line_map[0]
 
 
 _CELL_M = 2 * _SAME_M  # side of the cells in which features are looked up by their first point, m

@@ -1,7 +1,7 @@
 // Drawing on two canvases: a picture of the whole map that is kept and shifted while it is panned, and above it
 // what changes by the frame: the selection, handles, measured lines and the crosshair.
 
-import { isGone, isMovable, kindOf, middleOf } from "./model.js";
+import { isGone, isLine, isMovable, kindOf, middleOf } from "./model.js";
 
 const SERIES = ["blue", "green", "vermillion", "purple", "orange", "sky", "wine", "teal", "olive", "indigo"];
 const MARGIN = 0.3; // of the kept picture around the window, relative to its size
@@ -141,8 +141,14 @@ export class Drawing {
     this.dirty = false;
     for (const backdrop of this.backdrops) backdrop(context, wide);
     if (this.show.route) this.line(context, wide, this.model.route, { stroke: colour("muted"), width: 1, dash: [2, 5] });
-    for (const { kind, line } of this.model.lanes) this.line(context, wide, line, { stroke: colour("sky"), width: 2, dash: kind === "lane_dash" ? [10, 8] : [] });
+    for (const feature of this.model.lines) this.lane(context, wide, feature);
     this.features(context, wide);
+  }
+
+  lane(context, view, feature) {
+    if (isGone(feature) && feature.what === "drawn") return;
+    const dash = isGone(feature) ? [2, 6] : kindOf(feature) === "lane_dash" ? [10, 8] : [];
+    this.line(context, view, feature.places, { stroke: colour(isGone(feature) ? "vermillion" : "sky"), width: feature.entry ? 3 : 2, dash });
   }
 
   features(context, view) {
@@ -212,7 +218,7 @@ export class Drawing {
     if (feature.places.length < 2) {
       const [x, y] = this.view.toScreen(feature.places[0]);
       path.arc(x, y, 9, 0, 7);
-    } else trace(path, feature.places, this.view);
+    } else trace(path, feature.places, this.view, !isLine(feature));
     stroke(context, path, "rgb(255 255 255 / .85)", width + 1.6, []);
     stroke(context, path, ink, width, isGone(feature) ? [4, 4] : []);
   }
@@ -241,12 +247,12 @@ export class Drawing {
   }
 }
 
-function trace(path, places, view) {
+function trace(path, places, view, isClosed = true) {
   const { width, height, east, north, scale } = view;
   const [left, top] = [width / 2 - east * scale, height / 2 + north * scale];
   path.moveTo(left + places[0][0] * scale, top - places[0][1] * scale);
   for (let n = 1; n < places.length; n++) path.lineTo(left + places[n][0] * scale, top - places[n][1] * scale);
-  path.closePath();
+  if (isClosed) path.closePath();
 }
 
 function stroke(context, path, ink, width, dash) {

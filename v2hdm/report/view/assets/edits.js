@@ -1,5 +1,7 @@
 // Corrections on their way to the file: shown at once, sent in order, and taken back where they were refused.
 
+import { isLine } from "./model.js";
+
 const WAIT_MS = 350; // steps of the keyboard within this time are undone as one
 const LOOK_MS = 2500; // how often the page looks for what others have corrected
 const same = (a, b) => JSON.stringify(a ?? null) === JSON.stringify(b ?? null);
@@ -21,6 +23,7 @@ export class Edits {
   entry(feature, change) {
     if (change === null) return null;
     const { what, id, base, kind, entry } = feature;
+    if (isLine(feature)) return { says: "rejected", class: kind, line_map: base, ...entry, ...change };
     const stated = { says: "corrected", class: kind, outline_map: base, ...(id === undefined ? {} : { marking: id }), ...entry, ...change };
     if (stated.moved && !Object.keys(stated.moved).length) delete stated.moved;
     if (!stated.reason) delete stated.reason;
@@ -105,7 +108,8 @@ export class Edits {
     for (const { feature, after } of sent) {
       const before = feature.saved ?? null;
       if (same(before, after)) continue;
-      const moves = before && after && !same(before.outline_map, after.outline_map);
+      const place = ({ outline_map: outline, line_map: line }) => line ?? outline;
+      const moves = before && after && !same(place(before), place(after));
       if (moves) {
         parts.push({ key: feature.key, correction: null, before });
         named.push(null);

@@ -2,7 +2,8 @@
 
 import { Drawing, HANDLE_PX, View, colour, handlesOf } from "./drawing.js";
 import { Edits } from "./edits.js";
-import { Model, isGone, isMovable, kindOf, middleOf, nameOf, saidOf } from "./model.js";
+import { crossesItself, drawn, joined, parts, taken } from "./lines.js";
+import { Model, isGone, isLine, isMade, isMovable, kindOf, middleOf, nameOf, saidOf } from "./model.js";
 import { Tiles } from "./tiles.js";
 import { Images, Panel, byId, element, placeTip } from "./panel.js";
 
@@ -23,6 +24,7 @@ let hovered = null;
 let corner = null; // the one that the arrow keys move, from 0
 let tool = "select";
 let measured = [];
+let course = []; // of the line that is being drawn
 let pointer = null; // in pixels of the canvas; null while the keyboard leads
 let drag = null;
 let lastPlaced = null; // the outline that the next added marking gets
@@ -47,7 +49,8 @@ const images = new Images();
 let waiting = null;
 function look() { // once the outline rests
   clearTimeout(waiting);
-  waiting = setTimeout(() => images.show(selected), 250);
+  const shown = selected && isLine(selected) ? null : selected; // no image shows a whole line
+  waiting = setTimeout(() => images.show(shown), 250);
 }
 function select(feature, at = null) {
   selected = feature;
@@ -58,7 +61,7 @@ function select(feature, at = null) {
   panel.lists(looks, selected);
   drawing.change();
   tell(feature ? [nameOf(feature), saidOf(feature), at].filter(Boolean).join("; ") : "Nothing selected");
-  history.replaceState(null, "", feature && feature.what !== "added" ? `#${feature.key}` : location.pathname);
+  history.replaceState(null, "", feature && !isMade(feature) ? `#${feature.key}` : location.pathname);
   dispatchEvent(new CustomEvent("v2hdm-selected", { detail: feature }));
   buttons();
 }
@@ -91,21 +94,22 @@ function needs(isFit, text) {
   return false;
 }
 function accept() {
-  if (!needs(({ what }) => what !== "added", "A marking of yours needs no acceptance")) return;
+  if (!needs((feature) => !isMade(feature) && !isLine(feature), "A lane line, or what is yours, needs no acceptance")) return;
   const { moved, new_class: kind } = selected.entry ?? {};
   make(selected, { says: "accepted", moved, new_class: kind, reason: undefined }, `accept ${nameOf(selected)}`);
 }
 function remove(reason = "") {
   if (!needs((feature) => !isGone(feature) || reason, "It is deleted already")) return;
   const name = nameOf(selected);
-  if (selected.what === "added") make(selected, null, `delete ${name}`);
+  if (isMade(selected)) make(selected, null, `delete ${name}`);
+  else if (isLine(selected)) make(selected, reason ? { says: "rejected", reason } : { says: "rejected" }, `delete ${name}`);
   else make(selected, { says: "rejected", reason, moved: undefined, new_class: undefined }, `delete ${name}`);
   tell(`Deleted: ${name}`);
 }
 function classify(kind) {
   if (!selected) return;
   const says = ["accepted", "added"].includes(selected.entry?.says) ? selected.entry.says : selected.what === "candidate" ? "accepted" : "corrected";
-  const change = selected.what === "added" ? { class: kind } : { says, new_class: kind, reason: undefined };
+  const change = isMade(selected) ? { class: kind } : { says, new_class: kind, reason: undefined };
   make(selected, change, `reclassify ${nameOf(selected)}`);
 }
 const restore = () => selected && make(selected, null, `take back ${nameOf(selected)}`);
@@ -175,7 +179,36 @@ function nearest([x, y], isFit = () => true) {
 function undo() {
   const label = edits.undo();
   tell(label ? `Undone: ${label}` : "Nothing to undo");
-  if (selected?.what === "added" && !selected.entry) select(null);
+  if (selected && isMade(selected) && !selected.entry) select(null);
+}
+function finish() { // the line that is being drawn
+  const line = course;
+  setTool("select");
+  if (line.length < 2) return tell("A line needs two places");
+  if (crossesItself(line)) { course = line; tool = "draw"; buttons(); return tell("The line crosses itself; Backspace takes the last place back"); }
+  const change = drawn(model, selected && isLine(selected) ? kindOf(selected) : "lane_line", line);
+  edits.make([change], "draw a lane line");
+  return select(change[0]);
+}
+function split() {
+  if (!needs((feature) => isLine(feature) && !isGone(feature), "Select a lane line first")) return;
+  const cut = parts(selected.places, cursor());
+  if (!cut) { tell("Point at the place of the line where it is cut"); return; }
+  const made = cut.map((line) => drawn(model, kindOf(selected), line));
+  edits.make([taken(selected), ...made], `split ${nameOf(selected)}`);
+  select(made[0][0]);
+  tell("Split in two");
+}
+const MOST_GAP_M = 30; // between lines that are joined
+function join() {
+  if (!needs((feature) => isLine(feature) && !isGone(feature), "Select a lane line first")) return;
+  const best = joined(selected.places, model.lines.filter((other) => other !== selected && !isGone(other)));
+  if (!best || best.gap > MOST_GAP_M) { tell(`No other line ends within ${MOST_GAP_M} m of its ends`); return; }
+  if (crossesItself(best.line)) { tell("Joined, the line would cross itself"); return; }
+  const made = drawn(model, kindOf(selected), best.line);
+  edits.make([taken(selected), taken(best.other), made], `join ${nameOf(selected)}`);
+  select(made[0]);
+  tell(`Joined over ${best.gap.toFixed(1)} m`);
 }
 function redo() {
   const label = edits.redo();
@@ -196,6 +229,21 @@ function isInside([px, py], shape) {
   }
   return inside;
 }
+function hitLine(at) {
+  const [west, south, east, north] = view.box(0.2);
+  const isNear = ([x, y]) => x > west && x < east && y > south && y < north;
+  let [best, least] = [null, NEAR_PX];
+  for (const feature of model.lines) {
+    if (feature.what === "drawn" && isGone(feature)) continue;
+    const { places } = feature;
+    for (let n = 0; n + 1 < places.length; n++) {
+      if (!isNear(places[n]) && !isNear(places[n + 1]) && Math.hypot(places[n + 1][0] - places[n][0], places[n + 1][1] - places[n][1]) < east - west) continue;
+      const off = offLine(at, view.toScreen(places[n]), view.toScreen(places[n + 1]));
+      if (off < least) [best, least] = [feature, off];
+    }
+  }
+  return best;
+}
 function hit(at) {
   const [x, y] = view.toMap(at);
   const reach = 30;
@@ -209,7 +257,7 @@ function hit(at) {
     const extent = shape.length < 2 ? 0 : Math.hypot(shape[0][0] - shape[2 % shape.length][0], shape[0][1] - shape[2 % shape.length][1]);
     if (isHit && extent < size) [best, size] = [feature, extent];
   }
-  return best;
+  return best ?? hitLine(at);
 }
 const handleAt = (at) => (selected ? handlesOf(selected, view).find((handle) => Math.hypot(handle.at[0] - at[0], handle.at[1] - at[1]) <= HANDLE_PX + 3) : null);
 const at = (event) => { const box = canvas.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
@@ -263,6 +311,7 @@ canvas.addEventListener("wheel", (event) => {
 }, { passive: false });
 function click(there) {
   if (tool === "add") return add(view.toMap(there));
+  if (tool === "draw") { course.push(view.toMap(there)); tell(`${course.length} places; Enter twice at one place, or L, ends the line`); return drawing.later(); }
   if (tool === "measure") { measured.push(view.toMap(there)); return drawing.later(); }
   const handle = handleAt(there);
   if (handle && !handle.turn) { corner = handle.corner; return drawing.later(); }
@@ -300,6 +349,7 @@ drawing.extras.push((context) => {
   if (tool === "select") drawing.handles(context, shown, corner);
 });
 drawing.extras.push((context) => {
+  if (tool === "draw" && course.length) drawing.line(context, view, [...course, cursor()], { stroke: colour("accent"), width: 2.5 });
   const places = tool === "measure" && measured.length ? [...measured, cursor()] : measured;
   if (places.length) drawing.line(context, view, places, { stroke: colour("wine"), width: 2.5 });
   const metres = places.slice(1).reduce((sum, [x, y], n) => sum + Math.hypot(x - places[n][0], y - places[n][1]), 0);
@@ -323,9 +373,10 @@ drawing.extras.push((context) => {
 function setTool(name) {
   tool = tool === name ? "select" : name;
   measured = [];
+  course = [];
   hovered = null;
   byId("tip").hidden = true;
-  tell({ add: "Click where the new marking is, or press Enter for the crosshair", measure: "Click places, or press Enter at the crosshair; Escape ends" }[tool] ?? "");
+  tell({ draw: "Click the places of the line, or press Enter at the crosshair; L ends it, Escape gives it up", add: "Click where the new marking is, or press Enter for the crosshair", measure: "Click places, or press Enter at the crosshair; Escape ends" }[tool] ?? "");
   buttons();
   drawing.later();
 }
@@ -333,7 +384,7 @@ function fullScreen() {
   if (document.fullscreenElement) document.exitFullscreen(); else document.querySelector("main").requestFullscreen();
 }
 async function link() {
-  if (!selected || selected.what === "added") return tell("Select a marking of the map first");
+  if (!selected || isMade(selected)) return tell("Select a marking of the map first");
   try {
     await navigator.clipboard.writeText(location.href);
     return tell(`Copied the link to ${nameOf(selected)}`);
@@ -353,9 +404,12 @@ const KEYS = [
   ["q", "Q", () => step(questions, 1, "question"), "Next question", "the next question: a candidate that was left out; Shift+Q the one before"],
   ["Q", "", () => step(questions, -1, "question")],
   ["i", "I", () => setTool("add"), "Add", "add a marking: click, or Enter at the crosshair"],
+  ["l", "L", () => (tool === "draw" ? finish() : setTool("draw")), "Draw lane line", "draw a lane line: click its places, or Enter at the crosshair; L again ends it"],
+  ["s", "S", () => split(), "", "split the selected lane line at the pointer or crosshair"],
+  ["j", "J", () => join(), "", "join the selected lane line with the one that ends nearest to it"],
   ["a", "A", () => accept(), "", "accept the selected one"],
   ["Delete", "Del", () => remove(), "Delete", "delete the selected one; Backspace too"],
-  ["Backspace", "", () => remove()],
+  ["Backspace", "", () => (tool === "draw" ? (course.pop(), drawing.later()) : remove())],
   ["c", "C", () => byId("edit-class")?.focus(), "", "change its class: choose with the arrow keys, Escape goes back to the map"],
   ["r", "R", (event) => turn(event.altKey ? -TURN_DEG / 10 : -TURN_DEG), "", "turn it clockwise by 1\u00b0; Shift+R the other way; with Alt by 0.1\u00b0"],
   ["R", "", (event) => turn(event.altKey ? TURN_DEG / 10 : TURN_DEG)],
@@ -391,6 +445,8 @@ function arrow([dx, dy], event) {
   return drawing.later();
 }
 function enter() {
+  const last = course.at(-1);
+  if (tool === "draw" && last && Math.hypot(cursor()[0] - last[0], cursor()[1] - last[1]) * view.scale < 2) return finish();
   if (tool !== "select") return click(pointer ?? [view.width / 2, view.height / 2]);
   const middle = pointer ?? [view.width / 2, view.height / 2];
   return select(hit(middle) ?? nearest(view.toMap(middle)));
@@ -426,9 +482,9 @@ addEventListener("keydown", (event) => {
 });
 
 // ---- the panel ----
-const panel = new Panel(model, { accept, remove, classify, restore, link, choose: (feature) => show(feature) });
+const panel = new Panel(model, { accept, remove, classify, restore, link, split, join, choose: (feature) => show(feature) });
 const LAYERS = { before: "before the corrections", candidates: "left-out candidates", route: "route", ...(scene.mosaic ? { mosaic: "ground mosaic" } : {}), ...(scene.background ? { background: `background: ${scene.background}` } : {}) };
-const pressed = { i: () => tool === "add", m: () => tool === "measure", b: () => drawing.show.before };
+const pressed = { i: () => tool === "add", l: () => tool === "draw", m: () => tool === "measure", b: () => drawing.show.before };
 const usable = { z: () => edits.done.length, y: () => edits.undone.length, Delete: () => selected && !isGone(selected) };
 function buttons() {
   for (const made of byId("tools").children) {

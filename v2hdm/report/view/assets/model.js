@@ -19,16 +19,16 @@ export const words = (kind) => kind.replaceAll("_", " ");
 export class Model {
   constructor(scene) {
     this.scene = scene;
-    this.features = [];
+    this.features = []; // of paint
+    this.lines = []; // lane lines, which are too long to be looked up by their middle
     this.byKey = new Map();
     this.cells = new Map();
-    const { kinds } = scene;
     // Areas lie below the markings in them.
     for (const symbol of scene.symbols.filter(({ area }) => area)) this.take(symbol, "symbol", `s${symbol.id}`);
     for (const marking of scene.markings) this.take(marking, "marking", `m${marking.id}`);
     for (const symbol of scene.symbols.filter(({ area }) => !area)) this.take(symbol, "symbol", `s${symbol.id}`);
     scene.excluded.forEach((candidate, n) => this.take(candidate, "candidate", `x${n}`));
-    this.lanes = scene.lanes.map((lane) => ({ kind: kinds[lane.k], line: points(lane.p), id: lane.id }));
+    scene.lanes.forEach((lane, n) => this.take(lane, "line", `l${n}`));
     this.route = points(scene.route);
   }
 
@@ -38,12 +38,13 @@ export class Model {
 
   add(feature) {
     feature.places = feature.base;
-    this.features.push(feature);
+    (isLine(feature) ? this.lines : this.features).push(feature);
     this.byKey.set(feature.key, feature);
     this.index(feature);
   }
 
   index(feature) {
+    if (isLine(feature)) return;
     const [x, y] = middleOf(feature.places);
     const cell = `${Math.floor(x / CELL_M)},${Math.floor(y / CELL_M)}`;
     if (feature.cell === cell) return;
@@ -65,8 +66,9 @@ export class Model {
 
   // A new marking of a person; its correction says where it is.
   addedBy(entry, key) {
-    const what = entry.says === "added" ? "added" : "elsewhere"; // a correction of what is not in this map
-    const feature = { what, key, kind: entry.class, base: entry.outline_map, entry: null };
+    const isAdded = entry.says === "added"; // else a correction of what is not in this map
+    const what = entry.line_map ? (isAdded ? "drawn" : "line") : isAdded ? "added" : "elsewhere";
+    const feature = { what, key, kind: entry.class, base: entry.line_map ?? entry.outline_map, entry: null };
     this.add(feature);
     return feature;
   }
@@ -74,7 +76,8 @@ export class Model {
   // The correction of a feature, or null; the outline follows.
   state(feature, entry) {
     feature.entry = entry;
-    if (feature.what === "added") feature.places = entry?.outline_map ?? feature.places;
+    if (feature.what === "drawn") feature.places = entry?.line_map ?? feature.places;
+    else if (feature.what === "added") feature.places = entry?.outline_map ?? feature.places;
     else feature.places = entry?.moved ? feature.base.map((place, n) => entry.moved[n + 1] ?? place) : feature.base;
     this.index(feature);
   }
@@ -86,16 +89,19 @@ export class Model {
   }
 
   get corrected() {
-    return this.features.filter(({ entry }) => entry);
+    return [...this.features, ...this.lines].filter(({ entry }) => entry);
   }
 }
 
 export const kindOf = (feature) => feature.entry?.new_class ?? feature.entry?.class ?? feature.kind;
-export const isGone = (feature) => (feature.what === "added" ? !feature.entry : feature.entry?.says === "rejected");
+export const isLine = ({ what }) => what === "line" || what === "drawn";
+// What is there only because a person put it there.
+export const isMade = ({ what }) => what === "added" || what === "drawn";
+export const isGone = (feature) => (isMade(feature) ? !feature.entry : feature.entry?.says === "rejected");
 // Candidates are places without an outline; only four corners can be moved.
 export const isMovable = (feature) => feature.places.length === 4 && ["marking", "added"].includes(feature.what);
 export const nameOf = (feature) => {
-  const name = { marking: "Marking", symbol: "Symbol", candidate: "Left out", added: "Added", elsewhere: "Not in this map" }[feature.what];
+  const name = { marking: "Marking", symbol: "Symbol", candidate: "Left out", added: "Added", line: "Lane line", drawn: "Drawn lane line", elsewhere: "Not in this map" }[feature.what];
   return `${name}${feature.id === undefined ? "" : ` ${feature.id}`}, ${words(kindOf(feature))}`;
 };
 
@@ -104,7 +110,7 @@ export function saidOf({ what, entry }) {
   if (!entry) return "";
   const parts = [];
   if (entry.says === "rejected") parts.push(entry.reason ? `deleted: ${entry.reason}` : "deleted");
-  else if (entry.says === "added") parts.push("added");
+  else if (entry.says === "added") parts.push(what === "drawn" ? "drawn" : "added");
   else if (entry.says === "accepted") parts.push("accepted");
   if (entry.new_class && what !== "added") parts.push(`class ${words(entry.new_class)}`);
   const count = Object.keys(entry.moved ?? {}).length;

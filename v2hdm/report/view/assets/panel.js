@@ -1,6 +1,6 @@
 // What stands beside the map: the selection, lists to go through, layers. Names only become text nodes.
 
-import { isGone, isMovable, kindOf, middleOf, nameOf, saidOf, words } from "./model.js";
+import { isGone, isLine, isMade, isMovable, kindOf, middleOf, nameOf, saidOf, words } from "./model.js";
 
 const LISTED = 200; // entries of a list at once
 
@@ -32,6 +32,7 @@ export function factsOf(feature) {
     const sides = [0, 1].map((n) => Math.hypot(feature.places[n + 1][0] - feature.places[n][0], feature.places[n + 1][1] - feature.places[n][1]));
     facts.push(["size", `${Math.max(...sides).toFixed(2)} m by ${Math.min(...sides).toFixed(2)} m`]);
   }
+  if (isLine(feature)) facts.push(["length", `${feature.places.slice(1).reduce((sum, [x, y], n) => sum + Math.hypot(x - feature.places[n][0], y - feature.places[n][1]), 0).toFixed(1)} m`]);
   const [x, y] = middleOf(feature.places);
   facts.push(["middle", `${x.toFixed(2)} m E, ${y.toFixed(2)} m N`]);
   return facts;
@@ -57,7 +58,7 @@ export class Panel {
     this.feature = feature;
     const facts = factsOf(feature).flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, value)]);
     const kind = element("select", { id: "edit-class" });
-    const choices = feature.what === "added" ? this.model.scene.cornered : this.model.scene.choices;
+    const choices = isLine(feature) ? this.model.scene.line_kinds : feature.what === "added" ? this.model.scene.cornered : this.model.scene.choices;
     for (const name of new Set([...choices, kindOf(feature)])) kind.append(element("option", { value: name }, words(name)));
     kind.value = kindOf(feature);
     kind.addEventListener("change", () => act.classify(kind.value));
@@ -65,11 +66,12 @@ export class Panel {
     reason.value = feature.entry?.reason ?? "";
     reason.addEventListener("keydown", (event) => { if (event.key === "Enter") act.remove(reason.value); });
     const rows = [
-      element("div", { class: "row" }, ...(feature.what === "added" ? [] : [button("Accept", act.accept, { "aria-keyshortcuts": "a" })]), button("Delete", () => act.remove(reason.value), { "aria-keyshortcuts": "Delete" }),
-        ...(feature.entry && feature.what !== "added" ? [button("Take back", act.restore)] : []), button("Copy link", act.link, { "aria-keyshortcuts": "p" })),
-      element("div", { class: "row" }, element("label", { for: "edit-class" }, "Class"), kind),
+      element("div", { class: "row" }, ...(isMade(feature) || isLine(feature) ? [] : [button("Accept", act.accept, { "aria-keyshortcuts": "a" })]), button("Delete", () => act.remove(reason.value), { "aria-keyshortcuts": "Delete" }),
+        ...(feature.entry && !isMade(feature) ? [button("Take back", act.restore)] : []), button("Copy link", act.link, { "aria-keyshortcuts": "p" })),
+      ...(isLine(feature) ? [element("div", { class: "row" }, button("Split", act.split, { "aria-keyshortcuts": "s" }), button("Join", act.join, { "aria-keyshortcuts": "j" }))] : []),
+      ...(feature.what === "line" ? [] : [element("div", { class: "row" }, element("label", { for: "edit-class" }, "Class"), kind)]),
     ];
-    if (feature.what !== "added") rows.push(element("div", { class: "row" }, element("label", { for: "edit-reason" }, "Reason"), reason));
+    if (!isMade(feature)) rows.push(element("div", { class: "row" }, element("label", { for: "edit-reason" }, "Reason"), reason));
     const head = [element("h2", {}, nameOf(feature)), element("p", { class: "said" }, saidOf(feature)), element("dl", {}, ...facts)];
     if (isSame && ["edit-class", "edit-reason"].includes(focused)) { // a field that is being used stays
       head.forEach((part, n) => section.children[n].replaceWith(part));
