@@ -301,3 +301,20 @@ def test_a_lane_line_that_crosses_itself_is_refused_at_once_and_is_not_lost(brow
         press(page, "Backspace l")
         saved(page, 1)
         assert len(read_corrections(path)[0].outline_map) == 3
+
+
+def test_each_image_of_a_marking_is_shown_with_its_outline_as_it_is_now(browser, served):
+    address, _, _ = served
+    with opened(browser, f"{address}#m1") as watched:
+        page = watched.page
+        ready(page)
+        page.locator("#shots figure").nth(3).wait_for()
+        assert "4 images, the nearest first" in page.locator("#shots").inner_text()
+        outline = page.locator("#shots .mapped").first
+        before = outline.get_attribute("points")
+        assert page.locator("#shots figure").first.locator(".seen").count() == 4
+        press(page, "Shift+ArrowRight")
+        page.wait_for_timeout(300)
+        page.locator("#shots figure").nth(3).wait_for()
+        assert outline.get_attribute("points") != before
+        assert watched.said == []

@@ -113,7 +113,7 @@ class Pages:
         self._shown = shown
         self.scene = Once(self._draw_scene)
         self._report = Once(self._draw_report)
-        self._shots = Once(self._find_shots)
+        self.images = Once(self._find_shots)
 
     def _draw_scene(self) -> bytes:
         from v2hdm.report.view.scene import scene_bytes  # loads what states accuracies
@@ -191,7 +191,7 @@ class Pages:
         marking = query.get("marking", "")
         if not _NUMBER.fullmatch(start) or not (marking == "" or _NUMBER.fullmatch(marking)):
             raise MapFileError("start and marking: expected numbers")
-        shots = self._shots.value()
+        shots = self.images.value()
         number = int(marking) if marking else None
         return JSONResponse(shots.showing(outline_map, int(start), _SHOTS, number))
 

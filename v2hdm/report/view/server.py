@@ -8,10 +8,11 @@ from __future__ import annotations
 import secrets
 import socket
 import threading
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from v2hdm.errors import MapFileError
+from v2hdm.errors import MapFileError, V2hdmError
 from v2hdm.io.metrics import read_metrics
 from v2hdm.records import Drive
 from v2hdm.report.page.facts import read_excluded, read_map_of
@@ -111,6 +112,8 @@ class PageServer:
         self.load()
         assert self._pages is not None
         self._pages.scene.value()
+        with suppress(V2hdmError, OSError):  # which the page tells whoever asks for images
+            self._pages.images.value()
 
     def serve_forever(self) -> None:
         """Answer requests until :meth:`shutdown`, in a thread of its own."""

@@ -114,6 +114,7 @@ export class Images {
     byId("images").hidden = !feature;
     if (!feature) return;
     const outline = feature.places;
+    if (!start) byId("shots").replaceChildren(element("p", { class: "hint" }, "Looking for them\u2026"));
     const query = new URLSearchParams({ outline: JSON.stringify(outline), start, ...(feature.what === "marking" ? { marking: feature.id } : {}) });
     const answer = await fetch(`shots.json?${query}`);
     if (feature !== this.feature || outline !== feature.places) return; // something else by now
