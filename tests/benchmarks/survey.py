@@ -4,7 +4,7 @@
 by distance: errors and stated sigmas of corners, the share of markings found, and of false detections. Those
 of port 2 are the constants of :mod:`v2hdm.simulate.survey.sightings`.
 
-``python -m tests.benchmarks.survey --joint KM [--section-m M]``: one problem of a survey, adjusted at once and
+``python -m tests.benchmarks.survey --joint KM [--section-m M]``: a problem of a survey, adjusted at once and
 in sections: corners in mm, sigmas in per cent, seconds of CPU.
 
 ``python -m tests.benchmarks.survey --grow KM [KM ...] [--section-m M] [--workers N]``: a map of each length
