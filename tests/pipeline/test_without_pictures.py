@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import pytest
 
@@ -49,3 +50,27 @@ def test_damaged_detections_end_a_run_in_one_line(survey, tmp_path, capsys, dama
         main(["map", f"drive.path={folder}", f"cache={tmp_path}/c", f"output={tmp_path}/o", "workers=1"]) == 2
     )
     assert "000003.json" in capsys.readouterr().err
+
+
+def test_a_drive_is_mapped_in_sections_by_one_setting(survey, tmp_path):
+    """80 m of street are one section: more would each have too few markings for two cameras."""
+    config = run_config(survey[0], tmp_path / "out")
+    config.map.section_m = 200.0
+    result = run(config)
+    figures = json.loads((result.folder / "metrics.json").read_text())["results"]["both"]["Opt"]
+    assert figures["recall"] > 0.9
+    assert not list(Path(f"{tmp_path}/out.cache").glob("sections-*"))
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["map.section_m=20"], "map.section_m is 20"),
+        (["map.section_m=500", "all_maps=true"], "map.section_m and all_maps"),
+        (["map.section_m=500", "mapping.ground=surface"], "mapping.ground=surface: not with sections"),
+    ],
+)
+def test_sections_that_cannot_be_are_refused_before_any_work(survey, tmp_path, capsys, words, says):
+    given = [f"drive.path={survey[0]}", f"cache={tmp_path}/c", f"output={tmp_path}/o", "workers=1"]
+    assert main(["map", *given, *words]) == 2
+    assert says in capsys.readouterr().err

@@ -262,7 +262,8 @@ def map_and_save(
                 corrections=config.map.corrections,
                 accuracy_goal_cm=config.accuracy_goal_cm,
                 context=context,
-                all_maps=config.all_maps or _is_rendered(config),
+                all_maps=config.all_maps or (_is_rendered(config) and not config.map.section_m),
+                section_m=config.map.section_m,
             )
             key = result_key(config, mapped.drives, mapped.contents, context.cache.key())
             outputs = Outputs(

@@ -98,7 +98,8 @@ def _write_map(folder: Path, result: Result, outputs: Outputs) -> None:
     ]  # longitude and latitude, whatever the others have
     write_map(result.map, folder, "map", geojson, verdict)
     others = [name for name in with_data(outputs.formats) if name not in ("geojson", "qgis")]
-    write_map(result.map, folder, "map", others, verdict, crs=outputs.crs)
+    driven = [session.trajectory for session in drive.sessions if session.trajectory is not None]
+    write_map(result.map, folder, "map", others, verdict, crs=outputs.crs, trajectories=driven)
     about = Provenance.today(drive.name, verdict)
     for name, calibration in best.calibrations.items():
         clock = None if drive.joined else best.clocks[0].get(name)
