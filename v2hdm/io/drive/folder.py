@@ -100,7 +100,10 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
     frame_from_ground = frame_from_vehicle(next(iter(frames.values())).height_m)
     poses_of_frame = recorded.trajectory
     on_ground = Trajectory(poses_of_frame.stamp_s, poses_of_frame.map_from_vehicle @ frame_from_ground)
-    drive = Drive(name, path, cameras, (), pose_noise, recorded.origin, truth, recorded=on_ground)
+    drive = Drive(
+        name, path, cameras, (), pose_noise, recorded.origin, truth,
+        recorded=on_ground, headed_by_course=recorded.headed_by_course,
+    )  # fmt: skip
     return assemble_drive(drive, files, options.max_gap_s, poses_at)
 
 
