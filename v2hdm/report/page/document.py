@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 from types import SimpleNamespace
@@ -96,7 +95,7 @@ def _radii(facts: Facts) -> str:
     return charts.radius_chart(series) if series else ""
 
 
-_ASSETS = {"vendor": ("leaflet.js", "leaflet.css"), "templates": ("page.css", "map.js", "edit.js")}
+_ASSETS = {"vendor": ("leaflet.js", "leaflet.css"), "templates": ("page.css", "map.js")}
 """Scripts and styles that the page embeds, by folder."""
 
 
@@ -111,13 +110,8 @@ def write_page(folder: Path, drive: Drive | None, background: Path | None = None
     return folder / names.REPORT
 
 
-def page_text(
-    folder: Path,
-    drive: Drive | None,
-    editing: Mapping[str, object] | None = None,
-    background: Path | None = None,
-) -> str:
-    """The page of :func:`write_page`; ``editing`` is the data of the script for corrections."""
+def page_text(folder: Path, drive: Drive | None, background: Path | None = None) -> str:
+    """The page of :func:`write_page`."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("v2hdm.report.page"),
         autoescape=True,
@@ -145,7 +139,6 @@ def page_text(
         },
         map_json=json_text(page.map_data),
         pictures_json=json_text(page.pictures),
-        editing_json=editing and json_text(editing),
     )
 
 
