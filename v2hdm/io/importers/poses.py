@@ -11,7 +11,7 @@ import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -37,7 +37,7 @@ from v2hdm.io.importers.slip import driven
 from v2hdm.io.importers.strays import without_stray_turns, without_strays
 from v2hdm.io.importers.ubx import read_ubx
 from v2hdm.io.trajectory import check_geodetic, read_tum, span, why_no_pose
-from v2hdm.records import BoolArray, FloatArray, GeodeticOrigin, Trajectory
+from v2hdm.records import BoolArray, FloatArray, GeodeticOrigin, Reception, Trajectory
 from v2hdm.store.files import check_keys, take_array, take_choice, take_mapping, take_number, take_text
 
 _log = logging.getLogger(__name__)
@@ -62,6 +62,19 @@ class PoseSettings:
     offset_s: float = 0.0  # added to the recorded times
 
 
+class Fixes(NamedTuple):
+    """All positions of a source, used or not."""
+
+    stamp_s: FloatArray  # (P,)
+    is_fixed: BoolArray | None  # (P,) whether RTK had fixed its ambiguities, None where not stated
+
+    def between(self, first_s: float, last_s: float, geoid_m: float | None) -> Reception:
+        """Those of a span of time, counted."""
+        is_within = (self.stamp_s >= first_s) & (self.stamp_s <= last_s)
+        fixed = None if self.is_fixed is None else int((self.is_fixed & is_within).sum())
+        return Reception(int(is_within.sum()), fixed, geoid_m)
+
+
 @dataclass(frozen=True)
 class Recorded:
     """Poses ``map_from_vehicle`` as a drive has them."""
@@ -69,6 +82,8 @@ class Recorded:
     trajectory: Trajectory
     noise: Mapping[str, float]  # the fields of :class:`PoseNoise` that the source states
     origin: GeodeticOrigin | None  # None where the poses are the map's own
+    fixes: Fixes | None = None
+    geoid_m: float | None = None  # height of the geoid above the ellipsoid, as stated and added
 
 
 _Reader = Callable[[Path, dict[str, Any], Path, str, float | None], Readings]
@@ -184,7 +199,15 @@ def assemble(
             "vehicle turns, stands or reverses; add a heading (HDT, THS, PASHR, a column, an Imu topic, or "
             "heading_file, a second file)"
         )
-    readings = _usable(readings, settings, where)
+    fixes = Fixes(readings.stamp_s + settings.offset_s, readings.is_fixed)
+    recorded = _of_either_time(_usable(readings, settings, where), settings, origin, max_gap_s, where)
+    return replace(recorded, fixes=fixes, geoid_m=settings.geoid_m)
+
+
+def _of_either_time(
+    readings: Readings, settings: PoseSettings, origin: GeodeticOrigin | None, max_gap_s: float, where: str
+) -> Recorded:
+    """The poses by the times of the headings, or by the later ones where these fit the driving better."""
     attitudes = readings.attitudes
     assert attitudes is not None
     recorded = _recorded(readings, settings, origin, max_gap_s, where)
@@ -233,7 +256,7 @@ def _usable(readings: Readings, settings: PoseSettings, where: str) -> Readings:
 def _without(readings: Readings, is_usable: BoolArray) -> Readings:
     """The readings whose positions are ``kept`` (P,)."""
     rows = {key: getattr(readings, key)[is_usable] for key in ("stamp_s", "points", "sigma_m")}
-    return replace(readings, **rows)
+    return replace(readings, **rows, is_fixed=None)  # counted before anything was left out
 
 
 def _finite(values: FloatArray, sigma_m: FloatArray, where: str, things: str) -> BoolArray:
