@@ -1,6 +1,6 @@
 """How often and how finely a drive has seen each piece of ground, by geometry alone.
 
-An image sees the ground of its camera's region of interest, as if nothing stood in the way: what lay hidden
+An image sees the ground within its borders and within reach, as if nothing stood in the way: what lay hidden
 behind a container is counted as seen. A pixel at depth z covers z / f of ground across the view and
 z^2 / (f h) along it, with focal length f and the camera's height h; the larger is its ground sample distance.
 """
@@ -15,13 +15,17 @@ import cv2
 import numpy as np
 
 from v2hdm.errors import MapFileError
-from v2hdm.geometry.ipm import flat_motion, project_ground
+from v2hdm.geometry.ipm import flat_motion, pinhole_px_from_ground, project_ground
+from v2hdm.geometry.lens import undistort_points
+from v2hdm.geometry.planar import clip_half
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.records import Camera, Drive, FloatArray, IntArray
+from v2hdm.records import Camera, CameraInfo, Drive, FloatArray, IntArray
 from v2hdm.safe.pixels import read_pixels
 from v2hdm.store import names
 from v2hdm.store.files import load_json, take_number, whole_file, write_json
 
+REACH_M = 16.0  # from the camera's nadir, to which markings are mapped unless set (``mapping.max_range_m``)
+_RING = 48  # corners of the polygon that stands for a circle of that radius
 CELL_M = 0.25  # side of a cell of ground: finer than a marking, coarse enough for a port of kilometres
 ENOUGH_VIEWS = 3  # images that a marking needs: two for its parallax, and one that may fail
 _MOST_CELLS = 4_000_000  # of a site; larger ones get coarser cells, 16 MB of counts
@@ -73,17 +77,21 @@ class _Footprint(NamedTuple):
     height_m: float
 
 
-def coverage_of(drive: Drive, cam_from_vehicle: Mapping[str, FloatArray], cell_m: float = CELL_M) -> Coverage:
-    """The coverage by the images of the cameras in ``cam_from_vehicle`` (4, 4), under the recorded poses."""
+def coverage_of(
+    drive: Drive, cam_from_vehicle: Mapping[str, FloatArray], reach_m: float = REACH_M, cell_m: float = CELL_M
+) -> Coverage:
+    """The coverage by the images of the cameras in ``cam_from_vehicle`` (4, 4), under the recorded poses.
+
+    Ground counts that is within ``reach_m`` of the camera's nadir, to which markings are mapped.
+    """
     footprints = {
-        name: _footprint(drive.cameras[name], mounting)
+        name: _footprint(drive.cameras[name], mounting, reach_m)
         for name, mounting in cam_from_vehicle.items()
         if name in drive.cameras
     }
+    footprints = {name: footprint for name, footprint in footprints.items() if len(footprint.outline_vehicle)}
     images = [image for image in drive.images if image.camera in footprints]
-    outlines = [
-        _on_map(image.map_from_vehicle, footprints[image.camera].outline_vehicle) for image in images
-    ]
+    outlines = [_on_map(image.map_from_vehicle, footprints[image.camera].outline_vehicle) for image in images]
     every_corner = np.concatenate([np.zeros((0, 2)), *outlines])
     if not len(every_corner):
         nothing = np.zeros((0, 0))
@@ -99,9 +107,7 @@ def coverage_of(drive: Drive, cam_from_vehicle: Mapping[str, FloatArray], cell_m
     for image, outline in zip(images, outlines, strict=True):
         footprint = footprints[image.camera]
         row, column = _cells_in(outline, west_m, north_m, cell_m)
-        centre_map = np.column_stack(
-            [west_m + (column + 0.5) * cell_m, north_m - (row + 0.5) * cell_m]
-        )
+        centre_map = np.column_stack([west_m + (column + 0.5) * cell_m, north_m - (row + 0.5) * cell_m])
         foot_map = _on_map(image.map_from_vehicle, footprint.foot_vehicle[None])[0]
         views[row, column] += 1
         seen_m = _sample_m(footprint, image.map_from_vehicle, centre_map)
@@ -112,11 +118,47 @@ def coverage_of(drive: Drive, cam_from_vehicle: Mapping[str, FloatArray], cell_m
     return Coverage(west_m, north_m, cell_m, views, sample_m, sectors)
 
 
-def _footprint(camera: Camera, cam_from_vehicle: FloatArray) -> _Footprint:
+def _footprint(camera: Camera, cam_from_vehicle: FloatArray, reach_m: float) -> _Footprint:
     centre_vehicle = camera_centre(cam_from_vehicle)
     focal_px = float(np.sqrt(camera.info.intrinsic[0, 0] * camera.info.intrinsic[1, 1]))
     height_m = max(float(centre_vehicle[2]), 1e-3)
-    return _Footprint(camera.roi_vehicle, cam_from_vehicle, focal_px, centre_vehicle[:2], height_m)
+    outline = _outline(camera.info, cam_from_vehicle, centre_vehicle[:2], reach_m)
+    return _Footprint(outline, cam_from_vehicle, focal_px, centre_vehicle[:2], height_m)
+
+
+def _outline(
+    info: CameraInfo, cam_from_vehicle: FloatArray, foot_vehicle: FloatArray, reach_m: float
+) -> FloatArray:
+    """The ground (N, 2) within reach and the borders of an image: a convex polygon, empty if it sees none."""
+    angle_rad = np.linspace(0.0, 2 * np.pi, _RING, endpoint=False)
+    outline = foot_vehicle + reach_m * np.column_stack([np.cos(angle_rad), np.sin(angle_rad)])
+    low, high = _pinhole_box(info)
+    px_from_ground = pinhole_px_from_ground(info.intrinsic, cam_from_vehicle)
+    u, v, w = px_from_ground  # rows; w is the depth
+    borders = (w, u - low[0] * w, high[0] * w - u, v - low[1] * w, high[1] * w - v)
+    for border in borders:
+        outline = clip_half(outline, outline @ border[:2] + border[2])
+        if len(outline) < 3:
+            return np.zeros((0, 2))
+    return outline
+
+
+def _pinhole_box(info: CameraInfo) -> tuple[FloatArray, FloatArray]:
+    """The largest rectangle within the image's borders once its distortion is taken off: low, high (2,)."""
+    across = np.linspace(0.0, info.width - 1.0, _BORDER)
+    down = np.linspace(0.0, info.height - 1.0, _BORDER)
+    zeros = np.zeros(_BORDER)
+    right_px = zeros + info.width - 1.0
+    bottom_px = zeros + info.height - 1.0
+    recorded = ((zeros, down), (right_px, down), (across, zeros), (across, bottom_px))
+    sides = [undistort_points(info, np.column_stack(side)) for side in recorded]
+    left, right, top, bottom = (side[np.isfinite(side).all(axis=1)] for side in sides)
+    low = np.array([left[:, 0].max(), top[:, 1].max()])
+    high = np.array([right[:, 0].min(), bottom[:, 1].min()])
+    return low, high
+
+
+_BORDER = 9  # points of a border at which the lens is evaluated
 
 
 def _on_map(map_from_vehicle: FloatArray, points_vehicle: FloatArray) -> FloatArray:

@@ -36,7 +36,9 @@ _GRID = "crs"  # in job.json: the system of the document's coordinates
 def check_job(job: Job, where: str = "report.") -> None:
     """Raise ConfigError, which names the key, for a field that does not fit on the document."""
     for key, value in asdict(job).items():
-        if isinstance(value, str) and (not value.strip() or len(value) > _MOST_LETTERS or not _is_line(value)):
+        if isinstance(value, str) and (
+            not value.strip() or len(value) > _MOST_LETTERS or not _is_line(value)
+        ):
             raise ConfigError(f"{where}{key}: give one line of 1 to {_MOST_LETTERS} letters")
     if job.epoch is not None and not (math.isfinite(job.epoch) and job.epoch > 0):
         raise ConfigError(f"{where}epoch is {job.epoch}: give years, such as 2024.4")
@@ -59,6 +61,10 @@ class StatedJob:
         return StatedJob(replace(self.job, **stated), crs or self.crs)
 
 
+NO_JOB = StatedJob(Job())
+"""Nothing is stated."""
+
+
 def job_of(settings: Any) -> Job:
     """The fields of a job among other ``settings``."""
     return Job(**{key: getattr(settings, key) for key in JOB_KEYS})
@@ -76,7 +82,7 @@ def read_job(folder: Path) -> StatedJob:
     """The job of a result; nothing is stated where the folder has none. MapFileError if damaged."""
     path = folder / names.JOB
     if not path.is_file():
-        return StatedJob(Job())
+        return NO_JOB
     content = load_json(path, MapFileError)
     check_keys(content, (), (*JOB_KEYS, _GRID), str(path), MapFileError)
     crs = take_text(content.pop(_GRID), f"{path}: {_GRID}", MapFileError) if _GRID in content else None

@@ -38,9 +38,10 @@ class Place(NamedTuple):
 
 def weak_places(hd_map: HDMap, coverage: Coverage | None, route_map: FloatArray) -> tuple[Place, ...]:
     """The places of markings below accuracy A, most markings first; ``route_map`` (N, 2) was driven."""
+    mapped: list[Marking | Symbol] = [*hd_map.markings, *hd_map.symbols]
     features = [
         feature
-        for feature in (*hd_map.markings, *hd_map.symbols)
+        for feature in mapped
         if feature.accuracy in ACCURACIES[1:] and feature.covariance_m2 is not None
     ]
     if not features:
@@ -85,9 +86,8 @@ def _advice(
     images = float(np.median([feature.sightings for feature in features]))
     if images < _FEW_IMAGES:
         advice.append(f"Drive past slowly, or record more images: {images:.0f} show each marking.")
-    if coverage is not None and coverage.views.size:
-        if int(np.median(coverage.sectors[coverage.cells_of(centres_map)])) <= 1:
-            advice.append("Pass once more in the opposite direction: all images look the same way.")
+    if _is_one_sided(coverage, centres_map):
+        advice.append("Pass once more in the opposite direction: all images look the same way.")
     beside_m = [
         SIGMAS_95 * feature.relative_sigma_m
         for feature in features
@@ -98,6 +98,13 @@ def _advice(
     if not advice:
         advice.append("Drive past once more, on the other side if there is room.")
     return " ".join(advice[:2])
+
+
+def _is_one_sided(coverage: Coverage | None, centres_map: FloatArray) -> bool:
+    """Whether the images that show places (N, 2) look at them from one side alone."""
+    if coverage is None or not coverage.views.size:
+        return False
+    return int(np.median(coverage.sectors[coverage.cells_of(centres_map)])) <= 1
 
 
 def _side(route_map: FloatArray, nearest: IntArray, centres_map: FloatArray) -> str:
@@ -119,9 +126,9 @@ class Stretch(NamedTuple):
     def says(self) -> str:
         """Where to drive again, and how."""
         return (
-            f"from {self.from_m:.0f} m to {self.to_m:.0f} m along the route, {100 * self.covered:.0f} % of the "
-            f"ground within {BESIDE_M:.0f} m is seen in {ENOUGH_VIEWS} images or more: drive there again, "
-            "slower or with more images per second"
+            f"from {self.from_m:.0f} m to {self.to_m:.0f} m along the route, {100 * self.covered:.0f} % of "
+            f"the ground within {BESIDE_M:.0f} m is seen in {ENOUGH_VIEWS} images or more: drive there "
+            "again, slower or with more images per second"
         )
 
 

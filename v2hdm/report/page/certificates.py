@@ -45,7 +45,9 @@ def _certificate(
         words = f"The vehicle’s own tree of frames: {NOT_STATED}; the drive names no frames."
     else:
         edges = _edge_table(edges_of(frames, calibrated.calibration.cam_from_vehicle))
-    return Certificate(camera, _basis(facts, camera.name, residuals), _lens(calibrated.calibration), edges, words)
+    return Certificate(
+        camera, _basis(facts, camera.name, residuals), _lens(calibrated.calibration), edges, words
+    )
 
 
 def _basis(facts: Facts, name: str, residuals: GroundResiduals | None) -> tuple[Row, ...]:

@@ -36,7 +36,9 @@ def comparison_of(folder: Path | None) -> Comparison | None:
         return None
     path = folder / names.AS_BUILT
     if not path.is_file():
-        raise MapFileError(f"{folder}: has no {names.AS_BUILT}; give the folder that v2hdm compare has written")
+        raise MapFileError(
+            f"{folder}: has no {names.AS_BUILT}; give the folder that v2hdm compare has written"
+        )
     content = load_json(path, MapFileError)
     counts = take_mapping(content.get("counts"), f"{path}: counts", MapFileError)
     listed = content.get("findings")
@@ -69,7 +71,12 @@ def _row(entry: Mapping[str, Any]) -> list[str]:
                 measured.append(f"{name_of(quantity)} {value} ± {sigma} {shown}")
     who = entry.get("id")
     words = [str(entry.get("fate", "")), name_of(str(entry.get("class", "")))]
-    return [*words, "–" if who is None else str(who), str(entry.get("design") or "–"), "; ".join(measured) or "–"]
+    return [
+        *words,
+        "–" if who is None else str(who),
+        str(entry.get("design") or "–"),
+        "; ".join(measured) or "–",
+    ]
 
 
 def _whole(content: object) -> str:

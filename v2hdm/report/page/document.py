@@ -42,35 +42,35 @@ class Chart(NamedTuple):
 _RESIDUALS: Mapping[str, tuple[str, str]] = {
     "histogram": (
         "Reprojection errors",
-        "Left: in pixels. Right: in the detector’s stated standard deviations. A curve left of the grey line means "
-        "that corners are better than stated, a long tail that some are wrong.",
+        "Left: in pixels. Right: in the detector’s stated standard deviations. A curve left of the grey "
+        "line means that corners are better than stated, a long tail that some are wrong.",
     ),
     "field": (
         "Over the image",
-        "Mean residual of each part of the image, enlarged; the key gives the scale. Arrows without a pattern are "
-        "noise; a swirl or a fan would mean a wrong lens model or principal point.",
+        "Mean residual of each part of the image, enlarged; the key gives the scale. Arrows without a "
+        "pattern are noise; a swirl or a fan would mean a wrong lens model or principal point.",
     ),
     "range": (
         "Over range",
-        "In the image, near corners scatter more because a centimetre covers more pixels; a rise at long range would "
-        "mean a wrong pitch or lens model. On the ground, residuals grow with range because a distant pixel covers "
-        "more of it. The map averages many sightings and is more precise than each.",
+        "In the image, near corners scatter more because a centimetre covers more pixels; a rise at long range "
+        "would mean a wrong pitch or lens model. On the ground, residuals grow with range because a distant "
+        "pixel covers more of it. The map averages many sightings and is more precise than each.",
     ),
     "route": (
         "Along the route",
-        "Above: a stretch that stands out has poor images or wrong poses. Below: the correction of the recorded "
-        "poses with its 95 % band; it should drift within the receiver’s noise and never jump.",
+        "Above: a stretch that stands out has poor images or wrong poses. Below: the correction of the "
+        "recorded poses with its 95 % band; it should drift within the receiver’s noise and never jump.",
     ),
 }
 """Title and caption of the charts of residuals, by the name of each."""
 
 _PLAN_CAPTION = (
-    "The map from above, in local metres. Grey: ground that three images or more show. Ringed: places where markings "
-    "are known less well than the accuracy goal asks."
+    "The map from above, in local metres. Grey: ground that three images or more show. Ringed: places where "
+    "markings are known less well than the accuracy goal asks."
 )
 _COVERAGE_CAPTION = (
-    "How many images show each piece of ground, as if nothing stood in the way. The map is weakest where few images "
-    "show the ground, and at the ringed places, which the table lists."
+    "How many images show each piece of ground, as if nothing stood in the way. The map is weakest where few "
+    "images show the ground, and at the ringed places, which the table lists."
 )
 
 
@@ -122,7 +122,7 @@ def document(facts: Facts, compared: Path | None = None) -> SimpleNamespace:
         against_truth=tables.truth_table(facts),
         radii=_radii(facts),
         check_points=tables.check_point_table(facts),
-        map_data=layers(facts, residuals),
+        map_data=layers(facts, residuals, reference),
         pictures=pictures(facts),
         suspicious=(suspicious := _suspicious(facts)),
         suspicious_table=_suspicious_table(suspicious),
@@ -156,8 +156,19 @@ def _summary(facts: Facts) -> str:
 
 
 def _suspicious_table(rows: Mapping[str, list[str]]) -> tables.Table | None:
-    headings = ("marking", "class", "p", "criterion", "p (shape)", "p (residuals)", "p (sightings)", "disputed (%)")
-    return tables.Table(headings, list(rows.values()), [True, False, True, False, *[True] * 4]) if rows else None
+    headings = (
+        "marking",
+        "class",
+        "p",
+        "criterion",
+        "p (shape)",
+        "p (residuals)",
+        "p (sightings)",
+        "disputed (%)",
+    )
+    return (
+        tables.Table(headings, list(rows.values()), [True, False, True, False, *[True] * 4]) if rows else None
+    )
 
 
 def _radii(facts: Facts) -> str:
@@ -226,16 +237,20 @@ def page_text(
             )
         else:
             page.map_data["background"] = background_layer(background, facts)
-    return _environment().get_template("page.html").render(
-        page=page,
-        assets={
-            name: (here / where / name).read_text(encoding="utf-8")
-            for where, names in _ASSETS.items()
-            for name in names
-        },
-        map_json=json_text(page.map_data),
-        pictures_json=json_text(page.pictures),
-        editing_json=editing and json_text(editing),
+    return (
+        _environment()
+        .get_template("page.html")
+        .render(
+            page=page,
+            assets={
+                name: (here / where / name).read_text(encoding="utf-8")
+                for where, names in _ASSETS.items()
+                for name in names
+            },
+            map_json=json_text(page.map_data),
+            pictures_json=json_text(page.pictures),
+            editing_json=editing and json_text(editing),
+        )
     )
 
 

@@ -33,7 +33,7 @@ from v2hdm.records import (
     Truth,
 )
 from v2hdm.report.coverage import Coverage, read_coverage
-from v2hdm.report.job import Job, StatedJob, read_job
+from v2hdm.report.job import NO_JOB, StatedJob, read_job
 from v2hdm.store import names
 from v2hdm.store.files import load_json, load_yaml, read_csv, read_text, take_number
 
@@ -79,6 +79,9 @@ class Occasion(NamedTuple):
     images: int
 
 
+_NO_OCCASION = Occasion((), 0)
+
+
 @dataclass(frozen=True)
 class Facts:
     """The content of a result folder; missing parts are None or empty."""
@@ -95,8 +98,8 @@ class Facts:
     check_points: tuple[Mapping[str, str], ...]  # rows of ``check_points.csv`` by its columns
     drive: Drive | None
     truth: Truth | None  # of a rendered drive
-    job: StatedJob = StatedJob(Job())  # what people state for the document
-    occasion: Occasion = Occasion((), 0)
+    job: StatedJob = NO_JOB  # what people state for the document
+    occasion: Occasion = _NO_OCCASION
     reception: Reception | None = None
     coverage: Coverage | None = None
 

@@ -73,7 +73,9 @@ def _fixed(facts: Facts) -> str:
         return f"{NOT_STATED}: the recorded poses say nothing of their fix"
     share = 100 * reception.rtk_fixed / reception.positions
     # What is not all never reads so.
-    digits = next((n for n in (1, 2, 3) if reception.rtk_fixed == reception.positions or round(share, n) < 100), 3)
+    digits = next(
+        (n for n in (1, 2, 3) if reception.rtk_fixed == reception.positions or round(share, n) < 100), 3
+    )
     return f"{share:.{digits}f} % of {reception.positions:,} recorded while images were taken"
 
 
@@ -85,7 +87,9 @@ def _ground(facts: Facts) -> tuple[Row, ...]:
     sample_m = coverage.sample_of_covered_m()
     distance = NOT_STATED
     if math.isfinite(sample_m):
-        distance = f"{1000 * sample_m:.0f} mm (median over the covered ground, each place by its finest image)"
+        distance = (
+            f"{1000 * sample_m:.0f} mm (median over the covered ground, each place by its finest image)"
+        )
     area = f"{coverage.covered_m2:,.0f} m² covered by three images or more, {coverage.seen_m2:,.0f} m² seen"
     return (Row("Ground sample distance", distance), Row("Area", area))
 
@@ -94,16 +98,18 @@ def method_words(facts: Facts, reference: Reference) -> str:
     """The method, in one paragraph."""
     cameras = _listed(list(facts.cameras))
     way = "" if facts.route is None else f" along {facts.route.way_m[-1]:.0f} m"
+    rig = f"{_count(len(facts.cameras), 'calibrated camera')} ({cameras})"
+    frame = "those of the map" if reference.grid.is_local else f"in {reference.grid.crs}"
     sentences = [
-        f"A vehicle with a satellite receiver and {_count(len(facts.cameras), 'calibrated camera')} ({cameras}) "
-        f"drove{way} through the site and took {facts.occasion.images:,} images.",
+        f"A vehicle with a satellite receiver and {rig} drove{way} through the site and took "
+        f"{facts.occasion.images:,} images.",
         "A neural network found the paint in each image, and the corners of each marking were fitted to its "
         "edges, each with a covariance.",
-        "One least-squares adjustment of all images then estimated the corners of all markings, the mounting of "
-        "each camera and the errors of the recorded poses, with the covariance of each.",
+        "One least-squares adjustment of all images then estimated the corners of all markings, the mounting "
+        "of each camera and the errors of the recorded poses, with the covariance of each.",
         "A candidate is in the map if, from image to image, it moves as paint on the ground does, with a "
         "probability of 90 % or more.",
-        f"Coordinates are {'those of the map' if reference.grid.is_local else f'in {reference.grid.crs}'}.",
+        f"Coordinates are {frame}.",
     ]
     if facts.check_points:
         sentences.append("Surveyed check points, which no estimate has used, test the result.")

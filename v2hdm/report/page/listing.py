@@ -1,4 +1,4 @@
-"""The lists of a document: markings and lane lines with coordinates, what was left out, corrections by hand."""
+"""The lists of a document: markings, lane lines, weak places, what was left out, corrections by hand."""
 
 from __future__ import annotations
 
@@ -52,7 +52,9 @@ def lane_table(facts: Facts, reference: Reference) -> Table | None:
     for place, lane in enumerate(lanes):
         length_m = float(length_along(lane.points_map)[-1])
         begin, end = words[2 * place : 2 * place + 2]
-        rows.append([str(lane.id), name_of(lane.kind), number(length_m, 1), *begin, *end, str(lane.sightings)])
+        rows.append(
+            [str(lane.id), name_of(lane.kind), number(length_m, 1), *begin, *end, str(lane.sightings)]
+        )
     first, second = reference.axes
     ends_of = (f"begins {first}", second, f"ends {first}", second)
     headings = ("no.", "class", "length (m)", *ends_of, "images")

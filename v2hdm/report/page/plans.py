@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -23,8 +24,8 @@ from v2hdm.report.weak import Place
 _WIDTH_IN = 7.2  # width of a plan: that of an A4 page between its margins
 _TALLEST_IN = 7.6  # tallest plan that leaves room for its caption on a page
 _MARGIN_M = 4.0  # of ground around the map
-_STEPS = (1, ENOUGH_VIEWS, 10, 30, 100)
-"""First numbers of images of the classes of coverage: too few, enough, and three times as many each."""
+_STEPS = (1, ENOUGH_VIEWS, 6, 12, 24)
+"""First numbers of images of the classes of coverage: too few, enough, and twice as many each."""
 # Blues from light to dark, the first one a warning: what is there was seen too seldom to be mapped.
 _COLOURS = ("#f2c9a8", "#cfe3f1", "#94c1e0", "#4f97c8", "#1f6aa5")
 _GROUND = "#e4e8eb"  # covered ground under the plan of the markings
@@ -76,7 +77,7 @@ def draw_views(axes: Axes, coverage: Coverage) -> None:
 
 def view_patches() -> list[Patch]:
     """The legend of :func:`draw_views`."""
-    ends = [f"{first} to {last - 1}" for first, last in zip(_STEPS, _STEPS[1:], strict=False)]
+    ends = [f"{first} to {last - 1}" for first, last in pairwise(_STEPS)]
     names = [*ends, f"{_STEPS[-1]} or more"]
     patches = [Patch(facecolor=colour, label=name) for colour, name in zip(_COLOURS, names, strict=True)]
     patches[0].set_label(f"{names[0]} images: too few")
@@ -106,10 +107,11 @@ def _draw_places(axes: Axes, places: Sequence[Place]) -> None:
     look: dict[str, Any] = {"mfc": "none", "mec": OKABE_ITO["vermillion"], "mew": 1.4, "ls": "none"}
     for number, place in enumerate(places, 1):
         label = "drive again" if number == 1 else None
+        at = place.centre_map.tolist()
         axes.plot(*place.centre_map, "o", ms=11, label=label, **look)
         box = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.85}
         axes.annotate(
-            str(number), place.centre_map, xytext=(9, 7), textcoords="offset points", fontsize=8.5,
+            str(number), (at[0], at[1]), xytext=(9, 7), textcoords="offset points", fontsize=8.5,
             fontweight="bold", color=OKABE_ITO["vermillion"], bbox=box, zorder=5,
         )  # fmt: skip
 

@@ -36,7 +36,12 @@ def _absolute(facts: Facts) -> list[Sequence[str]]:
     circular = "circular error at 95 % (CE95)"
     without = "" if len(judged) == len(facts.hd_map.markings) else f", without accuracy {ACCURACIES[-1]}"
     rows: list[Sequence[str]] = [
-        (element, circular, _cm(radius_m), f"{_ADJUSTED}; corners of {in_words(len(judged), 'marking')}{without}")
+        (
+            element,
+            circular,
+            _cm(radius_m),
+            f"{_ADJUSTED}; corners of {in_words(len(judged), 'marking')}{without}",
+        )
     ]
     checked_m = _checked_m(facts)
     if len(checked_m):
@@ -47,7 +52,9 @@ def _absolute(facts: Facts) -> list[Sequence[str]]:
     else:
         rows.append((element, "RMSEP at check points", _NOT_EVALUATED, "no check points were surveyed"))
     if facts.truth is not None and "corner_rmse_m" in facts.best:
-        rows.append((element, "RMSEP", _cm(float(facts.best["corner_rmse_m"])), "against the rendered site’s truth"))
+        rows.append(
+            (element, "RMSEP", _cm(float(facts.best["corner_rmse_m"])), "against the rendered site’s truth")
+        )
     return rows
 
 
@@ -60,7 +67,7 @@ def _checked_m(facts: Facts) -> np.ndarray:
         except ValueError:
             continue
     values_m = np.array(distances)
-    return values_m[np.isfinite(values_m)]
+    return np.asarray(values_m[np.isfinite(values_m)])
 
 
 def _relative(facts: Facts) -> list[Sequence[str]]:
@@ -74,7 +81,9 @@ def _heights(facts: Facts) -> list[Sequence[str]]:
     assert facts.hd_map is not None
     sigmas = [m.heights_sigma_m for m in facts.hd_map.markings if m.heights_sigma_m is not None]
     if not sigmas:
-        return [("Vertical accuracy", "linear error at 95 %", _NOT_EVALUATED, "the map states no heights’ errors")]
+        return [
+            ("Vertical accuracy", "linear error at 95 %", _NOT_EVALUATED, "the map states no heights’ errors")
+        ]
     error_m = TWO_SIDED_95 * float(np.sqrt(np.mean(np.square(np.concatenate(sigmas)))))
     return [("Vertical accuracy", "linear error at 95 %", _cm(error_m), _ADJUSTED)]
 
@@ -87,7 +96,9 @@ def _others(facts: Facts) -> list[Sequence[str]]:
     rendered = "against the rendered site’s truth"
     if "recall" in best and facts.truth is not None:
         omitted = number(1 - float(best["recall"]), 1, 100)
-        rows.append(("Completeness", "rate of omission", f"{omitted} %", f"{rendered}; landmarks driven past"))
+        rows.append(
+            ("Completeness", "rate of omission", f"{omitted} %", f"{rendered}; landmarks driven past")
+        )
         extra = number(best.get("false_markings"), 0)
         rows.append(("Completeness", "number of items that are no markings", extra, rendered))
     else:

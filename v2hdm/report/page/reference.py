@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -41,6 +42,11 @@ class Reference(NamedTuple):
 
 
 _LOCAL_AXES = ("east (m)", "north (m)")
+
+
+def local_reference(facts: Facts) -> Reference:
+    """The map's own frame."""
+    return reference_of(replace(facts, job=replace(facts.job, crs=LOCAL)))
 
 
 def reference_of(facts: Facts) -> Reference:
@@ -106,9 +112,11 @@ _SAME_EPOCH = 0.01  # years: four days, in which no plate moves by a millimetre
 
 
 def _vertical(hd_map: HDMap | None, origin: GeodeticOrigin | None) -> str:
-    has_heights = hd_map is not None and any(
-        feature.heights_m is not None for feature in (*hd_map.markings, *hd_map.lanes, *hd_map.symbols)
-    )
+    heights = []
+    if hd_map is not None:
+        heights += [marking.heights_m for marking in hd_map.markings]
+        heights += [lane.heights_m for lane in hd_map.lanes]
+    has_heights = any(heights_m is not None for heights_m in heights)
     if not has_heights:
         return "none: the poses have no heights, and the map lies in one plane"
     if origin is None:

@@ -148,7 +148,9 @@ def accuracy_figure(facts: Facts) -> Figure | None:
     worse = len(markings) - len(judged)
     if worse:
         verb = "is" if worse == 1 else "are"
-        note += f" {in_words(worse, 'marking')} known less well (accuracy {ACCURACIES[-1]}) {verb} not counted."
+        note += (
+            f" {in_words(worse, 'marking')} known less well (accuracy {ACCURACIES[-1]}) {verb} not counted."
+        )
     return Figure("Accuracy", number(radius_m, 1, 100), "cm", note)
 
 
