@@ -199,7 +199,12 @@ def _side_of(towards_camera: FloatArray) -> np.ndarray:
 
 
 def write_coverage(folder: Path, coverage: Coverage) -> None:
-    """Write ``coverage.json`` and its cells, ``coverage_cells.png`` (16 bits: directions, 0.1 mm, images)."""
+    """Write ``coverage.json`` and its cells, ``coverage_cells.png`` (16 bits: directions, 0.1 mm, images).
+
+    Nothing is written where no image shows ground.
+    """
+    if not coverage.views.any():
+        return
     sample = np.nan_to_num(coverage.sample_m, nan=0.0) / _STORED_M
     layers = np.stack([coverage.sectors, np.round(sample), coverage.views], axis=-1)
     cells = np.clip(layers, 0, np.iinfo(np.uint16).max).astype(np.uint16)

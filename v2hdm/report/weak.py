@@ -12,12 +12,13 @@ from scipy.spatial import cKDTree
 from v2hdm.geometry.planar import length_along, points_along
 from v2hdm.records import ACCURACIES, SIGMAS_95, FloatArray, HDMap, IntArray, Marking, Symbol
 from v2hdm.report.coverage import ENOUGH_VIEWS, Coverage
-from v2hdm.site.accuracy import corner_radii_m
+from v2hdm.site.accuracy import corner_radii_m, radius_95_m
 
 _TOGETHER_M = 12.0  # markings nearer than this to each other are driven past at once; chosen
 _NEAR_M = 8.0  # pass a marking within this: twice the lateral distance of a lane's far edge; chosen
 _FEW_IMAGES = 10  # images beyond which more of the same drive improve little, as drift is shared; chosen
-_SHARED = 0.5  # radius beside neighbours over that in the frame, below which most of the error is shared
+_SHARED = 0.5  # radius of a centre beside neighbours over that in the frame, below which most is shared
+_UNEVEN = 2.0  # radius of the worst corner over that of the best, above which an end is in doubt; chosen
 MOST_PLACES = 12  # that are listed: more are a drive of their own
 
 BESIDE_M = 4.0  # reach of ground on either side of the route that a drive should cover: a lane's width
@@ -55,7 +56,7 @@ def weak_places(hd_map: HDMap, coverage: Coverage | None, route_map: FloatArray)
         rows = np.flatnonzero(number == cluster)
         together = [features[row] for row in rows]
         radius_m = max(float(corner_radii_m(_covariance(feature)).max()) for feature in together)
-        says = _advice(together, centres[rows], radius_m, coverage, route_map)
+        says = _advice(together, centres[rows], coverage, route_map)
         places.append(Place(centres[rows].mean(axis=0), len(rows), radius_m, says))
     return tuple(sorted(places, key=lambda place: (-place.markings, -place.radius_m)))
 
@@ -72,7 +73,6 @@ def _covariance(feature: Marking | Symbol) -> FloatArray:
 def _advice(
     features: Sequence[Marking | Symbol],
     centres_map: FloatArray,
-    radius_m: float,
     coverage: Coverage | None,
     route_map: FloatArray,
 ) -> str:
@@ -88,16 +88,32 @@ def _advice(
         advice.append(f"Drive past slowly, or record more images: {images:.0f} show each marking.")
     if _is_one_sided(coverage, centres_map):
         advice.append("Pass once more in the opposite direction: all images look the same way.")
-    beside_m = [
-        SIGMAS_95 * feature.relative_sigma_m
-        for feature in features
-        if isinstance(feature, Marking) and feature.relative_sigma_m is not None
-    ]
-    if beside_m and float(np.median(beside_m)) < _SHARED * radius_m:
+    if float(np.median([_unevenness(feature) for feature in features])) > _UNEVEN:
+        advice.append("Pass on the other side, or when nothing stands there: an end was not seen clearly.")
+    elif _is_shared(features):
         advice.append("Survey a control point here, or drive on another day: the positions drift together.")
     if not advice:
         advice.append("Drive past once more, on the other side if there is room.")
     return " ".join(advice[:2])
+
+
+def _unevenness(feature: Marking | Symbol) -> float:
+    """How many times less well the worst corner is known than the best."""
+    radii_m = corner_radii_m(_covariance(feature))
+    return float(radii_m.max() / max(float(radii_m.min()), 1e-6))
+
+
+def _is_shared(features: Sequence[Marking | Symbol]) -> bool:
+    """Whether most of the error of the markings' centres is common to them and their neighbours."""
+    shares = []
+    for feature in features:
+        if not isinstance(feature, Marking) or feature.relative_sigma_m is None:
+            continue
+        corners = len(feature.corners_map)
+        mean = np.tile(np.eye(2), corners) / corners
+        centre_m = float(radius_95_m(mean @ _covariance(feature) @ mean.T))
+        shares.append(SIGMAS_95 * feature.relative_sigma_m / max(centre_m, 1e-6))
+    return bool(shares) and float(np.median(shares)) < _SHARED
 
 
 def _is_one_sided(coverage: Coverage | None, centres_map: FloatArray) -> bool:

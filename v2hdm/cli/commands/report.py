@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from contextvars import Context
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -77,10 +78,11 @@ def _write(
     from v2hdm.report.page.facts import read_cameras
 
     assert isinstance(job, Job)
-    before = read_job(folder)
+    # Contexts of their own: what is stated now replaces a file that the report has as an input.
+    before = Context().run(read_job, folder)
     now = before.with_more(job, parsed.crs)
     if now != before:
-        write_job(folder, now)
+        Context().run(write_job, folder, now)
     try:
         if drive is not None and not (folder / names.COVERAGE).is_file():
             cameras = read_cameras(folder)
@@ -93,7 +95,7 @@ def _write(
             paths.append(write_paper(folder, drive, comparison))
     except V2hdmError:
         if now != before:
-            write_job(folder, before)
+            Context().run(write_job, folder, before)
         raise
     return paths
 

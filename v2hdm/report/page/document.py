@@ -42,8 +42,8 @@ class Chart(NamedTuple):
 _RESIDUALS: Mapping[str, tuple[str, str]] = {
     "histogram": (
         "Reprojection errors",
-        "Left: in pixels. Right: in the detector’s stated standard deviations. A curve left of the grey "
-        "line means that corners are better than stated, a long tail that some are wrong.",
+        "Left: in pixels. Right: in the detector’s stated standard deviations. A curve left of the "
+        "grey line means that corners are better than stated, a long tail that some are wrong.",
     ),
     "field": (
         "Over the image",
@@ -52,14 +52,15 @@ _RESIDUALS: Mapping[str, tuple[str, str]] = {
     ),
     "range": (
         "Over range",
-        "In the image, near corners scatter more because a centimetre covers more pixels; a rise at long range "
-        "would mean a wrong pitch or lens model. On the ground, residuals grow with range because a distant "
-        "pixel covers more of it. The map averages many sightings and is more precise than each.",
+        "In the image, near corners scatter more because a centimetre covers more pixels; a rise at long "
+        "range would mean a wrong pitch or lens model. On the ground, residuals grow with range because a "
+        "distant pixel covers more of it. The map averages many sightings and is more precise than each.",
     ),
     "route": (
         "Along the route",
-        "Above: a stretch that stands out has poor images or wrong poses. Below: the correction of the "
-        "recorded poses with its 95 % band; it should drift within the receiver’s noise and never jump.",
+        "Above: a stretch that stands out has poor images or wrong poses. Below: the "
+        "correction of the recorded poses with its 95 % band; it should drift within the receiver’s noise "
+        "and never jump.",
     ),
 }
 """Title and caption of the charts of residuals, by the name of each."""
