@@ -19,7 +19,7 @@ _NEAR_M = 8.0  # pass a marking within this: twice the lateral distance of a lan
 _FEW_IMAGES = 10  # images beyond which more of the same drive improve little, as drift is shared; chosen
 _SHARED = 0.5  # radius of a centre beside neighbours over that in the frame, below which most is shared
 _UNEVEN = 2.0  # radius of the worst corner over that of the best, above which an end is in doubt; chosen
-MOST_PLACES = 12  # that are listed: more are a drive of their own
+MOST_PLACES = 10  # that are listed: more are a drive of their own
 
 BESIDE_M = 4.0  # reach of ground on either side of the route that a drive should cover: a lane's width
 _STEP_M = 1.0  # distance along the route of the places that are looked at
