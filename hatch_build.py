@@ -1,4 +1,4 @@
-"""Compiles the detector's kernels into the wheel, where a compiler is there; without one numpy does the work.
+"""Compiles kernels into the wheel, where a compiler is there; without one numpy and numba do the work.
 
 ``python hatch_build.py`` compiles them in place.
 """

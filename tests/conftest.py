@@ -8,6 +8,7 @@ from tests.ports import rendered as rendered
 from tests.ports import short_drive as short_drive
 from tests.ports import small_drive as small_drive
 from tests.ports import small_mapped as small_mapped
+from tests.ports import survey as survey
 from tests.ports import tiny_drive as tiny_drive
 from v2hdm.native import SWITCH, _loaded, kernels
 

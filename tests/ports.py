@@ -11,8 +11,9 @@ import pytest
 from tests.drive.example import description
 from v2hdm.executor import HERE
 from v2hdm.pipeline.config import DriveConfig, RunConfig
-from v2hdm.simulate.port.config import PortConfig, RouteConfig, YardConfig
+from v2hdm.simulate.port.config import PortConfig, RouteConfig, SurveyConfig, YardConfig
 from v2hdm.simulate.port.drive import rendered_drive
+from v2hdm.simulate.survey.drive import simulated_drives
 
 ROUTE = [[20.0, 0.0], [16.0, 70.0], [10.0, 0.0]]
 """A straight, a bend and a straight, as [metres, degrees to the left]."""
@@ -87,6 +88,13 @@ def small_drive(rendered: Callable[[PortConfig], Path]) -> Path:
 def tiny_drive(rendered: Callable[[PortConfig], Path]) -> Path:
     """A drive like that through :func:`small_port`, of 13 images: for tests of all but the map's quality."""
     return rendered(small_port(route=RouteConfig(pieces=TINY_ROUTE, image_spacing_m=2.0)))
+
+
+@pytest.fixture(scope="session")
+def survey(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ...]:
+    """Two drives along 80 m of street, there and back, as detections: folders to be read only."""
+    port = PortConfig(name="street", seed=5, survey=SurveyConfig(length_km=0.12))
+    return simulated_drives(port, tmp_path_factory.mktemp("survey"), HERE, lambda done, total: None)
 
 
 @pytest.fixture(scope="session")

@@ -233,6 +233,12 @@ class LossConfig:
     dice: Annotated[float, NOT_NEGATIVE, "weight of the Dice loss of the paint."] = 0.5
     kinds: Annotated[float, NOT_NEGATIVE, "weight of the class of paint."] = 1.0
     lanes: Annotated[float, NOT_NEGATIVE, "weight of the lanes."] = 1.0
+    kept: Annotated[
+        float,
+        NOT_NEGATIVE,
+        "weight of what start says of classes, while only the heads that name them learn, where no label "
+        "says otherwise.",
+    ] = 2.0
     lane_weight: Annotated[float, NOT_NEGATIVE, _PAINT_WEIGHT_AND_LANE_WEIGHT] = 3.0
 
 
@@ -282,6 +288,11 @@ class TrainConfig:
         "In the first head_updates only the heads that name classes learn, ten times as fast: those of new "
         "classes catch up before what they read is changed.",
     ] = 0
+    only_classes: Annotated[
+        list[str] | None,
+        "In the first head_updates only the channels of these classes learn, if any are named: those of other "
+        "classes, paint and lanes stay what start says.",
+    ] = None
     ema_updates: Annotated[
         int,
         COUNT,
@@ -313,6 +324,11 @@ def check_training(config: TrainConfig) -> None:
     check_settings(config)
     if config.minutes is None and config.steps is None:
         raise ConfigError("the training has no end: set minutes= or steps=")
+    if config.only_classes is not None and not (config.start and config.head_updates):
+        raise ConfigError(
+            "only_classes names classes that heads learn alone: set start= and head_updates=, too, or leave "
+            "it out"
+        )
     if len(config.net.widths) != _LEVELS or not config.net.dilations:
         raise ConfigError(
             f"net.widths has {len(config.net.widths)} entries: give {_LEVELS}, and some dilations"

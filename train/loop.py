@@ -27,11 +27,13 @@ from train.checkpoint import (
 from train.config import TrainConfig, check_training
 from train.data import Pair, training_batches, validation_pairs
 from train.distributed import Team, choose_device, has_bfloat16
-from train.growth import CLASS_HEADS
+from train.growth import CLASS_CHANNELS, CLASS_HEADS
 from train.labels import VALIDATION, read_labels
-from train.losses import total_loss
+from train.losses import kept_loss, total_loss
 from train.metrics import Score, Tally
 from train.targets import Targets
+from v2hdm.errors import ConfigError
+from v2hdm.safe.texts import shown
 
 _HEADS_FASTER = 10.0
 """Heads that learn alone take steps so many times as large: the rest cannot be torn about."""
@@ -70,6 +72,8 @@ class Trainer:
         self.optimizer = torch.optim.AdamW(self.net.parameters(), weight_decay=config.weight_decay)
         if self.state.model:
             self._restore()
+        self._before = self._started_from() if config.start and self._heads_alone() else None
+        self._stays = self._rows_that_stay()
         self._team.follow([*self.net.state_dict().values(), *self.averaged.module.state_dict().values()])
 
     def run(self) -> Checkpoint:
@@ -123,6 +127,35 @@ class Trainer:
         if self.state.optimizer:
             self.optimizer.load_state_dict(self.state.optimizer)
 
+    def _started_from(self) -> MarkingNet:
+        """The network that this run started from: heads that learn alone keep to its classes."""
+        start = MarkingNet(self.config.net, len(self.state.catalogue.names)).to(self.device)
+        start.load_state_dict(fresh_checkpoint(self.config).averaged)
+        return start.eval()
+
+    def _rows_that_stay(self) -> Tensor | None:
+        """Which classes' channels (K,) stay while the heads learn alone; None where none has to.
+
+        Raises:
+            ConfigError: The network has no such class.
+        """
+        only = self.config.only_classes
+        if only is None:
+            return None
+        names = self.state.catalogue.names
+        for name in only:
+            if name not in names:
+                raise ConfigError(f"only_classes: no class {shown(name)}; choose from: {', '.join(names)}")
+        return torch.tensor([name not in only for name in names], device=self.device)
+
+    @torch.no_grad()
+    def _put_back(self, before: MarkingNet, stays: Tensor) -> None:
+        """Undo what an update did to the channels of classes that stay."""
+        known = dict(before.named_parameters())
+        for name, parameter in self.net.named_parameters():
+            if name in CLASS_CHANNELS:
+                parameter[stays] = known[name][stays]
+
     def _share(self) -> float:
         """How much of the run has passed, 0 to 1."""
         config = self.config
@@ -131,9 +164,9 @@ class Trainer:
         return max(by_time, by_step)
 
     def _learning_rate(self) -> float:
-        if self._heads_alone():
-            return _HEADS_FASTER * self.config.learning_rate
         share = min(self._share(), 1.0)
+        if self._heads_alone():
+            return _HEADS_FASTER * self.config.learning_rate * 0.5 * (1 + math.cos(math.pi * share))
         warmup = self.config.warmup
         if share < warmup:
             return self.config.learning_rate * (0.05 + 0.95 * share / warmup)
@@ -148,7 +181,8 @@ class Trainer:
         alone = self._heads_alone()
         self.net.train(not alone)
         for name, parameter in self.net.named_parameters():
-            parameter.requires_grad_(not alone or name.startswith(CLASS_HEADS))
+            of_heads = name in CLASS_CHANNELS if self._stays is not None else name.startswith(CLASS_HEADS)
+            parameter.requires_grad_(not alone or of_heads)
 
     def _average(self, averaged: Any, current: Any, count: Any) -> None:
         """Move averaged weights towards the current ones, the farther the fewer updates there were.
@@ -168,6 +202,10 @@ class Trainer:
             prediction = self.net(image)
         prediction = Prediction(*(output.float() for output in prediction))
         loss = total_loss(prediction, targets, self.config.loss)
+        if self._before is not None and self._heads_alone():
+            with torch.inference_mode():
+                before = self._before(image).kinds
+            loss = loss + self.config.loss.kept * kept_loss(prediction.kinds, before, prediction.paint, targets)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         # Statistics of the normalisations are averaged, too: each member has seen its own images only.
@@ -177,6 +215,8 @@ class Trainer:
         self._team.average([*gradients, *statistics, loss])
         nn.utils.clip_grad_norm_(self.net.parameters(), 5.0)
         self.optimizer.step()
+        if self._before is not None and self._stays is not None and self._heads_alone():
+            self._put_back(self._before, self._stays)
         self.averaged.update_parameters(self.net)
         self.state.step += 1
         step, renders = self._resumed_at

@@ -16,6 +16,9 @@ from models import Prediction
 from train.config import LossConfig
 from train.targets import IGNORE, Targets
 
+_BARE_WORTH = 0.1
+"""What a cell is worth that is taken for paint and bare: as much as one of a marking of 100 cells. Chosen."""
+
 
 def total_loss(prediction: Prediction, targets: Targets, config: LossConfig) -> Tensor:
     """The weighted sum of the terms, a scalar."""
@@ -69,6 +72,32 @@ def kind_loss(logits: Tensor, labels: Tensor, weight: Tensor) -> Tensor:
     weight = weight * _rarity(cells, weight, logits.shape[1]).clamp(max=6.0)[cells]
     loss = cross_entropy(logits.movedim(1, -1)[is_labelled], cells, reduction="none")
     return (weight * loss).sum() / weight.sum()
+
+
+def kept_loss(logits: Tensor, before: Tensor, paint: Tensor, targets: Targets) -> Tensor:
+    """How far the classes of paint have moved from those before, where no label says otherwise.
+
+    It is the mean Kullback-Leibler divergence from the earlier network's classes (Li and Hoiem, "Learning
+    without Forgetting", ECCV 2016) over the cells that the network takes for paint and that are bare by the
+    labels, or of the class that it gave them before.
+
+    Args:
+        logits: Of the classes, (B, K, H, W).
+        before: The same of the earlier network.
+        paint: Log odds of paint, (B, 1, 2H, 2W).
+        targets: The answers; paint of a class that nobody knows carries no loss.
+    """
+    is_seen = max_pool2d(paint, 2)[:, 0] > 0
+    is_bare = max_pool2d(targets.paint.float()[:, None], 2)[:, 0] == 0
+    agrees = targets.kinds == before.argmax(dim=1)
+    kept = is_seen & (agrees | (is_bare & (targets.kinds == IGNORE)))
+    if not kept.any():
+        return logits.sum() * 0
+    log_share = logits.movedim(1, -1)[kept].log_softmax(-1)
+    log_share_before = before.movedim(1, -1)[kept].log_softmax(-1)
+    divergence = (log_share_before.exp() * (log_share_before - log_share)).sum(-1)
+    worth = torch.where(agrees, targets.kind_weight, _BARE_WORTH)[kept]
+    return (worth * divergence).sum() / worth.sum()
 
 
 def rare_paint(kinds: Tensor, weight: Tensor) -> Tensor:

@@ -39,9 +39,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--keep",
         nargs="+",
-        choices=("judge", "lane_score"),
+        choices=("network", "judge", "lane_score"),
         default=(),
-        help="files of the folder that are kept instead of fitted anew",
+        help="files of the folder that are kept instead of fitted anew; of the network all but its classes",
     )
     parser.add_argument("--judge-images", type=int, default=1650, help="renders that the judge learns from")
     parser.add_argument("--lane-images", type=int, default=450, help="renders for the score of lanes")

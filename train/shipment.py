@@ -15,9 +15,11 @@ from pathlib import Path
 import cv2
 from rich.console import Console
 
+from export.class_rows import add_classes
 from export.config import ExportConfig, Precision
 from export.console import run as export
 from export.manifest import record
+from export.source import read_source
 from train import fit_judge, fit_lane_score
 from train.bar import Share, share_of_work
 from train.checkpoint import load_checkpoint
@@ -34,6 +36,7 @@ _ROOT = Path(__file__).resolve().parents[1]
 _CODE = ("v2hdm", "models", "train", "export")
 _FLOAT_FILE = _ROOT / "models" / "marking_net.onnx"
 _KEPT_FILES = {
+    "network": (weights.NETWORK_FILE.name,),
     "judge": (weights.JUDGE_FILE.name, weights.CONFIDENCE_FILE.name),
     "lane_score": (weights.LANE_SCORE_FILE.name,),
 }
@@ -74,6 +77,11 @@ class Order:
         return self.into or weights.FOLDER
 
     @property
+    def float_file(self) -> Path:
+        """Where the network of float32 goes."""
+        return _FLOAT_FILE if self.into is None else self.into / _FLOAT_FILE.name
+
+    @property
     def command(self) -> str:
         """The command that this is, without folders of this machine: users read it in the manifest."""
         source = self.source.resolve()
@@ -95,7 +103,7 @@ def ship(order: Order, tell: Share) -> Path:
     _check(order)
     folder = Path("runs") / f"ship-{_state(order)}"
     folder.mkdir(parents=True, exist_ok=True)
-    for name in (file for kept in order.keep for file in _KEPT_FILES[kept]):
+    for name in (file for kept in order.keep for file in _KEPT_FILES[kept] if kept != "network"):
         _copy(order.folder / name, folder / name)
     _export(order, folder, tell)
     if not (folder / weights.JUDGE_FILE.name).is_file():
@@ -105,9 +113,8 @@ def ship(order: Order, tell: Share) -> Path:
     tell(_LANES_SEEN, "putting the files in place")
     record(list(weights.COMMANDS), order.command, folder)
     weights.check_weights(folder)
-    float_file = _FLOAT_FILE if order.into is None else order.into / _FLOAT_FILE.name
     if (folder / _FLOAT_FILE.name).is_file():
-        _copy(folder / _FLOAT_FILE.name, float_file)
+        _copy(folder / _FLOAT_FILE.name, order.float_file)
     for name in (*weights.COMMANDS, weights.MANIFEST_FILE.name):
         _copy(folder / name, order.folder / name)
     shutil.rmtree(folder)
@@ -128,6 +135,8 @@ def _check(order: Order) -> None:
     for option, images in (("judge", order.judge_images), ("lane", order.lane_images)):
         if images < _LEAST_IMAGES:
             raise ConfigError(f"--{option}-images {images}: give {_LEAST_IMAGES} or more")
+    if "network" in order.keep and order.precision != Precision.int8.value:
+        raise ConfigError("--keep network keeps a rounded file: leave out --precision, or --keep network")
     for name in (file for kept in order.keep for file in _KEPT_FILES[kept]):
         if not (order.folder / name).is_file():
             raise ConfigError(f"{order.folder / name}: no such file to keep; leave out --keep to fit it")
@@ -155,6 +164,10 @@ def _export(order: Order, folder: Path, tell: Share) -> None:
         return
     tell(0.0, "exporting the network")
     export(ExportConfig(checkpoint=str(source), output=str(folder / _FLOAT_FILE.name)))
+    if "network" in order.keep:
+        tell(_EXPORTED, "adding the network's classes to the rounded file")
+        add_classes(order.folder / weights.NETWORK_FILE.name, order.float_file, read_source(source), network)
+        return
     config = ExportConfig(checkpoint=str(source), output=str(network), precision=Precision[order.precision])
     print(export(config, lambda share, doing: tell(_EXPORTED * share, f"exporting the network: {doing}")))
 

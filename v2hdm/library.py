@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from v2hdm.doors import check_types, checked
 from v2hdm.errors import MapFileError
 from v2hdm.executor import open_executor
-from v2hdm.io.drive import as_drive, read_drive
+from v2hdm.io.drive import as_drive, join_drives, read_drive
 from v2hdm.io.maps.reading import read_map as _read
 from v2hdm.progress import Steps
 from v2hdm.records import Drive, HDMap, ImageDetections
@@ -133,7 +133,8 @@ def simulate_port(
         progress: called as ``progress(done, total)`` images.
 
     Returns:
-        The drive, read from there. Its truth is for evaluation only; mapping never looks at it.
+        The drive, read from there; those of a survey as one. Its truth is for evaluation only; mapping never
+        looks at it.
 
     Raises:
         ConfigError: the settings make no port.
@@ -143,13 +144,14 @@ def simulate_port(
     >>> drive.name, list(drive.cameras), len(drive.images)
     ('port', ['front'], 22)
     """
-    from v2hdm.simulate.port.drive import rendered_drive
+    from v2hdm.simulate.survey.drive import simulated_drives
 
     config = config or _short_port()
     check_types(config, "config.")
     steps = progress or (lambda done, total: None)
     with open_executor(workers) as executor:
-        return read_drive(rendered_drive(config, Path(folder), executor, steps))
+        folders = simulated_drives(config, Path(folder), executor, steps)
+    return join_drives([read_drive(drive) for drive in folders])
 
 
 def _short_port() -> PortConfig:

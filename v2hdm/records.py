@@ -228,6 +228,10 @@ class Road:
     slope: FloatArray  # (P, 2) by x and y
 
 
+DETECTIONS_SUFFIX = ".json"
+"""Suffix of a file of detections, which stands for an image whose picture was not kept."""
+
+
 @dataclass(frozen=True)
 class Image:
     """One image of a drive."""
@@ -277,6 +281,11 @@ class Drive:
     listed_s: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     reception: Reception | None = None  # None where the poses come from no receiver's log
     joined: tuple[Session, ...] = ()  # its sessions, if several: then it has no trajectory
+
+    @property
+    def has_pictures(self) -> bool:
+        """Whether its images are pictures; else they are files of what was detected in them."""
+        return not any(image.path.suffix == DETECTIONS_SUFFIX for image in self.images)
 
     def name_of(self, path: Path) -> str:
         """Name an image as files of results do: its path below the drive's folder, else its whole path."""

@@ -108,9 +108,10 @@ def test_a_solve_refuses_kernels_that_minimise_something_else(monkeypatch, pose_
 
 
 def test_torchs_engine_needs_no_kernel(monkeypatch):
-    """Where numba is missing, too."""
+    """Where neither C++ nor numba compiles one."""
     program = """
-import sys
+import os, sys
+os.environ["V2HDM_NATIVE"] = "0"
 sys.modules["numba"] = None
 from tests.adjust.scene import make_scene
 from v2hdm.adjust import SolveOptions, solve

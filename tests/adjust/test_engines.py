@@ -10,9 +10,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.adjust.scene import HEIGHT, make_scene, with_late_clocks
-from v2hdm.adjust import ControlPoints, Drift, KnownLengths, PoseSigma, SolveOptions, Status, model, solve
+from v2hdm import native
+from v2hdm.adjust import (
+    ControlPoints,
+    Drift,
+    KnownLengths,
+    PoseSigma,
+    SolveOptions,
+    Status,
+    model,
+    reduced,
+    solve,
+)
 from v2hdm.adjust.descent import Objective
-from v2hdm.adjust.engine import Pairs, TorchEngine, View
+from v2hdm.adjust.engine import WEIGHT_FLOOR, Pairs, TorchEngine, View
 from v2hdm.adjust.engines import make_engine
 from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.model import Estimate, Loss
@@ -20,9 +31,22 @@ from v2hdm.adjust.problem import LOSSES, POSE_STATES
 from v2hdm.adjust.reduced import ReducedSystem
 from v2hdm.adjust.whitening import factorise
 from v2hdm.faults.score_tests import score_faults
+from v2hdm.geometry.tensors import NEAR_M
 
 POSES = PoseSigma(position_drift=Drift(0.01, 10.0), roll_pitch_drift=Drift(0.003, 2.0))
 MODELS = [((), False), ((), True), (("roll", "pitch"), True), (POSE_STATES, False), (POSE_STATES, True)]
+
+
+@pytest.fixture(params=["C++", "numba"], scope="module", autouse=True)
+def compiler(request):
+    """What has compiled the kernels."""
+    if request.param == "C++":
+        if native.kernels() is None:
+            pytest.skip(native.which_runs())
+        yield
+        return
+    with native.numpy_alone():
+        yield
 
 
 def example(*, lengths=True, rolling=False, frames=40, seed=3):
@@ -287,6 +311,28 @@ def test_residuals_and_gradients_of_a_solve_by_torch_are_those_of_kornia(monkeyp
     for one in evaluated:
         assert min(one[name] for name in ("transform_points", "project_points", "exp")) > 0
     assert calls["project_points"] > len(evaluated)
+
+
+def test_constants_of_the_kernels_in_cpp_are_those_of_python():
+    if native.kernels() is None:
+        pytest.skip(native.which_runs())
+    assert native.kernels().adjust.CONSTANTS == {
+        "NEAR_M": NEAR_M,
+        "WEIGHT_FLOOR": WEIGHT_FLOOR,
+        "CORNER_FLOOR": reduced.CORNER_FLOOR,
+        "PIVOT_FLOOR": reduced.PIVOT_FLOOR,
+        "MIN_DEPRESSION_SINE": model.MIN_DEPRESSION_SINE,
+    }
+
+
+def test_kernels_in_cpp_refuse_arrays_of_another_shape_or_type():
+    if native.kernels() is None:
+        pytest.skip(native.which_runs())
+    gather = native.kernels().adjust.gather
+    with pytest.raises(ValueError, match="parts: of another shape"):
+        gather(np.zeros(3, np.int32), np.zeros((2, 6)), np.zeros((4, 6)))
+    with pytest.raises(ValueError, match="out: of another type"):
+        gather(np.zeros(2, np.int32), np.zeros((2, 6)), np.zeros((4, 6), np.float32))
 
 
 def test_score_tests_are_the_same_by_either_engine():

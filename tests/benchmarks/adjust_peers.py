@@ -3,8 +3,9 @@
 ``python -m tests.benchmarks.adjust_peers [observations ...] [--threads N] [--rounds N] [--states]`` prints
 time (wall, and CPU for a machine that is busy otherwise: the least of several rounds, in which the solvers
 take turns), final cost and the ratio to *native Ceres*: a program of our own with analytic derivatives,
-written for this very problem (``native_ceres/``), of whose linear solvers the fastest counts, and of whose
-time that of ``ceres::Solve`` alone. Ours is all of ``solve()``, with checks, layout and report.
+written for this very problem (``native_ceres/``), of whose linear solvers and forms (a residual block for
+each observation, or *batched*: one for all observations of a corner by a camera) the fastest counts, and of
+whose time that of ``ceres::Solve`` alone. Ours is all of ``solve()``, with checks, layout and report.
 
 The other peers are slower and solve once: Ceres through pyceres with pycolmap's compiled cost functions and
 GTSAM (the extra ``bench``), and SciPy's trust region, which knows the Jacobian's sparsity and is left out
@@ -102,7 +103,8 @@ def ours(problem: Problem, options: SolveOptions, name: str) -> Row:
 def native(problem: Problem, options: NativeOptions) -> Row:
     """Native Ceres with analytic derivatives."""
     found = solve_native(problem, options)
-    name = f"native Ceres, {options.linear_solver}"
+    form = "batched" if options.is_batched else "single"
+    name = f"native Ceres, {form}, {options.linear_solver}"
     note = f"{found.steps} steps, {found.ended.lower()}"
     return Row(name, found.setup_s, found.solve_s, found.cpu_s, found.cost, note)
 
@@ -173,8 +175,10 @@ def in_turn(problem: Problem, states: bool, threads: int, rounds: int) -> list[R
         rows.append(ours(problem, options, "ours"))
         if build()[0] is not None:
             for name in POSE_SOLVERS if states else PAPER_SOLVERS:
-                asked = NativeOptions(frame_poses=states, threads=threads, linear_solver=name)
-                rows.append(native(problem, asked))
+                # A batch has no poses of frames.
+                for is_batched in (False,) if states else (False, True):
+                    wanted = NativeOptions(states, 0.0, threads, name, is_batched=is_batched)
+                    rows.append(native(problem, wanted))
     names = dict.fromkeys(row.name for row in rows)
     return [min((row for row in rows if row.name == name), key=lambda row: row.cpu_s) for name in names]
 
@@ -199,7 +203,7 @@ def show(rows: list[Row]) -> None:
         ratio = "" if peer is None else f"{row.cpu_s / peer.cpu_s:6.3f} x native Ceres' CPU time "
         ratio += "" if peer is None else f"({row.solve_s / peer.solve_s:6.3f} x its wall time)  "
         print(
-            f"  {row.name:31s} {ratio}solve {row.solve_s:8.4f} s, {row.cpu_s:8.4f} s CPU  "
+            f"  {row.name:37s} {ratio}solve {row.solve_s:8.4f} s, {row.cpu_s:8.4f} s CPU  "
             f"cost above the least {row.cost / least - 1:7.1e}  {row.note}",
             flush=True,
         )

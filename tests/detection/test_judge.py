@@ -20,7 +20,18 @@ from v2hdm.detection.quads.blobs import Blob
 from v2hdm.detection.quads.propose import open_sides, propose
 from v2hdm.detection.weights import CONFIDENCE_FILE, JUDGE_FILE
 from v2hdm.geometry.planar import order_corners
-from v2hdm.records import ARROW, CHEVRON, DIAMOND, LANE_DASH, LANE_LINE, OTHER_PAINT, STOP_LINE
+from v2hdm.records import (
+    ARROW,
+    BICYCLE,
+    BOX,
+    CHEVRON,
+    DIAMOND,
+    LANE_DASH,
+    LANE_LINE,
+    OTHER_PAINT,
+    STOP_LINE,
+    TEXT,
+)
 
 CATALOGUE = load_catalogue()
 VIEW = RoadCamera(make_camera("plumb_bob"), 16)
@@ -60,6 +71,15 @@ def test_all_classes_with_four_corners_that_are_not_negligible_go_to_the_judge(s
 def test_the_shares_of_the_classes_add_up_to_one():
     share = proposal_of(STRIP, {LANE_DASH: 0.5, LANE_LINE: 0.3, ARROW: 0.1}).share
     assert sum(share.values()) == pytest.approx(1.0)
+
+
+def test_an_arrow_is_as_likely_whatever_other_symbols_the_network_tells_apart():
+    shape = bar(8.0, 0.0, 4.0, 0.9)
+    before = dict.fromkeys((DIAMOND, LANE_DASH, LANE_LINE, STOP_LINE, CHEVRON, OTHER_PAINT), 0.02) | {ARROW: 0.6}
+    few = proposal_of(shape, before)
+    many = proposal_of(shape, before | dict.fromkeys((TEXT, BOX, BICYCLE), 0.0))
+    assert many.share[ARROW] == pytest.approx(few.share[ARROW], abs=0.01)
+    assert many.symbol_score(ARROW) == pytest.approx(few.symbol_score(ARROW), abs=0.01)
 
 
 @pytest.mark.parametrize("shape", [RHOMBUS, STRIP, bar(6.0, 1.0, 0.4, 3.0)])

@@ -13,8 +13,9 @@ from tests.drive.example import make_map
 from v2hdm.errors import MapFileError, V2hdmError
 from v2hdm.io.maps.formats import write_csv
 from v2hdm.io.maps.geojson import write_geojson
+from v2hdm.io.maps.landxml import write_landxml
+from v2hdm.io.maps.opendrive import write_opendrive
 from v2hdm.io.maps.reading import read_geojson
-from v2hdm.io.maps.road_xml import write_landxml, write_opendrive
 from v2hdm.records import GeodeticOrigin, HDMap, Lane
 from v2hdm.store.files import csv_text, read_csv, xml_text
 from v2hdm.surface import strips

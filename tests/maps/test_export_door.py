@@ -1,5 +1,6 @@
 """``v2hdm export``: calibrations in the forms of other tools, and what a user may get wrong."""
 
+import json
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 
@@ -9,6 +10,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
+from examples.lanes.site import made_site
 from tests.docs.blocks import blocks
 from tests.drive.example import camera_info, looking_forward
 from tests.maps.gis import street
@@ -22,6 +24,7 @@ from v2hdm.io.maps.formats import FORMATS
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.maps.geopackage import write_geopackage
 from v2hdm.io.maps.reading import read_geojson, read_map, read_verdict
+from v2hdm.io.trajectory import write_tum
 from v2hdm.records import Calibration, CameraFrames
 
 VERDICT = {"status": "PASS"}
@@ -228,3 +231,66 @@ def test_a_calibration_keeps_its_drive_and_date_in_its_file(tmp_path):
     np.testing.assert_array_equal(read_calibration(path).cam_from_vehicle, CALIBRATION.cam_from_vehicle)
     write_calibration(CALIBRATION, path)
     assert read_provenance(path) == Provenance()
+
+
+def test_paths_beside_the_map_or_named_say_where_lanes_lead(tmp_path, monkeypatch, capsys):
+    site = made_site()
+    write_geojson(site.hd_map, tmp_path / "map.geojson", VERDICT)
+    for number, trajectory in enumerate(site.trajectories):
+        write_tum(trajectory, tmp_path / f"trajectory_{number}.tum")
+    monkeypatch.chdir(tmp_path)
+    assert run(["export", "map.geojson", "--format", "opendrive", "--output", "all"]) == 0
+    assert "questions" in capsys.readouterr().out
+    named = ["--path", "trajectory_0.tum", "--output", "one"]
+    assert run(["export", "map.geojson", "--format", "opendrive", *named]) == 0
+    counts = [
+        len(ET.parse(tmp_path / folder / "map.xodr").getroot().findall("junction/connection"))
+        for folder in ("all", "one")
+    ]
+    assert counts[0] == 18
+    assert counts[1] < 8
+
+
+def test_a_path_far_from_the_map_is_one_line(tmp_path, monkeypatch, capsys):
+    site = made_site(drives=(0,))
+    write_geojson(site.hd_map, tmp_path / "map.geojson", VERDICT)
+    (trajectory,) = site.trajectories
+    far = trajectory.map_from_vehicle.copy()
+    far[:, 0, 3] += 5000.0
+    write_tum(replace(trajectory, map_from_vehicle=far), tmp_path / "far.tum")
+    monkeypatch.chdir(tmp_path)
+    assert run(["export", "map.geojson", "--format", "lanelet2", "--path", "far.tum"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "far.tum: no pose is near a lane of the map" in line
+    assert run(["export", "map.geojson", "--format", "csv", "--path", "far.tum"]) == 2
+    assert "--path" in capsys.readouterr().err
+
+
+def answered(folder, source, answer):
+    """The file of questions with an answer to each of those about ways."""
+    content = yaml.safe_load((folder / source).read_text())
+    for feature in content["features"]:
+        if feature["properties"]["subject"] == "connection":
+            feature["properties"]["answer"] = answer
+    (folder / "answers.geojson").write_text(json.dumps(content))
+
+
+def test_questions_that_were_answered_in_their_file_are_followed(tmp_path, monkeypatch, capsys):
+    site = made_site()
+    write_geojson(site.hd_map, tmp_path / "map.geojson", VERDICT)
+    for number, trajectory in enumerate(site.trajectories):
+        write_tum(trajectory, tmp_path / f"trajectory_{number}.tum")
+    monkeypatch.chdir(tmp_path)
+    assert run(["export", "map.geojson", "--format", "opendrive"]) == 0
+    answered(tmp_path, "map_questions.geojson", "yes")
+    again = ["export", "map.geojson", "--format", "opendrive"]
+    assert run([*again, "--answers", "map_questions.geojson"]) == 2  # the answers would be lost
+    assert "map_questions.geojson would be overwritten" in capsys.readouterr().err
+    assert run([*again, "--answers", "answers.geojson", "--output", "answered"]) == 0
+    root = ET.parse(tmp_path / "answered" / "map.xodr").getroot()
+    assert len(root.findall("junction/connection")) == 18 + 8
+    answered(tmp_path, "map_questions.geojson", "yes")
+    text = (tmp_path / "answers.geojson").read_text().replace('"connection"', '"colour"')
+    (tmp_path / "answers.geojson").write_text(text)
+    assert run([*again, "--answers", "answers.geojson", "--output", "there"]) == 2
+    assert "'colour' is no subject of a question" in capsys.readouterr().err

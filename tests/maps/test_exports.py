@@ -20,11 +20,11 @@ from lanelet2.projection import LocalCartesianProjector, UtmProjector
 
 from tests.maps.gis import ORIGIN, street
 from v2hdm.errors import ConfigError
-from v2hdm.io.maps.closed_lanes import closed_lanes
 from v2hdm.io.maps.formats import FORMATS, check_formats, write_map
-from v2hdm.io.maps.lanelet2 import grid_places
+from v2hdm.io.maps.osm import grid_places
 from v2hdm.io.maps.reading import read_map
 from v2hdm.records import GeodeticOrigin, HDMap, Lane, Marking
+from v2hdm.topology.closed_lanes import closed_lanes
 
 TENTH_OF_A_MM = 1e-4
 BOTH = pytest.mark.parametrize("origin", [ORIGIN, None])

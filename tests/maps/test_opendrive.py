@@ -9,9 +9,9 @@ import pytest
 from pyproj import Proj
 
 from tests.maps.gis import ORIGIN, street
-from v2hdm.io.maps.closed_lanes import closed_lanes
 from v2hdm.io.maps.formats import write_map
 from v2hdm.records import HDMap
+from v2hdm.topology.closed_lanes import closed_lanes
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # of the reader's own libraries
 
@@ -48,21 +48,40 @@ def test_a_reader_finds_roads_between_the_lines_with_both_lines_where_they_are(t
         assert away_m(driven.boundary_line, fine).max() < 0.06
 
 
+def place_at(piece, way_m):
+    """The place (2,) and the unit direction (2,) of a planView's geometry so far along it."""
+    start = np.array([float(piece.get("x")), float(piece.get("y"))])
+    cosine, sine = np.cos(float(piece.get("hdg"))), np.sin(float(piece.get("hdg")))
+    axes = np.array([[cosine, sine], [-sine, cosine]])
+    cubic = piece.find("paramPoly3")
+    if cubic is None:
+        return start + way_m * axes[0], axes[0]
+    assert cubic.get("pRange") == "normalized"
+    u, v = (np.polynomial.Polynomial([float(cubic.get(f"{c}{axis}")) for c in "abcd"]) for axis in "UV")
+    fine = np.linspace(0.0, 1.0, 2001)
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(u(fine)), np.diff(v(fine))))])
+    p = np.interp(way_m, along, fine)
+    ahead = np.array([u.deriv()(p), v.deriv()(p)]) @ axes
+    return start + np.array([u(p), v(p)]) @ axes, ahead / np.linalg.norm(ahead)
+
+
 def corners_of(root):
     """Corners (4, 3) of objects by their ids, from the standard's definitions alone."""
-    found = {}
+    corners_of_object = {}
     for road in root.findall("road"):
-        pieces = [{k: float(v) for k, v in one.attrib.items()} for one in road.findall("planView/geometry")]
-        for one in road.findall("objects/object"):
-            s, t = float(one.attrib["s"]), float(one.attrib["t"])
-            piece = max((p for p in pieces if p["s"] <= s + 1e-6), key=lambda p: p["s"])
-            cos, sin = np.cos(piece["hdg"]), np.sin(piece["hdg"])
-            at = np.array([piece["x"], piece["y"]]) + (s - piece["s"]) * np.array([cos, sin])
-            at += t * np.array([-sin, cos])
-            corners = one.findall("outlines/outline/cornerLocal")
-            uv = np.array([[float(c.attrib["u"]), float(c.attrib["v"])] for c in corners])
-            found[int(one.attrib["id"])] = at + uv @ np.array([[cos, sin], [-sin, cos]])
-    return found
+        pieces = road.findall("planView/geometry")
+        for mark in road.findall("objects/object"):
+            s, t = float(mark.get("s")), float(mark.get("t"))
+            piece = max(
+                (piece for piece in pieces if float(piece.get("s")) <= s + 1e-6),
+                key=lambda p: float(p.get("s")),
+            )
+            place, ahead = place_at(piece, s - float(piece.get("s")))
+            axes = np.array([ahead, [-ahead[1], ahead[0]]])
+            corners = mark.findall("outlines/outline/cornerLocal")
+            uv = np.array([[float(corner.get("u")), float(corner.get("v"))] for corner in corners])
+            corners_of_object[int(mark.get("id"))] = place + t * axes[1] + uv @ axes
+    return corners_of_object
 
 
 @pytest.mark.parametrize("lanes", [3, 1, 0])

@@ -34,7 +34,7 @@ from v2hdm.detection.classifier import AMONG, COMPANIES, SHAPES
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.evidence import CHANNELS, FEATURES
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.errors import DetectorError
+from v2hdm.errors import ConfigError, DetectorError
 from v2hdm.executor import HERE, open_executor
 from v2hdm.records import ARROW, DIAMOND, LANE_DASH
 
@@ -379,6 +379,27 @@ def test_judge_and_lane_score_can_be_kept_for_a_network_that_was_exported_before
     shipped(Order(source=network, into=into, keep=("judge", "lane_score")))
     assert weights.read_manifest(into)["files"]["judge.onnx"]["command"].endswith("--keep judge lane_score")
     assert digests(into)["judge.onnx"] == after["judge.onnx"]
+
+
+def test_a_rounded_network_is_kept_but_for_its_classes(into, quick):
+    shutil.copy(shipment._FLOAT_FILE, into)
+    before = digests(into)
+    every = ("network", "judge", "lane_score")
+    shipped(Order(source=shipment._FLOAT_FILE, into=into, keep=every))
+    after = digests(into)
+    assert {name for name in before if before[name] != after[name]} <= {
+        "default.onnx", "marking_net.onnx", "manifest.json",
+    }  # fmt: skip
+    stored = [
+        {t.name: t.SerializeToString() for t in onnx.load(path).graph.initializer}
+        for path in (weights.NETWORK_FILE, into / "default.onnx")
+    ]
+    assert stored[0] == stored[1]
+
+
+def test_a_network_that_stays_rounded_cannot_become_float32(into):
+    with pytest.raises(ConfigError, match="leave out --precision, or --keep network"):
+        shipped(Order(source=weights.NETWORK_FILE, into=into, keep=("network",), precision="float32"))
 
 
 @pytest.mark.parametrize(

@@ -7,10 +7,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from tests.benchmarks.photographs import covered, joined
-from tests.train.small import coco, tiny
-from train.config import DataConfig, LabelError
+from tests.train.small import coco, tiny, train
+from train.config import DataConfig, LabelError, LossConfig
 from train.examples import photograph
 from train.label_hints import with_hints
 from train.labels import Favour, Place, paint_labels, read_labels
@@ -19,6 +20,7 @@ from train.labels_tone import log_light, tone_of
 from train.loop import Trainer
 from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.detection.camera import RoadCamera, camera_from_calibration, rough_calibration
+from v2hdm.errors import ConfigError
 from v2hdm.geometry.ipm import apply_homography
 from v2hdm.records import ARROW, CROSSWALK_BAR, LANE_DASH, LANE_LINE, STOP_LINE, TEXT
 
@@ -175,6 +177,54 @@ def test_the_heads_of_classes_learn_alone_at_first(tmp_path):
     trainer.config.steps = 4
     trainer.run()
     assert (trainer.net.state_dict()["stem.0.weight"] != start["stem.0.weight"]).any()
+
+
+def heads_alone(folder, **changes):
+    """A trainer whose heads learn alone from the start of a small run, and what that start says of noise."""
+    if not (folder / "first").is_dir():
+        train(tiny(folder / "first"))
+    start = str(folder / "first" / "last.pt")
+    config = replace(tiny(folder, steps=12), start=start, head_updates=12, learning_rate=1e-2)
+    return Trainer(replace(config, **changes), lambda share, line: None)
+
+
+def test_heads_that_learn_alone_keep_to_the_classes_of_their_start(tmp_path):
+    image = torch.randint(0, 256, (4, 32, 64, 3), dtype=torch.uint8)
+    moved = []
+    for kept in (0.0, 30.0):
+        trainer = heads_alone(tmp_path, output=str(tmp_path / f"kept{kept}"), loss=LossConfig(kept=kept))
+        # Paint is seen everywhere, so that the classes of bare ground are kept, too.
+        for net in (trainer.net, trainer._before):
+            torch.nn.init.constant_(net.paint.bias, 50.0)
+        before = trainer._before(image).kinds.softmax(1)
+        trainer.run()
+        moved.append((trainer.net.eval()(image).kinds.softmax(1) - before).abs().mean().item())
+    assert moved[1] < 0.5 * moved[0]
+
+
+def test_of_classes_that_learn_alone_the_others_stay(tmp_path):
+    trainer = heads_alone(tmp_path, only_classes=["text"])
+    before = trainer._before.state_dict()
+    names = trainer.state.catalogue.names
+    text = names.index("text")
+    trainer.run()
+    changed = {name for name, value in trainer.net.state_dict().items() if (value != before[name]).any()}
+    assert changed == {"kinds.weight", "kinds.bias"}
+    rows = (trainer.net.state_dict()["kinds.weight"] != before["kinds.weight"]).flatten(1).any(dim=1)
+    assert rows.tolist() == [k == text for k in range(len(names))]
+
+
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        ({"only_classes": ["letters"]}, "no class 'letters'; choose from: diamond"),
+        ({"only_classes": ["text"], "start": None}, "set start= and head_updates=, too"),
+        ({"only_classes": ["text"], "head_updates": 0}, "set start= and head_updates=, too"),
+    ],
+)
+def test_classes_that_cannot_learn_alone_are_refused(tmp_path, changes, line):
+    with pytest.raises(ConfigError, match=line):
+        heads_alone(tmp_path, **changes)
 
 
 def test_the_judge_learns_a_stop_line_as_thin_as_its_paint(tmp_path):

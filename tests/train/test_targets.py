@@ -23,7 +23,7 @@ from train.label_hints import with_hints
 from train.labels import JUDGING, LEARNT, VALIDATION, Place, held_out, paint_labels, read_labels
 from train.labels_image import ANY, PAINT_ONLY, LabelledImage, Shape
 from train.labels_raster import coverage
-from train.losses import dice_loss, kind_loss, lane_loss, paint_loss, rare_paint, total_loss
+from train.losses import dice_loss, kept_loss, kind_loss, lane_loss, paint_loss, rare_paint, total_loss
 from train.metrics import Tally
 from train.scenes.scenes import TrainingSample
 from train.targets import (
@@ -188,6 +188,41 @@ def test_a_batch_without_paint_or_lanes_has_a_finite_loss():
     nothing = torch.zeros(1, 2, 2)
     targets = Targets(none, nothing, kinds, nothing, none, nothing)
     assert torch.isfinite(lane_loss(torch.randn(1, 2, 2, 2), targets, 3.0))
+
+
+def answers_for_cells(painted, kinds):
+    """The targets of one row of cells: whether labels paint each, and its class or IGNORE."""
+    paint = torch.tensor(painted, dtype=torch.uint8).repeat_interleave(2)[None, None].repeat(1, 2, 1)
+    labels = torch.tensor([[kinds]], dtype=torch.uint8)
+    nothing = torch.zeros(1, 1, len(kinds))
+    return Targets(paint, nothing, labels, torch.ones(1, 1, len(kinds)), nothing, nothing)
+
+
+def test_what_was_said_of_classes_is_kept_where_no_label_says_otherwise():
+    before = torch.zeros(1, KINDS, 1, 6)
+    before[0, 0] = 2.0  # the first class everywhere
+    seen = torch.tensor([5.0, 5.0, 5.0, 5.0, 5.0, -5.0]).repeat_interleave(2)[None, None, None].repeat(1, 1, 2, 1)
+    # Of the same class, bare, of another class, paint of an unknown one, unknown ground, not seen as paint.
+    answers = answers_for_cells([1, 0, 1, 1, IGNORE, 0], [0, IGNORE, 1, IGNORE, IGNORE, IGNORE])
+    assert float(kept_loss(before, before, seen, answers)) == 0
+    moved = before.clone().requires_grad_()
+    with torch.no_grad():
+        moved[0, 1] += 3.0
+    loss = kept_loss(moved, before, seen, answers)
+    log_share = before[0, :, 0, 0].log_softmax(0)
+    expected = (log_share.exp() * (log_share - moved[0, :, 0, 0].log_softmax(0))).sum()
+    assert float(loss.detach()) == pytest.approx(float(expected.detach()), rel=1e-5)
+    loss.backward()
+    has_pull = (moved.grad[0].abs().sum(dim=0)[0] > 0).tolist()
+    assert has_pull == [True, True, False, False, False, False]
+    pull = moved.grad[0, 1, 0]
+    assert float(pull[0] / pull[1]) == pytest.approx(10.0, rel=1e-4), "bare cells are worth a tenth"
+
+
+def test_where_no_paint_is_seen_nothing_is_kept():
+    logits = torch.randn(1, KINDS, 1, 2)
+    nowhere = torch.full((1, 1, 2, 4), -5.0)
+    assert float(kept_loss(logits, -logits, nowhere, answers_for_cells([0, 0], [IGNORE, IGNORE]))) == 0
 
 
 def test_cells_of_no_weight_leave_the_loss_of_kinds_as_it_is():

@@ -1,4 +1,4 @@
-"""Kernels compiled meanwhile by another process, unless cached: it takes half a minute of CPU."""
+"""Kernels compiled by numba meanwhile, in another process, unless cached: it takes half a minute of CPU."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from v2hdm.adjust.covariance import corner_gain
-from v2hdm.adjust.kernels import are_compiled, kept_in
+from v2hdm.adjust.kernels import kept_in
 from v2hdm.adjust.problem import Observations, Problem, SolveOptions
 from v2hdm.adjust.solve import solve
 
@@ -23,8 +23,8 @@ _PROGRAM = "from v2hdm.adjust import ahead; ahead.compile_kernels()"
 
 @contextmanager
 def compiled_meanwhile(device: str) -> Iterator[None]:
-    """Have the kernels of an adjustment on the CPU compiled by the end of the block, if cacheable."""
-    folder = kept_in() if are_compiled() else None
+    """Have the kernels of an adjustment on the CPU compiled by the end of the block, if numba does it."""
+    folder = kept_in()
     quiet = subprocess.DEVNULL
     if device != "cpu" or folder is None or (folder / _DONE).exists():
         yield

@@ -159,7 +159,7 @@ def _check_rigid(name: str, transforms: FloatArray) -> None:
 
 def check_observations(problem: Problem) -> None:
     """Raise :class:`AdjustError` for the first unusable observation."""
-    from v2hdm.adjust.kernels.layout import Seen, first_unsound  # loads numba
+    from v2hdm.adjust.kernels.layout import Seen, first_unsound
 
     by_corner = np.zeros(problem.corner_count, dtype=np.int64)
     by_camera = np.zeros(len(problem.intrinsic), dtype=np.int64)

@@ -124,7 +124,7 @@ class Covariance:
         # Known lengths couple V^-1 of corners to others outside their group.
         joined = _with_joined(arrays, chosen)
         corners = torch.unique(joined)
-        by_near = _reduced_root(self.whitening, corners).T[_columns(corners, joined)]
+        by_near = reduced_root(self.whitening, corners).T[_columns(corners, joined)]
         # V^-1 of the corners and all joined ones; 1 for kept corners.
         unit = torch.eye(2 * len(corners), dtype=torch.float64, device=corners.device)
         factor = self.whitening.linearised.corner_factor.take(corners)
@@ -153,7 +153,7 @@ def corner_gain(whitening: Whitening) -> FloatArray:
         if end - begin < at_once and end < arrays.corner_count:
             continue
         corners = torch.arange(begin, end, device=tip.device)
-        follow = (tip @ _reduced_root(whitening, corners)[-len(tip) :]).mT
+        follow = (tip @ reduced_root(whitening, corners)[-len(tip) :]).mT
         factor = whitening.linearised.corner_factor.part(slice(begin, end))
         gain = factor.solve_transposed(factor.solve(follow.reshape(end - begin, 2, -1)))
         out[arrays.corner_order[begin:end].cpu().numpy()] = gain.cpu().numpy()
@@ -183,7 +183,7 @@ def _columns(corners: Tensor, chosen: Tensor) -> Tensor:
     return torch.stack([place, place + 1], dim=-1).flatten(1)
 
 
-def _reduced_root(whitening: Whitening, corners: Tensor) -> Tensor:
+def reduced_root(whitening: Whitening, corners: Tensor) -> Tensor:
     """L_S^-1 W (D, 2 n) for n corners, ascending; -L_S^-1 E, with the selection E, for kept ones."""
     plan = whitening.plan
     estimate = whitening.estimate

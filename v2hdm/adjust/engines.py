@@ -1,4 +1,4 @@
-"""The engine of a solve by name: torch's, or its heir compiled by numba."""
+"""The engine of a solve by name: torch's, or its heir by compiled kernels."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from v2hdm.adjust.kernels import are_compiled
 
 
 def make_engine(engine: str, arrays: Arrays) -> TorchEngine:
-    """The engine of this name for a problem; ``auto`` is numba on the CPU if it is installed, else torch."""
+    """The engine of this name for a problem; ``auto`` is ``numba`` on the CPU if kernels are compiled."""
     is_on_cpu = arrays.centre.device.type == "cpu"
     if engine == "numba" or (engine == "auto" and is_on_cpu and are_compiled()):
-        from v2hdm.adjust.kernels.engine import NumbaEngine  # loads numba
+        from v2hdm.adjust.kernels.engine import NumbaEngine
 
         return NumbaEngine(arrays)
     return TorchEngine(arrays)

@@ -226,7 +226,7 @@ class _Sorted(NamedTuple):
 
 def _sorted_observations(problem: Problem, rank: IntArray) -> _Sorted:
     """The observations in order; AdjustError where two are of one corner in one image."""
-    from v2hdm.adjust.kernels.layout import Seen, lay_out  # loads numba
+    from v2hdm.adjust.kernels.layout import Seen, lay_out
 
     columns = Seen.of(problem.observations.columns, problem.intrinsic)
     count = len(problem.observations.corner)

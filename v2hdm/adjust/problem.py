@@ -275,8 +275,9 @@ class SolveOptions:
         gap_tolerance: predicted remaining decrease, as a fraction of the cost, at which to stop.
         max_refreshes: largest number of whitenings.
         max_evaluations: largest number of evaluations of cost and gradient, in total.
-        engine: of :data:`ENGINES`: ``numba`` by compiled kernels on the CPU, ``torch`` by autograd anywhere;
-            ``auto`` is numba on the CPU, torch elsewhere.
+        engine: of :data:`ENGINES`: ``numba`` by kernels on the CPU, compiled by numba unless the install
+            has compiled them from C++; ``torch`` by autograd anywhere; ``auto`` is kernels on the CPU, torch
+            elsewhere.
         device: torch device.
     """
 

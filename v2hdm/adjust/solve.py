@@ -177,10 +177,10 @@ def _solve(problem: Problem, options: SolveOptions) -> Solution:
     )
     spent = start.evaluations
     del start
-    return _report(problem, origin_map, options, descent, spent)
+    return report_of(problem, origin_map, options, descent, spent)
 
 
-class _Start(NamedTuple):
+class Start(NamedTuple):
     """Where the descent begins."""
 
     estimate: Estimate
@@ -188,14 +188,14 @@ class _Start(NamedTuple):
     evaluations: int  # spent so far
 
 
-def _start(problem: Problem, engine: TorchEngine, robust: Loss, options: SolveOptions) -> _Start:
+def _start(problem: Problem, engine: TorchEngine, robust: Loss, options: SolveOptions) -> Start:
     """Start of the descent. Raises AdjustError."""
     cam_from_vehicle = torch.as_tensor(problem.cam_from_vehicle, dtype=torch.float64, device=options.device)
     if options.coarse and not is_worth_a_look(engine.arrays):
         estimate, corner = _estimate(problem, engine, cam_from_vehicle)
         opening = open_descent(engine, estimate, robust) if corner is None else None
         if opening is not None and is_near(opening):
-            return _Start(estimate, opening, 0)
+            return Start(estimate, opening, 0)
         del opening
     spent = 0
     if options.coarse:
@@ -206,7 +206,14 @@ def _start(problem: Problem, engine: TorchEngine, robust: Loss, options: SolveOp
             f"no ray of corner {corner} meets the ground under the starting extrinsics: its observations "
             "lie above the horizon; leave it out or give corners_start"
         )
-    return _Start(estimate, None, spent)
+    return Start(estimate, None, spent)
+
+
+def start_of(
+    problem: Problem, origin_map: FloatArray, engine: TorchEngine, robust: Loss, options: SolveOptions
+) -> Start:
+    """Start of the descent of a problem that is laid out about ``origin_map`` (2,). Raises AdjustError."""
+    return _start(shifted(problem, -origin_map), engine, robust, options)
 
 
 def _estimate(problem: Problem, engine: TorchEngine, cam_from_vehicle: Tensor) -> tuple[Estimate, int | None]:
@@ -223,7 +230,7 @@ def _estimate(problem: Problem, engine: TorchEngine, cam_from_vehicle: Tensor) -
     return Estimate(cam_from_vehicle, state, corners, arrays.no_clock()), loose
 
 
-def _report(
+def report_of(
     problem: Problem, origin_map: FloatArray, options: SolveOptions, descent: Descent, spent: int
 ) -> Solution:
     """The solution in the frame of ``problem``; ``origin_map`` is the arrays' origin in it."""

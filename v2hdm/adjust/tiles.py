@@ -146,7 +146,7 @@ class TiledCholesky:
 
     @cached_property
     def _flat(self) -> Flat:
-        from v2hdm.adjust.kernels.substitute import Flat  # loads numba
+        from v2hdm.adjust.kernels.substitute import Flat
 
         return Flat(
             values=self.values.numpy(),
@@ -159,7 +159,7 @@ class TiledCholesky:
 
     def _substitute(self, right: Tensor, transposed: bool) -> Tensor:
         """Solve for one column by a kernel: Python's loop over tiles takes ten times as long."""
-        from v2hdm.adjust.kernels.substitute import backward, forward  # loads numba
+        from v2hdm.adjust.kernels.substitute import backward, forward
 
         out = right[:, 0].clone(memory_format=torch.contiguous_format)
         (backward if transposed else forward)(self._flat, out.numpy())

@@ -13,7 +13,7 @@ from v2hdm.ground.estimate import estimate_cameras
 from v2hdm.ground.results import GroundEstimate, GroundStatus, Reading
 from v2hdm.io.calibration.reading import Provenance
 from v2hdm.io.calibration.writing import write_calibration
-from v2hdm.io.drive import as_drive
+from v2hdm.io.drive import as_drive, need_pictures
 from v2hdm.records import Calibration, Drive
 from v2hdm.settings import Processes
 from v2hdm.store.files import write_json
@@ -81,6 +81,7 @@ def calibrate_from_ground(
     [(4, 4)]
     """
     drive = as_drive(drive)
+    need_pictures(drive, "a calibration by bare ground")
     with open_executor(workers) as executor:
         estimates = estimate_cameras(drive, executor, progress)
     return GroundCalibration(drive, estimates, _judged(check_drive(drive, ground=estimates), estimates))

@@ -126,4 +126,8 @@ def _check(config: ExperimentConfig) -> None:
     for port, site in config.ports.items():
         if (site.simulate is None) == (site.drive.path is None):
             raise ConfigError(f"ports.{port}: set either simulate or drive.path")
+        if site.simulate is not None and site.simulate.survey.length_km:
+            raise ConfigError(
+                f"ports.{port}.simulate.survey.length_km: an experiment compares methods on pictures; set 0"
+            )
     check_options(config.mapping, Detector.load(options=config.detector).catalogue.cornered)

@@ -73,7 +73,13 @@ class PoseKeys:
     """Keys that every source of poses has."""
 
     crs: Annotated[str | int | None, "system of x and y, or datum of latitudes, such as EPSG:4258."] = None
-    heading: Annotated[str | None, "north that headings count from: true or grid."] = None
+    heading: Annotated[
+        str | None, "north that headings count from, true or grid; course: there are none, but one antenna."
+    ] = None
+    gyro_file: Annotated[
+        Any, "yaw rates or wheel speeds beside heading: course, such as {csv: imu.csv, offset_s: 0.02}."
+    ] = None
+    starts: Annotated[str | None, "with heading: course, whether it begins forward or backward."] = None
     lever_arm_m: Annotated[list[float] | None, "the antenna in the vehicle frame: forward, left, up."] = None
     mounting_rpy_deg: Annotated[list[float] | None, "roll, pitch, yaw of the attitude's sensor."] = None
     max_sigma_m: Annotated[float, POSITIVE, "positions with a larger sigma are dropped."] = 0.1

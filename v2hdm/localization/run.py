@@ -17,6 +17,7 @@ from v2hdm.errors import MapFileError
 from v2hdm.executor import open_executor
 from v2hdm.geometry.planar import wrapped
 from v2hdm.geometry.rigid import heading_rad
+from v2hdm.io.detections import detections_of
 from v2hdm.io.drive import as_drive
 from v2hdm.io.trajectory import write_tum
 from v2hdm.localization.filter import Markings, Sighting, State, locate, predict, start
@@ -152,6 +153,8 @@ def localize(
     """
     drive = as_drive(drive)
     check_together(hd_map, calibrations, drive)
+    if detections is None and not drive.has_pictures:
+        detections = detections_of(drive)
     if detections is None:
         report = progress or (lambda done, total: None)
         with open_executor(workers) as executor:
@@ -159,8 +162,30 @@ def localize(
     check_detections(drive, detections)
     names = [name for name in drive.cameras if name in calibrations]
     sightings = collect_sightings(drive, detections, names)
-    attitude_rad = drive.pose_noise.roll_pitch_rad
     markings = Markings(hd_map)
+    states, matched = _follow(drive, sightings, names, calibrations, markings)
+    # The cameras' common turn about the vertical is that of their mean.
+    yaw_rad2 = [_yaw_variance(calibration) for calibration in calibrations.values()]
+    return Localised(
+        stamp_s=sightings.stamp_s,
+        recorded=sightings.map_from_vehicle,
+        states=states,
+        matched=matched,
+        in_view=_in_view(drive, sightings, hd_map, calibrations),
+        shared=np.array([markings.shared_m2, markings.shared_m2, np.mean(yaw_rad2)]),
+        detections=len(sightings),
+    )
+
+
+def _follow(
+    drive: Drive,
+    sightings: Sightings,
+    names: list[str],
+    calibrations: Mapping[str, Calibration],
+    markings: Markings,
+) -> tuple[tuple[State, ...], IntArray]:
+    """The vehicle after each of F frames, and the number of markings matched in each (F,)."""
+    attitude_rad = drive.pose_noise.roll_pitch_rad
     state = start(sightings.map_from_vehicle[0], _START_SIGMA_M, _START_SIGMA_RAD, attitude_rad)
     states = []
     matched = []
@@ -171,17 +196,7 @@ def localize(
         state, markings_of_frame = locate(state, sighted, markings)
         states.append(state)
         matched.append(len(markings_of_frame))
-    # The cameras' common turn about the vertical is that of their mean.
-    yaw_rad2 = [_yaw_variance(calibration) for calibration in calibrations.values()]
-    return Localised(
-        stamp_s=sightings.stamp_s,
-        recorded=sightings.map_from_vehicle,
-        states=tuple(states),
-        matched=np.array(matched),
-        in_view=_in_view(drive, sightings, hd_map, calibrations),
-        shared=np.array([markings.shared_m2, markings.shared_m2, np.mean(yaw_rad2)]),
-        detections=len(sightings),
-    )
+    return tuple(states), np.array(matched)
 
 
 def _yaw_variance(calibration: Calibration) -> float:

@@ -179,7 +179,7 @@ def run_methods(
     inputs = Inputs(drive, detections, cameras, options, grey)
     results = run_stated(inputs, progress) if naive else {}
     outcome, optimised = optimise(inputs, progress)
-    optimal = _optimised_result(outcome, optimised)
+    optimal = optimised_result(outcome, optimised)
     if base is not None:
         progress("the earlier map")
         optimal = _brought_up_to_date(base, optimal, outcome, optimised)
@@ -224,7 +224,8 @@ def _symbols(inputs: Inputs, optimised: Optimised) -> tuple[tuple[Symbol, ...], 
     return mapped, excluded
 
 
-def _optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
+def optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
+    """The result ``Opt`` of an optimised set of cameras, with lanes, symbols and evidence."""
     inputs = outcome.inputs
     options = inputs.options
     drive = inputs.drive

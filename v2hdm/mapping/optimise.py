@@ -148,10 +148,17 @@ class Optimiser:
         find_knots: Callable[[Rig, Surface | None], Knots | None] = lambda rig, surface: None,
         grey: Grey | None = None,
     ) -> Optimised:
-        """Choose the pose model, drop outliers of ``bundle`` from :meth:`settle`, classify the candidates.
+        """The candidates of :meth:`final_solve`, classified; raises MappingError if none is accepted."""
+        return conclude(self.final_solve(bundle, progress, find_knots, grey), self._options.acceptance)
 
-        Raises MappingError if no candidate is accepted.
-        """
+    def final_solve(
+        self,
+        bundle: Bundle,
+        progress: Callable[[str], None] = silent,
+        find_knots: Callable[[Rig, Surface | None], Knots | None] = lambda rig, surface: None,
+        grey: Grey | None = None,
+    ) -> FinalSolve:
+        """Choose the pose model, and solve without the outliers of ``bundle`` from :meth:`settle`."""
         if self._options.pose_model == AUTO:
             progress("choice of the pose model")
             self.pose_model = self._choose_pose_model(bundle)
@@ -168,7 +175,7 @@ class Optimiser:
             lanes = knots, final.solution.corners_map[:count]
             final = self._solve(final.association, usable, final.rig, lanes=lanes)
             final = replace(final, solution=replace(final.solution, chi2_per_dof=fit))
-        solve = FinalSolve(
+        return FinalSolve(
             bundle=self._with_errors_of_ground(final),
             ungated=bundle,
             inlier=inlier,
@@ -181,7 +188,6 @@ class Optimiser:
             grey=grey,
             surface=self.surface,
         )
-        return conclude(solve, self._options.acceptance)
 
     def solve_alone(self, settled: Bundle, camera: str) -> Bundle:
         """The solve of what one camera observed of ``settled``, without the others.
@@ -364,7 +370,7 @@ class Optimiser:
         stated = self._stated_sigma
         estimated = estimate_noise(replace(bundle.problem, pose_sigma=stated), bundle.solution)
         self._estimated_sigma = estimated
-        self._pose_sigma = tuple(map(_larger, stated, estimated))
+        self._pose_sigma = tuple(map(larger_noise, stated, estimated))
         return self._solve_all(bundle.association, bundle.rig)
 
     @property
@@ -401,8 +407,8 @@ class Optimiser:
         return selection.name
 
 
-def _larger(stated: PoseSigma, estimated: PoseSigma) -> PoseSigma:
-    """``stated`` with the estimated noise of height, attitude or heading where larger."""
+def larger_noise(stated: PoseSigma, estimated: PoseSigma) -> PoseSigma:
+    """``stated`` with the ``estimated`` noise of height, attitude or heading where larger."""
     kinds = {
         "height_m": ("height_m",),
         "roll_pitch_rad": ("roll_pitch_rad", "roll_pitch_drift"),

@@ -22,6 +22,9 @@ PLANE = "plane"
 SURFACE = "surface"
 GROUNDS = (PLANE, SURFACE, AUTO)  # values of ``mapping.ground``
 
+SHORTEST_SECTION_M = 100.0
+"""Least way, m, of a section: its overlaps are 40 m wide, and a camera's mounting shows on some turns."""
+
 POSE_MODELS: tuple[str, ...] = (AUTO, "paper", "roll_pitch", "full", "heave", "clock")
 """Values of ``mapping.pose_model``: the models of :data:`v2hdm.adjust.MODELS`, or ``auto``."""
 
@@ -186,3 +189,17 @@ def check_options(options: MappingOptions, kinds: Sequence[str] | None = None) -
     twice = next((name for number, name in enumerate(names) if name in names[:number]), None)
     if twice is not None:
         raise ConfigError(f"mapping.survey names the point {twice} twice; keep one of them.")
+
+
+def check_sections(options: MappingOptions) -> None:
+    """Raise ConfigError for settings that the sections of a drive cannot have each for itself."""
+    unfit = {
+        "mapping.survey": bool(options.survey.points) or options.survey.file is not None,
+        "mapping.known_sizes": bool(options.known_sizes.by_class_m),
+        "mapping.lanes.model=joint": options.lanes.model == JOINT,
+        "mapping.ground=surface": options.ground == SURFACE,
+        "mode=incremental": options.mode == INCREMENTAL,
+    }
+    for key, is_set in unfit.items():
+        if is_set:
+            raise ConfigError(f"{key}: not with sections; leave it out, or set map.section_m=0")

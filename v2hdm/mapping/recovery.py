@@ -32,7 +32,7 @@ from v2hdm.faults.odds import (
 from v2hdm.faults.score_tests import score_faults
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.mapping.bundle import Bundle, name_of
-from v2hdm.mapping.conclusion import Optimised
+from v2hdm.mapping.conclusion import FinalSolve, Optimised, conclude
 from v2hdm.mapping.foreign import foreign_segment
 from v2hdm.mapping.inputs import Inputs
 from v2hdm.mapping.optimise import Optimiser
@@ -60,6 +60,7 @@ class Outcome:
     settled: Bundle  # of all observations
     bundle: Bundle  # of the accepted ones
     evidence: SolveEvidence
+    final: FinalSolve
 
 
 def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, Optimised]:
@@ -88,13 +89,14 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
         _log_correction(inputs, corrected[-1])
         inputs = remaining
     # 4. Choose the pose model, solve without outliers and classify the candidates.
-    optimised = optimiser.finish(settled, progress, inputs.find_knots, inputs.grey_of_image)
+    final = optimiser.final_solve(settled, progress, inputs.find_knots, inputs.grey_of_image)
+    optimised = conclude(final, inputs.options.acceptance)
     corrected = [
         _as_solved(error, settled) for error in corrected if _is_of_the_map(error, survey, optimised)
     ]
     suspected = _contradictions(settled, tested.tests, inputs.sightings, sessions)
     evidence = _evidence(settled, suspected, corrected, optimiser, optimised.bundle, inputs.sightings)
-    return Outcome(inputs, settled, optimised.bundle, replace(evidence, foreign=foreign)), optimised
+    return Outcome(inputs, settled, optimised.bundle, replace(evidence, foreign=foreign), final), optimised
 
 
 def _log_correction(inputs: Inputs, error: Contradiction) -> None:

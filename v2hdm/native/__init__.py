@@ -1,7 +1,8 @@
-"""The detector's kernels, compiled from C++ when the package was installed or its wheel was built.
+"""Kernels of detector and adjustment, compiled from C++ when the package was installed or its wheel built.
 
-Each is the twin of numpy code that does the same where nothing could be compiled, and that tests compare it
-with. ``V2HDM_NATIVE=0`` in the environment leaves them out.
+Each is the twin of Python code that does the same where nothing could be compiled, by numpy in the detector
+and by numba in the adjustment, and that tests compare it with. ``V2HDM_NATIVE=0`` in the environment leaves
+them out.
 """
 
 from __future__ import annotations

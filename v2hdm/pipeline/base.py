@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from v2hdm.io.maps.evidence import read_exclusions
 from v2hdm.io.maps.reading import read_geojson, read_verdict
 from v2hdm.io.trajectory import read_tum
 from v2hdm.pipeline.config import base_files
-from v2hdm.records import Change, Changes, Drive, Fate, Image
+from v2hdm.records import Camera, Change, Changes, Drive, Fate, Image
 from v2hdm.site.living.changes import Base
 
 _SITE_M = 40.0  # markings farther from a route are not seen from it: twice what a camera reaches
@@ -68,11 +68,23 @@ def check_together(base: Base, drive: Drive, path: str) -> None:
         )
 
 
-def grey_reader(drive: Drive) -> Callable[[Image], NDArray[np.float32]]:
-    """Reads the grey values of a drive's images."""
-    from v2hdm.detection.batch import read_grey
+def grey_reader(drive: Drive) -> Callable[[Image], NDArray[np.float32]] | None:
+    """Reads the grey values of a drive's images; None where it has no pictures."""
+    if not drive.has_pictures:
+        return None
+    return _GreyReader(drive.cameras)
 
-    return lambda image: read_grey(image, drive.cameras[image.camera])
+
+@dataclass(frozen=True)
+class _GreyReader:
+    """Reads grey values of images of these cameras; other than a closure, it can go to another process."""
+
+    cameras: Mapping[str, Camera]
+
+    def __call__(self, image: Image) -> NDArray[np.float32]:
+        from v2hdm.detection.batch import read_grey
+
+        return read_grey(image, self.cameras[image.camera])
 
 
 def changes_json(changes: Changes) -> dict[str, Any]:

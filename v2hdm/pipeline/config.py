@@ -13,7 +13,14 @@ from v2hdm.errors import ConfigError, DriveError, need
 from v2hdm.executor import check_cluster
 from v2hdm.io.drive import ReadOptions, drive_name
 from v2hdm.io.maps.corrections import read_corrections
-from v2hdm.mapping.options import BATCH, INCREMENTAL, MappingOptions, check_options
+from v2hdm.mapping.options import (
+    BATCH,
+    INCREMENTAL,
+    SHORTEST_SECTION_M,
+    MappingOptions,
+    check_options,
+    check_sections,
+)
 from v2hdm.records import Drive, Image
 from v2hdm.report.job import Job, check_job
 from v2hdm.safe.texts import shown, take_camera_name, take_name
@@ -63,6 +70,12 @@ class MapConfig:
     corrections: Annotated[
         str | None, "a file of corrections to an earlier map of the same drive (v2hdm view)."
     ] = None
+    section_m: Annotated[
+        float,
+        NOT_NEGATIVE,
+        "way, m, of the sections in which a long drive, or a network, is mapped and then adjusted together; "
+        "0 maps all at once (docs/fleet.md#a-whole-network).",
+    ] = 0.0
 
 
 @dataclass(kw_only=True)
@@ -195,7 +208,9 @@ def admit(config: RunConfig) -> str:
 
         check_background(Path(config.report.background))  # before minutes of mapping
     has_base = config.map.base is not None
-    check_choice(config.mapping, len(config.drive.paths), has_base, config.accuracy_goal_cm)
+    check_choice(
+        config.mapping, len(config.drive.paths), has_base, config.accuracy_goal_cm, config.map.section_m
+    )
     return name
 
 
@@ -215,7 +230,9 @@ def _check_names(port: PortConfig) -> None:
         take_camera_name(camera, "simulate.cameras", ConfigError)
 
 
-def check_choice(options: MappingOptions, drives: int, has_base: bool, goal_cm: float) -> None:
+def check_choice(
+    options: MappingOptions, drives: int, has_base: bool, goal_cm: float, section_m: float = 0.0
+) -> None:
     """Raise ConfigError where settings do not go with so many drives, with an earlier map, or here."""
     if not 0 < goal_cm < math.inf:
         raise ConfigError(f"accuracy_goal_cm is {goal_cm}: set {POSITIVE}")
@@ -223,6 +240,14 @@ def check_choice(options: MappingOptions, drives: int, has_base: bool, goal_cm: 
         raise ConfigError("mode=incremental makes a map of one drive alone; update map.base with mode=batch")
     if drives > 1 and options.mode == INCREMENTAL:
         raise ConfigError("mode=incremental maps one drive, as on the vehicle; map several with batch")
+    if section_m:
+        if not SHORTEST_SECTION_M <= section_m < math.inf:
+            raise ConfigError(
+                f"map.section_m is {section_m:g}: set {SHORTEST_SECTION_M:g} m or more, or 0 for no sections"
+            )
+        if has_base:
+            raise ConfigError("map.section_m and map.base are both set: sections update no map; drop one")
+        check_sections(options)
     check_device(options.device)
 
 

@@ -29,7 +29,7 @@ from v2hdm.detection.stopwatch import Stopwatch, lap
 from v2hdm.doors import checked
 from v2hdm.errors import ConfigError, DriveError, shown
 from v2hdm.io.calibration.intrinsics import is_calibration, read_intrinsics
-from v2hdm.io.drive import READERS, read_drive
+from v2hdm.io.drive import READERS, need_pictures, read_drive
 from v2hdm.pipeline.rough_camera import ROUGH_NAME, RoughCamera, check_size
 from v2hdm.records import Calibration, CameraInfo
 from v2hdm.safe.pixels import IMAGE_SUFFIXES
@@ -176,6 +176,7 @@ def _drive_frames(path: Path, road: RoadDetector | None, rough: RoughCamera) -> 
             "file as camera_info in drive.yaml"
         )
     drive = read_drive(path)
+    need_pictures(drive, "detection")
     calibration = None
     if road is not None:
         name = road.camera.info.name

@@ -41,7 +41,7 @@ def inspect(
     """Check a drive and correct what can be corrected; ``max_gap_s`` bounds the gaps between poses."""
     from v2hdm.ground.estimate import estimate_cameras
 
-    ground = estimate_cameras(drive, executor, progress)
+    ground = estimate_cameras(drive, executor, progress) if drive.has_pictures else {}
     findings = tuple(input_findings(drive, ground))
     for finding in findings:
         if finding.status is not Status.PASS:

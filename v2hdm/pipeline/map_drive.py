@@ -74,6 +74,7 @@ def map_drive(
     workers: Processes = 0,
     context: Context | None = None,
     all_maps: bool = False,
+    section_m: float = 0.0,
 ) -> Result:
     """Map a drive, or several through one site together; nothing is written, but what ``cache`` keeps.
 
@@ -92,6 +93,8 @@ def map_drive(
         workers: processes; 0 takes one per core.
         context: takes the place of ``cache``, ``progress`` and ``workers``.
         all_maps: whether to map with each camera alone and by the naive methods, too, for a comparison.
+        section_m: way, m, of the sections in which a long drive is mapped, so that memory does not grow with
+            it; 0 maps all at once.
 
     Returns:
         Map (east, north, up; m), calibrations, trajectory, and the verdict as data: a FAIL raises nothing.
@@ -107,7 +110,9 @@ def map_drive(
     options = _options_of(options or MappingOptions(), corrections)
     reading = reading or ReadOptions()
     sources = _sources_of(drive)
-    check_choice(options, len(sources), base is not None, accuracy_goal_cm)
+    check_choice(options, len(sources), base is not None, accuracy_goal_cm, section_m)
+    if section_m and all_maps:
+        raise ConfigError("map.section_m and all_maps are both set: sections make the one map; drop one")
     with nullcontext(context) if context else _own_context(cache, progress, workers) as context:
         read = read_all(sources, reading, context)
         earlier = _earlier(base, read.whole, context)
@@ -119,7 +124,15 @@ def map_drive(
         described = inspection.drive_as_described
         mapped_so_far = Result(about, read.drives, read.contents, described, context.seconds, options.device)
         return _mapped(
-            mapped_so_far, inspection, detector, survey, earlier, accuracy_goal_cm, context, all_maps
+            mapped_so_far,
+            inspection,
+            detector,
+            survey,
+            earlier,
+            accuracy_goal_cm,
+            context,
+            all_maps,
+            section_m,
         )
 
 
@@ -168,6 +181,7 @@ def _mapped(
     goal_cm: float,
     context: Context,
     all_maps: bool,
+    section_m: float,
 ) -> Result:
     """The result of a drive that was read and checked."""
     from v2hdm.pipeline.paint import with_paint  # those who only check a drive do without
@@ -177,12 +191,24 @@ def _mapped(
     settings = detector if isinstance(detector, DetectorOptions) else detector.options
     try:
         with compiled_meanwhile(survey.mapping.device):
-            detections = _detect(inspection.drive, mapped_so_far.contents, settings, context)
+            # Where sections read them for themselves, detections of the whole drive would fill the memory.
+            detections = (
+                []
+                if section_m and not inspection.drive.has_pictures
+                else _detect(inspection.drive, mapped_so_far.contents, settings, context)
+            )
         with context.timed("map"):
             key = mapped_so_far.contents.key(inspection.drive)
             all_grades = of_all_grades(survey)
             mapped = map_camera_sets(
-                inspection.drive, key, detections, all_grades, earlier, context, compare=all_maps
+                inspection.drive,
+                key,
+                detections,
+                all_grades,
+                earlier,
+                context,
+                compare=all_maps,
+                section_m=section_m,
             )
             sets = graded_sets(mapped, goal_cm / 100)
         sets = with_paint(sets, inspection.drive, earlier, context)

@@ -27,7 +27,7 @@ def with_paint(
     """The same with the paint that is left of each marking of the best map, and what its words say."""
     name, last = list(sets.items())[-1]
     best = last.methods[BEST]
-    if best.poses is None or best.residuals is None:
+    if best.poses is None or best.residuals is None or not drive.has_pictures:
         return dict(sets)
     poses = [best.poses.of_image(image) for image in drive.images]
     ground = None if best.surface is None else best.surface.seen_from(np.array(poses))
@@ -58,6 +58,7 @@ def _with_wear(
         if marking_id in number_of_id
     }
     grey = grey_reader(drive)
+    assert grey is not None
     return with_wear(
         best.hd_map,
         footage.images,

@@ -35,7 +35,7 @@ from v2hdm.progress import Progress, silent
 from v2hdm.records import Drive
 from v2hdm.report.job import job_of
 from v2hdm.safe.texts import take_name
-from v2hdm.simulate.port.drive import folder_of_port
+from v2hdm.simulate.survey.drive import folders_of
 from v2hdm.store import remote
 from v2hdm.store.cache import CodecError, StageCache, code_key, decode, encode, key_of, prune_to_limit
 from v2hdm.store.folders import HOST, note_use
@@ -132,8 +132,9 @@ def _is_of(config: RunConfig, key: str) -> bool:
     """Whether ``key`` is that of a run's result, made now; raises where an input cannot be read."""
     paths = config.drive.paths
     if config.simulate is not None:
-        paths = (folder_of_port(config.simulate, Path(config.cache)),)
-        note_use(paths[0])
+        paths = folders_of(config.simulate, Path(config.cache))
+        for path in paths:
+            note_use(path)
     drives = [read_drive(path, config.drive) for path in paths]
     return key == result_key(config, drives, Contents.of(drives), key_of(code_key()))
 
@@ -262,7 +263,8 @@ def map_and_save(
                 corrections=config.map.corrections,
                 accuracy_goal_cm=config.accuracy_goal_cm,
                 context=context,
-                all_maps=config.all_maps or config.simulate is not None,
+                all_maps=config.all_maps or (_is_rendered(config) and not config.map.section_m),
+                section_m=config.map.section_m,
             )
             key = result_key(config, mapped.drives, mapped.contents, context.cache.key())
             outputs = Outputs(
@@ -284,6 +286,11 @@ def map_and_save(
     return result
 
 
+def _is_rendered(config: RunConfig) -> bool:
+    """Whether the drive is a rendered port, on which methods are compared; a survey is too long for that."""
+    return config.simulate is not None and not config.simulate.survey.length_km
+
+
 def _drive_folders(config: RunConfig, context: Context) -> tuple[Path, ...]:
     """The drives of a run; one that is rendered is made in the cache first."""
     if config.simulate is None:
@@ -292,9 +299,9 @@ def _drive_folders(config: RunConfig, context: Context) -> tuple[Path, ...]:
         return config.drive.paths
     if config.drive.paths:
         raise ConfigError("both simulate and drive.path are set: a run takes one, remove the other")
-    from v2hdm.simulate.port.drive import rendered_drive
+    from v2hdm.simulate.survey.drive import simulated_drives
 
     with context.timed("render"):
         folder = Path(config.cache)
         steps = context.steps("render")
-        return (rendered_drive(config.simulate, folder, context.executor, steps),)
+        return simulated_drives(config.simulate, folder, context.executor, steps)

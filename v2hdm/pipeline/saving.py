@@ -69,7 +69,7 @@ def write_result(result: Result, folder: Path, outputs: Outputs, context: Contex
         if outputs.all_maps:
             _write_all_maps(folder, result)
     write_json(folder / names.METRICS, result.metrics)
-    if outputs.mosaic and result.methods and not drive.joined:
+    if outputs.mosaic and result.methods and drive.has_pictures and not drive.joined:
         with context.timed("mosaic"):
             try:
                 write_mosaic(folder, drive, device=result.device, progress=context.steps("mosaic"))
@@ -110,7 +110,8 @@ def _write_map(folder: Path, result: Result, outputs: Outputs) -> None:
     ]  # longitude and latitude, whatever the others have
     write_map(result.map, folder, "map", geojson, verdict)
     others = [name for name in with_data(outputs.formats) if name not in ("geojson", "qgis")]
-    write_map(result.map, folder, "map", others, verdict, crs=outputs.crs)
+    driven = [session.trajectory for session in drive.sessions if session.trajectory is not None]
+    write_map(result.map, folder, "map", others, verdict, crs=outputs.crs, trajectories=driven)
     about = Provenance.today(drive.name, verdict)
     for name, calibration in best.calibrations.items():
         clock = None if drive.joined else best.clocks[0].get(name)
@@ -139,7 +140,7 @@ def _write_map(folder: Path, result: Result, outputs: Outputs) -> None:
         replace(exclusion, cameras=name) for name, methods in sets for exclusion in methods[BEST].excluded
     ]
     write_exclusions(excluded, folder / names.EXCLUDED, drive.origin, drive.road)
-    for name in best.calibrations:
+    for name in best.calibrations if drive.has_pictures else ():
         image = _fullest_image(drive, name, result.detections)
         _save_overlay(folder / names.overlay_file(name), drive, image, best)
 

@@ -7,10 +7,12 @@ of which drive they are. Mapping is kept by sets of cameras, each with every met
 from __future__ import annotations
 
 import logging
+import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -18,6 +20,7 @@ from numpy.typing import NDArray
 
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import WorkerError
+from v2hdm.io.detections import detections_of, read_detections
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.base import grey_reader
@@ -48,8 +51,10 @@ def detect_in_pieces(
 ) -> list[ImageDetections]:
     """Detect in every image of a drive, in its order, where that is not known yet.
 
-    ``detect`` does so in place of processes of this machine.
+    ``detect`` does so in place of processes of this machine. A drive without pictures brings its detections.
     """
+    if not drive.has_pictures:
+        return detections_of(drive)
     from v2hdm.detection.batch import detect_images, own_vehicles, with_masks
     from v2hdm.detection.detector import Detector
 
@@ -141,10 +146,12 @@ def map_camera_sets(
     context: Context,
     *,
     compare: bool = False,
+    section_m: float = 0.0,
 ) -> dict[str, MappedSet]:
     """Map a drive with all cameras by the joint optimisation, where that is not known yet.
 
-    ``compare`` maps it with each camera alone and by the naive methods as well. ``drive_key`` is that of the
+    ``compare`` maps it with each camera alone and by the naive methods as well; with ``section_m`` above 0 it
+    is mapped in sections of so much way. ``drive_key`` is that of the
     drive and of what its images show. The check points of the survey are held against the finished map of all
     cameras, which alone brings ``base`` up to date. Raises MappingError where no map can be made, AdjustError
     where the adjustment fails.
@@ -153,7 +160,7 @@ def map_camera_sets(
     sets = camera_sets(drive)
     if not compare:
         sets = dict([list(sets.items())[-1]])
-    common_key = cache.key(drive_key, list(detections), survey.mapping, compare)
+    common_key = cache.key(drive_key, list(detections), survey.mapping, compare, section_m)
     *single, last = sets
     keys = {name: cache.key(common_key, name, sets[name], None) for name in single}
     keys[last] = cache.key(common_key, last, sets[last], (base, survey.check))
@@ -166,6 +173,8 @@ def map_camera_sets(
         mapped_sets[name] = cache.put(_MAP, keys[name], MappedSet, outcome.mapped, outcome.lines)
         context.progress("map", len(mapped_sets), len(sets))
 
+    if section_m and last not in mapped_sets:
+        take(_in_sections(drive, detections, survey, last, sets[last], section_m, context))
     work = _Work(drive, detections, survey, base, last, compare)
     # The largest first, so that processes end together.
     todo = [
@@ -184,6 +193,56 @@ def map_camera_sets(
         for job in todo:
             take(work(job))
     return {name: mapped_sets[name] for name in sets}
+
+
+def _in_sections(
+    drive: Drive,
+    detections: Sequence[ImageDetections],
+    survey: Survey,
+    name: str,
+    cameras: Sequence[str],
+    section_m: float,
+    context: Context,
+) -> _Outcome:
+    """Map a set of cameras in sections, which lie in the cache, where all workers see them, for so long."""
+    from v2hdm.mapping.sections import map_in_sections  # only long drives need it
+
+    begin_s = time.perf_counter()
+    where = context.cache.folder
+    if where is not None:
+        where.mkdir(parents=True, exist_ok=True)
+    with recorded() as lines, tempfile.TemporaryDirectory(prefix="sections-", dir=where) as folder:
+        source = _Detections() if not drive.has_pictures else _Detections(tuple(detections))
+        best = map_in_sections(
+            drive,
+            source,
+            cameras,
+            survey.mapping,
+            section_m,
+            context.executor,
+            Path(folder),
+            context.progress,
+            grey_reader(drive),
+        )
+        _log.info(
+            "mapped with %s in sections: %d markings, %.1f s",
+            name, len(best.hd_map.markings), time.perf_counter() - begin_s,
+        )  # fmt: skip
+    return _Outcome(name, MappedSet({BEST: best}), lines)
+
+
+@dataclass(frozen=True)
+class _Detections:
+    """Detections in some images of a drive: of those ``listed`` for all, or from their files."""
+
+    listed: tuple[ImageDetections, ...] | None = None
+
+    def __call__(self, drive: Drive, images: Sequence[int]) -> list[ImageDetections]:
+        """Those in these images, numbered in their order."""
+        if self.listed is None:
+            return [read_detections(drive.images[image].path, at) for at, image in enumerate(images)]
+        place = {image: at for at, image in enumerate(images)}
+        return [replace(found, image=place[found.image]) for found in self.listed if found.image in place]
 
 
 class _Job(NamedTuple):

@@ -66,18 +66,12 @@ def in_series(
     ``laid`` is a shape of sigma ``sigma_m`` laid on each, ``shorter`` (N, 8) shortens it by 1 m, ``weight``
     (N,) is the probability of a marking.
     """
-    sides = np.roll(laid.corners_map, -1, axis=1) - laid.corners_map
-    lengths = np.linalg.norm(sides, axis=2)
-    rows = np.arange(len(sides))
-    longest = lengths.argmax(axis=1)
-    length_m = lengths[rows, longest]
-    axis = sides[rows, longest] / length_m[:, None]
+    length_m, axis = _long_sides(laid)
     marking = weight > 0.5
     middle = np.tile(axis, 4) / 4
     own_m2 = believed.along(middle, middle)
     spacing = _spacing(believed, axis, own_m2, length_m, marking)
     apart_m = spacing.apart_m
-    off_m = spacing.off_m
     own_m = np.sum((laid.corners_map - candidates.corners_map).reshape(-1, 8) * shorter, axis=1)
     variance = candidates.along(shorter, shorter) + sigma_m**2
     usual = np.isfinite(apart_m) & marking & (own_m**2 < 9 * variance)
@@ -98,23 +92,28 @@ def in_series(
     fixed = norm.pdf(own_m[regular], 0.0, np.sqrt(variance[regular]))
     spread_m, often = _regularity((own_m - longer_m)[regular], (variance + longer_m2)[regular], fixed)
     longer_sigma_m = np.where(in_line, np.sqrt(longer_m2 + spread_m**2), 0.0)
-    enclosed = regular & np.isfinite(off_m)
-    scatter_m = MEMBER_M
-    midway = 0.0
-    if enclosed.sum() >= _LEAST:
-        scatter_m, midway = _regularity(
-            off_m[enclosed], (own_m2 + spacing.off_m2)[enclosed], 1 / apart_m[enclosed]
-        )
+    enclosed = regular & np.isfinite(spacing.off_m)
+    scatter_m, midway = _midway(spacing, own_m2, enclosed)
     return Series(
         longer_m=longer_m,
         longer_sigma_m=longer_sigma_m,
         longer_often=often,
         apart_m=apart_m,
         middle=middle,
-        middle_m=_times(middle, believed) + off_m,
+        middle_m=_times(middle, believed) + spacing.off_m,
         middle_sigma_m=np.sqrt(spacing.off_m2 + scatter_m**2),
         middle_often=midway,
     )
+
+
+def _long_sides(laid: Laid) -> tuple[FloatArray, FloatArray]:
+    """Length (N,), m, and direction (N, 2) of the longest side of each laid shape."""
+    sides = np.roll(laid.corners_map, -1, axis=1) - laid.corners_map
+    lengths = np.linalg.norm(sides, axis=2)
+    rows = np.arange(len(sides))
+    longest = lengths.argmax(axis=1)
+    length_m = lengths[rows, longest]
+    return length_m, sides[rows, longest] / length_m[:, None]
 
 
 class _Spacing(NamedTuple):
@@ -166,6 +165,18 @@ def _spacing(
     off_m2 = (ahead_m2 + behind_m2 + (_ASIDE_M * (turn[nearest_ahead] + turn[nearest_behind])) ** 2) / 4
     apart_m2 = np.where(enclosed, off_m2, own_m2 + np.where(ahead < behind, ahead_m2, behind_m2))
     return _Spacing(apart_m, apart_m2, off_m, off_m2)
+
+
+def _midway(spacing: _Spacing, own_m2: FloatArray, enclosed: BoolArray) -> tuple[float, float]:
+    """How far ``enclosed`` dashes (N,) scatter about their neighbours' midpoint, m, and how many lie there.
+
+    ``own_m2`` (N,) is the variance of their positions along the line.
+    """
+    if enclosed.sum() < _LEAST:
+        return MEMBER_M, 0.0
+    variance_m2 = own_m2 + spacing.off_m2
+    anywhere = 1 / spacing.apart_m
+    return _regularity(spacing.off_m[enclosed], variance_m2[enclosed], anywhere[enclosed])
 
 
 def _regularity(off_m: FloatArray, variance: FloatArray, otherwise: FloatArray) -> tuple[float, float]:

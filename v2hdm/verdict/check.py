@@ -27,7 +27,7 @@ _MOST_POINTS = 5000  # points of the line that is drawn
 def draw_check(drive: Drive, folder: Path, ground: Mapping[str, GroundEstimate]) -> None:
     """Draw the route, and the metric grid of guess and ground estimate in sample images of every camera."""
     _save_route(folder / "route.png", drive.recorded or drive.trajectory or trajectory_of_images(drive))
-    for name, camera in drive.cameras.items():
+    for name, camera in drive.cameras.items() if drive.has_pictures else ():
         images = [image for image in drive.images if image.camera == name]
         mountings = {"guess": initial_extrinsic(camera)}
         calibration = ground[name].calibration if name in ground else None

@@ -1,25 +1,25 @@
-"""The engine ``numba``: kernels, compiled on first use, for all work per observation.
+"""The engine ``numba``: kernels for all work per observation, compiled from C++ or by numba.
 
 States, clocks, drifts and extrinsics act through the table of pairs, so that kernels are independent of the
-model. Nothing outside of this folder imports numba; others import from here where they use it, if at all.
+model. Each kernel is written twice: here, for numba, which compiles it on first use, and in ``native/src``,
+from which an installation compiles it if it can.
 """
 
 from __future__ import annotations
 
 import sys
-from functools import cache
-from importlib.util import find_spec
 from pathlib import Path
 
+from v2hdm import native
+from v2hdm.compiled import folder_of, is_numba_there
 
-@cache
+
 def are_compiled() -> bool:
-    """Whether numba is there to compile kernels; without it they run as Python, which suits small ones."""
-    return find_spec("numba") is not None
+    """Whether kernels are compiled, or numba is there to do it; as Python they suit small problems."""
+    return native.kernels() is not None or is_numba_there()
 
 
 def kept_in() -> Path | None:
-    """Where compiled kernels are kept, if anywhere."""
-    from v2hdm.compiled import folder_of  # loads numba
-
-    return folder_of(sys.modules[__name__])
+    """Where numba's kernels are kept, if it compiles any and they can be kept."""
+    is_numba_needed = native.kernels() is None and is_numba_there()
+    return folder_of(sys.modules[__name__]) if is_numba_needed else None

@@ -31,7 +31,7 @@ from v2hdm.adjust.reduced import (
 )
 from v2hdm.adjust.threads import share
 from v2hdm.adjust.tiles import find_pattern
-from v2hdm.compiled import kernel
+from v2hdm.compiled import kernel, twin
 from v2hdm.errors import AdjustError
 from v2hdm.records import FloatArray, IntArray
 
@@ -396,6 +396,7 @@ def _kept_tiles(
     return [*pairs, *pairwise(torch.unique(tile).tolist())]
 
 
+@twin("adjust.gather")
 @kernel
 def _gather(touched: IntArray, parts: FloatArray, out: FloatArray) -> None:
     for i in range(len(touched)):

@@ -23,7 +23,7 @@ from v2hdm.adjust.kernels.layout import Base, Layout, Scratch
 from v2hdm.adjust.kernels.linearise import couple, differentiate
 from v2hdm.adjust.model import MIN_DEPRESSION_SINE
 from v2hdm.adjust.reduced import PIVOT_FLOOR
-from v2hdm.compiled import inlined, kernel
+from v2hdm.compiled import inlined, kernel, twin
 from v2hdm.geometry.tensors import NEAR_M
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
@@ -107,6 +107,7 @@ def _carry(
             add_force(out.coupled, slot[t], observed[j, 0], observed[j, 1], observed[j, 2], fx, fy, fz)
 
 
+@twin("adjust.carry")
 @kernel
 def carry(
     begin: int, end: int, layout: Layout, base: Base, by_corner: FloatArray, scratch: Scratch, out: Evaluation
@@ -188,6 +189,7 @@ def _at_corner(
     return gx, gy, total, product
 
 
+@twin("adjust.evaluate")
 @kernel
 def evaluate(
     begin: int,
@@ -242,6 +244,7 @@ def evaluate(
         out.costs[q, 0] = total / 2
 
 
+@twin("adjust.meet_ground")
 @kernel
 def meet_ground(
     begin: int, end: int, layout: Layout, homographies: FloatArray, corners: FloatArray, determined: BoolArray
@@ -293,6 +296,7 @@ def meet_ground(
         corners[c, 1] = low
 
 
+@twin("adjust.report")
 @kernel
 def report(
     begin: int,
@@ -319,6 +323,7 @@ def report(
             out.behind[row] = pz <= NEAR_M
 
 
+@twin("adjust.residuals")
 @kernel
 def residuals(
     begin: int, end: int, layout: Layout, table: FloatArray, corners: FloatArray, out: FloatArray
@@ -332,6 +337,7 @@ def residuals(
             out[0, k], out[1, k] = whiten(layout, k, u, v)
 
 
+@twin("adjust.pull")
 @kernel
 def pull(
     layout: Layout,
@@ -354,6 +360,7 @@ def pull(
                 wrench[layout.pair[k], p] += jacobian[p] * r0 + jacobian[6 + p] * r1
 
 
+@twin("adjust.couplings")
 @kernel
 def couplings(layout: Layout, base: Base, corner: IntArray, jacobian: FloatArray, out: FloatArray) -> None:
     """Write W' (k, 12) of the layout's observations of the base's corners, numbered by ``corner``."""

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from v2hdm.adjust.arrays import Arrays
-from v2hdm.compiled import kernel
+from v2hdm.compiled import kernel, twin
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 LOSS_CODES = {"none": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3}
@@ -153,6 +153,7 @@ class Seen(NamedTuple):
         return cls(*contiguous)
 
 
+@twin("adjust.first_unsound")
 @kernel
 def first_unsound(
     observations: Seen,
@@ -186,6 +187,7 @@ def first_unsound(
     return -1
 
 
+@twin("adjust.lay_out")
 @kernel
 def lay_out(
     observations: Seen,

@@ -22,7 +22,7 @@ from v2hdm.adjust.kernels.inline import (
     whiten,
 )
 from v2hdm.adjust.kernels.layout import Base, Layout, Scratch
-from v2hdm.compiled import inlined, kernel
+from v2hdm.compiled import inlined, kernel, twin
 from v2hdm.records import FloatArray, IntArray
 
 
@@ -200,6 +200,7 @@ def _add_products(rows: FloatArray, count: int, tip: FloatArray) -> None:
                 tip[p, s] += top * rows[i, s] + low * rows[i + 1, s]
 
 
+@twin("adjust.linearise")
 @kernel
 def linearise(
     begin: int,
@@ -353,6 +354,7 @@ def _subtract_products(
                         out[s] -= x * top[s] + y * bottom[s]
 
 
+@twin("adjust.subtract_frames")
 @kernel
 def subtract_frames(
     begin: int,

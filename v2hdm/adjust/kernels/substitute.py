@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from v2hdm.compiled import kernel
+from v2hdm.compiled import kernel, twin
 from v2hdm.records import FloatArray, IntArray
 
 
@@ -19,6 +19,7 @@ class Flat(NamedTuple):
     tip: FloatArray
 
 
+@twin("adjust.forward")
 @kernel
 def forward(factor: Flat, out: FloatArray) -> None:
     """Overwrite b with L^-1 b."""
@@ -45,6 +46,7 @@ def forward(factor: Flat, out: FloatArray) -> None:
         out[first_row + i] = remainder / tip[i, i]
 
 
+@twin("adjust.backward")
 @kernel
 def backward(factor: Flat, out: FloatArray) -> None:
     """Overwrite b with L^-T b."""

@@ -18,7 +18,7 @@ from torch import Tensor
 from v2hdm.adjust.arrays import Arrays
 from v2hdm.adjust.model import Estimate, Gradient, clock_residual, frame_tangent, moved, state_residual
 from v2hdm.adjust.reduced import Spread
-from v2hdm.compiled import exact_kernel, inlined, kernel
+from v2hdm.compiled import exact_kernel, inlined, kernel, twin
 from v2hdm.geometry import rigid
 from v2hdm.geometry.rigid import EXP_SERIES, LEFT_JACOBIAN_SERIES
 from v2hdm.records import FloatArray
@@ -42,6 +42,7 @@ def compose(cameras: FloatArray, vehicle_from_map: FloatArray) -> FloatArray:
     return out
 
 
+@twin("adjust.compose")
 @exact_kernel
 def _compose(cameras: FloatArray, vehicle_from_map: FloatArray, out: FloatArray) -> None:
     for c in range(len(cameras)):
@@ -88,6 +89,7 @@ def _product(left: FloatArray, right: FloatArray, size: int, out: FloatArray) ->
             out[i, j] = total
 
 
+@twin("adjust.move")
 @kernel
 def _move(
     tangents: FloatArray,

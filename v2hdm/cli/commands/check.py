@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,15 +14,7 @@ from v2hdm.errors import EXIT_USER_ERROR, DriveError, one_line
 
 def _run(arguments: Sequence[str]) -> int:
     """One line per finding, a verdict and pictures, without torch; 0 for PASS and WARN, 3 for FAIL."""
-    parser = COMMAND.parser()
-    add_drive(parser, "check")
-    parser.add_argument("--no-ground", dest="ground", action="store_false", help="skip bare ground: faster")
-    parser.add_argument("--list-topics", action="store_true", help="only print a bag's topics and drive.yaml")
-    written = "write a drive.yaml for a bag, video or image folder"
-    values = "with --write: values that it asks for"
-    parser.add_argument("--write", type=Path, metavar="DIR", help=written)
-    parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="KEY=VALUE", help=values)
-    parser.add_argument("--all", action="store_true", help="also print passed checks")
+    parser = _parser()
     parsed = parser.parse_args(arguments)
     if parsed.list_topics:
         from v2hdm.io.drive import ReadOptions
@@ -41,15 +34,8 @@ def _run(arguments: Sequence[str]) -> int:
     if parsed.set and not parsed.write:
         parser.error("--set is for --write")
     if parsed.write:
-        from v2hdm.io.drive.draft import draft_drive
-
-        log_to_terminal()
-        if missing := draft_drive(parsed.drive, parsed.write, parsed.set, parsed.camera):
-            asked = [f"  {one_line(f'--set {key}=... {why}')}" for key, why in missing.items()]
-            problem = one_line(f"error: {parsed.drive}: nothing written; also give:")
-            print("\n".join([problem, *asked]), file=sys.stderr)
+        if not _is_drafted(parsed):
             return EXIT_USER_ERROR
-        print(one_line(f"{parsed.write / 'drive.yaml'} written"), file=sys.stderr)
         parsed.drive = parsed.write
     drive = drive_of(parsed)
     folder = parsed.output or Path("outputs") / f"{drive.name}-check"
@@ -74,6 +60,34 @@ def _run(arguments: Sequence[str]) -> int:
     summary, *findings = verdict.lines
     print("\n".join([*passed, *findings, summary, one_line(f"pictures in {folder}")]))
     return exit_code(verdict)
+
+
+def _parser() -> argparse.ArgumentParser:
+    """The options of the command."""
+    parser = COMMAND.parser()
+    add_drive(parser, "check")
+    parser.add_argument("--no-ground", dest="ground", action="store_false", help="skip bare ground: faster")
+    parser.add_argument("--list-topics", action="store_true", help="only print a bag's topics and drive.yaml")
+    written = "write a drive.yaml for a bag, video or image folder"
+    values = "with --write: values that it asks for"
+    parser.add_argument("--write", type=Path, metavar="DIR", help=written)
+    parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="KEY=VALUE", help=values)
+    parser.add_argument("--all", action="store_true", help="also print passed checks")
+    return parser
+
+
+def _is_drafted(parsed: argparse.Namespace) -> bool:
+    """Whether drive.yaml is written; if not, what it needs is asked for."""
+    from v2hdm.io.drive.draft import draft_drive
+
+    log_to_terminal()
+    if missing := draft_drive(parsed.drive, parsed.write, parsed.set, parsed.camera):
+        asked = [f"  {one_line(f'--set {key}=... {why}')}" for key, why in missing.items()]
+        problem = one_line(f"error: {parsed.drive}: nothing written; also give:")
+        print("\n".join([problem, *asked]), file=sys.stderr)
+        return False
+    print(one_line(f"{parsed.write / 'drive.yaml'} written"), file=sys.stderr)
+    return True
 
 
 def _recording_of(drive: Path) -> Path:

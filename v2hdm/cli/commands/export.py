@@ -17,7 +17,8 @@ from v2hdm.cli.command import Command
 from v2hdm.errors import ConfigError, MapFileError, shown
 
 if TYPE_CHECKING:
-    from v2hdm.records import FloatArray
+    from v2hdm.records import FloatArray, HDMap, Trajectory
+    from v2hdm.topology.answers import Answer
 
 
 def _run(arguments: Sequence[str]) -> None:
@@ -32,6 +33,13 @@ def _run(arguments: Sequence[str]) -> None:
     parser.add_argument("--projector", metavar="NAME", help=ways)
     system = "coordinate system of the output, such as EPSG:25832, or local for the drive's own frame"
     parser.add_argument("--crs", metavar="NAME", help=system)
+    paths = (
+        "for lanelet2 and opendrive: poses of a drive in the map's frame, which say where lanes lead; may "
+    )
+    paths += "be repeated (default: trajectory*.tum beside MAP)"
+    parser.add_argument("--path", action="append", type=Path, metavar="FILE", help=paths)
+    answered = "for lanelet2 and opendrive: map_questions.geojson of an export, with answers"
+    parser.add_argument("--answers", type=Path, metavar="FILE", help=answered)
     parsed = parser.parse_args(arguments)
     from v2hdm.pipeline.context import logging_to
     from v2hdm.store.results import listed_files
@@ -55,6 +63,7 @@ def _run(arguments: Sequence[str]) -> None:
 
 def _export_map(parsed: argparse.Namespace, folder: Path, check: Callable[[Path], object]) -> list[Path]:
     from v2hdm.io.maps import formats
+    from v2hdm.io.maps.questions import questions_file, read_answers
     from v2hdm.io.maps.reading import read_map
 
     if ground := [form for form in parsed.format if form in formats.GROUND_FORMATS]:
@@ -75,13 +84,61 @@ def _export_map(parsed: argparse.Namespace, folder: Path, check: Callable[[Path]
     files = [
         folder / formats.FORMATS[form].file.format(name=name) for form in chosen if form not in kept_formats
     ]
+    trajectories = []
+    answers: list[Answer] = []
+    if set(formats.LANE_FORMATS) & set(chosen):
+        trajectories = _driven(parsed, hd_map)
+        answers = [] if parsed.answers is None else read_answers(parsed.answers, hd_map.origin)
+        files.append(folder / questions_file(name))
+    elif parsed.path or parsed.answers:
+        option = "--path" if parsed.path else "--answers"
+        raise ConfigError(
+            f"{option}: only the formats {' and '.join(formats.LANE_FORMATS)} have a use for it"
+        )
     if parsed.source.resolve() in [file.resolve() for file in files]:
         raise ConfigError(f"{parsed.source} would be overwritten: set another --output or --format")
+    if parsed.answers is not None and parsed.answers.resolve() in [file.resolve() for file in files]:
+        raise ConfigError(f"{parsed.answers} would be overwritten: set another --output")
     for file in files:
         check(file)
     return formats.write_map(
-        hd_map, folder, name, parsed.format, verdict, parsed.projector, parsed.crs, kept_formats
+        hd_map,
+        folder,
+        name,
+        parsed.format,
+        verdict,
+        parsed.projector,
+        parsed.crs,
+        kept_formats,
+        trajectories,
+        answers,
     )
+
+
+_FARTHEST_M = 50.0  # distance, m, from the map within which a path says something of its lanes; chosen
+
+
+def _driven(parsed: argparse.Namespace, hd_map: HDMap) -> list[Trajectory]:
+    """The poses that the user names, else those beside the map."""
+    import numpy as np
+
+    from v2hdm.io.trajectory import read_tum
+    from v2hdm.store.names import TRAJECTORIES
+
+    paths = parsed.path or sorted(parsed.source.parent.glob(TRAJECTORIES))
+    trajectories = [read_tum(path) for path in paths]
+    lines = [lane.points_map for lane in hd_map.lanes if len(lane.points_map)]
+    for path, trajectory in zip(paths, trajectories, strict=True):
+        positions = trajectory.map_from_vehicle[:, :2, 3]
+        is_near = [
+            (positions > line.min(axis=0) - _FARTHEST_M) & (positions < line.max(axis=0) + _FARTHEST_M)
+            for line in lines
+        ]
+        if lines and not np.all(is_near, axis=2).any():
+            raise MapFileError(
+                f"{path}: no pose is near a lane of the map; give poses in the map's own frame"
+            )
+    return trajectories
 
 
 def _export_mosaic(parsed: argparse.Namespace, folder: Path, *_: object) -> list[Path]:

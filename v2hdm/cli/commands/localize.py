@@ -50,8 +50,8 @@ def _run(arguments: Sequence[str]) -> int:
     return 0 if located.explained else EXIT_FAILED_VERDICT
 
 
-def _run_live(arguments: Sequence[str]) -> int:
-    """Localise a vehicle as it drives, until Ctrl-C."""
+def _live_parser() -> argparse.ArgumentParser:
+    """The options of a vehicle as it drives."""
     parser = COMMAND.parser()
     parser.add_argument("map", type=Path, help=_MAP)
     parser.add_argument("--live", action="store_true", required=True, help="of a vehicle as it drives")
@@ -72,7 +72,12 @@ def _run_live(arguments: Sequence[str]) -> int:
     parser.add_argument("--output", type=Path, metavar="FILE", help="for the JSON lines (default: stdout)")
     mcap = "a new folder for an MCAP of ROS 2 messages (extra ros)"
     parser.add_argument("--mcap", type=Path, metavar="DIR", help=mcap)
-    parsed = parser.parse_args(arguments)
+    return parser
+
+
+def _run_live(arguments: Sequence[str]) -> int:
+    """Localise a vehicle as it drives, until Ctrl-C."""
+    parsed = _live_parser().parse_args(arguments)
     from v2hdm.io.calibration.reading import trusted_calibrations
     from v2hdm.io.maps.reading import read_geojson
     from v2hdm.localization.live import localize_live

@@ -28,12 +28,13 @@ def _render(job: Job) -> None:
 
     from v2hdm.executor import open_executor
     from v2hdm.pipeline.config import admit_port
-    from v2hdm.simulate.port.drive import rendered_drive
+    from v2hdm.simulate.survey.drive import simulated_drives
 
     config = job.settings
     port = admit_port(config)
     with open_executor(config.workers, config.cluster, writable=[config.cache]) as executor:
-        print(rendered_drive(port, Path(config.cache), executor, steps_of("render images")))
+        for folder in simulated_drives(port, Path(config.cache), executor, steps_of("render images")):
+            print(folder)
 
 
 COMMAND = Command(

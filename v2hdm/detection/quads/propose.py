@@ -31,6 +31,10 @@ _CLASS_DOUBT = 0.05  # share of its certainty about classes that the network may
 _GROUP_DOUBT = 0.1
 """Share of a group's certainty that each of its classes may have: seen from near by a dash is like a line."""
 
+_DOUBTED = 2
+"""Where a class has more others in its group, they share the doubt of so many: that a network tells more symbols
+apart makes an arrow no less likely."""
+
 _VOTES = 3.0
 """Independent opinions that the network's classes over a piece are worth: 1.5 to 3 find the same arrows in
 130 photographs for validation, 1 loses small ones."""
@@ -175,7 +179,9 @@ def _shares(
     certainty = np.array([max(sum(blob.class_score.values()), 1e-9) for blob in blobs])[:, None]
     classes = [catalogue.classes[name] for name in names]
     same_group = np.array([[first.group == second.group for second in classes] for first in classes])
-    odds = score / certainty + _CLASS_DOUBT / len(names) + _GROUP_DOUBT * (score @ same_group) / certainty
+    others = np.maximum(same_group.sum(axis=0) - 1, 1)
+    doubt = _GROUP_DOUBT * np.where(np.eye(len(names), dtype=np.bool_), 1, np.minimum(1, _DOUBTED / others))
+    odds = score / certainty + _CLASS_DOUBT / len(names) + score @ (doubt * same_group) / certainty
     length_m, width_m = size_m.T
     size_fit = [
         kind.size_log_likelihood(length_m, width_m, whole=whole, log_sigma=log_sigma) for kind in classes

@@ -20,7 +20,7 @@ from v2hdm.store.names import METRICS
 
 __all__ = [
     "READERS", "KittiOptions", "ReadOptions", "Trajectory", "drive_name", "join_drives",
-    "read_drive", "with_clock_offsets",
+    "need_pictures", "read_drive", "with_clock_offsets",
 ]  # fmt: skip
 
 
@@ -111,6 +111,14 @@ def as_drive(drive: Drive | str | Path, options: ReadOptions | None = None) -> D
     return drive
 
 
+def need_pictures(drive: Drive, what: str) -> None:
+    """Raise DriveError where a drive has detections in place of the pictures that ``what`` needs."""
+    if not drive.has_pictures:
+        raise DriveError(
+            f"{drive.root}: has detections in place of pictures, which {what} needs; give one with pictures"
+        )
+
+
 def drive_name(path: Path) -> str:
     """The name of the drive at ``path``: that in its ``drive.yaml``, else its folder's."""
     if is_folder_drive(path):
@@ -190,6 +198,7 @@ def single_drive_of(folder: Path, path: Path | None, what: str) -> Drive:
         raise DriveError(f"{folder}: its drive has moved; give its folder with --drive")
     if drive.joined:
         raise MapFileError(f"{folder} is of several drives; {what} of one: map them one by one")
+    need_pictures(drive, what.removesuffix(" is").removesuffix(" are"))
     return drive
 
 

@@ -205,7 +205,9 @@ def _read_pose_noise(content: object, of_source: Mapping[str, float], where: str
             raise DriveError(f"{where}, {key}: a standard deviation cannot be negative; fix it")
         if key.endswith("_over_m") and value == 0:
             raise DriveError(f"{where}, {key}: an error that fades over 0 m is not a drift; leave it out")
-    stated = {key: value for key, value in of_source.items() if not {key, DRIFTS[key]} & set(values)}
+    # A drift is part of its total: where the drive states one of both, the source's other one does not fit.
+    replaced = {key for pair in DRIFTS.items() if set(pair) & set(values) for key in pair} | set(values)
+    stated = {key: value for key, value in of_source.items() if key not in replaced}
     noise = PoseNoise.from_stated(**stated, **values)
     for total, drift in DRIFTS.items():
         if getattr(noise, drift) > getattr(noise, total):

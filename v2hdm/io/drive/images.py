@@ -15,7 +15,7 @@ from v2hdm.errors import DriveError, shown
 from v2hdm.geometry.rigid import in_order, interpolate
 from v2hdm.io.drive.road import lay_flat, log_road
 from v2hdm.io.trajectory import check_trajectory, span, why_no_pose
-from v2hdm.records import Camera, Drive, FloatArray, Image, Trajectory
+from v2hdm.records import DETECTIONS_SUFFIX, Camera, Drive, FloatArray, Image, Trajectory
 from v2hdm.settings import COUNT, NOT_NEGATIVE, POSITIVE
 
 _log = logging.getLogger(__name__)
@@ -130,6 +130,8 @@ def _check_image_files(images: Sequence[Image], cameras: Mapping[str, Camera]) -
     """Refuse missing, truncated and wrongly sized images before any long work begins."""
     from v2hdm.safe.pixels import read_header  # OpenCV, which reading settings does without
 
+    if _are_detections(images):
+        return
     for image in images:
         header = read_header(image.path)
         info = cameras[image.camera].info
@@ -143,6 +145,21 @@ def _check_image_files(images: Sequence[Image], cameras: Mapping[str, Camera]) -
                 f"{image.path}: its EXIF orientation {header.orientation} asks for a rotation, but a "
                 "calibration is of pixels as they are stored: take the orientation out of the images"
             )
+
+
+def _are_detections(images: Sequence[Image]) -> bool:
+    """Whether all images are files of detections; DriveError where one is missing, or only some are."""
+    detected = [image.path for image in images if image.path.suffix == DETECTIONS_SUFFIX]
+    if 0 < len(detected) < len(images):
+        picture = next(image.path for image in images if image.path.suffix != DETECTIONS_SUFFIX)
+        raise DriveError(
+            f"{picture}: a picture, but {len(detected)} of {len(images)} images are detections, such as "
+            f"{detected[0]}; list pictures or detections, for all cameras"
+        )
+    for path in detected:
+        if not path.is_file():
+            raise DriveError(f"{path}: no such file of detections; restore it or drop its line")
+    return bool(detected)
 
 
 def part_of(drive: Drive, options: ReadOptions) -> Drive:

@@ -29,6 +29,8 @@ from v2hdm.io.description import (
     keys_in,
 )
 from v2hdm.io.importers import readings as logs
+from v2hdm.io.importers.course.headings import STARTS, course_headings
+from v2hdm.io.importers.course.recording import Turning, course_of
 from v2hdm.io.importers.nmea import read_nmea
 from v2hdm.io.importers.readings import Attitudes, Readings
 from v2hdm.io.importers.rtklib import read_pos
@@ -42,7 +44,9 @@ from v2hdm.store.files import check_keys, take_array, take_choice, take_mapping,
 
 _log = logging.getLogger(__name__)
 
-HEADINGS = ("true", "grid")
+COURSE = "course"  # a heading that nothing recorded: the smoothed course over ground is one
+HEADINGS = ("true", "grid", COURSE)
+_USUAL_SIGMA_M = 0.02  # of a position that states none: RTK, fixed, as in records.PoseNoise
 _SAME_HEADING_DEG = 0.2  # headings closer than this are one: the noise of two antennas a metre apart
 COMMON_KEYS = keys_in(PoseKeys).optional
 TOPIC_KEYS = keys_in(TopicPoses, PoseKeys).optional
@@ -60,6 +64,7 @@ class PoseSettings:
     geoid_m: float | None = None  # height of the geoid above the ellipsoid, for heights above the sea
     epoch: float | None = None  # of the coordinates, in years
     offset_s: float = 0.0  # added to the recorded times
+    starts: str | None = None  # direction of the beginning, one of STARTS, for COURSE
 
 
 class Fixes(NamedTuple):
@@ -137,7 +142,19 @@ def read_poses(
     if entry.get("heading_file") is not None:
         attitudes = _headings(entry["heading_file"], root, f"{where}, heading_file", near_s)
         readings = replace(readings, attitudes=attitudes)
+    if entry.get("gyro_file") is not None:
+        turning = _turning(entry["gyro_file"], root, f"{where}, gyro_file")
+        readings = replace(readings, turning=turning)
     return assemble(readings, settings, origin, max_gap_s, source)
+
+
+def _turning(content: object, root: Path, where: str) -> Turning:
+    """The readings of a gyro's file."""
+    entry = {"csv": content} if isinstance(content, str) else take_mapping(content, where, DriveError)
+    check_keys(entry, ("csv",), ("columns", "offset_s"), where, DriveError)
+    turning = logs.read_turning(root / take_text(entry["csv"], f"{where}, csv", DriveError), entry, where)
+    offset_s = take_number(entry.get("offset_s", 0.0), f"{where}, offset_s", DriveError)
+    return replace(turning, stamp_s=turning.stamp_s + offset_s)
 
 
 def _headings(content: object, root: Path, where: str, near_s: float | None) -> Attitudes:
@@ -166,6 +183,11 @@ def _take_settings(entry: Mapping[str, Any], where: str) -> PoseSettings:
         fields[key] = take_array(entry[key], (3,), f"{where}, {key}", DriveError)
     if entry.get("heading") is not None:
         fields["heading"] = take_choice(entry["heading"], HEADINGS, f"{where}, heading", DriveError)
+    if entry.get("starts") is not None:
+        fields["starts"] = take_choice(entry["starts"], STARTS, f"{where}, starts", DriveError)
+    for key in ("starts", "gyro_file", "gyro_topic"):
+        if entry.get(key) is not None and fields.get("heading") != COURSE:
+            raise DriveError(f"{where}, {key}: only with heading: {COURSE}; add that or drop it")
     if fields.get("max_sigma_m", 1.0) <= 0:
         raise DriveError(f"{where}, max_sigma_m: give a positive number of metres")
     crs = entry.get("crs")
@@ -193,13 +215,17 @@ def assemble(
             f"{where}: holds {readings.point} positions: add lever_arm_m: [x, y, z], its place in the "
             "vehicle frame (m forward, left, up); [0, 0, 0] only if it is above the rear axle"
         )
+    fixes = Fixes(readings.stamp_s + settings.offset_s, readings.is_fixed)
+    if settings.heading == COURSE:
+        recorded = _of_course(readings, settings, origin, where)
+        return replace(recorded, fixes=fixes, geoid_m=settings.geoid_m)
     if readings.attitudes is None:
         raise DriveError(
             f"{where}: holds positions without a heading, and the course over ground is not a heading when a "
             "vehicle turns, stands or reverses; add a heading (HDT, THS, PASHR, a column, an Imu topic, or "
-            "heading_file, a second file)"
+            f"heading_file, a second file), or for one antenna heading: {COURSE}, with lever_arm_m and best "
+            "a gyro (gyro_file)"
         )
-    fixes = Fixes(readings.stamp_s + settings.offset_s, readings.is_fixed)
     recorded = _of_either_time(_usable(readings, settings, where), settings, origin, max_gap_s, where)
     return replace(recorded, fixes=fixes, geoid_m=settings.geoid_m)
 
@@ -244,13 +270,46 @@ def _usable(readings: Readings, settings: PoseSettings, where: str) -> Readings:
     """The readings without those that are no numbers, not sure enough, or strays."""
     attitudes = readings.attitudes
     assert attitudes is not None
-    fixed = _without(readings, _finite(readings.points, readings.sigma_m, where, "positions"))
-    fixed = _without(fixed, _sure_enough(fixed, settings.max_sigma_m, where))
-    fixed = _without(fixed, without_strays(fixed.stamp_s, _metres(fixed, where), where))
+    fixed = _fixed(readings, settings, where)
     turned = _finite(attitudes.rotation.reshape(-1, 9), np.zeros(len(attitudes.stamp_s)), where, "headings")
     attitudes = attitudes.at(turned)
     attitudes = attitudes.at(without_stray_turns(attitudes.stamp_s, attitudes.rotation, where))
     return replace(fixed, attitudes=attitudes)
+
+
+def _fixed(readings: Readings, settings: PoseSettings, where: str) -> Readings:
+    """The readings of positions that are numbers, sure enough and no strays."""
+    fixed = _without(readings, _finite(readings.points, readings.sigma_m, where, "positions"))
+    fixed = _without(fixed, _sure_enough(fixed, settings.max_sigma_m, where))
+    return _without(fixed, without_strays(fixed.stamp_s, _metres(fixed, where), where))
+
+
+def _of_course(
+    readings: Readings, settings: PoseSettings, origin: GeodeticOrigin | None, where: str
+) -> Recorded:
+    """The level vehicle's poses in the map, headed as its antenna's course and the gyro tell."""
+    if settings.lever_arm_m is None:
+        raise DriveError(
+            f"{where}: heading: {COURSE} needs lever_arm_m: [x, y, z], the antenna's place from the ground "
+            "under the rear axle, which does not slip (m forward, left, up)"
+        )
+    if readings.attitudes is not None:
+        _log.info("%s: its headings are not used: heading: %s", where, COURSE)
+    readings = _fixed(readings, settings, where)
+    if len(readings.stamp_s) < 3:
+        raise DriveError(f"{where}: {len(readings.stamp_s)} positions have no course; record a drive")
+    placed = _in_map(readings, settings, origin, where)
+    sigma_m = np.where(readings.sigma_m > 0, readings.sigma_m, _USUAL_SIGMA_M)
+    course = course_of(
+        readings.stamp_s, placed.points_map[:, :2], sigma_m, settings.lever_arm_m[:2], readings.turning, where
+    )
+    headings = course_headings(course, settings.starts, where)
+    zeros = np.zeros(len(readings.stamp_s))
+    rotation = rotation_from_euler(zeros, zeros, headings.heading_rad)
+    lever_arm_m = np.array([headings.lever_ahead_m, *settings.lever_arm_m[1:]])
+    poses = make_transform(rotation, placed.points_map - rotation @ lever_arm_m)
+    noise = _root_mean_squares({"position_m": readings.sigma_m}) | headings.noise
+    return Recorded(Trajectory(readings.stamp_s + settings.offset_s, poses), noise, placed.origin)
 
 
 def _without(readings: Readings, is_usable: BoolArray) -> Readings:
@@ -291,9 +350,29 @@ def _recorded(
     attitudes = readings.attitudes
     assert attitudes is not None
     rotation, has_heading = _rotation_at(readings, max_gap_s, where)
-    points = readings.points[has_heading]
     rotation = rotation @ settings.vehicle_from_sensor.T
-    stamp_s = readings.stamp_s[has_heading] + settings.offset_s
+    headed = _without(readings, has_heading)
+    placed = _in_map(headed, settings, origin, where)
+    rotation = placed.map_from_north @ rotation
+    points = placed.points_map
+    if settings.lever_arm_m is not None:
+        points = points - rotation @ settings.lever_arm_m
+    noise = _noise(headed.sigma_m, attitudes)
+    stamp_s = headed.stamp_s + settings.offset_s
+    return Recorded(Trajectory(stamp_s, make_transform(rotation, points)), noise, placed.origin)
+
+
+class _Placed(NamedTuple):
+    """Positions in the map, and what turns attitudes of each place into the map's axes."""
+
+    points_map: FloatArray  # (P, 3) m
+    map_from_north: FloatArray  # (P, 3, 3) from x east of the north that counts, y along it
+    origin: GeodeticOrigin | None
+
+
+def _in_map(readings: Readings, settings: PoseSettings, origin: GeodeticOrigin | None, where: str) -> _Placed:
+    """The positions of ``readings`` in the map."""
+    points = readings.points
     if readings.geodetic or settings.crs is not None:
         if readings.geodetic:
             check_geodetic(points, where)
@@ -302,28 +381,31 @@ def _recorded(
         origin = _origin(origin, geodetic[0], datum, settings, where)
         zeros = np.zeros(len(points))
         # A grid whose north lies clockwise of true north turns all that is measured from it clockwise.
-        rotation = rotation_from_euler(zeros, zeros, -north_rad) @ rotation
-        rotation = earth.enu_axes(earth.position_of(origin))[0].T @ earth.enu_axes(geodetic) @ rotation
-        points = earth.enu_from_geodetic(origin, geodetic)
-    else:
-        for key in ("heading", "geoid_m"):
-            if getattr(settings, key) is not None:
-                only = "only for coordinates on the earth; add crs or drop it"
-                raise DriveError(f"{where}, {key}: {only}")
-    if settings.lever_arm_m is not None:
-        points = points - rotation @ settings.lever_arm_m
-    noise = _noise(readings.sigma_m[has_heading], attitudes)
-    return Recorded(Trajectory(stamp_s, make_transform(rotation, points)), noise, origin)
+        grid = rotation_from_euler(zeros, zeros, -north_rad)
+        axes = earth.enu_axes(earth.position_of(origin))[0].T @ earth.enu_axes(geodetic)
+        return _Placed(earth.enu_from_geodetic(origin, geodetic), axes @ grid, origin)
+    for key in ("heading", "geoid_m"):
+        value = getattr(settings, key)
+        if value is not None and value != COURSE:
+            only = "only for coordinates on the earth; add crs or drop it"
+            raise DriveError(f"{where}, {key}: {only}")
+    return _Placed(points, np.broadcast_to(np.eye(3), (len(points), 3, 3)), origin)
 
 
 def _noise(sigma_m: FloatArray, attitudes: Attitudes) -> dict[str, float]:
     """Root mean squares of the sigmas that are stated."""
     tilt_sigma_rad = np.array([]) if attitudes.tilt_sigma_rad is None else attitudes.tilt_sigma_rad
-    values_of = {
-        "position_m": sigma_m,
-        "heading_rad": attitudes.sigma_rad,
-        "roll_pitch_rad": tilt_sigma_rad,
-    }
+    return _root_mean_squares(
+        {
+            "position_m": sigma_m,
+            "heading_rad": attitudes.sigma_rad,
+            "roll_pitch_rad": tilt_sigma_rad,
+        }
+    )
+
+
+def _root_mean_squares(values_of: Mapping[str, FloatArray]) -> dict[str, float]:
+    """Root mean squares of values that are stated."""
     return {
         key: float(np.sqrt(np.mean(np.square(stated))))
         for key, values in values_of.items()

@@ -17,6 +17,7 @@ import numpy as np
 
 from v2hdm.errors import DriveError, shown
 from v2hdm.geometry.rigid import rotation_from_euler
+from v2hdm.io.importers.course.recording import Turning
 from v2hdm.io.rows import read_rows
 from v2hdm.io.trajectory import NO_NUMBER, UNITS, checked_rotations, in_order, parse_number
 from v2hdm.records import BoolArray, FloatArray, Trajectory
@@ -75,6 +76,7 @@ class Readings:
     attitudes: Attitudes | None
     point: str = ""  # what the positions are of, which seldom sits at the vehicle's origin: an antenna's
     is_fixed: BoolArray | None = None  # (P,) whether RTK had fixed its ambiguities, None where not stated
+    turning: Turning | None = None  # of a gyro beside the receiver
 
 
 def readings_of_poses(poses: Trajectory) -> Readings:
@@ -98,10 +100,11 @@ _ANGLES = (
     "heading_deg", "yaw_deg", "yaw_rad", "roll_deg", "roll_rad", "pitch_deg", "pitch_rad", "pitch_up_deg",
 )  # fmt: skip
 _SURENESS = ("quality", "sigma_m", "heading_sigma_deg")
-NAMES = (*_STAMPS, "utc", *_MAP, *_GEODETIC, *_QUATERNION, *_ANGLES, *_SURENESS)
+_RATES = ("yaw_rate_rad_s", "yaw_rate_deg_s", "speed_m_s")
+NAMES = (*_STAMPS, "utc", *_MAP, *_GEODETIC, *_QUATERNION, *_ANGLES, *_SURENESS, *_RATES)
 """Columns that are understood. ``heading_deg`` counts clockwise from north, ``yaw_...`` counter-clockwise
 from x or east; roll is positive with the left side up, ``pitch_...`` with the nose down, ``pitch_up_deg``
-up."""
+up. ``yaw_rate_...`` is positive to the left, ``speed_m_s`` forward."""
 
 
 def read_table(
@@ -145,6 +148,31 @@ def read_table(
     point = "an antenna's" if geodetic else ""
     is_fixed = columns["quality"] == RTK_FIXED if "quality" in columns else None
     return Readings(stamp_s[rows], points, geodetic, sigma_m, attitudes, point, is_fixed)
+
+
+def read_turning(path: Path, entry: Mapping[str, Any], where: str) -> Turning:
+    """Read yaw rates, speeds of the wheels, or both, from the CSV file at ``path``."""
+    names = take_mapping(entry.get("columns", {}), f"{where}, columns", DriveError)
+    check_keys(names, (), NAMES, f"{where}, columns", DriveError)
+    texts = {ours: take_text(name, f"{where}, columns, {ours}", DriveError) for ours, name in names.items()}
+    columns = _columns(path, texts)
+    named = [name for name in _RATES if name in columns]
+    if not named or {"yaw_rate_rad_s", "yaw_rate_deg_s"} <= set(named):
+        raise DriveError(
+            f"{path}: needs a column yaw_rate_rad_s or yaw_rate_deg_s (to the left positive), or speed_m_s; "
+            f"has {', '.join(named) or 'none'}; see columns"
+        )
+    stamp_s = _stamps(columns, path)
+    is_timed = np.isfinite(stamp_s)
+    stamp_s = stamp_s[is_timed]
+    if len(stamp_s) < 2:
+        raise DriveError(f"{path}: holds {len(stamp_s)} lines with a time; record the gyro during the drive")
+    rows = in_order(stamp_s, str(path), "reading")
+    unknown = np.full(len(is_timed), np.nan)
+    degrees = np.radians(columns.get("yaw_rate_deg_s", unknown))
+    yaw_rate = columns.get("yaw_rate_rad_s", degrees)[is_timed][rows]
+    speed = columns.get("speed_m_s", unknown)[is_timed][rows]
+    return Turning(stamp_s[rows], yaw_rate, speed)
 
 
 def _columns(path: Path, names: Mapping[str, str]) -> dict[str, FloatArray]:

@@ -51,6 +51,11 @@ class Residuals:
         views, corners = np.unique(pairs, axis=0, return_counts=True)
         return {(self.image[image], marking) for image, marking in views[corners == 4].tolist()}
 
+    def take(self, rows: BoolArray) -> Residuals:
+        """The observations at ``rows`` (K,), in the same images."""
+        names = ("row_image", "marking", "corner", "is_point", "observed_px", "residual_px", "distance_sigma")
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
+
     def renamed(self, marking: IntArray, corner: IntArray) -> Residuals:
         """The same with new ids (M,) for markings 1 to M, 0 for none, and new corner numbers (M, 4)."""
         has_id = self.marking > 0

@@ -30,13 +30,18 @@ from v2hdm.io.maps.features import (
 )
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.maps.geopackage import write_geopackage, write_qgis
+from v2hdm.io.maps.landxml import write_landxml
 from v2hdm.io.maps.lanelet2 import write_lanelet2
+from v2hdm.io.maps.opendrive import write_opendrive
+from v2hdm.io.maps.questions import questions_file, write_questions
 from v2hdm.io.maps.reading import Verdict, read_geopackage, stated_in
-from v2hdm.io.maps.road_xml import write_landxml, write_opendrive
-from v2hdm.records import FloatArray, GeodeticOrigin, HDMap
+from v2hdm.records import FloatArray, GeodeticOrigin, HDMap, Trajectory
 from v2hdm.store.files import replace_csv, whole_file
 from v2hdm.store.inputs import protected_inputs
 from v2hdm.surface.strips import write_ground_geotiff, write_opencrg
+from v2hdm.topology.answers import Answer
+from v2hdm.topology.build import lane_graph
+from v2hdm.topology.graph import LaneGraph
 
 _log = logging.getLogger(__name__)
 
@@ -165,6 +170,9 @@ class Format:
     metres: str = ""  # the format's name where it holds nothing but metres
 
 
+LANE_FORMATS = ("lanelet2", "opendrive")
+"""Formats of lanes that lead to lanes, for which the paths of drives are needed."""
+
 FORMATS: Mapping[str, Format] = {
     "geojson": Format("{name}.geojson", write_geojson, states_verdict=True),
     "csv": Format("{name}.csv", write_csv),
@@ -239,17 +247,24 @@ def write_map(
     projector: str | None = None,
     crs: str | None = None,
     present: Sequence[str] = (),
+    trajectories: Sequence[Trajectory] = (),
+    answers: Sequence[Answer] = (),
 ) -> list[Path]:
     """Write a map in several of :data:`FORMATS` to ``folder``; returns the files, each written atomically.
 
     ``name`` is that of the files, ``verdict`` that on the run which made the map, as JSON, ``projector`` that
     of :func:`v2hdm.io.maps.lanelet2.write_lanelet2`, and ``crs`` the system of the other formats' coordinates
-    in place of their own; files of the formats ``present`` are there already. Raises ConfigError when a
+    in place of their own; files of the formats ``present`` are there already. ``trajectories`` are of the
+    drives whose paths say where lanes lead, for :data:`LANE_FORMATS`, with which what paint and paths leave
+    open is written as ``{name}_questions.geojson``, but for what ``answers`` state. Raises ConfigError when a
     format is not known or lacks its package, or when the projector or the system does not suit the map.
     """
     check_formats(formats, "formats")
     grids = check_crs(crs, with_data(formats), hd_map.origin, "crs")
     written = []
+    graph = None
+    if set(LANE_FORMATS) & set(formats) - set(present):
+        graph = lane_graph(hd_map, trajectories, answers)
     for chosen in [chosen for chosen in with_data(formats) if chosen not in present]:
         path = folder / _ALL[chosen].file.format(name=name)
         if chosen in GROUND_FORMATS and not hd_map.ground:
@@ -261,6 +276,7 @@ def write_map(
         more: dict[str, Any] = {"projector": projector} if chosen == "lanelet2" else {}
         more |= {"verdict": verdict} if _ALL[chosen].states_verdict else {}
         more |= {"grid": grids[chosen]} if chosen in grids else {}
+        more |= {"graph": graph} if chosen in LANE_FORMATS else {}
         _ALL[chosen].write(hd_map, path, **more)
         written.append(path)
         if chosen == "geojson" and hd_map.origin is None and crs is None:
@@ -268,4 +284,26 @@ def write_map(
                 "%s: the drive has no origin on the earth, so its coordinates are metres, which a GIS opens "
                 "as degrees; the format gpkg marks them as metres", path.name,
             )  # fmt: skip
+    if graph is not None:
+        written += _tell_open(graph, hd_map.origin, folder, name, bool(trajectories))
     return written
+
+
+def _tell_open(
+    graph: LaneGraph, origin: GeodeticOrigin | None, folder: Path, name: str, has_drives: bool
+) -> list[Path]:
+    """Write what lanes leave open where drives are known; log what else a user must know of them."""
+    for question in graph.questions:
+        if question.subject == "line":
+            _log.warning("%s: %s; it bounds no lane: redraw it", name, question.text)
+    if graph.lanes and not has_drives:
+        _log.warning(
+            "%s: no path of a drive is known: lanes have the directions of their lines, and no way leads "
+            "through crossings; export from the result folder, or give --path", name,
+        )  # fmt: skip
+    if not graph.questions or not has_drives:
+        return []
+    path = folder / questions_file(name)
+    write_questions(graph.questions, origin, path)
+    _log.info("%s: %d questions on lanes are open", path, len(graph.questions))
+    return [path]

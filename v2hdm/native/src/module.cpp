@@ -8,4 +8,5 @@ NB_MODULE(_kernels, module) {
     v2hdm::add_lanes(module);
     v2hdm::add_paint(module);
     v2hdm::add_lens(module);
+    v2hdm::add_adjust(module);
 }

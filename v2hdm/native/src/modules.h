@@ -10,5 +10,6 @@ void add_lattice(nanobind::module_& module);
 void add_lanes(nanobind::module_& module);
 void add_paint(nanobind::module_& module);
 void add_lens(nanobind::module_& module);
+void add_adjust(nanobind::module_& module);
 
 }  // namespace v2hdm

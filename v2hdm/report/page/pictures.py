@@ -50,7 +50,9 @@ def pictures(facts: Facts) -> dict[str, list[dict[str, Any]]]:
     (``map``) and the detected corners (``seen``), in px of the picture. Empty without the drive; raises
     DriveError for an unreadable image.
     """
-    if facts.drive is None or facts.residuals is None or facts.route is None or facts.hd_map is None:
+    if facts.drive is None or not facts.drive.has_pictures:
+        return {}
+    if facts.residuals is None or facts.route is None or facts.hd_map is None:
         return {}
     images = {facts.drive.name_of(image.path): image for image in facts.drive.images}
     calibrations = {name: camera.calibration for name, camera in facts.cameras.items()}

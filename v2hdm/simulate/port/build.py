@@ -161,7 +161,7 @@ def _session_seed(config: PortConfig, part: int) -> list[int]:
     return [config.seed, part, *([-1 % 2**32, config.session] if config.session else [])]
 
 
-def _surveyed_cameras(config: PortConfig) -> dict[str, Camera]:
+def surveyed_cameras(config: PortConfig) -> dict[str, Camera]:
     """A port's cameras as the mapper knows them: IPMs, a region, a surveyed centre. Raises ConfigError."""
     rng = np.random.default_rng([config.seed, _CALIBRATION])
     sigma = np.full(3, config.calibration.centre_sigma_m)
@@ -198,7 +198,7 @@ def build_port(config: PortConfig) -> Port:
         footprints = [box_footprint(box) for box in boxes]
         add_signs(layout, config.paint, route, footprints, np.random.default_rng([config.seed, _SIGNS]))
     scene = replace(scene, paints=tuple(layout.paints), boxes=boxes, relief=relief)
-    cameras = _surveyed_cameras(config)
+    cameras = surveyed_cameras(config)
     classes = (*PAINT_CLASSES, *config.paint.stencils)
     return Port(
         config=config,

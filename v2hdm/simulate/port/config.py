@@ -291,6 +291,21 @@ def _rear() -> CameraConfig:
 
 
 @dataclass(kw_only=True)
+class SurveyConfig:
+    """A network of streets and yards in place of a port, as detections in place of pictures."""
+
+    length_km: Annotated[
+        float,
+        Within(0, 1000),
+        "driven length of a network of streets and yards with detections in place of pictures; 0 renders "
+        "pictures along route.pieces.",
+    ] = 0.0
+    drives: Annotated[
+        int, Within(1, 100), "number of drives through the network, by turns there and back."
+    ] = 2
+
+
+@dataclass(kw_only=True)
 class PortConfig:
     """A port, a vehicle with its cameras, and one drive through it.
 
@@ -322,3 +337,4 @@ class PortConfig:
     relief: ReliefConfig = field(default_factory=ReliefConfig)
     yard: YardConfig = field(default_factory=YardConfig)
     exposure: ExposureConfig = field(default_factory=ExposureConfig)
+    survey: SurveyConfig = field(default_factory=SurveyConfig)

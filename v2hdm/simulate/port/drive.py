@@ -147,6 +147,8 @@ def folder_of_port(config: PortConfig, cache: Path) -> Path:
         del content["paint"]["stencils"]
     if config.paint.signs == SignsConfig():
         del content["paint"]["signs"]
+    if not config.survey.length_km:
+        del content["survey"]
     text = json.dumps([RENDERER_VERSION, content], sort_keys=True)
     return cache / f"{config.name}-{hashlib.sha256(text.encode()).hexdigest()[:10]}"
 

@@ -37,6 +37,12 @@ class ClosedLane:
     left: Bound
     right: Bound
 
+    @property
+    def turned(self) -> ClosedLane:
+        """The same lane in the other direction."""
+        left, right = (Bound(bound.line, bound.order[::-1]) for bound in (self.right, self.left))
+        return ClosedLane(left, right)
+
 
 @dataclass(frozen=True)
 class Connection:
@@ -112,14 +118,19 @@ def _is_way(
     return bool(is_short and all(gap @ way > 0 for gap in gaps))
 
 
-def closed_lanes(lines_map: Sequence[FloatArray]) -> list[ClosedLane]:
+def closed_lanes(
+    lines_map: Sequence[FloatArray], more_cuts: Sequence[tuple[int, int]] = ()
+) -> list[ClosedLane]:
     """The lanes between polylines (N, 2) m, in the order of their first line.
 
     A lane lies between a line and the nearest one across it, at a lane's width, for longer than it is wide.
     Where one ends, those beside it are cut, too: for lane changes neighbours share all of a bound.
+    ``more_cuts`` are numbers of lines and their vertices at which lanes end as well.
     """
     runs = _runs(lines_map)
     cuts = [_Cuts(line) for line in lines_map]
+    for number, vertex in more_cuts:
+        cuts[number].at(vertex)
     for run in runs:
         for end in (0, -1):
             cuts[run.line].at(run.vertices[end])

@@ -1,0 +1,79 @@
+"""Files of detections in place of pictures: what is written is read again, and damage is one line."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from v2hdm.errors import DriveError
+from v2hdm.io.detections import read_detections, write_detections
+from v2hdm.io.drive import read_drive
+from v2hdm.records import ImageDetections, LaneDetection, MarkingDetection
+
+
+def detections() -> ImageDetections:
+    """A marking with independent corners, one with a full covariance of which a corner is hidden, a line."""
+    corners = np.array([[100.25, 300.5], [140.0, 310.0], [135.0, 350.0], [95.0, 340.125]])
+    root = np.random.default_rng(1).normal(size=(8, 8))
+    known = np.array([True, True, False, True])
+    plain = MarkingDetection("diamond", 0.9, corners, np.diag(np.arange(1.0, 9.0)), np.ones(4, dtype=bool))
+    full = MarkingDetection("lane_dash", 0.7, corners + 50.0, root @ root.T + np.eye(8), known)
+    line = LaneDetection("lane_line", 0.8, corners, 2, np.array([0.5, 0.6, 0.7, 0.8]))
+    return ImageDetections(7, (plain, full), (line,))
+
+
+def test_detections_are_read_as_they_were_written(tmp_path):
+    written = detections()
+    write_detections(tmp_path / "a.json", written)
+    read = read_detections(tmp_path / "a.json", 7)
+    assert read.image == 7
+    for before, after in zip(written.markings, read.markings, strict=True):
+        assert (before.kind, before.score) == (after.kind, after.score)
+        np.testing.assert_allclose(after.corners_px, before.corners_px, atol=1e-5)
+        np.testing.assert_allclose(after.covariance_px, before.covariance_px, rtol=1e-5, atol=1e-5)
+        np.testing.assert_array_equal(after.corner_valid, before.corner_valid)
+    (line,) = read.lanes
+    assert (line.kind, line.identity) == ("lane_line", 2)
+    np.testing.assert_allclose(line.sigma_px, [0.5, 0.6, 0.7, 0.8])
+
+
+def marking(**changes: object) -> dict[str, object]:
+    """The least that a file says of a marking, with changes; None leaves a key out."""
+    entry = {"class": "diamond", "corners_px": [[0, 0]] * 4, "sigma_px": [[1, 1]] * 4, **changes}
+    return {key: value for key, value in entry.items() if value is not None}
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ({}, "missing key 'markings'"),
+        ({"markings": {}}, "expected a list"),
+        ({"markings": [marking(sigma_px=None)]}, "give one of sigma_px"),
+        ({"markings": [marking(covariance_px=[[0] * 8] * 8)]}, "give one of sigma_px"),
+        ({"markings": [marking(sigma_px=[[1, 0]] * 4)]}, "is not above 0"),
+        ({"markings": [marking(corners_px=[[0, 0]] * 3)]}, "expected 4 x 2 numbers"),
+        ({"markings": [marking(known=[1, 1, 1, 1])]}, "true or false"),
+        ({"markings": [marking(colour="white")]}, "unknown key 'colour'"),
+    ],
+)
+def test_a_damaged_file_is_one_line_that_names_it(tmp_path, content, says):
+    path = tmp_path / "000000.json"
+    path.write_text(json.dumps(content))
+    with pytest.raises(DriveError, match=r"000000\.json") as refused:
+        read_detections(path, 0)
+    assert says in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_drive_has_pictures_or_detections_but_not_both(survey, tmp_path):
+    folder = shutil.copytree(survey[0], tmp_path / "drive")
+    assert not read_drive(folder).has_pictures
+    images = folder / "front" / "images.txt"
+    before = images.read_text()
+    images.write_text(before.replace("000000.json", "000000.jpg"))
+    with pytest.raises(DriveError, match="list pictures or detections, for all cameras"):
+        read_drive(folder)
+    images.write_text(before.replace("000000.json", "999999.json"))
+    with pytest.raises(DriveError, match=r"999999\.json: no such file of detections"):
+        read_drive(folder)

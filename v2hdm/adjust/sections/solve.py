@@ -1,0 +1,376 @@
+"""``solve_parts``: a problem too large for one solve, part by part, to the same optimum and covariances.
+
+Each part is solved by itself at first. Then rounds follow: every part summarises what it says of its border
+(:mod:`v2hdm.adjust.sections.summary`), the summaries are joined (:mod:`v2hdm.adjust.sections.join`), and each
+part follows the border. This is a Gauss-Newton descent of the whole in which no process ever holds more than
+one part; parts are jobs of an executor, and their estimates lie in files between rounds.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from v2hdm.adjust.descent import Descent, descend
+from v2hdm.adjust.engine import TorchEngine
+from v2hdm.adjust.engines import make_engine
+from v2hdm.adjust.layout import nearby_origin
+from v2hdm.adjust.model import Estimate, Loss, rigid
+from v2hdm.adjust.problem import Problem, SolveOptions
+from v2hdm.adjust.sections.join import Joined, Labels, Net, Shared, labels_of
+from v2hdm.adjust.sections.parts import Link, Part
+from v2hdm.adjust.sections.summary import Border, JoinedCovariance, Summary, Values, follow, summarise
+from v2hdm.adjust.solution import Solution
+from v2hdm.adjust.solve import report_of, start_of
+from v2hdm.adjust.threads import one_thread_in_torch
+from v2hdm.adjust.whitening import Whitening, factorise
+from v2hdm.errors import AdjustError, WorkerError
+from v2hdm.executor import HERE, Executor
+from v2hdm.progress import Progress, silent
+from v2hdm.records import FloatArray
+
+GAP = 1e-8
+"""Twice the predicted decrease of the cost, as a fraction of it, at which the rounds end."""
+
+_MOST_ROUNDS = 15
+_HELD_SIGMA_M = 1.0  # standard deviation, m, of what holds border corners in a part: any ray tells more
+_CONTRADICTION = 9.0
+"""Chi-square per shared coordinate from which parts contradict each other: 1 is usual, this is 3 sigmas."""
+
+
+class Shape(NamedTuple):
+    """What all parts have in common: cameras and priors of the whole, the arrays' origin (2,), options."""
+
+    problem: Problem  # without observations: the cameras and priors of the whole
+    origin_map: FloatArray
+    options: SolveOptions
+
+    @classmethod
+    def of(cls, problem: Problem, options: SolveOptions) -> Shape:
+        """The shape of a problem."""
+        empty = problem.observations.take(np.zeros(0, dtype=np.int64))
+        bare = replace(
+            problem, observations=empty, corner_count=0, corners_start=None, control=None, lengths=None
+        )
+        return cls(bare, nearby_origin(problem), options)
+
+
+class PartStates(NamedTuple):
+    """A part's border in a round: where it is, its value and what it tells."""
+
+    labels: Labels
+    values: Values
+    told: Summary
+
+
+Finish = Callable[[int, Part, Solution], Any]
+"""Makes the result of a part of its number, itself and its solution, in the process that solved it."""
+
+
+class _Open(NamedTuple):
+    """A part laid out: ``held`` (m,), 1 / m^2, holds corners of its border at ``held_map`` (m, 2)."""
+
+    plain: TorchEngine  # without what holds them
+    engine: TorchEngine
+    border: Border
+    held: torch.Tensor
+    held_map: torch.Tensor
+
+
+@dataclass(frozen=True)
+class _Job:
+    """One round of one part; ``target`` is the value that its border moves to, None for its own optimum."""
+
+    number: int
+    target: Values | None = None
+    joint: FloatArray | None = None
+    gap: float = 0.0
+    rounds: int = 0
+
+
+@dataclass(frozen=True)
+class _Work:
+    """Rounds of parts whose files ``part_N`` and ``estimate_N`` are in ``folder``."""
+
+    folder: Path
+    shape: Shape
+    finish: Finish | None = None
+
+    def __call__(self, job: _Job, _: Progress = silent) -> Any:
+        """Do one round of one part, or finish it."""
+        part = load_part(self.folder, job.number)
+        options = self.shape.options
+        compiled = options.on_cpu and options.engine != "torch"
+        with one_thread_in_torch(len(part.problem.observations.corner), compiled):
+            if job.joint is not None:
+                return self._finished(job, part)
+            return self._round(job, part)
+
+    def _open(self, part: Part) -> _Open:
+        """The part's engine, with the corners of its border held near their start.
+
+        Where a part saw a corner along one line alone, the part alone could not tell where it is; what holds
+        it is taken out of the summary again.
+        """
+        options = self.shape.options
+        arrays = part.arrays(options, self.shape.origin_map)
+        plain = make_engine(options.engine, arrays)
+        border = border_of(part, plain)
+        cameras = arrays.centre.new_tensor(part.problem.cam_from_vehicle)
+        start_map, _ = plain.back_project(cameras)
+        is_free = (arrays.control_root[border.corners] == 0).all(dim=1)
+        held = is_free.to(arrays.centre.dtype) / _HELD_SIGMA_M**2
+        control = arrays.control.clone()
+        root = arrays.control_root.clone()
+        control[border.corners[is_free]] = start_map[border.corners[is_free]]
+        root[border.corners[is_free]] = root.new_tensor([1.0, 0.0, 1.0]) / _HELD_SIGMA_M
+        engine = plain.over(replace(arrays, control=control, control_root=root))
+        return _Open(plain, engine, border, held, control[border.corners])
+
+    def _round(self, job: _Job, part: Part) -> PartStates:
+        """The part's own optimum, or what follows the target, and what the part tells there."""
+        opened = self._open(part)
+        engine = opened.engine
+        border = opened.border
+        robust = self._robust
+        if job.target is None:
+            estimate = self._own_optimum(job.number, part, engine, robust)
+        else:
+            before = _whitened(engine, self._estimate(job.number), robust)
+            estimate = follow(before, border, job.target)
+            del before
+        with (self.folder / f"estimate_{job.number}").open("wb") as stream:
+            pickle.dump(estimate, stream)
+        told = summarise(_whitened(engine, estimate, robust), border, opened.held, opened.held_map)
+        labels = labels_of(part, engine.arrays.corner_order.cpu().numpy(), border.corners.cpu().numpy())
+        return PartStates(labels, Values.of(estimate, border), told)
+
+    @property
+    def _robust(self) -> Loss:
+        return Loss(self.shape.options.loss, self.shape.options.loss_scale)
+
+    def _own_optimum(self, number: int, part: Part, engine: TorchEngine, robust: Loss) -> Estimate:
+        options = self.shape.options
+        start = start_of(part.problem, self.shape.origin_map, engine, robust, options)
+        descent = descend(
+            engine, start.estimate, robust, options.gap_tolerance, options.max_refreshes,
+            options.max_evaluations, start.opening,
+        )  # fmt: skip
+        if descent.is_singular:
+            x, y = part.problem.map_from_vehicle[:, :2, 3].mean(axis=0)
+            raise AdjustError(
+                f"section {number + 1}, about x {x:.0f} m, y {y:.0f} m: its {part.problem.corner_count} "
+                "corners leave a direction of a camera free; make sections longer"
+            )
+        return descent.estimate
+
+    def _estimate(self, number: int) -> Estimate:
+        with (self.folder / f"estimate_{number}").open("rb") as stream:
+            estimate = pickle.load(stream)
+        assert isinstance(estimate, Estimate)
+        return estimate
+
+    def _finished(self, job: _Job, part: Part) -> Any:
+        assert self.finish is not None
+        assert job.target is not None
+        opened = self._open(part)
+        border = opened.border
+        robust = self._robust
+        before = _whitened(opened.engine, self._estimate(job.number), robust)
+        estimate = follow(before, border, job.target)
+        del before
+        descent = Descent(
+            engine=opened.plain,
+            plan=opened.engine.plan(),
+            estimate=estimate,
+            robust=robust,
+            terms=opened.plain.terms(estimate, robust),
+            gap=job.gap,
+            evaluations=job.rounds,
+            progressing=job.gap > GAP,
+            is_singular=False,
+            last_whitening=None,
+        )
+        options = replace(self.shape.options, gap_tolerance=GAP)
+        solution = report_of(part.problem, self.shape.origin_map, options, descent, 0)
+        held = replace(descent, engine=opened.engine)
+        return self.finish(
+            job.number, part, replace(solution, covariance=JoinedCovariance(held, None, border, job.joint))
+        )
+
+
+def _whitened(engine: TorchEngine, estimate: Estimate, robust: Loss) -> Whitening:
+    return factorise(engine, engine.plan(), estimate, robust)
+
+
+def border_of(part: Part, engine: TorchEngine) -> Border:
+    """The border of a part in the order of its arrays."""
+    rank = torch.argsort(engine.arrays.corner_order)
+    corners = rank[torch.as_tensor(part.border_corners, device=rank.device)].sort().values
+    return Border(torch.as_tensor(part.border_frames, device=rank.device), corners)
+
+
+def save_part(folder: Path, number: int, part: Part) -> None:
+    """Write a part for :func:`solve_parts`."""
+    with (folder / f"part_{number}").open("wb") as stream:
+        pickle.dump(part, stream)
+
+
+def load_part(folder: Path, number: int) -> Part:
+    """Read a part that :func:`save_part` has written."""
+    with (folder / f"part_{number}").open("rb") as stream:
+        part = pickle.load(stream)
+    assert isinstance(part, Part)
+    return part
+
+
+def solve_parts(
+    folder: Path,
+    count: int,
+    links: Sequence[Link],
+    shape: Shape,
+    finish: Finish,
+    executor: Executor = HERE,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Any]:
+    """Solve the ``count`` parts in ``folder`` together; returns what ``finish`` makes of each.
+
+    ``progress`` is called with the number of the round and the most that there may be. Raises AdjustError
+    where parts leave a direction free or contradict each other, WorkerError where a process died.
+    """
+    report = progress or (lambda done, total: None)
+    work = _Work(folder, shape)
+    jobs = [_Job(number) for number in range(count)]
+    alone: list[Summary] = []
+    targets: list[Values] = []
+    for number in range(_MOST_ROUNDS):
+        report(number, _MOST_ROUNDS)
+        states = _side_by_side(executor, work, jobs)
+        told = [state.told for state in states]
+        if number == 0:
+            net = _net_of(states, links, shape)
+            alone = told
+        elif number == 1:
+            _check_agreement(net, alone, told, folder)
+        shared = _shared(net, states)
+        joined = net.join([_about(state, shared, net) for state in states], shared)
+        cost = sum(_cost(part) for part in told)
+        gap = (joined.decrease + sum(part.slack for part in told)) / max(cost, 1.0)
+        moved = _moved(net, shared, joined)
+        targets = [_values(net, moved, state.labels, state.values) for state in states]
+        if number > 0 and gap <= GAP:
+            break
+        jobs = [_Job(part, target) for part, target in enumerate(targets)]
+    joint = net.covariances(joined.factor)
+    last = [
+        _Job(part, target, covariance, gap, number + 1)
+        for part, (target, covariance) in enumerate(zip(targets, joint, strict=True))
+    ]
+    return _side_by_side(executor, replace(work, finish=finish), last)
+
+
+def _side_by_side(executor: Executor, work: _Work, jobs: Sequence[_Job]) -> list[Any]:
+    results: dict[int, Any] = {}
+    with closing(executor.side_by_side(work, jobs)) as outcomes:
+        for number, outcome in outcomes:
+            if isinstance(outcome, WorkerError):
+                raise outcome
+            results[number] = outcome
+    return [results[number] for number in range(len(jobs))]
+
+
+def _net_of(states: Sequence[PartStates], links: Sequence[Link], shape: Shape) -> Net:
+    first = states[0].values
+    unknowns = 6 + first.clock_s.shape[1]
+    return Net.of(
+        shape.problem,
+        shape.options,
+        [state.labels for state in states],
+        links,
+        unknowns,
+        first.frame_state.shape[1],
+    )
+
+
+def _shared(net: Net, states: Sequence[PartStates]) -> Shared:
+    """The value of all borders: each item's is that of the last part that has it."""
+    cameras = np.tile(np.eye(4), (len(net.problem.intrinsic), 1, 1))
+    clocks = np.zeros((len(cameras), net.unknowns - 6))
+    frame_state = np.zeros((len(net.frames), net.states))
+    corners_map = np.zeros((len(net.corners), 2))
+    for state in states:
+        cameras[state.labels.cameras] = state.values.cam_from_vehicle.cpu().numpy()
+        clocks[state.labels.cameras] = state.values.clock_s.cpu().numpy()
+        frame_state[np.searchsorted(net.frames, state.labels.frames)] = state.values.frame_state.cpu().numpy()
+        corners_map[np.searchsorted(net.corners, state.labels.corners)] = (
+            state.values.corners_map.cpu().numpy()
+        )
+    return Shared(cameras, clocks, frame_state, corners_map)
+
+
+def _values(net: Net, shared: Shared, labels: Labels, like: Values) -> Values:
+    """A part's border as it is shared."""
+
+    def tensor(values: FloatArray) -> torch.Tensor:
+        return torch.as_tensor(values, dtype=torch.float64, device=like.cam_from_vehicle.device)
+
+    return Values(
+        tensor(shared.cam_from_vehicle[labels.cameras]),
+        tensor(shared.clock_s[labels.cameras]),
+        tensor(shared.frame_state[np.searchsorted(net.frames, labels.frames)]),
+        tensor(shared.corners_map[np.searchsorted(net.corners, labels.corners)]),
+    )
+
+
+def _about(state: PartStates, shared: Shared, net: Net) -> Summary:
+    """What a part tells about the shared value, which is not its own yet."""
+    away = _values(net, shared, state.labels, state.values).step_from(state.values).cpu().numpy()
+    return replace(state.told, slope=state.told.slope + state.told.information @ away)
+
+
+def _moved(net: Net, shared: Shared, joined: Joined) -> Shared:
+    """The shared value after the step of a join."""
+    by_camera = joined.step[0].reshape(len(shared.cam_from_vehicle), net.unknowns)
+    turn = rigid(torch.as_tensor(by_camera[:, :6])).detach().numpy()
+
+    def items(place: tuple[np.ndarray, np.ndarray], width: int) -> FloatArray:
+        out = np.zeros((len(place[0]), width))
+        for item, (block, row) in enumerate(zip(*place, strict=True)):
+            out[item] = joined.step[block][row : row + width]
+        return out
+
+    return Shared(
+        turn @ shared.cam_from_vehicle,
+        shared.clock_s + by_camera[:, 6:],
+        shared.frame_state + items(net.frame_place, net.states),
+        shared.corners_map + items(net.corner_place, 2),
+    )
+
+
+def _cost(told: Summary) -> float:
+    return sum(told.terms.values())
+
+
+def _check_agreement(net: Net, alone: Sequence[Summary], together: Sequence[Summary], folder: Path) -> None:
+    """Raise AdjustError where parts fit what they share much worse than their noise explains."""
+    rises = [_cost(after) - _cost(before) for before, after in zip(alone, together, strict=True)]
+    coordinates = sum(len(part.slope) for part in together) - sum(net.pattern.sizes)
+    ratio = 2 * sum(rises) / max(coordinates, 1)
+    if ratio <= _CONTRADICTION:
+        return
+    worst = int(
+        np.argmax([rise / max(len(part.slope), 1) for rise, part in zip(rises, together, strict=True)])
+    )
+    x, y = load_part(folder, worst).problem.map_from_vehicle[:, :2, 3].mean(axis=0)
+    raise AdjustError(
+        f"the drives contradict each other, most about x {x:.0f} m, y {y:.0f} m (section {worst + 1}): "
+        f"chi-square {ratio:.0f} for each coordinate that sections share; map the drives one by one to find "
+        "the one whose poses or clock are wrong"
+    )

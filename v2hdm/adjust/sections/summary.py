@@ -1,0 +1,282 @@
+"""What a part says of its border: its marginal information there, and its own optimum; and the way back.
+
+With the whitened variables y of :mod:`v2hdm.adjust.whitening`, in which the Hessian is the identity, the
+border is b = W'y for some columns W. By the part alone, b has the covariance W'W and the optimum -W'g. If all
+parts together move the border by d instead, y follows as y = -g + W (W'W)^-1 (d + W'g), and if they give it
+the covariance C, all else inherits C - W'W through the same regression (the law of total covariance).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import one_hot
+
+from v2hdm.adjust.covariance import Covariance, reduced_root
+from v2hdm.adjust.model import Estimate, left_tangent
+from v2hdm.adjust.reduced import to_tiles
+from v2hdm.adjust.whitening import Whitening
+from v2hdm.records import FloatArray
+
+_CORNERS_AT_ONCE = 256  # corners whose columns are computed together, to bound intermediate results
+_FRAMES_AT_ONCE = 64  # frames whose columns are computed together
+
+
+@dataclass(frozen=True)
+class Border:
+    """The border of a part in the order of its arrays: all cameras, then ``frames``, then ``corners``.
+
+    ``corners`` (m,) are ascending and closed: with a corner, all that known lengths join to it.
+    """
+
+    frames: Tensor
+    corners: Tensor
+
+
+@dataclass(frozen=True)
+class Values:
+    """The border's value: extrinsics (C, 4, 4), clocks (C, Q), frame states (b, S) and corners (m, 2)."""
+
+    cam_from_vehicle: Tensor
+    clock_s: Tensor
+    frame_state: Tensor
+    corners_map: Tensor
+
+    @classmethod
+    def of(cls, estimate: Estimate, border: Border) -> Values:
+        """The border's part of an estimate."""
+        return cls(
+            estimate.cam_from_vehicle,
+            estimate.clock_s,
+            estimate.frame_state[border.frames],
+            estimate.corners_map[border.corners],
+        )
+
+    def step_from(self, base: Values) -> Tensor:
+        """The step (n,) of the border that leads here from ``base``, in the border's order."""
+        turned = left_tangent(self.cam_from_vehicle, base.cam_from_vehicle)
+        by_camera = torch.cat([turned, self.clock_s - base.clock_s], dim=1)
+        states = self.frame_state - base.frame_state
+        corners = self.corners_map - base.corners_map
+        return torch.cat([by_camera.flatten(), states.flatten(), corners.flatten()])
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Columns of W: ``reduced`` (D, n), and of each corner's own variables ``own`` (2 m, 2 m), the last."""
+
+    reduced: Tensor
+    own: Tensor
+
+    def pushed(self, weights: Tensor) -> tuple[Tensor, Tensor]:
+        """W weights, as reduced variables (D,) and the corners' own (m, 2)."""
+        return self.reduced @ weights, (self.own @ weights[len(weights) - len(self.own) :]).view(-1, 2)
+
+    @cached_property
+    def covariance(self) -> Tensor:
+        """W'W (n, n)."""
+        out = self.reduced.mT @ self.reduced
+        if len(self.own):
+            out[-len(self.own) :, -len(self.own) :] += self.own.mT @ self.own
+        return out
+
+
+def border_columns(whitening: Whitening, border: Border) -> Columns:
+    """The columns of a border."""
+    arrays = whitening.engine.arrays
+    factor = whitening.reduced_factor
+    tip = len(factor.tip)
+    cameras = factor.tip.new_zeros(factor.size, tip)
+    cameras[factor.size - tip :] = torch.eye(tip, dtype=cameras.dtype, device=cameras.device)
+    parts = [factor.solve(cameras)]
+    if len(border.frames) and arrays.states:
+        unit = torch.eye(len(arrays.states), dtype=cameras.dtype, device=cameras.device)
+        parts.append(_frame_columns(whitening, border.frames, unit))
+    corners = _corner_columns(whitening, border.corners)
+    return Columns(torch.cat([*parts, corners.reduced], dim=1), corners.own)
+
+
+def _frame_columns(whitening: Whitening, frames: Tensor, acts: Tensor) -> Tensor:
+    """Reduced columns (D, b n) of ``acts`` (S, n) on the states of frames (b,)."""
+    arrays = whitening.engine.arrays
+    selected = acts.new_zeros(arrays.frame_count, len(acts), len(frames), acts.shape[1])
+    selected[frames, :, torch.arange(len(frames), device=frames.device)] = acts
+    tiles = to_tiles(whitening.plan, selected.flatten(2))
+    tip = tiles.new_zeros(len(whitening.reduced_factor.tip), tiles.shape[1])
+    return whitening.reduced_factor.solve(torch.cat([tiles, tip]))
+
+
+def _corner_columns(whitening: Whitening, corners: Tensor) -> Columns:
+    """Columns of corners (m,), ascending and closed."""
+    tip = whitening.reduced_factor.tip
+    reduced = [tip.new_zeros(whitening.reduced_factor.size, 0)]
+    own = tip.new_zeros(2 * len(corners), 2 * len(corners))
+    for begin, end in _chunks(whitening, corners):
+        chosen = corners[begin:end]
+        unit = torch.eye(2 * len(chosen), dtype=tip.dtype, device=tip.device).view(len(chosen), 2, -1)
+        factor = whitening.linearised.corner_factor.take(chosen)
+        lower = factor.solve(unit)
+        inverse = factor.solve_transposed(lower).flatten(0, 1)
+        is_kept = torch.isin(chosen, whitening.plan.kept_corners).repeat_interleave(2)
+        own_part = lower.flatten(0, 1)
+        own_part[is_kept] = 0.0
+        own[2 * begin : 2 * end, 2 * begin : 2 * end] = own_part
+        reduced.append(-reduced_root(whitening, chosen) @ inverse)
+    return Columns(torch.cat(reduced, dim=1), own)
+
+
+def _chunks(whitening: Whitening, corners: Tensor) -> list[tuple[int, int]]:
+    """Ranges of corners (m,) whose columns are computed together; joined ones are never separated."""
+    is_joined = whitening.engine.arrays.joined[corners].tolist()
+    begins = [0]
+    for at, joined in enumerate(is_joined):
+        if at - begins[-1] >= _CORNERS_AT_ONCE and not joined:
+            begins.append(at)
+    ends = [*begins[1:], len(corners)]
+    return [(begin, end) for begin, end in zip(begins, ends, strict=True) if end > begin]
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a part says of its border, as a quadratic function of the border's step.
+
+    Half of step' ``information`` step (n, n) plus ``slope`` (n,) times the step; ``terms`` is the cost at the
+    point that the step is from, by name. ``slack`` is twice the decrease of the cost that is left with the
+    border held.
+    """
+
+    information: FloatArray
+    slope: FloatArray
+    terms: dict[str, float]
+    slack: float
+
+
+def own_step(whitening: Whitening, border: Border, columns: Columns) -> Tensor:
+    """The step (n,) of the border to the part's own optimum."""
+    gradient = whitening.gradient
+    reduced = gradient[: whitening.reduced_factor.size]
+    step = -(columns.reduced.mT @ reduced)
+    if len(border.corners):
+        of_corners = gradient[len(reduced) :].view(-1, 2)[border.corners].flatten()
+        step[-len(of_corners) :] -= columns.own.mT @ of_corners
+    return step
+
+
+def summarise(whitening: Whitening, border: Border, held: Tensor, held_map: Tensor) -> Summary:
+    """The summary of a part at the whitening's estimate, without what holds its border's corners.
+
+    These were held at ``held_map`` (m, 2) with the information ``held`` (m,), 1 / m^2, in each direction.
+    """
+    columns = border_columns(whitening, border)
+    information = torch.cholesky_inverse(torch.linalg.cholesky(columns.covariance))
+    step = own_step(whitening, border, columns)
+    pulled = information @ step
+    slack = whitening.gradient.square().sum() - step @ pulled
+    slope = -pulled
+    count = 2 * len(border.corners)
+    if count:
+        weight = held.repeat_interleave(2)
+        off_m = (whitening.estimate.corners_map[border.corners] - held_map).flatten()
+        slope[-count:] -= weight * off_m
+        information.diagonal()[-count:] -= weight
+    terms = {name: cost for name, cost in whitening.terms.items() if name != "control_points"}
+    return Summary(information.cpu().numpy(), slope.cpu().numpy(), terms, max(float(slack), 0.0))
+
+
+def follow(whitening: Whitening, border: Border, target: Values) -> Estimate:
+    """The estimate after the border has moved to ``target`` and all else followed to its optimum."""
+    columns = border_columns(whitening, border)
+    step = target.step_from(Values.of(whitening.estimate, border))
+    beyond = step - own_step(whitening, border, columns)
+    weights = torch.cholesky_solve(beyond[:, None], torch.linalg.cholesky(columns.covariance))[:, 0]
+    reduced, own = columns.pushed(weights)
+    whitened = -whitening.gradient
+    whitened[: len(reduced)] += reduced
+    whitened[len(reduced) :].view(-1, 2)[border.corners] += own
+    moved = whitening.linearised.evaluate(*whitening.step(whitened)).estimate
+    states = moved.frame_state.clone()
+    states[border.frames] = target.frame_state
+    corners_map = moved.corners_map.clone()
+    corners_map[border.corners] = target.corners_map
+    return Estimate(target.cam_from_vehicle, states, corners_map, target.clock_s)
+
+
+@dataclass(frozen=True)
+class JoinedCovariance(Covariance):
+    """Covariances of a part that was joined with others; ``joint`` (n, n) is that of its ``border``."""
+
+    border: Border | None = None
+    joint: FloatArray | None = None
+
+    @cached_property
+    def _columns(self) -> Columns:
+        assert self.border is not None
+        return border_columns(self.whitening, self.border)
+
+    @cached_property
+    def _gained(self) -> Tensor:
+        """(W'W)^-1 (C - W'W) (W'W)^-1."""
+        alone = self._columns.covariance
+        difference = torch.as_tensor(self.joint, dtype=alone.dtype, device=alone.device) - alone
+        factor = torch.linalg.cholesky(alone)
+        return torch.cholesky_solve(torch.cholesky_solve(difference, factor).mT, factor)
+
+    def _cameras(self) -> list[FloatArray]:
+        """Covariances (6 + Q, 6 + Q) of each camera's unknowns."""
+        assert self.joint is not None
+        count = self.whitening.engine.arrays.camera_unknowns
+        tip = len(self.whitening.reduced_factor.tip)
+        return [self.joint[k : k + count, k : k + count] for k in range(0, tip, count)]
+
+    def camera_information(self) -> FloatArray:
+        """Marginal information (C (6 + Q), C (6 + Q)) of the cameras' left tangents and clock offsets."""
+        assert self.joint is not None
+        tip = len(self.whitening.reduced_factor.tip)
+        return np.asarray(np.linalg.inv(self.joint[:tip, :tip]), dtype=np.float64)
+
+    def poses(self) -> FloatArray:
+        """Variances (J, 6) of the frames' tangents; 0 without states."""
+        arrays = self.whitening.engine.arrays
+        out = super().poses()
+        if not arrays.states:
+            return out
+        columns = torch.tensor(arrays.states, dtype=torch.int64, device=arrays.centre.device)
+        acts = one_hot(columns, 6).to(torch.float64)
+        for begin in range(0, arrays.frame_count, _FRAMES_AT_ONCE):
+            frames = torch.arange(begin, min(begin + _FRAMES_AT_ONCE, arrays.frame_count), device=acts.device)
+            regression = _frame_columns(self.whitening, frames, acts).mT @ self._columns.reduced
+            gained = ((regression @ self._gained) * regression).sum(1)
+            out[frames.cpu().numpy()] += gained.view(-1, 6).cpu().numpy()
+        return out
+
+    def _corners(self, groups: NDArray[np.int64]) -> FloatArray:
+        of_part = super()._corners(groups)
+        assert self.border is not None
+        arrays = self.whitening.engine.arrays
+        rank = torch.argsort(arrays.corner_order)
+        chosen = rank[torch.as_tensor(groups, device=rank.device)]
+        unit = (~arrays.joined).cumsum(0)
+        corners = torch.isin(unit, unit[chosen.flatten()]).nonzero()[:, 0]
+        own = _corner_columns(self.whitening, corners)
+        regression = own.reduced.mT @ self._columns.reduced
+        # Corners of the border have their own variables in common with it.
+        shared = torch.isin(corners, self.border.corners)
+        rows = _axes(shared.nonzero()[:, 0])
+        if len(rows):
+            places = torch.searchsorted(self.border.corners, corners[shared])
+            at = _axes(places) + regression.shape[1] - len(self._columns.own)
+            block = self._columns.own[:, _axes(places)]
+            regression[rows[:, None], at] += own.own[:, rows][rows].mT @ block[_axes(places)]
+        place = _axes(torch.searchsorted(corners, chosen.contiguous()))
+        of_group = regression[place]
+        return np.asarray(of_part + (of_group @ self._gained @ of_group.mT).cpu().numpy())
+
+
+def _axes(index: Tensor) -> Tensor:
+    """Rows (..., 2 n) of x and y of points (..., n)."""
+    return torch.stack([2 * index, 2 * index + 1], dim=-1).flatten(-2)

@@ -1,0 +1,135 @@
+"""Files of detections: one JSON object for an image, in place of its picture (docs/drive-format.md)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from v2hdm.errors import DriveError
+from v2hdm.records import Drive, FloatArray, ImageDetections, LaneDetection, MarkingDetection
+from v2hdm.safe.fields import take_covariance
+from v2hdm.safe.texts import take_name
+from v2hdm.store.files import check_keys, load_json, take_array, take_mapping, take_number, take_text
+
+_MARKING = ("class", "corners_px")
+_LANE = ("class", "points_px")
+_DIGITS = 6  # significant digits of a standard deviation
+_PIXEL_DIGITS = 8  # of a coordinate: a ten-thousandth of a pixel in the widest image
+
+
+def write_detections(path: Path, detections: ImageDetections) -> None:
+    """Write the markings and lanes of one image; symbols, which have no corners, are left to pictures."""
+    markings = [_marking_json(marking) for marking in detections.markings if not len(marking.outline_px)]
+    lanes = [_lane_json(lane) for lane in detections.lanes]
+    path.write_text(json.dumps({"markings": markings, "lanes": lanes}) + "\n", encoding="utf-8")
+
+
+def _marking_json(marking: MarkingDetection) -> dict[str, Any]:
+    variance = marking.covariance_px.diagonal()
+    content = {
+        "class": marking.kind,
+        "score": marking.score,
+        "corners_px": _rounded(marking.corners_px, _PIXEL_DIGITS),
+    }
+    if np.count_nonzero(marking.covariance_px) == np.count_nonzero(variance):
+        content["sigma_px"] = _rounded(np.sqrt(variance).reshape(4, 2), _DIGITS)
+    else:
+        content["covariance_px"] = _rounded(marking.covariance_px, _DIGITS)
+    if not marking.corner_valid.all():
+        content["known"] = marking.corner_valid.tolist()
+    return content
+
+
+def _lane_json(lane: LaneDetection) -> dict[str, Any]:
+    content: dict[str, Any] = {
+        "class": lane.kind,
+        "score": lane.score,
+        "points_px": _rounded(lane.points_px, _PIXEL_DIGITS),
+    }
+    if lane.identity is not None:
+        content["identity"] = lane.identity
+    if lane.sigma_px is not None:
+        content["sigma_px"] = _rounded(lane.sigma_px, _DIGITS)
+    return content
+
+
+def _rounded(values: np.ndarray, digits: int) -> Any:
+    """Nested lists of numbers with so many significant digits."""
+    texts = [float(f"{value:.{digits}g}") for value in values.ravel().tolist()]
+    return np.array(texts).reshape(values.shape).tolist()
+
+
+def read_detections(path: Path, image: int) -> ImageDetections:
+    """The detections of image number ``image`` of a drive; raises DriveError where the file is damaged."""
+    content = load_json(path, DriveError)
+    check_keys(content, ("markings",), ("lanes",), str(path), DriveError)
+    markings = [
+        _marking(entry, f"{path}: markings[{number}]")
+        for number, entry in enumerate(_listed(content["markings"], f"{path}: markings"))
+    ]
+    lanes = [
+        _lane(entry, f"{path}: lanes[{number}]")
+        for number, entry in enumerate(_listed(content.get("lanes", []), f"{path}: lanes"))
+    ]
+    return ImageDetections(image, tuple(markings), tuple(lanes))
+
+
+def detections_of(drive: Drive) -> list[ImageDetections]:
+    """The detections in all images of a drive that has them in place of pictures; raises DriveError."""
+    return [read_detections(image.path, number) for number, image in enumerate(drive.images)]
+
+
+def _listed(content: object, where: str) -> list[Any]:
+    if not isinstance(content, list):
+        raise DriveError(f"{where}: expected a list; restore the file, or make it again")
+    return content
+
+
+def _marking(content: object, where: str) -> MarkingDetection:
+    entry = take_mapping(content, where, DriveError)
+    check_keys(entry, _MARKING, ("sigma_px", "covariance_px", "score", "known"), where, DriveError)
+    known = entry.get("known", [True] * 4)
+    if not (isinstance(known, list) and len(known) == 4 and all(isinstance(flag, bool) for flag in known)):
+        raise DriveError(f"{where}, known: expected four times true or false; fix it or leave it out")
+    return MarkingDetection(
+        kind=take_name(entry["class"], f"{where}, class", DriveError),
+        score=take_number(entry.get("score", 1.0), f"{where}, score", DriveError),
+        corners_px=take_array(entry["corners_px"], (4, 2), f"{where}, corners_px", DriveError),
+        covariance_px=_covariance_px(entry, where),
+        corner_valid=np.array(known, dtype=np.bool_),
+    )
+
+
+def _covariance_px(entry: Mapping[str, Any], where: str) -> FloatArray:
+    """The covariance (8, 8) of a marking's corners, or that of their standard deviations."""
+    if ("sigma_px" in entry) == ("covariance_px" in entry):
+        raise DriveError(f"{where}: give one of sigma_px (4 x 2) and covariance_px (8 x 8)")
+    if "covariance_px" in entry:
+        return take_covariance(entry["covariance_px"], 8, f"{where}, covariance_px", DriveError)
+    sigma_px = take_array(entry["sigma_px"], (4, 2), f"{where}, sigma_px", DriveError)
+    if (sigma_px <= 0).any():
+        raise DriveError(f"{where}, sigma_px: a standard deviation is not above 0; fix it")
+    return np.diag(np.square(sigma_px).ravel())
+
+
+def _lane(content: object, where: str) -> LaneDetection:
+    entry = take_mapping(content, where, DriveError)
+    check_keys(entry, _LANE, ("score", "identity", "sigma_px"), where, DriveError)
+    points_px = take_array(entry["points_px"], (-1, 2), f"{where}, points_px", DriveError)
+    identity = entry.get("identity")
+    if identity is not None and (isinstance(identity, bool) or not isinstance(identity, int)):
+        raise DriveError(f"{where}, identity: expected a whole number; fix it or leave it out")
+    sigma = entry.get("sigma_px")
+    return LaneDetection(
+        kind=take_text(entry["class"], f"{where}, class", DriveError),
+        score=take_number(entry.get("score", 1.0), f"{where}, score", DriveError),
+        points_px=points_px,
+        identity=identity,
+        sigma_px=None
+        if sigma is None
+        else take_array(sigma, (len(points_px),), f"{where}, sigma_px", DriveError),
+    )

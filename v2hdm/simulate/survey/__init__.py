@@ -1,0 +1,1 @@
+"""A survey of a made network: streets and yards, several drives, detections in place of pictures."""
