@@ -8,6 +8,7 @@ from tests.ports import run_config
 from v2hdm.errors import MapFileError
 from v2hdm.io.maps.corrections import (
     ACCEPTED,
+    ADDED,
     CORRECTED,
     REJECTED,
     Correction,
@@ -16,6 +17,7 @@ from v2hdm.io.maps.corrections import (
 )
 from v2hdm.io.maps.evidence import read_exclusions
 from v2hdm.io.maps.reading import read_geojson
+from v2hdm.io.trajectory import read_tum
 from v2hdm.pipeline.config import MapConfig
 from v2hdm.pipeline.run import run
 from v2hdm.site.candidates import Candidates
@@ -30,6 +32,8 @@ def corrected(small_mapped, small_drive, tmp_path_factory):
     (left_out, *_) = read_exclusions(result / "excluded.geojson")
     manhole, bar, dragged = before[:3]
     place = (dragged.corners_map[1] + [0.04, -0.03]).tolist()
+    bare = bare_place(before, read_tum(result / "trajectory.tum").map_from_vehicle[:, :2, 3])
+    again = before[3]
     said = [
         Correction(says=REJECTED, kind=manhole.kind, outline_map=manhole.corners_map.tolist(),
                    marking=manhole.id, reason="a manhole"),
@@ -39,12 +43,24 @@ def corrected(small_mapped, small_drive, tmp_path_factory):
                    moved={2: place}, sigma_m=0.005),
         Correction(says=ACCEPTED, kind=left_out.kind, outline_map=[left_out.position_map.tolist()]),
         Correction(says=CORRECTED, kind="diamond", outline_map=[[500.0, 500.0]]),
+        Correction(says=ADDED, kind="diamond", outline_map=bare.tolist()),
+        Correction(says=ADDED, kind=again.kind, outline_map=(again.corners_map + 0.02).tolist()),
     ]  # fmt: skip
     path = folder / "corrections.yaml"
     write_corrections(said, str(result), path)
     changes = {"cache": str(cache), "map": MapConfig(corrections=str(path))}
     made = run(run_config(small_drive, folder / "out", **changes))
     return before, left_out, made
+
+
+SQUARE = np.array([[-0.3, -0.3], [0.3, -0.3], [0.3, 0.3], [-0.3, 0.3]])
+
+
+def bare_place(markings, route_map):
+    """A square on the route without paint near it, that the drive passes."""
+    middles = np.array([marking.corners_map.mean(axis=0) for marking in markings])
+    away_m = [np.linalg.norm(middles - place, axis=1).min() for place in route_map[8:-8]]
+    return SQUARE + route_map[8:-8][int(np.argmax(away_m))]
 
 
 def nearest(markings, place):
@@ -60,7 +76,7 @@ def test_rejected_markings_stay_out_with_the_reason_and_accepted_ones_come_in(co
     assert "rejected by a person: a manhole" in [one.reason for one in excluded]
     came = nearest(after, left_out.position_map)
     assert np.linalg.norm(came.corners_map.mean(axis=0) - left_out.position_map) < 0.4
-    assert len(after) == len(before)  # one out, one in
+    assert len(after) == len(before) + 1  # one out, one in, one added
 
 
 def test_a_class_is_fixed_and_a_dragged_corner_is_where_it_was_put(corrected):
@@ -75,18 +91,36 @@ def test_a_class_is_fixed_and_a_dragged_corner_is_where_it_was_put(corrected):
     assert max(off_m) < 0.005
 
 
+def test_an_added_marking_is_in_the_map_and_the_images_say_that_nothing_is_painted_there(corrected):
+    before, _, made = corrected
+    bare = bare_place(before, read_tum(made.folder / "trajectory.tum").map_from_vehicle[:, :2, 3])
+    added = nearest(read_geojson(made.folder / "map.geojson").markings, bare.mean(axis=0))
+    assert (added.kind, added.sightings) == ("diamond", 0)
+    assert added.corners_map == pytest.approx(bare, abs=0.01)
+    heard = [entry for entry in made.metrics["corrections"] if entry["says"] == "added"]
+    assert sorted(entry["against"] for entry in heard) == ["", "the images show paint on 0 % of it"]
+
+
+def test_an_added_marking_on_paint_that_the_images_show_is_where_they_show_it(corrected):
+    before, _, made = corrected
+    after = read_geojson(made.folder / "map.geojson").markings
+    again = nearest(after, before[3].corners_map.mean(axis=0))
+    assert again.sightings == before[3].sightings
+    assert again.corners_map == pytest.approx(before[3].corners_map, abs=0.005)
+
+
 def test_a_correction_of_nothing_is_a_finding_and_no_silence(corrected):
     (finding,) = [one for one in corrected[2].verdict.findings if one.check == "corrections"]
-    assert "1 of 5 match no candidate" in finding.says
+    assert "1 of 7 match no candidate" in finding.says
     assert "diamond at (500.00, 500.00)" in finding.says
 
 
 def test_what_the_map_follows_is_listed_beside_what_the_images_show(corrected):
     listed = {heard["says"]: heard["against"] for heard in corrected[2].metrics["corrections"]}
-    assert set(listed) == {"rejected", "of class crosswalk_bar", "corner 2 moved", "accepted"}
+    assert set(listed) == {"rejected", "of class crosswalk_bar", "corner 2 moved", "accepted", "added"}
     assert listed["of class crosswalk_bar"] == ""
     told = [line for line in corrected[2].headlines if line.startswith("correction followed: ")]
-    assert len(told) == 4
+    assert len(told) == 6
     assert any("rejected" in line for line in told)
     log = (corrected[2].folder / "run.log").read_text()
     assert all(line in log for line in told)
@@ -138,7 +172,7 @@ def test_a_dragged_corner_has_the_error_of_the_others_and_its_own():
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"says": "maybe"}, "expected one of accepted, rejected, corrected, got 'maybe'"),
+        ({"says": "maybe"}, "expected one of accepted, rejected, corrected, added, got 'maybe'"),
         ({"moved": {5: [0, 0]}}, "no corner 5; quadrilaterals have 1 to 4"),
         ({"outline_map": [[0]]}, "outline_map: expected N x 2 numbers"),
         ({"reasons": "x"}, "unknown key 'reasons'; did you mean 'reason'"),

@@ -40,7 +40,7 @@ from v2hdm.records import (
     Marking,
     Symbol,
 )
-from v2hdm.site.corrections import with_symbols_corrected
+from v2hdm.site.corrections import added_markings, with_symbols_corrected
 from v2hdm.site.living.changes import Base, update_map
 from v2hdm.site.living.looks import Observer
 
@@ -244,7 +244,9 @@ def optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
     else:
         lanes = inputs.find_lanes(ground_by_rig(drive, cameras, bundle.rig, surface))
     symbols, no_symbols = _symbols(inputs, optimised)
-    hd_map = HDMap(optimised.markings, lanes, drive.origin, symbols, noise.position_drift_over_m)
+    added, heard = added_markings(options.acceptance.corrections, optimised.markings)
+    markings = (*optimised.markings, *added)
+    hd_map = HDMap(markings, lanes, drive.origin, symbols, noise.position_drift_over_m)
     if surface is not None:
         # A spline already contains the recorded heights.
         hd_map = with_heights(hd_map, None, surface.height_m)
@@ -270,10 +272,13 @@ def optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
         evidence=outcome.evidence,
         poses=adjusted_poses(outcome),
         clocks=clock_offsets(outcome),
-        joint_covariance=partial(joint_covariance, optimised),
+        # The adjustment knows nothing of what a person added.
+        joint_covariance=partial(stated_covariance, markings)
+        if added
+        else partial(joint_covariance, optimised),
         residuals=residuals_of(outcome, optimised),
         suspicions=optimised.suspicions,
-        heard=optimised.heard,
+        heard=(*optimised.heard, *heard),
         surface=surface,
         alone=map_alone(outcome, optimised),
     )

@@ -211,8 +211,8 @@ def _mapped(
                 section_m=section_m,
             )
             sets = graded_sets(mapped, goal_cm / 100)
-        sets = with_paint(sets, inspection.drive, earlier, context)
         acceptance = survey.mapping.acceptance
+        sets = with_paint(sets, inspection.drive, earlier, acceptance.corrections, context)
         chosen = accurate_enough(methods_of(sets), acceptance.accuracy, acceptance.corrections)
         chosen = with_composed(chosen, goal_cm / 100)
     except (MappingError, AdjustError) as failure:

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.detection.batch import read_image
+from v2hdm.io.maps.corrections import Correction
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.base import grey_reader
 from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.stages import MappedSet
 from v2hdm.records import BEST, TEXT, Drive, HDMap, Image
+from v2hdm.site.corrections import with_paint_of_added
 from v2hdm.site.living.changes import Base
 from v2hdm.site.living.wear import Footage, with_wear
 
@@ -22,9 +24,16 @@ _log = logging.getLogger(__name__)
 
 
 def with_paint(
-    sets: Mapping[str, MappedSet], drive: Drive, earlier: Base | None, context: Context
+    sets: Mapping[str, MappedSet],
+    drive: Drive,
+    earlier: Base | None,
+    corrections: Sequence[Correction],
+    context: Context,
 ) -> dict[str, MappedSet]:
-    """The same with the paint that is left of each marking of the best map, and what its words say."""
+    """The same with the paint that is left of each marking of the best map, and what its words say.
+
+    By their paint, the markings that a person added are compared with the images.
+    """
     name, last = list(sets.items())[-1]
     best = last.methods[BEST]
     if best.poses is None or best.residuals is None or not drive.has_pictures:
@@ -37,7 +46,8 @@ def with_paint(
     if any(symbol.kind == TEXT for symbol in hd_map.symbols):
         with context.timed("words"):
             hd_map = _with_words(hd_map, footage, drive, context)
-    methods = {**last.methods, BEST: replace(best, hd_map=hd_map)}
+    heard = with_paint_of_added(best.heard, corrections, hd_map.markings)
+    methods = {**last.methods, BEST: replace(best, hd_map=hd_map, heard=heard)}
     return {**sets, name: replace(last, methods=methods)}
 
 
@@ -57,6 +67,9 @@ def _with_wear(
         for image, marking_id in best.residuals.whole_views()
         if marking_id in number_of_id
     }
+    # Nothing was detected of what a person added: every image may show it.
+    unseen = [number for number, marking in enumerate(best.hd_map.markings) if not marking.sightings]
+    shown |= {(image, number) for image in range(len(drive.images)) for number in unseen}
     grey = grey_reader(drive)
     assert grey is not None
     return with_wear(

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from v2hdm.geometry.planar import clip_convex, signed_area
-from v2hdm.io.maps.corrections import ACCEPTED, REJECTED, Correction
-from v2hdm.records import Exclusion, FloatArray, HDMap, IntArray
+from v2hdm.io.maps.corrections import ACCEPTED, ADDED, REJECTED, Correction
+from v2hdm.records import Exclusion, FloatArray, HDMap, IntArray, Marking
 from v2hdm.site.candidates import Candidates
 
 _SAME_M = 0.4  # largest distance, m, between a candidate's centre and the one that a person corrected
@@ -18,6 +18,8 @@ _SURE = float(
     np.log(999.0)
 )  # log odds of a marking, or against it, from which the images contradict a person
 _CONTRADICTS = float(chi2.isf(1e-3, 2))  # squared distance, in sigmas, that one of 1000 right corners exceeds
+_LEAST_PAINT = 0.5  # share of a marking that is painted at least: a worn one, chosen
+_ADDED = "added"  # what the map follows of a marking that a person added
 MAX_OVERLAP = 0.2  # overlap of outlines, relative to the smaller, from which they are one paint
 
 
@@ -122,6 +124,8 @@ def heard_of(
                 against = f"the images show the paint {100 * off_m:.1f} cm from there"
         if not against and reason is not None and log_odds[group] < -_SURE:
             against = f"by the images it is left out: {reason}"
+        if correction.says == ADDED:
+            says.append(_ADDED)
         heard[correction.place] = Heard(correction.place, ", ".join(says) or "accepted", against)
     return tuple(heard.values())
 
@@ -141,6 +145,64 @@ def _moved_off(stated: Stated, group: int, shown: Candidates) -> tuple[float, bo
         squared = float(off_m[corner] @ np.linalg.solve(covariance_m2, off_m[corner]))
         is_off = is_off or squared > _CONTRADICTS
     return float(np.linalg.norm(off_m, axis=1).max()), is_off
+
+
+def added_markings(
+    corrections: Sequence[Correction], markings: Sequence[Marking]
+) -> tuple[tuple[Marking, ...], tuple[Heard, ...]]:
+    """The markings that a person added where none of ``markings`` is, and that the map follows them.
+
+    Their corners have the person's sigma, and the error that the corners of the nearest marking share.
+    """
+    corners = np.array([marking.corners_map for marking in markings]).reshape(-1, 4, 2)
+    added = []
+    heard = []
+    for correction in corrections:
+        if correction.says != ADDED or len(_same(correction, corners)):
+            continue
+        outline = np.array(correction.outline_map)
+        away_m = np.linalg.norm(corners.mean(axis=1) - outline.mean(axis=0), axis=1)
+        nearest = markings[int(np.argmin(away_m))]
+        added.append(_added_marking(correction, outline, nearest))
+        heard.append(Heard(correction.place, _ADDED))
+    return tuple(added), tuple(heard)
+
+
+def _added_marking(correction: Correction, outline: FloatArray, nearest: Marking) -> Marking:
+    shared_m2 = np.zeros((2, 2))
+    if nearest.covariance_m2 is not None:
+        shared_m2 = nearest.covariance_m2.reshape(4, 2, 4, 2).mean(axis=(0, 2))
+    covariance_m2 = np.tile(shared_m2, (4, 4)) + correction.sigma_m**2 * np.eye(8)
+    relative_sigma_m = nearest.relative_sigma_m
+    if relative_sigma_m is not None:
+        # The middle of four corners has half the sigma of each.
+        relative_sigma_m = float(np.hypot(relative_sigma_m, correction.sigma_m / 2))
+    return Marking(correction.kind, outline, 0, covariance_m2, relative_sigma_m)
+
+
+def with_paint_of_added(
+    heard: Sequence[Heard], corrections: Sequence[Correction], markings: Sequence[Marking]
+) -> tuple[Heard, ...]:
+    """What the map follows, with what the images show of the paint that a person added and nothing saw."""
+    corners = np.array([marking.corners_map for marking in markings]).reshape(-1, 4, 2)
+    against_of_place = {}
+    for correction in corrections:
+        if correction.says != ADDED:
+            continue
+        for group in _same(correction, corners):
+            marking = markings[group]
+            if not marking.sightings:
+                against_of_place[correction.place] = _against_paint(marking)
+    return tuple(replace(entry, against=against_of_place.get(entry.place, entry.against)) for entry in heard)
+
+
+def _against_paint(marking: Marking) -> str:
+    """How the images contradict that a marking is painted; empty where they do not."""
+    if marking.paint is None:
+        return "no two images show its place whole from near"
+    if marking.paint.share + marking.paint.sigma < _LEAST_PAINT:
+        return f"the images show paint on {100 * marking.paint.share:.0f} % of it"
+    return ""
 
 
 def reason_of(correction: Correction) -> str:

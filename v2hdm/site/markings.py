@@ -120,7 +120,7 @@ def classify(
     stated = Stated.of(options.corrections, uncorrected.candidates.corners_map, names)
     index_of_name = {kinds[index]: index for index in np.unique(kind).tolist()}
     for group, correction in stated.confirmed.items():
-        names[group] = correction.new_kind or names[group]
+        names[group] = correction.stated_kind or names[group]
         # The shape of a class is learned from its candidates: without other candidates there is none.
         number[group] = index_of_name.get(names[group], number[group])
     solved = stated.placed(solved, uncorrected.candidates)

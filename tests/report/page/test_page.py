@@ -478,3 +478,13 @@ def test_the_same_images_in_another_place_are_the_drive_of_the_result(tmp_path):
     shutil.move(drive.root, tmp_path / "moved")
     assert drive_of(tmp_path / "result", None) is None
     assert drive_of(tmp_path / "result", tmp_path / "moved") is not None
+
+
+def test_pictures_of_a_report_stay_when_it_is_made_again_without_its_drive(tmp_path):
+    drive = make_result(tmp_path)
+    pictures = [
+        path.read_text().split('id="pictures">')[1].split("</script>")[0]
+        for path in (write_page(tmp_path / "result", drive), write_page(tmp_path / "result", None))
+    ]
+    assert '"m1"' in pictures[0]
+    assert pictures[0] == pictures[1]

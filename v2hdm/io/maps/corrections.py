@@ -5,7 +5,7 @@ They name places, not candidates: markings get other numbers when a drive is map
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -31,6 +31,7 @@ from v2hdm.store.files import (
 ACCEPTED = "accepted"
 REJECTED = "rejected"
 CORRECTED = "corrected"
+ADDED = "added"  # a marking that the map lacks
 SIGMA_M = 0.02  # sigma of a corner that a person places beside the others of its marking, m: a mosaic's pixel
 
 _HEAD = "# Corrections of a map by a person: map.corrections=THIS FILE in the next run (docs/report.md).\n"
@@ -51,7 +52,7 @@ _KIND_AND_OUTLINE_MAP = (
 class Correction:
     """A person's decision on one marking, symbol or candidate that was left out."""
 
-    says: Annotated[str, "accepted, rejected or corrected."]
+    says: Annotated[str, "accepted, rejected, corrected or added."]
     kind: Annotated[str, _KIND_AND_OUTLINE_MAP]
     outline_map: Annotated[list[list[float]], _KIND_AND_OUTLINE_MAP]
     marking: Annotated[int | None, "its id in that map, only for readers."] = None
@@ -61,6 +62,11 @@ class Correction:
     )
     sigma_m: Annotated[float, "their standard deviation, m."] = SIGMA_M
     reason: Annotated[str, "an optional comment."] = ""
+
+    @property
+    def stated_kind(self) -> str | None:
+        """The class that the person gives it, None where that stays."""
+        return self.kind if self.says == ADDED else self.new_kind
 
     @property
     def place(self) -> str:
@@ -103,10 +109,12 @@ def correction_of(content: object, where: str) -> Correction:
     optional = ("marking", "new_class", "moved", "sigma_m", "reason")
     check_keys(entry, ("says", "class", "outline_map"), optional, where, MapFileError)
     outline = _take_places(entry["outline_map"], f"{where}: outline_map")
-    says = take_choice(entry["says"], (ACCEPTED, REJECTED, CORRECTED), f"{where}: says", MapFileError)
+    says = take_choice(entry["says"], (ACCEPTED, REJECTED, CORRECTED, ADDED), f"{where}: says", MapFileError)
     sigma_m = take_number(entry.get("sigma_m", SIGMA_M), f"{where}: sigma_m", MapFileError)
     if not len(outline) or not 0 < sigma_m <= 1:
         raise MapFileError(f"{where}: needs a point in outline_map, and sigma_m above 0 and at most 1 m")
+    if says == ADDED:
+        _check_added(entry, outline, where)
     marking = entry.get("marking")
     new = entry.get("new_class")
     reason = entry.get("reason") or ""
@@ -122,6 +130,23 @@ def correction_of(content: object, where: str) -> Correction:
         sigma_m=sigma_m,
         reason=str(reason),
     )
+
+
+def _check_added(entry: Mapping[str, Any], outline: FloatArray, where: str) -> None:
+    """Refuse a new marking that is not four corners around some paint, or that is corrected as well."""
+    if not is_quadrilateral(outline):
+        raise MapFileError(
+            f"{where}: outline_map: an added marking has four corners, counter-clockwise from above, whose "
+            "sides do not cross"
+        )
+    stated = sorted({"moved", "new_class"} & entry.keys())
+    if stated:
+        raise MapFileError(f"{where}: {stated[0]}: state class and outline_map of what is added instead")
+
+
+def is_quadrilateral(outline: FloatArray) -> bool:
+    """Whether an outline (N, 2) is of four corners, counter-clockwise, whose sides do not cross."""
+    return len(outline) == 4 and is_simple(outline) and float(signed_area(outline)) > 0
 
 
 def _take_id(content: object, where: str) -> int:
@@ -177,6 +202,8 @@ def entry_of(correction: Correction) -> dict[str, Any]:
     if correction.moved:
         moved = {corner: _rounded(place) for corner, place in sorted(correction.moved.items())}
         entry |= {"moved": moved, "sigma_m": correction.sigma_m}
+    elif correction.says == ADDED and correction.sigma_m != SIGMA_M:
+        entry["sigma_m"] = correction.sigma_m
     return entry
 
 

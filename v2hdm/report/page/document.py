@@ -183,7 +183,7 @@ def _radii(facts: Facts) -> str:
     return charts.radius_chart(series) if series else ""
 
 
-_ASSETS = {"vendor": ("leaflet.js", "leaflet.css"), "templates": ("page.css", "map.js", "edit.js")}
+_ASSETS = {"vendor": ("leaflet.js", "leaflet.css"), "templates": ("page.css", "map.js")}
 """Scripts and styles that the page embeds, by folder."""
 
 
@@ -222,11 +222,10 @@ def paper_text(folder: Path, drive: Drive | None, comparison: Path | None = None
 def page_text(
     folder: Path,
     drive: Drive | None,
-    editing: Mapping[str, object] | None = None,
     background: Path | None = None,
     comparison: Path | None = None,
 ) -> str:
-    """The page of :func:`write_page`; ``editing`` is the data of the script for corrections."""
+    """The page of :func:`write_page`."""
     here = files("v2hdm.report.page")
     facts = read_facts(folder, drive)
     page = document(facts, comparison)
@@ -250,7 +249,6 @@ def page_text(
             },
             map_json=json_text(page.map_data),
             pictures_json=json_text(page.pictures),
-            editing_json=editing and json_text(editing),
         )
     )
 

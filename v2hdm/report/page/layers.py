@@ -12,7 +12,7 @@ import numpy as np
 
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.geodetic import Grid, crs_of, geodetic_from_enu, utm_of
-from v2hdm.records import SIGMAS_95, FloatArray, Lane, Marking, Symbol
+from v2hdm.records import SIGMAS_95, FloatArray, HDMap, Lane, Marking, Symbol
 from v2hdm.report.areas import AREAS
 from v2hdm.report.metrics import corner_errors, match_markings, rms
 from v2hdm.report.page.facts import Facts, GroundResiduals
@@ -107,13 +107,19 @@ def background_layer(path: Path, facts: Facts) -> dict[str, Any]:
 
 
 def _extent(facts: Facts) -> tuple[FloatArray, FloatArray]:
-    """South-west and north-east (2,), m, of the map with a margin of 50 m."""
     assert facts.hd_map is not None
-    shapes = [marking.corners_map for marking in facts.hd_map.markings]
-    shapes += [lane.points_map for lane in facts.hd_map.lanes]
-    if facts.route is not None:
-        shapes.append(facts.route.map_from_vehicle[:, :2, 3])
-    points = np.concatenate(shapes or [np.zeros((1, 2))])
+    route = facts.route
+    route_map = np.zeros((0, 2)) if route is None else route.map_from_vehicle[:, :2, 3]
+    return map_extent(facts.hd_map, route_map)
+
+
+def map_extent(hd_map: HDMap, route_map: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """South-west and north-east (2,), m, of a map and the path driven (F, 2), with a margin of 50 m."""
+    shapes = [marking.corners_map for marking in hd_map.markings]
+    shapes += [lane.points_map for lane in hd_map.lanes]
+    points = np.concatenate([*shapes, route_map])
+    if not len(points):
+        points = np.zeros((1, 2))
     return points.min(axis=0) - 50.0, points.max(axis=0) + 50.0
 
 
@@ -205,7 +211,7 @@ def layers(
             "recorded": [] if route is None or route.recorded is None else rounded(route.recorded[:, :2, 3]),
         },
         "mosaic": mosaic_layer(facts.folder),
-        "systems": _systems(facts),
+        "systems": systems_of(hd_map, _extent(facts)),
         "files": sorted(path.name for path in facts.folder.iterdir() if path.suffix in _SHARED),
     }
 
@@ -239,12 +245,11 @@ def _symbol(symbol: Symbol, kinds: list[str]) -> dict[str, Any]:
     return feature
 
 
-def _systems(facts: Facts) -> list[dict[str, Any]]:
+def systems_of(hd_map: HDMap, extent: tuple[FloatArray, FloatArray]) -> list[dict[str, Any]]:
     """Coordinate systems besides local metres, to a millimetre: cubics in x and y; none without origin."""
-    hd_map = facts.hd_map
-    if hd_map is None or hd_map.origin is None:
+    if hd_map.origin is None:
         return []
-    south_west, north_east = _extent(facts)
+    south_west, north_east = extent
     east_m, north_m = np.linspace(south_west, north_east, 7).T
     x, y = (grid.ravel() for grid in np.meshgrid(east_m, north_m))
     places_map = np.column_stack([x, y, np.zeros_like(x)])

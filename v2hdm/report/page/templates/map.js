@@ -321,7 +321,6 @@
       side.append(element("p", { class: "hint" }, what), shots);
     } else side.append(element("p", { class: "hint" }, "No picture in this report."));
     byId("details").replaceChildren(element("div", { class: "card", "data-key": about.key }, text, side));
-    dispatchEvent(new CustomEvent("v2hdm-selected", { detail: { shape, text } }));
   }
 
   function corners(about) {
