@@ -280,6 +280,7 @@ class Drive:
     # First and last time, s, of all images of a camera, left out or not.
     listed_s: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     reception: Reception | None = None  # None where the poses come from no receiver's log
+    headed_by_course: bool = False  # whether its headings are its antenna's course, smoothed
     joined: tuple[Session, ...] = ()  # its sessions, if several: then it has no trajectory
 
     @property
