@@ -270,6 +270,7 @@ class Drive:
     unposed: Mapping[str, int] = field(default_factory=dict)  # images left out, without a pose
     # First and last time, s, of all images of a camera, left out or not.
     listed_s: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    headed_by_course: bool = False  # whether its headings are its antenna's course, smoothed
     joined: tuple[Session, ...] = ()  # its sessions, if several: then it has no trajectory
 
     @property

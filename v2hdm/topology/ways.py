@@ -78,6 +78,9 @@ class WayFinder:
         }
         self._last = {after: before for before, after in self._next.items()}
         self._all_links = {*self._next.items(), *links}
+        self._following: dict[int, list[int]] = {}
+        for before, after in sorted(self._all_links):
+            self._following.setdefault(before, []).append(after)
 
     def find(self) -> DrivenWays:
         """The ways of all paths, the best path for each pair of lanes."""
@@ -129,8 +132,8 @@ class WayFinder:
         for _ in range(_MOST_LINKS):
             longer = []
             for chain in chains:
-                for before, after in self._all_links:
-                    if before != chain[-1] or after in chain:
+                for after in self._following.get(chain[-1], ()):
+                    if after in chain:
                         continue
                     if after == last:
                         return [*chain, after]

@@ -97,11 +97,17 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
         if not truth.is_dir():
             raise DriveError(f"{where}: truth: no such folder {truth}; restore it or drop the key")
     name = name_of(content, path)
-    frame_from_ground = frame_from_vehicle(next(iter(frames.values())).height_m)
-    poses_of_frame = recorded.trajectory
-    on_ground = Trajectory(poses_of_frame.stamp_s, poses_of_frame.map_from_vehicle @ frame_from_ground)
-    drive = Drive(name, path, cameras, (), pose_noise, recorded.origin, truth, recorded=on_ground)
+    on_ground = _on_ground(recorded.trajectory, next(iter(frames.values())).height_m)
+    drive = Drive(
+        name, path, cameras, (), pose_noise, recorded.origin, truth,
+        recorded=on_ground, headed_by_course=recorded.headed_by_course,
+    )  # fmt: skip
     return assemble_drive(drive, files, options.max_gap_s, poses_at)
+
+
+def _on_ground(poses: Trajectory, height_m: float) -> Trajectory:
+    """The poses of the vehicle's origin on the ground, ``height_m`` below the frame that they are of."""
+    return Trajectory(poses.stamp_s, poses.map_from_vehicle @ frame_from_vehicle(height_m))
 
 
 def _middle_of(files: Sequence[ImageFiles]) -> float | None:

@@ -74,6 +74,7 @@ class Recorded:
     trajectory: Trajectory
     noise: Mapping[str, float]  # the fields of :class:`PoseNoise` that the source states
     origin: GeodeticOrigin | None  # None where the poses are the map's own
+    headed_by_course: bool = False  # whether no heading was recorded
 
 
 _Reader = Callable[[Path, dict[str, Any], Path, str, float | None], Readings]
@@ -271,13 +272,18 @@ def _of_course(
         )
     if readings.attitudes is not None:
         _log.info("%s: its headings are not used: heading: %s", where, COURSE)
+    turning = readings.turning
+    if readings.rates is not None:
+        if turning is not None:
+            raise DriveError(f"{where}: has gyro_topic and gyro_file; drop one")
+        turning = readings.rates.about_up(settings.vehicle_from_sensor)
     readings = _fixed(readings, settings, where)
     if len(readings.stamp_s) < 3:
         raise DriveError(f"{where}: {len(readings.stamp_s)} positions have no course; record a drive")
     placed = _in_map(readings, settings, origin, where)
     sigma_m = np.where(readings.sigma_m > 0, readings.sigma_m, _USUAL_SIGMA_M)
     course = course_of(
-        readings.stamp_s, placed.points_map[:, :2], sigma_m, settings.lever_arm_m[:2], readings.turning, where
+        readings.stamp_s, placed.points_map[:, :2], sigma_m, settings.lever_arm_m[:2], turning, where
     )
     headings = course_headings(course, settings.starts, where)
     zeros = np.zeros(len(readings.stamp_s))
@@ -285,7 +291,8 @@ def _of_course(
     lever_arm_m = np.array([headings.lever_ahead_m, *settings.lever_arm_m[1:]])
     poses = make_transform(rotation, placed.points_map - rotation @ lever_arm_m)
     noise = _root_mean_squares({"position_m": readings.sigma_m}) | headings.noise
-    return Recorded(Trajectory(readings.stamp_s + settings.offset_s, poses), noise, placed.origin)
+    trajectory = Trajectory(readings.stamp_s + settings.offset_s, poses)
+    return Recorded(trajectory, noise, placed.origin, headed_by_course=True)
 
 
 def _without(readings: Readings, is_usable: BoolArray) -> Readings:

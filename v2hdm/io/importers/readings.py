@@ -62,6 +62,19 @@ class Attitudes:
 
 
 @dataclass(frozen=True)
+class TurnRates:
+    """Turn rates of a gyro over time."""
+
+    stamp_s: FloatArray  # (G,) rising strictly
+    rate_rad_s: FloatArray  # (G, 3) about the sensor's axes
+
+    def about_up(self, vehicle_from_sensor: FloatArray) -> Turning:
+        """The vehicle's yaw rates, by the turn (3, 3) of the sensor on it."""
+        unknown = np.full(len(self.stamp_s), np.nan)
+        return Turning(self.stamp_s, self.rate_rad_s @ vehicle_from_sensor[2], unknown)
+
+
+@dataclass(frozen=True)
 class Readings:
     """Positions over time, and attitudes, if any, perhaps at other times."""
 
@@ -72,7 +85,8 @@ class Readings:
     sigma_m: FloatArray  # (P,) of a horizontal coordinate, nan where not stated, infinite without a fix
     attitudes: Attitudes | None
     point: str = ""  # what the positions are of, which seldom sits at the vehicle's origin: an antenna's
-    turning: Turning | None = None  # of a gyro beside the receiver
+    turning: Turning | None = None  # of a gyro's file beside the receiver
+    rates: TurnRates | None = None  # of a gyro in the bag
 
 
 def readings_of_poses(poses: Trajectory) -> Readings:
