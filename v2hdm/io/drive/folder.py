@@ -18,7 +18,7 @@ from v2hdm.io.description import DRIVE_FILE, POSES_FILE, CameraEntry, DriveDescr
 from v2hdm.io.drive.frames import plan_frames
 from v2hdm.io.drive.images import ImageFiles, ReadOptions, assemble_drive, select_cameras
 from v2hdm.io.drive.sources import Sources, plan_images, plan_info, plan_topic_poses
-from v2hdm.io.importers.poses import read_poses
+from v2hdm.io.importers.poses import Recorded, read_poses
 from v2hdm.records import (
     DRIFTS,
     BoolArray,
@@ -28,6 +28,7 @@ from v2hdm.records import (
     Drive,
     FloatArray,
     PoseNoise,
+    Reception,
     Trajectory,
 )
 from v2hdm.safe.fields import take_origin
@@ -99,10 +100,20 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
     name = name_of(content, path)
     on_ground = _on_ground(recorded.trajectory, next(iter(frames.values())).height_m)
     drive = Drive(
-        name, path, cameras, (), pose_noise, recorded.origin, truth,
-        recorded=on_ground, headed_by_course=recorded.headed_by_course,
+        name, path, cameras, (), pose_noise, recorded.origin, truth, recorded=on_ground,
+        reception=_reception(recorded, files), headed_by_course=recorded.headed_by_course,
     )  # fmt: skip
     return assemble_drive(drive, files, options.max_gap_s, poses_at)
+
+
+def _reception(recorded: Recorded, files: Sequence[ImageFiles]) -> Reception | None:
+    """What the source of the poses says of its positions from the first image to the last."""
+    listed = [entry.stamp_s for entry in files if len(entry.stamp_s)]
+    if recorded.fixes is None or not listed:
+        return None
+    first_s = min(float(stamp_s[0]) for stamp_s in listed)
+    last_s = max(float(stamp_s[-1]) for stamp_s in listed)
+    return recorded.fixes.between(first_s, last_s, recorded.geoid_m)
 
 
 def _on_ground(poses: Trajectory, height_m: float) -> Trajectory:

@@ -25,12 +25,15 @@ from v2hdm.store.files import check_keys, take_mapping, take_text
 
 _log = logging.getLogger(__name__)
 
+RTK_FIXED = 4
+"""The quality of NMEA's GGA of a position by RTK with fixed ambiguities."""
+
 SIGMA_OF_QUALITY_M: Mapping[int, float] = {
     0: np.inf,  # no fix
     1: 3.0,  # single
     2: 1.0,  # differential
     3: 3.0,  # PPS
-    4: 0.02,  # RTK, fixed
+    RTK_FIXED: 0.02,
     5: 0.5,  # RTK, float
     6: np.inf,  # dead reckoning
     7: np.inf,  # typed in
@@ -85,6 +88,7 @@ class Readings:
     sigma_m: FloatArray  # (P,) of a horizontal coordinate, nan where not stated, infinite without a fix
     attitudes: Attitudes | None
     point: str = ""  # what the positions are of, which seldom sits at the vehicle's origin: an antenna's
+    is_fixed: BoolArray | None = None  # (P,) whether RTK had fixed its ambiguities, None where not stated
     turning: Turning | None = None  # of a gyro's file beside the receiver
     rates: TurnRates | None = None  # of a gyro in the bag
 
@@ -155,9 +159,9 @@ def read_table(
     heading_sigma = np.radians(columns.get("heading_sigma_deg", np.full(count, np.nan)))
     rotation = _rotation(columns, path)
     attitudes = None if rotation is None else Attitudes(stamp_s[rows], rotation, heading_sigma)
-    return Readings(
-        stamp_s[rows], points, geodetic, sigma_m, attitudes, point="an antenna's" if geodetic else ""
-    )
+    point = "an antenna's" if geodetic else ""
+    is_fixed = columns["quality"] == RTK_FIXED if "quality" in columns else None
+    return Readings(stamp_s[rows], points, geodetic, sigma_m, attitudes, point, is_fixed)
 
 
 def read_turning(path: Path, entry: Mapping[str, Any], where: str) -> Turning:
