@@ -67,6 +67,7 @@ MORE = {
         "python -c 'from v2hdm.words.recogniser import load_recogniser; assert load_recogniser(1)'",
         f"v2hdm map +run=port2 workers=1 {' '.join(map(repr, SMALL_PORT))}",
     ),
+    "map,pdf": (f"v2hdm map +run=port2 report.pdf=true workers=1 {' '.join(map(repr, SMALL_PORT))}",),
 }
 """What no page has as a short command of its own, by extras."""
 

@@ -290,7 +290,7 @@ class TrainConfig:
     ] = 0
     only_classes: Annotated[
         list[str] | None,
-        "In the first head_updates only the channels of these classes learn, if any are named: those of other "
+        "In the first head_updates only the channels of these classes learn, if any are named: other "
         "classes, paint and lanes stay what start says.",
     ] = None
     ema_updates: Annotated[

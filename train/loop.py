@@ -205,7 +205,8 @@ class Trainer:
         if self._before is not None and self._heads_alone():
             with torch.inference_mode():
                 before = self._before(image).kinds
-            loss = loss + self.config.loss.kept * kept_loss(prediction.kinds, before, prediction.paint, targets)
+            kept = kept_loss(prediction.kinds, before, prediction.paint, targets)
+            loss = loss + self.config.loss.kept * kept
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         # Statistics of the normalisations are averaged, too: each member has seen its own images only.

@@ -211,6 +211,15 @@ class Trajectory:
 
 
 @dataclass(frozen=True)
+class Reception:
+    """What the source of a drive's poses says of the positions that it recorded while images were taken."""
+
+    positions: int
+    rtk_fixed: int | None  # of these, with fixed ambiguities; None where the source states no quality
+    geoid_m: float | None = None  # stated height of the geoid above the ellipsoid, added to all heights
+
+
+@dataclass(frozen=True)
 class Road:
     """The recorded ground along the route; the drive's poses are reduced to the plane z = 0."""
 
@@ -270,6 +279,8 @@ class Drive:
     unposed: Mapping[str, int] = field(default_factory=dict)  # images left out, without a pose
     # First and last time, s, of all images of a camera, left out or not.
     listed_s: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    reception: Reception | None = None  # None where the poses come from no receiver's log
+    headed_by_course: bool = False  # whether its headings are its antenna's course, smoothed
     joined: tuple[Session, ...] = ()  # its sessions, if several: then it has no trajectory
 
     @property
@@ -282,6 +293,14 @@ class Drive:
         path = path.absolute()
         root = self.root.absolute()
         return path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
+
+    @property
+    def spans_s(self) -> tuple[tuple[float, float], ...]:
+        """The first and the last stamp of the images of each session, s."""
+        stamps_of: dict[int, list[float]] = {}
+        for image in self.images:
+            stamps_of.setdefault(image.session, []).append(image.stamp_s)
+        return tuple((min(stamps), max(stamps)) for _, stamps in sorted(stamps_of.items()))
 
     @property
     def route_map(self) -> FloatArray:

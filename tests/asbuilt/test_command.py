@@ -7,9 +7,9 @@ import cv2
 import pytest
 
 from tests.asbuilt.site import layout, mapped, moved
-from v2hdm.asbuilt.writing import LAYER, PICTURE, REPORT, TABLE
 from v2hdm.cli.main import main
 from v2hdm.io.maps.geojson import write_geojson
+from v2hdm.store import names
 
 
 @pytest.fixture
@@ -29,12 +29,12 @@ def test_paint_that_conforms_ends_in_0_and_files_that_can_be_opened(site, capsys
     assert "the design as a whole lies in place" in said
     assert "results in outputs/map-compared" in said
     folder = site / "outputs/map-compared"
-    assert json.loads((folder / REPORT).read_text())["counts"]["right"] > 100
-    rows = list(csv.DictReader((folder / TABLE).read_text().splitlines()))
+    assert json.loads((folder / names.AS_BUILT).read_text())["counts"]["right"] > 100
+    rows = list(csv.DictReader((folder / names.AS_BUILT_TABLE).read_text().splitlines()))
     assert {row["quantity"] for row in rows} == {"along", "across", "turn", "length", "width"}
-    layer = json.loads((folder / LAYER).read_text())
+    layer = json.loads((folder / names.AS_BUILT_LAYER).read_text())
     assert len(layer["features"]) == 120
-    assert cv2.imread(str(folder / PICTURE)) is not None
+    assert cv2.imread(str(folder / names.AS_BUILT_PICTURE)) is not None
 
 
 def test_paint_that_is_off_ends_in_3_and_is_listed(site, capsys):

@@ -34,6 +34,7 @@ from tests.benchmarks.made.boxes import detect_pieces, make_boxes
 from tests.benchmarks.made.detect import detect
 from tests.benchmarks.made.draw import draw
 from tests.benchmarks.made.faults import APART_S, SPOILS
+from tests.benchmarks.made.lengths import make_lengths
 from tests.benchmarks.made.queue import detect_queue, make_queue
 from tests.benchmarks.made.world import World, drive_of, make, truth_of
 from tests.benchmarks.right_drives import CLEAN, Job, judge, map_one
@@ -367,6 +368,7 @@ def site_drives(seeds: Sequence[int], folders: Sequence[Path]) -> Iterator[SiteD
             (make_boxes(draw(seed, "straight")), detect_pieces, ("front",), True),
             (make_boxes(draw(seed, "straight")), partial(detect_pieces, known=_MOST_ENDS), ("front",), False),
             (make_queue(draw(seed, "straight")), detect_queue, ("front",), False),
+            (make_lengths(draw(seed, "straight")), detect, ("front",), False),
         ):
             drive = drive_of(world)
             detections, visibility = see(world, drive)

@@ -1,22 +1,50 @@
-"""Surveys by detections: the statistics that they are made of.
+"""Surveys by detections: the statistics they are made of, and mapping in sections against all at once.
 
 ``python -m tests.benchmarks.survey --statistics DRIVE [--every 3]``: the shipped detector on a rendered port,
 by distance: errors and stated sigmas of corners, the share of markings found, and of false detections. Those
 of port 2 are the constants of :mod:`v2hdm.simulate.survey.sightings`.
+
+``python -m tests.benchmarks.survey --joint KM [--section-m M]``: a problem of a survey, adjusted at once and
+in sections: corners in mm, sigmas in per cent, seconds of CPU.
+
+``python -m tests.benchmarks.survey --grow KM [KM ...] [--section-m M] [--workers N]``: a map of each length
+in sections, in a process of its own: peak memory, CPU, errors and coverage against the truth; then the
+exponents of growth.
 """
 
 import argparse
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from omegaconf import OmegaConf
+from scipy.spatial import cKDTree
 
+from v2hdm.adjust import Problem, SolveOptions, solve
+from v2hdm.adjust.sections.parts import cut, parts_of_way
+from v2hdm.adjust.sections.solve import Shape, save_part, solve_parts
+from v2hdm.cli.compose import conf_dir
 from v2hdm.detection.batch import detect_image
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.executor import HERE, open_executor
 from v2hdm.geometry.lens import distort_points
-from v2hdm.io.drive import read_drive
+from v2hdm.io.detections import detections_of, read_detections
+from v2hdm.io.drive import join_drives, read_drive
 from v2hdm.io.drive.truth import read_truth
-from v2hdm.records import Drive, FloatArray, MarkingDetection, Truth
+from v2hdm.io.maps.reading import read_geojson
+from v2hdm.mapping.inputs import Inputs
+from v2hdm.mapping.options import MappingOptions
+from v2hdm.mapping.sections import map_in_sections
+from v2hdm.records import Drive, FloatArray, HDMap, MarkingDetection, Truth
+from v2hdm.simulate.port.config import PortConfig, SurveyConfig
+from v2hdm.simulate.survey.drive import simulated_drives
 
 _MATCH_PX = 12.0  # mean distance of known corners from a marking's, within which a detection is of it
 _BORDER_PX = 4.0
@@ -113,13 +141,152 @@ def _print(corners: FloatArray, markings: FloatArray) -> None:
         )
 
 
+def survey_of(length_km: float, cache: Path) -> tuple[Drive, HDMap]:
+    """The drives of a survey as one, and its true map."""
+    port = OmegaConf.merge(
+        OmegaConf.structured(PortConfig), OmegaConf.load(conf_dir() / "run" / "port2.yaml").simulate
+    )
+    config = replace(OmegaConf.to_object(port), survey=SurveyConfig(length_km=length_km))
+    folders = simulated_drives(config, cache, HERE, lambda done, total: None)
+    drive = join_drives([read_drive(folder) for folder in folders])
+    return drive, read_geojson(folders[0] / "truth" / "map.geojson")
+
+
+def joint(length_km: float, section_m: float, cache: Path) -> None:
+    """Print how far the joint solve of a survey's problem is from that in sections."""
+    drive, _ = survey_of(length_km, cache)
+    inputs = Inputs(drive, detections_of(drive), list(drive.cameras), MappingOptions())
+    bundle = inputs.optimiser.settle(inputs.tracks)
+    problem = replace(bundle.problem, cam_from_vehicle=bundle.solution.cam_from_vehicle)
+    options = bundle.model.solver
+    print(f"{len(problem.map_from_vehicle)} frames, {problem.corner_count} corners, ", end="")
+    print(f"{len(problem.observations.corner)} observations")
+    begin_s = time.process_time()
+    whole = solve(problem, options)
+    groups = np.arange(problem.corner_count)[:, None]
+    of_whole = np.sqrt(np.diagonal(whole.covariance.corners(groups), axis1=1, axis2=2))
+    print(f"at once: {time.process_time() - begin_s:.1f} s")
+    begin_s = time.process_time()
+    off_mm, off_share = _in_sections(problem, options, section_m, whole.corners_map, of_whole)
+    print(f"in sections: {time.process_time() - begin_s:.1f} s")
+    print(f"corners {off_mm:.5f} mm, sigmas {100 * off_share:.5f} % at most")
+
+
+def _in_sections(
+    problem: Problem, options: SolveOptions, section_m: float, corners_map: FloatArray, sigma_m: FloatArray
+) -> tuple[float, float]:
+    """Largest differences of corners, mm, and of the shares of their sigmas."""
+    position = problem.map_from_vehicle[:, :2, 3]
+    part_of_frame = parts_of_way(position, problem.session_of_frame, section_m)
+    parts, links = cut(problem, part_of_frame, tuple(options.pose_states))
+    shared = np.mean([len(part.border_corners) for part in parts])
+    print(f"{len(parts)} sections, {shared:.0f} corners on the border of each, {len(links)} links")
+    off_mm = off_share = 0.0
+    with tempfile.TemporaryDirectory() as folder:
+        for number, part in enumerate(parts):
+            save_part(Path(folder), number, part)
+        results = solve_parts(
+            Path(folder), len(parts), links, Shape.of(problem, options),
+            lambda number, part, solution: (
+                part.corners,
+                solution.corners_map,
+                solution.covariance.corners(np.arange(part.problem.corner_count)[:, None]),
+            ),
+        )  # fmt: skip
+    for corners, found_map, covariance in results:
+        off_mm = max(off_mm, 1e3 * float(np.abs(found_map - corners_map[corners]).max()))
+        sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+        off_share = max(off_share, float(np.abs(sigma / sigma_m[corners] - 1).max()))
+    return off_mm, off_share
+
+
+class FromFiles:
+    """Detections from a drive's files, read where they are needed."""
+
+    def __call__(self, drive: Drive, images: list[int]) -> list:
+        return [read_detections(drive.images[image].path, at) for at, image in enumerate(images)]
+
+
+def one_length(length_km: float, section_m: float, workers: int, cache: Path) -> None:
+    """Map one survey and print its figures as JSON."""
+    drive, true_map = survey_of(length_km, cache)
+    begin_s = time.perf_counter()
+    with open_executor(workers) as executor, tempfile.TemporaryDirectory(dir=cache) as folder:
+        result = map_in_sections(
+            drive, FromFiles(), list(drive.cameras), MappingOptions(), section_m, executor, Path(folder)
+        )
+    usage = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    figures = {
+        "km": length_km,
+        "images": len(drive.images),
+        "markings": len(result.hd_map.markings),
+        "true": len(true_map.markings),
+        "wall_s": time.perf_counter() - begin_s,
+        "cpu_s": sum(part.ru_utime + part.ru_stime for part in usage),
+        "peak_mb": usage[0].ru_maxrss / 1e3,
+        "worker_peak_mb": usage[1].ru_maxrss / 1e3,
+        **_against(result.hd_map, true_map),
+    }
+    print(json.dumps(figures))
+
+
+def _against(hd_map: HDMap, true_map: HDMap) -> dict[str, float]:
+    """RMSE of corners, cm, the share of coordinates within 1.96 sigmas, and the false markings."""
+    true = np.array([marking.corners_map for marking in true_map.markings])
+    tree = cKDTree(true.mean(axis=1))
+    off, inside, false = [], [], 0
+    for marking in hd_map.markings:
+        away_m, j = tree.query(marking.corners_map.mean(axis=0))
+        if away_m > 0.5 or true_map.markings[int(j)].kind != marking.kind:
+            false += 1
+            continue
+        turned = [np.roll(true[j], turn, axis=0) for turn in range(4)]
+        error = marking.corners_map - min(
+            turned, key=lambda corners: np.abs(marking.corners_map - corners).max()
+        )
+        off.append(error)
+        inside.append(np.abs(error.ravel()) < 1.96 * np.sqrt(np.diag(marking.covariance_m2)))
+    rmse_cm = 100 * float(np.sqrt(2 * np.mean(np.square(off))))
+    return {"rmse_cm": rmse_cm, "inside_95": float(np.mean(inside)), "false": false}
+
+
+def grow(lengths_km: list[float], section_m: float, workers: int, cache: Path) -> None:
+    """Print the figures of each length, and the exponents of growth from the first to the last."""
+    rows = []
+    for length_km in lengths_km:
+        words = ["--one", str(length_km), "--section-m", str(section_m), "--workers", str(workers)]
+        command = [sys.executable, "-m", "tests.benchmarks.survey", *words, "--cache", str(cache)]
+        done = subprocess.run(command, check=True, capture_output=True, text=True)
+        rows.append(json.loads(done.stdout.splitlines()[-1]))
+        shown = {key: round(value, 3) for key, value in rows[-1].items()}
+        print(" ".join(f"{key} {value:g}" for key, value in shown.items()), flush=True)
+    if len(rows) > 1:
+        ratio = np.log(rows[-1]["images"] / rows[0]["images"])
+        for key in ("cpu_s", "peak_mb"):
+            print(f"exponent of {key}: {np.log(rows[-1][key] / rows[0][key]) / ratio:.2f}")
+
+
 def main() -> None:
     """Print what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--statistics", type=Path, metavar="DRIVE", required=True)
+    asked = parser.add_mutually_exclusive_group(required=True)
+    asked.add_argument("--statistics", type=Path, metavar="DRIVE")
+    asked.add_argument("--joint", type=float, metavar="KM")
+    asked.add_argument("--grow", type=float, nargs="+", metavar="KM")
+    asked.add_argument("--one", type=float, metavar="KM", help=argparse.SUPPRESS)
     parser.add_argument("--every", type=int, default=3, metavar="N", help="look at every N-th image")
+    parser.add_argument("--section-m", type=float, default=500.0, metavar="M")
+    parser.add_argument("--workers", type=int, default=1, metavar="N")
+    parser.add_argument("--cache", type=Path, default=Path("cache"), metavar="DIR", help="keeps the surveys")
     parsed = parser.parse_args()
-    statistics(parsed.statistics, parsed.every)
+    if parsed.statistics is not None:
+        statistics(parsed.statistics, parsed.every)
+    elif parsed.joint is not None:
+        joint(parsed.joint, parsed.section_m, parsed.cache)
+    elif parsed.grow is not None:
+        grow(parsed.grow, parsed.section_m, parsed.workers, parsed.cache)
+    else:
+        one_length(parsed.one, parsed.section_m, parsed.workers, parsed.cache)
 
 
 if __name__ == "__main__":

@@ -75,7 +75,8 @@ def test_the_shares_of_the_classes_add_up_to_one():
 
 def test_an_arrow_is_as_likely_whatever_other_symbols_the_network_tells_apart():
     shape = bar(8.0, 0.0, 4.0, 0.9)
-    before = dict.fromkeys((DIAMOND, LANE_DASH, LANE_LINE, STOP_LINE, CHEVRON, OTHER_PAINT), 0.02) | {ARROW: 0.6}
+    others = (DIAMOND, LANE_DASH, LANE_LINE, STOP_LINE, CHEVRON, OTHER_PAINT)
+    before = dict.fromkeys(others, 0.02) | {ARROW: 0.6}
     few = proposal_of(shape, before)
     many = proposal_of(shape, before | dict.fromkeys((TEXT, BOX, BICYCLE), 0.0))
     assert many.share[ARROW] == pytest.approx(few.share[ARROW], abs=0.01)

@@ -337,6 +337,25 @@ def test_fixes_and_an_imu_at_other_times_with_antenna_and_turned_sensor(tmp_path
     assert drive.pose_noise.heading_rad == pytest.approx(0.002)
 
 
+def test_fixes_of_one_antenna_and_the_rates_of_an_upturned_imu_are_the_drive(tmp_path):
+    stamp_s, points, yaw = curve()
+    made = Messages()
+    for k, where in enumerate(place(antenna(points, yaw))):
+        made.add(stamp_s[k], "/fix", made.fix(stamp_s[k], where, 2, 0.015, "gnss"))
+    for t in np.arange(START_S - 0.01, START_S + 10.1, 0.02):
+        imu = made.imu(t, np.eye(3), "imu")
+        imu.angular_velocity.z = -5.0 / 30.0
+        made.add(t, "/imu", imu)
+    poses = {"topic": "/fix", "heading": "course", "gyro_topic": "/imu", "lever_arm_m": list(LEVER_M)}
+    drive = with_topic(tmp_path, made, poses | {"mounting_rpy_deg": [180, 0, 0]})
+    got = drive.recorded.map_from_vehicle
+    assert np.degrees(np.abs(np.arctan2(got[:, 1, 0], got[:, 0, 0]) - yaw).max()) < 0.7
+    assert np.abs(got[:, :3, 3] - points).max() < 0.03
+    assert drive.headed_by_course
+    with pytest.raises(DriveError, match="its z axis points down"):
+        with_topic(tmp_path / "wrong", made, poses)
+
+
 def test_covariances_become_the_noise_unless_the_drive_says_otherwise(tmp_path):
     stamp_s, points, yaw = curve()
     covariance = np.diag([0.03**2, 0.03**2, 1.0, 0.1, 0.1, 0.004**2])

@@ -132,7 +132,9 @@ def test_all_that_a_bag_lacks_is_asked_for_at_once_with_what_it_offers(folder, t
     of_poses = ["poses.topic", "poses.heading_topic", "poses.lever_arm_m"]
     assert list(missing) == [*of_poses, *cameras]
     assert "/bow/fix (NavSatFix" in missing["poses.topic"]
-    assert missing["poses.heading_topic"] == "the topic of headings, such as /imu; the bag has none"
+    assert missing["poses.heading_topic"].startswith(
+        "the topic of headings, such as /imu; the bag has none; "
+    )
     assert re.match(
         r"for /bow/fix: position of 'bow' .*; for /stern/fix: position of 'stern' ",
         missing["poses.lever_arm_m"],
@@ -145,6 +147,31 @@ def test_all_that_a_bag_lacks_is_asked_for_at_once_with_what_it_offers(folder, t
     assert "gnss_antenna is at [1.5, 0.0, 2.0]" in again["poses.lever_arm_m"]
     with pytest.raises(DriveError, match="no poses on /none; it has: /bow/fix, /stern/fix"):
         draft_drive(bag, tmp_path / "drive", ["poses.topic=/none"])
+
+
+def test_one_antenna_is_one_question_and_its_gyro_is_found(folder, tmp_path):
+    made = messages_of(folder)
+    rows = []
+    for stamp_s, topic, message in made.rows:
+        if topic == "/odom":
+            place = (29.95 + 1e-6 * stamp_s, 122.05, 12.0)
+            rows.append((stamp_s, "/fix", made.fix(stamp_s, place, 2, 0.02, "gnss")))
+            imu = made.imu(stamp_s, np.eye(3), "imu")
+            imu.orientation_covariance[0] = -1
+            rows.append((stamp_s, "/imu", imu))
+        else:
+            rows.append((stamp_s, topic, message))
+    made.rows = rows
+    bag = write_ros2(tmp_path / "site", made)
+    missing = draft_drive(bag, tmp_path / "drive", [])
+    about_heading = [key for key in missing if "heading" in key or "gyro" in key]
+    assert about_heading == ["poses.heading_topic"]
+    assert "/imu (Imu, 10 Hz, it measures no orientation)" in missing["poses.heading_topic"]
+    assert "--set poses.heading=course" in missing["poses.heading_topic"]
+    again = draft_drive(bag, tmp_path / "drive", ["poses.heading=course"])
+    assert set(again) - set(missing) == {"poses.mounting_rpy_deg"}
+    assert "of the gyro 'imu'" in again["poses.mounting_rpy_deg"]
+    assert "poses.heading_topic" not in again
 
 
 def test_what_one_topic_of_poses_alone_needs_is_asked_for_together_with_the_topic(folder, tmp_path):

@@ -72,7 +72,7 @@ def test_the_detector_reads_the_file_with_its_classes(tmp_path):
 def test_a_network_that_differs_in_more_is_refused_by_the_name_of_a_weight(tmp_path):
     bias = read_exported(FLOAT_FILE).weights["paint.bias"]
     other = grown_source(**{"paint.bias": bias + 0.5})
-    with pytest.raises(DetectorError, match="paint.bias of the network is another one"):
+    with pytest.raises(DetectorError, match=r"paint\.bias of the network is another one"):
         add_classes(NETWORK_FILE, FLOAT_FILE, other, tmp_path / "net.onnx")
     assert not (tmp_path / "net.onnx").exists()
 

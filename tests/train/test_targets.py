@@ -201,7 +201,8 @@ def answers_for_cells(painted, kinds):
 def test_what_was_said_of_classes_is_kept_where_no_label_says_otherwise():
     before = torch.zeros(1, KINDS, 1, 6)
     before[0, 0] = 2.0  # the first class everywhere
-    seen = torch.tensor([5.0, 5.0, 5.0, 5.0, 5.0, -5.0]).repeat_interleave(2)[None, None, None].repeat(1, 1, 2, 1)
+    of_cells = torch.tensor([5.0, 5.0, 5.0, 5.0, 5.0, -5.0])
+    seen = of_cells.repeat_interleave(2)[None, None, None].repeat(1, 1, 2, 1)
     # Of the same class, bare, of another class, paint of an unknown one, unknown ground, not seen as paint.
     answers = answers_for_cells([1, 0, 1, 1, IGNORE, 0], [0, IGNORE, 1, IGNORE, IGNORE, IGNORE])
     assert float(kept_loss(before, before, seen, answers)) == 0

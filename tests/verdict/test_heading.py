@@ -256,3 +256,18 @@ def test_noise_in_the_wrong_unit_stands_for_ground_that_cannot_be_matched_under_
     ground = Finding("ground match", Status.FAIL, 0.0, None, "", "no match", "front")
     told = causes([ground, unit])
     assert [(one.check, one.status) for one in told] == [("pose noise", Status.FAIL)]
+
+
+@pytest.mark.parametrize(("turns", "status"), [(True, Status.PASS), (False, Status.WARN)])
+def test_a_straight_drive_headed_by_its_course_leaves_yaw_open_and_says_so(turns, status):
+    stamp_s = 0.1 * np.arange(300)
+    yaw = 0.05 * stamp_s if turns else np.zeros(300)
+    step = 0.4 * np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(300)])
+    recorded = trajectory(stamp_s, np.cumsum(step, axis=0), yaw)
+    by_check = {finding.check: finding for finding in check_heading(motion(recorded), by_course=True)}
+    offset = by_check["heading offset"]
+    assert offset.status is status
+    assert ("the cameras' yaw look the same" in offset.says) == (not turns)
+    assert {finding.status for check, finding in by_check.items() if check != "heading offset"} == {
+        Status.PASS
+    }

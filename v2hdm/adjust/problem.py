@@ -45,6 +45,9 @@ _LINE_RATIO = 1e3
 LINE_EXCESS = _LINE_RATIO + 2 + 1 / _LINE_RATIO
 """Squared trace over determinant of a covariance from which the observation is of a line."""
 
+_ROWS = 1 << 16
+"""Observations that are looked at together: all at once would take 24 bytes each."""
+
 _ROUNDED = 1e-12
 """Fraction of an axis' information below which its remainder beside the other axis is rounding."""
 
@@ -85,10 +88,14 @@ class Observations:
     @property
     def on_line(self) -> BoolArray:
         """Observations (K,) of lines: the position along the line is unknown."""
-        xx = self.covariance_px[:, 0, 0]
-        yx = self.covariance_px[:, 1, 0]
-        yy = self.covariance_px[:, 1, 1]
-        return np.asarray((xx + yy) ** 2 > (xx * yy - yx**2) * LINE_EXCESS)
+        is_on_line = np.empty(len(self.corner), dtype=np.bool_)
+        for begin in range(0, len(is_on_line), _ROWS):
+            rows = slice(begin, begin + _ROWS)
+            xx = self.covariance_px[rows, 0, 0]
+            yx = self.covariance_px[rows, 1, 0]
+            yy = self.covariance_px[rows, 1, 1]
+            is_on_line[rows] = (xx + yy) ** 2 > (xx * yy - yx**2) * LINE_EXCESS
+        return is_on_line
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,8 @@ from v2hdm.asbuilt.misfit import Misfit
 from v2hdm.geometry.planar import signed_area
 from v2hdm.io.maps.geojson import geojson_feature, geojson_positions, write_features
 from v2hdm.records import GeodeticOrigin, HDMap
+from v2hdm.store import names
 from v2hdm.store.files import replace_csv, write_json
-
-REPORT = "comparison.json"
-TABLE = "comparison.csv"
-LAYER = "comparison.geojson"
-PICTURE = "comparison.png"
 
 _MOST_LISTED = 12  # findings that the terminal lists; the table has all
 _WRONG = (Fate.OFF, Fate.MISSING, Fate.EXTRA)
@@ -46,7 +42,7 @@ def summary_lines(findings: Sequence[Finding], misfit: Misfit | None, source: st
     wrong = [finding for finding in findings if finding.fate in _WRONG]
     lines += [finding_line(finding) for finding in wrong[:_MOST_LISTED]]
     if len(wrong) > _MOST_LISTED:
-        lines.append(f"and {len(wrong) - _MOST_LISTED} more in {TABLE}")
+        lines.append(f"and {len(wrong) - _MOST_LISTED} more in {names.AS_BUILT_TABLE}")
     return lines
 
 
@@ -95,10 +91,10 @@ def write_comparison(
             "paint_about_design_sigma_m": misfit.painted_m,
         }
     content["findings"] = [_as_json(finding) for finding in findings]
-    write_json(folder / REPORT, content)
-    replace_csv(folder / TABLE, _rows(findings))
-    _write_layer(folder / LAYER, findings, hd_map.origin)
-    _write_picture(folder / PICTURE, findings, source)
+    write_json(folder / names.AS_BUILT, content)
+    replace_csv(folder / names.AS_BUILT_TABLE, _rows(findings))
+    _write_layer(folder / names.AS_BUILT_LAYER, findings, hd_map.origin)
+    _write_picture(folder / names.AS_BUILT_PICTURE, findings, source)
 
 
 def _as_json(finding: Finding) -> dict[str, Any]:

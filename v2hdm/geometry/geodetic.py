@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -219,6 +219,19 @@ def datum_of(crs: str, where: str, error: type[V2hdmError]) -> str:
 def has_height_datum(crs: str, where: str, error: type[V2hdmError]) -> bool:
     """Whether ``crs`` is a compound system, with heights above sea level rather than the ellipsoid."""
     return bool(_system(crs, where, error).is_compound)
+
+
+class System(NamedTuple):
+    """A coordinate system as PROJ knows it."""
+
+    name: str
+    is_geographic: bool  # whether its coordinates are latitude and longitude
+
+
+def system_of(crs: str, where: str, error: type[V2hdmError]) -> System:
+    """The system with the code ``crs``; raises ``error`` if it is unknown or on no satellite datum."""
+    system = _system(crs, where, error)
+    return System(str(system.name), bool(system.is_geographic))
 
 
 def is_geographic(crs: str, where: str, error: type[V2hdmError]) -> bool:

@@ -148,6 +148,7 @@ class TopicPoses(PoseKeys):
     heading_topic: Annotated[str | None, "topic of Imu or QuaternionStamped, for fixes."] = None
     frame: Annotated[str | None, "the map's frame, for /tf."] = None
     vehicle: Annotated[str | None, "the vehicle's frame, for /tf."] = None
+    gyro_topic: Annotated[str | None, "topic of Imu, with heading: course."] = None
     stamps: Annotated[str, "times to take: header or received."] = "header"
 
 

@@ -116,6 +116,14 @@ class ExtrinsicFigures(TypedDict, total=False):
     yaw_change_deg: Number | None
 
 
+class StatedReception(TypedDict):
+    """What the source of the poses says of its positions."""
+
+    positions: int
+    rtk_fixed: int | None
+    geoid_m: Number | None
+
+
 class StatedDrive(TypedDict, total=False):
     """The drive, beside the settings that it was read with."""
 
@@ -123,6 +131,8 @@ class StatedDrive(TypedDict, total=False):
     paths: list[str] | None
     images: int
     images_sha256: str
+    sessions_s: list[tuple[Number, Number]] | None
+    reception: StatedReception | None
 
 
 class Metrics(TypedDict, total=False):

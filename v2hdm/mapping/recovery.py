@@ -249,8 +249,8 @@ def _evidence(
         pose_noise=optimiser.pose_noise,
         worst_innovation=float(largest.max()),
         worst_innovation_s=float(_frame_s(settled, sightings)[int(largest.argmax())]),
-        clock_s=_clocks(final),
-        read_out_s=_read_outs(final),
+        clock_s=clocks_of(final),
+        read_out_s=read_outs_of(final),
         # A coordinate's noise averages both directions; along the path alone its variance is twice that.
         jitter_s=math.sqrt(2) * stated_m * optimiser.pose_noise.get("position_m", 0.0) / max(speed_mps, 0.1),
         along_over_across=innovations.along_over_across,
@@ -275,7 +275,8 @@ def _is_ambiguous(worst: ScoreTest, tests: Sequence[ScoreTest]) -> bool:
     return max(rivals, default=0.0) > _AMBIGUOUS_SHARE * worst.sigmas
 
 
-def _clocks(bundle: Bundle) -> tuple[dict[str, tuple[float, float]], ...]:
+def clocks_of(bundle: Bundle) -> tuple[dict[str, tuple[float, float]], ...]:
+    """Clock offsets by session and camera, s, with their sigmas; empty where they are not estimated."""
     offset_s = bundle.solution.clock_offset_s.T.tolist()
     if not bundle.model.solver.clock_offset:
         return tuple({} for _ in offset_s)
@@ -285,7 +286,8 @@ def _clocks(bundle: Bundle) -> tuple[dict[str, tuple[float, float]], ...]:
     return tuple({name: (off[c], sigma[c]) for name, c in index} for off, sigma in sessions)
 
 
-def _read_outs(bundle: Bundle) -> dict[str, tuple[float, float]]:
+def read_outs_of(bundle: Bundle) -> dict[str, tuple[float, float]]:
+    """Read-out times by camera, s, with their sigmas; empty where they are not estimated."""
     if not bundle.model.solver.read_out:
         return {}
     read_out_s = bundle.solution.read_out_s

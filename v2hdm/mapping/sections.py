@@ -41,7 +41,7 @@ from v2hdm.mapping.merging import merged
 from v2hdm.mapping.methods import optimised_result
 from v2hdm.mapping.optimise import initial_rig, larger_noise
 from v2hdm.mapping.options import MappingOptions, check_sections
-from v2hdm.mapping.recovery import Outcome, optimise
+from v2hdm.mapping.recovery import Outcome, clocks_of, optimise, read_outs_of
 from v2hdm.mapping.results import MethodResult
 from v2hdm.progress import Progress, silent
 from v2hdm.records import BoolArray, Drive, FloatArray, Image, ImageDetections, IntArray
@@ -278,7 +278,13 @@ class _Work:
         final = replace(final, bundle=bundle)
         optimised = conclude(final, self.options.acceptance)
         is_ours = self.common.is_ours[number][optimised.groups]
-        outcome = replace(outcome, bundle=bundle, final=final)
+        evidence = replace(
+            outcome.evidence,
+            pose_model=self.common.pose_model,
+            clock_s=clocks_of(bundle),
+            read_out_s=read_outs_of(bundle),
+        )
+        outcome = replace(outcome, bundle=bundle, final=final, evidence=evidence)
         kept = tuple(marking for marking, ours in zip(optimised.markings, is_ours, strict=True) if ours)
         excluded = tuple(
             exclusion

@@ -22,6 +22,7 @@ from v2hdm.mapping.options import (
     check_sections,
 )
 from v2hdm.records import Drive, Image
+from v2hdm.report.job import Job, check_job
 from v2hdm.safe.texts import shown, take_camera_name, take_name
 from v2hdm.settings import MOST_PROCESSES, NOT_NEGATIVE, POSITIVE, Within, check_settings
 from v2hdm.simulate.port.config import PortConfig
@@ -78,12 +79,13 @@ class MapConfig:
 
 
 @dataclass(kw_only=True)
-class ReportConfig:
-    """Settings of the report."""
+class ReportConfig(Job):
+    """Settings of the report; its coordinates are in ``crs``."""
 
     background: Annotated[str | None, "a GeoTIFF or a folder of XYZ tiles under its map, null for none."] = (
         None
     )
+    pdf: Annotated[bool, "whether to write it as report.pdf, too (extra pdf)."] = False
 
 
 @dataclass(kw_only=True)
@@ -193,6 +195,11 @@ def admit(config: RunConfig) -> str:
     if config.map.corrections is not None:
         read_corrections(Path(config.map.corrections))
     check_formats(config.export, "export")
+    check_job(config.report)
+    if config.report.pdf:
+        from v2hdm.report.paper import check_paper
+
+        check_paper("report.pdf")
     if config.report.background is not None:
         need("rasterio", "gis", "report.background", ConfigError)
         if not Path(config.report.background).exists():

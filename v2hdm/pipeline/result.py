@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ def describe_run(
 ) -> dict[str, Any]:
     """The beginning of ``metrics.json``: name, version, date (UTC), the drive at ``paths`` as it was read."""
     stamp_s = [image.stamp_s for image in drive.images]
+    reception = drive.reception
     return {
         "name": name,
         "version": __version__,
@@ -41,6 +42,8 @@ def describe_run(
             "length_m": round(float(length_along(drive.route_map)[-1]), 2),
             "position_sigma_m": drive.pose_noise.position_m,
             "heading_sigma_deg": round(float(np.rad2deg(drive.pose_noise.heading_rad)), 4),
+            "sessions_s": [list(span) for span in drive.spans_s],
+            **({} if reception is None else {"reception": asdict(reception)}),
         },
         "versions": {"v2hdm": __version__, **library_versions()},
     }

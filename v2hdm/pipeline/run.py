@@ -33,6 +33,7 @@ from v2hdm.pipeline.config import (
 from v2hdm.pipeline.context import Context, log_file, logging_to
 from v2hdm.progress import Progress, silent
 from v2hdm.records import Drive
+from v2hdm.report.job import job_of
 from v2hdm.safe.texts import take_name
 from v2hdm.simulate.survey.drive import folders_of
 from v2hdm.store import remote
@@ -272,6 +273,9 @@ def map_and_save(
                 mosaic=config.mosaic,
                 crs=config.crs,
                 background=config.report.background,
+                job=job_of(config.report),
+                pdf=config.report.pdf,
+                reach_m=config.mapping.max_range_m,
             )
             write_result(mapped, folder, outputs, context)
             for line in mapped.verdict.lines:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,7 +31,10 @@ from v2hdm.mosaic.result import write_mosaic
 from v2hdm.pipeline.base import change_json
 from v2hdm.pipeline.context import Context
 from v2hdm.records import BEST, Changes, Drive, FloatArray, HDMap, Image, ImageDetections, Trajectory
+from v2hdm.report.coverage import REACH_M, coverage_of, write_coverage
+from v2hdm.report.job import Job, StatedJob, write_job
 from v2hdm.report.page.document import write_page
+from v2hdm.report.paper import write_paper
 from v2hdm.report.photos import save_overlay
 from v2hdm.store import names
 from v2hdm.store.files import replace_text, write_json
@@ -53,6 +56,9 @@ class Outputs:
     mosaic: bool = True
     crs: str | None = None
     background: str | None = None  # under the report's map: a GeoTIFF or a folder of XYZ tiles
+    job: Job = field(default_factory=Job)  # what people state for the report
+    pdf: bool = False
+    reach_m: float = REACH_M  # from a camera's nadir, to which markings were mapped
 
 
 def write_result(result: Result, folder: Path, outputs: Outputs, context: Context) -> None:
@@ -72,7 +78,11 @@ def write_result(result: Result, folder: Path, outputs: Outputs, context: Contex
     if "qgis" in outputs.formats and result.methods:  # it opens the mosaic, too
         grid = check_crs(outputs.crs, ["qgis"], result.map.origin, "crs").get("qgis")
         write_qgis(result.map, folder / names.PROJECT, grid=grid)
+    write_job(folder, StatedJob(outputs.job, outputs.crs))
     with context.timed("report"):
+        if result.methods:
+            mountings = {name: camera.cam_from_vehicle for name, camera in result.calibrations.items()}
+            write_coverage(folder, coverage_of(drive, mountings, outputs.reach_m))
         try:
             write_page(folder, drive, None if outputs.background is None else Path(outputs.background))
         except MapFileError as failure:
@@ -80,6 +90,8 @@ def write_result(result: Result, folder: Path, outputs: Outputs, context: Contex
                 raise
             _log.warning("no picture lies under the report's map: %s", failure)
             write_page(folder, drive)
+        if outputs.pdf:
+            write_paper(folder, drive)
 
 
 def _write_all_maps(folder: Path, result: Result) -> None:

@@ -242,7 +242,11 @@ class _Detections:
         if self.listed is None:
             return [read_detections(drive.images[image].path, at) for at, image in enumerate(images)]
         place = {image: at for at, image in enumerate(images)}
-        return [replace(found, image=place[found.image]) for found in self.listed if found.image in place]
+        return [
+            replace(detections, image=place[detections.image])
+            for detections in self.listed
+            if detections.image in place
+        ]
 
 
 class _Job(NamedTuple):

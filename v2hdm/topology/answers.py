@@ -33,8 +33,14 @@ class Answer:
         if question.subject == "speed":
             return True
         pairs = ((question.place_map, self.place_map), (question.to_map, self.to_map))
-        known = [(one, other) for one, other in pairs if one is not None and other is not None]
-        return all(float(np.linalg.norm(one - other)) < _SAME_M for one, other in known)
+        places = [
+            (asked_map, answered_map)
+            for asked_map, answered_map in pairs
+            if asked_map is not None and answered_map is not None
+        ]
+        return all(
+            float(np.linalg.norm(asked_map - answered_map)) < _SAME_M for asked_map, answered_map in places
+        )
 
     @property
     def speed_kmh(self) -> float:

@@ -80,10 +80,10 @@ def _cubic(share: FloatArray, values: list[float], slopes: list[float]) -> Float
 def _without_backward(curve: FloatArray, ahead: FloatArray) -> FloatArray:
     """The points of a curve (N, 2) that go on from the last one that was taken, and its ends."""
     step_m = float(np.linalg.norm(curve[-1] - curve[0])) / len(curve)
-    taken = [0]
+    vertices = [0]
     for k in range(1, len(curve) - 1):
-        goes_on = (curve[k] - curve[taken[-1]]) @ ahead[k] > _LEAST_PROGRESS * step_m
+        goes_on = (curve[k] - curve[vertices[-1]]) @ ahead[k] > _LEAST_PROGRESS * step_m
         is_near_end = k > _NEAR_END * len(curve)
         if goes_on and (not is_near_end or (curve[-1] - curve[k]) @ ahead[-1] > 0):
-            taken.append(k)
-    return np.asarray(curve[[*taken, len(curve) - 1]])
+            vertices.append(k)
+    return np.asarray(curve[[*vertices, len(curve) - 1]])

@@ -48,9 +48,9 @@ def directed(
         return DirectedLanes(list(lanes), [Direction.DRAWN] * len(lanes), [()] * len(lanes))
     for number, directions in stated.items():
         ways[number].stated |= directions
-    known = {number: way for number, way in enumerate(ways) if way.is_forward or way.is_backward}
+    driven_lanes = {number: way for number, way in enumerate(ways) if way.is_forward or way.is_backward}
     result = DirectedLanes([], [], [])
-    turned = {number: way.is_backward and not way.is_forward for number, way in known.items()}
+    turned = {number: way.is_backward and not way.is_forward for number, way in driven_lanes.items()}
     turned |= _continued(lanes, lines_map, turned)
     driven = set(turned)
     asked = []
@@ -140,13 +140,13 @@ def _continued(
     lanes: Sequence[ClosedLane], lines_map: Sequence[FloatArray], turned: dict[int, bool]
 ) -> dict[int, bool]:
     """Whether lanes of unknown direction are turned, where those of known direction lead to or from them."""
-    found: dict[int, bool] = {}
+    inferred: dict[int, bool] = {}
     while True:
-        known = turned | found
-        news = dict(_touching(lanes, known)) or dict(_along_lines(lanes, lines_map, known))
+        directions = turned | inferred
+        news = dict(_touching(lanes, directions)) or dict(_along_lines(lanes, lines_map, directions))
         if not news:
-            return found
-        found |= news
+            return inferred
+        inferred |= news
 
 
 def _touching(lanes: Sequence[ClosedLane], turned: dict[int, bool]) -> Iterator[tuple[int, bool]]:

@@ -44,17 +44,17 @@ def joined(lanes: Sequence[LaneOfGraph], links: Sequence[Link]) -> Junctions:
     for lists in (starts, ends):
         for numbers in lists.values():
             together = [number for number in numbers if number in connecting]
-            for other in together[1:]:
-                groups.join(together[0], other)
+            for second in together[1:]:
+                groups.join(together[0], second)
     for before, after in links:
         if before in connecting and after in connecting:
             groups.join(before, after)
     crossing = set()
     centres = {number: lanes[number].centre_map for number in connecting}
-    for one, other in combinations(sorted(connecting), 2):
-        if cross_each_other(centres[one], centres[other]):
-            groups.join(one, other)
-            crossing |= {one, other}
+    for first, second in combinations(sorted(connecting), 2):
+        if cross_each_other(centres[first], centres[second]):
+            groups.join(first, second)
+            crossing |= {first, second}
     angle_rad = {number: turn_rad(centre) for number, centre in centres.items()}
     result = Junctions([*lanes], [])
     for members in groups.groups():
@@ -81,9 +81,9 @@ class _Groups:
     def __init__(self, numbers: Sequence[int]) -> None:
         self._group = {number: number for number in numbers}
 
-    def join(self, one: int, other: int) -> None:
-        kept, gone = sorted((self._group[one], self._group[other]))
-        self._group = {number: kept if group == gone else group for number, group in self._group.items()}
+    def join(self, first: int, second: int) -> None:
+        lower, higher = sorted((self._group[first], self._group[second]))
+        self._group = {number: lower if group == higher else group for number, group in self._group.items()}
 
     def groups(self) -> Iterator[list[int]]:
         for group in sorted(set(self._group.values())):
@@ -109,24 +109,24 @@ def leads_back(start: FloatArray, end: FloatArray) -> bool:
     return bool(start @ end < np.cos(_BACK_RAD))
 
 
-def cross_each_other(one: FloatArray, other: FloatArray) -> bool:
+def cross_each_other(first: FloatArray, second: FloatArray) -> bool:
     """Whether two polylines (N, 2) and (M, 2) cross away from their ends."""
-    if (one.max(axis=0) < other.min(axis=0)).any() or (other.max(axis=0) < one.min(axis=0)).any():
+    if (first.max(axis=0) < second.min(axis=0)).any() or (second.max(axis=0) < first.min(axis=0)).any():
         return False
-    return len(crossings(one, other)) > 0
+    return len(crossings(first, second)) > 0
 
 
-def crossings(one: FloatArray, other: FloatArray) -> FloatArray:
+def crossings(line: FloatArray, other_line: FloatArray) -> FloatArray:
     """The ways (K,) along a polyline (N, 2), m, at which it crosses another (M, 2)."""
-    step = np.diff(one, axis=0)[:, None]
-    other_step = np.diff(other, axis=0)[None]
-    between = other[None, :-1] - one[:-1, None]
+    step = np.diff(line, axis=0)[:, None]
+    other_step = np.diff(other_line, axis=0)[None]
+    between = other_line[None, :-1] - line[:-1, None]
     area = cross(step, other_step)
     is_parallel = np.abs(area) < 1e-12
     divisor = np.where(is_parallel, 1.0, area)
     part = cross(between, other_step) / divisor
     other_part = cross(between, step) / divisor
     meets = ~is_parallel & (part > 0) & (part <= 1) & (other_part > 0) & (other_part <= 1)
-    at_m = length_along(one)
+    at_m = length_along(line)
     places: FloatArray = (at_m[:-1, None] + part * np.diff(at_m)[:, None])[meets]
     return places

@@ -63,23 +63,27 @@ class LaneShape:
     def holding(self, points: FloatArray) -> IntArray:
         """The numbers of the ``points`` (M, 2) inside its outline."""
         low, high = self.outline.min(axis=0), self.outline.max(axis=0)
-        near = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
+        numbers_near = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
         # Far from the map's origin single precision is too coarse.
         outline = (self.outline - low).astype(np.float32)
         return np.array(
-            [k for k in near if cv2.pointPolygonTest(outline, (points[k] - low).tolist(), False) >= 0],
+            [
+                k
+                for k in numbers_near
+                if cv2.pointPolygonTest(outline, (points[k] - low).tolist(), False) >= 0
+            ],
             dtype=np.int64,
         )
 
 
 def _nearest(points: FloatArray, line: FloatArray) -> IntArray:
     """The vertices (M,) of a line (N, 2) nearest to neighbouring ``points`` (M, 2)."""
-    near = np.arange(len(line))
+    vertices = np.arange(len(line))
     low, high = points.min(axis=0) - LANE_WIDTH_M[1], points.max(axis=0) + LANE_WIDTH_M[1]
-    within = np.flatnonzero(((line >= low) & (line <= high)).all(axis=1))
-    near = within if len(within) else near
-    apart = points[:, None] - line[near]
-    return np.asarray(near[np.argmin(np.einsum("mni,mni->mn", apart, apart), axis=1)])
+    vertices_within = np.flatnonzero(((line >= low) & (line <= high)).all(axis=1))
+    vertices = vertices_within if len(vertices_within) else vertices
+    offsets = points[:, None] - line[vertices]
+    return np.asarray(vertices[np.argmin(np.einsum("mni,mni->mn", offsets, offsets), axis=1)])
 
 
 class Stay(NamedTuple):

@@ -78,6 +78,9 @@ class WayFinder:
         }
         self._last = {after: before for before, after in self._next.items()}
         self._all_links = {*self._next.items(), *links}
+        self._following: dict[int, list[int]] = {}
+        for before, after in sorted(self._all_links):
+            self._following.setdefault(before, []).append(after)
 
     def find(self) -> DrivenWays:
         """The ways of all paths, the best path for each pair of lanes."""
@@ -129,8 +132,8 @@ class WayFinder:
         for _ in range(_MOST_LINKS):
             longer = []
             for chain in chains:
-                for before, after in self._all_links:
-                    if before != chain[-1] or after in chain:
+                for after in self._following.get(chain[-1], ()):
+                    if after in chain:
                         continue
                     if after == last:
                         return [*chain, after]
@@ -144,26 +147,32 @@ class WayFinder:
         ahead = self._last.get(after)
         pairs = ((before, after), (behind, after), (before, ahead))
         return any(
-            one is not None and other is not None and are_beside(self._lanes[one], self._lanes[other])
-            for one, other in pairs
+            lane is not None
+            and next_lane is not None
+            and are_beside(self._lanes[lane], self._lanes[next_lane])
+            for lane, next_lane in pairs
         )
 
     def _departure(self, stays: Sequence[Stay], stay: Stay) -> _Place:
         """Where the path last went along its lane, or the one that this lane follows."""
-        earlier = [one for one in stays if one.last < stay.first and one.lane == self._last.get(stay.lane)]
-        for held in [stay, *earlier[-1:]]:
-            for point in range(held.last, held.first - 1, -1):
-                place, angle_rad = self._place(held, point)
+        earlier = [
+            other for other in stays if other.last < stay.first and other.lane == self._last.get(stay.lane)
+        ]
+        for followed in [stay, *earlier[-1:]]:
+            for point in range(followed.last, followed.first - 1, -1):
+                place, angle_rad = self._place(followed, point)
                 if angle_rad < _DEPARTED_RAD:
                     return place
         return self._place(stay, stay.first)[0]
 
     def _arrival(self, stays: Sequence[Stay], stay: Stay) -> _Place:
         """Where the path first went along its lane, or the one that follows this lane."""
-        later = [one for one in stays if one.first > stay.last and one.lane == self._next.get(stay.lane)]
-        for held in [stay, *later[:1]]:
-            for point in range(held.first, held.last + 1):
-                place, angle_rad = self._place(held, point)
+        later = [
+            other for other in stays if other.first > stay.last and other.lane == self._next.get(stay.lane)
+        ]
+        for followed in [stay, *later[:1]]:
+            for point in range(followed.first, followed.last + 1):
+                place, angle_rad = self._place(followed, point)
                 if angle_rad < _DEPARTED_RAD:
                     return place
         return self._place(stay, stay.last)[0]
@@ -218,12 +227,14 @@ class WayFinder:
         return Way(left, entered, before.path, first, last, off_m)
 
 
-def are_beside(one: ClosedLane, other: ClosedLane) -> bool:
+def are_beside(first: ClosedLane, second: ClosedLane) -> bool:
     """Whether two lanes of the same direction lie on either side of one stretch of a line."""
-    return _share(one.left, other.right) or _share(one.right, other.left)
+    return _share(first.left, second.right) or _share(first.right, second.left)
 
 
-def _share(one: Bound, other: Bound) -> bool:
-    if one.line != other.line or (one.order[-1] > one.order[0]) != (other.order[-1] > other.order[0]):
+def _share(first: Bound, second: Bound) -> bool:
+    if first.line != second.line or (first.order[-1] > first.order[0]) != (
+        second.order[-1] > second.order[0]
+    ):
         return False
-    return bool(min(one.order.max(), other.order.max()) > max(one.order.min(), other.order.min()))
+    return bool(min(first.order.max(), second.order.max()) > max(first.order.min(), second.order.min()))

@@ -58,13 +58,17 @@ def page(drive, result):
 def test_the_page_begins_with_how_good_the_map_is(page, result, drive):
     assert page.headline == "95 % of 12 markings within 2.1 cm; goal 5 cm"
     text = write_page(result, drive).read_text()
-    first = re.search(r'class="says">([^<]*)<', text)
-    assert first[1] == "95 % of 12 markings within 2.1 cm; goal 5 cm."
+    figure, definition = (
+        re.search(rf'class="{name}">([^<]*)<', text)[1].strip() for name in ("figure", "defined")
+    )
+    assert figure == "2.5"
+    assert definition.startswith("Accuracy: 95 % of the mapped corners lie within this distance")
+    assert "1 marking known less well (accuracy C) is not counted" in definition
 
 
 def test_suspicious_markings_are_listed_with_their_reason_and_pictures(page):
     # A marking that is not in the map, such as one that an update of the map has dropped, has no row.
-    assert page.suspicious == {"m2": ["2", "diamond", "3e-05", "shape", "1e-05", "0.4", "0.2", "25"]}
+    assert page.suspicious == {"m2": ["2", "diamond", "< 0.001", "shape", "< 0.001", "0.400", "0.200", "25"]}
     assert "m2" in page.pictures
 
 

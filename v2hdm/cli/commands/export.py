@@ -25,7 +25,10 @@ def _run(arguments: Sequence[str]) -> None:
     """Convert a map or a calibration."""
     parser = COMMAND.parser()
     parser.add_argument("source", type=Path, metavar="MAP", help="map.geojson, .gpkg, or calibration_*.yaml")
-    kinds = "for a map: geojson, csv, gpkg, lanelet2, dxf, qgis, opendrive, landxml; for mosaic.tif: pcd; "
+    kinds = (
+        "for a map: geojson, csv, gpkg, lanelet2, dxf, qgis, opendrive, landxml, flatgeobuf, shapefile, kml, "
+    )
+    kinds += "jsonfg; for mosaic.tif: pcd; "
     kinds += "for a calibration: camera_info, static_transform, urdf, kalibr, opencv; may be repeated"
     parser.add_argument("--format", action="append", required=True, metavar="NAME", help=kinds)
     parser.add_argument("--output", type=Path, metavar="DIR", help="output folder (default: that of MAP)")

@@ -32,8 +32,8 @@ _GROUP_DOUBT = 0.1
 """Share of a group's certainty that each of its classes may have: seen from near by a dash is like a line."""
 
 _DOUBTED = 2
-"""Where a class has more others in its group, they share the doubt of so many: that a network tells more symbols
-apart makes an arrow no less likely."""
+"""Where a class has more others in its group, they share the doubt of so many: that a network tells more
+symbols apart makes an arrow no less likely."""
 
 _VOTES = 3.0
 """Independent opinions that the network's classes over a piece are worth: 1.5 to 3 find the same arrows in

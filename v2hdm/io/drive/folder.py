@@ -18,7 +18,7 @@ from v2hdm.io.description import DRIVE_FILE, POSES_FILE, CameraEntry, DriveDescr
 from v2hdm.io.drive.frames import plan_frames
 from v2hdm.io.drive.images import ImageFiles, ReadOptions, assemble_drive, select_cameras
 from v2hdm.io.drive.sources import Sources, plan_images, plan_info, plan_topic_poses
-from v2hdm.io.importers.poses import read_poses
+from v2hdm.io.importers.poses import Recorded, read_poses
 from v2hdm.records import (
     DRIFTS,
     BoolArray,
@@ -28,6 +28,7 @@ from v2hdm.records import (
     Drive,
     FloatArray,
     PoseNoise,
+    Reception,
     Trajectory,
 )
 from v2hdm.safe.fields import take_origin
@@ -97,11 +98,27 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
         if not truth.is_dir():
             raise DriveError(f"{where}: truth: no such folder {truth}; restore it or drop the key")
     name = name_of(content, path)
-    frame_from_ground = frame_from_vehicle(next(iter(frames.values())).height_m)
-    poses_of_frame = recorded.trajectory
-    on_ground = Trajectory(poses_of_frame.stamp_s, poses_of_frame.map_from_vehicle @ frame_from_ground)
-    drive = Drive(name, path, cameras, (), pose_noise, recorded.origin, truth, recorded=on_ground)
+    on_ground = _on_ground(recorded.trajectory, next(iter(frames.values())).height_m)
+    drive = Drive(
+        name, path, cameras, (), pose_noise, recorded.origin, truth, recorded=on_ground,
+        reception=_reception(recorded, files), headed_by_course=recorded.headed_by_course,
+    )  # fmt: skip
     return assemble_drive(drive, files, options.max_gap_s, poses_at)
+
+
+def _reception(recorded: Recorded, files: Sequence[ImageFiles]) -> Reception | None:
+    """What the source of the poses says of its positions from the first image to the last."""
+    listed = [entry.stamp_s for entry in files if len(entry.stamp_s)]
+    if recorded.fixes is None or not listed:
+        return None
+    first_s = min(float(stamp_s[0]) for stamp_s in listed)
+    last_s = max(float(stamp_s[-1]) for stamp_s in listed)
+    return recorded.fixes.between(first_s, last_s, recorded.geoid_m)
+
+
+def _on_ground(poses: Trajectory, height_m: float) -> Trajectory:
+    """The poses of the vehicle's origin on the ground, ``height_m`` below the frame that they are of."""
+    return Trajectory(poses.stamp_s, poses.map_from_vehicle @ frame_from_vehicle(height_m))
 
 
 def _middle_of(files: Sequence[ImageFiles]) -> float | None:

@@ -25,6 +25,7 @@ from v2hdm.records import (
     FloatArray,
     GeodeticOrigin,
     Image,
+    Reception,
     Road,
     Session,
     Trajectory,
@@ -106,6 +107,21 @@ def join_drives(drives: Sequence[Drive], moved_cameras: Collection[tuple[int, st
         drives[0].origin,
         road=_one_road(roads, sessions),
         joined=tuple(sessions),
+        reception=_joint_reception([drive.reception for drive in drives]),
+    )
+
+
+def _joint_reception(receptions: Sequence[Reception | None]) -> Reception | None:
+    """The sum; what one drive does not state is not stated of all."""
+    stated = [reception for reception in receptions if reception is not None]
+    if len(stated) < len(receptions):
+        return None
+    fixed = [reception.rtk_fixed for reception in stated if reception.rtk_fixed is not None]
+    heights_m = {reception.geoid_m for reception in stated}
+    return Reception(
+        sum(reception.positions for reception in stated),
+        sum(fixed) if len(fixed) == len(stated) else None,
+        heights_m.pop() if len(heights_m) == 1 else None,
     )
 
 

@@ -154,7 +154,10 @@ def plan_topic_poses(content: object, sources: Sources, where: str) -> Callable[
     heading = content.get("heading_topic")
     if heading is not None:
         heading = take_text(heading, f"{where}, heading_topic", DriveError)
-    stream = streams.PoseStream(topic, heading, _take_stamps(content, where), where)
+    gyro = content.get("gyro_topic")
+    if gyro is not None:
+        gyro = take_text(gyro, f"{where}, gyro_topic", DriveError)
+    stream = streams.PoseStream(topic, heading, gyro, _take_stamps(content, where), where)
     folder = sources.want(stream)
     return lambda: stream.readings(folder())
 

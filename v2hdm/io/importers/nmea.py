@@ -26,6 +26,7 @@ from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.io.importers.epochs import Untimed, time_headings
 from v2hdm.io.importers.gps_time import SINCE_1970_S
 from v2hdm.io.importers.readings import (
+    RTK_FIXED,
     SIGMA_OF_QUALITY_M,
     Attitudes,
     Readings,
@@ -376,9 +377,10 @@ class _Log:
         points = np.column_stack([fixes[:, :2], self._heights(fixes[:, 2], fixes[:, 3])])
         has_height = np.isfinite(points[:, 2])
         attitudes = self._attitudes(chosen.others, begin_s)
+        is_fixed = fixes[:, 4] == RTK_FIXED
         return Readings(
             (begin_s + stamps[rows])[has_height], points[has_height], True, sigma_m[has_height], attitudes,
-            point="an antenna's",
+            point="an antenna's", is_fixed=is_fixed[has_height],
         )  # fmt: skip
 
     def _begin(self, first_day: date | None) -> float:

@@ -39,7 +39,7 @@ from v2hdm.io.importers.slip import driven
 from v2hdm.io.importers.strays import without_stray_turns, without_strays
 from v2hdm.io.importers.ubx import read_ubx
 from v2hdm.io.trajectory import check_geodetic, read_tum, span, why_no_pose
-from v2hdm.records import BoolArray, FloatArray, GeodeticOrigin, Trajectory
+from v2hdm.records import BoolArray, FloatArray, GeodeticOrigin, Reception, Trajectory
 from v2hdm.store.files import check_keys, take_array, take_choice, take_mapping, take_number, take_text
 
 _log = logging.getLogger(__name__)
@@ -67,6 +67,19 @@ class PoseSettings:
     starts: str | None = None  # direction of the beginning, one of STARTS, for COURSE
 
 
+class Fixes(NamedTuple):
+    """All positions of a source, used or not."""
+
+    stamp_s: FloatArray  # (P,)
+    is_fixed: BoolArray | None  # (P,) whether RTK had fixed its ambiguities, None where not stated
+
+    def between(self, first_s: float, last_s: float, geoid_m: float | None) -> Reception:
+        """Those of a span of time, counted."""
+        is_within = (self.stamp_s >= first_s) & (self.stamp_s <= last_s)
+        fixed = None if self.is_fixed is None else int((self.is_fixed & is_within).sum())
+        return Reception(int(is_within.sum()), fixed, geoid_m)
+
+
 @dataclass(frozen=True)
 class Recorded:
     """Poses ``map_from_vehicle`` as a drive has them."""
@@ -74,6 +87,9 @@ class Recorded:
     trajectory: Trajectory
     noise: Mapping[str, float]  # the fields of :class:`PoseNoise` that the source states
     origin: GeodeticOrigin | None  # None where the poses are the map's own
+    fixes: Fixes | None = None
+    geoid_m: float | None = None  # height of the geoid above the ellipsoid, as stated and added
+    headed_by_course: bool = False  # whether no heading was recorded
 
 
 _Reader = Callable[[Path, dict[str, Any], Path, str, float | None], Readings]
@@ -200,8 +216,10 @@ def assemble(
             f"{where}: holds {readings.point} positions: add lever_arm_m: [x, y, z], its place in the "
             "vehicle frame (m forward, left, up); [0, 0, 0] only if it is above the rear axle"
         )
+    fixes = Fixes(readings.stamp_s + settings.offset_s, readings.is_fixed)
     if settings.heading == COURSE:
-        return _of_course(readings, settings, origin, where)
+        recorded = _of_course(readings, settings, origin, where)
+        return replace(recorded, fixes=fixes, geoid_m=settings.geoid_m)
     if readings.attitudes is None:
         raise DriveError(
             f"{where}: holds positions without a heading, and the course over ground is not a heading when a "
@@ -209,7 +227,14 @@ def assemble(
             f"heading_file, a second file), or for one antenna heading: {COURSE}, with lever_arm_m and best "
             "a gyro (gyro_file)"
         )
-    readings = _usable(readings, settings, where)
+    recorded = _of_either_time(_usable(readings, settings, where), settings, origin, max_gap_s, where)
+    return replace(recorded, fixes=fixes, geoid_m=settings.geoid_m)
+
+
+def _of_either_time(
+    readings: Readings, settings: PoseSettings, origin: GeodeticOrigin | None, max_gap_s: float, where: str
+) -> Recorded:
+    """The poses by the times of the headings, or by the later ones where these fit the driving better."""
     attitudes = readings.attitudes
     assert attitudes is not None
     recorded = _recorded(readings, settings, origin, max_gap_s, where)
@@ -271,13 +296,18 @@ def _of_course(
         )
     if readings.attitudes is not None:
         _log.info("%s: its headings are not used: heading: %s", where, COURSE)
+    turning = readings.turning
+    if readings.rates is not None:
+        if turning is not None:
+            raise DriveError(f"{where}: has gyro_topic and gyro_file; drop one")
+        turning = readings.rates.about_up(settings.vehicle_from_sensor)
     readings = _fixed(readings, settings, where)
     if len(readings.stamp_s) < 3:
         raise DriveError(f"{where}: {len(readings.stamp_s)} positions have no course; record a drive")
     placed = _in_map(readings, settings, origin, where)
     sigma_m = np.where(readings.sigma_m > 0, readings.sigma_m, _USUAL_SIGMA_M)
     course = course_of(
-        readings.stamp_s, placed.points_map[:, :2], sigma_m, settings.lever_arm_m[:2], readings.turning, where
+        readings.stamp_s, placed.points_map[:, :2], sigma_m, settings.lever_arm_m[:2], turning, where
     )
     headings = course_headings(course, settings.starts, where)
     zeros = np.zeros(len(readings.stamp_s))
@@ -285,13 +315,14 @@ def _of_course(
     lever_arm_m = np.array([headings.lever_ahead_m, *settings.lever_arm_m[1:]])
     poses = make_transform(rotation, placed.points_map - rotation @ lever_arm_m)
     noise = _root_mean_squares({"position_m": readings.sigma_m}) | headings.noise
-    return Recorded(Trajectory(readings.stamp_s + settings.offset_s, poses), noise, placed.origin)
+    trajectory = Trajectory(readings.stamp_s + settings.offset_s, poses)
+    return Recorded(trajectory, noise, placed.origin, headed_by_course=True)
 
 
 def _without(readings: Readings, is_usable: BoolArray) -> Readings:
     """The readings whose positions are ``kept`` (P,)."""
     rows = {key: getattr(readings, key)[is_usable] for key in ("stamp_s", "points", "sigma_m")}
-    return replace(readings, **rows)
+    return replace(readings, **rows, is_fixed=None)  # counted before anything was left out
 
 
 def _finite(values: FloatArray, sigma_m: FloatArray, where: str, things: str) -> BoolArray:

@@ -25,12 +25,15 @@ from v2hdm.store.files import check_keys, take_mapping, take_text
 
 _log = logging.getLogger(__name__)
 
+RTK_FIXED = 4
+"""The quality of NMEA's GGA of a position by RTK with fixed ambiguities."""
+
 SIGMA_OF_QUALITY_M: Mapping[int, float] = {
     0: np.inf,  # no fix
     1: 3.0,  # single
     2: 1.0,  # differential
     3: 3.0,  # PPS
-    4: 0.02,  # RTK, fixed
+    RTK_FIXED: 0.02,
     5: 0.5,  # RTK, float
     6: np.inf,  # dead reckoning
     7: np.inf,  # typed in
@@ -62,6 +65,19 @@ class Attitudes:
 
 
 @dataclass(frozen=True)
+class TurnRates:
+    """Turn rates of a gyro over time."""
+
+    stamp_s: FloatArray  # (G,) rising strictly
+    rate_rad_s: FloatArray  # (G, 3) about the sensor's axes
+
+    def about_up(self, vehicle_from_sensor: FloatArray) -> Turning:
+        """The vehicle's yaw rates, by the turn (3, 3) of the sensor on it."""
+        unknown = np.full(len(self.stamp_s), np.nan)
+        return Turning(self.stamp_s, self.rate_rad_s @ vehicle_from_sensor[2], unknown)
+
+
+@dataclass(frozen=True)
 class Readings:
     """Positions over time, and attitudes, if any, perhaps at other times."""
 
@@ -72,7 +88,9 @@ class Readings:
     sigma_m: FloatArray  # (P,) of a horizontal coordinate, nan where not stated, infinite without a fix
     attitudes: Attitudes | None
     point: str = ""  # what the positions are of, which seldom sits at the vehicle's origin: an antenna's
-    turning: Turning | None = None  # of a gyro beside the receiver
+    is_fixed: BoolArray | None = None  # (P,) whether RTK had fixed its ambiguities, None where not stated
+    turning: Turning | None = None  # of a gyro's file beside the receiver
+    rates: TurnRates | None = None  # of a gyro in the bag
 
 
 def readings_of_poses(poses: Trajectory) -> Readings:
@@ -141,9 +159,9 @@ def read_table(
     heading_sigma = np.radians(columns.get("heading_sigma_deg", np.full(count, np.nan)))
     rotation = _rotation(columns, path)
     attitudes = None if rotation is None else Attitudes(stamp_s[rows], rotation, heading_sigma)
-    return Readings(
-        stamp_s[rows], points, geodetic, sigma_m, attitudes, point="an antenna's" if geodetic else ""
-    )
+    point = "an antenna's" if geodetic else ""
+    is_fixed = columns["quality"] == RTK_FIXED if "quality" in columns else None
+    return Readings(stamp_s[rows], points, geodetic, sigma_m, attitudes, point, is_fixed)
 
 
 def read_turning(path: Path, entry: Mapping[str, Any], where: str) -> Turning:

@@ -33,6 +33,7 @@ _JST_S = 9 * 3600.0  # Japan's time is ahead of UTC by this
 _PPP_M = 0.1  # sigma of precise point positioning where none is stated; chosen
 # RTKLIB's numbers of the quality, as NMEA's GGA numbers them.
 _QUALITIES: Mapping[int, int] = {0: 0, 1: 4, 2: 5, 3: 9, 4: 2, 5: 1}
+_RTK_FIXED = 1  # RTKLIB's number of the quality of a position with fixed ambiguities
 _PPP = 6  # RTKLIB's number of the quality of a precise point position
 
 _DMS = ("latitude(d'\")", "longitude(d'\")")
@@ -90,9 +91,10 @@ def read_pos(
             "the ellipsoid", path,
         )  # fmt: skip
     geodetic = _BASELINE[0] not in columns or header.base is not None
-    return Readings(
-        stamp_s, _points(columns, header), geodetic, _sigma_m(columns), None, point="an antenna's"
-    )
+    is_fixed = columns["Q"] == _RTK_FIXED if "Q" in columns else None
+    points = _points(columns, header)
+    sigma_m = _sigma_m(columns)
+    return Readings(stamp_s, points, geodetic, sigma_m, None, "an antenna's", is_fixed)
 
 
 def _header(comments: Sequence[str], where: str) -> _Header:

@@ -75,7 +75,9 @@ def read_ubx(
     if not len(positions):
         return headings_only(turned)
     table = positions[in_order(positions[:, 0], str(path), "position")]
-    return Readings(table[:, 0], table[:, 1:4], True, table[:, 4], turned, point="an antenna's")
+    solved = table[:, 5]
+    is_fixed = None if np.isnan(solved).all() else solved == _FIXED
+    return Readings(table[:, 0], table[:, 1:4], True, table[:, 4], turned, "an antenna's", is_fixed)
 
 
 def _texts(data: bytes, where: str) -> Iterator[dict[str, Any]]:
@@ -203,12 +205,13 @@ def _rows(
 
 
 def _position(message: Message, solution: Message) -> tuple[float, ...] | None:
-    """Latitude, longitude, deg, height, m, and the sigma of a coordinate, m."""
+    """Latitude, longitude, deg, height, m, the sigma of a coordinate, m, and the state of its ambiguities."""
     has_fix = solution.get("fixType", 3) in _FIXES and solution.get("gnssFixOk", 1)
     sigma_m = message["hAcc"] / 1e3 if has_fix else np.inf
     if message.get("invalidLlh", 0) or abs(message["lat"]) > 90 or abs(message["lon"]) > 180:
         return None
-    return message["lat"], message["lon"], message["height"] / 1e3, sigma_m
+    solved = solution.get("carrSoln", np.nan)
+    return message["lat"], message["lon"], message["height"] / 1e3, sigma_m, solved
 
 
 def _attitude(message: Message, solution: Message) -> tuple[float, ...] | None:

@@ -1,15 +1,8 @@
-"""The formats that a map is written in: their registry, and DXF for CAD and CSV for surveyors.
-
-In DXF, extended data (XDATA) of the application ``V2HDM`` at each polyline hold what CAD has no word for:
-strings name the values after them, ``id``, ``sightings``, ``relative_sigma_m``, ``accuracy``, ``kind``,
-``parts``, ``lines``, ``apart_m``, ``heights_sigma_m``, the rows of ``covariance_m2``, and what a text
-says, which is also a TEXT there.
-"""
+"""The formats that a map is written in: their registry, and CSV for surveyors."""
 
 from __future__ import annotations
 
 import logging
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +12,7 @@ import numpy as np
 
 from v2hdm.errors import ConfigError, V2hdmError, need, shown
 from v2hdm.geometry.geodetic import Grid
+from v2hdm.io.maps.dxf import write_dxf
 from v2hdm.io.maps.features import (
     COMPOSITION,
     PAINT,
@@ -30,13 +24,15 @@ from v2hdm.io.maps.features import (
 )
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.maps.geopackage import write_geopackage, write_qgis
+from v2hdm.io.maps.kml import write_kml
 from v2hdm.io.maps.landxml import write_landxml
 from v2hdm.io.maps.lanelet2 import write_lanelet2
+from v2hdm.io.maps.ogr import write_flatgeobuf, write_json_fg, write_shapefiles
 from v2hdm.io.maps.opendrive import write_opendrive
 from v2hdm.io.maps.questions import questions_file, write_questions
 from v2hdm.io.maps.reading import Verdict, read_geopackage, stated_in
-from v2hdm.records import FloatArray, GeodeticOrigin, HDMap, Trajectory
-from v2hdm.store.files import replace_csv, whole_file
+from v2hdm.records import GeodeticOrigin, HDMap, Trajectory
+from v2hdm.store.files import replace_csv
 from v2hdm.store.inputs import protected_inputs
 from v2hdm.surface.strips import write_ground_geotiff, write_opencrg
 from v2hdm.topology.answers import Answer
@@ -44,64 +40,6 @@ from v2hdm.topology.build import lane_graph
 from v2hdm.topology.graph import LaneGraph
 
 _log = logging.getLogger(__name__)
-
-APPLICATION = "V2HDM"
-# Group codes of extended data (DXF reference, "Extended data"):
-_TEXT = 1000  # group code of a string
-_REAL = 1040  # group code of a real number
-_WHOLE = 1071  # group code of a whole number of 32 bits
-
-_COLOURS = 6  # number of AutoCAD colours, 1 (red) to 6 (magenta), that the layers take in turn
-
-
-def write_dxf(hd_map: HDMap, path: Path, grid: Grid | None = None) -> None:
-    """Write ``hd_map`` as DXF, atomically: metres, a layer per class, closed 3D polylines for markings.
-
-    They are local, or of the ``grid``, which the drawing's custom properties name with datum and epoch.
-    Raises ConfigError when ``ezdxf`` is not installed.
-    """
-    ezdxf = need("ezdxf", "gis", "the format dxf", ConfigError)
-    document = ezdxf.new("R2010", units=ezdxf.units.M)
-    document.appids.add(APPLICATION)
-    if grid is not None:
-        for key, value in grid.stated.items():
-            document.header.custom_vars.append(key, value)
-    space = document.modelspace()
-    for feature in features_of(hd_map):
-        layer = re.sub(r'[<>/\\":;?*|=`]', "_", feature.kind)
-        if layer not in document.layers:
-            document.layers.add(layer, color=1 + len(document.layers) % _COLOURS)
-        points = (feature.xyz_map[feature.ring] if grid is None else feature.positions(grid)).tolist()
-        line = space.add_polyline3d(points, close=feature.closed, dxfattribs={"layer": layer})
-        data: list[tuple[int, Any]] = [(_TEXT, "id"), (_WHOLE, feature.id)]
-        data += [(_TEXT, "sightings"), (_WHOLE, feature.sightings)]
-        if feature.relative_sigma_m is not None:
-            data += [(_TEXT, "relative_sigma_m"), (_REAL, feature.relative_sigma_m)]
-        if feature.accuracy is not None:
-            data += [(_TEXT, "accuracy"), (_TEXT, feature.accuracy)]
-        for key in (*COMPOSITION, *TEXT_READ):
-            if (stated := properties_of(feature).get(key)) is not None:
-                data += [(_TEXT, key), (_TEXT, in_words(stated))]
-        if feature.heights_sigma_m is not None:
-            sigmas_m = feature.heights_sigma_m[feature.ring].tolist()
-            data += [(_TEXT, "heights_sigma_m"), *((_REAL, value) for value in sigmas_m)]
-        if (covariance := feature.ring_covariance_m2) is not None:
-            data += [(_TEXT, "covariance_m2"), *((_REAL, value) for value in covariance.ravel().tolist())]
-        if feature.reading is not None:
-            _add_text(space, feature.reading.text, np.array(points), layer)
-        line.set_xdata(APPLICATION, data)
-    with whole_file(path) as partial:
-        document.saveas(partial)
-
-
-def _add_text(space: Any, text: str, corners: FloatArray, layer: str) -> None:
-    """Write a text between the lower left and the upper right of its outline (N, 3), which begin there."""
-    along = (corners[1] - corners[0])[:2]
-    height_m = float(np.linalg.norm(corners[-1] - corners[0]))
-    turned_deg = float(np.rad2deg(np.arctan2(along[1], along[0])))
-    about = {"layer": layer, "rotation": turned_deg, "insert": corners[0].tolist()}
-    space.add_text(text, height=height_m, dxfattribs=about)
-
 
 COLUMNS: tuple[str, ...] = (
     *("id", "class", "point", "x_map_m", "y_map_m", "height_m"),
@@ -182,6 +120,10 @@ FORMATS: Mapping[str, Format] = {
     "qgis": Format("{name}.qgs", write_qgis, "pyogrio"),
     "opendrive": Format("{name}.xodr", write_opendrive, takes_crs=False),
     "landxml": Format("{name}.xml", write_landxml, metres="LandXML"),
+    "flatgeobuf": Format("{name}_flatgeobuf/markings.fgb", write_flatgeobuf, "pyogrio"),
+    "shapefile": Format("{name}_shapefile.zip", write_shapefiles, "pyogrio"),
+    "kml": Format("{name}.kml", write_kml, takes_crs=False),
+    "jsonfg": Format("{name}_fg.json", write_json_fg, "pyogrio"),
 }
 
 GROUND_FORMATS: Mapping[str, Format] = {

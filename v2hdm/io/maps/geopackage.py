@@ -3,8 +3,8 @@
 Layers ``markings`` and ``symbols`` hold polygons, ``lanes`` lines, all with heights; the table ``v2hdm``
 describes the map. With a geodetic origin coordinates are longitude, latitude and ellipsoidal height
 (EPSG:4326), or those of the grid that was asked for. Without one, or where the local frame was asked for,
-they are local metres in an engineering CRS, which no GIS takes for degrees. The project colours by class,
-over the mosaic of the ground.
+they are local metres in an engineering CRS, which no GIS takes for degrees. The project has the colours
+of the report's map, and dashed lines dashed, over the mosaic of the ground.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from v2hdm.errors import ConfigError, MapFileError, need
 from v2hdm.geometry.geodetic import Grid, crs_of
+from v2hdm.io.maps.colours import LINE, OTHER, channels, colours_of
 from v2hdm.io.maps.features import (
     CORNERS,
     OUTLINE,
@@ -37,20 +38,7 @@ from v2hdm.io.maps.features import (
     properties_of,
 )
 from v2hdm.io.maps.reading import EXACT, GEOMETRY, LAYERS
-from v2hdm.records import (
-    BICYCLE,
-    BOX,
-    CROSSWALK,
-    CROSSWALK_BAR,
-    DIAMOND,
-    DOUBLE_LINE,
-    LANE_DASH,
-    LANE_LINE,
-    STOP_LINE,
-    TEXT,
-    GeodeticOrigin,
-    HDMap,
-)
+from v2hdm.records import LANE_DASH, GeodeticOrigin, HDMap
 from v2hdm.store.files import replace_text, whole_file, xml_text
 from v2hdm.store.names import MOSAIC
 
@@ -60,21 +48,8 @@ LOCAL_CRS = (
     'AXIS["northing (N)",north,ORDER[2]],LENGTHUNIT["metre",1]]'
 )
 
-_COLOURS: Mapping[str, str] = {
-    DIAMOND: "31,119,180,255",
-    LANE_DASH: "255,127,14,255",
-    LANE_LINE: "44,160,44,255",
-    STOP_LINE: "214,39,40,255",
-    CROSSWALK_BAR: "148,103,189,255",
-    CROSSWALK: "197,176,213,255",
-    DOUBLE_LINE: "140,86,75,255",
-    TEXT: "227,119,194,255",
-    BOX: "188,189,34,255",
-    BICYCLE: "23,190,207,255",
-}
-_OTHER_COLOUR = "127,127,127,255"
-_FILL = {"color": "{}", "outline_color": "35,35,35,255", "outline_width": "0.1", "style": "solid"}
-_LINE = {"line_color": "{}", "line_width": "0.4", "line_width_unit": "MM"}
+_FILL = {"color": "{},140", "outline_color": "{},255", "outline_width": "0.3", "style": "solid"}
+_LINE = {"line_color": "{},255", "line_width": "0.5", "line_width_unit": "MM", "line_style": "solid"}
 _STYLE = """<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>
 <qgis version="3.28.0" styleCategories="Symbology"><renderer-v2 type="categorizedSymbol" attr="class"
 symbollevels="0" enableorderby="0"><categories>{}</categories><symbols>{}</symbols></renderer-v2></qgis>"""
@@ -120,11 +95,11 @@ def write_geopackage(
         for key, layer in LAYERS.items():
             features_of_layer = [feature for feature in features if feature.key == key]
             kind = "LineString Z" if key == POINTS else "Polygon Z"
-            shapes = _shapes(features_of_layer, grid or hd_map.origin)
+            shapes = shapes_of(features_of_layer, grid or hd_map.origin)
             write(place, layer, _columns(key, features_of_layer), shapes, geometry_type=kind, crs=crs)
-            styles.append(
-                _style_row(layer, sorted({feature.kind for feature in features_of_layer}), key != POINTS)
-            )
+            kinds = sorted({feature.kind for feature in features_of_layer})
+            style = layer_style(kinds, key != POINTS, colours_of(features))
+            styles.append(_style_row(layer, style))
         write(place, "v2hdm", {key: [json.dumps(value)] for key, value in about.items()})
         # The table in which QGIS looks for the style of a GeoPackage's layers.
         texts = {name: [row[name] for row in styles] for name in styles[0]}
@@ -134,7 +109,7 @@ def write_geopackage(
     with whole_file(path) as partial, TemporaryDirectory(".part", f".{path.name}.", path.parent) as folder:
         # GDAL goes on after some calls that fail: only two files that are alike are whole.
         first, second = (Path(folder, name) for name in ("first.gpkg", "second.gpkg"))
-        with _gdal_errors(path), _gdal_options(now):
+        with gdal_errors(path), _gdal_options(now):
             for place in (first, second):
                 write_all(place)
         if not filecmp.cmp(first, second, shallow=False):
@@ -156,7 +131,8 @@ def _gdal_options(now: np.datetime64) -> Iterator[None]:
 
 
 @contextmanager
-def _gdal_errors(path: Path) -> Iterator[None]:
+def gdal_errors(path: Path) -> Iterator[None]:
+    """Within, GDAL's failures to write are errors of one line that name the ``path``."""
     errors = need("pyogrio.errors", "gis", "the format gpkg", ConfigError)
     try:
         yield
@@ -191,7 +167,7 @@ def _columns(key: str, features: Sequence[Feature]) -> dict[str, Any]:
     }
 
 
-def _shapes(features: Sequence[Feature], origin: GeodeticOrigin | Grid | None) -> AnyArray:
+def shapes_of(features: Sequence[Feature], origin: GeodeticOrigin | Grid | None) -> AnyArray:
     """Well-known binary of features, with heights."""
     shapely = need("shapely", "gis", "the format gpkg", ConfigError)
     shapes = np.empty(len(features), dtype=object)
@@ -203,27 +179,29 @@ def _shapes(features: Sequence[Feature], origin: GeodeticOrigin | Grid | None) -
     return np.asarray(shapely.to_wkb(shapes, flavor="iso"))
 
 
-def layer_style(kinds: Sequence[str], closed: bool) -> str:
+def layer_style(kinds: Sequence[str], closed: bool, colours: Mapping[str, str]) -> str:
     """QGIS's style of a layer; classes of later edits fall into the last category, of an empty value."""
     categories = ""
     symbols = ""
     shape, drawing, options = ("fill", "SimpleFill", _FILL) if closed else ("line", "SimpleLine", _LINE)
     for number, kind in enumerate([*kinds, ""]):
         categories += _CATEGORY.format(number, quoteattr(kind), quoteattr(kind or "other"))
-        colour = _COLOURS.get(kind, _OTHER_COLOUR)
-        drawn = "".join(_OPTION.format(name, value.format(colour)) for name, value in options.items())
+        hue = (colours.get(kind, OTHER) if closed else LINE) if kind else OTHER
+        colour = ",".join(map(str, channels(hue)))
+        looks = options | ({"line_style": "dash"} if kind == LANE_DASH and not closed else {})
+        drawn = "".join(_OPTION.format(name, value.format(colour)) for name, value in looks.items())
         symbols += _SYMBOL.format(number, shape, drawing, drawn)
     return _STYLE.format(categories, symbols)
 
 
-def _style_row(layer: str, kinds: Sequence[str], closed: bool) -> dict[str, str]:
+def _style_row(layer: str, style: str) -> dict[str, str]:
     """A layer's row in the table of styles."""
     empty = dict.fromkeys(("f_table_catalog", "f_table_schema", "styleSLD", "owner", "ui"), "")
     return empty | {
         "f_table_name": layer,
         "f_geometry_column": GEOMETRY,
         "styleName": f"v2hdm {layer}",
-        "styleQML": layer_style(kinds, closed),
+        "styleQML": style,
         "description": "colours by class",
     }
 
@@ -270,7 +248,9 @@ def write_qgis(hd_map: HDMap, path: Path, grid: Grid | None = None) -> None:
         element = _layer(tree, layers, layer, source, "ogr", {"type": "vector", "geometry": shape})
         _refer(ET.SubElement(element, "srs"), pyproj.CRS.from_user_input(layers_crs))
         kinds = sorted({feature.kind for feature in features if feature.key == key})
-        element.extend(ET.fromstring(layer_style(kinds, key != POINTS).split("\n", 1)[1]))
+        element.extend(
+            ET.fromstring(layer_style(kinds, key != POINTS, colours_of(features)).split("\n", 1)[1])
+        )
     if (path.parent / MOSAIC).is_file():
         element = _layer(tree, layers, "mosaic", f"./{MOSAIC}", "gdal", {"type": "raster"})
         _refer(ET.SubElement(element, "srs"), pyproj.CRS.from_user_input(ground_crs))

@@ -153,7 +153,7 @@ def _write_link(element: ET.Element, number: int, roads: Sequence[Road]) -> None
         }
         links = {
             name: {"elementType": "junction", "elementId": str(_FIRST_JUNCTION + junction)}
-            for name, (junction,) in ((name, tuple(found)) for name, found in junctions.items() if found)
+            for name, (junction,) in ((name, tuple(ids)) for name, ids in junctions.items() if ids)
             if junction is not None
         }
     if links:
@@ -193,9 +193,9 @@ def _write_junction(
         onward = {after for lane in stop_line.lanes for after in graph.after(lane)}
         low = [k for k, road in members.items() if onward & set(road.lanes)]
         high = [k for k, road in members.items() if set(stop_line.yields_to) & set(road.lanes)]
-        for one in high:
-            for other in low:
-                ET.SubElement(element, "priority", {"high": str(one + 1), "low": str(other + 1)})
+        for preferred in high:
+            for yielding in low:
+                ET.SubElement(element, "priority", {"high": str(preferred + 1), "low": str(yielding + 1)})
 
 
 def _write_object(objects: ET.Element, feature: Feature, road: Road) -> None:

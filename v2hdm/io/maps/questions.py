@@ -58,8 +58,10 @@ def read_answers(path: Path, origin: GeodeticOrigin | None) -> list[Answer]:
             continue
         subject = properties.get("subject")
         if subject not in SUBJECTS:
-            known = ", ".join(SUBJECTS)
-            raise MapFileError(f"{where}: {shown(subject)} is no subject of a question; give one of {known}")
+            subjects = ", ".join(SUBJECTS)
+            raise MapFileError(
+                f"{where}: {shown(subject)} is no subject of a question; give one of {subjects}"
+            )
         places = _places(entry.get("geometry"), origin, where)
         to_map = places[-1] if len(places) > 1 else None
         answers.append(Answer(subject, str(properties["answer"]).strip(), places[0], to_map, where))

@@ -187,7 +187,7 @@ def _merged(pieces: list[Piece]) -> list[Piece]:
 
 def thinned(at: FloatArray, values: FloatArray, tolerance: float) -> list[int]:
     """Few of N points, by Douglas and Peucker (1973), whose straight pieces pass all ``values`` (N,)."""
-    kept = {0, len(at) - 1}
+    vertices = {0, len(at) - 1}
     pending = [(0, len(at) - 1)]
     while pending:
         first, last = pending.pop()
@@ -197,13 +197,13 @@ def thinned(at: FloatArray, values: FloatArray, tolerance: float) -> list[int]:
         off = np.abs(values[inner] - np.interp(at[inner], at[[first, last]], values[[first, last]]))
         worst = first + 1 + int(np.argmax(off))
         if off.max() > tolerance:
-            kept.add(worst)
+            vertices.add(worst)
             pending += [(first, worst), (worst, last)]
-    return sorted(kept)
+    return sorted(vertices)
 
 
 def linear_records(at: FloatArray, values: FloatArray, tolerance: float) -> list[tuple[float, float, float]]:
     """Starts, values and slopes of the straight pieces of :func:`thinned`."""
-    kept = thinned(at, values, tolerance)
-    slopes = np.diff(values[kept]) / np.diff(at[kept])
-    return list(zip(at[kept[:-1]].tolist(), values[kept[:-1]].tolist(), slopes.tolist(), strict=True))
+    vertices = thinned(at, values, tolerance)
+    slopes = np.diff(values[vertices]) / np.diff(at[vertices])
+    return list(zip(at[vertices[:-1]].tolist(), values[vertices[:-1]].tolist(), slopes.tolist(), strict=True))

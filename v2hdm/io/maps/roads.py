@@ -105,14 +105,14 @@ def _chains(graph: LaneGraph) -> Iterator[list[int]]:
         if not graph.lanes[after].is_connecting
     }
     inner = set(following.values())
-    begun: set[int] = set()
+    in_a_chain: set[int] = set()
     for start in [*(number for number in outside if number not in inner), *outside]:
-        if start in begun:
+        if start in in_a_chain:
             continue
         chain = [start]
         while (after := following.get(chain[-1])) is not None and after != start:
             chain.append(after)
-        begun |= set(chain)
+        in_a_chain |= set(chain)
         yield chain
 
 

@@ -109,7 +109,7 @@ struct Passes {
     void (*meet_ground)(
         Index begin, Index end, const Layout&, const double* homographies, double* corners, bool* determined);
     void (*report)(
-        Index begin, Index end, const Layout&, const double* table, const double* corners, const Index* order,
+        Index begin, Index end, const Layout&, const double* table, const double* corners, const int32_t* order,
         const double* focal, const Report&);
     void (*residuals)(
         Index begin, Index end, const Layout&, const double* table, const double* corners, double* out);

@@ -214,7 +214,7 @@ void meet_ground(
 }
 
 void report(
-    Index begin, Index end, const Layout& layout, const double* table, const double* corners, const Index* order,
+    Index begin, Index end, const Layout& layout, const double* table, const double* corners, const int32_t* order,
     const double* focal, const Report& out) {
     for (Index c = first_corner(layout, begin); c < first_corner(layout, end); ++c) {
         for (Index k = layout.begin[c]; k < layout.begin[c + 1]; ++k) {

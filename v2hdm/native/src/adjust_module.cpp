@@ -105,7 +105,7 @@ void report_chunks(
     const LayoutRecord layout(layout_object);
     const auto table = array_of<const double, 2>(table_object, "table");
     const auto corners = array_of<const double, 2>(corners_object, "corners");
-    const auto order = array_of<const Index, 1>(order_object, "order");
+    const auto order = array_of<const int32_t, 1>(order_object, "order");
     const auto focal = array_of<const double, 2>(focal_object, "focal");
     const size_t count = layout.pair.size();
     const auto residual = member<double, 2>(out_object, "residual_px", {count, 2});

@@ -11,10 +11,9 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
-from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
-from v2hdm.records import TWO_SIDED_95, FloatArray, HDMap
+from v2hdm.records import TWO_SIDED_95, FloatArray
 from v2hdm.report.page.facts import Facts, GroundResiduals, Route
 from v2hdm.report.style import OKABE_ITO, RC, draw_arrows
 
@@ -58,7 +57,7 @@ _RC: dict[Any, Any] = RC | {
 
 
 @contextmanager
-def _chart(name: str, width_in: float, height_in: float) -> Iterator[tuple[Figure, list[str]]]:
+def drawn_chart(name: str, width_in: float, height_in: float) -> Iterator[tuple[Figure, list[str]]]:
     """A figure, and the list that receives its SVG at the end of the block."""
     out: list[str] = []
     with mpl.rc_context({**_RC, "svg.hashsalt": name}):
@@ -78,33 +77,6 @@ def _look(number: int) -> dict[str, Any]:
     return {"color": OKABE_ITO[_ORDER[number % len(_ORDER)]], "linestyle": _DASHES[number % len(_DASHES)]}
 
 
-def site_chart(hd_map: HDMap, route: Route | None, excluded: FloatArray) -> str:
-    """Plan view of the map, for paper: markings, lane lines, route, excluded candidates (N, 2)."""
-    way = np.empty((0, 2)) if route is None else route.map_from_vehicle[:, :2, 3]
-    shapes = [m.corners_map for m in hd_map.markings]
-    lanes = [lane.points_map for lane in hd_map.lanes]
-    spread = np.ptp(np.concatenate([*shapes, *lanes, way]), axis=0) + 10.0
-    height_in = float(np.clip(6.4 * spread[1] / spread[0] + 0.8, 2.4, 6.2))
-    with _chart("site", 7.2, height_in) as (figure, out):
-        axes = figure.subplots()
-        if len(way):
-            axes.plot(way[:, 0], way[:, 1], color=MUTED, lw=1.0, ls=(0, (4, 2)), label="route of the vehicle")
-            axes.plot(way[0, 0], way[0, 1], "o", color=MUTED, ms=4)
-        lines = LineCollection(lanes, colors=OKABE_ITO["sky"], linewidths=0.9, label="lane lines")
-        axes.add_collection(lines)
-        shapes += [symbol.outline_map for symbol in hd_map.symbols]
-        paint: dict[str, Any] = {"facecolors": OKABE_ITO["blue"], "edgecolors": OKABE_ITO["blue"]}
-        axes.add_collection(PolyCollection(shapes, linewidths=0.8, label="markings", **paint))
-        if len(excluded):
-            cross: dict[str, Any] = {"color": OKABE_ITO["vermillion"], "ms": 4, "mew": 1.0}
-            axes.plot(excluded[:, 0], excluded[:, 1], "x", label="excluded", **cross)
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.autoscale_view()
-        axes.set(xlabel="east (m)", ylabel="north (m)")
-        figure.legend(loc="outside upper left", ncols=4, fontsize=8.5, handlelength=1.8, columnspacing=1.4)
-    return out[0]
-
-
 def residual_charts(facts: Facts, residuals: GroundResiduals) -> dict[str, str]:
     """Charts of residuals: histogram, over the image, over range, along the route."""
     infos = {name: camera.calibration.info for name, camera in facts.cameras.items()}
@@ -121,8 +93,8 @@ def residual_charts(facts: Facts, residuals: GroundResiduals) -> dict[str, str]:
 def _histogram_chart(residuals: GroundResiduals) -> str:
     """Residuals in px, and in standard deviations with their distribution under the noise model."""
     with (
-        _chart("histogram", 3.5, 2.5) as (figure, first),
-        _chart("histogram in sigmas", 3.5, 2.5) as (other, second),
+        drawn_chart("histogram", 3.5, 2.5) as (figure, first),
+        drawn_chart("histogram in sigmas", 3.5, 2.5) as (other, second),
     ):
         left = figure.subplots()
         right = other.subplots()
@@ -161,7 +133,7 @@ def _field_chart(residuals: GroundResiduals, sizes: Mapping[str, tuple[int, int]
     charts = ""
     for number, name in enumerate(names):
         width_px, height_px = sizes[name]
-        with _chart(f"field {name}", panel_in, 0.84 * panel_in * height_px / width_px + 0.75) as (
+        with drawn_chart(f"field {name}", panel_in, 0.84 * panel_in * height_px / width_px + 0.75) as (
             figure,
             out,
         ):
@@ -201,8 +173,8 @@ def _field(residuals: GroundResiduals, camera: int, size: tuple[int, int]) -> tu
 def _range_chart(residuals: GroundResiduals) -> str:
     """RMS residual by range, in the image and on the ground."""
     with (
-        _chart("range", 3.5, 2.5) as (figure, first),
-        _chart("range on the ground", 3.5, 2.5) as (other, second),
+        drawn_chart("range", 3.5, 2.5) as (figure, first),
+        drawn_chart("range on the ground", 3.5, 2.5) as (other, second),
     ):
         left = figure.subplots()
         right = other.subplots()
@@ -239,7 +211,7 @@ def _rms_by(place: FloatArray, values: FloatArray, edges: FloatArray) -> tuple[F
 def _route_chart(route: Route, residuals: GroundResiduals) -> str:
     """Residuals, and corrections of the recorded poses, along the route."""
     rows = 1 if route.recorded is None else 2
-    with _chart("route", _SINGLE_IN, 1.7 * rows + 0.3) as (figure, out):
+    with drawn_chart("route", _SINGLE_IN, 1.7 * rows + 0.3) as (figure, out):
         panels = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
         way_m = route.way_m
         fit = panels[0]
@@ -274,7 +246,7 @@ def _route_chart(route: Route, residuals: GroundResiduals) -> str:
 
 def radius_chart(radii_cm: Mapping[str, FloatArray]) -> str:
     """Cumulative distribution of corners and markings by their 95 % radius."""
-    with _chart("radius", _SINGLE_IN, 2.2) as (figure, out):
+    with drawn_chart("radius", _SINGLE_IN, 2.2) as (figure, out):
         axes = figure.subplots()
         top = max((float(values.max(initial=0.0)) for values in radii_cm.values()), default=1.0)
         for number, (name, values) in enumerate(radii_cm.items()):

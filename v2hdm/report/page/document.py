@@ -4,37 +4,114 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jinja2
 import numpy as np
 
 from v2hdm.records import Drive
-from v2hdm.report.page import charts, tables
+from v2hdm.report.page import charts, listing, plans, tables
+from v2hdm.report.page.certificates import certificates
+from v2hdm.report.page.comparison import comparison_of
 from v2hdm.report.page.embedding import json_text
 from v2hdm.report.page.facts import Facts, ground_residuals, read_facts
+from v2hdm.report.page.identity import identity_of, method_words
 from v2hdm.report.page.layers import background_layer, comparison, earlier_layer, layers
 from v2hdm.report.page.pictures import earlier_pictures, overlays, pictures
+from v2hdm.report.page.quality import quality_table
+from v2hdm.report.page.reference import reference_of
 from v2hdm.report.page.tables import in_words
+from v2hdm.report.weak import MOST_PLACES
 from v2hdm.site.accuracy import absolute_radii_m, relative_radii_m
 from v2hdm.store import names
 from v2hdm.store.files import replace_text
 
 
-def document(facts: Facts) -> SimpleNamespace:
-    """Content of the page by template names; missing parts are None or empty."""
+class Chart(NamedTuple):
+    """A chart as SVG with its words."""
+
+    svg: str
+    title: str
+    caption: str
+
+
+_RESIDUALS: Mapping[str, tuple[str, str]] = {
+    "histogram": (
+        "Reprojection errors",
+        "Left: in pixels. Right: in the detector’s stated standard deviations. A curve left of the "
+        "grey line means that corners are better than stated, a long tail that some are wrong.",
+    ),
+    "field": (
+        "Over the image",
+        "Mean residual of each part of the image, enlarged; the key gives the scale. Arrows without a "
+        "pattern are noise; a swirl or a fan would mean a wrong lens model or principal point.",
+    ),
+    "range": (
+        "Over range",
+        "In the image, near corners scatter more because a centimetre covers more pixels; a rise at long "
+        "range would mean a wrong pitch or lens model. On the ground, residuals grow with range because a "
+        "distant pixel covers more of it. The map averages many sightings and is more precise than each.",
+    ),
+    "route": (
+        "Along the route",
+        "Above: a stretch that stands out has poor images or wrong poses. Below: the "
+        "correction of the recorded poses with its 95 % band; it should drift within the receiver’s noise "
+        "and never jump.",
+    ),
+}
+"""Title and caption of the charts of residuals, by the name of each."""
+
+_PLAN_CAPTION = (
+    "The map from above, in local metres. Grey: ground that three images or more show. Ringed: places where "
+    "markings are known less well than the accuracy goal asks."
+)
+_COVERAGE_CAPTION = (
+    "How many images show each piece of ground, as if nothing stood in the way. The map is weakest where few "
+    "images show the ground, and at the ringed places, which the table lists."
+)
+
+
+def document(facts: Facts, compared: Path | None = None) -> SimpleNamespace:
+    """Content of the page by template names; missing parts are None or empty.
+
+    ``compared`` is a folder of ``v2hdm compare``.
+    """
     metrics = facts.metrics
     verdict = metrics.get("verdict") or {}
     residuals = ground_residuals(facts)
     findings = {
         which: tables.finding_rows(verdict, which) for which in ("findings", "unobservable", "passed")
     }
+    reference = reference_of(facts)
+    places = listing.places_of(facts)
+    cameras = tables.camera_pages(facts, overlays(facts))
+    charts_of_residuals = charts.residual_charts(facts, residuals) if residuals else {}
     return SimpleNamespace(
         facts=facts,
+        title=facts.job.job.site or str(metrics.get("name", facts.folder.name)),
         name=str(metrics.get("name", facts.folder.name)),
+        digest=str((metrics.get("drive") or {}).get("images_sha256") or "")[:16],
+        reference=reference,
+        identity=identity_of(facts, reference),
+        method=method_words(facts, reference),
+        quality=quality_table(facts),
+        accuracy_figure=tables.accuracy_figure(facts),
+        plan=plans.site_plan(facts, places[:MOST_PLACES]),
+        plan_caption=_PLAN_CAPTION,
+        coverage_plan=plans.coverage_plan(facts, places[:MOST_PLACES]),
+        coverage_caption=_COVERAGE_CAPTION,
+        again=listing.drive_again(places, reference),
+        listing=listing.marking_table(facts, reference),
+        lanes=listing.lane_table(facts, reference),
+        left_out=listing.left_out(facts),
+        mapped=len(facts.hd_map.markings) if facts.hd_map else 0,
+        corrections=listing.correction_table(facts),
+        certificates=certificates(facts, cameras, residuals),
+        comparison=comparison_of(compared),
         date=str(metrics.get("date", "")),
         version=str(metrics.get("version", "")),
         summary=_summary(facts),
@@ -42,18 +119,20 @@ def document(facts: Facts) -> SimpleNamespace:
         headline=str(verdict.get("headline") or "").partition(": ")[2],
         findings=findings,
         figures=tables.key_figures(facts),
-        site=_site(facts),
         accuracy=tables.accuracy_table(facts),
         against_truth=tables.truth_table(facts),
         radii=_radii(facts),
         check_points=tables.check_point_table(facts),
-        map_data=layers(facts, residuals),
+        map_data=layers(facts, residuals, reference),
         pictures=pictures(facts),
-        suspicious=_suspicious(facts),
-        cameras=tables.camera_pages(facts, overlays(facts)),
+        suspicious=(suspicious := _suspicious(facts)),
+        suspicious_table=_suspicious_table(suspicious),
+        cameras=cameras,
         ground=comparison(facts.folder),
-        residuals=charts.residual_charts(facts, residuals) if residuals else {},
-        excluded=tables.reason_table(facts),
+        residuals=charts_of_residuals,
+        residual_charts=[Chart(charts_of_residuals[key], *words) for key, words in _RESIDUALS.items()]
+        if charts_of_residuals
+        else [],
         contents=tables.content_table(facts),
         methods=tables.method_table(facts),
         drive=tables.pair_table(metrics.get("drive") or {}),
@@ -77,11 +156,20 @@ def _summary(facts: Facts) -> str:
     return f"{sentence}."
 
 
-def _site(facts: Facts) -> str:
-    if facts.hd_map is None or not (facts.hd_map.markings or facts.hd_map.lanes):
-        return ""
-    excluded = np.array([candidate.position_map for candidate in facts.excluded]).reshape(-1, 2)
-    return charts.site_chart(facts.hd_map, facts.route, excluded)
+def _suspicious_table(rows: Mapping[str, list[str]]) -> tables.Table | None:
+    headings = (
+        "marking",
+        "class",
+        "p",
+        "criterion",
+        "p (shape)",
+        "p (residuals)",
+        "p (sightings)",
+        "disputed (%)",
+    )
+    return (
+        tables.Table(headings, list(rows.values()), [True, False, True, False, *[True] * 4]) if rows else None
+    )
 
 
 def _radii(facts: Facts) -> str:
@@ -99,29 +187,48 @@ _ASSETS = {"vendor": ("leaflet.js", "leaflet.css"), "templates": ("page.css", "m
 """Scripts and styles that the page embeds, by folder."""
 
 
-def write_page(folder: Path, drive: Drive | None, background: Path | None = None) -> Path:
+def write_page(
+    folder: Path, drive: Drive | None, background: Path | None = None, comparison: Path | None = None
+) -> Path:
     """Write ``report.html`` into a result folder of :mod:`v2hdm.map`, atomically, and return its path.
 
     ``drive`` supplies pictures, recorded route and truth; ``background`` is a GeoTIFF or a folder of XYZ
-    tiles. If either is None, its content is taken from an existing report. Raises MapFileError for an invalid
-    folder, file or background, DriveError for a damaged image or truth.
+    tiles. If either is None, its content is taken from an existing report. ``comparison`` is a folder of
+    ``v2hdm compare``. Raises MapFileError for an invalid folder, file or background, DriveError for a damaged
+    image or truth.
     """
-    replace_text(folder / names.REPORT, page_text(folder, drive, background=background))
+    text = page_text(folder, drive, background=background, comparison=comparison)
+    replace_text(folder / names.REPORT, text)
     return folder / names.REPORT
 
 
-def page_text(folder: Path, drive: Drive | None, background: Path | None = None) -> str:
-    """The page of :func:`write_page`."""
-    environment = jinja2.Environment(
+def _environment() -> jinja2.Environment:
+    return jinja2.Environment(
         loader=jinja2.PackageLoader("v2hdm.report.page"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
+
+
+def paper_text(folder: Path, drive: Drive | None, comparison: Path | None = None) -> str:
+    """The document for paper as HTML; errors as of :func:`write_page`."""
+    page = document(read_facts(folder, drive), comparison)
+    style = (files("v2hdm.report.page") / "templates" / "paper.css").read_text(encoding="utf-8")
+    return _environment().get_template("paper.html").render(page=page, assets={"paper.css": style})
+
+
+def page_text(
+    folder: Path,
+    drive: Drive | None,
+    background: Path | None = None,
+    comparison: Path | None = None,
+) -> str:
+    """The page of :func:`write_page`."""
     here = files("v2hdm.report.page")
     facts = read_facts(folder, drive)
-    page = document(facts)
+    page = document(facts, comparison)
     page.pictures = page.pictures or earlier_pictures(_earlier(folder / names.REPORT, "pictures"))
     if page.map_data:
         if background is None:
@@ -130,15 +237,19 @@ def page_text(folder: Path, drive: Drive | None, background: Path | None = None)
             )
         else:
             page.map_data["background"] = background_layer(background, facts)
-    return environment.get_template("page.html").render(
-        page=page,
-        assets={
-            name: (here / where / name).read_text(encoding="utf-8")
-            for where, names in _ASSETS.items()
-            for name in names
-        },
-        map_json=json_text(page.map_data),
-        pictures_json=json_text(page.pictures),
+    return (
+        _environment()
+        .get_template("page.html")
+        .render(
+            page=page,
+            assets={
+                name: (here / where / name).read_text(encoding="utf-8")
+                for where, names in _ASSETS.items()
+                for name in names
+            },
+            map_json=json_text(page.map_data),
+            pictures_json=json_text(page.pictures),
+        )
     )
 
 
@@ -161,8 +272,8 @@ def _suspicious(facts: Facts) -> dict[str, list[str]]:
         number = suspect["marking"]
         tests = {name: suspect[f"p_{name}"] for name in ("shape", "residuals", "sightings")}
         if number in kinds:
-            cells = [str(number), tables.name_of(kinds[number]), f"{suspect['p']:.2g}"]
+            cells = [str(number), tables.name_of(kinds[number]), tables.probability(suspect["p"])]
             cells.append(min(tests, key=tests.__getitem__))
-            cells += [*(f"{p:.2g}" for p in tests.values()), f"{100 * suspect['disputed']:.0f}"]
+            cells += [*map(tables.probability, tests.values()), f"{100 * suspect['disputed']:.0f}"]
             rows[f"m{number}"] = cells
     return rows

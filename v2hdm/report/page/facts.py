@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -20,7 +20,20 @@ from v2hdm.io.maps.features import features_of, map_of
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.io.metrics import read_metrics
 from v2hdm.io.trajectory import read_tum
-from v2hdm.records import BEST, BoolArray, Calibration, Drive, Exclusion, FloatArray, HDMap, IntArray, Truth
+from v2hdm.records import (
+    BEST,
+    BoolArray,
+    Calibration,
+    Drive,
+    Exclusion,
+    FloatArray,
+    HDMap,
+    IntArray,
+    Reception,
+    Truth,
+)
+from v2hdm.report.coverage import Coverage, read_coverage
+from v2hdm.report.job import NO_JOB, StatedJob, read_job
 from v2hdm.store import names
 from v2hdm.store.files import load_json, load_yaml, read_csv, read_text, take_number
 
@@ -59,6 +72,16 @@ class CameraFacts:
     read_out_sigma_s: float | None
 
 
+class Occasion(NamedTuple):
+    """When images were taken, by their stamps: first and last of each session, s."""
+
+    sessions_s: tuple[tuple[float, float], ...]
+    images: int
+
+
+_NO_OCCASION = Occasion((), 0)
+
+
 @dataclass(frozen=True)
 class Facts:
     """The content of a result folder; missing parts are None or empty."""
@@ -75,6 +98,10 @@ class Facts:
     check_points: tuple[Mapping[str, str], ...]  # rows of ``check_points.csv`` by its columns
     drive: Drive | None
     truth: Truth | None  # of a rendered drive
+    job: StatedJob = NO_JOB  # what people state for the document
+    occasion: Occasion = _NO_OCCASION
+    reception: Reception | None = None
+    coverage: Coverage | None = None
 
     @property
     def results(self) -> Mapping[str, Any]:
@@ -109,7 +136,25 @@ def read_facts(folder: Path, drive: Drive | None) -> Facts:
         check_points=tuple(dict(zip(heading, row, strict=False)) for row in checked if row),
         drive=drive,
         truth=read_truth(drive) if drive is not None and drive.truth_dir is not None else None,
+        job=read_job(folder),
+        occasion=_occasion(metrics, drive),
+        reception=_reception(metrics) if drive is None else drive.reception,
+        coverage=read_coverage(folder),
     )
+
+
+def _occasion(metrics: Mapping[str, Any], drive: Drive | None) -> Occasion:
+    """The times of the drive's images, or as ``metrics.json`` has kept them."""
+    if drive is not None:
+        return Occasion(drive.spans_s, len(drive.images))
+    stated = metrics.get("drive") or {}
+    sessions = tuple((float(first), float(last)) for first, last in stated.get("sessions_s") or [])
+    return Occasion(sessions, int(stated.get("images", 0)))
+
+
+def _reception(metrics: Mapping[str, Any]) -> Reception | None:
+    stated = (metrics.get("drive") or {}).get("reception")
+    return None if stated is None else Reception(**stated)
 
 
 def read_map_of(folder: Path) -> HDMap | None:

@@ -16,6 +16,7 @@ from v2hdm.records import SIGMAS_95, FloatArray, HDMap, Lane, Marking, Symbol
 from v2hdm.report.areas import AREAS
 from v2hdm.report.metrics import corner_errors, match_markings, rms
 from v2hdm.report.page.facts import Facts, GroundResiduals
+from v2hdm.report.page.reference import Reference, local_reference
 from v2hdm.safe.backgrounds import Window, background_pixels
 from v2hdm.safe.pixels import read_pixels
 from v2hdm.site.accuracy import corner_radii_m
@@ -149,8 +150,13 @@ def _radii(paint: Marking | Symbol) -> list[float] | None:
     return None if covariance_m2 is None else np.round(corner_radii_m(covariance_m2), 5).tolist()
 
 
-def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
-    """The map document: markings, lanes, symbols, truth, route, excluded candidates, mosaic."""
+def layers(
+    facts: Facts, residuals: GroundResiduals | None, reference: Reference | None = None
+) -> dict[str, Any]:
+    """The map document: markings, lanes, symbols, truth, route, excluded candidates, mosaic.
+
+    The table's coordinates are in the system ``reference``, else in local metres.
+    """
     hd_map = facts.hd_map
     if hd_map is None:
         return {}
@@ -168,6 +174,12 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
         if marking.id in arrows:
             feature["a"] = arrows[marking.id]
         markings.append(feature)
+    symbols = [_symbol(symbol, kinds) for symbol in hd_map.symbols]
+    reference = reference or local_reference(facts)
+    shapes = [*(m.corners_map for m in hd_map.markings), *(s.outline_map for s in hd_map.symbols)]
+    centres = np.array([shape.mean(axis=0) for shape in shapes]).reshape(-1, 2)
+    for feature, at in zip([*markings, *symbols], reference.words(centres), strict=True):
+        feature["at"] = at
     route = facts.route
     return {
         "kinds": kinds,
@@ -175,7 +187,9 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
         "markings": markings,
         "lanes": [_feature(line, kinds, "p", line.points_map) for line in lines],
         "lane_lines": len(hd_map.lanes),
-        "symbols": [_symbol(symbol, kinds) for symbol in hd_map.symbols],
+        "symbols": symbols,
+        "axes": reference.axes,
+        "digits": reference.digits,
         "excluded": [
             {
                 "k": candidate.kind,
@@ -198,9 +212,6 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
         },
         "mosaic": mosaic_layer(facts.folder),
         "systems": systems_of(hd_map, _extent(facts)),
-        "suspicion": {
-            str(suspect["marking"]): float(suspect["p"]) for suspect in facts.best.get("suspicious") or []
-        },
         "files": sorted(path.name for path in facts.folder.iterdir() if path.suffix in _SHARED),
     }
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
@@ -54,6 +53,14 @@ def number(value: object, digits: int | None = None, factor: float = 1.0) -> str
     if value and not float(text):
         text = f"{factor * value:.1g}"
     return text.replace("-", "−")
+
+
+def probability(value: float) -> str:
+    """A probability of a test as text; one that is too small for three digits says so."""
+    return "< 0.001" if value < _LEAST_PROBABILITY else f"{value:.3f}"
+
+
+_LEAST_PROBABILITY = 1e-3  # of a test that is told by its number; below it the number says nothing more
 
 
 def name_of(kind: str) -> str:
@@ -123,6 +130,28 @@ def key_figures(facts: Facts) -> tuple[Figure, ...]:
         note = "reprojection" + ("" if before is None else f"; {number(before, 2)} px before")
         figures.append(Figure("In the images", number(best["reprojection_rmse_px"], 2), "px", note))
     return tuple(figures)
+
+
+def accuracy_figure(facts: Facts) -> Figure | None:
+    """The one accuracy of the first page, with its definition; None without any."""
+    if facts.hd_map is None:
+        return None
+    markings = facts.hd_map.markings
+    judged = well_known(markings)
+    radius_m = radius_of_all_m(absolute_radii_m(judged).ravel())
+    if not math.isfinite(radius_m):
+        return None
+    note = (
+        "Accuracy: 95 % of the mapped corners lie within this distance of their true places in the stated "
+        "coordinate system, by the covariances of the adjustment (circular error at 95 %)."
+    )
+    worse = len(markings) - len(judged)
+    if worse:
+        verb = "is" if worse == 1 else "are"
+        note += (
+            f" {in_words(worse, 'marking')} known less well (accuracy {ACCURACIES[-1]}) {verb} not counted."
+        )
+    return Figure("Accuracy", number(radius_m, 1, 100), "cm", note)
 
 
 def accuracy_table(facts: Facts) -> Table | None:
@@ -233,12 +262,6 @@ def content_table(facts: Facts) -> Table | None:
             sightings = number(float(np.median([feature.sightings for feature in features])), 0)
             rows.append([name_of(name), form, str(len(features)), length, sightings])
     return table(("class", "as", "count", "length (m)", "sightings"), rows, words=2)
-
-
-def reason_table(facts: Facts) -> Table:
-    """Reasons for exclusion, most frequent first."""
-    counts = Counter(candidate.reason for candidate in facts.excluded).most_common()
-    return table(("reason", "candidates"), [[reason, str(count)] for reason, count in counts])
 
 
 def method_table(facts: Facts) -> Table | None:

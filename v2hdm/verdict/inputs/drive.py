@@ -330,7 +330,7 @@ def input_findings(drive: Drive, ground: Mapping[str, GroundEstimate] | None = N
     motion = Motion.of(drive)
     findings = [
         *check_path(motion),
-        *check_heading(motion, path_of(ground)),
+        *check_heading(motion, path_of(ground), by_course=drive.headed_by_course),
         *check_attitude(motion),
         *check_jumps(motion, drive.pose_noise),
         *check_clocks(drive, motion),

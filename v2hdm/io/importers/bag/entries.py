@@ -97,7 +97,7 @@ def poses_entry(recording: Recording, answers: object) -> Entry:
     stated = answers or {}
     max_sigma_m = stated.get("max_sigma_m")
     limit_m = float(max_sigma_m) if isinstance(max_sigma_m, int | float) else PoseKeys.max_sigma_m
-    has_heading = bool({"heading_topic", "heading_file"} & set(stated))
+    has_heading = bool({"heading_topic", "heading_file"} & set(stated)) or _is_course(stated)
     candidates = position_candidates(recording.samples, limit_m, recording.is_linked, has_heading)
     world = _world_of(recording)
     topic = stated.get("topic")
@@ -181,7 +181,9 @@ def _entry_of(recording: Recording, position: PoseSample, stated: Mapping[str, A
     """The entry of poses of one topic."""
     entry = Entry({"topic": position.name})
     heading: PoseSample | None = None
-    if position.kind == kinds.FIX and "heading_file" not in stated:
+    if _is_course(stated):
+        heading = _gyro_of(recording, stated, entry)
+    elif position.kind == kinds.FIX and "heading_file" not in stated:
         heading = _heading_of(recording, position, stated, entry)
     vehicle_from_sensor = recording.vehicle_from(position.frame)
     if vehicle_from_sensor is None and recording.will_tell(position.frame):
@@ -197,14 +199,40 @@ def _entry_of(recording: Recording, position: PoseSample, stated: Mapping[str, A
     if turned is None:
         if heading is not None and not recording.will_tell(heading.frame):
             entry.missing["poses.mounting_rpy_deg"] = (
-                f"roll, pitch and yaw of the heading sensor '{heading.frame}', deg: [0, 0, 0]"
+                f"roll, pitch and yaw of the {'gyro' if _is_course(stated) else 'heading sensor'} "
+                f"'{heading.frame}', deg: [0, 0, 0]"
             )
             entry.content["mounting_rpy_deg"] = "?"
-    elif position.kind == kinds.FIX and heading is None:
+    elif (position.kind == kinds.FIX or _is_course(stated)) and heading is None:
         return entry  # a file's headings are not of the antenna's frame
     elif np.abs(turned[:3, :3] - np.eye(3)).max() > _TURNED:
         entry.content["mounting_rpy_deg"] = np.degrees(euler_from_rotation(turned[:3, :3])).tolist()
     return entry
+
+
+def _is_course(stated: Mapping[str, Any]) -> bool:
+    """Whether headings are those of the course."""
+    return stated.get("heading") == "course"
+
+
+def _gyro_of(recording: Recording, stated: Mapping[str, Any], entry: Entry) -> PoseSample | None:
+    """The sample of the topic of a gyro, put into the entry of poses headed by their course; None without."""
+    gyros = {
+        name: sample
+        for name, sample in recording.samples.headings.items()
+        if sample.kind == kinds.IMU and not sample.problem
+    }
+    if "gyro_topic" in stated or "gyro_file" in stated:
+        return gyros.get(str(stated.get("gyro_topic")))
+    if len(gyros) == 1:
+        (topic,) = gyros
+        entry.content["gyro_topic"] = topic
+        return gyros[topic]
+    if gyros:
+        offers = ", ".join(list(gyros)[:MOST_NAMES])
+        entry.missing["poses.gyro_topic"] = f"the topic of the gyro, null for none; the bag has {offers}"
+        entry.content["gyro_topic"] = "?"
+    return None
 
 
 def _heading_of(
@@ -224,7 +252,10 @@ def _heading_of(
             entry.notes.append(f"headings of {best.about}, not of {'; '.join(others[:MOST_NAMES])}")
         return best.sample
     offers = "; ".join(candidate.about for candidate in candidates[:MOST_NAMES]) or "none"
-    asked = f"the topic of headings, such as /imu; the bag has {offers}"
+    asked = (
+        f"the topic of headings, such as /imu; the bag has {offers}; without any, --set poses.heading=course "
+        "instead takes them from the antenna's course and a gyro"
+    )
     entry.missing["poses.heading_topic"] = asked
     entry.content["heading_topic"] = "?"
     return None

@@ -12,7 +12,7 @@ import numpy as np
 
 from v2hdm.errors import DriveError, need, shown
 from v2hdm.io.image_lists import has_time
-from v2hdm.io.importers.readings import SIGMA_OF_QUALITY_M, Attitudes, Readings
+from v2hdm.io.importers.readings import SIGMA_OF_QUALITY_M, Attitudes, Readings, TurnRates
 from v2hdm.io.trajectory import checked_rotations, in_order
 from v2hdm.records import FloatArray, IntArray
 from v2hdm.safe.pixels import AS_STORED, pixels_of, png
@@ -227,6 +227,23 @@ def heading_row(kind: str, fields: Any) -> Row:
     if kind == QUATERNION:
         return (*_quaternion(fields.quaternion), np.nan)
     return position_row(kind, fields)[4:]
+
+
+def rate_row(fields: Any) -> Row:
+    """Turn rates (3) about the axes of an Imu, rad/s."""
+    if fields.angular_velocity_covariance[0] < 0:  # sensor_msgs: this Imu measures no rates
+        return (np.nan,) * 3
+    rate = fields.angular_velocity
+    return (rate.x, rate.y, rate.z)
+
+
+def rates_of(stamp_s: FloatArray, rates: FloatArray, where: str) -> TurnRates:
+    """The turn rates (G, 3) of a gyro's stamps (G,); DriveError where none is measured."""
+    is_measured = np.isfinite(rates).all(axis=1)
+    if is_measured.sum() < 2:
+        raise DriveError(f"{where}: it measures no turn rates (angular_velocity); choose another topic")
+    order = _timed_order(stamp_s[is_measured], where, "message of the gyro")
+    return TurnRates(stamp_s[is_measured][order], rates[is_measured][order])
 
 
 def readings_of(

@@ -12,6 +12,7 @@ from array import array
 from collections import defaultdict
 from collections.abc import Collection, Generator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple, TextIO
@@ -49,6 +50,7 @@ IMAGE_LIST = "images.txt"
 INFO_FILE = "camera_info.yaml"
 _POSES = "positions.txt"
 _HEADINGS = "headings.txt"
+_RATES = "rates.txt"
 _KIND = "kind.txt"
 _TRANSFORMS = "transforms.txt"
 
@@ -158,12 +160,19 @@ class InfoStream(Stream):
 class PoseStream(Stream):
     """Positions of a topic, and headings of another one if need be, as rows of numbers."""
 
-    def __init__(self, topic: str, heading_topic: str | None, stamps: str, where: str) -> None:
+    def __init__(
+        self, topic: str, heading_topic: str | None, gyro_topic: str | None, stamps: str, where: str
+    ) -> None:
         needs = [Need(topic, kinds.POSE_KINDS, where)]
+        label = ["poses", heading_topic, stamps]
+        if gyro_topic is not None:
+            needs.append(Need(gyro_topic, (kinds.IMU,), f"{where}, gyro_topic"))
+            label.append(gyro_topic)
         if heading_topic is not None:
             needs.append(Need(heading_topic, kinds.HEADING_KINDS, f"{where}, heading_topic"))
-        super().__init__(topic, ["poses", heading_topic, stamps], where, needs)
+        super().__init__(topic, label, where, needs)
         self._heading = heading_topic
+        self._gyro = gyro_topic
         self._stamps = stamps
 
     def write(self, folder: Path) -> Writer:
@@ -172,6 +181,7 @@ class PoseStream(Stream):
         with (
             (folder / _POSES).open("w", encoding="utf-8") as positions,
             (folder / _HEADINGS).open("w", encoding="utf-8") as headings,
+            (folder / _RATES).open("w", encoding="utf-8") as rates,
         ):
             while (message := (yield)) is not None:
                 stamp_s = stamp_of(message, self._stamps)
@@ -183,10 +193,20 @@ class PoseStream(Stream):
                         _write_row(positions, stamp_s, kinds.position_row(kind, message.fields))
                 if message.topic == self._heading:
                     _write_row(headings, stamp_s, kinds.heading_row(message.kind, message.fields))
+                if message.topic == self._gyro:
+                    _write_row(rates, stamp_s, kinds.rate_row(message.fields))
         (folder / _KIND).write_text(kind, encoding="utf-8")
 
     def readings(self, folder: Path) -> Readings:
         """The readings that the entry in ``folder`` holds."""
+        readings = self._poses(folder)
+        if self._gyro is None:
+            return readings
+        stamp_s, rates = _read_rows(folder / _RATES, 4)
+        where = f"{self.where}, gyro_topic {self._gyro}"
+        return replace(readings, rates=kinds.rates_of(stamp_s, rates, where))
+
+    def _poses(self, folder: Path) -> Readings:
         kind = (folder / _KIND).read_text(encoding="utf-8")
         where = f"{self.where}, topic {self.label}"
         if kind == kinds.NMEA:

@@ -6,6 +6,7 @@ all epochs share border it. SciPy's banded Cholesky factor (LAPACK) solves for b
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from v2hdm.geometry.planar import length_along
 from v2hdm.io.importers.course.directions import Directions
 from v2hdm.io.importers.course.recording import Course
 from v2hdm.io.importers.course.terms import WIDTH, Epoch, Shared, State, Term, terms_of
-from v2hdm.records import FloatArray
+from v2hdm.records import FloatArray, IntArray
 
 _MOST_STEPS = 60  # Gauss-Newton takes under ten, a vehicle that stands now and then twenty; chosen
 _CONVERGED = 0.1  # squares of residuals, in sigmas, by which a step gains nothing any more; chosen
@@ -47,7 +48,7 @@ def smooth(course: Course, directions: Directions, where: str) -> Smoothed:
     cost = _cost(terms)
     damping = 0.0
     for _ in range(_MOST_STEPS):
-        system = _System.of(terms, state.epochs.size, len(state.shared), damping, linear)
+        system = _System.of(terms, state, damping, linear)
         moved = state.moved(system.step)
         terms_there = terms_of(course, moved, way_m)
         cost_there = _cost(terms_there)
@@ -66,7 +67,7 @@ def smooth(course: Course, directions: Directions, where: str) -> Smoothed:
             f"{where}: no path of a vehicle fits its positions; check their times, lever_arm_m and the gyro, "
             "or give a heading"
         )
-    system = _System.of(terms, state.epochs.size, len(state.shared), 0.0, linear)
+    system = _System.of(terms, state, 0.0, linear)
     sigma_rad, faded_m = system.heading_sigmas(length_along(course.antenna_map))
     shared_sigma = np.sqrt(np.diag(system.shared_covariance))
     misfit = {
@@ -90,6 +91,11 @@ def _cost(terms: list[Term]) -> float:
     return float(sum((term.residual**2).sum() for term in terms))
 
 
+def _summed(places: IntArray, values: FloatArray, count: int) -> FloatArray:
+    """Sums (``count``,) of values by their places, both of any shape."""
+    return np.asarray(np.bincount(places.ravel(), values.ravel(), minlength=count), dtype=np.float64)
+
+
 def _begin(course: Course, directions: Directions) -> State:
     """The state that the directions give."""
     heading_rad = directions.heading_rad
@@ -108,46 +114,49 @@ def _begin(course: Course, directions: Directions) -> State:
     return State(epochs, shared)
 
 
+@dataclass(frozen=True)
 class _System:
-    """Normal equations: a band (14, 7 P), its border (7 P, 5), and the corner (5, 5)."""
+    """Normal equations, solved: a band, bordered by the few unknowns that all epochs share."""
 
-    def __init__(self, factor: FloatArray, solved: FloatArray, corner: FloatArray, linear: Any) -> None:
-        self._factor = factor
-        self._border = solved[:, 1:]  # the band's inverse times the border
-        self._linear = linear
-        self.shared_covariance = np.linalg.inv(corner)
-        self.step = solved[:, 0]
+    step: FloatArray  # (7 P + 5,) the solution
+    shared_covariance: FloatArray  # (5, 5)
+    factor: FloatArray  # (14, 7 P) Cholesky factor of the band, as SciPy stores it
+    border: FloatArray  # (7 P, 5) the band's inverse times the border
+    linear: Any  # scipy.linalg
 
     @classmethod
-    def of(cls, terms: list[Term], count: int, shared: int, damping: float, linear: Any) -> _System:
+    def of(cls, terms: list[Term], state: State, damping: float, linear: Any) -> _System:
         """The system of residuals, its diagonal raised by a share, ``damping``, solved."""
-        band = np.zeros((_BAND, count))
-        border = np.zeros((count, shared))
-        corner = np.zeros((shared, shared))
-        right = np.zeros(count + shared)
+        count = state.epochs.size
+        shared = len(state.shared)
+        right: FloatArray = np.zeros(count + shared)
+        band: FloatArray = np.zeros(_BAND * count)
+        border: FloatArray = np.zeros(count * shared)
+        corner: FloatArray = np.zeros(shared * shared)
         for term in terms:
-            np.add.at(right, term.column, -term.derivative * term.residual[:, None])
-            for first in range(term.column.shape[1]):
-                for second in range(term.column.shape[1]):
-                    rows = term.column[:, first]
-                    columns = term.column[:, second]
-                    products = term.derivative[:, first] * term.derivative[:, second]
-                    low = (rows >= columns) & (rows < count)
-                    np.add.at(band, (rows[low] - columns[low], columns[low]), products[low])
-                    side = (rows < count) & (columns >= count)
-                    np.add.at(border, (rows[side], columns[side] - count), products[side])
-                    both = (rows >= count) & (columns >= count)
-                    np.add.at(corner, (rows[both] - count, columns[both] - count), products[both])
+            right -= _summed(term.column, term.derivative * term.residual[:, None], len(right))
+            rows = term.column[:, :, None]
+            columns = term.column[:, None, :]
+            products = term.derivative[:, :, None] * term.derivative[:, None, :]
+            is_band = (rows >= columns) & (rows < count)
+            is_border = (rows < count) & (columns >= count)
+            is_corner = (rows >= count) & (columns >= count)
+            band += _summed(((rows - columns) * count + columns)[is_band], products[is_band], len(band))
+            border += _summed((rows * shared + columns - count)[is_border], products[is_border], len(border))
+            places = (rows - count) * shared + columns - count
+            corner += _summed(places[is_corner], products[is_corner], len(corner))
+        band = band.reshape(_BAND, count)
+        border = border.reshape(count, shared)
+        corner = corner.reshape(shared, shared)
         band[0] *= 1 + damping
         corner[np.diag_indices(shared)] *= 1 + damping
         factor = linear.cholesky_banded(band, lower=True)
         solved = linear.cho_solve_banded((factor, True), np.column_stack([right[:count], border]))
-        reduced = corner - border.T @ solved[:, 1:]
-        of_shared = np.linalg.solve(reduced, right[count:] - border.T @ solved[:, 0])
+        shared_covariance = np.linalg.inv(corner - border.T @ solved[:, 1:])
+        of_shared = shared_covariance @ (right[count:] - border.T @ solved[:, 0])
         of_epochs = solved[:, 0] - solved[:, 1:] @ of_shared
-        system = cls(factor, solved, reduced, linear)
-        system.step = np.concatenate([of_epochs, of_shared])
-        return system
+        step = np.concatenate([of_epochs, of_shared])
+        return cls(step, shared_covariance, factor, solved[:, 1:], linear)
 
     def heading_sigmas(self, along_m: FloatArray) -> tuple[FloatArray, float]:
         """Sigmas (P,) of the headings, rad, and the distance over which their errors fade, m."""
@@ -160,9 +169,9 @@ class _System:
             unit = np.zeros((WIDTH * count, len(rows)))
             places = WIDTH * rows + Epoch.HEADING
             unit[places, np.arange(len(rows))] = 1.0
-            band = self._linear.cho_solve_banded((self._factor, True), unit)[Epoch.HEADING :: WIDTH]
-            border = self._border[Epoch.HEADING :: WIDTH] @ self.shared_covariance
-            covariance = band + border @ self._border[places].T  # (P, rows)
+            band = self.linear.cho_solve_banded((self.factor, True), unit)[Epoch.HEADING :: WIDTH]
+            border = self.border[Epoch.HEADING :: WIDTH] @ self.shared_covariance
+            covariance = band + border @ self.border[places].T  # (P, rows)
             own = covariance[rows, np.arange(len(rows))]
             variances.append(own)
             sigma_of_all = np.sqrt(np.maximum(own, 0))

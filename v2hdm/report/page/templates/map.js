@@ -376,12 +376,12 @@
     ...(written.length ? [{ name: "text", of: (one) => one.says?.[0] ?? "\u2013" }] : []),
     { name: "sightings", of: (one) => one.n, digits: 0 },
     ...(listed.some(({ about }) => about.g) ? [{ name: "accuracy", of: (one) => one.g ?? "\u2013" }] : []),
+    ...data.axes.map((name, n) => ({ name, of: (one) => (one.at ? Number(one.at[n]) : NaN), text: (one) => one.at?.[n], digits: data.digits })),
     { name: "from marking to marking (cm)", of: (one) => 100 * (one.r ?? NaN), digits: 1 },
     { name: "in the map’s frame (cm)", of: (one) => 100 * worst(one), digits: 1 },
     { name: "error against truth (cm)", of: (one) => 100 * (one.t ?? NaN), digits: 1 },
-    { name: "suspicion p", of: (one) => data.suspicion[one.id] ?? NaN, digits: 3 },
   ].filter((column) => !column.digits || things.some((shape) => Number.isFinite(column.of(shape.about))));
-  let order = { column: COLUMNS.at(-1).name === "suspicion p" ? COLUMNS.length - 1 : 0, down: false };
+  let order = { column: 0, down: false };
   function matching() {
     const wanted = byId("search").value.trim().toLowerCase().split(/\s+/);
     const { of } = COLUMNS[order.column];
@@ -392,6 +392,7 @@
       .map(([, shape]) => shape);
   }
   const cell = (column, about) => {
+    if (column.text?.(about)) return column.text(about);
     const value = column.of(about);
     return column.digits === undefined ? value : Number.isFinite(value) ? small(value, column.digits) : "\u2013";
   };
@@ -414,7 +415,7 @@
   byId("search").addEventListener("input", list);
   byId("save").addEventListener("click", () => {
     const quoted = (text) => `"${String(text).replaceAll('"', '""')}"`;
-    const lines = [COLUMNS.map((column) => quoted(column.name)), ...matching().map(({ about }) => COLUMNS.map((column) => { const value = column.of(about); return typeof value === "string" ? quoted(value) : Number.isFinite(value) ? value : ""; }))];
+    const lines = [COLUMNS.map((column) => quoted(column.name)), ...matching().map(({ about }) => COLUMNS.map((column) => { const value = column.of(about); return typeof value === "string" ? quoted(value) : Number.isFinite(value) ? value.toFixed(column.digits) : ""; }))];
     const link = element("a", { href: URL.createObjectURL(new Blob([lines.map((line) => line.join(",")).join("\r\n")], { type: "text/csv" })), download: "markings.csv" });
     link.click();
     URL.revokeObjectURL(link.href);
