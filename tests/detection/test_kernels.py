@@ -259,15 +259,17 @@ def copied(tmp_path_factory):
 
 def test_without_kernels_numpy_detects_and_one_line_says_so(copied):
     assert _told(copied, "-c", LOAD) == (
-        "nothing is compiled: detection runs in numpy, at half the speed; "
-        "with a C++ compiler, install v2hdm again\n"
+        "nothing is compiled: detection runs in numpy, at half the speed, and mapping first compiles for "
+        "some 20 s; with a C++ compiler, install v2hdm again\n"
     )
-    assert _told(copied, "-m", "v2hdm", "--version").endswith("detector in numpy (nothing is compiled)\n")
+    assert _told(copied, "-m", "v2hdm", "--version").endswith("numpy and numba (nothing is compiled)\n")
 
 
 def test_numpy_that_was_asked_for_is_not_complained_about(copied):
     assert _told(ROOT, "-c", LOAD, V2HDM_NATIVE="0") == ""
-    assert _told(ROOT, "-m", "v2hdm", "--version", V2HDM_NATIVE="0").endswith("numpy (V2HDM_NATIVE is 0)\n")
+    assert _told(ROOT, "-m", "v2hdm", "--version", V2HDM_NATIVE="0").endswith(
+        "numpy and numba (V2HDM_NATIVE is 0)\n"
+    )
 
 
 def test_kernels_of_another_processor_are_not_loaded_and_the_line_says_why(copied, tmp_path):

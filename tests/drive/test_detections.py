@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -36,6 +37,18 @@ def test_detections_are_read_as_they_were_written(tmp_path):
     (line,) = read.lanes
     assert (line.kind, line.identity) == ("lane_line", 2)
     np.testing.assert_allclose(line.sigma_px, [0.5, 0.6, 0.7, 0.8])
+
+
+def test_a_covariance_that_is_nearly_singular_is_positive_definite_when_it_is_read_again(tmp_path):
+    """A hidden end is known to a hundredth of a pixel across the marking and to kilometres along it."""
+    root = np.random.default_rng(2).normal(size=(8, 8))
+    directions, _ = np.linalg.qr(root)
+    covariance = directions @ np.diag([1e8, 1e8, 1.0, 1.0, 1.0, 1.0, 1e-4, 1e-4]) @ directions.T
+    plain = detections().markings[0]
+    written = ImageDetections(0, (replace(plain, covariance_px=(covariance + covariance.T) / 2),), ())
+    write_detections(tmp_path / "a.json", written)
+    (read,) = read_detections(tmp_path / "a.json", 0).markings
+    np.testing.assert_allclose(np.linalg.eigvalsh(read.covariance_px)[:2], 1e-4, rtol=1e-2)
 
 
 def marking(**changes: object) -> dict[str, object]:

@@ -38,7 +38,8 @@ def _marking_json(marking: MarkingDetection) -> dict[str, Any]:
     if np.count_nonzero(marking.covariance_px) == np.count_nonzero(variance):
         content["sigma_px"] = _rounded(np.sqrt(variance).reshape(4, 2), _DIGITS)
     else:
-        content["covariance_px"] = _rounded(marking.covariance_px, _DIGITS)
+        # Rounded, a covariance with a nearly certain direction would not be positive definite any more.
+        content["covariance_px"] = marking.covariance_px.tolist()
     if not marking.corner_valid.all():
         content["known"] = marking.corner_valid.tolist()
     return content
@@ -92,15 +93,19 @@ def _listed(content: object, where: str) -> list[Any]:
 def _marking(content: object, where: str) -> MarkingDetection:
     entry = take_mapping(content, where, DriveError)
     check_keys(entry, _MARKING, ("sigma_px", "covariance_px", "score", "known"), where, DriveError)
-    known = entry.get("known", [True] * 4)
-    if not (isinstance(known, list) and len(known) == 4 and all(isinstance(flag, bool) for flag in known)):
+    corner_known = entry.get("known", [True] * 4)
+    if not (
+        isinstance(corner_known, list)
+        and len(corner_known) == 4
+        and all(isinstance(flag, bool) for flag in corner_known)
+    ):
         raise DriveError(f"{where}, known: expected four times true or false; fix it or leave it out")
     return MarkingDetection(
         kind=take_name(entry["class"], f"{where}, class", DriveError),
         score=take_number(entry.get("score", 1.0), f"{where}, score", DriveError),
         corners_px=take_array(entry["corners_px"], (4, 2), f"{where}, corners_px", DriveError),
         covariance_px=_covariance_px(entry, where),
-        corner_valid=np.array(known, dtype=np.bool_),
+        corner_valid=np.array(corner_known, dtype=np.bool_),
     )
 
 

@@ -20,8 +20,11 @@ from v2hdm.native.sources import digest
 
 _log = logging.getLogger(__name__)
 
-SWITCH = "V2HDM_NATIVE"  # environment variable: 0 for numpy
-_REMEDY = "detection runs in numpy, at half the speed; with a C++ compiler, install v2hdm again"
+SWITCH = "V2HDM_NATIVE"  # environment variable: 0 for numpy and numba
+_REMEDY = (
+    "detection runs in numpy, at half the speed, and mapping first compiles for some 20 s; "
+    "with a C++ compiler, install v2hdm again"
+)
 
 
 class _Kernels:
@@ -62,7 +65,7 @@ def kernels() -> Any:
 def which_runs() -> str:
     """Which of the two runs, in a few words."""
     loaded = _loaded()
-    return "detector compiled" if loaded.module else f"detector in numpy ({loaded.problem})"
+    return "kernels compiled" if loaded.module else f"kernels in numpy and numba ({loaded.problem})"
 
 
 @contextmanager

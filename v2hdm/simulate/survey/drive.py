@@ -128,8 +128,8 @@ def _write_truth(
     markings = len(network.hd_map.markings)
     is_compared = len(images) * markings <= _MOST_SIGHTINGS
     visibility = np.zeros((len(images), markings) if is_compared else (len(images), 0))
-    for row, seen in enumerate(whole if is_compared else ()):
-        visibility[row, seen] = 1.0
+    for row, visible in enumerate(whole if is_compared else ()):
+        visibility[row, visible] = 1.0
     true = {name: cam_from_vehicle(camera.mount) for name, camera in config.cameras.items()}
     truth = Truth(
         map=network.hd_map,

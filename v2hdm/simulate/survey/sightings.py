@@ -79,18 +79,18 @@ class Shown:
 def detect(paint: Paint, info: CameraInfo, cam_from_map: FloatArray, rng: np.random.Generator) -> Shown:
     """The detections in the image of a camera at a true pose (4, 4)."""
     centre_map = camera_centre(cam_from_map)[:2]
-    near = np.array(sorted(paint.tree.query_ball_point(centre_map, RANGE_M)), dtype=np.intp)
-    corners = paint.corners_map[near]
+    in_range = np.array(sorted(paint.tree.query_ball_point(centre_map, RANGE_M)), dtype=np.intp)
+    corners = paint.corners_map[in_range]
     px = _project(info, cam_from_map, corners.reshape(-1, 2)).reshape(-1, 4, 2)
     size = np.array([info.width, info.height])
     with np.errstate(invalid="ignore"):
         whole = ((px > _BORDER_PX) & (px < size - 1 - _BORDER_PX)).all(axis=(1, 2))
     away_m = np.linalg.norm(corners.mean(axis=1) - centre_map, axis=1)
-    found = whole & (rng.random(len(near)) < np.interp(away_m, _MARKING_M, _FOUND))
-    corner_m = np.linalg.norm(corners[found] - centre_map, axis=2)
+    is_found = whole & (rng.random(len(in_range)) < np.interp(away_m, _MARKING_M, _FOUND))
+    corner_m = np.linalg.norm(corners[is_found] - centre_map, axis=2)
     sigma_px = _stated_px(corner_m, rng)
-    detected_px = px[found] + _errors_px(sigma_px, rng)
-    kinds = [paint.kinds[j] for j in near[found]]
+    detected_px = px[is_found] + _errors_px(sigma_px, rng)
+    kinds = [paint.kinds[j] for j in in_range[is_found]]
     # The detector does not know which corner the map counts first.
     first = rng.integers(0, 4, len(kinds))
     markings = [
@@ -99,7 +99,7 @@ def detect(paint: Paint, info: CameraInfo, cam_from_map: FloatArray, rng: np.ran
     ]
     for _ in range(rng.poisson(_FALSE_SHARE * len(markings))):
         markings += _false(info, cam_from_map, rng)
-    return Shown(tuple(markings), near[whole])
+    return Shown(tuple(markings), in_range[whole])
 
 
 def _stated_px(corner_m: FloatArray, rng: np.random.Generator) -> FloatArray:
@@ -130,9 +130,9 @@ def _project(info: CameraInfo, cam_from_map: FloatArray, points_map: FloatArray)
     pinhole = pinhole[:, :2] / pinhole[:, 2:]
     # Far outside the image the lens polynomial folds back; only near it are its values meaningful.
     size = np.array([info.width, info.height])
-    near = ((pinhole > -0.25 * size) & (pinhole < 1.25 * size)).all(axis=1)
+    is_near = ((pinhole > -0.25 * size) & (pinhole < 1.25 * size)).all(axis=1)
     out = np.full((len(points_map), 2), np.nan)
-    out[np.flatnonzero(ahead)[near]] = distort_points(info, pinhole[near])
+    out[np.flatnonzero(ahead)[is_near]] = distort_points(info, pinhole[is_near])
     return out
 
 

@@ -172,9 +172,9 @@ class _System:
             band = self.linear.cho_solve_banded((self.factor, True), unit)[Epoch.HEADING :: WIDTH]
             border = self.border[Epoch.HEADING :: WIDTH] @ self.shared_covariance
             covariance = band + border @ self.border[places].T  # (P, rows)
-            own = covariance[rows, np.arange(len(rows))]
-            variances.append(own)
-            sigma_of_all = np.sqrt(np.maximum(own, 0))
+            variance = covariance[rows, np.arange(len(rows))]
+            variances.append(variance)
+            sigma_of_all = np.sqrt(np.maximum(variance, 0))
             for place, row in enumerate(rows):
                 correlation = covariance[row:, place] / sigma_of_all[place] ** 2
                 below = np.flatnonzero(correlation < np.exp(-1))

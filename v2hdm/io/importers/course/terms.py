@@ -128,11 +128,11 @@ def _positions(course: Course, state: State) -> Term:
     offset_x = cosine * ahead - sine * left
     offset_y = sine * ahead + cosine * left
     sigma = _white(course.sigma_m)
-    one = np.ones(len(rows))
+    ones = np.ones(len(rows))
     residual_x = epochs[:, Epoch.X] + offset_x + epochs[:, Epoch.DRIFT_X] - course.antenna_map[:, 0]
     residual_y = epochs[:, Epoch.Y] + offset_y + epochs[:, Epoch.DRIFT_Y] - course.antenna_map[:, 1]
-    by_x = np.column_stack([one, -offset_y, one, cosine])
-    by_y = np.column_stack([one, offset_x, one, sine])
+    by_x = np.column_stack([ones, -offset_y, ones, cosine])
+    by_y = np.column_stack([ones, offset_x, ones, sine])
     lever = _shared_columns(len(rows), state, Shared.LEVER)
     columns_x = np.hstack([_columns(rows, Epoch.X, Epoch.HEADING, Epoch.DRIFT_X), lever])
     columns_y = np.hstack([_columns(rows, Epoch.Y, Epoch.HEADING, Epoch.DRIFT_Y), lever])
@@ -147,16 +147,16 @@ def _positions(course: Course, state: State) -> Term:
 def _drifts(course: Course, state: State, way_m: FloatArray) -> Term:
     """Drifts fade over a distance (a Gauss-Markov process)."""
     rows = np.arange(len(way_m))
-    kept = np.exp(-np.maximum(way_m, _LEAST_WAY_M) / _DRIFT_OVER_M)
+    fading = np.exp(-np.maximum(way_m, _LEAST_WAY_M) / _DRIFT_OVER_M)
     total = np.sqrt(_DRIFT_SHARE) * float(np.median(course.sigma_m))
-    sigma = total * np.sqrt(1 - kept**2)
+    sigma = total * np.sqrt(1 - fading**2)
     residuals = []
     derivatives = []
     columns = []
     for place in (Epoch.DRIFT_X, Epoch.DRIFT_Y):
         drift = state.epochs[:, place]
-        residuals.append(np.concatenate([[drift[0] / total], (drift[1:] - kept * drift[:-1]) / sigma]))
-        derivatives.append(np.vstack([[[0.0, 1 / total]], np.column_stack([-kept / sigma, 1 / sigma])]))
+        residuals.append(np.concatenate([[drift[0] / total], (drift[1:] - fading * drift[:-1]) / sigma]))
+        derivatives.append(np.vstack([[[0.0, 1 / total]], np.column_stack([-fading / sigma, 1 / sigma])]))
         # The first epoch's residual has no epoch before it: its derivative by that one is 0.
         before = np.concatenate([[1], rows])
         after = np.concatenate([[0], rows + 1])
@@ -200,9 +200,9 @@ def _motion(course: Course, state: State, way_m: FloatArray) -> list[Term]:
     across = columns_of(-sine, cosine, -ahead, nothing)
     sigma_turn = np.hypot(_STEER_RAD * np.sqrt(way_m), _STILL_RAD)
     turn = last[:, Epoch.HEADING] - first[:, Epoch.HEADING] - curvature * way
-    one = np.ones(len(rows))
+    ones = np.ones(len(rows))
     sides = [-0.5 * interval_s * curvature, -0.5 * way]
-    by_turn = np.column_stack([-one, *sides, one, *sides])
+    by_turn = np.column_stack([-ones, *sides, ones, *sides])
     of_turn = (Epoch.HEADING, Epoch.SPEED, Epoch.CURVATURE)
     return [
         Term("rolling", (ahead - way) / sigma_ahead, along / sigma_ahead[:, None], columns),
