@@ -28,8 +28,8 @@ def with_lines_corrected(hd_map: HDMap, corrections: Sequence[Correction]) -> tu
     added_lines = []
     heard = []
     for correction in drawn:
-        line, shown = _drawn_line(correction, hd_map.lanes)
-        added_lines.append(line)
+        drawn_line, shown = _drawn_line(correction, hd_map.lanes)
+        added_lines.append(drawn_line)
         against = "" if shown >= _MOSTLY else f"the images show a line along {100 * shown:.0f} % of it"
         heard.append(Heard(correction.place, "drawn", against))
     lanes = list(hd_map.lanes)

@@ -217,7 +217,8 @@ def thinned(line_map: FloatArray) -> FloatArray:
     """A line (N, 2), m, by fewer of its vertices."""
     # OpenCV's single precision is that of the distance from the first vertex.
     offset_m = (line_map - line_map[0]).astype(np.float32)
-    return np.asarray(cv2.approxPolyDP(offset_m, _THIN_M, False)[:, 0], np.float64) + line_map[0]
+    kept_m = np.asarray(cv2.approxPolyDP(offset_m, _THIN_M, False), np.float64)[:, 0]
+    return np.asarray(kept_m + line_map[0])
 
 
 _CELL_M = 2 * _SAME_M  # side of the cells in which features are looked up by their first point, m
