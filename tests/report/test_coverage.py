@@ -1,5 +1,6 @@
 """How often and how finely ground is seen, against what a hand computes."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.records import Camera, CameraInfo, Drive, HDMap, Image, Marking
 from v2hdm.report.coverage import coverage_of, read_coverage, write_coverage
 from v2hdm.report.weak import thin_stretches, weak_places
+from v2hdm.verdict.check import ground_seen
 
 INFO = CameraInfo("front", 640, 480, np.array([[500.0, 0, 320], [0, 500.0, 240], [0, 0, 1]]))
 HEIGHT_M, PITCH_RAD = 2.0, 0.25
@@ -89,6 +91,14 @@ def test_a_stretch_with_few_images_is_named_by_its_place_along_the_route():
     assert stretch.from_m == pytest.approx(40 + 14, abs=4)  # images look up to 16 m ahead
     assert stretch.to_m == pytest.approx(75 + 4, abs=4)
     assert thin_stretches(coverage_of(drive_of(np.arange(120.0)), {"front": MOUNTING}), route_map) == ()
+
+
+def test_check_says_how_finely_ground_is_seen_and_where_to_drive_again():
+    seen, again = ground_seen(drive_of([x for x in np.arange(0.0, 120.0) if not 40 < x < 75]), {})
+    assert re.fullmatch(r"ground: [\d,]+ m2 seen in 3 images or more, .*, at \d+ mm a pixel", seen)
+    assert re.match(r"drive again: from 5\d m to 7\d m along the route, ", again)
+    (seen_alone,) = ground_seen(drive_of(np.arange(120.0)), {})
+    assert seen_alone.startswith("ground: ")
 
 
 def marking(x_m, y_m, sigma_m, accuracy, shared=0.0, sightings=20):

@@ -17,11 +17,33 @@ from v2hdm.ground.motion import trajectory_of_images
 from v2hdm.ground.results import GroundEstimate
 from v2hdm.records import Drive, FloatArray, Trajectory
 from v2hdm.report import style
+from v2hdm.report.coverage import ENOUGH_VIEWS, coverage_of
 from v2hdm.report.photos import save_grid
+from v2hdm.report.weak import thin_stretches
 
 _PICTURES = 3  # sample images of each camera: near the start, in the middle and near the end
 _ARROWS = 30  # arrows along the route: enough to see a heading go wrong, few enough to see each
 _MOST_POINTS = 5000  # points of the line that is drawn
+
+
+def ground_seen(drive: Drive, ground: Mapping[str, GroundEstimate]) -> list[str]:
+    """How much ground the images show how finely, and where to drive again: a line each."""
+    coverage = coverage_of(drive, {name: _mountings(drive, ground, name)[-1] for name in drive.cameras})
+    if not coverage.covered_m2:
+        return []
+    sample_mm = 1000 * coverage.sample_of_covered_m()
+    seen = (
+        f"ground: {coverage.covered_m2:,.0f} m2 seen in {ENOUGH_VIEWS} images or more, as if nothing stood "
+        f"there, at {sample_mm:.0f} mm a pixel"
+    )
+    return [seen, *(f"drive again: {stretch.says}" for stretch in thin_stretches(coverage, drive.route_map))]
+
+
+def _mountings(drive: Drive, ground: Mapping[str, GroundEstimate], name: str) -> list[FloatArray]:
+    """The guessed mounting (4, 4) of a camera, and the one that bare ground shows, if it shows any."""
+    mountings = [initial_extrinsic(drive.cameras[name])]
+    calibration = ground[name].calibration if name in ground else None
+    return mountings if calibration is None else [*mountings, calibration.cam_from_vehicle]
 
 
 def draw_check(drive: Drive, folder: Path, ground: Mapping[str, GroundEstimate]) -> None:
@@ -29,10 +51,7 @@ def draw_check(drive: Drive, folder: Path, ground: Mapping[str, GroundEstimate])
     _save_route(folder / "route.png", drive.recorded or drive.trajectory or trajectory_of_images(drive))
     for name, camera in drive.cameras.items() if drive.has_pictures else ():
         images = [image for image in drive.images if image.camera == name]
-        mountings = {"guess": initial_extrinsic(camera)}
-        calibration = ground[name].calibration if name in ground else None
-        if calibration is not None:
-            mountings["ground"] = calibration.cam_from_vehicle
+        mountings = dict(zip(("guess", "ground"), _mountings(drive, ground, name), strict=False))
         for number in range(_PICTURES):
             image = images[(2 * number + 1) * len(images) // (2 * _PICTURES)]
             caption = f"{name}, {image.stamp_s:.2f} s"

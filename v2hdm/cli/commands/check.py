@@ -28,7 +28,7 @@ def _run(arguments: Sequence[str]) -> int:
     from v2hdm.store.files import write_json
     from v2hdm.store.names import VERDICT
     from v2hdm.verdict import check_drive
-    from v2hdm.verdict.check import draw_check
+    from v2hdm.verdict.check import draw_check, ground_seen
     from v2hdm.verdict.inputs.origin import HEIGHT, frame_of, height_to_state
 
     if parsed.set and not parsed.write:
@@ -58,7 +58,8 @@ def _run(arguments: Sequence[str]) -> int:
         draw_check(drive, unfinished, ground)
     passed = [finding.line for finding in verdict.passed if parsed.all]
     summary, *findings = verdict.lines
-    print("\n".join([*passed, *findings, summary, one_line(f"pictures in {folder}")]))
+    seen = ground_seen(drive, ground)
+    print("\n".join([*passed, *findings, *seen, summary, one_line(f"pictures in {folder}")]))
     return exit_code(verdict)
 
 
