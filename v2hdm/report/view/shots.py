@@ -24,15 +24,17 @@ _FAR_M = 25.0  # largest depth at which a person can tell what is painted there,
 class Shots:
     """The images of a run with their poses; none where the drive or the residuals are not at hand."""
 
-    facts: Facts
+    facts: Facts | None
     residuals: Residuals | None
     cam_from_map: FloatArray  # (I, 4, 4) of the residuals' images
 
     @classmethod
     def of(cls, folder: Path, drive: Drive | None) -> Shots:
         """Those of a result and its drive; raises V2hdmError where a file is damaged."""
+        if drive is None:
+            return cls(None, None, np.zeros((0, 4, 4)))
         facts = read_facts(folder, drive)
-        if drive is None or facts.residuals is None or facts.route is None:
+        if facts.residuals is None or facts.route is None:
             return cls(facts, None, np.zeros((0, 4, 4)))
         calibrations = {name: camera.calibration for name, camera in facts.cameras.items()}
         return cls(facts, facts.residuals, cams_from_map(facts.residuals, facts.route, calibrations))
@@ -42,7 +44,7 @@ class Shots:
 
         Of these, ``count`` from ``start`` on. The corners that were detected of a ``marking`` are drawn, too.
         """
-        if self.residuals is None or self.facts.drive is None:
+        if self.residuals is None or self.facts is None or self.facts.drive is None:
             return {"count": 0, "shots": [], "says": "The images of the drive are not at hand."}
         rows = self._rows(outline_map)
         images = {self.facts.drive.name_of(image.path): image for image in self.facts.drive.images}
@@ -62,6 +64,7 @@ class Shots:
     def _rows(self, outline_map: FloatArray) -> IntArray:
         """The images that show the whole outline, the nearest first."""
         assert self.residuals is not None
+        assert self.facts is not None
         depth_of_row: dict[int, float] = {}
         cameras = np.array(self.residuals.camera)
         for name, camera in self.facts.cameras.items():
@@ -80,6 +83,7 @@ class Shots:
         """The corners (M, 2), recorded px, that were detected of a marking in an image."""
         residuals = self.residuals
         assert residuals is not None
+        assert self.facts is not None
         camera = self.facts.cameras.get(residuals.camera[row])
         if marking is None or camera is None:
             return np.empty((0, 2))
