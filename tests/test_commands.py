@@ -302,7 +302,9 @@ def test_the_only_console_script_is_v2hdm():
 def test_every_command_reports_the_version(how, tmp_path):
     line = f"v2hdm {re.escape(__version__)}, (torch|no torch).*, (onnxruntime|no onnx).*, (numba|no numba).*"
     told = run_command(tmp_path, *how, "--version").stdout
-    assert re.fullmatch(line + ", weights [0-9a-f]{8}, kernels (compiled|in numpy and numba \\(.+\\))\n", told)
+    assert re.fullmatch(
+        line + ", weights [0-9a-f]{8}, kernels (compiled|in numpy and numba \\(.+\\))\n", told
+    )
 
 
 def test_a_version_is_told_where_libraries_are_missing(monkeypatch):
