@@ -43,8 +43,8 @@ def merged(results: Sequence[MethodResult], drive: Drive, own_images: Sequence[I
 
     def mean(value: Callable[[MethodResult], float | None]) -> float | None:
         values = [value(result) for result in results]
-        known = [(number, w) for number, w in zip(values, weight, strict=True) if number is not None]
-        return float(np.sqrt(np.average([v**2 for v, _ in known], weights=[w for _, w in known])))
+        stated = [(number, w) for number, w in zip(values, weight, strict=True) if number is not None]
+        return float(np.sqrt(np.average([v**2 for v, _ in stated], weights=[w for _, w in stated])))
 
     return replace(
         best,
@@ -67,7 +67,7 @@ def _poses(results: Sequence[MethodResult], drive: Drive, own_images: Sequence[I
     count = len(frames.stamp_s)
     map_from_vehicle = frames.map_from_vehicle.copy()
     sigma = np.zeros((count, 6))
-    seen = np.zeros(count, dtype=np.bool_)
+    is_seen = np.zeros(count, dtype=np.bool_)
     for result, images in zip(results, own_images, strict=True):
         poses = result.poses
         assert poses is not None
@@ -75,13 +75,13 @@ def _poses(results: Sequence[MethodResult], drive: Drive, own_images: Sequence[I
         local = np.array([poses.frame[drive.images[image].path] for image in images.tolist()])
         map_from_vehicle[at] = poses.map_from_vehicle[local]
         sigma[at] = poses.sigma[local]
-        seen[at] = poses.seen[local]
+        is_seen[at] = poses.seen[local]
     return AdjustedPoses(
         stamp_s=frames.stamp_s,
         before=frames.map_from_vehicle,
         map_from_vehicle=map_from_vehicle,
         sigma=sigma,
-        seen=seen,
+        seen=is_seen,
         frame={
             image.path: frame
             for image, frame in zip(drive.images, frames.frame_of_image.tolist(), strict=True)
@@ -149,22 +149,24 @@ def _most_telling(tests: Sequence[Contradiction]) -> tuple[Contradiction, ...]:
 
     The most doubtful come first.
     """
-    found: dict[object, Contradiction] = {}
+    most_telling: dict[object, Contradiction] = {}
     for test in sorted(tests, key=lambda test: (-log_odds(test) if is_doubtful(test) else 0.0, test.sigma)):
-        found.setdefault((test.fault.name, test.axis, test.cameras, test.about), test)
-    return tuple(sorted(found.values(), key=log_odds, reverse=True))
+        most_telling.setdefault((test.fault.name, test.axis, test.cameras, test.about), test)
+    return tuple(sorted(most_telling.values(), key=log_odds, reverse=True))
 
 
 def _fits(parts: Sequence[Mapping[str, CameraFit]]) -> dict[str, CameraFit]:
     """The fit of each camera over all sections, weighted by observations."""
     fits = {}
     for name in {name: None for part in parts for name in part}:
-        own = [part[name] for part in parts if name in part]
-        weights = [fit.observations for fit in own]
+        fits_of_camera = [part[name] for part in parts if name in part]
+        weights = [fit.observations for fit in fits_of_camera]
         fits[name] = CameraFit(
             observations=sum(weights),
-            variance_factor=float(np.average([fit.variance_factor for fit in own], weights=weights)),
-            rejected_share=float(np.average([fit.rejected_share for fit in own], weights=weights)),
-            sightings=sum(fit.sightings for fit in own),
+            variance_factor=float(
+                np.average([fit.variance_factor for fit in fits_of_camera], weights=weights)
+            ),
+            rejected_share=float(np.average([fit.rejected_share for fit in fits_of_camera], weights=weights)),
+            sightings=sum(fit.sightings for fit in fits_of_camera),
         )
     return fits

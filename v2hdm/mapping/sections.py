@@ -209,10 +209,10 @@ class _Work:
         frame_of_image = frames_of(self.drive).frame_of_image[section.images]
         own_frames = np.unique(frame_of_image[section.is_own])
         bundle = final.bundle
-        kept = section.is_own[sightings.image[bundle.row]]
-        row = bundle.row[kept]
-        own_corner = bundle.own_corner[kept]
-        corner = self._corner_names(number, bundle)[kept]
+        is_own = section.is_own[sightings.image[bundle.row]]
+        row = bundle.row[is_own]
+        own_corner = bundle.own_corner[is_own]
+        corner = self._corner_names(number, bundle)[is_own]
         on_line = known_elsewhere(bundle.association, sightings.valid & final.usable, final.usable)
         observations = observations_at(sightings, (row, own_corner), corner, self.common.model, on_line)
         observations = replace(observations, frame=frame_of_image[sightings.image[row]])
@@ -248,10 +248,10 @@ class _Work:
             if getattr(whole, name) is not None
         }
         changes["cam_from_vehicle"] = final.bundle.rig.cam_from_vehicle[cameras]
-        seen = replace(
+        of_part = replace(
             observations, camera=camera, frame=np.searchsorted(frames, observations.frame), corner=corner
         )
-        problem = replace(whole, observations=seen, corner_count=len(corners), **changes)
+        problem = replace(whole, observations=of_part, corner_count=len(corners), **changes)
         return Part(
             problem=problem,
             cameras=cameras,
@@ -285,7 +285,7 @@ class _Work:
             read_out_s=read_outs_of(bundle),
         )
         outcome = replace(outcome, bundle=bundle, final=final, evidence=evidence)
-        kept = tuple(marking for marking, ours in zip(optimised.markings, is_ours, strict=True) if ours)
+        markings = tuple(marking for marking, ours in zip(optimised.markings, is_ours, strict=True) if ours)
         excluded = tuple(
             exclusion
             for exclusion, ours in zip(
@@ -295,7 +295,7 @@ class _Work:
             )
             if ours
         )
-        ours = replace(optimised, groups=optimised.groups[is_ours], markings=kept, excluded=excluded)
+        ours = replace(optimised, groups=optimised.groups[is_ours], markings=markings, excluded=excluded)
         result = optimised_result(outcome, ours)
         assert result.residuals is not None
         residuals = result.residuals.take(self.common.is_ours[number][bundle.group])
@@ -309,7 +309,11 @@ class _Work:
         hd_map = result.hd_map
         lanes = hd_map.lanes
         if lanes:
-            detections = [found for found in inputs.detections if section.is_own[found.image]]
+            detections = [
+                image_detections
+                for image_detections in inputs.detections
+                if section.is_own[image_detections.image]
+            ]
             rig = outcome.bundle.rig
             lanes = replace(inputs, detections=detections).find_lanes(
                 ground_by_rig(inputs.drive, inputs.cameras, rig, None)
@@ -335,7 +339,7 @@ class _Work:
             [self.drive.images[image].map_from_vehicle[:2, 3] for image in section.images.tolist()]
         )
         _, nearest = cKDTree(route).query(np.array(places_map))
-        return [bool(own) for own in section.is_own[nearest]]
+        return [bool(is_own) for is_own in section.is_own[nearest]]
 
     def _joined(self, number: int, bundle: Bundle, part: Part, solution: Solution) -> Bundle:
         """A section's bundle under the joint solution; corners that only others' images show are left out."""
@@ -347,12 +351,14 @@ class _Work:
         index = bundle.corner_index[bundle.group, bundle.corner]
         place_of_corner = np.full(count, -1, dtype=np.int64)
         place_of_corner[index[is_known]] = place[is_known]
-        known = place_of_corner >= 0
+        is_solved_jointly = place_of_corner >= 0
         corners_map = bundle.solution.corners_map.copy()
-        corners_map[known] = solution.corners_map[place_of_corner[known]]
+        corners_map[is_solved_jointly] = solution.corners_map[place_of_corner[is_solved_jointly]]
         corner_index = bundle.corner_index.copy()
         is_solved = corner_index >= 0
-        corner_index[is_solved] = np.where(known[corner_index[is_solved]], corner_index[is_solved], -1)
+        corner_index[is_solved] = np.where(
+            is_solved_jointly[corner_index[is_solved]], corner_index[is_solved], -1
+        )
         rig = bundle.rig
         cam_from_vehicle = rig.cam_from_vehicle.copy()
         cam_from_vehicle[part.cameras] = solution.cam_from_vehicle
@@ -497,24 +503,24 @@ def _in_common(
     alone: Sequence[_Own], sections: Sequence[Section], options: MappingOptions
 ) -> tuple[_Common, IntArray]:
     """What the sections have in common, and the names of the markings that several of them have."""
-    weight = np.array([own.observations for own in alone], dtype=np.float64)
+    weight = np.array([section.observations for section in alone], dtype=np.float64)
     votes: Counter[str] = Counter()
-    for own in alone:
-        votes[own.pose_model] += own.observations
+    for section in alone:
+        votes[section.pose_model] += section.observations
     pose_model = votes.most_common(1)[0][0]
     noise: tuple[PoseSigma, ...] = alone[0].model.pose_sigma
-    for own in alone[1:]:
-        noise = tuple(map(larger_noise, noise, own.model.pose_sigma))
-    factors = np.array([own.model.variance_factor for own in alone])
+    for section in alone[1:]:
+        noise = tuple(map(larger_noise, noise, section.model.pose_sigma))
+    factors = np.array([section.model.variance_factor for section in alone])
     factor = float(np.exp(np.average(np.log(factors), weights=weight)))
     model = full_model(noise, options, pose_model, factor)
-    chi2 = float(np.average([own.chi2_per_dof for own in alone], weights=weight))
+    chi2 = float(np.average([section.chi2_per_dof for section in alone], weights=weight))
     names, turned = _named_markings(alone)
     best: dict[int, tuple[int, int]] = {}
     count: Counter[int] = Counter()
-    for number, own in enumerate(alone):
+    for number, section in enumerate(alone):
         count.update(names[number].tolist())
-        for name, rows in zip(names[number].tolist(), own.own_rows.tolist(), strict=True):
+        for name, rows in zip(names[number].tolist(), section.own_rows.tolist(), strict=True):
             best[name] = max(best.get(name, (-1, 0)), (rows, -number))
     is_ours = tuple(
         np.array([best[name][1] == -number for name in names[number].tolist()], dtype=np.bool_)
@@ -530,22 +536,22 @@ def _named_markings(alone: Sequence[_Own]) -> tuple[tuple[IntArray, ...], tuple[
     Groups of two sections are one marking if they have sightings in common; of several such pairs those with
     the most count, and no marking has two groups of one section.
     """
-    first = np.cumsum([0, *(len(own.own_rows) for own in alone)])
-    key = np.concatenate([own.row_key for own in alone])
-    group = np.concatenate([own.group + begin for own, begin in zip(alone, first[:-1], strict=True)])
-    shift = np.concatenate([own.shift for own in alone])
+    first = np.cumsum([0, *(len(section.own_rows) for section in alone)])
+    key = np.concatenate([section.row_key for section in alone])
+    group = np.concatenate([section.group + begin for section, begin in zip(alone, first[:-1], strict=True)])
+    shift = np.concatenate([section.shift for section in alone])
     section_of = np.repeat(np.arange(len(alone)), np.diff(first))
     order = np.argsort(key, kind="stable")
     key, group, shift = key[order], group[order], shift[order]
-    found = [np.zeros((0, 3), dtype=np.int64)]
+    pairs = [np.zeros((0, 3), dtype=np.int64)]
     for step in range(1, len(alone)):
         same = np.flatnonzero(key[step:] == key[:-step]) if len(key) > step else np.zeros(0, dtype=np.int64)
         if not len(same):
             break
         other = same + step
         # Corner c of group a is the sighting's c + shift: that of group b is c + shift_a - shift_b.
-        found.append(np.stack([group[same], group[other], (shift[same] - shift[other]) % 4], axis=1))
-    rows, counts = np.unique(np.concatenate(found), axis=0, return_counts=True)
+        pairs.append(np.stack([group[same], group[other], (shift[same] - shift[other]) % 4], axis=1))
+    rows, counts = np.unique(np.concatenate(pairs), axis=0, return_counts=True)
     name = np.arange(first[-1])
     turn = np.zeros(first[-1], dtype=np.int64)  # corner c of the group is corner c + turn of the marking
     members: dict[int, list[int]] = {}

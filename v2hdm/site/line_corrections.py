@@ -81,8 +81,8 @@ def _without(lane: Lane, line: FloatArray) -> list[Lane]:
     is_deleted = _is_along(lane.points_map, line)
     if not is_deleted.any():
         return [lane]
-    kept = np.flatnonzero(np.logical_not(is_deleted))
-    parts = np.split(kept, np.flatnonzero(np.diff(kept) > 1) + 1)
+    vertices = np.flatnonzero(np.logical_not(is_deleted))
+    parts = np.split(vertices, np.flatnonzero(np.diff(vertices) > 1) + 1)
     return [
         _part(lane, rows)
         for rows in parts

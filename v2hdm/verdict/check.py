@@ -32,11 +32,14 @@ def ground_seen(drive: Drive, ground: Mapping[str, GroundEstimate]) -> list[str]
     if not coverage.covered_m2:
         return []
     sample_mm = 1000 * coverage.sample_of_covered_m()
-    seen = (
+    of_images = (
         f"ground: {coverage.covered_m2:,.0f} m2 seen in {ENOUGH_VIEWS} images or more, as if nothing stood "
         f"there, at {sample_mm:.0f} mm a pixel"
     )
-    return [seen, *(f"drive again: {stretch.says}" for stretch in thin_stretches(coverage, drive.route_map))]
+    return [
+        of_images,
+        *(f"drive again: {stretch.says}" for stretch in thin_stretches(coverage, drive.route_map)),
+    ]
 
 
 def _mountings(drive: Drive, ground: Mapping[str, GroundEstimate], name: str) -> list[FloatArray]:

@@ -36,7 +36,7 @@ class BlockPattern:
         order: list[int] = []
         later: list[set[int]] = [set() for _ in sizes]
         while left:
-            block = min(left, key=lambda one: (sum(sizes[other] for other in neighbours[one]), one))
+            block = min(left, key=lambda block: (sum(sizes[other] for other in neighbours[block]), block))
             left.remove(block)
             order.append(block)
             later[block] = set(neighbours[block])
@@ -115,7 +115,7 @@ class BlockCholesky:
         for column in reversed(self.pattern.order):
             lower = self.blocks[column, column]
             later = self.pattern.later[column]
-            own = cho_solve((lower, True), np.eye(len(lower)))
+            diagonal = cho_solve((lower, True), np.eye(len(lower)))
             gains = {
                 row: solve_triangular(lower, self.blocks[row, column].T, lower=True, trans="T").T
                 for row in later
@@ -123,10 +123,10 @@ class BlockCholesky:
             for row in later:
                 total = np.zeros((self.pattern.sizes[row], len(lower)))
                 for other in later:
-                    known = out[row, other] if (row, other) in out else out[other, row].T
-                    total -= known @ gains[other]
+                    block = out[row, other] if (row, other) in out else out[other, row].T
+                    total -= block @ gains[other]
                 out[row, column] = total
             for row in later:
-                own = own - gains[row].T @ out[row, column]
-            out[column, column] = own
+                diagonal = diagonal - gains[row].T @ out[row, column]
+            out[column, column] = diagonal
         return out

@@ -90,8 +90,8 @@ class Net:
         # A link couples both its frames to all that the parts of either know.
         for link in links:
             ends = np.searchsorted(frames, [link.before, link.frame]).tolist()
-            both = of_frame[ends[0]] | of_frame[ends[1]]
-            of_frame[ends[0]] = of_frame[ends[1]] = both
+            parts_of_ends = of_frame[ends[0]] | of_frame[ends[1]]
+            of_frame[ends[0]] = of_frame[ends[1]] = parts_of_ends
         keys = sorted({frozenset(parts) for parts in (*of_frame, *of_corner)}, key=sorted)
         block_of = {key: number + 1 for number, key in enumerate(keys)}
         sizes = [unknowns * len(problem.intrinsic)] + [0] * len(keys)

@@ -100,8 +100,8 @@ def cut(problem: Problem, part_of_frame: IntArray, states: tuple[str, ...]) -> t
     for number in range(count):
         frames = np.flatnonzero(part_of_frame == number)
         corners = np.flatnonzero(saw[number])
-        own = first_part[corners] == number
-        local, cameras = _local(problem, np.flatnonzero(part == number), frames, corners, own)
+        is_first = first_part[corners] == number
+        local, cameras = _local(problem, np.flatnonzero(part == number), frames, corners, is_first)
         parts.append(
             Part(
                 problem=local,
@@ -148,7 +148,7 @@ def _link(problem: Problem, frame: int, states: tuple[str, ...]) -> Link:
 
 
 def _local(
-    problem: Problem, rows: IntArray, frames: IntArray, corners: IntArray, own: BoolArray
+    problem: Problem, rows: IntArray, frames: IntArray, corners: IntArray, is_first: BoolArray
 ) -> tuple[Problem, IntArray]:
     """The problem of some rows of the observations, and its cameras' numbers in the whole."""
     observations = problem.observations.take(rows)
@@ -157,38 +157,38 @@ def _local(
     corner = np.searchsorted(corners, observations.corner)
     of_cameras = ("intrinsic", "cam_from_vehicle", "centre_vehicle", "centre_sigma_m", "read_out_s")
     of_frames = ("map_from_vehicle", "twist_vehicle", "session")
-    taken = dict.fromkeys(of_cameras, cameras) | dict.fromkeys(of_frames, frames)
-    taken["corners_start"] = corners
+    numbers = dict.fromkeys(of_cameras, cameras) | dict.fromkeys(of_frames, frames)
+    numbers["corners_start"] = corners
     changes = {
-        name: getattr(problem, name)[at] for name, at in taken.items() if getattr(problem, name) is not None
+        name: getattr(problem, name)[at] for name, at in numbers.items() if getattr(problem, name) is not None
     }
     local = replace(
         problem,
         observations=replace(observations, camera=camera, frame=frame, corner=corner),
         corner_count=len(corners),
         pose_sigma=problem.pose_sigmas,
-        control=_control(problem.control, corners, own),
-        lengths=_lengths(problem.lengths, corners, own),
+        control=_control(problem.control, corners, is_first),
+        lengths=_lengths(problem.lengths, corners, is_first),
         **changes,
     )
     return local, cameras
 
 
-def _control(control: ControlPoints | None, corners: IntArray, own: BoolArray) -> ControlPoints | None:
+def _control(control: ControlPoints | None, corners: IntArray, is_first: BoolArray) -> ControlPoints | None:
     if control is None or not len(corners):
         return None
     place = np.minimum(np.searchsorted(corners, control.corner), len(corners) - 1)
-    rows = np.flatnonzero((corners[place] == control.corner) & own[place])
+    rows = np.flatnonzero((corners[place] == control.corner) & is_first[place])
     return control.take(rows, place[rows]) if len(rows) else None
 
 
-def _lengths(lengths: KnownLengths | None, corners: IntArray, own: BoolArray) -> KnownLengths | None:
+def _lengths(lengths: KnownLengths | None, corners: IntArray, is_first: BoolArray) -> KnownLengths | None:
     if lengths is None or not len(corners):
         return None
     last = len(corners) - 1
     first = np.minimum(np.searchsorted(corners, lengths.first), last)
     second = np.minimum(np.searchsorted(corners, lengths.second), last)
-    rows = (corners[first] == lengths.first) & (corners[second] == lengths.second) & own[first]
+    rows = (corners[first] == lengths.first) & (corners[second] == lengths.second) & is_first[first]
     if not rows.any():
         return None
     return KnownLengths(first[rows], second[rows], lengths.length_m[rows], lengths.sigma_m[rows])

@@ -115,7 +115,7 @@ def _corner_columns(whitening: Whitening, corners: Tensor) -> Columns:
     """Columns of corners (m,), ascending and closed."""
     tip = whitening.reduced_factor.tip
     reduced = [tip.new_zeros(whitening.reduced_factor.size, 0)]
-    own = tip.new_zeros(2 * len(corners), 2 * len(corners))
+    of_corners = tip.new_zeros(2 * len(corners), 2 * len(corners))
     for begin, end in _chunks(whitening, corners):
         chosen = corners[begin:end]
         unit = torch.eye(2 * len(chosen), dtype=tip.dtype, device=tip.device).view(len(chosen), 2, -1)
@@ -125,9 +125,9 @@ def _corner_columns(whitening: Whitening, corners: Tensor) -> Columns:
         is_kept = torch.isin(chosen, whitening.plan.kept_corners).repeat_interleave(2)
         own_part = lower.flatten(0, 1)
         own_part[is_kept] = 0.0
-        own[2 * begin : 2 * end, 2 * begin : 2 * end] = own_part
+        of_corners[2 * begin : 2 * end, 2 * begin : 2 * end] = own_part
         reduced.append(-reduced_root(whitening, chosen) @ inverse)
-    return Columns(torch.cat(reduced, dim=1), own)
+    return Columns(torch.cat(reduced, dim=1), of_corners)
 
 
 def _chunks(whitening: Whitening, corners: Tensor) -> list[tuple[int, int]]:
@@ -194,10 +194,10 @@ def follow(whitening: Whitening, border: Border, target: Values) -> Estimate:
     step = target.step_from(Values.of(whitening.estimate, border))
     beyond = step - own_step(whitening, border, columns)
     weights = torch.cholesky_solve(beyond[:, None], torch.linalg.cholesky(columns.covariance))[:, 0]
-    reduced, own = columns.pushed(weights)
+    reduced, of_corners = columns.pushed(weights)
     whitened = -whitening.gradient
     whitened[: len(reduced)] += reduced
-    whitened[len(reduced) :].view(-1, 2)[border.corners] += own
+    whitened[len(reduced) :].view(-1, 2)[border.corners] += of_corners
     moved = whitening.linearised.evaluate(*whitening.step(whitened)).estimate
     states = moved.frame_state.clone()
     states[border.frames] = target.frame_state
@@ -262,8 +262,8 @@ class JoinedCovariance(Covariance):
         chosen = rank[torch.as_tensor(groups, device=rank.device)]
         unit = (~arrays.joined).cumsum(0)
         corners = torch.isin(unit, unit[chosen.flatten()]).nonzero()[:, 0]
-        own = _corner_columns(self.whitening, corners)
-        regression = own.reduced.mT @ self._columns.reduced
+        columns = _corner_columns(self.whitening, corners)
+        regression = columns.reduced.mT @ self._columns.reduced
         # Corners of the border have their own variables in common with it.
         shared = torch.isin(corners, self.border.corners)
         rows = _axes(shared.nonzero()[:, 0])
@@ -271,7 +271,7 @@ class JoinedCovariance(Covariance):
             places = torch.searchsorted(self.border.corners, corners[shared])
             at = _axes(places) + regression.shape[1] - len(self._columns.own)
             block = self._columns.own[:, _axes(places)]
-            regression[rows[:, None], at] += own.own[:, rows][rows].mT @ block[_axes(places)]
+            regression[rows[:, None], at] += columns.own[:, rows][rows].mT @ block[_axes(places)]
         place = _axes(torch.searchsorted(corners, chosen.contiguous()))
         of_group = regression[place]
         return np.asarray(of_part + (of_group @ self._gained @ of_group.mT).cpu().numpy())

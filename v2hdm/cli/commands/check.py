@@ -58,8 +58,8 @@ def _run(arguments: Sequence[str]) -> int:
         draw_check(drive, unfinished, ground)
     passed = [finding.line for finding in verdict.passed if parsed.all]
     summary, *findings = verdict.lines
-    seen = ground_seen(drive, ground)
-    print("\n".join([*passed, *findings, *seen, summary, one_line(f"pictures in {folder}")]))
+    of_ground = ground_seen(drive, ground)
+    print("\n".join([*passed, *findings, *of_ground, summary, one_line(f"pictures in {folder}")]))
     return exit_code(verdict)
 
 

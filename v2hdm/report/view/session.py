@@ -119,11 +119,11 @@ class Session:
             self._follow()
             merged = dict(self.corrections)
             for correction in corrections:
-                kept = self._kept(entry_of(correction))
-                key = self._keys.of(kept)
-                if not _is_same(merged.setdefault(key, kept), kept):
+                entry = self._kept(entry_of(correction))
+                key = self._keys.of(entry)
+                if not _is_same(merged.setdefault(key, entry), entry):
                     raise MapFileError(
-                        f"{self.path}: corrects the {kept.place} otherwise already; take one back"
+                        f"{self.path}: corrects the {entry.place} otherwise already; take one back"
                     )
             count = len(merged) - len(self.corrections)
             if count:
