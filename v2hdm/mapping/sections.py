@@ -381,6 +381,7 @@ class _Work:
             read_out_s=solution.read_out_s,
             chi2_per_dof=self.common.chi2_per_dof,
             gap=solution.gap,
+            # What follows asks for these covariances alone, never for the factors that Covariance has.
             covariance=joint,  # type: ignore[arg-type]
         )
         rig = replace(rig, cam_from_vehicle=cam_from_vehicle, map_from_vehicle=map_from_vehicle)
@@ -427,6 +428,7 @@ class JointOfSection:
 
 def _bare(bundle: Bundle) -> Bundle:
     """A bundle without the factors of its solve, which are large and bound to this process."""
+    # Nothing asks for covariances before the joint solution has put its own in this place.
     return replace(bundle, solution=replace(bundle.solution, covariance=None))  # type: ignore[arg-type]
 
 
