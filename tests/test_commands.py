@@ -146,10 +146,16 @@ def test_a_command_under_a_limit_of_memory_ends_with_whoever_started_it(number, 
         pytest.skip("is the same whatever the signal")
     (tmp_path / "cv2.py").write_text(WAITS.format(first))
     _, most = resource.getrlimit(resource.RLIMIT_AS)
+
+    def limit_and_listen() -> None:
+        resource.setrlimit(resource.RLIMIT_AS, (2**40, most))
+        if number != signal.SIGKILL:
+            signal.signal(number, signal.SIG_DFL)  # tests that run under nohup ignore some
+
     parent = subprocess.Popen(
         [sys.executable, "-m", "v2hdm", "detect", "a.jpg"],
         env=os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"}, cwd=tmp_path,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (2**40, most)),
+        preexec_fn=limit_and_listen,
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
     told = tmp_path / "told"
