@@ -19,8 +19,8 @@ from v2hdm.report.coverage import coverage_of, write_coverage
 from v2hdm.report.job import Job, StatedJob, read_job, write_job
 from v2hdm.report.page.document import document, paper_text, write_page
 from v2hdm.report.page.facts import read_cameras, read_facts
-from v2hdm.store.files import write_json
-from v2hdm.store.results import added_to
+from v2hdm.store.files import file_digest, write_json
+from v2hdm.store.results import added_to, files_of_result
 
 HAMBURG = GeodeticOrigin(53.5, 9.9, 12.0, "ETRS89", 2015.5)
 DAY_S = datetime(2026, 5, 17, 8, 30, tzinfo=UTC).timestamp()
@@ -152,6 +152,16 @@ def test_what_was_stated_once_stays_and_a_system_that_does_not_fit_is_one_line(t
     assert "the drive's epoch is 2015.5, the report's 1989" in capsys.readouterr().err
     assert run(["report", str(result), "--site", "a\nb"]) == 2
     assert "--site: give one line of 1 to 200 letters" in capsys.readouterr().err
+
+
+def test_what_is_stated_is_a_file_of_the_result_which_the_next_run_may_replace(tmp_path):
+    make_result(tmp_path)
+    result = tmp_path / "result"
+    assert run(["report", str(result), "--site", "Quay 8"]) == 0
+    assert files_of_result(result)["job.json"] == file_digest(result / "job.json")
+    assert run(["report", str(result), "--site", "Quay 9", "--crs", "nowhere"]) == 2
+    assert read_job(result).job.site == "Quay 8"
+    assert files_of_result(result)["job.json"] == file_digest(result / "job.json")
 
 
 def test_without_weasyprint_the_report_says_what_to_install(survey, capsys, monkeypatch):

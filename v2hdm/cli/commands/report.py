@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from contextvars import Context
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,9 +12,11 @@ from v2hdm.cli.arguments import add_result
 from v2hdm.cli.command import Command
 from v2hdm.errors import ConfigError, MapFileError, V2hdmError
 from v2hdm.store import names
+from v2hdm.store.inputs import protected_inputs
 
 if TYPE_CHECKING:
     from v2hdm.records import Drive
+    from v2hdm.report.job import StatedJob
 
 _FIELDS = {
     "site": "name of the site",
@@ -73,16 +74,15 @@ def _write(
 ) -> list[Path]:
     """Write page and paper with what is stated now; where they cannot be, what was stated before stays."""
     from v2hdm.report.coverage import coverage_of, write_coverage
-    from v2hdm.report.job import Job, read_job, write_job
+    from v2hdm.report.job import Job, read_job
     from v2hdm.report.page.document import write_page  # the libraries of its charts, which takes seconds
     from v2hdm.report.page.facts import read_cameras
 
     assert isinstance(job, Job)
-    # Contexts of their own: what is stated now replaces a file that the report has as an input.
-    before = Context().run(read_job, folder)
+    before = read_job(folder)
     now = before.with_more(job, parsed.crs)
     if now != before:
-        Context().run(write_job, folder, now)
+        _restate(folder, now)
     try:
         if drive is not None and not (folder / names.COVERAGE).is_file():
             cameras = read_cameras(folder)
@@ -95,9 +95,17 @@ def _write(
             paths.append(write_paper(folder, drive, comparison))
     except V2hdmError:
         if now != before:
-            Context().run(write_job, folder, before)
+            _restate(folder, before)
         raise
     return paths
+
+
+def _restate(folder: Path, job: StatedJob) -> None:
+    """Replace what is stated of the survey, although the report has that file as an input."""
+    from v2hdm.report.job import write_job
+
+    with protected_inputs():
+        write_job(folder, job)
 
 
 def _beside(result: Path) -> Path | None:
