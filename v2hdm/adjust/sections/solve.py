@@ -39,7 +39,7 @@ from v2hdm.records import FloatArray
 GAP = 1e-8
 """Twice the predicted decrease of the cost, as a fraction of it, at which the rounds end."""
 
-_MOST_ROUNDS = 15
+_MOST_ROUNDS = 15  # rounds of joining and following, after which the solve has not converged; chosen
 _HELD_SIGMA_M = 1.0  # standard deviation, m, of what holds border corners in a part: any ray tells more
 _CONTRADICTION = 9.0
 """Chi-square per shared coordinate from which parts contradict each other: 1 is usual, this is 3 sigmas."""

@@ -16,10 +16,11 @@ from v2hdm.simulate.port.route import Route, build_route
 _Piece = list[float]  # length, m, and turn to the left, deg
 
 _TURN_M = 24.0  # length of the path of a turn by 90 degrees, as in the shipped ports
+# Pieces of a street, 320 m with a gentle bend in the middle, and of a yard's lane, straight; chosen.
 _STREET: list[_Piece] = [[80.0, 0.0], [40.0, 6.0], [40.0, -12.0], [40.0, 6.0], [120.0, 0.0]]
 _STREETS = 2  # streets of a block, one behind the other; even, so that a block ends where it began
 _STREET_GAP_M = 36.0  # straight from turn to turn between two streets, which are 66 m apart
-_YARD: list[_Piece] = [[90.0, 0.0]]
+_YARD: list[_Piece] = [[90.0, 0.0]]  # see _STREET
 _LANES = 4  # lanes of a block's yard; even, for the same reason
 _YARD_GAP_M = 8.0  # straight from turn to turn between two lanes of a yard, which are 39 m apart
 
