@@ -1,17 +1,14 @@
 """The editor in the browser: mouse or keyboard alone suffice, and what was corrected is in the file."""
 
 import re
-import threading
 
 import numpy as np
 import pytest
 
 from tests.report.page.browser import opened
-from tests.report.page.folder import DIAMOND_M, PLACES, make_result
+from tests.report.page.folder import DIAMOND_M, PLACES
 from tests.report.page.test_browser import browser as browser
 from v2hdm.io.maps.corrections import Correction, read_corrections, write_corrections
-from v2hdm.report.view.server import server_of
-from v2hdm.report.view.session import file_beside
 from v2hdm.store.files import file_digest
 
 ON_SCREEN = """([east, north]) => {
@@ -27,20 +24,6 @@ HANDLES = """async () => {
     const box = document.getElementById("map").getBoundingClientRect();
     return handlesOf(selected(), view).map(({ at }) => [box.left + at[0], box.top + at[1]]);
 }"""
-
-
-@pytest.fixture
-def served(tmp_path):
-    """The address of a result, the result, and its file of corrections."""
-    drive = make_result(tmp_path)
-    folder = tmp_path / "result"
-    server, address, _ = server_of(folder, drive, file_beside(folder))
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    yield address, folder, file_beside(folder)
-    server.shutdown()
-    server.server_close()
-    thread.join()
 
 
 def ready(page):
@@ -248,7 +231,9 @@ def test_a_distance_is_measured(browser, served):
         page.keyboard.press("m")
         page.mouse.click(left, top)
         page.mouse.click(left + 180, top)
-        page.locator("#told", has_text="Measured: 2.00 m").wait_for()
+        told = page.locator("#told", has_text="Measured: ")
+        told.wait_for()
+        assert "Measured: 2.00 m" in told.inner_text()
 
 
 def test_a_lane_line_is_drawn_split_joined_and_deleted_by_keys(browser, served):
