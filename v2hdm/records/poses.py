@@ -88,7 +88,7 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class Reception:
-    """What the source of a drive's poses says of the positions that it recorded while images were taken."""
+    """The quality of a drive's recorded positions, as their source states it, while images were taken."""
 
     positions: int
     rtk_fixed: int | None  # of these, with fixed ambiguities; None where the source states no quality

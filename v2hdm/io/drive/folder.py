@@ -122,7 +122,7 @@ def _plan_camera(name: str, content: object, sources: Sources, where: str) -> _P
 
 
 def _reception(recorded: Recorded, files: Sequence[ImageFiles]) -> Reception | None:
-    """What the source of the poses says of its positions from the first image to the last."""
+    """The stated quality of the positions from the first image to the last."""
     listed = [entry.stamp_s for entry in files if len(entry.stamp_s)]
     if recorded.fixes is None or not listed:
         return None
