@@ -206,8 +206,8 @@ def write_map(
     in place of their own; files of the formats ``present`` are there already. ``trajectories`` are of the
     drives whose paths say where lanes lead, for :data:`DRIVEN_FORMATS`. What paint and paths leave open of
     lanes is written as ``{name}_questions.geojson``, but for what ``answers`` state. ``pictures`` are the
-    overlays of a recording. Raises ConfigError when a format is not known or lacks its package, or when the projector
-    or the system does not suit the map.
+    overlays of a recording. Raises ConfigError when a format is not known or lacks its package, or when the
+    projector or the system does not suit the map.
     """
     check_formats(formats, "formats")
     grids = check_crs(crs, with_data(formats), hd_map.origin, "crs")
