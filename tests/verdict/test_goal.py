@@ -118,7 +118,7 @@ def test_clocks_that_leave_more_open_than_the_goal_are_named_first_and_no_pass()
     verdict = judged(unknown)
     assert verdict.status is Status.WARN
     first, of_all = verdict.raised[:2]
-    assert first.line.startswith("WARN clock (all cameras): whether all clocks are late or fast cannot be told")
+    assert first.line.startswith("WARN clock (all cameras): whether all clocks are late or fast cannot")
     assert "pose_noise.clock_s" in first.says
     assert (first.value, first.limit, first.unit) == (20.0, 5.0, "cm")
     assert "the largest part, 20 cm, is the clocks" in of_all.says

@@ -129,6 +129,7 @@ def rendered_drive(config: PortConfig, cache: Path, executor: Executor, progress
     """
     folder = folder_of_port(config, cache)
     if not (folder / DRIVE_FILE).is_file() or _lacks_clocks(folder) or _drop_damaged(folder):
+        # Images that are there stay as they are.
         render_drive(config, folder, executor, progress)
     note_use(folder)
     return folder
@@ -154,7 +155,7 @@ def folder_of_port(config: PortConfig, cache: Path) -> Path:
 
 
 def _lacks_clocks(folder: Path) -> bool:
-    """Whether a drive was rendered by a version that did not state its clocks, which are right; images stay."""
+    """Whether a drive was rendered by a version that did not state its clocks."""
     return "clock_s" not in (folder / DRIVE_FILE).read_text(encoding="utf-8")
 
 
