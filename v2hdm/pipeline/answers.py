@@ -46,9 +46,7 @@ def with_answers(result: Result, corrections: Sequence[Correction]) -> Result:
     figures = dict(result.figures)
     figures["corrections"] = [*figures.get("corrections", ()), *map(asdict, told)]
     findings = [*result.verdict.findings, _finding(told, len(answered.refused))]
-    return replace(
-        result, answers=answered.followed, figures=figures, verdict=Verdict.of(findings)
-    )
+    return replace(result, answers=answered.followed, figures=figures, verdict=Verdict.of(findings))
 
 
 def _finding(told: Sequence[Heard], refused: int) -> Finding:
@@ -56,5 +54,7 @@ def _finding(told: Sequence[Heard], refused: int) -> Finding:
     if not refused:
         return passed("answers on lanes", about, f"the lanes follow {len(told)} answers", 0.0)
     sentences = [heard.sentence for heard in told if heard.against]
-    says = f"{refused} of {len(told)} cannot be followed: {'; '.join(sentences[:_LISTED])}: answer these again"
+    says = (
+        f"{refused} of {len(told)} cannot be followed: {'; '.join(sentences[:_LISTED])}: answer these again"
+    )
     return Finding("answers on lanes", Status.WARN, float(refused), 0.0, "", says, about)

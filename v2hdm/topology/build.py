@@ -66,9 +66,7 @@ class Answered(NamedTuple):
     refused: tuple[Refusal, ...]
 
 
-def answered_graph(
-    hd_map: HDMap, trajectories: Sequence[Trajectory], answers: Sequence[Answer]
-) -> Answered:
+def answered_graph(hd_map: HDMap, trajectories: Sequence[Trajectory], answers: Sequence[Answer]) -> Answered:
     """The :func:`lane_graph` with those answers that contradict neither drives nor the map."""
     try:
         return Answered(lane_graph(hd_map, trajectories, answers), tuple(answers), ())

@@ -1,14 +1,14 @@
-"""The site of ``examples/lanes`` as rendered drives: its lines as paint, seen by a camera on each of ten ways.
+"""The site of ``examples/lanes`` as rendered drives: its lines as paint, seen by a camera on ten ways.
 
-Lines are painted 15 cm wide, dashes of 3 m with gaps of 3 m, every stop line whole; diamonds lie amid the lanes,
-as in a port. Ground, light and camera are those of the rendered port 1. No truth is written: a mapper that read
-these drives could not know it.
+Lines are painted 15 cm wide, dashes of 3 m with gaps of 3 m, every stop line whole; diamonds lie amid the
+lanes, as in a port. Ground, light and camera are those of the rendered port 1. No truth is written.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -114,7 +114,7 @@ def _lines(rng: np.random.Generator) -> list[Paint]:
             pieces = [(start_m, start_m + _DASH_M) for start_m in starts_m]
         else:
             ends_m = np.unique(np.concatenate([at_m, np.arange(0.0, at_m[-1], _PIECE_M)]))
-            pieces = list(zip(ends_m[:-1], ends_m[1:], strict=True))
+            pieces = list(pairwise(ends_m))
         for begin_m, end_m in pieces:
             begin, end = points_along(line, np.array([begin_m, end_m]))
             paints.append(_painted(LANE_LINE if kind == LANE_LINE else LANE_DASH, _ribbon(begin, end), rng))
@@ -130,7 +130,9 @@ def _ribbon(begin: FloatArray, end: FloatArray) -> FloatArray:
 
 def _stop_lines(rng: np.random.Generator) -> list[Paint]:
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    return [_painted(STOP_LINE, np.array(middle) + np.array(half) * corners, rng) for middle, half, _ in STOPS]
+    return [
+        _painted(STOP_LINE, np.array(middle) + np.array(half) * corners, rng) for middle, half, _ in STOPS
+    ]
 
 
 def _diamonds(ways: Sequence[Route], rng: np.random.Generator) -> list[Paint]:

@@ -134,14 +134,13 @@ def test_a_line_that_is_drawn_makes_a_lane_that_is_asked_about(browser, street):
 
 def test_an_answer_that_no_lane_follows_is_refused_and_one_in_the_file_is_told(street):
     address, folder, path = street
-    nowhere = {
-        "says": "answered", "subject": "direction", "answer": "along", "places_map": [[9.0, 90.0], [12.0, 90.0]],
-    }  # fmt: skip
+    places = [[9.0, 90.0], [12.0, 90.0]]
+    nowhere = {"says": "answered", "subject": "direction", "answer": "along", "places_map": places}
     status, text = ask(address, "POST", "correct", {"key": "x", "correction": nowhere})
     assert status == 400
     assert "no lane lies at (9.0, 90.0)" in text
     assert not path.exists()
-    stated = Correction(says="answered", kind="direction", outline_map=nowhere["places_map"], answer="along")
+    stated = Correction(says="answered", kind="direction", outline_map=places, answer="along")
     write_corrections([stated], str(folder), path)
     ask(address, "GET", "state.json")
     lanes = json.loads(ask(address, "GET", "lanes.json")[1])

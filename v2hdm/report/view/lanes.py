@@ -1,4 +1,4 @@
-"""The lanes of a result in its page: as lines and paths give them, with a person's corrections and answers."""
+"""The lanes of a result in its page, by lines, paths, and a person's corrections and answers."""
 
 from __future__ import annotations
 

@@ -62,7 +62,12 @@ def scene_of(
         "markings": [_marking(marking, index) for marking in hd_map.markings],
         "symbols": [_symbol(symbol, index) for symbol in hd_map.symbols],
         "lanes": [
-            {"id": line.id, "k": index[line.kind], "p": flat_mm(thinned(line.points_map)), "n": line.sightings}
+            {
+                "id": line.id,
+                "k": index[line.kind],
+                "p": flat_mm(thinned(line.points_map)),
+                "n": line.sightings,
+            }
             for line in lines
         ],
         "excluded": [

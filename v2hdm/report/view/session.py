@@ -258,7 +258,7 @@ class _Keys:
 
 
 def answer_key(subject: str, places: FloatArray) -> str:
-    """The key in the page of a question of a ``subject`` at one or two ``places`` (N, 2), m, and its answer."""
+    """The key in the page of a question, and of its answer: by ``subject`` and ``places`` (1 or 2, 2), m."""
     return f"q {subject} {places.round(_KEY_DIGITS).tolist()}"
 
 
