@@ -245,7 +245,7 @@ class _Keys:
             self._in_cell.setdefault(_cell(place[0]), []).append((key, place))
 
     def of(self, correction: Correction) -> str:
-        """That of a correction's feature; its outline, if that is not in the map."""
+        """The id of a correction's feature; its outline, if that is not in the map."""
         outline = np.array(correction.outline_map)
         if correction.is_answer:
             return answer_key(correction.kind, outline)
