@@ -77,4 +77,4 @@ def _root(solved: Sensitivity, late: Sequence[Hypothesis], sigma_s: FloatArray) 
     score = -efficient @ solved.flat(solved.residuals) / multiple
     covariance = np.linalg.inv(np.diag(sigma_s**-2.0) + information)
     mean = covariance @ score
-    return np.linalg.cholesky(covariance + np.outer(mean, mean))
+    return np.asarray(np.linalg.cholesky(covariance + np.outer(mean, mean)), dtype=np.float64)
