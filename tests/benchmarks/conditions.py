@@ -78,13 +78,14 @@ def mapped(port: PortConfig, executor: Executor) -> Iterator[Mapped]:
 
 def line(name: str, mapping: Mapped) -> str:
     """The figures of one map."""
+    corners = inside(mapping.errors["corners"])
+    sides = inside(mapping.errors["sides"])
     rmse_m = float(np.sqrt(np.mean(np.sum((mapping.corners - mapping.true) ** 2, axis=1))))
     stated_m2 = [np.trace(marking.covariance_m2) / 4 for marking in mapping.result.hd_map.markings]
     return (
         f"{name:24s} {100 * rmse_m:5.2f} cm, left {100 * left_m(mapping.corners, mapping.true):.2f}, "
         f"stated {100 * float(np.sqrt(np.median(stated_m2))):.2f}, {len(mapping.corners) // 4} markings, "
-        f"diagonals {1000 * longer_m(mapping):+.1f} mm, "
-        f"inside: corners {inside(mapping.errors['corners']):.2f}, sides {inside(mapping.errors['sides']):.2f}"
+        f"diagonals {1000 * longer_m(mapping):+.1f} mm, inside: corners {corners:.2f}, sides {sides:.2f}"
     )
 
 
