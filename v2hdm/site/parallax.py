@@ -154,7 +154,7 @@ def _measure(views: PointViews, count: int) -> Parallax:
         for mean, shared, single in (_GROUND, *_ELSEWHERE)
     )
     log_odds = ground - np.logaddexp(raised, moving_along) + np.log(len(_ELSEWHERE))
-    return Parallax(free.slope, free.covariance, log_odds)
+    return Parallax(free.slope, free.covariance(), log_odds)
 
 
 class _Distances(NamedTuple):
@@ -188,8 +188,13 @@ class _Fit(NamedTuple):
     """G candidates under one prior of s."""
 
     slope: FloatArray  # (G, P)
-    covariance: FloatArray  # (G, P, P)
+    information: FloatArray  # (G, U, U) on all unknowns
+    slopes: slice  # of s among these
     log_evidence: FloatArray  # (G,)
+
+    def covariance(self) -> FloatArray:
+        """The covariances (G, P, P) of s."""
+        return np.asarray(np.linalg.inv(self.information)[:, self.slopes, self.slopes], dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -283,8 +288,7 @@ class _Model:
         log_evidence = _sum(self.effective * either, self.group, count)
         log_evidence -= np.einsum("gi,ij,gj->g", away, prior, away) / 2
         log_evidence += (np.linalg.slogdet(prior)[1] - np.linalg.slogdet(information)[1]) / 2
-        inverse = np.asarray(np.linalg.inv(information)[:, slopes, slopes], dtype=np.float64)
-        return _Fit(1 - solved[:, slopes], inverse, log_evidence)
+        return _Fit(1 - solved[:, slopes], information, slopes, log_evidence)
 
 
 def _covariance(views: PointViews, by_pose: FloatArray) -> FloatArray:
