@@ -8,7 +8,7 @@ few, to cameras, frames and clocks.
 
 Numbers of observations are columns, (..., k): torch is several times faster along them than across.
 
-:class:`v2hdm.adjust.kernels.engine.NumbaEngine` inherits all of this and replaces the passes over the
+:class:`v2hdm.adjust.kernels.engine.KernelEngine` inherits all of this and replaces the passes over the
 observations by compiled ones.
 """
 

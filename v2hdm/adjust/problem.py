@@ -56,7 +56,8 @@ READ_OUT_SIGMA_S = 0.03
 (Ringaby and Forssen, International Journal of Computer Vision 96, 2012)."""
 
 LOSSES: tuple[str, ...] = ("none", "huber", "cauchy", "geman_mcclure")
-ENGINES: tuple[str, ...] = ("auto", "numba", "torch")
+ENGINES: tuple[str, ...] = ("auto", "native", "torch")
+OLD_ENGINES = {"numba": "native"}  # earlier names of engines, still accepted
 
 
 @dataclass(frozen=True)
@@ -282,9 +283,9 @@ class SolveOptions:
         gap_tolerance: predicted remaining decrease, as a fraction of the cost, at which to stop.
         max_refreshes: largest number of whitenings.
         max_evaluations: largest number of evaluations of cost and gradient, in total.
-        engine: of :data:`ENGINES`: ``numba`` by kernels on the CPU, compiled by numba unless the install
-            has compiled them from C++; ``torch`` by autograd anywhere; ``auto`` is kernels on the CPU, torch
-            elsewhere.
+        engine: of :data:`ENGINES`: ``native`` by kernels on the CPU, compiled by numba unless the install
+            has compiled them from C++ (``numba``, its earlier name, still chooses it); ``torch`` by autograd
+            anywhere; ``auto`` is kernels on the CPU, torch elsewhere.
         device: torch device.
     """
 

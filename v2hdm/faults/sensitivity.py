@@ -277,9 +277,10 @@ class Sensitivity:
     def information_by_stretch(self, columns: FloatArray) -> FloatArray:
         """Squared lengths (n, G + 1) of columns (n, R) by segment; last, priors of none."""
         order, begin = self._stretch_of
-        squares = np.square(columns[:, order])
-        parts = [slice(first, end) for first, end in pairwise(begin.tolist())]
-        return np.stack([squares[:, part].sum(1) for part in parts], axis=1)
+        stretch = np.empty(len(order), dtype=np.int64)
+        stretch[order] = np.repeat(np.arange(len(begin) - 1), np.diff(begin))
+        sums = [np.bincount(stretch, np.square(column), len(begin) - 1) for column in columns]
+        return np.array(sums).reshape(-1, len(begin) - 1)
 
 
 def _rows(arrays: Arrays, estimate: Estimate, observations: Tensor | None = None) -> Rows:
