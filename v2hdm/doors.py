@@ -41,10 +41,10 @@ def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
             arguments: Mapping[str, Any] = signature.bind(*args, **kwargs).arguments
         else:  # what does not belong to the signature the call itself refuses
             arguments = dict(zip(names, args, strict=False)) | kwargs
-        hints = _hints(function)
+        tests = _tests(function)
         for name, value in arguments.items():
-            if (hint := hints.get(name)) is not None:
-                _check(value, hint, f"{where}: {name}")
+            if name in tests and not tests[name](value):
+                _check(value, _hints(function)[name], f"{where}: {name}")
         return function(*args, **kwargs)
 
     return door
@@ -181,6 +181,12 @@ class _Names(dict[str, Any]):
         if name in self._module:
             return self._module[name]
         return vars(builtins)[name] if hasattr(builtins, name) else _ByName(name, (), {})
+
+
+@functools.cache
+def _tests(function: Callable[..., Any]) -> Mapping[str, Callable[[Any], bool]]:
+    """The tests of a function's arguments, by their names."""
+    return {name: _test_of(hint) for name, hint in _hints(function).items()}
 
 
 @functools.cache

@@ -324,11 +324,11 @@ class IncrementalMap:
         observations = _stacked([marking.observations for marking in sighted])
         counts = [len(marking.observations.corner) for marking in sighted]
         corner = observations.corner + np.repeat(starts[:-1], counts)
-        part = self._drive.seen_by(replace(observations, corner=corner))
         changes["control"] = _known([marking.control for marking in sighted], starts)
         changes["lengths"] = _known([marking.lengths for marking in sighted], starts)
-        extrinsics = self.cam_from_vehicle[part.cameras]
-        return replace(part.problem, cam_from_vehicle=extrinsics, **changes), part.cameras
+        changes["cam_from_vehicle"] = self.cam_from_vehicle
+        part = self._drive.seen_by(replace(observations, corner=corner), **changes)
+        return part.problem, part.cameras
 
 
 def _joined(
