@@ -28,7 +28,7 @@ from scipy.spatial import cKDTree
 
 from v2hdm.adjust import Problem, SolveOptions, solve
 from v2hdm.adjust.sections.parts import cut, parts_of_way
-from v2hdm.adjust.sections.solve import Shape, save_part, solve_parts
+from v2hdm.adjust.sections.solve import Shape, finish_parts, join_parts, save_part
 from v2hdm.cli.compose import conf_dir
 from v2hdm.detection.batch import detect_image
 from v2hdm.detection.detector import Detector
@@ -185,8 +185,10 @@ def _in_sections(
     with tempfile.TemporaryDirectory() as folder:
         for number, part in enumerate(parts):
             save_part(Path(folder), number, part)
-        results = solve_parts(
-            Path(folder), len(parts), links, Shape.of(problem, options),
+        shape = Shape.of(problem, options)
+        joined = join_parts(Path(folder), len(parts), links, shape, lambda number, part, solution: None)
+        results = finish_parts(
+            Path(folder), joined, shape,
             lambda number, part, solution: (
                 part.corners,
                 solution.corners_map,

@@ -99,6 +99,25 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
     return Outcome(inputs, settled, optimised.bundle, replace(evidence, foreign=foreign), final), optimised
 
 
+class Examined(NamedTuple):
+    """A solve of all observations with every input as stated, and what it says of these."""
+
+    inputs: Inputs
+    settled: Bundle
+    evidence: SolveEvidence
+
+
+def examine(inputs: Inputs, progress: Callable[[str], None]) -> Examined:
+    """Solve with all observations and test the inputs, but correct none; MappingError for nothing to map."""
+    tested = _over_ground(inputs, _settled(inputs, progress), progress)
+    inputs = tested.inputs
+    settled = tested.settled
+    foreign = _foreign(inputs, settled, tested.tests, progress)
+    suspected = _contradictions(settled, tested.tests, inputs.sightings, _session_names(inputs.drive))
+    evidence = _evidence(settled, suspected, (), inputs.optimiser, settled, inputs.sightings)
+    return Examined(inputs, settled, replace(evidence, foreign=foreign))
+
+
 def _log_correction(inputs: Inputs, error: Contradiction) -> None:
     about = f" {error.about}" if error.about else ""
     _log.warning(
