@@ -41,8 +41,8 @@ from v2hdm.io.drive.truth import read_truth
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.mapping.inputs import Inputs
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.mapping.sections import map_in_sections
-from v2hdm.records import Drive, FloatArray, HDMap, MarkingDetection, Truth
+from v2hdm.mapping.sections.run import map_in_sections
+from v2hdm.records import Drive, FloatArray, HDMap, Image, IntArray, MarkingDetection, Truth
 from v2hdm.simulate.port.config import PortConfig, SurveyConfig
 from v2hdm.simulate.survey.drive import simulated_drives
 
@@ -205,8 +205,8 @@ def _in_sections(
 class FromFiles:
     """Detections from a drive's files, read where they are needed."""
 
-    def __call__(self, drive: Drive, images: list[int]) -> list:
-        return [read_detections(drive.images[image].path, at) for at, image in enumerate(images)]
+    def __call__(self, images: list[Image], numbers: IntArray) -> list:
+        return [read_detections(image.path, at) for at, image in enumerate(images)]
 
 
 def one_length(length_km: float, section_m: float, workers: int, cache: Path) -> None:

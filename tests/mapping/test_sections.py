@@ -15,8 +15,9 @@ from v2hdm.executor import HERE
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions, SizeOptions
 from v2hdm.mapping.results import MethodResult
-from v2hdm.mapping.sections import map_in_sections, sections_of
-from v2hdm.records import Drive, ImageDetections
+from v2hdm.mapping.sections.run import map_in_sections
+from v2hdm.mapping.sections.section import sections_of
+from v2hdm.records import Image, ImageDetections, IntArray
 
 
 class Listed:
@@ -25,8 +26,8 @@ class Listed:
     def __init__(self, detections: Sequence[ImageDetections]) -> None:
         self.detections = detections
 
-    def __call__(self, drive: Drive, images: Sequence[int]) -> list[ImageDetections]:
-        return [replace(self.detections[image], image=at) for at, image in enumerate(images)]
+    def __call__(self, images: Sequence[Image], numbers: IntArray) -> list[ImageDetections]:
+        return [replace(self.detections[number], image=at) for at, number in enumerate(numbers)]
 
 
 class Elsewhere(type(HERE)):

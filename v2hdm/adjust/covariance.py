@@ -138,6 +138,18 @@ class Covariance:
         return np.asarray((of_factor + spread @ (by_near @ by_near.mT) @ spread.mT).cpu().numpy())
 
 
+class Dropped(Covariance):
+    """The covariances of a solution whose factors were dropped: nobody may ask for them."""
+
+    def __init__(self) -> None:
+        """Without a descent, there are no factors."""
+
+    @property
+    def whitening(self) -> Whitening:
+        """Raise AssertionError: a solution without factors was asked for its covariances."""
+        raise AssertionError("the factors of this solution were dropped; solve again for its covariances")
+
+
 def corner_gain(whitening: Whitening) -> FloatArray:
     """Regression (N, 2, C (6 + Q)) of corners on cameras: a change e of the cameras moves them by -gain e.
 

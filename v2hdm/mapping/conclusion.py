@@ -154,6 +154,7 @@ def conclude(solve: FinalSolve, acceptance: AcceptanceOptions) -> Optimised:
         acceptance,
         solve.standing_odds,
     )
+    classified.check()
     return concluded(solve, classified)
 
 
@@ -177,7 +178,7 @@ def proposed(solve: FinalSolve) -> Proposed:
 
 
 def concluded(solve: FinalSolve, classified: Classified) -> Optimised:
-    """The result of the final solve, whose candidates are ``classified``; MappingError if none is accepted."""
+    """The result of the final solve, whose candidates are ``classified``."""
     bundle = solve.bundle
     sightings = solve.sightings
     scale = bundle.solution.variance_scale

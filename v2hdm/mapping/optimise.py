@@ -51,7 +51,7 @@ from v2hdm.surface.surface import Recorded, Surface
 
 _log = logging.getLogger(__name__)
 
-_SETTLED_MODEL = "heave"  # pose model of the solves between associations: it omits no error of a pose
+SETTLED_MODEL = "heave"  # pose model of the solves between associations: it omits no error of a pose
 _STEEP_SINE = 0.15  # least sine of a ray's depression in the coarse stage, unless most rays are flatter
 
 _LOOSE_CLOCK_SIGMA_S = 0.3
@@ -87,7 +87,7 @@ class Optimiser:
     ) -> None:
         """``pose_noise`` is by session; gates use the largest of each kind."""
         self._seen = sightings
-        self._views = views
+        self.views = views
         self.sightings = sightings
         """The sightings, reduced to the plane."""
         self.surface: Surface | None = None
@@ -99,7 +99,7 @@ class Optimiser:
         self._pose_sigma = self.estimated_sigma = self.stated_sigma
         self._options = options
         self._recorded = Recorded.of(road, self._pose_noise)
-        self.pose_model = _SETTLED_MODEL if options.pose_model == AUTO else options.pose_model
+        self.pose_model = SETTLED_MODEL if options.pose_model == AUTO else options.pose_model
         """The pose model, one of :data:`v2hdm.adjust.MODELS`."""
         self._variance_factor = 1.0
         self.held_out: Mapping[str, float] = {}
@@ -181,7 +181,7 @@ class Optimiser:
             inlier=inlier,
             usable=usable,
             sightings=self.sightings,
-            views=self._views,
+            views=self.views,
             cameras=self._cameras,
             initial_rig=self.initial_rig,
             jitter_rad=self._pose_noise.roll_pitch_rad,
@@ -400,8 +400,8 @@ class Optimiser:
         try:
             selection = select_model(self._as_stated(bundle), bundle.model.solver)
         except AdjustError as failure:
-            _log.warning("the pose model stays %r, since none could be selected: %s", _SETTLED_MODEL, failure)
-            return _SETTLED_MODEL
+            _log.warning("the pose model stays %r, since none could be selected: %s", SETTLED_MODEL, failure)
+            return SETTLED_MODEL
         _log.info("%s: %s", ", ".join(self.camera_names), selection.sentence)
         self.held_out = selection.scores
         return selection.name

@@ -81,8 +81,8 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
         foreign = _foreign(inputs, settled, tested.tests, progress)
         remaining = None
         if worst is not None and log_odds(worst) > foreign.gain and len(corrected) < _MOST_CORRECTIONS:
-            is_ambiguous = _is_ambiguous(worst, tested.tests)
-            remaining = None if is_ambiguous else _recovered(inputs, worst, settled)
+            has_rival = is_ambiguous(worst, tested.tests)
+            remaining = None if has_rival else _recovered(inputs, worst, settled)
         if worst is None or remaining is None:
             break
         corrected += _contradictions(settled, (worst,), inputs.sightings, sessions)
@@ -276,7 +276,7 @@ def _evidence(
     )
 
 
-def _is_ambiguous(worst: ScoreTest, tests: Sequence[ScoreTest]) -> bool:
+def is_ambiguous(worst: ScoreTest, tests: Sequence[ScoreTest]) -> bool:
     """Whether another camera's fault, or for centres the poses' scale, would explain nearly as much."""
     if worst.fault.recovery is Recovery.DROP_CENTRES:
         least = doubt(worst) - RIVAL_LOG_ODDS
