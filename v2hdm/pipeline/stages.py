@@ -27,7 +27,7 @@ from v2hdm.pipeline.base import grey_reader
 from v2hdm.pipeline.config import Contents, model_key
 from v2hdm.pipeline.context import Context
 from v2hdm.progress import Progress, silent
-from v2hdm.records import BEST, Drive, ImageDetections
+from v2hdm.records import BEST, Drive, Image, ImageDetections, IntArray
 from v2hdm.site.living.changes import Base
 from v2hdm.store.cache import Line, key_of, log_again, recorded
 from v2hdm.survey.check_points import CheckTable

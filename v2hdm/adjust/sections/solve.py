@@ -3,8 +3,8 @@
 Each part is solved by itself at first. Then rounds follow: every part summarises what it says of its border
 (:mod:`v2hdm.adjust.sections.summary`), the summaries are joined (:mod:`v2hdm.adjust.sections.join`), and each
 part follows the border. This is a Gauss-Newton descent of the whole in which no process ever holds more than
-one part; parts are jobs of an executor, and their estimates lie in files between rounds. ``finish_parts`` makes
-of each part what needs its covariances.
+one part; parts are jobs of an executor, and their estimates lie in files between rounds. ``finish_parts``
+makes of each part what needs its covariances.
 """
 
 from __future__ import annotations
@@ -267,7 +267,7 @@ def join_parts(
     progress: Callable[[int, int], None] | None = None,
     gap_tolerance: float = GAP,
 ) -> Joint:
-    """Solve the ``count`` parts in ``folder`` together, and ``finish`` each, whose solution lacks covariances.
+    """Solve the ``count`` parts in ``folder`` together, and ``finish`` each without covariances.
 
     ``progress`` is called with the number of the round and the most that there may be. Raises AdjustError
     where parts leave a direction free or contradict each other, WorkerError where a process died.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -87,22 +87,22 @@ def _mean_sigma(sigmas: Sequence[PoseSigma], weight: FloatArray) -> PoseSigma:
         return float(np.sqrt(np.average(np.square(values), weights=weight)))
 
     def mean_drift(drifts: Sequence[Drift]) -> Drift:
-        over_m = np.exp(np.average(np.log([drift.over_m for drift in drifts]), weights=weight))
-        return replace(
-            drifts[0], sigma=root_mean_square([drift.sigma for drift in drifts]), over_m=float(over_m)
-        )
+        over_m = float(np.exp(np.average(np.log([drift.over_m for drift in drifts]), weights=weight)))
+        return Drift(root_mean_square([drift.sigma for drift in drifts]), over_m)
 
-    whites = ("position_m", "heading_rad", "roll_pitch_rad", "height_m")
-    drifts = ("position_drift", "heading_drift", "roll_pitch_drift")
-    return replace(
-        sigmas[0],
-        **{name: root_mean_square([getattr(sigma, name) for sigma in sigmas]) for name in whites},
-        **{name: mean_drift([getattr(sigma, name) for sigma in sigmas]) for name in drifts},
+    return PoseSigma(
+        position_m=root_mean_square([sigma.position_m for sigma in sigmas]),
+        heading_rad=root_mean_square([sigma.heading_rad for sigma in sigmas]),
+        roll_pitch_rad=root_mean_square([sigma.roll_pitch_rad for sigma in sigmas]),
+        height_m=root_mean_square([sigma.height_m for sigma in sigmas]),
+        position_drift=mean_drift([sigma.position_drift for sigma in sigmas]),
+        heading_drift=mean_drift([sigma.heading_drift for sigma in sigmas]),
+        roll_pitch_drift=mean_drift([sigma.roll_pitch_drift for sigma in sigmas]),
     )
 
 
 def named(sections: Sequence[Alone]) -> list[Names]:
-    """The names of all sections' groups; a marking belongs to the section most of whose own images show it."""
+    """The names of all sections' groups; a marking is of the section most of whose own images show it."""
     markings = _named_markings(sections)
     best: dict[int, tuple[int, int]] = {}
     count: Counter[int] = Counter()

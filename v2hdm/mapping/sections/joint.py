@@ -60,7 +60,7 @@ def fit_of(part: Part, solution: Solution) -> Fit:
     return Fit(
         mahalanobis2=solution.mahalanobis2,
         corner=part.corners[observations.corner],
-        freedom=2.0 - observations.on_line,
+        freedom=np.where(observations.on_line, 1.0, 2.0),
         is_behind=np.asarray(solution.verdict == Verdict.BEHIND_CAMERA),
         of_priors={name: cost for name, cost in solution.cost_terms.items() if name != "observations"},
         evaluations=solution.evaluations,
@@ -68,7 +68,7 @@ def fit_of(part: Part, solution: Solution) -> Fit:
 
 
 def gates(fits: Sequence[Fit], probability: float) -> list[Gate]:
-    """The gates of all sections' observations, at the scale of all; see :func:`v2hdm.adjust.solution.classify`."""
+    """The gates of all observations, at their common scale; see :func:`v2hdm.adjust.solution.classify`."""
     scale = noise_scale(np.concatenate([fit.mahalanobis2 for fit in fits]))
     limit = -2 * np.log(probability) * scale
     accepted = [(fit.mahalanobis2 <= limit) & ~fit.is_behind for fit in fits]

@@ -2,10 +2,10 @@
 
 1. Every section, with an overlap of images of its neighbours, is solved by itself, and tests its inputs.
 2. Groups of sightings that two sections have in common, image by image, are one marking.
-3. The solves of all sections are joined (:mod:`v2hdm.adjust.sections`), each with the images that are its own:
-   first with all observations, then with those that agree. These are the joint solves of the drive.
-4. The candidates of all sections are classified together: shapes are learnt over all. A marking belongs to the
-   section most of whose own images show it.
+3. The solves of all sections are joined (:mod:`v2hdm.adjust.sections`), each with the images that are its
+   own: first with all observations, then with those that agree. These are the joint solves of the drive.
+4. The candidates of all sections are classified together: shapes are learnt over all. A marking belongs to
+   the section most of whose own images show it.
 5. Every section makes its map, and their lanes are joined.
 
 Sections are jobs of an executor, and lie in files between these steps: no process holds more than one.
@@ -84,7 +84,7 @@ def map_in_sections(
     sections = sections_of(drive, most_m)
     _log.info("%d sections of at most %.0f m of way", len(sections), most_m)
     # Corrections are followed once, when all is known.
-    acceptance = replace(options.acceptance, corrections=())
+    acceptance = replace(options.acceptance, corrections=[])
     work = Work(detections_of, tuple(cameras), replace(options, acceptance=acceptance), folder, grey)
     for section in sections:
         work.write("section", section.number, section)

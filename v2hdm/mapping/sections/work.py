@@ -297,7 +297,8 @@ class Work:
             section: Section = self.read("section", places.number)
             grey_of_image = partial(_grey_of, self.grey, section.drive.images)
         final = replace(self._final(places.number), grey=grey_of_image)
-        return final.standing_odds(corners_map, is_end)[ours]
+        odds: FloatArray = final.standing_odds(corners_map, is_end)[ours]
+        return odds
 
     def finish(self, number: int, part: Part, solution: Solution) -> Finished:
         """The map of a section's markings, as all sections together have classified them."""
