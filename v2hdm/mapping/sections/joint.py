@@ -11,13 +11,18 @@ import numpy as np
 from v2hdm.adjust import Problem, Solution, Verdict
 from v2hdm.adjust.sections.parts import Part
 from v2hdm.adjust.solution import VarianceFactors, noise_scale, variance_factors
+from v2hdm.errors import AdjustError
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.conclusion import FinalSolve
 from v2hdm.mapping.recovery import Examined
 from v2hdm.mapping.sections.common import Names
 from v2hdm.mapping.sections.section import Section
-from v2hdm.records import BoolArray, FloatArray, IntArray
+from v2hdm.records import BoolArray, Drive, FloatArray, IntArray
 from v2hdm.site.candidates import scatter_of
+
+_CONTRADICTION_SIGMAS = 6.0
+"""Mean shift of a drive against others, in sigmas of its positions, from which it contradicts them; chosen: a
+receiver's slow errors average out over a network, to about one sigma along a single street."""
 
 _OF_CAMERAS = ("camera_centre", "clock_offsets")  # priors that every section has of the same cameras
 
@@ -44,7 +49,8 @@ class Fit(NamedTuple):
     freedom: FloatArray  # (K,) 2, or 1 of a corner that is known along one line
     is_behind: BoolArray  # (K,) the camera
     of_priors: dict[str, float]  # their parts of the cost
-    evaluations: int
+    shift_m: FloatArray  # (S, 2) sum of how far the frames of each session moved from their recorded poses
+    frames: IntArray  # (S,) number of these
 
 
 class Gate(NamedTuple):
@@ -56,15 +62,47 @@ class Gate(NamedTuple):
 
 def fit_of(part: Part, solution: Solution) -> Fit:
     """How the observations of a part fit."""
-    observations = part.problem.observations
+    problem = part.problem
+    observations = problem.observations
+    frames = np.unique(observations.frame)
+    session = problem.session_of_frame[frames]
+    moved_m = (solution.map_from_vehicle - problem.map_from_vehicle)[frames, :2, 3]
+    shift_m = np.zeros((problem.session_count, 2))
+    np.add.at(shift_m, session, moved_m)
     return Fit(
         mahalanobis2=solution.mahalanobis2,
         corner=part.corners[observations.corner],
         freedom=np.where(observations.on_line, 1.0, 2.0),
         is_behind=np.asarray(solution.verdict == Verdict.BEHIND_CAMERA),
         of_priors={name: cost for name, cost in solution.cost_terms.items() if name != "observations"},
-        evaluations=solution.evaluations,
+        shift_m=shift_m,
+        frames=np.bincount(session, minlength=problem.session_count),
     )
+
+
+def refuse_contradicting_drives(fits: Sequence[Fit], drive: Drive) -> None:
+    """Raise AdjustError where the markings shift one drive of a network against the others.
+
+    A shift of all drives shows in no marking; so the mean shift of each is compared with that of all others.
+    """
+    frames = np.sum([fit.frames for fit in fits], axis=0)
+    shift_m = np.sum([fit.shift_m for fit in fits], axis=0)
+    worst: tuple[float, str, float] | None = None
+    for number, session in enumerate(drive.joined):
+        others = frames.sum() - frames[number]
+        if not frames[number] or not others:
+            continue
+        of_others_m = (shift_m.sum(axis=0) - shift_m[number]) / others
+        off_m = float(np.linalg.norm(shift_m[number] / frames[number] - of_others_m))
+        sigmas = off_m / session.pose_noise.position_m
+        if sigmas > _CONTRADICTION_SIGMAS and (worst is None or sigmas > worst[0]):
+            worst = sigmas, session.name, off_m
+    if worst is not None:
+        raise AdjustError(
+            f"the drives contradict each other: markings shift drive {worst[1]} by {100 * worst[2]:.0f} cm "
+            f"against the others, {worst[0]:.0f} times the noise stated for its positions; map the drives "
+            "one by one to find the one whose poses are wrong, or state more noise (pose_noise.position_m)"
+        )
 
 
 def gates(fits: Sequence[Fit], probability: float) -> list[Gate]:

@@ -14,7 +14,7 @@ Sections are jobs of an executor, and lie in files between these steps: no proce
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
@@ -36,7 +36,13 @@ from v2hdm.mapping.options import AUTO, MappingOptions, check_sections
 from v2hdm.mapping.results import MethodResult
 from v2hdm.mapping.sections.common import Alone, Names, named, pooled_noise
 from v2hdm.mapping.sections.faults import pooled_tests, refuse_contradicted
-from v2hdm.mapping.sections.joint import Fit, gates, scatter_by_marking, variance_of
+from v2hdm.mapping.sections.joint import (
+    Fit,
+    gates,
+    refuse_contradicting_drives,
+    scatter_by_marking,
+    variance_of,
+)
 from v2hdm.mapping.sections.merging import merged
 from v2hdm.mapping.sections.section import part_of_frame, sections_of
 from v2hdm.mapping.sections.work import (
@@ -52,13 +58,17 @@ from v2hdm.mapping.sections.work import (
 )
 from v2hdm.records import BoolArray, Drive, FloatArray, IntArray
 from v2hdm.site.candidates import Candidates, Counts
-from v2hdm.site.corrections import added_markings, with_symbols_corrected
+from v2hdm.site.corrections import Heard, added_markings, with_symbols_corrected
 from v2hdm.site.line_corrections import with_lines_corrected
 from v2hdm.site.markings import Classified, classify
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import Parallax
 
 _log = logging.getLogger(__name__)
+
+_CLASSIFIED_AT_ONCE = 5000
+"""Most candidates that are classified together, of neighbouring sections: memory and time would grow with their
+square, and thousands tell all of a class's shapes."""
 
 _SETTLED_GAP = 1e-6  # gap of the joint solve that outliers are told by, a fraction of the cost
 
@@ -98,7 +108,7 @@ def map_in_sections(
     )
     del sections
     solved = _joint_solves(run, drive, part, alone)
-    classified = _classified(run, solved, options.acceptance)
+    heard = _classified(run, solved, options.acceptance)
     finished: list[Finished] = run.finish(solved, solved.work.finish)
     result = merged([section.result for section in finished], drive, own_images)
     assert result.evidence is not None
@@ -107,7 +117,7 @@ def map_in_sections(
         result,
         hd_map=replace(result.hd_map, lanes=lanes),
         evidence=replace(result.evidence, score_tests=tests, held_out=solved.held_out),
-        heard=classified.heard,
+        heard=heard,
     )
     return _corrected(result, options.acceptance)
 
@@ -129,7 +139,7 @@ class _Run:
         with closing(self.executor.side_by_side(work, todo)) as outcomes:
             for number, outcome in outcomes:
                 if isinstance(outcome, WorkerError):
-                    raise outcome
+                    raise WorkerError(f"{step}, section {number + 1} of {self.count}: {outcome}")
                 results[number] = outcome
                 self.progress(step, len(results), len(todo))
         return [results[number] for number in range(len(todo))]
@@ -163,6 +173,7 @@ def _joint_solves(run: _Run, drive: Drive, part: IntArray, alone: Sequence[Alone
     model = full_model(noise.pose_sigma, options, pose_model, noise.variance_factor)
     work = replace(run.work, model=model)
     fits, _, shape = _join(run, work, drive, part, _SETTLED_GAP)
+    refuse_contradicting_drives(fits, drive)
     for number, gate in enumerate(gates(fits, model.solver.gate_probability)):
         work.write("gate", number, gate)
     observations = np.array([section.observations for section in alone])
@@ -203,20 +214,38 @@ def _join(run: _Run, work: Work, drive: Drive, part: IntArray, gap: float) -> tu
     return joint.results, joint, shape
 
 
-def _classified(run: _Run, solved: _Solved, acceptance: AcceptanceOptions) -> Classified:
+def _classified(run: _Run, solved: _Solved, acceptance: AcceptanceOptions) -> tuple[Heard, ...]:
     """Classify the candidates of all sections together, and tell every section of its own."""
+    proposals: list[Proposal] = run.finish(solved, solved.work.propose)
+    count = np.array([len(proposal.kinds) for proposal in proposals])
+    batches = max(-(-int(count.sum()) // _CLASSIFIED_AT_ONCE), 1)
+    batch = (np.cumsum(count) - count) * batches // max(int(count.sum()), 1)
+    heard: list[Heard] = []
+    classes = []
+    for number in range(batches):
+        chosen = np.flatnonzero(batch == number).tolist()
+        classes.append(_classified_batch(run, solved, {k: proposals[k] for k in chosen}, acceptance))
+        heard += classes[-1].heard
+    if not any(len(classified.accepted) for classified in classes):
+        classes[0].check()
+    return tuple(heard)
+
+
+def _classified_batch(
+    run: _Run, solved: _Solved, proposals: Mapping[int, Proposal], acceptance: AcceptanceOptions
+) -> Classified:
+    """Classify the candidates of some sections together."""
     work = solved.work
-    proposals: list[Proposal] = run.finish(solved, work.propose)
-    names = [kind for proposal in proposals for kind in proposal.kinds]
-    kinds = sorted(set(names))
+    names = [kind for proposal in proposals.values() for kind in proposal.kinds]
+    kinds = sorted(set(names)) or [""]
     index = {name: number for number, name in enumerate(kinds)}
-    ends = np.cumsum([len(proposal.kinds) for proposal in proposals])
-    rows = np.split(np.arange(len(names)), ends[:-1])
+    ends = np.cumsum([len(proposal.kinds) for proposal in proposals.values()])
+    rows = dict(zip(proposals, np.split(np.arange(len(names)), ends[:-1]), strict=True))
 
     def places(corners_map: FloatArray, is_end: BoolArray | None = None) -> list[Places]:
         return [
             Places(number, corners_map[at], None if is_end is None else is_end[at])
-            for number, at in enumerate(rows)
+            for number, at in rows.items()
         ]
 
     def counted(corners_map: FloatArray) -> Counts:
@@ -227,24 +256,25 @@ def _classified(run: _Run, solved: _Solved, acceptance: AcceptanceOptions) -> Cl
     def standing(corners_map: FloatArray, is_end: BoolArray) -> FloatArray:
         return np.concatenate(run.all(work.look, "look at ends", places(corners_map, is_end)))
 
+    solutions = [proposal.solved for proposal in proposals.values()]
+    parallaxes = [proposal.parallax for proposal in proposals.values()]
     classified = classify(
         Candidates(
-            np.concatenate([proposal.solved.corners_map for proposal in proposals]),
-            np.concatenate([proposal.solved.covariance_m2 for proposal in proposals]),
+            np.concatenate([candidates.corners_map for candidates in solutions]),
+            np.concatenate([candidates.covariance_m2 for candidates in solutions]),
         ),
         np.array([index[name] for name in names], dtype=np.int64),
         kinds,
         counted,
         Parallax(
-            np.concatenate([proposal.parallax.slope for proposal in proposals]),
-            np.concatenate([proposal.parallax.covariance for proposal in proposals]),
-            np.concatenate([proposal.parallax.log_odds for proposal in proposals]),
+            np.concatenate([parallax.slope for parallax in parallaxes]),
+            np.concatenate([parallax.covariance for parallax in parallaxes]),
+            np.concatenate([parallax.log_odds for parallax in parallaxes]),
         ),
         acceptance,
         None if work.grey is None else standing,
     )
-    classified.check()
-    for number, at in enumerate(rows):
+    for number, at in rows.items():
         work.write("classified", number, classified_of(classified, at, solved.names[number], kinds))
     return classified
 
