@@ -221,6 +221,7 @@ def one_length(length_km: float, section_m: float, workers: int, cache: Path) ->
     figures = {
         "km": length_km,
         "images": len(drive.images),
+        "observations": result.diagnostics["observations"],
         "markings": len(result.hd_map.markings),
         "true": len(true_map.markings),
         "wall_s": time.perf_counter() - begin_s,
@@ -263,9 +264,12 @@ def grow(lengths_km: list[float], section_m: float, workers: int, cache: Path) -
         shown = {key: round(value, 3) for key, value in rows[-1].items()}
         print(" ".join(f"{key} {value:g}" for key, value in shown.items()), flush=True)
     if len(rows) > 1:
-        ratio = np.log(rows[-1]["images"] / rows[0]["images"])
-        for key in ("cpu_s", "peak_mb"):
-            print(f"exponent of {key}: {np.log(rows[-1][key] / rows[0][key]) / ratio:.2f}")
+        # Short networks have more streets than yards: cost follows the observations as well as the way.
+        for size in ("images", "observations"):
+            ratio = np.log(rows[-1][size] / rows[0][size])
+            for key in ("cpu_s", "peak_mb"):
+                exponent = np.log(rows[-1][key] / rows[0][key]) / ratio
+                print(f"exponent of {key} by {size}: {exponent:.2f}")
 
 
 def main() -> None:

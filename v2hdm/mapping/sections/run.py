@@ -67,8 +67,8 @@ from v2hdm.site.parallax import Parallax
 _log = logging.getLogger(__name__)
 
 _CLASSIFIED_AT_ONCE = 5000
-"""Most candidates that are classified together, of neighbouring sections: memory and time would grow with their
-square, and thousands tell all of a class's shapes."""
+"""Most candidates, of neighbouring sections, that are classified together: memory and time would grow with
+their square, and thousands tell all of a class's shapes."""
 
 _SETTLED_GAP = 1e-6  # gap of the joint solve that outliers are told by, a fraction of the cost
 
