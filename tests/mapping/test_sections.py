@@ -209,10 +209,10 @@ def late(value: float, sigma: float) -> Contradiction:
 
 
 def test_an_error_that_every_section_hints_at_is_seen_by_all_together():
-    (pooled,) = pooled_tests([[late(0.004, 0.002)]] * 16)
-    assert pooled.value == pytest.approx(0.004)
-    assert pooled.sigma == pytest.approx(0.0005)
-    with pytest.raises(MappingError, match=r"contradict the clock of front by 8 sigmas \(\+0\.004 s\)"):
+    (pooled,) = pooled_tests([[late(0.02, 0.01)]] * 16)
+    assert pooled.value == pytest.approx(0.02)
+    assert pooled.sigma == pytest.approx(0.0025)
+    with pytest.raises(MappingError, match=r"contradict the clock of front by 8 sigmas \(\+0\.02 s\)"):
         refuse_contradicted([pooled], NO_SEGMENT)
 
 
