@@ -238,7 +238,7 @@ class _Detections:
     listed: tuple[ImageDetections, ...] | None = None
 
     def __call__(self, images: Sequence[Image], numbers: IntArray) -> list[ImageDetections]:
-        """Those in images of such numbers in the drive, numbered in their order."""
+        """The detections in images of such numbers in the drive, numbered in their order."""
         if self.listed is None:
             return [read_detections(image.path, at) for at, image in enumerate(images)]
         place = {number: at for at, number in enumerate(numbers.tolist())}
