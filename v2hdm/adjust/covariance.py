@@ -29,6 +29,16 @@ class Moves:
     extrinsic: FloatArray  # (C, 6, B) left tangents
     poses: FloatArray  # (J, 6, B) tangents
 
+    def beside(self, other: Moves | None) -> Moves:
+        """These errors and independent ``other`` ones."""
+        if other is None:
+            return self
+        return Moves(
+            np.concatenate([other.corners, self.corners], axis=2),
+            np.concatenate([other.extrinsic, self.extrinsic], axis=2),
+            np.concatenate([other.poses, self.poses], axis=2),
+        )
+
 
 @dataclass(frozen=True)
 class Covariance:

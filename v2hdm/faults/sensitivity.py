@@ -234,6 +234,16 @@ class Sensitivity:
         slopes = torch.autograd.grad(along, list(leaves.values()), retain_graph=True, materialize_grads=True)
         return Gradient(**dict(zip(leaves, slopes, strict=True)))
 
+    def moves(self, columns: FloatArray) -> Moves:
+        """Motion of the solution under unit errors with columns (2 K, B) of the observations' residuals."""
+        arrays = self.arrays
+        steps = self.jacobians.steps(self.jacobians.whiten(columns, [None] * columns.shape[1]))
+        of_corners = np.empty(tuple(steps.corners_map.shape))
+        of_corners[arrays.corner_order.cpu().numpy()] = -steps.corners_map.cpu().numpy()
+        of_poses = np.zeros((arrays.frame_count, 6, columns.shape[1]))
+        of_poses[:, list(arrays.states)] = -steps.frame_state.cpu().numpy()
+        return Moves(of_corners, -steps.extrinsic.cpu().numpy(), of_poses)
+
     def flat(self, rows: Rows) -> FloatArray:
         """All residuals, or derivatives, concatenated, (R,)."""
         return np.concatenate([rows[name].detach().flatten().cpu().numpy() for name in self.residuals])
@@ -334,12 +344,6 @@ def height_information(solution: Solution, heights: Any) -> tuple[FloatArray, Fl
 def moves_with_heights(solution: Solution, heights: FloatArray) -> Moves:
     """Motion of a solution under B errors of the observed ground's heights (K, B), m."""
     solved = Sensitivity.at(solution.covariance.whitening)
-    arrays = solved.arrays
     unit = raised(solved, torch.ones_like(solved.root))["observations"].cpu().numpy()
-    by_height = (unit[:, :, None] * heights[arrays.order.cpu().numpy()]).reshape(-1, heights.shape[1])
-    steps = solved.jacobians.steps(solved.jacobians.whiten(by_height, [None] * heights.shape[1]))
-    of_corners = np.empty(tuple(steps.corners_map.shape))
-    of_corners[arrays.corner_order.cpu().numpy()] = -steps.corners_map.cpu().numpy()
-    of_poses = np.zeros((arrays.frame_count, 6, heights.shape[1]))
-    of_poses[:, list(arrays.states)] = -steps.frame_state.cpu().numpy()
-    return Moves(of_corners, -steps.extrinsic.cpu().numpy(), of_poses)
+    by_height = unit[:, :, None] * heights[solved.arrays.order.cpu().numpy()]
+    return solved.moves(by_height.reshape(-1, heights.shape[1]))

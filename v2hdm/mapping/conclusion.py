@@ -8,12 +8,24 @@ from typing import NamedTuple
 
 import numpy as np
 
+from v2hdm.adjust.covariance import Moves
 from v2hdm.association.ground import Located, Views, easy_views, images_with_line, images_with_symbol, locate
 from v2hdm.association.groups import fuse_groups, group_kinds
 from v2hdm.association.sightings import Rig, Sightings
+from v2hdm.faults.clock_errors import moves_with_clocks
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.mapping.bundle import Bundle
-from v2hdm.records import BoolArray, Calibration, Camera, Exclusion, FloatArray, IntArray, Marking
+from v2hdm.records import (
+    BoolArray,
+    Calibration,
+    Camera,
+    Exclusion,
+    FloatArray,
+    IntArray,
+    Marking,
+    PoseNoise,
+)
+from v2hdm.site.accuracy import corner_radii_m, radius_of_all_m
 from v2hdm.site.candidates import Candidates, Counts, scatter_of, with_dissent, with_shared_errors
 from v2hdm.site.corrections import Heard
 from v2hdm.site.markings import Classified, Suspicion, classify, most_suspicious
@@ -37,6 +49,7 @@ class Optimised:
     initial_reprojection_rmse_px: float  # under the initial ones
     suspicions: Sequence[Suspicion] = ()  # the worst first
     heard: tuple[Heard, ...] = ()  # of a person's corrections
+    clock_m: float | None = None  # 95 % radius of the corners by what clocks may err alone; None: they do not
 
 
 @dataclass(frozen=True)
@@ -142,8 +155,12 @@ class Proposed(NamedTuple):
     parallax: Parallax
 
 
-def conclude(solve: FinalSolve, acceptance: AcceptanceOptions) -> Optimised:
-    """Classify the candidates of the final solve; raises MappingError if none is accepted."""
+def conclude(solve: FinalSolve, acceptance: AcceptanceOptions, noises: Sequence[PoseNoise] = ()) -> Optimised:
+    """Classify the candidates of the final solve; raises MappingError if none is accepted.
+
+    What the clocks may err by under the ``noises`` of the sessions moves all markings, and is a reason
+    against none of them: it is stated of those that are accepted.
+    """
     candidates = proposed(solve)
     classified = classify(
         candidates.solved,
@@ -155,7 +172,7 @@ def conclude(solve: FinalSolve, acceptance: AcceptanceOptions) -> Optimised:
         solve.standing_odds,
     )
     classified.check()
-    return concluded(solve, classified)
+    return concluded(solve, classified, noises)
 
 
 def proposed(solve: FinalSolve) -> Proposed:
@@ -177,13 +194,24 @@ def proposed(solve: FinalSolve) -> Proposed:
     )
 
 
-def concluded(solve: FinalSolve, classified: Classified) -> Optimised:
-    """The result of the final solve, whose candidates are ``classified``."""
+def concluded(solve: FinalSolve, classified: Classified, noises: Sequence[PoseNoise] = ()) -> Optimised:
+    """The result of the final solve, whose candidates are ``classified``; see :func:`conclude`."""
     bundle = solve.bundle
     sightings = solve.sightings
     scale = bundle.solution.variance_scale
+    by_clock = _by_clock(bundle, noises)
+    markings = classified.markings()
+    clock_m = None
+    if by_clock is not None:
+        bundle = _with_errors(bundle, by_clock)
+        shared_m2 = scale * _shared_by(by_clock, bundle.corner_index[classified.accepted])
+        clock_m = radius_of_all_m(np.concatenate([corner_radii_m(block) for block in shared_m2]))
+        markings = tuple(
+            replace(marking, covariance_m2=marking.covariance_m2 + block)
+            for marking, block in zip(markings, shared_m2, strict=True)
+        )
     markings = with_relative_sigma(
-        classified.markings(),
+        markings,
         bundle.corner_index[classified.accepted],
         lambda pairs: scale * bundle.solution.corner_covariance(pairs),
     )
@@ -199,7 +227,31 @@ def concluded(solve: FinalSolve, classified: Classified) -> Optimised:
         initial_reprojection_rmse_px=_root_mean_square(solve.residual_px(solve.initial_rig)[used]),
         suspicions=most_suspicious(classified.accepted, classified.misfit, squared, classified.counts),
         heard=classified.heard,
+        clock_m=clock_m,
     )
+
+
+def _by_clock(bundle: Bundle, noises: Sequence[PoseNoise]) -> Moves | None:
+    """What the clocks may move a solution by; its scale is of residuals, and none of the clocks."""
+    if not noises:
+        return None
+    moves = moves_with_clocks(bundle.problem, bundle.solution, noises)
+    root = bundle.solution.variance_scale**-0.5
+    return None if moves is None else Moves(*(root * part for part in vars(moves).values()))
+
+
+def _with_errors(bundle: Bundle, moves: Moves) -> Bundle:
+    """``bundle`` with covariances that hold further errors."""
+    covariance = bundle.solution.covariance
+    covariance = replace(covariance, held=moves.beside(covariance.held))
+    return replace(bundle, solution=replace(bundle.solution, covariance=covariance))
+
+
+def _shared_by(moves: Moves, corner_index: IntArray) -> FloatArray:
+    """Covariances (M, 8, 8) of markings with corners (M, 4), of which unseen ones (-1) move as a seen one."""
+    index = np.where(corner_index >= 0, corner_index, corner_index.max(axis=1, keepdims=True))
+    moved = moves.corners[index].reshape(len(index), 8, -1)
+    return np.asarray(moved @ moved.swapaxes(1, 2))
 
 
 def calibrations_of(bundle: Bundle, cameras: Mapping[str, Camera]) -> dict[str, Calibration]:

@@ -90,13 +90,14 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
         inputs = remaining
     # 4. Choose the pose model, solve without outliers and classify the candidates.
     final = optimiser.final_solve(settled, progress, inputs.find_knots, inputs.grey_of_image)
-    optimised = conclude(final, inputs.options.acceptance)
+    optimised = conclude(final, inputs.options.acceptance, inputs.drive.noises)
     corrected = [
         _as_solved(error, settled) for error in corrected if _is_of_the_map(error, survey, optimised)
     ]
     suspected = _contradictions(settled, tested.tests, inputs.sightings, sessions)
     evidence = _evidence(settled, suspected, corrected, optimiser, optimised.bundle, inputs.sightings)
-    return Outcome(inputs, settled, optimised.bundle, replace(evidence, foreign=foreign), final), optimised
+    evidence = replace(evidence, foreign=foreign, clock_m=optimised.clock_m)
+    return Outcome(inputs, settled, optimised.bundle, evidence, final), optimised
 
 
 class Examined(NamedTuple):

@@ -310,16 +310,17 @@ class Work:
         joint = replace(bundle.solution, covariance=solution.covariance)
         bundle = replace(bundle, solution=joint)
         final = replace(final, bundle=bundle)
-        optimised = concluded(final, self.read("classified", number))
+        optimised = concluded(final, self.read("classified", number), section.drive.noises)
         evidence = replace(
             examined.evidence,
             pose_model=self.pose_model,
             clock_s=clocks_of(bundle),
             read_out_s=read_outs_of(bundle),
+            clock_m=optimised.clock_m,
         )
         inputs = examined.inputs
         inputs.optimiser.pose_model = self.pose_model
-        outcome = Outcome(inputs, examined.settled, bundle, evidence, final)
+        outcome = Outcome(inputs, examined.settled, optimised.bundle, evidence, final)
         result = optimised_result(outcome, optimised, with_lanes=False, with_alone=number == self.fullest)
         return Finished(self._of_own_images(section, result, names, bundle), self._lanes(section, outcome))
 
