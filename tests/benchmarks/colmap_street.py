@@ -1,9 +1,9 @@
-"""COLMAP on a real drive beside our result of it: images used, reprojection error, and the camera's mounting.
+"""COLMAP on a real drive beside our result of it: images used, reprojection error, the camera's mounting.
 
-``python -m tests.benchmarks.colmap_street DRIVE RESULT CAMERA`` (extra ``bench``) gives COLMAP the images, the
-intrinsics, and for each image the camera's centre by the recorded pose and the stated mounting as a prior, see
-:mod:`tests.benchmarks.colmap_peer`. There is no truth of the poses. What can be compared is how the camera is
-turned on the vehicle, of COLMAP the mean over the images and how they scatter, beside what was stated before.
+``python -m tests.benchmarks.colmap_street DRIVE RESULT CAMERA`` (extra ``bench``) gives COLMAP the images,
+the intrinsics, and for each image the camera's centre by the recorded pose and the stated mounting as a prior,
+see :mod:`tests.benchmarks.colmap_peer`. There is no truth of the poses. What can be compared is how the camera
+is turned on the vehicle, of COLMAP the mean over the images and how they scatter, beside what was stated.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from v2hdm.report.page.facts import read_facts
 
 
 def turned_deg(cam_from_vehicle: FloatArray, before: FloatArray) -> FloatArray:
-    """Yaw to the left, pitch nose down and roll to the right (3,) since ``before``, about the vehicle's axes."""
+    """Yaw to the left, pitch nose down and roll to the right (3,) since ``before``, by the vehicle's axes."""
     turn_vehicle = cam_from_vehicle[:3, :3].T @ before[:3, :3]
     return np.asarray(Rotation.from_matrix(turn_vehicle).as_euler("ZYX", degrees=True))
 
