@@ -1,9 +1,9 @@
 """COLMAP on a real drive beside our result of it: images used, reprojection error, the camera's mounting.
 
 ``python -m tests.benchmarks.colmap_street DRIVE RESULT CAMERA`` (extra ``bench``) gives COLMAP the images,
-the intrinsics, and for each image the camera's centre by the recorded pose and the stated mounting as a prior,
-see :mod:`tests.benchmarks.colmap_peer`. There is no truth of the poses. What can be compared is how the camera
-is turned on the vehicle, of COLMAP the mean over the images and how they scatter, beside what was stated.
+the intrinsics, and for each image the camera's centre by the recorded pose and the stated mounting as a
+prior, see :mod:`tests.benchmarks.colmap_peer`. There is no truth of the poses. What can be compared is how
+the camera is turned on the vehicle, of COLMAP the mean over images and its scatter, beside what was stated.
 """
 
 from __future__ import annotations
