@@ -230,11 +230,9 @@ class Sensitivity:
         of_priors = [name for name in column if name != "observations"]
         if not of_priors:
             return None
-        # A product: with gradients of its own, autograd first loads torch's symbolic shapes, for two seconds.
-        product = torch.stack([(priors[name] * column[name]).sum() for name in of_priors]).sum()
-        slopes = torch.autograd.grad(
-            product, list(leaves.values()), retain_graph=True, materialize_grads=True
-        )
+        # Of a sum: gradients handed to autograd would load sympy, for two seconds, to compare their shapes.
+        along = torch.stack([(priors[name] * column[name]).sum() for name in of_priors]).sum()
+        slopes = torch.autograd.grad(along, list(leaves.values()), retain_graph=True, materialize_grads=True)
         return Gradient(**dict(zip(leaves, slopes, strict=True)))
 
     def moves(self, columns: FloatArray) -> Moves:
