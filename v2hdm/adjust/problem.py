@@ -57,7 +57,6 @@ READ_OUT_SIGMA_S = 0.03
 
 LOSSES: tuple[str, ...] = ("none", "huber", "cauchy", "geman_mcclure")
 ENGINES: tuple[str, ...] = ("auto", "native", "torch")
-OLD_ENGINES = {"numba": "native"}  # earlier names of engines, still accepted
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,10 @@ from v2hdm import native
 from v2hdm.compiled import folder_of, is_numba_there
 
 
+NAMES = ("native", "numba")
+"""The names of this engine: the second is an earlier one, still accepted."""
+
+
 def are_compiled() -> bool:
     """Whether kernels are compiled, or numba is there to do it; as Python they suit small problems."""
     return native.kernels() is not None or is_numba_there()
