@@ -13,7 +13,6 @@ from pathlib import Path
 from v2hdm import native
 from v2hdm.compiled import folder_of, is_numba_there
 
-
 NAMES = ("native", "numba")
 """The names of this engine: the second is an earlier one, still accepted."""
 
