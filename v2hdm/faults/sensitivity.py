@@ -288,7 +288,7 @@ class Sensitivity:
         stretch = np.empty(len(order), dtype=np.int64)
         stretch[order] = np.repeat(np.arange(len(begin) - 1), np.diff(begin))
         sums = [np.bincount(stretch, np.square(column), len(begin) - 1) for column in columns]
-        return np.array(sums).reshape(-1, len(begin) - 1)
+        return np.array(sums, dtype=np.float64).reshape(-1, len(begin) - 1)
 
 
 def _rows(arrays: Arrays, estimate: Estimate, observations: Tensor | None = None) -> Rows:

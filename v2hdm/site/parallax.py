@@ -314,7 +314,7 @@ class _Sums(NamedTuple):
     order: IntArray  # (N,) that brings the members of a group together
     groups: IntArray  # with members
     first: IntArray  # of each of these, in that order
-    count: int
+    total: int  # number of groups, G
 
     @classmethod
     def by(cls, group: IntArray, count: int) -> _Sums:
@@ -325,7 +325,7 @@ class _Sums(NamedTuple):
 
     def of(self, values: FloatArray | BoolArray) -> FloatArray:
         """Sums (G, ...) of values (N, ...)."""
-        totals = np.zeros((self.count, *values.shape[1:]))
+        totals = np.zeros((self.total, *values.shape[1:]))
         if len(self.groups):
             totals[self.groups] = np.add.reduceat(values[self.order].astype(np.float64), self.first, axis=0)
         return totals
