@@ -19,17 +19,9 @@ from v2hdm.errors import ConfigError, DriveError, MapFileError, need
 from v2hdm.geometry.geodetic import crs_of
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.io.trajectory import read_tum
-from v2hdm.mosaic.blend import (
-    Canvas,
-    Lens,
-    Sheet,
-    Shot,
-    adjusted_shots,
-    blend,
-    lens_of,
-    recorded_shots,
-    whole,
-)
+from v2hdm.mosaic.blend import Sheet, blend, whole
+from v2hdm.mosaic.consensus import CELL_M, Consensus, find_consensus
+from v2hdm.mosaic.views import Canvas, Lens, Shot, adjusted_shots, lens_of, recorded_shots
 from v2hdm.progress import Steps
 from v2hdm.records import Drive, FloatArray, GeodeticOrigin, HDMap
 from v2hdm.report import style
