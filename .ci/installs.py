@@ -59,7 +59,11 @@ MORE = {
         "python -c 'import v2hdm.paper, v2hdm.experiment.run'",
         "v2hdm detect images --limit 1",
     ),
-    "map,ros": ("v2hdm check site --list-topics", "v2hdm detect site --limit 1"),
+    "map,ros": (
+        "v2hdm check site --list-topics",
+        "v2hdm detect site --limit 1",
+        "v2hdm export map.geojson --format mcap",
+    ),
     "map,video": (
         "v2hdm check drives/film --no-ground --workers 1 --output outputs/film-check",
         "v2hdm detect drives/film --limit 1",

@@ -75,7 +75,7 @@ CIRCLES = (
     "calibrate ground circle --output out", "calibrate compare circle calibration_front.yaml",
     "compare circle map.geojson", "compare map.geojson circle",
     "compare map.geojson map.geojson --output circle",
-    "benchmark make streets circle", "benchmark make streets out --cache circle",
+    "benchmark make streets circle", "benchmark make streets made --cache circle",
     "benchmark score circle streets",
     "localize circle drive --output out", "localize map.geojson circle --output out",
     "map drive.path=circle output=. name=out", "map drive.path=drive output=circle name=out workers=1",

@@ -49,6 +49,8 @@ class Submission:
 def read_content(path: Path) -> Mapping[str, Any]:
     """The content of a GeoJSON file, or of the one in a result folder; MapFileError where it is none."""
     path = map_file(path)
+    if not path.exists():
+        raise MapFileError(f"{path}: no such file; give a map as GeoJSON, or the result folder of v2hdm map")
     if path.suffix.lower() not in (".geojson", ".json"):
         raise MapFileError(f"{path}: is no GeoJSON; give a file that ends in .geojson")
     return load_json(path, MapFileError)

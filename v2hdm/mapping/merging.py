@@ -145,7 +145,7 @@ def _evidence(parts: Sequence[SolveEvidence], weight: Sequence[float]) -> SolveE
 
 
 def _most_telling(tests: Sequence[Contradiction]) -> tuple[Contradiction, ...]:
-    """Of each input's tests the most doubtful one, or where none is, that which would show the least error.
+    """The most doubtful test of each input or, where none is, the one that would show the least error.
 
     The most doubtful come first.
     """

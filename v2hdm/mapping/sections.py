@@ -101,7 +101,7 @@ class _Own:
 
 @dataclass(frozen=True)
 class _Common:
-    """What all sections have in common once they were mapped: model, scale, and the names of markings.
+    """The results that all sections share: model, scale, and the names of markings.
 
     Of each group of a section ``names`` (G,) is its marking's over the drive, ``turned`` (G,) by how many
     corners the marking's first is behind the group's, and ``is_ours`` (G,) whether it belongs to the section.
@@ -504,7 +504,7 @@ def _all(
 def _in_common(
     alone: Sequence[_Own], sections: Sequence[Section], options: MappingOptions
 ) -> tuple[_Common, IntArray]:
-    """What the sections have in common, and the names of the markings that several of them have."""
+    """The results that the sections share, and the names of the markings that several of them have."""
     weight = np.array([section.observations for section in alone], dtype=np.float64)
     votes: Counter[str] = Counter()
     for section in alone:

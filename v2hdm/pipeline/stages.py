@@ -238,7 +238,7 @@ class _Detections:
     listed: tuple[ImageDetections, ...] | None = None
 
     def __call__(self, drive: Drive, images: Sequence[int]) -> list[ImageDetections]:
-        """Those in these images, numbered in their order."""
+        """The detections in these images, numbered in their order."""
         if self.listed is None:
             return [read_detections(drive.images[image].path, at) for at, image in enumerate(images)]
         place = {image: at for at, image in enumerate(images)}

@@ -46,7 +46,7 @@ _CONTRADICTION = 9.0
 
 
 class Shape(NamedTuple):
-    """What all parts have in common: cameras and priors of the whole, the arrays' origin (2,), options."""
+    """The inputs that all parts share: cameras and priors of the whole, the arrays' origin (2,), options."""
 
     problem: Problem  # without observations: the cameras and priors of the whole
     origin_map: FloatArray
@@ -330,7 +330,7 @@ def _values(net: Net, shared: Shared, labels: Labels, like: Values) -> Values:
 
 
 def _about(state: PartStates, shared: Shared, net: Net) -> Summary:
-    """What a part tells about the shared value, which is not its own yet."""
+    """Evidence of a part on the shared value, which is not its own yet."""
     away = _values(net, shared, state.labels, state.values).step_from(state.values).cpu().numpy()
     return replace(state.told, slope=state.told.slope + state.told.information @ away)
 

@@ -143,7 +143,7 @@ def _chunks(whitening: Whitening, corners: Tensor) -> list[tuple[int, int]]:
 
 @dataclass(frozen=True)
 class Summary:
-    """What a part says of its border, as a quadratic function of the border's step.
+    """The cost of a part as a quadratic function of its border's step.
 
     Half of step' ``information`` step (n, n) plus ``slope`` (n,) times the step; ``terms`` is the cost at the
     point that the step is from, by name. ``slack`` is twice the decrease of the cost that is left with the

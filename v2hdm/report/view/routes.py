@@ -78,7 +78,7 @@ class Guard:
 
 
 class Once(Generic[Value]):
-    """What is made once, by whoever asks for it first."""
+    """A value that is made once, by the first request for it."""
 
     def __init__(self, make: Callable[[], Value]) -> None:
         self._make = make
@@ -95,7 +95,7 @@ class Once(Generic[Value]):
 
 @dataclass(frozen=True)
 class Shown:
-    """What the page shows: a result's ``folder``, what was read of it, its drive, and its corrections."""
+    """The content of the page: a result's ``folder``, its map, its drive, and its corrections."""
 
     folder: Path
     metrics: Any

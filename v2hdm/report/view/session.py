@@ -233,7 +233,7 @@ class _Keys:
             self._in_cell.setdefault(_cell(place[0]), []).append((key, place))
 
     def of(self, correction: Correction) -> str:
-        """That of a correction's feature; its outline, if that is not in the map."""
+        """The id of a correction's feature; its outline, if that is not in the map."""
         outline = np.array(correction.outline_map)
         x, y = _cell(outline[0])
         for cell in [(x + dx, y + dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]:
