@@ -1,14 +1,15 @@
-"""Which images show the ground, place by place: the ground looks alike from everywhere, what stands does not.
+"""Which images show the ground, place by place: it looks alike from everywhere, what stands does not.
 
-Images are warped onto the plane of the ground. What lies there stays where it is; a point ``h`` above it moves
-by ``h`` times the change of its direction, distance on the ground over the camera's height. Blocks of ground
-are compared between images by their patterns. A block is ground where images agree on its pattern from
+Images are warped onto the plane of the ground. What lies there stays where it is; a point ``h`` above it
+moves by ``h`` times the change of its direction, distance on the ground over the camera's height. Blocks of
+ground are compared between images by their patterns. A block is ground where images agree on its pattern from
 directions that are far enough apart, and an image shows it where it agrees with them. A block without a
 pattern is what the nearest block with one is.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -20,9 +21,11 @@ from torch import Tensor
 
 from v2hdm.geometry.ipm import apply_homography
 from v2hdm.mosaic.views import Canvas, Lens, Shot
-from v2hdm.mosaic.warp import TILE_PX, Source, Warp, plan_sheets, sources
+from v2hdm.mosaic.warp import TILE_PX, Area, Source, Warp, plan_sheets, sources
 from v2hdm.progress import Steps
 from v2hdm.records import BoolArray, FloatArray
+
+_log = logging.getLogger(__name__)
 
 CELL_M = 0.04  # side of a cell in which patterns are compared, m; chosen
 BLOCK_PX = 8  # side of a block, cells: 0.32 m; chosen
@@ -31,23 +34,32 @@ _BLOCKS = TILE_PX // BLOCK_PX  # blocks along a side of a tile
 
 _TEXTURE = 2.5  # standard deviation of grey values in a block that is more than an image's noise; chosen
 _AGREES = 0.4  # least correlation of an image's pattern with that of the others; chosen
-_FEWEST = 3  # least number of images that agree; chosen
-_SPREAD = 0.5  # least difference of their directions, m of shift a metre of height; chosen
-_MAJORITY = 0.5  # least share of them among images with a pattern, by weight; chosen
 _COARSEST = 0.1  # least px of an image that a cell covers, for its pattern to be compared; chosen
-_REACH_BLOCKS = 10.0  # distance, blocks, up to which a block without a pattern follows another; chosen
-_SPECK_BLOCKS = 4  # size, blocks, up to which what is alone among others is one of them; chosen
 
-_UNSEEN, _PLAIN, _GROUND, _STANDING = range(4)  # what a block is; plain ones have no pattern
+# Chosen on rendered port 2: of the ground that is shown, .4 % of the blocks show what stands.
+_FEWEST = 5  # least number of images that agree on ground
+_SPREAD = 2.5  # least difference of their directions, m of shift for a metre of height
+_MAJORITY = 0.5  # least share of them among images with a pattern, by weight
+_CONTRADICTED = 0.7  # share below which a block that is not ground stands
+_PATTERNED = 0.3  # least share, by weight, of images with a pattern where a block has one
+_SEEN_BY = 3  # least number of images of a block
+_AROUND = 5  # side, blocks, of the neighbourhood that decides on the block in its middle
+_VOTES = 3.0  # least number of blocks in it that are ground or stand
+_OUTVOTED = 3.0  # ground must be so many times what stands in it
+_REACH_BLOCKS = 10.0  # distance, blocks, up to which a block that nothing decides on follows another
+_LEAST_STANDING = 4  # size, blocks, up to which what stands alone amid ground is some of it
+_LEAST_GROUND = 20  # size, blocks, up to which ground alone amid what stands is none
+
+UNSEEN, PLAIN, GROUND, STANDING = range(4)  # what a block is; of plain ones nothing is known
 
 
 @dataclass(frozen=True)
 class Shown:
-    """The blocks, from ``(row, column)`` on, of which one image shows the ground: (rows, columns) of 0 or 1."""
+    """The blocks of which one image shows the ground, from ``(row, column)`` on."""
 
     row: int
     column: int
-    shows: Tensor
+    shows: Tensor  # (rows, columns) of 0 or 1
 
 
 @dataclass(frozen=True)
@@ -59,7 +71,7 @@ class Consensus:
     by_shot: Mapping[int, Shown]
 
     def share(self, index: int, points_map: FloatArray) -> Tensor:
-        """How far (...,) the image ``index`` shows the ground at points (..., 2): 0 to 1, smooth between blocks."""
+        """How far the image ``index`` shows the ground at points (..., 2): 0 to 1, smooth between blocks."""
         shown = self.by_shot.get(index)
         if shown is None:
             return torch.zeros(points_map.shape[:-1])
@@ -68,7 +80,8 @@ class Consensus:
         y = -offset_m[..., 1] / BLOCK_M - 0.5 - shown.row
         where = [torch.from_numpy(np.ascontiguousarray(part)).float().reshape(1, 1, -1) for part in (x, y)]
         found = remap(shown.shows[None, None], *where, align_corners=True)
-        return found.reshape(points_map.shape[:-1])
+        # Nothing beyond the border of a block that shows the ground.
+        return (2 * found.reshape(points_map.shape[:-1]) - 1).clamp(min=0)
 
 
 def find_consensus(
@@ -78,13 +91,16 @@ def find_consensus(
     device: str,
     area: Area | None = None,
     progress: Steps | None = None,
-) -> Consensus:
-    """Compare all images with each other on a canvas of cells of :data:`CELL_M`."""
+) -> Consensus | None:
+    """Compare all images with each other on a canvas of cells of :data:`CELL_M`.
+
+    None where images are too few, or too near together, to tell ground anywhere.
+    """
     rows = -(-canvas.rows // TILE_PX) * _BLOCKS
     columns = -(-canvas.columns // TILE_PX) * _BLOCKS
-    kinds = np.full((rows, columns), _UNSEEN, dtype=np.uint8)
+    kinds = np.full((rows, columns), UNSEEN, dtype=np.uint8)
     agreed: dict[int, list[tuple[int, int, BoolArray]]] = {}
-    plan = plan_sheets(canvas, shots, lenses)
+    plan = plan_sheets(canvas, shots, lenses, area)
     order = [index for _, views in plan for index, _ in views]
     images = sources(shots, lenses, device, order)
     done = 0
@@ -104,7 +120,18 @@ def find_consensus(
             for patch, flags in zip(patches, shows, strict=True):
                 agreed.setdefault(patch.index, []).append((top, left, flags))
     is_ground = ground_of(kinds)
+    if not is_ground.any():
+        _log.warning("the mosaic may show what stands: no images look at the same ground from two sides")
+        return None
+    if area is not None:
+        is_ground[is_ground] = area.holds(_centres(canvas, is_ground))
     return Consensus(canvas, kinds, {index: _joined(parts, is_ground) for index, parts in agreed.items()})
+
+
+def _centres(canvas: Canvas, chosen: BoolArray) -> FloatArray:
+    """The centres (N, 2) of the chosen blocks, m in the map."""
+    row, column = np.nonzero(chosen)
+    return canvas.corner_map + BLOCK_M * np.column_stack([column + 0.5, -(row + 0.5)])
 
 
 def _joined(parts: Sequence[tuple[int, int, BoolArray]], is_ground: BoolArray) -> Shown:
@@ -120,32 +147,31 @@ def _joined(parts: Sequence[tuple[int, int, BoolArray]], is_ground: BoolArray) -
 
 
 def ground_of(kinds: np.ndarray) -> BoolArray:
-    """Which blocks (rows, columns) are ground, from what they are one by one."""
-    decided = (kinds == _GROUND) | (kinds == _STANDING)
-    if not decided.any():
+    """Which blocks (rows, columns) are ground, from what they are one by one.
+
+    The neighbourhood of a block decides on it, and where it has no pattern, the nearest one that has. Beside
+    what stands a block is none.
+    """
+    window = np.ones((_AROUND, _AROUND))
+    for_ground = ndimage.convolve((kinds == GROUND).astype(np.float64), window, mode="constant")
+    against = ndimage.convolve((kinds == STANDING).astype(np.float64), window, mode="constant")
+    is_decided = for_ground + against >= _VOTES
+    if not is_decided.any():
         return np.zeros(kinds.shape, dtype=np.bool_)
-    distance, (row, column) = ndimage.distance_transform_edt(~decided, return_indices=True)
-    followed = kinds[row, column]
-    is_ground = (followed == _GROUND) & (kinds != _UNSEEN) & (distance <= _REACH_BLOCKS)
-    is_standing = (followed == _STANDING) & (kinds != _UNSEEN)
-    is_standing = _without_specks(is_standing)
-    is_ground = _without_specks(
-        (kinds != _UNSEEN) & is_ground | _specks((followed == _STANDING) & (kinds != _UNSEEN))
-    )
-    near = ndimage.binary_dilation(is_standing, np.ones((3, 3), dtype=np.bool_))
-    return np.asarray(is_ground & ~near)
+    distance, (row, column) = ndimage.distance_transform_edt(~is_decided, return_indices=True)
+    follows_ground = (for_ground > _OUTVOTED * against)[row, column] & (distance <= _REACH_BLOCKS)
+    is_seen = kinds != UNSEEN
+    is_standing = _larger_than(_LEAST_STANDING, is_seen & ~follows_ground)
+    beside = ndimage.binary_dilation(is_standing, np.ones((3, 3), dtype=np.bool_))
+    return _larger_than(_LEAST_GROUND, is_seen & ~beside)
 
 
-def _specks(flags: BoolArray) -> BoolArray:
-    return np.asarray(flags & ~_without_specks(flags))
-
-
-def _without_specks(flags: BoolArray) -> BoolArray:
-    """The flags without groups of up to :data:`_SPECK_BLOCKS`."""
+def _larger_than(size: int, flags: BoolArray) -> BoolArray:
+    """The flags without groups of up to ``size``."""
     labels, _ = ndimage.label(flags)
     sizes = np.bincount(labels.ravel())
     sizes[0] = 0
-    return np.asarray(sizes[labels] > _SPECK_BLOCKS)
+    return np.asarray(sizes[labels] > size)
 
 
 @dataclass(frozen=True)
@@ -195,7 +221,7 @@ class _Sheet:
 
 
 def _compare(patches: Sequence[_Patch]) -> tuple[np.ndarray, np.ndarray]:
-    """What the blocks (blocks, blocks) of a tile are, and which of them each patch shows (N, blocks, blocks)."""
+    """What the blocks of a tile are, and which of them each patch shows (N, blocks, blocks)."""
     grey = np.stack([patch.grey for patch in patches]).astype(np.float32)
     pattern = grey.reshape(-1, _BLOCKS, BLOCK_PX, _BLOCKS, BLOCK_PX).swapaxes(2, 3)
     pattern = pattern.reshape(len(patches), _BLOCKS, _BLOCKS, -1)
@@ -214,9 +240,10 @@ def _compare(patches: Sequence[_Patch]) -> tuple[np.ndarray, np.ndarray]:
     textured = (weight * has_texture).sum(axis=0)
     share = (weight * agrees).sum(axis=0) / np.maximum(textured, 1e-9)
     is_ground = (agrees.sum(axis=0) >= _FEWEST) & (spread >= _SPREAD) & (share >= _MAJORITY)
-    is_plain = textured < 0.3 * weight.sum(axis=0)
-    kinds = np.where(is_ground, _GROUND, np.where(is_plain, _PLAIN, _STANDING))
-    kinds = np.where(is_valid.sum(axis=0) >= _FEWEST, kinds, _UNSEEN)
+    has_pattern = textured >= _PATTERNED * weight.sum(axis=0)
+    is_standing = has_pattern & (share < _CONTRADICTED)
+    kinds = np.where(is_ground, GROUND, np.where(is_standing, STANDING, PLAIN))
+    kinds = np.where(is_valid.sum(axis=0) >= _SEEN_BY, kinds, UNSEEN)
     shows = is_valid & (agrees | ~has_texture)
     return kinds.astype(np.uint8), shows
 

@@ -27,6 +27,8 @@ TILE_PX = 64  # side of a tile, px of the canvas
 _NODE_PX = 4  # distance of the points of a tile at which the lens is evaluated, px of the canvas
 _FAR_OUT = 99.0  # a place outside of any image, in halves of its size from its middle
 SHEET_PX = 2048  # side of a sheet, px of the canvas: 70 MB of weighted sums where all of it is seen
+_ROW_M = 6.0  # markings of a row are no farther apart than twice this, m; chosen
+_FARTHEST_M = 14.0  # distance of paint from the way up to which the mosaic reaches, m; chosen
 _KEPT_IMAGES = 96  # decoded images that neighbouring sheets share, 1.5 MB each
 
 
@@ -72,16 +74,34 @@ def tiles_under(polygon: FloatArray, limit: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Area:
-    """The ground that a mosaic shows: within some distance of points."""
+    """The ground that a mosaic shows: discs about points of the cameras' way, each with a radius, m."""
 
-    near: tuple[tuple[cKDTree, float], ...]  # points of the map, m, and the distance from them, m
+    way: cKDTree
+    reach_m: FloatArray  # (P,)
+
+    @classmethod
+    def along(cls, way_map: FloatArray, paint_map: FloatArray, least_m: float, beyond_m: float) -> Area:
+        """The ground ``least_m`` beside a way (P, 2), and ``beyond_m`` beyond the paint (N, 2) beside it."""
+        way = cKDTree(way_map)
+        aside_m, nearest = way.query(paint_map)
+        reach_m = np.full(len(way_map), least_m)
+        np.maximum.at(reach_m, nearest, np.minimum(aside_m, _FARTHEST_M) + beyond_m)
+        # As wide between two markings of a row as beside them.
+        around = way.query_ball_point(way_map, _ROW_M)
+        reach_m = np.array([reach_m[indices].max() for indices in around])
+        return cls(way, reach_m)
+
+    @property
+    def corners_map(self) -> FloatArray:
+        """The corners (2, 2) of a box that holds it all."""
+        points_map = np.asarray(self.way.data)
+        reach_m = self.reach_m[:, None]
+        return np.stack([(points_map - reach_m).min(axis=0), (points_map + reach_m).max(axis=0)])
 
     def holds(self, points_map: FloatArray, further_m: float = 0.0) -> BoolArray:
         """Which points (N, 2) lie within it, or ``further_m`` from it."""
-        inside = np.zeros(len(points_map), dtype=np.bool_)
-        for tree, reach_m in self.near:
-            inside |= tree.query(points_map, distance_upper_bound=reach_m + further_m)[0] < np.inf
-        return inside
+        distance_m, nearest = self.way.query(points_map)
+        return np.asarray(distance_m <= self.reach_m[nearest] + further_m)
 
     def meets(self, canvas: Canvas, tiles: np.ndarray) -> BoolArray:
         """Which tiles (T, 2) of (column, row) of a canvas may hold some of it."""
