@@ -78,8 +78,10 @@ class Consensus:
         offset_m = points_map - self.canvas.corner_map
         x = offset_m[..., 0] / BLOCK_M - 0.5 - shown.column
         y = -offset_m[..., 1] / BLOCK_M - 0.5 - shown.row
-        where = [torch.from_numpy(np.ascontiguousarray(part)).float().reshape(1, 1, -1) for part in (x, y)]
-        found = remap(shown.shows[None, None], *where, align_corners=True)
+        x_px, y_px = (
+            torch.from_numpy(np.ascontiguousarray(part)).float().reshape(1, 1, -1) for part in (x, y)
+        )
+        found: Tensor = remap(shown.shows[None, None], x_px, y_px, align_corners=True)
         # Nothing beyond the border of a block that shows the ground.
         return (2 * found.reshape(points_map.shape[:-1]) - 1).clamp(min=0)
 
@@ -194,6 +196,10 @@ class _Sheet:
     def add(
         self, index: int, shot: Shot, source: Source, map_from_sheet: FloatArray, tiles: np.ndarray
     ) -> None:
+        """Add the image ``index`` to the tiles (T, 2) of (column, row) that it shows."""
+        centre_map = shot.centre_map
+        if centre_map is None:
+            raise ValueError("an image of which no camera's place is known shows no parallax")
         where = self._warp(source, shot, map_from_sheet, tiles)
         image = source.values
         grey = torch.stack([0.114 * image[0] + 0.587 * image[1] + 0.299 * image[2], image[3]])
@@ -206,8 +212,8 @@ class _Sheet:
         )
         blocks = (len(tiles), _BLOCKS, BLOCK_PX, _BLOCKS, BLOCK_PX)
         trust = values[:, 1].reshape(blocks).amin(dim=(2, 4))
-        density = where.density.reshape(blocks).mean(dim=(2, 4)) * (trust > 0)
-        density = (density * (density >= _COARSEST)).cpu().numpy()
+        mean_density = where.density.reshape(blocks).mean(dim=(2, 4)) * (trust > 0)
+        density = (mean_density * (mean_density >= _COARSEST)).cpu().numpy()
         greys = values[:, 0].half().cpu().numpy()
         at = (np.arange(_BLOCKS) + 0.5) * BLOCK_PX - 0.5
         for number, (column, row) in enumerate(tiles.tolist()):
@@ -215,7 +221,7 @@ class _Sheet:
                 continue
             centres = np.stack(np.meshgrid(at + column * TILE_PX, at + row * TILE_PX), axis=-1)
             points_map = apply_homography(map_from_sheet, centres.reshape(-1, 2)).reshape(_BLOCKS, _BLOCKS, 2)
-            direction = (points_map - shot.centre_map[:2]) / shot.centre_map[2]
+            direction = (points_map - centre_map[:2]) / centre_map[2]
             patch = _Patch(index, greys[number], density[number], direction)
             self.patches.setdefault((column, row), []).append(patch)
 
