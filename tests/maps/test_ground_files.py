@@ -19,8 +19,9 @@ from v2hdm.geometry.rigid import exp
 from v2hdm.io.maps.formats import write_map
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.trajectory import write_tum
-from v2hdm.mosaic.blend import Canvas, Sheet
+from v2hdm.mosaic.blend import Sheet
 from v2hdm.mosaic.result import geotiff
+from v2hdm.mosaic.views import Canvas
 from v2hdm.records import Trajectory
 
 QGIS = """
