@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import make_smoothing_spline
 
-from tests.benchmarks.made.truck import STEP_S, WHEELBASE_M
+from tests.benchmarks.made.van import STEP_S, WHEELBASE_M
 from v2hdm.geometry.planar import wrapped
 from v2hdm.records import FloatArray
 

@@ -12,7 +12,7 @@ from v2hdm.localization.motion import Motion
 from v2hdm.records import FloatArray
 
 STEP_S = 0.02
-"""Time, s, between two steps of the truck, two samples of its odometry, and two commands of its steering."""
+"""Time, s, between two steps of the van, two samples of its odometry, and two commands of its steering."""
 
 WHEELBASE_M = 2.8  # of a van
 BACK_M, AHEAD_M = 1.2, 3.7
@@ -36,8 +36,8 @@ _SPEED_M_SQRT_S, _YAW_RAD_SQRT_S = 0.01, 2e-4  # and their noise, of way and hea
 
 
 @dataclass
-class Truck:
-    """Where a truck truly is, and how it moves; all errors of its parts are drawn by ``rng``."""
+class Van:
+    """Where a van truly is, and how it moves; all errors of its parts are drawn by ``rng``."""
 
     rng: np.random.Generator
     place_map: FloatArray  # (2,) of the origin under the rear axle, m
@@ -98,10 +98,10 @@ class Truck:
         return Motion(self.stamp_s, float(speed_m_s), float(yaw_rate_rad_s))
 
 
-def clearance_m(truck: Truck, borders_map: FloatArray) -> float:
-    """The way, m, from a truck's outline to the nearest of points (N, 2); negative inside of it."""
-    offset = borders_map - truck.place_map
-    cos, sin = np.cos(truck.heading_rad), np.sin(truck.heading_rad)
+def clearance_m(van: Van, borders_map: FloatArray) -> float:
+    """The way, m, from a van's outline to the nearest of points (N, 2); negative inside of it."""
+    offset = borders_map - van.place_map
+    cos, sin = np.cos(van.heading_rad), np.sin(van.heading_rad)
     ahead_m = cos * offset[:, 0] + sin * offset[:, 1] - 0.5 * (AHEAD_M - BACK_M)
     left_m = cos * offset[:, 1] - sin * offset[:, 0]
     beyond = np.stack([np.abs(ahead_m) - 0.5 * (AHEAD_M + BACK_M), np.abs(left_m) - HALF_WIDTH_M])
@@ -109,11 +109,11 @@ def clearance_m(truck: Truck, borders_map: FloatArray) -> float:
     return float((outside_m + np.minimum(beyond.max(axis=0), 0.0)).min(initial=np.inf))
 
 
-def outlines(truck_poses: FloatArray) -> Iterator[FloatArray]:
-    """The outlines (4, 2) in the map of a truck at poses (N, 3) of x, y and heading."""
+def outlines(van_poses: FloatArray) -> Iterator[FloatArray]:
+    """The outlines (4, 2) in the map of a van at poses (N, 3) of x, y and heading."""
     corners = np.array(
         [[AHEAD_M, HALF_WIDTH_M], [-BACK_M, HALF_WIDTH_M], [-BACK_M, -HALF_WIDTH_M], [AHEAD_M, -HALF_WIDTH_M]]
     )
-    for x, y, heading_rad in truck_poses.tolist():
+    for x, y, heading_rad in van_poses.tolist():
         cos, sin = np.cos(heading_rad), np.sin(heading_rad)
         yield corners @ np.array([[cos, sin], [-sin, cos]]) + (x, y)
