@@ -33,9 +33,9 @@ _FAST_S = 0.25  # time, s, over which that fades
 _SLOW_RAD = 0.003  # standard deviation, rad, of what a bend, a brake or a load holds
 _SLOW_S = 4.0  # time, s, over which that fades
 _HEAVE_S = 0.5  # time, s, over which a heave fades
-# Change of a mounting within a second, m and rad (one sigma): 0.06 deg within an hour.
-_CREEP_M = 1e-5
-_CREEP_RAD = 1.7e-5  # of a mounting's angles
+_CREEP_M = 1e-5  # change of a mounting's place within a second, m (one sigma)
+CREEP_RAD = 1.7e-5
+"""Change of a mounting's angles within a second, rad (one sigma): 0.06 deg within an hour."""
 
 _SPRINGS = (
     (HEIGHT, HEAVE_SIGMA_M, _HEAVE_S),
@@ -136,7 +136,7 @@ def predict(belief: Belief, pieces: Sequence[Piece], noise: MotionNoise) -> Beli
         spread = by_state @ spread @ by_state.T + pushed
     length_s = sum(piece.length_s for piece in pieces)
     count = len(mean)
-    creep = np.tile(np.repeat([_CREEP_M, _CREEP_RAD], 3), belief.cameras) * np.sqrt(length_s)
+    creep = np.tile(np.repeat([_CREEP_M, CREEP_RAD], 3), belief.cameras) * np.sqrt(length_s)
     values, axes = np.linalg.eigh(spread)
     grown = np.zeros((count, count + belief.first_marking))
     grown[:, :count] = belief.root

@@ -12,7 +12,7 @@ import numpy as np
 
 from v2hdm.doors import checked
 from v2hdm.errors import MapFileError
-from v2hdm.localization.agreement import Agreement, Pace, RigTest, sigmas_off
+from v2hdm.localization.agreement import Agreement, Pace
 from v2hdm.localization.belief import (
     CAMERA,
     HEADING,
@@ -27,6 +27,7 @@ from v2hdm.localization.joint import Located, Scene, locate, paired
 from v2hdm.localization.motion import Motion, MotionLog, MotionNoise, moved
 from v2hdm.localization.paint import Paint
 from v2hdm.localization.places import Patch, Prior, search, vehicle_at
+from v2hdm.localization.rig import Estimate, Rig, Turned
 from v2hdm.localization.seeing import Look, Sighted, ground_points, sighted
 from v2hdm.records import BoolArray, Calibration, FloatArray, HDMap
 
@@ -58,7 +59,6 @@ _FORGET = 600.0  # coordinates
 _FACTORS = (0.3, 12.0)  # least and largest, times
 _JUDGED_M = 14.0  # distance, m, of detections that are counted for the map or against it
 _TURNED_RAD = np.deg2rad(1.0)  # standard deviation of what a camera that was pushed has turned
-_TURNED_SIGMAS = 5.0  # from which a mounting has surely turned
 _BEFORE_S = 0.25  # so long before it was noticed, s, a mounting may have turned
 _FEW = 0.7  # share of an image's detections under which a turned mounting is tried
 
@@ -77,15 +77,6 @@ class Fix(NamedTuple):
     stamp_s: float
     place_map: FloatArray
     sigma_m: float
-
-
-class Turned(NamedTuple):
-    """A camera whose mounting is no longer that of its calibration."""
-
-    camera: str
-    since_s: float
-    turn_deg: tuple[float, float, float]  # about the camera's axes right, down and forward
-    sigma_deg: tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -195,10 +186,9 @@ class Localizer:
         self._noise = {name: _Noise() for name in self.calibrations}
         self._agreement = Agreement()
         self._pace = Pace()
-        self._rig = RigTest()
+        self._rig = Rig(dict(zip(self.calibrations, self._mountings, strict=True)))
         self._turned_s: float | None = None
         self._rig_since_s: float | None = None
-        self._turned: dict[str, float] = {}
         self._local = np.zeros(3)
         self._local_s: float | None = None
         self._way_m = 0.0
@@ -286,6 +276,16 @@ class Localizer:
             self._let_turn(self._rig_since_s)
         if is_new:
             self._judge(look)
+            self._note_mounting(look)
+
+    def _note_mounting(self, look: Look) -> None:
+        """Test a camera's mounting after an image of it."""
+        belief = self._belief
+        if belief is None or not self._is_sure or not self._matched:
+            return
+        begin = VEHICLE + CAMERA * self._numbers[look.camera] + 3
+        angles = range(begin, begin + 3)
+        self._rig.note(look.camera, Estimate(look.stamp_s, belief.mean[angles], belief.covariance(angles)))
 
     def _let_turn(self, since_s: float) -> None:
         """Go back to before a mounting turned, and see again what came since with mountings that are free.
@@ -342,9 +342,9 @@ class Localizer:
         if self._is_sure and is_judged.sum() >= 2 and explained[is_judged].mean() < _FEW:
             turned = locate(loosened(belief, list(self._numbers.values()), _TURNED_RAD), scene)
             gained = int(paired(turned, len(quads.kinds))[is_judged].sum() - explained[is_judged].sum())
-            self._rig_since_s = self._rig.note(look, gained)
+            self._rig_since_s = self._rig.pushed.note(look, gained)
         elif self._is_sure:
-            self._rig.note(look, 0)
+            self._rig.pushed.note(look, 0)
         rows = np.flatnonzero(is_judged)
         kinds = tuple(quads.kinds[row] for row in rows.tolist())
         self._agreement.note(places[is_judged].mean(axis=1), kinds, explained[is_judged], self._way_m)
@@ -510,13 +510,14 @@ class Localizer:
                 f"the map explains {100 * self._agreement.share:.0f} % of the markings seen in the last m, "
                 "and too few of the latest"
             )
-        turned = self._turned_cameras(belief)
         protection = _protection(covariance, float(belief.mean[HEADING]))
-        if status != Status.TRACKING or self._rig.is_suspicious or self._agreement.differs:
+        if status != Status.TRACKING or self._rig.pushed.is_suspicious or self._agreement.differs:
             protection = (np.inf, np.inf, np.inf)
         if status == Status.INITIALISING:
             covariance = np.full((3, 3), np.inf)
-        if self._turned_s is not None:
+        if turned := self._rig.reasons:
+            reasons |= {f"rig {number}": sentence for number, sentence in enumerate(turned)}
+        elif self._turned_s is not None:
             reasons["rig"] = f"a camera's mounting has turned since {self._turned_s:.1f} s"
         motion = (float(np.exp(belief.mean[3])), float(belief.mean[4]))
         return Pose(
@@ -529,24 +530,8 @@ class Localizer:
             motion=motion,
             matched=self._matched,
             reasons=tuple(reasons.values()),
-            turned=turned,
+            turned=self._rig.turned,
         )
-
-    def _turned_cameras(self, belief: Belief) -> tuple[Turned, ...]:
-        """The cameras whose mountings are surely no longer their calibrations'."""
-        out = []
-        for name, number in self._numbers.items():
-            begin = VEHICLE + CAMERA * number + 3
-            turn_rad = belief.mean[begin : begin + 3]
-            posterior = belief.covariance(range(begin, begin + 3))
-            if sigmas_off(turn_rad, self._mountings[number][3:, 3:], posterior) < _TURNED_SIGMAS:
-                self._turned.pop(name, None)
-                continue
-            since_s = self._turned.setdefault(name, self._turned_s or belief.stamp_s)
-            turn = np.degrees(turn_rad).tolist()
-            sigma = np.degrees(np.sqrt(np.diag(posterior))).tolist()
-            out.append(Turned(name, since_s, (turn[0], turn[1], turn[2]), (sigma[0], sigma[1], sigma[2])))
-        return tuple(out)
 
 
 def _protection(covariance: FloatArray, heading_rad: float) -> tuple[float, float, float]:
