@@ -10,7 +10,7 @@ chapter V).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,6 +36,8 @@ _HEAVE_S = 0.5  # time, s, over which a heave fades
 _CREEP_M = 1e-5  # change of a mounting's place within a second, m (one sigma)
 CREEP_RAD = 1.7e-5
 """Change of a mounting's angles within a second, rad (one sigma): 0.06 deg within an hour."""
+TURNING_RAD = 3.5e-4
+"""The same of a mounting that is turning slowly: 0.15 deg within a minute."""
 
 _SPRINGS = (
     (HEIGHT, HEAVE_SIGMA_M, _HEAVE_S),
@@ -122,8 +124,10 @@ def start(
     return Belief(stamp_s, mean, root, len(mountings))
 
 
-def predict(belief: Belief, pieces: Sequence[Piece], noise: MotionNoise) -> Belief:
-    """The belief after pieces of motion."""
+def predict(
+    belief: Belief, pieces: Sequence[Piece], noise: MotionNoise, turning: Collection[int] = ()
+) -> Belief:
+    """The belief after pieces of motion; the mountings of some cameras are ``turning``."""
     if not pieces:
         return belief
     mean = belief.mean.copy()
@@ -136,7 +140,8 @@ def predict(belief: Belief, pieces: Sequence[Piece], noise: MotionNoise) -> Beli
         spread = by_state @ spread @ by_state.T + pushed
     length_s = sum(piece.length_s for piece in pieces)
     count = len(mean)
-    creep = np.tile(np.repeat([_CREEP_M, CREEP_RAD], 3), belief.cameras) * np.sqrt(length_s)
+    creep_rad = [TURNING_RAD if camera in turning else CREEP_RAD for camera in range(belief.cameras)]
+    creep = np.repeat([[_CREEP_M, angle_rad] for angle_rad in creep_rad], 3) * np.sqrt(length_s)
     values, axes = np.linalg.eigh(spread)
     grown = np.zeros((count, count + belief.first_marking))
     grown[:, :count] = belief.root

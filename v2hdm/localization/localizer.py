@@ -12,7 +12,7 @@ import numpy as np
 
 from v2hdm.doors import checked
 from v2hdm.errors import MapFileError
-from v2hdm.localization.agreement import Agreement, Pace
+from v2hdm.localization.agreement import Agreement, Detected, Pace, displaced
 from v2hdm.localization.belief import (
     CAMERA,
     HEADING,
@@ -59,6 +59,7 @@ _FORGET = 600.0  # coordinates
 _FACTORS = (0.3, 12.0)  # least and largest, times
 _JUDGED_M = 14.0  # distance, m, of detections that are counted for the map or against it
 _TURNED_RAD = np.deg2rad(1.0)  # standard deviation of what a camera that was pushed has turned
+_LOOSENED_RAD = np.deg2rad(0.1)  # of what any of them has turned when one is found to have turned slowly
 _BEFORE_S = 0.25  # so long before it was noticed, s, a mounting may have turned
 _FEW = 0.7  # share of an image's detections under which a turned mounting is tried
 
@@ -285,7 +286,11 @@ class Localizer:
             return
         begin = VEHICLE + CAMERA * self._numbers[look.camera] + 3
         angles = range(begin, begin + 3)
+        had_turned = self._rig.turned
         self._rig.note(look.camera, Estimate(look.stamp_s, belief.mean[angles], belief.covariance(angles)))
+        if self._rig.turned and not had_turned:
+            # Which of the mountings it is, and how far it has turned, looser ones tell.
+            self._belief = loosened(belief, list(self._numbers.values()), _LOOSENED_RAD)
 
     def _let_turn(self, since_s: float) -> None:
         """Go back to before a mounting turned, and see again what came since with mountings that are free.
@@ -304,7 +309,8 @@ class Localizer:
     def _moved_to(self, belief: Belief, stamp_s: float) -> Belief:
         if stamp_s <= belief.stamp_s:
             return belief
-        return predict(belief, self._log.pieces(belief.stamp_s, stamp_s), self.noise)
+        turning = [self._numbers[turned.camera] for turned in self._rig.turned if turned.is_slow]
+        return predict(belief, self._log.pieces(belief.stamp_s, stamp_s), self.noise, turning)
 
     def _count_way(self, stamp_s: float) -> None:
         """Lay the odometry's way out to a time."""
@@ -345,13 +351,22 @@ class Localizer:
             self._rig_since_s = self._rig.pushed.note(look, gained)
         elif self._is_sure:
             self._rig.pushed.note(look, 0)
-        rows = np.flatnonzero(is_judged)
-        kinds = tuple(quads.kinds[row] for row in rows.tolist())
-        self._agreement.note(places[is_judged].mean(axis=1), kinds, explained[is_judged], self._way_m)
+        near = quads.subset(np.flatnonzero(is_judged))
+        self._agreement.note(
+            self._detected(places[is_judged], near, explained[is_judged], located), self._way_m
+        )
         if located.misfit_freedom > 0:
             noise.note(located, noise.factor)
         self._matched = len(located.pairs.detection)
         return self._kept(located)
+
+    def _detected(
+        self, places: FloatArray, quads: Sighted, explained: BoolArray, located: Located
+    ) -> Detected:
+        """Detections (D) with corners at ``places`` (D, 4, 2) as they count for the map or against it."""
+        centres = places.mean(axis=1)
+        beside = displaced(centres, quads.kinds, explained, self.paint, located.pairs.marking)
+        return Detected(centres, quads.kinds, explained, beside)
 
     def _judged(self, places: FloatArray, pose: FloatArray, quads: Sighted) -> BoolArray:
         """Which detections (D,) lie whole, near, and where the map has been mapped."""

@@ -50,12 +50,12 @@ class RigTest:
         return any(evidence > _SUSPICIOUS for evidence in self.evidence.values())
 
 
-# Squared distance, in sigmas, from which a mounting has changed: of three unknowns 5 in a hundred million
-# come so far by chance, at any of the thousand moments of an hour that are compared.
-_CHANGED_SQUARED = 36.0
+# Squared distance, in sigmas, from which a mounting has changed: of three unknowns one in a million comes so
+# far by chance. Right drives of half a minute come to 8.
+_CHANGED_SQUARED = 30.0
 _CHANGED_BACK_SQUARED = 9.0  # squared distance from which it has not changed any more
 # What the detections' errors, which repeat from image to image, move a mounting by, rad (one sigma).
-_WANDER_RAD = np.deg2rad(0.015)
+_WANDER_RAD = np.deg2rad(0.012)
 _STEP_S = 0.5  # time between two estimates that are kept
 _MOST = 240  # estimates that are kept: of the older half every second one is dropped when there are more
 _COURSE = 40  # estimates by which the beginning of a change is found
@@ -100,9 +100,9 @@ class Change(NamedTuple):
 class MountingTest:
     """A generalised likelihood ratio test (Willsky and Jones 1976) of one camera's mounting.
 
-    A filter's estimates of what does not change differ by no more than their covariances. The present one
-    is compared with all earlier ones and with the calibration. ``creep_rad2_s`` is the variance by which a
-    mounting may change within a second.
+    A filter's estimates of what does not change differ by no more than what it has learnt since. The present
+    one is compared with all earlier ones and with the calibration. ``creep_rad2_s`` is the variance by
+    which a mounting may change within a second.
     """
 
     calibration_rad2: FloatArray
@@ -133,7 +133,12 @@ class MountingTest:
         """The squared distances (K,) of earlier estimates from the present one, in sigmas."""
         since_s = now.stamp_s - np.array([before.stamp_s for before in befores])
         creep_rad2 = self.creep_rad2_s * np.maximum(since_s, 0.0) + _WANDER_RAD**2
-        spread = np.array([before.covariance_rad2 for before in befores]) + now.covariance_rad2
+        # What two estimates differ by of which one is the better has the difference of their covariances
+        # (Hausman 1978): what neither tells, such as the vehicle's own pitch from that of both cameras,
+        # drops out.
+        gained = np.array([before.covariance_rad2 for before in befores]) - now.covariance_rad2
+        values, axes = np.linalg.eigh(gained)
+        spread = (axes * np.abs(values)[:, None]) @ axes.swapaxes(1, 2)
         spread += creep_rad2[:, None, None] * np.eye(3)
         moved = now.turn_rad - np.array([before.turn_rad for before in befores])
         return np.asarray((moved * np.linalg.solve(spread, moved[..., None])[..., 0]).sum(axis=1))
@@ -141,7 +146,7 @@ class MountingTest:
     def _change(self, before: Estimate, now: Estimate) -> Change:
         """When the change began, and whether it is one of a moment: the ramp that fits the estimates best."""
         moved = now.turn_rad - before.turn_rad
-        sigma = np.sqrt(np.diag(before.covariance_rad2 + now.covariance_rad2) + _WANDER_RAD**2)
+        sigma = np.sqrt(np.abs(np.diag(before.covariance_rad2 - now.covariance_rad2)) + _WANDER_RAD**2)
         axis = int(np.argmax(np.abs(moved) / sigma))
         course = [item for item in self.estimates if item.stamp_s >= before.stamp_s]
         course = [*course[:: max(1, len(course) // _COURSE)], now]
