@@ -224,6 +224,16 @@ def loosened(belief: Belief, cameras: Sequence[int], sigma_rad: float) -> Belief
     return replace(belief, root=_square(grown))
 
 
+def pinned(belief: Belief, states: Sequence[int], values: FloatArray, sigma: float) -> Belief:
+    """The belief in which some states (K,) are known to have values (K,) with a standard deviation."""
+    slope = belief.root[list(states)]
+    spread = slope @ slope.T + sigma**2 * np.eye(len(slope))
+    mean = belief.mean + belief.root @ slope.T @ np.linalg.solve(spread, values - belief.mean[list(states)])
+    inner = np.linalg.cholesky(np.eye(len(belief.mean)) + slope.T @ slope / sigma**2)
+    root = np.asarray(np.linalg.solve(inner, belief.root.T).T, dtype=np.float64)
+    return replace(belief, mean=mean, root=root)
+
+
 def _square(root: FloatArray) -> FloatArray:
     """A square root (n, n) of the covariance that a wide one (n, m) has."""
     return np.asarray(np.linalg.qr(root.T, mode="reduced")[1].T, dtype=np.float64)

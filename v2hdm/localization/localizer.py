@@ -20,6 +20,7 @@ from v2hdm.localization.belief import (
     Belief,
     loosened,
     only_markings,
+    pinned,
     predict,
     start,
 )
@@ -59,7 +60,8 @@ _FORGET = 600.0  # coordinates
 _FACTORS = (0.3, 12.0)  # least and largest, times
 _JUDGED_M = 14.0  # distance, m, of detections that are counted for the map or against it
 _TURNED_RAD = np.deg2rad(1.0)  # standard deviation of what a camera that was pushed has turned
-_LOOSENED_RAD = np.deg2rad(0.1)  # of what any of them has turned when one is found to have turned slowly
+_LOOSENED_RAD = np.deg2rad(0.2)  # of what a mounting has turned that is found to have turned slowly
+_PINNED_RAD = np.deg2rad(0.01)  # of what the others have meanwhile
 _BEFORE_S = 0.25  # so long before it was noticed, s, a mounting may have turned
 _FEW = 0.7  # share of an image's detections under which a turned mounting is tried
 
@@ -284,13 +286,22 @@ class Localizer:
         belief = self._belief
         if belief is None or not self._is_sure or not self._matched:
             return
-        begin = VEHICLE + CAMERA * self._numbers[look.camera] + 3
-        angles = range(begin, begin + 3)
-        had_turned = self._rig.turned
-        self._rig.note(look.camera, Estimate(look.stamp_s, belief.mean[angles], belief.covariance(angles)))
-        if self._rig.turned and not had_turned:
-            # Which of the mountings it is, and how far it has turned, looser ones tell.
-            self._belief = loosened(belief, list(self._numbers.values()), _LOOSENED_RAD)
+        angles = self._angles(look.camera)
+        estimate = Estimate(look.stamp_s, belief.mean[angles], belief.covariance(angles))
+        change = self._rig.note(look.camera, estimate)
+        if change is None or not change.is_slow:
+            return
+        # This mounting alone has turned; the others are where they were, though they seemed to turn with it.
+        belief = loosened(belief, [self._numbers[look.camera]], _LOOSENED_RAD)
+        for name, other in self._rig.others(look.camera, change.before.stamp_s).items():
+            belief = pinned(belief, self._angles(name), other.turn_rad, _PINNED_RAD)
+        self._belief = belief
+        self._past.clear()
+
+    def _angles(self, camera: str) -> range:
+        """The states of a camera's angles."""
+        begin = VEHICLE + CAMERA * self._numbers[camera] + 3
+        return range(begin, begin + 3)
 
     def _let_turn(self, since_s: float) -> None:
         """Go back to before a mounting turned, and see again what came since with mountings that are free.

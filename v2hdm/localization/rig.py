@@ -53,7 +53,7 @@ class RigTest:
 # Squared distance, in sigmas, from which a mounting has changed: of three unknowns one in a million comes so
 # far by chance. Right drives of half a minute come to 8.
 _CHANGED_SQUARED = 30.0
-_CHANGED_BACK_SQUARED = 9.0  # squared distance from which it has not changed any more
+_BACK_SHARE = 0.4  # of a change: a mounting that is nearer to where it was has been put right
 # What the detections' errors, which repeat from image to image, move a mounting by, rad (one sigma).
 _WANDER_RAD = np.deg2rad(0.012)
 _STEP_S = 0.5  # time between two estimates that are kept
@@ -86,6 +86,7 @@ class Change(NamedTuple):
     """How a mounting has changed since a time."""
 
     before: Estimate
+    found: Estimate  # by which it was found
     since_s: float
     until_s: float  # when it was as far as it is now
     angle: str  # that changed most surely
@@ -94,6 +95,12 @@ class Change(NamedTuple):
     def is_slow(self) -> bool:
         """Whether it changed gradually."""
         return self.until_s - self.since_s > _AT_ONCE_S
+
+    def is_undone(self, now: Estimate) -> bool:
+        """Whether the mounting is nearly back where it was."""
+        changed = self.found.turn_rad - self.before.turn_rad
+        left = now.turn_rad - self.before.turn_rad
+        return bool(left @ changed < _BACK_SHARE * (changed @ changed))
 
 
 @dataclass
@@ -115,7 +122,7 @@ class MountingTest:
         if not self.estimates:
             self.estimates.append(Estimate(now.stamp_s, np.zeros(3), self.calibration_rad2))
         if self.change is not None:
-            if self._squared([self.change.before], now)[0] > _CHANGED_BACK_SQUARED:
+            if not self.change.is_undone(now):
                 self._keep(now)
                 return self.change
             # The changed estimates are of a mounting that was put right.
@@ -128,6 +135,11 @@ class MountingTest:
             self.change = self._change(self.estimates[farthest], now)
         self._keep(now)
         return self.change
+
+    def at(self, stamp_s: float) -> Estimate | None:
+        """The latest estimate of before a time."""
+        earlier = [item for item in self.estimates if item.stamp_s <= stamp_s]
+        return earlier[-1] if earlier else None
 
     def _squared(self, befores: Sequence[Estimate], now: Estimate) -> FloatArray:
         """The squared distances (K,) of earlier estimates from the present one, in sigmas."""
@@ -155,7 +167,7 @@ class MountingTest:
         ramps = [(begin, end) for end in range(1, len(course)) for begin in range(end)]
         losses = [_ramp_loss(stamps_s, shares, stamps_s[begin], stamps_s[end]) for begin, end in ramps]
         begin, end = ramps[int(np.argmin(losses))]
-        return Change(before, float(stamps_s[begin]), float(stamps_s[end]), _ANGLES[axis])
+        return Change(before, now, float(stamps_s[begin]), float(stamps_s[end]), _ANGLES[axis])
 
     def _keep(self, now: Estimate) -> None:
         if now.stamp_s - self.estimates[-1].stamp_s < _STEP_S:
@@ -192,10 +204,18 @@ class Rig:
         }
         self._latest: dict[str, Estimate] = {}
 
-    def note(self, camera: str, now: Estimate) -> None:
-        """Take what the filter says of a camera's mounting after an image of it."""
+    def note(self, camera: str, now: Estimate) -> Change | None:
+        """Take what the filter says of a camera's mounting after an image of it; a change that is new."""
+        had_changed = self._tests[camera].change is not None
         self._latest[camera] = now
-        self._tests[camera].note(now)
+        change = self._tests[camera].note(now)
+        return None if had_changed else change
+
+    def others(self, camera: str, stamp_s: float) -> dict[str, Estimate]:
+        """What the mountings of the other cameras, which have not changed, were at a time."""
+        tests = {name: test for name, test in self._tests.items() if name != camera and test.change is None}
+        estimates = {name: test.at(stamp_s) for name, test in tests.items()}
+        return {name: estimate for name, estimate in estimates.items() if estimate is not None}
 
     @property
     def turned(self) -> tuple[Turned, ...]:
