@@ -310,6 +310,7 @@ class Localizer:
         mountings and the vehicle's springs, which fade, explain better and better.
         """
         self._turned_s = since_s
+        self._rig.loosen(since_s - _BEFORE_S)
         since_then = [past for past in self._past if past.look.stamp_s >= since_s - _BEFORE_S]
         self._belief = loosened(since_then[0].before, list(self._numbers.values()), _TURNED_RAD)
         while self._past and self._past[-1].look.stamp_s >= since_s - _BEFORE_S:

@@ -116,6 +116,7 @@ class MountingTest:
     creep_rad2_s: float
     estimates: list[Estimate] = field(default_factory=list)
     change: Change | None = None
+    loosened_s: float = -np.inf  # when the filter was last told that the mounting may have turned
 
     def note(self, now: Estimate) -> Change | None:
         """Take an estimate; the change, once there is one for sure."""
@@ -148,9 +149,12 @@ class MountingTest:
         # What two estimates differ by of which one is the better has the difference of their covariances
         # (Hausman 1978): what neither tells, such as the vehicle's own pitch from that of both cameras,
         # drops out.
-        gained = np.array([before.covariance_rad2 for before in befores]) - now.covariance_rad2
-        values, axes = np.linalg.eigh(gained)
+        covariances_rad2 = np.array([before.covariance_rad2 for before in befores])
+        values, axes = np.linalg.eigh(covariances_rad2 - now.covariance_rad2)
         spread = (axes * np.abs(values)[:, None]) @ axes.swapaxes(1, 2)
+        # A filter that has been loosened since has forgotten what the earlier estimate knew.
+        is_forgotten = np.array([before.stamp_s < self.loosened_s for before in befores])
+        spread[is_forgotten] = covariances_rad2[is_forgotten] + now.covariance_rad2
         spread += creep_rad2[:, None, None] * np.eye(3)
         moved = now.turn_rad - np.array([before.turn_rad for before in befores])
         return np.asarray((moved * np.linalg.solve(spread, moved[..., None])[..., 0]).sum(axis=1))
@@ -210,6 +214,11 @@ class Rig:
         self._latest[camera] = now
         change = self._tests[camera].note(now)
         return None if had_changed else change
+
+    def loosen(self, stamp_s: float) -> None:
+        """Take note that from a time on the filter lets all mountings turn."""
+        for test in self._tests.values():
+            test.loosened_s = stamp_s
 
     def others(self, camera: str, stamp_s: float) -> dict[str, Estimate]:
         """What the mountings of the other cameras, which have not changed, were at a time."""

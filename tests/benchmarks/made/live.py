@@ -179,6 +179,15 @@ def bumped(world: World, camera: str, frame: int, turn_rad: FloatArray) -> World
     return replace(world, cam_from_vehicle={**world.cam_from_vehicle, camera: poses})
 
 
+def turning(world: World, camera: str, frame: int, turn_rad: FloatArray, lasts_s: float) -> World:
+    """The world in which a camera turns slowly from a moment on, by ``turn_rad`` (3,) in the end."""
+    poses = world.cam_from_vehicle[camera].copy()
+    shares = np.clip((world.taken_s - world.taken_s[frame]) / lasts_s, 0.0, 1.0)
+    for number in np.flatnonzero(shares > 0).tolist():
+        poses[number] = exp(np.concatenate([np.zeros(3), shares[number] * turn_rad])) @ poses[number]
+    return replace(world, cam_from_vehicle={**world.cam_from_vehicle, camera: poses})
+
+
 def _odometry(
     stamp_s: FloatArray, points: FloatArray, heading: FloatArray, rng: np.random.Generator
 ) -> list[Motion]:
