@@ -128,10 +128,7 @@ def _rows(
     Rows that are as they were ``before`` stay as ``stored``. Inputs that are new have their own
     ``input_gain`` (A,).
     """
-    if stored.ndim == 1:
-        scale = np.ones(1)
-    else:
-        scale = _input_gain(stored, before)
+    scale = np.ones(1) if stored.ndim == 1 else _input_gain(stored, before)
     if input_gain is not None:
         scale = np.concatenate([scale, (1 / input_gain)[:, None, None]])
         more = ((0, 0), (0, len(input_gain)), (0, 0), (0, 0))

@@ -45,9 +45,7 @@ def is_grown(before: Tensor, wanted: Tensor, tolerance: Mapping[str, float]) -> 
 
 
 @torch.inference_mode()
-def added_channels(
-    net: MarkingNet, known: int, highest: float, images: Sequence[NDArray[np.uint8]]
-) -> Added:
+def added_channels(net: MarkingNet, known: int, highest: float, images: Sequence[NDArray[np.uint8]]) -> Added:
     """The channels after the ``known`` ones, scaled so that images drive each nearly to ``highest``.
 
     Args:

@@ -141,9 +141,7 @@ class MarkingNet(nn.Module):
         self.expand = ConvNormRelu(quarter, config.head_width * PAINT_UPSCALE**2, kernel=1)
         self.paint = nn.Conv2d(config.head_width, 1, 3, padding=1)
         self.kinds = nn.Conv2d(quarter, classes, 1)
-        self.wide_kinds = (
-            _head(refine, eighth, classes, config.added_kinds) if config.wide_kinds else None
-        )
+        self.wide_kinds = _head(refine, eighth, classes, config.added_kinds) if config.wide_kinds else None
         self.lanes = _head(refine, eighth, 2) if config.lanes else None
 
     def forward(self, image: Tensor) -> Prediction:
