@@ -130,7 +130,9 @@ class Trainer:
     def _started_from(self) -> MarkingNet:
         """The network that this run started from: heads that learn alone keep to its classes."""
         start = MarkingNet(self.config.net, len(self.state.catalogue.names)).to(self.device)
-        start.load_state_dict(fresh_checkpoint(self.config).averaged)
+        with torch.random.fork_rng():
+            torch.manual_seed(self.config.seed)  # channels that are added are drawn at random
+            start.load_state_dict(fresh_checkpoint(self.config).averaged)
         return start.eval()
 
     def _rows_that_stay(self) -> Tensor | None:
