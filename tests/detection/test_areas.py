@@ -1,5 +1,7 @@
 """Words and boxes of single images, from outputs drawn of the truth."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from tests.detection.pictures import bar, make_camera, to_image
 from v2hdm.catalogue import SHIPPED
 from v2hdm.detection.areas import find_areas, find_crosswalks
 from v2hdm.detection.camera import RoadCamera
-from v2hdm.detection.detector import _not_of
+from v2hdm.detection.detector import _not_of, _of_several
 from v2hdm.detection.network import NetworkOutput
 from v2hdm.geometry.planar import rectangle_size
 from v2hdm.records import MarkingDetection
@@ -69,8 +71,6 @@ def test_sides_that_the_image_s_border_cuts_are_no_sides_of_the_word():
 
 
 def test_the_vehicle_s_own_mask_cuts_a_word_like_the_border():
-    from dataclasses import replace
-
     letters = word("EBH", (5.5, 0.8))
     mask = np.zeros((CAMERA.info.height, CAMERA.info.width), dtype=bool)
     low = int(to_image(CAMERA, letters.reshape(-1, 2))[:, 1].max()) - 15
@@ -85,8 +85,6 @@ def test_the_vehicle_s_own_mask_cuts_a_word_like_the_border():
 
 
 def test_a_network_that_does_not_know_areas_finds_none():
-    from dataclasses import replace
-
     output = network_output(CAMERA, [("text", word("EBH", (7.0, 0.8)))])
     old = replace(output, areas=output.areas[:0], area_classes=())
     assert find_areas(old, RoadCamera(CAMERA, 16), SHIPPED, 0, 0.5, 22.0) == []
@@ -139,6 +137,16 @@ def test_a_letter_is_no_marking_and_a_surer_marking_in_a_box_stays():
     )
     beside = MarkingDetection("diamond", 0.3, corners + np.array([300, 0]), np.eye(8), np.ones(4, dtype=bool))
     assert [one.score for one in _not_of([area], (*markings, beside))] == [0.999, 0.3]
+
+
+def test_an_area_that_is_one_arrow_is_no_word():
+    letters = word("EBH", (7.0, 0.8))
+    (area,), _ = areas_of(("text", letters))
+    empty = MarkingDetection("arrow", 0.3, np.full((4, 2), np.nan), np.eye(8), np.zeros(4, dtype=bool))
+    arrow = replace(empty, outline_px=area.outline_px)
+    letter = replace(empty, outline_px=to_image(CAMERA, letters[0]))
+    assert _of_several([area], (arrow,)) == []
+    assert _of_several([area], (letter,)) == [area]
 
 
 def test_the_bars_of_an_image_are_its_crosswalk_s_parts():

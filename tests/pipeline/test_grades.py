@@ -137,11 +137,11 @@ def test_what_stays_keeps_the_id_of_the_whole_map_and_the_evidence_follows():
 def test_a_give_way_line_has_the_first_id_of_its_pieces_and_all_others_keep_theirs():
     result = mapped()
     markings = list(result.hd_map.markings)
-    pieces = np.array([[-0.2, -0.25], [0.2, -0.25], [0.2, 0.25], [-0.2, 0.25]]) + [4.0, 0.0]
+    pieces = np.array([[3.8, -0.25], [4.2, -0.25], [4.2, 0.25], [3.8, 0.25]])
     for number in (0, 1, 3):
-        corners = pieces + [0.0, 0.75 * number]
+        corners = pieces + np.array([0.0, 0.75 * number])
         markings[number] = replace(markings[number], kind="stop_line", corners_map=corners)
-    markings[3] = replace(markings[3], corners_map=pieces + [0.0, 1.5])
+    markings[3] = replace(markings[3], corners_map=pieces + np.array([0.0, 1.5]))
     result = replace(result, hd_map=replace(result.hd_map, markings=tuple(markings)))
     composed = with_composed({"front": {"Opt": result}}, GOAL_M)["front"]["Opt"]
     assert [(one.kind, one.variety, one.id) for one in composed.hd_map.markings] == [

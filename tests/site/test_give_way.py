@@ -28,7 +28,7 @@ def row(count=4, kind="stop_line", step_m=DASH_M + GAP_M, piece=PIECE, first_id=
     """Pieces beside each other across a lane, in no order."""
     covariance = 0.01**2 * np.eye(8)
     pieces = [
-        Marking(kind, piece + [20.0, 0.6 + k * step_m], 4 + k, covariance, 0.01, id=first_id + k)
+        Marking(kind, piece + np.array([20.0, 0.6 + k * step_m]), 4 + k, covariance, 0.01, id=first_id + k)
         for k in range(count)
     ]
     return tuple(pieces[::2] + pieces[1::2])
@@ -36,7 +36,7 @@ def row(count=4, kind="stop_line", step_m=DASH_M + GAP_M, piece=PIECE, first_id=
 
 @pytest.mark.parametrize("kind", ["stop_line", "lane_dash", "crosswalk_bar"])
 def test_short_pieces_across_a_lane_are_one_give_way_line(kind):
-    diamond = Marking("diamond", PIECE + [40.0, 1.0], 3, id=1)
+    diamond = Marking("diamond", PIECE + np.array([40.0, 1.0]), 3, id=1)
     hd_map = composed(HDMap((diamond, *row(kind=kind)), LANES))
     kept, line = hd_map.markings
     assert kept is diamond
@@ -83,7 +83,7 @@ def test_what_is_no_give_way_line_stays_as_it_is(markings, why):
 
 
 def test_where_no_lane_line_tells_the_direction_nothing_is_recognised():
-    far = tuple(replace(lane, points_map=lane.points_map + [0.0, 50.0]) for lane in LANES)
+    far = tuple(replace(lane, points_map=lane.points_map + np.array([0.0, 50.0])) for lane in LANES)
     markings = row()
     for lanes in ((), far):
         assert with_give_way_lines(HDMap(markings, lanes)).markings is markings

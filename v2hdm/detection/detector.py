@@ -35,6 +35,9 @@ _log = logging.getLogger(__name__)
 Markings = tuple[MarkingDetection, ...]
 
 _NO_PAINT = -20.0  # log odds of paint where the vehicle itself is
+_SAME_SHARE = (
+    0.5  # least intersection over union of an area and a marking that are one piece of paint; chosen
+)
 
 
 class Detector:
@@ -96,7 +99,7 @@ class Detector:
             quads = find_markings(readings, proposals.camera, self.options)
         markings = _likelier(quads, self._symbols(image_bgr, proposals))
         with lap("areas"):
-            areas = self._areas(proposals)
+            areas = _of_several(self._areas(proposals), markings)
         return (*_not_of(areas, markings), *areas), lanes
 
     def run_network(self, image_bgr: np.ndarray, camera: Camera, top: int | None = None) -> NetworkOutput:
@@ -213,6 +216,23 @@ class Detector:
                 symbols.append(symbol)
                 parts_until = after
         return symbols
+
+
+def _of_several(areas: Sequence[MarkingDetection], markings: Markings) -> list[MarkingDetection]:
+    """The areas that are no single marking of another class: what has been found as an arrow is no word."""
+    shapes = [marking.outline_px if len(marking.outline_px) else marking.corners_px for marking in markings]
+    hulls = [cv2.convexHull(shape_px.astype(np.float32)) for shape_px in shapes]
+
+    def is_one(area: MarkingDetection) -> bool:
+        outline = area.outline_px.astype(np.float32)
+        size_px2 = cv2.contourArea(outline)
+        common_px2 = [cv2.intersectConvexConvex(outline, hull)[0] for hull in hulls]
+        return any(
+            common > _SAME_SHARE * (size_px2 + cv2.contourArea(hull) - common)
+            for common, hull in zip(common_px2, hulls, strict=True)
+        )
+
+    return [area for area in areas if not is_one(area)]
 
 
 def _not_of(areas: Sequence[MarkingDetection], markings: Markings) -> Markings:

@@ -169,7 +169,7 @@ class NetworkOutput:
         return _softmax(self._logits_at(self.kinds, rows, columns))
 
     def area_probability(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Probability (A + K, N) of the areas and, after them, of the other classes at elements of ``paint``."""
+        """Probability (A + K, N) of areas and, after them, of other classes at elements of ``paint``."""
         planes = (self.areas, self.kinds)
         return _softmax(np.concatenate([self._logits_at(logits, rows, columns) for logits in planes]))
 
