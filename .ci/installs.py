@@ -42,6 +42,7 @@ PROMISES = {
     "docs/living-map.md": ("localize",),
     "docs/report.md": ("report", "mosaic"),
     "docs/bags.md": ("check site",),
+    "docs/benchmark.md": ("benchmark make",),
 }
 """Words by document: each line of a block with one of them is run."""
 
@@ -58,7 +59,11 @@ MORE = {
         "python -c 'import v2hdm.paper, v2hdm.experiment.run'",
         "v2hdm detect images --limit 1",
     ),
-    "map,ros": ("v2hdm check site --list-topics", "v2hdm detect site --limit 1"),
+    "map,ros": (
+        "v2hdm check site --list-topics",
+        "v2hdm detect site --limit 1",
+        "v2hdm export map.geojson --format mcap",
+    ),
     "map,video": (
         "v2hdm check drives/film --no-ground --workers 1 --output outputs/film-check",
         "v2hdm detect drives/film --limit 1",
@@ -182,6 +187,8 @@ def missing(environment: Environment, here: Path) -> int:
             "experiment": "",
             "fleet": "a.yaml",
             "check": "drives/mysite",
+            "benchmark make": "streets out",
+            "benchmark score": "map.geojson streets",
         }
         words = arguments.get(name) or given.get(name, "outputs/port2")
         words += " outputs/friday" * (name in ("calibrate compare", "compare"))

@@ -139,14 +139,16 @@ def test_a_letter_is_no_marking_and_a_surer_marking_in_a_box_stays():
     assert [one.score for one in _not_of([area], (*markings, beside))] == [0.999, 0.3]
 
 
-def test_an_area_that_is_one_arrow_is_no_word():
+def test_an_area_that_is_part_of_an_arrow_is_no_word():
     letters = word("EBH", (7.0, 0.8))
     (area,), _ = areas_of(("text", letters))
     empty = MarkingDetection("arrow", 0.3, np.full((4, 2), np.nan), np.eye(8), np.zeros(4, dtype=bool))
-    arrow = replace(empty, outline_px=area.outline_px)
+    middle = area.outline_px.mean(axis=0)
+    arrow = replace(empty, outline_px=middle + 3 * (area.outline_px - middle))
     letter = replace(empty, outline_px=to_image(CAMERA, letters[0]))
     assert _of_several([area], (arrow,)) == []
     assert _of_several([area], (letter,)) == [area]
+    assert _of_several([area], ()) == [area]
 
 
 def test_the_bars_of_an_image_are_its_crosswalk_s_parts():

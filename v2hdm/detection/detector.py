@@ -35,7 +35,7 @@ _log = logging.getLogger(__name__)
 Markings = tuple[MarkingDetection, ...]
 
 _NO_PAINT = -20.0  # log odds of paint where the vehicle itself is
-_SAME_SHARE = (
+_PART_SHARE = 0.5  # share of an area in a marking from which it is a part of that; chosen
     0.5  # least intersection over union of an area and a marking that are one piece of paint; chosen
 )
 
@@ -219,20 +219,16 @@ class Detector:
 
 
 def _of_several(areas: Sequence[MarkingDetection], markings: Markings) -> list[MarkingDetection]:
-    """The areas that are no single marking of another class: what has been found as an arrow is no word."""
+    """The areas that lie in no marking: what names a part of an arrow a word does not make it one."""
     shapes = [marking.outline_px if len(marking.outline_px) else marking.corners_px for marking in markings]
     hulls = [cv2.convexHull(shape_px.astype(np.float32)) for shape_px in shapes]
 
-    def is_one(area: MarkingDetection) -> bool:
+    def is_part(area: MarkingDetection) -> bool:
         outline = area.outline_px.astype(np.float32)
-        size_px2 = cv2.contourArea(outline)
         common_px2 = [cv2.intersectConvexConvex(outline, hull)[0] for hull in hulls]
-        return any(
-            common > _SAME_SHARE * (size_px2 + cv2.contourArea(hull) - common)
-            for common, hull in zip(common_px2, hulls, strict=True)
-        )
+        return max(common_px2, default=0.0) > _PART_SHARE * cv2.contourArea(outline)
 
-    return [area for area in areas if not is_one(area)]
+    return [area for area in areas if not is_part(area)]
 
 
 def _not_of(areas: Sequence[MarkingDetection], markings: Markings) -> Markings:

@@ -25,9 +25,10 @@ from v2hdm.io.maps.features import with_heights
 from v2hdm.io.maps.formats import check_crs, with_data, write_map
 from v2hdm.io.maps.geojson import geojson_feature, geojson_positions, write_features, write_geojson
 from v2hdm.io.maps.geopackage import write_qgis
-from v2hdm.io.trajectory import write_tum
+from v2hdm.io.trajectory import read_tum, write_tum
 from v2hdm.mapping.results import AdjustedPoses, MethodResult
 from v2hdm.mosaic.result import write_mosaic
+from v2hdm.pipeline.answers import driven_paths
 from v2hdm.pipeline.base import change_json
 from v2hdm.pipeline.context import Context
 from v2hdm.records import BEST, Changes, Drive, FloatArray, HDMap, Image, ImageDetections, Trajectory
@@ -45,6 +46,9 @@ if TYPE_CHECKING:
     from v2hdm.pipeline.result import Result
 
 _log = logging.getLogger(__name__)
+
+
+_OF_OTHER_FILES = ("qgis", "mcap")  # formats that hold or open what is written after the map
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,6 +82,8 @@ def write_result(result: Result, folder: Path, outputs: Outputs, context: Contex
     if "qgis" in outputs.formats and result.methods:  # it opens the mosaic, too
         grid = check_crs(outputs.crs, ["qgis"], result.map.origin, "crs").get("qgis")
         write_qgis(result.map, folder / names.PROJECT, grid=grid)
+    if "mcap" in outputs.formats and result.methods:
+        _write_recording(result.map, folder)
     write_job(folder, StatedJob(outputs.job, outputs.crs))
     with context.timed("report"):
         if result.methods:
@@ -92,6 +98,13 @@ def write_result(result: Result, folder: Path, outputs: Outputs, context: Contex
             write_page(folder, drive)
         if outputs.pdf:
             write_paper(folder, drive)
+
+
+def _write_recording(hd_map: HDMap, folder: Path) -> None:
+    """The map with the adjusted poses and the overlays that are in ``folder``."""
+    driven = [read_tum(path) for path in sorted(folder.glob(names.TRAJECTORIES))]
+    overlays = sorted(folder.glob(names.OVERLAYS))
+    write_map(hd_map, folder, "map", ["mcap"], trajectories=driven, pictures=overlays)
 
 
 def _write_all_maps(folder: Path, result: Result) -> None:
@@ -109,9 +122,18 @@ def _write_map(folder: Path, result: Result, outputs: Outputs) -> None:
         name for name in outputs.formats if name == "geojson"
     ]  # longitude and latitude, whatever the others have
     write_map(result.map, folder, "map", geojson, verdict)
-    others = [name for name in with_data(outputs.formats) if name not in ("geojson", "qgis")]
-    driven = [session.trajectory for session in drive.sessions if session.trajectory is not None]
-    write_map(result.map, folder, "map", others, verdict, crs=outputs.crs, trajectories=driven)
+    others = [name for name in with_data(outputs.formats) if name not in ("geojson", *_OF_OTHER_FILES)]
+    driven = driven_paths(drive)
+    write_map(
+        result.map,
+        folder,
+        "map",
+        others,
+        verdict,
+        crs=outputs.crs,
+        trajectories=driven,
+        answers=result.answers,
+    )
     about = Provenance.today(drive.name, verdict)
     for name, calibration in best.calibrations.items():
         clock = None if drive.joined else best.clocks[0].get(name)

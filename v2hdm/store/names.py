@@ -47,6 +47,14 @@ def overlay_file(camera: str) -> str:
     return f"overlay_{camera}.png"
 
 
+OVERLAYS = "overlay_*.png"  # the pattern of :func:`overlay_file`
+
+
+def camera_of_overlay(path: Path) -> str:
+    """The camera of a picture that has a name of :func:`overlay_file`."""
+    return path.stem.removeprefix("overlay_")
+
+
 def trajectory_files(session: str | None) -> tuple[str, str]:
     """The adjusted poses, and their standard deviations, of one of several sessions, or of the only one."""
     if session is None:

@@ -28,7 +28,7 @@ def _run(arguments: Sequence[str]) -> None:
     kinds = (
         "for a map: geojson, csv, gpkg, lanelet2, dxf, qgis, opendrive, landxml, flatgeobuf, shapefile, kml, "
     )
-    kinds += "jsonfg; for mosaic.tif: pcd; "
+    kinds += "jsonfg, mcap; for mosaic.tif: pcd; "
     kinds += "for a calibration: camera_info, static_transform, urdf, kalibr, opencv; may be repeated"
     parser.add_argument("--format", action="append", required=True, metavar="NAME", help=kinds)
     parser.add_argument("--output", type=Path, metavar="DIR", help="output folder (default: that of MAP)")
@@ -37,11 +37,12 @@ def _run(arguments: Sequence[str]) -> None:
     system = "coordinate system of the output, such as EPSG:25832, or local for the drive's own frame"
     parser.add_argument("--crs", metavar="NAME", help=system)
     paths = (
-        "for lanelet2 and opendrive: poses of a drive in the map's frame, which say where lanes lead; may "
+        "for lanelet2, opendrive and mcap: poses of a drive in the map's frame, which say where lanes lead; "
     )
-    paths += "be repeated (default: trajectory*.tum beside MAP)"
+    paths += "may be repeated (default: trajectory*.tum beside MAP)"
     parser.add_argument("--path", action="append", type=Path, metavar="FILE", help=paths)
-    answered = "for lanelet2 and opendrive: map_questions.geojson of an export, with answers"
+    answered = "for lanelet2 and opendrive: map_questions.geojson of an export with answers, or corrections "
+    answered += "by v2hdm view"
     parser.add_argument("--answers", type=Path, metavar="FILE", help=answered)
     parsed = parser.parse_args(arguments)
     from v2hdm.pipeline.context import logging_to
@@ -68,6 +69,7 @@ def _export_map(parsed: argparse.Namespace, folder: Path, check: Callable[[Path]
     from v2hdm.io.maps import formats
     from v2hdm.io.maps.questions import questions_file, read_answers
     from v2hdm.io.maps.reading import read_map
+    from v2hdm.store.names import OVERLAYS
 
     if ground := [form for form in parsed.format if form in formats.GROUND_FORMATS]:
         raise ConfigError(
@@ -89,15 +91,13 @@ def _export_map(parsed: argparse.Namespace, folder: Path, check: Callable[[Path]
     ]
     trajectories = []
     answers: list[Answer] = []
-    if set(formats.LANE_FORMATS) & set(chosen):
+    _check_used(parsed.path, "--path", formats.DRIVEN_FORMATS, chosen)
+    _check_used(parsed.answers, "--answers", formats.LANE_FORMATS, chosen)
+    if set(formats.DRIVEN_FORMATS) & set(chosen):
         trajectories = _driven(parsed, hd_map)
+    if set(formats.LANE_FORMATS) & set(chosen):
         answers = [] if parsed.answers is None else read_answers(parsed.answers, hd_map.origin)
         files.append(folder / questions_file(name))
-    elif parsed.path or parsed.answers:
-        option = "--path" if parsed.path else "--answers"
-        raise ConfigError(
-            f"{option}: only the formats {' and '.join(formats.LANE_FORMATS)} have a use for it"
-        )
     if parsed.source.resolve() in [file.resolve() for file in files]:
         raise ConfigError(f"{parsed.source} would be overwritten: set another --output or --format")
     if parsed.answers is not None and parsed.answers.resolve() in [file.resolve() for file in files]:
@@ -115,7 +115,16 @@ def _export_map(parsed: argparse.Namespace, folder: Path, check: Callable[[Path]
         kept_formats,
         trajectories,
         answers,
+        sorted(parsed.source.parent.glob(OVERLAYS)),
     )
+
+
+def _check_used(value: object, option: str, users: Sequence[str], chosen: Sequence[str]) -> None:
+    """Refuse an option of which none of the formats ``chosen`` makes use."""
+    if value and not set(users) & set(chosen):
+        raise ConfigError(
+            f"{option}: only the formats {', '.join(users[:-1])} and {users[-1]} have a use for it"
+        )
 
 
 _FARTHEST_M = 50.0  # distance, m, from the map within which a path says something of its lanes; chosen

@@ -31,6 +31,7 @@ from v2hdm.io.maps.ogr import write_flatgeobuf, write_json_fg, write_shapefiles
 from v2hdm.io.maps.opendrive import write_opendrive
 from v2hdm.io.maps.questions import questions_file, write_questions
 from v2hdm.io.maps.reading import Verdict, read_geopackage, stated_in
+from v2hdm.io.maps.recording import write_mcap
 from v2hdm.records import GeodeticOrigin, HDMap, Trajectory
 from v2hdm.store.files import replace_csv
 from v2hdm.store.inputs import protected_inputs
@@ -106,10 +107,14 @@ class Format:
     takes_crs: bool = True
     states_verdict: bool = False
     metres: str = ""  # the format's name where it holds nothing but metres
+    extra: str = "gis"  # brings the package that it needs
 
 
 LANE_FORMATS = ("lanelet2", "opendrive")
 """Formats of lanes that lead to lanes, for which the paths of drives are needed."""
+
+DRIVEN_FORMATS = (*LANE_FORMATS, "mcap")
+"""Formats that the paths of drives go into."""
 
 FORMATS: Mapping[str, Format] = {
     "geojson": Format("{name}.geojson", write_geojson, states_verdict=True),
@@ -124,6 +129,7 @@ FORMATS: Mapping[str, Format] = {
     "shapefile": Format("{name}_shapefile.zip", write_shapefiles, "pyogrio"),
     "kml": Format("{name}.kml", write_kml, takes_crs=False),
     "jsonfg": Format("{name}_fg.json", write_json_fg, "pyogrio"),
+    "mcap": Format("{name}.mcap", write_mcap, "rosbags", takes_crs=False, extra="ros"),
 }
 
 GROUND_FORMATS: Mapping[str, Format] = {
@@ -141,7 +147,7 @@ def check_formats(names: Sequence[str], key: str) -> None:
         if name not in _ALL:
             raise ConfigError(f"{key}: unknown format {shown(name)}; choose from: {', '.join(_ALL)}")
         if (package := _ALL[name].needs) is not None:
-            need(package, "gis", f"the format {name}", ConfigError)
+            need(package, _ALL[name].extra, f"the format {name}", ConfigError)
 
 
 def holds(path: Path, hd_map: HDMap, crs: str | None) -> bool:
@@ -191,15 +197,17 @@ def write_map(
     present: Sequence[str] = (),
     trajectories: Sequence[Trajectory] = (),
     answers: Sequence[Answer] = (),
+    pictures: Sequence[Path] = (),
 ) -> list[Path]:
     """Write a map in several of :data:`FORMATS` to ``folder``; returns the files, each written atomically.
 
     ``name`` is that of the files, ``verdict`` that on the run which made the map, as JSON, ``projector`` that
     of :func:`v2hdm.io.maps.lanelet2.write_lanelet2`, and ``crs`` the system of the other formats' coordinates
     in place of their own; files of the formats ``present`` are there already. ``trajectories`` are of the
-    drives whose paths say where lanes lead, for :data:`LANE_FORMATS`, with which what paint and paths leave
-    open is written as ``{name}_questions.geojson``, but for what ``answers`` state. Raises ConfigError when a
-    format is not known or lacks its package, or when the projector or the system does not suit the map.
+    drives whose paths say where lanes lead, for :data:`DRIVEN_FORMATS`. What paint and paths leave open of
+    lanes is written as ``{name}_questions.geojson``, but for what ``answers`` state. ``pictures`` are the
+    overlays of a recording. Raises ConfigError when a format is not known or lacks its package, or when the
+    projector or the system does not suit the map.
     """
     check_formats(formats, "formats")
     grids = check_crs(crs, with_data(formats), hd_map.origin, "crs")
@@ -219,6 +227,7 @@ def write_map(
         more |= {"verdict": verdict} if _ALL[chosen].states_verdict else {}
         more |= {"grid": grids[chosen]} if chosen in grids else {}
         more |= {"graph": graph} if chosen in LANE_FORMATS else {}
+        more |= {"trajectories": trajectories, "pictures": pictures} if chosen == "mcap" else {}
         _ALL[chosen].write(hd_map, path, **more)
         written.append(path)
         if chosen == "geojson" and hd_map.origin is None and crs is None:
