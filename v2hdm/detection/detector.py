@@ -36,8 +36,6 @@ Markings = tuple[MarkingDetection, ...]
 
 _NO_PAINT = -20.0  # log odds of paint where the vehicle itself is
 _PART_SHARE = 0.5  # share of an area in a marking from which it is a part of that; chosen
-    0.5  # least intersection over union of an area and a marking that are one piece of paint; chosen
-)
 
 
 class Detector:
