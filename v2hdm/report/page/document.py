@@ -183,7 +183,7 @@ def _radii(facts: Facts) -> str:
     return charts.radius_chart(series) if series else ""
 
 
-_ASSETS = {"vendor": ("leaflet.js", "leaflet.css"), "templates": ("page.css", "map.js")}
+_ASSETS = {"vendor": ("leaflet.js", "leaflet.css"), "templates": ("page.css", "features.js", "map.js")}
 """Scripts and styles that the page embeds, by folder."""
 
 
