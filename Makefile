@@ -5,6 +5,8 @@
 #   make docs    build the documentation's site into site/
 #   make audit   known weaknesses of the installed packages
 #   make installs  the wheel with one extra at a time: what the documents promise there
+#   make dist    wheel and source archive, in dist/
+#   make sbom    the parts of an installation with versions and licences (CycloneDX), in dist/
 # Further arguments: make map ARGS="+run=port1"
 
 PYTHON ?= python3
@@ -20,10 +22,11 @@ ADVISORIES := https://pypi.org/pypi/PyYAML/5.3/json
 # An empty file per set of packages: while it is newer than what it depends on, nothing is installed.
 MAP_INSTALLED := $(VENV)/.installed-map
 DEV_INSTALLED := $(VENV)/.installed-dev
+SBOM_TOOLS := $(VENV)-sbom/bin/cyclonedx-py
 # What an installation is made of: the kernels are compiled by it.
 INSTALLED_FROM := pyproject.toml constraints.txt hatch_build.py $(wildcard v2hdm/native/src/*)
 
-.PHONY: map test check docs audit installs clean
+.PHONY: map test check docs audit installs dist sbom clean
 
 map: $(MAP_INSTALLED)
 	$(BIN)/python -m v2hdm.map $(ARGS)
@@ -50,8 +53,23 @@ audit: $(DEV_INSTALLED)
 installs: $(DEV_INSTALLED)
 	PYTHONPATH=. $(BIN)/python .ci/installs.py
 
+dist: $(DEV_INSTALLED)
+	$(BIN)/python -m build --outdir dist
+	$(BIN)/twine check --strict dist/*.whl dist/*.tar.gz
+
+# Its tool has an environment of its own: what it needs is no part of an installation. After `make test` the
+# list has the packages for development as well.
+sbom: $(MAP_INSTALLED) $(SBOM_TOOLS)
+	@mkdir -p dist
+	$(SBOM_TOOLS) environment --pyproject pyproject.toml --mc-type library --output-format JSON \
+		--output-file dist/v2hdm.cdx.json $(BIN)/python
+
+$(SBOM_TOOLS):
+	$(PYTHON) -m venv $(VENV)-sbom
+	$(VENV)-sbom/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt cyclonedx-bom
+
 clean:
-	rm -rf $(VENV) build dist site v2hdm/native/_kernels* .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
+	rm -rf $(VENV) $(VENV)-sbom build dist site v2hdm/native/_kernels* .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.12 ...")'

@@ -42,6 +42,7 @@ PROMISES = {
     "docs/living-map.md": ("localize",),
     "docs/report.md": ("report", "mosaic"),
     "docs/bags.md": ("check site",),
+    "docs/benchmark.md": ("benchmark make",),
 }
 """Words by document: each line of a block with one of them is run."""
 
@@ -186,6 +187,8 @@ def missing(environment: Environment, here: Path) -> int:
             "experiment": "",
             "fleet": "a.yaml",
             "check": "drives/mysite",
+            "benchmark make": "streets out",
+            "benchmark score": "map.geojson streets",
         }
         words = arguments.get(name) or given.get(name, "outputs/port2")
         words += " outputs/friday" * (name in ("calibrate compare", "compare"))

@@ -123,3 +123,33 @@ def test_an_audit_that_reaches_no_advisories_says_so():
     command = ["make", "--no-print-directory", "--old-file", ".venv/.installed-dev", *place, "audit"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout == "audit skipped: no advisories at http://127.0.0.1:9/\n"
+
+
+def test_a_release_publishes_wheels_archive_site_and_image_without_a_key():
+    workflow = yaml.safe_load((ROOT / ".github" / "workflows" / "release.yml").read_text())
+    jobs = workflow["jobs"]
+    assert set(jobs) == {"wheels", "archive", "pypi", "docs", "container"}
+    assert (ROOT / jobs["wheels"]["uses"]).is_file()
+    assert jobs["pypi"]["permissions"] == {"id-token": "write"}
+    told = [step["run"].split() for job in jobs.values() for step in job.get("steps", ()) if "run" in step]
+    targets = {words[1] for words in told if words[0] == "make"}
+    assert targets == {"sbom", "docs"}
+    rules = (ROOT / "Makefile").read_text()
+    assert all(re.search(f"^{target}:", rules, re.MULTILINE) for target in targets)
+    assert "secrets.PYPI" not in str(workflow)
+
+
+def test_the_version_is_the_same_wherever_it_is_stated():
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    released = re.findall(r"^## \[(\d.*?)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert {str(cited["version"]), released[0]} == {__version__}
+
+
+def test_the_page_of_licences_has_every_part_that_is_installed(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "docs" / "tools"))
+    import licences
+
+    text = licences.PAGE.read_text()
+    listed = set(re.findall(r"^\| ([a-z0-9-]+) \| [0-9]", text, re.MULTILINE))
+    assert {part.name for part in licences.parts()} == listed
+    assert not re.search("not stated", text)

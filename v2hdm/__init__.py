@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from v2hdm.verdict.inputs.drive import check_drive
     from v2hdm.verdict.verdict import Verdict
 
-__version__ = "1.0.0"
+__version__ = "1.1.0"
 __all__ = [
     "Calibration", "Detector", "DetectorOptions", "HDMap", "Localizer", "MappingOptions", "Problem",
     "ReadOptions", "Result", "V2hdmError", "Verdict", "build_problem", "calibrate_from_ground",

@@ -108,7 +108,7 @@ def height_m(points: FloatArray) -> FloatArray:
 def _line(
     kind: str, corners: Sequence[tuple[float, float]], rng: np.random.Generator, sigma_m: float, number: int
 ) -> Lane:
-    points = _even(np.array(corners, dtype=float), 0.5)
+    points = even(np.array(corners, dtype=float), 0.5)
     noise = gaussian_filter1d(rng.normal(size=points.shape), 4.0, axis=0, mode="nearest")
     points += sigma_m * noise / noise.std()
     return Lane(kind, points, 9, height_m(points), id=number)
@@ -121,7 +121,8 @@ def _stop(
     return Marking(STOP_LINE, corners, 9, np.eye(8) * 1e-4, id=number, variety=variety)
 
 
-def _even(corners: FloatArray, step_m: float) -> FloatArray:
+def even(corners: FloatArray, step_m: float) -> FloatArray:
+    """Points about ``step_m`` apart along straight lines from corner to corner."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
     at = np.linspace(0.0, along[-1], round(along[-1] / step_m) + 1)
     return np.column_stack([np.interp(at, along, axis) for axis in corners.T])
@@ -134,7 +135,7 @@ def trajectory(
     speed_mps: float = 5.0,
 ) -> Trajectory:
     """A drive along corners rounded by arcs of 9 m radius, at 10 Hz, noise 1.5 cm."""
-    points = _even(_rounded(np.array(corners, dtype=float), 9.0), speed_mps / 10)
+    points = even(rounded(np.array(corners, dtype=float), 9.0), speed_mps / 10)
     wander = gaussian_filter1d(rng.normal(size=points.shape), 20.0, axis=0, mode="nearest")
     points = points + wander_m * wander / wander.std() + rng.normal(scale=0.015, size=points.shape)
     ahead = gaussian_filter1d(np.gradient(points, axis=0), 3.0, axis=0)
@@ -148,8 +149,8 @@ def trajectory(
     return Trajectory(np.arange(len(points)) / 10.0, map_from_vehicle)
 
 
-def _rounded(corners: FloatArray, radius_m: float) -> FloatArray:
-    """The corners with an arc in place of each that turns by more than 30 degrees."""
+def rounded(corners: FloatArray, radius_m: float) -> FloatArray:
+    """The corners (N, 2) with an arc in place of each that turns by more than 30 degrees."""
     points = [corners[0]]
     for before, corner, after in zip(corners, corners[1:], corners[2:], strict=False):
         into = (corner - before) / np.linalg.norm(corner - before)

@@ -29,6 +29,7 @@ from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.results import MethodResult
 from v2hdm.records import Calibration, Drive, FloatArray, Marking, PoseNoise, Truth
+from v2hdm.report.consistency import INSIDE_95, squared_in_sigmas
 from v2hdm.report.metrics import match_markings
 from v2hdm.simulate.port.config import PortConfig
 from v2hdm.simulate.port.drive import rendered_drive
@@ -40,8 +41,8 @@ CACHE = Path("~/.cache/v2hdm/uncertainty").expanduser()
 Errors = Mapping[str, FloatArray]
 """By quantity, squared errors in sigmas, as if of one degree of freedom: inside 95 % below 3.84."""
 
-_INSIDE = float(chi2.ppf(0.95, 1))
-_CORNER_INSIDE = float(chi2.ppf(0.95, 2))
+INSIDE = float(chi2.ppf(0.95, 1))
+"""Squared error, in sigmas, below which a quantity lies inside its 95 % region."""
 
 
 def squared_errors(result: MethodResult, truth: Truth) -> Errors:
@@ -58,7 +59,7 @@ def squared_errors(result: MethodResult, truth: Truth) -> Errors:
         [camera_errors(one, truth.cam_from_vehicle[name]) for name, one in result.calibrations.items()]
     )
     return {
-        "corners": corner_errors(mapped, true) * _INSIDE / _CORNER_INSIDE,
+        "corners": corner_errors(mapped, true) * INSIDE / INSIDE_95,
         "sides": side_errors(mapped, true),
         "distances": distance_errors(mapped, true),
         **{name: cameras[:, axis] for axis, name in enumerate(("height", "roll", "pitch", "yaw"))},
@@ -73,13 +74,9 @@ def in_order_of(corners: FloatArray, other: FloatArray) -> FloatArray:
 
 def corner_errors(mapped: Sequence[Marking], true: FloatArray) -> FloatArray:
     """Of every corner of markings (M,), squared and in sigmas; chi-square of two degrees of freedom."""
-    out = []
-    for marking, corners in zip(mapped, true, strict=True):
-        assert marking.covariance_m2 is not None
-        blocks = np.stack([marking.covariance_m2[k : k + 2, k : k + 2] for k in range(0, 8, 2)])
-        off = marking.corners_map - corners
-        out.append(np.einsum("ka,ka->k", off, np.linalg.solve(blocks, off[..., None])[..., 0]))
-    return np.concatenate(out)
+    assert all(marking.covariance_m2 is not None for marking in mapped)
+    pairs = zip(mapped, true, strict=True)
+    return squared_in_sigmas(mapped, [replace(marking, corners_map=corners) for marking, corners in pairs])
 
 
 def side_errors(mapped: Sequence[Marking], true: FloatArray) -> FloatArray:
@@ -125,7 +122,7 @@ def camera_errors(found: Calibration, true: FloatArray) -> FloatArray:
 
 def shares(errors: Errors) -> dict[str, float]:
     """By quantity, the share inside the 95 % region."""
-    return {name: float(np.mean(errors[name] <= _INSIDE)) for name in QUANTITIES}
+    return {name: float(np.mean(errors[name] <= INSIDE)) for name in QUANTITIES}
 
 
 def print_shares(name: str, errors: Errors) -> None:

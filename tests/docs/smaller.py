@@ -20,4 +20,6 @@ def smaller(arguments: list[str]) -> list[str]:
     small = [*(SMALL_PORT if ports else ()), "workers=1"]
     if name == "map" and given != ["+run=port2"]:  # that of `make map` shows the mosaic, once for all
         small.append("mosaic=false")
+    if any(argument.startswith("drive.path=bench/") for argument in given):
+        small.append("drive.limit=40")
     return [*arguments, *small]

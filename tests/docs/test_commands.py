@@ -181,7 +181,7 @@ def test_a_document_names_only_modules_extras_and_targets_that_are_there(name):
     text = document(name)
     for module in re.findall(r"python -m ([a-z][a-z_0-9.]*[a-z_0-9])\b", text):
         assert importlib.util.find_spec(module) is not None, module
-    for name in re.findall(r"(?:`|^)v2hdm (calibrate [a-z]+|[a-z]+)\b", text, re.MULTILINE):
+    for name in re.findall(r"(?:`|^)v2hdm ((?:calibrate|benchmark) [a-z]+|[a-z]+)\b", text, re.MULTILINE):
         assert name in command_names(), name
     for listed in re.findall(r"(?:\.|v2hdm|\.whl)\[([a-z, ]+)\]'", text):
         assert {one.strip() for one in listed.split(",")} <= set(EXTRAS), listed

@@ -31,6 +31,7 @@ COMMANDS = {
     "v2hdm localize": "map.geojson drive --workers 1 --output out",
     "v2hdm map": "drive.path=drive output=. name=out workers=1",
     "v2hdm compare": "map.geojson map.geojson --output out",
+    "v2hdm benchmark make": "streets out --workers 1",
 }
 """Each makes a result in the folder ``out``."""
 
@@ -74,6 +75,8 @@ CIRCLES = (
     "calibrate ground circle --output out", "calibrate compare circle calibration_front.yaml",
     "compare circle map.geojson", "compare map.geojson circle",
     "compare map.geojson map.geojson --output circle",
+    "benchmark make streets circle", "benchmark make streets made --cache circle",
+    "benchmark score circle streets",
     "localize circle drive --output out", "localize map.geojson circle --output out",
     "map drive.path=circle output=. name=out", "map drive.path=drive output=circle name=out workers=1",
     "report circle", "view circle", "labels circle", "mosaic circle",
@@ -90,7 +93,7 @@ def circles() -> Iterator[Case]:
     """A link in a circle in the place of every input and output."""
     for line in CIRCLES:
         words = line.split()
-        door = f"v2hdm {' '.join(words[:2] if words[0] == 'calibrate' else words[:1])}"
+        door = f"v2hdm {' '.join(words[:2] if words[0] in ('calibrate', 'benchmark') else words[:1])}"
         prepare = _site(_circle)
         yield Case(f"a circle: {line}", door, words[len(door.split()) - 1 :], prepare, "circle|Symlink loop")
 

@@ -9,6 +9,7 @@ from v2hdm.errors import MapFileError
 from v2hdm.io.maps.corrections import (
     ACCEPTED,
     ADDED,
+    ANSWERED,
     CORRECTED,
     REJECTED,
     Correction,
@@ -48,6 +49,8 @@ def corrected(small_mapped, small_drive, tmp_path_factory):
         Correction(says=ADDED, kind=again.kind, outline_map=(again.corners_map + 0.02).tolist()),
         Correction(says=REJECTED, kind=lane.kind, outline_map=lane.points_map.tolist(), is_line=True),
         Correction(says=ADDED, kind=lane.kind, outline_map=half_of(lane).tolist(), is_line=True),
+        Correction(says=ANSWERED, kind="line", outline_map=[[1.0, 2.0]], answer="noted"),
+        Correction(says=ANSWERED, kind="direction", outline_map=[[900.0, 0.0], [905.0, 0.0]], answer="along"),
     ]  # fmt: skip
     path = folder / "corrections.yaml"
     write_corrections(said, str(result), path)
@@ -141,7 +144,8 @@ def test_a_correction_of_nothing_is_a_finding_and_no_silence(corrected):
 
 
 def test_what_the_map_follows_is_listed_beside_what_the_images_show(corrected):
-    listed = {heard["says"]: heard["against"] for heard in corrected[2].metrics["corrections"]}
+    of_paint = [h for h in corrected[2].metrics["corrections"] if not h["says"].startswith("answered")]
+    listed = {heard["says"]: heard["against"] for heard in of_paint}
     assert set(listed) == {
         "rejected",
         "of class crosswalk_bar",
@@ -230,3 +234,14 @@ def test_what_is_written_is_read_back(tmp_path):
     )
     write_corrections([one], "outputs/port1", tmp_path / "corrections.yaml")
     assert read_corrections(tmp_path / "corrections.yaml") == [one]
+
+
+def test_answers_on_lanes_are_told_and_one_without_a_lane_is_a_warning(corrected):
+    _, _, made = corrected
+    answered = [entry for entry in made.metrics["corrections"] if entry["says"].startswith("answered")]
+    assert [entry["place"] for entry in answered] == ["line at (1.00, 2.00)", "direction at (902.50, 0.00)"]
+    assert answered[0]["against"] == ""
+    assert "no lane lies at (900.0, 0.0)" in answered[1]["against"]
+    (finding,) = [finding for finding in made.verdict.findings if finding.check == "answers on lanes"]
+    assert finding.status.value == "WARN"
+    assert "1 of 2 cannot be followed" in finding.says

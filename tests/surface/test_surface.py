@@ -282,7 +282,7 @@ def test_a_map_over_a_plane_gets_no_file_of_its_ground_and_is_told_so(tmp_path, 
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("engine", ["numba", "torch"])
+@pytest.mark.parametrize("engine", ["native", "torch"])
 def test_a_step_of_heights_is_that_to_the_least_cost_of_everything_anew(engine):
     scene = make_scene(3, frames=40, start_error_deg=0.1, start_error_m=0.01)
     options, seen = SolveOptions(loss="none", engine=engine, coarse=False), scene.problem.observations
@@ -328,7 +328,8 @@ def plane():
 def test_a_road_with_a_crown_or_crests_is_mapped_as_well_as_a_plane(plane, relief, height_m):
     # A roll of the recording sensor by 2 mrad, which a straight road does not show, leans recorded ground.
     curved = map_one(Job(SEED, spoil=relief, ground="auto"))
-    assert curved.status == plane.status == "PASS"
+    # Both are straight, and nothing is stated of their clocks.
+    assert {finding["check"] for row in (plane, curved) for finding in row.findings} == {"clock"}
     assert curved.rmse_m <= 1.2 * plane.rmse_m
     assert curved.markings >= plane.markings
     assert curved.height_rmse_m <= height_m

@@ -15,6 +15,7 @@ from v2hdm.asbuilt.design import (
     DesignShape,
     Outline,
     built_shapes,
+    check_place,
     check_shapes,
     outline_of,
 )
@@ -195,18 +196,7 @@ def _check_site(meant: FloatArray, corners: FloatArray, design: Design) -> None:
     """Refuse a design that lies elsewhere than the map."""
     if not len(corners):
         raise MapFileError(f"{design.source}: the map has no marking to compare with it; map the site first")
-    low = corners.min(axis=(0, 1))
-    high = corners.max(axis=(0, 1))
-    centres = meant.mean(axis=1)
-    gap_m, swapped_m = (
-        np.linalg.norm(np.maximum(np.maximum(low - places, places - high), 0.0), axis=1).min()
-        for places in (centres, centres[:, ::-1])
-    )
-    if gap_m > _ELSEWHERE_M:
-        hint = "its axes are swapped" if swapped_m < _ELSEWHERE_M else "check its system and its units"
-        raise MapFileError(
-            f"{design.source}: all of it lies at least {gap_m:,.0f} m from the map's markings; {hint}"
-        )
+    check_place(meant.mean(axis=1), corners.reshape(-1, 2), design.source, "the map's markings")
 
 
 def _check_found(pairs: Pairs, design: Design) -> None:
@@ -217,6 +207,3 @@ def _check_found(pairs: Pairs, design: Design) -> None:
             f"{design.source}: {len(pairs.shape)} of its {len(design.shapes)} shapes ({kinds}) lie on "
             "markings of the map; check that it is of this site, and its system, units and classes"
         )
-
-
-_ELSEWHERE_M = 100.0  # least distance, m, between a map and a design that is not of its site

@@ -161,3 +161,22 @@ def check_shapes(design: Design) -> Design:
 
 
 _LEAST_AREA_M2 = 1e-4  # least area of a shape, m^2: a centimetre squared
+
+
+def check_place(places: FloatArray, others: FloatArray, source: str, called: str) -> None:
+    """Raise MapFileError where all ``places`` (N, 2) of a source lie far from ``others`` (M, 2), m.
+
+    ``called`` is what the others are. The message says so where swapped axes explain it.
+    """
+    low = others.min(axis=0)
+    high = others.max(axis=0)
+    gap_m, swapped_m = (
+        float(np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0.0), axis=1).min())
+        for points in (places, places[:, ::-1])
+    )
+    if gap_m > _ELSEWHERE_M:
+        hint = "its axes are swapped" if swapped_m < _ELSEWHERE_M else "check its system and its units"
+        raise MapFileError(f"{source}: all of it lies at least {gap_m:,.0f} m from {called}; {hint}")
+
+
+_ELSEWHERE_M = 100.0  # least distance, m, between a map and a design that is not of its site

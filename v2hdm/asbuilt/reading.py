@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -61,19 +61,20 @@ class Source:
 
 
 @dataclass(frozen=True)
-class _Drawn:
-    """A closed shape as its file has it: x and y (N, 2), its name, and what it is called."""
+class Drawn:
+    """A shape as its file has it: x and y (N, 2), its name, what it is called, and its properties."""
 
     positions: FloatArray
     name: str
     called: str | None
+    properties: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class _File:
     """The shapes of a file, the system of their positions, and how many open lines it has besides."""
 
-    shapes: list[_Drawn]
+    shapes: list[Drawn]
     crs: str | None
     lines: int
 
@@ -101,8 +102,8 @@ def read_design(path: Path, hd_map: HDMap, source: Source | None = None) -> Desi
             f"{path}: does not say what its coordinates count from; give --crs, or --crs {LOCAL}"
         )
     shapes = []
-    for drawn, kind in _of_known_kinds(content.shapes, classes_of(hd_map), source, path):
-        outline = _in_map(drawn.positions, crs, origin, str(path))
+    for drawn, kind in of_known_kinds(content.shapes, classes_of(hd_map), source, path):
+        outline = in_map(drawn.positions, crs, origin, str(path))
         shapes.append(DesignShape(drawn.name, kind, outline))
     return Design(tuple(shapes), str(path), content.lines)
 
@@ -121,9 +122,9 @@ def _is_ours(path: Path) -> bool:
     return False
 
 
-def _of_known_kinds(
-    shapes: Iterable[_Drawn], classes: Collection[str], source: Source, path: Path
-) -> list[tuple[_Drawn, str | None]]:
+def of_known_kinds(
+    shapes: Iterable[Drawn], classes: Collection[str], source: Source, path: Path
+) -> list[tuple[Drawn, str | None]]:
     """Shapes with their classes; those with names of no class are left out, with one line that says so."""
     stated_kinds = source.kinds or {}
     for name, stated in stated_kinds.items():
@@ -131,7 +132,7 @@ def _of_known_kinds(
             choices = ", ".join(sorted(classes))
             raise ConfigError(f"--class {name}={shown(stated)}: is no class; choose from: {choices}")
     meant = {_plain(name): stated for name, stated in stated_kinds.items()}
-    out: list[tuple[_Drawn, str | None]] = []
+    out: list[tuple[Drawn, str | None]] = []
     unknown = dict[str, int]()
     for shape in shapes:
         called = None if shape.called is None else _plain(shape.called)
@@ -156,7 +157,7 @@ def _plain(name: str) -> str:
     return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
 
 
-def _in_map(positions: FloatArray, crs: str, origin: GeodeticOrigin | None, where: str) -> FloatArray:
+def in_map(positions: FloatArray, crs: str, origin: GeodeticOrigin | None, where: str) -> FloatArray:
     """Positions (N, 2) of a system in the map, m."""
     if crs == LOCAL:
         return positions
@@ -185,7 +186,8 @@ def _in_map(positions: FloatArray, crs: str, origin: GeodeticOrigin | None, wher
     return enu_from_geodetic(origin, on_earth)[:, :2]
 
 
-def _called(properties: Mapping[str, Any]) -> str | None:
+def called_by(properties: Mapping[str, Any]) -> str | None:
+    """What a feature is called by the first of its properties that says so, None without one."""
     by_name = {str(key).lower(): value for key, value in properties.items()}
     return next((str(by_name[key]) for key in _NAMED_BY if by_name.get(key) not in (None, "")), None)
 
@@ -200,7 +202,7 @@ def _of_features(
         if geometry is None:
             continue
         if geometry.closed:
-            shapes.append(_Drawn(geometry.positions[:, :2], name, _called(properties)))
+            shapes.append(Drawn(geometry.positions[:, :2], name, called_by(properties)))
         else:
             lines = lines + 1
     return _File(shapes, crs, lines)
@@ -221,9 +223,15 @@ def _read_geojson(path: Path, source: Source) -> _File:
         features.append(
             (None if is_point else geometry_of_geojson(geometry, where), properties, f"feature {shown(name)}")
         )
+    return _of_features(features, crs_of_geojson(content))
+
+
+def crs_of_geojson(content: Mapping[str, Any]) -> str:
+    """The system of a GeoJSON file's positions: the one that older files state, else that of RFC 7946."""
     stated = content.get("crs")
-    crs = stated.get("properties", {}).get("name") if isinstance(stated, dict) else None
-    return _of_features(features, str(crs) if crs else _RFC_7946)
+    properties = stated.get("properties") if isinstance(stated, dict) else None
+    name = properties.get("name") if isinstance(properties, dict) else None
+    return str(name) if name else _RFC_7946
 
 
 _SAME_PLACE = 1e-9  # distance, in units of a drawing, of a last vertex that repeats the first
@@ -280,7 +288,7 @@ def _read_dxf(path: Path, source: Source) -> _File:
         is_closed = len(points) > 3 and bool(np.abs(points[0] - points[-1]).max() < _SAME_PLACE)
         if is_closed or (len(points) > 2 and entity.is_closed):
             ring = points[:-1] if is_closed else points
-            shapes.append(_Drawn(metres * ring, name, entity.dxf.layer))
+            shapes.append(Drawn(metres * ring, name, entity.dxf.layer))
         else:
             lines = lines + 1
     return _File(shapes, stated, lines)
@@ -304,7 +312,7 @@ def _unit_m(unit: str) -> float:
 
 def _read_opendrive(path: Path, source: Source) -> _File:
     drawing = outlines_of(path)
-    shapes = [_Drawn(outline.positions, outline.name, outline.called) for outline in drawing.outlines]
+    shapes = [Drawn(outline.positions, outline.name, outline.called) for outline in drawing.outlines]
     return _File(shapes, drawing.crs, 0)
 
 

@@ -7,13 +7,13 @@ import json
 import logging
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from v2hdm.errors import EXIT_FAILED_VERDICT, masked
+from v2hdm.errors import EXIT_FAILED_VERDICT, ConfigError, masked
 from v2hdm.progress import Steps, patient, progress_lines
 
 if TYPE_CHECKING:
@@ -82,6 +82,17 @@ def result_of(folder: Path, maker: str, settings: Mapping[str, object]) -> Itera
     with result_folder(folder, "--output", maker) as unfinished:
         (unfinished / "config.yaml").write_text(masked(json.dumps(settings)) + "\n", encoding="utf-8")
         yield unfinished
+
+
+def kinds_of(pairs: Sequence[str]) -> dict[str, str]:
+    """Our classes by the names of a file, of options --class NAME=CLASS; ConfigError where one is not so."""
+    kind_of = {}
+    for pair in pairs:
+        name, separator, kind = pair.rpartition("=")
+        if not separator or not name or not kind:
+            raise ConfigError(f"--class {pair}: give it as NAME=CLASS, such as MARK_02=lane_dash")
+        kind_of[name] = kind
+    return kind_of
 
 
 def steps_of(task: str) -> Steps:

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
+from scipy.sparse import vstack
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
@@ -229,12 +230,20 @@ class Sensitivity:
         of_priors = [name for name in column if name != "observations"]
         if not of_priors:
             return None
-        ends = [priors[name] for name in of_priors]
-        along = [column[name] for name in of_priors]
-        slopes = torch.autograd.grad(
-            ends, list(leaves.values()), along, retain_graph=True, materialize_grads=True
-        )
+        # Of a sum: gradients handed to autograd would load sympy, for two seconds, to compare their shapes.
+        along = torch.stack([(priors[name] * column[name]).sum() for name in of_priors]).sum()
+        slopes = torch.autograd.grad(along, list(leaves.values()), retain_graph=True, materialize_grads=True)
         return Gradient(**dict(zip(leaves, slopes, strict=True)))
+
+    def moves(self, columns: FloatArray) -> Moves:
+        """Motion of the solution under unit errors with columns (2 K, B) of the observations' residuals."""
+        arrays = self.arrays
+        steps = self.jacobians.steps(self.jacobians.whiten(columns, [None] * columns.shape[1]))
+        of_corners = np.empty(tuple(steps.corners_map.shape))
+        of_corners[arrays.corner_order.cpu().numpy()] = -steps.corners_map.cpu().numpy()
+        of_poses = np.zeros((arrays.frame_count, 6, columns.shape[1]))
+        of_poses[:, list(arrays.states)] = -steps.frame_state.cpu().numpy()
+        return Moves(of_corners, -steps.extrinsic.cpu().numpy(), of_poses)
 
     def flat(self, rows: Rows) -> FloatArray:
         """All residuals, or derivatives, concatenated, (R,)."""
@@ -276,9 +285,10 @@ class Sensitivity:
     def information_by_stretch(self, columns: FloatArray) -> FloatArray:
         """Squared lengths (n, G + 1) of columns (n, R) by segment; last, priors of none."""
         order, begin = self._stretch_of
-        squares = np.square(columns[:, order])
-        parts = [slice(first, end) for first, end in pairwise(begin.tolist())]
-        return np.stack([squares[:, part].sum(1) for part in parts], axis=1)
+        stretch = np.empty(len(order), dtype=np.int64)
+        stretch[order] = np.repeat(np.arange(len(begin) - 1), np.diff(begin))
+        sums = [np.bincount(stretch, np.square(column), len(begin) - 1) for column in columns]
+        return np.array(sums, dtype=np.float64).reshape(-1, len(begin) - 1)
 
 
 def _rows(arrays: Arrays, estimate: Estimate, observations: Tensor | None = None) -> Rows:
@@ -321,10 +331,11 @@ def height_information(solution: Solution, heights: Any) -> tuple[FloatArray, Fl
     observed = np.flatnonzero(information.diagonal() > 0)
     by_column = columns[:, observed].tocsc()
     coupled = solved.root.new_zeros(len(observed), solved.whitening.size)
-    lifted = unit.cpu().numpy()[:, :, None]
+    along_u, along_v = unit.cpu().numpy()[:, :, None]
     for begin in range(0, len(observed), _AT_ONCE):
-        heights_m = by_column[:, begin : begin + _AT_ONCE].toarray()
-        by_height = (lifted * heights_m).reshape(-1, heights_m.shape[1])
+        heights_m = by_column[:, begin : begin + _AT_ONCE]
+        # Sparse: a height is seen in a few images.
+        by_height = vstack([heights_m.multiply(along_u), heights_m.multiply(along_v)], format="csr")
         whitened = solved.jacobians.whiten(by_height, [None] * heights_m.shape[1])
         coupled[begin : begin + _AT_ONCE] = torch.cat([whitened.reduced, whitened.corners.flatten(0, 1)]).mT
     information[np.ix_(observed, observed)] -= (coupled @ coupled.mT).cpu().numpy()
@@ -336,12 +347,6 @@ def height_information(solution: Solution, heights: Any) -> tuple[FloatArray, Fl
 def moves_with_heights(solution: Solution, heights: FloatArray) -> Moves:
     """Motion of a solution under B errors of the observed ground's heights (K, B), m."""
     solved = Sensitivity.at(solution.covariance.whitening)
-    arrays = solved.arrays
     unit = raised(solved, torch.ones_like(solved.root))["observations"].cpu().numpy()
-    by_height = (unit[:, :, None] * heights[arrays.order.cpu().numpy()]).reshape(-1, heights.shape[1])
-    steps = solved.jacobians.steps(solved.jacobians.whiten(by_height, [None] * heights.shape[1]))
-    of_corners = np.empty(tuple(steps.corners_map.shape))
-    of_corners[arrays.corner_order.cpu().numpy()] = -steps.corners_map.cpu().numpy()
-    of_poses = np.zeros((arrays.frame_count, 6, heights.shape[1]))
-    of_poses[:, list(arrays.states)] = -steps.frame_state.cpu().numpy()
-    return Moves(of_corners, -steps.extrinsic.cpu().numpy(), of_poses)
+    by_height = unit[:, :, None] * heights[solved.arrays.order.cpu().numpy()]
+    return solved.moves(by_height.reshape(-1, heights.shape[1]))

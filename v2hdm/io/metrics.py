@@ -117,7 +117,7 @@ class ExtrinsicFigures(TypedDict, total=False):
 
 
 class StatedReception(TypedDict):
-    """What the source of the poses says of its positions."""
+    """The quality of the positions, as their source states it."""
 
     positions: int
     rtk_fixed: int | None

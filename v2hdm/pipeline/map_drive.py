@@ -18,8 +18,9 @@ from v2hdm.doors import checked
 from v2hdm.errors import AdjustError, ConfigError, MappingError
 from v2hdm.executor import open_executor
 from v2hdm.io.drive import ReadOptions, as_drive, join_drives
-from v2hdm.io.maps.corrections import read_corrections
+from v2hdm.io.maps.corrections import Correction, read_corrections
 from v2hdm.mapping.options import AUTO, MappingOptions, check_options
+from v2hdm.pipeline.answers import with_answers
 from v2hdm.pipeline.base import changes_json, check_together, read_base
 from v2hdm.pipeline.config import ACCURACY_GOAL_CM, Contents, check_choice
 from v2hdm.pipeline.context import Context
@@ -107,7 +108,8 @@ def map_drive(
     >>> result.verdict.status.value, result.calibrations["front"].cam_from_vehicle.shape
     ('PASS', (4, 4))
     """
-    options = _options_of(options or MappingOptions(), corrections)
+    stated = [] if corrections is None else read_corrections(Path(corrections))
+    options = _options_of(options or MappingOptions(), stated)
     reading = reading or ReadOptions()
     sources = _sources_of(drive)
     check_choice(options, len(sources), base is not None, accuracy_goal_cm, section_m)
@@ -123,7 +125,7 @@ def map_drive(
         about = describe_run(name or read.whole.name, read.whole, read.contents, paths, reading)
         described = inspection.drive_as_described
         mapped_so_far = Result(about, read.drives, read.contents, described, context.seconds, options.device)
-        return _mapped(
+        mapped = _mapped(
             mapped_so_far,
             inspection,
             detector,
@@ -134,6 +136,7 @@ def map_drive(
             all_maps,
             section_m,
         )
+        return with_answers(mapped, stated)
 
 
 @contextmanager
@@ -146,11 +149,11 @@ def _own_context(cache: Path | str | None, progress: Progress, workers: int) -> 
         yield Context(stages, progress, executor=executor, workers=workers)
 
 
-def _options_of(options: MappingOptions, corrections: Path | str | None) -> MappingOptions:
-    """The checked options, with the corrections in a file."""
-    if corrections is not None:
-        stated = read_corrections(Path(corrections))
-        options = replace(options, acceptance=replace(options.acceptance, corrections=stated))
+def _options_of(options: MappingOptions, stated: Sequence[Correction]) -> MappingOptions:
+    """The checked options, with the corrections of paint that a person has stated, if any."""
+    if stated:
+        of_paint = [correction for correction in stated if not correction.is_answer]
+        options = replace(options, acceptance=replace(options.acceptance, corrections=of_paint))
     check_options(options)
     return options
 

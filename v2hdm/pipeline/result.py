@@ -23,6 +23,7 @@ from v2hdm.pipeline.evaluate import CameraSets
 from v2hdm.records import BEST, Calibration, Drive, HDMap, ImageDetections
 from v2hdm.store.cache import library_versions
 from v2hdm.survey.check_points import CheckTable
+from v2hdm.topology.answers import Answer
 from v2hdm.verdict import Verdict
 
 
@@ -67,6 +68,7 @@ class Result:
         detections: in each image of ``drive``.
         methods: results by camera set, then by method, those of all cameras last; empty where no map came.
         check_points: a survey's check points against the map; None without any.
+        answers: a person's on lanes, which the lanes of exported maps follow.
 
     >>> saved = result.save(folder / "port")
     >>> sorted(path.name for path in saved.glob("*.geojson"))
@@ -87,6 +89,7 @@ class Result:
     detections: Sequence[ImageDetections] = ()
     methods: CameraSets = field(default_factory=dict)
     check_points: CheckTable | None = None
+    answers: tuple[Answer, ...] = ()
 
     @property
     def metrics(self) -> dict[str, Any]:

@@ -28,6 +28,7 @@ from v2hdm.io.maps.geopackage import write_qgis
 from v2hdm.io.trajectory import read_tum, write_tum
 from v2hdm.mapping.results import AdjustedPoses, MethodResult
 from v2hdm.mosaic.result import write_mosaic
+from v2hdm.pipeline.answers import driven_paths
 from v2hdm.pipeline.base import change_json
 from v2hdm.pipeline.context import Context
 from v2hdm.records import BEST, Changes, Drive, FloatArray, HDMap, Image, ImageDetections, Trajectory
@@ -122,8 +123,17 @@ def _write_map(folder: Path, result: Result, outputs: Outputs) -> None:
     ]  # longitude and latitude, whatever the others have
     write_map(result.map, folder, "map", geojson, verdict)
     others = [name for name in with_data(outputs.formats) if name not in ("geojson", *_OF_OTHER_FILES)]
-    driven = [session.trajectory for session in drive.sessions if session.trajectory is not None]
-    write_map(result.map, folder, "map", others, verdict, crs=outputs.crs, trajectories=driven)
+    driven = driven_paths(drive)
+    write_map(
+        result.map,
+        folder,
+        "map",
+        others,
+        verdict,
+        crs=outputs.crs,
+        trajectories=driven,
+        answers=result.answers,
+    )
     about = Provenance.today(drive.name, verdict)
     for name, calibration in best.calibrations.items():
         clock = None if drive.joined else best.clocks[0].get(name)

@@ -128,7 +128,7 @@ def match_markings(
 
 def corner_errors(mapped: Sequence[Marking], true: Sequence[Marking]) -> FloatArray:
     """Error vectors (4 M, 2) of paired markings, over the best of the four cyclic corner orders."""
-    pairs = zip(mapped, true, _first_corners(mapped, true), strict=True)
+    pairs = zip(mapped, true, first_corners(mapped, true), strict=True)
     errors = [
         np.roll(marking.corners_map, shift, axis=0) - counterpart.corners_map
         for marking, counterpart, shift in pairs
@@ -140,7 +140,7 @@ def height_figures(mapped: Sequence[Marking], true: Sequence[Marking]) -> dict[s
     """RMSE, m, of paired corners' heights, and the fraction within 1.96 sigmas, where known."""
     errors_m = []
     inside = []
-    for marking, counterpart, shift in zip(mapped, true, _first_corners(mapped, true), strict=True):
+    for marking, counterpart, shift in zip(mapped, true, first_corners(mapped, true), strict=True):
         if marking.heights_m is None or counterpart.heights_m is None:
             continue
         errors_m.append(marking.heights_m - np.roll(counterpart.heights_m, -shift))
@@ -150,8 +150,8 @@ def height_figures(mapped: Sequence[Marking], true: Sequence[Marking]) -> dict[s
     return figures | ({"heights_inside_95": float(np.mean(inside))} if inside else {})
 
 
-def _first_corners(mapped: Sequence[Marking], true: Sequence[Marking]) -> list[int]:
-    """Cyclic shift of each pair's corners with the least error."""
+def first_corners(mapped: Sequence[Marking], true: Sequence[Marking]) -> list[int]:
+    """Steps by which the corners of each mapped marking are rolled to come nearest to the true ones."""
     shifts = []
     for marking, counterpart in zip(mapped, true, strict=True):
         errors = [np.roll(marking.corners_map, s, axis=0) - counterpart.corners_map for s in range(4)]

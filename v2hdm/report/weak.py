@@ -76,7 +76,7 @@ def _advice(
     coverage: Coverage | None,
     route_map: FloatArray,
 ) -> str:
-    """What a further drive should do otherwise, most effective first; at most two sentences."""
+    """Advice for a further drive, the most effective first; at most two sentences."""
     advice = []
     if len(route_map) > 1:
         away_m, nearest = cKDTree(route_map).query(centres_map)

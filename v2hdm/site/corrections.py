@@ -183,7 +183,7 @@ def _added_marking(correction: Correction, outline: FloatArray, nearest: Marking
 def with_paint_of_added(
     heard: Sequence[Heard], corrections: Sequence[Correction], markings: Sequence[Marking]
 ) -> tuple[Heard, ...]:
-    """What the map follows, with what the images show of the paint that a person added and nothing saw."""
+    """The corrections that the map follows; paint that a person added has the images' evidence with it."""
     corners = np.array([marking.corners_map for marking in markings]).reshape(-1, 4, 2)
     against_of_place = {}
     for correction in of_paint(corrections):
@@ -206,7 +206,7 @@ def _against_paint(marking: Marking) -> str:
 
 
 def of_paint(corrections: Sequence[Correction]) -> list[Correction]:
-    """Those of markings, symbols and candidates, without those of lane lines."""
+    """The corrections of markings, symbols and candidates, without those of lane lines."""
     return [correction for correction in corrections if not correction.is_line]
 
 

@@ -75,7 +75,7 @@ def _drawn_line(correction: Correction, lanes: Sequence[Lane]) -> tuple[Lane, fl
 
 
 def _without(lane: Lane, line: FloatArray) -> list[Lane]:
-    """What is left of a lane line beside a deleted one (N, 2)."""
+    """The pieces of a lane line that lie beside a deleted one (N, 2)."""
     if len(lane.points_map) < 2:
         return [lane]
     is_deleted = _is_along(lane.points_map, line)

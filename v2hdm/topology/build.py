@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import compress
+from typing import NamedTuple
 
 import numpy as np
 
+from v2hdm.errors import MapFileError
 from v2hdm.geometry.planar import length_along
 from v2hdm.records import FloatArray, HDMap, Trajectory
 from v2hdm.topology.answers import Answer, stated_pair
@@ -47,6 +49,39 @@ def lane_graph(
     asked += questions_of(graph, bool(trajectories))
     is_open = [not any(answer.closes(question) for answer in answers) for question in asked]
     return replace(graph, questions=tuple(compress(asked, is_open)))
+
+
+class Refusal(NamedTuple):
+    """An answer that cannot be followed, and why."""
+
+    answer: Answer
+    reason: str
+
+
+class Answered(NamedTuple):
+    """A lane graph with the answers that it follows, and those that it does not."""
+
+    graph: LaneGraph
+    followed: tuple[Answer, ...]
+    refused: tuple[Refusal, ...]
+
+
+def answered_graph(hd_map: HDMap, trajectories: Sequence[Trajectory], answers: Sequence[Answer]) -> Answered:
+    """The :func:`lane_graph` with those answers that contradict neither drives nor the map."""
+    try:
+        return Answered(lane_graph(hd_map, trajectories, answers), tuple(answers), ())
+    except MapFileError:
+        graph = lane_graph(hd_map, trajectories)
+    followed: list[Answer] = []
+    refused: list[Refusal] = []
+    for answer in answers:
+        try:
+            graph = lane_graph(hd_map, trajectories, [*followed, answer])
+        except MapFileError as error:
+            refused.append(Refusal(answer, str(error)))
+        else:
+            followed.append(answer)
+    return Answered(graph, tuple(followed), tuple(refused))
 
 
 class _Builder:

@@ -14,7 +14,7 @@ from v2hdm.topology.closed_lanes import Bound
 
 
 class Direction(Enum):
-    """What says that vehicles drive a lane in its direction."""
+    """The evidence that vehicles drive a lane in its direction."""
 
     DRIVEN = "driven"
     """A drive went along it, or along the lane that it continues."""
@@ -35,7 +35,7 @@ class Turn(Enum):
 
 
 class Right(Enum):
-    """What a line across a lane asks of vehicles."""
+    """The rule that a line across a lane sets for vehicles."""
 
     STOP = "stop"
     GIVE_WAY = "give way"
@@ -120,7 +120,7 @@ SUBJECTS = ("direction", "connection", "speed", "two ways", "stop line", "right 
 
 @dataclass(frozen=True)
 class Question:
-    """What neither paint nor drives say: ``place_map`` (2,), m, and the ``lanes`` that it is about.
+    """A question that paint and drives leave open, at ``place_map`` (2,), m, about ``lanes``.
 
     A question about a connection also has the place ``to_map`` (2,), m, where the other lane begins.
     """

@@ -57,7 +57,7 @@ def _turns(graph: LaneGraph, junction: Junction) -> Iterator[Question]:
 
 
 def _manoeuvre(end: FloatArray, start: FloatArray) -> str:
-    """What a drive does between two unit directions (2,)."""
+    """The manoeuvre of a drive between two unit directions (2,)."""
     angle_rad = float(np.arctan2(cross(end, start), end @ start))
     if abs(angle_rad) <= TURN_RAD:
         return "went straight on"

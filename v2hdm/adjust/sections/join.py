@@ -16,7 +16,7 @@ from v2hdm.records import FloatArray, IntArray
 
 
 class Labels(NamedTuple):
-    """What the border of a part is, in its order: numbers of cameras, frames and corners in the whole."""
+    """The border of a part, in its order: numbers of cameras, frames and corners in the whole."""
 
     cameras: IntArray
     frames: IntArray

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from v2hdm.cli.arguments import log_to_terminal, result_of
+from v2hdm.cli.arguments import kinds_of, log_to_terminal, result_of
 from v2hdm.cli.command import Command, need_installed
 from v2hdm.errors import EXIT_FAILED_VERDICT, ConfigError
 
@@ -55,7 +55,7 @@ def _run(arguments: Sequence[str]) -> int:
         if not TOLERANCE_M.holds(value):
             limits = f"from {TOLERANCE_M.least:g} to {TOLERANCE_M.most:g}"
             raise ConfigError(f"{option} {value:g}: is no tolerance in m; give one {limits}")
-    source = Source(parsed.crs, parsed.unit, _kinds_of(parsed.kinds))
+    source = Source(parsed.crs, parsed.unit, kinds_of(parsed.kinds))
     path = map_file(parsed.map)
     hd_map = read_map(path)[0]
     tolerance = Tolerances(parsed.tolerance, size_m)
@@ -87,16 +87,6 @@ def _compared(
         hd_map, read_design(path, hd_map, source), tolerance, read_mosaic(folder)
     )
     return comparison.findings, comparison.misfit, comparison.conforms
-
-
-def _kinds_of(pairs: Sequence[str]) -> dict[str, str]:
-    kind_of = {}
-    for pair in pairs:
-        name, separator, kind = pair.rpartition("=")
-        if not separator or not name or not kind:
-            raise ConfigError(f"--class {pair}: give it as NAME=CLASS, such as MARK_02=lane_dash")
-        kind_of[name] = kind
-    return kind_of
 
 
 COMMAND = Command("v2hdm compare", "Compare a map with the design of its site, or with rules.", _run)

@@ -41,7 +41,8 @@ def _run(arguments: Sequence[str]) -> None:
     )
     paths += "may be repeated (default: trajectory*.tum beside MAP)"
     parser.add_argument("--path", action="append", type=Path, metavar="FILE", help=paths)
-    answered = "for lanelet2 and opendrive: map_questions.geojson of an export, with answers"
+    answered = "for lanelet2 and opendrive: map_questions.geojson of an export with answers, or corrections "
+    answered += "by v2hdm view"
     parser.add_argument("--answers", type=Path, metavar="FILE", help=answered)
     parsed = parser.parse_args(arguments)
     from v2hdm.pipeline.context import logging_to

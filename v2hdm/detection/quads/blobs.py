@@ -187,7 +187,7 @@ def _class_scores(
 
 
 class _Tally(NamedTuple):
-    """What the network says of the elements of ``count`` pieces, added up."""
+    """The network's probabilities over the elements of ``count`` pieces, added up."""
 
     cells: IntArray  # (count,) elements
     best: IntArray  # (count, K) of which each class is the likeliest

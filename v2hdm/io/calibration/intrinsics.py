@@ -93,7 +93,7 @@ def read_intrinsics(path: Path, camera: str | None = None, name_by: str = "its n
 
 
 def read_rectified_intrinsics(path: Path, camera: str | None = None, name_by: str = "its name") -> Intrinsics:
-    """Those of images that were rectified by a camera's calibration: P without a distortion, turned by R.
+    """Intrinsics of images that a camera's calibration rectified: P without a distortion, turned by R.
 
     A file of a format without P is of the rectified images themselves, whose lens has no distortion.
     Arguments and errors are those of :func:`read_intrinsics`.
@@ -407,7 +407,7 @@ def _read_rectified_file(document: Document, name: str) -> Intrinsics:
 
 
 def _read_rectified_own(document: Document, name: str) -> Intrinsics:
-    """Those of our own calibration, which is of the rectified images themselves."""
+    """Intrinsics in our own calibration, which is of the rectified images themselves."""
     info = _read_own(document, name)
     rectified_matrix(info.intrinsic, np.array(info.distortion), np.zeros((3, 4)), str(document.path))
     turn = read_calibration(document.path).frames.rectified_from_camera

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -14,6 +14,7 @@ from v2hdm.errors import DriveError
 from v2hdm.geometry.frames import frame_from_vehicle
 from v2hdm.geometry.rigid import make_transform
 from v2hdm.io.calibration import reading
+from v2hdm.io.calibration.reading import Intrinsics
 from v2hdm.io.description import DRIVE_FILE, POSES_FILE, CameraEntry, DriveDescription, keys_in, name_of
 from v2hdm.io.drive.frames import plan_frames
 from v2hdm.io.drive.images import ImageFiles, ReadOptions, assemble_drive, select_cameras
@@ -58,35 +59,31 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
         if not bag.exists():
             raise DriveError(f"{where}: bag: {bag}: no such bag; check the path or drop the key")
     sources = Sources(path, Path(options.cache), bag, options.max_gap_s)
-    planned = {}
-    camera_keys = keys_in(CameraEntry)
-    for name in select_cameras(list(entries), options.cameras, Path(where)):
-        place = f"{where}: camera '{name}'"
-        entry = take_mapping(entries[name], place, DriveError)
-        check_keys(entry, camera_keys.required, camera_keys.optional, place, DriveError)
-        info = plan_info(entry["camera_info"], name, entry["images"], sources, f"{place}, camera_info")
-        planned[name] = (entry, info, plan_images(entry["images"], name, sources, f"{place}, images"))
+    planned = {
+        name: _plan_camera(name, entries[name], sources, f"{where}: camera '{name}'")
+        for name in select_cameras(list(entries), options.cameras, Path(where))
+    }
     poses_at = f"{where}: poses"
     poses = content.get("poses", POSES_FILE)
     if not isinstance(poses, dict):
         poses = take_text(poses, poses_at, DriveError)
     read_topic = plan_topic_poses(poses, sources, poses_at)
     origin = take_origin(content.get("origin"), f"{where}: origin", DriveError)
-    entries = {name: entry for name, (entry, _, _) in planned.items()}
+    entries = {name: plan.entry for name, plan in planned.items()}
     read_frames = plan_frames(content, entries, sources, where)
 
     cameras: dict[str, Camera] = {}
     files: list[ImageFiles] = []
     frames = read_frames()
-    for name, (entry, read_info, list_images) in planned.items():
+    for name, plan in planned.items():
         # Many tools call every camera they calibrate alike: the drive's own name for it holds.
-        intrinsics = read_info()
+        intrinsics = plan.read_info()
         named = replace(intrinsics.info, name=name)
-        listed = list_images()
+        listed = plan.list_images()
         place = f"{where}: camera '{name}'"
-        read_out_s = _take_read_out(entry, listed.stamp_s, f"{place}, read_out_s")
+        read_out_s = _take_read_out(plan.entry, listed.stamp_s, f"{place}, read_out_s")
         turned = replace(frames[name], rectified_from_camera=intrinsics.rectified_from_camera)
-        camera = _read_camera(entry, named, path, place, turned)
+        camera = _read_camera(plan.entry, named, path, place, turned)
         cameras[name] = replace(camera, read_out_s=read_out_s)
         files.append(listed)
     near_s = _middle_of(files)
@@ -106,8 +103,26 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
     return assemble_drive(drive, files, options.max_gap_s, poses_at)
 
 
+class _PlannedCamera(NamedTuple):
+    """A camera's ``entry`` of the description, and how its intrinsics and images are read."""
+
+    entry: dict[str, Any]
+    read_info: Callable[[], Intrinsics]
+    list_images: Callable[[], ImageFiles]
+
+
+def _plan_camera(name: str, content: object, sources: Sources, where: str) -> _PlannedCamera:
+    """Check a camera's entry; its files and topics are read once all sources are planned."""
+    keys = keys_in(CameraEntry)
+    entry = take_mapping(content, where, DriveError)
+    check_keys(entry, keys.required, keys.optional, where, DriveError)
+    read_info = plan_info(entry["camera_info"], name, entry["images"], sources, f"{where}, camera_info")
+    list_images = plan_images(entry["images"], name, sources, f"{where}, images")
+    return _PlannedCamera(entry, read_info, list_images)
+
+
 def _reception(recorded: Recorded, files: Sequence[ImageFiles]) -> Reception | None:
-    """What the source of the poses says of its positions from the first image to the last."""
+    """The stated quality of the positions from the first image to the last."""
     listed = [entry.stamp_s for entry in files if len(entry.stamp_s)]
     if recorded.fixes is None or not listed:
         return None

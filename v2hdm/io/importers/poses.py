@@ -74,7 +74,7 @@ class Fixes(NamedTuple):
     is_fixed: BoolArray | None  # (P,) whether RTK had fixed its ambiguities, None where not stated
 
     def between(self, first_s: float, last_s: float, geoid_m: float | None) -> Reception:
-        """Those of a span of time, counted."""
+        """The reception from ``first_s`` to ``last_s``, both included."""
         is_within = (self.stamp_s >= first_s) & (self.stamp_s <= last_s)
         fixed = None if self.is_fixed is None else int((self.is_fixed & is_within).sum())
         return Reception(int(is_within.sum()), fixed, geoid_m)

@@ -27,11 +27,13 @@ from v2hdm.store.files import (
     take_mapping,
     take_number,
 )
+from v2hdm.topology.graph import SUBJECTS
 
 ACCEPTED = "accepted"
 REJECTED = "rejected"
 CORRECTED = "corrected"
 ADDED = "added"  # a marking that the map lacks
+ANSWERED = "answered"  # a question on lanes
 SIGMA_M = 0.02  # sigma of a corner that a person places beside the others of its marking, m: a mosaic's pixel
 
 _HEAD = "# Corrections of a map by a person: map.corrections=THIS FILE in the next run (docs/report.md).\n"
@@ -50,9 +52,9 @@ _KIND_AND_OUTLINE_MAP = (
 
 @dataclass(kw_only=True)
 class Correction:
-    """A person's decision on one marking, symbol or candidate that was left out."""
+    """A person's decision on a marking, symbol, lane line or left-out candidate, or an answer on lanes."""
 
-    says: Annotated[str, "accepted, rejected, corrected or added."]
+    says: Annotated[str, "accepted, rejected, corrected, added or answered."]
     kind: Annotated[str, _KIND_AND_OUTLINE_MAP]
     outline_map: Annotated[list[list[float]], _KIND_AND_OUTLINE_MAP]
     marking: Annotated[int | None, "its id in that map, only for readers."] = None
@@ -65,6 +67,12 @@ class Correction:
     is_line: Annotated[bool, "whether outline_map is the course of a lane line, of two points or more."] = (
         False
     )
+    answer: Annotated[str, "the answer to a question on lanes, whose subject is kind, of outline_map."] = ""
+
+    @property
+    def is_answer(self) -> bool:
+        """Whether it answers a question on lanes, which says nothing of paint."""
+        return self.says == ANSWERED
 
     @property
     def stated_kind(self) -> str | None:
@@ -103,13 +111,15 @@ def read_corrections(path: Path) -> list[Correction]:
 
 def _said(correction: Correction) -> tuple[object, ...]:
     """The sentence that a correction states of its marking."""
-    return correction.says, correction.new_kind, correction.moved, correction.is_line
+    return correction.says, correction.new_kind, correction.moved, correction.is_line, correction.answer
 
 
 def correction_of(content: object, where: str) -> Correction:
     """One entry, checked; raises MapFileError."""
     entry = take_mapping(content, where, MapFileError)
     optional = ("marking", "new_class", "moved", "sigma_m", "reason")
+    if entry.get("says") == ANSWERED:
+        return _answer(entry, where)
     if "line_map" in entry:
         return _line_correction(entry, where)
     check_keys(entry, ("says", "class", "outline_map"), optional, where, MapFileError)
@@ -156,6 +166,23 @@ def _line_correction(entry: Mapping[str, Any], where: str) -> Correction:
         sigma_m=sigma_m,
         reason=reason,
         is_line=True,
+    )
+
+
+def _answer(entry: Mapping[str, Any], where: str) -> Correction:
+    """An entry that answers a question on lanes."""
+    check_keys(entry, ("says", "subject", "places_map", "answer"), (), where, MapFileError)
+    places = _take_places(entry["places_map"], f"{where}: places_map")
+    answer = entry["answer"]
+    if not 1 <= len(places) <= 2:
+        raise MapFileError(f"{where}: places_map: a question has one or two places")
+    if not isinstance(answer, str | int | float) or not 0 < len(str(answer)) <= _LONGEST_REASON:
+        raise MapFileError(f"{where}: answer: expected a text of at most {_LONGEST_REASON} letters")
+    return Correction(
+        says=ANSWERED,
+        kind=take_choice(entry["subject"], SUBJECTS, f"{where}: subject", MapFileError),
+        outline_map=places.tolist(),
+        answer=str(answer),
     )
 
 
@@ -233,6 +260,11 @@ def corrections_text(corrections: Sequence[Correction], result: str) -> str:
 
 def entry_of(correction: Correction) -> dict[str, Any]:
     """An entry as it is written."""
+    if correction.is_answer:
+        places = [_rounded(place) for place in correction.outline_map]
+        return {
+            "says": ANSWERED, "subject": correction.kind, "answer": correction.answer, "places_map": places,
+        }  # fmt: skip
     entry: dict[str, Any] = {"says": correction.says, "class": correction.kind}
     named = {"marking": correction.marking, "new_class": correction.new_kind, "reason": correction.reason}
     entry |= {key: value for key, value in named.items() if value}

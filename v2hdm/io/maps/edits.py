@@ -49,7 +49,7 @@ def read_edits(path: Path, hd_map: HDMap) -> MapEdits:
 
 
 def edits_between(hd_map: HDMap, edited: HDMap, where: str) -> MapEdits:
-    """What was deleted, reclassified, moved or added in the copy ``edited``, which is ``where``."""
+    """The features deleted, reclassified, moved or added in the copy ``edited``, which is ``where``."""
     corrections = []
     ignored = []
     marking_of_id = {marking.id: marking for marking in edited.markings}

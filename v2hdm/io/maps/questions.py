@@ -13,6 +13,7 @@ import numpy as np
 
 from v2hdm.errors import MapFileError, shown
 from v2hdm.geometry.geodetic import enu_from_geodetic
+from v2hdm.io.maps.corrections import Correction, read_corrections
 from v2hdm.io.maps.geojson import geojson_feature, geojson_positions, write_features
 from v2hdm.records import FloatArray, GeodeticOrigin
 from v2hdm.store.files import load_json, take_array, take_mapping
@@ -40,11 +41,26 @@ def write_questions(questions: Sequence[Question], origin: GeodeticOrigin | None
     write_features(path, features, origin, {"questions": len(features)})
 
 
+def answers_among(corrections: Sequence[Correction]) -> list[Answer]:
+    """The answers to questions on lanes among a person's corrections."""
+    answers = []
+    for correction in corrections:
+        if correction.is_answer:
+            places = np.array(correction.outline_map)
+            to_map = places[-1] if len(places) > 1 else None
+            where = f"the answer on the {correction.place}"
+            answers.append(Answer(correction.kind, correction.answer, places[0], to_map, where))
+    return answers
+
+
 def read_answers(path: Path, origin: GeodeticOrigin | None) -> list[Answer]:
     """The answers in a file of questions, and in lines that a person has drawn into it.
 
-    Raises MapFileError where the file is none, or an answer has no place.
+    A YAML file is one of corrections, with the answers given in ``v2hdm view``. Raises MapFileError where the
+    file is neither, or an answer has no place.
     """
+    if path.suffix.lower() in (".yaml", ".yml"):
+        return answers_among(read_corrections(path))
     content = take_mapping(load_json(path, MapFileError), str(path), MapFileError)
     features = content.get("features")
     if not isinstance(features, list):

@@ -51,7 +51,7 @@ def _certificate(
 
 
 def _basis(facts: Facts, name: str, residuals: GroundResiduals | None) -> tuple[Row, ...]:
-    """What the calibration rests on."""
+    """The observations that the calibration rests on."""
     drive: Mapping[str, Any] = facts.metrics.get("drive") or {}
     rows = [Row("Drive", str(drive.get("name") or facts.folder.name))]
     digest = drive.get("images_sha256")

@@ -19,7 +19,7 @@ _UNITS: Mapping[str, tuple[str, float]] = {"m": ("cm", 100.0), "deg": ("°", 1.0
 
 
 class Comparison(NamedTuple):
-    """What became of each shape of a design."""
+    """The fate of each shape of a design."""
 
     source: str
     whole: str  # how the design lies as a whole; empty for rules

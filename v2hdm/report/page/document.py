@@ -91,6 +91,8 @@ def document(facts: Facts, compared: Path | None = None) -> SimpleNamespace:
     cameras = tables.camera_pages(facts, overlays(facts))
     charts_of_residuals = charts.residual_charts(facts, residuals) if residuals else {}
     map_data = layers(facts, residuals, reference)
+    shown_residuals = _RESIDUALS if charts_of_residuals else {}
+    suspicious = _suspicious(facts)
     return SimpleNamespace(
         facts=facts,
         title=facts.job.job.site or str(metrics.get("name", facts.folder.name)),
@@ -126,14 +128,12 @@ def document(facts: Facts, compared: Path | None = None) -> SimpleNamespace:
         check_points=tables.check_point_table(facts),
         map_data=map_data,
         pictures=pictures(facts, room_for_pictures(map_data)),
-        suspicious=(suspicious := _suspicious(facts)),
+        suspicious=suspicious,
         suspicious_table=_suspicious_table(suspicious),
         cameras=cameras,
         ground=comparison(facts.folder),
         residuals=charts_of_residuals,
-        residual_charts=[Chart(charts_of_residuals[key], *words) for key, words in _RESIDUALS.items()]
-        if charts_of_residuals
-        else [],
+        residual_charts=[Chart(charts_of_residuals[key], *words) for key, words in shown_residuals.items()],
         contents=tables.content_table(facts),
         methods=tables.method_table(facts),
         drive=tables.pair_table(metrics.get("drive") or {}),

@@ -12,7 +12,7 @@ import numpy as np
 
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.geodetic import Grid, crs_of, geodetic_from_enu, utm_of
-from v2hdm.records import SIGMAS_95, FloatArray, HDMap, Lane, Marking, Symbol
+from v2hdm.records import SIGMAS_95, Exclusion, FloatArray, HDMap, Lane, Marking, Symbol
 from v2hdm.report.areas import AREAS
 from v2hdm.report.metrics import corner_errors, match_markings, rms
 from v2hdm.report.page.facts import Facts, GroundResiduals
@@ -190,15 +190,7 @@ def layers(
         "symbols": symbols,
         "axes": reference.axes,
         "digits": reference.digits,
-        "excluded": [
-            {
-                "k": candidate.kind,
-                "p": rounded(candidate.position_map[None])[0],
-                "n": candidate.sightings,
-                "why": candidate.reason,
-            }
-            for candidate in facts.excluded
-        ],
+        "excluded": [_excluded(candidate) for candidate in facts.excluded],
         "checks": _checks(facts),
         "changes": _changes(facts),
         "truth": facts.truth
@@ -213,6 +205,15 @@ def layers(
         "mosaic": mosaic_layer(facts.folder),
         "systems": systems_of(hd_map, _extent(facts)),
         "files": sorted(path.name for path in facts.folder.iterdir() if path.suffix in _SHARED),
+    }
+
+
+def _excluded(candidate: Exclusion) -> dict[str, Any]:
+    return {
+        "k": candidate.kind,
+        "p": rounded(candidate.position_map[None])[0],
+        "n": candidate.sightings,
+        "why": candidate.reason,
     }
 
 

@@ -26,6 +26,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from v2hdm.errors import MapFileError, V2hdmError, one_line
 from v2hdm.records import Drive, Exclusion, HDMap
+from v2hdm.report.view.lanes import Lanes
 from v2hdm.report.view.session import MeanwhileError, Session
 from v2hdm.safe.texts import parse_json
 from v2hdm.store.files import take_array
@@ -78,7 +79,7 @@ class Guard:
 
 
 class Once(Generic[Value]):
-    """What is made once, by whoever asks for it first."""
+    """A value that is made once, by the first request for it."""
 
     def __init__(self, make: Callable[[], Value]) -> None:
         self._make = make
@@ -95,7 +96,7 @@ class Once(Generic[Value]):
 
 @dataclass(frozen=True)
 class Shown:
-    """What the page shows: a result's ``folder``, what was read of it, its drive, and its corrections."""
+    """The content of the page: a result's ``folder``, its map, its drive, and its corrections."""
 
     folder: Path
     metrics: Any
@@ -103,6 +104,7 @@ class Shown:
     excluded: tuple[Exclusion, ...]
     drive: Drive | None
     session: Session
+    lanes: Lanes
     tiles: TileSource | None = None  # a background from the web
 
 
@@ -148,6 +150,11 @@ class Pages:
     def state(self, _: Request) -> Response:
         """The corrections, as they are in the file now."""
         return JSONResponse(self._shown.session.state())
+
+    def lanes_json(self, _: Request) -> Response:
+        """Lanes and open questions, as the corrections are now."""
+        corrections = [*self._shown.session.corrections.values()]
+        return Response(self._shown.lanes.document(corrections), media_type="application/json")
 
     def report(self, _: Request) -> Response:
         """The report."""
@@ -212,6 +219,7 @@ def app_of(pages: Pages, base: str, secret: str) -> ASGIApp:
         Route(begin, pages.page),
         Route(f"{begin}scene.json", pages.scene_json),
         Route(f"{begin}state.json", pages.state),
+        Route(f"{begin}lanes.json", pages.lanes_json),
         Route(f"{begin}report", pages.report),
         Route(f"{begin}mosaic", pages.mosaic),
         Route(f"{begin}shots.json", pages.shots),

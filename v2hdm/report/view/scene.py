@@ -15,7 +15,7 @@ from v2hdm.io.trajectory import read_tum
 from v2hdm.records import BEST, Exclusion, FloatArray, HDMap, Marking, Symbol
 from v2hdm.report.areas import AREAS
 from v2hdm.report.page.layers import map_extent, systems_of
-from v2hdm.report.view.session import painted_lines, thinned
+from v2hdm.report.view.session import flat_mm, painted_lines, thinned
 from v2hdm.site.accuracy import corner_radii_m
 from v2hdm.store import names
 from v2hdm.store.files import load_json, take_array
@@ -62,20 +62,25 @@ def scene_of(
         "markings": [_marking(marking, index) for marking in hd_map.markings],
         "symbols": [_symbol(symbol, index) for symbol in hd_map.symbols],
         "lanes": [
-            {"id": line.id, "k": index[line.kind], "p": _flat(thinned(line.points_map)), "n": line.sightings}
+            {
+                "id": line.id,
+                "k": index[line.kind],
+                "p": flat_mm(thinned(line.points_map)),
+                "n": line.sightings,
+            }
             for line in lines
         ],
         "excluded": [
             {
                 "k": index[candidate.kind],
-                "p": _flat(candidate.position_map[None]),
+                "p": flat_mm(candidate.position_map[None]),
                 "n": candidate.sightings,
                 "why": candidate.reason,
             }
             for candidate in excluded
         ],
         "suspicious": _suspicious(metrics),
-        "route": _flat(route_map),
+        "route": flat_mm(route_map),
         "systems": systems_of(hd_map, map_extent(hd_map, route_map)),
         "mosaic": _mosaic_bounds(folder),
     }
@@ -101,7 +106,7 @@ def _paint(paint: Marking | Symbol, index: Mapping[str, int], outline_map: Float
     feature: dict[str, Any] = {
         "id": paint.id,
         "k": index[paint.kind],
-        "p": _flat(outline_map),
+        "p": flat_mm(outline_map),
         "n": paint.sightings,
     }
     if paint.covariance_m2 is not None:
@@ -110,12 +115,6 @@ def _paint(paint: Marking | Symbol, index: Mapping[str, int], outline_map: Float
     if paint.accuracy is not None:
         feature["g"] = paint.accuracy
     return feature
-
-
-def _flat(points_m: FloatArray) -> list[int]:
-    """Points (N, 2) as x, y, x, y, ..., mm."""
-    flat: list[int] = np.rint(_MM * points_m).astype(np.int64).ravel().tolist()
-    return flat
 
 
 def _route(folder: Path) -> FloatArray:

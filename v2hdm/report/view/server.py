@@ -16,6 +16,7 @@ from v2hdm.errors import MapFileError, V2hdmError
 from v2hdm.io.metrics import read_metrics
 from v2hdm.records import Drive
 from v2hdm.report.page.facts import read_excluded, read_map_of
+from v2hdm.report.view.lanes import Lanes
 from v2hdm.report.view.session import Session, places_of
 
 if TYPE_CHECKING:
@@ -44,7 +45,8 @@ class PageServer:
             raise MapFileError(f"{folder}: has no map to view; fix its drive and map it again")
         self._hd_map = hd_map
         self._excluded = read_excluded(folder, self._metrics)
-        self.session = Session(folder, path, places_of(hd_map, self._excluded))
+        self._lanes = Lanes.of(folder, hd_map)
+        self.session = Session(folder, path, places_of(hd_map, self._excluded), self._lanes.check)
         self._tiles: TileSource | None = None
         if background is not None:
             from v2hdm.report.view.tiles import TileSource  # for those who give an address
@@ -86,6 +88,7 @@ class PageServer:
             self._excluded,
             self._drive,
             self.session,
+            self._lanes,
             self._tiles,
         )
         self._pages = Pages(shown)

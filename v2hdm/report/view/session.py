@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextvars import Context
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -53,10 +53,17 @@ class Session:
     has written there by hand is not replaced before the page has shown it. A link stays one.
     """
 
-    def __init__(self, folder: Path, path: Path, places: Mapping[str, FloatArray]) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        path: Path,
+        places: Mapping[str, FloatArray],
+        check: Callable[[Correction, Sequence[Correction]], None] | None = None,
+    ) -> None:
         """Start from the file's content; MapFileError if that is something else, ConfigError if no place.
 
-        ``places`` (N, 2) are those of the result's features, m, by their key in the page.
+        ``places`` (N, 2) are those of the result's features, m, by their key in the page. ``check`` raises
+        MapFileError for a new answer that cannot be followed, among all corrections.
         """
         refuse_url(path)
         refuse_unwritable(path.resolve())
@@ -64,6 +71,7 @@ class Session:
         self.corrections: dict[str, Correction] = {}
         self._folder = folder
         self._keys = _Keys(places)
+        self._check = check
         self._place = path.resolve()
         self._content: bytes | None = None  # of the file, as it was last read or written
         self._lock = threading.Lock()
@@ -102,6 +110,9 @@ class Session:
                 corrections.pop(change.key, None)
                 if change.correction is not None:
                     corrections[change.key] = change.correction
+            for change in changes:
+                if self._check is not None and change.correction is not None and change.correction.is_answer:
+                    self._check(change.correction, [*corrections.values()])
             # This command read the file at its start, and continues after writing it.
             Context().run(write_corrections, [*corrections.values()], str(self._folder), self._place)
             self._content = self._place.read_bytes()
@@ -221,6 +232,7 @@ def thinned(line_map: FloatArray) -> FloatArray:
     return np.asarray(kept_m + line_map[0])
 
 
+_KEY_DIGITS = 2  # decimals, m, of the places in the key of a question
 _CELL_M = 2 * _SAME_M  # side of the cells in which features are looked up by their first point, m
 
 
@@ -233,14 +245,27 @@ class _Keys:
             self._in_cell.setdefault(_cell(place[0]), []).append((key, place))
 
     def of(self, correction: Correction) -> str:
-        """That of a correction's feature; its outline, if that is not in the map."""
+        """The id of a correction's feature; its outline, if that is not in the map."""
         outline = np.array(correction.outline_map)
+        if correction.is_answer:
+            return answer_key(correction.kind, outline)
         x, y = _cell(outline[0])
         for cell in [(x + dx, y + dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]:
             for key, place in self._in_cell.get(cell, ()):
                 if place.shape == outline.shape and np.abs(place - outline).max() < _SAME_M:
                     return key
         return str(outline.round(3).tolist())
+
+
+def answer_key(subject: str, places: FloatArray) -> str:
+    """The key in the page of a question, and of its answer: by ``subject`` and ``places`` (1 or 2, 2), m."""
+    return f"q {subject} {places.round(_KEY_DIGITS).tolist()}"
+
+
+def flat_mm(points_m: FloatArray) -> list[int]:
+    """Points (N, 2), m, as x, y, x, y, ... in whole millimetres, which are short and fast to read."""
+    flat: list[int] = np.rint(1000.0 * points_m).astype(np.int64).ravel().tolist()
+    return flat
 
 
 def _cell(point_m: FloatArray) -> tuple[int, int]:

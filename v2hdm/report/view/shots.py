@@ -30,7 +30,7 @@ class Shots:
 
     @classmethod
     def of(cls, folder: Path, drive: Drive | None) -> Shots:
-        """Those of a result and its drive; raises V2hdmError where a file is damaged."""
+        """The shots of a result and its drive; raises V2hdmError where a file is damaged."""
         if drive is None:
             return cls(None, None, np.zeros((0, 4, 4)))
         facts = read_facts(folder, drive)

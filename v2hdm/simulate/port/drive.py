@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import count
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -114,6 +115,13 @@ def hidden_by(boxes: Sequence[Box], centre_map: FloatArray, points_map: FloatArr
     return hidden
 
 
+class TrueDrive(NamedTuple):
+    """A drive and its truth, whose rows belong to the drive's images."""
+
+    drive: Drive
+    truth: Truth
+
+
 _Job = tuple[str, int, str]  # camera, frame and path of an image
 
 _LANE_SIGHTINGS = 2  # least number of images that show a lane vertex which counts as seen
@@ -128,7 +136,8 @@ def rendered_drive(config: PortConfig, cache: Path, executor: Executor, progress
     what it had rendered is kept.
     """
     folder = folder_of_port(config, cache)
-    if not (folder / DRIVE_FILE).is_file() or _drop_damaged(folder):
+    if not (folder / DRIVE_FILE).is_file() or _lacks_clocks(folder) or _drop_damaged(folder):
+        # Images that are there stay as they are.
         render_drive(config, folder, executor, progress)
     note_use(folder)
     return folder
@@ -153,6 +162,11 @@ def folder_of_port(config: PortConfig, cache: Path) -> Path:
     return cache / f"{config.name}-{hashlib.sha256(text.encode()).hexdigest()[:10]}"
 
 
+def _lacks_clocks(folder: Path) -> bool:
+    """Whether a drive was rendered by a version that did not state its clocks."""
+    return "clock_s" not in (folder / DRIVE_FILE).read_text(encoding="utf-8")
+
+
 def _drop_damaged(folder: Path) -> bool:
     """Remove damaged images from a rendered drive; returns whether any is missing."""
     missing = False
@@ -170,12 +184,7 @@ def _drop_damaged(folder: Path) -> bool:
 def render_drive(config: PortConfig, folder: Path, executor: Executor, progress: Steps) -> None:
     """Render a port's drive into ``folder`` with its truth; see :func:`rendered_drive`."""
     port = build_port(config)
-    driven = zip(port.driven.stamp_s, port.driven.map_from_vehicle, strict=True)
-    images = [
-        Image(name, float(stamp), folder / name / "images" / f"{frame:06d}.jpg", pose)
-        for frame, (stamp, pose) in enumerate(driven)
-        for name in port.cameras
-    ]
+    images = _images_of(port, folder)
     try:
         for name in port.cameras:
             (folder / name / "images").mkdir(parents=True, exist_ok=True)
@@ -188,6 +197,26 @@ def render_drive(config: PortConfig, folder: Path, executor: Executor, progress:
     except OSError as failure:
         problem = f"cannot write the rendered drive ({failure.strerror})"
         raise DriveError(f"{folder}: {problem}; free space or choose another cache") from None
+
+
+def true_drive(config: PortConfig) -> TrueDrive:
+    """A port's drive with its truth, of which nothing is rendered or written."""
+    port = build_port(config)
+    folder = Path(config.name)
+    images = _images_of(port, folder)
+    noise = pose_noise(config.disturbance, config.route.speed_mps)
+    drive = Drive(config.name, folder, port.cameras, images, noise, port.hd_map.origin)
+    return TrueDrive(drive, _truth(port, images))
+
+
+def _images_of(port: Port, folder: Path) -> list[Image]:
+    """All images of a port's drive below a folder, rendered or not."""
+    driven = zip(port.driven.stamp_s, port.driven.map_from_vehicle, strict=True)
+    return [
+        Image(name, float(stamp), folder / name / "images" / f"{frame:06d}.jpg", pose)
+        for frame, (stamp, pose) in enumerate(driven)
+        for name in port.cameras
+    ]
 
 
 def _render_all(port: Port, images: list[Image], executor: Executor, progress: Steps) -> None:

@@ -70,7 +70,7 @@ class Paint:
 
 @dataclass(frozen=True)
 class Shown:
-    """What one image shows: its detections, and the indices (M,) of the markings whole within it."""
+    """The detections of one image, and the indices (M,) of the markings that it shows whole."""
 
     markings: tuple[MarkingDetection, ...]
     whole: IntArray

@@ -350,7 +350,7 @@ def input_findings(drive: Drive, ground: Mapping[str, GroundEstimate] | None = N
 
 
 def _without_pictures() -> Finding:
-    """That nothing of a drive could be checked which only pictures show."""
+    """The finding that a drive without pictures leaves the checks of pictures undone."""
     says = (
         "the drive has detections in place of pictures: mountings, clocks and heights could not be compared "
         "with bare ground, nor could the images; the map alone speaks for them"

@@ -152,7 +152,7 @@ def _alignment(motion: Motion, by_course: bool) -> Iterator[Finding]:
 
 
 def _of_course(motion: Motion) -> Finding:
-    """What a drive whose headings are its course leaves open."""
+    """The finding on a drive whose headings are its course, which leaves the yaw of the mounting open."""
     heading = np.unwrap(np.arctan2(motion.rotation[:, 1, 0], motion.rotation[:, 0, 0]))
     turned_deg = float(np.rad2deg(np.ptp(heading)))
     least_deg = float(np.rad2deg(_TURNED_RAD))

@@ -258,7 +258,7 @@ def _inputs(course: Course, state: State) -> list[Term]:
 
 
 def _priors(state: State) -> list[Term]:
-    """What is known before the drive; curvature stays small also where the vehicle stands."""
+    """The priors; curvature stays small also where the vehicle stands."""
     count = len(SHARED_SIGMAS)
     expected = np.zeros(count)
     expected[Shared.SLIP] = SLIP

@@ -73,7 +73,7 @@ export function handlesOf(feature, view) {
 
 export class Drawing {
   constructor(canvas, model, view) {
-    Object.assign(this, { canvas, model, view, dirty: true, show: { before: false, mosaic: true, background: true, candidates: true, route: true }, backdrops: [] });
+    Object.assign(this, { canvas, model, view, dirty: true, show: { before: false, mosaic: true, background: true, candidates: true, route: true, lanes: true, questions: true }, backdrops: [] });
     this.context = canvas.getContext("2d");
     this.kept = document.createElement("canvas");
     this.keptContext = this.kept.getContext("2d");
@@ -218,7 +218,7 @@ export class Drawing {
     if (feature.places.length < 2) {
       const [x, y] = this.view.toScreen(feature.places[0]);
       path.arc(x, y, 9, 0, 7);
-    } else trace(path, feature.places, this.view, !isLine(feature));
+    } else trace(path, feature.places, this.view, !isLine(feature) && !["lane", "question"].includes(feature.what));
     stroke(context, path, "rgb(255 255 255 / .85)", width + 1.6, []);
     stroke(context, path, ink, width, isGone(feature) ? [4, 4] : []);
   }

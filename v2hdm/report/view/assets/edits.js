@@ -23,6 +23,7 @@ export class Edits {
   entry(feature, change) {
     if (change === null) return null;
     const { what, id, base, kind, entry } = feature;
+    if (what === "question") return change;
     if (isLine(feature)) return { says: "rejected", class: kind, line_map: base, ...entry, ...change };
     const stated = { says: "corrected", class: kind, outline_map: base, ...(id === undefined ? {} : { marking: id }), ...entry, ...change };
     if (stated.moved && !Object.keys(stated.moved).length) delete stated.moved;
@@ -108,7 +109,7 @@ export class Edits {
     for (const { feature, after } of sent) {
       const before = feature.saved ?? null;
       if (same(before, after)) continue;
-      const place = ({ outline_map: outline, line_map: line }) => line ?? outline;
+      const place = ({ outline_map: outline, line_map: line, places_map: places }) => places ?? line ?? outline;
       const moves = before && after && !same(place(before), place(after));
       if (moves) {
         parts.push({ key: feature.key, correction: null, before });

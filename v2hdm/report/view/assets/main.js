@@ -3,6 +3,7 @@
 import { Drawing, HANDLE_PX, View, colour, handlesOf } from "./drawing.js";
 import { Edits } from "./edits.js";
 import { crossesItself, drawn, joined, parts, taken } from "./lines.js";
+import { Lanes, amid, answered, choicesOf, ofQuestion } from "./lanes.js";
 import { Model, isGone, isLine, isMade, isMovable, kindOf, middleOf, nameOf, saidOf } from "./model.js";
 import { Tiles } from "./tiles.js";
 import { Images, Panel, byId, element, placeTip } from "./panel.js";
@@ -19,6 +20,7 @@ const view = new View();
 const canvas = byId("map");
 const drawing = new Drawing(canvas, model, view);
 const edits = new Edits(model, changed, saved);
+const lanes = new Lanes(model, () => asked());
 let selected = null;
 let hovered = null;
 let corner = null; // the one that the arrow keys move, from 0
@@ -35,13 +37,25 @@ function saved(text, isProblem = false) {
   const count = model.corrected.length;
   byId("saved").textContent = text || `${count} ${count === 1 ? "correction" : "corrections"} in ${edits.file}, all saved`;
   byId("saved").classList.toggle("problem", isProblem);
+  if (!text && lanes.stale) lanes.refresh().catch(({ message }) => tell(message));
 }
 function changed(features) {
+  lanes.stale ||= features.some((feature) => isLine(feature) || feature.what === "question");
   drawing.change();
   if (features.includes(selected) || !selected) panel.select(selected);
   if (features.includes(selected)) look();
-  panel.lists(looks, selected);
+  panel.lists(looks, selected, questions);
   buttons();
+}
+// Lanes and questions are others now.
+function asked() {
+  const open = model.questions.filter((question) => question.open || question.entry);
+  questions = [...open.map((feature) => ({ feature, why: feature.text || saidOf(feature) })), ...leftOut];
+  if (selected?.what === "lane") select(lanes.again(selected));
+  if (lanes.refused.length) tell(`Not followed: ${lanes.refused[0]}`);
+  panel.select(selected);
+  panel.lists(looks, selected, questions);
+  drawing.change();
 }
 
 // ---- the selection ----
@@ -49,7 +63,7 @@ const images = new Images();
 let waiting = null;
 function look() { // once the outline rests
   clearTimeout(waiting);
-  const shown = selected && isLine(selected) ? null : selected; // no image shows a whole line
+  const shown = selected && (isLine(selected) || selected.what === "lane") ? null : selected; // no image shows a whole line
   waiting = setTimeout(() => images.show(shown), 250);
 }
 function select(feature, at = null) {
@@ -58,10 +72,10 @@ function select(feature, at = null) {
   drawing.lifted = null;
   panel.select(feature);
   look();
-  panel.lists(looks, selected);
+  panel.lists(looks, selected, questions);
   drawing.change();
   tell(feature ? [nameOf(feature), saidOf(feature), at].filter(Boolean).join("; ") : "Nothing selected");
-  history.replaceState(null, "", feature && !isMade(feature) ? `#${feature.key}` : location.pathname);
+  history.replaceState(null, "", feature && !isMade(feature) && feature.what !== "lane" ? `#${feature.key}` : location.pathname);
   dispatchEvent(new CustomEvent("v2hdm-selected", { detail: feature }));
   buttons();
 }
@@ -77,7 +91,8 @@ function show(feature) {
 const suspects = new Map(scene.suspicious.map(({ id, p, by }) => [`m${id}`, `${by}, p ${p.toPrecision(2)}`]));
 const looks = [...suspects].flatMap(([key, why]) => (model.byKey.has(key) ? [{ feature: model.byKey.get(key), why }] : []));
 for (const feature of model.features.filter(({ g, key }) => g === "C" && !suspects.has(key)).sort((a, b) => (b.w ?? 0) - (a.w ?? 0))) looks.push({ feature, why: `95 % radius ${(feature.w / 10).toFixed(1)} cm` });
-const questions = model.features.filter(({ what }) => what === "candidate").sort((a, b) => b.n - a.n).map((feature) => ({ feature, why: feature.why }));
+const leftOut = model.features.filter(({ what }) => what === "candidate").sort((a, b) => b.n - a.n).map((feature) => ({ feature, why: feature.why }));
+let questions = leftOut; // those on lanes first
 function step(list, by, name) {
   if (!list.length) return tell(`No ${name}`);
   const now = list.findIndex(({ feature }) => feature === selected);
@@ -94,11 +109,24 @@ function needs(isFit, text) {
   return false;
 }
 function accept() {
-  if (!needs((feature) => !isMade(feature) && !isLine(feature), "A lane line, or what is yours, needs no acceptance")) return;
+  if (!needs((feature) => !isMade(feature) && !isLine(feature) && !isAsked(feature), "A lane, or what is yours, needs no acceptance")) return;
   const { moved, new_class: kind } = selected.entry ?? {};
   make(selected, { says: "accepted", moved, new_class: kind, reason: undefined }, `accept ${nameOf(selected)}`);
 }
+const isAsked = ({ what }) => what === "question" || what === "lane";
+// An answer to the selected question, or on the selected lane's direction; empty ones are none.
+function answer(text) {
+  if (!selected || !text) return;
+  if (selected.what === "lane") {
+    const stated = { says: "answered", subject: "direction", answer: text, places_map: amid(selected) };
+    const question = lanes.asked(selected, stated);
+    edits.make([[question, answered(question, ofQuestion(text, selected, question))]], `state a direction`);
+  } else edits.make([[selected, answered(selected, text)]], `answer ${nameOf(selected)}`);
+  isFocus();
+  tell(`${nameOf(selected)}: ${text}`);
+}
 function remove(reason = "") {
+  if (selected && isAsked(selected)) return selected.entry ? make(selected, null, `take back ${nameOf(selected)}`) : tell("There is no answer to take back");
   if (!needs((feature) => !isGone(feature) || reason, "It is deleted already")) return;
   const name = nameOf(selected);
   if (isMade(selected)) make(selected, null, `delete ${name}`);
@@ -257,7 +285,7 @@ function hit(at) {
     const extent = shape.length < 2 ? 0 : Math.hypot(shape[0][0] - shape[2 % shape.length][0], shape[0][1] - shape[2 % shape.length][1]);
     if (isHit && extent < size) [best, size] = [feature, extent];
   }
-  return best ?? hitLine(at);
+  return lanes.question(at, view) ?? best ?? hitLine(at) ?? (drawing.show.lanes ? lanes.lane(at, view, offLine, NEAR_PX) : null);
 }
 const handleAt = (at) => (selected ? handlesOf(selected, view).find((handle) => Math.hypot(handle.at[0] - at[0], handle.at[1] - at[1]) <= HANDLE_PX + 3) : null);
 const at = (event) => { const box = canvas.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
@@ -341,6 +369,8 @@ function where() {
 }
 
 // ---- above the map ----
+drawing.backdrops.push((context, wide) => drawing.show.lanes && lanes.draw(context, wide));
+drawing.extras.push((context) => drawing.show.questions && lanes.marks(context, view));
 drawing.extras.push((context) => {
   if (hovered && hovered !== selected) drawing.outline(context, hovered, colour("ink"), 2);
   if (!selected) return;
@@ -401,7 +431,7 @@ const isFocus = () => { canvas.focus(); };
 const KEYS = [
   ["n", "N", () => step(looks, 1, "suspicious marking"), "Next suspicious", "the next suspicious marking; Shift+N the one before"],
   ["N", "", () => step(looks, -1, "suspicious marking")],
-  ["q", "Q", () => step(questions, 1, "question"), "Next question", "the next question: a candidate that was left out; Shift+Q the one before"],
+  ["q", "Q", () => step(questions, 1, "question"), "Next question", "the next question: on lanes, then candidates that were left out; Shift+Q the one before"],
   ["Q", "", () => step(questions, -1, "question")],
   ["i", "I", () => setTool("add"), "Add", "add a marking: click, or Enter at the crosshair"],
   ["l", "L", () => (tool === "draw" ? finish() : setTool("draw")), "Draw lane line", "draw a lane line: click its places, or Enter at the crosshair; L again ends it"],
@@ -410,7 +440,7 @@ const KEYS = [
   ["a", "A", () => accept(), "", "accept the selected one"],
   ["Delete", "Del", () => remove(), "Delete", "delete the selected one; Backspace too"],
   ["Backspace", "", () => (tool === "draw" ? (course.pop(), drawing.later()) : remove())],
-  ["c", "C", () => byId("edit-class")?.focus(), "", "change its class: choose with the arrow keys, Escape goes back to the map"],
+  ["c", "C", () => (byId("edit-class") ?? byId("answer"))?.focus(), "", "change its class: choose with the arrow keys, Escape goes back to the map"],
   ["r", "R", (event) => turn(event.altKey ? -TURN_DEG / 10 : -TURN_DEG), "", "turn it clockwise by 1\u00b0; Shift+R the other way; with Alt by 0.1\u00b0"],
   ["R", "", (event) => turn(event.altKey ? TURN_DEG / 10 : TURN_DEG)],
   ["z", "Z", () => undo(), "Undo", "undo; Ctrl+Z too"],
@@ -427,6 +457,7 @@ const KEYS = [
 ];
 const ALSO = [
   ["Arrows", "move the selection by 1 cm, with Shift by 10 cm, with Alt by 1 mm; without a selection, the map"],
+  ["1 2 3", "the first, second or third answer to a question, or direction of a lane"],
   ["1 2 3 4", "choose the corner that the arrows move; 0 the whole marking"],
   ["Enter", "select what is at the crosshair, or the nearest"],
   ["Escape", "end a tool; then leave the selection"],
@@ -470,6 +501,8 @@ addEventListener("keydown", (event) => {
   if (ARROWS[event.key] && onMap) { event.preventDefault(); return arrow(ARROWS[event.key], event); }
   if (event.key === "Enter" && onMap) { event.preventDefault(); return enter(); }
   if (event.key === "Escape") return escape();
+  const choice = choicesOf(selected)[Number(event.key) - 1];
+  if (choice) return answer(choice);
   if (/^[0-4]$/.test(event.key) && selected && isMovable(selected)) {
     corner = event.key === "0" ? null : Number(event.key) - 1;
     tell(corner === null ? "The whole marking" : `Corner ${corner + 1}`);
@@ -482,8 +515,8 @@ addEventListener("keydown", (event) => {
 });
 
 // ---- the panel ----
-const panel = new Panel(model, { accept, remove, classify, restore, link, split, join, choose: (feature) => show(feature) });
-const LAYERS = { before: "before the corrections", candidates: "left-out candidates", route: "route", ...(scene.mosaic ? { mosaic: "ground mosaic" } : {}), ...(scene.background ? { background: `background: ${scene.background}` } : {}) };
+const panel = new Panel(model, { accept, remove, classify, restore, answer, link, split, join, choose: (feature) => show(feature) });
+const LAYERS = { before: "before the corrections", candidates: "left-out candidates", route: "route", lanes: "lanes and their directions", questions: "questions on lanes", ...(scene.mosaic ? { mosaic: "ground mosaic" } : {}), ...(scene.background ? { background: `background: ${scene.background}` } : {}) };
 const pressed = { i: () => tool === "add", l: () => tool === "draw", m: () => tool === "measure", b: () => drawing.show.before };
 const usable = { z: () => edits.done.length, y: () => edits.undone.length, Delete: () => selected && !isGone(selected) };
 function buttons() {
@@ -522,24 +555,24 @@ if (scene.background) {
   const system = scene.systems.find(({ name }) => name === "");
   const failed = () => tell(`${scene.background} has no tile here, or does not answer`);
   const tiles = new Tiles((x, y) => within(system, x, y), () => drawing.change(), failed);
-  drawing.backdrops.push((context, wide) => drawing.show.background && tiles.draw(context, wide));
+  drawing.backdrops.unshift((context, wide) => drawing.show.background && tiles.draw(context, wide));
 }
 if (scene.mosaic && drawing.show.mosaic) {
   const picture = new Image();
   picture.onload = () => drawing.change();
   picture.src = "mosaic";
   const [west, south, east, north] = scene.mosaic;
-  drawing.backdrops.push((context, wide) => {
+  drawing.backdrops.splice(scene.background ? 1 : 0, 0, (context, wide) => {
     if (!drawing.show.mosaic || !picture.complete || !picture.naturalWidth) return;
     const [[left, top], [right, bottom]] = [wide.toScreen([west, north]), wide.toScreen([east, south])];
     context.drawImage(picture, left, top, right - left, bottom - top);
   });
 }
 await edits.look(true);
-panel.lists(looks, selected);
+await lanes.refresh().catch(({ message }) => tell(message));
 const linked = () => { const feature = model.byKey.get(decodeURIComponent(location.hash.slice(1))); if (feature) show(feature); };
 addEventListener("hashchange", linked);
 linked();
 buttons();
 document.documentElement.dataset.ready = String(Math.round(performance.now()));
-window.v2hdmView = { model, view, drawing, edits, select, show, selected: () => selected }; // for tests and further scripts
+window.v2hdmView = { lanes, model, view, drawing, edits, select, show, selected: () => selected }; // for tests and further scripts

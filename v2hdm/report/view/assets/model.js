@@ -3,7 +3,7 @@
 
 const CELL_M = 10; // side of the cells in which features are looked up by their middle
 
-const points = (flat) => {
+export const points = (flat) => {
   const places = [];
   for (let n = 0; n < flat.length; n += 2) places.push([flat[n] / 1000, flat[n + 1] / 1000]);
   return places;
@@ -20,6 +20,7 @@ export class Model {
   constructor(scene) {
     this.scene = scene;
     this.features = []; // of paint
+    this.questions = []; // on lanes
     this.lines = []; // lane lines, which are too long to be looked up by their middle
     this.byKey = new Map();
     this.cells = new Map();
@@ -38,13 +39,13 @@ export class Model {
 
   add(feature) {
     feature.places = feature.base;
-    (isLine(feature) ? this.lines : this.features).push(feature);
+    (feature.what === "question" ? this.questions : isLine(feature) ? this.lines : this.features).push(feature);
     this.byKey.set(feature.key, feature);
     this.index(feature);
   }
 
   index(feature) {
-    if (isLine(feature)) return;
+    if (isLine(feature) || feature.what === "question") return;
     const [x, y] = middleOf(feature.places);
     const cell = `${Math.floor(x / CELL_M)},${Math.floor(y / CELL_M)}`;
     if (feature.cell === cell) return;
@@ -66,11 +67,27 @@ export class Model {
 
   // A new marking of a person; its correction says where it is.
   addedBy(entry, key) {
+    if (entry.says === "answered") return this.askedBy({ key, subject: entry.subject, text: "" }, entry.places_map);
     const isAdded = entry.says === "added"; // else a correction of what is not in this map
     const what = entry.line_map ? (isAdded ? "drawn" : "line") : isAdded ? "added" : "elsewhere";
     const feature = { what, key, kind: entry.class, base: entry.line_map ?? entry.outline_map, entry: null };
     this.add(feature);
     return feature;
+  }
+
+  askedBy(about, base) {
+    const feature = { ...about, what: "question", kind: about.subject, base, entry: null, open: false };
+    this.add(feature);
+    return feature;
+  }
+
+  // The questions that are open now.
+  ask(questions) {
+    for (const question of this.questions) question.open = false;
+    for (const { p, ...about } of questions) {
+      const known = this.byKey.get(about.key) ?? this.askedBy(about, points(p));
+      Object.assign(known, { open: true, text: about.text });
+    }
   }
 
   // The correction of a feature, or null; the outline follows.
@@ -89,9 +106,12 @@ export class Model {
   }
 
   get corrected() {
-    return [...this.features, ...this.lines].filter(({ entry }) => entry);
+    return [...this.features, ...this.lines, ...this.questions].filter(({ entry }) => entry);
   }
 }
+
+// What answers a question, in the order of its keys; nothing where a person writes the answer.
+export const answersOf = (subject) => ({ direction: ["along", "against", "both"], connection: ["yes", "no"], "two ways": ["yes"], line: ["noted"] })[subject] ?? [];
 
 export const kindOf = (feature) => feature.entry?.new_class ?? feature.entry?.class ?? feature.kind;
 export const isLine = ({ what }) => what === "line" || what === "drawn";
@@ -101,13 +121,14 @@ export const isGone = (feature) => (isMade(feature) ? !feature.entry : feature.e
 // Candidates are places without an outline; only four corners can be moved.
 export const isMovable = (feature) => feature.places.length === 4 && ["marking", "added"].includes(feature.what);
 export const nameOf = (feature) => {
-  const name = { marking: "Marking", symbol: "Symbol", candidate: "Left out", added: "Added", line: "Lane line", drawn: "Drawn lane line", elsewhere: "Not in this map" }[feature.what];
+  const name = { marking: "Marking", symbol: "Symbol", candidate: "Left out", added: "Added", line: "Lane line", drawn: "Drawn lane line", elsewhere: "Not in this map", question: "Question", lane: "Lane" }[feature.what];
   return `${name}${feature.id === undefined ? "" : ` ${feature.id}`}, ${words(kindOf(feature))}`;
 };
 
 // What a correction says, in words.
 export function saidOf({ what, entry }) {
   if (!entry) return "";
+  if (entry.says === "answered") return `answered: ${entry.answer}`;
   const parts = [];
   if (entry.says === "rejected") parts.push(entry.reason ? `deleted: ${entry.reason}` : "deleted");
   else if (entry.says === "added") parts.push(what === "drawn" ? "drawn" : "added");

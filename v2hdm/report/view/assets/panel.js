@@ -1,7 +1,9 @@
 // What stands beside the map: the selection, lists to go through, layers. Names only become text nodes.
 
+import { choicesOf } from "./lanes.js";
 import { isGone, isLine, isMade, isMovable, kindOf, middleOf, nameOf, saidOf, words } from "./model.js";
 
+const LANE_SAYS = { driven: "A drive went along it in the direction of its arrows.", stated: "A person stated its direction.", drawn: "It runs as its lines do: no path of a drive is known.", asked: "No drive went along it; its direction is open." };
 const LISTED = 200; // entries of a list at once
 
 export const byId = (id) => document.getElementById(id);
@@ -15,7 +17,7 @@ export function element(tag, attributes = {}, ...children) {
 }
 
 const button = (label, act, attributes = {}) => {
-  const made = element("button", { type: "button", ...attributes }, label);
+  const made = element("button", { type: "button", ...attributes }, ...[label].flat());
   made.addEventListener("click", act);
   return made;
 };
@@ -53,6 +55,11 @@ export class Panel {
       section.replaceChildren(element("h2", {}, "Nothing selected"), element("p", { class: "hint", id: "keys-hint" }, "Select a marking with the mouse, or press N for the next suspicious one. Press ? for all keys."));
       return;
     }
+    if (["question", "lane"].includes(feature.what)) {
+      this.feature = feature;
+      section.replaceChildren(...this.asked(feature));
+      return;
+    }
     const { act } = this;
     const isSame = feature === this.feature;
     this.feature = feature;
@@ -81,7 +88,26 @@ export class Panel {
     if (focused && section.querySelector(`#${focused}`)) byId(focused).focus();
   }
 
-  lists(looks, chosen) {
+  // A question on lanes, or a lane whose direction a person may state.
+  asked(feature) {
+    const { act } = this;
+    const hint = feature.what === "lane" ? LANE_SAYS[feature.by] : feature.text;
+    const rows = choicesOf(feature).map((answer, n) => button([answer, " ", element("kbd", { "aria-hidden": "true" }, String(n + 1))], () => act.answer(answer), { "aria-keyshortcuts": String(n + 1), "aria-pressed": String(feature.entry?.answer === answer) }));
+    const head = [element("h2", {}, nameOf(feature)), element("p", { class: "said" }, saidOf(feature)), element("p", { class: "row" }, hint ?? "")];
+    if (feature.what === "question" && !rows.length) {
+      const field = element("input", { id: "answer", "aria-label": "Answer", maxlength: "200", ...(feature.subject === "speed" ? { placeholder: "km/h, such as 30", inputmode: "decimal" } : { placeholder: "answer" }) });
+      field.value = feature.entry?.answer ?? "";
+      field.addEventListener("keydown", (event) => { if (event.key === "Enter") act.answer(field.value.trim()); });
+      rows.push(field, button("Answer", () => act.answer(field.value.trim())));
+    }
+    if (feature.entry) rows.push(button("Take back", act.restore));
+    return [...head, element("div", { class: "row" }, ...rows)];
+  }
+
+  lists(looks, chosen, questions) {
+    const asked = questions.slice(0, LISTED).map(({ feature, why }) => element("li", {}, button(`${feature.what === "question" ? words(feature.subject) : nameOf(feature)}: ${why}${feature.entry ? " \u2713" : ""}`, () => this.act.choose(feature), feature === chosen ? { "aria-current": "true" } : {})));
+    byId("questions").replaceChildren(...asked);
+    byId("questions-title").textContent = `Questions (${questions.filter(({ feature }) => !feature.entry).length} open)`;
     const rows = looks.slice(0, LISTED).map(({ feature, why }) => element("li", {}, button(`${nameOf(feature)}: ${why}${feature.entry ? " \u2713" : ""}`, () => this.act.choose(feature), feature === chosen ? { "aria-current": "true" } : {})));
     byId("look").replaceChildren(...rows);
     const made = this.model.corrected.slice(-LISTED).reverse();

@@ -1,0 +1,160 @@
+"""The sites of the benchmark: drives made from fixed seeds, what a mapper gets of them, and their truth.
+
+A mapper gets a drive folder without truth. The truth is made anew from the same seed when a map is scored, so
+that it lies beside no drive. Both have hashes that are published here: equal hashes mean an equal benchmark.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from omegaconf import OmegaConf
+
+from v2hdm.cli.compose import conf_dir
+from v2hdm.errors import ConfigError, shown
+from v2hdm.executor import Executor
+from v2hdm.io.description import DRIVE_FILE, TRUTH_FOLDER
+from v2hdm.io.drive import read_drive
+from v2hdm.io.drive.truth import read_truth
+from v2hdm.progress import Progress, Steps
+from v2hdm.records import BoolArray, Drive, Truth
+from v2hdm.report.metrics import driven_past
+from v2hdm.simulate.port.config import PortConfig, SurveyConfig
+from v2hdm.simulate.port.drive import true_drive
+from v2hdm.simulate.render.renderer import RENDERER_VERSION
+from v2hdm.simulate.survey.drive import simulated_drives
+from v2hdm.store.cache import StageCache
+from v2hdm.store.files import dump_yaml, file_digest, load_yaml
+
+_DIGITS_M = 4  # decimals of a coordinate of the truth, m, that its hash counts
+
+
+@dataclass(frozen=True)
+class Site:
+    """A site with one drive through it.
+
+    Attributes:
+        name: as it is typed.
+        says: what it is, for a reader.
+        config: all that its drive follows from.
+        input_sha256: of the drive that a mapper gets, see :func:`input_hash`.
+        truth_sha256: of its true map, see :func:`truth_hash`.
+    """
+
+    name: str
+    says: str
+    config: PortConfig
+    input_sha256: str
+    truth_sha256: str
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What a map of a site is scored against: the truth, and which true markings (J,) the drive went past."""
+
+    truth: Truth
+    expected: BoolArray
+
+
+def site_of(name: str) -> Site:
+    """The site of that name; ConfigError names all where there is none."""
+    sites = all_sites()
+    if name not in sites:
+        raise ConfigError(f"{shown(name)}: is no site of the benchmark; choose from {', '.join(sites)}")
+    return sites[name]
+
+
+def all_sites() -> Mapping[str, Site]:
+    """All sites by name."""
+    streets = PortConfig(name="streets", seed=1, survey=SurveyConfig(length_km=0.5, drives=1))
+    sites = (
+        Site(
+            "port1", "pictures of diamonds on concrete, by a calibrated vehicle", _shipped("port1"), *_PORT1
+        ),
+        Site(
+            "port2", "pictures of worn paint on asphalt, by an uncalibrated one", _shipped("port2"), *_PORT2
+        ),
+        Site("streets", "500 m of streets and yards, detections in place of pictures", streets, *_STREETS),
+    )
+    return {site.name: site for site in sites}
+
+
+def _shipped(name: str) -> PortConfig:
+    """A port as its shipped run file has it, whatever a user's own configuration says."""
+    run = OmegaConf.load(conf_dir() / "run" / f"{name}.yaml")
+    config = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(PortConfig), run.simulate))
+    assert isinstance(config, PortConfig)
+    return config
+
+
+def write_input(site: Site, folder: Path, cache: Path, executor: Executor, progress: Steps) -> None:
+    """Write the drive that a mapper gets into ``folder``: all of the made drive but its truth.
+
+    The drive is made in a ``cache``, where a later call finds it. Raises as
+    :func:`v2hdm.simulate.port.drive.rendered_drive`.
+    """
+    (made,) = simulated_drives(site.config, cache, executor, progress)
+    description = load_yaml(made / DRIVE_FILE, ConfigError)
+    description.pop("truth", None)
+    shutil.copytree(made, folder, ignore=shutil.ignore_patterns(TRUTH_FOLDER, ".*"), dirs_exist_ok=True)
+    (folder / DRIVE_FILE).write_text(dump_yaml(description), encoding="utf-8")
+
+
+def input_hash(folder: Path) -> str:
+    """SHA-256 of a drive folder: of the name and the content of each of its files, by name."""
+    paths = sorted(path for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))
+    lines = [f"{path.relative_to(folder).as_posix()} {file_digest(path)}\n" for path in paths]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def reference_of(site: Site, cache: Path | None, executor: Executor, progress: Progress) -> Reference:
+    """The truth of a site, from its seed; a ``cache`` keeps it."""
+    stages = StageCache(cache)
+    key = stages.key(RENDERER_VERSION, site.config)
+    make = partial(_make_reference, site.config, executor, progress)
+    return stages.get_or_make("benchmark", key, Reference, make)
+
+
+def _make_reference(config: PortConfig, executor: Executor, progress: Progress) -> Reference:
+    drive, truth = _survey(config, executor, progress) if config.survey.length_km else true_drive(config)
+    return Reference(truth, driven_past(drive, truth, tuple(drive.cameras)))
+
+
+def _survey(config: PortConfig, executor: Executor, progress: Progress) -> tuple[Drive, Truth]:
+    """The drive of a survey with its truth, made in a folder that does not stay."""
+    with tempfile.TemporaryDirectory(prefix="v2hdm-benchmark-") as folder:
+        (made,) = simulated_drives(config, Path(folder), executor, partial(progress, "truth"))
+        drive = read_drive(made)
+        return drive, read_truth(drive)
+
+
+def truth_hash(reference: Reference) -> str:
+    """SHA-256 of the true markings: class, corners to 0.1 mm, and whether a drive must find them."""
+    lines = []
+    for marking, is_expected in zip(reference.truth.map.markings, reference.expected, strict=True):
+        corners = np.round(marking.corners_map, _DIGITS_M) + 0.0  # no minus zero
+        coordinates = " ".join(f"{value:.{_DIGITS_M}f}" for value in corners.ravel())
+        lines.append(f"{marking.kind} {coordinates} {int(is_expected)}\n")
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+# SHA-256 of input and truth, as v2hdm benchmark make and score print them; numpy 2.4, OpenCV 5.0, x86_64:
+_PORT1 = (
+    "52c29bda259fc20e5350d73e88999d39ccc62efcc2ebfb6c4ecf194c38e8e1c9",
+    "a7cb5a5970e22f4daa626151f4c9bf0356e6e548e42a483232a7aaa4e2b4c4a3",
+)
+_PORT2 = (
+    "ba083c46a2d626c411cfe7779c61fbd6357503608ed60ffa186a273e7b08ecdb",
+    "57436fb23b7cf59e636c0aa7a20d6d69bc02263bf94d2a5ef43a1a33c9462073",
+)
+_STREETS = (
+    "13f9da6d19d16aa718c58b344afd53d6350913be97e6cc965264c826ddb24f8a",
+    "aa098bd15cdb950b6920fbd067c4e29d5f795aec4a7b2a536db71cfe512869f3",
+)
