@@ -36,7 +36,7 @@ class _Error:
 
 
 class ClockEvidence(NamedTuple):
-    """The observations' evidence on the n errors of clocks: their ``information`` (n, n) and ``score`` (n,)."""
+    """Evidence of observations on the n errors of clocks: ``information`` (n, n) and ``score`` (n,)."""
 
     information: FloatArray
     score: FloatArray
