@@ -36,10 +36,10 @@ _STARTS_WITH = 0.05
 CLASS_HEADS = ("kinds.", "wide_kinds.")
 """How the names of the weights of layers begin that only classes are read from."""
 
-_CLASS_LAYERS = ("kinds", "wide_kinds.1")
+CLASS_LAYERS = ("kinds", "wide_kinds.1")
 """Layers with an output channel for each class, whose sum is the logits."""
 
-CLASS_CHANNELS = frozenset(f"{layer}.{part}" for layer in _CLASS_LAYERS for part in ("weight", "bias"))
+CLASS_CHANNELS = frozenset(f"{layer}.{part}" for layer in CLASS_LAYERS for part in ("weight", "bias"))
 """Names of the weights whose first axis is that of the classes."""
 
 HIDDEN_CLASS_LAYER = "wide_kinds.0."
@@ -85,7 +85,7 @@ def with_classes(
         then.index(name if name in then else _STARTS_AS[catalogue.classes[name].family])
         for name in catalogue.names
     ]
-    for head in (head for head in _CLASS_LAYERS if f"{head}.bias" in told):
+    for head in (head for head in CLASS_LAYERS if f"{head}.bias" in told):
         for part in ("weight", "bias"):
             told[f"{head}.{part}"] = told[f"{head}.{part}"][origin]
     told["kinds.bias"] = told["kinds.bias"] + torch.where(

@@ -68,8 +68,25 @@ def read_labels(
         LabelError: a label file or an image is missing, damaged or does not fit.
         ConfigError: the share is no share.
     """
+    chosen = labelled_images(config, classes, role)
+    if config.coco_complete is not None or any(_is_open(image) for image in chosen):
+        chosen = with_hints(
+            chosen, config, lambda share: tell(share, "asking the shipped network about labels")
+        )
+    return LabelledImages(chosen, config, classes) if chosen else None
+
+
+def labelled_images(
+    config: DataConfig, classes: Sequence[str] = PAINT_CLASSES, role: str = LEARNT
+) -> list[LabelledImage]:
+    """The labelled images of a ``role`` as their files describe them, checked; what these leave open is open.
+
+    Raises:
+        LabelError: a label file or an image is missing, damaged or does not fit.
+        ConfigError: the share is no share.
+    """
     if config.coco is None and config.tusimple is None:
-        return None
+        return []
     if not 0 < config.labelled_share <= 1:
         raise ConfigError(
             f"data.labelled_share is {config.labelled_share}: set more than 0 and at most 1, "
@@ -91,16 +108,10 @@ def read_labels(
     for image in images.values():
         _check(image, config)
     chosen = list(images.values())
-    if config.coco_held_out:
-        roles = held_out([image.path.stem for image in chosen])
-        chosen = [image for image, its in zip(chosen, roles, strict=True) if its == role]
-    elif role != LEARNT:
-        return None
-    if config.coco_complete is not None or any(_is_open(image) for image in chosen):
-        chosen = with_hints(
-            chosen, config, lambda share: tell(share, "asking the shipped network about labels")
-        )
-    return LabelledImages(chosen, config, classes) if chosen else None
+    if not config.coco_held_out:
+        return chosen if role == LEARNT else []
+    roles = held_out([image.path.stem for image in chosen])
+    return [image for image, its in zip(chosen, roles, strict=True) if its == role]
 
 
 def held_out(stems: Sequence[str]) -> list[str]:

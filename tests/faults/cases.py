@@ -654,6 +654,11 @@ TRAINING = _plainly(
     "catalogue=nowhere.yaml": "nowhere.yaml",
     "data.coco=nowhere.json": "nowhere.json",
 }
+AREAS = _plainly("steps=0 sky=2 threads=0 render_share=nan render_views=-1 seed=-1") | {
+    "classes=[]": "name one class or more",
+    "start=nowhere.pt": "nowhere.pt",
+    "data.coco=nowhere.json": "nowhere.json",
+}
 EXPORTS = _plainly("opset=3 opset=99 tolerance=nan int8.frames=0 int8.bounds.kinds_agree=7") | {
     "checkpoint=nowhere.pt": "nowhere.pt",
     "precision=int4": "precision",
@@ -698,6 +703,8 @@ def settings() -> Iterator[Case]:
         end = () if line.startswith(("minutes", "steps")) else ("steps=1",)
         words = (line, *end) if line.startswith("validation") else (line, *end, "validation.images=0")
         yield Case(f"train {line}", "train.__main__", words, both(), says)
+    for line, says in AREAS.items():
+        yield Case(f"areas {line}", "train.areas.__main__", (line,), both(), says)
     for line, says in EXPORTS.items():
         words = [
             one for one in ("checkpoint=a.pt", "output=b.onnx") if one.split("=")[0] != line.split("=")[0]
