@@ -11,10 +11,10 @@ from v2hdm.association.ground import Located, Views, easy_views, images_with_lin
 from v2hdm.association.groups import fuse_groups, group_kinds
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.geometry.ipm import project_ground
+from v2hdm.io.maps.corrections import Heard
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.records import BoolArray, Calibration, Camera, Exclusion, FloatArray, IntArray, Marking
 from v2hdm.site.candidates import Candidates, Counts, scatter_of, with_dissent, with_shared_errors
-from v2hdm.site.corrections import Heard
 from v2hdm.site.markings import Suspicion, classify, most_suspicious
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import PointViews, measure_parallax
