@@ -4,8 +4,8 @@
 
 First paint, the map's, and all ready count from the request for the page; ``prepared`` is the server's time
 to read the result and draw the document before that. A frame is what ``requestAnimationFrame`` counts while
-the mouse drags. Ten corrections are made by keys; each waits until the page says that it is saved. With ``--axe FILE``
-(axe.min.js of npm's axe-core) it lists what axe finds.
+the mouse drags. Ten corrections are made by keys; each waits until the page says that it is saved. With
+``--axe FILE`` (axe.min.js of npm's axe-core) it lists what axe finds.
 """
 
 from __future__ import annotations
