@@ -12,7 +12,7 @@ from tests.adjust.test_sessions import joined, visited_again
 from v2hdm.adjust import ControlPoints, KnownLengths, Problem, SolveOptions, solve
 from v2hdm.adjust.sections.blocks import BlockMatrix, BlockPattern
 from v2hdm.adjust.sections.parts import Part, cut, parts_of_way
-from v2hdm.adjust.sections.solve import Shape, save_part, solve_parts
+from v2hdm.adjust.sections.solve import Shape, finish_parts, join_parts, save_part
 from v2hdm.errors import AdjustError
 
 
@@ -66,7 +66,9 @@ def in_sections(folder: Path, problem: Problem, options: SolveOptions, part_of_f
     parts, links = cut(problem, part_of_frame, tuple(options.pose_states))
     for number, part in enumerate(parts):
         save_part(folder, number, part)
-    return solve_parts(folder, len(parts), links, Shape.of(problem, options), finish)
+    shape = Shape.of(problem, options)
+    joint = join_parts(folder, len(parts), links, shape, lambda number, part, solution: None)
+    return finish_parts(folder, joint, shape, finish)
 
 
 def check(results: list[dict], problem: Problem, options: SolveOptions) -> None:

@@ -213,8 +213,8 @@ def row_of_verdict(name: str, seeds: Sequence[int]) -> str:
         in_turn = map_one(Job(seed, "straight", apart_s=APART_S, stated=True))
         failed += sum(right.status == "FAIL" for right in (clean, in_turn))
         judged += [judge(map_one(Job(seed, spoil=spoil)), clean) for spoil in SPOILS if spoil != CLEAN]
-    silent = sum(wrong and not told for wrong, told, _ in judged)
-    told = [when for _, told, when in judged if told]
+    silent = sum(judgement.silent for judgement in judged)
+    told = [judgement.named for judgement in judged if judgement.told]
     return f"{name:38s} {failed:7d} {silent:7d} {len(told):7d} {told.count('first'):7d}"
 
 

@@ -86,18 +86,25 @@ def colmap(drive: Drive, rows: list[int], camera: str, scratch: Path) -> tuple[F
     # COLMAP's pixels begin at the corner of the first one, ours at its centre.
     parameters = [k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5, *of_lens]
     database, folder = scratch / "database.db", images[0].path.parent
-    reading = pycolmap.ImageReaderOptions(camera_params=",".join(map(repr, map(float, parameters))))
+    reading = pycolmap.ImageReaderOptions(
+        camera_model="OPENCV", camera_params=",".join(map(repr, map(float, parameters)))
+    )
     pycolmap.extract_features(
-        database, folder, [one.path.name for one in images], pycolmap.CameraMode.SINGLE, "OPENCV", reading,
+        database, folder, [one.path.name for one in images], pycolmap.CameraMode.SINGLE, reading,
         device=pycolmap.Device.cpu,
     )  # fmt: skip
     with pycolmap.Database.open(database) as opened:
         for one in images:
             centre = (one.map_from_vehicle @ [*prior.centre_vehicle, 1.0])[:3]
-            covariance = np.diag(prior.sigma_m**2 + 0.0125**2)
+            covariance = np.diag(prior.sigma_m**2 + drive.pose_noise.position_m**2)
             cartesian = pycolmap.PosePriorCoordinateSystem.CARTESIAN
-            placed = pycolmap.PosePrior(centre, covariance, cartesian)
-            opened.write_pose_prior(opened.read_image_with_name(one.path.name).image_id, placed)
+            placed = pycolmap.PosePrior(
+                corr_data_id=opened.read_image_with_name(one.path.name).data_id,
+                position=centre,
+                position_covariance=covariance,
+                coordinate_system=cartesian,
+            )
+            opened.write_pose_prior(placed)
     pairing = pycolmap.SequentialPairingOptions(overlap=OVERLAP)
     pycolmap.match_sequential(database, pairing_options=pairing, device=pycolmap.Device.cpu)
     options = pycolmap.IncrementalPipelineOptions(

@@ -17,14 +17,12 @@ from tests.benchmarks.made.detect import detect
 from tests.benchmarks.made.draw import ROUTES, draw
 from tests.benchmarks.made.faults import RELIEFS
 from tests.benchmarks.made.world import drive_of, make, truth_of
-from tests.benchmarks.uncertainty import in_order_of, squared_errors
+from tests.benchmarks.uncertainty import INSIDE, in_order_of, squared_errors
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.results import MethodResult
 from v2hdm.records import FloatArray, Truth
 from v2hdm.report.metrics import match_markings
-
-_INSIDE = 3.84  # chi-square of one degree of freedom at 95 %
 
 
 def corner_pairs(result: MethodResult, truth: Truth) -> tuple[FloatArray, FloatArray]:
@@ -72,11 +70,11 @@ def main() -> None:
             rmse_m = float(np.sqrt(np.mean(np.sum((mapped - true) ** 2, axis=1))))
             print(
                 f"{world.recipe.name:24s} {name:6s} {100 * rmse_m:5.2f} cm, "
-                f"left {100 * left_m(mapped, true):.2f}, inside {np.mean(errors <= _INSIDE):.2f}",
+                f"left {100 * left_m(mapped, true):.2f}, inside {np.mean(errors <= INSIDE):.2f}",
                 flush=True,
             )
     for name, of_drives in squared.items():
-        print(f"{name:6s} inside {np.mean(np.concatenate(of_drives) <= _INSIDE):.3f}")
+        print(f"{name:6s} inside {np.mean(np.concatenate(of_drives) <= INSIDE):.3f}")
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ from scipy.spatial import cKDTree
 
 from v2hdm.adjust import Problem, SolveOptions, solve
 from v2hdm.adjust.sections.parts import cut, parts_of_way
-from v2hdm.adjust.sections.solve import Shape, save_part, solve_parts
+from v2hdm.adjust.sections.solve import Shape, finish_parts, join_parts, save_part
 from v2hdm.cli.compose import conf_dir
 from v2hdm.detection.batch import detect_image
 from v2hdm.detection.detector import Detector
@@ -41,8 +41,8 @@ from v2hdm.io.drive.truth import read_truth
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.mapping.inputs import Inputs
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.mapping.sections import map_in_sections
-from v2hdm.records import Drive, FloatArray, HDMap, MarkingDetection, Truth
+from v2hdm.mapping.sections.run import map_in_sections
+from v2hdm.records import Drive, FloatArray, HDMap, Image, IntArray, MarkingDetection, Truth
 from v2hdm.simulate.port.config import PortConfig, SurveyConfig
 from v2hdm.simulate.survey.drive import simulated_drives
 
@@ -185,8 +185,10 @@ def _in_sections(
     with tempfile.TemporaryDirectory() as folder:
         for number, part in enumerate(parts):
             save_part(Path(folder), number, part)
-        results = solve_parts(
-            Path(folder), len(parts), links, Shape.of(problem, options),
+        shape = Shape.of(problem, options)
+        joined = join_parts(Path(folder), len(parts), links, shape, lambda number, part, solution: None)
+        results = finish_parts(
+            Path(folder), joined, shape,
             lambda number, part, solution: (
                 part.corners,
                 solution.corners_map,
@@ -203,8 +205,8 @@ def _in_sections(
 class FromFiles:
     """Detections from a drive's files, read where they are needed."""
 
-    def __call__(self, drive: Drive, images: list[int]) -> list:
-        return [read_detections(drive.images[image].path, at) for at, image in enumerate(images)]
+    def __call__(self, images: list[Image], numbers: IntArray) -> list:
+        return [read_detections(image.path, at) for at, image in enumerate(images)]
 
 
 def one_length(length_km: float, section_m: float, workers: int, cache: Path) -> None:
@@ -219,6 +221,7 @@ def one_length(length_km: float, section_m: float, workers: int, cache: Path) ->
     figures = {
         "km": length_km,
         "images": len(drive.images),
+        "observations": result.diagnostics["observations"],
         "markings": len(result.hd_map.markings),
         "true": len(true_map.markings),
         "wall_s": time.perf_counter() - begin_s,
@@ -261,9 +264,12 @@ def grow(lengths_km: list[float], section_m: float, workers: int, cache: Path) -
         shown = {key: round(value, 3) for key, value in rows[-1].items()}
         print(" ".join(f"{key} {value:g}" for key, value in shown.items()), flush=True)
     if len(rows) > 1:
-        ratio = np.log(rows[-1]["images"] / rows[0]["images"])
-        for key in ("cpu_s", "peak_mb"):
-            print(f"exponent of {key}: {np.log(rows[-1][key] / rows[0][key]) / ratio:.2f}")
+        # Short networks have more streets than yards: cost follows the observations as well as the way.
+        for size in ("images", "observations"):
+            ratio = np.log(rows[-1][size] / rows[0][size])
+            for key in ("cpu_s", "peak_mb"):
+                exponent = np.log(rows[-1][key] / rows[0][key]) / ratio
+                print(f"exponent of {key} by {size}: {exponent:.2f}")
 
 
 def main() -> None:

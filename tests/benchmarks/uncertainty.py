@@ -41,7 +41,8 @@ CACHE = Path("~/.cache/v2hdm/uncertainty").expanduser()
 Errors = Mapping[str, FloatArray]
 """By quantity, squared errors in sigmas, as if of one degree of freedom: inside 95 % below 3.84."""
 
-_INSIDE = float(chi2.ppf(0.95, 1))
+INSIDE = float(chi2.ppf(0.95, 1))
+"""Squared error, in sigmas, below which a quantity lies inside its 95 % region."""
 
 
 def squared_errors(result: MethodResult, truth: Truth) -> Errors:
@@ -58,7 +59,7 @@ def squared_errors(result: MethodResult, truth: Truth) -> Errors:
         [camera_errors(one, truth.cam_from_vehicle[name]) for name, one in result.calibrations.items()]
     )
     return {
-        "corners": corner_errors(mapped, true) * _INSIDE / INSIDE_95,
+        "corners": corner_errors(mapped, true) * INSIDE / INSIDE_95,
         "sides": side_errors(mapped, true),
         "distances": distance_errors(mapped, true),
         **{name: cameras[:, axis] for axis, name in enumerate(("height", "roll", "pitch", "yaw"))},
@@ -121,7 +122,7 @@ def camera_errors(found: Calibration, true: FloatArray) -> FloatArray:
 
 def shares(errors: Errors) -> dict[str, float]:
     """By quantity, the share inside the 95 % region."""
-    return {name: float(np.mean(errors[name] <= _INSIDE)) for name in QUANTITIES}
+    return {name: float(np.mean(errors[name] <= INSIDE)) for name in QUANTITIES}
 
 
 def print_shares(name: str, errors: Errors) -> None:

@@ -125,6 +125,13 @@ def test_noise_that_is_not_stated_counts_by_its_mean_square():
     assert noise.roll_pitch_rad / usual.roll_pitch_rad == noise.heading_rad / usual.heading_rad
 
 
+def test_clocks_that_nobody_states_are_unknown_and_stated_ones_drift_no_more_than_they_are_off():
+    unknown, stated = PoseNoise.from_stated(), PoseNoise.from_stated(clock_s=0.001)
+    assert 0.01 < unknown.clock_s < unknown.clock_drift_s < 0.1
+    assert (stated.clock_s, stated.clock_drift_s) == (0.001, 0.001)
+    assert PoseNoise.from_stated(clock_s=0.001, clock_drift_s=0.0).clock_drift_s == 0.0
+
+
 def test_a_mask_of_the_vehicle_is_read_and_one_of_another_size_refused(tmp_path):
     make_drive(tmp_path)
     mask = np.zeros((48, 64), dtype=np.uint8)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from v2hdm.lanes.lines import map_lanes
+from v2hdm.lanes.lines import join_paths, lanes_along, map_lanes, paths_of
 from v2hdm.lanes.points import NODE_SPACING_M, Guides, LaneCloud
 from v2hdm.site.options import LaneOptions
 
@@ -162,3 +162,21 @@ def test_a_short_piece_must_be_seen_more_often_than_a_long_one():
     assert map_lanes(cloud_of([piece], images=OPTIONS.min_images), OPTIONS) == ()
     assert len(map_lanes(cloud_of([piece], images=3 * OPTIONS.min_images), OPTIONS)) == 1
     assert len(map_lanes(cloud_of([straight(0, 12)], images=OPTIONS.min_images), OPTIONS)) == 1
+
+
+def test_paths_found_on_both_sides_of_a_border_are_one_lane_when_joined():
+    """What a long drive does in sections: each finds the paths inside its own ground."""
+    cloud = cloud_of([straight(0, 40), straight(0, 40, 3.5)])
+    west = paths_of(cloud, OPTIONS, lambda points_map: points_map[:, 0] < 17.3)
+    east = paths_of(cloud, OPTIONS, lambda points_map: points_map[:, 0] >= 17.3)
+    assert len(west) == len(east) == 2
+    lanes = lanes_along(join_paths([*west, *east]), OPTIONS)
+    whole = map_lanes(cloud, OPTIONS)
+    assert len(lanes) == len(whole) == 2
+    for lane, other in zip(
+        sorted(lanes, key=lambda lane: lane.points_map[0, 1]),
+        sorted(whole, key=lambda lane: lane.points_map[0, 1]),
+        strict=True,
+    ):
+        assert abs(length(lane) - length(other)) < 0.1
+        assert np.abs(lane.points_map[:, 1] - other.points_map[:, 1].mean()).max() < 0.03

@@ -8,15 +8,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from scipy.stats import norm
 
 from tests.mapping.scene import Scene, SceneOptions, make_scene
-from v2hdm.errors import ConfigError, MappingError
+from v2hdm.errors import AdjustError, ConfigError, MappingError, WorkerError
 from v2hdm.executor import HERE
+from v2hdm.faults import Contradiction, table
+from v2hdm.geometry.planar import length_along
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions, SizeOptions
-from v2hdm.mapping.results import MethodResult
-from v2hdm.mapping.sections import map_in_sections, sections_of
-from v2hdm.records import Drive, ImageDetections
+from v2hdm.mapping.results import NO_SEGMENT, MethodResult
+from v2hdm.mapping.sections.faults import pooled_tests, refuse_contradicted
+from v2hdm.mapping.sections.joint import Fit, gates, refuse_contradicting_drives, scatter_by_marking
+from v2hdm.mapping.sections.run import map_in_sections
+from v2hdm.mapping.sections.section import sections_of
+from v2hdm.records import Image, ImageDetections, IntArray, PoseNoise, Session
 
 
 class Listed:
@@ -25,8 +31,8 @@ class Listed:
     def __init__(self, detections: Sequence[ImageDetections]) -> None:
         self.detections = detections
 
-    def __call__(self, drive: Drive, images: Sequence[int]) -> list[ImageDetections]:
-        return [replace(self.detections[image], image=at) for at, image in enumerate(images)]
+    def __call__(self, images: Sequence[Image], numbers: IntArray) -> list[ImageDetections]:
+        return [replace(self.detections[number], image=at) for at, number in enumerate(numbers)]
 
 
 class Elsewhere(type(HERE)):
@@ -129,3 +135,109 @@ def test_settings_that_sections_cannot_have_each_for_itself_are_refused(scene, t
         in_sections(scene, tmp_path, known_sizes=sizes)
     with pytest.raises(ConfigError, match=r"mapping\.ground=surface: not with sections"):
         in_sections(scene, tmp_path, ground="surface")
+
+
+class Dying(Elsewhere):
+    """An executor whose process dies over the second job."""
+
+    def outcomes(self, stage, jobs, progress, at_once):
+        yield 1, WorkerError("a process died twice over the same work")
+
+
+def test_a_worker_that_dies_is_one_line_that_names_step_and_section(scene, tmp_path):
+    cameras = list(scene.drive.cameras)
+    with pytest.raises(WorkerError, match=r"map sections, section 2 of 2: a process died twice"):
+        map_in_sections(
+            scene.drive, Listed(scene.detections), cameras, MappingOptions(), 130.0, Dying(), tmp_path
+        )
+
+
+def fit_of(squared, corner, shift_m=((0.0, 0.0), (0.0, 0.0)), is_behind=None) -> Fit:
+    """A section's fit of observations with such squared residuals of such corners, by 100 frames a drive."""
+    count = len(squared)
+    return Fit(
+        mahalanobis2=np.array(squared, dtype=float),
+        corner=np.array(corner),
+        freedom=np.full(count, 2.0),
+        is_behind=np.zeros(count, dtype=bool) if is_behind is None else np.array(is_behind),
+        of_priors={},
+        shift_m=100 * np.array(shift_m),
+        frames=np.array([100, 100]),
+    )
+
+
+def test_an_observation_is_judged_at_the_scale_of_all_sections_and_its_corner_counted_in_all():
+    usual = [1.4] * 20
+    first = fit_of([*usual, 5.0, 300.0, 1.0], [*range(20), 20, 20, 21])
+    second = fit_of([*usual, 5.0, 1.0], [*range(22, 42), 20, 21], is_behind=[False] * 21 + [True])
+    of_first, of_second = gates([first, second], 0.001)
+    assert of_first.is_accepted[20:].tolist() == [True, False, True]
+    assert of_second.is_accepted[20:].tolist() == [True, False]
+    # Corner 20 is seen once in each section, corner 21 twice, once behind the camera.
+    assert of_first.is_used[20:].tolist() == [True, False, False]
+    assert of_second.is_used[20:].tolist() == [True, False]
+
+
+def test_a_corner_scatters_as_all_its_images_do_whatever_section_they_are_of():
+    rng = np.random.default_rng(3)
+    squared = rng.chisquare(2, 400)
+    squared[::40] *= 9  # of corner 0
+    corner = np.arange(400) % 40
+    whole = scatter_by_marking([fit_of(squared, corner)], 10)
+    halves = [fit_of(squared[::2], corner[::2]), fit_of(squared[1::2], corner[1::2])]
+    np.testing.assert_allclose(scatter_by_marking(halves, 10), whole)
+    assert whole[0, 0] == whole.max() > 2
+
+
+def test_drives_that_markings_shift_apart_are_named_in_one_line(scene):
+    noise = PoseNoise(position_m=0.02)
+    drives = [Session(name, Path(name), noise) for name in ("monday", "tuesday")]
+    network = replace(scene.drive, joined=tuple(drives))
+    refuse_contradicting_drives([fit_of([], [], ((0.03, 0.0), (-0.03, 0.0)))], network)
+    with pytest.raises(AdjustError, match=r"drive (monday|tuesday) by 30 cm against the others") as refused:
+        refuse_contradicting_drives([fit_of([], [], ((0.15, 0.0), (-0.15, 0.0)))], network)
+    assert "\n" not in str(refused.value)
+
+
+def late(value: float, sigma: float) -> Contradiction:
+    """The front camera's clock, off by so many seconds."""
+    sigmas = abs(value) / sigma
+    return Contradiction(
+        table.CLOCK.name, 0, 0, -1, value, sigma, sigma, 2 * float(norm.sf(sigmas)), sigmas**2 / 2,
+        cameras=("front",),
+    )  # fmt: skip
+
+
+def test_an_error_that_every_section_hints_at_is_seen_by_all_together():
+    (pooled,) = pooled_tests([[late(0.02, 0.01)]] * 16)
+    assert pooled.value == pytest.approx(0.02)
+    assert pooled.sigma == pytest.approx(0.0025)
+    with pytest.raises(MappingError, match=r"contradict the clock of front by 8 sigmas \(\+0\.02 s\)"):
+        refuse_contradicted([pooled], NO_SEGMENT)
+
+
+def test_errors_on_which_sections_disagree_are_known_as_badly_as_they_disagree():
+    tests = [[late(0.004 * (-1) ** number, 0.001)] for number in range(40)]
+    (pooled,) = pooled_tests(tests)
+    assert abs(pooled.value) < 1e-9
+    assert pooled.sigma > 2 * 0.001 / 40**0.5
+    refuse_contradicted([pooled], NO_SEGMENT)
+
+
+def test_one_of_many_sections_by_chance_contradicts_nothing():
+    """Of a hundred sections one is four sigmas off; their mean is not."""
+    rng = np.random.default_rng(0)
+    tests = [[late(float(rng.normal(0, 0.002)), 0.002)] for _ in range(100)]
+    tests[7] = [late(0.008, 0.002)]
+    (pooled,) = pooled_tests(tests)
+    assert pooled.sigmas < 3
+    refuse_contradicted([pooled], NO_SEGMENT)
+
+
+def test_lanes_do_not_end_where_sections_meet(result, whole):
+    longest, other = (
+        max(length_along(lane.points_map)[-1] for lane in of_drive.hd_map.lanes)
+        for of_drive in (result, whole)
+    )
+    assert longest == pytest.approx(other, abs=1.0)
+    assert len(result.hd_map.lanes) == len(whole.hd_map.lanes)

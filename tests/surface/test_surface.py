@@ -328,7 +328,8 @@ def plane():
 def test_a_road_with_a_crown_or_crests_is_mapped_as_well_as_a_plane(plane, relief, height_m):
     # A roll of the recording sensor by 2 mrad, which a straight road does not show, leans recorded ground.
     curved = map_one(Job(SEED, spoil=relief, ground="auto"))
-    assert curved.status == plane.status == "PASS"
+    # Both are straight, and nothing is stated of their clocks.
+    assert {finding["check"] for row in (plane, curved) for finding in row.findings} == {"clock"}
     assert curved.rmse_m <= 1.2 * plane.rmse_m
     assert curved.markings >= plane.markings
     assert curved.height_rmse_m <= height_m

@@ -15,7 +15,7 @@ from v2hdm.cli.compose import Job
 from v2hdm.errors import ConfigError
 from v2hdm.geometry.rigid import camera_centre, exp
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.mapping.results import AdjustedPoses, MethodResult
+from v2hdm.mapping.results import AdjustedPoses, MethodResult, SolveEvidence
 from v2hdm.pipeline.config import RunConfig, check_choice
 from v2hdm.pipeline.grades import graded
 from v2hdm.pipeline.map_drive import map_drive
@@ -46,6 +46,14 @@ def mapped(markings, calibration=None, position_m=0.003):
     calibrations = {"front": calibration or calibrated()}
     hd_map = graded(HDMap(tuple(markings)), 0.05)
     return MethodResult("Opt", ("front",), hd_map, calibrations, poses=poses)
+
+
+def with_clocks(clock_m):
+    """Evidence of a solve that leaves corners open by clocks alone."""
+    return SolveEvidence(
+        score_tests=(), corrected=(), pose_model="heave", held_out={}, fits={}, variance_factor=1.0,
+        pose_noise={}, worst_innovation=0.0, worst_innovation_s=0.0, clock_m=clock_m,
+    )  # fmt: skip
 
 
 def judged(one, goal_m=0.05):
@@ -103,6 +111,18 @@ def test_the_radius_of_all_corners_holds_for_errors_drawn_from_their_covariances
 def test_poses_that_drift_are_named_as_the_largest_part():
     found = of_map(mapped([marking(n, shared_m=0.05) for n in range(30)], position_m=0.045))
     assert "the largest part, 11 cm, is the poses: tie them down by mapping.survey" in found.says
+
+
+def test_clocks_that_leave_more_open_than_the_goal_are_named_first_and_no_pass():
+    unknown = replace(mapped([marking(n, shared_m=0.1) for n in range(30)]), evidence=with_clocks(0.2))
+    verdict = judged(unknown)
+    assert verdict.status is Status.WARN
+    first, of_all = verdict.raised[:2]
+    assert first.line.startswith("WARN clock (all cameras): whether all clocks are late or fast cannot")
+    assert "pose_noise.clock_s" in first.says
+    assert (first.value, first.limit, first.unit) == (20.0, 5.0, "cm")
+    assert "the largest part, 20 cm, is the clocks" in of_all.says
+    assert judged(unknown, goal_m=0.3).status is Status.PASS
 
 
 def test_what_the_map_leaves_out_as_too_uncertain_is_said_beside_the_share():

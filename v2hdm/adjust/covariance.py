@@ -29,6 +29,16 @@ class Moves:
     extrinsic: FloatArray  # (C, 6, B) left tangents
     poses: FloatArray  # (J, 6, B) tangents
 
+    def beside(self, other: Moves | None) -> Moves:
+        """These errors and independent ``other`` ones."""
+        if other is None:
+            return self
+        return Moves(
+            np.concatenate([other.corners, self.corners], axis=2),
+            np.concatenate([other.extrinsic, self.extrinsic], axis=2),
+            np.concatenate([other.poses, self.poses], axis=2),
+        )
+
 
 @dataclass(frozen=True)
 class Covariance:
@@ -138,6 +148,18 @@ class Covariance:
         return np.asarray((of_factor + spread @ (by_near @ by_near.mT) @ spread.mT).cpu().numpy())
 
 
+class Dropped(Covariance):
+    """The covariances of a solution whose factors were dropped: nobody may ask for them."""
+
+    def __init__(self) -> None:
+        """Without a descent, there are no factors."""
+
+    @property
+    def whitening(self) -> Whitening:
+        """Raise AssertionError: a solution without factors was asked for its covariances."""
+        raise AssertionError("the factors of this solution were dropped; solve again for its covariances")
+
+
 def corner_gain(whitening: Whitening) -> FloatArray:
     """Regression (N, 2, C (6 + Q)) of corners on cameras: a change e of the cameras moves them by -gain e.
 
@@ -185,13 +207,18 @@ def _columns(corners: Tensor, chosen: Tensor) -> Tensor:
 
 def reduced_root(whitening: Whitening, corners: Tensor) -> Tensor:
     """L_S^-1 W (D, 2 n) for n corners, ascending; -L_S^-1 E, with the selection E, for kept ones."""
+    return whitening.reduced_factor.solve(coupled_to(whitening, corners))
+
+
+def coupled_to(whitening: Whitening, corners: Tensor) -> Tensor:
+    """W (D, 2 n) for n corners, ascending; -E, with the selection E, for kept ones."""
     plan = whitening.plan
     estimate = whitening.estimate
     arrays = whitening.engine.arrays
     run = arrays.whole() if len(corners) == arrays.corner_count else arrays.gather(corners)
     coupling = whitening.linearised.coupling(run, estimate.corners_map[corners])
     if not len(plan.kept_corners):
-        return whitening.reduced_factor.solve(reduced_coupling(plan, whitening.spread, run, coupling))
+        return reduced_coupling(plan, whitening.spread, run, coupling)
     is_kept = torch.isin(corners, plan.kept_corners)
     coupling[is_kept[run.corner]] = 0.0
     right = reduced_coupling(plan, whitening.spread, run, coupling)
@@ -201,4 +228,4 @@ def reduced_root(whitening: Whitening, corners: Tensor) -> Tensor:
         picked[number, axis, is_kept.nonzero()[:, 0], axis] = -1.0
     frames = right.new_zeros(0, len(arrays.states), right.shape[1])
     right[: len(right) - len(whitening.reduced_factor.tip)] += to_tiles(plan, frames, picked.flatten(2))
-    return whitening.reduced_factor.solve(right)
+    return right

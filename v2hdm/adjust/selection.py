@@ -224,6 +224,11 @@ def _stretch(problem: Problem) -> BoolArray:
     return keep if everywhere else np.ones(len(observations.frame), dtype=bool)
 
 
+def busiest(problem: Problem) -> int:
+    """Number of observations of the part of the drive that models are compared on."""
+    return int(np.count_nonzero(_stretch(problem)))
+
+
 def _held_out(observations: Observations) -> BoolArray:
     """Held-out observations (K,); two of each corner stay, and the first and last frames."""
     rng = np.random.default_rng(0)

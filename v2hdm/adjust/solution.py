@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum, IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from v2hdm.adjust.covariance import Covariance
+from v2hdm.adjust.covariance import Covariance, Dropped
 from v2hdm.adjust.model import state_residual
 from v2hdm.adjust.problem import Observations, Problem
 from v2hdm.records import BoolArray, FloatArray, IntArray
@@ -148,6 +148,10 @@ class Solution:
     chi2_per_dof: float  # about 1 if the noise model is right; without outliers
     observation_factor: float  # variance factor of the observations if priors are right; without outliers
     covariance: Covariance = field(repr=False)  # of everything estimated, on demand
+
+    def without_factors(self) -> Solution:
+        """The solution without its covariances, whose factors are large and bound to this process."""
+        return replace(self, covariance=Dropped())
 
     @property
     def cost(self) -> float:

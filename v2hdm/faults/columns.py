@@ -260,6 +260,12 @@ def _moving(motion: Callable[[Arrays, Tensor], Tensor]) -> Column:
     return column
 
 
+def lateness(problem: Problem, share: FloatArray, *, is_drift: bool = False) -> Hypothesis:
+    """The clock of all images late by a ``share`` (J,) of the value, which may drift."""
+    fault = table.CLOCK_DRIFT if is_drift else table.CLOCK
+    return Hypothesis(fault, _moving(partial(_late, problem, -1, share)))
+
+
 def _late(problem: Problem, camera: int, share: FloatArray, _: Arrays, out: Tensor) -> Tensor:
     """Images late by a ``share`` (J,) of the value."""
     twist = torch.as_tensor(np.asarray(problem.twist_vehicle) * share[:, None])

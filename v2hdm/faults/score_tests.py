@@ -169,6 +169,13 @@ def score_faults(problem: Problem, solution: Solution) -> tuple[ScoreTest, ...]:
     return tuple(sorted(tests, key=lambda test: -test.gain))
 
 
+def noise_multiples(hypotheses: Sequence[Hypothesis], solved: Sensitivity) -> FloatArray:
+    """Variance (n,) of the noise in each fault's score over the stated one, at least 1."""
+    tests = [answer.test(np.ones(NOISES)) for answer in _Answer.to(hypotheses, solved)]
+    ratios = [test.sigma / test.model_sigma if np.isfinite(test.sigma) else 1.0 for test in tests]
+    return np.square(np.maximum(ratios, 1.0))
+
+
 def _noise_variances(answers: list[_Answer], solved: Sensitivity) -> FloatArray:
     """Variance (N,) of each kind of noise over the stated one, likeliest under the faults' disagreements.
 

@@ -229,12 +229,20 @@ class Sensitivity:
         of_priors = [name for name in column if name != "observations"]
         if not of_priors:
             return None
-        ends = [priors[name] for name in of_priors]
-        along = [column[name] for name in of_priors]
-        slopes = torch.autograd.grad(
-            ends, list(leaves.values()), along, retain_graph=True, materialize_grads=True
-        )
+        # Of a sum: gradients handed to autograd would load sympy, for two seconds, to compare their shapes.
+        along = torch.stack([(priors[name] * column[name]).sum() for name in of_priors]).sum()
+        slopes = torch.autograd.grad(along, list(leaves.values()), retain_graph=True, materialize_grads=True)
         return Gradient(**dict(zip(leaves, slopes, strict=True)))
+
+    def moves(self, columns: FloatArray) -> Moves:
+        """Motion of the solution under unit errors with columns (2 K, B) of the observations' residuals."""
+        arrays = self.arrays
+        steps = self.jacobians.steps(self.jacobians.whiten(columns, [None] * columns.shape[1]))
+        of_corners = np.empty(tuple(steps.corners_map.shape))
+        of_corners[arrays.corner_order.cpu().numpy()] = -steps.corners_map.cpu().numpy()
+        of_poses = np.zeros((arrays.frame_count, 6, columns.shape[1]))
+        of_poses[:, list(arrays.states)] = -steps.frame_state.cpu().numpy()
+        return Moves(of_corners, -steps.extrinsic.cpu().numpy(), of_poses)
 
     def flat(self, rows: Rows) -> FloatArray:
         """All residuals, or derivatives, concatenated, (R,)."""
@@ -336,12 +344,6 @@ def height_information(solution: Solution, heights: Any) -> tuple[FloatArray, Fl
 def moves_with_heights(solution: Solution, heights: FloatArray) -> Moves:
     """Motion of a solution under B errors of the observed ground's heights (K, B), m."""
     solved = Sensitivity.at(solution.covariance.whitening)
-    arrays = solved.arrays
     unit = raised(solved, torch.ones_like(solved.root))["observations"].cpu().numpy()
-    by_height = (unit[:, :, None] * heights[arrays.order.cpu().numpy()]).reshape(-1, heights.shape[1])
-    steps = solved.jacobians.steps(solved.jacobians.whiten(by_height, [None] * heights.shape[1]))
-    of_corners = np.empty(tuple(steps.corners_map.shape))
-    of_corners[arrays.corner_order.cpu().numpy()] = -steps.corners_map.cpu().numpy()
-    of_poses = np.zeros((arrays.frame_count, 6, heights.shape[1]))
-    of_poses[:, list(arrays.states)] = -steps.frame_state.cpu().numpy()
-    return Moves(of_corners, -steps.extrinsic.cpu().numpy(), of_poses)
+    by_height = unit[:, :, None] * heights[solved.arrays.order.cpu().numpy()]
+    return solved.moves(by_height.reshape(-1, heights.shape[1]))

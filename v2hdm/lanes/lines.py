@@ -7,7 +7,7 @@ several images, one whole line pass both ends of the gap; those lines give its c
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from v2hdm.geometry.planar import angle_between, length_along, points_along
 from v2hdm.lanes.points import NODE_SPACING_M, Guides, LaneCloud, Nodes, find_nodes
-from v2hdm.records import LANE_DASH, LANE_LINE, FloatArray, IntArray, Lane
+from v2hdm.records import LANE_DASH, LANE_LINE, BoolArray, FloatArray, IntArray, Lane
 from v2hdm.site.options import LaneOptions
 
 _MAX_DASH_GAP_M = 9.0  # longest gap between dashes, m, that is bridged
@@ -293,16 +293,30 @@ _LEAST_LENGTH_M = 6.0
 
 def map_lanes(cloud: LaneCloud, options: LaneOptions) -> tuple[Lane, ...]:
     """Polylines of the lane paint, with vertices half a metre apart; a line of dashes is one lane."""
+    return lanes_along(paths_of(cloud, options), options)
+
+
+def paths_of(
+    cloud: LaneCloud, options: LaneOptions, is_inside: Callable[[FloatArray], BoolArray] | None = None
+) -> list[Path]:
+    """Paths along the lane paint, of any length; only where points (N, 2) are ``is_inside`` (N,)."""
     if len(cloud.points_map) < 2:
-        return ()
-    paths = join_paths(string_nodes(find_nodes(cloud, options.min_images)))
+        return []
+    nodes = find_nodes(cloud, options.min_images)
+    if is_inside is not None:
+        nodes = nodes.subset(is_inside(nodes.points_map))
+    return bridge_paths(join_paths(string_nodes(nodes)), cloud.guides, options.min_images)
+
+
+def lanes_along(paths: Sequence[Path], options: LaneOptions) -> tuple[Lane, ...]:
+    """The paths that are long enough to be lanes, smoothed, with vertices half a metre apart."""
     return tuple(
         Lane(
             LANE_DASH if path.dash > 0.5 else LANE_LINE,
             _resample(path.points_map, NODE_SPACING_M),
             round(path.images),
         )
-        for path in bridge_paths(paths, cloud.guides, options.min_images)
+        for path in paths
         if path.length_m >= _LEAST_PIECE_M
         and path.length_m * path.images >= _LEAST_LENGTH_M * options.min_images
     )

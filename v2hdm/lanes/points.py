@@ -289,6 +289,10 @@ class Nodes:
     images: IntArray  # (N,) number of supporting images
     dash: FloatArray  # (N,) fraction of its points from dashes
 
+    def subset(self, rows: BoolArray) -> Nodes:
+        """The nodes at ``rows`` (N,)."""
+        return Nodes(**{name: values[rows] for name, values in vars(self).items()})
+
 
 def find_nodes(cloud: LaneCloud, least_images: int) -> Nodes:
     """Nodes on the ridges of ``cloud`` in at least ``least_images``, about :data:`NODE_SPACING_M` apart."""

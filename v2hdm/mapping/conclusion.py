@@ -4,20 +4,33 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
+from v2hdm.adjust.covariance import Moves
 from v2hdm.association.ground import Located, Views, easy_views, images_with_line, images_with_symbol, locate
 from v2hdm.association.groups import fuse_groups, group_kinds
 from v2hdm.association.sightings import Rig, Sightings
+from v2hdm.faults.clock_errors import moves_with_clocks
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.io.maps.corrections import Heard
 from v2hdm.mapping.bundle import Bundle
-from v2hdm.records import BoolArray, Calibration, Camera, Exclusion, FloatArray, IntArray, Marking
+from v2hdm.records import (
+    BoolArray,
+    Calibration,
+    Camera,
+    Exclusion,
+    FloatArray,
+    IntArray,
+    Marking,
+    PoseNoise,
+)
+from v2hdm.site.accuracy import corner_radii_m, radius_of_all_m
 from v2hdm.site.candidates import Candidates, Counts, scatter_of, with_dissent, with_shared_errors
-from v2hdm.site.markings import Suspicion, classify, most_suspicious
+from v2hdm.site.markings import Classified, Suspicion, classify, most_suspicious
 from v2hdm.site.options import AcceptanceOptions
-from v2hdm.site.parallax import PointViews, measure_parallax
+from v2hdm.site.parallax import Parallax, PointViews, measure_parallax
 from v2hdm.site.relative import with_relative_sigma
 from v2hdm.site.standing import Grey, Watch
 from v2hdm.surface.surface import Surface
@@ -36,6 +49,7 @@ class Optimised:
     initial_reprojection_rmse_px: float  # under the initial ones
     suspicions: Sequence[Suspicion] = ()  # the worst first
     heard: tuple[Heard, ...] = ()  # of a person's corrections
+    clock_m: float | None = None  # 95 % radius of the corners by what clocks may err alone; None: they do not
 
 
 @dataclass(frozen=True)
@@ -53,13 +67,15 @@ class FinalSolve:
     jitter_rad: float  # of roll and pitch
     grey: Grey | None = None  # reads the images; None for none
     surface: Surface | None = None  # of the ground; None for the plane
+    scatter: FloatArray | None = None  # (G, 4) as of :func:`scatter_of`, where others know more of it
 
     def candidates(self, located: Located) -> Candidates:
         """Solved candidates with the errors that their images share, and the dissent of outliers."""
         fused = fuse_groups(self.bundle.association, located, jitter_rad=0.0)
         ungated = self.ungated
         solved = _solved_candidates(self.bundle, ungated)
-        solved = with_shared_errors(solved, fused, _scatter(self.bundle))
+        scatter = scatter_of(*spread_of(self.bundle)) if self.scatter is None else self.scatter
+        solved = with_shared_errors(solved, fused, scatter)
         row = ungated.row
         corner = ungated.own_corner
         rejected = np.flatnonzero(~self.inlier & self.sightings.valid[row, corner])
@@ -131,27 +147,71 @@ def _pairs(views: IntArray) -> IntArray:
     return np.asarray(group * (1 << 32) + image)
 
 
-def conclude(solve: FinalSolve, acceptance: AcceptanceOptions) -> Optimised:
-    """Classify the candidates of the final solve; raises MappingError if none is accepted."""
+class Proposed(NamedTuple):
+    """G candidates of a final solve, before they are classified."""
+
+    solved: Candidates
+    kind: IntArray  # (G,) classes, into the sightings' kinds
+    parallax: Parallax
+
+
+def conclude(solve: FinalSolve, acceptance: AcceptanceOptions, noises: Sequence[PoseNoise] = ()) -> Optimised:
+    """Classify the candidates of the final solve; raises MappingError if none is accepted.
+
+    What the clocks may err by under the ``noises`` of the sessions moves all markings, and is a reason
+    against none of them: it is stated of those that are accepted.
+    """
+    candidates = proposed(solve)
+    classified = classify(
+        candidates.solved,
+        candidates.kind,
+        solve.sightings.kinds,
+        solve.counts,
+        candidates.parallax,
+        acceptance,
+        solve.standing_odds,
+    )
+    classified.check()
+    return concluded(solve, classified, noises)
+
+
+def proposed(solve: FinalSolve) -> Proposed:
+    """The candidates of the final solve."""
     bundle = solve.bundle
     sightings = solve.sightings
     located = locate(sightings, bundle.rig)
     located.informs[:] &= solve.usable
-    solved = solve.candidates(located)
     model = bundle.model
     # Of all observations, from the poses as recorded: something that moves moves the adjusted ones.
     recorded = locate(sightings, replace(bundle.rig, map_from_vehicle=sightings.map_from_vehicle))
     corners = PointViews.of_corners(
         bundle.association, sightings, recorded, model.variance_factor, model.pose_sigma
     )
-    parallax = measure_parallax(corners, bundle.association.count)
-    kind = group_kinds(bundle.association, sightings)
-    classified = classify(
-        solved, kind, sightings.kinds, solve.counts, parallax, acceptance, solve.standing_odds
+    return Proposed(
+        solved=solve.candidates(located),
+        kind=group_kinds(bundle.association, sightings),
+        parallax=measure_parallax(corners, bundle.association.count),
     )
+
+
+def concluded(solve: FinalSolve, classified: Classified, noises: Sequence[PoseNoise] = ()) -> Optimised:
+    """The result of the final solve, whose candidates are ``classified``; see :func:`conclude`."""
+    bundle = solve.bundle
+    sightings = solve.sightings
     scale = bundle.solution.variance_scale
+    by_clock = _by_clock(bundle, noises)
+    markings = classified.markings()
+    clock_m = None
+    if by_clock is not None:
+        bundle = _with_errors(bundle, by_clock)
+        shared_m2 = scale * _shared_by(by_clock, bundle.corner_index[classified.accepted])
+        clock_m = radius_of_all_m(np.concatenate([corner_radii_m(block) for block in shared_m2]))
+        markings = tuple(
+            replace(marking, covariance_m2=marking.covariance_m2 + block)
+            for marking, block in zip(markings, shared_m2, strict=True)
+        )
     markings = with_relative_sigma(
-        classified.markings(),
+        markings,
         bundle.corner_index[classified.accepted],
         lambda pairs: scale * bundle.solution.corner_covariance(pairs),
     )
@@ -167,7 +227,31 @@ def conclude(solve: FinalSolve, acceptance: AcceptanceOptions) -> Optimised:
         initial_reprojection_rmse_px=_root_mean_square(solve.residual_px(solve.initial_rig)[used]),
         suspicions=most_suspicious(classified.accepted, classified.misfit, squared, classified.counts),
         heard=classified.heard,
+        clock_m=clock_m,
     )
+
+
+def _by_clock(bundle: Bundle, noises: Sequence[PoseNoise]) -> Moves | None:
+    """What the clocks may move a solution by; its scale is of residuals, and none of the clocks."""
+    if not noises:
+        return None
+    moves = moves_with_clocks(bundle.problem, bundle.solution, noises)
+    root = bundle.solution.variance_scale**-0.5
+    return None if moves is None else Moves(*(root * part for part in vars(moves).values()))
+
+
+def _with_errors(bundle: Bundle, moves: Moves) -> Bundle:
+    """``bundle`` with covariances that hold further errors."""
+    covariance = bundle.solution.covariance
+    covariance = replace(covariance, held=moves.beside(covariance.held))
+    return replace(bundle, solution=replace(bundle.solution, covariance=covariance))
+
+
+def _shared_by(moves: Moves, corner_index: IntArray) -> FloatArray:
+    """Covariances (M, 8, 8) of markings with corners (M, 4), of which unseen ones (-1) move as a seen one."""
+    index = np.where(corner_index >= 0, corner_index, corner_index.max(axis=1, keepdims=True))
+    moved = moves.corners[index].reshape(len(index), 8, -1)
+    return np.asarray(moved @ moved.swapaxes(1, 2))
 
 
 def calibrations_of(bundle: Bundle, cameras: Mapping[str, Camera]) -> dict[str, Calibration]:
@@ -183,8 +267,15 @@ def calibrations_of(bundle: Bundle, cameras: Mapping[str, Camera]) -> dict[str, 
     }
 
 
-def _scatter(bundle: Bundle) -> FloatArray:
-    """Variance inflation of each corner's (G, 4) images relative to the usual."""
+class Spread(NamedTuple):
+    """How far the images of each corner (G, 4) differ: ``squared`` residuals, of so much ``freedom``."""
+
+    squared: FloatArray
+    freedom: FloatArray
+
+
+def spread_of(bundle: Bundle) -> Spread:
+    """The spread of each corner's images."""
     corner = 4 * bundle.group + bundle.corner
     size = 4 * bundle.association.count
     freedom = 2.0 - bundle.problem.observations.on_line[: len(corner)]
@@ -192,7 +283,7 @@ def _scatter(bundle: Bundle) -> FloatArray:
     degrees = np.full(size, -2.0)
     np.add.at(squared, corner, bundle.solution.mahalanobis2)
     np.add.at(degrees, corner, freedom)
-    return scatter_of(squared.reshape(-1, 4), degrees.reshape(-1, 4))
+    return Spread(squared.reshape(-1, 4), degrees.reshape(-1, 4))
 
 
 def _solved_candidates(bundle: Bundle, ungated: Bundle) -> Candidates:

@@ -15,7 +15,7 @@ from v2hdm.association.sightings import Rig, Sightings, collect_sightings
 from v2hdm.geometry.rigid import with_clock_offsets
 from v2hdm.lanes.knots import Knots, find_knots
 from v2hdm.lanes.lines import map_lanes
-from v2hdm.lanes.points import ImageGround, collect_lane_points
+from v2hdm.lanes.points import ImageGround, LaneCloud, collect_lane_points
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.records import Drive, Image, ImageDetections, Lane
@@ -64,10 +64,13 @@ class Inputs:
 
     def find_lanes(self, ground: ImageGround) -> tuple[Lane, ...]:
         """Lane lines of what these cameras detected, on a given ground."""
-        options = self.options.lanes
+        return map_lanes(self.lane_cloud(ground), self.options.lanes)
+
+    def lane_cloud(self, ground: ImageGround) -> LaneCloud:
+        """Points on the lane paint that these cameras detected, on a given ground."""
         jitter_rad = self.drive.pose_noise.roll_pitch_rad
-        cloud = collect_lane_points(self.drive, self.detections, ground, options.max_range_m, jitter_rad)
-        return map_lanes(cloud, options)
+        max_range_m = self.options.lanes.max_range_m
+        return collect_lane_points(self.drive, self.detections, ground, max_range_m, jitter_rad)
 
     @cached_property
     def tracks(self) -> Association:

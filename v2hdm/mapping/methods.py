@@ -225,8 +225,13 @@ def _symbols(inputs: Inputs, optimised: Optimised) -> tuple[tuple[Symbol, ...], 
     return mapped, excluded
 
 
-def optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
-    """The result ``Opt`` of an optimised set of cameras, with lanes, symbols and evidence."""
+def optimised_result(
+    outcome: Outcome, optimised: Optimised, *, with_lanes: bool = True, with_alone: bool = True
+) -> MethodResult:
+    """The result ``Opt`` of an optimised set of cameras, with lanes, symbols and evidence.
+
+    Without ``with_lanes`` it has no lanes, without ``with_alone`` no cameras alone.
+    """
     inputs = outcome.inputs
     options = inputs.options
     drive = inputs.drive
@@ -242,8 +247,10 @@ def optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
     surface = inputs.optimiser.surface
     if bundle.knots is not None:
         lanes = draw_lanes(bundle.knots, solution)
-    else:
+    elif with_lanes:
         lanes = inputs.find_lanes(ground_by_rig(drive, cameras, bundle.rig, surface))
+    else:
+        lanes = ()
     symbols, no_symbols = _symbols(inputs, optimised)
     added, heard = added_markings(options.acceptance.corrections, optimised.markings)
     markings = (*optimised.markings, *added)
@@ -282,7 +289,7 @@ def optimised_result(outcome: Outcome, optimised: Optimised) -> MethodResult:
         suspicions=optimised.suspicions,
         heard=(*optimised.heard, *heard, *heard_of_lines),
         surface=surface,
-        alone=map_alone(outcome, optimised),
+        alone=map_alone(outcome, optimised) if with_alone else {},
     )
 
 

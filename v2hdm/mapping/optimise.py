@@ -51,7 +51,7 @@ from v2hdm.surface.surface import Recorded, Surface
 
 _log = logging.getLogger(__name__)
 
-_SETTLED_MODEL = "heave"  # pose model of the solves between associations: it omits no error of a pose
+SETTLED_MODEL = "heave"  # pose model of the solves between associations: it omits no error of a pose
 _STEEP_SINE = 0.15  # least sine of a ray's depression in the coarse stage, unless most rays are flatter
 
 _LOOSE_CLOCK_SIGMA_S = 0.3
@@ -87,7 +87,7 @@ class Optimiser:
     ) -> None:
         """``pose_noise`` is by session; gates use the largest of each kind."""
         self._seen = sightings
-        self._views = views
+        self.views = views
         self.sightings = sightings
         """The sightings, reduced to the plane."""
         self.surface: Surface | None = None
@@ -95,11 +95,11 @@ class Optimiser:
         self._cameras = {name: cameras[name] for name in sightings.cameras}
         self._noises = pose_noise
         self._pose_noise = largest_noise(pose_noise)
-        self._stated_sigma = tuple(pose_sigma_of(noise) for noise in pose_noise)
-        self._pose_sigma = self._estimated_sigma = self._stated_sigma
+        self.stated_sigma = tuple(pose_sigma_of(noise) for noise in pose_noise)
+        self._pose_sigma = self.estimated_sigma = self.stated_sigma
         self._options = options
         self._recorded = Recorded.of(road, self._pose_noise)
-        self.pose_model = _SETTLED_MODEL if options.pose_model == AUTO else options.pose_model
+        self.pose_model = SETTLED_MODEL if options.pose_model == AUTO else options.pose_model
         """The pose model, one of :data:`v2hdm.adjust.MODELS`."""
         self._variance_factor = 1.0
         self.held_out: Mapping[str, float] = {}
@@ -161,7 +161,7 @@ class Optimiser:
         """Choose the pose model, and solve without the outliers of ``bundle`` from :meth:`settle`."""
         if self._options.pose_model == AUTO:
             progress("choice of the pose model")
-            self.pose_model = self._choose_pose_model(bundle)
+            self.pose_model = self.choose_pose_model(bundle)
         progress("final solve")
         inlier = bundle.inliers
         usable = np.zeros_like(self.sightings.valid)
@@ -181,7 +181,7 @@ class Optimiser:
             inlier=inlier,
             usable=usable,
             sightings=self.sightings,
-            views=self._views,
+            views=self.views,
             cameras=self._cameras,
             initial_rig=self.initial_rig,
             jitter_rad=self._pose_noise.roll_pitch_rad,
@@ -367,9 +367,9 @@ class Optimiser:
 
     def _weigh_poses(self, bundle: Bundle) -> Bundle:
         """The solve under the larger of stated and estimated noise; positions', unobservable, as stated."""
-        stated = self._stated_sigma
+        stated = self.stated_sigma
         estimated = estimate_noise(replace(bundle.problem, pose_sigma=stated), bundle.solution)
-        self._estimated_sigma = estimated
+        self.estimated_sigma = estimated
         self._pose_sigma = tuple(map(larger_noise, stated, estimated))
         return self._solve_all(bundle.association, bundle.rig)
 
@@ -381,8 +381,8 @@ class Optimiser:
             return max(float(getattr(sigma, kind)) for sigma in sigmas)
 
         kinds = ("position_m", "heading_rad", "roll_pitch_rad")
-        estimated = {kind: largest(self._estimated_sigma, kind) for kind in kinds}
-        stated = {kind: largest(self._stated_sigma, kind) for kind in kinds}
+        estimated = {kind: largest(self.estimated_sigma, kind) for kind in kinds}
+        stated = {kind: largest(self.stated_sigma, kind) for kind in kinds}
         return {kind: estimated[kind] / stated[kind] for kind in kinds if stated[kind] > 0}
 
     def _as_stated(self, bundle: Bundle) -> Problem:
@@ -395,13 +395,13 @@ class Optimiser:
             observations=replace(observations, covariance_px=covariance_px),
         )
 
-    def _choose_pose_model(self, bundle: Bundle) -> str:
+    def choose_pose_model(self, bundle: Bundle) -> str:
         """Name of the model that best predicts held-out observations, from the end of ``bundle``."""
         try:
             selection = select_model(self._as_stated(bundle), bundle.model.solver)
         except AdjustError as failure:
-            _log.warning("the pose model stays %r, since none could be selected: %s", _SETTLED_MODEL, failure)
-            return _SETTLED_MODEL
+            _log.warning("the pose model stays %r, since none could be selected: %s", SETTLED_MODEL, failure)
+            return SETTLED_MODEL
         _log.info("%s: %s", ", ".join(self.camera_names), selection.sentence)
         self.held_out = selection.scores
         return selection.name

@@ -81,8 +81,8 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
         foreign = _foreign(inputs, settled, tested.tests, progress)
         remaining = None
         if worst is not None and log_odds(worst) > foreign.gain and len(corrected) < _MOST_CORRECTIONS:
-            is_ambiguous = _is_ambiguous(worst, tested.tests)
-            remaining = None if is_ambiguous else _recovered(inputs, worst, settled)
+            has_rival = is_ambiguous(worst, tested.tests)
+            remaining = None if has_rival else _recovered(inputs, worst, settled)
         if worst is None or remaining is None:
             break
         corrected += _contradictions(settled, (worst,), inputs.sightings, sessions)
@@ -90,13 +90,33 @@ def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, 
         inputs = remaining
     # 4. Choose the pose model, solve without outliers and classify the candidates.
     final = optimiser.final_solve(settled, progress, inputs.find_knots, inputs.grey_of_image)
-    optimised = conclude(final, inputs.options.acceptance)
+    optimised = conclude(final, inputs.options.acceptance, inputs.drive.noises)
     corrected = [
         _as_solved(error, settled) for error in corrected if _is_of_the_map(error, survey, optimised)
     ]
     suspected = _contradictions(settled, tested.tests, inputs.sightings, sessions)
     evidence = _evidence(settled, suspected, corrected, optimiser, optimised.bundle, inputs.sightings)
-    return Outcome(inputs, settled, optimised.bundle, replace(evidence, foreign=foreign), final), optimised
+    evidence = replace(evidence, foreign=foreign, clock_m=optimised.clock_m)
+    return Outcome(inputs, settled, optimised.bundle, evidence, final), optimised
+
+
+class Examined(NamedTuple):
+    """A solve of all observations with every input as stated, and what it says of these."""
+
+    inputs: Inputs
+    settled: Bundle
+    evidence: SolveEvidence
+
+
+def examine(inputs: Inputs, progress: Callable[[str], None]) -> Examined:
+    """Solve with all observations and test the inputs, but correct none; MappingError for nothing to map."""
+    tested = _over_ground(inputs, _settled(inputs, progress), progress)
+    inputs = tested.inputs
+    settled = tested.settled
+    foreign = _foreign(inputs, settled, tested.tests, progress)
+    suspected = _contradictions(settled, tested.tests, inputs.sightings, _session_names(inputs.drive))
+    evidence = _evidence(settled, suspected, (), inputs.optimiser, settled, inputs.sightings)
+    return Examined(inputs, settled, replace(evidence, foreign=foreign))
 
 
 def _log_correction(inputs: Inputs, error: Contradiction) -> None:
@@ -257,7 +277,7 @@ def _evidence(
     )
 
 
-def _is_ambiguous(worst: ScoreTest, tests: Sequence[ScoreTest]) -> bool:
+def is_ambiguous(worst: ScoreTest, tests: Sequence[ScoreTest]) -> bool:
     """Whether another camera's fault, or for centres the poses' scale, would explain nearly as much."""
     if worst.fault.recovery is Recovery.DROP_CENTRES:
         least = doubt(worst) - RIVAL_LOG_ODDS

@@ -67,6 +67,7 @@ class SolveEvidence:
     jitter_s: float = 0.0  # scatter of stamps, s, that would explain all noise of the positions
     along_over_across: float = 1.0  # ratio of white position errors along and across the path
     foreign: ForeignSegment = NO_SEGMENT
+    clock_m: float | None = None  # 95 % radius of the corners by what clocks may err alone; None: they do not
 
     @property
     def held_out_loss(self) -> float | None:

@@ -27,7 +27,7 @@ from v2hdm.pipeline.base import grey_reader
 from v2hdm.pipeline.config import Contents, model_key
 from v2hdm.pipeline.context import Context
 from v2hdm.progress import Progress, silent
-from v2hdm.records import BEST, Drive, ImageDetections
+from v2hdm.records import BEST, Drive, Image, ImageDetections, IntArray
 from v2hdm.site.living.changes import Base
 from v2hdm.store.cache import Line, key_of, log_again, recorded
 from v2hdm.survey.check_points import CheckTable
@@ -205,7 +205,7 @@ def _in_sections(
     context: Context,
 ) -> _Outcome:
     """Map a set of cameras in sections, which lie in the cache, where all workers see them, for so long."""
-    from v2hdm.mapping.sections import map_in_sections  # only long drives need it
+    from v2hdm.mapping.sections.run import map_in_sections  # only long drives need it
 
     begin_s = time.perf_counter()
     where = context.cache.folder
@@ -237,11 +237,11 @@ class _Detections:
 
     listed: tuple[ImageDetections, ...] | None = None
 
-    def __call__(self, drive: Drive, images: Sequence[int]) -> list[ImageDetections]:
-        """The detections in these images, numbered in their order."""
+    def __call__(self, images: Sequence[Image], numbers: IntArray) -> list[ImageDetections]:
+        """The detections in images of such numbers in the drive, numbered in their order."""
         if self.listed is None:
-            return [read_detections(drive.images[image].path, at) for at, image in enumerate(images)]
-        place = {image: at for at, image in enumerate(images)}
+            return [read_detections(image.path, at) for at, image in enumerate(images)]
+        place = {number: at for at, number in enumerate(numbers.tolist())}
         return [
             replace(detections, image=place[detections.image])
             for detections in self.listed

@@ -25,7 +25,9 @@ class PoseNoise:
     """Standard deviations of the recorded poses, as in the receiver's data sheet.
 
     ``..._drift_...`` is the slow part of each, as in RTK: a first-order Gauss-Markov process with the
-    correlation length ``..._drift_over_m``. The rest, in quadrature, is white noise.
+    correlation length ``..._drift_over_m``. The rest, in quadrature, is white noise. ``clock_s`` is of the
+    time by which the images of all cameras are late on the poses' clock, ``clock_drift_s`` of the change of
+    that time from the first image of a drive to its last.
     """
 
     position_m: float = 0.02
@@ -37,13 +39,16 @@ class PoseNoise:
     heading_drift_over_m: float = 5.0
     roll_pitch_drift_rad: float = 0.0
     roll_pitch_drift_over_m: float = 5.0
+    clock_s: float = 0.0
+    clock_drift_s: float = 0.0
 
     @classmethod
     def from_stated(cls, **stated: float) -> PoseNoise:
         """The noise of a drive that states only some of it; the rest takes the mean square over drives.
 
         An unstated drift takes half the variance: without one, errors that repeat from image to image would
-        be averaged out, and the map state too small an uncertainty.
+        be averaged out, and the map state too small an uncertainty. Unstated clocks are those that nothing
+        synchronises; a clock that is stated drifts by no more than it is off.
         """
         noise = cls(**stated)
         unstated = {total: _UNSTATED * getattr(noise, total) for total in DRIFTS if total not in stated}
@@ -53,7 +58,11 @@ class PoseNoise:
             for total, drift in DRIFTS.items()
             if drift not in stated
         }
-        return replace(noise, **drifts)
+        clocks = {
+            "clock_s": _UNSTATED_CLOCK_S,
+            "clock_drift_s": stated.get("clock_s", _UNSTATED_CLOCK_DRIFT_S),
+        }
+        return replace(noise, **drifts, **{key: clocks[key] for key in clocks if key not in stated})
 
 
 def largest_noise(noises: Sequence[PoseNoise]) -> PoseNoise:
@@ -76,6 +85,14 @@ three times: the range of receivers and vehicles."""
 _USUAL_DRIFT_SHARE = 0.5
 """Fraction of an unstated variance that drifts: half of RTK's errors are multipath and atmosphere, which last
 for tens of metres."""
+
+_UNSTATED_CLOCK_S = 0.03
+"""Standard deviation, s, of the time by which images are late where nothing synchronises cameras with the
+receiver: exposure, read-out and transfer take 20 to 60 ms, and computers stamp images when these arrive."""
+
+_UNSTATED_CLOCK_DRIFT_S = 0.05
+"""Standard deviation, s, of its change over a drive where nothing synchronises them: that of stamps counted
+at the nominal rate of a camera, which is off by a few thousandths, over ten to twenty seconds."""
 
 
 @dataclass(frozen=True)

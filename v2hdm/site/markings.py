@@ -65,8 +65,8 @@ class Classified:
         """Candidates accepted as markings."""
         return np.flatnonzero([reason is None for reason in self.verdict])
 
-    def markings(self) -> tuple[Marking, ...]:
-        """Markings of the map, one per accepted candidate; MappingError if there is none."""
+    def check(self) -> None:
+        """Raise MappingError if no candidate is accepted."""
         if not len(self.accepted):
             reasons = [exclusion.reason for exclusion in self.exclusions()]
             commonest = max(set(reasons), key=reasons.count) if reasons else "nothing was seen twice"
@@ -74,6 +74,9 @@ class Classified:
                 f"none of {len(reasons)} candidate markings could be accepted (most often: {commonest}); "
                 "check the camera's IPM and the detector, and that the drive passes close to its markings."
             )
+
+    def markings(self) -> tuple[Marking, ...]:
+        """Markings of the map, one per accepted candidate."""
         return tuple(
             Marking(
                 kind=self.kind[group],

@@ -115,6 +115,10 @@ class Parallax:
     covariance: FloatArray  # (G, P, P)
     log_odds: FloatArray  # (G,) of lying on the ground, from even prior odds
 
+    def subset(self, rows: BoolArray) -> Parallax:
+        """That of the candidates at ``rows`` (G,)."""
+        return Parallax(**{name: values[rows] for name, values in vars(self).items()})
+
     def objections(self, min_probability: float) -> list[str | None]:
         """Objection to each candidate; None if it lies on the ground with this probability."""
         least = np.log(min_probability / (1 - min_probability))

@@ -43,9 +43,10 @@ class PoseErrors:
     heave_over_m: float
     smooth: bool = True
 
-    def as_stated(self) -> PoseNoise:
-        """A data sheet that states them as they are."""
-        return PoseNoise(
+    def as_stated(self, clock_s: float | None = None) -> PoseNoise:
+        """A data sheet that states them as they are, and the clocks if it says anything of these."""
+        clock = {} if clock_s is None else {"clock_s": clock_s}
+        return PoseNoise.from_stated(
             position_m=float(np.hypot(self.position_white_m, self.position_drift_m)),
             heading_rad=float(np.hypot(self.heading_white_rad, self.heading_drift_rad)),
             roll_pitch_rad=self.roll_pitch_rad,
@@ -55,6 +56,7 @@ class PoseErrors:
             heading_drift_over_m=self.heading_over_m,
             roll_pitch_drift_rad=self.roll_pitch_rad,
             roll_pitch_drift_over_m=self.roll_pitch_over_m,
+            **clock,
         )
 
 
@@ -106,7 +108,8 @@ class Recipe:
     receiver that records neither height nor roll and pitch; else it records these, with the errors of roll
     and pitch that ``poses`` has, beside the vehicle's sway. ``relief`` is what the ground does beside:
     ``grade``, ``ramp`` or ``crest``. Cameras fire ``apart_s`` after each other: between poses of a stream, so
-    that neighbouring images share the noise of these.
+    that neighbouring images share the noise of these. ``clock_s`` is stated of the clocks, which are right;
+    None where the user does not know how right they are.
     """
 
     seed: int
@@ -118,12 +121,23 @@ class Recipe:
     road: RoadShape | None
     relief: str = ""
     apart_s: float = 0.0
+    clock_s: float | None = None
+
+    @property
+    def pose_noise(self) -> PoseNoise:
+        """As the drive states it."""
+        return PoseNoise.from_stated() if self.default_noise else self.poses.as_stated(self.clock_s)
+
+    def with_noise_stated(self) -> Recipe:
+        """The same, whose poses and clocks are stated to be as they are."""
+        return replace(self, default_noise=False, clock_s=0.0)
 
     def as_modelled(self) -> Recipe:
         """The same with all errors stated as they are, and none that the product does not reckon with."""
         poses = replace(self.poses, smooth=False)
         detector = replace(self.detector, sigma_spread=0.0, stated_factor=1.0, missed=0.0, false=0.0, cut=0.0)
-        return replace(self, poses=poses, detector=detector, default_noise=False, road=None, apart_s=0.0)
+        modelled = replace(self, poses=poses, detector=detector, road=None, apart_s=0.0)
+        return modelled.with_noise_stated()
 
     def recorded(self, relief: str) -> Recipe:
         """The same under a receiver that records the road, which has this ``relief`` beside its own shape."""

@@ -127,7 +127,7 @@ def make(recipe: Recipe) -> World:
         cameras=port.cameras,
         stamp_s=stamp_s,
         recorded=Trajectory(poses_s, _recorded(recipe, port, poses_s, true[len(taken_s) :])),
-        pose_noise=PoseNoise.from_stated() if recipe.default_noise else recipe.poses.as_stated(),
+        pose_noise=recipe.pose_noise,
     )
 
 

@@ -1,9 +1,10 @@
-"""``solve_parts``: a problem too large for one solve, part by part, to the same optimum and covariances.
+"""``join_parts``: a problem too large for one solve, part by part, to the same optimum and covariances.
 
 Each part is solved by itself at first. Then rounds follow: every part summarises what it says of its border
 (:mod:`v2hdm.adjust.sections.summary`), the summaries are joined (:mod:`v2hdm.adjust.sections.join`), and each
 part follows the border. This is a Gauss-Newton descent of the whole in which no process ever holds more than
-one part; parts are jobs of an executor, and their estimates lie in files between rounds.
+one part; parts are jobs of an executor, and their estimates lie in files between rounds. ``finish_parts``
+makes of each part what needs its covariances.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from v2hdm.adjust.engines import make_engine
 from v2hdm.adjust.layout import nearby_origin
 from v2hdm.adjust.model import Estimate, Loss, rigid
 from v2hdm.adjust.problem import Problem, SolveOptions
+from v2hdm.adjust.sections.blocks import BlockCholesky
 from v2hdm.adjust.sections.join import Joined, Labels, Net, Shared, labels_of
 from v2hdm.adjust.sections.parts import Link, Part
 from v2hdm.adjust.sections.summary import Border, JoinedCovariance, Summary, Values, follow, summarise
@@ -74,6 +76,20 @@ Finish = Callable[[int, Part, Solution], Any]
 """Makes the result of a part of its number, itself and its solution, in the process that solved it."""
 
 
+class Joint(NamedTuple):
+    """The end of the rounds: what was made of each part, and the covariance of its border."""
+
+    results: list[Any]
+    net: Net
+    factor: BlockCholesky
+    gap: float
+    rounds: int
+
+    def covariances(self) -> list[FloatArray]:
+        """The joint covariance (n, n) of each part's border."""
+        return self.net.covariances(self.factor)
+
+
 class _Open(NamedTuple):
     """A part laid out: ``held`` (m,), 1 / m^2, holds corners of its border at ``held_map`` (m, 2)."""
 
@@ -90,6 +106,7 @@ class _Job:
 
     number: int
     target: Values | None = None
+    is_last: bool = False
     joint: FloatArray | None = None
     gap: float = 0.0
     rounds: int = 0
@@ -109,7 +126,7 @@ class _Work:
         options = self.shape.options
         compiled = options.on_cpu and options.engine != "torch"
         with one_thread_in_torch(len(part.problem.observations.corner), compiled):
-            if job.joint is not None:
+            if job.joint is not None or job.is_last:
                 return self._finished(job, part)
             return self._round(job, part)
 
@@ -143,11 +160,8 @@ class _Work:
         if job.target is None:
             estimate = self._own_optimum(job.number, part, engine, robust)
         else:
-            before = _whitened(engine, self._estimate(job.number), robust)
-            estimate = follow(before, border, job.target)
-            del before
-        with (self.folder / f"estimate_{job.number}").open("wb") as stream:
-            pickle.dump(estimate, stream)
+            estimate = self._followed(job, opened)
+        self._keep(job.number, estimate)
         told = summarise(_whitened(engine, estimate, robust), border, opened.held, opened.held_map)
         labels = labels_of(part, engine.arrays.corner_order.cpu().numpy(), border.corners.cpu().numpy())
         return PartStates(labels, Values.of(estimate, border), told)
@@ -177,15 +191,27 @@ class _Work:
         assert isinstance(estimate, Estimate)
         return estimate
 
-    def _finished(self, job: _Job, part: Part) -> Any:
-        assert self.finish is not None
+    def _keep(self, number: int, estimate: Estimate) -> None:
+        with (self.folder / f"estimate_{number}").open("wb") as stream:
+            pickle.dump(estimate, stream)
+
+    def _followed(self, job: _Job, opened: _Open) -> Estimate:
+        """The estimate of the round before, moved with the border to its target."""
         assert job.target is not None
+        before = _whitened(opened.engine, self._estimate(job.number), self._robust)
+        return follow(before, opened.border, job.target)
+
+    def _finished(self, job: _Job, part: Part) -> Any:
+        """What is made of the solution; it moves to the target once more if the job has one."""
+        assert self.finish is not None
         opened = self._open(part)
         border = opened.border
         robust = self._robust
-        before = _whitened(opened.engine, self._estimate(job.number), robust)
-        estimate = follow(before, border, job.target)
-        del before
+        if job.target is None:
+            estimate = self._estimate(job.number)
+        else:
+            estimate = self._followed(job, opened)
+            self._keep(job.number, estimate)
         descent = Descent(
             engine=opened.plain,
             plan=opened.engine.plan(),
@@ -200,10 +226,10 @@ class _Work:
         )
         options = replace(self.shape.options, gap_tolerance=GAP)
         solution = report_of(part.problem, self.shape.origin_map, options, descent, 0)
-        held = replace(descent, engine=opened.engine)
-        return self.finish(
-            job.number, part, replace(solution, covariance=JoinedCovariance(held, None, border, job.joint))
-        )
+        if job.joint is not None:
+            held = replace(descent, engine=opened.engine)
+            solution = replace(solution, covariance=JoinedCovariance(held, None, border, job.joint))
+        return self.finish(job.number, part, solution)
 
 
 def _whitened(engine: TorchEngine, estimate: Estimate, robust: Loss) -> Whitening:
@@ -231,7 +257,7 @@ def load_part(folder: Path, number: int) -> Part:
     return part
 
 
-def solve_parts(
+def join_parts(
     folder: Path,
     count: int,
     links: Sequence[Link],
@@ -239,8 +265,9 @@ def solve_parts(
     finish: Finish,
     executor: Executor = HERE,
     progress: Callable[[int, int], None] | None = None,
-) -> list[Any]:
-    """Solve the ``count`` parts in ``folder`` together; returns what ``finish`` makes of each.
+    gap_tolerance: float = GAP,
+) -> Joint:
+    """Solve the ``count`` parts in ``folder`` together, and ``finish`` each without covariances.
 
     ``progress`` is called with the number of the round and the most that there may be. Raises AdjustError
     where parts leave a direction free or contradict each other, WorkerError where a process died.
@@ -265,15 +292,28 @@ def solve_parts(
         gap = (joined.decrease + sum(part.slack for part in told)) / max(cost, 1.0)
         moved = _moved(net, shared, joined)
         targets = [_values(net, moved, state.labels, state.values) for state in states]
-        if number > 0 and gap <= GAP:
+        if number > 0 and gap <= gap_tolerance:
             break
         jobs = [_Job(part, target) for part, target in enumerate(targets)]
-    joint = net.covariances(joined.factor)
     last = [
-        _Job(part, target, covariance, gap, number + 1)
-        for part, (target, covariance) in enumerate(zip(targets, joint, strict=True))
+        _Job(part, target, is_last=True, gap=gap, rounds=number + 1) for part, target in enumerate(targets)
     ]
-    return _side_by_side(executor, replace(work, finish=finish), last)
+    results = _side_by_side(executor, replace(work, finish=finish), last)
+    return Joint(results, net, joined.factor, gap, number + 1)
+
+
+def finish_parts(
+    folder: Path, joint: Joint, shape: Shape, finish: Finish, executor: Executor = HERE
+) -> list[Any]:
+    """What ``finish`` makes of each joined part, whose solution has its joint covariances.
+
+    Raises WorkerError where a process died.
+    """
+    jobs = [
+        _Job(part, joint=covariance, gap=joint.gap, rounds=joint.rounds)
+        for part, covariance in enumerate(joint.covariances())
+    ]
+    return _side_by_side(executor, _Work(folder, shape, finish), jobs)
 
 
 def _side_by_side(executor: Executor, work: _Work, jobs: Sequence[_Job]) -> list[Any]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,9 +18,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from v2hdm.adjust.covariance import Covariance, reduced_root
+from v2hdm.adjust.covariance import Covariance, coupled_to, reduced_root
 from v2hdm.adjust.model import Estimate, left_tangent
-from v2hdm.adjust.reduced import to_tiles
+from v2hdm.adjust.reduced import from_tiles, to_tiles
 from v2hdm.adjust.whitening import Whitening
 from v2hdm.records import FloatArray
 
@@ -115,19 +116,31 @@ def _corner_columns(whitening: Whitening, corners: Tensor) -> Columns:
     """Columns of corners (m,), ascending and closed."""
     tip = whitening.reduced_factor.tip
     reduced = [tip.new_zeros(whitening.reduced_factor.size, 0)]
-    of_corners = tip.new_zeros(2 * len(corners), 2 * len(corners))
+    own = tip.new_zeros(2 * len(corners), 2 * len(corners))
     for begin, end in _chunks(whitening, corners):
         chosen = corners[begin:end]
-        unit = torch.eye(2 * len(chosen), dtype=tip.dtype, device=tip.device).view(len(chosen), 2, -1)
-        factor = whitening.linearised.corner_factor.take(chosen)
-        lower = factor.solve(unit)
-        inverse = factor.solve_transposed(lower).flatten(0, 1)
-        is_kept = torch.isin(chosen, whitening.plan.kept_corners).repeat_interleave(2)
-        own_part = lower.flatten(0, 1)
-        own_part[is_kept] = 0.0
-        of_corners[2 * begin : 2 * end, 2 * begin : 2 * end] = own_part
-        reduced.append(-reduced_root(whitening, chosen) @ inverse)
-    return Columns(torch.cat(reduced, dim=1), of_corners)
+        factors = _factors(whitening, chosen)
+        own[2 * begin : 2 * end, 2 * begin : 2 * end] = factors.own
+        reduced.append(-reduced_root(whitening, chosen) @ factors.inverse)
+    return Columns(torch.cat(reduced, dim=1), own)
+
+
+class _Factors(NamedTuple):
+    """Of n corners: V^-1 (2 n, 2 n), and the columns (2 n, 2 n) of their own variables."""
+
+    inverse: Tensor
+    own: Tensor
+
+
+def _factors(whitening: Whitening, corners: Tensor) -> _Factors:
+    tip = whitening.reduced_factor.tip
+    unit = torch.eye(2 * len(corners), dtype=tip.dtype, device=tip.device).view(len(corners), 2, -1)
+    factor = whitening.linearised.corner_factor.take(corners)
+    lower = factor.solve(unit)
+    inverse = factor.solve_transposed(lower).flatten(0, 1)
+    own = lower.flatten(0, 1)
+    own[torch.isin(corners, whitening.plan.kept_corners).repeat_interleave(2)] = 0.0
+    return _Factors(inverse, own)
 
 
 def _chunks(whitening: Whitening, corners: Tensor) -> list[tuple[int, int]]:
@@ -226,6 +239,11 @@ class JoinedCovariance(Covariance):
         factor = torch.linalg.cholesky(alone)
         return torch.cholesky_solve(torch.cholesky_solve(difference, factor).mT, factor)
 
+    @cached_property
+    def _by_border(self) -> Tensor:
+        """Covariances (D, n) of the reduced unknowns with the border, by the part alone."""
+        return self.whitening.reduced_factor.solve_transposed(self._columns.reduced)
+
     def _cameras(self) -> list[FloatArray]:
         """Covariances (6 + Q, 6 + Q) of each camera's unknowns."""
         assert self.joint is not None
@@ -245,13 +263,16 @@ class JoinedCovariance(Covariance):
         out = super().poses()
         if not arrays.states:
             return out
-        columns = torch.tensor(arrays.states, dtype=torch.int64, device=arrays.centre.device)
+        tip = len(self.whitening.reduced_factor.tip)
+        rows = self._by_border[:-tip]
+        by_frame, _ = from_tiles(self.whitening.plan, rows, arrays.frame_count, len(arrays.states))
+        # White errors and drifts add up to an axis of the tangent.
+        columns = torch.tensor(arrays.states, dtype=torch.int64, device=by_frame.device)
         acts = one_hot(columns, 6).to(torch.float64)
         for begin in range(0, arrays.frame_count, _FRAMES_AT_ONCE):
-            frames = torch.arange(begin, min(begin + _FRAMES_AT_ONCE, arrays.frame_count), device=acts.device)
-            regression = _frame_columns(self.whitening, frames, acts).mT @ self._columns.reduced
-            gained = ((regression @ self._gained) * regression).sum(1)
-            out[frames.cpu().numpy()] += gained.view(-1, 6).cpu().numpy()
+            regression = (acts.mT @ by_frame[begin : begin + _FRAMES_AT_ONCE]).flatten(0, 1)
+            gained = ((regression @ self._gained) * regression).sum(1).view(-1, 6)
+            out[begin : begin + len(gained)] += gained.cpu().numpy()
         return out
 
     def _corners(self, groups: NDArray[np.int64]) -> FloatArray:
@@ -262,8 +283,8 @@ class JoinedCovariance(Covariance):
         chosen = rank[torch.as_tensor(groups, device=rank.device)]
         unit = (~arrays.joined).cumsum(0)
         corners = torch.isin(unit, unit[chosen.flatten()]).nonzero()[:, 0]
-        columns = _corner_columns(self.whitening, corners)
-        regression = columns.reduced.mT @ self._columns.reduced
+        factors = _factors(self.whitening, corners)
+        regression = -factors.inverse.mT @ (coupled_to(self.whitening, corners).mT @ self._by_border)
         # Corners of the border have their own variables in common with it.
         shared = torch.isin(corners, self.border.corners)
         rows = _axes(shared.nonzero()[:, 0])
@@ -271,7 +292,7 @@ class JoinedCovariance(Covariance):
             places = torch.searchsorted(self.border.corners, corners[shared])
             at = _axes(places) + regression.shape[1] - len(self._columns.own)
             block = self._columns.own[:, _axes(places)]
-            regression[rows[:, None], at] += columns.own[:, rows][rows].mT @ block[_axes(places)]
+            regression[rows[:, None], at] += factors.own[:, rows][rows].mT @ block[_axes(places)]
         place = _axes(torch.searchsorted(corners, chosen.contiguous()))
         of_group = regression[place]
         return np.asarray(of_part + (of_group @ self._gained @ of_group.mT).cpu().numpy())

@@ -136,7 +136,8 @@ def rendered_drive(config: PortConfig, cache: Path, executor: Executor, progress
     what it had rendered is kept.
     """
     folder = folder_of_port(config, cache)
-    if not (folder / DRIVE_FILE).is_file() or _drop_damaged(folder):
+    if not (folder / DRIVE_FILE).is_file() or _lacks_clocks(folder) or _drop_damaged(folder):
+        # Images that are there stay as they are.
         render_drive(config, folder, executor, progress)
     note_use(folder)
     return folder
@@ -159,6 +160,11 @@ def folder_of_port(config: PortConfig, cache: Path) -> Path:
         del content["survey"]
     text = json.dumps([RENDERER_VERSION, content], sort_keys=True)
     return cache / f"{config.name}-{hashlib.sha256(text.encode()).hexdigest()[:10]}"
+
+
+def _lacks_clocks(folder: Path) -> bool:
+    """Whether a drive was rendered by a version that did not state its clocks."""
+    return "clock_s" not in (folder / DRIVE_FILE).read_text(encoding="utf-8")
 
 
 def _drop_damaged(folder: Path) -> bool:

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
+from v2hdm.faults import table
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.io.maps.corrections import Correction
 from v2hdm.mapping.bundle import known_lengths
@@ -43,13 +44,15 @@ def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Findin
     """The map, in a ``frame`` of poses or survey, against the 95 % radius ``goal_m``, then each mounting."""
     markings = best.hd_map.markings
     goal = f"; goal {100 * goal_m:g} cm"
+    unknown_clocks = list(_unknown_clocks(best.evidence, goal_m))
+    yield from unknown_clocks
     if markings:
         judged = well_known(markings)
         radii_m = absolute_radii_m(judged)
         reached_m = radius_of_all_m(radii_m.ravel())
         corners = f"95 % of the corners of {len(judged)} markings"
         says = f"{corners} within {_cm(reached_m)} in the frame of the {frame}"
-        says += "" if best.evidence is None else _conditions(best.evidence)
+        says += "" if best.evidence is None or unknown_clocks else _conditions(best.evidence)
         relative_m = relative_radii_m(judged)
         if len(relative_m):
             says += f", {_cm(radius_of_all_m(relative_m))} from marking to marking"
@@ -62,6 +65,18 @@ def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Findin
         left_m, helps = ground_ahead(calibration)
         says = f"the ground ahead is known, given its mounting, to {_cm(left_m)} (95 %){goal}"
         yield _judged(name, left_m, goal_m, says, helps)
+
+
+def _unknown_clocks(evidence: SolveEvidence | None, goal_m: float) -> Iterator[Finding]:
+    """The clocks, where what is unknown of them alone makes a map miss the goal."""
+    clock_m = None if evidence is None else evidence.clock_m
+    if clock_m is None or clock_m <= goal_m:
+        return
+    says = (
+        f"whether all clocks are late or fast cannot be told, and leaves the corners open by {_cm(clock_m)} "
+        "(95 %), which the map states: include a turn, or state pose_noise.clock_s in drive.yaml"
+    )
+    yield Finding(table.CLOCK.check, Status.WARN, 100 * clock_m, 100 * goal_m, "cm", says, "all cameras")
 
 
 def _beside(best: MethodResult, coarse: int) -> str:
@@ -95,11 +110,16 @@ def _judged(about: str, radius_m: float, goal_m: float, says: str, helps: str) -
 
 def _largest_part(best: MethodResult, coarse: Sequence[Marking]) -> str:
     """The largest of the errors that are stated of the markings that miss the goal, and what helps."""
+    clock_m = (best.evidence.clock_m if best.evidence is not None else None) or 0.0
     pose_m = [] if best.poses is None else SIGMAS_95 * best.poses.sigma[best.poses.seen, :2].max(axis=1)
+    # Poses are stated at the stamps of the images, with what clocks leave open.
+    own_pose_m = float(np.sqrt(max(_median(pose_m) ** 2 - clock_m**2, 0.0)))
     parts = [
-        (_median(pose_m), "the poses: tie them down by mapping.survey"),
+        (own_pose_m, "the poses: tie them down by mapping.survey"),
         (_median(list(map(_own_m, coarse))), "each marking's own views: pass them closer and again"),
     ]
+    if clock_m:
+        parts.append((clock_m, "the clocks: include a turn, or state pose_noise.clock_s"))
     # What one camera leaves open, a better one settles.
     left_m, helps = min(map(ground_ahead, best.calibrations.values()), default=(np.inf, ""))
     if np.isfinite(left_m):

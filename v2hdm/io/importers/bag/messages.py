@@ -14,7 +14,7 @@ from v2hdm.errors import DriveError, need, shown
 from v2hdm.io.image_lists import has_time
 from v2hdm.io.importers.readings import SIGMA_OF_QUALITY_M, Attitudes, Readings, TurnRates
 from v2hdm.io.trajectory import checked_rotations, in_order
-from v2hdm.records import FloatArray, IntArray
+from v2hdm.records import BoolArray, FloatArray, IntArray
 from v2hdm.safe.pixels import AS_STORED, pixels_of, png
 
 _log = logging.getLogger(__name__)
@@ -196,6 +196,9 @@ HEADING_KINDS = (IMU, QUATERNION, ODOMETRY, _WITH_COVARIANCE, _POSE)
 _NO_FIX = -1  # the status of a NavSatFix without a position (sensor_msgs/NavSatStatus)
 # Quality of NMEA's GGA by the status of a NavSatFix: plain, satellite-based and ground-based augmentation.
 _QUALITY_OF_STATUS = {0: 1, 1: 2, 2: 4}
+_GROUND_BASED = 2  # the status of a NavSatFix with ground-based augmentation, as RTK is
+_FIXED_SIGMA_M = 0.1  # largest sigma of a position with fixed ambiguities, m: 0.02, and about 0.5 with float
+_ATTITUDE = slice(4, 9)  # place of quaternion and sigma in a row
 _NORM_TOLERANCE = 1e-2  # by which a recorded quaternion's norm may be off 1; chosen
 _ANY_HEADING_RAD = np.pi / np.sqrt(3)  # standard deviation of a heading of which nothing is known
 _YAW = 35  # place of the variance of yaw among the 36 numbers of a pose's covariance (REP-103)
@@ -204,7 +207,10 @@ Row = tuple[float, ...]
 
 
 def position_row(kind: str, fields: Any) -> Row:
-    """Position (3), standard deviation (1, nan if not stated), quaternion (4, nan if none), its sigma (1)."""
+    """Position (3), sigma (1, nan if not stated), quaternion (4, nan if none), its sigma (1), status (1).
+
+    The status is that of a NavSatFix, nan of other messages.
+    """
     if kind == FIX:
         status = fields.status.status
         sigma_m = np.nan
@@ -214,8 +220,9 @@ def position_row(kind: str, fields: Any) -> Row:
             sigma_m = SIGMA_OF_QUALITY_M[_QUALITY_OF_STATUS.get(status, 0)]
         if status == _NO_FIX:
             sigma_m = np.inf
-        return (fields.latitude, fields.longitude, fields.altitude, sigma_m, *([np.nan] * 5))
-    return _pose(fields.pose, None) if kind == _POSE else _pose(fields.pose.pose, fields.pose.covariance)
+        return (fields.latitude, fields.longitude, fields.altitude, sigma_m, *([np.nan] * 5), float(status))
+    row = _pose(fields.pose, None) if kind == _POSE else _pose(fields.pose.pose, fields.pose.covariance)
+    return (*row, np.nan)
 
 
 def heading_row(kind: str, fields: Any) -> Row:
@@ -226,7 +233,7 @@ def heading_row(kind: str, fields: Any) -> Row:
         return (*_quaternion(fields.orientation), _heading_sigma(fields.orientation_covariance[8]))
     if kind == QUATERNION:
         return (*_quaternion(fields.quaternion), np.nan)
-    return position_row(kind, fields)[4:]
+    return position_row(kind, fields)[_ATTITUDE]
 
 
 def rate_row(fields: Any) -> Row:
@@ -252,7 +259,7 @@ def readings_of(
     headings: tuple[FloatArray, FloatArray] | None,
     where: str,
 ) -> Readings:
-    """Readings of a topic's stamps (P,) and rows (P, 9), and of rows (A, 5) of a topic of headings."""
+    """Readings of a topic's stamps (P,) and rows (P, 10), and of rows (A, 5) of a topic of headings."""
     stamp_s, rows = positions
     order = _timed_order(stamp_s, where, "message")
     stamp_s = stamp_s[order]
@@ -262,7 +269,7 @@ def readings_of(
     if geodetic and has_fix.any() and np.isnan(rows[has_fix, 2]).all():  # sensor_msgs: nan if no altitude
         _log.warning("%s: its positions have no heights; taken as 0 m", where)
         rows[:, 2] = 0.0
-    heading_s, turned = headings or (stamp_s, rows[:, 4:])
+    heading_s, turned = headings or (stamp_s, rows[:, _ATTITUDE])
     by_time = _timed_order(heading_s, where, "message of the heading")
     heading_s = heading_s[by_time]
     turned = turned[by_time]
@@ -282,7 +289,22 @@ def readings_of(
     if is_measured.any():
         rotation = checked_rotations(turned[is_measured, :4], lambda k: where, advice, _NORM_TOLERANCE)
         attitudes = Attitudes(heading_s[is_measured], rotation, turned[is_measured, 4])
-    return Readings(stamp_s, rows[:, :3], geodetic, rows[:, 3], attitudes, "an antenna's" if geodetic else "")
+    point = "an antenna's" if geodetic else ""
+    is_fixed = _rtk_fixed(rows[:, 9], rows[:, 3]) if geodetic else None
+    return Readings(stamp_s, rows[:, :3], geodetic, rows[:, 3], attitudes, point, is_fixed)
+
+
+def _rtk_fixed(status: FloatArray, sigma_m: FloatArray) -> BoolArray | None:
+    """Which positions (P,) RTK has fixed; None where the driver of the receiver does not tell.
+
+    A NavSatFix has one status for fixed and float ambiguities, which its sigma tells apart. Some drivers
+    write the status of a plain position whatever the receiver has: sigmas of centimetres give them away.
+    """
+    is_sure = sigma_m <= _FIXED_SIGMA_M
+    is_rtk = status == _GROUND_BASED
+    if (is_sure & ~is_rtk).sum() > (is_sure & is_rtk).sum():
+        return None
+    return np.asarray(is_rtk & is_sure)
 
 
 def _timed_order(stamp_s: FloatArray, where: str, what: str) -> IntArray:

@@ -164,7 +164,7 @@ class PoseStream(Stream):
         self, topic: str, heading_topic: str | None, gyro_topic: str | None, stamps: str, where: str
     ) -> None:
         needs = [Need(topic, kinds.POSE_KINDS, where)]
-        label = ["poses", heading_topic, stamps]
+        label = ["poses with status", heading_topic, stamps]
         if gyro_topic is not None:
             needs.append(Need(gyro_topic, (kinds.IMU,), f"{where}, gyro_topic"))
             label.append(gyro_topic)
@@ -216,7 +216,7 @@ class PoseStream(Stream):
             first_day = None if first_s is None else datetime.fromtimestamp(first_s, tz=UTC).date()
             return nmea_readings([sentence for _, sentence in rows], where, first_day)
         headings = None if self._heading is None else _read_rows(folder / _HEADINGS, 6)
-        return kinds.readings_of(kind, _read_rows(folder / _POSES, 10), headings, where)
+        return kinds.readings_of(kind, _read_rows(folder / _POSES, 11), headings, where)
 
 
 class TfStream(Stream):

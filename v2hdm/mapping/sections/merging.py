@@ -140,6 +140,7 @@ def _evidence(parts: Sequence[SolveEvidence], weight: Sequence[float]) -> SolveE
         worst_innovation_s=worst.worst_innovation_s,
         jitter_s=max(part.jitter_s for part in parts),
         along_over_across=mean(lambda part: part.along_over_across),
+        clock_m=max((part.clock_m for part in parts if part.clock_m is not None), default=None),
         foreign=max((part.foreign for part in parts), key=lambda segment: segment.gain),
     )
 

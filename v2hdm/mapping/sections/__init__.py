@@ -1,0 +1,1 @@
+"""A long drive, or many of one network, mapped in sections that are adjusted together."""

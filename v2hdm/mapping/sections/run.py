@@ -1,0 +1,320 @@
+"""A long drive, or many of one network, mapped in sections that are adjusted together.
+
+1. Every section, with an overlap of images of its neighbours, is solved by itself, and tests its inputs.
+2. Groups of sightings that two sections have in common, image by image, are one marking.
+3. The solves of all sections are joined (:mod:`v2hdm.adjust.sections`), each with the images that are its
+   own: first with all observations, then with those that agree. These are the joint solves of the drive.
+4. The candidates of all sections are classified together: shapes are learnt over all. A marking belongs to
+   the section most of whose own images show it.
+5. Every section makes its map, and their lanes are joined.
+
+Sections are jobs of an executor, and lie in files between these steps: no process holds more than one.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from v2hdm.adjust import Problem
+from v2hdm.adjust.sections.parts import chains_of
+from v2hdm.adjust.sections.solve import GAP, Joint, Shape, finish_parts, join_parts
+from v2hdm.association.sightings import Sightings, frames_of
+from v2hdm.errors import WorkerError
+from v2hdm.executor import Executor
+from v2hdm.lanes.lines import join_paths, lanes_along
+from v2hdm.mapping.bundle import LEAST_OBSERVATIONS, VARIANCE_FACTORS, Model, drive_problem, full_model
+from v2hdm.mapping.optimise import SETTLED_MODEL, initial_rig
+from v2hdm.mapping.options import AUTO, MappingOptions, check_sections
+from v2hdm.mapping.results import MethodResult
+from v2hdm.mapping.sections.common import Alone, Names, named, pooled_noise
+from v2hdm.mapping.sections.faults import pooled_tests, refuse_contradicted
+from v2hdm.mapping.sections.joint import (
+    Fit,
+    gates,
+    refuse_contradicting_drives,
+    scatter_by_marking,
+    variance_of,
+)
+from v2hdm.mapping.sections.merging import merged
+from v2hdm.mapping.sections.section import part_of_frame, sections_of
+from v2hdm.mapping.sections.work import (
+    FINAL,
+    DetectionsOf,
+    Ends,
+    Finished,
+    GreyOf,
+    Places,
+    Proposal,
+    Work,
+    classified_of,
+)
+from v2hdm.records import BoolArray, Drive, FloatArray, IntArray
+from v2hdm.site.candidates import Candidates, Counts
+from v2hdm.site.corrections import Heard, added_markings, with_symbols_corrected
+from v2hdm.site.line_corrections import with_lines_corrected
+from v2hdm.site.markings import Classified, classify
+from v2hdm.site.options import AcceptanceOptions
+from v2hdm.site.parallax import Parallax
+
+_log = logging.getLogger(__name__)
+
+_CLASSIFIED_AT_ONCE = 5000
+"""Most candidates, of neighbouring sections, that are classified together: memory and time would grow with
+their square, and thousands tell all of a class's shapes."""
+
+_SETTLED_GAP = 1e-6  # gap of the joint solve that outliers are told by, a fraction of the cost
+
+
+def map_in_sections(
+    drive: Drive,
+    detections_of: DetectionsOf,
+    cameras: Sequence[str],
+    options: MappingOptions,
+    most_m: float,
+    executor: Executor,
+    folder: Path,
+    progress: Callable[[str, int, int], None] = lambda step, done, total: None,
+    grey: GreyOf | None = None,
+) -> MethodResult:
+    """Map a drive by the joint optimisation in sections of at most ``most_m`` of way, ignoring truth.
+
+    ``folder`` keeps them while this runs; all processes of the ``executor`` must see it. Raises MappingError
+    where a section cannot be mapped or an input is contradicted, AdjustError where sections contradict each
+    other, WorkerError where a process died.
+    """
+    check_sections(options)
+    sections = sections_of(drive, most_m)
+    _log.info("%d sections of at most %.0f m of way", len(sections), most_m)
+    # Corrections are followed once, when all is known.
+    acceptance = replace(options.acceptance, corrections=[])
+    work = Work(detections_of, tuple(cameras), replace(options, acceptance=acceptance), folder, grey)
+    for section in sections:
+        work.write("section", section.number, section)
+    run = _Run(work, executor, progress, len(sections))
+    own_images = [section.images[section.is_own] for section in sections]
+    part = part_of_frame(sections, frames_of(drive).frame_of_image)
+    alone: list[Alone] = run.all(work.settle, "map sections")
+    tests = pooled_tests([section.evidence.score_tests for section in alone])
+    refuse_contradicted(
+        tests, max((section.evidence.foreign for section in alone), key=lambda segment: segment.gain)
+    )
+    del sections
+    solved = _joint_solves(run, drive, part, alone)
+    heard = _classified(run, solved, options.acceptance)
+    finished: list[Finished] = run.finish(solved, solved.work.finish)
+    result = merged([section.result for section in finished], drive, own_images)
+    assert result.evidence is not None
+    lanes = lanes_along(join_paths([path for section in finished for path in section.lanes]), options.lanes)
+    result = replace(
+        result,
+        hd_map=replace(result.hd_map, lanes=lanes),
+        evidence=replace(result.evidence, score_tests=tests, held_out=solved.held_out),
+        heard=heard,
+    )
+    return _corrected(result, options.acceptance)
+
+
+@dataclass(frozen=True)
+class _Run:
+    """Runs the steps of ``count`` sections on an executor, with its progress."""
+
+    work: Work
+    executor: Executor
+    progress: Callable[[str, int, int], None]
+    count: int
+
+    def all(self, work: Callable[..., Any], step: str, jobs: Sequence[Any] | None = None) -> list[Any]:
+        """The results of all sections, or of some ``jobs``, in their order."""
+        todo = range(self.count) if jobs is None else jobs
+        results: dict[int, Any] = {}
+        self.progress(step, 0, len(todo))
+        with closing(self.executor.side_by_side(work, todo)) as outcomes:
+            for number, outcome in outcomes:
+                if isinstance(outcome, WorkerError):
+                    raise WorkerError(f"{step}, section {number + 1} of {self.count}: {outcome}")
+                results[number] = outcome
+                self.progress(step, len(results), len(todo))
+        return [results[number] for number in range(len(todo))]
+
+    def finish(self, solved: _Solved, finish: Callable[..., Any]) -> list[Any]:
+        """What ``finish`` makes of all sections under their last joint solve."""
+        return finish_parts(self.work.folder, solved.joint, solved.shape, finish, self.executor)
+
+
+class _Solved(NamedTuple):
+    """The joint solves of a drive."""
+
+    work: Work  # of its sections, with the model of the last solve
+    names: list[Names]  # by section
+    joint: Joint
+    shape: Shape
+    held_out: dict[str, float]  # losses by pose model
+
+
+def _joint_solves(run: _Run, drive: Drive, part: IntArray, alone: Sequence[Alone]) -> _Solved:
+    """Join the sections: with all observations, then with those that agree, under the drive's pose model.
+
+    ``part`` (J,) is the section of each frame.
+    """
+    names = named(alone)
+    for number, of_section in enumerate(names):
+        run.work.write("names", number, of_section)
+    noise = pooled_noise(alone)
+    options = run.work.options
+    pose_model = SETTLED_MODEL if options.pose_model == AUTO else options.pose_model
+    model = full_model(noise.pose_sigma, options, pose_model, noise.variance_factor)
+    work = replace(run.work, model=model)
+    fits, _, shape = _join(run, work, drive, part, _SETTLED_GAP)
+    refuse_contradicting_drives(fits, drive)
+    for number, gate in enumerate(gates(fits, model.solver.gate_probability)):
+        work.write("gate", number, gate)
+    observations = np.array([section.observations for section in alone])
+    held_out: dict[str, float] = {}
+    if options.pose_model == AUTO:
+        busiest = int(np.argmax([section.busiest for section in alone]))
+        ((pose_model, held_out),) = run.all(work.choose, "choose pose model", [busiest])
+    factor = noise.variance_factor
+    if sum(len(fit.corner) for fit in fits) >= LEAST_OBSERVATIONS:
+        factor = float(np.clip(factor * variance_of(fits, shape.problem).observations, *VARIANCE_FACTORS))
+    model = full_model(noise.pose_sigma, options, pose_model, factor)
+    work = replace(
+        work, model=model, stage=FINAL, pose_model=pose_model, fullest=int(np.argmax(observations))
+    )
+    fits, joint, shape = _join(run, work, drive, part, GAP)
+    scatter = scatter_by_marking(fits, 1 + max(int(of_section.marking.max()) for of_section in names))
+    for number, of_section in enumerate(names):
+        corner = (np.arange(4) + of_section.turned[:, None]) % 4
+        work.write("scatter", number, scatter[of_section.marking[:, None], corner])
+    work = replace(work, chi2_per_dof=variance_of(fits, shape.problem).all)
+    return _Solved(work, names, joint, shape, held_out)
+
+
+def _join(run: _Run, work: Work, drive: Drive, part: IntArray, gap: float) -> tuple[list[Fit], Joint, Shape]:
+    """Cut a joint problem, and solve it."""
+    assert work.model is not None
+    whole = _without_sightings(drive, work.cameras, work.model)
+    chains = chains_of(whole, part, tuple(work.model.solver.pose_states))
+    for number in range(run.count):
+        frames = np.flatnonzero(part == number)
+        work.write("ends", number, Ends(chains.is_start[frames], chains.in_border[frames]))
+    run.all(work.cut, "cut sections")
+    shape = Shape.of(whole, work.model.solver)
+    joint = join_parts(
+        work.folder, run.count, chains.links, shape, work.tell, run.executor,
+        partial(run.progress, "join sections"), gap,
+    )  # fmt: skip
+    return joint.results, joint, shape
+
+
+def _classified(run: _Run, solved: _Solved, acceptance: AcceptanceOptions) -> tuple[Heard, ...]:
+    """Classify the candidates of all sections together, and tell every section of its own."""
+    proposals: list[Proposal] = run.finish(solved, solved.work.propose)
+    count = np.array([len(proposal.kinds) for proposal in proposals])
+    batches = max(-(-int(count.sum()) // _CLASSIFIED_AT_ONCE), 1)
+    batch = (np.cumsum(count) - count) * batches // max(int(count.sum()), 1)
+    heard: list[Heard] = []
+    classes = []
+    for number in range(batches):
+        chosen = np.flatnonzero(batch == number).tolist()
+        classes.append(_classified_batch(run, solved, {k: proposals[k] for k in chosen}, acceptance))
+        heard += classes[-1].heard
+    if not any(len(classified.accepted) for classified in classes):
+        classes[0].check()
+    return tuple(heard)
+
+
+def _classified_batch(
+    run: _Run, solved: _Solved, proposals: Mapping[int, Proposal], acceptance: AcceptanceOptions
+) -> Classified:
+    """Classify the candidates of some sections together."""
+    work = solved.work
+    names = [kind for proposal in proposals.values() for kind in proposal.kinds]
+    kinds = sorted(set(names)) or [""]
+    index = {name: number for number, name in enumerate(kinds)}
+    ends = np.cumsum([len(proposal.kinds) for proposal in proposals.values()])
+    rows = dict(zip(proposals, np.split(np.arange(len(names)), ends[:-1]), strict=True))
+
+    def places(corners_map: FloatArray, is_end: BoolArray | None = None) -> list[Places]:
+        return [
+            Places(number, corners_map[at], None if is_end is None else is_end[at])
+            for number, at in rows.items()
+        ]
+
+    def counted(corners_map: FloatArray) -> Counts:
+        counts = run.all(work.count, "count sightings", places(corners_map))
+        fields = vars(counts[0])
+        return Counts(**{name: np.concatenate([vars(part)[name] for part in counts]) for name in fields})
+
+    def standing(corners_map: FloatArray, is_end: BoolArray) -> FloatArray:
+        return np.concatenate(run.all(work.look, "look at ends", places(corners_map, is_end)))
+
+    solutions = [proposal.solved for proposal in proposals.values()]
+    parallaxes = [proposal.parallax for proposal in proposals.values()]
+    classified = classify(
+        Candidates(
+            np.concatenate([candidates.corners_map for candidates in solutions]),
+            np.concatenate([candidates.covariance_m2 for candidates in solutions]),
+        ),
+        np.array([index[name] for name in names], dtype=np.int64),
+        kinds,
+        counted,
+        Parallax(
+            np.concatenate([parallax.slope for parallax in parallaxes]),
+            np.concatenate([parallax.covariance for parallax in parallaxes]),
+            np.concatenate([parallax.log_odds for parallax in parallaxes]),
+        ),
+        acceptance,
+        None if work.grey is None else standing,
+    )
+    for number, at in rows.items():
+        work.write("classified", number, classified_of(classified, at, solved.names[number], kinds))
+    return classified
+
+
+def _corrected(result: MethodResult, acceptance: AcceptanceOptions) -> MethodResult:
+    """The result with what a person added, drew and rejected."""
+    corrections = acceptance.corrections
+    hd_map = result.hd_map
+    added, heard = added_markings(corrections, hd_map.markings)
+    hd_map = replace(hd_map, markings=(*hd_map.markings, *added))
+    hd_map, rejected = with_symbols_corrected(hd_map, corrections)
+    hd_map, heard_of_lines = with_lines_corrected(hd_map, corrections)
+    return replace(
+        result,
+        hd_map=hd_map,
+        excluded=(*result.excluded, *rejected),
+        heard=(*result.heard, *heard, *heard_of_lines),
+    )
+
+
+def _without_sightings(drive: Drive, cameras: tuple[str, ...], model: Model) -> Problem:
+    """All cameras and frames of a drive with their priors."""
+    frames = frames_of(drive)
+    none = np.zeros(0, dtype=np.int64)
+    sightings = Sightings(
+        cameras=cameras,
+        stamp_s=frames.stamp_s,
+        map_from_vehicle=frames.map_from_vehicle,
+        image=none,
+        camera=none,
+        frame=none,
+        kind=none,
+        corners_pinhole_px=np.zeros((0, 4, 2)),
+        covariance_px=np.zeros((0, 4, 2, 2)),
+        valid=np.zeros((0, 4), dtype=np.bool_),
+        kinds=(),
+        session=frames.session,
+        row_share=np.zeros((0, 4)),
+        log_odds=np.zeros(0),
+    )
+    stated = {name: drive.cameras[name] for name in cameras}
+    rig = initial_rig(stated, frames.map_from_vehicle)
+    return drive_problem(sightings, rig, stated, model)
