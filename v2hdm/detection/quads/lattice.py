@@ -19,6 +19,7 @@ from v2hdm.records import BoolArray, FloatArray, IntArray
 
 KNOTS = 6  # knots of the light along a marking: its two ends are as many fifths of it apart as a shadow needs
 
+_FAR_PX = 200  # from the image, px, up to which pixels about a side are listed: none beyond shows paint
 _OUTSIDE_PX = 3.0  # distance outside a side, px, up to which pixels are looked at
 _INSIDE_PX = 4.0  # distance inside a side, px, up to which pixels are looked at
 _MEDIAN_STRIDE = 3  # a median is taken over every third value: that is as good, and faster
@@ -150,10 +151,14 @@ def lay_grid(patches: Patches, frames: LensFrames, corners_px: FloatArray) -> Gr
 
 def lay_lattice(patches: Patches, frames: LensFrames, corners_px: FloatArray) -> Lattice:
     """The pixels about the sides of quadrilaterals ``corners_px`` (M, 4, 2), recorded px."""
-    bow_px = frames.bow_px(corners_px)
+    # A corner may lie anywhere, where the lens is nothing like its polynomial.
+    image_px = np.array(patches.source.image.shape[1::-1])
+    bow_px = np.minimum(frames.bow_px(corners_px), _FAR_PX)
     spare = np.ceil(bow_px)[:, None].astype(np.intp) + int(_OUTSIDE_PX)
-    low = np.floor(corners_px.min(axis=1)).astype(np.intp) - spare
-    size = np.ceil(corners_px.max(axis=1)).astype(np.intp) + spare + 1 - low
+    high = np.minimum(np.ceil(corners_px.max(axis=1)).astype(np.intp) + spare + 1, image_px + _FAR_PX)
+    low = np.maximum(np.floor(corners_px.min(axis=1)).astype(np.intp) - spare, -_FAR_PX)
+    low = np.minimum(low, high - 1)
+    size = high - low
     in_box = Quad(corners_px - low[:, None])
     columns, rows = _columns_and_rows(in_box, size)
     compiled = kernels()
