@@ -10,7 +10,7 @@ import builtins
 import functools
 import inspect
 import types
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from numbers import Integral, Real
 from typing import Annotated, Any, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -31,12 +31,20 @@ def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """``function`` behind a check of its arguments' types; ConfigError names the one that differs."""
     signature = inspect.signature(function)
     where = function.__qualname__.removesuffix(".__init__")
+    names = tuple(signature.parameters)
+    kinds = {parameter.kind for parameter in signature.parameters.values()}
+    takes_any = bool(kinds & {inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD})
 
     @functools.wraps(function)
     def door(*args: _P.args, **kwargs: _P.kwargs) -> _R:
-        for name, value in signature.bind(*args, **kwargs).arguments.items():
-            if (hint := _hints(function).get(name)) is not None:
-                _check(value, hint, f"{where}: {name}")
+        if takes_any or len(args) > len(names):
+            arguments: Mapping[str, Any] = signature.bind(*args, **kwargs).arguments
+        else:  # what does not belong to the signature the call itself refuses
+            arguments = dict(zip(names, args, strict=False)) | kwargs
+        tests = _tests(function)
+        for name, value in arguments.items():
+            if name in tests and not tests[name](value):
+                _check(value, _hints(function)[name], f"{where}: {name}")
         return function(*args, **kwargs)
 
     return door
@@ -67,20 +75,35 @@ def _check(value: object, hint: Any, where: str) -> None:
 
 def _fits(value: Any, hint: Any) -> bool:
     """Whether ``value`` is of the type ``hint``; what can be looked at only once is not looked into."""
+    return _test_of(hint)(value)
+
+
+@functools.cache
+def _test_of(hint: Any) -> Callable[[Any], bool]:
+    """The test of a type: a problem of the adjustment, made for each marking, has twenty fields to test."""
     origin = get_origin(hint)
     parts = get_args(hint)
     if hint is Any or isinstance(hint, TypeVar):
-        return True
+        return lambda value: True
     if origin is Annotated:
+        kind = _test_of(parts[0])
         allowed = [note for note in parts[1:] if isinstance(note, Within)]
-        numbers = allowed if isinstance(value, Real) else []
-        return _fits(value, parts[0]) and all(within.holds(float(value)) for within in numbers)
+        return lambda value: (
+            kind(value)
+            and (not isinstance(value, Real) or all(within.holds(float(value)) for within in allowed))
+        )
     if origin in (Union, types.UnionType):
-        return any(_fits(value, part) for part in parts)
+        tests = [_test_of(part) for part in parts]
+        return lambda value: any(test(value) for test in tests)
     if origin is None:
-        return _is_one(value, hint)
+        return lambda value: _is_one(value, hint)
     if origin is np.ndarray:
-        return isinstance(value, np.ndarray) and value.dtype.kind in "biuf"
+        return lambda value: isinstance(value, np.ndarray) and value.dtype.kind in "biuf"
+    return lambda value: _holds(value, origin, parts)
+
+
+def _holds(value: Any, origin: Any, parts: Sequence[Any]) -> bool:
+    """Whether ``value`` is a container of the type ``origin`` with entries of the types ``parts``."""
     if not isinstance(value, origin) or isinstance(value, str | bytes):
         return False
     if origin is Iterable and isinstance(value, Mapping | np.ndarray):
@@ -158,6 +181,12 @@ class _Names(dict[str, Any]):
         if name in self._module:
             return self._module[name]
         return vars(builtins)[name] if hasattr(builtins, name) else _ByName(name, (), {})
+
+
+@functools.cache
+def _tests(function: Callable[..., Any]) -> Mapping[str, Callable[[Any], bool]]:
+    """The tests of a function's arguments, by their names."""
+    return {name: _test_of(hint) for name, hint in _hints(function).items()}
 
 
 @functools.cache

@@ -22,6 +22,7 @@ from v2hdm.adjust import (
     reduced,
     solve,
 )
+from v2hdm.adjust.checks import check_options
 from v2hdm.adjust.descent import Objective
 from v2hdm.adjust.engine import WEIGHT_FLOOR, Pairs, TorchEngine, View
 from v2hdm.adjust.engines import make_engine
@@ -76,7 +77,7 @@ def example(*, lengths=True, rolling=False, frames=40, seed=3):
 def engines(problem, pose_states, clock=False, read_out=False):
     """Kernels and autograd over a problem."""
     arrays = make_arrays(problem, pose_states, "cpu", clock, read_out)
-    return make_engine("numba", arrays), make_engine("torch", arrays)
+    return make_engine("native", arrays), make_engine("torch", arrays)
 
 
 def estimate_of(engine, problem, generator, size=0.01, behind=True):
@@ -335,6 +336,12 @@ def test_kernels_in_cpp_refuse_arrays_of_another_shape_or_type():
         gather(np.zeros(2, np.int32), np.zeros((2, 6)), np.zeros((4, 6), np.float32))
 
 
+def test_the_earlier_name_of_the_compiled_engine_still_chooses_it():
+    arrays = make_arrays(make_scene().problem, (), "cpu")
+    assert type(make_engine("numba", arrays)) is type(make_engine("native", arrays))
+    check_options(SolveOptions(engine="numba"))
+
+
 def test_score_tests_are_the_same_by_either_engine():
     problem = make_scene().problem
     numba, by_torch = (
@@ -342,7 +349,7 @@ def test_score_tests_are_the_same_by_either_engine():
             (one.fault, one.camera, one.axis, one.item): one
             for one in score_faults(problem, solve(problem, each))
         }
-        for each in (SolveOptions(engine="numba"), SolveOptions(engine="torch"))
+        for each in (SolveOptions(engine="native"), SolveOptions(engine="torch"))
     )
     assert numba.keys() == by_torch.keys()
     for key, one in numba.items():

@@ -54,7 +54,7 @@ def residuals(arrays, estimate):
     return model.corner_residual(points, arrays.measured, arrays.root_information).T
 
 
-@pytest.mark.parametrize("engine", ["numba", "torch"])
+@pytest.mark.parametrize("engine", ["native", "torch"])
 @pytest.mark.parametrize("name", LOSSES)
 @pytest.mark.parametrize("size", [0.0, 1e-8, 0.05])
 @pytest.mark.parametrize(

@@ -164,12 +164,12 @@ def test_drives_whose_shared_corners_are_kept_are_adjusted_as_with_all_corners_e
 
 
 def test_many_drives_of_one_way_take_less_with_their_corners_kept():
-    crowd = make_engine("numba", make_arrays(site(6, 100, 100), POSE_STATES, "cpu"))
+    crowd = make_engine("native", make_arrays(site(6, 100, 100), POSE_STATES, "cpu"))
     plan = crowd.plan()
     eliminated = make_engine("torch", crowd.arrays).plan()
     assert len(plan.kept_corners) == crowd.arrays.corner_count
     tip = crowd.arrays.camera_count * crowd.arrays.camera_unknowns
     spent = [one.pattern.multiplications(one.size, tip) for one in (plan, eliminated)]
     assert spent[0] < 0.15 * spent[1]
-    chain = make_engine("numba", make_arrays(site(2, 60, 10), POSE_STATES, "cpu"))
+    chain = make_engine("native", make_arrays(site(2, 60, 10), POSE_STATES, "cpu"))
     assert not len(chain.plan().kept_corners)

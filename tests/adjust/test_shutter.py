@@ -55,7 +55,7 @@ READ_OUT_S = np.array([0.03, 0.02])
 STREET = {"seed": 14, "frames": 80, "turn_deg_per_m": 8.0, "prior_sigma_m": 0.01}
 
 
-@pytest.mark.parametrize("name", ["numba", "torch"])
+@pytest.mark.parametrize("name", ["native", "torch"])
 def test_the_residual_is_that_of_each_row_s_own_pose(name):
     """Of poses that err, a clock that is off and a read-out time that is not the stated one."""
     scene = rolling(READ_OUT_S, **STREET)
@@ -93,7 +93,7 @@ def test_a_known_read_out_time_costs_no_accuracy():
 
 
 @pytest.mark.parametrize("true_s", [READ_OUT_S, np.zeros(2)], ids=["rolling", "global"])
-@pytest.mark.parametrize("engine", ["numba", "torch"])
+@pytest.mark.parametrize("engine", ["native", "torch"])
 def test_an_estimated_read_out_time_is_the_true_one(engine, true_s):
     scene = rolling(true_s, **STREET)
     unknown = replace(scene.problem, read_out_s=None)
@@ -121,7 +121,7 @@ def test_a_coarse_start_knows_the_read_out_time():
     scene = rolling(READ_OUT_S, **STREET, start_error_deg=8.0)
     arrays = make_arrays(scene.problem, POSE_STATES, "cpu", True, True)
     start = torch.as_tensor(scene.problem.cam_from_vehicle)
-    improved, _ = coarse_extrinsics(make_engine("numba", arrays), start)
+    improved, _ = coarse_extrinsics(make_engine("native", arrays), start)
     assert scene.rotation_error_deg(improved.numpy()).max() < 0.2
 
 

@@ -87,8 +87,9 @@ def dense(tiles, pattern, size, tip):
     ],
 )
 @pytest.mark.parametrize("least_degree", [False, True])
-def test_the_tiled_factor_is_that_of_the_dense_matrix(cliques, least_degree):
-    size, tip, count = 5, 4, 6
+@pytest.mark.parametrize("tip", [4, 12])  # a few cameras, and more than fit a tile
+def test_the_tiled_factor_is_that_of_the_dense_matrix(cliques, least_degree, tip):
+    size, count = 5, 6
     generator = torch.Generator().manual_seed(1)
     pattern = find_pattern(count, cliques, least_degree)
     arrow = TiledMatrix.zeros(pattern, size, tip, torch.zeros((), dtype=torch.float64))

@@ -11,7 +11,7 @@ from v2hdm.cli.main import run
 from v2hdm.geometry.ipm import mounting_angles
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.ground import estimate
-from v2hdm.ground.adjust import _by_stretch
+from v2hdm.ground.adjust import _beside_m, _by_stretch
 from v2hdm.ground.estimate import estimate_ground
 from v2hdm.ground.model import guessed_mount
 from v2hdm.ground.motion import motion_of
@@ -126,6 +126,14 @@ def test_errors_that_go_together_along_the_route_widen_a_variance():
     together = np.repeat(together[:12], 40, axis=0)
     assert _by_stretch(alone, image)[0] == pytest.approx(480, rel=0.6)
     assert _by_stretch(together, image)[0] > 20 * _by_stretch(alone, image)[0]
+
+
+def test_how_far_beside_the_path_a_point_lies_does_not_depend_on_where_the_map_begins():
+    course_map = np.column_stack([np.arange(0.0, 50.0), np.zeros(50)])
+    points_map = np.array([[10.0, 2.5], [20.3, -1.25], [44.0, 0.0]])
+    for origin in (np.zeros(2), np.array([4.5e5, 5.4e6])):
+        beside_m = _beside_m(course_map + origin, points_map + origin)
+        np.testing.assert_allclose(beside_m, [2.5, 1.25, 0.0], atol=1e-8)
 
 
 def test_a_lens_without_its_distortion_leaves_larger_residuals(turning):

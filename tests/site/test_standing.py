@@ -1,5 +1,6 @@
 """Whether images tell what stands at an end of a dash from ground that goes on."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -8,7 +9,7 @@ from v2hdm.association.ground import Views
 from v2hdm.association.sightings import Rig
 from v2hdm.simulate.render.renderer import Renderer
 from v2hdm.simulate.render.scene import Box, Paint, Scene
-from v2hdm.site.standing import Watch
+from v2hdm.site.standing import Watch, _log_grey
 
 DASH = np.array([[12.0, -0.075], [15.0, -0.075], [15.0, 0.075], [12.0, 0.075]])
 FAR_END = 1  # the side of DASH at x = 15 m
@@ -66,3 +67,13 @@ def test_ends_that_no_camera_sees_over_their_paint_stay_unknown(side):
     is_end[0, side] = True
     backwards = DASH - np.array([40.0, 0.0])
     np.testing.assert_array_equal(looked.standing_odds(backwards[None], is_end), 0.0)
+
+
+def test_the_part_of_an_image_around_some_points_says_what_the_whole_image_does():
+    rng = np.random.default_rng(0)
+    grey = rng.uniform(0, 255, (120, 200)).astype(np.float32)
+    points_px = np.column_stack([rng.uniform(2, 60, 50), rng.uniform(70, 117, 50)])
+    blurred = cv2.GaussianBlur(np.log(grey + np.float32(3)), (0, 0), 1.7)
+    u, v = points_px.astype(np.float32).T
+    expected = cv2.remap(blurred, u[None], v[None], cv2.INTER_LINEAR)[0]
+    np.testing.assert_allclose(_log_grey(grey, [points_px], 1.7)[0], expected, atol=1e-5)

@@ -282,7 +282,7 @@ def test_a_map_over_a_plane_gets_no_file_of_its_ground_and_is_told_so(tmp_path, 
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("engine", ["numba", "torch"])
+@pytest.mark.parametrize("engine", ["native", "torch"])
 def test_a_step_of_heights_is_that_to_the_least_cost_of_everything_anew(engine):
     scene = make_scene(3, frames=40, start_error_deg=0.1, start_error_m=0.01)
     options, seen = SolveOptions(loss="none", engine=engine, coarse=False), scene.problem.observations

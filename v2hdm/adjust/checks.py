@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import torch
 
+from v2hdm.adjust.kernels import NAMES
 from v2hdm.adjust.problem import ENGINES, LOSSES, POSE_STATES, Problem, SolveOptions
 from v2hdm.doors import check_types
 from v2hdm.errors import AdjustError, shown
@@ -93,15 +94,15 @@ def check_options(options: SolveOptions) -> None:
         raise AdjustError(f"unknown pose state {shown(unknown[0])}: choose from {', '.join(POSE_STATES)}")
     for name, choices in (("loss", LOSSES), ("engine", ENGINES)):
         chosen = getattr(options, name)
-        if chosen not in choices:
+        if chosen not in choices and not (name == "engine" and chosen in NAMES):
             raise AdjustError(f"unknown {name} {shown(chosen)}: choose from {', '.join(choices)}")
     try:
         torch.empty(0, device=options.device)
     except (RuntimeError, AssertionError) as failure:
         reason = str(failure).splitlines()[0]
         raise AdjustError(f"device is {shown(options.device)}, which torch cannot use: {reason}") from None
-    if options.engine == "numba" and not options.on_cpu:
-        raise AdjustError("engine=numba computes on the CPU: choose engine=torch, or device=cpu")
+    if options.engine in NAMES and not options.on_cpu:
+        raise AdjustError(f"engine={options.engine} computes on the CPU: choose engine=torch, or device=cpu")
     if not 0 < options.gate_probability < 1:
         raise AdjustError(f"gate_probability is {options.gate_probability}: give a fraction between 0 and 1")
     for name in ("gap_tolerance", "max_refreshes", "max_evaluations"):

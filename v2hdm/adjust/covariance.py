@@ -134,7 +134,9 @@ class Covariance:
         # Known lengths couple V^-1 of corners to others outside their group.
         joined = _with_joined(arrays, chosen)
         corners = torch.unique(joined)
-        by_near = reduced_root(self.whitening, corners).T[_columns(corners, joined)]
+        root = reduced_root(self.whitening, corners)
+        # Of what is eliminated before the corners' frames the rows are zero: often half of them.
+        by_near = root[root.any(dim=1)].T[_columns(corners, joined)]
         # V^-1 of the corners and all joined ones; 1 for kept corners.
         unit = torch.eye(2 * len(corners), dtype=torch.float64, device=corners.device)
         factor = self.whitening.linearised.corner_factor.take(corners)

@@ -8,7 +8,7 @@ few, to cameras, frames and clocks.
 
 Numbers of observations are columns, (..., k): torch is several times faster along them than across.
 
-:class:`v2hdm.adjust.kernels.engine.NumbaEngine` inherits all of this and replaces the passes over the
+:class:`v2hdm.adjust.kernels.engine.KernelEngine` inherits all of this and replaces the passes over the
 observations by compiled ones.
 """
 
@@ -214,13 +214,12 @@ class TorchEngine:
             by_corner[run.corners] = _sums_by_corner(run, (view.axes * force).sum(1)).T
         by_pose = torch.zeros_like(pairs.poses)
         by_pose[:, :3, [0, 1, 3]] = by_column.T.view(-1, 3, 3).mT
-        # Then carried back to the unknowns once.
-        ends = [unknowns.poses, unknowns.estimate.corners_map]
-        by_end: list[Tensor | None] = [by_pose, by_corner]
+        # Then carried back to the unknowns once, by a product: given gradients of its own, autograd first
+        # loads torch's symbolic shapes, for two seconds.
+        product = (unknowns.poses * by_pose).sum() + (unknowns.estimate.corners_map * by_corner).sum()
         if priors is not None:
-            ends.append(priors)
-            by_end.append(None)
-        return Gradient(*torch.autograd.grad(ends, unknowns.leaves, by_end, materialize_grads=True))
+            product = product + priors
+        return Gradient(*torch.autograd.grad(product, unknowns.leaves, materialize_grads=True))
 
     def spread(self, estimate: Estimate) -> Spread:
         """Jacobians of the pairs by frame states and clock offsets."""

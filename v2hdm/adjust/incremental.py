@@ -27,6 +27,7 @@ from v2hdm.adjust.checks import check_observations
 from v2hdm.adjust.covariance import corner_gain
 from v2hdm.adjust.descent import narrowed
 from v2hdm.adjust.engines import make_engine
+from v2hdm.adjust.kernels.tables import move
 from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.model import Estimate, Loss
 from v2hdm.adjust.problem import ControlPoints, KnownLengths, Observations, Problem, SolveOptions
@@ -35,7 +36,6 @@ from v2hdm.adjust.solve import solve
 from v2hdm.adjust.tiles import TiledCholesky
 from v2hdm.adjust.whitening import factorise, whitened_gradient
 from v2hdm.errors import AdjustError
-from v2hdm.geometry.rigid import exp, left_jacobian
 from v2hdm.records import FloatArray, IntArray
 
 _GAP_TOLERANCE = 1e-9  # gap of a marking's solve: at a cost of a few hundred, within a thousandth of a sigma
@@ -324,11 +324,11 @@ class IncrementalMap:
         observations = _stacked([marking.observations for marking in sighted])
         counts = [len(marking.observations.corner) for marking in sighted]
         corner = observations.corner + np.repeat(starts[:-1], counts)
-        part = self._drive.seen_by(replace(observations, corner=corner))
         changes["control"] = _known([marking.control for marking in sighted], starts)
         changes["lengths"] = _known([marking.lengths for marking in sighted], starts)
-        extrinsics = self.cam_from_vehicle[part.cameras]
-        return replace(part.problem, cam_from_vehicle=extrinsics, **changes), part.cameras
+        changes["cam_from_vehicle"] = self.cam_from_vehicle
+        part = self._drive.seen_by(replace(observations, corner=corner), **changes)
+        return part.problem, part.cameras
 
 
 def _joined(
@@ -354,8 +354,7 @@ def _joined(
 def _moved(base: FloatArray, unknowns: FloatArray, device: str) -> _Moved:
     """The cameras at the unknowns (C (6 + Q),) around ``base`` (C, 4, 4)."""
     by_camera = unknowns.reshape(len(base), -1)
-    moved = exp(by_camera[:, :6]) @ base
-    turns = left_jacobian(by_camera[:, :6])
+    moved, turns = move(np.ascontiguousarray(by_camera[:, :6]), np.ascontiguousarray(base))
     chart = np.eye(len(unknowns))
     unknown_count = by_camera.shape[1]
     for begin, turn in zip(range(0, len(unknowns), unknown_count), turns, strict=True):

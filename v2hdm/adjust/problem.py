@@ -56,7 +56,7 @@ READ_OUT_SIGMA_S = 0.03
 (Ringaby and Forssen, International Journal of Computer Vision 96, 2012)."""
 
 LOSSES: tuple[str, ...] = ("none", "huber", "cauchy", "geman_mcclure")
-ENGINES: tuple[str, ...] = ("auto", "numba", "torch")
+ENGINES: tuple[str, ...] = ("auto", "native", "torch")
 
 
 @dataclass(frozen=True)
@@ -220,23 +220,23 @@ class Problem:
     lengths: KnownLengths | None = None
     session: IntArray | None = None
 
-    def seen_by(self, observations: Observations) -> ProblemPart:
-        """The problem of the cameras and frames of ``observations``.
+    def seen_by(self, observations: Observations, **changes: Any) -> ProblemPart:
+        """The problem of the cameras and frames of ``observations``, after ``changes`` of other fields.
 
         Corners are those of the observations, without this problem's knowledge of its own.
         """
+        stated = vars(self) | changes
         cameras, camera = np.unique(observations.camera, return_inverse=True)
         frames, frame = np.unique(observations.frame, return_inverse=True)
         of_cameras = "intrinsic", "cam_from_vehicle", "centre_vehicle", "centre_sigma_m", "read_out_s"
         of_frames = "map_from_vehicle", "twist_vehicle", "session"
         rows = dict.fromkeys(of_cameras, cameras) | dict.fromkeys(of_frames, frames)
-        changes = {
-            name: getattr(self, name)[at] for name, at in rows.items() if getattr(self, name) is not None
-        }
+        parts = {name: stated[name][at] for name, at in rows.items() if stated[name] is not None}
+        unknown = {"corners_start": None, "control": None, "lengths": None}
         renumbered = replace(observations, camera=camera, frame=frame)
-        changes |= {"corners_start": None, "control": None, "lengths": None}
         count = int(observations.corner.max(initial=-1)) + 1
-        problem = replace(self, observations=renumbered, corner_count=count, **changes)
+        fields = unknown | changes | parts
+        problem = replace(self, observations=renumbered, corner_count=count, **fields)
         return ProblemPart(problem, cameras, frames)
 
     @property
@@ -282,9 +282,9 @@ class SolveOptions:
         gap_tolerance: predicted remaining decrease, as a fraction of the cost, at which to stop.
         max_refreshes: largest number of whitenings.
         max_evaluations: largest number of evaluations of cost and gradient, in total.
-        engine: of :data:`ENGINES`: ``numba`` by kernels on the CPU, compiled by numba unless the install
-            has compiled them from C++; ``torch`` by autograd anywhere; ``auto`` is kernels on the CPU, torch
-            elsewhere.
+        engine: of :data:`ENGINES`: ``native`` by kernels on the CPU, compiled by numba unless the install
+            has compiled them from C++ (``numba``, its earlier name, still chooses it); ``torch`` by autograd
+            anywhere; ``auto`` is kernels on the CPU, torch elsewhere.
         device: torch device.
     """
 

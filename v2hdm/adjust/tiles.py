@@ -8,12 +8,12 @@ Large Sparse Positive Definite Systems, 1981): time and memory grow linearly wit
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from heapq import heapify, heappop, heappush
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -30,12 +30,41 @@ if TYPE_CHECKING:
 TIP = -1  # the row of the tiles that border the others, and row and column of the last one
 
 
+class Product(NamedTuple):
+    """A product of tiles below a column's diagonal, numbered from 0, that is subtracted from a later column.
+
+    Tiles that lie one below the other in both columns are one product: one tile is too small for a fast one.
+    """
+
+    right: int  # the right factor, and among the column's rows the later column
+    left: int  # the first tile of the left factor
+    tiles: int | None  # of the left factor; None for all from there on, with the tip
+    at: int  # the tile of the later column, its diagonal counted, from which it is subtracted
+
+
 @dataclass(frozen=True)
 class Pattern:
     """The nonzero tiles."""
 
     position: tuple[int, ...]  # elimination order of each tile along the route
     below: tuple[tuple[int, ...], ...]  # rows below each column's diagonal, fill included, ascending
+
+    @cached_property
+    def products(self) -> tuple[tuple[Product, ...], ...]:
+        """By column, what its elimination changes in other columns."""
+        return tuple(tuple(self._products(column)) for column in range(len(self.below)))
+
+    def _products(self, column: int) -> Iterator[Product]:
+        below = self.below[column]
+        for right, first in enumerate(below):
+            place = {row: number for number, row in enumerate((first, *self.below[first]))}
+            places = [*(place[row] for row in below[right:]), len(place)]  # the tip comes last in both
+            begin = 0
+            for end in range(1, len(places)):
+                if places[end] != places[end - 1] + 1:
+                    yield Product(right, right + begin, end - begin, places[begin])
+                    begin = end
+            yield Product(right, right + begin, None, places[begin])
 
     def multiplications(self, size: int, tip: int) -> float:
         """Multiplications of a factorisation, in tiles of ``size`` rows and a tip of ``tip``."""
@@ -214,12 +243,8 @@ def factorise_tiles(matrix: TiledMatrix, hold_tip: bool = False) -> TiledCholesk
         if not _factorise_tile(diagonal_tile):
             return None
         panel.copy_(torch.linalg.solve_triangular(diagonal_tile, panel.mT, upper=False).mT)
-        keys = (*below, TIP)
-        for n, first in enumerate(keys):
-            for second in keys[n:]:
-                left = matrix.tiles[second, column]
-                right = matrix.tiles[first, column]
-                matrix.tiles[second, first].addmm_(left, right.mT, alpha=-1)
+        for target, left, right in _updates(matrix, column):
+            target.addmm_(left, right.mT, alpha=-1)
         diagonal.append(diagonal_tile)
         panels.append(panel)
         tiles = [index[tile * size : (tile + 1) * size] for tile in below]
@@ -230,6 +255,22 @@ def factorise_tiles(matrix: TiledMatrix, hold_tip: bool = False) -> TiledCholesk
     elif not _factorise_tile(tip):
         return None
     return TiledCholesky(tuple(diagonal), tuple(panels), tuple(rows), tip, matrix.values, held)
+
+
+def _updates(matrix: TiledMatrix, column: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """What a column changes in later ones: views of the target, and of the left and right factors."""
+    size = matrix.columns[column].shape[1]
+    panel = matrix.columns[column][size:]
+    below = matrix.pattern.below[column]
+    for product in matrix.pattern.products[column]:
+        left = panel[product.left * size :]
+        if product.tiles is not None:
+            left = left[: product.tiles * size]
+        at = product.at * size
+        target = matrix.columns[below[product.right]][at : at + len(left)]
+        yield target, left, panel[product.right * size : (product.right + 1) * size]
+    bottom = panel[len(below) * size :]
+    yield matrix.tip, bottom, bottom
 
 
 def _factorise_tile(tile: Tensor) -> bool:

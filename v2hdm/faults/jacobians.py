@@ -72,18 +72,18 @@ class Jacobians:
             _coupling_matrix(arrays, coupled),
         )
 
-    def whiten(self, columns: FloatArray, of_priors: Sequence[Gradient | None]) -> Whitened:
+    def whiten(self, columns: FloatArray | csr_array, of_priors: Sequence[Gradient | None]) -> Whitened:
         """Inner products with the whitened unknowns of columns (2 K, n) and of those of the priors."""
         whitening = self.whitening
         factor = whitening.linearised.corner_factor
         like = whitening.estimate.corners_map
-        by_corner = torch.as_tensor(self.by_corner.T @ columns).to(like).view(len(like), 2, -1)
+        by_corner = torch.as_tensor(_dense(self.by_corner.T @ columns)).to(like).view(len(like), 2, -1)
         for number, gradient in enumerate(of_priors):
             if gradient is not None:
                 by_corner[:, :, number] += gradient.corners_map
         corners = factor.solve(by_corner)
         eliminated = factor.solve_transposed(corners).flatten(0, 1)
-        by_pair = self.by_pair.T @ columns - self.coupling.T @ eliminated.cpu().numpy()
+        by_pair = _dense(self.by_pair.T @ columns) - self.coupling.T @ eliminated.cpu().numpy()
         states, cameras = self._gathered(torch.as_tensor(by_pair).to(like))
         for number, gradient in enumerate(of_priors):
             if gradient is not None:
@@ -142,6 +142,10 @@ class Jacobians:
         """Derivatives (2, K) along left tangents (C, M, 6) of the pairs."""
         out = self.by_pair @ tangents.reshape(-1).cpu().numpy()
         return torch.as_tensor(out).to(tangents).view(2, -1)
+
+
+def _dense(product: FloatArray | csr_array) -> FloatArray:
+    return product if isinstance(product, np.ndarray) else np.asarray(product.toarray())
 
 
 def _matrix_of(tangents: Tensor) -> FloatArray:

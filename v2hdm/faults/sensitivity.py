@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
+from scipy.sparse import vstack
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
@@ -284,9 +285,10 @@ class Sensitivity:
     def information_by_stretch(self, columns: FloatArray) -> FloatArray:
         """Squared lengths (n, G + 1) of columns (n, R) by segment; last, priors of none."""
         order, begin = self._stretch_of
-        squares = np.square(columns[:, order])
-        parts = [slice(first, end) for first, end in pairwise(begin.tolist())]
-        return np.stack([squares[:, part].sum(1) for part in parts], axis=1)
+        stretch = np.empty(len(order), dtype=np.int64)
+        stretch[order] = np.repeat(np.arange(len(begin) - 1), np.diff(begin))
+        sums = [np.bincount(stretch, np.square(column), len(begin) - 1) for column in columns]
+        return np.array(sums, dtype=np.float64).reshape(-1, len(begin) - 1)
 
 
 def _rows(arrays: Arrays, estimate: Estimate, observations: Tensor | None = None) -> Rows:
@@ -329,10 +331,11 @@ def height_information(solution: Solution, heights: Any) -> tuple[FloatArray, Fl
     observed = np.flatnonzero(information.diagonal() > 0)
     by_column = columns[:, observed].tocsc()
     coupled = solved.root.new_zeros(len(observed), solved.whitening.size)
-    lifted = unit.cpu().numpy()[:, :, None]
+    along_u, along_v = unit.cpu().numpy()[:, :, None]
     for begin in range(0, len(observed), _AT_ONCE):
-        heights_m = by_column[:, begin : begin + _AT_ONCE].toarray()
-        by_height = (lifted * heights_m).reshape(-1, heights_m.shape[1])
+        heights_m = by_column[:, begin : begin + _AT_ONCE]
+        # Sparse: a height is seen in a few images.
+        by_height = vstack([heights_m.multiply(along_u), heights_m.multiply(along_v)], format="csr")
         whitened = solved.jacobians.whiten(by_height, [None] * heights_m.shape[1])
         coupled[begin : begin + _AT_ONCE] = torch.cat([whitened.reduced, whitened.corners.flatten(0, 1)]).mT
     information[np.ix_(observed, observed)] -= (coupled @ coupled.mT).cpu().numpy()

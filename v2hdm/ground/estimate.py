@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from v2hdm.executor import HERE, Executor
-from v2hdm.ground.adjust import CENTRE, Adjusted, adjust
+from v2hdm.ground.adjust import CENTRE, Adjusted, Near, adjust
 from v2hdm.ground.model import Mount, guessed_mount
 from v2hdm.ground.motion import ARM_M, Motion, changing_pairs, motion_of, spread_pairs
 from v2hdm.ground.patches import STRIP_M, Matcher, Round
@@ -199,9 +199,11 @@ def _scatter(observations: Observations, stated: Stated, solved: Adjusted) -> fl
     stretches = [part for part in np.array_split(ordered, _STRETCHES) if len(part)]
     free = "clock_s" if len(solved.covariance) > 6 else None
     answers = []
+    images = np.unique(np.concatenate([observations.first, observations.second]))  # of ``solved``
     for part in stretches:
         observed = stated.prior_of(observations.only(~np.isin(observations.pair, part)))
-        mount = adjust(observed.observations, observed.prior, solved.mount, free).mount
+        near = Near.of(solved, np.searchsorted(images, observed.rows))
+        mount = adjust(observed.observations, observed.prior, solved.mount, free, near=near).mount
         turn = mount.vehicle_from_cam_rotation @ solved.mount.vehicle_from_cam_rotation.T
         small = [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
         answers.append([*(np.array(small) / 2), *(mount.centre_vehicle - solved.mount.centre_vehicle)])

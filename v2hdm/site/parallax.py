@@ -158,7 +158,7 @@ def _measure(views: PointViews, count: int) -> Parallax:
         for mean, shared, single in (_GROUND, *_ELSEWHERE)
     )
     log_odds = ground - np.logaddexp(raised, moving_along) + np.log(len(_ELSEWHERE))
-    return Parallax(free.slope, free.covariance, log_odds)
+    return Parallax(free.slope, free.covariance(), log_odds)
 
 
 class _Distances(NamedTuple):
@@ -183,8 +183,8 @@ class _Distances(NamedTuple):
 
     def at(self, unknowns: FloatArray) -> FloatArray:
         """The squared distances (N,) at ``unknowns`` (N, U)."""
-        square = np.einsum("ni,nij,nj->n", unknowns, self.information, unknowns)
-        squared = square - 2 * np.sum(self.gradient * unknowns, axis=1) + self.squared
+        slope = (self.information @ unknowns[..., None])[..., 0] - 2 * self.gradient
+        squared = np.sum(slope * unknowns, axis=1) + self.squared
         return np.asarray(np.maximum(squared, 0.0))
 
 
@@ -192,8 +192,13 @@ class _Fit(NamedTuple):
     """G candidates under one prior of s."""
 
     slope: FloatArray  # (G, P)
-    covariance: FloatArray  # (G, P, P)
+    information: FloatArray  # (G, U, U) on all unknowns
+    slopes: slice  # of s among these
     log_evidence: FloatArray  # (G,)
+
+    def covariance(self) -> FloatArray:
+        """The covariances (G, P, P) of s."""
+        return np.asarray(np.linalg.inv(self.information)[:, self.slopes, self.slopes], dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -201,6 +206,7 @@ class _Model:
     """N sightings of G candidates, linear functions of the unknowns of these: places, 1 - s, tilt."""
 
     group: IntArray  # (N,)
+    sums: _Sums  # by candidate
     effective: FloatArray  # (N,) images that each is worth
     coordinates: IntArray  # (N,) informative ones
     freedom: FloatArray  # (G,) that places and s use up
@@ -217,12 +223,13 @@ class _Model:
         total = 2 * points_each
         points, ray = (np.where(used[..., None], at, 0.0) for at in (views.points_map, views.ray_map))
         centre = (points - ray).sum(axis=1) / used.sum(axis=1)[:, None]
-        sightings = _sum(used, group, count)
-        middle = _sum(points, group, count) / np.maximum(sightings, 1)[..., None]
+        by_group = _Sums.by(group, count)
+        sightings = by_group.of(used)
+        middle = by_group.of(points) / np.maximum(sightings, 1)[..., None]
         view, images = _views(views, centre)
         # Recorded positions of a standing vehicle wander; its images are one view, from their mean.
-        centre = (_sum(centre, view, len(images)) / images[:, None])[view]
-        reference = _sum(centre, group, count) / np.maximum(np.bincount(group, minlength=count), 1)[:, None]
+        centre = (_Sums.by(view, len(images)).of(centre) / images[:, None])[view]
+        reference = by_group.of(centre) / np.maximum(np.bincount(group, minlength=count), 1)[:, None]
 
         # Evaluated at the mean: derivatives at the ray itself would correlate with its error.
         by_pose = _by_pose(middle[group] - centre[:, None], views.height_m) * used[..., None, None]
@@ -241,6 +248,7 @@ class _Model:
         tilt_rad = np.max(views.pose_sigma[:, 3:5], initial=_LEVEL_RAD)
         return cls(
             group=group,
+            sums=by_group,
             effective=1 / (1 + CORRELATION * (images[view] - 1)),
             coordinates=is_used.sum(axis=1),
             freedom=3.0 * (sightings > 0).sum(axis=1),
@@ -269,9 +277,9 @@ class _Model:
             other = self.effective * (1 - share)
             by_image = weight[:, None, None] * self.inlier.information
             by_image += other[:, None, None] * self.outlier.information
-            information = _sum(by_image, self.group, count) + prior
+            information = self.sums.of(by_image) + prior
             pull = weight[:, None] * self.inlier.gradient + other[:, None] * self.outlier.gradient
-            gradient = _sum(pull, self.group, count) + prior @ expected
+            gradient = self.sums.of(pull) + prior @ expected
             solved = np.asarray(np.linalg.solve(information, gradient[..., None])[..., 0], dtype=np.float64)
             squared = self.inlier.at(solved[self.group])
             size = self.coordinates * np.log(variance) + self.inlier.log_det
@@ -281,14 +289,13 @@ class _Model:
             share = np.exp(inlier - either)
             if factor == _WIDENED[-1]:
                 steady = self.effective * share
-                freedom = np.maximum(_sum(steady * self.coordinates, self.group, count) - self.freedom, 1.0)
-                spread = np.maximum(_sum(steady * squared, self.group, count) / freedom, 1.0)
+                freedom = np.maximum(self.sums.of(steady * self.coordinates) - self.freedom, 1.0)
+                spread = np.maximum(self.sums.of(steady * squared) / freedom, 1.0)
         away = solved - expected
-        log_evidence = _sum(self.effective * either, self.group, count)
+        log_evidence = self.sums.of(self.effective * either)
         log_evidence -= np.einsum("gi,ij,gj->g", away, prior, away) / 2
         log_evidence += (np.linalg.slogdet(prior)[1] - np.linalg.slogdet(information)[1]) / 2
-        inverse = np.asarray(np.linalg.inv(information)[:, slopes, slopes], dtype=np.float64)
-        return _Fit(1 - solved[:, slopes], inverse, log_evidence)
+        return _Fit(1 - solved[:, slopes], information, slopes, log_evidence)
 
 
 def _covariance(views: PointViews, by_pose: FloatArray) -> FloatArray:
@@ -301,14 +308,27 @@ def _covariance(views: PointViews, by_pose: FloatArray) -> FloatArray:
     return covariance
 
 
-def _sum(values: FloatArray | BoolArray, group: IntArray, count: int) -> FloatArray:
-    """Sums (G, ...) of values (N, ...) by group (N,)."""
-    totals = np.zeros((count, *values.shape[1:]))
-    order = np.argsort(group, kind="stable")
-    groups, first = np.unique(group[order], return_index=True)
-    if len(groups):
-        totals[groups] = np.add.reduceat(values[order].astype(np.float64), first, axis=0)
-    return totals
+class _Sums(NamedTuple):
+    """Sums by group, of which there are G."""
+
+    order: IntArray  # (N,) that brings the members of a group together
+    groups: IntArray  # with members
+    first: IntArray  # of each of these, in that order
+    total: int  # number of groups, G
+
+    @classmethod
+    def by(cls, group: IntArray, count: int) -> _Sums:
+        """By groups (N,)."""
+        order = np.argsort(group, kind="stable")
+        groups, first = np.unique(group[order], return_index=True)
+        return cls(order, groups, first, count)
+
+    def of(self, values: FloatArray | BoolArray) -> FloatArray:
+        """Sums (G, ...) of values (N, ...)."""
+        totals = np.zeros((self.total, *values.shape[1:]))
+        if len(self.groups):
+            totals[self.groups] = np.add.reduceat(values[self.order].astype(np.float64), self.first, axis=0)
+        return totals
 
 
 def _by_pose(ray: FloatArray, height_m: FloatArray) -> FloatArray:

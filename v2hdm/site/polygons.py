@@ -475,9 +475,9 @@ def _normal_equations(
     pull = sums[..., 2]
     coupling = sums[..., 3:]
     inverse = np.linalg.inv(shifted)
-    gain = np.einsum("iju,ijk->iuk", coupling, inverse)
-    information = weighted.T @ jacobian - np.einsum("iuk,ikv->uv", gain, coupling)
-    gradient = weighted.T @ off_px - np.einsum("iuk,ik->u", gain, pull)
+    gain = coupling.swapaxes(1, 2) @ inverse
+    information = weighted.T @ jacobian - np.tensordot(gain, coupling, axes=([0, 2], [0, 1]))
+    gradient = weighted.T @ off_px - np.tensordot(gain, pull, axes=([0, 2], [0, 1]))
     return _NormalEquations(
         information, gradient, lambda step: np.einsum("ijk,ik->ij", inverse, pull - coupling @ step)
     )

@@ -39,6 +39,7 @@ _APART_PX = 1.5  # least distance of where the ground and a face would be in the
 _LEAST_POINTS = 60  # least number of points that tell
 
 _DARK = 3.0  # added to grey values of 8 bits before logarithms: noise of dark pixels
+_BLUR_SIGMAS = 5  # reach of a blur in its standard deviations: OpenCV's ends at four
 _LEAST_DEPTH_M = 1.0  # least depth of a point in front of a camera, m
 _MOST_CORRELATION = 0.995  # beyond it all correlations are alike
 
@@ -67,7 +68,7 @@ class Watch:
         """
         odds = np.zeros(is_end.shape)
         # Neighbouring ends are seen in the same images: along the route each of these is read about once.
-        read = lru_cache(maxsize=16)(self._log_grey)
+        read = lru_cache(maxsize=16)(self.grey)
         route = cKDTree(self.rig.map_from_vehicle[:, :2, 3])
         frame = route.query(np.nan_to_num(corners_map.mean(axis=1)))[1]
         ends = np.argwhere(is_end)
@@ -78,9 +79,6 @@ class Watch:
             if differences_z:
                 odds[group, side] = _BIAS + _PER_BETTER_GROUND * float(np.mean(differences_z))
         return odds
-
-    def _log_grey(self, image: int) -> NDArray[np.float32]:
-        return np.asarray(np.log(self.grey(image) + np.float32(_DARK)))
 
     def _height_m(self, corners_map: FloatArray) -> float:
         """Mean height, m, of the ground at points (N, 2) above the plane."""
@@ -132,10 +130,9 @@ class Watch:
         if np.count_nonzero(usable) < _LEAST_POINTS:
             return None
         # The nearer image is blurred to what the farther one resolves.
-        blur_px = 0.5 * float(np.sqrt((farther.depth_m / nearer.depth_m) ** 2 - 1))
-        blurred = cv2.GaussianBlur(read(nearer.image), (0, 0), max(blur_px, 0.1))
-        light = _sample(read(farther.image), as_seen.px[usable])
-        matches = [_sample(blurred, points.px[usable]) for points in (as_ground, as_face)]
+        blur_px = max(0.5 * float(np.sqrt((farther.depth_m / nearer.depth_m) ** 2 - 1)), 0.1)
+        light = _log_grey(read(farther.image), [as_seen.px[usable]])[0]
+        matches = _log_grey(read(nearer.image), [as_ground.px[usable], as_face.px[usable]], blur_px)
         ground_z, face_z = (_fisher_z(light, match) for match in matches)
         return ground_z - face_z
 
@@ -205,10 +202,25 @@ class _End(NamedTuple):
         )
 
 
-def _sample(values: np.ndarray, px: FloatArray) -> FloatArray:
-    """Values (N,) of an image (H, W) at points (N, 2), interpolated."""
-    u, v = px.astype(np.float32).T
-    return np.asarray(cv2.remap(values, u[None], v[None], cv2.INTER_LINEAR)[0], dtype=np.float64)
+def _log_grey(
+    grey: NDArray[np.float32], points_px: Sequence[FloatArray], blur_px: float = 0.0
+) -> list[FloatArray]:
+    """Logarithms of the grey values (H, W) of an image at points (N, 2), interpolated, after a blur.
+
+    Only the part of the image with the points is looked at: it is a small one.
+    """
+    points = [px.astype(np.float32) for px in points_px]
+    margin = int(np.ceil(_BLUR_SIGMAS * blur_px)) + 2
+    corner = np.maximum(np.min([px.min(axis=0) for px in points], axis=0).astype(np.int64) - margin, 0)
+    end = np.max([px.max(axis=0) for px in points], axis=0).astype(np.int64) + margin + 1
+    values = np.log(grey[corner[1] : end[1], corner[0] : end[0]] + np.float32(_DARK))
+    if blur_px:
+        values = cv2.GaussianBlur(values, (0, 0), blur_px)
+    maps = [(px - corner.astype(np.float32)).T for px in points]
+    return [
+        np.asarray(cv2.remap(values, u[None], v[None], cv2.INTER_LINEAR)[0], dtype=np.float64)
+        for u, v in maps
+    ]
 
 
 def _fisher_z(first: FloatArray, second: FloatArray) -> float:

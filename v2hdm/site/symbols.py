@@ -14,8 +14,7 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from scipy.cluster.hierarchy import DisjointSet
 from scipy.spatial import cKDTree
 from skimage.draw import polygon
 from skimage.measure import approximate_polygon, find_contours
@@ -355,13 +354,12 @@ def _groups(shapes: Sequence[FloatArray]) -> list[IntArray]:
     reach_m = np.array([np.ptp(shape, axis=0).max() for shape in shapes])
     pairs = cKDTree(middle).query_pairs(float(reach_m.max()), output_type="ndarray").reshape(-1, 2)
     in_reach = np.linalg.norm(middle[pairs[:, 0]] - middle[pairs[:, 1]], axis=1) < reach_m[pairs].max(axis=1)
-    linked = np.array(
-        [(a, b) for a, b in pairs[in_reach] if _common(shapes[a], shapes[b]) >= _COMMON], np.int64
-    )
-    a, b = linked.reshape(-1, 2).T
-    graph = coo_array((np.ones(len(a)), (a, b)), shape=(len(shapes), len(shapes)))
-    count, label = connected_components(graph, directed=False)
-    return [np.flatnonzero(label == group) for group in range(count)]
+    groups = DisjointSet(range(len(shapes)))
+    for first, second in pairs[in_reach].tolist():
+        # Of outlines that others connect already, the overlap says nothing new.
+        if not groups.connected(first, second) and _common(shapes[first], shapes[second]) >= _COMMON:
+            groups.merge(first, second)
+    return sorted((np.array(sorted(group)) for group in groups.subsets()), key=lambda group: int(group[0]))
 
 
 def _common(shape: FloatArray, other: FloatArray) -> float:

@@ -1,4 +1,4 @@
-"""The engine ``numba``: kernels for all work per observation, compiled from C++ or by numba.
+"""The engine ``native``: kernels for all work per observation, compiled from C++ or by numba.
 
 States, clocks, drifts and extrinsics act through the table of pairs, so that kernels are independent of the
 model. Each kernel is written twice: here, for numba, which compiles it on first use, and in ``native/src``,
@@ -12,6 +12,9 @@ from pathlib import Path
 
 from v2hdm import native
 from v2hdm.compiled import folder_of, is_numba_there
+
+NAMES = ("native", "numba")
+"""The names of this engine: the second is an earlier one, still accepted."""
 
 
 def are_compiled() -> bool:

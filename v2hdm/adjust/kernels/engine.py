@@ -1,4 +1,4 @@
-"""The engine ``numba``: torch's, its passes over the observations replaced by compiled kernels."""
+"""The engine ``native``: torch's, its passes over the observations replaced by compiled kernels."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _CLEARLY_LESS = 0.5  # fraction of the multiplications below which another order
 _PAIR_BLOCK = torch.triu_indices(6, 6)  # rows and columns of the upper triangle of a pair's block
 
 
-class NumbaEngine(TorchEngine):
+class KernelEngine(TorchEngine):
     """The model over one problem's arrays: linearised, evaluated, carried and pulled back by kernels."""
 
     @cached_property
@@ -168,7 +168,7 @@ class NumbaEngine(TorchEngine):
         """Jacobians of the pairs by frame states and clock offsets."""
         return spread_of(self.arrays, estimate)
 
-    def eliminate(self, system: ReducedSystem, estimate: Estimate, robust: Loss) -> NumbaLinearised:
+    def eliminate(self, system: ReducedSystem, estimate: Estimate, robust: Loss) -> KernelLinearised:
         """Linearise and eliminate the corners; raises AdjustError if a block of joined ones is singular."""
         arrays = self.arrays
         layout = self.layout
@@ -217,7 +217,7 @@ class NumbaEngine(TorchEngine):
         if states:
             self._subtract_frames(base, system)
         terms, gradient = with_priors(arrays, estimate, spread, out.costs.sum(0), self.pairs(out.wrench))
-        return NumbaLinearised(
+        return KernelLinearised(
             engine=self,
             estimate=estimate,
             robust=robust,
@@ -318,10 +318,10 @@ class NumbaEngine(TorchEngine):
 
 
 @dataclass(frozen=True)
-class NumbaLinearised(Linearised):
+class KernelLinearised(Linearised):
     """A problem linearised by kernels, its corners eliminated."""
 
-    engine: NumbaEngine
+    engine: KernelEngine
     base: Base
 
     def evaluate(self, step: Gradient, tangents: Tensor, whitened_corners: Tensor) -> Evaluated:

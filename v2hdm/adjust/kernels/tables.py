@@ -157,11 +157,17 @@ def _cam_from_vehicle_then(arrays: Arrays, estimate: Estimate) -> Tensor:
     return cam_from_vehicle @ _exp(-moved(arrays, estimate.clock_s)) if arrays.moves else cam_from_vehicle
 
 
+def _moved_frames(arrays: Arrays, estimate: Estimate) -> tuple[FloatArray, FloatArray]:
+    """Poses exp(-s) P^-1 (J, 4, 4) of the frames, and the left Jacobians (J, 6, 6) of -s."""
+    tangent = -frame_tangent(arrays, estimate.frame_state)
+    return move(np.ascontiguousarray(tangent.numpy()), np.ascontiguousarray(arrays.vehicle_from_map.numpy()))
+
+
 def cam_from_map(arrays: Arrays, estimate: Estimate) -> Tensor:
     """Poses of every pair, (C, M, 4, 4)."""
     vehicle_from_map = arrays.vehicle_from_map
     if arrays.states:
-        vehicle_from_map = _exp(-frame_tangent(arrays, estimate.frame_state)) @ vehicle_from_map
+        vehicle_from_map = torch.from_numpy(_moved_frames(arrays, estimate)[0])
     vehicle_from_map = arrays.at_moments(vehicle_from_map)
     cameras = _cam_from_vehicle_then(arrays, estimate)
     return torch.from_numpy(compose(cameras.numpy(), vehicle_from_map.numpy()))
@@ -171,8 +177,7 @@ def spread_of(arrays: Arrays, estimate: Estimate) -> Spread:
     """Jacobians of the pairs by frame states and clock offsets."""
     state = clock = arrays.centre.new_zeros(arrays.camera_count, arrays.moment_count, 6, 0)
     if arrays.states:
-        tangent = -frame_tangent(arrays, estimate.frame_state)
-        by_tangent = torch.from_numpy(rigid.left_jacobian(tangent.numpy())[..., list(arrays.states)])
+        by_tangent = torch.from_numpy(_moved_frames(arrays, estimate)[1][..., list(arrays.states)])
         state = -_adjoint(_cam_from_vehicle_then(arrays, estimate)) @ arrays.at_moments(by_tangent)
     if arrays.clock_twist.shape[-1]:
         clock = -_adjoint(estimate.cam_from_vehicle)[:, None] @ arrays.clock_twist
