@@ -3,8 +3,9 @@
 ``python -m tests.benchmarks.conditions [--ports port1] [--seeds 1 2] [--only worn dusk] [--length-m 40]``
 renders a straight piece of each port in each condition, whose drive states its noise and drift as they are,
 and maps it. It prints the corners' error, what of it remains after the best common motion, the sigma that is
-stated of a corner, and the share of corners inside their 95 % regions. Corners of one drive share its errors,
-so that often all of them or none lie inside: only many drives together mean much.
+stated of a corner, by how much diagonals of markings are too long, and the shares of corners and of sides
+inside their 95 % regions. Corners of one drive share its errors, so that often all of them or none lie
+inside: only many drives together mean much.
 """
 
 from __future__ import annotations
@@ -13,13 +14,13 @@ import argparse
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from omegaconf import OmegaConf
 
 from tests.benchmarks.sigmas import corner_pairs, left_m
-from tests.benchmarks.uncertainty import CACHE, INSIDE, squared_errors
+from tests.benchmarks.uncertainty import CACHE, INSIDE, Errors, squared_errors
 from v2hdm.detection.batch import detect_all
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.executor import Executor, open_executor
@@ -54,29 +55,52 @@ def port_of(run: str, seed: int, condition: str, length_m: float) -> PortConfig:
     return port
 
 
-def mapped(
-    port: PortConfig, executor: Executor
-) -> Iterator[tuple[str, MethodResult, FloatArray, FloatArray, FloatArray]]:
-    """By set of cameras: the map, mapped and true corners (N, 2), and squared errors (N,) of corners."""
+class Mapped(NamedTuple):
+    """A map by some cameras, beside the truth."""
+
+    cameras: str
+    result: MethodResult
+    corners: FloatArray  # (N, 2) m, of the markings that are found
+    true: FloatArray  # (N, 2) m
+    errors: Errors
+
+
+def mapped(port: PortConfig, executor: Executor) -> Iterator[Mapped]:
+    """The map of a rendered drive by all cameras, and by each alone."""
     drive = read_drive(rendered_drive(port, CACHE, executor, lambda _, __: None))
     detections = detect_all(drive, DetectorOptions.for_mapping(), executor)
     truth = read_truth(drive)
     for cameras in (list(drive.cameras), *([name] for name in drive.cameras)):
         result = run_methods(drive, detections, cameras, naive=False)[BEST]
-        corners, true = corner_pairs(result, truth)
         name = cameras[0] if len(cameras) == 1 else "all"
-        yield name, result, corners, true, squared_errors(result, truth)["corners"]
+        yield Mapped(name, result, *corner_pairs(result, truth), squared_errors(result, truth))
 
 
-def line(name: str, result: MethodResult, corners: FloatArray, true: FloatArray, squared: FloatArray) -> str:
+def line(name: str, mapping: Mapped) -> str:
     """The figures of one map."""
-    rmse_m = float(np.sqrt(np.mean(np.sum((corners - true) ** 2, axis=1))))
-    stated = [np.trace(marking.covariance_m2) / 4 for marking in result.hd_map.markings]
+    corners = inside(mapping.errors["corners"])
+    sides = inside(mapping.errors["sides"])
+    rmse_m = float(np.sqrt(np.mean(np.sum((mapping.corners - mapping.true) ** 2, axis=1))))
+    stated_m2 = [np.trace(marking.covariance_m2) / 4 for marking in mapping.result.hd_map.markings]
     return (
-        f"{name:32s} {100 * rmse_m:5.2f} cm, left {100 * left_m(corners, true):.2f}, "
-        f"stated {100 * float(np.sqrt(np.median(stated))):.2f}, {len(corners) // 4} markings, "
-        f"inside {np.mean(squared <= INSIDE):.2f}"
+        f"{name:24s} {100 * rmse_m:5.2f} cm, left {100 * left_m(mapping.corners, mapping.true):.2f}, "
+        f"stated {100 * float(np.sqrt(np.median(stated_m2))):.2f}, {len(mapping.corners) // 4} markings, "
+        f"diagonals {1000 * longer_m(mapping):+.1f} mm, inside: corners {corners:.2f}, sides {sides:.2f}"
     )
+
+
+def longer_m(mapping: Mapped) -> float:
+    """Median by which diagonals of markings are longer than the true ones, m."""
+    lengths_m = [
+        np.linalg.norm(corners[:, :2] - corners[:, 2:], axis=2)
+        for corners in (mapping.corners.reshape(-1, 4, 2), mapping.true.reshape(-1, 4, 2))
+    ]
+    return float(np.median(lengths_m[0] - lengths_m[1]))
+
+
+def inside(squared: FloatArray) -> float:
+    """The share of squared errors (N,) that lie inside their 95 % regions."""
+    return float(np.mean(squared <= INSIDE))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -94,13 +118,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
             for condition in asked.only:
                 port = port_of(run, seed, condition, asked.length_m)
                 with open_executor(asked.workers) as executor:
-                    for cameras, result, corners, true, errors in mapped(port, executor):
-                        squared.setdefault((condition, cameras), []).append(errors)
-                        name = f"{run} {seed} {condition}, {cameras}"
-                        print(line(name, result, corners, true, errors), flush=True)
-    for (condition, cameras), errors in squared.items():
-        share = np.mean(np.concatenate(errors) <= INSIDE)
-        print(f"{condition}, {cameras}: inside {share:.3f} of {len(errors)} drives")
+                    for mapping in mapped(port, executor):
+                        squared.setdefault((condition, mapping.cameras), []).append(mapping.errors["corners"])
+                        print(line(f"{run} {seed} {condition}, {mapping.cameras}", mapping), flush=True)
+    for (condition, cameras), of_drives in squared.items():
+        share = inside(np.concatenate(of_drives))
+        print(f"{condition}, {cameras}: corners inside {share:.3f}, of {len(of_drives)} drives")
 
 
 if __name__ == "__main__":

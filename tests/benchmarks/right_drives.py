@@ -19,8 +19,8 @@ Of a spoilt drive, what is said counts if it names the cause, or is not said of 
 states how well its clocks are synchronised.
 
 - *wrong*: its corners are more than 1.3 times as far off as those of the drive as it was
-- *told*: it does not end in PASS
-- *relied*: it ends in PASS, whose headline names the input as one that the drive cannot check
+- *told*: something is raised
+- *relied*: nothing is, but the input is named as one that the drive cannot check
 - *1.3 x*: wrong, and neither told nor relied. This rule alone blames a map for errors that it states: 3.9 cm
   in place of 2.0 under sigmas whose 95 % regions hold 99 % of the corners deceive nobody
 - *SILENT*: these, with less than 90 % of the corners inside their 95 % regions

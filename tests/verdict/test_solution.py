@@ -281,6 +281,9 @@ def test_a_straight_drive_says_what_it_cannot_tell():
         headline = Verdict.of(check_goal(result(evidence, sure), 0.05, "poses")).headline
         assert headline.startswith("PASS")
         assert ("if the clocks and the surveyed centres are right" in headline) is is_told
+    unknown = replace(unsure, clock_m=0.2)
+    headline = Verdict.of(check_goal(result(unknown, sure), 0.05, "poses")).headline
+    assert "(if the surveyed centres are right, which this drive cannot show)" in headline
 
 
 @pytest.mark.parametrize(

@@ -296,13 +296,14 @@ def _doubtful(evidence: SolveEvidence) -> list[Contradiction]:
     return sorted(likely, key=probability, reverse=True)
 
 
-def relied_on(evidence: SolveEvidence) -> list[str]:
-    """The inputs that would move the whole map if they erred in all cameras alike, unseen by this drive."""
-    is_loose = {
-        "the clocks": _loosest_clock_s(evidence) > _CLOCK_OBSERVABLE_S,
-        "the surveyed centres": bool(_loose_levers(evidence)),
-    }
-    return [name for name, loose in is_loose.items() if loose]
+def relied_on(evidence: SolveEvidence) -> dict[str, str]:
+    """By check, the inputs that would move the whole map if they erred in all cameras alike, unseen."""
+    relied = {}
+    if _loosest_clock_s(evidence) > _CLOCK_OBSERVABLE_S:
+        relied[table.CLOCK.check] = "the clocks"
+    if _loose_levers(evidence):
+        relied[table.LEVER.check] = "the surveyed centres"
+    return relied
 
 
 def _loosest_clock_s(evidence: SolveEvidence) -> float:
