@@ -376,8 +376,9 @@ def _steps_of(quad: Quad, size: np.ndarray) -> _Steps:
     corner_places = np.sort(quad.corners[marking, :, along], axis=1)
     first_end = np.minimum(corner_places[:, 1], corner_places[:, 0] + quad.width) + _END_PX
     last_end = np.maximum(corner_places[:, 2], corner_places[:, 3] - quad.width) - _END_PX
-    head = np.ceil(first_end).astype(np.intp)
-    tail = np.floor(last_end).astype(np.intp)
+    # Corners may lie outside of the box, which ends not far from the image.
+    head = np.clip(np.ceil(first_end).astype(np.intp), 0, extent)
+    tail = np.clip(np.floor(last_end).astype(np.intp), 0, extent)
     at_ends = head + extent - tail
     slim = np.flatnonzero((step[marking, along] > 1) & (at_ends < _MOST_ENDS * extent))
     per_place = band / extent
@@ -385,7 +386,7 @@ def _steps_of(quad: Quad, size: np.ndarray) -> _Steps:
     step_at_ends = np.ceil(per_place * at_ends / _MAX_AT_ENDS).astype(np.intp)
     step[slim] = 1
     step[slim, along[slim]] = np.maximum(step_between[slim], 1)
-    outer[slim, along[slim]] = step_at_ends[slim]
+    outer[slim, along[slim]] = np.maximum(step_at_ends[slim], 1)
     bounds[slim, along[slim]] = np.column_stack([head, tail])[slim]
     return _Steps(bounds, step, outer)
 

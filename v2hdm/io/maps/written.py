@@ -16,7 +16,7 @@ import numpy as np
 
 from v2hdm.io.maps.features import CORNERS, PAINT
 from v2hdm.io.maps.reading import read_geojson, read_geojson_of
-from v2hdm.records import FloatArray, HDMap, Marking, PaintLeft
+from v2hdm.records import FloatArray, HDMap, Lane, Marking, PaintLeft, Symbol
 from v2hdm.store.inputs import is_as_written, note_input
 
 _CORNERED = f'"{CORNERS}"'.encode()
@@ -71,7 +71,8 @@ def read_written(path: Path) -> HDMap:
     except (msgspec.MsgspecError, ValueError):  # something that a marking of ours has and this does not know
         return read_geojson(path)
     hd_map = read_geojson_of({"v2hdm": content.v2hdm, "features": others}, path)
-    ids = [paint.id for paint in (*markings, *hd_map.lanes, *hd_map.symbols)]
+    paints: list[Marking | Lane | Symbol] = [*markings, *hd_map.lanes, *hd_map.symbols]
+    ids = [paint.id for paint in paints]
     if len(set(ids)) < len(ids) or min(ids, default=1) < 1:
         return read_geojson(path)
     return replace(hd_map, markings=tuple(markings))

@@ -29,7 +29,10 @@ from v2hdm.records import (
     FloatArray,
     HDMap,
     IntArray,
+    Lane,
+    Marking,
     Reception,
+    Symbol,
     Truth,
 )
 from v2hdm.report.coverage import Coverage, read_coverage
@@ -162,7 +165,7 @@ def read_map_of(folder: Path) -> HDMap | None:
     if not (folder / names.MAP).is_file():
         return None
     hd_map = read_written(folder / names.MAP)
-    paints = [*hd_map.markings, *hd_map.lanes, *hd_map.symbols]
+    paints: list[Marking | Lane | Symbol] = [*hd_map.markings, *hd_map.lanes, *hd_map.symbols]
     if all(paint.id for paint in paints):
         return hd_map
     features = features_of(hd_map)
