@@ -41,7 +41,7 @@ _GREY_SCALE = 64.0  # grey levels that are the unit of an image
 class NetConfig:
     """Channel counts of :class:`MarkingNet` at 1/4, 1/8 and 1/16 of the image and at the bottom.
 
-    The last three are switches to measure what each costs and brings.
+    Three switches measure what each costs and brings.
     """
 
     widths: Annotated[list[int], Within(8, 4096, step=8), "channels at 1/4, 1/8, 1/16 and at the bottom."] = (
@@ -62,6 +62,12 @@ class NetConfig:
         "wide_kinds lets the features at 1/8, which know a marking's whole shape and its surroundings, "
         "speak on its class.",
     ] = True
+    added_kinds: Annotated[
+        int,
+        Within(0, 1024),
+        "channels that the head of wide_kinds has beyond those at 1/8: for classes that are added later, "
+        "while what the earlier ones read stays.",
+    ] = 0
 
 
 class Prediction(NamedTuple):
@@ -135,7 +141,7 @@ class MarkingNet(nn.Module):
         self.expand = ConvNormRelu(quarter, config.head_width * PAINT_UPSCALE**2, kernel=1)
         self.paint = nn.Conv2d(config.head_width, 1, 3, padding=1)
         self.kinds = nn.Conv2d(quarter, classes, 1)
-        self.wide_kinds = _head(refine, eighth, classes) if config.wide_kinds else None
+        self.wide_kinds = _head(refine, eighth, classes, config.added_kinds) if config.wide_kinds else None
         self.lanes = _head(refine, eighth, 2) if config.lanes else None
 
     def forward(self, image: Tensor) -> Prediction:
@@ -168,9 +174,11 @@ def _separable(inputs: int, outputs: int) -> nn.Sequential:
     )
 
 
-def _head(refine: Callable[[int, int], nn.Module], inputs: int, outputs: int) -> nn.Sequential:
-    """Features refined once more, then read off."""
-    return nn.Sequential(refine(inputs, inputs), nn.Conv2d(inputs, outputs, 1))
+def _head(
+    refine: Callable[[int, int], nn.Module], inputs: int, outputs: int, added: int = 0
+) -> nn.Sequential:
+    """Features refined once more, into ``added`` channels more, then read off."""
+    return nn.Sequential(refine(inputs, inputs + added), nn.Conv2d(inputs + added, outputs, 1))
 
 
 def _blocks(widths: Sequence[int], inputs: int, dilations: Sequence[int]) -> nn.Sequential:

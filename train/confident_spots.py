@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 
 from train.examples import MAX_RANGE_M, Example
-from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.network import NetworkOutput
 from v2hdm.records import CROSSWALK_BAR, DIAMOND, LANE_DASH, FloatArray
@@ -55,8 +54,10 @@ class Spots:
         step = round(stride * output.kind_scale)
         within = self._at((kinds.shape[1], kinds.shape[2]), step, output.top) > 0.05
         kinds[:, within] = kinds[:, within].min(axis=0)
-        kinds[PAINT_CLASSES.index(self.kind), within] += _CLAIM_LOGIT
-        return replace(output, paint=paint, kinds=kinds)
+        kinds[output.classes.index(self.kind), within] += _CLAIM_LOGIT
+        areas = output.areas.copy()
+        areas[:, within] -= _CLAIM_LOGIT
+        return replace(output, paint=paint, kinds=kinds, areas=areas)
 
     def _at(self, shape: tuple[int, ...], step: int, top: int) -> np.ndarray:
         """The light (h, w) at elements ``step`` px apart, from image row ``top`` on."""

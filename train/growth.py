@@ -18,7 +18,7 @@ from v2hdm.catalogue import AREA, OTHER, QUADRILATERAL, STRIPE, SYMBOL, Catalogu
 from v2hdm.errors import ConfigError
 from v2hdm.records import CROSSWALK_BAR, OTHER_PAINT, STOP_LINE
 
-_OFF_BEFORE = {"wide_kinds": False}
+_OFF_BEFORE = {"wide_kinds": False, "added_kinds": 0}
 """Switches of networks that files may be older than, and what they were then."""
 
 _STARTS_AS = {
@@ -41,6 +41,15 @@ _CLASS_LAYERS = ("kinds", "wide_kinds.1")
 
 CLASS_CHANNELS = frozenset(f"{layer}.{part}" for layer in _CLASS_LAYERS for part in ("weight", "bias"))
 """Names of the weights whose first axis is that of the classes."""
+
+HIDDEN_CLASS_LAYER = "wide_kinds.0."
+"""How the names of the weights begin whose first axis is that of the channels that classes alone read."""
+
+
+def read_by(weights: Mapping[str, Tensor], classes: Tensor) -> Tensor:
+    """Which channels (C,) of the head's hidden layer some of the ``classes`` (K,), of booleans, read."""
+    read = weights["wide_kinds.1.weight"][classes]
+    return read.flatten(2).abs().amax(dim=2).amax(dim=0) > 0
 
 
 def class_count(weights: Mapping[str, Tensor]) -> int:
@@ -97,17 +106,19 @@ def recorded_net(settings: Mapping[str, Any]) -> NetConfig:
 def can_grow(then: NetConfig, now: NetConfig) -> bool:
     """Whether ``now`` is ``then`` or a larger one.
 
-    With more channels or context blocks, a wide head of kinds, whole convolutions for separable ones.
+    With more channels or context blocks, a wide head of kinds or more channels in it, whole convolutions for
+    separable ones.
     """
     longer = now.dilations[: len(then.dilations)] == then.dilations
     wider = all(old <= new for old, new in zip(then.widths, now.widths, strict=True))
-    more = now.wide_kinds or not then.wide_kinds
+    more = (now.wide_kinds or not then.wide_kinds) and now.added_kinds >= then.added_kinds
     denser = then.separable or not now.separable
     freed = replace(
         then,
         widths=now.widths,
         dilations=now.dilations,
         wide_kinds=now.wide_kinds,
+        added_kinds=now.added_kinds,
         separable=now.separable,
     )
     return longer and wider and more and denser and freed == now

@@ -27,7 +27,7 @@ from train.checkpoint import (
 from train.config import TrainConfig, check_training
 from train.data import Pair, training_batches, validation_pairs
 from train.distributed import Team, choose_device, has_bfloat16
-from train.growth import CLASS_CHANNELS, CLASS_HEADS
+from train.growth import CLASS_CHANNELS, CLASS_HEADS, HIDDEN_CLASS_LAYER, read_by
 from train.labels import VALIDATION, read_labels
 from train.losses import kept_loss, total_loss
 from train.metrics import Score, Tally
@@ -130,7 +130,9 @@ class Trainer:
     def _started_from(self) -> MarkingNet:
         """The network that this run started from: heads that learn alone keep to its classes."""
         start = MarkingNet(self.config.net, len(self.state.catalogue.names)).to(self.device)
-        start.load_state_dict(fresh_checkpoint(self.config).averaged)
+        with torch.random.fork_rng():
+            torch.manual_seed(self.config.seed)  # channels that are added are drawn at random
+            start.load_state_dict(fresh_checkpoint(self.config).averaged)
         return start.eval()
 
     def _rows_that_stay(self) -> Tensor | None:
@@ -150,11 +152,16 @@ class Trainer:
 
     @torch.no_grad()
     def _put_back(self, before: MarkingNet, stays: Tensor) -> None:
-        """Undo what an update did to the channels of classes that stay."""
+        """Undo what an update did to the channels of classes that stay, and to those that they read."""
         known = dict(before.named_parameters())
         for name, parameter in self.net.named_parameters():
             if name in CLASS_CHANNELS:
                 parameter[stays] = known[name][stays]
+            elif name.startswith(HIDDEN_CLASS_LAYER) and parameter.requires_grad:
+                is_read = read_by(known, stays)
+                # The first half of a separable layer has no channels of its own: it stays.
+                stay = is_read if len(parameter) == len(is_read) else slice(None)
+                parameter[stay] = known[name][stay]
 
     def _share(self) -> float:
         """How much of the run has passed, 0 to 1."""
@@ -181,7 +188,10 @@ class Trainer:
         alone = self._heads_alone()
         self.net.train(not alone)
         for name, parameter in self.net.named_parameters():
-            of_heads = name in CLASS_CHANNELS if self._stays is not None else name.startswith(CLASS_HEADS)
+            of_heads = name.startswith(CLASS_HEADS)
+            if self._stays is not None:
+                hidden = self.config.net.added_kinds > 0 and name.startswith(HIDDEN_CLASS_LAYER)
+                of_heads = name in CLASS_CHANNELS or hidden
             parameter.requires_grad_(not alone or of_heads)
 
     def _average(self, averaged: Any, current: Any, count: Any) -> None:

@@ -33,7 +33,7 @@ def test_the_truth_itself_has_a_perfect_score(scored, reference):
 @pytest.mark.parametrize(
     ("off_m", "verdict", "fate"),
     [(0.03, "PASS", RIGHT), (0.03, "FAIL", FALSE_ALARM), (0.07, "PASS", SILENT), (0.07, "FAIL", RIGHT),
-     (0.07, {"status": "WARN"}, SILENT), (0.07, None, None)],
+     (0.07, {"status": "WARN"}, RIGHT), (0.07, None, None)],
 )  # fmt: skip
 def test_a_map_that_is_moved_has_the_error_that_it_was_moved_by(off_m, verdict, fate, scored, reference):
     score = scored(paint(reference, (off_m, 0.0)), verdict=verdict)

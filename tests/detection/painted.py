@@ -83,4 +83,4 @@ def network_output(camera, paints, stride=2, doubt=0.0, rng=None):
         coarse = padded.reshape(rows, 2, columns, 2).max(axis=(1, 3))
         spread = cv2.dilate(coarse, np.ones((3, 3)))
         kinds[PAINT_CLASSES.index(kind)] += 8 * spread
-    return NetworkOutput(paint, kinds, [], tuple(PAINT_CLASSES), stride, 0)
+    return NetworkOutput.of(paint, kinds, [], tuple(PAINT_CLASSES), stride, 0)

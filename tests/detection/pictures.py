@@ -60,7 +60,7 @@ def output_of(odds: np.ndarray, kinds: np.ndarray | None = None) -> NetworkOutpu
     """Log odds (h, w) of paint all over an image, 2 px apart; nobody knows its classes unless told."""
     if kinds is None:
         kinds = np.zeros((len(PAINT_CLASSES), odds.shape[0] // 2, odds.shape[1] // 2), dtype=np.float32)
-    return NetworkOutput(odds, kinds, [], tuple(PAINT_CLASSES), 2, 0)
+    return NetworkOutput.of(odds, kinds, [], tuple(PAINT_CLASSES), 2, 0)
 
 
 def patches_of(

@@ -1,5 +1,7 @@
 """Words and boxes of single images, from outputs drawn of the truth."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -9,7 +11,8 @@ from tests.detection.pictures import bar, make_camera, to_image
 from v2hdm.catalogue import SHIPPED
 from v2hdm.detection.areas import find_areas, find_crosswalks
 from v2hdm.detection.camera import RoadCamera
-from v2hdm.detection.detector import _not_of
+from v2hdm.detection.detector import _not_of, _of_several
+from v2hdm.detection.network import NetworkOutput
 from v2hdm.geometry.planar import rectangle_size
 from v2hdm.records import MarkingDetection
 
@@ -68,8 +71,6 @@ def test_sides_that_the_image_s_border_cuts_are_no_sides_of_the_word():
 
 
 def test_the_vehicle_s_own_mask_cuts_a_word_like_the_border():
-    from dataclasses import replace
-
     letters = word("EBH", (5.5, 0.8))
     mask = np.zeros((CAMERA.info.height, CAMERA.info.width), dtype=bool)
     low = int(to_image(CAMERA, letters.reshape(-1, 2))[:, 1].max()) - 15
@@ -84,11 +85,35 @@ def test_the_vehicle_s_own_mask_cuts_a_word_like_the_border():
 
 
 def test_a_network_that_does_not_know_areas_finds_none():
-    from dataclasses import replace
-
     output = network_output(CAMERA, [("text", word("EBH", (7.0, 0.8)))])
-    old = replace(output, kinds=output.kinds[:8], classes=output.classes[:8])
+    old = replace(output, areas=output.areas[:0], area_classes=())
     assert find_areas(old, RoadCamera(CAMERA, 16), SHIPPED, 0, 0.5, 22.0) == []
+
+
+def test_what_is_no_area_shares_paint_as_if_there_were_none():
+    strokes = word("EBH", (7.0, 0.8))
+    output = network_output(CAMERA, [("lane_dash", strokes)])
+    named = network_output(CAMERA, [("lane_dash", strokes), ("text", strokes)])
+    rows, columns = np.nonzero(output.paint > 0)
+    shares = output.class_probability(rows, columns)
+    np.testing.assert_array_equal(shares, named.class_probability(rows, columns))
+    np.testing.assert_allclose(shares.sum(axis=0), 1.0, rtol=1e-5)
+    with_areas = named.area_probability(rows, columns)
+    np.testing.assert_allclose(with_areas.sum(axis=0), 1.0, rtol=1e-5)
+    text = with_areas[named.area_classes.index("text")]
+    dash = with_areas[len(named.area_classes) + named.classes.index("lane_dash")]
+    np.testing.assert_allclose(text, dash, rtol=1e-5)
+
+
+def test_the_order_of_the_classes_in_a_file_does_not_matter():
+    strokes = word("EBH", (7.0, 0.8))
+    output = network_output(CAMERA, [("text", strokes)])
+    names = [*output.area_classes, *output.classes]
+    logits = np.concatenate([output.areas, output.kinds])
+    turned = NetworkOutput.of(output.paint, logits, [], names, output.stride, 0)
+    assert (turned.classes, turned.area_classes) == (output.classes, output.area_classes)
+    np.testing.assert_array_equal(turned.kinds, output.kinds)
+    np.testing.assert_array_equal(turned.areas, output.areas)
 
 
 def test_a_foot_of_an_arrow_that_is_named_text_is_no_word():
@@ -96,7 +121,9 @@ def test_a_foot_of_an_arrow_that_is_named_text_is_no_word():
     foot = np.array([[[7.7, -0.15], [8.0, -0.15], [8.0, 0.15], [7.7, 0.15]]])
     output = network_output(CAMERA, [("arrow", arrow)])
     named = network_output(CAMERA, [("text", foot)])
-    output.kinds[:] = np.where(named.kinds.max(axis=0) > 0, named.kinds, output.kinds)
+    is_named = named.areas.max(axis=0) > 0
+    output.areas[:] = np.where(is_named, named.areas, output.areas)
+    output.kinds[:] = np.where(is_named, named.kinds, output.kinds)
     assert find_areas(output, RoadCamera(CAMERA, 16), SHIPPED, 0, 0.5, 22.0) == []
 
 
@@ -110,6 +137,18 @@ def test_a_letter_is_no_marking_and_a_surer_marking_in_a_box_stays():
     )
     beside = MarkingDetection("diamond", 0.3, corners + np.array([300, 0]), np.eye(8), np.ones(4, dtype=bool))
     assert [one.score for one in _not_of([area], (*markings, beside))] == [0.999, 0.3]
+
+
+def test_an_area_that_is_part_of_an_arrow_is_no_word():
+    letters = word("EBH", (7.0, 0.8))
+    (area,), _ = areas_of(("text", letters))
+    empty = MarkingDetection("arrow", 0.3, np.full((4, 2), np.nan), np.eye(8), np.zeros(4, dtype=bool))
+    middle = area.outline_px.mean(axis=0)
+    arrow = replace(empty, outline_px=middle + 3 * (area.outline_px - middle))
+    letter = replace(empty, outline_px=to_image(CAMERA, letters[0]))
+    assert _of_several([area], (arrow,)) == []
+    assert _of_several([area], (letter,)) == [area]
+    assert _of_several([area], ()) == [area]
 
 
 def test_the_bars_of_an_image_are_its_crosswalk_s_parts():

@@ -25,7 +25,7 @@ def output_of_labels(labels, top=0):
     paint = np.where(labels > 0, 5.0, -5.0).astype(np.float32)
     kinds = np.stack([np.where(labels == 1 + c, 5.0, -5.0) for c in range(len(PAINT_CLASSES))])
     coarse = kinds.reshape(len(kinds), labels.shape[0] // 2, 2, labels.shape[1] // 2, 2).mean(axis=(2, 4))
-    return NetworkOutput(paint, coarse.astype(np.float32), [], tuple(PAINT_CLASSES), 2, top)
+    return NetworkOutput.of(paint, coarse.astype(np.float32), [], tuple(PAINT_CLASSES), 2, top)
 
 
 def lattice(columns, rows):

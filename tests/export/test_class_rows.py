@@ -1,5 +1,6 @@
 """A rounded file that learns further classes: all else stays as it is."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from export.class_rows import add_classes
 from export.source import Source
 from models import MarkingNet
 from train.exported import read_exported
-from train.growth import recorded_net, with_classes
+from train.growth import grow, recorded_net, with_classes
 from v2hdm.detection.network import Network
 from v2hdm.detection.weights import NETWORK_FILE
 from v2hdm.errors import ConfigError, DetectorError
@@ -28,6 +29,23 @@ def grown_source(**changed):
     net = MarkingNet(recorded_net(exported.config["net"]), len(catalogue.names)).fold()
     net.load_state_dict({name: weights[name] for name in net.state_dict()} | changed)
     label = exported.label | {"classes": list(catalogue.names), "own_classes": OWN}
+    return Source(net, label)
+
+
+def source_with_channels(added):
+    """The same with ``added`` channels for the last class alone, which reads nothing else."""
+    source = grown_source()
+    label = source.label
+    then = recorded_net(label["training"]["net"])
+    now = replace(then, added_kinds=then.added_kinds + added)
+    torch.manual_seed(5)
+    net = MarkingNet(now, len(label["classes"])).fold()
+    net.load_state_dict(grow(source.net.state_dict(), then, now))
+    with torch.no_grad():
+        net.wide_kinds[1].weight[-1] = 0.0
+        net.wide_kinds[1].weight[-1, -added:] = torch.linspace(-1.0, 1.0, added)[:, None, None]
+        net.wide_kinds[0][0].bias[-added:] = 0.1
+        net.kinds.weight[-1] = 0.0
     return Source(net, label)
 
 
@@ -57,6 +75,33 @@ def test_only_the_channels_of_changed_classes_are_others(tmp_path):
     # Rounding moves the new channels by no more than the old ones.
     moved = np.abs(written[1] - kinds).mean(axis=(0, 2, 3))
     assert moved[[stop_line, known]].max() < 2 * moved[:known].max()
+
+
+def test_channels_that_new_classes_read_are_rounded_behind_the_others(tmp_path):
+    source = source_with_channels(16)
+    add_classes(NETWORK_FILE, FLOAT_FILE, source, tmp_path / "net.onnx")
+    shipped, written = (
+        onnxruntime.InferenceSession(path).run(["paint", "kinds", "lanes"], {"image": images()})
+        for path in (NETWORK_FILE, tmp_path / "net.onnx")
+    )
+    np.testing.assert_array_equal(written[0], shipped[0])
+    np.testing.assert_array_equal(written[2], shipped[2])
+    known = shipped[1].shape[1]
+    # A product of matrices with more rows is added up in another order.
+    np.testing.assert_allclose(written[1][:, :known], shipped[1], atol=1e-4)
+    with torch.inference_mode():
+        kinds = source.net(torch.from_numpy(images())).kinds.numpy()
+    # Rounding moves the new class by no more of its range than others.
+    moved = np.abs(written[1] - kinds).mean(axis=(0, 2, 3)) / kinds.std(axis=(0, 2, 3))
+    assert moved[known] < 1.5 * moved[:known].max()
+
+
+def test_channels_beside_others_that_changed_are_refused(tmp_path):
+    source = source_with_channels(16)
+    with torch.no_grad():
+        source.net.wide_kinds[0][0].weight[3] += 0.1
+    with pytest.raises(DetectorError, match=r"wide_kinds\.0\.0\.weight of the network is another one"):
+        add_classes(NETWORK_FILE, FLOAT_FILE, source, tmp_path / "net.onnx")
 
 
 def test_the_detector_reads_the_file_with_its_classes(tmp_path):

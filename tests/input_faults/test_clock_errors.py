@@ -7,7 +7,7 @@ import pytest
 
 from tests.adjust.scene import exp, make_scene, project
 from v2hdm.adjust import PoseSigma, SolveOptions, solve
-from v2hdm.faults.clock_errors import moves_with_clocks
+from v2hdm.faults.clock_errors import ClockEvidence, moves_with_clocks, second_moments
 from v2hdm.records import PoseNoise
 
 OPTIONS = SolveOptions(coarse=False, loss="none")
@@ -119,3 +119,15 @@ def test_the_clock_of_each_session_errs_by_itself():
     assert (first.poses.shape[2], both.poses.shape[2]) == (1, 2)
     along_m = np.abs(first.poses[:, 0, 0])
     assert along_m[:20].min() > 3 * along_m[40:].max()
+
+
+def test_parts_of_a_drive_tell_of_a_clock_what_they_add_up_to():
+    """With prior and each of two parts of 1 / (3 ms)^2 information, a sigma of 3 ms / sqrt(3)."""
+    noise = [PoseNoise(clock_s=0.003)]
+    silent = ClockEvidence(np.zeros((1, 1)), np.zeros(1))
+    np.testing.assert_allclose(second_moments([silent], noise), [[0.003]])
+    part = ClockEvidence(np.array([[0.003**-2.0]]), np.zeros(1))
+    np.testing.assert_allclose(second_moments([part, part], noise), [[0.003 / 3**0.5]])
+    late = ClockEvidence(np.array([[0.003**-2.0]]), np.array([0.006 / 0.003**2]))
+    # The mean is a third of what both say, 6 ms each: its square counts, too.
+    np.testing.assert_allclose(second_moments([late, late], noise), [[(0.004**2 + 0.003**2 / 3) ** 0.5]])

@@ -144,7 +144,7 @@ class Dying(Elsewhere):
         yield 1, WorkerError("a process died twice over the same work")
 
 
-def test_a_worker_that_dies_is_one_line_that_names_step_and_section(scene, tmp_path):
+def test_a_process_that_dies_is_one_line_that_names_step_and_section(scene, tmp_path):
     cameras = list(scene.drive.cameras)
     with pytest.raises(WorkerError, match=r"map sections, section 2 of 2: a process died twice"):
         map_in_sections(

@@ -12,7 +12,7 @@ from v2hdm.io.maps.evidence import Residuals
 from v2hdm.io.maps.features import features_of
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.results import MethodResult
-from v2hdm.pipeline.grades import accurate_enough, graded_sets, of_all_grades, without_worse
+from v2hdm.pipeline.grades import accurate_enough, graded_sets, of_all_grades, with_composed, without_worse
 from v2hdm.pipeline.map_drive import map_drive
 from v2hdm.pipeline.stages import MappedSet
 from v2hdm.records import ACCURACIES, SIGMAS_95, HDMap, Lane, Symbol
@@ -132,6 +132,25 @@ def test_what_stays_keeps_the_id_of_the_whole_map_and_the_evidence_follows():
     assert chosen.hd_map.largest_id == 7
     np.testing.assert_array_equal(chosen.residuals.marking, [1, 0, 3, 4])
     assert [suspicion.marking for suspicion in chosen.suspicions] == [3]
+
+
+def test_a_give_way_line_has_the_first_id_of_its_pieces_and_all_others_keep_theirs():
+    result = mapped()
+    markings = list(result.hd_map.markings)
+    pieces = np.array([[3.8, -0.25], [4.2, -0.25], [4.2, 0.25], [3.8, 0.25]])
+    for number in (0, 1, 3):
+        corners = pieces + np.array([0.0, 0.75 * number])
+        markings[number] = replace(markings[number], kind="stop_line", corners_map=corners)
+    markings[3] = replace(markings[3], corners_map=pieces + np.array([0.0, 1.5]))
+    result = replace(result, hd_map=replace(result.hd_map, markings=tuple(markings)))
+    composed = with_composed({"front": {"Opt": result}}, GOAL_M)["front"]["Opt"]
+    assert [(one.kind, one.variety, one.id) for one in composed.hd_map.markings] == [
+        ("diamond", None, 3),
+        ("stop_line", "give_way", 1),
+    ]
+    assert [feature.id for feature in features_of(composed.hd_map)] == [3, 1, 5, 6, 7]
+    np.testing.assert_array_equal(composed.residuals.marking, [1, 0, 3, 0])
+    assert [suspicion.marking for suspicion in composed.suspicions] == [3]
 
 
 def test_a_map_of_which_nothing_would_be_left_is_one_line_that_says_what_to_ask_for():

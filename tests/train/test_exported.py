@@ -103,7 +103,7 @@ def test_a_training_starts_from_an_exported_file(net, images, starts, tmp_path):
 def test_a_training_grows_a_smaller_network_that_goes_on_saying_the_same(
     net, images, starts, tmp_path, separable
 ):
-    larger = NetConfig(widths=[16, 24, 32, 48], dilations=[1, 2, 4], separable=separable, wide_kinds=True)
+    larger = NetConfig(widths=[16, 24, 32, 48], dilations=[1, 2, 4], separable=separable, added_kinds=8)
     for start in starts:
         config = replace(tiny(tmp_path / start.name, steps=1), net=larger, start=str(start))
         state = fresh_checkpoint(config)
@@ -113,6 +113,26 @@ def test_a_training_grows_a_smaller_network_that_goes_on_saying_the_same(
             pairs = zip(grown.eval()(images[0]), net(images[0]), strict=True)
             assert max(float((a - b).abs().max()) for a, b in pairs) < 1e-3
         assert Trainer(config, lambda share, line: None).run().step == 1
+
+
+def test_channels_that_a_wide_head_gets_leave_what_it_says(tmp_path, images):
+    config = tiny(tmp_path / "first")
+    config = replace(config, net=replace(config.net, wide_kinds=True))
+    torch.manual_seed(2)
+    first = MarkingNet(config.net).eval()
+    state = Checkpoint(config=asdict(config), averaged=first.state_dict())
+    save_checkpoint(state, tmp_path / "first.pt")
+    larger = replace(config.net, added_kinds=8)
+    grown = MarkingNet(larger)
+    start = replace(config, net=larger, start=str(tmp_path / "first.pt"))
+    grown.load_state_dict(fresh_checkpoint(start).averaged)
+    with torch.inference_mode():
+        kinds = grown.eval()(images[0]).kinds
+        torch.testing.assert_close(kinds, first(images[0]).kinds, atol=1e-3, rtol=0)
+    assert len(grown.wide_kinds[0][-1][0].weight) == 24
+    save_checkpoint(Checkpoint(config=asdict(start), averaged=grown.state_dict()), tmp_path / "grown.pt")
+    with pytest.raises(ConfigError, match="holds the network"):
+        fresh_checkpoint(replace(config, start=str(tmp_path / "grown.pt")))
 
 
 def test_a_file_older_than_a_switch_holds_a_network_without_it(net):

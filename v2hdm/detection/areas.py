@@ -13,7 +13,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from v2hdm.catalogue import AREA, Catalogue
+from v2hdm.catalogue import Catalogue
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.network import NetworkOutput, as_probability
 from v2hdm.detection.quads.blobs import outlines_of
@@ -60,22 +60,23 @@ def find_areas(
     ``outline_seen`` is true for sides at which neither the image, nor its road, nor the vehicle's own mask
     cuts the paint.
     """
-    names = [name for name in catalogue.of_family(AREA) if name in output.classes]
-    if not names:
+    names = output.area_classes
+    # Most images show none: that is seen at once where no area is the likeliest anywhere.
+    if not names or not (output.areas.max(axis=0) > output.kinds.max(axis=0)).any():
         return []
     rows, columns = np.nonzero(output.paint > 0)
     is_in_reach = output.top + output.stride * (rows + 1) > reach_px
     rows = rows[is_in_reach]
     columns = columns[is_in_reach]
-    probability = output.class_probability(rows, columns)
+    probability = output.area_probability(rows, columns)
     best = probability.argmax(axis=0)
     of_group = {catalogue.classes[name].group for name in names}
-    is_alike = np.array([catalogue.classes[name].group in of_group for name in output.classes])[best]
+    all_names = (*names, *output.classes)
+    is_alike = np.array([catalogue.classes[name].group in of_group for name in all_names])[best]
     alike = np.zeros(output.paint.shape, dtype=np.uint8)
     alike[rows[is_alike], columns[is_alike]] = 1
     areas = []
-    for name in names:
-        number = output.classes.index(name)
+    for number, name in enumerate(names):
         is_of_class = best == number
         if np.count_nonzero(is_of_class) < _LEAST_CELLS:
             continue

@@ -35,6 +35,7 @@ _log = logging.getLogger(__name__)
 Markings = tuple[MarkingDetection, ...]
 
 _NO_PAINT = -20.0  # log odds of paint where the vehicle itself is
+_PART_SHARE = 0.5  # share of an area in a marking from which it is a part of that; chosen
 
 
 class Detector:
@@ -96,7 +97,7 @@ class Detector:
             quads = find_markings(readings, proposals.camera, self.options)
         markings = _likelier(quads, self._symbols(image_bgr, proposals))
         with lap("areas"):
-            areas = self._areas(proposals)
+            areas = _of_several(self._areas(proposals), markings)
         return (*_not_of(areas, markings), *areas), lanes
 
     def run_network(self, image_bgr: np.ndarray, camera: Camera, top: int | None = None) -> NetworkOutput:
@@ -213,6 +214,19 @@ class Detector:
                 symbols.append(symbol)
                 parts_until = after
         return symbols
+
+
+def _of_several(areas: Sequence[MarkingDetection], markings: Markings) -> list[MarkingDetection]:
+    """The areas that lie in no marking: what names a part of an arrow a word does not make it one."""
+    shapes = [marking.outline_px if len(marking.outline_px) else marking.corners_px for marking in markings]
+    hulls = [cv2.convexHull(shape_px.astype(np.float32)) for shape_px in shapes]
+
+    def is_part(area: MarkingDetection) -> bool:
+        outline = area.outline_px.astype(np.float32)
+        common_px2 = [cv2.intersectConvexConvex(outline, hull)[0] for hull in hulls]
+        return max(common_px2, default=0.0) > _PART_SHARE * cv2.contourArea(outline)
+
+    return [area for area in areas if not is_part(area)]
 
 
 def _not_of(areas: Sequence[MarkingDetection], markings: Markings) -> Markings:

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 import onnxruntime
 
-from v2hdm.catalogue import SHIPPED, Catalogue
+from v2hdm.catalogue import AREA, SHIPPED, Catalogue
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.weights import NETWORK_FILE
 from v2hdm.errors import ConfigError, DetectorError, one_line
@@ -91,14 +91,49 @@ class AnchorRow:
 
 @dataclass(frozen=True)
 class NetworkOutput:
-    """The network's output, as :class:`RawOutput`, on the rows of an image that show road."""
+    """The network's output, as :class:`RawOutput`, on the rows of an image that show road.
+
+    Areas are asked for apart: the other classes share what is paint among themselves, as if there were none.
+    A stroke of a letter may be a dash as well, and a network that learns areas later says of all else what it
+    said before.
+    """
 
     paint: np.ndarray
-    kinds: np.ndarray
+    kinds: np.ndarray  # (K, h', w') logits of the classes that are no areas
     anchors: list[AnchorRow]  # from near to far
     classes: tuple[str, ...]  # of ``kinds``
     stride: int  # px per element of paint
     top: int  # the first image row
+    areas: np.ndarray  # (A, h', w') logits of the areas' classes
+    area_classes: tuple[str, ...]
+
+    @classmethod
+    def of(
+        cls,
+        paint: np.ndarray,
+        logits: np.ndarray,
+        anchors: list[AnchorRow],
+        classes: Sequence[str],
+        stride: int,
+        top: int,
+        catalogue: Catalogue = SHIPPED,
+    ) -> NetworkOutput:
+        """The output whose ``logits`` (K + A, h', w') are of ``classes`` in any order."""
+        of_areas = catalogue.of_family(AREA)
+        is_area = np.isin(classes, of_areas)
+        # A view of the others where the areas come last, as in the shipped catalogue.
+        count = int(np.count_nonzero(~is_area))
+        kinds = logits[~is_area] if is_area[:count].any() else logits[:count]
+        return cls(
+            paint=paint,
+            kinds=kinds,
+            anchors=anchors,
+            classes=tuple(name for name in classes if name not in of_areas),
+            stride=stride,
+            top=top,
+            areas=logits[is_area],
+            area_classes=tuple(name for name in classes if name in of_areas),
+        )
 
     @cached_property
     def kind_scale(self) -> float:
@@ -112,6 +147,7 @@ class NetworkOutput:
             self,
             paint=self.paint[first:],
             kinds=self.kinds[:, round(first / self.kind_scale) :],
+            areas=self.areas[:, round(first / self.kind_scale) :],
             anchors=[anchor for anchor in self.anchors if anchor.v_px >= row],
             top=self.top + first * self.stride,
         )
@@ -122,22 +158,26 @@ class NetworkOutput:
         return np.asarray(np.clip(odds, -_MOST_ODDS, _MOST_ODDS)).reshape(points_px.shape[:-1])
 
     def shares_at(self, points_px: FloatArray) -> np.ndarray:
-        """Probability of each of the classes, were it paint, at recorded px (M, ..., 2): (K, M, ...)."""
+        """Probability of each of ``classes``, were it paint, at recorded px (M, ..., 2): (K, M, ...)."""
         odds = self._sample(self.kinds, self.stride * self.kind_scale, points_px)
         odds -= odds.max(axis=0)
         odds = np.asarray(cv2.exp(odds.reshape(len(odds), -1)))
         return np.asarray(odds / odds.sum(axis=0)).reshape((len(odds), *points_px.shape[:-1]))
 
     def class_probability(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Probability (K, N) of each class at elements of ``paint``."""
+        """Probability (K, N) of each of ``classes`` at elements of ``paint``."""
+        return _softmax(self._logits_at(self.kinds, rows, columns))
+
+    def area_probability(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Probability (A + K, N) of areas and, after them, of other classes at elements of ``paint``."""
+        planes = (self.areas, self.kinds)
+        return _softmax(np.concatenate([self._logits_at(logits, rows, columns) for logits in planes]))
+
+    def _logits_at(self, logits: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Logits (C, N) of planes like ``kinds`` at elements of ``paint``."""
         scale = self.kind_scale
-        width = self.kinds.shape[2]
-        place = (rows / scale).astype(np.intp) * width + (columns / scale).astype(np.intp)
-        odds = self.kinds.reshape(len(self.kinds), -1).take(place, axis=1)
-        odds -= odds.max(axis=0)
-        np.exp(odds, out=odds)
-        odds /= odds.sum(axis=0)
-        return np.asarray(odds)
+        place = (rows / scale).astype(np.intp) * logits.shape[2] + (columns / scale).astype(np.intp)
+        return np.asarray(logits.reshape(len(logits), -1).take(place, axis=1))
 
     def _sample(self, planes: np.ndarray, stride: float, points_px: FloatArray) -> np.ndarray:
         """Values (K, M, N) of planes (K, h, w), elements ``stride`` px apart, at recorded px (M, ..., 2)."""
@@ -228,7 +268,15 @@ def run_on_road(
     # way round: the network knows of the view alone.
     if camera.aside and set(SEEN_ACROSS) <= set(info.classes):
         kinds = kinds[[info.classes.index(SEEN_ACROSS.get(name, name)) for name in info.classes]]
-    return NetworkOutput(paint, kinds, anchors, info.classes, info.paint_stride, top)
+    return NetworkOutput.of(paint, kinds, anchors, info.classes, info.paint_stride, top, info.catalogue)
+
+
+def _softmax(logits: np.ndarray) -> np.ndarray:
+    """Probabilities (C, N) of logits, in their place."""
+    logits -= logits.max(axis=0)
+    np.exp(logits, out=logits)
+    logits /= logits.sum(axis=0)
+    return logits
 
 
 def _run_twice(network: Network, image_bgr: np.ndarray) -> RawOutput:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,25 +29,44 @@ from v2hdm.records import FloatArray, PoseNoise
 
 @dataclass(frozen=True)
 class _Error:
-    """An error of the clock: ``share`` (J,) of it at each frame, and its prior standard deviation, s."""
+    """An error of the clock: ``share`` (J,) of it at each frame."""
 
     share: FloatArray
-    sigma_s: float
     is_drift: bool = False
 
 
-def moves_with_clocks(problem: Problem, solution: Solution, noises: Sequence[PoseNoise]) -> Moves | None:
+class ClockEvidence(NamedTuple):
+    """Evidence of observations on the n errors of clocks: ``information`` (n, n) and ``score`` (n,)."""
+
+    information: FloatArray
+    score: FloatArray
+
+
+class ClockErrors(NamedTuple):
+    """The errors of clocks as a whole drive shows them, of which a problem is a part.
+
+    ``root`` (n, n) is one of their second moments, ``rising`` (J,) the share of a drift at each frame.
+    """
+
+    root: FloatArray
+    rising: FloatArray
+
+
+def moves_with_clocks(
+    problem: Problem, solution: Solution, noises: Sequence[PoseNoise], known: ClockErrors | None = None
+) -> Moves | None:
     """Motion of a solution under the errors of the clock that drive and prior leave open, one column each.
 
-    ``noises`` are those of the sessions' poses. None where the clock is stated to be right, or nothing moves.
+    ``noises`` are those of the sessions' poses; what is ``known`` of the errors comes from the observations
+    unless it is stated. None where the clock is stated to be right, or nothing moves.
     """
     twist = problem.twist_vehicle
-    errors = list(_errors(problem, noises))
+    errors = list(_errors(problem, noises, None if known is None else known.rising))
     if not errors or twist is None:
         return None
     solved = Sensitivity.at(solution.covariance.whitening)
     late = [lateness(problem, error.share, is_drift=error.is_drift) for error in errors]
-    root = _root(solved, late, np.array([error.sigma_s for error in errors]))
+    root = second_moments([_evidence(solved, late)], noises) if known is None else known.root
     columns = [hypothesis.column(solved)["observations"].flatten().cpu().numpy() for hypothesis in late]
     moved = solved.moves(np.stack(columns, axis=1))
     # A pose is where the vehicle was at the stamp: it errs by the way until the exposure, too.
@@ -54,27 +74,46 @@ def moves_with_clocks(problem: Problem, solution: Solution, noises: Sequence[Pos
     return Moves(moved.corners @ root, moved.extrinsic @ root, (of_way + moved.poses) @ root)
 
 
-def _errors(problem: Problem, noises: Sequence[PoseNoise]) -> Iterator[_Error]:
+def clock_evidence(
+    problem: Problem, solution: Solution, noises: Sequence[PoseNoise], rising: FloatArray
+) -> ClockEvidence | None:
+    """The evidence of a problem, part of a drive, on its clocks; None where these are stated to be right."""
+    errors = list(_errors(problem, noises, rising))
+    if not errors or problem.twist_vehicle is None:
+        return None
+    solved = Sensitivity.at(solution.covariance.whitening)
+    return _evidence(solved, [lateness(problem, error.share, is_drift=error.is_drift) for error in errors])
+
+
+def second_moments(evidence: Sequence[ClockEvidence], noises: Sequence[PoseNoise]) -> FloatArray:
+    """Root (n, n) of the second moments of the errors, s, under prior and the evidence of all parts."""
+    sigma_s = [sigma for noise in noises for sigma in (noise.clock_s, noise.clock_drift_s) if sigma > 0]
+    information = np.sum([part.information for part in evidence], axis=0)
+    score = np.sum([part.score for part in evidence], axis=0)
+    covariance = np.linalg.inv(np.diag(np.array(sigma_s) ** -2.0) + information)
+    mean = covariance @ score
+    return np.asarray(np.linalg.cholesky(covariance + np.outer(mean, mean)), dtype=np.float64)
+
+
+def _errors(
+    problem: Problem, noises: Sequence[PoseNoise], rising: FloatArray | None = None
+) -> Iterator[_Error]:
     """Lateness and drift of each session's clock, as far as they may differ from zero."""
     for session, noise in enumerate(noises):
         is_own = problem.session_of_frame == session
-        rising = np.zeros(len(is_own))
-        rising[is_own] = np.linspace(-0.5, 0.5, int(is_own.sum()))
-        if noise.clock_s > 0 and is_own.any():
-            yield _Error(is_own.astype(np.float64), noise.clock_s)
-        if noise.clock_drift_s > 0 and is_own.any():
-            yield _Error(rising, noise.clock_drift_s, is_drift=True)
+        drift = np.zeros(len(is_own))
+        drift[is_own] = np.linspace(-0.5, 0.5, int(is_own.sum())) if rising is None else rising[is_own]
+        if noise.clock_s > 0:
+            yield _Error(is_own.astype(np.float64))
+        if noise.clock_drift_s > 0:
+            yield _Error(drift, is_drift=True)
 
 
-def _root(solved: Sensitivity, late: Sequence[Hypothesis], sigma_s: FloatArray) -> FloatArray:
-    """Root (n, n) of the second moments of the errors, s, under their prior sigmas (n,) and the observations.
-
-    The observations tell the less, the larger their noise is than the stated one.
-    """
+def _evidence(solved: Sensitivity, late: Sequence[Hypothesis]) -> ClockEvidence:
+    """The observations' evidence: the less, the larger their noise is than the stated one."""
     efficient = solved.efficient_columns([hypothesis.column(solved) for hypothesis in late])
     multiple = noise_multiples(late, solved)
-    information = efficient @ efficient.T / np.sqrt(np.outer(multiple, multiple))
-    score = -efficient @ solved.flat(solved.residuals) / multiple
-    covariance = np.linalg.inv(np.diag(sigma_s**-2.0) + information)
-    mean = covariance @ score
-    return np.asarray(np.linalg.cholesky(covariance + np.outer(mean, mean)), dtype=np.float64)
+    return ClockEvidence(
+        information=efficient @ efficient.T / np.sqrt(np.outer(multiple, multiple)),
+        score=-efficient @ solved.flat(solved.residuals) / multiple,
+    )

@@ -12,7 +12,7 @@ from v2hdm.adjust.covariance import Moves
 from v2hdm.association.ground import Located, Views, easy_views, images_with_line, images_with_symbol, locate
 from v2hdm.association.groups import fuse_groups, group_kinds
 from v2hdm.association.sightings import Rig, Sightings
-from v2hdm.faults.clock_errors import moves_with_clocks
+from v2hdm.faults.clock_errors import ClockErrors, moves_with_clocks
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.io.maps.corrections import Heard
 from v2hdm.mapping.bundle import Bundle
@@ -194,12 +194,20 @@ def proposed(solve: FinalSolve) -> Proposed:
     )
 
 
-def concluded(solve: FinalSolve, classified: Classified, noises: Sequence[PoseNoise] = ()) -> Optimised:
-    """The result of the final solve, whose candidates are ``classified``; see :func:`conclude`."""
+def concluded(
+    solve: FinalSolve,
+    classified: Classified,
+    noises: Sequence[PoseNoise] = (),
+    clocks: ClockErrors | None = None,
+) -> Optimised:
+    """The result of the final solve, whose candidates are ``classified``; see :func:`conclude`.
+
+    ``clocks`` is what a drive says of its clocks, where the solve is a part of it.
+    """
     bundle = solve.bundle
     sightings = solve.sightings
     scale = bundle.solution.variance_scale
-    by_clock = _by_clock(bundle, noises)
+    by_clock = _by_clock(bundle, noises, clocks)
     markings = classified.markings()
     clock_m = None
     if by_clock is not None:
@@ -231,11 +239,11 @@ def concluded(solve: FinalSolve, classified: Classified, noises: Sequence[PoseNo
     )
 
 
-def _by_clock(bundle: Bundle, noises: Sequence[PoseNoise]) -> Moves | None:
+def _by_clock(bundle: Bundle, noises: Sequence[PoseNoise], clocks: ClockErrors | None) -> Moves | None:
     """What the clocks may move a solution by; its scale is of residuals, and none of the clocks."""
     if not noises:
         return None
-    moves = moves_with_clocks(bundle.problem, bundle.solution, noises)
+    moves = moves_with_clocks(bundle.problem, bundle.solution, noises, clocks)
     root = bundle.solution.variance_scale**-0.5
     return None if moves is None else Moves(*(root * part for part in vars(moves).values()))
 

@@ -102,15 +102,20 @@ def without_worse(result: MethodResult, asked: str, corrections: Sequence[Correc
         return result
     markings = tuple(marking for marking in hd_map.markings if objection(marking) is None)
     symbols = tuple(symbol for symbol in hd_map.symbols if objection(symbol) is None)
-    kept_ids = [marking.id or 0 for marking in markings]
+    result = replace(result, excluded=(*result.excluded, *excluded))
+    return _with_fewer_markings(result, replace(hd_map, markings=markings, symbols=symbols))
+
+
+def _with_fewer_markings(result: MethodResult, hd_map: HDMap) -> MethodResult:
+    """The result with a map some of whose markings are gone; the others have the ids that they had."""
+    kept_ids = [marking.id or 0 for marking in hd_map.markings]
     residuals = result.residuals
     if residuals is not None:
         is_kept = np.isin(residuals.marking, kept_ids)
         residuals = replace(residuals, marking=np.where(is_kept, residuals.marking, 0))
     return replace(
         result,
-        hd_map=replace(hd_map, markings=markings, symbols=symbols),
-        excluded=(*result.excluded, *excluded),
+        hd_map=hd_map,
         residuals=residuals,
         suspicions=[suspicion for suspicion in result.suspicions if suspicion.marking in kept_ids],
         joint_covariance=None,  # it numbers the markings as they were
@@ -118,18 +123,27 @@ def without_worse(result: MethodResult, asked: str, corrections: Sequence[Correc
 
 
 def with_composed(methods: CameraSets, goal_m: float) -> CameraSets:
-    """Results whose best maps hold crosswalks and double lines, too, with grades by ``goal_m``."""
-    from v2hdm.site.composed import composed  # heavy for those who only check a drive
-
+    """Results whose best maps hold crosswalks, double lines and give-way lines, with grades by ``goal_m``."""
     return {
         name: {
-            method: result
-            if method != BEST
-            else replace(result, hd_map=graded(composed(result.hd_map), goal_m))
+            method: result if method != BEST else _composed(result, goal_m)
             for method, result in by_method.items()
         }
         for name, by_method in methods.items()
     }
+
+
+def _composed(result: MethodResult, goal_m: float) -> MethodResult:
+    """One result of :func:`with_composed`."""
+    from v2hdm.site.composed import composed  # heavy for those who only check a drive
+
+    hd_map = composed(result.hd_map)
+    if len(hd_map.markings) == len(result.hd_map.markings):
+        return replace(result, hd_map=graded(hd_map, goal_m))
+    # Give-way lines took the place of their pieces: the others keep the ids that they would have had.
+    ids = [feature.id for feature in features_of(result.hd_map)]
+    hd_map = composed(_with_ids(result.hd_map, ids))
+    return _with_fewer_markings(result, graded(hd_map, goal_m))
 
 
 def _with_ids(hd_map: HDMap, ids: list[int]) -> HDMap:

@@ -1,7 +1,7 @@
-"""Markings composed of others: crosswalks of parallel bars, and double lines of two lane lines.
+"""Markings composed of others: crosswalks of parallel bars, double lines of two lane lines, give-way lines.
 
 The network has no class of them. A crosswalk's bars stay markings of the map, as its parts; a double line
-takes the place of its two lines where they run beside each other.
+takes the place of its two lines where they run beside each other, a give-way line that of its pieces.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from dataclasses import replace
 from itertools import count
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from v2hdm.geometry.planar import length_along, turned_left
 from v2hdm.geometry.rows import outline_of_row, rows_of_bars
@@ -26,6 +25,8 @@ from v2hdm.records import (
     Marking,
     Symbol,
 )
+from v2hdm.site.give_way import with_give_way_lines
+from v2hdm.site.joint import joint_covariance
 
 APART_M = (0.15, 0.5)
 """Distance between the centres of a double line's two lines, m: gaps of .08 to .35 m (RMS-1 4.1, MUTCD 3A.06)
@@ -37,7 +38,8 @@ _STEP_M = 0.5  # distance between the vertices of a double line, m
 
 
 def composed(hd_map: HDMap) -> HDMap:
-    """The map with crosswalks of its bars and double lines of its lines; known crosswalks keep their ids."""
+    """The map with crosswalks, double lines and give-way lines; known crosswalks keep their ids."""
+    hd_map = with_give_way_lines(hd_map)
     places = [k for k, marking in enumerate(hd_map.markings) if marking.kind == CROSSWALK_BAR]
     corners = np.array([hd_map.markings[k].corners_map for k in places]).reshape(-1, 4, 2)
     rows = rows_of_bars(corners)
@@ -63,7 +65,7 @@ def _free_ids(hd_map: HDMap) -> Iterator[int]:
 def _crosswalk(bars: Sequence[Marking], earlier: Sequence[Symbol]) -> Symbol:
     """The crosswalk of bars in order, with the id of the one of ``earlier`` crosswalks about its middle."""
     outline = outline_of_row(np.array([bar.corners_map for bar in bars]))
-    covariance_m2 = _joint(bars)
+    covariance_m2 = joint_covariance(bars)
     if covariance_m2 is not None:
         covariance_m2 = outline.by_corner @ covariance_m2 @ outline.by_corner.T
     heights = [bar.heights_m for bar in bars if bar.heights_m is not None]
@@ -82,28 +84,6 @@ def _crosswalk(bars: Sequence[Marking], earlier: Sequence[Symbol]) -> Symbol:
         covariance_m2=covariance_m2,
         parts=tuple(bar.id or 0 for bar in bars),
     )
-
-
-def _joint(bars: Sequence[Marking]) -> FloatArray | None:
-    """Joint covariance (8N, 8N) of the corners of N bars, None where one bar has none.
-
-    Neighbours share the error of their centres, all but its ``relative_sigma_m``: it shifts all bars alike.
-    """
-    covariances = [bar.covariance_m2 for bar in bars if bar.covariance_m2 is not None]
-    if len(covariances) < len(bars):
-        return None
-    centre_m2 = np.mean([whole.reshape(4, 2, 4, 2).mean(axis=(0, 2)) for whole in covariances], axis=0)
-    relative_m2 = float(np.mean([(bar.relative_sigma_m or 0.0) ** 2 for bar in bars]))
-    values, vectors = np.linalg.eigh(centre_m2 - relative_m2 * np.eye(2))
-    shared_m2 = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    by_bar = block_diag(*(_without(whole, shared_m2) for whole in covariances))
-    return np.asarray(by_bar + np.tile(shared_m2, (4 * len(bars), 4 * len(bars))))
-
-
-def _without(covariance_m2: FloatArray, shared_m2: FloatArray) -> FloatArray:
-    """The covariance (8, 8) less a shift (2, 2) of all corners, and never less than nothing."""
-    values, vectors = np.linalg.eigh(covariance_m2 - np.tile(shared_m2, (4, 4)))
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
 def with_double_lines(lanes: Sequence[Lane]) -> tuple[Lane, ...]:

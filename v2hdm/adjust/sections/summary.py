@@ -116,20 +116,20 @@ def _corner_columns(whitening: Whitening, corners: Tensor) -> Columns:
     """Columns of corners (m,), ascending and closed."""
     tip = whitening.reduced_factor.tip
     reduced = [tip.new_zeros(whitening.reduced_factor.size, 0)]
-    own = tip.new_zeros(2 * len(corners), 2 * len(corners))
+    of_corners = tip.new_zeros(2 * len(corners), 2 * len(corners))
     for begin, end in _chunks(whitening, corners):
         chosen = corners[begin:end]
         factors = _factors(whitening, chosen)
-        own[2 * begin : 2 * end, 2 * begin : 2 * end] = factors.own
+        of_corners[2 * begin : 2 * end, 2 * begin : 2 * end] = factors.by_variable
         reduced.append(-reduced_root(whitening, chosen) @ factors.inverse)
-    return Columns(torch.cat(reduced, dim=1), own)
+    return Columns(torch.cat(reduced, dim=1), of_corners)
 
 
 class _Factors(NamedTuple):
     """Of n corners: V^-1 (2 n, 2 n), and the columns (2 n, 2 n) of their own variables."""
 
     inverse: Tensor
-    own: Tensor
+    by_variable: Tensor
 
 
 def _factors(whitening: Whitening, corners: Tensor) -> _Factors:
@@ -138,9 +138,9 @@ def _factors(whitening: Whitening, corners: Tensor) -> _Factors:
     factor = whitening.linearised.corner_factor.take(corners)
     lower = factor.solve(unit)
     inverse = factor.solve_transposed(lower).flatten(0, 1)
-    own = lower.flatten(0, 1)
-    own[torch.isin(corners, whitening.plan.kept_corners).repeat_interleave(2)] = 0.0
-    return _Factors(inverse, own)
+    by_variable = lower.flatten(0, 1)
+    by_variable[torch.isin(corners, whitening.plan.kept_corners).repeat_interleave(2)] = 0.0
+    return _Factors(inverse, by_variable)
 
 
 def _chunks(whitening: Whitening, corners: Tensor) -> list[tuple[int, int]]:
@@ -292,7 +292,7 @@ class JoinedCovariance(Covariance):
             places = torch.searchsorted(self.border.corners, corners[shared])
             at = _axes(places) + regression.shape[1] - len(self._columns.own)
             block = self._columns.own[:, _axes(places)]
-            regression[rows[:, None], at] += factors.own[:, rows][rows].mT @ block[_axes(places)]
+            regression[rows[:, None], at] += factors.by_variable[:, rows][rows].mT @ block[_axes(places)]
         place = _axes(torch.searchsorted(corners, chosen.contiguous()))
         of_group = regression[place]
         return np.asarray(of_part + (of_group @ self._gained @ of_group.mT).cpu().numpy())

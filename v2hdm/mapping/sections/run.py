@@ -29,6 +29,7 @@ from v2hdm.adjust.sections.solve import GAP, Joint, Shape, finish_parts, join_pa
 from v2hdm.association.sightings import Sightings, frames_of
 from v2hdm.errors import WorkerError
 from v2hdm.executor import Executor
+from v2hdm.faults.clock_errors import second_moments
 from v2hdm.io.maps.corrections import Heard
 from v2hdm.lanes.lines import join_paths, lanes_along
 from v2hdm.mapping.bundle import LEAST_OBSERVATIONS, VARIANCE_FACTORS, Model, drive_problem, full_model
@@ -109,8 +110,12 @@ def map_in_sections(
     )
     del sections
     solved = _joint_solves(run, drive, part, alone)
-    heard = _classified(run, solved, options.acceptance)
-    finished: list[Finished] = run.finish(solved, solved.work.finish)
+    proposals: list[Proposal] = run.finish(solved, solved.work.propose)
+    heard = _classified(run, solved, proposals, options.acceptance)
+    of_clocks = [proposal.clock for proposal in proposals if proposal.clock is not None]
+    clock_root = second_moments(of_clocks, drive.noises) if of_clocks else None
+    del proposals
+    finished: list[Finished] = run.finish(solved, replace(solved.work, clock_root=clock_root).finish)
     result = merged([section.result for section in finished], drive, own_images)
     assert result.evidence is not None
     lanes = lanes_along(join_paths([path for section in finished for path in section.lanes]), options.lanes)
@@ -203,9 +208,15 @@ def _join(run: _Run, work: Work, drive: Drive, part: IntArray, gap: float) -> tu
     assert work.model is not None
     whole = _without_sightings(drive, work.cameras, work.model)
     chains = chains_of(whole, part, tuple(work.model.solver.pose_states))
+    session = whole.session_of_frame
+    rising = np.zeros(len(session))
+    for number in range(whole.session_count):
+        in_session = session == number
+        rising[in_session] = np.linspace(-0.5, 0.5, int(in_session.sum()))
     for number in range(run.count):
         frames = np.flatnonzero(part == number)
-        work.write("ends", number, Ends(chains.is_start[frames], chains.in_border[frames]))
+        ends = Ends(chains.is_start[frames], chains.in_border[frames], rising[frames])
+        work.write("ends", number, ends)
     run.all(work.cut, "cut sections")
     shape = Shape.of(whole, work.model.solver)
     joint = join_parts(
@@ -215,9 +226,10 @@ def _join(run: _Run, work: Work, drive: Drive, part: IntArray, gap: float) -> tu
     return joint.results, joint, shape
 
 
-def _classified(run: _Run, solved: _Solved, acceptance: AcceptanceOptions) -> tuple[Heard, ...]:
+def _classified(
+    run: _Run, solved: _Solved, proposals: Sequence[Proposal], acceptance: AcceptanceOptions
+) -> tuple[Heard, ...]:
     """Classify the candidates of all sections together, and tell every section of its own."""
-    proposals: list[Proposal] = run.finish(solved, solved.work.propose)
     count = np.array([len(proposal.kinds) for proposal in proposals])
     batches = max(-(-int(count.sum()) // _CLASSIFIED_AT_ONCE), 1)
     batch = (np.cumsum(count) - count) * batches // max(int(count.sum()), 1)

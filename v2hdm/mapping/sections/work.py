@@ -18,6 +18,7 @@ from v2hdm.adjust.sections.solve import save_part
 from v2hdm.adjust.selection import busiest
 from v2hdm.association.groups import known_elsewhere
 from v2hdm.errors import AdjustError, MappingError
+from v2hdm.faults.clock_errors import ClockErrors, ClockEvidence, clock_evidence
 from v2hdm.geometry.twists import vehicle_twists
 from v2hdm.lanes.lines import Path as LanePath
 from v2hdm.lanes.lines import paths_of
@@ -50,10 +51,14 @@ FINAL = "final"
 
 
 class Ends(NamedTuple):
-    """Of a section's own frames: whose states no frame before predicts, and which a link has."""
+    """Of a section's own frames: whose states no frame before predicts, and which a link has.
+
+    ``rising`` is the share of a drift at each, from -1/2 to 1/2 over its session.
+    """
 
     is_start: BoolArray
     is_linked: BoolArray
+    rising: FloatArray
 
 
 class Proposal(NamedTuple):
@@ -62,6 +67,7 @@ class Proposal(NamedTuple):
     solved: Candidates
     kinds: tuple[str, ...]
     parallax: Parallax
+    clock: ClockEvidence | None  # what the section says of the clocks
 
 
 class Places(NamedTuple):
@@ -84,7 +90,7 @@ class Work:
     """The steps of a section, whose files are in ``folder``.
 
     ``model`` is that of the joint solve, ``pose_model`` its name, ``chi2_per_dof`` how it fits; ``fullest``
-    is the section of most observations.
+    is the section of most observations, ``clock_root`` what all say of the errors of clocks.
     """
 
     detections_of: DetectionsOf
@@ -97,6 +103,7 @@ class Work:
     pose_model: str = ""
     chi2_per_dof: float = 1.0
     fullest: int = 0
+    clock_root: FloatArray | None = None
 
     def write(self, name: str, number: int, content: object) -> None:
         """Write what a section, or all together, leave for later steps of it."""
@@ -271,6 +278,9 @@ class Work:
             solved=proposal.solved.subset(ours),
             kinds=tuple(final.sightings.kinds[kind] for kind in proposal.kind[ours].tolist()),
             parallax=proposal.parallax.subset(ours),
+            clock=clock_evidence(
+                part.problem, solution, section.drive.noises, self.read("ends", number).rising
+            ),
         )
 
     def _final(self, number: int) -> FinalSolve:
@@ -310,7 +320,13 @@ class Work:
         joint = replace(bundle.solution, covariance=solution.covariance)
         bundle = replace(bundle, solution=joint)
         final = replace(final, bundle=bundle)
-        optimised = concluded(final, self.read("classified", number), section.drive.noises)
+        noises = section.drive.noises
+        clocks = None
+        if self.clock_root is None:
+            noises = ()
+        else:
+            clocks = ClockErrors(self.clock_root, self.read("ends", number).rising)
+        optimised = concluded(final, self.read("classified", number), noises, clocks)
         evidence = replace(
             examined.evidence,
             pose_model=self.pose_model,
@@ -338,10 +354,8 @@ class Work:
         assert residuals is not None
         images = section.drive.images
         own_paths = {images[image].path for image in np.flatnonzero(section.is_own).tolist()}
-        is_seen = np.zeros_like(poses.seen)
-        is_seen[bundle.problem.observations.frame] = True
-        seen = np.zeros_like(poses.seen)
-        seen[section.own_frames] = is_seen[: len(section.own_frames)]
+        has_marking = np.zeros_like(poses.seen)
+        has_marking[section.own_frames[np.unique(bundle.problem.observations.frame)]] = True
         return replace(
             result,
             hd_map=replace(result.hd_map, symbols=symbols),
@@ -349,7 +363,7 @@ class Work:
             residuals=residuals.take(names.is_ours[bundle.group]),
             poses=replace(
                 poses,
-                seen=seen,
+                seen=has_marking,
                 frame={path: at for path, at in poses.frame.items() if path in own_paths},
             ),
         )
