@@ -56,6 +56,7 @@ def test_the_wheel_holds_the_library_with_its_data_and_nothing_else(released):
         "paper/claims.py",
         "paper/templates/experiment.md",
         "report/page/vendor/leaflet.js",
+        "report/page/templates/features.js",
         "report/page/templates/map.js",
     }
     assert {f"v2hdm/{name}" for name in needed} <= names

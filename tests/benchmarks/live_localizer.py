@@ -7,7 +7,8 @@ renders, drawn anew (:mod:`tests.benchmarks.made.live`). An odometry is off by 1
 For each drive: errors of the tracked poses, shares inside the 95 % ellipse and inside the bounds, CPU time of
 the localiser alone. Then starts from random places known to 5 m and 20 deg, and from nothing; a map of the
 other port; half of the markings repainted 30 cm off, from the start and from the middle on; a camera that was
-pushed by half a degree about each axis.
+pushed by half a degree about each axis, and one that turns by half a degree within a minute. That a map
+was repainted is timed from when the first marking that was lies within 10 m of the vehicle.
 """
 
 from __future__ import annotations
@@ -20,13 +21,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tests.benchmarks.made.live import LiveDrive, bumped, drive, looks_of, moved, port_recipe
+from tests.benchmarks.made.live import LiveDrive, bumped, drive, looks_of, moved, port_recipe, turning
 from v2hdm.geometry.planar import wrapped
 from v2hdm.geometry.rigid import heading_rad
 from v2hdm.localization.localizer import Localizer, Pose, Status
 from v2hdm.localization.places import Prior, rough_position
 from v2hdm.localization.seeing import Look
-from v2hdm.records import FloatArray, HDMap
+from v2hdm.records import FloatArray, HDMap, Marking
 
 PORTS = ("port1", "port2")
 _ROUGH_M, _ROUGH_RAD = 5.0, np.deg2rad(20.0)
@@ -34,6 +35,8 @@ _SQUARE_95 = 5.991  # chi-square quantile of two coordinates
 _WRONG_M = 0.3  # a tracked pose so far off is confidently wrong
 _START_FRAMES = 30
 _PUSHED_RAD = np.deg2rad(0.5)
+_TURNS_S = 60.0  # time in which a camera turns slowly by that
+_NEAR_M = 10.0  # way in which a repainted map is to be said
 
 
 class Run(NamedTuple):
@@ -157,7 +160,7 @@ def repainted_line(driven: LiveDrive, rng: np.random.Generator, seed: int) -> st
     place = driven.map_from_vehicle[middle, :2, 3]
     ahead = driven.map_from_vehicle[middle, :2, 0]
     later = tuple(
-        new if (new.corners_map.mean(axis=0) - place) @ ahead > 0 else old
+        new if (new.corners_map.mean(axis=0) - place) @ ahead > 0 and _is_moved(new, old) else old
         for new, old in zip(hd_map.markings, driven.hd_map.markings, strict=True)
     )
     run_on = follow(
@@ -166,10 +169,23 @@ def repainted_line(driven: LiveDrive, rng: np.random.Generator, seed: int) -> st
     on = errors_of(driven, run_on)
     outside = sum(int((np.abs(own.errors) > own.bounds).any(axis=1).sum()) for own in (at_start, on))
     count = len(at_start.errors) + len(on.errors)
+    first = _first_near(driven, later)
     return (
         f"half repainted: from the start said after {said(run, 0):.1f} s; from the middle on after "
-        f"{said(run_on, middle):.1f} s; poses outside their bounds {outside} of {count}"
+        f"{said(run_on, first):.1f} s; poses outside their bounds {outside} of {count}"
     )
+
+
+def _is_moved(new: Marking, old: Marking) -> bool:
+    return not np.array_equal(new.corners_map, old.corners_map)
+
+
+def _first_near(driven: LiveDrive, markings: Sequence[Marking]) -> int:
+    """The first moment at which a marking that was moved lies near the vehicle."""
+    pairs = zip(markings, driven.hd_map.markings, strict=True)
+    places = np.array([new.corners_map.mean(axis=0) for new, old in pairs if new is not old])
+    offsets = driven.map_from_vehicle[:, None, :2, 3] - places[None]
+    return int((np.linalg.norm(offsets, axis=2) < _NEAR_M).any(axis=1).argmax())
 
 
 def pushed_line(driven: LiveDrive, rng: np.random.Generator, seed: int) -> str:
@@ -189,6 +205,30 @@ def pushed_line(driven: LiveDrive, rng: np.random.Generator, seed: int) -> str:
     return f"pushed by .5 deg about {'; '.join(parts)}"
 
 
+def slow_line(driven: LiveDrive, rng: np.random.Generator, seed: int) -> str:
+    """A camera that turns slowly, and how far it has turned when it is named; each axis."""
+    begin = len(driven.stamp_s) // 4
+    count = len(driven.stamp_s)
+    parts = []
+    for axis in range(3):
+        world = turning(driven.world, "front", begin, _PUSHED_RAD * np.eye(3)[axis], _TURNS_S)
+        looks = [*driven.looks[:begin], *looks_of(world, seed, range(begin, count))]
+        run = follow(driven, rough(driven, 0, rng), range(count), looks=looks)
+        errors = errors_of(driven, run)
+        outside = int((np.abs(errors.errors) > errors.bounds).any(axis=1).sum())
+        named = [frame for frame in run.frames if frame >= begin and run.poses[frame].turned]
+        text = f"{'xyz'[axis]}: not named"
+        if named:
+            turned = run.poses[named[0]].turned[0]
+            after_s = driven.stamp_s[named[0]] - driven.stamp_s[begin]
+            by_deg = np.degrees(_PUSHED_RAD) * after_s / _TURNS_S
+            since_s = turned.since_s - driven.stamp_s[begin]
+            what = f"{turned.camera} in {turned.angle}"
+            text = f"{'xyz'[axis]}: {what} at {by_deg:.2f} deg, began at {since_s:+.1f} s"
+        parts.append(f"{text}, outside {outside}")
+    return "slowly turning camera, " + "; ".join(parts)
+
+
 def main() -> None:
     """Run the benchmark and print its lines."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -196,7 +236,9 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--starts", type=int, default=40, help="of each drive")
-    parser.add_argument("--only", nargs="*", default=[], metavar="PART", help="starts, wrong, moved, pushed")
+    parser.add_argument(
+        "--only", nargs="*", default=[], metavar="PART", help="starts, wrong, moved, pushed, slow"
+    )
     parsed = parser.parse_args()
     parts, counts, cpu_s = [], 0, []
     totals = np.zeros((2, 3), dtype=int)
@@ -220,6 +262,8 @@ def main() -> None:
                 print(f"  {repainted_line(own, rng, seed)}", flush=True)
             if not only or "pushed" in only:
                 print(f"  {pushed_line(own, rng, seed)}", flush=True)
+            if not only or "slow" in only:
+                print(f"  {slow_line(own, rng, seed)}", flush=True)
     print(f"all: {tracking_line(parts, counts, float(np.mean(cpu_s)))}")
     print(
         f"starts from 5 m and 20 deg: {totals[0, 0]} right, {totals[0, 1]} wrong, {totals[0, 2]} none in 3 s"

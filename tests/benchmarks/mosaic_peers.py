@@ -22,8 +22,11 @@ import torch
 
 from v2hdm.detection.frames import read_bgr
 from v2hdm.io.drive import drive_of
-from v2hdm.mosaic.blend import Canvas, Lens, Shot, whole
+from v2hdm.io.maps.reading import read_geojson
+from v2hdm.mosaic.blend import whole
 from v2hdm.mosaic.result import MULTIPLE_PX, RESOLUTION_M, ground_of
+from v2hdm.mosaic.views import Canvas, Lens, Shot
+from v2hdm.store.names import MAP
 
 Undistort = Callable[[str, np.ndarray], np.ndarray]
 
@@ -53,7 +56,7 @@ def plain_loop(
             down * np.arange(rows, dtype=np.float32)[:, None] + constant
         )
         # Behind the camera nothing is trusted: a mirror image of it may seem so.
-        weight = np.where(third > 0, trusted * np.float32(np.linalg.det(px_from_part)) / third**3, 0)
+        weight = np.where(third > 0, trusted * (np.float32(np.linalg.det(px_from_part)) / third**3) ** 2, 0)
         part = np.s_[row : row + rows, column : column + columns]
         sums[part] += weight[..., None] * colours
         weights[part] += weight
@@ -98,7 +101,8 @@ def main() -> None:
     parsed = parser.parse_args()
     torch.set_num_threads(parsed.threads)
     cv2.setNumThreads(parsed.threads)
-    ground = ground_of(parsed.result, drive_of(parsed.result, None), parsed.resolution)
+    hd_map = read_geojson(parsed.result / MAP)
+    ground = ground_of(parsed.result, drive_of(parsed.result, None), parsed.resolution, hd_map)
     shots, lenses = ground.after[: parsed.images], ground.lenses
     seen = np.concatenate([shot.outline_map(lenses[shot.camera]) for shot in shots])
     canvas = Canvas.around(seen, parsed.resolution, MULTIPLE_PX)

@@ -14,8 +14,9 @@ from tests.faults.cases import picture
 from tests.faults.judge import DATE, Case, judge, judge_again
 from v2hdm.errors import MapFileError
 from v2hdm.io.maps.geopackage import write_geopackage
-from v2hdm.mosaic.blend import Canvas, Sheet
+from v2hdm.mosaic.blend import Sheet
 from v2hdm.mosaic.result import geotiff
+from v2hdm.mosaic.views import Canvas
 
 pytestmark = pytest.mark.skipif(why_not() is not None, reason=str(why_not()))
 

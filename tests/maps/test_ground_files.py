@@ -19,8 +19,9 @@ from v2hdm.geometry.rigid import exp
 from v2hdm.io.maps.formats import write_map
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.trajectory import write_tum
-from v2hdm.mosaic.blend import Canvas, Sheet
+from v2hdm.mosaic.blend import Sheet
 from v2hdm.mosaic.result import geotiff
+from v2hdm.mosaic.views import Canvas
 from v2hdm.records import Trajectory
 
 QGIS = """
@@ -144,8 +145,8 @@ def test_the_ground_as_points_has_heights_and_the_paint_where_it_is(result, monk
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["mosaic.tif", "--format", "gpkg"], "its other format is pcd"),
-        (["mosaic.tif", "--format", "pcd", "--crs", "local"], "in the map's own frame"),
+        (["mosaic.tif", "--format", "gpkg"], "its other formats are pcd, pmtiles, xyz"),
+        (["mosaic.tif", "--format", "pcd", "--crs", "local"], "points are in the map's own frame"),
         (["broken.tif", "--format", "pcd"], "broken.tif: not a readable GeoTIFF"),
         (["pipe.tif", "--format", "pcd"], "pipe.tif: not a readable GeoTIFF (no such file)"),
         (["huge.tif", "--format", "pcd"], "huge.tif: has more pixels than its bytes could hold"),

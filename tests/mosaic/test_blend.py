@@ -11,8 +11,9 @@ from v2hdm.errors import DriveError
 from v2hdm.geometry.ipm import apply_homography
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.rigid import camera_centre, inverse
-from v2hdm.mosaic import blend as module
-from v2hdm.mosaic.blend import FEATHER, Canvas, Shot, adjusted_shots, lens_of, recorded_shots, whole
+from v2hdm.mosaic import blend, warp
+from v2hdm.mosaic.blend import whole
+from v2hdm.mosaic.views import FEATHER, REACH_M, Canvas, Shot, adjusted_shots, lens_of, recorded_shots
 from v2hdm.records import Calibration
 
 
@@ -72,13 +73,14 @@ def test_ground_that_rises_is_shown_where_it_lies(tmp_path):
 def test_the_result_does_not_depend_on_the_size_of_sheets(drive, monkeypatch):
     canvas = Canvas(np.array([5.0, 3.0]), 0.02, 300, 400)
     at_once = whole(canvas, recorded_shots(drive), lenses(drive))
-    monkeypatch.setattr(module, "SHEET_PX", 128)
-    monkeypatch.setattr(module, "_KEPT_IMAGES", 2)
+    monkeypatch.setattr(blend, "SHEET_PX", 128)
+    monkeypatch.setattr(warp, "SHEET_PX", 128)
+    monkeypatch.setattr(warp, "_KEPT_IMAGES", 2)
     in_sheets = whole(canvas, recorded_shots(drive), lenses(drive))
     assert np.abs(at_once.astype(int) - in_sheets).max() <= 1
 
 
-def test_images_count_with_the_number_of_pixels_that_they_show_ground_with(tmp_path):
+def test_images_count_with_the_square_of_the_number_of_pixels_that_they_show_ground_with(tmp_path):
     """Two images of one grey each, one from nearer: the density by finite differences gives the mixture."""
     drive = scene.drive_of(tmp_path, lambda points: np.full(points.shape[:-1], 100.0))
     cv2.imwrite(str(drive.images[4].path), np.full((270, 480, 3), 200, np.uint8))
@@ -95,26 +97,27 @@ def test_images_count_with_the_number_of_pixels_that_they_show_ground_with(tmp_p
         density = abs(np.linalg.det((corners[1:] - corners[0]) / step))
         u, v = np.round(distort_points(scene.INFO, corners[:1])[0]).astype(int)
         assert lens["front"].trust[v, u] == 1
-        shares.append(density)
+        shares.append(density**2)
     expected = (100 * shares[0] + 200 * shares[1]) / sum(shares)
     assert whole(canvas, two, lens)[0, 0, 0] == pytest.approx(expected, abs=1)
 
 
-def test_the_own_vehicle_and_what_lies_outside_of_the_roi_are_left_out(drive):
+def test_the_own_vehicle_and_what_lies_too_far_away_are_left_out(drive):
     mask = np.zeros((270, 480), dtype=bool)
     mask[:, :240] = True
     camera = replace(drive.cameras["front"], own_vehicle=mask)
     lens = lens_of(camera, scene.cam_from_vehicle())
     shot = recorded_shots(drive)[0]
-    canvas = Canvas(np.array([4.0, 4.0]), 0.02, 400, 450)
+    canvas = Canvas(np.array([2.0, 8.0]), 0.05, 320, 450)
     rgba, points = whole(canvas, [shot], {"front": lens}), points_of(canvas)
     seen = rgba[..., 3] > 0
     assert seen.any()
     assert points[seen][:, 1].max() < 0.15
-    assert points[seen][:, 0].max() < 11.2  # a pixel shows 10 cm of ground there
+    away_m = np.linalg.norm(points[seen] - camera_centre(scene.cam_from_vehicle())[:2], axis=1)
+    assert REACH_M - 3.0 < away_m.max() < REACH_M + 0.5
 
 
-def test_trust_rises_from_the_edge_of_the_roi_over_the_feather(drive):
+def test_trust_rises_from_the_edge_of_what_is_near_over_the_feather(drive):
     trust = lenses(drive)["front"].trust
     edge = np.flatnonzero(trust[:, 240])
     feather_px = round(FEATHER * 270)

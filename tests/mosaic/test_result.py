@@ -13,8 +13,9 @@ import rasterio
 from tests.mosaic import scene
 from v2hdm.cli.main import run
 from v2hdm.geometry.geodetic import crs_of, geodetic_from_enu
-from v2hdm.mosaic.blend import Canvas, Sheet
+from v2hdm.mosaic.blend import Sheet
 from v2hdm.mosaic.result import Picture, geotiff
+from v2hdm.mosaic.views import Canvas
 from v2hdm.store.names import METRICS
 
 

@@ -10,7 +10,7 @@ chapter V).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,9 +33,11 @@ _FAST_S = 0.25  # time, s, over which that fades
 _SLOW_RAD = 0.003  # standard deviation, rad, of what a bend, a brake or a load holds
 _SLOW_S = 4.0  # time, s, over which that fades
 _HEAVE_S = 0.5  # time, s, over which a heave fades
-# Change of a mounting within a second, m and rad (one sigma): 0.06 deg within an hour.
-_CREEP_M = 1e-5
-_CREEP_RAD = 1.7e-5  # of a mounting's angles
+_CREEP_M = 1e-5  # change of a mounting's place within a second, m (one sigma)
+CREEP_RAD = 1.7e-5
+"""Change of a mounting's angles within a second, rad (one sigma): 0.06 deg within an hour."""
+TURNING_RAD = 3.5e-4
+"""The same of a mounting that is turning slowly: 0.15 deg within a minute."""
 
 _SPRINGS = (
     (HEIGHT, HEAVE_SIGMA_M, _HEAVE_S),
@@ -122,8 +124,10 @@ def start(
     return Belief(stamp_s, mean, root, len(mountings))
 
 
-def predict(belief: Belief, pieces: Sequence[Piece], noise: MotionNoise) -> Belief:
-    """The belief after pieces of motion."""
+def predict(
+    belief: Belief, pieces: Sequence[Piece], noise: MotionNoise, turning: Collection[int] = ()
+) -> Belief:
+    """The belief after pieces of motion; the mountings of some cameras are ``turning``."""
     if not pieces:
         return belief
     mean = belief.mean.copy()
@@ -136,7 +140,8 @@ def predict(belief: Belief, pieces: Sequence[Piece], noise: MotionNoise) -> Beli
         spread = by_state @ spread @ by_state.T + pushed
     length_s = sum(piece.length_s for piece in pieces)
     count = len(mean)
-    creep = np.tile(np.repeat([_CREEP_M, _CREEP_RAD], 3), belief.cameras) * np.sqrt(length_s)
+    creep_rad = [TURNING_RAD if camera in turning else CREEP_RAD for camera in range(belief.cameras)]
+    creep = np.repeat([[_CREEP_M, angle_rad] for angle_rad in creep_rad], 3) * np.sqrt(length_s)
     values, axes = np.linalg.eigh(spread)
     grown = np.zeros((count, count + belief.first_marking))
     grown[:, :count] = belief.root
@@ -217,6 +222,16 @@ def loosened(belief: Belief, cameras: Sequence[int], sigma_rad: float) -> Belief
     grown = np.concatenate([belief.root, np.zeros((count, len(rows)))], axis=1)
     grown[rows, range(count, count + len(rows))] = sigma_rad
     return replace(belief, root=_square(grown))
+
+
+def pinned(belief: Belief, states: Sequence[int], values: FloatArray, sigma: float) -> Belief:
+    """The belief in which some states (K,) are known to have values (K,) with a standard deviation."""
+    slope = belief.root[list(states)]
+    spread = slope @ slope.T + sigma**2 * np.eye(len(slope))
+    mean = belief.mean + belief.root @ slope.T @ np.linalg.solve(spread, values - belief.mean[list(states)])
+    inner = np.linalg.cholesky(np.eye(len(belief.mean)) + slope.T @ slope / sigma**2)
+    root = np.asarray(np.linalg.solve(inner, belief.root.T).T, dtype=np.float64)
+    return replace(belief, mean=mean, root=root)
 
 
 def _square(root: FloatArray) -> FloatArray:

@@ -12,7 +12,7 @@ import numpy as np
 
 from v2hdm.doors import checked
 from v2hdm.errors import MapFileError
-from v2hdm.localization.agreement import Agreement, Pace, RigTest, sigmas_off
+from v2hdm.localization.agreement import Agreement, Detected, Pace, displaced
 from v2hdm.localization.belief import (
     CAMERA,
     HEADING,
@@ -20,6 +20,7 @@ from v2hdm.localization.belief import (
     Belief,
     loosened,
     only_markings,
+    pinned,
     predict,
     start,
 )
@@ -27,6 +28,7 @@ from v2hdm.localization.joint import Located, Scene, locate, paired
 from v2hdm.localization.motion import Motion, MotionLog, MotionNoise, moved
 from v2hdm.localization.paint import Paint
 from v2hdm.localization.places import Patch, Prior, search, vehicle_at
+from v2hdm.localization.rig import Estimate, Rig, Turned
 from v2hdm.localization.seeing import Look, Sighted, ground_points, sighted
 from v2hdm.records import BoolArray, Calibration, FloatArray, HDMap
 
@@ -58,7 +60,8 @@ _FORGET = 600.0  # coordinates
 _FACTORS = (0.3, 12.0)  # least and largest, times
 _JUDGED_M = 14.0  # distance, m, of detections that are counted for the map or against it
 _TURNED_RAD = np.deg2rad(1.0)  # standard deviation of what a camera that was pushed has turned
-_TURNED_SIGMAS = 5.0  # from which a mounting has surely turned
+_LOOSENED_RAD = np.deg2rad(0.2)  # of what a mounting has turned that is found to have turned slowly
+_PINNED_RAD = np.deg2rad(0.01)  # of what the others have meanwhile
 _BEFORE_S = 0.25  # so long before it was noticed, s, a mounting may have turned
 _FEW = 0.7  # share of an image's detections under which a turned mounting is tried
 
@@ -77,15 +80,6 @@ class Fix(NamedTuple):
     stamp_s: float
     place_map: FloatArray
     sigma_m: float
-
-
-class Turned(NamedTuple):
-    """A camera whose mounting is no longer that of its calibration."""
-
-    camera: str
-    since_s: float
-    turn_deg: tuple[float, float, float]  # about the camera's axes right, down and forward
-    sigma_deg: tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -195,10 +189,9 @@ class Localizer:
         self._noise = {name: _Noise() for name in self.calibrations}
         self._agreement = Agreement()
         self._pace = Pace()
-        self._rig = RigTest()
+        self._rig = Rig(dict(zip(self.calibrations, self._mountings, strict=True)))
         self._turned_s: float | None = None
         self._rig_since_s: float | None = None
-        self._turned: dict[str, float] = {}
         self._local = np.zeros(3)
         self._local_s: float | None = None
         self._way_m = 0.0
@@ -286,6 +279,29 @@ class Localizer:
             self._let_turn(self._rig_since_s)
         if is_new:
             self._judge(look)
+            self._note_mounting(look)
+
+    def _note_mounting(self, look: Look) -> None:
+        """Test a camera's mounting after an image of it."""
+        belief = self._belief
+        if belief is None or not self._is_sure or not self._matched:
+            return
+        angles = self._angles(look.camera)
+        estimate = Estimate(look.stamp_s, belief.mean[angles], belief.covariance(angles))
+        change = self._rig.note(look.camera, estimate)
+        if change is None or not change.is_slow:
+            return
+        # This mounting alone has turned; the others are where they were, though they seemed to turn with it.
+        belief = loosened(belief, [self._numbers[look.camera]], _LOOSENED_RAD)
+        for name, other in self._rig.others(look.camera, change.before.stamp_s).items():
+            belief = pinned(belief, self._angles(name), other.turn_rad, _PINNED_RAD)
+        self._belief = belief
+        self._past.clear()
+
+    def _angles(self, camera: str) -> range:
+        """The states of a camera's angles."""
+        begin = VEHICLE + CAMERA * self._numbers[camera] + 3
+        return range(begin, begin + 3)
 
     def _let_turn(self, since_s: float) -> None:
         """Go back to before a mounting turned, and see again what came since with mountings that are free.
@@ -294,6 +310,7 @@ class Localizer:
         mountings and the vehicle's springs, which fade, explain better and better.
         """
         self._turned_s = since_s
+        self._rig.loosen(since_s - _BEFORE_S)
         since_then = [past for past in self._past if past.look.stamp_s >= since_s - _BEFORE_S]
         self._belief = loosened(since_then[0].before, list(self._numbers.values()), _TURNED_RAD)
         while self._past and self._past[-1].look.stamp_s >= since_s - _BEFORE_S:
@@ -304,7 +321,8 @@ class Localizer:
     def _moved_to(self, belief: Belief, stamp_s: float) -> Belief:
         if stamp_s <= belief.stamp_s:
             return belief
-        return predict(belief, self._log.pieces(belief.stamp_s, stamp_s), self.noise)
+        turning = [self._numbers[turned.camera] for turned in self._rig.turned if turned.is_slow]
+        return predict(belief, self._log.pieces(belief.stamp_s, stamp_s), self.noise, turning)
 
     def _count_way(self, stamp_s: float) -> None:
         """Lay the odometry's way out to a time."""
@@ -342,16 +360,25 @@ class Localizer:
         if self._is_sure and is_judged.sum() >= 2 and explained[is_judged].mean() < _FEW:
             turned = locate(loosened(belief, list(self._numbers.values()), _TURNED_RAD), scene)
             gained = int(paired(turned, len(quads.kinds))[is_judged].sum() - explained[is_judged].sum())
-            self._rig_since_s = self._rig.note(look, gained)
+            self._rig_since_s = self._rig.pushed.note(look, gained)
         elif self._is_sure:
-            self._rig.note(look, 0)
-        rows = np.flatnonzero(is_judged)
-        kinds = tuple(quads.kinds[row] for row in rows.tolist())
-        self._agreement.note(places[is_judged].mean(axis=1), kinds, explained[is_judged], self._way_m)
+            self._rig.pushed.note(look, 0)
+        near = quads.subset(np.flatnonzero(is_judged))
+        self._agreement.note(
+            self._detected(places[is_judged], near, explained[is_judged], located), self._way_m
+        )
         if located.misfit_freedom > 0:
             noise.note(located, noise.factor)
         self._matched = len(located.pairs.detection)
         return self._kept(located)
+
+    def _detected(
+        self, places: FloatArray, quads: Sighted, explained: BoolArray, located: Located
+    ) -> Detected:
+        """Detections (D) with corners at ``places`` (D, 4, 2) as they count for the map or against it."""
+        centres = places.mean(axis=1)
+        beside = displaced(centres, quads.kinds, explained, self.paint, located.pairs.marking)
+        return Detected(centres, quads.kinds, explained, beside)
 
     def _judged(self, places: FloatArray, pose: FloatArray, quads: Sighted) -> BoolArray:
         """Which detections (D,) lie whole, near, and where the map has been mapped."""
@@ -510,13 +537,14 @@ class Localizer:
                 f"the map explains {100 * self._agreement.share:.0f} % of the markings seen in the last m, "
                 "and too few of the latest"
             )
-        turned = self._turned_cameras(belief)
         protection = _protection(covariance, float(belief.mean[HEADING]))
-        if status != Status.TRACKING or self._rig.is_suspicious or self._agreement.differs:
+        if status != Status.TRACKING or self._rig.pushed.is_suspicious or self._agreement.differs:
             protection = (np.inf, np.inf, np.inf)
         if status == Status.INITIALISING:
             covariance = np.full((3, 3), np.inf)
-        if self._turned_s is not None:
+        if turned := self._rig.reasons:
+            reasons |= {f"rig {number}": sentence for number, sentence in enumerate(turned)}
+        elif self._turned_s is not None:
             reasons["rig"] = f"a camera's mounting has turned since {self._turned_s:.1f} s"
         motion = (float(np.exp(belief.mean[3])), float(belief.mean[4]))
         return Pose(
@@ -529,24 +557,8 @@ class Localizer:
             motion=motion,
             matched=self._matched,
             reasons=tuple(reasons.values()),
-            turned=turned,
+            turned=self._rig.turned,
         )
-
-    def _turned_cameras(self, belief: Belief) -> tuple[Turned, ...]:
-        """The cameras whose mountings are surely no longer their calibrations'."""
-        out = []
-        for name, number in self._numbers.items():
-            begin = VEHICLE + CAMERA * number + 3
-            turn_rad = belief.mean[begin : begin + 3]
-            posterior = belief.covariance(range(begin, begin + 3))
-            if sigmas_off(turn_rad, self._mountings[number][3:, 3:], posterior) < _TURNED_SIGMAS:
-                self._turned.pop(name, None)
-                continue
-            since_s = self._turned.setdefault(name, self._turned_s or belief.stamp_s)
-            turn = np.degrees(turn_rad).tolist()
-            sigma = np.degrees(np.sqrt(np.diag(posterior))).tolist()
-            out.append(Turned(name, since_s, (turn[0], turn[1], turn[2]), (sigma[0], sigma[1], sigma[2])))
-        return tuple(out)
 
 
 def _protection(covariance: FloatArray, heading_rad: float) -> tuple[float, float, float]:

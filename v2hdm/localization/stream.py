@@ -144,6 +144,8 @@ def pose_record(pose: Pose) -> dict[str, Any]:
         {
             "camera": camera_turn.camera,
             "since_s": camera_turn.since_s,
+            "angle": camera_turn.angle,
+            "slow": camera_turn.is_slow,
             "deg": camera_turn.turn_deg,
             "sigma_deg": camera_turn.sigma_deg,
         }

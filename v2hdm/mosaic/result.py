@@ -15,21 +15,15 @@ import numpy as np
 
 from v2hdm.detection.batch import with_own_vehicle
 from v2hdm.detection.detector import Detector
-from v2hdm.errors import ConfigError, DriveError, MapFileError, need
+from v2hdm.errors import ConfigError, MapFileError, need
 from v2hdm.geometry.geodetic import crs_of
+from v2hdm.geometry.planar import densified
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.io.trajectory import read_tum
-from v2hdm.mosaic.blend import (
-    Canvas,
-    Lens,
-    Sheet,
-    Shot,
-    adjusted_shots,
-    blend,
-    lens_of,
-    recorded_shots,
-    whole,
-)
+from v2hdm.mosaic.blend import Sheet, blend, whole
+from v2hdm.mosaic.consensus import CELL_M, Consensus, find_consensus
+from v2hdm.mosaic.views import Canvas, Lens, Shot, adjusted_shots, lens_of, recorded_shots
+from v2hdm.mosaic.warp import Area
 from v2hdm.progress import Steps
 from v2hdm.records import Drive, FloatArray, GeodeticOrigin, HDMap
 from v2hdm.report import style
@@ -177,6 +171,9 @@ class Picture:
 
 _log = logging.getLogger(__name__)
 
+_BESIDE_WAY_M = 6.0  # distance from the cameras' way up to which the ground is shown, m; chosen
+_BESIDE_PAINT_M = 1.6  # distance beyond paint up to which the ground is shown, m: a metre, and two blocks
+_DENSE = 4  # points to which a side of an outline is divided: the longest stop line has one in 6 m
 RESOLUTION_M = 0.02  # side of a pixel of the mosaic unless another is asked for
 
 
@@ -188,6 +185,13 @@ class Ground:
     after: Sequence[Shot]
     before: Sequence[Shot]
     canvas: Canvas
+    area: Area  # that is shown
+
+    def consensus(self, device: str = "cpu", progress: Steps | None = None) -> Consensus | None:
+        """Which images show the ground, place by place; None where that cannot be told."""
+        west, south, east, north = self.canvas.bounds_m
+        canvas = Canvas.around(np.array([[west, south], [east, north]]), CELL_M)
+        return find_consensus(self.after, self.lenses, canvas, device, self.area, progress)
 
 
 def write_mosaic(
@@ -209,7 +213,7 @@ def write_mosaic(
             f"a resolution of {resolution_m:g} m per pixel is too fine for a mosaic; give {_FINEST_M} or more"
         )
     hd_map = read_geojson(folder / names.MAP)
-    ground = ground_of(folder, drive, resolution_m)
+    ground = ground_of(folder, drive, resolution_m, hd_map)
     picture = Picture(ground.canvas)
     with ExitStack() as stack:
         try:
@@ -217,7 +221,10 @@ def write_mosaic(
         except ConfigError as missing:
             _log.warning("no GeoTIFF was written: %s", missing)
             put = None
-        for sheet in blend(ground.canvas, ground.after, ground.lenses, device, progress):
+        consensus = ground.consensus(device, progress)
+        for sheet in blend(
+            ground.canvas, ground.after, ground.lenses, device, progress, consensus, ground.area
+        ):
             if put is not None:
                 put(sheet)
             picture.put(sheet)
@@ -239,7 +246,7 @@ def write_mosaic(
     return content
 
 
-def ground_of(folder: Path, drive: Drive, resolution_m: float) -> Ground:
+def ground_of(folder: Path, drive: Drive, resolution_m: float, hd_map: HDMap) -> Ground:
     """The ground that a run's images show, and the canvas around it; errors as :func:`write_mosaic`."""
     cameras = read_cameras(folder)
     if not cameras:
@@ -268,7 +275,16 @@ def ground_of(folder: Path, drive: Drive, resolution_m: float) -> Ground:
     }
     after = adjusted_shots(drive, calibrations, clock_s, adjusted, partial(read_surface, folder))
     before = [shot for shot in recorded_shots(drive) if shot.camera in lenses]
-    outlines_map = np.concatenate([shot.outline_map(lenses[shot.camera]) for shot in after])
-    if not np.isfinite(outlines_map).all():
-        raise DriveError(f"drive {drive.name}: an ROI reaches the horizon; draw it nearer to the camera")
-    return Ground(lenses, after, before, Canvas.around(outlines_map, resolution_m, MULTIPLE_PX))
+    area = area_of(hd_map, after)
+    return Ground(lenses, after, before, Canvas.around(area.corners_map, resolution_m, MULTIPLE_PX), area)
+
+
+def area_of(hd_map: HDMap, shots: Sequence[Shot]) -> Area:
+    """The ground beside the cameras' way, and as far as the paint reaches and a metre more."""
+    way_map = np.array([shot.centre_map[:2] for shot in shots if shot.centre_map is not None])
+    outlines = [marking.corners_map for marking in hd_map.markings]
+    outlines += [symbol.outline_map for symbol in hd_map.symbols]
+    paint_map = [densified(outline, _DENSE) for outline in outlines]
+    paint_map += [lane.points_map for lane in hd_map.lanes]
+    listed = np.concatenate(paint_map) if paint_map else np.empty((0, 2))
+    return Area.along(way_map, listed, _BESIDE_WAY_M, _BESIDE_PAINT_M)

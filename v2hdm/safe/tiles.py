@@ -19,7 +19,7 @@ from v2hdm.records import FloatArray
 from v2hdm.safe.child import next_step
 from v2hdm.safe.pixels import read_header, read_pixels
 
-_HALF_WORLD_M = 20037508.342789244  # half a side of Web Mercator's square (EPSG:3857)
+HALF_WORLD_M = 20037508.342789244  # half a side of Web Mercator's square (EPSG:3857)
 _USUAL_PX = 256  # side of a tile; some have twice as many, and are chosen a level too fine
 _FINEST = 30  # level of tiles: there they are 4 cm wide
 _NUMBER = re.compile(r"[0-9]{1,10}")  # a name of a level, column or row
@@ -54,8 +54,8 @@ def read_tiles(folder: Path, low_m: FloatArray, high_m: FloatArray, step_m: floa
     by_fitness = sorted(levels, key=lambda level: _fitness(level, step_m))
     for level in by_fitness:
         side_m = _side_m(level)
-        west, east = (int((edge + _HALF_WORLD_M) // side_m) for edge in (low_m[0], high_m[0]))
-        north, south = (int((_HALF_WORLD_M - edge) // side_m) for edge in (high_m[1], low_m[1]))
+        west, east = (int((edge + HALF_WORLD_M) // side_m) for edge in (low_m[0], high_m[0]))
+        north, south = (int((HALF_WORLD_M - edge) // side_m) for edge in (high_m[1], low_m[1]))
         tiles = {
             (column, row): tile
             for column, row, tile in _tiles(levels[level], west, east)
@@ -72,7 +72,7 @@ def _fitness(level: int, step_m: float) -> tuple[bool, int]:
 
 
 def _side_m(level: int) -> float:
-    return float(2 * _HALF_WORLD_M / 2**level)
+    return float(2 * HALF_WORLD_M / 2**level)
 
 
 def _side_by_side(tiles: dict[tuple[int, int], Path], side_m: float, step_m: float) -> Tiles:
@@ -87,8 +87,8 @@ def _side_by_side(tiles: dict[tuple[int, int], Path], side_m: float, step_m: flo
         top = (row - rows[0]) * side_px
         left = (column - columns[0]) * side_px
         pixels[top : top + side_px, left : left + side_px] = _scaled(_pixels(tile), side_px)
-    west_m = columns[0] * side_m - _HALF_WORLD_M
-    north_m = _HALF_WORLD_M - rows[0] * side_m
+    west_m = columns[0] * side_m - HALF_WORLD_M
+    north_m = HALF_WORLD_M - rows[0] * side_m
     return Tiles(np.ascontiguousarray(np.moveaxis(pixels, 2, 0)), west_m, north_m, side_m / side_px)
 
 

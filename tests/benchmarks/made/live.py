@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +15,7 @@ from v2hdm.cli.compose import conf_dir
 from v2hdm.geometry.rigid import exp
 from v2hdm.localization.motion import Motion
 from v2hdm.localization.seeing import Look
-from v2hdm.records import Calibration, FloatArray, HDMap, Marking
+from v2hdm.records import Calibration, CameraInfo, FloatArray, HDMap, Marking
 from v2hdm.simulate.port.config import PortConfig
 
 RATE_HZ = 10.0
@@ -51,16 +51,20 @@ class LiveDrive:
 def port_recipe(name: str, seed: int) -> Recipe:
     """A recipe on a whole shipped port, with its own layout."""
     recipe = draw(seed, "straight")
+    return replace(recipe, port=port_config(name), road=None, relief="", apart_s=0.0)
+
+
+def port_config(name: str) -> PortConfig:
+    """The configuration of a shipped port."""
     shipped = OmegaConf.load(conf_dir() / "run" / f"{name}.yaml").simulate
     port = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(PortConfig), shipped))
     assert isinstance(port, PortConfig)
-    return replace(recipe, port=port, road=None, relief="", apart_s=0.0)
+    return port
 
 
-def surveyed(world: World, seed: int) -> HDMap:
-    """The port's map with errors as a drive's map has and states them."""
+def surveyed(true: HDMap, heights_m: FloatArray, seed: int) -> HDMap:
+    """A true map, with corners at heights (J, 4), with errors as a drive's map has and states them."""
     rng = np.random.default_rng([seed, _MAP])
-    true = world.port.hd_map
     corners = np.array([marking.corners_map for marking in true.markings])
     centres = corners.mean(axis=1)
     apart_m = np.linalg.norm(centres[:, None] - centres[None], axis=2)
@@ -70,12 +74,25 @@ def surveyed(world: World, seed: int) -> HDMap:
     corners = corners + off[:, None] + _CORNER_M * rng.standard_normal(corners.shape)
     shared = (_DRIFT_M**2 + _RELATIVE_M**2) * np.tile(np.eye(2), (4, 4)) + _CORNER_M**2 * np.eye(8)
     relative_m = float(np.hypot(_RELATIVE_M, _CORNER_M / 2))
-    heights = world.corners_map[..., 2]
     markings = tuple(
-        Marking(own.kind, corners[j], 20, shared, relative_m, heights[j], id=j + 1)
+        Marking(own.kind, corners[j], 20, shared, relative_m, heights_m[j], id=j + 1)
         for j, own in enumerate(true.markings)
     )
     return HDMap(markings, true.lanes, true.origin, drift_over_m=_DRIFT_OVER_M)
+
+
+def calibrated(
+    lenses: Mapping[str, CameraInfo], cam_from_vehicle: Mapping[str, FloatArray], rng: np.random.Generator
+) -> dict[str, Calibration]:
+    """Calibrations of cameras with errors as they state them."""
+    mounts = {
+        name: np.concatenate([rng.normal(0, _MOUNT_M, 3), rng.normal(0, _MOUNT_RAD, 3)]) for name in lenses
+    }
+    covariance = np.diag(np.repeat(np.square([_MOUNT_M, _MOUNT_RAD]), 3))
+    return {
+        name: Calibration(lens, exp(mounts[name]) @ cam_from_vehicle[name], covariance)
+        for name, lens in lenses.items()
+    }
 
 
 def moved(hd_map: HDMap, share: float, by_m: float, seed: int) -> HDMap:
@@ -109,18 +126,7 @@ def drive(recipe: Recipe, seed: int, seconds: float, begin_m: float = 3.0) -> Li
     every = int(ODOMETRY_HZ / RATE_HZ)
     frames = np.arange(every, len(stamp_s), every)
     motion = _odometry(stamp_s, points, heading, rng)
-    mounts = {
-        name: np.concatenate([rng.normal(0, _MOUNT_M, 3), rng.normal(0, _MOUNT_RAD, 3)])
-        for name in world.cameras
-    }
-    calibrations = {
-        name: Calibration(
-            world.lenses[name],
-            exp(mounts[name]) @ world.port.cam_from_vehicle[name],
-            np.diag(np.repeat(np.square([_MOUNT_M, _MOUNT_RAD]), 3)),
-        )
-        for name in world.cameras
-    }
+    calibrations = calibrated(world.lenses, world.port.cam_from_vehicle, rng)
     driven = replace(world.port.driven, stamp_s=stamp_s[frames])
     detector = DetectorErrors(
         sigma_px=_log_uniform(rng, 0.1, 0.4),
@@ -141,7 +147,7 @@ def drive(recipe: Recipe, seed: int, seconds: float, begin_m: float = 3.0) -> Li
             name: np.tile(own, (len(frames), 1, 1)) for name, own in world.port.cam_from_vehicle.items()
         },
     )
-    hd_map = surveyed(world, seed)
+    hd_map = surveyed(world.port.hd_map, world.corners_map[..., 2], seed)
     return LiveDrive(
         world=world,
         hd_map=hd_map,
@@ -170,6 +176,15 @@ def bumped(world: World, camera: str, frame: int, turn_rad: FloatArray) -> World
     """The world in which a camera is turned from a moment on."""
     poses = world.cam_from_vehicle[camera].copy()
     poses[frame:] = exp(np.concatenate([np.zeros(3), turn_rad])) @ poses[frame:]
+    return replace(world, cam_from_vehicle={**world.cam_from_vehicle, camera: poses})
+
+
+def turning(world: World, camera: str, frame: int, turn_rad: FloatArray, lasts_s: float) -> World:
+    """The world in which a camera turns slowly from a moment on, by ``turn_rad`` (3,) in the end."""
+    poses = world.cam_from_vehicle[camera].copy()
+    shares = np.clip((world.taken_s - world.taken_s[frame]) / lasts_s, 0.0, 1.0)
+    for number in np.flatnonzero(shares > 0).tolist():
+        poses[number] = exp(np.concatenate([np.zeros(3), shares[number] * turn_rad])) @ poses[number]
     return replace(world, cam_from_vehicle={**world.cam_from_vehicle, camera: poses})
 
 

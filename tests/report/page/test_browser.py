@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.report.page.browser import browser_path, opened
-from tests.report.page.folder import NASTY, NASTY_NAME, PLACES, make_result
+from tests.report.page.folder import NASTY, NASTY_NAME, PLACES, make_result, make_site
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.records import Reading, Symbol
@@ -248,4 +248,57 @@ def test_a_word_is_labelled_found_and_searched_by_what_it_says_or_may_say(browse
         page.fill("#find-id", "no such")
         page.press("#find-id", "Enter")
         assert page.evaluate("document.getElementById('find-id').validationMessage").startswith("No marking")
+        is_quiet(watched)
+
+
+THOUSANDS = 3200
+
+
+@pytest.fixture(scope="module")
+def large(tmp_path_factory):
+    """The report of a site of thousands of markings in rows 4.5 m apart."""
+    site = tmp_path_factory.mktemp("large") / "site"
+    make_site(site, THOUSANDS)
+    return write_page(site, None)
+
+
+def test_thousands_of_markings_take_a_kilobyte_each_and_no_element_each(browser, large):
+    assert large.stat().st_size < 1000 * THOUSANDS
+    with opened(browser, large) as watched:
+        assert watched.page.evaluate("document.querySelectorAll('*').length") < THOUSANDS
+        is_quiet(watched)
+
+
+def test_a_site_seen_from_afar_is_dots_that_are_named_and_selected(browser, large):
+    with opened(browser, large) as watched:
+        page = watched.page
+        page.locator("#map").scroll_into_view_if_needed()
+        page.wait_for_function(f"({PAINTED})() > {THOUSANDS}")
+        place = page.evaluate(
+            """() => {
+                const { map, things } = window.v2hdmMap;
+                const [x, y] = [0, 1].map((n) => things[77].points.reduce((sum, p) => sum + p[n], 0) / 4);
+                const box = map.getContainer().getBoundingClientRect();
+                const point = map.latLngToContainerPoint([y, x]);
+                return [box.left + point.x, box.top + point.y];
+            }"""
+        )
+        page.mouse.move(*place)
+        named = page.locator(".leaflet-tooltip:not(.corner) b").inner_text()
+        number = int(named.split()[1].rstrip(","))
+        assert abs(number - 78) in (0, 1, round(THOUSANDS**0.5), round(THOUSANDS**0.5) + 1)
+        page.mouse.down()
+        page.mouse.up()
+        assert page.locator("#details h3").inner_text() == named
+        is_quiet(watched)
+
+
+def test_a_panned_map_is_drawn_where_it_was_not_before(browser, large):
+    with opened(browser, large) as watched:
+        page = watched.page
+        page.evaluate("window.v2hdmMap.map.setView([20, 20], 5, { animate: false })")
+        for _ in range(4):
+            page.evaluate("window.v2hdmMap.map.panBy([600, 0], { animate: false })")
+        page.wait_for_function(f"({PAINTED})() > 5000")
+        assert "drawn" in page.locator("#map").get_attribute("data-detail")
         is_quiet(watched)

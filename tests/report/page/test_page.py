@@ -134,15 +134,22 @@ def test_residuals_on_the_ground_lead_from_the_observation_to_the_map(result, dr
 
 def test_pictures_stay_within_their_budget_and_the_best_of_everything_comes_first(result, drive, monkeypatch):
     facts = read_facts(result, drive)
-    everything = pictures.pictures(facts)
+    everything = pictures.pictures(facts, pictures.BUDGET_BYTES)
     assert {"m1", "m2", "m3", "m4", "s6", "x0"} <= everything.keys()
     total = sum(len(one["src"]) for shots in everything.values() for one in shots)
-    monkeypatch.setattr(pictures, "BUDGET_BYTES", total // 2)
     monkeypatch.setattr(pictures, "_USUAL_BYTES", 1)
-    fewer = pictures.pictures(facts)
+    fewer = pictures.pictures(facts, total // 2)
     assert sum(len(one["src"]) for shots in fewer.values() for one in shots) <= total // 2
     assert all(shots[0] == everything[key][0] for key, shots in fewer.items())
     assert len([key for key in fewer if key.startswith("m")]) == 4
+
+
+@pytest.mark.parametrize(
+    ("map_bytes", "expected"), [(100_000, 8_000_000), (10_000_000, 3_000_000), (20_000_000, 0)]
+)
+def test_a_large_map_leaves_less_room_for_pictures(map_bytes, expected):
+    room = pictures.room_for_pictures({"markings": "m" * map_bytes})
+    assert room == pytest.approx(expected, abs=100)
 
 
 def test_names_end_no_script_and_become_no_markup(tmp_path):

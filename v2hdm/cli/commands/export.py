@@ -28,7 +28,7 @@ def _run(arguments: Sequence[str]) -> None:
     kinds = (
         "for a map: geojson, csv, gpkg, lanelet2, dxf, qgis, opendrive, landxml, flatgeobuf, shapefile, kml, "
     )
-    kinds += "jsonfg, mcap; for mosaic.tif: pcd; "
+    kinds += "jsonfg, pmtiles, geoparquet, mcap; for mosaic.tif: pcd, pmtiles, xyz; "
     kinds += "for a calibration: camera_info, static_transform, urdf, kalibr, opencv; may be repeated"
     parser.add_argument("--format", action="append", required=True, metavar="NAME", help=kinds)
     parser.add_argument("--output", type=Path, metavar="DIR", help="output folder (default: that of MAP)")
@@ -154,6 +154,24 @@ def _driven(parsed: argparse.Namespace, hd_map: HDMap) -> list[Trajectory]:
 
 
 def _export_mosaic(parsed: argparse.Namespace, folder: Path, *_: object) -> list[Path]:
+    from v2hdm.io.maps.web_tiles import write_mosaic_pmtiles, write_mosaic_xyz
+
+    _refuse_crs(parsed, "points are in the map's own frame, and web tiles in Web Mercator")
+    name = parsed.source.stem
+    writers = {
+        "pcd": lambda: _export_cloud(parsed.source, folder / f"{name}.pcd"),
+        "pmtiles": lambda: write_mosaic_pmtiles(parsed.source, folder / f"{name}.pmtiles"),
+        "xyz": lambda: write_mosaic_xyz(parsed.source, folder / f"{name}_tiles"),
+    }
+    if unknown := [form for form in parsed.format if form not in writers]:
+        raise ConfigError(
+            f"--format {shown(unknown[0])}: a mosaic is already a GeoTIFF; its other formats are "
+            f"{', '.join(writers)}"
+        )
+    return [path for form in parsed.format for path in writers[form]()]
+
+
+def _export_cloud(mosaic: Path, path: Path) -> list[Path]:
     import numpy as np
 
     from v2hdm.io.drive.road import lay_flat
@@ -162,16 +180,12 @@ def _export_mosaic(parsed: argparse.Namespace, folder: Path, *_: object) -> list
     from v2hdm.store.names import TRAJECTORY
     from v2hdm.surface.strips import write_cloud
 
-    _refuse_crs(parsed, "a point cloud is in the map's own frame")
-    if parsed.format != ["pcd"]:
-        raise ConfigError("--format: a mosaic is already a GeoTIFF; its other format is pcd")
-    driven = lay_flat(read_tum(parsed.source.with_name(TRAJECTORY)))
+    driven = lay_flat(read_tum(mosaic.with_name(TRAJECTORY)))
 
     def height_m(places: FloatArray) -> FloatArray:
         return np.zeros(len(places)) if driven.road is None else ground_height_m(driven.road, places)
 
-    path = folder / f"{parsed.source.stem}.pcd"
-    write_cloud(parsed.source, path, height_m)
+    write_cloud(mosaic, path, height_m)
     return [path]
 
 

@@ -27,8 +27,9 @@ from v2hdm.io.maps.geopackage import write_geopackage, write_qgis
 from v2hdm.io.maps.kml import write_kml
 from v2hdm.io.maps.landxml import write_landxml
 from v2hdm.io.maps.lanelet2 import write_lanelet2
-from v2hdm.io.maps.ogr import write_flatgeobuf, write_json_fg, write_shapefiles
+from v2hdm.io.maps.ogr import write_flatgeobuf, write_json_fg, write_pmtiles, write_shapefiles
 from v2hdm.io.maps.opendrive import write_opendrive
+from v2hdm.io.maps.parquet import write_geoparquet
 from v2hdm.io.maps.questions import questions_file, write_questions
 from v2hdm.io.maps.reading import Verdict, read_geopackage, stated_in
 from v2hdm.io.maps.recording import write_mcap
@@ -129,6 +130,8 @@ FORMATS: Mapping[str, Format] = {
     "shapefile": Format("{name}_shapefile.zip", write_shapefiles, "pyogrio"),
     "kml": Format("{name}.kml", write_kml, takes_crs=False),
     "jsonfg": Format("{name}_fg.json", write_json_fg, "pyogrio"),
+    "pmtiles": Format("{name}.pmtiles", write_pmtiles, "pyogrio", takes_crs=False),
+    "geoparquet": Format("{name}.parquet", write_geoparquet, "pyarrow", extra="parquet"),
     "mcap": Format("{name}.mcap", write_mcap, "rosbags", takes_crs=False, extra="ros"),
 }
 

@@ -1,4 +1,4 @@
-"""Writing an HD map in further formats of GDAL, through ``pyogrio``: FlatGeobuf, Shapefiles, JSON-FG.
+"""Writing an HD map in further formats of GDAL by ``pyogrio``: FlatGeobuf, Shapefiles, JSON-FG, PMTiles.
 
 All features of a file have the columns of :data:`COLUMNS`, as short as Shapefile's ten letters allow.
 Coordinates are those of GeoPackage: longitude, latitude and ellipsoidal height, a grid's, or local metres.
@@ -36,8 +36,22 @@ COLUMNS = {
 """Columns of a file, and the properties of a feature that they hold."""
 
 _JSON_FG = "JSONFG"  # GDAL's driver
+_PMTILES = "PMTiles"  # GDAL's driver
 _DECIMALS = {"COORDINATE_PRECISION_GEOMETRY": "11", "COORDINATE_PRECISION_PLACE": "5"}
 """Decimals of degrees and of a grid's metres, as in GeoJSON: GDAL's own are 1 cm."""
+
+_LAYER = "map"  # the name of the layer in files of one layer
+
+# Options of GDAL's vector tiles (drivers PMTiles and MVT):
+_TILES = {
+    "MINZOOM": "12",  # tiles are 10 km wide there: coarser ones would show nothing
+    "MAXZOOM": "18",  # viewers enlarge these
+    "EXTENT": "16384",  # units of a tile's side: 1 cm or less at the finest level
+    "BUFFER": "256",  # units around a tile that lines are drawn on
+    "MAX_SIZE": "5000000",  # bytes of a tile above which GDAL would leave features out
+    "MAX_FEATURES": "1000000",  # number of features above which it would, too
+    "NAME": "map",
+}
 
 _NUMBERS = ("sigma_m", "rel_sig_m", "paint_left")  # columns of numbers that may be unknown
 
@@ -65,6 +79,21 @@ def write_json_fg(hd_map: HDMap, path: Path, grid: Grid | None = None) -> None:
     with whole_file(path) as partial, TemporaryDirectory(".part", f".{path.name}.", path.parent) as folder:
         place = Path(folder, "map.json")
         _write(place, features_of(hd_map), hd_map, grid, path, _JSON_FG, "Unknown")
+        place.replace(partial)
+
+
+def write_pmtiles(hd_map: HDMap, path: Path) -> None:
+    """Write ``hd_map`` as vector tiles in one PMTiles, atomically, a layer ``map``; positions to 1 cm.
+
+    Raises ConfigError where the map has no origin on the earth.
+    """
+    if hd_map.origin is None:
+        raise ConfigError(
+            f"{path.name}: web tiles need a place on the earth, and the map has no origin; leave it out"
+        )
+    with whole_file(path) as partial, TemporaryDirectory(".part", f".{path.name}.", path.parent) as folder:
+        place = Path(folder, "map.pmtiles")
+        _write(place, features_of(hd_map), hd_map, None, path, _PMTILES, "Unknown")
         place.replace(partial)
 
 
@@ -102,9 +131,11 @@ def _write(
     rows = [properties_of(feature) for feature in features]
     values = [_column(name, [row.get(key) for row in rows]) for name, key in COLUMNS.items()]
     shapes = shapes_of(features, grid or hd_map.origin)
-    options: dict[str, Any] = {"layer": "map"} if shape == "Unknown" else {}
+    options: dict[str, Any] = {"layer": _LAYER} if shape == "Unknown" else {}
     if driver == _JSON_FG:
         options |= _DECIMALS
+    if driver == _PMTILES:
+        options["dataset_options"] = _TILES
     with gdal_errors(path):
         raw.write(
             str(place), shapes, values, list(COLUMNS), driver=driver, geometry_type=shape, crs=crs, **options

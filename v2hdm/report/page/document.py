@@ -21,7 +21,7 @@ from v2hdm.report.page.embedding import json_text
 from v2hdm.report.page.facts import Facts, ground_residuals, read_facts
 from v2hdm.report.page.identity import identity_of, method_words
 from v2hdm.report.page.layers import background_layer, comparison, earlier_layer, layers
-from v2hdm.report.page.pictures import earlier_pictures, overlays, pictures
+from v2hdm.report.page.pictures import earlier_pictures, overlays, pictures, room_for_pictures
 from v2hdm.report.page.quality import quality_table
 from v2hdm.report.page.reference import reference_of
 from v2hdm.report.page.tables import in_words
@@ -90,6 +90,7 @@ def document(facts: Facts, compared: Path | None = None) -> SimpleNamespace:
     places = listing.places_of(facts)
     cameras = tables.camera_pages(facts, overlays(facts))
     charts_of_residuals = charts.residual_charts(facts, residuals) if residuals else {}
+    map_data = layers(facts, residuals, reference)
     shown_residuals = _RESIDUALS if charts_of_residuals else {}
     suspicious = _suspicious(facts)
     return SimpleNamespace(
@@ -125,8 +126,8 @@ def document(facts: Facts, compared: Path | None = None) -> SimpleNamespace:
         against_truth=tables.truth_table(facts),
         radii=_radii(facts),
         check_points=tables.check_point_table(facts),
-        map_data=layers(facts, residuals, reference),
-        pictures=pictures(facts),
+        map_data=map_data,
+        pictures=pictures(facts, room_for_pictures(map_data)),
         suspicious=suspicious,
         suspicious_table=_suspicious_table(suspicious),
         cameras=cameras,
@@ -183,7 +184,7 @@ def _radii(facts: Facts) -> str:
     return charts.radius_chart(series) if series else ""
 
 
-_ASSETS = {"vendor": ("leaflet.js", "leaflet.css"), "templates": ("page.css", "map.js")}
+_ASSETS = {"vendor": ("leaflet.js", "leaflet.css"), "templates": ("page.css", "features.js", "map.js")}
 """Scripts and styles that the page embeds, by folder."""
 
 

@@ -14,12 +14,15 @@ from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.io.metrics import Number
 from v2hdm.records import FloatArray, Image
+from v2hdm.report.page.embedding import json_text
 from v2hdm.report.page.facts import Facts, cams_from_map
 from v2hdm.report.page.layers import jpeg, jpeg_of, rounded, shrunk
 from v2hdm.store.files import take_typed
 from v2hdm.store.names import overlay_file
 
-BUDGET_BYTES = 8_000_000  # limit of all pictures, as text in the page: reports stay below 15 MB
+BUDGET_BYTES = 8_000_000  # limit of all pictures, as text in the page
+PAGE_BYTES = 15_000_000  # size below which a report stays, as long as its map alone leaves room; chosen
+_REST_BYTES = 2_000_000  # size of what is in a page beside map and pictures: half of that on rendered ports
 PER_CAMERA = 2  # pictures per marking and camera: the nearest, and one from the middle of its sightings
 _USUAL_BYTES = 5_000  # usual size of a picture, to estimate how many fit
 _LONGEST_PX = 320  # longer side of a picture at most
@@ -43,8 +46,16 @@ class Cut:
     seen_px: FloatArray  # (M, 2) detected corners, recorded px
 
 
-def pictures(facts: Facts) -> dict[str, list[dict[str, Any]]]:
+def room_for_pictures(map_data: dict[str, Any]) -> int:
+    """The bytes that a page's map leaves for pictures."""
+    room = PAGE_BYTES - _REST_BYTES - len(json_text(map_data))
+    return min(max(room, 0), BUDGET_BYTES)
+
+
+def pictures(facts: Facts, most_bytes: int) -> dict[str, list[dict[str, Any]]]:
     """Pictures by feature, best first: keys ``m`` or ``s`` and the id, ``x`` and an excluded one's number.
+
+    As text they take ``most_bytes``.
 
     Each has ``src`` (JPEG in base64), ``size``, ``camera``, ``image``, ``t`` (s), the projected shape
     (``map``) and the detected corners (``seen``), in px of the picture. Empty without the drive; raises
@@ -64,7 +75,7 @@ def pictures(facts: Facts) -> dict[str, list[dict[str, Any]]]:
         cuts += _of_place(facts, cam_from_map, f"x{number}", candidate.position_map[None])
     cuts = [cut for cut in cuts if cut.image in images]
     by_image: dict[str, list[Cut]] = {}
-    for cut in sorted(cuts, key=lambda cut: cut.rank)[: BUDGET_BYTES // _USUAL_BYTES]:
+    for cut in sorted(cuts, key=lambda cut: cut.rank)[: most_bytes // _USUAL_BYTES]:
         by_image.setdefault(cut.image, []).append(cut)
     drawn: list[tuple[Cut, dict[str, Any]]] = []
     for name, cuts_of_image in by_image.items():
@@ -79,7 +90,7 @@ def pictures(facts: Facts) -> dict[str, list[dict[str, Any]]]:
     spent = 0
     for cut, picture in sorted(drawn, key=lambda pair: pair[0].rank):
         spent += len(picture["src"])
-        if spent > BUDGET_BYTES:
+        if spent > most_bytes:
             break
         out.setdefault(cut.key, []).append(picture)
     return out

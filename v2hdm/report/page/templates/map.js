@@ -12,7 +12,7 @@
   const small = (value, digits) => (value > 0 && value < 0.5 * 10 ** -digits ? `< ${10 ** -digits}` : number(value, digits));
   const cm = (metres) => `${small(100 * metres, 1)} cm`;
   const SERIES = ["blue", "green", "vermillion", "purple", "orange", "sky", "wine", "teal", "olive", "indigo"];
-  const DASHES = [null, "7 4", "2 4", "8 3 2 3"];
+  const DASHES = [[], [7, 4], [2, 4], [8, 3, 2, 3]];
   const MOST_IN_DETAIL = 1200; // most markings in view with ellipses and arrows
   const LEAST_PX = 3; // least semi-axis of a drawn ellipse
   const NEAR_PX = 6; // least pixels per metre for ellipses and arrows
@@ -33,66 +33,59 @@
 
   const map = L.map("map", {
     crs: L.CRS.Simple, minZoom: -4, maxZoom: 10, zoomSnap: 0.25, zoomDelta: 1, wheelPxPerZoomLevel: 90,
-    attributionControl: false, renderer: L.canvas({ padding: 0.4 }), zoomControl: true,
+    attributionControl: false, zoomControl: true,
   });
   L.control.scale({ imperial: false, maxWidth: 140 }).addTo(map);
-  // Only markings react to the pointer; the panes above them are transparent to it.
-  const pane = (name, zIndex) => {
-    const made = map.createPane(name);
-    made.style.zIndex = zIndex;
-    made.style.pointerEvents = "none";
-    return L.canvas({ pane: name, padding: 0.4 });
-  };
-  const below = pane("below", 350);
-  const above = pane("above", 450);
+  const canvas = new Features.Canvas({ padding: 0.4 });
+  // What is selected lies above all, and is transparent to the pointer.
+  const above = map.createPane("above");
+  Object.assign(above.style, { zIndex: 450, pointerEvents: "none" });
+  const still = { renderer: L.canvas({ pane: "above", padding: 0.4 }), interactive: false, noClip: true, smoothFactor: 0 };
 
   // ---- layers ----
   const layers = {};
-  const exact = { noClip: true, smoothFactor: 0 }; // clipping and simplifying do not pay for four corners
-  const still = (renderer) => ({ renderer, interactive: false, smoothFactor: 0.3 });
+  const { Shape } = Features;
+  const group = (shapes, isInteractive = false) => new Features.Group(canvas, shapes, isInteractive);
+  const line = (points, more = {}) => new Shape(points, { isOpen: true, ...more });
   for (const [zIndex, name] of ["background", "mosaic"].entries()) {
     if (!data[name]) continue;
     const { type, src, bounds: [west, south, east, north] } = data[name];
     layers[name] = L.imageOverlay(`data:${type};base64,${src}`, [[south, west], [north, east]], { pane: "tilePane", interactive: false, zIndex: zIndex + 1 });
   }
   if (data.truth) {
-    layers.truth = L.featureGroup([
-      ...data.truth.markings.map((corners) => L.polygon(corners.map(at), { ...still(below), ...exact })),
-      ...data.truth.lanes.map((line) => L.polyline(line.map(at), still(below))),
+    layers.truth = group([
+      ...data.truth.markings.map((corners) => new Shape(corners)),
+      ...data.truth.lanes.map((points) => line(points)),
     ]);
   }
-  layers.lanes = L.featureGroup(data.lanes.map((lane) =>
-    Object.assign(L.polyline(lane.p.map(at), still(below)), { kind: lane.k })));
-  if (data.route.recorded.length) layers.recorded = L.featureGroup([L.polyline(data.route.recorded.map(at), still(below))]);
-  if (data.route.adjusted.length) layers.adjusted = L.featureGroup([L.polyline(data.route.adjusted.map(at), still(below))]);
+  layers.lanes = group(data.lanes.map((lane) => line(lane.p, { kind: lane.k })));
+  if (data.route.recorded.length) layers.recorded = group([line(data.route.recorded)]);
+  if (data.route.adjusted.length) layers.adjusted = group([line(data.route.adjusted)]);
   const things = [];
-  const feature = (shape, about) => {
-    Object.assign(shape, { about });
+  const feature = (points, about, more = {}) => {
+    const shape = new Shape(points, { about, ...more });
     things.push(shape);
     return shape;
   };
-  layers.markings = L.featureGroup([
-    // Areas lie below the markings in them.
-    ...data.symbols.filter((one) => one.area).map((one) => feature(L.polygon(one.p.map(at), exact), { ...one, key: `s${one.id}`, what: "symbol" })),
-    ...data.markings.map((one) => feature(L.polygon(one.c.map(at), exact), { ...one, key: `m${one.id}`, what: "marking" })),
-    ...data.symbols.filter((one) => !one.area).map((one) => feature(L.polygon(one.p.map(at), exact), { ...one, key: `s${one.id}`, what: "symbol" })),
-  ]);
-  layers.excluded = L.featureGroup(data.excluded.map((one, n) =>
-    feature(L.circleMarker(at(one.p), { radius: 4 }), { ...one, key: `x${n}`, what: "excluded" })));
-  layers.checks = L.featureGroup(data.checks.map((one, n) =>
-    feature(L.circleMarker(at(one.p), { radius: 6 }), { ...one, key: `c${n}`, what: "check" })));
+  layers.markings = group([
+    ...data.markings.map((one) => feature(one.c, { ...one, key: `m${one.id}`, what: "marking" })),
+    ...data.symbols.map((one) => feature(one.p, { ...one, key: `s${one.id}`, what: "symbol" })),
+  ], true);
+  layers.excluded = group(data.excluded.map((one, n) => feature([one.p], { ...one, key: `x${n}`, what: "excluded" }, { radius: 4 })), true);
+  layers.checks = group(data.checks.map((one, n) => feature([one.p], { ...one, key: `c${n}`, what: "check" }, { radius: 6 })), true);
   const FATES = { moved: "blue", vanished: "vermillion", new: "green" };
   const changed = new Map(data.changes.map((one) => [one.id, one]));
   // Existing markings react themselves; vanished ones need a shape of their own.
-  layers.changes = L.featureGroup(data.changes.flatMap(({ before, ...one }) => {
-    const dashed = { fate: one.fate, dashArray: "5 4" };
-    if (one.fate === "vanished") return [feature(L.polygon(one.p.map(at), { ...exact, ...dashed }), { ...one, key: `d${one.id}`, what: "change" })];
-    return [[before, dashed], [one.p, { fate: one.fate }]].map(([corners, look]) => L.polygon(corners.map(at), { ...still(above), ...exact, ...look, fill: false }));
-  }));
+  layers.changes = group(data.changes.flatMap(({ before, ...one }) => {
+    const dashed = { fate: one.fate, dash: [5, 4] };
+    if (one.fate === "vanished") return [feature(one.p, { ...one, key: `d${one.id}`, what: "change" }, dashed)];
+    return [[before, dashed], [one.p, { fate: one.fate }]].filter(([corners]) => corners.length).map(([corners, more]) => new Shape(corners, more));
+  }), true);
   const written = data.symbols.filter((one) => one.says);
   if (written.length) layers.texts = L.layerGroup();
-  layers.ellipses = L.layerGroup();
-  layers.arrows = L.layerGroup();
+  layers.ellipses = group([]);
+  layers.arrows = group([]);
+  canvas.groups = ["truth", "lanes", "recorded", "adjusted", "markings", "excluded", "checks", "changes", "ellipses", "arrows"].flatMap((name) => layers[name] ?? []);
   const selection = L.layerGroup().addTo(map);
 
   const worst = (one) => (one.w ? Math.max(...one.w) : NaN);
@@ -109,10 +102,12 @@
   let shade = "class";
   let range = [0, 1];
 
+  let inks = {}; // colours by name, of the theme
+
   function fill(one) {
-    if (shade === "class") return colour(SERIES[one.k % SERIES.length]);
+    if (shade === "class") return inks[SERIES[one.k % SERIES.length]];
     const value = SHADES[shade].of(one);
-    return Number.isFinite(value) ? ramp((value - range[0]) / (range[1] - range[0] || 1)) : colour("muted");
+    return Number.isFinite(value) ? ramp((value - range[0]) / (range[1] - range[0] || 1)) : inks.muted;
   }
 
   function paint() {
@@ -120,38 +115,32 @@
       const values = data.markings.map(SHADES[shade].of).filter(Number.isFinite).sort((a, b) => a - b);
       range = values.length ? [values[0], values[Math.floor(0.98 * (values.length - 1))]] : [0, 1];
     }
-    const [ink, muted] = [colour("ink"), colour("muted")];
-    layers.truth?.setStyle({ color: muted, weight: 1, dashArray: "3 3", fill: false });
-    layers.lanes.eachLayer((line) => line.setStyle({ color: colour("sky"), weight: 2, dashArray: data.kinds[line.kind] === "lane_dash" ? "10 8" : null }));
-    layers.recorded?.setStyle({ color: colour("vermillion"), weight: 1.2, dashArray: "2 5" });
-    layers.adjusted?.setStyle({ color: ink, weight: 1.2, dashArray: null });
-    layers.markings.eachLayer((shape) => shape.setStyle({ color: fill(shape.about), weight: 1.2, fillOpacity: shape.about.area ? 0.2 : 0.55, dashArray: shape.about.what === "symbol" ? "4 2" : null }));
-    layers.checks.setStyle({ color: ink, weight: 2, fillColor: colour("orange"), fillOpacity: 0.9 });
-    layers.changes.eachLayer((shape) => shape.setStyle({ color: colour(FATES[shape.options.fate]), weight: 2.5, fillOpacity: 0 }));
-    layers.excluded.setStyle({ color: colour("vermillion"), weight: 1.3, dashArray: "2 1.5", fill: true, fillOpacity: 0 });
+    inks = Object.fromEntries(["ink", "muted", ...SERIES].map((name) => [name, colour(name)]));
+    const { ink, muted, sky, vermillion, orange } = inks;
+    layers.truth?.restyle(() => ({ color: muted, weight: 1, dash: [3, 3] }));
+    layers.lanes.restyle(({ kind }) => ({ color: sky, weight: 2, dash: data.kinds[kind] === "lane_dash" ? [10, 8] : [] }));
+    layers.recorded?.restyle(() => ({ color: vermillion, weight: 1.2, dash: [2, 5] }));
+    layers.adjusted?.restyle(() => ({ color: ink, weight: 1.2 }));
+    layers.markings.restyle(({ about }) => ({ color: fill(about), weight: 1.2, opacity: about.area ? 0.2 : 0.55, dash: about.what === "symbol" ? [4, 2] : [] }));
+    layers.checks.restyle(() => ({ color: ink, weight: 2, fill: orange, opacity: 0.9 }));
+    layers.changes.restyle(({ fate, dash }) => ({ color: inks[FATES[fate]], weight: 2.5, dash }));
+    layers.excluded.restyle(() => ({ color: vermillion, weight: 1.3, dash: [2, 1.5] }));
     legend();
     detail();
   }
 
   // ---- details, for markings in view only ----
-  function ring([x, y], [a, b, direction], times) {
-    const [c, s] = [Math.cos(direction), Math.sin(direction)];
-    return Array.from({ length: 72 }, (_, n) => {
-      const [u, v] = [times * a * Math.cos(n * Math.PI / 36), times * b * Math.sin(n * Math.PI / 36)];
-      return [y + s * u + c * v, x + c * u - s * v];
-    });
-  }
-
   function inView() {
     if (map.getZoomScale(map.getZoom(), 0) < NEAR_PX) return null;
     const bounds = map.getBounds().pad(0.1);
-    const found = data.markings.filter((one) => bounds.contains(at(one.c[0])));
+    const [west, south, east, north] = [bounds.getWest(), bounds.getSouth(), bounds.getEast(), bounds.getNorth()];
+    const found = data.markings.filter(({ c: [[x, y]] }) => x > west && x < east && y > south && y < north);
     return found.length <= MOST_IN_DETAIL ? found : null;
   }
 
   function detail() {
-    layers.ellipses.clearLayers();
-    layers.arrows.clearLayers();
+    layers.ellipses.replace([]);
+    layers.arrows.replace([]);
     label();
     const [ellipses, arrows] = [map.hasLayer(layers.ellipses), map.hasLayer(layers.arrows)];
     const shown = ellipses || arrows ? inView() : [];
@@ -160,13 +149,17 @@
     if (!shown) return;
     const times = Number(byId("enlarge").value);
     const px = map.getZoomScale(map.getZoom(), 0);
+    const [look, looks] = [{ color: inks.ink, weight: 1 }, data.cameras.map(arrowLook)];
+    const [rings, heads] = [[], []];
     for (const one of shown) {
       if (ellipses && one.e) one.c.forEach((corner, n) => {
-        if (one.e[n][0] * times * px >= LEAST_PX) layers.ellipses.addLayer(
-          L.polygon(ring(corner, one.e[n], times), { ...still(above), ...exact, color: colour("ink"), weight: 1, fill: false }));
+        const [a, b, direction] = one.e[n];
+        if (a * times * px >= LEAST_PX) rings.push(new Shape([corner], { ellipse: [...corner, a * times, b * times, direction], look }));
       });
-      if (arrows) for (const [camera, dx, dy] of one.a ?? []) layers.arrows.addLayer(arrow(one, camera, dx, dy, times, px));
+      if (arrows) for (const [camera, dx, dy] of one.a ?? []) heads.push(arrow(one, looks[camera], dx, dy, times, px));
     }
+    layers.ellipses.replace(rings);
+    layers.arrows.replace(heads.flat());
   }
 
   function label() { // what words say, where there is room for it
@@ -179,15 +172,15 @@
     }
   }
 
-  function arrow(one, camera, dx, dy, times, px) {
+  const arrowLook = (_, camera) => ({ color: inks[SERIES[(camera + 3) % SERIES.length]], weight: 1.8, dash: DASHES[camera % DASHES.length] });
+  function arrow(one, look, dx, dy, times, px) {
     const x = one.c.reduce((sum, corner) => sum + corner[0], 0) / 4;
     const y = one.c.reduce((sum, corner) => sum + corner[1], 0) / 4;
     const [ex, ey] = [x + times * dx, y + times * dy];
     const head = Math.min(6 / px, 0.4 * Math.hypot(ex - x, ey - y));
     const angle = Math.atan2(ey - y, ex - x);
-    const wing = (turn) => [ey + head * Math.sin(angle + turn), ex + head * Math.cos(angle + turn)];
-    return L.polyline([[[y, x], [ey, ex]], [wing(2.6), [ey, ex], wing(-2.6)]],
-      { ...still(above), color: colour(SERIES[(camera + 3) % SERIES.length]), weight: 1.8, dashArray: DASHES[camera % DASHES.length] });
+    const wing = (turn) => [ex + head * Math.cos(angle + turn), ey + head * Math.sin(angle + turn)];
+    return [[[x, y], [ex, ey]], [wing(2.6), [ex, ey], wing(-2.6)]].map((points) => line(points, { look }));
   }
 
   // ---- the panel ----
@@ -245,7 +238,7 @@
       rows.push(element("div", { class: "ends" }, element("span", {}, text(range[0])), element("span", {}, `${text(range[1])} and more`)));
     }
     if (layers.arrows && map.hasLayer(layers.arrows)) {
-      data.cameras.forEach((name, n) => rows.push(element("div", {}, swatch(`var(--${SERIES[(n + 3) % SERIES.length]})`, DASHES[n % DASHES.length], "arrow"), `${name}: mean of projected minus observed`)));
+      data.cameras.forEach((name, n) => rows.push(element("div", {}, swatch(`var(--${SERIES[(n + 3) % SERIES.length]})`, DASHES[n % DASHES.length].join(" "), "arrow"), `${name}: mean of projected minus observed`)));
     }
     byId("legend").replaceChildren(...rows);
   }
@@ -286,10 +279,22 @@
     if (about.c) about.c.forEach(([x, y], n) => box.append(`${n + 1}: ${number(x, 3)} E, ${number(y, 3)} N`, element("br")));
     return box;
   }
-  for (const name of ["markings", "excluded", "checks", "changes"]) {
-    layers[name].bindTooltip(tooltip, { sticky: true, direction: "auto", opacity: 1 });
-    layers[name].on("click", (event) => select(event.layer));
-  }
+  const tip = L.tooltip({ direction: "auto", opacity: 1 });
+  let pointed = null; // the shape under the pointer
+  const point = (shape, place) => {
+    if (shape) tip.setLatLng(place);
+    if (shape === pointed) return;
+    pointed = shape;
+    map.getContainer().style.cursor = shape ? "pointer" : "";
+    if (!shape) map.closeTooltip(tip);
+    else map.openTooltip(tip.setContent(tooltip(shape)));
+  };
+  map.on("mousemove", ({ latlng }) => { if (!map.dragging.moving()) point(canvas.hit(latlng), latlng); });
+  map.on("mouseout movestart", () => point(null));
+  map.on("click", ({ latlng }) => {
+    const shape = canvas.hit(latlng);
+    if (shape) select(shape);
+  });
 
   function shot(picture) {
     const [width, height] = picture.size;
@@ -309,11 +314,11 @@
     for (const [name, value] of facts(about)) rows.append(element("dt", {}, name), element("dd", {}, value));
     const text = element("div", {}, element("h3", {}, title(about)), rows);
     if (about.c) {
-      selection.addLayer(L.polygon(about.c.map(at), { ...still(above), color: colour("ink"), weight: 3, fill: false }));
+      selection.addLayer(L.polygon(about.c.map(at), { ...still, color: colour("ink"), weight: 3, fill: false }));
       about.c.forEach((corner, n) => selection.addLayer(L.tooltip({ permanent: true, direction: "center", className: "corner", interactive: false }).setLatLng(at(corner)).setContent(String(n + 1))));
       text.append(corners(about));
-    } else if (["symbol", "change"].includes(about.what)) selection.addLayer(L.polygon(about.p.map(at), { ...still(above), color: colour("ink"), weight: 3, fill: false }));
-    else selection.addLayer(L.circleMarker(at(about.p), { ...still(above), radius: 9, color: colour("ink"), weight: 3, fill: false }));
+    } else if (["symbol", "change"].includes(about.what)) selection.addLayer(L.polygon(about.p.map(at), { ...still, color: colour("ink"), weight: 3, fill: false }));
+    else selection.addLayer(L.circleMarker(at(about.p), { ...still, radius: 9, color: colour("ink"), weight: 3, fill: false }));
     const shots = element("div", { class: "shots" }, ...picturesOf(about.key).map(shot));
     const side = element("div");
     if (shots.childElementCount) {
@@ -424,10 +429,11 @@
 
   // ---- begin ----
   const everything = L.latLngBounds([]);
-  for (const name of ["markings", "lanes", "adjusted"]) if (layers[name]?.getLayers().length) everything.extend(layers[name].getBounds());
+  for (const name of ["markings", "lanes", "adjusted"]) if (layers[name]?.shapes.length) everything.extend(layers[name].getBounds());
   map.fitBounds(everything.isValid() ? everything.pad(0.03) : [[-10, -10], [10, 10]]);
   map.setMinZoom(Math.min(map.getZoom() - 1, 0));
   map.setMaxBounds(everything.isValid() ? everything.pad(1) : null);
+  canvas.addTo(map);
   map.on("moveend", detail);
   for (const name of ["ellipses", "arrows"]) layers[name].on("add remove", legend);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", paint);
