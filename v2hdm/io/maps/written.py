@@ -72,7 +72,7 @@ def read_written(path: Path) -> HDMap:
         return read_geojson(path)
     hd_map = read_geojson_of({"v2hdm": content.v2hdm, "features": others}, path)
     paints: list[Marking | Lane | Symbol] = [*markings, *hd_map.lanes, *hd_map.symbols]
-    ids = [paint.id for paint in paints]
+    ids = [paint.id or 0 for paint in paints]
     if len(set(ids)) < len(ids) or min(ids, default=1) < 1:
         return read_geojson(path)
     return replace(hd_map, markings=tuple(markings))
