@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import ConfigError
-from v2hdm.records import LANE_BOUNDARY, BoolArray, FloatArray
+from v2hdm.records import CROSSWALK, LANE_BOUNDARY, BoolArray, FloatArray
 from v2hdm.safe.texts import read_yaml, shown
 
 CATALOGUE_FILE = Path(__file__).with_name("catalogue.yaml")
@@ -196,5 +196,8 @@ PAINT_CLASSES = SHIPPED.names
 traffic islands, a box is an area to be kept clear: its frame and hatching; a bicycle is any symbol of who may
 go there. Other paint is whatever else is no marking to map. A network that was trained before a class was
 added has the channels before it, and finds none of that class."""
+
+AREAS = (*SHIPPED.of_family(AREA), CROSSWALK)
+"""Classes of symbols that are areas: those of the catalogue, and what is composed of bars."""
 
 CORNERED_CLASSES = SHIPPED.cornered  # shipped classes that are mapped as quadrilaterals by their four corners

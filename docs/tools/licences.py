@@ -18,7 +18,7 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "licences.md"
-EXTRAS = ("", "map", "ros", "ubx", "video", "gis", "text", "pdf")
+EXTRAS = ("", "map", "ros", "ubx", "video", "gis", "parquet", "text", "pdf")
 """What users install, by extra; the first is the base install."""
 
 _BEGIN = "<!-- installed parts: python docs/tools/licences.py -->\n"

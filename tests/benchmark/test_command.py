@@ -95,5 +95,5 @@ def test_the_table_of_the_page_is_written_from_scores(tmp_path, cache, streets, 
 
 def test_the_page_has_the_score_of_every_site():
     page = page_tool().PAGE.read_text()
-    for name in ("port2", "streets"):
+    for name in ("port1", "port2", "streets"):
         assert sum(line.startswith(f"| `{name}` | ") and " % of " in line for line in page.splitlines()) == 1

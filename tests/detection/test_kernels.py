@@ -218,6 +218,14 @@ def test_boundaries_end_alike_compiled_and_in_numpy():
     np.testing.assert_allclose(total, total_too, rtol=1e-12)
 
 
+def test_a_corner_far_from_the_image_asks_for_no_more_pixels_than_the_image_has():
+    scene = Scene(3, "plumb_bob")
+    scene.start[0, 2] = [20_000.0, 160.0]
+    lattice = lay_lattice(scene.patches, scene.frames, scene.start)
+    height, width = scene.image.shape[:2]
+    assert lattice.use.shape[1] < (height + 400) * (width + 400)
+
+
 @compiled
 def test_arrays_that_do_not_belong_together_are_refused():
     scene = Scene(0)

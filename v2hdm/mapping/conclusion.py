@@ -14,6 +14,7 @@ from v2hdm.association.groups import fuse_groups, group_kinds
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.faults.clock_errors import ClockErrors, moves_with_clocks
 from v2hdm.geometry.ipm import project_ground
+from v2hdm.io.maps.corrections import Heard
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.records import (
     BoolArray,
@@ -27,7 +28,6 @@ from v2hdm.records import (
 )
 from v2hdm.site.accuracy import corner_radii_m, radius_of_all_m
 from v2hdm.site.candidates import Candidates, Counts, scatter_of, with_dissent, with_shared_errors
-from v2hdm.site.corrections import Heard
 from v2hdm.site.markings import Classified, Suspicion, classify, most_suspicious
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import Parallax, PointViews, measure_parallax

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from v2hdm.faults import Contradiction
+from v2hdm.io.maps.corrections import Heard
 from v2hdm.io.maps.evidence import Residuals
 from v2hdm.records import (
     BoolArray,
@@ -22,7 +23,6 @@ from v2hdm.records import (
     IntArray,
     JointCovariance,
 )
-from v2hdm.site.corrections import Heard
 from v2hdm.site.markings import Suspicion
 from v2hdm.surface.surface import Surface
 

@@ -6,11 +6,10 @@ import logging
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 
-from v2hdm.io.maps.corrections import Correction
+from v2hdm.io.maps.corrections import Correction, Heard
 from v2hdm.io.maps.questions import answers_among
 from v2hdm.pipeline.result import Result
 from v2hdm.records import Drive, Trajectory
-from v2hdm.site.corrections import Heard
 from v2hdm.topology.build import answered_graph
 from v2hdm.verdict import Finding, Status, Verdict
 from v2hdm.verdict.verdict import passed

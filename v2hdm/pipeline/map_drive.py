@@ -18,7 +18,7 @@ from v2hdm.doors import checked
 from v2hdm.errors import AdjustError, ConfigError, MappingError
 from v2hdm.executor import open_executor
 from v2hdm.io.drive import ReadOptions, as_drive, join_drives
-from v2hdm.io.maps.corrections import Correction, read_corrections
+from v2hdm.io.maps.corrections import Correction, Heard, read_corrections
 from v2hdm.mapping.options import AUTO, MappingOptions, check_options
 from v2hdm.pipeline.answers import with_answers
 from v2hdm.pipeline.base import changes_json, check_together, read_base
@@ -32,7 +32,6 @@ from v2hdm.pipeline.stages import MappedSet, detect_in_pieces, map_camera_sets, 
 from v2hdm.progress import Progress, silent
 from v2hdm.records import BEST, Drive, ImageDetections
 from v2hdm.settings import Processes
-from v2hdm.site.corrections import Heard
 from v2hdm.site.living.changes import Base
 from v2hdm.store.cache import StageCache
 from v2hdm.survey.run import Survey, check_survey, take_survey

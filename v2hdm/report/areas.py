@@ -9,13 +9,10 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from v2hdm.catalogue import AREA, SHIPPED
+from v2hdm.catalogue import AREAS
 from v2hdm.geometry.planar import clip_convex, signed_area
-from v2hdm.records import CROSSWALK, DOUBLE_LINE, TEXT, BoolArray, FloatArray, HDMap, Symbol, Truth
+from v2hdm.records import DOUBLE_LINE, TEXT, BoolArray, FloatArray, HDMap, Symbol, Truth
 from v2hdm.report.metrics import LATERAL_GATE_M, SAMPLE_STEP_M, distance_to_points, resample, runs
-
-AREAS = (*SHIPPED.of_family(AREA), CROSSWALK)
-"""Classes of symbols that are areas: those of the catalogue, and what is composed of bars."""
 
 LEAST_IOU = 0.3  # least intersection over union of a mapped area and a true one that are the same
 

@@ -11,9 +11,6 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
-from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from v2hdm.catalogue import CORNERED_CLASSES
 from v2hdm.geometry.planar import inside_convex, length_along, points_along
@@ -113,6 +110,8 @@ def match_markings(
     mapped: Sequence[Marking], true: Sequence[Marking], gate_m: float = MATCH_GATE_M
 ) -> tuple[list[int], list[int]]:
     """One-to-one pairs (indices into both) within a class, of least total centre distance."""
+    from scipy.optimize import linear_sum_assignment  # slow to load, and `view` compares nothing
+
     if not mapped or not true:
         return [], []
     centres = np.array([m.corners_map.mean(axis=0) for m in mapped])
@@ -161,6 +160,8 @@ def first_corners(mapped: Sequence[Marking], true: Sequence[Marking]) -> list[in
 
 def extrinsic_metrics(cam_from_vehicle: FloatArray, true_cam_from_vehicle: FloatArray) -> dict[str, float]:
     """Angle (deg) between two camera orientations (4, 4), and distance (m) of their centres."""
+    from scipy.spatial.transform import Rotation  # slow to load, and `view` compares nothing
+
     turn = Rotation.from_matrix(cam_from_vehicle[:3, :3] @ true_cam_from_vehicle[:3, :3].T)
     shift_m = camera_centre(cam_from_vehicle) - camera_centre(true_cam_from_vehicle)
     angle_deg = np.rad2deg(turn.magnitude())
@@ -232,6 +233,8 @@ def resample(points: FloatArray, step_m: float = SAMPLE_STEP_M) -> FloatArray:
 
 def distance_to_points(points: FloatArray, line: FloatArray) -> FloatArray:
     """Distance (N,) of points to a densely sampled line, perpendicular between the two nearest samples."""
+    from scipy.spatial import cKDTree  # slow to load, and `view` compares nothing
+
     if not len(points):
         return np.empty(0)
     if len(line) < 2:
@@ -294,6 +297,8 @@ def extrinsic_figures(estimate: FloatArray, initial: FloatArray, true: FloatArra
 
     Rotations are about the vehicle's axes, deg: yaw to the left, pitch nose down, roll to the right.
     """
+    from scipy.spatial.transform import Rotation  # slow to load, and `view` compares nothing
+
     turn_vehicle = estimate[:3, :3].T @ initial[:3, :3]
     yaw, pitch, roll = Rotation.from_matrix(turn_vehicle).as_euler("ZYX", degrees=True)
     shift_m = camera_centre(estimate) - camera_centre(initial)

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.optimize import brentq
 
 from v2hdm.records import ACCURACIES, SIGMAS_95, FloatArray, Marking
 
@@ -91,6 +90,8 @@ def radius_of_all_m(radius_m: FloatArray) -> float:
 
     Errors are circular normal: with 1 - 0.05^((r / own)^2) a point lies within r. Infinite for no points.
     """
+    from scipy.optimize import brentq  # slow to load, and `view` shows each radius by itself
+
     if not len(radius_m) or np.mean(np.isfinite(radius_m)) < _SHARE:
         return float("inf")
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from v2hdm.geometry.planar import clip_convex, signed_area
-from v2hdm.io.maps.corrections import ACCEPTED, ADDED, REJECTED, Correction
+from v2hdm.io.maps.corrections import ACCEPTED, ADDED, REJECTED, Correction, Heard
 from v2hdm.records import Exclusion, FloatArray, HDMap, IntArray, Marking
 from v2hdm.site.candidates import Candidates
 
@@ -80,20 +80,6 @@ class Stated:
                 rows = slice(2 * corner, 2 * corner + 2)
                 covariance[group][rows, rows] += correction.sigma_m**2 * np.eye(2)
         return Candidates(corners, covariance)
-
-
-@dataclass(frozen=True)
-class Heard:
-    """A correction that the map follows, and how the images contradict it; empty where they do not."""
-
-    place: str
-    says: str
-    against: str = ""
-
-    @property
-    def sentence(self) -> str:
-        """Both in a line."""
-        return f"{self.place}: {self.says}" + (f", but {self.against}" if self.against else "")
 
 
 def heard_of(

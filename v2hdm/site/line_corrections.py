@@ -8,9 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from v2hdm.geometry.planar import length_along, points_along
-from v2hdm.io.maps.corrections import ADDED, REJECTED, Correction
+from v2hdm.io.maps.corrections import ADDED, REJECTED, Correction, Heard
 from v2hdm.records import BoolArray, FloatArray, HDMap, Lane
-from v2hdm.site.corrections import Heard
 
 _SAME_M = 0.4  # largest distance, m, between a line and what a person says of it, as of markings
 _STEP_M = 0.5  # distance, m, between the vertices of a line that was drawn, as of those that are mapped

@@ -14,6 +14,7 @@ from scipy.stats import beta, f
 
 from v2hdm.errors import MappingError
 from v2hdm.geometry.planar import Quad
+from v2hdm.io.maps.corrections import Heard
 from v2hdm.records import BoolArray, Exclusion, FloatArray, IntArray, Marking
 from v2hdm.site.candidates import (
     FOUND_SELDOM,
@@ -24,7 +25,7 @@ from v2hdm.site.candidates import (
     Counts,
     variance_prior,
 )
-from v2hdm.site.corrections import MAX_OVERLAP, Heard, Stated, heard_of, overlap
+from v2hdm.site.corrections import MAX_OVERLAP, Stated, heard_of, overlap
 from v2hdm.site.hypotheses import Kind
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import Parallax

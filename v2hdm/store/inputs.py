@@ -58,20 +58,33 @@ def _identity(path: Path) -> tuple[int, int] | None:
     return about.st_dev, about.st_ino
 
 
+def is_as_written(path: Path, data: bytes) -> bool:
+    """Whether a file of a result holds the ``data`` that we wrote."""
+    with suppress(OSError, RuntimeError):
+        return hashlib.sha256(data).hexdigest() in _digests(path.resolve())
+    return False
+
+
+def _digests(path: Path) -> set[str]:
+    """The digests of what we wrote to a file, by the list of its result; empty where none lists it."""
+    folder = next((parent for parent in path.parents[:_DEEPEST] if (parent / LIST).is_file()), None)
+    if folder is None:
+        return set()
+    written = set()
+    for line in (folder / LIST).read_text(encoding="utf-8", errors="replace").splitlines()[1:]:
+        with suppress(ValueError, TypeError, LookupError, RecursionError):  # a torn or foreign line
+            entry = json.loads(line)
+            if entry["file"] == path.relative_to(folder).as_posix():
+                written.add(str(entry["sha256"]))
+    return written
+
+
 def warn_if_changed(path: Path, data: bytes) -> None:
     """Warn, once, of a file of a result that holds other ``data`` than we wrote; it is read all the same."""
     with suppress(OSError, RuntimeError):
         path = path.resolve()
         digest = hashlib.sha256(data).hexdigest()
-        written = set()
-        folder = next((parent for parent in path.parents[:_DEEPEST] if (parent / LIST).is_file()), None)
-        if folder is None:
-            return
-        for line in (folder / LIST).read_text(encoding="utf-8", errors="replace").splitlines()[1:]:
-            with suppress(ValueError, TypeError, LookupError, RecursionError):  # a torn or foreign line
-                entry = json.loads(line)
-                if entry["file"] == path.relative_to(folder).as_posix():
-                    written.add(str(entry["sha256"]))
+        written = _digests(path)
         if written and digest not in written and (path, digest) not in _reported:
             _reported.add((path, digest))
             advice = "edited since, or damaged; if nobody edited it, make it again"

@@ -234,6 +234,8 @@ class _Segments:
     end: FloatArray  # (S, 2) m
     line: IntArray  # (S,) number of the line that each is of
     index: IntArray  # (S,) number of each along its line
+    first: IntArray  # (L + 1,) number of the first segment of each line, then of all
+    boxes: FloatArray  # (L, 2, 2) m, least and largest coordinates of each line
 
     @classmethod
     def of(cls, lines_map: Sequence[FloatArray]) -> _Segments:
@@ -242,7 +244,13 @@ class _Segments:
         start = np.concatenate([none, *(line[:-1] for line in lines_map)])
         end = np.concatenate([none, *(line[1:] for line in lines_map)])
         index = np.concatenate([np.arange(0), *map(np.arange, counts)])
-        return cls(start, end, np.repeat(np.arange(len(lines_map)), counts), index)
+        first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        nowhere = np.array([[np.inf, np.inf], [-np.inf, -np.inf]])
+        boxes = [
+            np.stack([line.min(axis=0), line.max(axis=0)]) if len(line) else nowhere for line in lines_map
+        ]
+        numbers = np.repeat(np.arange(len(lines_map)), counts)
+        return cls(start, end, numbers, index, first, np.array(boxes).reshape(-1, 2, 2))
 
     def across(self, number: int, line: FloatArray, side: int) -> _Across:
         """The first line left (1) or right (-1) of each vertex of a line (N, 2)."""
@@ -263,8 +271,14 @@ class _Segments:
         """The result of :meth:`across` for neighbouring places (N, 2) and directions ``away`` (N, 2)."""
         low = places.min(axis=0) - LANE_WIDTH_M[1]
         high = places.max(axis=0) + LANE_WIDTH_M[1]
-        in_reach = (np.maximum(self.start, self.end) >= low) & (np.minimum(self.start, self.end) <= high)
-        candidates = np.flatnonzero(in_reach.all(axis=1) & (self.line != number))
+        lines_near = np.flatnonzero(((self.boxes[:, 1] >= low) & (self.boxes[:, 0] <= high)).all(axis=1))
+        near = np.concatenate(
+            [np.arange(0)]
+            + [np.arange(self.first[k], self.first[k + 1]) for k in lines_near.tolist() if k != number]
+        )
+        start, end = self.start[near], self.end[near]
+        in_reach = (np.maximum(start, end) >= low) & (np.minimum(start, end) <= high)
+        candidates = near[in_reach.all(axis=1)]
         if not len(candidates):
             nothing = np.zeros(len(places), dtype=np.int64)
             return _Across(nothing - 1, nothing, np.full(len(places), LANE_WIDTH_M[1]))

@@ -171,7 +171,6 @@ def _residuals(drive: Drive, hd_map: HDMap, poses: np.ndarray, cam_from_vehicle:
 
 def make_site(folder: Path, count: int) -> None:
     """Write the result of a site of ``count`` diamonds and its lane lines, without a drive."""
-    folder.mkdir(parents=True)
     side = int(np.ceil(np.sqrt(count)))
     random = np.random.default_rng(7)
     places = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2)[:count] * 4.5
@@ -184,9 +183,11 @@ def make_site(folder: Path, count: int) -> None:
         Lane(LANE_LINE, np.column_stack([along, np.full(len(along), row * 9.0 + 2.2)]), 9)
         for row in range(side // 2)
     ]
-    write_geojson(HDMap(tuple(markings), tuple(lanes)), folder / "map.geojson")
+    hd_map = HDMap(tuple(markings), tuple(lanes))
     metrics = {
         "name": f"{count} markings", "version": "0.1.0", "verdict": verdict(),
         "results": {"front": {"Opt": {"markings": count}}},
     }  # fmt: skip
-    write_json(folder / "metrics.json", metrics)
+    with result_folder(folder) as result:
+        write_geojson(hd_map, result / "map.geojson")
+        write_json(result / "metrics.json", metrics)

@@ -19,6 +19,7 @@ from v2hdm.records import BoolArray, FloatArray, IntArray
 
 KNOTS = 6  # knots of the light along a marking: its two ends are as many fifths of it apart as a shadow needs
 
+_FAR_PX = 200  # from the image, px, up to which pixels about a side are listed: none beyond shows paint
 _OUTSIDE_PX = 3.0  # distance outside a side, px, up to which pixels are looked at
 _INSIDE_PX = 4.0  # distance inside a side, px, up to which pixels are looked at
 _MEDIAN_STRIDE = 3  # a median is taken over every third value: that is as good, and faster
@@ -150,10 +151,14 @@ def lay_grid(patches: Patches, frames: LensFrames, corners_px: FloatArray) -> Gr
 
 def lay_lattice(patches: Patches, frames: LensFrames, corners_px: FloatArray) -> Lattice:
     """The pixels about the sides of quadrilaterals ``corners_px`` (M, 4, 2), recorded px."""
-    bow_px = frames.bow_px(corners_px)
+    # A corner may lie anywhere, where the lens is nothing like its polynomial.
+    image_px = np.array(patches.source.image.shape[1::-1])
+    bow_px = np.minimum(frames.bow_px(corners_px), _FAR_PX)
     spare = np.ceil(bow_px)[:, None].astype(np.intp) + int(_OUTSIDE_PX)
-    low = np.floor(corners_px.min(axis=1)).astype(np.intp) - spare
-    size = np.ceil(corners_px.max(axis=1)).astype(np.intp) + spare + 1 - low
+    high = np.minimum(np.ceil(corners_px.max(axis=1)).astype(np.intp) + spare + 1, image_px + _FAR_PX)
+    low = np.maximum(np.floor(corners_px.min(axis=1)).astype(np.intp) - spare, -_FAR_PX)
+    low = np.minimum(low, high - 1)
+    size = high - low
     in_box = Quad(corners_px - low[:, None])
     columns, rows = _columns_and_rows(in_box, size)
     compiled = kernels()
@@ -371,8 +376,9 @@ def _steps_of(quad: Quad, size: np.ndarray) -> _Steps:
     corner_places = np.sort(quad.corners[marking, :, along], axis=1)
     first_end = np.minimum(corner_places[:, 1], corner_places[:, 0] + quad.width) + _END_PX
     last_end = np.maximum(corner_places[:, 2], corner_places[:, 3] - quad.width) - _END_PX
-    head = np.ceil(first_end).astype(np.intp)
-    tail = np.floor(last_end).astype(np.intp)
+    # Corners may lie outside of the box, which ends not far from the image.
+    head = np.clip(np.ceil(first_end).astype(np.intp), 0, extent)
+    tail = np.clip(np.floor(last_end).astype(np.intp), 0, extent)
     at_ends = head + extent - tail
     slim = np.flatnonzero((step[marking, along] > 1) & (at_ends < _MOST_ENDS * extent))
     per_place = band / extent
@@ -380,7 +386,7 @@ def _steps_of(quad: Quad, size: np.ndarray) -> _Steps:
     step_at_ends = np.ceil(per_place * at_ends / _MAX_AT_ENDS).astype(np.intp)
     step[slim] = 1
     step[slim, along[slim]] = np.maximum(step_between[slim], 1)
-    outer[slim, along[slim]] = step_at_ends[slim]
+    outer[slim, along[slim]] = np.maximum(step_at_ends[slim], 1)
     bounds[slim, along[slim]] = np.column_stack([head, tail])[slim]
     return _Steps(bounds, step, outer)
 

@@ -87,6 +87,20 @@ class Correction:
         return f"{self.kind}{name} at ({x:.2f}, {y:.2f})"
 
 
+@dataclass(frozen=True)
+class Heard:
+    """A correction that the map follows, and how the images contradict it; empty where they do not."""
+
+    place: str
+    says: str
+    against: str = ""
+
+    @property
+    def sentence(self) -> str:
+        """Both in a line."""
+        return f"{self.place}: {self.says}" + (f", but {self.against}" if self.against else "")
+
+
 def read_corrections(path: Path) -> list[Correction]:
     """Read a file of corrections; raises MapFileError, with the entry, where it is missing or damaged."""
     content = load_yaml(path, MapFileError)

@@ -111,7 +111,11 @@ def read_map(path: Path) -> tuple[HDMap, Verdict]:
 
 def read_geojson(path: Path) -> HDMap:
     """Read our own GeoJSON, perhaps edited, in its order; missing or repeated ids are given anew."""
-    content = load_json(path, MapFileError)
+    return read_geojson_of(load_json(path, MapFileError), path)
+
+
+def read_geojson_of(content: Mapping[str, Any], path: Path) -> HDMap:
+    """The map in the ``content`` of the GeoJSON at ``path``; see :func:`read_geojson`."""
     about = content.get("v2hdm")
     features = content.get("features")
     if not isinstance(about, dict) or not isinstance(features, list):

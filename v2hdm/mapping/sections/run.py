@@ -30,6 +30,7 @@ from v2hdm.association.sightings import Sightings, frames_of
 from v2hdm.errors import WorkerError
 from v2hdm.executor import Executor
 from v2hdm.faults.clock_errors import second_moments
+from v2hdm.io.maps.corrections import Heard
 from v2hdm.lanes.lines import join_paths, lanes_along
 from v2hdm.mapping.bundle import LEAST_OBSERVATIONS, VARIANCE_FACTORS, Model, drive_problem, full_model
 from v2hdm.mapping.optimise import SETTLED_MODEL, initial_rig
@@ -59,7 +60,7 @@ from v2hdm.mapping.sections.work import (
 )
 from v2hdm.records import BoolArray, Drive, FloatArray, IntArray
 from v2hdm.site.candidates import Candidates, Counts
-from v2hdm.site.corrections import Heard, added_markings, with_symbols_corrected
+from v2hdm.site.corrections import added_markings, with_symbols_corrected
 from v2hdm.site.line_corrections import with_lines_corrected
 from v2hdm.site.markings import Classified, classify
 from v2hdm.site.options import AcceptanceOptions

@@ -17,7 +17,7 @@ from v2hdm.io.calibration.reading import read_calibration
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.io.maps.evidence import Residuals, read_exclusions, read_residuals
 from v2hdm.io.maps.features import features_of, map_of
-from v2hdm.io.maps.reading import read_geojson
+from v2hdm.io.maps.written import read_written
 from v2hdm.io.metrics import read_metrics
 from v2hdm.io.trajectory import read_tum
 from v2hdm.records import (
@@ -29,7 +29,10 @@ from v2hdm.records import (
     FloatArray,
     HDMap,
     IntArray,
+    Lane,
+    Marking,
     Reception,
+    Symbol,
     Truth,
 )
 from v2hdm.report.coverage import Coverage, read_coverage
@@ -161,7 +164,10 @@ def read_map_of(folder: Path) -> HDMap | None:
     """The map of a result folder, None where it has none; MapFileError if damaged."""
     if not (folder / names.MAP).is_file():
         return None
-    hd_map = read_geojson(folder / names.MAP)
+    hd_map = read_written(folder / names.MAP)
+    paints: list[Marking | Lane | Symbol] = [*hd_map.markings, *hd_map.lanes, *hd_map.symbols]
+    if all(paint.id for paint in paints):
+        return hd_map
     features = features_of(hd_map)
     return map_of(features, [feature.id for feature in features], hd_map.origin)
 

@@ -10,10 +10,10 @@ from typing import Any
 import cv2
 import numpy as np
 
+from v2hdm.catalogue import AREAS
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.geodetic import Grid, crs_of, geodetic_from_enu, utm_of
 from v2hdm.records import SIGMAS_95, Exclusion, FloatArray, HDMap, Lane, Marking, Symbol
-from v2hdm.report.areas import AREAS
 from v2hdm.report.metrics import corner_errors, match_markings, rms
 from v2hdm.report.page.facts import Facts, GroundResiduals
 from v2hdm.report.page.reference import Reference, local_reference

@@ -9,14 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.catalogue import SHIPPED
+from v2hdm.catalogue import AREAS, SHIPPED
 from v2hdm.errors import MapFileError
 from v2hdm.io.trajectory import read_tum
 from v2hdm.records import BEST, Exclusion, FloatArray, HDMap, Marking, Symbol
-from v2hdm.report.areas import AREAS
 from v2hdm.report.page.layers import map_extent, systems_of
 from v2hdm.report.view.session import flat_mm, painted_lines, thinned
-from v2hdm.site.accuracy import corner_radii_m
+from v2hdm.site.accuracy import corner_radii_m, radius_95_m
 from v2hdm.store import names
 from v2hdm.store.files import load_json, take_array
 
@@ -59,7 +58,7 @@ def scene_of(
         "choices": sorted({*SHIPPED.names, *(feature.kind for feature in named)}),
         "cornered": sorted({*SHIPPED.cornered, *(marking.kind for marking in hd_map.markings)}),
         "line_kinds": list(SHIPPED.lane_paint),
-        "markings": [_marking(marking, index) for marking in hd_map.markings],
+        "markings": _markings(hd_map.markings, index),
         "symbols": [_symbol(symbol, index) for symbol in hd_map.symbols],
         "lanes": [
             {
@@ -86,15 +85,30 @@ def scene_of(
     }
 
 
-def _marking(marking: Marking, index: Mapping[str, int]) -> dict[str, Any]:
-    feature = _paint(marking, index, marking.corners_map)
-    if marking.relative_sigma_m is not None:
-        feature["r"] = round(_MM * marking.relative_sigma_m, 2)
-    return feature
+def _markings(markings: Sequence[Marking], index: Mapping[str, int]) -> list[dict[str, Any]]:
+    corners_map = np.array([marking.corners_map for marking in markings]).reshape(-1, 8)
+    places_mm = np.rint(_MM * corners_map).astype(np.int64).tolist()
+    covered = [k for k, marking in enumerate(markings) if marking.covariance_m2 is not None]
+    worst_m: dict[int, float] = {}
+    if covered:
+        # Of the worst corner, as the grade is; all at once, which takes a tenth of the time.
+        stacked = np.array([markings[k].covariance_m2 for k in covered]).reshape(-1, 4, 2, 4, 2)
+        corner = np.arange(4)
+        blocks = stacked[:, corner, :, corner, :].transpose(1, 0, 2, 3)
+        worst_m = dict(zip(covered, radius_95_m(blocks).max(axis=1).tolist(), strict=True))
+    features = []
+    for k, marking in enumerate(markings):
+        feature = _paint(marking, index, places_mm[k], worst_m.get(k))
+        if marking.relative_sigma_m is not None:
+            feature["r"] = round(_MM * marking.relative_sigma_m, 2)
+        features.append(feature)
+    return features
 
 
 def _symbol(symbol: Symbol, index: Mapping[str, int]) -> dict[str, Any]:
-    feature = _paint(symbol, index, symbol.outline_map)
+    covariance_m2 = symbol.covariance_m2
+    worst_m = None if covariance_m2 is None else float(np.max(corner_radii_m(covariance_m2)))
+    feature = _paint(symbol, index, flat_mm(symbol.outline_map), worst_m)
     if symbol.reading is not None:
         feature["says"] = symbol.reading[0]
     if symbol.kind in AREAS:
@@ -102,16 +116,12 @@ def _symbol(symbol: Symbol, index: Mapping[str, int]) -> dict[str, Any]:
     return feature
 
 
-def _paint(paint: Marking | Symbol, index: Mapping[str, int], outline_map: FloatArray) -> dict[str, Any]:
-    feature: dict[str, Any] = {
-        "id": paint.id,
-        "k": index[paint.kind],
-        "p": flat_mm(outline_map),
-        "n": paint.sightings,
-    }
-    if paint.covariance_m2 is not None:
-        # Of the worst corner, as the grade is.
-        feature["w"] = round(_MM * float(np.max(corner_radii_m(paint.covariance_m2))), 1)
+def _paint(
+    paint: Marking | Symbol, index: Mapping[str, int], places_mm: list[int], worst_m: float | None
+) -> dict[str, Any]:
+    feature: dict[str, Any] = {"id": paint.id, "k": index[paint.kind], "p": places_mm, "n": paint.sightings}
+    if worst_m is not None:
+        feature["w"] = round(_MM * worst_m, 1)
     if paint.accuracy is not None:
         feature["g"] = paint.accuracy
     return feature

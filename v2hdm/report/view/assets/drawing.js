@@ -115,6 +115,7 @@ export class Drawing {
       clearTimeout(this.sharpen);
       this.sharpen = setTimeout(() => this.change(), 90);
     }
+    if (this.model.features.length) this.canvas.dataset.first ??= String(Math.round(performance.now())); // for tests
     this.canvas.dataset.drawn = String(Number(this.canvas.dataset.drawn ?? 0) + 1);
   }
 

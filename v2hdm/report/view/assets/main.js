@@ -569,10 +569,11 @@ if (scene.mosaic && drawing.show.mosaic) {
   });
 }
 await edits.look(true);
-await lanes.refresh().catch(({ message }) => tell(message));
 const linked = () => { const feature = model.byKey.get(decodeURIComponent(location.hash.slice(1))); if (feature) show(feature); };
 addEventListener("hashchange", linked);
 linked();
 buttons();
 document.documentElement.dataset.ready = String(Math.round(performance.now()));
+panel.lists(looks, selected, questions);
+lanes.refresh().catch(({ message }) => tell(message)); // for which the map does not wait
 window.v2hdmView = { lanes, model, view, drawing, edits, select, show, selected: () => selected }; // for tests and further scripts
