@@ -82,8 +82,10 @@ def _suffix() -> str:
 
 def _sources_of(file: Path) -> str:
     """The digest of the sources that a file was made of, "" where it cannot be loaded."""
-    program = f"import {_NAME}; print({_NAME}.SOURCES)"
-    done = subprocess.run([sys.executable, "-c", program], cwd=file.parent, capture_output=True, text=True)
+    # The folder by name: pipx sets PYTHONSAFEPATH, under which the working directory is not looked at.
+    program = f"import sys; sys.path.insert(0, sys.argv[1]); import {_NAME}; print({_NAME}.SOURCES)"
+    command = [sys.executable, "-c", program, str(file.parent)]
+    done = subprocess.run(command, capture_output=True, text=True)
     return done.stdout.strip()
 
 

@@ -305,3 +305,9 @@ def test_a_compiler_that_fails_does_not_fail_the_install(copied, tmp_path):
     assert "v2hdm: detection will run in numpy, nothing was compiled: Command '['false'" in told
     assert told.count("\n") == 2
     assert [path.name for path in tmp_path.iterdir()] == [f"v2hdm-{__version__}-py3-none-any.whl"]
+
+
+@compiled
+def test_what_was_compiled_is_found_where_the_working_directory_is_no_place_of_modules():
+    program = "import runpy; print(runpy.run_path('hatch_build.py')['compile_kernels']())"
+    assert "_kernels" in _told(ROOT, "-c", program, PYTHONSAFEPATH="1")  # as pipx installs
