@@ -68,6 +68,7 @@ def config(tmp_path, start):
         output=str(tmp_path / "fit"),
         start=str(start),
         log_odds={},
+        ridge=1e-5,
         sky=0.0,
         render_views=2,
         scored_images=1,
@@ -226,7 +227,7 @@ def test_fitted_rows_are_where_the_loss_is_least():
     features = torch.randn((400, 3), generator=generator)
     features[:, 0] += torch.tensor(marks)
     cells = cells_of(marks, features)
-    rows = fit_rows(cells, 2, 0.5, 200, lambda share: None)
+    rows = fit_rows(cells, 2, 0.5, 0.01, 200, lambda share: None)
     worth = worth_of(cells, 2, 0.5)
     answer = torch.where(cells.marks >= 0, cells.marks, 2).long()
 
@@ -235,7 +236,7 @@ def test_fitted_rows_are_where_the_loss_is_least():
             [cells.features.float() @ rows[:, :-1].T + rows[:, -1], torch.zeros(len(answer))]
         )
         losses = torch.nn.functional.cross_entropy(logits, answer, reduction="none")
-        return float((worth * losses).sum())
+        return float((worth * losses).sum() + 0.01 * rows[:, :-1].square().sum())
 
     for _ in range(20):
         other = rows + 0.1 * torch.randn(rows.shape, generator=generator)

@@ -74,9 +74,10 @@ class CellReader:
         self._places = list(places)
         self._rng = rng
         self._planes: dict[str, Tensor] = {}
-        for name in CLASS_LAYERS:
-            if name in dict(net.named_modules()):
-                net.get_submodule(name).register_forward_pre_hook(self._keeper(name))
+        modules = dict(net.named_modules())
+        self._layers = [name for name in CLASS_LAYERS if name in modules]
+        for name in self._layers:
+            modules[name].register_forward_pre_hook(self._keeper(name))
 
     def _keeper(self, name: str) -> Callable[[nn.Module, tuple[Tensor, ...]], None]:
         def keep(_layer: nn.Module, inputs: tuple[Tensor, ...]) -> None:
@@ -92,11 +93,7 @@ class CellReader:
         row, column = np.nonzero((paint > _LEAST_LOG_ODDS) & (view.marks != OPEN))
         chosen = self._chosen(view.marks[row, column])
         row, column = row[chosen], column[chosen]
-        features = [
-            plane[0][:, row // scale, column // scale]
-            for plane in self._planes.values()
-            for scale in [len(paint) // plane.shape[2]]
-        ]
+        features = [_at_cells(self._planes[name][0], row, column, len(paint)) for name in self._layers]
         logits = prediction.kinds[0][:, row, column]
         logits[self._places] = -torch.inf
         return Cells(
@@ -112,3 +109,9 @@ class CellReader:
         if len(others) > _MOST_OF_OTHERS:
             others = self._rng.choice(others, _MOST_OF_OTHERS, replace=False)
         return np.concatenate([np.flatnonzero(marks >= 0), others])
+
+
+def _at_cells(plane: Tensor, row: NDArray[np.intp], column: NDArray[np.intp], rows: int) -> Tensor:
+    """The values (C, N) of a plane (C, h, w) at cells of a plane of ``rows`` rows, perhaps a finer one."""
+    scale = rows // plane.shape[1]
+    return plane[:, row // scale, column // scale]

@@ -17,14 +17,11 @@ _WORTH_OF_BARE = 1.2
 """What all cells of the fitted classes, of other labels and of no label weigh together. Chosen: paint that
 is taken for a word by mistake costs a map more than a word that is missed."""
 
-_RIDGE = 1e-5
-"""What the squared weights are worth beside the mean loss of a cell. Chosen: too little to be felt."""
-
 _CHUNK = 65536  # cells that are looked at together, for memory
 
 
 def fit_rows(
-    cells: Cells, classes: int, render_share: float, steps: int, tell: Callable[[float], None]
+    cells: Cells, classes: int, render_share: float, ridge: float, steps: int, tell: Callable[[float], None]
 ) -> Tensor:
     """The rows (classes, C + 1) of least loss, their last column the bias.
 
@@ -35,6 +32,7 @@ def fit_rows(
         cells: of paint.
         classes: how many are fitted.
         render_share: what cells of renders weigh, of 1.
+        ridge: what the squared weights are worth beside the loss of all cells.
         steps: of L-BFGS, at most.
         tell: hears the share of the steps that is done.
     """
@@ -49,7 +47,7 @@ def fit_rows(
         looks += 1
         tell(looks / (2 * steps))
         search.zero_grad()
-        total = _RIDGE * rows[:, :-1].square().sum()
+        total = ridge * rows[:, :-1].square().sum()
         total.backward()
         columns = (cells.features, cells.others, answer, worth)
         for features, others, right, weight in zip(*(part.split(_CHUNK) for part in columns), strict=True):

@@ -68,7 +68,7 @@ def _learnt(config: AreasConfig, tell: Share) -> Checkpoint:
     def fitted(share: float) -> None:
         tell(_RENDERS_SEEN + (_FITTED - _RENDERS_SEEN) * share, f"fitting {len(cells.marks)} cells of paint")
 
-    rows = fit_rows(cells, len(config.classes), config.render_share, config.steps, fitted)
+    rows = fit_rows(cells, len(config.classes), config.render_share, config.ridge, config.steps, fitted)
     put_rows(state, config, rows)
     tell(_FITTED, "scoring on the validation renders")
     state.metrics = scored(state)
