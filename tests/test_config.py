@@ -127,7 +127,7 @@ def test_the_keys_of_rendered_ports_are_listed_where_ports_are_rendered(capsys):
     assert run(["map", "--help"]) == 0
     mapping = capsys.readouterr().out
     listed = re.findall(r"^  ([\w.]+) \(", mapping, re.MULTILINE)
-    assert len(listed) <= 82
+    assert len(listed) <= 73
     assert not [key for key in listed if key.startswith("simulate.")]
     assert "v2hdm simulate --help" in mapping
     for key in keys_of(RunConfig):

@@ -287,7 +287,10 @@ def help_text(command: Command, door: Door) -> str:
 
 
 def keys_of(schema: type[Any], prefix: str = "") -> Iterator[Key]:
-    """All keys below a dataclass, in order; those of an entry of a mapping stand under ``NAME``."""
+    """All keys below a dataclass, in order; those of an entry of a mapping stand under ``NAME``.
+
+    Entries of a list have no keys: a list is set as a whole.
+    """
     settings = settings_of(schema)
     for field in fields(schema):
         if field.metadata == NO_KEY:
@@ -297,9 +300,10 @@ def keys_of(schema: type[Any], prefix: str = "") -> Iterator[Key]:
         name = f"{prefix}{field.name}"
         below = schema_in(hint)
         is_mapping = hint is not below and "dict" in str(hint)
+        is_list = hint is not below and _kind(hint) == "list"
         if hint is not below or below is None:
             yield Key(name, _kind(hint), _default(field), setting.meaning)
-        if below is not None:
+        if below is not None and not is_list:
             yield from keys_of(below, f"{name}.NAME." if is_mapping else f"{name}.")
 
 
