@@ -6,6 +6,7 @@ Coordinates are those of GeoPackage: longitude, latitude and ellipsoidal height,
 
 from __future__ import annotations
 
+import gzip
 from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -93,8 +94,24 @@ def write_pmtiles(hd_map: HDMap, path: Path) -> None:
         )
     with whole_file(path) as partial, TemporaryDirectory(".part", f".{path.name}.", path.parent) as folder:
         place = Path(folder, "map.pmtiles")
-        _write(place, features_of(hd_map), hd_map, None, path, _PMTILES, "Unknown")
+        features = features_of(hd_map)
+        if features:
+            _write(place, features, hd_map, None, path, _PMTILES, "Unknown")
+        else:
+            _write_empty_tiles(place)
         place.replace(partial)
+
+
+def _write_empty_tiles(place: Path) -> None:
+    """Write PMTiles of the whole earth without a feature, which GDAL refuses to write."""
+    writer_module = need("pmtiles.writer", "gis", "the format pmtiles", ConfigError)
+    from pmtiles.tile import Compression, TileType
+
+    with place.open("wb") as file:
+        writer = writer_module.Writer(file)
+        writer.write_tile(0, gzip.compress(b"", mtime=0))
+        header = {"tile_type": TileType.MVT, "tile_compression": Compression.GZIP}
+        writer.finalize(header, {"vector_layers": [{"id": _LAYER, "fields": {}}]})
 
 
 def write_shapefiles(hd_map: HDMap, path: Path, grid: Grid | None = None) -> None:
