@@ -69,6 +69,7 @@ def test_questions_are_answered_by_keys_alone_and_are_in_the_file(browser, stree
         page.keyboard.type("30")
         press(page, "Enter")
         saved(page, 2)
+        assert page.evaluate("document.activeElement.id") != "answer"  # the next key is the map's
         assert watched.said == []
     direction, speed = read_corrections(path)
     assert (direction.says, direction.kind, direction.answer) == ("answered", "direction", "against")

@@ -56,8 +56,14 @@ export class Panel {
       return;
     }
     if (["question", "lane"].includes(feature.what)) {
+      // Lanes that arrive meanwhile draw the panel again: an answer that is being typed stays.
+      const typed = focused === "answer" && this.feature?.subject === feature.subject ? byId("answer").value : null;
       this.feature = feature;
       section.replaceChildren(...this.asked(feature));
+      if (typed !== null && byId("answer")) {
+        byId("answer").value = typed;
+        byId("answer").focus();
+      }
       return;
     }
     const { act } = this;
@@ -97,7 +103,11 @@ export class Panel {
     if (feature.what === "question" && !rows.length) {
       const field = element("input", { id: "answer", "aria-label": "Answer", maxlength: "200", ...(feature.subject === "speed" ? { placeholder: "km/h, such as 30", inputmode: "decimal" } : { placeholder: "answer" }) });
       field.value = feature.entry?.answer ?? "";
-      field.addEventListener("keydown", (event) => { if (event.key === "Enter") act.answer(field.value.trim()); });
+      field.addEventListener("keydown", (event) => {
+        if (event.key !== "Enter") return;
+        field.blur();  // further keys are the map's
+        act.answer(field.value.trim());
+      });
       rows.push(field, button("Answer", () => act.answer(field.value.trim())));
     }
     if (feature.entry) rows.push(button("Take back", act.restore));
