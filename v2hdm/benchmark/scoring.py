@@ -93,7 +93,7 @@ def _by_class(hd_map: HDMap, reference: Reference) -> dict[str, MarkingMetrics]:
 
 
 def _judged(verdict: str | None, is_good: bool) -> str | None:
-    """What becomes of a verdict: WARN states a missed goal, so it is right of a map that is not good, too."""
+    """Judge a verdict: WARN states a missed goal, so it is right of a map that is not good, too."""
     if verdict is None:
         return None
     if is_good:

@@ -221,7 +221,7 @@ class Rig:
             test.loosened_s = stamp_s
 
     def others(self, camera: str, stamp_s: float) -> dict[str, Estimate]:
-        """What the mountings of the other cameras, which have not changed, were at a time."""
+        """The mountings, at a time, of the other cameras, which have not changed."""
         tests = {name: test for name, test in self._tests.items() if name != camera and test.change is None}
         estimates = {name: test.at(stamp_s) for name, test in tests.items()}
         return {name: estimate for name, estimate in estimates.items() if estimate is not None}

@@ -240,7 +240,7 @@ def concluded(
 
 
 def _by_clock(bundle: Bundle, noises: Sequence[PoseNoise], clocks: ClockErrors | None) -> Moves | None:
-    """What the clocks may move a solution by; its scale is of residuals, and none of the clocks."""
+    """Motion of a solution by the clocks; its scale is of residuals, and none of the clocks."""
     if not noises:
         return None
     moves = moves_with_clocks(bundle.problem, bundle.solution, noises, clocks)

@@ -23,7 +23,7 @@ _CORNERED = f'"{CORNERS}"'.encode()
 
 
 class _Properties(msgspec.Struct, forbid_unknown_fields=True):
-    """What we write of a marking."""
+    """The properties that we write of a marking."""
 
     id: int
     kind_: str = msgspec.field(name="class")

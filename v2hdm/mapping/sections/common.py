@@ -1,4 +1,4 @@
-"""What all sections have in common once each is mapped: the noise of poses, the names of markings."""
+"""Results that all sections share once each is mapped: the noise of poses, the names of markings."""
 
 from __future__ import annotations
 

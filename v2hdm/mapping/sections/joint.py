@@ -1,4 +1,4 @@
-"""What sections tell each other of a joint solve, and a section's solve as the joint one left it."""
+"""Messages of sections on a joint solve, and a section's solve as the joint one left it."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ class Lanes:
 
     @classmethod
     def of(cls, folder: Path, hd_map: HDMap) -> Lanes:
-        """Those of a result; MapFileError where its poses are damaged."""
+        """The lanes of a result; MapFileError where its poses are damaged."""
         return cls(hd_map, [read_tum(path) for path in sorted(folder.glob(names.TRAJECTORIES))])
 
     def with_corrections(self, corrections: Sequence[Correction]) -> Answered:
