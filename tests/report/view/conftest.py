@@ -1,6 +1,7 @@
 """A result that is served to a browser, or to requests."""
 
 import threading
+from contextlib import contextmanager
 
 import pytest
 
@@ -9,11 +10,9 @@ from v2hdm.report.view.server import server_of
 from v2hdm.report.view.session import file_beside
 
 
-@pytest.fixture
-def served(tmp_path):
-    """The address of a result, the result, and its file of corrections."""
-    drive = make_result(tmp_path)
-    folder = tmp_path / "result"
+@contextmanager
+def serving(folder, drive):
+    """The address of a result while it is served, the result, and its file of corrections."""
     server, address, _ = server_of(folder, drive, file_beside(folder))
     thread = threading.Thread(target=server.serve_forever)
     thread.start()
@@ -21,3 +20,10 @@ def served(tmp_path):
     server.shutdown()
     server.server_close()
     thread.join()
+
+
+@pytest.fixture
+def served(tmp_path):
+    """The address of a result, the result, and its file of corrections."""
+    with serving(tmp_path / "result", make_result(tmp_path)) as result:
+        yield result

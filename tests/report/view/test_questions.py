@@ -2,7 +2,6 @@
 
 import http.client
 import json
-import threading
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -12,14 +11,13 @@ from examples.lanes.site import trajectory
 from tests.report.page.browser import opened
 from tests.report.page.folder import make_result, small_map
 from tests.report.page.test_browser import browser as browser
+from tests.report.view.conftest import serving
 from tests.report.view.test_editor import ON_SCREEN, press, ready, saved
 from v2hdm.io.maps.corrections import Correction, read_corrections, write_corrections
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.maps.questions import read_answers
 from v2hdm.io.trajectory import write_tum
 from v2hdm.records import HDMap, Lane
-from v2hdm.report.view.server import server_of
-from v2hdm.report.view.session import file_beside
 
 X = np.linspace(0.0, 60.0, 121)
 LINES = {-1.75: "lane_line", 1.75: "lane_dash", 5.25: "lane_line"}
@@ -33,13 +31,8 @@ def street(tmp_path):
     lanes = tuple(Lane(kind, np.column_stack([X, np.full(len(X), y)]), 3) for y, kind in LINES.items())
     write_geojson(HDMap(small_map().markings, lanes), folder / "map.geojson")
     write_tum(trajectory([(0, 0), (60, 0)], np.random.default_rng(0)), folder / "trajectory_east.tum")
-    server, address, _ = server_of(folder, drive, file_beside(folder))
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    yield address, folder, file_beside(folder)
-    server.shutdown()
-    server.server_close()
-    thread.join()
+    with serving(folder, drive) as result:
+        yield result
 
 
 def ask(address, method, name, content=None):
