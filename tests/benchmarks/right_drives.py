@@ -60,6 +60,7 @@ from v2hdm.mapping.results import MethodResult
 from v2hdm.records import BEST, Drive, FloatArray, HDMap
 from v2hdm.report.metrics import driven_past, marking_metrics
 from v2hdm.verdict import Finding, Verdict
+from v2hdm.verdict.inputs.alignment import check_alignment
 from v2hdm.verdict.inputs.drive import causes, check_camera, check_road
 from v2hdm.verdict.inputs.heading import check_heading
 from v2hdm.verdict.inputs.poses import Motion, check_attitude, check_jumps, check_noise, check_path
@@ -236,6 +237,7 @@ def findings_of_inputs(drive: Drive) -> list[Finding]:
     findings = [
         *check_path(motion),
         *check_heading(motion),
+        *check_alignment(motion, drive.pose_noise, drive.cameras),
         *check_attitude(motion),
         *check_jumps(motion, drive.pose_noise),
         *check_clocks(drive, motion),
