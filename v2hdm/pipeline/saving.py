@@ -190,7 +190,7 @@ def write_trajectories(poses: AdjustedPoses, drive: Drive, folder: Path) -> None
         rows = [
             f"{stamp:.9f},{int(is_seen)}," + ",".join(f"{value:.6g}" for value in sigma)
             for stamp, is_seen, sigma in zip(
-                stamp_s, poses.seen[is_in_session], poses.sigma[is_in_session], strict=True
+                stamp_s, poses.has_marking[is_in_session], poses.sigma[is_in_session], strict=True
             )
         ]
         replace_text(folder / sigma_file, "\n".join([_HEADER, *rows]) + "\n")
