@@ -28,7 +28,6 @@ from v2hdm.io.maps.geopackage import write_qgis
 from v2hdm.io.trajectory import read_tum, write_tum
 from v2hdm.mapping.results import AdjustedPoses, MethodResult
 from v2hdm.mosaic.result import write_mosaic
-from v2hdm.pipeline.answers import driven_paths
 from v2hdm.pipeline.base import change_json
 from v2hdm.pipeline.context import Context
 from v2hdm.records import BEST, Changes, Drive, FloatArray, HDMap, Image, ImageDetections, Trajectory
@@ -123,7 +122,7 @@ def _write_map(folder: Path, result: Result, outputs: Outputs) -> None:
     ]  # longitude and latitude, whatever the others have
     write_map(result.map, folder, "map", geojson, verdict)
     others = [name for name in with_data(outputs.formats) if name not in ("geojson", *_OF_OTHER_FILES)]
-    driven = driven_paths(drive)
+    driven = drive.paths
     write_map(
         result.map,
         folder,
