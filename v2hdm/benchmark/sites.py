@@ -57,7 +57,7 @@ class Site:
 
 @dataclass(frozen=True)
 class Reference:
-    """What a map of a site is scored against: the truth, and which true markings (J,) the drive went past."""
+    """The reference of a site's maps: the truth, and which true markings (J,) the drive went past."""
 
     truth: Truth
     expected: BoolArray

@@ -227,7 +227,7 @@ class _Sheet:
 
 
 def _compare(patches: Sequence[_Patch]) -> tuple[np.ndarray, np.ndarray]:
-    """What the blocks of a tile are, and which of them each patch shows (N, blocks, blocks)."""
+    """The kinds of the blocks of a tile, and which of them each patch shows (N, blocks, blocks)."""
     grey = np.stack([patch.grey for patch in patches]).astype(np.float32)
     pattern = grey.reshape(-1, _BLOCKS, BLOCK_PX, _BLOCKS, BLOCK_PX).swapaxes(2, 3)
     pattern = pattern.reshape(len(patches), _BLOCKS, _BLOCKS, -1)
