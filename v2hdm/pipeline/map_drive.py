@@ -279,8 +279,8 @@ def _judge(
         unfit_findings = check_known_sizes(survey.mapping.known_sizes, best)
         unfit_findings += check_corrections(survey.mapping.acceptance.corrections, best)
         frame = "survey" if best.diagnostics["control_points"] else "poses"
-        goal_findings = check_goal(list(chosen.values())[-1][BEST], goal_cm / 100, frame)
-        result_findings, goal_findings = clocks_once(result_findings, goal_findings)
+        of_goal = check_goal(list(chosen.values())[-1][BEST], goal_cm / 100, frame)
+        result_findings, goal_findings = clocks_once(result_findings, of_goal)
         survey_findings = check_survey(survey, best, check_points)
         input_findings = over_ground(inspection.findings, best, survey.mapping.ground == AUTO)
         verdict = Verdict.of(

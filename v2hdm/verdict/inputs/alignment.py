@@ -32,7 +32,7 @@ _ASKEW_RAD = np.deg2rad(0.25)
 """Angle by which the axles of a sound vehicle may steer it aside: the tolerance of a wheel alignment."""
 
 _CONVENTION_DEG = 15.0  # a larger angle is a wrong convention, which the check of the heading names
-_SURE = 5.0  # sigmas of an estimated offset beyond which it is reported
+_SURE = 4.0  # sigmas of an estimated offset beyond which it is reported
 _TURNED_RAD = np.deg2rad(30.0)  # turn that tells a heading's error from a camera's yaw; chosen
 _STRAIGHT_RAD = np.deg2rad(2.0)  # turn of the heading within a straight stretch, at most
 _SHORTEST_M = 10.0  # length of a straight stretch: on a shorter one, positions move less than their noise
