@@ -40,7 +40,9 @@ def test_a_start_on_a_map_that_was_half_repainted_is_said_within_a_second(seed):
     painted = yard(seed)
     driven = drive(painted, seed, seconds=1.3, begin_m=30.0)
     localizer = Localizer(
-        moved(mapped(painted, seed), 0.5, 0.3, seed), driven.calibrations, driven.rough(np.random.default_rng(seed))
+        moved(mapped(painted, seed), 0.5, 0.3, seed),
+        driven.calibrations,
+        driven.rough(np.random.default_rng(seed)),
     )
     moments = zip(driven.looks, driven.motion, strict=True)
     poses = [localizer.update(looks, motion) for looks, motion in moments]

@@ -68,7 +68,9 @@ class Detected(NamedTuple):
     places_map: FloatArray  # (D, 2) their centres, m
     kinds: tuple[str, ...]
     is_judged: BoolArray  # (D,) whole and near the vehicle
-    gains: FloatArray  # (D,) log likelihood ratios of a map with half of its markings moved and of a right one
+    gains: (
+        FloatArray  # (D,) log likelihood ratios of a map with half of its markings moved and of a right one
+    )
 
 
 def detected(scene: Scene, located: Located) -> Detected:
