@@ -273,7 +273,8 @@ def main() -> None:
                 print(f"  {slow_line(own, rng, seed)}", flush=True)
     print(f"all: {tracking_line(parts, counts, float(np.mean(cpu_s)))}")
     print(
-        f"starts from 5 m and 20 deg: {totals[0, 0]} right, {totals[0, 1]} wrong, {totals[0, 2]} none in 3 s, "
+        f"starts from 5 m and 20 deg: {totals[0, 0]} right, {totals[0, 1]} wrong, "
+        f"{totals[0, 2]} none in 3 s, "
         f"{totals[0, 3]} called the map wrong"
     )
     print(

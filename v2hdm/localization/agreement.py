@@ -58,7 +58,7 @@ class _Object:
 
     @property
     def gain(self) -> float:
-        """The log likelihood ratio of a map that differs: the median of its views, which share their errors."""
+        """The log likelihood ratio of a map that differs: the median of its views, whose errors are alike."""
         return float(np.median(self.gains))
 
 

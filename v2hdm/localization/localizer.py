@@ -411,8 +411,8 @@ class Localizer:
             if all(self._differs_at(place) for place in places if best.score - place.score < _SURER_BY):
                 self._is_lost = True
                 self._reasons["lost"] = (
-                    "wherever the vehicle may be, many markings seen lie beside those of the map: was the site "
-                    "repainted?"
+                    "wherever the vehicle may be, many markings seen lie beside those of the map: was the "
+                    "site repainted?"
                 )
         waited_s = look.stamp_s - quest.since_s
         waited_m = self._way_m - quest.since_m
