@@ -12,6 +12,7 @@ from tests.mapping.scene import SceneOptions, make_scene
 from tests.report.yard import SURVEY_M, checked, point, yard
 from tests.verdict.drives import INFO, square_at
 from v2hdm.faults import Contradiction, table
+from v2hdm.faults.odds import probability_of_any
 from v2hdm.mapping.results import CameraFit, ForeignSegment, MethodResult, SolveEvidence
 from v2hdm.records import Calibration, Exclusion, GroundStrip, HDMap
 from v2hdm.site.candidates import LACKS_A_CORNER
@@ -215,6 +216,18 @@ def test_a_doubt_names_every_cause_that_is_nearly_as_likely():
     ]
     assert "focal length fy of front is 0.8 % shorter" in told.says
     assert "or the principal point of front and rear lies -13 px" in told.says
+
+
+@pytest.mark.parametrize(("count", "is_told"), [(1, False), (2, True)])
+def test_causes_each_of_which_is_unlikely_are_doubted_together(count, is_told):
+    tests = tuple(
+        contradiction(table.SURVEY, (camera,), 0, "", 0.09, 0.026, 3.1)
+        for camera in ("front", "rear")[:count]
+    )
+    assert 0.025 < probability_of_any(tests[:1]) < 0.05
+    told = [f for f in check_inputs(replace(FINE, score_tests=tests)) if f.status is not Status.PASS]
+    assert [(f.check, f.status) for f in told] == [("survey", Status.WARN)] * is_told
+    assert all("front" in f.says and "rear" in f.says for f in told)
 
 
 @pytest.mark.parametrize("recorded", [Status.WARN, Status.FAIL])
