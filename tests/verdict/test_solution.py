@@ -18,7 +18,13 @@ from v2hdm.records import Calibration, Exclusion, GroundStrip, HDMap
 from v2hdm.site.candidates import LACKS_A_CORNER
 from v2hdm.verdict import Finding, Status, Verdict
 from v2hdm.verdict.results.accuracy import SIGNIFICANCE, check_frame, check_goal, check_points
-from v2hdm.verdict.results.solution import check_inputs, check_solution, over_ground, told_by_poses
+from v2hdm.verdict.results.solution import (
+    check_inputs,
+    check_solution,
+    doubted,
+    over_ground,
+    told_by_poses,
+)
 from v2hdm.verdict.verdict import passed
 
 FIT = CameraFit(observations=2000, variance_factor=0.15, rejected_share=0.01, sightings=400.0)
@@ -196,6 +202,8 @@ def test_stamps_that_jitter_explain_a_step_that_they_are_likelier_than_and_no_do
     scale = replace(contradiction(table.SCALE, ("front",), 0, "", -0.13, 0.025, 4.0), gain=13.5)
     told = [f for f in check_inputs(replace(noisy, score_tests=(scale,))) if f.status is not Status.PASS]
     assert [(f.check, f.status) for f in told] == [("image stamps", Status.WARN)]
+    assert doubted(replace(noisy, score_tests=(scale,))) is None, "nor does the headline doubt it"
+    assert doubted(replace(FINE, score_tests=(scale,))) == scale
     clock = replace(contradiction(table.CLOCK, ("front",), 0, "", 0.03, 0.002, 12.0), gain=72.0)
     told = [f for f in check_inputs(replace(noisy, score_tests=(clock,))) if f.status is not Status.PASS]
     assert [f.check for f in told] == ["clock", "image stamps"], "what is likelier than them is told"

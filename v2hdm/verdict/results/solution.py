@@ -283,8 +283,10 @@ def _least_shown(test: Contradiction) -> str:
 
 
 def doubted(evidence: SolveEvidence) -> Contradiction | None:
-    """The input that is likeliest to be off, of those that may well be and do not surely fail the map."""
-    return next(iter(_doubtful(evidence)), None)
+    """The input that is likeliest to be off, of those that may well be, unless a likelier cause is named."""
+    likeliest = next(iter(_doubtful(evidence)), None)
+    raised = {finding.check for finding in check_inputs(evidence) if finding.status is not Status.PASS}
+    return likeliest if likeliest is not None and likeliest.fault.check in raised else None
 
 
 def _doubtful(evidence: SolveEvidence) -> list[Contradiction]:
