@@ -89,6 +89,10 @@ class Joint(NamedTuple):
         """The joint covariance (n, n) of each part's border."""
         return self.net.covariances(self.factor)
 
+    def steps(self, slopes: Sequence[FloatArray]) -> list[FloatArray]:
+        """Steps (b, n) of each part's border under n errors, of which each part tells ``slopes`` (b, n)."""
+        return self.net.steps(self.factor, slopes)
+
 
 class _Open(NamedTuple):
     """A part laid out: ``held`` (m,), 1 / m^2, holds corners of its border at ``held_map`` (m, 2)."""

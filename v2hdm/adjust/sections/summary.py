@@ -239,6 +239,38 @@ class JoinedCovariance(Covariance):
         factor = torch.linalg.cholesky(alone)
         return torch.cholesky_solve(torch.cholesky_solve(difference, factor).mT, factor)
 
+    def slopes(self, reduced: Tensor, corners: Tensor) -> FloatArray:
+        """Slopes (b, n) of the cost by the border's step under n errors, all else following both.
+
+        The errors are columns by the whitened unknowns: ``reduced`` (D, n) and of ``corners`` (N, 2, n).
+        """
+        return np.asarray(self._in_border(self._pulled(reduced, corners)).cpu().numpy())
+
+    def followed(self, reduced: Tensor, corners: Tensor, steps: FloatArray) -> tuple[Tensor, Tensor]:
+        """Whitened steps under n errors, as in :meth:`slopes`, where the border makes ``steps`` (b, n)."""
+        assert self.border is not None
+        pulled = self._pulled(reduced, corners)
+        weights = self._in_border(torch.as_tensor(steps).to(pulled) + pulled)
+        moved = -corners
+        own = self._columns.own
+        if len(own):
+            of_own = own @ weights[len(weights) - len(own) :]
+            moved[self.border.corners] += of_own.view(-1, 2, of_own.shape[1])
+        return self._columns.reduced @ weights - reduced, moved
+
+    def _pulled(self, reduced: Tensor, corners: Tensor) -> Tensor:
+        """Inner products (b, n) of the border's columns and others."""
+        assert self.border is not None
+        pulled = self._columns.reduced.mT @ reduced
+        own = self._columns.own
+        if len(own):
+            pulled[len(pulled) - len(own) :] += own.mT @ corners[self.border.corners].flatten(0, 1)
+        return pulled
+
+    def _in_border(self, columns: Tensor) -> Tensor:
+        """(W'W)^-1 times columns (b, n)."""
+        return torch.cholesky_solve(columns, torch.linalg.cholesky(self._columns.covariance))
+
     @cached_property
     def _by_border(self) -> Tensor:
         """Covariances (D, n) of the reduced unknowns with the border, by the part alone."""
