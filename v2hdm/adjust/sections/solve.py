@@ -153,6 +153,7 @@ class _Work:
         control[border.corners[is_free]] = start_map[border.corners[is_free]]
         root[border.corners[is_free]] = root.new_tensor([1.0, 0.0, 1.0]) / _HELD_SIGMA_M
         engine = plain.over(replace(arrays, control=control, control_root=root))
+        engine = engine.keeping(border.frames, border.corners)
         return _Open(plain, engine, border, held, control[border.corners])
 
     def _round(self, job: _Job, part: Part) -> PartStates:

@@ -74,7 +74,7 @@ _CLASSIFIED_AT_ONCE = 5000
 """Most candidates, of neighbouring sections, that are classified together: memory and time would grow with
 their square, and thousands tell all of a class's shapes."""
 
-_SETTLED_GAP = 1e-6  # gap of the joint solve that outliers are told by, a fraction of the cost
+_SETTLED_GAP = 1e-5  # gap of the joint solve that outliers are told by, a fraction of the cost
 
 
 def map_in_sections(
