@@ -79,16 +79,16 @@ def _shapes(design: Path) -> list[tuple[str, FloatArray]]:
 
 def route_along(positions: FloatArray, speed_mps: float, where: str) -> Route:
     """The route through positions (N, 2) in order of time; DriveError where they are too few or too near."""
-    kept = [positions[0]]
+    corners = [positions[0]]
     for position in positions[1:]:
-        if np.linalg.norm(position - kept[-1]) >= _MOVED_M:
-            kept.append(position)
-    corners = np.array(kept)
-    along_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+        if np.linalg.norm(position - corners[-1]) >= _MOVED_M:
+            corners.append(position)
+    corners_map = np.array(corners)
+    along_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners_map, axis=0), axis=1))])
     if along_m[-1] < _SHORTEST_M:
         raise DriveError(f"{where}: moves by {along_m[-1]:.1f} m in all; give {_SHORTEST_M:g} m or more")
     station_m = np.linspace(0.0, along_m[-1], round(along_m[-1] / _STEP_M) + 1)
-    points = np.column_stack([np.interp(station_m, along_m, axis) for axis in corners.T])
+    points = np.column_stack([np.interp(station_m, along_m, axis) for axis in corners_map.T])
     # Beyond its ends the way goes on straight, so that they stay where they are.
     window = round(4 * _SMOOTHED_M / _STEP_M)
     longer = np.pad(points, ((window, window), (0, 0)), mode="reflect", reflect_type="odd")

@@ -62,7 +62,7 @@ class Site:
 
 @dataclass(frozen=True)
 class Reference:
-    """What a map of a site is scored against: the truth, and which true markings (J,) the drive went past."""
+    """The reference of a site's maps: the truth, and which true markings (J,) the drive went past."""
 
     truth: Truth
     expected: BoolArray
@@ -123,18 +123,19 @@ def write_input(site: Site, folder: Path, cache: Path, executor: Executor, progr
     The drive is made in a ``cache``, where a later call finds it. Raises as
     :func:`v2hdm.simulate.port.drive.rendered_drive`.
     """
-    made = _made(site, cache, executor, progress)
-    description = load_yaml(made / DRIVE_FILE, ConfigError)
+    drive_folder = _simulated(site, cache, executor, progress)
+    description = load_yaml(drive_folder / DRIVE_FILE, ConfigError)
     description.pop("truth", None)
-    shutil.copytree(made, folder, ignore=shutil.ignore_patterns(TRUTH_FOLDER, ".*"), dirs_exist_ok=True)
+    of_truth = shutil.ignore_patterns(TRUTH_FOLDER, ".*")
+    shutil.copytree(drive_folder, folder, ignore=of_truth, dirs_exist_ok=True)
     (folder / DRIVE_FILE).write_text(dump_yaml(description), encoding="utf-8")
 
 
-def _made(site: Site, cache: Path, executor: Executor, progress: Steps) -> Path:
+def _simulated(site: Site, cache: Path, executor: Executor, progress: Steps) -> Path:
     """The drive of a site with its truth, in a cache."""
     if site.layout is None:
-        (made,) = simulated_drives(site.config, cache, executor, progress)
-        return made
+        (drive_folder,) = simulated_drives(site.config, cache, executor, progress)
+        return drive_folder
     network = network_of(site.layout, site.config.route.speed_mps)
     digest = hashlib.sha256("".join(site.layout.digests).encode()).hexdigest()
     folder = folder_of_port(site.config, cache)
@@ -174,8 +175,8 @@ def _make_reference(site: Site, executor: Executor, progress: Progress) -> Refer
 def _survey(site: Site, executor: Executor, progress: Progress) -> tuple[Drive, Truth]:
     """A drive of detections with its truth, made in a folder that does not stay."""
     with tempfile.TemporaryDirectory(prefix="v2hdm-benchmark-") as folder:
-        made = _made(site, Path(folder), executor, partial(progress, "truth"))
-        drive = read_drive(made)
+        drive_folder = _simulated(site, Path(folder), executor, partial(progress, "truth"))
+        drive = read_drive(drive_folder)
         return drive, read_truth(drive)
 
 

@@ -363,9 +363,9 @@ class Localizer:
             self._rig_since_s = self._rig.pushed.note(look, gained)
         elif self._is_sure:
             self._rig.pushed.note(look, 0)
-        near = quads.subset(np.flatnonzero(is_judged))
+        judged_quads = quads.subset(np.flatnonzero(is_judged))
         self._agreement.note(
-            self._detected(places[is_judged], near, explained[is_judged], located), self._way_m
+            self._detected(places[is_judged], judged_quads, explained[is_judged], located), self._way_m
         )
         if located.misfit_freedom > 0:
             noise.note(located, noise.factor)

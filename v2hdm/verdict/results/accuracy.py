@@ -115,7 +115,8 @@ def _judged(about: str, radius_m: float, goal_m: float, says: str, helps: str) -
 def _largest_part(best: MethodResult, coarse: Sequence[Marking]) -> str:
     """The largest of the errors that are stated of the markings that miss the goal, and what helps."""
     clock_m = (best.evidence.clock_m if best.evidence is not None else None) or 0.0
-    pose_m = [] if best.poses is None else SIGMAS_95 * best.poses.sigma[best.poses.seen, :2].max(axis=1)
+    poses = best.poses
+    pose_m = [] if poses is None else SIGMAS_95 * poses.sigma[poses.has_marking, :2].max(axis=1)
     # Poses are stated at the stamps of the images, with what clocks leave open.
     own_pose_m = float(np.sqrt(max(_median(pose_m) ** 2 - clock_m**2, 0.0)))
     parts = [

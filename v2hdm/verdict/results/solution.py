@@ -54,7 +54,7 @@ and standard deviation are a little above those of 50 cameras, rendered or made 
 0.0035."""
 
 _REJECTED_OF_WRONG = (1.0, 6.0)
-"""That of cameras whose lens, clock or mounting is wrong: mean 0.14, as without distortion coefficients."""
+"""The same where a lens, clock or mounting is wrong: mean 0.14, as without distortion coefficients."""
 
 _VARIANCE_LIMIT = 3.0
 """Largest variance of observations over the one that the detector states: clean drives reach 0.2, a drive
