@@ -56,3 +56,16 @@ def test_a_covariance_belongs_to_its_corner_whichever_comes_first():
     assert second.shape == pytest.approx(first.shape)
     assert second.nees == pytest.approx(first.nees)
     assert first.nees == pytest.approx(0.25)
+
+
+def test_a_neighbour_that_is_known_badly_is_not_held_against_a_marking():
+    true = row(3, 0.001, 1e-4 * np.eye(8))
+    true[1] = replace(true[1], relative_sigma_m=0.2)
+    stated = consistency_of(moved(true, [[0.0, 0.0], [0.2, 0.0], [0.0, 0.0]]), true)
+    assert stated.beside < 0.6
+
+
+def test_without_markings_nothing_is_told():
+    stated = consistency_of([], [])
+    assert stated.corners == 0
+    assert np.isnan([stated.nees, stated.inside_95, stated.place, stated.beside, stated.shape]).all()

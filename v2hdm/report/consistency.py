@@ -59,6 +59,8 @@ def _parts(mapped: Sequence[Marking], true: Sequence[Marking]) -> _Parts:
     centres_m = errors_m.mean(axis=1)
     shifts = first_corners(mapped, true)
     others = neighbours(np.array([marking.corners_map.mean(axis=0) for marking in mapped]).reshape(-1, 2))
+    stated_m = [np.nan if marking.relative_sigma_m is None else marking.relative_sigma_m for marking in mapped]
+    relative_m2 = np.square(stated_m)
     for k, marking in enumerate(mapped):
         if marking.covariance_m2 is None:
             continue
@@ -67,10 +69,12 @@ def _parts(mapped: Sequence[Marking], true: Sequence[Marking]) -> _Parts:
         about_m2 = _ABOUT_CENTRE @ covariance_m2.reshape(8, 8) @ _ABOUT_CENTRE.T
         shapes.append(_squared(_ABOUT_CENTRE @ errors_m[k].ravel(), about_m2) / len(_ABOUT_CENTRE))
         nearest = others[k][:_NEIGHBOURS]
-        if marking.relative_sigma_m is not None and len(nearest):
+        nearest = nearest[np.isfinite(relative_m2[nearest])]
+        if np.isfinite(relative_m2[k]) and len(nearest):
             off_m = centres_m[k] - centres_m[nearest].mean(axis=0)
             # The neighbours' own errors add to the difference.
-            beside.append(float(off_m @ off_m) / (2 * marking.relative_sigma_m**2 * (1 + 1 / len(nearest))))
+            expected_m2 = relative_m2[k] + relative_m2[nearest].mean() / len(nearest)
+            beside.append(float(off_m @ off_m / (2 * expected_m2)))
     means = [float(np.mean(values)) if values else float("nan") for values in (places, beside, shapes)]
     return _Parts(*means)
 
