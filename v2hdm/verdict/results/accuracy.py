@@ -8,7 +8,7 @@ it leaves the ground ahead known as well.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import compress
 from typing import NamedTuple
@@ -66,6 +66,25 @@ def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Findin
         left_m, helps = ground_ahead(calibration)
         says = f"the ground ahead is known, given its mounting, to {_cm(left_m)} (95 %){goal}"
         yield _judged(name, left_m, goal_m, says, helps)
+
+
+_CLOCKS = (table.CLOCK.check, table.CLOCK_DRIFT.check)
+
+
+def clocks_once(
+    findings: Iterable[Finding], of_goal: Iterable[Finding]
+) -> tuple[list[Finding], list[Finding]]:
+    """The findings of a solve and those on the goal, without what either says of clocks less well.
+
+    A clock that is named as wrong is not unknown; and what is unknown of all clocks is told with its size.
+    """
+    findings = list(findings)
+    of_goal = list(of_goal)
+    if any(finding.check in _CLOCKS and finding.status is not Status.PASS for finding in findings):
+        return findings, [finding for finding in of_goal if finding.check not in _CLOCKS]
+    if any(finding.check in _CLOCKS for finding in of_goal):
+        findings = [f for f in findings if not (f.check in _CLOCKS and f.is_unobservable)]
+    return findings, of_goal
 
 
 def _unknown_clocks(evidence: SolveEvidence | None, goal_m: float) -> Iterator[Finding]:
