@@ -59,7 +59,9 @@ def _parts(mapped: Sequence[Marking], true: Sequence[Marking]) -> _Parts:
     centres_m = errors_m.mean(axis=1)
     shifts = first_corners(mapped, true)
     others = neighbours(np.array([marking.corners_map.mean(axis=0) for marking in mapped]).reshape(-1, 2))
-    stated_m = [np.nan if marking.relative_sigma_m is None else marking.relative_sigma_m for marking in mapped]
+    stated_m = [
+        np.nan if marking.relative_sigma_m is None else marking.relative_sigma_m for marking in mapped
+    ]
     relative_m2 = np.square(stated_m)
     for k, marking in enumerate(mapped):
         if marking.covariance_m2 is None:
