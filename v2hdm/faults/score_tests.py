@@ -104,7 +104,7 @@ class Segments:
         """Variance of the noise in the score over the stated one, at least 1."""
         if not self.is_observable:
             return 1.0
-        return max((self.sigma(self.multiple(1.0)) * self.information.sum() ** 0.5) ** 2, 1.0)
+        return max(self.sigma(self.multiple(1.0)) ** 2 * float(self.information.sum()), 1.0)
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,7 @@ class Columns:
     def pushed(self, weights: Tensor) -> tuple[Tensor, Tensor]:
         """W weights, as the last reduced variables (T, ...) and the corners' own (m, 2, ...)."""
         of_corners = self.own @ weights[len(weights) - len(self.own) :]
-        return self.reduced @ weights, of_corners.unflatten(0, (-1, 2)) if len(self.own) else of_corners
+        return self.reduced @ weights, of_corners.view(len(of_corners) // 2, 2, *weights.shape[1:])
 
     def pulled(self, reduced: Tensor, corners: Tensor) -> Tensor:
         """Inner products (n, ...) with all reduced (D, ...) and the corners' variables (m, 2, ...)."""
@@ -318,7 +318,7 @@ class JoinedCovariance(Covariance):
         is_shared = torch.isin(corners, self.border.corners)
         places = torch.searchsorted(self.border.corners, corners[is_shared])
         on_border[_axes(places)] = columns.own[_axes(is_shared.nonzero()[:, 0])]
-        regression = self._columns.pulled(columns.reduced, on_border.unflatten(0, (-1, 2)))
+        regression = self._columns.pulled(columns.reduced, on_border.view(len(self.border.corners), 2, -1))
         place = _axes(torch.searchsorted(corners, chosen.contiguous()))
         covariance = columns.covariance + regression.mT @ self._gained @ regression
         return np.asarray(covariance[place[:, :, None], place[:, None, :]].cpu().numpy())
