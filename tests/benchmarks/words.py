@@ -2,11 +2,11 @@
 
     python -m tests.benchmarks.words [--runs port1 port2] [--seeds 41 43] [--wrong FOLDER]
 
-Each port of a shipped run is built anew with other seeds and painted full of words, numbers and codes, as worn
-and dirty as its other paint, upright for who drives. The reader gets the true poses and the outline of each
-word with errors of 5 cm; only those images are rendered that it reads. Counted are the words that the drive
-saw whole at least twice, by the truth: how many are read, how many rightly, and how many of those that are
-said with a confidence of .8 and more. ``--wrong`` writes the patches of words that were not read rightly.
+Each port of a shipped run is built anew with other seeds and painted full of words, numbers and codes, as
+worn and dirty as its other paint, upright for who drives. The reader gets the true poses and the outline of
+each word with errors of 5 cm; only those images are rendered that it reads. Counted are the words that the
+drive saw whole at least twice, by the truth: how many are read, how many rightly, and how many of those that
+are said with a confidence of .8 and more. ``--wrong`` writes the patches of words that were not read rightly.
 How many words of a drive are found at all is in the ``areas`` of ``metrics.json``, after ``v2hdm map``.
 """
 
@@ -37,8 +37,8 @@ SIGHTINGS = 2  # images that show a word whole, at least
 SURE = 0.8  # confidence from which a reading counts as sure
 
 WORDS = (
-    "EBH", "BUS", "STOP", "SLOW", "GATE", "EXIT", "TAXI", "KEEP CLEAR", "NO ENTRY", "TRUCKS", "REEFER", "LANE 4",
-    "A12", "B07", "C31", "T16", "QC4", "RTG", "YARD", "EMPTY", "IN", "OUT", "FIRE", "XRAY",
+    "EBH", "BUS", "STOP", "SLOW", "GATE", "EXIT", "TAXI", "KEEP CLEAR", "NO ENTRY", "TRUCKS", "REEFER",
+    "LANE 4", "A12", "B07", "C31", "T16", "QC4", "RTG", "YARD", "EMPTY", "IN", "OUT", "FIRE", "XRAY",
 )  # fmt: skip
 NUMBERS = 24
 
@@ -118,8 +118,9 @@ def line_of(results: Sequence[Result]) -> str:
     right = sum(result.is_right for result in results)
     readings = [result for result in results if result.reading is not None]
     sure = [result for result in readings if result.reading and result.reading.confidence >= SURE]
+    share = right / len(results) if results else float("nan")
     return (
-        f"{len(results)} words seen twice, {len(readings)} read, {right} rightly ({right / len(results):.3f}); "
+        f"{len(results)} words seen twice, {len(readings)} read, {right} rightly ({share:.3f}); "
         f"of {len(sure)} said at {SURE} and more {sum(result.is_right for result in sure)}"
     )
 
@@ -156,7 +157,9 @@ def _write(path: Path, result: Result) -> None:
         return
     sides = []
     for side in zip(*result.patches, strict=True):
-        sides.append(np.hstack([cv2.copyMakeBorder(patch, 2, 2, 2, 2, cv2.BORDER_CONSTANT) for patch in side]))
+        sides.append(
+            np.hstack([cv2.copyMakeBorder(patch, 2, 2, 2, 2, cv2.BORDER_CONSTANT) for patch in side])
+        )
     width = max(side.shape[1] for side in sides)
     rows = [cv2.copyMakeBorder(side, 0, 0, 0, width - side.shape[1], cv2.BORDER_CONSTANT) for side in sides]
     cv2.imwrite(str(path), np.vstack(rows))
