@@ -258,7 +258,7 @@ def factorise_tiles(matrix: TiledMatrix, hold_tip: bool = False) -> TiledCholesk
 
 
 def _updates(matrix: TiledMatrix, column: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """What a column changes in later ones: views of the target, and of the left and right factors."""
+    """A column's changes in later ones: views of the target, and of the left and right factors."""
     size = matrix.columns[column].shape[1]
     panel = matrix.columns[column][size:]
     below = matrix.pattern.below[column]

@@ -57,7 +57,7 @@ class Site:
 
 @dataclass(frozen=True)
 class Reference:
-    """What a map of a site is scored against: the truth, and which true markings (J,) the drive went past."""
+    """The reference of a site's maps: the truth, and which true markings (J,) the drive went past."""
 
     truth: Truth
     expected: BoolArray
@@ -100,10 +100,11 @@ def write_input(site: Site, folder: Path, cache: Path, executor: Executor, progr
     The drive is made in a ``cache``, where a later call finds it. Raises as
     :func:`v2hdm.simulate.port.drive.rendered_drive`.
     """
-    (made,) = simulated_drives(site.config, cache, executor, progress)
-    description = load_yaml(made / DRIVE_FILE, ConfigError)
+    (drive_folder,) = simulated_drives(site.config, cache, executor, progress)
+    description = load_yaml(drive_folder / DRIVE_FILE, ConfigError)
     description.pop("truth", None)
-    shutil.copytree(made, folder, ignore=shutil.ignore_patterns(TRUTH_FOLDER, ".*"), dirs_exist_ok=True)
+    of_truth = shutil.ignore_patterns(TRUTH_FOLDER, ".*")
+    shutil.copytree(drive_folder, folder, ignore=of_truth, dirs_exist_ok=True)
     (folder / DRIVE_FILE).write_text(dump_yaml(description), encoding="utf-8")
 
 
@@ -134,8 +135,8 @@ def _make_reference(config: PortConfig, executor: Executor, progress: Progress) 
 def _survey(config: PortConfig, executor: Executor, progress: Progress) -> tuple[Drive, Truth]:
     """The drive of a survey with its truth, made in a folder that does not stay."""
     with tempfile.TemporaryDirectory(prefix="v2hdm-benchmark-") as folder:
-        (made,) = simulated_drives(config, Path(folder), executor, partial(progress, "truth"))
-        drive = read_drive(made)
+        (drive_folder,) = simulated_drives(config, Path(folder), executor, partial(progress, "truth"))
+        drive = read_drive(drive_folder)
         return drive, read_truth(drive)
 
 

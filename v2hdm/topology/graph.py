@@ -115,7 +115,7 @@ class StopLine:
 
 
 SUBJECTS = ("direction", "connection", "speed", "two ways", "stop line", "right of way", "line")
-"""What questions are about."""
+"""Subjects of questions."""
 
 
 @dataclass(frozen=True)

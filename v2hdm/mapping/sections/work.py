@@ -354,7 +354,7 @@ class Work:
         assert residuals is not None
         images = section.drive.images
         own_paths = {images[image].path for image in np.flatnonzero(section.is_own).tolist()}
-        has_marking = np.zeros_like(poses.seen)
+        has_marking = np.zeros_like(poses.has_marking)
         has_marking[section.own_frames[np.unique(bundle.problem.observations.frame)]] = True
         return replace(
             result,
@@ -363,7 +363,7 @@ class Work:
             residuals=residuals.take(names.is_ours[bundle.group]),
             poses=replace(
                 poses,
-                seen=has_marking,
+                has_marking=has_marking,
                 frame={path: at for path, at in poses.frame.items() if path in own_paths},
             ),
         )
