@@ -12,12 +12,12 @@ from collections.abc import Iterable
 
 from v2hdm.records import FloatArray
 
-_ALIKE = {"O0": 0.4, "I1": 0.3, "S5": 0.2, "Z2": 0.1, "G6": 0.05}
-"""Probability that either of two letters is named where the other is painted, chosen; two letters of the same
+_ALIKE = {("O", "0"): 0.4, ("I", "1"): 0.3, ("S", "5"): 0.2, ("Z", "2"): 0.1, ("G", "6"): 0.05}
+"""Probability that either of a letter and a digit is named where the other is painted, chosen; two of the same
 strokes would have .5."""
 
-_DIGIT_LIKE = {pair[0]: pair[1] for pair in _ALIKE}
-_LETTER_LIKE = {pair[1]: pair[0] for pair in _ALIKE}
+_DIGIT_LIKE = dict(_ALIKE)
+_LETTER_LIKE = {digit: letter for letter, digit in _ALIKE}
 _AS_DIGITS = str.maketrans(_DIGIT_LIKE)
 
 # Probabilities of the kinds of strings on the ground, chosen.
