@@ -13,10 +13,12 @@ from collections.abc import Iterable
 from v2hdm.records import FloatArray
 
 _ALIKE = {("O", "0"): 0.4, ("I", "1"): 0.3, ("S", "5"): 0.2, ("Z", "2"): 0.1, ("G", "6"): 0.05}
-"""Probability that either of a letter and a digit is named where the other is painted, chosen; two of the same
-strokes would have .5."""
+"""Probability that a letter or a digit is named where the other of the two is painted, chosen.
 
-_DIGIT_LIKE = dict(_ALIKE)
+Two of the same strokes would have .5.
+"""
+
+_DIGIT_LIKE = dict(_ALIKE.keys())
 _LETTER_LIKE = {digit: letter for letter, digit in _ALIKE}
 _AS_DIGITS = str.maketrans(_DIGIT_LIKE)
 
