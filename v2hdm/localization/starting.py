@@ -102,8 +102,8 @@ class Quest:
         if all(agreement.differs for agreement in agreements):
             return Proposal(
                 None,
-                "wherever the vehicle may be, many markings seen lie beside those of the map: is it the map of "
-                "this site, as painted today?",
+                "wherever the vehicle may be, many markings seen lie beside those of the map: is it the map "
+                "of this site, as painted today?",
             )
         scores = np.array([agreement.score for agreement in agreements])
         order = np.argsort(-scores)
