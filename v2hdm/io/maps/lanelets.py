@@ -12,12 +12,15 @@ from v2hdm.io.maps.features import Feature
 from v2hdm.io.maps.osm import MOST_VERTICES, PARTS, Document, part
 from v2hdm.records import LANE_DASH, FloatArray
 from v2hdm.topology.closed_lanes import Bound
-from v2hdm.topology.graph import Border, Direction, LaneGraph, LaneOfGraph, Right, StopLine
+from v2hdm.topology.graph import Border, Direction, LaneGraph, LaneOfGraph, Right, StatedRight, StopLine
 
 # Parts of a line, beside its vertices and its pieces:
 _LANELETS = MOST_VERTICES + PARTS // 4  # part that those of the lanelets to its right follow
 _VIRTUALS = MOST_VERTICES + 3 * PARTS // 8  # part that those of its bounds without paint follow
+_RIGHTS = MOST_VERTICES + 5 * PARTS // 16  # part that those of stated rights of way follow
 _INNER = MOST_VERTICES + 7 * PARTS // 16  # part that those of the nodes of such bounds follow
+
+_RULE = {"type": "regulatory_element"}
 
 
 class _StopEdges(NamedTuple):
@@ -35,6 +38,8 @@ class Lanelets:
         self._graph = graph
         self._lines = lines
         self.vertices = {line.id: document.nodes(line, line.xyz_map) for line in lines}
+        self._stop_of_lane: dict[int, int] = {}
+        self._rights: Counter[int] = Counter()
         self._rules: list[list[int]] = [[] for _ in graph.lanes]
         self._bounds: dict[tuple[int, int, int], int] = {}
         self._counts: Counter[int] = Counter()
@@ -62,21 +67,35 @@ class Lanelets:
         stop_id, sign_id, rule_id = (part(feature, MOST_VERTICES + k) for k in range(3))
         stop_nodes = self._document.nodes(feature, edges.stop, MOST_VERTICES + 10)
         self._document.way(stop_id, stop_nodes, {"type": "stop_line"})
-        tags = {"type": "regulatory_element"}
         if stop_line.right is Right.GIVE_WAY and stop_line.yields_to:
-            members = [("way", stop_id, "ref_line")]
-            members += [("relation", self._numbers[lane], "yield") for lane in stop_line.lanes]
-            members += [("relation", self._numbers[lane], "right_of_way") for lane in stop_line.yields_to]
-            self._document.relation(rule_id, members, tags | {"subtype": "right_of_way"})
+            self._right_of_way(rule_id, stop_id, stop_line.lanes, stop_line.yields_to)
         else:
             sign_nodes = self._document.nodes(feature, edges.other, MOST_VERTICES + 20)
             kind = "stop_sign" if stop_line.right is Right.STOP else "yield_sign"
             sign_tags = {"type": "traffic_sign", "subtype": kind, "virtual": "yes"}
             self._document.way(sign_id, sign_nodes, sign_tags)
             members = [("way", sign_id, "refers"), ("way", stop_id, "ref_line")]
-            self._document.relation(rule_id, members, tags | {"subtype": "traffic_sign"})
+            self._document.relation(rule_id, members, _RULE | {"subtype": "traffic_sign"})
         for lane in stop_line.lanes:
             self._rules[lane].append(rule_id)
+            self._stop_of_lane[lane] = stop_id
+
+    def write_right(self, right: StatedRight) -> None:
+        """Write that a lane gives way as stated, at the line that it ends at if one is painted."""
+        owner = self._owner(right.lane)
+        self._rights[owner.id] += 1
+        rule_id = part(owner, _RIGHTS + self._rights[owner.id])
+        self._right_of_way(rule_id, self._stop_of_lane.get(right.lane), (right.lane,), right.yields_to)
+        self._rules[right.lane].append(rule_id)
+
+    def _right_of_way(
+        self, rule_id: int, stop_id: int | None, yielding: Sequence[int], first: Sequence[int]
+    ) -> None:
+        """Write the rule by which lanes ``yielding`` wait for lanes that go ``first``."""
+        members = [] if stop_id is None else [("way", stop_id, "ref_line")]
+        members += [("relation", self._numbers[lane], "yield") for lane in yielding]
+        members += [("relation", self._numbers[lane], "right_of_way") for lane in first]
+        self._document.relation(rule_id, members, _RULE | {"subtype": "right_of_way"})
 
     def _direction(self, stop_line: StopLine, place_map: FloatArray) -> FloatArray | None:
         """The direction (2,) in which the lanes of a stop line pass it, None without lanes."""
