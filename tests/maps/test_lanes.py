@@ -120,7 +120,7 @@ def test_give_way_lines_are_rules_of_right_of_way_and_stop_lines_signs(files):
 
 @pytest.fixture(scope="module")
 def answered(tmp_path_factory):
-    """The files of the site with a speed and the right of way of the crossing stated: south and north wait."""
+    """The files of the site with a speed stated, and that from south and north one waits at the crossing."""
     site = made_site()
     stated = {"south in": "yes", "north in": "yes", "west in": "no", "east in": "no"}
     answers = [

@@ -47,7 +47,9 @@ def rights_asked(graph: LaneGraph, junction: Junction) -> Iterator[Question]:
         others = {way for other in arms if other != arm for way in _ways(graph, junction, other)}
         if ways_crossed(graph, centres, _ways(graph, junction, arm), sorted(others)):
             line = "a line says that one stops here" if arm in stops else "no line says who goes first"
-            yield Question(RIGHT_OF_WAY, f"{line}; does one give way to the others?", _place(graph, arm), (arm,))
+            yield Question(
+                RIGHT_OF_WAY, f"{line}; does one give way to the others?", _place(graph, arm), (arm,)
+            )
 
 
 def stated_rights(graph: LaneGraph, answers: Sequence[Answer]) -> tuple[StatedRight, ...]:

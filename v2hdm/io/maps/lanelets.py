@@ -19,6 +19,7 @@ _LANELETS = MOST_VERTICES + PARTS // 4  # part that those of the lanelets to its
 _VIRTUALS = MOST_VERTICES + 3 * PARTS // 8  # part that those of its bounds without paint follow
 _RIGHTS = MOST_VERTICES + 5 * PARTS // 16  # part that those of stated rights of way follow
 _INNER = MOST_VERTICES + 7 * PARTS // 16  # part that those of the nodes of such bounds follow
+_TOGETHER_M = 0.6  # distance, m, of points half a metre apart along curves that are one line; chosen
 
 _RULE = {"type": "regulatory_element"}
 
@@ -28,6 +29,13 @@ class _StopEdges(NamedTuple):
 
     stop: FloatArray
     other: FloatArray
+
+
+class _Virtual(NamedTuple):
+    """A bound that no paint shows, by its id, and its points (N, 3), m, between its ends."""
+
+    number: int
+    inner_xyz: FloatArray
 
 
 class Lanelets:
@@ -44,6 +52,7 @@ class Lanelets:
         self._bounds: dict[tuple[int, int, int], int] = {}
         self._counts: Counter[int] = Counter()
         self._virtuals: Counter[int] = Counter()
+        self._virtuals_between: dict[frozenset[int], list[_Virtual]] = {}
         self._inner: Counter[int] = Counter()
         self._numbers = [self._number(lane) for lane in range(len(graph.lanes))]
 
@@ -122,15 +131,23 @@ class Lanelets:
         return self._virtual(before, after, side.xyz_map[1:-1])
 
     def _virtual(self, end: Bound, start: Bound, inner_xyz: FloatArray) -> int:
-        """A bound that no paint shows, from where one lane's ends to where another's starts."""
+        """A bound that no paint shows, from where one lane's ends to where another's starts.
+
+        Ways beside each other share it, also where they lead in opposite directions (Autoware's vm-01-04).
+        """
         owner = self._lines[end.line]
+        last = self.vertices[owner.id][end.order[-1]]
+        first = self.vertices[self._lines[start.line].id][start.order[0]]
+        ends = frozenset((last, first))
+        for virtual in self._virtuals_between.get(ends, ()):
+            if _lie_together(virtual.inner_xyz, inner_xyz):
+                return virtual.number
         self._virtuals[owner.id] += 1
         number = part(owner, _VIRTUALS + self._virtuals[owner.id])
         inner = self._document.nodes(owner, inner_xyz, _INNER + self._inner[owner.id])
         self._inner[owner.id] += len(inner)
-        last = self.vertices[owner.id][end.order[-1]]
-        first = self.vertices[self._lines[start.line].id][start.order[0]]
-        self._document.way(number, [last, *inner, first], {"type": "virtual"})
+        self._virtuals_between.setdefault(ends, []).append(_Virtual(number, inner_xyz))
+        self._document.way(number, [last, *inner, first], {"type": "virtual", "lane_change": "no"})
         return number
 
     def _bound(self, bound: Bound) -> int:
@@ -158,6 +175,14 @@ def _tags(lane: LaneOfGraph) -> dict[str, str]:
     if lane.speed_kmh is not None:
         tags["speed_limit"] = f"{lane.speed_kmh:g}"
     return tags
+
+
+def _lie_together(first_xyz: FloatArray, second_xyz: FloatArray) -> bool:
+    """Whether two curves (N, 3) and (M, 3) between the same ends are one line."""
+    if not len(first_xyz) or not len(second_xyz):
+        return len(first_xyz) == len(second_xyz)
+    apart_m = np.linalg.norm(first_xyz[:, None, :2] - second_xyz[None, :, :2], axis=2)
+    return bool(max(apart_m.min(axis=0).max(), apart_m.min(axis=1).max()) < _TOGETHER_M)
 
 
 def _stop_edges(corners: FloatArray, direction: FloatArray | None) -> _StopEdges:
