@@ -32,7 +32,9 @@ def arm_of(graph, lane):
 
 
 def asked_of(graph):
-    return {arm_of(graph, question.lanes[0]) for question in graph.questions if question.subject == RIGHT_OF_WAY}
+    return {
+        arm_of(graph, question.lanes[0]) for question in graph.questions if question.subject == RIGHT_OF_WAY
+    }
 
 
 def crossed_arms(graph, right):
