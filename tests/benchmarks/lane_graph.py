@@ -171,14 +171,18 @@ def rendered(parsed: argparse.Namespace) -> None:
         drives, name="crossing", cache=folder / "stages", workers=1, progress=progress_lines(print)
     )
     print("\n".join(result.verdict.lines))
-    site = Site(result.map, tuple(driven_paths(result.drive)))
+    judge(Site(result.map, tuple(driven_paths(result.drive))), folder / "exports", parsed)
+
+
+def judge(site: Site, folder: Path, parsed: argparse.Namespace) -> None:
+    """Print the figures of a map of the rendered site, whose exports go into ``folder``."""
     graph = lane_graph(site.hd_map, site.trajectories)
     paint = painted_lines()
     by_paint = {name: painted(pairs_of_ends, paint) for name, pairs_of_ends in TRUTH.items()}
     print(f"{len(site.hd_map.markings)} markings, {len(site.hd_map.lanes)} lines")
     print(f"ends by the paint: {shown(scores(graph, by_paint))}")
     print(f"ends by the made lines: {shown(scores(graph, TRUTH))}")
-    print("\n".join(foreign(site, graph, folder / "exports", parsed)))
+    print("\n".join(foreign(site, graph, folder, parsed)))
 
 
 def main() -> None:

@@ -136,9 +136,9 @@ def compose_run_file(path: Path, name: str, schema: type[Any], overrides: Sequen
             shutil.copyfile(path, run)
         else:
             run.write_text(text, encoding="utf-8")
-        line = [f"+run={run.stem}", *renamed_overrides(overrides)]
+        words = [f"+run={run.stem}", *renamed_overrides(overrides)]
         try:
-            return _compose(name, schema, line, [Path(folder), *searched])
+            return _compose(name, schema, words, [Path(folder), *searched])
         except Exception as error:  # as in work_on
             # What the line does not name is the file's.
             of_line = [
