@@ -59,7 +59,7 @@ HARDSHIPS_EVERY = 3
 HARDSHIPS = replace(
     hardships_of(DataConfig()), aside=0.0, hollow=0.5, crossings=0.3, words=0.25, things_beside=1.2
 )
-"""Those of training, oftener where the classifier decides: outlines and letters, stop lines that meet lines,
+"""Scenes of training, oftener where the classifier decides: outlines and letters, stop lines that meet lines,
 ends that are hidden. A camera that looks aside sees classes by other names."""
 
 JUNCTIONS_SHARE = 1 / 12  # share of the scenes, the last ones, that are at junctions

@@ -17,7 +17,7 @@ from train.config import LossConfig
 from train.targets import IGNORE, Targets
 
 _BARE_WORTH = 0.1
-"""What a cell is worth that is taken for paint and bare: as much as one of a marking of 100 cells. Chosen."""
+"""The weight of a cell that is taken for paint and bare: as much as one of a marking of 100 cells. Chosen."""
 
 
 def total_loss(prediction: Prediction, targets: Targets, config: LossConfig) -> Tensor:

@@ -13,7 +13,8 @@ from typing import Any
 
 PAGE = Path(__file__).parents[1] / "benchmark.md"
 HEADS = (
-    "site", "recall", "false", "corner RMSE", "95 % within", "NEES", "inside 95 %", "lane lines", "verdict",
+    "site", "recall", "false", "corner RMSE", "95 % within", "NEES", "place / beside / shape", "inside 95 %",
+    "lane lines", "verdict", "strictly",
 )  # fmt: skip
 
 
@@ -29,9 +30,11 @@ def row_of(score: Mapping[str, Any]) -> list[str]:
         _cm(markings["corner_rmse_m"]),
         _cm(score["corner_95_m"]),
         f"{stated['nees']:.2f}" if stated["corners"] else "-",
+        " / ".join(_figure(stated[part]) for part in ("place", "beside", "shape")),
         f"{100 * stated['inside_95']:.1f} %" if stated["corners"] else "-",
         _cm(lanes["rms_lateral_error_m"]) if lanes else "-",
         f"{score['verdict']}: {score['verdict_is']}" if score["verdict"] else "-",
+        {True: "right", False: "wrong", None: "-"}[score["is_strictly_right"]],
     ]
 
 
@@ -48,6 +51,10 @@ def with_table(page: str, text: str) -> str:
         raise SystemExit(f"{PAGE}: has no table that begins with {HEADS[0]}")
     after = rest.partition("\n\n")[2]
     return f"{before}{text}\n\n{after}"
+
+
+def _figure(nees: float | None) -> str:
+    return "-" if nees is None else f"{nees:.2f}"
 
 
 def _cm(length_m: float | None) -> str:

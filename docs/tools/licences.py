@@ -1,4 +1,4 @@
-"""Write the table of installed parts of ``docs/licences.md``: ``python docs/tools/licences.py``.
+"""Write the table of installed parts, ``docs/installed_parts.csv``: ``python docs/tools/licences.py``.
 
 Parts are what the wheel's base install and its extras require, directly or through others, as installed here.
 Licences are those that each states of itself: an SPDX expression, else its classifiers, else its own words.
@@ -6,6 +6,7 @@ Licences are those that each states of itself: an SPDX expression, else its clas
 
 from __future__ import annotations
 
+import csv
 import re
 import tomllib
 from collections.abc import Iterator, Sequence
@@ -17,12 +18,11 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs" / "licences.md"
+TABLE = ROOT / "docs" / "installed_parts.csv"
 EXTRAS = ("", "map", "ros", "ubx", "video", "gis", "parquet", "text", "pdf")
 """What users install, by extra; the first is the base install."""
 
-_BEGIN = "<!-- installed parts: python docs/tools/licences.py -->\n"
-_END = "<!-- end -->\n"
+_HEADS = ("package", "version", "licence", "installed by")
 _LONGEST = 160  # letters of a licence; some packages state its whole text
 
 
@@ -82,22 +82,11 @@ def licence_of(installed: Distribution) -> str:
     return first[:_LONGEST] or "not stated in its metadata"
 
 
-def table() -> str:
-    """The table as Markdown."""
-    rows = [
-        f"| {part.name} | {part.version} | {part.licence} | {f'`{part.extra}`' if part.extra else 'base'} |"
-        for part in parts()
-    ]
-    return "\n".join(
-        ["| package | version | licence | installed by |", "| --- | --- | --- | --- |", *rows, ""]
-    )
-
-
 def main() -> None:
-    """Replace the table in the page."""
-    before, rest = PAGE.read_text(encoding="utf-8").split(_BEGIN)
-    _, after = rest.split(_END)
-    PAGE.write_text(f"{before}{_BEGIN}\n{table()}\n{_END}{after}", encoding="utf-8")
+    """Write the table."""
+    rows = [(part.name, part.version, part.licence, part.extra or "base") for part in parts()]
+    with TABLE.open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([_HEADS, *rows])
 
 
 if __name__ == "__main__":

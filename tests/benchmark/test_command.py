@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.benchmark.hand import paint, write
-from v2hdm.benchmark.sites import reference_of, site_of
+from v2hdm.benchmark.sites import all_sites, reference_of, site_of
 from v2hdm.cli.main import main
 from v2hdm.executor import HERE
 from v2hdm.io.drive import read_drive
@@ -86,7 +86,7 @@ def test_the_table_of_the_page_is_written_from_scores(tmp_path, cache, streets, 
     assert main(["benchmark", "score", str(path), "streets", "--cache", str(cache), "--json"]) == 0
     text = tool.table([json.loads(capsys.readouterr().out)])
     assert text.splitlines()[2].startswith("| `streets` | 100.0 % of ")
-    assert "| 3.0 cm | 3.0 cm | 0.50 | 100.0 % | - | PASS: right |" in text
+    assert "| 3.0 cm | 3.0 cm | 0.50 | 2.00 / - / 0.00 | 100.0 % | - | PASS: right | right |" in text
     page = tool.PAGE.read_text()
     written = tool.with_table(page, text)
     assert text in written
@@ -95,5 +95,5 @@ def test_the_table_of_the_page_is_written_from_scores(tmp_path, cache, streets, 
 
 def test_the_page_has_the_score_of_every_site():
     page = page_tool().PAGE.read_text()
-    for name in ("port1", "port2", "streets"):
+    for name in all_sites():
         assert sum(line.startswith(f"| `{name}` | ") and " % of " in line for line in page.splitlines()) == 1

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.benchmark.hand import DIAMOND, at, feature, paint, write
-from v2hdm.benchmark.scoring import FALSE_ALARM, RIGHT, SILENT, score_map, table_of
+from v2hdm.benchmark.scoring import FALSE_ALARM, RIGHT, SILENT, UNSTATED, score_map, table_of
 from v2hdm.benchmark.submissions import read_submission
 
 
@@ -33,7 +33,7 @@ def test_the_truth_itself_has_a_perfect_score(scored, reference):
 @pytest.mark.parametrize(
     ("off_m", "verdict", "fate"),
     [(0.03, "PASS", RIGHT), (0.03, "FAIL", FALSE_ALARM), (0.07, "PASS", SILENT), (0.07, "FAIL", RIGHT),
-     (0.07, {"status": "WARN"}, RIGHT), (0.07, None, None)],
+     (0.07, {"status": "WARN"}, UNSTATED), (0.07, None, None)],
 )  # fmt: skip
 def test_a_map_that_is_moved_has_the_error_that_it_was_moved_by(off_m, verdict, fate, scored, reference):
     score = scored(paint(reference, (off_m, 0.0)), verdict=verdict)
@@ -42,6 +42,40 @@ def test_a_map_that_is_moved_has_the_error_that_it_was_moved_by(off_m, verdict, 
     assert score.corner_median_m == pytest.approx(off_m, abs=1e-6)
     assert score.is_good == (off_m < 0.05)
     assert score.verdict_is == fate
+
+
+@pytest.mark.parametrize(
+    ("off_m", "verdict", "is_right"),
+    [(0.03, "PASS", True), (0.03, "WARN", False), (0.03, "FAIL", False), (0.07, "PASS", False),
+     (0.07, "WARN", False), (0.07, "FAIL", True), (0.07, None, None)],
+)  # fmt: skip
+def test_strictly_a_warning_is_never_right(off_m, verdict, is_right, scored, reference):
+    assert scored(paint(reference, (off_m, 0.0)), verdict=verdict).is_strictly_right is is_right
+
+
+def test_a_warning_is_right_only_while_the_stated_accuracy_holds(scored, reference):
+    honest = paint(reference, (0.07, 0.0), sigma_m=0.06)
+    assert scored(honest, verdict="WARN").verdict_is == RIGHT
+    assert scored(paint(reference, (0.07, 0.0), sigma_m=0.02), verdict="WARN").verdict_is == UNSTATED
+    invented = [feature("diamond", at(DIAMOND, 2.0 + 4.0 * k, 30.0), sigma_m=0.06) for k in range(3)]
+    assert scored([*honest, *invented], verdict="WARN").verdict_is == UNSTATED
+
+
+def test_the_parts_of_the_nees_tell_a_wrong_place_from_a_wrong_shape(scored, reference):
+    moved = scored(paint(reference, (0.03, 0.0), sigma_m=0.03)).stated
+    # The centre of four corners is known twice as well as each: (3 cm / 1.5 cm)^2 over two coordinates.
+    assert moved.place == pytest.approx(2.0, rel=1e-3)
+    assert moved.shape == pytest.approx(0.0, abs=1e-6)
+    assert math.isnan(moved.beside)
+    longer = [
+        feature(m.kind, m.corners_map + 0.03 * np.sign(m.corners_map - m.corners_map.mean(0)), sigma_m=0.03)
+        for m in reference.truth.map.markings
+        if m.kind == "lane_dash"
+    ]
+    stated = scored(longer).stated
+    assert stated.place == pytest.approx(0.0, abs=1e-6)
+    # Eight errors of a sigma each, over six degrees of freedom.
+    assert stated.shape == pytest.approx(8 / 6, rel=1e-3)
 
 
 def test_what_is_left_out_or_invented_is_counted(scored, reference):
@@ -114,10 +148,12 @@ def test_the_table_says_what_the_score_holds(scored, reference):
     assert (
         "stated accuracy: NEES 1.12 (1 is right), 100.0 % of 160 corners inside their 95 % ellipse" in lines
     )
-    assert lines[-1] == "verdict: PASS, right"
+    assert "NEES by part: places 4.50, shapes 0.00" in lines
+    assert lines[-1] == "verdict: PASS, right; strictly (no WARN) right"
 
 
 def test_as_json_has_none_for_what_cannot_be_told(scored, reference):
     content = scored(paint(reference)).as_json()
-    assert content["stated"] == {"corners": 0, "nees": None, "inside_95": None}
+    assert content["stated"]["corners"] == 0
+    assert {content["stated"][part] for part in ("nees", "inside_95", "place", "beside", "shape")} == {None}
     assert content["markings"]["recall"] == 1.0

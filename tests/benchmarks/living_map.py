@@ -141,7 +141,7 @@ def tell_changes(changes: Sequence[Change], alterations: Sequence[Alteration], b
         print(
             f"{fate.value}: {len(right)} of {len(own)} listed ({len(unknown)} were not in the earlier map), "
             f"{len(others)} others: "
-            + "; ".join(f"{c.id} {c.kind} p {c.probability:.2f} {c.found}/{c.views}" for c in others)
+            + "; ".join(f"{c.id} {c.kind} p {c.probability:.2f} {c.views_showing}/{c.views}" for c in others)
         )
         for one in own:
             if not any(one is other for other in right):
@@ -150,7 +150,9 @@ def tell_changes(changes: Sequence[Change], alterations: Sequence[Alteration], b
                 near = [
                     c for c in changes if any(at(x, corners) for x in (c.before, c.after) if x is not None)
                 ]
-                fates = ", ".join(f"{c.fate.value} p {c.probability:.2f} {c.found}/{c.views}" for c in near)
+                fates = ", ".join(
+                    f"{c.fate.value} p {c.probability:.2f} {c.views_showing}/{c.views}" for c in near
+                )
                 x, y = corners.mean(axis=0)
                 print(f"   missed at ({x:.1f}, {y:.1f}): {fates or 'nothing listed'}")
 

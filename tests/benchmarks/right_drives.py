@@ -20,10 +20,11 @@ states how well its clocks are synchronised.
 
 - *wrong*: its corners are more than 1.3 times as far off as those of the drive as it was
 - *told*: something is raised
+- *usual*: of these, nothing but what is raised of the drive as it was, too; it names the cause
 - *relied*: nothing is, but the input is named as one that the drive cannot check
-- *1.3 x*: wrong, and neither told nor relied. This rule alone blames a map for errors that it states: 3.9 cm
-  in place of 2.0 under sigmas whose 95 % regions hold 99 % of the corners deceive nobody
-- *SILENT*: these, with less than 90 % of the corners inside their 95 % regions
+- *SILENT*: wrong, and neither told nor relied
+- *held*: of these, how many have at least 90 % of their corners inside their 95 % regions
+- *inside*: the share of all corners of these drives inside their 95 % regions
 """
 
 from __future__ import annotations
@@ -59,11 +60,12 @@ from v2hdm.mapping.results import MethodResult
 from v2hdm.records import BEST, Drive, FloatArray, HDMap
 from v2hdm.report.metrics import driven_past, marking_metrics
 from v2hdm.verdict import Finding, Verdict
+from v2hdm.verdict.inputs.alignment import check_alignment
 from v2hdm.verdict.inputs.drive import causes, check_camera, check_road
 from v2hdm.verdict.inputs.heading import check_heading
 from v2hdm.verdict.inputs.poses import Motion, check_attitude, check_jumps, check_noise, check_path
 from v2hdm.verdict.inputs.recording import check_clocks
-from v2hdm.verdict.results.accuracy import check_goal
+from v2hdm.verdict.results.accuracy import check_goal, clocks_once
 from v2hdm.verdict.results.solution import check_solution, over_ground, told_by_poses
 from v2hdm.verdict.verdict import GOAL
 
@@ -173,7 +175,8 @@ def map_one(job: Job) -> Row:
         options = MappingOptions(ground=job.ground, estimate_read_out=job.estimate)
         best = run_methods(drive, detections, cameras, options, naive=False)[BEST]
         before = over_ground(findings_of_inputs(drive), best, job.ground == AUTO)
-        findings = [*before, *told_by_poses(check_solution(drive, best), before), *unknown(best)]
+        solved, of_goal = clocks_once(told_by_poses(check_solution(drive, best), before), unknown(best))
+        findings = [*before, *solved, *of_goal]
     except V2hdmError as error:
         refusal = {"check": _REFUSED, "says": str(error), "status": _REFUSED}
         return Row(**about, status=_REFUSED, findings=[refusal], seconds=time.process_time() - begin_s)
@@ -235,6 +238,7 @@ def findings_of_inputs(drive: Drive) -> list[Finding]:
     findings = [
         *check_path(motion),
         *check_heading(motion),
+        *check_alignment(motion, drive.pose_noise, drive.cameras),
         *check_attitude(motion),
         *check_jumps(motion, drive.pose_noise),
         *check_clocks(drive, motion),
@@ -301,24 +305,20 @@ class Judgement(NamedTuple):
     wrong: bool
     told: bool
     relied: bool
-    holds: bool  # whether its stated sigmas hold
+    held: bool  # whether its stated sigmas hold
+    usual: bool  # whether all that is told is told of the drive as it was, too
     named: str  # when the cause is named, of what is said: first, later or never; "-" where nothing is
 
     @property
-    def silent_by_factor(self) -> bool:
+    def silent(self) -> bool:
         """Whether it is wrong, and nothing is said."""
         return self.wrong and not self.told and not self.relied
 
     @property
-    def silent(self) -> bool:
-        """Whether it is wrong beyond what it states, and nothing is said."""
-        return self.silent_by_factor and not self.holds
-
-    @property
     def word(self) -> str:
         """For the line of the drive."""
-        said = "told" if self.told else "relied" if self.relied else "nothing" if self.wrong else "pass"
-        return f"{'wrong' if self.wrong else 'right'} {'SILENT' if self.silent else said} {self.named}"
+        said = "told" if self.told else "relied" if self.relied else "SILENT" if self.wrong else "pass"
+        return f"{'wrong' if self.wrong else 'right'} {said} {self.named}"
 
 
 def judge(row: Row, clean: Row) -> Judgement:
@@ -334,7 +334,9 @@ def judge(row: Row, clean: Row) -> Judgement:
     if spoil.cause is not None and said:
         hits = [re.search(spoil.cause, clause, re.IGNORECASE) is not None for clause in said]
         named = "first" if hits[0] else "later" if any(hits) else "never"
-    return Judgement(wrong, bool(said), bool(relied), _shares([row])["corners"] >= _HELD, named)
+    held = _shares([row])["corners"] >= _HELD
+    usual = bool(said) and not _said(row.findings, clean.findings, None)
+    return Judgement(wrong, bool(said), bool(relied), held, usual, named)
 
 
 def _said(
@@ -406,18 +408,20 @@ def summary_of_right(rows: Sequence[Row]) -> list[str]:
 
 def summary_of_spoilt(rows: Sequence[Row], clean: dict[int, Row]) -> list[str]:
     """By fault, how many maps are wrong, silently, and when the true cause is named."""
-    columns = ("drives", "wrong", "1.3 x", "SILENT", "relied", "told", "first", "later", "never")
-    lines = [f"{'fault':18s}" + "".join(f"{column:>7s}" for column in columns)]
+    columns = ("drives", "wrong", "SILENT", "held", "relied", "told", "usual", "first", "later", "never")
+    lines = [f"{'fault':18s}" + "".join(f"{column:>7s}" for column in (*columns, "inside"))]
     totals: Counter[str] = Counter()
     for spoil in dict.fromkeys(row.spoil for row in rows):
         own = [row for row in rows if row.spoil == spoil]
         counts = _counts([judge(row, clean[row.seed]) for row in own])
         totals.update(counts)
-        lines.append(f"{spoil:18s}" + "".join(f"{counts[column]:7d}" for column in columns))
+        inside = f"{_shares(own)['corners']:7.2f}"
+        lines.append(f"{spoil:18s}" + "".join(f"{counts[column]:7d}" for column in columns) + inside)
         said = Counter(finding["check"] for row in own for finding in row.findings)
         checks = ", ".join(f"{check} {count}" for check, count in said.most_common())
         lines.append(f"    {checks or 'nothing'}")
     lines.append(f"{'all':18s}" + "".join(f"{totals[column]:7d}" for column in columns))
+    lines.append(f"SILENT {totals['SILENT']}, of them inside their stated sigmas {totals['held']}")
     named = sum(totals[column] for column in ("first", "later", "never"))
     lines.append(f"cause first in {totals['first']} of {named} of which something is told")
     return lines
@@ -428,10 +432,11 @@ def _counts(judged: Sequence[Judgement]) -> Counter[str]:
     counts = Counter(judgement.named for judgement in judged)
     counts["drives"] = len(judged)
     counts["wrong"] = sum(judgement.wrong for judgement in judged)
-    counts["1.3 x"] = sum(judgement.silent_by_factor for judgement in judged)
     counts["SILENT"] = sum(judgement.silent for judgement in judged)
+    counts["held"] = sum(judgement.silent and judgement.held for judgement in judged)
     counts["relied"] = sum(j.wrong and j.relied and not j.told for j in judged)
     counts["told"] = sum(judgement.told for judgement in judged)
+    counts["usual"] = sum(judgement.usual for judgement in judged)
     return counts
 
 

@@ -70,7 +70,7 @@ def test_what_vanished_left_the_map_and_stays_in_the_list(before, updated):
     centres = [before.markings[k].corners_map.mean(axis=0) for k in REMOVED]
     assert all(any(near(one.before, centre) for one in gone) for centre in centres)
     assert len(gone) == len(REMOVED)
-    assert all(one.views >= 5 and one.found == 0 and one.after is None for one in gone)
+    assert all(one.views >= 5 and one.views_showing == 0 and one.after is None for one in gone)
     assert not {one.id for one in gone} & {one.id for one in result.hd_map.markings}
     pairs, _ = match(result.hd_map, now.markings, 0.3)
     assert len(pairs) == len(result.hd_map.markings)

@@ -24,7 +24,8 @@ from v2hdm.records import Calibration, Exclusion, HDMap
 from v2hdm.site.accuracy import absolute_radii_m, objection_to
 from v2hdm.site.candidates import TOO_UNCERTAIN
 from v2hdm.verdict import Finding, Status, Verdict
-from v2hdm.verdict.results.accuracy import check_goal, ground_ahead
+from v2hdm.verdict.results.accuracy import check_goal, clocks_once, ground_ahead
+from v2hdm.verdict.verdict import passed
 
 SURE = np.diag([0.003**2] * 3 + [1e-4**2] * 3)
 
@@ -123,6 +124,25 @@ def test_clocks_that_leave_more_open_than_the_goal_are_named_first_and_no_pass()
     assert (first.value, first.limit, first.unit) == (20.0, 5.0, "cm")
     assert "the largest part, 20 cm, is the clocks" in of_all.says
     assert judged(unknown, goal_m=0.3).status is Status.PASS
+
+
+def test_clocks_are_told_once_beside_what_else_the_drive_cannot_tell():
+    unknown = replace(mapped([marking(n, shared_m=0.1) for n in range(30)]), evidence=with_clocks(0.2))
+    of_goal = list(check_goal(unknown, 0.05, "poses"))
+    cannot_tell = [
+        passed(check, "all cameras", "include a turn") for check in ("slope", "clock", "clock drift")
+    ]
+    assert clocks_once(cannot_tell, of_goal) == (cannot_tell[:1], of_goal)
+    met = list(check_goal(unknown, 0.3, "poses"))
+    assert clocks_once(cannot_tell, met) == (cannot_tell, met)
+
+
+def test_a_clock_that_is_named_as_wrong_is_not_unknown():
+    unknown = replace(mapped([marking(n, shared_m=0.1) for n in range(30)]), evidence=with_clocks(0.2))
+    fast = Finding("clock drift", Status.FAIL, 5.0, 4.0, "sigmas", "runs fast", "front")
+    findings, of_goal = clocks_once([fast], check_goal(unknown, 0.05, "poses"))
+    assert findings == [fast]
+    assert {finding.check for finding in of_goal} == {"coarse"}
 
 
 def test_what_the_map_leaves_out_as_too_uncertain_is_said_beside_the_share():

@@ -18,6 +18,7 @@ from v2hdm.site.candidates import LACKS_A_CORNER
 from v2hdm.verdict import Finding, Status, Verdict
 from v2hdm.verdict.results.accuracy import SIGNIFICANCE, check_frame, check_goal, check_points
 from v2hdm.verdict.results.solution import check_inputs, check_solution, over_ground, told_by_poses
+from v2hdm.verdict.verdict import passed
 
 FIT = CameraFit(observations=2000, variance_factor=0.15, rejected_share=0.01, sightings=400.0)
 
@@ -276,6 +277,10 @@ def test_a_straight_drive_says_what_it_cannot_tell():
     unobservable = [f for f in check_inputs(unsure) if f.is_unobservable]
     assert {f.check for f in unobservable} == {"clock", "survey"}
     assert all("include a turn" in f.says for f in unobservable)
+    (survey,) = (f for f in unobservable if f.check == "survey")
+    assert "nothing checks the surveyed centres and the antenna" in survey.says
+    slope = passed("slope", "all cameras", "include a turn")
+    assert [f.check for f in Verdict.of([slope, *unobservable]).unobservable] == ["clock", "survey", "slope"]
     sure = replace(square_at(0.0, 0.0), covariance_m2=1e-6 * np.eye(8))
     for evidence, is_told in ((unsure, True), (FINE, False)):
         headline = Verdict.of(check_goal(result(evidence, sure), 0.05, "poses")).headline

@@ -252,49 +252,47 @@ def descend(
         cost, gradient = objective.at_base()
         gap = predicted_gap(cost, gradient)
         refreshes += 1
-        ended = (
-            (final and gap <= tolerance)
-            or refreshes > max_refreshes
-            or evaluations >= max_evaluations
-            or not progressing
+        is_spent = refreshes > max_refreshes or evaluations >= max_evaluations
+        if (final and gap <= tolerance) or is_spent or not progressing:
+            base = objective.point(torch.zeros_like(gradient))
+            evaluations += objective.evaluations
+            return _descent_to(base, whitening, gap, evaluations, progressing, is_base=True)
+        inner = tolerance if final else _ANNEALING_TOLERANCE
+        # After a slow whitening the next is near enough: the loss slows it, not the distance.
+        whitened, reached, gradient, slow = minimise(
+            objective, cost, gradient, inner, _ITERATIONS_PER_WHITENING, math.inf if slow else renewal
         )
-        whitened = torch.zeros_like(gradient)
-        reached = cost
-        last_whitening = None
-        if ended:
-            last_whitening = whitening
-        else:
-            inner = tolerance if final else _ANNEALING_TOLERANCE
-            # After a slow whitening the next is near enough: the loss slows it, not the distance.
-            whitened, reached, gradient, slow = minimise(
-                objective, cost, gradient, inner, _ITERATIONS_PER_WHITENING, math.inf if slow else renewal
-            )
-            gap = predicted_gap(reached, gradient)
-            # A whitening under which the gap shrank this fast determines it well.
-            ended = final and not slow and gap <= tolerance
+        gap = predicted_gap(reached, gradient)
         point = objective.point(whitened)
-        used = whitening.robust
         evaluations += objective.evaluations
-        singular = whitening.is_singular
-        if ended:
-            return Descent(
-                engine=engine,
-                plan=plan,
-                estimate=point.estimate,
-                robust=used,
-                terms=point.terms,
-                gap=gap,
-                evaluations=evaluations,
-                progressing=progressing,
-                is_singular=singular,
-                last_whitening=last_whitening,
-            )
-        estimate = point.estimate
+        # A whitening under which the gap shrank this fast determines it well.
+        if final and not slow and gap <= tolerance:
+            return _descent_to(point, whitening, gap, evaluations, progressing, is_base=False)
         progressing = reached < cost or not final
+        estimate = point.estimate
+        last = whitening.robust
         # Frees the memory of the old factor, and of what refers to it, before the new one is made.
         del whitening, objective, whitened, gradient, point
-        loss = used if final else narrowed(engine, estimate, robust, used)
+        loss = last if final else narrowed(engine, estimate, robust, last)
         whitening = factorise(engine, plan, estimate, loss)
+
+
+def _descent_to(
+    point: Point, whitening: Whitening, gap: float, evaluations: int, progressing: bool, *, is_base: bool
+) -> Descent:
+    """The descent that ends at a point of a whitening, or at its base."""
+    return Descent(
+        engine=whitening.engine,
+        plan=whitening.plan,
+        estimate=point.estimate,
+        robust=whitening.robust,
+        terms=point.terms,
+        gap=gap,
+        evaluations=evaluations,
+        progressing=progressing,
+        is_singular=whitening.is_singular,
+        last_whitening=whitening if is_base else None,
+    )
 
 
 def open_descent(engine: TorchEngine, estimate: Estimate, robust: Loss) -> Whitening:

@@ -1,4 +1,4 @@
-"""The outlines of objects in an OpenDRIVE file (ASAM OpenDRIVE 1.7, chapters 9 and 13)."""
+"""Roads and the outlines of objects in an OpenDRIVE file (ASAM OpenDRIVE 1.7, chapters 9 and 13)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class ObjectOutlines(NamedTuple):
     crs: str | None
 
 
-class _Pose(NamedTuple):
+class Pose(NamedTuple):
     """A place on a reference line: x, y and heading."""
 
     position: FloatArray
@@ -46,48 +46,48 @@ class _Pose(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _Piece:
+class Piece:
     """A geometry of a reference line, from ``s_m`` on."""
 
     s_m: float
     length_m: float
-    start: _Pose
+    start: Pose
     shape: ET.Element
 
-    def at(self, along_m: float) -> _Pose:
+    def at(self, along_m: float) -> Pose:
         """The place ``along_m`` from its start."""
         kind = self.shape.tag
         if kind == "paramPoly3":
             return self._of_polynomials(along_m)
         if kind == "poly3":
-            across = _cubic(self.shape, "", along_m)
+            across = cubic(self.shape, "", along_m)
             heading = np.arctan(_slope(self.shape, "", along_m))
-            return _Pose(
+            return Pose(
                 self.start.beside(np.array([[along_m, across]]))[0], self.start.heading_rad + float(heading)
             )
         if kind not in ("line", "arc", "spiral"):
             raise MapFileError(f"a geometry {kind} is none of OpenDRIVE's; fix the file")
-        begin = _number(self.shape, "curvature" if kind == "arc" else "curvStart", 0.0)
-        end = _number(self.shape, "curvature" if kind == "arc" else "curvEnd", begin)
+        begin = number_in(self.shape, "curvature" if kind == "arc" else "curvStart", 0.0)
+        end = number_in(self.shape, "curvature" if kind == "arc" else "curvEnd", begin)
         steps = 1 if kind == "line" else max(1, int(np.ceil(abs(along_m) / _STEP_M)))
         middle = (np.arange(steps) + 0.5) * along_m / steps
         change = (end - begin) / self.length_m
         turned = begin * middle + change * middle**2 / 2
         ahead = np.array([np.cos(turned).sum(), np.sin(turned).sum()]) * along_m / steps
         heading_rad = self.start.heading_rad + begin * along_m + change * along_m**2 / 2
-        return _Pose(self.start.beside(ahead[None])[0], heading_rad)
+        return Pose(self.start.beside(ahead[None])[0], heading_rad)
 
-    def _of_polynomials(self, along_m: float) -> _Pose:
+    def _of_polynomials(self, along_m: float) -> Pose:
         is_normalised = self.shape.get("pRange", "normalized") == "normalized"
         parameter = along_m / self.length_m if is_normalised else along_m
-        place = np.array([[_cubic(self.shape, axis, parameter) for axis in "UV"]])
+        place = np.array([[cubic(self.shape, axis, parameter) for axis in "UV"]])
         slope = [_slope(self.shape, axis, parameter) for axis in "UV"]
         heading_rad = self.start.heading_rad + float(np.arctan2(slope[1], slope[0]))
-        return _Pose(self.start.beside(place)[0], heading_rad)
+        return Pose(self.start.beside(place)[0], heading_rad)
 
 
-def outlines_of(path: Path) -> ObjectOutlines:
-    """The closed outlines of the objects in a file; MapFileError where it is damaged."""
+def read_root(path: Path) -> ET.Element:
+    """The root of an OpenDRIVE file; MapFileError where it is none."""
     text = read_text(path, MapFileError)
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise MapFileError(f"{path}: declares a document type, which OpenDRIVE has not; take it out")
@@ -97,12 +97,18 @@ def outlines_of(path: Path) -> ObjectOutlines:
         raise MapFileError(f"{path}: is no XML that can be read ({failure}); save it again") from None
     if root.tag != "OpenDRIVE":
         raise MapFileError(f"{path}: is no OpenDRIVE file (its root is {root.tag[:40]}); give one")
+    return root
+
+
+def outlines_of(path: Path) -> ObjectOutlines:
+    """The closed outlines of the objects in a file; MapFileError where it is damaged."""
+    root = read_root(path)
     reference = root.findtext("header/geoReference")
     outlines = []
     for road in root.findall("road"):
         where = f"{path}: road {road.get('id', '')[:40]}"
         try:
-            pieces = _pieces(road)
+            pieces = pieces_of(road)
             outlines += [
                 outline for entry in road.findall("objects/object") for outline in _outlines(entry, pieces)
             ]
@@ -113,17 +119,18 @@ def outlines_of(path: Path) -> ObjectOutlines:
     return ObjectOutlines(outlines, reference.strip() if reference and reference.strip() else None)
 
 
-def _pieces(road: ET.Element) -> list[_Piece]:
+def pieces_of(road: ET.Element) -> list[Piece]:
+    """The geometries of a road's reference line, in order; MapFileError where one has no shape."""
     pieces = []
     for entry in road.findall("planView/geometry"):
-        start = _Pose(np.array([_number(entry, "x"), _number(entry, "y")]), _number(entry, "hdg"))
+        start = Pose(np.array([number_in(entry, "x"), number_in(entry, "y")]), number_in(entry, "hdg"))
         if not len(entry):
             raise MapFileError("a geometry has no shape; fix the file")
-        pieces.append(_Piece(_number(entry, "s"), _number(entry, "length"), start, entry[0]))
+        pieces.append(Piece(number_in(entry, "s"), number_in(entry, "length"), start, entry[0]))
     return sorted(pieces, key=lambda piece: piece.s_m)
 
 
-def _place(pieces: list[_Piece], s_m: float) -> _Pose:
+def place_along(pieces: list[Piece], s_m: float) -> Pose:
     """The place at ``s_m`` along a reference line, which its last piece goes on."""
     if not pieces:
         raise MapFileError("has no reference line; fix the file")
@@ -131,18 +138,20 @@ def _place(pieces: list[_Piece], s_m: float) -> _Pose:
     return before[-1].at(s_m - before[-1].s_m)
 
 
-def _outlines(entry: ET.Element, pieces: list[_Piece]) -> list[ObjectOutline]:
+def _outlines(entry: ET.Element, pieces: list[Piece]) -> list[ObjectOutline]:
     called = entry.get("name") or entry.get("type")
     name = f"object {entry.get('id', '')[:40]} ({(called or '')[:40]})"
     outline_entries = entry.findall("outlines/outline") or entry.findall("outline")
-    place = _place(pieces, _number(entry, "s"))
-    centre = place.beside(np.array([[0.0, _number(entry, "t", 0.0)]]))[0]
-    frame = _Pose(centre, place.heading_rad + _number(entry, "hdg", 0.0))
+    place = place_along(pieces, number_in(entry, "s"))
+    centre = place.beside(np.array([[0.0, number_in(entry, "t", 0.0)]]))[0]
+    frame = Pose(centre, place.heading_rad + number_in(entry, "hdg", 0.0))
     outlines = []
     for outline in outline_entries:
-        local = [(_number(corner, "u"), _number(corner, "v")) for corner in outline.findall("cornerLocal")]
+        local = [
+            (number_in(corner, "u"), number_in(corner, "v")) for corner in outline.findall("cornerLocal")
+        ]
         on_road = [
-            _place(pieces, _number(corner, "s")).beside(np.array([[0.0, _number(corner, "t")]]))[0]
+            place_along(pieces, number_in(corner, "s")).beside(np.array([[0.0, number_in(corner, "t")]]))[0]
             for corner in outline.findall("cornerRoad")
         ]
         points = frame.beside(np.array(local)) if local else np.array(on_road).reshape(-1, 2)
@@ -153,7 +162,8 @@ def _outlines(entry: ET.Element, pieces: list[_Piece]) -> list[ObjectOutline]:
     return outlines
 
 
-def _number(entry: ET.Element, key: str, missing: float | None = None) -> float:
+def number_in(entry: ET.Element, key: str, missing: float | None = None) -> float:
+    """A finite number of an entry, ``missing`` where it has none; MapFileError where there must be one."""
     text = entry.get(key)
     if text is None and missing is not None:
         return missing
@@ -165,10 +175,11 @@ def _number(entry: ET.Element, key: str, missing: float | None = None) -> float:
     return value
 
 
-def _cubic(entry: ET.Element, axis: str, parameter: float) -> float:
-    return sum(_number(entry, f"{letter}{axis}") * parameter**power for power, letter in enumerate("abcd"))
+def cubic(entry: ET.Element, axis: str, parameter: float) -> float:
+    """The polynomial of an entry's ``a``, ``b``, ``c`` and ``d`` of an axis."""
+    return sum(number_in(entry, f"{letter}{axis}") * parameter**power for power, letter in enumerate("abcd"))
 
 
 def _slope(entry: ET.Element, axis: str, parameter: float) -> float:
-    slopes = [(_number(entry, f"{letter}{axis}"), power) for power, letter in enumerate("abcd") if power]
+    slopes = [(number_in(entry, f"{letter}{axis}"), power) for power, letter in enumerate("abcd") if power]
     return sum(power * factor * parameter ** (power - 1) for factor, power in slopes)

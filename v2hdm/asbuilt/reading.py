@@ -187,7 +187,7 @@ def in_map(positions: FloatArray, crs: str, origin: GeodeticOrigin | None, where
 
 
 def called_by(properties: Mapping[str, Any]) -> str | None:
-    """What a feature is called by the first of its properties that says so, None without one."""
+    """The name of a feature, from the first of its properties that has one, or None."""
     by_name = {str(key).lower(): value for key, value in properties.items()}
     return next((str(by_name[key]) for key in _NAMED_BY if by_name.get(key) not in (None, "")), None)
 

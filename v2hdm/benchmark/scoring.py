@@ -26,6 +26,9 @@ FALSE_SHARE = 0.01  # largest share of false markings of a good map
 RIGHT = "right"
 SILENT = "wrong: the map is not good, and it passed"
 FALSE_ALARM = "wrong: the map is good, and it failed"
+UNSTATED = "wrong: the map is not good, and its warning understates that"
+
+HOLDS = 0.9  # least share of corners in their stated 95 % ellipses for a warning to state how bad a map is
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,8 @@ class Score:
         lanes: its figures of lane lines, None without any.
         is_good: whether 95 % of the corners lie within :data:`GOAL_M`, and hardly a marking is false.
         verdict: that the tool states, None without one.
-        verdict_is: what becomes of it: right, silent or a false alarm; None without one.
+        verdict_is: what becomes of it: right or why it is wrong; None without one.
+        is_strictly_right: whether it is a PASS of a good map or a FAIL of another; None without one.
     """
 
     site: str
@@ -55,6 +59,7 @@ class Score:
     is_good: bool
     verdict: str | None
     verdict_is: str | None
+    is_strictly_right: bool | None
 
     def as_json(self) -> dict[str, Any]:
         """Plain values, None for what cannot be told."""
@@ -72,18 +77,22 @@ def score_map(submission: Submission, reference: Reference, site: str) -> Score:
     errors_m = np.linalg.norm(corner_errors(mapped, counterparts), axis=1)
     figures = marking_metrics(hd_map, reference.truth, reference.expected)
     corner_95_m = float(np.quantile(errors_m, 0.95)) if len(errors_m) else float("nan")
-    is_good = corner_95_m <= GOAL_M and figures.false_markings <= FALSE_SHARE * figures.markings
+    has_few_false = figures.false_markings <= FALSE_SHARE * figures.markings
+    is_good = corner_95_m <= GOAL_M and has_few_false
+    stated = consistency_of(mapped, counterparts)
+    verdict = submission.verdict
     return Score(
         site=site,
         markings=figures,
         by_class=_by_class(hd_map, reference),
         corner_median_m=float(np.median(errors_m)) if len(errors_m) else float("nan"),
         corner_95_m=corner_95_m,
-        stated=consistency_of(mapped, counterparts),
+        stated=stated,
         lanes=lane_metrics(hd_map.lanes, reference.truth) if hd_map.lanes else None,
         is_good=is_good,
-        verdict=submission.verdict,
-        verdict_is=_judged(submission.verdict, is_good),
+        verdict=verdict,
+        verdict_is=_judged(verdict, is_good, has_few_false and stated.inside_95 >= HOLDS),
+        is_strictly_right=None if verdict is None else verdict == ("PASS" if is_good else "FAIL"),
     )
 
 
@@ -92,13 +101,19 @@ def _by_class(hd_map: HDMap, reference: Reference) -> dict[str, MarkingMetrics]:
     return {kind: marking_metrics(hd_map, reference.truth, reference.expected, kind) for kind in kinds}
 
 
-def _judged(verdict: str | None, is_good: bool) -> str | None:
-    """Judge a verdict: WARN states a missed goal, so it is right of a map that is not good, too."""
+def _judged(verdict: str | None, is_good: bool, states_errors: bool) -> str | None:
+    """Judge a verdict by whether a user of the map is misled.
+
+    A PASS says that the map is good, a FAIL that it must not be used. A WARN says that it may be used for
+    what its stated accuracy allows, which misleads nobody while that accuracy holds.
+    """
     if verdict is None:
         return None
     if is_good:
         return FALSE_ALARM if verdict == "FAIL" else RIGHT
-    return SILENT if verdict == "PASS" else RIGHT
+    if verdict == "PASS":
+        return SILENT
+    return UNSTATED if verdict == "WARN" and not states_errors else RIGHT
 
 
 def _without_nan(value: Any) -> Any:
@@ -130,7 +145,7 @@ def table_of(score: Score) -> list[str]:
         for row in rows
     ]
     lines.append(f"corners: half within {_cm(score.corner_median_m)}, 95 % within {_cm(score.corner_95_m)}")
-    lines.append(_stated_line(score.stated))
+    lines += _stated_lines(score.stated)
     if score.lanes is not None:
         lanes = score.lanes
         lines.append(
@@ -140,17 +155,21 @@ def table_of(score: Score) -> list[str]:
     if score.verdict is None:
         lines.append("verdict: none stated")
     else:
-        lines.append(f"verdict: {score.verdict}, {score.verdict_is}")
+        strictly = "right" if score.is_strictly_right else "wrong"
+        lines.append(f"verdict: {score.verdict}, {score.verdict_is}; strictly (no WARN) {strictly}")
     return lines
 
 
-def _stated_line(stated: Consistency) -> str:
+def _stated_lines(stated: Consistency) -> list[str]:
     if not stated.corners:
-        return "stated accuracy: none"
-    return (
+        return ["stated accuracy: none"]
+    parts = {"places": stated.place, "beside neighbours": stated.beside, "shapes": stated.shape}
+    said = ", ".join(f"{name} {nees:.2f}" for name, nees in parts.items() if np.isfinite(nees))
+    return [
         f"stated accuracy: NEES {stated.nees:.2f} (1 is right), {100 * stated.inside_95:.1f} % of "
-        f"{stated.corners} corners inside their 95 % ellipse"
-    )
+        f"{stated.corners} corners inside their 95 % ellipse",
+        f"NEES by part: {said}",
+    ]
 
 
 def _cm(length_m: float) -> str:

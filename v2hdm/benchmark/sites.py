@@ -1,4 +1,4 @@
-"""The sites of the benchmark: drives made from fixed seeds, what a mapper gets of them, and their truth.
+"""The sites of the benchmark: drives made from seeds and layouts, what a mapper gets, and the truth.
 
 A mapper gets a drive folder without truth. The truth is made anew from the same seed when a map is scored, so
 that it lies beside no drive. Both have hashes that are published here: equal hashes mean an equal benchmark.
@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from omegaconf import OmegaConf
 
+from v2hdm.benchmark.layouts import Layout, network_of
 from v2hdm.cli.compose import conf_dir
 from v2hdm.errors import ConfigError, shown
 from v2hdm.executor import Executor
@@ -27,12 +28,14 @@ from v2hdm.progress import Progress, Steps
 from v2hdm.records import BoolArray, Drive, Truth
 from v2hdm.report.metrics import driven_past
 from v2hdm.simulate.port.config import PortConfig, SurveyConfig
-from v2hdm.simulate.port.drive import true_drive
+from v2hdm.simulate.port.drive import folder_of_port, true_drive
 from v2hdm.simulate.render.renderer import RENDERER_VERSION
-from v2hdm.simulate.survey.drive import simulated_drives
+from v2hdm.simulate.survey.drive import simulated_drives, write_simulated
 from v2hdm.store.cache import StageCache
 from v2hdm.store.files import dump_yaml, file_digest, load_yaml
+from v2hdm.store.folders import note_use
 
+_DESIGNS = conf_dir() / "benchmark"  # layouts that ship
 _DIGITS_M = 4  # decimals of a coordinate of the truth, m, that its hash counts
 
 
@@ -46,6 +49,7 @@ class Site:
         config: all that its drive follows from.
         input_sha256: of the drive that a mapper gets, see :func:`input_hash`.
         truth_sha256: of its true map, see :func:`truth_hash`.
+        layout: files that its paint and its way are from, None where they follow from the seed.
     """
 
     name: str
@@ -53,19 +57,33 @@ class Site:
     config: PortConfig
     input_sha256: str
     truth_sha256: str
+    layout: Layout | None = None
 
 
 @dataclass(frozen=True)
 class Reference:
-    """What a map of a site is scored against: the truth, and which true markings (J,) the drive went past."""
+    """The reference of a site's maps: the truth, and which true markings (J,) the drive went past."""
 
     truth: Truth
     expected: BoolArray
 
 
-def site_of(name: str) -> Site:
-    """The site of that name; ConfigError names all where there is none."""
+def site_of(name: str, way: Path | None = None) -> Site:
+    """The site of that name, or that of an OpenDRIVE file with the ``way`` along it.
+
+    ConfigError names all sites where there is none, or says that a way is missing or too much.
+    """
     sites = all_sites()
+    design = Path(name)
+    if design.suffix.lower() == ".xodr":
+        if way is None:
+            raise ConfigError(f"{name}: is a layout without a way; give --way FILE, a trajectory along it")
+        config = PortConfig(name=design.stem, seed=1)
+        return Site(design.stem, f"detections along {way}", config, "", "", Layout(design, way))
+    if way is not None:
+        raise ConfigError(
+            f"--way: is for a layout of your own; give SITE as an OpenDRIVE file (.xodr), not {name}"
+        )
     if name not in sites:
         raise ConfigError(f"{shown(name)}: is no site of the benchmark; choose from {', '.join(sites)}")
     return sites[name]
@@ -82,7 +100,12 @@ def all_sites() -> Mapping[str, Site]:
             "port2", "pictures of worn paint on asphalt, by an uncalibrated one", _shipped("port2"), *_PORT2
         ),
         Site("streets", "500 m of streets and yards, detections in place of pictures", streets, *_STREETS),
-    )
+        Site(
+            "quay", "500 m of road by an OpenDRIVE design, detections in place of pictures",
+            PortConfig(name="quay", seed=1), *_QUAY,
+            layout=Layout(_DESIGNS / "quay.xodr", _DESIGNS / "quay.tum"),
+        ),
+    )  # fmt: skip
     return {site.name: site for site in sites}
 
 
@@ -100,11 +123,27 @@ def write_input(site: Site, folder: Path, cache: Path, executor: Executor, progr
     The drive is made in a ``cache``, where a later call finds it. Raises as
     :func:`v2hdm.simulate.port.drive.rendered_drive`.
     """
-    (made,) = simulated_drives(site.config, cache, executor, progress)
-    description = load_yaml(made / DRIVE_FILE, ConfigError)
+    drive_folder = _simulated(site, cache, executor, progress)
+    description = load_yaml(drive_folder / DRIVE_FILE, ConfigError)
     description.pop("truth", None)
-    shutil.copytree(made, folder, ignore=shutil.ignore_patterns(TRUTH_FOLDER, ".*"), dirs_exist_ok=True)
+    of_truth = shutil.ignore_patterns(TRUTH_FOLDER, ".*")
+    shutil.copytree(drive_folder, folder, ignore=of_truth, dirs_exist_ok=True)
     (folder / DRIVE_FILE).write_text(dump_yaml(description), encoding="utf-8")
+
+
+def _simulated(site: Site, cache: Path, executor: Executor, progress: Steps) -> Path:
+    """The drive of a site with its truth, in a cache."""
+    if site.layout is None:
+        (drive_folder,) = simulated_drives(site.config, cache, executor, progress)
+        return drive_folder
+    network = network_of(site.layout, site.config.route.speed_mps)
+    digest = hashlib.sha256("".join(site.layout.digests).encode()).hexdigest()
+    folder = folder_of_port(site.config, cache)
+    folder = folder.with_name(f"{folder.name}-{digest[:10]}")
+    if not (folder / DRIVE_FILE).is_file():
+        write_simulated(site.config, network, folder, progress)
+    note_use(folder)
+    return folder
 
 
 def input_hash(folder: Path) -> str:
@@ -121,21 +160,23 @@ def input_hash(folder: Path) -> str:
 def reference_of(site: Site, cache: Path | None, executor: Executor, progress: Progress) -> Reference:
     """The truth of a site, from its seed; a ``cache`` keeps it."""
     stages = StageCache(cache)
-    key = stages.key(RENDERER_VERSION, site.config)
-    make = partial(_make_reference, site.config, executor, progress)
+    layout = site.layout
+    key = stages.key(RENDERER_VERSION, site.config, *(() if layout is None else layout.digests))
+    make = partial(_make_reference, site, executor, progress)
     return stages.get_or_make("benchmark", key, Reference, make)
 
 
-def _make_reference(config: PortConfig, executor: Executor, progress: Progress) -> Reference:
-    drive, truth = _survey(config, executor, progress) if config.survey.length_km else true_drive(config)
+def _make_reference(site: Site, executor: Executor, progress: Progress) -> Reference:
+    is_rendered = site.layout is None and not site.config.survey.length_km
+    drive, truth = true_drive(site.config) if is_rendered else _survey(site, executor, progress)
     return Reference(truth, driven_past(drive, truth, tuple(drive.cameras)))
 
 
-def _survey(config: PortConfig, executor: Executor, progress: Progress) -> tuple[Drive, Truth]:
-    """The drive of a survey with its truth, made in a folder that does not stay."""
+def _survey(site: Site, executor: Executor, progress: Progress) -> tuple[Drive, Truth]:
+    """A drive of detections with its truth, made in a folder that does not stay."""
     with tempfile.TemporaryDirectory(prefix="v2hdm-benchmark-") as folder:
-        (made,) = simulated_drives(config, Path(folder), executor, partial(progress, "truth"))
-        drive = read_drive(made)
+        drive_folder = _simulated(site, Path(folder), executor, partial(progress, "truth"))
+        drive = read_drive(drive_folder)
         return drive, read_truth(drive)
 
 
@@ -161,4 +202,8 @@ _PORT2 = (
 _STREETS = (
     "3d79b1851d91da66429cd708dc3f4608654d6c61345a5919884f19d31a6277c3",
     "aa098bd15cdb950b6920fbd067c4e29d5f795aec4a7b2a536db71cfe512869f3",
+)
+_QUAY = (
+    "118ad5809091c9a59c61542d4e6be2fb371856e5a0a32edaa820de3e7cfc2e4e",
+    "12bf4f0efe2012dec5a966e327f5d20d057821887a8cbf5291124ae55946370a",
 )

@@ -74,6 +74,14 @@ def add_result(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--drive", type=Path, metavar="DIR", help=where)
 
 
+def add_site(parser: argparse.ArgumentParser) -> None:
+    """Add a site of the benchmark, or a layout of a user's and the way along it."""
+    sites = "port1, port2, streets or quay, or an OpenDRIVE file (.xodr) with --way"
+    parser.add_argument("site", metavar="SITE", help=sites)
+    way = "trajectory (TUM) along an OpenDRIVE file, in its coordinates"
+    parser.add_argument("--way", type=Path, metavar="FILE", help=way)
+
+
 @contextmanager
 def result_of(folder: Path, maker: str, settings: Mapping[str, object]) -> Iterator[Path]:
     """The unfinished folder of a command's results, with the settings that they were made of."""

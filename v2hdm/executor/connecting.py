@@ -21,7 +21,6 @@ from distributed.system import MEMORY_LIMIT
 from v2hdm.errors import ConfigError, one_line
 from v2hdm.executor import tasks
 from v2hdm.executor.cluster import Cluster
-from v2hdm.executor.opening import BATCH_SYSTEMS
 from v2hdm.executor.processes import undisturbed_starts
 from v2hdm.store.cache import code_key, library_versions
 
@@ -135,15 +134,15 @@ def _close(client: Client) -> None:
         client.close(timeout=_CLOSE_S)
 
 
-def batch_cluster(system: str, workers: int) -> Cluster:
-    """Workers that are jobs of a batch system, as dask-jobqueue's own settings describe them."""
+def batch_cluster(system: str, class_name: str, workers: int) -> Cluster:
+    """Workers that are jobs of a batch system, as dask-jobqueue's own settings of a class describe them."""
     quiet()
     try:
         module = importlib.import_module("dask_jobqueue")
     except ModuleNotFoundError:
         raise ConfigError(f"cluster={system} needs dask-jobqueue: pip install dask-jobqueue") from None
     try:
-        jobs = getattr(module, BATCH_SYSTEMS[system])(processes=1)
+        jobs = getattr(module, class_name)(processes=1)
         jobs.scale(jobs=workers)
     except (OSError, ValueError, TypeError, RuntimeError) as failure:
         raise ConfigError(

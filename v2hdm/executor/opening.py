@@ -85,7 +85,7 @@ def _connected(cluster: str, workers: int, readable: Sequence[str], writable: Se
     from v2hdm.executor.cluster import ClusterExecutor
 
     if cluster in BATCH_SYSTEMS:
-        connected = connecting.batch_cluster(cluster, workers)
+        connected = connecting.batch_cluster(cluster, BATCH_SYSTEMS[cluster], workers)
     else:
         connected = connecting.distant_cluster(cluster)
     try:

@@ -85,15 +85,15 @@ class _Unknowns:
     roof: float
 
 
-class Near(NamedTuple):
-    """What a solution of other matches says of the errors: fewer steps lead from there."""
+class Errors(NamedTuple):
+    """The errors that a solution of other matches states: fewer steps lead from there."""
 
     pose_errors: FloatArray  # (I, 6)
     bends: FloatArray  # (12,) px
     roof: float
 
     @classmethod
-    def of(cls, solution: Adjusted, images: IntArray) -> Near:
+    def of(cls, solution: Adjusted, images: IntArray) -> Errors:
         """The errors of a solution, of some of its ``images`` (I,)."""
         return cls(solution.pose_errors[images], solution.bends, solution.roof)
 
@@ -123,12 +123,12 @@ def adjust(
     free: str | None = None,
     tolerance: float = 1.0,
     without: Adjusted | None = None,
-    near: Near | None = None,
+    initial: Errors | None = None,
 ) -> Adjusted:
     """Estimate the mounting, with the parameter ``free`` if given, with Cauchy weights.
 
     ``free`` is ``clock_s``, ``focal_scale``, ``distortion_k1`` or ``grade``; ``tolerance`` multiplies the
-    residual at which weights fall. It starts from ``start`` and what is ``near``, or from the solution
+    residual at which weights fall. It starts from ``start`` and the ``initial`` errors, or from the solution
     ``without`` the parameter for the same images.
     """
     # Steps move a ground point by centimetres: its distance from the path is computed once.
@@ -137,8 +137,8 @@ def adjust(
     problem = _Problem(observations, prior, free, tolerance, lower_m)
     damping = 0.0
     begin = _Unknowns(start, 0.0, np.zeros((len(prior.poses), 6)), np.zeros(2 * _BENDS), 0.0)
-    if near is not None:
-        begin = replace(begin, errors=near.pose_errors, bends=near.bends, roof=near.roof)
+    if initial is not None:
+        begin = replace(begin, errors=initial.pose_errors, bends=initial.bends, roof=initial.roof)
     if without is not None:
         begin = _Unknowns(without.mount, 0.0, without.pose_errors, without.bends, without.roof)
         damping = _DAMPING

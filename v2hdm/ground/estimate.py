@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from v2hdm.executor import HERE, Executor
-from v2hdm.ground.adjust import CENTRE, Adjusted, Near, adjust
+from v2hdm.ground.adjust import CENTRE, Adjusted, Errors, adjust
 from v2hdm.ground.model import Mount, guessed_mount
 from v2hdm.ground.motion import ARM_M, Motion, changing_pairs, motion_of, spread_pairs
 from v2hdm.ground.patches import STRIP_M, Matcher, Round
@@ -202,8 +202,8 @@ def _scatter(observations: Observations, stated: Stated, solved: Adjusted) -> fl
     images = np.unique(np.concatenate([observations.first, observations.second]))  # of ``solved``
     for part in stretches:
         observed = stated.prior_of(observations.only(~np.isin(observations.pair, part)))
-        near = Near.of(solved, np.searchsorted(images, observed.rows))
-        mount = adjust(observed.observations, observed.prior, solved.mount, free, near=near).mount
+        initial = Errors.of(solved, np.searchsorted(images, observed.rows))
+        mount = adjust(observed.observations, observed.prior, solved.mount, free, initial=initial).mount
         turn = mount.vehicle_from_cam_rotation @ solved.mount.vehicle_from_cam_rotation.T
         small = [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
         answers.append([*(np.array(small) / 2), *(mount.centre_vehicle - solved.mount.centre_vehicle)])

@@ -2,35 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
 from v2hdm.localization.belief import Plane
+from v2hdm.localization.joint import Located, Scene, offsets
 from v2hdm.localization.motion import Piece, moved
-from v2hdm.localization.paint import Paint
 from v2hdm.localization.seeing import Look, Sighted, ground_points
-from v2hdm.records import BoolArray, Calibration, FloatArray, IntArray
+from v2hdm.records import BoolArray, Calibration, FloatArray
 
 _WAY_M = 12.0  # way, m, over which agreement is counted
+_JUDGED_M = 22.0  # distance, m, of detections that are counted for the map or against it
 _SAME_M = 0.6  # distance, m, of sightings that are one object
 _FROM = 6  # objects from which a share says something
 _LEAST_SHARE = 0.67
 """Least share of what is seen that the map explains: of a right one it is 0.86 and more, with half of the
 markings moved about 0.5, of another site's 0.04."""
-# Log likelihood ratios of an object by a map with half of the markings moved and by a right one: of an object
-# that lies beside a marking of its class that is not seen itself (right maps: 0.02, twice what drives with
-# false detections show), of another that is not explained, and of one that is.
-_DISPLACED = np.log(0.3 / 0.02)
-_NOT_EXPLAINED = np.log(0.2 / 0.13)
-_EXPLAINED = np.log(0.5 / 0.85)
-_DIFFERS_LIMIT = 7.0  # sum of these, since it began to rise, from which a map differs (Page 1954)
-_DISPLACED_M = (
-    0.12,
-    0.9,
-)  # distance, m, from where the map has such a marking: repainted, but for the same use
+_DIFFERS_LIMIT = 7.0  # log likelihood ratio, since it began to rise, from which a map differs (Page 1954)
+# Shares of what is seen that lies on its marking, was repainted beside it, or is on no marking (false
+# detections, new paint): of a right map, as drives with false detections show, and of one with half of its
+# markings moved.
+_RIGHT = np.array([0.85, 0.02, 0.13])
+_MOVED = np.array([0.5, 0.3, 0.2])
+_MOVED_M = 0.22  # standard deviation, m, of each coordinate of a repainted marking: for the same use
+_ELSEWHERE_M = 2.8  # the same of what is on no marking: one piece of unmapped paint in 50 m2
+_BESIDE_M = 0.9  # distance, m, within which a marking may have been repainted
+_BLUNDER_M = 0.03  # standard deviation, m, of a detection's place beyond its covariance: shadow and wear
 _LOST_SHARE = 0.34  # share below which the map explains next to nothing
 
 # Log likelihood ratio at which the odometry counts as off by a factor: one in e^9 of right ones comes so far.
@@ -55,39 +54,70 @@ class _Object:
     place_map: FloatArray
     kind: str
     way_m: float
-    explained: int = 0
-    not_explained: int = 0
-    displaced: int = 0  # views, of those not explained, that lie beside an unseen marking of the class
+    gains: list[float] = field(default_factory=list)  # of each view
 
     @property
     def gain(self) -> float:
-        """The log likelihood ratio of a map that differs."""
-        if self.explained >= self.not_explained:
-            return float(_EXPLAINED)
-        return float(_DISPLACED if 2 * self.displaced > self.not_explained else _NOT_EXPLAINED)
+        """The log likelihood ratio of a map that differs: the median of its views, whose errors are alike."""
+        return float(np.median(self.gains))
 
 
 class Detected(NamedTuple):
-    """The whole detections (D) of an image near the vehicle, on the ground of the map."""
+    """The detections (D) of an image on the ground of the map."""
 
     places_map: FloatArray  # (D, 2) their centres, m
     kinds: tuple[str, ...]
-    is_explained: BoolArray  # (D,) by the map
-    is_displaced: BoolArray  # (D,) beside a marking of their class that is not seen itself
+    is_judged: BoolArray  # (D,) whole and near the vehicle
+    gains: (
+        FloatArray  # (D,) log likelihood ratios of a map with half of its markings moved and of a right one
+    )
 
 
-def displaced(
-    places_map: FloatArray, kinds: Sequence[str], explained: BoolArray, paint: Paint, matched: IntArray
-) -> BoolArray:
-    """Which detections (D,) at places (D, 2) that the map does not explain lie beside an unseen marking."""
-    out = np.zeros(len(kinds), dtype=bool)
-    for row in np.flatnonzero(~explained).tolist():
-        numbers = paint.near(places_map[row], _DISPLACED_M[1])
-        numbers = numbers[paint.looks_like(numbers, kinds[row])]
-        numbers = numbers[~np.isin(numbers, matched)]
-        apart_m = np.linalg.norm(paint.centres_map[numbers] - places_map[row], axis=1)
-        out[row] = bool((apart_m > _DISPLACED_M[0]).any() and not (apart_m <= _DISPLACED_M[0]).any())
-    return out
+def detected(scene: Scene, located: Located) -> Detected:
+    """The detections (D) of an image, as those near the vehicle count for the map or against it.
+
+    Each is on its marking, beside it, or on none. How far it lies from a marking is measured in the image,
+    with the covariances of detection, shape and belief.
+    """
+    pose = located.belief.map_from_vehicle(scene.plane)
+    places = ground_points(scene.quads.corners_px, pose, scene.plane, scene.calibration)
+    is_whole: BoolArray = np.asarray(np.isfinite(places).all(axis=(1, 2)) & scene.quads.valid.all(axis=1))
+    centres = np.where(is_whole[:, None], places.mean(axis=1), np.inf)
+    is_judged = np.asarray(np.linalg.norm(centres - pose[:2, 3], axis=1) < _JUDGED_M)
+    rows, numbers = [], []
+    for row in np.flatnonzero(is_judged).tolist():
+        beside = _beside(scene, located, centres[row], row)
+        rows += len(beside) * [row]
+        numbers += beside
+    gains = np.full(len(centres), np.log(_MOVED[2] / _RIGHT[2]))
+    if rows:
+        offset = offsets(located.belief, scene, np.array(rows), np.array(numbers))
+        by_pair = np.array(list(map(offset_gain, *offset)))
+        is_ahead = np.isfinite(by_pair)  # both in front of the camera
+        order = np.argsort(-by_pair[is_ahead])
+        gains[np.array(rows)[is_ahead][order]] = by_pair[is_ahead][order]  # the last, that is the least
+    return Detected(centres, scene.quads.kinds, is_judged, gains)
+
+
+def _beside(scene: Scene, located: Located, place_map: FloatArray, row: int) -> list[int]:
+    """The marking that a detection shows, or else those beside it that no other shows."""
+    shown = located.pairs.marking[located.pairs.detection == row]
+    if len(shown):
+        return [int(shown[0])]
+    numbers = scene.paint.near(place_map, _BESIDE_M)
+    numbers = numbers[scene.paint.looks_like(numbers, scene.quads.kinds[row])]
+    numbers = numbers[~np.isin(numbers, located.pairs.marking)]
+    return [int(number) for number in numbers]
+
+
+def offset_gain(off_m: FloatArray, covariance_m2: FloatArray) -> float:
+    """The log likelihood ratio of a repainted map by an offset (2,) of covariance (2, 2) from a marking."""
+    densities = []
+    for spread_m in (_BLUNDER_M, _MOVED_M, _ELSEWHERE_M):
+        total_m2 = covariance_m2 + spread_m**2 * np.eye(2)
+        squared = off_m @ np.linalg.solve(total_m2, off_m)
+        densities.append(np.exp(-0.5 * squared) / np.sqrt(np.linalg.det(total_m2)))
+    return float(np.log(_MOVED @ densities) - np.log(_RIGHT @ densities))
 
 
 @dataclass
@@ -96,20 +126,16 @@ class Agreement:
 
     objects: list[_Object] = field(default_factory=list)
 
-    def note(self, detected: Detected, way_m: float) -> None:
+    def note(self, judged: Detected, way_m: float) -> None:
         """Take the detections of an image."""
         self.objects = [spot for spot in self.objects if way_m - spot.way_m < _WAY_M]
-        rows = zip(*(part.tolist() for part in (detected.is_explained, detected.is_displaced)), strict=True)
-        for place, kind, (is_explained, is_displaced) in zip(
-            detected.places_map, detected.kinds, rows, strict=True
-        ):
-            spot = self._of(place, kind)
+        for row in np.flatnonzero(judged.is_judged).tolist():
+            place = judged.places_map[row]
+            spot = self._of(place, judged.kinds[row])
             if spot is None:
-                spot = _Object(place, kind, way_m)
+                spot = _Object(place, judged.kinds[row], way_m)
                 self.objects.append(spot)
-            spot.explained += is_explained
-            spot.not_explained += not is_explained
-            spot.displaced += is_displaced
+            spot.gains.append(float(judged.gains[row]))
 
     def _of(self, place: FloatArray, kind: str) -> _Object | None:
         for spot in self.objects:
@@ -119,7 +145,7 @@ class Agreement:
 
     @property
     def _several(self) -> list[_Object]:
-        return [spot for spot in self.objects if spot.explained + spot.not_explained > 1]
+        return [spot for spot in self.objects if len(spot.gains) > 1]
 
     @property
     def quads(self) -> int:
@@ -132,8 +158,7 @@ class Agreement:
         several = self._several
         if len(several) < _FROM:
             return 1.0
-        explained = [spot.explained >= spot.not_explained for spot in several]
-        return float(np.mean(explained))
+        return float(np.mean([spot.gain <= 0 for spot in several]))
 
     @property
     def differs(self) -> bool:

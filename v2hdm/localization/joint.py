@@ -156,6 +156,28 @@ def candidates(belief: Belief, scene: Scene) -> tuple[Pairs, FloatArray]:
     return pairs.subset(fits), loss[fits]
 
 
+class Offsets(NamedTuple):
+    """How far detections (P) lie from markings on the ground."""
+
+    off_m: FloatArray  # (P, 2) in the map
+    covariance_m2: FloatArray  # (P, 2, 2)
+
+
+def offsets(belief: Belief, scene: Scene, detection: IntArray, marking: IntArray) -> Offsets:
+    """How far detections (P) lie from markings (P), by least squares over their corners in the image."""
+    expected = scene.expect(belief, marking)
+    spread = scene.spread(belief, expected, marking)
+    state_px2 = (spread**2).sum(axis=2)
+    order = _order(scene.quads, detection, expected.px.reshape(-1, 8), state_px2.mean(axis=1) + 1.0)
+    pairs = Pairs(detection, marking, order)
+    total = spread @ spread.swapaxes(1, 2) + scene.noise(pairs, expected, belief)
+    by_place = expected.by_place.reshape(-1, 8, 2)
+    weighted = np.linalg.solve(total, by_place)
+    covariance_m2 = np.linalg.inv(by_place.swapaxes(1, 2) @ weighted)
+    pull = weighted.swapaxes(1, 2) @ scene.residual(pairs, expected)[..., None]
+    return Offsets((covariance_m2 @ pull)[..., 0], covariance_m2)
+
+
 def _order(quads: Sighted, detection: IntArray, px: FloatArray, state_px2: FloatArray) -> IntArray:
     """The corners' orders (P, 8) in which detections lie nearest to markings at ``px`` (P, 8)."""
     turned = _SHIFT_ROWS[None]  # (1, 4, 8)

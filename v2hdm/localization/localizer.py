@@ -12,7 +12,7 @@ import numpy as np
 
 from v2hdm.doors import checked
 from v2hdm.errors import MapFileError
-from v2hdm.localization.agreement import Agreement, Detected, Pace, displaced
+from v2hdm.localization.agreement import Agreement, Pace, detected
 from v2hdm.localization.belief import (
     CAMERA,
     HEADING,
@@ -27,10 +27,10 @@ from v2hdm.localization.belief import (
 from v2hdm.localization.joint import Located, Scene, locate, paired
 from v2hdm.localization.motion import Motion, MotionLog, MotionNoise, moved
 from v2hdm.localization.paint import Paint
-from v2hdm.localization.places import Patch, Prior, search, vehicle_at
+from v2hdm.localization.places import Patch, Place, Prior, search, vehicle_at
 from v2hdm.localization.rig import Estimate, Rig, Turned
-from v2hdm.localization.seeing import Look, Sighted, ground_points, sighted
-from v2hdm.records import BoolArray, Calibration, FloatArray, HDMap
+from v2hdm.localization.seeing import Look, Sighted, sighted
+from v2hdm.records import Calibration, FloatArray, HDMap
 
 _LAG_S = 1.0  # images may be so late
 _FUTURE_S = 2.0  # a stamp farther ahead of the odometry, s, is of another clock
@@ -44,6 +44,7 @@ _SURER_BY = 10.0
 _LEAST_MATCHED = 4  # markings of the place
 _LEAST_SHARE = 0.6  # of what is seen
 _SEARCH_S = 0.3  # time between searches
+_TRIED_LOOKS = 4  # images, of as many searches, by which a place is tried
 _LOST_S, _LOST_WAY_M = 0.9, 8.0  # after so long, or so far, without a place nothing fits
 _STILL_M = 0.5  # a vehicle that has moved less stands: it may not have seen enough
 _START_SIGMA = np.array([0.25, 0.25, np.deg2rad(1.5)])  # of a place that was found, m, m and rad
@@ -58,7 +59,6 @@ _FACTOR = 2.0  # times at first
 _FACTOR_COUNT = 60.0  # coordinates that say so
 _FORGET = 600.0  # coordinates
 _FACTORS = (0.3, 12.0)  # least and largest, times
-_JUDGED_M = 14.0  # distance, m, of detections that are counted for the map or against it
 _TURNED_RAD = np.deg2rad(1.0)  # standard deviation of what a camera that was pushed has turned
 _LOOSENED_RAD = np.deg2rad(0.2)  # of what a mounting has turned that is found to have turned slowly
 _PINNED_RAD = np.deg2rad(0.01)  # of what the others have meanwhile
@@ -145,6 +145,7 @@ class _Search:
     since_m: float = 0.0
     last_s: float = -np.inf
     patch: Patch = field(default_factory=Patch)
+    looks: deque[Look] = field(default_factory=lambda: deque(maxlen=_TRIED_LOOKS))
 
 
 class Localizer:
@@ -345,16 +346,13 @@ class Localizer:
 
     def _located(self, belief: Belief, look: Look, quads: Sighted, is_new: bool) -> Belief:
         """The belief after a look; another mounting is tried where the calibration's explains little."""
-        camera = self._numbers[look.camera]
         noise = self._noise[look.camera]
-        plane = self.paint.ground(belief.mean[:2])
-        scene = Scene(quads, self.paint, plane, camera, self.calibrations[look.camera], noise.factor)
+        scene = self._scene(belief, look, quads)
         located = locate(belief, scene)
         if not is_new:
             return located.belief
-        pose = located.belief.map_from_vehicle(plane)
-        places = ground_points(quads.corners_px, pose, plane, self.calibrations[look.camera])
-        is_judged = self._judged(places, pose, quads)
+        judged = detected(scene, located)
+        is_judged = judged.is_judged
         explained = paired(located, len(quads.kinds))
         gained = 0
         if self._is_sure and is_judged.sum() >= 2 and explained[is_judged].mean() < _FEW:
@@ -363,28 +361,18 @@ class Localizer:
             self._rig_since_s = self._rig.pushed.note(look, gained)
         elif self._is_sure:
             self._rig.pushed.note(look, 0)
-        near = quads.subset(np.flatnonzero(is_judged))
-        self._agreement.note(
-            self._detected(places[is_judged], near, explained[is_judged], located), self._way_m
-        )
+        self._agreement.note(judged, self._way_m)
         if located.misfit_freedom > 0:
             noise.note(located, noise.factor)
         self._matched = len(located.pairs.detection)
         return self._kept(located)
 
-    def _detected(
-        self, places: FloatArray, quads: Sighted, explained: BoolArray, located: Located
-    ) -> Detected:
-        """Detections (D) with corners at ``places`` (D, 4, 2) as they count for the map or against it."""
-        centres = places.mean(axis=1)
-        beside = displaced(centres, quads.kinds, explained, self.paint, located.pairs.marking)
-        return Detected(centres, quads.kinds, explained, beside)
-
-    def _judged(self, places: FloatArray, pose: FloatArray, quads: Sighted) -> BoolArray:
-        """Which detections (D,) lie whole, near, and where the map has been mapped."""
-        finite: BoolArray = np.asarray(np.isfinite(places).all(axis=(1, 2)) & quads.valid.all(axis=1))
-        middle = np.where(finite[:, None], places.mean(axis=1), np.inf)
-        return np.asarray(finite & (np.linalg.norm(middle - pose[:2, 3], axis=1) < _JUDGED_M))
+    def _scene(self, belief: Belief, look: Look, quads: Sighted) -> Scene:
+        """A look before the map, from about where the vehicle is believed to be."""
+        plane = self.paint.ground(belief.mean[:2])
+        calibration = self.calibrations[look.camera]
+        factor = self._noise[look.camera].factor
+        return Scene(quads, self.paint, plane, self._numbers[look.camera], calibration, factor)
 
     def _kept(self, located: Located) -> Belief:
         """The belief with the markings that were seen last."""
@@ -406,6 +394,7 @@ class Localizer:
         if quest.since_s is None or 0 <= look.stamp_s - quest.last_s < _SEARCH_S:
             return
         quest.last_s = look.stamp_s
+        quest.looks.append(look)
         local = self._local_at(look.stamp_s)
         places = search(quest.patch, self.paint, self.calibrations, quest.local, quest.prior)
         if places:
@@ -419,6 +408,12 @@ class Localizer:
             ):
                 self._begin(look.stamp_s, vehicle_at(best.map_from_local, local))
                 return
+            if all(self._differs_at(place) for place in places if best.score - place.score < _SURER_BY):
+                self._is_lost = True
+                self._reasons["lost"] = (
+                    "wherever the vehicle may be, many markings seen lie beside those of the map: was the "
+                    "site repainted?"
+                )
         waited_s = look.stamp_s - quest.since_s
         waited_m = self._way_m - quest.since_m
         is_long = (waited_s > _LOST_S and waited_m > _STILL_M) or waited_m > _LOST_WAY_M
@@ -430,6 +425,21 @@ class Localizer:
                     f"no place there explains more than {100 * share:.0f} % of the markings seen: is it the "
                     "map of this site, as painted today, in these coordinates, and are these its cameras?"
                 )
+
+    def _differs_at(self, place: Place) -> bool:
+        """Whether the last images, seen from a place, show markings beside those of the map."""
+        looks = self._search.looks
+        pose = vehicle_at(place.map_from_local, self._local_at(looks[0].stamp_s))
+        belief = start(looks[0].stamp_s, pose, _START_SIGMA, self._mountings, self.noise)
+        agreement = Agreement()
+        for look in looks:
+            quads = sighted(look, self.calibrations[look.camera])
+            belief = self._moved_to(belief, look.stamp_s)
+            scene = self._scene(belief, look, quads)
+            located = locate(belief, scene)
+            belief = located.belief
+            agreement.note(detected(scene, located), self._way_m)
+        return agreement.differs
 
     def _begin(self, stamp_s: float, pose: FloatArray) -> None:
         self._belief = start(stamp_s, pose, _START_SIGMA, self._mountings, self.noise)

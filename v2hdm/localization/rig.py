@@ -86,7 +86,7 @@ class Change(NamedTuple):
     """How a mounting has changed since a time."""
 
     before: Estimate
-    found: Estimate  # by which it was found
+    after: Estimate  # by which the change was found
     since_s: float
     until_s: float  # when it was as far as it is now
     angle: str  # that changed most surely
@@ -98,7 +98,7 @@ class Change(NamedTuple):
 
     def is_undone(self, now: Estimate) -> bool:
         """Whether the mounting is nearly back where it was."""
-        changed = self.found.turn_rad - self.before.turn_rad
+        changed = self.after.turn_rad - self.before.turn_rad
         left = now.turn_rad - self.before.turn_rad
         return bool(left @ changed < _BACK_SHARE * (changed @ changed))
 

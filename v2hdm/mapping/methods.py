@@ -64,7 +64,7 @@ def adjusted_poses(outcome: Outcome) -> AdjustedPoses:
         before=sightings.map_from_vehicle,
         map_from_vehicle=bundle.rig.map_from_vehicle,
         sigma=sigma,
-        seen=is_used,
+        has_marking=is_used,
         frame={image.path: int(frame) for image, frame in zip(drive.images, frames, strict=True)},
         session=sightings.session,
     )

@@ -83,7 +83,7 @@ class AdjustedPoses:
     before: FloatArray  # (F, 4, 4) ``map_from_vehicle`` before the solve
     map_from_vehicle: FloatArray  # (F, 4, 4) adjusted; unchanged without markings
     sigma: FloatArray  # (F, 6) in vehicle axes, m and rad; as stated without markings
-    seen: BoolArray  # (F,) whether a marking was seen
+    has_marking: BoolArray  # (F,) whether a marking was seen
     frame: Mapping[Path, int]  # frame of each image, by its path
     session: IntArray  # (F,) session
 

@@ -81,9 +81,9 @@ class Consensus:
         x_px, y_px = (
             torch.from_numpy(np.ascontiguousarray(part)).float().reshape(1, 1, -1) for part in (x, y)
         )
-        found: Tensor = remap(shown.shows[None, None], x_px, y_px, align_corners=True)
+        share: Tensor = remap(shown.shows[None, None], x_px, y_px, align_corners=True)
         # Nothing beyond the border of a block that shows the ground.
-        return (2 * found.reshape(points_map.shape[:-1]) - 1).clamp(min=0)
+        return (2 * share.reshape(points_map.shape[:-1]) - 1).clamp(min=0)
 
 
 def find_consensus(
@@ -117,8 +117,8 @@ def find_consensus(
         for (tile_column, tile_row), patches in sheet.patches.items():
             top = row // BLOCK_PX + tile_row * _BLOCKS
             left = column // BLOCK_PX + tile_column * _BLOCKS
-            found, shows = _compare(patches)
-            kinds[top : top + _BLOCKS, left : left + _BLOCKS] = found
+            block_kinds, shows = _compare(patches)
+            kinds[top : top + _BLOCKS, left : left + _BLOCKS] = block_kinds
             for patch, flags in zip(patches, shows, strict=True):
                 agreed.setdefault(patch.index, []).append((top, left, flags))
     is_ground = ground_of(kinds)
@@ -227,7 +227,7 @@ class _Sheet:
 
 
 def _compare(patches: Sequence[_Patch]) -> tuple[np.ndarray, np.ndarray]:
-    """What the blocks of a tile are, and which of them each patch shows (N, blocks, blocks)."""
+    """The kinds of the blocks of a tile, and which of them each patch shows (N, blocks, blocks)."""
     grey = np.stack([patch.grey for patch in patches]).astype(np.float32)
     pattern = grey.reshape(-1, _BLOCKS, BLOCK_PX, _BLOCKS, BLOCK_PX).swapaxes(2, 3)
     pattern = pattern.reshape(len(patches), _BLOCKS, _BLOCKS, -1)

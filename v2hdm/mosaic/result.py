@@ -96,7 +96,7 @@ MULTIPLE_PX = 256  # divides sides of a canvas, so that pictures reduced by up t
 _FINEST_M = 1e-3  # least side of a pixel: no camera on a vehicle shows finer ground
 _PICTURE_QUALITY = 80  # quality of the WebP, of 100
 _JPEG_QUALITY = 90  # quality of the JPEG in the GeoTIFF, of 100
-_SEEN_ALPHA = 128  # least alpha of a pixel that the GeoTIFF's mask shows as seen: it knows no half
+SEEN_ALPHA = 128  # least alpha of a pixel that the GeoTIFF's mask shows as seen: it knows no half
 _BLOCK_PX = 512  # side of a block of the GeoTIFF
 _AT_ONCE_BYTES = 1 << 24  # size of the pieces in which the GeoTIFF is written to the disk
 
@@ -124,7 +124,7 @@ def geotiff(path: Path, canvas: Canvas, origin: GeodeticOrigin | None) -> Iterat
                 rows, columns = sheet.rgba.shape[:2]
                 window = rasterio.windows.Window(sheet.column, sheet.row, columns, rows)
                 dataset.write(np.moveaxis(sheet.rgba[..., :3], 2, 0), window=window)
-                dataset.write_mask(sheet.rgba[..., 3] >= _SEEN_ALPHA, window=window)
+                dataset.write_mask(sheet.rgba[..., 3] >= SEEN_ALPHA, window=window)
 
             yield put
         with rasterio.MemoryFile(ext=".tif") as ordered:

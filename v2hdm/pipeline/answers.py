@@ -9,18 +9,12 @@ from dataclasses import asdict, replace
 from v2hdm.io.maps.corrections import Correction, Heard
 from v2hdm.io.maps.questions import answers_among
 from v2hdm.pipeline.result import Result
-from v2hdm.records import Drive, Trajectory
 from v2hdm.topology.build import answered_graph
 from v2hdm.verdict import Finding, Status, Verdict
 from v2hdm.verdict.verdict import passed
 
 _log = logging.getLogger(__name__)
 _LISTED = 5  # answers that a finding names
-
-
-def driven_paths(drive: Drive) -> list[Trajectory]:
-    """The paths of a drive's sessions, which say where lanes lead."""
-    return [session.trajectory for session in drive.sessions if session.trajectory is not None]
 
 
 def with_answers(result: Result, corrections: Sequence[Correction]) -> Result:
@@ -31,7 +25,7 @@ def with_answers(result: Result, corrections: Sequence[Correction]) -> Result:
     answers = answers_among(corrections)
     if not answers or not result.methods:
         return result
-    answered = answered_graph(result.map, driven_paths(result.drive), answers)
+    answered = answered_graph(result.map, result.drive.paths, answers)
     places = [correction.place for correction in corrections if correction.is_answer]
     reason_of = {id(refusal.answer): refusal.reason for refusal in answered.refused}
     told = [

@@ -100,7 +100,7 @@ def changes_json(changes: Changes) -> dict[str, Any]:
 
 def change_json(change: Change) -> dict[str, Any]:
     """A change as plain values."""
-    names = {"kind": "class", "before": "before_map", "after": "after_map"}
+    names = {"kind": "class", "before": "before_map", "after": "after_map", "views_showing": "found"}
     plain = {names.get(name, name): value for name, value in vars(change).items()} | {
         "fate": change.fate.value
     }

@@ -28,7 +28,6 @@ from v2hdm.io.maps.geopackage import write_qgis
 from v2hdm.io.trajectory import read_tum, write_tum
 from v2hdm.mapping.results import AdjustedPoses, MethodResult
 from v2hdm.mosaic.result import write_mosaic
-from v2hdm.pipeline.answers import driven_paths
 from v2hdm.pipeline.base import change_json
 from v2hdm.pipeline.context import Context
 from v2hdm.records import BEST, Changes, Drive, FloatArray, HDMap, Image, ImageDetections, Trajectory
@@ -123,7 +122,7 @@ def _write_map(folder: Path, result: Result, outputs: Outputs) -> None:
     ]  # longitude and latitude, whatever the others have
     write_map(result.map, folder, "map", geojson, verdict)
     others = [name for name in with_data(outputs.formats) if name not in ("geojson", *_OF_OTHER_FILES)]
-    driven = driven_paths(drive)
+    driven = drive.paths
     write_map(
         result.map,
         folder,
@@ -190,7 +189,7 @@ def write_trajectories(poses: AdjustedPoses, drive: Drive, folder: Path) -> None
         rows = [
             f"{stamp:.9f},{int(is_seen)}," + ",".join(f"{value:.6g}" for value in sigma)
             for stamp, is_seen, sigma in zip(
-                stamp_s, poses.seen[is_in_session], poses.sigma[is_in_session], strict=True
+                stamp_s, poses.has_marking[is_in_session], poses.sigma[is_in_session], strict=True
             )
         ]
         replace_text(folder / sigma_file, "\n".join([_HEADER, *rows]) + "\n")

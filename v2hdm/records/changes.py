@@ -33,7 +33,7 @@ class Change:
     shift_sigma_m: FloatArray | None
     probability: float  # of its fate
     views: int  # images with its place in near view (of a new one, the earlier drive's)
-    found: int  # of these, that showed it
+    views_showing: int  # of these, that showed it
     sightings: int  # of the map that has it
 
 

@@ -1,4 +1,4 @@
-"""What was detected in an image."""
+"""Markings and lanes that were detected in an image."""
 
 from __future__ import annotations
 

@@ -108,6 +108,11 @@ class Drive:
         return (alone,)
 
     @property
+    def paths(self) -> list[Trajectory]:
+        """The paths of its sessions, which say where lanes lead."""
+        return [session.trajectory for session in self.sessions if session.trajectory is not None]
+
+    @property
     def noises(self) -> tuple[PoseNoise, ...]:
         """The noise of each session's recorded poses."""
         return tuple(session.pose_noise for session in self.sessions)

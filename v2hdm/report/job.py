@@ -1,4 +1,4 @@
-"""What people state of a survey for its document: ``job.json`` of a result."""
+"""Statements of people on a survey, for its document: ``job.json`` of a result."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ AS_STORED = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR  # OpenCV's flags for the 
 _GREY_FLAGS = (cv2.IMREAD_GRAYSCALE, cv2.IMREAD_REDUCED_GRAYSCALE_4)
 _PRINTERS_SPACES = ("CMYK", "YCCK")  # which TurboJPEG turns into no other
 _ODD = re.compile("JFIF revision|Adobe color|progression sequence|subsampling")
-"""What a strict decoder refuses in a JPEG that may be whole: others make these, too."""
+"""Complaints of a strict decoder about a JPEG that may be whole: others make these files, too."""
 VIDEO_OPTIONS = {
     "protocol_whitelist": "file",
     "format_whitelist": "mov,matroska,avi,mpegts,mpeg,mpegvideo,m4v,h264,hevc,ivf,obu,asf,flv,ogg,mjpeg,mxf",

@@ -99,7 +99,8 @@ def _follows(first: _Piece, second: _Piece) -> bool:
     lengths = []
     for piece in (first, second):
         along = int(np.abs(piece.axes @ offset).argmax())
-        length, width = piece.sizes[along], piece.sizes[1 - along]
+        length = piece.sizes[along]
+        width = piece.sizes[1 - along]
         beside = abs(float(offset @ turned_left(piece.axes[along])))
         is_size = _LENGTH_M[0] <= length <= _LENGTH_M[1] and _WIDTH_M[0] <= width <= _WIDTH_M[1]
         if not is_size or beside > _BESIDE * width:
@@ -129,7 +130,8 @@ def _leads_across(centre: FloatArray, course: FloatArray, lanes: Sequence[Lane])
 
 def _line(pieces: Sequence[Marking]) -> Marking:
     """The stop line about the pieces of a row, in order: from the first one's outer end to the last one's."""
-    first, last = pieces[0], pieces[-1]
+    first = pieces[0]
+    last = pieces[-1]
     course = last.corners_map.mean(axis=0) - first.corners_map.mean(axis=0)
     outer_first, outer_last = (
         np.argsort(sign * (piece.corners_map @ course))[:2] for piece, sign in ((first, 1.0), (last, -1.0))
@@ -157,5 +159,5 @@ def _line(pieces: Sequence[Marking]) -> Marking:
 
 def _heights(of_pieces: Sequence[FloatArray | None], place: IntArray) -> FloatArray | None:
     """Values (4,) of the corners at ``place`` among those of two pieces; None where a piece has none."""
-    known = [values for values in of_pieces if values is not None]
-    return np.concatenate(known)[place] if len(known) == len(of_pieces) else None
+    stated = [values for values in of_pieces if values is not None]
+    return np.concatenate(stated)[place] if len(stated) == len(of_pieces) else None

@@ -1,4 +1,4 @@
-"""What a person states of lanes: answers to the questions of a lane graph."""
+"""Statements of a person on lanes: answers to the questions of a lane graph."""
 
 from __future__ import annotations
 

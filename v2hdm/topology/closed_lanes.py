@@ -272,13 +272,14 @@ class _Segments:
         low = places.min(axis=0) - LANE_WIDTH_M[1]
         high = places.max(axis=0) + LANE_WIDTH_M[1]
         lines_near = np.flatnonzero(((self.boxes[:, 1] >= low) & (self.boxes[:, 0] <= high)).all(axis=1))
-        near = np.concatenate(
+        segments = np.concatenate(
             [np.arange(0)]
             + [np.arange(self.first[k], self.first[k + 1]) for k in lines_near.tolist() if k != number]
         )
-        start, end = self.start[near], self.end[near]
+        start = self.start[segments]
+        end = self.end[segments]
         in_reach = (np.maximum(start, end) >= low) & (np.minimum(start, end) <= high)
-        candidates = near[in_reach.all(axis=1)]
+        candidates = segments[in_reach.all(axis=1)]
         if not len(candidates):
             nothing = np.zeros(len(places), dtype=np.int64)
             return _Across(nothing - 1, nothing, np.full(len(places), LANE_WIDTH_M[1]))

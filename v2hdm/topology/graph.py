@@ -124,7 +124,7 @@ class StatedRight:
 
 RIGHT_OF_WAY = "right of way"
 SUBJECTS = ("direction", "connection", "speed", "two ways", "stop line", RIGHT_OF_WAY, "line")
-"""What questions are about."""
+"""Subjects of questions."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What a lane graph leaves open at its crossings: turns that no drive took, speeds, the right of way."""
+"""Questions of a lane graph at its crossings: turns that no drive took, speeds, the right of way."""
 
 from __future__ import annotations
 

@@ -12,6 +12,10 @@ from v2hdm.doors import checked, checked_class
 GOAL = "coarse"  # the check whether map and calibrations are as good as accuracy_goal_cm asks
 
 
+_RESTS_ON = ("survey", "clock")
+"""Checks of inputs that shift a whole map where they err alike for all cameras."""
+
+
 class Status(Enum):
     """How a check ended; the verdict on a run is the worst of its checks."""
 
@@ -96,8 +100,9 @@ class Verdict:
 
     @property
     def unobservable(self) -> tuple[Finding, ...]:
-        """The checks that this drive gives no answer to."""
-        return tuple(finding for finding in self.findings if finding.is_unobservable)
+        """The checks that this drive gives no answer to, those that the whole map rests on first."""
+        findings = [finding for finding in self.findings if finding.is_unobservable]
+        return tuple(sorted(findings, key=lambda finding: finding.check not in _RESTS_ON))
 
     @property
     def passed(self) -> tuple[Finding, ...]:

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from v2hdm.cli.arguments import log_to_terminal, steps_of
+from v2hdm.cli.arguments import add_site, log_to_terminal, steps_of
 from v2hdm.cli.command import GO_ON, Command, need_installed
 
 
 def _run(arguments: Sequence[str]) -> None:
     """Make a drive without its truth."""
     parser = COMMAND.parser()
-    parser.add_argument("site", metavar="SITE", help="port1, port2 or streets")
+    add_site(parser)
     parser.add_argument("folder", type=Path, metavar="DIR", help="folder for the drive")
     where = "folder in which drives are made and kept (default: cache)"
     parser.add_argument("--cache", type=Path, default=Path("cache"), metavar="DIR", help=where)
@@ -26,7 +26,7 @@ def _run(arguments: Sequence[str]) -> None:
 
     log_to_terminal()
     check_workers(parsed.workers)
-    site = site_of(parsed.site)
+    site = site_of(parsed.site, parsed.way)
     with (
         result_folder(parsed.folder, "DIR", f"v2hdm benchmark make {site.name}") as unfinished,
         open_executor(parsed.workers, writable=[parsed.cache]) as executor,
@@ -38,6 +38,8 @@ def _run(arguments: Sequence[str]) -> None:
 
 
 def _published(digest: str, published: str) -> str:
+    if not published:
+        return "of a layout of your own, which is not published"
     if digest == published:
         return "as published"
     return f"not as published ({published}), say so where you compare scores"

@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from v2hdm.cli.arguments import log_to_terminal, steps_of
+from v2hdm.cli.arguments import add_site, log_to_terminal, steps_of
 from v2hdm.cli.command import Command, need_installed
 
 
@@ -14,7 +14,7 @@ def _run(arguments: Sequence[str]) -> None:
     """Score a map."""
     parser = COMMAND.parser()
     parser.add_argument("map", type=Path, metavar="RESULT", help="GeoJSON, or a result folder of v2hdm map")
-    parser.add_argument("site", metavar="SITE", help="port1, port2 or streets")
+    add_site(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of lines")
     system = "system of the coordinates, such as EPSG:32651, or local for metres from the site's origin"
     parser.add_argument("--crs", metavar="NAME", help=system)
@@ -34,7 +34,7 @@ def _run(arguments: Sequence[str]) -> None:
     from v2hdm.executor import HERE
 
     log_to_terminal()
-    site = site_of(parsed.site)
+    site = site_of(parsed.site, parsed.way)
     kind_of = kinds_of(parsed.kinds)
     read_content(parsed.map)  # before the truth is made, which takes a minute
     steps_of("make the truth")(0, 1)
@@ -47,7 +47,7 @@ def _run(arguments: Sequence[str]) -> None:
         print(json.dumps({**score.as_json(), "truth_sha256": digest, "truth_is_published": is_published}))
         return
     print("\n".join(table_of(score)))
-    if not is_published:
+    if site.truth_sha256 and not is_published:
         print(f"truth: sha256 {digest}, not as published ({site.truth_sha256}); say so with these figures")
 
 

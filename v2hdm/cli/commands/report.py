@@ -25,7 +25,7 @@ _FIELDS = {
     "receiver": "receiver, antenna and correction service",
     "geoid": "geoid model of heights above sea level, such as GCG2016",
 }
-"""What people state for the document, by the option; what is stated once stays."""
+"""Statements of people for the document, by the option; what is stated once stays."""
 
 
 def _run(arguments: Sequence[str]) -> None:

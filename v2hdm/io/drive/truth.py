@@ -20,7 +20,7 @@ SIGHTINGS = ("camera", "timestamp", "marking", "visible_fraction")
 LANE_VISIBLE = ("lane", "vertex")
 TEXTS = ("symbol", "text")
 TEXTS_FILE = "texts.csv"
-"""What symbols of the true map say, by their number among its symbols; left out where none says anything."""
+"""Words of the true map's symbols, by their number; left out where none says anything."""
 
 
 def read_truth(drive: Drive) -> Truth:

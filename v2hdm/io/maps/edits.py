@@ -1,4 +1,4 @@
-"""What a person has edited in a map's file, in a GIS for one, as corrections of the map."""
+"""The edits of a person in a map's file, in a GIS for one, as corrections of the map."""
 
 from __future__ import annotations
 

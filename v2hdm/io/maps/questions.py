@@ -1,4 +1,4 @@
-"""What a lane graph leaves open, as GeoJSON, and the answers that people write into it.
+"""The questions of a lane graph, as GeoJSON, and the answers that people write into it.
 
 A question is a point, or a line where a way or a direction is asked about; its property ``answer`` is empty.
 """

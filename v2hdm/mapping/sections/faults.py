@@ -46,23 +46,23 @@ def _likeliest(tests: Sequence[Contradiction]) -> Contradiction:
 
 def _mean(tests: Sequence[Contradiction]) -> Contradiction:
     """The mean of one input's error over the sections, weighted by their information."""
-    known = [test for test in tests if math.isfinite(test.sigma) and math.isfinite(test.model_sigma)]
-    if len(known) < 2:
-        return known[0] if known else tests[0]
-    value = np.array([test.value for test in known])
-    information = np.array([test.sigma for test in known]) ** -2.0
+    finite = [test for test in tests if math.isfinite(test.sigma) and math.isfinite(test.model_sigma)]
+    if len(finite) < 2:
+        return finite[0] if finite else tests[0]
+    value = np.array([test.value for test in finite])
+    information = np.array([test.sigma for test in finite]) ** -2.0
     score = information * value
     mean = float(score.sum() / information.sum())
-    freedom = len(known) - 1
+    freedom = len(finite) - 1
     disagreement = float(information @ np.square(value - mean)) / freedom
     multiple = max((_PRIOR_FREEDOM + freedom * disagreement) / (_PRIOR_FREEDOM + freedom), 1.0)
     sigma = math.sqrt(multiple / float(information.sum()))
     # Each section is predicted from the others, as segments are within a section.
     predicted = (score.sum() - score) / (information.sum() - information)
     gain = float(np.sum(predicted * score - predicted**2 * information / 2)) / multiple
-    of_model = float(np.sum(np.array([test.model_sigma for test in known]) ** -2.0)) ** -0.5
+    of_model = float(np.sum(np.array([test.model_sigma for test in finite]) ** -2.0)) ** -0.5
     return replace(
-        max(known, key=lambda test: test.gain),
+        max(finite, key=lambda test: test.gain),
         value=mean,
         sigma=sigma,
         model_sigma=of_model,

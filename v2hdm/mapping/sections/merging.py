@@ -67,7 +67,7 @@ def _poses(results: Sequence[MethodResult], drive: Drive, own_images: Sequence[I
     count = len(frames.stamp_s)
     map_from_vehicle = frames.map_from_vehicle.copy()
     sigma = np.zeros((count, 6))
-    is_seen = np.zeros(count, dtype=np.bool_)
+    has_marking = np.zeros(count, dtype=np.bool_)
     for result, images in zip(results, own_images, strict=True):
         poses = result.poses
         assert poses is not None
@@ -75,13 +75,13 @@ def _poses(results: Sequence[MethodResult], drive: Drive, own_images: Sequence[I
         local = np.array([poses.frame[drive.images[image].path] for image in images.tolist()])
         map_from_vehicle[at] = poses.map_from_vehicle[local]
         sigma[at] = poses.sigma[local]
-        is_seen[at] = poses.seen[local]
+        has_marking[at] = poses.has_marking[local]
     return AdjustedPoses(
         stamp_s=frames.stamp_s,
         before=frames.map_from_vehicle,
         map_from_vehicle=map_from_vehicle,
         sigma=sigma,
-        seen=is_seen,
+        has_marking=has_marking,
         frame={
             image.path: frame
             for image, frame in zip(drive.images, frames.frame_of_image.tolist(), strict=True)

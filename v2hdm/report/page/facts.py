@@ -82,7 +82,7 @@ class Occasion(NamedTuple):
     images: int
 
 
-_NO_OCCASION = Occasion((), 0)
+_NO_OCCASION = Occasion((), 0)  # of a result that holds no images' stamps
 
 
 @dataclass(frozen=True)

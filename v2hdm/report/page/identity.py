@@ -1,4 +1,4 @@
-"""What a document is about: the survey, the drive and its receiver, and the coordinates, as rows of text."""
+"""The subject of a document: the survey, the drive and its receiver, and the coordinates, as rows of text."""
 
 from __future__ import annotations
 

@@ -278,7 +278,7 @@ def method_table(facts: Facts) -> Table | None:
 
 
 _FORMERLY = {"unobservable": "untold"}
-"""What older results call a list of findings."""
+"""Names of the lists of findings in older results."""
 
 
 def finding_rows(verdict: Mapping[str, Any], which: str) -> tuple[tuple[str, ...], ...]:

@@ -1,4 +1,4 @@
-"""What the page of ``v2hdm view`` draws: one JSON document in millimetres of the map frame."""
+"""The content that the page of ``v2hdm view`` draws: one JSON document in millimetres of the map frame."""
 
 from __future__ import annotations
 

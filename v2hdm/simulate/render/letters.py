@@ -26,7 +26,7 @@ _STROKES = {
 """Corners of strokes as column (0 to 2) and row (0 to 4) from the lower left; commas part the strokes."""
 
 LETTERS = tuple(_STROKES)
-"""What can be written, beside spaces between words one behind the other."""
+"""Characters that can be written, beside spaces between words one behind the other."""
 
 _GAP = 1.35  # distance of two letters' middles, widths of a letter
 _LINE_GAP = 1.4  # distance of two lines' feet, heights of a letter

@@ -60,6 +60,14 @@ def simulated_drives(
     return folders
 
 
+def write_simulated(config: PortConfig, network: Network, folder: Path, progress: Steps) -> None:
+    """Write the first drive through a network into a folder; DriveError when that cannot be written."""
+    driven = _driven(config, network, 0)
+    total = len(config.cameras) * len(driven.stamp_s)
+    done = count(1)
+    _write(config, network, 0, driven, folder, lambda: progress(next(done), total))
+
+
 def folders_of(config: PortConfig, cache: Path) -> tuple[Path, ...]:
     """The folders of all drives of a configuration in a cache, there or not."""
     if not config.survey.length_km:

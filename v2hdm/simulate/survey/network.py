@@ -39,10 +39,13 @@ class Network:
 
     path: Route
     hd_map: HDMap
+    beside_m: float = _BESIDE_M  # distance of the vehicle's way to the right of the path
 
     def way(self, drive: int) -> Route:
         """The vehicle's way on a drive: even ones go there, odd ones back."""
-        return _beside(self.path, -_BESIDE_M) if drive % 2 == 0 else _reversed(_beside(self.path, _BESIDE_M))
+        if drive % 2 == 0:
+            return _beside(self.path, -self.beside_m)
+        return _reversed(_beside(self.path, self.beside_m))
 
 
 def build_network(config: PortConfig, origin: GeodeticOrigin | None) -> Network:

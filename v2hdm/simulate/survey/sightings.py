@@ -1,4 +1,4 @@
-"""What the detector would find of the paint in images that are not rendered.
+"""Detections of the paint in images that are not rendered, with the statistics of the detector.
 
 The statistics are those of the shipped detector on the rendered port 2: 270 images, 4893 detections, 18029
 corners (``python -m tests.benchmarks.survey --statistics``). Nothing stands in the way here, and a marking

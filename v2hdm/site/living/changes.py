@@ -249,7 +249,7 @@ def _changes(
                 shift_sigma_m=None,
                 probability=max(gone, 1 - gone),
                 views=int(now.views[k]),
-                found=int(now.detections[k]),
+                views_showing=int(now.detections[k]),
                 sightings=old[k].sightings,
             )
         )
@@ -266,7 +266,7 @@ def _changes(
                 shift_sigma_m=None,
                 probability=max(new, 1 - new),
                 views=int(before.views[k]),
-                found=int(before.detections[k]),
+                views_showing=int(before.detections[k]),
                 sightings=marking.sightings,
             )
         )
@@ -289,6 +289,6 @@ def _move(pair: Pair, old: Marking, after: Marking, shift: Shift, now: Looks) ->
         shift_sigma_m=np.sqrt(np.diag(own_m2.reshape(4, 2, 4, 2).mean(axis=(0, 2)) + spread[0])),
         probability=pair.moved,
         views=int(now.views[k]),
-        found=int(now.detections[k]),
+        views_showing=int(now.detections[k]),
         sightings=after.sightings,
     )

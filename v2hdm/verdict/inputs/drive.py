@@ -23,6 +23,7 @@ from v2hdm.io.drive.road import unevenness
 from v2hdm.records import FOOT_M, Camera, CameraInfo, CentrePrior, Drive, FloatArray
 from v2hdm.settings import Processes
 from v2hdm.verdict.inputs import ground as ground_checks
+from v2hdm.verdict.inputs.alignment import check_alignment
 from v2hdm.verdict.inputs.ground import check_ground, find_cause, path_of
 from v2hdm.verdict.inputs.heading import check_heading
 from v2hdm.verdict.inputs.origin import CHECK as ORIGIN_HEIGHT
@@ -330,7 +331,8 @@ def input_findings(drive: Drive, ground: Mapping[str, GroundEstimate] | None = N
     motion = Motion.of(drive)
     findings = [
         *check_path(motion),
-        *check_heading(motion, path_of(ground), by_course=drive.headed_by_course),
+        *check_heading(motion, path_of(ground)),
+        *check_alignment(motion, drive.pose_noise, drive.cameras, by_course=drive.headed_by_course),
         *check_attitude(motion),
         *check_jumps(motion, drive.pose_noise),
         *check_clocks(drive, motion),

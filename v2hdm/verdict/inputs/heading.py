@@ -7,7 +7,7 @@ is the cause.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from enum import Enum
 
 import numpy as np
@@ -22,11 +22,6 @@ from v2hdm.verdict.verdict import Finding, Status, judge, passed
 _AGREES_RAD = np.deg2rad(15)
 # A convention fits if this share of the chords agrees: the rest may be wheel spin, ferries, bad fixes.
 _FITS = 0.8
-# A heading that is off by this moves a camera 3.4 m ahead of the axle by 6 cm, three sigmas of a survey.
-_MISALIGNED_RAD = np.deg2rad(1.0)
-# A chord on which the heading turns less is straight: where the origin sits does not matter there.
-_STRAIGHT_RAD = np.deg2rad(2.0)
-_TURNED_RAD = np.deg2rad(30.0)  # turn that tells a heading's error from a camera's yaw; chosen
 _LEVER_M = 0.3  # origin this far from the axle, along the vehicle: 15 sigmas of a surveyed camera centre
 # Sigmas beyond which an offset is reported: the poses' drift makes sigmas optimistic by up to two.
 _SURE = 5.0
@@ -104,16 +99,13 @@ class Path(Enum):
     MIRRORED = "the path is mirrored"
 
 
-def check_heading(motion: Motion, path: Path | None = None, *, by_course: bool = False) -> list[Finding]:
-    """Whether the recorded poses drive where they point, z up; ``path`` is the verdict of the ground.
-
-    ``by_course`` states that the headings were made of the course.
-    """
+def check_heading(motion: Motion, path: Path | None = None) -> list[Finding]:
+    """Whether the recorded poses drive where they point, z up; ``path`` is the verdict of the ground."""
     if not len(motion.chords):
         return []  # the check of the path's length says so
     _, either = _agreement(motion)
     if either >= _FITS:
-        return [_as_given(motion, either, path), *_alignment(motion, by_course)]
+        return [_as_given(motion, either, path), *_origin(motion)]
     says = _cause(motion, path)
     if says is None:
         return []  # the check of the attitude says so
@@ -135,8 +127,8 @@ def _as_given(motion: Motion, agrees: float, path: Path | None) -> Finding:
     return passed("heading", "poses", f"the vehicle goes where its heading points; {how}", 1 - agrees)
 
 
-def _alignment(motion: Motion, by_course: bool) -> Iterator[Finding]:
-    """The constant angle between course and heading, and the lever from the axle to the origin."""
+def _origin(motion: Motion) -> list[Finding]:
+    """The lever from the axle to the origin, as turns show it."""
     offset = _course_minus_yaw(motion)
     reverse = np.abs(offset) > np.pi / 2
     offset = np.where(reverse, wrapped(offset + np.pi), offset)
@@ -144,42 +136,7 @@ def _alignment(motion: Motion, by_course: bool) -> Iterator[Finding]:
     keep = np.abs(offset) < _AGREES_RAD
     # Neighbouring chords share poses: this many count as one.
     overlap = float(max(1.0, np.median(motion.chords.last - motion.chords.first)))
-    if by_course:
-        yield _of_course(motion)
-    else:
-        yield _constant_offset(offset[keep], np.abs(motion.turn_rad[keep]), overlap)
-    yield from _lever(offset[keep], curvature[keep], overlap)
-
-
-def _of_course(motion: Motion) -> Finding:
-    """The finding on a drive whose headings are its course, which leaves the yaw of the mounting open."""
-    heading = np.unwrap(np.arctan2(motion.rotation[:, 1, 0], motion.rotation[:, 0, 0]))
-    turned_deg = float(np.rad2deg(np.ptp(heading)))
-    least_deg = float(np.rad2deg(_TURNED_RAD))
-    if turned_deg >= least_deg:
-        says = "headings are the course of the rear axle: a constant error of theirs is in the cameras' yaw"
-        return Finding("heading offset", Status.PASS, turned_deg, least_deg, "deg", says, "poses")
-    says = (
-        f"headings are the course, and the drive turns by {turned_deg:.0f} deg only: a constant error of the "
-        "heading and the cameras' yaw look the same, as does an antenna elsewhere; include a turn"
-    )
-    return Finding("heading offset", Status.WARN, turned_deg, least_deg, "deg", says, "poses")
-
-
-def _constant_offset(offset_rad: FloatArray, turn_rad: FloatArray, overlap: float) -> Finding:
-    straight = offset_rad[turn_rad < _STRAIGHT_RAD]
-    if len(straight) < 10:
-        return passed("heading offset", "poses", "the route has no straight stretch that would show it")
-    value = float(np.rad2deg(np.median(straight)))
-    sigma = 1.25 * np.std(straight) / np.sqrt(max(1.0, len(straight) / overlap))  # of a median
-    limit = float(np.rad2deg(_MISALIGNED_RAD + _SURE * sigma))
-    return judge(
-        "heading offset", "poses", value, limit, "deg",
-        fine="on straight stretches the vehicle goes where its heading points",
-        wrong=f"on straight stretches the vehicle drives {abs(value):.1f} deg to the "
-        f"{'left' if value > 0 else 'right'} of its heading; fix the alignment of the heading's antennas",
-        status=Status.WARN,
-    )  # fmt: skip
+    return _lever(offset[keep], curvature[keep], overlap)
 
 
 def _lever(offset_rad: FloatArray, curvature: FloatArray, overlap: float) -> list[Finding]:

@@ -8,7 +8,7 @@ it leaves the ground ahead known as well.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import compress
 from typing import NamedTuple
@@ -68,6 +68,25 @@ def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Findin
         yield _judged(name, left_m, goal_m, says, helps)
 
 
+_CLOCKS = (table.CLOCK.check, table.CLOCK_DRIFT.check)
+
+
+def clocks_once(
+    findings: Iterable[Finding], of_goal: Iterable[Finding]
+) -> tuple[list[Finding], list[Finding]]:
+    """The findings of a solve and those on the goal, without what either says of clocks less well.
+
+    A clock that is named as wrong is not unknown; and what is unknown of all clocks is told with its size.
+    """
+    findings = list(findings)
+    of_goal = list(of_goal)
+    if any(finding.check in _CLOCKS and finding.status is not Status.PASS for finding in findings):
+        return findings, [finding for finding in of_goal if finding.check not in _CLOCKS]
+    if any(finding.check in _CLOCKS for finding in of_goal):
+        findings = [f for f in findings if not (f.check in _CLOCKS and f.is_unobservable)]
+    return findings, of_goal
+
+
 def _unknown_clocks(evidence: SolveEvidence | None, goal_m: float) -> Iterator[Finding]:
     """The clocks, where what is unknown of them alone makes a map miss the goal."""
     clock_m = None if evidence is None else evidence.clock_m
@@ -115,7 +134,8 @@ def _judged(about: str, radius_m: float, goal_m: float, says: str, helps: str) -
 def _largest_part(best: MethodResult, coarse: Sequence[Marking]) -> str:
     """The largest of the errors that are stated of the markings that miss the goal, and what helps."""
     clock_m = (best.evidence.clock_m if best.evidence is not None else None) or 0.0
-    pose_m = [] if best.poses is None else SIGMAS_95 * best.poses.sigma[best.poses.seen, :2].max(axis=1)
+    poses = best.poses
+    pose_m = [] if poses is None else SIGMAS_95 * poses.sigma[poses.has_marking, :2].max(axis=1)
     # Poses are stated at the stamps of the images, with what clocks leave open.
     own_pose_m = float(np.sqrt(max(_median(pose_m) ** 2 - clock_m**2, 0.0)))
     parts = [

@@ -54,7 +54,7 @@ and standard deviation are a little above those of 50 cameras, rendered or made 
 0.0035."""
 
 _REJECTED_OF_WRONG = (1.0, 6.0)
-"""That of cameras whose lens, clock or mounting is wrong: mean 0.14, as without distortion coefficients."""
+"""The same where a lens, clock or mounting is wrong: mean 0.14, as without distortion coefficients."""
 
 _VARIANCE_LIMIT = 3.0
 """Largest variance of observations over the one that the detector states: clean drives reach 0.2, a drive
@@ -326,10 +326,10 @@ def _unobservable(evidence: SolveEvidence, raised: set[str]) -> Iterator[Finding
     if loose and "survey" not in raised:
         names = " and ".join(("forward", "left")[axis] for axis in sorted({test.axis for test in loose}))
         worst_m = max(test.sigma for test in loose)
-        shows = f"shows only to {200 * worst_m:.0f} cm" if worst_m < 1 else "does not show"
+        shows = f"would show one from {200 * worst_m:.0f} cm on" if worst_m < 1 else "shows none"
         says = (
-            f"this drive {shows} how far {names} the cameras are from the poses' reference point: "
-            "the result relies on the survey of centre and antenna; include a turn"
+            f"nothing checks the surveyed centres and the antenna {names}: an error of theirs shifts the "
+            f"whole map by as much, and this drive {shows}; measure them again, or include a turn"
         )
         yield passed("survey", "all cameras", says)
 

@@ -1,4 +1,4 @@
-"""What a receiver with one antenna, and a gyro beside it, recorded of a drive."""
+"""The recording of a drive by a receiver with one antenna, and by a gyro beside it."""
 
 from __future__ import annotations
 

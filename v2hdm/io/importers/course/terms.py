@@ -1,4 +1,4 @@
-"""What holds a vehicle's path together: residuals in sigmas, and their derivatives.
+"""The terms that hold a vehicle's path together: residuals in sigmas, and their derivatives.
 
 A state has per epoch the rear axle's place in the plane (2), the heading, the speed, the curvature and the
 drift of the position (2); and for the whole drive :class:`Shared`. All residuals of one kind are one
