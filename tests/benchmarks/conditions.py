@@ -4,10 +4,10 @@
 renders a straight piece of each port in each condition, whose drive states its noise and drift as they are,
 and maps it. It prints the corners' error, what of it remains after the best common motion, the sigma that is
 stated of a corner, by how much diagonals of markings are too long, and the shares of corners and of sides
-inside their 95 % regions; then, of each condition and set of cameras, mean squared errors in sigmas (1 if they
-are as stated) of corners, of the shift that all markings share, of distances between neighbours and of sides.
-Corners of one drive share its errors, so that often all of them or none lie inside: only many drives together
-mean much, and a port's conditions share the errors of its seed.
+inside their 95 % regions; then, of each condition and set of cameras, mean squared errors in sigmas (1 if
+they are as stated) of corners, of the shift that all markings share, of distances between neighbours and of
+sides. Corners of one drive share its errors, so that often all of them or none lie inside: only many drives
+together mean much, and a port's conditions share the errors of its seed.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def longer_m(mapping: Mapped) -> float:
 
 
 def shift_errors(mapping: Mapped) -> FloatArray:
-    """Of the shift (2,) that the markings share: their median, squared and in sigmas of a marking's centre."""
+    """Of the shift (2,) that markings share: their median, squared, in sigmas of a marking's centre."""
     off_m = np.median((mapping.corners - mapping.true).reshape(-1, 4, 2).mean(axis=1), axis=0)
     of_centres_m2 = [
         np.diagonal(marking.covariance_m2.reshape(4, 2, 4, 2).mean(axis=(0, 2)))
