@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import NamedTuple
 
@@ -27,9 +27,10 @@ from v2hdm.localization.belief import (
 from v2hdm.localization.joint import Located, Scene, locate, paired
 from v2hdm.localization.motion import Motion, MotionLog, MotionNoise, moved
 from v2hdm.localization.paint import Paint
-from v2hdm.localization.places import Patch, Place, Prior, search, vehicle_at
+from v2hdm.localization.places import Place, Prior, vehicle_at
 from v2hdm.localization.rig import Estimate, Rig, Turned
 from v2hdm.localization.seeing import Look, Sighted, sighted
+from v2hdm.localization.starting import Quest
 from v2hdm.records import Calibration, FloatArray, HDMap
 
 _LAG_S = 1.0  # images may be so late
@@ -39,14 +40,6 @@ _LOST_M = 0.3
 _PROTECTION_SIGMAS = 3.717  # radius, in sigmas, that one error in a thousand in a plane exceeds
 _MOST_MARKINGS = 28  # whose places' errors are states: those seen last
 _STARTED = 4  # images from the start on whose agreement makes it sure
-# Log likelihood by which one place must explain what is seen better than any other: one wrong in e^10.
-_SURER_BY = 10.0
-_LEAST_MATCHED = 4  # markings of the place
-_LEAST_SHARE = 0.6  # of what is seen
-_SEARCH_S = 0.3  # time between searches
-_TRIED_LOOKS = 4  # images, of as many searches, by which a place is tried
-_LOST_S, _LOST_WAY_M = 0.9, 8.0  # after so long, or so far, without a place nothing fits
-_STILL_M = 0.5  # a vehicle that has moved less stands: it may not have seen enough
 _START_SIGMA = np.array([0.25, 0.25, np.deg2rad(1.5)])  # of a place that was found, m, m and rad
 _UNSTATED = np.diag(np.square([0.01, 0.01, 0.01, *(3 * [np.deg2rad(0.05)])]))  # of a calibration without one
 _AGAIN_SIGMA_M = (
@@ -135,19 +128,6 @@ class _Noise:
         self.count = keeps * self.count + located.misfit_freedom
 
 
-@dataclass
-class _Search:
-    """The search for a place: the rough one and where the odometry was then, since when, and the last one."""
-
-    prior: Prior | None
-    local: FloatArray = field(default_factory=lambda: np.zeros(3))
-    since_s: float | None = None
-    since_m: float = 0.0
-    last_s: float = -np.inf
-    patch: Patch = field(default_factory=Patch)
-    looks: deque[Look] = field(default_factory=lambda: deque(maxlen=_TRIED_LOOKS))
-
-
 class Localizer:
     """Finds a vehicle in a map, image by image; needs no more than the base install.
 
@@ -183,7 +163,7 @@ class Localizer:
         self._log = MotionLog()
         self._belief: Belief | None = None
         self._past: deque[_Past] = deque()
-        self._search = _Search(prior)
+        self._search = Quest(prior)
         self._is_sure = False
         self._is_lost = False
         self._confirmed = 0
@@ -386,48 +366,17 @@ class Localizer:
         return only_markings(belief, order[-_MOST_MARKINGS:])
 
     def _find(self, look: Look) -> None:
-        """Search for a place that explains the patch as no other does."""
-        quest = self._search
-        if quest.since_s is None and quest.patch.objects:
-            quest.since_s = look.stamp_s
-            quest.since_m = self._way_m
-        if quest.since_s is None or 0 <= look.stamp_s - quest.last_s < _SEARCH_S:
-            return
-        quest.last_s = look.stamp_s
-        quest.looks.append(look)
+        """Search for a place that explains what is seen as no other does."""
         local = self._local_at(look.stamp_s)
-        places = search(quest.patch, self.paint, self.calibrations, quest.local, quest.prior)
-        if places:
-            best = places[0]
-            second = places[1].score if len(places) > 1 else 0.0
-            share = best.matched / max(best.quads, 1)
-            if (
-                best.matched >= _LEAST_MATCHED
-                and share >= _LEAST_SHARE
-                and best.score - max(second, 0.0) > _SURER_BY
-            ):
-                self._begin(look.stamp_s, vehicle_at(best.map_from_local, local))
-                return
-            if all(self._differs_at(place) for place in places if best.score - place.score < _SURER_BY):
-                self._is_lost = True
-                self._reasons["lost"] = (
-                    "wherever the vehicle may be, many markings seen lie beside those of the map: was the "
-                    "site repainted?"
-                )
-        waited_s = look.stamp_s - quest.since_s
-        waited_m = self._way_m - quest.since_m
-        is_long = (waited_s > _LOST_S and waited_m > _STILL_M) or waited_m > _LOST_WAY_M
-        if is_long and len(quest.patch.sure) >= _LEAST_MATCHED + 2:
-            share = places[0].matched / max(places[0].quads, 1) if places else 0.0
-            if share < _LEAST_SHARE:
-                self._is_lost = True
-                self._reasons["lost"] = (
-                    f"no place there explains more than {100 * share:.0f} % of the markings seen: is it the "
-                    "map of this site, as painted today, in these coordinates, and are these its cameras?"
-                )
+        proposal = self._search.propose(look, local, self._way_m, self.paint, self.calibrations, self._tried)
+        if proposal.pose is not None:
+            self._begin(look.stamp_s, proposal.pose)
+        elif proposal.reason is not None:
+            self._is_lost = True
+            self._reasons["lost"] = proposal.reason
 
-    def _differs_at(self, place: Place) -> bool:
-        """Whether the last images, seen from a place, show markings beside those of the map."""
+    def _tried(self, place: Place) -> Agreement:
+        """How the map explains the last images, seen from a place."""
         looks = self._search.looks
         pose = vehicle_at(place.map_from_local, self._local_at(looks[0].stamp_s))
         belief = start(looks[0].stamp_s, pose, _START_SIGMA, self._mountings, self.noise)
@@ -439,7 +388,7 @@ class Localizer:
             located = locate(belief, scene)
             belief = located.belief
             agreement.note(detected(scene, located), self._way_m)
-        return agreement.differs
+        return agreement
 
     def _begin(self, stamp_s: float, pose: FloatArray) -> None:
         self._belief = start(stamp_s, pose, _START_SIGMA, self._mountings, self.noise)
@@ -476,7 +425,7 @@ class Localizer:
             sigma_m = max(_AGAIN_SIGMA_M, self._belief.sigma_m)
             prior = Prior(pose, sigma_m, _AGAIN_SIGMA_RAD)
         local = self._local if self._belief is None else self._local_at(self._belief.stamp_s)
-        self._search = _Search(prior, local)
+        self._search = Quest(prior, local)
         self._belief = None
         self._past.clear()
         self._agreement = Agreement()

@@ -23,6 +23,7 @@ from v2hdm.records import (
     Drive,
     FloatArray,
     HDMap,
+    IntArray,
     Lane,
     Marking,
     Truth,
@@ -50,22 +51,27 @@ class MarkingMetrics:
 def driven_past(drive: Drive, truth: Truth, cameras: Sequence[str]) -> BoolArray:
     """True markings (J,) that the cameras saw whole in their ROI in :data:`MIN_SIGHTINGS` images."""
     outlines = [(marking.corners_map, marking.heights_m) for marking in truth.map.markings]
-    return _seen_whole(drive, truth, cameras, outlines, truth.visibility)
+    return _seen_whole(drive, truth, cameras, outlines, truth.visibility) >= MIN_SIGHTINGS
 
 
-def symbols_driven_past(drive: Drive, truth: Truth, cameras: Sequence[str]) -> BoolArray:
-    """True symbols (S,) of four corners of which :func:`driven_past` would say so."""
+def symbols_driven_past(
+    drive: Drive, truth: Truth, cameras: Sequence[str], least_sightings: int = MIN_SIGHTINGS
+) -> BoolArray:
+    """True symbols (S,) of four corners of which :func:`driven_past` would say so.
+
+    ``least_sightings`` is the number of images that it asks for.
+    """
     outlines = [(symbol.outline_map, symbol.heights_m) for symbol in truth.map.symbols]
     if truth.symbol_visibility is None or any(len(outline) != 4 for outline, _ in outlines):
         return np.zeros(len(outlines), dtype=np.bool_)
-    return _seen_whole(drive, truth, cameras, outlines, truth.symbol_visibility)
+    return _seen_whole(drive, truth, cameras, outlines, truth.symbol_visibility) >= least_sightings
 
 
 def _seen_whole(
     drive: Drive, truth: Truth, cameras: Sequence[str],
     outlines: Sequence[tuple[FloatArray, FloatArray | None]], visibility: FloatArray,
-) -> BoolArray:  # fmt: skip
-    """Outlines (J,) with heights that the cameras saw whole in their ROI in enough images."""
+) -> IntArray:  # fmt: skip
+    """The number (J,) of images in which the cameras saw outlines with heights whole, in their ROI."""
     corners = np.zeros((len(outlines), 4, 3))
     for j, (corners_map, heights_m) in enumerate(outlines):
         corners[j, :, :2] = corners_map
@@ -78,7 +84,7 @@ def _seen_whole(
         corners_vehicle = ground_in_vehicle(truth.map_from_vehicle[i], corners[candidates])
         inside = inside_convex(drive.cameras[image.camera].roi_vehicle, corners_vehicle).all(axis=1)
         sightings[candidates[inside]] += 1
-    return sightings >= MIN_SIGHTINGS
+    return sightings
 
 
 def marking_metrics(

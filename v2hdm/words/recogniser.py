@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from v2hdm.errors import ConfigError, one_line
 from v2hdm.records import FloatArray, IntArray
+from v2hdm.words.spelling import with_look_alikes
 
 HEIGHT_PX = 48  # height of the network's input, px
 _GREY_HALF = 127.5  # grey value that the network takes for 0; it takes 255 for 1
@@ -47,6 +48,12 @@ class Letters:
         channels = self.log_probability.argmax(axis=1)
         is_new = np.append(True, channels[1:] != channels[:-1])
         return "".join(self.alphabet[channel] for channel in channels[is_new] if channel != _NO_LETTER)
+
+    @cached_property
+    def alike(self) -> Letters:
+        """The same with letters that look alike in paint sharing their probability."""
+        probability = with_look_alikes(np.exp(self.log_probability), self.alphabet)
+        return Letters(np.log(probability), self.alphabet)
 
     def log_of(self, text: str) -> float:
         """The log probability of a string, over all ways to spell it (the forward pass of CTC)."""

@@ -146,13 +146,25 @@ class Net:
             out.append(covariance)
         return out
 
-    def step_of(self, joined: Joined, label: Labels) -> FloatArray:
-        """The step (n,) of a part's border."""
+    def steps(self, factor: BlockCholesky, slopes: Sequence[FloatArray]) -> list[FloatArray]:
+        """Steps (b, n) of each part's border to the optimum under n errors, as the parts' ``slopes`` tell."""
+        errors = slopes[0].shape[1]
+        gradient = [np.zeros((size, errors)) for size in self.pattern.sizes]
+        for label, of_part in zip(self.labels, slopes, strict=True):
+            place = self._place(label)
+            for number in np.unique(place.block).tolist():
+                rows = np.flatnonzero(place.block == number)
+                gradient[number][place.row[rows]] += of_part[rows]
+        step = factor.solve([-of_block for of_block in gradient])
+        return [self._of_border(step, label) for label in self.labels]
+
+    def _of_border(self, step: Sequence[FloatArray], label: Labels) -> FloatArray:
+        """The rows (b, ...) of a step by block that are of a part's border."""
         place = self._place(label)
-        out = np.zeros(len(place.block))
+        out = np.zeros((len(place.block), *step[0].shape[1:]))
         for number in np.unique(place.block).tolist():
             rows = np.flatnonzero(place.block == number)
-            out[rows] = joined.step[number][place.row[rows]]
+            out[rows] = step[number][place.row[rows]]
         return out
 
     def _place(self, label: Labels) -> _Place:

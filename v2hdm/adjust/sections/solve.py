@@ -89,6 +89,10 @@ class Joint(NamedTuple):
         """The joint covariance (n, n) of each part's border."""
         return self.net.covariances(self.factor)
 
+    def steps(self, slopes: Sequence[FloatArray]) -> list[FloatArray]:
+        """Steps (b, n) of each part's border under n errors, of which each part tells ``slopes`` (b, n)."""
+        return self.net.steps(self.factor, slopes)
+
 
 class _Open(NamedTuple):
     """A part laid out: ``held`` (m,), 1 / m^2, holds corners of its border at ``held_map`` (m, 2)."""
@@ -149,6 +153,7 @@ class _Work:
         control[border.corners[is_free]] = start_map[border.corners[is_free]]
         root[border.corners[is_free]] = root.new_tensor([1.0, 0.0, 1.0]) / _HELD_SIGMA_M
         engine = plain.over(replace(arrays, control=control, control_root=root))
+        engine = engine.keeping(border.frames, border.corners)
         return _Open(plain, engine, border, held, control[border.corners])
 
     def _round(self, job: _Job, part: Part) -> PartStates:
