@@ -76,9 +76,9 @@ def are_simple(quads: FloatArray) -> BoolArray:
     sides = np.roll(quads, -1, axis=1) - quads
     turns = cross(sides, np.roll(sides, -1, axis=1))
     # Four turns to one side are one round; only others are looked at one by one.
-    out = (turns > 0).all(axis=1) | (turns < 0).all(axis=1)
+    out = np.asarray((turns > 0).all(axis=1) | (turns < 0).all(axis=1))
     out[~out] = [is_simple(quad) for quad in quads[~out]]
-    return np.asarray(out)
+    return out
 
 
 def clip_convex(polygon: FloatArray, window: FloatArray) -> FloatArray:
