@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
@@ -13,6 +13,7 @@ import numpy as np
 from v2hdm.doors import checked
 from v2hdm.errors import MapFileError
 from v2hdm.localization.agreement import Agreement, Pace, detected
+from v2hdm.localization.antenna import Antenna, Fix, with_fix
 from v2hdm.localization.belief import (
     CAMERA,
     HEADING,
@@ -65,14 +66,6 @@ class Status(Enum):
     INITIALISING = "initialising"
     TRACKING = "tracking"
     LOST = "lost"
-
-
-class Fix(NamedTuple):
-    """A position (2,) of the vehicle's origin in the map by RTK, m, and its standard deviation."""
-
-    stamp_s: float
-    place_map: FloatArray
-    sigma_m: float
 
 
 @dataclass(frozen=True)
@@ -144,11 +137,13 @@ class Localizer:
         calibrations: Mapping[str, Calibration],
         prior: Prior | None = None,
         noise: MotionNoise | None = None,
+        antenna_m: Sequence[float] = (0.0, 0.0),
     ) -> None:
         """Start in a map (frame ``map``, m) with calibrated cameras, by name.
 
         ``prior`` is a rough position; without one, the whole map is searched.
-        ``noise`` is the odometry's. Raises MapFileError for a map without markings, or without cameras.
+        ``noise`` is the odometry's; ``antenna_m`` is how far ahead of its origin and to the left the vehicle
+        has the antenna of its positions. Raises MapFileError for a map without markings, or without cameras.
         """
         if not hd_map.markings:
             raise MapFileError("the map has no markings; nothing can be localised in it")
@@ -161,6 +156,8 @@ class Localizer:
         covariances = [item.covariance for item in self.calibrations.values()]
         self._mountings = [_UNSTATED if item is None else np.asarray(item) for item in covariances]
         self._log = MotionLog()
+        self._antenna = Antenna(np.asarray(antenna_m, dtype=np.float64).reshape(2))
+        self._fixes: deque[Fix] = deque()
         self._belief: Belief | None = None
         self._past: deque[_Past] = deque()
         self._search = Quest(prior)
@@ -250,7 +247,7 @@ class Localizer:
             return
         if look.stamp_s < self._belief.stamp_s:  # of before the place was found
             return
-        belief = self._moved_to(self._belief, look.stamp_s)
+        belief = self._fixed_to(self._belief, look.stamp_s)
         self._past.append(_Past(self._belief, look))
         while self._past[-1].look.stamp_s - self._past[0].look.stamp_s > _LAG_S:
             self._past.popleft()
@@ -397,6 +394,7 @@ class Localizer:
         self._confirmed = 0
         self._is_sure = self._is_lost = False
         self._turned_s = None
+        self._fixes.clear()
         self._reasons.pop("lost", None)
 
     def _judge(self, look: Look) -> None:
@@ -434,32 +432,34 @@ class Localizer:
         self._reasons["lost"] = reason
 
     def _fix(self, fix: Fix) -> None:
-        """Take a position by RTK."""
+        """Keep a position by RTK until the images of before it have come."""
         belief = self._belief
-        if belief is None or abs(fix.stamp_s - belief.stamp_s) > _LAG_S:
-            if self._belief is None:
-                heading = self._search.prior.pose[2] if self._search.prior else 0.0
-                turn = self._search.prior.sigma_rad if self._search.prior else np.pi
-                pose = np.array([*fix.place_map, heading])
-                self._search.prior = Prior(pose, max(fix.sigma_m, 0.5), turn)
-                self._search.local = self._local_at(fix.stamp_s)
+        if belief is None:
+            self._count_way(fix.stamp_s)
+            local = self._local_at(fix.stamp_s)
+            self._antenna.note(fix, local)
+            self._search.prior = self._antenna.prior(local, self._search.prior)
+            self._search.local = local
             return
-        belief = self._moved_to(belief, fix.stamp_s)
-        total = fix.sigma_m**2 + self.paint.shared_m2
-        slope = belief.root[:2]
-        gain = belief.root @ slope.T @ np.linalg.inv(slope @ slope.T + total * np.eye(2))
-        off = fix.place_map - belief.mean[:2]
-        spread = slope @ slope.T + total * np.eye(2)
-        if off @ np.linalg.solve(spread, off) > _PROTECTION_SIGMAS**2:
-            self._reasons["fix"] = (
-                f"RTK is {np.linalg.norm(off):.2f} m from where the markings put the vehicle: is the map in "
-                "its datum?"
-            )
-            return
-        self._reasons.pop("fix", None)
-        inner = np.linalg.cholesky(np.eye(len(belief.mean)) + slope.T @ slope / total)
-        root = np.linalg.solve(inner, belief.root.T).T
-        self._belief = replace(belief, mean=belief.mean + gain @ off, root=root)
+        self._fixes.append(fix)
+        while fix.stamp_s - self._fixes[0].stamp_s > 2 * _LAG_S:
+            self._fixes.popleft()
+        # Where no image came for long, none that is older will.
+        if fix.stamp_s - belief.stamp_s > _LAG_S:
+            self._belief = self._fixed_to(belief, fix.stamp_s - _LAG_S)
+
+    def _fixed_to(self, belief: Belief, stamp_s: float) -> Belief:
+        """The belief at a later time, after the positions until then."""
+        for fix in sorted(self._fixes, key=lambda item: item.stamp_s):
+            if belief.stamp_s < fix.stamp_s <= stamp_s:
+                moved_belief = self._moved_to(belief, fix.stamp_s)
+                belief, problem = with_fix(
+                    moved_belief, fix, self._antenna.ahead_left_m, self.paint.shared_m2
+                )
+                self._reasons.pop("fix", None)
+                if problem is not None:
+                    self._reasons["fix"] = problem
+        return self._moved_to(belief, stamp_s)
 
     def _pose(self) -> Pose:
         """The pose at the newest stamp."""
@@ -481,7 +481,7 @@ class Localizer:
             return Pose(
                 stamp_s, status, None, nothing, infinite, np.inf, (1.0, 0.0), 0, tuple(reasons.values())
             )
-        belief = self._moved_to(self._belief, stamp_s)
+        belief = self._fixed_to(self._belief, stamp_s)
         plane = self.paint.ground(belief.mean[:2])
         covariance = belief.covariance([0, 1, 2])
         covariance += np.diag([self.paint.shared_m2, self.paint.shared_m2, self.paint.shared_rad2])

@@ -100,6 +100,7 @@ def _mean_sigma(sigmas: Sequence[PoseSigma], weight: FloatArray) -> PoseSigma:
         position_drift=mean_drift([sigma.position_drift for sigma in sigmas]),
         heading_drift=mean_drift([sigma.heading_drift for sigma in sigmas]),
         roll_pitch_drift=mean_drift([sigma.roll_pitch_drift for sigma in sigmas]),
+        heading_slip=max(sigma.heading_slip for sigma in sigmas),
     )
 
 
