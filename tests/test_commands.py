@@ -298,11 +298,6 @@ def test_mapping_loads_no_writer_no_page_no_mosaic_and_no_renderer():
         assert not [module for module in modules if f"{module}.".startswith(f"v2hdm.{name}.")], name
 
 
-def test_the_only_console_script_is_v2hdm():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert project["scripts"] == {"v2hdm": "v2hdm.cli.main:main"}
-
-
 @pytest.mark.parametrize(
     "how", [["v2hdm"], ["v2hdm", "map"], ["v2hdm.map"], ["v2hdm", "calibrate", "ground"]]
 )

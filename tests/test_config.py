@@ -47,7 +47,6 @@ def test_every_shipped_run_composes_into_dataclasses(run):
         ("+run=port2 export=gpkg", "write export=[gpkg]"),
         ("+run=port2 drive.limit=0", "set 1 to 1e+12"),
         ("+run=port2 mapping.acceptance.accuracy=D", "mapping.acceptance.accuracy is 'D'; choose from A, B"),
-        ("+run=port2 mapping.acceptance.max_sigma_m=0.1", "max_sigma_m"),
         ("drive.path = nowhere", "write drive.path=nowhere"),
         ("+run=kitti", "drive.path"),
         ("+run=kitti drive.path=nowhere", "nowhere"),
@@ -149,8 +148,3 @@ def test_the_page_has_every_key_with_its_default_and_the_runs_that_are_shipped()
     assert "Shipped runs: kitti, port1, port2, signs" in page
     assert all(key.name in page for key in keys_of(RunConfig))
     assert max(map(len, page.splitlines())) <= 110
-
-
-def test_a_key_that_is_no_more_names_the_one_in_its_place(capsys):
-    assert run(["map", "mapping.acceptance.max_sigma_m=0.1"]) == 2
-    assert "mapping.acceptance.accuracy=A, B or C takes its place" in capsys.readouterr().err

@@ -268,6 +268,13 @@ def test_no_drive_at_all_is_named():
         v2hdm.map_drive([])
 
 
+def test_a_function_shows_progress_and_nothing_else_does():
+    with pytest.raises(ConfigError, match="no drive is given"):
+        v2hdm.map_drive([], progress=lambda task, done, total: None)
+    with pytest.raises(ConfigError, match="progress is 3: give a function"):
+        v2hdm.map_drive([], progress=3)
+
+
 def test_a_drive_without_images_is_named(doors):
     none = replace(doors["check_drive"].right["drive"], images=())
     for door in (v2hdm.check_drive, v2hdm.calibrate_from_ground, v2hdm.map_drive):

@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import IO, TYPE_CHECKING, Protocol
+from typing import IO, TYPE_CHECKING
 
 if TYPE_CHECKING:  # of the map extra; progress itself is reported without it
     from rich.console import Console
@@ -17,19 +17,16 @@ _EVERY_S = 10.0  # between two lines on one task
 Steps = Callable[[int, int], None]  # called with how many steps of one task are done, and of how many
 
 
-class Progress(Protocol):
-    """Shows how many steps of a named piece of long work are done, and of how many."""
-
-    def __call__(self, task: str, done: int, total: int) -> None:
-        """``done`` of ``total`` steps of ``task`` are finished."""
+# Called with the name of a piece of long work, how many of its steps are done, and of how many.
+Progress = Callable[[str, int, int], None]
 
 
 def silent(task: str, done: int, total: int) -> None:
-    """A :class:`Progress` that shows nothing."""
+    """A ``Progress`` that shows nothing."""
 
 
 def progress_lines(write: Callable[[str], None]) -> Progress:
-    """A :class:`Progress` for a log: a line when a task begins and ends, and every ten seconds between."""
+    """A ``Progress`` for a log: a line when a task begins and ends, and every ten seconds between."""
     written_s: dict[str, float] = {}
 
     def advance(task: str, done: int, total: int) -> None:

@@ -1,7 +1,7 @@
 """What each part of the detector of markings earns: switched off one at a time on scenes of unseen seeds.
 
     python -m tests.benchmarks.ablation [--images 60] [--only PATTERN] [--verdict FIRST LAST]
-                                        [--site FIRST LAST] [--drives FOLDER ...]
+                                        [--faults NAME ...] [--site FIRST LAST] [--drives FOLDER ...]
 
 Printed, for the detector as it is and without each part: recall within 20 m of markings that must be found,
 false ones, the share of markings with four corners known well, the corners' error, px, and whether the stated
@@ -9,9 +9,11 @@ covariance holds (inner-95 mean of the normalised squared error; honest 1.60). A
 leaves.
 
 With ``--verdict`` instead what each column of the table of fault sizes (faults/table.py), each number of
-mapping/foreign.py and parts of the tests earn, on made drives of these seeds, as they are and with every
-fault: right drives failed, wrong maps without a word, and of those with one how many are named rightly,
-first. To the right drives belongs each as a straight one under a stream of poses, whose cameras fire in turn.
+mapping/foreign.py, the priors of clocks and parts of the tests earn, on made drives of these seeds, as they
+are and with every fault, or those of these names: right drives failed, wrong maps without a word, of those
+with one how many are named rightly, first, and the share of the corners of all spoilt maps inside their 95 %
+regions. To the right drives belongs each as a straight one under a stream of poses, whose cameras fire in
+turn.
 """
 
 from __future__ import annotations
@@ -37,7 +39,7 @@ from tests.benchmarks.made.faults import APART_S, SPOILS
 from tests.benchmarks.made.lengths import make_lengths
 from tests.benchmarks.made.queue import detect_queue, make_queue
 from tests.benchmarks.made.world import World, drive_of, make, truth_of
-from tests.benchmarks.right_drives import CLEAN, Job, judge, map_one
+from tests.benchmarks.right_drives import Job, judge, map_one, shares_inside
 from tests.benchmarks.standing_ends import grey_of
 from tests.benchmarks.uncertainty import corner_errors, in_order_of
 from train.examples import Example, example
@@ -55,9 +57,20 @@ from v2hdm.io.drive.truth import read_truth
 from v2hdm.mapping import conclusion, foreign, optimise, recovery
 from v2hdm.mapping.methods import run_methods
 from v2hdm.pipeline.base import grey_reader
-from v2hdm.records import BoolArray, Drive, FloatArray, Image, ImageDetections, IntArray, Marking, Truth
+from v2hdm.records import (
+    BoolArray,
+    Drive,
+    FloatArray,
+    Image,
+    ImageDetections,
+    IntArray,
+    Marking,
+    Truth,
+    poses,
+)
 from v2hdm.report.metrics import driven_past, marking_metrics, match_markings
 from v2hdm.site import hypotheses, markings, parallax, posterior, standing, symbols
+from v2hdm.verdict.inputs import alignment
 from v2hdm.verdict.results import solution
 
 SEED = 5_318_008
@@ -195,6 +208,9 @@ def sizes() -> Iterator[Part]:
         partial(patch.object, Sensitivity, "map_from_vehicle", property(_recorded)),
     )
     yield "sightings of rejected corners", partial(patch.object, recovery, "_effective_count", _countless)
+    yield "clocks: prior of being late", partial(patch.object, poses, "_UNSTATED_CLOCK_S", 0.0)
+    yield "clocks: prior of their drift", partial(patch.object, poses, "_UNSTATED_CLOCK_DRIFT_S", 0.0)
+    yield "heading: held against surveys", partial(patch.object, alignment, "_ASKEW_RAD", np.deg2rad(1.0))
 
 
 def _by_neighbours(map_from_vehicle: FloatArray, stamp_s: FloatArray, session: IntArray) -> FloatArray:
@@ -205,17 +221,21 @@ def _by_neighbours(map_from_vehicle: FloatArray, stamp_s: FloatArray, session: I
     return np.asarray(moved / (stamp_s[behind] - stamp_s[before])[:, None])
 
 
-def row_of_verdict(name: str, seeds: Sequence[int]) -> str:
+def row_of_verdict(name: str, seeds: Sequence[int], faults: Sequence[str]) -> str:
     """One line of the table of the verdict."""
     failed, judged = 0, []
+    spoilt = []
     for seed in seeds:
         clean = map_one(Job(seed))
         in_turn = map_one(Job(seed, "straight", apart_s=APART_S, stated=True))
         failed += sum(right.status == "FAIL" for right in (clean, in_turn))
-        judged += [judge(map_one(Job(seed, spoil=spoil)), clean) for spoil in SPOILS if spoil != CLEAN]
+        of_seed = [map_one(Job(seed, spoil=spoil)) for spoil in faults]
+        judged += [judge(row, clean) for row in of_seed]
+        spoilt += of_seed
     silent = sum(judgement.silent for judgement in judged)
     told = [judgement.named for judgement in judged if judgement.told]
-    return f"{name:38s} {failed:7d} {silent:7d} {len(told):7d} {told.count('first'):7d}"
+    inside = shares_inside(spoilt)["corners"]
+    return f"{name:38s} {failed:7d} {silent:7d} {len(told):7d} {told.count('first'):7d} {inside:7.2f}"
 
 
 def terms() -> Iterator[Part]:
@@ -441,6 +461,7 @@ def main() -> None:
     parser.add_argument("--images", type=int, default=60)
     parser.add_argument("--only", default="")
     parser.add_argument("--verdict", nargs=2, type=int, metavar=("FIRST", "LAST"))
+    parser.add_argument("--faults", nargs="+", default=list(SPOILS), choices=SPOILS, metavar="NAME")
     parser.add_argument("--site", nargs=2, type=int, metavar=("FIRST", "LAST"))
     parser.add_argument("--drives", nargs="+", type=Path, default=[])
     parsed = parser.parse_args()
@@ -453,11 +474,11 @@ def main() -> None:
         print(*rows_of_site(parsed.only, range(*(parsed.site or (0, 0))), parsed.drives), sep="\n")
         return
     if parsed.verdict:
-        print(f"{'off':38s} {'failed':>7s} {'silent':>7s} {'told':>7s} {'first':>7s}")
+        print(f"{'off':38s} {'failed':>7s} {'silent':>7s} {'told':>7s} {'first':>7s} {'inside':>7s}")
         for name, off in sizes():
             if re.search(parsed.only, name):
                 with off():
-                    print(row_of_verdict(name, range(*parsed.verdict)), flush=True)
+                    print(row_of_verdict(name, range(*parsed.verdict), parsed.faults), flush=True)
         return
     shown = [example(index, 1.0, SEED) for index in range(parsed.images)]
     head = ("recall", "false", "all four", "median", "95 %", "squared")

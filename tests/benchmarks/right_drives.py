@@ -277,7 +277,7 @@ def _clause(finding: dict[str, Any]) -> str:
 
 def line(row: Row, clean: Row | None) -> str:
     """A drive as it is printed, against itself without the fault."""
-    shares = _shares([row])
+    shares = shares_inside([row])
     quantities = ("corners", "sides", "distances", "mountings", "heights")
     inside = " ".join(f"{shares[name]:.2f}" for name in quantities)
     mark = ""
@@ -334,7 +334,7 @@ def judge(row: Row, clean: Row) -> Judgement:
     if spoil.cause is not None and said:
         hits = [re.search(spoil.cause, clause, re.IGNORECASE) is not None for clause in said]
         named = "first" if hits[0] else "later" if any(hits) else "never"
-    held = _shares([row])["corners"] >= _HELD
+    held = shares_inside([row])["corners"] >= _HELD
     usual = bool(said) and not _said(row.findings, clean.findings, None)
     return Judgement(wrong, bool(said), bool(relied), held, usual, named)
 
@@ -353,7 +353,7 @@ def _said(
     ]
 
 
-def _shares(rows: Iterable[Row]) -> dict[str, float]:
+def shares_inside(rows: Iterable[Row]) -> dict[str, float]:
     """By quantity, the share of errors inside the 95 % region."""
     quantities = {name: (name,) for name in (*QUANTITIES, "heights")} | {"mountings": _MOUNTING}
     out = {}
@@ -397,7 +397,7 @@ def summary_of_right(rows: Sequence[Row]) -> list[str]:
         ("attitude recorded", [row for row in rows if row.road]),
         ("all", rows),
     ):
-        lines.append(f"{name:22s}" + " ".join(f"{share:9.3f}" for share in _shares(own).values()))
+        lines.append(f"{name:22s}" + " ".join(f"{share:9.3f}" for share in shares_inside(own).values()))
     rmse = np.array([row.rmse_m for row in rows])
     lines.append(
         f"corner RMSE, median {100 * np.nanmedian(rmse):.2f} cm, recall "
@@ -415,7 +415,7 @@ def summary_of_spoilt(rows: Sequence[Row], clean: dict[int, Row]) -> list[str]:
         own = [row for row in rows if row.spoil == spoil]
         counts = _counts([judge(row, clean[row.seed]) for row in own])
         totals.update(counts)
-        inside = f"{_shares(own)['corners']:7.2f}"
+        inside = f"{shares_inside(own)['corners']:7.2f}"
         lines.append(f"{spoil:18s}" + "".join(f"{counts[column]:7d}" for column in columns) + inside)
         said = Counter(finding["check"] for row in own for finding in row.findings)
         checks = ", ".join(f"{check} {count}" for check, count in said.most_common())

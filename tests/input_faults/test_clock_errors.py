@@ -121,13 +121,13 @@ def test_the_clock_of_each_session_errs_by_itself():
     assert along_m[:20].min() > 3 * along_m[40:].max()
 
 
-def test_parts_of_a_drive_tell_of_a_clock_what_they_add_up_to():
-    """With prior and each of two parts of 1 / (3 ms)^2 information, a sigma of 3 ms / sqrt(3)."""
+def test_second_moments_are_of_prior_and_evidence_together():
+    """With the prior and 2 / (3 ms)^2 of information, a sigma of 3 ms / sqrt(3)."""
     noise = [PoseNoise(clock_s=0.003)]
     silent = ClockEvidence(np.zeros((1, 1)), np.zeros(1))
-    np.testing.assert_allclose(second_moments([silent], noise), [[0.003]])
-    part = ClockEvidence(np.array([[0.003**-2.0]]), np.zeros(1))
-    np.testing.assert_allclose(second_moments([part, part], noise), [[0.003 / 3**0.5]])
-    late = ClockEvidence(np.array([[0.003**-2.0]]), np.array([0.006 / 0.003**2]))
-    # The mean is a third of what both say, 6 ms each: its square counts, too.
-    np.testing.assert_allclose(second_moments([late, late], noise), [[(0.004**2 + 0.003**2 / 3) ** 0.5]])
+    np.testing.assert_allclose(second_moments(silent, noise), [[0.003]])
+    told = ClockEvidence(np.array([[2 * 0.003**-2.0]]), np.zeros(1))
+    np.testing.assert_allclose(second_moments(told, noise), [[0.003 / 3**0.5]])
+    # The mean is two thirds of the 6 ms that the observations say: its square counts, too.
+    late = ClockEvidence(np.array([[2 * 0.003**-2.0]]), np.array([2 * 0.006 / 0.003**2]))
+    np.testing.assert_allclose(second_moments(late, noise), [[(0.004**2 + 0.003**2 / 3) ** 0.5]])

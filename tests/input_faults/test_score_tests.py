@@ -254,9 +254,21 @@ def drifting(scene: Scene):
     return replace(late.problem, observations=again.observations)
 
 
+def slipping(scene: Scene):
+    """Headings are the course of an antenna, off by .01 rad for each m/s2 to the side."""
+    problem = with_late_clocks(scene, np.zeros(2)).problem
+    twist = problem.twist_vehicle
+    assert twist is not None
+    turn = np.zeros((len(twist), 6))
+    turn[:, 5] = -0.01 * np.hypot(twist[:, 0], twist[:, 1]) * twist[:, 5]
+    poses = problem.map_from_vehicle @ exp(turn)
+    return replace(problem, map_from_vehicle=poses, pose_sigma=PoseSigma(heading_slip=0.005))
+
+
 @pytest.mark.parametrize(
     ("change", "fault", "value"),
     [
+        (slipping, table.SLIP, 0.01),
         (knocked, table.KNOCK, 0.0105),
         (loaded, table.KNOCK, 0.0105),
         (stepped, table.STEP, 0.3),
@@ -273,6 +285,13 @@ def test_a_fault_that_begins_or_grows_on_the_way_is_the_likeliest(change, fault:
     assert first.fault is fault
     assert abs(first.value) == pytest.approx(value, rel=0.25)
     assert first.sigmas > 5
+
+
+def test_headings_that_were_measured_do_not_slip():
+    street = make_scene(3, frames=40, every_m=3.0, jitter=None, start_error_deg=0.3)
+    problem = replace(slipping(street), pose_sigma=PoseSigma())
+    tests = score_faults(problem, solve(problem, OPTIONS))
+    assert not any(test.fault is table.SLIP for test in tests)
 
 
 def test_noise_that_goes_together_along_the_route_contradicts_nothing():

@@ -116,3 +116,16 @@ def test_the_sizes_of_every_fault_rise_from_what_matters_over_what_is_usual_to_w
 def test_the_table_and_the_odds_are_read_without_torch():
     code = "import sys, v2hdm.faults.table, v2hdm.faults.odds; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_slip_is_named_before_a_clock_that_explains_as_much_and_contradicts_nothing():
+    both = ("front", "rear")
+    slip = Contradiction(table.SLIP.name, -1, 0, -1, 0.004, 0.001, 0.001, 3e-5, 8.0)
+    clock = Contradiction(table.CLOCK.name, -1, 0, -1, 0.015, 0.0036, 0.003, 3e-5, 8.0, both)
+    assert log_odds(slip) > log_odds(clock) + np.log(10)
+    assert not is_contradicted(slip)
+    findings = check_inputs(evidence(score_tests=(slip, clock)))
+    raised = [finding for finding in findings if finding.status is not Status.PASS]
+    assert [finding.status for finding in raised] == [Status.WARN]
+    assert raised[0].check == "heading slip"
+    assert raised[0].says.startswith("in bends the headings, an antenna's course, are off by 0.23 deg")

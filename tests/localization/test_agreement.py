@@ -4,26 +4,28 @@ import numpy as np
 import pytest
 
 from tests.localization.driven import drive, mapped, moved, yard
-from v2hdm.localization.agreement import offset_gain
+from v2hdm.localization.agreement import offset_likelihood
 from v2hdm.localization.localizer import Localizer, Status
 
 SHARP_M2 = 0.02**2 * np.eye(2)
 
 
 def test_a_detection_on_its_marking_speaks_for_the_map():
-    assert offset_gain(np.zeros(2), SHARP_M2) == pytest.approx(np.log(0.5 / 0.85), abs=0.02)
+    assert offset_likelihood(np.zeros(2), SHARP_M2).gain == pytest.approx(np.log(0.5 / 0.85), abs=0.02)
 
 
 def test_a_detection_30_cm_beside_its_marking_speaks_for_paint_that_was_moved():
-    assert offset_gain(np.array([0.3, 0.0]), SHARP_M2) > 2.0
+    assert offset_likelihood(np.array([0.3, 0.0]), SHARP_M2).gain > 2.0
 
 
 def test_a_detection_far_from_any_marking_says_little():
-    assert offset_gain(np.array([5.0, 0.0]), SHARP_M2) == pytest.approx(np.log(0.2 / 0.13), abs=0.05)
+    assert offset_likelihood(np.array([5.0, 0.0]), SHARP_M2).gain == pytest.approx(
+        np.log(0.2 / 0.13), abs=0.05
+    )
 
 
 def test_what_is_known_to_half_a_metre_says_nothing_of_30_cm():
-    assert offset_gain(np.array([0.3, 0.0]), 0.5**2 * np.eye(2)) < 0
+    assert offset_likelihood(np.array([0.3, 0.0]), 0.5**2 * np.eye(2)).gain < 0
 
 
 @pytest.mark.parametrize("angle_rad", [0.3, 1.2, 2.9])
@@ -31,8 +33,8 @@ def test_the_direction_of_north_plays_no_part(angle_rad):
     turn = np.array([[np.cos(angle_rad), -np.sin(angle_rad)], [np.sin(angle_rad), np.cos(angle_rad)]])
     off_m = np.array([0.2, 0.05])
     covariance_m2 = np.diag([0.1, 0.02]) ** 2
-    turned = offset_gain(turn @ off_m, turn @ covariance_m2 @ turn.T)
-    assert turned == pytest.approx(offset_gain(off_m, covariance_m2))
+    turned = offset_likelihood(turn @ off_m, turn @ covariance_m2 @ turn.T).gain
+    assert turned == pytest.approx(offset_likelihood(off_m, covariance_m2).gain)
 
 
 @pytest.mark.parametrize("seed", range(4))

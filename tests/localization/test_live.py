@@ -19,7 +19,8 @@ from v2hdm.geometry.rigid import exp
 from v2hdm.io.calibration.writing import write_calibration
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.localization import belief, live
-from v2hdm.localization.localizer import Fix, Localizer, Status
+from v2hdm.localization.antenna import Fix
+from v2hdm.localization.localizer import Localizer, Status
 from v2hdm.localization.motion import Motion, MotionLog, MotionNoise
 from v2hdm.localization.seeing import Look, expect
 from v2hdm.localization.stream import MotionLines, look_of, pose_record
@@ -82,9 +83,20 @@ def test_a_vehicle_that_knows_nothing_finds_itself_by_the_pattern_of_the_marking
     assert (np.abs(errors) < bounds).all()
 
 
-def test_a_pattern_that_repeats_is_no_place():
+@pytest.mark.parametrize("seed", range(3))
+def test_a_vehicle_that_stands_finds_itself_without_moving(seed):
+    painted = yard(seed)
+    driven = drive(painted, seed, seconds=2.0, speed=0.0, begin_m=40.0)
+    errors, bounds = tracked(driven, follow(driven, mapped(painted, seed), seed))
+    assert len(errors) > 5
+    assert np.abs(errors[:, :2]).max() < 0.05
+    assert (np.abs(errors) < bounds).all()
+
+
+@pytest.mark.parametrize("speed", [4.0, 0.0])
+def test_a_pattern_that_repeats_is_no_place(speed):
     painted = yard(5, diamonds=False)
-    driven = drive(painted, 5, begin_m=60.0, seconds=4.0)
+    driven = drive(painted, 5, begin_m=60.0, seconds=4.0, speed=speed)
     poses = follow(driven, mapped(painted, 5))
     assert not any(pose.status == Status.TRACKING for pose in poses)
     assert all(np.isinf(pose.protection_m).all() for pose in poses)

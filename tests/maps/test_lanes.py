@@ -16,6 +16,7 @@ from v2hdm.io.maps.formats import write_map
 from v2hdm.io.maps.road_curves import Course, thinned
 from v2hdm.records import HDMap
 from v2hdm.store.files import load_json
+from v2hdm.topology.answers import Answer
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # of the readers' own libraries
 
@@ -44,6 +45,10 @@ def routing(lanelets):
 def end_of(lanelet, which):
     point = lanelet.centerline[which % len(lanelet.centerline)]
     return np.array([point.x, point.y])
+
+
+def end_of_line(line):
+    return np.mean([[point.x, point.y] for point in line], axis=0)
 
 
 def lanelet_at(lanelets, place, which):
@@ -113,11 +118,72 @@ def test_give_way_lines_are_rules_of_right_of_way_and_stop_lines_signs(files):
         assert rule.stopLine is not None
 
 
+@pytest.fixture(scope="module")
+def answered(tmp_path_factory):
+    """The files of the site with a speed stated, and that from south and north one waits at the crossing."""
+    site = made_site()
+    stated = {"south in": "yes", "north in": "yes", "west in": "no", "east in": "no"}
+    answers = [
+        Answer("right of way", answer, np.array(ENDS[name], dtype=float), None, "answers, feature 1")
+        for name, answer in stated.items()
+    ]
+    answers.append(Answer("speed", "30", np.zeros(2), None, "answers, feature 5"))
+    folder = tmp_path_factory.mktemp("answered")
+    formats = ["lanelet2", "opendrive"]
+    paths = write_map(site.hd_map, folder, "map", formats, trajectories=site.trajectories, answers=answers)
+    return {path.suffix: path for path in paths}
+
+
+def test_a_stated_right_of_way_is_a_rule_that_lanelet2_reads_at_the_line_that_is_painted(answered):
+    lanelets = loaded(answered[".osm"])
+    assert not list(routing(lanelets).checkValidity())
+    manoeuvre = lanelet2.core.ManeuverType
+    for name in ("south in", "north in"):
+        lane = lanelet_at(lanelets, ENDS[name], -1)
+        (rule,) = [rule for rule in lane.regulatoryElements if rule.attributes["subtype"] == "right_of_way"]
+        assert rule.getManeuver(lane) == manoeuvre.Yield
+        first = rule.rightOfWayLanelets()
+        assert len(first) >= 2
+        assert {rule.getManeuver(lanelet) for lanelet in first} == {manoeuvre.RightOfWay}
+        assert np.linalg.norm(end_of_line(rule.stopLine) - ENDS[name]) < 3.0
+    for name in ("west in", "east in"):
+        assert not lanelet_at(lanelets, ENDS[name], -1).regulatoryElements
+
+
+def test_a_stated_speed_is_the_limit_of_every_lane_in_both_formats(answered):
+    rules = lanelet2.traffic_rules.create(
+        lanelet2.traffic_rules.Locations.Germany, lanelet2.traffic_rules.Participants.Vehicle
+    )
+    lanelets = loaded(answered[".osm"])
+    limits = {rules.speedLimit(lanelet).speedLimit for lanelet in lanelets.laneletLayer}
+    np.testing.assert_allclose(sorted(limits), [30.0])  # km/h
+    speeds = ET.parse(answered[".xodr"]).getroot().findall("road/type/speed")
+    assert {(speed.get("max"), speed.get("unit")) for speed in speeds} == {("30", "km/h")}
+
+
+def test_a_stated_right_of_way_gives_junction_roads_priority(files, answered):
+    def priorities(path):
+        return {
+            (entry.get("high"), entry.get("low"))
+            for entry in ET.parse(path).getroot().findall("junction/priority")
+        }
+
+    roads = {road.get("id"): road for road in ET.parse(answered[".xodr"]).getroot().findall("road")}
+    stated = priorities(answered[".xodr"]) - priorities(files[".xodr"])
+    assert stated
+    for high, low in stated:
+        start = [float(roads[low].find("planView/geometry").get(axis)) for axis in "xy"]
+        assert abs(start[1]) > 9  # from the south or north
+        start = [float(roads[high].find("planView/geometry").get(axis)) for axis in "xy"]
+        assert abs(start[0]) > 9  # from the west or east
+
+
 def test_questions_are_written_beside_the_lanes(files):
     content = load_json(files[".geojson"], ValueError)
     subjects = [feature["properties"]["subject"] for feature in content["features"]]
-    assert sorted(set(subjects)) == ["connection", "speed"]
+    assert sorted(set(subjects)) == ["connection", "right of way", "speed"]
     assert subjects.count("connection") == 8
+    assert subjects.count("right of way") == 4  # arms of the crossing; at the T lines are painted
     shapes = {feature["geometry"]["type"] for feature in content["features"]}
     assert shapes == {"LineString", "Point"}
 

@@ -63,7 +63,7 @@ def test_a_turn_that_is_allowed_becomes_a_way_as_round_as_an_arc():
     graph = lane_graph(site.hd_map, site.trajectories, answers)
     more = {(ENDS[before], ENDS[after]) for before, after in UNDRIVEN}
     assert matched(ways_of(graph), WAYS | more) == WAYS | more
-    assert {question.subject for question in graph.questions} == {"speed"}
+    assert {question.subject for question in graph.questions} == {"speed", "right of way"}
     ends = np.array([ENDS["south in"], ENDS["east out"]])
     (lane,) = [
         lane for lane in graph.lanes if np.linalg.norm(lane.centre_map[[0, -1]] - ends, axis=1).max() < NEAR_M
@@ -78,7 +78,7 @@ def test_a_turn_that_is_not_allowed_is_asked_no_more():
     asked = lane_graph(site.hd_map, site.trajectories).questions
     graph = lane_graph(site.hd_map, site.trajectories, answers_to(asked, "no", "connection"))
     assert matched(ways_of(graph), WAYS) == WAYS
-    assert {question.subject for question in graph.questions} == {"speed"}
+    assert {question.subject for question in graph.questions} == {"speed", "right of way"}
 
 
 def test_a_stated_speed_is_that_of_all_lanes():

@@ -46,7 +46,7 @@ def test_what_no_drive_took_is_asked_and_nothing_else():
     truth = {(ENDS[before], ENDS[after]) for before, after in UNDRIVEN}
     assert len(asked) == len(truth)
     assert matched(places, truth) == truth
-    assert {question.subject for question in graph.questions} == {"connection", "speed"}
+    assert {question.subject for question in graph.questions} == {"connection", "speed", "right of way"}
 
 
 def test_a_turn_that_only_one_drive_took_is_asked_without_it():

@@ -12,12 +12,19 @@ from tests.mapping.scene import SceneOptions, make_scene
 from tests.report.yard import SURVEY_M, checked, point, yard
 from tests.verdict.drives import INFO, square_at
 from v2hdm.faults import Contradiction, table
+from v2hdm.faults.odds import probability_of_any
 from v2hdm.mapping.results import CameraFit, ForeignSegment, MethodResult, SolveEvidence
 from v2hdm.records import Calibration, Exclusion, GroundStrip, HDMap
 from v2hdm.site.candidates import LACKS_A_CORNER
 from v2hdm.verdict import Finding, Status, Verdict
 from v2hdm.verdict.results.accuracy import SIGNIFICANCE, check_frame, check_goal, check_points
-from v2hdm.verdict.results.solution import check_inputs, check_solution, over_ground, told_by_poses
+from v2hdm.verdict.results.solution import (
+    check_inputs,
+    check_solution,
+    doubted,
+    over_ground,
+    told_by_poses,
+)
 from v2hdm.verdict.verdict import passed
 
 FIT = CameraFit(observations=2000, variance_factor=0.15, rejected_share=0.01, sightings=400.0)
@@ -195,6 +202,8 @@ def test_stamps_that_jitter_explain_a_step_that_they_are_likelier_than_and_no_do
     scale = replace(contradiction(table.SCALE, ("front",), 0, "", -0.13, 0.025, 4.0), gain=13.5)
     told = [f for f in check_inputs(replace(noisy, score_tests=(scale,))) if f.status is not Status.PASS]
     assert [(f.check, f.status) for f in told] == [("image stamps", Status.WARN)]
+    assert doubted(replace(noisy, score_tests=(scale,))) is None, "nor does the headline doubt it"
+    assert doubted(replace(FINE, score_tests=(scale,))) == scale
     clock = replace(contradiction(table.CLOCK, ("front",), 0, "", 0.03, 0.002, 12.0), gain=72.0)
     told = [f for f in check_inputs(replace(noisy, score_tests=(clock,))) if f.status is not Status.PASS]
     assert [f.check for f in told] == ["clock", "image stamps"], "what is likelier than them is told"
@@ -215,6 +224,18 @@ def test_a_doubt_names_every_cause_that_is_nearly_as_likely():
     ]
     assert "focal length fy of front is 0.8 % shorter" in told.says
     assert "or the principal point of front and rear lies -13 px" in told.says
+
+
+@pytest.mark.parametrize(("count", "is_told"), [(1, False), (2, True)])
+def test_causes_each_of_which_is_unlikely_are_doubted_together(count, is_told):
+    tests = tuple(
+        contradiction(table.SURVEY, (camera,), 0, "", 0.09, 0.026, 3.1)
+        for camera in ("front", "rear")[:count]
+    )
+    assert 0.025 < probability_of_any(tests[:1]) < 0.05
+    told = [f for f in check_inputs(replace(FINE, score_tests=tests)) if f.status is not Status.PASS]
+    assert [(f.check, f.status) for f in told] == [("survey", Status.WARN)] * is_told
+    assert all("front" in f.says and "rear" in f.says for f in told)
 
 
 @pytest.mark.parametrize("recorded", [Status.WARN, Status.FAIL])

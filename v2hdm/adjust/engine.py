@@ -91,6 +91,10 @@ class TorchEngine:
         """The same engine over another problem."""
         return type(self)(arrays)
 
+    def keeping(self, frames: Tensor, corners: Tensor) -> TorchEngine:
+        """The same engine, which eliminates a border of ``frames`` and ``corners`` last if it can."""
+        return self
+
     @cached_property
     def _tiles(self) -> list[tuple[int, ...]]:
         """Tiles that each block of observations touches; none if frames have no states."""

@@ -159,7 +159,8 @@ class PoseSigma:
     """Standard deviations of the recorded poses, per state of a frame.
 
     A ``..._drift`` is the correlated part, for frames in driving order; the rest, in quadrature, is white. A
-    position drift keeps its direction in the map, and so rotates in the vehicle frame.
+    position drift keeps its direction in the map, and so rotates in the vehicle frame. ``heading_slip`` is
+    that of :class:`~v2hdm.records.PoseNoise`; no state, it tells which faults the headings can have.
     """
 
     position_m: float = 0.02
@@ -169,6 +170,7 @@ class PoseSigma:
     position_drift: Drift = Drift()
     heading_drift: Drift = Drift()
     roll_pitch_drift: Drift = Drift()
+    heading_slip: float = 0.0
 
     def by_state(self) -> FloatArray:
         """Sigmas (6,) in the order of :data:`POSE_STATES`."""

@@ -154,6 +154,7 @@ class Plan:
     pattern: Pattern  # nonzero tiles and their elimination order
     kept_corners: Tensor  # (n,) corners not eliminated before the frames, ascending
     most_tiles: int = 0  # largest number of tiles that the observations of a unit of corners touch
+    border_tiles: int = 0  # number of tiles, the last in the elimination order, that a border is in
 
     @property
     def tile_count(self) -> int:
@@ -169,6 +170,18 @@ class Plan:
     def position(self) -> Tensor:
         """Position of each tile in the elimination order."""
         return torch.tensor(self.pattern.position, dtype=torch.int64, device=self.kept_corners.device)
+
+    def kept_rows(self, number: Tensor) -> Tensor:
+        """Rows (..., 2) of kept corners, by their numbers."""
+        per_tile = self.size // 2
+        first = self.position[self.frame_tiles + number // per_tile] * self.size + number % per_tile * 2
+        return first[..., None] + torch.arange(2, device=number.device)
+
+    def frame_rows(self, frame: Tensor, states: int) -> Tensor:
+        """Rows (n, S) of the states of frames (n,)."""
+        begin = self.position[frame // self.frames_per_tile] * self.size
+        within = frame % self.frames_per_tile * states
+        return (begin + within)[:, None] + torch.arange(states, device=frame.device)
 
 
 def frames_per_tile(arrays: Arrays) -> int:
@@ -292,12 +305,11 @@ class ReducedSystem:
         triangle.
         """
         plan = self.plan
-        axes = torch.arange(2, device=index.device)
         by_state = self.spread.by_state(run, coupling)
-        rows = self._kept_rows(run.corner)[:, None] + axes
-        columns = self._frame_rows(self.arrays.frame_of(run.pair))
+        rows = plan.kept_rows(run.corner)
+        columns = plan.frame_rows(self.arrays.frame_of(run.pair), len(self.arrays.states))
         self._scatter(rows[:, :, None], columns[:, None, :], by_state)
-        first, second = self._kept_rows(index)[..., None] + axes
+        first, second = plan.kept_rows(index)
         self._scatter(first[:, :, None], second[:, None, :], blocks)
         on_diagonal = index[0] == index[1]
         self._diagonal[first[on_diagonal]] = blocks[on_diagonal].diagonal(dim1=1, dim2=2)
@@ -305,20 +317,6 @@ class ReducedSystem:
         for tile, part in enumerate(torch.split(border, plan.size // 2 * 2)):
             place = plan.pattern.position[plan.frame_tiles + tile]
             self.matrix.tiles[TIP, place][:, : len(part)] += part.mT
-
-    def _kept_rows(self, number: Tensor) -> Tensor:
-        """First rows of kept corners, by their numbers."""
-        plan = self.plan
-        per_tile = plan.size // 2
-        return plan.position[plan.frame_tiles + number // per_tile] * plan.size + number % per_tile * 2
-
-    def _frame_rows(self, frame: Tensor) -> Tensor:
-        """Rows (n, S) of the states of frames (n,)."""
-        plan = self.plan
-        states = len(self.arrays.states)
-        begin = plan.position[frame // plan.frames_per_tile] * plan.size
-        within = frame % plan.frames_per_tile * states
-        return (begin + within)[:, None] + torch.arange(states, device=frame.device)
 
     def _scatter(self, rows: Tensor, columns: Tensor, values: Tensor) -> None:
         """Add values at rows and columns of the tiles, at the lower triangle's of two mirrored ones."""
@@ -371,7 +369,7 @@ class ReducedSystem:
         border = arrays.over_moments((by_state.mT @ spread.camera).permute(1, 2, 0, 3).flatten(2))
         for column, part in enumerate(to_tiles(plan, border).chunk(plan.tile_count)):
             self.matrix.tiles[TIP, column].add_(part.mT)
-        rows = self._frame_rows(torch.arange(arrays.frame_count, device=border.device))
+        rows = plan.frame_rows(torch.arange(arrays.frame_count, device=border.device), len(arrays.states))
         self._scatter(rows[:, :, None], rows[:, None, :], by_frame.tril())
         if bool(priors.across.any()):
             self._scatter(rows[1:, :, None], rows[:-1, None, :], priors.across[1:])

@@ -320,7 +320,8 @@ def _scaled(stated: PoseSigma, scales: Mapping[str, _Scales]) -> PoseSigma:
     (height_m, _) = out["height"]
     (attitude_rad, attitude) = out["roll_pitch"]
     (heading_rad, heading) = out["heading"]
-    return PoseSigma(position_m, heading_rad, attitude_rad, height_m, position, heading, attitude)
+    drifts = position, heading, attitude
+    return PoseSigma(position_m, heading_rad, attitude_rad, height_m, *drifts, stated.heading_slip)
 
 
 def _scales(problem: Problem, drawn: FloatArray, name: str) -> _Scales:

@@ -9,7 +9,7 @@ Large Sparse Positive Definite Systems, 1981): time and memory grow linearly wit
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from heapq import heapify, heappop, heappush
 from itertools import combinations
@@ -72,13 +72,21 @@ class Pattern:
         return float(np.sum(size**3 / 6 + heights * size**2 / 2 + heights**2 * size / 2))
 
 
-def find_pattern(tile_count: int, cliques: Iterable[Sequence[int]], least_degree: bool = False) -> Pattern:
-    """Pattern of the factor of a matrix that couples all tiles of each clique."""
+def find_pattern(
+    tile_count: int,
+    cliques: Iterable[Sequence[int]],
+    least_degree: bool = False,
+    last: Sequence[int] = (),
+) -> Pattern:
+    """Pattern of the factor of a matrix that couples all tiles of each clique, some eliminated ``last``."""
     edges = {pair for clique in cliques for pair in combinations(sorted(clique), 2)}
     position = np.arange(tile_count)
     if edges:
         order = _least_degree(tile_count, edges) if least_degree else _cuthill_mckee(tile_count, edges)
         position[order] = np.arange(tile_count)
+    if len(last):
+        is_last = np.isin(np.arange(tile_count), last)
+        position[np.lexsort((position, is_last))] = np.arange(tile_count)
     below: list[set[int]] = [set() for _ in range(tile_count)]
     for first_tile, second_tile in edges:
         low, high = sorted((int(position[first_tile]), int(position[second_tile])))
@@ -172,6 +180,13 @@ class TiledCholesky:
     def pivots(self) -> Tensor:
         """Squares of L's diagonal."""
         return torch.cat([tile.diagonal() for tile in (*self.diagonal, self.tip)]).square()
+
+    def tail(self, tiles: int) -> TiledCholesky:
+        """The factor of the last tiles and the tip, all before them eliminated."""
+        begin = len(self.diagonal) - tiles
+        offset = sum(len(tile) for tile in self.diagonal[:begin])
+        rows = tuple(of_panel - offset for of_panel in self.rows[begin:])
+        return replace(self, diagonal=self.diagonal[begin:], panels=self.panels[begin:], rows=rows)
 
     @cached_property
     def _flat(self) -> Flat:

@@ -26,6 +26,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from v2hdm.cli.command import Command
+from v2hdm.cli.old_names import renamed_file, renamed_overrides
 from v2hdm.errors import ConfigError, V2hdmError, masked, shown
 from v2hdm.io.description import DRIVE_FILE
 from v2hdm.safe.texts import read_yaml
@@ -89,13 +90,16 @@ def work_on(command: Command, door: Door, work: Callable[[Job], int | None], arg
     if parsed.help:
         print(help_text(command, door))
         return 0
+    overrides = renamed_overrides(parsed.overrides)
     try:
-        _check_own_files(parsed.config_dir, parsed.overrides)
-        composed = _compose(door.name, door.schema, parsed.overrides, parsed.config_dir)
+        _check_own_files(parsed.config_dir, overrides)
+        with tempfile.TemporaryDirectory(prefix="v2hdm-") as folder:
+            renamed = _renamed_files(parsed.config_dir, overrides, Path(folder))
+            composed = _compose(door.name, door.schema, overrides, [*renamed, *parsed.config_dir])
     except V2hdmError:
         raise
     except Exception as error:  # whatever Hydra, OmegaConf and PyYAML raise about texts that users wrote
-        raise explain(error, door.schema, parsed.overrides) from error
+        raise explain(error, door.schema, overrides) from error
     if parsed.cfg:
         print(masked(OmegaConf.to_yaml(composed)))
         return 0
@@ -127,9 +131,14 @@ def compose_run_file(path: Path, name: str, schema: type[Any], overrides: Sequen
         # Under a name of ours: Hydra takes no others than those of identifiers.
         run = Path(folder) / "run" / "chosen_run_file.yaml"
         run.parent.mkdir()
-        shutil.copyfile(path, run)
+        text = renamed_file(path)
+        if text is None:
+            shutil.copyfile(path, run)
+        else:
+            run.write_text(text, encoding="utf-8")
+        words = [f"+run={run.stem}", *renamed_overrides(overrides)]
         try:
-            return _compose(name, schema, [f"+run={run.stem}", *overrides], [Path(folder), *searched])
+            return _compose(name, schema, words, [Path(folder), *searched])
         except Exception as error:  # as in work_on
             # What the line does not name is the file's.
             of_line = [
@@ -154,6 +163,16 @@ def _check_own_files(folders: Sequence[Path], overrides: Sequence[str]) -> None:
                 read_yaml(path, ConfigError)
                 if group == "run":
                     _refuse_headless(path)
+
+
+def _renamed_files(folders: Sequence[Path], overrides: Sequence[str], scratch: Path) -> list[Path]:
+    """A folder with the chosen run files that have names of 1.0, by those of now; none where no file has."""
+    for group, _, chosen in (override.lstrip("+").partition("=") for override in overrides):
+        for path in (folder / group / f"{chosen}.yaml" for folder in folders if group == "run"):
+            if path.is_file() and (text := renamed_file(path)) is not None:
+                (scratch / group).mkdir(exist_ok=True)
+                (scratch / group / path.name).write_text(text, encoding="utf-8")
+    return [scratch] if (scratch / "run").is_dir() else []
 
 
 def _refuse_headless(path: Path) -> None:
@@ -215,10 +234,6 @@ _NOISE = re.compile(
 _UNQUOTED = re.compile(r"Lexer|no viable alternative|mismatched input|extraneous input|Unknown function")
 
 
-_INSTEAD = {"max_sigma_m": "mapping.acceptance.accuracy=A, B or C takes its place (docs/accuracy.md)"}
-"""Keys that are no more, and what to set now."""
-
-
 def _advice(message: str, schema: type[Any]) -> str:
     if _UNQUOTED.search(message):
         return "a value with special characters needs quotes: \"drive.path='müll (1)'\""
@@ -229,8 +244,6 @@ def _advice(message: str, schema: type[Any]) -> str:
     if listed:
         return f"write {listed.group(1)}=[{listed.group(2)}]"
     unknown = re.search(r"[Kk]ey '([\w.]+)' (?:not in|is not in)", message)
-    if unknown and unknown.group(1).split(".")[-1] in _INSTEAD:
-        return _INSTEAD[unknown.group(1).split(".")[-1]]
     if unknown:
         leaves = [key.name.split(".") for key in keys_of(schema)]
         keys = dict.fromkeys(".".join(parts[:end]) for parts in leaves for end in range(1, len(parts) + 1))

@@ -23,16 +23,20 @@ from v2hdm.adjust.problem import Problem
 from v2hdm.adjust.solution import Solution
 from v2hdm.faults.columns import Hypothesis, lateness
 from v2hdm.faults.score_tests import noise_multiples
-from v2hdm.faults.sensitivity import Sensitivity
+from v2hdm.faults.sensitivity import Follow, Sensitivity, to_optimum
 from v2hdm.records import FloatArray, PoseNoise
 
 
 @dataclass(frozen=True)
-class _Error:
+class ClockError:
     """An error of the clock: ``share`` (J,) of it at each frame."""
 
     share: FloatArray
     is_drift: bool = False
+
+    def hypothesis(self, problem: Problem) -> Hypothesis:
+        """The error as a fault of a problem."""
+        return lateness(problem, self.share, is_drift=self.is_drift)
 
 
 class ClockEvidence(NamedTuple):
@@ -45,11 +49,13 @@ class ClockEvidence(NamedTuple):
 class ClockErrors(NamedTuple):
     """The errors of clocks as a whole drive shows them, of which a problem is a part.
 
-    ``root`` (n, n) is one of their second moments, ``rising`` (J,) the share of a drift at each frame.
+    ``root`` (n, n) is one of their second moments, ``rising`` (J,) the share of a drift at each frame. The
+    rest of the problem follows them as ``follow`` says.
     """
 
     root: FloatArray
     rising: FloatArray
+    follow: Follow
 
 
 def moves_with_clocks(
@@ -61,52 +67,39 @@ def moves_with_clocks(
     unless it is stated. None where the clock is stated to be right, or nothing moves.
     """
     twist = problem.twist_vehicle
-    errors = list(_errors(problem, noises, None if known is None else known.rising))
+    errors = list(errors_of_clocks(problem, noises, None if known is None else known.rising))
     if not errors or twist is None:
         return None
     solved = Sensitivity.at(solution.covariance.whitening)
-    late = [lateness(problem, error.share, is_drift=error.is_drift) for error in errors]
-    root = second_moments([_evidence(solved, late)], noises) if known is None else known.root
+    late = [error.hypothesis(problem) for error in errors]
+    root = second_moments(_evidence(solved, late), noises) if known is None else known.root
     columns = [hypothesis.column(solved)["observations"].flatten().cpu().numpy() for hypothesis in late]
-    moved = solved.moves(np.stack(columns, axis=1))
+    moved = solved.moves(np.stack(columns, axis=1), to_optimum if known is None else known.follow)
     # A pose is where the vehicle was at the stamp: it errs by the way until the exposure, too.
     of_way = np.stack([np.asarray(twist) * error.share[:, None] for error in errors], axis=2)
     return Moves(moved.corners @ root, moved.extrinsic @ root, (of_way + moved.poses) @ root)
 
 
-def clock_evidence(
-    problem: Problem, solution: Solution, noises: Sequence[PoseNoise], rising: FloatArray
-) -> ClockEvidence | None:
-    """The evidence of a problem, part of a drive, on its clocks; None where these are stated to be right."""
-    errors = list(_errors(problem, noises, rising))
-    if not errors or problem.twist_vehicle is None:
-        return None
-    solved = Sensitivity.at(solution.covariance.whitening)
-    return _evidence(solved, [lateness(problem, error.share, is_drift=error.is_drift) for error in errors])
-
-
-def second_moments(evidence: Sequence[ClockEvidence], noises: Sequence[PoseNoise]) -> FloatArray:
-    """Root (n, n) of the second moments of the errors, s, under prior and the evidence of all parts."""
+def second_moments(evidence: ClockEvidence, noises: Sequence[PoseNoise]) -> FloatArray:
+    """Root (n, n) of the second moments of the errors, s, under prior and evidence."""
     sigma_s = [sigma for noise in noises for sigma in (noise.clock_s, noise.clock_drift_s) if sigma > 0]
-    information = np.sum([part.information for part in evidence], axis=0)
-    score = np.sum([part.score for part in evidence], axis=0)
-    covariance = np.linalg.inv(np.diag(np.array(sigma_s) ** -2.0) + information)
-    mean = covariance @ score
+    covariance = np.linalg.inv(np.diag(np.array(sigma_s) ** -2.0) + evidence.information)
+    mean = covariance @ evidence.score
     return np.asarray(np.linalg.cholesky(covariance + np.outer(mean, mean)), dtype=np.float64)
 
 
-def _errors(
+def errors_of_clocks(
     problem: Problem, noises: Sequence[PoseNoise], rising: FloatArray | None = None
-) -> Iterator[_Error]:
+) -> Iterator[ClockError]:
     """Lateness and drift of each session's clock, as far as they may differ from zero."""
     for session, noise in enumerate(noises):
         is_own = problem.session_of_frame == session
         drift = np.zeros(len(is_own))
         drift[is_own] = np.linspace(-0.5, 0.5, int(is_own.sum())) if rising is None else rising[is_own]
         if noise.clock_s > 0:
-            yield _Error(is_own.astype(np.float64))
+            yield ClockError(is_own.astype(np.float64))
         if noise.clock_drift_s > 0:
-            yield _Error(drift, is_drift=True)
+            yield ClockError(drift, is_drift=True)
 
 
 def _evidence(solved: Sensitivity, late: Sequence[Hypothesis]) -> ClockEvidence:

@@ -38,6 +38,9 @@ _FOCAL_SHARES = ((1.0, 1.0), (0.0, 1.0))
 One of fx alone looks like one of both: over a plane, fy is nearly the camera's height.
 """
 
+_SURE_SLIP = 0.001
+"""Standard deviation of the slip, rad for each m/s2, below which the poses themselves tell it, as by gyro."""
+
 _LEAST_SPEED_MPS = 0.5  # a slower vehicle has no course
 
 Column = Callable[[Sensitivity], Rows]
@@ -169,6 +172,12 @@ def _course(setting: Setting) -> Iterator[Hypothesis]:
         yield Hypothesis(table.COURSE, _moving(partial(_sideslip, setting.problem)))
 
 
+def _slip(setting: Setting) -> Iterator[Hypothesis]:
+    slip = max(sigma.heading_slip for sigma in setting.problem.pose_sigmas)
+    if setting.is_moving and slip > _SURE_SLIP:
+        yield Hypothesis(table.SLIP, _moving(partial(_slipping, setting.problem)))
+
+
 def _survey(setting: Setting) -> Iterator[Hypothesis]:
     for axis in range(3 if setting.has_centres else 0):
         for camera in setting.cameras:
@@ -211,6 +220,7 @@ OF_DRIVE: dict[Fault, Callable[[Setting], Iterator[Hypothesis]]] = {
     table.STEP: _step,
     table.CROWN: _crown,
     table.COURSE: _course,
+    table.SLIP: _slip,
     table.SURVEY: _survey,
     table.LEVER: _lever,
     table.SCALE: _scale,
@@ -279,6 +289,14 @@ def _sideslip(problem: Problem, _: Arrays, out: Tensor) -> Tensor:
     speed = np.hypot(twist[:, 0], twist[:, 1])
     curvature = np.where(speed > _LEAST_SPEED_MPS, twist[:, 5] / np.maximum(speed, _LEAST_SPEED_MPS), 0.0)
     out[..., 5] = -torch.as_tensor(curvature).to(out.device)
+    return out
+
+
+def _slipping(problem: Problem, _: Arrays, out: Tensor) -> Tensor:
+    """Heading taken from a course that the acceleration to the side has turned."""
+    twist = np.asarray(problem.twist_vehicle)
+    aside = np.hypot(twist[:, 0], twist[:, 1]) * twist[:, 5]
+    out[..., 5] = torch.as_tensor(aside).to(out.device)
     return out
 
 

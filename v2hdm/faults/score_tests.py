@@ -48,43 +48,13 @@ _ROUNDS = 50  # towards the variances of the noise, which settle to 1 %
 
 
 @dataclass(frozen=True)
-class _Answer:
-    """Scores and information of the route's segments on one fault."""
+class Segments:
+    """Scores and information of the route's G segments on one fault; the last of each are of no segment."""
 
-    hypothesis: Hypothesis
-    score: FloatArray  # (G + 1,) s_g; the last is of priors of no segment
-    information: FloatArray  # (G + 1,) w_g, likewise
-    of_surveys: tuple[float, float]  # score and information of the cameras' surveyed centres
+    score: FloatArray  # (G + 1,) s_g
+    information: FloatArray  # (G + 1,) w_g
     drawn: FloatArray  # (D, G + 1) scores of noise drawn from the model
-    by_noise: FloatArray  # (N,) information by the kind of noise
     information_alone: float  # the fault's information with all else known
-
-    @classmethod
-    def to(cls, hypotheses: Sequence[Hypothesis], solved: Sensitivity) -> list[_Answer]:
-        """The segments' scores at a solution, on some faults."""
-        columns = [hypothesis.column(solved) for hypothesis in hypotheses]
-        efficient = solved.efficient_columns(columns)
-        centres = efficient[:, solved.places["camera_centre"]]
-        survey_scores = -centres @ solved.residuals["camera_centre"].detach().flatten().cpu().numpy()
-        information = solved.information_by_stretch(efficient)
-        noise = np.column_stack([-solved.flat(solved.residuals), solved.noise])
-        scores = solved.by_stretch(efficient, noise)
-        return [
-            cls(
-                hypothesis,
-                scores[number, :, 0],
-                information[number],
-                (float(survey_scores[number]), float(np.square(centres[number]).sum())),
-                scores[number, :, 1:].T,
-                solved.by_noise(efficient[number]),
-                sum(float(row.square().sum()) for row in columns[number].values()),
-            )
-            for number, hypothesis in enumerate(hypotheses)
-        ]
-
-    def without(self, effect: FloatArray) -> _Answer:
-        """The answer without the ``effect`` (G + 1,) of another fault on the scores."""
-        return replace(self, score=self.score - effect)
 
     @property
     def is_observable(self) -> bool:
@@ -118,6 +88,60 @@ class _Answer:
             1 + 2 * sum((1 - lag / (_LAGS + 1)) ** 2 for lag in range(1, _LAGS + 1))
         )
 
+    def multiple(self, usual: float) -> float:
+        """Variance of the segments' noise over the stated one, shrunk towards the ``usual`` one."""
+        freedom = self.freedom
+        return (_PRIOR_FREEDOM * usual + freedom * self.disagreement) / (_PRIOR_FREEDOM + freedom)
+
+    def sigma(self, multiple: float) -> float:
+        """Standard deviation of the value, if the segments' noise has such a variance over the stated one."""
+        of_segments = float(self.information[:-1].sum())
+        of_priors = float(self.information[-1])
+        return float(np.sqrt(multiple * of_segments + of_priors)) / (of_segments + of_priors)
+
+    @property
+    def noise_multiple(self) -> float:
+        """Variance of the noise in the score over the stated one, at least 1."""
+        if not self.is_observable:
+            return 1.0
+        return max(self.sigma(self.multiple(1.0)) ** 2 * float(self.information.sum()), 1.0)
+
+
+@dataclass(frozen=True)
+class _Answer(Segments):
+    """The segments' answer to one hypothesis."""
+
+    hypothesis: Hypothesis
+    of_surveys: tuple[float, float]  # score and information of the cameras' surveyed centres
+    by_noise: FloatArray  # (N,) information by the kind of noise
+
+    @classmethod
+    def to(cls, hypotheses: Sequence[Hypothesis], solved: Sensitivity) -> list[_Answer]:
+        """The segments' scores at a solution, on some faults."""
+        columns = [hypothesis.column(solved) for hypothesis in hypotheses]
+        efficient = solved.efficient_columns(columns)
+        centres = efficient[:, solved.places["camera_centre"]]
+        survey_scores = -centres @ solved.residuals["camera_centre"].detach().flatten().cpu().numpy()
+        information = solved.information_by_stretch(efficient)
+        noise = np.column_stack([-solved.flat(solved.residuals), solved.noise])
+        scores = solved.by_stretch(efficient, noise)
+        return [
+            cls(
+                score=scores[number, :, 0],
+                information=information[number],
+                drawn=scores[number, :, 1:].T,
+                information_alone=sum(float(row.square().sum()) for row in columns[number].values()),
+                hypothesis=hypothesis,
+                of_surveys=(float(survey_scores[number]), float(np.square(centres[number]).sum())),
+                by_noise=solved.by_noise(efficient[number]),
+            )
+            for number, hypothesis in enumerate(hypotheses)
+        ]
+
+    def without(self, effect: FloatArray) -> _Answer:
+        """The answer without the ``effect`` (G + 1,) of another fault on the scores."""
+        return replace(self, score=self.score - effect)
+
     @property
     def noise_shares(self) -> FloatArray:
         """Shares (N,) of the kinds of noise in the score's variance under the model."""
@@ -130,18 +154,15 @@ class _Answer:
         blank = ScoreTest(fault.name, hypothesis.camera, hypothesis.axis, hypothesis.item)
         if not self.is_observable:
             return blank
-        freedom = self.freedom
-        usual = float(self.noise_shares @ variances)
-        multiple = (_PRIOR_FREEDOM * usual + freedom * self.disagreement) / (_PRIOR_FREEDOM + freedom)
+        multiple = self.multiple(float(self.noise_shares @ variances))
         if not fault.is_change:
             # Noise as lasting as the fault is common to all segments, and no disagreement of theirs: they may
             # widen the model's sigma, but not narrow it.
             multiple = max(multiple, 1.0)
         information = self.information[:-1]
-        of_priors = self.information[-1]
         score = self.score[:-1]
         total = float(self.information.sum())
-        sigma = float(np.sqrt(multiple * information.sum() + of_priors)) / total
+        sigma = self.sigma(multiple)
         # Each segment is predicted from the others, which include priors of no segment.
         predicted = (self.score.sum() - score) / np.maximum(total - information, _LEAST_OBSERVABLE * total)
         gain = float(np.sum(predicted * score - predicted**2 * information / 2)) / multiple
@@ -153,7 +174,7 @@ class _Answer:
             value=self.value,
             sigma=sigma,
             model_sigma=total**-0.5,
-            p_value=2 * float(stats.t.sf(abs(self.value) / sigma, _PRIOR_FREEDOM + freedom)),
+            p_value=2 * float(stats.t.sf(abs(self.value) / sigma, _PRIOR_FREEDOM + self.freedom)),
             gain=gain,
         )
 
@@ -171,9 +192,7 @@ def score_faults(problem: Problem, solution: Solution) -> tuple[ScoreTest, ...]:
 
 def noise_multiples(hypotheses: Sequence[Hypothesis], solved: Sensitivity) -> FloatArray:
     """Variance (n,) of the noise in each fault's score over the stated one, at least 1."""
-    tests = [answer.test(np.ones(NOISES)) for answer in _Answer.to(hypotheses, solved)]
-    ratios = [test.sigma / test.model_sigma if np.isfinite(test.sigma) else 1.0 for test in tests]
-    return np.square(np.maximum(ratios, 1.0))
+    return np.array([answer.noise_multiple for answer in _Answer.to(hypotheses, solved)])
 
 
 def _noise_variances(answers: list[_Answer], solved: Sensitivity) -> FloatArray:

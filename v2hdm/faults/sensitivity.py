@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice, pairwise
@@ -26,7 +26,7 @@ from v2hdm.adjust.model import (
 )
 from v2hdm.adjust.solution import Solution
 from v2hdm.adjust.whitening import Whitening
-from v2hdm.faults.jacobians import Jacobians, Steps
+from v2hdm.faults.jacobians import Jacobians, Steps, Whitened
 from v2hdm.geometry.tensors import NEAR_M
 from v2hdm.records import FloatArray, IntArray
 
@@ -52,6 +52,14 @@ Rows = dict[str, Tensor]
 """Whitened residuals, or their derivatives by one parameter, by kind: ``observations`` (2, K), and the
 priors' of :func:`v2hdm.adjust.model.prior_residuals`; untouched kinds may be absent."""
 
+Follow = Callable[[Whitened], Whitened]
+"""Whitened steps of the unknowns under unit errors, from the errors' columns by the whitened unknowns."""
+
+
+def to_optimum(columns: Whitened) -> Whitened:
+    """The steps to the optimum of a solution that is a whole of its own."""
+    return Whitened(-columns.reduced, -columns.corners)
+
 
 @dataclass(frozen=True)
 class Sensitivity:
@@ -62,6 +70,7 @@ class Sensitivity:
     residuals: Rows  # of everything
     whitened_px: Tensor  # (2, K) unweighted residuals of the observations
     stretch: Tensor  # (J,) segment of the route of each frame, from 0
+    stretch_count: int
 
     @classmethod
     def at(cls, whitening: Whitening) -> Sensitivity:
@@ -72,7 +81,8 @@ class Sensitivity:
         _, weight = robustified(whitening.robust, whitened_px.square().sum(0))
         root = weight.sqrt()  # without the floor, which keeps corners definite but is no evidence
         rows = _rows(engine.arrays, estimate, whitened_px * root)
-        return cls(whitening, root, rows, whitened_px, stretches(engine.arrays))
+        stretch = stretches(engine.arrays)
+        return cls(whitening, root, rows, whitened_px, stretch, int(stretch.max()) + 1)
 
     @property
     def arrays(self) -> Arrays:
@@ -146,6 +156,10 @@ class Sensitivity:
     def efficient(self, column: Rows) -> Rows:
         """A fault's column net of the estimated unknowns: z = J_p - J_y H^-1 J_y' J_p."""
         (flat,) = self.efficient_columns([column])
+        return self.rows_of(flat)
+
+    def rows_of(self, flat: FloatArray) -> Rows:
+        """Residuals, or derivatives, (R,) as :meth:`flat` puts them, by kind."""
         return {
             name: torch.as_tensor(flat[place]).to(row).view_as(row)
             for (name, row), place in zip(self.residuals.items(), self.places.values(), strict=True)
@@ -158,20 +172,31 @@ class Sensitivity:
         while part := list(islice(iterator, most)):
             yield part
 
-    def efficient_columns(self, columns: Sequence[Rows]) -> FloatArray:
-        """Columns (n, R) as :meth:`flat` puts them, each net of the estimated unknowns."""
-        jacobians = self.jacobians
+    def efficient_columns(self, columns: Sequence[Rows], follow: Follow = to_optimum) -> FloatArray:
+        """Columns (n, R) as :meth:`flat` puts them, each net of the estimated unknowns.
+
+        These ``follow`` the columns; by default, to the optimum of this solution.
+        """
+        flat = self._flat_columns(columns)
+        steps = self.jacobians.steps(follow(self.whiten_columns(columns)))
+        flat[:, self.places["observations"]] += self.jacobians.along(steps).T
+        for number, numbers in enumerate(flat):
+            for name, along in self._priors_along(steps, number).items():
+                numbers[self.places[name]] += along.detach().flatten().cpu().numpy()
+        return flat
+
+    def whiten_columns(self, columns: Sequence[Rows]) -> Whitened:
+        """Columns by the whitened unknowns."""
+        flat = self._flat_columns(columns)
+        of_observations = np.ascontiguousarray(flat[:, self.places["observations"]].T)
+        return self.jacobians.whiten(of_observations, [self._pulled(column) for column in columns])
+
+    def _flat_columns(self, columns: Sequence[Rows]) -> FloatArray:
+        """Columns (n, R) as :meth:`flat` puts them."""
         flat = np.zeros((len(columns), sum(row.numel() for row in self.residuals.values())))
         for number, column in enumerate(columns):
             for name, row in column.items():
                 flat[number, self.places[name]] = row.detach().flatten().cpu().numpy()
-        of_observations = np.ascontiguousarray(flat[:, self.places["observations"]].T)
-        of_priors = [self._pulled(column) for column in columns]
-        steps = jacobians.steps(jacobians.whiten(of_observations, of_priors))
-        flat[:, self.places["observations"]] -= jacobians.along(steps).T
-        for number, numbers in enumerate(flat):
-            for name, along in self._priors_along(steps, number).items():
-                numbers[self.places[name]] -= along.detach().flatten().cpu().numpy()
         return flat
 
     @cached_property
@@ -235,15 +260,19 @@ class Sensitivity:
         slopes = torch.autograd.grad(along, list(leaves.values()), retain_graph=True, materialize_grads=True)
         return Gradient(**dict(zip(leaves, slopes, strict=True)))
 
-    def moves(self, columns: FloatArray) -> Moves:
-        """Motion of the solution under unit errors with columns (2 K, B) of the observations' residuals."""
+    def moves(self, columns: FloatArray, follow: Follow = to_optimum) -> Moves:
+        """Motion of the solution under unit errors with columns (2 K, B) of the observations' residuals.
+
+        The unknowns ``follow`` them as in :meth:`efficient_columns`.
+        """
         arrays = self.arrays
-        steps = self.jacobians.steps(self.jacobians.whiten(columns, [None] * columns.shape[1]))
+        whitened = self.jacobians.whiten(columns, [None] * columns.shape[1])
+        steps = self.jacobians.steps(follow(whitened))
         of_corners = np.empty(tuple(steps.corners_map.shape))
-        of_corners[arrays.corner_order.cpu().numpy()] = -steps.corners_map.cpu().numpy()
+        of_corners[arrays.corner_order.cpu().numpy()] = steps.corners_map.cpu().numpy()
         of_poses = np.zeros((arrays.frame_count, 6, columns.shape[1]))
-        of_poses[:, list(arrays.states)] = -steps.frame_state.cpu().numpy()
-        return Moves(of_corners, -steps.extrinsic.cpu().numpy(), of_poses)
+        of_poses[:, list(arrays.states)] = steps.frame_state.cpu().numpy()
+        return Moves(of_corners, steps.extrinsic.cpu().numpy(), of_poses)
 
     def flat(self, rows: Rows) -> FloatArray:
         """All residuals, or derivatives, concatenated, (R,)."""
@@ -252,7 +281,7 @@ class Sensitivity:
     @cached_property
     def _stretch_of(self) -> tuple[IntArray, IntArray]:
         """Indices of all residuals by segment, and the first position of each segment among them."""
-        count = int(self.stretch.max()) + 1
+        count = self.stretch_count
         by_kind = {name: torch.full_like(row, count) for name, row in self.residuals.items()}
         by_kind["observations"][:] = self.stretch[self.arrays.frame_of(self.arrays.pair).long()]
         by_kind["frame_states"][:] = self.stretch[:, None]
@@ -299,18 +328,25 @@ def _rows(arrays: Arrays, estimate: Estimate, observations: Tensor | None = None
 
 def stretches(arrays: Arrays) -> Tensor:
     """Segment (J,) of the route of each frame; the segments of a session have equal lengths."""
-    ahead = arrays.vehicle_from_map.inverse()[:, :2, 3].diff(dim=0).norm(dim=1)
-    path = torch.cat([ahead.new_zeros(1), ahead.cumsum(0)])
-    out = torch.zeros_like(arrays.session)
-    count = 0
-    for session in range(int(arrays.session.max()) + 1):
-        is_in_session = arrays.session == session
-        along = path[is_in_session] - path[is_in_session].min()
-        share = along / along.max().clamp(min=1e-9)
-        out[is_in_session] = count + (share * STRETCHES).long().clamp(max=STRETCHES - 1)
-        count += STRETCHES
-    stretch: Tensor = torch.unique(out, return_inverse=True)[1]
-    return stretch
+    position_map = arrays.vehicle_from_map.inverse()[:, :2, 3].cpu().numpy()
+    stretch = stretches_of_way(position_map, arrays.session.cpu().numpy())
+    return torch.as_tensor(stretch, device=arrays.session.device)
+
+
+def stretches_of_way(position_map: FloatArray, session: IntArray) -> IntArray:
+    """Segment (J,) of the route of each frame at a position (J, 2), of sessions (J,)."""
+    steps_m = np.linalg.norm(np.diff(position_map, axis=0, prepend=position_map[:1]), axis=1)
+    path_m = np.cumsum(steps_m)
+    out = np.zeros(len(session), dtype=np.int64)
+    for number in range(int(session.max()) + 1):
+        is_in_session = session == number
+        if not is_in_session.any():
+            continue
+        along_m = path_m[is_in_session] - path_m[is_in_session].min()
+        share = along_m / max(float(along_m.max()), 1e-9)
+        part = np.minimum((share * STRETCHES).astype(np.int64), STRETCHES - 1)
+        out[is_in_session] = number * STRETCHES + part
+    return np.asarray(np.unique(out, return_inverse=True)[1], dtype=np.int64)
 
 
 def raised(solved: Sensitivity, height: Tensor) -> Rows:

@@ -16,6 +16,9 @@ import numpy as np
 _SHOWN = {"m": (100.0, "cm"), "s": (1e3, "ms"), "rad": (180 / np.pi, "deg"), "px": (1.0, "px"), "": (1.0, "")}
 """For each unit, the factor and the unit with which a user sees its values."""
 
+PRIOR_ODDS = 1 / 400
+"""Prior odds of a wrong input: one in forty, in one of ten drives of a new vehicle."""
+
 _WAYS = (("behind", "ahead of"), ("to the right of", "to the left of"), ("below", "above"))
 _MAP_AXES = ("east", "north", "north-east", "north-west")
 
@@ -91,6 +94,9 @@ class Fault:
     corrected_by: str = "it was left out of the result"  # what the recovery did, as a clause
     needs_centres: bool = False  # tested only where all its cameras have a stated centre: others are guesses
     like_clock: bool = False  # a constant clock offset may stand for it
+    prior_odds: float = PRIOR_ODDS
+    # The stated noise of the poses allows for it: it may be why a map is doubtful, but contradicts none.
+    is_allowed_for: bool = False
     like_ground: bool = False  # it deforms a plane's image: if a surface leaves it, it is the likelier cause
 
     @property
@@ -151,6 +157,13 @@ def _course(error: Error) -> str:
     return (
         f"the heading is not the vehicle's, but the course of a point {error.size:.1f} m "
         f"{error.word('ahead of', 'behind')} the rear axle"
+    )
+
+
+def _slip(error: Error) -> str:
+    return (
+        f"in bends the headings, an antenna's course, are off by {np.rad2deg(error.size):.2f} deg for each "
+        "m/s2 to the side, as tyres slip, or as of an antenna that is elsewhere than lever_arm_m says"
     )
 
 
@@ -272,6 +285,17 @@ COURSE = Fault(
     like_clock=True,
 )  # fmt: skip
 
+# Angle by which the heading of a course is off for each m/s2 to the side. A constant speed makes it look like
+# a clock. In one of twenty drives it is beyond two sigmas of what the course's smoother allows for.
+SLIP = Fault(
+    "slip", "rad", least=0.001, observable_sigma=0.0015, usual=0.005, most=0.05,
+    check="heading slip",
+    remedy="record a gyro (poses.gyro_file or gyro_topic), or the heading of two antennas",
+    sentence=_slip,
+    prior_odds=1 / 20,
+    is_allowed_for=True,
+)  # fmt: skip
+
 # Offset of recorded positions from some time on; the axes are east, north, north-east and north-west.
 STEP = Fault(
     "step", "m", least=0.03, observable_sigma=0.02, usual=0.1, most=100.0,
@@ -357,7 +381,7 @@ DATUM = Fault(
 FAULTS: dict[str, Fault] = {
     fault.name: fault
     for fault in (
-        CLOCK, CLOCK_DRIFT, FOCAL, DISTORTION, PRINCIPAL, SLOPE, CROWN, COURSE,
+        CLOCK, CLOCK_DRIFT, FOCAL, DISTORTION, PRINCIPAL, SLOPE, CROWN, COURSE, SLIP,
         STEP, KNOCK, SURVEY, LEVER, SCALE, SIZE, CONTROL, DATUM,
     )
 }  # fmt: skip

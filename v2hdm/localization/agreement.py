@@ -55,6 +55,7 @@ class _Object:
     kind: str
     way_m: float
     gains: list[float] = field(default_factory=list)  # of each view
+    scores: list[float] = field(default_factory=list)  # of each view
 
     @property
     def gain(self) -> float:
@@ -68,9 +69,8 @@ class Detected(NamedTuple):
     places_map: FloatArray  # (D, 2) their centres, m
     kinds: tuple[str, ...]
     is_judged: BoolArray  # (D,) whole and near the vehicle
-    gains: (
-        FloatArray  # (D,) log likelihood ratios of a map with half of its markings moved and of a right one
-    )
+    gains: FloatArray  # (D,) log likelihood ratios of a map with half of its markings moved and a right one
+    scores: FloatArray  # (D,) log likelihoods by the map over those of chance
 
 
 def detected(scene: Scene, located: Located) -> Detected:
@@ -90,13 +90,15 @@ def detected(scene: Scene, located: Located) -> Detected:
         rows += len(beside) * [row]
         numbers += beside
     gains = np.full(len(centres), np.log(_MOVED[2] / _RIGHT[2]))
+    scores = np.full(len(centres), np.log(_RIGHT[2]))
     if rows:
         offset = offsets(located.belief, scene, np.array(rows), np.array(numbers))
-        by_pair = np.array(list(map(offset_gain, *offset)))
-        is_ahead = np.isfinite(by_pair)  # both in front of the camera
-        order = np.argsort(-by_pair[is_ahead])
-        gains[np.array(rows)[is_ahead][order]] = by_pair[is_ahead][order]  # the last, that is the least
-    return Detected(centres, scene.quads.kinds, is_judged, gains)
+        likelihoods = np.array([offset_likelihood(*of_pair) for of_pair in zip(*offset, strict=True)])
+        is_ahead = np.isfinite(likelihoods).all(axis=1)  # both in front of the camera
+        order = np.argsort(likelihoods[is_ahead, 1])
+        at = np.array(rows)[is_ahead][order]  # the last of a detection is its likeliest marking
+        gains[at], scores[at] = likelihoods[is_ahead][order].T
+    return Detected(centres, scene.quads.kinds, is_judged, gains, scores)
 
 
 def _beside(scene: Scene, located: Located, place_map: FloatArray, row: int) -> list[int]:
@@ -110,14 +112,22 @@ def _beside(scene: Scene, located: Located, place_map: FloatArray, row: int) -> 
     return [int(number) for number in numbers]
 
 
-def offset_gain(off_m: FloatArray, covariance_m2: FloatArray) -> float:
-    """The log likelihood ratio of a repainted map by an offset (2,) of covariance (2, 2) from a marking."""
+class OffsetLikelihood(NamedTuple):
+    """How an offset from a marking counts."""
+
+    gain: float  # log likelihood ratio of a map with half of its markings moved and of a right one
+    score: float  # log likelihood by a right map over that of chance
+
+
+def offset_likelihood(off_m: FloatArray, covariance_m2: FloatArray) -> OffsetLikelihood:
+    """How an offset (2,) of covariance (2, 2) from a marking counts; not a number where it is none."""
     densities = []
     for spread_m in (_BLUNDER_M, _MOVED_M, _ELSEWHERE_M):
         total_m2 = covariance_m2 + spread_m**2 * np.eye(2)
         squared = off_m @ np.linalg.solve(total_m2, off_m)
         densities.append(np.exp(-0.5 * squared) / np.sqrt(np.linalg.det(total_m2)))
-    return float(np.log(_MOVED @ densities) - np.log(_RIGHT @ densities))
+    right = float(np.log(_RIGHT @ densities))
+    return OffsetLikelihood(float(np.log(_MOVED @ densities)) - right, right - float(np.log(densities[2])))
 
 
 @dataclass
@@ -136,6 +146,7 @@ class Agreement:
                 spot = _Object(place, judged.kinds[row], way_m)
                 self.objects.append(spot)
             spot.gains.append(float(judged.gains[row]))
+            spot.scores.append(float(judged.scores[row]))
 
     def _of(self, place: FloatArray, kind: str) -> _Object | None:
         for spot in self.objects:
@@ -146,6 +157,11 @@ class Agreement:
     @property
     def _several(self) -> list[_Object]:
         return [spot for spot in self.objects if len(spot.gains) > 1]
+
+    @property
+    def score(self) -> float:
+        """The log likelihood of these objects by the map over that of chance."""
+        return float(sum(np.median(spot.scores) for spot in self._several))
 
     @property
     def quads(self) -> int:

@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import IO, NamedTuple
 
 from v2hdm.errors import ConfigError, DriveError
-from v2hdm.localization.localizer import Fix, Localizer, Pose
+from v2hdm.localization.antenna import Fix
+from v2hdm.localization.localizer import Localizer, Pose
 from v2hdm.localization.motion import Motion
 from v2hdm.localization.seeing import Look
 from v2hdm.localization.stream import MotionLines, look_of

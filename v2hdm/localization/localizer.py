@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
@@ -13,6 +13,7 @@ import numpy as np
 from v2hdm.doors import checked
 from v2hdm.errors import MapFileError
 from v2hdm.localization.agreement import Agreement, Pace, detected
+from v2hdm.localization.antenna import Antenna, Fix, with_fix
 from v2hdm.localization.belief import (
     CAMERA,
     HEADING,
@@ -27,9 +28,10 @@ from v2hdm.localization.belief import (
 from v2hdm.localization.joint import Located, Scene, locate, paired
 from v2hdm.localization.motion import Motion, MotionLog, MotionNoise, moved
 from v2hdm.localization.paint import Paint
-from v2hdm.localization.places import Patch, Place, Prior, search, vehicle_at
+from v2hdm.localization.places import Place, Prior, vehicle_at
 from v2hdm.localization.rig import Estimate, Rig, Turned
 from v2hdm.localization.seeing import Look, Sighted, sighted
+from v2hdm.localization.starting import Quest
 from v2hdm.records import Calibration, FloatArray, HDMap
 
 _LAG_S = 1.0  # images may be so late
@@ -39,14 +41,6 @@ _LOST_M = 0.3
 _PROTECTION_SIGMAS = 3.717  # radius, in sigmas, that one error in a thousand in a plane exceeds
 _MOST_MARKINGS = 28  # whose places' errors are states: those seen last
 _STARTED = 4  # images from the start on whose agreement makes it sure
-# Log likelihood by which one place must explain what is seen better than any other: one wrong in e^10.
-_SURER_BY = 10.0
-_LEAST_MATCHED = 4  # markings of the place
-_LEAST_SHARE = 0.6  # of what is seen
-_SEARCH_S = 0.3  # time between searches
-_TRIED_LOOKS = 4  # images, of as many searches, by which a place is tried
-_LOST_S, _LOST_WAY_M = 0.9, 8.0  # after so long, or so far, without a place nothing fits
-_STILL_M = 0.5  # a vehicle that has moved less stands: it may not have seen enough
 _START_SIGMA = np.array([0.25, 0.25, np.deg2rad(1.5)])  # of a place that was found, m, m and rad
 _UNSTATED = np.diag(np.square([0.01, 0.01, 0.01, *(3 * [np.deg2rad(0.05)])]))  # of a calibration without one
 _AGAIN_SIGMA_M = (
@@ -72,14 +66,6 @@ class Status(Enum):
     INITIALISING = "initialising"
     TRACKING = "tracking"
     LOST = "lost"
-
-
-class Fix(NamedTuple):
-    """A position (2,) of the vehicle's origin in the map by RTK, m, and its standard deviation."""
-
-    stamp_s: float
-    place_map: FloatArray
-    sigma_m: float
 
 
 @dataclass(frozen=True)
@@ -135,19 +121,6 @@ class _Noise:
         self.count = keeps * self.count + located.misfit_freedom
 
 
-@dataclass
-class _Search:
-    """The search for a place: the rough one and where the odometry was then, since when, and the last one."""
-
-    prior: Prior | None
-    local: FloatArray = field(default_factory=lambda: np.zeros(3))
-    since_s: float | None = None
-    since_m: float = 0.0
-    last_s: float = -np.inf
-    patch: Patch = field(default_factory=Patch)
-    looks: deque[Look] = field(default_factory=lambda: deque(maxlen=_TRIED_LOOKS))
-
-
 class Localizer:
     """Finds a vehicle in a map, image by image; needs no more than the base install.
 
@@ -164,11 +137,13 @@ class Localizer:
         calibrations: Mapping[str, Calibration],
         prior: Prior | None = None,
         noise: MotionNoise | None = None,
+        antenna_m: Sequence[float] = (0.0, 0.0),
     ) -> None:
         """Start in a map (frame ``map``, m) with calibrated cameras, by name.
 
         ``prior`` is a rough position; without one, the whole map is searched.
-        ``noise`` is the odometry's. Raises MapFileError for a map without markings, or without cameras.
+        ``noise`` is the odometry's; ``antenna_m`` is how far ahead of its origin and to the left the vehicle
+        has the antenna of its positions. Raises MapFileError for a map without markings, or without cameras.
         """
         if not hd_map.markings:
             raise MapFileError("the map has no markings; nothing can be localised in it")
@@ -181,9 +156,11 @@ class Localizer:
         covariances = [item.covariance for item in self.calibrations.values()]
         self._mountings = [_UNSTATED if item is None else np.asarray(item) for item in covariances]
         self._log = MotionLog()
+        self._antenna = Antenna(np.asarray(antenna_m, dtype=np.float64).reshape(2))
+        self._fixes: deque[Fix] = deque()
         self._belief: Belief | None = None
         self._past: deque[_Past] = deque()
-        self._search = _Search(prior)
+        self._search = Quest(prior)
         self._is_sure = False
         self._is_lost = False
         self._confirmed = 0
@@ -270,7 +247,7 @@ class Localizer:
             return
         if look.stamp_s < self._belief.stamp_s:  # of before the place was found
             return
-        belief = self._moved_to(self._belief, look.stamp_s)
+        belief = self._fixed_to(self._belief, look.stamp_s)
         self._past.append(_Past(self._belief, look))
         while self._past[-1].look.stamp_s - self._past[0].look.stamp_s > _LAG_S:
             self._past.popleft()
@@ -386,48 +363,17 @@ class Localizer:
         return only_markings(belief, order[-_MOST_MARKINGS:])
 
     def _find(self, look: Look) -> None:
-        """Search for a place that explains the patch as no other does."""
-        quest = self._search
-        if quest.since_s is None and quest.patch.objects:
-            quest.since_s = look.stamp_s
-            quest.since_m = self._way_m
-        if quest.since_s is None or 0 <= look.stamp_s - quest.last_s < _SEARCH_S:
-            return
-        quest.last_s = look.stamp_s
-        quest.looks.append(look)
+        """Search for a place that explains what is seen as no other does."""
         local = self._local_at(look.stamp_s)
-        places = search(quest.patch, self.paint, self.calibrations, quest.local, quest.prior)
-        if places:
-            best = places[0]
-            second = places[1].score if len(places) > 1 else 0.0
-            share = best.matched / max(best.quads, 1)
-            if (
-                best.matched >= _LEAST_MATCHED
-                and share >= _LEAST_SHARE
-                and best.score - max(second, 0.0) > _SURER_BY
-            ):
-                self._begin(look.stamp_s, vehicle_at(best.map_from_local, local))
-                return
-            if all(self._differs_at(place) for place in places if best.score - place.score < _SURER_BY):
-                self._is_lost = True
-                self._reasons["lost"] = (
-                    "wherever the vehicle may be, many markings seen lie beside those of the map: was the "
-                    "site repainted?"
-                )
-        waited_s = look.stamp_s - quest.since_s
-        waited_m = self._way_m - quest.since_m
-        is_long = (waited_s > _LOST_S and waited_m > _STILL_M) or waited_m > _LOST_WAY_M
-        if is_long and len(quest.patch.sure) >= _LEAST_MATCHED + 2:
-            share = places[0].matched / max(places[0].quads, 1) if places else 0.0
-            if share < _LEAST_SHARE:
-                self._is_lost = True
-                self._reasons["lost"] = (
-                    f"no place there explains more than {100 * share:.0f} % of the markings seen: is it the "
-                    "map of this site, as painted today, in these coordinates, and are these its cameras?"
-                )
+        proposal = self._search.propose(look, local, self._way_m, self.paint, self.calibrations, self._tried)
+        if proposal.pose is not None:
+            self._begin(look.stamp_s, proposal.pose)
+        elif proposal.reason is not None:
+            self._is_lost = True
+            self._reasons["lost"] = proposal.reason
 
-    def _differs_at(self, place: Place) -> bool:
-        """Whether the last images, seen from a place, show markings beside those of the map."""
+    def _tried(self, place: Place) -> Agreement:
+        """How the map explains the last images, seen from a place."""
         looks = self._search.looks
         pose = vehicle_at(place.map_from_local, self._local_at(looks[0].stamp_s))
         belief = start(looks[0].stamp_s, pose, _START_SIGMA, self._mountings, self.noise)
@@ -439,7 +385,7 @@ class Localizer:
             located = locate(belief, scene)
             belief = located.belief
             agreement.note(detected(scene, located), self._way_m)
-        return agreement.differs
+        return agreement
 
     def _begin(self, stamp_s: float, pose: FloatArray) -> None:
         self._belief = start(stamp_s, pose, _START_SIGMA, self._mountings, self.noise)
@@ -448,6 +394,7 @@ class Localizer:
         self._confirmed = 0
         self._is_sure = self._is_lost = False
         self._turned_s = None
+        self._fixes.clear()
         self._reasons.pop("lost", None)
 
     def _judge(self, look: Look) -> None:
@@ -476,7 +423,7 @@ class Localizer:
             sigma_m = max(_AGAIN_SIGMA_M, self._belief.sigma_m)
             prior = Prior(pose, sigma_m, _AGAIN_SIGMA_RAD)
         local = self._local if self._belief is None else self._local_at(self._belief.stamp_s)
-        self._search = _Search(prior, local)
+        self._search = Quest(prior, local)
         self._belief = None
         self._past.clear()
         self._agreement = Agreement()
@@ -485,32 +432,34 @@ class Localizer:
         self._reasons["lost"] = reason
 
     def _fix(self, fix: Fix) -> None:
-        """Take a position by RTK."""
+        """Keep a position by RTK until the images of before it have come."""
         belief = self._belief
-        if belief is None or abs(fix.stamp_s - belief.stamp_s) > _LAG_S:
-            if self._belief is None:
-                heading = self._search.prior.pose[2] if self._search.prior else 0.0
-                turn = self._search.prior.sigma_rad if self._search.prior else np.pi
-                pose = np.array([*fix.place_map, heading])
-                self._search.prior = Prior(pose, max(fix.sigma_m, 0.5), turn)
-                self._search.local = self._local_at(fix.stamp_s)
+        if belief is None:
+            self._count_way(fix.stamp_s)
+            local = self._local_at(fix.stamp_s)
+            self._antenna.note(fix, local)
+            self._search.prior = self._antenna.prior(local, self._search.prior)
+            self._search.local = local
             return
-        belief = self._moved_to(belief, fix.stamp_s)
-        total = fix.sigma_m**2 + self.paint.shared_m2
-        slope = belief.root[:2]
-        gain = belief.root @ slope.T @ np.linalg.inv(slope @ slope.T + total * np.eye(2))
-        off = fix.place_map - belief.mean[:2]
-        spread = slope @ slope.T + total * np.eye(2)
-        if off @ np.linalg.solve(spread, off) > _PROTECTION_SIGMAS**2:
-            self._reasons["fix"] = (
-                f"RTK is {np.linalg.norm(off):.2f} m from where the markings put the vehicle: is the map in "
-                "its datum?"
-            )
-            return
-        self._reasons.pop("fix", None)
-        inner = np.linalg.cholesky(np.eye(len(belief.mean)) + slope.T @ slope / total)
-        root = np.linalg.solve(inner, belief.root.T).T
-        self._belief = replace(belief, mean=belief.mean + gain @ off, root=root)
+        self._fixes.append(fix)
+        while fix.stamp_s - self._fixes[0].stamp_s > 2 * _LAG_S:
+            self._fixes.popleft()
+        # Where no image came for long, none that is older will.
+        if fix.stamp_s - belief.stamp_s > _LAG_S:
+            self._belief = self._fixed_to(belief, fix.stamp_s - _LAG_S)
+
+    def _fixed_to(self, belief: Belief, stamp_s: float) -> Belief:
+        """The belief at a later time, after the positions until then."""
+        for fix in sorted(self._fixes, key=lambda item: item.stamp_s):
+            if belief.stamp_s < fix.stamp_s <= stamp_s:
+                moved_belief = self._moved_to(belief, fix.stamp_s)
+                belief, problem = with_fix(
+                    moved_belief, fix, self._antenna.ahead_left_m, self.paint.shared_m2
+                )
+                self._reasons.pop("fix", None)
+                if problem is not None:
+                    self._reasons["fix"] = problem
+        return self._moved_to(belief, stamp_s)
 
     def _pose(self) -> Pose:
         """The pose at the newest stamp."""
@@ -532,7 +481,7 @@ class Localizer:
             return Pose(
                 stamp_s, status, None, nothing, infinite, np.inf, (1.0, 0.0), 0, tuple(reasons.values())
             )
-        belief = self._moved_to(self._belief, stamp_s)
+        belief = self._fixed_to(self._belief, stamp_s)
         plane = self.paint.ground(belief.mean[:2])
         covariance = belief.covariance([0, 1, 2])
         covariance += np.diag([self.paint.shared_m2, self.paint.shared_m2, self.paint.shared_rad2])

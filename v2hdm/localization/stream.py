@@ -12,7 +12,8 @@ import numpy as np
 from v2hdm.errors import ConfigError, shown
 from v2hdm.geometry.geodetic import enu_from_geodetic
 from v2hdm.geometry.rigid import euler_from_rotation
-from v2hdm.localization.localizer import Fix, Pose
+from v2hdm.localization.antenna import Fix
+from v2hdm.localization.localizer import Pose
 from v2hdm.localization.motion import Motion
 from v2hdm.localization.seeing import Look
 from v2hdm.records import FloatArray, GeodeticOrigin, MarkingDetection

@@ -133,6 +133,7 @@ def pose_sigma_of(pose_noise: PoseNoise) -> PoseSigma:
         position_drift=Drift(pose_noise.position_drift_m, pose_noise.position_drift_over_m),
         heading_drift=Drift(pose_noise.heading_drift_rad, pose_noise.heading_drift_over_m),
         roll_pitch_drift=Drift(pose_noise.roll_pitch_drift_rad, pose_noise.roll_pitch_drift_over_m),
+        heading_slip=pose_noise.heading_slip,
     )
 
 

@@ -27,7 +27,8 @@ class PoseNoise:
     ``..._drift_...`` is the slow part of each, as in RTK: a first-order Gauss-Markov process with the
     correlation length ``..._drift_over_m``. The rest, in quadrature, is white noise. ``clock_s`` is of the
     time by which the images of all cameras are late on the poses' clock, ``clock_drift_s`` of the change of
-    that time from the first image of a drive to its last.
+    that time from the first image of a drive to its last. ``heading_slip`` is of the slip in headings that
+    are an antenna's course: rad for each m/s2 to the side; 0 for headings that were measured.
     """
 
     position_m: float = 0.02
@@ -41,6 +42,7 @@ class PoseNoise:
     roll_pitch_drift_over_m: float = 5.0
     clock_s: float = 0.0
     clock_drift_s: float = 0.0
+    heading_slip: float = 0.0
 
     @classmethod
     def from_stated(cls, **stated: float) -> PoseNoise:

@@ -9,11 +9,11 @@ import numpy as np
 
 from v2hdm.errors import MapFileError
 from v2hdm.records import FloatArray
-from v2hdm.topology.graph import Question
+from v2hdm.topology.graph import RIGHT_OF_WAY, Question
 from v2hdm.topology.stays import LaneShape
 
 _SAME_M = 1.0  # distance, m, between the places of a question and of its answer; chosen
-_NEAR_M = 3.0  # distance, m, from a stated end or start of a lane to the lane's; chosen
+NEAR_M = 3.0  # distance, m, from a stated end or start of a lane to the lane's; chosen
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,9 @@ class Answer:
             for asked_map, answered_map in pairs
             if asked_map is not None and answered_map is not None
         ]
+        reach_m = NEAR_M if self.subject == RIGHT_OF_WAY else _SAME_M  # people may point at the lane's end
         return all(
-            float(np.linalg.norm(asked_map - answered_map)) < _SAME_M for asked_map, answered_map in places
+            float(np.linalg.norm(asked_map - answered_map)) < reach_m for asked_map, answered_map in places
         )
 
     @property
@@ -110,7 +111,7 @@ def stated_pair(shapes: Sequence[LaneShape], answer: Answer) -> tuple[int, int]:
     pair = []
     for places, place, what in ((ends, answer.place_map, "ends"), (starts, answer.to_map, "starts")):
         apart_m = np.linalg.norm(places - place, axis=1)
-        if not len(apart_m) or apart_m.min() > _NEAR_M:
+        if not len(apart_m) or apart_m.min() > NEAR_M:
             x, y = place.tolist()
             raise MapFileError(
                 f"{answer.where}: no lane {what} at ({x:.1f}, {y:.1f}); draw from an end to a start"

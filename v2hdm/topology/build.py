@@ -21,6 +21,7 @@ from v2hdm.topology.junctions import TURN_RAD, joined, turn_rad
 from v2hdm.topology.lines import tangents, usable_lines
 from v2hdm.topology.paths import Path, paths_of
 from v2hdm.topology.questions import questions_of
+from v2hdm.topology.rights import stated_rights
 from v2hdm.topology.stays import LaneShape
 from v2hdm.topology.stop_lines import tied
 from v2hdm.topology.ways import Cut, DrivenWays, Way, WayFinder
@@ -37,7 +38,7 @@ def lane_graph(
 
     Without trajectories lanes have the direction of their lines, and no ways through crossings are known:
     only lines that bound two lanes lead from one to the other. ``answers`` are those of a person to the
-    questions of such a graph; MapFileError where they contradict the drives.
+    questions of such a graph; MapFileError where they contradict drives or paint.
     """
     lines = usable_lines(hd_map.lanes)
     paths = paths_of(trajectories)
@@ -45,6 +46,7 @@ def lane_graph(
     graph = builder.graph()
     tied_lines = tied(graph, hd_map.markings)
     graph = replace(graph, stop_lines=tuple(tied_lines.stop_lines))
+    graph = replace(graph, stated_rights=stated_rights(graph, answers))
     asked = [*lines.asked, *graph.questions, *tied_lines.asked]
     asked += questions_of(graph, bool(trajectories))
     is_open = [not any(answer.closes(question) for answer in answers) for question in asked]

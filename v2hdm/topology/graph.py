@@ -114,7 +114,16 @@ class StopLine:
     yields_to: tuple[int, ...] = ()  # lanes of the junction whose way a give-way line's lanes cross
 
 
-SUBJECTS = ("direction", "connection", "speed", "two ways", "stop line", "right of way", "line")
+@dataclass(frozen=True)
+class StatedRight:
+    """A lane into a crossing that is stated to give way to the ways ``yields_to`` of others through it."""
+
+    lane: int
+    yields_to: tuple[int, ...]
+
+
+RIGHT_OF_WAY = "right of way"
+SUBJECTS = ("direction", "connection", "speed", "two ways", "stop line", RIGHT_OF_WAY, "line")
 """Subjects of questions."""
 
 
@@ -141,6 +150,7 @@ class LaneGraph:
     junctions: tuple[Junction, ...] = ()
     stop_lines: tuple[StopLine, ...] = ()
     questions: tuple[Question, ...] = ()
+    stated_rights: tuple[StatedRight, ...] = ()
 
     def after(self, lane: int) -> list[int]:
         """The lanes that follow a lane."""

@@ -10,6 +10,7 @@ from v2hdm.geometry.planar import cross
 from v2hdm.records import FloatArray
 from v2hdm.topology.graph import Direction, Junction, LaneGraph, Question
 from v2hdm.topology.junctions import TURN_RAD, leads_back
+from v2hdm.topology.rights import rights_asked
 
 _NEAR_M = 10.0  # distance from the lanes of a crossing within which a lane that ends belongs to it; chosen
 
@@ -19,7 +20,7 @@ def questions_of(graph: LaneGraph, has_drives: bool) -> list[Question]:
     asked = []
     for junction in graph.junctions:
         if junction.is_crossing and has_drives:
-            asked += [*_turns(graph, junction), *_rights(graph, junction)]
+            asked += [*_turns(graph, junction), *rights_asked(graph, junction)]
     if graph.lanes and all(lane.speed_kmh is None for lane in graph.lanes):
         place = graph.lanes[0].centre_map[0]
         asked.append(Question("speed", "no speed limit is stated; how fast may one drive?", place))
@@ -70,16 +71,6 @@ def _exits(graph: LaneGraph, number: int) -> list[int]:
     for after in graph.after(number):
         exits += _exits(graph, after) if graph.lanes[after].is_connecting else [after]
     return exits
-
-
-def _rights(graph: LaneGraph, junction: Junction) -> Iterator[Question]:
-    """Who has the right of way, where no line across a lane says so."""
-    held = {lane for stop in graph.stop_lines for lane in stop.lanes}
-    arms = {before for number in junction.lanes for before in graph.before(number)} - set(junction.lanes)
-    if len(arms) > 1 and not held & arms:
-        place = np.concatenate([graph.lanes[number].centre_map for number in junction.lanes]).mean(axis=0)
-        text = "no line says who gives way at this crossing; who has the right of way?"
-        yield Question("right of way", text, place, tuple(sorted(arms)))
 
 
 def _is_near(place: FloatArray, places: FloatArray) -> bool:

@@ -10,7 +10,8 @@ import numpy as np
 
 from v2hdm.records import GIVE_WAY, STOP_LINE, FloatArray, Marking
 from v2hdm.topology.graph import LaneGraph, Question, Right, StopLine
-from v2hdm.topology.junctions import cross_each_other, crossings
+from v2hdm.topology.junctions import crossings
+from v2hdm.topology.rights import ways_crossed
 
 _AT_START_M = 3.0  # way, m, from a lane's start within which a stop line ends the lane before it; chosen
 _BESIDE_M = 0.5  # way, m, that a stop line may lack to the middle of a lane; chosen
@@ -91,12 +92,4 @@ def _yields_to(
     onward = {after for lane in stop.lanes for after in graph.after(lane)}
     others = {number for junction in graph.junctions for number in junction.lanes} - onward
     free = [number for number in sorted(others) if not held & set(graph.before(number))]
-    return tuple(
-        number
-        for number in free
-        if any(
-            cross_each_other(centres[number], centres[way])
-            or set(graph.after(number)) & set(graph.after(way))
-            for way in onward
-        )
-    )
+    return ways_crossed(graph, centres, onward, free)

@@ -19,6 +19,7 @@ from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.geometry.planar import length_along, points_along
 from v2hdm.io.description import DRIVE_FILE
 from v2hdm.io.drive.writing import write_drive
+from v2hdm.progress import Progress, silent
 from v2hdm.records import DIAMOND, LANE_DASH, LANE_LINE, STOP_LINE, Drive, FloatArray, HDMap, Image
 from v2hdm.simulate.port.build import ORIGIN, Port, cam_from_vehicle, surveyed_cameras
 from v2hdm.simulate.port.config import PortConfig, SurfaceConfig, YardConfig
@@ -40,7 +41,7 @@ _DIAMOND_APART_M = 4.0  # least distance of two diamonds, m: ways share lanes; c
 _WAYS, _POSES = 11, 12  # streams of a seed; a port's own are 0 to 9
 
 
-def render_crossing(folder: Path, seed: int = 1) -> list[Path]:
+def render_crossing(folder: Path, seed: int = 1, progress: Progress = silent) -> list[Path]:
     """Render the ten drives into ``folder``, one after the other; those that are there already stay."""
     config = _config(seed)
     ways = [_way(corners) for corners in DRIVES]
@@ -49,9 +50,17 @@ def render_crossing(folder: Path, seed: int = 1) -> list[Path]:
     for number, way in enumerate(ways):
         drive_folder = folder / f"drive{number}"
         folders.append(drive_folder)
+        progress("render", number, len(ways))
         if not (drive_folder / DRIVE_FILE).is_file():
             _render(replace(config, name=f"drive{number}", session=number), way, renderer, drive_folder)
+    progress("render", len(ways), len(ways))
     return folders
+
+
+def painted_lines(seed: int = 1) -> list[FloatArray]:
+    """The corners (4, 2), m, of each dash and each piece of a line as rendered."""
+    scene = _scene(_config(seed), [_way(corners) for corners in DRIVES])
+    return [paint.polygon_map for paint in scene.paints if paint.kind in (LANE_LINE, LANE_DASH)]
 
 
 def _config(seed: int) -> PortConfig:

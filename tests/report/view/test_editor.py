@@ -231,9 +231,8 @@ def test_a_distance_is_measured(browser, served):
         page.keyboard.press("m")
         page.mouse.click(left, top)
         page.mouse.click(left + 180, top)
-        told = page.locator("#told", has_text="Measured: ")
-        told.wait_for()
-        assert "Measured: 2.00 m" in told.inner_text()
+        # The text follows the pointer, frame by frame: before the second click is drawn it is another length.
+        page.locator("#told", has_text="Measured: 2.00 m").wait_for()
 
 
 def test_a_lane_line_is_drawn_split_joined_and_deleted_by_keys(browser, served):

@@ -45,6 +45,15 @@ _PAIR_BLOCK = torch.triu_indices(6, 6)  # rows and columns of the upper triangle
 class KernelEngine(TorchEngine):
     """The model over one problem's arrays: linearised, evaluated, carried and pulled back by kernels."""
 
+    def __init__(self, arrays: Arrays, border: tuple[Tensor, Tensor] | None = None) -> None:
+        """``border`` are frames and corners to eliminate last, if any."""
+        super().__init__(arrays)
+        self._border = border
+
+    def keeping(self, frames: Tensor, corners: Tensor) -> KernelEngine:
+        """The same engine, which eliminates a border of ``frames`` and ``corners`` last."""
+        return KernelEngine(self.arrays, (frames, corners))
+
     @cached_property
     def _whole(self) -> Layout:
         return make_layout(self.arrays)
@@ -75,6 +84,8 @@ class KernelEngine(TorchEngine):
         size = per_tile * states
         tip = arrays.camera_count * arrays.camera_unknowns
         along = list(pairwise(range(count))) if bool(arrays.state_transition.any()) else []
+        if self._border is not None:
+            return self._plan_of_border(*self._border, along)
         edges, most = self._coupled_tiles(self._whole, per_tile, count)
         best = Plan(per_tile, size, count, find_pattern(count, [*edges, *along]), none, most)
         least = best.pattern.multiplications(size, tip)
@@ -91,6 +102,31 @@ class KernelEngine(TorchEngine):
                 least = cost
         return best
 
+    def _plan_of_border(self, frames: Tensor, corners: Tensor, along: Sequence[tuple[int, int]]) -> Plan:
+        """The cheaper order of two in which a border's tiles come last; ``along`` couples frames' tiles."""
+        arrays = self.arrays
+        per_tile = frames_per_tile(arrays)
+        size = per_tile * len(arrays.states)
+        count = -(-arrays.frame_count // per_tile)
+        kept_corners = corners[self._fits_a_tile(size // 2)[corners]]
+        edges, most = self._coupled_tiles(self._with_kept(kept_corners), per_tile, count)
+        corner_tiles = _kept_tiles(arrays, kept_corners, size // 2, count, per_tile)
+        total = count + -(-len(kept_corners) // (size // 2))
+        last = [*torch.unique(frames // per_tile).tolist(), *range(count, total)]
+        cliques = [*edges, *along, *corner_tiles, last]
+        tip = arrays.camera_count * arrays.camera_unknowns
+        patterns = [find_pattern(total, cliques, least_degree, last) for least_degree in (False, True)]
+        pattern = min(patterns, key=lambda pattern: pattern.multiplications(size, tip))
+        return Plan(per_tile, size, count, pattern, kept_corners, most, len(last))
+
+    def _fits_a_tile(self, most: int) -> Tensor:
+        """Whether each corner (N,) is joined to so few that a tile of ``most`` corners holds them.
+
+        A larger unit would reach beyond the next tile.
+        """
+        size = np.diff(self._whole.unit)
+        return torch.from_numpy(np.repeat(size <= most, size))
+
     def _with_kept(self, kept_corners: Tensor) -> Layout:
         mask = np.zeros(self.arrays.corner_count, dtype=np.bool_)
         mask[kept_corners.numpy()] = True
@@ -103,10 +139,9 @@ class KernelEngine(TorchEngine):
         session = arrays.session[arrays.frame_of(arrays.pair).long()].numpy()
         begin = layout.begin[layout.unit[:-1]]
         shared = np.minimum.reduceat(session, begin) < np.maximum.reduceat(session, begin)
-        size = np.diff(layout.unit)
-        # A unit larger than a tile would reach beyond the next one.
-        most = frames_per_tile(arrays) * len(arrays.states) // 2
-        return torch.from_numpy(np.flatnonzero(np.repeat(shared & (size <= most), size)))
+        fits = self._fits_a_tile(frames_per_tile(arrays) * len(arrays.states) // 2)
+        is_shared = torch.from_numpy(np.repeat(shared, np.diff(layout.unit)))
+        return (fits & is_shared).nonzero()[:, 0]
 
     def _coupled_tiles(self, layout: Layout, per_tile: int, tile_count: int) -> tuple[list[list[int]], int]:
         """Pairs of tiles coupled by eliminated corners, and the largest number of tiles of a unit."""

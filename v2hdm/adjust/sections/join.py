@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -113,7 +113,7 @@ class Net:
             corner_place=corner_place,
         )
 
-    def join(self, told: Sequence[Summary], shared: Shared) -> Joined:
+    def join(self, told: Iterable[Summary], shared: Shared) -> Joined:
         """The step of all borders to the optimum of the whole, as the parts tell of their borders."""
         matrix = BlockMatrix.zeros(self.pattern)
         gradient = [np.zeros(size) for size in self.pattern.sizes]
@@ -128,10 +128,9 @@ class Net:
         decrease = -sum(float(of_block @ part) for of_block, part in zip(step, gradient, strict=True))
         return Joined(step, decrease, factor)
 
-    def covariances(self, factor: BlockCholesky) -> list[FloatArray]:
-        """The joint covariance (n, n) of each part's border."""
+    def covariances(self, factor: BlockCholesky) -> Iterator[FloatArray]:
+        """The joint covariance (n, n) of each part's border, one after the other."""
         blocks = factor.inverse()
-        out = []
         for label in self.labels:
             place = self._place(label)
             covariance = np.zeros((len(place.block), len(place.block)))
@@ -143,16 +142,27 @@ class Net:
                     block = blocks.get((first, second))
                     whole = blocks[second, first].T if block is None else block
                     covariance[np.ix_(rows, columns)] = whole[np.ix_(place.row[rows], place.row[columns])]
-            out.append(covariance)
-        return out
+            yield covariance
 
-    def step_of(self, joined: Joined, label: Labels) -> FloatArray:
-        """The step (n,) of a part's border."""
+    def steps(self, factor: BlockCholesky, slopes: Sequence[FloatArray]) -> list[FloatArray]:
+        """Steps (b, n) of each part's border to the optimum under n errors, as the parts' ``slopes`` tell."""
+        errors = slopes[0].shape[1]
+        gradient = [np.zeros((size, errors)) for size in self.pattern.sizes]
+        for label, of_part in zip(self.labels, slopes, strict=True):
+            place = self._place(label)
+            for number in np.unique(place.block).tolist():
+                rows = np.flatnonzero(place.block == number)
+                gradient[number][place.row[rows]] += of_part[rows]
+        step = factor.solve([-of_block for of_block in gradient])
+        return [self._of_border(step, label) for label in self.labels]
+
+    def _of_border(self, step: Sequence[FloatArray], label: Labels) -> FloatArray:
+        """The rows (b, ...) of a step by block that are of a part's border."""
         place = self._place(label)
-        out = np.zeros(len(place.block))
+        out = np.zeros((len(place.block), *step[0].shape[1:]))
         for number in np.unique(place.block).tolist():
             rows = np.flatnonzero(place.block == number)
-            out[rows] = joined.step[number][place.row[rows]]
+            out[rows] = step[number][place.row[rows]]
         return out
 
     def _place(self, label: Labels) -> _Place:

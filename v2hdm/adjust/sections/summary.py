@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from v2hdm.adjust.covariance import Covariance, coupled_to, reduced_root
+from v2hdm.adjust.covariance import Covariance, reduced_root
 from v2hdm.adjust.model import Estimate, left_tangent
-from v2hdm.adjust.reduced import from_tiles, to_tiles
+from v2hdm.adjust.reduced import to_tiles
 from v2hdm.adjust.whitening import Whitening
 from v2hdm.records import FloatArray
 
@@ -69,14 +69,26 @@ class Values:
 
 @dataclass(frozen=True)
 class Columns:
-    """Columns of W: ``reduced`` (D, n), and of each corner's own variables ``own`` (2 m, 2 m), the last."""
+    """Columns of W, zero but in these rows.
+
+    ``reduced`` (T, n) are the last reduced variables, ``own`` (2 m, 2 m) the variables of the m corners that
+    the last columns are of; it is empty where corners are themselves reduced variables.
+    """
 
     reduced: Tensor
     own: Tensor
 
     def pushed(self, weights: Tensor) -> tuple[Tensor, Tensor]:
-        """W weights, as reduced variables (D,) and the corners' own (m, 2)."""
-        return self.reduced @ weights, (self.own @ weights[len(weights) - len(self.own) :]).view(-1, 2)
+        """W weights, as the last reduced variables (T, ...) and the corners' own (m, 2, ...)."""
+        of_corners = self.own @ weights[len(weights) - len(self.own) :]
+        return self.reduced @ weights, of_corners.view(len(of_corners) // 2, 2, *weights.shape[1:])
+
+    def pulled(self, reduced: Tensor, corners: Tensor) -> Tensor:
+        """Inner products (n, ...) with all reduced (D, ...) and the corners' variables (m, 2, ...)."""
+        out = self.reduced.mT @ reduced[len(reduced) - len(self.reduced) :]
+        if len(self.own):
+            out[len(out) - len(self.own) :] += self.own.mT @ corners.flatten(0, 1)
+        return out
 
     @cached_property
     def covariance(self) -> Tensor:
@@ -90,29 +102,29 @@ class Columns:
 def border_columns(whitening: Whitening, border: Border) -> Columns:
     """The columns of a border."""
     arrays = whitening.engine.arrays
+    plan = whitening.plan
     factor = whitening.reduced_factor
+    are_last = plan.border_tiles > 0 and len(border.corners) == len(plan.kept_corners)
+    if are_last:
+        factor = factor.tail(plan.border_tiles)
     tip = len(factor.tip)
-    cameras = factor.tip.new_zeros(factor.size, tip)
-    cameras[factor.size - tip :] = torch.eye(tip, dtype=cameras.dtype, device=cameras.device)
-    parts = [factor.solve(cameras)]
-    if len(border.frames) and arrays.states:
-        unit = torch.eye(len(arrays.states), dtype=cameras.dtype, device=cameras.device)
-        parts.append(_frame_columns(whitening, border.frames, unit))
-    corners = _corner_columns(whitening, border.corners)
-    return Columns(torch.cat([*parts, corners.reduced], dim=1), corners.own)
+    whole = whitening.reduced_factor.size
+    rows = [torch.arange(whole - tip, whole, device=factor.tip.device)]
+    if arrays.states:
+        rows.append(plan.frame_rows(border.frames, len(arrays.states)).flatten())
+    if are_last:
+        rows.append(plan.kept_rows(torch.arange(len(border.corners), device=rows[0].device)).flatten())
+    at = torch.cat(rows) - (whole - factor.size)
+    units = factor.tip.new_zeros(factor.size, len(at))
+    units[at, torch.arange(len(at), device=at.device)] = 1.0
+    reduced = factor.solve(units)
+    if are_last:
+        return Columns(reduced, units.new_zeros(0, 0))
+    corners = corner_columns(whitening, border.corners)
+    return Columns(torch.cat([reduced, corners.reduced], dim=1), corners.own)
 
 
-def _frame_columns(whitening: Whitening, frames: Tensor, acts: Tensor) -> Tensor:
-    """Reduced columns (D, b n) of ``acts`` (S, n) on the states of frames (b,)."""
-    arrays = whitening.engine.arrays
-    selected = acts.new_zeros(arrays.frame_count, len(acts), len(frames), acts.shape[1])
-    selected[frames, :, torch.arange(len(frames), device=frames.device)] = acts
-    tiles = to_tiles(whitening.plan, selected.flatten(2))
-    tip = tiles.new_zeros(len(whitening.reduced_factor.tip), tiles.shape[1])
-    return whitening.reduced_factor.solve(torch.cat([tiles, tip]))
-
-
-def _corner_columns(whitening: Whitening, corners: Tensor) -> Columns:
+def corner_columns(whitening: Whitening, corners: Tensor) -> Columns:
     """Columns of corners (m,), ascending and closed."""
     tip = whitening.reduced_factor.tip
     reduced = [tip.new_zeros(whitening.reduced_factor.size, 0)]
@@ -173,11 +185,7 @@ def own_step(whitening: Whitening, border: Border, columns: Columns) -> Tensor:
     """The step (n,) of the border to the part's own optimum."""
     gradient = whitening.gradient
     reduced = gradient[: whitening.reduced_factor.size]
-    step = -(columns.reduced.mT @ reduced)
-    if len(border.corners):
-        of_corners = gradient[len(reduced) :].view(-1, 2)[border.corners].flatten()
-        step[-len(of_corners) :] -= columns.own.mT @ of_corners
-    return step
+    return -columns.pulled(reduced, gradient[len(reduced) :].view(-1, 2)[border.corners])
 
 
 def summarise(whitening: Whitening, border: Border, held: Tensor, held_map: Tensor) -> Summary:
@@ -207,10 +215,12 @@ def follow(whitening: Whitening, border: Border, target: Values) -> Estimate:
     step = target.step_from(Values.of(whitening.estimate, border))
     beyond = step - own_step(whitening, border, columns)
     weights = torch.cholesky_solve(beyond[:, None], torch.linalg.cholesky(columns.covariance))[:, 0]
-    reduced, of_corners = columns.pushed(weights)
+    last, of_corners = columns.pushed(weights)
     whitened = -whitening.gradient
-    whitened[: len(reduced)] += reduced
-    whitened[len(reduced) :].view(-1, 2)[border.corners] += of_corners
+    size = whitening.reduced_factor.size
+    whitened[size - len(last) : size] += last
+    if len(of_corners):
+        whitened[size:].view(-1, 2)[border.corners] += of_corners
     moved = whitening.linearised.evaluate(*whitening.step(whitened)).estimate
     states = moved.frame_state.clone()
     states[border.frames] = target.frame_state
@@ -239,10 +249,33 @@ class JoinedCovariance(Covariance):
         factor = torch.linalg.cholesky(alone)
         return torch.cholesky_solve(torch.cholesky_solve(difference, factor).mT, factor)
 
-    @cached_property
-    def _by_border(self) -> Tensor:
-        """Covariances (D, n) of the reduced unknowns with the border, by the part alone."""
-        return self.whitening.reduced_factor.solve_transposed(self._columns.reduced)
+    def slopes(self, reduced: Tensor, corners: Tensor) -> FloatArray:
+        """Slopes (b, n) of the cost by the border's step under n errors, all else following both.
+
+        The errors are columns by the whitened unknowns: ``reduced`` (D, n) and of ``corners`` (N, 2, n).
+        """
+        return np.asarray(self._in_border(self._pulled(reduced, corners)).cpu().numpy())
+
+    def followed(self, reduced: Tensor, corners: Tensor, steps: FloatArray) -> tuple[Tensor, Tensor]:
+        """Whitened steps under n errors, as in :meth:`slopes`, where the border makes ``steps`` (b, n)."""
+        assert self.border is not None
+        pulled = self._pulled(reduced, corners)
+        last, of_border = self._columns.pushed(self._in_border(torch.as_tensor(steps).to(pulled) + pulled))
+        moved = -reduced
+        moved[len(moved) - len(last) :] += last
+        moved_corners = -corners
+        if len(of_border):
+            moved_corners[self.border.corners] += of_border
+        return moved, moved_corners
+
+    def _pulled(self, reduced: Tensor, corners: Tensor) -> Tensor:
+        """Inner products (b, n) of the border's columns and others."""
+        assert self.border is not None
+        return self._columns.pulled(reduced, corners[self.border.corners])
+
+    def _in_border(self, columns: Tensor) -> Tensor:
+        """(W'W)^-1 times columns (b, n)."""
+        return torch.cholesky_solve(columns, torch.linalg.cholesky(self._columns.covariance))
 
     def _cameras(self) -> list[FloatArray]:
         """Covariances (6 + Q, 6 + Q) of each camera's unknowns."""
@@ -261,41 +294,46 @@ class JoinedCovariance(Covariance):
         """Variances (J, 6) of the frames' tangents; 0 without states."""
         arrays = self.whitening.engine.arrays
         out = super().poses()
-        if not arrays.states:
-            return out
-        tip = len(self.whitening.reduced_factor.tip)
-        rows = self._by_border[:-tip]
-        by_frame, _ = from_tiles(self.whitening.plan, rows, arrays.frame_count, len(arrays.states))
         # White errors and drifts add up to an axis of the tangent.
-        columns = torch.tensor(arrays.states, dtype=torch.int64, device=by_frame.device)
-        acts = one_hot(columns, 6).to(torch.float64)
-        for begin in range(0, arrays.frame_count, _FRAMES_AT_ONCE):
-            regression = (acts.mT @ by_frame[begin : begin + _FRAMES_AT_ONCE]).flatten(0, 1)
-            gained = ((regression @ self._gained) * regression).sum(1).view(-1, 6)
+        axes = torch.tensor(arrays.states, dtype=torch.int64, device=arrays.centre.device)
+        acts = one_hot(axes, 6).to(torch.float64)
+        for begin in range(0, arrays.frame_count if arrays.states else 0, _FRAMES_AT_ONCE):
+            frames = torch.arange(begin, min(begin + _FRAMES_AT_ONCE, arrays.frame_count), device=axes.device)
+            of_frames = _frame_columns(self.whitening, frames, acts)
+            regression = self._columns.reduced.mT @ of_frames[len(of_frames) - len(self._columns.reduced) :]
+            gained = ((self._gained @ regression) * regression).sum(0).view(-1, 6)
             out[begin : begin + len(gained)] += gained.cpu().numpy()
         return out
 
     def _corners(self, groups: NDArray[np.int64]) -> FloatArray:
-        of_part = super()._corners(groups)
         assert self.border is not None
         arrays = self.whitening.engine.arrays
         rank = torch.argsort(arrays.corner_order)
         chosen = rank[torch.as_tensor(groups, device=rank.device)]
         unit = (~arrays.joined).cumsum(0)
         corners = torch.isin(unit, unit[chosen.flatten()]).nonzero()[:, 0]
-        factors = _factors(self.whitening, corners)
-        regression = -factors.inverse.mT @ (coupled_to(self.whitening, corners).mT @ self._by_border)
+        columns = corner_columns(self.whitening, corners)
         # Corners of the border have their own variables in common with it.
-        shared = torch.isin(corners, self.border.corners)
-        rows = _axes(shared.nonzero()[:, 0])
-        if len(rows):
-            places = torch.searchsorted(self.border.corners, corners[shared])
-            at = _axes(places) + regression.shape[1] - len(self._columns.own)
-            block = self._columns.own[:, _axes(places)]
-            regression[rows[:, None], at] += factors.by_variable[:, rows][rows].mT @ block[_axes(places)]
+        on_border = columns.own.new_zeros(2 * len(self.border.corners), columns.own.shape[1])
+        is_shared = torch.isin(corners, self.border.corners)
+        places = torch.searchsorted(self.border.corners, corners[is_shared])
+        on_border[_axes(places)] = columns.own[_axes(is_shared.nonzero()[:, 0])]
+        regression = self._columns.pulled(
+            columns.reduced, on_border.view(len(self.border.corners), 2, on_border.shape[1])
+        )
         place = _axes(torch.searchsorted(corners, chosen.contiguous()))
-        of_group = regression[place]
-        return np.asarray(of_part + (of_group @ self._gained @ of_group.mT).cpu().numpy())
+        covariance = columns.covariance + regression.mT @ self._gained @ regression
+        return np.asarray(covariance[place[:, :, None], place[:, None, :]].cpu().numpy())
+
+
+def _frame_columns(whitening: Whitening, frames: Tensor, acts: Tensor) -> Tensor:
+    """Reduced columns (D, b n) of ``acts`` (S, n) on the states of frames (b,)."""
+    arrays = whitening.engine.arrays
+    selected = acts.new_zeros(arrays.frame_count, len(acts), len(frames), acts.shape[1])
+    selected[frames, :, torch.arange(len(frames), device=frames.device)] = acts
+    tiles = to_tiles(whitening.plan, selected.flatten(2))
+    tip = tiles.new_zeros(len(whitening.reduced_factor.tip), tiles.shape[1])
+    return whitening.reduced_factor.solve(torch.cat([tiles, tip]))
 
 
 def _axes(index: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -23,7 +24,9 @@ def _run(arguments: Sequence[str]) -> int:
     machines = "machines to work on: the address of a Dask scheduler, or a batch system; as cluster=ADDRESS"
     parser.add_argument("--cluster", metavar="ADDRESS", help=machines)
     parser.add_argument("--again", action="store_true", help="map finished drives again")
+    parser.add_argument("--share", metavar="K/N", help=argparse.SUPPRESS)  # of 1.0, taken until 2.0
     parsed = parser.parse_intermixed_args(arguments)
+    from v2hdm.cli.old_names import share_of
     from v2hdm.fleet import FleetOptions, exit_code, fleet_on_terminal
     from v2hdm.settings import check_workers
 
@@ -38,7 +41,12 @@ def _run(arguments: Sequence[str]) -> int:
     # A pattern that matches nothing comes as it is.
     if unmatched := [file for file in missing if missing == files or set("*?[") & set(str(file))]:
         raise ConfigError(f"{unmatched[0]}: no such run file; check the path")
-    options = FleetOptions(parsed.table, parsed.workers, parsed.again)
+    table = parsed.table
+    if parsed.share is not None:
+        share = share_of(parsed.share)
+        files = files[share.first - 1 :: share.every]
+        table = table.with_name(f"{table.name}-{share.first}-of-{share.every}")
+    options = FleetOptions(table, parsed.workers, parsed.again)
     return exit_code(fleet_on_terminal(files, overrides, options))
 
 

@@ -61,6 +61,10 @@ def _live_parser() -> argparse.ArgumentParser:
     parser.add_argument("--motion", required=True, metavar="FILE", help=motion)
     begin = "where it starts, to 5 m and 20 deg: m and deg from east to north (default: anywhere)"
     parser.add_argument("--start", type=float, nargs=3, metavar=("EAST", "NORTH", "HEADING"), help=begin)
+    antenna = "where the antenna of the positions is: m ahead of the rear axle and to the left (default: 0 0)"
+    parser.add_argument(
+        "--antenna", type=float, nargs=2, default=(0.0, 0.0), metavar=("AHEAD", "LEFT"), help=antenna
+    )
     calibration = "calibration of a camera (default: those beside the map); repeatable"
     parser.add_argument(
         "--calibration", action="append", type=Path, default=[], metavar="FILE", help=calibration
@@ -96,7 +100,7 @@ def _run_live(arguments: Sequence[str]) -> int:
     sources = _sources(parsed, by_camera)
     calibrations = {name: content[by_camera[name]] for name in sources}
     prior = None if parsed.start is None else rough_position(*parsed.start)
-    localizer = Localizer(hd_map, calibrations, prior)
+    localizer = Localizer(hd_map, calibrations, prior, antenna_m=parsed.antenna)
     is_stdin = parsed.motion == "-"
     lines = MotionLines("standard input" if is_stdin else parsed.motion, hd_map.origin)
     stream_in = sys.stdin if is_stdin else Path(parsed.motion)

@@ -64,6 +64,8 @@ def write_lanelet2(
             document.way(feature.id, nodes, line_tags(feature) | _more_tags(feature))
     for stop_line in graph.stop_lines:  # markings come first among features
         lanelets.write_stop_line(features[stop_line.marking], stop_line)
+    for right in graph.stated_rights:
+        lanelets.write_right(right)
     lanelets.write()
     square = document.place_nodes()
     replace_text(path, document.text())

@@ -12,12 +12,16 @@ from v2hdm.io.maps.features import Feature
 from v2hdm.io.maps.osm import MOST_VERTICES, PARTS, Document, part
 from v2hdm.records import LANE_DASH, FloatArray
 from v2hdm.topology.closed_lanes import Bound
-from v2hdm.topology.graph import Border, Direction, LaneGraph, LaneOfGraph, Right, StopLine
+from v2hdm.topology.graph import Border, Direction, LaneGraph, LaneOfGraph, Right, StatedRight, StopLine
 
 # Parts of a line, beside its vertices and its pieces:
 _LANELETS = MOST_VERTICES + PARTS // 4  # part that those of the lanelets to its right follow
 _VIRTUALS = MOST_VERTICES + 3 * PARTS // 8  # part that those of its bounds without paint follow
+_RIGHTS = MOST_VERTICES + 5 * PARTS // 16  # part that those of stated rights of way follow
 _INNER = MOST_VERTICES + 7 * PARTS // 16  # part that those of the nodes of such bounds follow
+_TOGETHER_M = 0.6  # distance, m, of points half a metre apart along curves that are one line; chosen
+
+_RULE = {"type": "regulatory_element"}
 
 
 class _StopEdges(NamedTuple):
@@ -25,6 +29,13 @@ class _StopEdges(NamedTuple):
 
     stop: FloatArray
     other: FloatArray
+
+
+class _Virtual(NamedTuple):
+    """A bound that no paint shows, by its id, and its points (N, 3), m, between its ends."""
+
+    number: int
+    inner_xyz: FloatArray
 
 
 class Lanelets:
@@ -35,10 +46,13 @@ class Lanelets:
         self._graph = graph
         self._lines = lines
         self.vertices = {line.id: document.nodes(line, line.xyz_map) for line in lines}
+        self._stop_of_lane: dict[int, int] = {}
+        self._rights: Counter[int] = Counter()
         self._rules: list[list[int]] = [[] for _ in graph.lanes]
         self._bounds: dict[tuple[int, int, int], int] = {}
         self._counts: Counter[int] = Counter()
         self._virtuals: Counter[int] = Counter()
+        self._virtuals_between: dict[frozenset[int], list[_Virtual]] = {}
         self._inner: Counter[int] = Counter()
         self._numbers = [self._number(lane) for lane in range(len(graph.lanes))]
 
@@ -62,21 +76,35 @@ class Lanelets:
         stop_id, sign_id, rule_id = (part(feature, MOST_VERTICES + k) for k in range(3))
         stop_nodes = self._document.nodes(feature, edges.stop, MOST_VERTICES + 10)
         self._document.way(stop_id, stop_nodes, {"type": "stop_line"})
-        tags = {"type": "regulatory_element"}
         if stop_line.right is Right.GIVE_WAY and stop_line.yields_to:
-            members = [("way", stop_id, "ref_line")]
-            members += [("relation", self._numbers[lane], "yield") for lane in stop_line.lanes]
-            members += [("relation", self._numbers[lane], "right_of_way") for lane in stop_line.yields_to]
-            self._document.relation(rule_id, members, tags | {"subtype": "right_of_way"})
+            self._right_of_way(rule_id, stop_id, stop_line.lanes, stop_line.yields_to)
         else:
             sign_nodes = self._document.nodes(feature, edges.other, MOST_VERTICES + 20)
             kind = "stop_sign" if stop_line.right is Right.STOP else "yield_sign"
             sign_tags = {"type": "traffic_sign", "subtype": kind, "virtual": "yes"}
             self._document.way(sign_id, sign_nodes, sign_tags)
             members = [("way", sign_id, "refers"), ("way", stop_id, "ref_line")]
-            self._document.relation(rule_id, members, tags | {"subtype": "traffic_sign"})
+            self._document.relation(rule_id, members, _RULE | {"subtype": "traffic_sign"})
         for lane in stop_line.lanes:
             self._rules[lane].append(rule_id)
+            self._stop_of_lane[lane] = stop_id
+
+    def write_right(self, right: StatedRight) -> None:
+        """Write that a lane gives way as stated, at the line that it ends at if one is painted."""
+        owner = self._owner(right.lane)
+        self._rights[owner.id] += 1
+        rule_id = part(owner, _RIGHTS + self._rights[owner.id])
+        self._right_of_way(rule_id, self._stop_of_lane.get(right.lane), (right.lane,), right.yields_to)
+        self._rules[right.lane].append(rule_id)
+
+    def _right_of_way(
+        self, rule_id: int, stop_id: int | None, yielding: Sequence[int], first: Sequence[int]
+    ) -> None:
+        """Write the rule by which lanes ``yielding`` wait for lanes that go ``first``."""
+        members = [] if stop_id is None else [("way", stop_id, "ref_line")]
+        members += [("relation", self._numbers[lane], "yield") for lane in yielding]
+        members += [("relation", self._numbers[lane], "right_of_way") for lane in first]
+        self._document.relation(rule_id, members, _RULE | {"subtype": "right_of_way"})
 
     def _direction(self, stop_line: StopLine, place_map: FloatArray) -> FloatArray | None:
         """The direction (2,) in which the lanes of a stop line pass it, None without lanes."""
@@ -103,15 +131,23 @@ class Lanelets:
         return self._virtual(before, after, side.xyz_map[1:-1])
 
     def _virtual(self, end: Bound, start: Bound, inner_xyz: FloatArray) -> int:
-        """A bound that no paint shows, from where one lane's ends to where another's starts."""
+        """A bound that no paint shows, from where one lane's ends to where another's starts.
+
+        Ways beside each other share it, also where they lead in opposite directions (Autoware's vm-01-04).
+        """
         owner = self._lines[end.line]
+        last = self.vertices[owner.id][end.order[-1]]
+        first = self.vertices[self._lines[start.line].id][start.order[0]]
+        ends = frozenset((last, first))
+        for virtual in self._virtuals_between.get(ends, ()):
+            if _lie_together(virtual.inner_xyz, inner_xyz):
+                return virtual.number
         self._virtuals[owner.id] += 1
         number = part(owner, _VIRTUALS + self._virtuals[owner.id])
         inner = self._document.nodes(owner, inner_xyz, _INNER + self._inner[owner.id])
         self._inner[owner.id] += len(inner)
-        last = self.vertices[owner.id][end.order[-1]]
-        first = self.vertices[self._lines[start.line].id][start.order[0]]
-        self._document.way(number, [last, *inner, first], {"type": "virtual"})
+        self._virtuals_between.setdefault(ends, []).append(_Virtual(number, inner_xyz))
+        self._document.way(number, [last, *inner, first], {"type": "virtual", "lane_change": "no"})
         return number
 
     def _bound(self, bound: Bound) -> int:
@@ -139,6 +175,14 @@ def _tags(lane: LaneOfGraph) -> dict[str, str]:
     if lane.speed_kmh is not None:
         tags["speed_limit"] = f"{lane.speed_kmh:g}"
     return tags
+
+
+def _lie_together(first_xyz: FloatArray, second_xyz: FloatArray) -> bool:
+    """Whether two curves (N, 3) and (M, 3) between the same ends are one line."""
+    if not len(first_xyz) or not len(second_xyz):
+        return len(first_xyz) == len(second_xyz)
+    apart_m = np.linalg.norm(first_xyz[:, None, :2] - second_xyz[None, :, :2], axis=2)
+    return bool(max(apart_m.min(axis=0).max(), apart_m.min(axis=1).max()) < _TOGETHER_M)
 
 
 def _stop_edges(corners: FloatArray, direction: FloatArray | None) -> _StopEdges:

@@ -27,7 +27,7 @@ from v2hdm.io.maps.roads import Marks, Road, roads_of, spaced
 from v2hdm.records import CROSSWALK, FloatArray, HDMap
 from v2hdm.store.files import replace_text, xml_text
 from v2hdm.topology.build import lane_graph
-from v2hdm.topology.graph import LaneGraph, StopLine
+from v2hdm.topology.graph import LaneGraph
 from v2hdm.topology.lines import tangents
 
 _log = logging.getLogger(__name__)
@@ -63,7 +63,7 @@ def write_opendrive(hd_map: HDMap, path: Path, graph: LaneGraph | None = None) -
             k = int(np.argmin(apart_m))
             _write_object(objects[k], feature, roads[k])
     for number in range(len(graph.junctions)):
-        _write_junction(root, number, roads, graph.stop_lines, graph)
+        _write_junction(root, number, roads, graph)
     replace_text(path, xml_text(root))
 
 
@@ -175,10 +175,8 @@ def _write_piece(view: ET.Element, piece: Piece, s_m: float) -> None:
     ET.SubElement(geometry, "paramPoly3", cubic | {"pRange": "normalized"})
 
 
-def _write_junction(
-    root: ET.Element, number: int, roads: Sequence[Road], stop_lines: Sequence[StopLine], graph: LaneGraph
-) -> None:
-    """Write a junction: a connection for each of its roads, and which of them give way, as painted."""
+def _write_junction(root: ET.Element, number: int, roads: Sequence[Road], graph: LaneGraph) -> None:
+    """Write a junction: a connection for each of its roads, and which of them give way."""
     members = {k: road for k, road in enumerate(roads) if road.junction == number}
     incoming = {k: road for k, road in members.items() if road.before is not None}
     if not incoming:
@@ -189,10 +187,12 @@ def _write_junction(
         ways = {"id": str(count), "incomingRoad": str((road.before or 0) + 1), "connectingRoad": str(k + 1)}
         connection = ET.SubElement(element, "connection", ways | {"contactPoint": "start"})
         ET.SubElement(connection, "laneLink", {"from": "-1", "to": "-1"})
-    for stop_line in stop_lines:
-        onward = {after for lane in stop_line.lanes for after in graph.after(lane)}
+    rights = [(stop.lanes, stop.yields_to) for stop in graph.stop_lines]
+    rights += [((right.lane,), right.yields_to) for right in graph.stated_rights]
+    for yielding_lanes, lanes_first in rights:
+        onward = {after for lane in yielding_lanes for after in graph.after(lane)}
         low = [k for k, road in members.items() if onward & set(road.lanes)]
-        high = [k for k, road in members.items() if set(stop_line.yields_to) & set(road.lanes)]
+        high = [k for k, road in members.items() if set(lanes_first) & set(road.lanes)]
         for preferred in high:
             for yielding in low:
                 ET.SubElement(element, "priority", {"high": str(preferred + 1), "low": str(yielding + 1)})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -43,13 +43,15 @@ class Names:
     """Names over the drive of a section's G groups.
 
     ``marking`` (G,) is the marking's, ``turned`` (G,) by how many corners its first is behind the group's,
-    ``is_ours`` (G,) whether it belongs to the section, ``is_shared`` (G,) whether others have it, too.
+    ``is_shared`` (G,) whether other sections have it, too, ``sightings`` (G,) counts those in the section's
+    images, ``is_ours`` (G,) says whether it belongs to the section, as :func:`with_owners` has it.
     """
 
     marking: IntArray
     turned: IntArray
-    is_ours: BoolArray
     is_shared: BoolArray
+    sightings: IntArray
+    is_ours: BoolArray
 
     def corners(self, bundle: Bundle) -> IntArray:
         """The corner (K,), over the drive, of each observation of a section's bundle."""
@@ -98,27 +100,45 @@ def _mean_sigma(sigmas: Sequence[PoseSigma], weight: FloatArray) -> PoseSigma:
         position_drift=mean_drift([sigma.position_drift for sigma in sigmas]),
         heading_drift=mean_drift([sigma.heading_drift for sigma in sigmas]),
         roll_pitch_drift=mean_drift([sigma.roll_pitch_drift for sigma in sigmas]),
+        heading_slip=max(sigma.heading_slip for sigma in sigmas),
     )
 
 
 def named(sections: Sequence[Alone]) -> list[Names]:
-    """The names of all sections' groups; a marking is of the section most of whose own images show it."""
+    """The names of all sections' groups, which belong to none yet."""
     markings = _named_markings(sections)
-    best: dict[int, tuple[int, int]] = {}
-    count: Counter[int] = Counter()
-    for number, section in enumerate(sections):
-        names = markings[number].marking.tolist()
-        count.update(names)
-        for name, sightings in zip(names, section.own_sightings.tolist(), strict=True):
-            best[name] = max(best.get(name, (-1, 0)), (sightings, -number))
+    count = Counter(name for names in markings for name in names.marking.tolist())
     return [
         Names(
             marking=names.marking,
             turned=names.turned,
-            is_ours=np.array([best[name][1] == -number for name in names.marking.tolist()], dtype=np.bool_),
             is_shared=np.array([count[name] > 1 for name in names.marking.tolist()], dtype=np.bool_),
+            sightings=section.own_sightings,
+            is_ours=np.zeros(len(names.marking), dtype=np.bool_),
         )
-        for number, names in enumerate(markings)
+        for names, section in zip(markings, sections, strict=True)
+    ]
+
+
+def with_owners(sections: Sequence[Names], corners: Sequence[IntArray]) -> list[Names]:
+    """The names, with the section that each marking belongs to.
+
+    It is the section whose own images determine most of its corners, of several that with most sightings.
+    ``corners`` are by section those, over the drive, that its images determine: others are in no covariance
+    of the section.
+    """
+    best: dict[int, tuple[int, int, int]] = {}
+    claims = []
+    for number, (names, known) in enumerate(zip(sections, corners, strict=True)):
+        marking, count = np.unique(np.unique(known) // 4, return_counts=True)
+        corners_of = dict(zip(marking.tolist(), count.tolist(), strict=True))
+        pairs = zip(names.marking.tolist(), names.sightings.tolist(), strict=True)
+        claims.append([(name, (corners_of.get(name, 0), count_in, -number)) for name, count_in in pairs])
+        for name, claim in claims[-1]:
+            best[name] = max(best.get(name, claim), claim)
+    return [
+        replace(names, is_ours=np.array([best[name] == claim for name, claim in of_section], dtype=np.bool_))
+        for names, of_section in zip(sections, claims, strict=True)
     ]
 
 

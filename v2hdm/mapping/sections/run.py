@@ -5,7 +5,7 @@
 3. The solves of all sections are joined (:mod:`v2hdm.adjust.sections`), each with the images that are its
    own: first with all observations, then with those that agree. These are the joint solves of the drive.
 4. The candidates of all sections are classified together: shapes are learnt over all. A marking belongs to
-   the section most of whose own images show it.
+   the section whose own images determine most of its corners.
 5. Every section makes its map, and their lanes are joined.
 
 Sections are jobs of an executor, and lie in files between these steps: no process holds more than one.
@@ -30,13 +30,15 @@ from v2hdm.association.sightings import Sightings, frames_of
 from v2hdm.errors import WorkerError
 from v2hdm.executor import Executor
 from v2hdm.faults.clock_errors import second_moments
+from v2hdm.faults.clock_parts import Along, evidence_of
+from v2hdm.faults.sensitivity import stretches_of_way
 from v2hdm.io.maps.corrections import Heard
 from v2hdm.lanes.lines import join_paths, lanes_along
 from v2hdm.mapping.bundle import LEAST_OBSERVATIONS, VARIANCE_FACTORS, Model, drive_problem, full_model
 from v2hdm.mapping.optimise import SETTLED_MODEL, initial_rig
 from v2hdm.mapping.options import AUTO, MappingOptions, check_sections
 from v2hdm.mapping.results import MethodResult
-from v2hdm.mapping.sections.common import Alone, Names, named, pooled_noise
+from v2hdm.mapping.sections.common import Alone, Names, named, pooled_noise, with_owners
 from v2hdm.mapping.sections.faults import pooled_tests, refuse_contradicted
 from v2hdm.mapping.sections.joint import (
     Fit,
@@ -72,7 +74,7 @@ _CLASSIFIED_AT_ONCE = 5000
 """Most candidates, of neighbouring sections, that are classified together: memory and time would grow with
 their square, and thousands tell all of a class's shapes."""
 
-_SETTLED_GAP = 1e-6  # gap of the joint solve that outliers are told by, a fraction of the cost
+_SETTLED_GAP = 1e-5  # gap of the joint solve that outliers are told by, a fraction of the cost
 
 
 def map_in_sections(
@@ -112,8 +114,7 @@ def map_in_sections(
     solved = _joint_solves(run, drive, part, alone)
     proposals: list[Proposal] = run.finish(solved, solved.work.propose)
     heard = _classified(run, solved, proposals, options.acceptance)
-    of_clocks = [proposal.clock for proposal in proposals if proposal.clock is not None]
-    clock_root = second_moments(of_clocks, drive.noises) if of_clocks else None
+    clock_root = _clock_root(run, solved, [proposal.clock_slopes for proposal in proposals], drive)
     del proposals
     finished: list[Finished] = run.finish(solved, replace(solved.work, clock_root=clock_root).finish)
     result = merged([section.result for section in finished], drive, own_images)
@@ -180,7 +181,10 @@ def _joint_solves(run: _Run, drive: Drive, part: IntArray, alone: Sequence[Alone
     work = replace(run.work, model=model)
     fits, _, shape = _join(run, work, drive, part, _SETTLED_GAP)
     refuse_contradicting_drives(fits, drive)
-    for number, gate in enumerate(gates(fits, model.solver.gate_probability)):
+    passed = gates(fits, model.solver.gate_probability)
+    names = with_owners(names, [fit.corner[gate.is_used] for fit, gate in zip(fits, passed, strict=True)])
+    for number, (of_section, gate) in enumerate(zip(names, passed, strict=True)):
+        work.write("names", number, of_section)
         work.write("gate", number, gate)
     observations = np.array([section.observations for section in alone])
     held_out: dict[str, float] = {}
@@ -213,17 +217,35 @@ def _join(run: _Run, work: Work, drive: Drive, part: IntArray, gap: float) -> tu
     for number in range(whole.session_count):
         in_session = session == number
         rising[in_session] = np.linspace(-0.5, 0.5, int(in_session.sum()))
+    stretch = stretches_of_way(whole.map_from_vehicle[:, :2, 3], session)
     for number in range(run.count):
         frames = np.flatnonzero(part == number)
-        ends = Ends(chains.is_start[frames], chains.in_border[frames], rising[frames])
-        work.write("ends", number, ends)
+        is_start = chains.is_start[frames]
+        is_linked = chains.in_border[frames]
+        along = Along(number, stretch[frames], int(stretch.max()) + 1, rising[frames], is_start & is_linked)
+        work.write("ends", number, Ends(is_start, is_linked, along))
     run.all(work.cut, "cut sections")
     shape = Shape.of(whole, work.model.solver)
     joint = join_parts(
         work.folder, run.count, chains.links, shape, work.tell, run.executor,
-        partial(run.progress, "join sections"), gap,
+        partial(run.progress, "join sections"), gap, with_covariances=work.stage == FINAL,
     )  # fmt: skip
     return joint.results, joint, shape
+
+
+def _clock_root(
+    run: _Run, solved: _Solved, slopes: Sequence[FloatArray | None], drive: Drive
+) -> FloatArray | None:
+    """Root (n, n) of the second moments of the clocks' errors; None where they have none.
+
+    Every section is told how its border follows them.
+    """
+    told = [of_section for of_section in slopes if of_section is not None]
+    if not told:
+        return None
+    for number, steps in enumerate(solved.joint.steps(told)):
+        run.work.write("clock_steps", number, steps)
+    return second_moments(evidence_of(run.finish(solved, solved.work.weigh_clocks)), drive.noises)
 
 
 def _classified(

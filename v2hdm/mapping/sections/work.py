@@ -18,7 +18,8 @@ from v2hdm.adjust.sections.solve import save_part
 from v2hdm.adjust.selection import busiest
 from v2hdm.association.groups import known_elsewhere
 from v2hdm.errors import AdjustError, MappingError
-from v2hdm.faults.clock_errors import ClockErrors, ClockEvidence, clock_evidence
+from v2hdm.faults.clock_errors import ClockErrors
+from v2hdm.faults.clock_parts import Along, PartSegments, follow_of, segments_of, slopes_of
 from v2hdm.geometry.twists import vehicle_twists
 from v2hdm.lanes.lines import Path as LanePath
 from v2hdm.lanes.lines import paths_of
@@ -53,12 +54,12 @@ FINAL = "final"
 class Ends(NamedTuple):
     """Of a section's own frames: whose states no frame before predicts, and which a link has.
 
-    ``rising`` is the share of a drift at each, from -1/2 to 1/2 over its session.
+    ``along`` says where they are in the whole drive.
     """
 
     is_start: BoolArray
     is_linked: BoolArray
-    rising: FloatArray
+    along: Along
 
 
 class Proposal(NamedTuple):
@@ -67,7 +68,7 @@ class Proposal(NamedTuple):
     solved: Candidates
     kinds: tuple[str, ...]
     parallax: Parallax
-    clock: ClockEvidence | None  # what the section says of the clocks
+    clock_slopes: FloatArray | None  # of the section's border under errors of clocks; None: there are none
 
 
 class Places(NamedTuple):
@@ -278,10 +279,18 @@ class Work:
             solved=proposal.solved.subset(ours),
             kinds=tuple(final.sightings.kinds[kind] for kind in proposal.kind[ours].tolist()),
             parallax=proposal.parallax.subset(ours),
-            clock=clock_evidence(
-                part.problem, solution, section.drive.noises, self.read("ends", number).rising
-            ),
+            clock_slopes=slopes_of(part.problem, solution, section.drive.noises, self._along(number)),
         )
+
+    def _along(self, number: int) -> Along:
+        ends: Ends = self.read("ends", number)
+        return ends.along
+
+    def weigh_clocks(self, number: int, part: Part, solution: Solution) -> PartSegments:
+        """Evidence of a section on the errors of clocks, under which its border makes the steps told."""
+        section: Section = self.read("section", number)
+        steps: FloatArray = self.read("clock_steps", number)
+        return segments_of(part.problem, solution, section.drive.noises, self._along(number), steps)
 
     def _final(self, number: int) -> FinalSolve:
         final = self.read("final", number)
@@ -325,7 +334,10 @@ class Work:
         if self.clock_root is None:
             noises = ()
         else:
-            clocks = ClockErrors(self.clock_root, self.read("ends", number).rising)
+            steps: FloatArray = self.read("clock_steps", number)[:, : len(self.clock_root)]
+            clocks = ClockErrors(
+                self.clock_root, self._along(number).rising, follow_of(bundle.solution, steps)
+            )
         optimised = concluded(final, self.read("classified", number), noises, clocks)
         evidence = replace(
             examined.evidence,

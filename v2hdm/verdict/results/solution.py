@@ -21,10 +21,10 @@ from v2hdm.faults.odds import (
     RIVAL_LOG_ODDS,
     even_sigmas,
     is_contradicted,
-    is_doubtful,
     is_observable,
     is_physical,
     is_possible,
+    leaves_doubt,
     log_odds,
     matters,
     possible_sigmas,
@@ -283,17 +283,19 @@ def _least_shown(test: Contradiction) -> str:
 
 
 def doubted(evidence: SolveEvidence) -> Contradiction | None:
-    """The input that is likeliest to be off, of those that may well be and do not surely fail the map."""
-    return next(iter(_doubtful(evidence)), None)
+    """The input that is likeliest to be off, of those that may well be, unless a likelier cause is named."""
+    likeliest = next(iter(_doubtful(evidence)), None)
+    raised = {finding.check for finding in check_inputs(evidence) if finding.status is not Status.PASS}
+    return likeliest if likeliest is not None and likeliest.fault.check in raised else None
 
 
 def _doubtful(evidence: SolveEvidence) -> list[Contradiction]:
-    """The input likeliest to be off, and those at least a tenth as likely."""
-    possible = [test for test in evidence.score_tests if is_doubtful(test) and not is_contradicted(test)]
-    least = math.exp(-RIVAL_LOG_ODDS) * max(map(probability, possible), default=0.0)
+    """The input likeliest to be off, and those at least a tenth as likely, if one may well be off."""
     rivals = [test for test in evidence.score_tests if is_observable(test) and not is_contradicted(test)]
-    likely = [test for test in rivals if possible and probability(test) > least]
-    return sorted(likely, key=probability, reverse=True)
+    if not leaves_doubt(rivals):
+        return []
+    least = math.exp(-RIVAL_LOG_ODDS) * max(map(probability, rivals))
+    return sorted((t for t in rivals if probability(t) > least), key=probability, reverse=True)
 
 
 def relied_on(evidence: SolveEvidence) -> dict[str, str]:

@@ -56,6 +56,7 @@ def course_headings(course: Course, starts: str | None, where: str) -> CourseHea
         "heading_rad": sigma_rad,
         "heading_drift_rad": float(np.sqrt(_DRIFTING)) * sigma_rad,
         "heading_drift_over_m": max(1.0, smoothed.faded_m),
+        "heading_slip": float(smoothed.shared_sigma[Shared.SLIP]),
     }
     lever_ahead_m = float(course.lever_arm_m[0] + smoothed.shared[Shared.LEVER])
     return CourseHeadings(smoothed.heading_rad, lever_ahead_m, noise)

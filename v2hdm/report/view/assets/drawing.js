@@ -6,7 +6,8 @@ import { isGone, isLine, isMovable, kindOf, middleOf } from "./model.js";
 const SERIES = ["blue", "green", "vermillion", "purple", "orange", "sky", "wine", "teal", "olive", "indigo"];
 const MARGIN = 0.3; // of the kept picture around the window, relative to its size
 const DOT_PX = 5; // a marking that is smaller is drawn as a dot
-const MOST_WITH_EDGES = 4000; // outlines in view that have a dark edge as well
+const MOST_WITH_EDGES = 1000; // outlines in view that have a dark edge as well
+const MOST_IN_PATH = 16; // outlines that are stroked at once
 const HANDLE_AWAY_PX = 22; // from a corner to its handle, outwards: handles of a narrow stripe lie apart
 const TURN_AWAY_PX = 62; // from the end of a marking to the handle that turns it
 export const HANDLE_PX = 9; // radius of a handle
@@ -170,12 +171,11 @@ export class Drawing {
       count += 1;
     }
     for (const [key, features] of groups) {
-      const path = new Path2D();
-      for (const { places } of features) trace(path, places, view);
       const isGroupGone = key === "gone";
-      if (count < MOST_WITH_EDGES) stroke(context, path, "rgb(0 0 0 / .5)", 3.6, []);
       const name = key.replace("corrected ", "");
-      stroke(context, path, colour(isGroupGone ? "vermillion" : name), key === name && !isGroupGone ? 1.6 : 2.6, isGroupGone ? [3, 4] : []);
+      const paths = pathsOf(features, view);
+      if (count < MOST_WITH_EDGES) for (const path of paths) stroke(context, path, "rgb(0 0 0 / .5)", 3.6, []);
+      for (const path of paths) stroke(context, path, colour(isGroupGone ? "vermillion" : name), key === name && !isGroupGone ? 1.6 : 2.6, isGroupGone ? [3, 4] : []);
     }
     for (const [key, features] of dots) this.dots(context, view, key, features);
     if (this.show.before) {
@@ -246,6 +246,17 @@ export class Drawing {
       context.fillText(handle.turn ? "\u21bb" : String(handle.corner + 1), handle.at[0], handle.at[1] + 0.5);
     }
   }
+}
+
+// Outlines in paths of a few each: the browser takes far longer for one path of thousands.
+function pathsOf(features, view) {
+  const paths = [];
+  for (let n = 0; n < features.length; n += MOST_IN_PATH) {
+    const path = new Path2D();
+    for (const { places } of features.slice(n, n + MOST_IN_PATH)) trace(path, places, view);
+    paths.push(path);
+  }
+  return paths;
 }
 
 function trace(path, places, view, isClosed = true) {

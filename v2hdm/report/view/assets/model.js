@@ -111,7 +111,7 @@ export class Model {
 }
 
 // What answers a question, in the order of its keys; nothing where a person writes the answer.
-export const answersOf = (subject) => ({ direction: ["along", "against", "both"], connection: ["yes", "no"], "two ways": ["yes"], line: ["noted"] })[subject] ?? [];
+export const answersOf = (subject) => ({ direction: ["along", "against", "both"], connection: ["yes", "no"], "right of way": ["yes", "no"], "two ways": ["yes"], line: ["noted"] })[subject] ?? [];
 
 export const kindOf = (feature) => feature.entry?.new_class ?? feature.entry?.class ?? feature.kind;
 export const isLine = ({ what }) => what === "line" || what === "drawn";
