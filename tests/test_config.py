@@ -145,6 +145,6 @@ def test_the_page_has_every_key_with_its_default_and_the_runs_that_are_shipped()
     page = help_text(command_of("map"), Door("map", RunConfig, ""))
     assert "v2hdm map [key=value ...]" in page
     assert "mapping.max_range_m (number, 16.0)\n      sightings farther from" in page
-    assert "Shipped runs: kitti, port1, port2" in page
+    assert "Shipped runs: kitti, port1, port2, signs" in page
     assert all(key.name in page for key in keys_of(RunConfig))
     assert max(map(len, page.splitlines())) <= 110

@@ -167,3 +167,10 @@ def test_drives_whose_poses_contradict_each_other_end_in_one_line(tmp_path):
     ) as refused:
         in_sections(tmp_path, problem, SolveOptions(), np.repeat([0, 1], 80))
     assert "\n" not in str(refused.value)
+
+
+def test_a_single_section_is_the_street(tmp_path):
+    scene = make_scene(3, frames=60, jitter=DRIFTING, start_error_deg=1.0)
+    options = SolveOptions()
+    part = np.zeros(60, dtype=np.int64)
+    check(in_sections(tmp_path, scene.problem, options, part), scene.problem, options)

@@ -88,10 +88,12 @@ def dense(tiles, pattern, size, tip):
 )
 @pytest.mark.parametrize("least_degree", [False, True])
 @pytest.mark.parametrize("tip", [4, 12])  # a few cameras, and more than fit a tile
-def test_the_tiled_factor_is_that_of_the_dense_matrix(cliques, least_degree, tip):
+@pytest.mark.parametrize("last", [(), (1, 4)])
+def test_the_tiled_factor_is_that_of_the_dense_matrix(cliques, least_degree, tip, last):
     size, count = 5, 6
     generator = torch.Generator().manual_seed(1)
-    pattern = find_pattern(count, cliques, least_degree)
+    pattern = find_pattern(count, cliques, least_degree, last)
+    assert {pattern.position[tile] for tile in last} == set(range(count - len(last), count))
     arrow = TiledMatrix.zeros(pattern, size, tip, torch.zeros((), dtype=torch.float64))
     tiles = arrow.tiles
     for tile in (*(tiles[k, k] for k in range(count)), arrow.tip):
@@ -115,6 +117,10 @@ def test_the_tiled_factor_is_that_of_the_dense_matrix(cliques, least_degree, tip
         factor.solve_transposed(right), torch.linalg.solve_triangular(lower.T, right, upper=True)
     )
     torch.testing.assert_close(factor.pivots(), lower.diagonal().square())
+    # The last two tiles and the tip, once all others are eliminated.
+    at_end = slice(4 * size, None)
+    solved = torch.linalg.solve_triangular(lower[at_end, at_end], right[at_end], upper=False)
+    torch.testing.assert_close(factor.tail(2).solve(right[at_end]), solved)
 
 
 def test_laps_fill_in_only_where_they_meet():

@@ -12,6 +12,7 @@ import argparse
 import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,7 +21,7 @@ from tests.benchmarks.colmap_peer import colmap, mean_pose
 from v2hdm.geometry.ipm import initial_extrinsic
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.io.drive import read_drive
-from v2hdm.records import FloatArray
+from v2hdm.records import Drive, FloatArray
 from v2hdm.report.page.facts import read_facts
 
 
@@ -30,34 +31,65 @@ def turned_deg(cam_from_vehicle: FloatArray, before: FloatArray) -> FloatArray:
     return np.asarray(Rotation.from_matrix(turn_vehicle).as_euler("ZYX", degrees=True))
 
 
+class _Model(NamedTuple):
+    """What COLMAP found: poses (I, 4, 4), nan where an image is not used, and what it says of itself."""
+
+    cam_from_map: FloatArray
+    registered: int
+    points: int
+    error_px: float
+    spent_s: float
+
+
+def _kept_model(drive: Drive, rows: list[int], camera: str, kept: Path | None) -> _Model:
+    """COLMAP's model of the images ``rows``, from a file if there is one."""
+    if kept is not None and kept.exists():
+        with np.load(kept) as content:
+            return _Model(
+                content["cam_from_map"],
+                int(content["registered"]),
+                int(content["points"]),
+                float(content["error_px"]),
+                float(content["spent_s"]),
+            )
+    with TemporaryDirectory() as scratch:
+        began_s = time.process_time()
+        poses, registered, points, error_px = colmap(drive, rows, camera, Path(scratch))
+        model = _Model(poses, registered, points, error_px, time.process_time() - began_s)
+    if kept is not None:
+        np.savez(kept, **model._asdict())
+    return model
+
+
 def main() -> None:
     """Compare, and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("drive", type=Path)
     parser.add_argument("result", type=Path)
     parser.add_argument("camera")
+    kept = "NPZ of what COLMAP found: read if it is there, else written after minutes of CPU"
+    parser.add_argument("--kept", type=Path, metavar="FILE", help=kept)
     parsed = parser.parse_args()
     drive = read_drive(parsed.drive)
     rows = [row for row, image in enumerate(drive.images) if image.camera == parsed.camera]
     before = initial_extrinsic(drive.cameras[parsed.camera])
-    with TemporaryDirectory() as scratch:
-        began_s = time.process_time()
-        poses, registered, points, error_px = colmap(drive, rows, parsed.camera, Path(scratch))
-        spent_s = time.process_time() - began_s
+    model = _kept_model(drive, rows, parsed.camera, parsed.kept)
+    poses = model.cam_from_map
     print(
-        f"COLMAP: {registered} of {len(rows)} images, {points} points, {error_px:.2f} px, {spent_s:.0f} s CPU"
+        f"COLMAP: {model.registered} of {len(rows)} images, {model.points} points, {model.error_px:.2f} px, "
+        f"{model.spent_s:.0f} s CPU"
     )
     facts = read_facts(parsed.result, drive)
     ours = facts.cameras[parsed.camera].calibration.cam_from_vehicle
     print(f"V2HDM: {facts.best['markings']} markings, {facts.best['reprojection_rmse_px']:.2f} px")
     known = np.isfinite(poses[:, 0, 0])
     recorded = np.array([drive.images[row].map_from_vehicle for row in rows])
-    each = poses[known] @ recorded[known]
-    mean = mean_pose(each)
-    scatter = np.std([turned_deg(one, mean) for one in each], axis=0)
-    for name, found in (("COLMAP", mean), ("V2HDM", ours)):
-        yaw, pitch, roll = turned_deg(found, before)
-        shift_cm = 100 * (camera_centre(found) - camera_centre(before))
+    cam_from_vehicle = poses[known] @ recorded[known]
+    mean = mean_pose(cam_from_vehicle)
+    scatter = np.std([turned_deg(pose, mean) for pose in cam_from_vehicle], axis=0)
+    for name, extrinsic in (("COLMAP", mean), ("V2HDM", ours)):
+        yaw, pitch, roll = turned_deg(extrinsic, before)
+        shift_cm = 100 * (camera_centre(extrinsic) - camera_centre(before))
         print(
             f"{name}: yaw {yaw:+.2f}, pitch {pitch:+.2f}, roll {roll:+.2f} deg, centre "
             f"{', '.join(f'{value:+.0f}' for value in shift_cm)} cm from what was stated"

@@ -4,8 +4,10 @@
 renders a straight piece of each port in each condition, whose drive states its noise and drift as they are,
 and maps it. It prints the corners' error, what of it remains after the best common motion, the sigma that is
 stated of a corner, by how much diagonals of markings are too long, and the shares of corners and of sides
-inside their 95 % regions. Corners of one drive share its errors, so that often all of them or none lie
-inside: only many drives together mean much.
+inside their 95 % regions; then, of each condition and set of cameras, mean squared errors in sigmas (1 if
+they are as stated) of corners, of the shift that all markings share, of distances between neighbours and of
+sides. Corners of one drive share its errors, so that often all of them or none lie inside: only many drives
+together mean much, and a port's conditions share the errors of its seed.
 """
 
 from __future__ import annotations
@@ -29,6 +31,7 @@ from v2hdm.io.drive.truth import read_truth
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.results import MethodResult
 from v2hdm.records import BEST, FloatArray
+from v2hdm.report.consistency import INSIDE_95
 from v2hdm.simulate.port.config import PortConfig
 from v2hdm.simulate.port.drive import rendered_drive
 
@@ -98,6 +101,28 @@ def longer_m(mapping: Mapped) -> float:
     return float(np.median(lengths_m[0] - lengths_m[1]))
 
 
+def shift_errors(mapping: Mapped) -> FloatArray:
+    """Of the shift (2,) that markings share: their median, squared, in sigmas of a marking's centre."""
+    off_m = np.median((mapping.corners - mapping.true).reshape(-1, 4, 2).mean(axis=1), axis=0)
+    of_centres_m2 = [
+        np.diagonal(marking.covariance_m2.reshape(4, 2, 4, 2).mean(axis=(0, 2)))
+        for marking in mapping.result.hd_map.markings
+        if marking.covariance_m2 is not None
+    ]
+    return np.asarray(off_m**2 / np.median(of_centres_m2, axis=0))
+
+
+def components(mapping: Mapped) -> dict[str, FloatArray]:
+    """Squared errors in sigmas by component, with a mean of 1 where they are as stated."""
+    errors = mapping.errors
+    return {
+        "corners": errors["corners"] * INSIDE_95 / INSIDE / 2,
+        "shift": shift_errors(mapping),
+        "distances": errors["distances"],
+        "sides": errors["sides"],
+    }
+
+
 def inside(squared: FloatArray) -> float:
     """The share of squared errors (N,) that lie inside their 95 % regions."""
     return float(np.mean(squared <= INSIDE))
@@ -112,18 +137,24 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--length-m", type=float, default=40.0)
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     asked = parser.parse_args(arguments)
-    squared: dict[tuple[str, str], list[FloatArray]] = {}
+    of_cells: dict[tuple[str, str], list[Mapped]] = {}
     for run in asked.ports:
         for seed in asked.seeds:
             for condition in asked.only:
                 port = port_of(run, seed, condition, asked.length_m)
                 with open_executor(asked.workers) as executor:
                     for mapping in mapped(port, executor):
-                        squared.setdefault((condition, mapping.cameras), []).append(mapping.errors["corners"])
+                        of_cells.setdefault((condition, mapping.cameras), []).append(mapping)
                         print(line(f"{run} {seed} {condition}, {mapping.cameras}", mapping), flush=True)
-    for (condition, cameras), of_drives in squared.items():
-        share = inside(np.concatenate(of_drives))
-        print(f"{condition}, {cameras}: corners inside {share:.3f}, of {len(of_drives)} drives")
+    for (condition, cameras), mappings in of_cells.items():
+        share = inside(np.concatenate([mapping.errors["corners"] for mapping in mappings]))
+        by_map = [components(mapping) for mapping in mappings]
+        means = ", ".join(
+            f"{name} {np.mean([np.mean(part[name]) for part in by_map]):.2f}" for name in by_map[0]
+        )
+        print(
+            f"{condition}, {cameras}: corners inside {share:.3f}, of {len(mappings)} drives; squared: {means}"
+        )
 
 
 if __name__ == "__main__":

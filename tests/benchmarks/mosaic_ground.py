@@ -1,6 +1,6 @@
 """The mosaic of a rendered port against its truth: cells that show what stands, width beyond the markings.
 
-    python -m tests.benchmarks.mosaic_ground RESULT DRIVE [--config port1] [--seed 1] [--without-consensus]
+    python -m tests.benchmarks.mosaic_ground RESULT DRIVE [--config port1] [--frames 300]
 
 ``DRIVE`` is the rendered drive that ``RESULT`` is of. What stands is known: each image is replaced by a mask
 of the boxes of its scene and blended as the image was, so that a cell shows what stands where more than half
@@ -45,7 +45,7 @@ from v2hdm.simulate.render.scene import Box
 from v2hdm.store import names
 
 CELL_M = 0.08  # side of a cell of the mosaic that is scored, m
-_MASK_STEP_PX = 4  # distance of the pixels at which a mask is computed
+_MASK_STEP_PX = 8  # distance of the pixels at which a mask is computed
 _FARTHEST_M = 14.0  # distance from the way up to which markings count: that of the mosaic
 _ROW_M = 6.0  # markings as near as this along the way are of one place
 _STEP_M = 0.1  # steps in which the width is measured
@@ -59,6 +59,7 @@ def main() -> None:
     parser.add_argument("drive", type=Path)
     parser.add_argument("--config", default="port2", help="port1 or port2, as it ships")
     parser.add_argument("--seed", type=int, help="another seed than the shipped one")
+    parser.add_argument("--frames", type=int, help="use the first so many frames of each camera alone")
     parser.add_argument("--without-consensus", action="store_true", help="each image counts everywhere")
     parser.add_argument("--picture", type=Path, help="PNG in which cells that show what stands are red")
     parsed = parser.parse_args()
@@ -68,17 +69,19 @@ def main() -> None:
     port = build_port(config)
     hd_map = read_geojson(parsed.result / names.MAP)
     ground = ground_of(parsed.result, drive_of(parsed.result, parsed.drive), CELL_M, hd_map)
+    if parsed.frames is not None:
+        ground = replace(ground, after=[shot for shot in ground.after if int(shot.path.stem) < parsed.frames])
     began_s = time.process_time()
     consensus = None if parsed.without_consensus else ground.consensus()
     rgba = _blended(ground, ground.after, consensus)
-    print(f"{len(ground.after)} images, {time.process_time() - began_s:.0f} s CPU")
+    print(f"{len(ground.after)} images, {time.process_time() - began_s:.0f} s CPU", flush=True)
     is_shown = rgba[..., 3] >= SEEN_ALPHA
+    _print_width(ground, port, hd_map, is_shown)
     stands = _shows_standing(ground, port, consensus) & is_shown
     print(
         f"{is_shown.sum() * CELL_M**2:.0f} m2 shown, {100 * stands.sum() / max(is_shown.sum(), 1):.2f} % of "
         "them show what stands"
     )
-    _print_width(ground, port, hd_map, is_shown)
     if parsed.picture:
         picture = np.where(is_shown[..., None], rgba[..., 2::-1], (255, 200, 255)).astype(np.uint8)
         picture[stands] = (0, 0, 255)

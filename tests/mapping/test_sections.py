@@ -18,6 +18,7 @@ from v2hdm.geometry.planar import length_along
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions, SizeOptions
 from v2hdm.mapping.results import NO_SEGMENT, MethodResult
+from v2hdm.mapping.sections.common import Names, with_owners
 from v2hdm.mapping.sections.faults import pooled_tests, refuse_contradicted
 from v2hdm.mapping.sections.joint import Fit, gates, refuse_contradicting_drives, scatter_by_marking
 from v2hdm.mapping.sections.run import map_in_sections
@@ -200,6 +201,18 @@ def test_drives_that_markings_shift_apart_are_named_in_one_line(scene):
     with pytest.raises(AdjustError, match=r"drive (monday|tuesday) by 30 cm against the others") as refused:
         refuse_contradicting_drives([fit_of([], [], ((0.15, 0.0), (-0.15, 0.0)))], network)
     assert "\n" not in str(refused.value)
+
+
+def test_a_marking_belongs_to_the_section_that_knows_most_of_its_corners():
+    """Of marking 0 the first section knows two corners by ten sightings, the second all four by three."""
+    none = np.zeros(3, dtype=bool)
+    first = Names(np.array([0, 1, 2]), np.zeros(3, dtype=int), ~none, np.array([10, 4, 5]), none)
+    second = Names(np.array([2, 0, 1]), np.zeros(3, dtype=int), ~none, np.array([0, 3, 6]), none)
+    corners = [np.array([0, 1, 0, 4, 5, 6, 7]), np.array([0, 1, 2, 3, 4, 5, 6, 7])]
+    of_first, of_second = with_owners([first, second], corners)
+    # Both know all of marking 1, which the second sees more often; none knows a corner of marking 2.
+    assert of_first.is_ours.tolist() == [False, False, True]
+    assert of_second.is_ours.tolist() == [False, True, True]
 
 
 def late(value: float, sigma: float) -> Contradiction:

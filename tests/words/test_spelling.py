@@ -32,7 +32,7 @@ def test_letters_that_look_alike_share_what_they_had_together(seed):
 
 
 def test_a_string_stands_with_the_number_the_word_and_the_codes_of_its_strokes():
-    assert alike_strings(["BO7", "B07"], ALPHABET) == [["B07", "BO7"]]
+    assert alike_strings(["BO7", "B07"], ALPHABET) == [["807", "B07", "BO7"]]
     assert alike_strings(["5T0P"], ALPHABET) == [["5T0P", "STOP"]]
     assert alike_strings(["EBH", "347"], ALPHABET) == [["347"], ["EBH"]]
 

@@ -92,9 +92,28 @@ def started(config: AreasConfig) -> Checkpoint:
     Raises:
         ConfigError: It cannot be read, or cannot get these classes.
     """
-    path = Path(config.start)
-    known = classes_of(path)
-    training = TrainConfig(
+    state = fresh_checkpoint(_training_of(config))
+    names = state.catalogue.names
+    for name in (*config.classes, *config.log_odds):
+        if name not in names:
+            raise ConfigError(f"classes: no class {shown(name)}; choose from: {', '.join(names)}")
+    classes = {*classes_of(Path(config.start)), *config.classes}
+    wanted = tuple(name for name in names if name in classes)
+    for layer in CLASS_CHANNELS & state.averaged.keys():
+        state.averaged[layer] = state.averaged[layer][_places(names, wanted)]
+    state.model = state.averaged
+    if state.classes != wanted:
+        missing = next(name for name in names if name not in wanted)
+        raise ConfigError(
+            f"classes: {', '.join(config.classes)} come after {missing}, which {config.start} does not know: "
+            "add it to classes="
+        )
+    return state
+
+
+def _training_of(config: AreasConfig) -> TrainConfig:
+    """The training that would let nothing but the classes' channels learn."""
+    return TrainConfig(
         output=config.output,
         start=config.start,
         seed=config.seed,
@@ -103,26 +122,9 @@ def started(config: AreasConfig) -> Checkpoint:
         only_classes=config.classes,
         threads=config.threads,
         validation=ValidationConfig(images=config.scored_images),
-        net=_net_of(path),
+        net=_net_of(Path(config.start)),
         data=config.data,
     )
-    state = fresh_checkpoint(training)
-    names = state.catalogue.names
-    for name in (*config.classes, *config.log_odds):
-        if name not in names:
-            raise ConfigError(f"classes: no class {shown(name)}; choose from: {', '.join(names)}")
-    kept = [place for place, name in enumerate(names) if name in (*known, *config.classes)]
-    for name in CLASS_CHANNELS & state.averaged.keys():
-        state.averaged[name] = state.averaged[name][kept]
-    state.model = state.averaged
-    wanted = tuple(names[place] for place in kept)
-    if state.classes != wanted:
-        missing = next(name for name in names if name not in wanted)
-        raise ConfigError(
-            f"classes: {', '.join(config.classes)} come after {missing}, which {config.start} does not know: "
-            "add it to classes="
-        )
-    return state
 
 
 def known_already(config: AreasConfig) -> list[str]:
@@ -133,7 +135,7 @@ def known_already(config: AreasConfig) -> list[str]:
 
 def put_rows(state: Checkpoint, config: AreasConfig, rows: Tensor) -> None:
     """Make fitted rows (classes, C + 1) those of a checkpoint, and change their log odds as configured."""
-    places = _places(state, config)
+    places = _places(state.classes, config.classes)
     first = 0
     for layer in (name for name in CLASS_LAYERS if f"{name}.weight" in state.averaged):
         weight, bias = state.averaged[f"{layer}.weight"], state.averaged[f"{layer}.bias"]
@@ -145,9 +147,9 @@ def put_rows(state: Checkpoint, config: AreasConfig, rows: Tensor) -> None:
     state.averaged["kinds.bias"][places] = rows[:, -1] + changed
 
 
-def _places(state: Checkpoint, config: AreasConfig) -> list[int]:
-    """The places of the fitted classes among the channels."""
-    return [state.classes.index(name) for name in config.classes]
+def _places(channels: Sequence[str], classes: Sequence[str]) -> list[int]:
+    """The places of classes among channels."""
+    return [channels.index(name) for name in classes]
 
 
 def _net_of(path: Path) -> NetConfig:
@@ -158,22 +160,22 @@ def _net_of(path: Path) -> NetConfig:
 def _gathered(config: AreasConfig, state: Checkpoint, images: Sequence[LabelledImage], tell: Share) -> Cells:
     """The cells of all photographs and renders."""
     rng = np.random.default_rng([config.seed, 8])
-    reader = CellReader(state.network(), _places(state, config), rng)
+    places = _places(state.classes, config.classes)
+    reader = CellReader(state.network(), places, rng)
     cells = []
     for number, image in enumerate(images):
         tell(_PHOTOGRAPHS_SEEN * number / len(images), f"{number} of {len(images)} photographs seen")
         for view in views_of_photograph(image, config.classes, config.sky, rng):
             cells.append(reader.read(view, is_render=False))
-    for number, view in enumerate(_views_of_renders(config, state)):
+    for number, view in enumerate(_views_of_renders(config, state, places)):
         share = _PHOTOGRAPHS_SEEN + (_RENDERS_SEEN - _PHOTOGRAPHS_SEEN) * number / config.render_views
         tell(share, f"{number} of {config.render_views} views of renders seen")
         cells.append(reader.read(view, is_render=True))
     return Cells.joined(cells)
 
 
-def _views_of_renders(config: AreasConfig, state: Checkpoint) -> Iterator[View]:
-    """Views of renders that did not teach the network yet."""
+def _views_of_renders(config: AreasConfig, state: Checkpoint, places: Sequence[int]) -> Iterator[View]:
+    """Views of renders that did not teach the network yet; the classes are at ``places`` of the channels."""
     stream = RenderStream(config.data, config.seed, state.renders)
-    places = _places(state, config)
     for image, answers in islice(stream, config.render_views):
         yield View(image.numpy(), marks_of_targets(answers, places))

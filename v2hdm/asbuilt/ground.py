@@ -1,8 +1,7 @@
 """Whether the ground shows paint where a design has a shape: from the mosaic in a folder of results.
 
-Bare ground has nearly no contrast inside an outline to the ground around it, paint has. The map's own
-markings give the contrast of paint, the ground beside them that of bare ground. What something hid is not in
-the mosaic, or looks like neither.
+The contrast to the ground around a place tells, as :mod:`v2hdm.site.contrast` has it. What something hid is
+not in the mosaic, or looks like neither.
 """
 
 from __future__ import annotations
@@ -19,21 +18,18 @@ from scipy.special import expit
 from scipy.stats import norm
 
 from v2hdm.errors import MapFileError
-from v2hdm.geometry.planar import Quad, turned_left
-from v2hdm.records import SIGMA_OF_MAD, FloatArray
+from v2hdm.records import FloatArray
 from v2hdm.safe.pixels import read_pixels
+from v2hdm.site.contrast import places_aside, samples_of, usual_contrast
 from v2hdm.store.files import load_json, take_array, take_number
 from v2hdm.store.names import MOSAIC_EXTENT, MOSAIC_PICTURE
 
-_INSIDE = np.linspace(0.2, 0.8, 7)  # fractions along either side at which the inside is sampled
 _BESIDE_M = (0.15, 0.3)  # distances, m, from an outline at which the ground around it is sampled
 _SEEN_SHARE = 0.98  # least share of the samples that the mosaic must show
-_ASIDE_M = 1.3  # distance, m, of bare ground from a marking
 _CLEAR_M = 0.6  # least distance, m, of bare ground from corners of all known paint
 _FEWEST = 8  # places from which the contrast of paint, or of bare ground, is learned
 _STRANGE_SHARE = 0.05  # share of places, bare or painted, that look like something else
 _STRANGE_SIGMA = 0.5  # standard deviation of their contrast, log ratio of grey values
-_LEAST_SIGMA = 0.02  # floor of the standard deviation of bare ground's contrast: its grain
 
 
 @dataclass(frozen=True)
@@ -51,15 +47,9 @@ class Mosaic:
         return np.array([self._contrast(corners) for corners in corners_map], dtype=np.float64)
 
     def _contrast(self, corners: FloatArray) -> float:
-        along, across = np.meshgrid(_INSIDE, _INSIDE)
-        inside = self._sampled(Quad(corners).at(along.ravel(), across.ravel()))
-        sides = np.roll(corners, -1, axis=0) - corners
-        outwards = -turned_left(sides) / np.maximum(np.linalg.norm(sides, axis=1), 1e-9)[:, None]
-        on_sides = corners[:, None] + _INSIDE[:, None] * sides[:, None]
-        beside = [
-            self._sampled((on_sides + away_m * outwards[:, None]).reshape(-1, 2)) for away_m in _BESIDE_M
-        ]
-        around = np.concatenate(beside)
+        samples = samples_of(corners, _BESIDE_M)
+        inside = self._sampled(samples.inside)
+        around = self._sampled(samples.beside)
         if min(np.isfinite(inside).mean(), np.isfinite(around).mean()) < _SEEN_SHARE:
             return float("nan")
         return float(np.log((np.nanmedian(inside) + 1) / (np.nanmedian(around) + 1)))
@@ -104,7 +94,7 @@ def bare_probabilities(
     """
     everything = np.concatenate([*painted.values(), np.zeros((0, 4, 2))])
     paint = cKDTree(np.concatenate([everything, places]).reshape(-1, 2))
-    aside = np.concatenate([_aside(corners) for corners in painted.values()])
+    aside = np.concatenate([places_aside(corners) for corners in painted.values()])
     is_clear = paint.query(aside.reshape(-1, 2))[0].reshape(-1, 4).min(axis=1) > _CLEAR_M
     of_bare = _known(mosaic.contrasts(aside[is_clear]))
     out = np.full(len(places), np.nan)
@@ -120,24 +110,13 @@ def bare_probabilities(
     return out
 
 
-def _aside(corners: FloatArray) -> FloatArray:
-    """Places (2N, 4, 2) beside markings (N, 4, 2), across their longest sides."""
-    sides = np.roll(corners, -1, axis=1) - corners
-    longest = np.argmax(np.linalg.norm(sides, axis=2), axis=1)
-    along = sides[np.arange(len(corners)), longest]
-    across = _ASIDE_M * turned_left(along / np.linalg.norm(along, axis=1)[:, None])[:, None]
-    return np.concatenate([corners - across, corners + across])
-
-
 def _known(contrast: FloatArray) -> FloatArray:
     return contrast[np.isfinite(contrast)]
 
 
 def _log_density(contrast: FloatArray, sample: FloatArray) -> FloatArray:
     """Log density (N,) of contrasts like those of a sample (M,), or of something else."""
-    middle = float(np.median(sample))
-    sigma = max(SIGMA_OF_MAD * float(np.median(np.abs(sample - middle))), _LEAST_SIGMA)
-    usual = np.log1p(-_STRANGE_SHARE) + norm.logpdf(contrast, middle, sigma)
+    usual = np.log1p(-_STRANGE_SHARE) + norm.logpdf(contrast, *usual_contrast(sample))
     return np.asarray(
         np.logaddexp(usual, np.log(_STRANGE_SHARE) + norm.logpdf(contrast, 0.0, _STRANGE_SIGMA))
     )

@@ -39,8 +39,8 @@ One of fx alone looks like one of both: over a plane, fy is nearly the camera's 
 """
 
 _SURE_SLIP = 0.002
-"""Standard deviation of the slip, rad for each m/s2, below which the poses tell it: with a gyro 0.0009, without
-0.005."""
+"""Standard deviation of the slip, rad for each m/s2, below which the poses tell it: 0.0009 with a gyro, 0.005
+without."""
 
 _LEAST_SPEED_MPS = 0.5  # a slower vehicle has no course
 

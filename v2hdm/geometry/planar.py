@@ -71,6 +71,16 @@ def is_simple(polygon: FloatArray) -> bool:
     return not (crosses & crosses.T).any()
 
 
+def are_simple(quads: FloatArray) -> BoolArray:
+    """Whether no two sides of quadrilaterals (N, 4, 2) cross, as :func:`is_simple`."""
+    sides = np.roll(quads, -1, axis=1) - quads
+    turns = cross(sides, np.roll(sides, -1, axis=1))
+    # Four turns to one side are one round; only others are looked at one by one.
+    out = np.asarray((turns > 0).all(axis=1) | (turns < 0).all(axis=1))
+    out[~out] = [is_simple(quad) for quad in quads[~out]]
+    return out
+
+
 def clip_convex(polygon: FloatArray, window: FloatArray) -> FloatArray:
     """A polygon (N, 2) clipped to a convex window (M, 2), unlike OpenCV also if nearly coincident."""
     inside = window.mean(axis=0)

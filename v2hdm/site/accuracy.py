@@ -73,11 +73,12 @@ def radius_95_m(covariance_m2: FloatArray) -> FloatArray:
 
 def absolute_radii_m(markings: Sequence[Marking]) -> FloatArray:
     """The 95 % radii (M, 4), m, of the markings' corners; infinite where no covariance is stated."""
-    radii_m = [
-        np.full(4, np.inf) if marking.covariance_m2 is None else corner_radii_m(marking.covariance_m2)
-        for marking in markings
-    ]
-    return np.array(radii_m).reshape(-1, 4)
+    radii_m = np.full((len(markings), 4), np.inf)
+    blocks = [marking.corner_covariances_m2 for marking in markings]
+    rows = [row for row, block in enumerate(blocks) if block is not None]
+    if rows:
+        radii_m[rows] = radius_95_m(np.stack([block for block in blocks if block is not None]))
+    return radii_m
 
 
 def relative_radii_m(markings: Sequence[Marking]) -> FloatArray:

@@ -12,7 +12,9 @@ from collections.abc import Iterable
 
 from v2hdm.records import FloatArray
 
-_ALIKE = {("O", "0"): 0.4, ("I", "1"): 0.3, ("S", "5"): 0.2, ("Z", "2"): 0.1, ("G", "6"): 0.05}
+_ALIKE = {
+    ("O", "0"): 0.4, ("I", "1"): 0.3, ("S", "5"): 0.3, ("Z", "2"): 0.1, ("G", "6"): 0.05, ("B", "8"): 0.03,
+}  # fmt: skip
 """Probability that a letter or a digit is named where the other of the two is painted, chosen.
 
 Two of the same strokes would have .5.

@@ -75,7 +75,9 @@ def test_suspicious_markings_are_listed_with_their_reason_and_pictures(page):
 def test_an_ellipse_has_the_half_axes_and_the_direction_of_its_covariance():
     turned = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]])
     one = turned @ np.diag([0.02**2, 0.01**2]) @ turned.T
-    half = ellipses(Marking(DIAMOND, DIAMOND_M, 3, np.kron(np.eye(4), one)))
+    unknown = Marking(DIAMOND, DIAMOND_M, 3)
+    none, half = ellipses([unknown, Marking(DIAMOND, DIAMOND_M, 3, np.kron(np.eye(4), one))])
+    assert np.isnan(none).all()
     # 5.991 is the 95 % quantile of chi-square with two degrees of freedom.
     assert half[:, :2] == pytest.approx(np.tile(np.sqrt(5.991) * np.array([0.02, 0.01]), (4, 1)), rel=1e-3)
     assert np.tan(half[:, 2]) == pytest.approx(np.full(4, np.tan(0.4)))

@@ -7,17 +7,21 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
+from examples.lanes.site import main as write_site
 from examples.lanes.site import trajectory
 from tests.report.page.browser import opened
-from tests.report.page.folder import make_result, small_map
+from tests.report.page.folder import make_result, small_map, verdict
 from tests.report.page.test_browser import browser as browser
 from tests.report.view.conftest import serving
 from tests.report.view.test_editor import ON_SCREEN, press, ready, saved
 from v2hdm.io.maps.corrections import Correction, read_corrections, write_corrections
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.maps.questions import read_answers
-from v2hdm.io.trajectory import write_tum
+from v2hdm.io.maps.reading import read_geojson
+from v2hdm.io.trajectory import read_tum, write_tum
 from v2hdm.records import HDMap, Lane
+from v2hdm.store.files import write_json
+from v2hdm.topology.build import lane_graph
 
 X = np.linspace(0.0, 60.0, 121)
 LINES = {-1.75: "lane_line", 1.75: "lane_dash", 5.25: "lane_line"}
@@ -32,6 +36,16 @@ def street(tmp_path):
     write_geojson(HDMap(small_map().markings, lanes), folder / "map.geojson")
     write_tum(trajectory([(0, 0), (60, 0)], np.random.default_rng(0)), folder / "trajectory_east.tum")
     with serving(folder, drive) as result:
+        yield result
+
+
+@pytest.fixture
+def crossing(tmp_path):
+    """The made site of a crossing and a T, and its corrections."""
+    folder = tmp_path / "site"
+    write_site(folder)
+    write_json(folder / "metrics.json", {"name": "site", "version": "1", "verdict": verdict(), "results": {}})
+    with serving(folder, None) as result:
         yield result
 
 
@@ -68,6 +82,30 @@ def test_questions_are_answered_by_keys_alone_and_are_in_the_file(browser, stree
     assert (direction.says, direction.kind, direction.answer) == ("answered", "direction", "against")
     assert (speed.kind, speed.answer, len(speed.outline_map)) == ("speed", "30", 1)
     assert [answer.subject for answer in read_answers(path, None)] == ["direction", "speed"]
+
+
+def test_who_gives_way_is_answered_by_keys_and_is_a_rule_of_the_next_lanes(browser, crossing):
+    address, folder, path = crossing
+    with opened(browser, address) as watched:
+        page = watched.page
+        ready(page)
+        page.locator("#questions-title", has_text="(13 open)").wait_for()
+        for number in range(1, 5):  # the four arms of the crossing; the other questions stay open
+            for _ in range(13):
+                if "Question, right of way" in page.locator("#selected h2").all_inner_texts():
+                    break
+                press(page, "q")
+            press(page, "1" if number == 1 else "2")
+            saved(page, number)
+            page.locator("#questions-title", has_text=f"({13 - number} open)").wait_for()
+            press(page, "q")
+        assert watched.said == []
+    answers = read_answers(path, None)
+    assert [answer.answer for answer in answers] == ["yes", "no", "no", "no"]
+    hd_map = read_geojson(folder / "map.geojson")
+    graph = lane_graph(hd_map, [read_tum(file) for file in sorted(folder.glob("*.tum"))], answers)
+    (right,) = graph.stated_rights
+    assert len(right.yields_to) > 1
 
 
 def test_a_lane_gets_its_direction_by_hand_and_what_is_stated_can_be_undone(browser, street):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -113,7 +113,7 @@ class Net:
             corner_place=corner_place,
         )
 
-    def join(self, told: Sequence[Summary], shared: Shared) -> Joined:
+    def join(self, told: Iterable[Summary], shared: Shared) -> Joined:
         """The step of all borders to the optimum of the whole, as the parts tell of their borders."""
         matrix = BlockMatrix.zeros(self.pattern)
         gradient = [np.zeros(size) for size in self.pattern.sizes]
@@ -128,10 +128,9 @@ class Net:
         decrease = -sum(float(of_block @ part) for of_block, part in zip(step, gradient, strict=True))
         return Joined(step, decrease, factor)
 
-    def covariances(self, factor: BlockCholesky) -> list[FloatArray]:
-        """The joint covariance (n, n) of each part's border."""
+    def covariances(self, factor: BlockCholesky) -> Iterator[FloatArray]:
+        """The joint covariance (n, n) of each part's border, one after the other."""
         blocks = factor.inverse()
-        out = []
         for label in self.labels:
             place = self._place(label)
             covariance = np.zeros((len(place.block), len(place.block)))
@@ -143,8 +142,7 @@ class Net:
                     block = blocks.get((first, second))
                     whole = blocks[second, first].T if block is None else block
                     covariance[np.ix_(rows, columns)] = whole[np.ix_(place.row[rows], place.row[columns])]
-            out.append(covariance)
-        return out
+            yield covariance
 
     def steps(self, factor: BlockCholesky, slopes: Sequence[FloatArray]) -> list[FloatArray]:
         """Steps (b, n) of each part's border to the optimum under n errors, as the parts' ``slopes`` tell."""

@@ -10,7 +10,7 @@ makes of each part what needs its covariances.
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -77,17 +77,13 @@ Finish = Callable[[int, Part, Solution], Any]
 
 
 class Joint(NamedTuple):
-    """The end of the rounds: what was made of each part, and the covariance of its border."""
+    """The end of the rounds: what was made of each part; the covariances of borders lie in files."""
 
     results: list[Any]
     net: Net
     factor: BlockCholesky
     gap: float
     rounds: int
-
-    def covariances(self) -> list[FloatArray]:
-        """The joint covariance (n, n) of each part's border."""
-        return self.net.covariances(self.factor)
 
     def steps(self, slopes: Sequence[FloatArray]) -> list[FloatArray]:
         """Steps (b, n) of each part's border under n errors, of which each part tells ``slopes`` (b, n)."""
@@ -111,7 +107,7 @@ class _Job:
     number: int
     target: Values | None = None
     is_last: bool = False
-    joint: FloatArray | None = None
+    is_finish: bool = False
     gap: float = 0.0
     rounds: int = 0
 
@@ -130,7 +126,7 @@ class _Work:
         options = self.shape.options
         compiled = options.on_cpu and options.engine != "torch"
         with one_thread_in_torch(len(part.problem.observations.corner), compiled):
-            if job.joint is not None or job.is_last:
+            if job.is_finish or job.is_last:
                 return self._finished(job, part)
             return self._round(job, part)
 
@@ -231,9 +227,10 @@ class _Work:
         )
         options = replace(self.shape.options, gap_tolerance=GAP)
         solution = report_of(part.problem, self.shape.origin_map, options, descent, 0)
-        if job.joint is not None:
+        if job.is_finish:
             held = replace(descent, engine=opened.engine)
-            solution = replace(solution, covariance=JoinedCovariance(held, None, border, job.joint))
+            joint = np.load(_covariance_file(self.folder, job.number))
+            solution = replace(solution, covariance=JoinedCovariance(held, None, border, joint))
         return self.finish(job.number, part, solution)
 
 
@@ -271,30 +268,31 @@ def join_parts(
     executor: Executor = HERE,
     progress: Callable[[int, int], None] | None = None,
     gap_tolerance: float = GAP,
+    *,
+    with_covariances: bool = True,
 ) -> Joint:
     """Solve the ``count`` parts in ``folder`` together, and ``finish`` each without covariances.
 
-    ``progress`` is called with the number of the round and the most that there may be. Raises AdjustError
-    where parts leave a direction free or contradict each other, WorkerError where a process died.
+    Those of their borders are left in files for :func:`finish_parts`, if asked for. ``progress`` is called
+    with the number of the round and the most that there may be. Raises AdjustError where parts leave a
+    direction free or contradict each other, WorkerError where a process died.
     """
     report = progress or (lambda done, total: None)
     work = _Work(folder, shape)
     jobs = [_Job(number) for number in range(count)]
-    alone: list[Summary] = []
+    costs: list[list[float]] = []  # by round and part
     targets: list[Values] = []
     for number in range(_MOST_ROUNDS):
         report(number, _MOST_ROUNDS)
-        states = _side_by_side(executor, work, jobs)
-        told = [state.told for state in states]
+        states: list[PartStates] = _side_by_side(executor, work, jobs)
+        costs.append([_cost(state.told) for state in states])
         if number == 0:
             net = _net_of(states, links, shape)
-            alone = told
         elif number == 1:
-            _check_agreement(net, alone, told, folder)
+            _check_agreement(net, states, costs, folder)
         shared = _shared(net, states)
-        joined = net.join([_about(state, shared, net) for state in states], shared)
-        cost = sum(_cost(part) for part in told)
-        gap = (joined.decrease + sum(part.slack for part in told)) / max(cost, 1.0)
+        joined = net.join(_taken(states, shared, net), shared)
+        gap = (joined.decrease + sum(state.told.slack for state in states)) / max(sum(costs[-1]), 1.0)
         moved = _moved(net, shared, joined)
         targets = [_values(net, moved, state.labels, state.values) for state in states]
         if number > 0 and gap <= gap_tolerance:
@@ -304,7 +302,14 @@ def join_parts(
         _Job(part, target, is_last=True, gap=gap, rounds=number + 1) for part, target in enumerate(targets)
     ]
     results = _side_by_side(executor, replace(work, finish=finish), last)
+    if with_covariances:
+        for part, covariance in enumerate(net.covariances(joined.factor)):
+            np.save(_covariance_file(folder, part), covariance)
     return Joint(results, net, joined.factor, gap, number + 1)
+
+
+def _covariance_file(folder: Path, number: int) -> Path:
+    return folder / f"covariance_{number}.npy"
 
 
 def finish_parts(
@@ -315,8 +320,8 @@ def finish_parts(
     Raises WorkerError where a process died.
     """
     jobs = [
-        _Job(part, joint=covariance, gap=joint.gap, rounds=joint.rounds)
-        for part, covariance in enumerate(joint.covariances())
+        _Job(part, is_finish=True, gap=joint.gap, rounds=joint.rounds)
+        for part in range(len(joint.net.labels))
     ]
     return _side_by_side(executor, _Work(folder, shape, finish), jobs)
 
@@ -374,6 +379,14 @@ def _values(net: Net, shared: Shared, labels: Labels, like: Values) -> Values:
     )
 
 
+def _taken(states: list[PartStates], shared: Shared, net: Net) -> Iterator[Summary]:
+    """Evidence of all parts on the shared value; their information, which is large, leaves ``states``."""
+    nothing = np.zeros((0, 0))
+    for number, state in enumerate(states):
+        yield _about(state, shared, net)
+        states[number] = state._replace(told=replace(state.told, information=nothing))
+
+
 def _about(state: PartStates, shared: Shared, net: Net) -> Summary:
     """Evidence of a part on the shared value, which is not its own yet."""
     away = _values(net, shared, state.labels, state.values).step_from(state.values).cpu().numpy()
@@ -403,16 +416,18 @@ def _cost(told: Summary) -> float:
     return sum(told.terms.values())
 
 
-def _check_agreement(net: Net, alone: Sequence[Summary], together: Sequence[Summary], folder: Path) -> None:
+def _check_agreement(
+    net: Net, states: Sequence[PartStates], costs: Sequence[Sequence[float]], folder: Path
+) -> None:
     """Raise AdjustError where parts fit what they share much worse than their noise explains."""
-    rises = [_cost(after) - _cost(before) for before, after in zip(alone, together, strict=True)]
-    coordinates = sum(len(part.slope) for part in together) - sum(net.pattern.sizes)
+    alone, together = costs
+    rises = [after - before for before, after in zip(alone, together, strict=True)]
+    size = np.array([len(state.told.slope) for state in states])
+    coordinates = int(size.sum()) - sum(net.pattern.sizes)
     ratio = 2 * sum(rises) / max(coordinates, 1)
     if ratio <= _CONTRADICTION:
         return
-    worst = int(
-        np.argmax([rise / max(len(part.slope), 1) for rise, part in zip(rises, together, strict=True)])
-    )
+    worst = int(np.argmax(rises / np.maximum(size, 1)))
     x, y = load_part(folder, worst).problem.map_from_vehicle[:, :2, 3].mean(axis=0)
     raise AdjustError(
         f"the drives contradict each other, most about x {x:.0f} m, y {y:.0f} m (section {worst + 1}): "

@@ -318,7 +318,9 @@ class JoinedCovariance(Covariance):
         is_shared = torch.isin(corners, self.border.corners)
         places = torch.searchsorted(self.border.corners, corners[is_shared])
         on_border[_axes(places)] = columns.own[_axes(is_shared.nonzero()[:, 0])]
-        regression = self._columns.pulled(columns.reduced, on_border.view(len(self.border.corners), 2, -1))
+        regression = self._columns.pulled(
+            columns.reduced, on_border.view(len(self.border.corners), 2, on_border.shape[1])
+        )
         place = _axes(torch.searchsorted(corners, chosen.contiguous()))
         covariance = columns.covariance + regression.mT @ self._gained @ regression
         return np.asarray(covariance[place[:, :, None], place[:, None, :]].cpu().numpy())

@@ -98,6 +98,8 @@ def _places(geometry: object, origin: GeodeticOrigin | None, where: str) -> Floa
     if origin is None:
         return positions
     if (np.abs(positions[:, 1]) > 90).any():
-        raise MapFileError(f"{where}: its geometry is not in degrees of longitude and latitude; fix it")
+        raise MapFileError(
+            f"{where}: its geometry is not in degrees of longitude and latitude; save it in EPSG:4326"
+        )
     height_m = np.full(len(positions), origin.altitude_m)
     return enu_from_geodetic(origin, np.column_stack([positions[:, ::-1], height_m]))[:, :2]

@@ -208,7 +208,9 @@ class _Reader:
             positions = self._grid.geodetic(geometry.positions, where, MapFileError)
             geometry = replace(geometry, positions=positions)
         if geometry is not None and geodetic and (np.abs(geometry.positions[:, 1]) > 90).any():
-            raise MapFileError(f"{where}: its geometry is not in degrees of longitude and latitude; fix it")
+            raise MapFileError(
+                f"{where}: its geometry is not in degrees of longitude and latitude; save it in EPSG:4326"
+            )
         closed = POINTS not in properties if geometry is None else geometry.closed
         stored = _stored(properties, closed, where)
         feature = stored if geometry is None else _believed(stored, geometry, self._origin, self._rounding)

@@ -228,7 +228,7 @@ def _join(run: _Run, work: Work, drive: Drive, part: IntArray, gap: float) -> tu
     shape = Shape.of(whole, work.model.solver)
     joint = join_parts(
         work.folder, run.count, chains.links, shape, work.tell, run.executor,
-        partial(run.progress, "join sections"), gap,
+        partial(run.progress, "join sections"), gap, with_covariances=work.stage == FINAL,
     )  # fmt: skip
     return joint.results, joint, shape
 

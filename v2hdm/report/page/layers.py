@@ -19,7 +19,7 @@ from v2hdm.report.page.facts import Facts, GroundResiduals
 from v2hdm.report.page.reference import Reference, local_reference
 from v2hdm.safe.backgrounds import Window, background_pixels
 from v2hdm.safe.pixels import read_pixels
-from v2hdm.site.accuracy import corner_radii_m
+from v2hdm.site.accuracy import absolute_radii_m, corner_radii_m
 from v2hdm.store import names
 from v2hdm.store.files import load_json, take_array, take_mapping, take_text
 
@@ -133,20 +133,22 @@ _SHARED = (".geojson", ".gpkg", ".osm", ".dxf", ".csv", ".xodr", ".tif", ".tum",
 """Suffixes of the result files that the page links."""
 
 
-def ellipses(marking: Marking) -> FloatArray | None:
-    """95 % ellipses (4, 3) of the corners: semi-axes a >= b, m, and direction of a, rad."""
-    covariances = marking.corner_covariances_m2
-    if covariances is None:
-        return None
-    variance, axes = np.linalg.eigh(covariances)
-    half = SIGMAS_95 * np.sqrt(np.maximum(variance[:, ::-1], 0.0))
-    direction = np.arctan2(axes[:, 1, 1], axes[:, 0, 1])
-    return np.column_stack([half, direction])
+def ellipses(markings: Sequence[Marking]) -> FloatArray:
+    """95 % ellipses (M, 4, 3) of corners: semi-axes a >= b, m, and direction of a, rad; nan if not stated."""
+    unknown = np.full((4, 2, 2), np.nan)
+    blocks = [marking.corner_covariances_m2 for marking in markings]
+    covariances = np.array([unknown if block is None else block for block in blocks]).reshape(-1, 4, 2, 2)
+    is_known = np.isfinite(covariances).all(axis=(1, 2, 3))
+    variance, axes = np.linalg.eigh(covariances[is_known])
+    out = np.full((len(covariances), 4, 3), np.nan)
+    out[is_known, :, :2] = SIGMAS_95 * np.sqrt(np.maximum(variance[..., ::-1], 0.0))
+    out[is_known, :, 2] = np.arctan2(axes[..., 1, 1], axes[..., 0, 1])
+    return out
 
 
-def _radii(paint: Marking | Symbol) -> list[float] | None:
-    """The 95 % radii, m, of corners or vertices, of which the largest gives the grade."""
-    covariance_m2 = paint.covariance_m2
+def _radii(symbol: Symbol) -> list[float] | None:
+    """The 95 % radii, m, of a symbol's vertices, of which the largest gives the grade."""
+    covariance_m2 = symbol.covariance_m2
     return None if covariance_m2 is None else np.round(corner_radii_m(covariance_m2), 5).tolist()
 
 
@@ -166,14 +168,12 @@ def layers(
     kinds += sorted({line.kind for line in lines} - set(kinds))
     arrows = _arrows(residuals)
     errors = _errors(facts)
-    markings = []
-    for number, marking in enumerate(hd_map.markings):
-        feature = _marking(marking, kinds)
+    markings = _markings(hd_map.markings, kinds)
+    for number, feature in enumerate(markings):
         if number in errors:
             feature["t"] = round(errors[number], 5)
-        if marking.id in arrows:
-            feature["a"] = arrows[marking.id]
-        markings.append(feature)
+        if feature["id"] in arrows:
+            feature["a"] = arrows[feature["id"]]
     symbols = [_symbol(symbol, kinds) for symbol in hd_map.symbols]
     reference = reference or local_reference(facts)
     shapes = [*(m.corners_map for m in hd_map.markings), *(s.outline_map for s in hd_map.symbols)]
@@ -217,19 +217,30 @@ def _excluded(candidate: Exclusion) -> dict[str, Any]:
     }
 
 
-def _marking(marking: Marking, kinds: list[str]) -> dict[str, Any]:
-    feature = _feature(marking, kinds, "c", marking.corners_map)
-    axes = ellipses(marking)
-    if axes is not None:
-        feature["e"] = np.round(axes, 5).tolist()
-        feature["w"] = _radii(marking)
-    if marking.relative_sigma_m is not None:
-        feature["r"] = round(SIGMAS_95 * marking.relative_sigma_m, 5)
-    if marking.accuracy is not None:
-        feature["g"] = marking.accuracy
-    if marking.variety is not None:
-        feature["kind"] = marking.variety
-    return feature
+def _markings(markings: Sequence[Marking], kinds: list[str]) -> list[dict[str, Any]]:
+    """The features of markings; arrays of all at once, for a site may have tens of thousands."""
+    corners = np.round([marking.corners_map for marking in markings], 3).tolist()
+    axes = np.round(ellipses(markings), 5).tolist()
+    radii = np.round(absolute_radii_m(markings), 5).tolist()
+    features = []
+    for row, marking in enumerate(markings):
+        feature = {
+            "id": marking.id,
+            "k": kinds.index(marking.kind),
+            "c": corners[row],
+            "n": marking.sightings,
+        }
+        if marking.covariance_m2 is not None:
+            feature["e"] = axes[row]
+            feature["w"] = radii[row]
+        if marking.relative_sigma_m is not None:
+            feature["r"] = round(SIGMAS_95 * marking.relative_sigma_m, 5)
+        if marking.accuracy is not None:
+            feature["g"] = marking.accuracy
+        if marking.variety is not None:
+            feature["kind"] = marking.variety
+        features.append(feature)
+    return features
 
 
 def _symbol(symbol: Symbol, kinds: list[str]) -> dict[str, Any]:
@@ -270,9 +281,7 @@ def systems_of(hd_map: HDMap, extent: tuple[FloatArray, FloatArray]) -> list[dic
     ]
 
 
-def _feature(
-    feature: Marking | Symbol | Lane, kinds: list[str], key: str, points_map: FloatArray
-) -> dict[str, Any]:
+def _feature(feature: Symbol | Lane, kinds: list[str], key: str, points_map: FloatArray) -> dict[str, Any]:
     return {
         "id": feature.id,
         "k": kinds.index(feature.kind),

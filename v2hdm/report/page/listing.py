@@ -14,7 +14,7 @@ from v2hdm.report.page.facts import Facts
 from v2hdm.report.page.reference import Reference
 from v2hdm.report.page.tables import Table, name_of, number
 from v2hdm.report.weak import MOST_PLACES, Place, weak_places
-from v2hdm.site.accuracy import corner_radii_m
+from v2hdm.site.accuracy import absolute_radii_m, corner_radii_m
 
 
 def marking_table(facts: Facts, reference: Reference) -> Table | None:
@@ -23,14 +23,16 @@ def marking_table(facts: Facts, reference: Reference) -> Table | None:
         return None
     features: list[Marking | Symbol] = [*facts.hd_map.markings, *facts.hd_map.symbols]
     centres = np.array([_outline(feature).mean(axis=0) for feature in features]).reshape(-1, 2)
+    worst_m = absolute_radii_m(facts.hd_map.markings).max(axis=1).tolist()
+    for symbol in facts.hd_map.symbols:
+        covariance_m2 = symbol.covariance_m2
+        worst_m.append(np.inf if covariance_m2 is None else float(corner_radii_m(covariance_m2).max()))
     rows = []
-    for feature, (first, second) in zip(features, reference.words(centres), strict=True):
+    for feature, (first, second), radius_m in zip(features, reference.words(centres), worst_m, strict=True):
         length_m, width_m = rectangle_size(_outline(feature))
-        radius_m = None
-        if feature.covariance_m2 is not None:
-            radius_m = float(corner_radii_m(feature.covariance_m2).max())
         size = [number(length_m, 2), number(width_m, 2)]
-        numbers = [first, second, *size, number(radius_m, 1, 100), str(feature.sightings)]
+        numbers = [first, second, *size, number(None if np.isinf(radius_m) else radius_m, 1, 100)]
+        numbers.append(str(feature.sightings))
         rows.append([str(feature.id), name_of(feature.kind), feature.accuracy or "–", *numbers])
     axes = reference.axes
     headings = ("no.", "class", "accuracy", *axes, "length (m)", "width (m)", "95 % radius (cm)", "images")

@@ -47,13 +47,15 @@ def site_plan(facts: Facts, places: Sequence[Place] = ()) -> str:
         lanes = LineCollection([lane.points_map for lane in facts.hd_map.lanes], colors=OKABE_ITO["sky"])
         lanes.set(linewidths=0.8, label="lane lines")
         axes.add_collection(lanes)
-        shapes = [marking.corners_map for marking in facts.hd_map.markings]
-        shapes += [symbol.outline_map for symbol in facts.hd_map.symbols]
+        # An array is drawn faster than a list, though matplotlib's types know the list alone.
+        quads: Any = np.array([marking.corners_map for marking in facts.hd_map.markings]).reshape(-1, 4, 2)
+        outlines = [symbol.outline_map for symbol in facts.hd_map.symbols]
         paint: dict[str, Any] = {"facecolors": OKABE_ITO["blue"], "edgecolors": OKABE_ITO["blue"]}
-        is_picture = len(shapes) > _MOST_DRAWN
+        is_picture = len(quads) + len(outlines) > _MOST_DRAWN
         figure.set_dpi(_PICTURE_DPI if is_picture else figure.dpi)
-        markings = PolyCollection(shapes, linewidths=0.6, label="markings", rasterized=is_picture, **paint)
-        axes.add_collection(markings)
+        paint |= {"linewidths": 0.6, "rasterized": is_picture}
+        axes.add_collection(PolyCollection(quads, label="markings", **paint))
+        axes.add_collection(PolyCollection(outlines, **paint))
         _draw_places(axes, places)
         _finish(figure, axes, box)
     return out[0]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from v2hdm.geometry.planar import is_simple
+from v2hdm.geometry.planar import are_simple, is_simple
 from v2hdm.records import ACCURACIES, TWO_SIDED_95
 from v2hdm.report.page.facts import Facts
 from v2hdm.report.page.identity import drive_date
@@ -104,11 +104,11 @@ def _others(facts: Facts) -> list[Sequence[str]]:
     else:
         unknown = "no independent inventory of the site was given"
         rows.append(("Completeness", "omission, commission", _NOT_EVALUATED, unknown))
-    outlines = [marking.corners_map for marking in facts.hd_map.markings]
-    outlines += [symbol.outline_map for symbol in facts.hd_map.symbols]
-    crossed = sum(not is_simple(outline) for outline in outlines)
+    quads = np.array([marking.corners_map for marking in facts.hd_map.markings]).reshape(-1, 4, 2)
+    symbols = facts.hd_map.symbols
+    crossed = int((~are_simple(quads)).sum()) + sum(not is_simple(symbol.outline_map) for symbol in symbols)
     measure = "outlines that cross themselves"
-    result = f"{crossed} of {len(outlines)}"
+    result = f"{crossed} of {len(quads) + len(symbols)}"
     rows.append(("Logical consistency", measure, result, "all were tested (direct, internal)"))
     rows.append(("Thematic accuracy", "rate of wrong classes", _NOT_EVALUATED, "no independent inventory"))
     rows.append(("Temporal quality", "valid time", drive_date(facts), "stamps of the images"))

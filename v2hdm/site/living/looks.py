@@ -22,34 +22,29 @@ from v2hdm.association.groups import near_pairs, squared_distances
 from v2hdm.association.sightings import Rig, Sightings, row_shares
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
-from v2hdm.geometry.planar import Quad, turned_left
-from v2hdm.records import SIGMA_OF_MAD, BoolArray, Camera, FloatArray, IntArray, Marking
+from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, Marking
+from v2hdm.site.contrast import Contrast, places_aside, samples_of, usual_contrast
 from v2hdm.site.living.fates import Watched
 from v2hdm.site.posterior import log_found, log_found_where_none_is
 from v2hdm.site.standing import Grey
 
-_INSIDE = np.linspace(0.2, 0.8, 7)
-"""Fractions along either side at which the inside is sampled: off the edges, which pose errors blur."""
-
 _BESIDE_M = (0.12, 0.25)  # offsets from an outline's edges at which the ground is sampled, m
 _MOST_VIEWS = 6  # most views of a place that are used, the nearest ones: errors of more repeat
 _MOST_LEARNED = 40  # most markings of a class from which a drive's contrast of paint and ground is learned
-_ASIDE_M = 1.3  # distance of bare ground from a marking, m
 _CLEAR_M = 1.0  # least distance of bare ground from all known paint, m
 _LEAST_LEARNED = 8  # least places for the drive's own contrast of paint or ground; with fewer it is unknown
 
 HIDDEN_SIGMA = 0.5  # sigma of the contrast, log ratio of grey values, of anything that hides the ground
 _HIDDEN_SHARE = 0.5  # fraction of the existing, undetected markings that are hidden; the others are worn
 _STRANGE_SHARE = 0.05  # fraction of bare places with something else: a stain, the edge of a shadow
-_LEAST_SIGMA = 0.02  # floor of the sigma of bare ground's contrast: the grain of an image
 
 
 @dataclass(frozen=True)
 class Paint:
-    """Contrasts of a drive's ``painted`` and ``bare`` places: mean and sigma, log ratios of grey values."""
+    """Contrasts of a drive's ``painted`` and ``bare`` places."""
 
-    painted: tuple[float, float]
-    bare: tuple[float, float]
+    painted: Contrast
+    bare: Contrast
 
     def log_painted(self, contrast: FloatArray) -> FloatArray:
         """Log density (N,) of contrasts at undetected markings: worn, or hidden."""
@@ -70,19 +65,6 @@ def _mixed(first: FloatArray, second: FloatArray, share: float) -> FloatArray:
     return np.asarray(logsumexp([np.log(share) + first, np.log1p(-share) + second], axis=0))
 
 
-def _samples(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Points within an outline (4, 2), and beside its four sides."""
-    along, across = np.meshgrid(_INSIDE, _INSIDE)
-    inside = Quad(corners).at(along.ravel(), across.ravel())
-    beside = []
-    for first, second in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        side = second - first
-        outwards = np.array([side[1], -side[0]]) / max(float(np.linalg.norm(side)), 1e-9)
-        for away_m in _BESIDE_M:
-            beside.append(first + _INSIDE[:, None] * side + away_m * outwards)
-    return inside, np.concatenate(beside)
-
-
 def learn_paint(
     observer: Observer, markings: Sequence[Marking], paint_map: FloatArray
 ) -> Mapping[str, Paint]:
@@ -93,26 +75,13 @@ def learn_paint(
         corners = np.stack([marking.corners_map for marking in markings if marking.kind == kind])
         corners = corners[np.linspace(0, len(corners) - 1, min(len(corners), _MOST_LEARNED)).astype(int)]
         painted = observer.contrasts(corners)
-        # Across the longest side or diagonal of each.
-        sides = corners[:, [1, 2, 2, 3]] - corners[:, [0, 1, 0, 1]]
-        extent_m = np.linalg.norm(sides, axis=2)
-        rows = np.arange(len(sides))
-        longest = np.argmax(extent_m, axis=1)
-        along = sides[rows, longest] / extent_m[rows, longest, None]
-        across = _ASIDE_M * turned_left(along)[:, None]
-        aside = np.concatenate([corners - across, corners + across])
+        aside = places_aside(corners)
         clear = paint.query(aside.reshape(-1, 2))[0].reshape(-1, 4).min(axis=1) > _CLEAR_M
         bare = observer.contrasts(aside[clear]) if clear.any() else np.zeros(0)
         samples = [values[np.isfinite(values)] for values in (painted, bare)]
         if min(len(values) for values in samples) >= _LEAST_LEARNED:
-            paint_of_kind[kind] = Paint(_robust(samples[0]), _robust(samples[1]))
+            paint_of_kind[kind] = Paint(usual_contrast(samples[0]), usual_contrast(samples[1]))
     return paint_of_kind
-
-
-def _robust(values: FloatArray) -> tuple[float, float]:
-    """Median, and the standard deviation that its median deviation implies."""
-    middle = float(np.median(values))
-    return middle, max(SIGMA_OF_MAD * float(np.median(np.abs(values - middle))), _LEAST_SIGMA)
 
 
 _MOST_SQUARED = 25.0
@@ -214,7 +183,7 @@ class Observer:
             middle = distort_points(info, outline_px.mean(axis=0, keepdims=True))
             cam_from_map = self.rig.cam_from_map(camera, frame, row_shares(info, middle)[0])
         means = []
-        for points in _samples(corners):
+        for points in samples_of(corners, _BESIDE_M):
             pinhole, depth_m = project_ground(self.rig.intrinsic[camera], cam_from_map, points)
             pixel = distort_points(info, pinhole).astype(np.float32)
             values = cv2.remap(grey, pixel[None, :, 0], pixel[None, :, 1], cv2.INTER_LINEAR, borderValue=-1.0)

@@ -50,6 +50,14 @@ class _Slope(NamedTuple):
     freedom: int  # of that sum
 
 
+class _Tolerance(NamedTuple):
+    """The largest angle that passes."""
+
+    camera: str  # whose survey a larger one contradicts; empty where none is surveyed as closely
+    away_m: float  # distance of its centre from the axle
+    angle_rad: float
+
+
 def check_alignment(
     motion: Motion, noise: PoseNoise, cameras: Mapping[str, Camera], *, by_course: bool = False
 ) -> Iterator[Finding]:
@@ -89,16 +97,15 @@ def _constant_offset(motion: Motion, noise: PoseNoise, cameras: Mapping[str, Cam
     offset_rad = sum(slope.offset_rad / slope.variance for slope in slopes) / information
     scatter = sum(slope.squared for slope in slopes) / sum(slope.freedom for slope in slopes)
     sigma_rad = float(np.sqrt(max(scatter, 1.0) / information))
-    first, tolerated_rad = _tolerated(cameras)
     size_rad = abs(offset_rad)
-    moves = (
-        f", which moves the surveyed centre of {first[0]} by {100 * first[1] * size_rad:.0f} cm"
-        if first
-        else ""
-    )
+    tolerance = _tolerance(cameras)
+    moves = ""
+    if tolerance.camera:
+        by_cm = 100 * tolerance.away_m * size_rad
+        moves = f", which moves the surveyed centre of {tolerance.camera} by {by_cm:.0f} cm"
     return judge(
         CHECK, "poses", float(np.rad2deg(offset_rad)),
-        float(np.rad2deg(tolerated_rad + _SURE * sigma_rad)), "deg",
+        float(np.rad2deg(tolerance.angle_rad + _SURE * sigma_rad)), "deg",
         fine="on straight stretches the vehicle goes where its heading points",
         wrong=f"on straight stretches the vehicle drives {np.rad2deg(size_rad):.1f} deg to the "
         f"{'left' if offset_rad > 0 else 'right'} of its heading{moves}; fix the alignment of the heading's "
@@ -107,23 +114,18 @@ def _constant_offset(motion: Motion, noise: PoseNoise, cameras: Mapping[str, Cam
     )  # fmt: skip
 
 
-def _tolerated(cameras: Mapping[str, Camera]) -> tuple[tuple[str, float] | None, float]:
-    """The camera that a heading contradicts first, with its distance from the axle, and the angle until then.
-
-    A heading moves a surveyed centre in the frame of the poses; by one sigma of the survey it may.
-    """
-    first = None
-    tolerated_rad = float(_LARGEST_RAD)
+def _tolerance(cameras: Mapping[str, Camera]) -> _Tolerance:
+    """The angle by which a heading moves no surveyed centre, in the frame of the poses, by over a sigma."""
+    first = _Tolerance("", 0.0, float(_LARGEST_RAD))
     for name, camera in cameras.items():
         prior = camera.centre_prior
         if prior is None:
             continue
         away_m = float(np.hypot(*prior.centre_vehicle[:2]))
         angle_rad = float(np.max(prior.sigma_m[:2])) / max(away_m, 1e-9)
-        if angle_rad < tolerated_rad:
-            first = name, away_m
-            tolerated_rad = angle_rad
-    return first, max(tolerated_rad, float(_ASKEW_RAD))
+        if angle_rad < first.angle_rad:
+            first = _Tolerance(name, away_m, angle_rad)
+    return first._replace(angle_rad=max(first.angle_rad, float(_ASKEW_RAD)))
 
 
 def _heading_rad(motion: Motion) -> FloatArray:
