@@ -163,7 +163,7 @@ def _course(error: Error) -> str:
 def _slip(error: Error) -> str:
     return (
         f"in bends the headings, an antenna's course, are off by {np.rad2deg(error.size):.2f} deg for each "
-        "m/s2 to the side, as tyres slip, or as of an antenna that is elsewhere than lever_arm_m says"
+        "m/s2 to the side (slip of the tyres, or a wrong lever_arm_m)"
     )
 
 

@@ -22,7 +22,7 @@ _LEAST_SHARE = 0.6  # of what is seen
 _SEARCH_S = 0.3  # time between searches
 _TRIED_LOOKS = 4  # images, of as many searches, by which a place is tried
 _TRIED_PLACES = 6  # places that are tried: each costs as much as the images of 0.2 s
-_LOST_S, _LOST_WAY_M = 0.9, 8.0  # after so long, or so far, without a place nothing fits
+_LOST_S, _LOST_WAY_M = 0.8, 8.0  # after so long, or so far, without a place nothing fits
 _STILL_M = 0.5  # a vehicle that has moved less stands: it may not have seen enough
 
 
