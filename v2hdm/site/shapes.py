@@ -30,11 +30,12 @@ from v2hdm.site.candidates import Candidates
 
 _LEAST_MEMBERS = 8  # least markings of one shape of a class
 
-_FEWEST_MEMBERS = 3
-"""Least markings of a shape if they are at least half of the class and agree as one stencil makes them: from
-three on, two agree against a third. Beside a more common shape, its fragments soon agree by threes."""
+_STENCIL_M = 0.03  # sigma, m, of a corner's coordinate about a stencil's shape: a brush's width
 
-_STENCIL_M = 0.03  # largest sigma, m, of a corner's coordinate about a stencil's shape: a brush's width
+_FEWEST_MEMBERS = 3
+"""Least markings of a shape if they are at least half of the class and hardly agree by chance: from three on,
+two agree against a third. Beside a more common shape, its fragments soon agree by threes."""
+
 _LEAST_SHARE = 0.1  # least fraction of a class's markings with a shape of the class
 
 MEMBER_M = 0.05  # largest deviation of a member's corners from its shape, m
@@ -183,13 +184,16 @@ def learn_shapes(candidates: Candidates) -> tuple[Shape, ...]:
         count = int(np.count_nonzero(members))
         if count < _FEWEST_MEMBERS:
             break
-        spread_m, about_m = _spread_m(corners, unexplained.subset(members))
+        spread_m, formal_m = _spread_m(corners, unexplained.subset(members))
         # With so few members, of five directions each, mean and variance are uncertain: sigma of Student's t
         # distribution about a mean (Gelman et al., Bayesian Data Analysis, section 3.2).
         freedom = 5 * (count - 1)
         wider = float(np.sqrt((1 + 1 / count) * freedom / (freedom - 2)))
-        shape = Shape(corners, spread_m * wider, count / len(candidates))
-        if count < least and (shapes or 2 * count < len(whole) or about_m > _STENCIL_M):
+        sigma_m = float(np.hypot(spread_m * wider, formal_m / np.sqrt(count)))
+        shape = Shape(corners, sigma_m, count / len(candidates))
+        if count < least and (shapes or 2 * count < len(whole)):
+            break
+        if count < least and _agreement(shape, unexplained.subset(members)) < 0:
             break
         shapes.append(shape)
         whole = whole[~members]
@@ -221,12 +225,25 @@ def _commonest(candidates: Candidates) -> tuple[FloatArray, BoolArray]:
     return shape, members
 
 
-def _spread_m(shape: FloatArray, candidates: Candidates) -> tuple[float, float]:
-    """Scatter of members' corners about their shape: net of their covariances, by the median; and total."""
-    laid = lay(shape, SHAPE_SIGMA_M, candidates)[0]
+class _Deviations(NamedTuple):
+    """Deviations of N candidates from a shape laid on them."""
+
+    laid: Laid
+    off: FloatArray  # (N, 5, 1) m, in the directions of ``laid``
+    formal: FloatArray  # (N, 5, 5) their covariance, m^2, from the candidates' alone
+
+
+def _deviations(shape: FloatArray, sigma_m: float, candidates: Candidates) -> _Deviations:
+    """Deviations of candidates from a shape (4, 2) with ``sigma_m`` per coordinate."""
+    laid = lay(shape, sigma_m, candidates)[0]
     directions = laid.directions
     off = directions @ (candidates.corners_map - laid.corners_map).reshape(-1, 8, 1)
-    formal = directions @ candidates.covariance_m2 @ np.swapaxes(directions, 1, 2)
+    return _Deviations(laid, off, directions @ candidates.covariance_m2 @ np.swapaxes(directions, 1, 2))
+
+
+def _spread_m(shape: FloatArray, candidates: Candidates) -> tuple[float, float]:
+    """Scatter of members' corners about their shape net of their covariances, and by these, by medians."""
+    _, off, formal = _deviations(shape, SHAPE_SIGMA_M, candidates)
     expected = float(chi2.median(off.shape[1]))
     low = SHAPE_SIGMA_M
     high = float(np.abs(off).max()) + SHAPE_SIGMA_M
@@ -236,7 +253,29 @@ def _spread_m(shape: FloatArray, candidates: Candidates) -> tuple[float, float]:
         squared = (np.swapaxes(off, 1, 2) @ np.linalg.solve(innovation, off))[:, 0, 0]
         low, high = (sigma_m, high) if np.median(squared) > expected else (low, sigma_m)
     formal_m2 = np.median(np.trace(formal, axis1=1, axis2=2)) / off.shape[1]
-    return float(low), float(np.sqrt(low**2 + formal_m2))
+    return float(low), float(np.sqrt(formal_m2))
+
+
+def _agreement(shape: Shape, members: Candidates) -> float:
+    """Log-likelihood ratio of one stencil against any sizes among which members of a shape are chosen.
+
+    Paint that is rolled by the metre has one width anyway: there only the length counts.
+    """
+    laid, off, formal = _deviations(shape.corners, shape.sigma_m, members)
+    sides = laid.corners_map[:, 1:3] - laid.corners_map[:, :2]
+    sides_m = np.linalg.norm(sides, axis=2, keepdims=True)
+    is_free = sides_m >= sides_m.max(axis=1, keepdims=True) if shape.is_elongated else np.ones_like(sides_m)
+    signs = np.array([[-0.5, 0.5, 0.5, -0.5], [-0.5, -0.5, 0.5, 0.5]])  # of corners from the centre, by side
+    longer = signs[:, :, None] * (is_free * sides / sides_m)[:, :, None]
+    stretched = laid.directions @ np.swapaxes(longer.reshape(-1, 2, 8), 1, 2)
+    # A side that is longer by twice the limit moves both of its ends by it; any such length is as likely.
+    limit_m = max(MEMBER_M, _MEMBER_SHARE * 2 * float(np.linalg.norm(shape.corners, axis=1).max()))
+    any_size_m2 = (2 * limit_m) ** 2 / 3
+    alike = formal + _STENCIL_M**2 * np.eye(off.shape[1])
+    unlike = alike + any_size_m2 * stretched @ np.swapaxes(stretched, 1, 2)
+    squared = [(np.swapaxes(off, 1, 2) @ np.linalg.solve(each, off))[:, 0, 0] for each in (alike, unlike)]
+    ratio = np.linalg.slogdet(unlike)[1] - np.linalg.slogdet(alike)[1] + squared[1] - squared[0]
+    return float(0.5 * ratio.sum())
 
 
 _FREEDOM_BOUNDS = (1.0, 30.0)
