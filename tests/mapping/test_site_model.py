@@ -195,6 +195,22 @@ def test_a_piece_of_a_dash_is_no_short_dash_and_an_end_that_runs_on_into_a_strok
     assert (np.linalg.norm(found.candidates.corners_map - true, axis=2) < 3 * found.candidates.sigma_m).all()
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_four_dashes_with_worn_ends_tell_that_a_fifth_is_a_piece(seed):
+    """As on a worn road, where no dash but the fifth is known to a brush's width."""
+    true, candidates = row(seed, [DASH] * 5, 0.01)
+    for place, share in enumerate((-0.02, 0.01, 0.03, -0.01)):
+        wear_off(candidates, true, place, share, 0.1)
+    moved_end(candidates, 4, -0.75)
+    found = of_one_class(candidates)
+    piece_m, sigma_m = found.candidates.corners_map[4], found.candidates.sigma_m[4]
+    assert (np.linalg.norm(piece_m - true[4], axis=1) < 3 * sigma_m).all()
+    assert found.probability[4, Kind.WRONG_END] > 0.8
+    assert sigma_m.max() > 0.3
+    assert (found.probability[:4, Kind.OF_CLASS] > 0.5).all()
+    assert (normalised(found, true) < 25).all()
+
+
 def test_two_opposite_corners_in_a_shadow_do_not_make_another_shape():
     true, candidates = row(17, [DIAMOND] * 60, 0.01)
     shift = 0.1 * (true[12, 1] - true[12, 0])
