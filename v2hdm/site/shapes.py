@@ -273,9 +273,13 @@ def _agreement(shape: Shape, members: Candidates) -> float:
     any_size_m2 = (2 * limit_m) ** 2 / 3
     alike = formal + _STENCIL_M**2 * np.eye(off.shape[1])
     unlike = alike + any_size_m2 * stretched @ np.swapaxes(stretched, 1, 2)
-    squared = [(np.swapaxes(off, 1, 2) @ np.linalg.solve(each, off))[:, 0, 0] for each in (alike, unlike)]
-    ratio = np.linalg.slogdet(unlike)[1] - np.linalg.slogdet(alike)[1] + squared[1] - squared[0]
-    return float(0.5 * ratio.sum())
+    return _log_likelihood(off, alike) - _log_likelihood(off, unlike)
+
+
+def _log_likelihood(off: FloatArray, covariance: FloatArray) -> float:
+    """Log-likelihood of deviations (N, 5, 1) with a covariance (N, 5, 5), but for a constant."""
+    squared = np.swapaxes(off, 1, 2) @ np.linalg.solve(covariance, off)
+    return -0.5 * float(np.sum(squared[:, 0, 0] + np.linalg.slogdet(covariance)[1]))
 
 
 _FREEDOM_BOUNDS = (1.0, 30.0)
