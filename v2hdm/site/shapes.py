@@ -186,8 +186,8 @@ def learn_shapes(candidates: Candidates) -> tuple[Shape, ...]:
             break
         spread_m, formal_m = _spread_m(corners, unexplained.subset(members))
         # With so few members, of five directions each, mean and variance are uncertain: sigma of Student's t
-        # distribution about a mean (Gelman et al., Bayesian Data Analysis, section 3.2). Errors of the members
-        # leave their mean uncertain, too.
+        # distribution about a mean (Gelman et al., Bayesian Data Analysis, section 3.2). The members' own
+        # errors leave it uncertain, too.
         freedom = 5 * (count - 1)
         wider = float(np.sqrt((1 + 1 / count) * freedom / (freedom - 2)))
         sigma_m = float(np.hypot(spread_m * wider, formal_m / np.sqrt(count)))
