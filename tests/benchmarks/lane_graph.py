@@ -35,7 +35,6 @@ from tests.benchmarks.made.painted_truth import Pair, painted
 from tests.topology.scenes import ENDS, LANES, UNDRIVEN, WAYS, lanes_of, matched, ways_of
 from v2hdm import map_drive
 from v2hdm.io.maps.formats import write_map
-from v2hdm.pipeline.answers import driven_paths
 from v2hdm.progress import progress_lines
 from v2hdm.topology.build import lane_graph
 from v2hdm.topology.graph import LaneGraph
@@ -171,7 +170,7 @@ def rendered(parsed: argparse.Namespace) -> None:
         drives, name="crossing", cache=folder / "stages", workers=1, progress=progress_lines(print)
     )
     print("\n".join(result.verdict.lines))
-    judge(Site(result.map, tuple(driven_paths(result.drive))), folder / "exports", parsed)
+    judge(Site(result.map, tuple(result.drive.paths)), folder / "exports", parsed)
 
 
 def judge(site: Site, folder: Path, parsed: argparse.Namespace) -> None:

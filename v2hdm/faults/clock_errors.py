@@ -59,22 +59,22 @@ class ClockErrors(NamedTuple):
 
 
 def moves_with_clocks(
-    problem: Problem, solution: Solution, noises: Sequence[PoseNoise], known: ClockErrors | None = None
+    problem: Problem, solution: Solution, noises: Sequence[PoseNoise], of_drive: ClockErrors | None = None
 ) -> Moves | None:
     """Motion of a solution under the errors of the clock that drive and prior leave open, one column each.
 
-    ``noises`` are those of the sessions' poses; what is ``known`` of the errors comes from the observations
-    unless it is stated. None where the clock is stated to be right, or nothing moves.
+    ``noises`` are those of the sessions' poses. The errors are those ``of_drive``, or else come from the
+    observations. None where the clock is stated to be right, or nothing moves.
     """
     twist = problem.twist_vehicle
-    errors = list(errors_of_clocks(problem, noises, None if known is None else known.rising))
+    errors = list(errors_of_clocks(problem, noises, None if of_drive is None else of_drive.rising))
     if not errors or twist is None:
         return None
     solved = Sensitivity.at(solution.covariance.whitening)
     late = [error.hypothesis(problem) for error in errors]
-    root = second_moments(_evidence(solved, late), noises) if known is None else known.root
+    root = second_moments(_evidence(solved, late), noises) if of_drive is None else of_drive.root
     columns = [hypothesis.column(solved)["observations"].flatten().cpu().numpy() for hypothesis in late]
-    moved = solved.moves(np.stack(columns, axis=1), to_optimum if known is None else known.follow)
+    moved = solved.moves(np.stack(columns, axis=1), to_optimum if of_drive is None else of_drive.follow)
     # A pose is where the vehicle was at the stamp: it errs by the way until the exposure, too.
     of_way = np.stack([np.asarray(twist) * error.share[:, None] for error in errors], axis=2)
     return Moves(moved.corners @ root, moved.extrinsic @ root, (of_way + moved.poses) @ root)

@@ -24,8 +24,8 @@ _DIFFERS_LIMIT = 7.0  # log likelihood ratio, since it began to rise, from which
 # Shares of what is seen that lies on its marking, was repainted beside it, or is on no marking (false
 # detections, new paint): of a right map, as drives with false detections show, and of one with half of its
 # markings moved.
-_RIGHT = np.array([0.85, 0.02, 0.13])
-_MOVED = np.array([0.5, 0.3, 0.2])
+_RIGHT = np.array([0.85, 0.02, 0.13])  # of a right map
+_MOVED = np.array([0.5, 0.3, 0.2])  # of one with half of its markings moved
 _MOVED_M = 0.22  # standard deviation, m, of each coordinate of a repainted marking: for the same use
 _ELSEWHERE_M = 2.8  # the same of what is on no marking: one piece of unmapped paint in 50 m2
 _BESIDE_M = 0.9  # distance, m, within which a marking may have been repainted

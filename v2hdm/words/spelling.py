@@ -25,10 +25,10 @@ _LETTER_LIKE = {digit: letter for letter, digit in _ALIKE}
 _AS_DIGITS = str.maketrans(_DIGIT_LIKE)
 
 # Probabilities of the kinds of strings on the ground, chosen.
-_NUMBER = 0.3
-_WORD = 0.35
-_CODE = 0.3  # letters before digits
-_OTHER = 0.05
+_NUMBER = 0.3  # of digits alone
+_WORD = 0.35  # of letters alone
+_CODE = 0.3  # of letters before digits
+_OTHER = 0.05  # of anything else
 
 _DIGITS = 10  # in the alphabet of the ground
 _LETTERS = 26  # in the alphabet of the ground

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from v2hdm.cli.arguments import kinds_of, log_to_terminal, result_of
 from v2hdm.cli.command import Command, need_installed
@@ -59,21 +59,29 @@ def _run(arguments: Sequence[str]) -> int:
     path = map_file(parsed.map)
     hd_map = read_map(path)[0]
     tolerance = Tolerances(parsed.tolerance, size_m)
-    findings, misfit, conforms = _compared(hd_map, path.parent, parsed.design, tolerance, source)
+    compared = _comparison_of(hd_map, path.parent, parsed.design, tolerance, source)
     name = path.parent.resolve().name if parsed.map.is_dir() else path.stem
     folder = parsed.output or Path("outputs") / f"{name}-compared"
     maker = f"v2hdm compare of {path.resolve()} with {parsed.design.resolve()}"
     settings = {"map": str(parsed.map), "design": str(parsed.design), "tolerance": parsed.tolerance}
     with result_of(folder, maker, settings) as unfinished:
-        write_comparison(unfinished, hd_map, findings, misfit, str(parsed.design))
-    print("\n".join([*summary_lines(findings, misfit, str(parsed.design)), f"results in {folder}"]))
-    return 0 if conforms else EXIT_FAILED_VERDICT
+        write_comparison(unfinished, hd_map, compared.findings, compared.misfit, str(parsed.design))
+    lines = summary_lines(compared.findings, compared.misfit, str(parsed.design))
+    print("\n".join([*lines, f"results in {folder}"]))
+    return 0 if compared.conforms else EXIT_FAILED_VERDICT
 
 
-def _compared(
-    hd_map: HDMap, folder: Path, path: Path, tolerance: Tolerances, source: Source
-) -> tuple[Sequence[Finding], Misfit | None, bool]:
+class _Compared(NamedTuple):
     """The findings, the misfit of the whole design, and whether all of it conforms."""
+
+    findings: Sequence[Finding]
+    misfit: Misfit | None  # None against rules
+    conforms: bool
+
+
+def _comparison_of(
+    hd_map: HDMap, folder: Path, path: Path, tolerance: Tolerances, source: Source
+) -> _Compared:
     from v2hdm.asbuilt.comparison import compare_with_design
     from v2hdm.asbuilt.decisions import Fate
     from v2hdm.asbuilt.ground import read_mosaic
@@ -82,11 +90,11 @@ def _compared(
 
     if path.suffix.lower() == ".csv":
         findings = compare_with_rules(hd_map, read_rules(path, classes_of(hd_map)))
-        return findings, None, not any(finding.fate is Fate.OFF for finding in findings)
+        return _Compared(findings, None, not any(finding.fate is Fate.OFF for finding in findings))
     comparison = compare_with_design(
         hd_map, read_design(path, hd_map, source), tolerance, read_mosaic(folder)
     )
-    return comparison.findings, comparison.misfit, comparison.conforms
+    return _Compared(comparison.findings, comparison.misfit, comparison.conforms)
 
 
 COMMAND = Command("v2hdm compare", "Compare a map with the design of its site, or with rules.", _run)

@@ -129,8 +129,8 @@ def with_owners(sections: Sequence[Names], corners: Sequence[IntArray]) -> list[
     """
     best: dict[int, tuple[int, int, int]] = {}
     claims = []
-    for number, (names, known) in enumerate(zip(sections, corners, strict=True)):
-        marking, count = np.unique(np.unique(known) // 4, return_counts=True)
+    for number, (names, determined) in enumerate(zip(sections, corners, strict=True)):
+        marking, count = np.unique(np.unique(determined) // 4, return_counts=True)
         corners_of = dict(zip(marking.tolist(), count.tolist(), strict=True))
         pairs = zip(names.marking.tolist(), names.sightings.tolist(), strict=True)
         claims.append([(name, (corners_of.get(name, 0), count_in, -number)) for name, count_in in pairs])
