@@ -32,7 +32,7 @@ def turned_deg(cam_from_vehicle: FloatArray, before: FloatArray) -> FloatArray:
 
 
 class _Model(NamedTuple):
-    """What COLMAP found: poses (I, 4, 4), nan where an image is not used, and what it says of itself."""
+    """COLMAP's result: poses (I, 4, 4), nan where an image is not used, and what it says of itself."""
 
     cam_from_map: FloatArray
     registered: int

@@ -115,7 +115,7 @@ def shown(table: np.ndarray) -> str:
 
 
 def foreign(site: Site, graph: LaneGraph, folder: Path, parsed: argparse.Namespace) -> list[str]:
-    """What other tools say of the site's map, written into ``folder``."""
+    """Lines on how other tools read the site's map, written into ``folder``."""
     folder.mkdir(parents=True, exist_ok=True)
     osm, xodr, *_ = write_map(
         site.hd_map, folder, "site", ["lanelet2", "opendrive"], trajectories=site.trajectories

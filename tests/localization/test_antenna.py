@@ -26,6 +26,12 @@ def fixes_of(driven, rng, late_s=0.0):
     return [Fix(stamp_s + late_s, antenna_at(pose) + off, SIGMA_M) for stamp_s, pose, off in pairs]
 
 
+def localizer_of(painted, seed, driven, prior=None):
+    """A localiser of a vehicle with one antenna, on the map of a yard."""
+    antenna_m = tuple(AHEAD_LEFT_M.tolist())
+    return Localizer(mapped(painted, seed), driven.calibrations, prior, antenna_m=antenna_m)
+
+
 @pytest.mark.parametrize("turn_rad", [0.0, 1.0, -2.5])
 def test_a_course_tells_the_heading_whatever_it_is(turn_rad):
     rng = np.random.default_rng(0)
@@ -66,7 +72,7 @@ def test_a_position_beside_the_origin_turns_the_heading_as_its_derivative_says()
 def test_one_antenna_and_a_gyro_find_the_vehicle_without_a_stated_start():
     painted = yard(21)
     driven = drive(painted, 21, begin_m=60.0)
-    localizer = Localizer(mapped(painted, 21), driven.calibrations, antenna_m=tuple(AHEAD_LEFT_M.tolist()))
+    localizer = localizer_of(painted, 21, driven)
     fixes = fixes_of(driven, np.random.default_rng(1))
     for frame, (looks, motion) in enumerate(zip(driven.looks, driven.motion, strict=True)):
         pose = localizer.update(looks, motion, [fixes[frame]])
@@ -79,12 +85,8 @@ def test_one_antenna_and_a_gyro_find_the_vehicle_without_a_stated_start():
 def test_positions_that_come_before_the_images_of_their_time_leave_these_in_use():
     painted = yard(22)
     driven = drive(painted, 22, seconds=6.0)
-    localizer = Localizer(
-        mapped(painted, 22),
-        driven.calibrations,
-        driven.rough(np.random.default_rng(2)),
-        antenna_m=tuple(AHEAD_LEFT_M.tolist()),
-    )
+    prior = driven.rough(np.random.default_rng(2))
+    localizer = localizer_of(painted, 22, driven, prior)
     fixes = fixes_of(driven, np.random.default_rng(3))
     matched = []
     for frame in range(1, len(driven.looks)):
@@ -99,12 +101,8 @@ def test_positions_that_come_before_the_images_of_their_time_leave_these_in_use(
 def test_positions_hold_the_pose_where_no_image_comes():
     painted = yard(23)
     driven = drive(painted, 23, seconds=16.0)
-    localizer = Localizer(
-        mapped(painted, 23),
-        driven.calibrations,
-        driven.rough(np.random.default_rng(4)),
-        antenna_m=tuple(AHEAD_LEFT_M.tolist()),
-    )
+    prior = driven.rough(np.random.default_rng(4))
+    localizer = localizer_of(painted, 23, driven, prior)
     fixes = fixes_of(driven, np.random.default_rng(5))
     for frame, (looks, motion) in enumerate(zip(driven.looks, driven.motion, strict=True)):
         pose = localizer.update(looks if frame < 40 else [], motion, [fixes[frame]])

@@ -1,4 +1,4 @@
-"""What a network reads of cells of paint, and what these show."""
+"""Features of cells of paint in a network, and the classes that these cells show."""
 
 from __future__ import annotations
 

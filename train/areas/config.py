@@ -10,7 +10,7 @@ from v2hdm.records import BOX, TEXT
 from v2hdm.settings import ANY_NUMBER, COUNT, MOST_PROCESSES, NOT_NEGATIVE, SEED, SHARE, Within
 
 _LOWERED = {TEXT: -0.2, BOX: -0.75}
-"""What the shipped classes' log odds were changed by. Source: the 130 validation photographs of ROAD MARK."""
+"""The change of the shipped classes' log odds. Source: the 130 validation photographs of ROAD MARK."""
 
 _RIDGE = 1e-3
 """For text and box. Source: in these photographs 1e-5 saw words at 14 places without a label, 1e-3 at 10."""

@@ -14,7 +14,7 @@ from v2hdm.errors import ConfigError
 _WORTH_OF_CLASSES = 0.5
 _WORTH_OF_OTHER = 0.8
 _WORTH_OF_BARE = 1.2
-"""What all cells of the fitted classes, of other labels and of no label weigh together. Chosen: paint that
+"""Weight of all cells together, of the fitted classes, of other labels and of no label. Chosen: paint that
 is taken for a word by mistake costs a map more than a word that is missed."""
 
 _CHUNK = 65536  # cells that are looked at together, for memory
@@ -62,7 +62,7 @@ def fit_rows(
 
 
 def worth_of(cells: Cells, classes: int, render_share: float) -> Tensor:
-    """What each cell (N,) weighs: all cells of a mark together weigh the same, however many they are."""
+    """The weight of each cell (N,): all cells of a mark together weigh the same, however many they are."""
     worth = torch.zeros(len(cells.marks))
     shares = dict.fromkeys(range(classes), _WORTH_OF_CLASSES / classes)
     for mark, share in (shares | {OTHER: _WORTH_OF_OTHER, BARE: _WORTH_OF_BARE}).items():

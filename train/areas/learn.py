@@ -128,7 +128,7 @@ def _training_of(config: AreasConfig) -> TrainConfig:
 
 
 def known_already(config: AreasConfig) -> list[str]:
-    """Those of the classes that the network knows, which will be fitted anew."""
+    """The classes that the network knows already and that will be fitted anew."""
     known = classes_of(Path(config.start))
     return [name for name in config.classes if name in known]
 

@@ -112,7 +112,7 @@ def _point_override(point: tuple[float, float]) -> str:
 
 
 def _withdrawn(name: str) -> str | None:
-    """What takes the place of a key that has no effect, None for any other."""
+    """The advice for a key that has no effect, None for any other."""
     for old, instead in WITHDRAWN.items():
         if name == old or name.startswith(f"{old}."):
             return instead

@@ -21,7 +21,7 @@ _BACK_M = 2.0  # way, m, before the end of a lane at which it is asked, beside q
 def ways_crossed(
     graph: LaneGraph, centres: Sequence[FloatArray], ways: Iterable[int], others: Iterable[int]
 ) -> tuple[int, ...]:
-    """Those of ``others``, lanes of a junction, that cross one of ``ways`` or lead to the same lane."""
+    """The lanes among ``others``, of a junction, that cross one of ``ways`` or lead to the same lane."""
     yielding = list(ways)
     return tuple(
         other

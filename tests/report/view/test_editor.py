@@ -232,7 +232,9 @@ def test_a_distance_is_measured(browser, served):
         page.mouse.click(left, top)
         page.mouse.click(left + 180, top)
         # The text follows the pointer, frame by frame: before the second click is drawn it is another length.
-        page.locator("#told", has_text="Measured: 2.00 m").wait_for()
+        length = page.locator("#told", has_text="Measured: 2.00 m")
+        length.wait_for()
+        assert length.inner_text().startswith("Measured: 2.00 m")
 
 
 def test_a_lane_line_is_drawn_split_joined_and_deleted_by_keys(browser, served):

@@ -121,6 +121,7 @@ def _listed(names: list[str]) -> str:
 
 
 _WORDS: Mapping[int, str] = {1: "one", 2: "two", 3: "three", 4: "four", 5: "five", 6: "six"}
+"""Numbers that are written as words in the text of a document."""
 
 
 def _count(number: int, what: str) -> str:
