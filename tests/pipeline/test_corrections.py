@@ -1,5 +1,7 @@
 """What a person says of a map holds in the next run, and nothing else changes."""
 
+import html
+
 import numpy as np
 import pytest
 import yaml
@@ -165,6 +167,14 @@ def test_what_the_map_follows_is_listed_beside_what_the_images_show(corrected):
     against = [says for says in listed.values() if says]
     assert finding.value == len(against)
     assert all(says in finding.says for says in against)
+
+
+def test_the_report_lists_every_correction(corrected):
+    page = (corrected[2].folder / "report.html").read_text()
+    listed = page.split("Corrections by hand", 1)[1].split("</table>", 1)[0]
+    corrections = corrected[2].metrics["corrections"]
+    assert listed.count("<tr") == 1 + len(corrections)
+    assert all(html.escape(heard["says"]) in listed for heard in corrections)
 
 
 @pytest.mark.parametrize(("by_m", "is_against"), [(0.14, True), (0.03, False)])
