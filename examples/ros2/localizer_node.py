@@ -41,7 +41,8 @@ class Place:
     def saw(self, camera: str, stamp: Any, pixels: Any) -> list[tuple[str, Any]]:
         """Take an image (H, W, 3) BGR; the messages to publish, by topic."""
         found = self.roads[camera].detect(pixels)
-        look = Look(camera, seconds(stamp), [marking.image for marking in found.markings])
+        markings = [marking.image for marking in found.markings]
+        look = Look(camera, seconds(stamp), markings, [lane.image for lane in found.lanes])
         pose = self.localizer.update([look])
         messages = [("pose", pose_message(pose, make)), ("status", status_message(pose, make))]
         return [(topic, message) for topic, message in messages if message is not None]
