@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -22,6 +22,9 @@ from v2hdm.records import (
     MarkingDetection,
 )
 
+if TYPE_CHECKING:
+    from v2hdm.detection.road import Road
+
 _NEAREST_M = 0.3  # least depth, m, at which a corner can be seen
 _LARGEST_PX = 1e4  # standard deviation, px, from which a corner says nothing
 _STEP_PX = 0.5  # step, px, of the lens's differences
@@ -35,6 +38,12 @@ class Look:
     stamp_s: float
     markings: Sequence[MarkingDetection] = ()
     lanes: Sequence[LaneDetection] = ()
+
+    @classmethod
+    def of(cls, camera: str, stamp_s: float, road: Road) -> Look:
+        """What a :class:`~v2hdm.detection.road.RoadDetector` has found in an image."""
+        markings = tuple(marking.image for marking in road.markings)
+        return cls(camera, stamp_s, markings, tuple(lane.image for lane in road.lanes))
 
 
 class Sighted(NamedTuple):

@@ -21,7 +21,10 @@ _ALONE_PX = 0.1  # of each point alone, px
 _WEAR_M, _WEAR_OVER_M = 0.003, 10.0  # shift of a line's paint in all images, m, and over which way it changes
 _MISSED = 0.25  # share of pieces that are not found
 _CUT = 0.3  # share of pieces that are found in two parts
-_BENT, _BENT_RAD = 0.03, 0.1  # share of short pieces that turn aside, and by how much: caps, joints, crossings
+_BENT, _BENT_RAD = (
+    0.03,
+    0.1,
+)  # share of short pieces that turn aside, and by how much: caps, joints, crossings
 _MAPPED_M, _MAPPED_OVER_M = 0.005, 6.0  # error of a mapped line across beside the drift, and over which way
 
 
