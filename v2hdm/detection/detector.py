@@ -231,7 +231,7 @@ def _in_regions(pieces: Sequence[Proposal], regions_px: FloatArray) -> list[Prop
     """The pieces of paint whose middle lies in one of some regions (R, 4)."""
     middles = np.array([piece.blob.outline_px.mean(axis=0) for piece in pieces]).reshape(-1, 1, 2)
     is_inside = (middles > regions_px[:, :2]) & (middles < regions_px[:, 2:])
-    is_in: BoolArray = np.asarray(is_inside.all(axis=2)).any(axis=1)
+    is_in = np.asarray(np.any(is_inside.all(axis=2), axis=1))
     return [piece for piece, is_kept in zip(pieces, is_in.tolist(), strict=True) if is_kept]
 
 

@@ -19,10 +19,12 @@ EVERY_FULL = 5
 """Of so many images of a camera, one is searched as a whole: at 10 Hz every half second."""
 
 _RANGE_M = 20.0  # distance, m, up to which markings are found at almost every look
-_MOST = 9  # markings that are looked for: of more, few say anything new of a vehicle's six unknowns
+_MOST = 8  # markings that are looked for: of more, few say anything new of a vehicle's six unknowns
 _LEAST = 4  # markings with which a look is worth it; where fewer are expected, all is searched
-_AROUND_M = 0.4  # way, m, around a marking that is looked at: it may have been painted again beside
-_AROUND_PX = 8.0  # px beside
+_MOST_SHARE = 0.16  # share of the image that is looked at
+_HALVES = (0.0, 1.0, *(numerator / 2**power for power in range(1, 5) for numerator in range(1, 2**power, 2)))
+_AROUND_M = 0.25  # way, m, around a marking that is looked at
+_AROUND_PX = 6.0  # px beside
 _SIGMAS = 4.0  # of the place in the image, beside
 EARLY_S = 0.05
 """Time, s, by which an image may be taken earlier or later than it was expected."""
@@ -104,22 +106,29 @@ def expected_boxes(belief: Belief, scene: Scene, speed_m_s: float) -> FloatArray
     is_whole = ((corners_px > 0) & (corners_px < size - 1)).all(axis=(1, 2))
     rows = rows[is_whole]
     corners_px = corners_px[is_whole]
-    chosen = _spread_out(expected.depth_m[rows].mean(axis=1))
-    if len(chosen) < _LEAST:
-        return None
-    rows = rows[chosen]
-    corners_px = corners_px[chosen]
     spread_px = np.linalg.norm(scene.spread(belief, expected, numbers)[rows], axis=2).max(axis=1)
-    px_by_m = np.linalg.norm(expected.by_place[rows], axis=(2, 3)).max(axis=1)
-    around_m = _AROUND_M + EARLY_S * abs(speed_m_s)
-    around_px = _AROUND_PX + _SIGMAS * spread_px + around_m * px_by_m
-    low = corners_px.min(axis=1) - around_px[:, None]
-    high = corners_px.max(axis=1) + around_px[:, None]
-    return np.concatenate([low, high], axis=1)
+    by_place = expected.by_place[rows]
+    px_by_m = np.linalg.norm(by_place, axis=(2, 3)).max(axis=1)
+    around_px = _AROUND_PX + _SIGMAS * spread_px + _AROUND_M * px_by_m
+    ahead_map = np.array([np.cos(belief.mean[HEADING]), np.sin(belief.mean[HEADING])])
+    early_px = EARLY_S * abs(speed_m_s) * np.abs(by_place @ ahead_map).max(axis=1)
+    low = corners_px.min(axis=1) - around_px[:, None] - early_px
+    high = corners_px.max(axis=1) + around_px[:, None] + early_px
+    boxes = np.concatenate([low, high], axis=1)
+    chosen = _spread_out(boxes, expected.depth_m[rows].mean(axis=1), _MOST_SHARE * info.width * info.height)
+    return boxes[chosen] if len(chosen) >= _LEAST else None
 
 
-def _spread_out(distance_m: FloatArray) -> IntArray:
-    """Some of the markings at distances (M,), near and far."""
+def _spread_out(boxes_px: FloatArray, distance_m: FloatArray, most_px2: float) -> IntArray:
+    """Some of the markings in boxes (M, 4) at distances (M,), near and far, on not too large an area."""
     order = np.argsort(distance_m)
-    places = np.linspace(0, len(order) - 1, min(_MOST, len(order)))
-    return np.asarray(order[np.unique(places.round().astype(np.int64))])
+    area_px2 = np.prod(boxes_px[:, 2:] - boxes_px[:, :2], axis=1)
+    chosen: list[int] = []
+    left_px2 = most_px2
+    # The nearest and the farthest, what is midway between them, then between those, and so on.
+    for share in _HALVES:
+        row = int(order[round(share * (len(order) - 1))]) if len(order) else -1
+        if row >= 0 and row not in chosen and len(chosen) < _MOST and area_px2[row] < left_px2:
+            chosen.append(row)
+            left_px2 -= float(area_px2[row])
+    return np.array(chosen, dtype=np.int64)
