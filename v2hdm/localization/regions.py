@@ -44,7 +44,7 @@ class Glances:
 
     def note(self, found: int) -> None:
         """Take the number of markings that an image showed."""
-        self.was_as_expected = found >= _FOUND * self.expected
+        self.was_as_expected = found >= _FOUND * max(self.expected, _LEAST)
 
     def is_full_due(self, every_full: int) -> bool:
         """Whether the next image is to be searched as a whole."""

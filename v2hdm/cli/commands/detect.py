@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
 from v2hdm.cli.command import Command
-from v2hdm.errors import DriveError
+from v2hdm.errors import ConfigError, DriveError
 
 if TYPE_CHECKING:
     from v2hdm.detection.frames import Frame
@@ -63,6 +63,8 @@ def _detect(parsed: argparse.Namespace) -> None:
     from v2hdm.store.lines import lines_to
     from v2hdm.store.results import growing_folder
 
+    if parsed.regions and not parsed.live:
+        raise ConfigError("--regions: says where to look in the next image of --live; add --live")
     cv2.setNumThreads(1)
     stopwatch = Stopwatch()
     live = parsed.live or parsed.source.isdecimal()
