@@ -76,7 +76,7 @@ from v2hdm.verdict.results import solution
 SEED = 5_318_008
 """No seed of training, of the judge's fit or of the quality benchmark."""
 
-_WRONG_M, _WRONG_SIGMAS = 0.08, 4.0
+WRONG_M, WRONG_SIGMAS = 0.08, 4.0
 
 _MOST_ENDS = 0.75  # share of the images that know an end behind a box to be hidden
 
@@ -360,7 +360,7 @@ class Mapped:
         self.false += figures.false_markings
         self.found += figures.recall * figures.expected
         self.expected += figures.expected
-        self.wrong += int(np.count_nonzero(((off_m > _WRONG_M) & (sigmas2 > _WRONG_SIGMAS**2)).any(axis=1)))
+        self.wrong += int(np.count_nonzero(((off_m > WRONG_M) & (sigmas2 > WRONG_SIGMAS**2)).any(axis=1)))
         self.squared_m2 += np.square(off_m).ravel().tolist()
 
     def __str__(self) -> str:
@@ -393,7 +393,7 @@ def site_drives(seeds: Sequence[int], folders: Sequence[Path]) -> Iterator[SiteD
             drive = drive_of(world)
             detections, visibility = see(world, drive)
             truth = truth_of(world, drive, visibility)
-            grey = _rendered_once(world) if has_images else None
+            grey = rendered_once(world) if has_images else None
             yield SiteDrive(drive, detections, truth, cameras, grey)
     for folder in folders:
         drive = read_drive(folder)
@@ -401,7 +401,7 @@ def site_drives(seeds: Sequence[int], folders: Sequence[Path]) -> Iterator[SiteD
         yield SiteDrive(drive, found, read_truth(drive), tuple(drive.cameras), grey_reader(drive))
 
 
-def _rendered_once(world: World) -> Callable[[Image], np.ndarray]:
+def rendered_once(world: World) -> Callable[[Image], np.ndarray]:
     """Reads the images of a made drive, each of which is rendered once."""
     images: dict[Path, np.ndarray] = {}
 
