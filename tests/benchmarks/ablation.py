@@ -250,6 +250,7 @@ def terms() -> Iterator[Part]:
     yield "slanting cuts of pieces", partial(patch.object, hypotheses, "_SLANT_OF_PIECE", 0.0)
     yield "slanting ends of dashes", partial(patch.object, hypotheses, "_SLANT_OF_END", 0.0)
     yield "lengths that repeat", _without_repeats
+    yield "standards where dashes are few", partial(patch.object, markings, "STANDARD_M", {})
     yield "ends that run on", partial(patch.object, hypotheses, "_RUN_ON_M", 0.0)
     yield "images' disagreement on worn ends", partial(patch.object, hypotheses, "_worn_evidence", _no_odds)
     yield "views that know a corner hidden", partial(patch.object, posterior, "_vague_evidence", _unknown)
