@@ -209,6 +209,7 @@ def sizes() -> Iterator[Part]:
     )
     yield "sightings of rejected corners", partial(patch.object, recovery, "_effective_count", _countless)
     yield "clocks: prior of being late", partial(patch.object, poses, "_UNSTATED_CLOCK_S", 0.0)
+    yield "clocks: uneven stamps are no counted ones", partial(patch.object, poses, "_UNEVEN_S", np.inf)
     yield "clocks: prior of their drift", partial(patch.object, poses, "_UNSTATED_CLOCK_DRIFT_S", 0.0)
     yield "heading: held against surveys", partial(patch.object, alignment, "_ASKEW_RAD", np.deg2rad(1.0))
 
