@@ -425,7 +425,7 @@ def test_arrows_and_whole_lines_are_written_and_drawn_without_corners(bench, mon
     monkeypatch.setattr(Detector, "detect", lambda *_: ((arrow,), (line,)))
     assert bench.run(bench.folder / "0.png", "--draw", tmp_path) == 0
     (record,) = lines(capsys.readouterr().out)
-    assert set(record["markings"][0]) == {"class", "score", "outline_px", "outline_vehicle"}
+    assert set(record["markings"][0]) == {"class", "score", "outline_px", "outline_seen", "outline_vehicle"}
     (lane,) = record["lanes"]
     assert (lane["identity"], np.shape(lane["covariance_m2"])) == (-1, (2, 2, 2))
     image = np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8)

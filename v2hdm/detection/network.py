@@ -23,6 +23,7 @@ from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.weights import NETWORK_FILE
 from v2hdm.errors import ConfigError, DetectorError, one_line
 from v2hdm.records import SEEN_ACROSS, FloatArray
+from v2hdm.safe.placeholders import placeholder_words
 from v2hdm.safe.texts import parse_json
 
 METADATA_KEY = "v2hdm"  # key of the file's ``metadata_props`` that holds its label, as JSON
@@ -382,8 +383,8 @@ def open_session(path: Path, threads: int, device: str = "cpu") -> Any:
         providers = [_PROVIDERS[name] for name in dict.fromkeys((device, "cpu"))]
         session = onnxruntime.InferenceSession(str(path), options, providers)
     except Exception as error:
-        problem = f"{path}: not a usable ONNX model ({_cause(error)}); export it again"
-        raise DetectorError(problem) from error
+        words = placeholder_words(path) or f"not a usable ONNX model ({_cause(error)}); export it again"
+        raise DetectorError(f"{path}: {words}") from error
     # Where the driver or cuDNN fails, onnxruntime goes on without a word on the CPU.
     provider = _PROVIDERS[device][0]
     if provider not in session.get_providers():

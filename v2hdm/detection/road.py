@@ -218,6 +218,7 @@ def _marking_record(marking: RoadMarking) -> dict[str, Any]:
         record["parts"] = list(marking.parts)
     if len(image.outline_px):
         record["outline_px"] = _plain(np.round(image.outline_px, _PX_DIGITS))
+        record["outline_seen"] = image.outline_seen.tolist()
         if len(marking.outline_vehicle):
             record["outline_vehicle"] = _plain(np.round(marking.outline_vehicle, _M_DIGITS))
         return record

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, NamedTuple
 
@@ -125,7 +126,7 @@ def _follow_camera(name: str, process: subprocess.Popen[str], items: _Queue, del
     assert process.stderr is not None
     for line in process.stdout:
         look = look_of(json.loads(line), name)
-        items.put(Look(look.camera, look.stamp_s - delay_s, look.markings))
+        items.put(replace(look, stamp_s=look.stamp_s - delay_s))
     said = process.stderr.read()
     error = next((line for line in said.splitlines() if line.startswith("error: ")), None)
     items.put(_Ended(name, None if error is None else f"camera {name}: {error.removeprefix('error: ')}"))
