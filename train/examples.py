@@ -99,7 +99,7 @@ class Example:
 def example(index: int, difficulty: float = 1.0, seed: int = SEED, hardships: Hardships = NONE) -> Example:
     """Example ``index`` of the fixed set, or of that of another ``seed`` or with ``hardships``."""
     drawn = drawn_scene(np.random.default_rng([seed, index]), WIDTH, HEIGHT, difficulty, hardships)
-    return example_of(drawn.scene, drawn.lanes_map, drawn.view, drawn.rendered, _camera(drawn.view))
+    return example_of(drawn.scene, drawn.lanes_map, drawn.view, drawn.rendered, camera_of(drawn.view))
 
 
 def photograph(image: LabelledImage, config: DataConfig, rng: np.random.Generator) -> Example:
@@ -156,7 +156,8 @@ def _shows(lane_map: FloatArray, view: TrainingView, rendered: Rendered) -> bool
     return shown * _STATION_M >= LEAST_SHOWN_M
 
 
-def _camera(view: TrainingView) -> Camera:
+def camera_of(view: TrainingView) -> Camera:
+    """The true camera of a rendered view."""
     ipm = ipm_from_extrinsic(view.info, view.cam_from_map)
     middle = apply_homography(ipm, np.array([[WIDTH / 2, HEIGHT - 1.0]]))
     square = np.array([[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]])

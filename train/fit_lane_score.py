@@ -55,7 +55,7 @@ class Seen:
 def seen(shown: Example, detector: Detector) -> Seen:
     """The evidence for lanes in the network's output and the paint of an image."""
     proposals = detector.propose(detector.run_network(shown.image, shown.camera), shown.camera)
-    return Seen(detector.lane_image(proposals), shown.lanes_px)
+    return Seen(detector.lane_image(proposals, shown.image), shown.lanes_px)
 
 
 @dataclass

@@ -15,6 +15,7 @@ from v2hdm.catalogue import PAINT_CLASSES, SYMBOL, Catalogue
 from v2hdm.detection.areas import find_areas
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.classifier import Readings, find_markings, read_markings
+from v2hdm.detection.lanes.bare import painted
 from v2hdm.detection.lanes.curves import LaneImage
 from v2hdm.detection.lanes.lines import find_boundaries, trace_lanes
 from v2hdm.detection.network import Network, NetworkOutput, run_on_road
@@ -89,7 +90,7 @@ class Detector:
         with lap("propose"):
             proposals = self.propose(output, camera)
         with lap("lanes"):
-            image = self.lane_image(proposals)
+            image = self.lane_image(proposals, image_bgr)
             lanes = (*image.paint, *find_boundaries(image))
         with lap("fit"):
             readings = self.read(image_bgr, proposals)
@@ -141,9 +142,20 @@ class Detector:
         pieces = propose(blobs, road_camera, self.catalogue, reach_m)
         return Proposals(road_camera, output, pieces, owner)
 
-    def lane_image(self, proposals: Proposals) -> LaneImage:
+    def lane_image(self, proposals: Proposals, image_bgr: np.ndarray) -> LaneImage:
         """An image in which boundaries of lanes are looked for: row anchors and centre lines of paint."""
-        step_m = self.options.lane_step_m
+        pieces = self.lane_pieces(proposals)
+        return LaneImage(
+            camera=proposals.camera,
+            rows=proposals.output.anchors,
+            paint=painted(pieces, image_bgr, proposals.camera),
+            output=proposals.output,
+            paint_step_m=self.options.lane_step_m,
+            row_step_px=self.network.info.lane_stride,
+        )
+
+    def lane_pieces(self, proposals: Proposals) -> list[LaneDetection]:
+        """Centre lines of what the network takes for the paint of lanes."""
         lane_classes = set(self.catalogue.lane_paint)
         paint = [
             (piece, score)
@@ -151,16 +163,8 @@ class Detector:
             if piece.blob.traced and piece.kind in lane_classes and not piece.blob.touches_symbol
             if (score := piece.score_of(lane_classes)) >= self.options.min_score
         ]
-        return LaneImage(
-            camera=proposals.camera,
-            rows=proposals.output.anchors,
-            paint=trace_lanes(
-                paint, proposals.camera, step_m, proposals.camera.perhaps_m(self.options.max_range_m)
-            ),
-            output=proposals.output,
-            paint_step_m=step_m,
-            row_step_px=self.network.info.lane_stride,
-        )
+        reach_m = proposals.camera.perhaps_m(self.options.max_range_m)
+        return trace_lanes(paint, proposals.camera, self.options.lane_step_m, reach_m)
 
     def read(self, image_bgr: np.ndarray, proposals: Proposals) -> Readings | None:
         """Fit an image's proposals, and gather the evidence for each; None where there is none."""

@@ -30,7 +30,7 @@ _BOW_PX = 0.25  # a lens that bows the sides of a quadrilateral by less is as go
 
 
 @cache
-def _light_tables(linear_response: bool) -> tuple[np.ndarray, np.ndarray]:
+def light_tables(linear_response: bool) -> tuple[np.ndarray, np.ndarray]:
     """Radiance of each code and its :func:`log_light` (256,), float32."""
     radiance = (_CODED if linear_response else _LINEAR_FROM_SRGB).astype(np.float32)
     return radiance, log_light(radiance)
@@ -93,7 +93,7 @@ class Patches:
     ):
         self.output = output
         self.pieces = pieces
-        radiance, logs = _light_tables(camera.camera.linear_response)
+        radiance, logs = light_tables(camera.camera.linear_response)
         self.source = Source(
             image=np.ascontiguousarray(image_bgr),
             owner=owner,
