@@ -64,7 +64,7 @@ class Quest:
         if self.since_s is None and self.patch.objects:
             self.since_s = look.stamp_s
             self.since_m = way_m
-        if self.since_s is None or 0 <= look.stamp_s - self.last_s < _SEARCH_S:
+        if self.since_s is None or not self._is_due(look.stamp_s):
             return _NOTHING
         self.last_s = look.stamp_s
         self.looks.append(look)
@@ -84,6 +84,12 @@ class Quest:
                 "of this site, as painted today, in these coordinates, and are these its cameras?",
             )
         return _NOTHING
+
+    def _is_due(self, stamp_s: float) -> bool:
+        """Whether it is time for a search: in turn, or because a map that is wrong is to be said by now."""
+        assert self.since_s is not None
+        is_deadline = self.last_s < self.since_s + _LOST_S < stamp_s
+        return is_deadline or not 0 <= stamp_s - self.last_s < _SEARCH_S
 
     def _judged(
         self, places: list[Place], local: FloatArray, tried: Callable[[Place], Agreement]
