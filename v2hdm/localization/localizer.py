@@ -284,6 +284,8 @@ class Localizer:
             if self._belief is None:
                 local = self._local_at(look.stamp_s)
                 self._search.patch.add(quads, look.camera, calibration, local, self._way_m)
+                hulls = hulls_of_areas(look, calibration)
+                self._search.words.add(hulls, calibration, local, self._way_m)
             since_s = self._pace.since(look.camera)
             pieces = [] if since_s is None else self._log.pieces(since_s, look.stamp_s)
             self._pace_reason = self._pace.note(look, quads, calibration, pieces) or self._pace_reason
@@ -421,7 +423,9 @@ class Localizer:
     def _find(self, look: Look) -> None:
         """Search for a place that explains what is seen as no other does."""
         local = self._local_at(look.stamp_s)
-        proposal = self._search.propose(look, local, self._way_m, self.paint, self.calibrations, self._tried)
+        proposal = self._search.propose(
+            look, local, self._way_m, self.paint, self.areas, self.calibrations, self._tried
+        )
         if proposal.pose is not None:
             self._begin(look.stamp_s, proposal.pose)
         elif proposal.reason is not None:
