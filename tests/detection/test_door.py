@@ -521,6 +521,7 @@ def test_a_line_says_where_to_look_in_the_image_of_its_time(bench, tmp_path, mon
         assert bench.run(tmp_path / "images", "--live", "--regions", "--limit", 1) == 0
         (record,) = lines(capsys.readouterr().out)
         assert len(record["markings"]) == count
+        assert record.get("whole", True) == (count == 2)
         np.testing.assert_allclose(near(record)["corners_px"], corners_px, atol=0.05)
 
 

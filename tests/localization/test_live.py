@@ -403,7 +403,7 @@ def test_lines_come_as_images_do_and_end_with_the_cameras(monkeypatch, tmp_path)
             items.put(live._Ended(name, None))
 
         threading.Thread(target=play, daemon=True).start()
-        yield live._Eye(io.StringIO(), delay_s)
+        yield live._Eye(name, io.StringIO(), delay_s)
 
     monkeypatch.setattr(live, "_camera", camera)
     poses = []

@@ -20,6 +20,7 @@ from v2hdm.localization.belief import (
     HEADING,
     VEHICLE,
     Belief,
+    bounds,
     loosened,
     pinned,
     predict,
@@ -31,7 +32,7 @@ from v2hdm.localization.lines import LineMap, with_lines
 from v2hdm.localization.motion import Motion, MotionLog, MotionNoise, moved
 from v2hdm.localization.paint import Paint
 from v2hdm.localization.places import Place, Prior, vehicle_at
-from v2hdm.localization.regions import EVERY_FULL, Looking
+from v2hdm.localization.regions import EVERY_FULL, Ahead, Looking, View
 from v2hdm.localization.rig import Estimate, Rig, Turned
 from v2hdm.localization.seeing import Look, Sighted, hulls_of_areas, pieces_of_lines, sighted
 from v2hdm.localization.starting import Quest
@@ -41,7 +42,6 @@ _LAG_S = 1.0  # images may be so late
 _FUTURE_S = 2.0  # a stamp farther ahead of the odometry, s, is of another clock
 # With a larger standard deviation of the place the vehicle does not know where it is: half a dash's gap.
 _LOST_M = 0.3
-_PROTECTION_SIGMAS = 3.717  # radius, in sigmas, that one error in a thousand in a plane exceeds
 _MOST_FEATURES = 36  # markings, stretches of lines and areas whose places' errors are states: those seen last
 _STARTED = 4  # images from the start on whose agreement makes it sure
 _START_SIGMA = np.array([0.25, 0.25, np.deg2rad(1.5)])  # of a place that was found, m, m and rad
@@ -225,16 +225,27 @@ class Localizer:
         None to look everywhere: every few images, and where the place, the map or a mounting is in doubt, few
         markings are expected, or the last look did not show what was.
         """
+        return self._ahead(camera, [stamp_s])[0].regions_px
+
+    def ahead(self, camera: str, now_s: float) -> list[Ahead]:
+        """As :meth:`regions`, for the next images of a camera at a time; none where nobody knows when."""
+        return self._ahead(camera, self._looking.stamps_ahead(camera, now_s))
+
+    def _ahead(self, camera: str, stamps_s: Sequence[float]) -> list[Ahead]:
         if camera not in self._numbers:
-            return None
-        belief = scene = None
-        if self._belief is not None and self._is_settled:
+            return [Ahead(stamp_s, None) for stamp_s in stamps_s]
+
+        def view_at(stamp_s: float) -> View | None:
+            if self._belief is None or not self._is_settled:
+                return None
             belief = self._fixed_to(self._belief, stamp_s)
             nothing = Look(camera, stamp_s)
             scene = self._scene(belief, nothing, sighted(nothing, self.calibrations[camera]))
+            return View(belief, scene)
+
         newest = self._log.samples[-1:]
         speed_m_s = newest[0].speed_m_s if newest else 0.0
-        return self._looking.regions(camera, belief, scene, speed_m_s)
+        return self._looking.ahead(camera, stamps_s, view_at, speed_m_s)
 
     @property
     def _is_settled(self) -> bool:
@@ -410,7 +421,7 @@ class Localizer:
             matched = _Matched(matched.markings, len(of_lines.observations), len(of_areas.observations))
         if is_new:
             self._matched = matched
-            self._looking.of(look.camera).note(matched.markings)
+            self._looking.of(look.camera).note(look.stamp_s, look.is_whole, matched.markings)
         return with_latest(belief, features, _MOST_FEATURES)
 
     def _scene(self, belief: Belief, look: Look, quads: Sighted) -> Scene:
@@ -556,7 +567,7 @@ class Localizer:
                 f"the map explains {100 * self._agreement.share:.0f} % of the markings seen in the last m, "
                 "and too few of the latest"
             )
-        protection = _protection(covariance, float(belief.mean[HEADING]))
+        protection = bounds(covariance, float(belief.mean[HEADING]))
         if status != Status.TRACKING or self._rig.pushed.is_suspicious or self._agreement.differs:
             protection = (np.inf, np.inf, np.inf)
         if status == Status.INITIALISING:
@@ -580,13 +591,3 @@ class Localizer:
             matched_lines=self._matched.lines,
             matched_areas=self._matched.areas,
         )
-
-
-def _protection(covariance: FloatArray, heading_rad: float) -> tuple[float, float, float]:
-    """Bounds ahead, to the left and of the heading that one error in a thousand exceeds."""
-    c = np.cos(heading_rad)
-    s = np.sin(heading_rad)
-    turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    sigma = np.sqrt(np.diag(turn @ covariance @ turn.T))
-    ahead, left, heading = (_PROTECTION_SIGMAS * sigma).tolist()
-    return ahead, left, heading
