@@ -1,0 +1,44 @@
+"""The plane of the ground in a camera: what bare ground tells the adjustment of a mounting."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from v2hdm.geometry.rigid import hat
+from v2hdm.records import Calibration, FloatArray, GroundPlane
+
+
+def plane_in(cam_from_vehicle: FloatArray) -> FloatArray:
+    """The vehicle's ground in a camera (4,): its normal, upwards, and the camera's height above it, m."""
+    normal = cam_from_vehicle[:3, 2]
+    return np.append(normal, -normal @ cam_from_vehicle[:3, 3])
+
+
+def by_tangent(cam_from_vehicle: FloatArray) -> FloatArray:
+    """Derivative (4, 6) of :func:`plane_in` by the left tangent of the extrinsic."""
+    normal = cam_from_vehicle[:3, 2]
+    out = np.zeros((4, 6))
+    out[:3, 3:] = -hat(normal)
+    out[3, :3] = -normal
+    return out
+
+
+def plane_of(calibration: Calibration, by_lens: FloatArray) -> GroundPlane | None:
+    """The plane under a mounting, with its information; ``by_lens`` (2, 6) are the mounting's tangents.
+
+    Yaw and place of the mounting rest on the recorded poses and the survey, and are left to these. None
+    without a covariance.
+    """
+    matrix = calibration.cam_from_vehicle
+    if calibration.covariance is None:
+        return None
+    plane = plane_in(matrix)
+    slope = by_tangent(matrix)
+    # Two directions across the normal, and the height: a normal has no length to err in.
+    across = np.linalg.svd(plane[None, :3])[2][1:]
+    axes = np.zeros((3, 4))
+    axes[:2, :3] = across
+    axes[2, 3] = 1.0
+    covariance = axes @ slope @ calibration.covariance @ slope.T @ axes.T
+    root = np.linalg.inv(np.linalg.cholesky(covariance)) @ axes
+    return GroundPlane(plane, root, by_lens @ slope.T)
