@@ -7,6 +7,11 @@ import numpy as np
 from v2hdm.geometry.rigid import hat
 from v2hdm.records import Calibration, FloatArray, GroundPlane
 
+_HEIGHT_SHARE = 0.015
+"""Standard deviation of a height, relative to it, by what no match shows, such as errors of a lens within a
+pixel: heights were 1.4 % low on KITTI 0011, against markings and survey, and 2.7 +- 1.6 % on PandaSet 002,
+against its lidar."""
+
 
 def plane_in(cam_from_vehicle: FloatArray) -> FloatArray:
     """The vehicle's ground in a camera (4,): its normal, upwards, and the camera's height above it, m."""
@@ -40,5 +45,6 @@ def plane_of(calibration: Calibration, by_lens: FloatArray) -> GroundPlane | Non
     axes[:2, :3] = across
     axes[2, 3] = 1.0
     covariance = axes @ slope @ calibration.covariance @ slope.T @ axes.T
+    covariance[2, 2] += (_HEIGHT_SHARE * plane[3]) ** 2
     root = np.linalg.inv(np.linalg.cholesky(covariance)) @ axes
     return GroundPlane(plane, root, by_lens @ slope.T)
