@@ -172,7 +172,8 @@ def with_ground(scene: Scene, sigma_deg: float, sigma_m: float, seed: int = 0) -
         info = CameraInfo("front", width=WIDTH, height=HEIGHT, intrinsic=np.diag([FOCAL, FOCAL, 1.0]))
         plane = plane_of(Calibration(info, tilted, covariance), np.zeros((2, 6)))
         assert plane is not None
-        planes.append(plane.plane_cam + [0, 0, 0, sigma_m * rng.standard_normal()])
+        off = np.array([0.0, 0.0, 0.0, sigma_m * rng.standard_normal()])
+        planes.append(plane.plane_cam + off)
         roots.append(plane.root_information)
     ground = GroundPlanes(np.array(planes), np.array(roots), np.zeros((len(planes), 2, 4)))
     return replace(scene, problem=replace(scene.problem, ground=ground))

@@ -95,5 +95,5 @@ def test_a_ground_of_other_cameras_is_refused():
     with pytest.raises(AdjustError, match=r"ground.plane_cam has shape \(1, 4\), expected \(2, 4\)"):
         solve(replace(problem, ground=problem.ground.take(np.array([0]))))
     endless = replace(problem.ground, root_information=np.full((2, 3, 4), np.inf))
-    with pytest.raises(AdjustError, match="ground.root_information of camera 0 is not finite"):
+    with pytest.raises(AdjustError, match=r"ground.root_information of camera 0 is not finite"):
         solve(replace(problem, ground=endless))

@@ -3,8 +3,9 @@
 import numpy as np
 
 from tests.ground.scene import INFO, extrinsic
+from v2hdm.geometry.ground_plane import by_tangent, plane_in
 from v2hdm.geometry.rigid import exp
-from v2hdm.ground.planes import by_tangent, plane_in, plane_of
+from v2hdm.ground.planes import plane_of
 from v2hdm.records import Calibration
 
 MOUNT = extrinsic(roll_deg=0.5, pitch_deg=20.0, yaw_deg=-1.0)
@@ -23,7 +24,7 @@ def test_mountings_drawn_from_a_covariance_have_planes_of_unit_variance_but_for_
     plane = plane_of(Calibration(INFO, MOUNT, np.diag(SIGMAS**2)), np.zeros((2, 6)))
     tangents = np.random.default_rng(0).standard_normal((4000, 6)) * SIGMAS
     off = np.array([plane_in(matrix) for matrix in exp(tangents) @ MOUNT]) - plane.plane_cam
-    variance = np.cov((plane.root_information @ off.T))
+    variance = np.cov(plane.root_information @ off.T)
     np.testing.assert_allclose(variance[:2, :2], np.eye(2), atol=0.08)
     height_m = plane.plane_cam[3]
     stated = np.linalg.inv(plane.root_information[2:, 3:])[0, 0]

@@ -1,4 +1,4 @@
-"""What a solve owes to the ground is taken out of it again before its markings are held against the ground."""
+"""What a solve owes to the ground is taken out of it before its markings are held against the ground."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -14,7 +14,9 @@ OPTIONS = SolveOptions(loss="none")
 
 
 def bundle_of(problem):
-    return SimpleNamespace(problem=problem, solution=solve(problem, OPTIONS), camera_index={"front": 0, "rear": 1})
+    return SimpleNamespace(
+        problem=problem, solution=solve(problem, OPTIONS), camera_index={"front": 0, "rear": 1}
+    )
 
 
 def scene(tilt_deg=0.0, higher_m=0.0):

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from tests.cameras import level, mounted
+from v2hdm.geometry.ground_plane import plane_in
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.ground.planes import plane_in
 from v2hdm.records import Camera, CameraInfo, GroundPlane
 from v2hdm.surface.paths import Paths
 from v2hdm.surface.planes import with_planes_over

@@ -19,9 +19,9 @@ The cost, in units of half a squared standard deviation, is
     + \tfrac12 \sum_c \|(o_c - \bar o_c) / \sigma_c\|^2 + \tfrac12 \sum_j \|s_j / \sigma_s\|^2
 
 over observations k (one corner in one image), camera centres o and frame states s, plus terms of surveyed
-corners, known lengths, clock offsets and planes of the ground where given. The prior acts on the camera's *centre in the vehicle
-frame*, which a survey measures, rather than on the translation of ``cam_from_vehicle``, which depends on
-the rotation.
+corners, known lengths, clock offsets and planes of the ground where given. The prior acts on the camera's
+*centre in the vehicle frame*, which a survey measures, rather than on the translation of
+``cam_from_vehicle``, which depends on the rotation.
 """
 
 from __future__ import annotations

@@ -13,6 +13,7 @@ from torch import Tensor
 from v2hdm.adjust.model import by_ground_planes, ground_planes
 from v2hdm.adjust.problem import Problem
 from v2hdm.faults.sensitivity import Rows, Sensitivity
+from v2hdm.records import BoolArray
 
 _HEIGHT = 3  # place of the height in a plane of the ground
 
@@ -69,8 +70,8 @@ def seen_over_tilted_ground(tilt: float, solved: Sensitivity) -> Rows:
     return _rows(torch.nn.functional.pad(tilt * left, (0, 1)), solved)
 
 
-def _is_of(camera: int, problem: Problem) -> np.ndarray:
-    return (np.arange(len(problem.intrinsic)) == camera) | (camera < 0)
+def _is_of(camera: int, problem: Problem) -> BoolArray:
+    return np.asarray((np.arange(len(problem.intrinsic)) == camera) | (camera < 0))
 
 
 def _turned(tangents: Tensor, solved: Sensitivity) -> Tensor:

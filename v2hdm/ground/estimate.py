@@ -169,7 +169,7 @@ def _by_lens(name: str, observations: Observations, solved: _Solved) -> FloatArr
     observed = solved.stated.prior_of(observations)
     adjusted = solved.adjusted
     freed = adjust(observed.observations, observed.prior, adjusted.mount, free=name, without=adjusted)
-    return freed.covariance[:6, 6] / freed.covariance[6, 6]
+    return np.asarray(freed.covariance[:6, 6] / freed.covariance[6, 6])
 
 
 def _nothing(camera: str, readings: Readings) -> GroundEstimate:

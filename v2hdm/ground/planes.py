@@ -4,28 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from v2hdm.geometry.rigid import hat
+from v2hdm.geometry.ground_plane import by_tangent, plane_in
 from v2hdm.records import Calibration, FloatArray, GroundPlane
 
 _HEIGHT_SHARE = 0.015
 """Standard deviation of a height, relative to it, by what no match shows, such as errors of a lens within a
 pixel: heights were 1.4 % low on KITTI 0011, against markings and survey, and 2.7 +- 1.6 % on PandaSet 002,
 against its lidar."""
-
-
-def plane_in(cam_from_vehicle: FloatArray) -> FloatArray:
-    """The vehicle's ground in a camera (4,): its normal, upwards, and the camera's height above it, m."""
-    normal = cam_from_vehicle[:3, 2]
-    return np.append(normal, -normal @ cam_from_vehicle[:3, 3])
-
-
-def by_tangent(cam_from_vehicle: FloatArray) -> FloatArray:
-    """Derivative (4, 6) of :func:`plane_in` by the left tangent of the extrinsic."""
-    normal = cam_from_vehicle[:3, 2]
-    out = np.zeros((4, 6))
-    out[:3, 3:] = -hat(normal)
-    out[3, :3] = -normal
-    return out
 
 
 def plane_of(calibration: Calibration, by_lens: FloatArray) -> GroundPlane | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from v2hdm.ground.planes import by_tangent, plane_in
+from v2hdm.geometry.ground_plane import by_tangent, plane_in
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.results import OffGround
 from v2hdm.records import GroundPlane

@@ -135,9 +135,7 @@ def shared_offsets(a: MethodResult, b: MethodResult, drive: Drive) -> FloatArray
     return np.stack([(offset_m * forward).sum(1), (offset_m * turned_left(forward)).sum(1)], axis=1)
 
 
-def check_against_ground(
-    best: MethodResult, ground: Mapping[str, GroundEstimate]
-) -> Iterator[Finding]:
+def check_against_ground(best: MethodResult, ground: Mapping[str, GroundEstimate]) -> Iterator[Finding]:
     """Each camera's mounting from markings against that from bare ground, where there is one.
 
     Where the solve has taken the ground in, what it owes to it has been taken out again.
@@ -172,8 +170,8 @@ def _judged(name: str, apart: OffGround) -> Finding:
         "ground", name, sigmas, _GROUND_LIMIT_SIGMAS, "sigmas",
         fine=f"markings and bare ground agree on its mounting ({most_deg:.2f} deg at most)",
         wrong=f"markings and bare ground do not agree on its mounting (roll {roll:+.2f}, pitch {pitch:+.2f}, "
-        f"yaw {yaw:+.2f} deg, height {100 * apart.up_m:+.0f} cm): wrong associations, or ground that is not flat; "
-        "look at the overlay",
+        f"yaw {yaw:+.2f} deg, height {100 * apart.up_m:+.0f} cm): wrong associations, or ground that is not "
+        "flat; look at the overlay",
     )  # fmt: skip
 
 
