@@ -31,6 +31,7 @@ class ScoreTest:
     # log-likelihood ratio of the fault, each segment predicted from the others; negative if they disagree.
     # Surveyed centres belong to no segment and count as they are.
     gain: float = 0.0
+    moves_m: float = 0.0  # root mean square motion of the corners, m, under a value of 1; 0 but for lenses
 
     @property
     def fault(self) -> Fault:
