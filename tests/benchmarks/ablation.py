@@ -86,7 +86,7 @@ from v2hdm.verdict.verdict import Status
 SEED = 5_318_008
 """No seed of training, of the judge's fit or of the quality benchmark."""
 
-_WRONG_M, _WRONG_SIGMAS = 0.08, 4.0
+WRONG_M, WRONG_SIGMAS = 0.08, 4.0
 
 _MOST_ENDS = 0.75  # share of the images that know an end behind a box to be hidden
 
@@ -219,6 +219,7 @@ def sizes() -> Iterator[Part]:
     )
     yield "sightings of rejected corners", partial(patch.object, recovery, "_effective_count", _countless)
     yield "clocks: prior of being late", partial(patch.object, poses, "_UNSTATED_CLOCK_S", 0.0)
+    yield "clocks: uneven stamps are no counted ones", partial(patch.object, poses, "_UNEVEN_S", np.inf)
     yield "clocks: prior of their drift", partial(patch.object, poses, "_UNSTATED_CLOCK_DRIFT_S", 0.0)
     yield "heading: held against surveys", partial(patch.object, alignment, "_ASKEW_RAD", np.deg2rad(1.0))
 
@@ -260,6 +261,7 @@ def terms() -> Iterator[Part]:
     yield "slanting cuts of pieces", partial(patch.object, hypotheses, "_SLANT_OF_PIECE", 0.0)
     yield "slanting ends of dashes", partial(patch.object, hypotheses, "_SLANT_OF_END", 0.0)
     yield "lengths that repeat", _without_repeats
+    yield "standards where dashes are few", partial(patch.object, markings, "STANDARD_M", {})
     yield "ends that run on", partial(patch.object, hypotheses, "_RUN_ON_M", 0.0)
     yield "images' disagreement on worn ends", partial(patch.object, hypotheses, "_worn_evidence", _no_odds)
     yield "views that know a corner hidden", partial(patch.object, posterior, "_vague_evidence", _unknown)
@@ -370,7 +372,7 @@ class Mapped:
         self.false += figures.false_markings
         self.found += figures.recall * figures.expected
         self.expected += figures.expected
-        self.wrong += int(np.count_nonzero(((off_m > _WRONG_M) & (sigmas2 > _WRONG_SIGMAS**2)).any(axis=1)))
+        self.wrong += int(np.count_nonzero(((off_m > WRONG_M) & (sigmas2 > WRONG_SIGMAS**2)).any(axis=1)))
         self.squared_m2 += np.square(off_m).ravel().tolist()
 
     def __str__(self) -> str:
@@ -403,7 +405,7 @@ def site_drives(seeds: Sequence[int], folders: Sequence[Path]) -> Iterator[SiteD
             drive = drive_of(world)
             detections, visibility = see(world, drive)
             truth = truth_of(world, drive, visibility)
-            grey = _rendered_once(world) if has_images else None
+            grey = rendered_once(world) if has_images else None
             yield SiteDrive(drive, detections, truth, cameras, grey)
     for folder in folders:
         drive = read_drive(folder)
@@ -411,7 +413,7 @@ def site_drives(seeds: Sequence[int], folders: Sequence[Path]) -> Iterator[SiteD
         yield SiteDrive(drive, found, read_truth(drive), tuple(drive.cameras), grey_reader(drive))
 
 
-def _rendered_once(world: World) -> Callable[[Image], np.ndarray]:
+def rendered_once(world: World) -> Callable[[Image], np.ndarray]:
     """Reads the images of a made drive, each of which is rendered once."""
     images: dict[Path, np.ndarray] = {}
 
@@ -528,10 +530,8 @@ def main() -> None:
         print(*rows_of_site(parsed.only, range(*(parsed.site or (0, 0))), parsed.drives), sep="\n")
         return
     if parsed.short:
-        print(
-            f"{'off':38s} {'tilt, deg':>9s} {'height, cm':>10s} {'squared':>8s} {'markings':>8s} {'false':>6s} "
-            f"{'failed':>7s}"
-        )
+        head = f"{'tilt, deg':>9s} {'height, cm':>10s} {'squared':>8s} {'markings':>8s}"
+        print(f"{'off':38s} {head} {'false':>6s} {'failed':>7s}")
         for name, off in holds():
             if re.search(parsed.only, name) or name == "nothing off":
                 with off():

@@ -378,6 +378,11 @@ class Optimiser:
         return self._solve_all(bundle.association, bundle.rig)
 
     @property
+    def variance_factor(self) -> float:
+        """The residuals' variance over the detector's stated one, as the last solve shows it."""
+        return self._variance_factor
+
+    @property
     def pose_noise(self) -> dict[str, float]:
         """Estimated over stated pose noise, by kind."""
 

@@ -49,7 +49,16 @@ from v2hdm.records.maps import (
     Reading,
     Symbol,
 )
-from v2hdm.records.poses import DRIFTS, GeodeticOrigin, PoseNoise, Reception, Road, Trajectory, largest_noise
+from v2hdm.records.poses import (
+    DRIFTS,
+    GeodeticOrigin,
+    PoseNoise,
+    Reception,
+    Road,
+    Trajectory,
+    largest_noise,
+    unstated_clock_drift_s,
+)
 from v2hdm.records.truth import Truth
 from v2hdm.records.units import (
     BEST,
@@ -127,4 +136,5 @@ __all__ = [
     "Trajectory",
     "Truth",
     "largest_noise",
+    "unstated_clock_drift_s",
 ]

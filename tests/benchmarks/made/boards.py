@@ -90,8 +90,8 @@ def _boards(world: World) -> FloatArray:
     start = world.map_from_vehicle[0]
     boards = []
     for ahead_m in _PLACES_M:
-        corners = np.column_stack([_BOARD_M + [ahead_m, 0.0], np.full(4, _ABOVE_M), np.ones(4)])
-        corners[:, 1] = -_BESIDE_M - corners[:, 1]
+        ahead, right = _BOARD_M.T
+        corners = np.column_stack([ahead_m + ahead, -_BESIDE_M - right, np.full(4, _ABOVE_M), np.ones(4)])
         boards.append((corners @ start.T)[:, :3])
     return np.array(boards)
 
