@@ -472,6 +472,7 @@ def holds() -> Iterator[Part]:
     yield "nothing off", nullcontext
     yield "the ground that texture shows", partial(patch.object, bundle, "_ground_of", _nothing)
     yield "doubt of its height", partial(patch.object, planes, "_HEIGHT_SHARE", 0.0)
+    yield "things that stand, among rejected", partial(patch.object, solution, "_OTHER_SHARE", 0.0)
     yield "columns of the ground in tests", partial(patch.object, ground_columns, "_rows", _no_rows)
 
 
