@@ -384,7 +384,7 @@ def _camera_fits(bundle: Bundle) -> dict[str, CameraFit]:
 
 
 def _by_candidate(bundle: Bundle, of_camera: BoolArray, sightings: FloatArray) -> FloatArray:
-    """Sightings, and contradicted ones, of each candidate (J, 2), by those (K,) of a camera's observations."""
+    """Sightings, and contradicted ones, of each candidate (J, 2), by those of K observations of a camera."""
     group = bundle.group[of_camera]
     counts = np.bincount(group, sightings)
     contradicted = np.bincount(group, sightings * ~bundle.inliers[of_camera])
