@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from scipy import stats
 
@@ -31,6 +31,8 @@ class ScoreTest:
     # log-likelihood ratio of the fault, each segment predicted from the others; negative if they disagree.
     # Surveyed centres belong to no segment and count as they are.
     gain: float = 0.0
+    # Root mean square motion of the corners, m, under a value of 1; 0 for all but lenses.
+    moves_m: float = field(default=0.0, kw_only=True)
 
     @property
     def fault(self) -> Fault:

@@ -32,7 +32,7 @@ from v2hdm.adjust.solution import Solution
 from v2hdm.faults import table
 from v2hdm.faults.columns import Hypothesis, hypotheses
 from v2hdm.faults.score import ScoreTest
-from v2hdm.faults.sensitivity import NOISES, POSITION_NOISE, Sensitivity
+from v2hdm.faults.sensitivity import NOISES, POSITION_NOISE, Rows, Sensitivity
 from v2hdm.faults.table import Fault
 from v2hdm.records import FloatArray
 
@@ -114,6 +114,7 @@ class _Answer(Segments):
     hypothesis: Hypothesis
     of_surveys: tuple[float, float]  # score and information of the cameras' surveyed centres
     by_noise: FloatArray  # (N,) information by the kind of noise
+    moves_m: float  # as of :class:`v2hdm.faults.ScoreTest`
 
     @classmethod
     def to(cls, hypotheses: Sequence[Hypothesis], solved: Sensitivity) -> list[_Answer]:
@@ -125,6 +126,7 @@ class _Answer(Segments):
         information = solved.information_by_stretch(efficient)
         noise = np.column_stack([-solved.flat(solved.residuals), solved.noise])
         scores = solved.by_stretch(efficient, noise)
+        moves_m = _motions_m(hypotheses, columns, solved)
         return [
             cls(
                 score=scores[number, :, 0],
@@ -134,6 +136,7 @@ class _Answer(Segments):
                 hypothesis=hypothesis,
                 of_surveys=(float(survey_scores[number]), float(np.square(centres[number]).sum())),
                 by_noise=solved.by_noise(efficient[number]),
+                moves_m=float(moves_m[number]),
             )
             for number, hypothesis in enumerate(hypotheses)
         ]
@@ -151,7 +154,9 @@ class _Answer(Segments):
         """The test, shrinking its variance factor towards that of noise with ``variances`` (N,)."""
         hypothesis = self.hypothesis
         fault = hypothesis.fault
-        blank = ScoreTest(fault.name, hypothesis.camera, hypothesis.axis, hypothesis.item)
+        blank = ScoreTest(
+            fault.name, hypothesis.camera, hypothesis.axis, hypothesis.item, moves_m=self.moves_m
+        )
         if not self.is_observable:
             return blank
         multiple = self.multiple(float(self.noise_shares @ variances))
@@ -177,6 +182,17 @@ class _Answer(Segments):
             p_value=2 * float(stats.t.sf(abs(self.value) / sigma, _PRIOR_FREEDOM + self.freedom)),
             gain=gain,
         )
+
+
+def _motions_m(hypotheses: Sequence[Hypothesis], columns: Sequence[Rows], solved: Sensitivity) -> FloatArray:
+    """Root mean square motions (n,), m, of the corners under unit errors of lenses; 0 under others."""
+    out = np.zeros(len(hypotheses))
+    of_lens = [number for number, hypothesis in enumerate(hypotheses) if hypothesis.fault.is_of_lens]
+    if of_lens:
+        observed = [columns[number]["observations"].flatten().cpu().numpy() for number in of_lens]
+        moved = solved.moves(np.stack(observed, axis=1)).corners
+        out[of_lens] = np.sqrt(np.square(moved).sum(axis=1).mean(axis=0))
+    return out
 
 
 def score_faults(problem: Problem, solution: Solution) -> tuple[ScoreTest, ...]:
