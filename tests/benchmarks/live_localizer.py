@@ -9,7 +9,8 @@ the localiser alone. Then starts from random places known to 5 m and 20 deg, and
 other port; half of the markings repainted 30 cm off, from the start of drives on and from the middle of one
 on; a camera that was pushed by half a degree about each axis, and one that turns by half a degree within a
 minute. That a map was repainted is timed from the start of the drive, or from its middle, and there also from
-when the first marking that was moved lies within 10 m of the vehicle.
+when the first marking that was moved lies within 10 m of the vehicle. And ways of 50 m without a marking, on
+which solid lines of lanes are shown or not.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ _START_FRAMES = 30
 _PUSHED_RAD = np.deg2rad(0.5)
 _TURNS_S = 60.0  # time in which a camera turns slowly by that
 _NEAR_M = 10.0  # way in which a repainted map is to be said
+_GAP_M, _BEFORE_GAP_M = 50.0, 20.0  # way without a marking, and that before it
 _REPAINTED_STARTS, _REPAINTED_FRAMES = 4, 40  # drives on a repainted map, and moments of each
 
 
@@ -236,6 +238,52 @@ def slow_line(driven: LiveDrive, rng: np.random.Generator, seed: int) -> str:
     return "slowly turning camera, " + "; ".join(parts)
 
 
+class Gap(NamedTuple):
+    """The pose at the end of a way without a marking."""
+
+    lateral_m: float  # its error
+    bound_m: float  # of that
+    is_tracked: bool
+
+
+def gaps(driven: LiveDrive, rng: np.random.Generator, has_lines: bool) -> list[Gap]:
+    """The ends of ways without a marking, on which a drive shows the lines of lanes or not even these."""
+    steps_m = np.linalg.norm(np.diff(driven.map_from_vehicle[:, :2, 3], axis=0), axis=1)
+    way_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+    ends = []
+    for begin_m in np.arange(_BEFORE_GAP_M, way_m[-1] - _GAP_M, _GAP_M / 2).tolist():
+        first, begin, end = np.searchsorted(way_m, begin_m + np.array([-_BEFORE_GAP_M, 0.0, _GAP_M]))
+        looks = [
+            [_blinded(look, begin <= frame, has_lines) for look in moment]
+            for frame, moment in enumerate(driven.looks[:end])
+        ]
+        run = follow(driven, rough(driven, int(first), rng), range(first, end), looks=looks)
+        errors = errors_of(driven, run)
+        is_tracked = run.poses[-1].status == Status.TRACKING
+        if is_tracked:
+            ends.append(Gap(float(errors.errors[-1, 1]), float(errors.bounds[-1, 1]), True))
+        else:
+            ends.append(Gap(np.nan, np.inf, False))
+    return ends
+
+
+def _blinded(look: Look, is_in_gap: bool, has_lines: bool) -> Look:
+    markings = () if is_in_gap else look.markings
+    return replace(look, markings=markings, lanes=look.lanes if has_lines else ())
+
+
+def gap_line(ends: Sequence[Gap], what: str) -> str:
+    """The figures of ways without a marking as one line."""
+    lateral_m = np.array([end.lateral_m for end in ends if end.is_tracked])
+    bound_m = np.array([end.bound_m for end in ends if end.is_tracked])
+    return (
+        f"after {_GAP_M:.0f} m without a marking, {what}: {len(lateral_m)} of {len(ends)} tracked, lateral "
+        f"RMSE {100 * np.sqrt((lateral_m**2).mean()):.1f} cm, at most "
+        f"{100 * np.abs(lateral_m).max():.1f} cm, bound {100 * np.median(bound_m):.0f} cm (median), "
+        f"outside it {(np.abs(lateral_m) > bound_m).sum()}"
+    )
+
+
 def main() -> None:
     """Run the benchmark and print its lines."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -244,11 +292,12 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--starts", type=int, default=40, help="of each drive")
     parser.add_argument(
-        "--only", nargs="*", default=[], metavar="PART", help="starts, wrong, moved, pushed, slow"
+        "--only", nargs="*", default=[], metavar="PART", help="starts, wrong, moved, pushed, slow, gaps"
     )
     parsed = parser.parse_args()
     parts, counts, cpu_s = [], 0, []
     totals = np.zeros((2, 4), dtype=np.int64)
+    ends: dict[bool, list[Gap]] = {True: [], False: []}
     for seed in range(parsed.first, parsed.first + parsed.seeds):
         driven = {name: drive(port_recipe(name, seed), seed, parsed.seconds) for name in PORTS}
         for name, own in driven.items():
@@ -271,7 +320,13 @@ def main() -> None:
                 print(f"  {pushed_line(own, rng, seed)}", flush=True)
             if not only or "slow" in only:
                 print(f"  {slow_line(own, rng, seed)}", flush=True)
+            if not only or "gaps" in only:
+                for has_lines, of_drives in ends.items():
+                    of_drives += gaps(own, rng, has_lines)
     print(f"all: {tracking_line(parts, counts, float(np.mean(cpu_s)))}")
+    for has_lines, of_drives in ends.items():
+        if of_drives:
+            print(gap_line(of_drives, "with lines" if has_lines else "without lines"))
     print(
         f"starts from 5 m and 20 deg: {totals[0, 0]} right, {totals[0, 1]} wrong, "
         f"{totals[0, 2]} none in 3 s, "

@@ -31,7 +31,7 @@ from v2hdm.simulate.render.scene import box_footprint
 from v2hdm.site import standing
 
 _CAMERA = "front"
-_LEAST_HIDDEN_M = 0.25  # length of paint behind a box from which an end counts as hidden
+LEAST_HIDDEN_M = 0.25  # length of paint behind a box from which an end counts as hidden
 
 
 class ShownEnd(NamedTuple):
@@ -98,7 +98,7 @@ def look(seed: int) -> Iterator[ShownEnd]:
     outlines, hidden_m = map(np.array, zip(*shown_outlines(world), strict=True))
     sides_m = np.linalg.norm(np.roll(outlines, -1, axis=1) - outlines, axis=2)
     is_end = sides_m < sides_m.mean(axis=1, keepdims=True)
-    is_end &= (hidden_m == 0) | (hidden_m > _LEAST_HIDDEN_M)
+    is_end &= (hidden_m == 0) | (hidden_m > LEAST_HIDDEN_M)
     odds = watch.standing_odds(outlines, is_end)
     for dash, side in np.argwhere(odds != 0).tolist():
         yield ShownEnd(seed, bool(hidden_m[dash, side] > 0), float(odds[dash, side]))

@@ -398,7 +398,12 @@ def test_an_interruption_before_the_last_image_is_one_line_and_no_half_a_file(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"), [(["--mounting", 1, 0, 60], "exclude each other"), (["--live"], "--live")]
+    ("arguments", "words"),
+    [
+        (["--mounting", 1, 0, 60], "exclude each other"),
+        (["--live"], "--live"),
+        (["--regions"], "add --live"),
+    ],
 )
 def test_arguments_that_exclude_one_another_are_refused(bench, capsys, arguments, words):
     assert bench.run(bench.folder / "0.png", *arguments) == 2
@@ -425,7 +430,7 @@ def test_arrows_and_whole_lines_are_written_and_drawn_without_corners(bench, mon
     monkeypatch.setattr(Detector, "detect", lambda *_: ((arrow,), (line,)))
     assert bench.run(bench.folder / "0.png", "--draw", tmp_path) == 0
     (record,) = lines(capsys.readouterr().out)
-    assert set(record["markings"][0]) == {"class", "score", "outline_px", "outline_vehicle"}
+    assert set(record["markings"][0]) == {"class", "score", "outline_px", "outline_seen", "outline_vehicle"}
     (lane,) = record["lanes"]
     assert (lane["identity"], np.shape(lane["covariance_m2"])) == (-1, (2, 2, 2))
     image = np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8)

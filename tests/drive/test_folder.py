@@ -37,7 +37,7 @@ from v2hdm.io.image_lists import read_image_list
 from v2hdm.io.importers.poses import COMMON_KEYS, POSE_FORMATS, TOPIC_KEYS
 from v2hdm.io.importers.readings import NAMES
 from v2hdm.io.trajectory import read_tum, write_tum
-from v2hdm.records import DISTORTION_COEFFICIENTS, CameraInfo, PoseNoise
+from v2hdm.records import DISTORTION_COEFFICIENTS, CameraInfo, PoseNoise, unstated_clock_drift_s
 from v2hdm.safe.pixels import read_header
 
 
@@ -130,6 +130,33 @@ def test_clocks_that_nobody_states_are_unknown_and_stated_ones_drift_no_more_tha
     assert 0.01 < unknown.clock_s < unknown.clock_drift_s < 0.1
     assert (stated.clock_s, stated.clock_drift_s) == (0.001, 0.001)
     assert PoseNoise.from_stated(clock_s=0.001, clock_drift_s=0.0).clock_drift_s == 0.0
+
+
+def test_uneven_stamps_were_read_from_a_clock_and_even_ones_may_have_been_counted():
+    even_s = 0.1 * np.arange(100)
+    uneven_s = even_s + np.random.default_rng(0).normal(0.0, 0.004, 100)
+    counted_s = PoseNoise.from_stated().clock_drift_s
+    assert unstated_clock_drift_s([even_s]) == counted_s
+    assert unstated_clock_drift_s([np.round(even_s * 1.0037, 3)]) == counted_s
+    assert unstated_clock_drift_s([np.delete(even_s, [20, 21, 60])]) == counted_s
+    assert unstated_clock_drift_s([uneven_s]) == pytest.approx(0.005, rel=0.02)
+    assert unstated_clock_drift_s([uneven_s, even_s]) == counted_s
+    assert unstated_clock_drift_s([even_s[:2], np.empty(0)]) == counted_s
+    assert unstated_clock_drift_s([20 * uneven_s]) == counted_s
+
+
+def test_a_drive_with_uneven_stamps_drifts_less_unless_it_says_otherwise(tmp_path):
+    make_drive(tmp_path, stamps=(100.05, 100.15, 100.29, 100.35, 100.48, 100.55))
+    description = tmp_path / "drive.yaml"
+    described = yaml.safe_load(description.read_text())
+    for stated, drift_s in (
+        ({}, 0.5 * 5e-4),
+        ({"position_m": 0.01}, 0.5 * 5e-4),
+        ({"clock_drift_s": 0.02}, 0.02),
+        ({"clock_s": 0.01}, 0.01),
+    ):
+        description.write_text(yaml.safe_dump(described | {"pose_noise": stated}))
+        assert read_drive(tmp_path).pose_noise.clock_drift_s == pytest.approx(drift_s)
 
 
 def test_a_mask_of_the_vehicle_is_read_and_one_of_another_size_refused(tmp_path):

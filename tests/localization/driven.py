@@ -10,7 +10,7 @@ from v2hdm.geometry.rigid import exp, heading_rad, rotation_from_euler
 from v2hdm.localization.motion import Motion
 from v2hdm.localization.places import rough_position
 from v2hdm.localization.seeing import Look
-from v2hdm.records import Calibration, CameraInfo, HDMap, Marking, MarkingDetection
+from v2hdm.records import Calibration, CameraInfo, HDMap, Lane, LaneDetection, Marking, MarkingDetection
 
 INTRINSIC = np.array([[700.0, 0, 640], [0, 700, 360], [0, 0, 1]])
 DASH = np.array([[1.0, 0.06], [-1.0, 0.06], [-1.0, -0.06], [1.0, -0.06]])
@@ -38,6 +38,14 @@ def yard(seed, length_m=160.0, diamonds=True):
     return HDMap(tuple(markings))
 
 
+def lined(painted, length_m=160.0):
+    """A yard with a solid line to the right of its way."""
+    points_map = np.column_stack([np.arange(0.0, length_m, 0.5), np.full(int(2 * length_m), -1.7)])
+    return replace(
+        painted, lanes=(Lane("lane_line", points_map, 10, sigma_m=np.full(len(points_map), 0.01)),)
+    )
+
+
 def mapped(true, seed):
     """A yard as a drive has mapped it."""
     rng = np.random.default_rng([seed, 1])
@@ -52,7 +60,8 @@ def mapped(true, seed):
                 relative_sigma_m=MAP_SIGMA_M,
             )
             for own in true.markings
-        )
+        ),
+        true.lanes,
     )
 
 
@@ -136,4 +145,20 @@ def _look(camera, stamp_s, cam_from_map, painted, rng):
         noisy = np.roll(pixels[j] + SIGMA_PX * rng.standard_normal((4, 2)), int(rng.integers(4)), axis=0)
         covariance = SIGMA_PX**2 * np.eye(8)
         found.append(MarkingDetection(painted.markings[j].kind, 0.95, noisy, covariance, np.ones(4, bool)))
-    return Look(camera, float(stamp_s), tuple(found))
+    lanes = tuple(_piece(cam_from_map, lane.points_map, rng) for lane in painted.lanes)
+    return Look(camera, float(stamp_s), tuple(found), tuple(lane for lane in lanes if lane is not None))
+
+
+def _piece(cam_from_map, points_map, rng):
+    """What an image shows of a line within 14 m, with errors across that are alike along it."""
+    pixels, depth_m = project_ground(
+        INTRINSIC, np.tile(cam_from_map, (len(points_map), 1, 1)), points_map[:, None]
+    )
+    pixels, depth_m = pixels[:, 0], depth_m[:, 0]
+    inside = ((pixels > 0) & (pixels < [1280, 720])).all(axis=1) & (depth_m > 2) & (depth_m < 14)
+    if inside.sum() < 4:
+        return None
+    across_px = 0.2 * rng.standard_normal() + 0.2 * rng.standard_normal(int(inside.sum()))
+    ahead = np.gradient(pixels[inside], axis=0)
+    across = np.column_stack([-ahead[:, 1], ahead[:, 0]]) / np.linalg.norm(ahead, axis=1)[:, None]
+    return LaneDetection("lane_line", 0.9, pixels[inside] + across_px[:, None] * across)

@@ -1,19 +1,22 @@
 """A vehicle finds itself in a map as it drives, and says when it cannot."""
 
+import io
 import json
+import queue
 import subprocess
 import sys
 import threading
 import time
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.localization.driven import MOUNT, cameras, drive, mapped, moved, yard
+from tests.localization.driven import MOUNT, cameras, drive, lined, mapped, moved, yard
 from v2hdm.cli.main import run
 from v2hdm.detection.frames import Frame
-from v2hdm.detection.road import Road, RoadMarking, as_record
+from v2hdm.detection.road import Road, RoadLane, RoadMarking, as_record
 from v2hdm.errors import ConfigError, MapFileError
 from v2hdm.geometry.rigid import exp
 from v2hdm.io.calibration.writing import write_calibration
@@ -24,7 +27,7 @@ from v2hdm.localization.localizer import Localizer, Status
 from v2hdm.localization.motion import Motion, MotionLog, MotionNoise
 from v2hdm.localization.seeing import Look, expect
 from v2hdm.localization.stream import MotionLines, look_of, pose_record
-from v2hdm.records import Calibration, GeodeticOrigin, HDMap, Marking
+from v2hdm.records import Calibration, GeodeticOrigin, HDMap, Marking, MarkingDetection
 
 
 def follow(driven, hd_map, seed=0, prior=True, calibrations=None):
@@ -341,16 +344,26 @@ def test_a_line_that_is_no_motion_is_one_line(line, says):
 
 
 def test_detections_go_through_their_json_lines():
-    driven = drive(yard(17), 17, seconds=1.0)
-    look = driven.looks[0][0]
+    driven = drive(lined(yard(17)), 17, seconds=1.0)
+    seen = driven.looks[0][0]
+    silent = (np.full((4, 2), np.nan), np.full((8, 8), np.nan), np.zeros(4, bool))
+    outline_px = np.array([[500.0, 400.0], [560.0, 400.0], [560.0, 440.0]])
+    word = MarkingDetection("text", 0.8, *silent, outline_px, np.array([True, False, True]))
+    look = replace(seen, markings=(*seen.markings, word))
     nothing = np.empty((0, 2))
-    road = Road(tuple(RoadMarking(m, nothing, np.empty((0, 0)), nothing) for m in look.markings), ())
+    lanes = tuple(RoadLane(lane, nothing, np.empty((0, 2, 2))) for lane in look.lanes)
+    road = Road(tuple(RoadMarking(m, nothing, np.empty((0, 0)), nothing) for m in look.markings), lanes)
     frame = Frame("image", "image", 0, look.stamp_s, np.zeros((1, 1, 3), np.uint8))
     again = look_of(json.loads(json.dumps(as_record(frame, "front", road))), "front")
     assert again.stamp_s == look.stamp_s
     for one, two in zip(look.markings, again.markings, strict=True):
         np.testing.assert_allclose(one.corners_px, two.corners_px, atol=1e-3)
         np.testing.assert_allclose(one.covariance_px, two.covariance_px, atol=1e-5)
+        np.testing.assert_allclose(one.outline_px, two.outline_px, atol=1e-3)
+        np.testing.assert_array_equal(one.outline_seen, two.outline_seen)
+    for one, two in zip(look.lanes, again.lanes, strict=True):
+        assert one.kind == two.kind
+        np.testing.assert_allclose(one.points_px, two.points_px, atol=1e-3)
 
 
 def test_a_line_of_a_pose_is_json_whatever_is_unknown():
@@ -390,7 +403,7 @@ def test_lines_come_as_images_do_and_end_with_the_cameras(monkeypatch, tmp_path)
             items.put(live._Ended(name, None))
 
         threading.Thread(target=play, daemon=True).start()
-        yield
+        yield live._Eye(io.StringIO(), delay_s)
 
     monkeypatch.setattr(live, "_camera", camera)
     poses = []
@@ -401,10 +414,29 @@ def test_lines_come_as_images_do_and_end_with_the_cameras(monkeypatch, tmp_path)
     assert np.hypot(*driven.errors(poses[-1], len(driven.looks) - 1)[:2]) < 0.05
 
 
+def test_all_that_a_camera_shows_reaches_the_localiser_at_the_time_of_its_exposure():
+    look = drive(lined(yard(18)), 18, seconds=1.0).looks[0][0]
+    nothing = np.empty((0, 2))
+    markings = tuple(RoadMarking(m, nothing, np.empty((0, 0)), nothing) for m in look.markings)
+    lanes = tuple(RoadLane(lane, nothing, np.empty((0, 2, 2))) for lane in look.lanes)
+    frame = Frame("image", "image", 0, 5.0, np.zeros((1, 1, 3), np.uint8))
+    line = json.dumps(as_record(frame, "front", Road(markings, lanes)))
+    items = queue.SimpleQueue()
+    program = [sys.executable, "-c", f"print({line!r})"]
+    with subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        live._follow_camera("front", process, items, 0.25)
+    read = items.get()
+    assert read.stamp_s == 4.75
+    assert len(read.markings) == len(look.markings) > 0
+    assert len(read.lanes) == len(look.lanes) > 0
+    assert items.get() == live._Ended("front", None)
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
         ("--images front", "give a camera's name and its folder"),
+        ("--images front=images --every-full 0", "--every-full 0: give a number of images, 1 or more"),
         ("--images side=images", "no calibration of camera 'side'"),
         ("--images front=nowhere", "camera front: --live: nowhere is not a camera's index or a folder"),
     ],

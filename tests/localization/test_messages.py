@@ -97,8 +97,9 @@ def test_the_node_answers_images_with_poses(monkeypatch):
     seen = {}
 
     class Road:
-        def detect(self, pixels):
-            return SimpleNamespace(markings=[SimpleNamespace(image=own) for own in seen["look"].markings])
+        def detect(self, pixels, regions_px=None):
+            markings = [SimpleNamespace(image=marking) for marking in seen["look"].markings]
+            return SimpleNamespace(markings=markings, lanes=[])
 
     place.roads = {name: Road() for name in cameras()}
     for looks, motion in zip(driven.looks, driven.motion, strict=True):

@@ -20,7 +20,13 @@ from v2hdm.mapping.options import MappingOptions, SizeOptions
 from v2hdm.mapping.results import NO_SEGMENT, MethodResult
 from v2hdm.mapping.sections.common import Names, with_owners
 from v2hdm.mapping.sections.faults import pooled_tests, refuse_contradicted
-from v2hdm.mapping.sections.joint import Fit, gates, refuse_contradicting_drives, scatter_by_marking
+from v2hdm.mapping.sections.joint import (
+    Fit,
+    Judged,
+    gates,
+    refuse_contradicting_drives,
+    scatter_by_marking,
+)
 from v2hdm.mapping.sections.run import map_in_sections
 from v2hdm.mapping.sections.section import sections_of
 from v2hdm.records import Image, ImageDetections, IntArray, PoseNoise, Session
@@ -156,15 +162,12 @@ def test_a_process_that_dies_is_one_line_that_names_step_and_section(scene, tmp_
         )
 
 
-def fit_of(squared, corner, shift_m=((0.0, 0.0), (0.0, 0.0)), is_behind=None) -> Fit:
-    """A section's fit of observations with such squared residuals of such corners, by 100 frames a drive."""
-    count = len(squared)
-    return Fit(
-        mahalanobis2=np.array(squared, dtype=float),
+def judged(squared, corner, shift_m=((0.0, 0.0), (0.0, 0.0)), is_behind=None) -> Judged:
+    """A section's observations with such squared residuals of such corners, by 100 frames a drive."""
+    return Judged(
+        squared=np.array(squared, dtype=float),
         corner=np.array(corner),
-        freedom=np.full(count, 2.0),
-        is_behind=np.zeros(count, dtype=bool) if is_behind is None else np.array(is_behind),
-        of_priors={},
+        is_behind=np.zeros(len(squared), dtype=bool) if is_behind is None else np.array(is_behind),
         shift_m=100 * np.array(shift_m),
         frames=np.array([100, 100]),
     )
@@ -172,8 +175,8 @@ def fit_of(squared, corner, shift_m=((0.0, 0.0), (0.0, 0.0)), is_behind=None) ->
 
 def test_an_observation_is_judged_at_the_scale_of_all_sections_and_its_corner_counted_in_all():
     usual = [1.4] * 20
-    first = fit_of([*usual, 5.0, 300.0, 1.0], [*range(20), 20, 20, 21])
-    second = fit_of([*usual, 5.0, 1.0], [*range(22, 42), 20, 21], is_behind=[False] * 21 + [True])
+    first = judged([*usual, 5.0, 300.0, 1.0], [*range(20), 20, 20, 21])
+    second = judged([*usual, 5.0, 1.0], [*range(22, 42), 20, 21], is_behind=[False] * 21 + [True])
     of_first, of_second = gates([first, second], 0.001)
     assert of_first.is_accepted[20:].tolist() == [True, False, True]
     assert of_second.is_accepted[20:].tolist() == [True, False]
@@ -187,8 +190,11 @@ def test_a_corner_scatters_as_all_its_images_do_whatever_section_they_are_of():
     squared = rng.chisquare(2, 400)
     squared[::40] *= 9  # of corner 0
     corner = np.arange(400) % 40
-    whole = scatter_by_marking([fit_of(squared, corner)], 10)
-    halves = [fit_of(squared[::2], corner[::2]), fit_of(squared[1::2], corner[1::2])]
+    freedom = np.full(400, 2.0)
+    whole = scatter_by_marking([Fit(squared, corner, freedom, {})], 10)
+    halves = [
+        Fit(squared[rows], corner[rows], freedom[rows], {}) for rows in (slice(0, None, 2), slice(1, None, 2))
+    ]
     np.testing.assert_allclose(scatter_by_marking(halves, 10), whole)
     assert whole[0, 0] == whole.max() > 2
 
@@ -197,9 +203,9 @@ def test_drives_that_markings_shift_apart_are_named_in_one_line(scene):
     noise = PoseNoise(position_m=0.02)
     drives = [Session(name, Path(name), noise) for name in ("monday", "tuesday")]
     network = replace(scene.drive, joined=tuple(drives))
-    refuse_contradicting_drives([fit_of([], [], ((0.03, 0.0), (-0.03, 0.0)))], network)
+    refuse_contradicting_drives([judged([], [], ((0.03, 0.0), (-0.03, 0.0)))], network)
     with pytest.raises(AdjustError, match=r"drive (monday|tuesday) by 30 cm against the others") as refused:
-        refuse_contradicting_drives([fit_of([], [], ((0.15, 0.0), (-0.15, 0.0)))], network)
+        refuse_contradicting_drives([judged([], [], ((0.15, 0.0), (-0.15, 0.0)))], network)
     assert "\n" not in str(refused.value)
 
 

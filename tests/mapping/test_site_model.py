@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from v2hdm.association.groups import FusedGroups
+from v2hdm.records import LANE_DASH
 from v2hdm.site.candidates import Candidates, Counts, scatter_of, with_dissent, with_shared_errors
 from v2hdm.site.hypotheses import Kind
+from v2hdm.site.lengths import STANDARD_M
 from v2hdm.site.markings import classify
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import Parallax
@@ -209,6 +211,54 @@ def test_four_dashes_with_worn_ends_tell_that_a_fifth_is_a_piece(seed):
     assert sigma_m.max() > 0.3
     assert (found.probability[:4, Kind.OF_CLASS] > 0.5).all()
     assert (normalised(found, true) < 25).all()
+
+
+DASHES = {0: STANDARD_M[LANE_DASH]}
+
+
+def among_few(candidates):
+    """The posterior of dashes that are too few to teach how long they are."""
+    kind = np.zeros(len(candidates), dtype=np.int64)
+    return posterior(candidates, kind, well_seen(len(candidates)), None, DASHES)
+
+
+@pytest.mark.parametrize("others", [0, 1, 2])
+def test_a_dash_that_may_have_lost_an_end_is_not_certain_beside_so_few_others(others):
+    """Three of four metres are gone, and no class of three or more tells so."""
+    true, candidates = row(others, [DASH] * (others + 1), 0.01)
+    moved_end(candidates, others, -0.75)
+    found = among_few(candidates)
+    error_m = np.linalg.norm(found.candidates.corners_map - true, axis=2).max(axis=1)
+    sigma_m = found.candidates.sigma_m.max(axis=1)
+    assert sigma_m[others] > 0.6
+    assert error_m[others] < 3.1 * sigma_m[others]
+    assert (error_m[:others] < 0.05).all()
+    assert (sigma_m[:others] < 0.15).all()
+    assert (found.log_odds > 5).all()
+
+
+@pytest.mark.parametrize("length_m", [1.0, 2.0, 3.0, 6.0])
+def test_a_dash_of_a_standard_length_keeps_it_alone_and_is_known_better_beside_another(length_m):
+    sigmas_m = []
+    for count in (1, 2):
+        true, candidates = row(3, [DASH * [length_m / 3, 1.0]] * count, 0.01)
+        found = among_few(candidates)
+        sigmas_m.append(found.candidates.sigma_m.max())
+        assert (np.linalg.norm(found.candidates.corners_map - true, axis=2) < 0.05).all()
+    assert 0.15 > sigmas_m[0] > sigmas_m[1]
+    assert sigmas_m[1] < 0.08
+
+
+def test_what_most_dashes_show_of_their_length_counts_for_more_than_standards():
+    true, candidates = row(4, [DASH * [0.75 / 3, 1.0]] * 2, 0.01)
+    found = among_few(candidates)
+    assert found.candidates.sigma_m.max() < 0.1
+    assert shape_rmse(found.candidates.corners_map, true) < 0.02
+
+
+def test_a_marking_that_is_not_long_has_no_end_to_lose():
+    _, candidates = row(5, [DIAMOND], 0.01)
+    assert among_few(candidates).probability[0, Kind.WRONG_END] < 1e-6
 
 
 def test_two_opposite_corners_in_a_shadow_do_not_make_another_shape():

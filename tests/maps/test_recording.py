@@ -11,7 +11,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from tests.docs.blocks import document
+from tests.docs.blocks import ROOT
 from tests.maps.gis import ORIGIN, street
 from v2hdm.cli.main import run
 from v2hdm.geometry.rigid import exp, rotation_from_quaternion
@@ -182,7 +182,6 @@ def test_without_rosbags_a_recording_is_one_line(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("kind", messages.DEFINITIONS)
-def test_the_documents_show_the_messages_as_they_are(kind):
-    package, folder, name = kind.split("/")
-    shown = document("docs/exports.md").split(f'title="{package}/{folder}/{name}.msg"\n', 1)[1]
-    assert shown.split("```", 1)[0] == messages.DEFINITIONS[kind]
+def test_the_example_package_holds_the_messages_as_they_are(kind):
+    path = ROOT / "examples" / "ros2" / f"{kind}.msg"
+    assert path.read_text(encoding="utf-8") == messages.DEFINITIONS[kind]

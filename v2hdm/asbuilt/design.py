@@ -11,7 +11,7 @@ import numpy as np
 
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.geodetic import enu_from_geodetic, geodetic_from_enu
-from v2hdm.geometry.planar import is_simple, signed_area
+from v2hdm.geometry.planar import centroid, is_simple, signed_area
 from v2hdm.records import (
     UNSTATED_SIGMA_M,
     FloatArray,
@@ -73,17 +73,8 @@ def outline_of(outline_map: FloatArray) -> Outline:
     box = cv2.boxPoints(cv2.minAreaRect((outline_map - middle).astype(np.float32)))
     corners = np.asarray(box, dtype=np.float64)
     # The box says how the shape lies; its middle is that of the shape's area.
-    centred = corners - corners.mean(axis=0) + _centroid(outline_map)
+    centred = corners - corners.mean(axis=0) + centroid(outline_map)
     return Outline(centred if signed_area(centred) > 0 else centred[::-1], False)
-
-
-def _centroid(outline_map: FloatArray) -> FloatArray:
-    """The centre (2,) of the area of a polygon (N, 2)."""
-    origin = outline_map.mean(axis=0)
-    points = outline_map - origin
-    ahead = np.roll(points, -1, axis=0)
-    doubled = points[:, 0] * ahead[:, 1] - points[:, 1] * ahead[:, 0]
-    return np.asarray(origin + (doubled[:, None] * (points + ahead)).sum(axis=0) / (3 * doubled.sum()))
 
 
 def built_shapes(hd_map: HDMap) -> tuple[BuiltShape, ...]:

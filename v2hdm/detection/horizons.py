@@ -20,7 +20,7 @@ from v2hdm.records import CameraInfo, FloatArray
 
 BODY_SIGMA_RAD = np.deg2rad(0.35)
 """Standard deviation of a body's pitch on its suspension: .3 to .4 degrees in 106 photographs of one camera,
-and .1 to .4 in `docs/kitti.md`."""
+and .1 to .4 on a drive of KITTI."""
 
 _SPREADS_RAD = BODY_SIGMA_RAD * np.array([1.0, 2.0, 4.0])
 """Standard deviations of the pitch of a mounting's images, equally likely beforehand.

@@ -107,6 +107,15 @@ def clip_half(polygon: FloatArray, depth: FloatArray) -> FloatArray:
     return np.array(vertices).reshape(-1, polygon.shape[1])
 
 
+def centroid(polygon: FloatArray) -> FloatArray:
+    """The middle (2,) of the area of a polygon (N, 2) of either orientation."""
+    origin = polygon.mean(axis=0)
+    points = polygon - origin
+    ahead = np.roll(points, -1, axis=0)
+    doubled = cross(points, ahead)
+    return np.asarray(origin + (doubled[:, None] * (points + ahead)).sum(axis=0) / (3 * doubled.sum()))
+
+
 def densified(polygon: FloatArray, pieces: int) -> FloatArray:
     """A polygon (N, 2) with every side cut into ``pieces``: lenses bend straight lines."""
     part = np.arange(pieces)[:, None] / pieces

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
-from v2hdm.localization.belief import HEADING, Belief
+from v2hdm.localization.belief import HEADING, Belief, corrected
 from v2hdm.localization.places import Prior, vehicle_at
 from v2hdm.records import FloatArray
 
@@ -94,7 +94,5 @@ def with_fix(belief: Belief, fix: Fix, ahead_left_m: FloatArray, shared_m2: floa
             f"RTK is {np.linalg.norm(off):.2f} m from where the markings put the vehicle: is the map in its "
             "datum, and the antenna where it is stated?",
         )
-    mean = belief.mean + belief.root @ slope.T @ np.linalg.solve(spread, off)
-    inner = np.linalg.cholesky(np.eye(len(belief.mean)) + slope.T @ slope / total_m2)
-    root = np.asarray(np.linalg.solve(inner, belief.root.T).T, dtype=np.float64)
-    return Update(replace(belief, mean=mean, root=root), None)
+    sigma_m = np.sqrt(total_m2)
+    return Update(corrected(belief, off / sigma_m, slope / sigma_m), None)

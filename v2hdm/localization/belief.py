@@ -1,7 +1,7 @@
 """The belief of a localiser on vehicle, cameras and markings in view, as a square-root filter.
 
 The states are the vehicle's (:data:`VEHICLE`), for each camera the tangent (6) of its mounting's error
-(:class:`~v2hdm.records.Calibration`), and for each marking that was seen lately its place's error (2), m:
+(:class:`~v2hdm.records.Calibration`), and for each feature that was seen lately its place's error (2), m:
 what a map and a calibration are wrong by does not average out over the images. The covariance is
 ``root @ root.T``; updates work on the whitened state, where the information is never less than one, so that
 rounding cannot make it indefinite (Bierman, Factorization Methods for Discrete Sequential Estimation, 1977,
@@ -58,7 +58,11 @@ class Plane:
 
 @dataclass(frozen=True)
 class Belief:
-    """Mean (n,) and root (n, n) of the states at a time; ``markings`` are the map's numbers, in order."""
+    """Mean (n,) and root (n, n) of the states at a time.
+
+    ``markings`` are the numbers, in order, of the map's features whose errors are states: of markings, and
+    behind the last of these of stretches of lines and of areas.
+    """
 
     stamp_s: float
     mean: FloatArray
@@ -215,6 +219,13 @@ def only_markings(belief: Belief, markings: Sequence[int]) -> Belief:
     )
 
 
+def with_latest(belief: Belief, features: Sequence[int], most: int) -> Belief:
+    """The belief with so many of the features that were seen last; ``features`` are seen now."""
+    earlier = [feature for feature in belief.markings if feature not in set(features)]
+    order = [*earlier, *features]
+    return belief if len(order) <= most else only_markings(belief, order[-most:])
+
+
 def loosened(belief: Belief, cameras: Sequence[int], sigma_rad: float) -> Belief:
     """The belief in which the mountings of cameras may each have turned by so much since."""
     rows = [VEHICLE + CAMERA * camera + axis for camera in cameras for axis in (3, 4, 5)]
@@ -226,11 +237,19 @@ def loosened(belief: Belief, cameras: Sequence[int], sigma_rad: float) -> Belief
 
 def pinned(belief: Belief, states: Sequence[int], values: FloatArray, sigma: float) -> Belief:
     """The belief in which some states (K,) are known to have values (K,) with a standard deviation."""
-    slope = belief.root[list(states)]
-    spread = slope @ slope.T + sigma**2 * np.eye(len(slope))
-    mean = belief.mean + belief.root @ slope.T @ np.linalg.solve(spread, values - belief.mean[list(states)])
-    inner = np.linalg.cholesky(np.eye(len(belief.mean)) + slope.T @ slope / sigma**2)
+    rows = list(states)
+    return corrected(belief, (values - belief.mean[rows]) / sigma, belief.root[rows] / sigma)
+
+
+def corrected(belief: Belief, residual: FloatArray, slope: FloatArray) -> Belief:
+    """The belief after measurements (R,) of unit noise.
+
+    ``residual`` (R,) is measured less expected, ``slope`` (R, n) the derivative of what is expected by the
+    whitened states.
+    """
+    inner = np.linalg.cholesky(np.eye(len(belief.mean)) + slope.T @ slope)
     root = np.asarray(np.linalg.solve(inner, belief.root.T).T, dtype=np.float64)
+    mean = belief.mean + root @ np.linalg.solve(inner, slope.T @ residual)
     return replace(belief, mean=mean, root=root)
 
 

@@ -19,7 +19,7 @@ _REACH_SIGMAS = 4.0  # in sigmas of the place, beside
 _RANGE_M = 35.0  # distance, m, of markings that are looked for: farther than any is detected
 _GATE = 3.3  # one in two thousand right pairs, or right sets of them, fits worse (sigmas of a normal)
 # Twice the difference of log likelihoods from which one marking explains a detection and no other does.
-_CLEARER_BY = 9.0
+CLEARER_BY = 9.0
 _ROUNDS = 3  # of pairing what is clear once the clearer pairs are known
 _STEPS = 4  # of an update: half a metre off at the first, a few millimetres at the third
 _SETTLED = 0.02  # longest step, in sigmas of the prior belief, that changes nothing any more
@@ -203,7 +203,7 @@ def clear_pairs(pairs: Pairs, loss: FloatArray) -> Clear:
         detection = int(pairs.detection[row])
         if detection not in best:
             best[detection] = row
-        elif loss[row] < loss[best[detection]] + _CLEARER_BY:
+        elif loss[row] < loss[best[detection]] + CLEARER_BY:
             doubted.add(detection)
     paired: set[int] = set()
     rows = []

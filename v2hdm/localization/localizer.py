@@ -11,26 +11,29 @@ from typing import NamedTuple
 import numpy as np
 
 from v2hdm.doors import checked
-from v2hdm.errors import MapFileError
+from v2hdm.errors import ConfigError, MapFileError
 from v2hdm.localization.agreement import Agreement, Pace, detected
 from v2hdm.localization.antenna import Antenna, Fix, with_fix
+from v2hdm.localization.areas import AreaMap, with_areas
 from v2hdm.localization.belief import (
     CAMERA,
     HEADING,
     VEHICLE,
     Belief,
     loosened,
-    only_markings,
     pinned,
     predict,
     start,
+    with_latest,
 )
 from v2hdm.localization.joint import Located, Scene, locate, paired
+from v2hdm.localization.lines import LineMap, with_lines
 from v2hdm.localization.motion import Motion, MotionLog, MotionNoise, moved
 from v2hdm.localization.paint import Paint
 from v2hdm.localization.places import Place, Prior, vehicle_at
+from v2hdm.localization.regions import EVERY_FULL, Looking
 from v2hdm.localization.rig import Estimate, Rig, Turned
-from v2hdm.localization.seeing import Look, Sighted, sighted
+from v2hdm.localization.seeing import Look, Sighted, hulls_of_areas, pieces_of_lines, sighted
 from v2hdm.localization.starting import Quest
 from v2hdm.records import Calibration, FloatArray, HDMap
 
@@ -39,7 +42,7 @@ _FUTURE_S = 2.0  # a stamp farther ahead of the odometry, s, is of another clock
 # With a larger standard deviation of the place the vehicle does not know where it is: half a dash's gap.
 _LOST_M = 0.3
 _PROTECTION_SIGMAS = 3.717  # radius, in sigmas, that one error in a thousand in a plane exceeds
-_MOST_MARKINGS = 28  # whose places' errors are states: those seen last
+_MOST_FEATURES = 36  # markings, stretches of lines and areas whose places' errors are states: those seen last
 _STARTED = 4  # images from the start on whose agreement makes it sure
 _START_SIGMA = np.array([0.25, 0.25, np.deg2rad(1.5)])  # of a place that was found, m, m and rad
 _UNSTATED = np.diag(np.square([0.01, 0.01, 0.01, *(3 * [np.deg2rad(0.05)])]))  # of a calibration without one
@@ -81,6 +84,8 @@ class Pose:
         protection_rad: the same of the heading.
         motion: true over stated speed, and the yaw rate's bias, rad/s.
         matched: markings that the last look showed.
+        matched_lines: pieces of solid lines that it showed on their lines.
+        matched_areas: words, boxes and other symbols that it showed at their places.
         reasons: sentences: why there is no pose, or what differs from map, calibration or odometry.
         turned: cameras whose mountings have changed.
     """
@@ -95,6 +100,8 @@ class Pose:
     matched: int
     reasons: tuple[str, ...] = ()
     turned: tuple[Turned, ...] = ()
+    matched_lines: int = 0
+    matched_areas: int = 0
 
 
 class _Past(NamedTuple):
@@ -102,6 +109,14 @@ class _Past(NamedTuple):
 
     before: Belief
     look: Look
+
+
+class _Matched(NamedTuple):
+    """How much of the map an image showed."""
+
+    markings: int = 0
+    lines: int = 0
+    areas: int = 0
 
 
 @dataclass
@@ -138,19 +153,25 @@ class Localizer:
         prior: Prior | None = None,
         noise: MotionNoise | None = None,
         antenna_m: Sequence[float] = (0.0, 0.0),
+        every_full: int = EVERY_FULL,
     ) -> None:
         """Start in a map (frame ``map``, m) with calibrated cameras, by name.
 
         ``prior`` is a rough position; without one, the whole map is searched.
         ``noise`` is the odometry's; ``antenna_m`` is how far ahead of its origin and to the left the vehicle
-        has the antenna of its positions. Raises MapFileError for a map without markings, or without cameras.
+        has the antenna of its positions. Of ``every_full`` images of a camera, :meth:`regions` has one
+        searched as a whole. Raises MapFileError for a map without markings, or without cameras.
         """
+        if every_full < 1:
+            raise ConfigError(f"every_full is {every_full}: give a number of images, 1 or more")
         if not hd_map.markings:
             raise MapFileError("the map has no markings; nothing can be localised in it")
         if not calibrations:
             raise MapFileError("no camera is calibrated; give calibration_<camera>.yaml of the map's result")
         self.calibrations = dict(calibrations)
         self.paint = Paint(hd_map)
+        self.lines = LineMap(hd_map, self.paint.shared_m2, len(self.paint))
+        self.areas = AreaMap(hd_map, self.paint.shared_m2, len(self.paint) + len(self.lines))
         self.noise = noise or MotionNoise()
         self._numbers = {name: number for number, name in enumerate(self.calibrations)}
         covariances = [item.covariance for item in self.calibrations.values()]
@@ -175,7 +196,8 @@ class Localizer:
         self._way_m = 0.0
         self._pace_reason: str | None = None
         self._reasons: dict[str, str] = {}
-        self._matched = 0
+        self._matched = _Matched()
+        self._looking = Looking(every_full)
 
     def update(
         self, images: Sequence[Look] = (), motion: Sequence[Motion] = (), fixes: Sequence[Fix] = ()
@@ -195,6 +217,30 @@ class Localizer:
         for look in sorted(images, key=lambda item: item.stamp_s):
             self._take(look)
         return self._pose()
+
+    def regions(self, camera: str, stamp_s: float) -> FloatArray | None:
+        """Where to look in the next image of a camera, taken at about a time: around what the map will show.
+
+        Boxes (R, 4) of left, top, right and bottom, px, for :meth:`v2hdm.detection.road.RoadDetector.detect`.
+        None to look everywhere: every few images, and where the place, the map or a mounting is in doubt, few
+        markings are expected, or the last look did not show what was.
+        """
+        if camera not in self._numbers:
+            return None
+        belief = scene = None
+        if self._belief is not None and self._is_settled:
+            belief = self._fixed_to(self._belief, stamp_s)
+            nothing = Look(camera, stamp_s)
+            scene = self._scene(belief, nothing, sighted(nothing, self.calibrations[camera]))
+        newest = self._log.samples[-1:]
+        speed_m_s = newest[0].speed_m_s if newest else 0.0
+        return self._looking.regions(camera, belief, scene, speed_m_s)
+
+    @property
+    def _is_settled(self) -> bool:
+        """Whether nothing speaks against place, map, odometry and mountings."""
+        is_doubted = self._agreement.is_doubtful or self._rig.pushed.is_suspicious
+        return self._is_sure and not is_doubted and self._pace_reason is None
 
     def _take(self, look: Look) -> None:
         """Take a look in its place among those that came before it."""
@@ -262,7 +308,7 @@ class Localizer:
     def _note_mounting(self, look: Look) -> None:
         """Test a camera's mounting after an image of it."""
         belief = self._belief
-        if belief is None or not self._is_sure or not self._matched:
+        if belief is None or not self._is_sure or not self._matched.markings:
             return
         angles = self._angles(look.camera)
         estimate = Estimate(look.stamp_s, belief.mean[angles], belief.covariance(angles))
@@ -326,8 +372,9 @@ class Localizer:
         noise = self._noise[look.camera]
         scene = self._scene(belief, look, quads)
         located = locate(belief, scene)
+        belief_of_all = self._with_lines_and_areas(located, look, scene, is_new)
         if not is_new:
-            return located.belief
+            return belief_of_all
         judged = detected(scene, located)
         is_judged = judged.is_judged
         explained = paired(located, len(quads.kinds))
@@ -341,8 +388,28 @@ class Localizer:
         self._agreement.note(judged, self._way_m)
         if located.misfit_freedom > 0:
             noise.note(located, noise.factor)
-        self._matched = len(located.pairs.detection)
-        return self._kept(located)
+        return belief_of_all
+
+    def _with_lines_and_areas(self, located: Located, look: Look, scene: Scene, is_new: bool) -> Belief:
+        """The belief after a look's lines and areas, too, with the features of the map that were seen last.
+
+        Before the place is sure, lines that run alongside would only make a wrong one look right.
+        """
+        belief = located.belief
+        features = located.pairs.marking.tolist()
+        matched = _Matched(len(features))
+        if self._is_sure:
+            pieces_px = pieces_of_lines(look, scene.calibration)
+            of_lines = with_lines(belief, scene, self.lines, pieces_px)
+            hulls = hulls_of_areas(look, scene.calibration)
+            of_areas = with_areas(of_lines.belief, scene, self.areas, hulls)
+            belief = of_areas.belief
+            features += [*of_lines.features, *of_areas.features]
+            matched = _Matched(matched.markings, len(of_lines.observations), len(of_areas.observations))
+        if is_new:
+            self._matched = matched
+            self._looking.of(look.camera).note(matched.markings)
+        return with_latest(belief, features, _MOST_FEATURES)
 
     def _scene(self, belief: Belief, look: Look, quads: Sighted) -> Scene:
         """A look before the map, from about where the vehicle is believed to be."""
@@ -350,17 +417,6 @@ class Localizer:
         calibration = self.calibrations[look.camera]
         factor = self._noise[look.camera].factor
         return Scene(quads, self.paint, plane, self._numbers[look.camera], calibration, factor)
-
-    def _kept(self, located: Located) -> Belief:
-        """The belief with the markings that were seen last."""
-        belief = located.belief
-        latest = [
-            marking for marking in belief.markings if marking not in set(located.pairs.marking.tolist())
-        ]
-        order = [*latest, *located.pairs.marking.tolist()]
-        if len(order) <= _MOST_MARKINGS:
-            return belief
-        return only_markings(belief, order[-_MOST_MARKINGS:])
 
     def _find(self, look: Look) -> None:
         """Search for a place that explains what is seen as no other does."""
@@ -401,7 +457,7 @@ class Localizer:
         """Whether the belief still holds, by what it explains."""
         assert self._belief is not None
         if not self._is_sure:
-            self._confirmed += self._matched >= 2
+            self._confirmed += self._matched.markings >= 2
             if self._confirmed >= _STARTED and self._belief.sigma_m < _LOST_M and not self._agreement.differs:
                 self._is_sure = True
             elif self._agreement.differs:
@@ -514,9 +570,11 @@ class Localizer:
             protection_m=protection[:2],
             protection_rad=protection[2],
             motion=motion,
-            matched=self._matched,
+            matched=self._matched.markings,
             reasons=tuple(reasons.values()),
             turned=self._rig.turned,
+            matched_lines=self._matched.lines,
+            matched_areas=self._matched.areas,
         )
 
 

@@ -4,14 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from v2hdm.geometry.lens import has_distortion, undistort_points
 from v2hdm.geometry.rigid import exp, hat
 from v2hdm.localization.belief import CAMERA, HEADING, HEIGHT, VEHICLE, Belief, Plane
-from v2hdm.records import BoolArray, Calibration, FloatArray, IntArray, LaneDetection, MarkingDetection
+from v2hdm.records import (
+    CROSSWALK,
+    LANE_LINE,
+    BoolArray,
+    Calibration,
+    FloatArray,
+    IntArray,
+    LaneDetection,
+    MarkingDetection,
+)
+
+if TYPE_CHECKING:
+    from v2hdm.detection.road import Road
 
 _NEAREST_M = 0.3  # least depth, m, at which a corner can be seen
 _LARGEST_PX = 1e4  # standard deviation, px, from which a corner says nothing
@@ -26,6 +38,12 @@ class Look:
     stamp_s: float
     markings: Sequence[MarkingDetection] = ()
     lanes: Sequence[LaneDetection] = ()
+
+    @classmethod
+    def of(cls, camera: str, stamp_s: float, road: Road) -> Look:
+        """What a :class:`~v2hdm.detection.road.RoadDetector` has found in an image."""
+        markings = tuple(marking.image for marking in road.markings)
+        return cls(camera, stamp_s, markings, tuple(lane.image for lane in road.lanes))
 
 
 class Sighted(NamedTuple):
@@ -78,6 +96,32 @@ def sighted(look: Look, calibration: Calibration) -> Sighted:
     return finding.subset(np.flatnonzero(informs.sum(axis=1) >= 2))
 
 
+def pieces_of_lines(look: Look, calibration: Calibration) -> list[FloatArray]:
+    """The pieces (N, 2) of solid lines in a look, pinhole px; dashes are among its quadrilaterals."""
+    pieces = [lane.points_px for lane in look.lanes if lane.kind == LANE_LINE and len(lane.points_px) > 1]
+    return [undistort_points(calibration.info, points_px) for points_px in pieces]
+
+
+class Hull(NamedTuple):
+    """The outline of a symbol or area in an image, of which nothing is hidden."""
+
+    kind: str
+    points_px: FloatArray  # (N, 2) pinhole px
+
+
+def hulls_of_areas(look: Look, calibration: Calibration) -> list[Hull]:
+    """The symbols and areas of a look that it shows whole.
+
+    A crosswalk is left out: nobody knows how many of its bars an image lacks, and each bar is a marking.
+    """
+    outlined = [marking for marking in look.markings if len(marking.outline_px) and marking.kind != CROSSWALK]
+    return [
+        Hull(marking.kind, undistort_points(calibration.info, marking.outline_px))
+        for marking in outlined
+        if len(marking.outline_seen) and marking.outline_seen.all()
+    ]
+
+
 class Expected(NamedTuple):
     """Markings (M) as a camera should see them at a belief's mean."""
 
@@ -88,16 +132,37 @@ class Expected(NamedTuple):
     by_place: FloatArray  # (M, 4, 2, 2) by each corner's place in the map
 
 
+class ExpectedPoints(NamedTuple):
+    """Points (..., 3) of the map as a camera should see them at a belief's mean."""
+
+    px: FloatArray  # (..., 2) pinhole px, nan behind the camera
+    depth_m: FloatArray  # (...)
+    by_vehicle: FloatArray  # (..., 2, 10)
+    by_camera: FloatArray  # (..., 2, 6)
+    by_place: FloatArray  # (..., 2, 2) by the point's place in the map
+
+
 def expect(
     belief: Belief, plane: Plane, camera: int, calibration: Calibration, corners_map: FloatArray
 ) -> Expected:
     """Where corners (M, 4, 3) should be in an image of a camera, and the derivatives."""
+    points = expect_points(belief, plane, camera, calibration, corners_map)
+    count = len(corners_map)
+    by_vehicle = points.by_vehicle.reshape(count, 8, VEHICLE)
+    by_camera = points.by_camera.reshape(count, 8, CAMERA)
+    return Expected(points.px, points.depth_m, by_vehicle, by_camera, points.by_place)
+
+
+def expect_points(
+    belief: Belief, plane: Plane, camera: int, calibration: Calibration, points_map: FloatArray
+) -> ExpectedPoints:
+    """Where points (..., 3) of the map should be in an image of a camera, and the derivatives."""
     pose = belief.map_from_vehicle(plane)
     begin = VEHICLE + CAMERA * camera
     cam_from_vehicle = exp(belief.mean[begin : begin + CAMERA]) @ calibration.cam_from_vehicle
     rotation = pose[:3, :3]
     turn = cam_from_vehicle[:3, :3]
-    vehicle = (corners_map - pose[:3, 3]) @ rotation
+    vehicle = (points_map - pose[:3, 3]) @ rotation
     cam = vehicle @ turn.T + cam_from_vehicle[:3, 3]
     depth_m = cam[..., 2]
     intrinsic = calibration.info.intrinsic
@@ -117,14 +182,7 @@ def expect(
         for state in states:
             by_vehicle[..., state] = slope
     by_camera = np.concatenate([by_cam, by_cam @ -hat(cam)], axis=-1)
-    count = len(corners_map)
-    return Expected(
-        px,
-        depth_m,
-        by_vehicle.reshape(count, 8, VEHICLE),
-        by_camera.reshape(count, 8, CAMERA),
-        by_map[..., :2],
-    )
+    return ExpectedPoints(px, depth_m, by_vehicle, by_camera, by_map[..., :2])
 
 
 def ground_points(

@@ -16,7 +16,7 @@ from v2hdm.localization.antenna import Fix
 from v2hdm.localization.localizer import Pose
 from v2hdm.localization.motion import Motion
 from v2hdm.localization.seeing import Look
-from v2hdm.records import FloatArray, GeodeticOrigin, MarkingDetection
+from v2hdm.records import FloatArray, GeodeticOrigin, LaneDetection, MarkingDetection
 
 _MOTION = ("stamp_s", "speed_m_s", "yaw_rate_rad_s")
 _LOCAL = ("stamp_s", "east_m", "north_m", "sigma_m")
@@ -96,7 +96,13 @@ def _positive(value: float, at: str) -> float:
 
 def look_of(record: Mapping[str, Any], camera: str) -> Look:
     """The detections of one line of ``v2hdm detect``."""
-    return Look(camera, float(record["stamp_s"]), tuple(map(_marking, record["markings"])))
+    markings = tuple(map(_marking, record["markings"]))
+    return Look(camera, float(record["stamp_s"]), markings, tuple(map(_lane, record["lanes"])))
+
+
+def _lane(record: Mapping[str, Any]) -> LaneDetection:
+    points_px = np.array(record["points_px"], dtype=np.float64).reshape(-1, 2)
+    return LaneDetection(record["class"], record["score"], points_px, record.get("identity"))
 
 
 def _marking(record: Mapping[str, Any]) -> MarkingDetection:
@@ -104,7 +110,10 @@ def _marking(record: Mapping[str, Any]) -> MarkingDetection:
     if "corners_px" not in record:
         nothing = np.full((4, 2), np.nan)
         silent = np.full((8, 8), np.nan)
-        return MarkingDetection(record["class"], record["score"], nothing, silent, np.zeros(4, bool), outline)
+        is_seen = np.array(record.get("outline_seen", []), dtype=bool)
+        return MarkingDetection(
+            record["class"], record["score"], nothing, silent, np.zeros(4, bool), outline, is_seen
+        )
     return MarkingDetection(
         record["class"],
         record["score"],
@@ -140,6 +149,8 @@ def pose_record(pose: Pose) -> dict[str, Any]:
     }  # fmt: skip
     record["speed_scale"], record["yaw_bias_rad_s"] = (round(value, 6) for value in pose.motion)
     record["matched"] = pose.matched
+    record["matched_lines"] = pose.matched_lines
+    record["matched_areas"] = pose.matched_areas
     record["reasons"] = list(pose.reasons)
     record["turned"] = [
         {

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from v2hdm.association.ground import views_of
 from v2hdm.association.sightings import frames_of
 from v2hdm.errors import ConfigError
 from v2hdm.faults import table
+from v2hdm.io.maps.corrections import Heard
 from v2hdm.io.maps.evidence import Residuals
 from v2hdm.io.maps.features import with_heights
 from v2hdm.lanes.knots import draw_lanes
@@ -23,6 +25,7 @@ from v2hdm.lanes.points import ground_by_rig
 from v2hdm.mapping.alone import map_alone
 from v2hdm.mapping.bundle import Bundle, without_corner
 from v2hdm.mapping.conclusion import Optimised
+from v2hdm.mapping.ground_evidence import off_ground
 from v2hdm.mapping.inputs import Inputs
 from v2hdm.mapping.optimise import silent
 from v2hdm.mapping.options import MappingOptions, SurveyOptions, check_options
@@ -37,6 +40,7 @@ from v2hdm.records import (
     Image,
     ImageDetections,
     IntArray,
+    Lane,
     Marking,
     Symbol,
 )
@@ -225,6 +229,36 @@ def _symbols(inputs: Inputs, optimised: Optimised) -> tuple[tuple[Symbol, ...], 
     return mapped, excluded
 
 
+class _DrawnMap(NamedTuple):
+    hd_map: HDMap
+    excluded: tuple[Exclusion, ...]  # symbols that are too doubtful, or that a person rejected
+    heard: tuple[Heard, ...]  # what the map follows of a person's corrections
+    has_additions: bool  # whether a person added markings
+
+
+def _drawn_map(inputs: Inputs, optimised: Optimised, lanes: tuple[Lane, ...]) -> _DrawnMap:
+    """The adjusted markings with lanes, symbols, heights and a person's corrections."""
+    drive = inputs.drive
+    corrections = inputs.options.acceptance.corrections
+    surface = inputs.optimiser.surface
+    symbols, no_symbols = _symbols(inputs, optimised)
+    added, heard_of_paint = added_markings(corrections, optimised.markings)
+    markings = (*optimised.markings, *added)
+    hd_map = HDMap(markings, lanes, drive.origin, symbols, drive.pose_noise.position_drift_over_m)
+    if surface is not None:
+        # A spline already contains the recorded heights.
+        hd_map = with_heights(hd_map, None, surface.height_m)
+        hd_map = replace(hd_map, ground=surface.strips())
+    hd_map, rejected = with_symbols_corrected(hd_map, corrections)
+    hd_map, heard_of_lines = with_lines_corrected(hd_map, corrections)
+    return _DrawnMap(
+        hd_map=hd_map,
+        excluded=(*no_symbols, *rejected),
+        heard=(*heard_of_paint, *heard_of_lines),
+        has_additions=bool(added),
+    )
+
+
 def optimised_result(
     outcome: Outcome, optimised: Optimised, *, with_lanes: bool = True, with_alone: bool = True
 ) -> MethodResult:
@@ -238,7 +272,6 @@ def optimised_result(
     cameras = inputs.cameras
     bundle = optimised.bundle
     solution = bundle.solution
-    noise = drive.pose_noise
     if solution.status is not Status.CONVERGED:
         status = solution.status
         _log.warning("the joint optimisation ended early (%s): %s", status.value, status.advice)
@@ -251,22 +284,13 @@ def optimised_result(
         lanes = inputs.find_lanes(ground_by_rig(drive, cameras, bundle.rig, surface))
     else:
         lanes = ()
-    symbols, no_symbols = _symbols(inputs, optimised)
-    added, heard = added_markings(options.acceptance.corrections, optimised.markings)
-    markings = (*optimised.markings, *added)
-    hd_map = HDMap(markings, lanes, drive.origin, symbols, noise.position_drift_over_m)
-    if surface is not None:
-        # A spline already contains the recorded heights.
-        hd_map = with_heights(hd_map, None, surface.height_m)
-        hd_map = replace(hd_map, ground=surface.strips())
-    hd_map, rejected = with_symbols_corrected(hd_map, options.acceptance.corrections)
-    hd_map, heard_of_lines = with_lines_corrected(hd_map, options.acceptance.corrections)
+    drawn = _drawn_map(inputs, optimised, lanes)
     return MethodResult(
         name=BEST,
         cameras=tuple(cameras),
-        hd_map=hd_map,
+        hd_map=drawn.hd_map,
         calibrations=optimised.calibrations,
-        excluded=(*optimised.excluded, *no_symbols, *rejected),
+        excluded=(*optimised.excluded, *drawn.excluded),
         reprojection_rmse_px=optimised.reprojection_rmse_px,
         initial_reprojection_rmse_px=optimised.initial_reprojection_rmse_px,
         diagnostics={
@@ -282,13 +306,14 @@ def optimised_result(
         poses=adjusted_poses(outcome),
         clocks=clock_offsets(outcome),
         # The adjustment knows nothing of what a person added.
-        joint_covariance=partial(stated_covariance, markings)
-        if added
+        joint_covariance=partial(stated_covariance, drawn.hd_map.markings)
+        if drawn.has_additions
         else partial(joint_covariance, optimised),
         residuals=residuals_of(outcome, optimised),
         suspicions=optimised.suspicions,
-        heard=(*optimised.heard, *heard, *heard_of_lines),
+        heard=(*optimised.heard, *drawn.heard),
         surface=surface,
+        off_ground=off_ground(bundle),
         alone=map_alone(outcome, optimised) if with_alone else {},
     )
 

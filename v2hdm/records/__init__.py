@@ -13,6 +13,7 @@ from v2hdm.records.cameras import (
     CameraInfo,
     CentrePrior,
     FrameStep,
+    GroundPlane,
 )
 from v2hdm.records.changes import Change, Changes, Fate
 from v2hdm.records.classes import (
@@ -48,7 +49,16 @@ from v2hdm.records.maps import (
     Reading,
     Symbol,
 )
-from v2hdm.records.poses import DRIFTS, GeodeticOrigin, PoseNoise, Reception, Road, Trajectory, largest_noise
+from v2hdm.records.poses import (
+    DRIFTS,
+    GeodeticOrigin,
+    PoseNoise,
+    Reception,
+    Road,
+    Trajectory,
+    largest_noise,
+    unstated_clock_drift_s,
+)
 from v2hdm.records.truth import Truth
 from v2hdm.records.units import (
     BEST,
@@ -105,6 +115,7 @@ __all__ = [
     "FloatArray",
     "FrameStep",
     "GeodeticOrigin",
+    "GroundPlane",
     "GroundStrip",
     "HDMap",
     "Image",
@@ -125,4 +136,5 @@ __all__ = [
     "Trajectory",
     "Truth",
     "largest_noise",
+    "unstated_clock_drift_s",
 ]

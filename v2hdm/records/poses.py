@@ -6,6 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
+import numpy as np
+
 from v2hdm.records.arrays import FloatArray
 
 
@@ -67,6 +69,28 @@ class PoseNoise:
         return replace(noise, **drifts, **{key: clocks[key] for key in clocks if key not in stated})
 
 
+def unstated_clock_drift_s(stamp_s: Sequence[FloatArray]) -> float:
+    """Standard deviation, s, of the drift of clocks that nobody states, by the stamps (N,) of each camera.
+
+    Even stamps may have been counted at a camera's nominal rate. Uneven ones were read from a clock, which a
+    computer never lets drift by as much.
+    """
+    return max((_drift_of(stamps) for stamps in stamp_s if len(stamps)), default=_UNSTATED_CLOCK_DRIFT_S)
+
+
+def _drift_of(stamp_s: FloatArray) -> float:
+    """The same of one camera; stamps without at least two intervals tell nothing."""
+    intervals_s = np.diff(stamp_s)
+    if len(intervals_s) < 2:
+        return _UNSTATED_CLOCK_DRIFT_S
+    # Images that a recorder dropped leave whole multiples.
+    usual_s = float(np.median(intervals_s))
+    uneven_s = np.abs(intervals_s - usual_s * np.round(intervals_s / max(usual_s, 1e-9)))
+    if np.quantile(uneven_s, 1 - _UNEVEN_SHARE) <= _UNEVEN_S:
+        return _UNSTATED_CLOCK_DRIFT_S
+    return min(_MOST_SLEWED * float(stamp_s[-1] - stamp_s[0]), _UNSTATED_CLOCK_DRIFT_S)
+
+
 def largest_noise(noises: Sequence[PoseNoise]) -> PoseNoise:
     """The largest of each standard deviation, and of each distance over which a drift fades."""
     names = [field.name for field in fields(PoseNoise)]
@@ -95,6 +119,13 @@ receiver: exposure, read-out and transfer take 20 to 60 ms, and computers stamp 
 _UNSTATED_CLOCK_DRIFT_S = 0.05
 """Standard deviation, s, of its change over a drive where nothing synchronises them: that of stamps counted
 at the nominal rate of a camera, which is off by a few thousandths, over ten to twenty seconds."""
+
+_MOST_SLEWED = 5e-4
+"""Largest relative error of a computer's clock while it is led to the right time (RFC 5905, MAXFREQ); a
+quartz that nothing leads is off by a tenth of it."""
+
+_UNEVEN_S = 0.002  # departure of an interval, s, from multiples of the usual one that no rounding to ms makes
+_UNEVEN_SHARE = 0.1  # least share of such intervals among those of stamps that were read from a clock
 
 
 @dataclass(frozen=True)

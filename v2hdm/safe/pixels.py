@@ -24,6 +24,7 @@ import numpy as np
 import simplejpeg
 
 from v2hdm.errors import DriveError, V2hdmError
+from v2hdm.safe.placeholders import placeholder_words
 from v2hdm.store.inputs import note_input
 
 _log = logging.getLogger(__name__)
@@ -197,6 +198,8 @@ def _checked(data: _Data, path: Path) -> Header:
     begin = data[:12]
     is_webp = begin[:4] == b"RIFF" and begin[8:] == b"WEBP"
     if not (is_webp or begin.startswith((_PNG, _JPEG, b"BM", *_TIFF))):
+        if words := placeholder_words(path):
+            raise DriveError(f"{path}: {words}")
         raise DriveError(f"{path}: not a PNG, JPEG, TIFF, BMP or WebP image; convert it, or drop it")
     try:
         header = _header(data)

@@ -20,6 +20,7 @@ import yaml
 
 from v2hdm.errors import MOST_DIGITS, V2hdmError
 from v2hdm.errors import shown as shown
+from v2hdm.safe.placeholders import words_of_content
 from v2hdm.store.inputs import note_input, warn_if_changed
 
 MOST_BYTES = 1 << 30  # of a text file; an hour of poses at 100 Hz is 30 MB
@@ -57,6 +58,8 @@ def read_bytes(path: Path, error: type[V2hdmError], most: int = MOST_BYTES) -> b
     except (OSError, ValueError) as failure:  # ValueError: a path with a zero byte
         reason = getattr(failure, "strerror", None) or failure
         raise error(f"{path}: cannot be read ({reason}); check the path and its permissions") from None
+    if words := words_of_content(data, path):
+        raise error(f"{path}: {words}")
     warn_if_changed(path, data)
     return data
 

@@ -23,6 +23,7 @@ from v2hdm.association.groups import SHAPE_TOLERANCE
 from v2hdm.geometry.planar import diameters
 from v2hdm.records import BoolArray, FloatArray
 from v2hdm.site.candidates import Candidates
+from v2hdm.site.lengths import Lost, lost_of
 from v2hdm.site.series import Series, in_series
 from v2hdm.site.shapes import SHAPE_SIGMA_M, Laid, PaintError, Shape, lay, learn_paint_error, parallelograms
 
@@ -50,6 +51,9 @@ _WORN_SHARE = 0.5  # sigma of a worn end relative to the marking's length: any p
 
 _SLANT_OF_END = 0.5  # sigma, relative to the width, of a corner of a dash's end that is cut at any angle
 _SLANT_OF_PIECE = 0.1  # sigma, relative to the width, of a corner of a marking's piece that is in view
+
+_ALONE_ASPECT = 2.0  # least length over width of a marking that may have lost an end without others telling
+_ANYWHERE_M = 100.0  # sigma, m, of an end that says nothing of where the paint ended: beyond any paint
 
 _RUN_ON_M = 1.0  # sigma, m, of an end that merges with other paint: about the length of letters
 
@@ -175,7 +179,8 @@ class Hypotheses:
     From the previous pass are their corners as ``believed``, the ``probability`` (N, K) and frequency
     ``share`` (K,) of each kind, and the errors of ``paint``. ``vague`` (N, 4) are log-likelihood ratios of a
     worn or hidden corner, from views that disagree on it, ``standing_odds`` (N, 4) of something that stands
-    beyond a side; ``series`` is the evidence of lines of dashes.
+    beyond a side; ``series`` is the evidence of lines of dashes. ``standard_m`` are the lengths to which such
+    markings are painted; empty where none is known.
     """
 
     candidates: Candidates
@@ -185,6 +190,7 @@ class Hypotheses:
     paint: PaintError
     vague: FloatArray
     standing_odds: FloatArray
+    standard_m: tuple[float, ...] = ()
     members: list[Hypothesis] = field(default_factory=list)
     series: Series | None = None
 
@@ -234,6 +240,8 @@ class Hypotheses:
         own_shape = lay(shapes[0].corners, SHAPE_SIGMA_M, candidates)[0] if shapes else own_shape
         any_size = SHAPE_SIGMA_M**2 * np.eye(8) + _OWN_SIZE
         self.add(Kind.OWN_SHAPE, 1.0, own_shape, any_size)
+        if self.standard_m and not shapes:
+            self._add_worn_alone(own_shape, self.members[-1])
         self._add_unlike(1 - _LIKE_CLASS if shapes else 1.0, own_shape, any_size, ragged)
 
     def _add_shape(self, shape: Shape, part: float) -> FloatArray:
@@ -247,10 +255,7 @@ class Hypotheses:
         self.add(Kind.OF_CLASS, part / 2, other_way_round, scatter)
         if shape.is_elongated:
             worn = _worn_evidence(self.candidates, [end.inwards for end in ends], self.weight)
-            at_end = np.stack([end.inwards.reshape(-1, 4, 2).any(axis=2) for end in ends])
-            worn = worn + np.sum(at_end * self.vague, axis=2) / 2
-            is_end = at_end & np.roll(at_end, -1, axis=2)
-            worn = worn + np.sum(is_end * self.standing_odds, axis=2)
+            worn = worn + self._of_views(ends)
             shorter = (ends[0].inwards + ends[1].inwards) / 2
             alike = alike + (_WORN_SHARE * sides_m.max()) ** 2 * _outer(shorter)
             self._add_lengths(part, laid, shape.sigma_m, shorter, ends, worn)
@@ -262,6 +267,40 @@ class Hypotheses:
         ragged = np.asarray(np.sum(np.logaddexp(worn, 0.0) - np.log(2), axis=0))
         self._add_unlike(part * _LIKE_CLASS, laid, alike, ragged)
         return ragged
+
+    def _of_views(self, ends: Sequence[_End]) -> FloatArray:
+        """Log-likelihood ratios (E, N) of worn or hidden ``ends``, by views and by what stands beyond."""
+        at_end = np.stack([end.inwards.reshape(-1, 4, 2).any(axis=2) for end in ends])
+        is_end = at_end & np.roll(at_end, -1, axis=2)
+        by_views = np.sum(at_end * self.vague, axis=2) / 2
+        return np.asarray(by_views + np.sum(is_end * self.standing_odds, axis=2))
+
+    def _add_worn_alone(self, laid: Laid, whole: Hypothesis) -> None:
+        """Add those of one end lost by a long marking, where the class has no shape that would tell.
+
+        ``laid`` is its own shape, ``whole`` the hypothesis that this is all of it. Of both, the lengths that
+        are painted say which is likelier (:mod:`v2hdm.site.lengths`); its own deviations say nothing.
+        """
+        ends = _inwards(laid.corners_map, elongated=True)
+        length_m = ends[0].limit_m[:, 0]
+        breadth_m = np.linalg.norm(np.roll(laid.corners_map, -1, axis=1) - laid.corners_map, axis=2).min(1)
+        is_long = self.candidates.known.all(axis=1) & (length_m >= _ALONE_ASPECT * breadth_m)
+        longer = (ends[0].inwards + ends[1].inwards) / 2
+        sigma_m = np.where(is_long, np.sqrt(self.candidates.along(longer, longer)), np.inf)
+        lost: Lost = lost_of(self.standard_m, length_m, sigma_m)
+        # Without a shape of the class, a marking of its own shape is what one of the class's would be.
+        sound = self.share[[Kind.OF_CLASS, Kind.OTHER_LENGTH, Kind.OWN_SHAPE]].sum()
+        part = self.share[Kind.OWN_SHAPE] / sound / len(ends)
+        for end, by_views in zip(ends, self._of_views(ends), strict=True):
+            gone = (lost.mean_m[:, None] * end.inwards).reshape(-1, 4, 2)
+            scatter = SHAPE_SIGMA_M**2 * np.eye(8) + lost.variance_m2[:, None, None] * _outer(end.inwards)
+            anywhere = _outer(_ANYWHERE_M * end.inwards)
+            longer_shape = replace(laid, corners_map=laid.corners_map - gone)
+            self.add(Kind.WRONG_END, part, longer_shape, scatter, anywhere)
+            worn = self.members[-1]
+            odds = np.where(is_long, lost.log_odds + by_views, -np.inf)
+            beside = whole.log_likelihood - worn.log_likelihood + odds
+            self.members[-1] = replace(worn, beside=beside)
 
     def _add_lengths(
         self,

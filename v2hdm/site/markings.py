@@ -27,6 +27,7 @@ from v2hdm.site.candidates import (
 )
 from v2hdm.site.corrections import MAX_OVERLAP, Stated, heard_of, overlap
 from v2hdm.site.hypotheses import Kind
+from v2hdm.site.lengths import STANDARD_M
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.parallax import Parallax
 from v2hdm.site.posterior import CORNERS_OF_IMAGE, Posterior, posterior
@@ -118,7 +119,8 @@ def classify(
     that they lie on the ground, ``standing`` looks for what stands beyond ends.
     """
     known_corners = np.where(solved.known[..., None], solved.corners_map, np.nan)
-    uncorrected = posterior(solved, kind, counted(known_corners))
+    standard_m = {index: STANDARD_M[name] for index, name in enumerate(kinds) if name in STANDARD_M}
+    uncorrected = posterior(solved, kind, counted(known_corners), None, standard_m)
     names = [kinds[index] for index in kind]
     number = kind.copy()
     stated = Stated.of(options.corrections, uncorrected.candidates.corners_map, names)
@@ -133,7 +135,7 @@ def classify(
     standing_odds = None
     if standing is not None:
         standing_odds = standing(solved.corners_map, _known_ends(solved, uncorrected))
-    judged = posterior(solved, number, counts, standing_odds)
+    judged = posterior(solved, number, counts, standing_odds, standard_m)
     judged = replace(judged, candidates=stated.placed(judged.candidates, uncorrected.candidates))
     judged.log_odds[list(stated.confirmed)] = np.inf
     least = np.log(options.min_probability / (1 - options.min_probability))

@@ -10,6 +10,7 @@ maximisation with a Dirichlet prior).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -71,12 +72,18 @@ class Posterior:
 
 
 def posterior(
-    candidates: Candidates, kind: IntArray, counts: Counts, standing_odds: FloatArray | None = None
+    candidates: Candidates,
+    kind: IntArray,
+    counts: Counts,
+    standing_odds: FloatArray | None = None,
+    standard_m: Mapping[int, tuple[float, ...]] | None = None,
 ) -> Posterior:
     """Posterior of G candidates of classes ``kind`` (G,), given their positions and counts.
 
-    ``standing_odds`` (G, 4) are log-likelihood ratios that something stands beyond a side and hides the rest.
+    ``standing_odds`` (G, 4) are log-likelihood ratios that something stands beyond a side and hides the rest,
+    ``standard_m`` the lengths to which markings of a class are painted.
     """
+    standards = standard_m or {}
     total = len(candidates)
     odds = np.zeros((total, 4)) if standing_odds is None else standing_odds
     probability = np.zeros((total, len(Kind)))
@@ -88,7 +95,8 @@ def posterior(
     covariance = candidates.covariance_m2.copy()
     for class_index in np.unique(kind):
         members = np.flatnonzero(kind == class_index)
-        of_class = _of_class(candidates.subset(members), counts.subset(members), odds[members])
+        lengths_m = standards.get(int(class_index), ())
+        of_class = _of_class(candidates.subset(members), counts.subset(members), odds[members], lengths_m)
         probability[members] = of_class.probability
         log_odds[members] = of_class.log_odds
         evidence[members] = of_class.evidence
@@ -99,7 +107,9 @@ def posterior(
     return Posterior(probability, log_odds, Candidates(corners, covariance), evidence, misfit, deformed)
 
 
-def _of_class(candidates: Candidates, counts: Counts, standing_odds: FloatArray) -> Posterior:
+def _of_class(
+    candidates: Candidates, counts: Counts, standing_odds: FloatArray, standard_m: tuple[float, ...]
+) -> Posterior:
     """Posterior of the candidates of one class, which jointly determine its markings' distribution."""
     share = _PRIOR_COUNT / _PRIOR_COUNT.sum()
     paint = learn_paint_error([], [])
@@ -111,7 +121,7 @@ def _of_class(candidates: Candidates, counts: Counts, standing_odds: FloatArray)
     for number in range(1, _PASSES + 1):
         weight = probability[:, : Kind.PART_OF_SYMBOL].sum(axis=1)
         vague = _vague_evidence(counts, weight)
-        space = Hypotheses(candidates, believed, probability, share, paint, vague, standing_odds)
+        space = Hypotheses(candidates, believed, probability, share, paint, vague, standing_odds, standard_m)
         shapes = learn_shapes(candidates.subset(_examples(weight, standing_odds)))
         space.add_all(shapes)
         by_kind = np.array([hypothesis.kind for hypothesis in space.members])

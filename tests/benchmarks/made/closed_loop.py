@@ -112,7 +112,7 @@ def rendered_eyes(site: Site, calibrations: Mapping[str, Calibration], rng: np.r
         image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
         assert image is not None
         road = roads[camera].detect(image)
-        return Look(camera, van.stamp_s, tuple(marking.image for marking in road.markings))
+        return Look.of(camera, van.stamp_s, road)
 
     return see
 

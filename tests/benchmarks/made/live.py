@@ -10,24 +10,26 @@ from omegaconf import OmegaConf
 
 from tests.benchmarks.made.detect import _in_image
 from tests.benchmarks.made.draw import DetectorErrors, Recipe, _log_uniform, draw
+from tests.benchmarks.made.lines import mapped_line, pieces_in_image
 from tests.benchmarks.made.world import World, make, poses_of, smooth_noise
 from v2hdm.cli.compose import conf_dir
 from v2hdm.geometry.rigid import exp
 from v2hdm.localization.motion import Motion
 from v2hdm.localization.seeing import Look
-from v2hdm.records import Calibration, CameraInfo, FloatArray, HDMap, Marking
+from v2hdm.records import Calibration, CameraInfo, FloatArray, HDMap, Lane, Marking
 from v2hdm.simulate.port.config import PortConfig
 
 RATE_HZ = 10.0
 ODOMETRY_HZ = 50.0
 
-_MAP, _DRIVE, _MOVED = 71, 72, 73  # streams of a seed
+_MAP, _DRIVE, _MOVED, _LINES = 71, 72, 73, 74  # streams of a seed
 _DRIFT_M, _RELATIVE_M, _CORNER_M = (
     0.008,
     0.004,
     0.004,
 )  # sigma of a map's errors: shared, of a centre, of a corner
 _DRIFT_OVER_M = 30.0
+_KNOT = 8  # vertices of a lane between those at which the drift is drawn
 _MOUNT_M, _MOUNT_RAD = 0.005, np.deg2rad(0.03)  # sigma of a calibration's errors
 _SCALE, _BIAS_RAD_S = 0.01, np.deg2rad(0.01)  # sigma of an odometry's errors
 _SPEED_M_SQRT_S, _YAW_RAD_SQRT_S = 0.01, 2e-4  # and their noise
@@ -78,7 +80,33 @@ def surveyed(true: HDMap, heights_m: FloatArray, seed: int) -> HDMap:
         Marking(own.kind, corners[j], 20, shared, relative_m, heights_m[j], id=j + 1)
         for j, own in enumerate(true.markings)
     )
-    return HDMap(markings, true.lanes, true.origin, drift_over_m=_DRIFT_OVER_M)
+    lanes = _mapped_lanes(true, centres, drift, seed)
+    return HDMap(markings, lanes, true.origin, drift_over_m=_DRIFT_OVER_M)
+
+
+def _mapped_lanes(true: HDMap, centres: FloatArray, drift_map: FloatArray, seed: int) -> tuple[Lane, ...]:
+    """The lanes of a true map with the drift (J, 2) that it has at ``centres`` (J, 2), and their errors."""
+    rng = np.random.default_rng([seed, _LINES])
+    knots = np.concatenate([lane.points_map[::_KNOT] for lane in true.lanes])
+
+    def alike(first: FloatArray, second: FloatArray) -> FloatArray:
+        apart_m = np.linalg.norm(first[:, None] - second[None], axis=2)
+        return np.asarray(np.exp(-apart_m / _DRIFT_OVER_M))
+
+    # The drift at the lanes' knots, given that of the markings.
+    gain = np.linalg.solve(alike(centres, centres) + 1e-9 * np.eye(len(centres)), alike(centres, knots)).T
+    left = alike(knots, knots) - gain @ alike(centres, knots) + 1e-9 * np.eye(len(knots))
+    at_knots = gain @ drift_map
+    at_knots += _DRIFT_M * np.linalg.cholesky(left) @ rng.standard_normal((len(knots), 2))
+    lanes = []
+    for lane in true.lanes:
+        count = len(lane.points_map)
+        of_lane = at_knots[: len(range(0, count, _KNOT))]
+        at_knots = at_knots[len(of_lane) :]
+        rows = np.arange(0, count, _KNOT)
+        drift = np.column_stack([np.interp(np.arange(count), rows, axis) for axis in of_lane.T])
+        lanes.append(mapped_line(lane, drift, _DRIFT_M, rng))
+    return tuple(lanes)
 
 
 def calibrated(
@@ -168,7 +196,9 @@ def looks_of(world: World, seed: int, frames: Sequence[int] | None = None) -> It
         for number, name in enumerate(names):
             rng = np.random.default_rng([seed, _DRIVE, number, frame])
             markings, _ = _in_image(world, name, frame, rng)
-            moment.append(Look(name, float(world.taken_s[frame]), tuple(markings)))
+            lines_rng = np.random.default_rng([seed, _LINES, number, frame])
+            lanes = pieces_in_image(world, name, frame, seed, lines_rng)
+            moment.append(Look(name, float(world.taken_s[frame]), tuple(markings), lanes))
         yield moment
 
 

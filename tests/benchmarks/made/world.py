@@ -15,7 +15,17 @@ from tests.benchmarks.made.draw import Recipe
 from v2hdm.geometry.rigid import exp, interpolate, rotation_from_euler
 from v2hdm.geometry.twists import vehicle_twists
 from v2hdm.io.drive.road import lay_flat
-from v2hdm.records import Camera, CameraInfo, Drive, FloatArray, Image, PoseNoise, Trajectory, Truth
+from v2hdm.records import (
+    Camera,
+    CameraInfo,
+    Drive,
+    FloatArray,
+    Image,
+    PoseNoise,
+    Trajectory,
+    Truth,
+    unstated_clock_drift_s,
+)
 from v2hdm.simulate.port.build import Port, build_port
 from v2hdm.simulate.port.route import Route, correlated_noise
 
@@ -264,12 +274,20 @@ def drive_of(world: World) -> Drive:
         root=root,
         cameras=world.cameras,
         images=tuple(sorted(images, key=lambda image: (image.stamp_s, image.camera))),
-        pose_noise=world.pose_noise,
+        pose_noise=_noise_as_read(world),
         unposed=unposed,
         trajectory=laid.trajectory,
         recorded=world.recorded,
         road=laid.road,
     )
+
+
+def _noise_as_read(world: World) -> PoseNoise:
+    """The stated noise, with the drift of unstated clocks as the stamps show it."""
+    if world.recipe.clock_s is not None:
+        return world.pose_noise
+    stamp_s = [stamps[np.isfinite(stamps)] for stamps in world.stamp_s.values()]
+    return replace(world.pose_noise, clock_drift_s=unstated_clock_drift_s(stamp_s))
 
 
 def truth_of(world: World, drive: Drive, visibility: FloatArray) -> Truth:

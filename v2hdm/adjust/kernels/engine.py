@@ -211,31 +211,10 @@ class KernelEngine(TorchEngine):
         clock = _by_pair(spread.clock)
         width = system.tip
         pairs = arrays.pair_count
-        touched = len(layout.touched)
         chunks = len(layout.chunk) - 1
-        owners = touched if system.by_pair else chunks * arrays.camera_count
-        joined = np.diff(layout.unit)
-        states = bool(arrays.states)
-        base = Base(
-            table=_table(self.poses(estimate)),
-            corners=_rows(estimate.corners_map),
-            code=LOSS_CODES[robust.name],
-            scale=float(robust.scale),
-            lower=np.empty((3, arrays.corner_count)),
-            joint=np.empty(int(4 * np.square(joined[joined > 1]).sum())),
-            rows=np.empty((0 if states else 2 * arrays.corner_count, width)),
-        )
-        out = linearise.Linearisation(
-            costs=np.zeros((chunks, 3)),
-            wrench=np.zeros((touched, 6)),
-            coupled=np.zeros((touched if states else 0, 6)),
-            carried=np.zeros((chunks, width)),
-            whitened=np.empty(2 * arrays.corner_count),
-            squares=np.zeros((owners, 21)),
-            tip=np.zeros((chunks, width, width)),
-            failed=np.zeros(chunks),
-        )
+        base = self._base(estimate, robust, width)
         by_pair = system.by_pair
+        out = self._linearisation(width, by_pair)
 
         def work(begin: int, end: int) -> None:
             room = Scratch.of(layout, pairs, width)
@@ -249,7 +228,7 @@ class KernelEngine(TorchEngine):
         system.add(_symmetric(torch.from_numpy(of_pairs), arrays.camera_count), tip + tip.tril(-1).mT)
         if len(system.plan.kept_corners):
             self._keep(system, base)
-        if states:
+        if arrays.states:
             self._subtract_frames(base, system)
         terms, gradient = with_priors(arrays, estimate, spread, out.costs.sum(0), self.pairs(out.wrench))
         return KernelLinearised(
@@ -264,6 +243,37 @@ class KernelEngine(TorchEngine):
             coupled=self.coupled(out.coupled, out.carried, spread),
             couplings=gradient.extrinsic.new_empty(2, 6, 0),
             base=base,
+        )
+
+    def _base(self, estimate: Estimate, robust: Loss, width: int) -> Base:
+        """The estimate as kernels read it, with room for factors; all cameras have ``width`` unknowns."""
+        arrays = self.arrays
+        joined = np.diff(self.layout.unit)
+        carried_rows = 0 if arrays.states else 2 * arrays.corner_count
+        return Base(
+            table=_table(self.poses(estimate)),
+            corners=_rows(estimate.corners_map),
+            code=LOSS_CODES[robust.name],
+            scale=float(robust.scale),
+            lower=np.empty((3, arrays.corner_count)),
+            joint=np.empty(int(4 * np.square(joined[joined > 1]).sum())),
+            rows=np.empty((carried_rows, width)),
+        )
+
+    def _linearisation(self, width: int, by_pair: bool) -> linearise.Linearisation:
+        """Zeroed sums of the chunks; ``by_pair`` keeps squares of each touched pair, else of each camera."""
+        arrays = self.arrays
+        touched = len(self.layout.touched)
+        chunks = len(self.layout.chunk) - 1
+        return linearise.Linearisation(
+            costs=np.zeros((chunks, 3)),
+            wrench=np.zeros((touched, 6)),
+            coupled=np.zeros((touched if arrays.states else 0, 6)),
+            carried=np.zeros((chunks, width)),
+            whitened=np.empty(2 * arrays.corner_count),
+            squares=np.zeros((touched if by_pair else chunks * arrays.camera_count, 21)),
+            tip=np.zeros((chunks, width, width)),
+            failed=np.zeros(chunks),
         )
 
     def _keep(self, system: ReducedSystem, base: Base) -> None:

@@ -1,10 +1,10 @@
 """``join_parts``: a problem too large for one solve, part by part, to the same optimum and covariances.
 
-Each part is solved by itself at first. Then rounds follow: every part summarises what it says of its border
-(:mod:`v2hdm.adjust.sections.summary`), the summaries are joined (:mod:`v2hdm.adjust.sections.join`), and each
-part follows the border. This is a Gauss-Newton descent of the whole in which no process ever holds more than
-one part; parts are jobs of an executor, and their estimates lie in files between rounds. ``finish_parts``
-makes of each part what needs its covariances.
+Each part is roughly solved by itself at first. Then rounds follow: every part summarises what it says of its
+border (:mod:`v2hdm.adjust.sections.summary`), the summaries are joined (:mod:`v2hdm.adjust.sections.join`),
+and each part follows the border. This is a Gauss-Newton descent of the whole in which no process ever holds
+more than one part; parts are jobs of an executor, and their estimates lie in files between rounds.
+``finish_parts`` makes of each part what needs its covariances.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ from v2hdm.records import FloatArray
 GAP = 1e-8
 """Twice the predicted decrease of the cost, as a fraction of it, at which the rounds end."""
 
+_ALONE_GAP = 1e-5  # gap, a fraction of the cost, of a part's own optimum: the rounds move it by more; chosen
 _MOST_ROUNDS = 15  # rounds of joining and following, after which the solve has not converged; chosen
 _HELD_SIGMA_M = 1.0  # standard deviation, m, of what holds border corners in a part: any ray tells more
 _CONTRADICTION = 9.0
@@ -102,7 +103,7 @@ class _Open(NamedTuple):
 
 @dataclass(frozen=True)
 class _Job:
-    """One round of one part; ``target`` is the value that its border moves to, None for its own optimum."""
+    """One round of one part; ``target`` is the value that its border moves to, None for the first round."""
 
     number: int
     target: Values | None = None
@@ -155,16 +156,15 @@ class _Work:
     def _round(self, job: _Job, part: Part) -> PartStates:
         """The part's own optimum, or what follows the target, and what the part tells there."""
         opened = self._open(part)
-        engine = opened.engine
         border = opened.border
-        robust = self._robust
         if job.target is None:
-            estimate = self._own_optimum(job.number, part, engine, robust)
+            estimate = self._own_optimum(job.number, part, opened.engine, self._robust)
         else:
             estimate = self._followed(job, opened)
         self._keep(job.number, estimate)
-        told = summarise(_whitened(engine, estimate, robust), border, opened.held, opened.held_map)
-        labels = labels_of(part, engine.arrays.corner_order.cpu().numpy(), border.corners.cpu().numpy())
+        told = summarise(self._whitened(opened.engine, estimate), border, opened.held, opened.held_map)
+        order = opened.engine.arrays.corner_order.cpu().numpy()
+        labels = labels_of(part, order, border.corners.cpu().numpy())
         return PartStates(labels, Values.of(estimate, border), told)
 
     @property
@@ -175,7 +175,7 @@ class _Work:
         options = self.shape.options
         start = start_of(part.problem, self.shape.origin_map, engine, robust, options)
         descent = descend(
-            engine, start.estimate, robust, options.gap_tolerance, options.max_refreshes,
+            engine, start.estimate, robust, _ALONE_GAP, options.max_refreshes,
             options.max_evaluations, start.opening,
         )  # fmt: skip
         if descent.is_singular:
@@ -199,8 +199,11 @@ class _Work:
     def _followed(self, job: _Job, opened: _Open) -> Estimate:
         """The estimate of the round before, moved with the border to its target."""
         assert job.target is not None
-        before = _whitened(opened.engine, self._estimate(job.number), self._robust)
+        before = self._whitened(opened.engine, self._estimate(job.number))
         return follow(before, opened.border, job.target)
+
+    def _whitened(self, engine: TorchEngine, estimate: Estimate) -> Whitening:
+        return factorise(engine, engine.plan(), estimate, self._robust)
 
     def _finished(self, job: _Job, part: Part) -> Any:
         """What is made of the solution; it moves to the target once more if the job has one."""
@@ -234,10 +237,6 @@ class _Work:
         return self.finish(job.number, part, solution)
 
 
-def _whitened(engine: TorchEngine, estimate: Estimate, robust: Loss) -> Whitening:
-    return factorise(engine, engine.plan(), estimate, robust)
-
-
 def border_of(part: Part, engine: TorchEngine) -> Border:
     """The border of a part in the order of its arrays."""
     rank = torch.argsort(engine.arrays.corner_order)
@@ -267,14 +266,11 @@ def join_parts(
     finish: Finish,
     executor: Executor = HERE,
     progress: Callable[[int, int], None] | None = None,
-    gap_tolerance: float = GAP,
-    *,
-    with_covariances: bool = True,
 ) -> Joint:
     """Solve the ``count`` parts in ``folder`` together, and ``finish`` each without covariances.
 
-    Those of their borders are left in files for :func:`finish_parts`, if asked for. ``progress`` is called
-    with the number of the round and the most that there may be. Raises AdjustError where parts leave a
+    Those of their borders are left in files for :func:`finish_parts`. ``progress`` is called with the number
+    of the round and the most that there may be. Raises AdjustError where parts leave a
     direction free or contradict each other, WorkerError where a process died.
     """
     report = progress or (lambda done, total: None)
@@ -295,16 +291,15 @@ def join_parts(
         gap = (joined.decrease + sum(state.told.slack for state in states)) / max(sum(costs[-1]), 1.0)
         moved = _moved(net, shared, joined)
         targets = [_values(net, moved, state.labels, state.values) for state in states]
-        if number > 0 and gap <= gap_tolerance:
+        if number > 0 and gap <= GAP:
             break
         jobs = [_Job(part, target) for part, target in enumerate(targets)]
     last = [
         _Job(part, target, is_last=True, gap=gap, rounds=number + 1) for part, target in enumerate(targets)
     ]
     results = _side_by_side(executor, replace(work, finish=finish), last)
-    if with_covariances:
-        for part, covariance in enumerate(net.covariances(joined.factor)):
-            np.save(_covariance_file(folder, part), covariance)
+    for part, covariance in enumerate(net.covariances(joined.factor)):
+        np.save(_covariance_file(folder, part), covariance)
     return Joint(results, net, joined.factor, gap, number + 1)
 
 

@@ -31,6 +31,7 @@ from v2hdm.records import (
     PoseNoise,
     Reception,
     Trajectory,
+    unstated_clock_drift_s,
 )
 from v2hdm.safe.fields import take_origin
 from v2hdm.safe.pixels import read_pixels
@@ -88,7 +89,7 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
         files.append(listed)
     near_s = _middle_of(files)
     recorded = read_poses(poses, path, origin, options.max_gap_s, poses_at, read_topic, near_s)
-    pose_noise = _read_pose_noise(content.get("pose_noise"), recorded.noise, f"{where}: pose_noise")
+    pose_noise = _read_pose_noise(content.get("pose_noise"), recorded.noise, files, f"{where}: pose_noise")
     truth = None
     if content.get("truth") is not None:
         truth = path / take_text(content["truth"], f"{where}: truth", DriveError)
@@ -213,8 +214,10 @@ def _read_mask(entry: dict[str, Any], root: Path, info: CameraInfo, where: str) 
     return np.asarray(mask > 0)
 
 
-def _read_pose_noise(content: object, of_source: Mapping[str, float], where: str) -> PoseNoise:
-    """The noise as the drive states it, else as the source of its poses does."""
+def _read_pose_noise(
+    content: object, of_source: Mapping[str, float], files: Sequence[ImageFiles], where: str
+) -> PoseNoise:
+    """The noise as the drive states it, else as the source of its poses does, or the images' stamps show."""
     entry = {} if content is None else take_mapping(content, where, DriveError)
     check_keys(entry, (), [field.name for field in fields(PoseNoise)], where, DriveError)
     values = {key: take_number(value, f"{where}, {key}", DriveError) for key, value in entry.items()}
@@ -226,6 +229,8 @@ def _read_pose_noise(content: object, of_source: Mapping[str, float], where: str
     # A drift is part of its total: where the drive states one of both, the source's other one does not fit.
     replaced = {key for pair in DRIFTS.items() if set(pair) & set(values) for key in pair} | set(values)
     stated = {key: value for key, value in of_source.items() if key not in replaced}
+    if not {"clock_s", "clock_drift_s"} & {*stated, *values}:
+        stated["clock_drift_s"] = unstated_clock_drift_s([entry.stamp_s for entry in files])
     noise = PoseNoise.from_stated(**stated, **values)
     for total, drift in DRIFTS.items():
         if getattr(noise, drift) > getattr(noise, total):

@@ -2,7 +2,7 @@
 
 Geiger, Lenz, Stiller and Urtasun, Vision meets robotics: the KITTI dataset, IJRR 2013, section IV. The
 vehicle frame has its origin on the road under the IMU, which sits near the rear axle. The map is the local
-tangent plane at the first pose, with the road laid flat into z = 0. docs/kitti.md gives the reasons for what
+tangent plane at the first pose, with the road laid flat into z = 0. docs/real-streets.md states what
 the format leaves open.
 """
 

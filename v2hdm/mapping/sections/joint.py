@@ -24,7 +24,8 @@ _CONTRADICTION_SIGMAS = 6.0
 """Mean shift of a drive against others, in sigmas of its positions, from which it contradicts them; chosen: a
 receiver's slow errors average out over a network, to about one sigma along a single street."""
 
-_OF_CAMERAS = ("camera_centre", "clock_offsets")  # priors that every section has of the same cameras
+# Priors that every section has of the same cameras.
+_OF_CAMERAS = ("camera_centre", "ground_planes", "clock_offsets")
 
 
 @dataclass(frozen=True)
@@ -41,20 +42,27 @@ class Told:
     mahalanobis2: FloatArray  # (K,)
 
 
-class Fit(NamedTuple):
-    """How K observations of a section fit a joint solve, for what all sections together tell."""
+class Judged(NamedTuple):
+    """How K observations of a section's own images, by ascending names, fit the section's own solve."""
 
-    mahalanobis2: FloatArray  # (K,)
+    squared: FloatArray  # (K,) Mahalanobis distances under the detector's stated variance
     corner: IntArray  # (K,) over the drive
-    freedom: FloatArray  # (K,) 2, or 1 of a corner that is known along one line
     is_behind: BoolArray  # (K,) the camera
-    of_priors: dict[str, float]  # their parts of the cost
     shift_m: FloatArray  # (S, 2) sum of how far the frames of each session moved from their recorded poses
     frames: IntArray  # (S,) number of these
 
 
+class Fit(NamedTuple):
+    """How K observations of a section fit the joint solve, for what all sections together tell."""
+
+    mahalanobis2: FloatArray  # (K,)
+    corner: IntArray  # (K,) over the drive
+    freedom: FloatArray  # (K,) 2, or 1 of a corner that is known along one line
+    of_priors: dict[str, float]  # their parts of the cost
+
+
 class Gate(NamedTuple):
-    """Which observations of a section, K in the order of its part, pass the joint solve's gate."""
+    """Which observations of a section's own images, K by ascending names, are no outliers."""
 
     is_accepted: BoolArray
     is_used: BoolArray  # accepted, of a corner with two such at least
@@ -62,31 +70,40 @@ class Gate(NamedTuple):
 
 def fit_of(part: Part, solution: Solution) -> Fit:
     """How the observations of a part fit."""
-    problem = part.problem
-    observations = problem.observations
-    frames = np.unique(observations.frame)
-    session = problem.session_of_frame[frames]
-    moved_m = (solution.map_from_vehicle - problem.map_from_vehicle)[frames, :2, 3]
-    shift_m = np.zeros((problem.session_count, 2))
-    np.add.at(shift_m, session, moved_m)
+    observations = part.problem.observations
     return Fit(
         mahalanobis2=solution.mahalanobis2,
         corner=part.corners[observations.corner],
         freedom=np.where(observations.on_line, 1.0, 2.0),
-        is_behind=np.asarray(solution.verdict == Verdict.BEHIND_CAMERA),
         of_priors={name: cost for name, cost in solution.cost_terms.items() if name != "observations"},
+    )
+
+
+def judged_of(section: Section, settled: Bundle, chosen: IntArray, corner: IntArray) -> Judged:
+    """How the observations ``chosen`` (K,) of a section's solve, of corners (K,), fit it."""
+    problem = settled.problem
+    solution = settled.solution
+    is_own = np.isin(settled.frames, section.own_frames)
+    session = problem.session_of_frame[is_own]
+    moved_m = (solution.map_from_vehicle - problem.map_from_vehicle)[is_own, :2, 3]
+    shift_m = np.zeros((problem.session_count, 2))
+    np.add.at(shift_m, session, moved_m)
+    return Judged(
+        squared=settled.model.variance_factor * solution.mahalanobis2[chosen],
+        corner=corner,
+        is_behind=np.asarray(solution.verdict[chosen] == Verdict.BEHIND_CAMERA),
         shift_m=shift_m,
         frames=np.bincount(session, minlength=problem.session_count),
     )
 
 
-def refuse_contradicting_drives(fits: Sequence[Fit], drive: Drive) -> None:
+def refuse_contradicting_drives(judged: Sequence[Judged], drive: Drive) -> None:
     """Raise AdjustError where the markings shift one drive of a network against the others.
 
     A shift of all drives shows in no marking; so the mean shift of each is compared with that of all others.
     """
-    frames = np.sum([fit.frames for fit in fits], axis=0)
-    shift_m = np.sum([fit.shift_m for fit in fits], axis=0)
+    frames = np.sum([section.frames for section in judged], axis=0)
+    shift_m = np.sum([section.shift_m for section in judged], axis=0)
     worst: tuple[float, str, float] | None = None
     for number, session in enumerate(drive.joined):
         others = frames.sum() - frames[number]
@@ -105,18 +122,18 @@ def refuse_contradicting_drives(fits: Sequence[Fit], drive: Drive) -> None:
         )
 
 
-def gates(fits: Sequence[Fit], probability: float) -> list[Gate]:
+def gates(judged: Sequence[Judged], probability: float) -> list[Gate]:
     """The gates of all observations, at their common scale; see :func:`v2hdm.adjust.solution.classify`."""
-    scale = noise_scale(np.concatenate([fit.mahalanobis2 for fit in fits]))
+    scale = noise_scale(np.concatenate([section.squared for section in judged]))
     limit = -2 * np.log(probability) * scale
-    accepted = [(fit.mahalanobis2 <= limit) & ~fit.is_behind for fit in fits]
-    size = 1 + max(int(fit.corner.max(initial=-1)) for fit in fits)
+    accepted = [(section.squared <= limit) & ~section.is_behind for section in judged]
+    size = 1 + max(int(section.corner.max(initial=-1)) for section in judged)
     count = np.zeros(size, dtype=np.int64)
-    for fit, is_accepted in zip(fits, accepted, strict=True):
-        count += np.bincount(fit.corner[is_accepted], minlength=size)
+    for section, is_accepted in zip(judged, accepted, strict=True):
+        count += np.bincount(section.corner[is_accepted], minlength=size)
     return [
-        Gate(is_accepted, is_accepted & (count[fit.corner] >= 2))
-        for fit, is_accepted in zip(fits, accepted, strict=True)
+        Gate(is_accepted, is_accepted & (count[section.corner] >= 2))
+        for section, is_accepted in zip(judged, accepted, strict=True)
     ]
 
 
@@ -128,6 +145,8 @@ def variance_of(fits: Sequence[Fit], whole: Problem) -> VarianceFactors:
     of_cameras = sum(float(np.mean([fit.of_priors.get(name, 0.0) for fit in fits])) for name in _OF_CAMERAS)
     cameras = len(whole.intrinsic)
     held = 0 if whole.centre_sigma_m is None else 3 * cameras
+    if whole.ground is not None:
+        held += int(whole.ground.root_information.any(axis=2).sum())
     free = 2 * len(corners) + 6 * cameras - held
     return variance_factors(squared, 2 * (sum(costs) + of_cameras), free)
 
@@ -142,19 +161,19 @@ def scatter_by_marking(fits: Sequence[Fit], count: int) -> FloatArray:
     return scatter_of(squared.reshape(-1, 4), freedom.reshape(-1, 4))
 
 
-class Neighbourhood(NamedTuple):
-    """What a section and its neighbours have told: of the solve of all observations, and of the last one."""
+class Passed(NamedTuple):
+    """Names over the drive of the observations of a section and its neighbours that pass their gates."""
 
-    settled: Sequence[Told]
-    gates: Sequence[Gate]
-    final: Sequence[Told]
+    accepted: IntArray
+    used: IntArray
 
 
 def final_of(
     section: Section,
     examined: Examined,
     names: Names,
-    told: Neighbourhood,
+    passed: Passed,
+    told: Sequence[Told],
     joint: tuple[Part, Solution, float],
     scatter: FloatArray,
 ) -> FinalSolve:
@@ -166,13 +185,11 @@ def final_of(
     sightings = inputs.optimiser.sightings
     settled = examined.settled
     observation = section.observation_names(sightings, settled)
-    passed = [told.settled[k].observation[gate.is_accepted] for k, gate in enumerate(told.gates)]
-    used = [told.settled[k].observation[gate.is_used] for k, gate in enumerate(told.gates)]
-    inlier = np.isin(observation, np.concatenate(passed))
+    inlier = np.isin(observation, passed.accepted)
     usable = np.zeros_like(sightings.valid)
     usable[settled.row[inlier], settled.own_corner[inlier]] = True
-    is_used = np.isin(observation, np.concatenate(used))
-    bundle = _joint_bundle(section, examined, names, told.final, joint, is_used)
+    is_used = np.isin(observation, passed.used)
+    bundle = _joint_bundle(section, examined, names, told, joint, is_used)
     return FinalSolve(
         bundle=bundle,
         ungated=settled,

@@ -2,8 +2,8 @@
 
 1. Every section, with an overlap of images of its neighbours, is solved by itself, and tests its inputs.
 2. Groups of sightings that two sections have in common, image by image, are one marking.
-3. The solves of all sections are joined (:mod:`v2hdm.adjust.sections`), each with the images that are its
-   own: first with all observations, then with those that agree. These are the joint solves of the drive.
+3. Without outliers, the solves of all sections are joined (:mod:`v2hdm.adjust.sections`), each with the
+   images that are its own. This is the joint solve of the drive.
 4. The candidates of all sections are classified together: shapes are learnt over all. A marking belongs to
    the section whose own images determine most of its corners.
 5. Every section makes its map, and their lanes are joined.
@@ -23,9 +23,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from v2hdm.adjust import Problem
+from v2hdm.adjust import Problem, SolveOptions
 from v2hdm.adjust.sections.parts import chains_of
-from v2hdm.adjust.sections.solve import GAP, Joint, Shape, finish_parts, join_parts
+from v2hdm.adjust.sections.solve import Joint, Shape, finish_parts, join_parts
 from v2hdm.association.sightings import Sightings, frames_of
 from v2hdm.errors import WorkerError
 from v2hdm.executor import Executor
@@ -34,14 +34,15 @@ from v2hdm.faults.clock_parts import Along, evidence_of
 from v2hdm.faults.sensitivity import stretches_of_way
 from v2hdm.io.maps.corrections import Heard
 from v2hdm.lanes.lines import join_paths, lanes_along
-from v2hdm.mapping.bundle import LEAST_OBSERVATIONS, VARIANCE_FACTORS, Model, drive_problem, full_model
-from v2hdm.mapping.optimise import SETTLED_MODEL, initial_rig
+from v2hdm.mapping.bundle import Model, drive_problem, full_model
+from v2hdm.mapping.optimise import initial_rig
 from v2hdm.mapping.options import AUTO, MappingOptions, check_sections
 from v2hdm.mapping.results import MethodResult
 from v2hdm.mapping.sections.common import Alone, Names, named, pooled_noise, with_owners
 from v2hdm.mapping.sections.faults import pooled_tests, refuse_contradicted
 from v2hdm.mapping.sections.joint import (
     Fit,
+    Judged,
     gates,
     refuse_contradicting_drives,
     scatter_by_marking,
@@ -50,7 +51,6 @@ from v2hdm.mapping.sections.joint import (
 from v2hdm.mapping.sections.merging import merged
 from v2hdm.mapping.sections.section import part_of_frame, sections_of
 from v2hdm.mapping.sections.work import (
-    FINAL,
     DetectionsOf,
     Ends,
     Finished,
@@ -73,8 +73,6 @@ _log = logging.getLogger(__name__)
 _CLASSIFIED_AT_ONCE = 5000
 """Most candidates, of neighbouring sections, that are classified together: memory and time would grow with
 their square, and thousands tell all of a class's shapes."""
-
-_SETTLED_GAP = 1e-5  # gap of the joint solve that outliers are told by, a fraction of the cost
 
 
 def map_in_sections(
@@ -111,7 +109,7 @@ def map_in_sections(
         tests, max((section.evidence.foreign for section in alone), key=lambda segment: segment.gain)
     )
     del sections
-    solved = _joint_solves(run, drive, part, alone)
+    solved = _joint_solve(run, drive, part, alone)
     proposals: list[Proposal] = run.finish(solved, solved.work.propose)
     heard = _classified(run, solved, proposals, options.acceptance)
     clock_root = _clock_root(run, solved, [proposal.clock_slopes for proposal in proposals], drive)
@@ -157,48 +155,47 @@ class _Run:
 
 
 class _Solved(NamedTuple):
-    """The joint solves of a drive."""
+    """The joint solve of a drive."""
 
-    work: Work  # of its sections, with the model of the last solve
+    work: Work  # of its sections, with the model of the solve
     names: list[Names]  # by section
     joint: Joint
     shape: Shape
     held_out: dict[str, float]  # losses by pose model
 
 
-def _joint_solves(run: _Run, drive: Drive, part: IntArray, alone: Sequence[Alone]) -> _Solved:
-    """Join the sections: with all observations, then with those that agree, under the drive's pose model.
+def _joint_solve(run: _Run, drive: Drive, part: IntArray, alone: Sequence[Alone]) -> _Solved:
+    """Join the sections, with the observations that agree, under the drive's pose model.
 
     ``part`` (J,) is the section of each frame.
     """
     names = named(alone)
     for number, of_section in enumerate(names):
         run.work.write("names", number, of_section)
-    noise = pooled_noise(alone)
-    options = run.work.options
-    pose_model = SETTLED_MODEL if options.pose_model == AUTO else options.pose_model
-    model = full_model(noise.pose_sigma, options, pose_model, noise.variance_factor)
-    work = replace(run.work, model=model)
-    fits, _, shape = _join(run, work, drive, part, _SETTLED_GAP)
-    refuse_contradicting_drives(fits, drive)
-    passed = gates(fits, model.solver.gate_probability)
-    names = with_owners(names, [fit.corner[gate.is_used] for fit, gate in zip(fits, passed, strict=True)])
-    for number, (of_section, gate) in enumerate(zip(names, passed, strict=True)):
-        work.write("names", number, of_section)
-        work.write("gate", number, gate)
-    observations = np.array([section.observations for section in alone])
-    held_out: dict[str, float] = {}
-    if options.pose_model == AUTO:
-        busiest = int(np.argmax([section.busiest for section in alone]))
-        ((pose_model, held_out),) = run.all(work.choose, "choose pose model", [busiest])
-    factor = noise.variance_factor
-    if sum(len(fit.corner) for fit in fits) >= LEAST_OBSERVATIONS:
-        factor = float(np.clip(factor * variance_of(fits, shape.problem).observations, *VARIANCE_FACTORS))
-    model = full_model(noise.pose_sigma, options, pose_model, factor)
-    work = replace(
-        work, model=model, stage=FINAL, pose_model=pose_model, fullest=int(np.argmax(observations))
+    judged: list[Judged] = run.all(run.work.judge, "judge observations")
+    refuse_contradicting_drives(judged, drive)
+    passed = gates(judged, SolveOptions.gate_probability)
+    names = with_owners(
+        names, [section.corner[gate.is_used] for section, gate in zip(judged, passed, strict=True)]
     )
-    fits, joint, shape = _join(run, work, drive, part, GAP)
+    del judged
+    for number, (of_section, gate) in enumerate(zip(names, passed, strict=True)):
+        run.work.write("names", number, of_section)
+        run.work.write("gate", number, gate)
+    options = run.work.options
+    pose_model = options.pose_model
+    held_out: dict[str, float] = {}
+    if pose_model == AUTO:
+        busiest = int(np.argmax([section.busiest for section in alone]))
+        ((pose_model, held_out),) = run.all(run.work.choose, "choose pose model", [busiest])
+    noise = pooled_noise(alone)
+    work = replace(
+        run.work,
+        model=full_model(noise.pose_sigma, options, pose_model, noise.variance_factor),
+        pose_model=pose_model,
+        fullest=int(np.argmax([section.observations for section in alone])),
+    )
+    fits, joint, shape = _join(run, work, drive, part)
     scatter = scatter_by_marking(fits, 1 + max(int(of_section.marking.max()) for of_section in names))
     for number, of_section in enumerate(names):
         corner = (np.arange(4) + of_section.turned[:, None]) % 4
@@ -207,8 +204,8 @@ def _joint_solves(run: _Run, drive: Drive, part: IntArray, alone: Sequence[Alone
     return _Solved(work, names, joint, shape, held_out)
 
 
-def _join(run: _Run, work: Work, drive: Drive, part: IntArray, gap: float) -> tuple[list[Fit], Joint, Shape]:
-    """Cut a joint problem, and solve it."""
+def _join(run: _Run, work: Work, drive: Drive, part: IntArray) -> tuple[list[Fit], Joint, Shape]:
+    """Cut the joint problem, and solve it."""
     assert work.model is not None
     whole = _without_sightings(drive, work.cameras, work.model)
     chains = chains_of(whole, part, tuple(work.model.solver.pose_states))
@@ -228,7 +225,7 @@ def _join(run: _Run, work: Work, drive: Drive, part: IntArray, gap: float) -> tu
     shape = Shape.of(whole, work.model.solver)
     joint = join_parts(
         work.folder, run.count, chains.links, shape, work.tell, run.executor,
-        partial(run.progress, "join sections"), gap, with_covariances=work.stage == FINAL,
+        partial(run.progress, "join sections"),
     )  # fmt: skip
     return joint.results, joint, shape
 

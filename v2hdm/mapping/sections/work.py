@@ -32,7 +32,7 @@ from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.recovery import Examined, Outcome, clocks_of, examine, read_outs_of
 from v2hdm.mapping.results import MethodResult
 from v2hdm.mapping.sections.common import Alone, Names
-from v2hdm.mapping.sections.joint import Fit, Gate, Neighbourhood, Told, final_of, fit_of
+from v2hdm.mapping.sections.joint import Fit, Gate, Judged, Passed, Told, final_of, fit_of, judged_of
 from v2hdm.mapping.sections.section import Section
 from v2hdm.progress import Progress, silent
 from v2hdm.records import BoolArray, FloatArray, Image, ImageDetections, IntArray
@@ -43,12 +43,6 @@ from v2hdm.site.parallax import Parallax
 GreyOf = Callable[[Image], NDArray[np.float32]]
 DetectionsOf = Callable[[Sequence[Image], IntArray], Sequence[ImageDetections]]
 """Detections in some images, whose numbers in the drive are given, too; numbered in the order of these."""
-
-SETTLED = "settled"
-"""The joint solve of all observations."""
-
-FINAL = "final"
-"""The joint solve of those that agree."""
 
 
 class Ends(NamedTuple):
@@ -99,7 +93,6 @@ class Work:
     options: MappingOptions
     folder: Path
     grey: GreyOf | None = None
-    stage: str = SETTLED
     model: Model | None = None
     pose_model: str = ""
     chi2_per_dof: float = 1.0
@@ -145,7 +138,7 @@ class Work:
             own_sightings=np.bincount(association.group[rows][is_own], minlength=association.count),
             estimated_sigma=optimiser.estimated_sigma,
             stated_sigma=optimiser.stated_sigma,
-            variance_factor=settled.model.variance_factor,
+            variance_factor=optimiser.variance_factor,
             observations=len(settled.row),
             own_frames=len(section.own_frames),
             busiest=busiest(settled.problem),
@@ -163,23 +156,36 @@ class Work:
         assert isinstance(examined, Examined)
         return examined
 
+    def judge(self, number: int, _: Progress = silent) -> Judged:
+        """How the observations of a section's own images fit its own solve."""
+        section: Section = self.read("section", number)
+        examined = self._examined(number)
+        settled = examined.settled
+        names: Names = self.read("names", number)
+        chosen = self._own_rows(section, examined)
+        observation = section.observation_names(examined.inputs.optimiser.sightings, settled)
+        self.write("observed", number, observation[chosen])
+        return judged_of(section, settled, chosen, names.corners(settled)[chosen])
+
+    def _own_rows(self, section: Section, examined: Examined) -> IntArray:
+        """The observations (K,) of the section's own images in its solve, by ascending names."""
+        settled = examined.settled
+        sightings = examined.inputs.optimiser.sightings
+        own_rows = np.flatnonzero(section.is_own[sightings.image[settled.row]])
+        return own_rows[np.argsort(section.observation_names(sightings, settled)[own_rows])]
+
     def cut(self, number: int, _: Progress = silent) -> None:
-        """Write the part of a joint problem that a section's own images make up."""
+        """Write the part of the joint problem that a section's own images make up."""
         assert self.model is not None
         section: Section = self.read("section", number)
         examined = self._examined(number)
         settled = examined.settled
         sightings = examined.inputs.optimiser.sightings
-        is_own = section.is_own[sightings.image[settled.row]]
         observation = section.observation_names(sightings, settled)
-        chosen = np.flatnonzero(is_own)
-        chosen = chosen[np.argsort(observation[chosen])]
+        chosen = self._own_rows(section, examined)[self._gate(number).is_used]
+        passed = np.isin(observation, self._passed(section).accepted)
         usable = np.zeros_like(sightings.valid)
-        usable[settled.row, settled.own_corner] = True
-        if self.stage == FINAL:
-            chosen = chosen[self._gate(number).is_used]
-            passed = np.isin(observation, self._passed(section))
-            usable[settled.row[~passed], settled.own_corner[~passed]] = False
+        usable[settled.row[passed], settled.own_corner[passed]] = True
         names: Names = self.read("names", number)
         on_line = known_elsewhere(settled.association, sightings.valid & usable, usable)
         at = settled.row[chosen], settled.own_corner[chosen]
@@ -211,15 +217,16 @@ class Work:
             border_corners=np.unique(corner[is_shared]),
         )
         save_part(self.folder, number, part)
-        self.write(f"observed_{self.stage}", number, observation[chosen])
 
-    def _passed(self, section: Section) -> IntArray:
-        """Names of the observations that pass the gate, of a section's images and its neighbours'."""
+    def _passed(self, section: Section) -> Passed:
+        """The observations of a section's images and its neighbours' that are no outliers."""
         around = [section.number, *section.neighbours]
-        told = [self.read(f"told_{SETTLED}", number).observation for number in around]
-        accepted = [self._gate(number).is_accepted for number in around]
-        return np.concatenate(
-            [observation[passed] for observation, passed in zip(told, accepted, strict=True)]
+        observed: list[IntArray] = [self.read("observed", number) for number in around]
+        passed = [self._gate(number) for number in around]
+        pairs = list(zip(observed, passed, strict=True))
+        return Passed(
+            accepted=np.concatenate([observation[gate.is_accepted] for observation, gate in pairs]),
+            used=np.concatenate([observation[gate.is_used] for observation, gate in pairs]),
         )
 
     def _whole(self, section: Section, examined: Examined) -> Problem:
@@ -248,28 +255,26 @@ class Work:
 
     def tell(self, number: int, part: Part, solution: Solution) -> Fit:
         """Keep what a section's own images are in a joint solve."""
+        observed: IntArray = self.read("observed", number)
         told = Told(
             frame=part.frames,
             map_from_vehicle=solution.map_from_vehicle,
-            observation=self.read(f"observed_{self.stage}", number),
+            observation=observed[self._gate(number).is_used],
             residual_px=solution.residual_px,
             mahalanobis2=solution.mahalanobis2,
         )
-        self.write(f"told_{self.stage}", number, told)
+        self.write("told", number, told)
         return fit_of(part, solution)
 
     def propose(self, number: int, part: Part, solution: Solution) -> Proposal:
         """The candidates of a section under the joint solution."""
         section: Section = self.read("section", number)
         names: Names = self.read("names", number)
-        around = [number, *section.neighbours]
-        told = Neighbourhood(
-            settled=[self.read(f"told_{SETTLED}", other) for other in around],
-            gates=[self._gate(other) for other in around],
-            final=[self.read(f"told_{FINAL}", other) for other in around],
-        )
+        told: list[Told] = [self.read("told", other) for other in (number, *section.neighbours)]
         joint = part, solution, self.chi2_per_dof
-        final = final_of(section, self._examined(number), names, told, joint, self.read("scatter", number))
+        passed = self._passed(section)
+        scatter: FloatArray = self.read("scatter", number)
+        final = final_of(section, self._examined(number), names, passed, told, joint, scatter)
         assert self.model is not None
         final = replace(final, bundle=replace(final.bundle, model=self.model))
         proposal = proposed(final)

@@ -17,6 +17,7 @@ from v2hdm.errors import REASON_LETTERS, DriveError, bounded, need
 from v2hdm.io.importers.bag.mcap import ROS1, ROS2, mcap_reader
 from v2hdm.safe.child import Limits, in_child, next_step
 from v2hdm.safe.databases import opened, rows_of
+from v2hdm.safe.placeholders import placeholder_words
 from v2hdm.store.files import load_yaml, take_mapping
 
 SUFFIXES = (".bag", ".mcap", ".db3")
@@ -260,6 +261,8 @@ def _check_definition(text: str) -> None:
 
 def _check_database(path: Path) -> None:
     """Refuse an SQLite file (https://www.sqlite.org/fileformat.html, 1.3) whose end SQLite would not miss."""
+    if words := placeholder_words(path):
+        raise DriveError(f"{path}: {words}")
     journal = path.with_name(f"{path.name}-wal")
     if journal.is_file() and journal.stat().st_size:
         raise DriveError(f"{path}: was not closed; {journal.name} holds its end; run 'ros2 bag reindex'")
@@ -304,6 +307,8 @@ def _one_line(path: Path, what: str = "") -> Iterator[None]:
                 f"{path}: {what}the bag does not define the type {failure}; convert it to MCAP, which holds "
                 "its types, where it was recorded: 'ros2 bag convert'"
             ) from None
+        if words := placeholder_words(path):
+            raise DriveError(f"{path}: {words}") from None
         said = " ".join(str(failure).split()) or type(failure).__name__
         reason = bounded(said, REASON_LETTERS).rstrip(".")
         raise DriveError(
