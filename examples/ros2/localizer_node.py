@@ -40,8 +40,10 @@ class Place:
 
     def saw(self, camera: str, stamp: Any, pixels: Any) -> list[tuple[str, Any]]:
         """Take an image (H, W, 3) BGR; the messages to publish, by topic."""
-        found = self.roads[camera].detect(pixels)
-        pose = self.localizer.update([Look.of(camera, seconds(stamp), found)])
+        stamp_s = seconds(stamp)
+        regions_px = self.localizer.regions(camera, stamp_s)
+        found = self.roads[camera].detect(pixels, regions_px=regions_px)
+        pose = self.localizer.update([Look.of(camera, stamp_s, found)])
         messages = [("pose", pose_message(pose, make)), ("status", status_message(pose, make))]
         return [(topic, message) for topic, message in messages if message is not None]
 

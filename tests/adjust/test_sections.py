@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.adjust.scene import make_scene, with_late_clocks
+from tests.adjust.scene import make_scene, with_ground, with_late_clocks
 from tests.adjust.site import DRIFTING
 from tests.adjust.test_sessions import joined, visited_again
 from v2hdm.adjust import ControlPoints, KnownLengths, Problem, SolveOptions, solve
@@ -100,6 +100,7 @@ def check(results: list[dict], problem: Problem, options: SolveOptions) -> None:
 
 def test_sections_of_a_street_are_the_street(tmp_path):
     scene = make_scene(3, frames=160, jitter=DRIFTING, outliers=0.03, start_error_deg=1.0)
+    scene = with_ground(scene, 0.1, 0.01)
     position = scene.problem.map_from_vehicle[:, :2, 3]
     part = parts_of_way(position, np.zeros(len(position), dtype=np.int64), 30.0)
     assert part.max() == 3

@@ -398,7 +398,12 @@ def test_an_interruption_before_the_last_image_is_one_line_and_no_half_a_file(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"), [(["--mounting", 1, 0, 60], "exclude each other"), (["--live"], "--live")]
+    ("arguments", "words"),
+    [
+        (["--mounting", 1, 0, 60], "exclude each other"),
+        (["--live"], "--live"),
+        (["--regions"], "add --live"),
+    ],
 )
 def test_arguments_that_exclude_one_another_are_refused(bench, capsys, arguments, words):
     assert bench.run(bench.folder / "0.png", *arguments) == 2

@@ -155,9 +155,9 @@ def test_both_resolutions_say_the_same_of_the_same_place(tmp_path):
     network = Network(brightness_model(tmp_path))
     image = picture(camera, [diamond(5.0, 0.0)])
     twice = run_on_road(network, image, view)
-    assert network_module._seam_row(network, view, view.far_row) is not None
+    assert network_module.seam_row(network, view, view.far_row) is not None
     view.fine_row = None
-    assert network_module._seam_row(network, view, view.far_row) is None
+    assert network_module.seam_row(network, view, view.far_row) is None
     once = run_on_road(network, image, view)
     assert twice.paint.shape == once.paint.shape
     assert twice.kinds.shape == once.kinds.shape

@@ -1,5 +1,6 @@
 """A vehicle finds itself in a map as it drives, and says when it cannot."""
 
+import io
 import json
 import queue
 import subprocess
@@ -402,7 +403,7 @@ def test_lines_come_as_images_do_and_end_with_the_cameras(monkeypatch, tmp_path)
             items.put(live._Ended(name, None))
 
         threading.Thread(target=play, daemon=True).start()
-        yield
+        yield live._Eye(io.StringIO(), delay_s)
 
     monkeypatch.setattr(live, "_camera", camera)
     poses = []
@@ -435,6 +436,7 @@ def test_all_that_a_camera_shows_reaches_the_localiser_at_the_time_of_its_exposu
     ("arguments", "says"),
     [
         ("--images front", "give a camera's name and its folder"),
+        ("--images front=images --every-full 0", "--every-full 0: give a number of images, 1 or more"),
         ("--images side=images", "no calibration of camera 'side'"),
         ("--images front=nowhere", "camera front: --live: nowhere is not a camera's index or a folder"),
     ],

@@ -97,7 +97,7 @@ def test_the_node_answers_images_with_poses(monkeypatch):
     seen = {}
 
     class Road:
-        def detect(self, pixels):
+        def detect(self, pixels, regions_px=None):
             markings = [SimpleNamespace(image=marking) for marking in seen["look"].markings]
             return SimpleNamespace(markings=markings, lanes=[])
 

@@ -21,20 +21,20 @@ from v2hdm.detection.network import Network, NetworkOutput, run_on_road
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.quads.blobs import find_blobs
 from v2hdm.detection.quads.outline import on_edges, outline_polygon
-from v2hdm.detection.quads.propose import Proposals, propose
+from v2hdm.detection.quads.propose import Proposal, Proposals, propose
+from v2hdm.detection.regions import NO_PAINT, run_in_regions
 from v2hdm.detection.stopwatch import lap
 from v2hdm.detection.weights import NETWORK_FILE, check_weights
 from v2hdm.doors import checked
 from v2hdm.errors import DetectorError
 from v2hdm.native import tell_missing
-from v2hdm.records import BoolArray, Camera, LaneDetection, MarkingDetection
+from v2hdm.records import BoolArray, Camera, FloatArray, LaneDetection, MarkingDetection
 from v2hdm.safe.texts import shown
 
 _log = logging.getLogger(__name__)
 
 Markings = tuple[MarkingDetection, ...]
 
-_NO_PAINT = -20.0  # log odds of paint where the vehicle itself is
 _PART_SHARE = 0.5  # share of an area in a marking from which it is a part of that; chosen
 
 
@@ -100,6 +100,27 @@ class Detector:
             areas = _of_several(self._areas(proposals), markings)
         return (*_not_of(areas, markings), *areas), lanes
 
+    @checked
+    def detect_in_regions(
+        self, image_bgr: np.ndarray, camera: Camera, regions_px: FloatArray
+    ) -> tuple[MarkingDetection, ...]:
+        """Find the markings with corners that lie whole in regions (R, 4): left, top, right, bottom, px.
+
+        It costs less than :meth:`detect`, but looks for no lanes, symbols and areas; raises as that.
+        """
+        road_camera = self.road_camera(camera)
+        _check_image(image_bgr, camera)
+        regions_px = np.asarray(regions_px, dtype=np.float64).reshape(-1, 4)
+        with lap("net"):
+            output = run_in_regions(self.network, image_bgr, road_camera, regions_px, self.options.mirrored)
+        with lap("propose"):
+            everywhere = self.propose(_without_vehicle(output, camera), camera)
+            proposals = replace(everywhere, pieces=_in_regions(everywhere.pieces, regions_px))
+        with lap("fit"):
+            readings = self.read(image_bgr, proposals)
+        with lap("judge"):
+            return tuple(find_markings(readings, proposals.camera, self.options))
+
     def run_network(self, image_bgr: np.ndarray, camera: Camera, top: int | None = None) -> NetworkOutput:
         """Run the network on an image, less what shows the vehicle; raises as :meth:`detect`.
 
@@ -109,17 +130,7 @@ class Detector:
         _check_image(image_bgr, camera)
         with lap("net"):
             output = run_on_road(self.network, image_bgr, road_camera, self.options.mirrored, top)
-        mask = camera.own_vehicle
-        if mask is None:
-            return output
-        # The pixel in the middle of each element of paint.
-        stride = output.stride
-        rows = output.top + stride * np.arange(output.paint.shape[0]) + stride // 2
-        columns = stride * np.arange(output.paint.shape[1]) + stride // 2
-        rows = np.minimum(rows, mask.shape[0] - 1)
-        columns = np.minimum(columns, mask.shape[1] - 1)
-        paint = np.where(mask[np.ix_(rows, columns)], np.float32(_NO_PAINT), output.paint)
-        return replace(output, paint=paint)
+        return _without_vehicle(output, camera)
 
     def propose(self, output: NetworkOutput, camera: Camera) -> Proposals:
         """The pieces of paint of one image, each with the classes that it may be of."""
@@ -214,6 +225,29 @@ class Detector:
                 symbols.append(symbol)
                 parts_until = after
         return symbols
+
+
+def _in_regions(pieces: Sequence[Proposal], regions_px: FloatArray) -> list[Proposal]:
+    """The pieces of paint whose middle lies in one of some regions (R, 4)."""
+    middles = np.array([piece.blob.outline_px.mean(axis=0) for piece in pieces]).reshape(-1, 1, 2)
+    is_inside = (middles > regions_px[:, :2]) & (middles < regions_px[:, 2:])
+    is_in = np.asarray(np.any(is_inside.all(axis=2), axis=1))
+    return [piece for piece, is_kept in zip(pieces, is_in.tolist(), strict=True) if is_kept]
+
+
+def _without_vehicle(output: NetworkOutput, camera: Camera) -> NetworkOutput:
+    """The network's output on an image, less what shows the vehicle."""
+    mask = camera.own_vehicle
+    if mask is None:
+        return output
+    # The pixel in the middle of each element of paint.
+    stride = output.stride
+    rows = output.top + stride * np.arange(output.paint.shape[0]) + stride // 2
+    columns = stride * np.arange(output.paint.shape[1]) + stride // 2
+    rows = np.minimum(rows, mask.shape[0] - 1)
+    columns = np.minimum(columns, mask.shape[1] - 1)
+    paint = np.where(mask[np.ix_(rows, columns)], np.float32(NO_PAINT), output.paint)
+    return replace(output, paint=paint)
 
 
 def _of_several(areas: Sequence[MarkingDetection], markings: Markings) -> list[MarkingDetection]:

@@ -36,9 +36,9 @@ _PROVIDERS: dict[str, tuple[str, dict[str, str]]] = {
     "cuda": ("CUDAExecutionProvider", {"use_tf32": "0", "cudnn_conv_algo_search": "HEURISTIC"}),
 }
 
-_OVERLAP_PX = 32  # overlap of the two resolutions, so that either has its surroundings where they are joined
+OVERLAP_PX = 32  # overlap of the two resolutions, so that either has its surroundings where they are joined
 _MOST_MULTIPLE = 1024  # largest multiple of px that images are padded to: an encoder halves them ten times
-_GRID_PX = 16  # least grid, px, of the rows that the seam may be at: it is that of all outputs
+GRID_PX = 16  # least grid, px, of the rows that the seam may be at: it is that of all outputs
 _MIRRORED = np.array([1.0, -1.0], dtype=np.float32)[:, None, None]
 """Factors of a lane output (2, h, w), log odds and offset, in the mirror."""
 
@@ -248,16 +248,16 @@ def run_on_road(
     info = network.info
     top = camera.far_row if top is None else top
     band = image_bgr[top:]
-    run = partial(_run_twice, network) if mirrored else network.run
-    seam = _seam_row(network, camera, top)
+    run = partial(run_twice, network) if mirrored else network.run
+    seam = seam_row(network, camera, top)
     if seam is None:
         output = run(band)
         paint = output.paint
         kinds = output.kinds
         anchors = anchor_rows(output.lanes, network, top, 1)
     else:
-        fine = run(band[: seam + _OVERLAP_PX])
-        coarse_top = seam - _OVERLAP_PX
+        fine = run(band[: seam + OVERLAP_PX])
+        coarse_top = seam - OVERLAP_PX
         coarse = run(cv2.resize(band[coarse_top:], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
         coarse_rows = anchor_rows(coarse.lanes, network, top + coarse_top, 2)
         fine_rows = anchor_rows(fine.lanes, network, top, 1)
@@ -265,11 +265,19 @@ def run_on_road(
         anchors += [row for row in fine_rows if row.v_px < top + seam]
         paint = _joined(fine.paint[None], coarse.paint[None], seam, coarse_top, info.paint_stride)[0]
         kinds = _joined(fine.kinds, coarse.kinds, seam, coarse_top, info.kind_stride)
-    # Seen from the side a dash lies across the view, as a stop line does seen from the front, and the other
-    # way round: the network knows of the view alone.
-    if camera.aside and set(SEEN_ACROSS) <= set(info.classes):
-        kinds = kinds[[info.classes.index(SEEN_ACROSS.get(name, name)) for name in info.classes]]
+    kinds = as_seen_from(camera, kinds, info.classes)
     return NetworkOutput.of(paint, kinds, anchors, info.classes, info.paint_stride, top, info.catalogue)
+
+
+def as_seen_from(camera: RoadCamera, kinds: np.ndarray, classes: Sequence[str]) -> np.ndarray:
+    """Logits (K, h, w) of classes, renamed where a camera looks aside.
+
+    Seen from the side a dash lies across the view, as a stop line does seen from the front, and the other way
+    round: the network knows of the view alone.
+    """
+    if not camera.aside or not set(SEEN_ACROSS) <= set(classes):
+        return kinds
+    return np.asarray(kinds[[classes.index(SEEN_ACROSS.get(name, name)) for name in classes]])
 
 
 def _softmax(logits: np.ndarray) -> np.ndarray:
@@ -280,7 +288,7 @@ def _softmax(logits: np.ndarray) -> np.ndarray:
     return logits
 
 
-def _run_twice(network: Network, image_bgr: np.ndarray) -> RawOutput:
+def run_twice(network: Network, image_bgr: np.ndarray) -> RawOutput:
     """The mean of the outputs on an image (H, W, 3) and on its mirror image."""
     width = image_bgr.shape[1]
     info = network.info
@@ -302,16 +310,16 @@ def _run_twice(network: Network, image_bgr: np.ndarray) -> RawOutput:
     )
 
 
-def _seam_row(network: Network, camera: RoadCamera, top: int) -> int | None:
+def seam_row(network: Network, camera: RoadCamera, top: int) -> int | None:
     """Row of the band from ``top`` from which half the resolution will do; None if that saves nothing."""
-    grid = max(_GRID_PX, network.info.multiple)
+    grid = max(GRID_PX, network.info.multiple)
     height = camera.info.height - top
     if camera.fine_row is None or camera.info.width % (2 * grid) or height % grid:
         return None
     seam = -(-max(camera.fine_row - top, 0) // grid) * grid
     seam += (height - seam) % (2 * grid)
-    is_worth_it = height - seam >= 3 * _OVERLAP_PX
-    return seam if is_worth_it and seam >= _OVERLAP_PX else None
+    is_worth_it = height - seam >= 3 * OVERLAP_PX
+    return seam if is_worth_it and seam >= OVERLAP_PX else None
 
 
 def _joined(fine: np.ndarray, coarse: np.ndarray, seam: int, coarse_top: int, stride: int) -> np.ndarray:

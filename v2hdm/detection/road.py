@@ -153,12 +153,22 @@ class RoadDetector:
         except MapFileError as error:
             raise MapFileError(f"{calibration}: {error}") from error
 
-    def detect(self, image_bgr: np.ndarray, output: NetworkOutput | None = None) -> Road:
+    def detect(
+        self,
+        image_bgr: np.ndarray,
+        output: NetworkOutput | None = None,
+        regions_px: FloatArray | None = None,
+    ) -> Road:
         """Find what an image (H, W, 3) uint8 BGR of the camera's size shows; else raises DetectorError.
 
-        ``output`` is the network's, if it has looked at the image already.
+        ``output`` is the network's, if it has looked at the image already. Where ``regions_px`` (R, 4) are
+        given, of left, top, right and bottom, only markings with corners in these are looked for, for less
+        time: regions where a map expects them, as of :meth:`v2hdm.Localizer.regions`.
         """
-        if output is None:
+        lanes: Sequence[LaneDetection] = ()
+        if regions_px is not None:
+            markings = self.detector.detect_in_regions(image_bgr, self.camera, regions_px)
+        elif output is None:
             markings, lanes = self.detector.detect(image_bgr, self.camera)
         else:
             markings, lanes = self.detector.detect_in(output, image_bgr, self.camera)

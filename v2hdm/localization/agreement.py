@@ -21,6 +21,7 @@ _LEAST_SHARE = 0.67
 """Least share of what is seen that the map explains: of a right one it is 0.86 and more, with half of the
 markings moved about 0.5, of another site's 0.04."""
 _DIFFERS_LIMIT = 7.0  # log likelihood ratio, since it began to rise, from which a map differs (Page 1954)
+_DOUBTFUL = 2.0  # log likelihood ratio from which images are searched for more of it
 # Shares of what is seen that lies on its marking, was repainted beside it, or is on no marking (false
 # detections, new paint): of a right map, as drives with false detections show, and of one with half of its
 # markings moved.
@@ -179,10 +180,20 @@ class Agreement:
     @property
     def differs(self) -> bool:
         """Whether the map has too little of what is seen: of all in the last metres, or of what came last."""
+        return self.share < _LEAST_SHARE or self._evidence > _DIFFERS_LIMIT
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether what came last speaks for another map, surely or not."""
+        return self.share < _LEAST_SHARE or self._evidence > _DOUBTFUL
+
+    @property
+    def _evidence(self) -> float:
+        """The log likelihood ratio of a map that differs, since it began to rise."""
         evidence = 0.0
         for spot in self._several:
             evidence = max(0.0, evidence + spot.gain)
-        return self.share < _LEAST_SHARE or evidence > _DIFFERS_LIMIT
+        return evidence
 
     @property
     def is_lost(self) -> bool:

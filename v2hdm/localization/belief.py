@@ -219,6 +219,13 @@ def only_markings(belief: Belief, markings: Sequence[int]) -> Belief:
     )
 
 
+def with_latest(belief: Belief, features: Sequence[int], most: int) -> Belief:
+    """The belief with so many of the features that were seen last; ``features`` are seen now."""
+    earlier = [feature for feature in belief.markings if feature not in set(features)]
+    order = [*earlier, *features]
+    return belief if len(order) <= most else only_markings(belief, order[-most:])
+
+
 def loosened(belief: Belief, cameras: Sequence[int], sigma_rad: float) -> Belief:
     """The belief in which the mountings of cameras may each have turned by so much since."""
     rows = [VEHICLE + CAMERA * camera + axis for camera in cameras for axis in (3, 4, 5)]

@@ -9,11 +9,15 @@ import subprocess
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import IO, NamedTuple
+
+import numpy as np
 
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.localization.antenna import Fix
@@ -23,6 +27,8 @@ from v2hdm.localization.seeing import Look
 from v2hdm.localization.stream import MotionLines, look_of
 
 _QUIET_S = 0.5  # without an image, a pose comes after this time all the same
+_LAST_IMAGES = 10  # images of a camera by which its interval is known
+_SLOW_S = 0.5  # interval, s, after which nothing is expected at its place any more
 _POLL_S = 0.01  # a file that grows is looked at this often
 
 
@@ -64,8 +70,10 @@ def localize_live(
     """
     items: _Queue = queue.SimpleQueue()
     with ExitStack() as stack:
-        for name, source in sources.items():
-            stack.enter_context(_camera(name, source, calibrations[name], items, delay_s))
+        cameras = {
+            name: stack.enter_context(_camera(name, source, calibrations[name], items, delay_s))
+            for name, source in sources.items()
+        }
         threading.Thread(target=_follow_motion, args=(motion, lines, items), daemon=True).start()
         running = set(sources)
         images = 0
@@ -88,6 +96,8 @@ def localize_live(
             images += len(looks)
             if looks or motions or fixes:
                 pose = localizer.update(looks, motions, fixes)
+                for look in looks:
+                    cameras[look.camera].point(localizer, look, time.time() - delay_s)
                 if looks or pose.stamp_s - written_s > _QUIET_S:
                     written_s = pose.stamp_s
                     take(pose)
@@ -106,16 +116,49 @@ def _available(items: _Queue) -> Iterator[_Item]:
             return
 
 
+@dataclass
+class _Eye:
+    """A camera's process, told where to look next."""
+
+    stream: IO[str]
+    delay_s: float
+    stamps_s: deque[float] = field(default_factory=lambda: deque(maxlen=_LAST_IMAGES))
+
+    def point(self, localizer: Localizer, look: Look, now_s: float) -> None:
+        """Say where to look in the next image that the process can take, after a look of it."""
+        self.stamps_s.append(look.stamp_s)
+        if len(self.stamps_s) < 2:
+            return
+        interval_s = min(later - earlier for earlier, later in pairwise(self.stamps_s))
+        if interval_s <= 0 or interval_s > _SLOW_S:
+            return
+        # What came while the last image was looked at is the next one, or it is yet to come.
+        behind = max(1, math.ceil((now_s - look.stamp_s) / interval_s))
+        stamp_s = look.stamp_s + behind * interval_s
+        regions_px = localizer.regions(look.camera, stamp_s)
+        if regions_px is None:
+            return
+        record = {"stamp_s": stamp_s + self.delay_s, "regions_px": np.round(regions_px, 1).tolist()}
+        try:
+            print(json.dumps(record), file=self.stream, flush=True)
+        except OSError:  # it has ended; what it says of that comes as its last item
+            return
+
+
 @contextmanager
-def _camera(name: str, source: str, calibration: Path, items: _Queue, delay_s: float) -> Iterator[None]:
+def _camera(name: str, source: str, calibration: Path, items: _Queue, delay_s: float) -> Iterator[_Eye]:
     """A process that detects in the newest images of a camera, as ``v2hdm detect --live`` does."""
     command = [sys.executable, "-m", "v2hdm.detect", source, "--camera", str(calibration), "--live"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    pipe = subprocess.PIPE
+    with subprocess.Popen(
+        [*command, "--regions"], stdin=pipe, stdout=pipe, stderr=pipe, text=True
+    ) as process:
+        assert process.stdin is not None
         arguments = (name, process, items, delay_s)
         reader = threading.Thread(target=_follow_camera, args=arguments, daemon=True)
         reader.start()
         try:
-            yield
+            yield _Eye(process.stdin, delay_s)
         finally:
             process.terminate()
             reader.join()

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from v2hdm.doors import checked
-from v2hdm.errors import MapFileError
+from v2hdm.errors import ConfigError, MapFileError
 from v2hdm.localization.agreement import Agreement, Pace, detected
 from v2hdm.localization.antenna import Antenna, Fix, with_fix
 from v2hdm.localization.areas import AreaMap, with_areas
@@ -21,16 +21,17 @@ from v2hdm.localization.belief import (
     VEHICLE,
     Belief,
     loosened,
-    only_markings,
     pinned,
     predict,
     start,
+    with_latest,
 )
 from v2hdm.localization.joint import Located, Scene, locate, paired
 from v2hdm.localization.lines import LineMap, with_lines
 from v2hdm.localization.motion import Motion, MotionLog, MotionNoise, moved
 from v2hdm.localization.paint import Paint
 from v2hdm.localization.places import Place, Prior, vehicle_at
+from v2hdm.localization.regions import EVERY_FULL, Looking
 from v2hdm.localization.rig import Estimate, Rig, Turned
 from v2hdm.localization.seeing import Look, Sighted, hulls_of_areas, pieces_of_lines, sighted
 from v2hdm.localization.starting import Quest
@@ -152,13 +153,17 @@ class Localizer:
         prior: Prior | None = None,
         noise: MotionNoise | None = None,
         antenna_m: Sequence[float] = (0.0, 0.0),
+        every_full: int = EVERY_FULL,
     ) -> None:
         """Start in a map (frame ``map``, m) with calibrated cameras, by name.
 
         ``prior`` is a rough position; without one, the whole map is searched.
         ``noise`` is the odometry's; ``antenna_m`` is how far ahead of its origin and to the left the vehicle
-        has the antenna of its positions. Raises MapFileError for a map without markings, or without cameras.
+        has the antenna of its positions. Of ``every_full`` images of a camera, :meth:`regions` has one
+        searched as a whole. Raises MapFileError for a map without markings, or without cameras.
         """
+        if every_full < 1:
+            raise ConfigError(f"every_full is {every_full}: give a number of images, 1 or more")
         if not hd_map.markings:
             raise MapFileError("the map has no markings; nothing can be localised in it")
         if not calibrations:
@@ -192,6 +197,7 @@ class Localizer:
         self._pace_reason: str | None = None
         self._reasons: dict[str, str] = {}
         self._matched = _Matched()
+        self._looking = Looking(every_full)
 
     def update(
         self, images: Sequence[Look] = (), motion: Sequence[Motion] = (), fixes: Sequence[Fix] = ()
@@ -211,6 +217,30 @@ class Localizer:
         for look in sorted(images, key=lambda item: item.stamp_s):
             self._take(look)
         return self._pose()
+
+    def regions(self, camera: str, stamp_s: float) -> FloatArray | None:
+        """Where to look in the next image of a camera, taken at about a time: around what the map will show.
+
+        Boxes (R, 4) of left, top, right and bottom, px, for :meth:`v2hdm.detection.road.RoadDetector.detect`.
+        None to look everywhere: every few images, and where the place, the map or a mounting is in doubt, few
+        markings are expected, or the last look did not show what was.
+        """
+        if camera not in self._numbers:
+            return None
+        belief = scene = None
+        if self._belief is not None and self._is_settled:
+            belief = self._fixed_to(self._belief, stamp_s)
+            nothing = Look(camera, stamp_s)
+            scene = self._scene(belief, nothing, sighted(nothing, self.calibrations[camera]))
+        newest = self._log.samples[-1:]
+        speed_m_s = newest[0].speed_m_s if newest else 0.0
+        return self._looking.regions(camera, belief, scene, speed_m_s)
+
+    @property
+    def _is_settled(self) -> bool:
+        """Whether nothing speaks against place, map, odometry and mountings."""
+        is_doubted = self._agreement.is_doubtful or self._rig.pushed.is_suspicious
+        return self._is_sure and not is_doubted and self._pace_reason is None
 
     def _take(self, look: Look) -> None:
         """Take a look in its place among those that came before it."""
@@ -378,7 +408,8 @@ class Localizer:
             matched = _Matched(matched.markings, len(of_lines.observations), len(of_areas.observations))
         if is_new:
             self._matched = matched
-        return _with_latest(belief, features)
+            self._looking.of(look.camera).note(matched.markings)
+        return with_latest(belief, features, _MOST_FEATURES)
 
     def _scene(self, belief: Belief, look: Look, quads: Sighted) -> Scene:
         """A look before the map, from about where the vehicle is believed to be."""
@@ -545,15 +576,6 @@ class Localizer:
             matched_lines=self._matched.lines,
             matched_areas=self._matched.areas,
         )
-
-
-def _with_latest(belief: Belief, features: Sequence[int]) -> Belief:
-    """The belief with the features that were seen last; ``features`` are seen now."""
-    earlier = [feature for feature in belief.markings if feature not in set(features)]
-    order = [*earlier, *features]
-    if len(order) <= _MOST_FEATURES:
-        return belief
-    return only_markings(belief, order[-_MOST_FEATURES:])
 
 
 def _protection(covariance: FloatArray, heading_rad: float) -> tuple[float, float, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain, compress, count, islice
 from pathlib import Path
@@ -31,7 +31,7 @@ from v2hdm.errors import ConfigError, DriveError, shown
 from v2hdm.io.calibration.intrinsics import is_calibration, read_intrinsics
 from v2hdm.io.drive import READERS, need_pictures, read_drive
 from v2hdm.pipeline.rough_camera import ROUGH_NAME, RoughCamera, check_size
-from v2hdm.records import Calibration, CameraInfo
+from v2hdm.records import Calibration, CameraInfo, FloatArray
 from v2hdm.safe.pixels import IMAGE_SUFFIXES
 from v2hdm.store.inputs import note_input
 
@@ -39,6 +39,10 @@ _ROUGH_RANGE_M = 40.0  # distances may be wrong by two without a calibration: no
 
 _Frames = Iterator[tuple[Frame, RoadDetector | None]]
 """Frames to look at, and the detector for each as far as it is known before the first."""
+
+
+Regions = Callable[[Frame], FloatArray | None]
+"""Where to look in a frame: boxes (R, 4), px, or None for everywhere."""
 
 
 class Detected(NamedTuple):
@@ -61,6 +65,7 @@ def detect_images(
     limit: int | None = None,
     live: bool = False,
     stopwatch: Stopwatch | None = None,
+    regions: Regions | None = None,
 ) -> Iterator[Detected]:
     """Find markings and lanes in images one after another; the base install is enough.
 
@@ -75,6 +80,8 @@ def detect_images(
         live: of a camera, or a folder that somebody writes images to, take the newest image each time; those
             that came before it are dropped and counted (``frame.dropped``).
         stopwatch: takes the time of each stage.
+        regions: says for a frame of a calibrated camera where markings with corners are looked for, boxes
+            (R, 4) of left, top, right and bottom, px; None for everything everywhere.
 
     Returns:
         An iterator over the images; corners are (4, 2) px in the image as recorded, the top-left pixel's
@@ -106,7 +113,7 @@ def detect_images(
     rough = RoughCamera(detector, lens, path, mounting, linear)
     most = limit and min(limit, sys.maxsize)
     frames = islice((_live_frames if live else _frames)(str(source), road, rough), most)
-    return _on_ground(_glances(frames, rough, stopwatch or Stopwatch()))
+    return _on_ground(_glances(frames, rough, stopwatch or Stopwatch(), regions))
 
 
 def _lens(camera: Path | None, name: str | None, mounting: Sequence[float] | None) -> CameraInfo | None:
@@ -242,7 +249,9 @@ def _camera_and_view(glance: _Glance) -> tuple[str, View]:
     return glance.detected.camera, glance.view
 
 
-def _glances(frames: _Frames, rough: RoughCamera, stopwatch: Stopwatch) -> Iterator[_Glance]:
+def _glances(
+    frames: _Frames, rough: RoughCamera, stopwatch: Stopwatch, regions: Regions | None
+) -> Iterator[_Glance]:
     """The road of every frame."""
     while True:
         with stopwatch.image():
@@ -256,7 +265,7 @@ def _glances(frames: _Frames, rough: RoughCamera, stopwatch: Stopwatch) -> Itera
                 name = ROUGH_NAME if rough.lens is None else rough.lens.name
             else:
                 check_size(frame, road.camera.info, "the calibration" if road.calibration else "the drive")
-                on_road = road.detect(frame.pixels)
+                on_road = road.detect(frame.pixels, regions_px=None if regions is None else regions(frame))
                 name = road.camera.info.name
         view = None
         if road is not None and frame.map_from_vehicle is not None:

@@ -193,8 +193,10 @@ def _local(
     changes = {
         name: getattr(problem, name)[at] for name, at in numbers.items() if getattr(problem, name) is not None
     }
+    ground = None if problem.ground is None else problem.ground.take(cameras)
     local = replace(
         problem,
+        ground=ground,
         observations=replace(observations, camera=camera, frame=frame, corner=corner),
         corner_count=len(corners),
         pose_sigma=problem.pose_sigmas,

@@ -6,20 +6,22 @@ import argparse
 import gc
 import json
 import sys
+import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING
 
 from v2hdm.cli.command import Command
-from v2hdm.errors import DriveError
+from v2hdm.errors import ConfigError, DriveError
 
 if TYPE_CHECKING:
     from v2hdm.detection.frames import Frame
     from v2hdm.detection.road import Road
     from v2hdm.detection.stopwatch import Stopwatch
+    from v2hdm.records import FloatArray
 
 _FIRST = b'{"source": '  # the beginning of every line of detections
 _STAGES = ("read", "horizon", "net", "propose", "lanes", "fit", "judge")
@@ -42,6 +44,8 @@ def _run(arguments: Sequence[str]) -> None:
     parser.add_argument("--limit", type=int, metavar="N", help="stop after N images")
     newest = "process the newest image of a camera or growing folder, and drop older ones"
     parser.add_argument("--live", action="store_true", help=newest)
+    where = "with --live: read where to look next from standard input, JSON lines (docs/detect.md)"
+    parser.add_argument("--regions", action="store_true", help=where)
     parser.add_argument("--output", type=Path, metavar="FILE", help="for the JSON lines (default: stdout)")
     parser.add_argument("--draw", type=Path, metavar="DIR", help="folder for images with detections drawn")
     _detect(parser.parse_args(arguments))
@@ -59,6 +63,8 @@ def _detect(parsed: argparse.Namespace) -> None:
     from v2hdm.store.lines import lines_to
     from v2hdm.store.results import growing_folder
 
+    if parsed.regions and not parsed.live:
+        raise ConfigError("--regions: says where to look in the next image of --live; add --live")
     cv2.setNumThreads(1)
     stopwatch = Stopwatch()
     live = parsed.live or parsed.source.isdecimal()
@@ -75,6 +81,7 @@ def _detect(parsed: argparse.Namespace) -> None:
         limit=parsed.limit,
         live=parsed.live,
         stopwatch=stopwatch,
+        regions=_regions_from(sys.stdin) if parsed.regions else None,
     )
     gc.freeze()  # modules and networks outlive every image: no collection need look at them again
     failure = None
@@ -107,6 +114,15 @@ def _detect(parsed: argparse.Namespace) -> None:
         print(unknown, file=sys.stderr)
     if failure:
         raise failure
+
+
+def _regions_from(stream: IO[str]) -> Callable[[Frame], FloatArray | None]:
+    """Where to look in a frame, by the latest line of a stream if that is of the frame's time."""
+    from v2hdm.detection.pointing import Pointer
+
+    pointer = Pointer()
+    threading.Thread(target=pointer.follow, args=(stream,), name="v2hdm-regions", daemon=True).start()
+    return lambda frame: pointer.regions(frame.stamp_s)
 
 
 def _new_name(name: str, in_use: set[str]) -> str:

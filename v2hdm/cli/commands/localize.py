@@ -72,6 +72,10 @@ def _live_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--delay", type=float, default=0.0, metavar="S", help="from a picture to its file's date"
     )
+    full = (
+        "of N images of a camera, search at least one as a whole, the others where the map expects markings"
+    )
+    parser.add_argument("--every-full", type=int, default=5, metavar="N", help=f"{full} (default: 5)")
     parser.add_argument("--limit", type=int, metavar="N", help="stop after N images")
     parser.add_argument("--output", type=Path, metavar="FILE", help="for the JSON lines (default: stdout)")
     mcap = "a new folder for an MCAP of ROS 2 messages (extra ros)"
@@ -100,7 +104,9 @@ def _run_live(arguments: Sequence[str]) -> int:
     sources = _sources(parsed, by_camera)
     calibrations = {name: content[by_camera[name]] for name in sources}
     prior = None if parsed.start is None else rough_position(*parsed.start)
-    localizer = Localizer(hd_map, calibrations, prior, antenna_m=parsed.antenna)
+    if parsed.every_full < 1:
+        raise ConfigError(f"--every-full {parsed.every_full}: give a number of images, 1 or more")
+    localizer = Localizer(hd_map, calibrations, prior, antenna_m=parsed.antenna, every_full=parsed.every_full)
     is_stdin = parsed.motion == "-"
     lines = MotionLines("standard input" if is_stdin else parsed.motion, hd_map.origin)
     stream_in = sys.stdin if is_stdin else Path(parsed.motion)

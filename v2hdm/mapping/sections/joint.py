@@ -24,7 +24,8 @@ _CONTRADICTION_SIGMAS = 6.0
 """Mean shift of a drive against others, in sigmas of its positions, from which it contradicts them; chosen: a
 receiver's slow errors average out over a network, to about one sigma along a single street."""
 
-_OF_CAMERAS = ("camera_centre", "clock_offsets")  # priors that every section has of the same cameras
+# Priors that every section has of the same cameras.
+_OF_CAMERAS = ("camera_centre", "ground_planes", "clock_offsets")
 
 
 @dataclass(frozen=True)
@@ -144,6 +145,8 @@ def variance_of(fits: Sequence[Fit], whole: Problem) -> VarianceFactors:
     of_cameras = sum(float(np.mean([fit.of_priors.get(name, 0.0) for fit in fits])) for name in _OF_CAMERAS)
     cameras = len(whole.intrinsic)
     held = 0 if whole.centre_sigma_m is None else 3 * cameras
+    if whole.ground is not None:
+        held += int(whole.ground.root_information.any(axis=2).sum())
     free = 2 * len(corners) + 6 * cameras - held
     return variance_factors(squared, 2 * (sum(costs) + of_cameras), free)
 

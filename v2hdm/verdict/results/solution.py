@@ -80,7 +80,7 @@ def check_result(
     """The checks after the solve ``best``, and its mountings against those of bare ground, by session."""
     findings = check_solution(drive, best)
     for session, estimates in zip(drive.sessions, ground, strict=False):
-        of_session = agreement.check_against_ground(best.calibrations, estimates)
+        of_session = agreement.check_against_ground(best, estimates)
         suffix = f" of {session.name}" if drive.joined else ""
         findings += [replace(finding, about=f"{finding.about}{suffix}") for finding in of_session]
     return findings

@@ -1,0 +1,192 @@
+"""Between full searches a tracked vehicle looks only where its map says that markings are."""
+
+import io
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.localization.driven import INTRINSIC, cameras, drive, mapped, moved, yard
+from v2hdm.errors import ConfigError
+from v2hdm.geometry.ipm import project_ground
+from v2hdm.localization.live import _Eye
+from v2hdm.localization.localizer import Localizer, Status
+from v2hdm.localization.regions import expected_boxes
+from v2hdm.localization.seeing import Look
+
+
+def in_regions(look, regions_px):
+    """What a look shows whole in regions (R, 4)."""
+    if regions_px is None:
+        return look
+    low = np.array([marking.corners_px.min(axis=0) for marking in look.markings]).reshape(-1, 1, 2)
+    high = np.array([marking.corners_px.max(axis=0) for marking in look.markings]).reshape(-1, 1, 2)
+    is_in = ((low > regions_px[:, :2]) & (high < regions_px[:, 2:])).all(axis=2).any(axis=1)
+    return replace(
+        look, markings=tuple(m for m, kept in zip(look.markings, is_in, strict=True) if kept), lanes=()
+    )
+
+
+def followed(driven, hd_map, every_full=5, hidden=lambda frame, marking: False):
+    """Poses of a drive whose cameras look where the localiser says, and each moment's regions by camera."""
+    localizer = Localizer(
+        hd_map, driven.calibrations, driven.rough(np.random.default_rng(0)), every_full=every_full
+    )
+    poses, regions = [], []
+    for frame, (looks, motion) in enumerate(zip(driven.looks, driven.motion, strict=True)):
+        localizer.update([], motion)
+        now = {look.camera: localizer.regions(look.camera, look.stamp_s) for look in looks}
+        shown = [
+            replace(look, markings=tuple(m for m in look.markings if not hidden(frame, m))) for look in looks
+        ]
+        poses.append(localizer.update([in_regions(look, now[look.camera]) for look in shown]))
+        regions.append(now)
+    return poses, regions
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_pose_is_as_good_as_with_full_searches(seed):
+    painted = yard(seed)
+    driven = drive(painted, seed)
+    rmse = {}
+    for every_full in (1, 5):
+        poses, regions = followed(driven, mapped(painted, seed), every_full)
+        tracked = [(frame, pose) for frame, pose in enumerate(poses) if pose.status == Status.TRACKING]
+        errors = np.array([driven.errors(pose, frame) for frame, pose in tracked])
+        bounds = np.array([(*pose.protection_m, pose.protection_rad) for _, pose in tracked])
+        assert (np.abs(errors) < bounds).all()
+        rmse[every_full] = np.sqrt((errors[:, :2] ** 2).mean(axis=0))
+        partial = [box is not None for now in regions[len(poses) // 2 :] for box in now.values()]
+        assert np.mean(partial) <= 0.8 * (every_full > 1)
+        assert np.mean(partial) >= 0.5 * (every_full > 1)
+    assert (rmse[5] < np.maximum(1.3 * rmse[1], 0.01)).all()
+
+
+def test_of_every_five_images_of_a_camera_one_is_searched_as_a_whole_and_not_of_all_at_the_same_time():
+    painted = yard(2)
+    driven = drive(painted, 2)
+    _, regions = followed(driven, mapped(painted, 2))
+    for camera in ("front", "rear"):
+        full = [frame for frame, now in enumerate(regions) if now[camera] is None]
+        assert max(np.diff(full)) <= 5
+    both = [all(box is None for box in now.values()) for now in regions[30:]]
+    assert np.mean(both) < 0.2
+
+
+def test_a_marking_that_appears_beside_all_regions_is_found_at_the_next_full_search():
+    painted = yard(3)
+    driven = drive(painted, 3)
+    hd_map = mapped(painted, 3)
+    strange = driven.looks[-1][0].markings[0]
+    appears = 45
+    corner_px = np.array([[60.0, 650.0], [60.0, 640.0], [50.0, 640.0], [50.0, 650.0]])
+    new = replace(strange, kind="stop_line", corners_px=corner_px)
+    looks = [
+        [replace(look, markings=(*look.markings, new)) if frame >= appears else look for look in moment]
+        for frame, moment in enumerate(driven.looks)
+    ]
+    _, regions = followed(replace(driven, looks=looks), hd_map)
+    for camera in ("front", "rear"):
+        shown = [
+            new in in_regions(Look(camera, 0.0, (new,)), now[camera]).markings for now in regions[appears:]
+        ]
+        assert not all(shown)
+        assert any(shown[:5])
+
+
+def test_markings_that_are_hidden_make_the_next_look_a_full_one():
+    painted = yard(4)
+    driven = drive(painted, 4)
+    _, regions = followed(driven, mapped(painted, 4), hidden=lambda frame, marking: 40 <= frame < 50)
+    # One image, or two, without what they were to show, and all after these until some of it is there.
+    assert all(box is None for now in regions[42:50] for box in now.values())
+    assert any(box is not None for now in regions[53:60] for box in now.values())
+
+
+def test_until_the_place_is_sure_all_is_searched():
+    painted = yard(5)
+    driven = drive(painted, 5, seconds=2.0)
+    poses, regions = followed(driven, mapped(painted, 5))
+    begun = next(frame for frame, pose in enumerate(poses) if pose.status == Status.TRACKING)
+    assert all(box is None for now in regions[: begun + 1] for box in now.values())
+
+
+def test_where_markings_were_repainted_it_is_said_with_looks_at_regions_too():
+    painted = yard(7)
+    driven = drive(painted, 7, seconds=10.0)
+    poses, _ = followed(driven, moved(mapped(painted, 7), 0.5, 0.3, beyond_m=32.0))
+    entered = int(np.argmax(driven.poses[:, 0, 3] > 32.0))
+    said = next(frame for frame, pose in enumerate(poses) if frame >= entered and pose.reasons)
+    assert said - entered < 25
+    for frame, pose in enumerate(poses):
+        if pose.status == Status.TRACKING:
+            assert (np.abs(driven.errors(pose, frame)) < [*pose.protection_m, pose.protection_rad]).all()
+
+
+def test_boxes_hold_the_markings_of_the_true_pose():
+    painted = yard(6)
+    driven = drive(painted, 6, seconds=4.0)
+    localizer = Localizer(mapped(painted, 6), driven.calibrations, driven.rough(np.random.default_rng(0)))
+    for looks, motion in zip(driven.looks, driven.motion, strict=True):
+        localizer.update(looks, motion)
+    belief = localizer._belief
+    scene = localizer._scene(belief, driven.looks[-1][0], localizer_quads(driven))
+    boxes = expected_boxes(belief, scene, 4.0)
+    corners = np.array([marking.corners_map for marking in painted.markings])
+    cam_from_map = cameras()["front"].cam_from_vehicle @ np.linalg.inv(driven.poses[-1])
+    pixels, depth_m = project_ground(INTRINSIC, np.tile(cam_from_map, (len(corners), 1, 1)), corners)
+    for box in boxes:
+        is_in = ((pixels > box[:2]) & (pixels < box[2:])).all(axis=(1, 2)) & (depth_m > 0).all(axis=1)
+        assert is_in.any()
+
+
+def localizer_quads(driven):
+    """No detection at all."""
+    from v2hdm.localization.seeing import sighted
+
+    return sighted(Look("front", 0.0), driven.calibrations["front"])
+
+
+def test_a_number_of_images_below_one_is_refused():
+    with pytest.raises(ConfigError, match="give a number of images, 1 or more"):
+        Localizer(yard(0), cameras(), every_full=0)
+
+
+class Asked:
+    """A localiser that says the same of every image."""
+
+    def __init__(self, regions_px):
+        self.regions_px = regions_px
+        self.stamps_s = []
+
+    def regions(self, camera, stamp_s):
+        self.stamps_s.append(stamp_s)
+        return self.regions_px
+
+
+def test_a_camera_is_told_of_the_image_that_it_can_take_next():
+    eye = _Eye(io.StringIO(), delay_s=0.02)
+    asked = Asked(np.array([[1.0, 2.0, 3.0, 4.0]]))
+    for stamp_s in (5.0, 5.1):
+        eye.point(asked, Look("front", stamp_s), now_s=stamp_s + 0.06)
+    eye.point(asked, Look("front", 5.2), now_s=5.33)  # two images have come meanwhile
+    assert asked.stamps_s == pytest.approx([5.2, 5.4])
+    told = [json.loads(line) for line in eye.stream.getvalue().splitlines()]
+    assert [line["stamp_s"] for line in told] == pytest.approx([5.22, 5.42])
+    assert told[0]["regions_px"] == [[1.0, 2.0, 3.0, 4.0]]
+
+
+def test_a_camera_is_told_nothing_where_it_is_to_look_everywhere_and_after_its_end():
+    eye = _Eye(io.StringIO(), delay_s=0.0)
+    for stamp_s in (5.0, 5.1):
+        eye.point(Asked(None), Look("front", stamp_s), now_s=stamp_s + 0.05)
+    assert eye.stream.getvalue() == ""
+
+    class Closed(io.StringIO):
+        def write(self, text):
+            raise BrokenPipeError
+
+    eye = _Eye(Closed(), delay_s=0.0)
+    for stamp_s in (5.0, 5.1):
+        eye.point(Asked(np.zeros((1, 4))), Look("front", stamp_s), now_s=stamp_s + 0.05)

@@ -1,0 +1,56 @@
+"""Where to look in the next image, from lines that somebody else writes: ``v2hdm localize --live``."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from v2hdm.records import FloatArray
+from v2hdm.safe.texts import shown
+
+_log = logging.getLogger(__name__)
+
+_SAME_S = 0.05  # difference, s, of the times of an image and of a line that is of it
+
+
+class _Pointed(NamedTuple):
+    """Boxes (R, 4), px, of an image expected at a time."""
+
+    stamp_s: float
+    regions_px: FloatArray
+
+
+class Pointer:
+    """The latest line; one that cannot be read is left out with a warning, once."""
+
+    def __init__(self) -> None:
+        self._latest: _Pointed | None = None
+        self._has_warned = False
+
+    def follow(self, lines: Iterable[str]) -> None:
+        """Take lines until there are no more."""
+        for line in lines:
+            try:
+                record = json.loads(line)
+                regions_px = np.array(record["regions_px"], dtype=np.float64).reshape(-1, 4)
+                self._latest = _Pointed(float(record["stamp_s"]), regions_px)
+            except (ValueError, TypeError, KeyError):
+                self._latest = None
+                if not self._has_warned:
+                    _log.warning(
+                        "--regions: %s is left out; give stamp_s and regions_px, as "
+                        "[[left, top, right, bottom], ...]",
+                        shown(line.strip()),
+                    )
+                self._has_warned = True
+
+    def regions(self, stamp_s: float | None) -> FloatArray | None:
+        """The boxes (R, 4) for an image taken at a time; None to look everywhere."""
+        latest = self._latest
+        if latest is None or stamp_s is None or abs(latest.stamp_s - stamp_s) > _SAME_S:
+            return None
+        return latest.regions_px
