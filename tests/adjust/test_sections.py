@@ -61,13 +61,15 @@ def finish(number, part, solution):
     }
 
 
-def in_sections(folder: Path, problem: Problem, options: SolveOptions, part_of_frame) -> list[dict]:
+def in_sections(
+    folder: Path, problem: Problem, options: SolveOptions, part_of_frame, at_once: int = 0
+) -> list[dict]:
     """The results of all parts."""
     parts, links = cut(problem, part_of_frame, tuple(options.pose_states))
     for number, part in enumerate(parts):
         save_part(folder, number, part)
     shape = Shape.of(problem, options)
-    joint = join_parts(folder, len(parts), links, shape, lambda number, part, solution: None)
+    joint = join_parts(folder, len(parts), links, shape, lambda number, part, solution: None, at_once=at_once)
     return finish_parts(folder, joint, shape, finish)
 
 
@@ -104,6 +106,16 @@ def test_sections_of_a_street_are_the_street(tmp_path):
     assert part.max() == 3
     options = SolveOptions()
     check(in_sections(tmp_path, scene.problem, options, part), scene.problem, options)
+
+
+def test_sections_that_are_solved_at_once_are_the_street(tmp_path):
+    """Two drives with late clocks, in whose parts corners and frames have numbers of their own."""
+    scene = with_late_clocks(make_scene(3, frames=80, start_error_deg=0.5), np.array([0.004, -0.006]))
+    problem = joined(scene.problem, visited_again(scene, DRIFTING, 5).problem)
+    options = SolveOptions(clock_offset=True)
+    part = np.tile(np.arange(80) // 40, 2)
+    everything = len(problem.observations.corner)
+    check(in_sections(tmp_path, problem, options, part, at_once=everything), problem, options)
 
 
 def test_sections_without_frame_states_are_the_street(tmp_path):
