@@ -388,7 +388,7 @@ def _by_candidate(bundle: Bundle, of_camera: BoolArray, sightings: FloatArray) -
     group = bundle.group[of_camera]
     counts = np.bincount(group, sightings)
     contradicted = np.bincount(group, sightings * ~bundle.inliers[of_camera])
-    return np.column_stack([counts, contradicted])[counts > 0]
+    return np.column_stack([counts, contradicted])[counts > 0].astype(np.float64)
 
 
 def _effective_count(group: IntArray, weight: FloatArray) -> float:
