@@ -28,8 +28,8 @@ from v2hdm.simulate.port.build import Port, build_port
 from v2hdm.simulate.port.config import PortConfig, SignsConfig
 from v2hdm.simulate.port.drive import true_drive
 from v2hdm.site.living.wear import Footage
-from v2hdm.words.patches import Word, patches_of
-from v2hdm.words.reading import reading_of, side_prior, views_of
+from v2hdm.words.patches import Word, best_views, patches_of
+from v2hdm.words.reading import readings_of
 from v2hdm.words.recogniser import Recogniser, load_recogniser
 
 OUTLINE_SIGMA_M = 0.05  # error of a mapped outline's sides, m: half of it in each, as hulls of paint have
@@ -44,7 +44,7 @@ NUMBERS = 24
 
 
 class Result(NamedTuple):
-    """A word of a port: what it says, how it was read, and its patches."""
+    """A word of a port: what it says, how it was read, and its patches if they are kept."""
 
     text: str
     reading: Reading | None
@@ -64,8 +64,8 @@ def port_of(run: str, seed: int) -> PortConfig:
     return replace(config, seed=seed, paint=replace(config.paint, signs=signs))
 
 
-def results_of(config: PortConfig, recogniser: Recogniser) -> list[Result]:
-    """The words of a port that its drive saw twice."""
+def results_of(config: PortConfig, recogniser: Recogniser, *, keep_wrong: bool = False) -> list[Result]:
+    """The words of a port that its drive saw twice, with the patches of those that were not read rightly."""
     port = build_port(config)
     drive, truth = true_drive(config)
     expected = symbols_driven_past(drive, truth, list(drive.cameras), SIGHTINGS)
@@ -77,14 +77,15 @@ def results_of(config: PortConfig, recogniser: Recogniser) -> list[Result]:
     }
     poses = [image.map_from_vehicle for image in drive.images]
     footage = Footage(drive.images, poses, calibrations, None)
-    patches: list[list[list[np.ndarray]]] = [[] for _ in words]
-    for patch in patches_of(words, footage, drive.cameras, _light(port, drive.images)):
-        patches[patch.word].append(patch.upright)
+    light = _light(port, drive.images)
+    readings = readings_of(words, footage, drive.cameras, light, recogniser)
     results = []
-    for number, word, patches_of_word in zip(numbers, words, patches, strict=True):
-        upright = reading_of(views_of(patches_of_word, recogniser), side_prior(word, poses))
-        reading = None if upright is None else upright.reading
-        results.append(Result(truth.texts[number], reading, patches_of_word))
+    for number, word, upright in zip(numbers, words, readings, strict=True):
+        result = Result(truth.texts[number], None if upright is None else upright.reading, [])
+        if keep_wrong and not result.is_right:
+            views = best_views([word], footage, drive.cameras)
+            result.patches.extend(patch.upright for patch in patches_of([word], views, footage, light))
+        results.append(result)
     return results
 
 
@@ -139,7 +140,7 @@ def main() -> None:
     every = []
     for run in parsed.runs:
         for seed in range(*parsed.seeds):
-            results = results_of(port_of(run, seed), recogniser)
+            results = results_of(port_of(run, seed), recogniser, keep_wrong=parsed.wrong is not None)
             print(f"{run}, seed {seed}: {line_of(results)}", flush=True)
             for result in results:
                 if not result.is_right:

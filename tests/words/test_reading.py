@@ -7,13 +7,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tests.words.scene import CAMERA, footage_of, lights, painted, poses, word_map
+from tests.words.scene import ASPHALT, CAMERA, footage_of, lights, painted, poses, word_map
 from v2hdm.errors import ConfigError
 from v2hdm.pipeline.context import Context
 from v2hdm.pipeline.paint import _with_words
 from v2hdm.records import Drive
 from v2hdm.words import recogniser as recognising
-from v2hdm.words.patches import Word, patches_of
+from v2hdm.words.patches import Word, best_views, patches_of
 from v2hdm.words.reading import reading_of, side_prior, with_readings
 from v2hdm.words.recogniser import Letters, load_recogniser
 
@@ -110,11 +110,52 @@ def test_a_shadow_across_a_word_leaves_its_patch_as_it_is():
     shaded = ground.copy()
     shaded[:, 240:] = shaded[:, 240:] // 3
     plain, dark = (
-        next(patches_of([word], footage, {"front": CAMERA}, lights(pixels, footage))).upright
+        next(patches_of([word], [[0]], footage, lights(pixels, footage))).upright
         for pixels in (ground, shaded)
     )
     upright = int(np.argmax(word.up_map @ [1.0, 0.0]))
     assert np.corrcoef(plain[upright].ravel(), dark[upright].ravel())[0, 1] > 0.85
+
+
+@pytest.mark.parametrize(("is_painted", "opened"), [(True, 2), (False, 4)])
+def test_more_than_two_images_of_a_word_are_opened_only_where_two_leave_doubt(is_painted, opened):
+    ground, size_m = painted("EBH")
+    footage = footage_of(poses(0.0, (10.5, 9.0, 7.5, 6.0)))
+    light = lights(ground if is_painted else np.full_like(ground, ASPHALT), footage)
+    paths = []
+
+    def counted(image):
+        paths.append(image.path)
+        return light(image)
+
+    with_readings(word_map(size_m), footage, {"front": CAMERA}, counted, load_recogniser(1))
+    assert len(paths) == len(set(paths)) == opened
+
+
+def test_a_letter_that_a_patch_does_not_list_is_as_probable_as_its_likeliest_other():
+    listed = np.log([[0.7, 0.2, 0.1], [0.2, 0.7, 0.1]])
+    assert np.exp(Letters(listed, "\0A?").log_of("Z")) == pytest.approx(0.7 * 0.1 + 0.1 * 0.2 + 0.1 * 0.1)
+
+
+def test_a_patch_with_the_opposite_side_above_is_the_same_upside_down():
+    ground, size_m = painted("EBH")
+    footage = footage_of(poses(0.2, (6.0,)))
+    word = Word.around(word_map(size_m).symbols[0].outline_map)
+    turned = Word(np.roll(word.corners_map, -2, axis=0))
+    light = lights(ground, footage)
+    upright, after_a_turn = (
+        next(patches_of([rectangle], [[0]], footage, light)).upright for rectangle in (word, turned)
+    )
+    for side, patch in enumerate(upright):
+        grey = after_a_turn[(side + 2) % 4].astype(float)
+        assert np.abs(grey - patch).mean() < 1.0
+
+
+def test_the_best_view_of_a_word_is_the_nearest_that_shows_it_whole():
+    _, size_m = painted("EBH")
+    footage = footage_of(poses(0.0, (12.0, 6.0, 9.0, 0.0)))
+    word = Word.around(word_map(size_m).symbols[0].outline_map)
+    assert best_views([word], footage, {"front": CAMERA}) == [[1, 2, 0]]
 
 
 def test_without_the_extra_there_is_no_recogniser(monkeypatch):

@@ -74,16 +74,15 @@ class Word:
         """The height (4,) in each direction; its width is that of the next."""
         return side_frames(self.corners_map).length
 
-    def grid(self, direction: int, finer: int) -> FloatArray:
-        """The ground (rows, columns, 2) under a patch with ``finer`` rows a px, with that side above."""
+    def grid(self, direction: int) -> FloatArray:
+        """The ground (rows + 1, columns + 1, 2) under the corners of a patch's px, with that side above."""
         size_m = self.size_m[[direction, (direction + 1) % DIRECTIONS]]
         height_m, width_m = size_m + 2 * _MARGIN * size_m.min()
-        columns = round(float(np.clip(_STRETCH * HEIGHT_PX * width_m / height_m, *_WIDTHS_PX))) * finer
-        rows = HEIGHT_PX * finer
+        columns = round(float(np.clip(_STRETCH * HEIGHT_PX * width_m / height_m, *_WIDTHS_PX)))
         up = self.up_map[direction]
         right = -turned_left(up)
-        down_m = ((np.arange(rows) + 0.5) / rows - 0.5) * height_m
-        right_m = ((np.arange(columns) + 0.5) / columns - 0.5) * width_m
+        down_m = np.linspace(-0.5, 0.5, HEIGHT_PX + 1) * height_m
+        right_m = np.linspace(-0.5, 0.5, columns + 1) * width_m
         return np.asarray(self.middle_map + right_m[:, None] * right - down_m[:, None, None] * up)
 
 
@@ -97,16 +96,19 @@ class Patch(NamedTuple):
 
 def patches_of(
     words: Sequence[Word],
+    views: Sequence[Sequence[int]],
     footage: Footage,
-    cameras: Mapping[str, Camera],
     light: Callable[[Image], NDArray[np.float32]],
     threads: int = 1,
 ) -> Iterator[Patch]:
-    """The patches of each word in the images that show it best, whole and not under the own vehicle.
+    """The patches of each word in its ``views``, indices of images, in the order of the images.
 
     ``light`` reads an image as grey values (H, W), 0 to 255, in which paint of any colour is bright.
     """
-    words_of_image = _best_views(words, footage, cameras)
+    words_of_image: dict[int, list[int]] = {}
+    for number, views_of_word in enumerate(views):
+        for index in views_of_word:
+            words_of_image.setdefault(index, []).append(number)
     order = sorted(words_of_image)
     with ThreadPoolExecutor(threads) as readers:
         for start in range(0, len(order), 8 * threads):  # limits the decoded images in memory
@@ -118,20 +120,33 @@ def patches_of(
 
 
 def _cut(word: Word, footage: Footage, index: int, pixels: NDArray[np.float32]) -> list[Grey]:
+    upright = [_sampled(word.grid(direction), footage, index, pixels) for direction in range(DIRECTIONS // 2)]
+    # With the opposite side above, the same px are upside down.
+    return [*upright, *(np.ascontiguousarray(patch[::-1, ::-1]) for patch in upright)]
+
+
+def _sampled(
+    corners_map: FloatArray, footage: Footage, index: int, pixels: NDArray[np.float32]
+) -> NDArray[np.uint8]:
+    """The patch whose px have these corners (rows + 1, columns + 1, 2) on the ground."""
     info = footage.calibrations[footage.images[index].camera].info
-    patches = []
-    for direction in range(DIRECTIONS):
-        places_map = word.grid(direction, 1)
-        px = distort_points(info, footage.pinhole_px(index, places_map[:, 0])[0])
-        # As many samples a px of the patch as the image has: none of its px is skipped.
-        finer = max(math.ceil(np.linalg.norm(np.diff(px, axis=0), axis=1).max()), 1)
-        places_map = word.grid(direction, finer)
-        px = distort_points(info, footage.pinhole_px(index, places_map.reshape(-1, 2))[0])
-        places_px = px.reshape(places_map.shape).astype(np.float32)
-        sampled = cv2.remap(pixels, places_px[..., 0], places_px[..., 1], cv2.INTER_LINEAR)
-        size = (sampled.shape[1] // finer, HEIGHT_PX)
-        patches.append(_levelled(cv2.resize(sampled, size, interpolation=cv2.INTER_AREA)))
-    return patches
+    px = distort_points(info, footage.pinhole_px(index, corners_map.reshape(-1, 2))[0])
+    corners_px = px.reshape(corners_map.shape).astype(np.float32)
+    # As many samples a px of the patch as the image has: none of its px is skipped.
+    finer = max(math.ceil(np.linalg.norm(np.diff(corners_px[:, 0], axis=0), axis=1).max()), 1)
+    # Within a px of a patch the view is as good as a parallel one.
+    rows_px = _between(corners_px, finer)
+    places_px = _between(rows_px.swapaxes(0, 1), finer).swapaxes(0, 1)
+    sampled = cv2.remap(pixels, places_px[..., 0], places_px[..., 1], cv2.INTER_LINEAR)
+    size = (corners_map.shape[1] - 1, corners_map.shape[0] - 1)
+    return _levelled(cv2.resize(sampled, size, interpolation=cv2.INTER_AREA))
+
+
+def _between(corners: NDArray[np.float32], finer: int) -> NDArray[np.float32]:
+    """The middles (N * finer, ...) of ``finer`` parts of each interval between N + 1 corners (N + 1, ...)."""
+    share = ((np.arange(finer, dtype=np.float32) + 0.5) / finer)[:, None, None]
+    parts = corners[:-1, None] + share * np.diff(corners, axis=0)[:, None]
+    return np.asarray(parts.reshape(-1, *corners.shape[1:]), dtype=np.float32)
 
 
 def _levelled(patch: np.ndarray) -> Grey:
@@ -147,12 +162,10 @@ def _levelled(patch: np.ndarray) -> Grey:
     return np.asarray(np.clip(_GREYS[0] + share * (_GREYS[1] - _GREYS[0]), 0.0, 255.0), dtype=np.uint8)
 
 
-def _best_views(
-    words: Sequence[Word], footage: Footage, cameras: Mapping[str, Camera]
-) -> dict[int, list[int]]:
-    """The words by image, each in those of its images that have the most pixels a metre."""
+def best_views(words: Sequence[Word], footage: Footage, cameras: Mapping[str, Camera]) -> list[list[int]]:
+    """The images of each word that show it whole, not under the own vehicle, the sharpest first."""
     if not words:
-        return {}
+        return []
     tree = cKDTree([word.middle_map for word in words])
     views: list[list[tuple[float, int]]] = [[] for _ in words]
     for index, (image, pose) in enumerate(zip(footage.images, footage.map_from_vehicle, strict=True)):
@@ -171,11 +184,8 @@ def _best_views(
                 continue
             sides_px = np.linalg.norm(np.roll(px, -1, axis=0) - px, axis=1)
             views[number].append((float((sides_px / words[number].size_m).min()), index))
-    words_of_image: dict[int, list[int]] = {}
-    for number, views_of_word in enumerate(views):
-        for index in _apart([index for _, index in sorted(views_of_word, reverse=True)], footage):
-            words_of_image.setdefault(index, []).append(number)
-    return words_of_image
+    ranked = ([index for _, index in sorted(views_of_word, reverse=True)] for views_of_word in views)
+    return [_apart(indices, footage) for indices in ranked]
 
 
 def _apart(indices: Sequence[int], footage: Footage) -> list[int]:

@@ -30,6 +30,7 @@ _NO_LETTER = 0  # channel of "no new letter"
 _SMALL_LETTER = 0.2  # chosen: most words are capitals
 _OTHER_SIGN = 0.02  # chosen: rare, and the network takes illegible paint for one of its 18,000 Chinese signs
 
+_ANY_OTHER = "\ufffd"  # stands for the likeliest of all letters that a patch does not list
 _FAINTEST = 1e-12  # least probability of a letter: none is impossible
 
 MISSING = "words are mapped but not read: install the text extra, pip install 'v2hdm[text]'"
@@ -37,7 +38,10 @@ MISSING = "words are mapped but not read: install the text extra, pip install 'v
 
 @dataclass(frozen=True)
 class Letters:
-    """The log probabilities (T, C) of letters along a patch."""
+    """The log probabilities (T, C) of letters along a patch.
+
+    A letter that is not in the ``alphabet`` has the probability of its last.
+    """
 
     log_probability: FloatArray
     alphabet: str
@@ -67,14 +71,16 @@ class Letters:
         skips[3::2] = letters[1:] != letters[:-1]
         forward = np.full(len(states), -np.inf)
         forward[:2] = self.log_probability[0, states[:2]]
-        for column in self.log_probability[1:]:
-            stepped = np.logaddexp(forward, np.append(-np.inf, forward[:-1]))
-            skipped = np.append([-np.inf, -np.inf], forward[:-2])
-            forward = np.where(skips, np.logaddexp(stepped, skipped), stepped) + column[states]
+        stepped = np.full(len(states), -np.inf)
+        skipped = np.full(len(states), -np.inf)
+        for column in self.log_probability[1:, states]:
+            stepped[1:] = forward[:-1]
+            skipped[2:] = np.where(skips[2:], forward[:-2], -np.inf)
+            forward = np.logaddexp(np.logaddexp(forward, stepped), skipped) + column
         return float(np.logaddexp(forward[-1], forward[-2]))
 
     def _channels(self, text: str) -> IntArray:
-        return np.array([self.alphabet.index(letter) for letter in text])
+        return np.array([self.alphabet.find(letter) for letter in text]) % len(self.alphabet)
 
 
 @dataclass(frozen=True)
@@ -85,22 +91,39 @@ class Recogniser:
     alphabet: str
 
     def read(self, patch: NDArray[np.uint8]) -> Letters:
-        """The letters of a patch (48, W) of grey values, 0 to 255, whose text runs from left to right."""
+        """The letters of a patch (48, W) of grey values, 0 to 255, whose text runs from left to right.
+
+        Their alphabet is that of the ground and whatever else is likeliest somewhere along the patch.
+        """
         grey = np.asarray(patch / np.float32(_GREY_HALF) - 1, dtype=np.float32)
         batch = np.broadcast_to(grey, (1, 3, *grey.shape))
         (output,) = self.session.run(None, {self.session.get_inputs()[0].name: np.ascontiguousarray(batch)})
-        weighted = np.asarray(output[0], dtype=np.float64) * self._weights + _FAINTEST
-        return Letters(np.log(weighted / weighted.sum(axis=1, keepdims=True)), self.alphabet)
+        weighted = output[0] * self._weights
+        weighted += np.float32(_FAINTEST)
+        channels = np.unique(np.append(self._usual, weighted.argmax(axis=1)))
+        total = weighted.sum(axis=1)
+        kept = weighted[:, channels]
+        weighted[:, channels] = 0.0
+        probability = np.column_stack([kept, weighted.max(axis=1)]).astype(np.float64) / total[:, None]
+        return Letters(
+            np.log(np.maximum(probability, _FAINTEST)),
+            "".join([*(self.alphabet[channel] for channel in channels), _ANY_OTHER]),
+        )
 
     @cached_property
-    def _weights(self) -> FloatArray:
+    def _weights(self) -> NDArray[np.float32]:
         """The weight (C,) of each channel before anything is seen."""
-        weights = np.full(len(self.alphabet), _OTHER_SIGN)
-        for channel, letter in enumerate(self.alphabet):
-            if letter.isascii() and letter.isalnum():
-                weights[channel] = _SMALL_LETTER if letter.islower() else 1.0
-        weights[_NO_LETTER] = 1.0
+        weights = np.full(len(self.alphabet), _OTHER_SIGN, dtype=np.float32)
+        for channel in self._usual.tolist():
+            weights[channel] = _SMALL_LETTER if self.alphabet[channel].islower() else 1.0
         return weights
+
+    @cached_property
+    def _usual(self) -> IntArray:
+        """The channels of "no new letter" and of the letters and digits of the ground."""
+        is_usual = [letter.isascii() and letter.isalnum() for letter in self.alphabet]
+        is_usual[_NO_LETTER] = True
+        return np.flatnonzero(is_usual)
 
 
 def load_recogniser(threads: int) -> Recogniser | None:
@@ -119,6 +142,8 @@ def load_recogniser(threads: int) -> Recogniser | None:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.log_severity_level = 3
+    # Threads that spin while they wait take the time of the workers beside them.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
         session = onnxruntime.InferenceSession(str(files[0]), options, providers=["CPUExecutionProvider"])
         lines = session.get_modelmeta().custom_metadata_map[_LETTERS].split("\n")

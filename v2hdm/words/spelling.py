@@ -53,8 +53,9 @@ def alike_strings(texts: Iterable[str], alphabet: str) -> list[list[str]]:
     Only letters of the ``alphabet`` are used.
     """
     groups: dict[str, set[str]] = {}
+    usable = set(alphabet)
     for text in sorted(texts):
-        spelled = {spelling for spelling in _spellings(text) if set(spelling) <= set(alphabet)}
+        spelled = {spelling for spelling in _spellings(text) if set(spelling) <= usable}
         groups.setdefault(text.translate(_AS_DIGITS), set()).update(spelled)
     return [sorted(group) for group in groups.values()]
 
