@@ -196,6 +196,8 @@ def _write(ride: Ride, folder: Path, process: subprocess.Popen[str], seconds: fl
             image = ride.drive.images[i]
             partial = folder / image.camera / "partial"
             shutil.copyfile(image.path, partial)
+            # Exposed when it was due, however late this process was to write it.
+            os.utime(partial, (float(stamp_s[moment]), float(stamp_s[moment])))
             partial.replace(folder / image.camera / f"{moment:06d}.jpg")
 
 
