@@ -160,7 +160,7 @@ def _look(camera, stamp_s, cam_from_map, painted, rng):
 
 
 def _piece(cam_from_map, points_map, rng):
-    """What an image shows of a line within 14 m, with errors across that are alike along it."""
+    """The piece of a line that an image shows within 14 m, with errors across that are alike along it."""
     pixels, depth_m = project_ground(
         INTRINSIC, np.tile(cam_from_map, (len(points_map), 1, 1)), points_map[:, None]
     )

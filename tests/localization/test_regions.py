@@ -17,7 +17,7 @@ from v2hdm.localization.seeing import Look
 
 
 def in_regions(look, regions_px):
-    """What a look shows whole in regions (R, 4)."""
+    """The part of a look that lies whole in regions (R, 4)."""
     if regions_px is None:
         return look
     low = np.array([marking.corners_px.min(axis=0) for marking in look.markings]).reshape(-1, 1, 2)
@@ -210,7 +210,7 @@ def view():
 
 @pytest.mark.parametrize("late", [0, 1, 2])
 def test_of_every_five_images_one_is_whole_however_late_they_are_told(view, late):
-    """What is said of an image was said ``late`` images before, when newer ones had not been seen."""
+    """An image is told of ``late`` images before, when newer ones have not been seen."""
     looking = Looking(5)
     told = {}
     wholes = []

@@ -27,6 +27,7 @@ _RANGE_M = 20.0  # distance, m, up to which markings are found at almost every l
 _MOST = 8  # markings that are looked for: of more, few say anything new of a vehicle's six unknowns
 _LEAST = 4  # markings with which a look is worth it; where fewer are expected, all is searched
 _MOST_SHARE = 0.16  # share of the image that is looked at
+# Ranks of markings by distance, in parts of their number, in the order in which they are chosen.
 _HALVES = (0.0, 1.0, *(numerator / 2**power for power in range(1, 5) for numerator in range(1, 2**power, 2)))
 _AROUND_M = 0.25  # way, m, around a marking that is looked at
 _AROUND_PX = 6.0  # px beside
@@ -66,13 +67,13 @@ class Glances:
     expected: int = 0
     was_as_expected: bool = False
 
-    def note(self, stamp_s: float, is_whole: bool, found: int) -> None:
+    def note(self, stamp_s: float, is_whole: bool, markings: int) -> None:
         """Take a look and the number of markings that it showed."""
         self.stamps_s.append(stamp_s)
         if is_whole:
             self.whole_s = stamp_s
         expected = 0 if is_whole else self.expected
-        self.was_as_expected = found >= _FOUND * max(expected, _LEAST)
+        self.was_as_expected = markings >= _FOUND * max(expected, _LEAST)
 
     @property
     def interval_s(self) -> float | None:

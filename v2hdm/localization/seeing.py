@@ -45,7 +45,7 @@ class Look:
 
     @classmethod
     def of(cls, camera: str, stamp_s: float, road: Road) -> Look:
-        """What a :class:`~v2hdm.detection.road.RoadDetector` has found in an image."""
+        """The look that a :class:`~v2hdm.detection.road.RoadDetector` has had at an image."""
         markings = tuple(marking.image for marking in road.markings)
         return cls(camera, stamp_s, markings, tuple(lane.image for lane in road.lanes), road.is_whole)
 
