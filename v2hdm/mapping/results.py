@@ -36,6 +36,8 @@ class CameraFit:
     variance_factor: float
     rejected_share: float  # weighted by the corners' information
     sightings: float  # effective number: as many of equal information would tell as much about the share
+    # Of each candidate, (J, 2): sightings, which add up to all, and those of them that are contradicted.
+    by_candidate: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 class ForeignSegment(NamedTuple):

@@ -1,7 +1,7 @@
-"""Short drives past few markings and the running boards of parked cars, whose bare ground has been measured.
+"""Short drives past three dashes and the running boards of parked cars, whose bare ground has been measured.
 
-A running board looks like a dash from some images on, and stands 35 cm above the ground. On so short a way a
-few of them turn a camera, unless its bare ground holds it.
+A running board looks like a dash in some images, and stands 35 cm above the ground. On so short a way they
+turn a camera, unless its bare ground holds it.
 """
 
 from __future__ import annotations
@@ -30,6 +30,8 @@ from v2hdm.records import (
 
 CAMERA = "front"
 _WAY_M = 22.0  # length of the drive
+_DASHES = 3  # number of dashes
+_FIRST_M = 6.0  # least distance ahead of the start of a dash
 _BOARD_M = np.array([[1.8, 0.12], [0.0, 0.12], [0.0, 0.0], [1.8, 0.0]])  # ahead and to the right
 _ABOVE_M = 0.35  # height of the boards
 _BESIDE_M = 3.0  # distance of the boards to the right of the path
@@ -50,8 +52,8 @@ class ShortDrive(NamedTuple):
 
 
 def make_short(recipe: Recipe) -> ShortDrive:
-    """The first metres of a made drive, with running boards, its ground measured as well as is stated."""
-    world = make(recipe)
+    """The first metres of a made drive past dashes and boards, its ground measured as well as is stated."""
+    world = _with_few(make(recipe))
     whole = drive_of(world)
     station_m = world.station_m - world.station_m[0]
     images = [
@@ -69,6 +71,19 @@ def make_short(recipe: Recipe) -> ShortDrive:
         for in_image in found
     ]
     return ShortDrive(drive, with_boards, truth_of(world, drive, visibility))
+
+
+def _with_few(world: World) -> World:
+    """The world with the first dashes of the way, and nothing else painted."""
+    start = world.map_from_vehicle[0]
+    ahead_m = (world.corners_map.mean(axis=1) - start[:3, 3]) @ start[:3, 0]
+    painted = world.port.hd_map.markings
+    is_dash = np.array([marking.kind == LANE_DASH for marking in painted])
+    dashes = np.flatnonzero(is_dash & (ahead_m > _FIRST_M))
+    chosen = dashes[np.argsort(ahead_m[dashes])][:_DASHES]
+    hd_map = replace(world.port.hd_map, markings=tuple(painted[k] for k in chosen.tolist()))
+    port = replace(world.port, hd_map=hd_map)
+    return replace(world, port=port, corners_map=world.corners_map[chosen])
 
 
 def _measured(world: World, camera: Camera) -> Camera:
