@@ -80,7 +80,7 @@ from v2hdm.records import (
 from v2hdm.report.metrics import driven_past, marking_metrics, match_markings
 from v2hdm.site import hypotheses, markings, parallax, posterior, standing, symbols
 from v2hdm.verdict.inputs import alignment
-from v2hdm.verdict.results import solution
+from v2hdm.verdict.results import accuracy, solution
 from v2hdm.verdict.verdict import Status
 
 SEED = 5_318_008
@@ -219,6 +219,7 @@ def sizes() -> Iterator[Part]:
     )
     yield "sightings of rejected corners", partial(patch.object, recovery, "_effective_count", _countless)
     yield "clocks: prior of being late", partial(patch.object, poses, "_UNSTATED_CLOCK_S", 0.0)
+    yield "lenses: errors that nothing shows", partial(patch.object, accuracy, "_unseen_lenses", _none_unseen)
     yield "clocks: uneven stamps are no counted ones", partial(patch.object, poses, "_UNEVEN_S", np.inf)
     yield "clocks: prior of their drift", partial(patch.object, poses, "_UNSTATED_CLOCK_DRIFT_S", 0.0)
     yield "heading: held against surveys", partial(patch.object, alignment, "_ASKEW_RAD", np.deg2rad(1.0))
@@ -291,6 +292,10 @@ def _without_size(column: str, nothing: float) -> Iterator[None]:
 
 def _recorded(solved: Sensitivity) -> Any:
     return solved.arrays.vehicle_from_map.inverse()
+
+
+def _none_unseen(*_: Any) -> Iterator[Any]:
+    return iter(())
 
 
 def _countless(*_: Any) -> float:

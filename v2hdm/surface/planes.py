@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,6 +16,14 @@ from v2hdm.surface.surface import Surface
 _STRIP_M = 2.0  # half width of the strip about the path whose texture bare ground matches
 _FAR_M = 10.0  # distance from the camera up to which its texture is fine enough to match
 _FRAMES = 24  # frames at which the ground is looked at: about one for each metre of a short drive
+
+
+class _MeanPlane(NamedTuple):
+    """The mean of a curved ground above the vehicle's plane."""
+
+    height_m: float  # at the vehicle's origin
+    forwards: float  # slope
+    sideways: float  # slope to the left
 
 
 def with_planes_over(
@@ -30,13 +39,13 @@ def with_planes_over(
     out = dict(cameras)
     for (name, camera), mounting in zip(cameras.items(), cam_from_vehicle, strict=True):
         plane = camera.ground_plane
-        height_m, forwards, sideways = _mean_plane(surface, camera, mounting, map_from_vehicle)
-        if plane is None or not np.isfinite(height_m):
+        mean = _mean_plane(surface, camera, mounting, map_from_vehicle)
+        if plane is None or mean is None:
             continue
-        upwards = np.array([-forwards, -sideways, 1.0])
+        upwards = np.array([-mean.forwards, -mean.sideways, 1.0])
         upwards /= np.linalg.norm(upwards)
         centre = camera_centre(mounting)
-        lower_m = upwards @ (centre - [0.0, 0.0, height_m]) - centre[2]
+        lower_m = upwards @ (centre - [0.0, 0.0, mean.height_m]) - centre[2]
         shift = np.append(mounting[:3, :3] @ (upwards - [0.0, 0.0, 1.0]), lower_m)
         out[name] = replace(camera, ground_plane=replace(plane, plane_cam=plane.plane_cam - shift))
     return out
@@ -44,23 +53,22 @@ def with_planes_over(
 
 def _mean_plane(
     surface: Surface, camera: Camera, cam_from_vehicle: FloatArray, map_from_vehicle: FloatArray
-) -> tuple[float, float, float]:
-    """Height, m, and slopes forwards and to the left of the mean ground in a camera's view; nan for none."""
+) -> _MeanPlane | None:
+    """The mean ground in a camera's view; None where it sees none near its path."""
     centre = camera_centre(cam_from_vehicle)[:2]
-    low, high = camera.roi_vehicle.min(axis=0), camera.roi_vehicle.max(axis=0)
+    low = camera.roi_vehicle.min(axis=0)
+    high = camera.roi_vehicle.max(axis=0)
     ahead_m = np.arange(low[0], high[0] + 0.5)
     left_m = np.linspace(max(low[1], -_STRIP_M), min(high[1], _STRIP_M), 5)
     grid = np.stack(np.meshgrid(ahead_m, left_m), axis=-1).reshape(-1, 2)
     is_near = np.linalg.norm(grid - centre, axis=1) < _FAR_M
     grid = grid[is_near & inside_convex(camera.roi_vehicle, grid)]
     if len(grid) < 3:
-        return float("nan"), 0.0, 0.0
+        return None
     frames = np.unique(np.linspace(0, len(map_from_vehicle) - 1, _FRAMES).round().astype(np.int64))
     poses = map_from_vehicle[frames]
     points_map = grid @ poses[:, :2, :2].swapaxes(1, 2) + poses[:, None, :2, 3]
     above_m = surface.seen_height_m(points_map.reshape(-1, 2), np.repeat(frames, len(grid)))
     columns = np.column_stack([np.ones(len(grid)), grid])
-    height_m, forwards, sideways = np.linalg.lstsq(
-        columns, above_m.reshape(len(frames), -1).mean(axis=0), rcond=None
-    )[0].tolist()
-    return height_m, forwards, sideways
+    mean_m = above_m.reshape(len(frames), -1).mean(axis=0)
+    return _MeanPlane(*np.linalg.lstsq(columns, mean_m, rcond=None)[0].tolist())

@@ -114,8 +114,8 @@ def _unseen_lenses(evidence: SolveEvidence | None, goal_m: float) -> Iterator[Fi
     for test in evidence.score_tests:
         moved_m = CLEAR_SIGMAS * max(test.sigma, test.model_sigma) * test.moves_m
         check = test.fault.check
-        known = goal_m if check not in largest else largest[check][0]
-        if test.fault.is_of_lens and np.isfinite(moved_m) and moved_m > known and check not in raised:
+        least_m = goal_m if check not in largest else largest[check][0]
+        if test.fault.is_of_lens and np.isfinite(moved_m) and moved_m > least_m and check not in raised:
             largest[check] = moved_m, test
     for check, (moved_m, test) in largest.items():
         size = test.fault.shown(CLEAR_SIGMAS * max(test.sigma, test.model_sigma))

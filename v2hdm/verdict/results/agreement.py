@@ -161,17 +161,17 @@ def _against(mapped: Calibration, ground: Calibration) -> OffGround:
     return OffGround(turn_deg, up_m, mounting_sigmas(ground, mapped, of_both=True))
 
 
-def _judged(name: str, apart: OffGround) -> Finding:
-    most_deg = np.abs(apart.turn_deg).max()
-    small = most_deg < _LEAST_TURN_DEG and abs(apart.up_m) < _LEAST_HEIGHT_M
-    sigmas = 0.0 if small else apart.sigmas
-    roll, pitch, yaw = apart.turn_deg
+def _judged(name: str, deviation: OffGround) -> Finding:
+    most_deg = np.abs(deviation.turn_deg).max()
+    small = most_deg < _LEAST_TURN_DEG and abs(deviation.up_m) < _LEAST_HEIGHT_M
+    sigmas = 0.0 if small else deviation.sigmas
+    roll, pitch, yaw = deviation.turn_deg
     return judge(
         "ground", name, sigmas, _GROUND_LIMIT_SIGMAS, "sigmas",
         fine=f"markings and bare ground agree on its mounting ({most_deg:.2f} deg at most)",
         wrong=f"markings and bare ground do not agree on its mounting (roll {roll:+.2f}, pitch {pitch:+.2f}, "
-        f"yaw {yaw:+.2f} deg, height {100 * apart.up_m:+.0f} cm): wrong associations, or ground that is not "
-        "flat; look at the overlay",
+        f"yaw {yaw:+.2f} deg, height {100 * deviation.up_m:+.0f} cm): wrong associations, or ground that is "
+        "not flat; look at the overlay",
     )  # fmt: skip
 
 
