@@ -26,10 +26,12 @@ SBOM_TOOLS := $(VENV)-sbom/bin/cyclonedx-py
 # What an installation is made of: the kernels are compiled by it.
 INSTALLED_FROM := pyproject.toml constraints.txt hatch_build.py $(wildcard v2hdm/native/src/*)
 
-.PHONY: map test check docs audit installs dist sbom clean
+.PHONY: map test check docs audit installs installed dist sbom clean
 
 map: $(MAP_INSTALLED)
 	$(BIN)/python -m v2hdm.map $(ARGS)
+
+installed: $(DEV_INSTALLED)
 
 # The tests run side by side; more threads in each would only get in their way.
 test: export OMP_NUM_THREADS = 1

@@ -1,9 +1,9 @@
 """Each extra keeps what the documents promise: ``make installs`` installs the wheel and tries it.
 
-The wheel is built once. An environment begins with the base install and grows to ``[map]``; ``[map,ros]``,
-``[map,video]`` and ``[map,text]`` stand beside it, each on top of ``[map]`` alone. A page, or a section,
-begins with what it needs; its commands run in the environment with just that, on the small drive of the
-documents' tests.
+The wheel is built once. The base install and ``[map]`` have an environment each; ``[map,ros]``,
+``[map,video]`` and ``[map,text]`` stand on ``[map]``. A page, or a section, begins with what it needs; its
+commands run in the environment with just that, on the small drive of the documents' tests, which the first
+command of ``[map]`` renders and maps.
 """
 
 from __future__ import annotations
@@ -27,9 +27,8 @@ from tests.docs.smaller import SMALL_PORT, smaller
 from v2hdm.cli.main import all_commands
 
 _NEEDS = re.compile(r"\*Needs `pip install '?\.(?:\[([a-z,]+)\])?'?`")
-_PIP = [
-    "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-compile",
-    "-c", str(ROOT / "constraints.txt"),
+_INSTALL = [
+    "install", "--quiet", "--disable-pip-version-check", "--no-compile", "-c", str(ROOT / "constraints.txt"),
 ]  # fmt: skip
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 
@@ -46,6 +45,11 @@ PROMISES = {
 }
 """Words by document: each line of a block with one of them is run."""
 
+MAP_PORT = f"v2hdm map +run=port2 workers=1 {' '.join(map(repr, SMALL_PORT))}"
+
+FIRST = f"{MAP_PORT} all_maps=true"
+"""Makes the drive and the result on which all other commands work."""
+
 MORE = {
     "": (
         "v2hdm export map.geojson --format geojson --output exported",
@@ -53,7 +57,6 @@ MORE = {
         "v2hdm --version",
     ),
     "map": (
-        f"v2hdm map +run=port2 workers=1 resume=false all_maps=true {' '.join(map(repr, SMALL_PORT))}",
         "v2hdm export map.geojson --format lanelet2",
         "v2hdm experiment --cfg job",
         "python -c 'import v2hdm.paper, v2hdm.experiment.run'",
@@ -70,9 +73,9 @@ MORE = {
     ),
     "map,text": (
         "python -c 'from v2hdm.words.recogniser import load_recogniser; assert load_recogniser(1)'",
-        f"v2hdm map +run=port2 workers=1 {' '.join(map(repr, SMALL_PORT))}",
+        MAP_PORT,
     ),
-    "map,pdf": (f"v2hdm map +run=port2 report.pdf=true workers=1 {' '.join(map(repr, SMALL_PORT))}",),
+    "map,pdf": (f"{MAP_PORT} report.pdf=true",),
 }
 """What no page has as a short command of its own, by extras."""
 
@@ -86,13 +89,18 @@ class Environment:
     python: Path
     packages: list[Path] = field(default_factory=list)
 
-    def install(self, *what: str) -> None:
-        """Install packages."""
-        subprocess.run([self.python, *_PIP, *what], check=True)
+    @classmethod
+    def new(cls, folder: Path, *what: str) -> Environment:
+        """One with packages alone, and no pip: that of this Python installs them."""
+        subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder], check=True)
+        python = folder / "bin" / "python"
+        subprocess.run([sys.executable, "-m", "pip", "--python", python, *_INSTALL, *what], check=True)
+        return cls(python)
 
     def beside(self, folder: Path, *what: str) -> Environment:
         """This environment with packages beside its own."""
-        subprocess.run([self.python, *_PIP, "--target", folder, *what], check=True)
+        pip = [sys.executable, "-m", "pip", "--python", self.python]
+        subprocess.run([*pip, *_INSTALL, "--target", folder, *what], check=True)
         return Environment(self.python, [folder])
 
     def run(self, line: str, here: Path) -> subprocess.CompletedProcess[str]:
@@ -131,12 +139,7 @@ def _small(line: str) -> str:
 
 
 def prepare(folder: Path) -> None:
-    """The folder in which the documents' commands find what they name, and a drive with a video."""
-    given = ["map", "+run=port2", *SMALL_PORT, "workers=1"]
-    subprocess.run(
-        [sys.executable, "-m", "v2hdm", *given], cwd=folder, check=True, stdout=subprocess.DEVNULL,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-    )  # fmt: skip
+    """Lay out what the documents' commands name beside a map, and a drive with a video."""
     furnish(folder)
     film = folder / "drives" / "film"
     shutil.copytree(folder / "drives" / "mysite", film)
@@ -208,18 +211,18 @@ def main() -> int:
         build = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation"]
         subprocess.run([*build, "--disable-pip-version-check", "-w", wheels, ROOT], check=True)
         (wheel,) = wheels.glob("*.whl")
+        mapping = Environment.new(Path(scratch) / "map", f"{wheel}[map]")
+        if failed := tried("map", mapping, [FIRST], here):
+            return failed
         prepare(here)
-        subprocess.run([sys.executable, "-m", "venv", Path(scratch) / "venv"], check=True)
-        base = Environment(Path(scratch) / "venv" / "bin" / "python")
-        base.install(str(wheel))
+        base = Environment.new(Path(scratch) / "base", str(wheel))
         failed = tried("base", base, lines_of(""), here) + missing(base, here)
-        base.install(f"{wheel}[map]")
-        failed += tried("map", base, lines_of("map"), here)
-        ros = base.beside(packages / "ros", *EXTRAS["ros"])
+        failed += tried("map", mapping, lines_of("map"), here)
+        ros = mapping.beside(packages / "ros", *EXTRAS["ros"])
         failed += tried("map,ros", ros, lines_of("map,ros"), here)
-        video = base.beside(packages / "video", *EXTRAS["video"])
+        video = mapping.beside(packages / "video", *EXTRAS["video"])
         failed += tried("map,video", video, lines_of("map,video"), here)
-        text = base.beside(packages / "text", *EXTRAS["text"])
+        text = mapping.beside(packages / "text", *EXTRAS["text"])
         failed += tried("map,text", text, lines_of("map,text"), here)
     print(f"{failed} failed" if failed else "every promise is kept")
     return failed

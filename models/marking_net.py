@@ -47,26 +47,25 @@ class NetConfig:
     widths: Annotated[list[int], Within(8, 4096, step=8), "channels at 1/4, 1/8, 1/16 and at the bottom."] = (
         field(default_factory=lambda: [32, 64, 96, 128])
     )
-    dilations: Annotated[list[int], Within(1, 256), "of the blocks at the bottom, one each."] = field(
-        default_factory=lambda: [1, 2, 4, 8]
-    )
+    dilations: Annotated[
+        list[int], Within(1, 256), "dilations of the blocks at the bottom, one per block."
+    ] = field(default_factory=lambda: [1, 2, 4, 8])
     head_width: Annotated[int, Within(1, 1024), "channels of the paint's head."] = 8
     separable: Annotated[
         bool,
-        'separable takes depthwise separable convolutions (Howard et al., "MobileNets", 2017) where the '
-        "image is large;",
+        "whether convolutions at high resolution are depthwise separable (Howard et al., "
+        '"MobileNets", 2017).',
     ] = False
-    lanes: Annotated[bool, "lanes adds the head of row anchors;"] = True
+    lanes: Annotated[bool, "whether the network has the head of row anchors, which finds lanes."] = True
     wide_kinds: Annotated[
         bool,
-        "wide_kinds lets the features at 1/8, which know a marking's whole shape and its surroundings, "
-        "speak on its class.",
+        "whether features at 1/8, which cover a whole marking and its surroundings, help to name its class.",
     ] = True
     added_kinds: Annotated[
         int,
         Within(0, 1024),
-        "channels that the head of wide_kinds has beyond those at 1/8: for classes that are added later, "
-        "while what the earlier ones read stays.",
+        "channels that wide_kinds adds for classes of a later training, so that earlier classes "
+        "stay as they are.",
     ] = 0
 
 

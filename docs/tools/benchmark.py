@@ -13,13 +13,13 @@ from typing import Any
 
 PAGE = Path(__file__).parents[1] / "benchmark.md"
 HEADS = (
-    "site", "recall", "false", "corner RMSE", "95 % within", "NEES", "place / beside / shape", "inside 95 %",
-    "lane lines", "verdict", "strictly",
+    "figure", "recall", "false", "corner RMSE", "95 % within", "NEES", "place / beside / shape",
+    "inside 95 %", "lane lines", "verdict", "strictly",
 )  # fmt: skip
 
 
-def row_of(score: Mapping[str, Any]) -> list[str]:
-    """The cells of a score."""
+def column_of(score: Mapping[str, Any]) -> list[str]:
+    """The cells of a score, below the name of its site."""
     markings = score["markings"]
     stated = score["stated"]
     lanes = score["lanes"]
@@ -39,14 +39,15 @@ def row_of(score: Mapping[str, Any]) -> list[str]:
 
 
 def table(scores: Sequence[Mapping[str, Any]]) -> str:
-    """The table of some scores, as Markdown."""
-    rows = [list(HEADS), ["---"] * len(HEADS), *map(row_of, scores)]
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    """The table of some scores, a column for each site, as Markdown."""
+    columns = [HEADS, *map(column_of, scores)]
+    head, *rows = (f"| {' | '.join(row)} |" for row in zip(*columns, strict=True))
+    return "\n".join([head, "|" + "---|" * len(columns), *rows])
 
 
 def with_table(page: str, text: str) -> str:
-    """The page with another table in place of the one that begins with our heads."""
-    before, head, rest = page.partition(f"| {HEADS[0]} | {HEADS[1]} |")
+    """The page with another table in place of the one that begins with our first head."""
+    before, head, rest = page.partition(f"| {HEADS[0]} | ")
     if not head:
         raise SystemExit(f"{PAGE}: has no table that begins with {HEADS[0]}")
     after = rest.partition("\n\n")[2]

@@ -6,8 +6,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tests.cameras import mounted
-from v2hdm.adjust import Observations, PoseSigma, Problem
+from v2hdm.adjust import GroundPlanes, Observations, PoseSigma, Problem
 from v2hdm.geometry.rigid import exp
+from v2hdm.ground.planes import plane_of
+from v2hdm.records import Calibration, CameraInfo
 
 WIDTH, HEIGHT, FOCAL = 1280, 720, 900.0
 PIXEL_SIGMA = 0.7
@@ -158,6 +160,23 @@ def make_scene(
         pose_sigma=jitter or PoseSigma(),
     )
     return Scene(problem, truth, map_from_vehicle, corners)
+
+
+def with_ground(scene: Scene, sigma_deg: float, sigma_m: float, seed: int = 0) -> Scene:
+    """The scene with what texture shows of the ground in each camera, off by such errors."""
+    rng = np.random.default_rng([seed, 3])
+    planes, roots = [], []
+    for matrix in scene.cam_from_vehicle:
+        tilted = exp(np.concatenate([np.zeros(3), np.deg2rad(sigma_deg) * rng.standard_normal(3)])) @ matrix
+        covariance = np.diag([sigma_m**2] * 3 + [np.deg2rad(sigma_deg) ** 2] * 3)
+        info = CameraInfo("front", width=WIDTH, height=HEIGHT, intrinsic=np.diag([FOCAL, FOCAL, 1.0]))
+        plane = plane_of(Calibration(info, tilted, covariance), np.zeros((2, 6)))
+        assert plane is not None
+        off = np.array([0.0, 0.0, 0.0, sigma_m * rng.standard_normal()])
+        planes.append(plane.plane_cam + off)
+        roots.append(plane.root_information)
+    ground = GroundPlanes(np.array(planes), np.array(roots), np.zeros((len(planes), 2, 4)))
+    return replace(scene, problem=replace(scene.problem, ground=ground))
 
 
 def rows_of(seen: Observations, rows: np.ndarray | slice) -> Observations:

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.adjust.scene import HEIGHT, make_scene, with_late_clocks
+from tests.adjust.scene import HEIGHT, make_scene, with_ground, with_late_clocks
 from v2hdm import native
 from v2hdm.adjust import (
     ControlPoints,
@@ -51,8 +51,9 @@ def compiler(request):
 
 
 def example(*, lengths=True, rolling=False, frames=40, seed=3):
-    """A drive with all that a model can know: clocks, drifts, a survey, lengths, covariances of any shape."""
+    """A drive with all that a model can know: clocks, drifts, surveys, ground, lengths, any covariances."""
     scene = with_late_clocks(make_scene(seed, frames=frames, outliers=0.05), np.array([0.02, -0.01]))
+    scene = with_ground(scene, 0.3, 0.02)
     problem, rng = scene.problem, np.random.default_rng(0)
     root = rng.normal(0, 0.1, (len(problem.observations.corner), 2, 2)) + 0.7 * np.eye(2)
     count = problem.corner_count

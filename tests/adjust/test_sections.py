@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.adjust.scene import make_scene, with_late_clocks
+from tests.adjust.scene import make_scene, with_ground, with_late_clocks
 from tests.adjust.site import DRIFTING
 from tests.adjust.test_sessions import joined, visited_again
 from v2hdm.adjust import ControlPoints, KnownLengths, Problem, SolveOptions, solve
@@ -61,13 +61,15 @@ def finish(number, part, solution):
     }
 
 
-def in_sections(folder: Path, problem: Problem, options: SolveOptions, part_of_frame) -> list[dict]:
+def in_sections(
+    folder: Path, problem: Problem, options: SolveOptions, part_of_frame, at_once: int = 0
+) -> list[dict]:
     """The results of all parts."""
     parts, links = cut(problem, part_of_frame, tuple(options.pose_states))
     for number, part in enumerate(parts):
         save_part(folder, number, part)
     shape = Shape.of(problem, options)
-    joint = join_parts(folder, len(parts), links, shape, lambda number, part, solution: None)
+    joint = join_parts(folder, len(parts), links, shape, lambda number, part, solution: None, at_once=at_once)
     return finish_parts(folder, joint, shape, finish)
 
 
@@ -98,11 +100,22 @@ def check(results: list[dict], problem: Problem, options: SolveOptions) -> None:
 
 def test_sections_of_a_street_are_the_street(tmp_path):
     scene = make_scene(3, frames=160, jitter=DRIFTING, outliers=0.03, start_error_deg=1.0)
+    scene = with_ground(scene, 0.1, 0.01)
     position = scene.problem.map_from_vehicle[:, :2, 3]
     part = parts_of_way(position, np.zeros(len(position), dtype=np.int64), 30.0)
     assert part.max() == 3
     options = SolveOptions()
     check(in_sections(tmp_path, scene.problem, options, part), scene.problem, options)
+
+
+def test_sections_that_are_solved_at_once_are_the_street(tmp_path):
+    """Two drives with late clocks, in whose parts corners and frames have numbers of their own."""
+    scene = with_late_clocks(make_scene(3, frames=80, start_error_deg=0.5), np.array([0.004, -0.006]))
+    problem = joined(scene.problem, visited_again(scene, DRIFTING, 5).problem)
+    options = SolveOptions(clock_offset=True)
+    part = np.tile(np.arange(80) // 40, 2)
+    everything = len(problem.observations.corner)
+    check(in_sections(tmp_path, problem, options, part, at_once=everything), problem, options)
 
 
 def test_sections_without_frame_states_are_the_street(tmp_path):

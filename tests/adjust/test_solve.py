@@ -158,8 +158,8 @@ def test_the_corners_may_be_given_a_start():
 
 def test_the_cost_is_the_sum_of_its_named_terms():
     solution = solve(make_scene(13, frames=40, jitter=POSES).problem)
-    names = "observations camera_centre frame_states clock_offsets control_points known_lengths"
-    assert set(solution.cost_terms) == set(names.split())
+    priors = "camera_centre ground_planes frame_states clock_offsets control_points known_lengths"
+    assert set(solution.cost_terms) == {"observations", *priors.split()}
     assert solution.cost == pytest.approx(sum(solution.cost_terms.values()))
     assert solution.gap <= 1e-11
 

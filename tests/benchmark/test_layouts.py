@@ -62,6 +62,14 @@ def test_files_that_make_no_site_are_one_line(tmp_path):
         site_of("quay", far)
 
 
+def test_a_file_that_is_missing_is_named_before_the_truth_is_made(tmp_path):
+    design = site_of("quay").layout.design
+    with pytest.raises(MapFileError, match=r"gone\.xodr: no such file"):
+        _ = Layout(tmp_path / "gone.xodr", design).digests
+    with pytest.raises(DriveError, match=r"gone\.tum: no such file"):
+        _ = Layout(design, tmp_path / "gone.tum").digests
+
+
 def test_a_layout_of_ones_own_is_made_and_scored(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     design = str(site_of("quay").layout.design)

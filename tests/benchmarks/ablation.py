@@ -2,6 +2,7 @@
 
     python -m tests.benchmarks.ablation [--images 60] [--only PATTERN] [--verdict FIRST LAST]
                                         [--faults NAME ...] [--site FIRST LAST] [--drives FOLDER ...]
+                                        [--short FIRST LAST]
 
 Printed, for the detector as it is and without each part: recall within 20 m of markings that must be found,
 false ones, the share of markings with four corners known well, the corners' error, px, and whether the stated
@@ -14,6 +15,10 @@ are and with every fault, or those of these names: right drives failed, wrong ma
 with one how many are named rightly, first, and the share of the corners of all spoilt maps inside their 95 %
 regions. To the right drives belongs each as a straight one under a stream of poses, whose cameras fire in
 turn.
+
+With ``--short`` what holds the mounting on short made drives past running boards (made/boards.py): how far
+the normal of the ground and the height are off, root mean square, their squared error in stated sigmas (of
+three; honest 3), markings that are mapped, false ones among them, and right drives failed.
 """
 
 from __future__ import annotations
@@ -32,6 +37,7 @@ import cv2
 import numpy as np
 
 from tests.benchmarks.detector_quality import Tally
+from tests.benchmarks.made.boards import CAMERA, make_short
 from tests.benchmarks.made.boxes import detect_pieces, make_boxes
 from tests.benchmarks.made.detect import detect
 from tests.benchmarks.made.draw import draw
@@ -49,15 +55,18 @@ from v2hdm.detection.batch import detect_all
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.quads import fit, lattice, propose, robust, state
-from v2hdm.faults import FAULTS, columns
+from v2hdm.faults import FAULTS, columns, ground_columns
 from v2hdm.faults.sensitivity import Sensitivity
+from v2hdm.geometry.ground_plane import by_tangent, plane_in
 from v2hdm.geometry.rigid import inverse, log
+from v2hdm.ground import planes
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
-from v2hdm.mapping import conclusion, foreign, optimise, recovery
+from v2hdm.mapping import bundle, conclusion, foreign, optimise, recovery
 from v2hdm.mapping.methods import run_methods
 from v2hdm.pipeline.base import grey_reader
 from v2hdm.records import (
+    BEST,
     BoolArray,
     Drive,
     FloatArray,
@@ -71,7 +80,8 @@ from v2hdm.records import (
 from v2hdm.report.metrics import driven_past, marking_metrics, match_markings
 from v2hdm.site import hypotheses, markings, parallax, posterior, standing, symbols
 from v2hdm.verdict.inputs import alignment
-from v2hdm.verdict.results import solution
+from v2hdm.verdict.results import accuracy, solution
+from v2hdm.verdict.verdict import Status
 
 SEED = 5_318_008
 """No seed of training, of the judge's fit or of the quality benchmark."""
@@ -209,6 +219,7 @@ def sizes() -> Iterator[Part]:
     )
     yield "sightings of rejected corners", partial(patch.object, recovery, "_effective_count", _countless)
     yield "clocks: prior of being late", partial(patch.object, poses, "_UNSTATED_CLOCK_S", 0.0)
+    yield "lenses: errors that nothing shows", partial(patch.object, accuracy, "_unseen_lenses", _none_unseen)
     yield "clocks: uneven stamps are no counted ones", partial(patch.object, poses, "_UNEVEN_S", np.inf)
     yield "clocks: prior of their drift", partial(patch.object, poses, "_UNSTATED_CLOCK_DRIFT_S", 0.0)
     yield "heading: held against surveys", partial(patch.object, alignment, "_ASKEW_RAD", np.deg2rad(1.0))
@@ -281,6 +292,10 @@ def _without_size(column: str, nothing: float) -> Iterator[None]:
 
 def _recorded(solved: Sensitivity) -> Any:
     return solved.arrays.vehicle_from_map.inverse()
+
+
+def _none_unseen(*_: Any) -> Iterator[Any]:
+    return iter(())
 
 
 def _countless(*_: Any) -> float:
@@ -457,6 +472,50 @@ def rows_of_site(only: str, seeds: Sequence[int], folders: Sequence[Path]) -> It
     return (f"{name:38s} {own}" for name, own in tally.items())
 
 
+def holds() -> Iterator[Part]:
+    """Each thing that holds a mounting, and the context that lacks it."""
+    yield "nothing off", nullcontext
+    yield "the ground that texture shows", partial(patch.object, bundle, "_ground_of", _nothing)
+    yield "doubt of its height", partial(patch.object, planes, "_HEIGHT_SHARE", 0.0)
+    yield "things that stand, among rejected", partial(patch.object, solution, "_OTHER_SHARE", 0.0)
+    yield "columns of the ground in tests", partial(patch.object, ground_columns, "_rows", _no_rows)
+
+
+def _no_rows(*_: Any) -> dict[str, Any]:
+    return {}
+
+
+def row_of_short(name: str, seeds: Sequence[int]) -> str:
+    """One line of the table of short drives."""
+    tilt_rad2, off_m2, squared = [], [], []
+    mapped = false = failed = 0
+    for seed in seeds:
+        short = make_short(draw(seed, "straight"))
+        best = run_methods(short.drive, short.found, (CAMERA,), naive=False)[BEST]
+        calibration = best.calibrations[CAMERA]
+        true = plane_in(short.truth.cam_from_vehicle[CAMERA])
+        off = plane_in(calibration.cam_from_vehicle) - true
+        axes = np.zeros((3, 4))
+        axes[:2, :3] = np.linalg.svd(true[None, :3])[2][1:]
+        axes[2, 3] = 1.0
+        slope = axes @ by_tangent(calibration.cam_from_vehicle)
+        error = axes @ off
+        squared.append(error @ np.linalg.solve(slope @ calibration.covariance @ slope.T, error))
+        tilt_rad2.append(off[:3] @ off[:3])
+        off_m2.append(off[3] ** 2)
+        expected = driven_past(short.drive, short.truth, (CAMERA,))
+        figures = marking_metrics(best.hd_map, short.truth, expected)
+        mapped += figures.markings
+        false += figures.false_markings
+        failed += any(finding.status is Status.FAIL for finding in solution.check_solution(short.drive, best))
+    tilt_deg = np.rad2deg(np.sqrt(np.mean(tilt_rad2)))
+    height_cm = 100 * np.sqrt(np.mean(off_m2))
+    return (
+        f"{name:38s} {tilt_deg:9.2f} {height_cm:10.1f} {np.median(squared):8.1f} {mapped:8d} {false:6d} "
+        f"{failed:7d}"
+    )
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -466,6 +525,7 @@ def main() -> None:
     parser.add_argument("--faults", nargs="+", default=list(SPOILS), choices=SPOILS, metavar="NAME")
     parser.add_argument("--site", nargs=2, type=int, metavar=("FIRST", "LAST"))
     parser.add_argument("--drives", nargs="+", type=Path, default=[])
+    parser.add_argument("--short", nargs=2, type=int, metavar=("FIRST", "LAST"))
     parsed = parser.parse_args()
     cv2.setNumThreads(1)
     if parsed.site or parsed.drives:
@@ -474,6 +534,14 @@ def main() -> None:
             f"{'symbols':>7s}"
         )
         print(*rows_of_site(parsed.only, range(*(parsed.site or (0, 0))), parsed.drives), sep="\n")
+        return
+    if parsed.short:
+        head = f"{'tilt, deg':>9s} {'height, cm':>10s} {'squared':>8s} {'markings':>8s}"
+        print(f"{'off':38s} {head} {'false':>6s} {'failed':>7s}")
+        for name, off in holds():
+            if re.search(parsed.only, name) or name == "nothing off":
+                with off():
+                    print(row_of_short(name, range(*parsed.short)), flush=True)
         return
     if parsed.verdict:
         print(f"{'off':38s} {'failed':>7s} {'silent':>7s} {'told':>7s} {'first':>7s} {'inside':>7s}")

@@ -11,6 +11,9 @@ on; a camera that was pushed by half a degree about each axis, and one that turn
 minute. That a map was repainted is timed from the start of the drive, or from its middle, and there also from
 when the first marking that was moved lies within 10 m of the vehicle. And ways of 50 m without a marking, on
 which solid lines of lanes are shown or not.
+
+All poses of a drive share the errors of one map and of one calibration: whether the stated covariance holds
+is seen over many drives. ``--short N`` takes N short ones of each port, and of each the last pose alone.
 """
 
 from __future__ import annotations
@@ -39,6 +42,8 @@ _START_FRAMES = 30
 _PUSHED_RAD = np.deg2rad(0.5)
 _TURNS_S = 60.0  # time in which a camera turns slowly by that
 _NEAR_M = 10.0  # way in which a repainted map is to be said
+_SHORT_S = 5.5  # time of a short drive, s
+_SHORT_BEGINS_M = (3.0, 250.0)  # least and largest station, m, from which it begins
 _GAP_M, _BEFORE_GAP_M = 50.0, 20.0  # way without a marking, and that before it
 _REPAINTED_STARTS, _REPAINTED_FRAMES = 4, 40  # drives on a repainted map, and moments of each
 
@@ -284,6 +289,14 @@ def gap_line(ends: Sequence[Gap], what: str) -> str:
     )
 
 
+def short_drive(name: str, seed: int) -> Errors:
+    """The error at the end of a short drive from anywhere on a port, with its own map and calibrations."""
+    begin_m = float(np.random.default_rng([seed, 5]).uniform(*_SHORT_BEGINS_M))
+    driven = drive(port_recipe(name, seed), seed, _SHORT_S, begin_m)
+    run = follow(driven, rough(driven, 0, np.random.default_rng([seed, 99])), range(len(driven.stamp_s)))
+    return errors_of(driven, Run(run.poses[-1:], run.frames[-1:], run.cpu_s))
+
+
 def main() -> None:
     """Run the benchmark and print its lines."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -294,10 +307,16 @@ def main() -> None:
     parser.add_argument(
         "--only", nargs="*", default=[], metavar="PART", help="starts, wrong, moved, pushed, slow, gaps"
     )
+    parser.add_argument("--short", type=int, default=0, help="short drives of each port, and nothing else")
     parsed = parser.parse_args()
+    if parsed.short:
+        seeds = range(parsed.first, parsed.first + parsed.short)
+        ends = [short_drive(name, seed) for seed in seeds for name in PORTS]
+        print(f"ends of short drives: {tracking_line(ends, len(ends), 0.0)}")
+        return
     parts, counts, cpu_s = [], 0, []
     totals = np.zeros((2, 4), dtype=np.int64)
-    ends: dict[bool, list[Gap]] = {True: [], False: []}
+    gap_ends: dict[bool, list[Gap]] = {True: [], False: []}
     for seed in range(parsed.first, parsed.first + parsed.seeds):
         driven = {name: drive(port_recipe(name, seed), seed, parsed.seconds) for name in PORTS}
         for name, own in driven.items():
@@ -321,10 +340,10 @@ def main() -> None:
             if not only or "slow" in only:
                 print(f"  {slow_line(own, rng, seed)}", flush=True)
             if not only or "gaps" in only:
-                for has_lines, of_drives in ends.items():
+                for has_lines, of_drives in gap_ends.items():
                     of_drives += gaps(own, rng, has_lines)
     print(f"all: {tracking_line(parts, counts, float(np.mean(cpu_s)))}")
-    for has_lines, of_drives in ends.items():
+    for has_lines, of_drives in gap_ends.items():
         if of_drives:
             print(gap_line(of_drives, "with lines" if has_lines else "without lines"))
     print(

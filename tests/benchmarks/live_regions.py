@@ -65,12 +65,18 @@ class Ride(NamedTuple):
         """The odometry's samples up to a moment, if the moments were at ``stamp_s`` (M,)."""
         if moment == 0:
             return []
-        before, now = self.map_from_vehicle[moment - 1 : moment + 1]
-        length_s = float(stamp_s[moment] - stamp_s[moment - 1])
-        speed = float(np.linalg.norm(now[:2, 3] - before[:2, 3])) / length_s
-        rate = float(wrapped(heading_rad(now) - heading_rad(before))) / length_s
-        times = np.linspace(stamp_s[moment - 1], stamp_s[moment], _SAMPLES + 1)[1:].tolist()
-        return [Motion(at_s, _SCALE * speed, rate + _BIAS_RAD_S) for at_s in times]
+        place = self.map_from_vehicle[:, :2, 3]
+        heading = np.unwrap(np.asarray(heading_rad(self.map_from_vehicle)))
+        speed = np.linalg.norm(np.diff(place, axis=0), axis=1) / np.diff(stamp_s)
+        rate = np.diff(heading) / np.diff(stamp_s)
+        # What an odometry says is of its sample's time, not the mean since the last image.
+        middle_s = (stamp_s[:-1] + stamp_s[1:]) / 2
+        times = np.linspace(stamp_s[moment - 1], stamp_s[moment], _SAMPLES + 1)[1:]
+        speeds = _SCALE * np.interp(times, middle_s, speed)
+        rates = np.interp(times, middle_s, rate) + _BIAS_RAD_S
+        return [
+            Motion(*sample) for sample in zip(times.tolist(), speeds.tolist(), rates.tolist(), strict=True)
+        ]
 
 
 def ride_of(folder: Path, images: int) -> Ride:
@@ -196,6 +202,8 @@ def _write(ride: Ride, folder: Path, process: subprocess.Popen[str], seconds: fl
             image = ride.drive.images[i]
             partial = folder / image.camera / "partial"
             shutil.copyfile(image.path, partial)
+            # Exposed when it was due, however late this process was to write it.
+            os.utime(partial, (float(stamp_s[moment]), float(stamp_s[moment])))
             partial.replace(folder / image.camera / f"{moment:06d}.jpg")
 
 

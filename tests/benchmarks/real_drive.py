@@ -264,10 +264,13 @@ def _draw_polygon(
 def views_of_images(result: Result) -> list[View]:
     """The view of every image under the optimised calibration and poses."""
     views = []
+    surface = result.best.surface
     for image in result.drive.images:
         calibration = result.calibrations[image.camera]
-        vehicle_from_map = np.linalg.inv(result.trajectory.of_image(image))
-        views.append(View(calibration.info, calibration.cam_from_vehicle @ vehicle_from_map))
+        map_from_vehicle = result.trajectory.of_image(image)
+        cam_from_map = calibration.cam_from_vehicle @ np.linalg.inv(map_from_vehicle)
+        road = None if surface is None else surface.seen_from(map_from_vehicle[None])
+        views.append(View(calibration.info, cam_from_map, road))
     return views
 
 

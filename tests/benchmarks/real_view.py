@@ -14,30 +14,50 @@ from v2hdm.geometry.ipm import apply_in_front, ground_from_pinhole_px, project_g
 from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import LANE_DASH, CameraInfo, Drive, FloatArray
+from v2hdm.surface.surface import Surface
 
 LIGHT_RANGE_M = 15.0
 
 _NEAREST_M = 0.5
+_ROUNDS = 3  # towards the point of a curved road at a pixel; heights are small against the camera's
 _BESIDE_M = (0.15, 0.3, 0.45)
 
 
 @dataclass(frozen=True)
 class View:
-    """One image's camera over the flat road of the map, ``cam_from_map`` (4, 4)."""
+    """One image's camera over the road of the map, ``cam_from_map`` (4, 4).
+
+    The road is flat, or the ``surface`` as seen from this image alone.
+    """
 
     info: CameraInfo
     cam_from_map: FloatArray
+    surface: Surface | None = None
 
     def project(self, points_map: FloatArray) -> FloatArray:
         """Pixels (N, 2) of ground points (N, 2), nan behind the camera."""
-        pinhole, depth_m = project_ground(self.info.intrinsic, self.cam_from_map, points_map)
+        on_plane = self._on_plane(points_map)
+        pinhole, depth_m = project_ground(self.info.intrinsic, self.cam_from_map, on_plane)
         pinhole[depth_m < _NEAREST_M] = np.nan
         return distort_points(self.info, pinhole)
 
     def ground(self, points_px: FloatArray) -> FloatArray:
         """Ground points (N, 2) m of pixels (N, 2); nan above the horizon."""
         pinhole = undistort_points(self.info, points_px)
-        return apply_in_front(ground_from_pinhole_px(self.info.intrinsic, self.cam_from_map), pinhole)
+        flat = apply_in_front(ground_from_pinhole_px(self.info.intrinsic, self.cam_from_map), pinhole)
+        points_map = flat
+        for _ in range(_ROUNDS):
+            points_map = points_map + flat - self._on_plane(points_map)
+        return points_map
+
+    def _on_plane(self, points_map: FloatArray) -> FloatArray:
+        """Points (N, 2) of the flat road that the camera shows where it shows those of the road."""
+        is_finite = np.isfinite(points_map).all(axis=1)
+        if self.surface is None or not is_finite.any():
+            return points_map
+        out = points_map.copy()
+        out[is_finite] = self.surface.on_plane(points_map[is_finite], self.cam_from_map, 0)
+        return out
 
     def range_m(self, point_map: FloatArray) -> float:
         """Distance on the ground of a point (2,) from the camera."""

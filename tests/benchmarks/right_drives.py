@@ -65,7 +65,7 @@ from v2hdm.verdict.inputs.drive import causes, check_camera, check_road
 from v2hdm.verdict.inputs.heading import check_heading
 from v2hdm.verdict.inputs.poses import Motion, check_attitude, check_jumps, check_noise, check_path
 from v2hdm.verdict.inputs.recording import check_clocks
-from v2hdm.verdict.results.accuracy import check_goal, clocks_once
+from v2hdm.verdict.results.accuracy import check_goal, told_once
 from v2hdm.verdict.results.solution import check_solution, over_ground, told_by_poses
 from v2hdm.verdict.verdict import GOAL
 
@@ -175,7 +175,7 @@ def map_one(job: Job) -> Row:
         options = MappingOptions(ground=job.ground, estimate_read_out=job.estimate)
         best = run_methods(drive, detections, cameras, options, naive=False)[BEST]
         before = over_ground(findings_of_inputs(drive), best, job.ground == AUTO)
-        solved, of_goal = clocks_once(told_by_poses(check_solution(drive, best), before), unknown(best))
+        solved, of_goal = told_once(told_by_poses(check_solution(drive, best), before), unknown(best))
         findings = [*before, *solved, *of_goal]
     except V2hdmError as error:
         refusal = {"check": _REFUSED, "says": str(error), "status": _REFUSED}

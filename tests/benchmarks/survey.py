@@ -5,7 +5,7 @@ by distance: errors and stated sigmas of corners, the share of markings found, a
 of port 2 are the constants of :mod:`v2hdm.simulate.survey.sightings`.
 
 ``python -m tests.benchmarks.survey --joint KM [--section-m M]``: a problem of a survey, adjusted at once and
-in sections: corners in mm, sigmas in per cent, seconds of CPU.
+in rounds over its sections: corners in mm, sigmas in per cent, seconds of CPU.
 
 ``python -m tests.benchmarks.survey --grow KM [KM ...] [--section-m M] [--workers N]``: a map of each length
 in sections, in a process of its own: peak memory, CPU, errors and coverage against the truth; then the
@@ -186,7 +186,9 @@ def _in_sections(
         for number, part in enumerate(parts):
             save_part(Path(folder), number, part)
         shape = Shape.of(problem, options)
-        joined = join_parts(Path(folder), len(parts), links, shape, lambda number, part, solution: None)
+        joined = join_parts(
+            Path(folder), len(parts), links, shape, lambda number, part, solution: None, at_once=0
+        )
         results = finish_parts(
             Path(folder), joined, shape,
             lambda number, part, solution: (
@@ -281,7 +283,7 @@ def main() -> None:
     asked.add_argument("--grow", type=float, nargs="+", metavar="KM")
     asked.add_argument("--one", type=float, metavar="KM", help=argparse.SUPPRESS)
     parser.add_argument("--every", type=int, default=3, metavar="N", help="look at every N-th image")
-    parser.add_argument("--section-m", type=float, default=500.0, metavar="M")
+    parser.add_argument("--section-m", type=float, default=1000.0, metavar="M")
     parser.add_argument("--workers", type=int, default=1, metavar="N")
     parser.add_argument("--cache", type=Path, default=Path("cache"), metavar="DIR", help="keeps the surveys")
     parsed = parser.parse_args()

@@ -4,13 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
+from tests.benchmarks.made.boards import CAMERA, make_short
 from tests.benchmarks.made.boxes import _hidden, detect_pieces, largest, make_boxes
 from tests.benchmarks.made.detect import detect
 from tests.benchmarks.made.draw import Recipe, draw, draw_apart_s
 from tests.benchmarks.made.faults import APART_S, SPOILS
 from tests.benchmarks.made.queue import make_queue, rear_map
 from tests.benchmarks.made.world import beside, drive_of, make, smooth_noise
+from v2hdm.geometry.ground_plane import plane_in
 from v2hdm.geometry.ipm import apply_homography, ground_from_pinhole_px
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.planar import inside_convex
@@ -127,3 +130,18 @@ def test_what_is_hidden_of_a_piece_leaves_its_corners_free_along_the_sides_that_
     covariance = _hidden(px, np.array([[0, 0], [6, 0], [6, 8], [0, 8]]))
     np.testing.assert_array_equal(covariance[[0, 3]], 0.0)
     np.testing.assert_array_equal(covariance[[1, 2]], 2 * [[[200.0**2, 0.0], [0.0, 0.0]]])
+
+
+def test_running_boards_stand_above_dashes_whose_ground_is_measured_as_stated() -> None:
+    """The ground's whitened errors over 20 drives are of unit variance; boards are seen, and are no paint."""
+    squared = []
+    for seed in range(20):
+        short = make_short(draw(seed, "straight"))
+        plane = short.drive.cameras[CAMERA].ground_plane
+        assert plane is not None
+        off = plane.root_information @ (plane_in(short.truth.cam_from_vehicle[CAMERA]) - plane.plane_cam)
+        squared.append(off @ off)
+        assert len(short.truth.map.markings) == 3
+        assert sum(len(in_image.markings) for in_image in short.found) > 5
+    low, high = chi2.ppf([0.001, 0.999], 60)
+    assert low < sum(squared) < high

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,8 @@ from v2hdm.records import (
     FloatArray,
     MarkingDetection,
 )
+from v2hdm.surface.paths import Paths
+from v2hdm.surface.surface import Surface
 
 INFO = CameraInfo("front", 1200, 600, np.array([[700.0, 0, 600], [0, 700.0, 200], [0, 0, 1]]))
 # The camera stands 1.6 m above the origin and looks along the map's x.
@@ -138,3 +141,14 @@ def test_the_map_is_judged_by_what_is_painted() -> None:
         "lies there",
         "false: 1 markings of the map (target none): lane_dash at 9.5, -4.0",
     ]
+
+
+def test_over_a_crowned_road_pixels_and_points_are_each_others() -> None:
+    poses = np.tile(np.eye(4), (40, 1, 1))
+    poses[:, 0, 3] = np.arange(40.0)
+    level = Surface.level(Paths.of(poses, np.zeros(40, dtype=np.int64)))
+    falls = np.pad([0.0, 0.0, 0.03], (0, len(level.parameters) - 3))
+    view = replace(VIEW, surface=replace(level, parameters=falls).seen_from(poses[:1]))
+    points_map = dash(8.0, 3.0)
+    assert np.abs(view.project(points_map) - VIEW.project(points_map)).max() > 2.0
+    np.testing.assert_allclose(view.ground(view.project(points_map)), points_map, atol=0.01)

@@ -506,6 +506,25 @@ def test_lines_of_a_live_source_are_in_the_file_as_they_come_and_a_kill_loses_no
     assert "half" not in output.read_text()
 
 
+def test_a_line_says_where_to_look_in_the_image_of_its_time(bench, tmp_path, monkeypatch, capsys):
+    bench.run(bench.folder / "0.png")
+    (whole,) = lines(capsys.readouterr().out)
+    corners_px = np.array(near(whole)["corners_px"])
+    box = [*(corners_px.min(axis=0) - 20).tolist(), *(corners_px.max(axis=0) + 20).tolist()]
+    (tmp_path / "images").mkdir()
+    image = tmp_path / "images" / "0.png"
+    shutil.copyfile(bench.folder / "0.png", image)
+    for stamp_s, count in ((1000.0, 1), (1001.0, 2)):
+        os.utime(image, (stamp_s, stamp_s))
+        line = json.dumps({"stamp_s": 1000.02, "regions_px": [box]})
+        monkeypatch.setattr("sys.stdin", io.StringIO(line + "\n"))
+        assert bench.run(tmp_path / "images", "--live", "--regions", "--limit", 1) == 0
+        (record,) = lines(capsys.readouterr().out)
+        assert len(record["markings"]) == count
+        assert record.get("whole", True) == (count == 2)
+        np.testing.assert_allclose(near(record)["corners_px"], corners_px, atol=0.05)
+
+
 def test_a_kill_leaves_nothing_hidden_beside_the_output_and_the_earlier_file(bench, tmp_path):
     many = tmp_path / "images"
     many.mkdir()

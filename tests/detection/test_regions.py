@@ -98,6 +98,8 @@ def test_a_road_detector_takes_regions(detector, image):
     found = road.detect(image, regions_px=(box_of(marking) + AROUND_PX)[None])
     assert len(found.markings) == 1
     assert found.lanes == ()
+    assert not found.is_whole
+    assert road.detect(image).is_whole
 
 
 def test_a_line_holds_for_an_image_of_its_time_alone():

@@ -17,3 +17,9 @@ def folder(tmp_path_factory):
 def working_directory(tmp_path, monkeypatch):
     """The test's own folder as the working directory, so that nothing is cached beside the repository."""
     monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture(autouse=True)
+def unpictured(monkeypatch):
+    """``v2hdm check`` draws nothing: its pictures, half of its time, are asserted in tests/verdict."""
+    monkeypatch.setattr("v2hdm.verdict.check.draw_check", lambda *_: None)

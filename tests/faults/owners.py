@@ -1,6 +1,7 @@
 """Bad inputs of whose a file is: results of other commands, files of the user's, links, and GeoPackages."""
 
 import os
+import shutil
 import sqlite3
 import struct
 from collections.abc import Callable, Iterator
@@ -8,6 +9,7 @@ from contextlib import closing
 from pathlib import Path
 
 from tests.calibration.site import INFO, clicked, mounting, write_table
+from tests.docs.blocks import ROOT
 from tests.drive.example import make_map
 from tests.faults.again import list_again
 from tests.faults.judge import Case, Prepare
@@ -60,12 +62,23 @@ def owners() -> Iterator[Case]:
     for base in ("out/map.geojson", "out", "linked.geojson"):
         words = (*COMMANDS["v2hdm map"].split(), f"map.base={base}")
         yield Case(f"map over its base {base}", "v2hdm map", words, _site(_own_base), "one of the inputs")
+    for folder, way, says in WAYS:
+        line = f"road.xodr {folder} --way {way} --workers 1"
+        prepare = _site(_layout_beside_a_result)
+        yield Case(f"a benchmark: {line}", "v2hdm benchmark make", line.split(), prepare, says)
     for file, prepare, words in _exports():
         for name, harm in HARMS.items():
             harmed = both(prepare, lambda root, file=file, harm=harm: harm(root / file))
             says, case = "move it, or give another --output", f"export onto {name}: {words}"
             yield Case(case, "v2hdm export", words.split(), harmed, says)
 
+
+WAYS = (
+    ("drive", "drive/poses.tum", "holds files that V2HDM did not write"),
+    ("out", "out/trajectory.tum", "holds a result of .*: move it"),
+    ("way.tum", "way.tum", "is a file"),
+)
+"""Folders for a benchmark's drive that hold, or are, the way it is made from, and the refusals."""
 
 CIRCLES = (
     "check circle --output out", "check drive --no-ground --workers 1 --output circle",
@@ -77,6 +90,8 @@ CIRCLES = (
     "compare map.geojson map.geojson --output circle",
     "benchmark make streets circle", "benchmark make streets made --cache circle",
     "benchmark score circle streets",
+    "benchmark make road.xodr made --way circle", "benchmark score map.geojson road.xodr --way circle",
+    "benchmark make circle.xodr made --way way.tum", "benchmark score map.geojson circle.xodr --way way.tum",
     "localize circle drive --output out", "localize map.geojson circle --output out",
     "map drive.path=circle output=. name=out", "map drive.path=drive output=circle name=out workers=1",
     "report circle", "view circle", "labels circle", "mosaic circle",
@@ -100,7 +115,22 @@ def circles() -> Iterator[Case]:
 
 def _circle(root: Path) -> None:
     _result(root / "out", "v2hdm map of drive")
-    (root / "circle").symlink_to("circle")
+    _layout(root)
+    for name in ("circle", "circle.xodr"):
+        (root / name).symlink_to(name)
+
+
+def _layout_beside_a_result(root: Path) -> None:
+    _layout(root)
+    _result(root / "out", "v2hdm map of drive")
+    shutil.copy(root / "way.tum", root / "out" / "trajectory.tum")
+
+
+def _layout(root: Path) -> None:
+    """The shipped road, and a way of 30 m along its right lane."""
+    shutil.copy(ROOT / "conf" / "benchmark" / "quay.xodr", root / "road.xodr")
+    poses = [f"{0.1 * k:.1f} {0.5 * k:.1f} -1.75 0 0 0 0 1" for k in range(60)]
+    (root / "way.tum").write_text("\n".join(poses) + "\n")
 
 
 def _site(more: Callable[[Path], None]) -> Prepare:

@@ -51,6 +51,16 @@ def test_the_gain_and_the_value_of_a_focal_length_are_those_of_solving_for_it():
     assert one.value == pytest.approx(-0.002, abs=4 * one.sigma)
 
 
+def test_an_error_of_a_lens_moves_the_corners_as_solving_with_it_does():
+    problem = scene().problem
+    found = {(one.fault, one.camera, one.axis): one for one in score_faults(problem, solve(problem, OPTIONS))}
+    step = 1e-3
+    wrong, right = (solve(with_focal(problem, 1 + p), OPTIONS).corners_map for p in (step, 0.0))
+    moved_m = np.sqrt(np.mean(np.sum((wrong - right) ** 2, axis=1)))
+    assert found[table.FOCAL, -1, 0].moves_m == pytest.approx(moved_m / step, rel=0.05)
+    assert found[table.CROWN, -1, 0].moves_m == 0.0
+
+
 def test_fy_is_contradicted_where_an_error_of_both_focal_lengths_would_be_too_small_to_matter():
     street = make_scene(3, frames=150, every_m=3.0, jitter=POSES, start_error_deg=0.5)
     problem = with_focal(street.problem, 1.02, (1,))

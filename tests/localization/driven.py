@@ -10,9 +10,19 @@ from v2hdm.geometry.rigid import exp, heading_rad, rotation_from_euler
 from v2hdm.localization.motion import Motion
 from v2hdm.localization.places import rough_position
 from v2hdm.localization.seeing import Look
-from v2hdm.records import Calibration, CameraInfo, HDMap, Lane, LaneDetection, Marking, MarkingDetection
+from v2hdm.records import (
+    Calibration,
+    CameraInfo,
+    HDMap,
+    Lane,
+    LaneDetection,
+    Marking,
+    MarkingDetection,
+    Symbol,
+)
 
 INTRINSIC = np.array([[700.0, 0, 640], [0, 700, 360], [0, 0, 1]])
+WORD = np.array([[0.0, 0.6], [0.0, -0.6], [2.4, -0.6], [2.4, 0.6]])
 DASH = np.array([[1.0, 0.06], [-1.0, 0.06], [-1.0, -0.06], [1.0, -0.06]])
 DIAMOND = np.array([[0.5, 0.0], [0.0, 0.4], [-0.5, 0.0], [0.0, -0.4]])
 SIGMA_PX = 0.3
@@ -150,7 +160,7 @@ def _look(camera, stamp_s, cam_from_map, painted, rng):
 
 
 def _piece(cam_from_map, points_map, rng):
-    """What an image shows of a line within 14 m, with errors across that are alike along it."""
+    """The piece of a line that an image shows within 14 m, with errors across that are alike along it."""
     pixels, depth_m = project_ground(
         INTRINSIC, np.tile(cam_from_map, (len(points_map), 1, 1)), points_map[:, None]
     )
@@ -162,3 +172,29 @@ def _piece(cam_from_map, points_map, rng):
     ahead = np.gradient(pixels[inside], axis=0)
     across = np.column_stack([-ahead[:, 1], ahead[:, 0]]) / np.linalg.norm(ahead, axis=1)[:, None]
     return LaneDetection("lane_line", 0.9, pixels[inside] + across_px[:, None] * across)
+
+
+def word_at(x_m, y_m=0.0, kind="text"):
+    return Symbol(kind, WORD + np.array([x_m, y_m]), 10, sigma_m=0.02)
+
+
+def outlined(points_px, kind="text", is_seen=True):
+    """A detection with an outline."""
+    nothing = np.full((4, 2), np.nan)
+    seen = np.full(len(points_px), is_seen)
+    return MarkingDetection(kind, 0.8, nothing, np.full((8, 8), np.nan), np.zeros(4, bool), points_px, seen)
+
+
+def with_words(look, pose, words):
+    """A look with the words that the camera ahead shows whole, a letter's stroke off."""
+    calibration = cameras()["front"]
+    if look.camera != "front":
+        return look
+    cam_from_map = calibration.cam_from_vehicle @ np.linalg.inv(pose)
+    found = []
+    for word in words:
+        cam = np.column_stack([word.outline_map, np.zeros(4), np.ones(4)]) @ cam_from_map[:3].T
+        px = (cam @ calibration.info.intrinsic.T)[:, :2] / cam[:, 2:]
+        if (cam[:, 2] > 2).all() and (cam[:, 2] < 20).all() and ((px > 0) & (px < [1280, 720])).all():
+            found.append(outlined(px + 0.5))
+    return replace(look, markings=(*look.markings, *found))

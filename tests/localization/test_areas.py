@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.localization.driven import MOUNT, cameras, drive, mapped, yard
+from tests.localization.driven import MOUNT, WORD, cameras, drive, mapped, outlined, with_words, word_at, yard
 from v2hdm.localization.areas import AreaMap, middle_of_hull, with_areas
 from v2hdm.localization.belief import Plane, start
 from v2hdm.localization.joint import Scene
@@ -13,21 +13,9 @@ from v2hdm.localization.localizer import Localizer, Status
 from v2hdm.localization.motion import MotionNoise
 from v2hdm.localization.paint import Paint
 from v2hdm.localization.seeing import Look, expect_points, hulls_of_areas, sighted
-from v2hdm.records import HDMap, MarkingDetection, Symbol
+from v2hdm.records import HDMap
 
-WORD = np.array([[0.0, 0.6], [0.0, -0.6], [2.4, -0.6], [2.4, 0.6]])
 SIGMA = np.array([0.4, 0.1, np.deg2rad(0.5)])
-
-
-def word_at(x_m, y_m=0.0, kind="text"):
-    return Symbol(kind, WORD + np.array([x_m, y_m]), 10, sigma_m=0.02)
-
-
-def outlined(points_px, kind="text", is_seen=True):
-    """A detection with an outline."""
-    nothing = np.full((4, 2), np.nan)
-    seen = np.full(len(points_px), is_seen)
-    return MarkingDetection(kind, 0.8, nothing, np.full((8, 8), np.nan), np.zeros(4, bool), points_px, seen)
 
 
 def before(symbols, x_m=0.0):
@@ -111,24 +99,9 @@ def test_words_hold_a_vehicle_along_its_lane_where_no_marking_is():
         for frame, (looks, motion) in enumerate(zip(driven.looks, driven.motion, strict=True)):
             blind = [replace(look, markings=()) if frame > 30 else look for look in looks]
             if has_words:
-                blind = [_with_words(look, driven.poses[frame], words) for look in blind]
+                blind = [with_words(look, driven.poses[frame], words) for look in blind]
             pose = localizer.update(blind, motion)
         assert pose.status == Status.TRACKING
         assert abs(driven.errors(pose, len(driven.looks) - 1)[0]) < pose.protection_m[0]
         along_m[has_words] = pose.protection_m[0]
     assert along_m[True] < 0.7 * along_m[False]
-
-
-def _with_words(look, pose, words):
-    """A look with the words that the camera ahead shows whole, a letter's stroke off."""
-    calibration = cameras()["front"]
-    if look.camera != "front":
-        return look
-    cam_from_map = calibration.cam_from_vehicle @ np.linalg.inv(pose)
-    found = []
-    for word in words:
-        cam = np.column_stack([word.outline_map, np.zeros(4), np.ones(4)]) @ cam_from_map[:3].T
-        px = (cam @ calibration.info.intrinsic.T)[:, :2] / cam[:, 2:]
-        if (cam[:, 2] > 2).all() and (cam[:, 2] < 20).all() and ((px > 0) & (px < [1280, 720])).all():
-            found.append(outlined(px + 0.5))
-    return replace(look, markings=(*look.markings, *found))

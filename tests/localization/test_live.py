@@ -86,6 +86,16 @@ def test_a_vehicle_that_knows_nothing_finds_itself_by_the_pattern_of_the_marking
     assert (np.abs(errors) < bounds).all()
 
 
+def test_a_vehicle_that_drives_before_its_first_image_is_sought_where_the_odometry_has_brought_it():
+    painted = yard(1)
+    driven = drive(painted, 1, seconds=16.0)
+    localizer = Localizer(mapped(painted, 1), driven.calibrations, driven.rough(np.random.default_rng(0)))
+    for frame, (looks, motion) in enumerate(zip(driven.looks, driven.motion, strict=True)):
+        pose = localizer.update(looks if frame > 100 else [], motion)
+    assert pose.status == Status.TRACKING
+    assert (np.abs(driven.errors(pose, frame)[:2]) < pose.protection_m).all()
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_a_vehicle_that_stands_finds_itself_without_moving(seed):
     painted = yard(seed)
@@ -403,7 +413,7 @@ def test_lines_come_as_images_do_and_end_with_the_cameras(monkeypatch, tmp_path)
             items.put(live._Ended(name, None))
 
         threading.Thread(target=play, daemon=True).start()
-        yield live._Eye(io.StringIO(), delay_s)
+        yield live._Eye(name, io.StringIO(), delay_s)
 
     monkeypatch.setattr(live, "_camera", camera)
     poses = []

@@ -99,7 +99,7 @@ def test_the_node_answers_images_with_poses(monkeypatch):
     class Road:
         def detect(self, pixels, regions_px=None):
             markings = [SimpleNamespace(image=marking) for marking in seen["look"].markings]
-            return SimpleNamespace(markings=markings, lanes=[])
+            return SimpleNamespace(markings=markings, lanes=[], is_whole=regions_px is None)
 
     place.roads = {name: Road() for name in cameras()}
     for looks, motion in zip(driven.looks, driven.motion, strict=True):

@@ -12,19 +12,22 @@ from v2hdm.errors import ConfigError
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.localization.live import _Eye
 from v2hdm.localization.localizer import Localizer, Status
-from v2hdm.localization.regions import expected_boxes
+from v2hdm.localization.regions import Ahead, Looking, View, expected_boxes
 from v2hdm.localization.seeing import Look
 
 
 def in_regions(look, regions_px):
-    """What a look shows whole in regions (R, 4)."""
+    """The part of a look that lies whole in regions (R, 4)."""
     if regions_px is None:
         return look
     low = np.array([marking.corners_px.min(axis=0) for marking in look.markings]).reshape(-1, 1, 2)
     high = np.array([marking.corners_px.max(axis=0) for marking in look.markings]).reshape(-1, 1, 2)
     is_in = ((low > regions_px[:, :2]) & (high < regions_px[:, 2:])).all(axis=2).any(axis=1)
     return replace(
-        look, markings=tuple(m for m, kept in zip(look.markings, is_in, strict=True) if kept), lanes=()
+        look,
+        markings=tuple(m for m, kept in zip(look.markings, is_in, strict=True) if kept),
+        lanes=(),
+        is_whole=False,
     )
 
 
@@ -63,15 +66,13 @@ def test_the_pose_is_as_good_as_with_full_searches(seed):
     assert (rmse[5] < np.maximum(1.3 * rmse[1], 0.01)).all()
 
 
-def test_of_every_five_images_of_a_camera_one_is_searched_as_a_whole_and_not_of_all_at_the_same_time():
+def test_of_every_five_images_of_a_camera_one_is_searched_as_a_whole():
     painted = yard(2)
     driven = drive(painted, 2)
     _, regions = followed(driven, mapped(painted, 2))
     for camera in ("front", "rear"):
         full = [frame for frame, now in enumerate(regions) if now[camera] is None]
         assert max(np.diff(full)) <= 5
-    both = [all(box is None for box in now.values()) for now in regions[30:]]
-    assert np.mean(both) < 0.2
 
 
 def test_a_marking_that_appears_beside_all_regions_is_found_at_the_next_full_search():
@@ -158,35 +159,82 @@ class Asked:
 
     def __init__(self, regions_px):
         self.regions_px = regions_px
-        self.stamps_s = []
+        self.now_s = None
 
-    def regions(self, camera, stamp_s):
-        self.stamps_s.append(stamp_s)
-        return self.regions_px
+    def ahead(self, camera, now_s):
+        self.now_s = now_s
+        return [Ahead(5.2, self.regions_px), Ahead(5.3, None)]
 
 
-def test_a_camera_is_told_of_the_image_that_it_can_take_next():
-    eye = _Eye(io.StringIO(), delay_s=0.02)
+def test_a_camera_is_told_of_the_images_to_come_by_the_clock_of_its_files():
+    eye = _Eye("front", io.StringIO(), delay_s=0.02)
     asked = Asked(np.array([[1.0, 2.0, 3.0, 4.0]]))
-    for stamp_s in (5.0, 5.1):
-        eye.point(asked, Look("front", stamp_s), now_s=stamp_s + 0.06)
-    eye.point(asked, Look("front", 5.2), now_s=5.33)  # two images have come meanwhile
-    assert asked.stamps_s == pytest.approx([5.2, 5.4])
+    eye.point(asked, now_s=5.15)
+    assert asked.now_s == pytest.approx(5.13)
     told = [json.loads(line) for line in eye.stream.getvalue().splitlines()]
-    assert [line["stamp_s"] for line in told] == pytest.approx([5.22, 5.42])
-    assert told[0]["regions_px"] == [[1.0, 2.0, 3.0, 4.0]]
+    assert [line["stamp_s"] for line in told] == pytest.approx([5.22, 5.32])
+    assert [line["regions_px"] for line in told] == [[[1.0, 2.0, 3.0, 4.0]], None]
 
 
-def test_a_camera_is_told_nothing_where_it_is_to_look_everywhere_and_after_its_end():
-    eye = _Eye(io.StringIO(), delay_s=0.0)
-    for stamp_s in (5.0, 5.1):
-        eye.point(Asked(None), Look("front", stamp_s), now_s=stamp_s + 0.05)
-    assert eye.stream.getvalue() == ""
-
+def test_a_camera_that_has_ended_is_told_nothing_more():
     class Closed(io.StringIO):
         def write(self, text):
             raise BrokenPipeError
 
-    eye = _Eye(Closed(), delay_s=0.0)
-    for stamp_s in (5.0, 5.1):
-        eye.point(Asked(np.zeros((1, 4))), Look("front", stamp_s), now_s=stamp_s + 0.05)
+    _Eye("front", Closed(), delay_s=0.0).point(Asked(None), now_s=5.15)
+
+
+def test_images_to_come_are_those_at_the_pace_of_the_last_ones_wherever_one_was_left_out():
+    looking = Looking(5)
+    assert looking.stamps_ahead("front", 5.0) == []
+    for stamp_s in (5.0, 5.1, 5.3):
+        looking.of("front").note(stamp_s, True, 9)
+    assert looking.stamps_ahead("front", 5.35) == pytest.approx([5.4, 5.5, 5.6, 5.7])
+    assert looking.stamps_ahead("front", 5.55) == pytest.approx([5.5, 5.6, 5.7, 5.8])
+    looking.of("rear").note(5.0, True, 9)
+    looking.of("rear").note(7.0, True, 9)
+    assert looking.stamps_ahead("rear", 7.1) == []
+
+
+@pytest.fixture(scope="module")
+def view():
+    """A tracked vehicle's belief, and what its camera ahead has before it."""
+    painted = yard(2)
+    driven = drive(painted, 2, seconds=6.0)
+    localizer = Localizer(mapped(painted, 2), driven.calibrations, driven.rough(np.random.default_rng(0)))
+    for looks, motion in zip(driven.looks, driven.motion, strict=True):
+        localizer.update(looks, motion)
+    scene = localizer._scene(localizer._belief, Look("front", 0.0), localizer_quads(driven))
+    return View(localizer._belief, scene)
+
+
+@pytest.mark.parametrize("late", [0, 1, 2])
+def test_of_every_five_images_one_is_whole_however_late_they_are_told(view, late):
+    """An image is told of ``late`` images before, when newer ones have not been seen."""
+    looking = Looking(5)
+    told = {}
+    wholes = []
+    for number in range(60):
+        regions_px = told.get(number)
+        wholes.append(regions_px is None)
+        looking.of("front").note(0.1 * number, regions_px is None, 9)
+        first = number + late + 1
+        stamps_s = [0.1 * (first + later) for later in range(4)]
+        for later, ahead in enumerate(looking.ahead("front", stamps_s, lambda stamp_s: view, 4.0)):
+            told[first + later] = ahead.regions_px
+    assert max(np.diff(np.flatnonzero(wholes))) <= 5
+    assert np.mean(wholes[10:]) <= 0.25
+
+
+def test_cameras_search_whole_images_by_turns(view):
+    looking = Looking(5)
+    told = dict.fromkeys(("front", "rear"))
+    both = []
+    for number in range(60):
+        both.append(told["front"] is None and told["rear"] is None)
+        for camera, regions_px in told.items():
+            looking.of(camera).note(0.1 * number, regions_px is None, 9)
+        for camera in told:
+            (ahead,) = looking.ahead(camera, [0.1 * (number + 1)], lambda stamp_s: view, 4.0)
+            told[camera] = ahead.regions_px
+    assert not any(both[6:])

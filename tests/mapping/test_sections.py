@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from scipy.stats import norm
 
 from tests.mapping.scene import Scene, SceneOptions, make_scene
+from v2hdm.adjust import SolveOptions
 from v2hdm.errors import AdjustError, ConfigError, MappingError, WorkerError
 from v2hdm.executor import HERE
 from v2hdm.faults import Contradiction, table
@@ -18,7 +19,7 @@ from v2hdm.geometry.planar import length_along
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions, SizeOptions
 from v2hdm.mapping.results import NO_SEGMENT, MethodResult
-from v2hdm.mapping.sections.common import Names, with_owners
+from v2hdm.mapping.sections.common import Names, named, with_owners
 from v2hdm.mapping.sections.faults import pooled_tests, refuse_contradicted
 from v2hdm.mapping.sections.joint import (
     Fit,
@@ -29,6 +30,7 @@ from v2hdm.mapping.sections.joint import (
 )
 from v2hdm.mapping.sections.run import map_in_sections
 from v2hdm.mapping.sections.section import sections_of
+from v2hdm.mapping.sections.work import Work
 from v2hdm.records import Image, ImageDetections, IntArray, PoseNoise, Session
 
 
@@ -165,7 +167,7 @@ def test_a_process_that_dies_is_one_line_that_names_step_and_section(scene, tmp_
 def judged(squared, corner, shift_m=((0.0, 0.0), (0.0, 0.0)), is_behind=None) -> Judged:
     """A section's observations with such squared residuals of such corners, by 100 frames a drive."""
     return Judged(
-        squared=np.array(squared, dtype=float),
+        mahalanobis2=np.array(squared, dtype=float),
         corner=np.array(corner),
         is_behind=np.zeros(len(squared), dtype=bool) if is_behind is None else np.array(is_behind),
         shift_m=100 * np.array(shift_m),
@@ -183,6 +185,19 @@ def test_an_observation_is_judged_at_the_scale_of_all_sections_and_its_corner_co
     # Corner 20 is seen once in each section, corner 21 twice, once behind the camera.
     assert of_first.is_used[20:].tolist() == [True, False, False]
     assert of_second.is_used[20:].tolist() == [True, False]
+
+
+def test_outliers_are_those_of_the_drive_where_one_section_is_all_of_it(tmp_path):
+    scene = make_scene(SceneOptions(seed=4, length_m=60.0))
+    work = Work(Listed(scene.detections), tuple(scene.drive.cameras), MappingOptions(), tmp_path)
+    (section,) = sections_of(scene.drive, 1000.0)
+    work.write("section", 0, section)
+    (names,) = named([work.settle(0)])
+    work.write("names", 0, names)
+    (gate,) = gates([work.judge(0)], SolveOptions.gate_probability)
+    settled = work.read("examined", 0).settled
+    assert settled.model.variance_factor < 0.9  # the detector states more than there is
+    assert 0 < np.count_nonzero(~gate.is_accepted) == np.count_nonzero(~settled.inliers)
 
 
 def test_a_corner_scatters_as_all_its_images_do_whatever_section_they_are_of():

@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from tests.cameras import mounted
 from tests.verdict.drives import INFO, square_at
 from v2hdm.cli.commands.map import _map
 from v2hdm.cli.compose import Job
 from v2hdm.errors import ConfigError
+from v2hdm.faults import Contradiction, table
 from v2hdm.geometry.rigid import camera_centre, exp
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.results import AdjustedPoses, MethodResult, SolveEvidence
@@ -24,7 +26,7 @@ from v2hdm.records import Calibration, Exclusion, HDMap
 from v2hdm.site.accuracy import absolute_radii_m, objection_to
 from v2hdm.site.candidates import TOO_UNCERTAIN
 from v2hdm.verdict import Finding, Status, Verdict
-from v2hdm.verdict.results.accuracy import check_goal, clocks_once, ground_ahead
+from v2hdm.verdict.results.accuracy import check_goal, ground_ahead, told_once
 from v2hdm.verdict.verdict import passed
 
 SURE = np.diag([0.003**2] * 3 + [1e-4**2] * 3)
@@ -132,15 +134,52 @@ def test_clocks_are_told_once_beside_what_else_the_drive_cannot_tell():
     cannot_tell = [
         passed(check, "all cameras", "include a turn") for check in ("slope", "clock", "clock drift")
     ]
-    assert clocks_once(cannot_tell, of_goal) == (cannot_tell[:1], of_goal)
+    assert told_once(cannot_tell, of_goal) == (cannot_tell[:1], of_goal)
     met = list(check_goal(unknown, 0.3, "poses"))
-    assert clocks_once(cannot_tell, met) == (cannot_tell, met)
+    assert told_once(cannot_tell, met) == (cannot_tell, met)
+
+
+def of_lens(sigma_px, cameras=("front", "rear"), sigmas=0.5, fault=table.PRINCIPAL):
+    """A test of the principal point, of which one pixel moves the corners by 4 mm."""
+    p_value = float(2 * norm.sf(sigmas))
+    sigmas_px = {"value": sigmas * sigma_px, "sigma": sigma_px, "model_sigma": sigma_px}
+    return Contradiction(fault.name, -1, 0, -1, **sigmas_px, p_value=p_value, moves_m=0.004, cameras=cameras)
+
+
+def with_lens(*tests):
+    evidence = replace(with_clocks(None), score_tests=tests)
+    return replace(mapped([marking(n) for n in range(30)]), evidence=evidence)
+
+
+def test_what_no_marking_shows_of_a_lens_is_told_where_it_makes_the_map_miss_the_goal():
+    (told,) = judged(with_lens(of_lens(6.0))).unobservable
+    assert (told.check, told.about, told.status) == ("principal point", "front, rear", Status.PASS)
+    assert "would show from 24 px on, and moves the corners by 9.6 cm until then" in told.says
+    assert not judged(with_lens(of_lens(3.0))).unobservable
+    assert not judged(with_lens(of_lens(6.0)), goal_m=0.1).unobservable
+    assert not judged(with_lens(of_lens(math.inf))).unobservable
+    assert not judged(with_lens(of_lens(6.0, fault=table.CLOCK))).unobservable
+
+
+def test_of_a_lens_the_worst_is_told_and_nothing_once_it_is_named_as_wrong():
+    (told,) = judged(with_lens(of_lens(4.0, ("front",)), of_lens(6.0))).unobservable
+    assert "24 px" in told.says
+    named = with_lens(of_lens(4.0, sigmas=9.0), of_lens(6.0))
+    assert not judged(named).unobservable
+
+
+def test_markings_are_not_said_to_agree_with_a_lens_whose_errors_they_do_not_show():
+    unseen = with_lens(of_lens(6.0))
+    agrees = Finding("principal point", Status.PASS, 0.5, None, "sigmas", "agree", "front, rear")
+    solved, of_goal = told_once([agrees], check_goal(unseen, 0.05, "poses"))
+    assert solved == []
+    assert [finding.check for finding in of_goal if finding.is_unobservable] == ["principal point"]
 
 
 def test_a_clock_that_is_named_as_wrong_is_not_unknown():
     unknown = replace(mapped([marking(n, shared_m=0.1) for n in range(30)]), evidence=with_clocks(0.2))
     fast = Finding("clock drift", Status.FAIL, 5.0, 4.0, "sigmas", "runs fast", "front")
-    findings, of_goal = clocks_once([fast], check_goal(unknown, 0.05, "poses"))
+    findings, of_goal = told_once([fast], check_goal(unknown, 0.05, "poses"))
     assert findings == [fast]
     assert {finding.check for finding in of_goal} == {"coarse"}
 

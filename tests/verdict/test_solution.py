@@ -347,6 +347,28 @@ def test_a_share_of_rejected_corners_is_judged_by_how_many_sightings_it_is_of(
     assert not is_wrong or found["rejected"].value > found["rejected"].limit
 
 
+@pytest.mark.parametrize(
+    ("candidates", "is_wrong"),
+    [
+        # Three dashes and two running boards, half of whose sightings are contradicted.
+        ([(8, 0), (10, 0), (12, 0), (6, 4), (6, 3)], False),
+        # As large a share of all, spread over forty markings alike.
+        (40 * [(6, 1)], True),
+        # Among forty markings two that stand, which a right camera meets.
+        ([*38 * [(6, 0)], (6, 5), (6, 4)], False),
+    ],
+)
+def test_rejected_corners_of_a_few_candidates_are_theirs_and_of_all_alike_the_cameras(
+    candidates, is_wrong, drive
+):
+    by_candidate = np.array(candidates, dtype=np.float64)
+    count, contradicted = by_candidate.sum(axis=0)
+    share = float(contradicted / count)
+    fit = replace(FIT, rejected_share=share, sightings=float(count), by_candidate=by_candidate)
+    found = raised(result(replace(FINE, fits={"front": fit})), drive)
+    assert set(found) == ({"rejected"} if is_wrong else set())
+
+
 def test_markings_that_overlap_are_told_with_a_place_and_neighbours_are_no_doubles(drive):
     apart = [square_at(3.0 * n, 0.0) for n in range(12)]
     found = raised(result(FINE, *apart, square_at(6.4, 0.2)), drive)

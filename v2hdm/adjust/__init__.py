@@ -9,6 +9,7 @@ from v2hdm.adjust.model import MIN_DEPRESSION_SINE
 from v2hdm.adjust.problem import (
     ControlPoints,
     Drift,
+    GroundPlanes,
     KnownLengths,
     Observations,
     PoseSigma,
@@ -20,7 +21,8 @@ from v2hdm.adjust.solution import Solution, Status, Verdict, observability, pose
 from v2hdm.adjust.solve import solve
 
 __all__ = [
-    "MIN_DEPRESSION_SINE", "MODELS", "ControlPoints", "Drift", "KnownLengths", "Observations", "PoseSigma",
-    "Problem", "Solution", "SolveOptions", "Status", "Verdict", "estimate_noise", "observability",
-    "pose_innovations", "predicts_better", "select_model", "solve", "with_model",
+    "MIN_DEPRESSION_SINE", "MODELS", "ControlPoints", "Drift", "GroundPlanes", "KnownLengths",
+    "Observations", "PoseSigma", "Problem", "Solution", "SolveOptions", "Status", "Verdict",
+    "estimate_noise", "observability", "pose_innovations", "predicts_better", "select_model", "solve",
+    "with_model",
 ]  # fmt: skip

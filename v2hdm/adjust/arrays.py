@@ -71,6 +71,7 @@ class Arrays:
         states: column of the frame tangent of each state. An error with a drift beside its white part
             has two states on one column.
         centre, centre_information_root: (C, 3) prior on the camera centres, and 1 / sigma.
+        ground_plane, ground_root: (C, 4) plane of the ground in the cameras, and (C, 3, 4) root information.
         state_transition: (J, S, S) prediction of a frame's states from the frame before.
         state_information_root: (J, S) 1 / sigma of the innovations.
         clock_twist: (J, 6, Q) the vehicle's motion per clock offset; Q is the number of sessions, or 0
@@ -95,6 +96,8 @@ class Arrays:
     states: tuple[int, ...]
     centre: Tensor
     centre_information_root: Tensor
+    ground_plane: Tensor
+    ground_root: Tensor
     state_transition: Tensor
     state_information_root: Tensor
     clock_twist: Tensor

@@ -209,6 +209,15 @@ def _check_priors(problem: Problem) -> None:
     if problem.centre_sigma_m is not None:
         wrong = ~(problem.centre_sigma_m > 0).all(1)
         _refuse(wrong, "centre_sigma_m of camera {} must be above 0 (inf where nothing is known)")
+    if problem.ground is not None:
+        shapes = {"plane_cam": (4,), "root_information": (3, 4), "by_lens": (2, 4)}
+        for name, of_camera in shapes.items():
+            values = getattr(problem.ground, name)
+            shape = (len(problem.intrinsic), *of_camera)
+            if values.shape != shape:
+                raise AdjustError(f"ground.{name} has shape {values.shape}, expected {shape}")
+            finite = np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
+            _refuse(~finite, f"ground.{name} of camera {{}} is not finite: leave that camera's ground out")
     if not problem.clock_sigma_s > 0:
         raise AdjustError(f"clock_sigma_s is {problem.clock_sigma_s}: give a number of seconds above 0")
     if not problem.read_out_sigma_s > 0:

@@ -247,6 +247,8 @@ class TorchEngine:
         by_camera = arrays.centre.new_zeros(count, unknowns, count, unknowns)
         blocks = by_camera.diagonal(dim1=0, dim2=2)
         blocks[:3, :3] = (turned @ turned.mT).permute(1, 2, 0)
+        by_ground = arrays.ground_root @ model.by_ground_planes(estimate.cam_from_vehicle)
+        blocks[:6, :6] += (by_ground.mT @ by_ground).permute(1, 2, 0)
         if unknowns > 6:
             blocks[6:, 6:] = arrays.clock_information_root.square().diag()[..., None]
         cameras = by_camera.view(count * unknowns, -1)

@@ -267,7 +267,8 @@ class IncrementalMap:
     def _linearised(self, earlier: _Quadratic, marking: int, sighted: Sighted) -> _Linearised:
         """The quadratic ``earlier`` plus a marking."""
         # The quadratic contains the cameras' priors.
-        without = {"centre_vehicle": None, "clock_sigma_s": np.inf, "read_out_sigma_s": np.inf}
+        infinite = {"clock_sigma_s": np.inf, "read_out_sigma_s": np.inf}
+        without = {"centre_vehicle": None, "ground": None, **infinite}
         problem, cameras = self._problem([sighted], **without)
         check_observations(problem)
         options = self._options

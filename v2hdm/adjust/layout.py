@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays, Lengths
-from v2hdm.adjust.problem import POSE_STATES, KnownLengths, Problem
+from v2hdm.adjust.problem import POSE_STATES, GroundPlanes, KnownLengths, Problem
 from v2hdm.errors import AdjustError
 from v2hdm.geometry.rigid import inverse
 from v2hdm.records import BoolArray, FloatArray, IntArray
@@ -148,6 +148,8 @@ def make_arrays(
         states=tuple(prior.columns.tolist()),
         centre=real(surveys.centre),
         centre_information_root=real(surveys.centre_root),
+        ground_plane=real(surveys.ground.plane_cam),
+        ground_root=real(surveys.ground.root_information),
         state_transition=real(prior.transition),
         state_information_root=real(prior.information_root),
         clock_twist=real(clock_twist),
@@ -163,12 +165,13 @@ def make_arrays(
 
 
 class _Surveys(NamedTuple):
-    """Surveyed centres and corners; root information is 0 where nothing is surveyed."""
+    """Surveyed centres and corners, and planes of the ground; root information is 0 where there is none."""
 
     centre: FloatArray  # (C, 3)
     centre_root: FloatArray  # (C, 3) root information
     control: FloatArray  # (N, 2)
     control_root: FloatArray  # (N, 3) root information
+    ground: GroundPlanes  # of each camera
 
 
 def _surveys(problem: Problem) -> _Surveys:
@@ -182,7 +185,9 @@ def _surveys(problem: Problem) -> _Surveys:
     if problem.control is not None:
         control[problem.control.corner] = problem.control.points_map
         control_root[problem.control.corner] = problem.control.root_information
-    return _Surveys(centre, centre_root, control, control_root)
+    count = len(problem.intrinsic)
+    none = GroundPlanes(np.zeros((count, 4)), np.zeros((count, 3, 4)), np.zeros((count, 2, 4)))
+    return _Surveys(centre, centre_root, control, control_root, problem.ground or none)
 
 
 def _lengths(problem: Problem) -> KnownLengths:

@@ -198,6 +198,29 @@ def centre_residual(arrays: Arrays, cam_from_vehicle: Tensor) -> Tensor:
     return (-(rotation.mT @ translation)[..., 0] - arrays.centre) * arrays.centre_information_root
 
 
+def ground_planes(cam_from_vehicle: Tensor) -> Tensor:
+    """The vehicle's ground in cameras (C, 4, 4): its normal, upwards, and the height above it, (C, 4)."""
+    normal = cam_from_vehicle[:, :3, 2]
+    height = -(normal * cam_from_vehicle[:, :3, 3]).sum(dim=1, keepdim=True)
+    return torch.cat([normal, height], dim=1)
+
+
+def by_ground_planes(cam_from_vehicle: Tensor) -> Tensor:
+    """Derivatives (C, 4, 6) of :func:`ground_planes` by left tangents of the extrinsics."""
+    normal = cam_from_vehicle[:, :3, 2]
+    out = normal.new_zeros(len(normal), 4, 6)
+    out[:, :3, 3:] = -So3.hat(normal)
+    out[:, 3, :3] = -normal
+    return out
+
+
+def ground_residual(arrays: Arrays, cam_from_vehicle: Tensor) -> Tensor:
+    """The vehicle's ground in the cameras minus the plane that texture shows, (C, 3)."""
+    off = ground_planes(cam_from_vehicle) - arrays.ground_plane
+    residual: Tensor = (arrays.ground_root @ off[..., None])[..., 0]
+    return residual
+
+
 def state_residual(arrays: Arrays, frame_state: Tensor, before: Tensor | None = None) -> Tensor:
     """Innovations (J, S) of the frame states: s_j - A_j s_(j-1).
 
@@ -235,6 +258,7 @@ def prior_residuals(arrays: Arrays, estimate: Estimate) -> dict[str, Tensor]:
     lengths = arrays.lengths
     return {
         "camera_centre": centre_residual(arrays, estimate.cam_from_vehicle),
+        "ground_planes": ground_residual(arrays, estimate.cam_from_vehicle),
         "frame_states": state_residual(arrays, estimate.frame_state),
         "clock_offsets": clock_residual(arrays, estimate.clock_s),
         "control_points": control_residual(arrays, corners),

@@ -19,9 +19,9 @@ The cost, in units of half a squared standard deviation, is
     + \tfrac12 \sum_c \|(o_c - \bar o_c) / \sigma_c\|^2 + \tfrac12 \sum_j \|s_j / \sigma_s\|^2
 
 over observations k (one corner in one image), camera centres o and frame states s, plus terms of surveyed
-corners, known lengths and clock offsets where given. The prior acts on the camera's *centre in the vehicle
-frame*, which a survey measures, rather than on the translation of ``cam_from_vehicle``, which depends on
-the rotation.
+corners, known lengths, clock offsets and planes of the ground where given. The prior acts on the camera's
+*centre in the vehicle frame*, which a survey measures, rather than on the translation of
+``cam_from_vehicle``, which depends on the rotation.
 """
 
 from __future__ import annotations
@@ -155,6 +155,24 @@ class KnownLengths:
 
 
 @dataclass(frozen=True)
+class GroundPlanes:
+    """The ground as C cameras' images of its texture show it, a plane in each camera.
+
+    ``plane_cam`` (C, 4) is its normal, upwards, and the camera's height above it, m. ``root_information``
+    (C, 3, 4) whitens deviations from that, and is 0 where texture shows no ground. ``by_lens`` (C, 2, 4) is
+    the plane's change by a relative error of the focal length, and by one of k1.
+    """
+
+    plane_cam: FloatArray
+    root_information: FloatArray
+    by_lens: FloatArray
+
+    def take(self, cameras: IntArray) -> GroundPlanes:
+        """The planes of some cameras."""
+        return GroundPlanes(self.plane_cam[cameras], self.root_information[cameras], self.by_lens[cameras])
+
+
+@dataclass(frozen=True)
 class PoseSigma:
     """Standard deviations of the recorded poses, per state of a frame.
 
@@ -192,7 +210,8 @@ class Problem:
 
     ``intrinsic`` (C, 4) is fx, fy, cx, cy, px. ``cam_from_vehicle`` (C, 4, 4) is the start,
     ``map_from_vehicle`` (J, 4, 4) the recorded poses. ``centre_vehicle`` and ``centre_sigma_m`` (C, 3) are
-    the surveyed camera centres, or None. ``corners_start`` (N, 2) replaces the start by weighted
+    the surveyed camera centres, or None; ``ground`` is what texture shows of the ground, or None.
+    ``corners_start`` (N, 2) replaces the start by weighted
     back-projection. ``twist_vehicle`` (J, 6), the vehicle's velocity in its own frame (m/s, rad/s), is needed
     for clock offsets, whose prior sigma is ``clock_sigma_s``. ``read_out_s`` (C,) are the stated read-out
     times, None for global shutters; their prior sigma is ``read_out_sigma_s``. ``control`` are surveyed
@@ -221,6 +240,7 @@ class Problem:
     control: ControlPoints | None = None
     lengths: KnownLengths | None = None
     session: IntArray | None = None
+    ground: GroundPlanes | None = None
 
     def seen_by(self, observations: Observations, **changes: Any) -> ProblemPart:
         """The problem of the cameras and frames of ``observations``, after ``changes`` of other fields.
@@ -234,6 +254,8 @@ class Problem:
         of_frames = "map_from_vehicle", "twist_vehicle", "session"
         rows = dict.fromkeys(of_cameras, cameras) | dict.fromkeys(of_frames, frames)
         parts = {name: stated[name][at] for name, at in rows.items() if stated[name] is not None}
+        if stated["ground"] is not None:
+            parts["ground"] = stated["ground"].take(cameras)
         unknown = {"corners_start": None, "control": None, "lengths": None}
         renumbered = replace(observations, camera=camera, frame=frame)
         count = int(observations.corner.max(initial=-1)) + 1

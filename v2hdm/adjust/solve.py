@@ -250,6 +250,7 @@ def report_of(
     scale = noise_scale(mahalanobis2)
     of_priors = 2 * sum(cost for name, cost in terms.items() if name != "observations")
     held = int((arrays.centre_information_root > 0).sum()) + int((arrays.control_root[:, ::2] > 0).sum())
+    held += int(arrays.ground_root.any(dim=2).sum())
     free = 2 * arrays.corner_count + 6 * arrays.camera_count - held - len(arrays.lengths.first)
     variance = variance_factors(mahalanobis2, of_priors, free, scale)
     corners_map = np.empty(estimate.corners_map.shape)

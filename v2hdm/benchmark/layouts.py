@@ -6,6 +6,7 @@ from a trajectory in the coordinates of the file. The map counts from the way's 
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,10 +20,10 @@ from v2hdm.catalogue import load_catalogue
 from v2hdm.errors import DriveError, MapFileError
 from v2hdm.io.trajectory import read_tum
 from v2hdm.records import LANE_DASH, FloatArray, HDMap, Marking
+from v2hdm.safe.texts import read_bytes
 from v2hdm.simulate.port.build import ORIGIN
 from v2hdm.simulate.port.route import Route
 from v2hdm.simulate.survey.network import Network
-from v2hdm.store.files import file_digest
 
 _STEP_M = 0.05  # distance between the stations of a way
 _MOVED_M = 0.3  # least distance between two positions of a way: nearer ones are a receiver's noise at rest
@@ -40,8 +41,10 @@ class Layout:
 
     @property
     def digests(self) -> tuple[str, str]:
-        """SHA-256 of both files."""
-        return file_digest(self.design), file_digest(self.way)
+        """SHA-256 of both files. Raises MapFileError or DriveError if one cannot be read."""
+        design = read_bytes(self.design, MapFileError)
+        way = read_bytes(self.way, DriveError)
+        return hashlib.sha256(design).hexdigest(), hashlib.sha256(way).hexdigest()
 
 
 def network_of(layout: Layout, speed_mps: float) -> Network:

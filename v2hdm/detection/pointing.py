@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+from collections import deque
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -17,18 +18,21 @@ _log = logging.getLogger(__name__)
 _SAME_S = 0.05  # difference, s, of the times of an image and of a line that is of it
 
 
+_KEPT = 16  # lines that are kept
+
+
 class _Pointed(NamedTuple):
-    """Boxes (R, 4), px, of an image expected at a time."""
+    """Boxes (R, 4), px, of an image expected at a time; None for everywhere."""
 
     stamp_s: float
-    regions_px: FloatArray
+    regions_px: FloatArray | None
 
 
 class Pointer:
-    """The latest line; one that cannot be read is left out with a warning, once."""
+    """The latest lines; one that cannot be read is left out with a warning, once."""
 
     def __init__(self) -> None:
-        self._latest: _Pointed | None = None
+        self._latest = deque[_Pointed](maxlen=_KEPT)
         self._has_warned = False
 
     def follow(self, lines: Iterable[str]) -> None:
@@ -36,10 +40,11 @@ class Pointer:
         for line in lines:
             try:
                 record = json.loads(line)
-                regions_px = np.array(record["regions_px"], dtype=np.float64).reshape(-1, 4)
-                self._latest = _Pointed(float(record["stamp_s"]), regions_px)
+                stated = record["regions_px"]
+                regions_px = None if stated is None else np.array(stated, dtype=np.float64).reshape(-1, 4)
+                self._latest.append(_Pointed(float(record["stamp_s"]), regions_px))
             except (ValueError, TypeError, KeyError):
-                self._latest = None
+                self._latest.clear()
                 if not self._has_warned:
                     _log.warning(
                         "--regions: %s is left out; give stamp_s and regions_px, as "
@@ -50,7 +55,7 @@ class Pointer:
 
     def regions(self, stamp_s: float | None) -> FloatArray | None:
         """The boxes (R, 4) for an image taken at a time; None to look everywhere."""
-        latest = self._latest
-        if latest is None or stamp_s is None or abs(latest.stamp_s - stamp_s) > _SAME_S:
+        if stamp_s is None:
             return None
-        return latest.regions_px
+        of_image = [pointed for pointed in tuple(self._latest) if abs(pointed.stamp_s - stamp_s) < _SAME_S]
+        return of_image[-1].regions_px if of_image else None

@@ -95,15 +95,15 @@ def merged(boxes: IntArray) -> IntArray:
     while left:
         box = left.pop()
         for other in left:
-            both = [
+            union = [
                 min(box[0], other[0]),
                 min(box[1], other[1]),
                 max(box[2], other[2]),
                 max(box[3], other[3]),
             ]
-            if _area(both) <= _MERGED * (_area(box) + _area(other)):
+            if _area(union) <= _MERGED * (_area(box) + _area(other)):
                 left.remove(other)
-                left.append(both)
+                left.append(union)
                 break
         else:
             out.append(box)

@@ -111,10 +111,11 @@ class RoadLane:
 
 @dataclass(frozen=True)
 class Road:
-    """The markings and lanes of one image."""
+    """The markings and lanes of one image; ``is_whole`` unless only regions of it were looked at."""
 
     markings: tuple[RoadMarking, ...]
     lanes: tuple[RoadLane, ...]
+    is_whole: bool = True
 
 
 class RoadDetector:
@@ -177,7 +178,8 @@ class RoadDetector:
             road = self._on_ground((*markings, *(crosswalk for crosswalk, _ in crosswalks)), lanes)
             parts = (*(() for _ in markings), *(parts for _, parts in crosswalks))
             with_parts = zip(road.markings, parts, strict=True)
-            return replace(road, markings=tuple(replace(marking, parts=of) for marking, of in with_parts))
+            with_crosswalks = tuple(replace(marking, parts=of) for marking, of in with_parts)
+            return replace(road, markings=with_crosswalks, is_whole=regions_px is None)
 
     def _on_ground(self, markings: Sequence[MarkingDetection], lanes: Sequence[LaneDetection]) -> Road:
         """The detections with their places on the ground, if the camera is calibrated."""
@@ -211,7 +213,7 @@ def _lane(image: LaneDetection, ground: GroundPoints) -> RoadLane:
 
 def as_record(frame: Frame, camera: str, road: Road) -> dict[str, Any]:
     """The content of one JSON line (docs/detect.md); not-a-number, which JSON lacks, is null."""
-    return {
+    record: dict[str, Any] = {
         "source": frame.source,
         "frame": frame.index,
         "stamp_s": None if frame.stamp_s is None else round(frame.stamp_s, 6),
@@ -219,6 +221,9 @@ def as_record(frame: Frame, camera: str, road: Road) -> dict[str, Any]:
         "markings": [_marking_record(marking) for marking in road.markings],
         "lanes": [_lane_record(lane) for lane in road.lanes],
     }
+    if not road.is_whole:
+        record["whole"] = False
+    return record
 
 
 def _marking_record(marking: RoadMarking) -> dict[str, Any]:

@@ -26,7 +26,8 @@ from v2hdm.records import BoolArray, FloatArray, IntArray, PoseNoise
 
 _DRAWS = 16  # draws of the model's noise, as many as of a drive in one piece
 
-_OF_CAMERAS = ("camera_centre", "clock_offsets")  # priors that every part has of the same cameras
+# Priors that every part has of the same cameras.
+_OF_CAMERAS = ("camera_centre", "ground_planes", "clock_offsets")
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,12 @@ from torch import Tensor
 from v2hdm.adjust.arrays import Arrays
 from v2hdm.adjust.problem import Problem
 from v2hdm.faults import table
+from v2hdm.faults.ground_columns import (
+    seen_by_lens,
+    seen_by_moved_vehicle,
+    seen_by_shifted_image,
+    seen_over_tilted_ground,
+)
 from v2hdm.faults.sensitivity import Rows, Sensitivity, raised, stretches
 from v2hdm.faults.table import Fault
 from v2hdm.records import FloatArray
@@ -43,6 +49,8 @@ _SURE_SLIP = 0.002
 without."""
 
 _LEAST_SPEED_MPS = 0.5  # a slower vehicle has no course
+
+_BY_FOCAL, _BY_K1 = 0, 1  # rows of the changes of the ground by the lens
 
 Column = Callable[[Sensitivity], Rows]
 """Derivatives of a solution's residuals by one parameter, in its unit."""
@@ -115,13 +123,14 @@ def _clock(setting: Setting, camera: int) -> Iterator[Hypothesis]:
         yield Hypothesis(table.CLOCK, _moving(partial(_late, problem, camera, is_late)), camera, item=session)
 
 
-def _focal(_: Setting, camera: int) -> Iterator[Hypothesis]:
+def _focal(setting: Setting, camera: int) -> Iterator[Hypothesis]:
     for axis, (in_x, in_y) in enumerate(_FOCAL_SHARES):
-        yield Hypothesis(table.FOCAL, partial(_zoomed, camera, in_x, in_y), camera, axis)
+        column = partial(_zoomed, setting.problem, camera, in_x, in_y)
+        yield Hypothesis(table.FOCAL, column, camera, axis)
 
 
-def _distortion(_: Setting, camera: int) -> Iterator[Hypothesis]:
-    yield Hypothesis(table.DISTORTION, partial(_bent, camera), camera)
+def _distortion(setting: Setting, camera: int) -> Iterator[Hypothesis]:
+    yield Hypothesis(table.DISTORTION, partial(_bent, setting.problem, camera), camera)
 
 
 def _principal(setting: Setting, camera: int) -> Iterator[Hypothesis]:
@@ -231,19 +240,22 @@ OF_DRIVE: dict[Fault, Callable[[Setting], Iterator[Hypothesis]]] = {
 """Hypotheses on everything else, by fault; surveyed points are tested one by one without a column."""
 
 
-def _zoomed(camera: int, in_x: float, in_y: float, solved: Sensitivity) -> Rows:
+def _zoomed(problem: Problem, camera: int, in_x: float, in_y: float, solved: Sensitivity) -> Rows:
     """Relative error of the focal lengths fx and fy, by the shares ``in_x`` and ``in_y`` of the value."""
     # Projected points rather than measured ones: pixels, whose noise is stated, do not scale.
     is_of_camera = (solved.camera == camera) | (camera < 0)
     shares = solved.projected.new_tensor([[in_x], [in_y]])
-    return {"observations": solved.whiten(solved.projected * shares * is_of_camera)}
+    # On the ground, whose height and distances ahead it scales, fy is most of a focal length.
+    ground = seen_by_lens(problem, camera, _BY_FOCAL, solved)
+    return {"observations": solved.whiten(solved.projected * shares * is_of_camera), **ground}
 
 
-def _bent(camera: int, solved: Sensitivity) -> Rows:
+def _bent(problem: Problem, camera: int, solved: Sensitivity) -> Rows:
     """Error of the first radial coefficient."""
     projected = solved.projected
     is_of_camera = (solved.camera == camera) | (camera < 0)
-    return {"observations": solved.whiten(projected * projected.square().sum(0) * is_of_camera)}
+    off = projected * projected.square().sum(0) * is_of_camera
+    return {"observations": solved.whiten(off), **seen_by_lens(problem, camera, _BY_K1, solved)}
 
 
 def _shifted_image(problem: Problem, camera: int, axis: int, solved: Sensitivity) -> Rows:
@@ -252,7 +264,8 @@ def _shifted_image(problem: Problem, camera: int, axis: int, solved: Sensitivity
     focal_px = torch.as_tensor(problem.intrinsic[:, axis])
     off = ((camera_of == camera) | (camera < 0)) / focal_px.to(camera_of.device)[camera_of]
     still = torch.zeros_like(off)
-    return {"observations": solved.whiten(torch.stack([off, still] if axis == 0 else [still, off]))}
+    observations = solved.whiten(torch.stack([off, still] if axis == 0 else [still, off]))
+    return {"observations": observations, **seen_by_shifted_image(problem, camera, axis, solved)}
 
 
 def _moving(motion: Callable[[Arrays, Tensor], Tensor]) -> Column:
@@ -262,11 +275,13 @@ def _moving(motion: Callable[[Arrays, Tensor], Tensor]) -> Column:
         extrinsic = solved.whitening.estimate.cam_from_vehicle[:, None]
         arrays = solved.arrays
         still = arrays.centre.new_zeros(arrays.camera_count, arrays.frame_count, 6)
-        tangent = arrays.at_moments(motion(arrays, still), axis=1)
+        of_frames = motion(arrays, still)
+        tangent = arrays.at_moments(of_frames, axis=1)
         shift = (extrinsic[..., :3, :3] @ tangent[..., :3, None])[..., 0]
         turn = (extrinsic[..., :3, :3] @ tangent[..., 3:, None])[..., 0]
         shift = shift + torch.linalg.cross(extrinsic[..., :3, 3].expand_as(turn), turn)
-        return {"observations": solved.jacobians.along_tangents(-torch.cat([shift, turn], dim=-1))}
+        observations = solved.jacobians.along_tangents(-torch.cat([shift, turn], dim=-1))
+        return {"observations": observations, **seen_by_moved_vehicle(of_frames, solved)}
 
     return column
 
@@ -349,7 +364,9 @@ def _falling(axis: int, solved: Sensitivity) -> Rows:
     nearest = torch.as_tensor(route.query(estimate.corners_map.cpu().numpy())[1], device=frames.device)
     left = ((estimate.corners_map - frames[nearest, :2, 3]) * frames[nearest, :2, 1]).sum(1)
     lower = (left.abs(), left.clamp(min=0), -left.clamp(max=0))[axis]
-    return raised(solved, -lower[arrays.corner.long()])
+    # The ground's estimate knows of falls to both sides alike: of one to one side that is half.
+    tilt = (0.0, 0.5, -0.5)[axis]
+    return {**raised(solved, -lower[arrays.corner.long()]), **seen_over_tilted_ground(tilt, solved)}
 
 
 def _rising(axis: int, arrays: Arrays, out: Tensor) -> Tensor:

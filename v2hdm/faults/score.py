@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from scipy import stats
 
@@ -29,8 +29,10 @@ class ScoreTest:
     model_sigma: float = float("inf")  # standard deviation under the model's own noise
     p_value: float = 1.0  # probability of such a value without the fault; 1 if unobservable
     # log-likelihood ratio of the fault, each segment predicted from the others; negative if they disagree.
-    # Surveyed centres belong to no segment and count as they are.
+    # Surveyed centres and planes of the ground belong to no segment and count as they are.
     gain: float = 0.0
+    # Root mean square motion of the corners, m, under a value of 1; 0 for all but lenses.
+    moves_m: float = field(default=0.0, kw_only=True)
 
     @property
     def fault(self) -> Fault:

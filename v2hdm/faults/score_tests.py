@@ -32,7 +32,7 @@ from v2hdm.adjust.solution import Solution
 from v2hdm.faults import table
 from v2hdm.faults.columns import Hypothesis, hypotheses
 from v2hdm.faults.score import ScoreTest
-from v2hdm.faults.sensitivity import NOISES, POSITION_NOISE, Sensitivity
+from v2hdm.faults.sensitivity import NOISES, POSITION_NOISE, Rows, Sensitivity
 from v2hdm.faults.table import Fault
 from v2hdm.records import FloatArray
 
@@ -44,6 +44,7 @@ _STATED_FREEDOM = 6.0
 """Degrees of freedom of the prior that a kind of noise has the stated variance: within a factor of 1.6 either
 way in two of three drives."""
 
+_OF_CAMERAS = ("camera_centre", "ground_planes")  # what is known of mountings beside the markings
 _ROUNDS = 50  # towards the variances of the noise, which settle to 1 %
 
 
@@ -112,19 +113,22 @@ class _Answer(Segments):
     """The segments' answer to one hypothesis."""
 
     hypothesis: Hypothesis
-    of_surveys: tuple[float, float]  # score and information of the cameras' surveyed centres
+    of_surveys: tuple[float, float]  # score and information of what is known of the cameras' mountings
     by_noise: FloatArray  # (N,) information by the kind of noise
+    moves_m: float  # as of :class:`v2hdm.faults.ScoreTest`
 
     @classmethod
     def to(cls, hypotheses: Sequence[Hypothesis], solved: Sensitivity) -> list[_Answer]:
         """The segments' scores at a solution, on some faults."""
         columns = [hypothesis.column(solved) for hypothesis in hypotheses]
         efficient = solved.efficient_columns(columns)
-        centres = efficient[:, solved.places["camera_centre"]]
-        survey_scores = -centres @ solved.residuals["camera_centre"].detach().flatten().cpu().numpy()
+        of_cameras = np.r_[tuple(solved.places[name] for name in _OF_CAMERAS)]
+        surveys = efficient[:, of_cameras]
+        survey_scores = -surveys @ solved.flat(solved.residuals)[of_cameras]
         information = solved.information_by_stretch(efficient)
         noise = np.column_stack([-solved.flat(solved.residuals), solved.noise])
         scores = solved.by_stretch(efficient, noise)
+        moves_m = _motions_m(hypotheses, columns, solved)
         return [
             cls(
                 score=scores[number, :, 0],
@@ -132,8 +136,9 @@ class _Answer(Segments):
                 drawn=scores[number, :, 1:].T,
                 information_alone=sum(float(row.square().sum()) for row in columns[number].values()),
                 hypothesis=hypothesis,
-                of_surveys=(float(survey_scores[number]), float(np.square(centres[number]).sum())),
+                of_surveys=(float(survey_scores[number]), float(np.square(surveys[number]).sum())),
                 by_noise=solved.by_noise(efficient[number]),
+                moves_m=float(moves_m[number]),
             )
             for number, hypothesis in enumerate(hypotheses)
         ]
@@ -151,7 +156,9 @@ class _Answer(Segments):
         """The test, shrinking its variance factor towards that of noise with ``variances`` (N,)."""
         hypothesis = self.hypothesis
         fault = hypothesis.fault
-        blank = ScoreTest(fault.name, hypothesis.camera, hypothesis.axis, hypothesis.item)
+        blank = ScoreTest(
+            fault.name, hypothesis.camera, hypothesis.axis, hypothesis.item, moves_m=self.moves_m
+        )
         if not self.is_observable:
             return blank
         multiple = self.multiple(float(self.noise_shares @ variances))
@@ -166,7 +173,7 @@ class _Answer(Segments):
         # Each segment is predicted from the others, which include priors of no segment.
         predicted = (self.score.sum() - score) / np.maximum(total - information, _LEAST_OBSERVABLE * total)
         gain = float(np.sum(predicted * score - predicted**2 * information / 2)) / multiple
-        # Surveys belong to no segment: they are one more, and gain by the value itself.
+        # Surveys, and the ground, belong to no segment: they are one more, and gain by the value itself.
         survey_score, survey_information = self.of_surveys
         gain += self.value * survey_score - self.value**2 * survey_information / 2
         return replace(
@@ -177,6 +184,17 @@ class _Answer(Segments):
             p_value=2 * float(stats.t.sf(abs(self.value) / sigma, _PRIOR_FREEDOM + self.freedom)),
             gain=gain,
         )
+
+
+def _motions_m(hypotheses: Sequence[Hypothesis], columns: Sequence[Rows], solved: Sensitivity) -> FloatArray:
+    """Root mean square motions (n,), m, of the corners under unit errors of lenses; 0 under others."""
+    out = np.zeros(len(hypotheses))
+    of_lens = [number for number, hypothesis in enumerate(hypotheses) if hypothesis.fault.is_of_lens]
+    if of_lens:
+        observed = [columns[number]["observations"].flatten().cpu().numpy() for number in of_lens]
+        moved = solved.moves(np.stack(observed, axis=1)).corners
+        out[of_lens] = np.sqrt(np.square(moved).sum(axis=1).mean(axis=0))
+    return out
 
 
 def score_faults(problem: Problem, solution: Solution) -> tuple[ScoreTest, ...]:

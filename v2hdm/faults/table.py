@@ -97,6 +97,7 @@ class Fault:
     prior_odds: float = PRIOR_ODDS
     # The stated noise of the poses allows for it: it may be why a map is doubtful, but contradicts none.
     is_allowed_for: bool = False
+    is_of_lens: bool = False  # of camera_info
     like_ground: bool = False  # it deforms a plane's image: if a surface leaves it, it is the likelier cause
 
     @property
@@ -238,6 +239,7 @@ FOCAL = Fault(
     check="focal length",
     remedy="check fx and fy in camera_info against the resolution, or recalibrate the lens",
     sentence=_focal,
+    is_of_lens=True,
     like_ground=True,
 )  # fmt: skip
 
@@ -247,6 +249,7 @@ DISTORTION = Fault(
     check="distortion",
     remedy="check distortion_coefficients (and the focal length) in camera_info, or recalibrate",
     sentence=_distortion,
+    is_of_lens=True,
     like_ground=True,
 )  # fmt: skip
 
@@ -256,6 +259,7 @@ PRINCIPAL = Fault(
     check="principal point",
     remedy="check cx and cy in camera_info against the image's size and crop, or recalibrate",
     sentence=_principal,
+    is_of_lens=True,
     like_ground=True,
 )  # fmt: skip
 

@@ -15,10 +15,11 @@ from v2hdm.ground.adjust import CENTRE, Adjusted, Errors, adjust
 from v2hdm.ground.model import Mount, guessed_mount
 from v2hdm.ground.motion import ARM_M, Motion, changing_pairs, motion_of, spread_pairs
 from v2hdm.ground.patches import STRIP_M, Matcher, Round
+from v2hdm.ground.planes import plane_of
 from v2hdm.ground.prior import Observations, Stated, state_sigmas
 from v2hdm.ground.results import STEEP_RAD, GroundEstimate, GroundOptions, GroundStatus, Parameter, Reading
 from v2hdm.ground.start import Readings, contradicts, try_readings
-from v2hdm.records import Calibration, Drive, PoseNoise
+from v2hdm.records import Calibration, Drive, FloatArray, PoseNoise
 
 _FREE_CENTRE = {"forward_m": (0, 2.0), "left_m": (1, 2.0), "up_m": (2, 0.3)}  # axis, prior sigma, m
 _STRAIGHT = "the vehicle drives straight: include a turn"
@@ -150,14 +151,25 @@ def _found(nothing: GroundEstimate, solved: _Solved, free: tuple[str, ...]) -> G
     # Left tangent of ``cam_from_vehicle`` (translation, rotation) by turn and centre in vehicle axes.
     by_axes = -np.kron([[0, 1], [1, 0]], mount.vehicle_from_cam_rotation.T)
     covariance = by_axes @ (factor * adjusted.covariance[:6, :6] + flatness) @ by_axes.T
+    calibration = Calibration(mount.info, mount.cam_from_vehicle, covariance)
+    by_lens = np.array([_by_lens(name, observations, solved) for name in ("focal_scale", "distortion_k1")])
     return replace(
         nothing,
         status=GroundStatus.FOUND,
-        calibration=Calibration(mount.info, mount.cam_from_vehicle, covariance),
+        calibration=calibration,
+        plane=plane_of(calibration, by_lens @ by_axes.T),
         parameters=_free_parameters(free, observations, solved, factor),
         median_residual=float(np.median(adjusted.residual)),
         innovations=_innovations(adjusted, solved.stated.drive.pose_noise),
     )
+
+
+def _by_lens(name: str, observations: Observations, solved: _Solved) -> FloatArray:
+    """Change (6,) of the mounting's turn and centre by an error of the lens."""
+    observed = solved.stated.prior_of(observations)
+    adjusted = solved.adjusted
+    freed = adjust(observed.observations, observed.prior, adjusted.mount, free=name, without=adjusted)
+    return np.asarray(freed.covariance[:6, 6] / freed.covariance[6, 6])
 
 
 def _nothing(camera: str, readings: Readings) -> GroundEstimate:

@@ -9,7 +9,7 @@ from enum import Enum
 import numpy as np
 
 from v2hdm.geometry.ipm import ipm_from_extrinsic
-from v2hdm.records import Calibration, Camera, Drive
+from v2hdm.records import Calibration, Camera, Drive, GroundPlane
 
 GROUND_IPM = "ground"
 """Name of the ground's IPM, beside those of the drive."""
@@ -86,7 +86,8 @@ class GroundEstimate:
     ``shares`` are the matched fractions of patches under each reading of the poses, ``reading`` the best.
     ``calibration`` has ``cam_from_vehicle`` with its covariance, None unless ``status`` is FOUND.
     ``median_residual`` is in units of :data:`v2hdm.ground.adjust.PIXEL_SIGMA`, 0.3 to 0.5 on a clean drive.
-    ``innovations`` are the RMS of estimated pose errors in stated sigmas.
+    ``innovations`` are the RMS of estimated pose errors in stated sigmas. ``plane`` is the ground in the
+    camera, where there is a calibration.
     """
 
     camera: str
@@ -98,10 +99,11 @@ class GroundEstimate:
     median_residual: float
     innovations: Mapping[str, float]
     seconds: float
+    plane: GroundPlane | None = None
 
 
 def better_start(drive: Drive, estimates: Mapping[str, GroundEstimate]) -> Drive:
-    """The drive with its cameras started from the ground's mounting where that is found and certain."""
+    """The drive with the ground's planes, its cameras started from the ground's mounting where certain."""
     cameras = {
         name: _started(camera, estimates[name]) if name in estimates else camera
         for name, camera in drive.cameras.items()
@@ -115,6 +117,7 @@ def _started(camera: Camera, estimate: GroundEstimate) -> Camera:
         return camera
     if calibration is None or calibration.covariance is None:
         return camera
+    camera = replace(camera, ground_plane=estimate.plane)
     if np.sqrt(np.diag(calibration.covariance)[3:].max()) > _SURE_RAD:
         return camera
     ipm = {**camera.ipm, GROUND_IPM: ipm_from_extrinsic(camera.info, calibration.cam_from_vehicle)}

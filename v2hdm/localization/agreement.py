@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from statistics import median  # of a few numbers in a tenth of numpy's time
 from typing import NamedTuple
 
 import numpy as np
@@ -61,7 +62,7 @@ class _Object:
     @property
     def gain(self) -> float:
         """The log likelihood ratio of a map that differs: the median of its views, whose errors are alike."""
-        return float(np.median(self.gains))
+        return median(self.gains)
 
 
 class Detected(NamedTuple):
@@ -94,11 +95,12 @@ def detected(scene: Scene, located: Located) -> Detected:
     scores = np.full(len(centres), np.log(_RIGHT[2]))
     if rows:
         offset = offsets(located.belief, scene, np.array(rows), np.array(numbers))
-        likelihoods = np.array([offset_likelihood(*of_pair) for of_pair in zip(*offset, strict=True)])
-        is_ahead = np.isfinite(likelihoods).all(axis=1)  # both in front of the camera
-        order = np.argsort(likelihoods[is_ahead, 1])
+        likelihood = offset_likelihood(*offset)
+        is_ahead = np.isfinite(likelihood.score)  # in front of the camera
+        order = np.argsort(likelihood.score[is_ahead])
         at = np.array(rows)[is_ahead][order]  # the last of a detection is its likeliest marking
-        gains[at], scores[at] = likelihoods[is_ahead][order].T
+        gains[at] = likelihood.gain[is_ahead][order]
+        scores[at] = likelihood.score[is_ahead][order]
     return Detected(centres, scene.quads.kinds, is_judged, gains, scores)
 
 
@@ -114,21 +116,23 @@ def _beside(scene: Scene, located: Located, place_map: FloatArray, row: int) -> 
 
 
 class OffsetLikelihood(NamedTuple):
-    """How an offset from a marking counts."""
+    """How offsets (...) from markings count; not a number where there is none."""
 
-    gain: float  # log likelihood ratio of a map with half of its markings moved and of a right one
-    score: float  # log likelihood by a right map over that of chance
+    gain: FloatArray  # (...) log likelihood ratio of a map with half of its markings moved and of a right one
+    score: FloatArray  # (...) log likelihood by a right map over that of chance
 
 
 def offset_likelihood(off_m: FloatArray, covariance_m2: FloatArray) -> OffsetLikelihood:
-    """How an offset (2,) of covariance (2, 2) from a marking counts; not a number where it is none."""
+    """How offsets (..., 2) of covariances (..., 2, 2) from markings count."""
     densities = []
     for spread_m in (_BLUNDER_M, _MOVED_M, _ELSEWHERE_M):
         total_m2 = covariance_m2 + spread_m**2 * np.eye(2)
-        squared = off_m @ np.linalg.solve(total_m2, off_m)
+        squared = (off_m * np.linalg.solve(total_m2, off_m[..., None])[..., 0]).sum(axis=-1)
         densities.append(np.exp(-0.5 * squared) / np.sqrt(np.linalg.det(total_m2)))
-    right = float(np.log(_RIGHT @ densities))
-    return OffsetLikelihood(float(np.log(_MOVED @ densities)) - right, right - float(np.log(densities[2])))
+    density = np.stack(densities, axis=-1)
+    right = np.log(density @ _RIGHT)
+    moved_log = np.log(density @ _MOVED)
+    return OffsetLikelihood(np.asarray(moved_log - right), np.asarray(right - np.log(density[..., 2])))
 
 
 @dataclass
@@ -141,19 +145,21 @@ class Agreement:
         """Take the detections of an image."""
         self.objects = [spot for spot in self.objects if way_m - spot.way_m < _WAY_M]
         for row in np.flatnonzero(judged.is_judged).tolist():
-            place = judged.places_map[row]
-            spot = self._of(place, judged.kinds[row])
+            spot = self._of(judged.places_map[row], judged.kinds[row])
             if spot is None:
-                spot = _Object(place, judged.kinds[row], way_m)
+                spot = _Object(judged.places_map[row], judged.kinds[row], way_m)
                 self.objects.append(spot)
             spot.gains.append(float(judged.gains[row]))
             spot.scores.append(float(judged.scores[row]))
 
-    def _of(self, place: FloatArray, kind: str) -> _Object | None:
-        for spot in self.objects:
-            if spot.kind == kind and float(np.abs(spot.place_map - place).max()) < _SAME_M:
-                return spot
-        return None
+    def _of(self, place_map: FloatArray, kind: str) -> _Object | None:
+        """The object of a class at a place."""
+        alike = [spot for spot in self.objects if spot.kind == kind]
+        if not alike:
+            return None
+        places_map = np.array([spot.place_map for spot in alike])
+        is_there = np.abs(places_map - place_map).max(axis=1) < _SAME_M
+        return alike[int(is_there.argmax())] if is_there.any() else None
 
     @property
     def _several(self) -> list[_Object]:
@@ -162,7 +168,7 @@ class Agreement:
     @property
     def score(self) -> float:
         """The log likelihood of these objects by the map over that of chance."""
-        return float(sum(np.median(spot.scores) for spot in self._several))
+        return sum(median(spot.scores) for spot in self._several)
 
     @property
     def quads(self) -> int:

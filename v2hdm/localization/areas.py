@@ -72,12 +72,12 @@ def with_areas(belief: Belief, scene: Scene, area_map: AreaMap, hulls: Sequence[
         is_alike = (area_map.kinds[numbers] == hull.kind) & (distance_m < reach_m)
         candidates += [(detection, number, middle_map) for number in numbers[is_alike].tolist()]
     features = sorted({area_map.first + number for _, number, _ in candidates})
-    new = [feature for feature in features if feature not in belief.markings]
-    priors = [area_map.variance_m2[feature - area_map.first] * np.eye(2) for feature in new]
-    held = with_markings(belief, new, priors)
+    unheld = [feature for feature in features if feature not in belief.markings]
+    priors = [area_map.variance_m2[feature - area_map.first] * np.eye(2) for feature in unheld]
+    held = with_markings(belief, unheld, priors)
     observations = [_observed(held, scene, area_map, *candidate) for candidate in candidates]
-    taken = take(held, [observation for observation in observations if observation is not None])
-    return taken if taken.observations else Taken(belief, ())
+    update = take(held, [observation for observation in observations if observation is not None])
+    return update if update.observations else Taken(belief, ())
 
 
 def _observed(

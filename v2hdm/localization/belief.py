@@ -24,6 +24,8 @@ X, Y, HEADING, SCALE, BIAS, HEIGHT, ROLL, PITCH, SLOW_ROLL, SLOW_PITCH = range(1
 and above the ground of the map height, m, roll and pitch, rad, in a part that changes fast and one that
 lasts."""
 
+_PROTECTION_SIGMAS = 3.717  # radius, in sigmas, that one error in a thousand in a plane exceeds
+
 VEHICLE = 10  # number of the vehicle's states
 CAMERA = 6  # number of a camera's
 
@@ -251,6 +253,16 @@ def corrected(belief: Belief, residual: FloatArray, slope: FloatArray) -> Belief
     root = np.asarray(np.linalg.solve(inner, belief.root.T).T, dtype=np.float64)
     mean = belief.mean + root @ np.linalg.solve(inner, slope.T @ residual)
     return replace(belief, mean=mean, root=root)
+
+
+def bounds(covariance: FloatArray, heading_rad: float) -> tuple[float, float, float]:
+    """Bounds ahead, to the left and of the heading that one error in a thousand exceeds."""
+    c = np.cos(heading_rad)
+    s = np.sin(heading_rad)
+    turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    sigma = np.sqrt(np.diag(turn @ covariance @ turn.T))
+    ahead, left, heading = (_PROTECTION_SIGMAS * sigma).tolist()
+    return ahead, left, heading
 
 
 def _square(root: FloatArray) -> FloatArray:

@@ -46,7 +46,7 @@ class Feet(NamedTuple):
     is_beside: BoolArray  # (P,) not beyond the line's ends
 
     def subset(self, rows: BoolArray) -> Feet:
-        """Those of some of the points."""
+        """The feet of some of the points."""
         return Feet(
             self.points_map[rows],
             self.left[rows],
@@ -169,11 +169,11 @@ def with_lines(belief: Belief, scene: Scene, line_map: LineMap, pieces_px: Seque
                 continue
             candidates.append((number, line, points_px[is_near][is_used], near_feet))
     features = sorted({int(stretch) for *_, feet in candidates for stretch in feet.stretch})
-    new = [feature for feature in features if feature not in belief.markings]
-    held = with_markings(belief, new, [line_map.prior(feature) for feature in new])
+    unheld = [feature for feature in features if feature not in belief.markings]
+    held = with_markings(belief, unheld, [line_map.prior(feature) for feature in unheld])
     observations = [_observed(held, scene, *candidate) for candidate in candidates]
-    taken = take(held, [observation for observation in observations if observation is not None])
-    return taken if taken.observations else Taken(belief, ())
+    update = take(held, [observation for observation in observations if observation is not None])
+    return update if update.observations else Taken(belief, ())
 
 
 def _observed(

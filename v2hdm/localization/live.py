@@ -9,11 +9,9 @@ import subprocess
 import sys
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, NamedTuple
 
@@ -27,8 +25,6 @@ from v2hdm.localization.seeing import Look
 from v2hdm.localization.stream import MotionLines, look_of
 
 _QUIET_S = 0.5  # without an image, a pose comes after this time all the same
-_LAST_IMAGES = 10  # images of a camera by which its interval is known
-_SLOW_S = 0.5  # interval, s, after which nothing is expected at its place any more
 _POLL_S = 0.01  # a file that grows is looked at this often
 
 
@@ -96,8 +92,8 @@ def localize_live(
             images += len(looks)
             if looks or motions or fixes:
                 pose = localizer.update(looks, motions, fixes)
-                for look in looks:
-                    cameras[look.camera].point(localizer, look, time.time() - delay_s)
+                for camera in {look.camera for look in looks}:
+                    cameras[camera].point(localizer, time.time())
                 if looks or pose.stamp_s - written_s > _QUIET_S:
                     written_s = pose.stamp_s
                     take(pose)
@@ -116,31 +112,23 @@ def _available(items: _Queue) -> Iterator[_Item]:
             return
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Eye:
     """A camera's process, told where to look next."""
 
+    camera: str
     stream: IO[str]
-    delay_s: float
-    stamps_s: deque[float] = field(default_factory=lambda: deque(maxlen=_LAST_IMAGES))
+    delay_s: float  # from a picture to the stamp of its file
 
-    def point(self, localizer: Localizer, look: Look, now_s: float) -> None:
-        """Say where to look in the next image that the process can take, after a look of it."""
-        self.stamps_s.append(look.stamp_s)
-        if len(self.stamps_s) < 2:
-            return
-        interval_s = min(later - earlier for earlier, later in pairwise(self.stamps_s))
-        if interval_s <= 0 or interval_s > _SLOW_S:
-            return
-        # What came while the last image was looked at is the next one, or it is yet to come.
-        behind = max(1, math.ceil((now_s - look.stamp_s) / interval_s))
-        stamp_s = look.stamp_s + behind * interval_s
-        regions_px = localizer.regions(look.camera, stamp_s)
-        if regions_px is None:
-            return
-        record = {"stamp_s": stamp_s + self.delay_s, "regions_px": np.round(regions_px, 1).tolist()}
+    def point(self, localizer: Localizer, now_s: float) -> None:
+        """Say where to look in the images to come, after a look at the time ``now_s`` of a file."""
+        lines = []
+        for ahead in localizer.ahead(self.camera, now_s - self.delay_s):
+            regions_px = None if ahead.regions_px is None else np.round(ahead.regions_px, 1).tolist()
+            lines.append(json.dumps({"stamp_s": ahead.stamp_s + self.delay_s, "regions_px": regions_px}))
         try:
-            print(json.dumps(record), file=self.stream, flush=True)
+            self.stream.write("".join(f"{line}\n" for line in lines))
+            self.stream.flush()
         except OSError:  # it has ended; what it says of that comes as its last item
             return
 
@@ -158,7 +146,7 @@ def _camera(name: str, source: str, calibration: Path, items: _Queue, delay_s: f
         reader = threading.Thread(target=_follow_camera, args=arguments, daemon=True)
         reader.start()
         try:
-            yield _Eye(process.stdin, delay_s)
+            yield _Eye(name, process.stdin, delay_s)
         finally:
             process.terminate()
             reader.join()

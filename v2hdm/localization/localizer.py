@@ -20,6 +20,7 @@ from v2hdm.localization.belief import (
     HEADING,
     VEHICLE,
     Belief,
+    bounds,
     loosened,
     pinned,
     predict,
@@ -28,20 +29,20 @@ from v2hdm.localization.belief import (
 )
 from v2hdm.localization.joint import Located, Scene, locate, paired
 from v2hdm.localization.lines import LineMap, with_lines
-from v2hdm.localization.motion import Motion, MotionLog, MotionNoise, moved
+from v2hdm.localization.motion import Motion, MotionLog, MotionNoise
 from v2hdm.localization.paint import Paint
 from v2hdm.localization.places import Place, Prior, vehicle_at
-from v2hdm.localization.regions import EVERY_FULL, Looking
+from v2hdm.localization.regions import EVERY_FULL, Ahead, Looking, View
 from v2hdm.localization.rig import Estimate, Rig, Turned
 from v2hdm.localization.seeing import Look, Sighted, hulls_of_areas, pieces_of_lines, sighted
 from v2hdm.localization.starting import Quest
+from v2hdm.localization.way import Way
 from v2hdm.records import Calibration, FloatArray, HDMap
 
 _LAG_S = 1.0  # images may be so late
 _FUTURE_S = 2.0  # a stamp farther ahead of the odometry, s, is of another clock
 # With a larger standard deviation of the place the vehicle does not know where it is: half a dash's gap.
 _LOST_M = 0.3
-_PROTECTION_SIGMAS = 3.717  # radius, in sigmas, that one error in a thousand in a plane exceeds
 _MOST_FEATURES = 36  # markings, stretches of lines and areas whose places' errors are states: those seen last
 _STARTED = 4  # images from the start on whose agreement makes it sure
 _START_SIGMA = np.array([0.25, 0.25, np.deg2rad(1.5)])  # of a place that was found, m, m and rad
@@ -191,9 +192,7 @@ class Localizer:
         self._rig = Rig(dict(zip(self.calibrations, self._mountings, strict=True)))
         self._turned_s: float | None = None
         self._rig_since_s: float | None = None
-        self._local = np.zeros(3)
-        self._local_s: float | None = None
-        self._way_m = 0.0
+        self._way = Way(self._log)
         self._pace_reason: str | None = None
         self._reasons: dict[str, str] = {}
         self._matched = _Matched()
@@ -212,6 +211,7 @@ class Localizer:
                 f"{self._log.refused} samples of the odometry are no motion of a road vehicle; "
                 "state m/s and rad/s"
             )
+        self._way.follow_all_but(_LAG_S)
         for fix in sorted(fixes, key=lambda item: item.stamp_s):
             self._fix(fix)
         for look in sorted(images, key=lambda item: item.stamp_s):
@@ -225,16 +225,27 @@ class Localizer:
         None to look everywhere: every few images, and where the place, the map or a mounting is in doubt, few
         markings are expected, or the last look did not show what was.
         """
+        return self._ahead(camera, [stamp_s])[0].regions_px
+
+    def ahead(self, camera: str, now_s: float) -> list[Ahead]:
+        """As :meth:`regions`, for the next images of a camera at a time; none where nobody knows when."""
+        return self._ahead(camera, self._looking.stamps_ahead(camera, now_s))
+
+    def _ahead(self, camera: str, stamps_s: Sequence[float]) -> list[Ahead]:
         if camera not in self._numbers:
-            return None
-        belief = scene = None
-        if self._belief is not None and self._is_settled:
+            return [Ahead(stamp_s, None) for stamp_s in stamps_s]
+
+        def view_at(stamp_s: float) -> View | None:
+            if self._belief is None or not self._is_settled:
+                return None
             belief = self._fixed_to(self._belief, stamp_s)
             nothing = Look(camera, stamp_s)
             scene = self._scene(belief, nothing, sighted(nothing, self.calibrations[camera]))
+            return View(belief, scene)
+
         newest = self._log.samples[-1:]
         speed_m_s = newest[0].speed_m_s if newest else 0.0
-        return self._looking.regions(camera, belief, scene, speed_m_s)
+        return self._looking.ahead(camera, stamps_s, view_at, speed_m_s)
 
     @property
     def _is_settled(self) -> bool:
@@ -280,10 +291,12 @@ class Localizer:
         calibration = self.calibrations[look.camera]
         quads = sighted(look, calibration)
         if is_new:
-            self._count_way(look.stamp_s)
+            self._way.follow(look.stamp_s)
             if self._belief is None:
-                local = self._local_at(look.stamp_s)
-                self._search.patch.add(quads, look.camera, calibration, local, self._way_m)
+                local = self._way.at(look.stamp_s)
+                self._search.patch.add(quads, look.camera, calibration, local, self._way.length_m)
+                hulls = hulls_of_areas(look, calibration)
+                self._search.words.add(hulls, calibration, local, self._way.length_m)
             since_s = self._pace.since(look.camera)
             pieces = [] if since_s is None else self._log.pieces(since_s, look.stamp_s)
             self._pace_reason = self._pace.note(look, quads, calibration, pieces) or self._pace_reason
@@ -348,25 +361,6 @@ class Localizer:
         turning = [self._numbers[turned.camera] for turned in self._rig.turned if turned.is_slow]
         return predict(belief, self._log.pieces(belief.stamp_s, stamp_s), self.noise, turning)
 
-    def _count_way(self, stamp_s: float) -> None:
-        """Lay the odometry's way out to a time."""
-        if self._local_s is None:
-            self._local_s = stamp_s
-        if stamp_s > self._local_s:
-            step = moved(self._log.pieces(self._local_s, stamp_s))
-            self._local = vehicle_at(self._local, step)
-            self._way_m += float(np.hypot(step[0], step[1]))
-            self._local_s = stamp_s
-
-    def _local_at(self, stamp_s: float) -> FloatArray:
-        """The odometry's pose at a time that it has passed."""
-        if self._local_s is None or stamp_s >= self._local_s:
-            return self._local
-        x, y, turn = moved(self._log.pieces(stamp_s, self._local_s))
-        c = np.cos(turn)
-        s = np.sin(turn)
-        return vehicle_at(self._local, np.array([-c * x - s * y, s * x - c * y, -turn]))
-
     def _located(self, belief: Belief, look: Look, quads: Sighted, is_new: bool) -> Belief:
         """The belief after a look; another mounting is tried where the calibration's explains little."""
         noise = self._noise[look.camera]
@@ -385,7 +379,7 @@ class Localizer:
             self._rig_since_s = self._rig.pushed.note(look, gained)
         elif self._is_sure:
             self._rig.pushed.note(look, 0)
-        self._agreement.note(judged, self._way_m)
+        self._agreement.note(judged, self._way.length_m)
         if located.misfit_freedom > 0:
             noise.note(located, noise.factor)
         return belief_of_all
@@ -408,7 +402,7 @@ class Localizer:
             matched = _Matched(matched.markings, len(of_lines.observations), len(of_areas.observations))
         if is_new:
             self._matched = matched
-            self._looking.of(look.camera).note(matched.markings)
+            self._looking.of(look.camera).note(look.stamp_s, look.is_whole, matched.markings)
         return with_latest(belief, features, _MOST_FEATURES)
 
     def _scene(self, belief: Belief, look: Look, quads: Sighted) -> Scene:
@@ -420,8 +414,10 @@ class Localizer:
 
     def _find(self, look: Look) -> None:
         """Search for a place that explains what is seen as no other does."""
-        local = self._local_at(look.stamp_s)
-        proposal = self._search.propose(look, local, self._way_m, self.paint, self.calibrations, self._tried)
+        local = self._way.at(look.stamp_s)
+        proposal = self._search.propose(
+            look, local, self._way.length_m, self.paint, self.areas, self.calibrations, self._tried
+        )
         if proposal.pose is not None:
             self._begin(look.stamp_s, proposal.pose)
         elif proposal.reason is not None:
@@ -431,7 +427,7 @@ class Localizer:
     def _tried(self, place: Place) -> Agreement:
         """How the map explains the last images, seen from a place."""
         looks = self._search.looks
-        pose = vehicle_at(place.map_from_local, self._local_at(looks[0].stamp_s))
+        pose = vehicle_at(place.map_from_local, self._way.at(looks[0].stamp_s))
         belief = start(looks[0].stamp_s, pose, _START_SIGMA, self._mountings, self.noise)
         agreement = Agreement()
         for look in looks:
@@ -440,7 +436,7 @@ class Localizer:
             scene = self._scene(belief, look, quads)
             located = locate(belief, scene)
             belief = located.belief
-            agreement.note(detected(scene, located), self._way_m)
+            agreement.note(detected(scene, located), self._way.length_m)
         return agreement
 
     def _begin(self, stamp_s: float, pose: FloatArray) -> None:
@@ -478,7 +474,7 @@ class Localizer:
             pose = self._belief.mean[:3].copy()
             sigma_m = max(_AGAIN_SIGMA_M, self._belief.sigma_m)
             prior = Prior(pose, sigma_m, _AGAIN_SIGMA_RAD)
-        local = self._local if self._belief is None else self._local_at(self._belief.stamp_s)
+        local = self._way.pose if self._belief is None else self._way.at(self._belief.stamp_s)
         self._search = Quest(prior, local)
         self._belief = None
         self._past.clear()
@@ -491,8 +487,8 @@ class Localizer:
         """Keep a position by RTK until the images of before it have come."""
         belief = self._belief
         if belief is None:
-            self._count_way(fix.stamp_s)
-            local = self._local_at(fix.stamp_s)
+            self._way.follow(fix.stamp_s)
+            local = self._way.at(fix.stamp_s)
             self._antenna.note(fix, local)
             self._search.prior = self._antenna.prior(local, self._search.prior)
             self._search.local = local
@@ -519,7 +515,7 @@ class Localizer:
 
     def _pose(self) -> Pose:
         """The pose at the newest stamp."""
-        stamps = [item for item in (self._log.newest_s, self._local_s) if item is not None]
+        stamps = [item for item in (self._log.newest_s, self._way.stamp_s) if item is not None]
         stamp_s = max(stamps, default=0.0)
         reasons = dict(self._reasons)
         if self._pace_reason is not None:
@@ -552,7 +548,7 @@ class Localizer:
                 f"the map explains {100 * self._agreement.share:.0f} % of the markings seen in the last m, "
                 "and too few of the latest"
             )
-        protection = _protection(covariance, float(belief.mean[HEADING]))
+        protection = bounds(covariance, float(belief.mean[HEADING]))
         if status != Status.TRACKING or self._rig.pushed.is_suspicious or self._agreement.differs:
             protection = (np.inf, np.inf, np.inf)
         if status == Status.INITIALISING:
@@ -576,13 +572,3 @@ class Localizer:
             matched_lines=self._matched.lines,
             matched_areas=self._matched.areas,
         )
-
-
-def _protection(covariance: FloatArray, heading_rad: float) -> tuple[float, float, float]:
-    """Bounds ahead, to the left and of the heading that one error in a thousand exceeds."""
-    c = np.cos(heading_rad)
-    s = np.sin(heading_rad)
-    turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    sigma = np.sqrt(np.diag(turn @ covariance @ turn.T))
-    ahead, left, heading = (_PROTECTION_SIGMAS * sigma).tolist()
-    return ahead, left, heading

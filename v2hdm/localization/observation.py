@@ -49,7 +49,7 @@ class Taken(NamedTuple):
     @property
     def features(self) -> list[int]:
         """The features that were seen."""
-        return sorted({feature for taken in self.observations for feature in taken.features})
+        return sorted({feature for view in self.observations for feature in view.features})
 
 
 def clear_ones(observations: Sequence[Observation]) -> list[Observation]:
@@ -74,14 +74,14 @@ def take(belief: Belief, observations: Sequence[Observation]) -> Taken:
         slope = np.concatenate([observation.slope for observation in chosen])
         rows = np.arange(len(residual)).reshape(-1, _NUMBERS)
         noise = np.zeros((len(residual), len(residual)))
-        for of_one, observation in zip(rows, chosen, strict=True):
-            noise[np.ix_(of_one, of_one)] = observation.noise
+        for numbers, observation in zip(rows, chosen, strict=True):
+            noise[np.ix_(numbers, numbers)] = observation.noise
         pull = np.linalg.solve(noise + slope @ slope.T, residual)
         if residual @ pull <= largest_square(np.array(float(len(residual)))):
             inner = np.linalg.inv(np.linalg.cholesky(noise))
             return Taken(corrected(belief, inner @ residual, inner @ slope), tuple(chosen))
         # What noise has to explain of each once all are taken: of the worst it is not noise.
         left = noise @ pull
-        squared = [float(left[of_one] @ pull[of_one]) for of_one in rows]
+        squared = [float(left[numbers] @ pull[numbers]) for numbers in rows]
         del chosen[int(np.argmax(squared))]
     return Taken(belief, ())

@@ -7,7 +7,7 @@ markings of their class. What is only as likely as chance, or likely at two plac
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -65,6 +65,7 @@ class Place(NamedTuple):
     score: float  # log likelihood over that of chance
     matched: int
     quads: int
+    word_score: float = 0.0  # the part of ``score`` that words give
 
 
 @dataclass
@@ -132,12 +133,21 @@ class Patch:
         return several or self.objects
 
 
+WordScores = Callable[[FloatArray], FloatArray]
+"""What words say for places (C, 3) of a patch: log likelihoods (C,) over those of chance."""
+
+
+def _no_words(poses: FloatArray) -> FloatArray:
+    return np.zeros(len(poses))
+
+
 def search(
     patch: Patch,
     paint: Paint,
     calibrations: Mapping[str, Calibration],
     local_from_vehicle: FloatArray,
     prior: Prior | None,
+    word_scores: WordScores = _no_words,
 ) -> list[Place]:
     """The places of a patch, the likeliest first; ``prior`` is of the vehicle at a pose of the odometry."""
     objects = patch.sure
@@ -155,19 +165,21 @@ def search(
     poses = _allowed(poses, local_from_vehicle, prior)
     if not len(poses):
         return []
-    count = stacks.count(poses, _SLACK_M)
-    poses = poses[np.argsort(-count, kind="stable")[:_REFINED]]
+    likely = _MATCHED * stacks.count(poses, _SLACK_M) + word_scores(poses)
+    poses = poses[np.argsort(-likely, kind="stable")[:_REFINED]]
     for slack_m in (_SLACK_M, _SLACK_M, _SLACK_SIGMAS * _SIGMA_M):
         poses = np.array([stacks.refined(pose, slack_m) for pose in poses])
     places = []
-    for pose in _distinct(_allowed(poses, local_from_vehicle, prior), stacks):
+    distinct = _distinct(_allowed(poses, local_from_vehicle, prior), stacks)
+    for pose in distinct:
+        words = float(word_scores(pose[None])[0])
         squared, marking = stacks.nearest(pose)
         is_matched = squared < (_SLACK_SIGMAS * _SIGMA_M) ** 2
         score = _MATCHED * is_matched.sum() - 0.5 * float(squared[is_matched].sum()) / _SIGMA_M**2
         score -= _MISSED * _missed(patch, pose, paint, calibrations, numbers[marking[is_matched]])
-        score -= _surprise(pose, local_from_vehicle, prior)
+        score += words - _surprise(pose, local_from_vehicle, prior)
         matched = len(np.unique(marking[is_matched]))
-        places.append(Place(np.array([pose[0], pose[1], pose[2]]), float(score), matched, len(objects)))
+        places.append(Place(np.array(pose), float(score), matched, len(objects), words))
     return sorted(places, key=lambda place: -place.score)
 
 

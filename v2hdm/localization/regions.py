@@ -6,7 +6,12 @@ expects are looked at, spread over the distance, in boxes around where they shou
 
 from __future__ import annotations
 
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,6 +27,7 @@ _RANGE_M = 20.0  # distance, m, up to which markings are found at almost every l
 _MOST = 8  # markings that are looked for: of more, few say anything new of a vehicle's six unknowns
 _LEAST = 4  # markings with which a look is worth it; where fewer are expected, all is searched
 _MOST_SHARE = 0.16  # share of the image that is looked at
+# Ranks of markings by distance, in parts of their number, in the order in which they are chosen.
 _HALVES = (0.0, 1.0, *(numerator / 2**power for power in range(1, 5) for numerator in range(1, 2**power, 2)))
 _AROUND_M = 0.25  # way, m, around a marking that is looked at
 _AROUND_PX = 6.0  # px beside
@@ -31,24 +37,50 @@ EARLY_S = 0.05
 
 _BESIDE = 0.25  # share of an image's size beside it, up to which a lens' polynomial is taken at its word
 _SURE_M, _SURE_RAD = 0.15, np.deg2rad(1.0)  # standard deviations of a place that is known well enough
+_LAST_LOOKS = 10  # looks of a camera by which its interval is known
+_SLOW_S = 0.5  # interval, s, after which nothing is expected at its place any more
+_AHEAD = 4  # images to come that are told of: a look may last longer than it takes to the next
 _FOUND = 0.6  # share of the markings looked for, from which the last look was as expected
+
+
+class View(NamedTuple):
+    """A belief at the time of an image, and the scene that has its camera."""
+
+    belief: Belief
+    scene: Scene
+
+
+class Ahead(NamedTuple):
+    """Where to look in an image that is to come: boxes (R, 4), px, or None for everywhere."""
+
+    stamp_s: float
+    regions_px: FloatArray | None
 
 
 @dataclass
 class Glances:
-    """What is known of one camera's looks: how many since a full search, and how they went."""
+    """What is known of one camera's looks: when they were, the last whole one, and how the last went."""
 
-    since_full: int
+    stamps_s: deque[float] = field(default_factory=lambda: deque(maxlen=_LAST_LOOKS))
+    whole_s: float = -np.inf
+    told_s: float = -np.inf  # time of the last image that was to be searched as a whole
     expected: int = 0
     was_as_expected: bool = False
 
-    def note(self, found: int) -> None:
-        """Take the number of markings that an image showed."""
-        self.was_as_expected = found >= _FOUND * max(self.expected, _LEAST)
+    def note(self, stamp_s: float, is_whole: bool, markings: int) -> None:
+        """Take a look and the number of markings that it showed."""
+        self.stamps_s.append(stamp_s)
+        if is_whole:
+            self.whole_s = stamp_s
+        expected = 0 if is_whole else self.expected
+        self.was_as_expected = markings >= _FOUND * max(expected, _LEAST)
 
-    def is_full_due(self, every_full: int) -> bool:
-        """Whether the next image is to be searched as a whole."""
-        return not self.was_as_expected or self.since_full + 1 >= every_full
+    @property
+    def interval_s(self) -> float | None:
+        """The time between two images; None where that is not known, or too long to expect anything."""
+        apart_s = [later - earlier for earlier, later in pairwise(self.stamps_s) if later > earlier]
+        interval_s = min(apart_s, default=np.inf)
+        return interval_s if interval_s <= _SLOW_S else None
 
 
 @dataclass
@@ -60,29 +92,60 @@ class Looking:
 
     def of(self, camera: str) -> Glances:
         """The looks of a camera."""
-        if camera not in self.glances:
-            count = len(self.glances)
-            self.glances[camera] = Glances(since_full=(count * self.every_full) // 2 % self.every_full)
-        return self.glances[camera]
+        return self.glances.setdefault(camera, Glances())
 
-    def regions(
-        self, camera: str, belief: Belief | None, scene: Scene | None, speed_m_s: float
-    ) -> FloatArray | None:
-        """Boxes (R, 4) for the next image of a camera, px; None for all of it.
+    def stamps_ahead(self, camera: str, now_s: float) -> list[float]:
+        """When the next images of a camera will have been taken, that of which may already be there first."""
+        glances = self.of(camera)
+        interval_s = glances.interval_s
+        if interval_s is None:
+            return []
+        newest_s = glances.stamps_s[-1]
+        behind = max(1, math.floor((now_s - newest_s) / interval_s))
+        return [newest_s + (behind + number) * interval_s for number in range(_AHEAD)]
 
-        ``belief`` is that of the image's time, None where nothing is sure; ``scene`` has its camera.
+    def ahead(
+        self,
+        camera: str,
+        stamps_s: Sequence[float],
+        view_at: Callable[[float], View | None],
+        speed_m_s: float,
+    ) -> list[Ahead]:
+        """Where to look in images of a camera that are to come at some times.
+
+        ``view_at`` gives the view at such a time, None where nothing is sure.
         """
         glances = self.of(camera)
-        expected = None
-        if belief is not None and scene is not None and not glances.is_full_due(self.every_full):
-            expected = expected_boxes(belief, scene, speed_m_s)
-        if expected is None:
-            glances.since_full = 0
-            glances.expected = 0
-            return None
-        glances.since_full += 1
-        glances.expected = len(expected)
-        return expected
+        interval_s = glances.interval_s
+        whole_s = glances.whole_s
+        out: list[Ahead] = []
+        for stamp_s in stamps_s:
+            boxes = None
+            # A whole look that was told of, but has not come yet, is as good as done for some images.
+            if interval_s is not None and stamp_s - glances.told_s < (_AHEAD + 0.5) * interval_s:
+                whole_s = max(whole_s, glances.told_s)
+            is_due = interval_s is None or stamp_s - whole_s > (self._period(camera) - 0.5) * interval_s
+            if glances.was_as_expected and not is_due:
+                view = view_at(stamp_s)
+                boxes = None if view is None else expected_boxes(*view, speed_m_s)
+            if boxes is None:
+                whole_s = stamp_s
+                # What is told of later images is told again.
+                glances.told_s = glances.told_s if out else stamp_s
+            else:
+                glances.expected = len(boxes)
+            out.append(Ahead(stamp_s, boxes))
+        return out
+
+    def _period(self, camera: str) -> int:
+        """After so many images one is due; the first time after fewer if another camera's is due then."""
+        glances = self.of(camera)
+        interval_s = glances.interval_s or 0.0
+        others = list(self.glances)[: list(self.glances).index(camera)]
+        is_together = any(
+            abs(self.glances[other].whole_s - glances.whole_s) < 0.5 * interval_s for other in others
+        )
+        return max(1, self.every_full // 2) if is_together else self.every_full
 
 
 def expected_boxes(belief: Belief, scene: Scene, speed_m_s: float) -> FloatArray | None:

@@ -32,18 +32,22 @@ _STEP_PX = 0.5  # step, px, of the lens's differences
 
 @dataclass(frozen=True)
 class Look:
-    """One image's content: the camera's name, the time of exposure, and the detections."""
+    """One image's content: the camera's name, the time of exposure, and the detections.
+
+    ``is_whole`` tells whether all of the image was searched.
+    """
 
     camera: str
     stamp_s: float
     markings: Sequence[MarkingDetection] = ()
     lanes: Sequence[LaneDetection] = ()
+    is_whole: bool = True
 
     @classmethod
     def of(cls, camera: str, stamp_s: float, road: Road) -> Look:
-        """What a :class:`~v2hdm.detection.road.RoadDetector` has found in an image."""
+        """The look that a :class:`~v2hdm.detection.road.RoadDetector` has had at an image."""
         markings = tuple(marking.image for marking in road.markings)
-        return cls(camera, stamp_s, markings, tuple(lane.image for lane in road.lanes))
+        return cls(camera, stamp_s, markings, tuple(lane.image for lane in road.lanes), road.is_whole)
 
 
 class Sighted(NamedTuple):

@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from v2hdm.localization.agreement import Agreement
+from v2hdm.localization.areas import AreaMap
 from v2hdm.localization.paint import Paint
 from v2hdm.localization.places import Patch, Place, Prior, search, vehicle_at
 from v2hdm.localization.seeing import Look
+from v2hdm.localization.words import WordPatch
 from v2hdm.records import Calibration, FloatArray
 
 # Log likelihood by which one place must explain what is seen better than any other: one wrong in e^10.
@@ -46,6 +49,7 @@ class Quest:
     since_m: float = 0.0
     last_s: float = -np.inf
     patch: Patch = field(default_factory=Patch)
+    words: WordPatch = field(default_factory=WordPatch)
     looks: deque[Look] = field(default_factory=lambda: deque(maxlen=_TRIED_LOOKS))
 
     def propose(
@@ -54,6 +58,7 @@ class Quest:
         local: FloatArray,
         way_m: float,
         paint: Paint,
+        areas: AreaMap,
         calibrations: Mapping[str, Calibration],
         tried: Callable[[Place], Agreement],
     ) -> Proposal:
@@ -64,11 +69,12 @@ class Quest:
         if self.since_s is None and self.patch.objects:
             self.since_s = look.stamp_s
             self.since_m = way_m
-        if self.since_s is None or 0 <= look.stamp_s - self.last_s < _SEARCH_S:
+        if self.since_s is None or not self._is_due(look.stamp_s):
             return _NOTHING
         self.last_s = look.stamp_s
         self.looks.append(look)
-        places = search(self.patch, paint, calibrations, self.local, self.prior)
+        word_scores = partial(self.words.scores, area_map=areas)
+        places = search(self.patch, paint, calibrations, self.local, self.prior, word_scores)
         if places:
             proposal = self._judged(places, local, tried)
             if proposal is not _NOTHING:
@@ -84,6 +90,12 @@ class Quest:
                 "of this site, as painted today, in these coordinates, and are these its cameras?",
             )
         return _NOTHING
+
+    def _is_due(self, stamp_s: float) -> bool:
+        """Whether it is time for a search: in turn, or because a map that is wrong is to be said by now."""
+        assert self.since_s is not None
+        is_deadline = self.last_s < self.since_s + _LOST_S < stamp_s
+        return is_deadline or not 0 <= stamp_s - self.last_s < _SEARCH_S
 
     def _judged(
         self, places: list[Place], local: FloatArray, tried: Callable[[Place], Agreement]
@@ -105,7 +117,8 @@ class Quest:
                 "wherever the vehicle may be, many markings seen lie beside those of the map: is it the map "
                 "of this site, as painted today?",
             )
-        scores = np.array([agreement.score for agreement in agreements])
+        pairs = zip(agreements, rivals, strict=True)
+        scores = np.array([agreement.score + place.word_score for agreement, place in pairs])
         order = np.argsort(-scores)
         likeliest = agreements[order[0]]
         surer_by = scores[order[0]] - max(scores[order[1]] if len(order) > 1 else 0.0, 0.0)

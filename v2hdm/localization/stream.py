@@ -97,7 +97,8 @@ def _positive(value: float, at: str) -> float:
 def look_of(record: Mapping[str, Any], camera: str) -> Look:
     """The detections of one line of ``v2hdm detect``."""
     markings = tuple(map(_marking, record["markings"]))
-    return Look(camera, float(record["stamp_s"]), markings, tuple(map(_lane, record["lanes"])))
+    lanes = tuple(map(_lane, record["lanes"]))
+    return Look(camera, float(record["stamp_s"]), markings, lanes, record.get("whole", True))
 
 
 def _lane(record: Mapping[str, Any]) -> LaneDetection:

@@ -13,6 +13,7 @@ from v2hdm.adjust import (
     MODELS,
     ControlPoints,
     Drift,
+    GroundPlanes,
     KnownLengths,
     Observations,
     PoseSigma,
@@ -298,7 +299,22 @@ def drive_problem(sightings: Sightings, rig: Rig, cameras: Mapping[str, Camera],
         session=sightings.session,
         clock_sigma_s=model.clock_sigma_s,
         read_out_s=read_outs_s(stated),
+        ground=_ground_of(stated),
     )
+
+
+def _ground_of(cameras: Sequence[Camera]) -> GroundPlanes | None:
+    """The ground that texture shows in the cameras, None if it shows none in any."""
+    planes = [camera.ground_plane for camera in cameras]
+    if not any(planes):
+        return None
+    out = GroundPlanes(*(np.zeros((len(planes), *shape)) for shape in ((4,), (3, 4), (2, 4))))
+    for c, plane in enumerate(planes):
+        if plane is not None:
+            out.plane_cam[c] = plane.plane_cam
+            out.root_information[c] = plane.root_information
+            out.by_lens[c] = plane.by_lens
+    return out
 
 
 def _constraints(

@@ -25,6 +25,7 @@ from v2hdm.lanes.points import ground_by_rig
 from v2hdm.mapping.alone import map_alone
 from v2hdm.mapping.bundle import Bundle, without_corner
 from v2hdm.mapping.conclusion import Optimised
+from v2hdm.mapping.ground_evidence import off_ground
 from v2hdm.mapping.inputs import Inputs
 from v2hdm.mapping.optimise import silent
 from v2hdm.mapping.options import MappingOptions, SurveyOptions, check_options
@@ -312,6 +313,7 @@ def optimised_result(
         suspicions=optimised.suspicions,
         heard=(*optimised.heard, *drawn.heard),
         surface=surface,
+        off_ground=off_ground(bundle),
         alone=map_alone(outcome, optimised) if with_alone else {},
     )
 

@@ -47,6 +47,7 @@ from v2hdm.mapping.options import AUTO, SURFACE, MappingOptions
 from v2hdm.records import BoolArray, Camera, FloatArray, PoseNoise, Road, largest_noise
 from v2hdm.site.standing import Grey
 from v2hdm.surface.paths import Paths
+from v2hdm.surface.planes import with_planes_over
 from v2hdm.surface.surface import Recorded, Surface
 
 _log = logging.getLogger(__name__)
@@ -349,7 +350,10 @@ class Optimiser:
             if coarse
             else full_model(self._pose_sigma, options, self.pose_model, self._variance_factor)
         )
-        bundle = solve_bundle(self.sightings, association, usable, rig, self._cameras, model, lanes)
+        cameras: Mapping[str, Camera] = self._cameras
+        if self.surface is not None:
+            cameras = with_planes_over(self.surface, cameras, rig.cam_from_vehicle, rig.map_from_vehicle)
+        bundle = solve_bundle(self.sightings, association, usable, rig, cameras, model, lanes)
         status = bundle.solution.status
         if status is Status.UNDETERMINED or not np.isfinite(bundle.solution.corners_map).all():
             raise MappingError(f"the joint optimisation failed ({status.value}): {status.advice}")

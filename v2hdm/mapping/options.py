@@ -29,35 +29,28 @@ POSE_MODELS: tuple[str, ...] = (AUTO, "paper", "roll_pitch", "full", "heave", "c
 """Values of ``mapping.pose_model``: the models of :data:`v2hdm.adjust.MODELS`, or ``auto``."""
 
 
-_BY_CLASS_M_AND_SIGMA_M = (
-    "by_class_m has length and width, m (diagonals of diamonds, sides of other classes), as in "
-    "{diamond: [1.0, 0.7]}, with the standard deviation sigma_m."
-)
-
-
 @dataclass(kw_only=True)
 class SizeOptions:
     """Sizes of classes that are painted to a standard, as factors of the joint solve."""
 
-    by_class_m: Annotated[dict[str, list[float]], _BY_CLASS_M_AND_SIGMA_M] = field(default_factory=dict)
-    sigma_m: Annotated[float, POSITIVE, _BY_CLASS_M_AND_SIGMA_M] = 0.005
+    by_class_m: Annotated[
+        dict[str, list[float]],
+        "by class, length and width, m, such as {diamond: [1.0, 0.7]}: diagonals of diamonds, "
+        "sides of other classes.",
+    ] = field(default_factory=dict)
+    sigma_m: Annotated[float, POSITIVE, "standard deviation of these sizes, m."] = 0.005
     tolerance: Annotated[
-        float, POSITIVE, "A marking off by more than the fraction tolerance is not of that size."
+        float, POSITIVE, "a marking whose size differs by more than this fraction is not held to it."
     ] = 0.15
-
-
-_POSITION_MAP_AND_SIGMA_M = (
-    "id is its name in the survey, position_map x and y with standard deviations sigma_m, m."
-)
 
 
 @dataclass(kw_only=True)
 class ControlOptions:
     """A surveyed corner of a marking."""
 
-    id: Annotated[str, "its name in the survey, position_map x and y with standard deviations sigma_m, m."]
-    position_map: Annotated[list[float], _POSITION_MAP_AND_SIGMA_M]
-    sigma_m: Annotated[list[float], _POSITION_MAP_AND_SIGMA_M]
+    id: Annotated[str, "name of the point in the survey."]
+    position_map: Annotated[list[float], "x and y, m."]
+    sigma_m: Annotated[list[float], "standard deviations of x and y, m."]
 
 
 @dataclass(kw_only=True)
@@ -83,7 +76,7 @@ class SurveyOptions:
         0.01
     )
     reach_m: Annotated[
-        float, POSITIVE, "Each control point ties down the nearest corner of the map within reach_m."
+        float, POSITIVE, "a control point ties down the nearest corner of the map within this distance, m."
     ] = 0.25
 
     def without(self, name: str) -> SurveyOptions:

@@ -38,7 +38,7 @@ from v2hdm.mapping.inputs import Inputs
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import AUTO, INCREMENTAL, SURFACE, SurveyOptions
 from v2hdm.mapping.results import CameraFit, ForeignSegment, SolveEvidence
-from v2hdm.records import Drive, FloatArray, IntArray
+from v2hdm.records import BoolArray, Drive, FloatArray, IntArray
 
 _log = logging.getLogger(__name__)
 
@@ -371,13 +371,24 @@ def _camera_fits(bundle: Bundle) -> dict[str, CameraFit]:
     information = 1 / np.trace(observations.covariance_px, axis1=1, axis2=2)
     for name, c in bundle.camera_index.items():
         of_camera = observations.camera == c
+        weight = information[of_camera]
+        sightings = _effective_count(bundle.row[of_camera], weight)
         fits[name] = CameraFit(
             observations=int(of_camera.sum()),
             variance_factor=_factor(bundle, bundle.solution.mahalanobis2[of_camera]),
-            rejected_share=float(1 - np.average(bundle.inliers[of_camera], weights=information[of_camera])),
-            sightings=_effective_count(bundle.row[of_camera], information[of_camera]),
+            rejected_share=float(1 - np.average(bundle.inliers[of_camera], weights=weight)),
+            sightings=sightings,
+            by_candidate=_by_candidate(bundle, of_camera, sightings * weight / weight.sum()),
         )
     return fits
+
+
+def _by_candidate(bundle: Bundle, of_camera: BoolArray, sightings: FloatArray) -> FloatArray:
+    """Sightings, and contradicted ones, of each candidate (J, 2), by those of K observations of a camera."""
+    group = bundle.group[of_camera]
+    counts = np.bincount(group, sightings)
+    contradicted = np.bincount(group, sightings * ~bundle.inliers[of_camera])
+    return np.column_stack([counts, contradicted])[counts > 0].astype(np.float64)
 
 
 def _effective_count(group: IntArray, weight: FloatArray) -> float:

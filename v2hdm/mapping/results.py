@@ -18,6 +18,7 @@ from v2hdm.records import (
     Changes,
     Exclusion,
     FloatArray,
+    GroundPlane,
     HDMap,
     Image,
     IntArray,
@@ -35,6 +36,8 @@ class CameraFit:
     variance_factor: float
     rejected_share: float  # weighted by the corners' information
     sightings: float  # effective number: as many of equal information would tell as much about the share
+    # Of each candidate, (J, 2): sightings, which add up to all, and those of them that are contradicted.
+    by_candidate: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 class ForeignSegment(NamedTuple):
@@ -102,6 +105,22 @@ class ClockOffset:
 
 
 @dataclass(frozen=True)
+class OffGround:
+    """A camera's mounting from markings, minus that from bare ground."""
+
+    turn_deg: FloatArray  # (3,) in roll, pitch and yaw
+    up_m: float
+    sigmas: float  # root mean square, in the sigmas of both
+    plane: GroundPlane | None = None  # the ground that a solve has taken in
+
+    def is_of(self, plane: GroundPlane | None) -> bool:
+        """Whether it is the ground of an estimate's ``plane``, which a surface may have moved since."""
+        if plane is None or self.plane is None:
+            return False
+        return bool(np.array_equal(plane.root_information, self.plane.root_information))
+
+
+@dataclass(frozen=True)
 class MethodResult:
     """The result of one method for one set of cameras."""
 
@@ -123,4 +142,5 @@ class MethodResult:
     changes: Changes | None = None  # to an earlier map
     heard: tuple[Heard, ...] = ()  # corrections of markings that the map follows
     surface: Surface | None = None  # of the ground, None for a plane
+    off_ground: Mapping[str, OffGround] = field(default_factory=dict)  # by camera whose ground was taken in
     alone: Mapping[str, MethodResult] = field(default_factory=dict)  # by camera, its observations alone

@@ -94,15 +94,21 @@ def join(inspections: Sequence[Inspection]) -> Inspection:
 
 
 def _started(drive: Drive, inspections: Sequence[Inspection]) -> dict[str, Camera]:
-    """Each camera with the start that the ground gave it on the first session where it did."""
+    """Each camera with the start and the plane that the ground gave it on the first session where it did.
+
+    Planes of further sessions share the errors of the lens with it; the map is held against them.
+    """
     cameras = dict(drive.cameras)
     for session, inspection in reversed(list(zip(drive.joined, inspections, strict=True))):
         for own_name, name in session.cameras.items():
             camera = inspection.drive.cameras[own_name]
+            described = cameras[name]
+            if camera.ground_plane is not None:
+                described = replace(described, ground_plane=camera.ground_plane)
             if camera.initial_ipm == GROUND_IPM:
-                described = drive.cameras[name]
                 ipm = {**described.ipm, GROUND_IPM: camera.ipm[GROUND_IPM]}
-                cameras[name] = replace(described, ipm=ipm, initial_ipm=GROUND_IPM)
+                described = replace(described, ipm=ipm, initial_ipm=GROUND_IPM)
+            cameras[name] = described
     return cameras
 
 

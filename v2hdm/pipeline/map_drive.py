@@ -36,7 +36,7 @@ from v2hdm.site.living.changes import Base
 from v2hdm.store.cache import StageCache
 from v2hdm.survey.run import Survey, check_survey, take_survey
 from v2hdm.verdict import Finding, Status, Verdict
-from v2hdm.verdict.results.accuracy import check_corrections, check_goal, check_known_sizes, clocks_once
+from v2hdm.verdict.results.accuracy import check_corrections, check_goal, check_known_sizes, told_once
 from v2hdm.verdict.results.solution import check_result, over_ground, told_by_poses
 
 if TYPE_CHECKING:
@@ -280,7 +280,7 @@ def _judge(
         unfit_findings += check_corrections(survey.mapping.acceptance.corrections, best)
         frame = "survey" if best.diagnostics["control_points"] else "poses"
         of_goal = check_goal(list(chosen.values())[-1][BEST], goal_cm / 100, frame)
-        result_findings, goal_findings = clocks_once(result_findings, of_goal)
+        result_findings, goal_findings = told_once(result_findings, of_goal)
         survey_findings = check_survey(survey, best, check_points)
         input_findings = over_ground(inspection.findings, best, survey.mapping.ground == AUTO)
         verdict = Verdict.of(

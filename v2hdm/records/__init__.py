@@ -13,6 +13,7 @@ from v2hdm.records.cameras import (
     CameraInfo,
     CentrePrior,
     FrameStep,
+    GroundPlane,
 )
 from v2hdm.records.changes import Change, Changes, Fate
 from v2hdm.records.classes import (
@@ -114,6 +115,7 @@ __all__ = [
     "FloatArray",
     "FrameStep",
     "GeodeticOrigin",
+    "GroundPlane",
     "GroundStrip",
     "HDMap",
     "Image",

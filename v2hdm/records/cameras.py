@@ -57,6 +57,20 @@ class CameraFrames:
 
 
 @dataclass(frozen=True)
+class GroundPlane:
+    """The ground as a camera's images of its texture show it, a plane in the camera.
+
+    ``plane_cam`` (4,) is its normal, upwards, and the camera's height above it, m; ``root_information``
+    (3, 4) whitens deviations from that. ``by_lens`` (2, 4) is the plane's change by a relative error of the
+    focal length, and by one of k1.
+    """
+
+    plane_cam: FloatArray
+    root_information: FloatArray
+    by_lens: FloatArray
+
+
+@dataclass(frozen=True)
 class Camera:
     """One camera of a drive: its intrinsics and approximate mounting."""
 
@@ -71,6 +85,7 @@ class Camera:
     mounting_sigma: tuple[float, float] = (0.0, 0.0)  # of a guessed horizon (rad) and log focal length
     read_out_s: float = 0.0  # first row to last, 0 for a global shutter; stamps are of the middle row
     frames: CameraFrames = CameraFrames()
+    ground_plane: GroundPlane | None = None
 
 
 @checked_class

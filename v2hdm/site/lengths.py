@@ -22,10 +22,8 @@ STANDARD_M: Mapping[str, tuple[float, ...]] = {LANE_DASH: (1.0, 1.5, 2.0, 3.0, 4
 
 _STANDARD_SHARE = 0.7  # fraction of dashes that are painted to a standard: yards and older roads are not
 _LAID_OUT = 0.05  # standard deviation of the logarithm of a painted length about its standard
-_OTHER_LENGTH = (
-    np.log(3.0),
-    0.7,
-)  # mean and standard deviation of the logarithm of other lengths: 0.7 to 12 m
+_OTHER_M = 3.0  # median of other lengths, m
+_OTHER_SPREAD = 0.7  # standard deviation of the logarithm of other lengths: 0.7 to 12 m
 
 _STANDARDS_COUNT = 3.0
 """How many dashes of a drive the standards weigh as much as: the concentration of the Dirichlet process."""
@@ -71,5 +69,5 @@ def _density(standard_m: tuple[float, ...], grid_m: FloatArray) -> FloatArray:
     log_m = np.log(grid_m)
     standards = [norm.pdf(log_m, np.log(length_m), _LAID_OUT) for length_m in standard_m]
     of_standards = np.mean(standards, axis=0)
-    of_others = norm.pdf(log_m, *_OTHER_LENGTH)
+    of_others = norm.pdf(log_m, np.log(_OTHER_M), _OTHER_SPREAD)
     return np.asarray((_STANDARD_SHARE * of_standards + (1 - _STANDARD_SHARE) * of_others) / grid_m)

@@ -17,8 +17,8 @@ class AcceptanceOptions:
     min_probability: Annotated[
         float,
         Within(0, 1 - 1e-9, open=True),
-        "A candidate must be a marking (by shape and detections) and lie on the ground (by parallax) with "
-        "at least min_probability.",
+        "least probability with which a candidate must be a marking (by shape and detections) and "
+        "lie on the ground (by parallax).",
     ] = 0.9
     accuracy: Annotated[
         str, "markings of a worse grade are left out of the map: A, B or C (none is left out)."
@@ -32,11 +32,6 @@ AFTER = "after"
 JOINT = "joint"  # values of ``mapping.lanes.model``
 
 
-_MAX_RANGE_M_AND_MIN_IMAGES = (
-    "Lane paint counts up to max_range_m from the camera; a vertex needs min_images."
-)
-
-
 @dataclass(kw_only=True)
 class LaneOptions:
     """Options of the polylines of lane paint."""
@@ -46,5 +41,9 @@ class LaneOptions:
         "after, which draws lanes after the adjustment, or joint, which adjusts them as cubic splines whose "
         "vertices have sigmas.",
     ] = AFTER
-    max_range_m: Annotated[float, NOT_NEGATIVE, _MAX_RANGE_M_AND_MIN_IMAGES] = 12.0
-    min_images: Annotated[int, NOT_NEGATIVE, _MAX_RANGE_M_AND_MIN_IMAGES] = 3
+    max_range_m: Annotated[
+        float, NOT_NEGATIVE, "distance from the camera, m, up to which lane paint counts."
+    ] = 12.0
+    min_images: Annotated[
+        int, NOT_NEGATIVE, "least number of images that must show a vertex of a lane line."
+    ] = 3

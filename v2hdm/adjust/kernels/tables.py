@@ -16,7 +16,16 @@ import torch
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
-from v2hdm.adjust.model import Estimate, Gradient, clock_residual, frame_tangent, moved, state_residual
+from v2hdm.adjust.model import (
+    Estimate,
+    Gradient,
+    by_ground_planes,
+    clock_residual,
+    frame_tangent,
+    ground_residual,
+    moved,
+    state_residual,
+)
 from v2hdm.adjust.reduced import Spread
 from v2hdm.compiled import exact_kernel, inlined, kernel, twin
 from v2hdm.geometry import rigid
@@ -201,11 +210,13 @@ def with_priors(
     centre_root = arrays.centre_information_root.numpy()
     towards_origin = (cameras[:, None, :3, 3] @ cameras[:, :3, :3])[:, 0]
     centre = -(towards_origin + arrays.centre.numpy()) * centre_root
+    ground = ground_residual(arrays, estimate.cam_from_vehicle)
     state = state_residual(arrays, estimate.frame_state) if arrays.states else estimate.frame_state
     clock = clock_residual(arrays, estimate.clock_s) if arrays.camera_unknowns > 6 else estimate.clock_s
     terms = {
         "observations": float(costs[0]),
         "camera_centre": float(np.vdot(centre, centre)) / 2,
+        "ground_planes": _half_square(ground),
         "frame_states": _half_square(state),
         "clock_offsets": _half_square(clock),
         "control_points": float(costs[1]),
@@ -217,6 +228,9 @@ def with_priors(
     # A left perturbation moves the centre by minus its translation in vehicle axes.
     by_centre = (centre * centre_root)[..., None]
     gradient.extrinsic.numpy()[:, :3] -= (cameras[:, :3, :3] @ by_centre)[..., 0]
+    if bool(arrays.ground_root.any()):
+        by_ground = arrays.ground_root @ by_ground_planes(estimate.cam_from_vehicle)
+        gradient.extrinsic.add_((by_ground.mT @ ground[..., None])[..., 0])
     if arrays.states:
         innovation = state * arrays.state_information_root
         gradient.frame_state.add_(innovation)

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import torch
 
-from v2hdm.adjust.problem import Problem, SolveOptions
+from v2hdm.adjust.model import by_ground_planes, ground_planes
+from v2hdm.adjust.problem import GroundPlanes, Problem, SolveOptions
 from v2hdm.adjust.sections.blocks import BlockCholesky, BlockMatrix, BlockPattern
 from v2hdm.adjust.sections.parts import Link, Part
 from v2hdm.adjust.sections.summary import Summary
@@ -194,6 +196,10 @@ class Net:
                 of_axes = 1 / self.problem.centre_sigma_m[camera] ** 2
                 information[:3, :3] = (rotation * of_axes) @ rotation.T
                 slope[:3] = -rotation @ (of_axes * (centre - self.problem.centre_vehicle[camera]))
+            if self.problem.ground is not None:
+                by_ground, off = _of_ground(self.problem.ground, shared.cam_from_vehicle, camera)
+                information[:6, :6] += by_ground.T @ by_ground
+                slope[:6] += by_ground.T @ off
             information[6:, 6:] = np.diag(1 / sigma_s**2)
             slope[6:] = shared.clock_s[camera] / sigma_s**2
             rows = camera * self.unknowns + np.arange(self.unknowns)
@@ -215,6 +221,16 @@ class Net:
         information[self.states :, self.states :] -= np.diag(alone)
         slope[self.states :] -= alone * shared.frame_state[frame]
         _add(matrix, gradient, place, information, slope)
+
+
+def _of_ground(
+    ground: GroundPlanes, cam_from_vehicle: FloatArray, camera: int
+) -> tuple[FloatArray, FloatArray]:
+    """Whitened deviation (3,) of a camera from its plane of the ground, after its derivatives (3, 6)."""
+    extrinsic = torch.as_tensor(cam_from_vehicle[camera : camera + 1])
+    off = ground_planes(extrinsic)[0].numpy() - ground.plane_cam[camera]
+    root = ground.root_information[camera]
+    return root @ by_ground_planes(extrinsic)[0].numpy(), root @ off
 
 
 def labels_of(part: Part, corner_order: IntArray, corners: IntArray) -> Labels:

@@ -10,7 +10,7 @@ import numpy as np
 
 from v2hdm.adjust.arrays import Arrays
 from v2hdm.adjust.layout import StatePrior, make_arrays, shifted, state_prior
-from v2hdm.adjust.problem import ControlPoints, KnownLengths, Problem, SolveOptions
+from v2hdm.adjust.problem import ControlPoints, KnownLengths, Observations, Problem, SolveOptions
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 
@@ -116,6 +116,37 @@ def cut(problem: Problem, part_of_frame: IntArray, states: tuple[str, ...]) -> t
     return parts, list(chains.links)
 
 
+def whole_of(parts: Sequence[Part], bare: Problem, corners: IntArray) -> Problem:
+    """The problem that was cut into parts, without surveyed corners and known lengths.
+
+    ``bare`` has its cameras and frames; ``corners`` (N,) are those of all parts.
+    """
+    cam_from_vehicle = bare.cam_from_vehicle.copy()
+    twists = None if bare.twist_vehicle is None else bare.twist_vehicle.copy()
+    columns = []
+    for part in parts:
+        problem = part.problem
+        cam_from_vehicle[part.cameras] = problem.cam_from_vehicle
+        if twists is not None:
+            twists[part.frames] = problem.twist_vehicle
+        observations = replace(
+            problem.observations,
+            camera=part.cameras[problem.observations.camera],
+            frame=part.frames[problem.observations.frame],
+            corner=np.searchsorted(corners, part.corners)[problem.observations.corner],
+        )
+        columns.append(vars(observations))
+    stated = [name for name, column in columns[0].items() if column is not None]
+    joined = {name: np.concatenate([of_part[name] for of_part in columns]) for name in stated}
+    return replace(
+        bare,
+        observations=Observations(**joined),
+        corner_count=len(corners),
+        cam_from_vehicle=cam_from_vehicle,
+        twist_vehicle=twists,
+    )
+
+
 def _with_joined(lengths: KnownLengths | None, saw: BoolArray) -> BoolArray:
     """Whether parts know corners (P, N): those that they saw, and all that known lengths join to these."""
     if lengths is None:
@@ -162,8 +193,10 @@ def _local(
     changes = {
         name: getattr(problem, name)[at] for name, at in numbers.items() if getattr(problem, name) is not None
     }
+    ground = None if problem.ground is None else problem.ground.take(cameras)
     local = replace(
         problem,
+        ground=ground,
         observations=replace(observations, camera=camera, frame=frame, corner=corner),
         corner_count=len(corners),
         pose_sigma=problem.pose_sigmas,

@@ -24,7 +24,8 @@ _CONTRADICTION_SIGMAS = 6.0
 """Mean shift of a drive against others, in sigmas of its positions, from which it contradicts them; chosen: a
 receiver's slow errors average out over a network, to about one sigma along a single street."""
 
-_OF_CAMERAS = ("camera_centre", "clock_offsets")  # priors that every section has of the same cameras
+# Priors that every section has of the same cameras.
+_OF_CAMERAS = ("camera_centre", "ground_planes", "clock_offsets")
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class Told:
 class Judged(NamedTuple):
     """How K observations of a section's own images, by ascending names, fit the section's own solve."""
 
-    squared: FloatArray  # (K,) Mahalanobis distances under the detector's stated variance
+    mahalanobis2: FloatArray  # (K,)
     corner: IntArray  # (K,) over the drive
     is_behind: BoolArray  # (K,) the camera
     shift_m: FloatArray  # (S, 2) sum of how far the frames of each session moved from their recorded poses
@@ -88,7 +89,7 @@ def judged_of(section: Section, settled: Bundle, chosen: IntArray, corner: IntAr
     shift_m = np.zeros((problem.session_count, 2))
     np.add.at(shift_m, session, moved_m)
     return Judged(
-        squared=settled.model.variance_factor * solution.mahalanobis2[chosen],
+        mahalanobis2=solution.mahalanobis2[chosen],
         corner=corner,
         is_behind=np.asarray(solution.verdict[chosen] == Verdict.BEHIND_CAMERA),
         shift_m=shift_m,
@@ -123,9 +124,9 @@ def refuse_contradicting_drives(judged: Sequence[Judged], drive: Drive) -> None:
 
 def gates(judged: Sequence[Judged], probability: float) -> list[Gate]:
     """The gates of all observations, at their common scale; see :func:`v2hdm.adjust.solution.classify`."""
-    scale = noise_scale(np.concatenate([section.squared for section in judged]))
+    scale = noise_scale(np.concatenate([section.mahalanobis2 for section in judged]))
     limit = -2 * np.log(probability) * scale
-    accepted = [(section.squared <= limit) & ~section.is_behind for section in judged]
+    accepted = [(section.mahalanobis2 <= limit) & ~section.is_behind for section in judged]
     size = 1 + max(int(section.corner.max(initial=-1)) for section in judged)
     count = np.zeros(size, dtype=np.int64)
     for section, is_accepted in zip(judged, accepted, strict=True):
@@ -144,6 +145,8 @@ def variance_of(fits: Sequence[Fit], whole: Problem) -> VarianceFactors:
     of_cameras = sum(float(np.mean([fit.of_priors.get(name, 0.0) for fit in fits])) for name in _OF_CAMERAS)
     cameras = len(whole.intrinsic)
     held = 0 if whole.centre_sigma_m is None else 3 * cameras
+    if whole.ground is not None:
+        held += int(whole.ground.root_information.any(axis=2).sum())
     free = 2 * len(corners) + 6 * cameras - held
     return variance_factors(squared, 2 * (sum(costs) + of_cameras), free)
 

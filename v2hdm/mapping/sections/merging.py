@@ -169,5 +169,6 @@ def _fits(parts: Sequence[Mapping[str, CameraFit]]) -> dict[str, CameraFit]:
             ),
             rejected_share=float(np.average([fit.rejected_share for fit in fits_of_camera], weights=weights)),
             sightings=sum(fit.sightings for fit in fits_of_camera),
+            by_candidate=np.concatenate([fit.by_candidate for fit in fits_of_camera]),
         )
     return fits

@@ -15,8 +15,11 @@ from v2hdm.mapping.bundle import Bundle
 from v2hdm.records import BoolArray, Drive, FloatArray, IntArray, Session
 
 OVERLAP_M = 40.0
-"""Distance from a section's frames within which its neighbours' images are its overlap: twice a camera's
-reach, so that all who see a marking of the section are there."""
+"""Distance, m, from a section's frames within which its neighbours' images are its overlap.
+
+It is twice a camera's reach, so that all who see a marking of the section are there: with 26 m, corners are
+twice as far from those without sections (.42 and .20 mm in the median, on 130 m in two sections).
+"""
 
 _MOST_PER_IMAGE = 1 << 20  # more detections than any image has, in the names of sightings
 

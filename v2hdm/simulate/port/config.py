@@ -78,8 +78,7 @@ class DisturbanceConfig:
     rtk_correlation_m: Annotated[
         float,
         POSITIVE,
-        "The RTK position error has a white part and one that is correlated over rtk_correlation_m of "
-        "driving.",
+        "distance driven over which the correlated position error fades, m.",
     ] = 30.0
     heading_deg: Annotated[float, NOT_NEGATIVE, "error of the recorded heading."] = 0.065
     heading_correlation_s: Annotated[float, POSITIVE, "correlation time of the heading error."] = 1.0
@@ -97,17 +96,9 @@ class RouteConfig:
             [95.0, 0.0], [24.0, 90.0], [60.0, 0.0], [24.0, 90.0], [75.0, 0.0], [24.0, -90.0], [58.0, 0.0],
         ]
     )  # fmt: skip
-    speed_mps: Annotated[
-        float, Within(0.01, 1e3), "The route, made up of pieces and driven at about speed_mps."
-    ] = 5.0
+    speed_mps: Annotated[float, Within(0.01, 1e3), "mean speed, m/s."] = 5.0
     image_spacing_m: Annotated[float, Within(0.01, 1e3), "distance driven between two images."] = 0.9
     pose_rate_hz: Annotated[float, Within(0.1, 1e4), "recorded poses per second."] = 10.0
-
-
-_SPACING_M_AND_OFFSETS_M = (
-    "A stencil is painted every spacing_m along each of offsets_m to the left of the route, where there "
-    "is room."
-)
 
 
 @dataclass(kw_only=True)
@@ -117,8 +108,12 @@ class StencilConfig:
     shapes_m: Annotated[
         list[list[list[float]]], "the convex polygons that make it up, as points [ahead, left] in m."
     ]
-    spacing_m: Annotated[float, _SPACING_M_AND_OFFSETS_M] = 10.0
-    offsets_m: Annotated[list[float], _SPACING_M_AND_OFFSETS_M] = field(default_factory=lambda: [-3.4, 3.4])
+    spacing_m: Annotated[
+        float, "distance between two stencils along the route, m; none is painted where there is no room."
+    ] = 10.0
+    offsets_m: Annotated[list[float], "offsets of the rows of stencils to the left of the route, m."] = field(
+        default_factory=lambda: [-3.4, 3.4]
+    )
 
 
 @dataclass(kw_only=True)
@@ -128,23 +123,20 @@ class SignsConfig:
     They are painted after all other paint, which stays where it is. The truth has them as symbols and lanes.
     """
 
-    words: Annotated[list[str], "words of capital letters, digits and -, each painted once."] = field(
+    words: Annotated[list[str], "words, each painted once: capital letters, digits and -."] = field(
         default_factory=list
     )
-    numbers: Annotated[int, Within(0, 1000), "how many bay numbers are painted, counting up."] = 0
-    first_number: Annotated[int, Within(0, 100_000), "the first of the bay numbers."] = 101
+    numbers: Annotated[int, Within(0, 1000), "number of bay numbers, counting up."] = 0
+    first_number: Annotated[int, Within(0, 100_000), "the first bay number."] = 101
     word_height_m: Annotated[float, Within(0.2, 5), "height of the letters of words."] = 1.5
     number_height_m: Annotated[float, Within(0.2, 5), "height of the digits of bay numbers."] = 0.9
-    hatched: Annotated[int, Within(0, 1000), "how many hatched areas there are."] = 0
-    crosswalks: Annotated[int, Within(0, 1000), "how many crosswalks there are."] = 0
+    hatched: Annotated[int, Within(0, 1000), "number of hatched areas."] = 0
+    crosswalks: Annotated[int, Within(0, 1000), "number of crosswalks."] = 0
     double_lines: Annotated[
         int,
         Within(0, 1000),
-        "along how many stretches of 15 to 25 m a second line runs beside a lane's line.",
+        "number of stretches of 15 to 25 m along which a second line runs beside a lane line.",
     ] = 0
-
-
-_WEAR_AND_DIRT = "wear and dirt are mean values, which vary from marking to marking."
 
 
 @dataclass(kw_only=True)
@@ -179,8 +171,8 @@ class PaintConfig:
     arrow_spacing_m: Annotated[float, Within(0.1), "distance between two arrows."] = 47.0
     stop_line_spacing_m: Annotated[float, Within(0.1), "distance between two stop lines."] = 83.0
     lettering_spacing_m: Annotated[float, Within(0.1), "distance between two words."] = 31.0
-    wear: Annotated[float, SHARE, _WEAR_AND_DIRT] = 0.14
-    dirt: Annotated[float, SHARE, _WEAR_AND_DIRT] = 0.2
+    wear: Annotated[float, SHARE, "mean share of a marking's paint that is worn off."] = 0.14
+    dirt: Annotated[float, SHARE, "mean strength of dirt on markings, 0 to 1."] = 0.2
     yellow_diamonds: Annotated[bool, "whether diamonds are yellow instead of white."] = False
     stencils: Annotated[dict[str, StencilConfig], "paint of users' own classes, by name."] = field(
         default_factory=dict
@@ -236,7 +228,7 @@ class YardConfig:
     """Objects that stand and drive in the port, and the light."""
 
     stack_fill: Annotated[
-        float, NOT_NEGATIVE, "the fraction of the places beside the route that hold container stacks."
+        float, NOT_NEGATIVE, "share of the places beside the route that hold container stacks."
     ] = 0.55
     stack_clearance_m: Annotated[float, NOT_NEGATIVE, "distance of container stacks from the route."] = 8.5
     parked_trucks: Annotated[int, Within(0, 1e4), "number of parked trucks, closer than the stacks."] = 7
@@ -251,18 +243,17 @@ class YardConfig:
     haze_m: Annotated[float, POSITIVE, "distance at which haze removes most of the contrast."] = 400.0
 
 
-_LEVEL_AND_LEVEL_SIGMA = (
-    "The shutter and the sensor, which aims at a mean brightness of level, varying by level_sigma."
-)
-
-
 @dataclass(kw_only=True)
 class ExposureConfig:
     """The shutter and the sensor."""
 
     exposure_s: Annotated[float, Within(0, 1), "time that the shutter is open."] = 0.002
-    level: Annotated[float, Within(0, 1, open=True), _LEVEL_AND_LEVEL_SIGMA] = 0.25
-    level_sigma: Annotated[float, NOT_NEGATIVE, _LEVEL_AND_LEVEL_SIGMA] = 0.08
+    level: Annotated[
+        float, Within(0, 1, open=True), "mean brightness of the images, as a fraction of full brightness."
+    ] = 0.25
+    level_sigma: Annotated[
+        float, NOT_NEGATIVE, "standard deviation of the brightness from image to image."
+    ] = 0.08
     full_well_electrons: Annotated[
         float, POSITIVE, "electrons in a pixel at full brightness; fewer mean more noise."
     ] = 9000.0
@@ -317,8 +308,7 @@ class PortConfig:
     session: Annotated[
         int,
         NOT_NEGATIVE,
-        "session numbers drives through one port: the same paint with different pose noise, image noise and "
-        "traffic.",
+        "number of the drive through this port: the same paint, other pose noise, image noise and traffic.",
     ] = 0
     initial_ipm: Annotated[
         str,
@@ -327,7 +317,7 @@ class PortConfig:
     ] = "calibrated"
     cameras: Annotated[
         dict[str, CameraConfig],
-        "A camera: its lens, its mount, and its mount on the other vehicle, which lends its IPM.",
+        "cameras by name: lens, mount, and mount on the other vehicle, which lends its IPM.",
     ] = field(default_factory=lambda: {"front": _front(), "rear": _rear()})
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     disturbance: DisturbanceConfig = field(default_factory=DisturbanceConfig)

@@ -16,7 +16,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from v2hdm.faults import table
+from v2hdm.faults import Contradiction, table
+from v2hdm.faults.odds import CLEAR_SIGMAS
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.io.maps.corrections import Correction
 from v2hdm.mapping.bundle import known_lengths
@@ -34,7 +35,7 @@ from v2hdm.site.accuracy import (
 from v2hdm.site.candidates import LACKS_A_CORNER, TOO_UNCERTAIN
 from v2hdm.site.corrections import unmet
 from v2hdm.survey.check_points import CheckTable, squared
-from v2hdm.verdict.results.solution import doubted, relied_on
+from v2hdm.verdict.results.solution import check_inputs, doubted, relied_on
 from v2hdm.verdict.verdict import GOAL, Finding, Status, passed
 
 _AHEAD_M = 10.0  # distance, m, within which a vehicle uses what it sees on the ground
@@ -46,6 +47,7 @@ def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Findin
     goal = f"; goal {100 * goal_m:g} cm"
     unknown_clocks = list(_unknown_clocks(best.evidence, goal_m))
     yield from unknown_clocks
+    yield from _unseen_lenses(best.evidence, goal_m)
     if markings:
         judged = well_known(markings)
         radii_m = absolute_radii_m(judged)
@@ -71,15 +73,15 @@ def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Findin
 _CLOCKS = (table.CLOCK.check, table.CLOCK_DRIFT.check)
 
 
-def clocks_once(
-    findings: Iterable[Finding], of_goal: Iterable[Finding]
-) -> tuple[list[Finding], list[Finding]]:
-    """The findings of a solve and those on the goal, without what either says of clocks less well.
+def told_once(findings: Iterable[Finding], of_goal: Iterable[Finding]) -> tuple[list[Finding], list[Finding]]:
+    """The findings of a solve and those on the goal, without what either says less well than the other.
 
-    A clock that is named as wrong is not unknown; and what is unknown of all clocks is told with its size.
+    A clock that is named as wrong is not unknown; what is unknown of all clocks is told with its size; and of
+    a lens whose unseen errors make the map miss the goal it is not told that the markings agree with it.
     """
-    findings = list(findings)
     of_goal = list(of_goal)
+    unseen = {finding.check for finding in of_goal if finding.is_unobservable}
+    findings = [f for f in findings if not (f.check in unseen and f.status is Status.PASS)]
     if any(finding.check in _CLOCKS and finding.status is not Status.PASS for finding in findings):
         return findings, [finding for finding in of_goal if finding.check not in _CLOCKS]
     if any(finding.check in _CLOCKS for finding in of_goal):
@@ -97,6 +99,32 @@ def _unknown_clocks(evidence: SolveEvidence | None, goal_m: float) -> Iterator[F
         "(95 %), which the map states: include a turn, or state pose_noise.clock_s in drive.yaml"
     )
     yield Finding(table.CLOCK.check, Status.WARN, 100 * clock_m, 100 * goal_m, "cm", says, "all cameras")
+
+
+def _unseen_lenses(evidence: SolveEvidence | None, goal_m: float) -> Iterator[Finding]:
+    """The errors of ``camera_info`` that no marking shows, although they make a map miss the goal.
+
+    They are Baarda's minimal detectable errors with their external reliability (A testing procedure for use
+    in geodetic networks, 1968): the largest error that the tests would let pass, and what it does.
+    """
+    if evidence is None:
+        return
+    raised = {finding.check for finding in check_inputs(evidence) if finding.status is not Status.PASS}
+    largest: dict[str, tuple[float, Contradiction]] = {}
+    for test in evidence.score_tests:
+        moved_m = CLEAR_SIGMAS * max(test.sigma, test.model_sigma) * test.moves_m
+        check = test.fault.check
+        least_m = goal_m if check not in largest else largest[check][0]
+        if test.fault.is_of_lens and np.isfinite(moved_m) and moved_m > least_m and check not in raised:
+            largest[check] = moved_m, test
+    for check, (moved_m, test) in largest.items():
+        size = test.fault.shown(CLEAR_SIGMAS * max(test.sigma, test.model_sigma))
+        whose = "all cameras alike" if len(test.cameras) > 1 else "it"
+        says = (
+            f"an error of {whose} would show from {size} on, and moves the corners by {_cm(moved_m)} until "
+            "then: calibrate the lens, or include a turn"
+        )
+        yield passed(check, ", ".join(test.cameras), says)
 
 
 def _beside(best: MethodResult, coarse: int) -> str:

@@ -13,7 +13,7 @@ from v2hdm.geometry.ipm import centre_sigmas
 from v2hdm.geometry.planar import length_along, turned_left
 from v2hdm.geometry.rigid import camera_centre, inverse, log
 from v2hdm.ground.results import GroundEstimate, GroundStatus
-from v2hdm.mapping.results import MethodResult
+from v2hdm.mapping.results import MethodResult, OffGround
 from v2hdm.records import HEIGHT_NOISE, SIGMA_OF_MAD, Calibration, Drive, FloatArray, Marking
 from v2hdm.verdict.verdict import Finding, Status, judge
 
@@ -30,7 +30,7 @@ _MOUNTING_LIMIT_SIGMAS = 5.0
 the former: below 2 on clean drives."""
 
 _GROUND_LIMIT_SIGMAS = 4.0
-"""Largest root mean square of six mounting parameters' deviations, in the sigmas of both: one in a million by
+"""Largest root mean square of a mounting's deviations, in the sigmas of both: less than one in a million by
 chance."""
 
 _LEAST_TURN_DEG = 0.2  # smallest angle between two mountings at which bare ground is the better judge
@@ -135,32 +135,43 @@ def shared_offsets(a: MethodResult, b: MethodResult, drive: Drive) -> FloatArray
     return np.stack([(offset_m * forward).sum(1), (offset_m * turned_left(forward)).sum(1)], axis=1)
 
 
-def check_against_ground(
-    calibrations: Mapping[str, Calibration], ground: Mapping[str, GroundEstimate]
-) -> Iterator[Finding]:
-    """Each camera's mounting from markings against that from bare ground, where there is one."""
-    for name, mapped in calibrations.items():
+def check_against_ground(best: MethodResult, ground: Mapping[str, GroundEstimate]) -> Iterator[Finding]:
+    """Each camera's mounting from markings against that from bare ground, where there is one.
+
+    Where the solve has taken the ground in, what it owes to it has been taken out again.
+    """
+    for name, mapped in best.calibrations.items():
         estimate = ground.get(name)
         if estimate is None or estimate.status is not GroundStatus.FOUND or estimate.calibration is None:
             continue
-        if mapped.covariance is not None and estimate.calibration.covariance is not None:
-            yield _compare(name, mapped, estimate.calibration)
+        if mapped.covariance is None or estimate.calibration.covariance is None:
+            continue
+        taken_in = best.off_ground.get(name)
+        if taken_in is not None and taken_in.is_of(estimate.plane):
+            yield _judged(name, taken_in)
+        else:
+            yield _judged(name, _against(mapped, estimate.calibration))
 
 
-def _compare(name: str, mapped: Calibration, ground: Calibration) -> Finding:
+def _against(mapped: Calibration, ground: Calibration) -> OffGround:
+    """A mounting ``mapped`` without that ground, against the ground's."""
     off = _difference(ground, mapped)
     turn_deg = np.rad2deg(mapped.cam_from_vehicle[:3, :3].T @ off[3:])
     up_m = float(camera_centre(mapped.cam_from_vehicle)[2] - camera_centre(ground.cam_from_vehicle)[2])
-    most_deg = np.abs(turn_deg).max()
-    small = most_deg < _LEAST_TURN_DEG and abs(up_m) < _LEAST_HEIGHT_M
-    sigmas = 0.0 if small else mounting_sigmas(ground, mapped, of_both=True)
-    roll, pitch, yaw = turn_deg
+    return OffGround(turn_deg, up_m, mounting_sigmas(ground, mapped, of_both=True))
+
+
+def _judged(name: str, deviation: OffGround) -> Finding:
+    most_deg = np.abs(deviation.turn_deg).max()
+    small = most_deg < _LEAST_TURN_DEG and abs(deviation.up_m) < _LEAST_HEIGHT_M
+    sigmas = 0.0 if small else deviation.sigmas
+    roll, pitch, yaw = deviation.turn_deg
     return judge(
         "ground", name, sigmas, _GROUND_LIMIT_SIGMAS, "sigmas",
         fine=f"markings and bare ground agree on its mounting ({most_deg:.2f} deg at most)",
         wrong=f"markings and bare ground do not agree on its mounting (roll {roll:+.2f}, pitch {pitch:+.2f}, "
-        f"yaw {yaw:+.2f} deg, height {100 * up_m:+.0f} cm): wrong associations, or ground that is not flat; "
-        "look at the overlay",
+        f"yaw {yaw:+.2f} deg, height {100 * deviation.up_m:+.0f} cm): wrong associations, or ground that is "
+        "not flat; look at the overlay",
     )  # fmt: skip
 
 

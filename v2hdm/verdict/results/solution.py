@@ -13,7 +13,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import betaln
+from scipy.special import betaln, logsumexp
+from scipy.stats import beta
 
 from v2hdm.faults import Contradiction, Fault, table
 from v2hdm.faults.odds import (
@@ -56,6 +57,12 @@ and standard deviation are a little above those of 50 cameras, rendered or made 
 _REJECTED_OF_WRONG = (1.0, 6.0)
 """The same where a lens, clock or mounting is wrong: mean 0.14, as without distortion coefficients."""
 
+_OTHER_SHARE = 0.1
+"""Share of candidates that are no markings on the ground, such as running boards, on right drives: those left
+out there are 0.05 of hundreds and 0.13 of 26."""
+
+_SHARES = np.logspace(-6, np.log10(0.999), 400)  # shares of rejected sightings, over which is integrated
+
 _VARIANCE_LIMIT = 3.0
 """Largest variance of observations over the one that the detector states: clean drives reach 0.2, a drive
 without its distortion 6."""
@@ -80,7 +87,7 @@ def check_result(
     """The checks after the solve ``best``, and its mountings against those of bare ground, by session."""
     findings = check_solution(drive, best)
     for session, estimates in zip(drive.sessions, ground, strict=False):
-        of_session = agreement.check_against_ground(best.calibrations, estimates)
+        of_session = agreement.check_against_ground(best, estimates)
         suffix = f" of {session.name}" if drive.joined else ""
         findings += [replace(finding, about=f"{finding.about}{suffix}") for finding in of_session]
     return findings
@@ -371,11 +378,23 @@ def check_fit(evidence: SolveEvidence) -> Iterator[Finding]:
 
 
 def _rejected_odds(fit: CameraFit) -> float:
-    """The log odds of a wrong camera, by how many of its sightings are rejected: beta-binomial of both."""
-    rejected = fit.rejected_share * fit.sightings
+    """The log odds of a wrong camera, by how many of its sightings of each candidate are rejected.
+
+    A wrong one contradicts all candidates alike. What stands or moves contradicts a right one, too, but by
+    itself: it may have any share.
+    """
+    contradicted = fit.rejected_share * fit.sightings
+    of_all = np.array([[fit.sightings, contradicted]])
+    count, rejected = (fit.by_candidate if len(fit.by_candidate) else of_all).T
+    agreeing = np.maximum(count - rejected, 0.0)
+    of_marking = rejected * np.log(_SHARES[:, None]) + agreeing * np.log1p(-_SHARES[:, None])
+    of_other = betaln(rejected + 1, agreeing + 1)
+    other = _OTHER_SHARE if len(count) > 1 else 0.0
+    with np.errstate(divide="ignore"):
+        mixed = np.logaddexp(np.log1p(-other) + of_marking, np.log(other) + of_other)
+    along = mixed.sum(axis=1) + np.log(np.gradient(_SHARES))
     wrong, right = (
-        betaln(rejected + a, fit.sightings - rejected + b) - betaln(a, b)
-        for a, b in (_REJECTED_OF_WRONG, _REJECTED_OF_RIGHT)
+        logsumexp(along + beta.logpdf(_SHARES, a, b)) for a, b in (_REJECTED_OF_WRONG, _REJECTED_OF_RIGHT)
     )
     return float(wrong - right)
 
