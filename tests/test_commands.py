@@ -19,7 +19,7 @@ import pytest
 import yaml
 
 from v2hdm import __version__
-from v2hdm.cli.main import all_commands, run, version_line
+from v2hdm.cli.main import all_commands, command_of, run, version_line
 from v2hdm.progress import patient
 
 ROOT = Path(__file__).parents[1]
@@ -206,6 +206,13 @@ def test_openmp_waits_without_spinning_unless_the_user_says_so(given, expected, 
     monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
     (tmp_path / "torch.py").write_text("import os; raise SystemExit(os.environ['OMP_WAIT_POLICY'])")
     assert run_command(tmp_path, "v2hdm.map", "+run=port2", **given).stderr.strip() == expected
+
+
+@pytest.mark.parametrize("number", ["-1.3e-05", "-2E3", "-.5", "-7", "-4."])
+def test_a_negative_number_is_a_value_and_no_option_in_whatever_form(number):
+    parser = command_of("localize").parser()
+    parser.add_argument("--start", type=float, nargs=2)
+    assert parser.parse_args(["--start", number, "1"]).start == [float(number), 1.0]
 
 
 def test_the_list_has_a_sentence_for_each_command_and_each_file_declares_its_own(capsys):

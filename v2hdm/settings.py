@@ -14,6 +14,8 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 from v2hdm.errors import ConfigError
 
 MOST_PROCESSES = 1024  # or threads; more are a typing error, and take the machine's memory
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""Environment variables with the number of threads of numerical libraries, which read them when loaded."""
 
 
 @dataclass(frozen=True)

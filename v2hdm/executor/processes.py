@@ -27,9 +27,9 @@ import cv2
 from v2hdm.errors import WorkerError
 from v2hdm.executor.executor import TWICE_DEAD, Executor, JobProgress, Outcomes, Stage
 from v2hdm.progress import silent
+from v2hdm.settings import THREAD_VARIABLES
 
 _TIDY_S = 30.0  # a worker without its parent may take this long to end, whatever it is in
-_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _MOST_DEATHS = 2  # processes that one job may cost; chosen: one is an accident
 
 _Job = TypeVar("_Job")
@@ -146,7 +146,7 @@ def prepare_process() -> None:
     torch: Any = sys.modules.get("torch")
     if torch is not None:
         torch.set_num_threads(1)
-    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))  # for what is loaded later
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))  # for what is loaded later
     logger = logging.getLogger("v2hdm")
     if not logger.handlers:
         logger.addHandler(logging.NullHandler())
@@ -156,8 +156,8 @@ def prepare_process() -> None:
 @contextmanager
 def undisturbed_starts() -> Iterator[None]:
     """Processes started within never see Ctrl-C, and their linear algebra starts no thread a core each."""
-    variables = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
-    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
+    variables = {name: os.environ.get(name) for name in THREAD_VARIABLES}
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
     mask = None
     if sys.platform != "win32":
         _start_tracker()  # started by the first process, it would lift the block

@@ -34,6 +34,7 @@ from typing import IO, Any, Never
 
 from v2hdm import errors
 from v2hdm.errors import REASON_LETTERS, V2hdmError, bounded, describe, one_line
+from v2hdm.settings import THREAD_VARIABLES
 
 try:
     import resource
@@ -41,7 +42,6 @@ except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
 _START = "import sys; sys.path[:] = {path!r}; from v2hdm.safe.child import _serve; _serve()"
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _TEMPORARY = ("TMPDIR", "TEMP", "TMP")  # variables that name the folder of temporary files
 _SPARE_BYTES = 2_000_000_000  # memory and largest file of work on the smallest input; chosen
 _TIMES = 10  # by which memory and largest file grow with the input's bytes
@@ -77,7 +77,7 @@ def in_child(
     if _Child.step_s is not None:
         return work(*arguments)
     job = pickle.dumps((f"{work.__module__}:{work.__qualname__}", arguments, limits))
-    variables = dict.fromkeys(_THREADS, "1")
+    variables = dict.fromkeys(THREAD_VARIABLES, "1")
     with TemporaryDirectory(prefix="v2hdm-") as scratch, (Path(scratch) / "stderr").open("w+b") as printed:
         variables |= dict.fromkeys(_TEMPORARY, scratch)
         child = subprocess.Popen(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,6 +12,7 @@ from pathlib import Path
 from v2hdm.cli.arguments import add_drive, drive_of, result_of, steps_of
 from v2hdm.cli.command import Command, need_installed
 from v2hdm.errors import EXIT_FAILED_VERDICT, ConfigError
+from v2hdm.settings import THREAD_VARIABLES
 
 _MAP = "result folder of v2hdm map, or the map.geojson in it"
 
@@ -86,6 +88,9 @@ def _live_parser() -> argparse.ArgumentParser:
 def _run_live(arguments: Sequence[str]) -> int:
     """Localise a vehicle as it drives, until Ctrl-C."""
     parsed = _live_parser().parse_args(arguments)
+    # The filter's matrices are small: several threads of BLAS would spin on the cores that detection needs.
+    for variable in THREAD_VARIABLES:
+        os.environ.setdefault(variable, "1")
     from v2hdm.io.calibration.reading import trusted_calibrations
     from v2hdm.io.maps.reading import read_geojson
     from v2hdm.localization.live import localize_live
