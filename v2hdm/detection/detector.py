@@ -13,6 +13,7 @@ import numpy as np
 
 from v2hdm.catalogue import PAINT_CLASSES, SYMBOL, Catalogue
 from v2hdm.detection.areas import find_areas
+from v2hdm.detection.arrows import arrow_probability, features_of
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.classifier import Readings, find_markings, read_markings
 from v2hdm.detection.lanes.bare import painted
@@ -29,13 +30,14 @@ from v2hdm.detection.weights import NETWORK_FILE, check_weights
 from v2hdm.doors import checked
 from v2hdm.errors import DetectorError
 from v2hdm.native import tell_missing
-from v2hdm.records import BoolArray, Camera, FloatArray, LaneDetection, MarkingDetection
+from v2hdm.records import ARROW, BoolArray, Camera, FloatArray, LaneDetection, MarkingDetection
 from v2hdm.safe.texts import shown
 
 _log = logging.getLogger(__name__)
 
 Markings = tuple[MarkingDetection, ...]
 
+_LEAST_NAMED = 0.3  # share named a symbol below which nothing is one: few true arrows are below 0.7
 _PART_SHARE = 0.5  # share of an area in a marking from which it is a part of that; chosen
 
 
@@ -206,13 +208,15 @@ class Detector:
         for piece in proposals.pieces:
             if not names or piece.index < parts_until:
                 continue
-            kind = max(names, key=lambda name: piece.share.get(name, 0.0))
+            kind = piece.symbol_kind(names)
             score = piece.symbol_score(kind)
-            if score < self.options.min_score:
-                continue
             range_m = proposals.camera.range_m(piece.outline_vehicle.mean(axis=0))
             after = piece.index + 1 + piece.blob.parts
-            if not range_m <= reach_m:  # nan is not
+            if score < _LEAST_NAMED or not range_m <= reach_m:  # nan is not
+                continue
+            if kind == ARROW:
+                score = arrow_probability(score, features_of(piece, proposals.camera))
+            if score < self.options.min_score:
                 continue
             parts = [part for part in proposals.pieces if piece.index < part.index < after]
             if piece.is_one_symbol(parts, self.catalogue):

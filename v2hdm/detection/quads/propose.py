@@ -60,7 +60,7 @@ _NAMED_RIGHTLY = 0.8  # share of a marking's paint that is named of its own grou
 _TOUCHING = float(np.log(0.02))  # log odds of an arrow that touches other paint: a guess
 
 _LEAST_FILL = 0.5  # least share of a quadrilateral that its piece of paint fills: a triangle fills half
-_BORDER_PX = 3.0  # a side this near to the image's border is cut by it: outlines are coarser than this
+BORDER_PX = 3.0  # a side this near to the image's border is cut by it: outlines are coarser than this
 
 
 @dataclass(frozen=True)
@@ -87,6 +87,10 @@ class Proposal:
     def score_of(self, kinds: Iterable[str]) -> float:
         """Mean probability of some classes, by the network alone."""
         return sum(self.blob.class_score.get(kind, 0.0) for kind in kinds)
+
+    def symbol_kind(self, names: Sequence[str]) -> str:
+        """The likeliest of some classes of symbols."""
+        return max(names, key=lambda name: self.share.get(name, 0.0))
 
     def symbol_score(self, kind: str) -> float:
         """Probability of a symbol of a class.
@@ -145,7 +149,7 @@ def propose(
     count = np.array([len(blob.outline_px) for blob in blobs])
     begins = np.cumsum(count) - count
     range_m = camera.range_m(np.add.reduceat(points_vehicle, begins) / count[:, None])
-    whole = np.logical_and.reduceat(camera.inside(points_px, _BORDER_PX), begins)
+    whole = np.logical_and.reduceat(camera.inside(points_px, BORDER_PX), begins)
     outlines_vehicle = np.split(points_vehicle, begins[1:])
     outlines_pinhole_px = np.split(points_pinhole_px, begins[1:])
     size_m = np.array([rectangle_size(outline) for outline in outlines_vehicle])
@@ -167,7 +171,7 @@ def propose(
 
 def open_sides(corners_px: FloatArray, camera: RoadCamera) -> BoolArray:
     """Which sides (M, 4) of quadrilaterals (M, 4, 2), recorded px, the image's border cuts."""
-    return ~camera.inside((corners_px + following(corners_px)) / 2, _BORDER_PX)
+    return ~camera.inside((corners_px + following(corners_px)) / 2, BORDER_PX)
 
 
 def _shares(
