@@ -1,11 +1,14 @@
 """A vehicle follows itself through a map of markings by what its cameras see."""
 
+from types import SimpleNamespace
+from typing import cast
+
 import numpy as np
 
 from tests.cameras import mounted
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.rigid import heading_rad
-from v2hdm.localization.filter import Markings, Sighting, locate, pose_of, predict, start
+from v2hdm.localization.filter import Markings, Match, Sighting, State, fit, locate, pose_of, predict, start
 from v2hdm.records import HDMap, Marking
 
 INTRINSIC = np.array([[700.0, 0, 640], [0, 700, 360], [0, 0, 1]])
@@ -128,3 +131,13 @@ def test_a_detection_that_two_markings_could_explain_is_not_used():
     assert locate(unsure, seen, Markings(dashes))[1] == []
     sure = start(pose_of(np.zeros(5)), 0.3, 0.02, ATTITUDE_RAD)
     assert len(locate(sure, seen, Markings(dashes))[1]) == 1
+
+
+def test_a_corner_that_would_lie_at_the_horizon_is_no_match_whatever_it_seems_to_say():
+    state = State(np.zeros(7), np.diag([0.25, 0.25, 0.003, 25.0, 0.09, 4e-6, 4e-6]))
+    steep = np.zeros((2, 7))
+    steep[0, :3] = 1e9, 2e8, -3e9  # px per m and rad
+    at_horizon = SimpleNamespace(noise=np.eye(2), against=lambda _: (np.array([5.0, 5.0]), steep))
+    fitted = fit(state, cast(Match, at_horizon))
+    assert fitted.squared == np.inf
+    assert fitted.state is state

@@ -271,9 +271,11 @@ def fit(state: State, match: Match) -> Fit:
 
     optimum = gauss_newton(linearise, np.zeros(7), steps=_ITERATIONS, settled=settled)
     squared = 2 * optimum.predicted_cost
-    if not np.isfinite(squared):
+    covariance = optimum.covariance
+    # The equations of a corner that would lie at the horizon are singular, and say nothing.
+    if not (np.isfinite(squared) and np.isfinite(covariance).all()):
         return Fit(state, np.inf, np.inf)
-    state_after = State(state.mean + spread @ optimum.x, spread @ optimum.covariance @ spread.T)
+    state_after = State(state.mean + spread @ optimum.x, spread @ covariance @ spread.T)
     volume = np.linalg.slogdet(match.noise)[1] + np.linalg.slogdet(optimum.last.information)[1]
     return Fit(state_after, squared, squared + float(volume))
 
