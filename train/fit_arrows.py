@@ -72,7 +72,7 @@ def renders(count: int) -> Iterator[Example]:
 
 
 def named_in(shown: Example, detector: Detector) -> list[Named]:
-    """What the network names an arrow in an image, as far as the image's labels tell whether it is one."""
+    """Pieces that the network names arrows in an image, as far as labels tell whether they are arrows."""
     output = detector.run_network(shown.image, shown.camera)
     proposals = detector.propose(output, shown.camera)
     symbols = detector.catalogue.of_family(SYMBOL)

@@ -67,7 +67,7 @@ def pieces_of(number: int, detector: Detector) -> list[Piece]:
 
 
 def fitted(pieces: Sequence[Piece]) -> bare.Contrast:
-    """What sets paint off from bare ground: weights of sections, then of what pieces of them say."""
+    """Weights that tell paint from bare ground: of sections first, then of the pieces that they form."""
     sections = np.concatenate([piece.features for piece in pieces])
     is_paint = np.array([piece.is_paint for piece in pieces])
     of_section = np.repeat(is_paint, [len(piece.features) for piece in pieces])

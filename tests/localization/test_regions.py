@@ -181,7 +181,9 @@ def test_a_camera_that_has_ended_is_told_nothing_more():
         def write(self, text):
             raise BrokenPipeError
 
-    _Eye("front", Closed(), delay_s=0.0).point(Asked(None), now_s=5.15)
+    eye = _Eye("front", Closed(), delay_s=0.0)
+    eye.point(Asked(None), now_s=5.15)
+    assert eye.stream.getvalue() == ""
 
 
 def test_images_to_come_are_those_at_the_pace_of_the_last_ones_wherever_one_was_left_out():

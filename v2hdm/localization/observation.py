@@ -15,7 +15,7 @@ _NUMBERS = 2  # of an observation
 
 
 class Observation(NamedTuple):
-    """What a detection says of the states if it shows a certain line or area of the map."""
+    """A detection as an observation of the states, if it shows a certain line or area of the map."""
 
     detection: int
     target: int  # the line or area

@@ -134,7 +134,7 @@ class Patch:
 
 
 WordScores = Callable[[FloatArray], FloatArray]
-"""What words say for places (C, 3) of a patch: log likelihoods (C,) over those of chance."""
+"""Log likelihoods (C,) of places (C, 3) of a patch by words, over those of chance."""
 
 
 def _no_words(poses: FloatArray) -> FloatArray:

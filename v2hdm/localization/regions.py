@@ -59,7 +59,7 @@ class Ahead(NamedTuple):
 
 @dataclass
 class Glances:
-    """What is known of one camera's looks: when they were, the last whole one, and how the last went."""
+    """One camera's looks: their times, the last whole one, and how the last one went."""
 
     stamps_s: deque[float] = field(default_factory=lambda: deque(maxlen=_LAST_LOOKS))
     whole_s: float = -np.inf

@@ -1,4 +1,4 @@
-"""What the markings of a solve make of the mountings, against the ground that the solve has taken in."""
+"""The mountings by the markings of a solve alone, compared with the ground that the solve has taken in."""
 
 from __future__ import annotations
 

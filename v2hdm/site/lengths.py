@@ -1,4 +1,4 @@
-"""What a dash may have lost of its length, where no other dash tells how long those of its road are.
+"""The length that a dash may have lost, where no other dash tells how long those of its road are.
 
 A dash that is worn or covered from one end on shows any share of itself, all as likely. How long it was
 painted, standards say: a density p(L) of lengths, to which each other dash of the drive adds its own, as in a
@@ -33,7 +33,7 @@ _STEP_M = 0.01  # of the integrals over lengths, m
 
 
 class Lost(NamedTuple):
-    """What N dashes have lost at one end, if they have lost anything."""
+    """The lengths that N dashes have lost at one end, if they have lost anything."""
 
     log_odds: FloatArray  # (N,) log-likelihood ratio of their lengths, against whole dashes
     mean_m: FloatArray  # (N,) length that was lost
@@ -41,7 +41,7 @@ class Lost(NamedTuple):
 
 
 def lost_of(standard_m: tuple[float, ...], length_m: FloatArray, sigma_m: FloatArray) -> Lost:
-    """What dashes of the lengths (N,), known to ``sigma_m`` (N,), may have lost, by standards and the others.
+    """Losses of dashes of lengths (N,), known to ``sigma_m`` (N,), by standards and the other dashes.
 
     ``sigma_m`` is infinite for a dash of unknown length, which tells the others nothing.
     """

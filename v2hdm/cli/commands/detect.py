@@ -58,7 +58,6 @@ def _detect(parsed: argparse.Namespace) -> None:
     from v2hdm.detection.options import DetectorOptions
     from v2hdm.detection.road import as_record
     from v2hdm.detection.stopwatch import KEPT, Stopwatch
-    from v2hdm.detection.weights import unknown_network
     from v2hdm.pipeline.detect_images import detect_images
     from v2hdm.store.lines import lines_to
     from v2hdm.store.results import growing_folder
@@ -109,11 +108,19 @@ def _detect(parsed: argparse.Namespace) -> None:
     _report(stopwatch, age_s)
     if parsed.live and stopwatch.images:
         print(f"{dropped} images dropped for newer ones", file=sys.stderr)
-    unknown = unknown_network(parsed.model) if parsed.model is not None else None
-    if unknown is not None:
-        print(unknown, file=sys.stderr)
+    if parsed.model is not None:
+        _warn_of_unknown(parsed.model)
     if failure:
         raise failure
+
+
+def _warn_of_unknown(model: Path) -> None:
+    """Say on stderr that the judge was not fitted to a network, if it was not."""
+    from v2hdm.detection.weights import unknown_network
+
+    unknown = unknown_network(model)
+    if unknown is not None:
+        print(unknown, file=sys.stderr)
 
 
 def _regions_from(stream: IO[str]) -> Callable[[Frame], FloatArray | None]:

@@ -44,7 +44,7 @@ difference of the sides; and how much the log of its width differs from the usua
 
 
 class Contrast(NamedTuple):
-    """What sets paint off from bare ground: log odds of a piece as a linear function."""
+    """Log odds that a piece is paint and no bare ground, as a linear function."""
 
     weights: tuple[float, ...]  # of the features of a section
     section: float  # added for each section
@@ -225,5 +225,5 @@ def paint_log_odds(values: FloatArray, score: float, model: Contrast = FITTED) -
 
 
 def shared(ratio: FloatArray, correlation: float) -> float:
-    """What the log likelihood ratios (S,) of sections say together where their errors are correlated."""
+    """The joint log likelihood ratio of sections by their own (S,), whose errors are correlated."""
     return float(ratio.sum() / (1.0 + correlation * (len(ratio) - 1)))
