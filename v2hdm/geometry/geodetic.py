@@ -6,6 +6,7 @@ ETRS89, NAD83, GDA2020, JGD2011); others are refused: without national grid file
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -22,6 +23,7 @@ _ECCENTRICITY2 = _FLATTENING * (2 - _FLATTENING)  # square of the first eccentri
 _SAME_ELLIPSOID_M = (
     1e-3  # difference, m, of axes of one ellipsoid: GRS80's semi-minor is 0.1 mm longer than WGS84's
 )
+_WGS84 = ("World Geodetic System 1984", "World Geodetic System 1984 ensemble")  # datum's names in PROJ
 _CONFORMAL_DEG = 1e-3  # tolerance, deg, of a conformal grid's angles, for rounding
 
 
@@ -211,9 +213,12 @@ def convergence_rad(crs: str, points: FloatArray, where: str, error: type[V2hdmE
 def datum_of(crs: str, where: str, error: type[V2hdmError]) -> str:
     """Satellite datum of the coordinates of ``crs``, WGS84 spelt ``WGS84``."""
     system = _system(crs, where, error).geodetic_crs
-    # A system by its parameters alone, as OpenDRIVE has it, is "unknown", but its datum has a name.
-    name = str(system.datum.name if system.name == "unknown" and system.datum is not None else system.name)
-    return "WGS84" if name.replace(" ", "") in ("WGS84", "WorldGeodeticSystem1984") else name
+    datum = str(system.name if system.datum is None else system.datum.name)
+    if datum in _WGS84:
+        return "WGS84"
+    # A system by its parameters alone, as OpenDRIVE has it, is "unknown", but its datum has a name. Systems
+    # with longitude before latitude have a suffix: NAD83 (CRS83).
+    return datum if system.name == "unknown" else re.sub(r" \(CRS\d+\)$", "", str(system.name))
 
 
 def has_height_datum(crs: str, where: str, error: type[V2hdmError]) -> bool:
@@ -237,6 +242,12 @@ def system_of(crs: str, where: str, error: type[V2hdmError]) -> System:
 def is_geographic(crs: str, where: str, error: type[V2hdmError]) -> bool:
     """Whether coordinates of ``crs`` are latitude and longitude."""
     return bool(_system(crs, where, error).is_geographic)
+
+
+def unit_m(crs: str, where: str, error: type[V2hdmError]) -> float:
+    """Length, m, of the unit of a projected system's easting and northing; 1 of one in degrees."""
+    system = _system(crs, where, error)
+    return 1.0 if system.is_geographic else float(system.axis_info[0].unit_conversion_factor)
 
 
 def _system(crs: str, where: str, error: type[V2hdmError]) -> Any:
