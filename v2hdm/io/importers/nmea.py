@@ -65,8 +65,8 @@ def read_nmea(
 ) -> Readings:
     """Read the log at ``path``; damaged sentences are left out and counted, and refused if they prevail.
 
-    Where neither the log nor ``entry`` states a day, that counts by which the log lies about ``near_s``, a time
-    of the drive.
+    Where neither the log nor ``entry`` states a day, it is the one by which the log lies about ``near_s``, a
+    time of the drive.
     """
     data = read_bytes(path, DriveError)
     # PowerShell's > writes UTF-16.
@@ -396,7 +396,9 @@ class _Log:
         day = dates[0][0] if dates else first_day
         if day is None and near_s is not None:
             # A log from before midnight may belong to images from behind it, or the other way round.
-            middle_s = float(np.median([epoch.stamp_s for epoch in self._epochs if epoch.stamp_s is not None]))
+            middle_s = float(
+                np.median([epoch.stamp_s for epoch in self._epochs if epoch.stamp_s is not None])
+            )
             return _DAY_S * round((near_s - middle_s) / _DAY_S)
         if day is None:
             advice = "add date, the day of the first sentence"

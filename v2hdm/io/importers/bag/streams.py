@@ -110,8 +110,8 @@ class ImageStream(Stream):
             stamp_s.append(stamp_of(message, self._stamps))
             if not len(message.fields.data):
                 continue
-            if message.kind == kinds.VIDEO:
-                decoder = decoder or kinds.VideoDecoder(message.fields.format, topic)
+            if form := kinds.video_format(message.kind, message.fields):
+                decoder = decoder or kinds.VideoDecoder(form, topic)
                 decode(decoder, message.fields.data.tobytes())
             else:
                 suffix, data = kinds.file_of(message.kind, message.fields, f"{topic}, image {number + 1}")
