@@ -278,7 +278,7 @@ def _read_dxf(path: Path, source: Source) -> _File:
     if crs is None or crs == LOCAL:
         scale = UNITS_M[drawing.unit]
     else:
-        scale = units_per_system(drawing.unit, geodetic.unit_m(crs, str(path), MapFileError))
+        scale = units_per_system(drawing.unit, geodetic.units_of(crs, str(path), MapFileError).horizontal_m)
     shapes = [Drawn(scale * area.outline, area.name, area.layer) for area in drawing.areas]
     return _File(shapes, drawing.crs, drawing.lines)
 

@@ -82,6 +82,7 @@ _LONGEST_CRS = 20_000  # letters of a system's description: WKT of a compound on
 LOCAL = "local"  # name of the map's own frame as a coordinate system
 _GRID_DECIMALS = 4  # decimals of a coordinate in metres: 0.1 mm
 _DEGREE_DECIMALS = 9  # decimals of a latitude or longitude in degrees: 0.1 mm on the ground
+_ZONE_DEG = 6.0  # width of a zone, deg of longitude, by which a grid may be used beyond its edges for a job
 _BESIDE_DEG = 1.0  # longitude, deg, by which a zone's grid is in use beyond its edges
 
 
@@ -244,10 +245,33 @@ def is_geographic(crs: str, where: str, error: type[V2hdmError]) -> bool:
     return bool(_system(crs, where, error).is_geographic)
 
 
-def unit_m(crs: str, where: str, error: type[V2hdmError]) -> float:
-    """Length, m, of the unit of a projected system's easting and northing; 1 of one in degrees."""
+class Units(NamedTuple):
+    """The lengths, m, of a system's units, 1 where it counts in degrees or has no height, and their name."""
+
+    horizontal_m: float
+    vertical_m: float
+    name: str  # of the horizontal one
+
+
+def units_of(crs: str, where: str, error: type[V2hdmError]) -> Units:
+    """The units of a system. Heights of one without any are in the unit of its easting and northing."""
     system = _system(crs, where, error)
-    return 1.0 if system.is_geographic else float(system.axis_info[0].unit_conversion_factor)
+    axes = [axis for axis in system.axis_info if axis.unit_name != "degree"]
+    if not axes:
+        return Units(1.0, 1.0, "degree")
+    is_up = [axis.direction == "up" for axis in axes]
+    horizontal = 1.0 if is_up[0] else float(axes[0].unit_conversion_factor)
+    return Units(horizontal, float(axes[-1].unit_conversion_factor), str(axes[0].unit_name))
+
+
+def is_in_use(crs: str, geodetic: FloatArray, where: str, error: type[V2hdmError]) -> bool:
+    """Whether positions (N, 3) lie no farther than a zone east or west of where a system is in use."""
+    area = _system(crs, where, error).area_of_use
+    if area is None:
+        return True
+    width_deg = (area.east - area.west) % 360 or 360
+    ahead_deg = (geodetic[:, 1] - area.west + _ZONE_DEG) % 360
+    return bool((ahead_deg <= width_deg + 2 * _ZONE_DEG).any())
 
 
 def _system(crs: str, where: str, error: type[V2hdmError]) -> Any:
