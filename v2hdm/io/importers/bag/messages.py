@@ -146,8 +146,8 @@ def video_format(kind: str, fields: Any) -> str:
         return ""
     stated = fields.encoding if kind == PACKET else fields.format
     codec = stated.partition(";")[0].strip().lower()
-    known = next((form for part, form in _FORMAT_OF_CODEC.items() if part in codec), "")
-    return known or (codec if kind == PACKET else "")
+    formats = [form for letters, form in _FORMAT_OF_CODEC.items() if letters in codec]
+    return formats[0] if formats else codec if kind == PACKET else ""
 
 
 class VideoDecoder:
