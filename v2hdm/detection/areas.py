@@ -1,7 +1,8 @@
 """Areas of paint: words, numbers and hatched boxes, each by the hull on the ground of all of its pieces.
 
-An area is made of pieces that do not touch: letters, hatching. Pieces of one class are one area where the gap
-between them on the ground is small beside their own size. Crosswalks are composed of bars.
+An area is made of pieces that do not touch: letters, hatching. Each is named whole, as writing or as a box.
+Pieces of one class are one area where the gap between them on the ground is small beside their own size.
+Crosswalks are composed of bars.
 """
 
 from __future__ import annotations
@@ -15,11 +16,21 @@ import numpy as np
 
 from v2hdm.catalogue import Catalogue
 from v2hdm.detection.camera import RoadCamera
+from v2hdm.detection.hatching import box_probability, meshes
 from v2hdm.detection.network import NetworkOutput, as_probability
 from v2hdm.detection.quads.blobs import outlines_of
 from v2hdm.geometry.planar import rectangle_size
 from v2hdm.geometry.rows import linked_groups, outline_of_row, rows_of_bars
-from v2hdm.records import CROSSWALK, CROSSWALK_BAR, TEXT, BoolArray, FloatArray, IntArray, MarkingDetection
+from v2hdm.records import (
+    BOX,
+    CROSSWALK,
+    CROSSWALK_BAR,
+    TEXT,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    MarkingDetection,
+)
 
 _LEAST_CELLS = 5  # elements of paint of a piece: fewer are noise
 _LEAST_SHARE = 0.25
@@ -39,6 +50,7 @@ _CUT_PX = 6.0  # distance from where the image or its road begins, px, within wh
 class _Piece(NamedTuple):
     """A connected piece of paint of one class."""
 
+    kind: str
     points_px: FloatArray  # (N, 2) of its outline, recorded px, in no order
     ground: FloatArray  # (N, 2) the same on the ground, m
     extent_m: float  # length of the smallest rectangle around it
@@ -75,21 +87,31 @@ def find_areas(
     is_alike = np.array([catalogue.classes[name].group in of_group for name in all_names])[best]
     alike = np.zeros(output.paint.shape, dtype=np.uint8)
     alike[rows[is_alike], columns[is_alike]] = 1
-    areas = []
-    for number, name in enumerate(names):
-        is_of_class = best == number
-        if np.count_nonzero(is_of_class) < _LEAST_CELLS:
+    pieces: list[_Piece] = []
+    for kinds in _named_together(names):
+        numbers = [names.index(kind) for kind in kinds]
+        is_of_kinds = np.isin(best, numbers)
+        if np.count_nonzero(is_of_kinds) < _LEAST_CELLS:
             continue
-        share = np.zeros(output.paint.shape, dtype=np.float32)
-        share[rows[is_of_class], columns[is_of_class]] = probability[number, is_of_class]
-        pieces = _pieces(output, camera, share, alike)
-        for members in _together(pieces, _MOST_GAP_M.get(name, _OTHER_GAP_M)):
-            area = _area(name, [pieces[k] for k in members], output, camera, catalogue)
+        share = np.zeros((len(kinds), *output.paint.shape), dtype=np.float32)
+        share[:, rows[is_of_kinds], columns[is_of_kinds]] = probability[np.ix_(numbers, is_of_kinds)]
+        pieces += _pieces(kinds, output, camera, share, alike)
+    areas = []
+    for name in names:
+        named = [piece for piece in pieces if piece.kind == name]
+        for members in _together(named, _MOST_GAP_M.get(name, _OTHER_GAP_M)):
+            area = _area(name, [named[k] for k in members], output, camera, catalogue)
             ground = camera.unproject(area.outline_px)
             within = camera.range_m(ground.mean(axis=0)) <= max_range_m
             if within and area.score >= least_score:
                 areas.append(area)
     return areas
+
+
+def _named_together(names: Sequence[str]) -> list[tuple[str, ...]]:
+    """The classes of areas; those of which a piece may show both to the network are together."""
+    written = (TEXT, BOX) if {TEXT, BOX} <= set(names) else ()
+    return [*([written] if written else []), *((name,) for name in names if name not in written)]
 
 
 def find_crosswalks(
@@ -116,9 +138,15 @@ def find_crosswalks(
     return crosswalks
 
 
-def _pieces(output: NetworkOutput, camera: RoadCamera, share: np.ndarray, alike: np.ndarray) -> list[_Piece]:
-    """The pieces of a class with this ``share`` (h, w) of the paint; ``alike`` (h, w) is 1 for its group."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats((share > 0).view(np.uint8), ltype=cv2.CV_16U)
+def _pieces(
+    kinds: tuple[str, ...], output: NetworkOutput, camera: RoadCamera, share: np.ndarray, alike: np.ndarray
+) -> list[_Piece]:
+    """The pieces of K classes with these ``share`` (K, h, w) of the paint; of two they are text and box.
+
+    ``alike`` (h, w) is 1 for paint of their group of classes.
+    """
+    of_all = share.sum(axis=0)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats((of_all > 0).view(np.uint8), ltype=cv2.CV_16U)
     _, whole, whole_stats, _ = cv2.connectedComponentsWithStats(alike, ltype=cv2.CV_16U)
     framed = cv2.copyMakeBorder(output.paint, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=-1.0)
     piece = cv2.copyMakeBorder(labels, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0).astype(np.int32)
@@ -136,11 +164,17 @@ def _pieces(output: NetworkOutput, camera: RoadCamera, share: np.ndarray, alike:
         is_on_ground = np.isfinite(ground).all(axis=1)
         if is_on_ground.sum() < 3:
             continue
-        certainty = float((as_probability(output.paint[is_of_piece]) * share[is_of_piece]).mean())
+        certainty = float((as_probability(output.paint[is_of_piece]) * of_all[is_of_piece]).mean())
+        kind = kinds[0]
+        if len(kinds) > 1:
+            text_cells, box_cells = share[:, is_of_piece].sum(axis=1).tolist()
+            probability = box_probability(text_cells, box_cells, meshes(is_of_piece, output.paint))
+            kind = kinds[int(probability > 0.5)]
+            certainty *= max(probability, 1.0 - probability)
         extent_m = rectangle_size(ground[is_on_ground])[0]
         is_cut = bool(_cut(points_px, output, camera).any())
         pieces.append(
-            _Piece(points_px[is_on_ground], ground[is_on_ground], extent_m, cells, certainty, is_cut)
+            _Piece(kind, points_px[is_on_ground], ground[is_on_ground], extent_m, cells, certainty, is_cut)
         )
     return pieces
 
