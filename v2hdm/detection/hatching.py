@@ -12,7 +12,7 @@ import numpy as np
 
 from v2hdm.records import BoolArray
 
-FITTED = 4.84
+FITTED = 5.04
 """Weight of the meshes, fitted to photographs and renders by ``python -m train.fit_hatching``."""
 
 _LEAST_CELLS = 3  # elements of ground of a mesh: fewer are wear
