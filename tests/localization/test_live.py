@@ -78,6 +78,23 @@ def test_the_stated_covariance_holds():
     assert 0.5 < np.mean(squared) < 3.5  # of two coordinates: honest is 2
 
 
+@pytest.mark.parametrize("late_s", [0.0, 0.05])
+def test_an_odometry_that_comes_late_is_known_to_and_no_camera_is_blamed(late_s):
+    painted = yard(6)
+    driven = drive(painted, 6, seconds=16.0, swerve_rad=0.15)
+    stamped = [sample._replace(stamp_s=sample.stamp_s + late_s) for part in driven.motion for sample in part]
+    begins_s = [-np.inf, *driven.stamp_s[:-1]]
+    motion = [
+        [sample for sample in stamped if begin_s < sample.stamp_s <= end_s]
+        for begin_s, end_s in zip(begins_s, driven.stamp_s, strict=True)
+    ]
+    poses = follow(replace(driven, motion=motion), mapped(painted, 6))
+    errors, bounds = tracked(driven, poses)
+    assert poses[-1].motion[2] == pytest.approx(late_s, abs=0.012)
+    assert (np.abs(errors) < bounds).all()
+    assert not poses[-1].turned
+
+
 def test_a_vehicle_that_knows_nothing_finds_itself_by_the_pattern_of_the_markings():
     painted = yard(4)
     driven = drive(painted, 4, begin_m=50.0)
@@ -287,7 +304,11 @@ def test_the_derivatives_of_expected_pixels_are_those_of_their_differences():
     for column in range(len(mean)):
         ends = [
             expect(
-                belief.replace(state, mean=mean + by * np.eye(16)[column]), plane, 0, calibration, corners
+                belief.replace(state, mean=mean + by * np.eye(len(mean))[column]),
+                plane,
+                0,
+                calibration,
+                corners,
             ).px
             for by in (step, -step)
         ]

@@ -16,8 +16,11 @@ from v2hdm.localization.agreement import Agreement, Pace, detected
 from v2hdm.localization.antenna import Antenna, Fix, with_fix
 from v2hdm.localization.areas import AreaMap, with_areas
 from v2hdm.localization.belief import (
+    BIAS,
     CAMERA,
     HEADING,
+    LATE,
+    SCALE,
     VEHICLE,
     Belief,
     bounds,
@@ -83,7 +86,7 @@ class Pose:
         covariance: (3, 3) of x, y, m, and heading, rad, in the map; infinite before the place is sure.
         protection_m: ahead and to the left, bounds that one error in a thousand exceeds; else infinite.
         protection_rad: the same of the heading.
-        motion: true over stated speed, and the yaw rate's bias, rad/s.
+        motion: true over stated speed, the yaw rate's bias, rad/s, and how late the odometry's stamps are, s.
         matched: markings that the last look showed.
         matched_lines: pieces of solid lines that it showed on their lines.
         matched_areas: words, boxes and other symbols that it showed at their places.
@@ -97,7 +100,7 @@ class Pose:
     covariance: FloatArray
     protection_m: tuple[float, float]
     protection_rad: float
-    motion: tuple[float, float]
+    motion: tuple[float, float, float]
     matched: int
     reasons: tuple[str, ...] = ()
     turned: tuple[Turned, ...] = ()
@@ -531,7 +534,7 @@ class Localizer:
             nothing = np.full((3, 3), np.inf)
             infinite = (np.inf, np.inf)
             return Pose(
-                stamp_s, status, None, nothing, infinite, np.inf, (1.0, 0.0), 0, tuple(reasons.values())
+                stamp_s, status, None, nothing, infinite, np.inf, (1.0, 0.0, 0.0), 0, tuple(reasons.values())
             )
         belief = self._fixed_to(self._belief, stamp_s)
         plane = self.paint.ground(belief.mean[:2])
@@ -557,7 +560,7 @@ class Localizer:
             reasons |= {f"rig {number}": sentence for number, sentence in enumerate(turned)}
         elif self._turned_s is not None:
             reasons["rig"] = f"a camera's mounting has turned since {self._turned_s:.1f} s"
-        motion = (float(np.exp(belief.mean[3])), float(belief.mean[4]))
+        motion = (float(np.exp(belief.mean[SCALE])), float(belief.mean[BIAS]), float(belief.mean[LATE]))
         return Pose(
             stamp_s=stamp_s,
             status=status,
