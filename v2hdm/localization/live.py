@@ -74,10 +74,10 @@ def localize_live(
         running = set(sources)
         images = 0
         written_s = -math.inf
+        motions: list[Motion] = []
+        fixes: list[Fix] = []
         while running and (limit is None or images < limit):
             looks: list[Look] = []
-            motions: list[Motion] = []
-            fixes: list[Fix] = []
             for item in _available(items):
                 if isinstance(item, _Ended):
                     running.discard(item.source)
@@ -90,13 +90,16 @@ def localize_live(
                 else:
                     fixes.append(item)
             images += len(looks)
-            if looks or motions or fixes:
-                pose = localizer.update(looks, motions, fixes)
-                for camera in {look.camera for look in looks}:
-                    cameras[camera].point(localizer, time.time())
-                if looks or pose.stamp_s - written_s > _QUIET_S:
-                    written_s = pose.stamp_s
-                    take(pose)
+            newest_s = max((item.stamp_s for item in (*motions, *fixes)), default=-math.inf)
+            # What comes between images waits for the next: a pose of it would only cost time.
+            if not looks and newest_s - written_s <= _QUIET_S:
+                continue
+            pose = localizer.update(looks, motions, fixes)
+            motions, fixes = [], []
+            written_s = pose.stamp_s
+            take(pose)
+            for camera in {look.camera for look in looks}:
+                cameras[camera].point(localizer, time.time())
 
 
 def _available(items: _Queue) -> Iterator[_Item]:

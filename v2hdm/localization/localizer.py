@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import NamedTuple
 
@@ -90,6 +90,7 @@ class Pose:
         matched: markings that the last look showed.
         matched_lines: pieces of solid lines that it showed on their lines.
         matched_areas: words, boxes and other symbols that it showed at their places.
+        images_s: by camera the time of the newest image that is in it.
         reasons: sentences: why there is no pose, or what differs from map, calibration or odometry.
         turned: cameras whose mountings have changed.
     """
@@ -106,6 +107,7 @@ class Pose:
     turned: tuple[Turned, ...] = ()
     matched_lines: int = 0
     matched_areas: int = 0
+    images_s: Mapping[str, float] = field(default_factory=dict)
 
 
 class _Past(NamedTuple):
@@ -200,6 +202,7 @@ class Localizer:
         self._reasons: dict[str, str] = {}
         self._matched = _Matched()
         self._looking = Looking(every_full)
+        self._images_s: dict[str, float] = {}
 
     def update(
         self, images: Sequence[Look] = (), motion: Sequence[Motion] = (), fixes: Sequence[Fix] = ()
@@ -219,7 +222,7 @@ class Localizer:
             self._fix(fix)
         for look in sorted(images, key=lambda item: item.stamp_s):
             self._take(look)
-        return self._pose()
+        return replace(self._pose(), images_s=dict(self._images_s))
 
     def regions(self, camera: str, stamp_s: float) -> FloatArray | None:
         """Where to look in the next image of a camera, taken at about a time: around what the map will show.
@@ -272,6 +275,7 @@ class Localizer:
             )
             return
         self._reasons.pop("clock", None)
+        self._images_s[look.camera] = max(look.stamp_s, self._images_s.get(look.camera, look.stamp_s))
         later_looks = [past for past in self._past if past.look.stamp_s > look.stamp_s]
         latest_s = max([look.stamp_s, *(past.look.stamp_s for past in self._past)])
         if latest_s - look.stamp_s > _LAG_S:

@@ -150,6 +150,7 @@ def pose_record(pose: Pose) -> dict[str, Any]:
     }  # fmt: skip
     motion = ("speed_scale", "yaw_bias_rad_s", "odometry_late_s")
     record |= {name: round(value, 6) for name, value in zip(motion, pose.motion, strict=True)}
+    record["images_s"] = {camera: round(stamp_s, 6) for camera, stamp_s in pose.images_s.items()}
     record["matched"] = pose.matched
     record["matched_lines"] = pose.matched_lines
     record["matched_areas"] = pose.matched_areas
