@@ -231,10 +231,20 @@ def test_without_images_the_pose_is_lost_and_images_bring_it_back():
         gone = 30 < frame < 190
         pose = localizer.update([] if gone else looks, motion)
         statuses.append(pose.status)
+        said_missing = any("no image of front has come" in reason for reason in pose.reasons)
+        assert said_missing == (41 <= frame < 190)
         if pose.status == Status.TRACKING:
             assert (np.abs(driven.errors(pose, frame)[:2]) < pose.protection_m).all()
     assert statuses[30] == Status.TRACKING
     assert statuses[-1] == Status.TRACKING
+
+
+def test_images_that_never_come_are_missed():
+    localizer = Localizer(yard(12), cameras())
+    poses = [localizer.update([], [Motion(0.1 * sample, 0.0, 0.0)]) for sample in range(20)]
+    assert not poses[5].reasons
+    assert poses[-1].reasons == ("no image has come yet",)
+    assert poses[-1].status == Status.INITIALISING
 
 
 def test_an_image_of_another_clock_is_left_out_with_a_reason():

@@ -43,6 +43,7 @@ from v2hdm.localization.way import Way
 from v2hdm.records import Calibration, FloatArray, HDMap
 
 _LAG_S = 1.0  # images may be so late
+_NO_IMAGE_S = 1.0  # time, s, without an image that is said
 _FUTURE_S = 2.0  # a stamp farther ahead of the odometry, s, is of another clock
 # With a larger standard deviation of the place the vehicle does not know where it is: half a dash's gap.
 _LOST_M = 0.3
@@ -520,11 +521,23 @@ class Localizer:
                     self._reasons["fix"] = problem
         return self._moved_to(belief, stamp_s)
 
+    def _missing(self, stamp_s: float) -> dict[str, str]:
+        """Sentences on cameras of which no image has come lately."""
+        if not self._images_s:
+            waited_s = stamp_s - self._log.stamps_s[0] if self._log.stamps_s else 0.0
+            return {"images": "no image has come yet"} if waited_s > _NO_IMAGE_S else {}
+        return {
+            f"images of {camera}": f"no image of {camera} has come for {stamp_s - image_s:.1f} s"
+            for camera, image_s in self._images_s.items()
+            if stamp_s - image_s > _NO_IMAGE_S
+        }
+
     def _pose(self) -> Pose:
         """The pose at the newest stamp."""
         stamps = [item for item in (self._log.newest_s, self._way.stamp_s) if item is not None]
         stamp_s = max(stamps, default=0.0)
         reasons = dict(self._reasons)
+        reasons |= self._missing(stamp_s)
         if self._pace_reason is not None:
             reasons["odometry"] = f"the odometry does not fit the images: {self._pace_reason}"
         if self._belief is None:
