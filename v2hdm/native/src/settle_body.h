@@ -50,11 +50,6 @@ class Fit {
         for (int s = 0; s < SIDES; ++s) copy(pixels.of_side + s * pixels.stride, OF_SIDE + s);
         for (int k = 0; k < KNOTS; ++k) copy(pixels.hats + k * pixels.stride, HATS + k);
         if (pixels.paint != nullptr) copy(pixels.paint, PAINT);
-        const int last = table.columns - 2;
-        for (int h = 0; h < table.rows; ++h) {
-            const float* values = table.values + h * table.columns;
-            whole_side_.push_back(values[last] - values[0]);
-        }
     }
 
     void step(Unknowns& unknowns, double least_scatter, Equations& equations) {
@@ -157,7 +152,7 @@ class Fit {
         std::fill(inside, inside + BLOCK, 1.0f);
         for (int s = 0; s < SIDES; ++s) {
             float across[BLOCK], start[BLOCK], end[BLOCK];
-            int near = 0, beside = 1;
+            int near = 0;
             for (int i = 0; i < BLOCK; ++i) {
                 across[i] = matrix[0][s][0] * x[i] + matrix[0][s][1] * y[i] + matrix[0][s][2];
                 start[i] = matrix[1][s][0] * x[i] + matrix[1][s][1] * y[i] + matrix[1][s][2];
@@ -165,23 +160,11 @@ class Fit {
                 inside[i] = across[i] < 0.0f ? inside[i] : 0.0f;
             }
             for (int i = 0; i < BLOCK; ++i) near |= (across[i] < FAR_BLURS) & (across[i] > -FAR_BLURS);
-            for (int i = 0; i < BLOCK; ++i) beside &= (start[i] < -FAR_BLURS) & (end[i] > FAR_BLURS);
             float* by_start = row(BY_SHAPE + s) + begin;
             float* by_end = row(BY_SHAPE + SIDES + s) + begin;
             if (near == 0) {
                 std::fill(by_start, by_start + BLOCK, 0.0f);
                 std::fill(by_end, by_end + BLOCK, 0.0f);
-                continue;
-            }
-            if (beside != 0) {
-                // Far from both ends the side is as good as endless.
-                for (int i = 0; i < BLOCK; ++i) {
-                    const float density = normal_pdf(across[i]) * per_blur;
-                    by_end[i] = -density * start[i] * per_length[s];
-                    by_blur[i] += density * across[i];
-                    by_start[i] = density - by_end[i];
-                }
-                add_whole_side(across, coverage);
                 continue;
             }
             for (int i = 0; i < BLOCK; ++i) {
@@ -221,19 +204,6 @@ class Fit {
         for (int i = 0; i < BLOCK; ++i) {
             const float beyond =
                 read(at_end[i], right_of_end[i], down[i]) - read(at_start[i], right_of_start[i], down[i]);
-            coverage[i] += across[i] < 0.0f ? -beyond : beyond;
-        }
-    }
-
-    // The same where the line has no ends.
-    void add_whole_side(const float* across, float* coverage) const {
-        const float last_row = table_.cells_per_blur * table_.reach - 1.01f;
-        for (int i = 0; i < BLOCK; ++i) {
-            const float size = across[i] < 0.0f ? -across[i] : across[i];
-            const float v = least(size * table_.cells_per_blur, last_row);
-            const int32_t row = static_cast<int32_t>(v);
-            const float upper = whole_side_[row], lower = whole_side_[row + 1];
-            const float beyond = upper + (v - static_cast<float>(row)) * (lower - upper);
             coverage[i] += across[i] < 0.0f ? -beyond : beyond;
         }
     }
@@ -498,7 +468,6 @@ class Fit {
     std::vector<int32_t> of_median_;           // places in the rows of every few of them, for a median
     std::vector<int32_t> limited_;             // places of those at which the sensor was at its limit
     std::vector<std::vector<Pair>> pairs_;     // places of neighbours, by axis
-    std::vector<float> whole_side_;            // the table for lines without ends, by row
     int row_ = 0;                              // floats from one row of the buffer to the next
     std::vector<float> buffer_;
 };
