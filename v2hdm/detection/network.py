@@ -327,11 +327,12 @@ def _joined(fine: np.ndarray, coarse: np.ndarray, seam: int, coarse_top: int, st
     first = seam // stride
     overlap = (seam - coarse_top) // stride
     height = first - overlap + 2 * coarse.shape[1]
-    joined = np.empty((len(fine), height, 2 * coarse.shape[2]), dtype=np.float32)
-    joined[:, :first] = fine[:, :first]
+    width = 2 * coarse.shape[2]
+    joined = np.empty((len(fine), height, width), dtype=np.float32)
     for whole, plane in zip(joined, coarse, strict=True):
-        doubled = cv2.resize(plane, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
-        whole[first:] = doubled[overlap:]
+        doubled = whole[first - overlap :]
+        cv2.resize(plane, (width, len(doubled)), dst=doubled, interpolation=cv2.INTER_LINEAR)
+    joined[:, :first] = fine[:, :first]
     return joined
 
 
