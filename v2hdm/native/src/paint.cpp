@@ -8,6 +8,7 @@
 namespace v2hdm {
 namespace {
 
+constexpr float LEAST_LEVEL = 1e-3f;  // least size of the level of a piece, and beside it
 constexpr int FOUR = 4;  // elements of a map of pieces that are compared at once
 
 uint64_t four_of(const int16_t* piece) {
@@ -54,6 +55,16 @@ std::vector<std::vector<double>> outlines(const PieceMap& map, int count) {
         }
     }
     return points;
+}
+
+void sign(const PieceMap& map, int piece, const Box& box, float* levels) {
+    for (int i = box.first_row; i < box.last_row; ++i) {
+        const size_t row = static_cast<size_t>(i) * map.width;
+        for (int j = box.first_column; j < box.last_column; ++j) {
+            const float level = map.level[row + j];
+            *levels++ = map.piece[row + j] == piece ? most(level, LEAST_LEVEL) : least(level, -LEAST_LEVEL);
+        }
+    }
 }
 
 Tally tally(const PieceMap& map, const Kinds& kinds, int count) {
