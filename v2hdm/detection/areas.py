@@ -171,7 +171,9 @@ def _pieces(
     framed[down : down + paint.shape[0], right : right + paint.shape[1]] = paint
     piece = labels.astype(np.int16)
     level = np.where(piece > 0, np.maximum(framed, 1e-3), np.minimum(framed, -1e-3))
-    first_px = (output.stride - 1) / 2 + output.stride * np.array([first_column, first_row]) + [0.0, output.top]
+    first_px = (
+        (output.stride - 1) / 2 + output.stride * np.array([first_column, first_row]) + [0.0, output.top]
+    )
     of_element = labels[part.rows, part.columns]
     pieces = []
     for number, points in enumerate(outlines_of(level, piece, len(stats) - 1), start=1):

@@ -166,9 +166,7 @@ def propose(
     outlines_vehicle = np.split(points_vehicle, begins[1:])
     outlines_pinhole_px = np.split(points_pinhole_px, begins[1:])
     hulls = [_hull(outline) for outline in outlines_pinhole_px]
-    size_m = np.array(
-        [_size_m(outline, hull) for outline, hull in zip(outlines_vehicle, hulls, strict=True)]
-    )
+    size_m = np.array([_size_m(outline, hull) for outline, hull in zip(outlines_vehicle, hulls, strict=True)])
     shares = _shares(blobs, size_m, catalogue, whole, camera.log_size_sigma(range_m))
     tightest = _tightest(outlines_pinhole_px, hulls, camera, max_range_m)
     return [
