@@ -4,10 +4,10 @@ Decoders of bags, videos and rasters are libraries of others, which a few bytes 
 memory or work for ever. Here they take what :class:`Limits` allow, or end in one line of the caller's error.
 
 The child is the fork of an interpreter that imports only the modules of such work: no ``__main__`` is run
-again, so scripts without a guard, notebooks and worker processes may all call this. That interpreter, the fork
-server, waits for further jobs until its parent ends: to start it takes ten times as long as a fork. It never
-opens a file from outside. The child's answer is JSON, never an object. The caller makes the folders that the
-child writes into, and so removes them if it dies; the child ends with its parent.
+again, so scripts without a guard, notebooks and worker processes may all call this. That interpreter, the
+fork server, waits for further jobs until its parent ends: it is slow to start and takes 60 MB. It never opens a
+file from outside. The child's answer is JSON, never an object. The caller makes the folders that the child
+writes into, and so removes them if it dies; the child ends with its parent.
 
 Where forks are not safe (macOS) or unknown (Windows), each job has an interpreter that ends with it. Systems
 without ``resource`` (Windows) have the process and its end, but no limits.
@@ -121,7 +121,7 @@ class _Ending(NamedTuple):
 
 def _working_folder() -> str | None:
     try:
-        return os.getcwd()
+        return str(Path.cwd())
     except FileNotFoundError:  # somebody has removed it
         return None
 
@@ -133,7 +133,7 @@ class _ForkServer:
 
     def __init__(self, conditions: tuple[Any, ...]) -> None:
         self._conditions = conditions
-        self._printed = TemporaryFile()
+        self._printed = TemporaryFile()  # noqa: SIM115  # closed with the process
         self._process = subprocess.Popen(
             [sys.executable, "-c", _START.format(path=sys.path)],
             stdin=subprocess.PIPE,
@@ -180,11 +180,10 @@ class _ForkServer:
 
     def end(self) -> None:
         """End the process, and the child that may be at work."""
-        with suppress(ProcessLookupError, PermissionError):
-            if hasattr(os, "killpg"):
+        if self._process.returncode is None and hasattr(os, "killpg"):
+            with suppress(ProcessLookupError, PermissionError):
                 os.killpg(self._process.pid, signal.SIGKILL)
-            else:
-                self._process.kill()
+        self._process.kill()
         self._process.wait()
         self._close()
 
