@@ -5,9 +5,9 @@ memory or work for ever. Here they take what :class:`Limits` allow, or end in on
 
 The child is the fork of an interpreter that imports only the modules of such work: no ``__main__`` is run
 again, so scripts without a guard, notebooks and worker processes may all call this. That interpreter, the
-fork server, waits for further jobs until its parent ends: it is slow to start and takes 60 MB. It never opens a
-file from outside. The child's answer is JSON, never an object. The caller makes the folders that the child
-writes into, and so removes them if it dies; the child ends with its parent.
+fork server, waits for further jobs until its parent ends: to start it is slow, and it takes 60 MB. It never
+opens a file from outside. The child's answer is JSON, never an object. The caller makes the folders that the
+child writes into, and so removes them if it dies; the child ends with its parent.
 
 Where forks are not safe (macOS) or unknown (Windows), each job has an interpreter that ends with it. Systems
 without ``resource`` (Windows) have the process and its end, but no limits.
