@@ -58,7 +58,7 @@ def figure(path: Path, width_in: float, height_in: float, dpi: int = 110) -> Ite
     """A figure that is saved atomically to ``path`` at the end of the block."""
     with mpl.rc_context(RC):
         fig = Figure(figsize=(width_in, height_in), dpi=dpi, layout="constrained", facecolor="white")
-        canvas = FigureCanvasAgg(fig)
+        canvas: Any = FigureCanvasAgg(fig)
         yield fig
         with whole_file(path) as partial:
             canvas.print_png(partial)  # savefig draws twice, the layout first

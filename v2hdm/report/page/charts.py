@@ -62,7 +62,7 @@ def drawn_chart(name: str, width_in: float, height_in: float) -> Iterator[tuple[
     out: list[str] = []
     with mpl.rc_context({**_RC, "svg.hashsalt": name}):
         figure = Figure(figsize=(width_in, height_in), layout="constrained")
-        canvas = FigureCanvasSVG(figure)
+        canvas: Any = FigureCanvasSVG(figure)
         figure.patch.set(facecolor="none", edgecolor="none")
         yield figure, out
         text = io.StringIO()
