@@ -119,7 +119,7 @@ def find_crosswalks(
 
 
 class _Part(NamedTuple):
-    """Elements of the paint, and the part of its rows and columns that they are in, framed by one that they are not."""
+    """Elements of the paint, in the part of it that they reach, and one row or column more all around."""
 
     rows: IntArray  # (N,) of the part
     columns: IntArray  # (N,) of the part
@@ -160,7 +160,10 @@ def _pieces(
     alike: _Part,
     whole: _Connected,
 ) -> list[_Piece]:
-    """The pieces of a class in its ``part``, with this ``share`` (N,) of the paint; ``alike`` is its group's."""
+    """The pieces of a class, whose ``part`` has this ``share`` (N,) of the paint.
+
+    ``alike`` is the part of its group, and ``whole`` are the pieces of that.
+    """
     labels, stats = part.connected((share > 0).view(np.uint8))
     first_row, first_column = part.first
     framed = np.full(part.shape, -1.0, dtype=np.float32)

@@ -32,8 +32,8 @@ _SURROUNDINGS_PX = 24  # rows above the farthest ground that help to classify wh
 _FINE_ENOUGH_M = 0.010
 """Ground per pixel, across the view, of which half the resolution shows enough: a dash stays 7 px wide.
 
-Of 160 images of ports 1 and 2 (seeds 9001 and 9002) recall is .962 with this and .954 with 0.007, that of lanes
-.932 and .928, and as many markings are false.
+Of 160 images of ports 1 and 2 (seeds 9001 and 9002) recall is .962 with this and .954 with 0.007, that of
+lanes .932 and .928, and as many markings are false.
 """
 
 ASIDE_RAD = np.deg2rad(60)

@@ -318,7 +318,7 @@ def _lead(output: NetworkOutput, is_of_group: BoolArray, box: Box) -> np.ndarray
 
 
 def _signed(labels: np.ndarray, label: int, level: np.ndarray, box: Box) -> np.ndarray:
-    """The level in a box of int16 ``labels``, positive in one of them only: holes filled, all else emptied."""
+    """The level in a box of int16 ``labels``, positive in one only: holes filled, all else emptied."""
     compiled = kernels()
     if compiled is not None:
         rows, columns = box
