@@ -218,7 +218,8 @@ class _Tightest(NamedTuple):
 
 def _hull(outline_px: FloatArray) -> IntArray:
     """The indices of the points of an outline (N, 2) that are its convex hull, in order."""
-    return cv2.convexHull((outline_px - outline_px[0]).astype(np.float32), returnPoints=False).ravel()
+    hull = cv2.convexHull((outline_px - outline_px[0]).astype(np.float32), returnPoints=False)
+    return np.asarray(hull.ravel(), dtype=np.intp)
 
 
 def _size_m(outline_vehicle: FloatArray, hull: IntArray) -> tuple[float, float]:
