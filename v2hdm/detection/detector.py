@@ -211,10 +211,12 @@ class Detector:
                 continue
             kind = piece.symbol_kind(names)
             score = piece.symbol_score(kind)
-            range_m = proposals.camera.range_m(piece.outline_vehicle.mean(axis=0))
-            after = piece.index + 1 + piece.blob.parts
-            if score < _LEAST_NAMED or not range_m <= reach_m:  # nan is not
+            if score < _LEAST_NAMED:
                 continue
+            range_m = proposals.camera.range_m(piece.outline_vehicle.mean(axis=0))
+            if not range_m <= reach_m:  # nan is not
+                continue
+            after = piece.index + 1 + piece.blob.parts
             if kind == ARROW:
                 score = arrow_probability(score, features_of(piece, proposals.camera))
             if score < self.options.min_score:
