@@ -536,8 +536,7 @@ class Localizer:
         """The pose at the newest stamp."""
         stamps = [item for item in (self._log.newest_s, self._way.stamp_s) if item is not None]
         stamp_s = max(stamps, default=0.0)
-        reasons = dict(self._reasons)
-        reasons |= self._missing(stamp_s)
+        reasons = self._reasons | self._missing(stamp_s)
         if self._pace_reason is not None:
             reasons["odometry"] = f"the odometry does not fit the images: {self._pace_reason}"
         if self._belief is None:
