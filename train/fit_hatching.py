@@ -111,7 +111,7 @@ def pieces_of(shown: Shown, detector: Detector) -> Iterator[Piece]:
         text_share, box_share = (float((labels == label).mean()) for label in (_TEXT, _BOX))
         if max(text_share, box_share) >= LEAST_LABELLED:
             text_cells, box_cells = share[:, is_of_piece].sum(axis=1).tolist()
-            netted = meshes(is_of_piece, output.paint)
+            netted = meshes(*cells.T, output.paint > 0)
             yield Piece(text_cells, box_cells, netted, box_share > text_share)
 
 

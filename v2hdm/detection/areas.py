@@ -17,7 +17,7 @@ import numpy as np
 from v2hdm.catalogue import Catalogue
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.hatching import box_probability, meshes
-from v2hdm.detection.network import NetworkOutput, as_probability
+from v2hdm.detection.network import NetworkOutput, as_probability, as_shares
 from v2hdm.detection.quads.blobs import outlines_of
 from v2hdm.geometry.planar import rectangle_size
 from v2hdm.geometry.rows import linked_groups, outline_of_row, rows_of_bars
@@ -73,29 +73,33 @@ def find_areas(
     cuts the paint.
     """
     names = output.area_classes
-    # Most images show none: that is seen at once where no area is the likeliest anywhere.
-    if not names or not (output.areas.max(axis=0) > output.kinds.max(axis=0)).any():
+    if not names:
         return []
-    rows, columns = np.nonzero(output.paint > 0)
+    rows, columns = np.divmod(np.flatnonzero(output.paint > 0), output.paint.shape[1])
     is_in_reach = output.top + output.stride * (rows + 1) > reach_px
     rows = rows[is_in_reach]
     columns = columns[is_in_reach]
-    probability = output.area_probability(rows, columns)
-    best = probability.argmax(axis=0)
+    odds = output.area_odds(rows, columns)
+    best = odds.argmax(axis=0)
+    # Most images show none.
+    if max(np.bincount(best, minlength=len(names))[: len(names)], default=0) < _LEAST_CELLS:
+        return []
+    probability = as_shares(odds)
     of_group = {catalogue.classes[name].group for name in names}
     all_names = (*names, *output.classes)
     is_alike = np.array([catalogue.classes[name].group in of_group for name in all_names])[best]
-    alike = np.zeros(output.paint.shape, dtype=np.uint8)
-    alike[rows[is_alike], columns[is_alike]] = 1
+    alike = _Part.of(rows[is_alike], columns[is_alike])
+    whole = alike.connected(np.ones(np.count_nonzero(is_alike), dtype=np.uint8))
     pieces: list[_Piece] = []
     for kinds in _named_together(names):
         numbers = [names.index(kind) for kind in kinds]
         is_of_kinds = np.isin(best, numbers)
         if np.count_nonzero(is_of_kinds) < _LEAST_CELLS:
             continue
-        share = np.zeros((len(kinds), *output.paint.shape), dtype=np.float32)
-        share[:, rows[is_of_kinds], columns[is_of_kinds]] = probability[np.ix_(numbers, is_of_kinds)]
-        pieces += _pieces(kinds, output, camera, share, alike)
+        part = _Part.of(rows[is_of_kinds], columns[is_of_kinds])
+        pieces += _pieces(
+            kinds, output, camera, part, probability[np.ix_(numbers, is_of_kinds)], alike, whole
+        )
     areas = []
     for name in names:
         named = [piece for piece in pieces if piece.kind == name]
@@ -138,43 +142,102 @@ def find_crosswalks(
     return crosswalks
 
 
-def _pieces(
-    kinds: tuple[str, ...], output: NetworkOutput, camera: RoadCamera, share: np.ndarray, alike: np.ndarray
-) -> list[_Piece]:
-    """The pieces of K classes with these ``share`` (K, h, w) of the paint; of two they are text and box.
+class _Part(NamedTuple):
+    """Elements of the paint, in the part of it that they reach, and one row or column more all around."""
 
-    ``alike`` (h, w) is 1 for paint of their group of classes.
+    rows: IntArray  # (N,) of the part
+    columns: IntArray  # (N,) of the part
+    first: tuple[int, int]  # row and column of the paint that are the part's first
+    shape: tuple[int, int]  # of the part
+
+    @classmethod
+    def of(cls, rows: IntArray, columns: IntArray) -> _Part:
+        """The part that elements at rows and columns (N,) of the paint are in; N is not 0."""
+        first = int(rows.min()) - 1, int(columns.min()) - 1
+        shape = int(rows.max()) + 2 - first[0], int(columns.max()) + 2 - first[1]
+        return cls(rows - first[0], columns - first[1], first, shape)
+
+    def filled(self, values: np.ndarray) -> np.ndarray:
+        """A map of the part with these values (N,) at the elements, and 0 elsewhere."""
+        plane = np.zeros(self.shape, dtype=values.dtype)
+        plane[self.rows, self.columns] = values
+        return plane
+
+    def connected(self, values: np.ndarray) -> _Connected:
+        """The connected pieces of elements with ``values`` (N,) over 0."""
+        _, labels, stats, _ = cv2.connectedComponentsWithStats(self.filled(values), ltype=cv2.CV_16U)
+        return _Connected(labels, stats)
+
+
+class _Connected(NamedTuple):
+    """Connected pieces of elements of a part."""
+
+    labels: np.ndarray  # (h, w) of the pieces, from 1 on
+    stats: np.ndarray  # (P + 1, 5) OpenCV's
+
+
+def _pieces(
+    kinds: tuple[str, ...],
+    output: NetworkOutput,
+    camera: RoadCamera,
+    part: _Part,
+    share: np.ndarray,
+    alike: _Part,
+    whole: _Connected,
+) -> list[_Piece]:
+    """The pieces of K classes, whose ``part`` has these ``share`` (K, N) of the paint; of two: text and box.
+
+    ``alike`` is the part of their group, and ``whole`` are the pieces of that.
     """
     of_all = share.sum(axis=0)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats((of_all > 0).view(np.uint8), ltype=cv2.CV_16U)
-    _, whole, whole_stats, _ = cv2.connectedComponentsWithStats(alike, ltype=cv2.CV_16U)
-    framed = cv2.copyMakeBorder(output.paint, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=-1.0)
-    piece = cv2.copyMakeBorder(labels, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0).astype(np.int32)
+    labels, stats = part.connected((of_all > 0).view(np.uint8))
+    first_row, first_column = part.first
+    framed = np.full(part.shape, -1.0, dtype=np.float32)
+    rows = slice(max(first_row, 0), first_row + part.shape[0])
+    columns = slice(max(first_column, 0), first_column + part.shape[1])
+    paint = output.paint[rows, columns]
+    down, right = max(-first_row, 0), max(-first_column, 0)
+    framed[down : down + paint.shape[0], right : right + paint.shape[1]] = paint
+    piece = labels.astype(np.int16)
     level = np.where(piece > 0, np.maximum(framed, 1e-3), np.minimum(framed, -1e-3))
-    first_px = np.array([0.0, output.top]) + (output.stride - 1) / 2 - output.stride
+    first_px = (
+        (output.stride - 1) / 2 + output.stride * np.array([first_column, first_row]) + [0.0, output.top]
+    )
+    of_element = labels[part.rows, part.columns]
     pieces = []
-    for number, points in enumerate(outlines_of(level, piece, count - 1), start=1):
+    for number, points in enumerate(outlines_of(level, piece, len(stats) - 1), start=1):
         cells = int(stats[number, cv2.CC_STAT_AREA])
-        is_of_piece = labels == number
-        whole_cells = whole_stats[np.bincount(whole[is_of_piece]).argmax(), cv2.CC_STAT_AREA]
-        if cells < max(_LEAST_CELLS, _LEAST_SHARE * whole_cells):
+        if cells < _LEAST_CELLS:
+            continue
+        elements = np.flatnonzero(of_element == number)
+        row = part.rows[elements]
+        column = part.columns[elements]
+        in_whole = whole.labels[row + first_row - alike.first[0], column + first_column - alike.first[1]]
+        if cells < _LEAST_SHARE * whole.stats[np.bincount(in_whole).argmax(), cv2.CC_STAT_AREA]:
             continue
         points_px = first_px + output.stride * points
         ground = camera.unproject(points_px)
         is_on_ground = np.isfinite(ground).all(axis=1)
         if is_on_ground.sum() < 3:
             continue
-        certainty = float((as_probability(output.paint[is_of_piece]) * of_all[is_of_piece]).mean())
+        extent_m = rectangle_size(ground[is_on_ground])[0]
+        certainty = float((as_probability(framed[row, column]) * of_all[elements]).mean())
         kind = kinds[0]
         if len(kinds) > 1:
-            text_cells, box_cells = share[:, is_of_piece].sum(axis=1).tolist()
-            probability = box_probability(text_cells, box_cells, meshes(is_of_piece, output.paint))
+            text_cells, box_cells = share[:, elements].sum(axis=1).tolist()
+            probability = box_probability(text_cells, box_cells, meshes(row, column, framed > 0))
             kind = kinds[int(probability > 0.5)]
             certainty *= max(probability, 1.0 - probability)
-        extent_m = rectangle_size(ground[is_on_ground])[0]
-        is_cut = bool(_cut(points_px, output, camera).any())
         pieces.append(
-            _Piece(kind, points_px[is_on_ground], ground[is_on_ground], extent_m, cells, certainty, is_cut)
+            _Piece(
+                kind=kind,
+                points_px=points_px[is_on_ground],
+                ground=ground[is_on_ground],
+                extent_m=extent_m,
+                cells=cells,
+                certainty=certainty,
+                is_cut=bool(_cut(points_px, output, camera).any()),
+            )
         )
     return pieces
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from v2hdm.records import BoolArray
+from v2hdm.records import BoolArray, IntArray
 
 FITTED = 5.04
 """Weight of the meshes, fitted to photographs and renders by ``python -m train.fit_hatching``."""
@@ -19,17 +19,18 @@ _LEAST_CELLS = 3  # elements of ground of a mesh: fewer are wear
 _PRIOR_CELLS = 0.5  # elements of either class that are added to both, for the log odds
 
 
-def meshes(is_of_piece: BoolArray, paint: np.ndarray) -> float:
-    """How much a piece (h, w) of paint is a net: the share of ground in it, by the log of its meshes.
+def meshes(rows: IntArray, columns: IntArray, is_painted: BoolArray) -> float:
+    """How much a piece of paint is a net: the share of ground in it, times the log of its number of meshes.
 
-    ``paint`` (h, w) is the log odds of paint of any class: what lies in the hull of the piece adds to it.
+    Its N elements lie at ``rows`` and ``columns`` (N,) of ``is_painted`` (h, w), the paint of any class: what
+    lies in the hull of the piece adds to it.
     """
-    rows, columns = np.nonzero(is_of_piece)
-    crop = (slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1))
-    cells = np.column_stack([columns - columns.min(), rows - rows.min()]).astype(np.int32)
-    hull = np.zeros(is_of_piece[crop].shape, dtype=np.uint8)
+    top, left = int(rows.min()), int(columns.min())
+    painted = is_painted[top : int(rows.max()) + 1, left : int(columns.max()) + 1]
+    hull = np.zeros(painted.shape, dtype=np.uint8)
+    cells = np.column_stack([columns - left, rows - top]).astype(np.int32)
     cv2.fillConvexPoly(hull, cv2.convexHull(cells), 1)
-    painted = (hull > 0) & (paint[crop] > 0)
+    painted = painted & (hull > 0)
     ground = np.pad(~painted, 1, constant_values=True).astype(np.uint8)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(ground, connectivity=4)
     cells_of_mesh = stats[1:, cv2.CC_STAT_AREA]

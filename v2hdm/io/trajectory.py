@@ -31,6 +31,8 @@ _NEWEST_S = 4.1e9  # and earlier than this, December 2099
 _COLUMNS = "timestamp tx ty tz qx qy qz qw"
 _FARTHEST_M = 1e8  # coordinates on the earth end at ten thousand kilometres
 _FARTHEST_FROM_ORIGIN_M = 1e5  # a map is flat, and there the ground is 800 m below it
+_LEAP_M = 1e4  # least step, m, between poses that another grid's coordinates make: a zone's are 400 km off
+_FASTEST_MPS = 300.0  # no vehicle is faster, m/s
 _STRAYS = 0.05  # share of times out of order up to which these are left out; more are of two recordings
 LATE_S = 1.0  # a reading that comes later than this after its successor is of another clock or recording
 
@@ -75,11 +77,24 @@ def check_trajectory(trajectory: Trajectory, origin: GeodeticOrigin | None, wher
     farthest_m = float(np.abs(trajectory.map_from_vehicle[:, :3, 3]).max())
     if not farthest_m <= _FARTHEST_M:
         raise DriveError(f"{where}: a position is {farthest_m:.3g} m from zero, off the earth; fix it")
+    _check_one_grid(trajectory, where)
     if origin is not None and farthest_m > _FARTHEST_FROM_ORIGIN_M:
         raise DriveError(
             f"{where}: the poses lie {farthest_m / 1e3:.0f} km from the map's origin, which is at latitude "
             f"{origin.latitude_deg:.4f}, longitude {origin.longitude_deg:.4f}: are they coordinates of a "
             "grid such as UTM? Then say so under poses with crs, or give the origin that they count from"
+        )
+
+
+def _check_one_grid(trajectory: Trajectory, where: str) -> None:
+    """Refuse poses whose coordinates change their grid on the way, as drivers do at the edge of a zone."""
+    steps_m = np.linalg.norm(np.diff(trajectory.map_from_vehicle[:, :2, 3], axis=0), axis=1)
+    is_leap = (steps_m > _LEAP_M) & (steps_m > _FASTEST_MPS * np.diff(trajectory.stamp_s))
+    if is_leap.any():
+        k = int(np.argmax(is_leap))
+        raise DriveError(
+            f"{where}: the poses leap by {steps_m[k] / 1e3:.0f} km at {trajectory.stamp_s[k + 1]:.3f} s, as "
+            "where coordinates change their UTM zone or MGRS square; give all in one, or latitude, longitude"
         )
 
 

@@ -153,6 +153,14 @@ def misreadings(table: SurveyTable, origin: GeodeticOrigin | None) -> dict[str, 
     """Positions (N, 2) of the points in the map, had the file meant something else; by that meaning."""
     first, second = table.frame.columns
     others = {f"with {first} and {second} swapped": replace(table, coordinates=table.coordinates[:, ::-1])}
+    if table.crs is not None and table.frame is Frame.GRID:
+        units = geodetic.units_of(table.crs, str(table.path), DriveError)
+        if units.horizontal_m != 1.0:
+            others["in metres"] = replace(
+                table,
+                coordinates=table.coordinates / units.horizontal_m,
+                height_m=table.height_m / units.vertical_m,
+            )
     if table.frame is not Frame.GEODETIC:
         others["in feet"] = replace(table, coordinates=FOOT_M * table.coordinates)
         others["in millimetres"] = replace(table, coordinates=1e-3 * table.coordinates)
@@ -191,6 +199,10 @@ def _on_earth(table: SurveyTable, origin: GeodeticOrigin | None) -> tuple[FloatA
         )
     height_m = table.height_m
     if crs is not None:
+        units = geodetic.units_of(crs, where, DriveError)
+        height_m = units.vertical_m * height_m
+        if units.horizontal_m != 1.0:
+            _log.info("%s: east, north and heights are read in the unit of %s, %s", where, crs, units.name)
         datum = geodetic.datum_of(crs, where, DriveError)
         if datum.replace(" ", "") != origin.datum.replace(" ", ""):
             raise DriveError(
