@@ -10,7 +10,7 @@ from tests.asbuilt.site import layout, mapped
 from v2hdm.asbuilt.opendrive import outlines_of
 from v2hdm.asbuilt.reading import Source, read_design
 from v2hdm.errors import ConfigError, MapFileError, V2hdmError
-from v2hdm.geometry.geodetic import utm_of
+from v2hdm.geometry.datums import utm_of
 from v2hdm.io.maps.formats import write_map
 from v2hdm.records import GeodeticOrigin
 

@@ -336,7 +336,7 @@ MISTAKES: dict[str, tuple[Callable[[Path], Path], str]] = {
     "missing": (lambda folder: folder / "none.yaml", "no such file"),
     "folder": (lambda folder: folder, "is a folder"),
     "radial alone": (
-        text_mistake("a.yaml", ECHO.format(model="plumb_bob", d=[-0.1, 0.01, 0.003], k=MATRIX.ravel().tolist())),
+        text_mistake("a.yaml", ECHO.format(model="plumb_bob", d=LENSES[4][:3], k=[1] * 9)),
         "3 distortion coefficients leave open which they are; give k1 k2 p1 p2 and k3",
     ),
     "uncalibrated message": (

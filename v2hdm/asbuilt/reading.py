@@ -22,6 +22,7 @@ from v2hdm.asbuilt.opendrive import Pose, outlines_of
 from v2hdm.catalogue import load_catalogue
 from v2hdm.errors import ConfigError, MapFileError, shown
 from v2hdm.geometry import geodetic
+from v2hdm.geometry.datums import is_same_datum
 from v2hdm.geometry.geodetic import LOCAL, enu_from_geodetic
 from v2hdm.io.maps.reading import (
     GEOMETRY,
@@ -170,7 +171,7 @@ def in_map(positions: FloatArray, crs: str, origin: GeodeticOrigin | None, where
             f"{where}: is in {crs}, but the map has no origin on the earth; give a design in the map's frame"
         )
     datum = geodetic.datum_of(crs, where, MapFileError)
-    if datum.replace(" ", "") != origin.datum.replace(" ", ""):
+    if not is_same_datum(datum, origin.datum):
         raise MapFileError(
             f"{where}: is on {datum} ({crs}), the map on {origin.datum}, which differ by decimetres; bring "
             "both to one datum"
