@@ -39,6 +39,11 @@ def is_same_datum(name: str, other: str) -> bool:
     return _plain(name) == _plain(other)
 
 
+def is_named(name: str) -> bool:
+    """Whether a datum has a name, which PROJ's text of an ellipsoid alone leaves open."""
+    return not _plain(name).startswith("unknown")
+
+
 def utm_of(origin: GeodeticOrigin) -> str | None:
     """The UTM zone of an origin on its datum as an EPSG code; None where the datum has none there."""
     datum = _plain(origin.datum)
