@@ -12,7 +12,7 @@ from v2hdm.catalogue import SHIPPED
 from v2hdm.detection.areas import find_areas, find_crosswalks
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.detector import _not_of, _of_several
-from v2hdm.detection.network import NetworkOutput
+from v2hdm.detection.network import NetworkOutput, as_shares
 from v2hdm.geometry.planar import rectangle_size
 from v2hdm.records import MarkingDetection
 
@@ -98,7 +98,7 @@ def test_what_is_no_area_shares_paint_as_if_there_were_none():
     shares = output.class_probability(rows, columns)
     np.testing.assert_array_equal(shares, named.class_probability(rows, columns))
     np.testing.assert_allclose(shares.sum(axis=0), 1.0, rtol=1e-5)
-    with_areas = named.area_probability(rows, columns)
+    with_areas = as_shares(named.area_odds(rows, columns))
     np.testing.assert_allclose(with_areas.sum(axis=0), 1.0, rtol=1e-5)
     text = with_areas[named.area_classes.index("text")]
     dash = with_areas[len(named.area_classes) + named.classes.index("lane_dash")]

@@ -77,23 +77,24 @@ class Detector:
 
     @checked
     def detect(
-        self, image_bgr: np.ndarray, camera: Camera
+        self, image_bgr: np.ndarray, camera: Camera, has_boundaries: bool = True
     ) -> tuple[tuple[MarkingDetection, ...], tuple[LaneDetection, ...]]:
         """Find the markings and lanes of one image (H, W, 3) uint8 BGR.
 
-        Raises DetectorError where the image is not of that form or not of the camera's size.
+        Without ``has_boundaries``, of lanes only their paint. Raises DetectorError where the image is not of
+        that form or not of the camera's size.
         """
-        return self.detect_in(self.run_network(image_bgr, camera), image_bgr, camera)
+        return self.detect_in(self.run_network(image_bgr, camera), image_bgr, camera, has_boundaries)
 
     def detect_in(
-        self, output: NetworkOutput, image_bgr: np.ndarray, camera: Camera
+        self, output: NetworkOutput, image_bgr: np.ndarray, camera: Camera, has_boundaries: bool = True
     ) -> tuple[tuple[MarkingDetection, ...], tuple[LaneDetection, ...]]:
         """Find the markings and lanes of an image of which the network's output is known."""
         with lap("propose"):
             proposals = self.propose(output, camera)
         with lap("lanes"):
             image = self.lane_image(proposals, image_bgr)
-            lanes = (*image.paint, *find_boundaries(image))
+            lanes = (*image.paint, *(find_boundaries(image) if has_boundaries else ()))
         with lap("fit"):
             readings = self.read(image_bgr, proposals)
         with lap("judge"):
@@ -210,10 +211,12 @@ class Detector:
                 continue
             kind = piece.symbol_kind(names)
             score = piece.symbol_score(kind)
-            range_m = proposals.camera.range_m(piece.outline_vehicle.mean(axis=0))
-            after = piece.index + 1 + piece.blob.parts
-            if score < _LEAST_NAMED or not range_m <= reach_m:  # nan is not
+            if score < _LEAST_NAMED:
                 continue
+            range_m = proposals.camera.range_m(piece.outline_vehicle.mean(axis=0))
+            if not range_m <= reach_m:  # nan is not
+                continue
+            after = piece.index + 1 + piece.blob.parts
             if kind == ARROW:
                 score = arrow_probability(score, features_of(piece, proposals.camera))
             if score < self.options.min_score:
