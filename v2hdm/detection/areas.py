@@ -97,9 +97,8 @@ def find_areas(
         if np.count_nonzero(is_of_kinds) < _LEAST_CELLS:
             continue
         part = _Part.of(rows[is_of_kinds], columns[is_of_kinds])
-        pieces += _pieces(
-            kinds, output, camera, part, probability[np.ix_(numbers, is_of_kinds)], alike, whole
-        )
+        share = probability[numbers][:, is_of_kinds]
+        pieces += _pieces(kinds, output, camera, part, share, alike, whole)
     areas = []
     for name in names:
         named = [piece for piece in pieces if piece.kind == name]
