@@ -34,7 +34,7 @@ from v2hdm.adjust.problem import ControlPoints, KnownLengths, Observations, Prob
 from v2hdm.adjust.solution import Solution, Status
 from v2hdm.adjust.solve import solve
 from v2hdm.adjust.tiles import TiledCholesky
-from v2hdm.adjust.whitening import factorise, whitened_gradient
+from v2hdm.adjust.whitening import factorise
 from v2hdm.errors import AdjustError
 from v2hdm.records import FloatArray, IntArray
 
@@ -296,12 +296,9 @@ class IncrementalMap:
             step = held.step(before.whitened_step)
             if not float(step[1][..., 3:].norm(dim=-1).max()) <= math.pi:  # outside the chart
                 raise _unsolved(f"marking {marking}", Status.STALLED)
-            done = held.linearised.evaluate(*step)
+            done = held.reach(before.whitened_step)
             at = before.joint.mean
-            gradient = whitened_gradient(
-                plan, held.reduced_factor, done.gradient, done.coupled, done.whitened
-            )
-            joined = share(at, gradient)
+            joined = share(at, done.gradient)
             gap = joined.gained / max(sum(done.terms.values()), 1.0)
             if not gap > _GAP_TOLERANCE and loss.scale <= robust.scale:
                 break

@@ -24,7 +24,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from v2hdm.adjust.engine import Linearised, TorchEngine
+from v2hdm.adjust.engine import Linearised, Reached, TorchEngine
 from v2hdm.adjust.model import Estimate, Gradient, Loss
 from v2hdm.adjust.reduced import Coupled, Plan, ReducedSystem, Spread, from_tiles, to_tiles
 from v2hdm.adjust.tiles import TiledCholesky
@@ -108,6 +108,17 @@ class Whitening:
             whitened_corners = whitened_corners.index_copy(0, self.plan.kept_corners, kept_steps)
         return Step(Gradient(extrinsics, states, motion.new_empty(0, 2), clock), motion, whitened_corners)
 
+    def reach(self, whitened: Tensor) -> Reached:
+        """The estimate that whitened variables stand for, its cost, and the gradient by them."""
+        at_once = self.linearised.reach(whitened)
+        if at_once is not None:
+            return at_once
+        done = self.linearised.evaluate(*self.step(whitened))
+        gradient = whitened_gradient(
+            self.plan, self.reduced_factor, done.gradient, done.coupled, done.whitened
+        )
+        return Reached(done.estimate, done.terms, gradient)
+
 
 def whitened_gradient(
     plan: Plan, factor: TiledCholesky, gradient: Gradient, coupled: Coupled, corners: Tensor
@@ -137,6 +148,20 @@ def factorise(
 
     Raises AdjustError if the normal equations cannot be factorised.
     """
+    at_once = engine.factorised(estimate, robust, hold_cameras)
+    if at_once is not None:
+        return Whitening(
+            engine=engine,
+            plan=plan,
+            estimate=estimate,
+            robust=robust,
+            linearised=at_once.linearised,
+            gradient=at_once.gradient,
+            spread=at_once.linearised.spread,
+            reduced_factor=at_once.reduced_factor,
+            smallest_pivot=at_once.smallest_pivot,
+            jitter=0.0,
+        )
     spread = engine.spread(estimate)
     priors = engine.prior_blocks(estimate)
     for jitter in JITTER_STEPS:

@@ -255,6 +255,7 @@ void add_adjust(nb::module_& module) {
     constants["PIVOT_FLOOR"] = PIVOT_FLOOR;
     constants["MIN_DEPRESSION_SINE"] = MIN_DEPRESSION_SINE;
     adjust.attr("CONSTANTS") = constants;
+    add_adjust_rig(adjust);
 }
 
 }  // namespace v2hdm
