@@ -86,7 +86,9 @@ def coarse_extrinsics(engine: TorchEngine, cam_from_vehicle: Tensor) -> tuple[Te
         opening = open_descent(part, start, _LOSS)
         if stage == 0 and not is_near(opening):
             continue
-        descent = descend(part, start, _LOSS, _GAP_TOLERANCE, _MAX_REFRESHES, _MAX_EVALUATIONS, opening)
+        # From nearby the loss that the start calls for does: the descent of all corners narrows its own.
+        robust = _LOSS if stage else opening.robust
+        descent = descend(part, start, robust, _GAP_TOLERANCE, _MAX_REFRESHES, _MAX_EVALUATIONS, opening)
         cam_from_vehicle = descent.estimate.cam_from_vehicle
         evaluations += descent.evaluations
         if stage == 0:

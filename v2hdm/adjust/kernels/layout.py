@@ -187,27 +187,56 @@ def first_unsound(
     return -1
 
 
-@twin("adjust.lay_out")
+@twin("adjust.arrange")
 @kernel
-def lay_out(
+def arrange(
     observations: Seen,
     rank: IntArray,
     frames: int,
-    order: IntArray,
+    by_pair: NDArray[np.int32],
+    pair_at: IntArray,
+    corner_at: IntArray,
+    order: NDArray[np.int32],
     corner: NDArray[np.int32],
     pair: NDArray[np.int32],
-    measured: FloatArray,
-    root: FloatArray,
 ) -> int:
-    """Write observations in an order (K,); returns the position of a duplicate of the one before, or -1."""
+    """Sort observations (K,) by the rank of their corner, then by pair, each time counting how many are before.
+
+    ``by_pair`` (K,) is room, and ``pair_at`` (P + 1,) and ``corner_at`` (N + 1,) are zeros. Returns the position
+    of a duplicate of the one before, or -1.
+    """
+    for k in range(len(order)):
+        pair_at[observations.camera[k] * frames + observations.frame[k] + 1] += 1
+        corner_at[rank[observations.corner[k]] + 1] += 1
+    for p in range(1, len(pair_at)):
+        pair_at[p] += pair_at[p - 1]
+    for c in range(1, len(corner_at)):
+        corner_at[c] += corner_at[c - 1]
+    for k in range(len(order)):
+        p = observations.camera[k] * frames + observations.frame[k]
+        by_pair[pair_at[p]] = k
+        pair_at[p] += 1
     again = -1
+    for i in range(len(order)):
+        k = by_pair[i]
+        c = rank[observations.corner[k]]
+        at = corner_at[c]
+        corner_at[c] += 1
+        order[at] = k
+        corner[at] = c
+        pair[at] = observations.camera[k] * frames + observations.frame[k]
+        if at and corner[at - 1] == c and pair[at - 1] == pair[at] and (again < 0 or at < again):
+            again = at
+    return again
+
+
+@twin("adjust.lay_out")
+@kernel
+def lay_out(observations: Seen, order: NDArray[np.int32], measured: FloatArray, root: FloatArray) -> None:
+    """Write observations in an order (K,): where at depth 1, and their root information."""
     for i in range(len(order)):
         k = order[i]
         c = observations.camera[k]
-        corner[i] = rank[observations.corner[k]]
-        pair[i] = c * frames + observations.frame[k]
-        if i and corner[i] == corner[i - 1] and pair[i] == pair[i - 1] and again < 0:
-            again = i
         fx = observations.intrinsic[c, 0]
         fy = observations.intrinsic[c, 1]
         measured[0, i] = (observations.pinhole_px[k, 0] - observations.intrinsic[c, 2]) / fx
@@ -218,4 +247,3 @@ def lay_out(
         root[0, i] = fx / first
         root[1, i] = -below * fx / (first * last)
         root[2, i] = fy / last
-    return again
