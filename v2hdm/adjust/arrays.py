@@ -229,7 +229,8 @@ class Arrays:
 
         Known lengths need both corners. Returns the corners' indices here as well.
         """
-        corners, corner = torch.unique(self.corner[keep], return_inverse=True)
+        # Ascending, and so without a sort.
+        corners, corner = torch.unique_consecutive(self.corner[keep], return_inverse=True)
         corners = corners.long()
         rank = torch.full_like(self.corner_order, -1)
         rank[corners] = torch.arange(len(corners), device=rank.device)

@@ -68,7 +68,8 @@ def minimise(
     def closure() -> float:
         new_cost, new_gradient = evaluations.at(u)
         # An infinite cost means an overshooting step, whatever its gradient.
-        if math.isnan(new_cost) or not (math.isinf(new_cost) or bool(new_gradient.isfinite().all())):
+        # A sum is finite only if all of its terms are.
+        if math.isnan(new_cost) or not (math.isinf(new_cost) or math.isfinite(float(new_gradient.sum()))):
             raise _NoNumberError
         u.grad = new_gradient / scale
         # Differences to the start keep the digits of small improvements of a large cost.

@@ -58,8 +58,8 @@ def is_worth_a_look(arrays: Arrays) -> bool:
 
 def is_near(whitening: Whitening) -> bool:
     """Whether the Newton step turns every camera by less than the descent's range of convergence."""
-    step = whitening.step(-whitening.gradient).unknowns
-    return float(step.extrinsic[:, 3:].norm(dim=1).max()) <= _NEAR_RAD
+    by_camera = whitening.camera_step(-whitening.gradient)
+    return float(by_camera[:, 3:6].norm(dim=1).max()) <= _NEAR_RAD
 
 
 def coarse_extrinsics(engine: TorchEngine, cam_from_vehicle: Tensor) -> tuple[Tensor, int]:
