@@ -90,10 +90,12 @@ class Whitening:
         return torch.cat([reduced.mT, corner_gradients.flatten(1)], dim=1)
 
     def camera_step(self, whitened: Tensor) -> Tensor:
-        """The cameras' part (C, 6 + Q) of the step of whitened variables: they come last, and so depend on no others."""
+        """The cameras' part (C, 6 + Q) of the step of whitened variables; they come last, and need no others."""
         tip = self.reduced_factor.tip
         end = self.reduced_factor.size
-        solved = torch.linalg.solve_triangular(tip.mT, whitened[end - len(tip) : end, None], upper=True)
+        solved: Tensor = torch.linalg.solve_triangular(
+            tip.mT, whitened[end - len(tip) : end, None], upper=True
+        )
         return solved.view(self.engine.arrays.camera_count, -1)
 
     def step(self, whitened: Tensor) -> Step:

@@ -200,10 +200,10 @@ def arrange(
     corner: NDArray[np.int32],
     pair: NDArray[np.int32],
 ) -> int:
-    """Sort observations (K,) by the rank of their corner, then by pair, each time counting how many are before.
+    """Sort observations (K,) by the rank of their corner, then by pair, each time by counting those before.
 
-    ``by_pair`` (K,) is room, and ``pair_at`` (P + 1,) and ``corner_at`` (N + 1,) are zeros. Returns the position
-    of a duplicate of the one before, or -1.
+    ``by_pair`` (K,) is room, and ``pair_at`` (P + 1,) and ``corner_at`` (N + 1,) are zeros. Returns the
+    position of a duplicate of the one before, or -1.
     """
     for k in range(len(order)):
         pair_at[observations.camera[k] * frames + observations.frame[k] + 1] += 1

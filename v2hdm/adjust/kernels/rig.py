@@ -1,25 +1,21 @@
 """Whitenings and evaluations at once, in C++, of problems in which cameras alone move.
 
-That is the paper's model, and that of every coarse stage. There the reduced unknowns are the extrinsics, whose
-few numbers took torch longer than the passes over the observations took. The reference is
+That is the paper's model, and that of every coarse stage. There the reduced unknowns are the extrinsics: few
+numbers, which took torch longer than the passes over the observations. The reference is
 :mod:`v2hdm.adjust.whitening`, which goes step by step; an engine without C++ does so, too.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from v2hdm import native
 from v2hdm.adjust.arrays import Arrays
-from v2hdm.adjust.engine import Reached
 from v2hdm.adjust.kernels.layout import Layout
 from v2hdm.adjust.kernels.tables import EXP_TERMS, LEFT_JACOBIAN_TERMS
-from v2hdm.adjust.model import Estimate
 from v2hdm.adjust.tiles import TiledCholesky
 from v2hdm.records import FloatArray
 
