@@ -90,7 +90,7 @@ class Whitening:
         return torch.cat([reduced.mT, corner_gradients.flatten(1)], dim=1)
 
     def camera_step(self, whitened: Tensor) -> Tensor:
-        """The cameras' part (C, 6 + Q) of the step of whitened variables; they come last, and need no others."""
+        """The cameras' part (C, 6 + Q) of a step: they come last, and need no other variables."""
         tip = self.reduced_factor.tip
         end = self.reduced_factor.size
         solved: Tensor = torch.linalg.solve_triangular(

@@ -216,7 +216,6 @@ def arrange(
         p = observations.camera[k] * frames + observations.frame[k]
         by_pair[pair_at[p]] = k
         pair_at[p] += 1
-    again = -1
     for i in range(len(order)):
         k = by_pair[i]
         c = rank[observations.corner[k]]
@@ -225,9 +224,10 @@ def arrange(
         order[at] = k
         corner[at] = c
         pair[at] = observations.camera[k] * frames + observations.frame[k]
-        if at and corner[at - 1] == c and pair[at - 1] == pair[at] and (again < 0 or at < again):
-            again = at
-    return again
+    for i in range(1, len(order)):
+        if corner[i] == corner[i - 1] and pair[i] == pair[i - 1]:
+            return i
+    return -1
 
 
 @twin("adjust.lay_out")

@@ -62,17 +62,17 @@ Index arrange(const Columns& columns, const Index* rank, Index frames, const Arr
     for (Index p = 0; p < out.pairs; ++p) out.pair_at[p + 1] += out.pair_at[p];
     for (Index c = 0; c < out.corners; ++c) out.corner_at[c + 1] += out.corner_at[c];
     for (Index k = 0; k < columns.count; ++k) out.by_pair[out.pair_at[pair_of(k)]++] = static_cast<int32_t>(k);
-    Index again = -1;
     for (Index i = 0; i < columns.count; ++i) {
         const int32_t k = out.by_pair[i];
         const Index corner = rank[columns.corner[k]], at = out.corner_at[corner]++;
         out.order[at] = k;
         out.corner[at] = static_cast<int32_t>(corner);
         out.pair[at] = static_cast<int32_t>(pair_of(k));
-        const bool is_again = at && out.corner[at - 1] == out.corner[at] && out.pair[at - 1] == out.pair[at];
-        if (is_again && (again < 0 || at < again)) again = at;
     }
-    return again;
+    for (Index i = 1; i < columns.count; ++i) {
+        if (out.corner[i] == out.corner[i - 1] && out.pair[i] == out.pair[i - 1]) return i;
+    }
+    return -1;
 }
 
 void lay_out(const Columns& columns, const int32_t* order, double* measured, double* root) {
