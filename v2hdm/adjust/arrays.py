@@ -171,6 +171,8 @@ class Arrays:
     @cached_property
     def units(self) -> Tensor:
         """First corners of units, which may begin a run, and the end."""
+        if not bool(self.joined.any()):
+            return torch.arange(self.corner_count + 1, device=self.joined.device)
         end = self.joined.new_full((1,), self.corner_count, dtype=torch.int64)
         return torch.cat([(~self.joined).nonzero()[:, 0], end])
 

@@ -384,6 +384,10 @@ class Linearised:
         """What variables of the whitening lead to, if the engine evaluates that at once."""
         return None
 
+    def by_cameras(self) -> Tensor | None:
+        """L^-1 W' (N, 2, D) of all corners, if frames have no states and the engine keeps it."""
+        return None
+
     def carry(self, by_corner: Tensor) -> tuple[Tensor, Coupled]:
         """L^-1 g (N, 2) and W V^-1 g of a gradient g (N, 2) by the corners."""
         return _carry(self.engine.arrays, self.spread, self.corner_factor, self.couplings, by_corner)

@@ -465,6 +465,11 @@ class KernelLinearised(Linearised):
         at = replace(at, corners_map=torch.from_numpy(out.corners))
         return Evaluated(at, terms, replace(gradient, extrinsic=by_tangent), *self._carried(out))
 
+    def by_cameras(self) -> Tensor | None:
+        """L^-1 W' (N, 2, D) of all corners, if frames have no states."""
+        rows = self.base.rows
+        return torch.from_numpy(rows).view(-1, 2, rows.shape[1]) if len(rows) else None
+
     def carry(self, by_corner: Tensor) -> tuple[Tensor, Coupled]:
         """L^-1 g (N, 2) and W V^-1 g of a gradient g (N, 2) by the corners."""
         layout = self.engine.layout

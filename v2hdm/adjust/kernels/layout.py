@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from v2hdm.adjust.arrays import Arrays
@@ -55,7 +55,7 @@ def make_layout(arrays: Arrays) -> Layout:
     unit = arrays.units.numpy()
     chunk = np.searchsorted(unit, [corner for _, corner in arrays.run_bounds])
     pair = arrays.pair.numpy()
-    touched = [_distinct(part, arrays.pair_count) for part in np.split(pair, begin[unit[chunk[1:-1]]])]
+    touched = [_distinct(pair[start:end], arrays.pair_count) for start, end in pairwise(begin[unit[chunk]])]
     joined = np.diff(unit)
     lengths = arrays.lengths
     of_length = np.searchsorted(unit, lengths.first.numpy(), side="right") - 1
@@ -65,7 +65,7 @@ def make_layout(arrays: Arrays) -> Layout:
         measured=arrays.measured.numpy(),
         root=arrays.root_information.numpy(),
         moments=arrays.moment_count,
-        frame=arrays.frame_of(torch.arange(arrays.moment_count)).numpy(),
+        frame=_frame_of_moment(arrays),
         begin=begin,
         unit=unit,
         joint_at=joint_offsets(joined),
@@ -85,6 +85,12 @@ def make_layout(arrays: Arrays) -> Layout:
     )
 
 
+def _frame_of_moment(arrays: Arrays) -> IntArray:
+    """The frame (M,) of each moment."""
+    moments = arrays.frame_of_moment
+    return np.arange(arrays.moment_count) if moments is None else np.asarray(moments.numpy())
+
+
 def _distinct(pair: IntArray, pairs: int) -> IntArray:
     """The distinct pairs of a chunk, by a mask over all pairs, which is faster than sorting."""
     is_touched = np.zeros(pairs, dtype=np.bool_)
@@ -95,6 +101,8 @@ def _distinct(pair: IntArray, pairs: int) -> IntArray:
 def joint_offsets(joined: IntArray) -> IntArray:
     """Offsets (M,) of the factors (2g, 2g) of units of g > 1 corners; equal sizes are contiguous."""
     out = np.zeros(len(joined), dtype=np.int64)
+    if joined.max(initial=1) == 1:
+        return out
     begin = 0
     for size in np.unique(joined[joined > 1]):
         same = np.flatnonzero(joined == size)
