@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, NamedTuple
 
@@ -74,29 +74,47 @@ def localize_live(
         running = set(sources)
         images = 0
         written_s = -math.inf
+        news = _News()
         while running and (limit is None or images < limit):
-            looks: list[Look] = []
-            motions: list[Motion] = []
-            fixes: list[Fix] = []
             for item in _available(items):
                 if isinstance(item, _Ended):
                     running.discard(item.source)
                     if item.error is not None:
                         raise DriveError(item.error)
-                elif isinstance(item, Look):
-                    looks.append(item)
-                elif isinstance(item, Motion):
-                    motions.append(item)
                 else:
-                    fixes.append(item)
+                    news.add(item)
+            # What comes between images waits for the next: a pose of it would only cost time.
+            if not news.looks and news.newest_s - written_s <= _QUIET_S:
+                continue
+            looks = news.looks
+            pose = localizer.update(looks, news.motions, news.fixes)
+            news = _News()
             images += len(looks)
-            if looks or motions or fixes:
-                pose = localizer.update(looks, motions, fixes)
-                for camera in {look.camera for look in looks}:
-                    cameras[camera].point(localizer, time.time())
-                if looks or pose.stamp_s - written_s > _QUIET_S:
-                    written_s = pose.stamp_s
-                    take(pose)
+            written_s = pose.stamp_s
+            take(pose)
+            for camera in {look.camera for look in looks}:
+                cameras[camera].point(localizer, time.time())
+
+
+@dataclass
+class _News:
+    """What has come since the last pose."""
+
+    looks: list[Look] = field(default_factory=list)
+    motions: list[Motion] = field(default_factory=list)
+    fixes: list[Fix] = field(default_factory=list)
+    newest_s: float = -math.inf  # stamp of the newest motion or position
+
+    def add(self, item: Look | Motion | Fix) -> None:
+        """Take an item."""
+        if isinstance(item, Look):
+            self.looks.append(item)
+            return
+        self.newest_s = max(self.newest_s, item.stamp_s)
+        if isinstance(item, Motion):
+            self.motions.append(item)
+        else:
+            self.fixes.append(item)
 
 
 def _available(items: _Queue) -> Iterator[_Item]:

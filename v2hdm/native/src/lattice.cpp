@@ -40,18 +40,20 @@ Seen see(const Source& source, const Marking& marking, int64_t u, int64_t v) {
 int clearest(const std::vector<float>& light, const std::vector<uint8_t>& part, int count, double grey_first) {
     double best = -1.0;
     int chosen = 0;
+    double number[3];
+    for (int p = 0; p < 3; ++p) number[p] = std::max<double>(std::count(part.begin(), part.end(), p), 1.0);
     for (int colour = 0; colour < COLOURS; ++colour) {
-        double number[3] = {}, mean[3] = {}, variance[3] = {};
+        double mean[3] = {}, square[3] = {};
         for (int i = 0; i < count; ++i) {
-            number[part[i]] += 1;
-            mean[part[i]] += light[COLOURS * i + colour];
+            const double value = light[COLOURS * i + colour];
+            mean[part[i]] += value;
+            square[part[i]] += value * value;
         }
-        for (int p = 0; p < 3; ++p) mean[p] /= std::max(number[p], 1.0);
-        for (int i = 0; i < count; ++i) {
-            const double off = light[COLOURS * i + colour] - mean[part[i]];
-            variance[part[i]] += off * off;
+        double scatter = 0.0;
+        for (int p = 1; p < 3; ++p) {
+            mean[p] /= number[p];
+            scatter += std::max(square[p] / number[p] - mean[p] * mean[p], 0.0);
         }
-        const double scatter = variance[1] / std::max(number[1], 1.0) + variance[2] / std::max(number[2], 1.0);
         double clearness = std::abs(mean[1] - mean[2]) / std::sqrt(scatter + 1e-4);
         if (colour == 0) clearness *= grey_first;
         if (clearness > best) {
