@@ -39,6 +39,7 @@ from tests.benchmarks.made.live import (
 )
 from v2hdm.geometry.planar import wrapped
 from v2hdm.geometry.rigid import heading_rad
+from v2hdm.localization.antenna import Fix
 from v2hdm.localization.localizer import Localizer, Pose, Status
 from v2hdm.localization.places import Prior, rough_position
 from v2hdm.localization.seeing import Look
@@ -55,6 +56,10 @@ _NEAR_M = 10.0  # way in which a repainted map is to be said
 _SHORT_S = 5.5  # time of a short drive, s
 _SHORT_BEGINS_M = (3.0, 250.0)  # least and largest station, m, from which it begins
 _GAP_M, _BEFORE_GAP_M = 50.0, 20.0  # way without a marking, and that before it
+_ANTENNA_M = (1.2, 0.3)  # ahead of the rear axle and to the left, m
+_RTK_M = 0.015  # standard deviation of a fixed position, m
+_FIX_EVERY = 2  # moments from one position to the next: 5 Hz
+_DUAL_RAD = np.deg2rad(0.2)  # standard deviation of the heading by two antennas
 _REPAINTED_STARTS, _REPAINTED_FRAMES = 4, 40  # drives on a repainted map, and moments of each
 
 
@@ -335,6 +340,31 @@ def alarm_line(alarms: Sequence[Alarms], seconds: float) -> str:
     )
 
 
+def antenna_line(driven: LiveDrive, rng: np.random.Generator) -> str:
+    """A vehicle with one RTK antenna, which must drive to know its heading, beside one with two."""
+    count = len(driven.stamp_s)
+    places = driven.map_from_vehicle[:, :2, :2] @ np.array(_ANTENNA_M) + driven.map_from_vehicle[:, :2, 3]
+    places = places + rng.normal(0, _RTK_M, places.shape)
+    fixes = [
+        [Fix(float(driven.stamp_s[frame]), places[frame], _RTK_M)] if frame % _FIX_EVERY == 0 else []
+        for frame in range(count)
+    ]
+    begin = driven.map_from_vehicle[0]
+    heading = float(heading_rad(begin)) + rng.normal(0, _DUAL_RAD)
+    dual = Prior(np.array([*places[0], heading]), 3.0 * _RTK_M + float(np.hypot(*_ANTENNA_M)), _DUAL_RAD)
+    texts = []
+    for name, prior in (("one antenna", None), ("two", dual)):
+        localizer = Localizer(driven.hd_map, driven.calibrations, prior, antenna_m=_ANTENNA_M)
+        moments = zip(driven.looks, driven.motion, fixes, strict=True)
+        poses = [localizer.update(*moment) for moment in moments]
+        run = Run(poses, range(count), 0.0)
+        errors = errors_of(driven, run)
+        first = next((frame for frame, pose in enumerate(poses) if pose.status == Status.TRACKING), None)
+        begun = "never" if first is None else f"after {way_m(driven, 0, first / RATE_HZ):.1f} m"
+        texts.append(f"{name}: tracked {begun}, {tracking_line([errors], count, 0.0)}")
+    return "; ".join(texts)
+
+
 class Gap(NamedTuple):
     """The pose at the end of a way without a marking."""
 
@@ -397,7 +427,11 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--starts", type=int, default=40, help="of each drive")
     parser.add_argument(
-        "--only", nargs="*", default=[], metavar="PART", help="starts, wrong, moved, pushed, slow, gaps"
+        "--only",
+        nargs="*",
+        default=[],
+        metavar="PART",
+        help="starts, wrong, moved, pushed, antenna, slow, gaps",
     )
     full = "of so many images one is searched as a whole, the others where the map expects markings"
     parser.add_argument("--every-full", type=int, default=1, help=full)
@@ -433,6 +467,8 @@ def main() -> None:
                 print(f"  {repainted_line(own, rng, seed, parsed.every_full)}", flush=True)
             if not only or "pushed" in only:
                 print(f"  {pushed_line(own, rng, seed, parsed.every_full)}", flush=True)
+            if not only or "antenna" in only:
+                print(f"  {antenna_line(own, rng)}", flush=True)
             if not only or "slow" in only:
                 print(f"  {slow_line(own, rng, seed)}", flush=True)
             if not only or "gaps" in only:
