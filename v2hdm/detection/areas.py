@@ -1,7 +1,8 @@
 """Areas of paint: words, numbers and hatched boxes, each by the hull on the ground of all of its pieces.
 
-An area is made of pieces that do not touch: letters, hatching. Pieces of one class are one area where the gap
-between them on the ground is small beside their own size. Crosswalks are composed of bars.
+An area is made of pieces that do not touch: letters, hatching. Each is named whole, as writing or as a box.
+Pieces of one class are one area where the gap between them on the ground is small beside their own size.
+Crosswalks are composed of bars.
 """
 
 from __future__ import annotations
@@ -15,11 +16,21 @@ import numpy as np
 
 from v2hdm.catalogue import Catalogue
 from v2hdm.detection.camera import RoadCamera
+from v2hdm.detection.hatching import box_probability, meshes
 from v2hdm.detection.network import NetworkOutput, as_probability, as_shares
 from v2hdm.detection.quads.blobs import outlines_of
 from v2hdm.geometry.planar import rectangle_size
 from v2hdm.geometry.rows import linked_groups, outline_of_row, rows_of_bars
-from v2hdm.records import CROSSWALK, CROSSWALK_BAR, TEXT, BoolArray, FloatArray, IntArray, MarkingDetection
+from v2hdm.records import (
+    BOX,
+    CROSSWALK,
+    CROSSWALK_BAR,
+    TEXT,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    MarkingDetection,
+)
 
 _LEAST_CELLS = 5  # elements of paint of a piece: fewer are noise
 _LEAST_SHARE = 0.25
@@ -39,6 +50,7 @@ _CUT_PX = 6.0  # distance from where the image or its road begins, px, within wh
 class _Piece(NamedTuple):
     """A connected piece of paint of one class."""
 
+    kind: str
     points_px: FloatArray  # (N, 2) of its outline, recorded px, in no order
     ground: FloatArray  # (N, 2) the same on the ground, m
     extent_m: float  # length of the smallest rectangle around it
@@ -78,20 +90,31 @@ def find_areas(
     is_alike = np.array([catalogue.classes[name].group in of_group for name in all_names])[best]
     alike = _Part.of(rows[is_alike], columns[is_alike])
     whole = alike.connected(np.ones(np.count_nonzero(is_alike), dtype=np.uint8))
-    areas = []
-    for number, name in enumerate(names):
-        is_of_class = best == number
-        if np.count_nonzero(is_of_class) < _LEAST_CELLS:
+    pieces: list[_Piece] = []
+    for kinds in _named_together(names):
+        numbers = [names.index(kind) for kind in kinds]
+        is_of_kinds = np.isin(best, numbers)
+        if np.count_nonzero(is_of_kinds) < _LEAST_CELLS:
             continue
-        part = _Part.of(rows[is_of_class], columns[is_of_class])
-        pieces = _pieces(output, camera, part, probability[number, is_of_class], alike, whole)
-        for members in _together(pieces, _MOST_GAP_M.get(name, _OTHER_GAP_M)):
-            area = _area(name, [pieces[k] for k in members], output, camera, catalogue)
+        part = _Part.of(rows[is_of_kinds], columns[is_of_kinds])
+        share = probability[numbers][:, is_of_kinds]
+        pieces += _pieces(kinds, output, camera, part, share, alike, whole)
+    areas = []
+    for name in names:
+        named = [piece for piece in pieces if piece.kind == name]
+        for members in _together(named, _MOST_GAP_M.get(name, _OTHER_GAP_M)):
+            area = _area(name, [named[k] for k in members], output, camera, catalogue)
             ground = camera.unproject(area.outline_px)
             within = camera.range_m(ground.mean(axis=0)) <= max_range_m
             if within and area.score >= least_score:
                 areas.append(area)
     return areas
+
+
+def _named_together(names: Sequence[str]) -> list[tuple[str, ...]]:
+    """The classes of areas; those of which a piece may show both to the network are together."""
+    written = (TEXT, BOX) if {TEXT, BOX} <= set(names) else ()
+    return [*([written] if written else []), *((name,) for name in names if name not in written)]
 
 
 def find_crosswalks(
@@ -153,6 +176,7 @@ class _Connected(NamedTuple):
 
 
 def _pieces(
+    kinds: tuple[str, ...],
     output: NetworkOutput,
     camera: RoadCamera,
     part: _Part,
@@ -160,11 +184,12 @@ def _pieces(
     alike: _Part,
     whole: _Connected,
 ) -> list[_Piece]:
-    """The pieces of a class, whose ``part`` has this ``share`` (N,) of the paint.
+    """The pieces of K classes, whose ``part`` has these ``share`` (K, N) of the paint; of two: text and box.
 
-    ``alike`` is the part of its group, and ``whole`` are the pieces of that.
+    ``alike`` is the part of their group, and ``whole`` are the pieces of that.
     """
-    labels, stats = part.connected((share > 0).view(np.uint8))
+    of_all = share.sum(axis=0)
+    labels, stats = part.connected((of_all > 0).view(np.uint8))
     first_row, first_column = part.first
     framed = np.full(part.shape, -1.0, dtype=np.float32)
     rows = slice(max(first_row, 0), first_row + part.shape[0])
@@ -195,13 +220,21 @@ def _pieces(
         if is_on_ground.sum() < 3:
             continue
         extent_m = rectangle_size(ground[is_on_ground])[0]
+        certainty = float((as_probability(framed[row, column]) * of_all[elements]).mean())
+        kind = kinds[0]
+        if len(kinds) > 1:
+            text_cells, box_cells = share[:, elements].sum(axis=1).tolist()
+            probability = box_probability(text_cells, box_cells, meshes(row, column, framed > 0))
+            kind = kinds[int(probability > 0.5)]
+            certainty *= max(probability, 1.0 - probability)
         pieces.append(
             _Piece(
+                kind=kind,
                 points_px=points_px[is_on_ground],
                 ground=ground[is_on_ground],
                 extent_m=extent_m,
                 cells=cells,
-                certainty=float((as_probability(framed[row, column]) * share[elements]).mean()),
+                certainty=certainty,
                 is_cut=bool(_cut(points_px, output, camera).any()),
             )
         )

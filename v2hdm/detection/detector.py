@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from v2hdm.catalogue import PAINT_CLASSES, SYMBOL, Catalogue
-from v2hdm.detection.areas import find_areas
+from v2hdm.detection.areas import find_areas, find_crosswalks
 from v2hdm.detection.arrows import arrow_probability, features_of
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.classifier import Readings, find_markings, read_markings
@@ -101,7 +101,8 @@ class Detector:
             quads = find_markings(readings, proposals.camera, self.options)
         markings = _likelier(quads, self._symbols(image_bgr, proposals))
         with lap("areas"):
-            areas = _of_several(self._areas(proposals), markings)
+            crosswalks = [crosswalk for crosswalk, _ in find_crosswalks(markings, proposals.camera)]
+            areas = _of_several(self._areas(proposals), (*markings, *crosswalks))
         return (*_not_of(areas, markings), *areas), lanes
 
     @checked
@@ -262,7 +263,7 @@ def _without_vehicle(output: NetworkOutput, camera: Camera) -> NetworkOutput:
 
 
 def _of_several(areas: Sequence[MarkingDetection], markings: Markings) -> list[MarkingDetection]:
-    """The areas that lie in no marking: what names a part of an arrow a word does not make it one."""
+    """The areas that lie in no marking: a part of an arrow, and bars, are no word, whatever names them so."""
     shapes = [marking.outline_px if len(marking.outline_px) else marking.corners_px for marking in markings]
     hulls = [cv2.convexHull(shape_px.astype(np.float32)) for shape_px in shapes]
 
@@ -297,17 +298,35 @@ def _tell_lacking(path: Path, names: tuple[str, ...]) -> None:
 
 
 def _likelier(quads: Sequence[MarkingDetection], symbols: Sequence[MarkingDetection]) -> Markings:
-    """Quadrilaterals and symbols of one image: where one lies in the other, the one of the higher score."""
-    centres = [quad.corners_px.mean(axis=0).tolist() for quad in quads]
+    """Quadrilaterals and symbols of one image: where one lies in the other, the one of the higher score.
+
+    A quadrilateral lies in a symbol that covers its centre and most of its longer middle line: a stop line
+    that an arrow crosses does not.
+    """
     left_out: set[int] = set()
     likelier_symbols = []
+    middle_lines = [_on_middle_line(quad.corners_px) for quad in quads]
     for symbol in symbols:
         polygon = symbol.outline_px.astype(np.float32)
-        on_it = [k for k, centre in enumerate(centres) if cv2.pointPolygonTest(polygon, centre, False) > 0]
+        on_it = [k for k, points in enumerate(middle_lines) if _covers(polygon, points)]
         if all(quads[k].score < symbol.score for k in on_it):
             left_out.update(on_it)
             likelier_symbols.append(symbol)
     return (*(quad for k, quad in enumerate(quads) if k not in left_out), *likelier_symbols)
+
+
+def _on_middle_line(corners_px: FloatArray) -> FloatArray:
+    """Points (5, 2) along most of the longer middle line of a quadrilateral (4, 2), its centre the third."""
+    sides = (corners_px + np.roll(corners_px, -1, axis=0)) / 2
+    across = sides[2:] - sides[:2]
+    way = across[np.linalg.norm(across, axis=1).argmax()]
+    return np.asarray(corners_px.mean(axis=0) + np.linspace(-0.4, 0.4, 5)[:, None] * way)
+
+
+def _covers(polygon: np.ndarray, points: FloatArray) -> bool:
+    """Whether a polygon (N, 2) float32 holds the middle and most of points (M, 2)."""
+    inside = [cv2.pointPolygonTest(polygon, point, False) > 0 for point in points.tolist()]
+    return inside[len(inside) // 2] and 2 * sum(inside) > len(inside)
 
 
 def _check_image(image_bgr: np.ndarray, camera: Camera) -> None:

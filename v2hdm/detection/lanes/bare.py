@@ -80,8 +80,8 @@ def painted(
 ) -> list[LaneDetection]:
     """The pieces without those of ``lane_line`` that are likelier bare ground than paint.
 
-    Those of other classes stay: of 222 true dashes in renders one in ten would go, too. So do pieces of
-    which the image shows too little.
+    Those of other classes stay: of 222 true dashes in renders one in ten would go, too. Where the image shows
+    too little of a piece, the network alone tells.
     """
     lines = [number for number, piece in enumerate(pieces) if piece.kind == LANE_LINE]
     if not lines:
@@ -91,7 +91,7 @@ def painted(
     bare: set[int] = set()
     for place, number in enumerate(lines):
         is_of_piece = sections.piece == place
-        if is_of_piece.any() and paint_log_odds(values[is_of_piece], pieces[number].score) < 0.0:
+        if paint_log_odds(values[is_of_piece], pieces[number].score) < 0.0:
             bare.add(number)
     return [piece for number, piece in enumerate(pieces) if number not in bare]
 
