@@ -106,7 +106,8 @@ class _News:
 
     def has_waited(self, written_s: float) -> bool:
         """Whether motions or positions are well after the last pose, or before it: a clock may go back."""
-        stamps_s = [item.stamp_s for item in (*self.motions[-1:], *self.fixes[-1:])]
+        stamps_s = [motion.stamp_s for motion in self.motions[-1:]]
+        stamps_s += [fix.stamp_s for fix in self.fixes[-1:]]
         return any(abs(stamp_s - written_s) > _QUIET_S for stamp_s in stamps_s)
 
     def add(self, item: Look | Motion | Fix) -> None:
