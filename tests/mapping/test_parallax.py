@@ -86,6 +86,8 @@ def test_what_moves_along_or_belongs_to_the_vehicle_is_not_on_the_ground():
 def test_the_sill_of_a_car_is_not_taken_for_paint_but_paint_on_a_bump_is(height_m, is_paint, seed):
     views = sighted(np.linspace(0.0, 3.0, 10), AHEAD + QUAD, height_m, seed=seed)
     assert (objection(views) is None) is is_paint
+    no_bar = measure_parallax(views, 1, np.zeros(1, dtype=bool)).log_odds[0]
+    assert no_bar > measure_parallax(views, 1).log_odds[0], "only bars look like sills"
 
 
 def test_a_camera_lower_than_a_sill_still_tells_paint():

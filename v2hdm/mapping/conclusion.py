@@ -17,6 +17,7 @@ from v2hdm.geometry.ipm import project_ground
 from v2hdm.io.maps.corrections import Heard
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.records import (
+    LANE_DASH,
     BoolArray,
     Calibration,
     Camera,
@@ -187,10 +188,12 @@ def proposed(solve: FinalSolve) -> Proposed:
     corners = PointViews.of_corners(
         bundle.association, sightings, recorded, model.variance_factor, model.pose_sigma
     )
+    kind = group_kinds(bundle.association, sightings)
+    is_bar = np.array([name == LANE_DASH for name in sightings.kinds], dtype=np.bool_)[kind]
     return Proposed(
         solved=solve.candidates(located),
-        kind=group_kinds(bundle.association, sightings),
-        parallax=measure_parallax(corners, bundle.association.count),
+        kind=kind,
+        parallax=measure_parallax(corners, bundle.association.count, is_bar),
     )
 
 

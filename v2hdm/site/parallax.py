@@ -44,6 +44,7 @@ _SILL_M = (0.35, 0.1)
 """Mean height, m, of sills and running boards of parked cars above the ground, and its standard deviation."""
 
 _SILL_SHARE = 0.05  # of what is not on the ground, sills that look like dashes; chosen: they are rare
+_NEVER = 1e-300  # share of sills where none can be, which keeps its logarithm finite
 _LEAST_HEIGHTS = 3.0  # least height of a camera over that of a sill: lower cameras see lower sills
 
 _OFF_SHARE = 0.07  # fraction of a marking's sightings that are of something else, as of its observations
@@ -134,16 +135,18 @@ class Parallax:
         ]
 
 
-def measure_parallax(views: PointViews, count: int) -> Parallax:
+def measure_parallax(views: PointViews, count: int, is_bar: BoolArray | None = None) -> Parallax:
     """Compare how likely the sightings of ``count`` candidates are on the ground, above it and moving along.
 
-    What is above is at half the camera's height or, more rarely, a car's sill or running board. Each
+    What is above is at half the camera's height or, more rarely, a car's sill or running board; that looks
+    like a bar, as the candidates ``is_bar`` (count,) do, or all. Each
     hypothesis has its own prior of s, and one of all s gives ``slope``. Unknown as well: positions, and
     a roll and pitch error common to all images. A sighting may be of something else, under each hypothesis
     alike; so what a solve would drop counts for the hypothesis that explains it.
     """
+    share = _SILL_SHARE * (np.ones(count) if is_bar is None else is_bar)
     parts = [
-        _measure(views.of_groups(begin, min(begin + _AT_ONCE, count)), min(_AT_ONCE, count - begin))
+        _measure(views.of_groups(begin, min(begin + _AT_ONCE, count)), share[begin : begin + _AT_ONCE])
         for begin in range(0, max(count, 1), _AT_ONCE)
     ]
     return Parallax(
@@ -153,8 +156,9 @@ def measure_parallax(views: PointViews, count: int) -> Parallax:
     )
 
 
-def _measure(views: PointViews, count: int) -> Parallax:
-    """:func:`measure_parallax` of all candidates at once."""
+def _measure(views: PointViews, sill_share: FloatArray) -> Parallax:
+    """:func:`measure_parallax` of all candidates at once, which are sills with a prior share (G,)."""
+    count = len(sill_share)
     model = _Model.of(views, count)
     points = views.used.shape[1]
     alone = np.eye(points)
@@ -165,8 +169,8 @@ def _measure(views: PointViews, count: int) -> Parallax:
         for mean, shared, single in (_GROUND, *_ELSEWHERE)
     )
     sill = model.fit(*_of_sills(views, count)).log_evidence
-    elsewhere = np.logaddexp(raised, moving_along) - np.log(len(_ELSEWHERE)) + np.log1p(-_SILL_SHARE)
-    log_odds = ground - np.logaddexp(elsewhere, sill + np.log(_SILL_SHARE))
+    elsewhere = np.logaddexp(raised, moving_along) - np.log(len(_ELSEWHERE)) + np.log1p(-sill_share)
+    log_odds = ground - np.logaddexp(elsewhere, sill + np.log(np.maximum(sill_share, _NEVER)))
     return Parallax(free.slope, free.covariance(), log_odds)
 
 

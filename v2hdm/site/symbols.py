@@ -92,7 +92,8 @@ def map_symbols(
         if reasons[number] is None and place.kind != BOX:  # of a box each image shows other ends
             # The border or a shadow may hide one end in some images: then the other is used.
             ends = [_middle(place)] if place.kind in AREAS else [_ends(place, sign) for sign in (1, -1)]
-            objections = [measure_parallax(end, 1).objections(options.min_probability)[0] for end in ends]
+            measured = [measure_parallax(end, 1, np.zeros(1, dtype=np.bool_)) for end in ends]
+            objections = [parallax.objections(options.min_probability)[0] for parallax in measured]
             reasons[number] = None if None in objections else objections[0]
     standing = [place for place, reason in zip(places, reasons, strict=True) if reason is None]
     exclusions = [
