@@ -10,7 +10,7 @@ from tests.asbuilt.site import layout, mapped
 from v2hdm.asbuilt.opendrive import outlines_of
 from v2hdm.asbuilt.reading import Source, read_design
 from v2hdm.errors import ConfigError, MapFileError, V2hdmError
-from v2hdm.geometry.geodetic import utm_of
+from v2hdm.geometry.datums import utm_of
 from v2hdm.io.maps.formats import write_map
 from v2hdm.records import GeodeticOrigin
 
@@ -225,6 +225,23 @@ def test_the_offset_of_a_header_leads_from_the_file_to_its_system(tmp_path, hd_m
     assert place[0, :2] == pytest.approx([east, north + 30], abs=1e-3)
     (shape,) = read_design(tmp_path / "a.xodr", hd_map, Source(crs="local")).shapes
     assert shape.outline_map.mean(axis=0) == pytest.approx([30, 0])
+
+
+def test_a_system_that_names_no_datum_is_on_the_map_s(tmp_path, hd_map, caplog):
+    """As German OpenDRIVE files state ETRS89 by its ellipsoid, and as we write that of a map."""
+    etrs = replace(hd_map, origin=replace(ORIGIN, datum="ETRS89"))
+    zone = "+proj=utm +zone=32 +ellps=GRS80 +towgs84=0,0,0,0,0,0,0 +units=m +no_defs"
+    header = f"<geoReference>{zone}</geoReference><offset x='561640' y='5932800' z='0' hdg='0'/>"
+    box = '<object id="1" name="lane_dash" s="30" t="0" length="3" width="0.12"/>'
+    (tmp_path / "a.xodr").write_text(objects(header, box))
+    (shape,) = read_design(tmp_path / "a.xodr", etrs).shapes
+    assert "a.xodr: its system names no datum: taken to be on the map's, ETRS89" in caplog.text
+    named = read_design(tmp_path / "a.xodr", etrs, Source(crs="EPSG:25832")).shapes[0]
+    assert shape.outline_map == pytest.approx(named.outline_map, abs=1e-6)
+    write_map(etrs, tmp_path, "site", ["opendrive"], None, None, None, [])
+    assert "+datum" not in (tmp_path / "site.xodr").read_text()
+    for read, drawn in zip(outlines(read_design(tmp_path / "site.xodr", etrs)), of_map(etrs), strict=True):
+        assert read[1:] == pytest.approx(drawn[1:], abs=2e-3)
 
 
 def test_a_spiral_ends_where_fresnel_says(tmp_path):

@@ -219,6 +219,16 @@ def test_easting_northing_and_height_of_a_grid_of_feet_are_in_feet(crs, geoid_m,
     check(read(content, tmp_path, origin), metres=1e-5, radians=1e-6)
 
 
+def test_a_grid_that_names_no_datum_is_on_that_of_the_stated_origin(tmp_path):
+    stamp_s, points, yaw = curve()
+    rows = np.column_stack([stamp_s, grid(points, "EPSG:25832"), true_azimuth_deg(points, yaw)])
+    lines = [",".join(map(repr, row)) for row in rows.tolist()]
+    (tmp_path / "route.csv").write_text("\n".join(["stamp_s,x_m,y_m,z_m,heading_deg", *lines]))
+    zone = "+proj=utm +zone=32 +ellps=GRS80 +units=m +no_defs"
+    content = {"csv": "route.csv", "crs": zone, "heading": "true"}
+    check(read(content, tmp_path, ETRS), metres=1e-5, radians=1e-6)
+
+
 def test_swapped_easting_and_northing_are_refused_as_a_place_where_the_grid_is_not_used(tmp_path):
     stamp_s, points, _ = curve()
     rows = np.column_stack([stamp_s, grid(points, "EPSG:25832")[:, [1, 0, 2]], np.zeros(len(points))])
@@ -237,6 +247,7 @@ def test_what_a_projected_system_leaves_open_is_asked_for(tmp_path):
     for changes, message in (
         ({"heading": None}, "true and grid north differ in EPSG:25832: add heading"),
         ({"crs": "EPSG:99999"}, "unknown crs 'EPSG:99999'"),
+        ({"crs": "+proj=utm +zone=32 +ellps=GRS80"}, r"\+ellps=GRS80 names no datum; give its code"),
         ({"crs": "EPSG:27700"}, "EPSG:27700 .* is not on a satellite datum"),
         ({"crs": "EPSG:5555"}, "are above sea level: add geoid_m"),
         ({"crs": None}, "heading: only for coordinates on the earth"),

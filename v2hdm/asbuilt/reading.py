@@ -22,6 +22,7 @@ from v2hdm.asbuilt.opendrive import Pose, outlines_of
 from v2hdm.catalogue import load_catalogue
 from v2hdm.errors import ConfigError, MapFileError, shown
 from v2hdm.geometry import geodetic
+from v2hdm.geometry.datums import is_named, is_same_datum
 from v2hdm.geometry.geodetic import LOCAL, enu_from_geodetic
 from v2hdm.io.maps.reading import (
     GEOMETRY,
@@ -96,6 +97,8 @@ def read_design(path: Path, hd_map: HDMap, source: Source | None = None) -> Desi
         raise ConfigError(
             f"{path}: does not say what its coordinates count from; give --crs, or --crs {LOCAL}"
         )
+    if crs != LOCAL and origin is not None and not is_named(geodetic.datum_of(crs, str(path), MapFileError)):
+        _log.warning("%s: its system names no datum: taken to be on the map's, %s", path, origin.datum)
     shapes = []
     for drawn, kind in of_known_kinds(content.shapes, classes_of(hd_map), source, path):
         outline = in_map(drawn.positions, crs, origin, str(path))
@@ -170,7 +173,7 @@ def in_map(positions: FloatArray, crs: str, origin: GeodeticOrigin | None, where
             f"{where}: is in {crs}, but the map has no origin on the earth; give a design in the map's frame"
         )
     datum = geodetic.datum_of(crs, where, MapFileError)
-    if datum.replace(" ", "") != origin.datum.replace(" ", ""):
+    if is_named(datum) and not is_same_datum(datum, origin.datum):
         raise MapFileError(
             f"{where}: is on {datum} ({crs}), the map on {origin.datum}, which differ by decimetres; bring "
             "both to one datum"

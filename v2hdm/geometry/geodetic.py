@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from v2hdm.errors import MapFileError, V2hdmError, need, shown
+from v2hdm.geometry.datums import is_same_datum, utm_of
 from v2hdm.records import FloatArray, GeodeticOrigin
 
 _SEMI_MAJOR_M = 6378137.0  # semi-major axis, m, of the ellipsoid WGS84 (NGA.STND.0036)
@@ -116,12 +117,13 @@ class Grid:
         datum = datum_of(crs, where, error)
         if origin is None:
             raise error(f"{where}: {crs} needs an origin on the earth, which the map lacks; give {LOCAL}")
-        fit = utm_of(origin)
+        zone = utm_of(origin)
+        fit = zone or f"a projected system on {origin.datum}"
         if (code := system.to_authority(min_confidence=100)) is None:
             raise error(f"{where}: {shown(crs)} has no code that other programs know; give {fit}")
         if system.is_compound or not (system.is_projected or system.is_geographic):
             raise error(f"{where}: {crs} has a vertical part or unusual axes; give its horizontal part")
-        if datum.replace(" ", "") != origin.datum.replace(" ", ""):
+        if not is_same_datum(datum, origin.datum):
             raise error(
                 f"{where}: {crs} is on {datum}, the map on {origin.datum}, which differ by decimetres; give "
                 f"{fit}, or state the datum of the drive's poses (drive.yaml, origin, datum)"
@@ -132,6 +134,7 @@ class Grid:
         west, south, east, north = system.area_of_use.bounds if system.area_of_use else (-180, -90, 180, 90)
         width_deg = (east - west) % 360 or 360
         inside = (origin.longitude_deg - west + _BESIDE_DEG) % 360 <= width_deg + 2 * _BESIDE_DEG
+        inside = inside or ":".join(code) == zone  # as in the west of Norway
         if not inside or not south - _BESIDE_DEG <= origin.latitude_deg <= north + _BESIDE_DEG:
             at = f"latitude {origin.latitude_deg:.2f}, longitude {origin.longitude_deg:.2f}"
             raise error(f"{where}: the site, at {at}, lies outside {crs} ({system.name}); give {fit}")
@@ -172,14 +175,6 @@ class Grid:
         return geodetic_from_grid(self.crs, positions, where, error)[:, [1, 0, 2]]
 
 
-def utm_of(origin: GeodeticOrigin) -> str:
-    """The UTM zone of an origin as an EPSG code."""
-    zone = int((origin.longitude_deg + 180) // 6) % 60 + 1
-    north = origin.latitude_deg >= 0
-    etrs = origin.datum.upper().startswith("ETRS")
-    return f"EPSG:{(25800 if etrs else 32600 if north else 32700) + zone}"
-
-
 _ENGINEERING = (
     'LOCAL_CS["V2HDM map frame: east, north in metres from an origin that the drive does not state",'
     'LOCAL_DATUM["local",0],UNIT["metre",1],AXIS["East",EAST],AXIS["North",NORTH]]'
@@ -190,7 +185,8 @@ def crs_of(origin: GeodeticOrigin | None) -> str:
     """PROJ or WKT text of the map frame.
 
     With an origin, a transverse Mercator projection about it, scaled to its ellipsoidal height, which every
-    GIS knows: within 1 mm of the tangent plane up to 2 km away. Without, an engineering system.
+    GIS knows: within 1 mm of the tangent plane up to 2 km away. It names WGS84, between which and other
+    satellite datums a GIS moves nothing. Without an origin, an engineering system.
     """
     if origin is None:
         return _ENGINEERING

@@ -140,7 +140,7 @@ def read_tum(path: Path) -> Trajectory:
             f"{path}: all times are {table[0, 0]:.10g}: they were written with too few digits; write seconds "
             "with six decimals"
         )
-    stamp_s = table[:, 0] / (layout.per_s or _per_second(table[:, 0]))
+    stamp_s = table[:, 0] / (layout.per_s or units_per_second(table[:, 0]))
     order = in_order(stamp_s, str(path), "pose")
     if lost:
         _log.warning("%s: left out %d of %d poses that are no numbers", path, lost, lost + len(table))
@@ -204,7 +204,7 @@ def _cells(line: str) -> list[str]:
     return line.replace(",", " ").split()
 
 
-def _per_second(stamps: FloatArray) -> float:
+def units_per_second(stamps: FloatArray) -> float:
     """Units in a second of stamps (N,) that count since 1970, which their size shows; 1 for others."""
     latest = float(stamps.max())
     scales = (scale for scale in UNITS.values() if _OLDEST_S < latest / scale < _NEWEST_S)

@@ -17,6 +17,7 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.geometry import geodetic as earth
+from v2hdm.geometry.datums import is_named, is_same_datum
 from v2hdm.geometry.planar import angle_between
 from v2hdm.geometry.rigid import interpolate, make_transform, rotation_from_euler
 from v2hdm.io.description import (
@@ -514,9 +515,11 @@ def _origin(
     stated: GeodeticOrigin | None, first: FloatArray, datum: str, settings: PoseSettings, where: str
 ) -> GeodeticOrigin:
     if stated is None:
+        if not is_named(datum):
+            raise DriveError(f"{where}: crs {settings.crs} names no datum; give its code, such as EPSG:25832")
         return GeodeticOrigin(float(first[0]), float(first[1]), float(first[2]), datum, settings.epoch)
     # Without crs the source does not say its datum: that of a correction service is the origin's.
-    if settings.crs is not None and stated.datum.replace(" ", "") != datum.replace(" ", ""):
+    if settings.crs is not None and is_named(datum) and not is_same_datum(stated.datum, datum):
         raise DriveError(
             f"{where}: the poses are in {datum}, the origin in {stated.datum}, which differ by decimetres; "
             f"give the origin in {datum} (datum: {datum})"
