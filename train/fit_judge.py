@@ -44,7 +44,7 @@ from v2hdm.store.files import replace_text, whole_file
 
 SEED = 917  # seed of the rendered scenes, not that of the benchmark nor of a training
 EASY = 0.2  # difficulty of the easy scenes
-RIDGE = 2.0  # information of the prior of the weights of the logistic functions
+RIDGE = 2.0  # information of the prior that weights of the logistic functions are 0
 FOLDS = 5  # parts of the images by which log loss is measured, each by a fit to the others
 _JUDGE_FOLDS = 2
 """Parts of the images, each judged by what was learnt from the others; a judge takes minutes to learn."""
@@ -206,20 +206,16 @@ def render_to_judge(number: int, images: int, seed: int) -> tuple[int, Example]:
     return index, example(index, difficulty, seed, HARDSHIPS if number % HARDSHIPS_EVERY else NONE)
 
 
-def fit(evidence: FloatArray, true: BoolArray, usual: FloatArray | None = None) -> tuple[FloatArray, float]:
-    """Weights (F,) and bias of a logistic regression, by Newton's method on standardised features.
-
-    The prior holds weights near the ``usual`` ones (F,), by default 0.
-    """
+def fit(evidence: FloatArray, true: BoolArray) -> tuple[FloatArray, float]:
+    """Weights (F,) and bias of a logistic regression, by Newton's method on standardised features."""
     mean = evidence.mean(axis=0)
     deviation = np.maximum(evidence.std(axis=0), 1e-6)
     design = np.column_stack([(evidence - mean) / deviation, np.ones(len(evidence))])
     ridge = RIDGE * np.diag(np.append(np.ones(evidence.shape[1]), 1e-6))
-    held = np.append(np.zeros(evidence.shape[1]) if usual is None else usual * deviation, 0.0)
     solution = np.zeros(design.shape[1])
     for _ in range(30):
         probability = 1 / (1 + np.exp(-design @ solution))
-        slope = design.T @ (true - probability) - ridge @ (solution - held)
+        slope = design.T @ (true - probability) - ridge @ solution
         curvature = (design * (probability * (1 - probability))[:, None]).T @ design + ridge
         solution = solution + np.linalg.solve(curvature, slope)
     weights = solution[:-1] / deviation
@@ -354,10 +350,6 @@ def fit_among(gathered: Gathered, odds: FloatArray) -> dict[str, dict[str, objec
     return fitted
 
 
-ALONE = np.array([float(name == "alone") for name in AMONG])
-"""Usual weights (F,) of :data:`AMONG`: the judge is right on a reading alone, and company adds nothing."""
-
-
 def _fit_each(
     features: FloatArray, company: np.ndarray, true: BoolArray, is_counted: BoolArray, fold: np.ndarray
 ) -> tuple[dict[str, dict[str, object]], FloatArray]:
@@ -367,14 +359,14 @@ def _fit_each(
     left_out = np.zeros(len(true))
     for name in COMPANIES:
         mine = is_counted & (company == name)
-        weights, bias = fit(features[mine], true[mine], ALONE)
+        weights, bias = fit(features[mine], true[mine])
         effect[name] = weights * features[mine].std(axis=0)
         named = dict(zip(AMONG, weights.round(4).tolist(), strict=True))
         fitted[name] = {"bias": round(bias, 4), "weights": named}
         for k in range(FOLDS):
             others = mine & (fold != k)
             these = (company == name) & (fold == k)
-            weights, bias = fit(features[others], true[others], ALONE)
+            weights, bias = fit(features[others], true[others])
             left_out[these] = features[these] @ weights + bias
     print(f"{'':16s} " + " ".join(f"{name:>9s}" for name in COMPANIES))
     for row, name in enumerate(AMONG):
