@@ -11,8 +11,9 @@ from tests.adjust.site import DRIFTING
 from tests.adjust.test_sessions import joined, visited_again
 from v2hdm.adjust import ControlPoints, KnownLengths, Problem, SolveOptions, solve
 from v2hdm.adjust.sections.blocks import BlockMatrix, BlockPattern
-from v2hdm.adjust.sections.parts import Part, cut, parts_of_way
+from v2hdm.adjust.sections.parts import Part, cut
 from v2hdm.adjust.sections.solve import Shape, finish_parts, join_parts, save_part
+from v2hdm.adjust.sections.way import parts_of_way
 from v2hdm.errors import AdjustError
 
 
@@ -102,7 +103,7 @@ def test_sections_of_a_street_are_the_street(tmp_path):
     scene = make_scene(3, frames=160, jitter=DRIFTING, outliers=0.03, start_error_deg=1.0)
     scene = with_ground(scene, 0.1, 0.01)
     position = scene.problem.map_from_vehicle[:, :2, 3]
-    part = parts_of_way(position, np.zeros(len(position), dtype=np.int64), 30.0)
+    part = parts_of_way(position, np.zeros(len(position), dtype=np.int64), 26.0)
     assert part.max() == 3
     options = SolveOptions()
     check(in_sections(tmp_path, scene.problem, options, part), scene.problem, options)

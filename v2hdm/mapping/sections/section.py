@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
-from v2hdm.adjust.sections.parts import parts_of_way
+from v2hdm.adjust.sections.way import parts_of_way
 from v2hdm.association.sightings import Frames, Sightings, frames_of
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.records import BoolArray, Drive, FloatArray, IntArray, Session

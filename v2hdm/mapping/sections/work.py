@@ -244,6 +244,7 @@ class Work:
             whole,
             cam_from_vehicle=rig.cam_from_vehicle,
             map_from_vehicle=whole.map_from_vehicle[frames],
+            poses_start=rig.map_from_vehicle[frames],
             session=None if whole.session is None else whole.session[frames],
             twist_vehicle=twists[frames],
         )
