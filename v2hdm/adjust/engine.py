@@ -146,7 +146,8 @@ class TorchEngine:
     ) -> tuple[Tensor, Tensor]:
         """Corners (N, 2) by weighted back-projection, and which (N,) are determined.
 
-        Poses are as recorded, or of states (J, S). A corner is the mean of the ground points of its rays, each weighted by its observation.
+        Poses are as recorded, or of states (J, S). A corner is the mean of the ground points of its rays,
+        each weighted by its observation.
         """
         arrays = self.arrays
         state = torch.zeros_like(arrays.state_information_root) if frame_state is None else frame_state

@@ -59,7 +59,9 @@ def inverse_diagonal(factor: TiledCholesky, pattern: Pattern, tail: Tensor | Non
     tip = len(factor.tip)
     count = len(factor.diagonal)
     first = count - (len(tail) - tip) // size
-    columns = _Columns(pattern, size, [tail.new_zeros(0, 0)] * count, tail[len(tail) - tip :, len(tail) - tip :])
+    columns = _Columns(
+        pattern, size, [tail.new_zeros(0, 0)] * count, tail[len(tail) - tip :, len(tail) - tip :]
+    )
     for column in reversed(range(count)):
         if column >= first:
             begin = (column - first) * size

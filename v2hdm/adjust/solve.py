@@ -231,7 +231,7 @@ def _estimate(problem: Problem, engine: TorchEngine, cam_from_vehicle: Tensor) -
 
 
 def _states_start(problem: Problem, arrays: Arrays) -> Tensor:
-    """States (J, S) whose poses are where the problem starts; of two states of an axis the first has it all."""
+    """States (J, S) whose poses are where the problem starts, in the first state of each axis."""
     state = torch.zeros_like(arrays.state_information_root)
     if problem.poses_start is None:
         return state

@@ -123,15 +123,12 @@ def whole_of(parts: Sequence[Part], bare: Problem, corners: IntArray) -> Problem
     """
     cam_from_vehicle = bare.cam_from_vehicle.copy()
     twists = None if bare.twist_vehicle is None else bare.twist_vehicle.copy()
-    poses_start = bare.map_from_vehicle.copy()
     columns = []
     for part in parts:
         problem = part.problem
         cam_from_vehicle[part.cameras] = problem.cam_from_vehicle
         if twists is not None:
             twists[part.frames] = problem.twist_vehicle
-        if problem.poses_start is not None:
-            poses_start[part.frames] = problem.poses_start
         observations = replace(
             problem.observations,
             camera=part.cameras[problem.observations.camera],
@@ -147,7 +144,6 @@ def whole_of(parts: Sequence[Part], bare: Problem, corners: IntArray) -> Problem
         corner_count=len(corners),
         cam_from_vehicle=cam_from_vehicle,
         twist_vehicle=twists,
-        poses_start=poses_start,
     )
 
 

@@ -1,4 +1,4 @@
-"""The way of one or many drives divided into parts, where few frames of neighbours look at the same ground."""
+"""The way of one or many drives divided into parts where few frames of neighbours see the same ground."""
 
 from __future__ import annotations
 
