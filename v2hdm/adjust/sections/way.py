@@ -9,7 +9,7 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from v2hdm.records import FloatArray, IntArray
+from v2hdm.records import BoolArray, FloatArray, IntArray
 
 _CELL_M = 5.0  # side of the cells of ground whose frames stay together; a lane and the one beside it
 _NEAR_M = 12.0  # distance of cells that are neighbours: those of both directions of a street are
@@ -47,7 +47,7 @@ def parts_of_way(position_map: FloatArray, session: Sequence[int] | IntArray, mo
     return out
 
 
-def _streets(cells_map: FloatArray, cell: IntArray, is_first: FloatArray) -> csr_matrix:
+def _streets(cells_map: FloatArray, cell: IntArray, is_first: BoolArray) -> csr_matrix:
     """The graph of cells (N, 2) that are near each other, or follow one another in a drive; lengths in m."""
     near = cKDTree(cells_map).query_pairs(_NEAR_M, output_type="ndarray")
     before = cell[:-1][~is_first[1:]]
