@@ -51,6 +51,8 @@ def test_every_shipped_run_composes_into_dataclasses(run):
         ("+run=kitti", "drive.path"),
         ("+run=kitti drive.path=nowhere", "nowhere"),
         ("+run=kitti drive.path=straße", "needs quotes"),
+        ("./drive", "'./drive' is not key=value; write drive.path=./drive"),
+        (".", "write drive.path=."),
         ("+run=kitti drive.path=a(1)", "needs quotes"),
     ],
 )
@@ -62,6 +64,15 @@ def test_a_wrong_argument_is_one_line_that_names_it(line, named, tmp_path, monke
     assert named in error
     assert error.count("\n") == 1
     assert not list(tmp_path.rglob("metrics.json"))
+
+
+@pytest.mark.parametrize("name", ["straße", "a (1)", "it's", "a,b", "a=b", "20240517", "1.0", "a{b}", "[a]b"])
+def test_the_path_of_a_folder_that_exists_needs_no_quotes(name, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path(name).mkdir()
+    line = f"drive.path={name}" if name != "[a]b" else f"drive.path={tmp_path / name}"
+    assert run(["map", line]) == 2
+    assert f"{name}: not a drive in any known format" in capsys.readouterr().err
 
 
 def test_a_users_own_runs_join_the_shipped_ones(tmp_path, monkeypatch, capsys):

@@ -54,12 +54,17 @@ CLASSES = {
 """The class of each label: here all but arrows are alike."""
 
 
-def photographs(labels: Path, images: Path, count: int) -> Iterator[Example]:
-    """Labelled photographs that networks learn from."""
-    config = DataConfig(
+def config_of(labels: Path, images: Path) -> DataConfig:
+    """The settings of the photographs of ROAD MARK."""
+    return DataConfig(
         coco=str(labels), coco_images=str(images), coco_size=[1280, 720], coco_camera=[1.3, -12.0, 90.0],
         coco_held_out=True, coco_classes=CLASSES,
     )  # fmt: skip
+
+
+def photographs(labels: Path, images: Path, count: int) -> Iterator[Example]:
+    """Labelled photographs that networks learn from."""
+    config = config_of(labels, images)
     rng = np.random.default_rng(SEED)
     for image in labelled_images(config)[:count]:
         yield photograph(image, config, rng)

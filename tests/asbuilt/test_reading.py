@@ -10,7 +10,7 @@ from tests.asbuilt.site import layout, mapped
 from v2hdm.asbuilt.opendrive import outlines_of
 from v2hdm.asbuilt.reading import Source, read_design
 from v2hdm.errors import ConfigError, MapFileError, V2hdmError
-from v2hdm.geometry.geodetic import utm_of
+from v2hdm.geometry.datums import utm_of
 from v2hdm.io.maps.formats import write_map
 from v2hdm.records import GeodeticOrigin
 
@@ -72,6 +72,16 @@ def test_a_design_in_any_format_lies_where_it_was_drawn(name, folder, hd_map):
 
 def test_geojson_of_other_programs_is_in_longitude_and_latitude(tmp_path, hd_map):
     design = read_design(foreign(tmp_path / "a.geojson", hd_map), hd_map)
+    for read, drawn in zip(outlines(design), of_map(hd_map), strict=True):
+        assert read[1:] == pytest.approx(drawn[1:], abs=2e-3)
+
+
+@pytest.mark.parametrize("name", ["urn:ogc:def:crs:OGC:1.3:CRS84", "OGC:CRS84", "urn:ogc:def:crs:EPSG::4326"])
+def test_geojson_of_qgis_and_gdal_names_its_system_and_is_on_wgs84(name, tmp_path, hd_map):
+    path = foreign(tmp_path / "a.geojson", hd_map)
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps(content | {"crs": {"type": "name", "properties": {"name": name}}}))
+    design = read_design(path, hd_map)
     for read, drawn in zip(outlines(design), of_map(hd_map), strict=True):
         assert read[1:] == pytest.approx(drawn[1:], abs=2e-3)
 
@@ -150,6 +160,88 @@ def test_outlines_of_opendrive_follow_lines_arcs_and_polynomials(tmp_path):
     assert on_road.positions == pytest.approx(
         np.array([[10 + root, 10 - root], [21, 10], [19, 15]]), abs=1e-4
     )
+
+
+def objects(header, *entries):
+    road = '<geometry s="0" x="0" y="0" hdg="0" length="100"><line/></geometry>'
+    return (
+        f"<OpenDRIVE><header>{header}</header><road id='1' length='100'><planView>{road}</planView>"
+        f"<objects>{''.join(entries)}</objects></road></OpenDRIVE>"
+    )
+
+
+def middles(outlines):
+    return [(outline.called, *np.round(outline.positions.mean(axis=0), 6).tolist()) for outline in outlines]
+
+
+def test_flat_objects_without_an_outline_are_boxes_and_may_be_repeated(tmp_path):
+    """Dashes every 9 m on 20 m, of which the lateral place changes by 2 m; a post and a barrier are none."""
+    (tmp_path / "a.xodr").write_text(
+        objects(
+            "",
+            '<object id="1" name="stop_line" s="10" t="-1" hdg="0" length="0.3" width="3"/>',
+            '<object id="2" name="lane_dash" s="0" t="0" length="3" width="0.12">'
+            '<repeat s="40" length="20" distance="9" tStart="1" tEnd="3"/></object>',
+            '<object id="3" name="post" s="0" t="0" length="0.2" width="0.2" height="1.5"/>',
+            '<object id="4" name="barrier" s="0" t="0" length="3" width="0.3">'
+            '<repeat s="0" length="100" distance="0"/></object>',
+        )
+    )
+    read = outlines_of(tmp_path / "a.xodr").outlines
+    assert middles(read) == [
+        ("stop_line", 10.0, -1.0),
+        ("lane_dash", 40.0, 1.0),
+        ("lane_dash", 49.0, 1.9),
+        ("lane_dash", 58.0, 2.8),
+    ]
+    assert np.ptp(read[0].positions, axis=0) == pytest.approx([0.3, 3.0])
+    assert np.ptp(read[1].positions, axis=0) == pytest.approx([3.0, 0.12])
+
+
+def test_inner_outlines_of_an_object_are_holes(tmp_path):
+    corners = '<cornerLocal u="0" v="0"/><cornerLocal u="1" v="0"/><cornerLocal u="0" v="1"/>'
+    rings = [f"<outline outer='{outer}'>{corners}</outline>" for outer in ("true", "false")]
+    box = f"<object id='1' name='box' s='0' t='0'><outlines>{''.join(rings)}</outlines></object>"
+    (tmp_path / "a.xodr").write_text(objects("", box))
+    assert len(outlines_of(tmp_path / "a.xodr").outlines) == 1
+
+
+def test_the_offset_of_a_header_leads_from_the_file_to_its_system(tmp_path, hd_map):
+    """As SUMO writes it: a UTM zone, and coordinates from a point in it; turned by a right angle."""
+    from v2hdm.geometry.geodetic import Grid
+
+    zone = utm_of(ORIGIN)
+    east, north, _ = Grid.of(zone, ORIGIN, "test", MapFileError).positions(np.zeros((1, 3)))[0]
+    header = (
+        "<geoReference>+proj=utm +zone=32 +datum=WGS84 +units=m +no_defs +type=crs</geoReference>"
+        f'<offset x="{east}" y="{north}" z="0" hdg="1.5707963267948966"/>'
+    )
+    box = '<object id="1" name="lane_dash" s="30" t="0" length="3" width="0.12"/>'
+    (tmp_path / "a.xodr").write_text(objects(header, box))
+    (shape,) = read_design(tmp_path / "a.xodr", hd_map).shapes
+    place = Grid.of(zone, ORIGIN, "test", MapFileError).positions(
+        np.array([[*shape.outline_map.mean(axis=0), 0]])
+    )
+    assert place[0, :2] == pytest.approx([east, north + 30], abs=1e-3)
+    (shape,) = read_design(tmp_path / "a.xodr", hd_map, Source(crs="local")).shapes
+    assert shape.outline_map.mean(axis=0) == pytest.approx([30, 0])
+
+
+def test_a_system_that_names_no_datum_is_on_the_map_s(tmp_path, hd_map, caplog):
+    """As German OpenDRIVE files state ETRS89 by its ellipsoid, and as we write that of a map."""
+    etrs = replace(hd_map, origin=replace(ORIGIN, datum="ETRS89"))
+    zone = "+proj=utm +zone=32 +ellps=GRS80 +towgs84=0,0,0,0,0,0,0 +units=m +no_defs"
+    header = f"<geoReference>{zone}</geoReference><offset x='561640' y='5932800' z='0' hdg='0'/>"
+    box = '<object id="1" name="lane_dash" s="30" t="0" length="3" width="0.12"/>'
+    (tmp_path / "a.xodr").write_text(objects(header, box))
+    (shape,) = read_design(tmp_path / "a.xodr", etrs).shapes
+    assert "a.xodr: its system names no datum: taken to be on the map's, ETRS89" in caplog.text
+    named = read_design(tmp_path / "a.xodr", etrs, Source(crs="EPSG:25832")).shapes[0]
+    assert shape.outline_map == pytest.approx(named.outline_map, abs=1e-6)
+    write_map(etrs, tmp_path, "site", ["opendrive"], None, None, None, [])
+    assert "+datum" not in (tmp_path / "site.xodr").read_text()
+    for read, drawn in zip(outlines(read_design(tmp_path / "site.xodr", etrs)), of_map(etrs), strict=True):
+        assert read[1:] == pytest.approx(drawn[1:], abs=2e-3)
 
 
 def test_a_spiral_ends_where_fresnel_says(tmp_path):

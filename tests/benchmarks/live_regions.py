@@ -8,8 +8,9 @@ and .006 deg/s, and calibrations stated to 5 mm and .03 deg. For each ``--every-
 poses, what was found, CPU time of an image in the detector, of looks at parts alone, and in the localiser.
 
 With ``--seconds`` the command ``v2hdm localize --live`` itself then runs for so long on images that are
-written at 10 Hz, and the age of an image when its pose was written is printed: on a machine that others use
-it says little.
+written at 10 Hz, the drive to and fro, and an odometry of 50 Hz. Printed is the age of each image when the
+first pose that has it was written, from when it was due, and the CPU that each process used: the writer's is
+this benchmark's own, on the same cores. On a machine that others use the ages say little.
 """
 
 from __future__ import annotations
@@ -23,12 +24,15 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import groupby
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
 
 import cv2
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from v2hdm.detection.camera import camera_from_calibration
 from v2hdm.detection.detector import Detector
@@ -49,34 +53,49 @@ _SCALE, _BIAS_RAD_S = 1.005, 1e-4  # stated over true speed, and the bias of the
 _MOUNT = np.diag(np.square([*(3 * [0.005]), *(3 * [np.deg2rad(0.03)])]))  # stated covariance of a calibration
 _SAMPLES = 5  # of the odometry between two images
 _RATE_HZ = 10.0
+_LATE_S = 0.15  # age, s, that no image may have
+_STARTING_S = 3.0  # time, s, that the processes take to start
+_KEPT = 50  # images of a camera that stay in its folder
 
 
-class Ride(NamedTuple):
+@dataclass(frozen=True)
+class Ride:
     """A rendered drive as a vehicle has it: images in the order of their times, and its odometry."""
 
     drive: Drive
     truth: Truth
-    images: list[int]
-    stamp_s: FloatArray  # (M,) the moments
+    moments: list[list[int]]  # (M) the images of each
+    stamp_s: FloatArray  # (M,)
     map_from_vehicle: FloatArray  # (M, 4, 4)
     calibrations: dict[str, Calibration]
 
-    def motion(self, moment: int, stamp_s: FloatArray) -> list[Motion]:
-        """The odometry's samples up to a moment, if the moments were at ``stamp_s`` (M,)."""
+    def motion(self, moment: int) -> list[Motion]:
+        """The odometry's samples since the last moment."""
         if moment == 0:
             return []
-        place = self.map_from_vehicle[:, :2, 3]
+        times_s = np.linspace(self.stamp_s[moment - 1], self.stamp_s[moment], _SAMPLES + 1)[1:]
+        speed_m_s, rate_rad_s = self._course(times_s - self.stamp_s[0], 1).T
+        speeds = (_SCALE * speed_m_s).tolist()
+        rates = (rate_rad_s + _BIAS_RAD_S).tolist()
+        return [Motion(*sample) for sample in zip(times_s.tolist(), speeds, rates, strict=True)]
+
+    @cached_property
+    def _course(self) -> CubicSpline:
+        """Its way and heading, so that what the odometry says adds up also where the vehicle turns back."""
         heading = np.unwrap(np.asarray(heading_rad(self.map_from_vehicle)))
-        speed = np.linalg.norm(np.diff(place, axis=0), axis=1) / np.diff(stamp_s)
-        rate = np.diff(heading) / np.diff(stamp_s)
-        # What an odometry says is of its sample's time, not the mean since the last image.
-        middle_s = (stamp_s[:-1] + stamp_s[1:]) / 2
-        times = np.linspace(stamp_s[moment - 1], stamp_s[moment], _SAMPLES + 1)[1:]
-        speeds = _SCALE * np.interp(times, middle_s, speed)
-        rates = np.interp(times, middle_s, rate) + _BIAS_RAD_S
-        return [
-            Motion(*sample) for sample in zip(times.tolist(), speeds.tolist(), rates.tolist(), strict=True)
-        ]
+        middle = (heading[1:] + heading[:-1]) / 2
+        ahead = np.column_stack([np.cos(middle), np.sin(middle)])
+        steps_m = (np.diff(self.map_from_vehicle[:, :2, 3], axis=0) * ahead).sum(axis=1)
+        way_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+        return CubicSpline(self.stamp_s - self.stamp_s[0], np.column_stack([way_m, heading]))
+
+    def to_and_fro(self, stamp_s: FloatArray) -> Ride:
+        """The drive on to its end, back to its begin and so on, with moments at some times (N,)."""
+        count = len(self.moments)
+        turns = [*range(count), *range(count - 2, 0, -1)]
+        order = [turns[number % len(turns)] for number in range(len(stamp_s))]
+        moments = [self.moments[moment] for moment in order]
+        return replace(self, moments=moments, stamp_s=stamp_s, map_from_vehicle=self.map_from_vehicle[order])
 
 
 def ride_of(folder: Path, images: int) -> Ride:
@@ -84,14 +103,17 @@ def ride_of(folder: Path, images: int) -> Ride:
     drive = read_drive(folder)
     truth = read_truth(drive)
     order = sorted(range(len(drive.images)), key=lambda i: drive.images[i].stamp_s)[:images]
-    stamps = np.array([drive.images[i].stamp_s for i in order])
-    stamp_s, first = np.unique(stamps, return_index=True)
+    by_stamp = {
+        stamp_s: list(of_moment)
+        for stamp_s, of_moment in groupby(order, key=lambda i: drive.images[i].stamp_s)
+    }
     calibrations = {
         name: Calibration(camera.info, truth.cam_from_vehicle[name], _MOUNT)
         for name, camera in drive.cameras.items()
     }
-    poses = truth.map_from_vehicle[order][first]
-    return Ride(drive, truth, order, stamp_s, poses, calibrations)
+    moments = list(by_stamp.values())
+    poses = truth.map_from_vehicle[[of_moment[0] for of_moment in moments]]
+    return Ride(drive, truth, moments, np.array(list(by_stamp)), poses, calibrations)
 
 
 def followed(ride: Ride, every_full: int, roads: dict[str, RoadDetector]) -> str:
@@ -99,35 +121,35 @@ def followed(ride: Ride, every_full: int, roads: dict[str, RoadDetector]) -> str
     begin = ride.map_from_vehicle[0]
     start = rough_position(*begin[:2, 3].tolist(), float(np.degrees(heading_rad(begin))))
     localizer = Localizer(ride.truth.map, ride.calibrations, start, every_full=every_full)
-    moment = 0
     errors, found, detected_s, parts_s, localised_s = [], [], [], [], []
-    for i in ride.images:
-        image = ride.drive.images[i]
-        while ride.stamp_s[moment] < image.stamp_s:
-            moment += 1
-            localizer.update([], ride.motion(moment, ride.stamp_s))
-        pixels = np.asarray(cv2.imread(str(image.path)))
-        times = [time.process_time()]
-        regions_px = localizer.regions(image.camera, image.stamp_s)
-        times.append(time.process_time())
-        road = roads[image.camera].detect(pixels, regions_px=regions_px)
-        times.append(time.process_time())
-        pose = localizer.update([Look.of(image.camera, image.stamp_s, road)])
-        times.append(time.process_time())
-        asked_s, look_s, update_s = np.diff(times).tolist()
-        detected_s.append(look_s)
-        localised_s.append(asked_s + update_s)
-        if regions_px is not None:
-            parts_s.append(look_s)
-        found.append(len(road.markings))
-        if pose.status == Status.TRACKING and pose.map_from_vehicle is not None:
-            true = ride.truth.map_from_vehicle[i]
-            off = true[:2, :2].T @ (pose.map_from_vehicle[:2, 3] - true[:2, 3])
-            errors.append([*off, float(wrapped(heading_rad(pose.map_from_vehicle) - heading_rad(true)))])
+    for moment, images in enumerate(ride.moments):
+        localizer.update([], ride.motion(moment))
+        for i in images:
+            image = ride.drive.images[i]
+            pixels = np.asarray(cv2.imread(str(image.path)))
+            times = [time.process_time()]
+            regions_px = localizer.regions(image.camera, image.stamp_s)
+            times.append(time.process_time())
+            road = roads[image.camera].detect(pixels, regions_px=regions_px)
+            times.append(time.process_time())
+            pose = localizer.update([Look.of(image.camera, image.stamp_s, road)])
+            times.append(time.process_time())
+            asked_s, look_s, update_s = np.diff(times).tolist()
+            detected_s.append(look_s)
+            localised_s.append(asked_s + update_s)
+            if regions_px is not None:
+                parts_s.append(look_s)
+            found.append(len(road.markings))
+            if pose.status == Status.TRACKING and pose.map_from_vehicle is not None:
+                true = ride.truth.map_from_vehicle[i]
+                off = true[:2, :2].T @ (pose.map_from_vehicle[:2, 3] - true[:2, 3])
+                turn_rad = float(wrapped(heading_rad(pose.map_from_vehicle) - heading_rad(true)))
+                errors.append([*off, turn_rad])
     rmse = np.sqrt((np.array(errors) ** 2).mean(axis=0)) * [100, 100, np.degrees(1)]
     parts = f", {1e3 * np.median(parts_s):.0f} (median) of {len(parts_s)} in parts" if parts_s else ""
+    count = sum(map(len, ride.moments))
     return (
-        f"every {every_full}: tracked {len(errors)} of {len(ride.images)}, along {rmse[0]:.2f} cm, lateral "
+        f"every {every_full}: tracked {len(errors)} of {count}, along {rmse[0]:.2f} cm, lateral "
         f"{rmse[1]:.2f} cm, heading {rmse[2]:.3f} deg, {np.mean(found):.1f} markings an image; CPU, ms: "
         f"detector {1e3 * np.mean(detected_s):.0f} (mean){parts}, localiser {1e3 * np.mean(localised_s):.0f}"
     )
@@ -157,47 +179,74 @@ def paced(ride: Ride, every_full: int, seconds: float) -> str:
             *(f"{value:.4f}" for value in start),
         ]
         pipe = subprocess.PIPE
-        ages_s: list[float] = []
-        statuses: list[str] = []
+        poses = Poses()
+        writer_s = time.process_time()
         with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as process:
-
-            def follow() -> None:
-                assert process.stdout is not None
-                for line in process.stdout:
-                    record = json.loads(line)
-                    ages_s.append(time.time() - record["stamp_s"])
-                    statuses.append(record["status"])
-
-            threading.Thread(target=follow, daemon=True).start()
-            _write(ride, folder, process, seconds)
+            threading.Thread(target=poses.follow, args=(process,), daemon=True).start()
+            written = _write(ride, folder, process, seconds)
+            cpu_s = _spent_s(process.pid)
             process.terminate()
-        tracked_s = [age for age, status in zip(ages_s, statuses, strict=True) if status == "tracking"]
-    if not tracked_s:
-        return f"every {every_full}, at 10 Hz: no pose was tracked ({len(ages_s)} lines)"
-    p50, p99, most = np.percentile(tracked_s, [50, 99, 100]) * 1e3
+        writer_s = time.process_time() - writer_s
+    ages_s = np.array([age_s for ages in poses.ages_s.values() for age_s in ages.values()])
+    if not len(ages_s):
+        return f"every {every_full}, at 10 Hz: no pose was tracked ({poses.lines} lines)"
+    p50, p99, most = np.percentile(ages_s, [50, 99, 100]) * 1e3
+    late = (ages_s > _LATE_S).sum()
+    cores = ", ".join(f"{used_s / seconds:.2f}" for used_s in cpu_s)
+    load = f"load {os.getloadavg()[0]:.1f} of {os.cpu_count()} cores"
     return (
-        f"every {every_full}, at 10 Hz, load {os.getloadavg()[0]:.1f} of {os.cpu_count()} cores: "
-        f"{len(tracked_s)} tracked poses of {len(ages_s)}; age, ms: {p50:.0f} (median), {p99:.0f} (99 %), "
-        f"{most:.0f} (most)"
+        f"every {every_full}, at 10 Hz for {seconds:.0f} s, {load}: "
+        f"{len(ages_s)} of {written} images in tracked poses; age, ms: "
+        f"{p50:.0f} (median), {p99:.0f} (99 %), {most:.0f} (most), {late} over {1e3 * _LATE_S:.0f}; "
+        f"order of stamps kept: {poses.is_in_order}; CPU seconds a second: {cores} (localiser, cameras), "
+        f"{writer_s / seconds:.2f} (writer)"
     )
 
 
-def _write(ride: Ride, folder: Path, process: subprocess.Popen[str], seconds: float) -> None:
-    """Write images and odometry as they come; the first moment lasts until the processes have started."""
+@dataclass
+class Poses:
+    """The command's lines as they come."""
+
+    lines: int = 0
+    is_in_order: bool = True
+    ages_s: dict[str, dict[float, float]] = field(default_factory=dict)  # by camera and time of the image
+    stamp_s: float = -np.inf
+
+    def follow(self, process: subprocess.Popen[str]) -> None:
+        """Take lines until there are no more."""
+        assert process.stdout is not None
+        for line in process.stdout:
+            now_s = time.time()
+            record = json.loads(line)
+            self.lines += 1
+            self.is_in_order &= record["stamp_s"] >= self.stamp_s
+            self.stamp_s = record["stamp_s"]
+            if record["status"] == "tracking":
+                for camera, image_s in record["images_s"].items():
+                    self.ages_s.setdefault(camera, {}).setdefault(image_s, now_s - image_s)
+
+
+def _spent_s(pid: int) -> list[float]:
+    """CPU seconds of a process and of those that it has started; for Linux."""
+    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    schedules = [Path(f"/proc/{number}/schedstat").read_text().split() for number in (str(pid), *children)]
+    return [int(schedule[0]) / 1e9 for schedule in schedules]
+
+
+def _write(ride: Ride, folder: Path, process: subprocess.Popen[str], seconds: float) -> int:
+    """Write images and odometry as they come; the number of images.
+
+    The ride begins when the processes have had time to start.
+    """
     assert process.stdin is not None
-    by_moment: dict[float, list[int]] = {}
-    for i in ride.images:
-        by_moment.setdefault(ride.drive.images[i].stamp_s, []).append(i)
-    moments = list(by_moment.values())
-    begin_s = time.time()
-    stamp_s = begin_s + np.arange(len(moments)) / _RATE_HZ
-    for moment, images in enumerate(moments):
-        if time.time() - begin_s > seconds:
-            return
-        time.sleep(max(float(stamp_s[moment]) - time.time(), 0.0))
-        for sample in ride.motion(moment, stamp_s):
-            print(json.dumps(dict(zip(Motion._fields, sample, strict=True))), file=process.stdin)
-        process.stdin.flush()
+    time.sleep(_STARTING_S)
+    stamp_s = time.time() + np.arange(int(seconds * _RATE_HZ)) / _RATE_HZ
+    paced_ride = ride.to_and_fro(stamp_s)
+    written = 0
+    for moment, images in enumerate(paced_ride.moments):
+        for sample in paced_ride.motion(moment):
+            time.sleep(max(sample.stamp_s - time.time(), 0.0))
+            print(json.dumps(sample._asdict()), file=process.stdin, flush=True)
         for i in images:
             image = ride.drive.images[i]
             partial = folder / image.camera / "partial"
@@ -205,6 +254,10 @@ def _write(ride: Ride, folder: Path, process: subprocess.Popen[str], seconds: fl
             # Exposed when it was due, however late this process was to write it.
             os.utime(partial, (float(stamp_s[moment]), float(stamp_s[moment])))
             partial.replace(folder / image.camera / f"{moment:06d}.jpg")
+            written += 1
+            if moment >= _KEPT:
+                (folder / image.camera / f"{moment - _KEPT:06d}.jpg").unlink(missing_ok=True)
+    return written
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -214,12 +267,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--images", type=int, default=160, help="of all cameras together")
     parser.add_argument("--every-full", type=int, nargs="+", default=[1, 5])
     parser.add_argument("--seconds", type=float, default=0.0, help="of the command itself, at 10 Hz")
+    parser.add_argument("--only-command", action="store_true", help="with --seconds: nothing but that")
     parsed = parser.parse_args(arguments)
     cv2.setNumThreads(1)
     ride = ride_of(parsed.drive, parsed.images)
+    if parsed.only_command:
+        for every_full in parsed.every_full:
+            print(paced(ride, every_full, parsed.seconds), flush=True)
+        return
     detector = Detector.load()
     roads = {
-        name: RoadDetector(detector, camera_from_calibration(calibration), calibration)
+        name: RoadDetector(detector, camera_from_calibration(calibration), calibration, is_for_localizer=True)
         for name, calibration in ride.calibrations.items()
     }
     for every_full in parsed.every_full:

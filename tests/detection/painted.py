@@ -40,19 +40,32 @@ def word(text, at=(0.0, 0.0), height_m=1.2, gap=0.2, yaw_deg=0.0):
     return np.array(bars) @ np.array([[c, s], [-s, c]]) + np.array(at)
 
 
+def framed(at, length_m, width_m, line_m=0.12, pitch_m=0.6):
+    """Quadrilaterals of a frame and of lines across it from side to side."""
+    x = np.arange(pitch_m, length_m - 0.1, pitch_m)
+    lines = [((0, 0), (length_m, 0)), ((0, width_m), (length_m, width_m)), ((0, 0), (0, width_m))]
+    lines += [((length_m, 0), (length_m, width_m)), *(((k, 0), (k, width_m)) for k in x)]
+    return bars_of(lines, line_m) + np.array(at)
+
+
 def hatched(at, length_m=4.0, width_m=3.0, line_m=0.15):
     """Quadrilaterals of a frame and the bars across it."""
     x, y = at
     lines = [((0, 0), (length_m, 0)), ((0, width_m), (length_m, width_m)), ((0, 0), (0, width_m))]
     lines += [((length_m, 0), (length_m, width_m))]
     lines += [((k, 0.3), (k + 0.8, width_m - 0.3)) for k in np.arange(0.5, length_m - 1.0, 0.8)]
+    return bars_of(lines, line_m) + np.array([x, y])
+
+
+def bars_of(lines, line_m):
+    """Quadrilaterals (N, 4, 2) along lines from point to point, so thick."""
     out = []
     for first, last in lines:
         first, last = np.array(first, float), np.array(last, float)
         ahead = (last - first) / np.linalg.norm(last - first)
         left = np.array([-ahead[1], ahead[0]]) * line_m / 2
         out.append([first - left, last - left, last + left, first + left])
-    return np.array(out) + np.array([x, y])
+    return np.array(out)
 
 
 def network_output(camera, paints, stride=2, doubt=0.0, rng=None):

@@ -6,13 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.detection.painted import hatched, network_output, word
+from tests.detection.painted import framed, hatched, network_output, word
 from tests.detection.pictures import bar, make_camera, to_image
 from v2hdm.catalogue import SHIPPED
 from v2hdm.detection.areas import find_areas, find_crosswalks
 from v2hdm.detection.camera import RoadCamera
-from v2hdm.detection.detector import _not_of, _of_several
-from v2hdm.detection.network import NetworkOutput
+from v2hdm.detection.detector import _likelier, _not_of, _of_several
+from v2hdm.detection.network import NetworkOutput, as_shares
 from v2hdm.geometry.planar import rectangle_size
 from v2hdm.records import MarkingDetection
 
@@ -98,7 +98,7 @@ def test_what_is_no_area_shares_paint_as_if_there_were_none():
     shares = output.class_probability(rows, columns)
     np.testing.assert_array_equal(shares, named.class_probability(rows, columns))
     np.testing.assert_allclose(shares.sum(axis=0), 1.0, rtol=1e-5)
-    with_areas = named.area_probability(rows, columns)
+    with_areas = as_shares(named.area_odds(rows, columns))
     np.testing.assert_allclose(with_areas.sum(axis=0), 1.0, rtol=1e-5)
     text = with_areas[named.area_classes.index("text")]
     dash = with_areas[len(named.area_classes) + named.classes.index("lane_dash")]
@@ -137,6 +137,43 @@ def test_a_letter_is_no_marking_and_a_surer_marking_in_a_box_stays():
     )
     beside = MarkingDetection("diamond", 0.3, corners + np.array([300, 0]), np.eye(8), np.ones(4, dtype=bool))
     assert [one.score for one in _not_of([area], (*markings, beside))] == [0.999, 0.3]
+
+
+def test_a_box_whose_lines_the_network_takes_for_strokes_of_letters_is_named_by_its_meshes():
+    def named(polygons):
+        output = network_output(CAMERA, [("text", polygons)])
+        text, box = (output.area_classes.index(name) for name in ("text", "box"))
+        output.areas[box] = np.where(output.areas[text] > 0, output.areas[text] - 2.0, output.areas[box])
+        return [area.kind for area in find_areas(output, RoadCamera(CAMERA, 16), SHIPPED, 0, 0.5, 22.0)]
+
+    assert named(framed((6.0, -1.2), 2.4, 2.4)) == ["box"]
+    assert named(word("BOBO", (6.5, 1.5))) == ["text"]
+
+
+def test_bars_in_a_row_are_a_crosswalk_whatever_takes_them_for_letters():
+    bars = [bar(8.0, across, 2.0, 0.4) for across in (-1.2, -0.4, 0.4, 1.2)]
+    valid = np.ones(4, dtype=bool)
+    markings = tuple(
+        MarkingDetection("crosswalk_bar", 0.6, to_image(CAMERA, corners), np.eye(8), valid)
+        for corners in bars
+    )
+    ((crosswalk, _),) = find_crosswalks(markings, RoadCamera(CAMERA, 16))
+    (area,), _ = areas_of(("text", np.array(bars[:3])))
+    assert _of_several([area], markings) == [area]
+    assert _of_several([area], (*markings, crosswalk)) == []
+
+
+def test_a_stop_line_that_an_arrow_crosses_is_a_marking_and_a_dash_on_its_shaft_is_none():
+    valid = np.ones(4, dtype=bool)
+    stop = MarkingDetection("stop_line", 0.5, to_image(CAMERA, bar(7.0, 0, 0.4, 3.0)), np.eye(8), valid)
+    dash = MarkingDetection("lane_dash", 0.5, to_image(CAMERA, bar(7.2, 0, 1.4, 0.2)), np.eye(8), valid)
+    shape = np.array(
+        [[6.4, -0.12], [8.0, -0.12], [8.0, -0.4], [9.0, 0], [8.0, 0.4], [8.0, 0.12], [6.4, 0.12]]
+    )
+    arrow = MarkingDetection(
+        "arrow", 0.9, np.full((4, 2), np.nan), np.eye(8), np.zeros(4, dtype=bool), to_image(CAMERA, shape)
+    )
+    assert [marking.kind for marking in _likelier([stop, dash], [arrow])] == ["stop_line", "arrow"]
 
 
 def test_an_area_that_is_part_of_an_arrow_is_no_word():

@@ -90,9 +90,10 @@ def test_what_is_paint_in_the_sun_is_paint_in_the_shade():
     assert odds(bright) == pytest.approx(odds((bright * 0.6).astype(np.uint8)), abs=0.3)
 
 
-def test_what_an_image_does_not_show_stays():
-    cut = LaneDetection(LANE_LINE, 0.6, np.array([[1.0, 700.0], [1.0, 690.0], [1.0, 680.0]]))
-    assert painted([cut], image_of(edge()), CAMERA) == [cut]
+def test_of_what_an_image_does_not_show_the_network_alone_tells():
+    doubtful = LaneDetection(LANE_LINE, 0.6, np.array([[1.0, 700.0], [1.0, 690.0], [1.0, 680.0]]))
+    sure = replace(doubtful, score=0.8)
+    assert painted([sure, doubtful], image_of(edge()), CAMERA) == [sure]
 
 
 def test_the_surer_the_network_the_more_it_takes_to_contradict_it():

@@ -68,6 +68,18 @@ def test_all_classes_with_four_corners_that_are_not_negligible_go_to_the_judge(s
     assert STOP_LINE not in proposal_of(RHOMBUS, {DIAMOND: 0.9}).kinds(CATALOGUE)
 
 
+def test_a_class_that_neither_network_nor_size_names_does_not_go_to_the_judge():
+    long = bar(10.0, 0.0, 5.0, 0.15)
+    assert proposal_of(long, {LANE_LINE: 0.9, LANE_DASH: 0.02}).kinds(CATALOGUE) == []
+    assert proposal_of(long, {LANE_LINE: 0.9, LANE_DASH: 0.1}).kinds(CATALOGUE) == [LANE_DASH], (
+        "by the network"
+    )
+    short = bar(10.0, 0.0, 3.0, 0.15)
+    assert proposal_of(short, {LANE_LINE: 0.9, LANE_DASH: 0.02}).kinds(CATALOGUE) == [LANE_DASH], (
+        "by its size"
+    )
+
+
 def test_the_shares_of_the_classes_add_up_to_one():
     share = proposal_of(STRIP, {LANE_DASH: 0.5, LANE_LINE: 0.3, ARROW: 0.1}).share
     assert sum(share.values()) == pytest.approx(1.0)

@@ -22,6 +22,17 @@ VIDEO = "foxglove_msgs/msg/CompressedVideo"
 ROS1, ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.LATEST)
 _PACKET = "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format"
 ROS2.register(get_types_from_msg(_PACKET, VIDEO))
+FFMPEG = "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"
+_FFMPEG_PACKET = """std_msgs/Header header
+int32 width
+int32 height
+string encoding
+uint64 pts
+uint8 flags
+bool is_bigendian
+uint8[] data
+"""
+ROS2.register(get_types_from_msg(_FFMPEG_PACKET, FFMPEG))
 ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
 
 Row = tuple[float, str, Any]
@@ -59,6 +70,19 @@ class Messages:
             "sensor_msgs/msg/Image", header=self.header(stamp_s, frame), height=height, width=width,
             encoding=encoding, is_bigendian=0, step=data.shape[1], data=data.ravel(),
         )  # fmt: skip
+
+    def packet(self, kind: str, stamp_s: float, data: bytes, form: str, frame: str) -> Any:
+        """A packet of video in a message of that ``kind``."""
+        header = self.header(stamp_s, frame)
+        numbers = np.frombuffer(data, np.uint8)
+        if kind == VIDEO:
+            return self.make(VIDEO, timestamp=header.stamp, frame_id=frame, data=numbers, format=form)
+        if kind == FFMPEG:
+            return self.make(
+                FFMPEG, header=header, width=0, height=0, encoding=form, pts=0, flags=0, is_bigendian=False,
+                data=numbers,
+            )  # fmt: skip
+        return self.compressed(stamp_s, data, form, frame)
 
     def compressed(self, stamp_s: float, data: bytes, form: str, frame: str) -> Any:
         return self.make(

@@ -22,6 +22,7 @@ from backports import zstd
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from tests.drive.bags import (
+    FFMPEG,
     VIDEO,
     Messages,
     assert_mounted,
@@ -443,20 +444,30 @@ def test_images_of_an_unknown_encoding_are_named(folder, tmp_path):
 
 H265 = "lossless=1:bframes=0:keyint=2:min-keyint=2:repeat-headers=1:log-level=0"
 LOSSLESS: dict[str, Any] = {
-    "libx264rgb": ("rgb24", "h264", {"crf": "0", "bf": "0", "preset": "ultrafast", "g": "2"}),
-    "libx265": ("gbrp", "h265", {"x265-params": H265}),
+    "libx264rgb": ("rgb24", {"crf": "0", "bf": "0", "preset": "ultrafast", "g": "2"}),
+    "libx265": ("gbrp", {"x265-params": H265}),
 }
 
 
-@pytest.mark.parametrize("codec", LOSSLESS)
-def test_video_in_a_bag_is_decoded_from_its_first_key_frame_on(codec, folder, tmp_path, caplog):
+@pytest.mark.parametrize(
+    ("codec", "kind", "stated"),
+    [
+        ("libx264rgb", VIDEO, "h264"),
+        ("libx265", VIDEO, "h265"),
+        ("libx264rgb", COMPRESSED, "h264"),
+        ("libx265", COMPRESSED, "hevc"),
+        ("libx264rgb", FFMPEG, "h264_nvenc"),
+        ("libx265", FFMPEG, "hevc;yuv420p;bgr8;bgr8"),
+    ],
+)
+def test_video_in_a_bag_is_decoded_from_its_first_key_frame_on(codec, kind, stated, folder, tmp_path, caplog):
     """A packet a message without loss; the recording began two packets too late."""
     expected = read_drive(folder)
     pictures = [cv2.imread(str(image.path)) for image in expected.images if image.camera == "front"]
     pictures = [pictures[0], pictures[1], *pictures]
     encoder = av.CodecContext.create(codec, "w")
     encoder.width, encoder.height, encoder.time_base = 64, 48, Fraction(1, 10)
-    encoder.pix_fmt, form, encoder.options = LOSSLESS[codec]
+    encoder.pix_fmt, encoder.options = LOSSLESS[codec]
     packets: list[bytes] = []
     for number, pixels in enumerate([*pictures, None]):
         frame = None if pixels is None else av.VideoFrame.from_ndarray(pixels, format="bgr24")
@@ -470,9 +481,7 @@ def test_video_in_a_bag_is_decoded_from_its_first_key_frame_on(codec, folder, tm
     # The first packet of all is a key frame: leave it out, and the one after it has none.
     begin_s = rows[0][0] - 0.04
     for stamp_s, packet in zip([begin_s, *(row[0] for row in rows)], packets[1:], strict=True):
-        header = made.header(stamp_s, "front_optical")
-        data = np.frombuffer(packet, np.uint8)
-        message = made.make(VIDEO, timestamp=header.stamp, frame_id="front_optical", data=data, format=form)
+        message = made.packet(kind, stamp_s, packet, stated, "front_optical")
         made.add(stamp_s, "/sensing/front/image_raw", message)
     made.rows.sort(key=lambda row: row[0])
     bag = write_ros2(tmp_path / "site", made)

@@ -225,6 +225,10 @@ roi:
         ("plumb_bob", LENSES[5], lambda: as_opencv(LENSES[5])),
         ("rational_polynomial", LENSES[8], lambda: as_opencv(LENSES[8])),
         ("equidistant", FISHEYE, lambda: as_fisheye(FISHEYE)),
+        # Names of OpenCV and Kalibr, and numbers as OpenCV counts them.
+        ("fisheye", FISHEYE, lambda: as_fisheye(FISHEYE)),
+        ("Brown-Conrady", LENSES[4], lambda: as_opencv(LENSES[4])),
+        ("rational_polynomial", [*LENSES[8], *[0.0] * 6], lambda: as_opencv(LENSES[8])),
     ],
 )
 def test_an_echoed_message_and_a_camera_info_file_of_ros_are_read(tmp_path, model, lens, expected):
@@ -331,6 +335,10 @@ MISTAKES: dict[str, tuple[Callable[[Path], Path], str]] = {
     "something else": (text_mistake("a.yaml", "poses: poses.tum\n"), "no intrinsics of a known format"),
     "missing": (lambda folder: folder / "none.yaml", "no such file"),
     "folder": (lambda folder: folder, "is a folder"),
+    "radial alone": (
+        text_mistake("a.yaml", ECHO.format(model="plumb_bob", d=LENSES[4][:3], k=[1] * 9)),
+        "3 distortion coefficients leave open which they are; give k1 k2 p1 p2 and k3",
+    ),
     "uncalibrated message": (
         text_mistake("a.yaml", ECHO.format(model="plumb_bob", d=[], k=[0] * 9)),
         "not calibrated",

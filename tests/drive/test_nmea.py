@@ -332,3 +332,12 @@ def test_without_a_date_that_of_the_images_holds(tmp_path):
     content = {"nmea": "log.nmea", "lever_arm_m": list(LEVER_M)}
     got = read_poses(content, tmp_path, ORIGIN, 0.5, "here", None, near_s=START_S + 9.0)
     np.testing.assert_allclose(got.trajectory.stamp_s[0], START_S)
+
+
+@pytest.mark.parametrize("image_s", [2.0, 3000.0, 43000.0])
+def test_a_log_from_before_midnight_without_a_date_belongs_to_images_from_behind_it(image_s):
+    """The log begins at 23:59:55; the images' middle is ``image_s`` behind its first sentence."""
+    begin_s = START_S + 55765
+    lines = [gga(begin_s + n, (53.5, 9.9, 45.0)) for n in range(20)]
+    stamp_s = nmea_readings(lines, "log", near_s=begin_s + image_s).stamp_s
+    np.testing.assert_allclose(stamp_s, begin_s + np.arange(20))

@@ -195,6 +195,50 @@ def test_projected_coordinates_and_either_north_give_the_same_poses(crs, heading
     check(read(content, tmp_path, origin), metres=1e-5, radians=1e-6)
 
 
+@pytest.mark.parametrize(("crs", "geoid_m"), [("EPSG:2263", None), ("EPSG:2263+6360", -32.0)])
+def test_easting_northing_and_height_of_a_grid_of_feet_are_in_feet(crs, geoid_m, tmp_path, caplog):
+    """New York Long Island; NAVD88 counts US survey feet above the sea, 32 m below the ellipsoid."""
+    origin = GeodeticOrigin(40.7, -73.9, 30.0, "NAD83")
+    stamp_s, points, yaw = curve()
+    places = place(points, origin)
+    to_grid = pyproj.Transformer.from_crs("EPSG:4269", "EPSG:2263", always_xy=True)
+    east, north = to_grid.transform(places[:, 1], places[:, 0])
+    up = (places[:, 2] - (geoid_m or 0.0)) * 3937 / 1200
+    ahead = place(points + np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))]), origin)
+    azimuth_deg, _, _ = pyproj.Geod(ellps="WGS84").inv(places[:, 1], places[:, 0], ahead[:, 1], ahead[:, 0])
+    rows = np.column_stack([stamp_s, east, north, up, azimuth_deg % 360])
+    lines = [",".join(map(repr, row)) for row in rows.tolist()]
+    (tmp_path / "route.csv").write_text("\n".join(["stamp_s,x_m,y_m,z_m,heading_deg", *lines]))
+    content = {"csv": "route.csv", "crs": crs, "heading": "true"}
+    if geoid_m is not None:
+        content["geoid_m"] = geoid_m
+    with caplog.at_level(logging.INFO):
+        got = read(content, tmp_path, None)
+    assert "are read in the unit of EPSG:2263" in caplog.text
+    assert got.origin.altitude_m == pytest.approx(places[0, 2], abs=1e-6)
+    check(read(content, tmp_path, origin), metres=1e-5, radians=1e-6)
+
+
+def test_a_grid_that_names_no_datum_is_on_that_of_the_stated_origin(tmp_path):
+    stamp_s, points, yaw = curve()
+    rows = np.column_stack([stamp_s, grid(points, "EPSG:25832"), true_azimuth_deg(points, yaw)])
+    lines = [",".join(map(repr, row)) for row in rows.tolist()]
+    (tmp_path / "route.csv").write_text("\n".join(["stamp_s,x_m,y_m,z_m,heading_deg", *lines]))
+    zone = "+proj=utm +zone=32 +ellps=GRS80 +units=m +no_defs"
+    content = {"csv": "route.csv", "crs": zone, "heading": "true"}
+    check(read(content, tmp_path, ETRS), metres=1e-5, radians=1e-6)
+
+
+def test_swapped_easting_and_northing_are_refused_as_a_place_where_the_grid_is_not_used(tmp_path):
+    stamp_s, points, _ = curve()
+    rows = np.column_stack([stamp_s, grid(points, "EPSG:25832")[:, [1, 0, 2]], np.zeros(len(points))])
+    lines = [",".join(map(repr, row)) for row in rows.tolist()]
+    (tmp_path / "route.csv").write_text("\n".join(["stamp_s,x_m,y_m,z_m,heading_deg", *lines]))
+    content = {"csv": "route.csv", "crs": "EPSG:25832", "heading": "true"}
+    with pytest.raises(DriveError, match=r"longitude 5\d.\d\d, where EPSG:25832 is not used; check it, and"):
+        read(content, tmp_path, None)
+
+
 def test_what_a_projected_system_leaves_open_is_asked_for(tmp_path):
     (tmp_path / "route.csv").write_text(
         "stamp_s,x_m,y_m,z_m,heading_deg\n1,560000,5930000,3,5\n2,560001,5930000,3,5\n"
@@ -203,6 +247,7 @@ def test_what_a_projected_system_leaves_open_is_asked_for(tmp_path):
     for changes, message in (
         ({"heading": None}, "true and grid north differ in EPSG:25832: add heading"),
         ({"crs": "EPSG:99999"}, "unknown crs 'EPSG:99999'"),
+        ({"crs": "+proj=utm +zone=32 +ellps=GRS80"}, r"\+ellps=GRS80 names no datum; give its code"),
         ({"crs": "EPSG:27700"}, "EPSG:27700 .* is not on a satellite datum"),
         ({"crs": "EPSG:5555"}, "are above sea level: add geoid_m"),
         ({"crs": None}, "heading: only for coordinates on the earth"),

@@ -184,3 +184,42 @@ def test_a_list_of_decimals_without_zeros_at_their_end_has_these_times(tmp_path)
 def test_timecodes_of_matroska_are_in_milliseconds(tmp_path):
     (tmp_path / "times.txt").write_text("# timecode format v2\n0.000\n33.333\n66.667\n")
     np.testing.assert_allclose(read_stamps(tmp_path / "times.txt", 3, "frames"), [0, 0.033333, 0.066667])
+
+
+LISTS = {
+    "EuRoC": "#timestamp [ns],filename\n{ns[0]},a b.png\n{ns[1]},c.png\n",
+    "columns named": "timestamp,filename\r\n{s[0]},a b.png\r\n{s[1]},c.png\r\n",
+    "semicolons, quotes": '{s[0]}; "a b.png"\n"{s[1]}";"c.png"\n',
+    "blanks": "{s[0]} a b.png\n{s[1]}  c.png\n",
+}
+
+
+@pytest.mark.parametrize("form", LISTS)
+def test_a_list_of_images_as_tools_write_it_has_its_times_and_names(form, tmp_path):
+    stamps = ["1715934630.25", "1715934630.75"]
+    whole = [text.replace(".", "").ljust(19, "0") for text in stamps]
+    (tmp_path / "images.txt").write_text(LISTS[form].format(s=stamps, ns=whole), newline="")
+    listed = read_image_list(tmp_path / "images.txt")
+    np.testing.assert_allclose(listed.stamp_s, [float(text) for text in stamps], rtol=0, atol=5e-7)
+    assert listed.names == ["a b.png", "c.png"]
+
+
+def test_a_list_from_windows_names_its_folders_by_backslashes(tmp_path):
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "a.png").touch()
+    (tmp_path / "b\\c.png").touch()  # a name that has a backslash itself
+    (tmp_path / "images.txt").write_text("1.0 images\\a.png\n2.0 b\\c.png\n")
+    assert read_image_list(tmp_path / "images.txt").names == ["images/a.png", "b\\c.png"]
+
+
+def test_a_decimal_comma_in_a_list_is_named_and_no_separator(tmp_path):
+    (tmp_path / "images.txt").write_text("100,05 a.png\n100,15 b.png\n")
+    with pytest.raises(DriveError, match=r"line 1: '100,05' is not a number; write a decimal point"):
+        read_image_list(tmp_path / "images.txt")
+
+
+def test_times_in_a_file_may_count_nanoseconds_since_1970(tmp_path):
+    (tmp_path / "times.txt").write_text("1715934630250000000\n1715934630750000000\n")
+    np.testing.assert_allclose(
+        read_stamps(tmp_path / "times.txt", 2, "images"), [1715934630.25, 1715934630.75], rtol=0, atol=5e-7
+    )

@@ -20,6 +20,7 @@ from v2hdm.geometry.rigid import (
     rotation_from_quaternion,
 )
 from v2hdm.io.drive import join_drives, read_drive, with_clock_offsets
+from v2hdm.io.trajectory import check_trajectory
 from v2hdm.records import FloatArray, GeodeticOrigin, PoseNoise, Trajectory
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -105,6 +106,19 @@ def test_a_generous_limit_bridges_the_gap():
     poses, inside = interpolate(without_middle(), np.array([101.0]), max_gap_s=1.01)
     assert inside.all()
     np.testing.assert_allclose(poses[0, 0, 3], 5.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("is_on_earth", [True, False])
+def test_poses_that_change_their_utm_zone_on_the_way_are_refused_with_the_place(is_on_earth):
+    """As drivers of receivers do at 12 degrees east, from zone 32 to 33; a ferry goes as far in hours."""
+    poses = straight_trajectory()
+    moved = poses.map_from_vehicle.copy()
+    moved[3:, 0, 3] -= 397_000.0
+    origin = GeodeticOrigin(53.5, 12.0, 10.0) if is_on_earth else None
+    with pytest.raises(DriveError, match=r"leap by 397 km at .* s, as where coordinates change"):
+        check_trajectory(replace(poses, map_from_vehicle=moved), origin, "here")
+    later_s = poses.stamp_s + np.where(np.arange(len(moved)) >= 3, 7200.0, 0.0)
+    check_trajectory(Trajectory(later_s, moved), None, "here")
 
 
 def test_a_single_pose_serves_its_own_time_only():

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from v2hdm.lanes.lines import join_paths, lanes_along, map_lanes, paths_of
-from v2hdm.lanes.points import NODE_SPACING_M, Guides, LaneCloud
+from v2hdm.lanes.points import NODE_SPACING_M, Guides, LaneCloud, distance_beside_m
 from v2hdm.site.options import LaneOptions
 
 OPTIONS = LaneOptions()
@@ -118,6 +118,42 @@ def test_a_closed_line_is_closed():
     angle = np.arange(0, 2 * np.pi, 0.3 / 15)
     (lane,) = map_lanes(cloud_of([15 * np.column_stack([np.cos(angle), np.sin(angle)])]), OPTIONS)
     assert np.linalg.norm(lane.points_map[0] - lane.points_map[-1]) < 0.6
+
+
+def as_shown(lines, images_of_line, sigma_m=0.02):
+    """The cloud of lines (N, 2), each a piece of the first images, of as many as are given for it."""
+    clouds = [
+        cloud_of([line], images=count, sigma_m=sigma_m, seed=seed)
+        for seed, (line, count) in enumerate(zip(lines, images_of_line, strict=True))
+    ]
+    joined = {
+        name: np.concatenate([getattr(cloud, name) for cloud in clouds])
+        for name in ("points_map", "tangent", "weight", "image", "dash")
+    }
+    piece = np.repeat(np.arange(len(lines)), [len(cloud.weight) for cloud in clouds])
+    beside_m = distance_beside_m(joined["points_map"], joined["tangent"], joined["image"], piece)
+    return LaneCloud(**joined, beside_m=beside_m)
+
+
+DOUBLE = [straight(0, 20), straight(0, 20, y=0.26)]
+
+
+def test_two_lines_that_images_show_beside_each_other_stay_two():
+    lanes = map_lanes(as_shown(DOUBLE, [12, 12]), OPTIONS)
+    middles = sorted(float(lane.points_map[:, 1].mean()) for lane in lanes)
+    np.testing.assert_allclose(middles, [0.0, 0.26], atol=0.02)
+
+
+def test_two_lines_stay_two_though_half_of_the_images_show_one_of_them():
+    assert len(map_lanes(as_shown(DOUBLE, [24, 12]), OPTIONS)) == 2
+
+
+def test_paint_that_no_image_shows_as_two_lines_is_one_line():
+    cloud = as_shown(DOUBLE, [12, 12])
+    image = cloud.image + 12 * (cloud.points_map[:, 1] > 0.13)
+    beside_m = distance_beside_m(cloud.points_map, cloud.tangent, image, image)
+    assert np.isnan(beside_m).all()
+    assert len(map_lanes(replace(cloud, image=image, beside_m=beside_m), OPTIONS)) == 1
 
 
 def test_an_empty_cloud_has_no_lanes():

@@ -110,11 +110,11 @@ class Driven:
         return np.array([*off, (turn + np.pi) % (2 * np.pi) - np.pi])
 
 
-def drive(painted, seed, seconds=8.0, speed=4.0, begin_m=12.0, turned=None, kmh=False):
+def drive(painted, seed, seconds=8.0, speed=4.0, begin_m=12.0, turned=None, kmh=False, swerve_rad=0.05):
     """A swerving drive; ``turned`` is a camera, since when, s, and by how much (3,), rad, it was pushed."""
     rng = np.random.default_rng([seed, 3])
     stamp_s = np.arange(0, seconds, 0.02)
-    heading = 0.05 * np.sin(0.8 * stamp_s)
+    heading = swerve_rad * np.sin(0.8 * stamp_s)
     step_m = 0.02 * speed * np.column_stack([np.cos(heading), np.sin(heading)])
     place = np.array([begin_m, 0.0]) + np.cumsum(step_m, axis=0) - step_m[0]
     roll, pitch = 0.002 * np.sin(3.0 * stamp_s + 1), 0.002 * np.sin(2.3 * stamp_s)

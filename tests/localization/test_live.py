@@ -78,6 +78,23 @@ def test_the_stated_covariance_holds():
     assert 0.5 < np.mean(squared) < 3.5  # of two coordinates: honest is 2
 
 
+@pytest.mark.parametrize("late_s", [0.0, 0.05])
+def test_an_odometry_that_comes_late_is_known_to_and_no_camera_is_blamed(late_s):
+    painted = yard(6)
+    driven = drive(painted, 6, seconds=16.0, swerve_rad=0.15)
+    stamped = [sample._replace(stamp_s=sample.stamp_s + late_s) for part in driven.motion for sample in part]
+    begins_s = [-np.inf, *driven.stamp_s[:-1]]
+    motion = [
+        [sample for sample in stamped if begin_s < sample.stamp_s <= end_s]
+        for begin_s, end_s in zip(begins_s, driven.stamp_s, strict=True)
+    ]
+    poses = follow(replace(driven, motion=motion), mapped(painted, 6))
+    errors, bounds = tracked(driven, poses)
+    assert poses[-1].motion[2] == pytest.approx(late_s, abs=0.012)
+    assert (np.abs(errors) < bounds).all()
+    assert not poses[-1].turned
+
+
 def test_a_vehicle_that_knows_nothing_finds_itself_by_the_pattern_of_the_markings():
     painted = yard(4)
     driven = drive(painted, 4, begin_m=50.0)
@@ -214,10 +231,20 @@ def test_without_images_the_pose_is_lost_and_images_bring_it_back():
         gone = 30 < frame < 190
         pose = localizer.update([] if gone else looks, motion)
         statuses.append(pose.status)
+        said_missing = any("no image of front has come" in reason for reason in pose.reasons)
+        assert said_missing == (41 <= frame < 190)
         if pose.status == Status.TRACKING:
             assert (np.abs(driven.errors(pose, frame)[:2]) < pose.protection_m).all()
     assert statuses[30] == Status.TRACKING
     assert statuses[-1] == Status.TRACKING
+
+
+def test_images_that_never_come_are_missed():
+    localizer = Localizer(yard(12), cameras())
+    poses = [localizer.update([], [Motion(0.1 * sample, 0.0, 0.0)]) for sample in range(20)]
+    assert not poses[5].reasons
+    assert poses[-1].reasons == ("no image has come yet",)
+    assert poses[-1].status == Status.INITIALISING
 
 
 def test_an_image_of_another_clock_is_left_out_with_a_reason():
@@ -287,7 +314,11 @@ def test_the_derivatives_of_expected_pixels_are_those_of_their_differences():
     for column in range(len(mean)):
         ends = [
             expect(
-                belief.replace(state, mean=mean + by * np.eye(16)[column]), plane, 0, calibration, corners
+                belief.replace(state, mean=mean + by * np.eye(len(mean))[column]),
+                plane,
+                0,
+                calibration,
+                corners,
             ).px
             for by in (step, -step)
         ]
@@ -422,6 +453,34 @@ def test_lines_come_as_images_do_and_end_with_the_cameras(monkeypatch, tmp_path)
     live.localize_live(localizer, sources, files, motion, MotionLines("odometry", None), poses.append)
     assert poses[-1].status == Status.TRACKING
     assert np.hypot(*driven.errors(poses[-1], len(driven.looks) - 1)[:2]) < 0.05
+
+
+def test_motions_between_images_make_no_poses_but_without_images_some(monkeypatch, tmp_path):
+    """Two seconds of an odometry, of a clock that then is set back."""
+    lines = [f"{stamp_s:.2f},4.0,0.0" for stamp_s in (*np.arange(50.0, 52.0, 0.02), 7.0)]
+    motion = io.StringIO("\n".join(["stamp_s,speed_m_s,yaw_rate_rad_s", *lines, ""]))
+
+    @contextmanager
+    def camera(name, source, calibration, items, delay_s):
+        def end():
+            time.sleep(0.6)  # the odometry is read first
+            items.put(live._Ended(name, None))
+
+        threading.Thread(target=end, daemon=True).start()
+        yield live._Eye(name, io.StringIO(), delay_s)
+
+    def one_by_one(waiting):
+        yield from [waiting.get(timeout=1.0)]
+
+    monkeypatch.setattr(live, "_camera", camera)
+    monkeypatch.setattr(live, "_available", one_by_one)
+    poses = []
+    sources = {"front": "folder"}
+    localizer = Localizer(yard(18), cameras())
+    odometry = MotionLines("odometry", None)
+    live.localize_live(localizer, sources, {"front": tmp_path}, motion, odometry, poses.append)
+    assert 4 <= len(poses) <= 6
+    assert any("clock went back" in reason for reason in poses[-1].reasons)
 
 
 def test_all_that_a_camera_shows_reaches_the_localiser_at_the_time_of_its_exposure():

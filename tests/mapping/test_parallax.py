@@ -1,5 +1,7 @@
 """Images tell what lies on the ground from what stands above it or moves, as far as the vehicle moves."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -77,6 +79,20 @@ def test_what_moves_along_or_belongs_to_the_vehicle_is_not_on_the_ground():
     way_m = np.linspace(0.0, 3.0, 12)
     assert objection(sighted(way_m, AHEAD + QUAD, moved_m=way_m)) == NOT_ON_GROUND
     assert objection(sighted(way_m, AHEAD / 2 + QUAD, 0.8, moved_m=0.9 * way_m)) == NOT_ON_GROUND
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize(("height_m", "is_paint"), [(0.0, True), (0.08, True), (0.35, False), (0.45, False)])
+def test_the_sill_of_a_car_is_not_taken_for_paint_but_paint_on_a_bump_is(height_m, is_paint, seed):
+    views = sighted(np.linspace(0.0, 3.0, 10), AHEAD + QUAD, height_m, seed=seed)
+    assert (objection(views) is None) is is_paint
+
+
+def test_a_camera_lower_than_a_sill_still_tells_paint():
+    views = sighted(np.linspace(0.0, 3.0, 10), AHEAD + QUAD)
+    low = replace(views, height_m=np.full_like(views.height_m, 0.3))
+    assert np.isfinite(measure_parallax(low, 1).log_odds).all()
+    assert objection(low) is None
 
 
 def test_stripes_on_an_upright_rear_are_not_on_the_ground():

@@ -41,6 +41,58 @@ def test_errors_of_a_child_are_raised_as_they_were(tmp_path):
     assert failure.value.filename == str(missing)
 
 
+def test_a_child_works_where_its_parent_does_in_its_environment_and_in_a_scratch_folder(
+    tmp_path, monkeypatch
+):
+    scratches = set()
+    for name in ("one", "other"):
+        (tmp_path / name).mkdir()
+        monkeypatch.chdir(tmp_path / name)
+        monkeypatch.setenv("V2HDM_SAID", name)
+        told = ask(work.surroundings)
+        scratches.add(told.pop("temporary"))
+        assert told == {"folder": str(tmp_path / name), "said": name}
+    assert len(scratches) == 2
+    assert not any(Path(scratch).exists() for scratch in scratches)
+
+
+def test_a_child_leaves_nothing_to_the_next_one(monkeypatch):
+    monkeypatch.delenv("V2HDM_SAID", raising=False)
+    assert [ask(work.remember, word) for word in ("a", "b")] == [["a"], ["b"]]
+    assert ask(work.surroundings)["said"] is None
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="has no fork server")
+def test_children_are_forks_of_a_process_that_serves_their_parent_alone():
+    server = ask(work.forked_by)
+    with pytest.raises(MapFileError):
+        ask(work.crash)
+    assert ask(work.forked_by) == server
+    fork = os.fork()
+    if not fork:
+        os._exit(ask(work.forked_by) == server)
+    assert os.waitstatus_to_exitcode(os.waitpid(fork, 0)[1]) == 0
+    assert ask(work.forked_by) == server
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="has no fork server")
+def test_a_server_that_was_killed_or_has_other_limits_is_replaced(monkeypatch):
+    killed = ask(work.forked_by)
+    os.kill(killed, signal.SIGKILL)
+    wait_until(lambda: Path("/proc", str(killed), "stat").read_text().split()[2] == "Z")
+    server = ask(work.forked_by)
+    assert server != killed
+    import resource
+
+    kind = resource.RLIMIT_NOFILE
+    before, most = resource.getrlimit(kind)
+    resource.setrlimit(kind, (before - 1, most))
+    try:
+        assert ask(work.forked_by) != server
+    finally:
+        resource.setrlimit(kind, (before, most))
+
+
 ENDS = {
     "memory": (work.take_memory, (1_000_000_000,), "takes more than 0.3 GB of memory"),
     "time": (work.take_time, (), "takes more than 1 s of a processor for one piece"),

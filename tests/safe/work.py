@@ -4,6 +4,7 @@ import ctypes
 import logging
 import os
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -28,6 +29,28 @@ def fail(path):
     Path(path).write_text("never")
 
 
+def forked_by():
+    return os.getppid()
+
+
+def surroundings():
+    return {
+        "folder": str(Path.cwd()),
+        "said": os.environ.get("V2HDM_SAID"),
+        "temporary": tempfile.gettempdir(),
+    }
+
+
+seen: list[str] = []
+
+
+def remember(word):
+    os.environ["V2HDM_SAID"] = word
+    os.chdir("/")
+    seen.append(word)
+    return seen
+
+
 def take_memory(count):
     return np.ones(count, np.uint8).size
 
@@ -38,9 +61,9 @@ def take_time():
 
 
 def take_time_in_steps():
-    for _ in range(6):
+    for _ in range(10):
         begin_s = time.process_time()
-        while time.process_time() - begin_s < 0.5:
+        while time.process_time() - begin_s < 0.25:
             pass
         next_step()
     return "done"

@@ -118,6 +118,14 @@ def test_a_word_in_a_box_is_a_word_in_a_box():
     assert sorted(area.kind for area in areas) == ["box", "text"]
 
 
+def test_paint_that_some_images_take_for_a_word_is_what_most_take_it_for():
+    count = len(WAYS_M)
+    kinds = ["text" if number % 3 == 0 else "box" for number in range(count)]
+    (area,) = mapped(*seen([hull(LETTERS)] * count, kinds, WAYS_M))
+    assert area.kind == "box"
+    assert area.sightings == count
+
+
 def test_the_corners_of_words_are_as_uncertain_as_they_are_stated():
     rng = np.random.default_rng(2)
     true = rectangle(LETTERS)

@@ -62,6 +62,21 @@ def test_grid_coordinates_of_any_zone_lie_where_they_are_whatever_its_convergenc
     np.testing.assert_allclose([one.height_m for one in found], PLACES[:, 2], atol=1e-4)
 
 
+def test_grid_coordinates_and_heights_of_a_grid_of_feet_are_in_feet(tmp_path):
+    """In metres they are among the misreadings."""
+    origin = GeodeticOrigin(40.7, -73.9, 30.0, "NAD83")
+    geodetic = geodetic_from_enu(origin, PLACES)
+    to_grid = pyproj.Transformer.from_crs("EPSG:4269", "EPSG:2263", always_xy=True)
+    east, north = to_grid.transform(geodetic[:, 1], geodetic[:, 0])
+    feet = np.column_stack([east, north, geodetic[:, 2] * 3937 / 1200])
+    placed = points(tmp_path, written("Easting,Northing,height", feet), origin, crs="EPSG:2263")
+    np.testing.assert_allclose([point.position_map for point in placed], PLACES[:, :2], atol=1e-4)
+    np.testing.assert_allclose([point.height_m for point in placed], PLACES[:, 2], atol=1e-4)
+    (tmp_path / "m.csv").write_text(written("Easting,Northing,height", feet * 1200 / 3937))
+    table = read_survey(tmp_path / "m.csv", "EPSG:2263", None, 0.01)
+    np.testing.assert_allclose(misreadings(table, origin)["in metres"], PLACES[:, :2], atol=1e-4)
+
+
 def test_latitudes_and_longitudes_lie_where_they_are(tmp_path):
     geodetic = geodetic_from_enu(ORIGIN, PLACES)
     found = points(tmp_path, written("lat,lon,altitude_m", geodetic), ORIGIN)

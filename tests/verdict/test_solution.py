@@ -95,6 +95,17 @@ def test_noise_along_the_way_alone_is_of_stamps_that_jitter(drive, ratio, named)
     assert "image stamps" not in raised(result(quiet), drive)
 
 
+@pytest.mark.parametrize(("factor", "named"), [(0.5, False), (3.3, True)])
+def test_stamps_that_may_jitter_are_named_where_the_corners_fit_badly(drive, factor, named):
+    """The ratio is that of a made drive whose stamps jitter by 20 ms; right drives reach 1.25."""
+    noisy = replace(FINE, pose_noise={"position_m": 6.4}, jitter_s=0.012, along_over_across=2.06)
+    found = raised(result(replace(noisy, variance_factor=factor)), drive)
+    assert ("image stamps" in found) is named
+    assert not named or found["fit"].says.endswith("see image stamps")
+    right = replace(noisy, variance_factor=3.3, along_over_across=1.25)
+    assert "image stamps" not in raised(result(right), drive)
+
+
 @pytest.mark.parametrize(("noise", "status"), [(2.9, Status.WARN), (4.0, Status.FAIL)])
 def test_stamps_that_jitter_within_the_noise_that_is_allowed_for_are_a_warning(drive, noise, status):
     noisy = replace(FINE, pose_noise={"position_m": noise}, jitter_s=0.02, along_over_across=5.0)

@@ -13,9 +13,9 @@ from v2hdm.records import CROSSWALK_BAR, STOP_LINE, FloatArray
 
 _SIZES_M = (
     ((3.0, 3.0), (11.0, 9.0)), ((4.0, 1.0), (6.0, 2.0)), ((1.5, 1.5), (7.0, 6.0)),
-    ((5.0, 1.5), (16.0, 4.0)), ((0.8, 0.8), (6.0, 5.0)),
+    ((5.0, 1.5), (16.0, 4.0)), ((0.8, 0.8), (6.0, 5.0)), ((1.5, 1.5), (3.0, 3.0)),
 )  # fmt: skip
-"""Least and largest length and width by kind: boxes of junctions, aisles, areas, islands, crosses."""
+"""Least and largest length and width by kind: boxes of junctions, aisles, areas, islands, crosses, yards."""
 
 _MOST_LINES = 60  # number of lines across an area, more would be a tone
 
@@ -23,10 +23,10 @@ _MOST_LINES = 60  # number of lines across an area, more would be a tone
 def hatched_area(rng: np.random.Generator) -> tuple[list[FloatArray], FloatArray]:
     """Convex parts of a framed area with lines across it, and its outline (N, 2), about the origin.
 
-    It is a yellow box of a junction, an aisle beside a bay, a no-parking area, an island that tapers, or a
-    rectangle with a cross.
+    It is a yellow box of a junction, an aisle beside a bay, a no-parking area, an island that tapers, a
+    rectangle with a cross, or a small box of a yard.
     """
-    kind = int(rng.choice(5, p=[0.35, 0.15, 0.2, 0.15, 0.15]))
+    kind = int(rng.choice(6, p=[0.3, 0.13, 0.17, 0.13, 0.12, 0.15]))
     low, high = _SIZES_M[kind]
     long_m, wide_m = (float(m) for m in rng.uniform(low, high))
     outline = rectangle(np.zeros(2), long_m, wide_m)
@@ -38,7 +38,7 @@ def hatched_area(rng: np.random.Generator) -> tuple[list[FloatArray], FloatArray
     if kind == 4:
         return [*parts, bar(outline[0], outline[2], thick_m), bar(outline[1], outline[3], thick_m)], outline
     lean = float(rng.uniform(0.45, 1.1) * rng.choice([-1, 1]))
-    crossed = rng.random() < (0.85 if kind == 0 else 0.2)
+    crossed = rng.random() < {0: 0.85, 5: 0.5}.get(kind, 0.2)
     pitch_m = float(rng.uniform(0.9, 2.4) if kind == 0 else rng.uniform(0.35, 1.3))
     line_m = thick_m * float(rng.uniform(0.7, 1.1))
     for yaw in (lean, -lean)[: 1 + crossed]:

@@ -177,6 +177,11 @@ def corner_gain(whitening: Whitening) -> FloatArray:
     arrays = whitening.engine.arrays
     tip = whitening.reduced_factor.tip
     out = np.empty((arrays.corner_count, 2, len(tip)))
+    by_cameras = whitening.linearised.by_cameras()
+    if by_cameras is not None:
+        gain = whitening.linearised.corner_factor.solve_transposed(by_cameras)
+        out[arrays.corner_order.numpy()] = gain.numpy()
+        return out
     begin = 0
     at_once = _at_once(whitening)
     for end in arrays.units.tolist()[1:]:

@@ -58,8 +58,8 @@ def is_worth_a_look(arrays: Arrays) -> bool:
 
 def is_near(whitening: Whitening) -> bool:
     """Whether the Newton step turns every camera by less than the descent's range of convergence."""
-    step = whitening.step(-whitening.gradient).unknowns
-    return float(step.extrinsic[:, 3:].norm(dim=1).max()) <= _NEAR_RAD
+    by_camera = whitening.camera_step(-whitening.gradient)
+    return float(by_camera[:, 3:6].norm(dim=1).max()) <= _NEAR_RAD
 
 
 def coarse_extrinsics(engine: TorchEngine, cam_from_vehicle: Tensor) -> tuple[Tensor, int]:
@@ -86,7 +86,9 @@ def coarse_extrinsics(engine: TorchEngine, cam_from_vehicle: Tensor) -> tuple[Te
         opening = open_descent(part, start, _LOSS)
         if stage == 0 and not is_near(opening):
             continue
-        descent = descend(part, start, _LOSS, _GAP_TOLERANCE, _MAX_REFRESHES, _MAX_EVALUATIONS, opening)
+        # From nearby the loss that the start calls for does: the descent of all corners narrows its own.
+        robust = _LOSS if stage else opening.robust
+        descent = descend(part, start, robust, _GAP_TOLERANCE, _MAX_REFRESHES, _MAX_EVALUATIONS, opening)
         cam_from_vehicle = descent.estimate.cam_from_vehicle
         evaluations += descent.evaluations
         if stage == 0:

@@ -85,7 +85,10 @@ def compare_with_design(
     """
     design = check_shapes(design)
     if not design.shapes:
-        raise MapFileError(f"{design.source}: has no closed shapes to compare; give a design with outlines")
+        besides = f" ({design.lines} open lines)" if design.lines else ""
+        raise MapFileError(
+            f"{design.source}: has no closed shapes to compare{besides}; give a design with outlines"
+        )
     built = built_shapes(hd_map)
     outlines = [outline_of(shape.outline_map) for shape in design.shapes]
     meant = np.stack([outline.corners_map for outline in outlines])

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from v2hdm.errors import MapFileError
+from v2hdm.geometry.datums import is_same_datum
 from v2hdm.geometry.geodetic import enu_from_geodetic, geodetic_from_enu
 from v2hdm.geometry.planar import centroid, is_simple, signed_area
 from v2hdm.records import (
@@ -128,7 +129,7 @@ def design_of_map(hd_map: HDMap, origin: GeodeticOrigin | None, source: str) -> 
 
 def moved_to(points_map: FloatArray, old: GeodeticOrigin, new: GeodeticOrigin) -> FloatArray:
     """Points (N, 2) of the map of an ``old`` origin in that of a ``new`` one; MapFileError between datums."""
-    if old.datum.replace(" ", "") != new.datum.replace(" ", ""):
+    if not is_same_datum(old.datum, new.datum):
         raise MapFileError(
             f"the design is on {old.datum}, the map on {new.datum}, which differ by decimetres; bring both "
             "to one datum"

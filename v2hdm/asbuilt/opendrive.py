@@ -14,6 +14,8 @@ from v2hdm.records import FloatArray
 from v2hdm.store.files import read_text
 
 _SAME_PLACE_M = 1e-6  # distance, m, of a last corner that repeats the first
+_PAINT_M = 0.1  # largest height, m, of an object that may be paint: posts and barriers are higher; chosen
+_MOST_REPEATED = 100_000  # repetitions of an object; a road of 100 km has fewer dashes
 _STEP_M = 0.05  # step, m, by which a spiral is integrated: it is exact to a micrometre in bends of roads
 
 
@@ -23,13 +25,6 @@ class ObjectOutline(NamedTuple):
     positions: FloatArray
     name: str
     called: str | None
-
-
-class ObjectOutlines(NamedTuple):
-    """The outlines in a file, and the system of its coordinates, None if it is not stated."""
-
-    outlines: list[ObjectOutline]
-    crs: str | None
 
 
 class Pose(NamedTuple):
@@ -43,6 +38,14 @@ class Pose(NamedTuple):
         cos = np.cos(self.heading_rad)
         sin = np.sin(self.heading_rad)
         return np.asarray(self.position + points @ np.array([[cos, sin], [-sin, cos]]))
+
+
+class ObjectOutlines(NamedTuple):
+    """The outlines in a file, the system of its coordinates, if stated, and its frame in that system."""
+
+    outlines: list[ObjectOutline]
+    crs: str | None
+    frame: Pose
 
 
 @dataclass(frozen=True)
@@ -116,7 +119,20 @@ def outlines_of(path: Path) -> ObjectOutlines:
             raise MapFileError(f"{where}: {failure}; fix the file") from None
         except MapFileError as failure:
             raise MapFileError(f"{where}: {failure}") from None
-    return ObjectOutlines(outlines, reference.strip() if reference and reference.strip() else None)
+    crs = reference.strip() if reference and reference.strip() else None
+    try:
+        return ObjectOutlines(outlines, crs, _frame_of(root))
+    except (ValueError, MapFileError) as failure:
+        raise MapFileError(f"{path}: header: {failure}; fix the file") from None
+
+
+def _frame_of(root: ET.Element) -> Pose:
+    """The place of the file's coordinates in its system, which the header may state as an offset."""
+    offset = root.find("header/offset")
+    if offset is None:
+        return Pose(np.zeros(2), 0.0)
+    place = np.array([number_in(offset, "x", 0.0), number_in(offset, "y", 0.0)])
+    return Pose(place, number_in(offset, "hdg", 0.0))
 
 
 def pieces_of(road: ET.Element) -> list[Piece]:
@@ -142,24 +158,75 @@ def _outlines(entry: ET.Element, pieces: list[Piece]) -> list[ObjectOutline]:
     called = entry.get("name") or entry.get("type")
     name = f"object {entry.get('id', '')[:40]} ({(called or '')[:40]})"
     outline_entries = entry.findall("outlines/outline") or entry.findall("outline")
-    place = place_along(pieces, number_in(entry, "s"))
-    centre = place.beside(np.array([[0.0, number_in(entry, "t", 0.0)]]))[0]
-    frame = Pose(centre, place.heading_rad + number_in(entry, "hdg", 0.0))
+    is_painted = number_in(entry, "height", 0.0) <= _PAINT_M and called is not None
     outlines = []
-    for outline in outline_entries:
-        local = [
-            (number_in(corner, "u"), number_in(corner, "v")) for corner in outline.findall("cornerLocal")
-        ]
-        on_road = [
-            place_along(pieces, number_in(corner, "s")).beside(np.array([[0.0, number_in(corner, "t")]]))[0]
-            for corner in outline.findall("cornerRoad")
-        ]
-        points = frame.beside(np.array(local)) if local else np.array(on_road).reshape(-1, 2)
-        if len(points) > 1 and np.abs(points[0] - points[-1]).max() < _SAME_PLACE_M:
-            points = points[:-1]
-        if len(points) > 2 and outline.get("closed", "true") != "false":
-            outlines.append(ObjectOutline(points, name, called))
+    for instance in _instances(entry):
+        place = place_along(pieces, instance.s_m)
+        centre = place.beside(np.array([[0.0, instance.t_m]]))[0]
+        frame = Pose(centre, place.heading_rad + number_in(entry, "hdg", 0.0))
+        if not outline_entries and is_painted and min(instance.size_m) > 0:
+            corners = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]) * instance.size_m
+            outlines.append(ObjectOutline(frame.beside(corners), name, called))
+        for outline in outline_entries:
+            points = _corners(outline, frame, pieces)
+            is_area = outline.get("closed", "true") != "false" and outline.get("outer", "true") != "false"
+            if len(points) > 2 and is_area:
+                outlines.append(ObjectOutline(points, name, called))
     return outlines
+
+
+class _Instance(NamedTuple):
+    """An object, or a repetition of it: its station, m, how far to the left, m, and length and width, m."""
+
+    s_m: float
+    t_m: float
+    size_m: tuple[float, float]
+
+
+def _instances(entry: ET.Element) -> list[_Instance]:
+    """The object itself, or its repetitions; none of what it is along the whole road, such as a barrier."""
+    size_m = (number_in(entry, "length", 0.0), number_in(entry, "width", 0.0))
+    repeats = entry.findall("repeat")
+    if not repeats:
+        return [_Instance(number_in(entry, "s"), number_in(entry, "t", 0.0), size_m)]
+    instances = []
+    for repeat in repeats:
+        begin_m = number_in(repeat, "s")
+        length_m = number_in(repeat, "length")
+        distance_m = number_in(repeat, "distance", 0.0)
+        if distance_m <= 0:
+            continue
+        count = int((length_m + _SAME_PLACE_M) / distance_m) + 1
+        if count > _MOST_REPEATED:
+            raise MapFileError(f"an object is repeated {count} times; fix the file")
+        for along_m in (distance_m * np.arange(count)).tolist():
+            share = along_m / length_m if length_m > 0 else 0.0
+            t_m = _between(repeat, "t", number_in(entry, "t", 0.0), share)
+            sides_m = (
+                _between(repeat, "length", size_m[0], share),
+                _between(repeat, "width", size_m[1], share),
+            )
+            instances.append(_Instance(begin_m + along_m, t_m, sides_m))
+    return instances
+
+
+def _between(repeat: ET.Element, key: str, usual: float, share: float) -> float:
+    """A value between those that a repetition states for its start and its end."""
+    start = number_in(repeat, f"{key}Start", usual)
+    return start + share * (number_in(repeat, f"{key}End", start) - start)
+
+
+def _corners(outline: ET.Element, frame: Pose, pieces: list[Piece]) -> FloatArray:
+    """The corners (N, 2) of an outline, in the object's ``frame`` or along the road."""
+    local = [(number_in(corner, "u"), number_in(corner, "v")) for corner in outline.findall("cornerLocal")]
+    on_road = [
+        place_along(pieces, number_in(corner, "s")).beside(np.array([[0.0, number_in(corner, "t")]]))[0]
+        for corner in outline.findall("cornerRoad")
+    ]
+    points = frame.beside(np.array(local)) if local else np.array(on_road).reshape(-1, 2)
+    if len(points) > 1 and np.abs(points[0] - points[-1]).max() < _SAME_PLACE_M:
+        return points[:-1]
+    return points
 
 
 def number_in(entry: ET.Element, key: str, missing: float | None = None) -> float:

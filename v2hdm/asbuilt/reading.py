@@ -17,10 +17,12 @@ from typing import Any
 import numpy as np
 
 from v2hdm.asbuilt.design import Design, DesignShape, design_of_map
-from v2hdm.asbuilt.opendrive import outlines_of
+from v2hdm.asbuilt.drawing import UNITS_M, read_drawing, units_per_system
+from v2hdm.asbuilt.opendrive import Pose, outlines_of
 from v2hdm.catalogue import load_catalogue
-from v2hdm.errors import ConfigError, MapFileError, need, shown
+from v2hdm.errors import ConfigError, MapFileError, shown
 from v2hdm.geometry import geodetic
+from v2hdm.geometry.datums import is_named, is_same_datum
 from v2hdm.geometry.geodetic import LOCAL, enu_from_geodetic
 from v2hdm.io.maps.reading import (
     GEOMETRY,
@@ -30,19 +32,13 @@ from v2hdm.io.maps.reading import (
     geopackage_rows,
     read_map,
 )
-from v2hdm.records import CROSSWALK, FOOT_M, FloatArray, GeodeticOrigin, HDMap
+from v2hdm.records import CROSSWALK, FloatArray, GeodeticOrigin, HDMap
 from v2hdm.store.files import load_json, take_mapping
-from v2hdm.store.inputs import note_input
 from v2hdm.store.names import map_file
 
 _log = logging.getLogger(__name__)
 
 _NAMED_BY = ("class", "kind", "type", "layer", "name")  # properties that say what a feature is, in this order
-_UNITS_M: Mapping[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "ft": FOOT_M, "in": FOOT_M / 12}
-"""Metres of the units of a drawing."""
-
-_DRAWING_UNITS: Mapping[int, str] = {1: "in", 2: "ft", 4: "mm", 5: "cm", 6: "m"}
-"""Units by their number in the header variable INSUNITS (DXF reference)."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +47,7 @@ class Source:
 
     Attributes:
         crs: the system of its coordinates, such as EPSG:25832, or local for the map's own frame.
-        unit: the unit of a drawing, as m, cm, mm, ft or in.
+        unit: the unit of a drawing, as m, cm, mm, ft, us-ft or in.
         kinds: our class by the file's name of it.
     """
 
@@ -101,11 +97,22 @@ def read_design(path: Path, hd_map: HDMap, source: Source | None = None) -> Desi
         raise ConfigError(
             f"{path}: does not say what its coordinates count from; give --crs, or --crs {LOCAL}"
         )
+    if crs != LOCAL and origin is not None and not is_named(geodetic.datum_of(crs, str(path), MapFileError)):
+        _log.warning("%s: its system names no datum: taken to be on the map's, %s", path, origin.datum)
     shapes = []
     for drawn, kind in of_known_kinds(content.shapes, classes_of(hd_map), source, path):
         outline = in_map(drawn.positions, crs, origin, str(path))
         shapes.append(DesignShape(drawn.name, kind, outline))
-    return Design(tuple(shapes), str(path), content.lines)
+    return Design(_without_copies(shapes), str(path), content.lines)
+
+
+def _without_copies(shapes: Iterable[DesignShape]) -> tuple[DesignShape, ...]:
+    """The shapes without those that are drawn twice, as a hatch and its border are."""
+    first_of = dict[tuple[str | None, frozenset[tuple[float, ...]]], DesignShape]()
+    for shape in shapes:
+        corners = frozenset(map(tuple, (np.round(shape.outline_map, 3) + 0.0).tolist()))
+        first_of.setdefault((shape.kind, corners), shape)
+    return tuple(first_of.values())
 
 
 def classes_of(hd_map: HDMap) -> tuple[str, ...]:
@@ -166,7 +173,7 @@ def in_map(positions: FloatArray, crs: str, origin: GeodeticOrigin | None, where
             f"{where}: is in {crs}, but the map has no origin on the earth; give a design in the map's frame"
         )
     datum = geodetic.datum_of(crs, where, MapFileError)
-    if datum.replace(" ", "") != origin.datum.replace(" ", ""):
+    if is_named(datum) and not is_same_datum(datum, origin.datum):
         raise MapFileError(
             f"{where}: is on {datum} ({crs}), the map on {origin.datum}, which differ by decimetres; bring "
             "both to one datum"
@@ -234,7 +241,6 @@ def crs_of_geojson(content: Mapping[str, Any]) -> str:
     return str(name) if name else _RFC_7946
 
 
-_SAME_PLACE = 1e-9  # distance, in units of a drawing, of a last vertex that repeats the first
 _RFC_7946 = "EPSG:4326"  # the only system of GeoJSON: longitude and latitude
 
 
@@ -264,55 +270,29 @@ def _read_geopackage(path: Path, source: Source) -> _File:
 
 
 def _read_dxf(path: Path, source: Source) -> _File:
-    ezdxf = need("ezdxf", "gis", "designs in DXF", ConfigError)
-    note_input(path)
-    try:
-        document = ezdxf.readfile(path)
-        stated = document.header.custom_vars.get("crs") if document.header.custom_vars else None
-        unit = source.unit or _DRAWING_UNITS.get(int(document.header.get("$INSUNITS", 0)))
-        entities = list(document.modelspace())
-    except (ezdxf.DXFError, OSError, ValueError, TypeError, UnicodeError, RecursionError) as failure:
-        # What is no DXF file at all is an OSError, too.
-        reason = getattr(failure, "strerror", None) or failure
-        raise MapFileError(f"{path}: is no drawing that can be read ({reason}); check the file") from None
-    if unit is None:
-        raise ConfigError(f"{path}: does not state its unit; give --unit m, cm, mm, ft or in")
-    metres = _unit_m(unit)
-    shapes = []
-    lines = 0
-    for entity in entities:
-        points = _vertices(entity)
-        if points is None:
-            continue
-        name = f"{entity.dxftype()} {entity.dxf.handle} on {entity.dxf.layer}"
-        is_closed = len(points) > 3 and bool(np.abs(points[0] - points[-1]).max() < _SAME_PLACE)
-        if is_closed or (len(points) > 2 and entity.is_closed):
-            ring = points[:-1] if is_closed else points
-            shapes.append(Drawn(metres * ring, name, entity.dxf.layer))
-        else:
-            lines = lines + 1
-    return _File(shapes, stated, lines)
-
-
-def _vertices(entity: Any) -> FloatArray | None:
-    """The vertices (N, 2) of a polyline, None of other entities."""
-    if entity.dxftype() == "LWPOLYLINE":
-        return np.array([point[:2] for point in entity.get_points("xy")], dtype=np.float64).reshape(-1, 2)
-    if entity.dxftype() == "POLYLINE":
-        points = [tuple(vertex.dxf.location)[:2] for vertex in entity.vertices]
-        return np.array(points, dtype=np.float64).reshape(-1, 2)
-    return None
-
-
-def _unit_m(unit: str) -> float:
-    if unit not in _UNITS_M:
-        raise ConfigError(f"--unit {shown(unit)}: is no unit of a drawing; give {', '.join(_UNITS_M)}")
-    return _UNITS_M[unit]
+    drawing = read_drawing(path, source.unit)
+    if drawing.unreadable:
+        named = ", ".join(f"{count} {kind}" for kind, count in sorted(drawing.unreadable.items()))
+        _log.warning(
+            "%s: left out %s, whose outlines only CAD can read; explode those that are paint",
+            path, named,
+        )  # fmt: skip
+    crs = source.crs or drawing.crs
+    if crs is None or crs == LOCAL:
+        scale = UNITS_M[drawing.unit]
+    else:
+        scale = units_per_system(drawing.unit, geodetic.units_of(crs, str(path), MapFileError).horizontal_m)
+    shapes = [Drawn(scale * area.outline, area.name, area.layer) for area in drawing.areas]
+    return _File(shapes, drawing.crs, drawing.lines)
 
 
 def _read_opendrive(path: Path, source: Source) -> _File:
     drawing = outlines_of(path)
-    shapes = [Drawn(outline.positions, outline.name, outline.called) for outline in drawing.outlines]
+    # The header's offset leads to the system; the map's own frame is that of the file.
+    frame = drawing.frame if source.crs != LOCAL else Pose(np.zeros(2), 0.0)
+    shapes = [
+        Drawn(frame.beside(outline.positions), outline.name, outline.called) for outline in drawing.outlines
+    ]
     return _File(shapes, drawing.crs, 0)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import os
 import re
 import shutil
 import sys
@@ -90,7 +91,7 @@ def work_on(command: Command, door: Door, work: Callable[[Job], int | None], arg
     if parsed.help:
         print(help_text(command, door))
         return 0
-    overrides = renamed_overrides(parsed.overrides)
+    overrides = [_quoted(override) for override in renamed_overrides(parsed.overrides)]
     try:
         _check_own_files(parsed.config_dir, overrides)
         with tempfile.TemporaryDirectory(prefix="v2hdm-") as folder:
@@ -104,6 +105,25 @@ def work_on(command: Command, door: Door, work: Callable[[Job], int | None], arg
         print(masked(OmegaConf.to_yaml(composed)))
         return 0
     return work(Job(to_dataclass(composed, door.schema, door.advice), to_yaml(composed))) or 0
+
+
+def _quoted(override: str) -> str:
+    """An override whose value is the path of something that exists, so that Hydra takes it as it is.
+
+    Names of people's folders have umlauts, brackets and dates, which Hydra's grammar has other uses for.
+    """
+    key, equals, value = override.partition("=")
+    is_plain = not _HYDRAS.search(value) and not (key == "drive.path" and _NUMBER.fullmatch(value))
+    if not equals or is_plain or value[0] in "'\"[{":
+        return override
+    if not os.path.exists(value):  # noqa: PTH110, for names that are too long for a file are none
+        return override
+    return f"{key}='" + value.replace("'", "\\'") + "'"
+
+
+# Letters that Hydra's grammar wants quotes around.
+_HYDRAS = re.compile(r"[^\w./+:%@*-]|[^\x00-\x7f]")
+_NUMBER = re.compile(r"[\d.]+")
 
 
 def _compose(
@@ -209,10 +229,8 @@ def explain(error: Exception, schema: type[Any], overrides: list[str]) -> Config
     message = "; ".join(dict.fromkeys(line for line in lines if not _NOISE.match(line)))
     key = re.search(r"full_key: (\S+)", f"{error}\n{root}")
     place = f" of {key.group(1)}" if key and key.group(1) not in message else ""
-    if "missing EQUAL" in message:
-        bare = [
-            override for override in overrides if "=" not in override and not override.startswith(("-", "~"))
-        ]
+    bare = [override for override in overrides if "=" not in override and not override.startswith(("-", "~"))]
+    if "missing EQUAL" in message or (bare and _UNQUOTED.search(message)):
         word = " ".join(bare[-1:]) or "an argument"
         return ConfigError(
             f"configuration: {shown(word)} is not key=value; write drive.path={word}, see --help"

@@ -1,7 +1,8 @@
 """Areas of paint: words, numbers and hatched boxes, each by the hull on the ground of all of its pieces.
 
-An area is made of pieces that do not touch: letters, hatching. Pieces of one class are one area where the gap
-between them on the ground is small beside their own size. Crosswalks are composed of bars.
+An area is made of pieces that do not touch: letters, hatching. Each is named whole, as writing or as a box.
+Pieces of one class are one area where the gap between them on the ground is small beside their own size.
+Crosswalks are composed of bars.
 """
 
 from __future__ import annotations
@@ -15,11 +16,21 @@ import numpy as np
 
 from v2hdm.catalogue import Catalogue
 from v2hdm.detection.camera import RoadCamera
-from v2hdm.detection.network import NetworkOutput, as_probability
+from v2hdm.detection.hatching import box_probability, meshes
+from v2hdm.detection.network import NetworkOutput, as_probability, as_shares
 from v2hdm.detection.quads.blobs import outlines_of
 from v2hdm.geometry.planar import rectangle_size
 from v2hdm.geometry.rows import linked_groups, outline_of_row, rows_of_bars
-from v2hdm.records import CROSSWALK, CROSSWALK_BAR, TEXT, BoolArray, FloatArray, IntArray, MarkingDetection
+from v2hdm.records import (
+    BOX,
+    CROSSWALK,
+    CROSSWALK_BAR,
+    TEXT,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    MarkingDetection,
+)
 
 _LEAST_CELLS = 5  # elements of paint of a piece: fewer are noise
 _LEAST_SHARE = 0.25
@@ -39,6 +50,7 @@ _CUT_PX = 6.0  # distance from where the image or its road begins, px, within wh
 class _Piece(NamedTuple):
     """A connected piece of paint of one class."""
 
+    kind: str
     points_px: FloatArray  # (N, 2) of its outline, recorded px, in no order
     ground: FloatArray  # (N, 2) the same on the ground, m
     extent_m: float  # length of the smallest rectangle around it
@@ -61,35 +73,48 @@ def find_areas(
     cuts the paint.
     """
     names = output.area_classes
-    # Most images show none: that is seen at once where no area is the likeliest anywhere.
-    if not names or not (output.areas.max(axis=0) > output.kinds.max(axis=0)).any():
+    if not names:
         return []
-    rows, columns = np.nonzero(output.paint > 0)
+    rows, columns = np.divmod(np.flatnonzero(output.paint > 0), output.paint.shape[1])
     is_in_reach = output.top + output.stride * (rows + 1) > reach_px
     rows = rows[is_in_reach]
     columns = columns[is_in_reach]
-    probability = output.area_probability(rows, columns)
-    best = probability.argmax(axis=0)
+    odds = output.area_odds(rows, columns)
+    best = odds.argmax(axis=0)
+    # Most images show none.
+    if max(np.bincount(best, minlength=len(names))[: len(names)], default=0) < _LEAST_CELLS:
+        return []
+    probability = as_shares(odds)
     of_group = {catalogue.classes[name].group for name in names}
     all_names = (*names, *output.classes)
     is_alike = np.array([catalogue.classes[name].group in of_group for name in all_names])[best]
-    alike = np.zeros(output.paint.shape, dtype=np.uint8)
-    alike[rows[is_alike], columns[is_alike]] = 1
-    areas = []
-    for number, name in enumerate(names):
-        is_of_class = best == number
-        if np.count_nonzero(is_of_class) < _LEAST_CELLS:
+    alike = _Part.of(rows[is_alike], columns[is_alike])
+    whole = alike.connected(np.ones(np.count_nonzero(is_alike), dtype=np.uint8))
+    pieces: list[_Piece] = []
+    for kinds in _named_together(names):
+        numbers = [names.index(kind) for kind in kinds]
+        is_of_kinds = np.isin(best, numbers)
+        if np.count_nonzero(is_of_kinds) < _LEAST_CELLS:
             continue
-        share = np.zeros(output.paint.shape, dtype=np.float32)
-        share[rows[is_of_class], columns[is_of_class]] = probability[number, is_of_class]
-        pieces = _pieces(output, camera, share, alike)
-        for members in _together(pieces, _MOST_GAP_M.get(name, _OTHER_GAP_M)):
-            area = _area(name, [pieces[k] for k in members], output, camera, catalogue)
+        part = _Part.of(rows[is_of_kinds], columns[is_of_kinds])
+        share = probability[numbers][:, is_of_kinds]
+        pieces += _pieces(kinds, output, camera, part, share, alike, whole)
+    areas = []
+    for name in names:
+        named = [piece for piece in pieces if piece.kind == name]
+        for members in _together(named, _MOST_GAP_M.get(name, _OTHER_GAP_M)):
+            area = _area(name, [named[k] for k in members], output, camera, catalogue)
             ground = camera.unproject(area.outline_px)
             within = camera.range_m(ground.mean(axis=0)) <= max_range_m
             if within and area.score >= least_score:
                 areas.append(area)
     return areas
+
+
+def _named_together(names: Sequence[str]) -> list[tuple[str, ...]]:
+    """The classes of areas; those of which a piece may show both to the network are together."""
+    written = (TEXT, BOX) if {TEXT, BOX} <= set(names) else ()
+    return [*([written] if written else []), *((name,) for name in names if name not in written)]
 
 
 def find_crosswalks(
@@ -116,31 +141,102 @@ def find_crosswalks(
     return crosswalks
 
 
-def _pieces(output: NetworkOutput, camera: RoadCamera, share: np.ndarray, alike: np.ndarray) -> list[_Piece]:
-    """The pieces of a class with this ``share`` (h, w) of the paint; ``alike`` (h, w) is 1 for its group."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats((share > 0).view(np.uint8), ltype=cv2.CV_16U)
-    _, whole, whole_stats, _ = cv2.connectedComponentsWithStats(alike, ltype=cv2.CV_16U)
-    framed = cv2.copyMakeBorder(output.paint, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=-1.0)
-    piece = cv2.copyMakeBorder(labels, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0).astype(np.int32)
+class _Part(NamedTuple):
+    """Elements of the paint, in the part of it that they reach, and one row or column more all around."""
+
+    rows: IntArray  # (N,) of the part
+    columns: IntArray  # (N,) of the part
+    first: tuple[int, int]  # row and column of the paint that are the part's first
+    shape: tuple[int, int]  # of the part
+
+    @classmethod
+    def of(cls, rows: IntArray, columns: IntArray) -> _Part:
+        """The part that elements at rows and columns (N,) of the paint are in; N is not 0."""
+        first = int(rows.min()) - 1, int(columns.min()) - 1
+        shape = int(rows.max()) + 2 - first[0], int(columns.max()) + 2 - first[1]
+        return cls(rows - first[0], columns - first[1], first, shape)
+
+    def filled(self, values: np.ndarray) -> np.ndarray:
+        """A map of the part with these values (N,) at the elements, and 0 elsewhere."""
+        plane = np.zeros(self.shape, dtype=values.dtype)
+        plane[self.rows, self.columns] = values
+        return plane
+
+    def connected(self, values: np.ndarray) -> _Connected:
+        """The connected pieces of elements with ``values`` (N,) over 0."""
+        _, labels, stats, _ = cv2.connectedComponentsWithStats(self.filled(values), ltype=cv2.CV_16U)
+        return _Connected(labels, stats)
+
+
+class _Connected(NamedTuple):
+    """Connected pieces of elements of a part."""
+
+    labels: np.ndarray  # (h, w) of the pieces, from 1 on
+    stats: np.ndarray  # (P + 1, 5) OpenCV's
+
+
+def _pieces(
+    kinds: tuple[str, ...],
+    output: NetworkOutput,
+    camera: RoadCamera,
+    part: _Part,
+    share: np.ndarray,
+    alike: _Part,
+    whole: _Connected,
+) -> list[_Piece]:
+    """The pieces of K classes, whose ``part`` has these ``share`` (K, N) of the paint; of two: text and box.
+
+    ``alike`` is the part of their group, and ``whole`` are the pieces of that.
+    """
+    of_all = share.sum(axis=0)
+    labels, stats = part.connected((of_all > 0).view(np.uint8))
+    first_row, first_column = part.first
+    framed = np.full(part.shape, -1.0, dtype=np.float32)
+    rows = slice(max(first_row, 0), first_row + part.shape[0])
+    columns = slice(max(first_column, 0), first_column + part.shape[1])
+    paint = output.paint[rows, columns]
+    down, right = max(-first_row, 0), max(-first_column, 0)
+    framed[down : down + paint.shape[0], right : right + paint.shape[1]] = paint
+    piece = labels.astype(np.int16)
     level = np.where(piece > 0, np.maximum(framed, 1e-3), np.minimum(framed, -1e-3))
-    first_px = np.array([0.0, output.top]) + (output.stride - 1) / 2 - output.stride
+    first_px = (
+        (output.stride - 1) / 2 + output.stride * np.array([first_column, first_row]) + [0.0, output.top]
+    )
+    of_element = labels[part.rows, part.columns]
     pieces = []
-    for number, points in enumerate(outlines_of(level, piece, count - 1), start=1):
+    for number, points in enumerate(outlines_of(level, piece, len(stats) - 1), start=1):
         cells = int(stats[number, cv2.CC_STAT_AREA])
-        is_of_piece = labels == number
-        whole_cells = whole_stats[np.bincount(whole[is_of_piece]).argmax(), cv2.CC_STAT_AREA]
-        if cells < max(_LEAST_CELLS, _LEAST_SHARE * whole_cells):
+        if cells < _LEAST_CELLS:
+            continue
+        elements = np.flatnonzero(of_element == number)
+        row = part.rows[elements]
+        column = part.columns[elements]
+        in_whole = whole.labels[row + first_row - alike.first[0], column + first_column - alike.first[1]]
+        if cells < _LEAST_SHARE * whole.stats[np.bincount(in_whole).argmax(), cv2.CC_STAT_AREA]:
             continue
         points_px = first_px + output.stride * points
         ground = camera.unproject(points_px)
         is_on_ground = np.isfinite(ground).all(axis=1)
         if is_on_ground.sum() < 3:
             continue
-        certainty = float((as_probability(output.paint[is_of_piece]) * share[is_of_piece]).mean())
         extent_m = rectangle_size(ground[is_on_ground])[0]
-        is_cut = bool(_cut(points_px, output, camera).any())
+        certainty = float((as_probability(framed[row, column]) * of_all[elements]).mean())
+        kind = kinds[0]
+        if len(kinds) > 1:
+            text_cells, box_cells = share[:, elements].sum(axis=1).tolist()
+            probability = box_probability(text_cells, box_cells, meshes(row, column, framed > 0))
+            kind = kinds[int(probability > 0.5)]
+            certainty *= max(probability, 1.0 - probability)
         pieces.append(
-            _Piece(points_px[is_on_ground], ground[is_on_ground], extent_m, cells, certainty, is_cut)
+            _Piece(
+                kind=kind,
+                points_px=points_px[is_on_ground],
+                ground=ground[is_on_ground],
+                extent_m=extent_m,
+                cells=cells,
+                certainty=certainty,
+                is_cut=bool(_cut(points_px, output, camera).any()),
+            )
         )
     return pieces
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from v2hdm.catalogue import PAINT_CLASSES, SYMBOL, Catalogue
-from v2hdm.detection.areas import find_areas
+from v2hdm.detection.areas import find_areas, find_crosswalks
 from v2hdm.detection.arrows import arrow_probability, features_of
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.classifier import Readings, find_markings, read_markings
@@ -29,6 +29,7 @@ from v2hdm.detection.stopwatch import lap
 from v2hdm.detection.weights import NETWORK_FILE, check_weights
 from v2hdm.doors import checked
 from v2hdm.errors import DetectorError
+from v2hdm.geometry.planar import following
 from v2hdm.native import tell_missing
 from v2hdm.records import ARROW, BoolArray, Camera, FloatArray, LaneDetection, MarkingDetection
 from v2hdm.safe.texts import shown
@@ -77,30 +78,32 @@ class Detector:
 
     @checked
     def detect(
-        self, image_bgr: np.ndarray, camera: Camera
+        self, image_bgr: np.ndarray, camera: Camera, has_boundaries: bool = True
     ) -> tuple[tuple[MarkingDetection, ...], tuple[LaneDetection, ...]]:
         """Find the markings and lanes of one image (H, W, 3) uint8 BGR.
 
-        Raises DetectorError where the image is not of that form or not of the camera's size.
+        Without ``has_boundaries``, of lanes only their paint. Raises DetectorError where the image is not of
+        that form or not of the camera's size.
         """
-        return self.detect_in(self.run_network(image_bgr, camera), image_bgr, camera)
+        return self.detect_in(self.run_network(image_bgr, camera), image_bgr, camera, has_boundaries)
 
     def detect_in(
-        self, output: NetworkOutput, image_bgr: np.ndarray, camera: Camera
+        self, output: NetworkOutput, image_bgr: np.ndarray, camera: Camera, has_boundaries: bool = True
     ) -> tuple[tuple[MarkingDetection, ...], tuple[LaneDetection, ...]]:
         """Find the markings and lanes of an image of which the network's output is known."""
         with lap("propose"):
             proposals = self.propose(output, camera)
         with lap("lanes"):
             image = self.lane_image(proposals, image_bgr)
-            lanes = (*image.paint, *find_boundaries(image))
+            lanes = (*image.paint, *(find_boundaries(image) if has_boundaries else ()))
         with lap("fit"):
             readings = self.read(image_bgr, proposals)
         with lap("judge"):
             quads = find_markings(readings, proposals.camera, self.options)
         markings = _likelier(quads, self._symbols(image_bgr, proposals))
         with lap("areas"):
-            areas = _of_several(self._areas(proposals), markings)
+            crosswalks = [crosswalk for crosswalk, _ in find_crosswalks(markings, proposals.camera)]
+            areas = _of_several(self._areas(proposals), (*markings, *crosswalks))
         return (*_not_of(areas, markings), *areas), lanes
 
     @checked
@@ -210,10 +213,12 @@ class Detector:
                 continue
             kind = piece.symbol_kind(names)
             score = piece.symbol_score(kind)
-            range_m = proposals.camera.range_m(piece.outline_vehicle.mean(axis=0))
-            after = piece.index + 1 + piece.blob.parts
-            if score < _LEAST_NAMED or not range_m <= reach_m:  # nan is not
+            if score < _LEAST_NAMED:
                 continue
+            range_m = proposals.camera.range_m(piece.outline_vehicle.mean(axis=0))
+            if not range_m <= reach_m:  # nan is not
+                continue
+            after = piece.index + 1 + piece.blob.parts
             if kind == ARROW:
                 score = arrow_probability(score, features_of(piece, proposals.camera))
             if score < self.options.min_score:
@@ -259,7 +264,7 @@ def _without_vehicle(output: NetworkOutput, camera: Camera) -> NetworkOutput:
 
 
 def _of_several(areas: Sequence[MarkingDetection], markings: Markings) -> list[MarkingDetection]:
-    """The areas that lie in no marking: what names a part of an arrow a word does not make it one."""
+    """The areas that lie in no marking: a part of an arrow, and bars, are no word, whatever names them so."""
     shapes = [marking.outline_px if len(marking.outline_px) else marking.corners_px for marking in markings]
     hulls = [cv2.convexHull(shape_px.astype(np.float32)) for shape_px in shapes]
 
@@ -294,17 +299,40 @@ def _tell_lacking(path: Path, names: tuple[str, ...]) -> None:
 
 
 def _likelier(quads: Sequence[MarkingDetection], symbols: Sequence[MarkingDetection]) -> Markings:
-    """Quadrilaterals and symbols of one image: where one lies in the other, the one of the higher score."""
-    centres = [quad.corners_px.mean(axis=0).tolist() for quad in quads]
+    """Quadrilaterals and symbols of one image: where one lies in the other, the one of the higher score.
+
+    A quadrilateral lies in a symbol that covers its centre and most of its longer middle line: a stop line
+    that an arrow crosses does not.
+    """
+    if not symbols:
+        return tuple(quads)
     left_out: set[int] = set()
     likelier_symbols = []
+    middle_lines = _on_middle_lines(np.array([quad.corners_px for quad in quads]).reshape(-1, 4, 2))
     for symbol in symbols:
         polygon = symbol.outline_px.astype(np.float32)
-        on_it = [k for k, centre in enumerate(centres) if cv2.pointPolygonTest(polygon, centre, False) > 0]
+        on_it = [k for k, points in enumerate(middle_lines) if _covers(polygon, points)]
         if all(quads[k].score < symbol.score for k in on_it):
             left_out.update(on_it)
             likelier_symbols.append(symbol)
     return (*(quad for k, quad in enumerate(quads) if k not in left_out), *likelier_symbols)
+
+
+def _on_middle_lines(corners_px: FloatArray) -> FloatArray:
+    """Points (M, 5, 2) along most of the longer middle lines of quadrilaterals, their centres the third."""
+    sides = (corners_px + following(corners_px)) / 2
+    across = sides[:, 2:] - sides[:, :2]
+    longer = np.linalg.norm(across, axis=2).argmax(axis=1)
+    way = across[np.arange(len(across)), longer][:, None]
+    return np.asarray(corners_px.mean(axis=1)[:, None] + np.linspace(-0.4, 0.4, 5)[:, None] * way)
+
+
+def _covers(polygon: np.ndarray, points: FloatArray) -> bool:
+    """Whether a polygon (N, 2) float32 holds the middle and most of points (M, 2)."""
+    if not cv2.pointPolygonTest(polygon, points[len(points) // 2].tolist(), False) > 0:
+        return False
+    inside = [cv2.pointPolygonTest(polygon, point, False) > 0 for point in points.tolist()]
+    return 2 * sum(inside) > len(inside)
 
 
 def _check_image(image_bgr: np.ndarray, camera: Camera) -> None:

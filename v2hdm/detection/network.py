@@ -167,12 +167,12 @@ class NetworkOutput:
 
     def class_probability(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Probability (K, N) of each of ``classes`` at elements of ``paint``."""
-        return _softmax(self._logits_at(self.kinds, rows, columns))
+        return as_shares(self._logits_at(self.kinds, rows, columns))
 
-    def area_probability(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Probability (A + K, N) of areas and, after them, of other classes at elements of ``paint``."""
+    def area_odds(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Logits (A + K, N) of areas and, after them, of other classes at elements of ``paint``."""
         planes = (self.areas, self.kinds)
-        return _softmax(np.concatenate([self._logits_at(logits, rows, columns) for logits in planes]))
+        return np.concatenate([self._logits_at(logits, rows, columns) for logits in planes])
 
     def _logits_at(self, logits: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Logits (C, N) of planes like ``kinds`` at elements of ``paint``."""
@@ -280,7 +280,7 @@ def as_seen_from(camera: RoadCamera, kinds: np.ndarray, classes: Sequence[str]) 
     return np.asarray(kinds[[classes.index(SEEN_ACROSS.get(name, name)) for name in classes]])
 
 
-def _softmax(logits: np.ndarray) -> np.ndarray:
+def as_shares(logits: np.ndarray) -> np.ndarray:
     """Probabilities (C, N) of logits, in their place."""
     logits -= logits.max(axis=0)
     np.exp(logits, out=logits)
@@ -327,11 +327,12 @@ def _joined(fine: np.ndarray, coarse: np.ndarray, seam: int, coarse_top: int, st
     first = seam // stride
     overlap = (seam - coarse_top) // stride
     height = first - overlap + 2 * coarse.shape[1]
-    joined = np.empty((len(fine), height, 2 * coarse.shape[2]), dtype=np.float32)
-    joined[:, :first] = fine[:, :first]
+    width = 2 * coarse.shape[2]
+    joined = np.empty((len(fine), height, width), dtype=np.float32)
     for whole, plane in zip(joined, coarse, strict=True):
-        doubled = cv2.resize(plane, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
-        whole[first:] = doubled[overlap:]
+        doubled = whole[first - overlap :]
+        cv2.resize(plane, (width, len(doubled)), dst=doubled, interpolation=cv2.INTER_LINEAR)
+    joined[:, :first] = fine[:, :first]
     return joined
 
 

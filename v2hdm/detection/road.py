@@ -122,12 +122,20 @@ class RoadDetector:
     """Finds the markings and lanes in the images of one camera; use one per thread.
 
     ``detector`` may be shared by the cameras of one thread. Without a ``calibration`` there are no metres.
+    With ``is_for_localizer`` there are neither metres nor lanes but by their paint.
     """
 
-    def __init__(self, detector: Detector, camera: Camera, calibration: Calibration | None = None):
+    def __init__(
+        self,
+        detector: Detector,
+        camera: Camera,
+        calibration: Calibration | None = None,
+        is_for_localizer: bool = False,
+    ):
         self.detector = detector
         self.camera = camera
         self.calibration = calibration
+        self.is_for_localizer = is_for_localizer
 
     @classmethod
     def load(
@@ -167,12 +175,13 @@ class RoadDetector:
         time: regions where a map expects them, as of :meth:`v2hdm.Localizer.regions`.
         """
         lanes: Sequence[LaneDetection] = ()
+        has_boundaries = not self.is_for_localizer
         if regions_px is not None:
             markings = self.detector.detect_in_regions(image_bgr, self.camera, regions_px)
         elif output is None:
-            markings, lanes = self.detector.detect(image_bgr, self.camera)
+            markings, lanes = self.detector.detect(image_bgr, self.camera, has_boundaries)
         else:
-            markings, lanes = self.detector.detect_in(output, image_bgr, self.camera)
+            markings, lanes = self.detector.detect_in(output, image_bgr, self.camera, has_boundaries)
         with lap("metres"):
             crosswalks = find_crosswalks(markings, self.detector.road_camera(self.camera))
             road = self._on_ground((*markings, *(crosswalk for crosswalk, _ in crosswalks)), lanes)
@@ -184,7 +193,7 @@ class RoadDetector:
     def _on_ground(self, markings: Sequence[MarkingDetection], lanes: Sequence[LaneDetection]) -> Road:
         """The detections with their places on the ground, if the camera is calibrated."""
         none = np.empty((0, 2))
-        if self.calibration is None:
+        if self.calibration is None or self.is_for_localizer:
             return Road(
                 tuple(RoadMarking(marking, none, np.empty((0, 0)), none) for marking in markings),
                 tuple(RoadLane(lane, none, np.empty((0, 2, 2))) for lane in lanes),

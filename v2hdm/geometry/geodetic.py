@@ -6,6 +6,7 @@ ETRS89, NAD83, GDA2020, JGD2011); others are refused: without national grid file
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -13,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from v2hdm.errors import MapFileError, V2hdmError, need, shown
+from v2hdm.geometry.datums import is_same_datum, utm_of
 from v2hdm.records import FloatArray, GeodeticOrigin
 
 _SEMI_MAJOR_M = 6378137.0  # semi-major axis, m, of the ellipsoid WGS84 (NGA.STND.0036)
@@ -22,6 +24,7 @@ _ECCENTRICITY2 = _FLATTENING * (2 - _FLATTENING)  # square of the first eccentri
 _SAME_ELLIPSOID_M = (
     1e-3  # difference, m, of axes of one ellipsoid: GRS80's semi-minor is 0.1 mm longer than WGS84's
 )
+_WGS84 = ("World Geodetic System 1984", "World Geodetic System 1984 ensemble")  # datum's names in PROJ
 _CONFORMAL_DEG = 1e-3  # tolerance, deg, of a conformal grid's angles, for rounding
 
 
@@ -80,6 +83,7 @@ _LONGEST_CRS = 20_000  # letters of a system's description: WKT of a compound on
 LOCAL = "local"  # name of the map's own frame as a coordinate system
 _GRID_DECIMALS = 4  # decimals of a coordinate in metres: 0.1 mm
 _DEGREE_DECIMALS = 9  # decimals of a latitude or longitude in degrees: 0.1 mm on the ground
+_ZONE_DEG = 6.0  # width of a zone, deg of longitude, by which a grid may be used beyond its edges for a job
 _BESIDE_DEG = 1.0  # longitude, deg, by which a zone's grid is in use beyond its edges
 
 
@@ -113,12 +117,13 @@ class Grid:
         datum = datum_of(crs, where, error)
         if origin is None:
             raise error(f"{where}: {crs} needs an origin on the earth, which the map lacks; give {LOCAL}")
-        fit = utm_of(origin)
+        zone = utm_of(origin)
+        fit = zone or f"a projected system on {origin.datum}"
         if (code := system.to_authority(min_confidence=100)) is None:
             raise error(f"{where}: {shown(crs)} has no code that other programs know; give {fit}")
         if system.is_compound or not (system.is_projected or system.is_geographic):
             raise error(f"{where}: {crs} has a vertical part or unusual axes; give its horizontal part")
-        if datum.replace(" ", "") != origin.datum.replace(" ", ""):
+        if not is_same_datum(datum, origin.datum):
             raise error(
                 f"{where}: {crs} is on {datum}, the map on {origin.datum}, which differ by decimetres; give "
                 f"{fit}, or state the datum of the drive's poses (drive.yaml, origin, datum)"
@@ -129,6 +134,7 @@ class Grid:
         west, south, east, north = system.area_of_use.bounds if system.area_of_use else (-180, -90, 180, 90)
         width_deg = (east - west) % 360 or 360
         inside = (origin.longitude_deg - west + _BESIDE_DEG) % 360 <= width_deg + 2 * _BESIDE_DEG
+        inside = inside or ":".join(code) == zone  # as in the west of Norway
         if not inside or not south - _BESIDE_DEG <= origin.latitude_deg <= north + _BESIDE_DEG:
             at = f"latitude {origin.latitude_deg:.2f}, longitude {origin.longitude_deg:.2f}"
             raise error(f"{where}: the site, at {at}, lies outside {crs} ({system.name}); give {fit}")
@@ -169,14 +175,6 @@ class Grid:
         return geodetic_from_grid(self.crs, positions, where, error)[:, [1, 0, 2]]
 
 
-def utm_of(origin: GeodeticOrigin) -> str:
-    """The UTM zone of an origin as an EPSG code."""
-    zone = int((origin.longitude_deg + 180) // 6) % 60 + 1
-    north = origin.latitude_deg >= 0
-    etrs = origin.datum.upper().startswith("ETRS")
-    return f"EPSG:{(25800 if etrs else 32600 if north else 32700) + zone}"
-
-
 _ENGINEERING = (
     'LOCAL_CS["V2HDM map frame: east, north in metres from an origin that the drive does not state",'
     'LOCAL_DATUM["local",0],UNIT["metre",1],AXIS["East",EAST],AXIS["North",NORTH]]'
@@ -187,7 +185,8 @@ def crs_of(origin: GeodeticOrigin | None) -> str:
     """PROJ or WKT text of the map frame.
 
     With an origin, a transverse Mercator projection about it, scaled to its ellipsoidal height, which every
-    GIS knows: within 1 mm of the tangent plane up to 2 km away. Without, an engineering system.
+    GIS knows: within 1 mm of the tangent plane up to 2 km away. It names WGS84, between which and other
+    satellite datums a GIS moves nothing. Without an origin, an engineering system.
     """
     if origin is None:
         return _ENGINEERING
@@ -211,9 +210,12 @@ def convergence_rad(crs: str, points: FloatArray, where: str, error: type[V2hdmE
 def datum_of(crs: str, where: str, error: type[V2hdmError]) -> str:
     """Satellite datum of the coordinates of ``crs``, WGS84 spelt ``WGS84``."""
     system = _system(crs, where, error).geodetic_crs
-    # A system by its parameters alone, as OpenDRIVE has it, is "unknown", but its datum has a name.
-    name = str(system.datum.name if system.name == "unknown" and system.datum is not None else system.name)
-    return "WGS84" if name.replace(" ", "") in ("WGS84", "WorldGeodeticSystem1984") else name
+    datum = str(system.name if system.datum is None else system.datum.name)
+    if datum in _WGS84:
+        return "WGS84"
+    # A system by its parameters alone, as OpenDRIVE has it, is "unknown", but its datum has a name. Systems
+    # with longitude before latitude have a suffix: NAD83 (CRS83).
+    return datum if system.name == "unknown" else re.sub(r" \(CRS\d+\)$", "", str(system.name))
 
 
 def has_height_datum(crs: str, where: str, error: type[V2hdmError]) -> bool:
@@ -237,6 +239,35 @@ def system_of(crs: str, where: str, error: type[V2hdmError]) -> System:
 def is_geographic(crs: str, where: str, error: type[V2hdmError]) -> bool:
     """Whether coordinates of ``crs`` are latitude and longitude."""
     return bool(_system(crs, where, error).is_geographic)
+
+
+class Units(NamedTuple):
+    """The lengths, m, of a system's units, 1 where it counts in degrees or has no height, and their name."""
+
+    horizontal_m: float
+    vertical_m: float
+    name: str  # of the horizontal one
+
+
+def units_of(crs: str, where: str, error: type[V2hdmError]) -> Units:
+    """The units of a system. Heights of one without any are in the unit of its easting and northing."""
+    system = _system(crs, where, error)
+    axes = [axis for axis in system.axis_info if axis.unit_name != "degree"]
+    if not axes:
+        return Units(1.0, 1.0, "degree")
+    is_up = [axis.direction == "up" for axis in axes]
+    horizontal = 1.0 if is_up[0] else float(axes[0].unit_conversion_factor)
+    return Units(horizontal, float(axes[-1].unit_conversion_factor), str(axes[0].unit_name))
+
+
+def is_in_use(crs: str, geodetic: FloatArray, where: str, error: type[V2hdmError]) -> bool:
+    """Whether positions (N, 3) lie no farther than a zone east or west of where a system is in use."""
+    area = _system(crs, where, error).area_of_use
+    if area is None:
+        return True
+    width_deg = (area.east - area.west) % 360 or 360
+    ahead_deg = (geodetic[:, 1] - area.west + _ZONE_DEG) % 360
+    return bool((ahead_deg <= width_deg + 2 * _ZONE_DEG).any())
 
 
 def _system(crs: str, where: str, error: type[V2hdmError]) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Sequence
 from pathlib import Path, PurePath
 from typing import NamedTuple
@@ -11,7 +12,7 @@ import numpy as np
 
 from v2hdm.errors import DriveError, shown
 from v2hdm.io.stamps import seconds_of
-from v2hdm.io.trajectory import LATE_S, LONGEST_S, UNITS, content_lines, parse_number
+from v2hdm.io.trajectory import LATE_S, LONGEST_S, UNITS, content_lines, parse_number, units_per_second
 from v2hdm.records import BoolArray, FloatArray, IntArray
 from v2hdm.store.files import read_text, replace_text
 
@@ -19,6 +20,8 @@ _log = logging.getLogger(__name__)
 
 _APPLE_DOUBLE = "._"  # begins the names of files that macOS writes beside others
 _TIMECODES = ("# timecode format v2", "# timestamp format v2")  # first lines of Matroska's, in ms
+_SEPARATED = re.compile(r"([^\s,;]+)\s*[,;]\s*(?!\d+\s)(.+)")  # but 12,5 FILE is a decimal comma
+_TITLE = re.compile(r"[^\W\d_][^\d.]*$")  # a line of words alone
 _MOST_DOUBLED = 0.25  # share of images whose time repeats, chosen: more are of two cameras
 
 
@@ -30,22 +33,30 @@ class ImageList(NamedTuple):
 
 
 def read_image_list(path: Path) -> ImageList:
-    """Read ``timestamp filename`` lines by time; what is late, repeated or without a time is counted."""
+    """Read ``timestamp filename`` lines by time; what is late, repeated or without a time is counted.
+
+    A comma or semicolon may separate both, quotes enclose the name, and a first line may name the columns.
+    """
     texts: list[str] = []
     names: list[str] = []
     numbers: list[int] = []
     hidden = 0
-    for number, line in content_lines(path, "lists no image", "timestamp filename"):
-        parts = line.split(maxsplit=1)
+    content = content_lines(path, "lists no image", "timestamp filename")
+    for number, line in content:
+        if number == content[0][0] and len(content) > 1 and _TITLE.match(line):
+            continue
+        separated = _SEPARATED.match(line)
+        parts = line.split(maxsplit=1) if separated is None else separated.groups()
         if len(parts) != 2:
             raise DriveError(
                 f"{path}: line {number}: expected 'timestamp filename', got {shown(line)}; fix that line"
             )
-        if PurePath(parts[1]).name.startswith(_APPLE_DOUBLE):
+        name = _on_this_system(_unquoted(parts[1]), path.parent)
+        if PurePath(name).name.startswith(_APPLE_DOUBLE):
             hidden += 1
             continue
-        texts.append(parts[0])
-        names.append(parts[1])
+        texts.append(_unquoted(parts[0]))
+        names.append(name)
         numbers.append(number)
     if hidden:
         _log.warning("%s: left out %d files of macOS (%sNAME)", path, hidden, _APPLE_DOUBLE)
@@ -54,6 +65,15 @@ def read_image_list(path: Path) -> ImageList:
     stamp_s = _times_of(texts, numbers, path)
     rows = image_order(stamp_s, str(path), "line", numbers, together=False)
     return ImageList(stamp_s[rows], [names[row] for row in rows])
+
+
+def _unquoted(text: str) -> str:
+    return text[1:-1] if len(text) > 2 and text[0] == text[-1] == '"' else text
+
+
+def _on_this_system(name: str, folder: Path) -> str:
+    """A file's name, of which a list from Windows separates the folders by backslashes."""
+    return name.replace("\\", "/") if "\\" in name and not (folder / name).exists() else name
 
 
 def read_stamps(path: Path, count: int, things: str) -> FloatArray:
@@ -66,17 +86,19 @@ def read_stamps(path: Path, count: int, things: str) -> FloatArray:
     ]
     if len(rows) != count:
         raise DriveError(f"{path}: {len(rows)} times for {count} {things}; give one of each")
-    stamp_s = _times_of([line for _, line in rows], [number for number, _ in rows], path)
     # Matroska's timecodes, which rpicam-apps and mkvextract write, are in ms.
-    is_timecodes = any(line.startswith(_TIMECODES) for line in lines)
-    return stamp_s / UNITS["ms"] if is_timecodes else stamp_s
+    per_s = UNITS["ms"] if any(line.startswith(_TIMECODES) for line in lines) else None
+    return _times_of([line for _, line in rows], [number for number, _ in rows], path, per_s)
 
 
-def _times_of(texts: Sequence[str], numbers: Sequence[int], path: Path) -> FloatArray:
-    stamp_s = np.array(
+def _times_of(
+    texts: Sequence[str], numbers: Sequence[int], path: Path, per_s: float | None = None
+) -> FloatArray:
+    """The times (N,), s, of which ``per_s`` make one: ms, us or ns since 1970 are told by their size."""
+    stamps = np.array(
         [parse_number(text, f"{path}: line {number}") for text, number in zip(texts, numbers, strict=True)]
     )
-    return seconds_of(texts, stamp_s, str(path))
+    return seconds_of(texts, stamps, str(path)) / (per_s or units_per_second(stamps))
 
 
 def write_image_list(stamp_s: FloatArray, names: Sequence[str], path: Path) -> None:

@@ -31,6 +31,8 @@ _NEWEST_S = 4.1e9  # and earlier than this, December 2099
 _COLUMNS = "timestamp tx ty tz qx qy qz qw"
 _FARTHEST_M = 1e8  # coordinates on the earth end at ten thousand kilometres
 _FARTHEST_FROM_ORIGIN_M = 1e5  # a map is flat, and there the ground is 800 m below it
+_LEAP_M = 1e4  # least step, m, between poses that another grid's coordinates make: a zone's are 400 km off
+_FASTEST_MPS = 300.0  # no vehicle is faster, m/s
 _STRAYS = 0.05  # share of times out of order up to which these are left out; more are of two recordings
 LATE_S = 1.0  # a reading that comes later than this after its successor is of another clock or recording
 
@@ -75,11 +77,24 @@ def check_trajectory(trajectory: Trajectory, origin: GeodeticOrigin | None, wher
     farthest_m = float(np.abs(trajectory.map_from_vehicle[:, :3, 3]).max())
     if not farthest_m <= _FARTHEST_M:
         raise DriveError(f"{where}: a position is {farthest_m:.3g} m from zero, off the earth; fix it")
+    _check_one_grid(trajectory, where)
     if origin is not None and farthest_m > _FARTHEST_FROM_ORIGIN_M:
         raise DriveError(
             f"{where}: the poses lie {farthest_m / 1e3:.0f} km from the map's origin, which is at latitude "
             f"{origin.latitude_deg:.4f}, longitude {origin.longitude_deg:.4f}: are they coordinates of a "
             "grid such as UTM? Then say so under poses with crs, or give the origin that they count from"
+        )
+
+
+def _check_one_grid(trajectory: Trajectory, where: str) -> None:
+    """Refuse poses whose coordinates change their grid on the way, as drivers do at the edge of a zone."""
+    steps_m = np.linalg.norm(np.diff(trajectory.map_from_vehicle[:, :2, 3], axis=0), axis=1)
+    is_leap = (steps_m > _LEAP_M) & (steps_m > _FASTEST_MPS * np.diff(trajectory.stamp_s))
+    if is_leap.any():
+        k = int(np.argmax(is_leap))
+        raise DriveError(
+            f"{where}: the poses leap by {steps_m[k] / 1e3:.0f} km at {trajectory.stamp_s[k + 1]:.3f} s, as "
+            "where coordinates change their UTM zone or MGRS square; give all in one, or latitude, longitude"
         )
 
 
@@ -125,7 +140,7 @@ def read_tum(path: Path) -> Trajectory:
             f"{path}: all times are {table[0, 0]:.10g}: they were written with too few digits; write seconds "
             "with six decimals"
         )
-    stamp_s = table[:, 0] / (layout.per_s or _per_second(table[:, 0]))
+    stamp_s = table[:, 0] / (layout.per_s or units_per_second(table[:, 0]))
     order = in_order(stamp_s, str(path), "pose")
     if lost:
         _log.warning("%s: left out %d of %d poses that are no numbers", path, lost, lost + len(table))
@@ -189,7 +204,7 @@ def _cells(line: str) -> list[str]:
     return line.replace(",", " ").split()
 
 
-def _per_second(stamps: FloatArray) -> float:
+def units_per_second(stamps: FloatArray) -> float:
     """Units in a second of stamps (N,) that count since 1970, which their size shows; 1 for others."""
     latest = float(stamps.max())
     scales = (scale for scale in UNITS.values() if _OLDEST_S < latest / scale < _NEWEST_S)

@@ -2,7 +2,8 @@
 
 Seeds over the cloud move across their line onto the local regression line of the points around them: a mean
 shift in one dimension, as every point has a direction and points of crossing or parallel lines are excluded.
-They are then thinned to single nodes, half a metre apart.
+They are then thinned to single nodes, half a metre apart. Two lines of a double line are told apart by the
+images that show both at once.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from v2hdm.records import (
     IntArray,
     LaneDetection,
 )
+from v2hdm.site.composed import APART_M
 from v2hdm.surface.surface import Surface
 
 NODE_SPACING_M = 0.5  # distance, m, between the vertices of a polyline
@@ -63,6 +65,9 @@ class LaneCloud:
     dash: BoolArray  # (P,) whether detected as a dash
     guides: Guides = field(default_factory=Guides)
     row_share: FloatArray = field(default_factory=lambda: np.zeros(0))  # (P,) of their pixels
+    # (P,) distance, m, of a parallel line that the same image shows beside the point, nan for none; empty for
+    # none at all
+    beside_m: FloatArray = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -184,6 +189,9 @@ def collect_lane_points(
     with np.errstate(invalid="ignore"):
         is_usable = (np.linalg.norm(ray, axis=1) <= max_range_m) & np.isfinite(tangent).all(axis=1)
         is_usable &= np.isfinite(variance)
+    beside_m = distance_beside_m(
+        points_map[is_usable], tangent[is_usable], image[is_usable], piece[is_usable]
+    )
     dash = np.array([lane.kind == LANE_DASH for _, lane in lanes])[piece]
     return LaneCloud(
         points_map=points_map[is_usable],
@@ -193,7 +201,30 @@ def collect_lane_points(
         dash=dash[is_usable],
         guides=guides,
         row_share=points.row_share[is_usable],
+        beside_m=beside_m,
     )
+
+
+def distance_beside_m(
+    points_map: FloatArray, tangent: FloatArray, image: IntArray, piece: IntArray
+) -> FloatArray:
+    """Distances (P,), m, to the nearest other piece that runs beside a point in its image, nan for none.
+
+    Pieces nearer than the two lines of a double line are readings of the same paint.
+    """
+    reach_m = float(np.hypot(NODE_SPACING_M, APART_M[1]))
+    apart_by_image = np.column_stack([points_map, 2.0 * reach_m * image])
+    pairs = cKDTree(apart_by_image).query_pairs(reach_m, output_type="ndarray")
+    point, other = np.concatenate([pairs, pairs[:, ::-1]]).T
+    offset = points_map[other] - points_map[point]
+    along_m = np.abs(np.einsum("pi,pi->p", offset, tangent[point]))
+    across_m = np.abs(cross(tangent[point], offset))
+    cosine = np.abs(np.einsum("pi,pi->p", tangent[point], tangent[other]))
+    is_beside = (piece[point] != piece[other]) & (along_m <= NODE_SPACING_M) & (cosine >= SAME_DIRECTION)
+    is_beside &= (across_m >= APART_M[0]) & (across_m <= APART_M[1])
+    beside_m = np.full(len(points_map), np.nan)
+    np.fmin.at(beside_m, point[is_beside], across_m[is_beside])
+    return beside_m
 
 
 def _lanes(
@@ -277,6 +308,9 @@ _SEED_CELL_M = 0.25  # side of the cells with one seed each, m
 _DIRECTION_BINS = 8  # directions distinguished within a cell, over half a circle
 SAME_DIRECTION = np.cos(np.deg2rad(20.0))  # least cosine of directions within one line; crossing ones differ
 _ITERATIONS = 4  # mean shifts of each seed
+_KERNEL_SIGMA_M = HALF_WIDTH_M / 2  # sigma, m, across a line of the weights of points around a seed
+_BESIDE_SIGMAS = 4.0  # sigmas of these weights at which the other line of two lies, at least
+_SHOW_BOTH = 0.25  # least share of a place's images that must show two lines: far ones see them as one
 _THIN_SPACINGS = 0.7  # radius, in spacings, in which the best supported node suppresses others of its line
 
 
@@ -309,8 +343,9 @@ def find_nodes(cloud: LaneCloud, least_images: int) -> Nodes:
         cKDTree(cloud.points_map), reach_m, output_type="ndarray"
     )
     pairs = _Pairs(distances["i"].astype(np.int64), distances["j"].astype(np.int64))
+    sigma_m = _kernel_sigma_m(points, tangent, cloud, pairs, least_images)
     for _ in range(_ITERATIONS):
-        points, tangent = _shift(points, tangent, cloud, pairs)
+        points, tangent = _shift(points, tangent, cloud, pairs, sigma_m)
     in_line = _in_line(points, tangent, cloud, pairs)
     in_reach = (np.abs(in_line.along_m) <= NODE_SPACING_M) & (np.abs(in_line.across_m) <= 0.5 * HALF_WIDTH_M)
     in_reach &= in_line.cosine >= SAME_DIRECTION
@@ -351,17 +386,46 @@ def _in_line(points: FloatArray, tangent: FloatArray, cloud: LaneCloud, pairs: _
     )
 
 
+def _kernel_sigma_m(
+    points: FloatArray, tangent: FloatArray, cloud: LaneCloud, pairs: _Pairs, least_images: int
+) -> FloatArray:
+    """Sigmas (N,), m, across their lines of the weights about seeds: less where images show two lines."""
+    usual_m = np.full(len(points), _KERNEL_SIGMA_M)
+    if not len(cloud.beside_m):
+        return usual_m
+    in_line = _in_line(points, tangent, cloud, pairs)
+    in_reach = (np.abs(in_line.along_m) <= _HALF_LENGTH_M) & (np.abs(in_line.across_m) <= HALF_WIDTH_M)
+    in_reach &= in_line.cosine >= SAME_DIRECTION
+    seed = pairs.seed[in_reach]
+    point = pairs.point[in_reach]
+    shows_both = np.isfinite(cloud.beside_m[point])
+
+    def images_of(chosen: BoolArray) -> IntArray:
+        of_seed = np.unique(np.stack([seed[chosen], cloud.image[point[chosen]]]), axis=1)[0]
+        return np.bincount(of_seed, minlength=len(points))
+
+    both = images_of(shows_both)
+    is_double = (both >= max(least_images, 1)) & (both >= _SHOW_BOTH * images_of(np.ones_like(shows_both)))
+    total_m = np.bincount(seed[shows_both], cloud.beside_m[point[shows_both]], len(points))
+    mean_m = total_m / np.maximum(np.bincount(seed[shows_both], minlength=len(points)), 1)
+    return np.where(is_double, np.minimum(usual_m, mean_m / _BESIDE_SIGMAS), usual_m)
+
+
 def _shift(
-    points: FloatArray, tangent: FloatArray, cloud: LaneCloud, pairs: _Pairs
+    points: FloatArray, tangent: FloatArray, cloud: LaneCloud, pairs: _Pairs, sigma_m: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Move each seed across its line onto the weighted regression line of its neighbourhood."""
+    """Move each seed across its line onto the regression line of its neighbourhood, weighted by ``sigma_m``.
+
+    ``sigma_m`` (N,) is that of the weights across the line.
+    """
     in_line = _in_line(points, tangent, cloud, pairs)
     in_reach = (np.abs(in_line.along_m) <= _HALF_LENGTH_M) & (np.abs(in_line.across_m) <= HALF_WIDTH_M)
     in_reach &= in_line.cosine >= SAME_DIRECTION
     x = in_line.along_m[in_reach]
     y = in_line.across_m[in_reach]
     # Gaussian across, so that the nearer of two lines wins.
-    kernel = np.exp(-0.5 * (2.0 * y / HALF_WIDTH_M) ** 2) * (1 - (x / _HALF_LENGTH_M) ** 2)
+    across = y / sigma_m[pairs.seed[in_reach]]
+    kernel = np.exp(-0.5 * across**2) * (1 - (x / _HALF_LENGTH_M) ** 2)
     weight = cloud.weight[pairs.point[in_reach]] * kernel
     count = len(points)
 

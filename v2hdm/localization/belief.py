@@ -19,14 +19,14 @@ from v2hdm.geometry.rigid import make_transform, rotation_from_euler
 from v2hdm.localization.motion import MotionNoise, Piece
 from v2hdm.records import HEAVE_SIGMA_M, FloatArray
 
-X, Y, HEADING, SCALE, BIAS, HEIGHT, ROLL, PITCH, SLOW_ROLL, SLOW_PITCH = range(10)
+X, Y, HEADING, SCALE, BIAS, HEIGHT, ROLL, PITCH, SLOW_ROLL, SLOW_PITCH, LATE = range(11)
 """The vehicle's states: place, m, heading, rad, log of true over stated speed, bias of the yaw rate, rad/s,
-and above the ground of the map height, m, roll and pitch, rad, in a part that changes fast and one that
-lasts."""
+above the ground of the map height, m, roll and pitch, rad, in a part that changes fast and one that lasts,
+and how much later than the images the odometry is stamped, s."""
 
 _PROTECTION_SIGMAS = 3.717  # radius, in sigmas, that one error in a thousand in a plane exceeds
 
-VEHICLE = 10  # number of the vehicle's states
+VEHICLE = 11  # number of the vehicle's states
 CAMERA = 6  # number of a camera's
 
 # Roll and pitch of a body on its springs, for vehicles of 1 to 6 mrad:
@@ -117,7 +117,7 @@ def start(
 
     ``mountings`` are the covariances (6, 6) of the cameras' calibrations.
     """
-    vehicle = [*sigma, noise.scale, noise.bias_rad_s, *(spring[1] for spring in _SPRINGS)]
+    vehicle = [*sigma, noise.scale, noise.bias_rad_s, *(spring[1] for spring in _SPRINGS), noise.late_s]
     count = VEHICLE + CAMERA * len(mountings)
     root = np.zeros((count, count))
     root[range(VEHICLE), range(VEHICLE)] = vehicle
@@ -167,14 +167,18 @@ def _step(mean: FloatArray, piece: Piece, noise: MotionNoise) -> tuple[FloatArra
     middle = mean[HEADING] + 0.5 * turn * length_s
     ahead = np.array([np.cos(middle), np.sin(middle)])
     left = np.array([-ahead[1], ahead[0]])
-    way_m = speed * length_s
+    # A late odometry states the motion of a piece over a piece that begins and ends later by as much.
+    faster_m_s = piece.faster_m_s * np.exp(mean[SCALE])
+    way_m = speed * length_s + mean[LATE] * faster_m_s
     out[:2] += way_m * ahead
-    out[HEADING] += turn * length_s
+    out[HEADING] += turn * length_s + mean[LATE] * piece.turning_more_rad_s
     change = np.eye(VEHICLE)
     change[:2, HEADING] = way_m * left
     change[:2, SCALE] = way_m * ahead
     change[:2, BIAS] = -0.5 * length_s * way_m * left
     change[HEADING, BIAS] = -length_s
+    change[:2, LATE] = faster_m_s * ahead
+    change[HEADING, LATE] = piece.turning_more_rad_s
     way_m2 = noise.speed_m_sqrt_s**2 * length_s + (piece.speed_sigma_m_s * length_s) ** 2
     yaw_rad2 = noise.yaw_rad_sqrt_s**2 * length_s + (piece.yaw_rate_sigma_rad_s * length_s) ** 2
     pushed = np.zeros((VEHICLE, VEHICLE))
@@ -183,6 +187,7 @@ def _step(mean: FloatArray, piece: Piece, noise: MotionNoise) -> tuple[FloatArra
     )
     pushed[HEADING, HEADING] = yaw_rad2
     pushed[BIAS, BIAS] = noise.bias_walk_rad_s**2 * length_s
+    pushed[LATE, LATE] = noise.late_walk_s**2 * length_s
     for state, sigma, fades_s in _SPRINGS:
         keeps = np.exp(-length_s / fades_s)
         out[state] *= keeps

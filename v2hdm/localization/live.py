@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, NamedTuple
 
@@ -74,29 +74,50 @@ def localize_live(
         running = set(sources)
         images = 0
         written_s = -math.inf
+        news = _News()
         while running and (limit is None or images < limit):
-            looks: list[Look] = []
-            motions: list[Motion] = []
-            fixes: list[Fix] = []
             for item in _available(items):
                 if isinstance(item, _Ended):
                     running.discard(item.source)
                     if item.error is not None:
                         raise DriveError(item.error)
-                elif isinstance(item, Look):
-                    looks.append(item)
-                elif isinstance(item, Motion):
-                    motions.append(item)
                 else:
-                    fixes.append(item)
+                    news.add(item)
+            # What comes between images waits for the next: a pose of it would only cost time.
+            if not news.looks and not news.has_waited(written_s):
+                continue
+            looks = news.looks
+            pose = localizer.update(looks, news.motions, news.fixes)
+            news = _News()
             images += len(looks)
-            if looks or motions or fixes:
-                pose = localizer.update(looks, motions, fixes)
-                for camera in {look.camera for look in looks}:
-                    cameras[camera].point(localizer, time.time())
-                if looks or pose.stamp_s - written_s > _QUIET_S:
-                    written_s = pose.stamp_s
-                    take(pose)
+            written_s = pose.stamp_s
+            take(pose)
+            for camera in {look.camera for look in looks}:
+                cameras[camera].point(localizer, time.time())
+
+
+@dataclass
+class _News:
+    """What has come since the last pose."""
+
+    looks: list[Look] = field(default_factory=list)
+    motions: list[Motion] = field(default_factory=list)
+    fixes: list[Fix] = field(default_factory=list)
+
+    def has_waited(self, written_s: float) -> bool:
+        """Whether motions or positions are well after the last pose, or before it: a clock may go back."""
+        stamps_s = [motion.stamp_s for motion in self.motions[-1:]]
+        stamps_s += [fix.stamp_s for fix in self.fixes[-1:]]
+        return any(abs(stamp_s - written_s) > _QUIET_S for stamp_s in stamps_s)
+
+    def add(self, item: Look | Motion | Fix) -> None:
+        """Take an item."""
+        if isinstance(item, Look):
+            self.looks.append(item)
+        elif isinstance(item, Motion):
+            self.motions.append(item)
+        else:
+            self.fixes.append(item)
 
 
 def _available(items: _Queue) -> Iterator[_Item]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import NamedTuple
 
@@ -16,8 +16,11 @@ from v2hdm.localization.agreement import Agreement, Pace, detected
 from v2hdm.localization.antenna import Antenna, Fix, with_fix
 from v2hdm.localization.areas import AreaMap, with_areas
 from v2hdm.localization.belief import (
+    BIAS,
     CAMERA,
     HEADING,
+    LATE,
+    SCALE,
     VEHICLE,
     Belief,
     bounds,
@@ -40,6 +43,7 @@ from v2hdm.localization.way import Way
 from v2hdm.records import Calibration, FloatArray, HDMap
 
 _LAG_S = 1.0  # images may be so late
+_NO_IMAGE_S = 1.0  # time, s, without an image that is said
 _FUTURE_S = 2.0  # a stamp farther ahead of the odometry, s, is of another clock
 # With a larger standard deviation of the place the vehicle does not know where it is: half a dash's gap.
 _LOST_M = 0.3
@@ -83,10 +87,11 @@ class Pose:
         covariance: (3, 3) of x, y, m, and heading, rad, in the map; infinite before the place is sure.
         protection_m: ahead and to the left, bounds that one error in a thousand exceeds; else infinite.
         protection_rad: the same of the heading.
-        motion: true over stated speed, and the yaw rate's bias, rad/s.
+        motion: true over stated speed, the yaw rate's bias, rad/s, and how late the odometry's stamps are, s.
         matched: markings that the last look showed.
         matched_lines: pieces of solid lines that it showed on their lines.
         matched_areas: words, boxes and other symbols that it showed at their places.
+        images_s: by camera the time of the newest image that is in it.
         reasons: sentences: why there is no pose, or what differs from map, calibration or odometry.
         turned: cameras whose mountings have changed.
     """
@@ -97,12 +102,13 @@ class Pose:
     covariance: FloatArray
     protection_m: tuple[float, float]
     protection_rad: float
-    motion: tuple[float, float]
+    motion: tuple[float, float, float]
     matched: int
     reasons: tuple[str, ...] = ()
     turned: tuple[Turned, ...] = ()
     matched_lines: int = 0
     matched_areas: int = 0
+    images_s: Mapping[str, float] = field(default_factory=dict)
 
 
 class _Past(NamedTuple):
@@ -197,6 +203,7 @@ class Localizer:
         self._reasons: dict[str, str] = {}
         self._matched = _Matched()
         self._looking = Looking(every_full)
+        self._images_s: dict[str, float] = {}
 
     def update(
         self, images: Sequence[Look] = (), motion: Sequence[Motion] = (), fixes: Sequence[Fix] = ()
@@ -216,7 +223,7 @@ class Localizer:
             self._fix(fix)
         for look in sorted(images, key=lambda item: item.stamp_s):
             self._take(look)
-        return self._pose()
+        return replace(self._pose(), images_s=dict(self._images_s))
 
     def regions(self, camera: str, stamp_s: float) -> FloatArray | None:
         """Where to look in the next image of a camera, taken at about a time: around what the map will show.
@@ -269,6 +276,7 @@ class Localizer:
             )
             return
         self._reasons.pop("clock", None)
+        self._images_s[look.camera] = max(look.stamp_s, self._images_s.get(look.camera, look.stamp_s))
         later_looks = [past for past in self._past if past.look.stamp_s > look.stamp_s]
         latest_s = max([look.stamp_s, *(past.look.stamp_s for past in self._past)])
         if latest_s - look.stamp_s > _LAG_S:
@@ -513,11 +521,22 @@ class Localizer:
                     self._reasons["fix"] = problem
         return self._moved_to(belief, stamp_s)
 
+    def _missing(self, stamp_s: float) -> dict[str, str]:
+        """Sentences on cameras of which no image has come lately."""
+        if not self._images_s:
+            waited_s = stamp_s - self._log.stamps_s[0] if self._log.stamps_s else 0.0
+            return {"images": "no image has come yet"} if waited_s > _NO_IMAGE_S else {}
+        return {
+            f"images of {camera}": f"no image of {camera} has come for {stamp_s - image_s:.1f} s"
+            for camera, image_s in self._images_s.items()
+            if stamp_s - image_s > _NO_IMAGE_S
+        }
+
     def _pose(self) -> Pose:
         """The pose at the newest stamp."""
         stamps = [item for item in (self._log.newest_s, self._way.stamp_s) if item is not None]
         stamp_s = max(stamps, default=0.0)
-        reasons = dict(self._reasons)
+        reasons = self._reasons | self._missing(stamp_s)
         if self._pace_reason is not None:
             reasons["odometry"] = f"the odometry does not fit the images: {self._pace_reason}"
         if self._belief is None:
@@ -531,7 +550,7 @@ class Localizer:
             nothing = np.full((3, 3), np.inf)
             infinite = (np.inf, np.inf)
             return Pose(
-                stamp_s, status, None, nothing, infinite, np.inf, (1.0, 0.0), 0, tuple(reasons.values())
+                stamp_s, status, None, nothing, infinite, np.inf, (1.0, 0.0, 0.0), 0, tuple(reasons.values())
             )
         belief = self._fixed_to(self._belief, stamp_s)
         plane = self.paint.ground(belief.mean[:2])
@@ -557,7 +576,7 @@ class Localizer:
             reasons |= {f"rig {number}": sentence for number, sentence in enumerate(turned)}
         elif self._turned_s is not None:
             reasons["rig"] = f"a camera's mounting has turned since {self._turned_s:.1f} s"
-        motion = (float(np.exp(belief.mean[3])), float(belief.mean[4]))
+        motion = (float(np.exp(belief.mean[SCALE])), float(belief.mean[BIAS]), float(belief.mean[LATE]))
         return Pose(
             stamp_s=stamp_s,
             status=status,

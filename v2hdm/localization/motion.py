@@ -39,6 +39,8 @@ class MotionNoise:
         yaw_rad_sqrt_s: of the heading after a second.
         slip_m_sqrt_s: of the way sideways after a second.
         bias_walk_rad_s: of the change of the bias after a second.
+        late_s: of how much later than the images it is stamped: buses and exposures take 10 to 100 ms.
+        late_walk_s: of the change of that after a second: of 20 parts in a million, as clocks drift.
     """
 
     scale: float = 0.02
@@ -47,6 +49,8 @@ class MotionNoise:
     yaw_rad_sqrt_s: float = 5e-4
     slip_m_sqrt_s: float = 0.01
     bias_walk_rad_s: float = 1e-5
+    late_s: float = 0.05
+    late_walk_s: float = 2e-5
 
 
 class Piece(NamedTuple):
@@ -57,6 +61,8 @@ class Piece(NamedTuple):
     yaw_rate_rad_s: float
     speed_sigma_m_s: float  # beside the noise of samples: of a gap
     yaw_rate_sigma_rad_s: float
+    faster_m_s: float = 0.0  # the speed at its end less that at its beginning
+    turning_more_rad_s: float = 0.0  # the same of the yaw rate
 
 
 @dataclass
@@ -132,12 +138,22 @@ class MotionLog:
             speed = earlier.speed_m_s + share * (later_sample.speed_m_s - earlier.speed_m_s)
             turn = earlier.yaw_rate_rad_s + share * (later_sample.yaw_rate_rad_s - earlier.yaw_rate_rad_s)
             gap_s = self.stamps_s[after] - nearest_s
+            part = length_s / gap_s
+            faster = part * (later_sample.speed_m_s - earlier.speed_m_s)
+            turning_more = part * (later_sample.yaw_rate_rad_s - earlier.yaw_rate_rad_s)
         else:
             speed, turn = self.samples[before][1:]
             gap_s = max(stop_s - nearest_s, nearest_s - start_s)
+            faster = turning_more = 0.0
         unknown_s = max(gap_s - _GAP_S, 0.0)
         return Piece(
-            length_s, speed, turn, _ACCELERATION_M_S2 * unknown_s, _TURN_ACCELERATION_RAD_S2 * unknown_s
+            length_s,
+            speed,
+            turn,
+            _ACCELERATION_M_S2 * unknown_s,
+            _TURN_ACCELERATION_RAD_S2 * unknown_s,
+            faster,
+            turning_more,
         )
 
 

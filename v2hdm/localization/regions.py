@@ -40,6 +40,7 @@ _SURE_M, _SURE_RAD = 0.15, np.deg2rad(1.0)  # standard deviations of a place tha
 _LAST_LOOKS = 10  # looks of a camera by which its interval is known
 _SLOW_S = 0.5  # interval, s, after which nothing is expected at its place any more
 _AHEAD = 4  # images to come that are told of: a look may last longer than it takes to the next
+_EARLIER = 3  # images by which a whole search may come earlier, so that it is at no other camera's time
 _FOUND = 0.6  # share of the markings looked for, from which the last look was as expected
 
 
@@ -64,6 +65,7 @@ class Glances:
     stamps_s: deque[float] = field(default_factory=lambda: deque(maxlen=_LAST_LOOKS))
     whole_s: float = -np.inf
     told_s: float = -np.inf  # time of the last image that was to be searched as a whole
+    to_come_s: list[float] = field(default_factory=list)  # times of images that are to be searched so
     expected: int = 0
     was_as_expected: bool = False
 
@@ -124,7 +126,7 @@ class Looking:
             # A whole look that was told of, but has not come yet, is as good as done for some images.
             if interval_s is not None and stamp_s - glances.told_s < (_AHEAD + 0.5) * interval_s:
                 whole_s = max(whole_s, glances.told_s)
-            is_due = interval_s is None or stamp_s - whole_s > (self._period(camera) - 0.5) * interval_s
+            is_due = interval_s is None or self._is_due(camera, stamp_s, whole_s, interval_s)
             if glances.was_as_expected and not is_due:
                 view = view_at(stamp_s)
                 boxes = None if view is None else expected_boxes(*view, speed_m_s)
@@ -135,17 +137,34 @@ class Looking:
             else:
                 glances.expected = len(boxes)
             out.append(Ahead(stamp_s, boxes))
+        glances.to_come_s = [ahead.stamp_s for ahead in out if ahead.regions_px is None]
         return out
 
-    def _period(self, camera: str) -> int:
-        """After so many images one is due; the first time after fewer if another camera's is due then."""
-        glances = self.of(camera)
-        interval_s = glances.interval_s or 0.0
-        others = list(self.glances)[: list(self.glances).index(camera)]
-        is_together = any(
-            abs(self.glances[other].whole_s - glances.whole_s) < 0.5 * interval_s for other in others
+    def _is_due(self, camera: str, stamp_s: float, whole_s: float, interval_s: float) -> bool:
+        """Whether an image is to be searched as a whole: the last of N, or one before if others take turns.
+
+        An earlier one is, where other cameras' whole searches fall on all that are left.
+        """
+        left = self.every_full - round((stamp_s - whole_s) / interval_s)
+        if left <= 0:
+            return True
+        later_s = [stamp_s + number * interval_s for number in range(1, left + 1)]
+        is_last_chance = left <= _EARLIER and all(
+            self._is_whole_beside(camera, later, interval_s) for later in later_s
         )
-        return max(1, self.every_full // 2) if is_together else self.every_full
+        return is_last_chance and not self._is_whole_beside(camera, stamp_s, interval_s)
+
+    def _is_whole_beside(self, camera: str, stamp_s: float, interval_s: float) -> bool:
+        """Whether another camera searches a whole image at a time, as it was told, or as will be its turn.
+
+        Of two cameras whose turns are the same the second one gives way.
+        """
+        cameras = list(self.glances)
+        stamps_s = [stamp for other in cameras if other != camera for stamp in self.glances[other].to_come_s]
+        for other in cameras[: cameras.index(camera)]:
+            glances = self.glances[other]
+            stamps_s.append(max(glances.whole_s, glances.told_s) + self.every_full * interval_s)
+        return any(abs(stamp - stamp_s) < 0.5 * interval_s for stamp in stamps_s)
 
 
 def expected_boxes(belief: Belief, scene: Scene, speed_m_s: float) -> FloatArray | None:

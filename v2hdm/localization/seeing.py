@@ -9,8 +9,19 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from v2hdm.geometry.lens import has_distortion, undistort_points
-from v2hdm.geometry.rigid import exp, hat
-from v2hdm.localization.belief import CAMERA, HEADING, HEIGHT, VEHICLE, Belief, Plane
+from v2hdm.geometry.rigid import exp
+from v2hdm.localization.belief import (
+    CAMERA,
+    HEADING,
+    HEIGHT,
+    PITCH,
+    ROLL,
+    SLOW_PITCH,
+    SLOW_ROLL,
+    VEHICLE,
+    Belief,
+    Plane,
+)
 from v2hdm.records import (
     CROSSWALK,
     LANE_LINE,
@@ -181,12 +192,20 @@ def expect_points(
     # About the axis up in the map, the vehicle's own axis ahead, and its axis to the left before it rolls.
     up = rotation[2]
     left = np.array([0.0, up[2], -up[1]]) / max(float(np.hypot(up[1], up[2])), 1e-9)
-    for states, axis in (((HEADING,), up), ((6, 8), np.array([1.0, 0.0, 0.0])), ((7, 9), left)):
-        slope = (by_vehicle_point @ -(vehicle @ hat(axis).T)[..., None])[..., 0]
-        for state in states:
-            by_vehicle[..., state] = slope
-    by_camera = np.concatenate([by_cam, by_cam @ -hat(cam)], axis=-1)
+    axes = np.array([up, [1.0, 0.0, 0.0], left])
+    turned = _cross(vehicle[..., None, :], axes)
+    by_turn = by_vehicle_point @ turned.swapaxes(-1, -2)
+    by_vehicle[..., [HEADING, ROLL, PITCH]] = by_turn
+    by_vehicle[..., [SLOW_ROLL, SLOW_PITCH]] = by_turn[..., 1:]
+    by_camera = np.concatenate([by_cam, _cross(cam[..., None, :], by_cam)], axis=-1)
     return ExpectedPoints(px, depth_m, by_vehicle, by_camera, by_map[..., :2])
+
+
+def _cross(first: FloatArray, second: FloatArray) -> FloatArray:
+    """The cross product (..., 3): of many short arrays in a fifth of numpy's time."""
+    x, y, z = first[..., 0], first[..., 1], first[..., 2]
+    a, b, c = second[..., 0], second[..., 1], second[..., 2]
+    return np.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=-1)
 
 
 def ground_points(

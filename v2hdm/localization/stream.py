@@ -148,7 +148,9 @@ def pose_record(pose: Pose) -> dict[str, Any]:
     record["protection"] = {
         "ahead_m": _or_none(ahead), "left_m": _or_none(left), "heading_rad": _or_none(pose.protection_rad)
     }  # fmt: skip
-    record["speed_scale"], record["yaw_bias_rad_s"] = (round(value, 6) for value in pose.motion)
+    motion = ("speed_scale", "yaw_bias_rad_s", "odometry_late_s")
+    record |= {name: round(value, 6) for name, value in zip(motion, pose.motion, strict=True)}
+    record["images_s"] = {camera: round(stamp_s, 6) for camera, stamp_s in pose.images_s.items()}
     record["matched"] = pose.matched
     record["matched_lines"] = pose.matched_lines
     record["matched_areas"] = pose.matched_areas

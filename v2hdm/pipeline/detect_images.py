@@ -81,7 +81,8 @@ def detect_images(
             that came before it are dropped and counted (``frame.dropped``).
         stopwatch: takes the time of each stage.
         regions: says for a frame of a calibrated camera where markings with corners are looked for, boxes
-            (R, 4) of left, top, right and bottom, px; None for everything everywhere.
+            (R, 4) of left, top, right and bottom, px; None for everything everywhere. With it, there are no
+            metres, and of lanes only their paint: what a localiser takes.
 
     Returns:
         An iterator over the images; corners are (4, 2) px in the image as recorded, the top-left pixel's
@@ -110,6 +111,8 @@ def detect_images(
             options.max_range_m = _ROUGH_RANGE_M
         detector = Detector.load(options=options)
     road = None if path is None or lens is not None else RoadDetector.calibrated(detector, path, linear)
+    if road is not None and regions is not None:
+        road = RoadDetector(detector, road.camera, road.calibration, is_for_localizer=True)
     rough = RoughCamera(detector, lens, path, mounting, linear)
     most = limit and min(limit, sys.maxsize)
     frames = islice((_live_frames if live else _frames)(str(source), road, rough), most)

@@ -68,6 +68,7 @@ from v2hdm.records.units import (
     SIGMA_OF_MAD,
     SIGMAS_95,
     TWO_SIDED_95,
+    US_FOOT_M,
 )
 
 __all__ = [
@@ -101,6 +102,7 @@ __all__ = [
     "TWO_SIDED_95",
     "UNSTATED_DRIFT_OVER_M",
     "UNSTATED_SIGMA_M",
+    "US_FOOT_M",
     "BoolArray",
     "Calibration",
     "Camera",

@@ -13,6 +13,7 @@ TWO_SIDED_95 = 1.96
 """Half the width of the band that holds 95 % of a normal error in one dimension, in standard deviations."""
 
 FOOT_M = 0.3048  # an international foot, m
+US_FOOT_M = 1200 / 3937  # a US survey foot, m (NIST Handbook 44, appendix C)
 HEIGHT_NOISE = 2.0  # noise of heights by RTK over that of positions in the plane, about
 
 HEAVE_SIGMA_M = 0.01

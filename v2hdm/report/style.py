@@ -58,10 +58,10 @@ def figure(path: Path, width_in: float, height_in: float, dpi: int = 110) -> Ite
     """A figure that is saved atomically to ``path`` at the end of the block."""
     with mpl.rc_context(RC):
         fig = Figure(figsize=(width_in, height_in), dpi=dpi, layout="constrained", facecolor="white")
-        FigureCanvasAgg(fig)
+        canvas: Any = FigureCanvasAgg(fig)
         yield fig
         with whole_file(path) as partial:
-            fig.savefig(partial, format="png")
+            canvas.print_png(partial)  # savefig draws twice, the layout first
 
 
 def draw_arrows(

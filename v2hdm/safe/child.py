@@ -3,17 +3,21 @@
 Decoders of bags, videos and rasters are libraries of others, which a few bytes can make ask for all of the
 memory or work for ever. Here they take what :class:`Limits` allow, or end in one line of the caller's error.
 
-The child is an interpreter that imports only the module of its work: no ``__main__`` is run again, so scripts
-without a guard, notebooks and worker processes may all call this. Its answer is JSON, never an object. The
-caller makes the folders that the child writes into, and so removes them if it dies; the child ends with its
-parent.
+The child is the fork of an interpreter that imports only the modules of such work: no ``__main__`` is run
+again, so scripts without a guard, notebooks and worker processes may all call this. That interpreter, the
+fork server, waits for further jobs until its parent ends: to start it is slow, and it takes 60 MB. It never
+opens a file from outside. The child's answer is JSON, never an object. The caller makes the folders that the
+child writes into, and so removes them if it dies; the child ends with its parent.
 
-Systems without ``resource`` (Windows) have the process and its end, but no limits.
+Where forks are not safe (macOS) or unknown (Windows), each job has an interpreter that ends with it. Systems
+without ``resource`` (Windows) have the process and its end, but no limits.
 """
 
 from __future__ import annotations
 
+import atexit
 import errno
+import importlib
 import json
 import logging
 import os
@@ -22,15 +26,17 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 import traceback
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import IO, Any, Never
+from tempfile import TemporaryDirectory, TemporaryFile
+from typing import IO, Any, ClassVar, NamedTuple, Never
 
 from v2hdm import errors
 from v2hdm.errors import REASON_LETTERS, V2hdmError, bounded, describe, one_line
@@ -43,6 +49,8 @@ except ImportError:  # Windows
 
 _START = "import sys; sys.path[:] = {path!r}; from v2hdm.safe.child import _serve; _serve()"
 _TEMPORARY = ("TMPDIR", "TEMP", "TMP")  # variables that name the folder of temporary files
+# Whether a child is a fork: elsewhere than on Linux, libraries of the system may not work in forks.
+_FORKS = sys.platform == "linux"
 _SPARE_BYTES = 2_000_000_000  # memory and largest file of work on the smallest input; chosen
 _TIMES = 10  # by which memory and largest file grow with the input's bytes
 _STEP_S = 20.0  # processor time of a step of work on the smallest input; chosen
@@ -66,47 +74,146 @@ class Limits:
 
 
 def in_child(
-    work: Callable[..., Any], *arguments: Any, limits: Limits, where: str, error: type[V2hdmError]
+    work: Callable[..., Any],
+    *arguments: Any,
+    limits: Limits,
+    where: str,
+    error: type[V2hdmError],
+    libraries: Sequence[str] = (),
 ) -> Any:
     """The answer of ``work``, a function of a module, in a process of its own: None or plain values of JSON.
 
     Its log lines are this process's. An error that a user can mend and an OSError are raised here as they
     were there; whatever else ends the child, such as a limit, becomes one line of ``error`` that begins
-    with ``where``. Within a child the work is done in place.
+    with ``where``. Within a child the work is done in place. ``libraries`` are modules that the work imports
+    where it needs them: the fork server has them ready.
     """
     if _Child.step_s is not None:
         return work(*arguments)
-    job = pickle.dumps((f"{work.__module__}:{work.__qualname__}", arguments, limits))
-    variables = dict.fromkeys(THREAD_VARIABLES, "1")
-    with TemporaryDirectory(prefix="v2hdm-") as scratch, (Path(scratch) / "stderr").open("w+b") as printed:
-        variables |= dict.fromkeys(_TEMPORARY, scratch)
-        child = subprocess.Popen(
+    with TemporaryDirectory(prefix="v2hdm-") as scratch:
+        variables = dict.fromkeys(THREAD_VARIABLES, "1") | dict.fromkeys(_TEMPORARY, scratch)
+        job = _Job(work.__qualname__, arguments, limits, dict(os.environ | variables), _working_folder())
+        ending = _ForkServer.idle().outcome_of((work.__module__, *libraries), job)
+    if ending.answer is None:
+        _refuse_death(ending.code, ending.said, limits, where, error)
+    if ending.said:
+        print(ending.said, file=sys.stderr)  # what libraries print: no line of it is ours
+    return _outcome_of(ending.answer, limits, where, error)
+
+
+class _Job(NamedTuple):
+    """Work for a child: a function by its name in a module, and what the child has of its parent."""
+
+    function: str
+    arguments: tuple[Any, ...]
+    limits: Limits
+    environment: dict[str, str]
+    folder: str | None  # that its parent works in
+
+
+class _Ending(NamedTuple):
+    """A child's answer, None where it died without one, its exit code, and what was printed in it."""
+
+    answer: list[Any] | None
+    code: int
+    said: str
+
+
+def _working_folder() -> str | None:
+    try:
+        return str(Path.cwd())
+    except FileNotFoundError:  # somebody has removed it
+        return None
+
+
+class _ForkServer:
+    """An interpreter that does one job after another, each in a fork; used by one thread at a time."""
+
+    _waiting: ClassVar[list[_ForkServer]] = []
+
+    def __init__(self, conditions: tuple[Any, ...]) -> None:
+        self._conditions = conditions
+        self._printed = TemporaryFile()  # noqa: SIM115  # closed with the process
+        self._process = subprocess.Popen(
             [sys.executable, "-c", _START.format(path=sys.path)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            stderr=printed,
-            env=os.environ | variables,
+            stderr=self._printed,
+            env=os.environ | dict.fromkeys(THREAD_VARIABLES, "1"),
             start_new_session=True,  # Ctrl-C reaches this process alone, which ends the child
         )
-        assert child.stdin is not None
-        assert child.stdout is not None
+
+    @classmethod
+    def idle(cls) -> _ForkServer:
+        """One that was started as it would be now: a waiting one, or a new one."""
+        now = _conditions()
+        while True:
+            try:
+                server = cls._waiting.pop()
+            except IndexError:
+                return cls(now)
+            if server._conditions == now and server._process.poll() is None:
+                return server
+            server.end()
+
+    def outcome_of(self, modules: Sequence[str], job: _Job) -> _Ending:
+        """How a child ends that does a job of the first of ``modules``; its log lines are this process's."""
+        job_bytes = pickle.dumps((modules, pickle.dumps(job)))
+        self._printed.seek(0)  # the child's place in the file, too
+        self._printed.truncate()
+        code = None
         try:
+            assert self._process.stdin is not None
+            assert self._process.stdout is not None
             with suppress(BrokenPipeError):  # it has died, as its answer says
-                child.stdin.write(len(job).to_bytes(8, "big") + job)
-                child.stdin.flush()
-            answer = _answer(child.stdout)
+                self._process.stdin.write(len(job_bytes).to_bytes(8, "big") + job_bytes)
+                self._process.stdin.flush()
+            answer, code = _answer(self._process.stdout)
+            self._printed.seek(0)
+            said = self._printed.read(1 << 20).decode("utf-8", "replace").rstrip()
         finally:
-            child.kill()
-            child.wait()
-            child.stdout.close()
+            if code is None:
+                self.end()
+            else:
+                self._waiting.append(self)
+        return _Ending(answer, self._process.returncode if code is None else code, said)
+
+    def end(self) -> None:
+        """End the process, and the child that may be at work."""
+        if self._process.returncode is None and hasattr(os, "killpg"):
+            with suppress(ProcessLookupError, PermissionError):
+                os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.kill()
+        self._process.wait()
+        self._close()
+
+    def forget(self) -> None:
+        """Leave the process to the one that has started it, of which this is a fork."""
+        self._process.returncode = 0
+        self._close()
+
+    def _close(self) -> None:
+        for stream in (self._process.stdin, self._process.stdout, self._printed):
+            assert stream is not None
             with suppress(BrokenPipeError):
-                child.stdin.close()
-        said = _said(printed)
-    if answer is None:
-        _refuse_death(child.returncode, said, limits, where, error)
-    if said:
-        print(said, file=sys.stderr)  # what libraries print: no line of it is ours
-    return _outcome_of(answer, limits, where, error)
+                stream.close()
+
+    @classmethod
+    def all_waiting(cls, leave: Callable[[_ForkServer], None]) -> None:
+        """Leave all that wait."""
+        while cls._waiting:
+            leave(cls._waiting.pop())
+
+
+def _conditions() -> tuple[Any, ...]:
+    """What an interpreter has from its parent for good: where modules are, and limits."""
+    names = () if resource is None else [name for name in dir(resource) if name.startswith("RLIMIT_")]
+    return tuple(sys.path), *(resource.getrlimit(getattr(resource, name)) for name in names)
+
+
+atexit.register(_ForkServer.all_waiting, _ForkServer.end)
+if _FORKS:
+    os.register_at_fork(after_in_child=partial(_ForkServer.all_waiting, _ForkServer.forget))
 
 
 def _outcome_of(answer: Sequence[Any], limits: Limits, where: str, error: type[V2hdmError]) -> Any:
@@ -138,22 +245,27 @@ def next_step() -> None:
         _limit("RLIMIT_CPU", time.process_time() + _Child.step_s)
 
 
-def _answer(stream: IO[bytes]) -> list[Any] | None:
-    """The last message of a child, None where it died without one; its log lines are logged on the way."""
+def _answer(stream: IO[bytes]) -> tuple[list[Any] | None, int | None]:
+    """A child's answer, None where it died without one, and its exit code, None where its server ends, too.
+
+    The child's log lines are logged on the way.
+    """
+    answer = None
     for line in stream:
-        message = json.loads(line)
+        try:
+            message = json.loads(line)
+        except ValueError:  # it died while it wrote this
+            continue
+        if message[0] == "ended":
+            return answer, int(message[1])
         if message[0] != "log":
-            return list(message)
+            answer = list(message)
+            continue
         _, name, level, text = message
         logger = logging.getLogger(name)
         if logger.isEnabledFor(level):
             logger.handle(logger.makeRecord(name, level, __file__, 0, text, (), None))
-    return None
-
-
-def _said(printed: IO[bytes]) -> str:
-    printed.seek(0)
-    return printed.read(1 << 20).decode("utf-8", "replace").rstrip()
+    return answer, None
 
 
 def _refuse_death(code: int, said: str, limits: Limits, where: str, error: type[V2hdmError]) -> Never:
@@ -197,15 +309,36 @@ def _send(pipe: IO[bytes], message: tuple[Any, ...]) -> None:
 
 
 def _serve() -> None:
-    """Do one job: what it is comes from stdin, and messages go where stdout went."""
+    """Do one job after another: what each is comes from stdin, and messages go where stdout went."""
     pipe = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what libraries print is no message
-    job = _read(int.from_bytes(_read(8), "big"))
+    while size := _read(8):
+        modules, job = pickle.loads(_read(int.from_bytes(size, "big")))  # our own parent's
+        for module in modules:
+            with suppress(Exception):  # the child tells what it needs and cannot have
+                importlib.import_module(module)
+        if not _FORKS:
+            _work(pipe, modules[0], job)
+        child = os.fork()
+        if not child:
+            _work(pipe, modules[0], job)
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        try:
+            pipe.write(b"\n")  # the child may have died within a line
+            _send(pipe, ("ended", code))
+        except BrokenPipeError:
+            break
+    os._exit(0)
+
+
+def _work(pipe: IO[bytes], module: str, job_bytes: bytes) -> Never:
+    """Do one job, and end."""
+    tempfile.tempdir = None
     threading.Thread(target=_end_with_parent, daemon=True).start()
     logging.basicConfig(handlers=[_Forward(pipe)], level=logging.WARNING)
     logging.getLogger("v2hdm").setLevel(logging.INFO)
     try:
-        message = _outcome(job)
+        message = _outcome(module, job_bytes)
     except MemoryError:
         message = ("memory",)
     _send(pipe, message)
@@ -221,14 +354,16 @@ def _read(size: int) -> bytes:
     return b"".join(parts)
 
 
-def _outcome(job: bytes) -> tuple[Any, ...]:
+def _outcome(module: str, job_bytes: bytes) -> tuple[Any, ...]:
     try:
-        name, arguments, limits = pickle.loads(job)  # our own parent's
-        module, function = name.split(":")
-        __import__(module)
-        work = getattr(sys.modules[module], function)
-        _begin(limits)
-        return "done", work(*arguments)
+        work_module = importlib.import_module(module)
+        job = pickle.loads(job_bytes)
+        os.environ.clear()
+        os.environ.update(job.environment)
+        if job.folder is not None:
+            os.chdir(job.folder)
+        _begin(job.limits)
+        return "done", getattr(work_module, job.function)(*job.arguments)
     except V2hdmError as refusal:
         return "refused", type(refusal).__name__, str(refusal)
     except OSError as failure:

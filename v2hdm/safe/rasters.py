@@ -38,7 +38,10 @@ def mosaic_points(mosaic: Path, spacing_m: float, most: int, piece_px: int) -> I
 def ask(work: Any, path: Path, *arguments: Any) -> None:
     """Do ``work`` on a raster, or on a folder of them, in a child; MapFileError where it dies."""
     files = path.rglob("*") if path.is_dir() else [path]
-    in_child(work, path, *arguments, limits=Limits.of(files), where=str(path), error=MapFileError)
+    limits = Limits.of(files)
+    in_child(
+        work, path, *arguments, limits=limits, where=str(path), error=MapFileError, libraries=("rasterio",)
+    )
 
 
 @contextmanager

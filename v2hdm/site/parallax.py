@@ -40,6 +40,12 @@ Above, at half the camera's height, are upright things, whose points differ in h
 nearer or goes farther with all its points together.
 """
 
+_SILL_M = (0.35, 0.1)
+"""Mean height, m, of sills and running boards of parked cars above the ground, and its standard deviation."""
+
+_SILL_SHARE = 0.05  # of what is not on the ground, sills that look like dashes; chosen: they are rare
+_LEAST_HEIGHTS = 3.0  # least height of a camera over that of a sill: lower cameras see lower sills
+
 _OFF_SHARE = 0.07  # fraction of a marking's sightings that are of something else, as of its observations
 _OFF_M = 1.0  # sigma, m, of such sightings about the marking: association reaches 1.5 m
 _WIDENED = (256.0, 64.0, 16.0, 4.0, 1.0, 1.0, 1.0, 1.0)
@@ -131,7 +137,8 @@ class Parallax:
 def measure_parallax(views: PointViews, count: int) -> Parallax:
     """Compare how likely the sightings of ``count`` candidates are on the ground, above it and moving along.
 
-    Each hypothesis has its own prior of s, and one of all s gives ``slope``. Unknown as well: positions, and
+    What is above is at half the camera's height or, more rarely, a car's sill or running board. Each
+    hypothesis has its own prior of s, and one of all s gives ``slope``. Unknown as well: positions, and
     a roll and pitch error common to all images. A sighting may be of something else, under each hypothesis
     alike; so what a solve would drop counts for the hypothesis that explains it.
     """
@@ -157,8 +164,25 @@ def _measure(views: PointViews, count: int) -> Parallax:
         model.fit(mean, shared**2 * together + single**2 * alone).log_evidence
         for mean, shared, single in (_GROUND, *_ELSEWHERE)
     )
-    log_odds = ground - np.logaddexp(raised, moving_along) + np.log(len(_ELSEWHERE))
+    sill = model.fit(*_of_sills(views, count)).log_evidence
+    elsewhere = np.logaddexp(raised, moving_along) - np.log(len(_ELSEWHERE)) + np.log1p(-_SILL_SHARE)
+    log_odds = ground - np.logaddexp(elsewhere, sill + np.log(_SILL_SHARE))
     return Parallax(free.slope, free.covariance(), log_odds)
+
+
+def _of_sills(views: PointViews, count: int) -> tuple[FloatArray, FloatArray]:
+    """Mean (G,) and covariances (G, P, P) of s of sills under the cameras of ``count`` candidates."""
+    height_m = np.ones(count)
+    sightings = np.bincount(views.group, minlength=count)
+    heights_m = np.bincount(views.group, views.height_m, minlength=count)
+    np.divide(heights_m, sightings, out=height_m, where=sightings > 0)
+    mean_m, sigma_m = _SILL_M
+    mean = height_m / (height_m - np.minimum(mean_m, height_m / _LEAST_HEIGHTS))
+    shared = mean**2 * sigma_m / height_m
+    single = _GROUND[2]
+    points = views.used.shape[1]
+    covariance = shared[:, None, None] ** 2 * np.ones((points, points)) + single**2 * np.eye(points)
+    return mean, covariance
 
 
 class _Distances(NamedTuple):
@@ -257,18 +281,21 @@ class _Model:
             sigma=np.repeat([_ANYWHERE_M, _ANY_SLOPE, tilt_rad], [total, points_each, 2]),
         )
 
-    def fit(self, mean: float, covariance: FloatArray) -> _Fit:
+    def fit(self, mean: float | FloatArray, covariance: FloatArray) -> _Fit:
         """Candidates whose s have a prior of ``mean`` and ``covariance`` (P, P); Laplace's evidence.
+
+        Each candidate may have its own: (G,) and (G, P, P).
 
         Expectation maximisation decides which sightings are of something else, and how large the noise is.
         """
-        points = len(covariance)
-        slopes = slice(2 * points, 3 * points)
-        prior = np.diag(self.sigma**-2.0)
-        prior[slopes, slopes] = np.linalg.inv(covariance)
-        expected = np.zeros(len(prior))
-        expected[slopes] = 1 - mean
         count = len(self.freedom)
+        points = covariance.shape[-1]
+        slopes = slice(2 * points, 3 * points)
+        prior = np.tile(np.diag(self.sigma**-2.0), (count, 1, 1))
+        prior[:, slopes, slopes] = np.linalg.inv(covariance)
+        expected = np.zeros((count, len(self.sigma)))
+        expected[:, slopes] = np.reshape(1 - mean, (-1, 1))
+        by_prior = (prior @ expected[..., None])[..., 0]
         share = np.ones(len(self.group))
         spread = np.ones(count)
         for factor in _WIDENED:
@@ -279,7 +306,7 @@ class _Model:
             by_image += other[:, None, None] * self.outlier.information
             information = self.sums.of(by_image) + prior
             pull = weight[:, None] * self.inlier.gradient + other[:, None] * self.outlier.gradient
-            gradient = self.sums.of(pull) + prior @ expected
+            gradient = self.sums.of(pull) + by_prior
             solved = np.asarray(np.linalg.solve(information, gradient[..., None])[..., 0], dtype=np.float64)
             squared = self.inlier.at(solved[self.group])
             size = self.coordinates * np.log(variance) + self.inlier.log_det
@@ -293,7 +320,7 @@ class _Model:
                 spread = np.maximum(self.sums.of(steady * squared) / freedom, 1.0)
         away = solved - expected
         log_evidence = self.sums.of(self.effective * either)
-        log_evidence -= np.einsum("gi,ij,gj->g", away, prior, away) / 2
+        log_evidence -= np.einsum("gi,gij,gj->g", away, prior, away) / 2
         log_evidence += (np.linalg.slogdet(prior)[1] - np.linalg.slogdet(information)[1]) / 2
         return _Fit(1 - solved[:, slopes], information, slopes, log_evidence)
 

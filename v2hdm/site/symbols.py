@@ -8,7 +8,7 @@ initial vertices, which are then fitted to the outlines in the images (:mod:`v2h
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -80,6 +80,7 @@ def map_symbols(
     apply as to markings. How well vertices are known is no reason against a symbol, unless it has no shape.
     """
     infos = [camera.info for camera in cameras]
+    symbols = _with_areas_by_most_images(symbols, rig)
     kinds = np.array([kind if kind in AREAS else "" for kind in symbols.kinds])
     places = [
         place
@@ -176,7 +177,7 @@ def _places(
     shapes = list(grounds.values())
     centres_map = np.array([marking.corners_map.mean(axis=0) for marking in markings]).reshape(-1, 2)
     places = []
-    for members in _groups(shapes):
+    for members in _groups(shapes, _common):
         image_of_member = np.stack([symbols.camera[rows[members]], symbols.frame[rows[members]]])
         (camera, frame), image = np.unique(image_of_member, axis=1, return_inverse=True)
         if len(camera) < LEAST_SIGHTINGS:
@@ -191,6 +192,25 @@ def _places(
         sides = [symbols.seen_sides[n] for n in rows[members]]
         places.append(_Place(kind, outline, outlines, sides, image.ravel(), eyes))
     return places
+
+
+def _with_areas_by_most_images(symbols: Symbols, rig: Rig) -> Symbols:
+    """The same, but areas of one ground are of the class that most of their images name.
+
+    The same ground is the same size: a word in a box is no box.
+    """
+    grounds = outlines_on_ground(symbols, rig)
+    rows = [row for row, kind in enumerate(symbols.kinds) if kind in AREAS and grounds[row] is not None]
+    if len({symbols.kinds[row] for row in rows}) < 2:
+        return symbols
+    kinds = list(symbols.kinds)
+    shapes = [shape for row in rows if (shape := grounds[row]) is not None]
+    for members in _groups(shapes, _shared):
+        rows_of_ground = [rows[n] for n in members]
+        most = Counter(kinds[row] for row in rows_of_ground).most_common(1)[0][0]
+        for row in rows_of_ground:
+            kinds[row] = most
+    return replace(symbols, kinds=tuple(kinds))
 
 
 def _holds_any(outline: FloatArray, points_map: FloatArray) -> bool:
@@ -348,8 +368,10 @@ def _point_views(points: FloatArray, image: IntArray, eyes: _Eyes, is_other: Boo
     )
 
 
-def _groups(shapes: Sequence[FloatArray]) -> list[IntArray]:
-    """Indices of polygons connected by overlap."""
+def _groups(
+    shapes: Sequence[FloatArray], overlap: Callable[[FloatArray, FloatArray], float]
+) -> list[IntArray]:
+    """Indices of polygons that are connected by enough ``overlap`` of two."""
     middle = np.array([(shape.min(axis=0) + shape.max(axis=0)) / 2 for shape in shapes])
     reach_m = np.array([np.ptp(shape, axis=0).max() for shape in shapes])
     pairs = cKDTree(middle).query_pairs(float(reach_m.max()), output_type="ndarray").reshape(-1, 2)
@@ -357,7 +379,7 @@ def _groups(shapes: Sequence[FloatArray]) -> list[IntArray]:
     groups = DisjointSet(range(len(shapes)))
     for first, second in pairs[in_reach].tolist():
         # Of outlines that others connect already, the overlap says nothing new.
-        if not groups.connected(first, second) and _common(shapes[first], shapes[second]) >= _COMMON:
+        if not groups.connected(first, second) and overlap(shapes[first], shapes[second]) >= _COMMON:
             groups.merge(first, second)
     return sorted((np.array(sorted(group)) for group in groups.subsets()), key=lambda group: int(group[0]))
 
@@ -366,6 +388,12 @@ def _common(shape: FloatArray, other: FloatArray) -> float:
     """Common area of two polygons, relative to the smaller."""
     masks = _covered([shape, other], _COARSE_M)[0]
     return float((masks[0] & masks[1]).sum() / max(min(mask.sum() for mask in masks), 1))
+
+
+def _shared(shape: FloatArray, other: FloatArray) -> float:
+    """Intersection over union of two polygons."""
+    first, second = _covered([shape, other], _COARSE_M)[0]
+    return float((first & second).sum() / max((first | second).sum(), 1))
 
 
 def _covered(shapes: Sequence[FloatArray], cell_m: float) -> tuple[list[np.ndarray], FloatArray]:

@@ -18,6 +18,7 @@ import numpy as np
 
 from v2hdm.errors import DriveError, shown
 from v2hdm.geometry import geodetic
+from v2hdm.geometry.datums import is_named, is_same_datum, utm_of
 from v2hdm.io.rows import read_rows
 from v2hdm.io.trajectory import parse_number
 from v2hdm.records import FOOT_M, FloatArray, GeodeticOrigin
@@ -153,6 +154,14 @@ def misreadings(table: SurveyTable, origin: GeodeticOrigin | None) -> dict[str, 
     """Positions (N, 2) of the points in the map, had the file meant something else; by that meaning."""
     first, second = table.frame.columns
     others = {f"with {first} and {second} swapped": replace(table, coordinates=table.coordinates[:, ::-1])}
+    if table.crs is not None and table.frame is Frame.GRID:
+        units = geodetic.units_of(table.crs, str(table.path), DriveError)
+        if units.horizontal_m != 1.0:
+            others["in metres"] = replace(
+                table,
+                coordinates=table.coordinates / units.horizontal_m,
+                height_m=table.height_m / units.vertical_m,
+            )
     if table.frame is not Frame.GEODETIC:
         others["in feet"] = replace(table, coordinates=FOOT_M * table.coordinates)
         others["in millimetres"] = replace(table, coordinates=1e-3 * table.coordinates)
@@ -175,8 +184,8 @@ def _other_systems(table: SurveyTable, origin: GeodeticOrigin | None) -> list[st
     authority, _, code = (table.crs or "").partition(":")
     if authority.upper() == "EPSG" and code.isdecimal():
         systems = [f"EPSG:{int(code) - 1}", f"EPSG:{int(code) + 1}"]
-    if origin is not None and table.frame is not Frame.GEODETIC:
-        systems.append(geodetic.utm_of(origin))
+    if origin is not None and table.frame is not Frame.GEODETIC and (zone := utm_of(origin)) is not None:
+        systems.append(zone)
     return [crs for crs in systems if crs != table.crs]
 
 
@@ -191,8 +200,12 @@ def _on_earth(table: SurveyTable, origin: GeodeticOrigin | None) -> tuple[FloatA
         )
     height_m = table.height_m
     if crs is not None:
+        units = geodetic.units_of(crs, where, DriveError)
+        height_m = units.vertical_m * height_m
+        if units.horizontal_m != 1.0:
+            _log.info("%s: east, north and heights are read in the unit of %s, %s", where, crs, units.name)
         datum = geodetic.datum_of(crs, where, DriveError)
-        if datum.replace(" ", "") != origin.datum.replace(" ", ""):
+        if is_named(datum) and not is_same_datum(datum, origin.datum):
             raise DriveError(
                 f"{where}: the points are in {datum} ({crs}), the drive's origin in {origin.datum}, which "
                 "differ by decimetres; give the points in the origin's datum"

@@ -10,7 +10,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 
 from tests.faults.cases import png_header
 from tests.maps.gis import write_empty
@@ -324,13 +324,14 @@ def test_a_picture_that_cannot_lie_under_the_map_is_refused_with_its_reason(resu
 def test_no_chart_cuts_off_its_labels(drive, result, monkeypatch):
     ends = []
 
-    def saved(figure, *arguments, **options):
-        save(figure, *arguments, **options)
+    def saved(canvas, *arguments, **options):
+        save(canvas, *arguments, **options)
+        figure = canvas.figure
         box, tight = figure.bbox_inches, figure.get_tightbbox()
         ends.append([box.x0 - tight.x0, box.y0 - tight.y0, tight.x1 - box.x1, tight.y1 - box.y1])
 
-    save = Figure.savefig
-    monkeypatch.setattr(Figure, "savefig", saved)
+    save = FigureCanvasSVG.print_svg
+    monkeypatch.setattr(FigureCanvasSVG, "print_svg", saved)
     document(read_facts(result, drive))
     assert len(ends) >= 6
     assert np.max(ends) < 0.02

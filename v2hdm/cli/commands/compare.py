@@ -33,7 +33,7 @@ def _run(arguments: Sequence[str]) -> int:
     system = "system of the design's coordinates, such as EPSG:25832, or local for the map's frame"
     parser.add_argument("--crs", metavar="NAME", help=system)
     parser.add_argument(
-        "--unit", metavar="NAME", help="unit of a drawing that states none: m, cm, mm, ft, in"
+        "--unit", metavar="NAME", help="unit of a drawing that states none: m, cm, mm, ft, us-ft, in"
     )
     kinds = "what a name in the design is, such as MARK_02=lane_dash; may be repeated"
     parser.add_argument(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import os
 import sys
@@ -116,6 +117,7 @@ def _run_live(arguments: Sequence[str]) -> int:
     lines = MotionLines("standard input" if is_stdin else parsed.motion, hd_map.origin)
     stream_in = sys.stdin if is_stdin else Path(parsed.motion)
 
+    gc.freeze()  # the map outlives every image: no collection need look at it again
     lines_of_poses = lines_to(parsed.output, b'{"stamp_s": ', "poses", grows=True)
     with pose_bag(parsed.mcap) as write_message, lines_of_poses as stream:
 

@@ -73,7 +73,9 @@ def find_blobs(
     scores = _class_scores(output, piece, level, len(contours), groups)
     may_split = _may_split(piece, level, scores.votes >= groups.least_share)
     outlines = outlines_of(level, piece, len(contours))
-    owner = np.zeros_like(piece)
+    first_px = _origin_px(output, 0, 0)
+    number_of_piece = np.zeros(len(contours) + 1, dtype=np.int16)
+    of_parts: list[tuple[Box, BoolArray, int]] = []
     blobs: list[Blob] = []
     doubtful = _doubtful(level, contours, scores.cells)
     first_of_area: dict[int, int] = {}
@@ -85,27 +87,30 @@ def find_blobs(
             first_of_area[area] = len(blobs)
             blobs.append(_doubtful_blob(doubtful, area, level, output))
         box = _framed(cv2.boundingRect(contours[index]))
-        inside = piece[box] == index + 1
         parts: list[Blob] = []
         if may_split[index]:
+            inside = piece[box] == index + 1
             parts = _split(inside, level[box], output, box, groups, scores.votes[index])
         whole = Blob(
             class_score=dict(zip(output.classes, scores.score[:, index].tolist(), strict=True)),
-            level=_signed(inside, level[box]),
+            level=_signed(piece, index + 1, level, box),
             origin_px=_origin_px(output, box[0].start, box[1].start),
             stride=output.stride,
-            outline_px=_origin_px(output, 0, 0) + output.stride * outlines[index],
+            outline_px=first_px + output.stride * outlines[index],
             parts=len(parts),
             traced=not any(part.traced for part in parts),
         )
         blobs.append(whole)
-        owner[box][inside] = len(blobs)
+        number_of_piece[index + 1] = len(blobs)
         for part in parts:
             blobs.append(part)
-            owner[box][part.level > 0] = len(blobs)
+            of_parts.append((box, part.level > 0, len(blobs)))
         if area:
             first = first_of_area[area]
             blobs[first] = replace(blobs[first], parts=len(blobs) - 1 - first)
+    owner = number_of_piece.take(piece)
+    for box, is_of_part, number in of_parts:
+        owner[box][is_of_part] = number
     return blobs, owner[1:-1, 1:-1]
 
 
@@ -124,7 +129,7 @@ def _origin_px(output: NetworkOutput, row: int, column: int) -> FloatArray:
 class _Doubtful(NamedTuple):
     """Connected areas of doubtful paint."""
 
-    labels: np.ndarray  # (h, w) the area of each element of the framed ``paint``
+    labels: np.ndarray  # (h, w) int16 the area of each element of the framed ``paint``
     stats: np.ndarray  # (A, 5) OpenCV's statistics of the areas
     area_of_piece: IntArray  # (B,) the area in which each piece of likely paint lies, 0 if it is the same
 
@@ -136,6 +141,7 @@ def _doubtful(level: np.ndarray, contours: Sequence[np.ndarray], cells: np.ndarr
     doubtful[:, [0, -1]] = 0
     # Labels of 16 bits take a third of the time.
     _, labels, stats, _ = cv2.connectedComponentsWithStats(doubtful, ltype=cv2.CV_16U)
+    labels = labels.view(np.int16)
     if not contours:
         return _Doubtful(labels, stats, np.zeros(0, dtype=np.int64))
     first_point = np.array([contour[0, 0] for contour in contours])
@@ -150,7 +156,8 @@ def _doubtful_blob(doubtful: _Doubtful, area: int, level: np.ndarray, output: Ne
     """The blob of one area of doubtful paint."""
     box = _framed(doubtful.stats[area, : cv2.CC_STAT_AREA].tolist())
     raised = level[box] - np.float32(_DOUBTFUL)
-    return replace(_blob(doubtful.labels[box] == area, raised, output, box), traced=False)
+    labels = np.ascontiguousarray(doubtful.labels[box])
+    return replace(_blob(labels, area, raised, output, box), traced=False)
 
 
 def _connected(level: np.ndarray, least_row: float) -> tuple[list[np.ndarray], np.ndarray]:
@@ -269,24 +276,25 @@ def _split(
     levels = [level - _SURE]
     if len(present) > 1:
         levels = [np.minimum(level, _lead(output, groups.of_class == group, box)) for group in present]
-    masks = []
+    labelled = []
     for part_level in levels:
-        _, labels, stats, _ = cv2.connectedComponentsWithStats(((part_level > 0) & inside).view(np.uint8))
+        is_part = ((part_level > 0) & inside).view(np.uint8)
+        _, labels, stats, _ = cv2.connectedComponentsWithStats(is_part, ltype=cv2.CV_16U)
         large = np.flatnonzero(stats[:, cv2.CC_STAT_AREA] >= _MIN_CELLS)[:_MOST_PARTS].tolist()
-        masks += [(labels == label, part_level) for label in large if label]
-    if len(masks) < 2:
+        labelled += [(labels.view(np.int16), label, part_level) for label in large if label]
+    if len(labelled) < 2:
         return []
-    parts = [_blob(mask, part_level, output, box) for mask, part_level in masks]
+    parts = [_blob(labels, label, part_level, output, box) for labels, label, part_level in labelled]
     touches = any(part.kind in groups.symbols for part in parts)
     return [replace(part, touches_symbol=touches, traced=len(present) > 1) for part in parts]
 
 
-def _blob(mask: BoolArray, level: np.ndarray, output: NetworkOutput, box: Box) -> Blob:
-    """The blob of a mask (h, w), a box of the framed ``paint``."""
-    piece = mask.astype(np.int16)
+def _blob(labels: np.ndarray, label: int, level: np.ndarray, output: NetworkOutput, box: Box) -> Blob:
+    """The blob with one label of int16 ``labels`` (h, w) of a box of the framed ``paint``."""
+    piece = (labels == label).astype(np.int16)
     tally = _tally(output, piece, level, 1, (box[0].start - 1, box[1].start - 1))
     scores = tally.probability[0] * tally.certainty[0] / tally.cells[0] ** 2
-    signed = _signed(mask, level)
+    signed = _signed(labels, label, level, (slice(0, len(level)), slice(0, level.shape[1])))
     origin_px = _origin_px(output, box[0].start, box[1].start)
     outline_px = origin_px + output.stride * outlines_of(signed, piece, 1)[0]
     named = dict(zip(output.classes, scores.tolist(), strict=True))
@@ -310,6 +318,13 @@ def _lead(output: NetworkOutput, is_of_group: BoolArray, box: Box) -> np.ndarray
     return np.asarray(cv2.remap(lead, map_u, map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
-def _signed(mask: BoolArray, level: np.ndarray) -> np.ndarray:
-    """A level (h, w) that is positive in the mask only: holes filled, other blobs in the same box emptied."""
-    return np.asarray(np.where(mask, np.maximum(level, 1e-3), np.minimum(level, -1e-3)))
+def _signed(labels: np.ndarray, label: int, level: np.ndarray, box: Box) -> np.ndarray:
+    """The level in a box of int16 ``labels``, positive in one only: holes filled, all else emptied."""
+    compiled = kernels()
+    if compiled is not None:
+        rows, columns = box
+        return np.asarray(
+            compiled.signed(level, labels, label, rows.start, columns.start, rows.stop, columns.stop)
+        )
+    value = level[box]
+    return np.asarray(np.where(labels[box] == label, np.maximum(value, 1e-3), np.minimum(value, -1e-3)))

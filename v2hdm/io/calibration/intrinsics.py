@@ -18,6 +18,7 @@ import numpy as np
 from v2hdm.errors import DriveError, MapFileError, shown
 from v2hdm.io.calibration.reading import (
     Intrinsics,
+    Lens,
     info_of,
     read_calibration,
     rectified_matrix,
@@ -45,13 +46,6 @@ _COLMAP_CENTRE_PX = 0.5  # COLMAP's coordinate of the centre of the first pixel,
 _KALIBR_PROJECTIONS = {
     "omni": "omnidirectional (omni)", "ds": "double sphere (ds)", "eucm": "extended unified (eucm)",
 }  # fmt: skip
-
-
-class _Lens(NamedTuple):
-    """A distortion model of ours and all of its coefficients."""
-
-    model: str
-    coefficients: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -179,7 +173,7 @@ def _scalar(text: str | None) -> object:
         return words.strip('"')
 
 
-def _brown_conrady(coefficients: Sequence[float], where: str) -> _Lens:
+def _brown_conrady(coefficients: Sequence[float], where: str) -> Lens:
     """Our model for OpenCV's coefficients k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tx ty]]]]."""
     values = list(coefficients) or [0.0] * 5
     while (count := len(values)) in _BEYOND:
@@ -194,16 +188,16 @@ def _brown_conrady(coefficients: Sequence[float], where: str) -> _Lens:
     return _complete(_BROWN_CONRADY[count], values)
 
 
-def _equidistant(coefficients: Sequence[float], where: str) -> _Lens:
+def _equidistant(coefficients: Sequence[float], where: str) -> Lens:
     if len(coefficients) != 4:
         raise DriveError(f"{where}: a fisheye has 4 coefficients, got {len(coefficients)}; restore the file")
     return _complete("equidistant", coefficients)
 
 
-def _complete(model: str, coefficients: Sequence[float]) -> _Lens:
+def _complete(model: str, coefficients: Sequence[float]) -> Lens:
     """The lens with zeros for the coefficients that are missing."""
     missing = DISTORTION_COEFFICIENTS[model] - len(coefficients)
-    return _Lens(model, (*map(float, coefficients), *(0.0,) * missing))
+    return Lens(model, (*map(float, coefficients), *(0.0,) * missing))
 
 
 def _mapping(content: object) -> dict[str, Any]:
@@ -221,7 +215,7 @@ def _need(entries: Mapping[str, Any], keys: Sequence[str], where: str, advice: s
 
 
 def _camera(
-    name: str, size: Sequence[object], size_at: Sequence[str], matrix: FloatArray, lens: _Lens, where: str
+    name: str, size: Sequence[object], size_at: Sequence[str], matrix: FloatArray, lens: Lens, where: str
 ) -> CameraInfo:
     """The checked camera; ``size_at`` names width and height in errors."""
     width, height = (take_size_px(side, at, DriveError) for side, at in zip(size, size_at, strict=True))

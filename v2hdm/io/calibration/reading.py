@@ -51,6 +51,7 @@ _OPTIONAL = (
 _EDGE = ("frame_id", "child_frame_id")
 _IGNORED = ("rectification_matrix", "projection_matrix")  # of stereo rectification, not of recorded images
 _OF_OPENCV = ("dt", "type_id")  # OpenCV adds these to its matrices; numbers tell their type themselves
+_LEAST_COEFFICIENTS = 4  # fewer may be k1 k2 p1, or the three of a radial lens, as MATLAB counts them
 _MODELS = dict.fromkeys(("", "none", "radtan", "brown_conrady"), "plumb_bob")
 _MODELS |= dict.fromkeys(("fisheye", "kannala_brandt", "kannala_brandt4", "kb4"), "equidistant")
 """Our lenses by the names that drivers, OpenCV and Kalibr have for them."""
@@ -180,14 +181,9 @@ def read_camera_info(path: Path) -> CameraInfo:
 def take_camera_info(content: Mapping[str, Any], where: str) -> CameraInfo:
     """The intrinsics in the entries of a ``camera_info`` file; raises DriveError where one is wrong."""
     check_keys(content, _INFO, _IGNORED, where, DriveError)
-    model = take_text(content["distortion_model"], f"{where}: distortion_model", DriveError)
-    expected = _coefficients_of(model, where, "convert the calibration to")
+    stated = take_text(content["distortion_model"], f"{where}: distortion_model", DriveError)
     distortion = take_matrix(content["distortion_coefficients"], f"{where}: distortion_coefficients").ravel()
-    if len(distortion) != expected:
-        raise DriveError(
-            f"{where}: distortion_coefficients: {model} has {expected} coefficients, got {len(distortion)}; "
-            "complete them (zeros where unused) or give the right model"
-        )
+    lens = _lens_of(stated, distortion, where, "convert the calibration to")
     name = take_text(content["camera_name"], f"{where}: camera_name", DriveError)
     width, height = (take_size_px(content[key], f"{where}: {key}", DriveError) for key in _SIZE)
     at = f"{where}: camera_matrix"
@@ -198,16 +194,38 @@ def take_camera_info(content: Mapping[str, Any], where: str) -> CameraInfo:
     zeros = intrinsic[[0, 1, 2, 2], [1, 0, 0, 1]]
     if not has_focals or zeros.any() or intrinsic[2, 2] != 1:
         raise DriveError(f"{at}: not of the form fx 0 cx, 0 fy cy, 0 0 1 with positive fx, fy; fix it")
-    info = CameraInfo(name, width, height, intrinsic, model, tuple(distortion.tolist()))
+    info = CameraInfo(name, width, height, intrinsic, lens.model, lens.coefficients)
     return check_camera(info, where, DriveError)
 
 
-def _coefficients_of(model: str, where: str, advice: str) -> int:
-    """The number of coefficients of a distortion model of ours; else DriveError with ``advice``."""
+class Lens(NamedTuple):
+    """A distortion model of ours and all of its coefficients."""
+
+    model: str
+    coefficients: tuple[float, ...]
+
+
+def _lens_of(stated: str, distortion: FloatArray, where: str, advice: str) -> Lens:
+    """The lens of a model's ``stated`` name and its numbers (N,); DriveError with ``advice`` for others.
+
+    k3 and those after it are zero where they are not given.
+    """
+    model = _MODELS.get(stated.strip().lower().replace("-", "_").replace(" ", "_"), stated)
     if model not in DISTORTION_COEFFICIENTS:
         models = ", ".join(DISTORTION_COEFFICIENTS)
         raise DriveError(f"{where}: unknown distortion_model {shown(model)}; {advice} one of: {models}")
-    return DISTORTION_COEFFICIENTS[model]
+    count = DISTORTION_COEFFICIENTS[model]
+    if model != "equidistant" and 0 < len(distortion) < _LEAST_COEFFICIENTS:
+        raise DriveError(
+            f"{where}: {len(distortion)} distortion coefficients leave open which they are; give k1 k2 p1 p2 "
+            "and k3, with zeros where unused"
+        )
+    if distortion[count:].any():
+        raise DriveError(
+            f"{where}: {model} has {count} coefficients, got {len(distortion)}; {advice} one of: "
+            f"{', '.join(DISTORTION_COEFFICIENTS)}"
+        )
+    return Lens(model, (*distortion[:count].tolist(), *(0.0,) * (count - len(distortion))))
 
 
 def take_matrix(content: object, where: str) -> FloatArray:
@@ -236,7 +254,6 @@ def info_of(fields: Any, name: str, where: str, rectified: bool = False) -> Intr
     intrinsic = info_numbers(fields, "k").reshape(3, -1)
     distortion = info_numbers(fields, "d")
     stated = fields.distortion_model
-    model = _MODELS.get(stated.strip().lower().replace("-", "_").replace(" ", "_"), stated)
     if min(fields.width, fields.height) <= 0:
         raise DriveError(f"{where}: states no size of the image; give camera_info as a file")
     if not intrinsic.any():
@@ -246,18 +263,14 @@ def info_of(fields: Any, name: str, where: str, rectified: bool = False) -> Intr
         projection = info_numbers(fields, "p").reshape(3, -1)
         intrinsic = rectified_matrix(intrinsic, distortion, projection, where)
         distortion = np.zeros(0)
-        model = "plumb_bob"
+        stated = "plumb_bob"
         turn = rectifying_turn(info_numbers(fields, "r").reshape(3, -1), f"{where}, R")
     region = (fields.roi.width, fields.roi.height)
     is_cropped = region not in ((0, 0), (fields.width, fields.height))  # the whole image may be stated, too
     if max(fields.binning_x, fields.binning_y) > 1 or is_cropped:
         raise DriveError(f"{where}: its images are binned or cropped; give camera_info as a file")
-    count = _coefficients_of(model, where, "give camera_info as a file with")
-    if distortion[count:].any():
-        raise DriveError(f"{where}: {model} has {count} coefficients, got {len(distortion)}; give a file")
-    # k3 and those after it are zero where they are not given.
-    padded = (*distortion[:count].tolist(), *(0.0,) * (count - len(distortion)))
-    info = CameraInfo(name, int(fields.width), int(fields.height), intrinsic, model, padded)
+    lens = _lens_of(stated, distortion, where, "give camera_info as a file with")
+    info = CameraInfo(name, int(fields.width), int(fields.height), intrinsic, lens.model, lens.coefficients)
     return Intrinsics(check_camera(info, where, DriveError), turn)
 
 

@@ -15,6 +15,7 @@ from itertools import chain, count
 import numpy as np
 
 from v2hdm.errors import DriveError
+from v2hdm.geometry.datums import is_same_datum
 from v2hdm.geometry.geodetic import enu_axes, enu_from_geodetic, position_of
 from v2hdm.geometry.ipm import initial_extrinsic
 from v2hdm.geometry.rigid import camera_centre, in_order, log, make_transform
@@ -177,7 +178,7 @@ def _check(drives: Sequence[Drive]) -> None:
     if without:
         _log.warning("no drive has an origin: their coordinates are assumed to share one frame")
     datums = {drive.origin.datum: drive.root for drive in drives if drive.origin is not None}
-    if len(datums) > 1:
+    if not all(is_same_datum(datum, next(iter(datums))) for datum in datums):
         stated = ", ".join(f"{root}: {datum}" for datum, root in datums.items())
         raise DriveError(f"drives of several datums ({stated}): transform their poses to one")
 

@@ -65,19 +65,21 @@ def read_nmea(
 ) -> Readings:
     """Read the log at ``path``; damaged sentences are left out and counted, and refused if they prevail.
 
-    The day of ``near_s``, a time of the drive, holds where neither the log nor ``entry`` states one.
+    Where neither the log nor ``entry`` states a day, it is the one by which the log lies about ``near_s``, a
+    time of the drive.
     """
     data = read_bytes(path, DriveError)
     # PowerShell's > writes UTF-16.
     form = "utf-16" if data.startswith((b"\xff\xfe", b"\xfe\xff")) else "ascii"
     lines = data.decode(form, errors="replace").splitlines()
-    first = None
-    if "date" in entry:
-        first = take_date(entry["date"], f"{where}, date")
-    elif near_s is not None and near_s > SINCE_1970_S:
-        first = datetime.fromtimestamp(near_s, tz=UTC).date()
+    first = take_date(entry["date"], f"{where}, date") if "date" in entry else None
     talker = take_text(entry["talker"], f"{where}, talker", DriveError) if "talker" in entry else None
-    return nmea_readings(lines, str(path), first, talker)
+    return nmea_readings(lines, str(path), first, talker, dated(near_s))
+
+
+def dated(near_s: float | None) -> float | None:
+    """A time of the drive if it counts from 1970, so that it has a day; else None."""
+    return near_s if near_s is not None and near_s > SINCE_1970_S else None
 
 
 def take_date(content: object, where: str) -> date:
@@ -90,11 +92,16 @@ def take_date(content: object, where: str) -> date:
 
 
 def nmea_readings(
-    lines: Iterable[str], where: str, first_day: date | None = None, talker: str | None = None
+    lines: Iterable[str],
+    where: str,
+    first_day: date | None = None,
+    talker: str | None = None,
+    near_s: float | None = None,
 ) -> Readings:
     """Readings of sentences in the order of the log, from ``first_day`` on where none has a date.
 
-    ``talker``, two letters, chooses the receiver of several.
+    Without either they lie about ``near_s``, s since 1970. ``talker``, two letters, chooses the receiver of
+    several.
     """
     log = _Log(where)
     sentences = list(_sentences(lines))
@@ -113,7 +120,7 @@ def nmea_readings(
         raise DriveError(
             f"{where}: {bad} of {len(sentences)} NMEA sentences are damaged; record the log again"
         )
-    return log.readings(first_day, talker)
+    return log.readings(first_day, talker, near_s)
 
 
 class _Sentence(NamedTuple):
@@ -361,11 +368,11 @@ class _Log:
         if first > 0:
             self._first_dates[date.fromordinal(first)] += weight
 
-    def readings(self, first_day: date | None, talker: str | None) -> Readings:
+    def readings(self, first_day: date | None, talker: str | None, near_s: float | None) -> Readings:
         """All of it on one clock, seconds since 1970 UTC."""
         if not any(source.fixes for sources in self._positions.values() for source in sources.values()):
             raise DriveError(f"{self._where}: no GGA sentence with a position; log GGA and HDT, THS or PASHR")
-        begin_s = self._begin(first_day)
+        begin_s = self._begin(first_day, near_s)
         chosen = self._receiver(talker)
         stamps = np.array(list(chosen.source.fixes))
         rows = in_order(stamps, self._where, "fix")
@@ -383,10 +390,16 @@ class _Log:
             point="an antenna's", is_fixed=is_fixed[has_height],
         )  # fmt: skip
 
-    def _begin(self, first_day: date | None) -> float:
+    def _begin(self, first_day: date | None, near_s: float | None) -> float:
         """The first day's midnight, s since 1970."""
         dates = self._first_dates.most_common(1)
         day = dates[0][0] if dates else first_day
+        if day is None and near_s is not None:
+            # A log from before midnight may belong to images from behind it, or the other way round.
+            middle_s = float(
+                np.median([epoch.stamp_s for epoch in self._epochs if epoch.stamp_s is not None])
+            )
+            return _DAY_S * round((near_s - middle_s) / _DAY_S)
         if day is None:
             advice = "add date, the day of the first sentence"
             raise DriveError(f"{self._where}: no RMC or ZDA sentence states the date: {advice}")

@@ -17,6 +17,7 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.geometry import geodetic as earth
+from v2hdm.geometry.datums import is_named, is_same_datum
 from v2hdm.geometry.planar import angle_between
 from v2hdm.geometry.rigid import interpolate, make_transform, rotation_from_euler
 from v2hdm.io.description import (
@@ -282,7 +283,7 @@ def _fixed(readings: Readings, settings: PoseSettings, where: str) -> Readings:
     """The readings of positions that are numbers, sure enough and no strays."""
     fixed = _without(readings, _finite(readings.points, readings.sigma_m, where, "positions"))
     fixed = _without(fixed, _sure_enough(fixed, settings.max_sigma_m, where))
-    return _without(fixed, without_strays(fixed.stamp_s, _metres(fixed, where), where))
+    return _without(fixed, without_strays(fixed.stamp_s, _metres(fixed, settings, where), where))
 
 
 def _of_course(
@@ -338,10 +339,10 @@ def _finite(values: FloatArray, sigma_m: FloatArray, where: str, things: str) ->
     return is_number
 
 
-def _metres(readings: Readings, where: str) -> FloatArray:
+def _metres(readings: Readings, settings: PoseSettings, where: str) -> FloatArray:
     """The positions (P, 3) in m, in any frame."""
     if not readings.geodetic:
-        return readings.points
+        return readings.points * _units_m(settings, where)
     middle = np.median(readings.points, axis=0)
     # Strays off the earth stay far away.
     limited = np.clip(readings.points, [-90.0, -540.0, -1e7], [90.0, 540.0, 1e7])
@@ -470,7 +471,10 @@ def _on_earth(
     if crs is not None and earth.has_height_datum(crs, where, DriveError) and settings.geoid_m is None:
         advice = "add geoid_m, the geoid's height above the ellipsoid"
         raise DriveError(f"{where}: heights of {crs} are above sea level: {advice}")
-    raised = points + np.array([0.0, 0.0, settings.geoid_m or 0.0])
+    raised = points.copy()
+    raised[:, 2] = (1.0 if geodetic else _units_m(settings, where)[2]) * points[:, 2] + (
+        settings.geoid_m or 0.0
+    )
     if geodetic:
         if crs is not None and not earth.is_geographic(crs, where, DriveError):
             raise DriveError(f"{where}: holds latitudes and longitudes, but crs {crs} is projected; fix crs")
@@ -486,16 +490,36 @@ def _on_earth(
     north_rad = np.zeros(len(points))
     if settings.heading == "grid":
         north_rad = earth.convergence_rad(crs, raised, where, DriveError)
-    return earth.geodetic_from_grid(crs, raised, where, DriveError), north_rad
+    units = earth.units_of(crs, where, DriveError)
+    if units.horizontal_m != 1.0:
+        _log.info("%s: x, y and z are read in the unit of %s, %s", where, crs, units.name)
+    on_earth = earth.geodetic_from_grid(crs, raised, where, DriveError)
+    if not earth.is_in_use(crs, on_earth, where, DriveError):
+        latitude_deg, longitude_deg, _ = on_earth[0]
+        raise DriveError(
+            f"{where}: its positions would be at latitude {latitude_deg:.2f}, longitude {longitude_deg:.2f}, "
+            f"where {crs} is not used; check it, and that x is the easting and y the northing"
+        )
+    return on_earth, north_rad
+
+
+def _units_m(settings: PoseSettings, where: str) -> FloatArray:
+    """Lengths (3,), m, of the units of x, y and z in the system of the coordinates."""
+    if settings.crs is None:
+        return np.ones(3)
+    units = earth.units_of(settings.crs, where, DriveError)
+    return np.array([units.horizontal_m, units.horizontal_m, units.vertical_m])
 
 
 def _origin(
     stated: GeodeticOrigin | None, first: FloatArray, datum: str, settings: PoseSettings, where: str
 ) -> GeodeticOrigin:
     if stated is None:
+        if not is_named(datum):
+            raise DriveError(f"{where}: crs {settings.crs} names no datum; give its code, such as EPSG:25832")
         return GeodeticOrigin(float(first[0]), float(first[1]), float(first[2]), datum, settings.epoch)
     # Without crs the source does not say its datum: that of a correction service is the origin's.
-    if settings.crs is not None and stated.datum.replace(" ", "") != datum.replace(" ", ""):
+    if settings.crs is not None and is_named(datum) and not is_same_datum(stated.datum, datum):
         raise DriveError(
             f"{where}: the poses are in {datum}, the origin in {stated.datum}, which differ by decimetres; "
             f"give the origin in {datum} (datum: {datum})"

@@ -20,7 +20,7 @@ from v2hdm.errors import DriveError
 from v2hdm.geometry.geodetic import enu_axes, geodetic_from_ecef, geodetic_from_enu
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.io.importers.gps_time import GPS_EPOCH_S, WEEK_S, utc_of_gps
-from v2hdm.io.importers.nmea import nmea_readings
+from v2hdm.io.importers.nmea import dated, nmea_readings
 from v2hdm.io.importers.readings import SIGMA_OF_QUALITY_M, Attitudes, Readings, headings_only
 from v2hdm.io.trajectory import in_order
 from v2hdm.records import FloatArray, GeodeticOrigin
@@ -75,7 +75,7 @@ def read_pos(
     if not rows:
         raise DriveError(f"{path}: holds no solution; check the log of RTKLIB")
     if rows[0].startswith("$"):
-        return nmea_readings(rows, str(path))
+        return nmea_readings(rows, str(path), near_s=dated(near_s))
     header = _header([line for line in lines if line.startswith("%")], str(path))
     table = _table(rows, header, str(path))
     columns = dict(zip(_value_names(header.names), table.T[1:], strict=True))

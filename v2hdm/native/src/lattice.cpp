@@ -40,18 +40,20 @@ Seen see(const Source& source, const Marking& marking, int64_t u, int64_t v) {
 int clearest(const std::vector<float>& light, const std::vector<uint8_t>& part, int count, double grey_first) {
     double best = -1.0;
     int chosen = 0;
+    double number[3];
+    for (int p = 0; p < 3; ++p) number[p] = std::max<double>(std::count(part.begin(), part.end(), p), 1.0);
     for (int colour = 0; colour < COLOURS; ++colour) {
-        double number[3] = {}, mean[3] = {}, variance[3] = {};
+        double mean[3] = {}, square[3] = {};
         for (int i = 0; i < count; ++i) {
-            number[part[i]] += 1;
-            mean[part[i]] += light[COLOURS * i + colour];
+            const double value = light[COLOURS * i + colour];
+            mean[part[i]] += value;
+            square[part[i]] += value * value;
         }
-        for (int p = 0; p < 3; ++p) mean[p] /= std::max(number[p], 1.0);
-        for (int i = 0; i < count; ++i) {
-            const double off = light[COLOURS * i + colour] - mean[part[i]];
-            variance[part[i]] += off * off;
+        double scatter = 0.0;
+        for (int p = 1; p < 3; ++p) {
+            mean[p] /= number[p];
+            scatter += std::max(square[p] / number[p] - mean[p] * mean[p], 0.0);
         }
-        const double scatter = variance[1] / std::max(number[1], 1.0) + variance[2] / std::max(number[2], 1.0);
         double clearness = std::abs(mean[1] - mean[2]) / std::sqrt(scatter + 1e-4);
         if (colour == 0) clearness *= grey_first;
         if (clearness > best) {
@@ -62,26 +64,34 @@ int clearest(const std::vector<float>& light, const std::vector<uint8_t>& part, 
     return chosen;
 }
 
-// What of a point in the frame is told by its place: the nearest side, and the light's basis.
-float place(const Marking& marking, float x, float y, float use, int i, LatticeRows& rows) {
-    float outside[4], nearest = 0.0f;
+// What of the points in the frame is told by their places: the nearest side, and the light's basis.
+//
+// ``nearest`` becomes how far outside of that side each is. Row by row compilers make vector instructions of it.
+void place(const Marking& marking, int count, std::vector<float>& nearest, LatticeRows& rows) {
+    const float *x = rows.points, *y = rows.points + rows.stride;
     for (int s = 0; s < 4; ++s) {
         const float* row = marking.outward + 3 * s;
-        outside[s] = row[0] * x + row[1] * y + row[2];
-        nearest = s == 0 || outside[s] > nearest ? outside[s] : nearest;
+        float* outside = rows.of_side + s * rows.stride;
+        for (int i = 0; i < count; ++i) outside[i] = row[0] * x[i] + row[1] * y[i] + row[2];
+        for (int i = 0; i < count; ++i) nearest[i] = s == 0 || outside[i] > nearest[i] ? outside[i] : nearest[i];
     }
-    for (int s = 0; s < 4; ++s) rows.of_side[s * rows.stride + i] = outside[s] == nearest ? use : 0.0f;
-    float placed[2];
-    for (int axis = 0; axis < 2; ++axis) {
-        const float* row = marking.axes + 3 * axis;
-        placed[axis] = least(most(row[0] * x + row[1] * y + row[2], -1.0f), 1.0f);
+    for (int s = 0; s < 4; ++s) {
+        float* of_side = rows.of_side + s * rows.stride;
+        for (int i = 0; i < count; ++i) of_side[i] = of_side[i] == nearest[i] ? rows.use[i] : 0.0f;
     }
-    const float knot = (placed[0] + 1) * (static_cast<float>(HATS - 1) / 2);
+    const float *along = marking.axes, *across = marking.axes + 3;
+    float* knot = rows.across;  // until it is known how far across they are
+    for (int i = 0; i < count; ++i) {
+        const float placed = least(most(along[0] * x[i] + along[1] * y[i] + along[2], -1.0f), 1.0f);
+        knot[i] = (placed + 1) * (static_cast<float>(HATS - 1) / 2);
+    }
     for (int k = 0; k < HATS; ++k) {
-        rows.hats[k * rows.stride + i] = most(1 - std::abs(knot - static_cast<float>(k)), 0.0f);
+        float* hat = rows.hats + k * rows.stride;
+        for (int i = 0; i < count; ++i) hat[i] = most(1 - std::abs(knot[i] - static_cast<float>(k)), 0.0f);
     }
-    rows.across[i] = placed[1];
-    return nearest;
+    for (int i = 0; i < count; ++i) {
+        rows.across[i] = least(most(across[0] * x[i] + across[1] * y[i] + across[2], -1.0f), 1.0f);
+    }
 }
 
 }  // namespace
@@ -112,9 +122,10 @@ void look(
         rows.limited[i] = seen.clipped;
         used += seen.use;
         clipped += seen.clipped;
-        const float nearest = place(marking, x, y, rows.use[i], i, rows);
-        part[i] = seen.use ? (nearest < 0 ? 1 : 2) : 0;
     }
+    std::vector<float> nearest(count);
+    place(marking, count, nearest, rows);
+    for (int i = 0; i < count; ++i) part[i] = rows.use[i] > 0.0f ? (nearest[i] < 0 ? 1 : 2) : 0;
     const int colour = clearest(light, part, count, grey_first);
     for (int i = 0; i < count; ++i) rows.values[i] = light[static_cast<size_t>(COLOURS) * i + colour];
     *rows.clipped = static_cast<double>(clipped) / std::max(used, 1);

@@ -39,11 +39,11 @@ struct SourceArrays {
         };
         if (lens_object.is_none()) return;
         const auto lens = array_of<const double, 4>(lens_object, "lens");
-        if (lens.shape(0) != 2 || lens.shape(1) != 4) throw std::invalid_argument("lens: of another shape");
+        if (lens.shape(2) != 2 || lens.shape(3) != 4 || lens.size() == 0) throw std::invalid_argument("lens: of another shape");
         lens_array_ = lens;
         source.lens.values = lens_array_.data();
-        source.lens.height = static_cast<int>(lens.shape(2));
-        source.lens.width = static_cast<int>(lens.shape(3));
+        source.lens.height = static_cast<int>(lens.shape(0));
+        source.lens.width = static_cast<int>(lens.shape(1));
     }
 
   private:

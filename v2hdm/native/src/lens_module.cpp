@@ -14,10 +14,10 @@ using namespace nb::literals;
 void undistort(nb::handle points_object, nb::handle table_object, double step_px) {
     const auto points = array_of<double, 2>(points_object, "points");
     const auto table = array_of<const double, 4>(table_object, "table");
-    if (points.shape(1) != 2 || table.shape(0) != 2 || table.shape(1) != 4 || table.size() == 0) {
+    if (points.shape(1) != 2 || table.shape(2) != 2 || table.shape(3) != 4 || table.size() == 0) {
         throw std::invalid_argument("points or table: of another shape");
     }
-    const LensTable lens = {table.data(), static_cast<int>(table.shape(3)), static_cast<int>(table.shape(2)), step_px};
+    const LensTable lens = {table.data(), static_cast<int>(table.shape(1)), static_cast<int>(table.shape(0)), step_px};
     for (size_t i = 0; i < points.shape(0); ++i) {
         double pinhole[2];
         lens.undistort(points.data()[2 * i], points.data()[2 * i + 1], pinhole);

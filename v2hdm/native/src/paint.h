@@ -16,6 +16,14 @@ struct PieceMap {
 // Points (x, y, x, y, ...) of the outlines of ``count`` pieces, where the level falls to zero beside each.
 std::vector<std::vector<double>> outlines(const PieceMap& map, int count);
 
+// Where a rectangle of a map begins, and where it ends.
+struct Box {
+    int first_row, first_column, last_row, last_column;
+};
+
+// The level in a box of a map, positive in one piece only; blobs._signed.
+void sign(const PieceMap& map, int piece, const Box& box, float* levels);
+
 // Log odds of classes at elements that are ``scale`` times as far apart as those of the paint.
 struct Kinds {
     const float* odds;  // (classes, height, width)

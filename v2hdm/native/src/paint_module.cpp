@@ -35,6 +35,18 @@ nb::list outlines_of(nb::handle level, nb::handle piece, int count) {
     return listed;
 }
 
+nb::object signed_of(
+    nb::handle level, nb::handle piece, int number, int first_row, int first_column, int last_row, int last_column) {
+    const MapArrays arrays(level, piece);
+    const Box box = {first_row, first_column, last_row, last_column};
+    const bool is_inside = first_row >= 0 && first_column >= 0 && first_row <= last_row && first_column <= last_column
+        && last_row <= arrays.map.height && last_column <= arrays.map.width;
+    if (!is_inside) throw std::invalid_argument("box: beyond the map");
+    const Made<float> made({static_cast<size_t>(last_row - first_row), static_cast<size_t>(last_column - first_column)});
+    sign(arrays.map, number, box, made.data);
+    return made.array;
+}
+
 nb::tuple tally_of(nb::handle level, nb::handle piece, int count, nb::handle kinds_object, double scale, int first_row, int first_column) {
     const MapArrays arrays(level, piece);
     const auto odds = array_of<const float, 3>(kinds_object, "kinds");
@@ -58,6 +70,9 @@ nb::tuple tally_of(nb::handle level, nb::handle piece, int count, nb::handle kin
 
 void add_paint(nb::module_& module) {
     module.def("outlines", &outlines_of, "level"_a, "piece"_a, "count"_a);
+    module.def(
+        "signed", &signed_of, "level"_a, "piece"_a, "number"_a, "first_row"_a, "first_column"_a, "last_row"_a,
+        "last_column"_a);
     module.def(
         "tally", &tally_of, "level"_a, "piece"_a, "count"_a, "kinds"_a, "scale"_a, "first_row"_a, "first_column"_a);
 }

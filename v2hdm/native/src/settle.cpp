@@ -5,6 +5,7 @@
 #include <vector>
 
 #define V2HDM_SETTLE settle_anywhere
+#include "products.h"
 #include "quad.h"
 #include "solve.h"
 #include "vector_math.h"

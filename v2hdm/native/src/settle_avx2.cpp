@@ -14,6 +14,7 @@
 #endif
 
 #define V2HDM_SETTLE settle_avx2
+#include "products.h"
 #include "quad.h"
 #include "solve.h"
 #include "vector_math.h"

@@ -6,9 +6,14 @@ constexpr int BLOCK = 16;         // pixels that are worked on together; a row o
 constexpr int MEDIAN_STRIDE = 3;  // lattice.py: a median is taken over every third value
 constexpr float FAR_BLURS = 5.0f; // blurs from a side beyond which it changes nothing: its density is 1.5e-6
 constexpr float LOG_SQRT_2PI = 0.91893853f;
+constexpr int32_t NOWHERE = -1;   // the place of a pixel that is not used
 
 using Matrix = double[UNKNOWNS][UNKNOWNS];
 using Vector = double[UNKNOWNS];
+
+struct Pair {
+    int32_t first, second;
+};
 
 float normal_pdf(float x) { return exponential(-0.5f * x * x - LOG_SQRT_2PI); }
 
@@ -16,18 +21,6 @@ float normal_pdf(float x) { return exponential(-0.5f * x * x - LOG_SQRT_2PI); }
 float normal_share(float x) {
     const float odds = 2.0f * x * (0.7988f + 0.03528f * x * x);
     return 0.5f - 1.0f / (exponential(odds) + 1.0f);
-}
-
-double dot(const float* a, const float* b, int count) {
-    float sum = 0.0f;
-    for (int i = 0; i < count; ++i) sum += a[i] * b[i];
-    return sum;
-}
-
-double sum(const float* a, int count) {
-    float total = 0.0f;
-    for (int i = 0; i < count; ++i) total += a[i];
-    return total;
 }
 
 // Factor by which variance grows if residuals correlate with their neighbours; robust.variance_inflation.
@@ -45,7 +38,8 @@ struct Correlation {
 class Fit {
   public:
     Fit(const Pixels& pixels, const OwenTable& table, const FitRules& rules)
-        : pixels_(pixels), table_(table), rules_(rules), count_(pixels.count) {
+        : pixels_(pixels), table_(table), rules_(rules) {
+        arrange();
         row_ = (count_ + BLOCK - 1) / BLOCK * BLOCK;
         buffer_.assign(static_cast<size_t>(row_) * ROWS, 0.0f);
         copy(pixels.points, X);
@@ -64,10 +58,9 @@ class Fit {
         if (std::isnan(unknowns.light[0])) first_light(unknowns);
         explain(unknowns);
         weigh(least_scatter, equations);
-        build_design(*unknowns.contrast);
         Matrix information;
         Vector gradient;
-        square(information, gradient);
+        square(*unknowns.contrast, information, gradient);
         if (pixels_.paint != nullptr) add_paint(information, gradient);
         add_priors(quad, unknowns, information, gradient);
         Vector step;
@@ -89,15 +82,47 @@ class Fit {
         HATS = OF_SIDE + SIDES,
         COVERAGE = HATS + KNOTS,
         BY_SHAPE,  // the coverage's derivatives by the sides' starts and ends, and by the blur
-        DESIGN = BY_SHAPE + BLUR + 1,
-        RESIDUAL = DESIGN + UNKNOWNS,
+        RESIDUAL = BY_SHAPE + BLUR + 1,
         USED, ROBUST, WEIGHT, RATIO, WEIGHTED, SCRATCH,
         ROWS
     };
 
     float* row(int number) { return buffer_.data() + static_cast<size_t>(number) * row_; }
 
-    void copy(const float* from, int number) { std::copy(from, from + count_, row(number)); }
+    void copy(const float* from, int number) {
+        float* to = row(number);
+        for (int i = 0; i < count_; ++i) to[i] = from[order_[i]];
+    }
+
+    // Put the pixels that are used in order of their sides: most blocks of them are far from the three others.
+    void arrange() {
+        std::vector<int32_t> of_side[SIDES + 1];
+        for (int i = 0; i < pixels_.count; ++i) {
+            if (pixels_.use[i] == 0.0f) continue;
+            int side = 0;
+            while (side < SIDES && !(pixels_.of_side[side * pixels_.stride + i] > 0)) ++side;
+            of_side[side].push_back(i);
+        }
+        for (const auto& pixels : of_side) order_.insert(order_.end(), pixels.begin(), pixels.end());
+        count_ = static_cast<int>(order_.size());
+        std::vector<int32_t> place(pixels_.count, NOWHERE);
+        for (int32_t i = 0; i < count_; ++i) place[order_[i]] = i;
+        for (int i = 0; i < pixels_.count; ++i) {
+            if (place[i] == NOWHERE) continue;
+            if (i % MEDIAN_STRIDE == 0) of_median_.push_back(place[i]);
+            if (pixels_.limited[i]) limited_.push_back(place[i]);
+        }
+        pairs_.resize(pixels_.neighbour_rows);
+        for (int axis = 0; axis < pixels_.neighbour_rows; ++axis) {
+            const int64_t* neighbours = pixels_.neighbours + static_cast<int64_t>(axis) * pixels_.stride;
+            for (int32_t i = 0; i < count_; ++i) {
+                const int64_t other = neighbours[order_[i]];  // 0 for none
+                if (other > 0 && other < pixels_.count && place[other] != NOWHERE) {
+                    pairs_[axis].push_back({i, place[other]});
+                }
+            }
+        }
+    }
 
     // The coverage and its derivatives; coverage.blurred_coverage.
     void cover(const Quad& quad, double blur_px) {
@@ -200,12 +225,12 @@ class Fit {
             const float* use = row(USE);
             for (int i = 0; i < row_; ++i) weighted[i] = basis[i] * use[i];
             for (int other = 0; other <= k; ++other) {
-                matrix[k][other] = dot(weighted, row(other < KNOTS ? HATS + other : static_cast<int>(COVERAGE)), row_);
+                matrix[k][other] = product(weighted, row(other < KNOTS ? HATS + other : static_cast<int>(COVERAGE)), row_);
                 if (k < KNOTS) matrix[k][other] += rules_.roughness[k][other];
                 matrix[other][k] = matrix[k][other];
             }
             matrix[k][k] += 1e-6;
-            solution[k] = dot(weighted, row(VALUES), row_);
+            solution[k] = product(weighted, row(VALUES), row_);
         }
         matrix[KNOTS][KNOTS] += 1 / (rules_.contrast_sigma * rules_.contrast_sigma);
         solve_symmetric(matrix, solution);
@@ -235,8 +260,8 @@ class Fit {
             used[i] = use[i];
         }
         // Where the sensor was at its limit the truth is as bright or brighter.
-        for (int i = 0; i < count_; ++i) {
-            if (pixels_.limited[i] && residual[i] < 0) used[i] = 0.0f;
+        for (const int32_t i : limited_) {
+            if (residual[i] < 0) used[i] = 0.0f;
         }
         for (int i = 0; i < row_; ++i) residual[i] *= used[i];
     }
@@ -246,7 +271,7 @@ class Fit {
         const float *residual = row(RESIDUAL), *used = row(USED);
         float* sizes = row(SCRATCH);
         int count = 0;
-        for (int i = 0; i < count_; i += MEDIAN_STRIDE) {
+        for (const int32_t i : of_median_) {
             if (used[i] > 0) sizes[count++] = std::abs(residual[i]);
         }
         if (count == 0) return 0.0f;
@@ -269,17 +294,17 @@ class Fit {
         const double counted = sum(robust, row_);
         const double shared = sum(square, row_) / std::max(counted, 1.0);
         double inflation = 1.0;
-        for (int axis = 0; axis < pixels_.neighbour_rows; ++axis) {
-            inflation *= correlation(pixels_.neighbours + static_cast<int64_t>(axis) * pixels_.stride)
-                             .inflation(rules_.max_correlation);
-        }
+        for (const auto& pairs : pairs_) inflation *= correlation(pairs).inflation(rules_.max_correlation);
         float* weight = row(WEIGHT);
         std::fill(weight, weight + row_, 0.0f);
+        const float* const both[2] = {square, robust};
+        const float* const of_sides[SIDES] = {row(OF_SIDE), row(OF_SIDE + 1), row(OF_SIDE + 2), row(OF_SIDE + 3)};
+        float totals[2][SIDES];
+        products(both, of_sides, row_, totals);
         for (int s = 0; s < SIDES; ++s) {
-            const float* of_side = row(OF_SIDE + s);
+            const float* of_side = of_sides[s];
             const double variance = std::max(
-                (dot(square, of_side, row_) + rules_.shared_pixels * shared)
-                    / (dot(robust, of_side, row_) + rules_.shared_pixels),
+                (totals[0][s] + rules_.shared_pixels * shared) / (totals[1][s] + rules_.shared_pixels),
                 rules_.min_scatter * rules_.min_scatter);
             equations.scatter[s] = std::sqrt(variance);
             const float per_pixel = static_cast<float>(1 / (variance * inflation));
@@ -288,73 +313,77 @@ class Fit {
         *equations.inliers = counted / std::max(sum(used, row_), 1.0);
     }
 
-    // How far residuals are alike at neighbours, of which 0 is none.
-    Correlation correlation(const int64_t* neighbours) {
+    // How far residuals are alike at pairs of neighbours.
+    Correlation correlation(const std::vector<Pair>& pairs) {
         const float *residual = row(RESIDUAL), *robust = row(ROBUST);
         Correlation total;
-        for (int i = 0; i < count_; ++i) {
-            const int64_t other = neighbours[i];
-            const float weight = other > 0 ? robust[i] * robust[other] : 0.0f;
-            const float first = residual[i], second = residual[other];
+        for (const Pair& pair : pairs) {
+            const float weight = robust[pair.first] * robust[pair.second];
+            const float first = residual[pair.first], second = residual[pair.second];
             total.power += weight * (first * first + second * second);
             total.product += weight * first * second;
         }
         return total;
     }
 
-    // The derivatives of the residuals by the unknowns.
-    void build_design(double contrast) {
-        const float gain = std::exp(static_cast<float>(contrast)) - 1;
-        const float *coverage = row(COVERAGE), *ratio = row(RATIO), *across = row(ACROSS);
-        for (int u = 0; u <= BLUR; ++u) {
-            const float* by_shape = row(BY_SHAPE + u);
-            float* design = row(DESIGN + u);
-            for (int i = 0; i < row_; ++i) design[i] = by_shape[i] * gain;
+    // The normal equations of the weighted residuals.
+    void square(double contrast, Matrix& information, Vector& gradient) {
+        double sums[UNKNOWNS + 1][UNKNOWNS + 1] = {};
+        float design[UNKNOWNS + 1][CHUNK];
+        for (int begin = 0; begin < row_; begin += CHUNK) {
+            const int count = std::min(CHUNK, row_ - begin);
+            derive(contrast, begin, count, design);
+            std::copy_n(row(RESIDUAL) + begin, count, design[UNKNOWNS]);
+            add_products(design, row(WEIGHT) + begin, count, sums);
         }
-        for (int k = 0; k < KNOTS; ++k) {
-            const float* hat = row(HATS + k);
-            float* design = row(DESIGN + LIGHT + k);
-            for (int i = 0; i < row_; ++i) design[i] = hat[i] * ratio[i];
-        }
-        float *by_contrast = row(DESIGN + CONTRAST), *by_slope = row(DESIGN + SLOPE);
-        for (int i = 0; i < row_; ++i) {
-            by_contrast[i] = (gain + 1) * coverage[i];
-            by_slope[i] = across[i] * ratio[i];
+        for (int u = 0; u < UNKNOWNS; ++u) {
+            for (int other = 0; other <= u; ++other) information[u][other] = information[other][u] = sums[u][other];
+            gradient[u] = sums[UNKNOWNS][u];
         }
     }
 
-    // The normal equations of the weighted residuals.
-    void square(Matrix& information, Vector& gradient) {
-        const float *weight = row(WEIGHT), *residual = row(RESIDUAL);
-        float* weighted = row(WEIGHTED);
-        for (int u = 0; u < UNKNOWNS; ++u) {
-            const float* design = row(DESIGN + u);
-            for (int i = 0; i < row_; ++i) weighted[i] = design[i] * weight[i];
-            for (int other = 0; other <= u; ++other) {
-                information[u][other] = information[other][u] = dot(weighted, row(DESIGN + other), row_);
-            }
-            gradient[u] = dot(weighted, residual, row_);
+    // The derivatives of ``count`` residuals from ``begin`` on by the unknowns.
+    void derive(double contrast, int begin, int count, float (&design)[UNKNOWNS + 1][CHUNK]) {
+        const float gain = std::exp(static_cast<float>(contrast)) - 1;
+        const float *coverage = row(COVERAGE) + begin, *ratio = row(RATIO) + begin, *across = row(ACROSS) + begin;
+        for (int u = 0; u <= BLUR; ++u) {
+            const float* by_shape = row(BY_SHAPE + u) + begin;
+            for (int i = 0; i < count; ++i) design[u][i] = by_shape[i] * gain;
+        }
+        for (int k = 0; k < KNOTS; ++k) {
+            const float* hat = row(HATS + k) + begin;
+            for (int i = 0; i < count; ++i) design[LIGHT + k][i] = hat[i] * ratio[i];
+        }
+        for (int i = 0; i < count; ++i) {
+            design[CONTRAST][i] = (gain + 1) * coverage[i];
+            design[SLOPE][i] = across[i] * ratio[i];
         }
     }
 
     // Add that the network's probability of paint is the coverage; robust.add_paint.
     void add_paint(Matrix& information, Vector& gradient) {
         const float *paint = row(PAINT), *coverage = row(COVERAGE), *use = row(USE);
-        float *residual = row(SCRATCH), *weight = row(WEIGHT), *weighted = row(WEIGHTED);
         const float per_sigma = static_cast<float>(1 / (rules_.cauchy * rules_.paint_sigma));
         const float per_variance = static_cast<float>(1 / (rules_.paint_sigma * rules_.paint_sigma));
-        for (int i = 0; i < row_; ++i) {
-            residual[i] = paint[i] - coverage[i];
-            const float size = residual[i] * per_sigma;
-            weight[i] = use[i] * per_variance / (1 + size * size);
+        double sums[BLUR + 1][BLUR + 1] = {};
+        float design[BLUR + 1][CHUNK], weight[CHUNK];
+        float* residual = design[BLUR];
+        for (int begin = 0; begin < row_; begin += CHUNK) {
+            const int count = std::min(CHUNK, row_ - begin);
+            for (int u = 0; u < BLUR; ++u) std::copy_n(row(BY_SHAPE + u) + begin, count, design[u]);
+            for (int i = 0; i < count; ++i) {
+                residual[i] = paint[begin + i] - coverage[begin + i];
+                const float size = residual[i] * per_sigma;
+                weight[i] = use[begin + i] * per_variance / (1 + size * size);
+            }
+            add_products(design, weight, count, sums);
         }
         for (int u = 0; u < BLUR; ++u) {
-            const float* by_side = row(BY_SHAPE + u);
-            for (int i = 0; i < row_; ++i) weighted[i] = by_side[i] * weight[i];
-            for (int other = 0; other < BLUR; ++other) {
-                information[u][other] += dot(weighted, row(BY_SHAPE + other), row_);
+            for (int other = 0; other <= u; ++other) {
+                information[u][other] += sums[u][other];
+                if (other < u) information[other][u] += sums[u][other];
             }
-            gradient[u] += dot(weighted, residual, row_);
+            gradient[u] += sums[BLUR][u];
         }
     }
 
@@ -434,8 +463,12 @@ class Fit {
     const Pixels& pixels_;
     const OwenTable& table_;
     const FitRules& rules_;
-    int count_;
-    int row_;  // floats from one row of the buffer to the next
+    std::vector<int32_t> order_;               // the pixels that are used, as they are in the rows of the buffer
+    int count_ = 0;                            // of them
+    std::vector<int32_t> of_median_;           // places in the rows of every few of them, for a median
+    std::vector<int32_t> limited_;             // places of those at which the sensor was at its limit
+    std::vector<std::vector<Pair>> pairs_;     // places of neighbours, by axis
+    int row_ = 0;                              // floats from one row of the buffer to the next
     std::vector<float> buffer_;
 };
 

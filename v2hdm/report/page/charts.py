@@ -62,12 +62,12 @@ def drawn_chart(name: str, width_in: float, height_in: float) -> Iterator[tuple[
     out: list[str] = []
     with mpl.rc_context({**_RC, "svg.hashsalt": name}):
         figure = Figure(figsize=(width_in, height_in), layout="constrained")
-        FigureCanvasSVG(figure)
-        figure.patch.set_alpha(0.0)
+        canvas: Any = FigureCanvasSVG(figure)
+        figure.patch.set(facecolor="none", edgecolor="none")
         yield figure, out
         text = io.StringIO()
         nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-        figure.savefig(text, format="svg", metadata=nothing, transparent=True)
+        canvas.print_svg(text, metadata=nothing)  # savefig draws twice, the layout first
     svg = text.getvalue()
     out.append(svg[svg.index("<svg") :])
 

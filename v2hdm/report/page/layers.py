@@ -12,7 +12,8 @@ import numpy as np
 
 from v2hdm.catalogue import AREAS
 from v2hdm.errors import MapFileError
-from v2hdm.geometry.geodetic import Grid, crs_of, geodetic_from_enu, utm_of
+from v2hdm.geometry.datums import utm_of
+from v2hdm.geometry.geodetic import Grid, crs_of, geodetic_from_enu
 from v2hdm.records import SIGMAS_95, Exclusion, FloatArray, HDMap, Lane, Marking, Symbol
 from v2hdm.report.metrics import corner_errors, match_markings, rms
 from v2hdm.report.page.facts import Facts, GroundResiduals
@@ -265,9 +266,9 @@ def systems_of(hd_map: HDMap, extent: tuple[FloatArray, FloatArray]) -> list[dic
     east_m, north_m = np.linspace(south_west, north_east, 7).T
     x, y = (grid.ravel() for grid in np.meshgrid(east_m, north_m))
     places_map = np.column_stack([x, y, np.zeros_like(x)])
-    code = utm_of(hd_map.origin)
-    earth = geodetic_from_enu(hd_map.origin, places_map)
-    grid = Grid(code, hd_map.origin).positions(places_map)[:, :2]
+    systems = [("", geodetic_from_enu(hd_map.origin, places_map)[:, :2], 7)]
+    if (code := utm_of(hd_map.origin)) is not None:
+        systems.append((code, Grid(code, hd_map.origin).positions(places_map)[:, :2], 2))
     scale = float(np.abs([x, y]).max())
     terms = np.column_stack([(x / scale) ** a * (y / scale) ** b for a in range(4) for b in range(4 - a)])
     return [
@@ -277,7 +278,7 @@ def systems_of(hd_map: HDMap, extent: tuple[FloatArray, FloatArray]) -> list[dic
             "scale": scale,
             "of": np.linalg.lstsq(terms, to, rcond=None)[0].T.tolist(),
         }
-        for name, to, digits in (("", earth[:, :2], 7), (code, grid, 2))
+        for name, to, digits in systems
     ]
 
 

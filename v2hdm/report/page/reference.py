@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from v2hdm.errors import MapFileError
-from v2hdm.geometry.geodetic import LOCAL, Grid, system_of, utm_of
+from v2hdm.geometry.datums import is_same_datum, utm_of
+from v2hdm.geometry.geodetic import LOCAL, Grid, system_of
 from v2hdm.records import FloatArray, GeodeticOrigin, HDMap
 from v2hdm.report.job import StatedJob
 from v2hdm.report.page.facts import Facts
@@ -57,9 +58,9 @@ def reference_of(facts: Facts) -> Reference:
     hd_map = facts.hd_map
     origin = None if hd_map is None else hd_map.origin
     where = f"{facts.folder}: crs of the report"
-    if origin is None or facts.job.crs == LOCAL:
-        asked = facts.job.crs or LOCAL
-        grid = Grid.of(asked, origin, where, MapFileError)
+    chosen = facts.job.crs or (None if origin is None else utm_of(origin)) or LOCAL
+    grid = Grid.of(chosen, origin, where, MapFileError)
+    if grid.is_local:
         name = "local metres, east and north of the map's origin"
         if origin is None:
             horizontal = f"{name}, whose place on the earth the drive does not state"
@@ -68,9 +69,6 @@ def reference_of(facts: Facts) -> Reference:
         axes = _LOCAL_AXES
         digits = 3
     else:
-        grid = Grid(utm_of(origin), origin)
-        if facts.job.crs is not None:
-            grid = Grid.of(facts.job.crs, origin, where, MapFileError)
         system = system_of(grid.crs, where, MapFileError)
         horizontal = f"{system.name} ({grid.crs})"
         axes = ("longitude (°)", "latitude (°)") if system.is_geographic else _LOCAL_AXES
@@ -92,7 +90,7 @@ def _datum(origin: GeodeticOrigin | None) -> str:
     if origin is None:
         return f"{NOT_STATED}: the drive has no position on the earth"
     names = {"WGS84": "World Geodetic System 1984", "ETRS89": "European Terrestrial Reference System 1989"}
-    full = names.get(origin.datum.replace(" ", ""))
+    full = next((full for name, full in names.items() if is_same_datum(name, origin.datum)), None)
     named = f"{origin.datum} ({full})" if full else origin.datum
     return f"{named}, as the drive states it; no datum was transformed"
 

@@ -174,8 +174,11 @@ def _named(evidence: SolveEvidence, contradicted: list[Contradiction], foreign: 
     """The causes to be told, the likeliest first: each would explain part of the same contradictions.
 
     Others are left out if less than a tenth as likely, but for stamps that jitter within the allowed noise.
+    Where the corners fit badly and no input is contradicted, something is wrong for certain: then stamps need
+    only be ten times likelier to jitter than not.
     """
-    stamps = _stamps(evidence)
+    is_unexplained = not contradicted and _fits_badly(evidence)
+    stamps = _stamps(evidence, RIVAL_LOG_ODDS if is_unexplained else _ODDS_LIMIT)
     causes = {foreign: evidence.foreign.gain} if foreign.status is Status.FAIL else {}
     if contradicted:
         likeliest = contradicted[0]
@@ -417,13 +420,21 @@ def _jitter_odds(evidence: SolveEvidence) -> float:
     return STRETCHES * math.log((ratio + 1 / ratio) / 2) - size
 
 
-def _stamps(evidence: SolveEvidence) -> Finding:
-    """Stamps that scatter: the poses err more than stated, from image to image, and only along the way."""
+def _fits_badly(evidence: SolveEvidence) -> bool:
+    """Whether observations fit so badly that something is wrong."""
+    return any(finding.status is Status.FAIL for finding in check_fit(evidence))
+
+
+def _stamps(evidence: SolveEvidence, limit: float) -> Finding:
+    """Stamps that scatter: the poses err more than stated, from image to image, and only along the way.
+
+    They are named from log odds of ``limit`` on.
+    """
     ratio = evidence.along_over_across
     by_ms = 1e3 * evidence.jitter_s
     allowed = max(evidence.pose_noise.values(), default=0.0) <= _POSE_NOISE_LIMIT
     return judge(
-        "image stamps", "poses", _jitter_odds(evidence) * (evidence.jitter_s > _LEAST_JITTER_S), _ODDS_LIMIT,
+        "image stamps", "poses", _jitter_odds(evidence) * (evidence.jitter_s > _LEAST_JITTER_S), limit,
         "", fine="the poses err as much across the path as along it",
         wrong=f"the stamps of the images jitter by {by_ms:.0f} ms: poses err {ratio:.0f} times as much along "
         "the way as across it: stamp images when exposed, not when they arrive",

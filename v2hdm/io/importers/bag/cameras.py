@@ -16,7 +16,13 @@ from v2hdm.io.importers.bag.samples import ImageSample, InfoSample, Samples, is_
 # Of depth, thermal and label images (REP-118, sensor_msgs/image_encodings): more than 8 bits of one channel.
 _NO_LIGHT = re.compile(r"\s*(mono(1[0-6])|(16|32|64)[USF]C1|Z16|Y1[0-6])\b|.*compresseddepth", re.IGNORECASE)
 _RECTIFIED = re.compile(r"rect(?!angle)")
-_TRANSPORTS = ("/compressed", "/compressedDepth")  # ends of topics' names, of image_transport
+_TRANSPORTS = (
+    "/compressed",
+    "/compressedDepth",
+    "/ffmpeg",
+    "/foxglove",
+    "/h264",
+)  # ends of topics' names, of image_transport
 _PLAIN = ("image_raw", "image_color", "image", "image_mono", "compressed")
 """Last names of a sensor's own images, the best first (image_proc)."""
 _IMAGE_WORDS = frozenset(

@@ -22,7 +22,8 @@ _log = logging.getLogger(__name__)
 RAW = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 VIDEO = "foxglove_msgs/msg/CompressedVideo"
-IMAGE_KINDS = (RAW, COMPRESSED, VIDEO)
+PACKET = "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"
+IMAGE_KINDS = (RAW, COMPRESSED, VIDEO, PACKET)
 
 _SUFFIXES: Mapping[bytes, str] = {
     b"\xff\xd8": ".jpg",
@@ -127,7 +128,26 @@ def _turned(pixels: np.ndarray, to_bgr: int, where: str) -> np.ndarray:
 
 
 _FORMATS = ("h264", "h265", "vp9", "av1")
+_FORMAT_OF_CODEC: Mapping[str, str] = {
+    "264": "h264", "265": "h265", "hevc": "h265", "vp9": "vp9", "av1": "av1",
+}  # fmt: skip
+"""The format of video by a part of an encoder's name: libx264, h264_nvenc, hevc_vaapi."""
 _CODECS = {"h265": "hevc"}  # FFmpeg's other names of formats
+
+
+def video_format(kind: str, fields: Any) -> str:
+    """The format of a message that is a packet of video; empty of one that is an image.
+
+    Encoders on the vehicle (Isaac ROS, DepthAI) send packets as ``CompressedImage``, too.
+    """
+    if kind == VIDEO:
+        return str(fields.format)
+    if kind not in (COMPRESSED, PACKET):
+        return ""
+    stated = fields.encoding if kind == PACKET else fields.format
+    codec = stated.partition(";")[0].strip().lower()
+    formats = [form for letters, form in _FORMAT_OF_CODEC.items() if letters in codec]
+    return formats[0] if formats else codec if kind == PACKET else ""
 
 
 class VideoDecoder:

@@ -21,6 +21,11 @@ from v2hdm.safe.placeholders import placeholder_words
 from v2hdm.store.files import load_yaml, take_mapping
 
 SUFFIXES = (".bag", ".mcap", ".db3")
+_LIBRARIES = (
+    "rosbags.rosbag1",
+    "rosbags.rosbag2",
+    "rosbags.typesys",
+)  # a third of the time to read a short bag
 _METADATA = "metadata.yaml"
 _TIMES = 10  # by which a message or a file may have more bytes than the bag that it is packed in
 _TIMES_IN_ALL = 100  # the same of all messages: raw pictures of a simulator may pack twenty times
@@ -181,7 +186,9 @@ def in_child_of(path: Path, work: Callable[..., Any], *arguments: Any) -> Any:
     """The answer of ``work`` on the bag at ``path`` and more ``arguments``, done in a child."""
     need("rosbags", "ros", f"{path}: a bag", DriveError)
     limits = Limits.of(bag_files(path))
-    return in_child(work, path, *arguments, limits=limits, where=str(path), error=DriveError)
+    return in_child(
+        work, path, *arguments, limits=limits, where=str(path), error=DriveError, libraries=_LIBRARIES
+    )
 
 
 @contextmanager

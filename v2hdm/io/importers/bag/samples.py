@@ -150,8 +150,8 @@ def _image_sample(bag: Bag, topic: Topic) -> ImageSample:
 def _look_of(message: Message) -> dict[str, Any]:
     """The form of an image and its size, or what is wrong with it."""
     fields = message.fields
-    if message.kind == kinds.VIDEO:
-        return {"form": fields.format}
+    if form := kinds.video_format(message.kind, fields):
+        return {"form": form}
     if message.kind == kinds.RAW:
         look: dict[str, Any] = {"form": fields.encoding, "size_px": [int(fields.width), int(fields.height)]}
         return look | _refusal_of(lambda: kinds.file_of(message.kind, fields, _HERE))

@@ -13,7 +13,6 @@ from collections import defaultdict
 from collections.abc import Collection, Generator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple, TextIO
 
@@ -111,8 +110,8 @@ class ImageStream(Stream):
             stamp_s.append(stamp_of(message, self._stamps))
             if not len(message.fields.data):
                 continue
-            if message.kind == kinds.VIDEO:
-                decoder = decoder or kinds.VideoDecoder(message.fields.format, topic)
+            if form := kinds.video_format(message.kind, message.fields):
+                decoder = decoder or kinds.VideoDecoder(form, topic)
                 decode(decoder, message.fields.data.tobytes())
             else:
                 suffix, data = kinds.file_of(message.kind, message.fields, f"{topic}, image {number + 1}")
@@ -212,9 +211,9 @@ class PoseStream(Stream):
         if kind == kinds.NMEA:
             text = (folder / _POSES).read_text(encoding="utf-8")
             rows = [line.split(" ", 1) for line in text.splitlines()]
-            first_s = next((stamp_s for stamp, _ in rows if (stamp_s := float(stamp))), None)
-            first_day = None if first_s is None else datetime.fromtimestamp(first_s, tz=UTC).date()
-            return nmea_readings([sentence for _, sentence in rows], where, first_day)
+            stamps = [stamp_s for stamp, _ in rows if (stamp_s := float(stamp))]
+            near_s = float(np.median(stamps)) if stamps else None
+            return nmea_readings([sentence for _, sentence in rows], where, near_s=near_s)
         headings = None if self._heading is None else _read_rows(folder / _HEADINGS, 6)
         return kinds.readings_of(kind, _read_rows(folder / _POSES, 11), headings, where)
 
