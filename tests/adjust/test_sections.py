@@ -52,9 +52,9 @@ def test_drives_along_one_street_are_in_one_part():
 def test_a_street_is_cut_where_few_frames_look_across():
     """Two yards of five passes each, 8 m apart, joined by a street of one pass: the cut is in the street."""
     there = np.column_stack([np.arange(0.0, 100.0, 2.0), np.zeros(50)])
-    passes = np.concatenate([there + [0.0, 8.0 * row] for row in range(5)])
+    passes = np.concatenate([there + np.array([0.0, 8.0 * row]) for row in range(5)])
     street = np.column_stack([np.arange(100.0, 240.0, 2.0), np.zeros(70)])
-    position = np.concatenate([passes, street, passes + [240.0, 0.0]])
+    position = np.concatenate([passes, street, passes + np.array([240.0, 0.0])])
     session = np.repeat(np.arange(11), [50] * 5 + [70] + [50] * 5)
     part = parts_of_way(position, session, 700.0)
     assert part.max() == 1
