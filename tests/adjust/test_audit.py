@@ -14,6 +14,7 @@ from v2hdm.adjust.audit import audit
 from v2hdm.adjust.engine import TorchEngine
 from v2hdm.adjust.engines import make_engine
 from v2hdm.adjust.kernels import evaluate
+from v2hdm.adjust.kernels.rig import make_rig
 from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.model import Estimate, Loss
 from v2hdm.adjust.problem import POSE_STATES
@@ -102,7 +103,11 @@ def test_a_solve_refuses_kernels_that_minimise_something_else(monkeypatch, pose_
     def broken(begin, end, layout, *arguments):
         at(begin, end, layout._replace(measured=layout.measured + 1e-4), *arguments)
 
+    def aside(arrays, layout):
+        return make_rig(arrays, layout._replace(measured=layout.measured + 1e-4))
+
     monkeypatch.setattr(evaluate, "evaluate", broken)
+    monkeypatch.setattr("v2hdm.adjust.kernels.engine.make_rig", aside)
     with pytest.raises(AdjustError, match="compiled adjustment departs from its model: the cost of the obs"):
         solve(make_scene(0, frames=30).problem, SolveOptions(pose_states=pose_states))
 

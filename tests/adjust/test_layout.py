@@ -5,6 +5,7 @@ import math
 import os
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,10 @@ import pytest
 import torch
 
 from tests.adjust.scene import make_scene
+from v2hdm import native
 from v2hdm.adjust import KnownLengths, PoseSigma, SolveOptions, arrays, solve
 from v2hdm.adjust.descent import minimise
+from v2hdm.adjust.kernels.layout import Seen, arrange
 from v2hdm.adjust.problem import POSE_STATES
 
 
@@ -55,6 +58,39 @@ def test_the_covariance_of_corners_that_lengths_join_knows_the_lengths_however_t
         along = np.zeros(8)
         along[2 * k : 2 * k + 4] = np.concatenate([direction, -direction])
         assert np.sqrt(along @ joint @ along) < sigma_m
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_observations_are_sorted_by_corner_and_pair_whatever_was_in_memory(compiled):
+    """Their room is not cleared: even what looks like duplicates there is none."""
+    rng = np.random.default_rng(0)
+    count, cameras, frames, corners = 300, 2, 15, 11
+    chosen = rng.choice(cameras * frames * corners, count, replace=False)
+    camera, frame, corner = np.unravel_index(chosen, (cameras, frames, corners))
+    rank = rng.permutation(corners)
+    seen = Seen.of(
+        (camera, frame, corner, np.zeros((count, 2)), np.tile(np.eye(2), (count, 1, 1))),
+        np.ones((cameras, 4)),
+    )
+    room, order, rank_of_corner, pair = np.zeros((4, count), dtype=np.int32)
+    counts = np.zeros(cameras * frames + 1, dtype=np.int64), np.zeros(corners + 1, dtype=np.int64)
+    with nullcontext() if compiled else native.numpy_alone():
+        repeated = arrange(seen, rank, frames, room, *counts, order, rank_of_corner, pair)
+    assert repeated == -1
+    np.testing.assert_array_equal(order, np.lexsort((frame, camera, rank[corner])))
+    np.testing.assert_array_equal(rank_of_corner, rank[corner][order])
+    np.testing.assert_array_equal(pair, (camera * frames + frame)[order])
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_the_first_observation_that_repeats_another_is_found(compiled):
+    camera, frame, corner = np.array([[0, 1, 0, 1, 0], [2, 2, 1, 2, 0], [1, 0, 1, 0, 1]])
+    seen = Seen.of((camera, frame, corner, np.zeros((5, 2)), np.tile(np.eye(2), (5, 1, 1))), np.ones((2, 4)))
+    room, order, rank_of_corner, pair = np.zeros((4, 5), dtype=np.int32)
+    counts = np.zeros(7, dtype=np.int64), np.zeros(3, dtype=np.int64)
+    with nullcontext() if compiled else native.numpy_alone():
+        repeated = arrange(seen, np.arange(2), 3, room, *counts, order, rank_of_corner, pair)
+    assert order[repeated - 1 : repeated + 1].tolist() == [1, 3]
 
 
 CENTRE = torch.tensor([3.0, -2.0, 0.5], dtype=torch.float64)

@@ -171,6 +171,8 @@ class Arrays:
     @cached_property
     def units(self) -> Tensor:
         """First corners of units, which may begin a run, and the end."""
+        if not bool(self.joined.any()):
+            return torch.arange(self.corner_count + 1, device=self.joined.device)
         end = self.joined.new_full((1,), self.corner_count, dtype=torch.int64)
         return torch.cat([(~self.joined).nonzero()[:, 0], end])
 
@@ -229,7 +231,8 @@ class Arrays:
 
         Known lengths need both corners. Returns the corners' indices here as well.
         """
-        corners, corner = torch.unique(self.corner[keep], return_inverse=True)
+        # Ascending, and so without a sort.
+        corners, corner = torch.unique_consecutive(self.corner[keep], return_inverse=True)
         corners = corners.long()
         rank = torch.full_like(self.corner_order, -1)
         rank[corners] = torch.arange(len(corners), device=rank.device)

@@ -60,19 +60,19 @@ def _audit_observations(arrays: Arrays, estimate: Estimate, focal_px: FloatArray
     points = model.points_in_camera(
         poses.flatten(0, 1).index_select(0, pair), estimate.corners_map.index_select(0, corner)
     )
-    error = model.reprojection_error(points, measured).cpu()
+    x, y = model.reprojection_error(points, measured).cpu().T
     depth_m = points[:, 2].cpu()
     focal = torch.as_tensor(focal_px).repeat_interleave(arrays.moment_count, 0).index_select(0, pair.cpu())
     a, b, c = root_information.cpu()
     place = place.cpu()
 
     residual_px, squared, behind = (torch.from_numpy(column).index_select(0, place) for column in report)
-    expected_px = error * focal
-    x, y = error.unbind(1)
+    expected_px = torch.stack([x, y], dim=1) * focal
     distance = torch.hypot(a * x, b * x + c * y)
-    size = 1 + x.abs() + y.abs()
-    agrees = (squared.sqrt() - distance).abs() <= _ROUNDING * size * (a + b.abs() + c)
-    agrees &= (residual_px - expected_px).abs().amax(1) <= _ROUNDING * float(focal_px.max()) * size
+    rounding = (1 + x.abs() + y.abs()) * _ROUNDING
+    agrees = (squared.sqrt() - distance).abs() <= rounding * (a + b.abs() + c)
+    apart_px = (residual_px - expected_px).abs()
+    agrees &= torch.maximum(*apart_px.T) <= rounding * float(focal_px.max())
     # A descent that got lost says so by its status: what is finite for neither agrees.
     agrees |= ~(squared.isfinite() | distance.isfinite())
     agrees &= (behind == (depth_m <= NEAR_M)) | ((depth_m - NEAR_M).abs() <= _ROUNDING)

@@ -17,7 +17,7 @@ from v2hdm.adjust.model import Estimate, Loss
 from v2hdm.adjust.reduced import Plan
 from v2hdm.adjust.threads import one_thread_in_torch
 from v2hdm.adjust.torch_quirks import bare_step, leave_compiler_out
-from v2hdm.adjust.whitening import Whitening, factorise, whitened_gradient
+from v2hdm.adjust.whitening import Whitening, factorise
 
 Evaluate = Callable[[Tensor], tuple[float, Tensor]]  # cost and gradient at whitened variables y
 
@@ -68,7 +68,8 @@ def minimise(
     def closure() -> float:
         new_cost, new_gradient = evaluations.at(u)
         # An infinite cost means an overshooting step, whatever its gradient.
-        if math.isnan(new_cost) or not (math.isinf(new_cost) or bool(new_gradient.isfinite().all())):
+        # A sum is finite only if all of its terms are.
+        if math.isnan(new_cost) or not (math.isinf(new_cost) or math.isfinite(float(new_gradient.sum()))):
             raise _NoNumberError
         u.grad = new_gradient / scale
         # Differences to the start keep the digits of small improvements of a large cost.
@@ -208,13 +209,9 @@ class Objective:
     def __call__(self, whitened: Tensor) -> tuple[float, Tensor]:
         """Cost and gradient at whitened variables."""
         self.evaluations += 1
-        whitening = self.whitening
-        done = whitening.linearised.evaluate(*whitening.step(whitened))
-        self._last = Point(whitened.clone(), done.estimate, done.terms)
-        by_whitened = whitened_gradient(
-            whitening.plan, whitening.reduced_factor, done.gradient, done.coupled, done.whitened
-        )
-        return sum(done.terms.values()), by_whitened
+        reached = self.whitening.reach(whitened)
+        self._last = Point(whitened.clone(), reached.estimate, reached.terms)
+        return sum(reached.terms.values()), reached.gradient
 
 
 def narrowed(engine: TorchEngine, estimate: Estimate, robust: Loss, last: Loss | None = None) -> Loss:

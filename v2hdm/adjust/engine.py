@@ -38,7 +38,7 @@ from v2hdm.adjust.reduced import (
     factorise_corners,
     frames_per_tile,
 )
-from v2hdm.adjust.tiles import TIP, find_pattern
+from v2hdm.adjust.tiles import TIP, TiledCholesky, find_pattern
 from v2hdm.geometry.tensors import NEAR_M, inverse_depth
 from v2hdm.records import BoolArray, FloatArray
 
@@ -65,6 +65,23 @@ class Evaluated:
     gradient: Gradient  # with respect to the step
     whitened: Tensor  # L^-1 g of the corners, see :meth:`Linearised.carry`
     coupled: Coupled
+
+
+class Factorised(NamedTuple):
+    """A whitening that an engine makes at once, see :class:`v2hdm.adjust.whitening.Whitening`."""
+
+    linearised: Linearised
+    reduced_factor: TiledCholesky
+    smallest_pivot: float
+    gradient: Tensor
+
+
+class Reached(NamedTuple):
+    """What whitened variables lead to."""
+
+    estimate: Estimate
+    terms: dict[str, float]  # its cost, by name
+    gradient: Tensor  # of the cost there by the whitened variables
 
 
 def jacobians(residual: Tensor, leaves: Sequence[Tensor]) -> list[Tensor]:
@@ -141,13 +158,16 @@ class TorchEngine:
         report.behind[order] = (points[:, 2] <= NEAR_M).cpu().numpy()
         return report
 
-    def back_project(self, cam_from_vehicle: Tensor) -> tuple[Tensor, Tensor]:
-        """Corners (N, 2) by weighted back-projection from recorded poses, and which (N,) are determined.
+    def back_project(
+        self, cam_from_vehicle: Tensor, frame_state: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Corners (N, 2) by weighted back-projection, and which (N,) are determined.
 
-        A corner is the mean of the ground points of its rays, each weighted by its observation.
+        Poses are as recorded, or of states (J, S). A corner is the mean of the ground points of its rays,
+        each weighted by its observation.
         """
         arrays = self.arrays
-        state = torch.zeros_like(arrays.state_information_root)
+        state = torch.zeros_like(arrays.state_information_root) if frame_state is None else frame_state
         start = Estimate(cam_from_vehicle, state, arrays.control, arrays.no_clock())
         return self.meet_ground(model.ground_from_ray(self.poses(start).flatten(0, 1)))
 
@@ -261,6 +281,10 @@ class TorchEngine:
         frame[:-1] += (by_before.mT @ by_before)[1:]
         return PriorBlocks(cameras, frame, root[..., None] * by_before)
 
+    def factorised(self, estimate: Estimate, robust: Loss, hold_cameras: bool) -> Factorised | None:
+        """The whitening at an estimate, if this engine makes it at once and its Hessian is definite."""
+        return None
+
     def linearise(self, run: Run, pairs: Pairs, corners_map: Tensor, robust: Loss) -> tuple[Tensor, Tensor]:
         """Jacobians (2, 6, k) and (2, 2, k) of a run's residuals by pair and corner, times root weights."""
         view = View.of(run, pairs, corners_map)
@@ -358,6 +382,14 @@ class Linearised:
         estimate, terms, gradient = self.engine.cost_and_gradient(moved, step.extrinsic, self.robust)
         whitened, coupled = self.carry(gradient.corners_map)
         return Evaluated(estimate, terms, gradient, whitened, coupled)
+
+    def reach(self, whitened: Tensor) -> Reached | None:
+        """What variables of the whitening lead to, if the engine evaluates that at once."""
+        return None
+
+    def by_cameras(self) -> Tensor | None:
+        """L^-1 W' (N, 2, D) of all corners, if frames have no states and the engine keeps it."""
+        return None
 
     def carry(self, by_corner: Tensor) -> tuple[Tensor, Coupled]:
         """L^-1 g (N, 2) and W V^-1 g of a gradient g (N, 2) by the corners."""

@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -33,8 +33,7 @@ from v2hdm.adjust.model import Estimate, Loss
 from v2hdm.adjust.problem import ControlPoints, KnownLengths, Observations, Problem, SolveOptions
 from v2hdm.adjust.solution import Solution, Status
 from v2hdm.adjust.solve import solve
-from v2hdm.adjust.tiles import TiledCholesky
-from v2hdm.adjust.whitening import factorise, whitened_gradient
+from v2hdm.adjust.whitening import Whitening, factorise
 from v2hdm.errors import AdjustError
 from v2hdm.records import FloatArray, IntArray
 
@@ -126,6 +125,44 @@ class _Linearised(NamedTuple):
     settled: _Settled  # its corners
 
 
+@dataclass(frozen=True)
+class _Sum:
+    """A quadratic and a marking's information on the unknowns ``rows``; its vector depends on where it is."""
+
+    earlier: _Quadratic
+    rows: IntArray
+    chart: FloatArray  # that of :func:`_moved`
+    information: FloatArray  # the marking's, by the unknowns
+    joint: FloatArray  # the sum's
+
+    @classmethod
+    def of(cls, earlier: _Quadratic, rows: IntArray, held: FloatArray, chart: FloatArray) -> _Sum:
+        """Of the information ``held`` by the cameras' tangents."""
+        information = chart.T @ held @ chart
+        joint = earlier.information.copy()
+        joint[rows[:, None], rows] += information
+        return cls(earlier, rows, chart, information, joint)
+
+    def minimised(self, at: FloatArray, by: Tensor, size: int) -> _Joined:
+        """Its minimum, from the marking's whitened gradient ``by`` at the unknowns ``at``.
+
+        The first ``size`` of the whitened variables are the reduced ones, whose last are the cameras.
+        """
+        rows = self.rows
+        step = -by
+        cameras = step[size - len(rows) : size]
+        vector = self.information @ at[rows] + self.chart.T @ cameras.cpu().numpy()
+        contribution = _Contribution(rows, self.information, vector)
+        moved = self.earlier.vector.copy()
+        moved[rows] += vector
+        quadratic = _Quadratic(self.earlier.cameras, self.earlier.base, self.joint, moved)
+        change = quadratic.mean - at
+        cameras.zero_()
+        gained = float(step @ step) + float(change @ self.joint @ change)
+        cameras.copy_(torch.from_numpy(self.chart @ change[rows]))
+        return _Joined(contribution, quadratic, step, gained)
+
+
 class _Joined(NamedTuple):
     """A marking joined to a quadratic, and the step to the minimum of the sum."""
 
@@ -176,7 +213,7 @@ class IncrementalMap:
 
     def preview(self, sighted: Sighted) -> FloatArray:
         """Back-projected corners (n, 2), nan above the horizon; AdjustError for a duplicate in an image."""
-        problem, _ = self._problem([sighted])
+        problem, _ = self._problem([sighted], cam_from_vehicle=self.cam_from_vehicle)
         arrays = make_arrays(problem, (), "cpu")
         engine = make_engine(self._options.engine, arrays)
         corners, fixed = engine.back_project(torch.from_numpy(problem.cam_from_vehicle))
@@ -246,7 +283,7 @@ class IncrementalMap:
         if not self._sighted:
             raise AdjustError("there is no marking to adjust")
         every = list(self._sighted.values())
-        problem, cameras = self._problem(every)
+        problem, cameras = self._problem(every, cam_from_vehicle=self.cam_from_vehicle)
         options = replace(self._options, coarse=self._options.coarse and self._earlier is None)
         solution = solve(problem, options)
         bad = solution.status in (Status.BEHIND_CAMERA, Status.UNDETERMINED)
@@ -291,17 +328,15 @@ class IncrementalMap:
         for _ in range(options.max_refreshes):
             loss = narrowed(engine, estimate, robust, loss)
             held = factorise(engine, plan, estimate, loss, hold_cameras=True)
-            share = partial(_joined, earlier, rows, held.reduced_factor, moved.chart)
-            before = share(at, held.gradient)
-            step = held.step(before.whitened_step)
-            if not float(step[1][..., 3:].norm(dim=-1).max()) <= math.pi:  # outside the chart
+            assert held.reduced_factor.held is not None
+            joining = _Sum.of(earlier, rows, held.reduced_factor.held.cpu().numpy(), moved.chart)
+            size = held.reduced_factor.size
+            before = joining.minimised(at, held.gradient, size)
+            if not _largest_turn_rad(held, before.whitened_step) <= math.pi:  # outside the chart
                 raise _unsolved(f"marking {marking}", Status.STALLED)
-            done = held.linearised.evaluate(*step)
+            done = held.reach(before.whitened_step)
             at = before.joint.mean
-            gradient = whitened_gradient(
-                plan, held.reduced_factor, done.gradient, done.coupled, done.whitened
-            )
-            joined = share(at, gradient)
+            joined = joining.minimised(at, done.gradient, size)
             gap = joined.gained / max(sum(done.terms.values()), 1.0)
             if not gap > _GAP_TOLERANCE and loss.scale <= robust.scale:
                 break
@@ -320,36 +355,27 @@ class IncrementalMap:
         return _Linearised(joined.joint, joined.contribution, settled)
 
     def _problem(self, sighted: Sequence[Sighted], **changes: Any) -> tuple[Problem, IntArray]:
-        """Some markings as a problem of their cameras and frames, and the indices of these cameras."""
+        """Some markings as a problem of their cameras and frames, and the indices of these cameras.
+
+        Cameras are where the drive has them, unless ``changes`` say otherwise.
+        """
         starts = np.cumsum([0, *(marking.corner_count for marking in sighted)])
         observations = _stacked([marking.observations for marking in sighted])
         counts = [len(marking.observations.corner) for marking in sighted]
         corner = observations.corner + np.repeat(starts[:-1], counts)
         changes["control"] = _known([marking.control for marking in sighted], starts)
         changes["lengths"] = _known([marking.lengths for marking in sighted], starts)
-        changes["cam_from_vehicle"] = self.cam_from_vehicle
         part = self._drive.seen_by(replace(observations, corner=corner), **changes)
         return part.problem, part.cameras
 
 
-def _joined(
-    earlier: _Quadratic, rows: IntArray, factor: TiledCholesky, chart: FloatArray, at: FloatArray, by: Tensor
-) -> _Joined:
-    """A marking joined to ``earlier``, from its whitened gradient ``by`` at the unknowns ``at``.
-
-    ``factor`` is of a whitening with held cameras, ``chart`` that of :func:`_moved`.
-    """
-    assert factor.held is not None
-    step = -by
-    cameras = step[factor.size - len(rows) : factor.size]
-    information = chart.T @ factor.held.cpu().numpy() @ chart
-    contribution = _Contribution(rows, information, information @ at[rows] + chart.T @ cameras.cpu().numpy())
-    joint = earlier.plus(contribution, 1.0)
-    change = joint.mean - at
-    cameras.zero_()
-    gained = float(step @ step) + float(change @ joint.information @ change)
-    cameras.copy_(torch.from_numpy(chart @ change[rows]))
-    return _Joined(contribution, joint, step, gained)
+def _largest_turn_rad(held: Whitening, whitened: Tensor) -> float:
+    """The largest rotation of a camera in a frame by the step of whitened variables."""
+    if held.engine.arrays.states:
+        turns = held.step(whitened).tangents[..., 3:]
+    else:
+        turns = held.camera_step(whitened)[:, 3:6]
+    return float(turns.norm(dim=-1).max())
 
 
 def _moved(base: FloatArray, unknowns: FloatArray, device: str) -> _Moved:

@@ -36,13 +36,15 @@ def shifted(problem: Problem, by_m: FloatArray) -> Problem:
     """``problem`` on a map with all points moved by ``by_m`` (2,)."""
     if not by_m.any():
         return problem
-    poses = problem.map_from_vehicle.copy()
-    poses[:, :2, 3] += by_m
+    moves = np.eye(4)
+    moves[:2, 3] = by_m
+    poses_start = problem.poses_start
     start = problem.corners_start
     control = problem.control
     return replace(
         problem,
-        map_from_vehicle=poses,
+        map_from_vehicle=moves @ problem.map_from_vehicle,
+        poses_start=None if poses_start is None else moves @ poses_start,
         corners_start=None if start is None else start + by_m,
         control=None if control is None else replace(control, points_map=control.points_map + by_m),
     )
@@ -231,32 +233,25 @@ class _Sorted(NamedTuple):
 
 def _sorted_observations(problem: Problem, rank: IntArray) -> _Sorted:
     """The observations in order; AdjustError where two are of one corner in one image."""
-    from v2hdm.adjust.kernels.layout import Seen, lay_out
+    from v2hdm.adjust.kernels.layout import Seen, arrange, lay_out
 
     columns = Seen.of(problem.observations.columns, problem.intrinsic)
     count = len(problem.observations.corner)
     frames = len(problem.map_from_vehicle)
-    key = (rank[columns.corner] * len(columns.intrinsic) + columns.camera) * frames + columns.frame
-    order = _stable_order(key)
-    corner, pair = np.empty((2, count), dtype=np.int32)
-    measured = np.empty((2, count))
-    root = np.empty((3, count))
-    repeated = lay_out(columns, rank, frames, order, corner, pair, measured, root)
+    by_pair, order, corner, pair = np.empty((4, count), dtype=np.int32)
+    pair_at = np.zeros(len(columns.intrinsic) * frames + 1, dtype=np.int64)
+    corner_at = np.zeros(len(rank) + 1, dtype=np.int64)
+    repeated = arrange(columns, rank, frames, by_pair, pair_at, corner_at, order, corner, pair)
     if repeated >= 0:
         first, second = order[repeated - 1 : repeated + 1].tolist()
         raise AdjustError(
             f"observations {first} and {second} are the same corner {columns.corner[first]} in frame "
             f"{columns.frame[first]} of camera {columns.camera[first]}: keep one of them"
         )
-    return _Sorted(order.astype(np.int32), corner, pair, measured, root)
-
-
-def _stable_order(keys: IntArray) -> IntArray:
-    """The stable order (K,) of keys from 0, digit by digit: numpy sorts numbers of 16 bits in linear time."""
-    order = np.argsort((keys & 0xFFFF).astype(np.uint16), kind="stable")
-    while (keys := keys >> 16).any():
-        order = order[np.argsort((keys[order] & 0xFFFF).astype(np.uint16), kind="stable")]
-    return order
+    measured = np.empty((2, count))
+    root = np.empty((3, count))
+    lay_out(columns, order, measured, root)
+    return _Sorted(order, corner, pair, measured, root)
 
 
 def _clock_twist(problem: Problem, clock_offset: bool) -> tuple[FloatArray, list[float]]:

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 
+@cache
 def bare_step() -> Callable[[torch.optim.LBFGS, Callable[[], float]], Any]:
     """LBFGS' step without the profiler's hooks around it, which take as long as the step."""
     step: Callable[[torch.optim.LBFGS, Callable[[], float]], Any] = inspect.unwrap(torch.optim.LBFGS.step)

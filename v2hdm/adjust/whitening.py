@@ -24,7 +24,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from v2hdm.adjust.engine import Linearised, TorchEngine
+from v2hdm.adjust.engine import Linearised, Reached, TorchEngine
 from v2hdm.adjust.model import Estimate, Gradient, Loss
 from v2hdm.adjust.reduced import Coupled, Plan, ReducedSystem, Spread, from_tiles, to_tiles
 from v2hdm.adjust.tiles import TiledCholesky
@@ -89,6 +89,15 @@ class Whitening:
         corner_gradients = torch.stack([_less_kept(self.plan, corners) for corners, _ in carried])
         return torch.cat([reduced.mT, corner_gradients.flatten(1)], dim=1)
 
+    def camera_step(self, whitened: Tensor) -> Tensor:
+        """The cameras' part (C, 6 + Q) of a step: they come last, and need no other variables."""
+        tip = self.reduced_factor.tip
+        end = self.reduced_factor.size
+        solved: Tensor = torch.linalg.solve_triangular(
+            tip.mT, whitened[end - len(tip) : end, None], upper=True
+        )
+        return solved.view(self.engine.arrays.camera_count, -1)
+
     def step(self, whitened: Tensor) -> Step:
         """The step of whitened variables."""
         arrays = self.engine.arrays
@@ -107,6 +116,17 @@ class Whitening:
         if len(kept_steps):
             whitened_corners = whitened_corners.index_copy(0, self.plan.kept_corners, kept_steps)
         return Step(Gradient(extrinsics, states, motion.new_empty(0, 2), clock), motion, whitened_corners)
+
+    def reach(self, whitened: Tensor) -> Reached:
+        """The estimate that whitened variables stand for, its cost, and the gradient by them."""
+        at_once = self.linearised.reach(whitened)
+        if at_once is not None:
+            return at_once
+        done = self.linearised.evaluate(*self.step(whitened))
+        gradient = whitened_gradient(
+            self.plan, self.reduced_factor, done.gradient, done.coupled, done.whitened
+        )
+        return Reached(done.estimate, done.terms, gradient)
 
 
 def whitened_gradient(
@@ -137,6 +157,20 @@ def factorise(
 
     Raises AdjustError if the normal equations cannot be factorised.
     """
+    at_once = engine.factorised(estimate, robust, hold_cameras)
+    if at_once is not None:
+        return Whitening(
+            engine=engine,
+            plan=plan,
+            estimate=estimate,
+            robust=robust,
+            linearised=at_once.linearised,
+            gradient=at_once.gradient,
+            spread=at_once.linearised.spread,
+            reduced_factor=at_once.reduced_factor,
+            smallest_pivot=at_once.smallest_pivot,
+            jitter=0.0,
+        )
     spread = engine.spread(estimate)
     priors = engine.prior_blocks(estimate)
     for jitter in JITTER_STEPS:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,10 +14,11 @@ from scipy.sparse import csr_array, triu
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays, Run
-from v2hdm.adjust.engine import Evaluated, Linearised, Report, TorchEngine
+from v2hdm.adjust.engine import Evaluated, Factorised, Linearised, Reached, Report, TorchEngine
 from v2hdm.adjust.kernels import evaluate, linearise
 from v2hdm.adjust.kernels.evaluate import Evaluation
 from v2hdm.adjust.kernels.layout import LOSS_CODES, Base, Layout, Scratch, make_layout
+from v2hdm.adjust.kernels.rig import factor_of, make_rig, terms_of
 from v2hdm.adjust.kernels.tables import cam_from_map, move, spread_of, with_priors
 from v2hdm.adjust.model import Estimate, Gradient, Loss
 from v2hdm.adjust.reduced import (
@@ -245,6 +247,60 @@ class KernelEngine(TorchEngine):
             base=base,
         )
 
+    @cached_property
+    def _rig(self) -> Any:
+        return make_rig(self.arrays, self.layout)
+
+    @cached_property
+    def _still(self) -> Spread:
+        """The spread of pairs that move with their camera alone."""
+        none = self.arrays.centre.new_zeros(self.arrays.camera_count, self.arrays.moment_count, 6, 0)
+        return Spread(self.arrays, none, none)
+
+    def factorised(self, estimate: Estimate, robust: Loss, hold_cameras: bool) -> Factorised | None:
+        """The whitening at an estimate at once, if cameras alone move and its Hessian is definite."""
+        if self._rig is None:
+            return None
+        corners = _rows(estimate.corners_map)
+        code = LOSS_CODES[robust.name]
+        scale = float(robust.scale)
+        made = self._rig.linearise(_rows(estimate.cam_from_vehicle), corners, code, scale)
+        self.share(made.eliminate)
+        if not made.is_separable():
+            raise AdjustError(INSEPARABLE)
+        if not made.factorise(hold_cameras):
+            return None
+        arrays = self.arrays
+        lower = made.lower.reshape(3, -1)
+        base = Base(
+            made.table.reshape(-1, 16),
+            corners,
+            code,
+            scale,
+            lower,
+            made.joint,
+            made.rows.reshape(-1, 6 * arrays.camera_count),
+        )
+        factor = factor_of(made)
+        gradient = torch.from_numpy(made.gradient)
+        by_camera = torch.from_numpy(made.by_camera).view(-1, 6)
+        none = estimate.corners_map[:0]
+        linearised = KernelLinearised(
+            engine=self,
+            estimate=estimate,
+            robust=robust,
+            spread=self._still,
+            terms=terms_of(made),
+            gradient=Gradient(by_camera, estimate.frame_state, none, estimate.clock_s),
+            corner_factor=_corner_factor(arrays, base),
+            whitened=gradient[factor.size :].view(-1, 2),
+            coupled=Coupled(estimate.frame_state, torch.from_numpy(made.coupled).view(-1, 6)),
+            couplings=by_camera.new_empty(2, 6, 0),
+            base=base,
+            rig=made,
+        )
+        return Factorised(linearised, factor, made.smallest_pivot, gradient)
+
     def _base(self, estimate: Estimate, robust: Loss, width: int) -> Base:
         """The estimate as kernels read it, with room for factors; all cameras have ``width`` unknowns."""
         arrays = self.arrays
@@ -368,6 +424,19 @@ class KernelLinearised(Linearised):
 
     engine: KernelEngine
     base: Base
+    rig: Any = None  # the same as C++ made it, if at once
+
+    def reach(self, whitened: Tensor) -> Reached | None:
+        """What variables of the whitening lead to, if the engine made it at once."""
+        if self.rig is None:
+            return None
+        made = self.rig.evaluate(_rows(whitened))
+        self.engine.share(made.look)
+        made.finish()
+        cameras = torch.from_numpy(made.cam_from_vehicle).view(-1, 4, 4)
+        corners = torch.from_numpy(made.corners_map).view(-1, 2)
+        estimate = replace(self.estimate, cam_from_vehicle=cameras, corners_map=corners)
+        return Reached(estimate, terms_of(made), torch.from_numpy(made.gradient))
 
     def evaluate(self, step: Gradient, tangents: Tensor, whitened_corners: Tensor) -> Evaluated:
         """Evaluate after a step of the reduced unknowns, in one pass over the observations."""
@@ -395,6 +464,11 @@ class KernelLinearised(Linearised):
         by_tangent = (torch.from_numpy(chart).mT @ gradient.extrinsic[..., None])[..., 0]
         at = replace(at, corners_map=torch.from_numpy(out.corners))
         return Evaluated(at, terms, replace(gradient, extrinsic=by_tangent), *self._carried(out))
+
+    def by_cameras(self) -> Tensor | None:
+        """L^-1 W' (N, 2, D) of all corners, if frames have no states."""
+        rows = self.base.rows
+        return torch.from_numpy(rows).view(-1, 2, rows.shape[1]) if len(rows) else None
 
     def carry(self, by_corner: Tensor) -> tuple[Tensor, Coupled]:
         """L^-1 g (N, 2) and W V^-1 g of a gradient g (N, 2) by the corners."""

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from v2hdm.adjust.arrays import Arrays
@@ -55,7 +55,7 @@ def make_layout(arrays: Arrays) -> Layout:
     unit = arrays.units.numpy()
     chunk = np.searchsorted(unit, [corner for _, corner in arrays.run_bounds])
     pair = arrays.pair.numpy()
-    touched = [_distinct(part, arrays.pair_count) for part in np.split(pair, begin[unit[chunk[1:-1]]])]
+    touched = [_distinct(pair[start:end], arrays.pair_count) for start, end in pairwise(begin[unit[chunk]])]
     joined = np.diff(unit)
     lengths = arrays.lengths
     of_length = np.searchsorted(unit, lengths.first.numpy(), side="right") - 1
@@ -65,7 +65,7 @@ def make_layout(arrays: Arrays) -> Layout:
         measured=arrays.measured.numpy(),
         root=arrays.root_information.numpy(),
         moments=arrays.moment_count,
-        frame=arrays.frame_of(torch.arange(arrays.moment_count)).numpy(),
+        frame=_frame_of_moment(arrays),
         begin=begin,
         unit=unit,
         joint_at=joint_offsets(joined),
@@ -85,6 +85,12 @@ def make_layout(arrays: Arrays) -> Layout:
     )
 
 
+def _frame_of_moment(arrays: Arrays) -> IntArray:
+    """The frame (M,) of each moment."""
+    moments = arrays.frame_of_moment
+    return np.arange(arrays.moment_count) if moments is None else np.asarray(moments.numpy())
+
+
 def _distinct(pair: IntArray, pairs: int) -> IntArray:
     """The distinct pairs of a chunk, by a mask over all pairs, which is faster than sorting."""
     is_touched = np.zeros(pairs, dtype=np.bool_)
@@ -95,6 +101,8 @@ def _distinct(pair: IntArray, pairs: int) -> IntArray:
 def joint_offsets(joined: IntArray) -> IntArray:
     """Offsets (M,) of the factors (2g, 2g) of units of g > 1 corners; equal sizes are contiguous."""
     out = np.zeros(len(joined), dtype=np.int64)
+    if joined.max(initial=1) == 1:
+        return out
     begin = 0
     for size in np.unique(joined[joined > 1]):
         same = np.flatnonzero(joined == size)
@@ -187,27 +195,56 @@ def first_unsound(
     return -1
 
 
-@twin("adjust.lay_out")
+@twin("adjust.arrange")
 @kernel
-def lay_out(
+def arrange(
     observations: Seen,
     rank: IntArray,
     frames: int,
-    order: IntArray,
+    by_pair: NDArray[np.int32],
+    pair_at: IntArray,
+    corner_at: IntArray,
+    order: NDArray[np.int32],
     corner: NDArray[np.int32],
     pair: NDArray[np.int32],
-    measured: FloatArray,
-    root: FloatArray,
 ) -> int:
-    """Write observations in an order (K,); returns the position of a duplicate of the one before, or -1."""
-    again = -1
+    """Sort observations (K,) by the rank of their corner, then by pair, each time by counting those before.
+
+    ``by_pair`` (K,) is room, and ``pair_at`` (P + 1,) and ``corner_at`` (N + 1,) are zeros. Returns the
+    position of a duplicate of the one before, or -1.
+    """
+    for k in range(len(order)):
+        pair_at[observations.camera[k] * frames + observations.frame[k] + 1] += 1
+        corner_at[rank[observations.corner[k]] + 1] += 1
+    for p in range(1, len(pair_at)):
+        pair_at[p] += pair_at[p - 1]
+    for c in range(1, len(corner_at)):
+        corner_at[c] += corner_at[c - 1]
+    for k in range(len(order)):
+        p = observations.camera[k] * frames + observations.frame[k]
+        by_pair[pair_at[p]] = k
+        pair_at[p] += 1
+    for i in range(len(order)):
+        k = by_pair[i]
+        c = rank[observations.corner[k]]
+        at = corner_at[c]
+        corner_at[c] += 1
+        order[at] = k
+        corner[at] = c
+        pair[at] = observations.camera[k] * frames + observations.frame[k]
+    for i in range(1, len(order)):
+        if corner[i] == corner[i - 1] and pair[i] == pair[i - 1]:
+            return i
+    return -1
+
+
+@twin("adjust.lay_out")
+@kernel
+def lay_out(observations: Seen, order: NDArray[np.int32], measured: FloatArray, root: FloatArray) -> None:
+    """Write observations in an order (K,): where at depth 1, and their root information."""
     for i in range(len(order)):
         k = order[i]
         c = observations.camera[k]
-        corner[i] = rank[observations.corner[k]]
-        pair[i] = c * frames + observations.frame[k]
-        if i and corner[i] == corner[i - 1] and pair[i] == pair[i - 1] and again < 0:
-            again = i
         fx = observations.intrinsic[c, 0]
         fy = observations.intrinsic[c, 1]
         measured[0, i] = (observations.pinhole_px[k, 0] - observations.intrinsic[c, 2]) / fx
@@ -218,4 +255,3 @@ def lay_out(
         root[0, i] = fx / first
         root[1, i] = -below * fx / (first * last)
         root[2, i] = fy / last
-    return again

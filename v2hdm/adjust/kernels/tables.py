@@ -32,15 +32,15 @@ from v2hdm.geometry import rigid
 from v2hdm.geometry.rigid import EXP_SERIES, LEFT_JACOBIAN_SERIES
 from v2hdm.records import FloatArray
 
-_EXP = np.ascontiguousarray(EXP_SERIES, dtype=np.float64)
-_LEFT_JACOBIAN = np.ascontiguousarray(LEFT_JACOBIAN_SERIES, dtype=np.float64)
+EXP_TERMS = np.ascontiguousarray(EXP_SERIES, dtype=np.float64)
+LEFT_JACOBIAN_TERMS = np.ascontiguousarray(LEFT_JACOBIAN_SERIES, dtype=np.float64)
 
 
 def move(tangents: FloatArray, dst_from_src: FloatArray) -> tuple[FloatArray, FloatArray]:
     """``exp(tangents) @ dst_from_src`` (C, 4, 4) and the left Jacobian (C, 6, 6) of the tangents (C, 6)."""
     moved = np.zeros((len(tangents), 4, 4))
     jacobian = np.empty((len(tangents), 6, 6))
-    _move(tangents, dst_from_src, _EXP, _LEFT_JACOBIAN, np.empty((5, 6, 6)), moved, jacobian)
+    _move(tangents, dst_from_src, EXP_TERMS, LEFT_JACOBIAN_TERMS, np.empty((5, 6, 6)), moved, jacobian)
     return moved, jacobian
 
 

@@ -22,7 +22,7 @@ enum Loss { NONE, HUBER, CAUCHY, GEMAN_MCCLURE };  // layout.LOSS_CODES
 
 // layout.Layout.
 struct Layout {
-    Index observations, corners, units, chunks, moments, most_joined;
+    Index observations, corners, units, chunks, moments, most_seen, most_joined;
     const int32_t* pair;
     const double *measured, *root;
     const Index *frame, *begin, *unit, *joint_at, *chunk;

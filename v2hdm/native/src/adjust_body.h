@@ -1,5 +1,6 @@
 // The passes, for the processor that the file which includes this is compiled for, as V2HDM_PASSES.
 #include "adjust_parts.h"
+#include "adjust_batch.h"
 #include "adjust_linearise.h"
 #include "adjust_evaluate.h"
 #include "adjust_substitute.h"

@@ -137,6 +137,7 @@ void evaluate(
     Index begin, Index end, const Layout& layout, const Base& base, const Step& by, const Scratch& scratch,
     const Evaluation& out) {
     double *step = scratch.step, *gradient = scratch.gradient;
+    const bool is_by_camera = cameras_alone_move(layout, base);
     for (Index q = begin; q < end; ++q) {
         number_touched(layout, q, scratch.slot);
         LossSum losses;
@@ -153,7 +154,11 @@ void evaluate(
                 const Index i = 2 * (c - first);
                 out.corners[2 * c] = base.corners[2 * c] + step[i];
                 out.corners[2 * c + 1] = base.corners[2 * c + 1] + step[i + 1];
-                see_corner(layout, base, by.table, c, scratch, out, losses, gradient + i);
+                if (is_by_camera) {
+                    see_corner_by_camera(layout, base, by.table, c, scratch, out, losses, gradient + i);
+                } else {
+                    see_corner(layout, base, by.table, c, scratch, out, losses, gradient + i);
+                }
             }
             add_corner_priors(layout, u, out.corners, gradient, out.costs + 3 * q);
             carry_unit(layout, base, q, u, coupled, scratch, out);

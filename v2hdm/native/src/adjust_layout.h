@@ -20,11 +20,18 @@ struct Tally {
 Index first_unsound(
     const Columns& columns, Index frames, double symmetric_to, double max_slope, const Tally& tally);
 
-// Observations in order, (K,), (2, K) and (3, K); layout.lay_out.
-struct Ordered {
-    int32_t *corner, *pair;
-    double *measured, *root;
+// Where observations end, sorted by the rank of their corner and by pair, and what counting them takes.
+struct Arranged {
+    int32_t* by_pair;
+    Index *pair_at, *corner_at;
+    Index pairs, corners;
+    int32_t *order, *corner, *pair;
 };
-Index lay_out(const Columns& columns, const Index* rank, Index frames, const Index* order, const Ordered& out);
+
+// Position of a duplicate of the observation before, or -1.
+Index arrange(const Columns& columns, const Index* rank, Index frames, const Arranged& out);
+
+// Observations in an order: (2, K) where at depth 1, (3, K) root information.
+void lay_out(const Columns& columns, const int32_t* order, double* measured, double* root);
 
 }  // namespace v2hdm::adjust

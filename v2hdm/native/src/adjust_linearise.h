@@ -4,43 +4,37 @@ namespace {
 
 // Adds the observations of corner c to gradients, blocks, rows and loss; its unit begins at ``first``.
 void add_corner(
-    const Layout& layout, const Base& base, const double* clock, bool by_pair, Index q, Index c, Index first,
-    const Scratch& scratch, const Linearisation& out, LossSum& losses) {
+    const Layout& layout, const Base& base, const double* clock, Index c, Index first, const Scratch& scratch,
+    const Linearisation& out, LossSum& losses) {
     const Index cameras = base.pairs / layout.moments, unknowns = out.width / cameras;
     const Index i = 2 * (c - first), columns = scratch.row_columns;
     double *top = scratch.rows + i * columns, *low = top + columns;
     const double x = base.corners[2 * c], y = base.corners[2 * c + 1];
-    double gx = 0, gy = 0, xx = 0, yx = 0, yy = 0;
+    double block[3] = {}, gradient[2] = {};
     for (Index k = layout.begin[c]; k < layout.begin[c + 1]; ++k) {
         const Derived derived(layout, base.table, k, x, y);
         const double* j = derived.jacobian;
         losses.add(base, derived.squared());
         double weight = weigh(base, derived.squared());
         const double w0 = weight * derived.r0, w1 = weight * derived.r1;
-        gx += j[12] * w0 + j[14] * w1;
-        gy += j[13] * w0 + j[15] * w1;
+        gradient[0] += j[12] * w0 + j[14] * w1;
+        gradient[1] += j[13] * w0 + j[15] * w1;
         const int32_t pair = layout.pair[k], at = scratch.slot[pair];
         const Index camera = pair / layout.moments;
         add_force(
             out.wrench + 6 * at, derived.px, derived.py, derived.pz, j[0] * w0 + j[6] * w1, j[7] * w1,
             j[2] * w0 + j[8] * w1);
         weight = floored(weight);
-        xx += weight * (j[12] * j[12] + j[14] * j[14]);
-        yx += weight * (j[13] * j[12] + j[15] * j[14]);
-        yy += weight * (j[13] * j[13] + j[15] * j[15]);
-        derived.add_square(weight, out.squares + 21 * (by_pair ? at : q * cameras + camera));
+        block[0] += weight * (j[12] * j[12] + j[14] * j[14]);
+        block[1] += weight * (j[13] * j[12] + j[15] * j[14]);
+        block[2] += weight * (j[13] * j[13] + j[15] * j[15]);
+        derived.add_square(weight, out.squares + 21 * at);
         double* coupling = scratch.coupling + (base.has_rows ? 0 : 12 * (k - layout.begin[first]));
         derived.couple(weight, coupling);
         const Index column = camera * unknowns;
         add_camera(coupling, clock + pair * 6 * (unknowns - 6), unknowns, top + column, low + column);
     }
-    const double* root = layout.control_root + 3 * c;
-    double* block = scratch.block + i * scratch.block_columns + i;
-    block[0] = xx + root[0] * root[0] + root[1] * root[1];
-    block[scratch.block_columns] = yx + root[1] * root[2];
-    block[scratch.block_columns + 1] = yy + root[2] * root[2];
-    scratch.gradient[i] = gx;
-    scratch.gradient[i + 1] = gy;
+    put_corner(layout, c, i, block, gradient, scratch);
 }
 
 // Adds W times unit u's gradient to the pairs that see it.
@@ -133,7 +127,11 @@ void linearise(
                 std::fill_n(scratch.rows + i * scratch.row_columns, out.width, 0.0);
             }
             for (Index c = first; c < layout.unit[u + 1]; ++c) {
-                add_corner(layout, base, clock, by_pair, q, c, first, scratch, out, losses);
+                if (by_pair) {
+                    add_corner(layout, base, clock, c, first, scratch, out, losses);
+                } else {
+                    add_corner_by_camera(layout, base, q, c, first, scratch, out, losses);
+                }
             }
             add_corner_priors(layout, u, base.corners, scratch.gradient, out.costs + 3 * q);
             add_lengths(layout, u, base.corners, scratch);

@@ -211,21 +211,36 @@ Index first_unsound_of(
     return first_unsound(columns.view, frames, symmetric_to, max_slope, tally);
 }
 
-Index lay_out_columns(
-    nb::handle columns_object, nb::handle rank_object, Index frames, nb::handle order_object, nb::handle corner_object,
-    nb::handle pair_object, nb::handle measured_object, nb::handle root_object) {
+Index arrange_columns(
+    nb::handle columns_object, nb::handle rank_object, Index frames, nb::handle by_pair_object, nb::handle pair_at_object,
+    nb::handle corner_at_object, nb::handle order_object, nb::handle corner_object, nb::handle pair_object) {
     const ColumnsRecord columns(columns_object);
     const auto rank = array_of<const Index, 1>(rank_object, "rank");
-    const auto order = array_of<const Index, 1>(order_object, "order");
+    const auto by_pair = array_of<int32_t, 1>(by_pair_object, "by_pair");
+    const auto pair_at = array_of<Index, 1>(pair_at_object, "pair_at");
+    const auto corner_at = array_of<Index, 1>(corner_at_object, "corner_at");
+    const auto order = array_of<int32_t, 1>(order_object, "order");
     const auto corner = array_of<int32_t, 1>(corner_object, "corner");
     const auto pair = array_of<int32_t, 1>(pair_object, "pair");
+    const size_t count = columns.camera.size();
+    require(order.size() == count && corner.size() == count && pair.size() == count && by_pair.size() == count, "order");
+    require(corner_at.size() == rank.size() + 1 && pair_at.size() > 0, "corner_at");
+    return arrange(
+        columns.view, rank.data(), frames,
+        {by_pair.data(), pair_at.data(), corner_at.data(), size_of(pair_at.size()) - 1, size_of(rank.size()),
+         order.data(), corner.data(), pair.data()});
+}
+
+void lay_out_columns(
+    nb::handle columns_object, nb::handle order_object, nb::handle measured_object, nb::handle root_object) {
+    const ColumnsRecord columns(columns_object);
+    const auto order = array_of<const int32_t, 1>(order_object, "order");
     const auto measured = array_of<double, 2>(measured_object, "measured");
     const auto root = array_of<double, 2>(root_object, "root");
     const size_t count = order.size();
-    require(count == columns.camera.size() && corner.size() == count && pair.size() == count, "order");
+    require(count == columns.camera.size(), "order");
     require(measured.size() == 2 * count && root.size() == 3 * count, "measured");
-    return lay_out(
-        columns.view, rank.data(), frames, order.data(), {corner.data(), pair.data(), measured.data(), root.data()});
+    lay_out(columns.view, order.data(), measured.data(), root.data());
 }
 
 }  // namespace
@@ -247,6 +262,7 @@ void add_adjust(nb::module_& module) {
     adjust.def("compose", &compose_pairs);
     adjust.def("move", &move_cameras);
     adjust.def("first_unsound", &first_unsound_of);
+    adjust.def("arrange", &arrange_columns);
     adjust.def("lay_out", &lay_out_columns);
     nb::dict constants;
     constants["NEAR_M"] = NEAR_M;
@@ -255,6 +271,7 @@ void add_adjust(nb::module_& module) {
     constants["PIVOT_FLOOR"] = PIVOT_FLOOR;
     constants["MIN_DEPRESSION_SINE"] = MIN_DEPRESSION_SINE;
     adjust.attr("CONSTANTS") = constants;
+    add_adjust_rig(adjust);
 }
 
 }  // namespace v2hdm

@@ -343,5 +343,17 @@ inline void add_camera(const double* coupling, const double* clock, Index unknow
     }
 }
 
+// Writes corner c's block, from its observations' lower triangle (3,) and its survey, and its gradient (2,), at i.
+inline void put_corner(
+    const Layout& layout, Index c, Index i, const double* observed, const double* gradient, const Scratch& scratch) {
+    const double* root = layout.control_root + 3 * c;
+    double* block = scratch.block + i * scratch.block_columns + i;
+    block[0] = observed[0] + root[0] * root[0] + root[1] * root[1];
+    block[scratch.block_columns] = observed[1] + root[1] * root[2];
+    block[scratch.block_columns + 1] = observed[2] + root[2] * root[2];
+    scratch.gradient[i] = gradient[0];
+    scratch.gradient[i + 1] = gradient[1];
+}
+
 }  // namespace
 }  // namespace v2hdm::adjust

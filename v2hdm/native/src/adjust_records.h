@@ -46,8 +46,8 @@ struct LayoutRecord {
         require(unit.size() > 0 && chunk.size() > 0, "layout");
         view = {
             size_of(pair.size()), size_of(control.shape(0)), size_of(unit.size()) - 1, size_of(chunk.size()) - 1,
-            nb::cast<Index>(record.attr("moments")), nb::cast<Index>(record.attr("most_joined")), pair.data(),
-            measured.data(), root.data(), frame.data(), begin.data(), unit.data(), joint_at.data(), chunk.data(),
+            nb::cast<Index>(record.attr("moments")), nb::cast<Index>(record.attr("most_seen")),
+            nb::cast<Index>(record.attr("most_joined")), pair.data(), measured.data(), root.data(), frame.data(), begin.data(), unit.data(), joint_at.data(), chunk.data(),
             touched.data(), touched_at.data(), control.data(), control_root.data(), length_at.data(),
             length_first.data(), length_second.data(), length_m.data(), length_root.data(), is_kept.data(),
         };

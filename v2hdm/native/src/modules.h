@@ -11,5 +11,6 @@ void add_lanes(nanobind::module_& module);
 void add_paint(nanobind::module_& module);
 void add_lens(nanobind::module_& module);
 void add_adjust(nanobind::module_& module);
+void add_adjust_rig(nanobind::module_& adjust);
 
 }  // namespace v2hdm
