@@ -13,7 +13,8 @@ when the first marking that was moved lies within 10 m of the vehicle. And ways 
 which solid lines of lanes are shown or not.
 
 All poses of a drive share the errors of one map and of one calibration: whether the stated covariance holds
-is seen over many drives. ``--short N`` takes N short ones of each port, and of each the last pose alone.
+is seen over many drives. Of every drive the false alarms are counted; ``--only none`` runs nothing else.
+``--short N`` takes N short ones of each port, and of each the last pose alone.
 """
 
 from __future__ import annotations
@@ -26,9 +27,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tests.benchmarks.made.live import LiveDrive, bumped, drive, looks_of, moved, port_recipe, turning
+from tests.benchmarks.made.live import (
+    RATE_HZ,
+    LiveDrive,
+    bumped,
+    drive,
+    looks_of,
+    moved,
+    port_recipe,
+    turning,
+)
 from v2hdm.geometry.planar import wrapped
 from v2hdm.geometry.rigid import heading_rad
+from v2hdm.localization.antenna import Fix
 from v2hdm.localization.localizer import Localizer, Pose, Status
 from v2hdm.localization.places import Prior, rough_position
 from v2hdm.localization.seeing import Look
@@ -45,6 +56,10 @@ _NEAR_M = 10.0  # way in which a repainted map is to be said
 _SHORT_S = 5.5  # time of a short drive, s
 _SHORT_BEGINS_M = (3.0, 250.0)  # least and largest station, m, from which it begins
 _GAP_M, _BEFORE_GAP_M = 50.0, 20.0  # way without a marking, and that before it
+_ANTENNA_M = (1.2, 0.3)  # ahead of the rear axle and to the left, m
+_RTK_M = 0.015  # standard deviation of a fixed position, m
+_FIX_EVERY = 2  # moments from one position to the next: 5 Hz
+_DUAL_RAD = np.deg2rad(0.2)  # standard deviation of the heading by two antennas
 _REPAINTED_STARTS, _REPAINTED_FRAMES = 4, 40  # drives on a repainted map, and moments of each
 
 
@@ -80,15 +95,38 @@ def follow(
     frames: range,
     maps: Mapping[int, HDMap] | HDMap | None = None,
     looks: Sequence[list[Look]] | None = None,
+    every_full: int = 1,
 ) -> Run:
-    """Localise through some moments of a drive."""
+    """Localise through some moments of a drive; of ``every_full`` images one is searched as a whole."""
     hd_map = maps if isinstance(maps, HDMap) else driven.hd_map
-    localizer = Localizer(hd_map, driven.calibrations, prior)
+    localizer = Localizer(hd_map, driven.calibrations, prior, every_full=every_full)
     begin_s = time.process_time()
     shown = driven.looks if looks is None else looks
-    poses = [localizer.update(shown[frame], driven.motion[frame]) for frame in frames]
+    poses = []
+    for frame in frames:
+        if every_full > 1:
+            localizer.update([], driven.motion[frame])
+            poses.append(localizer.update([_looked_at(localizer, look) for look in shown[frame]]))
+        else:
+            poses.append(localizer.update(shown[frame], driven.motion[frame]))
     images = sum(len(shown[frame]) for frame in frames)
     return Run(poses, frames, (time.process_time() - begin_s) / max(images, 1))
+
+
+def _looked_at(localizer: Localizer, look: Look) -> Look:
+    """What an image shows where the localiser has it looked at."""
+    regions_px = localizer.regions(look.camera, look.stamp_s)
+    if regions_px is None:
+        return look
+    quads = [marking for marking in look.markings if not len(marking.outline_px)]
+    corners_px = [marking.corners_px[marking.corner_valid] for marking in quads]
+    is_in = [
+        len(corners) > 0
+        and ((corners > regions_px[:, None, :2]) & (corners < regions_px[:, None, 2:])).all(axis=(1, 2)).any()
+        for corners in corners_px
+    ]
+    markings = tuple(marking for marking, is_kept in zip(quads, is_in, strict=True) if is_kept)
+    return replace(look, markings=markings, lanes=(), is_whole=False)
 
 
 def errors_of(driven: LiveDrive, run: Run) -> Errors:
@@ -149,29 +187,53 @@ def said(run: Run, since: int) -> float:
     return float("inf")
 
 
-def wrong_map_line(driven: LiveDrive, other: HDMap, rng: np.random.Generator) -> str:
-    """Drives in the map of another port."""
-    times, confident, ways = [], 0, []
-    for begin in range(0, len(driven.stamp_s) - 40, 40):
-        run = follow(driven, rough(driven, begin, rng), range(begin, begin + 40), other)
-        confident += any(pose.status == Status.TRACKING for pose in run.poses)
-        times.append(said(run, begin))
-        ways.append(4.0 * times[-1])
+def way_m(driven: LiveDrive, begin: int, time_s: float) -> float:
+    """The way driven from a moment until so long after; infinite after never."""
+    if not np.isfinite(time_s):
+        return np.inf
+    places = driven.map_from_vehicle[begin : begin + round(10 * time_s) + 1, :2, 3]
+    return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+
+
+def said_line(times_s: Sequence[float], ways_m: Sequence[float]) -> str:
+    """When something was said: after seconds and metres."""
+    pairs = list(zip(times_s, ways_m, strict=True))
     return (
-        f"wrong map: said after {np.median(times):.1f} s, at most {max(times):.1f} s; confident {confident}"
+        f"said after {np.median(times_s):.1f} s (median), {max(times_s):.1f} s and {max(ways_m):.1f} m "
+        f"(most); within 1 s {sum(time_s <= 1 for time_s in times_s)} of {len(pairs)}, within 10 m "
+        f"{sum(way <= _NEAR_M for way in ways_m)}"
     )
 
 
-def repainted_line(driven: LiveDrive, rng: np.random.Generator, seed: int) -> str:
+def wrong_map_line(driven: LiveDrive, other: HDMap, rng: np.random.Generator, every_full: int) -> str:
+    """Drives in the map of another port."""
+    times_s, ways_m, confident = [], [], 0
+    for begin in range(0, len(driven.stamp_s) - 40, 40):
+        frames = range(begin, begin + 40)
+        run = follow(driven, rough(driven, begin, rng), frames, other, every_full=every_full)
+        confident += any(pose.status == Status.TRACKING for pose in run.poses)
+        times_s.append(said(run, begin))
+        ways_m.append(way_m(driven, begin, times_s[-1]))
+    return f"wrong map: {said_line(times_s, ways_m)}; confident {confident}"
+
+
+def repainted_line(driven: LiveDrive, rng: np.random.Generator, seed: int, every_full: int) -> str:
     """Half of the markings 30 cm off, from the start of drives on, and from the middle of one on."""
     count = len(driven.stamp_s)
     hd_map = moved(driven.hd_map, 0.5, 0.3, seed)
     begins = range(0, count - _REPAINTED_FRAMES, max((count - _REPAINTED_FRAMES) // _REPAINTED_STARTS, 1))
     runs = [
-        follow(driven, rough(driven, begin, rng), range(begin, begin + _REPAINTED_FRAMES), hd_map)
+        follow(
+            driven,
+            rough(driven, begin, rng),
+            range(begin, begin + _REPAINTED_FRAMES),
+            hd_map,
+            every_full=every_full,
+        )
         for begin in begins
     ]
     times_s = [said(run, begin) for run, begin in zip(runs, begins, strict=True)]
+    ways_m = [way_m(driven, begin, time_s) for begin, time_s in zip(begins, times_s, strict=True)]
     middle = count // 2
     place = driven.map_from_vehicle[middle, :2, 3]
     ahead = driven.map_from_vehicle[middle, :2, 0]
@@ -179,14 +241,16 @@ def repainted_line(driven: LiveDrive, rng: np.random.Generator, seed: int) -> st
         new if (new.corners_map.mean(axis=0) - place) @ ahead > 0 and _is_moved(new, old) else old
         for new, old in zip(hd_map.markings, driven.hd_map.markings, strict=True)
     )
-    on = follow(driven, rough(driven, 0, rng), range(count), replace(hd_map, markings=later))
+    later_map = replace(hd_map, markings=later)
+    on = follow(driven, rough(driven, 0, rng), range(count), later_map, every_full=every_full)
+    near = _first_near(driven, later)
     errors = [errors_of(driven, run) for run in (*runs, on)]
     outside = sum(int((np.abs(part.errors) > part.bounds).any(axis=1).sum()) for part in errors)
     return (
-        f"half repainted: from the start said after {' '.join(f'{time_s:.1f}' for time_s in times_s)} s; "
+        f"half repainted: from the start {said_line(times_s, ways_m)}; "
         f"from the middle on after {said(on, middle):.1f} s, since a moved marking was near "
-        f"{said(on, _first_near(driven, later)):.1f} s; poses outside their bounds {outside} of "
-        f"{sum(len(part.errors) for part in errors)}"
+        f"{said(on, near):.1f} s and {way_m(driven, near, said(on, near)):.1f} m; poses outside their "
+        f"bounds {outside} of {sum(len(part.errors) for part in errors)}"
     )
 
 
@@ -202,7 +266,7 @@ def _first_near(driven: LiveDrive, markings: Sequence[Marking]) -> int:
     return int((np.linalg.norm(offsets, axis=2) < _NEAR_M).any(axis=1).argmax())
 
 
-def pushed_line(driven: LiveDrive, rng: np.random.Generator, seed: int) -> str:
+def pushed_line(driven: LiveDrive, rng: np.random.Generator, seed: int, every_full: int) -> str:
     """A camera turned by half a degree."""
     middle = len(driven.stamp_s) // 2
     parts = []
@@ -211,11 +275,15 @@ def pushed_line(driven: LiveDrive, rng: np.random.Generator, seed: int) -> str:
         world = bumped(driven.world, "front", middle, turn)
         frames = range(middle, len(driven.stamp_s))
         looks = [*driven.looks[:middle], *looks_of(world, seed, frames)]
-        run = follow(driven, rough(driven, 0, rng), range(len(driven.stamp_s)), looks=looks)
+        run = follow(
+            driven, rough(driven, 0, rng), range(len(driven.stamp_s)), looks=looks, every_full=every_full
+        )
         found = errors_of(driven, run)
         outside = int((np.abs(found.errors) > found.bounds).any(axis=1).sum())
         named = [own.camera for own in run.poses[-1].turned]
-        parts.append(f"{'xyz'[axis]}: said after {said(run, middle):.1f} s, {named}, outside {outside}")
+        time_s = said(run, middle)
+        when = f"said after {time_s:.1f} s and {way_m(driven, middle, time_s):.1f} m"
+        parts.append(f"{'xyz'[axis]}: {when}, {named}, outside {outside}")
     return f"pushed by .5 deg about {'; '.join(parts)}"
 
 
@@ -241,6 +309,60 @@ def slow_line(driven: LiveDrive, rng: np.random.Generator, seed: int) -> str:
             text = f"{'xyz'[axis]}: {what} at {by_deg:.2f} deg, began at {since_s:+.1f} s"
         parts.append(f"{text}, outside {outside}")
     return "slowly turning camera, " + "; ".join(parts)
+
+
+class Alarms(NamedTuple):
+    """What was said of a right drive from when it was tracked on."""
+
+    lost: int  # times that it was lost
+    turned: int  # cameras that were named
+    other: tuple[str, ...]  # reasons beside
+
+    @classmethod
+    def of(cls, run: Run) -> Alarms:
+        """Those of a run."""
+        tracked = [number for number, pose in enumerate(run.poses) if pose.status == Status.TRACKING]
+        poses = run.poses[tracked[0] :] if tracked else run.poses
+        is_lost = [pose.status == Status.LOST for pose in poses]
+        begins = sum(now and not before for before, now in zip([False, *is_lost], is_lost, strict=False))
+        cameras = {turned.camera for pose in poses for turned in pose.turned}
+        reasons = {reason for pose in poses for reason in pose.reasons if not pose.turned}
+        return cls(begins, len(cameras), tuple(sorted(reasons)))
+
+
+def alarm_line(alarms: Sequence[Alarms], seconds: float) -> str:
+    """The false alarms of right drives as one line."""
+    others = sorted({reason for alarm in alarms for reason in alarm.other})
+    return (
+        f"false alarms in {seconds / 3600:.2f} h of {len(alarms)} right drives: lost "
+        f"{sum(alarm.lost for alarm in alarms)}, cameras named {sum(alarm.turned for alarm in alarms)}, "
+        f"drives with other reasons {sum(bool(alarm.other) for alarm in alarms)} {others[:3]}"
+    )
+
+
+def antenna_line(driven: LiveDrive, rng: np.random.Generator) -> str:
+    """A vehicle with one RTK antenna, which must drive to know its heading, beside one with two."""
+    count = len(driven.stamp_s)
+    places = driven.map_from_vehicle[:, :2, :2] @ np.array(_ANTENNA_M) + driven.map_from_vehicle[:, :2, 3]
+    places = places + rng.normal(0, _RTK_M, places.shape)
+    fixes = [
+        [Fix(float(driven.stamp_s[frame]), places[frame], _RTK_M)] if frame % _FIX_EVERY == 0 else []
+        for frame in range(count)
+    ]
+    begin = driven.map_from_vehicle[0]
+    heading = float(heading_rad(begin)) + rng.normal(0, _DUAL_RAD)
+    dual = Prior(np.array([*places[0], heading]), 3.0 * _RTK_M + float(np.hypot(*_ANTENNA_M)), _DUAL_RAD)
+    texts = []
+    for name, prior in (("one antenna", None), ("two", dual)):
+        localizer = Localizer(driven.hd_map, driven.calibrations, prior, antenna_m=_ANTENNA_M)
+        moments = zip(driven.looks, driven.motion, fixes, strict=True)
+        poses = [localizer.update(*moment) for moment in moments]
+        run = Run(poses, range(count), 0.0)
+        errors = errors_of(driven, run)
+        first = next((frame for frame, pose in enumerate(poses) if pose.status == Status.TRACKING), None)
+        begun = "never" if first is None else f"after {way_m(driven, 0, first / RATE_HZ):.1f} m"
+        texts.append(f"{name}: tracked {begun}, {tracking_line([errors], count, 0.0)}")
+    return "; ".join(texts)
 
 
 class Gap(NamedTuple):
@@ -305,8 +427,14 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--starts", type=int, default=40, help="of each drive")
     parser.add_argument(
-        "--only", nargs="*", default=[], metavar="PART", help="starts, wrong, moved, pushed, slow, gaps"
+        "--only",
+        nargs="*",
+        default=[],
+        metavar="PART",
+        help="starts, wrong, moved, pushed, antenna, slow, gaps",
     )
+    full = "of so many images one is searched as a whole, the others where the map expects markings"
+    parser.add_argument("--every-full", type=int, default=1, help=full)
     parser.add_argument("--short", type=int, default=0, help="short drives of each port, and nothing else")
     parsed = parser.parse_args()
     if parsed.short:
@@ -314,14 +442,16 @@ def main() -> None:
         ends = [short_drive(name, seed) for seed in seeds for name in PORTS]
         print(f"ends of short drives: {tracking_line(ends, len(ends), 0.0)}")
         return
-    parts, counts, cpu_s = [], 0, []
+    parts, alarms, counts, cpu_s = [], [], 0, []
     totals = np.zeros((2, 4), dtype=np.int64)
     gap_ends: dict[bool, list[Gap]] = {True: [], False: []}
     for seed in range(parsed.first, parsed.first + parsed.seeds):
         driven = {name: drive(port_recipe(name, seed), seed, parsed.seconds) for name in PORTS}
         for name, own in driven.items():
             rng = np.random.default_rng([seed, 99])
-            run = follow(own, rough(own, 0, rng), range(len(own.stamp_s)))
+            frames = range(len(own.stamp_s))
+            run = follow(own, rough(own, 0, rng), frames, every_full=parsed.every_full)
+            alarms.append(Alarms.of(run))
             parts.append(errors_of(own, run))
             counts += len(run.poses)
             cpu_s.append(run.cpu_s)
@@ -332,17 +462,20 @@ def main() -> None:
                 totals[1] += starts(own, max(parsed.starts // 4, 1), rng, known=False)
             if not only or "wrong" in only:
                 other = driven[PORTS[1 - PORTS.index(name)]].hd_map
-                print(f"  {wrong_map_line(own, other, rng)}", flush=True)
+                print(f"  {wrong_map_line(own, other, rng, parsed.every_full)}", flush=True)
             if not only or "moved" in only:
-                print(f"  {repainted_line(own, rng, seed)}", flush=True)
+                print(f"  {repainted_line(own, rng, seed, parsed.every_full)}", flush=True)
             if not only or "pushed" in only:
-                print(f"  {pushed_line(own, rng, seed)}", flush=True)
+                print(f"  {pushed_line(own, rng, seed, parsed.every_full)}", flush=True)
+            if not only or "antenna" in only:
+                print(f"  {antenna_line(own, rng)}", flush=True)
             if not only or "slow" in only:
                 print(f"  {slow_line(own, rng, seed)}", flush=True)
             if not only or "gaps" in only:
                 for has_lines, of_drives in gap_ends.items():
                     of_drives += gaps(own, rng, has_lines)
     print(f"all: {tracking_line(parts, counts, float(np.mean(cpu_s)))}")
+    print(alarm_line(alarms, counts / RATE_HZ))
     for has_lines, of_drives in gap_ends.items():
         if of_drives:
             print(gap_line(of_drives, "with lines" if has_lines else "without lines"))

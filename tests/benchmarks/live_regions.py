@@ -267,9 +267,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--images", type=int, default=160, help="of all cameras together")
     parser.add_argument("--every-full", type=int, nargs="+", default=[1, 5])
     parser.add_argument("--seconds", type=float, default=0.0, help="of the command itself, at 10 Hz")
+    parser.add_argument("--only-command", action="store_true", help="with --seconds: nothing but that")
     parsed = parser.parse_args(arguments)
     cv2.setNumThreads(1)
     ride = ride_of(parsed.drive, parsed.images)
+    if parsed.only_command:
+        for every_full in parsed.every_full:
+            print(paced(ride, every_full, parsed.seconds), flush=True)
+        return
     detector = Detector.load()
     roads = {
         name: RoadDetector(detector, camera_from_calibration(calibration), calibration, is_for_localizer=True)

@@ -455,6 +455,34 @@ def test_lines_come_as_images_do_and_end_with_the_cameras(monkeypatch, tmp_path)
     assert np.hypot(*driven.errors(poses[-1], len(driven.looks) - 1)[:2]) < 0.05
 
 
+def test_motions_between_images_make_no_poses_but_without_images_some(monkeypatch, tmp_path):
+    """Two seconds of an odometry, of a clock that then is set back."""
+    lines = [f"{stamp_s:.2f},4.0,0.0" for stamp_s in (*np.arange(50.0, 52.0, 0.02), 7.0)]
+    motion = io.StringIO("\n".join(["stamp_s,speed_m_s,yaw_rate_rad_s", *lines, ""]))
+
+    @contextmanager
+    def camera(name, source, calibration, items, delay_s):
+        def end():
+            time.sleep(0.6)  # the odometry is read first
+            items.put(live._Ended(name, None))
+
+        threading.Thread(target=end, daemon=True).start()
+        yield live._Eye(name, io.StringIO(), delay_s)
+
+    def one_by_one(waiting):
+        yield from [waiting.get(timeout=1.0)]
+
+    monkeypatch.setattr(live, "_camera", camera)
+    monkeypatch.setattr(live, "_available", one_by_one)
+    poses = []
+    sources = {"front": "folder"}
+    localizer = Localizer(yard(18), cameras())
+    odometry = MotionLines("odometry", None)
+    live.localize_live(localizer, sources, {"front": tmp_path}, motion, odometry, poses.append)
+    assert 4 <= len(poses) <= 6
+    assert any("clock went back" in reason for reason in poses[-1].reasons)
+
+
 def test_all_that_a_camera_shows_reaches_the_localiser_at_the_time_of_its_exposure():
     look = drive(lined(yard(18)), 18, seconds=1.0).looks[0][0]
     nothing = np.empty((0, 2))

@@ -240,3 +240,28 @@ def test_cameras_search_whole_images_by_turns(view):
             (ahead,) = looking.ahead(camera, [0.1 * (number + 1)], lambda stamp_s: view, 4.0)
             told[camera] = ahead.regions_px
     assert not any(both[6:])
+
+
+def test_a_camera_keeps_out_of_the_way_of_whole_searches_that_another_one_needs(view):
+    """What images will show is told four ahead: the camera ahead is to search three in a row as a whole."""
+    looking = Looking(5)
+    told = {"front": {}, "rear": {}}
+    both = []
+    rear = []
+    for number in range(80):
+        now = {camera: of_camera.get(number) is None for camera, of_camera in told.items()}
+        both.append(all(now.values()))
+        rear.append(now["rear"])
+        for camera, is_whole in now.items():
+            looking.of(camera).note(0.1 * number, is_whole, 9)
+        for camera, of_camera in told.items():
+
+            def view_at(stamp_s, camera=camera):
+                needs_all = camera == "front" and round(10 * stamp_s) % 17 in (0, 1, 2)
+                return None if needs_all else view
+
+            stamps_s = [0.1 * (number + later) for later in range(1, 5)]
+            for ahead in looking.ahead(camera, stamps_s, view_at, 4.0):
+                of_camera[round(10 * ahead.stamp_s)] = ahead.regions_px
+    assert not any(both[6:])
+    assert max(np.diff(np.flatnonzero(rear))) <= 5

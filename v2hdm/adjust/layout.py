@@ -36,13 +36,15 @@ def shifted(problem: Problem, by_m: FloatArray) -> Problem:
     """``problem`` on a map with all points moved by ``by_m`` (2,)."""
     if not by_m.any():
         return problem
-    poses = problem.map_from_vehicle.copy()
-    poses[:, :2, 3] += by_m
+    moves = np.eye(4)
+    moves[:2, 3] = by_m
+    poses_start = problem.poses_start
     start = problem.corners_start
     control = problem.control
     return replace(
         problem,
-        map_from_vehicle=poses,
+        map_from_vehicle=moves @ problem.map_from_vehicle,
+        poses_start=None if poses_start is None else moves @ poses_start,
         corners_start=None if start is None else start + by_m,
         control=None if control is None else replace(control, points_map=control.points_map + by_m),
     )

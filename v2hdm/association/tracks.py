@@ -7,7 +7,9 @@ compared across gaps, laps and cameras later.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -67,7 +69,7 @@ def build_tracks(
         for rows in np.split(rows_of_camera, images[1:]):
             if not len(rows):
                 continue
-            active = [track for track in active if linker.is_alive(track, rows[0])]
+            active = linker.alive(active, rows[0])
             continued = linker.match(active, rows)
             for row in rows.tolist():
                 if row in continued:
@@ -103,11 +105,13 @@ class _Linker:
         self._centre_map = mean_corners(located.corners_map, located.valid)
         self._size_m = diameters(located.corners_map, located.valid)
 
-    def is_alive(self, track: _Track, row: int) -> bool:
-        """Whether ``track`` may still be continued by the sighting at ``row``."""
-        now, last = self._sightings.frame[[row, track.row]]
-        gap_m = self._odometer_m[now] - self._odometer_m[last]
-        return bool(self._sightings.session[now] == self._sightings.session[last] and gap_m <= _MAX_GAP_M)
+    def alive(self, tracks: Sequence[_Track], row: int) -> list[_Track]:
+        """The tracks that may still be continued by the sighting at ``row``."""
+        now = self._sightings.frame[row]
+        last = self._sightings.frame[[track.row for track in tracks]]
+        is_near = self._odometer_m[now] - self._odometer_m[last] <= _MAX_GAP_M
+        is_alive = is_near & (self._sightings.session[last] == self._sightings.session[now])
+        return list(compress(tracks, is_alive.tolist()))
 
     def match(self, tracks: list[_Track], rows: IntArray) -> dict[int, tuple[_Track, int]]:
         """Track and corner shift of each row that continues a track."""
@@ -118,7 +122,8 @@ class _Linker:
         valid = np.stack([track.valid for track in tracks])
         size_m = diameters(corners, valid)
         # Pairs of one class no farther apart than their sizes.
-        distance_m = np.linalg.norm(mean_corners(corners, valid)[:, None] - self._centre_map[rows], axis=-1)
+        apart_m = mean_corners(corners, valid)[:, None] - self._centre_map[rows]
+        distance_m = np.hypot(apart_m[..., 0], apart_m[..., 1])
         reach_m = MAX_GATE_M + size_m[:, None] + self._size_m[rows]
         alike = self._sightings.kind[last][:, None] == self._sightings.kind[rows]
         t, d = np.argwhere(alike & (distance_m <= reach_m)).T
@@ -129,12 +134,10 @@ class _Linker:
         )
         noise_m2 = self._noise_m2[pair_last] + self._noise_m2[pair_rows]
         covariance = noise_m2 + self._drift_covariance(pair_last, pair_rows)
-        cost = np.sum(
-            aligned.offset * np.linalg.solve(covariance, aligned.offset[..., None])[..., 0], axis=-1
-        )
+        cost = _squared_distance(aligned.offset, covariance)
         shape = aligned.deformation_m / np.maximum(SHAPE_TOLERANCE * size_m[t], LEAST_TOLERANCE_M)
         accepted = (cost <= GATE_SIGMAS**2) & (shape <= 1.0)
-        accepted &= np.linalg.norm(aligned.offset, axis=-1) <= MAX_GATE_M
+        accepted &= np.hypot(aligned.offset[:, 0], aligned.offset[:, 1]) <= MAX_GATE_M
         costs = np.full((len(tracks), len(rows)), _REFUSED)
         costs[t, d] = np.where(accepted, cost + shape**2, _REFUSED)
         shift = np.zeros(costs.shape, dtype=np.int64)
@@ -161,6 +164,15 @@ class _Linker:
         along_m = direction * (1.0 + 2.0 * range_m / height_m) * (moved_m + range_m * turned)
         across_m = direction * (moved_m + range_m * turned + range_m**2 / height_m * turned)
         return ray_covariance(self._ray_map[rows], along_m, across_m)
+
+
+def _squared_distance(offset: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Squared Mahalanobis distances (P,) of offsets (P, 2), by Cramer's rule, which is faster than LAPACK."""
+    x, y = offset.T
+    variance_x, variance_y = covariance[:, 0, 0], covariance[:, 1, 1]
+    product = covariance[:, 0, 1]
+    determinant = variance_x * variance_y - product**2
+    return np.asarray((variance_y * x**2 - 2 * product * x * y + variance_x * y**2) / determinant)
 
 
 def _noise_covariances(located: Located, ray: FloatArray, noise: PoseNoise) -> FloatArray:

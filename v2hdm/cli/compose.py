@@ -121,9 +121,8 @@ def _quoted(override: str) -> str:
     return f"{key}='" + value.replace("'", "\\'") + "'"
 
 
-_HYDRAS = re.compile(
-    r"[^\w./+:%@*-]|[^\x00-\x7f]"
-)  # letters that Hydra's grammar wants quotes around, and others
+# Letters that Hydra's grammar wants quotes around.
+_HYDRAS = re.compile(r"[^\w./+:%@*-]|[^\x00-\x7f]")
 _NUMBER = re.compile(r"[\d.]+")
 
 

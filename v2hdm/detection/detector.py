@@ -29,6 +29,7 @@ from v2hdm.detection.stopwatch import lap
 from v2hdm.detection.weights import NETWORK_FILE, check_weights
 from v2hdm.doors import checked
 from v2hdm.errors import DetectorError
+from v2hdm.geometry.planar import following
 from v2hdm.native import tell_missing
 from v2hdm.records import ARROW, BoolArray, Camera, FloatArray, LaneDetection, MarkingDetection
 from v2hdm.safe.texts import shown
@@ -303,9 +304,11 @@ def _likelier(quads: Sequence[MarkingDetection], symbols: Sequence[MarkingDetect
     A quadrilateral lies in a symbol that covers its centre and most of its longer middle line: a stop line
     that an arrow crosses does not.
     """
+    if not symbols:
+        return tuple(quads)
     left_out: set[int] = set()
     likelier_symbols = []
-    middle_lines = [_on_middle_line(quad.corners_px) for quad in quads]
+    middle_lines = _on_middle_lines(np.array([quad.corners_px for quad in quads]).reshape(-1, 4, 2))
     for symbol in symbols:
         polygon = symbol.outline_px.astype(np.float32)
         on_it = [k for k, points in enumerate(middle_lines) if _covers(polygon, points)]
@@ -315,18 +318,21 @@ def _likelier(quads: Sequence[MarkingDetection], symbols: Sequence[MarkingDetect
     return (*(quad for k, quad in enumerate(quads) if k not in left_out), *likelier_symbols)
 
 
-def _on_middle_line(corners_px: FloatArray) -> FloatArray:
-    """Points (5, 2) along most of the longer middle line of a quadrilateral (4, 2), its centre the third."""
-    sides = (corners_px + np.roll(corners_px, -1, axis=0)) / 2
-    across = sides[2:] - sides[:2]
-    way = across[np.linalg.norm(across, axis=1).argmax()]
-    return np.asarray(corners_px.mean(axis=0) + np.linspace(-0.4, 0.4, 5)[:, None] * way)
+def _on_middle_lines(corners_px: FloatArray) -> FloatArray:
+    """Points (M, 5, 2) along most of the longer middle lines of quadrilaterals, their centres the third."""
+    sides = (corners_px + following(corners_px)) / 2
+    across = sides[:, 2:] - sides[:, :2]
+    longer = np.linalg.norm(across, axis=2).argmax(axis=1)
+    way = across[np.arange(len(across)), longer][:, None]
+    return np.asarray(corners_px.mean(axis=1)[:, None] + np.linspace(-0.4, 0.4, 5)[:, None] * way)
 
 
 def _covers(polygon: np.ndarray, points: FloatArray) -> bool:
     """Whether a polygon (N, 2) float32 holds the middle and most of points (M, 2)."""
+    if not cv2.pointPolygonTest(polygon, points[len(points) // 2].tolist(), False) > 0:
+        return False
     inside = [cv2.pointPolygonTest(polygon, point, False) > 0 for point in points.tolist()]
-    return inside[len(inside) // 2] and 2 * sum(inside) > len(inside)
+    return 2 * sum(inside) > len(inside)
 
 
 def _check_image(image_bgr: np.ndarray, camera: Camera) -> None:

@@ -332,19 +332,24 @@ def align(a: FloatArray, valid_a: BoolArray, b: FloatArray, valid_b: BoolArray) 
     chosen = shift[..., None]
     mean = difference.sum(axis=-2) / count[..., None]
     offset = np.take_along_axis(mean, chosen[..., None], axis=-2)[..., 0, :]
-    deviation = np.linalg.norm(difference - mean[..., None, :], axis=-1)
+    from_mean = difference - mean[..., None, :]
+    deviation = np.hypot(from_mean[..., 0], from_mean[..., 1])
     worst = np.max(np.where(is_common, deviation, 0.0), axis=-1)
     common = np.take_along_axis(common, chosen, axis=-1)[..., 0]
     worst = np.take_along_axis(worst, chosen, axis=-1)[..., 0]
     return Alignment(shift, offset, np.where(common >= 2, worst, np.inf))
 
 
+_PAIRS = np.triu_indices(4, 1)  # of corners
+
+
 def diameters(corners: FloatArray, valid: BoolArray) -> FloatArray:
     """Largest distance (...) between two valid corners of quadrilaterals (..., 4, 2)."""
-    difference = corners[..., :, None, :] - corners[..., None, :, :]
-    distance = np.linalg.norm(difference, axis=-1)
-    is_valid_pair = valid[..., :, None] & valid[..., None, :]
-    return np.asarray(np.max(np.where(is_valid_pair, distance, 0.0), axis=(-1, -2)))
+    first, second = _PAIRS
+    difference = corners[..., first, :] - corners[..., second, :]
+    distance = np.hypot(difference[..., 0], difference[..., 1])
+    is_valid_pair = valid[..., first] & valid[..., second]
+    return np.asarray(np.max(np.where(is_valid_pair, distance, 0.0), axis=-1))
 
 
 def mean_corners(corners: FloatArray, valid: BoolArray) -> FloatArray:

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from v2hdm.errors import DriveError
+from v2hdm.geometry.planar import signed_area
 from v2hdm.records import Drive, FloatArray, ImageDetections, LaneDetection, MarkingDetection
 from v2hdm.safe.fields import take_covariance
 from v2hdm.safe.texts import take_name
-from v2hdm.store.files import check_keys, load_json, take_array, take_mapping, take_number, take_text
+from v2hdm.store.files import check_keys, load_json, take_array, take_mapping, take_number
 
 _MARKING = ("class", "corners_px")
 _LANE = ("class", "points_px")
 _DIGITS = 6  # significant digits of a standard deviation
+_SURELY = 4.0  # sigmas of an area that are never reached by chance
 _PIXEL_DIGITS = 8  # of a coordinate: a ten-thousandth of a pixel in the widest image
 
 
@@ -76,7 +79,7 @@ def read_detections(path: Path, image: int) -> ImageDetections:
         _lane(entry, f"{path}: lanes[{number}]")
         for number, entry in enumerate(_listed(content.get("lanes", []), f"{path}: lanes"))
     ]
-    return ImageDetections(image, tuple(markings), tuple(lanes))
+    return ImageDetections(image, _counter_clockwise(markings), tuple(lanes))
 
 
 def detections_of(drive: Drive) -> list[ImageDetections]:
@@ -100,13 +103,53 @@ def _marking(content: object, where: str) -> MarkingDetection:
         and all(isinstance(flag, bool) for flag in corner_known)
     ):
         raise DriveError(f"{where}, known: expected four times true or false; fix it or leave it out")
+    corners_px = take_array(entry["corners_px"], (4, 2), f"{where}, corners_px", DriveError)
+    corner_valid = np.array(corner_known, dtype=np.bool_)
     return MarkingDetection(
         kind=take_name(entry["class"], f"{where}, class", DriveError),
-        score=take_number(entry.get("score", 1.0), f"{where}, score", DriveError),
-        corners_px=take_array(entry["corners_px"], (4, 2), f"{where}, corners_px", DriveError),
+        score=_score(entry, where),
+        corners_px=corners_px,
         covariance_px=_covariance_px(entry, where),
-        corner_valid=np.array(corner_known, dtype=np.bool_),
+        corner_valid=corner_valid,
     )
+
+
+def _counter_clockwise(markings: Sequence[MarkingDetection]) -> tuple[MarkingDetection, ...]:
+    """The markings of a file with corners counter-clockwise on the screen: other tools list them clockwise.
+
+    The one whose direction is surest tells that of all: noise turns small ones over.
+    """
+    turns = [_turning(marking) for marking in markings if marking.corner_valid.all()]
+    if max(turns, key=abs, default=0.0) < _SURELY:
+        return tuple(markings)
+    return tuple(_reversed(marking) for marking in markings)
+
+
+def _turning(marking: MarkingDetection) -> float:
+    """The area of a marking, positive where its corners run clockwise on the screen, in its sigmas."""
+    corners = marking.corners_px
+    across = np.roll(corners, -1, axis=0) - np.roll(corners, 1, axis=0)
+    gradient = 0.5 * np.column_stack([across[:, 1], -across[:, 0]]).ravel()
+    variance = float(gradient @ marking.covariance_px @ gradient)
+    return float(signed_area(corners) / np.sqrt(max(variance, 1e-12)))
+
+
+def _reversed(marking: MarkingDetection) -> MarkingDetection:
+    order = [0, 3, 2, 1]
+    by_corner = marking.covariance_px.reshape(4, 2, 4, 2)
+    return replace(
+        marking,
+        corners_px=marking.corners_px[order],
+        covariance_px=by_corner[order][:, :, order].reshape(8, 8),
+        corner_valid=marking.corner_valid[order],
+    )
+
+
+def _score(entry: Mapping[str, Any], where: str) -> float:
+    score = take_number(entry.get("score", 1.0), f"{where}, score", DriveError)
+    if not 0 <= score <= 1:
+        raise DriveError(f"{where}, score: {score:g} is no probability; give one from 0 to 1")
+    return score
 
 
 def _covariance_px(entry: Mapping[str, Any], where: str) -> FloatArray:
@@ -128,13 +171,15 @@ def _lane(content: object, where: str) -> LaneDetection:
     identity = entry.get("identity")
     if identity is not None and (isinstance(identity, bool) or not isinstance(identity, int)):
         raise DriveError(f"{where}, identity: expected a whole number; fix it or leave it out")
-    sigma = entry.get("sigma_px")
+    sigma_px = None
+    if entry.get("sigma_px") is not None:
+        sigma_px = take_array(entry["sigma_px"], (len(points_px),), f"{where}, sigma_px", DriveError)
+        if (sigma_px <= 0).any():
+            raise DriveError(f"{where}, sigma_px: a standard deviation is not above 0; fix it")
     return LaneDetection(
-        kind=take_text(entry["class"], f"{where}, class", DriveError),
-        score=take_number(entry.get("score", 1.0), f"{where}, score", DriveError),
+        kind=take_name(entry["class"], f"{where}, class", DriveError),
+        score=_score(entry, where),
         points_px=points_px,
         identity=identity,
-        sigma_px=None
-        if sigma is None
-        else take_array(sigma, (len(points_px),), f"{where}, sigma_px", DriveError),
+        sigma_px=sigma_px,
     )

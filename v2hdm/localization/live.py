@@ -84,7 +84,7 @@ def localize_live(
                 else:
                     news.add(item)
             # What comes between images waits for the next: a pose of it would only cost time.
-            if not news.looks and news.newest_s - written_s <= _QUIET_S:
+            if not news.looks and not news.has_waited(written_s):
                 continue
             looks = news.looks
             pose = localizer.update(looks, news.motions, news.fixes)
@@ -103,15 +103,18 @@ class _News:
     looks: list[Look] = field(default_factory=list)
     motions: list[Motion] = field(default_factory=list)
     fixes: list[Fix] = field(default_factory=list)
-    newest_s: float = -math.inf  # stamp of the newest motion or position
+
+    def has_waited(self, written_s: float) -> bool:
+        """Whether motions or positions are well after the last pose, or before it: a clock may go back."""
+        stamps_s = [motion.stamp_s for motion in self.motions[-1:]]
+        stamps_s += [fix.stamp_s for fix in self.fixes[-1:]]
+        return any(abs(stamp_s - written_s) > _QUIET_S for stamp_s in stamps_s)
 
     def add(self, item: Look | Motion | Fix) -> None:
         """Take an item."""
         if isinstance(item, Look):
             self.looks.append(item)
-            return
-        self.newest_s = max(self.newest_s, item.stamp_s)
-        if isinstance(item, Motion):
+        elif isinstance(item, Motion):
             self.motions.append(item)
         else:
             self.fixes.append(item)

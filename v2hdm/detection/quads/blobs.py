@@ -73,6 +73,7 @@ def find_blobs(
     scores = _class_scores(output, piece, level, len(contours), groups)
     may_split = _may_split(piece, level, scores.votes >= groups.least_share)
     outlines = outlines_of(level, piece, len(contours))
+    first_px = _origin_px(output, 0, 0)
     number_of_piece = np.zeros(len(contours) + 1, dtype=np.int16)
     of_parts: list[tuple[Box, BoolArray, int]] = []
     blobs: list[Blob] = []
@@ -95,7 +96,7 @@ def find_blobs(
             level=_signed(piece, index + 1, level, box),
             origin_px=_origin_px(output, box[0].start, box[1].start),
             stride=output.stride,
-            outline_px=_origin_px(output, 0, 0) + output.stride * outlines[index],
+            outline_px=first_px + output.stride * outlines[index],
             parts=len(parts),
             traced=not any(part.traced for part in parts),
         )

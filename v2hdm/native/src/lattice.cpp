@@ -64,26 +64,34 @@ int clearest(const std::vector<float>& light, const std::vector<uint8_t>& part, 
     return chosen;
 }
 
-// What of a point in the frame is told by its place: the nearest side, and the light's basis.
-float place(const Marking& marking, float x, float y, float use, int i, LatticeRows& rows) {
-    float outside[4], nearest = 0.0f;
+// What of the points in the frame is told by their places: the nearest side, and the light's basis.
+//
+// ``nearest`` becomes how far outside of that side each is. Row by row compilers make vector instructions of it.
+void place(const Marking& marking, int count, std::vector<float>& nearest, LatticeRows& rows) {
+    const float *x = rows.points, *y = rows.points + rows.stride;
     for (int s = 0; s < 4; ++s) {
         const float* row = marking.outward + 3 * s;
-        outside[s] = row[0] * x + row[1] * y + row[2];
-        nearest = s == 0 || outside[s] > nearest ? outside[s] : nearest;
+        float* outside = rows.of_side + s * rows.stride;
+        for (int i = 0; i < count; ++i) outside[i] = row[0] * x[i] + row[1] * y[i] + row[2];
+        for (int i = 0; i < count; ++i) nearest[i] = s == 0 || outside[i] > nearest[i] ? outside[i] : nearest[i];
     }
-    for (int s = 0; s < 4; ++s) rows.of_side[s * rows.stride + i] = outside[s] == nearest ? use : 0.0f;
-    float placed[2];
-    for (int axis = 0; axis < 2; ++axis) {
-        const float* row = marking.axes + 3 * axis;
-        placed[axis] = least(most(row[0] * x + row[1] * y + row[2], -1.0f), 1.0f);
+    for (int s = 0; s < 4; ++s) {
+        float* of_side = rows.of_side + s * rows.stride;
+        for (int i = 0; i < count; ++i) of_side[i] = of_side[i] == nearest[i] ? rows.use[i] : 0.0f;
     }
-    const float knot = (placed[0] + 1) * (static_cast<float>(HATS - 1) / 2);
+    const float *along = marking.axes, *across = marking.axes + 3;
+    float* knot = rows.across;  // until it is known how far across they are
+    for (int i = 0; i < count; ++i) {
+        const float placed = least(most(along[0] * x[i] + along[1] * y[i] + along[2], -1.0f), 1.0f);
+        knot[i] = (placed + 1) * (static_cast<float>(HATS - 1) / 2);
+    }
     for (int k = 0; k < HATS; ++k) {
-        rows.hats[k * rows.stride + i] = most(1 - std::abs(knot - static_cast<float>(k)), 0.0f);
+        float* hat = rows.hats + k * rows.stride;
+        for (int i = 0; i < count; ++i) hat[i] = most(1 - std::abs(knot[i] - static_cast<float>(k)), 0.0f);
     }
-    rows.across[i] = placed[1];
-    return nearest;
+    for (int i = 0; i < count; ++i) {
+        rows.across[i] = least(most(across[0] * x[i] + across[1] * y[i] + across[2], -1.0f), 1.0f);
+    }
 }
 
 }  // namespace
@@ -114,9 +122,10 @@ void look(
         rows.limited[i] = seen.clipped;
         used += seen.use;
         clipped += seen.clipped;
-        const float nearest = place(marking, x, y, rows.use[i], i, rows);
-        part[i] = seen.use ? (nearest < 0 ? 1 : 2) : 0;
     }
+    std::vector<float> nearest(count);
+    place(marking, count, nearest, rows);
+    for (int i = 0; i < count; ++i) part[i] = rows.use[i] > 0.0f ? (nearest[i] < 0 ? 1 : 2) : 0;
     const int colour = clearest(light, part, count, grey_first);
     for (int i = 0; i < count; ++i) rows.values[i] = light[static_cast<size_t>(COLOURS) * i + colour];
     *rows.clipped = static_cast<double>(clipped) / std::max(used, 1);
