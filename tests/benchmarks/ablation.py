@@ -278,6 +278,7 @@ def terms() -> Iterator[Part]:
     yield "their sureness", partial(patch.object, ground, "_SURE_M", np.inf)
     yield "their direction", partial(patch.object, ground, "_PARALLEL", -1.0)
     yield "sightings of something else", partial(patch.object, parallax, "_OFF_SHARE", 1e-9)
+    yield "sills of parked cars", partial(patch.object, parallax, "_SILL_SHARE", 1e-9)
     yield "corners of paint in one plane", partial(patch.object, parallax, "_GROUND", (1.0, 0.07, 0.07))
 
 
@@ -473,11 +474,12 @@ def rows_of_site(only: str, seeds: Sequence[int], folders: Sequence[Path]) -> It
 
 
 def holds() -> Iterator[Part]:
-    """Each thing that holds a mounting, and the context that lacks it."""
+    """Each thing that holds a mounting, or tells what stands, and the context that lacks it."""
     yield "nothing off", nullcontext
     yield "the ground that texture shows", partial(patch.object, bundle, "_ground_of", _nothing)
     yield "doubt of its height", partial(patch.object, planes, "_HEIGHT_SHARE", 0.0)
     yield "things that stand, among rejected", partial(patch.object, solution, "_OTHER_SHARE", 0.0)
+    yield "sills of parked cars", partial(patch.object, parallax, "_SILL_SHARE", 1e-9)
     yield "columns of the ground in tests", partial(patch.object, ground_columns, "_rows", _no_rows)
 
 

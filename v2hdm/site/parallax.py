@@ -44,9 +44,7 @@ _SILL_M = (0.35, 0.1)
 """Mean height, m, of sills and running boards of parked cars above the ground, and its standard deviation."""
 
 _SILL_SHARE = 0.05  # of what is not on the ground, sills that look like dashes; chosen: they are rare
-_LEAST_HEIGHTS = (
-    3.0  # of a sill, height of the camera above the ground: a lower camera sees sills that are lower
-)
+_LEAST_HEIGHTS = 3.0  # least height of a camera over that of a sill: lower cameras see lower sills
 
 _OFF_SHARE = 0.07  # fraction of a marking's sightings that are of something else, as of its observations
 _OFF_M = 1.0  # sigma, m, of such sightings about the marking: association reaches 1.5 m
