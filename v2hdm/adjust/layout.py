@@ -238,10 +238,12 @@ def _sorted_observations(problem: Problem, rank: IntArray) -> _Sorted:
     columns = Seen.of(problem.observations.columns, problem.intrinsic)
     count = len(problem.observations.corner)
     frames = len(problem.map_from_vehicle)
-    by_pair, order, corner, pair = np.empty((4, count), dtype=np.int32)
+    order = np.empty(count, dtype=np.int32)
+    corner = np.empty_like(order)
+    pair = np.empty_like(order)
     pair_at = np.zeros(len(columns.intrinsic) * frames + 1, dtype=np.int64)
     corner_at = np.zeros(len(rank) + 1, dtype=np.int64)
-    repeated = arrange(columns, rank, frames, by_pair, pair_at, corner_at, order, corner, pair)
+    repeated = arrange(columns, rank, frames, np.empty_like(order), pair_at, corner_at, order, corner, pair)
     if repeated >= 0:
         first, second = order[repeated - 1 : repeated + 1].tolist()
         raise AdjustError(
