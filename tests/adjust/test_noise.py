@@ -7,6 +7,7 @@ import pytest
 
 from tests.adjust.scene import correlated, exp, make_scene, project
 from v2hdm.adjust import Drift, PoseSigma, SolveOptions, estimate_noise, solve
+from v2hdm.adjust.solution import noise_scale
 
 STATED = PoseSigma(0.01, 0.001, 0.002, 0.005, roll_pitch_drift=Drift(0.0015, 5.0))
 
@@ -40,3 +41,12 @@ def test_without_states_of_the_frames_nothing_is_estimated():
     street = make_scene(2, frames=40, every_m=3.0, jitter=None)
     options = SolveOptions(coarse=False, loss="none", pose_states=())
     assert estimate_noise(street.problem, solve(street.problem, options)) == street.problem.pose_sigmas
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 1000])
+@pytest.mark.parametrize("factor", [0.3, 0.999, 1.0, 1.001, 4.0])
+def test_the_variance_factor_is_the_medians_and_at_least_one(count, factor):
+    squared = factor * np.random.default_rng(count).chisquare(2, count)
+    expected = max(1.0, float(np.median(squared)) / (2 * np.log(2)))
+    assert noise_scale(squared) == pytest.approx(expected, rel=1e-6)
+    assert noise_scale(np.full(count, 1.5 * 2 * np.log(2))) == pytest.approx(1.5)

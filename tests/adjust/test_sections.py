@@ -11,8 +11,9 @@ from tests.adjust.site import DRIFTING
 from tests.adjust.test_sessions import joined, visited_again
 from v2hdm.adjust import ControlPoints, KnownLengths, Problem, SolveOptions, solve
 from v2hdm.adjust.sections.blocks import BlockMatrix, BlockPattern
-from v2hdm.adjust.sections.parts import Part, cut, parts_of_way
+from v2hdm.adjust.sections.parts import Part, cut
 from v2hdm.adjust.sections.solve import Shape, finish_parts, join_parts, save_part
+from v2hdm.adjust.sections.way import parts_of_way
 from v2hdm.errors import AdjustError
 
 
@@ -46,6 +47,19 @@ def test_drives_along_one_street_are_in_one_part():
     part = parts_of_way(there_and_back, np.repeat([0, 1], 501), 600.0)
     assert len(set(part.tolist())) == 4
     np.testing.assert_array_equal(part[:501], part[501:][::-1])
+
+
+def test_a_street_is_cut_where_few_frames_look_across():
+    """Two yards of five passes each, 8 m apart, joined by a street of one pass: the cut is in the street."""
+    there = np.column_stack([np.arange(0.0, 100.0, 2.0), np.zeros(50)])
+    passes = np.concatenate([there + np.array([0.0, 8.0 * row]) for row in range(5)])
+    street = np.column_stack([np.arange(100.0, 240.0, 2.0), np.zeros(70)])
+    position = np.concatenate([passes, street, passes + np.array([240.0, 0.0])])
+    session = np.repeat(np.arange(11), [50] * 5 + [70] + [50] * 5)
+    part = parts_of_way(position, session, 700.0)
+    assert part.max() == 1
+    assert len(set(part[:250].tolist())) == 1
+    assert len(set(part[320:].tolist())) == 1
 
 
 def finish(number, part, solution):
@@ -102,7 +116,7 @@ def test_sections_of_a_street_are_the_street(tmp_path):
     scene = make_scene(3, frames=160, jitter=DRIFTING, outliers=0.03, start_error_deg=1.0)
     scene = with_ground(scene, 0.1, 0.01)
     position = scene.problem.map_from_vehicle[:, :2, 3]
-    part = parts_of_way(position, np.zeros(len(position), dtype=np.int64), 30.0)
+    part = parts_of_way(position, np.zeros(len(position), dtype=np.int64), 26.0)
     assert part.max() == 3
     options = SolveOptions()
     check(in_sections(tmp_path, scene.problem, options, part), scene.problem, options)

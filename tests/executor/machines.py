@@ -44,19 +44,20 @@ class Machines:
                 assert self.scheduler.poll() is None, self.log("scheduler", 0)
                 time.sleep(0.1)
 
-    def _start(self, kind, *arguments, cwd=None, environment=None):
+    def _start(self, kind, *arguments, cwd=None, environment=None, most_bytes=None):
         log = (self.folder / f"{kind}-{len(self.processes)}.log").open("w")
         given = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", **(environment or {})}
+        limited = [] if most_bytes is None else ["prlimit", f"--fsize={most_bytes}"]
         process = subprocess.Popen(
-            [DASK, kind, *arguments], cwd=cwd or ROOT, stdout=log, stderr=log, start_new_session=True,
-            env=os.environ | given,
+            [*limited, DASK, kind, *arguments], cwd=cwd or ROOT, stdout=log, stderr=log,
+            start_new_session=True, env=os.environ | given,
         )  # fmt: skip
         log.close()
         self.processes.append(process)
         return process
 
     def worker(self, *arguments, **how):
-        """Start a worker."""
+        """Start a worker; it can write files of ``most_bytes``, as if its disk were full."""
         given = arguments or ("--nthreads", "1")
         host = ["--host", "127.0.0.1"]
         name = ["--local-directory", str(self.folder), "--no-dashboard", "--death-timeout", "30"]

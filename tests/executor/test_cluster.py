@@ -1,11 +1,13 @@
 """Work on machines that run ``dask scheduler`` and ``dask worker``, and what is said where they cannot."""
 
+import errno
 import os
 import signal
 import socket
 import sys
 import threading
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import dask
@@ -16,6 +18,7 @@ from tests.executor.machines import Machines, free_port
 from tests.executor.test_local import nothing, refuse, slowly_doubled, step_by_step
 from v2hdm.errors import ConfigError, DriveError, WorkerError
 from v2hdm.executor import check_cluster, connecting, open_executor
+from v2hdm.store.files import whole_file
 
 
 def where(job, progress):
@@ -26,6 +29,18 @@ def die_where_told(folder, progress):
     (folder / f"begun-{os.getpid()}").touch()
     time.sleep(2.0)
     return "alive"
+
+
+@dataclass(frozen=True)
+class Large:
+    """Writes a file of so many bytes."""
+
+    folder: Path
+
+    def __call__(self, size, progress):
+        with whole_file(self.folder / f"large_{size}") as partial:
+            partial.write_bytes(bytes(size))
+        return size
 
 
 @pytest.fixture(scope="module")
@@ -87,6 +102,26 @@ def test_a_job_whose_worker_is_killed_is_done_again_and_one_that_is_killed_twice
             else:
                 assert isinstance(outcome, WorkerError)
                 assert "died twice over the same work" in str(outcome)
+
+
+def test_a_worker_whose_disk_is_full_is_an_error_that_names_the_file_and_nothing_is_half_written(tmp_path):
+    machines = Machines(tmp_path)
+    out = tmp_path / "out"
+    out.mkdir()
+    try:
+        machines.worker(most_bytes=65536)
+        machines.wait_for(1)
+        with open_executor(0, machines.address) as executor:
+            work = Large(out)
+            outcomes = executor.side_by_side(work, [10, 200_000])
+            assert next(outcomes) == (0, 10)
+            with pytest.raises(OSError, match="large") as failure:
+                next(outcomes)
+            assert failure.value.errno == errno.EFBIG
+            assert [path.name for path in out.iterdir()] == ["large_10"]
+            assert dict(executor.side_by_side(work, [20])) == {0: 20}
+    finally:
+        machines.close()
 
 
 def test_a_worker_that_cannot_read_a_drive_is_one_line_with_its_address(machines, tmp_path, monkeypatch):

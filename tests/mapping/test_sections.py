@@ -11,7 +11,6 @@ from scipy.spatial import cKDTree
 from scipy.stats import norm
 
 from tests.mapping.scene import Scene, SceneOptions, make_scene
-from v2hdm.adjust import SolveOptions
 from v2hdm.errors import AdjustError, ConfigError, MappingError, WorkerError
 from v2hdm.executor import HERE
 from v2hdm.faults import Contradiction, table
@@ -19,10 +18,12 @@ from v2hdm.geometry.planar import length_along
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions, SizeOptions
 from v2hdm.mapping.results import NO_SEGMENT, MethodResult
+from v2hdm.mapping.sections import run
 from v2hdm.mapping.sections.common import Names, named, with_owners
 from v2hdm.mapping.sections.faults import pooled_tests, refuse_contradicted
 from v2hdm.mapping.sections.joint import (
     Fit,
+    Gate,
     Judged,
     gates,
     refuse_contradicting_drives,
@@ -164,22 +165,26 @@ def test_a_process_that_dies_is_one_line_that_names_step_and_section(scene, tmp_
         )
 
 
-def judged(squared, corner, shift_m=((0.0, 0.0), (0.0, 0.0)), is_behind=None) -> Judged:
-    """A section's observations with such squared residuals of such corners, by 100 frames a drive."""
-    return Judged(
-        mahalanobis2=np.array(squared, dtype=float),
-        corner=np.array(corner),
-        is_behind=np.zeros(len(squared), dtype=bool) if is_behind is None else np.array(is_behind),
-        shift_m=100 * np.array(shift_m),
-        frames=np.array([100, 100]),
-    )
+def judged(corner, shift_m) -> Judged:
+    """A section's observations of such corners, by 100 frames a drive."""
+    return Judged(np.array(corner), 100 * np.array(shift_m), np.array([100, 100]))
+
+
+def fit(squared, corner, is_behind=None) -> Fit:
+    """A section's observations with such squared residuals of such corners."""
+    is_behind = np.zeros(len(squared), dtype=bool) if is_behind is None else np.array(is_behind)
+    return Fit(np.array(squared, dtype=float), np.array(corner), is_behind, np.full(len(squared), 2.0), {})
 
 
 def test_an_observation_is_judged_at_the_scale_of_all_sections_and_its_corner_counted_in_all():
     usual = [1.4] * 20
-    first = judged([*usual, 5.0, 300.0, 1.0], [*range(20), 20, 20, 21])
-    second = judged([*usual, 5.0, 1.0], [*range(22, 42), 20, 21], is_behind=[False] * 21 + [True])
-    of_first, of_second = gates([first, second], 0.001)
+    first = fit([*usual, 5.0, 300.0, 1.0], [*range(20), 20, 20, 21])
+    second = fit([*usual, 5.0, 1.0], [*range(22, 42), 20, 21], is_behind=[False] * 21 + [True])
+    # Before the second section's others it has an observation of a corner of its own, which no solve has.
+    in_solve = [np.ones(23, dtype=bool), np.arange(23) > 0]
+    of_first, of_second = gates([first, second], [Gate(rows, rows) for rows in in_solve], 0.001)
+    assert not of_second.is_accepted[0]
+    of_second = Gate(*(column[1:] for column in of_second))
     assert of_first.is_accepted[20:].tolist() == [True, False, True]
     assert of_second.is_accepted[20:].tolist() == [True, False]
     # Corner 20 is seen once in each section, corner 21 twice, once behind the camera.
@@ -192,9 +197,13 @@ def test_outliers_are_those_of_the_drive_where_one_section_is_all_of_it(tmp_path
     work = Work(Listed(scene.detections), tuple(scene.drive.cameras), MappingOptions(), tmp_path)
     (section,) = sections_of(scene.drive, 1000.0)
     work.write("section", 0, section)
-    (names,) = named([work.settle(0)])
+    alone = [work.settle(0)]
+    (names,) = named(alone)
     work.write("names", 0, names)
-    (gate,) = gates([work.judge(0)], SolveOptions.gate_probability)
+    in_one = np.zeros(len(section.frames), dtype=np.int64)
+    of_section = run._Run(work, HERE, lambda step, done, total: None, 1)
+    rough = run._judge_together(of_section, scene.drive, in_one, alone, [work.judge(0).corner])
+    (gate,) = rough.gates
     settled = work.read("examined", 0).settled
     assert settled.model.variance_factor < 0.9  # the detector states more than there is
     assert 0 < np.count_nonzero(~gate.is_accepted) == np.count_nonzero(~settled.inliers)
@@ -206,9 +215,11 @@ def test_a_corner_scatters_as_all_its_images_do_whatever_section_they_are_of():
     squared[::40] *= 9  # of corner 0
     corner = np.arange(400) % 40
     freedom = np.full(400, 2.0)
-    whole = scatter_by_marking([Fit(squared, corner, freedom, {})], 10)
+    is_behind = np.zeros(400, dtype=bool)
+    whole = scatter_by_marking([Fit(squared, corner, is_behind, freedom, {})], 10)
     halves = [
-        Fit(squared[rows], corner[rows], freedom[rows], {}) for rows in (slice(0, None, 2), slice(1, None, 2))
+        Fit(squared[rows], corner[rows], is_behind[rows], freedom[rows], {})
+        for rows in (slice(0, None, 2), slice(1, None, 2))
     ]
     np.testing.assert_allclose(scatter_by_marking(halves, 10), whole)
     assert whole[0, 0] == whole.max() > 2
@@ -218,9 +229,9 @@ def test_drives_that_markings_shift_apart_are_named_in_one_line(scene):
     noise = PoseNoise(position_m=0.02)
     drives = [Session(name, Path(name), noise) for name in ("monday", "tuesday")]
     network = replace(scene.drive, joined=tuple(drives))
-    refuse_contradicting_drives([judged([], [], ((0.03, 0.0), (-0.03, 0.0)))], network)
+    refuse_contradicting_drives([judged([], ((0.03, 0.0), (-0.03, 0.0)))], network)
     with pytest.raises(AdjustError, match=r"drive (monday|tuesday) by 30 cm against the others") as refused:
-        refuse_contradicting_drives([judged([], [], ((0.15, 0.0), (-0.15, 0.0)))], network)
+        refuse_contradicting_drives([judged([], ((0.15, 0.0), (-0.15, 0.0)))], network)
     assert "\n" not in str(refused.value)
 
 

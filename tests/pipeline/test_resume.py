@@ -26,10 +26,11 @@ SAME = ("map.geojson", "calibration_front.yaml", "trajectory.tum", "excluded.geo
 
 
 @pytest.fixture(scope="module")
-def site(small_drive, tmp_path_factory):
+def site(small_drive, small_mapped, tmp_path_factory):
     """A folder with a drive, what a first run has made of it, and its cache."""
     folder = tmp_path_factory.mktemp("site")
     shutil.copytree(small_drive, folder / "drive")
+    shutil.copytree(small_mapped[1], folder / "cache")  # the same drive elsewhere, detected and mapped
     run(config(folder, "first"))
     return folder
 

@@ -1,7 +1,9 @@
 """Classes that a finished network learns alone."""
 
+import shutil
 import sys
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -9,6 +11,7 @@ import pytest
 import torch
 
 from models import MarkingNet
+from tests.detection.pictures import make_camera
 from tests.train.small import HEIGHT, WIDTH, coco, tiny
 from train.areas.__main__ import main
 from train.areas.cells import BARE, OPEN, OTHER, CellReader, Cells, View
@@ -20,8 +23,12 @@ from train.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from train.labels import Place, labelled_images
 from train.labels_image import Shape
 from train.scenes.scenes import TrainingSample
+from train.shipment import Order, ship
 from train.targets import IGNORE, targets
 from v2hdm.catalogue import NOT_PAINT, SHIPPED
+from v2hdm.detection import weights
+from v2hdm.detection.camera import RoadCamera
+from v2hdm.detection.network import Network, run_on_road
 from v2hdm.errors import ConfigError
 from v2hdm.records import BOX, TEXT
 
@@ -109,6 +116,29 @@ def test_all_else_that_the_network_says_stays(config, start):
     assert torch.equal(said.paint, known.paint)
     assert torch.equal(said.lanes, known.lanes)
     torch.testing.assert_close(said.kinds[:, : len(KNOWN)], known.kinds)
+
+
+@pytest.mark.slow
+def test_rows_fitted_to_the_shipped_network_are_shipped_with_all_else_as_it_was(
+    config, tmp_path, monkeypatch
+):
+    into = tmp_path / "into"
+    shutil.copytree(weights.FOLDER, into, ignore=shutil.ignore_patterns("__pycache__", "*.py"))
+    network_file = Path("models/marking_net.onnx").resolve()
+    shutil.copy(network_file, into)
+    fit = learn_areas(replace(config, start=str(network_file), render_views=0), quiet)
+    monkeypatch.chdir(tmp_path)
+    ship(Order(source=fit.parent, into=into, keep=("network", "judge", "lane_score")), quiet)
+    weights.check_weights(into)
+    before, after = (Network(folder / weights.NETWORK_FILE.name) for folder in (weights.FOLDER, into))
+    assert after.info.classes == before.info.classes
+    camera = make_camera("pinhole")
+    image = np.full((camera.info.height, camera.info.width, 3), 90, dtype=np.uint8)
+    image[250:300, 200:400] = 250
+    outputs = [run_on_road(network, image, RoadCamera(camera, 16)) for network in (before, after)]
+    np.testing.assert_array_equal(outputs[0].paint, outputs[1].paint)
+    np.testing.assert_array_equal(outputs[0].kinds, outputs[1].kinds)
+    assert (outputs[0].areas != outputs[1].areas).any()
 
 
 def test_a_network_that_knows_the_classes_gets_the_same_rows_anew(config):

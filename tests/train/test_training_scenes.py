@@ -1,7 +1,7 @@
 """Random scenes, views and hardships of training: reproducible, varied, labelled where the paint is."""
 
 from dataclasses import fields
-from functools import partial
+from functools import cache, partial
 
 import cv2
 import numpy as np
@@ -240,10 +240,17 @@ ELSEWHERE = (
 )  # fmt: skip
 
 
+@cache
+def plain_sample(index):
+    """A sample without hardships, which many tests hold others against."""
+    return training_sample(5, index, 160, 96, hardships=Hardships())
+
+
 def pairs(hard, count):
     """Samples without and with hardships."""
-    return [[training_sample(5, index, 160, 96, hardships=given) for given in (Hardships(), hard)]
-            for index in range(count)]  # fmt: skip
+    return [
+        (plain_sample(index), training_sample(5, index, 160, 96, hardships=hard)) for index in range(count)
+    ]
 
 
 @pytest.mark.parametrize("name", [f.name for f in fields(Hardships) if f.name not in ELSEWHERE])

@@ -117,7 +117,7 @@ _ARRAYS: Mapping[str, Mapping[str, tuple[int, ...]]] = {
         "intrinsic": (4,), "cam_from_vehicle": (4, 4), "centre_vehicle": (3,), "centre_sigma_m": (3,),
         "read_out_s": (),
     },
-    "frame": {"map_from_vehicle": (4, 4), "twist_vehicle": (6,)},
+    "frame": {"map_from_vehicle": (4, 4), "poses_start": (4, 4), "twist_vehicle": (6,)},
     "corner": {"corners_start": (2,)},
     "observation": {
         "camera": (), "frame": (), "corner": (), "pinhole_px": (2,), "covariance_px": (2, 2), "row_share": (),

@@ -12,13 +12,13 @@ from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
 from v2hdm.adjust.descent import Descent
+from v2hdm.adjust.inverse import inverse_diagonal
 from v2hdm.adjust.reduced import reduced_coupling, to_tiles
 from v2hdm.adjust.whitening import Whitening
 from v2hdm.records import FloatArray
 
 _CORNERS_AT_ONCE = 256  # corners whose right-hand sides are solved together: enough for fast products
 _NUMBERS_AT_ONCE = 1 << 25  # most numbers, of 8 bytes, in the right-hand sides that are solved together
-_FRAMES_AT_ONCE = 64  # frames whose right-hand sides are solved together
 
 
 @dataclass(frozen=True)
@@ -76,22 +76,28 @@ class Covariance:
 
     def poses(self) -> FloatArray:
         """Variances (J, 6) of the frames' tangents; 0 without states."""
-        arrays = self.whitening.engine.arrays
-        whitening = self.whitening
-        frames = arrays.frame_count
-        states = len(arrays.states)
-        out = np.zeros((frames, 6))
-        columns = torch.tensor(arrays.states, dtype=torch.int64, device=arrays.centre.device)
-        acts = torch.nn.functional.one_hot(columns, 6).to(torch.float64)
-        for begin in range(0, frames if states else 0, _FRAMES_AT_ONCE):
-            chunk = torch.arange(begin, min(begin + _FRAMES_AT_ONCE, frames), device=columns.device)
-            selected = acts.new_zeros(frames, states, len(chunk), 6)
-            selected[chunk, :, chunk - begin] = acts
-            tiles = to_tiles(whitening.plan, selected.flatten(2))
-            tip = tiles.new_zeros(len(whitening.reduced_factor.tip), tiles.shape[1])
-            root = whitening.reduced_factor.solve(torch.cat([tiles, tip]))
-            out[chunk.cpu().numpy()] = root.square().sum(0).view(len(chunk), 6).cpu().numpy()
+        out = self._poses(None)
         return out if self.held is None else out + np.square(self.held.poses).sum(axis=2)
+
+    def _poses(self, tail: Tensor | None) -> FloatArray:
+        """Variances (J, 6) of the frames' tangents, with ``tail`` as of :func:`inverse_diagonal`."""
+        whitening = self.whitening
+        plan = whitening.plan
+        arrays = whitening.engine.arrays
+        states = len(arrays.states)
+        if not states:
+            return np.zeros((arrays.frame_count, 6))
+        tiles = inverse_diagonal(whitening.reduced_factor, plan.pattern, tail)[
+            plan.position[: plan.frame_tiles]
+        ]
+        per_tile = plan.frames_per_tile
+        by_place = tiles.view(plan.frame_tiles, per_tile, states, per_tile, states)
+        # White errors and drifts add up to an axis of the tangent.
+        axes = torch.tensor(arrays.states, dtype=torch.int64, device=tiles.device)
+        acts = torch.nn.functional.one_hot(axes, 6).to(tiles.dtype)
+        of_frames = torch.einsum("tpaqb,ak,bk->tpqk", by_place, acts, acts).diagonal(dim1=1, dim2=2)
+        variances = of_frames.permute(0, 2, 1).flatten(0, 1)[: arrays.frame_count]
+        return np.asarray(variances.cpu().numpy())
 
     def camera_information(self) -> FloatArray:
         """Marginal information (C (6 + Q), C (6 + Q)) of the cameras' left tangents and clock offsets."""

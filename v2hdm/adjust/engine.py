@@ -158,13 +158,16 @@ class TorchEngine:
         report.behind[order] = (points[:, 2] <= NEAR_M).cpu().numpy()
         return report
 
-    def back_project(self, cam_from_vehicle: Tensor) -> tuple[Tensor, Tensor]:
-        """Corners (N, 2) by weighted back-projection from recorded poses, and which (N,) are determined.
+    def back_project(
+        self, cam_from_vehicle: Tensor, frame_state: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Corners (N, 2) by weighted back-projection, and which (N,) are determined.
 
-        A corner is the mean of the ground points of its rays, each weighted by its observation.
+        Poses are as recorded, or of states (J, S). A corner is the mean of the ground points of its rays,
+        each weighted by its observation.
         """
         arrays = self.arrays
-        state = torch.zeros_like(arrays.state_information_root)
+        state = torch.zeros_like(arrays.state_information_root) if frame_state is None else frame_state
         start = Estimate(cam_from_vehicle, state, arrays.control, arrays.no_clock())
         return self.meet_ground(model.ground_from_ray(self.poses(start).flatten(0, 1)))
 

@@ -36,13 +36,15 @@ def shifted(problem: Problem, by_m: FloatArray) -> Problem:
     """``problem`` on a map with all points moved by ``by_m`` (2,)."""
     if not by_m.any():
         return problem
-    poses = problem.map_from_vehicle.copy()
-    poses[:, :2, 3] += by_m
+    moves = np.eye(4)
+    moves[:2, 3] = by_m
+    poses_start = problem.poses_start
     start = problem.corners_start
     control = problem.control
     return replace(
         problem,
-        map_from_vehicle=poses,
+        map_from_vehicle=moves @ problem.map_from_vehicle,
+        poses_start=None if poses_start is None else moves @ poses_start,
         corners_start=None if start is None else start + by_m,
         control=None if control is None else replace(control, points_map=control.points_map + by_m),
     )
@@ -236,10 +238,12 @@ def _sorted_observations(problem: Problem, rank: IntArray) -> _Sorted:
     columns = Seen.of(problem.observations.columns, problem.intrinsic)
     count = len(problem.observations.corner)
     frames = len(problem.map_from_vehicle)
-    by_pair, order, corner, pair = np.empty((4, count), dtype=np.int32)
+    order = np.empty(count, dtype=np.int32)
+    corner = np.empty_like(order)
+    pair = np.empty_like(order)
     pair_at = np.zeros(len(columns.intrinsic) * frames + 1, dtype=np.int64)
     corner_at = np.zeros(len(rank) + 1, dtype=np.int64)
-    repeated = arrange(columns, rank, frames, by_pair, pair_at, corner_at, order, corner, pair)
+    repeated = arrange(columns, rank, frames, np.empty_like(order), pair_at, corner_at, order, corner, pair)
     if repeated >= 0:
         first, second = order[repeated - 1 : repeated + 1].tolist()
         raise AdjustError(

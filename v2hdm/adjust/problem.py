@@ -211,8 +211,8 @@ class Problem:
     ``intrinsic`` (C, 4) is fx, fy, cx, cy, px. ``cam_from_vehicle`` (C, 4, 4) is the start,
     ``map_from_vehicle`` (J, 4, 4) the recorded poses. ``centre_vehicle`` and ``centre_sigma_m`` (C, 3) are
     the surveyed camera centres, or None; ``ground`` is what texture shows of the ground, or None.
-    ``corners_start`` (N, 2) replaces the start by weighted
-    back-projection. ``twist_vehicle`` (J, 6), the vehicle's velocity in its own frame (m/s, rad/s), is needed
+    ``poses_start`` (J, 4, 4) replaces these, and ``corners_start`` (N, 2) weighted back-projection, as the
+    start. ``twist_vehicle`` (J, 6), the vehicle's velocity in its own frame (m/s, rad/s), is needed
     for clock offsets, whose prior sigma is ``clock_sigma_s``. ``read_out_s`` (C,) are the stated read-out
     times, None for global shutters; their prior sigma is ``read_out_sigma_s``. ``control`` are surveyed
     corners: they alone separate a shift of the whole map from the drift of GNSS. ``lengths`` are known
@@ -232,6 +232,7 @@ class Problem:
     centre_vehicle: FloatArray | None = None
     centre_sigma_m: FloatArray | None = None
     pose_sigma: PoseSigma | tuple[PoseSigma, ...] = PoseSigma()
+    poses_start: FloatArray | None = None
     corners_start: FloatArray | None = None
     twist_vehicle: FloatArray | None = None
     clock_sigma_s: float = 0.01
@@ -251,7 +252,7 @@ class Problem:
         cameras, camera = np.unique(observations.camera, return_inverse=True)
         frames, frame = np.unique(observations.frame, return_inverse=True)
         of_cameras = "intrinsic", "cam_from_vehicle", "centre_vehicle", "centre_sigma_m", "read_out_s"
-        of_frames = "map_from_vehicle", "twist_vehicle", "session"
+        of_frames = "map_from_vehicle", "poses_start", "twist_vehicle", "session"
         rows = dict.fromkeys(of_cameras, cameras) | dict.fromkeys(of_frames, frames)
         parts = {name: stated[name][at] for name, at in rows.items() if stated[name] is not None}
         if stated["ground"] is not None:

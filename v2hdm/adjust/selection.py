@@ -51,6 +51,7 @@ def restrict(problem: Problem, keep: BoolArray) -> tuple[Problem, IntArray]:
     corners, corner = np.unique(observations.corner[keep], return_inverse=True)
     frame = observations.frame[keep]
     used = slice(int(frame.min()), int(frame.max()) + 1)
+    poses_start = problem.poses_start
     start = problem.corners_start
     twist = problem.twist_vehicle
     control = problem.control
@@ -66,6 +67,7 @@ def restrict(problem: Problem, keep: BoolArray) -> tuple[Problem, IntArray]:
     part = replace(
         problem,
         map_from_vehicle=problem.map_from_vehicle[used],
+        poses_start=None if poses_start is None else poses_start[used],
         observations=replace(
             observations.take(keep), frame=frame - used.start, corner=corner.astype(np.int64)
         ),

@@ -27,7 +27,7 @@ from v2hdm.adjust.threads import one_thread_in_torch
 from v2hdm.adjust.whitening import Whitening
 from v2hdm.doors import checked
 from v2hdm.errors import AdjustError
-from v2hdm.geometry.rigid import exp
+from v2hdm.geometry.rigid import exp, log
 from v2hdm.records import FloatArray
 
 _MIN_DEPRESSION_SINES = (0.1, 0.2, 0.1)
@@ -221,15 +221,26 @@ def start_of(
 def _estimate(problem: Problem, engine: TorchEngine, cam_from_vehicle: Tensor) -> tuple[Estimate, int | None]:
     """The start under some extrinsics, and a corner that no ray determines, if any."""
     arrays = engine.arrays
-    state = torch.zeros_like(arrays.state_information_root)
+    state = _states_start(problem, arrays)
     if problem.corners_start is not None:
         corners_start = torch.as_tensor(
             problem.corners_start, dtype=torch.float64, device=cam_from_vehicle.device
         )
         return Estimate(cam_from_vehicle, state, corners_start[arrays.corner_order], arrays.no_clock()), None
-    corners, fixed = engine.back_project(cam_from_vehicle)
+    corners, fixed = engine.back_project(cam_from_vehicle, state)
     loose = None if bool(fixed.all()) else int(arrays.corner_order[~fixed].min())
     return Estimate(cam_from_vehicle, state, corners, arrays.no_clock()), loose
+
+
+def _states_start(problem: Problem, arrays: Arrays) -> Tensor:
+    """States (J, S) whose poses are where the problem starts, in the first state of each axis."""
+    state = torch.zeros_like(arrays.state_information_root)
+    if problem.poses_start is None:
+        return state
+    tangent = log(np.linalg.inv(problem.map_from_vehicle) @ problem.poses_start)
+    for axis in sorted(set(arrays.states)):
+        state[:, arrays.states.index(axis)] = state.new_tensor(tangent[:, axis])
+    return state
 
 
 def report_of(

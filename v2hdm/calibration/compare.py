@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.stats import chi2, ncx2
+from scipy.special import chdtrc, chdtri, chndtr
 
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.rigid import adjoint, camera_centre, inverse, log
@@ -40,8 +40,8 @@ class Movement:
     @property
     def detectable(self) -> FloatArray:
         """The least shifts, m, and turns, rad, each alone (6,), that would hardly be missed."""
-        limit = chi2.isf(FALSE_ALARM, 6)
-        needed = brentq(lambda offset: ncx2.sf(limit, 6, offset) - (1 - _MISSED), 1.0, 1e3)
+        limit = chdtri(6, FALSE_ALARM)
+        needed = brentq(lambda offset: _MISSED - chndtr(limit, 6, offset), 1.0, 1e3)
         return np.asarray(np.sqrt(needed / np.diag(np.linalg.inv(self.covariance))))
 
     @property
@@ -78,7 +78,7 @@ def movement(before: Calibration, after: Calibration) -> Movement:
         shift_m=np.asarray(shift_m),
         turn_rad=np.asarray(to_vehicle[3:, 3:] @ tangent[3:]),
         covariance=np.asarray(to_vehicle @ spread @ to_vehicle.T),
-        probability=float(chi2.sf(squared, 6)),
+        probability=float(chdtrc(6, max(squared, 0.0))),
     )
 
 
@@ -90,7 +90,7 @@ def turned_alike(movements: Sequence[Movement]) -> bool:
     for other in movements[1:]:
         off = other.turn_rad - first.turn_rad
         spread = other.covariance[3:, 3:] + first.covariance[3:, 3:]
-        if chi2.sf(off @ np.linalg.solve(spread, off), 3) < FALSE_ALARM:
+        if chdtrc(3, off @ np.linalg.solve(spread, off)) < FALSE_ALARM:
             return False
     return True
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2, f
+from scipy.special import chdtrc, chdtri, fdtrc
 
 from v2hdm.calibration.fit import STATED_AS, UNKNOWNS, Fit, SeenPoints, fit_mountings
 from v2hdm.errors import DriveError, shown
@@ -201,7 +201,7 @@ def _held_out(fit: Fit) -> tuple[FloatArray, FloatArray]:
     free = np.maximum(count - UNKNOWNS, 0.0) + STATED_AS
     others = (np.maximum(total - np.where(fit.is_right, square, 0.0), 0.0) + STATED_AS) / free
     ratio = square / others
-    return np.sqrt(ratio), np.asarray(f.sf(ratio / 2, 2, free))
+    return np.sqrt(ratio), np.asarray(fdtrc(2, free, np.maximum(ratio, 0.0) / 2))
 
 
 class Scatter(NamedTuple):
@@ -218,8 +218,8 @@ def scatter(fit: Fit, chance: float) -> Scatter:
     stated = fit.points.covariance(fit.cam_from_vehicle)[fit.is_right]
     total = float(np.einsum("ni,nij,nj->", residual, np.linalg.inv(stated), residual))
     free = max(2 * len(residual) - UNKNOWNS, 1)
-    limit = float(np.sqrt(chi2.isf(chance, free) / free))
-    return Scatter(float(np.sqrt(total / free)), limit, float(chi2.sf(total, free)))
+    limit = float(np.sqrt(chdtri(free, chance) / free))
+    return Scatter(float(np.sqrt(total / free)), limit, float(chdtrc(free, total)))
 
 
 class Lens(NamedTuple):
@@ -266,7 +266,7 @@ def _freed(fit: Fit) -> Lens:
     noise = (max(total - gain, 0.0) + STATED_AS) / free
     focal = _gain_of(from_centre[..., None], stated, slopes, residual)
     return Lens(
-        probability=float(f.sf(gain / 2 / noise, 2, free)),
+        probability=float(fdtrc(2, free, max(gain, 0.0) / 2 / noise)),
         focal=float(focal.step[0]),
         focal_sigma=float(np.sqrt(noise / focal.information[0, 0])),
     )

@@ -73,7 +73,8 @@ def find_areas(
     cuts the paint.
     """
     names = output.area_classes
-    if not names:
+    # Most images show none.
+    if not names or not (output.areas.max(axis=0) >= output.kinds.max(axis=0)).any():
         return []
     rows, columns = np.divmod(np.flatnonzero(output.paint > 0), output.paint.shape[1])
     is_in_reach = output.top + output.stride * (rows + 1) > reach_px
@@ -81,7 +82,6 @@ def find_areas(
     columns = columns[is_in_reach]
     odds = output.area_odds(rows, columns)
     best = odds.argmax(axis=0)
-    # Most images show none.
     if max(np.bincount(best, minlength=len(names))[: len(names)], default=0) < _LEAST_CELLS:
         return []
     probability = as_shares(odds)

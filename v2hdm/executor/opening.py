@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, TypeVar
 
 from v2hdm.errors import ConfigError
 from v2hdm.executor.executor import HERE, Executor, JobProgress, Outcomes, Stage
-from v2hdm.executor.processes import ProcessExecutor
 
 _SCHEMES = ("tcp://", "tls://")
 BATCH_SYSTEMS = {
@@ -72,6 +71,9 @@ def open_executor(
     elif has_dask:
         executor = _WhenNeeded(workers, memory_gb, isolated)
     else:
+        # It loads OpenCV, which would keep every command from its first line.
+        from v2hdm.executor.processes import ProcessExecutor
+
         executor = ProcessExecutor(workers)
     try:
         yield executor

@@ -9,8 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
-from scipy.special import expit
-from scipy.stats import norm
+from scipy.special import expit, ndtr
 
 from v2hdm.faults.score import ScoreTest
 from v2hdm.faults.table import PRIOR_ODDS
@@ -60,7 +59,7 @@ def _share_that_matters(test: ScoreTest) -> float:
     """Probability that an error is larger than a drive tolerates, given that there is one."""
     if not math.isfinite(test.sigma):
         return 0.0
-    return float(sum(norm.cdf((side * test.value - test.fault.least) / test.sigma) for side in (1.0, -1.0)))
+    return float(sum(ndtr((side * test.value - test.fault.least) / test.sigma) for side in (1.0, -1.0)))
 
 
 def even_sigmas(test: ScoreTest, odds: float = 1.0) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from scipy import stats
+from scipy.special import ndtri  # scipy.stats takes as long to load as a short drive to be checked
 
 from v2hdm.faults.table import FAULTS, Error, Fault
 
@@ -13,7 +13,7 @@ _LEAST_P = 1e-300  # a smaller p-value is zero in floating point
 
 def sigmas_of(p_value: float) -> float:
     """Two-sided p-value as a number of standard deviations of a normal distribution."""
-    return float(stats.norm.isf(max(p_value, _LEAST_P) / 2))
+    return -float(ndtri(max(p_value, _LEAST_P) / 2))
 
 
 @dataclass(frozen=True)

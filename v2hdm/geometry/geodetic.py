@@ -185,16 +185,15 @@ def crs_of(origin: GeodeticOrigin | None) -> str:
     """PROJ or WKT text of the map frame.
 
     With an origin, a transverse Mercator projection about it, scaled to its ellipsoidal height, which every
-    GIS knows: within 1 mm of the tangent plane up to 2 km away. Its text names no datum but WGS84, as PROJ's
-    has no words for others. Without an origin, an engineering system.
+    GIS knows: within 1 mm of the tangent plane up to 2 km away. It names WGS84, between which and other
+    satellite datums a GIS moves nothing. Without an origin, an engineering system.
     """
     if origin is None:
         return _ENGINEERING
     scale = 1 + origin.altitude_m / _SEMI_MAJOR_M
-    datum = "+datum=WGS84" if is_same_datum(origin.datum, "WGS84") else "+ellps=GRS80"
     return (
         f"+proj=tmerc +lat_0={origin.latitude_deg!r} +lon_0={origin.longitude_deg!r} +k={scale!r} "
-        f"+x_0=0 +y_0=0 {datum} +units=m +no_defs"
+        "+x_0=0 +y_0=0 +datum=WGS84 +units=m +no_defs"
     )
 
 

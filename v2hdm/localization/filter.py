@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from v2hdm.association.groups import CLEARER_BY
 from v2hdm.geometry.ipm import (
@@ -35,7 +35,7 @@ _START_SPEED_M_S = 5.0  # standard deviation of the speed then, m/s
 _START_TURN_RAD_S = 0.3  # standard deviation of the yaw rate then, rad/s
 
 # Squared distance, in sigmas, up to which a detection fits: one in a thousand is farther.
-_LARGEST_SQUARE = float(chi2.isf(1e-3, 8))
+_LARGEST_SQUARE = float(chdtri(8, 1e-3))
 
 # Radius about where a detection seems to lie, in sigmas of the place, in which its marking is looked for.
 _REACH_SIGMAS = 4.0

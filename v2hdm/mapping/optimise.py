@@ -18,6 +18,7 @@ from v2hdm.adjust import (
     MIN_DEPRESSION_SINE,
     PoseSigma,
     Problem,
+    SolveOptions,
     Status,
     estimate_noise,
     predicts_better,
@@ -57,6 +58,9 @@ _STEEP_SINE = 0.15  # least sine of a ray's depression in the coarse stage, unle
 
 _LOOSE_CLOCK_SIGMA_S = 0.3
 """Prior sigma of clock offsets, s, once a drive shows them: half a period of a slow receiver."""
+
+_ROUGH_GAP = 3e-4
+"""Decrease still possible, a fraction of the cost, at which solves before another end: a tenth of a sigma."""
 
 _GROUND_ROUNDS = 6  # most solves over improving ground; four suffice for a crown of 4 %
 _SETTLED_M = 1e-3  # RMS change of the observed heights at which the ground has converged
@@ -128,7 +132,7 @@ class Optimiser:
             # The coarse solve fixes the poses, on which no test of the inputs may rest.
             if number > 1 and same_groups(association, bundle.association):
                 break
-            bundle = self._solve_all(association, bundle.rig)
+            bundle = self._solve_all(association, bundle.rig, gap=_ROUGH_GAP)
         return self.settle_from(bundle, progress)
 
     def settle_from(
@@ -342,6 +346,7 @@ class Optimiser:
         rig: Rig,
         coarse: bool = False,
         lanes: tuple[Knots, FloatArray] | None = None,
+        gap: float = SolveOptions.gap_tolerance,
     ) -> Bundle:
         noises = self._noises
         options = self._options
@@ -350,6 +355,7 @@ class Optimiser:
             if coarse
             else full_model(self._pose_sigma, options, self.pose_model, self._variance_factor)
         )
+        model = replace(model, solver=replace(model.solver, gap_tolerance=gap))
         cameras: Mapping[str, Camera] = self._cameras
         if self.surface is not None:
             cameras = with_planes_over(self.surface, cameras, rig.cam_from_vehicle, rig.map_from_vehicle)
@@ -359,10 +365,16 @@ class Optimiser:
             raise MappingError(f"the joint optimisation failed ({status.value}): {status.advice}")
         return bundle
 
-    def _solve_all(self, association: Association, rig: Rig, usable: BoolArray | None = None) -> Bundle:
+    def _solve_all(
+        self,
+        association: Association,
+        rig: Rig,
+        usable: BoolArray | None = None,
+        gap: float = SolveOptions.gap_tolerance,
+    ) -> Bundle:
         """Solve with the ``usable`` corners (S, 4), by default all, and refit the observations' variance."""
         usable = self._usable(association, rig) if usable is None else usable
-        bundle = self._solve(association, usable, rig)
+        bundle = self._solve(association, usable, rig, gap=gap)
         if len(bundle.row) >= LEAST_OBSERVATIONS:
             factor = self._variance_factor * bundle.solution.observation_factor
             least, largest = VARIANCE_FACTORS

@@ -12,7 +12,6 @@ from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError, DriveError, need
 from v2hdm.executor import check_cluster
 from v2hdm.io.drive import ReadOptions, drive_name
-from v2hdm.io.maps.corrections import read_corrections
 from v2hdm.mapping.options import (
     BATCH,
     INCREMENTAL,
@@ -193,6 +192,8 @@ def admit(config: RunConfig) -> str:
     check_options(config.mapping, detector.catalogue.cornered)
     table_of(config.mapping.survey)
     if config.map.corrections is not None:
+        from v2hdm.io.maps.corrections import read_corrections  # few runs have any
+
         read_corrections(Path(config.map.corrections))
     check_formats(config.export, "export")
     check_job(config.report)

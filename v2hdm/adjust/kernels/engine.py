@@ -433,10 +433,11 @@ class KernelLinearised(Linearised):
         made = self.rig.evaluate(_rows(whitened))
         self.engine.share(made.look)
         made.finish()
-        cameras = torch.from_numpy(made.cam_from_vehicle).view(-1, 4, 4)
-        corners = torch.from_numpy(made.corners_map).view(-1, 2)
+        # Copies, since views would keep the factors alive as long as the solution.
+        cameras = torch.from_numpy(made.cam_from_vehicle.copy()).view(-1, 4, 4)
+        corners = torch.from_numpy(made.corners_map.copy()).view(-1, 2)
         estimate = replace(self.estimate, cam_from_vehicle=cameras, corners_map=corners)
-        return Reached(estimate, terms_of(made), torch.from_numpy(made.gradient))
+        return Reached(estimate, terms_of(made), torch.from_numpy(made.gradient.copy()))
 
     def evaluate(self, step: Gradient, tangents: Tensor, whitened_corners: Tensor) -> Evaluated:
         """Evaluate after a step of the reduced unknowns, in one pass over the observations."""

@@ -187,7 +187,7 @@ def _local(
     frame = np.searchsorted(frames, observations.frame)
     corner = np.searchsorted(corners, observations.corner)
     of_cameras = ("intrinsic", "cam_from_vehicle", "centre_vehicle", "centre_sigma_m", "read_out_s")
-    of_frames = ("map_from_vehicle", "twist_vehicle", "session")
+    of_frames = ("map_from_vehicle", "poses_start", "twist_vehicle", "session")
     numbers = dict.fromkeys(of_cameras, cameras) | dict.fromkeys(of_frames, frames)
     numbers["corners_start"] = corners
     changes = {
@@ -225,29 +225,3 @@ def _lengths(lengths: KnownLengths | None, corners: IntArray, is_first: BoolArra
     if not rows.any():
         return None
     return KnownLengths(first[rows], second[rows], lengths.length_m[rows], lengths.sigma_m[rows])
-
-
-def parts_of_way(position_map: FloatArray, session: Sequence[int] | IntArray, most_m: float) -> IntArray:
-    """The part (J,) of each frame at ``position_map`` (J, 2): neighbours, on at most ``most_m`` of way.
-
-    Frames are halved where they spread farthest until the way driven in each part is short enough, so drives
-    along one street are in one part.
-    """
-    session = np.asarray(session)
-    steps_m = np.linalg.norm(np.diff(position_map, axis=0, prepend=position_map[:1]), axis=1)
-    steps_m[np.concatenate([[True], session[1:] != session[:-1]])] = 0.0
-    out = np.zeros(len(position_map), dtype=np.int64)
-    todo = [np.arange(len(position_map))]
-    done = 0
-    while todo:
-        frames = todo.pop()
-        if steps_m[frames].sum() <= most_m or len(frames) < 2:
-            out[frames] = done
-            done += 1
-            continue
-        axis = int(np.ptp(position_map[frames], axis=0).argmax())
-        along = np.argsort(position_map[frames, axis], kind="stable")
-        way_m = np.cumsum(steps_m[frames[along]])
-        middle = int(np.clip(np.searchsorted(way_m, way_m[-1] / 2), 1, len(frames) - 1))
-        todo += [np.sort(frames[along[middle:]]), np.sort(frames[along[:middle]])]
-    return out

@@ -5,7 +5,8 @@ Then rounds follow: every part summarises what it says of its border (:mod:`v2hd
 the summaries are joined (:mod:`v2hdm.adjust.sections.join`), and each part follows the border. This is a
 Gauss-Newton descent of the whole in which no process holds more than one part; parts are jobs of an executor,
 and their estimates lie in files between rounds. After a solve at once one round states the covariances.
-``finish_parts`` makes of each part what needs these.
+``fit_parts`` does the same roughly and without covariances, for what tells outliers and noise.
+``finish_parts`` makes of each part what needs covariances.
 """
 
 from __future__ import annotations
@@ -42,6 +43,8 @@ from v2hdm.records import FloatArray
 
 GAP = 1e-8
 """Twice the predicted decrease of the cost, as a fraction of it, at which the rounds end."""
+
+ROUGH_GAP = 1e-6  # as GAP, where only residuals are asked for: a thousandth of a sigma in most of them
 
 AT_ONCE = 400_000
 """Most observations that are solved at once: they take 2.8 kB each, factors included, of 2 km of yards."""
@@ -94,6 +97,14 @@ class Joint(NamedTuple):
     def steps(self, slopes: Sequence[FloatArray]) -> list[FloatArray]:
         """Steps (b, n) of each part's border under n errors, of which each part tells ``slopes`` (b, n)."""
         return self.net.steps(self.factor, slopes)
+
+
+class Fitted(NamedTuple):
+    """What was made of each part under a rough solve; the problem and solution of all if solved at once."""
+
+    results: list[Any]
+    problem: Problem | None
+    solution: Solution | None
 
 
 class _Open(NamedTuple):
@@ -167,8 +178,7 @@ class _Work:
         opened = self._open(part)
         border = opened.border
         if job.start is not None:
-            in_order = job.start.corners_map[opened.engine.arrays.corner_order]
-            estimate = replace(job.start, corners_map=in_order)
+            estimate = _in_order(job.start, opened)
         elif job.target is None:
             estimate = self._own_optimum(job.number, part, opened.engine, self._robust)
         else:
@@ -223,7 +233,9 @@ class _Work:
         opened = self._open(part)
         border = opened.border
         robust = self._robust
-        if job.target is None:
+        if job.start is not None:
+            estimate = _in_order(job.start, opened)
+        elif job.target is None:
             estimate = self._estimate(job.number)
         else:
             estimate = self._followed(job, opened)
@@ -247,6 +259,11 @@ class _Work:
             joint = np.load(_covariance_file(self.folder, job.number))
             solution = replace(solution, covariance=JoinedCovariance(held, None, border, joint))
         return self.finish(job.number, part, solution)
+
+
+def _in_order(start: Estimate, opened: _Open) -> Estimate:
+    """An estimate whose corners are in the order of the part's problem, in that of its arrays."""
+    return replace(start, corners_map=start.corners_map[opened.engine.arrays.corner_order])
 
 
 def border_of(part: Part, engine: TorchEngine) -> Border:
@@ -286,9 +303,48 @@ def join_parts(
     of the round and the most that there may be; up to ``at_once`` observations are solved at once. Raises
     AdjustError where parts leave a direction free or contradict each other, WorkerError where a process died.
     """
+    whole = _solved_at_once(folder, count, shape, at_once)
+    starts = [None] * count if whole is None else whole.starts
+    joint = _in_rounds(folder, starts, links, shape, finish, executor, progress, GAP)
+    for part, covariance in enumerate(joint.net.covariances(joint.factor)):
+        np.save(_covariance_file(folder, part), covariance)
+    return joint
+
+
+def fit_parts(
+    folder: Path,
+    count: int,
+    links: Sequence[Link],
+    shape: Shape,
+    finish: Finish,
+    executor: Executor = HERE,
+    progress: Callable[[int, int], None] | None = None,
+    at_once: int = AT_ONCE,
+) -> Fitted:
+    """What ``finish`` makes of each part under a rough solve of all; otherwise as :func:`join_parts`."""
+    whole = _solved_at_once(folder, count, shape, at_once)
+    if whole is None:
+        nowhere: list[Estimate | None] = [None] * count
+        joint = _in_rounds(folder, nowhere, links, shape, finish, executor, progress, ROUGH_GAP)
+        return Fitted(joint.results, None, None)
+    jobs = [_Job(number, start, is_last=True) for number, start in enumerate(whole.starts)]
+    results = _side_by_side(executor, _Work(folder, shape, finish), jobs)
+    return Fitted(results, whole.problem, whole.solution)
+
+
+def _in_rounds(
+    folder: Path,
+    starts: Sequence[Estimate | None],
+    links: Sequence[Link],
+    shape: Shape,
+    finish: Finish,
+    executor: Executor,
+    progress: Callable[[int, int], None] | None,
+    least_gap: float,
+) -> Joint:
+    """The rounds of parts, from their own optima or from ``starts``, until the gap is small."""
     report = progress or (lambda done, total: None)
     work = _Work(folder, shape)
-    starts = _solved_at_once(folder, count, shape, at_once)
     jobs = [_Job(number, start) for number, start in enumerate(starts)]
     costs: list[list[float]] = []  # by round and part
     targets: list[Values] = []
@@ -305,7 +361,7 @@ def join_parts(
         gap = (joined.decrease + sum(state.told.slack for state in states)) / max(sum(costs[-1]), 1.0)
         moved = _moved(net, shared, joined)
         targets = [_values(net, moved, state.labels, state.values) for state in states]
-        if (number > 0 or starts[0] is not None) and gap <= GAP:
+        if (number > 0 or starts[0] is not None) and gap <= least_gap:
             break
         jobs = [_Job(part, target=target) for part, target in enumerate(targets)]
     last = [
@@ -313,28 +369,35 @@ def join_parts(
         for part, target in enumerate(targets)
     ]
     results = _side_by_side(executor, replace(work, finish=finish), last)
-    for part, covariance in enumerate(net.covariances(joined.factor)):
-        np.save(_covariance_file(folder, part), covariance)
     return Joint(results, net, joined.factor, gap, number + 1)
 
 
-def _solved_at_once(folder: Path, count: int, shape: Shape, most: int) -> list[Estimate | None]:
-    """The parts in one solve of all; None for each where they are too large for it, or not plain."""
+class _AtOnce(NamedTuple):
+    """One solve of all parts; each starts there."""
+
+    problem: Problem
+    solution: Solution
+    starts: list[Estimate]
+
+
+def _solved_at_once(folder: Path, count: int, shape: Shape, most: int) -> _AtOnce | None:
+    """The parts in one solve of all; None where they are too large for it, or not plain."""
     parts: list[Part] = []
     size = 0
     for number in range(count):
         part = load_part(folder, number)
         size += len(part.problem.observations.corner)
         if size > most or part.problem.control is not None or part.problem.lengths is not None:
-            return [None] * count
+            return None
         parts.append(part)
     corners = np.unique(np.concatenate([part.corners for part in parts]))
-    solution = solve(whole_of(parts, shape.problem, corners), shape.options)
+    problem = whole_of(parts, shape.problem, corners)
+    solution = solve(problem, shape.options)
     assert isinstance(solution.covariance, Covariance)
     estimate = solution.covariance.descent.estimate
     shift = torch.as_tensor(shape.origin_map).to(estimate.corners_map)
     corners_map = torch.as_tensor(solution.corners_map).to(shift) - shift
-    return [
+    starts = [
         Estimate(
             estimate.cam_from_vehicle[part.cameras],
             estimate.frame_state[part.frames],
@@ -343,6 +406,7 @@ def _solved_at_once(folder: Path, count: int, shape: Shape, most: int) -> list[E
         )
         for part in parts
     ]
+    return _AtOnce(problem, solution, starts)
 
 
 def _covariance_file(folder: Path, number: int) -> Path:

@@ -292,18 +292,28 @@ class JoinedCovariance(Covariance):
 
     def poses(self) -> FloatArray:
         """Variances (J, 6) of the frames' tangents; 0 without states."""
-        arrays = self.whitening.engine.arrays
-        out = super().poses()
-        # White errors and drifts add up to an axis of the tangent.
+        assert self.border is not None
+        whitening = self.whitening
+        if len(self.border.corners) == len(whitening.plan.kept_corners):
+            return self._poses(self._tail())
+        out = self._poses(None)
+        arrays = whitening.engine.arrays
         axes = torch.tensor(arrays.states, dtype=torch.int64, device=arrays.centre.device)
         acts = one_hot(axes, 6).to(torch.float64)
         for begin in range(0, arrays.frame_count if arrays.states else 0, _FRAMES_AT_ONCE):
             frames = torch.arange(begin, min(begin + _FRAMES_AT_ONCE, arrays.frame_count), device=axes.device)
-            of_frames = _frame_columns(self.whitening, frames, acts)
+            of_frames = _frame_columns(whitening, frames, acts)
             regression = self._columns.reduced.mT @ of_frames[len(of_frames) - len(self._columns.reduced) :]
             gained = ((self._gained @ regression) * regression).sum(0).view(-1, 6)
             out[begin : begin + len(gained)] += gained.cpu().numpy()
         return out
+
+    def _tail(self) -> Tensor:
+        """The joint covariance at the tiles of the border and the tip."""
+        tail = self.whitening.reduced_factor.tail(self.whitening.plan.border_tiles)
+        root = tail.solve(torch.eye(tail.size, dtype=tail.tip.dtype, device=tail.tip.device))
+        by_border = root.mT @ self._columns.reduced[-tail.size :]
+        return root.mT @ root + by_border @ self._gained @ by_border.mT
 
     def _corners(self, groups: NDArray[np.int64]) -> FloatArray:
         assert self.border is not None

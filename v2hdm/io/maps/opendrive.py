@@ -19,12 +19,13 @@ from pathlib import Path
 
 import numpy as np
 
+from v2hdm.geometry.datums import is_same_datum
 from v2hdm.geometry.geodetic import crs_of
 from v2hdm.geometry.planar import length_along, turned_left
 from v2hdm.io.maps.features import COMPOSITION, TEXT_READ, Feature, features_of, in_words, properties_of
 from v2hdm.io.maps.road_curves import Course, Piece, linear_records
 from v2hdm.io.maps.roads import Marks, Road, roads_of, spaced
-from v2hdm.records import CROSSWALK, FloatArray, HDMap
+from v2hdm.records import CROSSWALK, FloatArray, GeodeticOrigin, HDMap
 from v2hdm.store.files import replace_text, xml_text
 from v2hdm.topology.build import lane_graph
 from v2hdm.topology.graph import LaneGraph
@@ -54,7 +55,7 @@ def write_opendrive(hd_map: HDMap, path: Path, graph: LaneGraph | None = None) -
     about = {"revMajor": "1", "revMinor": "7", "name": path.stem, "date": stamp, "vendor": "v2hdm"}
     header = ET.SubElement(root, "header", about | bounds)
     if hd_map.origin is not None:
-        ET.SubElement(header, "geoReference").text = crs_of(hd_map.origin)
+        ET.SubElement(header, "geoReference").text = _reference_of(hd_map.origin)
     objects = [_write_road(root, number, roads) for number in range(len(roads))]
     for feature in features:
         if feature.closed:
@@ -65,6 +66,14 @@ def write_opendrive(hd_map: HDMap, path: Path, graph: LaneGraph | None = None) -
     for number in range(len(graph.junctions)):
         _write_junction(root, number, roads, graph)
     replace_text(path, xml_text(root))
+
+
+def _reference_of(origin: GeodeticOrigin) -> str:
+    """The map's frame as PROJ text, which names WGS84 alone: another datum is stated by its ellipsoid."""
+    text = crs_of(origin)
+    if is_same_datum(origin.datum, "WGS84"):
+        return text
+    return text.replace("+datum=WGS84", "+ellps=GRS80 +towgs84=0,0,0,0,0,0,0")
 
 
 def _roads(graph: LaneGraph, features: Sequence[Feature], path: Path) -> list[Road]:

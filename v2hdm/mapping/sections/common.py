@@ -21,7 +21,8 @@ class Alone:
     """A section solved by itself, as the others need to know it.
 
     ``sighting`` (R,) names its sightings, over the whole drive, ``group`` and ``shift`` (R,) their markings;
-    ``own_sightings`` (G,) counts a group's sightings in the section's own images. ``busiest`` is the most
+    ``own_sightings`` (G,) counts a group's sightings in the section's own images. ``variance_factor`` is that
+    of the observations which its solve assumes, as the joint one does. ``busiest`` is the most
     observations of a stretch of frames on which pose models are compared.
     """
 

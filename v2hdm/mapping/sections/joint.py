@@ -43,11 +43,9 @@ class Told:
 
 
 class Judged(NamedTuple):
-    """How K observations of a section's own images, by ascending names, fit the section's own solve."""
+    """What a section's own solve says of its own images, with K observations by ascending names."""
 
-    mahalanobis2: FloatArray  # (K,)
     corner: IntArray  # (K,) over the drive
-    is_behind: BoolArray  # (K,) the camera
     shift_m: FloatArray  # (S, 2) sum of how far the frames of each session moved from their recorded poses
     frames: IntArray  # (S,) number of these
 
@@ -57,6 +55,7 @@ class Fit(NamedTuple):
 
     mahalanobis2: FloatArray  # (K,)
     corner: IntArray  # (K,) over the drive
+    is_behind: BoolArray  # (K,) the camera
     freedom: FloatArray  # (K,) 2, or 1 of a corner that is known along one line
     of_priors: dict[str, float]  # their parts of the cost
 
@@ -74,13 +73,14 @@ def fit_of(part: Part, solution: Solution) -> Fit:
     return Fit(
         mahalanobis2=solution.mahalanobis2,
         corner=part.corners[observations.corner],
+        is_behind=np.asarray(solution.verdict == Verdict.BEHIND_CAMERA),
         freedom=np.where(observations.on_line, 1.0, 2.0),
         of_priors={name: cost for name, cost in solution.cost_terms.items() if name != "observations"},
     )
 
 
-def judged_of(section: Section, settled: Bundle, chosen: IntArray, corner: IntArray) -> Judged:
-    """How the observations ``chosen`` (K,) of a section's solve, of corners (K,), fit it."""
+def judged_of(section: Section, settled: Bundle, corner: IntArray) -> Judged:
+    """What a section's solve says of its own images, whose observations are of corners (K,)."""
     problem = settled.problem
     solution = settled.solution
     is_own = np.isin(settled.frames, section.own_frames)
@@ -89,9 +89,7 @@ def judged_of(section: Section, settled: Bundle, chosen: IntArray, corner: IntAr
     shift_m = np.zeros((problem.session_count, 2))
     np.add.at(shift_m, session, moved_m)
     return Judged(
-        mahalanobis2=solution.mahalanobis2[chosen],
         corner=corner,
-        is_behind=np.asarray(solution.verdict[chosen] == Verdict.BEHIND_CAMERA),
         shift_m=shift_m,
         frames=np.bincount(session, minlength=problem.session_count),
     )
@@ -122,19 +120,42 @@ def refuse_contradicting_drives(judged: Sequence[Judged], drive: Drive) -> None:
         )
 
 
-def gates(judged: Sequence[Judged], probability: float) -> list[Gate]:
-    """The gates of all observations, at their common scale; see :func:`v2hdm.adjust.solution.classify`."""
-    scale = noise_scale(np.concatenate([section.mahalanobis2 for section in judged]))
+def open_gates(corners: Sequence[IntArray]) -> list[Gate]:
+    """Gates that all observations pass; of the corners (K,), by section, those with two are used."""
+    return _gates(corners, [np.ones(len(corner), dtype=np.bool_) for corner in corners])
+
+
+def gates(fits: Sequence[Fit], before: Sequence[Gate], probability: float) -> list[Gate]:
+    """The gates of all observations under a solve of those used ``before``, at their common scale.
+
+    They are those of :func:`v2hdm.adjust.solution.classify`.
+    """
+    scale = noise_scale(np.concatenate([fit.mahalanobis2 for fit in fits]))
     limit = -2 * np.log(probability) * scale
-    accepted = [(section.mahalanobis2 <= limit) & ~section.is_behind for section in judged]
-    size = 1 + max(int(section.corner.max(initial=-1)) for section in judged)
+    passed = _gates(
+        [fit.corner for fit in fits], [(fit.mahalanobis2 <= limit) & ~fit.is_behind for fit in fits]
+    )
+    return [_of_all(gate, used.is_used) for gate, used in zip(passed, before, strict=True)]
+
+
+def _gates(corners: Sequence[IntArray], accepted: Sequence[BoolArray]) -> list[Gate]:
+    """The gates of observations of corners (K,), by section, which are ``accepted`` (K,) or not."""
+    size = 1 + max(int(corner.max(initial=-1)) for corner in corners)
     count = np.zeros(size, dtype=np.int64)
-    for section, is_accepted in zip(judged, accepted, strict=True):
-        count += np.bincount(section.corner[is_accepted], minlength=size)
+    for corner, is_accepted in zip(corners, accepted, strict=True):
+        count += np.bincount(corner[is_accepted], minlength=size)
     return [
-        Gate(is_accepted, is_accepted & (count[section.corner] >= 2))
-        for section, is_accepted in zip(judged, accepted, strict=True)
+        Gate(is_accepted, is_accepted & (count[corner] >= 2))
+        for corner, is_accepted in zip(corners, accepted, strict=True)
     ]
+
+
+def _of_all(gate: Gate, is_in: BoolArray) -> Gate:
+    """The gate of observations ``is_in`` a solve as that of all (K,), of which the others do not pass."""
+    columns = [np.zeros(len(is_in), dtype=np.bool_) for _ in gate]
+    for column, passed in zip(columns, gate, strict=True):
+        column[is_in] = passed
+    return Gate(*columns)
 
 
 def variance_of(fits: Sequence[Fit], whole: Problem) -> VarianceFactors:

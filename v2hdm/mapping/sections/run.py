@@ -2,8 +2,9 @@
 
 1. Every section, with an overlap of images of its neighbours, is solved by itself, and tests its inputs.
 2. Groups of sightings that two sections have in common, image by image, are one marking.
-3. Without outliers, the solves of all sections are joined (:mod:`v2hdm.adjust.sections`), each with the
-   images that are its own. This is the joint solve of the drive.
+3. The solves of all sections are joined (:mod:`v2hdm.adjust.sections`), each with the images that are its
+   own: roughly, which tells outliers and noise, and then without outliers. This is the joint solve of the
+   drive.
 4. The candidates of all sections are classified together: shapes are learnt over all. A marking belongs to
    the section whose own images determine most of its corners.
 5. Every section makes its map, and their lanes are joined.
@@ -23,9 +24,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from v2hdm.adjust import Problem, SolveOptions
-from v2hdm.adjust.sections.parts import chains_of
-from v2hdm.adjust.sections.solve import Joint, Shape, finish_parts, join_parts
+from v2hdm.adjust import PoseSigma, Problem, estimate_noise
+from v2hdm.adjust.sections.parts import Link, chains_of
+from v2hdm.adjust.sections.solve import Fitted, Joint, Shape, finish_parts, fit_parts, join_parts
 from v2hdm.association.sightings import Sightings, frames_of
 from v2hdm.errors import WorkerError
 from v2hdm.executor import Executor
@@ -34,16 +35,18 @@ from v2hdm.faults.clock_parts import Along, evidence_of
 from v2hdm.faults.sensitivity import stretches_of_way
 from v2hdm.io.maps.corrections import Heard
 from v2hdm.lanes.lines import join_paths, lanes_along
-from v2hdm.mapping.bundle import Model, drive_problem, full_model
-from v2hdm.mapping.optimise import initial_rig
+from v2hdm.mapping.bundle import LEAST_OBSERVATIONS, VARIANCE_FACTORS, Model, drive_problem, full_model
+from v2hdm.mapping.optimise import SETTLED_MODEL, initial_rig, larger_noise
 from v2hdm.mapping.options import AUTO, MappingOptions, check_sections
 from v2hdm.mapping.results import MethodResult
-from v2hdm.mapping.sections.common import Alone, Names, named, pooled_noise, with_owners
+from v2hdm.mapping.sections.common import Alone, Names, Pooled, named, pooled_noise, with_owners
 from v2hdm.mapping.sections.faults import pooled_tests, refuse_contradicted
 from v2hdm.mapping.sections.joint import (
     Fit,
+    Gate,
     Judged,
     gates,
+    open_gates,
     refuse_contradicting_drives,
     scatter_by_marking,
     variance_of,
@@ -174,28 +177,33 @@ def _joint_solve(run: _Run, drive: Drive, part: IntArray, alone: Sequence[Alone]
         run.work.write("names", number, of_section)
     judged: list[Judged] = run.all(run.work.judge, "judge observations")
     refuse_contradicting_drives(judged, drive)
-    passed = gates(judged, SolveOptions.gate_probability)
+    corners = [section.corner for section in judged]
+    rough = _judge_together(run, drive, part, alone, corners)
     names = with_owners(
-        names, [section.corner[gate.is_used] for section, gate in zip(judged, passed, strict=True)]
+        names, [corner[gate.is_used] for corner, gate in zip(corners, rough.gates, strict=True)]
     )
-    del judged
-    for number, (of_section, gate) in enumerate(zip(names, passed, strict=True)):
+    for number, of_section in enumerate(names):
         run.work.write("names", number, of_section)
-        run.work.write("gate", number, gate)
     options = run.work.options
     pose_model = options.pose_model
     held_out: dict[str, float] = {}
     if pose_model == AUTO:
         busiest = int(np.argmax([section.busiest for section in alone]))
         ((pose_model, held_out),) = run.all(run.work.choose, "choose pose model", [busiest])
-    noise = pooled_noise(alone)
+    noise = rough.noise
     work = replace(
         run.work,
         model=full_model(noise.pose_sigma, options, pose_model, noise.variance_factor),
         pose_model=pose_model,
         fullest=int(np.argmax([section.observations for section in alone])),
     )
-    fits, joint, shape = _join(run, work, drive, part)
+    cut = _cut(run, work, drive, part)
+    shape = cut.shape
+    joint = join_parts(
+        work.folder, run.count, cut.links, shape, work.tell, run.executor,
+        partial(run.progress, "join sections"),
+    )  # fmt: skip
+    fits: list[Fit] = joint.results
     scatter = scatter_by_marking(fits, 1 + max(int(of_section.marking.max()) for of_section in names))
     for number, of_section in enumerate(names):
         corner = (np.arange(4) + of_section.turned[:, None]) % 4
@@ -204,8 +212,57 @@ def _joint_solve(run: _Run, drive: Drive, part: IntArray, alone: Sequence[Alone]
     return _Solved(work, names, joint, shape, held_out)
 
 
-def _join(run: _Run, work: Work, drive: Drive, part: IntArray) -> tuple[list[Fit], Joint, Shape]:
-    """Cut the joint problem, and solve it."""
+class _Rough(NamedTuple):
+    """What a rough joint solve of all observations tells."""
+
+    gates: list[Gate]  # by section, also in its files
+    noise: Pooled
+
+
+def _judge_together(
+    run: _Run, drive: Drive, part: IntArray, alone: Sequence[Alone], corners: Sequence[IntArray]
+) -> _Rough:
+    """Tell outliers and noise by a joint solve of all observations, of corners (K,) by section."""
+    before = open_gates(corners)
+    for number, gate in enumerate(before):
+        run.work.write("gate", number, gate)
+    options = run.work.options
+    pose_model = SETTLED_MODEL if options.pose_model == AUTO else options.pose_model
+    pooled = pooled_noise(alone)
+    model = full_model(pooled.pose_sigma, options, pose_model, pooled.variance_factor)
+    work = replace(run.work, model=model)
+    cut = _cut(run, work, drive, part)
+    fitted = fit_parts(
+        work.folder, run.count, cut.links, cut.shape, work.fit, run.executor,
+        partial(run.progress, "judge sections together"),
+    )  # fmt: skip
+    fits: list[Fit] = fitted.results
+    passed = gates(fits, before, model.solver.gate_probability)
+    for number, gate in enumerate(passed):
+        run.work.write("gate", number, gate)
+    factor = pooled.variance_factor
+    if sum(len(fit.corner) for fit in fits) >= LEAST_OBSERVATIONS:
+        factor = float(np.clip(factor * variance_of(fits, cut.shape.problem).observations, *VARIANCE_FACTORS))
+    return _Rough(passed, Pooled(_pose_sigma(fitted, alone[0].stated_sigma, pooled), factor))
+
+
+def _pose_sigma(fitted: Fitted, stated: tuple[PoseSigma, ...], pooled: Pooled) -> tuple[PoseSigma, ...]:
+    """The noise of the poses, by session, that a solve of all sections at once shows, or that of each."""
+    if fitted.problem is None or fitted.solution is None:
+        return pooled.pose_sigma
+    estimated = estimate_noise(replace(fitted.problem, pose_sigma=stated), fitted.solution)
+    return tuple(map(larger_noise, stated, estimated))
+
+
+class _Cut(NamedTuple):
+    """The joint problem, cut into parts that are in files."""
+
+    links: tuple[Link, ...]
+    shape: Shape
+
+
+def _cut(run: _Run, work: Work, drive: Drive, part: IntArray) -> _Cut:
+    """Cut the joint problem of the observations that pass their gates."""
     assert work.model is not None
     whole = _without_sightings(drive, work.cameras, work.model)
     chains = chains_of(whole, part, tuple(work.model.solver.pose_states))
@@ -222,12 +279,7 @@ def _join(run: _Run, work: Work, drive: Drive, part: IntArray) -> tuple[list[Fit
         along = Along(number, stretch[frames], int(stretch.max()) + 1, rising[frames], is_start & is_linked)
         work.write("ends", number, Ends(is_start, is_linked, along))
     run.all(work.cut, "cut sections")
-    shape = Shape.of(whole, work.model.solver)
-    joint = join_parts(
-        work.folder, run.count, chains.links, shape, work.tell, run.executor,
-        partial(run.progress, "join sections"),
-    )  # fmt: skip
-    return joint.results, joint, shape
+    return _Cut(chains.links, Shape.of(whole, work.model.solver))
 
 
 def _clock_root(

@@ -9,17 +9,22 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
-from v2hdm.adjust.sections.parts import parts_of_way
+from v2hdm.adjust.sections.way import parts_of_way
 from v2hdm.association.sightings import Frames, Sightings, frames_of
+from v2hdm.geometry.ipm import initial_extrinsic
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.records import BoolArray, Drive, FloatArray, IntArray, Session
 
-OVERLAP_M = 40.0
-"""Distance, m, from a section's frames within which its neighbours' images are its overlap.
+_AHEAD_M = 12.0  # distance, m, from a camera to the middle of the ground that an image shows markings on
 
-It is twice a camera's reach, so that all who see a marking of the section are there: with 26 m, corners are
-twice as far from those without sections (.42 and .20 mm in the median, on 130 m in two sections).
+_OVERLAP_M = 26.0
+"""Distance, m, of the middles of two images' grounds within which they may show the same marking.
+
+It is twice a camera's reach from that middle, so that all who see a marking of a section are in it.
 """
+
+_LEVEL = 0.5  # sine of a camera's angle from straight down, below which it looks ahead by less; chosen
 
 _MOST_PER_IMAGE = 1 << 20  # more detections than any image has, in the names of sightings
 
@@ -71,7 +76,7 @@ def sections_of(drive: Drive, most_m: float) -> list[Section]:
     """Sections of at most ``most_m`` of way; their own images make up the drive."""
     frames = frames_of(drive)
     part_of_image = _part_of_frame(frames, most_m)[frames.frame_of_image]
-    place_of_image = frames.map_from_vehicle[frames.frame_of_image, :2, 3]
+    place_of_image = _looked_at(drive, frames.map_from_vehicle[frames.frame_of_image])
     # Trajectories, of the whole way, serve the correction of clocks alone.
     bare = replace(drive, trajectory=None, recorded=None, joined=_without_trajectories(drive))
     sections = []
@@ -100,13 +105,25 @@ def _without_trajectories(drive: Drive) -> tuple[Session, ...]:
     return tuple(replace(session, trajectory=None, recorded=None) for session in drive.joined)
 
 
+def _looked_at(drive: Drive, map_from_vehicle: FloatArray) -> FloatArray:
+    """The middles (I, 2) of the ground that a drive's images look at, from poses (I, 4, 4)."""
+    number = {name: c for c, name in enumerate(drive.cameras)}
+    extrinsics = np.array([initial_extrinsic(camera) for camera in drive.cameras.values()])
+    ahead = extrinsics[:, 2, :2]  # each camera's axis, by the vehicle
+    level = ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), _LEVEL)
+    middles = np.column_stack([camera_centre(extrinsics)[:, :2] + _AHEAD_M * level, np.zeros(len(ahead))])
+    of_image = middles[[number[image.camera] for image in drive.images]]
+    turned = np.einsum("iab,ib->ia", map_from_vehicle[:, :2, :3], of_image)
+    return np.asarray(turned + map_from_vehicle[:, :2, 3])
+
+
 def _near(points_map: FloatArray, places_map: FloatArray) -> BoolArray:
     """Which points (N, 2) are within the overlap of some places (M, 2)."""
     is_near = np.zeros(len(points_map), dtype=np.bool_)
-    low = places_map.min(axis=0) - OVERLAP_M
-    high = places_map.max(axis=0) + OVERLAP_M
+    low = places_map.min(axis=0) - _OVERLAP_M
+    high = places_map.max(axis=0) + _OVERLAP_M
     inside = np.flatnonzero(((points_map >= low) & (points_map <= high)).all(axis=1))
-    away_m, _ = cKDTree(places_map).query(points_map[inside], distance_upper_bound=OVERLAP_M)
+    away_m, _ = cKDTree(places_map).query(points_map[inside], distance_upper_bound=_OVERLAP_M)
     is_near[inside] = np.isfinite(away_m)
     return is_near
 

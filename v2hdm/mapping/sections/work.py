@@ -138,7 +138,7 @@ class Work:
             own_sightings=np.bincount(association.group[rows][is_own], minlength=association.count),
             estimated_sigma=optimiser.estimated_sigma,
             stated_sigma=optimiser.stated_sigma,
-            variance_factor=optimiser.variance_factor,
+            variance_factor=settled.model.variance_factor,
             observations=len(settled.row),
             own_frames=len(section.own_frames),
             busiest=busiest(settled.problem),
@@ -157,7 +157,7 @@ class Work:
         return examined
 
     def judge(self, number: int, _: Progress = silent) -> Judged:
-        """How the observations of a section's own images fit its own solve."""
+        """What a section's own solve says of its own images."""
         section: Section = self.read("section", number)
         examined = self._examined(number)
         settled = examined.settled
@@ -165,7 +165,7 @@ class Work:
         chosen = self._own_rows(section, examined)
         observation = section.observation_names(examined.inputs.optimiser.sightings, settled)
         self.write("observed", number, observation[chosen])
-        return judged_of(section, settled, chosen, names.corners(settled)[chosen])
+        return judged_of(section, settled, names.corners(settled)[chosen])
 
     def _own_rows(self, section: Section, examined: Examined) -> IntArray:
         """The observations (K,) of the section's own images in its solve, by ascending names."""
@@ -244,6 +244,7 @@ class Work:
             whole,
             cam_from_vehicle=rig.cam_from_vehicle,
             map_from_vehicle=whole.map_from_vehicle[frames],
+            poses_start=rig.map_from_vehicle[frames],
             session=None if whole.session is None else whole.session[frames],
             twist_vehicle=twists[frames],
         )
@@ -252,6 +253,10 @@ class Work:
         gate = self.read("gate", number)
         assert isinstance(gate, Gate)
         return gate
+
+    def fit(self, number: int, part: Part, solution: Solution) -> Fit:
+        """How the observations of a section's own images fit a solve of all sections."""
+        return fit_of(part, solution)
 
     def tell(self, number: int, part: Part, solution: Solution) -> Fit:
         """Keep what a section's own images are in a joint solve."""

@@ -222,23 +222,27 @@ void RigWhitening::subtract_corners(Numbers& information) {
     for (Index i = 0; i < width * width; ++i) tip[i] -= products[i];
 }
 
-RigEvaluation::RigEvaluation(const RigWhitening& whitening, const double* by)
+RigEvaluation::Work::Work(const RigWhitening& whitening, const double* by)
+    : whitened(by, by + whitening.gradient.size()), step(by, by + whitening.rig.unknowns()),
+      chart(36 * whitening.rig.cameras), table(whitening.table.size()),
+      sums(whitening.layout, whitening.rig, false) {}
+
+RigEvaluation::RigEvaluation(const RigWhitening& whitening, const double* whitened)
     : cam_from_vehicle(whitening.cam_from_vehicle.size()), corners(whitening.corners.size()),
-      gradient(whitening.gradient.size()), whitening(whitening), whitened(by, by + gradient.size()),
-      step(by, by + whitening.rig.unknowns()), chart(36 * whitening.rig.cameras), table(whitening.table.size()),
-      sums(whitening.layout, whitening.rig, false) {
+      gradient(whitening.gradient.size()), whitening(whitening), work(std::make_unique<Work>(whitening, whitened)) {
     const Rig& rig = whitening.rig;
-    passes().backward(factor_of(whitening.tip, rig.unknowns()), step.data());
+    passes().backward(factor_of(whitening.tip, rig.unknowns()), work->step.data());
     move(
-        step.data(), whitening.cam_from_vehicle.data(), rig.cameras, rig.exp, rig.left_jacobian,
-        cam_from_vehicle.data(), chart.data());
-    compose(cam_from_vehicle.data(), false, rig.vehicle_from_map, rig.cameras, rig.frames, table.data());
+        work->step.data(), whitening.cam_from_vehicle.data(), rig.cameras, rig.exp, rig.left_jacobian,
+        cam_from_vehicle.data(), work->chart.data());
+    compose(cam_from_vehicle.data(), false, rig.vehicle_from_map, rig.cameras, rig.frames, work->table.data());
 }
 
 void RigEvaluation::look(Index begin, Index end) {
     const Index width = whitening.rig.unknowns();
     const Workspace room(whitening.layout, whitening.rig.pairs(), 0);
-    const Step by = {table.data(), nullptr, step.data(), whitened.data() + width};
+    const Step by = {work->table.data(), nullptr, work->step.data(), work->whitened.data() + width};
+    ChunkSums& sums = work->sums;
     const Evaluation out = {
         sums.costs.data(), sums.wrench.data(), nullptr, sums.carried.data(), corners.data(), gradient.data() + width,
         width,
@@ -249,18 +253,19 @@ void RigEvaluation::look(Index begin, Index end) {
 void RigEvaluation::finish() {
     const Rig& rig = whitening.rig;
     const Index width = rig.unknowns();
-    terms = observed_terms(whitening.layout, sums);
+    terms = observed_terms(whitening.layout, work->sums);
     Numbers by_camera(width), coupled(width);
-    gather_wrenches(whitening.layout, sums, by_camera.data());
+    gather_wrenches(whitening.layout, work->sums, by_camera.data());
     add_priors(rig, cam_from_vehicle.data(), terms, by_camera.data(), nullptr);
-    add_parts(sums.carried, coupled);
+    add_parts(work->sums.carried, coupled);
     for (Index p = 0; p < width; ++p) {
-        const double *jacobian = chart.data() + 36 * (p / 6), *of_camera = by_camera.data() + p / 6 * 6;
+        const double *jacobian = work->chart.data() + 36 * (p / 6), *of_camera = by_camera.data() + p / 6 * 6;
         double by_tangent = 0;
         for (int i = 0; i < 6; ++i) by_tangent += jacobian[6 * i + p % 6] * of_camera[i];
         gradient[p] = by_tangent - coupled[p];
     }
     passes().forward(factor_of(whitening.tip, width), gradient.data());
+    work.reset();
 }
 
 }  // namespace v2hdm::adjust

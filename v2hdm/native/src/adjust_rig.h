@@ -73,7 +73,7 @@ class RigEvaluation {
     RigEvaluation(const RigWhitening& whitening, const double* whitened);
 
     void look(Index begin, Index end);
-    void finish();
+    void finish();  // and forget what only the passes need
     const Layout& layout() const { return whitening.layout; }
 
     Numbers cam_from_vehicle, corners;  // moved
@@ -81,9 +81,15 @@ class RigEvaluation {
     Terms terms;
 
   private:
+    struct Work {
+        Numbers whitened, step, chart, table;
+        ChunkSums sums;
+
+        Work(const RigWhitening& whitening, const double* whitened);
+    };
+
     const RigWhitening& whitening;
-    Numbers whitened, step, chart, table;
-    ChunkSums sums;
+    std::unique_ptr<Work> work;
 };
 
 }  // namespace v2hdm::adjust

@@ -144,7 +144,7 @@ def _lever(offset_rad: FloatArray, curvature: FloatArray, overlap: float) -> lis
     turns = np.abs(curvature) > _CURVED_PER_M
     if turns.sum() < 30:
         same = "a straight route looks the same in a mirrored world (x and y swapped, NED): include a turn"
-        unknown = "straight poses do not show how far the origin (antenna?) is from the axle: include a turn"
+        unknown = "straight poses do not show how far the origin (antenna) is from the axle: include a turn"
         return [passed("mirrored", "poses", same), passed("origin", "poses", unknown)]
     centred = offset_rad - np.median(offset_rad[~turns]) if (~turns).any() else offset_rad
     lever = np.tan(centred[turns]) / curvature[turns]

@@ -1,0 +1,75 @@
+"""Diagonal tiles of the inverse of a factorised matrix, from its last tiles backwards.
+
+Within the factor's pattern the inverse follows from the factor alone (Takahashi, Fagan and Chen, Formation of
+a sparse bus impedance matrix, 1973): twice the work of a factorisation gives what solves for all columns of
+the identity would.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from v2hdm.adjust.tiles import Pattern, TiledCholesky
+
+
+class _Columns(NamedTuple):
+    """Columns of the inverse at the rows of the factor's: its diagonal tile, those below, the tip."""
+
+    pattern: Pattern
+    size: int
+    parts: list[Tensor]  # by column; those that are not known yet are empty
+    tip: Tensor  # the inverse at the tip
+
+    def among(self, tiles: Sequence[int]) -> Tensor:
+        """The inverse (M, M) at tiles that the pattern couples, and at the tip."""
+        size = self.size
+        out = self.tip.new_empty(2 * [len(tiles) * size + len(self.tip)])
+        out[len(tiles) * size :, len(tiles) * size :] = self.tip
+        for number, tile in enumerate(tiles):
+            part = self.parts[tile][self._rows(tile, tiles[number:])]
+            columns = slice(number * size, (number + 1) * size)
+            out[columns.start :, columns] = part
+            out[columns, columns.start :] = part.mT
+        return out
+
+    def _rows(self, tile: int, tiles: Sequence[int]) -> Tensor:
+        """The rows of a column's part that are of some tiles, and of the tip."""
+        stacked = tile, *self.pattern.below[tile]
+        place = {row: number * self.size for number, row in enumerate(stacked)}
+        of_tiles = torch.tensor([place[row] for row in tiles])[:, None] + torch.arange(self.size)
+        of_tip = len(stacked) * self.size + torch.arange(len(self.tip))
+        return torch.cat([of_tiles.flatten(), of_tip]).to(self.tip.device)
+
+
+def inverse_diagonal(factor: TiledCholesky, pattern: Pattern, tail: Tensor | None = None) -> Tensor:
+    """Diagonal tiles (G, size, size) of the inverse, in elimination order.
+
+    ``tail`` (T, T) replaces the inverse at the last tiles, which the pattern couples, and at the tip, where
+    more may be known: all else follows through its regression on these. By default it is that of the tip.
+    """
+    if tail is None:
+        tail = torch.cholesky_inverse(factor.tip)
+    if not factor.diagonal:
+        return tail.new_zeros(0, 0, 0)
+    size = len(factor.diagonal[0])
+    tip = len(factor.tip)
+    count = len(factor.diagonal)
+    first = count - (len(tail) - tip) // size
+    columns = _Columns(
+        pattern, size, [tail.new_zeros(0, 0)] * count, tail[len(tail) - tip :, len(tail) - tip :]
+    )
+    for column in reversed(range(count)):
+        if column >= first:
+            begin = (column - first) * size
+            columns.parts[column] = tail[begin:, begin : begin + size]
+            continue
+        diagonal = factor.diagonal[column]
+        gain = torch.linalg.solve_triangular(diagonal, factor.panels[column], upper=False, left=False)
+        lower = -columns.among(pattern.below[column]) @ gain
+        own = torch.cholesky_inverse(diagonal) - gain.mT @ lower
+        columns.parts[column] = torch.cat([own, lower])
+    return torch.stack([part[:size] for part in columns.parts])
