@@ -144,7 +144,9 @@ def measure_parallax(views: PointViews, count: int, is_bar: BoolArray | None = N
     a roll and pitch error common to all images. A sighting may be of something else, under each hypothesis
     alike; so what a solve would drop counts for the hypothesis that explains it.
     """
-    share = _SILL_SHARE * (np.ones(count) if is_bar is None else is_bar)
+    share: FloatArray = np.full(count, _SILL_SHARE)
+    if is_bar is not None:
+        share[~is_bar] = 0.0
     parts = [
         _measure(views.of_groups(begin, min(begin + _AT_ONCE, count)), share[begin : begin + _AT_ONCE])
         for begin in range(0, max(count, 1), _AT_ONCE)
