@@ -67,8 +67,7 @@ def minimise(
 
     def closure() -> float:
         new_cost, new_gradient = evaluations.at(u)
-        # An infinite cost means an overshooting step, whatever its gradient.
-        # A sum is finite only if all of its terms are.
+        # An infinite cost means an overshooting step; a sum is finite only if all of its terms are.
         if math.isnan(new_cost) or not (math.isinf(new_cost) or math.isfinite(float(new_gradient.sum()))):
             raise _NoNumberError
         u.grad = new_gradient / scale

@@ -175,6 +175,18 @@ class _Connected(NamedTuple):
     stats: np.ndarray  # (P + 1, 5) OpenCV's
 
 
+def _framed_paint(part: _Part, output: NetworkOutput) -> np.ndarray:
+    """The network's paint over a part, whose frame may lie outside the network's rows and columns: -1."""
+    first_row, first_column = part.first
+    framed = np.full(part.shape, -1.0, dtype=np.float32)
+    rows = slice(max(first_row, 0), first_row + part.shape[0])
+    columns = slice(max(first_column, 0), first_column + part.shape[1])
+    paint = output.paint[rows, columns]
+    down, right = max(-first_row, 0), max(-first_column, 0)
+    framed[down : down + paint.shape[0], right : right + paint.shape[1]] = paint
+    return framed
+
+
 def _pieces(
     kinds: tuple[str, ...],
     output: NetworkOutput,
@@ -190,15 +202,10 @@ def _pieces(
     """
     of_all = share.sum(axis=0)
     labels, stats = part.connected((of_all > 0).view(np.uint8))
-    first_row, first_column = part.first
-    framed = np.full(part.shape, -1.0, dtype=np.float32)
-    rows = slice(max(first_row, 0), first_row + part.shape[0])
-    columns = slice(max(first_column, 0), first_column + part.shape[1])
-    paint = output.paint[rows, columns]
-    down, right = max(-first_row, 0), max(-first_column, 0)
-    framed[down : down + paint.shape[0], right : right + paint.shape[1]] = paint
+    framed = _framed_paint(part, output)
     piece = labels.astype(np.int16)
     level = np.where(piece > 0, np.maximum(framed, 1e-3), np.minimum(framed, -1e-3))
+    first_row, first_column = part.first
     first_px = (
         (output.stride - 1) / 2 + output.stride * np.array([first_column, first_row]) + [0.0, output.top]
     )

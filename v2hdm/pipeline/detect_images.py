@@ -106,10 +106,7 @@ def detect_images(
     if limit is not None and limit < 1:
         raise ConfigError(f"--limit {limit}: give a number of images, 1 or more")
     if not isinstance(detector, Detector):
-        options = replace(detector) if detector is not None else DetectorOptions()
-        if path is None or lens is not None:
-            options.max_range_m = _ROUGH_RANGE_M
-        detector = Detector.load(options=options)
+        detector = _loaded(detector, is_rough=path is None or lens is not None)
     road = None if path is None or lens is not None else RoadDetector.calibrated(detector, path, linear)
     if road is not None and regions is not None:
         road = RoadDetector(detector, road.camera, road.calibration, is_for_localizer=True)
@@ -117,6 +114,14 @@ def detect_images(
     most = limit and min(limit, sys.maxsize)
     frames = islice((_live_frames if live else _frames)(str(source), road, rough), most)
     return _on_ground(_glances(frames, rough, stopwatch or Stopwatch(), regions))
+
+
+def _loaded(options: DetectorOptions | None, is_rough: bool) -> Detector:
+    """The detector of these settings; a roughly known camera looks no farther than its metres hold."""
+    options = replace(options) if options is not None else DetectorOptions()
+    if is_rough:
+        options.max_range_m = _ROUGH_RANGE_M
+    return Detector.load(options=options)
 
 
 def _lens(camera: Path | None, name: str | None, mounting: Sequence[float] | None) -> CameraInfo | None:
