@@ -219,6 +219,17 @@ roi:
 """
 
 
+def write_ros(path, model, lens):
+    """Write a file of ROS's ``camera_info_manager``; its path."""
+    matrices = {"camera_matrix": MATRIX, "distortion_coefficients": np.array([lens])}
+    matrices |= {"rectification_matrix": np.eye(3), "projection_matrix": np.eye(3, 4)}
+    content = {"image_width": 1280, "image_height": 720, "camera_name": "front", "distortion_model": model}
+    for name, of in matrices.items():
+        content[name] = {"rows": of.shape[0], "cols": of.shape[1], "data": of.ravel().tolist()}
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
 @pytest.mark.parametrize(
     ("model", "lens", "expected"),
     [
@@ -236,14 +247,16 @@ def test_an_echoed_message_and_a_camera_info_file_of_ros_are_read(tmp_path, mode
     echo.write_text(ECHO.format(model=model, d=lens, k=MATRIX.ravel().tolist()))
     assert read_intrinsics(echo).name == "front_optical"
     np.testing.assert_allclose(seen(read_intrinsics(echo)), expected(), atol=1e-9)
-    matrices = {"camera_matrix": MATRIX, "distortion_coefficients": np.array([lens])}
-    matrices |= {"rectification_matrix": np.eye(3), "projection_matrix": np.eye(3, 4)}
-    content = {"image_width": 1280, "image_height": 720, "camera_name": "front", "distortion_model": model}
-    for name, of in matrices.items():
-        content[name] = {"rows": of.shape[0], "cols": of.shape[1], "data": of.ravel().tolist()}
-    file = tmp_path / "front.yaml"
-    file.write_text(yaml.safe_dump(content))
+    file = write_ros(tmp_path / "front.yaml", model, lens)
     np.testing.assert_allclose(seen(read_intrinsics(file)), expected(), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("model", "lens"), [("rational_polynomial", LENSES[5]), ("equidistant", FISHEYE[:3])]
+)
+def test_a_file_that_lacks_numbers_of_its_lens_is_refused(tmp_path, model, lens):
+    with pytest.raises(DriveError, match=f"{model} has .*, got {len(lens)}; complete them"):
+        read_intrinsics(write_ros(tmp_path / "front.yaml", model, lens))
 
 
 @pytest.mark.parametrize("form", ["camera_info", "kalibr", "opencv", "own"])

@@ -184,6 +184,13 @@ def take_camera_info(content: Mapping[str, Any], where: str) -> CameraInfo:
     stated = take_text(content["distortion_model"], f"{where}: distortion_model", DriveError)
     distortion = take_matrix(content["distortion_coefficients"], f"{where}: distortion_coefficients").ravel()
     lens = _lens_of(stated, distortion, where, "convert the calibration to")
+    count = len(lens.coefficients)
+    # Of a message drivers leave out zeros; a file that lacks numbers was cut, or names the wrong model.
+    if len(distortion) < (_LEAST_COEFFICIENTS if lens.model == "plumb_bob" else count):
+        raise DriveError(
+            f"{where}: distortion_coefficients: {lens.model} has {count} coefficients, "
+            f"got {len(distortion)}; complete them (zeros where unused) or give the right model"
+        )
     name = take_text(content["camera_name"], f"{where}: camera_name", DriveError)
     width, height = (take_size_px(content[key], f"{where}: {key}", DriveError) for key in _SIZE)
     at = f"{where}: camera_matrix"
