@@ -77,7 +77,7 @@ class Factorised(NamedTuple):
 
 
 class Reached(NamedTuple):
-    """What whitened variables lead to."""
+    """The estimate, cost and gradient that whitened variables lead to."""
 
     estimate: Estimate
     terms: dict[str, float]  # its cost, by name
@@ -384,7 +384,7 @@ class Linearised:
         return Evaluated(estimate, terms, gradient, whitened, coupled)
 
     def reach(self, whitened: Tensor) -> Reached | None:
-        """What variables of the whitening lead to, if the engine evaluates that at once."""
+        """The estimate, cost and gradient at variables of the whitening, if the engine evaluates at once."""
         return None
 
     def by_cameras(self) -> Tensor | None:

@@ -70,6 +70,6 @@ def inverse_diagonal(factor: TiledCholesky, pattern: Pattern, tail: Tensor | Non
         diagonal = factor.diagonal[column]
         gain = torch.linalg.solve_triangular(diagonal, factor.panels[column], upper=False, left=False)
         lower = -columns.among(pattern.below[column]) @ gain
-        own = torch.cholesky_inverse(diagonal) - gain.mT @ lower
-        columns.parts[column] = torch.cat([own, lower])
+        diagonal_block = torch.cholesky_inverse(diagonal) - gain.mT @ lower
+        columns.parts[column] = torch.cat([diagonal_block, lower])
     return torch.stack([part[:size] for part in columns.parts])

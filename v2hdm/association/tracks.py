@@ -169,7 +169,8 @@ class _Linker:
 def _squared_distance(offset: FloatArray, covariance: FloatArray) -> FloatArray:
     """Squared Mahalanobis distances (P,) of offsets (P, 2), by Cramer's rule, which is faster than LAPACK."""
     x, y = offset.T
-    variance_x, variance_y = covariance[:, 0, 0], covariance[:, 1, 1]
+    variance_x = covariance[:, 0, 0]
+    variance_y = covariance[:, 1, 1]
     product = covariance[:, 0, 1]
     determinant = variance_x * variance_y - product**2
     return np.asarray((variance_y * x**2 - 2 * product * x * y + variance_x * y**2) / determinant)

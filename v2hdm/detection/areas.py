@@ -182,7 +182,8 @@ def _framed_paint(part: _Part, output: NetworkOutput) -> np.ndarray:
     rows = slice(max(first_row, 0), first_row + part.shape[0])
     columns = slice(max(first_column, 0), first_column + part.shape[1])
     paint = output.paint[rows, columns]
-    down, right = max(-first_row, 0), max(-first_column, 0)
+    down = max(-first_row, 0)
+    right = max(-first_column, 0)
     framed[down : down + paint.shape[0], right : right + paint.shape[1]] = paint
     return framed
 

@@ -25,7 +25,8 @@ def meshes(rows: IntArray, columns: IntArray, is_painted: BoolArray) -> float:
     Its N elements lie at ``rows`` and ``columns`` (N,) of ``is_painted`` (h, w), the paint of any class: what
     lies in the hull of the piece adds to it.
     """
-    top, left = int(rows.min()), int(columns.min())
+    top = int(rows.min())
+    left = int(columns.min())
     painted = is_painted[top : int(rows.max()) + 1, left : int(columns.max()) + 1]
     hull = np.zeros(painted.shape, dtype=np.uint8)
     cells = np.column_stack([columns - left, rows - top]).astype(np.int32)

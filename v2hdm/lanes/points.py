@@ -404,8 +404,9 @@ def _kernel_sigma_m(
         of_seed = np.unique(np.stack([seed[chosen], cloud.image[point[chosen]]]), axis=1)[0]
         return np.bincount(of_seed, minlength=len(points))
 
-    both = images_of(shows_both)
-    is_double = (both >= max(least_images, 1)) & (both >= _SHOW_BOTH * images_of(np.ones_like(shows_both)))
+    double_count = images_of(shows_both)
+    image_count = images_of(np.ones_like(shows_both))
+    is_double = (double_count >= max(least_images, 1)) & (double_count >= _SHOW_BOTH * image_count)
     total_m = np.bincount(seed[shows_both], cloud.beside_m[point[shows_both]], len(points))
     mean_m = total_m / np.maximum(np.bincount(seed[shows_both], minlength=len(points)), 1)
     return np.where(is_double, np.minimum(usual_m, mean_m / _BESIDE_SIGMAS), usual_m)

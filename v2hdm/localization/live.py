@@ -98,7 +98,7 @@ def localize_live(
 
 @dataclass
 class _News:
-    """What has come since the last pose."""
+    """Looks, motions and positions that have come since the last pose."""
 
     looks: list[Look] = field(default_factory=list)
     motions: list[Motion] = field(default_factory=list)

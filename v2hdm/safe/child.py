@@ -206,7 +206,7 @@ class _ForkServer:
 
 
 def _conditions() -> tuple[Any, ...]:
-    """What an interpreter has from its parent for good: where modules are, and limits."""
+    """The search path and limits that an interpreter has from its parent for good."""
     names = () if resource is None else [name for name in dir(resource) if name.startswith("RLIMIT_")]
     return tuple(sys.path), *(resource.getrlimit(getattr(resource, name)) for name in names)
 

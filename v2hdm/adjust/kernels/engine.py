@@ -254,8 +254,8 @@ class KernelEngine(TorchEngine):
     @cached_property
     def _still(self) -> Spread:
         """The spread of pairs that move with their camera alone."""
-        none = self.arrays.centre.new_zeros(self.arrays.camera_count, self.arrays.moment_count, 6, 0)
-        return Spread(self.arrays, none, none)
+        no_states = self.arrays.centre.new_zeros(self.arrays.camera_count, self.arrays.moment_count, 6, 0)
+        return Spread(self.arrays, no_states, no_states)
 
     def factorised(self, estimate: Estimate, robust: Loss, hold_cameras: bool) -> Factorised | None:
         """The whitening at an estimate at once, if cameras alone move and its Hessian is definite."""
@@ -264,42 +264,42 @@ class KernelEngine(TorchEngine):
         corners = _rows(estimate.corners_map)
         code = LOSS_CODES[robust.name]
         scale = float(robust.scale)
-        made = self._rig.linearise(_rows(estimate.cam_from_vehicle), corners, code, scale)
-        self.share(made.eliminate)
-        if not made.is_separable():
+        whitening = self._rig.linearise(_rows(estimate.cam_from_vehicle), corners, code, scale)
+        self.share(whitening.eliminate)
+        if not whitening.is_separable():
             raise AdjustError(INSEPARABLE)
-        if not made.factorise(hold_cameras):
+        if not whitening.factorise(hold_cameras):
             return None
         arrays = self.arrays
-        lower = made.lower.reshape(3, -1)
+        lower = whitening.lower.reshape(3, -1)
         base = Base(
-            made.table.reshape(-1, 16),
+            whitening.table.reshape(-1, 16),
             corners,
             code,
             scale,
             lower,
-            made.joint,
-            made.rows.reshape(-1, 6 * arrays.camera_count),
+            whitening.joint,
+            whitening.rows.reshape(-1, 6 * arrays.camera_count),
         )
-        factor = factor_of(made)
-        gradient = torch.from_numpy(made.gradient)
-        by_camera = torch.from_numpy(made.by_camera).view(-1, 6)
-        none = estimate.corners_map[:0]
+        factor = factor_of(whitening)
+        gradient = torch.from_numpy(whitening.gradient)
+        by_camera = torch.from_numpy(whitening.by_camera).view(-1, 6)
+        no_tangents = estimate.corners_map[:0]
         linearised = KernelLinearised(
             engine=self,
             estimate=estimate,
             robust=robust,
             spread=self._still,
-            terms=terms_of(made),
-            gradient=Gradient(by_camera, estimate.frame_state, none, estimate.clock_s),
+            terms=terms_of(whitening),
+            gradient=Gradient(by_camera, estimate.frame_state, no_tangents, estimate.clock_s),
             corner_factor=_corner_factor(arrays, base),
             whitened=gradient[factor.size :].view(-1, 2),
-            coupled=Coupled(estimate.frame_state, torch.from_numpy(made.coupled).view(-1, 6)),
+            coupled=Coupled(estimate.frame_state, torch.from_numpy(whitening.coupled).view(-1, 6)),
             couplings=by_camera.new_empty(2, 6, 0),
             base=base,
-            rig=made,
+            rig=whitening,
         )
-        return Factorised(linearised, factor, made.smallest_pivot, gradient)
+        return Factorised(linearised, factor, whitening.smallest_pivot, gradient)
 
     def _base(self, estimate: Estimate, robust: Loss, width: int) -> Base:
         """The estimate as kernels read it, with room for factors; all cameras have ``width`` unknowns."""
@@ -427,17 +427,17 @@ class KernelLinearised(Linearised):
     rig: Any = None  # the same as C++ made it, if at once
 
     def reach(self, whitened: Tensor) -> Reached | None:
-        """What variables of the whitening lead to, if the engine made it at once."""
+        """The estimate, cost and gradient at variables of the whitening, if the engine made it at once."""
         if self.rig is None:
             return None
-        made = self.rig.evaluate(_rows(whitened))
-        self.engine.share(made.look)
-        made.finish()
+        evaluation = self.rig.evaluate(_rows(whitened))
+        self.engine.share(evaluation.look)
+        evaluation.finish()
         # Copies, since views would keep the factors alive as long as the solution.
-        cameras = torch.from_numpy(made.cam_from_vehicle.copy()).view(-1, 4, 4)
-        corners = torch.from_numpy(made.corners_map.copy()).view(-1, 2)
+        cameras = torch.from_numpy(evaluation.cam_from_vehicle.copy()).view(-1, 4, 4)
+        corners = torch.from_numpy(evaluation.corners_map.copy()).view(-1, 2)
         estimate = replace(self.estimate, cam_from_vehicle=cameras, corners_map=corners)
-        return Reached(estimate, terms_of(made), torch.from_numpy(made.gradient.copy()))
+        return Reached(estimate, terms_of(evaluation), torch.from_numpy(evaluation.gradient.copy()))
 
     def evaluate(self, step: Gradient, tangents: Tensor, whitened_corners: Tensor) -> Evaluated:
         """Evaluate after a step of the reduced unknowns, in one pass over the observations."""

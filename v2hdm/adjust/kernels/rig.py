@@ -51,9 +51,9 @@ def make_rig(arrays: Arrays, layout: Layout) -> Any:
     )
 
 
-def terms_of(made: Any) -> dict[str, float]:
+def terms_of(compiled: Any) -> dict[str, float]:
     """The cost by name of a compiled whitening or evaluation."""
-    observations, camera_centre, ground_planes, control_points, known_lengths = made.costs
+    observations, camera_centre, ground_planes, control_points, known_lengths = compiled.costs
     return {
         "observations": observations,
         "camera_centre": camera_centre,

@@ -100,7 +100,7 @@ class Joint(NamedTuple):
 
 
 class Fitted(NamedTuple):
-    """What was made of each part under a rough solve; the problem and solution of all if solved at once."""
+    """The results of the parts under a rough solve; the problem and solution of all if solved at once."""
 
     results: list[Any]
     problem: Problem | None
@@ -321,7 +321,7 @@ def fit_parts(
     progress: Callable[[int, int], None] | None = None,
     at_once: int = AT_ONCE,
 ) -> Fitted:
-    """What ``finish`` makes of each part under a rough solve of all; otherwise as :func:`join_parts`."""
+    """``finish`` each part under a rough solve of all; otherwise as :func:`join_parts`."""
     whole = _solved_at_once(folder, count, shape, at_once)
     if whole is None:
         nowhere: list[Estimate | None] = [None] * count

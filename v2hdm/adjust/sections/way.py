@@ -49,11 +49,11 @@ def parts_of_way(position_map: FloatArray, session: Sequence[int] | IntArray, mo
 
 def _streets(cells_map: FloatArray, cell: IntArray, is_first: BoolArray) -> csr_matrix:
     """The graph of cells (N, 2) that are near each other, or follow one another in a drive; lengths in m."""
-    near = cKDTree(cells_map).query_pairs(_NEAR_M, output_type="ndarray")
+    near_pairs = cKDTree(cells_map).query_pairs(_NEAR_M, output_type="ndarray")
     before = cell[:-1][~is_first[1:]]
     after = cell[1:][~is_first[1:]]
     follows = np.column_stack([before, after])[before != after]
-    pairs = np.unique(np.sort(np.concatenate([near, follows]), axis=1), axis=0)
+    pairs = np.unique(np.sort(np.concatenate([near_pairs, follows]), axis=1), axis=0)
     first, second = pairs.T
     length_m = np.linalg.norm(cells_map[first] - cells_map[second], axis=1)
     return coo_matrix((length_m, (first, second)), shape=(len(cells_map), len(cells_map))).tocsr()

@@ -213,7 +213,7 @@ def _joint_solve(run: _Run, drive: Drive, part: IntArray, alone: Sequence[Alone]
 
 
 class _Rough(NamedTuple):
-    """What a rough joint solve of all observations tells."""
+    """Results of a rough joint solve of all observations."""
 
     gates: list[Gate]  # by section, also in its files
     noise: Pooled

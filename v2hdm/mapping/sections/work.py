@@ -157,7 +157,7 @@ class Work:
         return examined
 
     def judge(self, number: int, _: Progress = silent) -> Judged:
-        """What a section's own solve says of its own images."""
+        """The outliers and noise of a section's own images by its own solve."""
         section: Section = self.read("section", number)
         examined = self._examined(number)
         settled = examined.settled
