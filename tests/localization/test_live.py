@@ -309,7 +309,7 @@ def test_the_derivatives_of_expected_pixels_are_those_of_their_differences():
     plane = belief.Plane(0.05)
     state = belief.replace(state, mean=mean)
     expected = expect(state, plane, 0, calibration, corners)
-    derivative = np.concatenate([expected.by_vehicle, expected.by_camera], axis=2)[0]
+    derivative = expected.by_states[0]
     step = 1e-6
     for column in range(len(mean)):
         ends = [

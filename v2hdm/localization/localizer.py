@@ -24,6 +24,7 @@ from v2hdm.localization.belief import (
     VEHICLE,
     Belief,
     bounds,
+    foresee,
     loosened,
     pinned,
     predict,
@@ -242,13 +243,15 @@ class Localizer:
         if camera not in self._numbers:
             return [Ahead(stamp_s, None) for stamp_s in stamps_s]
 
+        nothing = Look(camera, 0.0)
+        no_quads = sighted(nothing, self.calibrations[camera])
+        belief = self._belief if self._is_settled else None
+
         def view_at(stamp_s: float) -> View | None:
-            if self._belief is None or not self._is_settled:
+            if belief is None:
                 return None
-            belief = self._fixed_to(self._belief, stamp_s)
-            nothing = Look(camera, stamp_s)
-            scene = self._scene(belief, nothing, sighted(nothing, self.calibrations[camera]))
-            return View(belief, scene)
+            belief_ahead = self._foreseen(belief, stamp_s)
+            return View(belief_ahead, self._scene(belief_ahead, nothing, no_quads))
 
         newest = self._log.samples[-1:]
         speed_m_s = newest[0].speed_m_s if newest else 0.0
@@ -366,8 +369,20 @@ class Localizer:
     def _moved_to(self, belief: Belief, stamp_s: float) -> Belief:
         if stamp_s <= belief.stamp_s:
             return belief
-        turning = [self._numbers[turned.camera] for turned in self._rig.turned if turned.is_slow]
-        return predict(belief, self._log.pieces(belief.stamp_s, stamp_s), self.noise, turning)
+        return predict(belief, self._log.pieces(belief.stamp_s, stamp_s), self.noise, self._turning)
+
+    def _foreseen(self, belief: Belief, stamp_s: float) -> Belief:
+        """The belief at a later time, after the positions until then, that nothing is to correct."""
+        latest_s = max((fix.stamp_s for fix in self._fixes if fix.stamp_s <= stamp_s), default=-np.inf)
+        belief = self._fixed_to(belief, latest_s)
+        if stamp_s <= belief.stamp_s:
+            return belief
+        return foresee(belief, self._log.pieces(belief.stamp_s, stamp_s), self.noise, self._turning)
+
+    @property
+    def _turning(self) -> list[int]:
+        """The cameras whose mountings are turning slowly."""
+        return [self._numbers[turned.camera] for turned in self._rig.turned if turned.is_slow]
 
     def _located(self, belief: Belief, look: Look, quads: Sighted, is_new: bool) -> Belief:
         """The belief after a look; another mounting is tried where the calibration's explains little."""
@@ -552,7 +567,7 @@ class Localizer:
             return Pose(
                 stamp_s, status, None, nothing, infinite, np.inf, (1.0, 0.0, 0.0), 0, tuple(reasons.values())
             )
-        belief = self._fixed_to(self._belief, stamp_s)
+        belief = self._foreseen(self._belief, stamp_s)
         plane = self.paint.ground(belief.mean[:2])
         covariance = belief.covariance([0, 1, 2])
         covariance += np.diag([self.paint.shared_m2, self.paint.shared_m2, self.paint.shared_rad2])

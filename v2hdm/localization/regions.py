@@ -18,6 +18,7 @@ import numpy as np
 from v2hdm.geometry.lens import distort_points
 from v2hdm.localization.belief import HEADING, Belief
 from v2hdm.localization.joint import Scene
+from v2hdm.localization.seeing import Expected
 from v2hdm.records import FloatArray, IntArray
 
 EVERY_FULL = 5
@@ -188,8 +189,9 @@ def expected_boxes(belief: Belief, scene: Scene, speed_m_s: float) -> FloatArray
     is_whole = ((corners_px > 0) & (corners_px < size - 1)).all(axis=(1, 2))
     rows = rows[is_whole]
     corners_px = corners_px[is_whole]
-    spread_px = np.linalg.norm(scene.spread(belief, expected, numbers)[rows], axis=2).max(axis=1)
-    by_place = expected.by_place[rows]
+    in_image = Expected(*(array[rows] for array in expected))
+    spread_px = np.linalg.norm(scene.spread(belief, in_image, numbers[rows]), axis=2).max(axis=1)
+    by_place = in_image.by_place
     px_by_m = np.linalg.norm(by_place, axis=(2, 3)).max(axis=1)
     around_px = _AROUND_PX + _SIGMAS * spread_px + _AROUND_M * px_by_m
     ahead_map = np.array([np.cos(belief.mean[HEADING]), np.sin(belief.mean[HEADING])])
