@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tests.localization.driven import MOUNT, cameras, drive, mapped, yard
+from v2hdm.geometry.rigid import heading_rad
 from v2hdm.localization import belief
 from v2hdm.localization.joint import Pairs, Scene, _distances, _whitened, candidates
 from v2hdm.localization.motion import MotionNoise
@@ -31,7 +32,8 @@ class Before:
         look = driven.looks[0][0]
         self.calibration = cameras()["front"]
         paint = Paint(mapped(painted, seed))
-        start = belief.start(0.0, np.array([12.0, 0.0, 0.0]), np.full(3, 0.02), [MOUNT, MOUNT], MotionNoise())
+        pose = np.array([*driven.poses[0, :2, 3], heading_rad(driven.poses[0])])
+        start = belief.start(0.0, pose, np.full(3, 0.02), [MOUNT, MOUNT], MotionNoise())
         near = paint.near(start.mean[:2], 20.0)[::2].tolist()
         held = belief.with_markings(start, near, [paint.centre_m2[number] for number in near])
         mean = held.mean + held.root @ (0.05 * rng.standard_normal(len(held.mean)))
@@ -55,7 +57,7 @@ def test_points_are_expected_at_the_same_pixels_with_the_same_derivatives(seed):
 def test_pairs_have_the_same_noise_and_distance(seed):
     before = Before(seed)
     (pairs, loss), (pairs_too, loss_too) = twice(lambda: candidates(before.belief, before.scene))
-    assert len(pairs.marking) > 5
+    assert len(pairs.marking) >= 3
     for array, by_numpy in zip(pairs, pairs_too, strict=True):
         np.testing.assert_array_equal(array, by_numpy)
     np.testing.assert_allclose(loss, loss_too, rtol=1e-8)
