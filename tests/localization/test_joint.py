@@ -94,8 +94,8 @@ def test_kernels_refuse_what_would_lead_beyond_their_arrays():
         kernels().spread(
             np.eye(17), np.zeros((1, 8, 17)), np.zeros((1, 8, 2)), np.array([16]), belief.VEHICLE
         )
+    order = np.arange(8)[None]
     with pytest.raises(ValueError, match="beyond the look"):
-        order = np.arange(8)[None]
         kernels().pair_noise(
             np.zeros((1, 8, 8)), np.array([1]), order, 1.0, np.zeros((1, 8, 8)), np.zeros((1, 8, 2))
         )

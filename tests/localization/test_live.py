@@ -23,8 +23,9 @@ from v2hdm.io.calibration.writing import write_calibration
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.localization import belief, live
 from v2hdm.localization.antenna import Fix
-from v2hdm.localization.localizer import Localizer, Status
+from v2hdm.localization.localizer import Localizer
 from v2hdm.localization.motion import Motion, MotionLog, MotionNoise
+from v2hdm.localization.pose import Status
 from v2hdm.localization.seeing import Look, expect
 from v2hdm.localization.stream import MotionLines, look_of, pose_record
 from v2hdm.records import Calibration, GeodeticOrigin, HDMap, Marking, MarkingDetection

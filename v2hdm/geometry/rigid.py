@@ -162,8 +162,8 @@ def rotation_from_euler(roll_rad: FloatArray, pitch_rad: FloatArray, yaw_rad: Fl
 
 def rotation_from_angles(roll_rad: float, pitch_rad: float, yaw_rad: float) -> FloatArray:
     """The rotation matrix (3, 3) of :func:`rotation_from_euler` for three numbers, in a tenth of its time."""
-    rows = _euler_rows(cos(roll_rad), sin(roll_rad), cos(pitch_rad), sin(pitch_rad), cos(yaw_rad), sin(yaw_rad))
-    return np.array(rows)
+    cosines_and_sines = (part(angle) for angle in (roll_rad, pitch_rad, yaw_rad) for part in (cos, sin))
+    return np.array(_euler_rows(*cosines_and_sines))
 
 
 def _euler_rows(cr: Any, sr: Any, cp: Any, sp: Any, cy: Any, sy: Any) -> list[list[Any]]:

@@ -63,8 +63,9 @@ class Plane:
 class Belief:
     """Mean (n,) and root of the states at a time.
 
-    The root has shape (n, n), or (n, m) with m > n as :func:`foresee` leaves it. ``markings`` are the numbers, in order, of the map's features whose errors are states: of markings, and
-    behind the last of these of stretches of lines and of areas.
+    The root has shape (n, n), or (n, m) with m > n as :func:`foresee` leaves it. ``markings`` are the numbers,
+    in order, of the map's features whose errors are states: of markings, and behind the last of these of
+    stretches of lines and of areas.
     """
 
     stamp_s: float
@@ -290,4 +291,5 @@ def bounds(covariance: FloatArray, heading_rad: float) -> tuple[float, float, fl
 
 def _square(root: FloatArray) -> FloatArray:
     """A square root (n, n) of the covariance that a wide one (n, m) has."""
-    return np.asarray(np.linalg.qr(root.T, mode="r").T, dtype=np.float64)
+    upper: FloatArray = np.asarray(np.linalg.qr(root.T, mode="r"))  # without its orthogonal factor
+    return upper.T

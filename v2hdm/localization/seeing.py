@@ -46,7 +46,8 @@ _STEP_PX = 0.5  # step, px, of the lens's differences
 class Look:
     """One image's content: the camera's name, the time of exposure, and the detections.
 
-    ``is_whole`` tells whether all of the image was searched.
+    ``is_whole`` tells whether all of the image was searched, ``is_second`` whether that was done after a look
+    at parts of the same image: such a look is held against the map, and changes no pose.
     """
 
     camera: str
@@ -54,6 +55,7 @@ class Look:
     markings: Sequence[MarkingDetection] = ()
     lanes: Sequence[LaneDetection] = ()
     is_whole: bool = True
+    is_second: bool = False
 
     @classmethod
     def of(cls, camera: str, stamp_s: float, road: Road) -> Look:
