@@ -1,4 +1,4 @@
-"""A whole search that follows a look at parts takes its steps between images, and finds what it would at once."""
+"""A whole search that follows a look at parts takes its steps between images, and finds the same."""
 
 import time
 

@@ -160,7 +160,7 @@ def test_where_no_whole_search_comes_an_image_is_searched_at_once():
 
 def test_what_second_looks_alone_show_speaks_against_the_map():
     painted = yard(3)
-    extra = [Marking("diamond", DIAMOND + [x, 5.5], 10) for x in np.arange(30.0, 100.0, 2.0)]
+    extra = [Marking("diamond", DIAMOND + np.array([x, 5.5]), 10) for x in np.arange(30.0, 100.0, 2.0)]
     driven = drive(replace(painted, markings=(*painted.markings, *extra)), 3)
     poses, told = followed_by_second_looks(driven, mapped(painted, 3), 2)
     entered = int(np.argmax(driven.poses[:, 0, 3] > 22.0))

@@ -63,9 +63,9 @@ class Plane:
 class Belief:
     """Mean (n,) and root of the states at a time.
 
-    The root has shape (n, n), or (n, m) with m > n as :func:`foresee` leaves it. ``markings`` are the numbers,
-    in order, of the map's features whose errors are states: of markings, and behind the last of these of
-    stretches of lines and of areas.
+    The root has shape (n, n), or (n, m) with m > n as :func:`foresee` leaves it. ``markings`` are the
+    numbers, in order, of the map's features whose errors are states: of markings, and behind the last of
+    these of stretches of lines and of areas.
     """
 
     stamp_s: float

@@ -164,7 +164,7 @@ class Looking:
     def _can_wait(self, camera: str, stamp_s: float) -> bool:
         """Whether a whole search may come after a look at parts.
 
-        It may not where none has come for too long, or the last look showed next to nothing of what it was to.
+        It may not where none has come for too long, or the last look showed too little of what it was to.
         """
         glances = self.of(camera)
         most_s = _PATIENCE * self.every_full * (glances.interval_s or 0.0)
