@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from statistics import median
 
 import cv2
 import numpy as np
@@ -146,7 +147,7 @@ class NewestFrames(Iterator[Frame]):
             is_waiting = self._newest is not None or self._end is not None
         if is_waiting or len(came_s) < 2:
             return not is_waiting
-        interval_s = min(later_s - earlier_s for earlier_s, later_s in pairwise(came_s))
+        interval_s = median(later_s - earlier_s for earlier_s, later_s in pairwise(came_s))
         since_s = time.perf_counter() - came_s[-1]
         return since_s + seconds < interval_s or since_s > _OVERDUE * interval_s
 
