@@ -58,14 +58,29 @@ def checked_class(kind: _Class) -> _Class:
 
 def check_types(options: Any, prefix: str = "") -> None:
     """Raise ConfigError, which names ``prefix`` and the key, for settings of another type than theirs."""
-    dot = "" if not prefix or prefix.endswith(".") else "."
-    for field in fields(options):
-        value = getattr(options, field.name)
-        hint = _hints(type(options).__init__)[field.name]
-        kind = get_args(hint)[0] if get_origin(hint) is Annotated else hint  # ranges are another check
-        _check(value, kind, f"{prefix}{dot}{field.name}")
-        if is_dataclass(value):
-            check_types(value, f"{prefix}{dot}{field.name}")
+    for name, (fits, kind) in _tests_of_fields(type(options)).items():
+        value = getattr(options, name)
+        is_nested = is_dataclass(value)
+        if fits(value) and not is_nested:
+            continue
+        dot = "" if not prefix or prefix.endswith(".") else "."
+        where = f"{prefix}{dot}{name}"
+        _check(value, kind, where)
+        if is_nested:
+            check_types(value, where)
+
+
+@functools.cache
+def _tests_of_fields(kind: type[Any]) -> Mapping[str, tuple[Callable[[Any], bool], Any]]:
+    """Test and type of each field of a dataclass; ranges are another check."""
+    hints = _hints(kind.__init__)
+    types_of_fields = {
+        field.name: get_args(hints[field.name])[0]
+        if get_origin(hints[field.name]) is Annotated
+        else hints[field.name]
+        for field in fields(kind)
+    }
+    return {name: (_test_of(hint), hint) for name, hint in types_of_fields.items()}
 
 
 def _check(value: object, hint: Any, where: str) -> None:

@@ -109,11 +109,14 @@ def make_arrays(
 ) -> Arrays:
     """Lay out a checked problem; AdjustError for a corner twice in an image, or too many joined corners."""
 
-    def real(values: FloatArray) -> Tensor:
-        return torch.as_tensor(np.ascontiguousarray(values), dtype=torch.float64, device=device)
+    is_on_cpu = device == "cpu"
 
     def index(values: NDArray[Any]) -> Tensor:
-        return torch.as_tensor(values, device=device)
+        tensor = torch.from_numpy(values)
+        return tensor if is_on_cpu else tensor.to(device)
+
+    def real(values: FloatArray) -> Tensor:
+        return index(np.ascontiguousarray(values, dtype=np.float64))
 
     corner_order, joined = _corners_in_route_order(problem)
     rank = np.empty_like(corner_order)

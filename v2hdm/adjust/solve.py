@@ -58,8 +58,8 @@ def is_worth_a_look(arrays: Arrays) -> bool:
 
 def is_near(whitening: Whitening) -> bool:
     """Whether the Newton step turns every camera by less than the descent's range of convergence."""
-    by_camera = whitening.camera_step(-whitening.gradient)
-    return float(by_camera[:, 3:6].norm(dim=1).max()) <= _NEAR_RAD
+    turns = whitening.camera_step(whitening.gradient)[:, 3:6].numpy(force=True)
+    return float(np.square(turns).sum(axis=1).max()) <= _NEAR_RAD**2
 
 
 def coarse_extrinsics(engine: TorchEngine, cam_from_vehicle: Tensor) -> tuple[Tensor, int]:
@@ -100,22 +100,14 @@ def _papers_model(arrays: Arrays, corners: int) -> Arrays:
     """The problem of ``corners`` corners and their frames, without states and clocks."""
     if arrays.corner_count > corners:
         arrays, _ = arrays.take(_route_blocks(arrays, corners))
-    # Without states each moment is a frame.
-    moments, moment = torch.unique(arrays.pair % arrays.moment_count, return_inverse=True)
-    camera = arrays.camera_of(arrays.pair)
-    moments = moments.long()
-    frames = arrays.frame_of(moments)
+    part = arrays.by_moment().arrays
     return replace(
-        arrays,
-        pair=camera * len(moments) + moment.to(camera.dtype),
-        vehicle_from_map=arrays.vehicle_from_map[frames],
+        part,
         states=(),
-        state_transition=arrays.state_transition[frames, :0, :0],
-        state_information_root=arrays.state_information_root[frames, :0],
-        clock_twist=arrays.clock_twist[moments, :, :0],
-        clock_information_root=arrays.clock_information_root[:0],
-        frame_of_moment=None,
-        read_out=None if arrays.read_out is None else arrays.read_out[:, moments],
+        state_transition=part.state_transition[:, :0, :0],
+        state_information_root=part.state_information_root[:, :0],
+        clock_twist=part.clock_twist[:, :, :0],
+        clock_information_root=part.clock_information_root[:0],
     )
 
 

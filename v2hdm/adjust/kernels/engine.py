@@ -439,6 +439,12 @@ class KernelLinearised(Linearised):
         estimate = replace(self.estimate, cam_from_vehicle=cameras, corners_map=corners)
         return Reached(estimate, terms_of(evaluation), torch.from_numpy(evaluation.gradient.copy()))
 
+    def camera_step(self, whitened: Tensor) -> Tensor | None:
+        """The step (C, 6) of the cameras by variables of the whitening, if the engine made it at once."""
+        if self.rig is None:
+            return None
+        return torch.from_numpy(self.rig.camera_step(_rows(whitened))).view(-1, 6)
+
     def evaluate(self, step: Gradient, tangents: Tensor, whitened_corners: Tensor) -> Evaluated:
         """Evaluate after a step of the reduced unknowns, in one pass over the observations."""
         engine, base, before, arrays = self.engine, self.base, self.estimate, self.engine.arrays

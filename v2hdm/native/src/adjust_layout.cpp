@@ -35,6 +35,57 @@ void prefetch(const Columns& columns, Index k) {
 #endif
 }
 
+constexpr int BLOCK = 32;  // observations of a block, whose roots and quotients are taken side by side
+using Lanes = double[BLOCK];
+
+// Some observations: pixels from the principal point, focal lengths and the lower triangle of covariances.
+struct Block {
+    Lanes u, v, fx, fy, xx, yx, yy;
+
+    void read(const Columns& columns, const int32_t* order, Index begin, int count) {
+        for (int l = 0; l < count; ++l) {
+            prefetch(columns, order[std::min(begin + l + AHEAD, columns.count - 1)]);
+            const Index k = order[begin + l];
+            const double* intrinsic = columns.intrinsic + 4 * columns.camera[k];
+            const double* covariance = columns.covariance_px + 4 * k;
+            fx[l] = intrinsic[0];
+            fy[l] = intrinsic[1];
+            u[l] = columns.pinhole_px[2 * k] - intrinsic[2];
+            v[l] = columns.pinhole_px[2 * k + 1] - intrinsic[3];
+            xx[l] = covariance[0];
+            yx[l] = covariance[2];
+            yy[l] = covariance[3];
+        }
+    }
+
+    // Writes numbers of so many observations to rows of ``stride``.
+    void write(int count, Index stride, double* measured, double* root) const {
+        for (int l = 0; l < count; ++l) {
+            measured[l] = u[l] / fx[l];
+            measured[stride + l] = v[l] / fy[l];
+            const double over_first = 1 / std::sqrt(xx[l]), below = yx[l] * over_first;
+            const double over_last = 1 / std::sqrt(yy[l] - below * below);
+            root[l] = fx[l] * over_first;
+            root[stride + l] = -below * fx[l] * over_first * over_last;
+            root[2 * stride + l] = fy[l] * over_last;
+        }
+    }
+};
+
+bool is_rigid(const double* transform, double orthonormal_to) {
+    for (int i = 0; i < 3; ++i) {
+        for (int j = 0; j <= i; ++j) {
+            const double *a = transform + 4 * i, *b = transform + 4 * j;
+            const double product = a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+            if (!(std::fabs(product - (i == j ? 1.0 : 0.0)) <= orthonormal_to)) return false;
+        }
+    }
+    const double *a = transform, *b = transform + 4, *c = transform + 8, *last = transform + 12;
+    const double determinant = a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2]) +
+                               a[2] * (b[0] * c[1] - b[1] * c[0]);
+    return determinant > 0 && last[0] == 0 && last[1] == 0 && last[2] == 0 && last[3] == 1;
+}
+
 }  // namespace
 
 Index first_unsound(
@@ -76,21 +127,38 @@ Index arrange(const Columns& columns, const Index* rank, Index frames, const Arr
 }
 
 void lay_out(const Columns& columns, const int32_t* order, double* measured, double* root) {
-    const Index count = columns.count;
-    for (Index i = 0; i < count; ++i) {
-        prefetch(columns, order[std::min(i + AHEAD, count - 1)]);
-        const Index k = order[i];
-        const double* intrinsic = columns.intrinsic + 4 * columns.camera[k];
-        const double fx = intrinsic[0], fy = intrinsic[1];
-        measured[i] = (columns.pinhole_px[2 * k] - intrinsic[2]) / fx;
-        measured[count + i] = (columns.pinhole_px[2 * k + 1] - intrinsic[3]) / fy;
-        const double* covariance = columns.covariance_px + 4 * k;
-        const double over_first = 1 / std::sqrt(covariance[0]), below = covariance[2] * over_first;
-        const double over_last = 1 / std::sqrt(covariance[3] - below * below);
-        root[i] = fx * over_first;
-        root[count + i] = -below * fx * over_first * over_last;
-        root[2 * count + i] = fy * over_last;
+    Block block;
+    for (Index begin = 0; begin < columns.count; begin += BLOCK) {
+        const int count = static_cast<int>(std::min<Index>(columns.count - begin, BLOCK));
+        block.read(columns, order, begin, count);
+        block.write(count, columns.count, measured + begin, root + begin);
     }
+}
+
+Index first_not_rigid(const double* transforms, Index count, double orthonormal_to) {
+    for (Index k = 0; k < count; ++k) {
+        if (!is_rigid(transforms + 16 * k, orthonormal_to)) return k;
+    }
+    return -1;
+}
+
+Index find_touched(const int32_t* pair, const Index* chunk, Index chunks, uint8_t* is_touched, const Touched& out) {
+    Index count = 0;
+    for (Index q = 0; q < chunks; ++q) {
+        out.at[q] = count;
+        Index lowest = std::numeric_limits<Index>::max(), highest = -1;
+        for (Index k = chunk[q]; k < chunk[q + 1]; ++k) {
+            is_touched[pair[k]] = 1;
+            lowest = std::min<Index>(lowest, pair[k]);
+            highest = std::max<Index>(highest, pair[k]);
+        }
+        for (Index p = lowest; p <= highest; ++p) {
+            if (is_touched[p]) out.pair[count++] = static_cast<int32_t>(p);
+            is_touched[p] = 0;
+        }
+    }
+    out.at[chunks] = count;
+    return count;
 }
 
 }  // namespace v2hdm::adjust

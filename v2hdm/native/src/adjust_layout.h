@@ -34,4 +34,16 @@ Index arrange(const Columns& columns, const Index* rank, Index frames, const Arr
 // Observations in an order: (2, K) where at depth 1, (3, K) root information.
 void lay_out(const Columns& columns, const int32_t* order, double* measured, double* root);
 
+// Index of the first transform (4, 4) that is not rigid, or -1.
+Index first_not_rigid(const double* transforms, Index count, double orthonormal_to);
+
+// Pairs that chunks of observations touch, in turn, and the first of each chunk.
+struct Touched {
+    int32_t* pair;
+    Index* at;
+};
+
+// Their number; ``chunk`` are the observations at which chunks begin, ``is_touched`` are zeros by pair.
+Index find_touched(const int32_t* pair, const Index* chunk, Index chunks, uint8_t* is_touched, const Touched& out);
+
 }  // namespace v2hdm::adjust

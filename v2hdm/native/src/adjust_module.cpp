@@ -6,6 +6,8 @@
 #include "adjust_tables.h"
 #include "modules.h"
 
+#include <algorithm>
+
 namespace v2hdm {
 namespace {
 
@@ -243,6 +245,31 @@ void lay_out_columns(
     lay_out(columns.view, order.data(), measured.data(), root.data());
 }
 
+Index first_not_rigid_of(nb::handle transforms_object, double orthonormal_to) {
+    const auto transforms = array_of<const double, 3>(transforms_object, "transforms");
+    require(transforms.shape(1) == 4 && transforms.shape(2) == 4, "transforms");
+    return first_not_rigid(transforms.data(), size_of(transforms.shape(0)), orthonormal_to);
+}
+
+Index find_touched_pairs(
+    nb::handle pair_object, nb::handle chunk_object, nb::handle is_touched_object, nb::handle touched_object,
+    nb::handle touched_at_object) {
+    const auto pair = array_of<const int32_t, 1>(pair_object, "pair");
+    const auto chunk = array_of<const Index, 1>(chunk_object, "chunk");
+    const auto is_touched = array_of<uint8_t, 1>(is_touched_object, "is_touched");
+    const auto touched = array_of<int32_t, 1>(touched_object, "touched");
+    const auto touched_at = array_of<Index, 1>(touched_at_object, "touched_at");
+    const Index chunks = size_of(chunk.size()) - 1;
+    require(chunks >= 0 && touched_at.size() == chunk.size() && touched.size() == pair.size(), "touched");
+    for (Index q = 0; q < chunks; ++q) require(0 <= chunk.data()[q] && chunk.data()[q] <= chunk.data()[q + 1], "chunk");
+    require(chunk.data()[chunks] == size_of(pair.size()), "chunk");
+    const Index pairs = size_of(is_touched.size());
+    const auto is_within = [&](int32_t place) { return 0 <= place && place < pairs; };
+    require(std::all_of(pair.data(), pair.data() + pair.size(), is_within), "pair");
+    return find_touched(
+        pair.data(), chunk.data(), chunks, is_touched.data(), {touched.data(), touched_at.data()});
+}
+
 }  // namespace
 
 void add_adjust(nb::module_& module) {
@@ -264,6 +291,8 @@ void add_adjust(nb::module_& module) {
     adjust.def("first_unsound", &first_unsound_of);
     adjust.def("arrange", &arrange_columns);
     adjust.def("lay_out", &lay_out_columns);
+    adjust.def("first_not_rigid", &first_not_rigid_of);
+    adjust.def("find_touched", &find_touched_pairs);
     nb::dict constants;
     constants["NEAR_M"] = NEAR_M;
     constants["WEIGHT_FLOOR"] = WEIGHT_FLOOR;

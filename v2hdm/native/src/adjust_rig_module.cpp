@@ -3,6 +3,8 @@
 #include "adjust_records.h"
 #include "modules.h"
 
+#include <algorithm>
+
 namespace v2hdm {
 namespace {
 
@@ -50,6 +52,17 @@ RigEvaluation* evaluated(const RigWhitening& whitening, nb::handle whitened_obje
     return new RigEvaluation(whitening, whitened.data());
 }
 
+// The cameras' part (D,) of a step: they come last, and need no other variables.
+nb::object camera_step(const RigWhitening& whitening, nb::handle whitened_object) {
+    const auto whitened = array_of<const double, 1>(whitened_object, "whitened");
+    require(whitened.size() == whitening.gradient.size(), "whitened");
+    const size_t unknowns = whitening.by_camera.size();
+    const Made<double> step({unknowns});
+    std::copy(whitened.data(), whitened.data() + unknowns, step.data);
+    whitening.substitute_back(step.data);
+    return step.array;
+}
+
 // Numbers of an object as an array.
 template <typename Owner>
 auto view_of(Numbers Owner::*numbers) {
@@ -91,6 +104,7 @@ void add_adjust_rig(nb::module_& adjust) {
         .def("eliminate", &eliminate)
         .def("is_separable", &RigWhitening::is_separable)
         .def("factorise", &RigWhitening::factorise)
+        .def("camera_step", &camera_step)
         .def("evaluate", &evaluated, nb::keep_alive<0, 1>(), nb::rv_policy::take_ownership)
         .def_ro("smallest_pivot", &RigWhitening::smallest_pivot)
         .def_prop_ro("costs", &costs_of<RigWhitening>)
