@@ -72,10 +72,10 @@ def test_observations_are_sorted_by_corner_and_pair_whatever_was_in_memory(compi
         (camera, frame, corner, np.zeros((count, 2)), np.tile(np.eye(2), (count, 1, 1))),
         np.ones((cameras, 4)),
     )
-    room, order, rank_of_corner, pair = np.zeros((4, count), dtype=np.int32)
-    counts = np.zeros(cameras * frames + 1, dtype=np.int64), np.zeros(corners + 1, dtype=np.int64)
+    order, rank_of_corner, pair = np.zeros((3, count), dtype=np.int32)
+    corner_at = np.zeros(corners + 1, dtype=np.int64)
     with nullcontext() if compiled else native.numpy_alone():
-        repeated = arrange(seen, rank, frames, room, *counts, order, rank_of_corner, pair)
+        repeated = arrange(seen, rank, frames, corner_at, order, rank_of_corner, pair)
     assert repeated == -1
     np.testing.assert_array_equal(order, np.lexsort((frame, camera, rank[corner])))
     np.testing.assert_array_equal(rank_of_corner, rank[corner][order])
@@ -86,10 +86,10 @@ def test_observations_are_sorted_by_corner_and_pair_whatever_was_in_memory(compi
 def test_the_first_observation_that_repeats_another_is_found(compiled):
     camera, frame, corner = np.array([[0, 1, 0, 1, 0], [2, 2, 1, 2, 0], [1, 0, 1, 0, 1]])
     seen = Seen.of((camera, frame, corner, np.zeros((5, 2)), np.tile(np.eye(2), (5, 1, 1))), np.ones((2, 4)))
-    room, order, rank_of_corner, pair = np.zeros((4, 5), dtype=np.int32)
-    counts = np.zeros(7, dtype=np.int64), np.zeros(3, dtype=np.int64)
+    order, rank_of_corner, pair = np.zeros((3, 5), dtype=np.int32)
+    corner_at = np.zeros(3, dtype=np.int64)
     with nullcontext() if compiled else native.numpy_alone():
-        repeated = arrange(seen, np.arange(2), 3, room, *counts, order, rank_of_corner, pair)
+        repeated = arrange(seen, np.arange(2), 3, corner_at, order, rank_of_corner, pair)
     assert order[repeated - 1 : repeated + 1].tolist() == [1, 3]
 
 

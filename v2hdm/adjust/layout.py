@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays, Lengths
-from v2hdm.adjust.problem import POSE_STATES, GroundPlanes, KnownLengths, Problem
+from v2hdm.adjust.problem import LINE_EXCESS, POSE_STATES, GroundPlanes, KnownLengths, Problem
 from v2hdm.errors import AdjustError
 from v2hdm.geometry.rigid import inverse
 from v2hdm.records import BoolArray, FloatArray, IntArray
@@ -148,6 +148,7 @@ def make_arrays(
         corner=index(observations.corner),
         measured=real(observations.measured),
         root_information=real(observations.root_information),
+        has_lines=observations.has_lines,
         vehicle_from_map=real(inverse(problem.map_from_vehicle)),
         session=index(np.asarray(problem.session_of_frame, dtype=np.int64)),
         states=tuple(prior.columns.tolist()),
@@ -232,6 +233,7 @@ class _Sorted(NamedTuple):
     pair: NDArray[np.int32]  # (K,) its camera and frame
     measured: FloatArray  # (2, K)
     root_information: FloatArray  # (3, K)
+    has_lines: bool
 
 
 def _sorted_observations(problem: Problem, rank: IntArray) -> _Sorted:
@@ -244,9 +246,8 @@ def _sorted_observations(problem: Problem, rank: IntArray) -> _Sorted:
     order = np.empty(count, dtype=np.int32)
     corner = np.empty_like(order)
     pair = np.empty_like(order)
-    pair_at = np.zeros(len(columns.intrinsic) * frames + 1, dtype=np.int64)
     corner_at = np.zeros(len(rank) + 1, dtype=np.int64)
-    repeated = arrange(columns, rank, frames, np.empty_like(order), pair_at, corner_at, order, corner, pair)
+    repeated = arrange(columns, rank, frames, corner_at, order, corner, pair)
     if repeated >= 0:
         first, second = order[repeated - 1 : repeated + 1].tolist()
         raise AdjustError(
@@ -255,8 +256,8 @@ def _sorted_observations(problem: Problem, rank: IntArray) -> _Sorted:
         )
     measured = np.empty((2, count))
     root = np.empty((3, count))
-    lay_out(columns, order, measured, root)
-    return _Sorted(order, corner, pair, measured, root)
+    lines = lay_out(columns, order, LINE_EXCESS, measured, root)
+    return _Sorted(order, corner, pair, measured, root, lines > 0)
 
 
 def _clock_twist(problem: Problem, clock_offset: bool) -> tuple[FloatArray, list[float]]:

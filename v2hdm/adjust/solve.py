@@ -249,14 +249,12 @@ def report_of(
     report = engine.report(estimate, problem.intrinsic[:, :2])
     audit(arrays, estimate, robust, problem.intrinsic[:, :2], report, terms["observations"])
     residual_px, mahalanobis2, behind = report
-    lines = problem.observations.on_line
-    if lines.any():
-        mahalanobis2[lines] = as_of_point(mahalanobis2[lines])
+    if arrays.has_lines:
+        is_on_line = problem.observations.on_line
+        mahalanobis2[is_on_line] = as_of_point(mahalanobis2[is_on_line])
     scale = noise_scale(mahalanobis2)
     of_priors = 2 * sum(cost for name, cost in terms.items() if name != "observations")
-    held = int((arrays.centre_information_root > 0).sum()) + int((arrays.control_root[:, ::2] > 0).sum())
-    held += int(arrays.ground_root.any(dim=2).sum())
-    free = 2 * arrays.corner_count + 6 * arrays.camera_count - held - len(arrays.lengths.first)
+    free = 2 * arrays.corner_count + 6 * arrays.camera_count - _held(arrays)
     variance = variance_factors(mahalanobis2, of_priors, free, scale)
     corners_map = np.empty(estimate.corners_map.shape)
     corners_map[arrays.corner_order.cpu().numpy()] = estimate.corners_map.cpu().numpy()
@@ -285,6 +283,14 @@ def report_of(
         observation_factor=variance.observations,
         covariance=Covariance(descent),
     )
+
+
+def _held(arrays: Arrays) -> int:
+    """The number of unknowns that priors other than the poses' determine."""
+    centre = np.count_nonzero(arrays.centre_information_root.numpy(force=True))
+    control = np.count_nonzero(arrays.control_root[:, ::2].numpy(force=True))
+    ground = np.count_nonzero(arrays.ground_root.numpy(force=True).any(axis=2))
+    return centre + control + ground + len(arrays.lengths.first)
 
 
 def _status(descent: Descent, options: SolveOptions, behind: bool) -> Status:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.adjust.arrays import Arrays
-from v2hdm.compiled import kernel, twin
+from v2hdm.compiled import inlined, kernel, twin
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 LOSS_CODES = {"none": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3}
@@ -261,43 +261,59 @@ def first_not_rigid(transforms: FloatArray, orthonormal_to: float) -> int:
     return -1
 
 
+@inlined
+def _sort_run(pair: NDArray[np.int32], order: NDArray[np.int32], begin: int, end: int) -> None:
+    """Shell's sort of a corner's observations by pair and number, which needs no room."""
+    gap = 1
+    while gap < (end - begin) // 3:
+        gap = 3 * gap + 1
+    while gap > 0:
+        for i in range(begin + gap, end):
+            moved_pair = pair[i]
+            number = order[i]
+            at = i
+            while at - gap >= begin and (
+                moved_pair < pair[at - gap] or (moved_pair == pair[at - gap] and number < order[at - gap])
+            ):
+                pair[at] = pair[at - gap]
+                order[at] = order[at - gap]
+                at -= gap
+            pair[at] = moved_pair
+            order[at] = number
+        gap //= 3
+
+
 @twin("adjust.arrange")
 @kernel
 def arrange(
     observations: Seen,
     rank: IntArray,
     frames: int,
-    by_pair: NDArray[np.int32],
-    pair_at: IntArray,
     corner_at: IntArray,
     order: NDArray[np.int32],
     corner: NDArray[np.int32],
     pair: NDArray[np.int32],
 ) -> int:
-    """Sort observations (K,) by the rank of their corner, then by pair, each time by counting those before.
+    """Sort observations (K,) by the rank of their corner, counting those before, then by pair.
 
-    ``by_pair`` (K,) is room, and ``pair_at`` (P + 1,) and ``corner_at`` (N + 1,) are zeros. Returns the
-    position of a duplicate of the one before, or -1.
+    ``corner_at`` (N + 1,) are zeros. Returns the position of a duplicate of the one before, or -1.
     """
     for k in range(len(order)):
-        pair_at[observations.camera[k] * frames + observations.frame[k] + 1] += 1
         corner_at[rank[observations.corner[k]] + 1] += 1
-    for p in range(1, len(pair_at)):
-        pair_at[p] += pair_at[p - 1]
     for c in range(1, len(corner_at)):
         corner_at[c] += corner_at[c - 1]
     for k in range(len(order)):
-        p = observations.camera[k] * frames + observations.frame[k]
-        by_pair[pair_at[p]] = k
-        pair_at[p] += 1
-    for i in range(len(order)):
-        k = by_pair[i]
         c = rank[observations.corner[k]]
         at = corner_at[c]
         corner_at[c] += 1
         order[at] = k
         corner[at] = c
         pair[at] = observations.camera[k] * frames + observations.frame[k]
+    begin = 0
+    for i in range(1, len(order) + 1):
+        if i == len(order) or corner[i] != corner[begin]:
+            _sort_run(pair, order, begin, i)
+            begin = i
     for i in range(1, len(order)):
         if corner[i] == corner[i - 1] and pair[i] == pair[i - 1]:
             return i
@@ -306,18 +322,72 @@ def arrange(
 
 @twin("adjust.lay_out")
 @kernel
-def lay_out(observations: Seen, order: NDArray[np.int32], measured: FloatArray, root: FloatArray) -> None:
-    """Write observations in an order (K,): where at depth 1, and their root information."""
+def lay_out(
+    observations: Seen,
+    order: NDArray[np.int32],
+    line_excess: float,
+    measured: FloatArray,
+    root: FloatArray,
+) -> int:
+    """Write observations in an order (K,): where at depth 1, and their root information.
+
+    Returns how many are of lines, by the ``line_excess`` of their covariances.
+    """
+    lines = 0
     for i in range(len(order)):
         k = order[i]
         c = observations.camera[k]
         fx = observations.intrinsic[c, 0]
         fy = observations.intrinsic[c, 1]
+        xx = observations.covariance_px[k, 0, 0]
+        yx = observations.covariance_px[k, 1, 0]
+        yy = observations.covariance_px[k, 1, 1]
         measured[0, i] = (observations.pinhole_px[k, 0] - observations.intrinsic[c, 2]) / fx
         measured[1, i] = (observations.pinhole_px[k, 1] - observations.intrinsic[c, 3]) / fy
-        first = math.sqrt(observations.covariance_px[k, 0, 0])
-        below = observations.covariance_px[k, 1, 0] / first
-        last = math.sqrt(observations.covariance_px[k, 1, 1] - below * below)
+        first = math.sqrt(xx)
+        below = yx / first
+        last = math.sqrt(yy - below * below)
         root[0, i] = fx / first
         root[1, i] = -below * fx / (first * last)
         root[2, i] = fy / last
+        if (xx + yy) * (xx + yy) > (xx * yy - yx * yx) * line_excess:
+            lines += 1
+    return lines
+
+
+# :class:`v2hdm.adjust.solution.Verdict`, which numba does not know.
+_ACCEPTED = 0
+_CONTRADICTS = 1
+_UNCONFIRMED = 2
+_BEHIND_CAMERA = 3
+
+
+@twin("adjust.classify")
+@kernel
+def classify(
+    corner: IntArray,
+    mahalanobis2: FloatArray,
+    behind: BoolArray,
+    gate: float,
+    verdict: NDArray[np.int8],
+    sightings: IntArray,
+    accepted: IntArray,
+) -> None:
+    """Write a verdict on each observation (K,), and each corner's number of them and of accepted ones (N,).
+
+    Both numbers are zeros before.
+    """
+    for k in range(len(corner)):
+        c = corner[k]
+        sightings[c] += 1
+        if behind[k]:
+            verdict[k] = _BEHIND_CAMERA
+        elif mahalanobis2[k] > gate:
+            verdict[k] = _CONTRADICTS
+        else:
+            verdict[k] = _ACCEPTED
+            accepted[c] += 1
+    for k in range(len(corner)):
+        c = corner[k]
+        if verdict[k] == _ACCEPTED and accepted[c] == 1 and sightings[c] > 1:
+            verdict[k] = _UNCONFIRMED

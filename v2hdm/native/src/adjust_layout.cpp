@@ -58,6 +58,16 @@ struct Block {
         }
     }
 
+    // Number of observations of lines, whose squared traces exceed their determinants so much.
+    int lines(int count, double line_excess) const {
+        int lines = 0;
+        for (int l = 0; l < count; ++l) {
+            const double trace = xx[l] + yy[l], determinant = xx[l] * yy[l] - yx[l] * yx[l];
+            lines += trace * trace > determinant * line_excess;
+        }
+        return lines;
+    }
+
     // Writes numbers of so many observations to rows of ``stride``.
     void write(int count, Index stride, double* measured, double* root) const {
         for (int l = 0; l < count; ++l) {
@@ -101,24 +111,51 @@ Index first_unsound(
     return -1;
 }
 
+namespace {
+
+// A corner's observations by pair, and those of one pair by their number.
+bool is_before(int32_t pair, int32_t number, int32_t other_pair, int32_t other_number) {
+    return pair < other_pair || (pair == other_pair && number < other_number);
+}
+
+// Shell's sort, which needs no room; most runs are sorted already.
+void sort_run(int32_t* pair, int32_t* order, Index count) {
+    Index gap = 1;
+    while (gap < count / 3) gap = 3 * gap + 1;
+    for (; gap > 0; gap /= 3) {
+        for (Index i = gap; i < count; ++i) {
+            const int32_t moved_pair = pair[i], number = order[i];
+            Index at = i;
+            for (; at >= gap && is_before(moved_pair, number, pair[at - gap], order[at - gap]); at -= gap) {
+                pair[at] = pair[at - gap];
+                order[at] = order[at - gap];
+            }
+            pair[at] = moved_pair;
+            order[at] = number;
+        }
+    }
+}
+
+}  // namespace
+
 Index arrange(const Columns& columns, const Index* rank, Index frames, const Arranged& out) {
-    const auto pair_of = [&](Index k) { return columns.camera[k] * frames + columns.frame[k]; };
     for (Index k = 0; k < columns.count; ++k) {
-        const Index pair = pair_of(k), corner = columns.corner[k];
-        const bool is_within = 0 <= pair && pair < out.pairs && 0 <= corner && corner < out.corners;
-        if (!is_within) throw std::invalid_argument("observations: of a camera, frame or corner that there is not");
-        out.pair_at[pair + 1] += 1;
+        const Index corner = columns.corner[k];
+        if (!(0 <= corner && corner < out.corners)) throw std::invalid_argument("observations: of no corner");
         out.corner_at[rank[corner] + 1] += 1;
     }
-    for (Index p = 0; p < out.pairs; ++p) out.pair_at[p + 1] += out.pair_at[p];
     for (Index c = 0; c < out.corners; ++c) out.corner_at[c + 1] += out.corner_at[c];
-    for (Index k = 0; k < columns.count; ++k) out.by_pair[out.pair_at[pair_of(k)]++] = static_cast<int32_t>(k);
-    for (Index i = 0; i < columns.count; ++i) {
-        const int32_t k = out.by_pair[i];
+    for (Index k = 0; k < columns.count; ++k) {
         const Index corner = rank[columns.corner[k]], at = out.corner_at[corner]++;
-        out.order[at] = k;
+        out.order[at] = static_cast<int32_t>(k);
         out.corner[at] = static_cast<int32_t>(corner);
-        out.pair[at] = static_cast<int32_t>(pair_of(k));
+        out.pair[at] = static_cast<int32_t>(columns.camera[k] * frames + columns.frame[k]);
+    }
+    Index begin = 0;
+    for (Index i = 1; i <= columns.count; ++i) {
+        if (i < columns.count && out.corner[i] == out.corner[begin]) continue;
+        if (!std::is_sorted(out.pair + begin, out.pair + i)) sort_run(out.pair + begin, out.order + begin, i - begin);
+        begin = i;
     }
     for (Index i = 1; i < columns.count; ++i) {
         if (out.corner[i] == out.corner[i - 1] && out.pair[i] == out.pair[i - 1]) return i;
@@ -126,12 +163,30 @@ Index arrange(const Columns& columns, const Index* rank, Index frames, const Arr
     return -1;
 }
 
-void lay_out(const Columns& columns, const int32_t* order, double* measured, double* root) {
+Index lay_out(const Columns& columns, const int32_t* order, double line_excess, double* measured, double* root) {
+    Index lines = 0;
     Block block;
     for (Index begin = 0; begin < columns.count; begin += BLOCK) {
         const int count = static_cast<int>(std::min<Index>(columns.count - begin, BLOCK));
         block.read(columns, order, begin, count);
         block.write(count, columns.count, measured + begin, root + begin);
+        lines += block.lines(count, line_excess);
+    }
+    return lines;
+}
+
+void classify(const Reported& reported, double gate, const Judged& out) {
+    for (Index k = 0; k < reported.count; ++k) {
+        const bool is_far = reported.mahalanobis2[k] > gate;
+        out.verdict[k] = reported.behind[k] ? BEHIND_CAMERA : is_far ? CONTRADICTS : ACCEPTED;
+        out.sightings[reported.corner[k]] += 1;
+        out.accepted[reported.corner[k]] += out.verdict[k] == ACCEPTED;
+    }
+    const auto is_last = [&](Index c) { return out.accepted[c] == 1 && out.sightings[c] > 1; };
+    Index last = 0;
+    for (Index c = 0; c < out.corners; ++c) last += is_last(c);
+    for (Index k = 0; k < (last ? reported.count : 0); ++k) {
+        if (out.verdict[k] == ACCEPTED && is_last(reported.corner[k])) out.verdict[k] = UNCONFIRMED;
     }
 }
 

@@ -214,27 +214,25 @@ Index first_unsound_of(
 }
 
 Index arrange_columns(
-    nb::handle columns_object, nb::handle rank_object, Index frames, nb::handle by_pair_object, nb::handle pair_at_object,
-    nb::handle corner_at_object, nb::handle order_object, nb::handle corner_object, nb::handle pair_object) {
+    nb::handle columns_object, nb::handle rank_object, Index frames, nb::handle corner_at_object,
+    nb::handle order_object, nb::handle corner_object, nb::handle pair_object) {
     const ColumnsRecord columns(columns_object);
     const auto rank = array_of<const Index, 1>(rank_object, "rank");
-    const auto by_pair = array_of<int32_t, 1>(by_pair_object, "by_pair");
-    const auto pair_at = array_of<Index, 1>(pair_at_object, "pair_at");
     const auto corner_at = array_of<Index, 1>(corner_at_object, "corner_at");
     const auto order = array_of<int32_t, 1>(order_object, "order");
     const auto corner = array_of<int32_t, 1>(corner_object, "corner");
     const auto pair = array_of<int32_t, 1>(pair_object, "pair");
     const size_t count = columns.camera.size();
-    require(order.size() == count && corner.size() == count && pair.size() == count && by_pair.size() == count, "order");
-    require(corner_at.size() == rank.size() + 1 && pair_at.size() > 0, "corner_at");
+    require(order.size() == count && corner.size() == count && pair.size() == count, "order");
+    require(corner_at.size() == rank.size() + 1, "corner_at");
     return arrange(
         columns.view, rank.data(), frames,
-        {by_pair.data(), pair_at.data(), corner_at.data(), size_of(pair_at.size()) - 1, size_of(rank.size()),
-         order.data(), corner.data(), pair.data()});
+        {corner_at.data(), size_of(rank.size()), order.data(), corner.data(), pair.data()});
 }
 
-void lay_out_columns(
-    nb::handle columns_object, nb::handle order_object, nb::handle measured_object, nb::handle root_object) {
+Index lay_out_columns(
+    nb::handle columns_object, nb::handle order_object, double line_excess, nb::handle measured_object,
+    nb::handle root_object) {
     const ColumnsRecord columns(columns_object);
     const auto order = array_of<const int32_t, 1>(order_object, "order");
     const auto measured = array_of<double, 2>(measured_object, "measured");
@@ -242,7 +240,27 @@ void lay_out_columns(
     const size_t count = order.size();
     require(count == columns.camera.size(), "order");
     require(measured.size() == 2 * count && root.size() == 3 * count, "measured");
-    lay_out(columns.view, order.data(), measured.data(), root.data());
+    return lay_out(columns.view, order.data(), line_excess, measured.data(), root.data());
+}
+
+void classify_observations(
+    nb::handle corner_object, nb::handle mahalanobis2_object, nb::handle behind_object, double gate,
+    nb::handle verdict_object, nb::handle sightings_object, nb::handle accepted_object) {
+    const auto corner = array_of<const Index, 1>(corner_object, "corner");
+    const auto mahalanobis2 = array_of<const double, 1>(mahalanobis2_object, "mahalanobis2");
+    const auto behind = array_of<const bool, 1>(behind_object, "behind");
+    const auto verdict = array_of<int8_t, 1>(verdict_object, "verdict");
+    const auto sightings = array_of<Index, 1>(sightings_object, "sightings");
+    const auto accepted = array_of<Index, 1>(accepted_object, "accepted");
+    const size_t count = corner.size();
+    require(mahalanobis2.size() == count && behind.size() == count && verdict.size() == count, "verdict");
+    require(accepted.size() == sightings.size(), "accepted");
+    const Index corners = size_of(sightings.size());
+    const auto is_within = [&](Index place) { return 0 <= place && place < corners; };
+    require(std::all_of(corner.data(), corner.data() + count, is_within), "corner");
+    classify(
+        {corner.data(), mahalanobis2.data(), behind.data(), size_of(count)}, gate,
+        {verdict.data(), sightings.data(), accepted.data(), corners});
 }
 
 Index first_not_rigid_of(nb::handle transforms_object, double orthonormal_to) {
@@ -291,6 +309,7 @@ void add_adjust(nb::module_& module) {
     adjust.def("first_unsound", &first_unsound_of);
     adjust.def("arrange", &arrange_columns);
     adjust.def("lay_out", &lay_out_columns);
+    adjust.def("classify", &classify_observations);
     adjust.def("first_not_rigid", &first_not_rigid_of);
     adjust.def("find_touched", &find_touched_pairs);
     nb::dict constants;

@@ -72,11 +72,28 @@ auto view_of(Numbers Owner::*numbers) {
     };
 }
 
-template <typename Owner>
-nb::tuple costs_of(const Owner& owner) {
-    const Terms& terms = owner.terms;
+nb::tuple costs_of(const Terms& terms) {
     return nb::make_tuple(
         terms.observations, terms.camera_centre, terms.ground_planes, terms.control_points, terms.known_lengths);
+}
+
+nb::tuple costs_of_whitening(const RigWhitening& whitening) { return costs_of(whitening.terms); }
+
+// An array that keeps its numbers alive itself.
+nb::object owned(Numbers&& numbers, std::initializer_list<size_t> shape) {
+    auto* kept = new Numbers(std::move(numbers));
+    const nb::capsule owner(kept, [](void* memory) noexcept { delete static_cast<Numbers*>(memory); });
+    return nb::cast(nb::ndarray<nb::numpy, double>(kept->data(), shape, owner));
+}
+
+// What kernels.rig.Evaluated holds. Views would keep the factors alive for as long as the solution.
+nb::tuple finished(RigEvaluation& evaluation) {
+    evaluation.finish();
+    const size_t cameras = evaluation.cam_from_vehicle.size() / 16, corners = evaluation.corners.size() / 2;
+    const size_t unknowns = evaluation.gradient.size();
+    return nb::make_tuple(
+        costs_of(evaluation.terms), owned(std::move(evaluation.cam_from_vehicle), {cameras, 4, 4}),
+        owned(std::move(evaluation.corners), {corners, 2}), owned(std::move(evaluation.gradient), {unknowns}));
 }
 
 template <typename Owner, void (Owner::*WORK)(Index, Index)>
@@ -107,7 +124,7 @@ void add_adjust_rig(nb::module_& adjust) {
         .def("camera_step", &camera_step)
         .def("evaluate", &evaluated, nb::keep_alive<0, 1>(), nb::rv_policy::take_ownership)
         .def_ro("smallest_pivot", &RigWhitening::smallest_pivot)
-        .def_prop_ro("costs", &costs_of<RigWhitening>)
+        .def_prop_ro("costs", &costs_of_whitening)
         .def_prop_ro("table", view_of(&RigWhitening::table))
         .def_prop_ro("lower", view_of(&RigWhitening::lower))
         .def_prop_ro("joint", view_of(&RigWhitening::joint))
@@ -119,11 +136,7 @@ void add_adjust_rig(nb::module_& adjust) {
         .def_prop_ro("gradient", view_of(&RigWhitening::gradient));
     nb::class_<RigEvaluation>(adjust, "RigEvaluation")
         .def("look", &look)
-        .def("finish", &RigEvaluation::finish)
-        .def_prop_ro("costs", &costs_of<RigEvaluation>)
-        .def_prop_ro("cam_from_vehicle", view_of(&RigEvaluation::cam_from_vehicle))
-        .def_prop_ro("corners_map", view_of(&RigEvaluation::corners))
-        .def_prop_ro("gradient", view_of(&RigEvaluation::gradient));
+        .def("finish", &finished);
 }
 
 }  // namespace v2hdm
