@@ -99,7 +99,9 @@ def _audit_observations(arrays: Arrays, estimate: Estimate, focal_px: FloatArray
     if not agrees.all():
         k = int(np.argmin(agrees))
         said = _px(residual_px[k])
-        raise _refusal(f"the residual of observation {place[k]} is {said}, not {_px(expected.residual_px[k])}")
+        raise _refusal(
+            f"the residual of observation {place[k]} is {said}, not {_px(expected.residual_px[k])}"
+        )
 
 
 def _sample(arrays: Arrays) -> _Sample:

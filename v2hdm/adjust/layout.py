@@ -108,7 +108,6 @@ def make_arrays(
     read_out: bool = False,
 ) -> Arrays:
     """Lay out a checked problem; AdjustError for a corner twice in an image, or too many joined corners."""
-
     is_on_cpu = device == "cpu"
 
     def index(values: NDArray[Any]) -> Tensor:
