@@ -11,7 +11,7 @@ import functools
 import inspect
 import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import is_dataclass
 from numbers import Integral, Real
 from typing import Annotated, Any, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -58,7 +58,7 @@ def checked_class(kind: _Class) -> _Class:
 
 def check_types(options: Any, prefix: str = "") -> None:
     """Raise ConfigError, which names ``prefix`` and the key, for settings of another type than theirs."""
-    for name, (fits, kind) in _tests_of_fields(type(options)).items():
+    for name, (fits, kind) in _tests_of_fields(type(options).__init__).items():
         value = getattr(options, name)
         is_nested = is_dataclass(value)
         if fits(value) and not is_nested:
@@ -71,16 +71,14 @@ def check_types(options: Any, prefix: str = "") -> None:
 
 
 @functools.cache
-def _tests_of_fields(kind: type[Any]) -> Mapping[str, tuple[Callable[[Any], bool], Any]]:
-    """Test and type of each field of a dataclass; ranges are another check."""
-    hints = _hints(kind.__init__)
-    types_of_fields = {
-        field.name: get_args(hints[field.name])[0]
-        if get_origin(hints[field.name]) is Annotated
-        else hints[field.name]
-        for field in fields(kind)
+def _tests_of_fields(init: Callable[..., None]) -> Mapping[str, tuple[Callable[[Any], bool], Any]]:
+    """Test and type of each field of a dataclass, of its making; ranges are another check."""
+    kinds = {
+        name: get_args(hint)[0] if get_origin(hint) is Annotated else hint
+        for name, hint in _hints(init).items()
+        if name != "return"
     }
-    return {name: (_test_of(hint), hint) for name, hint in types_of_fields.items()}
+    return {name: (_test_of(kind), kind) for name, kind in kinds.items()}
 
 
 def _check(value: object, hint: Any, where: str) -> None:

@@ -150,9 +150,8 @@ def _check_arrays(problem: Problem) -> None:
                 raise AdjustError(f"{prefix}{name} holds {values.dtype}: give whole numbers")
             if name in indices or name in ("centre_sigma_m", "pinhole_px", "covariance_px"):
                 continue
-            finite = np.isfinite(values)
-            if not finite.all():
-                finite = finite.all(axis=tuple(range(1, values.ndim)))
+            if not np.isfinite(values).all():
+                finite = np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
                 _refuse(~finite, f"{name} of {of} {{}} is not finite: remove it or fix its source")
 
 

@@ -290,7 +290,7 @@ def _held(arrays: Arrays) -> int:
     centre = np.count_nonzero(arrays.centre_information_root.numpy(force=True))
     control = np.count_nonzero(arrays.control_root[:, ::2].numpy(force=True))
     ground = np.count_nonzero(arrays.ground_root.numpy(force=True).any(axis=2))
-    return centre + control + ground + len(arrays.lengths.first)
+    return int(centre + control + ground) + len(arrays.lengths.first)
 
 
 def _status(descent: Descent, options: SolveOptions, behind: bool) -> Status:
