@@ -511,7 +511,11 @@ def _kept_tiles(
     """Pairs of tiles coupled by observations of kept corners, or by corners joined to them."""
     run = arrays.gather(kept_corners)
     tile = first + run.corner // per_corner_tile
-    pairs = torch.unique(torch.stack([arrays.frame_of(run.pair) // per_tile, tile]), dim=1).T.tolist()
+    of_frame = arrays.frame_of(run.pair).long() // per_tile
+    count = int(tile.max()) + 1 if len(tile) else 1
+    # As one number each: unique columns would take a hundred times as long.
+    coupled = torch.unique(of_frame * count + tile)
+    pairs = torch.stack([coupled // count, coupled % count], dim=1).tolist()
     # Joined corners are adjacent: a unit may reach into the next tile.
     return [*pairs, *pairwise(torch.unique(tile).tolist())]
 

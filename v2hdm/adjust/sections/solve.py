@@ -359,7 +359,6 @@ def _in_rounds(
     are_joined = jobs[0].start is not None
     is_from_afar = not are_joined and not jobs[0].is_near
     costs: list[list[float]] = []  # by round and part
-    targets: list[Values] = []
     for number in range(_MOST_ROUNDS):
         report(number, _MOST_ROUNDS)
         states: list[PartStates] = _side_by_side(executor, work, jobs)
@@ -372,14 +371,15 @@ def _in_rounds(
         joined = net.join(_taken(states, shared, net), shared)
         gap = (joined.decrease + sum(state.told.slack for state in states)) / max(sum(costs[-1]), 1.0)
         moved = _moved(net, shared, joined)
-        targets = [_values(net, moved, state.labels, state.values) for state in states]
+        jobs = [
+            _Job(part, target=_values(net, moved, state.labels, state.values))
+            for part, state in enumerate(states)
+        ]
         if (number > 0 or are_joined) and gap <= least_gap:
             break
-        jobs = [_Job(part, target=target) for part, target in enumerate(targets)]
-    last = [
-        _Job(part, target=target, is_last=True, gap=gap, rounds=number + 1)
-        for part, target in enumerate(targets)
-    ]
+    if are_joined and number == 0:  # they are where they should be
+        jobs = [_Job(part) for part in range(len(states))]
+    last = [replace(job, is_last=True, gap=gap, rounds=number + 1) for job in jobs]
     results = _side_by_side(executor, replace(work, finish=finish), last)
     return Joint(results, net, joined.factor, gap, number + 1)
 
