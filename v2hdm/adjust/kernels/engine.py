@@ -52,6 +52,17 @@ class KernelEngine(TorchEngine):
         super().__init__(arrays)
         self._border = border
 
+    def over(self, arrays: Arrays) -> KernelEngine:
+        """The same engine over another problem; what it knows of the same observations is not found anew."""
+        engine = KernelEngine(arrays)
+        before = self.arrays
+        if arrays.pair is before.pair and arrays.corner is before.corner and self._border is None:
+            if arrays.root_information is before.root_information and "_whole" in vars(self):
+                vars(engine)["_whole"] = self._whole
+            if arrays.states == before.states and "_plan" in vars(self):
+                vars(engine)["_plan"] = self._plan
+        return engine
+
     def keeping(self, frames: Tensor, corners: Tensor) -> KernelEngine:
         """The same engine, which eliminates a border of ``frames`` and ``corners`` last."""
         return KernelEngine(self.arrays, (frames, corners))
