@@ -170,7 +170,7 @@ def solve_bundle(
 
     Those are knots and the groups' approximate corners, which they need: rays to a knot have no common
     intersection. ``usable`` (S, 4), in the sightings' own order, selects corners. Extrinsics start from
-    ``rig``, poses from the recorded ones, or from those of a rig that ``is_near``, a solve of nearly the same.
+    ``rig``, poses from the recorded ones, or those of a rig that ``is_near``, a solve of nearly the same.
     Raises MappingError if no corner was seen twice.
     """
     observed = _observed_corners(association, usable)

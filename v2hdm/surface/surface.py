@@ -566,8 +566,8 @@ class Surface:
 class _Smoothness:
     """The prior of a surface's B parameters by the sizes of its second differences.
 
-    ``by_order`` (3, B', B') are the squared differences of the spline's B' coefficients, along the path twice,
-    once and not at all; ``bands`` (3, W, B') are their lower diagonals.
+    ``by_order`` (3, N, N) are the squared differences of the spline's N coefficients, along the path twice,
+    once and not at all; ``bands`` (3, W, N) are their lower diagonals.
     """
 
     by_order: FloatArray

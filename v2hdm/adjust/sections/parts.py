@@ -119,7 +119,7 @@ def cut(problem: Problem, part_of_frame: IntArray, states: tuple[str, ...]) -> t
 def whole_of(parts: Sequence[Part], bare: Problem, corners: IntArray) -> Problem:
     """The problem that was cut into parts, without surveyed corners and known lengths.
 
-    ``bare`` has its cameras and frames; ``corners`` (N,) are those of all parts. It starts where the parts do.
+    ``bare`` has its cameras and frames; ``corners`` (N,) are those of all parts, which say where it starts.
     """
     cam_from_vehicle = bare.cam_from_vehicle.copy()
     poses_start = bare.map_from_vehicle.copy()
