@@ -118,11 +118,13 @@ def main() -> None:
     weights = likeliest_weights(features, np.zeros(len(features)), is_bar, RIDGE)
     print(f"FITTED = {weights}")
     for name, (columns, truth) in groups.items():
+        is_bar = truth > 0
+        bars = int(is_bar.sum())
         for how, values in (("alone", columns[:, 1]), ("in its row", columns @ np.array(weights))):
             is_kept = as_probability(values) >= LEAST_KEPT
-            kept = int((is_kept & (truth > 0)).sum())
-            false = int((is_kept & (truth == 0)).sum())
-            print(f"{name}, {how}: {kept} of {int(truth.sum())} bars, {false} of {int((truth == 0).sum())} others")
+            kept = int((is_kept & is_bar).sum())
+            others = int((is_kept & ~is_bar).sum())
+            print(f"{name}, {how}: {kept} of {bars} bars, {others} of {len(truth) - bars} others")
 
 
 if __name__ == "__main__":

@@ -67,7 +67,9 @@ def test_bars_above_the_horizon_keep_their_probability():
     assert (np.delete(of_bars, 2) > 0.2).all()
 
 
-@pytest.mark.parametrize(("pitch_off_deg", "roll_off_deg"), [(0.0, 0.0), (-2.0, 0.0), (1.0, 2.0), (-1.0, -2.0)])
+@pytest.mark.parametrize(
+    ("pitch_off_deg", "roll_off_deg"), [(0.0, 0.0), (-2.0, 0.0), (1.0, 2.0), (-1.0, -2.0)]
+)
 def test_a_row_is_one_in_an_image_even_where_pitch_and_roll_are_known_about(pitch_off_deg, roll_off_deg):
     ground = seen_wrongly(BARS, pitch_off_deg, roll_off_deg)
     (row,) = rows_of_bars(ground, IN_IMAGE)

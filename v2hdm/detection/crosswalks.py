@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.network import as_log_odds, as_probability
-from v2hdm.geometry.rows import IN_IMAGE, LEAST_BARS, outline_of_row, rows_of_bars
+from v2hdm.geometry.rows import IN_IMAGE, LEAST_BARS, rows_of_bars
 from v2hdm.records import CROSSWALK, CROSSWALK_BAR, BoolArray, FloatArray, MarkingDetection
 
 FEATURES = ("row", "alone", "bars")
@@ -47,14 +48,15 @@ def in_rows(score: FloatArray, ground: FloatArray, is_bar: BoolArray) -> FloatAr
 def find_crosswalks(
     markings: Sequence[MarkingDetection], camera: RoadCamera
 ) -> list[tuple[MarkingDetection, tuple[int, ...]]]:
-    """The crosswalks of an image's bars, each with ``outline_px`` (4, 2) and the indices of its bars."""
+    """The crosswalks of an image's bars, each with the hull ``outline_px`` and the indices of its bars."""
     bars = [k for k, marking in enumerate(markings) if marking.kind == CROSSWALK_BAR]
     ground = camera.unproject(np.array([markings[k].corners_px for k in bars]).reshape(-1, 4, 2))
     on_ground = np.flatnonzero(np.isfinite(ground).all(axis=(1, 2)))
     crosswalks = []
     for row in rows_of_bars(ground[on_ground], IN_IMAGE):
         parts = tuple(bars[k] for k in on_ground[row].tolist())
-        outline_px = camera.project(outline_of_row(ground[on_ground[row]]).corners)
+        corners_px = np.concatenate([markings[k].corners_px for k in parts])
+        outline_px = corners_px[cv2.convexHull(corners_px.astype(np.float32), returnPoints=False).ravel()]
         crosswalk = MarkingDetection(
             kind=CROSSWALK,
             score=float(np.mean([markings[k].score for k in parts])),
@@ -62,7 +64,7 @@ def find_crosswalks(
             covariance_px=np.full((8, 8), np.nan),
             corner_valid=np.zeros(4, dtype=np.bool_),
             outline_px=outline_px,
-            outline_seen=np.ones(4, dtype=np.bool_),
+            outline_seen=np.ones(len(outline_px), dtype=np.bool_),
         )
         crosswalks.append((crosswalk, parts))
     return crosswalks
