@@ -3,9 +3,10 @@
     python -m train.fit_crosswalks LABELS.json IMAGES [--photographs 500] [--renders 60]
 
 LABELS.json and IMAGES are those of ROAD MARK. The images of it that are learnt from, and rendered scenes, are
-shown to the shipped network, every second photograph as if nobody stated its mounting. A bar that stands in a row is true if it overlaps a rendered bar by half, or its
-middle lies in the outline of a photographed crosswalk; it is false where nothing like it is labelled.
-Printed is what belongs into ``FITTED``, and how many of either it keeps.
+shown to the shipped network, every second photograph as if nobody stated its mounting. A bar that stands in a
+row is true if it overlaps a rendered bar by half, or its middle lies in the outline of a photographed
+crosswalk; it is false where nothing like it is labelled. Printed is what belongs into ``FITTED``, and how
+many of either it keeps.
 """
 
 from __future__ import annotations
