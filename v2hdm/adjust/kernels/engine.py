@@ -52,6 +52,17 @@ class KernelEngine(TorchEngine):
         super().__init__(arrays)
         self._border = border
 
+    def over(self, arrays: Arrays) -> KernelEngine:
+        """The same engine over another problem; what it knows of the same observations is not found anew."""
+        engine = KernelEngine(arrays)
+        before = self.arrays
+        if arrays.pair is before.pair and arrays.corner is before.corner and self._border is None:
+            if arrays.root_information is before.root_information and "_whole" in vars(self):
+                vars(engine)["_whole"] = self._whole
+            if arrays.states == before.states and "_plan" in vars(self):
+                vars(engine)["_plan"] = self._plan
+        return engine
+
     def keeping(self, frames: Tensor, corners: Tensor) -> KernelEngine:
         """The same engine, which eliminates a border of ``frames`` and ``corners`` last."""
         return KernelEngine(self.arrays, (frames, corners))
@@ -519,7 +530,11 @@ def _kept_tiles(
     """Pairs of tiles coupled by observations of kept corners, or by corners joined to them."""
     run = arrays.gather(kept_corners)
     tile = first + run.corner // per_corner_tile
-    pairs = torch.unique(torch.stack([arrays.frame_of(run.pair) // per_tile, tile]), dim=1).T.tolist()
+    of_frame = arrays.frame_of(run.pair).long() // per_tile
+    count = int(tile.max()) + 1 if len(tile) else 1
+    # As one number each: unique columns would take a hundred times as long.
+    coupled = torch.unique(of_frame * count + tile)
+    pairs = torch.stack([coupled // count, coupled % count], dim=1).tolist()
     # Joined corners are adjacent: a unit may reach into the next tile.
     return [*pairs, *pairwise(torch.unique(tile).tolist())]
 
