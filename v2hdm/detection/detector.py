@@ -12,10 +12,11 @@ import cv2
 import numpy as np
 
 from v2hdm.catalogue import PAINT_CLASSES, SYMBOL, Catalogue
-from v2hdm.detection.areas import find_areas, find_crosswalks
+from v2hdm.detection.areas import find_areas
 from v2hdm.detection.arrows import arrow_probability, features_of
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.classifier import Readings, find_markings, read_markings
+from v2hdm.detection.crosswalks import find_crosswalks
 from v2hdm.detection.lanes.bare import painted
 from v2hdm.detection.lanes.curves import LaneImage
 from v2hdm.detection.lanes.lines import find_boundaries, trace_lanes

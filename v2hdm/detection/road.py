@@ -19,8 +19,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from v2hdm.detection.areas import find_crosswalks
 from v2hdm.detection.camera import GroundPoints, camera_from_calibration
+from v2hdm.detection.crosswalks import find_crosswalks
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.frames import Frame
 from v2hdm.detection.network import NetworkOutput
