@@ -10,5 +10,6 @@ NB_MODULE(_kernels, module) {
     v2hdm::add_lanes(module);
     v2hdm::add_paint(module);
     v2hdm::add_lens(module);
+    v2hdm::add_seeing(module);
     v2hdm::add_adjust(module);
 }

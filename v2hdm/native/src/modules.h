@@ -10,6 +10,7 @@ void add_lattice(nanobind::module_& module);
 void add_lanes(nanobind::module_& module);
 void add_paint(nanobind::module_& module);
 void add_lens(nanobind::module_& module);
+void add_seeing(nanobind::module_& module);
 void add_adjust(nanobind::module_& module);
 void add_adjust_rig(nanobind::module_& adjust);
 
