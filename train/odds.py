@@ -18,7 +18,7 @@ _SHARE_SIGMA = 2.0  # standard deviation of the log odds of the unknown share, a
 
 
 class Worth(NamedTuple):
-    """Log odds are ``weight`` times the judge's plus ``bias``, but for an ``unknown`` share of the readings."""
+    """Log odds are ``weight`` times the judge's plus ``bias``, but of an ``unknown`` share of readings."""
 
     weight: float
     bias: float
