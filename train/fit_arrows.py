@@ -22,10 +22,12 @@ from train.config import DataConfig
 from train.examples import Example, example, photograph, polygon_overlap
 from train.fit_judge import HARDSHIPS, HARDSHIPS_EVERY
 from train.labels import labelled_images
+from train.logistic import likeliest_weights
 from train.scenes.hardships import NONE
 from v2hdm.catalogue import SYMBOL
 from v2hdm.detection import arrows
 from v2hdm.detection.detector import Detector
+from v2hdm.detection.network import as_log_odds
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.records import ARROW, BOX, CROSSWALK_BAR, DIAMOND, LANE_DASH, TEXT, FloatArray
 
@@ -33,7 +35,6 @@ SEED = 931  # seed of the rendered scenes, not that of a benchmark nor of a trai
 OVERLAP = 0.3  # of what is an arrow with a label, intersection over union
 APART = 0.05  # of what is none with any label, at most
 RIDGE = 0.2  # information of the prior that weights are 0
-STEPS = 40  # of Newton's method, which settles within ten
 LEAST_NAMED = 0.05  # share named an arrow from which a piece is looked at
 RANGE_M = 40.0  # as of photographs of which nothing is stated
 
@@ -99,16 +100,9 @@ def named_in(shown: Example, detector: Detector) -> list[Named]:
 def fitted(named: Sequence[Named]) -> tuple[float, ...]:
     """The likeliest weights of the features, added to the log odds of the name (Newton's method)."""
     features = np.array([piece.features for piece in named])
-    offset = np.array([arrows.named_log_odds(piece.share) for piece in named])
+    offset = as_log_odds(np.array([piece.share for piece in named]))
     is_arrow = np.array([piece.is_arrow for piece in named], dtype=np.float64)
-    weights = np.zeros(features.shape[1])
-    ridge = RIDGE * np.eye(features.shape[1])
-    for _ in range(STEPS):
-        probability = 1.0 / (1.0 + np.exp(-(offset + features @ weights)))
-        slope = features.T @ (is_arrow - probability) - ridge @ weights
-        curvature = (features * (probability * (1.0 - probability))[:, None]).T @ features + ridge
-        weights = weights + np.linalg.solve(curvature, slope)
-    return tuple(np.round(weights, 2).tolist())
+    return likeliest_weights(features, offset, is_arrow, RIDGE)
 
 
 def main() -> None:

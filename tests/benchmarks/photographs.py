@@ -12,6 +12,10 @@ image, the symbols where no label is near; and how paint below the horizon agree
 RoadMarkResUNet's published .628 / .747. That is said of the network's paint as it is, and of its outlines
 drawn as the labels are (:func:`regions`): what a class's pieces enclose counts as theirs, by the network's
 classes alone.
+
+Crosswalks, words and boxes are found where the hull of neighbouring detections of their class overlaps the
+label by more than .3. That joins words that stand side by side in several lanes. So it is printed, too, how
+many are found where the outline of a single detection counts as well, of crosswalks that of a whole one.
 """
 
 from __future__ import annotations
@@ -37,6 +41,7 @@ from v2hdm.detection.options import DetectorOptions
 from v2hdm.pipeline.detect_images import detect_images
 from v2hdm.records import (
     BOX,
+    CROSSWALK,
     CROSSWALK_BAR,
     DIAMOND,
     STOP_LINE,
@@ -68,6 +73,9 @@ _APART = 1.0
 
 CLASS_OF = {"crosswalk_outline": CROSSWALK_BAR, "slow": TEXT, "bus_lane": TEXT, "yellow_box": BOX}
 """What labels of many pieces show."""
+
+WHOLE_OF = {**CLASS_OF, "crosswalk_outline": CROSSWALK}
+"""Classes of the detections that outline these labels whole."""
 
 STOP_LINE_PX = 11.0  # height of a stop line's outline from which it is no thin one
 COVERED_SHARE = 0.5  # of a stop line's length is covered where it is found
@@ -207,6 +215,7 @@ class Tally:
     def __init__(self) -> None:
         self.areas: Counter[str] = Counter()
         self.areas_found: Counter[str] = Counter()
+        self.areas_outlined: Counter[str] = Counter()
         self.count: Counter[tuple[str, int]] = Counter()
         self.found: Counter[tuple[str, int]] = Counter()
         self.named: Counter[tuple[str, int]] = Counter()
@@ -255,15 +264,18 @@ class Tally:
                 self.areas_found[size] += covered(polygon, stop_lines) >= COVERED_SHARE
             elif name in CLASS_OF:
                 hulls = joined([o for kind, o in outlines if kind == CLASS_OF[name]], _APART)
+                whole = [outline for kind, outline in outlines if kind == WHOLE_OF[name]]
+                joined_share = max((polygon_overlap(hull, polygon) for hull in hulls), default=0.0)
+                whole_share = max((polygon_overlap(outline, polygon) for outline in whole), default=0.0)
                 self.areas[name] += 1
-                self.areas_found[name] += (
-                    max((polygon_overlap(h, polygon) for h in hulls), default=0) > FOUND_IOU
-                )
+                self.areas_found[name] += joined_share > FOUND_IOU
+                self.areas_outlined[name] += max(joined_share, whole_share) > FOUND_IOU
 
     def print(self) -> None:
         """Say it."""
         for name, count in sorted(self.areas.items()):
-            print(f"{name}: {self.areas_found[name]} of {count} found as what they are")
+            outlined = f", {self.areas_outlined[name]} with single outlines" if name in WHOLE_OF else ""
+            print(f"{name}: {self.areas_found[name]} of {count} found as what they are{outlined}")
         for (kind, size), count in sorted(self.count.items()):
             low, high = TALL_PX[size]
             found, named = self.found[kind, size] / count, self.named[kind, size] / count

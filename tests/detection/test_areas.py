@@ -9,7 +9,7 @@ import pytest
 from tests.detection.painted import framed, hatched, network_output, word
 from tests.detection.pictures import bar, make_camera, to_image
 from v2hdm.catalogue import SHIPPED
-from v2hdm.detection.areas import find_areas, find_crosswalks
+from v2hdm.detection.areas import find_areas
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.detector import _likelier, _not_of, _of_several
 from v2hdm.detection.network import NetworkOutput, as_shares
@@ -50,6 +50,20 @@ def test_two_words_are_two_areas_and_two_letters_of_one_are_one():
     found = sorted(max(overlap(area.outline_px, one) for one in (first, second)) for area in areas)
     assert len(found) == 2
     assert found[0] > 0.85
+
+
+def test_a_letter_of_few_elements_belongs_to_the_word_beside_it_and_is_none_by_itself():
+    letters = word("EB", (7.0, 0.8))
+    output = network_output(CAMERA, [("text", letters)])
+    rows, columns = np.nonzero(output.paint > 0)
+    right = columns.max() + 4
+    for row, column in ((rows.mean(), right), (rows.mean(), right + 120)):
+        output.paint[int(row), column : column + 3] = 5.0
+        span = output.paint.shape[0] // output.areas.shape[1]
+        name = output.area_classes.index("text")
+        output.areas[name, int(row) // span, column // span : (column + 2) // span + 1] = 9.0
+    (area,) = find_areas(output, RoadCamera(CAMERA, 16), SHIPPED, 0, 0.5, 22.0)
+    assert area.outline_px[:, 0].max() == pytest.approx(output.stride * (right + 2.5), abs=2.0)
 
 
 def test_a_hatched_box_is_one_area_with_its_frame():
@@ -150,19 +164,6 @@ def test_a_box_whose_lines_the_network_takes_for_strokes_of_letters_is_named_by_
     assert named(word("BOBO", (6.5, 1.5))) == ["text"]
 
 
-def test_bars_in_a_row_are_a_crosswalk_whatever_takes_them_for_letters():
-    bars = [bar(8.0, across, 2.0, 0.4) for across in (-1.2, -0.4, 0.4, 1.2)]
-    valid = np.ones(4, dtype=bool)
-    markings = tuple(
-        MarkingDetection("crosswalk_bar", 0.6, to_image(CAMERA, corners), np.eye(8), valid)
-        for corners in bars
-    )
-    ((crosswalk, _),) = find_crosswalks(markings, RoadCamera(CAMERA, 16))
-    (area,), _ = areas_of(("text", np.array(bars[:3])))
-    assert _of_several([area], markings) == [area]
-    assert _of_several([area], (*markings, crosswalk)) == []
-
-
 def test_a_stop_line_that_an_arrow_crosses_is_a_marking_and_a_dash_on_its_shaft_is_none():
     valid = np.ones(4, dtype=bool)
     stop = MarkingDetection("stop_line", 0.5, to_image(CAMERA, bar(7.0, 0, 0.4, 3.0)), np.eye(8), valid)
@@ -186,21 +187,3 @@ def test_an_area_that_is_part_of_an_arrow_is_no_word():
     assert _of_several([area], (arrow,)) == []
     assert _of_several([area], (letter,)) == [area]
     assert _of_several([area], ()) == [area]
-
-
-def test_the_bars_of_an_image_are_its_crosswalk_s_parts():
-    bars = [bar(8.0, across, 2.0, 0.4) for across in (-1.6, -0.8, 0.0, 0.8, 1.6)]
-    valid = np.ones(4, dtype=bool)
-    stop = MarkingDetection("stop_line", 0.9, to_image(CAMERA, bar(5.5, 0, 0.3, 3.0)), np.eye(8), valid)
-    markings = [
-        MarkingDetection("crosswalk_bar", 0.8, to_image(CAMERA, one), np.eye(8), valid) for one in bars
-    ]
-    ((crosswalk, parts),) = find_crosswalks([stop, *markings], RoadCamera(CAMERA, 16))
-    assert (crosswalk.kind, crosswalk.score, sorted(parts)) == (
-        "crosswalk",
-        pytest.approx(0.8),
-        [1, 2, 3, 4, 5],
-    )
-    ground = RoadCamera(CAMERA, 16).unproject(crosswalk.outline_px)
-    np.testing.assert_allclose(np.ptp(ground, axis=0), [2.0, 3.6], atol=0.02)
-    assert find_crosswalks(markings[:2], RoadCamera(CAMERA, 16)) == []

@@ -2,7 +2,6 @@
 
 An area is made of pieces that do not touch: letters, hatching. Each is named whole, as writing or as a box.
 Pieces of one class are one area where the gap between them on the ground is small beside their own size.
-Crosswalks are composed of bars.
 """
 
 from __future__ import annotations
@@ -20,19 +19,11 @@ from v2hdm.detection.hatching import box_probability, meshes
 from v2hdm.detection.network import NetworkOutput, as_probability, as_shares
 from v2hdm.detection.quads.blobs import outlines_of
 from v2hdm.geometry.planar import rectangle_size
-from v2hdm.geometry.rows import linked_groups, outline_of_row, rows_of_bars
-from v2hdm.records import (
-    BOX,
-    CROSSWALK,
-    CROSSWALK_BAR,
-    TEXT,
-    BoolArray,
-    FloatArray,
-    IntArray,
-    MarkingDetection,
-)
+from v2hdm.geometry.rows import linked_groups
+from v2hdm.records import BOX, TEXT, BoolArray, FloatArray, IntArray, MarkingDetection
 
-_LEAST_CELLS = 5  # elements of paint of a piece: fewer are noise
+_LEAST_CELLS = 5  # elements of paint of an area's largest piece: fewer are noise
+_LEAST_CELLS_BESIDE = 2  # elements of paint of a piece beside such a piece: from afar a letter has few
 _LEAST_SHARE = 0.25
 """Least share of the area's class in a connected piece of paint of its group of classes: the network may give
 the foot of an arrow such a name."""
@@ -103,6 +94,8 @@ def find_areas(
     for name in names:
         named = [piece for piece in pieces if piece.kind == name]
         for members in _together(named, _MOST_GAP_M.get(name, _OTHER_GAP_M)):
+            if max(named[k].cells for k in members) < _LEAST_CELLS:
+                continue
             area = _area(name, [named[k] for k in members], output, camera, catalogue)
             ground = camera.unproject(area.outline_px)
             within = camera.range_m(ground.mean(axis=0)) <= max_range_m
@@ -115,30 +108,6 @@ def _named_together(names: Sequence[str]) -> list[tuple[str, ...]]:
     """The classes of areas; those of which a piece may show both to the network are together."""
     written = (TEXT, BOX) if {TEXT, BOX} <= set(names) else ()
     return [*([written] if written else []), *((name,) for name in names if name not in written)]
-
-
-def find_crosswalks(
-    markings: Sequence[MarkingDetection], camera: RoadCamera
-) -> list[tuple[MarkingDetection, tuple[int, ...]]]:
-    """The crosswalks of an image's bars, each with ``outline_px`` (4, 2) and the indices of its bars."""
-    bars = [k for k, marking in enumerate(markings) if marking.kind == CROSSWALK_BAR]
-    ground = camera.unproject(np.array([markings[k].corners_px for k in bars]).reshape(-1, 4, 2))
-    on_ground = np.flatnonzero(np.isfinite(ground).all(axis=(1, 2)))
-    crosswalks = []
-    for row in rows_of_bars(ground[on_ground]):
-        parts = tuple(bars[k] for k in on_ground[row].tolist())
-        outline_px = camera.project(outline_of_row(ground[on_ground[row]]).corners)
-        crosswalk = MarkingDetection(
-            kind=CROSSWALK,
-            score=float(np.mean([markings[k].score for k in parts])),
-            corners_px=np.full((4, 2), np.nan),
-            covariance_px=np.full((8, 8), np.nan),
-            corner_valid=np.zeros(4, dtype=np.bool_),
-            outline_px=outline_px,
-            outline_seen=np.ones(4, dtype=np.bool_),
-        )
-        crosswalks.append((crosswalk, parts))
-    return crosswalks
 
 
 class _Part(NamedTuple):
@@ -214,7 +183,7 @@ def _pieces(
     pieces = []
     for number, points in enumerate(outlines_of(level, piece, len(stats) - 1), start=1):
         cells = int(stats[number, cv2.CC_STAT_AREA])
-        if cells < _LEAST_CELLS:
+        if cells < _LEAST_CELLS_BESIDE:
             continue
         elements = np.flatnonzero(of_element == number)
         row = part.rows[elements]

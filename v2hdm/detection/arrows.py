@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from v2hdm.detection.camera import RoadCamera
+from v2hdm.detection.network import as_log_odds
 from v2hdm.detection.quads.propose import BORDER_PX, Proposal
 from v2hdm.geometry.planar import smallest_rectangle
 from v2hdm.records import FloatArray
@@ -20,7 +21,6 @@ FEATURES = ("short", "standing")
 
 _USUAL_LENGTH_M = 2.0  # of the shortest arrows of standards less what an outline loses, m
 _OUTLINE_PX = 2.0  # by which an outline may be too short, a px at either end
-_MOST_NAMED = 0.999  # share named an arrow from which more says nothing
 
 FITTED = (6.01, -3.59)
 """Weights of the features, fitted to photographs and renders by ``python -m train.fit_arrows``."""
@@ -52,11 +52,5 @@ def features_of(piece: Proposal, camera: RoadCamera) -> FloatArray:
 
 def arrow_probability(share: float, features: FloatArray, weights: tuple[float, ...] = FITTED) -> float:
     """The probability that a piece of such features (F,), named an arrow by ``share``, is one."""
-    odds = named_log_odds(share) + float(features @ np.array(weights))
+    odds = float(as_log_odds(np.array(share))) + float(features @ np.array(weights))
     return float(1.0 / (1.0 + np.exp(-odds)))
-
-
-def named_log_odds(share: float) -> float:
-    """The log odds of the network's name."""
-    share = float(np.clip(share, 1.0 - _MOST_NAMED, _MOST_NAMED))
-    return float(np.log(share / (1.0 - share)))

@@ -15,13 +15,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from v2hdm.catalogue import Catalogue
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.company import COMPANY, company
-from v2hdm.detection.evidence import gather, rectified_views
+from v2hdm.detection.crosswalks import LEAST_NAMED, in_rows
+from v2hdm.detection.evidence import FEATURES, gather, rectified_views
 from v2hdm.detection.hidden import hidden_ends
 from v2hdm.detection.network import as_probability, open_session
 from v2hdm.detection.options import DetectorOptions
@@ -30,7 +32,16 @@ from v2hdm.detection.quads.patch import ImageQuads, Patches
 from v2hdm.detection.quads.propose import Proposal, Proposals, open_sides
 from v2hdm.detection.weights import CONFIDENCE_FILE, JUDGE_FILE
 from v2hdm.geometry.planar import Quad
-from v2hdm.records import DIAMOND, LANE_DASH, STOP_LINE, BoolArray, FloatArray, MarkingDetection
+from v2hdm.records import (
+    CROSSWALK_BAR,
+    DIAMOND,
+    LANE_DASH,
+    STOP_LINE,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    MarkingDetection,
+)
 
 JUDGE_INPUTS = ("views", "evidence", "shape")
 JUDGE_OUTPUTS = ("odds", "log_side_sigma")
@@ -115,26 +126,47 @@ def find_markings(
     """The quadrilaterals that are likely enough to be whole markings, each as its likeliest class."""
     if readings is None:
         return []
+    likeliest = likeliest_readings(readings)
+    best = likeliest.reading
+    score = in_rows(likeliest.score, readings.ground[best], likeliest.may_be_bar)
+    turned = (np.arange(4) - readings.first_side[best, None]) % 4
+    corners_px = readings.fit.corners_px
+    side_sigma_px = np.take_along_axis(likeliest.side_sigma_px, turned, axis=1)
+    # Its paint may go on behind the thing for any length.
+    length_px = readings.fit.quad.length.max(axis=1)[:, None]
+    side_sigma_px = np.where(readings.hidden_ends, OPEN_SIGMA * length_px, side_sigma_px)
+    covariance = readings.fit.covariance_px(side_sigma_px)
+    valid = _are_points(covariance, corners_px, camera) & camera.inside(corners_px, options.border_px)
+    return [
+        MarkingDetection(readings.kinds[row], float(score[m]), corners_px[m], covariance[m], valid[m])
+        for m, row in enumerate(best.tolist())
+        if score[m] >= options.min_confidence and not likeliest.is_left_out[m]
+    ]
+
+
+class Likeliest(NamedTuple):
+    """The likeliest reading of each of M quadrilaterals."""
+
+    reading: IntArray  # (M,)
+    score: FloatArray  # (M,) its probability
+    side_sigma_px: FloatArray  # (M, 4) how far each side in its view may be off
+    is_left_out: BoolArray  # (M,) for the sake of its parts, or of what it is a part of
+    may_be_bar: BoolArray  # (M,) of a crosswalk
+
+
+def likeliest_readings(readings: Readings) -> Likeliest:
+    """What each quadrilateral is, of those of one image, before rows of bars are looked for."""
     odds, side_sigma_px = classify_alone(readings.evidence, readings.views, readings.kinds)
     score = classify_among(odds, readings.ground, readings.kinds)
     # The reading of each quadrilateral with the highest score; of equals the likelier.
     order = np.lexsort((-np.arange(len(score)), score))
     best = np.zeros(int(readings.quadrilateral.max()) + 1, dtype=np.intp)
     best[readings.quadrilateral[order]] = order
-    turned = (np.arange(4) - readings.first_side[best, None]) % 4
-    corners_px = readings.fit.corners_px
-    side_sigma_px = np.take_along_axis(side_sigma_px[best], turned, axis=1)
-    # Its paint may go on behind the thing for any length.
-    length_px = readings.fit.quad.length.max(axis=1)[:, None]
-    side_sigma_px = np.where(readings.hidden_ends, OPEN_SIGMA * length_px, side_sigma_px)
-    covariance = readings.fit.covariance_px(side_sigma_px)
-    valid = _are_points(covariance, corners_px, camera) & camera.inside(corners_px, options.border_px)
-    left_out = _left_out(readings.parts, score[best])
-    return [
-        MarkingDetection(readings.kinds[row], float(score[row]), corners_px[m], covariance[m], valid[m])
-        for m, row in enumerate(best.tolist())
-        if score[row] >= options.min_confidence and m not in left_out
-    ]
+    is_left_out = np.zeros(len(best), dtype=np.bool_)
+    is_left_out[list(_left_out(readings.parts, score[best]))] = True
+    is_bar = np.array([kind == CROSSWALK_BAR for kind in readings.kinds])[best]
+    is_named = readings.evidence[best, FEATURES.index("share")] >= LEAST_NAMED
+    return Likeliest(best, score[best], side_sigma_px[best], is_left_out, is_bar & is_named & ~is_left_out)
 
 
 def _left_out(parts_of: Mapping[int, Sequence[int]], score: FloatArray) -> set[int]:

@@ -46,12 +46,19 @@ _LEAST_LOG_ODDS = -3.0
 """Crossings of lanes' lines less likely than this are left out; unlikely ones help to follow a known line."""
 
 _MOST_ODDS = 6.0  # log odds of paint beyond which they differ by chance only
+_MOST_CERTAIN = 0.999  # probability from which more is chance
 _MOST_EXPONENT = 30.0  # log odds beyond which a probability is the same: 1e-13 of 0 or 1
 
 
 def as_probability(odds: np.ndarray) -> np.ndarray:
     """Probabilities, in the shape and precision of the log odds."""
     return np.asarray(1 / (1 + np.exp(-np.clip(odds, -_MOST_EXPONENT, _MOST_EXPONENT))))
+
+
+def as_log_odds(probability: np.ndarray) -> np.ndarray:
+    """Log odds, in the shape of the probabilities, of which those near 0 or 1 say no more than others."""
+    share = np.clip(probability, 1.0 - _MOST_CERTAIN, _MOST_CERTAIN)
+    return np.asarray(np.log(share / (1.0 - share)))
 
 
 @dataclass(frozen=True)

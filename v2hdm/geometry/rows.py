@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,25 @@ _STEP_WIDTHS = (1.2, 4.5)
 bars, MUTCD 3C.05 gaps of 0.3 to 1.5 m between bars of 0.3 to 0.6 m."""
 _STEP_SIGMA = 0.2  # largest deviation, RMS, of bars from an even row, in steps
 _MOST_MISSING = 2  # bars that may be missing between two of a row
+_SAME_PLACE_WIDTHS = 0.9  # step below which two bars, in their widths, are readings of the same paint
+_NEIGHBOURS = 2  # steps on either side whose median is the usual one at a place of a row that an image shows
+_ODD_SHARE = 1 / 3  # largest share of a group's members that are left out of such a row
+
+
+class Tolerance(NamedTuple):
+    """How exact a row is."""
+
+    aside: float  # largest offset of neighbours along the bars, in their lengths
+    least_step: float  # from bar to bar, in widths
+    degree: int  # of the polynomials that places follow: 1 is a straight row of even steps
+
+
+MAPPED = Tolerance(aside=0.5, least_step=_STEP_WIDTHS[0], degree=1)
+"""Of a row on a map, which is metric."""
+
+IN_IMAGE = Tolerance(aside=0.75, least_step=1.0, degree=2)
+"""Of a row that an image shows, over a camera whose mounting and lens are known about: steps grow along the
+row, the row bends, and blur widens bars that are far away. Chosen on photographs that networks learn from."""
 
 
 class _Bars(NamedTuple):
@@ -45,10 +65,11 @@ def _bars_of(corners: FloatArray) -> _Bars:
     return _Bars(corners.mean(axis=1), longer / length[:, None], length, np.maximum(size.min(axis=1), 1e-9))
 
 
-def rows_of_bars(corners: FloatArray) -> list[IntArray]:
+def rows_of_bars(corners: FloatArray, tolerance: Tolerance = MAPPED) -> list[IntArray]:
     """The rows among quadrilaterals (N, 4, 2) on the ground, m: the indices of each row's bars, in order.
 
-    A row has three or more parallel bars of one size at even steps; some of its bars may be missing.
+    A row has three or more parallel bars of one size at even steps; some of its bars may be missing. Of a row
+    that is not straight, bars at odd places are left out.
     """
     if len(corners) < LEAST_BARS:
         return []
@@ -61,11 +82,14 @@ def rows_of_bars(corners: FloatArray) -> list[IntArray]:
     squared += (np.arccos(np.minimum(cosine, 1.0)) / _TURNED_SIGMA_RAD) ** 2
     offset = bars.centre - bars.centre[:, None]
     along = np.abs(np.einsum("ijk,ik->ij", offset, bars.way))
-    widths = np.abs(np.einsum("ijk,ik->ij", offset, turned_left(bars.way))) / bars.width
-    is_next = (squared < _MOST_SQUARED) & (along < bars.length / 2)
-    is_next &= (widths > _STEP_WIDTHS[0]) & (widths < _STEP_WIDTHS[1] * (1 + _MOST_MISSING))
+    across = np.abs(np.einsum("ijk,ik->ij", offset, turned_left(bars.way)))
+    lengths = along / np.sqrt(bars.length[:, None] * bars.length)
+    widths = across / np.sqrt(bars.width[:, None] * bars.width)
+    is_next = (squared < _MOST_SQUARED) & (lengths < tolerance.aside)
+    is_next &= (widths > tolerance.least_step) & (widths < _STEP_WIDTHS[1] * (1 + _MOST_MISSING))
     is_next &= is_next.T
-    rows = (_even_row(members, bars) for members in linked_groups(is_next))
+    find_row = _even_row if tolerance.degree == 1 else partial(_bent_row, tolerance=tolerance)
+    rows = (find_row(members, bars) for members in linked_groups(is_next))
     return [row for row in rows if row is not None]
 
 
@@ -104,6 +128,48 @@ def _even_row(members: IntArray, bars: _Bars) -> IntArray | None:
     is_even = np.sqrt(np.mean(off**2)) < _STEP_SIGMA * step
     is_straight = np.sqrt(np.mean(beside**2)) < _STEP_SIGMA * float(np.median(bars.length[members]))
     return members[order] if is_even and is_straight else None
+
+
+def _bent_row(members: IntArray, bars: _Bars, tolerance: Tolerance) -> IntArray | None:
+    """The bars in order of a row whose steps grow and which may bend, less bars at odd places; else None."""
+    least = max(LEAST_BARS, len(members) * (1 - _ODD_SHARE))
+    while len(members) >= least:
+        centres = bars.centre[members] - bars.centre[members].mean(axis=0)
+        course = np.linalg.svd(centres, full_matrices=False)[2][0]
+        course = course * np.sign(course[np.abs(course).argmax()])  # its sign is arbitrary
+        order = np.argsort(centres @ course)
+        members = members[order]
+        centres = centres[order]
+        width = bars.width[members]
+        steps = np.diff(centres @ course)
+        is_same_place = steps < _SAME_PLACE_WIDTHS * np.sqrt(width[1:] * width[:-1])
+        if is_same_place.any():
+            first = int(is_same_place.argmax())
+            size = (bars.width * bars.length)[members]
+            members = np.delete(members, first + int(size[first] > size[first + 1]))
+            continue
+        step = _usual_steps(steps)
+        off = _off_places(centres @ course, steps / step, tolerance.degree) / float(np.median(step))
+        beside = _off_places(centres @ turned_left(course), steps / step, tolerance.degree)
+        beside = beside / float(np.median(bars.length[members]))
+        is_step = tolerance.least_step < np.median(step) / np.median(width) < _STEP_WIDTHS[1]
+        if is_step and max(np.mean(off**2), np.mean(beside**2)) < _STEP_SIGMA**2:
+            return members
+        members = np.delete(members, int(np.hypot(off, beside).argmax()))
+    return None
+
+
+def _usual_steps(steps: FloatArray) -> FloatArray:
+    """The median of the steps about each of steps (N,)."""
+    places = range(len(steps))
+    return np.array([np.median(steps[max(k - _NEIGHBOURS, 0) : k + _NEIGHBOURS + 1]) for k in places])
+
+
+def _off_places(places: FloatArray, steps: FloatArray, degree: int) -> FloatArray:
+    """How far places (N,) are off a polynomial of their numbers, by steps (N - 1,) in usual ones."""
+    number = np.concatenate([[0], np.cumsum(np.maximum(np.round(steps), 1))])
+    # Three places alone would follow any bend.
+    return places - np.polyval(np.polyfit(number, places, min(degree, len(places) - 2)), number)
 
 
 class RowOutline(NamedTuple):

@@ -3,6 +3,7 @@
 #include "adjust_batch.h"
 #include "adjust_linearise.h"
 #include "adjust_evaluate.h"
+#include "adjust_ground.h"
 #include "adjust_substitute.h"
 
 namespace v2hdm::adjust {

@@ -224,7 +224,7 @@ def _route_chart(route: Route, residuals: GroundResiduals) -> str:
             fit.plot(middles_m, rms_px, label=name, lw=1.1, **_look(number))
         fit.set_ylabel("RMS residual (px)")
         fit.set_ylim(bottom=0)
-        fit.legend(loc="upper right", ncols=len(residuals.cameras), fontsize=8.5)
+        _legend_above(fit)
         if route.recorded is not None:
             moved_cm = 100 * (np.linalg.inv(route.recorded) @ route.map_from_vehicle)[:, :2, 3]
             for axis, name in enumerate(("forward", "left")):
@@ -236,12 +236,18 @@ def _route_chart(route: Route, residuals: GroundResiduals) -> str:
                 panels[1].plot(way_m, shift, label=name, lw=1.1, **look)
             panels[1].axhline(0, color=MUTED, lw=0.6)
             panels[1].set_ylabel("correction (cm)")
-            panels[1].legend(loc="upper right", ncols=2, fontsize=8.5)
+            _legend_above(panels[1])
         for axes in panels:
             axes.grid(axis="y")
             axes.set_xlim(0, total)
         panels[-1].set_xlabel("distance driven (m)")
     return out[0]
+
+
+def _legend_above(axes: Axes) -> None:
+    """Name the lines above the axes, where the legend covers none of them."""
+    count = len(axes.get_legend_handles_labels()[0])
+    axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=count, fontsize=8.5, borderaxespad=0)
 
 
 def radius_chart(radii_cm: Mapping[str, FloatArray]) -> str:
