@@ -17,6 +17,13 @@ _LARGEST_YAW_RATE_RAD_S = 3.0  # largest yaw rate, rad/s: full lock at a crawl i
 _GAP_S = 0.3  # time without a sample, s, from which the last one says little
 _ACCELERATION_M_S2 = 1.5  # standard deviation of the acceleration in a gap: a yard truck brakes with 2 to 3
 _TURN_ACCELERATION_RAD_S2 = 0.3  # the same of the yaw rate: full lock within two seconds
+# A slope of the samples is that of the motion where it exceeds so many sigmas of their noise: a noise taken for
+# motion would say that the odometry is on time, whatever it is. One in 16,000 slopes of noise alone does.
+_SURE_SLOPE = 4.0
+_SLOPE_REACHES_S = (0.1, 0.3)  # times, s, on either side over which a slope is fitted: a short one if it is sure
+_LEAST_SAMPLES = 4  # samples from which a slope, and what it may be wrong by, is known
+_NOISE_SAMPLES = 64  # samples by whose deviations from their neighbours the noise is known
+_MEDIAN_SQUARE = 0.455  # median of the square of a standard normal
 _CLOCK_BACK_S = 1.0  # a stamp that lies farther back than this, s, is of a clock that was set
 
 
@@ -61,7 +68,7 @@ class Piece(NamedTuple):
     yaw_rate_rad_s: float
     speed_sigma_m_s: float  # beside the noise of samples: of a gap
     yaw_rate_sigma_rad_s: float
-    faster_m_s: float = 0.0  # the speed at its end less that at its beginning
+    faster_m_s: float = 0.0  # the speed at its end less that at its beginning, 0 where that may be noise
     turning_more_rad_s: float = 0.0  # the same of the yaw rate
 
 
@@ -73,6 +80,8 @@ class MotionLog:
     samples: list[Motion] = field(default_factory=list)
     refused: int = 0
     late: int = 0
+    _noise: FloatArray = field(default_factory=lambda: np.zeros(2))  # variances of speeds and of yaw rates
+    _noise_at: tuple[int, float] | None = None  # number and time of the samples of which these are
 
     def add(self, sample: Motion) -> str | None:
         """Take a sample; a sentence where the clock was set back, so that nothing before it counts."""
@@ -138,13 +147,10 @@ class MotionLog:
             speed = earlier.speed_m_s + share * (later_sample.speed_m_s - earlier.speed_m_s)
             turn = earlier.yaw_rate_rad_s + share * (later_sample.yaw_rate_rad_s - earlier.yaw_rate_rad_s)
             gap_s = self.stamps_s[after] - nearest_s
-            part = length_s / gap_s
-            faster = part * (later_sample.speed_m_s - earlier.speed_m_s)
-            turning_more = part * (later_sample.yaw_rate_rad_s - earlier.yaw_rate_rad_s)
         else:
             speed, turn = self.samples[before][1:]
             gap_s = max(stop_s - nearest_s, nearest_s - start_s)
-            faster = turning_more = 0.0
+        faster, turning_more = (length_s * self._slopes(0.5 * (start_s + stop_s))).tolist()
         unknown_s = max(gap_s - _GAP_S, 0.0)
         return Piece(
             length_s,
@@ -155,6 +161,42 @@ class MotionLog:
             faster,
             turning_more,
         )
+
+
+    def _slopes(self, middle_s: float) -> FloatArray:
+        """How fast speed and yaw rate (2,) change about a time; 0 where that may be noise."""
+        slopes = np.zeros(2)
+        for reach_s in _SLOPE_REACHES_S:
+            first = bisect_left(self.stamps_s, middle_s - reach_s)
+            last = bisect_right(self.stamps_s, middle_s + reach_s)
+            if last - first < _LEAST_SAMPLES:
+                continue
+            table = np.array(self.samples[first:last])
+            from_mean = table - table.mean(axis=0)
+            squared_s2 = float(from_mean[:, 0] @ from_mean[:, 0])
+            if squared_s2 <= 0.0:
+                continue
+            fitted = from_mean[:, 0] @ from_mean[:, 1:] / squared_s2
+            is_sure = fitted**2 * squared_s2 > _SURE_SLOPE**2 * self._noise_squared()
+            slopes = np.where((slopes == 0.0) & is_sure, fitted, slopes)
+        return slopes
+
+    def _noise_squared(self) -> FloatArray:
+        """The variances (2,) of the noise of the last speeds and yaw rates, by how far each is off its neighbours.
+
+        That of a motion's bends and of numbers that are rounded is in it.
+        """
+        newest = (len(self.samples), self.stamps_s[-1])
+        if self._noise_at != newest:
+            table = np.array(self.samples[-_NOISE_SAMPLES:])
+            stamps_s = table[:, 0]
+            share = (stamps_s[1:-1] - stamps_s[:-2]) / (stamps_s[2:] - stamps_s[:-2])
+            between = table[:-2, 1:] + share[:, None] * (table[2:, 1:] - table[:-2, 1:])
+            off = table[1:-1, 1:] - between
+            count = 1.0 + share**2 + (1.0 - share) ** 2
+            self._noise = np.median(off**2 / count[:, None], axis=0) / _MEDIAN_SQUARE
+            self._noise_at = newest
+        return self._noise
 
 
 def moved(pieces: list[Piece]) -> FloatArray:
