@@ -125,13 +125,13 @@ def test_dashes_are_no_lines_for_their_corners_say_more():
 @pytest.mark.parametrize("seed", range(2))
 def test_a_line_holds_the_vehicle_in_its_lane_where_no_marking_is(seed):
     painted = lined(yard(seed))
-    driven = drive(painted, seed, seconds=16.0)
+    driven = drive(painted, seed, seconds=19.0)
     hd_map = mapped(painted, seed)
     errors, bounds = {}, {}
     for has_lines in (True, False):
         localizer = Localizer(hd_map, driven.calibrations, driven.rough(np.random.default_rng(0)))
         for frame, (looks, motion) in enumerate(zip(driven.looks, driven.motion, strict=True)):
-            blind = [replace(look, markings=()) if frame > 30 else look for look in looks]
+            blind = [replace(look, markings=()) if frame > 60 else look for look in looks]
             shown = blind if has_lines else [replace(look, lanes=()) for look in blind]
             pose = localizer.update(shown, motion)
         assert pose.status == Status.TRACKING

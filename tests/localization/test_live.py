@@ -79,7 +79,7 @@ def test_the_stated_covariance_holds():
     assert 0.5 < np.mean(squared) < 3.5  # of two coordinates: honest is 2
 
 
-@pytest.mark.parametrize("late_s", [0.0, 0.05])
+@pytest.mark.parametrize("late_s", [0.0, 0.05, 0.1])
 def test_an_odometry_that_comes_late_is_known_to_and_no_camera_is_blamed(late_s):
     painted = yard(6)
     driven = drive(painted, 6, seconds=16.0, swerve_rad=0.15)
@@ -355,6 +355,43 @@ def test_samples_of_the_odometry_out_of_order_are_put_in_order():
     assert log.stamps_s == sorted(stamps)
     assert log.late == 1
     assert sum(piece.length_s * piece.speed_m_s for piece in log.pieces(0.0, 0.4)) == pytest.approx(0.48)
+
+
+def odometry_log(speed_m_s, yaw_rate_rad_s, seed=0):
+    """Two seconds of 50 Hz, with the noise of wheels and gyro."""
+    rng = np.random.default_rng(seed)
+    log = MotionLog()
+    for stamp_s in np.arange(0.0, 2.0, 0.02).tolist():
+        speed = speed_m_s(stamp_s) + 0.1 * rng.standard_normal()
+        log.add(Motion(stamp_s, speed, yaw_rate_rad_s(stamp_s) + 0.004 * rng.standard_normal()))
+    return log
+
+
+def test_noise_of_an_odometry_is_no_change_of_the_motion():
+    changes = [
+        (piece.faster_m_s, piece.turning_more_rad_s)
+        for seed in range(5)
+        for piece in odometry_log(lambda stamp_s: 4.0, lambda stamp_s: 0.0, seed).pieces(0.5, 2.0)
+    ]
+    assert np.mean(np.array(changes) != 0.0) < 0.01
+
+
+def test_a_bend_and_a_brake_change_the_motion_by_as_much_as_they_do():
+    log = odometry_log(lambda stamp_s: 6.0 - 1.5 * stamp_s, lambda stamp_s: 0.3 * max(stamp_s - 0.5, 0.0))
+    pieces = log.pieces(0.8, 1.8)
+    assert sum(piece.turning_more_rad_s for piece in pieces) == pytest.approx(0.3, rel=0.05)
+    assert sum(piece.faster_m_s for piece in pieces) == pytest.approx(-1.5, rel=0.1)
+
+
+def test_a_straight_drive_does_not_say_how_late_an_odometry_is():
+    """Nor that it is on time, as differences of its noise would."""
+    log = odometry_log(lambda stamp_s: 4.0, lambda stamp_s: 0.0)
+    state = belief.start(0.5, np.zeros(3), np.full(3, 0.01), [MOUNT], MotionNoise())
+    for stamp_s in np.arange(0.6, 1.9, 0.1).tolist():
+        state = belief.predict(state, log.pieces(state.stamp_s, stamp_s), MotionNoise())
+        place = np.array([4.0 * (stamp_s - 0.5), 0.0, 0.0])
+        state = belief.pinned(state, [belief.X, belief.Y, belief.HEADING], place, 1e-3)
+    assert state.covariance([belief.LATE])[0, 0] ** 0.5 > 0.04
 
 
 def test_lines_of_an_odometry_are_json_or_csv_and_may_hold_positions():

@@ -17,10 +17,13 @@ _LARGEST_YAW_RATE_RAD_S = 3.0  # largest yaw rate, rad/s: full lock at a crawl i
 _GAP_S = 0.3  # time without a sample, s, from which the last one says little
 _ACCELERATION_M_S2 = 1.5  # standard deviation of the acceleration in a gap: a yard truck brakes with 2 to 3
 _TURN_ACCELERATION_RAD_S2 = 0.3  # the same of the yaw rate: full lock within two seconds
-# A slope of the samples is that of the motion where it exceeds so many sigmas of their noise: a noise taken for
-# motion would say that the odometry is on time, whatever it is. One in 16,000 slopes of noise alone does.
+# A slope of the samples is that of the motion where it exceeds so many sigmas of their noise: a noise taken
+# for motion would say that the odometry is on time, whatever it is. One in 16,000 slopes of noise alone does.
 _SURE_SLOPE = 4.0
-_SLOPE_REACHES_S = (0.1, 0.3)  # times, s, on either side over which a slope is fitted: a short one if it is sure
+_SLOPE_REACHES_S = (
+    0.1,
+    0.3,
+)  # times, s, on either side over which a slope is fitted: a short one if it is sure
 _LEAST_SAMPLES = 4  # samples from which a slope, and what it may be wrong by, is known
 _NOISE_SAMPLES = 64  # samples by whose deviations from their neighbours the noise is known
 _MEDIAN_SQUARE = 0.455  # median of the square of a standard normal
@@ -162,7 +165,6 @@ class MotionLog:
             turning_more,
         )
 
-
     def _slopes(self, middle_s: float) -> FloatArray:
         """How fast speed and yaw rate (2,) change about a time; 0 where that may be noise."""
         slopes = np.zeros(2)
@@ -182,9 +184,9 @@ class MotionLog:
         return slopes
 
     def _noise_squared(self) -> FloatArray:
-        """The variances (2,) of the noise of the last speeds and yaw rates, by how far each is off its neighbours.
+        """The variances (2,) of the noise of the last speeds and yaw rates, by how far each is off others.
 
-        That of a motion's bends and of numbers that are rounded is in it.
+        What a motion bends between two samples, and what numbers are rounded by, is in it.
         """
         newest = (len(self.samples), self.stamps_s[-1])
         if self._noise_at != newest:
