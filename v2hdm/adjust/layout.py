@@ -255,7 +255,7 @@ def _sorted_observations(problem: Problem, rank: IntArray) -> _Sorted:
         )
     measured = np.empty((2, count))
     root = np.empty((3, count))
-    lines = lay_out(columns, order, LINE_EXCESS, measured, root)
+    lines = lay_out(columns, order, pair, frames, LINE_EXCESS, measured, root)
     return _Sorted(order, corner, pair, measured, root, lines > 0)
 
 

@@ -325,18 +325,20 @@ def arrange(
 def lay_out(
     observations: Seen,
     order: NDArray[np.int32],
+    pair: NDArray[np.int32],
+    frames: int,
     line_excess: float,
     measured: FloatArray,
     root: FloatArray,
 ) -> int:
     """Write observations in an order (K,): where at depth 1, and their root information.
 
-    Returns how many are of lines, by the ``line_excess`` of their covariances.
+    ``pair`` (K,) are their cameras and frames in this order. Returns how many are of lines, by the ``line_excess`` of their covariances.
     """
     lines = 0
     for i in range(len(order)):
         k = order[i]
-        c = observations.camera[k]
+        c = pair[i] // frames
         fx = observations.intrinsic[c, 0]
         fy = observations.intrinsic[c, 1]
         xx = observations.covariance_px[k, 0, 0]

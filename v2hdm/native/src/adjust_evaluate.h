@@ -138,6 +138,7 @@ void evaluate(
     const Evaluation& out) {
     double *step = scratch.step, *gradient = scratch.gradient;
     const bool is_by_camera = cameras_alone_move(layout, base);
+    CameraSums sums(base.pairs / layout.moments, 6);
     for (Index q = begin; q < end; ++q) {
         number_touched(layout, q, scratch.slot);
         LossSum losses;
@@ -155,7 +156,7 @@ void evaluate(
                 out.corners[2 * c] = base.corners[2 * c] + step[i];
                 out.corners[2 * c + 1] = base.corners[2 * c + 1] + step[i + 1];
                 if (is_by_camera) {
-                    see_corner_by_camera(layout, base, by.table, c, scratch, out, losses, gradient + i);
+                    see_corner_by_camera(layout, base, by.table, c, out, sums, losses, gradient + i);
                 } else {
                     see_corner(layout, base, by.table, c, scratch, out, losses, gradient + i);
                 }
@@ -163,6 +164,7 @@ void evaluate(
             add_corner_priors(layout, u, out.corners, gradient, out.costs + 3 * q);
             carry_unit(layout, base, q, u, coupled, scratch, out);
         }
+        if (is_by_camera) sums.flush_wrenches(layout, q, 0, out.wrench);
         out.costs[3 * q] = losses.cost(base);
     }
 }
