@@ -235,7 +235,7 @@ def first_unsound(
         for axis in range(2):
             focal = observations.intrinsic[c, axis]
             centre = observations.intrinsic[c, 2 + axis]
-            if not abs((observations.pinhole_px[k, axis] - centre) / focal) <= max_slope:
+            if not abs(observations.pinhole_px[k, axis] - centre) <= max_slope * focal:
                 return k
     return -1
 

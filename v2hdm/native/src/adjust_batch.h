@@ -152,14 +152,22 @@ struct Batch {
     }
 };
 
-// Derivatives of a batch, as Derived, and the same times the weights of the Hessian.
+// Derivatives of a batch, as Derived, and residuals, both so that their products are those of the weighted ones: times
+// the roots of the Hessian's weights, which are 0 in lanes that fill up.
 struct BatchDerived {
-    Lanes jacobian[16], weighted[16];
+    Lanes jacobian[16], r0, r1;
 
     explicit BatchDerived(const Batch& at) {
-        Lanes *j = jacobian, floor;
+        Lanes *j = jacobian, root;
         for (int l = 0; l < at.size; ++l) {
-            const double a = at.a[l], b = at.b[l], c = at.c[l], px = at.px[l], py = at.py[l], pz = at.pz[l];
+            const double floor = std::sqrt(floored(at.weight[l]));
+            const double weight = at.weight[l] / floor;
+            root[l] = l < at.count ? floor : 0.0;
+            r0[l] = l < at.count ? weight * at.r0[l] : 0.0;
+            r1[l] = l < at.count ? weight * at.r1[l] : 0.0;
+        }
+        for (int l = 0; l < at.size; ++l) {
+            const double a = at.a[l] * root[l], b = at.b[l] * root[l], c = at.c[l] * root[l], px = at.px[l], py = at.py[l], pz = at.pz[l];
             const double ad = a * at.inverse[l], bd = b * at.inverse[l], cd = c * at.inverse[l];
             const double g = a * px * at.slope[l], h = (b * px + c * py) * at.slope[l];
             j[0][l] = ad;
@@ -178,11 +186,6 @@ struct BatchDerived {
             j[13][l] = ad * at.down[0][l] + g * at.down[2][l];
             j[14][l] = bd * at.right[0][l] + cd * at.right[1][l] + h * at.right[2][l];
             j[15][l] = bd * at.down[0][l] + cd * at.down[1][l] + h * at.down[2][l];
-            floor[l] = floored(at.weight[l]);
-        }
-        for (int l = at.count; l < at.size; ++l) floor[l] = 0.0;
-        for (int p = 0; p < 16; ++p) {
-            for (int l = 0; l < at.size; ++l) weighted[p][l] = floor[l] * j[p][l];
         }
     }
 };
@@ -192,26 +195,21 @@ constexpr int SQUARES = 21;  // numbers of J'J by a camera's tangent, the first 
 // Adds a batch to the camera's sums and rows, and to the corner's block (3,) and gradient (2,).
 void add_batch(const Batch& batch, double* sums, double* top, double* low, double* block, double* gradient) {
     const BatchDerived derived(batch);
-    const Lanes *j = derived.jacobian, *w = derived.weighted;
+    const Lanes* j = derived.jacobian;
     const int size = batch.size;
     for (int p = 0; p < 6; ++p) {
-        for (int s = p; s < 6; ++s, sums += VECTOR) add_dots(sums, w[p], j[s], w[6 + p], j[6 + s], size);
+        for (int s = p; s < 6; ++s, sums += VECTOR) add_dots(sums, j[p], j[s], j[6 + p], j[6 + s], size);
     }
     for (int p = 0; p < 6; ++p) {
-        top[p] += dots(w[12], j[p], w[14], j[6 + p], size);
-        low[p] += dots(w[13], j[p], w[15], j[6 + p], size);
+        top[p] += dots(j[12], j[p], j[14], j[6 + p], size);
+        low[p] += dots(j[13], j[p], j[15], j[6 + p], size);
     }
-    block[0] += dots(w[12], j[12], w[14], j[14], size);
-    block[1] += dots(w[13], j[12], w[15], j[14], size);
-    block[2] += dots(w[13], j[13], w[15], j[15], size);
-    Lanes w0, w1;
-    for (int l = 0; l < size; ++l) {
-        w0[l] = batch.weight[l] * batch.r0[l];
-        w1[l] = batch.weight[l] * batch.r1[l];
-    }
-    for (int p = 0; p < 6; ++p, sums += VECTOR) add_dots(sums, j[p], w0, j[6 + p], w1, size);
-    gradient[0] += dots(j[12], w0, j[14], w1, size);
-    gradient[1] += dots(j[13], w0, j[15], w1, size);
+    block[0] += dots(j[12], j[12], j[14], j[14], size);
+    block[1] += dots(j[13], j[12], j[15], j[14], size);
+    block[2] += dots(j[13], j[13], j[15], j[15], size);
+    for (int p = 0; p < 6; ++p, sums += VECTOR) add_dots(sums, j[p], derived.r0, j[6 + p], derived.r1, size);
+    gradient[0] += dots(j[12], derived.r0, j[14], derived.r1, size);
+    gradient[1] += dots(j[13], derived.r0, j[15], derived.r1, size);
 }
 
 // add_corner where cameras alone move.

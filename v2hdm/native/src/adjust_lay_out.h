@@ -2,7 +2,7 @@
 namespace v2hdm::adjust {
 namespace {
 
-constexpr Index AHEAD = 16;  // observations ahead: about as long as memory takes
+constexpr Index AHEAD = 48;  // observations ahead: about as long as memory takes
 
 // Has an observation, of which the next is anywhere in memory, on its way.
 void prefetch(const Columns& columns, Index k) {

@@ -16,8 +16,8 @@ bool is_sound(const Columns& columns, Index k, double symmetric_to, double max_s
     if (!((xy - yx) * (xy - yx) <= symmetric_to * symmetric_to * xx * yy)) return false;
     const double* intrinsic = columns.intrinsic + 4 * columns.camera[k];
     for (int axis = 0; axis < 2; ++axis) {
-        const double slope = (columns.pinhole_px[2 * k + axis] - intrinsic[2 + axis]) / intrinsic[axis];
-        if (!(std::fabs(slope) <= max_slope)) return false;
+        const double aside_px = std::fabs(columns.pinhole_px[2 * k + axis] - intrinsic[2 + axis]);
+        if (!(aside_px <= max_slope * intrinsic[axis])) return false;
     }
     return true;
 }
