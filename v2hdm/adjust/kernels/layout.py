@@ -333,7 +333,8 @@ def lay_out(
 ) -> int:
     """Write observations in an order (K,): where at depth 1, and their root information.
 
-    ``pair`` (K,) are their cameras and frames in this order. Returns how many are of lines, by the ``line_excess`` of their covariances.
+    ``pair`` (K,) are their cameras and frames in this order. Returns how many are of lines, by the
+    ``line_excess`` of their covariances.
     """
     lines = 0
     for i in range(len(order)):
@@ -357,11 +358,10 @@ def lay_out(
     return lines
 
 
-# :class:`v2hdm.adjust.solution.Verdict`, which numba does not know.
-_ACCEPTED = 0
-_CONTRADICTS = 1
-_UNCONFIRMED = 2
-_BEHIND_CAMERA = 3
+_ACCEPTED = 0  # a Verdict of v2hdm.adjust.solution; numba knows no enumerations
+_CONTRADICTS = 1  # a Verdict
+_UNCONFIRMED = 2  # a Verdict
+_BEHIND_CAMERA = 3  # a Verdict
 
 
 @twin("adjust.classify")
