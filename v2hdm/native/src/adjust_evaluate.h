@@ -169,6 +169,18 @@ void evaluate(
     }
 }
 
+constexpr Index ROWS_AHEAD = 48;  // observations ahead: about as long as memory takes
+
+// Has the places of an observation in a report, of which the next is anywhere in memory, on their way.
+void prefetch_rows(const Report& out, Index row) {
+#ifdef __GNUC__
+    __builtin_prefetch(out.residual_px + 2 * row, 1);
+    __builtin_prefetch(out.mahalanobis2 + row, 1);
+#else
+    static_cast<void>(out), static_cast<void>(row);
+#endif
+}
+
 void report(
     Index begin, Index end, const Layout& layout, const double* table, const double* corners, const int32_t* order,
     const double* focal, const Report& out) {
@@ -178,6 +190,7 @@ void report(
             const auto [a, b, d] = root_of(layout, k);
             const double r0 = a * seen.u, r1 = b * seen.u + d * seen.v;
             const Index row = order[k], camera = layout.pair[k] / layout.moments;
+            prefetch_rows(out, order[std::min(k + ROWS_AHEAD, layout.observations - 1)]);
             out.residual_px[2 * row] = seen.u * focal[2 * camera];
             out.residual_px[2 * row + 1] = seen.v * focal[2 * camera + 1];
             out.mahalanobis2[row] = r0 * r0 + r1 * r1;
