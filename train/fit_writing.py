@@ -1,6 +1,6 @@
 """Fits what words of one image say of each other, in :mod:`v2hdm.detection.writing`.
 
-    python -m train.fit_writing LABELS.json IMAGES [--photographs 400] [--renders 30]
+    python -m train.fit_writing LABELS.json IMAGES [--photographs 240] [--renders 12]
 
 LABELS.json and IMAGES are those of ROAD MARK. Photographs of it that networks learn from, every second of
 them as if nobody stated its mounting, and rendered scenes are shown to the shipped network. An area that it
@@ -120,8 +120,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("labels", type=Path)
     parser.add_argument("images", type=Path)
-    parser.add_argument("--photographs", type=int, default=400)
-    parser.add_argument("--renders", type=int, default=30)
+    parser.add_argument("--photographs", type=int, default=240)
+    parser.add_argument("--renders", type=int, default=12)
     parsed = parser.parse_args()
     cv2.setNumThreads(1)
     detector = Detector.load(options=DetectorOptions(max_range_m=RANGE_M))

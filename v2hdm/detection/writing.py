@@ -15,7 +15,7 @@ from v2hdm.detection.network import as_log_odds, as_probability
 from v2hdm.geometry.planar import rectangle_size
 from v2hdm.records import FloatArray
 
-FITTED = 3.15
+FITTED = 4.45
 """Weight of the company, fitted to photographs and renders by ``python -m train.fit_writing``."""
 
 _REACH = 1.0  # largest gap between words of one message, in lengths of the longer one
