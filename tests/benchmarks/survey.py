@@ -10,10 +10,14 @@ in rounds over its sections: corners in mm, sigmas in per cent, seconds of CPU.
 ``python -m tests.benchmarks.survey --grow KM [KM ...] [--section-m M] [--workers N]``: a map of each length
 in sections, in a process of its own: peak memory, CPU, errors and coverage against the truth; then the
 exponents of growth.
+
+``python -m tests.benchmarks.survey --apart KM [--section-m M]``: the same survey mapped at once and in
+sections, each in a process of its own: CPU, how far corners are apart, and the ratio of their sigmas.
 """
 
 import argparse
 import json
+import pickle
 import resource
 import subprocess
 import sys
@@ -41,9 +45,10 @@ from v2hdm.io.drive import join_drives, read_drive
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.io.maps.reading import read_geojson
 from v2hdm.mapping.inputs import Inputs
+from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.sections.run import map_in_sections
-from v2hdm.records import Drive, FloatArray, HDMap, Image, IntArray, MarkingDetection, Truth
+from v2hdm.records import BEST, Drive, FloatArray, HDMap, Image, IntArray, MarkingDetection, Truth
 from v2hdm.simulate.port.config import PortConfig, SurveyConfig
 from v2hdm.simulate.survey.drive import simulated_drives
 
@@ -212,14 +217,20 @@ class FromFiles:
         return [read_detections(image.path, at) for at, image in enumerate(images)]
 
 
-def one_length(length_km: float, section_m: float, workers: int, cache: Path) -> None:
-    """Map one survey and print its figures as JSON."""
+def one_length(length_km: float, section_m: float, workers: int, cache: Path, keep: Path | None) -> None:
+    """Map one survey, in no sections if these are of 0 m, and print its figures as JSON."""
     drive, true_map = survey_of(length_km, cache)
+    cameras = list(drive.cameras)
     begin_s = time.perf_counter()
-    with open_executor(workers) as executor, tempfile.TemporaryDirectory(dir=cache) as folder:
-        result = map_in_sections(
-            drive, FromFiles(), list(drive.cameras), MappingOptions(), section_m, executor, Path(folder)
-        )
+    if section_m == 0:
+        result = run_methods(drive, detections_of(drive), cameras, MappingOptions(), naive=False)[BEST]
+    else:
+        with open_executor(workers) as executor, tempfile.TemporaryDirectory(dir=cache) as folder:
+            result = map_in_sections(
+                drive, FromFiles(), cameras, MappingOptions(), section_m, executor, Path(folder)
+            )
+    if keep is not None:
+        keep.write_bytes(pickle.dumps(result.hd_map))
     usage = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     figures = {
         "km": length_km,
@@ -237,10 +248,13 @@ def one_length(length_km: float, section_m: float, workers: int, cache: Path) ->
 
 
 def _against(hd_map: HDMap, true_map: HDMap) -> dict[str, float]:
-    """RMSE of corners, cm, the share of coordinates within 1.96 sigmas, and the false markings."""
+    """RMSE of corners, cm, the share of coordinates within 1.96 sigmas, and the false markings.
+
+    Sigmas are those of corners and of markings' centres.
+    """
     true = np.array([marking.corners_map for marking in true_map.markings])
     tree = cKDTree(true.mean(axis=1))
-    off, inside, false = [], [], 0
+    off, inside, centre_inside, false = [], [], [], 0
     for marking in hd_map.markings:
         away_m, j = tree.query(marking.corners_map.mean(axis=0))
         if away_m > 0.5 or true_map.markings[int(j)].kind != marking.kind:
@@ -251,9 +265,63 @@ def _against(hd_map: HDMap, true_map: HDMap) -> dict[str, float]:
             turned, key=lambda corners: np.abs(marking.corners_map - corners).max()
         )
         off.append(error)
-        inside.append(np.abs(error.ravel()) < 1.96 * np.sqrt(np.diag(marking.covariance_m2)))
-    rmse_cm = 100 * float(np.sqrt(2 * np.mean(np.square(off))))
-    return {"rmse_cm": rmse_cm, "inside_95": float(np.mean(inside)), "false": false}
+        covariance_m2 = marking.covariance_m2
+        inside.append(np.abs(error.ravel()) < 1.96 * np.sqrt(np.diag(covariance_m2)))
+        centre_inside.append(np.abs(error.mean(axis=0)) < 1.96 * np.sqrt(_of_centre(covariance_m2)))
+    return {
+        "rmse_cm": 100 * float(np.sqrt(2 * np.mean(np.square(off)))),
+        "inside_95": float(np.mean(inside)),
+        "centres_inside_95": float(np.mean(centre_inside)),
+        "false": false,
+    }
+
+
+def _of_centre(covariance_m2: FloatArray) -> FloatArray:
+    """The variances (2,) of a marking's centre, m^2."""
+    return np.asarray(covariance_m2.reshape(4, 2, 4, 2).mean(axis=(0, 2)).diagonal())
+
+
+def apart(length_km: float, section_m: float, cache: Path) -> None:
+    """Print how far a map in sections is from that of one solve, and the CPU of both."""
+    maps: list[HDMap] = []
+    spent_s = []
+    with tempfile.TemporaryDirectory() as folder:
+        for most_m in (0.0, section_m):
+            keep = Path(folder, "map")
+            words = ["--one", str(length_km), "--section-m", str(most_m), "--keep", str(keep)]
+            figures = _in_a_process(words, cache)
+            maps.append(pickle.loads(keep.read_bytes()))
+            spent_s.append(figures["cpu_s"])
+            print(" ".join(f"{key} {value:g}" for key, value in figures.items()), flush=True)
+    print(f"CPU in sections over that at once: {spent_s[1] / spent_s[0]:.2f}")
+    _print_apart(*maps)
+
+
+def _print_apart(whole: HDMap, parted: HDMap) -> None:
+    """Print distances of the corners of two maps, and ratios of their sigmas."""
+    corners = np.array([marking.corners_map for marking in whole.markings])
+    away_m, near = cKDTree(corners.mean(axis=1)).query(
+        [marking.corners_map.mean(axis=0) for marking in parted.markings]
+    )
+    are_same = away_m < 0.3
+    off_mm, ratio = [], []
+    for number in np.flatnonzero(are_same).tolist():
+        marking, other = parted.markings[number], whole.markings[int(near[number])]
+        turn = min(
+            range(4),
+            key=lambda turn: np.abs(np.roll(marking.corners_map, turn, axis=0) - other.corners_map).max(),
+        )
+        moved = np.roll(marking.corners_map, turn, axis=0) - other.corners_map
+        off_mm.append(1e3 * np.linalg.norm(moved, axis=1))
+        variance_m2 = np.diag(marking.covariance_m2).reshape(4, 2).sum(axis=1)
+        ratio.append(
+            np.sqrt(np.roll(variance_m2, turn) / np.diag(other.covariance_m2).reshape(4, 2).sum(axis=1))
+        )
+    print(f"{len(whole.markings)} and {len(parted.markings)} markings, {are_same.sum()} of them the same")
+    median, most_of_all, most = np.percentile(off_mm, [50, 95, 100])
+    print(f"corners apart: median {median:.4f}, 95 % within {most_of_all:.4f}, most {most:.4f} mm")
+    share = np.percentile(ratio, [0, 5, 50, 95, 100])
+    print("sigmas, least, 5 %, median, 95 %, most:", " ".join(f"{value:.4f}" for value in share))
 
 
 def grow(lengths_km: list[float], section_m: float, workers: int, cache: Path) -> None:
@@ -261,9 +329,7 @@ def grow(lengths_km: list[float], section_m: float, workers: int, cache: Path) -
     rows = []
     for length_km in lengths_km:
         words = ["--one", str(length_km), "--section-m", str(section_m), "--workers", str(workers)]
-        command = [sys.executable, "-m", "tests.benchmarks.survey", *words, "--cache", str(cache)]
-        done = subprocess.run(command, check=True, capture_output=True, text=True)
-        rows.append(json.loads(done.stdout.splitlines()[-1]))
+        rows.append(_in_a_process(words, cache))
         shown = {key: round(value, 3) for key, value in rows[-1].items()}
         print(" ".join(f"{key} {value:g}" for key, value in shown.items()), flush=True)
     if len(rows) > 1:
@@ -275,6 +341,14 @@ def grow(lengths_km: list[float], section_m: float, workers: int, cache: Path) -
                 print(f"exponent of {key} by {size}: {exponent:.2f}")
 
 
+def _in_a_process(words: list[str], cache: Path) -> dict[str, float]:
+    """The figures that this module prints with some words of its command."""
+    command = [sys.executable, "-m", "tests.benchmarks.survey", *words, "--cache", str(cache)]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    figures: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
+    return figures
+
+
 def main() -> None:
     """Print what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -282,9 +356,11 @@ def main() -> None:
     asked.add_argument("--statistics", type=Path, metavar="DRIVE")
     asked.add_argument("--joint", type=float, metavar="KM")
     asked.add_argument("--grow", type=float, nargs="+", metavar="KM")
+    asked.add_argument("--apart", type=float, metavar="KM")
     asked.add_argument("--one", type=float, metavar="KM", help=argparse.SUPPRESS)
     parser.add_argument("--every", type=int, default=3, metavar="N", help="look at every N-th image")
     parser.add_argument("--section-m", type=float, default=1000.0, metavar="M")
+    parser.add_argument("--keep", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--workers", type=int, default=1, metavar="N")
     parser.add_argument("--cache", type=Path, default=Path("cache"), metavar="DIR", help="keeps the surveys")
     parsed = parser.parse_args()
@@ -294,8 +370,10 @@ def main() -> None:
         joint(parsed.joint, parsed.section_m, parsed.cache)
     elif parsed.grow is not None:
         grow(parsed.grow, parsed.section_m, parsed.workers, parsed.cache)
+    elif parsed.apart is not None:
+        apart(parsed.apart, parsed.section_m, parsed.cache)
     else:
-        one_length(parsed.one, parsed.section_m, parsed.workers, parsed.cache)
+        one_length(parsed.one, parsed.section_m, parsed.workers, parsed.cache, parsed.keep)
 
 
 if __name__ == "__main__":

@@ -286,13 +286,14 @@ def estimate_noise(problem: Problem, solution: Solution) -> tuple[PoseSigma, ...
     states_of = tuple(POSE_STATES[axis] for axis in arrays.states)
     scales = dict.fromkeys(_GROUPS, _Scales())
     generator = torch.Generator()
+    engine = descent.engine
     for _ in range(_ROUNDS):
         sigmas = tuple(_scaled(sigma, scales) for sigma in stated)
         prior = state_prior(replace(problem, pose_sigma=sigmas), states_of)
         transition = arrays.state_transition.new_tensor(prior.transition)
         root = arrays.state_transition.new_tensor(prior.information_root)
         scaled = replace(arrays, state_transition=transition, state_information_root=root)
-        engine = descent.engine.over(scaled)
+        engine = engine.over(scaled)
         whitening = factorise(engine, descent.plan, descent.estimate, descent.robust)
         noise = torch.randn(_DRAWS, whitening.size, generator=generator.manual_seed(0), dtype=torch.float64)
         steps = [whitening.step(y.to(whitening.gradient) - whitening.gradient)[0] for y in (*noise, *-noise)]

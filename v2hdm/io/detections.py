@@ -119,19 +119,27 @@ def _counter_clockwise(markings: Sequence[MarkingDetection]) -> tuple[MarkingDet
 
     The one whose direction is surest tells that of all: noise turns small ones over.
     """
-    turns = [_turning(marking) for marking in markings if marking.corner_valid.all()]
-    if max(turns, key=abs, default=0.0) < _SURELY:
+    whole = [marking for marking in markings if marking.corner_valid.all()]
+    if not whole:
+        return tuple(markings)
+    turns = _turnings(
+        np.stack([marking.corners_px for marking in whole]),
+        np.stack([marking.covariance_px for marking in whole]),
+    )
+    if turns[np.abs(turns).argmax()] < _SURELY:
         return tuple(markings)
     return tuple(_reversed(marking) for marking in markings)
 
 
-def _turning(marking: MarkingDetection) -> float:
-    """The area of a marking, positive where its corners run clockwise on the screen, in its sigmas."""
-    corners = marking.corners_px
-    across = np.roll(corners, -1, axis=0) - np.roll(corners, 1, axis=0)
-    gradient = 0.5 * np.column_stack([across[:, 1], -across[:, 0]]).ravel()
-    variance = float(gradient @ marking.covariance_px @ gradient)
-    return float(signed_area(corners) / np.sqrt(max(variance, 1e-12)))
+def _turnings(corners_px: FloatArray, covariance_px: FloatArray) -> FloatArray:
+    """The areas (M,) of markings with corners (M, 4, 2) and their covariances (M, 8, 8), in their sigmas.
+
+    They are positive where corners run clockwise on the screen.
+    """
+    across = np.roll(corners_px, -1, axis=1) - np.roll(corners_px, 1, axis=1)
+    gradient = 0.5 * np.stack([across[:, :, 1], -across[:, :, 0]], axis=2).reshape(-1, 8)
+    variance = np.einsum("mi,mij,mj->m", gradient, covariance_px, gradient)
+    return np.asarray(signed_area(corners_px) / np.sqrt(np.maximum(variance, 1e-12)))
 
 
 def _reversed(marking: MarkingDetection) -> MarkingDetection:

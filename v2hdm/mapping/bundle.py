@@ -164,12 +164,14 @@ def solve_bundle(
     cameras: Mapping[str, Camera],
     model: Model,
     lanes: tuple[Knots, FloatArray] | None = None,
+    is_near: bool = False,
 ) -> Bundle:
     """Estimate extrinsics, poses and the corners of all groups jointly, with ``lanes`` if any.
 
     Those are knots and the groups' approximate corners, which they need: rays to a knot have no common
     intersection. ``usable`` (S, 4), in the sightings' own order, selects corners. Extrinsics start from
-    ``rig``, poses from the recorded ones. Raises MappingError if no corner was seen twice.
+    ``rig``, poses from the recorded ones, or those of a rig that ``is_near``, a solve of nearly the same.
+    Raises MappingError if no corner was seen twice.
     """
     observed = _observed_corners(association, usable)
     row = observed.row
@@ -198,6 +200,8 @@ def solve_bundle(
     twists = _twists(rig, sightings, part.frames)
     problem = replace(part.problem, lengths=lengths, control=control, twist_vehicle=twists)
     problem = replace(problem, corners_start=corners_start)
+    if is_near:
+        problem = replace(problem, poses_start=rig.map_from_vehicle[part.frames])
     solution = solve(problem, model.solver)
     if knots is not None:
         of_markings = {name: getattr(solution, name)[: len(row)] for name in _OF_OBSERVATIONS}

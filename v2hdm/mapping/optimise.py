@@ -132,7 +132,7 @@ class Optimiser:
             # The coarse solve fixes the poses, on which no test of the inputs may rest.
             if number > 1 and same_groups(association, bundle.association):
                 break
-            bundle = self._solve_all(association, bundle.rig, gap=_ROUGH_GAP)
+            bundle = self._solve_all(association, bundle.rig, gap=_ROUGH_GAP, is_near=number > 1)
         return self.settle_from(bundle, progress)
 
     def settle_from(
@@ -171,14 +171,14 @@ class Optimiser:
         inlier = bundle.inliers
         usable = np.zeros_like(self.sightings.valid)
         usable[bundle.row[inlier], bundle.own_corner[inlier]] = True
-        final = self._solve(bundle.association, usable, bundle.rig)
+        final = self._solve(bundle.association, usable, bundle.rig, is_near=True)
         knots = find_knots(final.rig, self.surface)
         if knots is not None and knots.count:
             progress("lanes")
             fit = final.solution.chi2_per_dof  # of markings: lines, whose variance is fitted, would dilute it
             count = int(final.corner_index.max(initial=-1)) + 1
             lanes = knots, final.solution.corners_map[:count]
-            final = self._solve(final.association, usable, final.rig, lanes=lanes)
+            final = self._solve(final.association, usable, final.rig, lanes=lanes, is_near=True)
             final = replace(final, solution=replace(final.solution, chi2_per_dof=fit))
         return FinalSolve(
             bundle=self._with_errors_of_ground(final),
@@ -347,7 +347,9 @@ class Optimiser:
         coarse: bool = False,
         lanes: tuple[Knots, FloatArray] | None = None,
         gap: float = SolveOptions.gap_tolerance,
+        is_near: bool = False,
     ) -> Bundle:
+        """Solve; ``is_near`` says that the rig is from a solve of nearly the same."""
         noises = self._noises
         options = self._options
         model = (
@@ -359,7 +361,7 @@ class Optimiser:
         cameras: Mapping[str, Camera] = self._cameras
         if self.surface is not None:
             cameras = with_planes_over(self.surface, cameras, rig.cam_from_vehicle, rig.map_from_vehicle)
-        bundle = solve_bundle(self.sightings, association, usable, rig, cameras, model, lanes)
+        bundle = solve_bundle(self.sightings, association, usable, rig, cameras, model, lanes, is_near)
         status = bundle.solution.status
         if status is Status.UNDETERMINED or not np.isfinite(bundle.solution.corners_map).all():
             raise MappingError(f"the joint optimisation failed ({status.value}): {status.advice}")
@@ -371,10 +373,11 @@ class Optimiser:
         rig: Rig,
         usable: BoolArray | None = None,
         gap: float = SolveOptions.gap_tolerance,
+        is_near: bool = False,
     ) -> Bundle:
         """Solve with the ``usable`` corners (S, 4), by default all, and refit the observations' variance."""
         usable = self._usable(association, rig) if usable is None else usable
-        bundle = self._solve(association, usable, rig, gap=gap)
+        bundle = self._solve(association, usable, rig, gap=gap, is_near=is_near)
         if len(bundle.row) >= LEAST_OBSERVATIONS:
             factor = self._variance_factor * bundle.solution.observation_factor
             least, largest = VARIANCE_FACTORS
@@ -387,7 +390,7 @@ class Optimiser:
         estimated = estimate_noise(replace(bundle.problem, pose_sigma=stated), bundle.solution)
         self.estimated_sigma = estimated
         self._pose_sigma = tuple(map(larger_noise, stated, estimated))
-        return self._solve_all(bundle.association, bundle.rig)
+        return self._solve_all(bundle.association, bundle.rig, is_near=True)
 
     @property
     def variance_factor(self) -> float:

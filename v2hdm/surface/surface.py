@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.interpolate import BSpline
-from scipy.linalg import block_diag, cholesky, solve_triangular
+from scipy.linalg import block_diag, cholesky, cholesky_banded, solve_triangular
 from scipy.optimize import minimize
 from scipy.sparse import csr_array, diags_array, hstack
 from scipy.spatial import cKDTree
@@ -399,35 +399,26 @@ class Surface:
         vector = records.vector + information @ self.parameters - score
         usual = np.full(3, np.log(_CURVATURE))
         total = information + records.information
+        smoothness = _Smoothness.of(self.knots)
 
         def cost(sizes: FloatArray) -> float:
-            prior = self._smoothness(sizes)
             try:
-                lower, prior_lower = (cholesky(matrix, lower=True) for matrix in (total + prior, prior))
+                lower = cholesky(total + smoothness.prior(sizes), lower=True, check_finite=False)
+                of_prior = smoothness.log_root(sizes)
             except np.linalg.LinAlgError:  # so even that rounding leaves nothing of the ridge
                 return np.inf
-            fit = solve_triangular(lower, vector, lower=True)
-            odds = np.log(prior_lower.diagonal()).sum() - np.log(lower.diagonal()).sum() + fit @ fit / 2
+            fit = solve_triangular(lower, vector, lower=True, check_finite=False)
+            odds = of_prior - np.log(lower.diagonal()).sum() + fit @ fit / 2
             return float(np.sum((sizes - usual) ** 2) / (2 * _SIZES**2) - odds)
 
         search = {"maxfev": 60, "xatol": 0.2, "fatol": 0.2}
         best = minimize(cost, usual, method="Nelder-Mead", options=search).x
-        covariance = np.asarray(np.linalg.inv(total + self._smoothness(best)), dtype=np.float64)
+        covariance = np.asarray(np.linalg.inv(total + smoothness.prior(best)), dtype=np.float64)
         parameters = covariance @ vector
         step = parameters - self.parameters
         gain = -score @ step - step @ information @ step / 2 - np.sum(information * covariance)
         surface = replace(self, parameters=parameters, covariance=covariance, datum_m=records.datum_m)
         return surface, float(gain)
-
-    def _smoothness(self, sizes: FloatArray) -> FloatArray:
-        """Prior information (B, B) for log standard deviations (3,) of the second differences."""
-        along = _squared_differences(self.knots)
-        across = _squared_differences(_ACROSS_KNOTS)
-        spline = np.eye(self.knots.functions * _ACROSS) / _RIDGE_M**2
-        for size, order in zip(np.exp(-2 * sizes).tolist(), (2, 1, 0), strict=True):
-            spline += size * np.kron(along[order], across[2 - order])
-        slopes = np.repeat([_GRADE_SIGMA, _SLOPE_SIGMA], [_GRADES, _HINGES])
-        return np.asarray(block_diag(np.diag(slopes**-2), spline))
 
     def _recorded(self, recorded: Recorded) -> _Records:
         """The information of the records on the path."""
@@ -569,6 +560,49 @@ class Surface:
             symbols=moved(sightings.symbols),
             lines=moved(sightings.lines),
         )
+
+
+@dataclass(frozen=True)
+class _Smoothness:
+    """The prior of a surface's B parameters by the sizes of its second differences.
+
+    ``by_order`` (3, N, N) are the squared differences of the spline's N coefficients, along the path twice,
+    once and not at all; ``bands`` (3, W, N) are their lower diagonals.
+    """
+
+    by_order: FloatArray
+    bands: FloatArray
+
+    @classmethod
+    def of(cls, knots: Knots) -> _Smoothness:
+        """The prior over some knots along the path."""
+        along = _squared_differences(knots)
+        across = _squared_differences(_ACROSS_KNOTS)
+        by_order = np.stack([np.kron(along[order], across[2 - order]) for order in (2, 1, 0)])
+        # Differences along the path reach two knots ahead, those across it no further than a row of knots.
+        width = min(3 * _ACROSS, by_order.shape[1])
+        bands = np.zeros((3, width, by_order.shape[1]))
+        for below in range(width):
+            bands[:, below, : by_order.shape[1] - below] = by_order.diagonal(-below, axis1=1, axis2=2)
+        return cls(by_order, bands)
+
+    def prior(self, sizes: FloatArray) -> FloatArray:
+        """Prior information (B, B) for log standard deviations (3,) of the second differences."""
+        spline = np.tensordot(np.exp(-2 * sizes), self.by_order, axes=1)
+        spline.flat[:: len(spline) + 1] += _RIDGE_M**-2
+        return np.asarray(block_diag(np.diag(_of_slopes()), spline))
+
+    def log_root(self, sizes: FloatArray) -> float:
+        """Half the logarithm of the prior information's determinant; raises LinAlgError by rounding."""
+        bands = np.tensordot(np.exp(-2 * sizes), self.bands, axes=1)
+        bands[0] += _RIDGE_M**-2
+        root = cholesky_banded(bands, lower=True, check_finite=False)
+        return float(np.log(root[0]).sum() + np.log(_of_slopes()).sum() / 2)
+
+
+def _of_slopes() -> FloatArray:
+    """Prior information of the parameters before the spline's."""
+    return np.repeat([_GRADE_SIGMA, _SLOPE_SIGMA], [_GRADES, _HINGES]) ** -2.0
 
 
 def _squared_differences(knots: Knots) -> list[FloatArray]:

@@ -119,14 +119,20 @@ def cut(problem: Problem, part_of_frame: IntArray, states: tuple[str, ...]) -> t
 def whole_of(parts: Sequence[Part], bare: Problem, corners: IntArray) -> Problem:
     """The problem that was cut into parts, without surveyed corners and known lengths.
 
-    ``bare`` has its cameras and frames; ``corners`` (N,) are those of all parts.
+    ``bare`` has its cameras and frames; ``corners`` (N,) are those of all parts, which say where it starts.
     """
     cam_from_vehicle = bare.cam_from_vehicle.copy()
+    poses_start = bare.map_from_vehicle.copy()
+    corners_start = np.full((len(corners), 2), np.nan)
     twists = None if bare.twist_vehicle is None else bare.twist_vehicle.copy()
     columns = []
     for part in parts:
         problem = part.problem
         cam_from_vehicle[part.cameras] = problem.cam_from_vehicle
+        if problem.poses_start is not None:
+            poses_start[part.frames] = problem.poses_start
+        if problem.corners_start is not None:
+            corners_start[np.searchsorted(corners, part.corners)] = problem.corners_start
         if twists is not None:
             twists[part.frames] = problem.twist_vehicle
         observations = replace(
@@ -143,6 +149,8 @@ def whole_of(parts: Sequence[Part], bare: Problem, corners: IntArray) -> Problem
         observations=Observations(**joined),
         corner_count=len(corners),
         cam_from_vehicle=cam_from_vehicle,
+        poses_start=poses_start,
+        corners_start=None if np.isnan(corners_start).any() else corners_start,
         twist_vehicle=twists,
     )
 

@@ -33,7 +33,7 @@ from v2hdm.adjust.sections.join import Joined, Labels, Net, Shared, labels_of
 from v2hdm.adjust.sections.parts import Link, Part, whole_of
 from v2hdm.adjust.sections.summary import Border, JoinedCovariance, Summary, Values, follow, summarise
 from v2hdm.adjust.solution import Solution
-from v2hdm.adjust.solve import report_of, solve, start_of
+from v2hdm.adjust.solve import Start, report_of, solve, start_of
 from v2hdm.adjust.threads import one_thread_in_torch
 from v2hdm.adjust.whitening import Whitening, factorise
 from v2hdm.errors import AdjustError, WorkerError
@@ -127,6 +127,7 @@ class _Job:
     number: int
     start: Estimate | None = None
     target: Values | None = None
+    is_near: bool = False  # the part's problem starts near the joint optimum
     is_last: bool = False
     is_finish: bool = False
     gap: float = 0.0
@@ -179,6 +180,8 @@ class _Work:
         border = opened.border
         if job.start is not None:
             estimate = _in_order(job.start, opened)
+        elif job.target is None and job.is_near:
+            estimate = self._start(part, opened.engine).estimate
         elif job.target is None:
             estimate = self._own_optimum(job.number, part, opened.engine, self._robust)
         else:
@@ -193,9 +196,12 @@ class _Work:
     def _robust(self) -> Loss:
         return Loss(self.shape.options.loss, self.shape.options.loss_scale)
 
+    def _start(self, part: Part, engine: TorchEngine) -> Start:
+        return start_of(part.problem, self.shape.origin_map, engine, self._robust, self.shape.options)
+
     def _own_optimum(self, number: int, part: Part, engine: TorchEngine, robust: Loss) -> Estimate:
         options = self.shape.options
-        start = start_of(part.problem, self.shape.origin_map, engine, robust, options)
+        start = self._start(part, engine)
         descent = descend(
             engine, start.estimate, robust, _ALONE_GAP, options.max_refreshes,
             options.max_evaluations, start.opening,
@@ -296,16 +302,21 @@ def join_parts(
     executor: Executor = HERE,
     progress: Callable[[int, int], None] | None = None,
     at_once: int = AT_ONCE,
+    are_near: bool = False,
 ) -> Joint:
     """Solve the ``count`` parts in ``folder`` together, and ``finish`` each without covariances.
 
     Those of their borders are left in files for :func:`finish_parts`. ``progress`` is called with the number
-    of the round and the most that there may be; up to ``at_once`` observations are solved at once. Raises
-    AdjustError where parts leave a direction free or contradict each other, WorkerError where a process died.
+    of the round and the most that there may be; up to ``at_once`` observations are solved at once. Parts that
+    ``are_near`` start near the joint optimum, by what :func:`fit_parts` has told: else each looks for its own
+    first. Raises AdjustError where parts leave a direction free or contradict each other, WorkerError where a
+    process died.
     """
     whole = _solved_at_once(folder, count, shape, at_once)
-    starts = [None] * count if whole is None else whole.starts
-    joint = _in_rounds(folder, starts, links, shape, finish, executor, progress, GAP)
+    jobs = [_Job(number, is_near=are_near) for number in range(count)]
+    if whole is not None:
+        jobs = [_Job(number, start) for number, start in enumerate(whole.starts)]
+    joint = _in_rounds(folder, jobs, links, shape, finish, executor, progress, GAP)
     for part, covariance in enumerate(joint.net.covariances(joint.factor)):
         np.save(_covariance_file(folder, part), covariance)
     return joint
@@ -324,8 +335,8 @@ def fit_parts(
     """``finish`` each part under a rough solve of all; otherwise as :func:`join_parts`."""
     whole = _solved_at_once(folder, count, shape, at_once)
     if whole is None:
-        nowhere: list[Estimate | None] = [None] * count
-        joint = _in_rounds(folder, nowhere, links, shape, finish, executor, progress, ROUGH_GAP)
+        from_afar = [_Job(number) for number in range(count)]
+        joint = _in_rounds(folder, from_afar, links, shape, finish, executor, progress, ROUGH_GAP)
         return Fitted(joint.results, None, None)
     jobs = [_Job(number, start, is_last=True) for number, start in enumerate(whole.starts)]
     results = _side_by_side(executor, _Work(folder, shape, finish), jobs)
@@ -334,7 +345,7 @@ def fit_parts(
 
 def _in_rounds(
     folder: Path,
-    starts: Sequence[Estimate | None],
+    jobs: Sequence[_Job],
     links: Sequence[Link],
     shape: Shape,
     finish: Finish,
@@ -342,32 +353,33 @@ def _in_rounds(
     progress: Callable[[int, int], None] | None,
     least_gap: float,
 ) -> Joint:
-    """The rounds of parts, from their own optima or from ``starts``, until the gap is small."""
+    """The rounds of parts, the first by ``jobs``, until the gap is small."""
     report = progress or (lambda done, total: None)
     work = _Work(folder, shape)
-    jobs = [_Job(number, start) for number, start in enumerate(starts)]
+    are_joined = jobs[0].start is not None
+    is_from_afar = not are_joined and not jobs[0].is_near
     costs: list[list[float]] = []  # by round and part
-    targets: list[Values] = []
     for number in range(_MOST_ROUNDS):
         report(number, _MOST_ROUNDS)
         states: list[PartStates] = _side_by_side(executor, work, jobs)
         costs.append([_cost(state.told) for state in states])
         if number == 0:
             net = _net_of(states, links, shape)
-        elif number == 1 and starts[0] is None:
+        elif number == 1 and is_from_afar:
             _check_agreement(net, states, costs, folder)
         shared = _shared(net, states)
         joined = net.join(_taken(states, shared, net), shared)
         gap = (joined.decrease + sum(state.told.slack for state in states)) / max(sum(costs[-1]), 1.0)
         moved = _moved(net, shared, joined)
-        targets = [_values(net, moved, state.labels, state.values) for state in states]
-        if (number > 0 or starts[0] is not None) and gap <= least_gap:
+        jobs = [
+            _Job(part, target=_values(net, moved, state.labels, state.values))
+            for part, state in enumerate(states)
+        ]
+        if (number > 0 or are_joined) and gap <= least_gap:
             break
-        jobs = [_Job(part, target=target) for part, target in enumerate(targets)]
-    last = [
-        _Job(part, target=target, is_last=True, gap=gap, rounds=number + 1)
-        for part, target in enumerate(targets)
-    ]
+    if are_joined and number == 0:  # they are where they should be
+        jobs = [_Job(part) for part in range(len(states))]
+    last = [replace(job, is_last=True, gap=gap, rounds=number + 1) for job in jobs]
     results = _side_by_side(executor, replace(work, finish=finish), last)
     return Joint(results, net, joined.factor, gap, number + 1)
 

@@ -194,6 +194,7 @@ def _joint_solve(run: _Run, drive: Drive, part: IntArray, alone: Sequence[Alone]
     work = replace(
         run.work,
         model=full_model(noise.pose_sigma, options, pose_model, noise.variance_factor),
+        is_fitted=True,
         pose_model=pose_model,
         fullest=int(np.argmax([section.observations for section in alone])),
     )
@@ -201,7 +202,7 @@ def _joint_solve(run: _Run, drive: Drive, part: IntArray, alone: Sequence[Alone]
     shape = cut.shape
     joint = join_parts(
         work.folder, run.count, cut.links, shape, work.tell, run.executor,
-        partial(run.progress, "join sections"),
+        partial(run.progress, "join sections"), are_near=True,
     )  # fmt: skip
     fits: list[Fit] = joint.results
     scatter = scatter_by_marking(fits, 1 + max(int(of_section.marking.max()) for of_section in names))

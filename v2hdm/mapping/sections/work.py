@@ -56,6 +56,15 @@ class Ends(NamedTuple):
     along: Along
 
 
+class Start(NamedTuple):
+    """Where a joint solve of a section begins; ``corners`` (N,) are names over the drive, ascending."""
+
+    cam_from_vehicle: FloatArray  # (C, 4, 4)
+    map_from_vehicle: FloatArray  # (F, 4, 4) of its own frames
+    corners: IntArray
+    corners_map: FloatArray  # (N, 2)
+
+
 class Proposal(NamedTuple):
     """The candidates of a section that are its own, before they are classified."""
 
@@ -84,8 +93,9 @@ class Finished(NamedTuple):
 class Work:
     """The steps of a section, whose files are in ``folder``.
 
-    ``model`` is that of the joint solve, ``pose_model`` its name, ``chi2_per_dof`` how it fits; ``fullest``
-    is the section of most observations, ``clock_root`` what all say of the errors of clocks.
+    ``model`` is that of the joint solve, ``pose_model`` its name, ``chi2_per_dof`` how it fits; ``is_fitted``
+    says whether a rough one has placed all. ``fullest`` is the section of most observations, ``clock_root``
+    what all say of the errors of clocks.
     """
 
     detections_of: DetectionsOf
@@ -94,6 +104,7 @@ class Work:
     folder: Path
     grey: GreyOf | None = None
     model: Model | None = None
+    is_fitted: bool = False
     pose_model: str = ""
     chi2_per_dof: float = 1.0
     fullest: int = 0
@@ -192,7 +203,8 @@ class Work:
         corner = names.corners(settled)[chosen]
         observations = observations_at(sightings, at, corner, self.model, on_line)
         corners, corner = np.unique(observations.corner, return_inverse=True)
-        whole = self._whole(section, examined)
+        start = self._start(section, examined, names)
+        whole = self._whole(section, examined, start)
         cameras, camera = np.unique(observations.camera, return_inverse=True)
         if len(cameras) < len(self.cameras):
             blind = next(name for c, name in enumerate(self.cameras) if c not in cameras)
@@ -208,6 +220,7 @@ class Work:
                 whole,
                 observations=replace(observations, camera=camera, frame=frame, corner=corner),
                 corner_count=len(corners),
+                corners_start=start.corners_map[np.searchsorted(start.corners, corners)],
             ),
             cameras=cameras,
             frames=section.frames[section.own_frames],
@@ -229,7 +242,22 @@ class Work:
             used=np.concatenate([observation[gate.is_used] for observation, gate in pairs]),
         )
 
-    def _whole(self, section: Section, examined: Examined) -> Problem:
+    def _start(self, section: Section, examined: Examined, names: Names) -> Start:
+        """Where a joint solve begins: at the rough one, or at the section's own."""
+        if self.is_fitted:
+            start = self.read("fitted", section.number)
+            assert isinstance(start, Start)
+            return start
+        settled = examined.settled
+        corners, first = np.unique(names.corners(settled), return_index=True)
+        return Start(
+            cam_from_vehicle=settled.rig.cam_from_vehicle,
+            map_from_vehicle=settled.rig.map_from_vehicle[section.own_frames],
+            corners=corners,
+            corners_map=settled.corners_map[settled.group[first], settled.corner[first]],
+        )
+
+    def _whole(self, section: Section, examined: Examined, start: Start) -> Problem:
         """All cameras and own frames of a section with their priors, without observations."""
         assert self.model is not None
         optimiser = examined.inputs.optimiser
@@ -242,9 +270,9 @@ class Work:
         frames = section.own_frames
         return replace(
             whole,
-            cam_from_vehicle=rig.cam_from_vehicle,
+            cam_from_vehicle=start.cam_from_vehicle,
             map_from_vehicle=whole.map_from_vehicle[frames],
-            poses_start=rig.map_from_vehicle[frames],
+            poses_start=start.map_from_vehicle,
             session=None if whole.session is None else whole.session[frames],
             twist_vehicle=twists[frames],
         )
@@ -255,7 +283,11 @@ class Work:
         return gate
 
     def fit(self, number: int, part: Part, solution: Solution) -> Fit:
-        """How the observations of a section's own images fit a solve of all sections."""
+        """How the observations of a section's own images fit a rough solve of all sections."""
+        start = Start(
+            solution.cam_from_vehicle, solution.map_from_vehicle, part.corners, solution.corners_map
+        )
+        self.write("fitted", number, start)
         return fit_of(part, solution)
 
     def tell(self, number: int, part: Part, solution: Solution) -> Fit:
