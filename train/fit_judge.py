@@ -30,6 +30,7 @@ from train.data import hardships_of
 from train.examples import Example, TrueMarking, example, photograph, polygon_overlap
 from train.judge import JudgeConfig, Quadrilaterals, judged, train_judge
 from train.labels import LabelledImages
+from train.odds import worth_of
 from train.scenes.hardships import NONE
 from v2hdm.catalogue import SHIPPED, SYMBOL
 from v2hdm.detection.classifier import AMONG, COMPANIES, SHAPES, Readings, features_among, one_hot, shape_of
@@ -39,7 +40,7 @@ from v2hdm.detection.network import Network
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.weights import CONFIDENCE_FILE, JUDGE_FILE
 from v2hdm.geometry.planar import Quad, following
-from v2hdm.records import BoolArray, FloatArray
+from v2hdm.records import STOP_LINE, BoolArray, FloatArray
 from v2hdm.store.files import replace_text, whole_file
 
 SEED = 917  # seed of the rendered scenes, not that of the benchmark nor of a training
@@ -350,6 +351,14 @@ def fit_among(gathered: Gathered, odds: FloatArray) -> dict[str, dict[str, objec
     return fitted
 
 
+def _fit_company(company: str, features: FloatArray, true: BoolArray) -> tuple[FloatArray, float]:
+    """Weights (F,) of :data:`AMONG` and bias, of a shape's features (N, F); of stop lines only odds count."""
+    if company != STOP_LINE:
+        return fit(features, true)
+    worth = worth_of(features[:, AMONG.index("alone")], true)
+    return np.where(np.array(AMONG) == "alone", worth.weight, 0.0), worth.bias
+
+
 def _fit_each(
     features: FloatArray, company: np.ndarray, true: BoolArray, is_counted: BoolArray, fold: np.ndarray
 ) -> tuple[dict[str, dict[str, object]], FloatArray]:
@@ -359,14 +368,14 @@ def _fit_each(
     left_out = np.zeros(len(true))
     for name in COMPANIES:
         mine = is_counted & (company == name)
-        weights, bias = fit(features[mine], true[mine])
+        weights, bias = _fit_company(name, features[mine], true[mine])
         effect[name] = weights * features[mine].std(axis=0)
         named = dict(zip(AMONG, weights.round(4).tolist(), strict=True))
         fitted[name] = {"bias": round(bias, 4), "weights": named}
         for k in range(FOLDS):
             others = mine & (fold != k)
             these = (company == name) & (fold == k)
-            weights, bias = fit(features[others], true[others])
+            weights, bias = _fit_company(name, features[others], true[others])
             left_out[these] = features[these] @ weights + bias
     print(f"{'':16s} " + " ".join(f"{name:>9s}" for name in COMPANIES))
     for row, name in enumerate(AMONG):

@@ -11,7 +11,7 @@ import functools
 import inspect
 import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import is_dataclass
 from numbers import Integral, Real
 from typing import Annotated, Any, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -58,14 +58,27 @@ def checked_class(kind: _Class) -> _Class:
 
 def check_types(options: Any, prefix: str = "") -> None:
     """Raise ConfigError, which names ``prefix`` and the key, for settings of another type than theirs."""
-    dot = "" if not prefix or prefix.endswith(".") else "."
-    for field in fields(options):
-        value = getattr(options, field.name)
-        hint = _hints(type(options).__init__)[field.name]
-        kind = get_args(hint)[0] if get_origin(hint) is Annotated else hint  # ranges are another check
-        _check(value, kind, f"{prefix}{dot}{field.name}")
-        if is_dataclass(value):
-            check_types(value, f"{prefix}{dot}{field.name}")
+    for name, (fits, kind) in _tests_of_fields(type(options).__init__).items():
+        value = getattr(options, name)
+        is_nested = is_dataclass(value)
+        if fits(value) and not is_nested:
+            continue
+        dot = "" if not prefix or prefix.endswith(".") else "."
+        where = f"{prefix}{dot}{name}"
+        _check(value, kind, where)
+        if is_nested:
+            check_types(value, where)
+
+
+@functools.cache
+def _tests_of_fields(init: Callable[..., None]) -> Mapping[str, tuple[Callable[[Any], bool], Any]]:
+    """Test and type of each field of a dataclass, of its making; ranges are another check."""
+    kinds = {
+        name: get_args(hint)[0] if get_origin(hint) is Annotated else hint
+        for name, hint in _hints(init).items()
+        if name != "return"
+    }
+    return {name: (_test_of(kind), kind) for name, kind in kinds.items()}
 
 
 def _check(value: object, hint: Any, where: str) -> None:

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from contextlib import nullcontext
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +17,10 @@ from tests.adjust.scene import make_scene
 from v2hdm import native
 from v2hdm.adjust import KnownLengths, PoseSigma, SolveOptions, arrays, solve
 from v2hdm.adjust.descent import minimise
-from v2hdm.adjust.kernels.layout import Seen, arrange
-from v2hdm.adjust.problem import POSE_STATES
+from v2hdm.adjust.kernels.layout import Seen, arrange, find_touched, first_not_rigid, lay_out
+from v2hdm.adjust.problem import LINE_EXCESS, POSE_STATES
+from v2hdm.adjust.solution import Verdict, classify
+from v2hdm.geometry.rigid import exp
 
 
 def street(**changes):
@@ -72,10 +75,10 @@ def test_observations_are_sorted_by_corner_and_pair_whatever_was_in_memory(compi
         (camera, frame, corner, np.zeros((count, 2)), np.tile(np.eye(2), (count, 1, 1))),
         np.ones((cameras, 4)),
     )
-    room, order, rank_of_corner, pair = np.zeros((4, count), dtype=np.int32)
-    counts = np.zeros(cameras * frames + 1, dtype=np.int64), np.zeros(corners + 1, dtype=np.int64)
+    order, rank_of_corner, pair = np.zeros((3, count), dtype=np.int32)
+    corner_at = np.zeros(corners + 1, dtype=np.int64)
     with nullcontext() if compiled else native.numpy_alone():
-        repeated = arrange(seen, rank, frames, room, *counts, order, rank_of_corner, pair)
+        repeated = arrange(seen, rank, frames, corner_at, order, rank_of_corner, pair)
     assert repeated == -1
     np.testing.assert_array_equal(order, np.lexsort((frame, camera, rank[corner])))
     np.testing.assert_array_equal(rank_of_corner, rank[corner][order])
@@ -86,11 +89,73 @@ def test_observations_are_sorted_by_corner_and_pair_whatever_was_in_memory(compi
 def test_the_first_observation_that_repeats_another_is_found(compiled):
     camera, frame, corner = np.array([[0, 1, 0, 1, 0], [2, 2, 1, 2, 0], [1, 0, 1, 0, 1]])
     seen = Seen.of((camera, frame, corner, np.zeros((5, 2)), np.tile(np.eye(2), (5, 1, 1))), np.ones((2, 4)))
-    room, order, rank_of_corner, pair = np.zeros((4, 5), dtype=np.int32)
-    counts = np.zeros(7, dtype=np.int64), np.zeros(3, dtype=np.int64)
+    order, rank_of_corner, pair = np.zeros((3, 5), dtype=np.int32)
+    corner_at = np.zeros(3, dtype=np.int64)
     with nullcontext() if compiled else native.numpy_alone():
-        repeated = arrange(seen, np.arange(2), 3, room, *counts, order, rank_of_corner, pair)
+        repeated = arrange(seen, np.arange(2), 3, corner_at, order, rank_of_corner, pair)
     assert order[repeated - 1 : repeated + 1].tolist() == [1, 3]
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_pairs_that_a_chunk_touches_are_those_of_its_observations_in_order(compiled):
+    pairs = 40
+    pair = np.random.default_rng(1).integers(0, pairs, 200).astype(np.int32)
+    chunk = np.array([0, 7, 7, 130, 200])
+    touched = np.empty_like(pair)
+    touched_at = np.empty(len(chunk), dtype=np.int64)
+    with nullcontext() if compiled else native.numpy_alone():
+        count = find_touched(pair, chunk, np.zeros(pairs, dtype=np.uint8), touched, touched_at)
+    expected = [np.unique(pair[begin:end]) for begin, end in pairwise(chunk)]
+    np.testing.assert_array_equal(touched[:count], np.concatenate(expected))
+    np.testing.assert_array_equal(np.diff(touched_at), [len(part) for part in expected])
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("wrong", ["scale", "mirror", "last row", "nan"])
+def test_the_first_transform_that_is_not_rigid_is_found(compiled, wrong):
+    transforms = exp(0.3 * np.random.default_rng(2).standard_normal((9, 6)))
+    with nullcontext() if compiled else native.numpy_alone():
+        assert first_not_rigid(transforms, 1e-6) == -1
+        for k in (4, 7):
+            if wrong == "scale":
+                transforms[k, :3, :3] *= 1 + 1e-5
+            elif wrong == "mirror":
+                transforms[k, :3, 1] *= -1
+            else:
+                transforms[k, 3 if wrong == "last row" else 1, 2] = math.nan if wrong == "nan" else 1e-9
+        assert first_not_rigid(transforms, 1e-6) == 4
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_observations_of_lines_are_counted_as_they_are_laid_out(compiled):
+    problem = make_scene(0, frames=12).problem
+    seen = problem.observations
+    covariance_px = seen.covariance_px.copy()
+    covariance_px[::5, 0, 0] *= 1e5
+    observations = dataclasses.replace(seen, covariance_px=covariance_px)
+    count = len(seen.corner)
+    order = np.arange(count, dtype=np.int32)
+    frames = len(problem.map_from_vehicle)
+    pair = (seen.camera * frames + seen.frame).astype(np.int32)
+    with nullcontext() if compiled else native.numpy_alone():
+        columns = Seen.of(observations.columns, problem.intrinsic)
+        lines = lay_out(columns, order, pair, frames, LINE_EXCESS, np.empty((2, count)), np.empty((3, count)))
+    assert lines == np.count_nonzero(observations.on_line) == -(-count // 5)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_verdicts_are_by_gate_and_camera_and_the_last_of_several_is_unconfirmed(compiled):
+    """Corner 0 keeps two, corner 1 the last of three, corner 2 its only one, corner 3 none."""
+    corner = np.array([0, 1, 2, 1, 0, 1, 3, 0])
+    squared = np.array([1.0, 30.0, 2.0, 3.0, 4.0, 5.0, 90.0, 50.0])
+    behind = np.array([False, False, False, False, False, True, False, False])
+    observations = dataclasses.replace(make_scene(0, frames=12).problem.observations, corner=corner)
+    with nullcontext() if compiled else native.numpy_alone():
+        verdict = classify(observations, squared, behind, math.exp(-10.0), 1.0)
+    ok, far, alone, back = (
+        Verdict.ACCEPTED, Verdict.CONTRADICTS, Verdict.UNCONFIRMED, Verdict.BEHIND_CAMERA
+    )  # fmt: skip
+    assert verdict.tolist() == [ok, far, ok, alone, ok, back, far, far]
 
 
 CENTRE = torch.tensor([3.0, -2.0, 0.5], dtype=torch.float64)

@@ -70,6 +70,13 @@ def test_evaluations_agree(loss, hold_cameras):
     assert_same(reached.gradient, expected.gradient, 1e-8)
 
 
+def test_the_cameras_steps_agree():
+    at_once, stepwise = both(example(), Loss("none", 1.0))
+    step = at_once.camera_step(at_once.gradient)
+    assert step.shape == (2, 6)
+    assert_same(step, stepwise.camera_step(at_once.gradient), 1e-9)
+
+
 def test_an_evaluation_of_no_step_is_the_whitening():
     at_once, _ = both(example(), Loss("cauchy", 3.0))
     reached = at_once.reach(torch.zeros(at_once.size, dtype=torch.float64))

@@ -40,8 +40,9 @@ from tests.benchmarks.made.live import (
 from v2hdm.geometry.planar import wrapped
 from v2hdm.geometry.rigid import heading_rad
 from v2hdm.localization.antenna import Fix
-from v2hdm.localization.localizer import Localizer, Pose, Status
+from v2hdm.localization.localizer import Localizer
 from v2hdm.localization.places import Prior, rough_position
+from v2hdm.localization.pose import Pose, Status
 from v2hdm.localization.seeing import Look
 from v2hdm.records import FloatArray, HDMap, IntArray, Marking
 
@@ -60,6 +61,7 @@ _ANTENNA_M = (1.2, 0.3)  # ahead of the rear axle and to the left, m
 _RTK_M = 0.015  # standard deviation of a fixed position, m
 _FIX_EVERY = 2  # moments from one position to the next: 5 Hz
 _DUAL_RAD = np.deg2rad(0.2)  # standard deviation of the heading by two antennas
+_LATER = 2  # moments after which a whole search that follows a look at parts is done
 _REPAINTED_STARTS, _REPAINTED_FRAMES = 4, 40  # drives on a repainted map, and moments of each
 
 
@@ -103,21 +105,34 @@ def follow(
     begin_s = time.process_time()
     shown = driven.looks if looks is None else looks
     poses = []
+    later: list[tuple[int, Look]] = []
     for frame in frames:
         if every_full > 1:
-            localizer.update([], driven.motion[frame])
-            poses.append(localizer.update([_looked_at(localizer, look) for look in shown[frame]]))
+            localizer.update([look for due, look in later if due == frame], driven.motion[frame])
+            at_once = [_looked_at(localizer, look) for look in shown[frame]]
+            pairs = zip(at_once, shown[frame], strict=True)
+            later += [
+                (frame + _LATER, replace(look, is_second=True)) for part, look in pairs if part.is_all_later
+            ]
+            poses.append(localizer.update([part.look for part in at_once]))
         else:
             poses.append(localizer.update(shown[frame], driven.motion[frame]))
     images = sum(len(shown[frame]) for frame in frames)
     return Run(poses, frames, (time.process_time() - begin_s) / max(images, 1))
 
 
-def _looked_at(localizer: Localizer, look: Look) -> Look:
+class _Part(NamedTuple):
+    """A look at parts of an image, or all of it, and whether all is to be searched later."""
+
+    look: Look
+    is_all_later: bool
+
+
+def _looked_at(localizer: Localizer, look: Look) -> _Part:
     """What an image shows where the localiser has it looked at."""
-    regions_px = localizer.regions(look.camera, look.stamp_s)
+    _, regions_px, is_all_later = localizer.glance(look.camera, look.stamp_s)
     if regions_px is None:
-        return look
+        return _Part(look, is_all_later)
     quads = [marking for marking in look.markings if not len(marking.outline_px)]
     corners_px = [marking.corners_px[marking.corner_valid] for marking in quads]
     is_in = [
@@ -126,7 +141,7 @@ def _looked_at(localizer: Localizer, look: Look) -> Look:
         for corners in corners_px
     ]
     markings = tuple(marking for marking, is_kept in zip(quads, is_in, strict=True) if is_kept)
-    return replace(look, markings=markings, lanes=(), is_whole=False)
+    return _Part(replace(look, markings=markings, lanes=(), is_whole=False), is_all_later)
 
 
 def errors_of(driven: LiveDrive, run: Run) -> Errors:

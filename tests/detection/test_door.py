@@ -527,6 +527,40 @@ def test_a_line_says_where_to_look_in_the_image_of_its_time(bench, tmp_path, mon
         assert not any("corners_vehicle" in marking for marking in record["markings"])
 
 
+def test_an_image_of_which_all_is_to_be_searched_later_comes_a_second_time(
+    bench, tmp_path, monkeypatch, capsys
+):
+    bench.run(bench.folder / "0.png")
+    (whole,) = lines(capsys.readouterr().out)
+    corners_px = np.array(near(whole)["corners_px"])
+    box = [*(corners_px.min(axis=0) - 20).tolist(), *(corners_px.max(axis=0) + 20).tolist()]
+    images = tmp_path / "images"
+    images.mkdir()
+    shutil.copyfile(bench.folder / "0.png", images / "0.png")
+    os.utime(images / "0.png", (1000.0, 1000.0))
+
+    def write_next():
+        wait_until(lambda: len(lines(output.read_text())) == 2)
+        shutil.copyfile(bench.folder / "0.png", images / "1.png")
+
+    line = json.dumps({"stamp_s": 1000.0, "regions_px": [box], "all_later": True})
+    monkeypatch.setattr("sys.stdin", io.StringIO(line + "\n"))
+    output = tmp_path / "found.jsonl"
+    writer = threading.Thread(target=write_next)
+    output.touch()
+    writer.start()
+    assert bench.run(images, "--live", "--regions", "--limit", 2, "--output", output) == 0
+    writer.join()
+    first, second, third = lines(output.read_text())
+    assert first["stamp_s"] == second["stamp_s"] == 1000.0
+    assert not first["whole"]
+    assert "second" not in first
+    assert second["second"]
+    assert "whole" not in second
+    assert len(second["markings"]) == len(whole["markings"]) > len(first["markings"])
+    assert "second" not in third
+
+
 def test_a_kill_leaves_nothing_hidden_beside_the_output_and_the_earlier_file(bench, tmp_path):
     many = tmp_path / "images"
     many.mkdir()

@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from importlib.machinery import EXTENSION_SUFFIXES
 
 import cv2
@@ -22,18 +23,20 @@ from tests.detection.pictures import (
 )
 from tests.docs.blocks import ROOT
 from v2hdm import __version__, native
-from v2hdm.catalogue import PAINT_CLASSES
+from v2hdm.catalogue import PAINT_CLASSES, SHIPPED
 from v2hdm.detection.camera import RoadCamera
+from v2hdm.detection.evidence import CHANNELS, rectified_views
 from v2hdm.detection.lanes.boundaries import _STATES, _forward_backward
 from v2hdm.detection.lanes.chains import find_chains
 from v2hdm.detection.lanes.lines import trace_lanes
 from v2hdm.detection.quads.blobs import Blob, find_blobs
 from v2hdm.detection.quads.fit import fit_quadrilaterals
 from v2hdm.detection.quads.lattice import lay_grid, lay_lattice
-from v2hdm.detection.quads.patch import LensFrames
+from v2hdm.detection.quads.patch import ImageQuads, LensFrames
 from v2hdm.detection.quads.propose import Proposal, open_sides
 from v2hdm.detection.quads.state import State
 from v2hdm.geometry.planar import Quad, order_corners
+from v2hdm.records import DIAMOND, LANE_DASH, STOP_LINE
 
 compiled = pytest.mark.skipif(native.kernels() is None, reason=native.which_runs())
 
@@ -311,3 +314,27 @@ def test_a_compiler_that_fails_does_not_fail_the_install(copied, tmp_path):
 def test_what_was_compiled_is_found_where_the_working_directory_is_no_place_of_modules():
     program = "import runpy; print(runpy.run_path('hatch_build.py')['compile_kernels']())"
     assert "_kernels" in _told(ROOT, "-c", program, PYTHONSAFEPATH="1")  # as pipx installs
+
+
+@compiled
+@pytest.mark.parametrize("lens", sorted(LENSES))
+def test_pictures_for_the_judge_are_the_same_compiled_and_in_numpy(lens):
+    scene = Scene(5, lens)
+    # One marking is partly outside of the image.
+    scene.start[0] += [scene.view.info.width - scene.start[0, 0, 0], 0.0]
+    output = scene.patches.output
+    kinds = np.random.default_rng(5).normal(size=output.kinds.shape).astype(np.float32)
+    scene.patches.output = replace(output, kinds=kinds)
+    quads = ImageQuads.of(scene.view, scene.start)
+    ground = Quad(scene.view.unproject(scene.start))
+    readings = [(m, kind) for m in range(len(scene.start)) for kind in (DIAMOND, LANE_DASH, STOP_LINE)]
+
+    def views():
+        return rectified_views(scene.patches, quads, ground, readings, SHIPPED)
+
+    (views, first_side), (views_too, first_side_too) = twice(views)
+    np.testing.assert_array_equal(first_side, first_side_too)
+    assert views[:, CHANNELS.index("outside")].any()
+    # A code that lies between two is rounded to either: of 1,000 pixels one, by one code.
+    np.testing.assert_allclose(np.mean(np.abs(views - views_too)), 0.0, atol=1e-5)
+    np.testing.assert_allclose(views, views_too, atol=0.05)

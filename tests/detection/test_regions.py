@@ -105,10 +105,13 @@ def test_a_road_detector_takes_regions(detector, image):
 def test_a_line_holds_for_an_image_of_its_time_alone():
     pointer = Pointer()
     pointer.follow(io.StringIO(json.dumps({"stamp_s": 10.0, "regions_px": [[1, 2, 3, 4]]}) + "\n"))
-    np.testing.assert_array_equal(pointer.regions(10.03), [[1, 2, 3, 4]])
-    assert pointer.regions(10.1) is None
-    assert pointer.regions(9.9) is None
-    assert pointer.regions(Frame("image", "image", 0, None, np.zeros((1, 1, 3), np.uint8)).stamp_s) is None
+    np.testing.assert_array_equal(pointer.at(10.03).regions_px, [[1, 2, 3, 4]])
+    assert not pointer.at(10.03).is_all_later
+    assert pointer.at(10.1) is None
+    assert pointer.at(9.9) is None
+    assert pointer.at(Frame("image", "image", 0, None, np.zeros((1, 1, 3), np.uint8)).stamp_s) is None
+    pointer.follow(io.StringIO(json.dumps({"stamp_s": 10.0, "regions_px": None, "all_later": True}) + "\n"))
+    assert pointer.at(10.03) == (10.0, None, True)
 
 
 @pytest.mark.parametrize(
@@ -126,6 +129,6 @@ def test_a_line_that_cannot_be_read_is_said_once_and_all_is_looked_at(line, capl
     right = json.dumps({"stamp_s": 1.0, "regions_px": [[1, 2, 3, 4]]})
     with caplog.at_level(logging.WARNING):
         pointer.follow([right, line, line])
-    assert pointer.regions(1.0) is None
+    assert pointer.at(1.0) is None
     assert len(caplog.records) == 1
     assert "give stamp_s and regions_px" in caplog.text

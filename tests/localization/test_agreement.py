@@ -5,7 +5,8 @@ import pytest
 
 from tests.localization.driven import drive, mapped, moved, yard
 from v2hdm.localization.agreement import offset_likelihood
-from v2hdm.localization.localizer import Localizer, Status
+from v2hdm.localization.localizer import Localizer
+from v2hdm.localization.pose import Status
 
 SHARP_M2 = 0.02**2 * np.eye(2)
 

@@ -6,9 +6,10 @@ import pytest
 from tests.localization.driven import MOUNT, drive, mapped, yard
 from v2hdm.localization.antenna import Antenna, Fix, with_fix
 from v2hdm.localization.belief import HEADING, start
-from v2hdm.localization.localizer import Localizer, Status
+from v2hdm.localization.localizer import Localizer
 from v2hdm.localization.motion import MotionNoise
 from v2hdm.localization.places import Prior
+from v2hdm.localization.pose import Status
 
 AHEAD_LEFT_M = np.array([1.2, -0.3])
 SIGMA_M = 0.02

@@ -9,9 +9,10 @@ from tests.localization.driven import MOUNT, WORD, cameras, drive, mapped, outli
 from v2hdm.localization.areas import AreaMap, middle_of_hull, with_areas
 from v2hdm.localization.belief import Plane, start
 from v2hdm.localization.joint import Scene
-from v2hdm.localization.localizer import Localizer, Status
+from v2hdm.localization.localizer import Localizer
 from v2hdm.localization.motion import MotionNoise
 from v2hdm.localization.paint import Paint
+from v2hdm.localization.pose import Status
 from v2hdm.localization.seeing import Look, expect_points, hulls_of_areas, sighted
 from v2hdm.records import HDMap
 

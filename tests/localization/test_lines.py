@@ -9,9 +9,10 @@ from tests.localization.driven import MOUNT, cameras, drive, lined, mapped, yard
 from v2hdm.localization.belief import HEADING, Plane, start
 from v2hdm.localization.joint import Scene
 from v2hdm.localization.lines import LineMap, _observed, with_lines
-from v2hdm.localization.localizer import Localizer, Status
+from v2hdm.localization.localizer import Localizer
 from v2hdm.localization.motion import MotionNoise
 from v2hdm.localization.paint import Paint
+from v2hdm.localization.pose import Status
 from v2hdm.localization.seeing import Look, expect_points, pieces_of_lines, sighted
 from v2hdm.records import HDMap, Lane, LaneDetection
 

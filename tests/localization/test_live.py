@@ -23,8 +23,9 @@ from v2hdm.io.calibration.writing import write_calibration
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.localization import belief, live
 from v2hdm.localization.antenna import Fix
-from v2hdm.localization.localizer import Localizer, Status
+from v2hdm.localization.localizer import Localizer
 from v2hdm.localization.motion import Motion, MotionLog, MotionNoise
+from v2hdm.localization.pose import Status
 from v2hdm.localization.seeing import Look, expect
 from v2hdm.localization.stream import MotionLines, look_of, pose_record
 from v2hdm.records import Calibration, GeodeticOrigin, HDMap, Marking, MarkingDetection
@@ -309,7 +310,7 @@ def test_the_derivatives_of_expected_pixels_are_those_of_their_differences():
     plane = belief.Plane(0.05)
     state = belief.replace(state, mean=mean)
     expected = expect(state, plane, 0, calibration, corners)
-    derivative = np.concatenate([expected.by_vehicle, expected.by_camera], axis=2)[0]
+    derivative = expected.by_states[0]
     step = 1e-6
     for column in range(len(mean)):
         ends = [

@@ -13,8 +13,9 @@ from tests.drive.bags import ROS2, Messages
 from tests.localization.driven import cameras, drive, mapped, yard
 from v2hdm.errors import DriveError
 from v2hdm.geometry.rigid import rotation_from_quaternion
-from v2hdm.localization.localizer import Localizer, Status
+from v2hdm.localization.localizer import Localizer
 from v2hdm.localization.messages import fix_of, motion_of, pose_bag, pose_message, status_message
+from v2hdm.localization.pose import Status
 
 NODE = Path(__file__).parents[2] / "examples" / "ros2" / "localizer_node.py"
 

@@ -7,13 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.localization.driven import INTRINSIC, cameras, drive, mapped, moved, yard
+from tests.localization.driven import DIAMOND, INTRINSIC, cameras, drive, mapped, moved, yard
 from v2hdm.errors import ConfigError
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.localization.live import _Eye
-from v2hdm.localization.localizer import Localizer, Status
+from v2hdm.localization.localizer import Localizer
+from v2hdm.localization.pose import Status
 from v2hdm.localization.regions import Ahead, Looking, View, expected_boxes
 from v2hdm.localization.seeing import Look
+from v2hdm.records import Marking
 
 
 def in_regions(look, regions_px):
@@ -105,6 +107,81 @@ def test_markings_that_are_hidden_make_the_next_look_a_full_one():
     assert any(box is not None for now in regions[53:60] for box in now.values())
 
 
+def followed_by_second_looks(driven, hd_map, late, changed=lambda frame, look: look):
+    """As ``followed``, with whole searches that come so many moments after the looks at parts."""
+    localizer = Localizer(hd_map, driven.calibrations, driven.rough(np.random.default_rng(0)))
+    poses, told, waiting = [], [], []
+    for frame, (looks, motion) in enumerate(zip(driven.looks, driven.motion, strict=True)):
+        localizer.update([look for due, look in waiting if due == frame])
+        localizer.update([], motion)
+        now = {look.camera: localizer.glance(look.camera, look.stamp_s) for look in looks}
+        shown = [changed(frame, look) for look in looks]
+        waiting += [
+            (frame + late, replace(look, is_second=True)) for look in shown if now[look.camera].is_all_later
+        ]
+        poses.append(localizer.update([in_regions(look, now[look.camera].regions_px) for look in shown]))
+        told.append(now)
+    return poses, told
+
+
+@pytest.mark.parametrize("late", [1, 3])
+def test_whole_searches_follow_looks_at_parts_and_come_as_often(late):
+    painted = yard(2)
+    driven = drive(painted, 2)
+    poses, told = followed_by_second_looks(driven, mapped(painted, 2), late)
+    for camera in ("front", "rear"):
+        tracked = [
+            now[camera] for now, pose in zip(told, poses, strict=True) if pose.status == Status.TRACKING
+        ]
+        assert np.mean([ahead.regions_px is None for ahead in tracked]) < 0.1
+        whole = [
+            frame
+            for frame, now in enumerate(told)
+            if now[camera].is_all_later or now[camera].regions_px is None
+        ]
+        assert max(np.diff(whole)) <= 5
+    errors = np.array(
+        [driven.errors(pose, k) for k, pose in enumerate(poses) if pose.status == Status.TRACKING]
+    )
+    bounds = np.array(
+        [(*pose.protection_m, pose.protection_rad) for pose in poses if pose.status == Status.TRACKING]
+    )
+    assert (np.abs(errors) < bounds).all()
+    assert np.sqrt((errors[:, :2] ** 2).mean(axis=0)).max() < 0.03
+
+
+def test_where_no_whole_search_comes_an_image_is_searched_at_once():
+    painted = yard(2)
+    driven = drive(painted, 2)
+    _, told = followed_by_second_looks(driven, mapped(painted, 2), late=1000)
+    at_once = [frame for frame, now in enumerate(told) if now["front"].regions_px is None]
+    assert 5 < max(np.diff(at_once)) <= 10
+
+
+def test_what_second_looks_alone_show_speaks_against_the_map():
+    painted = yard(3)
+    extra = [Marking("diamond", DIAMOND + np.array([x, 5.5]), 10) for x in np.arange(30.0, 100.0, 2.0)]
+    driven = drive(replace(painted, markings=(*painted.markings, *extra)), 3)
+    poses, told = followed_by_second_looks(driven, mapped(painted, 3), 2)
+    entered = int(np.argmax(driven.poses[:, 0, 3] > 22.0))
+    said = next(frame for frame, pose in enumerate(poses) if frame >= entered and pose.reasons)
+    assert "the map explains" in poses[said].reasons[0]
+    assert any(now["front"].is_all_later for now in told[entered : said + 1])
+
+
+def test_a_second_look_at_an_image_that_nobody_knows_changes_nothing():
+    painted = yard(3)
+    driven = drive(painted, 3, seconds=2.0)
+    localizer = Localizer(mapped(painted, 3), driven.calibrations, driven.rough(np.random.default_rng(0)))
+    for looks, motion in zip(driven.looks, driven.motion, strict=True):
+        pose = localizer.update(looks, motion)
+    unknown = replace(driven.looks[-1][0], stamp_s=driven.stamp_s[-1] - 0.05, is_second=True)
+    again = localizer.update([unknown])
+    np.testing.assert_array_equal(again.map_from_vehicle, pose.map_from_vehicle)
+    assert again.images_s == pose.images_s
+    assert again.reasons == pose.reasons
+
+
 def test_until_the_place_is_sure_all_is_searched():
     painted = yard(5)
     driven = drive(painted, 5, seconds=2.0)
@@ -163,7 +240,7 @@ class Asked:
 
     def ahead(self, camera, now_s):
         self.now_s = now_s
-        return [Ahead(5.2, self.regions_px), Ahead(5.3, None)]
+        return [Ahead(5.2, self.regions_px, is_all_later=True), Ahead(5.3, None)]
 
 
 def test_a_camera_is_told_of_the_images_to_come_by_the_clock_of_its_files():
@@ -174,6 +251,7 @@ def test_a_camera_is_told_of_the_images_to_come_by_the_clock_of_its_files():
     told = [json.loads(line) for line in eye.stream.getvalue().splitlines()]
     assert [line["stamp_s"] for line in told] == pytest.approx([5.22, 5.32])
     assert [line["regions_px"] for line in told] == [[[1.0, 2.0, 3.0, 4.0]], None]
+    assert [line.get("all_later", False) for line in told] == [True, False]
 
 
 def test_a_camera_that_has_ended_is_told_nothing_more():

@@ -7,7 +7,8 @@ import pytest
 
 from tests.localization.driven import cameras, drive, mapped, with_words, word_at, yard
 from v2hdm.localization.areas import AreaMap
-from v2hdm.localization.localizer import Localizer, Status
+from v2hdm.localization.localizer import Localizer
+from v2hdm.localization.pose import Status
 from v2hdm.localization.seeing import Hull
 from v2hdm.localization.words import WordPatch
 from v2hdm.records import HDMap

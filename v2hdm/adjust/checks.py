@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import torch
 
 from v2hdm.adjust.kernels import NAMES
-from v2hdm.adjust.problem import ENGINES, LOSSES, POSE_STATES, Problem, SolveOptions
+from v2hdm.adjust.problem import ENGINES, LOSSES, POSE_STATES, PoseSigma, Problem, SolveOptions
 from v2hdm.doors import check_types
 from v2hdm.errors import AdjustError, shown
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 _SYMMETRIC_TO = 1e-5  # asymmetry of a covariance, relative to its diagonal: that of float32
+_ORTHONORMAL_TO = 1e-6  # largest entry of R R' - I of a rotation R
 _MAX_SLOPE = 573.0  # tangent of the largest angle from a camera's axis to anything it sees: 89.9 degrees
 
 
@@ -88,6 +92,19 @@ def check_model(problem: Problem, options: SolveOptions) -> None:
 
 def check_options(options: SolveOptions) -> None:
     """Raise :class:`AdjustError` for an option out of range."""
+    try:
+        _check_values(*vars(options).values())
+    except TypeError:  # a value without a hash
+        _check_options(options)
+
+
+@lru_cache(maxsize=64, typed=True)
+def _check_values(*values: Any) -> None:
+    """Check options by their values, sound ones once."""
+    _check_options(SolveOptions(**dict(zip(vars(SolveOptions()), values, strict=True))))
+
+
+def _check_options(options: SolveOptions) -> None:
     check_types(options)
     unknown = [name for name in options.pose_states if name not in POSE_STATES]
     if unknown:
@@ -131,7 +148,8 @@ def _check_arrays(problem: Problem) -> None:
     observations = problem.observations
     if len(observations.camera) == 0:
         raise AdjustError("there are no observations to adjust: detect and associate markings first")
-    sizes = _sizes(problem) | {"observation": len(observations.camera)}
+    indices = _sizes(problem)
+    sizes = indices | {"observation": len(observations.camera)}
     for of, arrays in _ARRAYS.items():
         owner, prefix = (observations, "observations.") if of == "observation" else (problem, "")
         for name, item_shape in arrays.items():
@@ -143,19 +161,29 @@ def _check_arrays(problem: Problem) -> None:
                 raise AdjustError(f"{prefix}{name} is a {type(values).__name__}: give a numpy array")
             if values.shape != shape:
                 raise AdjustError(f"{prefix}{name} has shape {values.shape}, expected {shape}")
-            if name in _sizes(problem) and not np.issubdtype(values.dtype, np.integer):
+            if name in indices and values.dtype.kind not in "iu":
                 raise AdjustError(f"{prefix}{name} holds {values.dtype}: give whole numbers")
-            if name not in ("centre_sigma_m", "pinhole_px", "covariance_px"):
+            if name in indices or name in ("centre_sigma_m", "pinhole_px", "covariance_px"):
+                continue
+            if not _has_finite_sum(values):
                 finite = np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
                 _refuse(~finite, f"{name} of {of} {{}} is not finite: remove it or fix its source")
 
 
+def _has_finite_sum(values: FloatArray) -> bool:
+    """Whether a sum, which is finite only if all of its terms are, is: cheaper than looking at each."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        return math.isfinite(np.add.reduce(values, axis=None))
+
+
 def _check_rigid(name: str, transforms: FloatArray) -> None:
-    rotation = transforms[:, :3, :3]
-    off = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max((1, 2), initial=0.0)
-    said = f"{name} {{}} is not a rigid transform: its "
-    _refuse((off > 1e-6) | (np.linalg.det(rotation) < 0), said + "rotation is not orthonormal")
-    _refuse((transforms[:, 3] != [0, 0, 0, 1]).any(1), said + "last row is not 0, 0, 0, 1")
+    from v2hdm.adjust.kernels.layout import first_not_rigid
+
+    k = first_not_rigid(np.ascontiguousarray(transforms, dtype=np.float64), _ORTHONORMAL_TO)
+    if k >= 0:
+        is_closed = (transforms[k, 3] == [0, 0, 0, 1]).all()
+        wrong = "rotation is not orthonormal" if is_closed else "last row is not 0, 0, 0, 1"
+        raise AdjustError(f"{name} {k} is not a rigid transform: its {wrong}")
 
 
 def check_observations(problem: Problem) -> None:
@@ -225,16 +253,22 @@ def _check_priors(problem: Problem) -> None:
     if problem.read_out_s is not None:
         said = "read_out_s of camera {} is {} s: give 0 (all rows at once) or more"
         _refuse(problem.read_out_s < 0, said, problem.read_out_s)
+    if problem.session is None and isinstance(problem.pose_sigma, PoseSigma):
+        _check_pose_sigma(problem.pose_sigma)
+        return
     _check_sessions(problem)
     for pose_sigma in problem.pose_sigmas:
-        sigma = pose_sigma.by_state()
-        if not (np.isfinite(sigma).all() and (sigma > 0).all()):
-            raise AdjustError(f"pose_sigma must be above 0 and finite: {pose_sigma}")
-        for total, drift in zip(sigma, pose_sigma.drift_by_state(), strict=True):
-            if not (0 <= drift.sigma <= total and drift.over_m > 0):
-                raise AdjustError(
-                    f"{drift} must be part of its pose_sigma {total:g} and fade over a distance"
-                )
+        _check_pose_sigma(pose_sigma)
+
+
+@lru_cache(maxsize=64)
+def _check_pose_sigma(pose_sigma: PoseSigma) -> None:
+    sigma = pose_sigma.by_state()
+    if not (np.isfinite(sigma).all() and (sigma > 0).all()):
+        raise AdjustError(f"pose_sigma must be above 0 and finite: {pose_sigma}")
+    for total, drift in zip(sigma, pose_sigma.drift_by_state(), strict=True):
+        if not (0 <= drift.sigma <= total and drift.over_m > 0):
+            raise AdjustError(f"{drift} must be part of its pose_sigma {total:g} and fade over a distance")
 
 
 def _check_sessions(problem: Problem) -> None:

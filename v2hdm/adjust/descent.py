@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -21,10 +22,15 @@ from v2hdm.adjust.whitening import Whitening, factorise
 
 Evaluate = Callable[[Tensor], tuple[float, Tensor]]  # cost and gradient at whitened variables y
 
-# Pairs of steps and gradients that LBFGS remembers, and most evaluations of a step: chosen.
-_LINE_SEARCH: dict[str, Any] = {"history_size": 20, "max_eval": 25}
-# One iteration per step: the surrounding loop decides when to stop.
-_STEPWISE: dict[str, Any] = {"max_iter": 1, "tolerance_grad": 0.0, "tolerance_change": 0.0}
+# Pairs of steps and gradients that LBFGS remembers, and most evaluations under one whitening: chosen. When to
+# stop is decided by the closure.
+_LBFGS: dict[str, Any] = {
+    "line_search_fn": "strong_wolfe",
+    "history_size": 20,
+    "max_eval": 50,
+    "tolerance_grad": 0.0,
+    "tolerance_change": 0.0,
+}
 _STEPS_FROM_NEARBY = 2  # steps to convergence under a whitening made near the optimum
 _NO_PROGRESS = 1e-15  # relative decrease below which it is rounding
 
@@ -35,11 +41,12 @@ def predicted_gap(cost: float, gradient: Tensor) -> float:
 
 
 class Minimum(NamedTuple):
-    """The end of a minimisation: y, cost, gradient, and whether its whitening converged too slowly."""
+    """The end of a minimisation, and whether its whitening converged too slowly."""
 
-    whitened: Tensor
+    whitened: Tensor  # y
     cost: float
     gradient: Tensor
+    gap: float
     slow: bool
 
 
@@ -59,50 +66,20 @@ def minimise(
     slow after ``max_iterations``, or if the remaining steps, at the rate of the last, cost more than a new
     whitening of ``renewal`` evaluations and the few steps from nearby.
     """
+    start = _Evaluation(torch.zeros_like(gradient), cost, gradient, predicted_gap(cost, gradient))
     scale = float(gradient.abs().sum())
-    u = torch.zeros_like(gradient)
-    evaluations = _Evaluations(
-        lambda point: objective(point * scale), torch.zeros_like(gradient), cost, gradient
-    )
-
-    def closure() -> float:
-        new_cost, new_gradient = evaluations.at(u)
-        # An infinite cost means an overshooting step; a sum is finite only if all of its terms are.
-        if math.isnan(new_cost) or not (math.isinf(new_cost) or math.isfinite(float(new_gradient.sum()))):
-            raise _NoNumberError
-        u.grad = new_gradient / scale
-        # Differences to the start keep the digits of small improvements of a large cost.
-        return (new_cost - cost) / scale**2
-
+    # No step leads from a gradient of zero, and none is needed where the gap is small.
+    if not start.gap > tolerance or scale == 0.0:
+        return Minimum(start.whitened, cost, gradient, start.gap, slow=False)
     leave_compiler_out()
-    optimizer = torch.optim.LBFGS([u], line_search_fn="strong_wolfe", **_STEPWISE, **_LINE_SEARCH)
-    step = bare_step()
-    best = cost
-    best_gradient = gradient
-    gap = predicted_gap(best, best_gradient)
-    slow = False
-    for iteration in range(max_iterations):
-        if gap <= tolerance or slow:
-            break
-        try:
-            step(optimizer, closure)
-            reached, reached_gradient = evaluations.at(u)
-        except _NoNumberError:
-            reached = math.inf
-        if not math.isfinite(reached):
-            # A line search along a singular direction diverged; the point before it stands.
-            u.copy_(evaluations.start)
-            break
-        evaluations.begin_step(u, reached, reached_gradient)
-        progress = best - reached
-        best = reached
-        best_gradient = reached_gradient
-        if progress <= _NO_PROGRESS * best:
-            break
-        before = gap
-        gap = predicted_gap(best, best_gradient)
-        slow = iteration > 0 and _steps_left(before, gap, tolerance) > renewal + _STEPS_FROM_NEARBY
-    return Minimum(u * scale, best, best_gradient, slow)
+    u = torch.zeros_like(gradient)
+    optimizer = torch.optim.LBFGS([u], max_iter=max_iterations, **_LBFGS)
+    search = _Search(objective, optimizer, u, scale, start, tolerance, renewal)
+    with suppress(_EnoughError):
+        bare_step()(optimizer, search)
+        search.accept()
+    end = search.accepted
+    return Minimum(end.whitened, end.cost, end.gradient, end.gap, search.slow)
 
 
 def _steps_left(before: float, gap: float, tolerance: float) -> float:
@@ -112,35 +89,90 @@ def _steps_left(before: float, gap: float, tolerance: float) -> float:
     return math.log(tolerance / gap) / math.log(gap / before) if gap < before else math.inf
 
 
-class _NoNumberError(Exception):
-    """The objective is NaN within a line search, whose comparisons are then meaningless."""
+class _EnoughError(Exception):
+    """Raised by a closure to end the optimiser's step."""
 
 
-class _Evaluations:
-    """An objective that caches the points of a step: each step first asks for the end of the last."""
+class _Evaluation(NamedTuple):
+    """An objective at whitened variables, and the gap there."""
 
-    def __init__(self, objective: Evaluate, start: Tensor, cost: float, gradient: Tensor) -> None:
+    whitened: Tensor
+    cost: float
+    gradient: Tensor
+    gap: float
+
+
+class _Search:
+    """The closure of LBFGS in u = y / ``scale``: evaluates, and ends the step where a point is good enough.
+
+    ``accepted`` is the start of LBFGS' present iteration, and in the end the result.
+    """
+
+    def __init__(
+        self,
+        objective: Evaluate,
+        optimizer: torch.optim.LBFGS,
+        u: Tensor,
+        scale: float,
+        start: _Evaluation,
+        tolerance: float,
+        renewal: float,
+    ) -> None:
         self._objective = objective
-        self.begin_step(start, cost, gradient)
+        self._u = u
+        self._scale = scale
+        self._start_cost = start.cost
+        self._tolerance = tolerance
+        self._renewal = renewal
+        self._state = optimizer.state[u]
+        self._iteration = 0
+        self._lowest = start
+        self.accepted = start
+        self.slow = False
 
-    def begin_step(self, start: Tensor, cost: float, gradient: Tensor) -> None:
-        """Forget all points except the start of a step, with its cost and gradient."""
-        self._known = [(start.clone(), cost, gradient)]
-
-    @property
-    def start(self) -> Tensor:
-        """Start of the current step."""
-        return self._known[0][0]
-
-    def at(self, point: Tensor) -> tuple[float, Tensor]:
-        """Cost and gradient at a point, from the cache if possible."""
-        for evaluated_point, cost, gradient in self._known:
-            if torch.equal(evaluated_point, point):
-                return cost, gradient
+    def __call__(self) -> float:
+        """Cost at u less that at the start, where LBFGS asks first; sets the gradient."""
+        if self._state["n_iter"] == 0:
+            return self._told(self.accepted.cost, self.accepted.gradient)
+        if self._state["n_iter"] > self._iteration:
+            self._begin_iteration()
+        whitened = self._u * self._scale
         with np.errstate(over="ignore", invalid="ignore"):  # an overshooting step may overflow
-            cost, gradient = self._objective(point)
-        self._known.append((point.clone(), cost, gradient))
-        return cost, gradient
+            cost, gradient = self._objective(whitened)
+        gap = predicted_gap(cost, gradient)
+        # An infinite cost means an overshooting step. After NaN a line search, which compares, means nothing.
+        if math.isnan(cost) or not (math.isinf(cost) or math.isfinite(gap)):
+            raise _EnoughError
+        if cost <= self._lowest.cost:
+            self._lowest = _Evaluation(whitened, cost, gradient, gap)
+            self._end_where_good_enough()
+        return self._told(cost, gradient)
+
+    def accept(self) -> None:
+        """Take the lowest point so far for the start of an iteration."""
+        self.accepted = self._lowest
+
+    def _begin_iteration(self) -> None:
+        before = self.accepted
+        self.accept()
+        if self._iteration > 0 and before.cost - self.accepted.cost <= _NO_PROGRESS * self.accepted.cost:
+            raise _EnoughError
+        self._iteration = self._state["n_iter"]
+
+    def _end_where_good_enough(self) -> None:
+        """End at the lowest point if it is at the minimum, or if the way there is longer than a new one."""
+        gap = self._lowest.gap
+        left = _steps_left(self.accepted.gap, gap, self._tolerance)
+        self.slow = self._iteration > 1 and left > self._renewal + _STEPS_FROM_NEARBY
+        if gap <= self._tolerance or self.slow:
+            self.accept()
+            raise _EnoughError
+
+    def _told(self, cost: float, gradient: Tensor) -> float:
+        """Cost and gradient as LBFGS reads them."""
+        self._u.grad = gradient / self._scale
+        # Differences to the start keep the digits of small improvements of a large cost.
+        return (cost - self._start_cost) / self._scale**2
 
 
 _ANNEALING_TOLERANCE = 1e-3  # while a robust loss is being narrowed, more digits are wasted
@@ -255,20 +287,21 @@ def descend(
             return _descent_to(base, whitening, gap, evaluations, progressing, is_base=True)
         inner = tolerance if final else _ANNEALING_TOLERANCE
         # After a slow whitening the next is near enough: the loss slows it, not the distance.
-        whitened, reached, gradient, slow = minimise(
+        minimum = minimise(
             objective, cost, gradient, inner, _ITERATIONS_PER_WHITENING, math.inf if slow else renewal
         )
-        gap = predicted_gap(reached, gradient)
-        point = objective.point(whitened)
+        slow = minimum.slow
+        gap = minimum.gap
+        point = objective.point(minimum.whitened)
         evaluations += objective.evaluations
         # A whitening under which the gap shrank this fast determines it well.
         if final and not slow and gap <= tolerance:
             return _descent_to(point, whitening, gap, evaluations, progressing, is_base=False)
-        progressing = reached < cost or not final
+        progressing = minimum.cost < cost or not final
         estimate = point.estimate
         last = whitening.robust
         # Frees the memory of the old factor, and of what refers to it, before the new one is made.
-        del whitening, objective, whitened, gradient, point
+        del whitening, objective, minimum, gradient, point
         loss = last if final else narrowed(engine, estimate, robust, last)
         whitening = factorise(engine, plan, estimate, loss)
 

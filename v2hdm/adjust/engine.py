@@ -387,6 +387,10 @@ class Linearised:
         """The estimate, cost and gradient at variables of the whitening, if the engine evaluates at once."""
         return None
 
+    def camera_step(self, whitened: Tensor) -> Tensor | None:
+        """The step (C, 6) of the cameras by variables of the whitening, if the engine made it at once."""
+        return None
+
     def by_cameras(self) -> Tensor | None:
         """L^-1 W' (N, 2, D) of all corners, if frames have no states and the engine keeps it."""
         return None

@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays, Lengths
-from v2hdm.adjust.problem import POSE_STATES, GroundPlanes, KnownLengths, Problem
+from v2hdm.adjust.problem import LINE_EXCESS, POSE_STATES, GroundPlanes, KnownLengths, Problem
 from v2hdm.errors import AdjustError
 from v2hdm.geometry.rigid import inverse
 from v2hdm.records import BoolArray, FloatArray, IntArray
@@ -28,8 +28,9 @@ _NEAR_M = 10_000.0  # coordinates up to this are exact to a picometre; moving th
 def nearby_origin(problem: Problem) -> FloatArray:
     """A point (2,) in whole metres near the recorded poses: the origin, or their centre if that is far."""
     position = problem.map_from_vehicle[:, :2, 3]
-    middle = np.round((position.min(0) + position.max(0)) / 2)
-    return np.asarray(middle if np.abs(middle).max() > _NEAR_M else np.zeros(2))
+    middle = np.round((np.minimum.reduce(position) + np.maximum.reduce(position)) / 2)
+    is_far = max(map(abs, middle.tolist())) > _NEAR_M
+    return np.asarray(middle if is_far else np.zeros(2))
 
 
 def shifted(problem: Problem, by_m: FloatArray) -> Problem:
@@ -70,11 +71,11 @@ def state_prior(problem: Problem, pose_states: tuple[str, ...]) -> StatePrior:
     (Gelb, Applied Optimal Estimation, section 3.8).
     """
     poses = problem.map_from_vehicle
-    session = problem.session_of_frame
     chosen = [k for k, name in enumerate(POSE_STATES) if name in pose_states]
     if not chosen:
         no_columns = np.zeros(0, dtype=np.int64)
         return StatePrior(no_columns, np.zeros((len(poses), 0, 0)), np.zeros((len(poses), 0)))
+    session = problem.session_of_frame
     total = np.array([sigma.by_state() for sigma in problem.pose_sigmas])
     drifts = [[(d.sigma, d.over_m) for d in sigma.drift_by_state()] for sigma in problem.pose_sigmas]
     drift, over_m = np.array(drifts).transpose(2, 0, 1)
@@ -108,12 +109,14 @@ def make_arrays(
     read_out: bool = False,
 ) -> Arrays:
     """Lay out a checked problem; AdjustError for a corner twice in an image, or too many joined corners."""
-
-    def real(values: FloatArray) -> Tensor:
-        return torch.as_tensor(np.ascontiguousarray(values), dtype=torch.float64, device=device)
+    is_on_cpu = device == "cpu"
 
     def index(values: NDArray[Any]) -> Tensor:
-        return torch.as_tensor(values, device=device)
+        tensor = torch.from_numpy(values)
+        return tensor if is_on_cpu else tensor.to(device)
+
+    def real(values: FloatArray) -> Tensor:
+        return index(np.ascontiguousarray(values, dtype=np.float64))
 
     corner_order, joined = _corners_in_route_order(problem)
     rank = np.empty_like(corner_order)
@@ -145,6 +148,7 @@ def make_arrays(
         corner=index(observations.corner),
         measured=real(observations.measured),
         root_information=real(observations.root_information),
+        has_lines=observations.has_lines,
         vehicle_from_map=real(inverse(problem.map_from_vehicle)),
         session=index(np.asarray(problem.session_of_frame, dtype=np.int64)),
         states=tuple(prior.columns.tolist()),
@@ -229,6 +233,7 @@ class _Sorted(NamedTuple):
     pair: NDArray[np.int32]  # (K,) its camera and frame
     measured: FloatArray  # (2, K)
     root_information: FloatArray  # (3, K)
+    has_lines: bool
 
 
 def _sorted_observations(problem: Problem, rank: IntArray) -> _Sorted:
@@ -241,9 +246,8 @@ def _sorted_observations(problem: Problem, rank: IntArray) -> _Sorted:
     order = np.empty(count, dtype=np.int32)
     corner = np.empty_like(order)
     pair = np.empty_like(order)
-    pair_at = np.zeros(len(columns.intrinsic) * frames + 1, dtype=np.int64)
     corner_at = np.zeros(len(rank) + 1, dtype=np.int64)
-    repeated = arrange(columns, rank, frames, np.empty_like(order), pair_at, corner_at, order, corner, pair)
+    repeated = arrange(columns, rank, frames, corner_at, order, corner, pair)
     if repeated >= 0:
         first, second = order[repeated - 1 : repeated + 1].tolist()
         raise AdjustError(
@@ -252,8 +256,8 @@ def _sorted_observations(problem: Problem, rank: IntArray) -> _Sorted:
         )
     measured = np.empty((2, count))
     root = np.empty((3, count))
-    lay_out(columns, order, measured, root)
-    return _Sorted(order, corner, pair, measured, root)
+    lines = lay_out(columns, order, pair, frames, LINE_EXCESS, measured, root)
+    return _Sorted(order, corner, pair, measured, root, lines > 0)
 
 
 def _clock_twist(problem: Problem, clock_offset: bool) -> tuple[FloatArray, list[float]]:

@@ -22,6 +22,7 @@ Derivatives are those of :mod:`v2hdm.adjust.engine`, against which :mod:`v2hdm.a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from kornia.geometry.camera.perspective import project_points
@@ -117,6 +118,8 @@ def moved(arrays: Arrays, clock_s: Tensor) -> Tensor:
 def before_camera(points_cam: Tensor) -> Tensor:
     """Points (k, 3) for projection: below the depth ``NEAR_M``, 1 / z continues as in ``inverse_depth``."""
     depth = points_cam[:, 2:]
+    if bool((depth >= NEAR_M).all()):
+        return points_cam
     at_least = depth.clamp(min=NEAR_M)
     return torch.cat([points_cam[:, :2] * (1 + (at_least - depth) / NEAR_M), at_least], dim=1)
 
@@ -129,9 +132,13 @@ def points_in_camera(cam_from_map: Tensor, corners_map: Tensor) -> Tensor:
 
 def reprojection_error(points_cam: Tensor, measured: Tensor) -> Tensor:
     """Projected points (k, 3) minus the measured ones (2, k), at depth 1: (k, 2)."""
-    at_depth_one = torch.eye(3, dtype=points_cam.dtype, device=points_cam.device)
-    error: Tensor = project_points(before_camera(points_cam), at_depth_one) - measured.T
+    error: Tensor = project_points(before_camera(points_cam), _at_depth_one(points_cam.device)) - measured.T
     return error
+
+
+@lru_cache(maxsize=8)
+def _at_depth_one(device: torch.device) -> Tensor:
+    return torch.eye(3, dtype=torch.float64, device=device)
 
 
 def corner_residual(points_cam: Tensor, measured: Tensor, root_information: Tensor) -> Tensor:

@@ -19,7 +19,6 @@ from v2hdm.records import BoolArray, FloatArray, IntArray
 VerdictArray = NDArray[np.int8]
 
 _MEDIAN_SQUARED = 2 * float(np.log(2))  # median of a chi-square distribution with two degrees of freedom
-_ROWS = 1 << 18  # number of observations that are classified at once
 
 
 class Verdict(IntEnum):
@@ -56,19 +55,13 @@ def classify(
     freedom: -2 ln p), times the variance ``scale``, so that understated covariances do not empty the map. An
     observation is unconfirmed if the gate leaves it as the last of several of its corner.
     """
-    gate = -2 * np.log(probability) * scale
-    verdict = np.full(len(mahalanobis2), Verdict.ACCEPTED, dtype=np.int8)
-    verdict[mahalanobis2 > gate] = Verdict.CONTRADICTS
-    verdict[behind] = Verdict.BEHIND_CAMERA
-    count = int(observations.corner.max()) + 1
-    observation_count = np.bincount(observations.corner, minlength=count)
-    accepted_count = np.bincount(observations.corner[verdict == Verdict.ACCEPTED], minlength=count)
-    is_last = (accepted_count == 1) & (observation_count > 1)
-    for begin in range(0, len(verdict) if is_last.any() else 0, _ROWS):
-        part = slice(begin, begin + _ROWS)
-        verdict[part][is_last[observations.corner[part]] & (verdict[part] == Verdict.ACCEPTED)] = (
-            Verdict.UNCONFIRMED
-        )
+    from v2hdm.adjust.kernels.layout import classify as classify_all
+
+    gate = -2 * math.log(probability) * scale
+    corner = np.ascontiguousarray(observations.corner, dtype=np.int64)
+    verdict = np.empty(len(corner), dtype=np.int8)
+    counts = np.zeros((2, int(corner.max()) + 1), dtype=np.int64)
+    classify_all(corner, mahalanobis2, behind, gate, verdict, *counts)
     return verdict
 
 

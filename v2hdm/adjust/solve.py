@@ -58,8 +58,8 @@ def is_worth_a_look(arrays: Arrays) -> bool:
 
 def is_near(whitening: Whitening) -> bool:
     """Whether the Newton step turns every camera by less than the descent's range of convergence."""
-    by_camera = whitening.camera_step(-whitening.gradient)
-    return float(by_camera[:, 3:6].norm(dim=1).max()) <= _NEAR_RAD
+    turns = whitening.camera_step(whitening.gradient)[:, 3:6].numpy(force=True)
+    return float(np.square(turns).sum(axis=1).max()) <= _NEAR_RAD**2
 
 
 def coarse_extrinsics(engine: TorchEngine, cam_from_vehicle: Tensor) -> tuple[Tensor, int]:
@@ -100,22 +100,14 @@ def _papers_model(arrays: Arrays, corners: int) -> Arrays:
     """The problem of ``corners`` corners and their frames, without states and clocks."""
     if arrays.corner_count > corners:
         arrays, _ = arrays.take(_route_blocks(arrays, corners))
-    # Without states each moment is a frame.
-    moments, moment = torch.unique(arrays.pair % arrays.moment_count, return_inverse=True)
-    camera = arrays.camera_of(arrays.pair)
-    moments = moments.long()
-    frames = arrays.frame_of(moments)
+    part = arrays.by_moment().arrays
     return replace(
-        arrays,
-        pair=camera * len(moments) + moment.to(camera.dtype),
-        vehicle_from_map=arrays.vehicle_from_map[frames],
+        part,
         states=(),
-        state_transition=arrays.state_transition[frames, :0, :0],
-        state_information_root=arrays.state_information_root[frames, :0],
-        clock_twist=arrays.clock_twist[moments, :, :0],
-        clock_information_root=arrays.clock_information_root[:0],
-        frame_of_moment=None,
-        read_out=None if arrays.read_out is None else arrays.read_out[:, moments],
+        state_transition=part.state_transition[:, :0, :0],
+        state_information_root=part.state_information_root[:, :0],
+        clock_twist=part.clock_twist[:, :, :0],
+        clock_information_root=part.clock_information_root[:0],
     )
 
 
@@ -257,14 +249,12 @@ def report_of(
     report = engine.report(estimate, problem.intrinsic[:, :2])
     audit(arrays, estimate, robust, problem.intrinsic[:, :2], report, terms["observations"])
     residual_px, mahalanobis2, behind = report
-    lines = problem.observations.on_line
-    if lines.any():
-        mahalanobis2[lines] = as_of_point(mahalanobis2[lines])
+    if arrays.has_lines:
+        is_on_line = problem.observations.on_line
+        mahalanobis2[is_on_line] = as_of_point(mahalanobis2[is_on_line])
     scale = noise_scale(mahalanobis2)
     of_priors = 2 * sum(cost for name, cost in terms.items() if name != "observations")
-    held = int((arrays.centre_information_root > 0).sum()) + int((arrays.control_root[:, ::2] > 0).sum())
-    held += int(arrays.ground_root.any(dim=2).sum())
-    free = 2 * arrays.corner_count + 6 * arrays.camera_count - held - len(arrays.lengths.first)
+    free = 2 * arrays.corner_count + 6 * arrays.camera_count - _held(arrays)
     variance = variance_factors(mahalanobis2, of_priors, free, scale)
     corners_map = np.empty(estimate.corners_map.shape)
     corners_map[arrays.corner_order.cpu().numpy()] = estimate.corners_map.cpu().numpy()
@@ -293,6 +283,14 @@ def report_of(
         observation_factor=variance.observations,
         covariance=Covariance(descent),
     )
+
+
+def _held(arrays: Arrays) -> int:
+    """The number of unknowns that priors other than the poses' determine."""
+    centre = np.count_nonzero(arrays.centre_information_root.numpy(force=True))
+    control = np.count_nonzero(arrays.control_root[:, ::2].numpy(force=True))
+    ground = np.count_nonzero(arrays.ground_root.numpy(force=True).any(axis=2))
+    return int(centre + control + ground) + len(arrays.lengths.first)
 
 
 def _status(descent: Descent, options: SolveOptions, behind: bool) -> Status:

@@ -39,8 +39,9 @@ def one_thread_in_torch(observations: int, alone: bool) -> Iterator[None]:
 
 def share(work: Callable[[int, int], None], chunks: int, observations: int) -> None:
     """Call ``work(begin, end)`` for ranges that partition the ``chunks``."""
-    threads = min(_granted or torch.get_num_threads(), chunks)
-    if threads <= 1 or observations < _WORTH_THREADS:
+    is_small = chunks == 1 or observations < _WORTH_THREADS
+    threads = 1 if is_small else min(_granted or torch.get_num_threads(), chunks)
+    if threads <= 1:
         work(0, chunks)
         return
     for _ in _executor(threads).map(lambda chunk: work(chunk, chunk + 1), range(chunks)):

@@ -26,6 +26,7 @@ from v2hdm.detection.quads.blobs import find_blobs
 from v2hdm.detection.quads.outline import on_edges, outline_polygon
 from v2hdm.detection.quads.propose import Proposal, Proposals, propose
 from v2hdm.detection.regions import NO_PAINT, run_in_regions
+from v2hdm.detection.steps import Steps, last
 from v2hdm.detection.stopwatch import lap
 from v2hdm.detection.weights import NETWORK_FILE, check_weights
 from v2hdm.doors import checked
@@ -92,13 +93,28 @@ class Detector:
         self, output: NetworkOutput, image_bgr: np.ndarray, camera: Camera, has_boundaries: bool = True
     ) -> tuple[tuple[MarkingDetection, ...], tuple[LaneDetection, ...]]:
         """Find the markings and lanes of an image of which the network's output is known."""
+        return last(self._steps_in(output, image_bgr, camera, has_boundaries))
+
+    def steps(
+        self, image_bgr: np.ndarray, camera: Camera, has_boundaries: bool = True
+    ) -> Steps[tuple[Markings, tuple[LaneDetection, ...]]]:
+        """As :meth:`detect`, in steps between which something else may be done."""
+        output = self.run_network(image_bgr, camera)
+        yield
+        return (yield from self._steps_in(output, image_bgr, camera, has_boundaries))
+
+    def _steps_in(
+        self, output: NetworkOutput, image_bgr: np.ndarray, camera: Camera, has_boundaries: bool
+    ) -> Steps[tuple[Markings, tuple[LaneDetection, ...]]]:
         with lap("propose"):
             proposals = self.propose(output, camera)
         with lap("lanes"):
             image = self.lane_image(proposals, image_bgr)
             lanes = (*image.paint, *(find_boundaries(image) if has_boundaries else ()))
+        yield
         with lap("fit"):
             readings = self.read(image_bgr, proposals)
+        yield
         with lap("judge"):
             quads = find_markings(readings, proposals.camera, self.options)
         markings = _likelier(quads, self._symbols(image_bgr, proposals))

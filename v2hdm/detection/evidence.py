@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,7 +15,8 @@ from v2hdm.detection.quads.fit import STATISTICS, Fit
 from v2hdm.detection.quads.patch import ImageQuads, Patches, grey_of, log_light
 from v2hdm.detection.quads.propose import Proposal
 from v2hdm.geometry.planar import Quad, cross
-from v2hdm.records import DIAMOND, LANE_LINE, FloatArray
+from v2hdm.native import kernels
+from v2hdm.records import DIAMOND, LANE_LINE, BoolArray, FloatArray
 
 CLAIMED = (
     "odds_inside", "surest_inside", "paint_beside", "certainty", "share", "size_share", "line_share",
@@ -133,26 +135,60 @@ def rectified_views(
     quads = quads.take(marking)
     output = patches.output
     points = quads.px(_points(ordered, is_diamond, SIZE))
-    bgr = _coarser(patches.light_at(quads.px(_points(ordered, is_diamond, _FINER * SIZE))))
+    finer = quads.px(_points(ordered, is_diamond, _FINER * SIZE))
+    class_index = [output.classes.index(kind) for _, kind in readings]
+    first_side = np.where(lengthwise, 0, 1)[marking][of_reading]
+    claims = _Claims.of(output, catalogue)
+    compiled = kernels()
+    if compiled is not None:
+        own_class = np.array(class_index, dtype=np.intp)
+        gains = (_GREY_GAIN, _COLOUR_GAIN, _ODDS_GAIN)
+        views = compiled.views(
+            patches.source, claims, points, finer, of_reading.astype(np.intp), own_class, *gains
+        )
+        return views, first_side
+    bgr = _coarser(patches.light_at(finer))
     logs = log_light(bgr)
     odds = output.odds_at(points)
     shares = output.shares_at(points)
-    symbol_names = catalogue.of_any_shape
-    symbols = [k for k, name in enumerate(output.classes) if name in symbol_names]
     planes_of = {
         "log_grey": np.float32(_GREY_GAIN) * _over_median(log_light(grey_of(bgr))),
         "blueness": np.float32(_COLOUR_GAIN) * _over_median(logs[..., 0] - logs[..., 2]),
         "paint_odds": np.float32(_ODDS_GAIN) * odds,
-        "line_share": shares[output.classes.index(LANE_LINE)],
-        "symbol_share": shares[symbols].sum(axis=0),
+        "line_share": shares[claims.line],
+        "symbol_share": shares[claims.is_symbol].sum(axis=0),
         "outside": patches.outside(points),
     }
     views = np.empty((len(readings), len(CHANNELS), SIZE, SIZE), dtype=np.float32)
     for name, planes in planes_of.items():
         views[:, CHANNELS.index(name)] = planes[of_reading]
-    class_index = [output.classes.index(kind) for _, kind in readings]
     views[:, CHANNELS.index("own_share")] = shares[class_index, of_reading]
-    return views, np.where(lengthwise, 0, 1)[marking][of_reading]
+    return views, first_side
+
+
+class _Claims(NamedTuple):
+    """What the network says about an image, for the compiled kernel."""
+
+    paint: np.ndarray  # (h, w) float32 log odds
+    kinds: np.ndarray  # (K, h', w') float32 logits
+    stride: int  # px per element of paint
+    kind_scale: float  # elements of paint per element of ``kinds``
+    top: int  # the first image row
+    line: int  # which class is lane lines
+    is_symbol: BoolArray  # (K,) which classes are symbols
+
+    @classmethod
+    def of(cls, output: NetworkOutput, catalogue: Catalogue) -> _Claims:
+        """The claims of an output."""
+        return cls(
+            paint=output.paint,
+            kinds=output.kinds,
+            stride=output.stride,
+            kind_scale=output.kind_scale,
+            top=output.top,
+            line=output.classes.index(LANE_LINE),
+            is_symbol=np.isin(output.classes, catalogue.of_any_shape),
+        )
 
 
 def _coarser(fine: np.ndarray) -> np.ndarray:

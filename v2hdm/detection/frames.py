@@ -6,11 +6,14 @@ import logging
 import os
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
+from statistics import median
 
 import cv2
 import numpy as np
@@ -25,6 +28,8 @@ _log = logging.getLogger(__name__)
 _MOST_CAMERAS = 1 << 16  # OpenCV takes a larger index for something else
 _POLL_S = 0.005  # a folder that grows is looked at this often
 _WRITTEN_S = 1.0  # an image is written within this time
+_LAST_FRAMES = 10  # frames by which the pace of a camera is known
+_OVERDUE = 1.5  # intervals without a frame after which nobody knows when the next one comes
 _SAME_DATE_S = (2.0, 0.05)
 """Seconds within which two changes may have one date: of dates in whole seconds (FAT), and in fractions."""
 
@@ -113,6 +118,7 @@ class NewestFrames(Iterator[Frame]):
     """The newest frame of a camera whenever one is asked for: a thread reads and drops those before it."""
 
     def __init__(self, frames: Iterator[Frame]) -> None:
+        self._came_s: deque[float] = deque(maxlen=_LAST_FRAMES)  # times at which frames came
         self._newest: Frame | None = None
         self._end: BaseException | None = None
         self._changed = threading.Condition()
@@ -124,14 +130,26 @@ class NewestFrames(Iterator[Frame]):
             for frame in frames:
                 with self._changed:
                     before = self._newest
-                    dropped = 0 if before is None else before.dropped + 1
+                    dropped = frame.dropped + (0 if before is None else before.dropped + 1)
                     self._newest = replace(frame, dropped=dropped)
+                    self._came_s.append(time.perf_counter())
                     self._changed.notify()
         except BaseException as error:  # for the one who asks for frames
             end = error
         with self._changed:
             self._end = end
             self._changed.notify()
+
+    def is_idle_for(self, seconds: float) -> bool:
+        """Whether no frame waits, and the next one is not expected within a time; frames come at a pace."""
+        with self._changed:
+            came_s = [*self._came_s]
+            is_waiting = self._newest is not None or self._end is not None
+        if is_waiting or len(came_s) < 2:
+            return not is_waiting
+        interval_s = median(later_s - earlier_s for earlier_s, later_s in pairwise(came_s))
+        since_s = time.perf_counter() - came_s[-1]
+        return since_s + seconds < interval_s or since_s > _OVERDUE * interval_s
 
     def __next__(self) -> Frame:
         """Wait for a frame that was not given yet; raises what the camera did, after its last one."""

@@ -21,18 +21,19 @@ _SAME_S = 0.05  # difference, s, of the times of an image and of a line that is 
 _KEPT = 16  # lines that are kept
 
 
-class _Pointed(NamedTuple):
-    """Boxes (R, 4), px, of an image expected at a time; None for everywhere."""
+class Pointed(NamedTuple):
+    """Where to look in an image expected at a time."""
 
     stamp_s: float
-    regions_px: FloatArray | None
+    regions_px: FloatArray | None  # boxes (R, 4), px; None for everywhere
+    is_all_later: bool = False  # whether all of it is to be searched once there is time
 
 
 class Pointer:
     """The latest lines; one that cannot be read is left out with a warning, once."""
 
     def __init__(self) -> None:
-        self._latest = deque[_Pointed](maxlen=_KEPT)
+        self._latest = deque[Pointed](maxlen=_KEPT)
         self._has_warned = False
 
     def follow(self, lines: Iterable[str]) -> None:
@@ -42,8 +43,9 @@ class Pointer:
                 record = json.loads(line)
                 stated = record["regions_px"]
                 regions_px = None if stated is None else np.array(stated, dtype=np.float64).reshape(-1, 4)
-                self._latest.append(_Pointed(float(record["stamp_s"]), regions_px))
-            except (ValueError, TypeError, KeyError):
+                is_all_later = record.get("all_later", False) is True
+                self._latest.append(Pointed(float(record["stamp_s"]), regions_px, is_all_later))
+            except (ValueError, TypeError, KeyError, AttributeError):
                 self._latest.clear()
                 if not self._has_warned:
                     _log.warning(
@@ -53,9 +55,9 @@ class Pointer:
                     )
                 self._has_warned = True
 
-    def regions(self, stamp_s: float | None) -> FloatArray | None:
-        """The boxes (R, 4) for an image taken at a time; None to look everywhere."""
+    def at(self, stamp_s: float | None) -> Pointed | None:
+        """What the latest line of an image taken at a time says; None to look everywhere."""
         if stamp_s is None:
             return None
         of_image = [pointed for pointed in tuple(self._latest) if abs(pointed.stamp_s - stamp_s) < _SAME_S]
-        return of_image[-1].regions_px if of_image else None
+        return of_image[-1] if of_image else None

@@ -25,6 +25,7 @@ from v2hdm.detection.detector import Detector
 from v2hdm.detection.frames import Frame
 from v2hdm.detection.network import NetworkOutput
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.detection.steps import Steps
 from v2hdm.detection.stopwatch import lap
 from v2hdm.errors import MapFileError
 from v2hdm.io.calibration.reading import read_calibration
@@ -111,11 +112,15 @@ class RoadLane:
 
 @dataclass(frozen=True)
 class Road:
-    """The markings and lanes of one image; ``is_whole`` unless only regions of it were looked at."""
+    """The markings and lanes of one image.
+
+    ``is_whole`` unless only regions of it were looked at, ``is_second`` if they were before.
+    """
 
     markings: tuple[RoadMarking, ...]
     lanes: tuple[RoadLane, ...]
     is_whole: bool = True
+    is_second: bool = False
 
 
 class RoadDetector:
@@ -182,13 +187,25 @@ class RoadDetector:
             markings, lanes = self.detector.detect(image_bgr, self.camera, has_boundaries)
         else:
             markings, lanes = self.detector.detect_in(output, image_bgr, self.camera, has_boundaries)
+        return self._road(markings, lanes, is_whole=regions_px is None)
+
+    def steps(self, image_bgr: np.ndarray) -> Steps[Road]:
+        """As :meth:`detect` of all of an image, in steps between which something else may be done."""
+        has_boundaries = not self.is_for_localizer
+        markings, lanes = yield from self.detector.steps(image_bgr, self.camera, has_boundaries)
+        return self._road(markings, lanes, is_whole=True)
+
+    def _road(
+        self, markings: Sequence[MarkingDetection], lanes: Sequence[LaneDetection], is_whole: bool
+    ) -> Road:
+        """The detections on the ground, with the crosswalks that they make."""
         with lap("metres"):
             crosswalks = find_crosswalks(markings, self.detector.road_camera(self.camera))
             road = self._on_ground((*markings, *(crosswalk for crosswalk, _ in crosswalks)), lanes)
             parts = (*(() for _ in markings), *(parts for _, parts in crosswalks))
             with_parts = zip(road.markings, parts, strict=True)
             with_crosswalks = tuple(replace(marking, parts=of) for marking, of in with_parts)
-            return replace(road, markings=with_crosswalks, is_whole=regions_px is None)
+            return replace(road, markings=with_crosswalks, is_whole=is_whole)
 
     def _on_ground(self, markings: Sequence[MarkingDetection], lanes: Sequence[LaneDetection]) -> Road:
         """The detections with their places on the ground, if the camera is calibrated."""
@@ -232,6 +249,8 @@ def as_record(frame: Frame, camera: str, road: Road) -> dict[str, Any]:
     }
     if not road.is_whole:
         record["whole"] = False
+    if road.is_second:
+        record["second"] = True
     return record
 
 

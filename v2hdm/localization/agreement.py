@@ -58,11 +58,20 @@ class _Object:
     way_m: float
     gains: list[float] = field(default_factory=list)  # of each view
     scores: list[float] = field(default_factory=list)  # of each view
+    images: list[tuple[str, float]] = field(default_factory=list)  # camera and time of each view
+    # The medians of its views, whose errors are alike:
+    gain: float = 0.0  # the log likelihood ratio of a map that differs
+    score: float = 0.0  # the log likelihood by the map over that of chance
 
-    @property
-    def gain(self) -> float:
-        """The log likelihood ratio of a map that differs: the median of its views, whose errors are alike."""
-        return median(self.gains)
+    def note(self, gain: float, score: float, image: tuple[str, float]) -> None:
+        """Take a view; an image counts once."""
+        if image in self.images:
+            return
+        self.images.append(image)
+        self.gains.append(gain)
+        self.scores.append(score)
+        self.gain = median(self.gains)
+        self.score = median(self.scores)
 
 
 class Detected(NamedTuple):
@@ -141,16 +150,16 @@ class Agreement:
 
     objects: list[_Object] = field(default_factory=list)
 
-    def note(self, judged: Detected, way_m: float) -> None:
-        """Take the detections of an image."""
+    def note(self, judged: Detected, way_m: float, look: Look) -> None:
+        """Take the detections of a look."""
+        image = (look.camera, look.stamp_s)
         self.objects = [spot for spot in self.objects if way_m - spot.way_m < _WAY_M]
         for row in np.flatnonzero(judged.is_judged).tolist():
             spot = self._of(judged.places_map[row], judged.kinds[row])
             if spot is None:
                 spot = _Object(judged.places_map[row], judged.kinds[row], way_m)
                 self.objects.append(spot)
-            spot.gains.append(float(judged.gains[row]))
-            spot.scores.append(float(judged.scores[row]))
+            spot.note(float(judged.gains[row]), float(judged.scores[row]), image)
 
     def _of(self, place_map: FloatArray, kind: str) -> _Object | None:
         """The object of a class at a place."""
@@ -168,7 +177,7 @@ class Agreement:
     @property
     def score(self) -> float:
         """The log likelihood of these objects by the map over that of chance."""
-        return sum(median(spot.scores) for spot in self._several)
+        return sum(spot.score for spot in self._several)
 
     @property
     def quads(self) -> int:
@@ -181,7 +190,7 @@ class Agreement:
         several = self._several
         if len(several) < _FROM:
             return 1.0
-        return float(np.mean([spot.gain <= 0 for spot in several]))
+        return sum(spot.gain <= 0 for spot in several) / len(several)
 
     @property
     def differs(self) -> bool:

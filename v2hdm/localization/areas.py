@@ -95,8 +95,8 @@ def _observed(
     if not np.isfinite(expected.px).all():
         return None
     begin = VEHICLE + CAMERA * scene.camera
-    slope = expected.by_vehicle[0] @ belief.root[:VEHICLE]
-    slope += expected.by_camera[0] @ belief.root[begin : begin + CAMERA]
+    slope = expected.by_states[0, :, :VEHICLE] @ belief.root[:VEHICLE]
+    slope += expected.by_states[0, :, VEHICLE:] @ belief.root[begin : begin + CAMERA]
     slope += expected.by_place[0] @ belief.root[state : state + 2]
     noise_px2 = _IMAGE_M**2 * expected.by_place[0] @ expected.by_place[0].T
     residual_px = expected.px[1] - expected.px[0]

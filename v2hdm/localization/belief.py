@@ -10,14 +10,15 @@ chapter V).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from v2hdm.geometry.rigid import make_transform, rotation_from_euler
+from v2hdm.geometry.rigid import make_transform, rotation_from_angles
 from v2hdm.localization.motion import MotionNoise, Piece
-from v2hdm.records import HEAVE_SIGMA_M, FloatArray
+from v2hdm.records import HEAVE_SIGMA_M, FloatArray, IntArray
 
 X, Y, HEADING, SCALE, BIAS, HEIGHT, ROLL, PITCH, SLOW_ROLL, SLOW_PITCH, LATE = range(11)
 """The vehicle's states: place, m, heading, rad, log of true over stated speed, bias of the yaw rate, rad/s,
@@ -60,10 +61,11 @@ class Plane:
 
 @dataclass(frozen=True)
 class Belief:
-    """Mean (n,) and root (n, n) of the states at a time.
+    """Mean (n,) and root of the states at a time.
 
-    ``markings`` are the numbers, in order, of the map's features whose errors are states: of markings, and
-    behind the last of these of stretches of lines and of areas.
+    The root has shape (n, n), or (n, m) with m > n as :func:`foresee` leaves it. ``markings`` are the
+    numbers, in order, of the map's features whose errors are states: of markings, and behind the last of
+    these of stretches of lines and of areas.
     """
 
     stamp_s: float
@@ -83,6 +85,12 @@ class Belief:
             return None
         return self.first_marking + 2 * self.markings.index(marking)
 
+    def states_of(self, markings: IntArray) -> IntArray:
+        """The first of the two states of markings (M,), -1 for one without."""
+        is_same = markings[:, None] == np.array(self.markings, dtype=np.int64)
+        place = is_same @ np.arange(1, len(self.markings) + 1)
+        return np.where(place > 0, self.first_marking + 2 * (place - 1), -1)
+
     def covariance(self, states: Sequence[int]) -> FloatArray:
         """The covariance of some states."""
         rows = self.root[list(states)]
@@ -95,15 +103,16 @@ class Belief:
 
     def map_from_vehicle(self, plane: Plane) -> FloatArray:
         """The pose (4, 4) over the map's ground."""
-        cos = np.cos(self.mean[HEADING])
-        sin = np.sin(self.mean[HEADING])
+        vehicle = self.mean[:VEHICLE].tolist()
+        cos = math.cos(vehicle[HEADING])
+        sin = math.sin(vehicle[HEADING])
         along = plane.slope[0] * cos + plane.slope[1] * sin
         left = plane.slope[1] * cos - plane.slope[0] * sin
-        roll = np.arctan(left) + self.mean[ROLL] + self.mean[SLOW_ROLL]
-        pitch = -np.arctan(along) + self.mean[PITCH] + self.mean[SLOW_PITCH]
-        rotation = rotation_from_euler(*(np.array([angle]) for angle in (roll, pitch, self.mean[HEADING])))
-        place = np.array([self.mean[X], self.mean[Y], plane.height_m + self.mean[HEIGHT]])
-        return make_transform(rotation[0], place)
+        roll = math.atan(left) + vehicle[ROLL] + vehicle[SLOW_ROLL]
+        pitch = -math.atan(along) + vehicle[PITCH] + vehicle[SLOW_PITCH]
+        rotation = rotation_from_angles(roll, pitch, vehicle[HEADING])
+        place = np.array([vehicle[X], vehicle[Y], plane.height_m + vehicle[HEIGHT]])
+        return make_transform(rotation, place)
 
 
 def start(
@@ -134,6 +143,16 @@ def predict(
     belief: Belief, pieces: Sequence[Piece], noise: MotionNoise, turning: Collection[int] = ()
 ) -> Belief:
     """The belief after pieces of motion; the mountings of some cameras are ``turning``."""
+    belief_ahead = foresee(belief, pieces, noise, turning)
+    if belief_ahead.root.shape[1] == len(belief_ahead.mean):
+        return belief_ahead
+    return replace(belief_ahead, root=_square(belief_ahead.root))
+
+
+def foresee(
+    belief: Belief, pieces: Sequence[Piece], noise: MotionNoise, turning: Collection[int] = ()
+) -> Belief:
+    """As :func:`predict`, with a wide root: for a look ahead that nothing is to correct, in less time."""
     if not pieces:
         return belief
     mean = belief.mean.copy()
@@ -145,17 +164,17 @@ def predict(
         change = by_state @ change
         spread = by_state @ spread @ by_state.T + pushed
     length_s = sum(piece.length_s for piece in pieces)
-    count = len(mean)
+    width = belief.root.shape[1]
     creep_rad = [TURNING_RAD if camera in turning else CREEP_RAD for camera in range(belief.cameras)]
     creep = np.repeat([[_CREEP_M, angle_rad] for angle_rad in creep_rad], 3) * np.sqrt(length_s)
     values, axes = np.linalg.eigh(spread)
-    grown = np.zeros((count, count + belief.first_marking))
-    grown[:, :count] = belief.root
-    grown[:VEHICLE, :count] = change @ belief.root[:VEHICLE]
-    grown[:VEHICLE, count : count + VEHICLE] = axes * np.sqrt(np.maximum(values, 0.0))
+    grown = np.zeros((len(mean), width + belief.first_marking))
+    grown[:, :width] = belief.root
+    grown[:VEHICLE, :width] = change @ belief.root[:VEHICLE]
+    grown[:VEHICLE, width : width + VEHICLE] = axes * np.sqrt(np.maximum(values, 0.0))
     mountings = np.arange(VEHICLE, belief.first_marking)
-    grown[mountings, count + mountings] = creep
-    return replace(belief, stamp_s=belief.stamp_s + length_s, mean=mean, root=_square(grown))
+    grown[mountings, width + mountings] = creep
+    return replace(belief, stamp_s=belief.stamp_s + length_s, mean=mean, root=grown)
 
 
 def _step(mean: FloatArray, piece: Piece, noise: MotionNoise) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -254,9 +273,9 @@ def corrected(belief: Belief, residual: FloatArray, slope: FloatArray) -> Belief
     ``residual`` (R,) is measured less expected, ``slope`` (R, n) the derivative of what is expected by the
     whitened states.
     """
-    inner = np.linalg.cholesky(np.eye(len(belief.mean)) + slope.T @ slope)
-    root = np.asarray(np.linalg.solve(inner, belief.root.T).T, dtype=np.float64)
-    mean = belief.mean + root @ np.linalg.solve(inner, slope.T @ residual)
+    inner = np.linalg.inv(np.linalg.cholesky(np.eye(len(belief.mean)) + slope.T @ slope))
+    root = belief.root @ inner.T
+    mean = belief.mean + root @ (inner @ (slope.T @ residual))
     return replace(belief, mean=mean, root=root)
 
 
@@ -272,4 +291,5 @@ def bounds(covariance: FloatArray, heading_rad: float) -> tuple[float, float, fl
 
 def _square(root: FloatArray) -> FloatArray:
     """A square root (n, n) of the covariance that a wide one (n, m) has."""
-    return np.asarray(np.linalg.qr(root.T, mode="reduced")[1].T, dtype=np.float64)
+    upper: FloatArray = np.asarray(np.linalg.qr(root.T, mode="r"))  # without its orthogonal factor
+    return upper.T

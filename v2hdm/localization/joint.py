@@ -12,6 +12,7 @@ from v2hdm.geometry.planar import SHIFTS
 from v2hdm.localization.belief import CAMERA, HEADING, VEHICLE, Belief, Plane, with_markings
 from v2hdm.localization.paint import Paint
 from v2hdm.localization.seeing import Expected, Sighted, expect, ground_points
+from v2hdm.native import kernels
 from v2hdm.records import BoolArray, Calibration, FloatArray, IntArray
 
 _REACH_M = 2.5  # the corners of a marking that the image's border cuts seem so far from its centre, m
@@ -25,6 +26,7 @@ _STEPS = 4  # of an update: half a metre off at the first, a few millimetres at 
 _SETTLED = 0.02  # longest step, in sigmas of the prior belief, that changes nothing any more
 # Degrees of freedom of the t distribution of a detection's error: shadow and wear misplace one in fifty.
 _TAIL = 12.0
+_AXES = np.arange(2)  # of a marking's place
 _SHIFT_ROWS = (2 * SHIFTS[..., None] + np.arange(2)).reshape(4, 8)  # rows of stacked corners by their shift
 
 
@@ -60,41 +62,46 @@ class Scene:
 
     def expect(self, belief: Belief, markings: IntArray) -> Expected:
         """Markings as this image should show them."""
-        corners_map = self.paint.corners_map[markings].copy()
-        for row, marking in enumerate(markings.tolist()):
-            state = belief.state_of(marking)
-            if state is not None:
-                corners_map[row, :, :2] += belief.mean[state : state + 2]
+        corners_map = self.paint.corners_map[markings]
+        states = belief.states_of(markings)
+        rows = np.flatnonzero(states >= 0)
+        corners_map[rows, :, :2] += belief.mean[states[rows, None] + _AXES][:, None]
         return expect(belief, self.plane, self.camera, self.calibration, corners_map)
 
     def spread(self, belief: Belief, expected: Expected, markings: IntArray) -> FloatArray:
         """The derivative (M, 8, n) of the expected pixels by the whitened states of a belief."""
         begin = VEHICLE + CAMERA * self.camera
-        out = expected.by_vehicle @ belief.root[:VEHICLE]
-        out += expected.by_camera @ belief.root[begin : begin + CAMERA]
+        states = belief.states_of(markings)
         by_centre = expected.by_place.reshape(-1, 8, 2)
-        for row, marking in enumerate(markings.tolist()):
-            state = belief.state_of(marking)
-            if state is not None:
-                out[row] += by_centre[row] @ belief.root[state : state + 2]
+        compiled = kernels()
+        if compiled is not None:
+            return np.asarray(compiled.spread(belief.root, expected.by_states, by_centre, states, begin))
+        rows_of_states = [*range(VEHICLE), *range(begin, begin + CAMERA)]
+        flat = expected.by_states.reshape(-1, VEHICLE + CAMERA) @ belief.root[rows_of_states]
+        out = flat.reshape(len(markings), 8, -1)
+        rows = np.flatnonzero(states >= 0)
+        out[rows] += by_centre[rows] @ belief.root[states[rows, None] + _AXES]
         return np.asarray(out)
 
     def noise(self, pairs: Pairs, expected: Expected, belief: Belief | None) -> FloatArray:
         """The covariance (P, 8, 8) of pairs: detections, shapes, and places that ``belief`` does not hold."""
-        rows = pairs.order
-        cov = self.quads.covariance_px2[pairs.detection]
-        out = self.noise_factor * np.take_along_axis(
-            np.take_along_axis(cov, rows[:, :, None], axis=1), rows[:, None, :], axis=2
-        )
-        map_m2 = self.paint.shape_m2[pairs.marking].copy()
+        map_m2 = self.paint.shape_m2[pairs.marking]
         if belief is not None:
-            is_free = [marking not in belief.markings for marking in pairs.marking.tolist()]
+            is_free = belief.states_of(pairs.marking) < 0
             map_m2[is_free] += np.tile(self.paint.centre_m2[pairs.marking[is_free]], (1, 4, 4))
+        covariance_px2 = self.quads.covariance_px2
+        compiled = kernels()
+        if compiled is not None:
+            detections = (covariance_px2, pairs.detection, pairs.order, self.noise_factor)
+            by_corner = expected.by_place.reshape(-1, 8, 2)
+            return np.asarray(compiled.pair_noise(*detections, map_m2, by_corner))
+        rows = pairs.order
+        out = covariance_px2[pairs.detection[:, None, None], rows[:, :, None], rows[:, None, :]]
         by_place = np.zeros((len(rows), 8, 8))
         for corner in range(4):
             axes = slice(2 * corner, 2 * corner + 2)
             by_place[:, axes, axes] = expected.by_place[:, corner]
-        return np.asarray(out + by_place @ map_m2 @ by_place.swapaxes(1, 2))
+        return np.asarray(self.noise_factor * out + by_place @ map_m2 @ by_place.swapaxes(1, 2))
 
     def residual(self, pairs: Pairs, expected: Expected) -> FloatArray:
         """Detected less expected pixels (P, 8)."""
@@ -148,12 +155,44 @@ def candidates(belief: Belief, scene: Scene) -> tuple[Pairs, FloatArray]:
     state_px2 = (spread**2).sum(axis=2)
     order = _order(quads, detection, expected.px.reshape(-1, 8), state_px2.mean(axis=1) + 1.0)
     pairs = Pairs(detection, neighbours[used][place], order)
-    total = spread @ spread.swapaxes(1, 2) + scene.noise(pairs, expected, belief)
-    residual = scene.residual(pairs, expected)
-    squared = (residual * np.linalg.solve(total, residual[..., None])[..., 0]).sum(axis=1)
-    fits = squared <= largest_square(scene.freedom(pairs))
-    loss = squared + np.linalg.slogdet(total)[1]
+    noise = scene.noise(pairs, expected, belief)
+    distance = _distances(noise, scene.residual(pairs, expected), spread)
+    fits = distance.squared <= largest_square(scene.freedom(pairs))
+    loss = distance.squared + distance.log_determinant
     return pairs.subset(fits), loss[fits]
+
+
+class _Distances(NamedTuple):
+    """How far detections (P) lie from what is expected, in sigmas of noise and belief together."""
+
+    squared: FloatArray  # (P,)
+    log_determinant: FloatArray  # (P,) of the covariance
+
+
+def _distances(noise: FloatArray, residual: FloatArray, spread: FloatArray) -> _Distances:
+    """Distances of residuals (P, 8) by noise (P, 8, 8) and a belief's ``spread`` (P, 8, n)."""
+    compiled = kernels()
+    if compiled is not None:
+        return _Distances(*compiled.distances(noise, residual, spread))
+    total = spread @ spread.swapaxes(1, 2) + noise
+    squared = (residual * np.linalg.solve(total, residual[..., None])[..., 0]).sum(axis=1)
+    return _Distances(squared, np.linalg.slogdet(total)[1])
+
+
+class _Whitened(NamedTuple):
+    """Residuals (P, 8), and their slopes (P, 8, n), in sigmas of noise."""
+
+    residual: FloatArray
+    slope: FloatArray
+
+
+def _whitened(noise: FloatArray, residual: FloatArray, spread: FloatArray) -> _Whitened:
+    """Residuals (P, 8) and slopes (P, 8, n) by the root of noise (P, 8, 8)."""
+    compiled = kernels()
+    if compiled is not None:
+        return _Whitened(*compiled.whiten(noise, residual, spread))
+    inner = np.linalg.inv(np.linalg.cholesky(noise))
+    return _Whitened((inner @ residual[..., None])[..., 0], inner @ spread)
 
 
 class Offsets(NamedTuple):
@@ -228,9 +267,9 @@ def update(belief: Belief, scene: Scene, pairs: Pairs) -> Located:
         expected = scene.expect(at, pairs.marking)
         if not np.isfinite(expected.px).all():  # a corner is behind the camera
             return Located(belief, pairs, np.inf, 1.0, np.inf, 1.0)
-        inverse = np.linalg.inv(np.linalg.cholesky(scene.noise(pairs, expected, None)))
-        residual = (inverse @ scene.residual(pairs, expected)[..., None])[..., 0]
-        slope = inverse @ scene.spread(belief, expected, pairs.marking)
+        noise = scene.noise(pairs, expected, None)
+        spread = scene.spread(belief, expected, pairs.marking)
+        residual, slope = _whitened(noise, scene.residual(pairs, expected), spread)
         squared = (residual**2).sum(axis=1)
         weight = (_TAIL + freedom) / (_TAIL + squared)
         root_weight = np.sqrt(weight)[:, None]
@@ -243,9 +282,9 @@ def update(belief: Belief, scene: Scene, pairs: Pairs) -> Located:
             break
     left = residual - (slope @ step)
     misfit = float((weight * (left**2).sum(axis=1)).sum())
-    lower = np.linalg.cholesky(information)
-    root = np.asarray(np.linalg.solve(lower, belief.root.T).T, dtype=np.float64)
-    explained = count - float((np.linalg.inv(lower) ** 2).sum())
+    inner = np.linalg.inv(np.linalg.cholesky(information))
+    root = belief.root @ inner.T
+    explained = count - float((inner**2).sum())
     after = replace(belief, mean=belief.mean + belief.root @ whitened, root=root)
     total = float((left**2).sum() + whitened @ whitened)
     return Located(after, pairs, total, float(freedom.sum()), misfit, float(freedom.sum()) - explained)

@@ -207,9 +207,10 @@ def _observed(
     misfit = float(left_over @ np.linalg.solve(noise_px2, left_over))
     if misfit > largest_square(np.array(len(along_m) - 2.0)):
         return None
-    slope = _spread(belief, scene, feet, across[:, None] @ expected.by_vehicle, px_by_m)
+    by_states = (across[:, None] @ expected.by_states)[:, 0]
+    slope = _spread(belief, scene, feet, by_states[:, :VEHICLE], px_by_m)
     begin = VEHICLE + CAMERA * scene.camera
-    slope += (across[:, None] @ expected.by_camera)[:, 0] @ belief.root[begin : begin + CAMERA]
+    slope += by_states[:, VEHICLE:] @ belief.root[begin : begin + CAMERA]
     features = tuple(sorted({int(stretch) for stretch in feet.stretch}))
     return Observation(piece, line, residual, noise, gain @ slope, features)
 
@@ -230,7 +231,7 @@ def _spread(
     belief: Belief, scene: Scene, feet: Feet, by_vehicle: FloatArray, px_by_m: FloatArray
 ) -> FloatArray:
     """The derivative (P, n) of the points' places across by the whitened states, but for the camera's."""
-    out = by_vehicle[:, 0] @ belief.root[:VEHICLE]
+    out = by_vehicle @ belief.root[:VEHICLE]
     for stretch in np.unique(feet.stretch).tolist():
         state = belief.state_of(stretch)
         is_on = feet.stretch == stretch

@@ -19,8 +19,9 @@ import numpy as np
 
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.localization.antenna import Fix
-from v2hdm.localization.localizer import Localizer, Pose
+from v2hdm.localization.localizer import Localizer
 from v2hdm.localization.motion import Motion
+from v2hdm.localization.pose import Pose
 from v2hdm.localization.seeing import Look
 from v2hdm.localization.stream import MotionLines, look_of
 
@@ -84,16 +85,18 @@ def localize_live(
                 else:
                     news.add(item)
             # What comes between images waits for the next: a pose of it would only cost time.
-            if not news.looks and not news.has_waited(written_s):
-                continue
-            looks = news.looks
-            pose = localizer.update(looks, news.motions, news.fixes)
-            news = _News()
-            images += len(looks)
-            written_s = pose.stamp_s
-            take(pose)
-            for camera in {look.camera for look in looks}:
-                cameras[camera].point(localizer, time.time())
+            if news.looks or news.has_waited(written_s):
+                pose = localizer.update(news.looks, news.motions, news.fixes)
+                images += len(news.looks)
+                written_s = pose.stamp_s
+                take(pose)
+                for camera in {look.camera for look in news.looks}:
+                    cameras[camera].point(localizer, time.time())
+                news = _News(second_looks=news.second_looks)
+            # What was searched once there was time is judged once poses are written.
+            elif news.second_looks:
+                localizer.update(news.second_looks)
+                news = _News(motions=news.motions, fixes=news.fixes)
 
 
 @dataclass
@@ -101,6 +104,7 @@ class _News:
     """Looks, motions and positions that have come since the last pose."""
 
     looks: list[Look] = field(default_factory=list)
+    second_looks: list[Look] = field(default_factory=list)
     motions: list[Motion] = field(default_factory=list)
     fixes: list[Fix] = field(default_factory=list)
 
@@ -113,7 +117,7 @@ class _News:
     def add(self, item: Look | Motion | Fix) -> None:
         """Take an item."""
         if isinstance(item, Look):
-            self.looks.append(item)
+            (self.second_looks if item.is_second else self.looks).append(item)
         elif isinstance(item, Motion):
             self.motions.append(item)
         else:
@@ -146,7 +150,10 @@ class _Eye:
         lines = []
         for ahead in localizer.ahead(self.camera, now_s - self.delay_s):
             regions_px = None if ahead.regions_px is None else np.round(ahead.regions_px, 1).tolist()
-            lines.append(json.dumps({"stamp_s": ahead.stamp_s + self.delay_s, "regions_px": regions_px}))
+            record = {"stamp_s": ahead.stamp_s + self.delay_s, "regions_px": regions_px}
+            if ahead.is_all_later:
+                record["all_later"] = True
+            lines.append(json.dumps(record))
         try:
             self.stream.write("".join(f"{line}\n" for line in lines))
             self.stream.flush()

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from enum import Enum
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +23,7 @@ from v2hdm.localization.belief import (
     VEHICLE,
     Belief,
     bounds,
+    foresee,
     loosened,
     pinned,
     predict,
@@ -35,8 +35,9 @@ from v2hdm.localization.lines import LineMap, with_lines
 from v2hdm.localization.motion import Motion, MotionLog, MotionNoise
 from v2hdm.localization.paint import Paint
 from v2hdm.localization.places import Place, Prior, vehicle_at
+from v2hdm.localization.pose import Pose, Status
 from v2hdm.localization.regions import EVERY_FULL, Ahead, Looking, View
-from v2hdm.localization.rig import Estimate, Rig, Turned
+from v2hdm.localization.rig import Estimate, Rig
 from v2hdm.localization.seeing import Look, Sighted, hulls_of_areas, pieces_of_lines, sighted
 from v2hdm.localization.starting import Quest
 from v2hdm.localization.way import Way
@@ -66,49 +67,6 @@ _LOOSENED_RAD = np.deg2rad(0.2)  # of what a mounting has turned that is found t
 _PINNED_RAD = np.deg2rad(0.01)  # of what the others have meanwhile
 _BEFORE_S = 0.25  # so long before it was noticed, s, a mounting may have turned
 _FEW = 0.7  # share of an image's detections under which a turned mounting is tried
-
-
-class Status(Enum):
-    """Whether the pose can be relied on: only while ``TRACKING``."""
-
-    INITIALISING = "initialising"
-    TRACKING = "tracking"
-    LOST = "lost"
-
-
-@dataclass(frozen=True)
-class Pose:
-    """Where the vehicle is at a time.
-
-    Attributes:
-        stamp_s: of the newest motion or image.
-        status: only a tracked pose can be relied on.
-        map_from_vehicle: (4, 4); None before any place was found.
-        covariance: (3, 3) of x, y, m, and heading, rad, in the map; infinite before the place is sure.
-        protection_m: ahead and to the left, bounds that one error in a thousand exceeds; else infinite.
-        protection_rad: the same of the heading.
-        motion: true over stated speed, the yaw rate's bias, rad/s, and how late the odometry's stamps are, s.
-        matched: markings that the last look showed.
-        matched_lines: pieces of solid lines that it showed on their lines.
-        matched_areas: words, boxes and other symbols that it showed at their places.
-        images_s: by camera the time of the newest image that is in it.
-        reasons: sentences: why there is no pose, or what differs from map, calibration or odometry.
-        turned: cameras whose mountings have changed.
-    """
-
-    stamp_s: float
-    status: Status
-    map_from_vehicle: FloatArray | None
-    covariance: FloatArray
-    protection_m: tuple[float, float]
-    protection_rad: float
-    motion: tuple[float, float, float]
-    matched: int
-    reasons: tuple[str, ...] = ()
-    turned: tuple[Turned, ...] = ()
-    matched_lines: int = 0
-    matched_areas: int = 0
-    images_s: Mapping[str, float] = field(default_factory=dict)
 
 
 class _Past(NamedTuple):
@@ -232,27 +190,33 @@ class Localizer:
         None to look everywhere: every few images, and where the place, the map or a mounting is in doubt, few
         markings are expected, or the last look did not show what was.
         """
-        return self._ahead(camera, [stamp_s])[0].regions_px
+        return self._ahead(camera, [stamp_s], has_time_later=False)[0].regions_px
+
+    def glance(self, camera: str, stamp_s: float) -> Ahead:
+        """As :meth:`regions`, where a whole search can follow a look at parts, as an ``is_second`` look."""
+        return self._ahead(camera, [stamp_s], has_time_later=True)[0]
 
     def ahead(self, camera: str, now_s: float) -> list[Ahead]:
-        """As :meth:`regions`, for the next images of a camera at a time; none where nobody knows when."""
-        return self._ahead(camera, self._looking.stamps_ahead(camera, now_s))
+        """As :meth:`glance`, for the next images of a camera at a time; none where nobody knows when."""
+        return self._ahead(camera, self._looking.stamps_ahead(camera, now_s), has_time_later=True)
 
-    def _ahead(self, camera: str, stamps_s: Sequence[float]) -> list[Ahead]:
+    def _ahead(self, camera: str, stamps_s: Sequence[float], has_time_later: bool) -> list[Ahead]:
         if camera not in self._numbers:
             return [Ahead(stamp_s, None) for stamp_s in stamps_s]
 
+        nothing = Look(camera, 0.0)
+        no_quads = sighted(nothing, self.calibrations[camera])
+        belief = self._belief if self._is_settled else None
+
         def view_at(stamp_s: float) -> View | None:
-            if self._belief is None or not self._is_settled:
+            if belief is None:
                 return None
-            belief = self._fixed_to(self._belief, stamp_s)
-            nothing = Look(camera, stamp_s)
-            scene = self._scene(belief, nothing, sighted(nothing, self.calibrations[camera]))
-            return View(belief, scene)
+            belief_ahead = self._foreseen(belief, stamp_s)
+            return View(belief_ahead, self._scene(belief_ahead, nothing, no_quads))
 
         newest = self._log.samples[-1:]
         speed_m_s = newest[0].speed_m_s if newest else 0.0
-        return self._looking.ahead(camera, stamps_s, view_at, speed_m_s)
+        return self._looking.ahead(camera, stamps_s, view_at, speed_m_s, has_time_later)
 
     @property
     def _is_settled(self) -> bool:
@@ -275,6 +239,9 @@ class Localizer:
                 "is it on the same clock, and still coming?"
             )
             return
+        if look.is_second:
+            self._look_again(look)
+            return
         self._reasons.pop("clock", None)
         self._images_s[look.camera] = max(look.stamp_s, self._images_s.get(look.camera, look.stamp_s))
         later_looks = [past for past in self._past if past.look.stamp_s > look.stamp_s]
@@ -293,6 +260,21 @@ class Localizer:
         self._see(look, is_new=True)
         for past in later_looks:
             self._see(past.look, is_new=False)
+
+    def _look_again(self, look: Look) -> None:
+        """Hold all that an image shows against the map; the look at parts of it has moved the belief."""
+        self._looking.of(look.camera).note_all(look.stamp_s)
+        earlier = [
+            past.before
+            for past in self._past
+            if past.look.camera == look.camera and past.look.stamp_s == look.stamp_s
+        ]
+        if not earlier or not self._is_sure:
+            return
+        belief = self._fixed_to(earlier[0], look.stamp_s)
+        scene = self._scene(belief, look, sighted(look, self.calibrations[look.camera]))
+        judged = detected(scene, locate(belief, scene))
+        self._agreement.note(judged, self._way.length_m, look)
 
     def _see(self, look: Look, is_new: bool) -> None:
         """Move the belief to a look, and take what that shows."""
@@ -366,8 +348,20 @@ class Localizer:
     def _moved_to(self, belief: Belief, stamp_s: float) -> Belief:
         if stamp_s <= belief.stamp_s:
             return belief
-        turning = [self._numbers[turned.camera] for turned in self._rig.turned if turned.is_slow]
-        return predict(belief, self._log.pieces(belief.stamp_s, stamp_s), self.noise, turning)
+        return predict(belief, self._log.pieces(belief.stamp_s, stamp_s), self.noise, self._turning)
+
+    def _foreseen(self, belief: Belief, stamp_s: float) -> Belief:
+        """The belief at a later time, after the positions until then, that nothing is to correct."""
+        latest_s = max((fix.stamp_s for fix in self._fixes if fix.stamp_s <= stamp_s), default=-np.inf)
+        belief = self._fixed_to(belief, latest_s)
+        if stamp_s <= belief.stamp_s:
+            return belief
+        return foresee(belief, self._log.pieces(belief.stamp_s, stamp_s), self.noise, self._turning)
+
+    @property
+    def _turning(self) -> list[int]:
+        """The cameras whose mountings are turning slowly."""
+        return [self._numbers[turned.camera] for turned in self._rig.turned if turned.is_slow]
 
     def _located(self, belief: Belief, look: Look, quads: Sighted, is_new: bool) -> Belief:
         """The belief after a look; another mounting is tried where the calibration's explains little."""
@@ -387,7 +381,7 @@ class Localizer:
             self._rig_since_s = self._rig.pushed.note(look, gained)
         elif self._is_sure:
             self._rig.pushed.note(look, 0)
-        self._agreement.note(judged, self._way.length_m)
+        self._agreement.note(judged, self._way.length_m, look)
         if located.misfit_freedom > 0:
             noise.note(located, noise.factor)
         return belief_of_all
@@ -444,7 +438,7 @@ class Localizer:
             scene = self._scene(belief, look, quads)
             located = locate(belief, scene)
             belief = located.belief
-            agreement.note(detected(scene, located), self._way.length_m)
+            agreement.note(detected(scene, located), self._way.length_m, look)
         return agreement
 
     def _begin(self, stamp_s: float, pose: FloatArray) -> None:
@@ -552,7 +546,7 @@ class Localizer:
             return Pose(
                 stamp_s, status, None, nothing, infinite, np.inf, (1.0, 0.0, 0.0), 0, tuple(reasons.values())
             )
-        belief = self._fixed_to(self._belief, stamp_s)
+        belief = self._foreseen(self._belief, stamp_s)
         plane = self.paint.ground(belief.mean[:2])
         covariance = belief.covariance([0, 1, 2])
         covariance += np.diag([self.paint.shared_m2, self.paint.shared_m2, self.paint.shared_rad2])

@@ -13,8 +13,8 @@ import numpy as np
 from v2hdm.errors import DriveError, need
 from v2hdm.geometry.rigid import quaternion_from_rotation
 from v2hdm.localization.antenna import Fix
-from v2hdm.localization.localizer import Pose, Status
 from v2hdm.localization.motion import Motion
+from v2hdm.localization.pose import Pose, Status
 from v2hdm.localization.stream import pose_record
 
 Make = Callable[..., Any]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from v2hdm.localization.belief import Plane
@@ -12,7 +14,8 @@ _CELL_M = 10.0  # side of the squares by which markings are looked up
 _GROUND_M = 8.0  # distance, m, over which the ground counts as a plane: a truck's length
 _GROUND_SIGMA = 0.1  # standard deviation of a slope before any height is known, m/m
 _HEIGHT_SIGMA_M = 0.03  # standard deviation of a marking's height about the plane, m
-_AGAIN_M = 1.0  # way, m, after which the plane is fitted anew
+_PLANE_M = 1.0  # side of the squares of which each has its plane, m
+_MOST_PLANES = 256  # planes that are kept
 
 
 class Paint:
@@ -50,8 +53,7 @@ class Paint:
         self._cells: dict[tuple[int, int], list[int]] = {}
         for number, (column, row) in enumerate(cells.tolist()):
             self._cells.setdefault((column, row), []).append(number)
-        self._plane = Plane()
-        self._plane_at = np.full(2, np.inf)
+        self._planes: dict[tuple[int, int], Plane] = {}  # by square
 
     def __len__(self) -> int:
         return len(self.kinds)
@@ -77,8 +79,17 @@ class Paint:
 
     def ground(self, place_map: FloatArray) -> Plane:
         """The plane of the ground about a place, of the heights of the markings there."""
-        if np.linalg.norm(place_map - self._plane_at) < _AGAIN_M:
-            return self._plane
+        column = math.floor(place_map[0] / _PLANE_M)
+        row = math.floor(place_map[1] / _PLANE_M)
+        plane = self._planes.get((column, row))
+        if plane is None:
+            plane = self._fitted_plane(_PLANE_M * (np.array([column, row]) + 0.5))
+            if len(self._planes) >= _MOST_PLANES:
+                self._planes.clear()
+            self._planes[column, row] = plane
+        return plane
+
+    def _fitted_plane(self, place_map: FloatArray) -> Plane:
         numbers = self.near(place_map, 2 * _GROUND_M)
         points = self.corners_map[numbers].reshape(-1, 3)
         offset = points[:, :2] - place_map
@@ -86,6 +97,4 @@ class Paint:
         design = np.column_stack([np.ones(len(points)), offset])
         normal = design.T @ (weight[:, None] * design) + np.diag([1e-6, *(2 * [_GROUND_SIGMA**-2])])
         height_m, by_x, by_y = np.linalg.solve(normal, design.T @ (weight * points[:, 2])).tolist()
-        self._plane = Plane(height_m, (by_x, by_y))
-        self._plane_at = place_map.copy()
-        return self._plane
+        return Plane(height_m, (by_x, by_y))

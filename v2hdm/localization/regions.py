@@ -18,6 +18,7 @@ import numpy as np
 from v2hdm.geometry.lens import distort_points
 from v2hdm.localization.belief import HEADING, Belief
 from v2hdm.localization.joint import Scene
+from v2hdm.localization.seeing import Expected
 from v2hdm.records import FloatArray, IntArray
 
 EVERY_FULL = 5
@@ -25,7 +26,7 @@ EVERY_FULL = 5
 
 _RANGE_M = 20.0  # distance, m, up to which markings are found at almost every look
 _MOST = 8  # markings that are looked for: of more, few say anything new of a vehicle's six unknowns
-_LEAST = 4  # markings with which a look is worth it; where fewer are expected, all is searched
+_LEAST = 4  # markings with which a look is worth it; where fewer are expected, all may be searched
 _MOST_SHARE = 0.16  # share of the image that is looked at
 # Ranks of markings by distance, in parts of their number, in the order in which they are chosen.
 _HALVES = (0.0, 1.0, *(numerator / 2**power for power in range(1, 5) for numerator in range(1, 2**power, 2)))
@@ -37,11 +38,14 @@ EARLY_S = 0.05
 
 _BESIDE = 0.25  # share of an image's size beside it, up to which a lens' polynomial is taken at its word
 _SURE_M, _SURE_RAD = 0.15, np.deg2rad(1.0)  # standard deviations of a place that is known well enough
+_SURER_M = 0.04  # standard deviation, m, of one at which fewer than the least markings are worth a look
 _LAST_LOOKS = 10  # looks of a camera by which its interval is known
 _SLOW_S = 0.5  # interval, s, after which nothing is expected at its place any more
 _AHEAD = 4  # images to come that are told of: a look may last longer than it takes to the next
 _EARLIER = 3  # images by which a whole search may come earlier, so that it is at no other camera's time
+_PATIENCE = 2.0  # so many times its turn a whole search is waited for, before it comes first
 _FOUND = 0.6  # share of the markings looked for, from which the last look was as expected
+_SOME = 0.3  # share from which it was so in part
 
 
 class View(NamedTuple):
@@ -52,10 +56,11 @@ class View(NamedTuple):
 
 
 class Ahead(NamedTuple):
-    """Where to look in an image that is to come: boxes (R, 4), px, or None for everywhere."""
+    """Where to look in an image that is to come."""
 
     stamp_s: float
-    regions_px: FloatArray | None
+    regions_px: FloatArray | None  # boxes (R, 4), px, or None for everywhere
+    is_all_later: bool = False  # whether all of it is to be searched once there is time
 
 
 @dataclass
@@ -64,18 +69,30 @@ class Glances:
 
     stamps_s: deque[float] = field(default_factory=lambda: deque(maxlen=_LAST_LOOKS))
     whole_s: float = -np.inf
-    told_s: float = -np.inf  # time of the last image that was to be searched as a whole
+    told_s: float = -np.inf  # time of the last image that was to be searched as a whole, at once or later
     to_come_s: list[float] = field(default_factory=list)  # times of images that are to be searched so
-    expected: int = 0
+    boxes: dict[float, int] = field(default_factory=dict)  # numbers of boxes of the images to come, by time
     was_as_expected: bool = False
+    was_partly_expected: bool = False
 
     def note(self, stamp_s: float, is_whole: bool, markings: int) -> None:
         """Take a look and the number of markings that it showed."""
         self.stamps_s.append(stamp_s)
         if is_whole:
-            self.whole_s = stamp_s
-        expected = 0 if is_whole else self.expected
-        self.was_as_expected = markings >= _FOUND * max(expected, _LEAST)
+            self.note_all(stamp_s)
+        expected = 1 if is_whole else max(self._boxes_at(stamp_s), 1)
+        self.was_as_expected = markings >= _FOUND * expected
+        self.was_partly_expected = markings >= _SOME * expected
+
+    def _boxes_at(self, stamp_s: float) -> int:
+        """In how many boxes an image was to be looked at; earlier ones are forgotten."""
+        self.boxes = {at_s: count for at_s, count in self.boxes.items() if at_s > stamp_s - _SLOW_S}
+        nearest_s = min(self.boxes, key=lambda at_s: abs(at_s - stamp_s), default=stamp_s)
+        return self.boxes.get(nearest_s, 0)
+
+    def note_all(self, stamp_s: float) -> None:
+        """Take note that all of an image was searched."""
+        self.whole_s = max(self.whole_s, stamp_s)
 
     @property
     def interval_s(self) -> float | None:
@@ -112,10 +129,12 @@ class Looking:
         stamps_s: Sequence[float],
         view_at: Callable[[float], View | None],
         speed_m_s: float,
+        has_time_later: bool = False,
     ) -> list[Ahead]:
         """Where to look in images of a camera that are to come at some times.
 
-        ``view_at`` gives the view at such a time, None where nothing is sure.
+        ``view_at`` gives the view at such a time, None where nothing is sure. With ``has_time_later`` whole
+        searches can follow a look at parts.
         """
         glances = self.of(camera)
         interval_s = glances.interval_s
@@ -127,18 +146,29 @@ class Looking:
             if interval_s is not None and stamp_s - glances.told_s < (_AHEAD + 0.5) * interval_s:
                 whole_s = max(whole_s, glances.told_s)
             is_due = interval_s is None or self._is_due(camera, stamp_s, whole_s, interval_s)
-            if glances.was_as_expected and not is_due:
+            # After a look that did not show what was expected all of the next image is searched.
+            is_due |= not (glances.was_as_expected or out)
+            if self._can_wait(camera, stamp_s) if has_time_later else not is_due and glances.was_as_expected:
                 view = view_at(stamp_s)
                 boxes = None if view is None else expected_boxes(*view, speed_m_s)
-            if boxes is None:
+            if boxes is None or is_due:
                 whole_s = stamp_s
                 # What is told of later images is told again.
                 glances.told_s = glances.told_s if out else stamp_s
-            else:
-                glances.expected = len(boxes)
-            out.append(Ahead(stamp_s, boxes))
-        glances.to_come_s = [ahead.stamp_s for ahead in out if ahead.regions_px is None]
+            if boxes is not None:
+                glances.boxes[stamp_s] = len(boxes)
+            out.append(Ahead(stamp_s, boxes, is_all_later=boxes is not None and is_due))
+        glances.to_come_s = [ahead.stamp_s for ahead in out if ahead.regions_px is None or ahead.is_all_later]
         return out
+
+    def _can_wait(self, camera: str, stamp_s: float) -> bool:
+        """Whether a whole search may come after a look at parts.
+
+        It may not where none has come for too long, or the last look showed too little of what it was to.
+        """
+        glances = self.of(camera)
+        most_s = _PATIENCE * self.every_full * (glances.interval_s or 0.0)
+        return glances.was_partly_expected and stamp_s - glances.whole_s < most_s
 
     def _is_due(self, camera: str, stamp_s: float, whole_s: float, interval_s: float) -> bool:
         """Whether an image is to be searched as a whole: the last of N, or one before if others take turns.
@@ -188,8 +218,9 @@ def expected_boxes(belief: Belief, scene: Scene, speed_m_s: float) -> FloatArray
     is_whole = ((corners_px > 0) & (corners_px < size - 1)).all(axis=(1, 2))
     rows = rows[is_whole]
     corners_px = corners_px[is_whole]
-    spread_px = np.linalg.norm(scene.spread(belief, expected, numbers)[rows], axis=2).max(axis=1)
-    by_place = expected.by_place[rows]
+    in_image = Expected(*(array[rows] for array in expected))
+    spread_px = np.linalg.norm(scene.spread(belief, in_image, numbers[rows]), axis=2).max(axis=1)
+    by_place = in_image.by_place
     px_by_m = np.linalg.norm(by_place, axis=(2, 3)).max(axis=1)
     around_px = _AROUND_PX + _SIGMAS * spread_px + _AROUND_M * px_by_m
     ahead_map = np.array([np.cos(belief.mean[HEADING]), np.sin(belief.mean[HEADING])])
@@ -198,7 +229,8 @@ def expected_boxes(belief: Belief, scene: Scene, speed_m_s: float) -> FloatArray
     high = corners_px.max(axis=1) + around_px[:, None] + early_px
     boxes = np.concatenate([low, high], axis=1)
     chosen = _spread_out(boxes, expected.depth_m[rows].mean(axis=1), _MOST_SHARE * info.width * info.height)
-    return boxes[chosen] if len(chosen) >= _LEAST else None
+    least = _LEAST if belief.sigma_m > _SURER_M else 1
+    return boxes[chosen] if len(chosen) >= least else None
 
 
 def _spread_out(boxes_px: FloatArray, distance_m: FloatArray, most_px2: float) -> IntArray:

@@ -22,6 +22,7 @@ from v2hdm.localization.belief import (
     Belief,
     Plane,
 )
+from v2hdm.native import kernels
 from v2hdm.records import (
     CROSSWALK,
     LANE_LINE,
@@ -45,7 +46,8 @@ _STEP_PX = 0.5  # step, px, of the lens's differences
 class Look:
     """One image's content: the camera's name, the time of exposure, and the detections.
 
-    ``is_whole`` tells whether all of the image was searched.
+    ``is_whole`` tells whether all of the image was searched, ``is_second`` whether that was done after a look
+    at parts of the same image: such a look is held against the map, and changes no pose.
     """
 
     camera: str
@@ -53,6 +55,7 @@ class Look:
     markings: Sequence[MarkingDetection] = ()
     lanes: Sequence[LaneDetection] = ()
     is_whole: bool = True
+    is_second: bool = False
 
     @classmethod
     def of(cls, camera: str, stamp_s: float, road: Road) -> Look:
@@ -142,8 +145,7 @@ class Expected(NamedTuple):
 
     px: FloatArray  # (M, 4, 2) pinhole px, nan behind the camera
     depth_m: FloatArray  # (M, 4)
-    by_vehicle: FloatArray  # (M, 8, 10)
-    by_camera: FloatArray  # (M, 8, 6)
+    by_states: FloatArray  # (M, 8, 17) by the states of the vehicle and, after these, of the camera
     by_place: FloatArray  # (M, 4, 2, 2) by each corner's place in the map
 
 
@@ -152,8 +154,7 @@ class ExpectedPoints(NamedTuple):
 
     px: FloatArray  # (..., 2) pinhole px, nan behind the camera
     depth_m: FloatArray  # (...)
-    by_vehicle: FloatArray  # (..., 2, 10)
-    by_camera: FloatArray  # (..., 2, 6)
+    by_states: FloatArray  # (..., 2, 17) by the states of the vehicle and, after these, of the camera
     by_place: FloatArray  # (..., 2, 2) by the point's place in the map
 
 
@@ -162,10 +163,8 @@ def expect(
 ) -> Expected:
     """Where corners (M, 4, 3) should be in an image of a camera, and the derivatives."""
     points = expect_points(belief, plane, camera, calibration, corners_map)
-    count = len(corners_map)
-    by_vehicle = points.by_vehicle.reshape(count, 8, VEHICLE)
-    by_camera = points.by_camera.reshape(count, 8, CAMERA)
-    return Expected(points.px, points.depth_m, by_vehicle, by_camera, points.by_place)
+    by_states = points.by_states.reshape(len(corners_map), 8, VEHICLE + CAMERA)
+    return Expected(points.px, points.depth_m, by_states, points.by_place)
 
 
 def expect_points(
@@ -174,7 +173,14 @@ def expect_points(
     """Where points (..., 3) of the map should be in an image of a camera, and the derivatives."""
     pose = belief.map_from_vehicle(plane)
     begin = VEHICLE + CAMERA * camera
-    cam_from_vehicle = exp(belief.mean[begin : begin + CAMERA]) @ calibration.cam_from_vehicle
+    tangent = belief.mean[begin : begin + CAMERA]
+    compiled = kernels()
+    if compiled is not None:
+        calibrated = (calibration.cam_from_vehicle, tangent, calibration.info.intrinsic)
+        flat = compiled.expect_points(points_map.reshape(-1, 3), pose, *calibrated, _NEAREST_M)
+        shape = points_map.shape[:-1]
+        return ExpectedPoints(*(array.reshape(*shape, *array.shape[1:]) for array in flat))
+    cam_from_vehicle = exp(tangent) @ calibration.cam_from_vehicle
     rotation = pose[:3, :3]
     turn = cam_from_vehicle[:3, :3]
     vehicle = (points_map - pose[:3, 3]) @ rotation
@@ -186,19 +192,19 @@ def expect_points(
     by_cam = (intrinsic[:2] - px[..., None] * np.array([0.0, 0.0, 1.0])) / safe[..., None, None]
     by_vehicle_point = by_cam @ turn
     by_map = by_vehicle_point @ rotation.T
-    by_vehicle = np.zeros((*px.shape, VEHICLE))
-    by_vehicle[..., :2] = -by_map[..., :2]
-    by_vehicle[..., HEIGHT] = -by_map[..., 2]
+    by_states = np.zeros((*px.shape, VEHICLE + CAMERA))
+    by_states[..., :2] = -by_map[..., :2]
+    by_states[..., HEIGHT] = -by_map[..., 2]
     # About the axis up in the map, the vehicle's own axis ahead, and its axis to the left before it rolls.
     up = rotation[2]
     left = np.array([0.0, up[2], -up[1]]) / max(float(np.hypot(up[1], up[2])), 1e-9)
     axes = np.array([up, [1.0, 0.0, 0.0], left])
     turned = _cross(vehicle[..., None, :], axes)
     by_turn = by_vehicle_point @ turned.swapaxes(-1, -2)
-    by_vehicle[..., [HEADING, ROLL, PITCH]] = by_turn
-    by_vehicle[..., [SLOW_ROLL, SLOW_PITCH]] = by_turn[..., 1:]
-    by_camera = np.concatenate([by_cam, _cross(cam[..., None, :], by_cam)], axis=-1)
-    return ExpectedPoints(px, depth_m, by_vehicle, by_camera, by_map[..., :2])
+    by_states[..., [HEADING, ROLL, PITCH]] = by_turn
+    by_states[..., [SLOW_ROLL, SLOW_PITCH]] = by_turn[..., 1:]
+    by_states[..., VEHICLE:] = np.concatenate([by_cam, _cross(cam[..., None, :], by_cam)], axis=-1)
+    return ExpectedPoints(px, depth_m, by_states, by_map[..., :2])
 
 
 def _cross(first: FloatArray, second: FloatArray) -> FloatArray:

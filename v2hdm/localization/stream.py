@@ -13,8 +13,8 @@ from v2hdm.errors import ConfigError, shown
 from v2hdm.geometry.geodetic import enu_from_geodetic
 from v2hdm.geometry.rigid import euler_from_rotation
 from v2hdm.localization.antenna import Fix
-from v2hdm.localization.localizer import Pose
 from v2hdm.localization.motion import Motion
+from v2hdm.localization.pose import Pose
 from v2hdm.localization.seeing import Look
 from v2hdm.records import FloatArray, GeodeticOrigin, LaneDetection, MarkingDetection
 
@@ -98,7 +98,9 @@ def look_of(record: Mapping[str, Any], camera: str) -> Look:
     """The detections of one line of ``v2hdm detect``."""
     markings = tuple(map(_marking, record["markings"]))
     lanes = tuple(map(_lane, record["lanes"]))
-    return Look(camera, float(record["stamp_s"]), markings, lanes, record.get("whole", True))
+    is_whole = record.get("whole", True)
+    is_second = record.get("second", False)
+    return Look(camera, float(record["stamp_s"]), markings, lanes, is_whole, is_second)
 
 
 def _lane(record: Mapping[str, Any]) -> LaneDetection:

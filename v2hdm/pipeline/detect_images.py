@@ -24,14 +24,16 @@ from v2hdm.detection.frames import (
 )
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.persistence import STATED_SIGMA_RAD, View, settled
+from v2hdm.detection.pointing import Pointed
 from v2hdm.detection.road import Road, RoadDetector
+from v2hdm.detection.second import SecondLooks
 from v2hdm.detection.stopwatch import Stopwatch, lap
 from v2hdm.doors import checked
 from v2hdm.errors import ConfigError, DriveError, shown
 from v2hdm.io.calibration.intrinsics import is_calibration, read_intrinsics
 from v2hdm.io.drive import READERS, need_pictures, read_drive
 from v2hdm.pipeline.rough_camera import ROUGH_NAME, RoughCamera, check_size
-from v2hdm.records import Calibration, CameraInfo, FloatArray
+from v2hdm.records import Calibration, CameraInfo
 from v2hdm.safe.pixels import IMAGE_SUFFIXES
 from v2hdm.store.inputs import note_input
 
@@ -41,8 +43,8 @@ _Frames = Iterator[tuple[Frame, RoadDetector | None]]
 """Frames to look at, and the detector for each as far as it is known before the first."""
 
 
-Regions = Callable[[Frame], FloatArray | None]
-"""Where to look in a frame: boxes (R, 4), px, or None for everywhere."""
+Regions = Callable[[Frame], Pointed | None]
+"""Where to look in a frame, None for everywhere."""
 
 
 class Detected(NamedTuple):
@@ -82,7 +84,8 @@ def detect_images(
         stopwatch: takes the time of each stage.
         regions: says for a frame of a calibrated camera where markings with corners are looked for, boxes
             (R, 4) of left, top, right and bottom, px; None for everything everywhere. With it, there are no
-            metres, and of lanes only their paint: what a localiser takes.
+            metres, and of lanes only their paint: what a localiser takes. All of a live image may be searched
+            later, once no newer one waits: it then comes a second time (``road.is_second``).
 
     Returns:
         An iterator over the images; corners are (4, 2) px in the image as recorded, the top-left pixel's
@@ -112,8 +115,13 @@ def detect_images(
         road = RoadDetector(detector, road.camera, road.calibration, is_for_localizer=True)
     rough = RoughCamera(detector, lens, path, mounting, linear)
     most = limit and min(limit, sys.maxsize)
-    frames = islice((_live_frames if live else _frames)(str(source), road, rough), most)
-    return _on_ground(_glances(frames, rough, stopwatch or Stopwatch(), regions))
+    newest = _newest_frames(str(source), road, rough, regions is not None) if live else None
+    if newest is None:
+        frames = islice(_frames(str(source), road, rough), most)
+    else:
+        frames = islice(((frame, road) for frame in newest), most)
+    later = SecondLooks(newest) if isinstance(newest, NewestFrames) else None
+    return _on_ground(_glances(frames, rough, stopwatch or Stopwatch(), regions, later))
 
 
 def _loaded(options: DetectorOptions | None, is_rough: bool) -> Detector:
@@ -171,16 +179,16 @@ def _of_camera(number: int, road: RoadDetector | None, rough: RoughCamera) -> It
     return camera_frames(number, (info.width, info.height) if info else None)
 
 
-def _live_frames(source: str, road: RoadDetector | None, rough: RoughCamera) -> _Frames:
-    """The newest frame each time, of a camera or a folder."""
+def _newest_frames(
+    source: str, road: RoadDetector | None, rough: RoughCamera, are_read_ahead: bool
+) -> Iterator[Frame]:
+    """The newest frame each time, of a camera or a folder, of which one may be read while another is seen."""
     path = Path(source)
     if source.isdecimal() and not path.exists():
-        frames: Iterator[Frame] = NewestFrames(_of_camera(int(source), road, rough))
-    elif path.is_dir():
-        frames = arriving_frames(path)
-    else:
-        raise ConfigError(f"--live: {path} is not a camera's index or a folder; only these get new images")
-    return ((frame, road) for frame in frames)
+        return NewestFrames(_of_camera(int(source), road, rough))
+    if path.is_dir():
+        return NewestFrames(arriving_frames(path)) if are_read_ahead else arriving_frames(path)
+    raise ConfigError(f"--live: {path} is not a camera's index or a folder; only these get new images")
 
 
 def _drive_frames(path: Path, road: RoadDetector | None, rough: RoughCamera) -> _Frames:
@@ -258,10 +266,17 @@ def _camera_and_view(glance: _Glance) -> tuple[str, View]:
 
 
 def _glances(
-    frames: _Frames, rough: RoughCamera, stopwatch: Stopwatch, regions: Regions | None
+    frames: _Frames,
+    rough: RoughCamera,
+    stopwatch: Stopwatch,
+    regions: Regions | None,
+    later: SecondLooks | None,
 ) -> Iterator[_Glance]:
-    """The road of every frame."""
+    """The road of every frame, and of some a second time once all of it was searched."""
     while True:
+        if later is not None and (second := later.look()) is not None:
+            yield _Glance(Detected(second.frame, second.camera, second.road), None)
+            continue
         with stopwatch.image():
             with lap("read"):
                 frame, road = next(frames, (None, None))
@@ -273,8 +288,12 @@ def _glances(
                 name = ROUGH_NAME if rough.lens is None else rough.lens.name
             else:
                 check_size(frame, road.camera.info, "the calibration" if road.calibration else "the drive")
-                on_road = road.detect(frame.pixels, regions_px=None if regions is None else regions(frame))
+                pointed = None if regions is None else regions(frame)
+                regions_px = None if pointed is None else pointed.regions_px
+                on_road = road.detect(frame.pixels, regions_px=regions_px)
                 name = road.camera.info.name
+                if later is not None and pointed is not None and pointed.is_all_later:
+                    later.add(frame, road)
         view = None
         if road is not None and frame.map_from_vehicle is not None:
             markings = [marking.image for marking in on_road.markings]

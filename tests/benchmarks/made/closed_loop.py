@@ -18,9 +18,10 @@ from v2hdm.detection.camera import camera_from_calibration
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.road import RoadDetector
 from v2hdm.geometry.rigid import camera_centre, heading_rad, inverse
-from v2hdm.localization.localizer import Localizer, Pose, Status
+from v2hdm.localization.localizer import Localizer
 from v2hdm.localization.motion import Motion
 from v2hdm.localization.places import Prior, rough_position
+from v2hdm.localization.pose import Pose, Status
 from v2hdm.localization.seeing import Look
 from v2hdm.records import Calibration, FloatArray, HDMap
 from v2hdm.simulate.port.build import Port, build_port

@@ -15,10 +15,10 @@ from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays, Run
 from v2hdm.adjust.engine import Evaluated, Factorised, Linearised, Reached, Report, TorchEngine
-from v2hdm.adjust.kernels import evaluate, linearise
+from v2hdm.adjust.kernels import evaluate, linearise, rig
 from v2hdm.adjust.kernels.evaluate import Evaluation
 from v2hdm.adjust.kernels.layout import LOSS_CODES, Base, Layout, Scratch, make_layout
-from v2hdm.adjust.kernels.rig import factor_of, make_rig, terms_of
+from v2hdm.adjust.kernels.rig import make_rig
 from v2hdm.adjust.kernels.tables import cam_from_map, move, spread_of, with_priors
 from v2hdm.adjust.model import Estimate, Gradient, Loss
 from v2hdm.adjust.reduced import (
@@ -292,7 +292,7 @@ class KernelEngine(TorchEngine):
             whitening.joint,
             whitening.rows.reshape(-1, 6 * arrays.camera_count),
         )
-        factor = factor_of(whitening)
+        factor = rig.factor_of(whitening)
         gradient = torch.from_numpy(whitening.gradient)
         by_camera = torch.from_numpy(whitening.by_camera).view(-1, 6)
         no_tangents = estimate.corners_map[:0]
@@ -301,7 +301,7 @@ class KernelEngine(TorchEngine):
             estimate=estimate,
             robust=robust,
             spread=self._still,
-            terms=terms_of(whitening),
+            terms=rig.terms_of(whitening.costs),
             gradient=Gradient(by_camera, estimate.frame_state, no_tangents, estimate.clock_s),
             corner_factor=_corner_factor(arrays, base),
             whitened=gradient[factor.size :].view(-1, 2),
@@ -443,12 +443,20 @@ class KernelLinearised(Linearised):
             return None
         evaluation = self.rig.evaluate(_rows(whitened))
         self.engine.share(evaluation.look)
-        evaluation.finish()
-        # Copies, since views would keep the factors alive as long as the solution.
-        cameras = torch.from_numpy(evaluation.cam_from_vehicle.copy()).view(-1, 4, 4)
-        corners = torch.from_numpy(evaluation.corners_map.copy()).view(-1, 2)
-        estimate = replace(self.estimate, cam_from_vehicle=cameras, corners_map=corners)
-        return Reached(estimate, terms_of(evaluation), torch.from_numpy(evaluation.gradient.copy()))
+        done = rig.Evaluated(*evaluation.finish())
+        estimate = Estimate(
+            torch.from_numpy(done.cam_from_vehicle),
+            self.estimate.frame_state,
+            torch.from_numpy(done.corners_map),
+            self.estimate.clock_s,
+        )
+        return Reached(estimate, rig.terms_of(done.costs), torch.from_numpy(done.gradient))
+
+    def camera_step(self, whitened: Tensor) -> Tensor | None:
+        """The step (C, 6) of the cameras by variables of the whitening, if the engine made it at once."""
+        if self.rig is None:
+            return None
+        return torch.from_numpy(self.rig.camera_step(_rows(whitened))).view(-1, 6)
 
     def evaluate(self, step: Gradient, tangents: Tensor, whitened_corners: Tensor) -> Evaluated:
         """Evaluate after a step of the reduced unknowns, in one pass over the observations."""

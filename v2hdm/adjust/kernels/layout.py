@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.adjust.arrays import Arrays
-from v2hdm.compiled import kernel, twin
+from v2hdm.compiled import inlined, kernel, twin
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 LOSS_CODES = {"none": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3}
@@ -51,15 +50,16 @@ class Layout(NamedTuple):
 
 def make_layout(arrays: Arrays) -> Layout:
     """The layout of arrays in the processor's memory."""
-    begin = np.searchsorted(arrays.corner.numpy(), np.arange(arrays.corner_count + 1, dtype=np.int32))
+    begin = arrays.begin.numpy()
     unit = arrays.units.numpy()
     chunk = np.searchsorted(unit, [corner for _, corner in arrays.run_bounds])
     pair = arrays.pair.numpy()
-    touched = [_distinct(pair[start:end], arrays.pair_count) for start, end in pairwise(begin[unit[chunk]])]
+    touched_at = np.empty(len(chunk), dtype=np.int64)
+    touched = np.empty_like(pair)
+    is_touched = np.zeros(arrays.pair_count, dtype=np.uint8)
+    touched_count = find_touched(pair, begin[unit[chunk]], is_touched, touched, touched_at)
     joined = np.diff(unit)
-    lengths = arrays.lengths
-    of_length = np.searchsorted(unit, lengths.first.numpy(), side="right") - 1
-    order = np.argsort(of_length, kind="stable")
+    lengths = _lengths(arrays, unit)
     return Layout(
         pair=pair,
         measured=arrays.measured.numpy(),
@@ -70,19 +70,44 @@ def make_layout(arrays: Arrays) -> Layout:
         unit=unit,
         joint_at=joint_offsets(joined),
         chunk=chunk,
-        touched=np.concatenate(touched),
-        touched_at=np.cumsum([0, *(len(part) for part in touched)]),
+        touched=touched[:touched_count].copy(),
+        touched_at=touched_at,
         control=arrays.control.numpy(),
         control_root=arrays.control_root.numpy(),
-        length_at=np.searchsorted(of_length[order], np.arange(len(joined) + 1)),
-        length_first=lengths.first.numpy()[order],
-        length_second=lengths.second.numpy()[order],
-        length_m=lengths.length_m.numpy()[order],
-        length_root=lengths.information_root.numpy()[order],
+        length_at=lengths.at,
+        length_first=lengths.first,
+        length_second=lengths.second,
+        length_m=lengths.length_m,
+        length_root=lengths.root,
         most_seen=int(np.diff(begin[unit]).max()),
         most_joined=int(joined.max()),
         is_kept=np.zeros(len(joined), dtype=np.bool_),
     )
+
+
+class _Lengths(NamedTuple):
+    """The known lengths by unit, as in :class:`Layout`."""
+
+    at: IntArray
+    first: IntArray
+    second: IntArray
+    length_m: FloatArray
+    root: FloatArray
+
+
+def _lengths(arrays: Arrays, unit: IntArray) -> _Lengths:
+    """The known lengths, sorted by the units (M + 1,) that they are in."""
+    lengths = arrays.lengths
+    first, second, length_m, root = (
+        column.numpy()
+        for column in (lengths.first, lengths.second, lengths.length_m, lengths.information_root)
+    )
+    if not len(first):
+        return _Lengths(np.zeros(len(unit), dtype=np.int64), first, second, length_m, root)
+    of_length = np.searchsorted(unit, first, side="right") - 1
+    order = np.argsort(of_length, kind="stable")
+    at = np.searchsorted(of_length[order], np.arange(len(unit)))
+    return _Lengths(at, first[order], second[order], length_m[order], root[order])
 
 
 def _frame_of_moment(arrays: Arrays) -> IntArray:
@@ -91,11 +116,31 @@ def _frame_of_moment(arrays: Arrays) -> IntArray:
     return np.arange(arrays.moment_count) if moments is None else np.asarray(moments.numpy())
 
 
-def _distinct(pair: IntArray, pairs: int) -> IntArray:
-    """The distinct pairs of a chunk, by a mask over all pairs, which is faster than sorting."""
-    is_touched = np.zeros(pairs, dtype=np.bool_)
-    is_touched[pair] = True
-    return np.flatnonzero(is_touched).astype(np.int32)
+@twin("adjust.find_touched")
+@kernel
+def find_touched(
+    pair: IntArray, chunk: IntArray, is_touched: NDArray[np.uint8], touched: IntArray, touched_at: IntArray
+) -> int:
+    """Number of pairs that chunks touch, which are written in turn, ascending, and where those of each begin.
+
+    ``chunk`` (Q + 1,) are the observations at which chunks begin; ``is_touched`` (P,) are zeros.
+    """
+    count = 0
+    for q in range(len(chunk) - 1):
+        touched_at[q] = count
+        lowest = len(is_touched)
+        highest = -1
+        for k in range(chunk[q], chunk[q + 1]):
+            is_touched[pair[k]] = 1
+            lowest = min(lowest, pair[k])
+            highest = max(highest, pair[k])
+        for p in range(lowest, highest + 1):
+            if is_touched[p]:
+                touched[count] = p
+                count += 1
+            is_touched[p] = 0
+    touched_at[len(chunk) - 1] = count
+    return count
 
 
 def joint_offsets(joined: IntArray) -> IntArray:
@@ -190,9 +235,52 @@ def first_unsound(
         for axis in range(2):
             focal = observations.intrinsic[c, axis]
             centre = observations.intrinsic[c, 2 + axis]
-            if not abs((observations.pinhole_px[k, axis] - centre) / focal) <= max_slope:
+            if not abs(observations.pinhole_px[k, axis] - centre) <= max_slope * focal:
                 return k
     return -1
+
+
+@twin("adjust.first_not_rigid")
+@kernel
+def first_not_rigid(transforms: FloatArray, orthonormal_to: float) -> int:
+    """Index of the first of transforms (n, 4, 4) that is not rigid, or -1."""
+    for k in range(len(transforms)):
+        turn = transforms[k]
+        for i in range(3):
+            for j in range(i + 1):
+                off = turn[i, 0] * turn[j, 0] + turn[i, 1] * turn[j, 1] + turn[i, 2] * turn[j, 2]
+                if not abs(off - (1.0 if i == j else 0.0)) <= orthonormal_to:
+                    return k
+        determinant = turn[0, 0] * (turn[1, 1] * turn[2, 2] - turn[1, 2] * turn[2, 1])
+        determinant += turn[0, 1] * (turn[1, 2] * turn[2, 0] - turn[1, 0] * turn[2, 2])
+        determinant += turn[0, 2] * (turn[1, 0] * turn[2, 1] - turn[1, 1] * turn[2, 0])
+        if not determinant > 0:
+            return k
+        if turn[3, 0] != 0 or turn[3, 1] != 0 or turn[3, 2] != 0 or turn[3, 3] != 1:
+            return k
+    return -1
+
+
+@inlined
+def _sort_run(pair: NDArray[np.int32], order: NDArray[np.int32], begin: int, end: int) -> None:
+    """Shell's sort of a corner's observations by pair and number, which needs no room."""
+    gap = 1
+    while gap < (end - begin) // 3:
+        gap = 3 * gap + 1
+    while gap > 0:
+        for i in range(begin + gap, end):
+            moved_pair = pair[i]
+            number = order[i]
+            at = i
+            while at - gap >= begin and (
+                moved_pair < pair[at - gap] or (moved_pair == pair[at - gap] and number < order[at - gap])
+            ):
+                pair[at] = pair[at - gap]
+                order[at] = order[at - gap]
+                at -= gap
+            pair[at] = moved_pair
+            order[at] = number
+        gap //= 3
 
 
 @twin("adjust.arrange")
@@ -201,37 +289,31 @@ def arrange(
     observations: Seen,
     rank: IntArray,
     frames: int,
-    by_pair: NDArray[np.int32],
-    pair_at: IntArray,
     corner_at: IntArray,
     order: NDArray[np.int32],
     corner: NDArray[np.int32],
     pair: NDArray[np.int32],
 ) -> int:
-    """Sort observations (K,) by the rank of their corner, then by pair, each time by counting those before.
+    """Sort observations (K,) by the rank of their corner, counting those before, then by pair.
 
-    ``by_pair`` (K,) is room, and ``pair_at`` (P + 1,) and ``corner_at`` (N + 1,) are zeros. Returns the
-    position of a duplicate of the one before, or -1.
+    ``corner_at`` (N + 1,) are zeros. Returns the position of a duplicate of the one before, or -1.
     """
     for k in range(len(order)):
-        pair_at[observations.camera[k] * frames + observations.frame[k] + 1] += 1
         corner_at[rank[observations.corner[k]] + 1] += 1
-    for p in range(1, len(pair_at)):
-        pair_at[p] += pair_at[p - 1]
     for c in range(1, len(corner_at)):
         corner_at[c] += corner_at[c - 1]
     for k in range(len(order)):
-        p = observations.camera[k] * frames + observations.frame[k]
-        by_pair[pair_at[p]] = k
-        pair_at[p] += 1
-    for i in range(len(order)):
-        k = by_pair[i]
         c = rank[observations.corner[k]]
         at = corner_at[c]
         corner_at[c] += 1
         order[at] = k
         corner[at] = c
         pair[at] = observations.camera[k] * frames + observations.frame[k]
+    begin = 0
+    for i in range(1, len(order) + 1):
+        if i == len(order) or corner[i] != corner[begin]:
+            _sort_run(pair, order, begin, i)
+            begin = i
     for i in range(1, len(order)):
         if corner[i] == corner[i - 1] and pair[i] == pair[i - 1]:
             return i
@@ -240,18 +322,74 @@ def arrange(
 
 @twin("adjust.lay_out")
 @kernel
-def lay_out(observations: Seen, order: NDArray[np.int32], measured: FloatArray, root: FloatArray) -> None:
-    """Write observations in an order (K,): where at depth 1, and their root information."""
+def lay_out(
+    observations: Seen,
+    order: NDArray[np.int32],
+    pair: NDArray[np.int32],
+    frames: int,
+    line_excess: float,
+    measured: FloatArray,
+    root: FloatArray,
+) -> int:
+    """Write observations in an order (K,): where at depth 1, and their root information.
+
+    ``pair`` (K,) are their cameras and frames in this order. Returns how many are of lines, by the
+    ``line_excess`` of their covariances.
+    """
+    lines = 0
     for i in range(len(order)):
         k = order[i]
-        c = observations.camera[k]
+        c = pair[i] // frames
         fx = observations.intrinsic[c, 0]
         fy = observations.intrinsic[c, 1]
+        xx = observations.covariance_px[k, 0, 0]
+        yx = observations.covariance_px[k, 1, 0]
+        yy = observations.covariance_px[k, 1, 1]
         measured[0, i] = (observations.pinhole_px[k, 0] - observations.intrinsic[c, 2]) / fx
         measured[1, i] = (observations.pinhole_px[k, 1] - observations.intrinsic[c, 3]) / fy
-        first = math.sqrt(observations.covariance_px[k, 0, 0])
-        below = observations.covariance_px[k, 1, 0] / first
-        last = math.sqrt(observations.covariance_px[k, 1, 1] - below * below)
+        first = math.sqrt(xx)
+        below = yx / first
+        last = math.sqrt(yy - below * below)
         root[0, i] = fx / first
         root[1, i] = -below * fx / (first * last)
         root[2, i] = fy / last
+        if (xx + yy) * (xx + yy) > (xx * yy - yx * yx) * line_excess:
+            lines += 1
+    return lines
+
+
+_ACCEPTED = 0  # a Verdict of v2hdm.adjust.solution; numba knows no enumerations
+_CONTRADICTS = 1  # a Verdict
+_UNCONFIRMED = 2  # a Verdict
+_BEHIND_CAMERA = 3  # a Verdict
+
+
+@twin("adjust.classify")
+@kernel
+def classify(
+    corner: IntArray,
+    mahalanobis2: FloatArray,
+    behind: BoolArray,
+    gate: float,
+    verdict: NDArray[np.int8],
+    sightings: IntArray,
+    accepted: IntArray,
+) -> None:
+    """Write a verdict on each observation (K,), and each corner's number of them and of accepted ones (N,).
+
+    Both numbers are zeros before.
+    """
+    for k in range(len(corner)):
+        c = corner[k]
+        sightings[c] += 1
+        if behind[k]:
+            verdict[k] = _BEHIND_CAMERA
+        elif mahalanobis2[k] > gate:
+            verdict[k] = _CONTRADICTS
+        else:
+            verdict[k] = _ACCEPTED
+            accepted[c] += 1
+    for k in range(len(corner)):
+        c = corner[k]
+        if verdict[k] == _ACCEPTED and accepted[c] == 1 and sightings[c] > 1:
+            verdict[k] = _UNCONFIRMED

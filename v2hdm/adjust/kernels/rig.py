@@ -51,9 +51,18 @@ def make_rig(arrays: Arrays, layout: Layout) -> Any:
     )
 
 
-def terms_of(compiled: Any) -> dict[str, float]:
+class Evaluated(NamedTuple):
+    """A compiled evaluation: costs by name as in :func:`terms_of`, what moved, and the gradient."""
+
+    costs: tuple[float, ...]
+    cam_from_vehicle: FloatArray  # (C, 4, 4)
+    corners_map: FloatArray  # (N, 2)
+    gradient: FloatArray  # by the whitened variables
+
+
+def terms_of(costs: tuple[float, ...]) -> dict[str, float]:
     """The cost by name of a compiled whitening or evaluation."""
-    observations, camera_centre, ground_planes, control_points, known_lengths = compiled.costs
+    observations, camera_centre, ground_planes, control_points, known_lengths = costs
     return {
         "observations": observations,
         "camera_centre": camera_centre,

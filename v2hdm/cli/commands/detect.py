@@ -19,9 +19,9 @@ from v2hdm.errors import ConfigError, DriveError
 
 if TYPE_CHECKING:
     from v2hdm.detection.frames import Frame
+    from v2hdm.detection.pointing import Pointed
     from v2hdm.detection.road import Road
     from v2hdm.detection.stopwatch import Stopwatch
-    from v2hdm.records import FloatArray
 
 _FIRST = b'{"source": '  # the beginning of every line of detections
 _STAGES = ("read", "horizon", "net", "propose", "lanes", "fit", "judge")
@@ -90,13 +90,13 @@ def _detect(parsed: argparse.Namespace) -> None:
         try:
             for frame, camera, road in frames:
                 record = as_record(frame, camera, road)
-                if parsed.live:
+                if parsed.live and not road.is_second:
                     record["dropped"] = frame.dropped
                 print(json.dumps(record), file=stream, flush=live)
-                if parsed.live:
+                if parsed.live and not road.is_second:
                     dropped += frame.dropped
                     age_s.append(time.time() - (frame.stamp_s or 0.0))
-                if write_drawing is not None:
+                if write_drawing is not None and not road.is_second:
                     write_drawing(f"{_new_name(frame.name, drawn_as)}.jpg", _drawing(frame, road))
         except KeyboardInterrupt:
             if not live:
@@ -123,13 +123,13 @@ def _warn_of_unknown(model: Path) -> None:
         print(unknown, file=sys.stderr)
 
 
-def _regions_from(stream: IO[str]) -> Callable[[Frame], FloatArray | None]:
+def _regions_from(stream: IO[str]) -> Callable[[Frame], Pointed | None]:
     """Where to look in a frame, by the latest line of a stream if that is of the frame's time."""
     from v2hdm.detection.pointing import Pointer
 
     pointer = Pointer()
     threading.Thread(target=pointer.follow, args=(stream,), name="v2hdm-regions", daemon=True).start()
-    return lambda frame: pointer.regions(frame.stamp_s)
+    return lambda frame: pointer.at(frame.stamp_s)
 
 
 def _new_name(name: str, in_use: set[str]) -> str:

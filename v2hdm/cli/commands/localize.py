@@ -95,9 +95,10 @@ def _run_live(arguments: Sequence[str]) -> int:
     from v2hdm.io.calibration.reading import trusted_calibrations
     from v2hdm.io.maps.reading import read_geojson
     from v2hdm.localization.live import localize_live
-    from v2hdm.localization.localizer import Localizer, Pose
+    from v2hdm.localization.localizer import Localizer
     from v2hdm.localization.messages import pose_bag
     from v2hdm.localization.places import rough_position
+    from v2hdm.localization.pose import Pose
     from v2hdm.localization.stream import MotionLines, pose_record
     from v2hdm.store.lines import lines_to
     from v2hdm.store.names import CALIBRATIONS, map_file

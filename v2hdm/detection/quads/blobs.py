@@ -68,32 +68,35 @@ def find_blobs(
     """Blobs of paint below image row ``reach_px``, and 1 + the index of each element's (h, w) int16."""
     # A frame of no paint around it lets every outline close.
     level = cv2.copyMakeBorder(output.paint, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=-1.0)
-    contours, piece = _connected(level, (reach_px - output.top) / output.stride + 1)
+    pieces = _find_pieces(level, (reach_px - output.top) / output.stride + 1)
+    count = len(pieces.boxes)
     groups = _Groups(output.classes, catalogue)
-    scores = _class_scores(output, piece, level, len(contours), groups)
-    may_split = _may_split(piece, level, scores.votes >= groups.least_share)
-    outlines = outlines_of(level, piece, len(contours))
+    scores = _class_scores(output, pieces.number, level, count, groups)
+    # Pieces of several groups, or with several parts of sure paint.
+    may_split = ((scores.votes >= groups.least_share).sum(axis=1) > 1) | (pieces.sure_parts > 1)
+    outlines = outlines_of(level, pieces.number, count)
+    levels = _signed_levels(level, pieces)
     first_px = _origin_px(output, 0, 0)
-    number_of_piece = np.zeros(len(contours) + 1, dtype=np.int16)
+    number_of_piece = np.zeros(count + 1, dtype=np.int16)
     of_parts: list[tuple[Box, BoolArray, int]] = []
     blobs: list[Blob] = []
-    doubtful = _doubtful(level, contours, scores.cells)
+    area_of_piece = _areas_of_use(pieces, scores.cells)
     first_of_area: dict[int, int] = {}
-    for index in np.argsort(doubtful.area_of_piece, kind="stable").tolist():
+    for index in _by_area(area_of_piece):
         if scores.cells[index] < _MIN_CELLS:
             continue
-        area = int(doubtful.area_of_piece[index])
+        area = int(area_of_piece[index])
         if area and area not in first_of_area:
             first_of_area[area] = len(blobs)
-            blobs.append(_doubtful_blob(doubtful, area, level, output))
-        box = _framed(cv2.boundingRect(contours[index]))
+            blobs.append(_doubtful_blob(pieces, area, level, output))
+        box = _framed(pieces.boxes[index].tolist())
         parts: list[Blob] = []
         if may_split[index]:
-            inside = piece[box] == index + 1
+            inside = pieces.number[box] == index + 1
             parts = _split(inside, level[box], output, box, groups, scores.votes[index])
         whole = Blob(
             class_score=dict(zip(output.classes, scores.score[:, index].tolist(), strict=True)),
-            level=_signed(piece, index + 1, level, box),
+            level=levels[index],
             origin_px=_origin_px(output, box[0].start, box[1].start),
             stride=output.stride,
             outline_px=first_px + output.stride * outlines[index],
@@ -108,7 +111,7 @@ def find_blobs(
         if area:
             first = first_of_area[area]
             blobs[first] = replace(blobs[first], parts=len(blobs) - 1 - first)
-    owner = number_of_piece.take(piece)
+    owner = number_of_piece.take(pieces.number)
     for box, is_of_part, number in of_parts:
         owner[box][is_of_part] = number
     return blobs, owner[1:-1, 1:-1]
@@ -126,50 +129,85 @@ def _origin_px(output: NetworkOutput, row: int, column: int) -> FloatArray:
     return np.array([first + output.stride * column, first + output.top + output.stride * row])
 
 
-class _Doubtful(NamedTuple):
-    """Connected areas of doubtful paint."""
+class _Pieces(NamedTuple):
+    """B connected pieces of likely paint that reach far enough down, and the areas of doubtful paint."""
 
-    labels: np.ndarray  # (h, w) int16 the area of each element of the framed ``paint``
-    stats: np.ndarray  # (A, 5) OpenCV's statistics of the areas
-    area_of_piece: IntArray  # (B,) the area in which each piece of likely paint lies, 0 if it is the same
+    number: np.ndarray  # (h, w) int16 1 + the index of each element's piece, 0 for none; holes are filled
+    boxes: IntArray  # (B, 4) left, top, width and height of each
+    sure_parts: IntArray  # (B,) parts of sure paint, large enough to count, that each has
+    area_number: np.ndarray  # (h, w) int16 1 + the index of each element's area, 0 for none
+    area_boxes: IntArray  # (A, 4)
+    area_cells: IntArray  # (A,) elements
+    area: IntArray  # (B,) number of the area in which each piece lies
 
 
-def _doubtful(level: np.ndarray, contours: Sequence[np.ndarray], cells: np.ndarray) -> _Doubtful:
-    """The areas of doubtful paint about the B pieces of likely paint, which have so many ``cells`` (B,)."""
+def _find_pieces(level: np.ndarray, least_row: float) -> _Pieces:
+    """The pieces of paint of a framed level (h, w) that reach ``least_row``, the last row first."""
+    compiled = kernels()
+    if compiled is not None:
+        return _Pieces(*compiled.find_pieces(level, least_row, _SURE, _DOUBTFUL, _MIN_CELLS))
+    contours, _ = cv2.findContours((level > 0).view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    contours = [c for c in contours if len(c) >= 4 and c[:, 0, 1].max() + 1 >= least_row]
+    number = np.zeros(level.shape, dtype=np.int16)
+    for index, contour in enumerate(contours):
+        cv2.drawContours(number, [contour], -1, index + 1, cv2.FILLED)
     doubtful = (level > _DOUBTFUL).view(np.uint8)
     doubtful[[0, -1]] = 0
     doubtful[:, [0, -1]] = 0
     # Labels of 16 bits take a third of the time.
     _, labels, stats, _ = cv2.connectedComponentsWithStats(doubtful, ltype=cv2.CV_16U)
-    labels = labels.view(np.int16)
-    if not contours:
-        return _Doubtful(labels, stats, np.zeros(0, dtype=np.int64))
-    first_point = np.array([contour[0, 0] for contour in contours])
-    area = labels[first_point[:, 1], first_point[:, 0]].astype(np.int64)
-    sure = np.bincount(area, cells, len(stats)) / np.maximum(stats[:, cv2.CC_STAT_AREA], 1)
-    holds_several = np.bincount(area, minlength=len(stats)) > 1
-    is_of_use = (holds_several | (sure < _MOST_SURE)) & (sure > _LEAST_SURE)
-    return _Doubtful(labels, stats, np.where(is_of_use[area], area, 0))
+    first_point = np.array([contour[0, 0] for contour in contours], dtype=np.int64).reshape(-1, 2)
+    boxes = [cv2.boundingRect(contour) for contour in contours]
+    return _Pieces(
+        number=number,
+        boxes=np.array(boxes, dtype=np.int64).reshape(-1, 4),
+        sure_parts=_sure_parts(number, level, len(contours)),
+        area_number=labels.view(np.int16),
+        area_boxes=stats[1:, : cv2.CC_STAT_AREA].astype(np.int64),
+        area_cells=stats[1:, cv2.CC_STAT_AREA].astype(np.int64),
+        area=labels[first_point[:, 1], first_point[:, 0]].astype(np.int64),
+    )
 
 
-def _doubtful_blob(doubtful: _Doubtful, area: int, level: np.ndarray, output: NetworkOutput) -> Blob:
+def _sure_parts(number: np.ndarray, level: np.ndarray, count: int) -> IntArray:
+    """How many parts (B,) of sure paint each of ``count`` pieces has, in a map (h, w) of their numbers.
+
+    Sure paint of two pieces never touches: it is labelled for all of them at once.
+    """
+    sure = ((level > _SURE) & (number > 0)).view(np.uint8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(sure, ltype=cv2.CV_16U)
+    large = np.flatnonzero(stats[1:, cv2.CC_STAT_AREA] >= _MIN_CELLS) + 1
+    # The piece of a part is that at any of its elements: on its first row there is one.
+    rows = stats[large, cv2.CC_STAT_TOP]
+    firsts = (labels[rows] == large[:, None]).argmax(axis=1) if len(large) else rows
+    return np.bincount(number[rows, firsts], minlength=count + 1)[1:]
+
+
+def _areas_of_use(pieces: _Pieces, cells: np.ndarray) -> IntArray:
+    """The number of the area of doubtful paint about each piece, which has so many ``cells`` (B,).
+
+    It is 0 where the area says nothing new, or hardly anything of it is likely.
+    """
+    areas = len(pieces.area_cells) + 1
+    is_likely = np.bincount(pieces.area, cells, areas)[1:] / np.maximum(pieces.area_cells, 1)
+    holds_several = np.bincount(pieces.area, minlength=areas)[1:] > 1
+    is_of_use = (holds_several | (is_likely < _MOST_SURE)) & (is_likely > _LEAST_SURE)
+    return np.where(np.append(False, is_of_use)[pieces.area], pieces.area, 0)
+
+
+def _by_area(area_of_piece: IntArray) -> list[int]:
+    """The indices of pieces, those of one area together."""
+    first_of: dict[int, int] = {}
+    firsts = [first_of.setdefault(area, index) for index, area in enumerate(area_of_piece.tolist())]
+    return sorted(range(len(firsts)), key=firsts.__getitem__)
+
+
+def _doubtful_blob(pieces: _Pieces, area: int, level: np.ndarray, output: NetworkOutput) -> Blob:
     """The blob of one area of doubtful paint."""
-    box = _framed(doubtful.stats[area, : cv2.CC_STAT_AREA].tolist())
+    box = _framed(pieces.area_boxes[area - 1].tolist())
     raised = level[box] - np.float32(_DOUBTFUL)
-    labels = np.ascontiguousarray(doubtful.labels[box])
+    labels = np.ascontiguousarray(pieces.area_number[box])
     return replace(_blob(labels, area, raised, output, box), traced=False)
-
-
-def _connected(level: np.ndarray, least_row: float) -> tuple[list[np.ndarray], np.ndarray]:
-    """Contours of paint that reaches ``least_row``, and a map of 1 + the number of each, holes filled."""
-    contours, _ = cv2.findContours((level > 0).view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    within_reach = [
-        contour for contour in contours if len(contour) >= 4 and contour[:, 0, 1].max() + 1 >= least_row
-    ]
-    piece = np.zeros(level.shape, dtype=np.int16)
-    for index, contour in enumerate(within_reach):
-        cv2.drawContours(piece, [contour], -1, index + 1, cv2.FILLED)
-    return within_reach, piece
 
 
 class _Scores(NamedTuple):
@@ -248,21 +286,6 @@ def outlines_of(level: np.ndarray, piece: np.ndarray, count: int) -> list[FloatA
     return [ordered[begin:end] for begin, end in pairwise(ends)]
 
 
-def _may_split(piece: np.ndarray, level: np.ndarray, present: BoolArray) -> BoolArray:
-    """Which pieces are of several groups, by those ``present`` (B, G), or have several parts of sure paint.
-
-    Sure paint of two pieces never touches: it is labelled for all of them at once.
-    """
-    sure = ((level > _SURE) & (piece > 0)).view(np.uint8)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(sure, ltype=cv2.CV_16U)
-    large = np.flatnonzero(stats[1:, cv2.CC_STAT_AREA] >= _MIN_CELLS) + 1
-    # The piece of a part is that at any of its elements: on its first row there is one.
-    rows = stats[large, cv2.CC_STAT_TOP]
-    firsts = (labels[rows] == large[:, None]).argmax(axis=1) if len(large) else rows
-    parts = np.bincount(piece[rows, firsts], minlength=len(present) + 1)[1:]
-    return np.asarray((present.sum(axis=1) > 1) | (parts > 1))
-
-
 def _split(
     inside: BoolArray,
     level: np.ndarray,
@@ -316,6 +339,16 @@ def _lead(output: NetworkOutput, is_of_group: BoolArray, box: Box) -> np.ndarray
     )
     map_u, map_v = np.meshgrid(u, v)
     return np.asarray(cv2.remap(lead, map_u, map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+
+
+def _signed_levels(level: np.ndarray, pieces: _Pieces) -> list[np.ndarray]:
+    """The level in the box around each piece, as :func:`_signed`."""
+    compiled = kernels()
+    if compiled is not None:
+        levels: list[np.ndarray] = compiled.signed_levels(level, pieces.number, pieces.boxes)
+        return levels
+    boxes = [_framed(box) for box in pieces.boxes.tolist()]
+    return [_signed(pieces.number, index + 1, level, box) for index, box in enumerate(boxes)]
 
 
 def _signed(labels: np.ndarray, label: int, level: np.ndarray, box: Box) -> np.ndarray:

@@ -33,7 +33,7 @@ TYPICAL_BLUR_PX = 0.75  # point spread of a focused camera, px, pixel aperture i
 _SEARCH_BLUR = 0.6  # blur of a search, in distances of the grid's points: it sees sides from far away
 _LEAST_SEARCH_BLUR_PX = 1.5  # least blur of a search, px
 _SEARCH_SIGMA = 0.1  # how far the network's outline is from a side's end before the search, marking lengths
-_SEARCH_STEPS = 4  # steps of a search at most
+_SEARCH_STEPS = 2  # steps of a search at most; with one of them a dash of KITTI 0011's map was false
 _STEPS = 8  # steps of a fit at most
 
 _BLOOM = 1.2  # blurs by which the outline of clipped paint lies outside of the paint

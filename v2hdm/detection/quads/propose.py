@@ -11,7 +11,6 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import compress
 from typing import NamedTuple
 
 import cv2
@@ -21,8 +20,8 @@ from v2hdm.catalogue import Catalogue
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.network import NetworkOutput
 from v2hdm.detection.quads.blobs import Blob
-from v2hdm.geometry.planar import following, is_convex_px, quads_from_hulls, rectangle_size
-from v2hdm.records import BoolArray, FloatArray, IntArray
+from v2hdm.geometry.planar import Quad, following, is_convex_px, quads_from_hulls, rectangle_size
+from v2hdm.records import BoolArray, FloatArray
 
 _LEAST_CERTAINTY = 0.3  # least mean probability of paint of a piece; below it one in fifty is a marking
 _LEAST_CLASS_SHARE = 0.02  # least share of a class, by network and size, with which it is proposed
@@ -164,11 +163,23 @@ def propose(
     range_m = camera.range_m(np.add.reduceat(points_vehicle, begins) / count[:, None])
     whole = np.logical_and.reduceat(camera.inside(points_px, BORDER_PX), begins)
     outlines_vehicle = np.split(points_vehicle, begins[1:])
-    outlines_pinhole_px = np.split(points_pinhole_px, begins[1:])
-    hulls = [_hull(outline) for outline in outlines_pinhole_px]
-    size_m = np.array([_size_m(outline, hull) for outline, hull in zip(outlines_vehicle, hulls, strict=True)])
-    shares = _shares(blobs, size_m, catalogue, whole, camera.log_size_sigma(range_m))
-    tightest = _tightest(outlines_pinhole_px, hulls, camera, max_range_m)
+    # OpenCV computes in float32: far from the origin that is too coarse.
+    first_px = points_pinhole_px[begins]
+    from_first_px = (points_pinhole_px - np.repeat(first_px, count, axis=0)).astype(np.float32)
+    outlines = np.split(from_first_px, begins[1:])
+    hulls = [cv2.convexHull(outline, returnPoints=False)[:, 0] for outline in outlines]
+    on_ground = np.logical_and.reduceat(np.isfinite(points_vehicle[:, 0]), begins).tolist()
+    size_m = np.array(
+        [
+            # Straight lines are straight on the ground, unless they cross the horizon.
+            rectangle_size(outline[hull] if is_on_ground else outline)
+            for outline, hull, is_on_ground in zip(outlines_vehicle, hulls, on_ground, strict=True)
+        ]
+    )
+    certainty = [sum(blob.class_score.values()) for blob in blobs]
+    shares = _shares(blobs, np.array(certainty), size_m, catalogue, whole, camera.log_size_sigma(range_m))
+    hulls_px = [outline[hull][:, None] for outline, hull in zip(outlines, hulls, strict=True)]
+    tightest = _tightest(hulls_px, first_px, camera, max_range_m)
     return [
         Proposal(
             blob=blob,
@@ -179,7 +190,7 @@ def propose(
             fill=tightest[index].fill,
         )
         for index, blob in enumerate(blobs)
-        if sum(blob.class_score.values()) >= _LEAST_CERTAINTY
+        if certainty[index] >= _LEAST_CERTAINTY
     ]
 
 
@@ -189,12 +200,17 @@ def open_sides(corners_px: FloatArray, camera: RoadCamera) -> BoolArray:
 
 
 def _shares(
-    blobs: Sequence[Blob], size_m: FloatArray, catalogue: Catalogue, whole: BoolArray, log_sigma: FloatArray
+    blobs: Sequence[Blob],
+    certainty: FloatArray,
+    size_m: FloatArray,
+    catalogue: Catalogue,
+    whole: BoolArray,
+    log_sigma: FloatArray,
 ) -> list[dict[str, float]]:
     """Share of each class of the catalogue in every blob, by network and size (B, 2), length and width."""
     names = [name for name in blobs[0].class_score if name in catalogue.classes]
     score = np.array([[blob.class_score[name] for name in names] for blob in blobs])
-    certainty = np.array([max(sum(blob.class_score.values()), 1e-9) for blob in blobs])[:, None]
+    certainty = np.maximum(certainty, 1e-9)[:, None]
     classes = [catalogue.classes[name] for name in names]
     same_group = np.array([[first.group == second.group for second in classes] for first in classes])
     others = np.maximum(same_group.sum(axis=0) - 1, 1)
@@ -216,41 +232,21 @@ class _Tightest(NamedTuple):
     fill: float = 0.0  # share of it that the outline's convex hull fills
 
 
-def _hull(outline_px: FloatArray) -> IntArray:
-    """The indices of the points of an outline (N, 2) that are its convex hull, in order."""
-    hull = cv2.convexHull((outline_px - outline_px[0]).astype(np.float32), returnPoints=False)
-    return np.asarray(hull.ravel(), dtype=np.intp)
-
-
-def _size_m(outline_vehicle: FloatArray, hull: IntArray) -> tuple[float, float]:
-    """Length and width of an outline (N, 2) on the ground, by the indices of its hull in the image."""
-    on_hull = outline_vehicle[hull]
-    # Straight lines are straight on the ground, unless they cross the horizon.
-    return rectangle_size(on_hull if np.isfinite(on_hull).all() else outline_vehicle)
-
-
 def _tightest(
-    outlines_px: Sequence[FloatArray],
-    hulls_of: Sequence[IntArray],
-    camera: RoadCamera,
-    max_range_m: float,
+    hulls: Sequence[np.ndarray], first_px: FloatArray, camera: RoadCamera, max_range_m: float
 ) -> list[_Tightest]:
-    """The tightest quadrilateral around each outline (N, 2), pinhole px, by the indices of its hull."""
-    hulls = [
-        (outline[hull, None] - outline[0]).astype(np.float32)
-        for outline, hull in zip(outlines_px, hulls_of, strict=True)
-    ]
+    """The tightest quadrilateral around each hull (N, 1, 2) float32, pinhole px from ``first_px`` (B, 2)."""
     quads = quads_from_hulls(hulls)
     of_outline = [k for k, quad in enumerate(quads) if quad is not None]
-    tightest = [_Tightest()] * len(outlines_px)
+    tightest = [_Tightest()] * len(hulls)
     if not of_outline:
         return tightest
-    first_px = np.array([outlines_px[k][0] for k in of_outline])
-    corners_px = np.array([quads[k] for k in of_outline]) + first_px[:, None]
+    corners_px = np.array([quads[k] for k in of_outline]) + first_px[of_outline][:, None]
     ground = camera.ground(corners_px.reshape(-1, 2)).reshape(corners_px.shape)
     within_range = camera.range_m(ground.mean(axis=1)) <= max_range_m  # nan is not
-    usable = is_convex_px(corners_px) & within_range
-    for k, corners in zip(compress(of_outline, usable), corners_px[usable], strict=True):
-        area_px2 = float(cv2.contourArea(np.asarray(quads[k], dtype=np.float32)))
-        tightest[k] = _Tightest(corners, cv2.contourArea(hulls[k]) / max(area_px2, 1e-6))
+    area_px2 = np.maximum(Quad(corners_px).area, 1e-6)
+    usable = np.flatnonzero(is_convex_px(corners_px) & within_range)
+    for place in usable.tolist():
+        k = of_outline[place]
+        tightest[k] = _Tightest(corners_px[place], cv2.contourArea(hulls[k]) / float(area_px2[place]))
     return tightest

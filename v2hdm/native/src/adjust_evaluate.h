@@ -138,6 +138,7 @@ void evaluate(
     const Evaluation& out) {
     double *step = scratch.step, *gradient = scratch.gradient;
     const bool is_by_camera = cameras_alone_move(layout, base);
+    CameraSums sums(base.pairs / layout.moments, 6);
     for (Index q = begin; q < end; ++q) {
         number_touched(layout, q, scratch.slot);
         LossSum losses;
@@ -155,7 +156,7 @@ void evaluate(
                 out.corners[2 * c] = base.corners[2 * c] + step[i];
                 out.corners[2 * c + 1] = base.corners[2 * c + 1] + step[i + 1];
                 if (is_by_camera) {
-                    see_corner_by_camera(layout, base, by.table, c, scratch, out, losses, gradient + i);
+                    see_corner_by_camera(layout, base, by.table, c, out, sums, losses, gradient + i);
                 } else {
                     see_corner(layout, base, by.table, c, scratch, out, losses, gradient + i);
                 }
@@ -163,59 +164,21 @@ void evaluate(
             add_corner_priors(layout, u, out.corners, gradient, out.costs + 3 * q);
             carry_unit(layout, base, q, u, coupled, scratch, out);
         }
+        if (is_by_camera) sums.flush_wrenches(layout, q, 0, out.wrench);
         out.costs[3 * q] = losses.cost(base);
     }
 }
 
-Index first_corner(const Layout& layout, Index chunk) { return layout.unit[layout.chunk[chunk]]; }
+constexpr Index ROWS_AHEAD = 48;  // observations ahead: about as long as memory takes
 
-// The ground point of a ray of observation k, and its information; false if the ray is too flat.
-struct GroundPoint {
-    double x, y, xx, yx, yy;
-};
-
-bool meet(const Layout& layout, const double* ground, Index k, GroundPoint& point) {
-    const double u = layout.measured[k], v = layout.measured[layout.observations + k];
-    const double drop = ground[6] * u + ground[7] * v + ground[8];
-    const double least = MIN_DEPRESSION_SINE * MIN_DEPRESSION_SINE * (1 + u * u + v * v);
-    if (!(drop > 0 && drop * drop > least)) return false;
-    const auto [a, b, c] = root_of(layout, k);
-    point.x = (ground[0] * u + ground[1] * v + ground[2]) / drop;
-    point.y = (ground[3] * u + ground[4] * v + ground[5]) / drop;
-    const double xu = ground[0] - point.x * ground[6], xv = ground[1] - point.x * ground[7];
-    const double yu = ground[3] - point.y * ground[6], yv = ground[4] - point.y * ground[7];
-    const double share = drop / (xu * yv - xv * yu);
-    const double j0 = a * share * yv, j2 = b * share * yv - c * share * yu;
-    const double j1 = -a * share * xv, j3 = -b * share * xv + c * share * xu;
-    point.xx = j0 * j0 + j2 * j2;
-    point.yx = j0 * j1 + j2 * j3;
-    point.yy = j1 * j1 + j3 * j3;
-    return true;
-}
-
-void meet_ground(
-    Index begin, Index end, const Layout& layout, const double* homographies, double* corners, bool* determined) {
-    for (Index c = first_corner(layout, begin); c < first_corner(layout, end); ++c) {
-        double xx = 0, yx = 0, yy = 0, x = 0, y = 0;
-        for (Index k = layout.begin[c]; k < layout.begin[c + 1]; ++k) {
-            GroundPoint point;
-            if (!meet(layout, homographies + 9 * layout.pair[k], k, point)) continue;
-            xx += point.xx;
-            yx += point.yx;
-            yy += point.yy;
-            x += point.xx * point.x + point.yx * point.y;
-            y += point.yx * point.x + point.yy * point.y;
-        }
-        determined[c] = xx > 0;
-        corners[2 * c] = corners[2 * c + 1] = 0.0;
-        if (!(xx > 0)) continue;
-        const double first = std::sqrt(xx), below = yx / first;
-        const double remainder = yy - below * below, least = PIVOT_FLOOR * yy;
-        const double last = std::sqrt(remainder < least ? least : remainder);
-        const double top = x / first, low = (y - below * top) / last / last;
-        corners[2 * c] = (top - below * low) / first;
-        corners[2 * c + 1] = low;
-    }
+// Has the places of an observation in a report, of which the next is anywhere in memory, on their way.
+void prefetch_rows(const Report& out, Index row) {
+#ifdef __GNUC__
+    __builtin_prefetch(out.residual_px + 2 * row, 1);
+    __builtin_prefetch(out.mahalanobis2 + row, 1);
+#else
+    static_cast<void>(out), static_cast<void>(row);
+#endif
 }
 
 void report(
@@ -227,6 +190,7 @@ void report(
             const auto [a, b, d] = root_of(layout, k);
             const double r0 = a * seen.u, r1 = b * seen.u + d * seen.v;
             const Index row = order[k], camera = layout.pair[k] / layout.moments;
+            prefetch_rows(out, order[std::min(k + ROWS_AHEAD, layout.observations - 1)]);
             out.residual_px[2 * row] = seen.u * focal[2 * camera];
             out.residual_px[2 * row + 1] = seen.v * focal[2 * camera + 1];
             out.mahalanobis2[row] = r0 * r0 + r1 * r1;

@@ -6,6 +6,8 @@
 #include "adjust_tables.h"
 #include "modules.h"
 
+#include <algorithm>
+
 namespace v2hdm {
 namespace {
 
@@ -212,35 +214,81 @@ Index first_unsound_of(
 }
 
 Index arrange_columns(
-    nb::handle columns_object, nb::handle rank_object, Index frames, nb::handle by_pair_object, nb::handle pair_at_object,
-    nb::handle corner_at_object, nb::handle order_object, nb::handle corner_object, nb::handle pair_object) {
+    nb::handle columns_object, nb::handle rank_object, Index frames, nb::handle corner_at_object,
+    nb::handle order_object, nb::handle corner_object, nb::handle pair_object) {
     const ColumnsRecord columns(columns_object);
     const auto rank = array_of<const Index, 1>(rank_object, "rank");
-    const auto by_pair = array_of<int32_t, 1>(by_pair_object, "by_pair");
-    const auto pair_at = array_of<Index, 1>(pair_at_object, "pair_at");
     const auto corner_at = array_of<Index, 1>(corner_at_object, "corner_at");
     const auto order = array_of<int32_t, 1>(order_object, "order");
     const auto corner = array_of<int32_t, 1>(corner_object, "corner");
     const auto pair = array_of<int32_t, 1>(pair_object, "pair");
     const size_t count = columns.camera.size();
-    require(order.size() == count && corner.size() == count && pair.size() == count && by_pair.size() == count, "order");
-    require(corner_at.size() == rank.size() + 1 && pair_at.size() > 0, "corner_at");
+    require(order.size() == count && corner.size() == count && pair.size() == count, "order");
+    require(corner_at.size() == rank.size() + 1, "corner_at");
     return arrange(
         columns.view, rank.data(), frames,
-        {by_pair.data(), pair_at.data(), corner_at.data(), size_of(pair_at.size()) - 1, size_of(rank.size()),
-         order.data(), corner.data(), pair.data()});
+        {corner_at.data(), size_of(rank.size()), order.data(), corner.data(), pair.data()});
 }
 
-void lay_out_columns(
-    nb::handle columns_object, nb::handle order_object, nb::handle measured_object, nb::handle root_object) {
+Index lay_out_columns(
+    nb::handle columns_object, nb::handle order_object, nb::handle pair_object, int32_t frames, double line_excess,
+    nb::handle measured_object, nb::handle root_object) {
     const ColumnsRecord columns(columns_object);
     const auto order = array_of<const int32_t, 1>(order_object, "order");
+    const auto pair = array_of<const int32_t, 1>(pair_object, "pair");
+    require(frames > 0 && pair.size() == order.size(), "pair");
     const auto measured = array_of<double, 2>(measured_object, "measured");
     const auto root = array_of<double, 2>(root_object, "root");
     const size_t count = order.size();
     require(count == columns.camera.size(), "order");
     require(measured.size() == 2 * count && root.size() == 3 * count, "measured");
-    lay_out(columns.view, order.data(), measured.data(), root.data());
+    const Sorted sorted = {order.data(), pair.data(), frames};
+    return lay_out(columns.view, sorted, line_excess, measured.data(), root.data());
+}
+
+void classify_observations(
+    nb::handle corner_object, nb::handle mahalanobis2_object, nb::handle behind_object, double gate,
+    nb::handle verdict_object, nb::handle sightings_object, nb::handle accepted_object) {
+    const auto corner = array_of<const Index, 1>(corner_object, "corner");
+    const auto mahalanobis2 = array_of<const double, 1>(mahalanobis2_object, "mahalanobis2");
+    const auto behind = array_of<const bool, 1>(behind_object, "behind");
+    const auto verdict = array_of<int8_t, 1>(verdict_object, "verdict");
+    const auto sightings = array_of<Index, 1>(sightings_object, "sightings");
+    const auto accepted = array_of<Index, 1>(accepted_object, "accepted");
+    const size_t count = corner.size();
+    require(mahalanobis2.size() == count && behind.size() == count && verdict.size() == count, "verdict");
+    require(accepted.size() == sightings.size(), "accepted");
+    const Index corners = size_of(sightings.size());
+    const auto is_within = [&](Index place) { return 0 <= place && place < corners; };
+    require(std::all_of(corner.data(), corner.data() + count, is_within), "corner");
+    classify(
+        {corner.data(), mahalanobis2.data(), behind.data(), size_of(count)}, gate,
+        {verdict.data(), sightings.data(), accepted.data(), corners});
+}
+
+Index first_not_rigid_of(nb::handle transforms_object, double orthonormal_to) {
+    const auto transforms = array_of<const double, 3>(transforms_object, "transforms");
+    require(transforms.shape(1) == 4 && transforms.shape(2) == 4, "transforms");
+    return first_not_rigid(transforms.data(), size_of(transforms.shape(0)), orthonormal_to);
+}
+
+Index find_touched_pairs(
+    nb::handle pair_object, nb::handle chunk_object, nb::handle is_touched_object, nb::handle touched_object,
+    nb::handle touched_at_object) {
+    const auto pair = array_of<const int32_t, 1>(pair_object, "pair");
+    const auto chunk = array_of<const Index, 1>(chunk_object, "chunk");
+    const auto is_touched = array_of<uint8_t, 1>(is_touched_object, "is_touched");
+    const auto touched = array_of<int32_t, 1>(touched_object, "touched");
+    const auto touched_at = array_of<Index, 1>(touched_at_object, "touched_at");
+    const Index chunks = size_of(chunk.size()) - 1;
+    require(chunks >= 0 && touched_at.size() == chunk.size() && touched.size() == pair.size(), "touched");
+    for (Index q = 0; q < chunks; ++q) require(0 <= chunk.data()[q] && chunk.data()[q] <= chunk.data()[q + 1], "chunk");
+    require(chunk.data()[chunks] == size_of(pair.size()), "chunk");
+    const Index pairs = size_of(is_touched.size());
+    const auto is_within = [&](int32_t place) { return 0 <= place && place < pairs; };
+    require(std::all_of(pair.data(), pair.data() + pair.size(), is_within), "pair");
+    return find_touched(
+        pair.data(), chunk.data(), chunks, is_touched.data(), {touched.data(), touched_at.data()});
 }
 
 }  // namespace
@@ -264,6 +312,9 @@ void add_adjust(nb::module_& module) {
     adjust.def("first_unsound", &first_unsound_of);
     adjust.def("arrange", &arrange_columns);
     adjust.def("lay_out", &lay_out_columns);
+    adjust.def("classify", &classify_observations);
+    adjust.def("first_not_rigid", &first_not_rigid_of);
+    adjust.def("find_touched", &find_touched_pairs);
     nb::dict constants;
     constants["NEAR_M"] = NEAR_M;
     constants["WEIGHT_FLOOR"] = WEIGHT_FLOOR;

@@ -24,6 +24,8 @@ inline Seen see(const Layout& layout, const double* table, Index k, double x, do
     return seen;
 }
 
+inline Index first_corner(const Layout& layout, Index chunk) { return layout.unit[layout.chunk[chunk]]; }
+
 struct Root {
     double a, b, c;
 };

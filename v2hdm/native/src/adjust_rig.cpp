@@ -206,6 +206,8 @@ bool RigWhitening::factorise(bool hold_cameras) {
     return true;
 }
 
+void RigWhitening::substitute_back(double* step) const { passes().backward(factor_of(tip, rig.unknowns()), step); }
+
 // Completes the cameras' information; ``information`` (D,) is what there is of each unknown alone.
 void RigWhitening::subtract_corners(Numbers& information) {
     const Index width = rig.unknowns();
@@ -231,7 +233,7 @@ RigEvaluation::RigEvaluation(const RigWhitening& whitening, const double* whiten
     : cam_from_vehicle(whitening.cam_from_vehicle.size()), corners(whitening.corners.size()),
       gradient(whitening.gradient.size()), whitening(whitening), work(std::make_unique<Work>(whitening, whitened)) {
     const Rig& rig = whitening.rig;
-    passes().backward(factor_of(whitening.tip, rig.unknowns()), work->step.data());
+    whitening.substitute_back(work->step.data());
     move(
         work->step.data(), whitening.cam_from_vehicle.data(), rig.cameras, rig.exp, rig.left_jacobian,
         cam_from_vehicle.data(), work->chart.data());

@@ -49,6 +49,9 @@ class RigWhitening {
     // The extrinsics stay where they are, if held; false if the cameras' information is not definite.
     bool factorise(bool hold_cameras);
 
+    // From the cameras' whitened variables (D,) to their step.
+    void substitute_back(double* step) const;
+
     const Layout& layout;
     const Rig& rig;
     const Numbers cam_from_vehicle, corners;

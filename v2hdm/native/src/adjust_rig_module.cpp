@@ -3,6 +3,8 @@
 #include "adjust_records.h"
 #include "modules.h"
 
+#include <algorithm>
+
 namespace v2hdm {
 namespace {
 
@@ -50,6 +52,17 @@ RigEvaluation* evaluated(const RigWhitening& whitening, nb::handle whitened_obje
     return new RigEvaluation(whitening, whitened.data());
 }
 
+// The cameras' part (D,) of a step: they come last, and need no other variables.
+nb::object camera_step(const RigWhitening& whitening, nb::handle whitened_object) {
+    const auto whitened = array_of<const double, 1>(whitened_object, "whitened");
+    require(whitened.size() == whitening.gradient.size(), "whitened");
+    const size_t unknowns = whitening.by_camera.size();
+    const Made<double> step({unknowns});
+    std::copy(whitened.data(), whitened.data() + unknowns, step.data);
+    whitening.substitute_back(step.data);
+    return step.array;
+}
+
 // Numbers of an object as an array.
 template <typename Owner>
 auto view_of(Numbers Owner::*numbers) {
@@ -59,11 +72,28 @@ auto view_of(Numbers Owner::*numbers) {
     };
 }
 
-template <typename Owner>
-nb::tuple costs_of(const Owner& owner) {
-    const Terms& terms = owner.terms;
+nb::tuple costs_of(const Terms& terms) {
     return nb::make_tuple(
         terms.observations, terms.camera_centre, terms.ground_planes, terms.control_points, terms.known_lengths);
+}
+
+nb::tuple costs_of_whitening(const RigWhitening& whitening) { return costs_of(whitening.terms); }
+
+// An array that keeps its numbers alive itself.
+nb::object owned(Numbers&& numbers, std::initializer_list<size_t> shape) {
+    auto* kept = new Numbers(std::move(numbers));
+    const nb::capsule owner(kept, [](void* memory) noexcept { delete static_cast<Numbers*>(memory); });
+    return nb::cast(nb::ndarray<nb::numpy, double>(kept->data(), shape, owner));
+}
+
+// What kernels.rig.Evaluated holds. Views would keep the factors alive for as long as the solution.
+nb::tuple finished(RigEvaluation& evaluation) {
+    evaluation.finish();
+    const size_t cameras = evaluation.cam_from_vehicle.size() / 16, corners = evaluation.corners.size() / 2;
+    const size_t unknowns = evaluation.gradient.size();
+    return nb::make_tuple(
+        costs_of(evaluation.terms), owned(std::move(evaluation.cam_from_vehicle), {cameras, 4, 4}),
+        owned(std::move(evaluation.corners), {corners, 2}), owned(std::move(evaluation.gradient), {unknowns}));
 }
 
 template <typename Owner, void (Owner::*WORK)(Index, Index)>
@@ -91,9 +121,10 @@ void add_adjust_rig(nb::module_& adjust) {
         .def("eliminate", &eliminate)
         .def("is_separable", &RigWhitening::is_separable)
         .def("factorise", &RigWhitening::factorise)
+        .def("camera_step", &camera_step)
         .def("evaluate", &evaluated, nb::keep_alive<0, 1>(), nb::rv_policy::take_ownership)
         .def_ro("smallest_pivot", &RigWhitening::smallest_pivot)
-        .def_prop_ro("costs", &costs_of<RigWhitening>)
+        .def_prop_ro("costs", &costs_of_whitening)
         .def_prop_ro("table", view_of(&RigWhitening::table))
         .def_prop_ro("lower", view_of(&RigWhitening::lower))
         .def_prop_ro("joint", view_of(&RigWhitening::joint))
@@ -105,11 +136,7 @@ void add_adjust_rig(nb::module_& adjust) {
         .def_prop_ro("gradient", view_of(&RigWhitening::gradient));
     nb::class_<RigEvaluation>(adjust, "RigEvaluation")
         .def("look", &look)
-        .def("finish", &RigEvaluation::finish)
-        .def_prop_ro("costs", &costs_of<RigEvaluation>)
-        .def_prop_ro("cam_from_vehicle", view_of(&RigEvaluation::cam_from_vehicle))
-        .def_prop_ro("corners_map", view_of(&RigEvaluation::corners))
-        .def_prop_ro("gradient", view_of(&RigEvaluation::gradient));
+        .def("finish", &finished);
 }
 
 }  // namespace v2hdm

@@ -9,6 +9,9 @@ NB_MODULE(_kernels, module) {
     v2hdm::add_lattice(module);
     v2hdm::add_lanes(module);
     v2hdm::add_paint(module);
+    v2hdm::add_pieces(module);
+    v2hdm::add_views(module);
     v2hdm::add_lens(module);
+    v2hdm::add_seeing(module);
     v2hdm::add_adjust(module);
 }
