@@ -2,7 +2,8 @@
 
 ``python -m tests.benchmarks.survey --statistics DRIVE [--every 3]``: the shipped detector on a rendered port,
 by distance: errors and stated sigmas of corners, the share of markings found, and of false detections; and
-how far errors of one corner are alike in different images. Those of port 2 are the constants of :mod:`v2hdm.simulate.survey.sightings`.
+how far errors of one corner are alike in different images. Those of port 2 are the constants of
+:mod:`v2hdm.simulate.survey.sightings`.
 
 ``python -m tests.benchmarks.survey --joint KM [--section-m M]``: a problem of a survey, adjusted at once and
 in rounds over its sections: corners in mm, sigmas in per cent, seconds of CPU.
@@ -78,7 +79,7 @@ def _projected(drive: Drive, truth: Truth, row: int) -> dict[int, FloatArray]:
 def _matched(
     detected: MarkingDetection, shown: dict[int, FloatArray], truth: Truth
 ) -> tuple[int, FloatArray, int] | None:
-    """The marking that a detection is of, the errors (4, 2) of its corners, px, and the first one's number."""
+    """The marking that a detection is of, the errors (4, 2) of its corners, px, and which came first."""
     known = detected.corner_valid if detected.corner_valid.any() else np.ones(4, dtype=bool)
     candidates = [
         (j, detected.corners_px - np.roll(px, turn, axis=0), turn)

@@ -122,7 +122,7 @@ def _stated_px(corner_m: FloatArray, rng: np.random.Generator) -> FloatArray:
 
 
 def _errors_px(sigma_px: FloatArray, alike_px: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Errors (M, 4, 2), px, of corners of stated sigmas, of which those but the tail are in part ``alike_px``."""
+    """Errors (M, 4, 2), px, of corners of stated sigmas; those but the tail are in part ``alike_px``."""
     in_tail = rng.random(sigma_px.shape[:-1])[..., None] < _TAIL_SHARE
     of_image_px = rng.standard_normal(sigma_px.shape) * sigma_px
     most_px = np.sqrt(1 - _ALIKE) * of_image_px + np.sqrt(_ALIKE) * alike_px
