@@ -19,10 +19,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from train.config import DataConfig
 from train.examples import Example, example, photograph, polygon_overlap
 from train.fit_arrows import SEED, config_of
 from train.fit_judge import HARDSHIPS, HARDSHIPS_EVERY
 from train.labels import labelled_images
+from train.labels_image import LabelledImage
 from train.logistic import likeliest_weights
 from train.scenes.hardships import NONE
 from v2hdm.detection import crosswalks
@@ -48,9 +50,17 @@ def photographs(labels: Path, images: Path, count: int) -> Iterator[Example]:
     """Labelled photographs that networks learn from, over two cameras in turn."""
     rng = np.random.default_rng(SEED)
     stated = config_of(labels, images)
+    for image, config in configs_in_turn(labelled_images(stated)[:count], stated):
+        yield photograph(image, config, rng)
+
+
+def configs_in_turn(
+    images: Iterable[LabelledImage], stated: DataConfig
+) -> Iterator[tuple[LabelledImage, DataConfig]]:
+    """Photographs, every second one with the settings of a camera of which nobody states the mounting."""
     configs = (stated, replace(stated, coco_camera=list(NOT_STATED)))
-    for number, image in enumerate(labelled_images(stated)[:count]):
-        yield photograph(image, configs[number % len(configs)], rng)
+    for number, image in enumerate(images):
+        yield image, configs[number % len(configs)]
 
 
 def renders(count: int) -> Iterator[Example]:

@@ -135,9 +135,11 @@ def test_observations_of_lines_are_counted_as_they_are_laid_out(compiled):
     observations = dataclasses.replace(seen, covariance_px=covariance_px)
     count = len(seen.corner)
     order = np.arange(count, dtype=np.int32)
+    frames = len(problem.map_from_vehicle)
+    pair = (seen.camera * frames + seen.frame).astype(np.int32)
     with nullcontext() if compiled else native.numpy_alone():
         columns = Seen.of(observations.columns, problem.intrinsic)
-        lines = lay_out(columns, order, LINE_EXCESS, np.empty((2, count)), np.empty((3, count)))
+        lines = lay_out(columns, order, pair, frames, LINE_EXCESS, np.empty((2, count)), np.empty((3, count)))
     assert lines == np.count_nonzero(observations.on_line) == -(-count // 5)
 
 

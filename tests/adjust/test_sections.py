@@ -76,14 +76,22 @@ def finish(number, part, solution):
 
 
 def in_sections(
-    folder: Path, problem: Problem, options: SolveOptions, part_of_frame, at_once: int = 0
+    folder: Path,
+    problem: Problem,
+    options: SolveOptions,
+    part_of_frame,
+    at_once: int = 0,
+    are_near: bool = False,
 ) -> list[dict]:
     """The results of all parts."""
     parts, links = cut(problem, part_of_frame, tuple(options.pose_states))
     for number, part in enumerate(parts):
         save_part(folder, number, part)
     shape = Shape.of(problem, options)
-    joint = join_parts(folder, len(parts), links, shape, lambda number, part, solution: None, at_once=at_once)
+    joint = join_parts(
+        folder, len(parts), links, shape, lambda number, part, solution: None,
+        at_once=at_once, are_near=are_near,
+    )  # fmt: skip
     return finish_parts(folder, joint, shape, finish)
 
 
@@ -130,6 +138,19 @@ def test_sections_that_are_solved_at_once_are_the_street(tmp_path):
     part = np.tile(np.arange(80) // 40, 2)
     everything = len(problem.observations.corner)
     check(in_sections(tmp_path, problem, options, part, at_once=everything), problem, options)
+
+
+def test_sections_that_start_near_their_joint_optimum_are_the_street(tmp_path):
+    scene = make_scene(3, frames=100, jitter=DRIFTING, outliers=0.03, start_error_deg=0.5)
+    options = SolveOptions()
+    rough = solve(scene.problem, replace(options, gap_tolerance=1e-3))
+    near = replace(
+        scene.problem,
+        cam_from_vehicle=rough.cam_from_vehicle,
+        poses_start=rough.map_from_vehicle,
+        corners_start=rough.corners_map,
+    )
+    check(in_sections(tmp_path, near, options, np.arange(100) // 50, are_near=True), scene.problem, options)
 
 
 def test_sections_without_frame_states_are_the_street(tmp_path):

@@ -15,7 +15,8 @@ classes alone.
 
 Crosswalks, words and boxes are found where the hull of neighbouring detections of their class overlaps the
 label by more than .3. That joins words that stand side by side in several lanes. So it is printed, too, how
-many are found where the outline of a single detection counts as well, of crosswalks that of a whole one.
+many are found where the outline of a single detection counts as well, of crosswalks that of a whole one; and
+how many such areas lie where nothing is labelled.
 """
 
 from __future__ import annotations
@@ -222,6 +223,7 @@ class Tally:
         self.taken_for: dict[str, Counter[str]] = defaultdict(Counter)
         self.given: Counter[str] = Counter()
         self.false: Counter[str] = Counter()
+        self.false_areas: Counter[str] = Counter()
         self.images = 0
 
     def add(self, labels: Labels, given: tuple[MarkingDetection, ...]) -> None:
@@ -235,6 +237,7 @@ class Tally:
             cv2.fillPoly(mask, [np.round(outline).astype(np.int32)], 1)
             alone = not (mask & near).any()
             self.false[detection.kind] += alone and detection.kind in _SYMBOLS
+            self.false_areas[detection.kind] += alone and detection.kind in WHOLE_OF.values()
         for name, polygon in zip(labels.names, labels.polygons, strict=True):
             kind = "diamond" if name == "diamond_outline" else name.split("_")[0]
             if kind not in ("diamond", "arrow"):
@@ -276,6 +279,8 @@ class Tally:
         for name, count in sorted(self.areas.items()):
             outlined = f", {self.areas_outlined[name]} with single outlines" if name in WHOLE_OF else ""
             print(f"{name}: {self.areas_found[name]} of {count} found as what they are{outlined}")
+        alone = {kind: self.false_areas[kind] for kind in sorted(set(WHOLE_OF.values()))}
+        print(f"areas where no label is near: {alone}")
         for (kind, size), count in sorted(self.count.items()):
             low, high = TALL_PX[size]
             found, named = self.found[kind, size] / count, self.named[kind, size] / count

@@ -1,8 +1,9 @@
 """Surveys by detections: the statistics they are made of, and mapping in sections against all at once.
 
 ``python -m tests.benchmarks.survey --statistics DRIVE [--every 3]``: the shipped detector on a rendered port,
-by distance: errors and stated sigmas of corners, the share of markings found, and of false detections. Those
-of port 2 are the constants of :mod:`v2hdm.simulate.survey.sightings`.
+by distance: errors and stated sigmas of corners, the share of markings found, and of false detections; and
+how far errors of one corner are alike in different images. Those of port 2 are the constants of
+:mod:`v2hdm.simulate.survey.sightings`.
 
 ``python -m tests.benchmarks.survey --joint KM [--section-m M]``: a problem of a survey, adjusted at once and
 in rounds over its sections: corners in mm, sigmas in per cent, seconds of CPU.
@@ -56,6 +57,8 @@ _MATCH_PX = 12.0  # mean distance of known corners from a marking's, within whic
 _BORDER_PX = 4.0
 _STEP_M = 2.0  # width of a class of distances
 _FARTHEST_M = 26.0
+_MOTION_M = 0.01  # motion on the ground by which a pixel's is told
+_TAIL_SIGMAS = 3.0  # errors beyond are outliers to the mapping
 
 
 def _projected(drive: Drive, truth: Truth, row: int) -> dict[int, FloatArray]:
@@ -75,11 +78,11 @@ def _projected(drive: Drive, truth: Truth, row: int) -> dict[int, FloatArray]:
 
 def _matched(
     detected: MarkingDetection, shown: dict[int, FloatArray], truth: Truth
-) -> tuple[int, FloatArray] | None:
-    """The marking that a detection is of, and the errors (4, 2) of its corners, px."""
+) -> tuple[int, FloatArray, int] | None:
+    """The marking that a detection is of, the errors (4, 2) of its corners, px, and which came first."""
     known = detected.corner_valid if detected.corner_valid.any() else np.ones(4, dtype=bool)
     candidates = [
-        (j, detected.corners_px - np.roll(px, turn, axis=0))
+        (j, detected.corners_px - np.roll(px, turn, axis=0), turn)
         for j, px in shown.items()
         if truth.map.markings[j].kind == detected.kind
         for turn in range(4)
@@ -97,12 +100,12 @@ def statistics(folder: Path, every: int) -> None:
     detector = Detector.load(options=DetectorOptions.for_mapping())
     corners: list[tuple[float, ...]] = []  # distance, |error|, smaller and larger sigma, squared distance
     markings: list[tuple[float, bool]] = []  # distance, whether found; of those whole in the image
+    by_corner: dict[tuple[int, int, str], list[FloatArray]] = {}  # whitened errors on the ground
     detections = false = 0
     for row in range(0, len(drive.images), every):
         image = drive.images[row]
-        camera_map = np.linalg.inv(
-            truth.cam_from_vehicle[image.camera] @ np.linalg.inv(truth.map_from_vehicle[row])
-        )[:2, 3]
+        cam_from_map = truth.cam_from_vehicle[image.camera] @ np.linalg.inv(truth.map_from_vehicle[row])
+        camera_map = np.linalg.inv(cam_from_map)[:2, 3]
         shown = _projected(drive, truth, row)
         found = set()
         for detected in detect_image(detector, drive, row).markings:
@@ -113,7 +116,7 @@ def statistics(folder: Path, every: int) -> None:
             if match is None:
                 false += 1
                 continue
-            j, off_px = match
+            j, off_px, first = match
             found.add(j)
             away_m = float(np.linalg.norm(truth.map.markings[j].corners_map.mean(axis=0) - camera_map))
             for k in np.flatnonzero(detected.corner_valid).tolist():
@@ -121,6 +124,11 @@ def statistics(folder: Path, every: int) -> None:
                 sigma = np.sqrt(np.linalg.eigvalsh(covariance))
                 squared = float(off_px[k] @ np.linalg.solve(covariance, off_px[k]))
                 corners.append((away_m, *np.abs(off_px[k]), *sigma, squared))
+                of_marking = (k - first) % 4
+                point_map = truth.map.markings[j].corners_map[of_marking]
+                root = _root_on_ground(drive, row, cam_from_map, point_map, covariance)
+                key = j, of_marking, image.camera
+                by_corner.setdefault(key, []).append(root @ off_px[k])
         size = np.array([drive.cameras[image.camera].info.width, drive.cameras[image.camera].info.height])
         for j, px in shown.items():
             inside = ((px > _BORDER_PX) & (px < size - 1 - _BORDER_PX)).all()
@@ -128,7 +136,50 @@ def statistics(folder: Path, every: int) -> None:
                 away_m = float(np.linalg.norm(truth.map.markings[j].corners_map.mean(axis=0) - camera_map))
                 markings.append((away_m, j in found))
     _print(np.array(corners), np.array(markings, dtype=float))
+    _print_alike(by_corner)
     print(f"{detections} detections, {false} of no marking ({false / detections:.3f})")
+
+
+def _root_on_ground(
+    drive: Drive, row: int, cam_from_map: FloatArray, point_map: FloatArray, covariance_px: FloatArray
+) -> FloatArray:
+    """The matrix (2, 2) that makes of an error, px, one along map x and y of unit covariance.
+
+    It is the symmetric root of the information on the ground, times the motion there of a pixel.
+    """
+    info = drive.cameras[drive.images[row].camera].info
+    around = point_map + _MOTION_M * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    points = around @ cam_from_map[:3, :2].T + cam_from_map[:3, 3]
+    pinhole = points @ info.intrinsic.T
+    px = distort_points(info, pinhole[:, :2] / pinhole[:, 2:])
+    px_by_m = np.column_stack([px[0] - px[1], px[2] - px[3]]) / (2 * _MOTION_M)
+    information = px_by_m.T @ np.linalg.solve(covariance_px, px_by_m)
+    share, axes = np.linalg.eigh(information)
+    return np.asarray((axes * np.sqrt(share)) @ axes.T @ np.linalg.inv(px_by_m))
+
+
+def _print_alike(by_corner: dict[tuple[int, int, str], list[FloatArray]]) -> None:
+    """Print the correlation of the errors of one corner in images of one camera, and in those of several."""
+    whitened = {key: _without_tails(np.array(errors)) for key, errors in by_corner.items()}
+    inside = [errors for errors in whitened.values() if len(errors) > 1]
+    square = float(np.mean(np.concatenate(inside) ** 2))
+    products = sum(float((errors.sum(axis=0) ** 2 - (errors**2).sum(axis=0)).sum()) for errors in inside)
+    pairs = sum(2 * len(errors) * (len(errors) - 1) for errors in inside)
+    print(f"errors of a corner in images of one camera: correlation {products / pairs / square:.3f}")
+    across, count = 0.0, 0
+    for (j, k, camera), errors in whitened.items():
+        for other in {name for *_, name in whitened if name > camera}:
+            others = whitened.get((j, k, other))
+            if others is not None:
+                across += float(errors.sum(axis=0) @ others.sum(axis=0))
+                count += 2 * len(errors) * len(others)
+    if count:
+        print(f"errors of a corner in images of two cameras: correlation {across / count / square:.3f}")
+
+
+def _without_tails(errors: FloatArray) -> FloatArray:
+    """Whitened errors (n, 2), those beyond the tail's sigmas drawn in to it."""
+    return np.clip(errors, -_TAIL_SIGMAS, _TAIL_SIGMAS)
 
 
 def _print(corners: FloatArray, markings: FloatArray) -> None:

@@ -81,12 +81,13 @@ def test_detected_corners_scatter_about_the_truth_as_the_detector_s_do():
     info = camera_info("front", camera)
     cam_from_map = cam_from_vehicle(camera.mount)
     square = np.array([[0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5], [0.5, -0.5]])
-    paint = Paint.of(HDMap((Marking("diamond", square + np.array([13.0, 0.0]), 0),)))
-    points = paint.corners_map[0] @ cam_from_map[:3, :2].T + cam_from_map[:3, 3]
+    ahead = HDMap((Marking("diamond", square + np.array([13.0, 0.0]), 0),))
+    points = ahead.markings[0].corners_map @ cam_from_map[:3, :2].T + cam_from_map[:3, 3]
     pinhole = points @ info.intrinsic.T
     px = distort_points(info, pinhole[:, :2] / pinhole[:, 2:])
     squared = []
     for seed in range(2000):
+        paint = Paint.of(ahead, np.random.default_rng([seed, 1]))
         shown = detect(paint, info, cam_from_map, np.random.default_rng(seed))
         assert shown.whole.tolist() == [0]
         for detected in shown.markings:
@@ -98,3 +99,55 @@ def test_detected_corners_scatter_about_the_truth_as_the_detector_s_do():
     assert len(squared) / 4 / 2000 == pytest.approx(0.98, abs=0.015)
     assert np.median(squared) / (2 * np.log(2)) == pytest.approx(0.77, abs=0.05)
     assert np.percentile(squared, 95) == pytest.approx(11.0, abs=2.5)
+
+
+def test_a_corner_errs_alike_in_different_images_as_the_detector_does():
+    """On the ground, the same in images from both ends of a marking: they see it from different sides."""
+    camera = PortConfig().cameras["front"]
+    info = camera_info("front", camera)
+    square = np.array([[0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5], [0.5, -0.5]])
+    ahead = HDMap((Marking("diamond", square, 0),))
+    there = np.eye(4)
+    there[0, 3] = -9.0
+    back = np.diag([-1.0, -1.0, 1.0, 1.0])
+    back[0, 3] = 11.0
+    products, squares = [], []
+    for seed in range(1500):
+        paint = Paint.of(ahead, np.random.default_rng([seed, 2]))
+        both = []
+        for number, pose in enumerate((there, back)):
+            cam_from_map = cam_from_vehicle(camera.mount) @ np.linalg.inv(pose)
+            rng = np.random.default_rng([seed, number])
+            shown = detect(paint, info, cam_from_map, rng)
+            both.append(whitened_errors(shown.markings, paint, info, cam_from_map))
+        if all(len(errors) for errors in both):
+            are_usual = np.all([np.linalg.norm(errors, axis=1) < 2.5 for errors in both], axis=0)
+            products.append((both[0] * both[1])[are_usual])
+            squares.append(np.square(both)[:, are_usual])
+    correlation = np.mean(np.concatenate(products)) / np.mean(np.concatenate(squares, axis=1))
+    assert correlation == pytest.approx(0.32, abs=0.04)
+
+
+def whitened_errors(markings, paint, info, cam_from_map) -> np.ndarray:
+    """Errors (4, 2) of the marking's corners on the ground, in sigmas; empty where it was not detected."""
+
+    def px_of(corners_map):
+        points = corners_map @ cam_from_map[:3, :2].T + cam_from_map[:3, 3]
+        pinhole = points @ info.intrinsic.T
+        return distort_points(info, pinhole[:, :2] / pinhole[:, 2:])
+
+    px = px_of(paint.corners_map[0])
+    for detected in markings:
+        turned = [np.roll(detected.corners_px, -k, axis=0) - px for k in range(4)]
+        turn = min(range(4), key=lambda k: np.abs(turned[k]).max())
+        sigma_px = np.roll(np.sqrt(detected.covariance_px.diagonal()).reshape(4, 2), -turn, axis=0)
+        if np.abs(turned[turn]).max() > 8.0 or np.ptp(sigma_px) == 0.0:
+            continue
+        errors = []
+        for off_px, sigma, corner in zip(turned[turn], sigma_px, paint.corners_map[0], strict=True):
+            steps = px_of(corner + 0.01 * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]]))
+            by_m = np.column_stack([steps[0] - steps[1], steps[2] - steps[3]]) / 0.02
+            share, axes = np.linalg.eigh(by_m.T @ np.diag(sigma**-2) @ by_m)
+            errors.append((axes * np.sqrt(share)) @ axes.T @ np.linalg.solve(by_m, off_px))
+        return np.array(errors)
+    return np.zeros((0, 2))

@@ -28,7 +28,7 @@ from v2hdm.report.metrics import driven_past, map_figures
 from v2hdm.simulate.port.config import PortConfig, ReliefConfig
 from v2hdm.store.files import load_json, write_json
 from v2hdm.surface.paths import Paths
-from v2hdm.surface.surface import KNOTS_M, Recorded, Surface
+from v2hdm.surface.surface import KNOTS_M, Recorded, Surface, _Smoothness
 
 FALLS = np.array([0.02, 0.03, -0.01, 0.01, 0.015, 0.02, -0.02])
 SHAPE = np.array([0.0, 0.0, *FALLS])  # with the grade
@@ -355,3 +355,13 @@ def test_a_port_rendered_on_a_grade_with_a_crown_is_mapped_as_well_as_the_flat_o
     assert figures["corner_rmse_m"] < 1.2 * 0.0211  # of the flat one; the plane is 17 cm off
     assert figures["height_rmse_m"] < 0.02
     assert figures["heights_inside_95"] > 0.9
+
+
+def test_the_prior_s_determinant_by_its_bands_is_that_of_the_matrix():
+    poses = np.tile(np.eye(4), (40, 1, 1))
+    poses[:, 0, 3] = np.arange(40)
+    paths = Paths.of(poses, np.zeros(40, dtype=np.int64))
+    smoothness = _Smoothness.of(Surface.level(paths).knots)
+    for sizes in np.random.default_rng(0).uniform(-12.0, -4.0, (5, 3)):
+        _, logarithm = np.linalg.slogdet(smoothness.prior(sizes))
+        assert smoothness.log_root(sizes) == pytest.approx(logarithm / 2, abs=1e-4)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -90,6 +92,19 @@ def check_model(problem: Problem, options: SolveOptions) -> None:
 
 def check_options(options: SolveOptions) -> None:
     """Raise :class:`AdjustError` for an option out of range."""
+    try:
+        _check_values(*vars(options).values())
+    except TypeError:  # a value without a hash
+        _check_options(options)
+
+
+@lru_cache(maxsize=64, typed=True)
+def _check_values(*values: Any) -> None:
+    """Check options by their values, sound ones once."""
+    _check_options(SolveOptions(**dict(zip(vars(SolveOptions()), values, strict=True))))
+
+
+def _check_options(options: SolveOptions) -> None:
     check_types(options)
     unknown = [name for name in options.pose_states if name not in POSE_STATES]
     if unknown:
@@ -146,13 +161,19 @@ def _check_arrays(problem: Problem) -> None:
                 raise AdjustError(f"{prefix}{name} is a {type(values).__name__}: give a numpy array")
             if values.shape != shape:
                 raise AdjustError(f"{prefix}{name} has shape {values.shape}, expected {shape}")
-            if name in indices and not np.issubdtype(values.dtype, np.integer):
+            if name in indices and values.dtype.kind not in "iu":
                 raise AdjustError(f"{prefix}{name} holds {values.dtype}: give whole numbers")
             if name in indices or name in ("centre_sigma_m", "pinhole_px", "covariance_px"):
                 continue
-            if not np.isfinite(values).all():
+            if not _has_finite_sum(values):
                 finite = np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
                 _refuse(~finite, f"{name} of {of} {{}} is not finite: remove it or fix its source")
+
+
+def _has_finite_sum(values: FloatArray) -> bool:
+    """Whether a sum, which is finite only if all of its terms are, is: cheaper than looking at each."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        return math.isfinite(np.add.reduce(values, axis=None))
 
 
 def _check_rigid(name: str, transforms: FloatArray) -> None:
@@ -232,6 +253,9 @@ def _check_priors(problem: Problem) -> None:
     if problem.read_out_s is not None:
         said = "read_out_s of camera {} is {} s: give 0 (all rows at once) or more"
         _refuse(problem.read_out_s < 0, said, problem.read_out_s)
+    if problem.session is None and isinstance(problem.pose_sigma, PoseSigma):
+        _check_pose_sigma(problem.pose_sigma)
+        return
     _check_sessions(problem)
     for pose_sigma in problem.pose_sigmas:
         _check_pose_sigma(pose_sigma)

@@ -7,7 +7,6 @@ the identity would.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -24,25 +23,31 @@ class _Columns(NamedTuple):
     parts: list[Tensor]  # by column; those that are not known yet are empty
     tip: Tensor  # the inverse at the tip
 
-    def among(self, tiles: Sequence[int]) -> Tensor:
-        """The inverse (M, M) at tiles that the pattern couples, and at the tip."""
+    def times(self, tiles: tuple[int, ...], right: Tensor) -> Tensor:
+        """The inverse at tiles that the pattern couples, and at the tip, times ``right`` (M, n).
+
+        Its blocks are taken one after the other: all of them at once would not fit in the processor's cache.
+        """
         size = self.size
-        out = self.tip.new_empty(2 * [len(tiles) * size + len(self.tip)])
-        out[len(tiles) * size :, len(tiles) * size :] = self.tip
+        out = right.new_zeros(right.shape)
+        end = len(tiles) * size
+        out[end:] = self.tip @ right[end:]
         for number, tile in enumerate(tiles):
-            part = self.parts[tile][self._rows(tile, tiles[number:])]
-            columns = slice(number * size, (number + 1) * size)
-            out[columns.start :, columns] = part
-            out[columns, columns.start :] = part.mT
+            part = self._rows(tile, tiles[number:])
+            begin = number * size
+            out[begin:].addmm_(part, right[begin : begin + size])
+            out[begin : begin + size].addmm_(part[size:].mT, right[begin + size :])
         return out
 
-    def _rows(self, tile: int, tiles: Sequence[int]) -> Tensor:
-        """The rows of a column's part that are of some tiles, and of the tip."""
+    def _rows(self, tile: int, tiles: tuple[int, ...]) -> Tensor:
+        """The rows of a column's part that are of some tiles, the first its own, and of the tip."""
         stacked = tile, *self.pattern.below[tile]
+        part = self.parts[tile]
+        if tiles == stacked:
+            return part
         place = {row: number * self.size for number, row in enumerate(stacked)}
-        of_tiles = torch.tensor([place[row] for row in tiles])[:, None] + torch.arange(self.size)
-        of_tip = len(stacked) * self.size + torch.arange(len(self.tip))
-        return torch.cat([of_tiles.flatten(), of_tip]).to(self.tip.device)
+        blocks = [part[place[row] : place[row] + self.size] for row in tiles]
+        return torch.cat([*blocks, part[len(stacked) * self.size :]])
 
 
 def inverse_diagonal(factor: TiledCholesky, pattern: Pattern, tail: Tensor | None = None) -> Tensor:
@@ -69,7 +74,7 @@ def inverse_diagonal(factor: TiledCholesky, pattern: Pattern, tail: Tensor | Non
             continue
         diagonal = factor.diagonal[column]
         gain = torch.linalg.solve_triangular(diagonal, factor.panels[column], upper=False, left=False)
-        lower = -columns.among(pattern.below[column]) @ gain
+        lower = -columns.times(pattern.below[column], gain)
         diagonal_block = torch.cholesky_inverse(diagonal) - gain.mT @ lower
         columns.parts[column] = torch.cat([diagonal_block, lower])
     return torch.stack([part[:size] for part in columns.parts])

@@ -28,8 +28,9 @@ _NEAR_M = 10_000.0  # coordinates up to this are exact to a picometre; moving th
 def nearby_origin(problem: Problem) -> FloatArray:
     """A point (2,) in whole metres near the recorded poses: the origin, or their centre if that is far."""
     position = problem.map_from_vehicle[:, :2, 3]
-    middle = np.round((position.min(0) + position.max(0)) / 2)
-    return np.asarray(middle if np.abs(middle).max() > _NEAR_M else np.zeros(2))
+    middle = np.round((np.minimum.reduce(position) + np.maximum.reduce(position)) / 2)
+    is_far = max(map(abs, middle.tolist())) > _NEAR_M
+    return np.asarray(middle if is_far else np.zeros(2))
 
 
 def shifted(problem: Problem, by_m: FloatArray) -> Problem:
@@ -70,11 +71,11 @@ def state_prior(problem: Problem, pose_states: tuple[str, ...]) -> StatePrior:
     (Gelb, Applied Optimal Estimation, section 3.8).
     """
     poses = problem.map_from_vehicle
-    session = problem.session_of_frame
     chosen = [k for k, name in enumerate(POSE_STATES) if name in pose_states]
     if not chosen:
         no_columns = np.zeros(0, dtype=np.int64)
         return StatePrior(no_columns, np.zeros((len(poses), 0, 0)), np.zeros((len(poses), 0)))
+    session = problem.session_of_frame
     total = np.array([sigma.by_state() for sigma in problem.pose_sigmas])
     drifts = [[(d.sigma, d.over_m) for d in sigma.drift_by_state()] for sigma in problem.pose_sigmas]
     drift, over_m = np.array(drifts).transpose(2, 0, 1)
@@ -255,7 +256,7 @@ def _sorted_observations(problem: Problem, rank: IntArray) -> _Sorted:
         )
     measured = np.empty((2, count))
     root = np.empty((3, count))
-    lines = lay_out(columns, order, LINE_EXCESS, measured, root)
+    lines = lay_out(columns, order, pair, frames, LINE_EXCESS, measured, root)
     return _Sorted(order, corner, pair, measured, root, lines > 0)
 
 

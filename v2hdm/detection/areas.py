@@ -7,6 +7,7 @@ Pieces of one class are one area where the gap between them on the ground is sma
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import combinations
 from typing import NamedTuple
 
@@ -18,6 +19,7 @@ from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.hatching import box_probability, meshes
 from v2hdm.detection.network import NetworkOutput, as_probability, as_shares
 from v2hdm.detection.quads.blobs import outlines_of
+from v2hdm.detection.writing import company_of_words, writing_probability
 from v2hdm.geometry.planar import rectangle_size
 from v2hdm.geometry.rows import linked_groups
 from v2hdm.records import BOX, TEXT, BoolArray, FloatArray, IntArray, MarkingDetection
@@ -57,8 +59,12 @@ def find_areas(
     reach_px: int,
     least_score: float,
     max_range_m: float,
+    *,
+    has_company: bool = True,
 ) -> list[MarkingDetection]:
     """The areas of an image below row ``reach_px``, each with the polygon ``outline_px`` of its hull.
+
+    Unless ``has_company`` each is scored alone.
 
     ``outline_seen`` is true for sides at which neither the image, nor its road, nor the vehicle's own mask
     cuts the paint.
@@ -93,15 +99,26 @@ def find_areas(
     areas = []
     for name in names:
         named = [piece for piece in pieces if piece.kind == name]
+        of_name = []
         for members in _together(named, _MOST_GAP_M.get(name, _OTHER_GAP_M)):
             if max(named[k].cells for k in members) < _LEAST_CELLS:
                 continue
             area = _area(name, [named[k] for k in members], output, camera, catalogue)
             ground = camera.unproject(area.outline_px)
-            within = camera.range_m(ground.mean(axis=0)) <= max_range_m
-            if within and area.score >= least_score:
-                areas.append(area)
-    return areas
+            if camera.range_m(ground.mean(axis=0)) <= max_range_m:
+                of_name.append(area)
+        areas += in_company(of_name, camera) if name == TEXT and has_company else of_name
+    return [area for area in areas if area.score >= least_score]
+
+
+def in_company(words: Sequence[MarkingDetection], camera: RoadCamera) -> list[MarkingDetection]:
+    """Areas that are named writing, with their probability given each other."""
+    if not words:
+        return []
+    score = np.array([word.score for word in words])
+    company = company_of_words(score, [camera.unproject(word.outline_px) for word in words])
+    probability = writing_probability(score, company).tolist()
+    return [replace(word, score=score) for word, score in zip(words, probability, strict=True)]
 
 
 def _named_together(names: Sequence[str]) -> list[tuple[str, ...]]:

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.cluster.hierarchy import DisjointSet
 from scipy.spatial import cKDTree
 from skimage.draw import polygon
-from skimage.measure import approximate_polygon, find_contours
+from skimage.measure import find_contours
 
 from v2hdm.adjust import PoseSigma
 from v2hdm.association.ground import BORDER_PX, Views, easy_views, outlines_on_ground
@@ -434,8 +434,9 @@ def _fused_outline(
     if not contours:
         return None
     largest = max(contours, key=lambda contour: abs(float(signed_area(contour))))
-    simple = approximate_polygon(largest, 0.5)  # type: ignore[no-untyped-call]
-    outline = simple[:-1, ::-1] * cell_m + first
+    # OpenCV's, as scikit-image's loads all of scipy.signal. The last point is the first.
+    simple = cv2.approxPolyDP(largest[:-1, None].astype(np.float32), 0.5, closed=True)[:, 0]
+    outline = simple[:, ::-1].astype(np.float64) * cell_m + first
     if len(outline) < 3:
         return None
     return np.asarray(outline if signed_area(outline) > 0 else outline[::-1])

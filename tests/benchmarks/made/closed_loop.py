@@ -90,7 +90,7 @@ def site_of(name: str, seed: int) -> Site:
 
 def made_eyes(site: Site, rng: np.random.Generator) -> See:
     """Cameras whose detections have the statistics of the detector on renders."""
-    paint = Paint.of(site.port.hd_map)
+    paint = Paint.of(site.port.hd_map, rng)
 
     def see(camera: str, van: Van) -> Look:
         cam_from_map = site.port.cam_from_vehicle[camera] @ inverse(van.map_from_vehicle)

@@ -235,7 +235,7 @@ def first_unsound(
         for axis in range(2):
             focal = observations.intrinsic[c, axis]
             centre = observations.intrinsic[c, 2 + axis]
-            if not abs((observations.pinhole_px[k, axis] - centre) / focal) <= max_slope:
+            if not abs(observations.pinhole_px[k, axis] - centre) <= max_slope * focal:
                 return k
     return -1
 
@@ -325,18 +325,21 @@ def arrange(
 def lay_out(
     observations: Seen,
     order: NDArray[np.int32],
+    pair: NDArray[np.int32],
+    frames: int,
     line_excess: float,
     measured: FloatArray,
     root: FloatArray,
 ) -> int:
     """Write observations in an order (K,): where at depth 1, and their root information.
 
-    Returns how many are of lines, by the ``line_excess`` of their covariances.
+    ``pair`` (K,) are their cameras and frames in this order. Returns how many are of lines, by the
+    ``line_excess`` of their covariances.
     """
     lines = 0
     for i in range(len(order)):
         k = order[i]
-        c = observations.camera[k]
+        c = pair[i] // frames
         fx = observations.intrinsic[c, 0]
         fy = observations.intrinsic[c, 1]
         xx = observations.covariance_px[k, 0, 0]
@@ -355,11 +358,10 @@ def lay_out(
     return lines
 
 
-# :class:`v2hdm.adjust.solution.Verdict`, which numba does not know.
-_ACCEPTED = 0
-_CONTRADICTS = 1
-_UNCONFIRMED = 2
-_BEHIND_CAMERA = 3
+_ACCEPTED = 0  # a Verdict of v2hdm.adjust.solution; numba knows no enumerations
+_CONTRADICTS = 1  # a Verdict
+_UNCONFIRMED = 2  # a Verdict
+_BEHIND_CAMERA = 3  # a Verdict
 
 
 @twin("adjust.classify")

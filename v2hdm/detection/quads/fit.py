@@ -33,10 +33,7 @@ TYPICAL_BLUR_PX = 0.75  # point spread of a focused camera, px, pixel aperture i
 _SEARCH_BLUR = 0.6  # blur of a search, in distances of the grid's points: it sees sides from far away
 _LEAST_SEARCH_BLUR_PX = 1.5  # least blur of a search, px
 _SEARCH_SIGMA = 0.1  # how far the network's outline is from a side's end before the search, marking lengths
-_SEARCH_STEPS = 2
-"""Steps of a search at most: of 160 images of ports 1 and 2 (seeds 9001 and 9002) recall is .964 with two and
-.963 with four, and 11 and 10 markings are false. With one, a dash of KITTI 0011's map is false."""
-
+_SEARCH_STEPS = 4  # steps of a search at most; with fewer KITTI 0011 or port 2 has one false marking
 _STEPS = 8  # steps of a fit at most
 
 _BLOOM = 1.2  # blurs by which the outline of clipped paint lies outside of the paint

@@ -93,6 +93,19 @@ struct Factor {
     const double* tip;
 };
 
+// layout.Seen, of so many observations.
+struct Columns {
+    const Index *camera, *frame, *corner;
+    const double *pinhole_px, *covariance_px, *intrinsic;
+    Index count;
+};
+
+// Observations in their order, and the pair of each: camera * frames + frame.
+struct Sorted {
+    const int32_t *order, *pair;
+    int32_t frames;
+};
+
 // The passes; each stands in v2hdm.adjust.kernels under the same name.
 struct Passes {
     void (*linearise)(
@@ -106,6 +119,7 @@ struct Passes {
     void (*carry)(
         Index begin, Index end, const Layout&, const Base&, const double* by_corner, const Scratch&,
         const Evaluation&);
+    Index (*lay_out)(const Columns&, const Sorted&, double line_excess, double* measured, double* root);
     void (*meet_ground)(
         Index begin, Index end, const Layout&, const double* homographies, double* corners, bool* determined);
     void (*report)(

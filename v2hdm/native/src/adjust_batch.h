@@ -28,15 +28,6 @@ inline double sum(const Lanes& a, int size) {
     return (sums[0] + sums[1]) + (sums[2] + sums[3]);
 }
 
-// The sum of a b.
-inline double dot(const Lanes& a, const Lanes& b, int size) {
-    double sums[VECTOR] = {};
-    for (int begin = 0; begin < size; begin += VECTOR) {
-        for (int l = 0; l < VECTOR; ++l) sums[l] += a[begin + l] * b[begin + l];
-    }
-    return (sums[0] + sums[1]) + (sums[2] + sums[3]);
-}
-
 // The sum of a b + c d.
 inline double dots(const Lanes& a, const Lanes& b, const Lanes& c, const Lanes& d, int size) {
     double sums[VECTOR] = {};
@@ -47,6 +38,64 @@ inline double dots(const Lanes& a, const Lanes& b, const Lanes& c, const Lanes& 
     }
     return (sums[0] + sums[1]) + (sums[2] + sums[3]);
 }
+
+// Adds a b + c d to sums by lane.
+inline void add_dots(double* sums, const Lanes& a, const Lanes& b, const Lanes& c, const Lanes& d, int size) {
+    double lanes[VECTOR];
+    for (int l = 0; l < VECTOR; ++l) lanes[l] = sums[l];
+    for (int begin = 0; begin < size; begin += VECTOR) {
+        for (int l = 0; l < VECTOR; ++l) {
+            lanes[l] += a[begin + l] * b[begin + l] + c[begin + l] * d[begin + l];
+        }
+    }
+    for (int l = 0; l < VECTOR; ++l) sums[l] = lanes[l];
+}
+
+// Adds a to sums by lane.
+inline void add_lanes(double* sums, const Lanes& a, int size) {
+    double lanes[VECTOR];
+    for (int l = 0; l < VECTOR; ++l) lanes[l] = sums[l];
+    for (int begin = 0; begin < size; begin += VECTOR) {
+        for (int l = 0; l < VECTOR; ++l) lanes[l] += a[begin + l];
+    }
+    for (int l = 0; l < VECTOR; ++l) sums[l] = lanes[l];
+}
+
+// Sums of a chunk by camera, some numbers each, whose lanes are added up at the end of the chunk: at the end of each
+// batch that took as long as the batch. Without std::vector, whose code other files would share.
+class CameraSums {
+  public:
+    CameraSums(Index cameras, int numbers) : numbers(numbers), lanes(new double[cameras * numbers * VECTOR]()) {}
+    ~CameraSums() { delete[] lanes; }
+    CameraSums(const CameraSums&) = delete;
+    CameraSums& operator=(const CameraSums&) = delete;
+
+    // By lane, number by number.
+    double* of(Index camera) { return lanes + camera * numbers * VECTOR; }
+
+    // Adds ``count`` numbers of a camera from ``first`` on to ``out``, and begins these anew.
+    void flush(Index camera, int first, int count, double* out) {
+        double* sums = of(camera) + first * VECTOR;
+        for (int p = 0; p < count; ++p, sums += VECTOR) {
+            out[p] += (sums[0] + sums[1]) + (sums[2] + sums[3]);
+            std::fill_n(sums, VECTOR, 0.0);
+        }
+    }
+
+    // Adds the wrenches, from number ``first`` on, to the first pair of each camera that the chunk touches.
+    void flush_wrenches(const Layout& layout, Index q, int first, double* wrench) {
+        Index last = -1;
+        for (Index i = layout.touched_at[q]; i < layout.touched_at[q + 1]; ++i) {
+            const Index camera = layout.touched[i] / layout.moments;
+            if (camera != last) flush(camera, first, 6, wrench + 6 * i);
+            last = camera;
+        }
+    }
+
+  private:
+    const int numbers;
+    double* const lanes;
+};
 
 // Observations of the ground point x, y by a camera, as Seen. Lanes from ``count`` to ``size`` fill up the last
 // vector: they repeat the last observation, at no weight.
@@ -87,6 +136,13 @@ struct Batch {
 
     // Weights by the loss, which is added up.
     void weigh_all(const Base& base, LossSum& losses) {
+        if (base.code == NONE) {
+            for (int l = 0; l < size; ++l) weight[l] = l < count ? 1.0 : 0.0;
+            Lanes squared;
+            for (int l = 0; l < size; ++l) squared[l] = weight[l] * (r0[l] * r0[l] + r1[l] * r1[l]);
+            losses.total += sum(squared, size);
+            return;
+        }
         for (int l = 0; l < count; ++l) {
             const double squared = r0[l] * r0[l] + r1[l] * r1[l];
             losses.add(base, squared);
@@ -96,14 +152,22 @@ struct Batch {
     }
 };
 
-// Derivatives of a batch, as Derived, and the same times the weights of the Hessian.
+// Derivatives of a batch, as Derived, and residuals, both so that their products are those of the weighted ones: times
+// the roots of the Hessian's weights, which are 0 in lanes that fill up.
 struct BatchDerived {
-    Lanes jacobian[16], weighted[16];
+    Lanes jacobian[16], r0, r1;
 
     explicit BatchDerived(const Batch& at) {
-        Lanes *j = jacobian, floor;
+        Lanes *j = jacobian, root;
         for (int l = 0; l < at.size; ++l) {
-            const double a = at.a[l], b = at.b[l], c = at.c[l], px = at.px[l], py = at.py[l], pz = at.pz[l];
+            const double floor = std::sqrt(floored(at.weight[l]));
+            const double weight = at.weight[l] / floor;
+            root[l] = l < at.count ? floor : 0.0;
+            r0[l] = l < at.count ? weight * at.r0[l] : 0.0;
+            r1[l] = l < at.count ? weight * at.r1[l] : 0.0;
+        }
+        for (int l = 0; l < at.size; ++l) {
+            const double a = at.a[l] * root[l], b = at.b[l] * root[l], c = at.c[l] * root[l], px = at.px[l], py = at.py[l], pz = at.pz[l];
             const double ad = a * at.inverse[l], bd = b * at.inverse[l], cd = c * at.inverse[l];
             const double g = a * px * at.slope[l], h = (b * px + c * py) * at.slope[l];
             j[0][l] = ad;
@@ -122,46 +186,37 @@ struct BatchDerived {
             j[13][l] = ad * at.down[0][l] + g * at.down[2][l];
             j[14][l] = bd * at.right[0][l] + cd * at.right[1][l] + h * at.right[2][l];
             j[15][l] = bd * at.down[0][l] + cd * at.down[1][l] + h * at.down[2][l];
-            floor[l] = floored(at.weight[l]);
-        }
-        for (int l = at.count; l < at.size; ++l) floor[l] = 0.0;
-        for (int p = 0; p < 16; ++p) {
-            for (int l = 0; l < at.size; ++l) weighted[p][l] = floor[l] * j[p][l];
         }
     }
 };
 
-// Adds a batch to the camera's J'J (21,), wrench (6,) and rows, and to the corner's block (3,) and gradient (2,).
-void add_batch(
-    const Batch& batch, double* square, double* wrench, double* top, double* low, double* block, double* gradient) {
+constexpr int SQUARES = 21;  // numbers of J'J by a camera's tangent, the first of its sums; then come its wrenches
+
+// Adds a batch to the camera's sums and rows, and to the corner's block (3,) and gradient (2,).
+void add_batch(const Batch& batch, double* sums, double* top, double* low, double* block, double* gradient) {
     const BatchDerived derived(batch);
-    const Lanes *j = derived.jacobian, *w = derived.weighted;
+    const Lanes* j = derived.jacobian;
     const int size = batch.size;
     for (int p = 0; p < 6; ++p) {
-        for (int s = p; s < 6; ++s) *square++ += dots(w[p], j[s], w[6 + p], j[6 + s], size);
+        for (int s = p; s < 6; ++s, sums += VECTOR) add_dots(sums, j[p], j[s], j[6 + p], j[6 + s], size);
     }
     for (int p = 0; p < 6; ++p) {
-        top[p] += dots(w[12], j[p], w[14], j[6 + p], size);
-        low[p] += dots(w[13], j[p], w[15], j[6 + p], size);
+        top[p] += dots(j[12], j[p], j[14], j[6 + p], size);
+        low[p] += dots(j[13], j[p], j[15], j[6 + p], size);
     }
-    block[0] += dots(w[12], j[12], w[14], j[14], size);
-    block[1] += dots(w[13], j[12], w[15], j[14], size);
-    block[2] += dots(w[13], j[13], w[15], j[15], size);
-    Lanes w0, w1;
-    for (int l = 0; l < size; ++l) {
-        w0[l] = batch.weight[l] * batch.r0[l];
-        w1[l] = batch.weight[l] * batch.r1[l];
-    }
-    for (int p = 0; p < 6; ++p) wrench[p] += dots(j[p], w0, j[6 + p], w1, size);
-    gradient[0] += dots(j[12], w0, j[14], w1, size);
-    gradient[1] += dots(j[13], w0, j[15], w1, size);
+    block[0] += dots(j[12], j[12], j[14], j[14], size);
+    block[1] += dots(j[13], j[12], j[15], j[14], size);
+    block[2] += dots(j[13], j[13], j[15], j[15], size);
+    for (int p = 0; p < 6; ++p, sums += VECTOR) add_dots(sums, j[p], derived.r0, j[6 + p], derived.r1, size);
+    gradient[0] += dots(j[12], derived.r0, j[14], derived.r1, size);
+    gradient[1] += dots(j[13], derived.r0, j[15], derived.r1, size);
 }
 
-// add_corner where cameras alone move; the wrench of a camera's pairs is added to the first of each batch.
+// add_corner where cameras alone move.
 void add_corner_by_camera(
-    const Layout& layout, const Base& base, Index q, Index c, Index first, const Scratch& scratch,
-    const Linearisation& out, LossSum& losses) {
-    const Index cameras = base.pairs / layout.moments, columns = scratch.row_columns, i = 2 * (c - first);
+    const Layout& layout, const Base& base, Index c, Index first, const Scratch& scratch, CameraSums& sums,
+    LossSum& losses) {
+    const Index columns = scratch.row_columns, i = 2 * (c - first);
     const double x = base.corners[2 * c], y = base.corners[2 * c + 1];
     double block[3] = {}, gradient[2] = {};
     for (Index k = layout.begin[c]; k < layout.begin[c + 1];) {
@@ -169,23 +224,22 @@ void add_corner_by_camera(
         Batch batch(layout, base.table, k, batch_size(layout, k, c), x, y);
         batch.weigh_all(base, losses);
         double *top = scratch.rows + i * columns + 6 * camera, *low = top + columns;
-        double* wrench = out.wrench + 6 * scratch.slot[layout.pair[k]];
-        add_batch(batch, out.squares + 21 * (q * cameras + camera), wrench, top, low, block, gradient);
+        add_batch(batch, sums.of(camera), top, low, block, gradient);
         k += batch.count;
     }
     put_corner(layout, c, i, block, gradient, scratch);
 }
 
-// see_corner where cameras alone move; the wrench of a camera's pairs is added to the first of each batch.
+// see_corner where cameras alone move.
 void see_corner_by_camera(
-    const Layout& layout, const Base& base, const double* table, Index c, const Scratch& scratch,
-    const Evaluation& out, LossSum& losses, double* gradient) {
+    const Layout& layout, const Base& base, const double* table, Index c, const Evaluation& out, CameraSums& sums,
+    LossSum& losses, double* gradient) {
     gradient[0] = gradient[1] = 0;
     for (Index k = layout.begin[c]; k < layout.begin[c + 1];) {
         Batch batch(layout, table, k, batch_size(layout, k, c), out.corners[2 * c], out.corners[2 * c + 1]);
         batch.weigh_all(base, losses);
         const int size = batch.size;
-        Lanes fx, fy, fz, turn[3];
+        Lanes fx, fy, fz, turn[3], along[2];
         for (int l = 0; l < size; ++l) {
             const double r0 = batch.r0[l] * batch.weight[l], r1 = batch.r1[l] * batch.weight[l];
             const double fu = batch.a[l] * r0 + batch.b[l] * r1, fv = batch.c[l] * r1;
@@ -196,12 +250,14 @@ void see_corner_by_camera(
             turn[0][l] = py * fz[l] - pz * fy[l];
             turn[1][l] = pz * fx[l] - px * fz[l];
             turn[2][l] = px * fy[l] - py * fx[l];
+            along[0][l] = batch.right[0][l] * fx[l] + batch.right[1][l] * fy[l] + batch.right[2][l] * fz[l];
+            along[1][l] = batch.down[0][l] * fx[l] + batch.down[1][l] * fy[l] + batch.down[2][l] * fz[l];
         }
-        double* wrench = out.wrench + 6 * scratch.slot[layout.pair[k]];
+        double* wrench = sums.of(layout.pair[k] / layout.moments);
         const Lanes* parts[6] = {&fx, &fy, &fz, &turn[0], &turn[1], &turn[2]};
-        for (int p = 0; p < 6; ++p) wrench[p] += sum(*parts[p], size);
-        gradient[0] += dot(batch.right[0], fx, size) + dots(batch.right[1], fy, batch.right[2], fz, size);
-        gradient[1] += dot(batch.down[0], fx, size) + dots(batch.down[1], fy, batch.down[2], fz, size);
+        for (int p = 0; p < 6; ++p) add_lanes(wrench + VECTOR * p, *parts[p], size);
+        gradient[0] += sum(along[0], size);
+        gradient[1] += sum(along[1], size);
         k += batch.count;
     }
 }

@@ -4,13 +4,14 @@
 #include "adjust_linearise.h"
 #include "adjust_evaluate.h"
 #include "adjust_ground.h"
+#include "adjust_lay_out.h"
 #include "adjust_substitute.h"
 
 namespace v2hdm::adjust {
 
 extern const Passes V2HDM_PASSES;
 const Passes V2HDM_PASSES = {
-    linearise, subtract_frames, evaluate, carry, meet_ground, report, residuals, pull, couplings, forward, backward,
+    linearise, subtract_frames, evaluate, carry, lay_out, meet_ground, report, residuals, pull, couplings, forward, backward,
 };
 
 }  // namespace v2hdm::adjust

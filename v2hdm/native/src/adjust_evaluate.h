@@ -138,6 +138,7 @@ void evaluate(
     const Evaluation& out) {
     double *step = scratch.step, *gradient = scratch.gradient;
     const bool is_by_camera = cameras_alone_move(layout, base);
+    CameraSums sums(base.pairs / layout.moments, 6);
     for (Index q = begin; q < end; ++q) {
         number_touched(layout, q, scratch.slot);
         LossSum losses;
@@ -155,7 +156,7 @@ void evaluate(
                 out.corners[2 * c] = base.corners[2 * c] + step[i];
                 out.corners[2 * c + 1] = base.corners[2 * c + 1] + step[i + 1];
                 if (is_by_camera) {
-                    see_corner_by_camera(layout, base, by.table, c, scratch, out, losses, gradient + i);
+                    see_corner_by_camera(layout, base, by.table, c, out, sums, losses, gradient + i);
                 } else {
                     see_corner(layout, base, by.table, c, scratch, out, losses, gradient + i);
                 }
@@ -163,8 +164,21 @@ void evaluate(
             add_corner_priors(layout, u, out.corners, gradient, out.costs + 3 * q);
             carry_unit(layout, base, q, u, coupled, scratch, out);
         }
+        if (is_by_camera) sums.flush_wrenches(layout, q, 0, out.wrench);
         out.costs[3 * q] = losses.cost(base);
     }
+}
+
+constexpr Index ROWS_AHEAD = 48;  // observations ahead: about as long as memory takes
+
+// Has the places of an observation in a report, of which the next is anywhere in memory, on their way.
+void prefetch_rows(const Report& out, Index row) {
+#ifdef __GNUC__
+    __builtin_prefetch(out.residual_px + 2 * row, 1);
+    __builtin_prefetch(out.mahalanobis2 + row, 1);
+#else
+    static_cast<void>(out), static_cast<void>(row);
+#endif
 }
 
 void report(
@@ -176,6 +190,7 @@ void report(
             const auto [a, b, d] = root_of(layout, k);
             const double r0 = a * seen.u, r1 = b * seen.u + d * seen.v;
             const Index row = order[k], camera = layout.pair[k] / layout.moments;
+            prefetch_rows(out, order[std::min(k + ROWS_AHEAD, layout.observations - 1)]);
             out.residual_px[2 * row] = seen.u * focal[2 * camera];
             out.residual_px[2 * row + 1] = seen.v * focal[2 * camera + 1];
             out.mahalanobis2[row] = r0 * r0 + r1 * r1;

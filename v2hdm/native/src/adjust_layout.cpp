@@ -16,71 +16,11 @@ bool is_sound(const Columns& columns, Index k, double symmetric_to, double max_s
     if (!((xy - yx) * (xy - yx) <= symmetric_to * symmetric_to * xx * yy)) return false;
     const double* intrinsic = columns.intrinsic + 4 * columns.camera[k];
     for (int axis = 0; axis < 2; ++axis) {
-        const double slope = (columns.pinhole_px[2 * k + axis] - intrinsic[2 + axis]) / intrinsic[axis];
-        if (!(std::fabs(slope) <= max_slope)) return false;
+        const double aside_px = std::fabs(columns.pinhole_px[2 * k + axis] - intrinsic[2 + axis]);
+        if (!(aside_px <= max_slope * intrinsic[axis])) return false;
     }
     return true;
 }
-
-constexpr Index AHEAD = 16;  // observations ahead: about as long as memory takes
-
-// Has an observation, of which the next is anywhere in memory, on its way.
-void prefetch(const Columns& columns, Index k) {
-#ifdef __GNUC__
-    __builtin_prefetch(columns.camera + k);
-    __builtin_prefetch(columns.pinhole_px + 2 * k);
-    __builtin_prefetch(columns.covariance_px + 4 * k);
-#else
-    static_cast<void>(columns), static_cast<void>(k);
-#endif
-}
-
-constexpr int BLOCK = 32;  // observations of a block, whose roots and quotients are taken side by side
-using Lanes = double[BLOCK];
-
-// Some observations: pixels from the principal point, focal lengths and the lower triangle of covariances.
-struct Block {
-    Lanes u, v, fx, fy, xx, yx, yy;
-
-    void read(const Columns& columns, const int32_t* order, Index begin, int count) {
-        for (int l = 0; l < count; ++l) {
-            prefetch(columns, order[std::min(begin + l + AHEAD, columns.count - 1)]);
-            const Index k = order[begin + l];
-            const double* intrinsic = columns.intrinsic + 4 * columns.camera[k];
-            const double* covariance = columns.covariance_px + 4 * k;
-            fx[l] = intrinsic[0];
-            fy[l] = intrinsic[1];
-            u[l] = columns.pinhole_px[2 * k] - intrinsic[2];
-            v[l] = columns.pinhole_px[2 * k + 1] - intrinsic[3];
-            xx[l] = covariance[0];
-            yx[l] = covariance[2];
-            yy[l] = covariance[3];
-        }
-    }
-
-    // Number of observations of lines, whose squared traces exceed their determinants so much.
-    int lines(int count, double line_excess) const {
-        int lines = 0;
-        for (int l = 0; l < count; ++l) {
-            const double trace = xx[l] + yy[l], determinant = xx[l] * yy[l] - yx[l] * yx[l];
-            lines += trace * trace > determinant * line_excess;
-        }
-        return lines;
-    }
-
-    // Writes numbers of so many observations to rows of ``stride``.
-    void write(int count, Index stride, double* measured, double* root) const {
-        for (int l = 0; l < count; ++l) {
-            measured[l] = u[l] / fx[l];
-            measured[stride + l] = v[l] / fy[l];
-            const double over_first = 1 / std::sqrt(xx[l]), below = yx[l] * over_first;
-            const double over_last = 1 / std::sqrt(yy[l] - below * below);
-            root[l] = fx[l] * over_first;
-            root[stride + l] = -below * fx[l] * over_first * over_last;
-            root[2 * stride + l] = fy[l] * over_last;
-        }
-    }
-};
 
 bool is_rigid(const double* transform, double orthonormal_to) {
     for (int i = 0; i < 3; ++i) {
@@ -163,16 +103,8 @@ Index arrange(const Columns& columns, const Index* rank, Index frames, const Arr
     return -1;
 }
 
-Index lay_out(const Columns& columns, const int32_t* order, double line_excess, double* measured, double* root) {
-    Index lines = 0;
-    Block block;
-    for (Index begin = 0; begin < columns.count; begin += BLOCK) {
-        const int count = static_cast<int>(std::min<Index>(columns.count - begin, BLOCK));
-        block.read(columns, order, begin, count);
-        block.write(count, columns.count, measured + begin, root + begin);
-        lines += block.lines(count, line_excess);
-    }
-    return lines;
+Index lay_out(const Columns& columns, const Sorted& sorted, double line_excess, double* measured, double* root) {
+    return passes().lay_out(columns, sorted, line_excess, measured, root);
 }
 
 void classify(const Reported& reported, double gate, const Judged& out) {

@@ -5,13 +5,6 @@
 
 namespace v2hdm::adjust {
 
-// layout.Seen, of so many observations.
-struct Columns {
-    const Index *camera, *frame, *corner;
-    const double *pinhole_px, *covariance_px, *intrinsic;
-    Index count;
-};
-
 // Index of the first unsound observation, or -1; counts the observations of each corner and camera.
 struct Tally {
     Index *by_corner, *by_camera;
@@ -31,7 +24,7 @@ struct Arranged {
 Index arrange(const Columns& columns, const Index* rank, Index frames, const Arranged& out);
 
 // Observations in an order: (2, K) where at depth 1, (3, K) root information. Returns how many are of lines.
-Index lay_out(const Columns& columns, const int32_t* order, double line_excess, double* measured, double* root);
+Index lay_out(const Columns& columns, const Sorted& sorted, double line_excess, double* measured, double* root);
 
 // solution.Verdict.
 enum Verdict : int8_t { ACCEPTED, CONTRADICTS, UNCONFIRMED, BEHIND_CAMERA };

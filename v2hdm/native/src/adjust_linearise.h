@@ -117,6 +117,8 @@ void eliminate_unit(
 void linearise(
     Index begin, Index end, const Layout& layout, const Base& base, const double* clock, bool by_pair,
     const Scratch& scratch, const Linearisation& out) {
+    const Index cameras = base.pairs / layout.moments;
+    CameraSums sums(cameras, SQUARES + 6);
     for (Index q = begin; q < end; ++q) {
         number_touched(layout, q, scratch.slot);
         LossSum losses;
@@ -130,12 +132,16 @@ void linearise(
                 if (by_pair) {
                     add_corner(layout, base, clock, c, first, scratch, out, losses);
                 } else {
-                    add_corner_by_camera(layout, base, q, c, first, scratch, out, losses);
+                    add_corner_by_camera(layout, base, c, first, scratch, sums, losses);
                 }
             }
             add_corner_priors(layout, u, base.corners, scratch.gradient, out.costs + 3 * q);
             add_lengths(layout, u, base.corners, scratch);
             eliminate_unit(layout, base, q, u, scratch, out);
+        }
+        if (!by_pair) {
+            for (Index c = 0; c < cameras; ++c) sums.flush(c, 0, SQUARES, out.squares + SQUARES * (q * cameras + c));
+            sums.flush_wrenches(layout, q, SQUARES, out.wrench);
         }
         out.costs[3 * q] = losses.cost(base);
     }

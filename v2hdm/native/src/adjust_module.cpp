@@ -231,16 +231,19 @@ Index arrange_columns(
 }
 
 Index lay_out_columns(
-    nb::handle columns_object, nb::handle order_object, double line_excess, nb::handle measured_object,
-    nb::handle root_object) {
+    nb::handle columns_object, nb::handle order_object, nb::handle pair_object, int32_t frames, double line_excess,
+    nb::handle measured_object, nb::handle root_object) {
     const ColumnsRecord columns(columns_object);
     const auto order = array_of<const int32_t, 1>(order_object, "order");
+    const auto pair = array_of<const int32_t, 1>(pair_object, "pair");
+    require(frames > 0 && pair.size() == order.size(), "pair");
     const auto measured = array_of<double, 2>(measured_object, "measured");
     const auto root = array_of<double, 2>(root_object, "root");
     const size_t count = order.size();
     require(count == columns.camera.size(), "order");
     require(measured.size() == 2 * count && root.size() == 3 * count, "measured");
-    return lay_out(columns.view, order.data(), line_excess, measured.data(), root.data());
+    const Sorted sorted = {order.data(), pair.data(), frames};
+    return lay_out(columns.view, sorted, line_excess, measured.data(), root.data());
 }
 
 void classify_observations(

@@ -37,6 +37,9 @@ from v2hdm.simulate.render.scene import Box, ground_under
 from v2hdm.store.files import refuse_url, whole_file
 from v2hdm.store.folders import note_use
 
+SIGHTINGS_VERSION = 2
+"""Version of how the detections of a survey are drawn: drives of another one are made anew."""
+
 # By the truth, an image shows ground points as far from its camera as this, and of this depth or more.
 _FARTHEST_M = 40.0
 _NEAR_M = 0.3  # least depth
@@ -158,6 +161,8 @@ def folder_of_port(config: PortConfig, cache: Path) -> Path:
         del content["paint"]["signs"]
     if not config.survey.length_km:
         del content["survey"]
+    else:
+        content["sightings"] = SIGHTINGS_VERSION
     text = json.dumps([RENDERER_VERSION, content], sort_keys=True)
     return cache / f"{config.name}-{hashlib.sha256(text.encode()).hexdigest()[:10]}"
 

@@ -27,7 +27,8 @@ from v2hdm.store.folders import note_use
 
 _log = logging.getLogger(__name__)
 
-_POSES, _IMAGES = 8, 9  # streams of a seed; a network's paint is 7, a port's own are 0 to 6
+# Streams of a seed; a network's paint is 7, a port's own are 0 to 6.
+_POSES, _IMAGES, _ALIKE = 8, 9, 10
 
 _MOST_SIGHTINGS = 20_000_000
 """Images times markings up to which a drive names its truth: the comparison takes 8 bytes for each."""
@@ -99,7 +100,7 @@ def _write(
     assert callable(report)
     cameras = surveyed_cameras(config)
     true = {name: cam_from_vehicle(config.cameras[name].mount) for name in cameras}
-    paint = Paint.of(network.hd_map)
+    paint = Paint.of(network.hd_map, np.random.default_rng([config.seed, _ALIKE]))
     images: list[Image] = []
     whole: list[np.ndarray] = []
     try:

@@ -43,6 +43,9 @@ _ERROR_FACTOR = 0.85
 _TAIL_SHARE, _TAIL_FACTOR = 0.08, 4.0
 """Share of the corners with larger errors, and how much larger: from the 95th and 99th percentiles."""
 
+_ALIKE = 0.32
+"""Correlation of a corner's errors on the ground between images, of both cameras, without the tail."""
+
 _FALSE_SHARE = 0.04
 """Detections of what is no marking, of all."""
 
@@ -51,21 +54,27 @@ _FALSE_AHEAD_M = (4.0, 20.0)  # distance ahead of the camera of such a detection
 _SCORE = 0.95  # of every detection; the mapping does not weigh it
 _BORDER_PX = 4.0  # corners nearer to the image's border are not the marking's own
 _NEAR_M = 0.3  # least depth
+_MOTION_M = 0.01  # motion of a corner on the ground by which that in the image is told
 
 
 @dataclass(frozen=True)
 class Paint:
-    """The corners (J, 4, 2) of markings, m, their kinds, and a tree of their centres."""
+    """The corners (J, 4, 2) of markings, m, their kinds, and a tree of their centres.
+
+    ``alike`` (J, 4, 2) are the errors of the corners, along map x and y and in sigmas, that all images share.
+    """
 
     corners_map: FloatArray
     kinds: tuple[str, ...]
     tree: cKDTree
+    alike: FloatArray
 
     @classmethod
-    def of(cls, hd_map: HDMap) -> Paint:
+    def of(cls, hd_map: HDMap, rng: np.random.Generator) -> Paint:
         """The markings of a map."""
         corners = np.array([marking.corners_map for marking in hd_map.markings]).reshape(-1, 4, 2)
-        return cls(corners, tuple(marking.kind for marking in hd_map.markings), cKDTree(corners.mean(axis=1)))
+        kinds = tuple(marking.kind for marking in hd_map.markings)
+        return cls(corners, kinds, cKDTree(corners.mean(axis=1)), rng.standard_normal(corners.shape))
 
 
 @dataclass(frozen=True)
@@ -89,7 +98,9 @@ def detect(paint: Paint, info: CameraInfo, cam_from_map: FloatArray, rng: np.ran
     is_found = whole & (rng.random(len(in_range)) < np.interp(away_m, _MARKING_M, _FOUND))
     corner_m = np.linalg.norm(corners[is_found] - centre_map, axis=2)
     sigma_px = _stated_px(corner_m, rng)
-    detected_px = px[is_found] + _errors_px(sigma_px, rng)
+    px_by_m = _motions_px(info, cam_from_map, corners[is_found])
+    alike_px = _on_image(paint.alike[in_range[is_found]], px_by_m, sigma_px)
+    detected_px = px[is_found] + _errors_px(sigma_px, alike_px, rng)
     kinds = [paint.kinds[j] for j in in_range[is_found]]
     # The detector does not know which corner the map counts first.
     first = rng.integers(0, 4, len(kinds))
@@ -110,11 +121,28 @@ def _stated_px(corner_m: FloatArray, rng: np.random.Generator) -> FloatArray:
     return np.stack([along, across], axis=-1)
 
 
-def _errors_px(sigma_px: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Errors (M, 4, 2), px, of corners of stated sigmas."""
-    in_tail = rng.random(sigma_px.shape[:-1]) < _TAIL_SHARE
-    factor = _ERROR_FACTOR * np.where(in_tail, _TAIL_FACTOR, 1.0)
-    return np.asarray(rng.standard_normal(sigma_px.shape) * sigma_px * factor[..., None])
+def _errors_px(sigma_px: FloatArray, alike_px: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Errors (M, 4, 2), px, of corners of stated sigmas; those but the tail are in part ``alike_px``."""
+    in_tail = rng.random(sigma_px.shape[:-1])[..., None] < _TAIL_SHARE
+    of_image_px = rng.standard_normal(sigma_px.shape) * sigma_px
+    most_px = np.sqrt(1 - _ALIKE) * of_image_px + np.sqrt(_ALIKE) * alike_px
+    return np.asarray(_ERROR_FACTOR * np.where(in_tail, _TAIL_FACTOR * of_image_px, most_px))
+
+
+def _motions_px(info: CameraInfo, cam_from_map: FloatArray, corners_map: FloatArray) -> FloatArray:
+    """The motions (M, 4, 2, 2) of u and v, px, by those of corners (M, 4, 2) along map x and y, m."""
+    steps = _MOTION_M * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    around = corners_map[:, :, None] + steps
+    px = _project(info, cam_from_map, around.reshape(-1, 2)).reshape(around.shape)
+    return np.asarray((px[:, :, ::2] - px[:, :, 1::2]).swapaxes(2, 3) / (2 * _MOTION_M))
+
+
+def _on_image(errors: FloatArray, px_by_m: FloatArray, sigma_px: FloatArray) -> FloatArray:
+    """Errors (M, 4, 2) along map x and y, in sigmas of one image, as errors (M, 4, 2) there, px."""
+    whitened = px_by_m / sigma_px[..., None]
+    share, axes = np.linalg.eigh(whitened.swapaxes(2, 3) @ whitened)  # of the information on the ground
+    along = (axes.swapaxes(2, 3) @ errors[..., None]) / np.sqrt(share)[..., None]
+    return np.asarray((px_by_m @ axes @ along)[..., 0])
 
 
 def _detection(kind: str, corners_px: FloatArray, sigma_px: FloatArray) -> MarkingDetection:
