@@ -179,8 +179,9 @@ class MotionLog:
             if squared_s2 <= 0.0:
                 continue
             fitted = from_mean[:, 0] @ from_mean[:, 1:] / squared_s2
-            is_sure = fitted**2 * squared_s2 > _SURE_SLOPE**2 * self._noise_squared()
-            slopes = np.where((slopes == 0.0) & is_sure, fitted, slopes)
+            # Of a short time only where that surely differs: what noise lets pass is mostly too steep.
+            is_sure = (fitted - slopes) ** 2 * squared_s2 > _SURE_SLOPE**2 * self._noise_squared()
+            slopes = np.where(is_sure, fitted, slopes)
         return slopes
 
     def _noise_squared(self) -> FloatArray:
