@@ -32,8 +32,15 @@ def test_make_writes_a_drive_and_prints_its_published_hash(tmp_path, cache, monk
     assert main(["benchmark", "make", "streets", "drive", "--cache", str(cache), "--workers", "1"]) == 0
     said = capsys.readouterr().out
     assert site_of("streets").input_sha256 in said
+    assert "not as published" not in said
     assert read_drive(tmp_path / "drive").truth_dir is None
     assert len(read_drive(tmp_path / "drive").images) == 1244
+
+
+def test_a_site_by_a_design_is_as_published(tmp_path, cache, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["benchmark", "make", "quay", "drive", "--cache", str(cache), "--workers", "1"]) == 0
+    assert f"{site_of('quay').input_sha256}: as published" in capsys.readouterr().out
 
 
 def test_the_true_map_has_a_perfect_score_and_a_moved_one_its_error(tmp_path, cache, streets, capsys):

@@ -87,7 +87,7 @@ def test_detected_corners_scatter_about_the_truth_as_the_detector_s_do():
     px = distort_points(info, pinhole[:, :2] / pinhole[:, 2:])
     squared = []
     for seed in range(2000):
-        paint = Paint.of(ahead, np.random.default_rng([seed, 1]))
+        paint = Paint.of(ahead, 0.32, np.random.default_rng([seed, 1]))
         shown = detect(paint, info, cam_from_map, np.random.default_rng(seed))
         assert shown.whole.tolist() == [0]
         for detected in shown.markings:
@@ -113,7 +113,7 @@ def test_a_corner_errs_alike_in_different_images_as_the_detector_does():
     back[0, 3] = 11.0
     products, squares = [], []
     for seed in range(1500):
-        paint = Paint.of(ahead, np.random.default_rng([seed, 2]))
+        paint = Paint.of(ahead, 0.32, np.random.default_rng([seed, 2]))
         both = []
         for number, pose in enumerate((there, back)):
             cam_from_map = cam_from_vehicle(camera.mount) @ np.linalg.inv(pose)

@@ -25,6 +25,7 @@ from v2hdm.localization.pose import Pose, Status
 from v2hdm.localization.seeing import Look
 from v2hdm.records import Calibration, FloatArray, HDMap
 from v2hdm.simulate.port.build import Port, build_port
+from v2hdm.simulate.port.config import SurveyConfig
 from v2hdm.simulate.render.renderer import Motion as CameraMotion
 from v2hdm.simulate.render.renderer import Optics
 from v2hdm.simulate.render.scene import standing
@@ -90,7 +91,7 @@ def site_of(name: str, seed: int) -> Site:
 
 def made_eyes(site: Site, rng: np.random.Generator) -> See:
     """Cameras whose detections have the statistics of the detector on renders."""
-    paint = Paint.of(site.port.hd_map, rng)
+    paint = Paint.of(site.port.hd_map, SurveyConfig().correlation, rng)
 
     def see(camera: str, van: Van) -> Look:
         cam_from_map = site.port.cam_from_vehicle[camera] @ inverse(van.map_from_vehicle)

@@ -294,6 +294,12 @@ class SurveyConfig:
     drives: Annotated[
         int, Within(1, 100), "number of drives through the network, by turns there and back."
     ] = 2
+    correlation: Annotated[
+        float,
+        Within(0, 0.9),
+        "correlation of a corner's errors on the ground between images, as of the detector's on port 2 by "
+        "default; 0 draws those of every image apart.",
+    ] = 0.32
 
 
 @dataclass(kw_only=True)

@@ -37,9 +37,6 @@ from v2hdm.simulate.render.scene import Box, ground_under
 from v2hdm.store.files import refuse_url, whole_file
 from v2hdm.store.folders import note_use
 
-SIGHTINGS_VERSION = 2
-"""Version of how the detections of a survey are drawn: drives of another one are made anew."""
-
 # By the truth, an image shows ground points as far from its camera as this, and of this depth or more.
 _FARTHEST_M = 40.0
 _NEAR_M = 0.3  # least depth
@@ -150,7 +147,7 @@ def folder_of_port(config: PortConfig, cache: Path) -> Path:
     """The folder of a port's drive in a cache, named by the port and a hash of its configuration."""
     refuse_url(cache)
     content = asdict(config)
-    # Ports that were rendered before there were sessions, stencils and reliefs stay the same.
+    # What was made before there were sessions, stencils, reliefs and correlations stays the same.
     if not config.session:
         del content["session"]
     if config.relief == ReliefConfig():
@@ -161,8 +158,8 @@ def folder_of_port(config: PortConfig, cache: Path) -> Path:
         del content["paint"]["signs"]
     if not config.survey.length_km:
         del content["survey"]
-    else:
-        content["sightings"] = SIGHTINGS_VERSION
+    elif not config.survey.correlation:
+        del content["survey"]["correlation"]
     text = json.dumps([RENDERER_VERSION, content], sort_keys=True)
     return cache / f"{config.name}-{hashlib.sha256(text.encode()).hexdigest()[:10]}"
 

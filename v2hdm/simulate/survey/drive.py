@@ -100,7 +100,8 @@ def _write(
     assert callable(report)
     cameras = surveyed_cameras(config)
     true = {name: cam_from_vehicle(config.cameras[name].mount) for name in cameras}
-    paint = Paint.of(network.hd_map, np.random.default_rng([config.seed, _ALIKE]))
+    alike_rng = np.random.default_rng([config.seed, _ALIKE])
+    paint = Paint.of(network.hd_map, config.survey.correlation, alike_rng)
     images: list[Image] = []
     whole: list[np.ndarray] = []
     try:

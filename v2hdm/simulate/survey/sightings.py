@@ -43,9 +43,6 @@ _ERROR_FACTOR = 0.85
 _TAIL_SHARE, _TAIL_FACTOR = 0.08, 4.0
 """Share of the corners with larger errors, and how much larger: from the 95th and 99th percentiles."""
 
-_ALIKE = 0.32
-"""Correlation of a corner's errors on the ground between images, of both cameras, without the tail."""
-
 _FALSE_SHARE = 0.04
 """Detections of what is no marking, of all."""
 
@@ -61,20 +58,24 @@ _MOTION_M = 0.01  # motion of a corner on the ground by which that in the image 
 class Paint:
     """The corners (J, 4, 2) of markings, m, their kinds, and a tree of their centres.
 
-    ``alike`` (J, 4, 2) are the errors of the corners, along map x and y and in sigmas, that all images share.
+    ``alike`` (J, 4, 2) are the errors of the corners, along map x and y and in sigmas, that all images share;
+    they make for ``correlation`` between any two images.
     """
 
     corners_map: FloatArray
     kinds: tuple[str, ...]
     tree: cKDTree
     alike: FloatArray
+    correlation: float
 
     @classmethod
-    def of(cls, hd_map: HDMap, rng: np.random.Generator) -> Paint:
+    def of(cls, hd_map: HDMap, correlation: float, rng: np.random.Generator) -> Paint:
         """The markings of a map."""
         corners = np.array([marking.corners_map for marking in hd_map.markings]).reshape(-1, 4, 2)
         kinds = tuple(marking.kind for marking in hd_map.markings)
-        return cls(corners, kinds, cKDTree(corners.mean(axis=1)), rng.standard_normal(corners.shape))
+        return cls(
+            corners, kinds, cKDTree(corners.mean(axis=1)), rng.standard_normal(corners.shape), correlation
+        )
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,7 @@ def detect(paint: Paint, info: CameraInfo, cam_from_map: FloatArray, rng: np.ran
     sigma_px = _stated_px(corner_m, rng)
     px_by_m = _motions_px(info, cam_from_map, corners[is_found])
     alike_px = _on_image(paint.alike[in_range[is_found]], px_by_m, sigma_px)
-    detected_px = px[is_found] + _errors_px(sigma_px, alike_px, rng)
+    detected_px = px[is_found] + _errors_px(sigma_px, alike_px, paint.correlation, rng)
     kinds = [paint.kinds[j] for j in in_range[is_found]]
     # The detector does not know which corner the map counts first.
     first = rng.integers(0, 4, len(kinds))
@@ -121,11 +122,13 @@ def _stated_px(corner_m: FloatArray, rng: np.random.Generator) -> FloatArray:
     return np.stack([along, across], axis=-1)
 
 
-def _errors_px(sigma_px: FloatArray, alike_px: FloatArray, rng: np.random.Generator) -> FloatArray:
+def _errors_px(
+    sigma_px: FloatArray, alike_px: FloatArray, correlation: float, rng: np.random.Generator
+) -> FloatArray:
     """Errors (M, 4, 2), px, of corners of stated sigmas; those but the tail are in part ``alike_px``."""
     in_tail = rng.random(sigma_px.shape[:-1])[..., None] < _TAIL_SHARE
     of_image_px = rng.standard_normal(sigma_px.shape) * sigma_px
-    most_px = np.sqrt(1 - _ALIKE) * of_image_px + np.sqrt(_ALIKE) * alike_px
+    most_px = np.sqrt(1 - correlation) * of_image_px + np.sqrt(correlation) * alike_px
     return np.asarray(_ERROR_FACTOR * np.where(in_tail, _TAIL_FACTOR * of_image_px, most_px))
 
 
