@@ -10,7 +10,6 @@ into ``FITTED``, and how many of either it keeps.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -20,6 +19,7 @@ import numpy as np
 
 from train.config import DataConfig
 from train.examples import Example, example, photograph, polygon_overlap
+from train.fit_arguments import fit_arguments
 from train.fit_judge import HARDSHIPS, HARDSHIPS_EVERY
 from train.labels import labelled_images
 from train.logistic import likeliest_weights
@@ -98,7 +98,7 @@ def named_in(shown: Example, detector: Detector) -> list[Named]:
 
 
 def fitted(named: Sequence[Named]) -> tuple[float, ...]:
-    """The likeliest weights of the features, added to the log odds of the name (Newton's method)."""
+    """The likeliest weights of the features, added to the log odds of the name."""
     features = np.array([piece.features for piece in named])
     offset = as_log_odds(np.array([piece.share for piece in named]))
     is_arrow = np.array([piece.is_arrow for piece in named], dtype=np.float64)
@@ -108,12 +108,7 @@ def fitted(named: Sequence[Named]) -> tuple[float, ...]:
 def main() -> None:
     """Print what was fitted."""
     about = (__doc__ or "").format(OVERLAP=OVERLAP, APART=APART)
-    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("labels", type=Path)
-    parser.add_argument("images", type=Path)
-    parser.add_argument("--photographs", type=int, default=350)
-    parser.add_argument("--renders", type=int, default=70)
-    parsed = parser.parse_args()
+    parsed = fit_arguments(about, photographs=350, renders=70)
     cv2.setNumThreads(1)
     detector = Detector.load(options=DetectorOptions(max_range_m=RANGE_M))
     named = [

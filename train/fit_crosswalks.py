@@ -11,7 +11,6 @@ many of either it keeps.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +20,7 @@ import numpy as np
 
 from train.config import DataConfig
 from train.examples import Example, example, photograph, polygon_overlap
+from train.fit_arguments import fit_arguments
 from train.fit_arrows import SEED, config_of
 from train.fit_judge import HARDSHIPS, HARDSHIPS_EVERY
 from train.labels import labelled_images
@@ -111,12 +111,7 @@ def gathered(images: Iterable[Example], detector: Detector) -> tuple[FloatArray,
 
 def main() -> None:
     """Print what was fitted."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("labels", type=Path)
-    parser.add_argument("images", type=Path)
-    parser.add_argument("--photographs", type=int, default=500)
-    parser.add_argument("--renders", type=int, default=60)
-    parsed = parser.parse_args()
+    parsed = fit_arguments(__doc__, photographs=500, renders=60)
     cv2.setNumThreads(1)
     detector = Detector.load(options=DetectorOptions(max_range_m=RANGE_M))
     shown = {

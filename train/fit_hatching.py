@@ -10,7 +10,6 @@ right by the network alone and with their meshes.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -20,13 +19,16 @@ import cv2
 import numpy as np
 
 from train.examples import HEIGHT, WIDTH, camera_of, photograph
+from train.fit_arguments import fit_arguments
 from train.fit_arrows import SEED, config_of
 from train.fit_judge import HARDSHIPS
 from train.labels import labelled_images
+from train.logistic import likeliest_weights
 from train.scenes.scenes import drawn_scene
 from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.hatching import box_probability, meshes
+from v2hdm.detection.network import as_log_odds
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.records import BOX, TEXT, Camera, IntArray
 
@@ -35,7 +37,6 @@ LEAST_LABELLED = 0.5  # least share of a piece that its label covers
 DIFFICULTIES = (1.0, 0.4)  # of the renders, in turn
 WRITTEN = replace(HARDSHIPS, words=0.4, boxes=0.8)  # most scenes show a box, many a word
 RIDGE = 0.1  # information of the prior that the weight is 0
-STEPS = 40  # of Newton's method, which settles within ten
 
 _TEXT = PAINT_CLASSES.index(TEXT) + 1
 _BOX = PAINT_CLASSES.index(BOX) + 1
@@ -116,25 +117,17 @@ def pieces_of(shown: Shown, detector: Detector) -> Iterator[Piece]:
 
 
 def fitted(pieces: Sequence[Piece]) -> float:
-    """The likeliest weight of the meshes, added to the log odds of the names (Newton's method)."""
-    netted = np.array([piece.netted for piece in pieces])
+    """The likeliest weight of the meshes, added to the log odds of the names."""
+    netted = np.array([[piece.netted] for piece in pieces])
+    by_name = as_log_odds(np.array([box_probability(*piece[:3], 0.0) for piece in pieces]))
     is_box = np.array([piece.is_box for piece in pieces], dtype=np.float64)
-    weight = 0.0
-    for _ in range(STEPS):
-        probability = np.array([box_probability(*piece[:3], weight) for piece in pieces])
-        slope = netted @ (is_box - probability) - RIDGE * weight
-        weight += slope / (netted**2 @ (probability * (1.0 - probability)) + RIDGE)
-    return round(float(weight), 2)
+    (weight,) = likeliest_weights(netted, by_name, is_box, RIDGE)
+    return weight
 
 
 def main() -> None:
     """Print what was fitted."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("labels", type=Path)
-    parser.add_argument("images", type=Path)
-    parser.add_argument("--photographs", type=int, default=110)
-    parser.add_argument("--renders", type=int, default=160)
-    parsed = parser.parse_args()
+    parsed = fit_arguments(__doc__, photographs=110, renders=160)
     cv2.setNumThreads(1)
     detector = Detector.load(options=DetectorOptions())
     shown = {

@@ -10,7 +10,6 @@ Printed is what belongs into ``FITTED``, and how many of either it keeps.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -19,6 +18,7 @@ import cv2
 import numpy as np
 
 from train.examples import HEIGHT, WIDTH, camera_of, photograph
+from train.fit_arguments import fit_arguments
 from train.fit_arrows import SEED, config_of
 from train.fit_crosswalks import configs_in_turn
 from train.fit_hatching import DIFFICULTIES, WRITTEN
@@ -117,12 +117,7 @@ def fitted(words: Sequence[Word]) -> float:
 
 def main() -> None:
     """Print what was fitted."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("labels", type=Path)
-    parser.add_argument("images", type=Path)
-    parser.add_argument("--photographs", type=int, default=240)
-    parser.add_argument("--renders", type=int, default=12)
-    parsed = parser.parse_args()
+    parsed = fit_arguments(__doc__, photographs=240, renders=12)
     cv2.setNumThreads(1)
     detector = Detector.load(options=DetectorOptions(max_range_m=RANGE_M))
     shown = {

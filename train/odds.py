@@ -1,4 +1,4 @@
-"""What a judge's log odds are worth where it knows nothing of some of what is true."""
+"""The worth of a judge's log odds where it knows nothing of some of what is true."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What words of one image say of each other."""
+"""Words of one image make each other likelier."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What pairs say is computed alike by compiled kernels and by numpy."""
+"""Compiled kernels and numpy compute residuals, slopes and distances of pairs alike."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ compiled = pytest.mark.skipif(kernels() is None, reason="nothing is compiled")
 
 
 def twice(compute):
-    """What a function gives compiled, and by numpy alone."""
+    """The results of a function compiled, and by numpy alone."""
     with numpy_alone():
         by_numpy = compute()
     return compute(), by_numpy

@@ -1,4 +1,4 @@
-"""What a judge's log odds are worth."""
+"""A judge's log odds are fitted to be worth what readings show."""
 
 import numpy as np
 import pytest

@@ -69,7 +69,7 @@ class _Sample(NamedTuple):
 
 
 class _Expected(NamedTuple):
-    """What the model says of them."""
+    """The model's prediction of the audited observations."""
 
     residual_px: FloatArray  # (k, 2)
     distance: FloatArray  # (k,) Mahalanobis

@@ -155,7 +155,7 @@ class Likeliest(NamedTuple):
 
 
 def likeliest_readings(readings: Readings) -> Likeliest:
-    """What each quadrilateral is, of those of one image, before rows of bars are looked for."""
+    """The likeliest reading of each quadrilateral of one image, before rows of bars are looked for."""
     odds, side_sigma_px = classify_alone(readings.evidence, readings.views, readings.kinds)
     score = classify_among(odds, readings.ground, readings.kinds)
     # The reading of each quadrilateral with the highest score; of equals the likelier.

@@ -167,7 +167,7 @@ def rectified_views(
 
 
 class _Claims(NamedTuple):
-    """What the network says about an image, for the compiled kernel."""
+    """The network's planes of an image, for the compiled kernel."""
 
     paint: np.ndarray  # (h, w) float32 log odds
     kinds: np.ndarray  # (K, h', w') float32 logits

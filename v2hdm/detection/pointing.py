@@ -56,7 +56,7 @@ class Pointer:
                 self._has_warned = True
 
     def at(self, stamp_s: float | None) -> Pointed | None:
-        """What the latest line of an image taken at a time says; None to look everywhere."""
+        """The boxes of the latest line about an image taken at a time; None to look everywhere."""
         if stamp_s is None:
             return None
         of_image = [pointed for pointed in tuple(self._latest) if abs(pointed.stamp_s - stamp_s) < _SAME_S]

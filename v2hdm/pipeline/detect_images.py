@@ -102,12 +102,7 @@ def detect_images(
     """
     path = None if camera is None else Path(camera)
     lens = _lens(path, camera_name, mounting)
-    if mounting is not None and len(mounting) != 3:
-        raise ConfigError(
-            f"--mounting: {len(mounting)} numbers; give height (m), pitch (deg) and field of view (deg)"
-        )
-    if limit is not None and limit < 1:
-        raise ConfigError(f"--limit {limit}: give a number of images, 1 or more")
+    _check_numbers(mounting, limit)
     if not isinstance(detector, Detector):
         detector = _loaded(detector, is_rough=path is None or lens is not None)
     road = None if path is None or lens is not None else RoadDetector.calibrated(detector, path, linear)
@@ -122,6 +117,16 @@ def detect_images(
         frames = islice(((frame, road) for frame in newest), most)
     later = SecondLooks(newest) if isinstance(newest, NewestFrames) else None
     return _on_ground(_glances(frames, rough, stopwatch or Stopwatch(), regions, later))
+
+
+def _check_numbers(mounting: Sequence[float] | None, limit: int | None) -> None:
+    """Raise ConfigError for a mounting that is not of three numbers, or no positive limit."""
+    if mounting is not None and len(mounting) != 3:
+        raise ConfigError(
+            f"--mounting: {len(mounting)} numbers; give height (m), pitch (deg) and field of view (deg)"
+        )
+    if limit is not None and limit < 1:
+        raise ConfigError(f"--limit {limit}: give a number of images, 1 or more")
 
 
 def _loaded(options: DetectorOptions | None, is_rough: bool) -> Detector:

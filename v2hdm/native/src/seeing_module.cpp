@@ -97,16 +97,32 @@ nb::object pair_noise(
     return out.array;
 }
 
+// The noise (P, 8, 8), residuals (P, 8) and slopes (P, 8, m) of pairs of a detection and a marking.
+struct Pairs {
+    Pairs(nb::handle noise_object, nb::handle residual_object, nb::handle slope_object)
+        : noise(array_of<const double, 3>(noise_object, "noise")),
+          residual(array_of<const double, 2>(residual_object, "residual")),
+          slope(array_of<const double, 3>(slope_object, "slope")),
+          count(noise.shape(0)),
+          width(slope.shape(2)) {
+        const bool noise_fits = noise.shape(1) == PAIR && noise.shape(2) == PAIR;
+        const bool residual_fits = residual.shape(0) == count && residual.shape(1) == PAIR;
+        if (!noise_fits || !residual_fits || slope.shape(0) != count || slope.shape(1) != PAIR) {
+            throw std::invalid_argument("noise, residual or slope: of another shape");
+        }
+    }
+
+    const Array<const double, 3> noise;
+    const Array<const double, 2> residual;
+    const Array<const double, 3> slope;
+    const size_t count;
+    const size_t width;
+};
+
 // Residuals (P, 8) and slopes (P, 8, m) less the noise's (P, 8, 8) factors; not-a-number where it has none.
 nb::tuple whiten(nb::handle noise_object, nb::handle residual_object, nb::handle slope_object) {
-    const auto noise = array_of<const double, 3>(noise_object, "noise");
-    const size_t count = noise.shape(0);
-    const auto residual = shaped<double, 2>(residual_object, "residual", {count, PAIR});
-    const auto slope = array_of<const double, 3>(slope_object, "slope");
-    if (noise.shape(1) != PAIR || noise.shape(2) != PAIR || slope.shape(0) != count || slope.shape(1) != PAIR) {
-        throw std::invalid_argument("noise or slope: of another shape");
-    }
-    const size_t width = slope.shape(2);
+    const Pairs pairs(noise_object, residual_object, slope_object);
+    const auto& [noise, residual, slope, count, width] = pairs;
     const Made<double> residuals({count, PAIR}), slopes({count, PAIR, width});
     std::copy(residual.data(), residual.data() + PAIR * count, residuals.data);
     std::copy(slope.data(), slope.data() + PAIR * width * count, slopes.data);
@@ -122,14 +138,8 @@ nb::tuple whiten(nb::handle noise_object, nb::handle residual_object, nb::handle
 
 // Squared distances (P) of residuals (P, 8) by slopes and noise together, and log determinants (P).
 nb::tuple distances(nb::handle noise_object, nb::handle residual_object, nb::handle slope_object) {
-    const auto noise = array_of<const double, 3>(noise_object, "noise");
-    const size_t count = noise.shape(0);
-    const auto residual = shaped<double, 2>(residual_object, "residual", {count, PAIR});
-    const auto slope = array_of<const double, 3>(slope_object, "slope");
-    if (noise.shape(1) != PAIR || noise.shape(2) != PAIR || slope.shape(0) != count || slope.shape(1) != PAIR) {
-        throw std::invalid_argument("noise or slope: of another shape");
-    }
-    const size_t width = slope.shape(2);
+    const Pairs pairs(noise_object, residual_object, slope_object);
+    const auto& [noise, residual, slope, count, width] = pairs;
     const Made<double> squared({count}), log_determinant({count});
     for (size_t i = 0; i < count; ++i) {
         double total[PAIR * PAIR], whitened[PAIR];
