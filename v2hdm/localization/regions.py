@@ -150,7 +150,10 @@ class Looking:
             is_due = interval_s is None or self._is_due(camera, stamp_s, whole_s, interval_s)
             # After a look that did not show what was expected all of the next image is searched.
             is_due |= not (glances.was_as_expected or out)
-            if self._can_wait(camera, stamp_s, at_once_s) if has_time_later else not is_due and glances.was_as_expected:
+            is_in_parts = not is_due and glances.was_as_expected
+            if has_time_later:
+                is_in_parts = self._can_wait(camera, stamp_s, at_once_s)
+            if is_in_parts:
                 view = view_at(stamp_s)
                 boxes = None if view is None else expected_boxes(*view, speed_m_s)
             if boxes is None or is_due:
