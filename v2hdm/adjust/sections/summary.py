@@ -224,7 +224,8 @@ class Footing:
     @cached_property
     def factor(self) -> Tensor:
         """Lower factor of W'W (n, n)."""
-        return torch.linalg.cholesky(self.columns.covariance)
+        lower: Tensor = torch.linalg.cholesky(self.columns.covariance)
+        return lower
 
     def in_border(self, whitened: Tensor) -> Tensor:
         """The border's step (n,) of whitened variables, W'y."""
