@@ -75,7 +75,7 @@ class Run(NamedTuple):
 
 
 class Errors(NamedTuple):
-    """Of tracked poses (K)."""
+    """Errors and bounds of K tracked poses."""
 
     errors: FloatArray  # (K, 3) ahead, left, m, and heading, rad
     bounds: FloatArray  # (K, 3)
@@ -130,7 +130,7 @@ class _Part(NamedTuple):
 
 
 def _looked_at(localizer: Localizer, look: Look) -> _Part:
-    """What an image shows where the localiser has it looked at."""
+    """The part of an image's look that the localiser asks for."""
     _, regions_px, is_all_later = localizer.glance(look.camera, look.stamp_s)
     if regions_px is None:
         return _Part(look, is_all_later)
@@ -328,7 +328,7 @@ def slow_line(driven: LiveDrive, rng: np.random.Generator, seed: int) -> str:
 
 
 class Alarms(NamedTuple):
-    """What was said of a right drive from when it was tracked on."""
+    """False alarms on a right drive from when it was first tracked."""
 
     lost: int  # times that it was lost
     turned: int  # cameras that were named
@@ -336,7 +336,7 @@ class Alarms(NamedTuple):
 
     @classmethod
     def of(cls, run: Run) -> Alarms:
-        """Those of a run."""
+        """The alarms of a run."""
         tracked = [number for number, pose in enumerate(run.poses) if pose.status == Status.TRACKING]
         poses = run.poses[tracked[0] :] if tracked else run.poses
         is_lost = [pose.status == Status.LOST for pose in poses]

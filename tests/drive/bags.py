@@ -263,7 +263,7 @@ def assert_same_poses(got: Drive, expected: Drive) -> None:
 
 
 def assert_mounted(got: Drive) -> None:
-    """Of the extrinsic the IPM keeps the two columns of the ground's axes and the translation."""
+    """The IPM keeps two columns of the extrinsic, the ground's axes, and the translation."""
     for name, cam_from_vehicle in mountings().items():
         ground = got.cameras[name].info.intrinsic @ cam_from_vehicle[:3, [0, 1, 3]]
         product = got.cameras[name].ipm["estimated"] @ ground

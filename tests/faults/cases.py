@@ -458,7 +458,7 @@ def fields() -> Iterator[Case]:
 
 
 def _names(key: str, value: object) -> str:
-    """What an error about a key must name: the key, or the file of the name that it gives."""
+    """The pattern that an error about a key must name: the key, or the file of the name that it gives."""
     return f"{key}|drive/x: no such file" if value == "x" else key
 
 

@@ -32,7 +32,7 @@ from v2hdm.records import Calibration, Exclusion
 
 
 def refusal(read: Callable[[], object], error: type[V2hdmError]) -> str | None:
-    """What a reader says of what it refuses; None where it reads."""
+    """A reader's sentence of refusal; None where it reads."""
     try:
         read()
     except error as refused:

@@ -34,7 +34,7 @@ FALLS = np.array([0.02, 0.03, -0.01, 0.01, 0.015, 0.02, -0.02])
 SHAPE = np.array([0.0, 0.0, *FALLS])  # with the grade
 INTRINSIC = np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]])
 SEED = 4
-"""Of a drive on level ground, 43 markings."""
+"""The seed of a drive on level ground with 43 markings."""
 MOUNT = np.array([[0.0, -1, 0, 0], [-0.35, 0, -0.94, 1.6], [0.94, 0, -0.35, -0.9], [0, 0, 0, 1]])
 
 

@@ -1,4 +1,4 @@
-"""What is drawn for a right drive: port, route, errors of poses, of the road and of the detector."""
+"""Draws for a right drive: port, route, errors of poses, of the road and of the detector."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ class Recipe:
         return replace(self, port=replace(self.port, route=route), apart_s=apart_s)
 
     def as_figures(self) -> dict[str, Any]:
-        """What was drawn, for the record."""
+        """The drawn values, for the record."""
         return {
             **asdict(self.poses),
             **asdict(self.detector),

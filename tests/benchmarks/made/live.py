@@ -189,7 +189,7 @@ def drive(recipe: Recipe, seed: int, seconds: float, begin_m: float = 3.0) -> Li
 
 
 def looks_of(world: World, seed: int, frames: Sequence[int] | None = None) -> Iterator[list[Look]]:
-    """What all cameras see at each moment."""
+    """The looks of all cameras at each moment."""
     names = sorted(world.cameras)
     for frame in range(len(world.taken_s)) if frames is None else frames:
         moment = []

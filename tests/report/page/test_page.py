@@ -1,4 +1,4 @@
-"""What the page says is what the folder's files say, and what it lacks it tells."""
+"""The page says what the folder's files say, and tells what it lacks."""
 
 import base64
 import json

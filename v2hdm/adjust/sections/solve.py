@@ -234,7 +234,7 @@ class _Work:
         return factorise(engine, engine.plan(), estimate, self._robust)
 
     def _finished(self, job: _Job, part: Part) -> Any:
-        """What is made of the solution; it moves to the target once more if the job has one."""
+        """The result of ``finish``; the solution moves to the target once more if the job has one."""
         assert self.finish is not None
         opened = self._open(part)
         border = opened.border
@@ -428,7 +428,7 @@ def _covariance_file(folder: Path, number: int) -> Path:
 def finish_parts(
     folder: Path, joint: Joint, shape: Shape, finish: Finish, executor: Executor = HERE
 ) -> list[Any]:
-    """What ``finish`` makes of each joined part, whose solution has its joint covariances.
+    """Results of ``finish`` for each joined part, whose solution has its joint covariances.
 
     Raises WorkerError where a process died.
     """
