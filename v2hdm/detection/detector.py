@@ -311,9 +311,9 @@ def _not_of(areas: Sequence[MarkingDetection], markings: Markings) -> Markings:
 
 @cache
 def _tell_lacking(path: Path, names: tuple[str, ...]) -> None:
-    """Say once which shipped classes a network was trained without; of the shipped one only to who asks."""
+    """Say once which of our classes a network was trained without; of the shipped one, see its model card."""
     if names:
-        level = logging.INFO if path == NETWORK_FILE else logging.WARNING
+        level = logging.DEBUG if path == NETWORK_FILE else logging.WARNING
         _log.log(level, "%s does not know %s: none of these will be found", path, ", ".join(names))
 
 
