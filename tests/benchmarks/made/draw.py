@@ -176,7 +176,13 @@ def draw(seed: int, route: str | None = None) -> Recipe:
     route = route or drawn_route
     default_noise = bool(rng.random() < 0.5)
     poses = _pose_errors(rng, default_noise)
-    detector = DetectorErrors(
+    detector = draw_detector_errors(rng)
+    return Recipe(seed, route, _port(rng, seed, route), poses, detector, default_noise, _road(seed, poses))
+
+
+def draw_detector_errors(rng: np.random.Generator) -> DetectorErrors:
+    """Errors of a detector between a very good and a poor one."""
+    return DetectorErrors(
         sigma_px=_log_uniform(rng, 0.1, 0.4),
         sigma_spread=float(rng.uniform(0.1, 0.4)),
         doubled_at_m=float(rng.uniform(8.0, 16.0)),
@@ -185,7 +191,6 @@ def draw(seed: int, route: str | None = None) -> Recipe:
         false=float(rng.uniform(0.0, 0.03)),
         cut=float(rng.uniform(0.0, 0.02)),
     )
-    return Recipe(seed, route, _port(rng, seed, route), poses, detector, default_noise, _road(seed, poses))
 
 
 def draw_apart_s(seed: int) -> float:
