@@ -311,10 +311,10 @@ def paint_labels(
                 continue
             if shape.tone is not None and kinds != [UNKNOWN]:
                 bright, ground = place.toned(shape.tone)
-                known = inside & (bright | (ground & (labels == 0)))
+                is_known = inside & (bright | (ground & (labels == 0)))
                 unknown[inside & (labels == 0)] = True
                 labels[inside & bright] = value
-                unknown[known] = False
+                unknown[is_known] = False
                 continue
             if in_part or kinds == [UNKNOWN]:
                 unknown |= inside

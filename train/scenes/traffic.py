@@ -157,7 +157,8 @@ def _wheel(rng: np.random.Generator, picture: Picture, middle: float, radius: fl
         foot, tip = reach * rng.uniform([0.06, 0.06], [0.2, 0.3])
         for angle in rng.uniform(0, 2 * np.pi) + np.arange(spokes) * 2 * np.pi / spokes:
             spoke = np.array([[0, -foot], [0.95 * reach, -tip], [0.95 * reach, tip], [0, foot]])
-            cos, sin = np.cos(angle), np.sin(angle)
+            cos = np.cos(angle)
+            sin = np.sin(angle)
             _fill(picture, spoke @ np.array([[cos, sin], [-sin, cos]]) + hub, rim)
     if not spokes or rng.random() < 0.5:
         _fill(picture, circle * radius * rng.uniform(0.1, 0.27) + hub, (0.05, 0.05, 0.05))
