@@ -22,9 +22,7 @@ from train.config import DataConfig, TrainConfig
 from train.data import validation_pairs
 from train.exported import read_exported
 from train.growth import CLASS_CHANNELS, recorded_net, with_classes
-from train.loop import metrics
-from train.metrics import Tally
-from train.targets import Targets
+from train.validation import score_of
 from v2hdm.errors import ConfigError, V2hdmError
 
 
@@ -94,16 +92,11 @@ def _mean(values: Sequence[Tensor], shares: Tensor) -> Tensor:
     return total.to(values[0].dtype)
 
 
-@torch.inference_mode()
 def scored(checkpoint: Checkpoint) -> dict[str, float]:
-    """The score of a checkpoint's averaged weights on the validation renders of its own settings."""
+    """The figures of a checkpoint's averaged weights on the validation renders of its own settings."""
     config = checkpoint.config
-    net = checkpoint.network()
-    tally = Tally(checkpoint.catalogue.names)
-    images = config["validation"]["images"]
-    for image, targets in validation_pairs(DataConfig(**config["data"]), config["seed"], images):
-        tally.add(net(image[None]), Targets(*(target[None] for target in targets)))
-    return metrics(tally.score())
+    renders = validation_pairs(DataConfig(**config["data"]), config["seed"], config["validation"]["images"])
+    return score_of(checkpoint.network(), renders, checkpoint.catalogue.names).figures()
 
 
 def main() -> None:

@@ -37,7 +37,7 @@ SHELL = [block for name in documents() for block in blocks(name, "sh")]
 RUN = [block for block in SHELL if block.not_run_because is None and not run_elsewhere(block)]
 PYTHON = [block for name in documents() for block in blocks(name, "python")]
 NOT_RUN = [block for block in SHELL if block.not_run_because is not None]
-COMPOSED = ("map", "simulate", "experiment", "train", "train.areas", "export")
+COMPOSED = ("map", "simulate", "experiment", "train", "train.areas", "train.score", "export")
 """Commands whose arguments are checked by composing their configuration."""
 
 FOREIGN = ("pip", "dask")

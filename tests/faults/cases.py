@@ -659,6 +659,10 @@ AREAS = _plainly("steps=0 sky=2 threads=0 render_share=nan render_views=-1 seed=
     "start=nowhere.pt": "nowhere.pt",
     "data.coco=nowhere.json": "nowhere.json",
 }
+SCORES = {
+    "seed=1": "start",
+    "start=nowhere.pt": "nowhere.pt",
+}
 EXPORTS = _plainly("opset=3 opset=99 tolerance=nan int8.frames=0 int8.bounds.kinds_agree=7") | {
     "checkpoint=nowhere.pt": "nowhere.pt",
     "precision=int4": "precision",
@@ -705,6 +709,8 @@ def settings() -> Iterator[Case]:
         yield Case(f"train {line}", "train.__main__", words, both(), says)
     for line, says in AREAS.items():
         yield Case(f"areas {line}", "train.areas.__main__", (line,), both(), says)
+    for line, says in SCORES.items():
+        yield Case(f"score {line}", "train.score", (line,), both(), says)
     for line, says in EXPORTS.items():
         words = [
             one for one in ("checkpoint=a.pt", "output=b.onnx") if one.split("=")[0] != line.split("=")[0]

@@ -29,7 +29,14 @@ from v2hdm.cli.main import run as run_command
 LONGEST_S = 60  # of its own time, whatever else the machine does
 LONGEST_WAIT_S = 5 * LONGEST_S
 DATE = re.compile(rb"\d{4}-\d\d-\d\dT[\d:.]+Z")
-HYDRA_DOORS = ("v2hdm map", "v2hdm experiment", "train.__main__", "train.areas.__main__", "export.__main__")
+HYDRA_DOORS = (
+    "v2hdm map",
+    "v2hdm experiment",
+    "train.__main__",
+    "train.areas.__main__",
+    "train.score",
+    "export.__main__",
+)
 
 Prepare = Callable[[Path], None]
 Ran = tuple[int | str, str, str]

@@ -235,7 +235,7 @@ def _judge_together(
     cut = _cut(run, work, drive, part)
     fitted = fit_parts(
         work.folder, run.count, cut.links, cut.shape, work.fit, run.executor,
-        partial(run.progress, "judge sections together"),
+        partial(run.progress, "judge sections together"), are_near=True,
     )  # fmt: skip
     fits: list[Fit] = fitted.results
     passed = gates(fits, before, model.solver.gate_probability)
