@@ -147,7 +147,7 @@ def make_arrays(
         state_transition=real(prior.transition),
         state_information_root=real(prior.information_root),
         clock_twist=real(timing.clock_twist),
-        clock_information_root=1 / real(np.array(timing.sigma_s, dtype=np.float64)),
+        clock_information_root=real(1 / np.array(timing.sigma_s, dtype=np.float64)),
         control=real(surveys.control[corner_order]),
         control_root=real(surveys.control_root[corner_order]),
         lengths=Lengths(
