@@ -279,7 +279,7 @@ class _Work:
         return place
 
     def _finished(self, job: _Job, part: Part) -> Any:
-        """What is made of the solution where the part is."""
+        """The result of ``finish`` for the solution where the part is."""
         assert self.finish is not None
         robust = self._robust
         whitening = None
@@ -487,7 +487,7 @@ def _covariance_file(folder: Path, number: int) -> Path:
 def finish_parts(
     folder: Path, joint: Joint, shape: Shape, finish: Finish, executor: Executor = HERE
 ) -> list[Any]:
-    """What ``finish`` makes of each joined part, whose solution has its joint covariances.
+    """Results of ``finish`` for each joined part, whose solution has its joint covariances.
 
     Raises WorkerError where a process died.
     """
