@@ -23,7 +23,7 @@ import numpy as np
 from train.config import DataConfig
 from train.examples import Example, example, photograph, polygon_overlap
 from train.fit_arguments import fit_arguments
-from train.fit_arrows import SEED, config_of
+from train.fit_arrows import RANGE_M, SEED, config_of
 from train.fit_judge import HARDSHIPS, HARDSHIPS_EVERY
 from train.labels import labelled_images
 from train.labels_image import LabelledImage
@@ -42,7 +42,6 @@ OVERLAP = 0.5  # of a true bar with a rendered one, intersection over union
 APART = 0.05  # of a false bar with any label, at most
 MOST = 0.5  # share of a row's bars, and of a piece's outline, that lie in a crosswalk's outline
 RIDGE = 0.2  # information of the prior that weights are 0
-RANGE_M = 40.0  # as of photographs of which nothing is stated
 NOT_STATED = (1.6, -6.1, 60.0)
 """Height, m, pitch, deg down, and field of view, deg, that `v2hdm detect` takes these photographs to have."""
 LEAST_KEPT = 0.7  # probability from which a bar is detected

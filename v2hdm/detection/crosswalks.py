@@ -20,7 +20,7 @@ from v2hdm.geometry.rows import IN_IMAGE, LEAST_BARS, rows_of_bars
 from v2hdm.records import CROSSWALK, CROSSWALK_BAR, BoolArray, FloatArray, MarkingDetection
 
 FEATURES = ("row", "alone", "bars")
-"""Of a bar in a row: 1; its log odds alone; log of the row's number of bars over the least."""
+"""Features of a bar in a row: 1; its log odds alone; log of the row's number of bars over the least."""
 
 FITTED = (1.87, 0.19, 3.04)
 """Weights of the features, fitted to photographs and renders by ``python -m train.fit_crosswalks``."""
