@@ -74,7 +74,7 @@ MORE = {
     ),
     "map,pdf": (f"{MAP_PORT} report.pdf=true",),
 }
-"""What no page has as a short command of its own, by extras."""
+"""Commands, by extras, for work that no page shows as a short command of its own."""
 
 MISSING = "needs [a-z0-9_.]+: install the [a-z]+ extra, pip install 'v2hdm\\[[a-z]+\\]'"
 

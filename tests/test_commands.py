@@ -57,6 +57,7 @@ NEEDED = {
     "v2hdm export map.geojson --format csv": ("", "cv2", ""),
     "train": ("train", "torch", "tensorboard"),
     "train.areas": ("train", "torch", "tensorboard"),
+    "train.score": ("train", "torch", "tensorboard"),
     "train.ship runs/gpu": ("train", "onnx", "onnx"),
     "export checkpoint=a output=b": ("train", "onnx", "onnx"),
 }

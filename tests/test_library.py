@@ -24,7 +24,7 @@ SETTINGS = {"DetectorOptions", "MappingOptions", "ReadOptions", "V2hdmError"}
 
 @pytest.fixture(scope="module")
 def names(small_drive, coarse_mosaics, tmp_path_factory):
-    """What the examples name: the library, a rendered drive, its result, and a folder to write to."""
+    """Names that the examples use: the library, a rendered drive, its result, and a folder to write to."""
     folder = tmp_path_factory.mktemp("library")
     port = v2hdm.read_drive(small_drive)
     result = v2hdm.map_drive(port, accuracy_goal_cm=10.0, workers=1)

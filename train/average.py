@@ -22,9 +22,7 @@ from train.config import DataConfig, TrainConfig
 from train.data import validation_pairs
 from train.exported import read_exported
 from train.growth import CLASS_CHANNELS, recorded_net, with_classes
-from train.loop import metrics
-from train.metrics import Tally
-from train.targets import Targets
+from train.validation import score_of
 from v2hdm.errors import ConfigError, V2hdmError
 
 
@@ -47,15 +45,15 @@ def mean_checkpoint(
             f"{len(shares)} weights for {1 + len(others)} files: give one for each, none below 0"
         )
     mean = load_checkpoint(first)
-    known = [mean.classes]
+    classes_of_files = [mean.classes]
     mean.averaged = with_classes(mean.averaged, mean.classes, mean.catalogue, str(first))
     asked = TrainConfig(net=recorded_net(mean.config["net"]), data=DataConfig(**mean.config["data"]))
     states = [mean.averaged]
     for path in others:
         torch.manual_seed(mean.config["seed"])  # what a smaller network grows by is drawn as that run drew it
         states.append(fresh_checkpoint(replace(asked, start=str(path)), mean.catalogue).averaged)
-        known.append(classes_of(path))
-    knows = torch.tensor([[name in classes for name in mean.catalogue.names] for classes in known])
+        classes_of_files.append(classes_of(path))
+    knows = torch.tensor([[name in classes for name in mean.catalogue.names] for classes in classes_of_files])
     of_class = _shares_of_classes(torch.tensor(shares, dtype=torch.float64), knows)
     mean.averaged = {
         name: _mean(
@@ -94,16 +92,11 @@ def _mean(values: Sequence[Tensor], shares: Tensor) -> Tensor:
     return total.to(values[0].dtype)
 
 
-@torch.inference_mode()
 def scored(checkpoint: Checkpoint) -> dict[str, float]:
-    """The score of a checkpoint's averaged weights on the validation renders of its own settings."""
+    """The figures of a checkpoint's averaged weights on the validation renders of its own settings."""
     config = checkpoint.config
-    net = checkpoint.network()
-    tally = Tally(checkpoint.catalogue.names)
-    images = config["validation"]["images"]
-    for image, targets in validation_pairs(DataConfig(**config["data"]), config["seed"], images):
-        tally.add(net(image[None]), Targets(*(target[None] for target in targets)))
-    return metrics(tally.score())
+    renders = validation_pairs(DataConfig(**config["data"]), config["seed"], config["validation"]["images"])
+    return score_of(checkpoint.network(), renders, checkpoint.catalogue.names).figures()
 
 
 def main() -> None:

@@ -25,13 +25,13 @@ from train.checkpoint import (
     save_checkpoint,
 )
 from train.config import TrainConfig, check_training
-from train.data import Pair, training_batches, validation_pairs
+from train.data import Pair, training_batches
 from train.distributed import Team, choose_device, has_bfloat16
 from train.growth import CLASS_CHANNELS, CLASS_HEADS, HIDDEN_CLASS_LAYER, read_by
-from train.labels import VALIDATION, read_labels
+from train.labels import read_labels
 from train.losses import kept_loss, total_loss
-from train.metrics import Score, Tally
 from train.targets import Targets
+from train.validation import metrics_of_sets, score_of, validation_sets
 from v2hdm.errors import ConfigError
 from v2hdm.safe.texts import shown
 
@@ -85,11 +85,7 @@ class Trainer:
         classes = state.catalogue.names
         labels = read_labels(config.data, classes, self.progress)
         batches = training_batches(config.data, config.seed, config.batch, state.renders, part, labels)
-        images = config.validation.images if team.leads else 0
-        validation = {"": list(validation_pairs(config.data, config.seed, images))}
-        held_out = read_labels(config.data, classes, self.progress, VALIDATION) if images else None
-        if held_out is not None:
-            validation["photographs_"] = list(held_out.whole())
+        validation = validation_sets(config, classes, self.progress) if team.leads else {}
         began_s = time.monotonic() - state.elapsed_s
         saved = validated = state.elapsed_s
         with SummaryWriter(str(self.output)) if team.leads else nullcontext() as board:
@@ -153,15 +149,15 @@ class Trainer:
     @torch.no_grad()
     def _put_back(self, before: MarkingNet, stays: Tensor) -> None:
         """Undo what an update did to the channels of classes that stay, and to those that they read."""
-        known = dict(before.named_parameters())
+        earlier = dict(before.named_parameters())
         for name, parameter in self.net.named_parameters():
             if name in CLASS_CHANNELS:
-                parameter[stays] = known[name][stays]
+                parameter[stays] = earlier[name][stays]
             elif name.startswith(HIDDEN_CLASS_LAYER) and parameter.requires_grad:
-                is_read = read_by(known, stays)
+                is_read = read_by(earlier, stays)
                 # The first half of a separable layer has no channels of its own: it stays.
                 stay = is_read if len(parameter) == len(is_read) else slice(None)
-                parameter[stay] = known[name][stay]
+                parameter[stay] = earlier[name][stay]
 
     def _share(self) -> float:
         """How much of the run has passed, 0 to 1."""
@@ -215,8 +211,8 @@ class Trainer:
         if self._before is not None and self._heads_alone():
             with torch.inference_mode():
                 before = self._before(image).kinds
-            kept = kept_loss(prediction.kinds, before, prediction.paint, targets)
-            loss = loss + self.config.loss.kept * kept
+            loss_of_kept = kept_loss(prediction.kinds, before, prediction.paint, targets)
+            loss = loss + self.config.loss.kept * loss_of_kept
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         # Statistics of the normalisations are averaged, too: each member has seen its own images only.
@@ -240,28 +236,19 @@ class Trainer:
         move = (target.to(self.device, non_blocking=True) for target in targets)
         return image.to(self.device, non_blocking=True), Targets(*move)
 
-    @torch.inference_mode()
     def _validate(self, sets: Mapping[str, list[Pair]], board: SummaryWriter | None) -> None:
         """Score the averaged weights on each set, and keep them if they are the best yet on all together."""
         if not any(sets.values()) or board is None:
             return
         self.averaged.eval()
-        means = []
-        self.state.metrics = {}
-        for prefix, pairs in sets.items():
-            tally = Tally(self.state.catalogue.names)
-            for image, targets in pairs:
-                batch = image[None], Targets(*(target[None] for target in targets))
-                image, targets = self._to_device(batch)
-                tally.add(self.averaged(image), targets)
-            score = tally.score()
-            means.append(score.mean_iou)
-            self.state.metrics |= {prefix + name: value for name, value in metrics(score).items()}
-            line = f"{prefix}{summary(score)}"
-            _LOG.info("step %d, %.1f min: %s", self.state.step, self.state.elapsed_s / 60, line)
+        classes = self.state.catalogue.names
+        scores = {name: score_of(self.averaged, pairs, classes, self.device) for name, pairs in sets.items()}
+        self.state.metrics = metrics_of_sets(scores)
+        for name, score in scores.items():
+            _LOG.info("step %d, %.1f min, %s: %s", self.state.step, self.state.elapsed_s / 60, name, score)
         for name, value in self.state.metrics.items():
             board.add_scalar(f"validation/{name}", value, self.state.step)
-        mean_iou = sum(means) / len(means)
+        mean_iou = sum(score.mean_iou for score in scores.values()) / len(scores)
         if mean_iou >= self.state.best_iou:
             self.state.best_iou = mean_iou
             self._save("best.pt")
@@ -284,18 +271,6 @@ class Trainer:
         self.state.averaged = _on_cpu(self.averaged.module.state_dict())
         self.state.optimizer = self.optimizer.state_dict()
         save_checkpoint(self.state, self.output / name)
-
-
-def metrics(score: Score) -> dict[str, float]:
-    """A score as flat figures."""
-    lanes = {"lane_recall": score.lane_recall, "lane_precision": score.lane_precision}
-    iou = {f"{name}_iou": value for name, value in score.iou.items()}
-    return {"mean_iou": score.mean_iou, "paint_iou": score.paint_iou} | iou | lanes
-
-
-def summary(score: Score) -> str:
-    """A score as one line."""
-    return ", ".join(f"{name} {value:.3f}" for name, value in metrics(score).items())
 
 
 def _on_cpu(state: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -34,6 +34,15 @@ class Score:
         """Mean over the paint classes that the images show."""
         return float(np.mean(list(self.iou.values()))) if self.iou else 0.0
 
+    def figures(self) -> dict[str, float]:
+        """All of it by name."""
+        lanes = {"lane_recall": self.lane_recall, "lane_precision": self.lane_precision}
+        iou = {f"{name}_iou": value for name, value in self.iou.items()}
+        return {"mean_iou": self.mean_iou, "paint_iou": self.paint_iou} | iou | lanes
+
+    def __str__(self) -> str:
+        return ", ".join(f"{name} {value:.3f}" for name, value in self.figures().items())
+
 
 class Tally:
     """Counts over images, added up one by one, of the ``classes`` of a network."""

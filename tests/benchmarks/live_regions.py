@@ -1,4 +1,4 @@
-"""What looks at parts of an image save on the vehicle, and what they cost in accuracy.
+"""The time that looks at parts of an image save on the vehicle, and the accuracy that they cost.
 
     python -m tests.benchmarks.live_regions DRIVE --images 160 --every-full 1 5 [--seconds 60]
 
@@ -56,8 +56,10 @@ _SAMPLES = 5  # of the odometry between two images
 _RATE_HZ = 10.0
 _LATE_S = 0.15  # age, s, that no image may have
 _STARTING_S = 3.0  # time, s, that the processes take to start
+_SAME_S = 0.01  # difference, s, of two times of one image: poses round theirs
 _LATER = 2  # moments after which a whole search that follows a look at parts is done
 _KEPT = 50  # images of a camera that stay in its folder
+_ANSWER_S = 1.0  # time, s, in which the last images are answered
 
 
 @dataclass(frozen=True)
@@ -191,8 +193,9 @@ def paced(ride: Ride, every_full: int, seconds: float) -> str:
         writer_s = time.process_time()
         with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as process:
             threading.Thread(target=poses.follow, args=(process,), daemon=True).start()
-            written = _write(ride, folder, process, seconds)
+            stamps_s = _write(ride, folder, process, seconds)
             cpu_s = _spent_s(process.pid)
+            time.sleep(_ANSWER_S)
             process.terminate()
         writer_s = time.process_time() - writer_s
     ages_s = np.array([age_s for ages in poses.ages_s.values() for age_s in ages.values()])
@@ -200,11 +203,14 @@ def paced(ride: Ride, every_full: int, seconds: float) -> str:
         return f"every {every_full}, at 10 Hz: no pose was tracked ({poses.lines} lines)"
     p50, p99, most = np.percentile(ages_s, [50, 99, 100]) * 1e3
     late = (ages_s > _LATE_S).sum()
+    first_s = min(min(ages) for ages in poses.ages_s.values())
+    before = sum(stamp_s < first_s - _SAME_S for stamp_s in stamps_s)
     cores = ", ".join(f"{used_s / seconds:.2f}" for used_s in cpu_s)
     load = f"load {os.getloadavg()[0]:.1f} of {os.cpu_count()} cores"
     return (
         f"every {every_full}, at 10 Hz for {seconds:.0f} s, {load}: "
-        f"{len(ages_s)} of {written} images in tracked poses; age, ms: "
+        f"{len(ages_s)} of {len(stamps_s)} images in tracked poses, {before} of the others before the first; "
+        f"age, ms: "
         f"{p50:.0f} (median), {p99:.0f} (99 %), {most:.0f} (most), {late} over {1e3 * _LATE_S:.0f}; "
         f"order of stamps kept: {poses.is_in_order}; CPU seconds a second: {cores} (localiser, cameras), "
         f"{writer_s / seconds:.2f} (writer)"
@@ -241,8 +247,8 @@ def _spent_s(pid: int) -> list[float]:
     return [int(schedule[0]) / 1e9 for schedule in schedules]
 
 
-def _write(ride: Ride, folder: Path, process: subprocess.Popen[str], seconds: float) -> int:
-    """Write images and odometry as they come; the number of images.
+def _write(ride: Ride, folder: Path, process: subprocess.Popen[str], seconds: float) -> list[float]:
+    """Write images and odometry as they come; when each image was due.
 
     The ride begins when the processes have had time to start.
     """
@@ -250,7 +256,7 @@ def _write(ride: Ride, folder: Path, process: subprocess.Popen[str], seconds: fl
     time.sleep(_STARTING_S)
     stamp_s = time.time() + np.arange(int(seconds * _RATE_HZ)) / _RATE_HZ
     paced_ride = ride.to_and_fro(stamp_s)
-    written = 0
+    written_s = []
     for moment, images in enumerate(paced_ride.moments):
         for sample in paced_ride.motion(moment):
             time.sleep(max(sample.stamp_s - time.time(), 0.0))
@@ -262,10 +268,10 @@ def _write(ride: Ride, folder: Path, process: subprocess.Popen[str], seconds: fl
             # Exposed when it was due, however late this process was to write it.
             os.utime(partial, (float(stamp_s[moment]), float(stamp_s[moment])))
             partial.replace(folder / image.camera / f"{moment:06d}.jpg")
-            written += 1
+            written_s.append(float(stamp_s[moment]))
             if moment >= _KEPT:
                 (folder / image.camera / f"{moment - _KEPT:06d}.jpg").unlink(missing_ok=True)
-    return written
+    return written_s
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -12,6 +12,8 @@ from v2hdm.detection.road import RoadDetector
 from v2hdm.detection.second import SecondLooks
 from v2hdm.detection.steps import last
 
+ALL_STEPS = 9 * [True]  # time for more steps than a search has
+
 
 class Frames:
     """A camera that has time, or not, as it is told."""
@@ -47,7 +49,7 @@ def test_steps_find_what_a_look_at_once_does(road, frame):
 
 
 def test_a_search_waits_where_an_image_is_expected_and_goes_on_after_it(road, frame):
-    looks = SecondLooks(Frames([True, True, False, True, True]))
+    looks = SecondLooks(Frames([True, True, False, *ALL_STEPS]))
     assert looks.look() is None  # nothing is to be searched
     looks.add(frame, road)
     assert looks.look() is None  # two steps, then no time
@@ -61,7 +63,7 @@ def test_a_search_waits_where_an_image_is_expected_and_goes_on_after_it(road, fr
 
 
 def test_of_two_images_the_one_that_is_searched_is_finished(road, frame):
-    looks = SecondLooks(Frames([True, False, True, True, True]))
+    looks = SecondLooks(Frames([True, False, *ALL_STEPS]))
     looks.add(frame, road)
     assert looks.look() is None
     looks.add(Frame("later", "later", 4, 5.1, frame.pixels), road)
@@ -70,14 +72,35 @@ def test_of_two_images_the_one_that_is_searched_is_finished(road, frame):
 
 
 def test_a_step_needs_the_time_that_it_took_before(road, frame):
-    frames = Frames([True] * 8)
+    frames = Frames([*ALL_STEPS, *ALL_STEPS])
     looks = SecondLooks(frames)
+    asked_s = []
     for _ in range(2):
         looks.add(frame, road)
         assert looks.look() is not None
-    first, second = frames.asked_s[:4], frames.asked_s[4:]
+        asked_s.append(frames.asked_s.copy())
+        frames.asked_s.clear()
+    first, second = asked_s
     assert len(set(first)) == 1  # nothing is known yet
-    assert len(set(second)) == 4
+    assert len(set(second)) == len(second) == len(first) > 4
+
+
+def test_a_step_for_which_there_was_no_time_is_taken_before_long(road, frame):
+    class Hurried(Frames):
+        """A camera whose images leave little time."""
+
+        def is_idle_for(self, seconds):
+            self.asked_s.append(seconds)
+            return seconds < 0.01
+
+    frames = Hurried([])
+    looks = SecondLooks(frames)
+    looks.add(frame, road)
+    looks._longest_s = dict.fromkeys(range(9), 0.05)  # as after an image during which something else ran
+    images = next(image for image in range(200) if looks.look() is not None)
+    assert images > 4
+    waited_s = np.array(frames.asked_s)
+    assert (waited_s[1:5] < waited_s[:4]).all()
 
 
 def test_a_camera_has_time_until_its_next_image_is_expected():

@@ -37,7 +37,7 @@ SHELL = [block for name in documents() for block in blocks(name, "sh")]
 RUN = [block for block in SHELL if block.not_run_because is None and not run_elsewhere(block)]
 PYTHON = [block for name in documents() for block in blocks(name, "python")]
 NOT_RUN = [block for block in SHELL if block.not_run_because is not None]
-COMPOSED = ("map", "simulate", "experiment", "train", "train.areas", "export")
+COMPOSED = ("map", "simulate", "experiment", "train", "train.areas", "train.score", "export")
 """Commands whose arguments are checked by composing their configuration."""
 
 FOREIGN = ("pip", "dask")
@@ -57,7 +57,7 @@ class Shell:
         self.programs = programs
 
     def __call__(self, text, folder):
-        """What the commands print."""
+        """The output of the commands."""
         ran = subprocess.run(
             ["bash", "-c", f"set -eo pipefail\n{text}"],
             cwd=folder, capture_output=True, text=True, timeout=300, stdin=subprocess.DEVNULL,

@@ -29,11 +29,18 @@ from v2hdm.cli.main import run as run_command
 LONGEST_S = 60  # of its own time, whatever else the machine does
 LONGEST_WAIT_S = 5 * LONGEST_S
 DATE = re.compile(rb"\d{4}-\d\d-\d\dT[\d:.]+Z")
-HYDRA_DOORS = ("v2hdm map", "v2hdm experiment", "train.__main__", "train.areas.__main__", "export.__main__")
+HYDRA_DOORS = (
+    "v2hdm map",
+    "v2hdm experiment",
+    "train.__main__",
+    "train.areas.__main__",
+    "train.score",
+    "export.__main__",
+)
 
 Prepare = Callable[[Path], None]
 Ran = tuple[int | str, str, str]
-"""What a door did: its exit code, or the name of what it raised, and what it wrote to stderr and stdout."""
+"""The end of a door: its exit code, or the name of what it raised, and its stderr and stdout."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +72,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a door did."""
+    """The outcome of a door's run."""
 
     code: int | str
     error: str
@@ -74,7 +81,7 @@ class Outcome:
     after: dict[str, str]
 
     def faults(self, case: Case) -> list[str]:
-        """What it may not have done."""
+        """Forbidden acts of the door."""
         told = [line for line in self.error.splitlines() if line.startswith("error: ")]
         found = []
         if self.code != case.code:

@@ -507,7 +507,7 @@ def test_motions_between_images_make_no_poses_but_without_images_some(monkeypatc
         threading.Thread(target=end, daemon=True).start()
         yield live._Eye(name, io.StringIO(), delay_s)
 
-    def one_by_one(waiting):
+    def one_by_one(waiting, waits):
         yield from [waiting.get(timeout=1.0)]
 
     monkeypatch.setattr(live, "_camera", camera)

@@ -158,6 +158,24 @@ def test_where_no_whole_search_comes_an_image_is_searched_at_once():
     assert 5 < max(np.diff(at_once)) <= 10
 
 
+def test_while_an_image_is_searched_at_once_the_next_ones_are_not():
+    painted = yard(2)
+    driven = drive(painted, 2)
+    localizer = Localizer(mapped(painted, 2), driven.calibrations, driven.rough(np.random.default_rng(0)))
+    at_once, told = [], []
+    for looks, motion in zip(driven.looks, driven.motion, strict=True):
+        localizer.update([], motion)
+        now = {look.camera: localizer.glance(look.camera, look.stamp_s) for look in looks}
+        localizer.update([in_regions(look, now[look.camera].regions_px) for look in looks])
+        told.append([ahead.regions_px is None for ahead in localizer.ahead("front", looks[0].stamp_s)])
+        at_once.append(now["front"].regions_px is None)
+    # No whole search ever follows a look at parts: now and then one comes at once, the images after it wait.
+    begun = at_once.index(False)
+    told = told[begun:]
+    assert any(images[0] for images in told)
+    assert not any(images[0] and images[1] for images in told)
+
+
 def test_what_second_looks_alone_show_speaks_against_the_map():
     painted = yard(3)
     extra = [Marking("diamond", DIAMOND + np.array([x, 5.5]), 10) for x in np.arange(30.0, 100.0, 2.0)]
@@ -321,7 +339,7 @@ def test_cameras_search_whole_images_by_turns(view):
 
 
 def test_a_camera_keeps_out_of_the_way_of_whole_searches_that_another_one_needs(view):
-    """What images will show is told four ahead: the camera ahead is to search three in a row as a whole."""
+    """Requests go out four images ahead: the camera ahead is to search three in a row as a whole."""
     looking = Looking(5)
     told = {"front": {}, "rear": {}}
     both = []

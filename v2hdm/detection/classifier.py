@@ -30,6 +30,7 @@ from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.quads.fit import OPEN_SIGMA, TYPICAL_BLUR_PX, Fit, fit_quadrilaterals
 from v2hdm.detection.quads.patch import ImageQuads, Patches
 from v2hdm.detection.quads.propose import Proposal, Proposals, open_sides
+from v2hdm.detection.steps import Steps
 from v2hdm.detection.weights import CONFIDENCE_FILE, JUDGE_FILE
 from v2hdm.geometry.planar import Quad
 from v2hdm.records import (
@@ -74,10 +75,10 @@ class Readings:
     parts: Mapping[int, Sequence[int]]
 
 
-def read_markings(
+def reading_steps(
     image_bgr: np.ndarray, proposals: Proposals, catalogue: Catalogue, blur_px: float | None
-) -> Readings | None:
-    """Fit the proposals with four corners and gather the evidence for their classes; None for none."""
+) -> Steps[Readings | None]:
+    """Fit the proposals with four corners, then gather the evidence for their classes; None for none."""
     camera = proposals.camera
     output = proposals.output
     kinds_of_piece = [proposal.kinds(catalogue) for proposal in proposals.pieces]
@@ -91,6 +92,7 @@ def read_markings(
     patches = Patches(image_bgr, camera, output, proposals.owner, first_and_last)
     cut_sides = open_sides(start_px, camera)
     fit = fit_quadrilaterals(patches, camera, start_px, cut_sides, blur_px or TYPICAL_BLUR_PX)
+    yield
     quads = ImageQuads.of(camera, fit.corners_px)
     ground = Quad(camera.unproject(fit.corners_px))
     evidence = gather(fit, output, quads, ground, pieces, readings, catalogue)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -14,19 +15,19 @@ import numpy as np
 from v2hdm.catalogue import PAINT_CLASSES, SYMBOL, Catalogue
 from v2hdm.detection.areas import find_areas
 from v2hdm.detection.arrows import arrow_probability, features_of
-from v2hdm.detection.camera import FINE_ENOUGH_M, FINE_TO_MAP_M, RoadCamera
-from v2hdm.detection.classifier import Readings, find_markings, read_markings
+from v2hdm.detection.camera import RoadCamera
+from v2hdm.detection.classifier import Readings, find_markings, reading_steps
 from v2hdm.detection.crosswalks import find_crosswalks
 from v2hdm.detection.lanes.bare import painted
 from v2hdm.detection.lanes.curves import LaneImage
 from v2hdm.detection.lanes.lines import find_boundaries, trace_lanes
-from v2hdm.detection.network import Network, NetworkOutput, run_on_road
+from v2hdm.detection.network import Network, NetworkOutput, run_on_road, steps_on_road
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.quads.blobs import find_blobs
 from v2hdm.detection.quads.outline import on_edges, outline_polygon
 from v2hdm.detection.quads.propose import Proposal, Proposals, propose
 from v2hdm.detection.regions import NO_PAINT, run_in_regions
-from v2hdm.detection.steps import Steps, last
+from v2hdm.detection.steps import Steps, last, timed
 from v2hdm.detection.stopwatch import lap
 from v2hdm.detection.weights import NETWORK_FILE, check_weights
 from v2hdm.doors import checked
@@ -42,6 +43,14 @@ Markings = tuple[MarkingDetection, ...]
 
 _LEAST_NAMED = 0.3  # share named a symbol below which nothing is one: few true arrows are below 0.7
 _PART_SHARE = 0.5  # share of an area in a marking from which it is a part of that; chosen
+
+
+class Looked(NamedTuple):
+    """What is found in one image: markings, lanes, and the pieces of its paint, of any class."""
+
+    markings: Markings
+    lanes: tuple[LaneDetection, ...]
+    pieces: Sequence[Proposal]
 
 
 class Detector:
@@ -93,27 +102,27 @@ class Detector:
         self, output: NetworkOutput, image_bgr: np.ndarray, camera: Camera, has_boundaries: bool = True
     ) -> tuple[tuple[MarkingDetection, ...], tuple[LaneDetection, ...]]:
         """Find the markings and lanes of an image of which the network's output is known."""
-        return last(self._steps_in(output, image_bgr, camera, has_boundaries))
+        looked = last(self.steps_in(output, image_bgr, camera, has_boundaries))
+        return looked.markings, looked.lanes
 
-    def steps(
-        self, image_bgr: np.ndarray, camera: Camera, has_boundaries: bool = True
-    ) -> Steps[tuple[Markings, tuple[LaneDetection, ...]]]:
+    def steps(self, image_bgr: np.ndarray, camera: Camera, has_boundaries: bool = True) -> Steps[Looked]:
         """As :meth:`detect`, in steps between which something else may be done."""
-        output = self.run_network(image_bgr, camera)
+        output = yield from self._network_steps(image_bgr, camera)
         yield
-        return (yield from self._steps_in(output, image_bgr, camera, has_boundaries))
+        return (yield from self.steps_in(output, image_bgr, camera, has_boundaries))
 
-    def _steps_in(
-        self, output: NetworkOutput, image_bgr: np.ndarray, camera: Camera, has_boundaries: bool
-    ) -> Steps[tuple[Markings, tuple[LaneDetection, ...]]]:
+    def steps_in(
+        self, output: NetworkOutput, image_bgr: np.ndarray, camera: Camera, has_boundaries: bool = True
+    ) -> Steps[Looked]:
+        """As :meth:`steps`, of an image of which the network's output is known."""
         with lap("propose"):
             proposals = self.propose(output, camera)
+        yield
         with lap("lanes"):
             image = self.lane_image(proposals, image_bgr)
             lanes = (*image.paint, *(find_boundaries(image) if has_boundaries else ()))
         yield
-        with lap("fit"):
-            readings = self.read(image_bgr, proposals)
+        readings = yield from timed("fit", self._reading_steps(image_bgr, proposals))
         yield
         with lap("judge"):
             quads = find_markings(readings, proposals.camera, self.options)
@@ -121,7 +130,7 @@ class Detector:
         with lap("areas"):
             crosswalks = [crosswalk for crosswalk, _ in find_crosswalks(markings, proposals.camera)]
             areas = _of_several(self._areas(proposals), (*markings, *crosswalks))
-        return (*_not_of(areas, markings), *areas), lanes
+        return Looked((*_not_of(areas, markings), *areas), lanes, proposals.pieces)
 
     @checked
     def detect_in_regions(
@@ -149,10 +158,16 @@ class Detector:
 
         It looks from the row ``top`` on, see :func:`v2hdm.detection.network.run_on_road`.
         """
+        return last(self._network_steps(image_bgr, camera, top))
+
+    def _network_steps(
+        self, image_bgr: np.ndarray, camera: Camera, top: int | None = None
+    ) -> Steps[NetworkOutput]:
+        """As :meth:`run_network`, in steps."""
         road_camera = self.road_camera(camera)
         _check_image(image_bgr, camera)
-        with lap("net"):
-            output = run_on_road(self.network, image_bgr, road_camera, self.options.mirrored, top)
+        steps = steps_on_road(self.network, image_bgr, road_camera, self.options.mirrored, top)
+        output = yield from timed("net", steps)
         return _without_vehicle(output, camera)
 
     def propose(self, output: NetworkOutput, camera: Camera) -> Proposals:
@@ -190,7 +205,11 @@ class Detector:
 
     def read(self, image_bgr: np.ndarray, proposals: Proposals) -> Readings | None:
         """Fit an image's proposals, and gather the evidence for each; None where there is none."""
-        return read_markings(image_bgr, proposals, self.catalogue, self.options.blur_px)
+        return last(self._reading_steps(image_bgr, proposals))
+
+    def _reading_steps(self, image_bgr: np.ndarray, proposals: Proposals) -> Steps[Readings | None]:
+        """As :meth:`read`, in steps."""
+        return reading_steps(image_bgr, proposals, self.catalogue, self.options.blur_px)
 
     def markings_paint(self, image_bgr: np.ndarray, camera: Camera) -> BoolArray:
         """Where (h, w) the network sees paint of markings, from the camera's ``far_row`` on."""
@@ -205,9 +224,7 @@ class Detector:
         road_camera, _ = self._cameras.get(camera.info.name, (None, 0))
         if road_camera is None or road_camera.camera is not camera:
             lens = None if road_camera is None else road_camera.lens
-            # Only mapping takes the time for mirror images.
-            fine_enough_m = FINE_TO_MAP_M if self.options.mirrored else FINE_ENOUGH_M
-            road_camera = RoadCamera(camera, self.network.info.multiple, lens, fine_enough_m)
+            road_camera = RoadCamera(camera, self.network.info.multiple, lens)
             reach_px = road_camera.first_row_within(road_camera.perhaps_m(self.options.max_range_m))
             self._cameras[camera.info.name] = (road_camera, reach_px)
         return road_camera
@@ -311,9 +328,9 @@ def _not_of(areas: Sequence[MarkingDetection], markings: Markings) -> Markings:
 
 @cache
 def _tell_lacking(path: Path, names: tuple[str, ...]) -> None:
-    """Say once which shipped classes a network was trained without; of the shipped one only to who asks."""
+    """Say once which of our classes a network was trained without; of the shipped one, see its model card."""
     if names:
-        level = logging.INFO if path == NETWORK_FILE else logging.WARNING
+        level = logging.DEBUG if path == NETWORK_FILE else logging.WARNING
         _log.log(level, "%s does not know %s: none of these will be found", path, ", ".join(names))
 
 

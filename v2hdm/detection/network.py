@@ -20,6 +20,7 @@ import onnxruntime
 
 from v2hdm.catalogue import AREA, SHIPPED, Catalogue
 from v2hdm.detection.camera import RoadCamera
+from v2hdm.detection.steps import Steps, last
 from v2hdm.detection.weights import NETWORK_FILE
 from v2hdm.errors import ConfigError, DetectorError, one_line
 from v2hdm.records import SEEN_ACROSS, FloatArray
@@ -252,6 +253,17 @@ def run_on_road(
 
     ``top`` is the first row, else the camera's ``far_row``, whole multiples of the network's away.
     """
+    return last(steps_on_road(network, image_bgr, camera, mirrored, top))
+
+
+def steps_on_road(
+    network: Network,
+    image_bgr: np.ndarray,
+    camera: RoadCamera,
+    mirrored: bool = False,
+    top: int | None = None,
+) -> Steps[NetworkOutput]:
+    """As :func:`run_on_road`, in two steps: far ground, and near ground with half the resolution."""
     info = network.info
     top = camera.far_row if top is None else top
     band = image_bgr[top:]
@@ -264,6 +276,7 @@ def run_on_road(
         anchors = anchor_rows(output.lanes, network, top, 1)
     else:
         fine = run(band[: seam + OVERLAP_PX])
+        yield
         coarse_top = seam - OVERLAP_PX
         coarse = run(cv2.resize(band[coarse_top:], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
         coarse_rows = anchor_rows(coarse.lanes, network, top + coarse_top, 2)

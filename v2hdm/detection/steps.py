@@ -5,10 +5,24 @@ from __future__ import annotations
 from collections.abc import Generator
 from typing import TypeVar
 
+from v2hdm.detection.stopwatch import lap
+
 _Result = TypeVar("_Result")
 
 Steps = Generator[None, None, _Result]
 """Steps that lead to a result."""
+
+
+def timed(stage: str, steps: Steps[_Result]) -> Steps[_Result]:
+    """Steps of a stage, each of which is timed as a part of it."""
+    while True:
+        try:
+            with lap(stage):
+                next(steps)
+        except StopIteration as end:
+            result: _Result = end.value
+            return result
+        yield
 
 
 def last(steps: Steps[_Result]) -> _Result:

@@ -76,8 +76,9 @@ def localize_live(
         images = 0
         written_s = -math.inf
         news = _News()
+        untold: list[str] = []  # cameras that are to be told where to look
         while running and (limit is None or images < limit):
-            for item in _available(items):
+            for item in _available(items, waits=not untold):
                 if isinstance(item, _Ended):
                     running.discard(item.source)
                     if item.error is not None:
@@ -90,9 +91,11 @@ def localize_live(
                 images += len(news.looks)
                 written_s = pose.stamp_s
                 take(pose)
-                for camera in {look.camera for look in news.looks}:
-                    cameras[camera].point(localizer, time.time())
+                untold = list(dict.fromkeys([*untold, *(look.camera for look in news.looks)]))
                 news = _News(second_looks=news.second_looks)
+            # Another camera's image that waits goes first: the cameras were told of several images to come.
+            elif untold:
+                cameras[untold.pop(0)].point(localizer, time.time())
             # What was searched once there was time is judged once poses are written.
             elif news.second_looks:
                 localizer.update(news.second_looks)
@@ -124,12 +127,13 @@ class _News:
             self.fixes.append(item)
 
 
-def _available(items: _Queue) -> Iterator[_Item]:
-    """All that has come, at least one."""
-    try:
-        yield items.get(timeout=1.0)
-    except queue.Empty:
-        return
+def _available(items: _Queue, waits: bool) -> Iterator[_Item]:
+    """All that has come; if it ``waits``, at least one."""
+    if waits:
+        try:
+            yield items.get(timeout=1.0)
+        except queue.Empty:
+            return
     while True:
         try:
             yield items.get_nowait()

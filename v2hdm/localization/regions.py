@@ -22,7 +22,7 @@ from v2hdm.localization.seeing import Expected
 from v2hdm.records import FloatArray, IntArray
 
 EVERY_FULL = 5
-"""Of so many images of a camera, one is searched as a whole: at 10 Hz every half second."""
+"""One of so many images of a camera is searched as a whole: at 10 Hz every half second."""
 
 _RANGE_M = 20.0  # distance, m, up to which markings are found at almost every look
 _MOST = 8  # markings that are looked for: of more, few say anything new of a vehicle's six unknowns
@@ -70,6 +70,7 @@ class Glances:
     stamps_s: deque[float] = field(default_factory=lambda: deque(maxlen=_LAST_LOOKS))
     whole_s: float = -np.inf
     told_s: float = -np.inf  # time of the last image that was to be searched as a whole, at once or later
+    at_once_s: float = -np.inf  # the same of one that was to be at once
     to_come_s: list[float] = field(default_factory=list)  # times of images that are to be searched so
     boxes: dict[float, int] = field(default_factory=dict)  # numbers of boxes of the images to come, by time
     was_as_expected: bool = False
@@ -139,6 +140,7 @@ class Looking:
         glances = self.of(camera)
         interval_s = glances.interval_s
         whole_s = glances.whole_s
+        at_once_s = glances.at_once_s
         out: list[Ahead] = []
         for stamp_s in stamps_s:
             boxes = None
@@ -148,26 +150,37 @@ class Looking:
             is_due = interval_s is None or self._is_due(camera, stamp_s, whole_s, interval_s)
             # After a look that did not show what was expected all of the next image is searched.
             is_due |= not (glances.was_as_expected or out)
-            if self._can_wait(camera, stamp_s) if has_time_later else not is_due and glances.was_as_expected:
+            is_in_parts = not is_due and glances.was_as_expected
+            if has_time_later:
+                is_in_parts = self._can_wait(camera, stamp_s, at_once_s)
+            if is_in_parts:
                 view = view_at(stamp_s)
                 boxes = None if view is None else expected_boxes(*view, speed_m_s)
             if boxes is None or is_due:
                 whole_s = stamp_s
                 # What is told of later images is told again.
                 glances.told_s = glances.told_s if out else stamp_s
-            if boxes is not None:
+            if boxes is None:
+                at_once_s = stamp_s
+                glances.at_once_s = glances.at_once_s if out else stamp_s
+            else:
                 glances.boxes[stamp_s] = len(boxes)
             out.append(Ahead(stamp_s, boxes, is_all_later=boxes is not None and is_due))
         glances.to_come_s = [ahead.stamp_s for ahead in out if ahead.regions_px is None or ahead.is_all_later]
         return out
 
-    def _can_wait(self, camera: str, stamp_s: float) -> bool:
+    def _can_wait(self, camera: str, stamp_s: float, at_once_s: float) -> bool:
         """Whether a whole search may come after a look at parts.
 
-        It may not where none has come for too long, or the last look showed too little of what it was to.
+        It may not where none has come for too long, or the last look showed too little of what it was to, but
+        for the images that come before such a search, of one at ``at_once_s``, has had time to end.
         """
         glances = self.of(camera)
-        most_s = _PATIENCE * self.every_full * (glances.interval_s or 0.0)
+        interval_s = glances.interval_s or 0.0
+        since_s = stamp_s - at_once_s
+        if 0.5 * interval_s < since_s < (_AHEAD + 0.5) * interval_s and at_once_s > glances.whole_s:
+            return True
+        most_s = _PATIENCE * self.every_full * interval_s
         return glances.was_partly_expected and stamp_s - glances.whole_s < most_s
 
     def _is_due(self, camera: str, stamp_s: float, whole_s: float, interval_s: float) -> bool:
