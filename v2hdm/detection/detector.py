@@ -14,7 +14,7 @@ import numpy as np
 from v2hdm.catalogue import PAINT_CLASSES, SYMBOL, Catalogue
 from v2hdm.detection.areas import find_areas
 from v2hdm.detection.arrows import arrow_probability, features_of
-from v2hdm.detection.camera import FINE_ENOUGH_M, FINE_TO_MAP_M, RoadCamera
+from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.classifier import Readings, find_markings, reading_steps
 from v2hdm.detection.crosswalks import find_crosswalks
 from v2hdm.detection.lanes.bare import painted
@@ -215,9 +215,7 @@ class Detector:
         road_camera, _ = self._cameras.get(camera.info.name, (None, 0))
         if road_camera is None or road_camera.camera is not camera:
             lens = None if road_camera is None else road_camera.lens
-            # Only mapping takes the time for mirror images.
-            fine_enough_m = FINE_TO_MAP_M if self.options.mirrored else FINE_ENOUGH_M
-            road_camera = RoadCamera(camera, self.network.info.multiple, lens, fine_enough_m)
+            road_camera = RoadCamera(camera, self.network.info.multiple, lens)
             reach_px = road_camera.first_row_within(road_camera.perhaps_m(self.options.max_range_m))
             self._cameras[camera.info.name] = (road_camera, reach_px)
         return road_camera
