@@ -115,9 +115,9 @@ def doors_of_classes(drive: Drive) -> Mapping[str, Door]:
 
 
 @pytest.fixture(scope="module")
-def doors(tmp_path_factory) -> Mapping[str, Door]:
+def doors(small_drive, tmp_path_factory) -> Mapping[str, Door]:
     folder = tmp_path_factory.mktemp("doors")
-    drive = v2hdm.simulate_port(folder)
+    drive = v2hdm.read_drive(small_drive)
     info = drive.cameras["front"].info
     calibration = v2hdm.Calibration(info, np.eye(4))
     empty = v2hdm.HDMap(())
