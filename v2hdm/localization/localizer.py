@@ -271,7 +271,7 @@ class Localizer:
         ]
         if not earlier or not self._is_sure:
             return
-        belief = self._fixed_to(earlier[0], look.stamp_s)
+        belief = self._fixed_to(earlier[0], look.stamp_s, has_untold=True)
         scene = self._scene(belief, look, sighted(look, self.calibrations[look.camera]))
         judged = detected(scene, locate(belief, scene))
         self._agreement.note(judged, self._way.length_m, look)
@@ -296,12 +296,15 @@ class Localizer:
             return
         if look.stamp_s < self._belief.stamp_s:  # of before the place was found
             return
-        belief = self._fixed_to(self._belief, look.stamp_s)
-        self._past.append(_Past(self._belief, look))
+        before = self._belief
+        belief = self._fixed_to(before, look.stamp_s, has_untold=True)
+        self._past.append(_Past(before, look))
         while self._past[-1].look.stamp_s - self._past[0].look.stamp_s > _LAG_S:
             self._past.popleft()
         self._rig_since_s = None
         self._belief = self._located(belief, look, quads, is_new)
+        if self._belief is belief:  # nothing of the map was seen
+            self._belief = self._fixed_to(before, look.stamp_s)
         if self._rig_since_s is not None:
             self._let_turn(self._rig_since_s)
         if is_new:
@@ -345,10 +348,11 @@ class Localizer:
         for past in since_then:
             self._see(past.look, is_new=False)
 
-    def _moved_to(self, belief: Belief, stamp_s: float) -> Belief:
+    def _moved_to(self, belief: Belief, stamp_s: float, has_untold: bool = False) -> Belief:
         if stamp_s <= belief.stamp_s:
             return belief
-        return predict(belief, self._log.pieces(belief.stamp_s, stamp_s), self.noise, self._turning)
+        pieces = self._log.pieces(belief.stamp_s, stamp_s)
+        return predict(belief, pieces, self.noise, self._turning, has_untold)
 
     def _foreseen(self, belief: Belief, stamp_s: float) -> Belief:
         """The belief at a later time, after the positions until then, that nothing is to correct."""
@@ -356,7 +360,8 @@ class Localizer:
         belief = self._fixed_to(belief, latest_s)
         if stamp_s <= belief.stamp_s:
             return belief
-        return foresee(belief, self._log.pieces(belief.stamp_s, stamp_s), self.noise, self._turning)
+        pieces = self._log.pieces(belief.stamp_s, stamp_s)
+        return foresee(belief, pieces, self.noise, self._turning, has_untold=True)
 
     @property
     def _turning(self) -> list[int]:
@@ -502,7 +507,7 @@ class Localizer:
         if fix.stamp_s - belief.stamp_s > _LAG_S:
             self._belief = self._fixed_to(belief, fix.stamp_s - _LAG_S)
 
-    def _fixed_to(self, belief: Belief, stamp_s: float) -> Belief:
+    def _fixed_to(self, belief: Belief, stamp_s: float, has_untold: bool = False) -> Belief:
         """The belief at a later time, after the positions until then."""
         for fix in sorted(self._fixes, key=lambda item: item.stamp_s):
             if belief.stamp_s < fix.stamp_s <= stamp_s:
@@ -513,7 +518,7 @@ class Localizer:
                 self._reasons.pop("fix", None)
                 if problem is not None:
                     self._reasons["fix"] = problem
-        return self._moved_to(belief, stamp_s)
+        return self._moved_to(belief, stamp_s, has_untold)
 
     def _missing(self, stamp_s: float) -> dict[str, str]:
         """Sentences on cameras of which no image has come lately."""
