@@ -283,9 +283,20 @@ def with_latest(belief: Belief, features: Sequence[int], most: int) -> Belief:
 def loosened(belief: Belief, cameras: Sequence[int], sigma_rad: float) -> Belief:
     """The belief in which the mountings of cameras may each have turned by so much since."""
     rows = [VEHICLE + CAMERA * camera + axis for camera in cameras for axis in (3, 4, 5)]
+    return _widened(belief, rows, sigma_rad)
+
+
+def perhaps_later(belief: Belief, sigma_s: float) -> Belief:
+    """The belief in which the odometry may be later, or earlier, than was thought by so much."""
+    return _widened(belief, [LATE], sigma_s)
+
+
+def _widened(belief: Belief, states: Sequence[int], sigma: float) -> Belief:
+    """The belief in which some states may each have changed by so much."""
+    rows = list(states)
     count = len(belief.mean)
     grown = np.concatenate([belief.root, np.zeros((count, len(rows)))], axis=1)
-    grown[rows, range(count, count + len(rows))] = sigma_rad
+    grown[rows, range(count, count + len(rows))] = sigma
     return replace(belief, root=_square(grown))
 
 
