@@ -36,6 +36,7 @@ _FAST_S = 0.25  # time, s, over which that fades
 _SLOW_RAD = 0.003  # standard deviation, rad, of what a bend, a brake or a load holds
 _SLOW_S = 4.0  # time, s, over which that fades
 _HEAVE_S = 0.5  # time, s, over which a heave fades
+_ACCELERATES_S = 1.0  # time, s, for which an acceleration lasts: a brake, or the turn of a steering wheel
 _CREEP_M = 1e-5  # change of a mounting's place within a second, m (one sigma)
 CREEP_RAD = 1.7e-5
 """Change of a mounting's angles within a second, rad (one sigma): 0.06 deg within an hour."""
@@ -176,7 +177,8 @@ def foresee(
         change = by_state @ change
         spread = by_state @ spread @ by_state.T + pushed
     if has_untold:
-        spread += _untold(mean, float(belief.root[LATE] @ belief.root[LATE]))
+        late_s2 = float(belief.root[LATE] @ belief.root[LATE])
+        spread += _untold(mean, late_s2, sum(piece.length_s for piece in pieces))
     length_s = sum(piece.length_s for piece in pieces)
     width = belief.root.shape[1]
     creep_rad = [TURNING_RAD if camera in turning else CREEP_RAD for camera in range(belief.cameras)]
@@ -191,13 +193,15 @@ def foresee(
     return replace(belief, stamp_s=belief.stamp_s + length_s, mean=mean, root=grown)
 
 
-def _untold(mean: FloatArray, late_s2: float) -> FloatArray:
+def _untold(mean: FloatArray, late_s2: float, length_s: float) -> FloatArray:
     """The covariance (11, 11) of what a vehicle has done since what its late odometry tells of.
 
     ``late_s2`` is the variance of the lateness, s^2. The last speed and yaw rate are taken to last until now;
-    accelerations since then move the place along and the heading.
+    accelerations since then move the place along and the heading. The last belief, ``length_s`` ago, was
+    off by as much, but for what the accelerations have changed by: these fade as a first-order process.
     """
-    half_s2 = 0.5 * (float(mean[LATE]) ** 2 + late_s2)
+    changed = math.sqrt(2 * (1 - math.exp(-length_s / _ACCELERATES_S)))
+    half_s2 = 0.5 * (float(mean[LATE]) ** 2 + late_s2) * changed
     ahead = np.array([np.cos(mean[HEADING]), np.sin(mean[HEADING])])
     covariance = np.zeros((VEHICLE, VEHICLE))
     covariance[:2, :2] = (half_s2 * ACCELERATION_M_S2) ** 2 * np.outer(ahead, ahead)
