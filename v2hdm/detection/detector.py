@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -42,6 +43,14 @@ Markings = tuple[MarkingDetection, ...]
 
 _LEAST_NAMED = 0.3  # share named a symbol below which nothing is one: few true arrows are below 0.7
 _PART_SHARE = 0.5  # share of an area in a marking from which it is a part of that; chosen
+
+
+class Looked(NamedTuple):
+    """What is found in one image: markings, lanes, and the pieces of its paint, of any class."""
+
+    markings: Markings
+    lanes: tuple[LaneDetection, ...]
+    pieces: Sequence[Proposal]
 
 
 class Detector:
@@ -93,19 +102,19 @@ class Detector:
         self, output: NetworkOutput, image_bgr: np.ndarray, camera: Camera, has_boundaries: bool = True
     ) -> tuple[tuple[MarkingDetection, ...], tuple[LaneDetection, ...]]:
         """Find the markings and lanes of an image of which the network's output is known."""
-        return last(self._steps_in(output, image_bgr, camera, has_boundaries))
+        looked = last(self.steps_in(output, image_bgr, camera, has_boundaries))
+        return looked.markings, looked.lanes
 
-    def steps(
-        self, image_bgr: np.ndarray, camera: Camera, has_boundaries: bool = True
-    ) -> Steps[tuple[Markings, tuple[LaneDetection, ...]]]:
+    def steps(self, image_bgr: np.ndarray, camera: Camera, has_boundaries: bool = True) -> Steps[Looked]:
         """As :meth:`detect`, in steps between which something else may be done."""
         output = yield from self._network_steps(image_bgr, camera)
         yield
-        return (yield from self._steps_in(output, image_bgr, camera, has_boundaries))
+        return (yield from self.steps_in(output, image_bgr, camera, has_boundaries))
 
-    def _steps_in(
-        self, output: NetworkOutput, image_bgr: np.ndarray, camera: Camera, has_boundaries: bool
-    ) -> Steps[tuple[Markings, tuple[LaneDetection, ...]]]:
+    def steps_in(
+        self, output: NetworkOutput, image_bgr: np.ndarray, camera: Camera, has_boundaries: bool = True
+    ) -> Steps[Looked]:
+        """As :meth:`steps`, of an image of which the network's output is known."""
         with lap("propose"):
             proposals = self.propose(output, camera)
         yield
@@ -121,7 +130,7 @@ class Detector:
         with lap("areas"):
             crosswalks = [crosswalk for crosswalk, _ in find_crosswalks(markings, proposals.camera)]
             areas = _of_several(self._areas(proposals), (*markings, *crosswalks))
-        return (*_not_of(areas, markings), *areas), lanes
+        return Looked((*_not_of(areas, markings), *areas), lanes, proposals.pieces)
 
     @checked
     def detect_in_regions(
