@@ -92,9 +92,9 @@ FILES = {
 
 
 @pytest.fixture(scope="module")
-def doors(tmp_path_factory) -> Mapping[str, Door]:
+def doors(small_drive, tmp_path_factory) -> Mapping[str, Door]:
     folder = tmp_path_factory.mktemp("doors")
-    drive = v2hdm.simulate_port(folder)
+    drive = v2hdm.read_drive(small_drive)
     info = drive.cameras["front"].info
     detector = v2hdm.Detector.load()
     pixels = np.zeros((info.height, info.width, 3), np.uint8)

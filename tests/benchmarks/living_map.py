@@ -105,7 +105,7 @@ def base_of(result: MethodResult) -> Base:
 
 
 def ids_kept(before: HDMap, after: HDMap, truth: Truth) -> str:
-    """Of the true markings that both maps have, how many have one id in both."""
+    """How many of the true markings that both maps have are of one id in both, in words."""
     ids = []
     for hd_map in (before, after):
         rows, columns = match_markings(hd_map.markings, truth.map.markings)

@@ -73,7 +73,7 @@ _APART = 1.0
 """Neighbouring pieces are at most so far apart, in sizes of the larger one along each side of the image."""
 
 CLASS_OF = {"crosswalk_outline": CROSSWALK_BAR, "slow": TEXT, "bus_lane": TEXT, "yellow_box": BOX}
-"""What labels of many pieces show."""
+"""Classes of the pieces that labels of many pieces show."""
 
 WHOLE_OF = {**CLASS_OF, "crosswalk_outline": CROSSWALK}
 """Classes of the detections that outline these labels whole."""

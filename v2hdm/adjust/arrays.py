@@ -182,10 +182,11 @@ class Arrays:
     @cached_property
     def begin(self) -> Tensor:
         """First observation (N + 1,) of each corner, and the end."""
-        changes = (self.corner[1:] != self.corner[:-1]).nonzero()[:, 0] + 1
-        if len(changes) == self.corner_count - 1:  # each has an observation: ten times as fast as searching
-            ends = changes.new_tensor([0, len(self.corner)])
-            return torch.cat([ends[:1], changes, ends[1:]])
+        if len(self.corner) > _RUN:
+            changes = (self.corner[1:] != self.corner[:-1]).nonzero()[:, 0] + 1
+            if len(changes) == self.corner_count - 1:  # each is observed: ten times as fast as searching
+                ends = changes.new_tensor([0, len(self.corner)])
+                return torch.cat([ends[:1], changes, ends[1:]])
         corners = torch.arange(self.corner_count + 1, dtype=self.corner.dtype, device=self.corner.device)
         return torch.searchsorted(self.corner, corners)
 

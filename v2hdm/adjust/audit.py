@@ -89,7 +89,7 @@ def _audit_observations(arrays: Arrays, estimate: Estimate, focal_px: FloatArray
     with np.errstate(invalid="ignore"):
         agrees = np.abs(np.sqrt(squared) - expected.distance) <= rounding * (a + np.abs(b) + c)
         apart_px = np.abs(residual_px - expected.residual_px)
-        agrees &= (apart_px <= focal_px.max() * rounding[:, None]).all(axis=1)
+        agrees &= np.maximum(apart_px[:, 0], apart_px[:, 1]) <= focal_px.max() * rounding
         is_same_side = behind == (expected.depth_m <= NEAR_M)
         if (agrees & is_same_side).all():
             return
@@ -118,7 +118,7 @@ def _sample(arrays: Arrays) -> _Sample:
 
 def _expected(arrays: Arrays, sample: _Sample, estimate: Estimate, focal_px: FloatArray) -> _Expected:
     pair = sample.pair
-    camera = arrays.camera_of(pair)
+    camera = pair.numpy(force=True) // arrays.moment_count
     state = estimate.frame_state
     if arrays.moment_count > len(pair):
         part = replace(arrays, pair=pair).by_moment()
@@ -134,7 +134,7 @@ def _expected(arrays: Arrays, sample: _Sample, estimate: Estimate, focal_px: Flo
     a, b, c = sample.root_information.numpy(force=True)
     with np.errstate(invalid="ignore", over="ignore"):
         return _Expected(
-            residual_px=error * focal_px[camera.numpy(force=True)],
+            residual_px=error * focal_px[camera],
             distance=np.sqrt((a * x) ** 2 + (b * x + c * y) ** 2),
             off_axis=np.abs(x) + np.abs(y),
             depth_m=points[:, 2].numpy(force=True),

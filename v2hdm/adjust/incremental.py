@@ -137,7 +137,7 @@ class _Sum:
 
     @classmethod
     def of(cls, earlier: _Quadratic, rows: IntArray, held: FloatArray, chart: FloatArray) -> _Sum:
-        """Of the information ``held`` by the cameras' tangents."""
+        """The sum with information ``held`` by the cameras' tangents."""
         information = chart.T @ held @ chart
         joint = earlier.information.copy()
         joint[rows[:, None], rows] += information
@@ -375,7 +375,8 @@ def _largest_turn_rad(held: Whitening, whitened: Tensor) -> float:
         turns = held.step(whitened).tangents[..., 3:]
     else:
         turns = held.camera_step(whitened)[:, 3:6]
-    return float(turns.norm(dim=-1).max())
+    # By numpy: torch's norm takes a tenth of the time of a marking.
+    return math.sqrt(np.square(turns.numpy(force=True)).sum(axis=-1).max())
 
 
 def _moved(base: FloatArray, unknowns: FloatArray, device: str) -> _Moved:

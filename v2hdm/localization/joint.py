@@ -234,7 +234,7 @@ class Clear(NamedTuple):
 
 
 def clear_pairs(pairs: Pairs, loss: FloatArray) -> Clear:
-    """Of all pairs the ones that are the only explanation of a detection, one for each marking."""
+    """The pairs that are the only explanation of a detection, one for each marking."""
     order = np.argsort(loss, kind="stable")
     best: dict[int, int] = {}
     doubted: set[int] = set()

@@ -126,13 +126,15 @@ def _driven(shapes: Sequence[LaneShape], paths: Sequence[Path]) -> list[_Driven]
 
 def start_of(lane: ClosedLane) -> _End:
     """The vertices at which a lane starts."""
-    (left, order), (right, across) = lane.left, lane.right
+    left, order = lane.left
+    right, across = lane.right
     return left, int(order[0]), right, int(across[0])
 
 
 def end_of(lane: ClosedLane) -> _End:
     """The vertices at which a lane ends."""
-    (left, order), (right, across) = lane.left, lane.right
+    left, order = lane.left
+    right, across = lane.right
     return left, int(order[-1]), right, int(across[-1])
 
 

@@ -141,6 +141,8 @@ class KernelEngine(TorchEngine):
         return torch.from_numpy(np.repeat(size <= most, size))
 
     def _with_kept(self, kept_corners: Tensor) -> Layout:
+        if not len(kept_corners):
+            return self._whole
         mask = np.zeros(self.arrays.corner_count, dtype=np.bool_)
         mask[kept_corners.numpy()] = True
         return self._whole._replace(is_kept=mask[self._whole.unit[:-1]])
@@ -260,6 +262,8 @@ class KernelEngine(TorchEngine):
 
     @cached_property
     def _rig(self) -> Any:
+        if self._border is not None:  # whose whitenings are kept in files, which C++ does not write
+            return None
         return make_rig(self.arrays, self.layout)
 
     @cached_property

@@ -52,13 +52,14 @@ def make_layout(arrays: Arrays) -> Layout:
     """The layout of arrays in the processor's memory."""
     begin = arrays.begin.numpy()
     unit = arrays.units.numpy()
-    chunk = np.searchsorted(unit, [corner for _, corner in arrays.run_bounds])
+    joined = unit[1:] - unit[:-1]
+    first_observation = begin[unit]
+    chunk = _chunks(arrays, unit)
     pair = arrays.pair.numpy()
     touched_at = np.empty(len(chunk), dtype=np.int64)
     touched = np.empty_like(pair)
     is_touched = np.zeros(arrays.pair_count, dtype=np.uint8)
-    touched_count = find_touched(pair, begin[unit[chunk]], is_touched, touched, touched_at)
-    joined = np.diff(unit)
+    touched_count = find_touched(pair, first_observation[chunk], is_touched, touched, touched_at)
     lengths = _lengths(arrays, unit)
     return Layout(
         pair=pair,
@@ -79,10 +80,17 @@ def make_layout(arrays: Arrays) -> Layout:
         length_second=lengths.second,
         length_m=lengths.length_m,
         length_root=lengths.root,
-        most_seen=int(np.diff(begin[unit]).max()),
+        most_seen=int((first_observation[1:] - first_observation[:-1]).max()),
         most_joined=int(joined.max()),
         is_kept=np.zeros(len(joined), dtype=np.bool_),
     )
+
+
+def _chunks(arrays: Arrays, unit: IntArray) -> IntArray:
+    """First units (Q + 1,) of the runs, and the end."""
+    if len(arrays.run_bounds) == 2:  # one run, of all units
+        return np.array([0, len(unit) - 1])
+    return np.searchsorted(unit, [corner for _, corner in arrays.run_bounds])
 
 
 class _Lengths(NamedTuple):

@@ -4,7 +4,9 @@ Parts that fit in memory together are solved at once, in a third of the time; ot
 Then rounds follow: every part summarises what it says of its border (:mod:`v2hdm.adjust.sections.summary`),
 the summaries are joined (:mod:`v2hdm.adjust.sections.join`), and each part follows the border. This is a
 Gauss-Newton descent of the whole in which no process holds more than one part; parts are jobs of an executor,
-and their estimates lie in files between rounds. After a solve at once one round states the covariances.
+and their estimates lie in files between rounds. So do their whitenings, which cost ten rounds: they are made
+at the start, after long steps, and at the end, for the covariances. After a solve at once one round states
+these.
 ``fit_parts`` does the same roughly and without covariances, for what tells outliers and noise.
 ``finish_parts`` makes of each part what needs covariances.
 """
@@ -31,11 +33,19 @@ from v2hdm.adjust.problem import Problem, SolveOptions
 from v2hdm.adjust.sections.blocks import BlockCholesky
 from v2hdm.adjust.sections.join import Joined, Labels, Net, Shared, labels_of
 from v2hdm.adjust.sections.parts import Link, Part, whole_of
-from v2hdm.adjust.sections.summary import Border, JoinedCovariance, Summary, Values, follow, summarise
+from v2hdm.adjust.sections.summary import (
+    Border,
+    Footing,
+    JoinedCovariance,
+    Place,
+    Summary,
+    Values,
+    summarise,
+)
 from v2hdm.adjust.solution import Solution
 from v2hdm.adjust.solve import Start, report_of, solve, start_of
 from v2hdm.adjust.threads import one_thread_in_torch
-from v2hdm.adjust.whitening import Whitening, factorise
+from v2hdm.adjust.whitening import factorise
 from v2hdm.errors import AdjustError, WorkerError
 from v2hdm.executor import HERE, Executor
 from v2hdm.progress import Progress, silent
@@ -50,6 +60,10 @@ AT_ONCE = 400_000
 """Most observations that are solved at once: they take 2.8 kB each, factors included, of 2 km of yards."""
 
 _ALONE_GAP = 1e-5  # gap, a fraction of the cost, of a part's own optimum: the rounds move it by more; chosen
+_FAR_GAP = 1e-3  # gap of a round, a fraction of the cost, above which the next whitens anew: chosen
+_SLOW = 0.6  # gap of a round, a fraction of that before, above which the next whitens anew: chosen
+_SETTLED_SHARE = 0.1  # gap of a part with its border held, as a fraction of that of all: chosen
+_PROTOCOL = 5  # of pickles: the first that keeps arrays as they are
 _MOST_ROUNDS = 15  # rounds of joining and following, after which the solve has not converged; chosen
 _HELD_SIGMA_M = 1.0  # standard deviation, m, of what holds border corners in a part: any ray tells more
 _CONTRADICTION = 9.0
@@ -117,17 +131,35 @@ class _Open(NamedTuple):
     held_map: torch.Tensor
 
 
+class _Stand(NamedTuple):
+    """A part laid out, and its last whitening."""
+
+    opened: _Open
+    footing: Footing
+
+    def bare(self) -> _Stand:
+        """The same without what a factor knows twice."""
+        whitening = self.footing.whitening
+        factor = replace(whitening.reduced_factor)
+        return self._replace(
+            footing=replace(self.footing, whitening=replace(whitening, reduced_factor=factor))
+        )
+
+
 @dataclass(frozen=True)
 class _Job:
     """One round of one part; ``target`` is the value that its border moves to, None for the first round.
 
-    That begins at ``start``, if there is one; its corners are in the order of the part's problem.
+    That begins at ``start``, if there is one; its corners are in the order of the part's problem. A round
+    that ``is_renewed`` whitens anew where it ends; another settles to a gap of ``settled``, its border held.
     """
 
     number: int
     start: Estimate | None = None
     target: Values | None = None
-    is_near: bool = False  # the part's problem starts near the joint optimum
+    is_near: bool = False  # the part's problem starts near an optimum
+    is_renewed: bool = True
+    settled: float = 0.0
     is_last: bool = False
     is_finish: bool = False
     gap: float = 0.0
@@ -136,7 +168,7 @@ class _Job:
 
 @dataclass(frozen=True)
 class _Work:
-    """Rounds of parts whose files ``part_N`` and ``estimate_N`` are in ``folder``."""
+    """Rounds of parts whose files ``part_N``, ``stand_N`` and ``place_N`` are in ``folder``."""
 
     folder: Path
     shape: Shape
@@ -176,21 +208,40 @@ class _Work:
 
     def _round(self, job: _Job, part: Part) -> PartStates:
         """The part's own optimum, or what follows the target, and what the part tells there."""
-        opened = self._open(part)
-        border = opened.border
-        if job.start is not None:
-            estimate = _in_order(job.start, opened)
-        elif job.target is None and job.is_near:
-            estimate = self._start(part, opened.engine).estimate
-        elif job.target is None:
-            estimate = self._own_optimum(job.number, part, opened.engine, self._robust)
+        if job.target is None:
+            opened = self._open(part)
+            stand = self._new_stand(job.number, opened, self._first(job, part, opened))
+            place = Place.base(stand.footing.whitening)
         else:
-            estimate = self._followed(job, opened)
-        self._keep(job.number, estimate)
-        told = summarise(self._whitened(opened.engine, estimate), border, opened.held, opened.held_map)
+            stand = self._stand(job.number)
+            place = stand.footing.follow(self._place(job.number), job.target)
+            if job.is_renewed:
+                stand = self._new_stand(job.number, stand.opened, place.estimate)
+                place = Place.base(stand.footing.whitening)
+            else:
+                place = stand.footing.settle(place, job.settled)
+        self._keep("place", job.number, place)
+        opened = stand.opened
+        border = opened.border
+        told = summarise(stand.footing, place, opened.held, opened.held_map)
         order = opened.engine.arrays.corner_order.cpu().numpy()
         labels = labels_of(part, order, border.corners.cpu().numpy())
-        return PartStates(labels, Values.of(estimate, border), told)
+        return PartStates(labels, Values.of(place.estimate, border), told)
+
+    def _first(self, job: _Job, part: Part, opened: _Open) -> Estimate:
+        """Where a part's rounds begin."""
+        if job.start is not None:
+            return _in_order(job.start, opened)
+        if job.is_near:
+            return self._start(part, opened.engine).estimate
+        return self._own_optimum(job.number, part, opened.engine, self._robust)
+
+    def _new_stand(self, number: int, opened: _Open, estimate: Estimate) -> _Stand:
+        """Whiten a part at an estimate, and keep that for later rounds."""
+        whitening = factorise(opened.engine, opened.engine.plan(), estimate, self._robust)
+        stand = _Stand(opened, Footing.of(whitening, opened.border))
+        self._keep("stand", number, stand.bare())
+        return stand
 
     @property
     def _robust(self) -> Loss:
@@ -214,38 +265,33 @@ class _Work:
             )
         return descent.estimate
 
-    def _estimate(self, number: int) -> Estimate:
-        with (self.folder / f"estimate_{number}").open("rb") as stream:
-            estimate = pickle.load(stream)
-        assert isinstance(estimate, Estimate)
-        return estimate
+    def _keep(self, name: str, number: int, content: _Stand | Place) -> None:
+        # A pickle would hold the memory of a factor once for each of its tiles.
+        torch.save(content, self.folder / f"{name}_{number}", pickle_protocol=_PROTOCOL)
 
-    def _keep(self, number: int, estimate: Estimate) -> None:
-        with (self.folder / f"estimate_{number}").open("wb") as stream:
-            pickle.dump(estimate, stream)
+    def _stand(self, number: int) -> _Stand:
+        stand = torch.load(self.folder / f"stand_{number}", weights_only=False)
+        assert isinstance(stand, _Stand)
+        return stand
 
-    def _followed(self, job: _Job, opened: _Open) -> Estimate:
-        """The estimate of the round before, moved with the border to its target."""
-        assert job.target is not None
-        before = self._whitened(opened.engine, self._estimate(job.number))
-        return follow(before, opened.border, job.target)
-
-    def _whitened(self, engine: TorchEngine, estimate: Estimate) -> Whitening:
-        return factorise(engine, engine.plan(), estimate, self._robust)
+    def _place(self, number: int) -> Place:
+        place = torch.load(self.folder / f"place_{number}", weights_only=False)
+        assert isinstance(place, Place)
+        return place
 
     def _finished(self, job: _Job, part: Part) -> Any:
-        """What is made of the solution; it moves to the target once more if the job has one."""
+        """The result of ``finish`` for the solution where the part is."""
         assert self.finish is not None
-        opened = self._open(part)
-        border = opened.border
         robust = self._robust
-        if job.start is not None:
-            estimate = _in_order(job.start, opened)
-        elif job.target is None:
-            estimate = self._estimate(job.number)
+        whitening = None
+        if job.is_finish:
+            stand = self._stand(job.number)
+            opened = stand.opened
+            whitening = stand.footing.whitening
+            estimate = whitening.estimate
         else:
-            estimate = self._followed(job, opened)
-            self._keep(job.number, estimate)
+            opened = self._open(part)
+            estimate = self._place(job.number).estimate if job.start is None else _in_order(job.start, opened)
         descent = Descent(
             engine=opened.plain,
             plan=opened.engine.plan(),
@@ -261,9 +307,9 @@ class _Work:
         options = replace(self.shape.options, gap_tolerance=GAP)
         solution = report_of(part.problem, self.shape.origin_map, options, descent, 0)
         if job.is_finish:
-            held = replace(descent, engine=opened.engine)
+            held = replace(descent, engine=opened.engine, last_whitening=whitening)
             joint = np.load(_covariance_file(self.folder, job.number))
-            solution = replace(solution, covariance=JoinedCovariance(held, None, border, joint))
+            solution = replace(solution, covariance=JoinedCovariance(held, None, opened.border, joint))
         return self.finish(job.number, part, solution)
 
 
@@ -306,11 +352,11 @@ def join_parts(
 ) -> Joint:
     """Solve the ``count`` parts in ``folder`` together, and ``finish`` each without covariances.
 
-    Those of their borders are left in files for :func:`finish_parts`. ``progress`` is called with the number
-    of the round and the most that there may be; up to ``at_once`` observations are solved at once. Parts that
-    ``are_near`` start near the joint optimum, by what :func:`fit_parts` has told: else each looks for its own
-    first. Raises AdjustError where parts leave a direction free or contradict each other, WorkerError where a
-    process died.
+    Those of their borders are left in files for :func:`finish_parts`, and the parts' whitenings, of some
+    150 MB for a kilometre. ``progress`` is called with the number of the round and the most that there may
+    be; up to ``at_once`` observations are solved at once. Parts that ``are_near`` start near the joint
+    optimum, by what :func:`fit_parts` has told: else each looks for its own first. Raises AdjustError where
+    parts leave a direction free or contradict each other, WorkerError where a process died.
     """
     whole = _solved_at_once(folder, count, shape, at_once)
     jobs = [_Job(number, is_near=are_near) for number in range(count)]
@@ -331,12 +377,18 @@ def fit_parts(
     executor: Executor = HERE,
     progress: Callable[[int, int], None] | None = None,
     at_once: int = AT_ONCE,
+    are_near: bool = False,
 ) -> Fitted:
-    """``finish`` each part under a rough solve of all; otherwise as :func:`join_parts`."""
+    """``finish`` each part under a rough solve of all; otherwise as :func:`join_parts`.
+
+    Parts that ``are_near`` start near their own optimum.
+    """
     whole = _solved_at_once(folder, count, shape, at_once)
     if whole is None:
-        from_afar = [_Job(number) for number in range(count)]
-        joint = _in_rounds(folder, from_afar, links, shape, finish, executor, progress, ROUGH_GAP)
+        from_afar = [_Job(number, is_near=are_near) for number in range(count)]
+        joint = _in_rounds(
+            folder, from_afar, links, shape, finish, executor, progress, ROUGH_GAP, is_rough=True
+        )
         return Fitted(joint.results, None, None)
     jobs = [_Job(number, start, is_last=True) for number, start in enumerate(whole.starts)]
     results = _side_by_side(executor, _Work(folder, shape, finish), jobs)
@@ -352,34 +404,45 @@ def _in_rounds(
     executor: Executor,
     progress: Callable[[int, int], None] | None,
     least_gap: float,
+    is_rough: bool = False,
 ) -> Joint:
-    """The rounds of parts, the first by ``jobs``, until the gap is small."""
+    """The rounds of parts, the first by ``jobs``, until the gap is small.
+
+    They end where all are whitened, unless the solve ``is_rough``.
+    """
     report = progress or (lambda done, total: None)
     work = _Work(folder, shape)
     are_joined = jobs[0].start is not None
     is_from_afar = not are_joined and not jobs[0].is_near
-    costs: list[list[float]] = []  # by round and part
+    before = np.inf
     for number in range(_MOST_ROUNDS):
         report(number, _MOST_ROUNDS)
         states: list[PartStates] = _side_by_side(executor, work, jobs)
-        costs.append([_cost(state.told) for state in states])
+        costs = [_cost(state.told) for state in states]
         if number == 0:
             net = _net_of(states, links, shape)
-        elif number == 1 and is_from_afar:
-            _check_agreement(net, states, costs, folder)
+            least = [state.told.least_cost for state in states]
+        elif number == 1 and (is_rough or is_from_afar):
+            _check_agreement(net, states, least, costs, folder)
         shared = _shared(net, states)
         joined = net.join(_taken(states, shared, net), shared)
-        gap = (joined.decrease + sum(state.told.slack for state in states)) / max(sum(costs[-1]), 1.0)
+        gap = (joined.decrease + sum(state.told.slack for state in states)) / max(sum(costs), 1.0)
+        is_slow = gap > _SLOW * before
+        before = gap
+        is_small = (number > 0 or are_joined) and gap <= least_gap
+        if is_small and (is_rough or jobs[0].is_renewed):
+            break
         moved = _moved(net, shared, joined)
         jobs = [
-            _Job(part, target=_values(net, moved, state.labels, state.values))
+            _Job(
+                part,
+                target=_values(net, moved, state.labels, state.values),
+                is_renewed=is_small or is_slow or gap > _FAR_GAP or number == _MOST_ROUNDS - 2,
+                settled=_SETTLED_SHARE * least_gap,
+            )
             for part, state in enumerate(states)
         ]
-        if (number > 0 or are_joined) and gap <= least_gap:
-            break
-    if are_joined and number == 0:  # they are where they should be
-        jobs = [_Job(part) for part in range(len(states))]
-    last = [replace(job, is_last=True, gap=gap, rounds=number + 1) for job in jobs]
+    last = [_Job(part, is_last=True, gap=gap, rounds=number + 1) for part in range(len(states))]
     results = _side_by_side(executor, replace(work, finish=finish), last)
     return Joint(results, net, joined.factor, gap, number + 1)
 
@@ -428,7 +491,7 @@ def _covariance_file(folder: Path, number: int) -> Path:
 def finish_parts(
     folder: Path, joint: Joint, shape: Shape, finish: Finish, executor: Executor = HERE
 ) -> list[Any]:
-    """What ``finish`` makes of each joined part, whose solution has its joint covariances.
+    """Results of ``finish`` for each joined part, whose solution has its joint covariances.
 
     Raises WorkerError where a process died.
     """
@@ -530,10 +593,9 @@ def _cost(told: Summary) -> float:
 
 
 def _check_agreement(
-    net: Net, states: Sequence[PartStates], costs: Sequence[Sequence[float]], folder: Path
+    net: Net, states: Sequence[PartStates], alone: Sequence[float], together: Sequence[float], folder: Path
 ) -> None:
     """Raise AdjustError where parts fit what they share much worse than their noise explains."""
-    alone, together = costs
     rises = [after - before for before, after in zip(alone, together, strict=True)]
     size = np.array([len(state.told.slope) for state in states])
     coordinates = int(size.sum()) - sum(net.pattern.sizes)

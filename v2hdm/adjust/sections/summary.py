@@ -1,4 +1,4 @@
-"""What a part says of its border: its marginal information there, and its own optimum; and the way back.
+"""A part's summary of its border, its marginal information and optimum there, and the way back.
 
 With the whitened variables y of :mod:`v2hdm.adjust.whitening`, in which the Hessian is the identity, the
 border is b = W'y for some columns W. By the part alone, b has the covariance W'W and the optimum -W'g. If all
@@ -19,13 +19,18 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 
 from v2hdm.adjust.covariance import Covariance, reduced_root
-from v2hdm.adjust.model import Estimate, left_tangent
+from v2hdm.adjust.descent import minimise
+from v2hdm.adjust.kernels.tables import move
+from v2hdm.adjust.model import Estimate
 from v2hdm.adjust.reduced import to_tiles
 from v2hdm.adjust.whitening import Whitening
+from v2hdm.geometry.rigid import log
+from v2hdm.geometry.tensors import inverse
 from v2hdm.records import FloatArray
 
 _CORNERS_AT_ONCE = 256  # corners whose columns are computed together, to bound intermediate results
 _FRAMES_AT_ONCE = 64  # frames whose columns are computed together
+_MOST_STEPS = 12  # most steps of LBFGS with the border held, under one whitening: chosen
 
 
 @dataclass(frozen=True)
@@ -60,7 +65,8 @@ class Values:
 
     def step_from(self, base: Values) -> Tensor:
         """The step (n,) of the border that leads here from ``base``, in the border's order."""
-        turned = left_tangent(self.cam_from_vehicle, base.cam_from_vehicle)
+        motion = self.cam_from_vehicle @ inverse(base.cam_from_vehicle)
+        turned = torch.as_tensor(log(motion.cpu().numpy())).to(motion)
         by_camera = torch.cat([turned, self.clock_s - base.clock_s], dim=1)
         states = self.frame_state - base.frame_state
         corners = self.corners_map - base.corners_map
@@ -138,7 +144,7 @@ def corner_columns(whitening: Whitening, corners: Tensor) -> Columns:
 
 
 class _Factors(NamedTuple):
-    """Of n corners: V^-1 (2 n, 2 n), and the columns (2 n, 2 n) of their own variables."""
+    """Factors of n corners: V^-1 (2 n, 2 n), and the columns (2 n, 2 n) of their own variables."""
 
     inverse: Tensor
     by_variable: Tensor
@@ -172,61 +178,138 @@ class Summary:
 
     Half of step' ``information`` step (n, n) plus ``slope`` (n,) times the step; ``terms`` is the cost at the
     point that the step is from, by name. ``slack`` is twice the decrease of the cost that is left with the
-    border held.
+    border held, ``least_cost`` the cost at the part's own optimum, as predicted.
     """
 
     information: FloatArray
     slope: FloatArray
     terms: dict[str, float]
     slack: float
+    least_cost: float
 
 
-def own_step(whitening: Whitening, border: Border, columns: Columns) -> Tensor:
-    """The step (n,) of the border to the part's own optimum."""
-    gradient = whitening.gradient
-    reduced = gradient[: whitening.reduced_factor.size]
-    return -columns.pulled(reduced, gradient[len(reduced) :].view(-1, 2)[border.corners])
+class Place(NamedTuple):
+    """A point that a part has reached under its whitening: whitened variables, and what is there."""
+
+    whitened: Tensor
+    estimate: Estimate
+    terms: dict[str, float]  # the cost, by name
+    gradient: Tensor  # of the cost by the whitened variables
+
+    @classmethod
+    def base(cls, whitening: Whitening) -> Place:
+        """The point where the whitening was made."""
+        nowhere = torch.zeros_like(whitening.gradient)
+        return cls(nowhere, whitening.estimate, whitening.terms, whitening.gradient)
+
+    @classmethod
+    def at(cls, whitening: Whitening, whitened: Tensor) -> Place:
+        """The point of some whitened variables."""
+        return cls(whitened, *whitening.reach(whitened))
 
 
-def summarise(whitening: Whitening, border: Border, held: Tensor, held_map: Tensor) -> Summary:
-    """The summary of a part at the whitening's estimate, without what holds its border's corners.
+@dataclass(frozen=True)
+class Footing:
+    """A part's whitening with the columns of its border, from which it follows the border round by round."""
+
+    whitening: Whitening
+    border: Border
+    columns: Columns
+
+    @classmethod
+    def of(cls, whitening: Whitening, border: Border) -> Footing:
+        """The footing that a whitening gives."""
+        return cls(whitening, border, border_columns(whitening, border))
+
+    @cached_property
+    def factor(self) -> Tensor:
+        """Lower factor of W'W (n, n)."""
+        lower: Tensor = torch.linalg.cholesky(self.columns.covariance)
+        return lower
+
+    def in_border(self, whitened: Tensor) -> Tensor:
+        """The border's step (n,) of whitened variables, W'y."""
+        reduced = whitened[: self.whitening.reduced_factor.size]
+        of_corners = whitened[len(reduced) :].view(-1, 2)[self.border.corners]
+        return self.columns.pulled(reduced, of_corners)
+
+    def moved(self, whitened: Tensor, step: Tensor) -> Tensor:
+        """The variables nearest to ``whitened`` whose step of the border is larger by ``step`` (n,)."""
+        weights = torch.cholesky_solve(step[:, None], self.factor)[:, 0]
+        last, of_corners = self.columns.pushed(weights)
+        out = whitened.clone()
+        size = self.whitening.reduced_factor.size
+        out[size - len(last) : size] += last
+        if len(of_corners):
+            out[size:].view(-1, 2)[self.border.corners] += of_corners
+        return out
+
+    def follow(self, place: Place, target: Values) -> Place:
+        """Where a Newton step leads from ``place`` when the border moves to ``target``."""
+        newton = place.whitened - place.gradient
+        asked = target.step_from(Values.of(self.whitening.estimate, self.border))
+        return Place.at(self.whitening, self.moved(newton, asked - self.in_border(newton)))
+
+    def settle(self, place: Place, tolerance: float) -> Place:
+        """The optimum, to a gap of ``tolerance``, with the border where it is at ``place``."""
+
+        def along(gradient: Tensor) -> Tensor:
+            return self.moved(gradient, -self.in_border(gradient))
+
+        def objective(step: Tensor) -> tuple[float, Tensor]:
+            reached = self.whitening.reach(place.whitened + step)
+            return sum(reached.terms.values()), along(reached.gradient)
+
+        cost = sum(place.terms.values())
+        minimum = minimise(objective, cost, along(place.gradient), tolerance, _MOST_STEPS)
+        if not bool(minimum.whitened.any()):
+            return place
+        return Place.at(self.whitening, place.whitened + minimum.whitened)
+
+
+def summarise(footing: Footing, place: Place, held: Tensor, held_map: Tensor) -> Summary:
+    """The summary of a part at a place, without what holds its border's corners.
 
     These were held at ``held_map`` (m, 2) with the information ``held`` (m,), 1 / m^2, in each direction.
     """
-    columns = border_columns(whitening, border)
-    information = torch.cholesky_inverse(torch.linalg.cholesky(columns.covariance))
-    step = own_step(whitening, border, columns)
+    border = footing.border
+    information = torch.cholesky_inverse(footing.factor)
+    gradient = place.gradient
+    step = -footing.in_border(gradient)
     pulled = information @ step
-    slack = whitening.gradient.square().sum() - step @ pulled
+    slack = gradient.square().sum() - step @ pulled
     slope = -pulled
+    _to_place(footing.whitening, place, information, slope)
     count = 2 * len(border.corners)
     if count:
         weight = held.repeat_interleave(2)
-        off_m = (whitening.estimate.corners_map[border.corners] - held_map).flatten()
+        off_m = (place.estimate.corners_map[border.corners] - held_map).flatten()
         slope[-count:] -= weight * off_m
         information.diagonal()[-count:] -= weight
-    terms = {name: cost for name, cost in whitening.terms.items() if name != "control_points"}
-    return Summary(information.cpu().numpy(), slope.cpu().numpy(), terms, max(float(slack), 0.0))
+    terms = {name: cost for name, cost in place.terms.items() if name != "control_points"}
+    return Summary(
+        information.cpu().numpy(),
+        slope.cpu().numpy(),
+        terms,
+        max(float(slack), 0.0),
+        sum(terms.values()) - float(gradient.square().sum()) / 2,
+    )
 
 
-def follow(whitening: Whitening, border: Border, target: Values) -> Estimate:
-    """The estimate after the border has moved to ``target`` and all else followed to its optimum."""
-    columns = border_columns(whitening, border)
-    step = target.step_from(Values.of(whitening.estimate, border))
-    beyond = step - own_step(whitening, border, columns)
-    weights = torch.cholesky_solve(beyond[:, None], torch.linalg.cholesky(columns.covariance))[:, 0]
-    last, of_corners = columns.pushed(weights)
-    whitened = -whitening.gradient
-    size = whitening.reduced_factor.size
-    whitened[size - len(last) : size] += last
-    if len(of_corners):
-        whitened[size:].view(-1, 2)[border.corners] += of_corners
-    moved = whitening.linearised.evaluate(*whitening.step(whitened)).estimate
-    states = moved.frame_state.clone()
-    states[border.frames] = target.frame_state
-    corners_map = moved.corners_map.clone()
-    corners_map[border.corners] = target.corners_map
-    return Estimate(target.cam_from_vehicle, states, corners_map, target.clock_s)
+def _to_place(whitening: Whitening, place: Place, information: Tensor, slope: Tensor) -> None:
+    """Carry information and slope from cameras' tangents at the whitening's estimate to those at a place."""
+    if not bool(place.whitened.any()):
+        return
+    before = whitening.estimate.cam_from_vehicle
+    tangents = log((place.estimate.cam_from_vehicle @ inverse(before)).cpu().numpy())
+    unknowns = whitening.engine.arrays.camera_unknowns
+    _, charts = move(tangents, before.cpu().numpy())
+    for camera, chart in enumerate(charts):
+        rows = slice(camera * unknowns, camera * unknowns + 6)
+        turn = torch.as_tensor(np.linalg.inv(chart)).to(slope)
+        slope[rows] = turn.mT @ slope[rows]
+        information[rows] = turn.mT @ information[rows]
+        information[:, rows] = information[:, rows] @ turn
 
 
 @dataclass(frozen=True)

@@ -153,7 +153,7 @@ class _Run:
         return [results[number] for number in range(len(todo))]
 
     def finish(self, solved: _Solved, finish: Callable[..., Any]) -> list[Any]:
-        """What ``finish`` makes of all sections under their last joint solve."""
+        """Results of ``finish`` for all sections under their last joint solve."""
         return finish_parts(self.work.folder, solved.joint, solved.shape, finish, self.executor)
 
 
@@ -235,7 +235,7 @@ def _judge_together(
     cut = _cut(run, work, drive, part)
     fitted = fit_parts(
         work.folder, run.count, cut.links, cut.shape, work.fit, run.executor,
-        partial(run.progress, "judge sections together"),
+        partial(run.progress, "judge sections together"), are_near=True,
     )  # fmt: skip
     fits: list[Fit] = fitted.results
     passed = gates(fits, before, model.solver.gate_probability)
