@@ -22,11 +22,11 @@ SETTINGS = {"DetectorOptions", "MappingOptions", "ReadOptions", "V2hdmError"}
 """They are explained attribute by attribute."""
 
 
-@pytest.fixture(scope="session")
-def names(tmp_path_factory):
+@pytest.fixture(scope="module")
+def names(small_drive, coarse_mosaics, tmp_path_factory):
     """Names that the examples use: the library, a rendered drive, its result, and a folder to write to."""
     folder = tmp_path_factory.mktemp("library")
-    port = v2hdm.simulate_port(folder)
+    port = v2hdm.read_drive(small_drive)
     result = v2hdm.map_drive(port, accuracy_goal_cm=10.0, workers=1)
     survey_camera(folder, port, read_truth(port))
     public = {name: getattr(v2hdm, name) for name in v2hdm.__all__}
