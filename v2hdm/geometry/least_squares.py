@@ -83,7 +83,8 @@ def gauss_newton(
     ``retract`` applies a step (U,) to an estimate, by default their sum; ``limit`` shortens steps to the
     range of the linearisation. It ends on a step below ``tolerance`` conditional standard deviations of every
     unknown, or once ``settled``. ``damping`` is a fraction of the information's diagonal: a step that raises
-    the cost is rejected and the damping raised tenfold; at 0 every step is accepted whole.
+    the cost is rejected and the damping raised tenfold, at least to where it began; at 0 every step is
+    accepted whole.
     """
     move: Callable[[X, FloatArray], X] = retract or add
     x = x0
@@ -107,7 +108,8 @@ def gauss_newton(
         if damping > 0 and not after.cost <= last.cost:
             if damped > _GIVE_UP:
                 return Fit(x, last, np.zeros(len(step)), True, step_count)
-            damped *= 10.0
+            # Far below where it began, ten times the damping leads to the same step again.
+            damped = max(10.0 * damped, damping)
         else:
             x = moved
             last = after
