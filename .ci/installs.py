@@ -1,25 +1,25 @@
 """Each extra keeps what the documents promise: ``make installs`` installs the wheel and tries it.
 
 The wheel is built once. The base install and ``[map]`` have an environment each; ``[map,ros]``,
-``[map,video]`` and ``[map,text]`` stand on ``[map]``. A page, or a section, begins with what it needs; its
-commands run in the environment with just that, on the small drive of the documents' tests, which the first
-command of ``[map]`` renders and maps.
+``[map,video]`` and ``[map,text]`` stand on ``[map]``. A page, or a section, begins with what it needs; the
+first command there with each word of :data:`PROMISES` runs in the environment with just that, on the small
+drive of the documents' tests, which the first command of ``[map]`` renders and maps. The documents' tests run
+all commands.
 """
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 import subprocess
 import sys
 import time
 import tomllib
-from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import cv2
+from environments import Environment
 
 from tests.docs.blocks import ROOT, blocks, document
 from tests.docs.sandbox import furnish
@@ -27,9 +27,6 @@ from tests.docs.smaller import SMALL_PORT, smaller
 from v2hdm.cli.main import all_commands
 
 _NEEDS = re.compile(r"\*Needs `pip install '?\.(?:\[([a-z,]+)\])?'?`")
-_INSTALL = [
-    "install", "--quiet", "--disable-pip-version-check", "--no-compile", "-c", str(ROOT / "constraints.txt"),
-]  # fmt: skip
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 
 PROMISES = {
@@ -39,13 +36,13 @@ PROMISES = {
     "docs/cache.md": ("cache list",),
     "docs/check.md": ("check",),
     "docs/living-map.md": ("localize",),
-    "docs/report.md": ("report", "mosaic"),
+    "docs/report.md": ("v2hdm report", "v2hdm mosaic"),
     "docs/bags.md": ("check site",),
     "docs/benchmark.md": ("benchmark make",),
 }
-"""Words by document: each line of a block with one of them is run."""
+"""Words by document: the first line of its blocks with each of them is run, in each environment."""
 
-MAP_PORT = f"v2hdm map +run=port2 workers=1 {' '.join(map(repr, SMALL_PORT))}"
+MAP_PORT = f"v2hdm map +run=port2 workers=1 mosaic=false {' '.join(map(repr, SMALL_PORT))}"
 
 FIRST = f"{MAP_PORT} all_maps=true"
 """Makes the drive and the result on which all other commands work."""
@@ -77,38 +74,9 @@ MORE = {
     ),
     "map,pdf": (f"{MAP_PORT} report.pdf=true",),
 }
-"""What no page has as a short command of its own, by extras."""
+"""Commands, by extras, for work that no page shows as a short command of its own."""
 
 MISSING = "needs [a-z0-9_.]+: install the [a-z]+ extra, pip install 'v2hdm\\[[a-z]+\\]'"
-
-
-@dataclass
-class Environment:
-    """A Python with some extras: of its own, or in folders of packages on top of another."""
-
-    python: Path
-    packages: list[Path] = field(default_factory=list)
-
-    @classmethod
-    def new(cls, folder: Path, *what: str) -> Environment:
-        """One with packages alone, and no pip: that of this Python installs them."""
-        subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder], check=True)
-        python = folder / "bin" / "python"
-        subprocess.run([sys.executable, "-m", "pip", "--python", python, *_INSTALL, *what], check=True)
-        return cls(python)
-
-    def beside(self, folder: Path, *what: str) -> Environment:
-        """This environment with packages beside its own."""
-        pip = [sys.executable, "-m", "pip", "--python", self.python]
-        subprocess.run([*pip, *_INSTALL, "--target", folder, *what], check=True)
-        return Environment(self.python, [folder])
-
-    def run(self, line: str, here: Path) -> subprocess.CompletedProcess[str]:
-        """Run a line of shell in which ``v2hdm`` and ``python`` are this environment's."""
-        path = f"{self.python.parent}:/usr/bin:/bin"
-        own = {"PATH": path, "HOME": str(here), "OMP_NUM_THREADS": "1", "MPLBACKEND": "agg"}
-        own |= {"PYTHONPATH": os.pathsep.join(map(str, self.packages))} if self.packages else {}
-        return subprocess.run(["bash", "-c", line], cwd=here, env=own, capture_output=True, text=True)
 
 
 def lines_of(extras: str) -> list[str]:
@@ -120,7 +88,7 @@ def lines_of(extras: str) -> list[str]:
         for word in words:
             chosen = [one for one in listed if "v2hdm" in one[0] and word in one[0]]
             assert chosen, f"{page}: none of its commands has {word}"
-            lines += [_small(line) for line, needs in chosen if needs == extras]
+            lines += [_small(line) for line, needs in chosen if needs == extras][:1]
     return [*dict.fromkeys(lines), *MORE[extras]]
 
 
@@ -211,11 +179,11 @@ def main() -> int:
         build = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation"]
         subprocess.run([*build, "--disable-pip-version-check", "-w", wheels, ROOT], check=True)
         (wheel,) = wheels.glob("*.whl")
-        mapping = Environment.new(Path(scratch) / "map", f"{wheel}[map]")
+        mapping = Environment.new(Path(scratch) / "map", wheel, "map")
         if failed := tried("map", mapping, [FIRST], here):
             return failed
         prepare(here)
-        base = Environment.new(Path(scratch) / "base", str(wheel))
+        base = Environment.new(Path(scratch) / "base", wheel)
         failed = tried("base", base, lines_of(""), here) + missing(base, here)
         failed += tried("map", mapping, lines_of("map"), here)
         ros = mapping.beside(packages / "ros", *EXTRAS["ros"])

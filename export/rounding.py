@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from export.graph import Convolution, FloatTensor
 
 _DAMPING = 1e-2
-"""Of the mean square of the inputs, added to each: what was not seen on the images may come yet."""
+"""Share of the inputs' mean square that is added to each: a channel that no image has shown yet may come."""
 
 Moments = NDArray[np.float64]
 

@@ -1,9 +1,11 @@
 """Settings for all tests."""
 
+import gc
 import os
 
 from hypothesis import settings
 
+from tests.ports import coarse_mosaics as coarse_mosaics
 from tests.ports import rendered as rendered
 from tests.ports import short_drive as short_drive
 from tests.ports import small_drive as small_drive
@@ -20,3 +22,8 @@ settings.load_profile("repeatable")
 if kernels() is None:
     os.environ[SWITCH] = "0"
     _loaded.cache_clear()
+
+
+def pytest_collection_finish() -> None:
+    """Leave out what is loaded by now, for good, whenever garbage is collected."""
+    gc.freeze()

@@ -2,13 +2,15 @@
 
 import fcntl
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from tests.drive.example import description
+from v2hdm import library
 from v2hdm.executor import HERE
 from v2hdm.pipeline.config import DriveConfig, RunConfig
 from v2hdm.simulate.port.config import PortConfig, RouteConfig, SurveyConfig, YardConfig
@@ -30,16 +32,8 @@ def short_port() -> PortConfig:
 
 
 def small_port(**changes: object) -> PortConfig:
-    """The same route with one camera of half the pixels and an image every two metres."""
-    port = PortConfig(
-        name="small",
-        seed=11,
-        initial_ipm="estimated",
-        route=RouteConfig(pieces=ROUTE, image_spacing_m=2.0),
-        yard=YardConfig(parked_trucks=0, barriers=0, lamp_posts=0, moving_trucks=0, shadow_strips=1),
-        cameras={"front": replace(PortConfig().cameras["front"], width=640, height=360, focal_px=450.0)},
-    )
-    return replace(port, **changes)  # type: ignore[arg-type]
+    """The port of the library's examples: one camera of half the pixels, an image every two metres."""
+    return replace(library._short_port(), **changes)  # type: ignore[arg-type]
 
 
 def run_config(drive: Path, output: Path, **changes: object) -> RunConfig:
@@ -55,6 +49,16 @@ def blind_copy(drive: Path, target: Path) -> Path:
     with description(target) as content:
         content.pop("truth")
     return target
+
+
+@pytest.fixture(scope="module")
+def coarse_mosaics() -> Iterator[None]:
+    """Mosaics of runs have pixels of 20 cm: at 2 cm they take longer than all else that a run writes."""
+    from v2hdm.pipeline import saving
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(saving, "write_mosaic", partial(saving.write_mosaic, resolution_m=0.2))
+        yield
 
 
 @pytest.fixture(scope="session")

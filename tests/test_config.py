@@ -9,7 +9,7 @@ from hydra import compose, initialize_config_dir
 
 from export.config import ExportConfig
 from tests.docs.smaller import SMALL_PORT
-from tests.faults.cases import SIGNED, measures
+from tests.faults.settings import SIGNED, measures
 from train.config import TrainConfig
 from v2hdm.cli import compose as config
 from v2hdm.cli.compose import Door, help_text, keys_of

@@ -1,4 +1,4 @@
-"""What a URL holds of passwords and tokens is in no message, no log and no file."""
+"""Passwords and tokens of a URL are in no message, no log and no file."""
 
 import logging
 from pathlib import Path

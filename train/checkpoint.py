@@ -72,10 +72,10 @@ class Checkpoint:
     @property
     def classes(self) -> tuple[str, ...]:
         """The classes of the network's channels: a network may be older than the last of the shipped ones."""
-        own = tuple(self.own_classes)
+        own_classes = tuple(self.own_classes)
         weights = self.averaged or self.model
-        shipped = class_count(weights) - len(own) if weights else len(SHIPPED.names)
-        return SHIPPED.names[:shipped] + own
+        shipped = class_count(weights) - len(own_classes) if weights else len(SHIPPED.names)
+        return SHIPPED.names[:shipped] + own_classes
 
     @property
     def catalogue(self) -> Catalogue:

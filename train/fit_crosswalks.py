@@ -1,19 +1,21 @@
-"""Fits what a row says of the bars in it, in :mod:`v2hdm.detection.crosswalks`.
+"""Fits what a row says of the bars in it, and of paint beside it, in :mod:`v2hdm.detection.crosswalks`.
 
     python -m train.fit_crosswalks LABELS.json IMAGES [--photographs 500] [--renders 60]
 
 LABELS.json and IMAGES are those of ROAD MARK. The images of it that are learnt from, and rendered scenes, are
 shown to the shipped network, every second photograph as if nobody stated its mounting. A bar that stands in a
 row is true if it overlaps a rendered bar by half, or its middle lies in the outline of a photographed
-crosswalk; it is false where nothing like it is labelled. Printed is what belongs into ``FITTED``, and how
-many of either it keeps.
+crosswalk; it is false where nothing like it is labelled. Paint near a row that the network names a bar is of
+the row's crosswalk if most of its outline lies in that of the photographed crosswalk that most of the row's
+bars are in. Printed is what belongs into ``FITTED`` and ``CONTINUING_FITTED``, and how many are kept.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -21,7 +23,7 @@ import numpy as np
 from train.config import DataConfig
 from train.examples import Example, example, photograph, polygon_overlap
 from train.fit_arguments import fit_arguments
-from train.fit_arrows import SEED, config_of
+from train.fit_arrows import RANGE_M, SEED, config_of
 from train.fit_judge import HARDSHIPS, HARDSHIPS_EVERY
 from train.labels import labelled_images
 from train.labels_image import LabelledImage
@@ -32,13 +34,14 @@ from v2hdm.detection.classifier import likeliest_readings
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.network import as_probability
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.detection.quads.propose import Proposal
 from v2hdm.geometry.rows import IN_IMAGE, rows_of_bars
 from v2hdm.records import CROSSWALK_BAR, FloatArray
 
 OVERLAP = 0.5  # of a true bar with a rendered one, intersection over union
 APART = 0.05  # of a false bar with any label, at most
+MOST = 0.5  # share of a row's bars, and of a piece's outline, that lie in a crosswalk's outline
 RIDGE = 0.2  # information of the prior that weights are 0
-RANGE_M = 40.0  # as of photographs of which nothing is stated
 NOT_STATED = (1.6, -6.1, 60.0)
 """Height, m, pitch, deg down, and field of view, deg, that `v2hdm detect` takes these photographs to have."""
 LEAST_KEPT = 0.7  # probability from which a bar is detected
@@ -69,22 +72,70 @@ def renders(count: int) -> Iterator[Example]:
         yield example(number, 1.0, SEED, CROSSED if number % HARDSHIPS_EVERY else NONE)
 
 
-def bars_in(shown: Example, detector: Detector) -> Iterator[tuple[FloatArray, bool]]:
-    """The features (F,) of the bars of an image that stand in a row, and whether they are bars."""
+class Row(NamedTuple):
+    """A row of N bars that an image shows."""
+
+    features: FloatArray  # (N, F) of its bars
+    corners_px: FloatArray  # (N, 4, 2)
+    ground: FloatArray  # (N, 4, 2) m
+
+
+class Rows(NamedTuple):
+    """The rows of an image, and its pieces of paint that the network names bars."""
+
+    rows: Sequence[Row]
+    pieces: Sequence[Proposal]
+
+
+def rows_in(shown: Example, detector: Detector) -> Rows:
+    """The rows that an image shows, with their likeliest bars."""
     output = detector.run_network(shown.image, shown.camera)
-    readings = detector.read(shown.image, detector.propose(output, shown.camera))
+    proposals = detector.propose(output, shown.camera)
+    readings = detector.read(shown.image, proposals)
     if readings is None:
-        return
+        return Rows((), ())
     likeliest = likeliest_readings(readings)
     ground = readings.ground[likeliest.reading]
     candidates = np.flatnonzero(likeliest.may_be_bar & np.isfinite(ground).all(axis=(1, 2)))
+    rows = []
     for row in rows_of_bars(ground[candidates], IN_IMAGE):
         members = candidates[row]
         features = crosswalks.row_features(likeliest.score[members])
-        for number, m in enumerate(members.tolist()):
-            is_bar = _is_bar(shown, readings.fit.corners_px[m])
+        rows.append(Row(features, readings.fit.corners_px[members], ground[members]))
+    return Rows(rows, crosswalks.pieces_named_bars(proposals.pieces))
+
+
+def bars_in(shown: Example, rows: Rows) -> Iterator[tuple[FloatArray, bool]]:
+    """The features (F,) of the bars of an image that stand in a row, and whether they are bars."""
+    for row in rows.rows:
+        for features, corners_px in zip(row.features, row.corners_px, strict=True):
+            is_bar = _is_bar(shown, corners_px)
             if is_bar is not None:
-                yield features[number], is_bar
+                yield features, is_bar
+
+
+def pieces_in(shown: Example, rows: Rows) -> Iterator[tuple[FloatArray, bool]]:
+    """The features (F,) of pieces near to rows of a photograph, and whether they are of their crosswalk."""
+    outlines = [true.polygon_px.astype(np.float32) for true in shown.markings if true.kind == CROSSWALK_BAR]
+    if shown.unknown is None or not outlines:
+        return
+    for row in rows.rows:
+        middles_px = row.corners_px.mean(axis=1)
+        bars_inside = [_share_inside(outline, middles_px) for outline in outlines]
+        if max(bars_inside) < MOST:
+            continue
+        outline = outlines[int(np.argmax(bars_inside))]
+        centres = row.ground.mean(axis=1)
+        length_m = crosswalks.usual_length_m(row.ground)
+        for piece in rows.pieces:
+            features = crosswalks.continuing_features(centres, length_m, piece.outline_vehicle)
+            if features[1] <= crosswalks.MOST_BEYOND:
+                yield features, _share_inside(outline, piece.blob.outline_px) > MOST
+
+
+def _share_inside(outline: np.ndarray, points_px: FloatArray) -> float:
+    """The share of points (N, 2) that lie in an outline."""
+    return float(np.mean([cv2.pointPolygonTest(outline, at, False) >= 0 for at in points_px.tolist()]))
 
 
 def _is_bar(shown: Example, corners_px: FloatArray) -> bool | None:
@@ -102,11 +153,29 @@ def _is_bar(shown: Example, corners_px: FloatArray) -> bool | None:
     return False if max((share for share, _ in overlaps), default=0.0) < APART else None
 
 
-def gathered(images: Iterable[Example], detector: Detector) -> tuple[FloatArray, FloatArray]:
-    """The features (N, F) and the truth (N,), 1 or 0, of all bars in rows."""
-    bars = [bar for image in images for bar in bars_in(image, detector)]
-    features = np.array([features for features, _ in bars]).reshape(-1, len(crosswalks.FEATURES))
-    return features, np.array([is_bar for _, is_bar in bars], dtype=np.float64)
+class Gathered(NamedTuple):
+    """Features (N, F) and the truth (N,), 1 or 0."""
+
+    features: FloatArray
+    is_true: FloatArray
+
+    @classmethod
+    def of(cls, known: Sequence[tuple[FloatArray, bool]], width: int) -> Gathered:
+        """Of features (width,), each with its truth."""
+        features = np.array([features for features, _ in known]).reshape(-1, width)
+        return cls(features, np.array([is_true for _, is_true in known], dtype=np.float64))
+
+    def fitted(self) -> tuple[float, ...]:
+        """The likeliest weights of the features."""
+        return likeliest_weights(self.features, np.zeros(len(self.features)), self.is_true, RIDGE)
+
+    def say(self, name: str, odds: FloatArray, least: float) -> None:
+        """Print how many have at least a probability, by log odds (N,)."""
+        is_kept = as_probability(odds) >= least
+        kept = int((is_kept & (self.is_true > 0)).sum())
+        others = int((is_kept & (self.is_true == 0)).sum())
+        true = int(self.is_true.sum())
+        print(f"{name}: {kept} of {true}, {others} of {len(self.is_true) - true} others")
 
 
 def main() -> None:
@@ -118,19 +187,24 @@ def main() -> None:
         "photographs": photographs(parsed.labels, parsed.images, parsed.photographs),
         "renders": renders(parsed.renders),
     }
-    groups = {name: gathered(images, detector) for name, images in shown.items()}
-    features = np.concatenate([features for features, _ in groups.values()])
-    is_bar = np.concatenate([is_bar for _, is_bar in groups.values()])
-    weights = likeliest_weights(features, np.zeros(len(features)), is_bar, RIDGE)
+    bars: dict[str, Gathered] = {}
+    beside: list[tuple[FloatArray, bool]] = []
+    for name, images in shown.items():
+        of_bars: list[tuple[FloatArray, bool]] = []
+        for image in images:
+            rows = rows_in(image, detector)
+            of_bars += bars_in(image, rows)
+            beside += pieces_in(image, rows)
+        bars[name] = Gathered.of(of_bars, len(crosswalks.FEATURES))
+    weights = Gathered(*(np.concatenate(column) for column in zip(*bars.values(), strict=True))).fitted()
     print(f"FITTED = {weights}")
-    for name, (columns, truth) in groups.items():
-        is_bar = truth > 0
-        bars = int(is_bar.sum())
-        for how, values in (("alone", columns[:, 1]), ("in its row", columns @ np.array(weights))):
-            is_kept = as_probability(values) >= LEAST_KEPT
-            kept = int((is_kept & is_bar).sum())
-            others = int((is_kept & ~is_bar).sum())
-            print(f"{name}, {how}: {kept} of {bars} bars, {others} of {len(truth) - bars} others")
+    for name, group in bars.items():
+        group.say(f"{name}, bars alone", group.features[:, 1], LEAST_KEPT)
+        group.say(f"{name}, bars in their row", group.features @ np.array(weights), LEAST_KEPT)
+    pieces = Gathered.of(beside, len(crosswalks.CONTINUING))
+    weights = pieces.fitted()
+    print(f"CONTINUING_FITTED = {weights}")
+    pieces.say("pieces near to rows", pieces.features @ np.array(weights), 0.5)
 
 
 if __name__ == "__main__":

@@ -51,7 +51,7 @@ _JUDGE_FOLDS = 2
 """Parts of the images, each judged by what was learnt from the others; a judge takes minutes to learn."""
 
 _FALSE_SHARE = 1 / 3
-"""Of the false readings of renders so many are learnt from, and photographs, which are few, twice: the
+"""Share of the false readings of renders that is learnt from; photographs, which are few, count twice. The
 confidence, fitted to all, sets the odds right again."""
 
 HARDSHIPS_EVERY = 3
@@ -73,10 +73,10 @@ MIRRORED_EVERY = 3
 """Which images are looked at once more, with spots of sun and as in the mapping."""
 
 _UNTOLD_SHARE = 0.05
-"""Of a quadrilateral with more unknown ground than this in it nobody knows whether it is a marking."""
+"""Largest share of unknown ground in a quadrilateral of which anybody knows whether it is a marking."""
 
 COUNTS = (10, 20, 40, 80)
-"""Of false ones, at which those true are counted."""
+"""Numbers of false readings at which the true ones are counted."""
 
 
 @dataclass

@@ -19,7 +19,7 @@ import numpy as np
 
 from train.examples import HEIGHT, WIDTH, camera_of, photograph
 from train.fit_arguments import fit_arguments
-from train.fit_arrows import SEED, config_of
+from train.fit_arrows import RANGE_M, SEED, config_of
 from train.fit_crosswalks import configs_in_turn
 from train.fit_hatching import DIFFICULTIES, WRITTEN
 from train.labels import labelled_images
@@ -36,7 +36,6 @@ from v2hdm.records import TEXT, BoolArray, Camera, FloatArray
 MOST = 0.5  # share of an area that labels of words cover from which it is writing
 HARDLY = 0.1  # share below which it is none
 RIDGE = 0.2  # information of the prior that weights are 0
-RANGE_M = 40.0  # as of photographs of which nothing is stated
 LEAST_KEPT = 0.5  # probability from which an area is detected
 
 

@@ -42,7 +42,7 @@ _ZOOM = (0.6, 1.5)
 """Labelled images are shown this much smaller to larger: one camera took them all, others are to be met."""
 
 _LEAST_CORE = 0.35
-"""Of the half width of a piece so much at most is edge: thin ones are paint in their middle all the same."""
+"""Largest share of a piece's half width that is edge: thin pieces are paint in their middle all the same."""
 
 _MOST_FAVOUR = 8.0  # times that an image with the rarest class is shown for one with the commonest, at most
 
@@ -311,10 +311,10 @@ def paint_labels(
                 continue
             if shape.tone is not None and kinds != [UNKNOWN]:
                 bright, ground = place.toned(shape.tone)
-                known = inside & (bright | (ground & (labels == 0)))
+                is_known = inside & (bright | (ground & (labels == 0)))
                 unknown[inside & (labels == 0)] = True
                 labels[inside & bright] = value
-                unknown[known] = False
+                unknown[is_known] = False
                 continue
             if in_part or kinds == [UNKNOWN]:
                 unknown |= inside

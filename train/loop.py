@@ -149,15 +149,15 @@ class Trainer:
     @torch.no_grad()
     def _put_back(self, before: MarkingNet, stays: Tensor) -> None:
         """Undo what an update did to the channels of classes that stay, and to those that they read."""
-        known = dict(before.named_parameters())
+        earlier = dict(before.named_parameters())
         for name, parameter in self.net.named_parameters():
             if name in CLASS_CHANNELS:
-                parameter[stays] = known[name][stays]
+                parameter[stays] = earlier[name][stays]
             elif name.startswith(HIDDEN_CLASS_LAYER) and parameter.requires_grad:
-                is_read = read_by(known, stays)
+                is_read = read_by(earlier, stays)
                 # The first half of a separable layer has no channels of its own: it stays.
                 stay = is_read if len(parameter) == len(is_read) else slice(None)
-                parameter[stay] = known[name][stay]
+                parameter[stay] = earlier[name][stay]
 
     def _share(self) -> float:
         """How much of the run has passed, 0 to 1."""
@@ -211,8 +211,8 @@ class Trainer:
         if self._before is not None and self._heads_alone():
             with torch.inference_mode():
                 before = self._before(image).kinds
-            kept = kept_loss(prediction.kinds, before, prediction.paint, targets)
-            loss = loss + self.config.loss.kept * kept
+            loss_of_kept = kept_loss(prediction.kinds, before, prediction.paint, targets)
+            loss = loss + self.config.loss.kept * loss_of_kept
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         # Statistics of the normalisations are averaged, too: each member has seen its own images only.

@@ -90,13 +90,13 @@ def kept_loss(logits: Tensor, before: Tensor, paint: Tensor, targets: Targets) -
     is_seen = max_pool2d(paint, 2)[:, 0] > 0
     is_bare = max_pool2d(targets.paint.float()[:, None], 2)[:, 0] == 0
     agrees = targets.kinds == before.argmax(dim=1)
-    kept = is_seen & (agrees | (is_bare & (targets.kinds == IGNORE)))
-    if not kept.any():
+    is_kept = is_seen & (agrees | (is_bare & (targets.kinds == IGNORE)))
+    if not is_kept.any():
         return logits.sum() * 0
-    log_share = logits.movedim(1, -1)[kept].log_softmax(-1)
-    log_share_before = before.movedim(1, -1)[kept].log_softmax(-1)
+    log_share = logits.movedim(1, -1)[is_kept].log_softmax(-1)
+    log_share_before = before.movedim(1, -1)[is_kept].log_softmax(-1)
     divergence = (log_share_before.exp() * (log_share_before - log_share)).sum(-1)
-    worth = torch.where(agrees, targets.kind_weight, _BARE_WORTH)[kept]
+    worth = torch.where(agrees, targets.kind_weight, _BARE_WORTH)[is_kept]
     return (worth * divergence).sum() / worth.sum()
 
 

@@ -46,11 +46,10 @@ _LEAST_IMAGES = 100
 _PART_IMAGES = 25
 """Renders that one process looks at in one go: what a kill loses at most, per process."""
 
-_EXPORTED = 0.05
-_GATHERED = 0.6
-_JUDGED = 0.85
-_LANES_SEEN = 0.99
-"""Shares of the time that have passed after each step, about."""
+_EXPORTED = 0.05  # share of the time that has passed after the export, about
+_GATHERED = 0.6  # share after the judge's examples
+_JUDGED = 0.85  # share after the judge's fit
+_LANES_SEEN = 0.99  # share after the lane score's examples
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +102,7 @@ def ship(order: Order, tell: Share) -> Path:
     _check(order)
     folder = Path("runs") / f"ship-{_state(order)}"
     folder.mkdir(parents=True, exist_ok=True)
-    for name in (file for kept in order.keep for file in _KEPT_FILES[kept] if kept != "network"):
+    for name in (file for part in order.keep for file in _KEPT_FILES[part] if part != "network"):
         _copy(order.folder / name, folder / name)
     _export(order, folder, tell)
     if not (folder / weights.JUDGE_FILE.name).is_file():
@@ -137,7 +136,7 @@ def _check(order: Order) -> None:
             raise ConfigError(f"--{option}-images {images}: give {_LEAST_IMAGES} or more")
     if "network" in order.keep and order.precision != Precision.int8.value:
         raise ConfigError("--keep network keeps a rounded file: leave out --precision, or --keep network")
-    for name in (file for kept in order.keep for file in _KEPT_FILES[kept]):
+    for name in (file for part in order.keep for file in _KEPT_FILES[part]):
         if not (order.folder / name).is_file():
             raise ConfigError(f"{order.folder / name}: no such file to keep; leave out --keep to fit it")
 
@@ -146,7 +145,7 @@ def _state(order: Order) -> str:
     """A name for all that the files depend on."""
     said = f"{order.precision} {order.judge_images} {order.lane_images} {sorted(order.keep)}"
     digest = hashlib.sha256(said.encode() + order.network.read_bytes())
-    for name in (file for kept in order.keep for file in _KEPT_FILES[kept]):
+    for name in (file for part in order.keep for file in _KEPT_FILES[part]):
         digest.update((order.folder / name).read_bytes())
     for package in _CODE:
         for path in sorted((_ROOT / package).rglob("*.py")) + sorted((_ROOT / package).rglob("*.yaml")):
@@ -156,7 +155,8 @@ def _state(order: Order) -> str:
 
 def _export(order: Order, folder: Path, tell: Share) -> None:
     """Write the network that runs on the vehicle and, unless it was rounded before, that of float32."""
-    network, source = folder / weights.NETWORK_FILE.name, order.network
+    network = folder / weights.NETWORK_FILE.name
+    source = order.network
     if network.is_file():
         return
     if source.suffix == ".onnx" and read_exported(source).label.get("precision", "float32") != "float32":

@@ -20,7 +20,7 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).parents[2]
 TABLE = ROOT / "docs" / "installed_parts.csv"
 EXTRAS = ("", "map", "ros", "ubx", "video", "gis", "parquet", "text", "pdf")
-"""What users install, by extra; the first is the base install."""
+"""Extras that users install; the first is the base install."""
 
 _HEADS = ("package", "version", "licence", "installed by")
 _LONGEST = 160  # letters of a licence; some packages state its whole text
@@ -36,7 +36,7 @@ class Part(NamedTuple):
 
 
 def parts() -> list[Part]:
-    """What is installed of all extras, by name."""
+    """The installed packages of all extras, by name."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     found: dict[str, Part] = {}
     for extra in EXTRAS:

@@ -90,7 +90,7 @@ def _mean(values: Sequence[float], digits: int) -> str:
 
 
 def finite(values: Iterable[float]) -> tuple[float, ...]:
-    """Those of some values that are known."""
+    """The known values."""
     return tuple(value for value in values if not math.isnan(value))
 
 

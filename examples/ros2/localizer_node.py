@@ -27,7 +27,7 @@ def make(kind: str, **fields: Any) -> Any:
 
 
 class Place:
-    """What the node does with messages: images and odometry in, a pose and a status out."""
+    """A node's work on messages: images and odometry come in, a pose and a status go out."""
 
     def __init__(self, result: Path) -> None:
         calibrations = trusted_calibrations(result)

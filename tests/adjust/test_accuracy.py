@@ -36,7 +36,7 @@ STEP = 1e-5
 
 
 def state_covariance(scene):
-    """Of all frames' states (6J, 6J)."""
+    """The prior covariance (6J, 6J) of all frames' states."""
     sigma, poses = scene.problem.pose_sigma, scene.problem.map_from_vehicle
     steps_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     driven_m = np.concatenate([[0.0], np.cumsum(steps_m)])

@@ -40,7 +40,7 @@ MODELS = [((), False), ((), True), (("roll", "pitch"), True), (POSE_STATES, Fals
 
 @pytest.fixture(params=["C++", "numba"], scope="module", autouse=True)
 def compiler(request):
-    """What has compiled the kernels."""
+    """Each test runs with kernels compiled by either compiler."""
     if request.param == "C++":
         if native.kernels() is None:
             pytest.skip(native.which_runs())

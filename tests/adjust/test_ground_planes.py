@@ -1,4 +1,4 @@
-"""What texture shows of the ground is one more observation of a mounting, as sure as it says."""
+"""The ground that texture shows is one more observation of a mounting, as sure as it says."""
 
 from dataclasses import replace
 

@@ -69,7 +69,7 @@ def grow(problem, options=PAPER):
 
 
 def farthest(grown, problem, options):
-    """Of all corners' coordinates, how far from the batch optimum at most, in standard deviations."""
+    """The largest distance of a corner's coordinate from the batch optimum, in standard deviations."""
     best = solve(problem, options)
     groups = np.arange(problem.corner_count).reshape(-1, 4)
     sigma = np.sqrt(np.diagonal(best.corner_covariance(groups), axis1=1, axis2=2))

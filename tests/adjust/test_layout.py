@@ -210,7 +210,7 @@ def cost_in_a_fresh_process(before="", after=""):
 
 
 def said_by(program):
-    """What a program says on stdout, and that it says nothing else."""
+    """The output of a program, which must succeed and say nothing on stderr."""
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-c", program]
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)

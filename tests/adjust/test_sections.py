@@ -10,10 +10,12 @@ from tests.adjust.scene import make_scene, with_ground, with_late_clocks
 from tests.adjust.site import DRIFTING
 from tests.adjust.test_sessions import joined, visited_again
 from v2hdm.adjust import ControlPoints, KnownLengths, Problem, SolveOptions, solve
+from v2hdm.adjust.sections import solve as rounds
 from v2hdm.adjust.sections.blocks import BlockMatrix, BlockPattern
 from v2hdm.adjust.sections.parts import Part, cut
-from v2hdm.adjust.sections.solve import Shape, finish_parts, join_parts, save_part
+from v2hdm.adjust.sections.solve import Shape, finish_parts, fit_parts, join_parts, save_part
 from v2hdm.adjust.sections.way import parts_of_way
+from v2hdm.adjust.whitening import factorise
 from v2hdm.errors import AdjustError
 
 
@@ -215,6 +217,61 @@ def test_drives_whose_poses_contradict_each_other_end_in_one_line(tmp_path):
     ) as refused:
         in_sections(tmp_path, problem, SolveOptions(), np.repeat([0, 1], 80))
     assert "\n" not in str(refused.value)
+
+
+def from_their_optimum(part: Part, options: SolveOptions) -> Part:
+    """The part, whose problem starts where a solve of itself ends."""
+    alone = solve(part.problem, options)
+    return replace(
+        part,
+        problem=replace(
+            part.problem,
+            cam_from_vehicle=alone.cam_from_vehicle,
+            poses_start=alone.map_from_vehicle,
+            corners_start=alone.corners_map,
+        ),
+    )
+
+
+def test_drives_that_contradict_each_other_do_so_from_their_own_optima(tmp_path):
+    scene = make_scene(3, frames=80, start_error_deg=0.5)
+    again = visited_again(scene, DRIFTING, 5)
+    off = again.problem.map_from_vehicle.copy()
+    off[:, :2, 3] += 0.5
+    problem = joined(scene.problem, replace(again.problem, map_from_vehicle=off))
+    options = SolveOptions()
+    parts, links = cut(problem, np.repeat([0, 1], 80), tuple(options.pose_states))
+    for number, part in enumerate(parts):
+        save_part(tmp_path, number, from_their_optimum(part, options))
+    with pytest.raises(AdjustError, match=r"the drives contradict each other, .* chi-square 1\d for"):
+        fit_parts(
+            tmp_path, 2, links, Shape.of(problem, options), lambda number, part, solution: None,
+            at_once=0, are_near=True,
+        )  # fmt: skip
+
+
+def test_rounds_go_on_from_a_whitening_of_an_earlier_one(tmp_path, monkeypatch):
+    """A part is whitened where it starts, after the long first step, and for its covariances."""
+    scene = make_scene(3, frames=100, jitter=DRIFTING, outliers=0.03, start_error_deg=0.5)
+    options = SolveOptions()
+    parts, links = cut(scene.problem, np.arange(100) // 50, tuple(options.pose_states))
+    for number, part in enumerate(parts):
+        save_part(tmp_path, number, from_their_optimum(part, options))
+    whitened = []
+
+    def counted(*inputs):
+        whitened.append(inputs)
+        return factorise(*inputs)
+
+    monkeypatch.setattr(rounds, "factorise", counted)
+    shape = Shape.of(scene.problem, options)
+    joint = join_parts(
+        tmp_path, 2, links, shape, lambda number, part, solution: None, at_once=0, are_near=True
+    )
+    assert joint.rounds > 3
+    assert len(whitened) <= 2 * 3
+    check(finish_parts(tmp_path, joint, shape, finish), scene.problem, options)
+    assert len(whitened) <= 2 * 3
 
 
 def test_a_single_section_is_the_street(tmp_path):

@@ -57,7 +57,7 @@ STREET = {"seed": 14, "frames": 80, "turn_deg_per_m": 8.0, "prior_sigma_m": 0.01
 
 @pytest.mark.parametrize("name", ["native", "torch"])
 def test_the_residual_is_that_of_each_row_s_own_pose(name):
-    """Of poses that err, a clock that is off and a read-out time that is not the stated one."""
+    """The poses err, the clock is off, and the read-out time is not the stated one."""
     scene = rolling(READ_OUT_S, **STREET)
     problem = replace(scene.problem, read_out_s=READ_OUT_S - 0.01)
     seen, rng = problem.observations, np.random.default_rng(1)

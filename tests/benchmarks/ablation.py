@@ -1,4 +1,4 @@
-"""What each part of the detector of markings earns: switched off one at a time on scenes of unseen seeds.
+"""The worth of each part of the detector of markings, switched off one at a time on scenes of unseen seeds.
 
     python -m tests.benchmarks.ablation [--images 60] [--only PATTERN] [--verdict FIRST LAST]
                                         [--faults NAME ...] [--site FIRST LAST] [--drives FOLDER ...]
@@ -351,7 +351,7 @@ def _without_kind(kind: int) -> Callable[[], AbstractContextManager[Any]]:
 
 @dataclass
 class Mapped:
-    """What maps of several drives have."""
+    """Counts over the maps of several drives."""
 
     markings: int = 0
     false: int = 0

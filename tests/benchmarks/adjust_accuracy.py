@@ -59,7 +59,7 @@ _CHI2_95 = 5.991
 
 @dataclass(frozen=True)
 class Honesty:
-    """Of one drive: mean NEES per degree of freedom and share within the 95 % region, by kind of unknown."""
+    """Mean NEES per degree of freedom of one drive, and share within the 95 % region, by kind of unknown."""
 
     corner_nees: float
     corner_coverage: float

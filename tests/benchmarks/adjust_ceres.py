@@ -40,7 +40,7 @@ class CeresOptions:
 
 @dataclass(frozen=True)
 class PeerResult:
-    """What came of it; times in s, ``cpu_s`` that of the solve; ``steps`` taken or tried."""
+    """A peer's solution; times in s, ``cpu_s`` that of the solve; ``steps`` taken or tried."""
 
     setup_s: float
     solve_s: float

@@ -71,7 +71,7 @@ def grow(problem: Problem, markings: list[Sighted]) -> Growth:
 
 
 def largest_distance(best: Solution, growth: Growth) -> float:
-    """Of all corners' coordinates, the farthest from the batch optimum, in standard deviations."""
+    """The largest distance of a corner's coordinate from the batch optimum, in standard deviations."""
     count = len(growth.corners_map)
     groups = np.arange(CORNERS * count).reshape(count, CORNERS)
     sigma = np.sqrt(np.diagonal(best.corner_covariance(groups), axis1=1, axis2=2))

@@ -49,7 +49,7 @@ class NativeOptions:
 
 @dataclass(frozen=True)
 class NativeResult:
-    """What came of it; times in s, but for ``setup_s`` those of ceres::Solve; ``steps`` taken or tried."""
+    """A solution by Ceres; times in s, but for ``setup_s`` of ceres::Solve; ``steps`` taken or tried."""
 
     setup_s: float
     solve_s: float

@@ -52,7 +52,7 @@ SCIPY_LIMIT = 120_000
 """Observations above which SciPy takes minutes: its steps solve the whole system iteratively."""
 
 CERES_POSES_LIMIT = 400_000
-"""Of a million observations' frame poses CHOLMOD finds pycolmap's matrix not positive, over and over."""
+"""Observations above which pycolmap with frame poses fails: CHOLMOD finds its matrix not positive."""
 
 SAME_COST = 1e-8
 """Share of the cost by which a linear solver may miss the optimum and still count as a peer."""
@@ -131,7 +131,7 @@ def scipy_trf(problem: Problem) -> Row:
     assert problem.corners_start is not None
 
     def residuals(x: np.ndarray) -> np.ndarray:
-        """Of all observations, then of the priors; x holds turn and centre of each camera, then corners."""
+        """Residuals of all observations, then priors; x holds each camera's turn and centre, then corners."""
         turn, centre = x[: 6 * cameras].reshape(-1, 2, 3).transpose(1, 0, 2)
         corner = x[6 * cameras :].reshape(-1, 2)[seen.corner]
         ground = np.column_stack([corner, np.zeros(len(corner)), np.ones(len(corner))])

@@ -1,4 +1,4 @@
-"""What the poses and the survey of the rendered ports allow, whatever the detector: no image is rendered.
+"""The accuracy that poses and survey of the rendered ports allow any detector: no image is rendered.
 
 ``python -m tests.benchmarks.adjust_ports [run ...] [--drives N]`` drives each port's route with its cameras,
 and with the errors of poses and survey that its configuration states, past diamonds of this benchmark,

@@ -45,7 +45,7 @@ CONDITIONS: dict[str, dict[str, Any]] = {
         "exposure": {"exposure_s": 0.006, "level": 0.07, "full_well_electrons": 1500.0, "read_noise": 0.006},
     },
 }
-"""What each condition changes of a port."""
+"""Changes of a port by each condition."""
 
 
 def port_of(run: str, seed: int, condition: str, length_m: float) -> PortConfig:
@@ -102,7 +102,7 @@ def longer_m(mapping: Mapped) -> float:
 
 
 def shift_errors(mapping: Mapped) -> FloatArray:
-    """Of the shift (2,) that markings share: their median, squared, in sigmas of a marking's centre."""
+    """The squared median shift (2,) that markings share, in sigmas of a marking's centre."""
     off_m = np.median((mapping.corners - mapping.true).reshape(-1, 4, 2).mean(axis=1), axis=0)
     of_centres_m2 = [
         np.diagonal(marking.covariance_m2.reshape(4, 2, 4, 2).mean(axis=(0, 2)))

@@ -121,7 +121,7 @@ def containers(drive: Path) -> dict[str, Callable[[Path], Path]]:
 
 
 def map_of(path: Path, output: Path, workers: int) -> Mapped:
-    """What ``v2hdm.map drive.path=PATH`` makes of it."""
+    """The result of ``v2hdm.map drive.path=PATH``."""
     config = RunConfig(
         name="drive", drive=DriveConfig(path=str(path), cache=str(output / "cache")),
         output=str(output), cache=str(output / "cache"), workers=workers,

@@ -84,7 +84,7 @@ def peer_graph(name: str) -> Callable[[], None]:
 
 
 def peak_memory_mb(images: Path, calibration: Path, model: str | None) -> float:
-    """What the on-vehicle process holds at most, by its own count."""
+    """The on-vehicle process's peak memory, by its own count."""
     command = [sys.executable, "-m", "v2hdm.detect", str(images), "--camera", str(calibration)]
     command += ["--model", model] if model else []
     done = subprocess.run(command, capture_output=True, text=True, check=True)

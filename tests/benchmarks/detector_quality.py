@@ -37,7 +37,7 @@ some other camera depends on that."""
 
 
 class Tally:
-    """What has been counted so far."""
+    """Counts of detections so far."""
 
     def __init__(self) -> None:
         self.scored: dict[str, list[tuple[float, bool]]] = defaultdict(list)
@@ -166,7 +166,7 @@ def main() -> None:
 
 
 def counted(examples: Iterable[Example], model: str | None) -> Tally:
-    """What a detector with a network (None: the shipped one) makes of examples."""
+    """The detections of a network (None: the shipped one) on examples, counted."""
     options = DetectorOptions(model=model, max_range_m=24.0, min_confidence=ANY_CONFIDENCE)
     detector = Detector.load(options=options)
     tally = Tally()

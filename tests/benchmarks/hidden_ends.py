@@ -117,7 +117,7 @@ def found_on(
 def visible_ends(
     view: View, reference: Reference, hidden: Sequence[FloatArray], detections: Sequence[MarkingDetection]
 ) -> Iterator[bool]:
-    """Of the ends of found dashes that an image shows, whether they are called hidden."""
+    """Whether the ends of mapped dashes that an image shows are called hidden, end by end."""
     dashes = [detection for detection in detections if detection.kind == LANE_DASH]
     for painted in reference.markings:
         if painted.kind != LANE_DASH or view.range_m(painted.centre_map) > MAX_RANGE_M:
@@ -128,7 +128,7 @@ def visible_ends(
 
 
 def ends_of_drive(result: Result, reference: Reference) -> list[bool]:
-    """Of all visible ends of a mapped drive's dashes, whether they are called hidden."""
+    """Whether the visible ends of a drive's mapped dashes are called hidden, end by end."""
     ends: list[bool] = []
     for index, view in enumerate(views_of_images(result)):
         placed = replace(view, cam_from_map=reference.cam_from_map.get(index, view.cam_from_map))

@@ -22,7 +22,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -47,6 +47,7 @@ from v2hdm.localization.seeing import Look
 from v2hdm.records import FloatArray, HDMap, IntArray, Marking
 
 PORTS = ("port1", "port2")
+_PARTS = ("starts", "wrong", "moved", "pushed", "antenna", "slow", "gaps")  # of --only; all by default
 _ROUGH_M, _ROUGH_RAD = 5.0, np.deg2rad(20.0)
 _SQUARE_95 = 5.991  # chi-square quantile of two coordinates
 _WRONG_M = 0.3  # a tracked pose so far off is confidently wrong
@@ -74,7 +75,7 @@ class Run(NamedTuple):
 
 
 class Errors(NamedTuple):
-    """Of tracked poses (K)."""
+    """Errors and bounds of K tracked poses."""
 
     errors: FloatArray  # (K, 3) ahead, left, m, and heading, rad
     bounds: FloatArray  # (K, 3)
@@ -129,7 +130,7 @@ class _Part(NamedTuple):
 
 
 def _looked_at(localizer: Localizer, look: Look) -> _Part:
-    """What an image shows where the localiser has it looked at."""
+    """The part of an image's look that the localiser asks for."""
     _, regions_px, is_all_later = localizer.glance(look.camera, look.stamp_s)
     if regions_px is None:
         return _Part(look, is_all_later)
@@ -327,7 +328,7 @@ def slow_line(driven: LiveDrive, rng: np.random.Generator, seed: int) -> str:
 
 
 class Alarms(NamedTuple):
-    """What was said of a right drive from when it was tracked on."""
+    """False alarms on a right drive from when it was first tracked."""
 
     lost: int  # times that it was lost
     turned: int  # cameras that were named
@@ -335,7 +336,7 @@ class Alarms(NamedTuple):
 
     @classmethod
     def of(cls, run: Run) -> Alarms:
-        """Those of a run."""
+        """The alarms of a run."""
         tracked = [number for number, pose in enumerate(run.poses) if pose.status == Status.TRACKING]
         poses = run.poses[tracked[0] :] if tracked else run.poses
         is_lost = [pose.status == Status.LOST for pose in poses]
@@ -434,75 +435,103 @@ def short_drive(name: str, seed: int) -> Errors:
     return errors_of(driven, Run(run.poses[-1:], run.frames[-1:], run.cpu_s))
 
 
-def main() -> None:
-    """Run the benchmark and print its lines."""
+def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--starts", type=int, default=40, help="of each drive")
-    parser.add_argument(
-        "--only",
-        nargs="*",
-        default=[],
-        metavar="PART",
-        help="starts, wrong, moved, pushed, antenna, slow, gaps",
-    )
+    parser.add_argument("--only", nargs="*", default=[], metavar="PART", help=", ".join(_PARTS))
     full = "of so many images one is searched as a whole, the others where the map expects markings"
     parser.add_argument("--every-full", type=int, default=1, help=full)
     parser.add_argument("--short", type=int, default=0, help="short drives of each port, and nothing else")
-    parsed = parser.parse_args()
+    return parser.parse_args()
+
+
+@dataclass
+class _Totals:
+    """Results of all drives together; starts are counted as :func:`starts` counts them."""
+
+    errors: list[Errors] = field(default_factory=list)
+    alarms: list[Alarms] = field(default_factory=list)
+    images: int = 0
+    cpu_s: list[float] = field(default_factory=list)
+    known_starts: IntArray = field(default_factory=lambda: np.zeros(4, dtype=np.int64))
+    unknown_starts: IntArray = field(default_factory=lambda: np.zeros(4, dtype=np.int64))
+    gaps: dict[bool, list[Gap]] = field(default_factory=lambda: {True: [], False: []})
+
+    def add(self, driven: LiveDrive, run: Run) -> None:
+        """Count a drive that was followed from its start to its end."""
+        self.errors.append(errors_of(driven, run))
+        self.alarms.append(Alarms.of(run))
+        self.images += len(run.poses)
+        self.cpu_s.append(run.cpu_s)
+
+    def lines(self) -> list[str]:
+        """The summary."""
+        known = self.known_starts
+        unknown = self.unknown_starts
+        of_gaps = {"with lines": self.gaps[True], "without lines": self.gaps[False]}
+        return [
+            f"all: {tracking_line(self.errors, self.images, float(np.mean(self.cpu_s)))}",
+            alarm_line(self.alarms, self.images / RATE_HZ),
+            *(gap_line(of_drives, name) for name, of_drives in of_gaps.items() if of_drives),
+            f"starts from 5 m and 20 deg: {known[0]} right, {known[1]} wrong, {known[2]} none in 3 s, "
+            f"{known[3]} called the map wrong",
+            f"starts from nothing: {unknown[0]} right, {unknown[1]} wrong, {unknown[2]} none within 30 m, "
+            f"{unknown[3]} called the map wrong",
+        ]
+
+
+def _try_parts(
+    driven: LiveDrive,
+    other: HDMap,
+    rng: np.random.Generator,
+    seed: int,
+    parsed: argparse.Namespace,
+    totals: _Totals,
+) -> None:
+    """Try the chosen parts on one drive; ``other`` is the map of the other port."""
+    parts = parsed.only or _PARTS
+    if "starts" in parts:
+        totals.known_starts += starts(driven, parsed.starts, rng, known=True)
+        totals.unknown_starts += starts(driven, max(parsed.starts // 4, 1), rng, known=False)
+    if "wrong" in parts:
+        print(f"  {wrong_map_line(driven, other, rng, parsed.every_full)}", flush=True)
+    if "moved" in parts:
+        print(f"  {repainted_line(driven, rng, seed, parsed.every_full)}", flush=True)
+    if "pushed" in parts:
+        print(f"  {pushed_line(driven, rng, seed, parsed.every_full)}", flush=True)
+    if "antenna" in parts:
+        print(f"  {antenna_line(driven, rng)}", flush=True)
+    if "slow" in parts:
+        print(f"  {slow_line(driven, rng, seed)}", flush=True)
+    if "gaps" in parts:
+        for has_lines, of_drives in totals.gaps.items():
+            of_drives += gaps(driven, rng, has_lines)
+
+
+def main() -> None:
+    """Run the benchmark and print its lines."""
+    parsed = _arguments()
     if parsed.short:
         seeds = range(parsed.first, parsed.first + parsed.short)
         ends = [short_drive(name, seed) for seed in seeds for name in PORTS]
         print(f"ends of short drives: {tracking_line(ends, len(ends), 0.0)}")
         return
-    parts, alarms, counts, cpu_s = [], [], 0, []
-    totals = np.zeros((2, 4), dtype=np.int64)
-    gap_ends: dict[bool, list[Gap]] = {True: [], False: []}
+    totals = _Totals()
     for seed in range(parsed.first, parsed.first + parsed.seeds):
-        driven = {name: drive(port_recipe(name, seed), seed, parsed.seconds) for name in PORTS}
-        for name, own in driven.items():
+        drives = {name: drive(port_recipe(name, seed), seed, parsed.seconds) for name in PORTS}
+        for name, driven in drives.items():
             rng = np.random.default_rng([seed, 99])
-            frames = range(len(own.stamp_s))
-            run = follow(own, rough(own, 0, rng), frames, every_full=parsed.every_full)
-            alarms.append(Alarms.of(run))
-            parts.append(errors_of(own, run))
-            counts += len(run.poses)
-            cpu_s.append(run.cpu_s)
-            print(f"{name}, seed {seed}: {tracking_line(parts[-1:], len(run.poses), run.cpu_s)}", flush=True)
-            only = parsed.only
-            if not only or "starts" in only:
-                totals[0] += starts(own, parsed.starts, rng, known=True)
-                totals[1] += starts(own, max(parsed.starts // 4, 1), rng, known=False)
-            if not only or "wrong" in only:
-                other = driven[PORTS[1 - PORTS.index(name)]].hd_map
-                print(f"  {wrong_map_line(own, other, rng, parsed.every_full)}", flush=True)
-            if not only or "moved" in only:
-                print(f"  {repainted_line(own, rng, seed, parsed.every_full)}", flush=True)
-            if not only or "pushed" in only:
-                print(f"  {pushed_line(own, rng, seed, parsed.every_full)}", flush=True)
-            if not only or "antenna" in only:
-                print(f"  {antenna_line(own, rng)}", flush=True)
-            if not only or "slow" in only:
-                print(f"  {slow_line(own, rng, seed)}", flush=True)
-            if not only or "gaps" in only:
-                for has_lines, of_drives in gap_ends.items():
-                    of_drives += gaps(own, rng, has_lines)
-    print(f"all: {tracking_line(parts, counts, float(np.mean(cpu_s)))}")
-    print(alarm_line(alarms, counts / RATE_HZ))
-    for has_lines, of_drives in gap_ends.items():
-        if of_drives:
-            print(gap_line(of_drives, "with lines" if has_lines else "without lines"))
-    print(
-        f"starts from 5 m and 20 deg: {totals[0, 0]} right, {totals[0, 1]} wrong, "
-        f"{totals[0, 2]} none in 3 s, "
-        f"{totals[0, 3]} called the map wrong"
-    )
-    print(
-        f"starts from nothing: {totals[1, 0]} right, {totals[1, 1]} wrong, {totals[1, 2]} none within 30 m, "
-        f"{totals[1, 3]} called the map wrong"
-    )
+            start = rough(driven, 0, rng)
+            run = follow(driven, start, range(len(driven.stamp_s)), every_full=parsed.every_full)
+            totals.add(driven, run)
+            line = tracking_line(totals.errors[-1:], len(run.poses), run.cpu_s)
+            print(f"{name}, seed {seed}: {line}", flush=True)
+            other = drives[PORTS[1 - PORTS.index(name)]].hd_map
+            _try_parts(driven, other, rng, seed, parsed, totals)
+    print("\n".join(totals.lines()))
 
 
 if __name__ == "__main__":

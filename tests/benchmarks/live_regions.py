@@ -1,4 +1,4 @@
-"""What looks at parts of an image save on the vehicle, and what they cost in accuracy.
+"""The time that looks at parts of an image save on the vehicle, and the accuracy that they cost.
 
     python -m tests.benchmarks.live_regions DRIVE --images 160 --every-full 1 5 [--seconds 60]
 

@@ -1,4 +1,4 @@
-"""What a map of docs/own-class's port is worth, class by class.
+"""The score of a map of docs/own-class's port, class by class.
 
     python -m tests.benchmarks.own_class_score outputs/ownport
 

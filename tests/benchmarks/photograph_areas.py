@@ -1,4 +1,4 @@
-"""What the network sees of stop lines, crosswalks, words and boxes on labelled photographs.
+"""Stop lines, crosswalks, words and boxes on labelled photographs, as far as the network sees them.
 
     python -m tests.benchmarks.photograph_areas LABELS.json IMAGES --stop-lines LIST.json [--model FILE]
         [--role validation]

@@ -138,7 +138,7 @@ def edge_offsets(
 
 
 def _visible(edges: Edges, view: View, hidden: Sequence[FloatArray]) -> Edges:
-    """Those well inside the image, near and not hidden."""
+    """The edges well inside the image, near and not hidden."""
     at_px = view.project(edges.points_map)
     limit = np.array([view.info.width, view.info.height]) - 1 - _BORDER_PX
     seen = ((at_px > _BORDER_PX) & (at_px < limit)).all(axis=1)

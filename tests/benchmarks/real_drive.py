@@ -73,7 +73,7 @@ class Shown:
 
 @dataclass
 class ImageResult:
-    """What one image says: ``on`` pairs markings of the reference with the class of a detection on them."""
+    """One image's result: ``on`` pairs markings of the reference with the class of a detection on them."""
 
     shown: list[Shown] = field(default_factory=list)
     on: list[tuple[int, str]] = field(default_factory=list)
@@ -304,7 +304,7 @@ def map_summary(
     reference: Reference,
     tally: Tally,
 ) -> str:
-    """What of the reference the map holds, what is missing and why, and what of the map is false.
+    """Lines on the reference's markings that the map holds, those missing and why, and false markings.
 
     ``mapped`` are class and polygon (N, 2), m, of each marking and symbol of the map.
     """

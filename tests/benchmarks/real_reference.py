@@ -1,4 +1,4 @@
-"""What is painted on a real road, for :mod:`tests.benchmarks.real_drive`: read from a file that people drew.
+"""The paint of a real road, for :mod:`tests.benchmarks.real_drive`: read from a file that people drew.
 
 A reference never comes from a map of our own: what the map lacks would be missing in it, too.
 """

@@ -81,7 +81,7 @@ _REFUSED, _CRASHED = "refused", "CRASHED"
 
 @dataclass(frozen=True)
 class Row:
-    """What became of one drive.
+    """The outcome of one drive.
 
     ``tests`` are the score tests: kind, p-value, value, sigma. ``errors`` are squared, in sigmas, by
     quantity. ``height_rmse_m`` is of the corners' heights, ``height_scatter_m`` the same about their mean.
@@ -110,7 +110,7 @@ class Row:
 
     @property
     def first(self) -> str:
-        """What was said first."""
+        """The first finding."""
         return _sentence(self.findings[0]) if self.findings else "-"
 
 
@@ -144,7 +144,7 @@ class Job:
 
     @property
     def recipe(self) -> Recipe:
-        """What is drawn for it."""
+        """The recipe that is drawn for it."""
         drawn = draw(self.seed, self.route)
         if self.apart_s:
             drawn = drawn.in_turn(self.apart_s)
@@ -271,7 +271,7 @@ def _sentence(finding: dict[str, Any]) -> str:
 
 
 def _clause(finding: dict[str, Any]) -> str:
-    """What a finding names, without the recovery, which may speak of other causes."""
+    """A finding's name and cause, without the recovery, which may speak of other causes."""
     return f"{finding['check']} {finding['says'].split(': ')[0]}"
 
 
@@ -300,7 +300,7 @@ def _read_outs(row: Row) -> str:
 
 
 class Judgement(NamedTuple):
-    """What becomes of the user of a spoilt map, as the docstring of this file defines it."""
+    """The judgement of a spoilt map for its user, as the docstring of this file defines it."""
 
     wrong: bool
     told: bool
@@ -322,7 +322,7 @@ class Judgement(NamedTuple):
 
 
 def judge(row: Row, clean: Row) -> Judgement:
-    """What is said of a spoilt drive, beside what is said of the ``clean`` one."""
+    """Judge a spoilt drive beside the ``clean`` one."""
     spoil = (SPOILS | RELIEFS)[row.spoil]
     wrong = not row.rmse_m <= RIGHT_FACTOR * clean.rmse_m
     said = _said(row.findings, clean.findings, spoil.cause)
@@ -342,7 +342,7 @@ def judge(row: Row, clean: Row) -> Judgement:
 def _said(
     findings: Sequence[dict[str, Any]], of_clean: Sequence[dict[str, Any]], cause: str | None
 ) -> list[str]:
-    """What findings name, without those that the clean drive has as well and that are not the cause."""
+    """Clauses of findings, without those that the clean drive has as well and that are not the cause."""
     usual = {(finding["check"], finding["status"], finding.get("about")) for finding in of_clean}
     clauses = [(finding, _clause(finding)) for finding in findings]
     return [

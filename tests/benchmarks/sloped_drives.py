@@ -1,4 +1,4 @@
-"""What the mapping makes of ground that is not level: copies of a rendered drive, mapped and judged.
+"""Maps of ground that is not level: copies of a rendered drive, mapped and judged.
 
 ``python -m tests.benchmarks.sloped_drives DRIVE [--copies FOLDER] [--only NAME ...]`` maps a rendered drive
 folder as it is and in copies with the same images: its world tilted as a whole, raised, with noisy heights,

@@ -35,7 +35,7 @@ LEAST_HIDDEN_M = 0.25  # length of paint behind a box from which an end counts a
 
 
 class ShownEnd(NamedTuple):
-    """What images show beyond an end of a dash."""
+    """The evidence of images beyond an end of a dash."""
 
     seed: int
     hidden: bool

@@ -73,14 +73,14 @@ def in_order_of(corners: FloatArray, other: FloatArray) -> FloatArray:
 
 
 def corner_errors(mapped: Sequence[Marking], true: FloatArray) -> FloatArray:
-    """Of every corner of markings (M,), squared and in sigmas; chi-square of two degrees of freedom."""
+    """Squared errors of markings' (M,) corners, in sigmas; chi-square of two degrees of freedom."""
     assert all(marking.covariance_m2 is not None for marking in mapped)
     pairs = zip(mapped, true, strict=True)
     return squared_in_sigmas(mapped, [replace(marking, corners_map=corners) for marking, corners in pairs])
 
 
 def side_errors(mapped: Sequence[Marking], true: FloatArray) -> FloatArray:
-    """Of every side's length."""
+    """Squared errors of every side's length, in sigmas."""
     out = []
     for marking, corners in zip(mapped, true, strict=True):
         assert marking.covariance_m2 is not None
@@ -96,7 +96,7 @@ def side_errors(mapped: Sequence[Marking], true: FloatArray) -> FloatArray:
 
 
 def distance_errors(mapped: Sequence[Marking], true: FloatArray) -> FloatArray:
-    """Of the distances between the centres of markings about 10 m apart, by their relative sigmas."""
+    """Squared errors of distances between centres of markings about 10 m apart, in their relative sigmas."""
     centres = np.array([marking.corners_map.mean(axis=0) for marking in mapped])
     true_centres = true.mean(axis=1)
     sigma = np.array([marking.relative_sigma_m or np.nan for marking in mapped])
@@ -110,7 +110,7 @@ def distance_errors(mapped: Sequence[Marking], true: FloatArray) -> FloatArray:
 
 
 def camera_errors(found: Calibration, true: FloatArray) -> FloatArray:
-    """Of a camera's height, roll, pitch and yaw (4,)."""
+    """Squared errors of a camera's height, roll, pitch and yaw (4,), in sigmas."""
     assert found.covariance is not None
     off = found.cam_from_vehicle @ np.linalg.inv(true)
     turn = Rotation.from_matrix(off[:3, :3]).as_rotvec()

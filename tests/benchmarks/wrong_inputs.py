@@ -66,7 +66,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Row:
-    """What became of one fault on one drive."""
+    """The outcome of one fault on one drive."""
 
     drive: str
     fault: str

@@ -1,4 +1,4 @@
-"""What a network that knows all classes says of shapes on the ground, drawn from the truth."""
+"""The output of a network that knows all classes for shapes on the ground, drawn from the truth."""
 
 import cv2
 import numpy as np

@@ -237,7 +237,7 @@ def boundaries_of(
 
 
 def anchors_of(view: RoadCamera, lines_px: list[np.ndarray], hidden: slice = slice(0, 0)) -> list[AnchorRow]:
-    """What a perfect network says of lines (N, 2), near to far, except on the ``hidden`` anchors."""
+    """A perfect network's anchors of lines (N, 2), near to far, except the ``hidden`` ones."""
     rows = []
     for v in np.arange(view.info.height - 4.5, view.top, -STRIDES["lanes"]):
         u = []

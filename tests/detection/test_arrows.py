@@ -1,4 +1,4 @@
-"""What is named an arrow and is none: sizes and directions on the ground."""
+"""Shapes that are named arrows and are none: sizes and directions on the ground."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What sets paint off from bare ground: pieces over made roads with lines, edges and seams."""
+"""Paint stands out from bare ground: pieces over made roads with lines, edges and seams."""
 
 from __future__ import annotations
 

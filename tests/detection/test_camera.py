@@ -5,8 +5,6 @@ import pytest
 
 from tests.detection.pictures import LENSES, extrinsic, make_camera, to_image
 from v2hdm.detection.camera import FARTHEST_M, RoadCamera, camera_from_calibration, rough_calibration
-from v2hdm.detection.detector import Detector
-from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic
 from v2hdm.geometry.lens import distort_points, undistort_points
@@ -164,11 +162,8 @@ def test_a_calibration_that_cannot_be_right_is_refused(change, words):
         camera_from_calibration(Calibration(CameraInfo(**info), cam_from_vehicle))
 
 
-def test_a_map_is_made_from_whole_pixels_farther_down_than_a_single_look():
-    camera = camera_from_calibration(rough_calibration("front", 1280, 720, 2.0, 10.0, 60.0))
-    look = Detector.load().road_camera(camera)
-    mapping = Detector.load(options=DetectorOptions.for_mapping()).road_camera(camera)
-    for view, width_m in ((look, 0.010), (mapping, 0.007)):
-        assert view.fine_row is not None
-        ends = view.unproject(np.array([[639.0, view.fine_row], [640.0, view.fine_row]]))
-        assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(width_m, rel=0.02)
+def test_half_resolution_begins_where_a_pixel_is_seven_millimetres_of_ground():
+    view = RoadCamera(camera_from_calibration(rough_calibration("front", 1280, 720, 2.0, 10.0, 60.0)), 32)
+    assert view.fine_row is not None
+    ends = view.unproject(np.array([[639.0, view.fine_row], [640.0, view.fine_row]]))
+    assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(0.007, rel=0.02)

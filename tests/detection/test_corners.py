@@ -170,7 +170,7 @@ def test_a_diamond_half_hidden_behind_a_straight_edge_is_not_believed(occluder):
 
 @pytest.mark.parametrize("y", [-0.6, 0.4])
 def test_a_bar_half_hidden_behind_a_dark_edge_has_no_points_there(models, y):
-    """Of an edge like the ground nothing tells but the length, of which a single image knows the class's."""
+    """Only its length tells an edge that looks like ground, and one image knows only the class's length."""
     camera = make_camera("pinhole")
     image = picture(camera, [bar(6.0, y, 0.3, 2.4)], ground=0.2, paint=0.6)
     middle = int(to_image(camera, np.array([[6.0, y]]))[0, 0])

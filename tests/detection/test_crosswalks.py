@@ -8,8 +8,8 @@ from tests.detection.pictures import bar, make_camera, to_image
 from v2hdm.catalogue import SHIPPED
 from v2hdm.detection.areas import find_areas
 from v2hdm.detection.camera import RoadCamera, camera_from_calibration, rough_calibration
-from v2hdm.detection.crosswalks import find_crosswalks, in_rows
-from v2hdm.detection.detector import _of_several
+from v2hdm.detection.crosswalks import continuing_features, find_crosswalks, in_rows
+from v2hdm.detection.detector import Detector, _of_several
 from v2hdm.geometry.rows import IN_IMAGE, MAPPED, rows_of_bars
 from v2hdm.records import MarkingDetection
 
@@ -130,3 +130,41 @@ def test_the_bars_of_an_image_are_its_crosswalk_s_parts():
     ground = RoadCamera(CAMERA, 16).unproject(crosswalk.outline_px)
     np.testing.assert_allclose(np.ptp(ground, axis=0), [2.0, 3.6], atol=0.02)
     assert find_crosswalks(markings[:2], RoadCamera(CAMERA, 16)) == []
+
+
+def painted_bars(places, kind="crosswalk_bar"):
+    """Pieces of paint of which the network says that they are of a class."""
+    output = network_output(CAMERA, [(kind, np.array([bar(8.0, across, 2.0, 0.4)])) for across in places])
+    detector = Detector.load()
+    return detector.propose(output, CAMERA).pieces
+
+
+def crosswalk_of(places, pieces):
+    bars = [to_image(CAMERA, bar(8.0, across, 2.0, 0.4)) for across in places]
+    valid = np.ones(4, dtype=bool)
+    markings = [MarkingDetection("crosswalk_bar", 0.8, px, np.eye(8), valid) for px in bars]
+    ((crosswalk, parts),) = find_crosswalks(markings, RoadCamera(CAMERA, 16), pieces)
+    assert sorted(parts) == list(range(len(places)))
+    return np.ptp(RoadCamera(CAMERA, 16).unproject(crosswalk.outline_px)[:, 1])
+
+
+def test_paint_that_the_network_names_a_bar_continues_a_row():
+    places = (-1.6, -0.8, 0.0)
+    pieces = painted_bars((*places, 0.8, 1.6))
+    assert crosswalk_of(places, ()) == pytest.approx(2.0, abs=0.02)
+    assert crosswalk_of(places, pieces) == pytest.approx(3.6, abs=0.1)
+
+
+@pytest.mark.parametrize(("places", "kind"), [((3.2,), "crosswalk_bar"), ((0.8, 1.6), "lane_line")])
+def test_paint_far_from_a_row_or_of_another_class_does_not_continue_it(places, kind):
+    pieces = painted_bars(places, kind)
+    assert crosswalk_of((-1.6, -0.8, 0.0), pieces) == pytest.approx(2.0, abs=0.02)
+
+
+def test_paint_beyond_and_beside_a_row_is_measured_in_its_steps_and_lengths():
+    centres = BARS.mean(axis=1)
+    ahead = BARS[-1] + [1.25, 0.0]
+    beyond = BARS[-1] + [0.0, 2.0]
+    assert continuing_features(centres, 2.5, BARS[2]) == pytest.approx([1.0, 0.0, 0.0])
+    assert continuing_features(centres, 2.5, ahead) == pytest.approx([1.0, 0.0, np.log(2.0)])
+    assert continuing_features(centres, 2.5, beyond) == pytest.approx([1.0, 2.0, 0.0])

@@ -24,7 +24,7 @@ from tests.detection.pictures import HEIGHT, WIDTH, brightness_model, diamond, e
 from tests.drive.example import make_drive
 from v2hdm.cli.main import run
 from v2hdm.detection import frames
-from v2hdm.detection.detector import Detector
+from v2hdm.detection.detector import Detector, Looked
 from v2hdm.detection.frames import Frame
 from v2hdm.detection.road import RoadDetector, draw_detections
 from v2hdm.detection.stopwatch import TOTAL, Stopwatch, lap
@@ -377,7 +377,7 @@ def test_a_full_standard_output_is_one_line(bench, monkeypatch, capsys):
     assert error.count("\n") == 1
 
 
-@pytest.mark.parametrize("when", ["load", "detect"])
+@pytest.mark.parametrize("when", ["load", "steps"])
 def test_an_interruption_before_the_last_image_is_one_line_and_no_half_a_file(
     bench, tmp_path, monkeypatch, capsys, when
 ):
@@ -427,7 +427,12 @@ def test_arrows_and_whole_lines_are_written_and_drawn_without_corners(bench, mon
     outline = np.array([[300.0, 200.0], [340.0, 200.0], [320.0, 300.0]])
     arrow = MarkingDetection("arrow", 0.9, *nothing, outline)
     line = LaneDetection("lane_boundary", 0.8, np.array([[100.0, 350.0], [200.0, 200.0]]), -1)
-    monkeypatch.setattr(Detector, "detect", lambda *_: ((arrow,), (line,)))
+
+    def looked(*_):
+        yield
+        return Looked((arrow,), (line,), ())
+
+    monkeypatch.setattr(Detector, "steps", looked)
     assert bench.run(bench.folder / "0.png", "--draw", tmp_path) == 0
     (record,) = lines(capsys.readouterr().out)
     assert set(record["markings"][0]) == {"class", "score", "outline_px", "outline_seen", "outline_vehicle"}

@@ -42,7 +42,7 @@ compiled = pytest.mark.skipif(native.kernels() is None, reason=native.which_runs
 
 
 def twice(function):
-    """What a function gives with the kernels, and what with numpy alone."""
+    """The results of a function with the kernels, and with numpy alone."""
     by_kernels = function()
     with native.numpy_alone():
         return by_kernels, function()
@@ -166,7 +166,7 @@ def test_the_same_crossings_are_linked_compiled_and_in_numpy(seed):
 @compiled
 @pytest.mark.parametrize("seed", range(4))
 def test_paint_is_traced_alike_compiled_and_in_numpy(seed):
-    """Of a random mask, framed by no paint, with branches that meet and part."""
+    """The mask is random, framed by no paint, with branches that meet and part."""
     rng = np.random.default_rng(seed)
     noise = cv2.GaussianBlur(rng.standard_normal((60, 50)).astype(np.float32), (0, 0), 3.0) * 20
     level = cv2.copyMakeBorder(noise, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=-1.0)
@@ -244,7 +244,7 @@ def test_arrays_that_do_not_belong_together_are_refused():
 
 
 def _told(folder, *program, **environment):
-    """What a new process tells, with the package from a folder."""
+    """The output of a new process, with the package from a folder."""
     environment = {native.SWITCH: "1", "PYTHONPATH": str(folder), **environment}
     told = subprocess.run(
         [sys.executable, *program], cwd=folder, env=os.environ | environment,

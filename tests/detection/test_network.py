@@ -193,7 +193,7 @@ def test_the_parts_cover_the_band_whatever_the_image_size(tmp_path, width, heigh
 
 
 def looked_at(image, mirrored):
-    """What the shipped network says of an image, looked at whole."""
+    """The shipped network's output for an image, looked at whole."""
     view = RoadCamera(large_camera(image.shape[1], image.shape[0]))
     view.fine_row = None
     return run_on_road(Network(), image, view, mirrored)

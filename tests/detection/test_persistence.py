@@ -1,4 +1,4 @@
-"""What stays on the ground as the vehicle moves, and what does not."""
+"""Paint stays on the ground as the vehicle moves; reflections and things do not."""
 
 import numpy as np
 import pytest

@@ -21,7 +21,7 @@ KITE = order_corners(np.array([[20.3, 10.2], [40.1, 14.9], [19.4, 19.3], [3.2, 1
 
 
 def output_of_labels(labels, top=0):
-    """What a confident network says of a label picture (h, w) at the resolution of its paint."""
+    """The output of a confident network for a label picture (h, w) at the resolution of its paint."""
     paint = np.where(labels > 0, 5.0, -5.0).astype(np.float32)
     kinds = np.stack([np.where(labels == 1 + c, 5.0, -5.0) for c in range(len(PAINT_CLASSES))])
     coarse = kinds.reshape(len(kinds), labels.shape[0] // 2, 2, labels.shape[1] // 2, 2).mean(axis=(2, 4))

@@ -47,7 +47,7 @@ def furnish(folder: Path) -> None:
 
 
 def _lay_out_recording(folder: Path, rendered: Path) -> None:
-    """What a vehicle brings home, and single images of it."""
+    """Lay out the recording that a vehicle brings home, and single images of it."""
     recording = folder / "recording"
     shutil.copytree(rendered / "front", recording / "front")
     shutil.copy(rendered / "poses.tum", recording)

@@ -1,4 +1,4 @@
-"""What is added to a documented command so that it ends in seconds on one core."""
+"""Settings that are added to a documented command so that it ends in seconds on one core."""
 
 SMALL_PORT = (
     "simulate.seed=11", "simulate.route.pieces=[[12.0,0.0],[12.0,55.0],[4.0,0.0]]",

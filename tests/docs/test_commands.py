@@ -57,7 +57,7 @@ class Shell:
         self.programs = programs
 
     def __call__(self, text, folder):
-        """What the commands print."""
+        """The output of the commands."""
         ran = subprocess.run(
             ["bash", "-c", f"set -eo pipefail\n{text}"],
             cwd=folder, capture_output=True, text=True, timeout=300, stdin=subprocess.DEVNULL,

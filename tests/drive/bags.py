@@ -13,11 +13,13 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from tests.drive.example import looking_forward
+from tests.drive.example import looking_forward, make_drive
 from v2hdm.geometry.rigid import inverse, quaternion_from_rotation
-from v2hdm.io.drive import read_drive
+from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.records import Drive, FloatArray
 
+SQLITE3, MCAP = StoragePlugin.SQLITE3, StoragePlugin.MCAP
+FRONT = "/sensing/front/image_raw"  # topic of the front camera of :func:`messages_of`
 VIDEO = "foxglove_msgs/msg/CompressedVideo"
 ROS1, ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.LATEST)
 _PACKET = "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format"
@@ -263,7 +265,7 @@ def assert_same_poses(got: Drive, expected: Drive) -> None:
 
 
 def assert_mounted(got: Drive) -> None:
-    """Of the extrinsic the IPM keeps the two columns of the ground's axes and the translation."""
+    """The IPM keeps two columns of the extrinsic, the ground's axes, and the translation."""
     for name, cam_from_vehicle in mountings().items():
         ground = got.cameras[name].info.intrinsic @ cam_from_vehicle[:3, [0, 1, 3]]
         product = got.cameras[name].ipm["estimated"] @ ground
@@ -281,3 +283,24 @@ def topics_for(folder: Path, bag: Path, **changes: Any) -> dict[str, Any]:
             "images": {"topic": f"/sensing/{name}/image_raw{suffix}"},
         }
     return content | changes
+
+
+def read(root: Path, content: Mapping[str, Any]) -> Drive:
+    """The drive that a drive.yaml of this content in a folder describes."""
+    root.mkdir(exist_ok=True)
+    (root / "drive.yaml").write_text(yaml.safe_dump(content))
+    return read_drive(root, ReadOptions(cache=str(root / "cache")))
+
+
+def make_pictured_drive(root: Path) -> Path:
+    """The example drive with a picture in its images, so that a wrong channel or row would be seen."""
+    drive = make_drive(root)
+    rng = np.random.default_rng(5)
+    for image in drive.images:
+        cv2.imwrite(str(image.path), rng.integers(0, 255, (48, 64, 3), np.uint8))
+    return root
+
+
+def front_times(drive: Drive) -> list[float]:
+    """Stamps of the front camera's images, s."""
+    return [image.stamp_s for image in drive.images if image.camera == "front"]

@@ -1,4 +1,4 @@
-"""What a NavSatFix and a CameraInfo state counts as their definitions say."""
+"""The statements of a NavSatFix and a CameraInfo count as their definitions say."""
 
 import math
 

@@ -48,7 +48,7 @@ def as_fisheye(coefficients):
 
 
 def write_opencv(path, coefficients, **more):
-    """What OpenCV's calibration programs write, by OpenCV itself."""
+    """Write the file of OpenCV's calibration programs, by OpenCV itself."""
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     storage.write("calibration_time", "Mon Nov 23 10:01:02 2026")
     storage.write("image_width", SIZE[0])

@@ -1,7 +1,6 @@
 """Warnings of an import are told by every reading that takes it."""
 
-from tests.drive.bags import messages_of, topics_for, write_ros2
-from tests.drive.test_bags import FRONT, read
+from tests.drive.bags import FRONT, messages_of, read, topics_for, write_ros2
 from tests.test_commands import run_command
 
 

@@ -6,8 +6,7 @@ from typing import Any
 
 import pytest
 
-from tests.drive.bags import ROS1, ROS2, Messages, assert_same_drive, messages_of, topics_for
-from tests.drive.test_bags import read
+from tests.drive.bags import ROS1, ROS2, Messages, assert_same_drive, messages_of, read, topics_for
 from v2hdm.errors import DriveError
 from v2hdm.io.drive import read_drive
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import yaml
 
-from tests.drive.bags import Messages, messages_of, mountings, topics_for, write_ros2
-from tests.drive.test_bags import read
+from tests.drive.bags import Messages, messages_of, mountings, read, topics_for, write_ros2
 from v2hdm.errors import DriveError
 from v2hdm.geometry.frames import edges_of
 from v2hdm.geometry.ipm import ipm_from_extrinsic

@@ -55,16 +55,19 @@ def images():
     return smooth.repeat(8, axis=1).repeat(8, axis=2)
 
 
+def outputs_of(path):
+    """Paint, kinds and lanes of the images."""
+    return onnxruntime.InferenceSession(path).run(["paint", "kinds", "lanes"], {"image": images()})
+
+
 def test_only_the_channels_of_changed_classes_are_others(tmp_path):
     source = grown_source()
     stop_line = source.label["classes"].index("stop_line")
     with torch.no_grad():
         source.net.kinds.weight[stop_line] += 0.2
     add_classes(NETWORK_FILE, FLOAT_FILE, source, tmp_path / "net.onnx")
-    shipped, written = (
-        onnxruntime.InferenceSession(path).run(["paint", "kinds", "lanes"], {"image": images()})
-        for path in (NETWORK_FILE, tmp_path / "net.onnx")
-    )
+    shipped = outputs_of(NETWORK_FILE)
+    written = outputs_of(tmp_path / "net.onnx")
     np.testing.assert_array_equal(written[0], shipped[0])
     np.testing.assert_array_equal(written[2], shipped[2])
     known = shipped[1].shape[1]
@@ -80,10 +83,8 @@ def test_only_the_channels_of_changed_classes_are_others(tmp_path):
 def test_channels_that_new_classes_read_are_rounded_behind_the_others(tmp_path):
     source = source_with_channels(16)
     add_classes(NETWORK_FILE, FLOAT_FILE, source, tmp_path / "net.onnx")
-    shipped, written = (
-        onnxruntime.InferenceSession(path).run(["paint", "kinds", "lanes"], {"image": images()})
-        for path in (NETWORK_FILE, tmp_path / "net.onnx")
-    )
+    shipped = outputs_of(NETWORK_FILE)
+    written = outputs_of(tmp_path / "net.onnx")
     np.testing.assert_array_equal(written[0], shipped[0])
     np.testing.assert_array_equal(written[2], shipped[2])
     known = shipped[1].shape[1]

@@ -1,20 +1,12 @@
 """All bad inputs and situations, as a table; `python -m tests.benchmarks.bad_inputs` runs it."""
 
-import io
 import json
 import os
-import struct
-import zlib
 from collections.abc import Iterator
-from dataclasses import fields as fields_of
-from dataclasses import is_dataclass
 from pathlib import Path
 
-import av
-import cv2
 import numpy as np
 import yaml
-from PIL import Image
 
 from tests.calibration.site import INFO
 from tests.drive.example import camera_info, looking_forward, make_map
@@ -33,10 +25,19 @@ from tests.faults.making import (
     write_example,
 )
 from tests.faults.owners import circles, geopackages, owners
+from tests.faults.pictures import (
+    IMAGES,
+    PLAYLISTS,
+    SHORT_VIDEO,
+    damaged_inside,
+    picture,
+    turned,
+)
+from tests.faults.settings import numbers, settings
 from tests.faults.small import small
+from tests.faults.texts import BAD_NAMES, JSON_TEXTS, YAML_TEXTS
 from v2hdm.io.calibration.writing import write_calibration, write_camera_info
 from v2hdm.io.maps.geojson import write_geojson
-from v2hdm.pipeline.config import PortConfig, RunConfig
 from v2hdm.records import Calibration, CameraFrames
 
 
@@ -76,206 +77,6 @@ def folder_instead(name: str) -> Change:
         (root / name).mkdir()
 
     return change
-
-
-ALIAS_BOMB = "a: &a [0,0,0,0,0,0,0,0,0]\n" + "".join(
-    f"{'bcdefghij'[n]}: &{'bcdefghij'[n]} [{','.join(['*' + 'abcdefghi'[n]] * 9)}]\n" for n in range(9)
-)
-
-YAML_TEXTS: dict[str, tuple[str | bytes, str]] = {
-    "empty": ("", "expected 'key: value' entries"),
-    "only a comment": ("# nothing\n", "expected 'key: value' entries"),
-    "a list": ("- a\n", "expected 'key: value' entries"),
-    "a text": ("words\n", "expected 'key: value' entries"),
-    "a number": ("3\n", "expected 'key: value' entries"),
-    "unclosed list": ("name: [a\n", "line \\d+ YAML syntax error"),
-    "unclosed quote": ('name: "a\n', "line \\d+ YAML syntax error"),
-    "tab": ("name:\n\tx: 1\n", "line 2 YAML syntax error: a tab"),
-    "two documents": ("name: a\n---\nname: b\n", "YAML syntax error"),
-    "utf-16": ("name: a\n".encode("utf-16"), "UTF-16"),
-    "latin-1": ("name: M\u00fcll\n".encode("latin-1"), "not a UTF-8"),
-    "zero bytes": (b"\0" * 64, "zero byte"),
-    "binary": (bytes(range(1, 256)), "not a UTF-8|special characters"),
-    "control letters": ("name: a\x07b\n", "special characters"),
-    "a key twice": ("name: a\nname: b\n", "line 2.*'name' appears twice"),
-    "nested 70 deep": ("name: " + "[" * 70 + "]" * 70, "nested deeper"),
-    "nested 3000 deep": ("name: " + "[" * 3000 + "]" * 3000, "nested deeper"),
-    "mappings nested 3000 deep": ("name: " + "{a: " * 3000 + "}" * 3000, "nested deeper"),
-    "alias bomb": (ALIAS_BOMB, "including aliases|no intrinsics of a known format"),
-    "alias of itself": ("name: &a [*a]\n", "alias of something that contains it"),
-    "unknown alias": ("name: *a\n", "YAML syntax error"),
-    "5000 digits": ("name: " + "9" * 5000 + "\n", "5000 digits"),
-    "5000 hex digits": ("name: 0x" + "f" * 5000 + "\n", "5002 digits"),
-    "int of letters": ("name: !!int abc\n", "'abc' does not match its tag"),
-    "float of letters": ("name: !!float abc\n", "'abc' does not match its tag"),
-    "bool of letters": ("name: !!bool abc\n", "'abc' does not match its tag"),
-    "python object": ("name: !!python/object/apply:os.system [true]\n", "the tag"),
-    "python name": ("name: !!python/name:os.system\n", "the tag"),
-    "own tag": ("name: !secret x\n", "the tag"),
-    "binary tag": ("name: !!binary aGk=\n", "the tag"),
-    "half a letter": ('name: "\\ud800"\n', "line 1 .*half a character"),
-    "half a letter in a key": ('"\\udc00": 1\n', "line 1 .*half a character"),
-    "set": ("name: !!set {a}\n", "the tag"),
-    "key that is a list": ("? [a, b]\n: 1\n", "a key that is a list"),
-    "mapping that is a list": ("name: !!map [1]\n", "YAML syntax error"),
-    "merge of a text": ("<<: words\n", "YAML syntax error"),
-}
-
-JSON_TEXTS: dict[str, tuple[str | bytes, str]] = {
-    "empty": ("", "JSON syntax error"),
-    "cut off": ('{"v2hdm": {', "JSON syntax error"),
-    "list": ("[]", "expected a JSON object"),
-    "number": ("7", "expected a JSON object"),
-    "utf-16": ("{}".encode("utf-16"), "UTF-16"),
-    "binary": (bytes(range(256)), "not a UTF-8"),
-    "nested 70 deep": ('{"features": ' + "[" * 70 + "]" * 70 + "}", "nested deeper"),
-    "nested 3000 deep": ('{"features": ' + "[" * 3000 + "]" * 3000 + "}", "nested deeper"),
-    "nested 100000 deep": ("[" * 100000, "nested deeper"),
-    "depth hidden in a text": ('{"a": "]]]]]]]", "b": ' + "[" * 3000 + "]" * 3000 + "}", "nested deeper"),
-    "a key twice": ('{"v2hdm": {}, "v2hdm": {}}', "'v2hdm' appears twice"),
-    "5000 digits": ('{"v2hdm": {"origin": ' + "9" * 5000 + '}, "features": []}', "origin"),
-    "half a letter": ('{"v2hdm": {"crs": "\\ud800"}, "features": []}', "half a character"),
-    "half a letter in a key": ('{"\\uDC00": {}}', "half a character"),
-    "not a number": ('{"v2hdm": {}, "features": [{"properties": {"corners_map": NaN}}]}', "feature 0"),
-    "no map": ('{"type": "FeatureCollection", "features": []}', "not a map written by v2hdm"),
-    "features that are a text": ('{"v2hdm": {}, "features": "x"}', "not a map written by v2hdm"),
-    "feature that is a list": ('{"v2hdm": {}, "features": [[]]}', "feature 0"),
-    "feature that is nothing": ('{"v2hdm": {}, "features": [null]}', "feature 0"),
-    "properties that are a list": ('{"v2hdm": {}, "features": [{"properties": [1]}]}', "feature 0"),
-    "origin that is a list": ('{"v2hdm": {"origin": [1]}, "features": []}', "origin"),
-    "byte order mark in the midst": ('{"v2hdm": \ufeff{}}', "JSON syntax error"),
-}
-
-BAD_NAMES: dict[str, tuple[object, str]] = {
-    "empty": ("", "name is empty"),
-    "parent": ("..", "begins with a dot"),
-    "hidden": (".front", "begins with a dot"),
-    "escape": ("../../x", "path separator"),
-    "absolute": ("/tmp/x", "path separator"),
-    "folder": ("a/b", "path separator"),
-    "backslash": ("a\\b", "path separator"),
-    "newline": ("a\nb", "does not show"),
-    "zero byte": ("a\0b", "does not show|special characters|zero byte"),
-    "escape sequence": ("a\x1b[31mb", "does not show|special characters"),
-    "turned around": ("a\u202eb", "does not show"),
-    "line separator": ("a\u2028b", "does not show"),
-    "blank at the end": ("front ", "a space"),
-    "too long": ("x" * 65, "longer than 64"),
-    "too many bytes": ("\U0001f697" * 64, "longer than 64"),
-}
-
-
-def _png_chunk(kind: bytes, body: bytes) -> bytes:
-    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-
-
-def png_header(width: int, height: int) -> bytes:
-    """A PNG of few bytes that says it is large."""
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    data = _png_chunk(b"IDAT", zlib.compress(b"\0" * 64))
-    return b"\x89PNG\r\n\x1a\n" + _png_chunk(b"IHDR", header) + data + _png_chunk(b"IEND", b"")
-
-
-def picture(suffix: str = ".jpg", height: int = 48, width: int = 64, depth: type = np.uint8) -> bytes:
-    """A picture of noise."""
-    rng = np.random.default_rng(4)
-    pixels = rng.integers(0, 255, (height, width, 3)).astype(depth)
-    return cv2.imencode(suffix, pixels)[1].tobytes()
-
-
-def damaged_inside() -> bytes:
-    """A JPEG with its end, whose middle is zeros."""
-    data = bytearray(picture(height=480, width=640))
-    data[len(data) // 3 : len(data) // 2] = bytes(len(data) // 2 - len(data) // 3)
-    return bytes(data)
-
-
-def again_and_again() -> bytes:
-    """A progressive JPEG that repeats its last scan, of a few bytes, 100 times: each is over all pixels."""
-    plain = np.zeros((48, 64, 3), np.uint8)
-    data = cv2.imencode(".jpg", plain, (cv2.IMWRITE_JPEG_PROGRESSIVE, 1))[1].tobytes()
-    return data[:-2] + 100 * data[data.rindex(b"\xff\xda") : -2] + data[-2:]
-
-
-def flipped_png() -> bytes:
-    """A PNG with one bit changed."""
-    data = bytearray(picture(".png"))
-    data[len(data) // 2] ^= 4
-    return bytes(data)
-
-
-def chunk_of_4_gb(kind: bytes = b"IDAT") -> bytes:
-    """A PNG with a chunk that says it is longer than the file: one before the end, or the end itself."""
-    data = picture(".png")
-    begin = data.index(kind) - 4
-    return data[:begin] + struct.pack(">I", 0xF3002000) + data[begin + 4 :]
-
-
-def turned(kind: str, orientation: int) -> bytes:
-    """A picture of the example's size with an EXIF orientation."""
-    exif, stream = Image.Exif(), io.BytesIO()
-    exif[0x112] = orientation
-    pixels = cv2.imdecode(np.frombuffer(picture(), np.uint8), cv2.IMREAD_COLOR)
-    Image.fromarray(pixels).save(stream, kind, exif=exif)
-    return stream.getvalue()
-
-
-PLAYLISTS: dict[str, str] = {
-    "a list of files": "ffconcat version 1.0\nfile a.mp4\n",
-    "a playlist": "#EXTM3U\n#EXT-X-TARGETDURATION:4\n#EXTINF:4,\na.mp4\n#EXT-X-ENDLIST\n",
-    "a playlist of a host": "#EXTM3U\n#EXT-X-TARGETDURATION:4\n#EXTINF:4,\nhttp://127.0.0.1:9/a.ts\n",
-    "a session of a host": "v=0\no=- 0 0 IN IP4 127.0.0.1\nm=video 9 RTP/AVP 96\na=rtpmap:96 H264/90000\n",
-    "a manifest": '<MPD xmlns="urn:mpeg:dash:schema:mpd:2011"><BaseURL>a.mp4</BaseURL></MPD>',
-    "an edit list of FFmpeg's": ";FFMETADATA1\ntitle=x\n",
-    "subtitles": "1\n00:00:00,000 --> 00:00:01,000\na\n",
-}
-
-
-def _video() -> bytes:
-    """Four frames of an MP4, made once a process."""
-    stream = io.BytesIO()
-    with av.open(stream, "w", "mp4") as container:
-        track = container.add_stream("mpeg4", rate=10)
-        track.width, track.height = 320, 240
-        frames = [av.VideoFrame.from_ndarray(np.zeros((240, 320, 3), np.uint8), format="bgr24")] * 4
-        for frame in (*frames, None):
-            container.mux(track.encode(frame))
-    return stream.getvalue()
-
-
-SHORT_VIDEO = _video()
-
-
-IMAGES: dict[str, tuple[bytes, str]] = {
-    "empty": (b"", "empty"),
-    "text": (b"no image", "not a PNG"),
-    "zeros": (bytes(4096), "not a PNG"),
-    "one byte": (b"\xff", "not a PNG"),
-    "start of a jpeg": (b"\xff\xd8", "truncated"),
-    "end of a jpeg": (b"\xff\xd8\xff\xd9", "truncated"),
-    "start of a png": (b"\x89PNG\r\n\x1a\n", "truncated"),
-    "half a jpeg": (picture()[:700], "truncated"),
-    "half a png": (picture(".png")[:700], "truncated"),
-    "png with a chunk of 4 GB": (chunk_of_4_gb(), "damaged"),
-    "png with an end of 4 GB": (chunk_of_4_gb(b"IEND"), "damaged"),
-    "png with a flipped bit": (flipped_png(), "damaged"),
-    "jpeg that goes over its pixels 100 times": (again_and_again(), "damaged"),
-    "1 x 1 px": (picture(height=1, width=1), "1 x 1 px"),
-    "1 x 1 px png": (picture(".png", height=1, width=1), "1 x 1 px"),
-    "3 x 2000 px": (picture(height=3, width=2000), "at least 16 px"),
-    "header of 60000 x 60000": (png_header(60000, 60000), "60000 x 60000 px, more than"),
-    "header of 2**31 x 1": (png_header(2**31 - 1, 1), "px"),
-    "header of 0 x 0": (png_header(0, 0), "0 x 0 px"),
-    "jpeg header of 65535 x 65535": (
-        b"\xff\xd8\xff\xc0" + struct.pack(">HBHHB", 11, 8, 65535, 65535, 1) + b"\1\x11\0" + b"\xff\xd9",
-        "65535 x 65535 px, more than",
-    ),
-    "gif": (b"GIF89a" + bytes(40), "not a PNG"),
-    "svg": (b"<svg xmlns='http://www.w3.org/2000/svg'/>", "not a PNG"),
-    "tiff with a loop": (b"II*\0" + struct.pack("<IH", 8, 65535) + bytes(12), "truncated"),
-    "bmp header only": (b"BM" + bytes(30), "px|truncated"),
-    "webp header only": (b"RIFF\x10\0\0\0WEBPVP8 ", "truncated"),
-}
 
 
 def texts() -> Iterator[Case]:
@@ -458,7 +259,7 @@ def fields() -> Iterator[Case]:
 
 
 def _names(key: str, value: object) -> str:
-    """What an error about a key must name: the key, or the file of the name that it gives."""
+    """The pattern that an error about a key must name: the key, or the file of the name that it gives."""
     return f"{key}|drive/x: no such file" if value == "x" else key
 
 
@@ -600,142 +401,6 @@ def arguments() -> Iterator[Case]:
         ". --format csv": "",
     }.items():
         yield Case(f"export {line}", "v2hdm export", line.split(), both(), says)
-
-
-def _plainly(lines: str) -> dict[str, str]:
-    """Settings that an error repeats: of ``data.width=7`` it says ``width is 7``, of words in quotes."""
-    pairs = [(line, *line.split("=")) for line in lines.split()]
-    return {line: f"{key.rpartition('.')[2]} is '?{value}" for line, key, value in pairs}
-
-
-SETTINGS = _plainly(
-    "workers=-1 device=tpu mode=x mapping.max_range_m=nan mapping.max_range_m=inf mapping.max_range_m=0 "
-    "mapping.rounds=0 mapping.loss=x mapping.pose_model=x mapping.lanes.min_images=-1 detector.threads=0 "
-    "detector.blur_px=99 detector.max_range_m=-1 detector.min_score=nan detector.border_px=-3 "
-    "detector.lane_step_m=-1 drive.max_gap_s=-1 drive.max_gap_s=nan"
-) | {
-    "workers=99999999999999999999": "workers is",
-    "workers=many": "workers=many",
-    "name=../x": "path separator",
-    "name=..": "begins with a dot",
-    "'name=\"a/b\"'": "path separator",
-    "+mapping.known_sizes.by_class_m={squid: [1.0, 0.7]}": "there is no such class",
-    "+mapping.known_sizes.by_class_m={diamond: [1.0]}": "by_class_m",
-    "+mapping.known_sizes.by_class_m={diamond: [.nan, 1.0]}": "by_class_m",
-    "detector.model=nowhere.onnx": "nowhere.onnx",
-    "export=[pdf]": "pdf",
-    "maping.max_range_m=1": "did you mean mapping",
-    "drive": "is not key=value",
-    "+run=port9": "port9",
-    "drive.path=straße": "needs quotes",
-    "mapping=null": "mapping",
-    "drive.cameras=front": "drive.cameras",
-    "--config-name=x": "no option --config-name=x",
-}
-SIMULATED = _plainly(
-    "simulate.seed=-1 simulate.cameras.front.width=0 simulate.cameras.front.width=100000 "
-    "simulate.route.image_spacing_m=0 simulate.route.speed_mps=nan "
-    "simulate.exposure.full_well_electrons=0 simulate.yard.barriers=-5"
-) | {
-    "simulate.name=../x": "path separator",
-    "+simulate.cameras.both=${simulate.cameras.front}": "results of all",
-}
-TRAINING = _plainly(
-    "batch=0 batch=-4 data.width=7 data.width=0 data.height=100 data.reservoir=0 data.views_per_render=0 "
-    "data.workers=-1 data.kerbs=nan data.labelled_share=2 learning_rate=nan learning_rate=-1 learning_rate=0 "
-    "weight_decay=inf minutes=-1 minutes=nan minutes=inf steps=0 warmup=1 ema_updates=0 threads=0 seed=-1 "
-    "checkpoint_minutes=0 net.head_width=0 loss.dice=-1 validation.images=-1"
-) | {
-    "data.width=1024": "data.width x data.height",
-    "net.widths=[8]": "net.widths",
-    "net.widths=[]": "net.widths",
-    "device=abacus": "device=abacus",
-    "start=nowhere.pt": "nowhere.pt",
-    "catalogue=nowhere.yaml": "nowhere.yaml",
-    "data.coco=nowhere.json": "nowhere.json",
-}
-AREAS = _plainly("steps=0 sky=2 threads=0 render_share=nan render_views=-1 seed=-1") | {
-    "classes=[]": "name one class or more",
-    "start=nowhere.pt": "nowhere.pt",
-    "data.coco=nowhere.json": "nowhere.json",
-}
-SCORES = {
-    "seed=1": "start",
-    "start=nowhere.pt": "nowhere.pt",
-}
-EXPORTS = _plainly("opset=3 opset=99 tolerance=nan int8.frames=0 int8.bounds.kinds_agree=7") | {
-    "checkpoint=nowhere.pt": "nowhere.pt",
-    "precision=int4": "precision",
-    "output=a.pt": "inputs",
-}
-
-
-def measures(options: object, below: str = "") -> Iterator[str]:
-    """The keys of all settings that are numbers with a fraction, also of those that are added later."""
-    for one in fields_of(options):
-        value = getattr(options, one.name)
-        if is_dataclass(value):
-            yield from measures(value, f"{below}{one.name}.")
-        elif isinstance(value, float):
-            yield below + one.name
-
-
-SIGNED = ("start_s", "sun_azimuth_deg", "sun_elevation_deg", "moving_offset_m")
-
-
-def numbers() -> Iterator[Case]:
-    """No measure is NaN, and none but an angle or a time is negative."""
-    for options, below, run in (
-        (RunConfig(), "", ("drive.path=drive",)),
-        (PortConfig(), "simulate.", ("+run=port2",)),
-    ):
-        for key in measures(options, below):
-            last = key.rpartition(".")[2]
-            for value in ("nan",) if last in SIGNED else ("nan", "-1e-3"):
-                words = (*run, "workers=1", f"{key}={value}")
-                yield Case(f"number: {key}={value}", "v2hdm map", words, drive(), last)
-
-
-def settings() -> Iterator[Case]:
-    """Settings of the doors that Hydra configures."""
-    for line, says in SETTINGS.items():
-        words = (line.strip("'"), "workers=1") if "workers" not in line else (line,)
-        yield Case(f"map {line}", "v2hdm map", ("drive.path=drive", *words), drive(), says)
-    for line, says in SIMULATED.items():
-        yield Case(f"map {line}", "v2hdm map", ("+run=port2", "workers=1", line), both(), says)
-    for line, says in TRAINING.items():
-        end = () if line.startswith(("minutes", "steps")) else ("steps=1",)
-        words = (line, *end) if line.startswith("validation") else (line, *end, "validation.images=0")
-        yield Case(f"train {line}", "train.__main__", words, both(), says)
-    for line, says in AREAS.items():
-        yield Case(f"areas {line}", "train.areas.__main__", (line,), both(), says)
-    for line, says in SCORES.items():
-        yield Case(f"score {line}", "train.score", (line,), both(), says)
-    for line, says in EXPORTS.items():
-        words = [
-            one for one in ("checkpoint=a.pt", "output=b.onnx") if one.split("=")[0] != line.split("=")[0]
-        ]
-        yield Case(f"export {line}", "export.__main__", (*words, line), write("a.pt", "x"), says)
-    run = ("drive.path=drive", "--config-dir", "conf", "+run=mine", "workers=1")
-    for name, (text, says) in YAML_TEXTS.items():
-        if name in ("empty", "only a comment"):
-            continue
-        header = b"# @package _global_\n" if name not in ("utf-16",) else b""
-        data = text.encode() if isinstance(text, str) else text
-        says = says if "expected" not in says else "mine|list|dict|config"
-        yield Case(
-            f"run file: {name}", "v2hdm map", run, _run_file(header + data), f"{says}|mine.yaml|configuration"
-        )
-    yield Case("run file without its header", "v2hdm map", run, _run_file(b"name: x\n"), "@package _global_")
-
-
-def _run_file(data: bytes) -> Prepare:
-    def prepare(root: Path) -> None:
-        drive()(root)
-        (root / "conf" / "run").mkdir(parents=True)
-        (root / "conf" / "run" / "mine.yaml").write_bytes(data)
-
-    return prepare
 
 
 def all_cases() -> list[Case]:

@@ -40,7 +40,7 @@ HYDRA_DOORS = (
 
 Prepare = Callable[[Path], None]
 Ran = tuple[int | str, str, str]
-"""What a door did: its exit code, or the name of what it raised, and what it wrote to stderr and stdout."""
+"""The end of a door: its exit code, or the name of what it raised, and its stderr and stdout."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a door did."""
+    """The outcome of a door's run."""
 
     code: int | str
     error: str
@@ -81,7 +81,7 @@ class Outcome:
     after: dict[str, str]
 
     def faults(self, case: Case) -> list[str]:
-        """What it may not have done."""
+        """Forbidden acts of the door."""
         told = [line for line in self.error.splitlines() if line.startswith("error: ")]
         found = []
         if self.code != case.code:

@@ -217,7 +217,7 @@ def _twin(path: Path) -> None:
 
 
 def _listless(path: Path) -> None:
-    """What an earlier version has written, or the user."""
+    """The folder of an earlier version, or of the user, which no list names."""
     for one in path.parents:
         (one / ".v2hdm-results.jsonl").unlink(missing_ok=True)
 

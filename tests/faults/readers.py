@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from tests.drive.example import camera_info, looking_forward, make_drive, make_map
-from tests.faults.cases import picture
+from tests.faults.pictures import picture
 from v2hdm.calibration.points import read_points
 from v2hdm.detection.frames import read_bgr
 from v2hdm.errors import V2hdmError
@@ -32,7 +32,7 @@ from v2hdm.records import Calibration, Exclusion
 
 
 def refusal(read: Callable[[], object], error: type[V2hdmError]) -> str | None:
-    """What a reader says of what it refuses; None where it reads."""
+    """A reader's sentence of refusal; None where it reads."""
     try:
         read()
     except error as refused:

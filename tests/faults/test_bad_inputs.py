@@ -10,8 +10,9 @@ import yaml
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from tests.faults.cases import all_cases, chunk_of_4_gb, damaged_inside
+from tests.faults.cases import all_cases
 from tests.faults.judge import HYDRA_DOORS, Case, judge
+from tests.faults.pictures import chunk_of_4_gb, damaged_inside
 from tests.faults.readers import READERS, refusal
 from v2hdm.detection.frames import read_bgr
 from v2hdm.errors import ConfigError, DriveError, V2hdmError

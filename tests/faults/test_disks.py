@@ -10,8 +10,8 @@ from tests.benchmarks.faults.failing_calls import Failure, watch, why_not
 from tests.benchmarks.faults.forked import Forked
 from tests.benchmarks.faults.situations import Expected, Situation, calibrating
 from tests.drive.example import make_map
-from tests.faults.cases import picture
 from tests.faults.judge import DATE, Case, judge, judge_again
+from tests.faults.pictures import picture
 from v2hdm.errors import MapFileError
 from v2hdm.io.maps.geopackage import write_geopackage
 from v2hdm.mosaic.blend import Sheet

@@ -1,4 +1,4 @@
-"""What a map may be off by a clock that its drive does not show, against maps that are off by one."""
+"""Errors by a clock that a drive does not show hold against maps that are off by one."""
 
 from dataclasses import replace
 

@@ -31,7 +31,7 @@ def whole(problem):
 
 @pytest.fixture(scope="module")
 def parts(problem, tmp_path_factory):
-    """What three parts say of the errors, and how each of them follows these."""
+    """The evidence of three parts on the errors, and how each of them follows these."""
     folder = tmp_path_factory.mktemp("parts")
     part_of_frame = np.arange(60) // 20
     cuts, links = cut(problem, part_of_frame, tuple(OPTIONS.pose_states))

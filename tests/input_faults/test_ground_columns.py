@@ -1,4 +1,4 @@
-"""What bare ground tells rests on the inputs too: a wrong one is named by both, and hides behind neither."""
+"""Evidence of bare ground rests on the inputs too: both name a wrong input, and it hides behind neither."""
 
 from dataclasses import replace
 

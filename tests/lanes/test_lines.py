@@ -201,7 +201,7 @@ def test_a_short_piece_must_be_seen_more_often_than_a_long_one():
 
 
 def test_paths_found_on_both_sides_of_a_border_are_one_lane_when_joined():
-    """What a long drive does in sections: each finds the paths inside its own ground."""
+    """A long drive does so in sections: each finds the paths inside its own ground."""
     cloud = cloud_of([straight(0, 40), straight(0, 40, 3.5)])
     west = paths_of(cloud, OPTIONS, lambda points_map: points_map[:, 0] < 17.3)
     east = paths_of(cloud, OPTIONS, lambda points_map: points_map[:, 0] >= 17.3)

@@ -43,7 +43,7 @@ def yard(rng, length_m=120.0):
 
 
 def seen_from(pose, hd_map, rng):
-    """What the camera finds from a true pose (5,): whole markings within 15 m, with noise."""
+    """The camera's detections from a true pose (5,): whole markings within 15 m, with noise."""
     camera = looking_ahead()
     out = []
     for marking in hd_map.markings:

@@ -339,7 +339,7 @@ def test_cameras_search_whole_images_by_turns(view):
 
 
 def test_a_camera_keeps_out_of_the_way_of_whole_searches_that_another_one_needs(view):
-    """What images will show is told four ahead: the camera ahead is to search three in a row as a whole."""
+    """Requests go out four images ahead: the camera ahead is to search three in a row as a whole."""
     looking = Looking(5)
     told = {"front": {}, "rear": {}}
     both = []

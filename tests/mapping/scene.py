@@ -35,7 +35,7 @@ from v2hdm.records import (
 
 @dataclass(kw_only=True)
 class SceneOptions:
-    """What is in the yard and how badly it is seen."""
+    """The contents of the yard, and how badly it is seen."""
 
     seed: int = 0
     length_m: float = 200.0

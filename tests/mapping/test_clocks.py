@@ -1,4 +1,4 @@
-"""What tests of clocks know is told by poses and surveys, not by the noise of the poses."""
+"""Tests of clocks learn from poses and surveys, not from the noise of the poses."""
 
 from dataclasses import replace
 

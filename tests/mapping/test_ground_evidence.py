@@ -1,4 +1,4 @@
-"""What a solve owes to the ground is taken out of it before its markings are held against the ground."""
+"""A solve's debt to the ground is taken out of it before its markings are held against the ground."""
 
 from dataclasses import replace
 from types import SimpleNamespace

@@ -236,7 +236,7 @@ def test_drives_that_markings_shift_apart_are_named_in_one_line(scene):
 
 
 def test_a_marking_belongs_to_the_section_that_knows_most_of_its_corners():
-    """Of marking 0 the first section knows two corners by ten sightings, the second all four by three."""
+    """The first section knows two corners of marking 0 by ten sightings, the second all four by three."""
     none = np.zeros(3, dtype=bool)
     first = Names(np.array([0, 1, 2]), np.zeros(3, dtype=int), ~none, np.array([10, 4, 5]), none)
     second = Names(np.array([2, 0, 1]), np.zeros(3, dtype=int), ~none, np.array([0, 3, 6]), none)
@@ -273,7 +273,7 @@ def test_errors_on_which_sections_disagree_are_known_as_badly_as_they_disagree()
 
 
 def test_one_of_many_sections_by_chance_contradicts_nothing():
-    """Of a hundred sections one is four sigmas off; their mean is not."""
+    """One of a hundred sections is four sigmas off; their mean is not."""
     rng = np.random.default_rng(0)
     tests = [[late(float(rng.normal(0, 0.002)), 0.002)] for _ in range(100)]
     tests[7] = [late(0.008, 0.002)]

@@ -54,7 +54,7 @@ def test_sightings_lie_where_the_pose_of_their_row_puts_them(scene):
 
 
 def test_a_stated_read_out_time_makes_a_better_map_than_none(scene):
-    """Of markings of one pixel noise; that it makes as good a map as a global shutter is tested in adjust."""
+    """Markings have one pixel of noise; that the map is as good as a global shutter's is tested in adjust."""
     pairs, known_m = match(mapped(scene.drive, scene.detections).hd_map, scene.markings, MATCH_M)
     ignorant = mapped(unstated(scene.drive), scene.detections)
     _, ignorant_m = match(ignorant.hd_map, scene.markings, MATCH_M)

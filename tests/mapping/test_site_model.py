@@ -1,4 +1,4 @@
-"""What a class has in common, and how often a place was seen, say what lies there and where."""
+"""The traits of a class, and how often a place was seen, say what lies there and where."""
 
 from dataclasses import replace
 
@@ -423,7 +423,7 @@ def cut_short(candidates, true, dash, cut_m):
 
 
 def piece_of(corners):
-    """What a barrier on two adjacent sides leaves to be seen: .7 of one extent and .5 of the other."""
+    """The piece that a barrier on two adjacent sides leaves in sight: .7 of one extent, .5 of the other."""
     u, v = corners[1] - corners[0], corners[3] - corners[0]
     return corners[0] + np.outer([0, 0.7, 0.7, 0], u) + np.outer([0, 0, 0.5, 0.5], v)
 

@@ -1,4 +1,4 @@
-"""What a map may hold that a program which opens its exports must not act on, and how large exports grow."""
+"""Texts in a map that a program which opens its exports must not act on, and how large exports grow."""
 
 import csv
 import io

@@ -70,7 +70,7 @@ def _refused(folder, name, capsys, words):
 
 
 def test_an_export_replaces_what_it_has_written_of_the_same_map_and_nothing_else(folder, capsys):
-    """Of edited files, links and the user's own, tests/faults has a case for each format."""
+    """Edited files, links and the user's own files have cases for each format in tests/faults."""
     for _ in range(2):
         assert run(EXPORT) == 0
     write_geojson(street(), folder / "other" / "map.geojson")  # of the same name, from elsewhere

@@ -22,7 +22,7 @@ SCRIPT = Path(__file__).with_name("render_qgis.py")
 
 
 class Drawn(NamedTuple):
-    """What QGIS says of a project, and its picture (H, W, 3) RGB."""
+    """A project as QGIS reads it, and its picture (H, W, 3) RGB."""
 
     about: dict
     rgb: np.ndarray

@@ -1,4 +1,4 @@
-"""What painted words say, in every format."""
+"""Readings of painted words are in every format."""
 
 import csv
 import json

@@ -42,7 +42,7 @@ def drive(start_s=START_S) -> Trajectory:
 
 
 def messages_by_topic(path):
-    """What the file sends, in order, by topic."""
+    """The messages of the file, in order, by topic."""
     sent = defaultdict(list)
     with path.open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])

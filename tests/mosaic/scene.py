@@ -70,7 +70,7 @@ def squares(points_map: FloatArray) -> FloatArray:
 
 
 def picture(ground, map_from_vehicle: FloatArray) -> np.ndarray:
-    """What the camera sees of ``ground`` from a pose, as (height, width, 3) uint8; 3 x 3 rays a pixel."""
+    """The camera's picture of ``ground`` from a pose, as (height, width, 3) uint8; 3 x 3 rays a pixel."""
     v, u = np.mgrid[: INFO.height, : INFO.width]
     cam_from_map = cam_from_vehicle() @ inverse(map_from_vehicle)
     total = np.zeros((INFO.height, INFO.width))

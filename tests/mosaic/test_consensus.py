@@ -1,4 +1,4 @@
-"""What stands is not shown as ground: by patterns made here, and in images of a box on a painted plane."""
+"""Things that stand are not shown as ground: in made patterns, and in images of a box on a painted plane."""
 
 from dataclasses import replace
 

@@ -21,7 +21,7 @@ from v2hdm.store.names import METRICS
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
-    """Of a drive over squares whose recorded poses are 20 cm off to and fro."""
+    """The result of a drive over squares whose recorded poses are 20 cm off to and fro."""
     folder = tmp_path_factory.mktemp("squares")
     return scene.result_of(folder, scene.drive_of(folder / "drive", scene.squares, 0.2))
 

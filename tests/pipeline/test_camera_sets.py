@@ -21,7 +21,7 @@ from v2hdm.survey.run import Survey
 
 @dataclass
 class Images:
-    """What stands for a drive's detections: so many markings in one image."""
+    """A stand-in for a drive's detections: so many markings in one image."""
 
     markings: list[int]
 

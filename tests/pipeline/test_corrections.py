@@ -1,4 +1,4 @@
-"""What a person says of a map holds in the next run, and nothing else changes."""
+"""A person's corrections of a map hold in the next run, and nothing else changes."""
 
 import html
 

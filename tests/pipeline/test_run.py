@@ -242,7 +242,7 @@ def test_a_base_in_the_place_of_the_result_is_refused_before_any_work(tmp_path, 
 
 def test_a_run_without_a_name_has_that_of_its_drive(tiny_drive, tmp_path):
     drive = blind_copy(tiny_drive, tmp_path / "folder")
-    assert run_name(run_config(drive, tmp_path, name=None)) == "small"
+    assert run_name(run_config(drive, tmp_path, name=None)) == "port"
     with description(drive) as content:
         content.pop("name")
     assert run_name(run_config(drive, tmp_path, name=None)) == "folder"

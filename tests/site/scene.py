@@ -38,7 +38,7 @@ def of_outlines(symbols, outlines):
 
 
 def seen(shapes, kinds, poses_x):
-    """What a camera at so many places ahead says of shapes on the ground, one from each.
+    """A camera's sightings, at so many places ahead, of shapes on the ground, one from each.
 
     It takes one image at a place, but one after the other if it stands.
     """

@@ -20,7 +20,7 @@ def test_a_dash_of_a_standard_length_is_likelier_whole_than_what_no_standard_kno
 
 
 def test_what_is_lost_makes_up_the_next_longer_lengths():
-    """Of 5.5 m nearly all that the standards know is 6 m."""
+    """Nearly all standard lengths that a dash of 5.5 m may be a piece of are 6 m."""
     of_long = lost(5.5)
     assert of_long.mean_m[0] == pytest.approx(0.9, abs=0.5)
     assert lost(0.75).mean_m[0] > 1.0

@@ -27,14 +27,16 @@ from v2hdm.records import HDMap, PoseNoise, Road
 from v2hdm.report.metrics import driven_past, map_figures
 from v2hdm.simulate.port.config import PortConfig, ReliefConfig
 from v2hdm.store.files import load_json, write_json
+from v2hdm.surface.basis import KNOTS_M
 from v2hdm.surface.paths import Paths
-from v2hdm.surface.surface import KNOTS_M, Recorded, Surface, _Smoothness
+from v2hdm.surface.prior import Recorded, Smoothness
+from v2hdm.surface.surface import Surface
 
 FALLS = np.array([0.02, 0.03, -0.01, 0.01, 0.015, 0.02, -0.02])
 SHAPE = np.array([0.0, 0.0, *FALLS])  # with the grade
 INTRINSIC = np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]])
 SEED = 4
-"""Of a drive on level ground, 43 markings."""
+"""The seed of a drive on level ground with 43 markings."""
 MOUNT = np.array([[0.0, -1, 0, 0], [-0.35, 0, -0.94, 1.6], [0.94, 0, -0.35, -0.9], [0, 0, 0, 1]])
 
 
@@ -361,7 +363,7 @@ def test_the_prior_s_determinant_by_its_bands_is_that_of_the_matrix():
     poses = np.tile(np.eye(4), (40, 1, 1))
     poses[:, 0, 3] = np.arange(40)
     paths = Paths.of(poses, np.zeros(40, dtype=np.int64))
-    smoothness = _Smoothness.of(Surface.level(paths).knots)
+    smoothness = Smoothness.of(Surface.level(paths).knots)
     for sizes in np.random.default_rng(0).uniform(-12.0, -4.0, (5, 3)):
         _, logarithm = np.linalg.slogdet(smoothness.prior(sizes))
         assert smoothness.log_root(sizes) == pytest.approx(logarithm / 2, abs=1e-4)

@@ -1,4 +1,4 @@
-"""What a user knows beforehand, surveyed corners and sizes; and inputs that the drive contradicts."""
+"""A user's knowledge beforehand, surveyed corners and sizes; and inputs that the drive contradicts."""
 
 import re
 from dataclasses import replace

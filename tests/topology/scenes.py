@@ -1,4 +1,4 @@
-"""What truly leads where in the made site of ``examples/lanes``: a crossing, and a T with turn lanes."""
+"""True connections in the made site of ``examples/lanes``: a crossing, and a T with turn lanes."""
 
 from __future__ import annotations
 

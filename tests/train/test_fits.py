@@ -1,4 +1,4 @@
-"""What teaches the detector its scores, and the command that ships a trained network."""
+"""The fits of the detector's scores, and the command that ships a trained network."""
 
 import shutil
 from contextlib import nullcontext
@@ -191,7 +191,7 @@ def test_what_shows_in_views_alone_is_learnt_and_a_seed_repeats_it():
 
 
 def test_the_errors_of_sides_are_learnt_one_by_one():
-    """Those of the top and the bottom, which mirroring makes alike, and not those of the ends."""
+    """The errors of top and bottom, which mirroring makes alike, are large; those of the ends are not."""
     known = replace(quadrilaterals(7, 2000), true=np.ones(2000, dtype=bool))
     _, sigma_px = judged(train_judge(known, replace(CONFIG, epochs=12)), known)
     typical = np.median(sigma_px, axis=0)

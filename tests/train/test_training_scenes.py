@@ -7,10 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from train.augment import random_crop
 from train.config import DataConfig
 from train.data import RenderStream, validation_pairs
-from train.scenes import scenes
 from train.scenes.hardships import (
     Hardships,
     bleached,
@@ -19,45 +17,21 @@ from train.scenes.hardships import (
     tight_bend,
     with_side_seams,
 )
-from train.scenes.letters import WORDS, random_hand, random_text
 from train.scenes.paint import (
     Bend,
-    Brush,
-    Facing,
-    RoadPaint,
-    double_line,
     port_paint,
     random_brush,
-    rectangle,
     rhombus,
-    stout_arrow,
     street_paint,
 )
 from train.scenes.remains import with_erased
-from train.scenes.scenes import TrainingSample, image_line, image_points, random_scene, training_sample
-from train.scenes.symbols import (
-    hollow_diamond,
-    lines_across,
-    with_bays,
-    with_boxes,
-    with_crossing,
-    with_crosswalk,
-    with_double,
-    with_far_stop,
-    with_give_way,
-    with_other,
-    with_users,
-    with_words,
-)
+from train.scenes.scenes import random_scene, training_sample
 from train.scenes.traffic import reflectance, traffic
-from train.scenes.views import TrainingView, looking, mounted_otherwise, random_view, turned_aside
+from train.scenes.views import looking
 from train.scenes.weather import GROUNDS, photo_tile
 from train.scenes.windscreen import before_lens
 from v2hdm.catalogue import PAINT_CLASSES, SHIPPED
-from v2hdm.detection.camera import ASIDE_RAD
-from v2hdm.geometry.lens import undistort_points
-from v2hdm.geometry.planar import clip_convex, inside_convex, signed_area
-from v2hdm.geometry.rigid import camera_centre
+from v2hdm.geometry.planar import clip_convex, inside_convex
 from v2hdm.records import (
     ARROW,
     BICYCLE,
@@ -65,14 +39,11 @@ from v2hdm.records import (
     CROSSWALK_BAR,
     DIAMOND,
     LANE_DASH,
-    LANE_LINE,
-    OTHER_PAINT,
     STOP_LINE,
     TEXT,
     CameraInfo,
 )
-from v2hdm.simulate.render.letters import Hand, word
-from v2hdm.simulate.render.renderer import Motion, Optics, Renderer
+from v2hdm.simulate.render.renderer import Renderer
 from v2hdm.simulate.render.scene import Box, Ground, Paint, Scene, box_footprint
 
 TINY = DataConfig(width=64, height=32, render_width=80, render_height=48, views_per_render=2, reservoir=3)
@@ -116,23 +87,6 @@ def test_painted_pixels_are_mostly_brighter_than_the_ground_around_them():
             brighter.append(grey[band][paint[band]].mean() > np.median(grey[band][~paint[band]]))
     assert len(brighter) > 5
     assert np.mean(brighter) > 0.75
-
-
-def turns_of(polygon):
-    """Twice the area (N,) between each two sides of a polygon, above 0 where it turns left."""
-    sides = np.roll(polygon, -1, axis=0) - polygon
-    following = np.roll(sides, -1, axis=0)
-    return sides[:, 0] * following[:, 1] - sides[:, 1] * following[:, 0]
-
-
-def test_paint_polygons_are_convex_and_have_the_size_asked_for():
-    scenes = [random_scene(np.random.default_rng(index)) for index in range(12)]
-    polygons = [paint.polygon_map for scene, _ in scenes for paint in scene.paints]
-    assert polygons
-    for polygon in polygons:
-        assert (turns_of(polygon) > -1e-9).all() or (turns_of(polygon) < 1e-9).all()
-    assert np.ptp(rhombus(np.zeros(2), 1.2, 0.6)[:, 0]) == pytest.approx(1.2)
-    assert np.ptp(rectangle(np.zeros(2), 3.0, 0.15, np.pi / 2)[:, 1]) == pytest.approx(3.0)
 
 
 def test_lanes_lie_on_their_paint():
@@ -282,140 +236,6 @@ def test_things_beside_markings_hide_paint_and_add_none(name, much):
     assert any((plain.hidden != crowded.hidden).any() for plain, crowded in seen)
 
 
-def test_an_outline_of_a_diamond_is_a_diamond_and_its_middle_shows_the_ground():
-    rng = np.random.default_rng(0)
-    brush = Brush((0.7, 0.7, 0.7), 0.0, 0.0)
-    corners = rhombus(np.array([6.0, 0.0]), 2.0, 1.4)
-    info = CameraInfo("down", 120, 120, np.array([[100.0, 0, 60], [0, 100.0, 60], [0, 0, 1]]))
-    above = looking(np.array([6.0, 0.0, 3.0]), 0.0, np.pi / 2, 0.0)
-    ground = Ground(albedo_bgr=(0.1, 0.1, 0.1), contrast=0.0, stains=0.0)
-    seen = []
-    for paints in ([Paint(kind=DIAMOND, polygon_map=corners)], hollow_diamond(brush, rng, corners, 0.2)):
-        seen.append(Renderer(Scene(ground=ground, paints=tuple(paints))).render(info, above, rng))
-    filled, hollow = seen
-    assert (filled.labels == hollow.labels).mean() > 0.999
-    assert filled.image[60, 60, 1] > 2 * hollow.image[60, 60, 1]
-    ring = (hollow.labels > 0) & (hollow.image[..., 1] > 2 * hollow.image[60, 60, 1])
-    assert 0.3 < ring.sum() / (hollow.labels > 0).sum() < 0.6, "a stroke of 0.2 m is 46 % of the area"
-
-
-def test_stout_arrows_are_of_convex_parts_that_begin_at_their_tail_and_fit_a_lane():
-    for seed in range(60):
-        parts = list(stout_arrow(np.random.default_rng(seed)))
-        assert all(signed_area(part) > 0 and (turns_of(part) > -1e-9).all() for part in parts)
-        points = np.vstack(parts)
-        assert points[:, 0].min() == 0
-        assert 2 < points[:, 0].max() < 6.5
-        assert np.abs(points[:, 1]).max() < 1.4
-
-
-def test_half_of_the_arrows_face_the_camera_when_half_are_asked_to():
-    turned = []
-    for seed in range(60):
-        brush = Brush((0.7, 0.7, 0.7), 0.0, 0.0)
-        facing = [Facing(np.random.default_rng(seed), share) for share in (0.0, 0.5)]
-        roads = [street_paint(np.random.default_rng(seed), brush, Bend(0.0), one) for one in facing]
-        arrows = [[p.polygon_map for p in road.paints if p.kind == ARROW] for road in roads]
-        assert len(arrows[0]) == len(arrows[1])
-        turned += [not np.allclose(a, b) for a, b in zip(*arrows, strict=True)]
-    assert len(turned) > 60
-    assert 0.3 < np.mean(turned) < 0.7
-
-
-def test_a_stop_line_that_meets_lines_of_lanes_reaches_from_one_to_another():
-    met = 0
-    for seed in range(40):
-        rng = np.random.default_rng(seed)
-        brush, bend = random_brush(rng, 0.0), Bend(0.01 if seed % 2 else 0.0)
-        road = street_paint(rng, brush, bend)
-        crossed = with_crossing(rng, road, brush, bend, 1.0)
-        if crossed is road:
-            continue
-        bar = crossed.paints[-1].polygon_map
-        assert crossed.paints[-1].kind == STOP_LINE
-        along = bend.to_map(np.column_stack([np.linspace(0, 30, 3001), np.zeros(3001)]))
-        at = float(np.argmin(np.linalg.norm(along - bar.mean(axis=0), axis=1))) * 0.01
-        heading = float(bend.heading(at))
-        beside = (bar - bend.to_map(np.array([at, 0.0]))) @ np.array([-np.sin(heading), np.cos(heading)])
-        lines = lines_across(road.lanes, bend, at)
-        met += ((lines > beside.min() - 0.5) & (lines < beside.max() + 0.5)).sum() >= 2
-    assert met > 15
-
-
-def test_words_are_strokes_of_their_size_in_the_order_in_which_they_are_read():
-    near, far = (list(word(text, 2.0, 0.5, 0.1)) for text in ("BUS", "BUS LANE"))
-    assert all(signed_area(stroke) > 0 for stroke in far)
-    assert np.ptp(np.vstack(near)[:, 0]) == pytest.approx(2.1, abs=0.05)
-    assert np.vstack(far)[:, 0].max() == pytest.approx(4.85, abs=0.05)
-    left_i, right_l = (np.vstack(list(word(text, 2.0, 0.5, 0.1)))[:, 1] for text in ("I", "LI"))
-    assert right_l.max() > left_i.max()
-    assert all(list(word(text, 2.0, 0.5, 0.1)) for text in WORDS)
-
-
-PAINTED = (
-    (with_words, {TEXT}), (with_bays, {TEXT}), (with_boxes, {BOX}), (with_users, {BICYCLE}),
-    (with_other, {OTHER_PAINT}), (with_give_way, {STOP_LINE}), (with_far_stop, {STOP_LINE}),
-    (with_crosswalk, {CROSSWALK_BAR, STOP_LINE}), (with_double, {LANE_LINE, LANE_DASH}),
-)  # fmt: skip
-
-
-@pytest.mark.parametrize(("lay", "kinds"), PAINTED)
-def test_paint_laid_on_a_bare_road_is_convex_and_of_the_class_that_labels_call_it(lay, kinds):
-    laid = 0
-    for seed in range(30):
-        rng = np.random.default_rng(seed)
-        brush = random_brush(rng, 0.0)
-        bare = RoadPaint()
-        assert lay(rng, bare, brush, Bend(0.0), 0.0) is bare
-        paints = lay(rng, bare, brush, Bend(0.01), 1.0).paints
-        laid += bool(paints)
-        assert {paint.kind for paint in paints} <= kinds
-        for paint in paints:
-            turn = turns_of(paint.polygon_map)
-            assert (turn > -1e-9).all() or (turn < 1e-9).all()
-    assert laid == 30
-
-
-def test_numbers_words_and_letters_have_strokes_in_every_hand():
-    rng = np.random.default_rng(0)
-    texts = [random_text(rng) for _ in range(200)]
-    assert {text.isdigit() for text in texts} == {True, False}
-    for text in texts:
-        strokes = list(word(text, 2.0, 0.5, 0.1, random_hand(rng)))
-        assert all(signed_area(stroke) > 0 and (turns_of(stroke) > -1e-9).all() for stroke in strokes)
-        assert np.vstack(strokes)[:, 0].max() == pytest.approx(2.0 + 2.8 * text.count(" "), abs=0.3), (
-            "letters are as tall as asked for, whatever the hand"
-        )
-
-
-def test_a_stencil_leaves_bridges_and_a_round_hand_has_more_strokes():
-    plain, stencil, round_hand = (
-        list(word("B", 2.0, 0.5, 0.1, hand)) for hand in (Hand(), Hand(stencil=True), Hand(rounds=1))
-    )
-    assert len(stencil) > len(plain)
-    assert len(round_hand) > len(plain)
-    area = [sum(signed_area(stroke) for stroke in strokes) for strokes in (plain, stencil)]
-    assert area[1] < area[0]
-
-
-def test_the_strands_of_a_double_line_are_a_hand_apart():
-    for seed in range(40):
-        rng = np.random.default_rng(seed)
-        double = double_line(rng, random_brush(rng, 0.0), Bend(0.0), 1.0)
-        across = np.array([[p.polygon_map[:, 1].min(), p.polygon_map[:, 1].max()] for p in double.paints])
-        right, left = across[across[:, 1] < 1.0], across[across[:, 0] > 1.0]
-        assert 0.08 <= left[:, 0].min() - right[:, 1].max() <= 0.35
-        assert len(double.lanes) == 1
-
-
-def test_a_stop_line_far_ahead_is_12_to_40_m_away():
-    for seed in range(40):
-        rng = np.random.default_rng(seed)
-        brush = random_brush(rng, 0.0)
-        for paint in with_far_stop(rng, RoadPaint(), brush, Bend(0.0), 1.0).paints:
-            assert 6 < paint.polygon_map[:, 0].mean() < 44
-
-
 def test_scenes_without_hardships_show_words_boxes_and_symbols_too():
     new = [1 + PAINT_CLASSES.index(kind) for kind in (TEXT, BOX, BICYCLE)]
     shown = [np.isin(training_sample(11, k, 224, 128).labels, new).any() for k in range(60)]
@@ -489,77 +309,6 @@ def test_things_stand_beside_their_marking_and_not_on_it_or_on_the_camera():
     assert things_beside(np.random.default_rng(0), [], 5.0) == ()
 
 
-@pytest.mark.parametrize(
-    ("model", "coefficients"),
-    [("plumb_bob", (-0.16, 0.024, 0.0, 0.0, 0.0)), ("plumb_bob", (0.0,) * 5), ("equidistant", (0.0,) * 4)],
-)
-def test_a_line_is_followed_to_the_borders_of_the_image(model, coefficients):
-    """Points of a strong lens's image that a pinhole would see far outside of it belong to it, too."""
-    intrinsic = np.array([[500.0, 0.0, 640.0], [0.0, 500.0, 260.0], [0.0, 0.0, 1.0]])
-    info = CameraInfo("wide", 1280, 720, intrinsic, model, coefficients)
-    cam_from_map = looking(np.array([0.0, 0.0, 1.4]), 0.0, 0.1, 0.0)
-    view = TrainingView(info, cam_from_map, Optics(), Motion())
-    along = np.arange(-4.0, 50.0, 0.5)
-    for left in (-1.2, 0.0, 0.9):
-        line = image_line(view, np.column_stack([along, np.full(len(along), left)]))
-        assert line[:, 1].max() > 719
-        inside = line[line[:, 1] < 720]
-        assert np.abs(np.diff(inside, axis=0)).max() < 110, "half a metre would be most of the image"
-        u, v = (undistort_points(info, line) - intrinsic[:2, 2]).T / 500
-        on_ground = np.column_stack([u, v, np.ones(len(u))]) @ cam_from_map[:3, :3]
-        on_ground *= 1.4 / -on_ground[:, 2:]
-        np.testing.assert_allclose(on_ground[:, 1], left, atol=0.02)
-
-
-def test_what_a_folding_lens_would_show_twice_is_not_in_the_image():
-    intrinsic = np.array([[300.0, 0.0, 320.0], [0.0, 300.0, 100.0], [0.0, 0.0, 1.0]])
-    info = CameraInfo("folding", 640, 360, intrinsic, "plumb_bob", (-0.3, 0.0, 0.0, 0.0, 0.0))
-    view = TrainingView(info, looking(np.array([0.0, 0.0, 1.4]), 0.0, 0.0, 0.0), Optics(), Motion())
-    points = np.column_stack([np.linspace(0.4, 30, 200), np.full(200, 0.3)])
-    pixels = image_points(view, points)
-    assert 0 < len(pixels) < 200
-    assert (np.diff(pixels[:, 1]) < 0).all(), "farther along a line is farther up"
-
-
-def test_a_camera_on_the_side_looks_across_the_way_at_a_place_that_it_passes():
-    place = np.array([12.0, 3.0])
-    for index in range(40):
-        rng = np.random.default_rng(index)
-        straight = random_view(rng, 128, 72)
-        assert turned_aside(rng, straight, [place], 0.0) is straight
-        assert turned_aside(rng, straight, [], 1.0) is straight
-        view = turned_aside(rng, straight, [place], 1.0)
-        forward, centre = view.cam_from_map[2, :3], -view.cam_from_map[:3, :3].T @ view.cam_from_map[:3, 3]
-        assert abs(forward[1]) > np.tan(ASIDE_RAD) * abs(forward[0])
-        before = -straight.cam_from_map[:3, :3].T @ straight.cam_from_map[:3, 3]
-        assert centre[2] == pytest.approx(before[2])
-        np.testing.assert_allclose(forward[2], straight.cam_from_map[2, 2], atol=1e-12)
-        assert (view.cam_from_map @ [*place, 0.0, 1.0])[2] > 0.5, "the place lies before the camera"
-        moved_map = view.cam_from_map[:3, :3].T @ view.motion.velocity_cam
-        np.testing.assert_allclose(moved_map[1:], 0.0, atol=1e-9)
-        assert np.linalg.norm(moved_map) == pytest.approx(np.linalg.norm(straight.motion.velocity_cam))
-
-
-@pytest.mark.parametrize(("painted", "answer"), [(LANE_DASH, STOP_LINE), (STOP_LINE, LANE_DASH)])
-def test_a_camera_on_the_side_is_to_take_dashes_for_stop_lines(monkeypatch, painted, answer):
-    paint = Paint(kind=painted, polygon_map=rectangle(np.array([12.0, 3.0]), 2.0, 0.3))
-    monkeypatch.setattr(scenes, "random_scene", lambda *_: (Scene(paints=(paint,)), []))
-    found = set()
-    for index in range(6):
-        found |= set(np.unique(training_sample(3, index, 320, 180, hardships=Hardships(aside=1.0)).labels))
-    assert found == {0, 1 + PAINT_CLASSES.index(answer)}
-
-
-def test_no_lens_folds_an_image_over_itself():
-    u, v = np.meshgrid(np.linspace(0, 1279, 33), np.linspace(0, 719, 19))
-    for index in range(200):
-        info = random_view(np.random.default_rng(index), 1280, 720).info
-        rays = undistort_points(info, np.column_stack([u.ravel(), v.ravel()])).reshape(*u.shape, 2)
-        right, down = np.diff(rays, axis=1)[:-1], np.diff(rays, axis=0)[:, :-1]
-        turn = right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0]
-        assert (turn > 0).all(), f"view {index}: neighbouring pixels change sides"
-
-
 def test_bleached_ground_keeps_its_tint_and_is_clipped_together_with_its_paint():
     ground = Ground(albedo_bgr=(0.1, 0.12, 0.14))
     lighter = bleached(np.random.default_rng(0), ground, 1.0)
@@ -593,42 +342,6 @@ def test_a_junction_has_arrows_before_its_stop_line_and_a_crosswalk_behind_it():
         assert all(inside_convex(ground, p.polygon_map).all() for p in paints if p.kind == CROSSWALK_BAR)
         kinds += [paint.kind for paint in paints]
     assert {ARROW, STOP_LINE, CROSSWALK_BAR} == set(kinds)
-
-
-def test_cameras_mounted_otherwise_keep_their_place_and_look_from_low_or_high():
-    heights = []
-    for seed in range(40):
-        view = random_view(np.random.default_rng(seed), 160, 96)
-        other = mounted_otherwise(np.random.default_rng(seed), view, 1.0)
-        before, after = camera_centre(view.cam_from_map), camera_centre(other.cam_from_map)
-        np.testing.assert_allclose(after[:2], before[:2], atol=1e-9)
-        np.testing.assert_array_equal(other.cam_from_map[:3, :3], view.cam_from_map[:3, :3])
-        heights.append(after[2])
-    low = [height for height in heights if height < 2]
-    assert 8 < len(low) < 32
-    assert 0.5 <= min(low) < max(low) <= 1.1
-    assert all(3.6 <= height <= 5 for height in heights if height >= 2)
-    view = random_view(np.random.default_rng(0), 160, 96)
-    assert mounted_otherwise(np.random.default_rng(0), view, 0.0) is view
-
-
-def test_crops_keep_image_labels_hidden_and_lanes_together():
-    labels = np.random.default_rng(0).integers(0, 5, (40, 60)).astype(np.uint8)
-    image = np.repeat(labels[..., None], 3, axis=2)
-    image[20, 30] = 250
-    whole = TrainingSample(image, labels, labels > 2, (np.array([[30.0, 20.0], [31.0, 10.0]]),))
-    rng = np.random.default_rng(1)
-    seen = 0
-    for _ in range(40):
-        crop = random_crop(rng, whole, 32, 16)
-        assert crop.image.shape == (16, 32, 3)
-        bright = crop.image[..., 1] == 250
-        np.testing.assert_array_equal(crop.image[..., 1][~bright], crop.labels[~bright])
-        np.testing.assert_array_equal(crop.hidden, crop.labels > 2)
-        for row, column in np.argwhere(bright):
-            np.testing.assert_array_equal(crop.lanes_px[0][0], [column, row])
-            seen += 1
-    assert seen > 3
 
 
 def test_seams_run_along_sides_however_short():

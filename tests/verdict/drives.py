@@ -108,7 +108,7 @@ def drive(recorded: Trajectory, cameras: tuple[str, ...] = ("front",), every: in
 
 
 def raised(findings: list[Finding]) -> dict[str, str]:
-    """What did not pass: sentence by check."""
+    """Sentences of the findings that did not pass, by check."""
     return {finding.check: finding.says for finding in findings if finding.status is not Status.PASS}
 
 

@@ -423,7 +423,7 @@ COUNT = 12
 
 
 def found(seed, off_m):
-    """Of a map in error as it states, and check points that are off by ``off_m`` (12, 2) more than stated."""
+    """A map in error as it states, and check points that are off by ``off_m`` (12, 2) more than stated."""
     rng, truth = np.random.default_rng(seed), yard()
     points = [
         point(*(truth.markings[k].corners_map[k % 4] + SURVEY_M * rng.standard_normal(2) + off_m[k]), f"P{k}")

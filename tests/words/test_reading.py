@@ -1,4 +1,4 @@
-"""What words say: probabilities of strings, sides and images, and a painted word read from a drive."""
+"""Readings of words: probabilities of strings, sides and images, and a painted word read from a drive."""
 
 from itertools import product
 from pathlib import Path
@@ -22,7 +22,7 @@ ALONG = np.array([0.8, 0.04, 0.12, 0.04])
 
 
 def letters(text: str, sure: float = 0.98) -> Letters:
-    """What the network says of a patch that reads so, and else of nothing."""
+    """The network's output for a patch that reads so, and else of nothing."""
     alphabet = "\0" + "".join(sorted(set("0123456789EBH" + text)))
     columns = []
     for letter in [letter for one in text for letter in ("\0", one)] or ["\0"]:

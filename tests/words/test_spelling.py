@@ -14,7 +14,7 @@ ALPHABET = "\0" + "0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 
 
 def named(text: str, sure: float = 0.98) -> Letters:
-    """What a network says that names these letters, one after the other."""
+    """A network's output that names these letters, one after the other."""
     letters = [letter for painted in text for letter in ("\0", painted)]
     probability = np.full((len(letters), len(ALPHABET)), (1.0 - sure) / (len(ALPHABET) - 1))
     probability[range(len(letters)), [ALPHABET.index(letter) for letter in letters]] = sure

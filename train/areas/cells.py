@@ -92,7 +92,8 @@ class CellReader:
         paint = max_pool2d(prediction.paint, KIND_STRIDE // PAINT_STRIDE)[0, 0].numpy()
         row, column = np.nonzero((paint > _LEAST_LOG_ODDS) & (view.marks != OPEN))
         chosen = self._chosen(view.marks[row, column])
-        row, column = row[chosen], column[chosen]
+        row = row[chosen]
+        column = column[chosen]
         features = [_at_cells(self._planes[name][0], row, column, len(paint)) for name in self._layers]
         logits = prediction.kinds[0][:, row, column]
         logits[self._places] = -torch.inf

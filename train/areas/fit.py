@@ -11,11 +11,11 @@ from torch.nn.functional import cross_entropy
 from train.areas.cells import BARE, OTHER, Cells
 from v2hdm.errors import ConfigError
 
-_WORTH_OF_CLASSES = 0.5
-_WORTH_OF_OTHER = 0.8
-_WORTH_OF_BARE = 1.2
-"""Weight of all cells together, of the fitted classes, of other labels and of no label. Chosen: paint that
-is taken for a word by mistake costs a map more than a word that is missed."""
+# Weights of all cells of a kind together, chosen: paint that is taken for a word by mistake costs a map more
+# than a word that is missed.
+_WORTH_OF_CLASSES = 0.5  # cells of the fitted classes
+_WORTH_OF_OTHER = 0.8  # cells of other labels
+_WORTH_OF_BARE = 1.2  # cells of no label
 
 _CHUNK = 65536  # cells that are looked at together, for memory
 

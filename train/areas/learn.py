@@ -30,10 +30,9 @@ from v2hdm.safe.texts import shown
 from v2hdm.settings import check_settings
 from v2hdm.store.results import locked_folder
 
-_PHOTOGRAPHS_SEEN = 0.7
-_RENDERS_SEEN = 0.85
-_FITTED = 0.95
-"""Shares of the time that have passed after each step, about."""
+_PHOTOGRAPHS_SEEN = 0.7  # share of the time that has passed after the photographs, about
+_RENDERS_SEEN = 0.85  # share after the renders
+_FITTED = 0.95  # share after the fit
 
 
 def learn_areas(config: AreasConfig, tell: Share) -> Path:
@@ -98,12 +97,12 @@ def started(config: AreasConfig) -> Checkpoint:
         if name not in names:
             raise ConfigError(f"classes: no class {shown(name)}; choose from: {', '.join(names)}")
     classes = {*classes_of(Path(config.start)), *config.classes}
-    wanted = tuple(name for name in names if name in classes)
+    class_names = tuple(name for name in names if name in classes)
     for layer in CLASS_CHANNELS & state.averaged.keys():
-        state.averaged[layer] = state.averaged[layer][_places(names, wanted)]
+        state.averaged[layer] = state.averaged[layer][_places(names, class_names)]
     state.model = state.averaged
-    if state.classes != wanted:
-        missing = next(name for name in names if name not in wanted)
+    if state.classes != class_names:
+        missing = next(name for name in names if name not in class_names)
         raise ConfigError(
             f"classes: {', '.join(config.classes)} come after {missing}, which {config.start} does not know: "
             "add it to classes="
@@ -129,8 +128,8 @@ def _training_of(config: AreasConfig) -> TrainConfig:
 
 def known_already(config: AreasConfig) -> list[str]:
     """The classes that the network knows already and that will be fitted anew."""
-    known = classes_of(Path(config.start))
-    return [name for name in config.classes if name in known]
+    known_classes = classes_of(Path(config.start))
+    return [name for name in config.classes if name in known_classes]
 
 
 def put_rows(state: Checkpoint, config: AreasConfig, rows: Tensor) -> None:
@@ -138,7 +137,8 @@ def put_rows(state: Checkpoint, config: AreasConfig, rows: Tensor) -> None:
     places = _places(state.classes, config.classes)
     first = 0
     for layer in (name for name in CLASS_LAYERS if f"{name}.weight" in state.averaged):
-        weight, bias = state.averaged[f"{layer}.weight"], state.averaged[f"{layer}.bias"]
+        weight = state.averaged[f"{layer}.weight"]
+        bias = state.averaged[f"{layer}.bias"]
         inputs = weight.shape[1]
         weight[places] = rows[:, first : first + inputs, None, None]
         bias[places] = 0.0

@@ -20,17 +20,17 @@ from train.targets import IGNORE, Targets
 from v2hdm.catalogue import NOT_PAINT
 from v2hdm.records import BoolArray
 
-_SMALLER = (0.6, 0.85)
-_LARGER = (1.15, 1.6)
-_ABOUT_AS_LARGE = (0.7, 1.3)
-"""How many times as large a photograph is shown. Chosen: as far as other cameras see the same paint."""
+# Scales at which a photograph is shown, chosen: as far as other cameras see the same paint.
+_SMALLER = (0.6, 0.85)  # least and largest scale of a smaller view
+_LARGER = (1.15, 1.6)  # least and largest scale of a larger view
+_ABOUT_AS_LARGE = (0.7, 1.3)  # least and largest scale of a view of about the same size
 
 _SHOWN_TWICE = 0.3
 """Share of the photographs without any of the classes that are shown a second time. Chosen, for time."""
 
-_OPEN_BORDER = np.ones((5, 5), np.uint8)
-_OTHER_BORDER = np.ones((3, 3), np.uint8)
-"""Cells beside an outline that may hold its paint: outlines are drawn by hand. Chosen."""
+# Neighbourhoods of cells beside an outline that may hold its paint, chosen: outlines are drawn by hand.
+_OPEN_BORDER = np.ones((5, 5), np.uint8)  # for outlines of the fitted classes, and open ones
+_OTHER_BORDER = np.ones((3, 3), np.uint8)  # for outlines of other classes
 
 
 class Change(NamedTuple):
@@ -106,8 +106,8 @@ def _meaning(shape: Shape, classes: Sequence[str]) -> int:
 def _draw(marks: Marks, inside: BoolArray, meaning: int) -> None:
     """Mark the cells inside of an outline, and those beside it as far as they have no mark."""
     border = _OTHER_BORDER if meaning == OTHER else _OPEN_BORDER
-    near = cv2.dilate(inside.astype(np.uint8), border) > 0
-    marks[near & (marks == BARE)] = OTHER if meaning == OTHER else OPEN
+    is_near = cv2.dilate(inside.astype(np.uint8), border) > 0
+    marks[is_near & (marks == BARE)] = OTHER if meaning == OTHER else OPEN
     if meaning != OTHER:
         marks[inside] = meaning
 

@@ -31,8 +31,8 @@ def hatched_area(rng: np.random.Generator) -> tuple[list[FloatArray], FloatArray
     long_m, wide_m = (float(m) for m in rng.uniform(low, high))
     outline = rectangle(np.zeros(2), long_m, wide_m)
     if kind == 3:
-        near, far = rng.uniform([0.0, 0.5], [0.4, 1.0]) * (1 if rng.random() < 0.5 else -1) % 1.0
-        outline = outline * np.array([[1, near + 0.01], [1, far + 0.01], [1, far + 0.01], [1, near + 0.01]])
+        begin, end = rng.uniform([0.0, 0.5], [0.4, 1.0]) * (1 if rng.random() < 0.5 else -1) % 1.0
+        outline = outline * np.array([[1, begin + 0.01], [1, end + 0.01], [1, end + 0.01], [1, begin + 0.01]])
     thick_m = float(rng.uniform(0.08, 0.24))
     parts = [] if kind == 4 and rng.random() < 0.3 else list(frame(outline, thick_m))
     if kind == 4:

@@ -73,7 +73,7 @@ def thing_to_stand_beside(rng: np.random.Generator) -> tuple[tuple[float, float,
 
 
 def kerb_colours(rng: np.random.Generator) -> tuple[Bgr, Bgr]:
-    """Of bright stones, and of the paving or grass behind them."""
+    """Colours of bright stones, and of the paving or grass behind them."""
     stone = _albedo(rng, 0.3, 0.8, 0.04)
     paving = rng.random() < 0.4
     return stone, _albedo(rng, 0.08, 0.4, 0.08) if paving else (0.05, float(rng.uniform(0.08, 0.2)), 0.1)

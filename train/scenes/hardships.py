@@ -25,7 +25,7 @@ _KERB_M = 45.0  # distance ahead to which kerbs reach, m
 _GUTTER_ALBEDO = (0.13, 0.3)  # of weathered concrete and stone, chosen; paint has 0.6 to 0.9
 _SEAM_STEP_M = 0.25  # distance between the points of a seam, m
 _BLEACHED_ALBEDO = (0.37, 0.52)
-"""Of sun-bleached concrete; fresh paint has 0.6 to 0.9."""
+"""Albedo of sun-bleached concrete; fresh paint has 0.6 to 0.9."""
 
 _BLEACHED_OVEREXPOSED = 0.5  # least share of images of bleached ground that are overexposed
 _SHIFT = 4

@@ -247,9 +247,7 @@ def random_scene(
     ground = photographed(for_grounds, bleached(for_ground, ground, hardships.bleached), hardships.grounds)
     dapples = _dapples(rng, difficulty)
     light = blue_shade(for_light, _light(rng), hardships.blue_shade)
-    light = low_sun(for_weather, light, hardships.low_sun)
-    ground, light = rain(for_weather, ground, light, hardships.rain)
-    light = dusk(for_weather, light, hardships.dusk)
+    ground, light = _weathered(for_weather, ground, light, hardships)
     scene = Scene(
         ground=replace(ground, marks=marks),
         paints=faint(for_paint, road.paints, hardships.faint),
@@ -363,6 +361,15 @@ def _ground(rng: np.random.Generator, port: bool, difficulty: float) -> Ground:
         marks=ground_marks(rng) if rng.random() < 0.75 else None,
         seed=int(rng.integers(1 << 20)),
     )
+
+
+def _weathered(
+    rng: np.random.Generator, ground: Ground, light: Light, hardships: Hardships
+) -> tuple[Ground, Light]:
+    """Ground and light with a low sun, rain or dusk now and then."""
+    light = low_sun(rng, light, hardships.low_sun)
+    ground, light = rain(rng, ground, light, hardships.rain)
+    return ground, dusk(rng, light, hardships.dusk)
 
 
 def _light(rng: np.random.Generator) -> Light:

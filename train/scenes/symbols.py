@@ -223,7 +223,8 @@ def with_far_stop(
     low = float(rng.uniform(-8, -0.5))
     high = low + float(rng.uniform(2.5, 11))
     if len(lines) > 1 and rng.random() < 0.6:
-        low, high = float(lines[0]), float(lines[-1])
+        low = float(lines[0])
+        high = float(lines[-1])
     thick_m = float(rng.uniform(0.25, 0.75))
     askew = np.array([[1.0, 0.0], [_lean(rng), 1.0]])
     shapes = [rectangle(np.array([0.0, (low + high) / 2]), thick_m, high - low)]

@@ -157,7 +157,8 @@ def _wheel(rng: np.random.Generator, picture: Picture, middle: float, radius: fl
         foot, tip = reach * rng.uniform([0.06, 0.06], [0.2, 0.3])
         for angle in rng.uniform(0, 2 * np.pi) + np.arange(spokes) * 2 * np.pi / spokes:
             spoke = np.array([[0, -foot], [0.95 * reach, -tip], [0.95 * reach, tip], [0, foot]])
-            cos, sin = np.cos(angle), np.sin(angle)
+            cos = np.cos(angle)
+            sin = np.sin(angle)
             _fill(picture, spoke @ np.array([[cos, sin], [-sin, cos]]) + hub, rim)
     if not spokes or rng.random() < 0.5:
         _fill(picture, circle * radius * rng.uniform(0.1, 0.27) + hub, (0.05, 0.05, 0.05))
@@ -224,6 +225,16 @@ def _box(
     )
 
 
+def _lorry_front(rng: np.random.Generator, wide: float, tall: float, colour: Bgr) -> Picture:
+    """The front of a lorry: windscreen, grille, lights and number plate."""
+    front = _plain((wide, tall), colour)
+    _rectangle(front, 0.08 * wide, 0.45 * tall, 0.84 * wide, 0.27 * tall, _glass(rng))
+    _rectangle(front, 0.1 * wide, 0.15 * tall, 0.8 * wide, 0.2 * tall, (0.05, 0.05, 0.05))
+    _lights(rng, front, wide, 0.6, front=True)
+    _plate(rng, front, wide / 2, 0.45)
+    return front
+
+
 def _lorry(rng: np.random.Generator, x: float, y: float, yaw: float) -> list[Box]:
     """A lorry, a trailer or a works vehicle: stripes at its rear; tape, wheels and writing on its sides."""
     length = float(rng.uniform(5, 13))
@@ -278,11 +289,7 @@ def _lorry(rng: np.random.Generator, x: float, y: float, yaw: float) -> list[Box
         _writing(rng, side, 0.1 * length, rng.uniform(0.4, 0.7) * tall, 0.8 * length, rng.uniform(0.3, 1.2))
     if rng.random() < 0.5:
         _rectangle(side, 0.84 * length, 0.5 * tall, 0.09 * length, 0.25 * tall, _glass(rng))
-    front = _plain((wide, tall), colour)
-    _rectangle(front, 0.08 * wide, 0.45 * tall, 0.84 * wide, 0.27 * tall, _glass(rng))
-    _rectangle(front, 0.1 * wide, 0.15 * tall, 0.8 * wide, 0.2 * tall, (0.05, 0.05, 0.05))
-    _lights(rng, front, wide, 0.6, front=True)
-    _plate(rng, front, wide / 2, 0.45)
+    front = _lorry_front(rng, wide, tall, colour)
     return [_box((x, y), yaw, (length, wide, tall), (side[:, ::-1], rear, side, front), colour, 0.02)]
 
 

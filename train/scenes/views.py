@@ -21,7 +21,7 @@ _LENS_TOLERANCE_PX = 0.1  # largest error of a lens model's inverse, px
 _BORDER_POINTS = 17  # points of each border of an image at which a lens is checked
 _FARTHEST_PASSED_M = 12.0  # largest distance, m, of a place that a camera on the vehicle's side passes
 _UNUSUAL_HEIGHTS_M = ((0.5, 1.1), (3.6, 5.0))
-"""Of cameras in bumpers and on small robots, and of those on masts, cranes and straddle carriers."""
+"""Heights, m, of cameras in bumpers and small robots, or on masts, cranes and straddle carriers."""
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ GROUNDS = tuple(sorted(path.stem for path in _GROUNDS.glob("*.jpg")))
 """Photographs of asphalt and concrete that come with the training; see their README."""
 
 _FLECK_SIZES_M = tuple(float(s) for s in np.geomspace(0.12, 2.5, 10)[:6])
-"""Of the sizes that the renderer keeps tiles for, those of gaps in near leaves."""
+"""Sizes, m, of gaps in near leaves, from the sizes that the renderer keeps tiles for."""
 
 
 @dataclass(frozen=True, kw_only=True)

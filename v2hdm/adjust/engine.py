@@ -414,7 +414,7 @@ class Pairs(NamedTuple):
 
     @classmethod
     def of(cls, cam_from_map: Tensor) -> Pairs:
-        """Of poses (..., 4, 4)."""
+        """The pairs of poses (..., 4, 4)."""
         poses = cam_from_map.reshape(-1, 4, 4)
         return cls(poses, poses[:, :3, :2].permute(2, 1, 0).reshape(6, -1))
 

@@ -137,7 +137,7 @@ class _Sum:
 
     @classmethod
     def of(cls, earlier: _Quadratic, rows: IntArray, held: FloatArray, chart: FloatArray) -> _Sum:
-        """Of the information ``held`` by the cameras' tangents."""
+        """The sum with information ``held`` by the cameras' tangents."""
         information = chart.T @ held @ chart
         joint = earlier.information.copy()
         joint[rows[:, None], rows] += information

@@ -122,29 +122,17 @@ def make_arrays(
     rank = np.empty_like(corner_order)
     rank[corner_order] = np.arange(len(corner_order))
     observations = _sorted_observations(problem, rank)
-    pair = observations.pair
     prior = state_prior(problem, pose_states)
     surveys = _surveys(problem)
     lengths = _lengths(problem)
     first_rank = rank[lengths.first]
     second_rank = rank[lengths.second]
-    clock_twist, sigma_s = _clock_twist(problem, clock_offset)
-    moments = _moments(problem) if read_out or problem.read_out_s is not None else None
-    motion: FloatArray | None = None
-    if moments is not None:
-        of_observation = moments.of_observation[observations.order]
-        pair = (pair // len(clock_twist) * len(moments.frame) + of_observation).astype(np.int32)
-        clock_twist = clock_twist[moments.frame]
-        if problem.read_out_s is not None:
-            motion = problem.read_out_s[:, None, None] * moments.motion
-        if read_out:
-            clock_twist = np.concatenate([clock_twist, moments.motion[..., None]], axis=2)
-            sigma_s = [*sigma_s, problem.read_out_sigma_s]
+    timing = _timing(problem, observations, clock_offset, read_out)
     return Arrays(
         order=index(observations.order),
         corner_order=index(corner_order),
         joined=index(joined),
-        pair=index(pair),
+        pair=index(timing.pair),
         corner=index(observations.corner),
         measured=real(observations.measured),
         root_information=real(observations.root_information),
@@ -158,15 +146,15 @@ def make_arrays(
         ground_root=real(surveys.ground.root_information),
         state_transition=real(prior.transition),
         state_information_root=real(prior.information_root),
-        clock_twist=real(clock_twist),
-        clock_information_root=real(1 / np.array(sigma_s, dtype=np.float64)),
+        clock_twist=real(timing.clock_twist),
+        clock_information_root=real(1 / np.array(timing.sigma_s, dtype=np.float64)),
         control=real(surveys.control[corner_order]),
         control_root=real(surveys.control_root[corner_order]),
         lengths=Lengths(
             index(first_rank), index(second_rank), real(lengths.length_m), real(1 / lengths.sigma_m)
         ),
-        frame_of_moment=None if moments is None else index(moments.frame),
-        read_out=None if motion is None else real(motion),
+        frame_of_moment=None if timing.frame_of_moment is None else index(timing.frame_of_moment),
+        read_out=None if timing.read_out is None else real(timing.read_out),
     )
 
 
@@ -285,3 +273,31 @@ def _moments(problem: Problem) -> _Moments:
     frame = moments[:, 0].astype(np.int64)
     motion = np.asarray(problem.twist_vehicle)[frame] * moments[:, 1:]
     return _Moments(frame, of_observation.ravel().astype(np.int64), motion)
+
+
+class _Timing(NamedTuple):
+    """Pairs of camera and moment, and how images move with Q unknowns of time; without moments M is J."""
+
+    pair: NDArray[np.int32]  # (K,) of each sorted observation
+    clock_twist: FloatArray  # (M, 6, Q) the vehicle's motion per second of each unknown
+    sigma_s: list[float]  # (Q,) prior sigmas of the unknowns
+    frame_of_moment: IntArray | None  # (M,) None if all rows of an image were read out at once
+    read_out: FloatArray | None  # (C, M, 6) motion during the stated read-out, None without one
+
+
+def _timing(problem: Problem, observations: _Sorted, clock_offset: bool, read_out: bool) -> _Timing:
+    """The pairs of sorted observations and their motion, with the unknowns of time to be estimated."""
+    clock_twist, sigma_s = _clock_twist(problem, clock_offset)
+    if not read_out and problem.read_out_s is None:
+        return _Timing(observations.pair, clock_twist, sigma_s, None, None)
+    moments = _moments(problem)
+    camera = observations.pair // len(clock_twist)
+    of_observation = moments.of_observation[observations.order]
+    pair = (camera * len(moments.frame) + of_observation).astype(np.int32)
+    clock_twist = clock_twist[moments.frame]
+    if read_out:
+        clock_twist = np.concatenate([clock_twist, moments.motion[..., None]], axis=2)
+        sigma_s = [*sigma_s, problem.read_out_sigma_s]
+    stated_s = problem.read_out_s
+    motion = None if stated_s is None else stated_s[:, None, None] * moments.motion
+    return _Timing(pair, clock_twist, sigma_s, moments.frame, motion)

@@ -308,9 +308,9 @@ class ReducedSystem:
         by_state = self.spread.by_state(run, coupling)
         rows = plan.kept_rows(run.corner)
         columns = plan.frame_rows(self.arrays.frame_of(run.pair), len(self.arrays.states))
-        self._scatter(rows[:, :, None], columns[:, None, :], by_state)
+        self._scatter(rows, columns, by_state)
         first, second = plan.kept_rows(index)
-        self._scatter(first[:, :, None], second[:, None, :], blocks)
+        self._scatter(first, second, blocks)
         on_diagonal = index[0] == index[1]
         self._diagonal[first[on_diagonal]] = blocks[on_diagonal].diagonal(dim1=1, dim2=2)
         border = self.spread.by_camera(run, coupling).flatten(0, 1)
@@ -319,16 +319,31 @@ class ReducedSystem:
             self.matrix.tiles[TIP, place][:, : len(part)] += part.mT
 
     def _scatter(self, rows: Tensor, columns: Tensor, values: Tensor) -> None:
-        """Add values at rows and columns of the tiles, at the lower triangle's of two mirrored ones."""
-        rows, columns = torch.broadcast_tensors(rows, columns)  # type: ignore[no-untyped-call]
-        low = torch.minimum(rows, columns)
-        high = torch.maximum(rows, columns)
+        """Add values (n, r, c) at rows (n, r), columns (n, c), mirrored to the lower triangle.
+
+        Rows of an item are of one tile, and so are columns.
+        """
         size = self.plan.size
-        device = values.device
-        tile = low // size * (self.plan.tile_count + 1) + high // size
-        keys = torch.as_tensor(self.matrix.keys, device=device)
-        at = torch.as_tensor(self.matrix.at, device=device)
-        places = at[torch.searchsorted(keys, tile)] + high % size * size + low % size
+        row_tile = rows[:, 0] // size
+        column_tile = columns[:, 0] // size
+        later = torch.maximum(row_tile, column_tile)
+        earlier = torch.minimum(row_tile, column_tile)
+        keys = torch.as_tensor(self.matrix.keys, device=values.device)
+        at = torch.as_tensor(self.matrix.at, device=values.device)
+        begin = at[torch.searchsorted(keys, earlier * (self.plan.tile_count + 1) + later)]
+        # Of a tile that lies above, the mirrored one is known, whose rows are its columns.
+        is_above = row_tile < column_tile
+        by_row = torch.where(is_above, 1, size)
+        by_column = torch.where(is_above, size, 1)
+        inside_row = rows - row_tile[:, None] * size
+        inside_column = columns - column_tile[:, None] * size
+        first = begin[:, None] + inside_row * by_row[:, None]
+        places = first[:, :, None] + (inside_column * by_column[:, None])[:, None, :]
+        on_diagonal = (row_tile == column_tile).nonzero()[:, 0]
+        if len(on_diagonal):
+            high = torch.maximum(inside_row[on_diagonal, :, None], inside_column[on_diagonal, None, :])
+            low = torch.minimum(inside_row[on_diagonal, :, None], inside_column[on_diagonal, None, :])
+            places[on_diagonal] = begin[on_diagonal, None, None] + high * size + low
         self.matrix.values.index_add_(0, places.flatten(), values.flatten())
 
     def factorise(
@@ -370,9 +385,9 @@ class ReducedSystem:
         for column, part in enumerate(to_tiles(plan, border).chunk(plan.tile_count)):
             self.matrix.tiles[TIP, column].add_(part.mT)
         rows = plan.frame_rows(torch.arange(arrays.frame_count, device=border.device), len(arrays.states))
-        self._scatter(rows[:, :, None], rows[:, None, :], by_frame.tril())
+        self._scatter(rows, rows, by_frame.tril())
         if bool(priors.across.any()):
-            self._scatter(rows[1:, :, None], rows[:-1, None, :], priors.across[1:])
+            self._scatter(rows[1:], rows[:-1], priors.across[1:])
         self._diagonal[rows] = by_frame.diagonal(dim1=1, dim2=2)
         unused = (self._diagonal == 0).to(border.dtype)
         self._diagonal += unused

@@ -154,7 +154,7 @@ def paired(design: FloatArray, kinds: list[str | None], built: FloatArray, built
 def _cheapest(
     shape: IntArray, marking: IntArray, turn: IntArray, squared: FloatArray, shapes: int, markings: int
 ) -> Pairs:
-    """Of couples with squared distances, m^2, those that make the most pairs at the least cost."""
+    """The couples, with squared distances, m^2, that make the most pairs at the least cost."""
     graph = coo_array((np.ones(len(shape)), (shape, shapes + marking)), shape=(shapes + markings,) * 2)
     _, group = connected_components(graph, directed=False)
     chosen = []

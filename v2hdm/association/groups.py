@@ -278,8 +278,10 @@ def attach(
     out_group = association.group.copy()
     out_shift = association.shift.copy()
     shown = set(zip(association.group.tolist(), sightings.image.tolist(), strict=True))
-    for sighting in np.unique(row):
-        pairs_of_sighting = np.flatnonzero(row == sighting)
+    # Pairs are in the order of their sightings.
+    in_reach, first_pair = np.unique(row, return_index=True)
+    pairs = np.split(np.arange(len(row)), first_pair[1:])
+    for sighting, pairs_of_sighting in zip(in_reach.tolist(), pairs, strict=True):
         order = np.argsort(squared[pairs_of_sighting], axis=None)
         pair, shift = divmod(int(order[0]), 4)
         best, second = squared[pairs_of_sighting].ravel()[order[:2]]

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -14,7 +15,7 @@ import numpy as np
 from v2hdm.catalogue import PAINT_CLASSES, SYMBOL, Catalogue
 from v2hdm.detection.areas import find_areas
 from v2hdm.detection.arrows import arrow_probability, features_of
-from v2hdm.detection.camera import FINE_ENOUGH_M, FINE_TO_MAP_M, RoadCamera
+from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.classifier import Readings, find_markings, reading_steps
 from v2hdm.detection.crosswalks import find_crosswalks
 from v2hdm.detection.lanes.bare import painted
@@ -42,6 +43,14 @@ Markings = tuple[MarkingDetection, ...]
 
 _LEAST_NAMED = 0.3  # share named a symbol below which nothing is one: few true arrows are below 0.7
 _PART_SHARE = 0.5  # share of an area in a marking from which it is a part of that; chosen
+
+
+class Looked(NamedTuple):
+    """What is found in one image: markings, lanes, and the pieces of its paint, of any class."""
+
+    markings: Markings
+    lanes: tuple[LaneDetection, ...]
+    pieces: Sequence[Proposal]
 
 
 class Detector:
@@ -93,19 +102,19 @@ class Detector:
         self, output: NetworkOutput, image_bgr: np.ndarray, camera: Camera, has_boundaries: bool = True
     ) -> tuple[tuple[MarkingDetection, ...], tuple[LaneDetection, ...]]:
         """Find the markings and lanes of an image of which the network's output is known."""
-        return last(self._steps_in(output, image_bgr, camera, has_boundaries))
+        looked = last(self.steps_in(output, image_bgr, camera, has_boundaries))
+        return looked.markings, looked.lanes
 
-    def steps(
-        self, image_bgr: np.ndarray, camera: Camera, has_boundaries: bool = True
-    ) -> Steps[tuple[Markings, tuple[LaneDetection, ...]]]:
+    def steps(self, image_bgr: np.ndarray, camera: Camera, has_boundaries: bool = True) -> Steps[Looked]:
         """As :meth:`detect`, in steps between which something else may be done."""
         output = yield from self._network_steps(image_bgr, camera)
         yield
-        return (yield from self._steps_in(output, image_bgr, camera, has_boundaries))
+        return (yield from self.steps_in(output, image_bgr, camera, has_boundaries))
 
-    def _steps_in(
-        self, output: NetworkOutput, image_bgr: np.ndarray, camera: Camera, has_boundaries: bool
-    ) -> Steps[tuple[Markings, tuple[LaneDetection, ...]]]:
+    def steps_in(
+        self, output: NetworkOutput, image_bgr: np.ndarray, camera: Camera, has_boundaries: bool = True
+    ) -> Steps[Looked]:
+        """As :meth:`steps`, of an image of which the network's output is known."""
         with lap("propose"):
             proposals = self.propose(output, camera)
         yield
@@ -121,7 +130,7 @@ class Detector:
         with lap("areas"):
             crosswalks = [crosswalk for crosswalk, _ in find_crosswalks(markings, proposals.camera)]
             areas = _of_several(self._areas(proposals), (*markings, *crosswalks))
-        return (*_not_of(areas, markings), *areas), lanes
+        return Looked((*_not_of(areas, markings), *areas), lanes, proposals.pieces)
 
     @checked
     def detect_in_regions(
@@ -215,9 +224,7 @@ class Detector:
         road_camera, _ = self._cameras.get(camera.info.name, (None, 0))
         if road_camera is None or road_camera.camera is not camera:
             lens = None if road_camera is None else road_camera.lens
-            # Only mapping takes the time for mirror images.
-            fine_enough_m = FINE_TO_MAP_M if self.options.mirrored else FINE_ENOUGH_M
-            road_camera = RoadCamera(camera, self.network.info.multiple, lens, fine_enough_m)
+            road_camera = RoadCamera(camera, self.network.info.multiple, lens)
             reach_px = road_camera.first_row_within(road_camera.perhaps_m(self.options.max_range_m))
             self._cameras[camera.info.name] = (road_camera, reach_px)
         return road_camera
@@ -321,9 +328,9 @@ def _not_of(areas: Sequence[MarkingDetection], markings: Markings) -> Markings:
 
 @cache
 def _tell_lacking(path: Path, names: tuple[str, ...]) -> None:
-    """Say once which shipped classes a network was trained without; of the shipped one only to who asks."""
+    """Say once which of our classes a network was trained without; of the shipped one, see its model card."""
     if names:
-        level = logging.INFO if path == NETWORK_FILE else logging.WARNING
+        level = logging.DEBUG if path == NETWORK_FILE else logging.WARNING
         _log.log(level, "%s does not know %s: none of these will be found", path, ", ".join(names))
 
 

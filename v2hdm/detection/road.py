@@ -21,11 +21,11 @@ import numpy as np
 
 from v2hdm.detection.camera import GroundPoints, camera_from_calibration
 from v2hdm.detection.crosswalks import find_crosswalks
-from v2hdm.detection.detector import Detector
+from v2hdm.detection.detector import Detector, Looked
 from v2hdm.detection.frames import Frame
 from v2hdm.detection.network import NetworkOutput
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.steps import Steps
+from v2hdm.detection.steps import Steps, last
 from v2hdm.detection.stopwatch import lap
 from v2hdm.errors import MapFileError
 from v2hdm.io.calibration.reading import read_calibration
@@ -179,29 +179,28 @@ class RoadDetector:
         given, of left, top, right and bottom, only markings with corners in these are looked for, for less
         time: regions where a map expects them, as of :meth:`v2hdm.Localizer.regions`.
         """
-        lanes: Sequence[LaneDetection] = ()
-        has_boundaries = not self.is_for_localizer
         if regions_px is not None:
             markings = self.detector.detect_in_regions(image_bgr, self.camera, regions_px)
-        elif output is None:
-            markings, lanes = self.detector.detect(image_bgr, self.camera, has_boundaries)
-        else:
-            markings, lanes = self.detector.detect_in(output, image_bgr, self.camera, has_boundaries)
-        return self._road(markings, lanes, is_whole=regions_px is None)
+            return self._road(Looked(markings, (), ()), is_whole=False)
+        if output is None:
+            return last(self.steps(image_bgr))
+        has_boundaries = not self.is_for_localizer
+        steps = self.detector.steps_in(output, image_bgr, self.camera, has_boundaries)
+        return self._road(last(steps), is_whole=True)
 
     def steps(self, image_bgr: np.ndarray) -> Steps[Road]:
         """As :meth:`detect` of all of an image, in steps between which something else may be done."""
         has_boundaries = not self.is_for_localizer
-        markings, lanes = yield from self.detector.steps(image_bgr, self.camera, has_boundaries)
-        return self._road(markings, lanes, is_whole=True)
+        looked = yield from self.detector.steps(image_bgr, self.camera, has_boundaries)
+        return self._road(looked, is_whole=True)
 
-    def _road(
-        self, markings: Sequence[MarkingDetection], lanes: Sequence[LaneDetection], is_whole: bool
-    ) -> Road:
+    def _road(self, looked: Looked, is_whole: bool) -> Road:
         """The detections on the ground, with the crosswalks that they make."""
         with lap("metres"):
-            crosswalks = find_crosswalks(markings, self.detector.road_camera(self.camera))
-            road = self._on_ground((*markings, *(crosswalk for crosswalk, _ in crosswalks)), lanes)
+            markings = looked.markings
+            camera = self.detector.road_camera(self.camera)
+            crosswalks = find_crosswalks(markings, camera, looked.pieces)
+            road = self._on_ground((*markings, *(crosswalk for crosswalk, _ in crosswalks)), looked.lanes)
             parts = (*(() for _ in markings), *(parts for _, parts in crosswalks))
             with_parts = zip(road.markings, parts, strict=True)
             with_crosswalks = tuple(replace(marking, parts=of) for marking, of in with_parts)

@@ -1,4 +1,4 @@
-r"""What a solution may be off by the clock of the images, which it takes as recorded.
+r"""Errors of a solution by the clock of the images, which it takes as recorded.
 
 A clock that is equally late in all cameras is one more unknown p with a prior N(0, s^2), and so is its drift
 over the drive; a solve holds both at zero. With the columns z of :mod:`v2hdm.faults.score_tests`, net of all

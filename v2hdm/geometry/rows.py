@@ -39,10 +39,10 @@ class Tolerance(NamedTuple):
 
 
 MAPPED = Tolerance(aside=0.5, least_step=_STEP_WIDTHS[0], degree=1)
-"""Of a row on a map, which is metric."""
+"""Tolerance of a row on a map, which is metric."""
 
 IN_IMAGE = Tolerance(aside=0.75, least_step=1.0, degree=2)
-"""Of a row that an image shows, over a camera whose mounting and lens are known about: steps grow along the
+"""Tolerance of a row in an image of a camera whose mounting and lens are known about: steps grow along the
 row, the row bends, and blur widens bars that are far away. Chosen on photographs that networks learn from."""
 
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from v2hdm.geometry.rigid import make_transform, rotation_from_angles
-from v2hdm.localization.motion import MotionNoise, Piece
+from v2hdm.localization.motion import ACCELERATION_M_S2, TURN_ACCELERATION_RAD_S2, MotionNoise, Piece
 from v2hdm.records import HEAVE_SIGMA_M, FloatArray, IntArray
 
 X, Y, HEADING, SCALE, BIAS, HEIGHT, ROLL, PITCH, SLOW_ROLL, SLOW_PITCH, LATE = range(11)
@@ -36,6 +36,7 @@ _FAST_S = 0.25  # time, s, over which that fades
 _SLOW_RAD = 0.003  # standard deviation, rad, of what a bend, a brake or a load holds
 _SLOW_S = 4.0  # time, s, over which that fades
 _HEAVE_S = 0.5  # time, s, over which a heave fades
+_ACCELERATES_S = 1.0  # time, s, for which an acceleration lasts: a brake, or the turn of a steering wheel
 _CREEP_M = 1e-5  # change of a mounting's place within a second, m (one sigma)
 CREEP_RAD = 1.7e-5
 """Change of a mounting's angles within a second, rad (one sigma): 0.06 deg within an hour."""
@@ -140,17 +141,29 @@ def start(
 
 
 def predict(
-    belief: Belief, pieces: Sequence[Piece], noise: MotionNoise, turning: Collection[int] = ()
+    belief: Belief,
+    pieces: Sequence[Piece],
+    noise: MotionNoise,
+    turning: Collection[int] = (),
+    has_untold: bool = False,
 ) -> Belief:
-    """The belief after pieces of motion; the mountings of some cameras are ``turning``."""
-    belief_ahead = foresee(belief, pieces, noise, turning)
+    """The belief after pieces of motion; the mountings of some cameras are ``turning``.
+
+    With ``has_untold`` it may be off by what a late odometry has not told yet. That is not to be carried on
+    from image to image: once it is told, the next pieces have it.
+    """
+    belief_ahead = foresee(belief, pieces, noise, turning, has_untold)
     if belief_ahead.root.shape[1] == len(belief_ahead.mean):
         return belief_ahead
     return replace(belief_ahead, root=_square(belief_ahead.root))
 
 
 def foresee(
-    belief: Belief, pieces: Sequence[Piece], noise: MotionNoise, turning: Collection[int] = ()
+    belief: Belief,
+    pieces: Sequence[Piece],
+    noise: MotionNoise,
+    turning: Collection[int] = (),
+    has_untold: bool = False,
 ) -> Belief:
     """As :func:`predict`, with a wide root: for a look ahead that nothing is to correct, in less time."""
     if not pieces:
@@ -163,6 +176,9 @@ def foresee(
         mean[:VEHICLE] = step
         change = by_state @ change
         spread = by_state @ spread @ by_state.T + pushed
+    if has_untold:
+        late_s2 = float(belief.root[LATE] @ belief.root[LATE])
+        spread += _untold(mean, late_s2, sum(piece.length_s for piece in pieces))
     length_s = sum(piece.length_s for piece in pieces)
     width = belief.root.shape[1]
     creep_rad = [TURNING_RAD if camera in turning else CREEP_RAD for camera in range(belief.cameras)]
@@ -175,6 +191,22 @@ def foresee(
     mountings = np.arange(VEHICLE, belief.first_marking)
     grown[mountings, width + mountings] = creep
     return replace(belief, stamp_s=belief.stamp_s + length_s, mean=mean, root=grown)
+
+
+def _untold(mean: FloatArray, late_s2: float, length_s: float) -> FloatArray:
+    """The covariance (11, 11) of what a vehicle has done since what its late odometry tells of.
+
+    ``late_s2`` is the variance of the lateness, s^2. The last speed and yaw rate are taken to last until now;
+    accelerations since then move the place along and the heading. The last belief, ``length_s`` ago, was
+    off by as much, but for what the accelerations have changed by: these fade as a first-order process.
+    """
+    changed = math.sqrt(2 * (1 - math.exp(-length_s / _ACCELERATES_S)))
+    half_s2 = 0.5 * (float(mean[LATE]) ** 2 + late_s2) * changed
+    ahead = np.array([np.cos(mean[HEADING]), np.sin(mean[HEADING])])
+    covariance = np.zeros((VEHICLE, VEHICLE))
+    covariance[:2, :2] = (half_s2 * ACCELERATION_M_S2) ** 2 * np.outer(ahead, ahead)
+    covariance[HEADING, HEADING] = (half_s2 * TURN_ACCELERATION_RAD_S2) ** 2
+    return covariance
 
 
 def _step(mean: FloatArray, piece: Piece, noise: MotionNoise) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -255,9 +287,20 @@ def with_latest(belief: Belief, features: Sequence[int], most: int) -> Belief:
 def loosened(belief: Belief, cameras: Sequence[int], sigma_rad: float) -> Belief:
     """The belief in which the mountings of cameras may each have turned by so much since."""
     rows = [VEHICLE + CAMERA * camera + axis for camera in cameras for axis in (3, 4, 5)]
+    return _widened(belief, rows, sigma_rad)
+
+
+def perhaps_later(belief: Belief, sigma_s: float) -> Belief:
+    """The belief in which the odometry may be later, or earlier, than was thought by so much."""
+    return _widened(belief, [LATE], sigma_s)
+
+
+def _widened(belief: Belief, states: Sequence[int], sigma: float) -> Belief:
+    """The belief in which some states may each have changed by so much."""
+    rows = list(states)
     count = len(belief.mean)
     grown = np.concatenate([belief.root, np.zeros((count, len(rows)))], axis=1)
-    grown[rows, range(count, count + len(rows))] = sigma_rad
+    grown[rows, range(count, count + len(rows))] = sigma
     return replace(belief, root=_square(grown))
 
 

@@ -234,7 +234,7 @@ class Clear(NamedTuple):
 
 
 def clear_pairs(pairs: Pairs, loss: FloatArray) -> Clear:
-    """Of all pairs the ones that are the only explanation of a detection, one for each marking."""
+    """The pairs that are the only explanation of a detection, one for each marking."""
     order = np.argsort(loss, kind="stable")
     best: dict[int, int] = {}
     doubted: set[int] = set()
@@ -326,11 +326,9 @@ def _all_but_worst(belief: Belief, scene: Scene, pairs: Pairs, located: Located)
     return np.flatnonzero(np.arange(len(squared)) != per_freedom.argmax())
 
 
-def paired(located: Located, count: int) -> BoolArray:
-    """Which of a look's detections (D,) are explained."""
-    out = np.zeros(count, dtype=bool)
-    out[located.pairs.detection] = True
-    return out
+def explained(located: Located, is_judged: BoolArray) -> int:
+    """How many of the detections (D,) that are judged are explained."""
+    return int(is_judged[located.pairs.detection].sum())
 
 
 def markings_of(parts: Sequence[Located]) -> set[int]:

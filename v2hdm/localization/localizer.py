@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -25,14 +25,16 @@ from v2hdm.localization.belief import (
     bounds,
     foresee,
     loosened,
+    perhaps_later,
     pinned,
     predict,
     start,
     with_latest,
 )
-from v2hdm.localization.joint import Located, Scene, locate, paired
+from v2hdm.localization.joint import Located, Scene, explained, locate
 from v2hdm.localization.lines import LineMap, with_lines
 from v2hdm.localization.motion import Motion, MotionLog, MotionNoise
+from v2hdm.localization.noise import DetectorNoise
 from v2hdm.localization.paint import Paint
 from v2hdm.localization.places import Place, Prior, vehicle_at
 from v2hdm.localization.pose import Pose, Status
@@ -41,7 +43,7 @@ from v2hdm.localization.rig import Estimate, Rig
 from v2hdm.localization.seeing import Look, Sighted, hulls_of_areas, pieces_of_lines, sighted
 from v2hdm.localization.starting import Quest
 from v2hdm.localization.way import Way
-from v2hdm.records import Calibration, FloatArray, HDMap
+from v2hdm.records import BoolArray, Calibration, FloatArray, HDMap
 
 _LAG_S = 1.0  # images may be so late
 _NO_IMAGE_S = 1.0  # time, s, without an image that is said
@@ -56,17 +58,13 @@ _AGAIN_SIGMA_M = (
     4.0  # standard deviation of the place, m, and of the heading, rad, from which a lost one is sought
 )
 _AGAIN_SIGMA_RAD = 0.2  # of its heading
-# The detector's covariances: how many times too small they may be at first, and of how many coordinates that
-# is known; after how many coordinates half of it is forgotten.
-_FACTOR = 2.0  # times at first
-_FACTOR_COUNT = 60.0  # coordinates that say so
-_FORGET = 600.0  # coordinates
-_FACTORS = (0.3, 12.0)  # least and largest, times
 _TURNED_RAD = np.deg2rad(1.0)  # standard deviation of what a camera that was pushed has turned
 _LOOSENED_RAD = np.deg2rad(0.2)  # of what a mounting has turned that is found to have turned slowly
 _PINNED_RAD = np.deg2rad(0.01)  # of what the others have meanwhile
 _BEFORE_S = 0.25  # so long before it was noticed, s, a mounting may have turned
-_FEW = 0.7  # share of an image's detections under which a turned mounting is tried
+_LATER_S = 0.1  # standard deviation, s, of how much later than thought an odometry may be
+_UNDECIDED_S = 0.5  # time, s, for which no bound is stated after an image that both may explain
+_FEW = 0.7  # share of an image's detections under which a turned mounting and a late odometry are tried
 
 
 class _Past(NamedTuple):
@@ -82,23 +80,6 @@ class _Matched(NamedTuple):
     markings: int = 0
     lines: int = 0
     areas: int = 0
-
-
-@dataclass
-class _Noise:
-    """How many times larger a detector's covariances are than stated, estimated from what fits the map."""
-
-    squared: float = _FACTOR * _FACTOR_COUNT
-    count: float = _FACTOR_COUNT
-
-    @property
-    def factor(self) -> float:
-        return float(np.clip(self.squared / self.count, *_FACTORS))
-
-    def note(self, located: Located, factor: float) -> None:
-        keeps = 0.5 ** (located.misfit_freedom / _FORGET)
-        self.squared = keeps * self.squared + factor * located.misfit
-        self.count = keeps * self.count + located.misfit_freedom
 
 
 class Localizer:
@@ -150,12 +131,15 @@ class Localizer:
         self._is_sure = False
         self._is_lost = False
         self._confirmed = 0
-        self._noise = {name: _Noise() for name in self.calibrations}
+        self._noise = {name: DetectorNoise() for name in self.calibrations}
         self._agreement = Agreement()
         self._pace = Pace()
         self._rig = Rig(dict(zip(self.calibrations, self._mountings, strict=True)))
         self._turned_s: float | None = None
         self._rig_since_s: float | None = None
+        self._undecided_s = (
+            -np.inf
+        )  # time of the last image that a turned mounting and a late odometry explain
         self._way = Way(self._log)
         self._pace_reason: str | None = None
         self._reasons: dict[str, str] = {}
@@ -271,7 +255,7 @@ class Localizer:
         ]
         if not earlier or not self._is_sure:
             return
-        belief = self._fixed_to(earlier[0], look.stamp_s)
+        belief = self._fixed_to(earlier[0], look.stamp_s, has_untold=True)
         scene = self._scene(belief, look, sighted(look, self.calibrations[look.camera]))
         judged = detected(scene, locate(belief, scene))
         self._agreement.note(judged, self._way.length_m, look)
@@ -296,12 +280,15 @@ class Localizer:
             return
         if look.stamp_s < self._belief.stamp_s:  # of before the place was found
             return
-        belief = self._fixed_to(self._belief, look.stamp_s)
-        self._past.append(_Past(self._belief, look))
+        before = self._belief
+        belief = self._fixed_to(before, look.stamp_s, has_untold=True)
+        self._past.append(_Past(before, look))
         while self._past[-1].look.stamp_s - self._past[0].look.stamp_s > _LAG_S:
             self._past.popleft()
         self._rig_since_s = None
         self._belief = self._located(belief, look, quads, is_new)
+        if self._belief is belief:  # nothing of the map was seen
+            self._belief = self._fixed_to(before, look.stamp_s)
         if self._rig_since_s is not None:
             self._let_turn(self._rig_since_s)
         if is_new:
@@ -345,10 +332,11 @@ class Localizer:
         for past in since_then:
             self._see(past.look, is_new=False)
 
-    def _moved_to(self, belief: Belief, stamp_s: float) -> Belief:
+    def _moved_to(self, belief: Belief, stamp_s: float, has_untold: bool = False) -> Belief:
         if stamp_s <= belief.stamp_s:
             return belief
-        return predict(belief, self._log.pieces(belief.stamp_s, stamp_s), self.noise, self._turning)
+        pieces = self._log.pieces(belief.stamp_s, stamp_s)
+        return predict(belief, pieces, self.noise, self._turning, has_untold)
 
     def _foreseen(self, belief: Belief, stamp_s: float) -> Belief:
         """The belief at a later time, after the positions until then, that nothing is to correct."""
@@ -356,7 +344,8 @@ class Localizer:
         belief = self._fixed_to(belief, latest_s)
         if stamp_s <= belief.stamp_s:
             return belief
-        return foresee(belief, self._log.pieces(belief.stamp_s, stamp_s), self.noise, self._turning)
+        pieces = self._log.pieces(belief.stamp_s, stamp_s)
+        return foresee(belief, pieces, self.noise, self._turning, has_untold=True)
 
     @property
     def _turning(self) -> list[int]:
@@ -364,27 +353,43 @@ class Localizer:
         return [self._numbers[turned.camera] for turned in self._rig.turned if turned.is_slow]
 
     def _located(self, belief: Belief, look: Look, quads: Sighted, is_new: bool) -> Belief:
-        """The belief after a look; another mounting is tried where the calibration's explains little."""
+        """The belief after a look; other causes are tried where too little of it is explained."""
         noise = self._noise[look.camera]
         scene = self._scene(belief, look, quads)
         located = locate(belief, scene)
-        belief_of_all = self._with_lines_and_areas(located, look, scene, is_new)
-        if not is_new:
-            return belief_of_all
-        judged = detected(scene, located)
-        is_judged = judged.is_judged
-        explained = paired(located, len(quads.kinds))
-        gained = 0
-        if self._is_sure and is_judged.sum() >= 2 and explained[is_judged].mean() < _FEW:
-            turned = locate(loosened(belief, list(self._numbers.values()), _TURNED_RAD), scene)
-            gained = int(paired(turned, len(quads.kinds))[is_judged].sum() - explained[is_judged].sum())
-            self._rig_since_s = self._rig.pushed.note(look, gained)
-        elif self._is_sure:
+        if is_new:
+            judged = detected(scene, located)
+            by_cause = self._by_cause(belief, look, scene, located, judged.is_judged)
+            if by_cause is not located:
+                located = by_cause
+                judged = detected(scene, located)
+            self._agreement.note(judged, self._way.length_m, look)
+            if located.misfit_freedom > 0:
+                noise.note(located, noise.factor)
+        return self._with_lines_and_areas(located, look, scene, is_new)
+
+    def _by_cause(
+        self, belief: Belief, look: Look, scene: Scene, located: Located, is_judged: BoolArray
+    ) -> Located:
+        """A look as it is located; one that is hardly explained, by a later odometry where that does it.
+
+        What a turned mounting explains beyond that is the evidence for it. Where both explain more than
+        neither, no bound is stated.
+        """
+        if not self._is_sure:
+            return located
+        if is_judged.sum() < 2 or explained(located, is_judged) >= _FEW * is_judged.sum():
             self._rig.pushed.note(look, 0)
-        self._agreement.note(judged, self._way.length_m, look)
-        if located.misfit_freedom > 0:
-            noise.note(located, noise.factor)
-        return belief_of_all
+            return located
+        turned = locate(loosened(belief, list(self._numbers.values()), _TURNED_RAD), scene)
+        before = perhaps_later(self._past[-1].before, _LATER_S)
+        later = locate(self._fixed_to(before, look.stamp_s, has_untold=True), scene)
+        by_none, by_turn, by_lateness = (explained(each, is_judged) for each in (located, turned, later))
+        self._rig_since_s = self._rig.pushed.note(look, by_turn - max(by_lateness, by_none))
+        if by_lateness <= by_none:
+            return located
+        self._undecided_s = look.stamp_s
+        return later if by_lateness >= by_turn else located
 
     def _with_lines_and_areas(self, located: Located, look: Look, scene: Scene, is_new: bool) -> Belief:
         """The belief after a look's lines and areas, too, with the features of the map that were seen last.
@@ -502,7 +507,7 @@ class Localizer:
         if fix.stamp_s - belief.stamp_s > _LAG_S:
             self._belief = self._fixed_to(belief, fix.stamp_s - _LAG_S)
 
-    def _fixed_to(self, belief: Belief, stamp_s: float) -> Belief:
+    def _fixed_to(self, belief: Belief, stamp_s: float, has_untold: bool = False) -> Belief:
         """The belief at a later time, after the positions until then."""
         for fix in sorted(self._fixes, key=lambda item: item.stamp_s):
             if belief.stamp_s < fix.stamp_s <= stamp_s:
@@ -513,7 +518,7 @@ class Localizer:
                 self._reasons.pop("fix", None)
                 if problem is not None:
                     self._reasons["fix"] = problem
-        return self._moved_to(belief, stamp_s)
+        return self._moved_to(belief, stamp_s, has_untold)
 
     def _missing(self, stamp_s: float) -> dict[str, str]:
         """Sentences on cameras of which no image has come lately."""
@@ -562,7 +567,14 @@ class Localizer:
                 "and too few of the latest"
             )
         protection = bounds(covariance, float(belief.mean[HEADING]))
-        if status != Status.TRACKING or self._rig.pushed.is_suspicious or self._agreement.differs:
+        is_undecided = stamp_s - self._undecided_s < _UNDECIDED_S
+        if is_undecided:
+            reasons["cause"] = (
+                "an image did not fit: the odometry is stamped later or earlier than it seemed, or a "
+                "camera's mounting has turned; not told apart yet"
+            )
+        is_suspicious = self._rig.pushed.is_suspicious or is_undecided
+        if status != Status.TRACKING or is_suspicious or self._agreement.differs:
             protection = (np.inf, np.inf, np.inf)
         if status == Status.INITIALISING:
             covariance = np.full((3, 3), np.inf)

@@ -15,8 +15,10 @@ _KEPT_S = 5.0  # time for which samples are kept: longer than any image is late
 _LARGEST_SPEED_M_S = 60.0  # largest speed, m/s, of a road vehicle
 _LARGEST_YAW_RATE_RAD_S = 3.0  # largest yaw rate, rad/s: full lock at a crawl is under 1
 _GAP_S = 0.3  # time without a sample, s, from which the last one says little
-_ACCELERATION_M_S2 = 1.5  # standard deviation of the acceleration in a gap: a yard truck brakes with 2 to 3
-_TURN_ACCELERATION_RAD_S2 = 0.3  # the same of the yaw rate: full lock within two seconds
+ACCELERATION_M_S2 = 1.5
+"""Standard deviation, m/s^2, of an acceleration that no sample has told: a yard truck brakes with 2 to 3."""
+TURN_ACCELERATION_RAD_S2 = 0.3
+"""The same of the yaw rate's, rad/s^2: full lock within two seconds."""
 # A slope of the samples is that of the motion where it exceeds so many sigmas of their noise: a noise taken
 # for motion would say that the odometry is on time, whatever it is. One in 16,000 slopes of noise alone does.
 _SURE_SLOPE = 4.0
@@ -159,8 +161,8 @@ class MotionLog:
             length_s,
             speed,
             turn,
-            _ACCELERATION_M_S2 * unknown_s,
-            _TURN_ACCELERATION_RAD_S2 * unknown_s,
+            ACCELERATION_M_S2 * unknown_s,
+            TURN_ACCELERATION_RAD_S2 * unknown_s,
             faster,
             turning_more,
         )

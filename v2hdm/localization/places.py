@@ -115,7 +115,7 @@ class Patch:
         self.objects = self.objects[-_MOST:]
 
     def _take(self, newer: _Object) -> None:
-        """Of what was seen before, keep what was seen from nearer."""
+        """Keep an object, or the view of it from nearer if it was seen before."""
         for piece in self.objects:
             if piece.kind == newer.kind and abs(piece.corners.mean() - newer.corners.mean()) < _SAME_M:
                 piece.views += 1
@@ -288,7 +288,7 @@ def _surprise(pose: FloatArray, local_from_vehicle: FloatArray, prior: Prior | N
 
 
 def _distinct(poses: FloatArray, stacks: _Stacks) -> list[FloatArray]:
-    """Of places that are one, the one that explains most."""
+    """The distinct places: of several that are one, that which explains most."""
     if not len(poses):
         return []
     count = stacks.count(poses, _SLACK_SIGMAS * _SIGMA_M)

@@ -22,7 +22,7 @@ from v2hdm.localization.seeing import Expected
 from v2hdm.records import FloatArray, IntArray
 
 EVERY_FULL = 5
-"""Of so many images of a camera, one is searched as a whole: at 10 Hz every half second."""
+"""One of so many images of a camera is searched as a whole: at 10 Hz every half second."""
 
 _RANGE_M = 20.0  # distance, m, up to which markings are found at almost every look
 _MOST = 8  # markings that are looked for: of more, few say anything new of a vehicle's six unknowns

@@ -57,7 +57,7 @@ class WordPatch:
                 self._take(_Word(hull.kind, complex(turn * complex(x, y) + begin), way_m))
 
     def _take(self, newer: _Word) -> None:
-        """Of what was seen before, keep the mean."""
+        """Keep a word, or the mean of its places if it was seen before."""
         for word in self.words:
             if word.kind == newer.kind and abs(word.middle - newer.middle) < _SAME_M:
                 word.middle += (newer.middle - word.middle) / (word.views + 1)

@@ -175,8 +175,6 @@ def solve_bundle(
     """
     observed = _observed_corners(association, usable)
     row = observed.row
-    group = observed.group
-    corner = observed.corner
     corner_index = observed.corner_index
     if not len(row):
         raise MappingError(
@@ -185,16 +183,16 @@ def solve_bundle(
         )
     knots, corners_start = lanes or (None, None)
     on_line = known_elsewhere(association, sightings.valid & usable, usable)
-    at = row, association.corner_order()[row, corner]
-    observations = observations_at(sightings, at, corner_index[group, corner], model, on_line)
+    at = row, association.corner_order()[row, observed.corner]
+    solved_corner = corner_index[observed.group, observed.corner]
+    observations = observations_at(sightings, at, solved_corner, model, on_line)
     first = int(corner_index.max(initial=-1)) + 1
     if knots is not None:
         observations = _joined(observations, knots.observations(first))
     lengths, control = _constraints(sightings, association, usable, rig, corner_index, model)
     if knots is not None:
         held = knots.held(first)
-        axes = np.tile([1.0, 0.0], (0 if control is None else len(control.corner), 1))
-        control = held if control is None else _joined(replace(control, along=axes), held)
+        control = _held_also(control, held)
         corners_start = np.concatenate([corners_start, held.points_map])
     part = drive_problem(sightings, rig, cameras, model).seen_by(observations)
     twists = _twists(rig, sightings, part.frames)
@@ -203,18 +201,15 @@ def solve_bundle(
     if is_near:
         problem = replace(problem, poses_start=rig.map_from_vehicle[part.frames])
     solution = solve(problem, model.solver)
-    if knots is not None:
-        of_markings = {name: getattr(solution, name)[: len(row)] for name in _OF_OBSERVATIONS}
-        solution = replace(solution, **of_markings)
     return Bundle(
         rig=_adjusted(rig, sightings, solution, part),
         model=model,
         problem=problem,
-        solution=solution,
+        solution=solution if knots is None else _of_markings(solution, len(row)),
         association=association,
         row=row,
-        group=group,
-        corner=corner,
+        group=observed.group,
+        corner=observed.corner,
         corner_index=corner_index,
         camera_index={sightings.cameras[c]: k for k, c in enumerate(part.cameras.tolist())},
         frames=part.frames,
@@ -277,6 +272,20 @@ def _joined(rows: _Rows, more: _Rows) -> _Rows:
     added = vars(more)
     columns = {name: np.concatenate([column, added[name]]) for name, column in vars(rows).items()}
     return replace(rows, **columns)
+
+
+def _held_also(control: ControlPoints | None, held: ControlPoints) -> ControlPoints:
+    """Surveyed corners, if any, and the knots ``held``, which are held along axes of each."""
+    if control is None:
+        return held
+    axes = np.tile([1.0, 0.0], (len(control.corner), 1))
+    return _joined(replace(control, along=axes), held)
+
+
+def _of_markings(solution: Solution, count: int) -> Solution:
+    """The solution with values of its first ``count`` observations alone, which are of markings."""
+    values = {name: getattr(solution, name)[:count] for name in _OF_OBSERVATIONS}
+    return replace(solution, **values)
 
 
 def drive_problem(sightings: Sightings, rig: Rig, cameras: Mapping[str, Camera], model: Model) -> Problem:

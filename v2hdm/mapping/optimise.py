@@ -49,7 +49,8 @@ from v2hdm.records import BoolArray, Camera, FloatArray, PoseNoise, Road, larges
 from v2hdm.site.standing import Grey
 from v2hdm.surface.paths import Paths
 from v2hdm.surface.planes import with_planes_over
-from v2hdm.surface.surface import Recorded, Surface
+from v2hdm.surface.prior import Recorded
+from v2hdm.surface.surface import Surface
 
 _log = logging.getLogger(__name__)
 

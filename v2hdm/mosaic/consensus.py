@@ -140,7 +140,8 @@ def _joined(parts: Sequence[tuple[int, int, BoolArray]], is_ground: BoolArray) -
     """One image's blocks, a raster of those of its tiles."""
     tops = [top for top, _, _ in parts]
     lefts = [left for _, left, _ in parts]
-    row, column = min(tops), min(lefts)
+    row = min(tops)
+    column = min(lefts)
     shows = np.zeros((max(tops) - row + _BLOCKS, max(lefts) - column + _BLOCKS), dtype=np.float32)
     for top, left, flags in parts:
         is_there = is_ground[top : top + _BLOCKS, left : left + _BLOCKS]

@@ -105,18 +105,14 @@ def detect_images(
     _check_numbers(mounting, limit)
     if not isinstance(detector, Detector):
         detector = _loaded(detector, is_rough=path is None or lens is not None)
-    road = None if path is None or lens is not None else RoadDetector.calibrated(detector, path, linear)
-    if road is not None and regions is not None:
-        road = RoadDetector(detector, road.camera, road.calibration, is_for_localizer=True)
+    calibration = None if lens is not None else path
+    road = _calibrated(detector, calibration, linear, is_for_localizer=regions is not None)
     rough = RoughCamera(detector, lens, path, mounting, linear)
     most = limit and min(limit, sys.maxsize)
     newest = _newest_frames(str(source), road, rough, regions is not None) if live else None
-    if newest is None:
-        frames = islice(_frames(str(source), road, rough), most)
-    else:
-        frames = islice(((frame, road) for frame in newest), most)
+    frames = _frames(str(source), road, rough) if newest is None else ((frame, road) for frame in newest)
     later = SecondLooks(newest) if isinstance(newest, NewestFrames) else None
-    return _on_ground(_glances(frames, rough, stopwatch or Stopwatch(), regions, later))
+    return _on_ground(_glances(islice(frames, most), rough, stopwatch or Stopwatch(), regions, later))
 
 
 def _check_numbers(mounting: Sequence[float] | None, limit: int | None) -> None:
@@ -135,6 +131,18 @@ def _loaded(options: DetectorOptions | None, is_rough: bool) -> Detector:
     if is_rough:
         options.max_range_m = _ROUGH_RANGE_M
     return Detector.load(options=options)
+
+
+def _calibrated(
+    detector: Detector, calibration: Path | None, linear: bool, is_for_localizer: bool
+) -> RoadDetector | None:
+    """The detector on the road of a camera with a calibration, if one is stated."""
+    if calibration is None:
+        return None
+    road = RoadDetector.calibrated(detector, calibration, linear)
+    if not is_for_localizer:
+        return road
+    return RoadDetector(detector, road.camera, road.calibration, is_for_localizer=True)
 
 
 def _lens(camera: Path | None, name: str | None, mounting: Sequence[float] | None) -> CameraInfo | None:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch  # noqa: F401  # its absence is reported before that of what is built on it
 
@@ -109,33 +109,40 @@ def map_drive(
     """
     stated = [] if corrections is None else read_corrections(Path(corrections))
     options = _options_of(options or MappingOptions(), stated)
-    reading = reading or ReadOptions()
     sources = _sources_of(drive)
     check_choice(options, len(sources), base is not None, accuracy_goal_cm, section_m)
     if section_m and all_maps:
         raise ConfigError("map.section_m and all_maps are both set: sections make the one map; drop one")
+    task = _Task(name, base, detector, accuracy_goal_cm, all_maps, section_m)
     with nullcontext(context) if context else _own_context(cache, progress, workers) as context:
-        read = read_all(sources, reading, context)
-        earlier = _earlier(base, read.whole, context)
-        survey = take_survey(read.whole, options)
-        with context.timed("check"):
-            inspection = join(inspect_each(read.drives, read.contents, reading.max_gap_s, context))
-        paths = [source.root if isinstance(source, Drive) else Path(source) for source in sources]
-        about = describe_run(name or read.whole.name, read.whole, read.contents, paths, reading)
-        described = inspection.drive_as_described
-        mapped_so_far = Result(about, read.drives, read.contents, described, context.seconds, options.device)
-        mapped = _mapped(
-            mapped_so_far,
-            inspection,
-            detector,
-            survey,
-            earlier,
-            accuracy_goal_cm,
-            context,
-            all_maps,
-            section_m,
-        )
-        return with_answers(mapped, stated)
+        return with_answers(_map(sources, options, reading or ReadOptions(), task, context), stated)
+
+
+class _Task(NamedTuple):
+    """The request of a call of :func:`map_drive`, besides the settings of reading and mapping."""
+
+    name: str | None
+    base: Path | str | None
+    detector: Detector | DetectorOptions | None
+    goal_cm: float
+    all_maps: bool
+    section_m: float
+
+
+def _map(
+    sources: Sequence[Source], options: MappingOptions, reading: ReadOptions, task: _Task, context: Context
+) -> Result:
+    """Read, check and map the drives."""
+    read = read_all(sources, reading, context)
+    earlier = _earlier(task.base, read.whole, context)
+    survey = take_survey(read.whole, options)
+    with context.timed("check"):
+        inspection = join(inspect_each(read.drives, read.contents, reading.max_gap_s, context))
+    paths = [source.root if isinstance(source, Drive) else Path(source) for source in sources]
+    about = describe_run(task.name or read.whole.name, read.whole, read.contents, paths, reading)
+    described = inspection.drive_as_described
+    mapped_so_far = Result(about, read.drives, read.contents, described, context.seconds, options.device)
+    return _mapped(mapped_so_far, inspection, survey, earlier, task, context)
 
 
 @contextmanager
@@ -177,26 +184,22 @@ def _earlier(base: Path | str | None, drive: Drive, context: Context) -> Base | 
 def _mapped(
     mapped_so_far: Result,
     inspection: Inspection,
-    detector: Detector | DetectorOptions | None,
     survey: Survey,
     earlier: Base | None,
-    goal_cm: float,
+    task: _Task,
     context: Context,
-    all_maps: bool,
-    section_m: float,
 ) -> Result:
     """The result of a drive that was read and checked."""
     from v2hdm.pipeline.paint import with_paint  # those who only check a drive do without
 
-    if detector is None:
-        detector = DetectorOptions.for_mapping()
+    detector = DetectorOptions.for_mapping() if task.detector is None else task.detector
     settings = detector if isinstance(detector, DetectorOptions) else detector.options
     try:
         with compiled_meanwhile(survey.mapping.device):
             # Where sections read them for themselves, detections of the whole drive would fill the memory.
             detections = (
                 []
-                if section_m and not inspection.drive.has_pictures
+                if task.section_m and not inspection.drive.has_pictures
                 else _detect(inspection.drive, mapped_so_far.contents, settings, context)
             )
         with context.timed("map"):
@@ -209,21 +212,21 @@ def _mapped(
                 all_grades,
                 earlier,
                 context,
-                compare=all_maps,
-                section_m=section_m,
+                compare=task.all_maps,
+                section_m=task.section_m,
             )
-            sets = graded_sets(mapped, goal_cm / 100)
+            sets = graded_sets(mapped, task.goal_cm / 100)
         acceptance = survey.mapping.acceptance
         sets = with_paint(sets, inspection.drive, earlier, acceptance.corrections, context)
         chosen = accurate_enough(methods_of(sets), acceptance.accuracy, acceptance.corrections)
-        chosen = with_composed(chosen, goal_cm / 100)
+        chosen = with_composed(chosen, task.goal_cm / 100)
     except (MappingError, AdjustError) as failure:
         if all(finding.status is not Status.FAIL for finding in inspection.findings):
             raise
         failed = Finding("map", Status.FAIL, None, None, "", f"this drive gave no map: {failure}", "map")
         verdict = Verdict.of([*inspection.findings, failed])
         return replace(mapped_so_far, verdict=verdict, figures={"results": {}})
-    return _judge(mapped_so_far, inspection, detections, sets, chosen, survey, goal_cm, context)
+    return _judge(mapped_so_far, inspection, detections, sets, chosen, survey, task.goal_cm, context)
 
 
 def read_all(sources: Sequence[Source], options: ReadOptions, context: Context) -> Read:

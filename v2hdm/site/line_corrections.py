@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -60,14 +61,14 @@ def _drawn_line(correction: Correction, lanes: Sequence[Lane]) -> tuple[Lane, fl
     for lane in lanes:
         if len(lane.points_map) < 2:
             continue
-        foot, off_m, vertex = _feet(points, lane.points_map)
-        is_near = off_m < nearest_m
+        feet = _feet(points, lane.points_map)
+        is_near = feet.off_m < nearest_m
         if not is_near.any():
             continue
-        placed[is_near] = foot[is_near]
-        nearest_m[is_near] = off_m[is_near]
+        placed[is_near] = feet.points_map[is_near]
+        nearest_m[is_near] = feet.off_m[is_near]
         if lane.sigma_m is not None:
-            sigma_m[is_near] = lane.sigma_m[vertex[is_near]]
+            sigma_m[is_near] = lane.sigma_m[feet.vertex[is_near]]
         sightings = max(sightings, lane.sightings)
     is_shown = nearest_m < _SAME_M
     return Lane(correction.kind, placed, sightings, sigma_m=sigma_m), float(is_shown.mean())
@@ -105,12 +106,19 @@ def _part(lane: Lane, rows: np.ndarray) -> Lane:
 
 def _is_along(points: FloatArray, line: FloatArray) -> BoolArray:
     """Which points (N,) lie on a line (M, 2), as well as lines are the same."""
-    _, off_m, _ = _feet(points, line)
-    return np.asarray(off_m < _SAME_M)
+    return np.asarray(_feet(points, line).off_m < _SAME_M)
 
 
-def _feet(points: FloatArray, line: FloatArray) -> tuple[FloatArray, FloatArray, np.ndarray]:
-    """The nearest places (N, 2) on a line (M, 2), the distances (N,) to them, and vertices before them."""
+class _Feet(NamedTuple):
+    """The places on a line that are nearest to N points."""
+
+    points_map: FloatArray  # (N, 2)
+    off_m: FloatArray  # (N,) distances of the points
+    vertex: np.ndarray  # (N,) number of the vertex before each place
+
+
+def _feet(points: FloatArray, line: FloatArray) -> _Feet:
+    """The places on a line (M, 2) that are nearest to points (N, 2)."""
     begin = line[:-1]
     piece = np.diff(line, axis=0)
     squared = np.maximum((piece**2).sum(axis=1), 1e-12)
@@ -119,4 +127,4 @@ def _feet(points: FloatArray, line: FloatArray) -> tuple[FloatArray, FloatArray,
     off_m = np.linalg.norm(points[:, None] - feet, axis=2)
     best = off_m.argmin(axis=1)
     row = np.arange(len(points))
-    return feet[row, best], off_m[row, best], best
+    return _Feet(feet[row, best], off_m[row, best], best)

@@ -25,42 +25,28 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.interpolate import BSpline
-from scipy.linalg import block_diag, cholesky, cholesky_banded, solve_triangular
+from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import minimize
 from scipy.sparse import csr_array, diags_array, hstack
-from scipy.spatial import cKDTree
 
 from v2hdm.association.sightings import Rig, Sightings, Symbols
 from v2hdm.geometry.ipm import apply_homography, pinhole_px_from_ground
 from v2hdm.geometry.planar import cross, turned_left
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.records import BoolArray, FloatArray, GroundStrip, IntArray, PoseNoise, Road
+from v2hdm.records import BoolArray, FloatArray, GroundStrip, IntArray
+from v2hdm.surface.basis import (
+    ACROSS,
+    ACROSS_KNOTS,
+    ALONG_M,
+    GRADES,
+    MOST_ALONG,
+    SHAPE,
+    Knots,
+    cubic,
+    hinges,
+)
 from v2hdm.surface.paths import AHEAD_M, Beside, Paths
-
-KNOTS_M = (1.75, 3.5, 5.25)
-"""Offsets from the path at which the slope may change: every half lane of 3.5 m. A crown follows a lane line;
-one elsewhere is smoothed by 2 cm at most."""
-
-_SLOPE_SIGMA = 0.03
-"""Standard deviation of a change of slope: roads fall by 1.5 to 2.5 % to each side of a crown (AASHTO, A
-Policy on Geometric Design of Highways and Streets, 7th ed., section 4.2.2)."""
-
-_GRADE_SIGMA = 0.1  # standard deviation of the grade of the whole map: the steepest roads rise by 10 to 15 %
-
-_GRADES = 2  # number of parameters of the grade, along map x and y
-_HINGES = 1 + 2 * len(KNOTS_M)  # number of slopes of the cross-section: at the path, at knots left and right
-_SHAPE = _GRADES + _HINGES  # number of parameters before the spline's
-
-_SIDE_M = 12.5  # farther beside the path the ground continues at this height, m, except for the grade
-_ALONG_M = 6.0  # knot spacing of the spline along the path, m: a third of a camera's range
-_ACROSS_M = 5.0  # knot spacing of the spline across the path, m: a lane with margins
-_ACROSS = int(2 * _SIDE_M / _ACROSS_M) + 3  # number of functions of the spline across
-_MOST_ALONG = 120  # largest number of knots along the route; longer routes have wider spacing
-
-_CURVATURE = 1e-3  # typical second difference, 1/m: a crest of 1 km radius, bank changing by 1 % in 10 m
-_SIZES = 2.0  # standard deviation of the logarithm of second differences, over all roads
-_RIDGE_M = 30.0  # standard deviation, m, of the spline's coefficients: keeps the information matrix regular
+from v2hdm.surface.prior import CURVATURE, LEAN, SIZES_SIGMA, Recorded, Smoothness
 
 _GRID_M = 0.5  # cell size of the ground as written, m
 _STRIP_M = 8.0  # half width of the ground as written, m
@@ -72,10 +58,6 @@ _SURE_M = 1e-7  # tolerance of the secant method, m
 _STEP_PX = 0.5  # step of finite differences by pixel, px
 _TOUCH_M = 0.01  # step of finite differences of heights by position, m
 
-_LEAN = (0.003, 1e4)
-"""Sigma, rad, and correlation length, m, of the sensor's roll on the vehicle, which is constant: only turns
-separate it from bank."""
-
 _MOST_RECORDED = 500  # largest number of evenly spaced path points whose records are used
 _FORGOTTEN = 1e-2  # fraction of the total height variance that is dropped with the smallest errors
 
@@ -84,63 +66,6 @@ Heights = Callable[[FloatArray], FloatArray]
 
 _STORED = ("points_map", "ahead", "sense", "station_m", "session_ends")
 """Fields of the paths that are stored; frames are assigned on reading."""
-
-
-@dataclass(frozen=True)
-class Recorded:
-    """Heights and slopes recorded on the path, with errors that are sums of correlated processes."""
-
-    road: Road | None  # None on a level road
-    heights: tuple[tuple[float, float], ...] = ((0.1, 20.0),)  # sigma, m, and correlation length, m
-    slopes: tuple[tuple[float, float], ...] = ((0.01, 10.0),)  # sigma, and correlation length, m
-
-    @classmethod
-    def of(cls, road: Road | None, noise: PoseNoise) -> Recorded:
-        """From a drive: GNSS heights are 1.5 times as uncertain as positions; a level road is a weak guess.
-
-        The road's heights and slopes are means over 10 m, which leaves a third of the poses' white noise.
-        """
-        if road is None:
-            return cls(None)
-        drift_m = noise.position_drift_m
-        white_m = np.sqrt(max(noise.position_m**2 - drift_m**2, 0.0)) / 3
-        heights = ((1.5 * drift_m, noise.position_drift_over_m), (1.5 * float(white_m), 10.0))
-        return cls(road, heights, ((0.004, 10.0),))
-
-    def at(self, points_map: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Heights (N,) and slopes (N, 2) along map x and y at points (N, 2) of the path."""
-        if self.road is None:
-            return np.zeros(len(points_map)), np.zeros((len(points_map), 2))
-        _, nearest = cKDTree(self.road.points_map).query(points_map)
-        slope = self.road.slope[nearest]
-        off = points_map - self.road.points_map[nearest]
-        return self.road.height_m[nearest] + np.einsum("ni,ni->n", slope, off), slope
-
-
-def _hinges(left_m: FloatArray) -> FloatArray:
-    """Heights (K, B) at left offsets (K,) per unit of each slope of the cross-section."""
-    left_m = np.clip(left_m, -_SIDE_M, _SIDE_M)
-    sides = [np.maximum(side * left_m - knot, 0.0) for side in (1.0, -1.0) for knot in KNOTS_M]
-    return -np.column_stack([np.abs(left_m), *sides])
-
-
-class Knots(NamedTuple):
-    """Uniform knots of cubic B-splines."""
-
-    first_m: float
-    step_m: float
-    functions: int  # number of functions
-
-
-_ACROSS_KNOTS = Knots(-_SIDE_M, _ACROSS_M, _ACROSS)  # knots of the spline across the path
-
-
-def _cubic(at_m: FloatArray, knots: Knots) -> tuple[IntArray, FloatArray]:
-    """Indices and values (K, 4) of the four functions that cover ``at_m`` (K,)."""
-    first, step, count = knots
-    within = np.clip(at_m, first, first + (count - 3 - 1e-9) * step)
-    design = BSpline.design_matrix(within, first + step * np.arange(-3.0, count + 1), 3)
-    return design.indices.reshape(-1, 4).astype(np.int64), design.data.reshape(-1, 4)
 
 
 class _Footprints(NamedTuple):
@@ -187,21 +112,21 @@ class Surface:
     def level(cls, paths: Paths) -> Surface:
         """A plane, the start value."""
         begin_m, end_m = (paths.station_m[[0, -1]] + [-AHEAD_M, AHEAD_M]).tolist()
-        step_m = max(_ALONG_M, (end_m - begin_m) / _MOST_ALONG)
+        step_m = max(ALONG_M, (end_m - begin_m) / MOST_ALONG)
         along = int(np.ceil((end_m - begin_m) / step_m)) + 3
-        size = _SHAPE + along * _ACROSS
+        size = SHAPE + along * ACROSS
         return cls(paths, np.zeros(size), np.zeros((size, size)), Knots(begin_m, step_m, along))
 
     def _columns(self, beside: Beside) -> csr_array:
         """Jacobian (K, B) by the parameters of heights at places beside the path."""
-        i, by_way = _cubic(beside.station_m, self.knots)
-        j, by_side = _cubic(beside.left_m, _ACROSS_KNOTS)
-        index = (i[:, :, None] * _ACROSS + j[:, None, :]).reshape(-1)
+        i, by_way = cubic(beside.station_m, self.knots)
+        j, by_side = cubic(beside.left_m, ACROSS_KNOTS)
+        index = (i[:, :, None] * ACROSS + j[:, None, :]).reshape(-1)
         value = (by_way[:, :, None] * by_side[:, None, :]).reshape(-1)
         places = len(beside.station_m)
         bounds = 16 * np.arange(places + 1)
-        spline = csr_array((value, index, bounds), (places, self.knots.functions * _ACROSS))
-        shape = np.hstack([self._off_middle(beside), _hinges(beside.left_m)])
+        spline = csr_array((value, index, bounds), (places, self.knots.functions * ACROSS))
+        shape = np.hstack([self._off_middle(beside), hinges(beside.left_m)])
         return csr_array(hstack([csr_array(shape), spline]))
 
     def _off_middle(self, beside: Beside) -> FloatArray:
@@ -280,12 +205,12 @@ class Surface:
 
     def _height_m(self, beside: Beside) -> FloatArray:
         """Heights (K,) at places beside the path."""
-        i, by_way = _cubic(beside.station_m, self.knots)
-        j, by_side = _cubic(beside.left_m, _ACROSS_KNOTS)
-        around = self.parameters[_SHAPE:].reshape(-1, _ACROSS)[i[:, :, None], j[:, None, :]]
+        i, by_way = cubic(beside.station_m, self.knots)
+        j, by_side = cubic(beside.left_m, ACROSS_KNOTS)
+        around = self.parameters[SHAPE:].reshape(-1, ACROSS)[i[:, :, None], j[:, None, :]]
         spline = np.einsum("ki,kij,kj->k", by_way, around, by_side, optimize=True)
-        graded = self._off_middle(beside) @ self.parameters[:_GRADES]
-        return np.asarray(graded + _hinges(beside.left_m) @ self.parameters[_GRADES:_SHAPE] + spline)
+        graded = self._off_middle(beside) @ self.parameters[:GRADES]
+        return np.asarray(graded + hinges(beside.left_m) @ self.parameters[GRADES:SHAPE] + spline)
 
     def height_m(self, points_map: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Heights (K,) of the ground at points (K, 2) of the map, and their standard deviations (K,)."""
@@ -333,7 +258,7 @@ class Surface:
         places = len(station)
         nothing = np.zeros((0, 2))
         shapes = (points.shape, ahead.shape, sense.shape, ends.shape[1:], parameters.shape)
-        expected = ((places, 2), (places, 2), (places,), (2,), (_SHAPE + along * _ACROSS,))
+        expected = ((places, 2), (places, 2), (places,), (2,), (SHAPE + along * ACROSS,))
         numbers = np.array([begin_m, step_m, datum_m])
         arrays = (numbers, points, ahead, sense, station, ends, parameters)
         is_sound = shapes == expected and places and all(np.isfinite(array).all() for array in arrays)
@@ -397,9 +322,9 @@ class Surface:
         """
         records = self._recorded(recorded)
         vector = records.vector + information @ self.parameters - score
-        usual = np.full(3, np.log(_CURVATURE))
+        usual = np.full(3, np.log(CURVATURE))
         total = information + records.information
-        smoothness = _Smoothness.of(self.knots)
+        smoothness = Smoothness.of(self.knots)
 
         def cost(sizes: FloatArray) -> float:
             try:
@@ -409,7 +334,7 @@ class Surface:
                 return np.inf
             fit = solve_triangular(lower, vector, lower=True, check_finite=False)
             odds = of_prior - np.log(lower.diagonal()).sum() + fit @ fit / 2
-            return float(np.sum((sizes - usual) ** 2) / (2 * _SIZES**2) - odds)
+            return float(np.sum((sizes - usual) ** 2) / (2 * SIZES_SIGMA**2) - odds)
 
         search = {"maxfev": 60, "xatol": 0.2, "fatol": 0.2}
         best = minimize(cost, usual, method="Nelder-Mead", options=search).x
@@ -434,7 +359,7 @@ class Surface:
         information = np.zeros((size, size))
         vector = np.zeros(size)
         values = (height - datum_m, forwards, sideways)
-        noises = (recorded.heights, recorded.slopes, (*recorded.slopes, _LEAN))
+        noises = (recorded.heights, recorded.slopes, (*recorded.slopes, LEAN))
         for columns, value, noise in zip(self._footprints(), values, noises, strict=True):
             covariance = 1e-6 * np.eye(len(frame))
             for sigma, over_m in noise:
@@ -560,57 +485,6 @@ class Surface:
             symbols=moved(sightings.symbols),
             lines=moved(sightings.lines),
         )
-
-
-@dataclass(frozen=True)
-class _Smoothness:
-    """The prior of a surface's B parameters by the sizes of its second differences.
-
-    ``by_order`` (3, N, N) are the squared differences of the spline's N coefficients, along the path twice,
-    once and not at all; ``bands`` (3, W, N) are their lower diagonals.
-    """
-
-    by_order: FloatArray
-    bands: FloatArray
-
-    @classmethod
-    def of(cls, knots: Knots) -> _Smoothness:
-        """The prior over some knots along the path."""
-        along = _squared_differences(knots)
-        across = _squared_differences(_ACROSS_KNOTS)
-        by_order = np.stack([np.kron(along[order], across[2 - order]) for order in (2, 1, 0)])
-        # Differences along the path reach two knots ahead, those across it no further than a row of knots.
-        width = min(3 * _ACROSS, by_order.shape[1])
-        bands = np.zeros((3, width, by_order.shape[1]))
-        for below in range(width):
-            bands[:, below, : by_order.shape[1] - below] = by_order.diagonal(-below, axis1=1, axis2=2)
-        return cls(by_order, bands)
-
-    def prior(self, sizes: FloatArray) -> FloatArray:
-        """Prior information (B, B) for log standard deviations (3,) of the second differences."""
-        spline = np.tensordot(np.exp(-2 * sizes), self.by_order, axes=1)
-        spline.flat[:: len(spline) + 1] += _RIDGE_M**-2
-        return np.asarray(block_diag(np.diag(_of_slopes()), spline))
-
-    def log_root(self, sizes: FloatArray) -> float:
-        """Half the logarithm of the prior information's determinant; raises LinAlgError by rounding."""
-        bands = np.tensordot(np.exp(-2 * sizes), self.bands, axes=1)
-        bands[0] += _RIDGE_M**-2
-        root = cholesky_banded(bands, lower=True, check_finite=False)
-        return float(np.log(root[0]).sum() + np.log(_of_slopes()).sum() / 2)
-
-
-def _of_slopes() -> FloatArray:
-    """Prior information of the parameters before the spline's."""
-    return np.repeat([_GRADE_SIGMA, _SLOPE_SIGMA], [_GRADES, _HINGES]) ** -2.0
-
-
-def _squared_differences(knots: Knots) -> list[FloatArray]:
-    """By order 0, 1 and 2: the matrix (N, N) of the squared differences of N coefficients."""
-    unit = np.eye(knots.functions)
-    first = np.diff(unit, axis=0) / knots.step_m
-    second = np.diff(unit, 2, axis=0) / knots.step_m**2
-    return [difference.T @ difference for difference in (unit, first, second)]
 
 
 class _View:

@@ -68,7 +68,7 @@ def directed(
         result.drives.append(tuple(sorted(drives)))
         place = shapes[number].centre[len(shapes[number].centre) // 2]
         if number in asked:
-            text = "no drive went along this lane; is it driven along, against, or both ways of this line?"
+            text = "no drive went along this lane; is it driven along this line, against it, or both ways?"
             to = shapes[number].centre[
                 min(len(shapes[number].centre) // 2 + 10, len(shapes[number].centre) - 1)
             ]
@@ -126,13 +126,15 @@ def _driven(shapes: Sequence[LaneShape], paths: Sequence[Path]) -> list[_Driven]
 
 def start_of(lane: ClosedLane) -> _End:
     """The vertices at which a lane starts."""
-    (left, order), (right, across) = lane.left, lane.right
+    left, order = lane.left
+    right, across = lane.right
     return left, int(order[0]), right, int(across[0])
 
 
 def end_of(lane: ClosedLane) -> _End:
     """The vertices at which a lane ends."""
-    (left, order), (right, across) = lane.left, lane.right
+    left, order = lane.left
+    right, across = lane.right
     return left, int(order[-1]), right, int(across[-1])
 
 

@@ -39,14 +39,17 @@ def usable_lines(lanes: Sequence[Lane]) -> UsableLines:
 
 def crosses_itself(line: FloatArray) -> FloatArray | None:
     """The place (2,) where a polyline (N, 2) first crosses itself, None where it does not."""
-    begin, end = line[:-1], line[1:]
+    begin = line[:-1]
+    end = line[1:]
     numbers = np.arange(len(begin))
-    low, high = np.minimum(begin, end), np.maximum(begin, end)
+    low = np.minimum(begin, end)
+    high = np.maximum(begin, end)
     for first in range(0, len(begin), _AT_ONCE):
         piece = slice(first, first + _AT_ONCE)
         is_near = ((high >= low[piece].min(axis=0)) & (low <= high[piece].max(axis=0))).all(axis=1)
         others = numbers[is_near & (numbers < first + _AT_ONCE)]
-        step, other_step = (end - begin)[piece, None], (end - begin)[others]
+        step = (end - begin)[piece, None]
+        other_step = (end - begin)[others]
         between = begin[others] - begin[piece, None]
         area = cross(step, other_step)
         divisor = np.where(np.abs(area) < 1e-12, 1.0, area)

@@ -62,7 +62,8 @@ class LaneShape:
 
     def holding(self, points: FloatArray) -> IntArray:
         """The numbers of the ``points`` (M, 2) inside its outline."""
-        low, high = self.outline.min(axis=0), self.outline.max(axis=0)
+        low = self.outline.min(axis=0)
+        high = self.outline.max(axis=0)
         numbers_near = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
         # Far from the map's origin single precision is too coarse.
         outline = (self.outline - low).astype(np.float32)
@@ -79,7 +80,8 @@ class LaneShape:
 def _nearest(points: FloatArray, line: FloatArray) -> IntArray:
     """The vertices (M,) of a line (N, 2) nearest to neighbouring ``points`` (M, 2)."""
     vertices = np.arange(len(line))
-    low, high = points.min(axis=0) - LANE_WIDTH_M[1], points.max(axis=0) + LANE_WIDTH_M[1]
+    low = points.min(axis=0) - LANE_WIDTH_M[1]
+    high = points.max(axis=0) + LANE_WIDTH_M[1]
     vertices_within = np.flatnonzero(((line >= low) & (line <= high)).all(axis=1))
     vertices = vertices_within if len(vertices_within) else vertices
     offsets = points[:, None] - line[vertices]

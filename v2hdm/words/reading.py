@@ -102,12 +102,12 @@ def readings_of(
     letters: list[list[_View]] = [[] for _ in words]
     readings: list[Upright | None] = [None] * len(words)
     for ranks in (slice(_FIRST_VIEWS), slice(_FIRST_VIEWS, None)):
-        wanted = [
+        images_to_read = [
             [] if _is_sure(reading) else images[ranks]
             for reading, images in zip(readings, views, strict=True)
         ]
         fresh: list[list[list[Grey]]] = [[] for _ in words]
-        for patch in patches_of(words, wanted, footage, light, threads):
+        for patch in patches_of(words, images_to_read, footage, light, threads):
             fresh[patch.word].append(patch.upright)
         for number in np.flatnonzero([len(patches_of_word) for patches_of_word in fresh]).tolist():
             patches[number] += fresh[number]

@@ -102,9 +102,9 @@ class Recogniser:
         weighted += np.float32(_FAINTEST)
         channels = np.unique(np.append(self._usual, weighted.argmax(axis=1)))
         total = weighted.sum(axis=1)
-        kept = weighted[:, channels]
+        of_channels = weighted[:, channels]
         weighted[:, channels] = 0.0
-        probability = np.column_stack([kept, weighted.max(axis=1)]).astype(np.float64) / total[:, None]
+        probability = np.column_stack([of_channels, weighted.max(axis=1)]).astype(np.float64) / total[:, None]
         return Letters(
             np.log(np.maximum(probability, _FAINTEST)),
             "".join([*(self.alphabet[channel] for channel in channels), _ANY_OTHER]),

@@ -20,7 +20,7 @@ def flip_a_bit(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def cut_off(data: bytes, rng: np.random.Generator) -> bytes:
-    """What is behind any place is missing."""
+    """The file ends at any place: all behind it is missing."""
     return data[: int(rng.integers(len(data)))]
 
 

@@ -77,7 +77,7 @@ def readonly_disks(order: Order) -> Iterator[Row]:
 
 
 def expected_of(situation: Situation, scratch: Path) -> tuple[Expected, list[str]]:
-    """What a door leaves on a good disk, and its calls that write."""
+    """The outcome of a door on a good disk, and its calls that write."""
     outcomes, calls = [], []
     for _ in range(2):
         with folder_in(scratch) as folder:

@@ -21,7 +21,7 @@ from v2hdm.store.files import dump_yaml, load_yaml, replace_text
 from v2hdm.store.folders import IN_USE, STAGES
 
 IMAGES = 16
-"""Of the drive's one camera: enough for a map, few enough for a second or two a run."""
+"""Images of the drive's one camera: enough for a map, few enough for a second or two a run."""
 
 _FORMATS = "geojson,csv,gpkg,lanelet2,dxf"
 
@@ -48,7 +48,7 @@ def small_drive(scratch: Path, cameras: Sequence[str] = ("front",), images: int 
 
 
 def map_arguments(drive: Path | str, *more: str) -> tuple[str, ...]:
-    """Of the mapping door, for that drive."""
+    """Arguments of the mapping door, for that drive."""
     places = ("name=run", "workers=1", "output=out", "cache=cache")
     return (f"drive.path={drive}", *places, *more)
 
@@ -167,7 +167,7 @@ class _Given:
 
 
 def cache_defects(cache: Path) -> list[str]:
-    """What is wrong in a cache after a run: damaged entries, and what was never finished."""
+    """Defects of a cache after a run: damaged entries, and entries that were never finished."""
     items = items_of(cache)
     known = {item.path for item in items}
     strange = [

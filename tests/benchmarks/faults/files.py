@@ -29,7 +29,7 @@ _TEXTS = ("poses.tum", "drive.yaml", "front/camera_info.yaml", "front/images.txt
 _TELLS = (
     r"damaged|has changed since we wrote it|was changed after|not fitted to|verdict: (WARN|FAIL)|^error: "
 )
-"""What a door says of a file that it does not take for whole."""
+"""Sentences by which a door says that it does not take a file for whole."""
 
 
 def damaged_texts(order: Order) -> Iterator[Row]:
@@ -166,7 +166,7 @@ def _told(order: Order, situation: Situation, files: str, remade: bool = False) 
 
 
 def _untold(outcome: Outcome, defects: list[str]) -> list[str]:
-    """What there is to say where the user was not told."""
+    """Defects of an outcome of which the user was not told."""
     says = re.search(_TELLS, f"{outcome.error}\n{outcome.output}", re.MULTILINE)
     if outcome.code == 2 or not says or "Traceback" in outcome.error:
         return defects

@@ -1,4 +1,4 @@
-"""What a kind of fault is given, and what a case comes to."""
+"""Orders for a kind of fault, and rows for the ends of its cases."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.faults.judge import Outcome
 
 @dataclass(frozen=True)
 class Row:
-    """What came of a case: ``right``, ``told`` or ``DEFECT``."""
+    """The end of a case: ``right``, ``told`` or ``DEFECT``."""
 
     name: str
     end: str
@@ -28,7 +28,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Order:
-    """What to do: how many cases of each door or file, which of these, where, and by what chance."""
+    """An order: how many cases of each door or file, which of these, where, and by what chance."""
 
     doors: Doors
     scratch: Path
@@ -41,7 +41,7 @@ Kind = Callable[[Order], Iterator[Row]]
 
 
 def in_fork(work: Callable[[], Any]) -> Any:
-    """What work in a fork of this process returns; None where that died."""
+    """The result of work in a fork of this process; None where that died."""
     ours, theirs = multiprocessing.Pipe(duplex=False)
     process = os.fork()
     if not process:
@@ -66,7 +66,7 @@ def folder_in(scratch: Path) -> Iterator[Path]:
 
 
 def row_of(name: str, outcome: Outcome, defects: Sequence[str]) -> Row:
-    """What a case came to."""
+    """The row of a case by its outcome and defects."""
     said = " | ".join(outcome.error.strip().splitlines()[-3:])[-300:]
     if defects:
         return Row(name, "DEFECT", f"{'; '.join(defects)} -- {said}")

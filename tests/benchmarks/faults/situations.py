@@ -30,7 +30,7 @@ class Situation:
 
     @property
     def name(self) -> str:
-        """Of the case."""
+        """The case's name."""
         return self.case.name
 
 
@@ -47,7 +47,7 @@ def _points(root: Path) -> None:
 
 @dataclass(frozen=True)
 class Expected:
-    """What a door leaves where nothing fails: its exit code, files, and which differ from run to run."""
+    """The outcome of a door where nothing fails: exit code, files, and which differ from run to run."""
 
     code: int | str
     files: dict[str, str]
@@ -63,7 +63,7 @@ class Expected:
         return cls(first.code, files, frozenset(loose))
 
     def defects(self, situation: Situation, outcome: Outcome, again: Outcome | None = None) -> list[str]:
-        """What a door may not have done on a disk that fails, and ``again`` on one that does not any more."""
+        """Defects of an outcome on a disk that fails, and of ``again`` on one that does not any more."""
         if outcome.code != 2:
             found = self._wrong(situation, outcome, "is")
         else:

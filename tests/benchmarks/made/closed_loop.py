@@ -120,7 +120,7 @@ def rendered_eyes(site: Site, calibrations: Mapping[str, Calibration], rng: np.r
 
 
 def render(site: Site, camera: str, van: Van, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """What a camera on a van sees (H, W, 3), in motion and with its port's light and traffic."""
+    """The image (H, W, 3) of a camera on a van, in motion and with its port's light and traffic."""
     config = site.port.config
     lens = config.cameras[camera]
     optics = Optics(

@@ -1,4 +1,4 @@
-"""What a detector would find in the images of a made drive: true corners, projected, with its errors."""
+"""Detections in the images of a made drive, without a detector: true corners, projected, with its errors."""
 
 from __future__ import annotations
 

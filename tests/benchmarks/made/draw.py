@@ -1,4 +1,4 @@
-"""What is drawn for a right drive: port, route, errors of poses, of the road and of the detector."""
+"""Draws for a right drive: port, route, errors of poses, of the road and of the detector."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ class Recipe:
         return replace(self, port=replace(self.port, route=route), apart_s=apart_s)
 
     def as_figures(self) -> dict[str, Any]:
-        """What was drawn, for the record."""
+        """The drawn values, for the record."""
         return {
             **asdict(self.poses),
             **asdict(self.detector),
@@ -176,7 +176,13 @@ def draw(seed: int, route: str | None = None) -> Recipe:
     route = route or drawn_route
     default_noise = bool(rng.random() < 0.5)
     poses = _pose_errors(rng, default_noise)
-    detector = DetectorErrors(
+    detector = draw_detector_errors(rng)
+    return Recipe(seed, route, _port(rng, seed, route), poses, detector, default_noise, _road(seed, poses))
+
+
+def draw_detector_errors(rng: np.random.Generator) -> DetectorErrors:
+    """Errors of a detector between a very good and a poor one."""
+    return DetectorErrors(
         sigma_px=_log_uniform(rng, 0.1, 0.4),
         sigma_spread=float(rng.uniform(0.1, 0.4)),
         doubled_at_m=float(rng.uniform(8.0, 16.0)),
@@ -185,7 +191,6 @@ def draw(seed: int, route: str | None = None) -> Recipe:
         false=float(rng.uniform(0.0, 0.03)),
         cut=float(rng.uniform(0.0, 0.02)),
     )
-    return Recipe(seed, route, _port(rng, seed, route), poses, detector, default_noise, _road(seed, poses))
 
 
 def draw_apart_s(seed: int) -> float:

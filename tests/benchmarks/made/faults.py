@@ -1,4 +1,4 @@
-"""What may be wrong with a made drive: each fault changes the world, or what was recorded of it."""
+"""Faults of a made drive: each changes the world, or its recording."""
 
 from __future__ import annotations
 
@@ -261,7 +261,7 @@ RELIEFS: Mapping[str, Spoil] = {
         Spoil("cameras in turn", None, _in_turn),
     )
 }
-"""What is recorded as it is, but unusual: nothing is wrong, but that the mapper has to know of it.
+"""Unusual drives with right recordings: nothing is wrong, but the mapper has to know of it.
 
 Ground that is no plane; and cameras that fire 37 ms after each other, under poses at 20 Hz.
 """

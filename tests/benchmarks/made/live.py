@@ -9,7 +9,7 @@ import numpy as np
 from omegaconf import OmegaConf
 
 from tests.benchmarks.made.detect import _in_image
-from tests.benchmarks.made.draw import DetectorErrors, Recipe, _log_uniform, draw
+from tests.benchmarks.made.draw import Recipe, draw, draw_detector_errors
 from tests.benchmarks.made.lines import mapped_line, pieces_in_image
 from tests.benchmarks.made.world import World, make, poses_of, smooth_noise
 from v2hdm.cli.compose import conf_dir
@@ -156,15 +156,7 @@ def drive(recipe: Recipe, seed: int, seconds: float, begin_m: float = 3.0) -> Li
     motion = _odometry(stamp_s, points, heading, rng)
     calibrations = calibrated(world.lenses, world.port.cam_from_vehicle, rng)
     driven = replace(world.port.driven, stamp_s=stamp_s[frames])
-    detector = DetectorErrors(
-        sigma_px=_log_uniform(rng, 0.1, 0.4),
-        sigma_spread=float(rng.uniform(0.1, 0.4)),
-        doubled_at_m=float(rng.uniform(8.0, 16.0)),
-        stated_factor=_log_uniform(rng, 0.5, 2.0),
-        missed=float(rng.uniform(0.0, 0.25)),
-        false=float(rng.uniform(0.0, 0.03)),
-        cut=float(rng.uniform(0.0, 0.02)),
-    )
+    detector = draw_detector_errors(rng)
     world = replace(
         world,
         recipe=replace(recipe, seed=seed, detector=detector),
@@ -189,7 +181,7 @@ def drive(recipe: Recipe, seed: int, seconds: float, begin_m: float = 3.0) -> Li
 
 
 def looks_of(world: World, seed: int, frames: Sequence[int] | None = None) -> Iterator[list[Look]]:
-    """What all cameras see at each moment."""
+    """The looks of all cameras at each moment."""
     names = sorted(world.cameras)
     for frame in range(len(world.taken_s)) if frames is None else frames:
         moment = []

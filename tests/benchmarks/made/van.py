@@ -89,7 +89,7 @@ class Van:
         self.heave_m = float(keep * self.heave_m + push_m * self.rng.standard_normal())
 
     def odometry(self) -> Motion:
-        """What the odometry measures now, with its errors."""
+        """The odometry's measurement now, with its errors."""
         speed_m_s = self.speed_m_s * self._scale
         yaw_rate_rad_s = self.yaw_rate_rad_s + self._bias_rad_s
         if self.speed_m_s > 0.01:

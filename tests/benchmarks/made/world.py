@@ -33,7 +33,7 @@ MAX_GAP_S = 0.5
 """As users read drives."""
 
 WHEELBASE_M, HALF_TRACK_M = 2.8, 0.8
-"""Of the vehicle, whose origin is under the rear axle."""
+"""Dimensions of the vehicle, whose origin is under the rear axle."""
 
 _TRUE, _RECORDED, _ROAD = 40, 41, 43  # streams of a seed
 _GRID_M = 0.1
@@ -41,7 +41,7 @@ _GRID_M = 0.1
 
 @dataclass(frozen=True)
 class World:
-    """What truly was, F times two images long, and what was recorded of it.
+    """The true world, F times two images long, and the recording of it.
 
     Attributes:
         recipe: what was drawn.

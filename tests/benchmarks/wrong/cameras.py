@@ -162,7 +162,7 @@ def _sizes(**sizes: list[float]) -> Callable[[MappingOptions], MappingOptions]:
 
 
 def camera_faults() -> list[Fault]:
-    """What can be wrong with cameras, images and settings."""
+    """All that can be wrong with cameras, images and settings."""
     lens, distortion, clock = "focal|camera_info|square pixels", "distortion", r"\bclock|\bstamps?\b"
     return [
         Fault("front and rear images swapped", "swapped|other way|backward", _swap_cameras),

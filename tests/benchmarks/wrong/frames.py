@@ -74,7 +74,7 @@ def _drifting(off_m: float, seconds: float, stamp_s: FloatArray, poses: FloatArr
 
 
 def frame_faults() -> list[Fault]:
-    """What can be wrong with the sequence of images and poses."""
+    """All that can be wrong with the sequence of images and poses."""
     order = "clock|reorder|order|repeat|identical|jump|frozen|ground|exchang"
     return [
         Fault("a third of the images dropped", None, partial(_edit_list, _drop)),

@@ -117,16 +117,26 @@ def _noise(folder: Path, **values: float) -> None:
     edit(folder, lambda content: content["pose_noise"].update(values))
 
 
-def poses_faults() -> list[Fault]:
-    """What can be wrong with times and poses."""
-    clock = r"\bclock|\bstamps?\b"
+_CLOCK = r"\bclock|\bstamps?\b"  # what names a fault of a clock
+
+
+def _clock_faults() -> list[Fault]:
+    """Images that are stamped late or early."""
     return [
-        Fault("clock: all 30 ms late", clock, partial(_later, 0.03, CAMERAS), hidden_on_straight=clock),
-        Fault("clock: all 60 ms early", clock, partial(_later, -0.06, CAMERAS), hidden_on_straight=clock),
-        Fault("clock: all 120 ms late", clock, partial(_later, 0.12, CAMERAS), hidden_on_straight=clock),
-        Fault("clock: front 120 ms late", clock, partial(_later, 0.12, ("front",)), hidden_on_straight=clock),
-        Fault("clock: rear 60 ms late", clock, partial(_later, 0.06, ("rear",)), hidden_on_straight=clock),
-        Fault("clock: all 400 ms late", clock, partial(_later, 0.4, CAMERAS), hidden_on_straight=clock),
+        Fault("clock: all 30 ms late", _CLOCK, partial(_later, 0.03, CAMERAS), hidden_on_straight=_CLOCK),
+        Fault("clock: all 60 ms early", _CLOCK, partial(_later, -0.06, CAMERAS), hidden_on_straight=_CLOCK),
+        Fault("clock: all 120 ms late", _CLOCK, partial(_later, 0.12, CAMERAS), hidden_on_straight=_CLOCK),
+        Fault(
+            "clock: front 120 ms late", _CLOCK, partial(_later, 0.12, ("front",)), hidden_on_straight=_CLOCK
+        ),
+        Fault("clock: rear 60 ms late", _CLOCK, partial(_later, 0.06, ("rear",)), hidden_on_straight=_CLOCK),
+        Fault("clock: all 400 ms late", _CLOCK, partial(_later, 0.4, CAMERAS), hidden_on_straight=_CLOCK),
+    ]
+
+
+def _convention_faults() -> list[Fault]:
+    """Poses and stamps by other conventions of axes, angles and units."""
+    return [
         Fault(
             "axes swapped",
             r"\baxes|swapped|mirror",
@@ -148,11 +158,6 @@ def poses_faults() -> list[Fault]:
             "180|backward|opposite",
             partial(edit_poses, lambda t, p: (t, _turned(p, _yaw_of(p) + np.pi))),
         ),
-        Fault(
-            "heading off by 2 deg",
-            None,
-            partial(edit_poses, lambda t, p: (t, _turned(p, _yaw_of(p) + 0.035))),
-        ),
         Fault("quaternion w first", "quaternion|qw", _w_first),
         Fault(
             "poses inverted",
@@ -171,11 +176,22 @@ def poses_faults() -> list[Fault]:
         ),
         Fault("latitude and longitude as metres", "degree|latitude", partial(edit_poses, _as_degrees)),
         Fault("positions in feet", "feet", partial(edit_poses, _as_feet)),
+        Fault("z axis down", r"z axis|upside|\bz\b.* down", partial(edit_poses, _z_down)),
+    ]
+
+
+def _motion_faults() -> list[Fault]:
+    """Positions, heights and headings that are off, jump or stand."""
+    return [
+        Fault(
+            "heading off by 2 deg",
+            None,
+            partial(edit_poses, lambda t, p: (t, _turned(p, _yaw_of(p) + 0.035))),
+        ),
         Fault("heights of 46.2 m", None, partial(edit_poses, partial(_raise, 46.2))),
         Fault("heights of 1.8 m", None, partial(edit_poses, partial(_raise, 1.8))),
         Fault("grade of 0.3 %", None, partial(edit_poses, partial(_tilt, 0.003))),
         Fault("grade of 1 %", None, partial(edit_poses, partial(_tilt, 0.01))),
-        Fault("z axis down", r"z axis|upside|\bz\b.* down", partial(edit_poses, _z_down)),
         Fault(
             "position jumps 0.5 m for 15 m",
             r"\bjump|\bposition|\bfix\b",
@@ -199,6 +215,12 @@ def poses_faults() -> list[Fault]:
             partial(edit_poses, partial(_lever, 0.0, 0.8)),
             hidden_on_straight=r"antenna|lever|\bsurvey|\bcentre|\borigin",
         ),
+    ]
+
+
+def _noise_faults() -> list[Fault]:
+    """Noise of poses that is stated too large or too small."""
+    return [
         Fault("pose_noise: heading 0.15", r"\bnoise\b|heading_rad", partial(_noise, heading_rad=0.15)),
         Fault("pose_noise: position 2.0", r"\bnoise\b|position_m", partial(_noise, position_m=2.0)),
         Fault(
@@ -215,3 +237,8 @@ def poses_faults() -> list[Fault]:
             ),
         ),
     ]
+
+
+def poses_faults() -> list[Fault]:
+    """All that can be wrong with times and poses."""
+    return [*_clock_faults(), *_convention_faults(), *_motion_faults(), *_noise_faults()]

@@ -1,4 +1,4 @@
-"""What a person edits in a copy of the map is a correction of it, and nothing else is."""
+"""Edits that a person makes in a copy of the map are corrections of it, and nothing else is."""
 
 import sqlite3
 from dataclasses import replace

@@ -38,12 +38,12 @@ DIAMOND_M = np.array([[0.5, 0.0], [0.0, 0.35], [-0.5, 0.0], [0.0, -0.35]])
 PLACES = np.array([[6.0, 0.0], [7.5, 1.2], [7.5, -1.2], [9.0, 0.0]])
 NASTY = "</script><img src=x onerror=alert(1)>&\"'"
 NASTY_NAME = NASTY.replace("/", "")
-"""What of it a name may be."""
+"""The part of :data:`NASTY` that a file's name may have."""
 SHIFT_PX = np.array([0.3, -0.2])
 
 
 def covariance(sigma_m: float = 0.01) -> np.ndarray:
-    """Of corners that share half of their variance."""
+    """Covariance of corners that share half of their variance."""
     return sigma_m**2 * (0.5 * np.eye(8) + 0.5 * np.tile(np.eye(2), (4, 4)))
 
 

@@ -1,4 +1,4 @@
-"""What the page shows of areas, crosswalks and double lines."""
+"""The page shows areas, crosswalks and double lines."""
 
 import numpy as np
 

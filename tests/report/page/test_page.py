@@ -1,4 +1,4 @@
-"""What the page says is what the folder's files say, and what it lacks it tells."""
+"""The page says what the folder's files say, and tells what it lacks."""
 
 import base64
 import json
@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 
-from tests.faults.cases import png_header
+from tests.faults.pictures import png_header
 from tests.maps.gis import write_empty
 from tests.report.page.folder import (
     DIAMOND_M,

@@ -354,6 +354,61 @@ def _subtract_products(
                         out[s] -= x * top[s] + y * bottom[s]
 
 
+@inlined
+def _fill_rows(
+    u: int,
+    count: int,
+    layout: Layout,
+    base: Base,
+    tiles: TileMap,
+    by_state: FloatArray,
+    clock: FloatArray,
+    unknowns: int,
+    marks: IntArray,
+    scratch: Scratch,
+) -> None:
+    """Write the rows of unit ``u`` by its ``count`` tiles and the tip, and their nonzero columns.
+
+    Arguments are those of :func:`subtract_frames`.
+    """
+    states = by_state.shape[1] // 6
+    size = tiles.size
+    width = len(base.table) // layout.moments * unknowns
+    place = marks[1]
+    low = marks[3]
+    high = marks[4]
+    jacobian = scratch.jacobian
+    w = scratch.coupling
+    rows = scratch.rows
+    low[:count] = size
+    high[:count] = 0
+    low[count] = 0
+    high[count] = width
+    first = layout.unit[u]
+    last = layout.unit[u + 1]
+    tip = count * size
+    rows[: 2 * (last - first), : tip + width] = 0.0
+    for c in range(first, last):
+        i = 2 * (c - first)
+        for k in range(layout.begin[c], layout.begin[c + 1]):
+            t = layout.pair[k]
+            x = base.corners[c, 0]
+            y = base.corners[c, 1]
+            r0, r1, _, _, _ = differentiate(layout, base.table, k, x, y, jacobian)
+            couple(jacobian, floored(weigh(base, r0 * r0 + r1 * r1)), w, 0)
+            frame = layout.frame[t % layout.moments]
+            a = place[frame // tiles.per_tile]
+            within = frame % tiles.per_tile * states
+            low[a] = min(low[a], within)
+            high[a] = max(high[a], within + states)
+            column = a * size + within
+            for p in range(6):
+                for s in range(states):
+                    rows[i, column + s] += w[0, p] * by_state[t, p * states + s]
+                    rows[i + 1, column + s] += w[0, 6 + p] * by_state[t, p * states + s]
+            add_camera(w, 0, clock, t, unknowns, rows, i, tip + t // layout.moments * unknowns)
+
+
 @twin("adjust.subtract_frames")
 @kernel
 def subtract_frames(
@@ -376,15 +431,10 @@ def subtract_frames(
     unknowns. ``marks`` (5, G + 1), initially -1, is scratch: its last two rows are the nonzero columns of
     each touched tile and of the tip.
     """
-    states = by_state.shape[1] // 6
     size = tiles.size
-    width = len(base.table) // layout.moments * unknowns
-    place = marks[1]
     touched = marks[2]
     low = marks[3]
     high = marks[4]
-    jacobian = scratch.jacobian
-    w = scratch.coupling
     rows = scratch.rows
     for u in range(len(layout.unit) - 1):
         if layout.is_kept[u]:
@@ -395,34 +445,8 @@ def subtract_frames(
             is_wanted |= begin <= tiles.position[touched[a]] < end
         if not is_wanted:
             continue
-        low[:count] = size
-        high[:count] = 0
-        low[count] = 0
-        high[count] = width
-        first = layout.unit[u]
-        last = layout.unit[u + 1]
-        joined = last - first
-        tip = count * size
-        rows[: 2 * joined, : tip + width] = 0.0
-        for c in range(first, last):
-            i = 2 * (c - first)
-            for k in range(layout.begin[c], layout.begin[c + 1]):
-                t = layout.pair[k]
-                x = base.corners[c, 0]
-                y = base.corners[c, 1]
-                r0, r1, _, _, _ = differentiate(layout, base.table, k, x, y, jacobian)
-                couple(jacobian, floored(weigh(base, r0 * r0 + r1 * r1)), w, 0)
-                frame = layout.frame[t % layout.moments]
-                a = place[frame // tiles.per_tile]
-                within = frame % tiles.per_tile * states
-                low[a] = min(low[a], within)
-                high[a] = max(high[a], within + states)
-                column = a * size + within
-                for p in range(6):
-                    for s in range(states):
-                        rows[i, column + s] += w[0, p] * by_state[t, p * states + s]
-                        rows[i + 1, column + s] += w[0, 6 + p] * by_state[t, p * states + s]
-                add_camera(w, 0, clock, t, unknowns, rows, i, tip + t // layout.moments * unknowns)
+        _fill_rows(u, count, layout, base, tiles, by_state, clock, unknowns, marks, scratch)
         for a in range(count + 1):
             solve_unit_rows(layout, base, u, rows, a * size + low[a], a * size + high[a])
-        _subtract_products(begin, end, tiles, marks, count, rows[: 2 * joined], values)
+        height = 2 * (layout.unit[u + 1] - layout.unit[u])
+        _subtract_products(begin, end, tiles, marks, count, rows[:height], values)

@@ -61,6 +61,7 @@ AT_ONCE = 400_000
 
 _ALONE_GAP = 1e-5  # gap, a fraction of the cost, of a part's own optimum: the rounds move it by more; chosen
 _FAR_GAP = 1e-3  # gap of a round, a fraction of the cost, above which the next whitens anew: chosen
+_SLOW = 0.6  # gap of a round, a fraction of that before, above which the next whitens anew: chosen
 _SETTLED_SHARE = 0.1  # gap of a part with its border held, as a fraction of that of all: chosen
 _PROTOCOL = 5  # of pickles: the first that keeps arrays as they are
 _MOST_ROUNDS = 15  # rounds of joining and following, after which the solve has not converged; chosen
@@ -279,7 +280,7 @@ class _Work:
         return place
 
     def _finished(self, job: _Job, part: Part) -> Any:
-        """What is made of the solution where the part is."""
+        """The result of ``finish`` for the solution where the part is."""
         assert self.finish is not None
         robust = self._robust
         whitening = None
@@ -413,6 +414,7 @@ def _in_rounds(
     work = _Work(folder, shape)
     are_joined = jobs[0].start is not None
     is_from_afar = not are_joined and not jobs[0].is_near
+    before = np.inf
     for number in range(_MOST_ROUNDS):
         report(number, _MOST_ROUNDS)
         states: list[PartStates] = _side_by_side(executor, work, jobs)
@@ -425,6 +427,8 @@ def _in_rounds(
         shared = _shared(net, states)
         joined = net.join(_taken(states, shared, net), shared)
         gap = (joined.decrease + sum(state.told.slack for state in states)) / max(sum(costs), 1.0)
+        is_slow = gap > _SLOW * before
+        before = gap
         is_small = (number > 0 or are_joined) and gap <= least_gap
         if is_small and (is_rough or jobs[0].is_renewed):
             break
@@ -433,7 +437,7 @@ def _in_rounds(
             _Job(
                 part,
                 target=_values(net, moved, state.labels, state.values),
-                is_renewed=is_small or gap > _FAR_GAP or number == _MOST_ROUNDS - 2,
+                is_renewed=is_small or is_slow or gap > _FAR_GAP or number == _MOST_ROUNDS - 2,
                 settled=_SETTLED_SHARE * least_gap,
             )
             for part, state in enumerate(states)
@@ -487,7 +491,7 @@ def _covariance_file(folder: Path, number: int) -> Path:
 def finish_parts(
     folder: Path, joint: Joint, shape: Shape, finish: Finish, executor: Executor = HERE
 ) -> list[Any]:
-    """What ``finish`` makes of each joined part, whose solution has its joint covariances.
+    """Results of ``finish`` for each joined part, whose solution has its joint covariances.
 
     Raises WorkerError where a process died.
     """

@@ -1,4 +1,4 @@
-"""What a part says of its border: its marginal information there, and its own optimum; and the way back.
+"""A part's summary of its border, its marginal information and optimum there, and the way back.
 
 With the whitened variables y of :mod:`v2hdm.adjust.whitening`, in which the Hessian is the identity, the
 border is b = W'y for some columns W. By the part alone, b has the covariance W'W and the optimum -W'g. If all
@@ -144,7 +144,7 @@ def corner_columns(whitening: Whitening, corners: Tensor) -> Columns:
 
 
 class _Factors(NamedTuple):
-    """Of n corners: V^-1 (2 n, 2 n), and the columns (2 n, 2 n) of their own variables."""
+    """Factors of n corners: V^-1 (2 n, 2 n), and the columns (2 n, 2 n) of their own variables."""
 
     inverse: Tensor
     by_variable: Tensor

@@ -9,8 +9,9 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
@@ -22,9 +23,24 @@ if TYPE_CHECKING:
     from v2hdm.detection.pointing import Pointed
     from v2hdm.detection.road import Road
     from v2hdm.detection.stopwatch import Stopwatch
+    from v2hdm.pipeline.detect_images import Detected
+    from v2hdm.store.results import WriteFile
 
 _FIRST = b'{"source": '  # the beginning of every line of detections
 _STAGES = ("read", "horizon", "net", "propose", "lanes", "fit", "judge")
+
+
+@dataclass
+class _Delays:
+    """How old live images were when their detections were written, and how many were dropped."""
+
+    age_s: deque[float]
+    dropped: int = 0
+
+    def add(self, frame: Frame) -> None:
+        """Count an image whose detections have just been written."""
+        self.dropped += frame.dropped
+        self.age_s.append(time.time() - (frame.stamp_s or 0.0))
 
 
 def _run(arguments: Sequence[str]) -> None:
@@ -56,7 +72,6 @@ def _detect(parsed: argparse.Namespace) -> None:
     import cv2
 
     from v2hdm.detection.options import DetectorOptions
-    from v2hdm.detection.road import as_record
     from v2hdm.detection.stopwatch import KEPT, Stopwatch
     from v2hdm.pipeline.detect_images import detect_images
     from v2hdm.store.lines import lines_to
@@ -67,10 +82,8 @@ def _detect(parsed: argparse.Namespace) -> None:
     cv2.setNumThreads(1)
     stopwatch = Stopwatch()
     live = parsed.live or parsed.source.isdecimal()
-    dropped = 0
-    age_s = deque[float](maxlen=KEPT)
-    drawn_as = set[str]()
-    frames = detect_images(
+    delays = _Delays(deque(maxlen=KEPT))
+    detections = detect_images(
         parsed.source,
         camera=parsed.camera,
         camera_name=parsed.camera_name,
@@ -88,16 +101,7 @@ def _detect(parsed: argparse.Namespace) -> None:
     folder = nullcontext() if parsed.draw is None else growing_folder(parsed.draw, "--draw", maker)
     with folder as write_drawing, lines_to(parsed.output, _FIRST, "detections", grows=live) as stream:
         try:
-            for frame, camera, road in frames:
-                record = as_record(frame, camera, road)
-                if parsed.live and not road.is_second:
-                    record["dropped"] = frame.dropped
-                print(json.dumps(record), file=stream, flush=live)
-                if parsed.live and not road.is_second:
-                    dropped += frame.dropped
-                    age_s.append(time.time() - (frame.stamp_s or 0.0))
-                if write_drawing is not None and not road.is_second:
-                    write_drawing(f"{_new_name(frame.name, drawn_as)}.jpg", _drawing(frame, road))
+            _write(detections, stream, write_drawing, live, delays if parsed.live else None)
         except KeyboardInterrupt:
             if not live:
                 raise
@@ -105,13 +109,36 @@ def _detect(parsed: argparse.Namespace) -> None:
             if not (live and stopwatch.images):
                 raise
             failure = error  # hours of a camera that was unplugged are kept
-    _report(stopwatch, age_s)
+    _report(stopwatch, delays.age_s)
     if parsed.live and stopwatch.images:
-        print(f"{dropped} images dropped for newer ones", file=sys.stderr)
+        print(f"{delays.dropped} images dropped for newer ones", file=sys.stderr)
     if parsed.model is not None:
         _warn_of_unknown(parsed.model)
     if failure:
         raise failure
+
+
+def _write(
+    detections: Iterable[Detected],
+    stream: IO[str],
+    write_drawing: WriteFile | None,
+    live: bool,
+    delays: _Delays | None,
+) -> None:
+    """Write a line for each image, and its drawing; ``delays`` takes the age of new images."""
+    from v2hdm.detection.road import as_record
+
+    drawn_as = set[str]()
+    for frame, camera, road in detections:
+        record = as_record(frame, camera, road)
+        is_new = not road.is_second
+        if delays is not None and is_new:
+            record["dropped"] = frame.dropped
+        print(json.dumps(record), file=stream, flush=live)
+        if delays is not None and is_new:
+            delays.add(frame)
+        if write_drawing is not None and is_new:
+            write_drawing(f"{_new_name(frame.name, drawn_as)}.jpg", _drawing(frame, road))
 
 
 def _warn_of_unknown(model: Path) -> None:

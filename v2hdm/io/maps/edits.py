@@ -151,7 +151,8 @@ def _lane_edits(hd_map: HDMap, edited: HDMap, where: str) -> list[str]:
     def lines(lanes: tuple[Lane, ...]) -> dict[int | None, Lane]:
         return {lane.id: lane for lane in lanes}
 
-    before, after = lines(hd_map.lanes), lines(edited.lanes)
+    before = lines(hd_map.lanes)
+    after = lines(edited.lanes)
     changed = [
         str(number)
         for number in before.keys() | after.keys()

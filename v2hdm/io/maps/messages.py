@@ -70,8 +70,8 @@ _IN_FIELDS = ("id", "class", "sightings", "sigma_m", "accuracy", "covariance_m2"
 
 def stamp_message(nanoseconds: int, make: Make) -> Any:
     """A time since 1970 as a ``builtin_interfaces/msg/Time``."""
-    seconds, rest = divmod(nanoseconds, 10**9)
-    return make("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
+    seconds, remainder = divmod(nanoseconds, 10**9)
+    return make("builtin_interfaces/msg/Time", sec=seconds, nanosec=remainder)
 
 
 def _header(nanoseconds: int, make: Make) -> Any:

@@ -44,7 +44,8 @@ class Piece(NamedTuple):
 
     @property
     def _axes(self) -> FloatArray:
-        cosine, sine = np.cos(self.heading_rad), np.sin(self.heading_rad)
+        cosine = np.cos(self.heading_rad)
+        sine = np.sin(self.heading_rad)
         return np.array([[cosine, sine], [-sine, cosine]])
 
 
@@ -57,7 +58,8 @@ def _piece(place: FloatArray, end: FloatArray, start_ahead: FloatArray, end_ahea
     u = (speed, 3 * du - 2 * speed - speed * tu, speed + speed * tu - 2 * du)
     v = (0.0, 3 * dv - speed * tv, speed * tv - 2 * dv)
     if max(map(abs, v)) < _STRAIGHT_M:
-        u, v = (du, 0.0, 0.0), (0.0, 0.0, 0.0)
+        u = (du, 0.0, 0.0)
+        v = (0.0, 0.0, 0.0)
     share = (_ROOT + 1) / 2
     slopes = np.stack([np.ones_like(share), 2 * share, 3 * share**2], axis=1)
     length_m = float(np.hypot(slopes @ u, slopes @ v) @ _WEIGHT / 2)
@@ -144,8 +146,10 @@ class Stations(NamedTuple):
 
 def _widths_m(points: FloatArray, ahead: FloatArray, border: FloatArray) -> FloatArray:
     """The same for neighbouring points (N, 2) and directions (N, 2)."""
-    low, high = points.min(axis=0) - _WIDEST_M, points.max(axis=0) + _WIDEST_M
-    begin, end = border[:-1], border[1:]
+    low = points.min(axis=0) - _WIDEST_M
+    high = points.max(axis=0) + _WIDEST_M
+    begin = border[:-1]
+    end = border[1:]
     is_near = ((np.maximum(begin, end) >= low) & (np.minimum(begin, end) <= high)).all(axis=1)
     begin = begin[is_near] if is_near.any() else begin
     side = (end[is_near] if is_near.any() else end) - begin

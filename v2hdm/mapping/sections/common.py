@@ -176,7 +176,8 @@ def _named_markings(sections: Sequence[Alone]) -> list[_Turned]:
     turn = np.zeros(first[-1], dtype=np.int64)  # corner c of the group is corner c + turn of the marking
     members: dict[int, list[int]] = {}
     for a, b, by in rows[np.argsort(-counts, kind="stable")].tolist():
-        of_a, of_b = members.get(int(name[a]), [a]), members.get(int(name[b]), [b])
+        of_a = members.get(int(name[a]), [a])
+        of_b = members.get(int(name[b]), [b])
         if name[a] == name[b] or {*section_of[of_a]} & {*section_of[of_b]}:
             continue
         # c of a is c + by of b; the marking's corner is c + turn[a] by a, c + by + turn[b] by b.

@@ -43,7 +43,7 @@ class Told:
 
 
 class Judged(NamedTuple):
-    """What a section's own solve says of its own images, with K observations by ascending names."""
+    """Results of a section's own solve on its own images, with K observations by ascending names."""
 
     corner: IntArray  # (K,) over the drive
     shift_m: FloatArray  # (S, 2) sum of how far the frames of each session moved from their recorded poses
@@ -80,7 +80,7 @@ def fit_of(part: Part, solution: Solution) -> Fit:
 
 
 def judged_of(section: Section, settled: Bundle, corner: IntArray) -> Judged:
-    """What a section's solve says of its own images, whose observations are of corners (K,)."""
+    """Results of a section's solve on its own images, whose observations are of corners (K,)."""
     problem = settled.problem
     solution = settled.solution
     is_own = np.isin(settled.frames, section.own_frames)

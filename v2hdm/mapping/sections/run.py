@@ -153,7 +153,7 @@ class _Run:
         return [results[number] for number in range(len(todo))]
 
     def finish(self, solved: _Solved, finish: Callable[..., Any]) -> list[Any]:
-        """What ``finish`` makes of all sections under their last joint solve."""
+        """Results of ``finish`` for all sections under their last joint solve."""
         return finish_parts(self.work.folder, solved.joint, solved.shape, finish, self.executor)
 
 

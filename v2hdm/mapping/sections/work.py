@@ -46,7 +46,7 @@ DetectionsOf = Callable[[Sequence[Image], IntArray], Sequence[ImageDetections]]
 
 
 class Ends(NamedTuple):
-    """Of a section's own frames: whose states no frame before predicts, and which a link has.
+    """The ends of a section's own frames: whose states no frame before predicts, and which a link has.
 
     ``along`` says where they are in the whole drive.
     """
@@ -430,7 +430,7 @@ class Work:
 
 
 def classified_of(classified: Classified, rows: IntArray, names: Names, kinds: Sequence[str]) -> Classified:
-    """Of all sections' candidates those at ``rows`` as a section's, which has others' besides, of no kind."""
+    """A section's candidates, at ``rows`` of those of all sections; those of others in it are of no kind."""
     count = len(names.is_ours)
 
     def spread(values: NDArray[Any]) -> NDArray[Any]:

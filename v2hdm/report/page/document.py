@@ -18,12 +18,12 @@ from v2hdm.report.page import charts, listing, plans, tables
 from v2hdm.report.page.certificates import certificates
 from v2hdm.report.page.comparison import comparison_of
 from v2hdm.report.page.embedding import json_text
-from v2hdm.report.page.facts import Facts, ground_residuals, read_facts
+from v2hdm.report.page.facts import Facts, GroundResiduals, ground_residuals, read_facts
 from v2hdm.report.page.identity import identity_of, method_words
 from v2hdm.report.page.layers import background_layer, comparison, earlier_layer, layers
 from v2hdm.report.page.pictures import earlier_pictures, overlays, pictures, room_for_pictures
 from v2hdm.report.page.quality import quality_table
-from v2hdm.report.page.reference import reference_of
+from v2hdm.report.page.reference import Reference, reference_of
 from v2hdm.report.page.tables import in_words
 from v2hdm.report.weak import MOST_PLACES
 from v2hdm.site.accuracy import absolute_radii_m, relative_radii_m
@@ -80,34 +80,17 @@ def document(facts: Facts, compared: Path | None = None) -> SimpleNamespace:
 
     ``compared`` is a folder of ``v2hdm compare``.
     """
-    metrics = facts.metrics
-    verdict = metrics.get("verdict") or {}
-    residuals = ground_residuals(facts)
-    findings = {
-        which: tables.finding_rows(verdict, which) for which in ("findings", "unobservable", "passed")
-    }
     reference = reference_of(facts)
-    places = listing.places_of(facts)
+    residuals = ground_residuals(facts)
     cameras = tables.camera_pages(facts, overlays(facts))
-    charts_of_residuals = charts.residual_charts(facts, residuals) if residuals else {}
     map_data = layers(facts, residuals, reference)
-    shown_residuals = _RESIDUALS if charts_of_residuals else {}
     suspicious = _suspicious(facts)
     return SimpleNamespace(
         facts=facts,
-        title=facts.job.job.site or str(metrics.get("name", facts.folder.name)),
-        name=str(metrics.get("name", facts.folder.name)),
-        digest=str((metrics.get("drive") or {}).get("images_sha256") or "")[:16],
         reference=reference,
         identity=identity_of(facts, reference),
         method=method_words(facts, reference),
         quality=quality_table(facts),
-        accuracy_figure=tables.accuracy_figure(facts),
-        plan=plans.site_plan(facts, places[:MOST_PLACES]),
-        plan_caption=_PLAN_CAPTION,
-        coverage_plan=plans.coverage_plan(facts, places[:MOST_PLACES]),
-        coverage_caption=_COVERAGE_CAPTION,
-        again=listing.drive_again(places, reference),
         listing=listing.marking_table(facts, reference),
         lanes=listing.lane_table(facts, reference),
         left_out=listing.left_out(facts),
@@ -115,31 +98,76 @@ def document(facts: Facts, compared: Path | None = None) -> SimpleNamespace:
         corrections=listing.correction_table(facts),
         certificates=certificates(facts, cameras, residuals),
         comparison=comparison_of(compared),
-        date=str(metrics.get("date", "")),
-        version=str(metrics.get("version", "")),
-        summary=_summary(facts),
-        status=str(verdict.get("status", "FAIL")),
-        headline=str(verdict.get("headline") or "").partition(": ")[2],
-        findings=findings,
-        figures=tables.key_figures(facts),
-        accuracy=tables.accuracy_table(facts),
-        against_truth=tables.truth_table(facts),
-        radii=_radii(facts),
-        check_points=tables.check_point_table(facts),
         map_data=map_data,
         pictures=pictures(facts, room_for_pictures(map_data)),
         suspicious=suspicious,
         suspicious_table=_suspicious_table(suspicious),
         cameras=cameras,
         ground=comparison(facts.folder),
-        residuals=charts_of_residuals,
-        residual_charts=[Chart(charts_of_residuals[key], *words) for key, words in shown_residuals.items()],
-        contents=tables.content_table(facts),
-        methods=tables.method_table(facts),
-        drive=tables.pair_table(metrics.get("drive") or {}),
-        seconds=tables.timing_table(facts),
-        versions=tables.pair_table(metrics.get("versions") or {}),
+        **_of_metrics(facts),
+        **_of_accuracy(facts),
+        **_of_places(facts, reference),
+        **_of_residuals(facts, residuals),
     )
+
+
+def _of_metrics(facts: Facts) -> dict[str, Any]:
+    """Title, verdict and tables of what the run says of itself."""
+    metrics = facts.metrics
+    verdict = metrics.get("verdict") or {}
+    name = str(metrics.get("name", facts.folder.name))
+    drive = metrics.get("drive") or {}
+    kinds = ("findings", "unobservable", "passed")
+    return {
+        "title": facts.job.job.site or name,
+        "name": name,
+        "digest": str(drive.get("images_sha256") or "")[:16],
+        "date": str(metrics.get("date", "")),
+        "version": str(metrics.get("version", "")),
+        "summary": _summary(facts),
+        "status": str(verdict.get("status", "FAIL")),
+        "headline": str(verdict.get("headline") or "").partition(": ")[2],
+        "findings": {kind: tables.finding_rows(verdict, kind) for kind in kinds},
+        "contents": tables.content_table(facts),
+        "methods": tables.method_table(facts),
+        "drive": tables.pair_table(drive),
+        "seconds": tables.timing_table(facts),
+        "versions": tables.pair_table(metrics.get("versions") or {}),
+    }
+
+
+def _of_accuracy(facts: Facts) -> dict[str, Any]:
+    """Figures and tables of how well the map is known."""
+    return {
+        "accuracy_figure": tables.accuracy_figure(facts),
+        "figures": tables.key_figures(facts),
+        "accuracy": tables.accuracy_table(facts),
+        "against_truth": tables.truth_table(facts),
+        "radii": _radii(facts),
+        "check_points": tables.check_point_table(facts),
+    }
+
+
+def _of_places(facts: Facts, reference: Reference) -> dict[str, Any]:
+    """The plans, and the places to drive again, which they ring."""
+    places = listing.places_of(facts)
+    ringed = places[:MOST_PLACES]
+    return {
+        "plan": plans.site_plan(facts, ringed),
+        "plan_caption": _PLAN_CAPTION,
+        "coverage_plan": plans.coverage_plan(facts, ringed),
+        "coverage_caption": _COVERAGE_CAPTION,
+        "again": listing.drive_again(places, reference),
+    }
+
+
+def _of_residuals(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
+    """Charts of the residuals, if the run kept them."""
+    if residuals is None:
+        return {"residuals": {}, "residual_charts": []}
+    drawings = charts.residual_charts(facts, residuals)
+    shown = [Chart(drawings[key], *words) for key, words in _RESIDUALS.items()] if drawings else []
+    return {"residuals": drawings, "residual_charts": shown}
 
 
 def _summary(facts: Facts) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -74,9 +74,23 @@ def in_words(count: int, what: str) -> str:
 
 
 def pair_table(content: Mapping[str, Any]) -> Table | None:
-    """Names and values as in ``metrics.json``."""
-    rows = [[name_of(str(key)), _plain(value)] for key, value in content.items() if value is not None]
+    """Names and values of a part of ``metrics.json``, with its own parts; None is left out."""
+    rows = list(_pairs(content))
     return table(("", ""), rows, words=2) if rows else None
+
+
+_UNITS = {"m": "m", "s": "s", "deg": "°", "sha256": "SHA-256"}
+"""Units as readers know them, by the endings of names."""
+
+
+def _pairs(content: Mapping[str, Any], of: str = "") -> Iterator[list[str]]:
+    for key, value in content.items():
+        if isinstance(value, Mapping):
+            yield from _pairs(value, f"{name_of(key)}: ")
+        elif value is not None:
+            name, _, ending = key.rpartition("_")
+            has_unit = ending in _UNITS and name
+            yield [of + (f"{name_of(name)} ({_UNITS[ending]})" if has_unit else name_of(key)), _plain(value)]
 
 
 def _plain(value: object) -> str:

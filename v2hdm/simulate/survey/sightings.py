@@ -174,7 +174,8 @@ def _false(info: CameraInfo, cam_from_map: FloatArray, rng: np.random.Generator)
     left = np.array([-ahead[1], ahead[0]])
     place = camera_centre(cam_from_map)[:2] + rng.uniform(*_FALSE_AHEAD_M) * ahead
     place = place + rng.uniform(-4.0, 4.0) * left
-    length_m, width_m = rng.uniform(0.6, 2.0), rng.uniform(0.15, 0.8)
+    length_m = rng.uniform(0.6, 2.0)
+    width_m = rng.uniform(0.15, 0.8)
     turn = rng.uniform(-np.pi, np.pi)
     sides = 0.5 * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * (length_m, width_m)
     rotation = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
