@@ -12,6 +12,7 @@ import v2hdm
 from v2hdm.adjust.problem import SolveOptions
 from v2hdm.doors import checked
 from v2hdm.errors import ConfigError, V2hdmError
+from v2hdm.records import Drive
 from v2hdm.simulate.port.config import PortConfig
 
 
@@ -91,13 +92,33 @@ FILES = {
 """Arguments that may be a path: that of no file is refused as such."""
 
 
+def doors_of_classes(drive: Drive) -> Mapping[str, Door]:
+    """The constructors and methods, with arguments of a drive."""
+    info = drive.cameras["front"].info
+    detector = v2hdm.Detector.load()
+    pixels = np.zeros((info.height, info.width, 3), np.uint8)
+    return {
+        "Detector": Door(v2hdm.Detector, {"network": detector.network, "options": detector.options}),
+        "Detector.load": Door(v2hdm.Detector.load, {"path": None, "options": None}),
+        "Detector.detect": Door(detector.detect, {"image_bgr": pixels, "camera": drive.cameras["front"]}),
+        "DetectorOptions": Door(
+            v2hdm.DetectorOptions,
+            {"model": None, "device": "cpu", "threads": 1, "blur_px": None, "max_range_m": 22.0},
+        ),
+        "HDMap": Door(v2hdm.HDMap, {"markings": (), "lanes": (), "origin": None, "largest_id": 0}),
+        "Calibration": Door(
+            v2hdm.Calibration, {"info": info, "cam_from_vehicle": np.eye(4), "covariance": None}
+        ),
+        "Verdict": Door(v2hdm.Verdict, {"findings": ()}),
+        "Verdict.of": Door(v2hdm.Verdict.of, {"findings": []}),
+    }  # fmt: skip
+
+
 @pytest.fixture(scope="module")
 def doors(small_drive, tmp_path_factory) -> Mapping[str, Door]:
     folder = tmp_path_factory.mktemp("doors")
     drive = v2hdm.read_drive(small_drive)
     info = drive.cameras["front"].info
-    detector = v2hdm.Detector.load()
-    pixels = np.zeros((info.height, info.width, 3), np.uint8)
     calibration = v2hdm.Calibration(info, np.eye(4))
     empty = v2hdm.HDMap(())
     return {
@@ -142,19 +163,7 @@ def doors(small_drive, tmp_path_factory) -> Mapping[str, Door]:
             v2hdm.simulate_port, {"folder": folder, "config": None, "workers": 1, "progress": None}
         ),
         "solve": Door(v2hdm.solve, {"problem": problem_of(), "options": None}),
-        "Detector": Door(v2hdm.Detector, {"network": detector.network, "options": detector.options}),
-        "Detector.load": Door(v2hdm.Detector.load, {"path": None, "options": None}),
-        "Detector.detect": Door(detector.detect, {"image_bgr": pixels, "camera": drive.cameras["front"]}),
-        "DetectorOptions": Door(
-            v2hdm.DetectorOptions,
-            {"model": None, "device": "cpu", "threads": 1, "blur_px": None, "max_range_m": 22.0},
-        ),
-        "HDMap": Door(v2hdm.HDMap, {"markings": (), "lanes": (), "origin": None, "largest_id": 0}),
-        "Calibration": Door(
-            v2hdm.Calibration, {"info": info, "cam_from_vehicle": np.eye(4), "covariance": None}
-        ),
-        "Verdict": Door(v2hdm.Verdict, {"findings": ()}),
-        "Verdict.of": Door(v2hdm.Verdict.of, {"findings": []}),
+        **doors_of_classes(drive),
     }  # fmt: skip
 
 

@@ -1,6 +1,7 @@
 """A synthetic street: diamonds beside a route, seen by one or two cameras with known truth."""
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -88,6 +89,50 @@ def pose_errors(
     return out
 
 
+MOUNTS = np.stack([mounted((1.5, 0.0, 2.4), 18), mounted((-1.0, 0.2, 2.6), 22, yaw_deg=180)])
+
+
+def with_outliers(pixel: np.ndarray, share: float, seed: int) -> np.ndarray:
+    """Pixels (K, 2), a share of which are up to 60 px off.
+
+    Outliers have a generator of their own: the same street without them has the same noise.
+    """
+    rng = np.random.default_rng([seed, 1])
+    is_wrong = rng.random(len(pixel)) < share
+    pixel = pixel.copy()
+    pixel[is_wrong] += rng.uniform(-60, 60, (int(is_wrong.sum()), 2))
+    return pixel
+
+
+class Seen(NamedTuple):
+    """K observations of the corners (N, 2) that are seen often enough, by their numbers among these."""
+
+    camera: np.ndarray
+    frame: np.ndarray
+    corner: np.ndarray
+    corners_map: np.ndarray
+
+
+def seen_often(
+    truth: np.ndarray, recorded: np.ndarray, corners: np.ndarray, max_range_m: float, min_views: int
+) -> Seen:
+    """Observations of the corners that ``min_views`` images show at least."""
+    camera, frame, corner, _ = observe(truth, recorded, corners, max_range_m)
+    is_often = np.bincount(corner, minlength=len(corners)) >= min_views
+    keep = is_often[corner]
+    rank = np.cumsum(is_often) - 1
+    return Seen(camera[keep], frame[keep], rank[corner[keep]], corners[is_often])
+
+
+def off_start(truth: np.ndarray, error_deg: float, error_m: float, rng: np.random.Generator) -> np.ndarray:
+    """Extrinsics (C, 4, 4), each turned about a random axis, and moved."""
+    axis = rng.standard_normal((len(truth), 3))
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    start = exp(np.concatenate([np.zeros_like(axis), np.deg2rad(error_deg) * axis], 1)) @ truth
+    start[:, :3, 3] += rng.uniform(-error_m, error_m, axis.shape)
+    return start
+
+
 def make_scene(
     seed: int = 0,
     *,
@@ -116,10 +161,7 @@ def make_scene(
     (J, 4, 4), ``map_from_vehicle``, takes the place of the route, ``mounts`` (C, 4, 4) that of the cameras.
     """
     rng = np.random.default_rng(seed)
-    if mounts is None:
-        mounts = np.stack([mounted((1.5, 0.0, 2.4), 18), mounted((-1.0, 0.2, 2.6), 22, yaw_deg=180)])[
-            :cameras
-        ]
+    mounts = MOUNTS[:cameras] if mounts is None else mounts
     cameras = len(mounts)
     truth = exp(np.concatenate([np.zeros((cameras, 3)), rng.normal(0, 0.02, (cameras, 3))], 1)) @ mounts
     recorded = route(frames, step_m, turn_deg_per_m, straight_m) if driven is None else driven
@@ -130,22 +172,11 @@ def make_scene(
         rng, pose_rng = np.random.default_rng(noise_seed), np.random.default_rng([noise_seed, 2])
     state = np.zeros((frames, 6)) if jitter is None else pose_errors(recorded, jitter, step_m, pose_rng)
     map_from_vehicle = recorded @ exp(state)
-    camera, frame, corner, _ = observe(truth, recorded, corners, max_range_m)
-    often = np.bincount(corner, minlength=len(corners)) >= min_views
-    keep = often[corner]
-    rank = np.cumsum(often) - 1
-    camera, frame, corner = camera[keep], frame[keep], rank[corner[keep]]
-    corners = corners[often]
+    camera, frame, corner, corners = seen_often(truth, recorded, corners, max_range_m, min_views)
     pixel = project(truth[camera] @ np.linalg.inv(map_from_vehicle)[frame], corners[corner])
     pixel = pixel + pixel_sigma * rng.standard_normal(pixel.shape)
-    # Of a generator of their own, so that the same street without them has the same noise.
-    wrong_rng = np.random.default_rng([seed, 1])
-    wrong = wrong_rng.random(len(pixel)) < outliers
-    pixel[wrong] += wrong_rng.uniform(-60, 60, (int(wrong.sum()), 2))
-    axis = rng.standard_normal((cameras, 3))
-    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-    start = exp(np.concatenate([np.zeros((cameras, 3)), np.deg2rad(start_error_deg) * axis], 1)) @ truth
-    start[:, :3, 3] += rng.uniform(-start_error_m, start_error_m, (cameras, 3))
+    pixel = with_outliers(pixel, outliers, seed)
+    start = off_start(truth, start_error_deg, start_error_m, rng)
     centre = -np.einsum("cji,cj->ci", truth[:, :3, :3], truth[:, :3, 3])
     problem = Problem(
         intrinsic=np.tile([FOCAL, FOCAL, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5], (cameras, 1)),

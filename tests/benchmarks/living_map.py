@@ -61,7 +61,7 @@ def port(full: bool, session: int) -> PortConfig:
     return replace(config, name="port2-short", route=route, yard=yard)
 
 
-def seen(config: PortConfig, cache: Path, workers: int) -> Seen:
+def detected(config: PortConfig, cache: Path, workers: int) -> Seen:
     """A drive and its detections."""
     with open_executor(workers) as executor:
         drive = read_drive(rendered_drive(config, cache, executor, lambda _, __: None))
@@ -69,17 +69,19 @@ def seen(config: PortConfig, cache: Path, workers: int) -> Seen:
         return drive, detect_all(drive, DetectorOptions.for_mapping(), executor)
 
 
-def mapped(one: Seen, base: Base | None = None) -> MethodResult:
+def mapped(drive_seen: Seen, base: Base | None = None) -> MethodResult:
     """The optimised map by all cameras."""
-    return run_methods(*one, tuple(one[0].cameras), base=base, grey=grey_reader(one[0]))["Opt"]
+    drive, detections = drive_seen
+    methods = run_methods(drive, detections, tuple(drive.cameras), base=base, grey=grey_reader(drive))
+    return methods["Opt"]
 
 
 def together(drives: Sequence[Seen]) -> Seen:
     """Drives as sessions of one."""
     detections: list[ImageDetections] = []
-    for drive, found in drives:
-        before = sum(len(one.images) for one, _ in drives[: [d for d, _ in drives].index(drive)])
-        detections += [replace(one, image=one.image + before) for one in found]
+    for drive, in_images in drives:
+        before = sum(len(earlier.images) for earlier, _ in drives[: [d for d, _ in drives].index(drive)])
+        detections += [replace(in_image, image=in_image.image + before) for in_image in in_images]
     return join_drives([drive for drive, _ in drives]), detections
 
 
@@ -100,7 +102,9 @@ def base_of(result: MethodResult) -> Base:
         write_geojson(result.hd_map, Path(folder) / "map.geojson")
         hd_map = read_geojson(Path(folder) / "map.geojson")
     assert result.poses is not None
-    left_out = tuple((one.kind, one.position_map, one.sightings) for one in result.excluded)
+    left_out = tuple(
+        (candidate.kind, candidate.position_map, candidate.sightings) for candidate in result.excluded
+    )
     return Base(hd_map, result.poses.map_from_vehicle, left_out)
 
 
@@ -121,37 +125,49 @@ def at(corners: FloatArray | None, other: FloatArray | None) -> bool:
     return bool(np.linalg.norm(corners.mean(axis=0) - other.mean(axis=0)) < SAME_M)
 
 
+def _is_same(alteration: Alteration, change: Change) -> bool:
+    return at(alteration.before, change.before) and at(alteration.after, change.after)
+
+
 def tell_changes(changes: Sequence[Change], alterations: Sequence[Alteration], base: HDMap) -> None:
     """Print which alterations are listed, and what else is."""
-    known = [one.corners_map for one in base.markings]
-    for fate, is_one in (
-        (Fate.MOVED, lambda one: one.before is not None and one.after is not None),
-        (Fate.VANISHED, lambda one: one.after is None),
-        (Fate.NEW, lambda one: one.before is None),
+    known_corners = [marking.corners_map for marking in base.markings]
+    for fate, is_of_fate in (
+        (Fate.MOVED, lambda alteration: alteration.before is not None and alteration.after is not None),
+        (Fate.VANISHED, lambda alteration: alteration.after is None),
+        (Fate.NEW, lambda alteration: alteration.before is None),
     ):
-        own = [one for one in alterations if is_one(one)]
+        own_alterations = [alteration for alteration in alterations if is_of_fate(alteration)]
         listed = [change for change in changes if change.fate is fate]
         right = [
-            one for one in own if any(at(one.before, c.before) and at(one.after, c.after) for c in listed)
+            alteration
+            for alteration in own_alterations
+            if any(_is_same(alteration, change) for change in listed)
         ]
         others = [
-            c for c in listed if not any(at(one.before, c.before) and at(one.after, c.after) for one in own)
+            change
+            for change in listed
+            if not any(_is_same(alteration, change) for alteration in own_alterations)
         ]
-        unknown = [one for one in own if one.before is not None and not any(at(one.before, k) for k in known)]
+        unknown = [
+            alteration
+            for alteration in own_alterations
+            if alteration.before is not None and not any(at(alteration.before, k) for k in known_corners)
+        ]
         print(
-            f"{fate.value}: {len(right)} of {len(own)} listed ({len(unknown)} were not in the earlier map), "
-            f"{len(others)} others: "
+            f"{fate.value}: {len(right)} of {len(own_alterations)} listed "
+            f"({len(unknown)} were not in the earlier map), {len(others)} others: "
             + "; ".join(f"{c.id} {c.kind} p {c.probability:.2f} {c.views_showing}/{c.views}" for c in others)
         )
-        for one in own:
-            if not any(one is other for other in right):
-                corners = one.before if one.after is None else one.after
+        for alteration in own_alterations:
+            if not any(alteration is other for other in right):
+                corners = alteration.before if alteration.after is None else alteration.after
                 assert corners is not None
-                near = [
+                changes_near = [
                     c for c in changes if any(at(x, corners) for x in (c.before, c.after) if x is not None)
                 ]
                 fates = ", ".join(
-                    f"{c.fate.value} p {c.probability:.2f} {c.views_showing}/{c.views}" for c in near
+                    f"{c.fate.value} p {c.probability:.2f} {c.views_showing}/{c.views}" for c in changes_near
                 )
                 x, y = corners.mean(axis=0)
                 print(f"   missed at ({x:.1f}, {y:.1f}): {fates or 'nothing listed'}")
@@ -159,7 +175,9 @@ def tell_changes(changes: Sequence[Change], alterations: Sequence[Alteration], b
 
 def common_rmse_m(hd_map: HDMap, others: Sequence[HDMap], truth: Truth) -> float:
     """Corner RMSE, m, over the true markings that all of the maps have."""
-    columns = [set(match_markings(one.markings, truth.map.markings)[1]) for one in (hd_map, *others)]
+    columns = [
+        set(match_markings(compared.markings, truth.map.markings)[1]) for compared in (hd_map, *others)
+    ]
     shared = set.intersection(*columns)
     pairs = [
         (row, column)
@@ -172,22 +190,23 @@ def common_rmse_m(hd_map: HDMap, others: Sequence[HDMap], truth: Truth) -> float
 
 def two_drives(arguments: argparse.Namespace) -> Base:
     """Map two drives alone and together; returns the map of the first."""
-    first = seen(port(arguments.full, 0), arguments.cache, arguments.workers)
+    first = detected(port(arguments.full, 0), arguments.cache, arguments.workers)
     truth = read_truth(first[0])
-    one = mapped(first)
-    told("first drive", one.hd_map, truth, first[0])
-    base = base_of(one)
-    second = seen(port(arguments.full, 1), arguments.cache, arguments.workers)
-    other, both = mapped(second), mapped(together([first, second]))
+    of_first = mapped(first)
+    told("first drive", of_first.hd_map, truth, first[0])
+    base = base_of(of_first)
+    second = detected(port(arguments.full, 1), arguments.cache, arguments.workers)
+    of_second = mapped(second)
+    of_both = mapped(together([first, second]))
     updated = mapped(second, base)
     maps = {
-        "second drive": other.hd_map,
-        "both in one adjustment": both.hd_map,
+        "second drive": of_second.hd_map,
+        "both in one adjustment": of_both.hd_map,
         "first map brought up to date by the second drive": updated.hd_map,
     }
     for name, hd_map in maps.items():
         told(name, hd_map, truth, first[0])
-    every = [one.hd_map, *maps.values()]
+    every = [of_first.hd_map, *maps.values()]
     rmse_m = [common_rmse_m(hd_map, every, truth) for hd_map in every]
     better = min(rmse_m[:2])
     print(
@@ -216,7 +235,7 @@ def main() -> None:
     with altered(count, config.seed) as alterations:  # in this process alone, which renders them
         build_port(config)
         rendered_drive(config, arguments.cache, HERE, lambda _, __: None)
-    third = seen(config, arguments.cache, arguments.workers)
+    third = detected(config, arguments.cache, arguments.workers)
     renewed = mapped(third, base)
     assert renewed.changes is not None
     told("first map after the paint was altered", renewed.hd_map, read_truth(third[0]), third[0])

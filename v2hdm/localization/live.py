@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -78,13 +78,7 @@ def localize_live(
         news = _News()
         untold: list[str] = []  # cameras that are to be told where to look
         while running and (limit is None or images < limit):
-            for item in _available(items, waits=not untold):
-                if isinstance(item, _Ended):
-                    running.discard(item.source)
-                    if item.error is not None:
-                        raise DriveError(item.error)
-                else:
-                    news.add(item)
+            _gather(_available(items, waits=not untold), news, running)
             # What comes between images waits for the next: a pose of it would only cost time.
             if news.looks or news.has_waited(written_s):
                 pose = localizer.update(news.looks, news.motions, news.fixes)
@@ -139,6 +133,20 @@ def _available(items: _Queue, waits: bool) -> Iterator[_Item]:
             yield items.get_nowait()
         except queue.Empty:
             return
+
+
+def _gather(items: Iterable[_Item], news: _News, running: set[str]) -> None:
+    """Sort what has come into ``news``; a source that has ended is ``running`` no longer.
+
+    Raises DriveError if it ended in an error.
+    """
+    for item in items:
+        if isinstance(item, _Ended):
+            running.discard(item.source)
+            if item.error is not None:
+                raise DriveError(item.error)
+        else:
+            news.add(item)
 
 
 @dataclass(frozen=True)

@@ -50,10 +50,25 @@ def evaluate(drive: Drive, methods: CameraSets) -> Evaluation:
         metrics["disturbances"] = truth.disturbances
     headlines = [headline(name, by_method) for name, by_method in results.items()]
     if truth is not None and truth.disturbances:
-        disturbed = ", ".join(f"{name} {value:g}" for name, value in truth.disturbances.items())
-        headlines.insert(0, f"disturbances: {disturbed}")
+        headlines.insert(0, _disturbed(truth.disturbances))
     headlines += list(methods.values())[-1][BEST].certainty.values()
     return Evaluation(metrics, headlines)
+
+
+def _disturbed(disturbances: Mapping[str, float]) -> str:
+    """A sentence on the errors that a rendered drive was given: their sigmas, and those that were drawn."""
+    parts = []
+    for name, sigma in disturbances.items():
+        if name.startswith(_DRAWN):
+            continue
+        words, _, unit = name.rpartition("_")
+        drawn = disturbances.get(f"{_DRAWN}{name}")
+        of_drawn = "" if drawn is None else f" (drawn {drawn:.2g})"
+        parts.append(f"{words.replace('_', ' ')} {sigma:.2g} {unit}{of_drawn}")
+    return f"this drive was rendered with errors of one sigma of: {', '.join(parts)}"
+
+
+_DRAWN = "actual_"  # beginning of the name of a disturbance as it was drawn
 
 
 def _areas(

@@ -68,7 +68,7 @@ def directed(
         result.drives.append(tuple(sorted(drives)))
         place = shapes[number].centre[len(shapes[number].centre) // 2]
         if number in asked:
-            text = "no drive went along this lane; is it driven along, against, or both ways of this line?"
+            text = "no drive went along this lane; is it driven along this line, against it, or both ways?"
             to = shapes[number].centre[
                 min(len(shapes[number].centre) // 2 + 10, len(shapes[number].centre) - 1)
             ]

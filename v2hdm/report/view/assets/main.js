@@ -88,7 +88,7 @@ function show(feature) {
 }
 
 // ---- lists to go through ----
-const suspects = new Map(scene.suspicious.map(({ id, p, by }) => [`m${id}`, `${by}, p ${p.toPrecision(2)}`]));
+const suspects = new Map(scene.suspicious.map(({ id, p, by }) => [`m${id}`, `${by}, p\u00a0${p < 0.001 ? "<\u00a00.001" : p.toFixed(3)}`]));
 const looks = [...suspects].flatMap(([key, why]) => (model.byKey.has(key) ? [{ feature: model.byKey.get(key), why }] : []));
 for (const feature of model.features.filter(({ g, key }) => g === "C" && !suspects.has(key)).sort((a, b) => (b.w ?? 0) - (a.w ?? 0))) looks.push({ feature, why: `95 % radius ${(feature.w / 10).toFixed(1)} cm` });
 const leftOut = model.features.filter(({ what }) => what === "candidate").sort((a, b) => b.n - a.n).map((feature) => ({ feature, why: feature.why }));
@@ -425,7 +425,8 @@ async function link() {
 const home = () => { view.fit([...model.features.flatMap(({ base }) => base), ...model.route]); drawing.change(); };
 const before = () => { drawing.show.before = !drawing.show.before; panel.layers(LAYERS, drawing.show, () => drawing.change()); drawing.change(); };
 const zoom = (by) => { view.zoomTo(view.scale * by, pointer ?? undefined); drawing.later(); };
-const help = () => byId("keys").showModal();
+// The focus on the button at its end scrolls a long list there.
+const help = () => { byId("keys").showModal(); byId("keys").scrollTop = 0; };
 const isFocus = () => { canvas.focus(); };
 // Key, its name where it is told, what it does, the name of its button if it has one, and in words.
 const KEYS = [
