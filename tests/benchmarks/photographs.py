@@ -36,9 +36,10 @@ from scipy.sparse.csgraph import connected_components
 from train.examples import polygon_overlap
 from train.labels import JUDGING, held_out
 from v2hdm.catalogue import AREA, OTHER, SHIPPED, SYMBOL
-from v2hdm.detection.detector import Detector
+from v2hdm.detection.detector import Detector, Looked
 from v2hdm.detection.network import NetworkOutput
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.detection.steps import Steps
 from v2hdm.pipeline.detect_images import detect_images
 from v2hdm.records import (
     BOX,
@@ -160,14 +161,16 @@ def as_it_is(output: NetworkOutput) -> np.ndarray:
 
 
 class Listening(Detector):
-    """A detector that keeps its network's last output."""
+    """A detector that keeps the network's output on the image that it searched last."""
 
     output: NetworkOutput
 
-    def run_network(self, image_bgr: np.ndarray, camera: Camera, top: int | None = None) -> NetworkOutput:
-        """Run the network on one image."""
-        self.output = super().run_network(image_bgr, camera, top)
-        return self.output
+    def steps_in(
+        self, output: NetworkOutput, image_bgr: np.ndarray, camera: Camera, has_boundaries: bool = True
+    ) -> Steps[Looked]:
+        """Search one image."""
+        self.output = output
+        return (yield from super().steps_in(output, image_bgr, camera, has_boundaries))
 
 
 def read(labels: Path, roles: tuple[str, ...], stop_lines: Collection[int] = ()) -> dict[str, Labels]:
