@@ -40,7 +40,7 @@ from v2hdm.verdict import Status
 
 
 @pytest.fixture(scope="module")
-def result(short_drive, tmp_path_factory):
+def result(short_drive, coarse_mosaics, tmp_path_factory):
     output = tmp_path_factory.mktemp("outputs")
     report = ReportConfig(background=str(aerial_picture(output / "aerial.tif", read_drive(short_drive))))
     config = run_config(short_drive, output, export=list(FORMATS), mosaic=True, report=report, all_maps=True)
