@@ -59,7 +59,7 @@ class Environment:
 
 
 def requirements(of: Distribution, extras: Iterable[str]) -> list[Requirement]:
-    """What a distribution needs on this machine, with extras; the extra "" is the distribution alone."""
+    """A distribution's requirements on this machine, with extras; the extra "" is the distribution alone."""
     listed = [Requirement(text) for text in of.requires or ()]
     return [
         one

@@ -42,7 +42,7 @@ PROMISES = {
 }
 """Words by document: the first line of its blocks with each of them is run, in each environment."""
 
-MAP_PORT = f"v2hdm map +run=port2 workers=1 {' '.join(map(repr, SMALL_PORT))}"
+MAP_PORT = f"v2hdm map +run=port2 workers=1 mosaic=false {' '.join(map(repr, SMALL_PORT))}"
 
 FIRST = f"{MAP_PORT} all_maps=true"
 """Makes the drive and the result on which all other commands work."""

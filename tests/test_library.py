@@ -27,7 +27,7 @@ def names(small_drive, coarse_mosaics, tmp_path_factory):
     """Names that the examples use: the library, a rendered drive, its result, and a folder to write to."""
     folder = tmp_path_factory.mktemp("library")
     port = v2hdm.read_drive(small_drive)
-    result = v2hdm.map_drive(port, accuracy_goal_cm=10.0, workers=1)
+    result = v2hdm.map_drive(port, accuracy_goal_cm=10.0, workers=1, cache=folder / "cache")
     survey_camera(folder, port, read_truth(port))
     public = {name: getattr(v2hdm, name) for name in v2hdm.__all__}
     own = {"folder": folder, "port": port, "result": result, "points": folder / "points.csv"}
@@ -69,7 +69,7 @@ def test_what_is_saved_is_what_the_command_writes(names, tmp_path):
     from v2hdm.cli.main import run
 
     saved = names["result"].save(tmp_path / "saved")
-    given = f"name=run output={tmp_path} cache={tmp_path / 'cache'} workers=1 accuracy_goal_cm=10"
+    given = f"name=run output={tmp_path} cache={names['folder'] / 'cache'} workers=1 accuracy_goal_cm=10"
     assert run(["map", f"drive.path={names['port'].root}", *given.split()]) == 0
     written = {path.relative_to(tmp_path / "run") for path in (tmp_path / "run").rglob("*") if path.is_file()}
     of_runs = {Path("config.yaml"), Path("run.log")}

@@ -156,6 +156,16 @@ def test_the_corners_may_be_given_a_start():
     assert given.cost == pytest.approx(free.cost, rel=1e-9)
 
 
+def test_a_newton_step_of_the_cameras_leads_to_a_start_from_which_few_evaluations_do():
+    """Corners that are given are not back-projected anew, and so cannot follow such a step."""
+    problem = make_scene(0, frames=30, start_error_deg=1.0).problem
+    solution = solve(problem, PAPER)
+    aside_m = np.random.default_rng(0).normal(0, 0.1, solution.corners_map.shape)
+    other = solve(replace(problem, corners_start=solution.corners_map + aside_m), PAPER)
+    assert solution.evaluations < other.evaluations
+    assert solution.cost == pytest.approx(other.cost, rel=1e-10)
+
+
 def test_the_cost_is_the_sum_of_its_named_terms():
     solution = solve(make_scene(13, frames=40, jitter=POSES).problem)
     priors = "camera_centre ground_planes frame_states clock_offsets control_points known_lengths"

@@ -2,11 +2,11 @@
 
 SMALL_PORT = (
     "simulate.seed=11", "simulate.route.pieces=[[12.0,0.0],[12.0,55.0],[4.0,0.0]]",
-    "simulate.route.image_spacing_m=2.0", "~simulate.cameras.rear", "simulate.cameras.front.width=640",
+    "simulate.route.image_spacing_m=3.0", "~simulate.cameras.rear", "simulate.cameras.front.width=640",
     "simulate.cameras.front.height=360", "simulate.cameras.front.focal_px=450.0",
     "simulate.yard.parked_trucks=0", "simulate.yard.barriers=0", "simulate.yard.shadow_strips=1",
 )  # fmt: skip
-"""28 m of a port, one camera, half its pixels, little in the way."""
+"""28 m of a port in 9 images, one camera, half its pixels, little in the way."""
 
 
 def smaller(arguments: list[str]) -> list[str]:

@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from v2hdm.geometry.least_squares import gauss_newton, normal_equations
+from v2hdm.geometry.least_squares import Normal, gauss_newton, normal_equations
 from v2hdm.geometry.rigid import exp, inverse, log
 
 AT = np.linspace(0.0, 2.0, 30)
@@ -63,6 +63,19 @@ def test_damping_reaches_a_minimum_that_whole_steps_leap_over():
     fit = gauss_newton(linearise, far, steps=60, damping=1e-3)
     assert fit.converged
     assert abs(fit.x[0]) < 1e-8
+
+
+def test_at_a_minimum_up_to_rounding_damping_begins_anew():
+    """Near 0 the gradient is wrong, as rounding is, by more than a short step: each step raises the cost."""
+    limited = partial(np.clip, a_min=-1.0, a_max=1.0)
+
+    def linearise(x):
+        return Normal(np.eye(1), x + 0.03, 0.5 * float(x @ x))
+
+    fit = gauss_newton(linearise, np.array([8.0]), limit=limited, steps=60, tolerance=0.02, damping=1e-3)
+    assert fit.converged
+    # Eight steps of 1 lower the damping to 1e-11, one fails there, and four raise it from 1e-3 to 1.
+    assert fit.steps == 13
 
 
 def test_a_motion_is_found_on_its_manifold():

@@ -176,6 +176,21 @@ def test_while_an_image_is_searched_at_once_the_next_ones_are_not():
     assert not any(images[0] and images[1] for images in told)
 
 
+def test_of_two_cameras_that_show_too_little_one_gives_way_for_one_image():
+    painted = yard(2)
+    driven = drive(painted, 2)
+
+    def changed(frame, look):
+        return replace(look, markings=()) if 40 <= frame < 43 else look
+
+    _, told = followed_by_second_looks(driven, mapped(painted, 2), 2, changed)
+    at_once = {
+        camera: [told[frame][camera].regions_px is None for frame in (41, 42)] for camera in ("front", "rear")
+    }
+    assert at_once == {"front": [True, True], "rear": [False, True]}
+    assert told[41]["rear"].is_all_later
+
+
 def test_what_second_looks_alone_show_speaks_against_the_map():
     painted = yard(3)
     extra = [Marking("diamond", DIAMOND + np.array([x, 5.5]), 10) for x in np.arange(30.0, 100.0, 2.0)]

@@ -16,9 +16,10 @@ from v2hdm.adjust.arrays import Arrays
 from v2hdm.adjust.audit import audit
 from v2hdm.adjust.checks import check_model, check_options, check_problem
 from v2hdm.adjust.covariance import Covariance
-from v2hdm.adjust.descent import Descent, descend, open_descent
+from v2hdm.adjust.descent import Descent, descend, open_descent, predicted_gap
 from v2hdm.adjust.engine import TorchEngine
 from v2hdm.adjust.engines import make_engine
+from v2hdm.adjust.kernels.tables import move
 from v2hdm.adjust.layout import make_arrays, nearby_origin, shifted
 from v2hdm.adjust.model import Estimate, Loss, depression_sine, frame_tangent
 from v2hdm.adjust.problem import Problem, SolveOptions
@@ -36,6 +37,9 @@ _MIN_DEPRESSION_SINES = (0.1, 0.2, 0.1)
 _NEAR_RAD = 0.052
 """Rotation of a camera, rad, up to which every start converged without steep rays: 3 degrees, of the 5 tried.
 At ten degrees a first Newton step errs by a twentieth."""
+
+_CLOSE_GAP = 1e-2
+"""Gap of a start up to which a few evaluations lead to the optimum, so that no nearer start pays. Chosen."""
 
 _WORTH_CORNERS = (
     1000  # corners above which a coarse stage saves more evaluations of all corners than it costs
@@ -189,7 +193,7 @@ def _start(problem: Problem, engine: TorchEngine, robust: Loss, options: SolveOp
         estimate, corner = _estimate(problem, engine, cam_from_vehicle)
         opening = open_descent(engine, estimate, robust) if corner is None else None
         if opening is not None and is_near(opening):
-            return Start(estimate, opening, 0)
+            return _nearer(problem, engine, robust, estimate, opening)
         del opening
     spent = 0
     if options.coarse:
@@ -201,6 +205,31 @@ def _start(problem: Problem, engine: TorchEngine, robust: Loss, options: SolveOp
             "lie above the horizon; leave it out or give corners_start"
         )
     return Start(estimate, None, spent)
+
+
+def _nearer(
+    problem: Problem, engine: TorchEngine, robust: Loss, estimate: Estimate, opening: Whitening
+) -> Start:
+    """The start with the cameras where a Newton step leads, if that is nearer to the optimum.
+
+    Corners are back-projected anew, and so follow the cameras exactly: by the step itself they would to first
+    order. Of 4,000 observations that saves three of six evaluations, with frame states four of fourteen.
+    """
+    start = Start(estimate, opening, 0)
+    cost = sum(opening.terms.values())
+    if problem.corners_start is not None or predicted_gap(cost, opening.gradient) <= _CLOSE_GAP:
+        return start
+    tangents = opening.camera_step(-opening.gradient)[:, :6].numpy(force=True)
+    cameras = estimate.cam_from_vehicle
+    moved, _ = move(np.ascontiguousarray(tangents), np.ascontiguousarray(cameras.numpy(force=True)))
+    moved_estimate, corner = _estimate(problem, engine, torch.as_tensor(moved, device=cameras.device))
+    if corner is not None:
+        return start
+    moved_opening = open_descent(engine, moved_estimate, robust)
+    # A start farther away has larger residuals, for which the loss is opened.
+    before = (opening.robust.scale, cost)
+    after = (moved_opening.robust.scale, sum(moved_opening.terms.values()))
+    return Start(moved_estimate, moved_opening, 0) if after < before else start
 
 
 def start_of(

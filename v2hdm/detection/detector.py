@@ -46,7 +46,7 @@ _PART_SHARE = 0.5  # share of an area in a marking from which it is a part of th
 
 
 class Looked(NamedTuple):
-    """What is found in one image: markings, lanes, and the pieces of its paint, of any class."""
+    """The detections of one image: markings, lanes, and the pieces of its paint, of any class."""
 
     markings: Markings
     lanes: tuple[LaneDetection, ...]

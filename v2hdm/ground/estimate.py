@@ -152,23 +152,33 @@ def _found(nothing: GroundEstimate, solved: _Solved, free: tuple[str, ...]) -> G
     by_axes = -np.kron([[0, 1], [1, 0]], mount.vehicle_from_cam_rotation.T)
     covariance = by_axes @ (factor * adjusted.covariance[:6, :6] + flatness) @ by_axes.T
     calibration = Calibration(mount.info, mount.cam_from_vehicle, covariance)
-    by_lens = np.array([_by_lens(name, observations, solved) for name in ("focal_scale", "distortion_k1")])
+    freed = {
+        name: _free(name, observations, solved.stated, adjusted)
+        for name in free
+        if name != "clock_s" or solved.clock is None
+    }
+    k1 = freed.get("distortion_k1") or _free("distortion_k1", observations, solved.stated, adjusted)
+    by_lens = np.array([_by_lens(_with_focal_scale(observations, solved)), _by_lens(k1.adjusted)])
     return replace(
         nothing,
         status=GroundStatus.FOUND,
         calibration=calibration,
         plane=plane_of(calibration, by_lens @ by_axes.T),
-        parameters=_free_parameters(free, observations, solved, factor),
+        parameters=_free_parameters(free, freed, solved, factor),
         median_residual=float(np.median(adjusted.residual)),
         innovations=_innovations(adjusted, solved.stated.drive.pose_noise),
     )
 
 
-def _by_lens(name: str, observations: Observations, solved: _Solved) -> FloatArray:
-    """Change (6,) of the mounting's turn and centre by an error of the lens."""
+def _with_focal_scale(observations: Observations, solved: _Solved) -> Adjusted:
+    """The solution with the focal length free, the camera's height no better known than before."""
     observed = solved.stated.prior_of(observations)
     adjusted = solved.adjusted
-    freed = adjust(observed.observations, observed.prior, adjusted.mount, free=name, without=adjusted)
+    return adjust(observed.observations, observed.prior, adjusted.mount, "focal_scale", without=adjusted)
+
+
+def _by_lens(freed: Adjusted) -> FloatArray:
+    """Change (6,) of the mounting's turn and centre by an error of the lens, which a solution frees."""
     return np.asarray(freed.covariance[:6, 6] / freed.covariance[6, 6])
 
 
@@ -233,9 +243,9 @@ def clock_shows(motion: Motion) -> bool:
 
 
 def _free_parameters(
-    names: tuple[str, ...], observations: Observations, solved: _Solved, factor: float
+    names: tuple[str, ...], freed_alone: Mapping[str, _Freed], solved: _Solved, factor: float
 ) -> Mapping[str, Parameter]:
-    """Each of ``names`` freed alone; ``factor`` inflates all variances, see :func:`_scatter`."""
+    """The parameters ``names``, the clock as solved; ``factor`` inflates variances, see :func:`_scatter`."""
     turns = clock_shows(solved.stated.motion)
     widened = float(np.sqrt(factor))
     parameters = {}
@@ -243,7 +253,7 @@ def _free_parameters(
         if name == "clock_s" and solved.clock is not None:
             parameters[name] = replace(solved.clock, sigma=solved.clock.sigma * widened)
             continue
-        freed = _free(name, observations, solved.stated, solved.adjusted)
+        freed = freed_alone[name]
         largest, why_not = _OBSERVABLE[name]
         # An error inflates the variance; whether it is observable must not depend on that.
         observable = name != "clock_s" and float(np.sqrt(freed.variance)) < largest

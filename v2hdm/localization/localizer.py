@@ -531,6 +531,21 @@ class Localizer:
             if stamp_s - image_s > _NO_IMAGE_S
         }
 
+    def _pose_of_search(self, stamp_s: float, reasons: dict[str, str]) -> Pose:
+        """The pose while nothing is believed of the place."""
+        if (quest := self._search.prior) is not None and not len(self.paint.near(quest.pose[:2], 60.0)):
+            reasons["place"] = (
+                "no marking of the map lies within 60 m of where the vehicle should be: is it the map of "
+                "this site, in these coordinates?"
+            )
+            self._is_lost = True
+        status = Status.LOST if self._is_lost or self._pace_reason else Status.INITIALISING
+        nothing = np.full((3, 3), np.inf)
+        infinite = (np.inf, np.inf)
+        return Pose(
+            stamp_s, status, None, nothing, infinite, np.inf, (1.0, 0.0, 0.0), 0, tuple(reasons.values())
+        )
+
     def _pose(self) -> Pose:
         """The pose at the newest stamp."""
         stamps = [item for item in (self._log.newest_s, self._way.stamp_s) if item is not None]
@@ -539,18 +554,7 @@ class Localizer:
         if self._pace_reason is not None:
             reasons["odometry"] = f"the odometry does not fit the images: {self._pace_reason}"
         if self._belief is None:
-            if (quest := self._search.prior) is not None and not len(self.paint.near(quest.pose[:2], 60.0)):
-                reasons["place"] = (
-                    "no marking of the map lies within 60 m of where the vehicle should be: is it the map of "
-                    "this site, in these coordinates?"
-                )
-                self._is_lost = True
-            status = Status.LOST if self._is_lost or self._pace_reason else Status.INITIALISING
-            nothing = np.full((3, 3), np.inf)
-            infinite = (np.inf, np.inf)
-            return Pose(
-                stamp_s, status, None, nothing, infinite, np.inf, (1.0, 0.0, 0.0), 0, tuple(reasons.values())
-            )
+            return self._pose_of_search(stamp_s, reasons)
         belief = self._foreseen(self._belief, stamp_s)
         plane = self.paint.ground(belief.mean[:2])
         covariance = belief.covariance([0, 1, 2])

@@ -71,6 +71,7 @@ class Glances:
     whole_s: float = -np.inf
     told_s: float = -np.inf  # time of the last image that was to be searched as a whole, at once or later
     at_once_s: float = -np.inf  # the same of one that was to be at once
+    gave_way_s: float = -np.inf  # the same of one that was not to be, since another camera's was
     to_come_s: list[float] = field(default_factory=list)  # times of images that are to be searched so
     boxes: dict[float, int] = field(default_factory=dict)  # numbers of boxes of the images to come, by time
     was_as_expected: bool = False
@@ -160,6 +161,8 @@ class Looking:
                 whole_s = stamp_s
                 # What is told of later images is told again.
                 glances.told_s = glances.told_s if out else stamp_s
+            if not out and boxes is not None and self._gives_way(camera, stamp_s):
+                glances.gave_way_s = stamp_s
             if boxes is None:
                 at_once_s = stamp_s
                 glances.at_once_s = glances.at_once_s if out else stamp_s
@@ -173,15 +176,26 @@ class Looking:
         """Whether a whole search may come after a look at parts.
 
         It may not where none has come for too long, or the last look showed too little of what it was to, but
-        for the images that come before such a search, of one at ``at_once_s``, has had time to end.
+        for the images that come before such a search, of one at ``at_once_s``, has had time to end, and for
+        one image while another camera is searched so: two at a time would make both poses late.
         """
         glances = self.of(camera)
         interval_s = glances.interval_s or 0.0
         since_s = stamp_s - at_once_s
         if 0.5 * interval_s < since_s < (_AHEAD + 0.5) * interval_s and at_once_s > glances.whole_s:
             return True
+        if self._gives_way(camera, stamp_s):
+            return True
         most_s = _PATIENCE * self.every_full * interval_s
         return glances.was_partly_expected and stamp_s - glances.whole_s < most_s
+
+    def _gives_way(self, camera: str, stamp_s: float) -> bool:
+        """Whether another camera's image is searched at once at a time; not for two images in a row."""
+        glances = self.of(camera)
+        interval_s = glances.interval_s or 0.0
+        others_s = [other.at_once_s for name, other in self.glances.items() if name != camera]
+        gave_way_before = 0.5 * interval_s < stamp_s - glances.gave_way_s < 1.5 * interval_s
+        return not gave_way_before and any(abs(at_s - stamp_s) < 0.5 * interval_s for at_s in others_s)
 
     def _is_due(self, camera: str, stamp_s: float, whole_s: float, interval_s: float) -> bool:
         """Whether an image is to be searched as a whole: the last of N, or one before if others take turns.
