@@ -13,7 +13,8 @@ from v2hdm.adjust import ControlPoints, KnownLengths, Problem, SolveOptions, sol
 from v2hdm.adjust.sections import solve as rounds
 from v2hdm.adjust.sections.blocks import BlockMatrix, BlockPattern
 from v2hdm.adjust.sections.parts import Part, cut
-from v2hdm.adjust.sections.solve import Shape, finish_parts, fit_parts, join_parts, save_part
+from v2hdm.adjust.sections.rounds import Shape, save_part
+from v2hdm.adjust.sections.solve import finish_parts, fit_parts, join_parts
 from v2hdm.adjust.sections.way import parts_of_way
 from v2hdm.adjust.whitening import factorise
 from v2hdm.errors import AdjustError

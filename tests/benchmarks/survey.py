@@ -33,7 +33,8 @@ from scipy.spatial import cKDTree
 
 from v2hdm.adjust import Problem, SolveOptions, solve
 from v2hdm.adjust.sections.parts import cut
-from v2hdm.adjust.sections.solve import Shape, finish_parts, join_parts, save_part
+from v2hdm.adjust.sections.rounds import Shape, save_part
+from v2hdm.adjust.sections.solve import finish_parts, join_parts
 from v2hdm.adjust.sections.way import parts_of_way
 from v2hdm.cli.compose import conf_dir
 from v2hdm.detection.batch import detect_image

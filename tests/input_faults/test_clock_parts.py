@@ -6,7 +6,8 @@ import pytest
 from tests.input_faults.test_clock_errors import seen_later, street
 from v2hdm.adjust import SolveOptions, solve
 from v2hdm.adjust.sections.parts import chains_of, cut
-from v2hdm.adjust.sections.solve import Shape, finish_parts, join_parts, save_part
+from v2hdm.adjust.sections.rounds import Shape, save_part
+from v2hdm.adjust.sections.solve import finish_parts, join_parts
 from v2hdm.faults.clock_errors import ClockErrors, errors_of_clocks, moves_with_clocks
 from v2hdm.faults.clock_parts import Along, evidence_of, follow_of, segments_of, slopes_of
 from v2hdm.faults.score_tests import noise_multiples

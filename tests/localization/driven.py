@@ -7,8 +7,10 @@ import numpy as np
 from tests.cameras import mounted
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.rigid import exp, heading_rad, rotation_from_euler
+from v2hdm.localization.localizer import Localizer
 from v2hdm.localization.motion import Motion
 from v2hdm.localization.places import rough_position
+from v2hdm.localization.pose import Status
 from v2hdm.localization.seeing import Look
 from v2hdm.records import (
     Calibration,
@@ -198,3 +200,20 @@ def with_words(look, pose, words):
         if (cam[:, 2] > 2).all() and (cam[:, 2] < 20).all() and ((px > 0) & (px < [1280, 720])).all():
             found.append(outlined(px + 0.5))
     return replace(look, markings=(*look.markings, *found))
+
+
+def follow(driven, hd_map, seed=0, prior=True, calibrations=None):
+    """The poses after each moment."""
+    start = driven.rough(np.random.default_rng(seed)) if prior else None
+    localizer = Localizer(hd_map, calibrations or driven.calibrations, start)
+    return [
+        localizer.update(looks, motion) for looks, motion in zip(driven.looks, driven.motion, strict=True)
+    ]
+
+
+def tracked(driven, poses):
+    """The errors (K, 3) of the tracked poses, and their bounds."""
+    known = [(k, pose) for k, pose in enumerate(poses) if pose.status == Status.TRACKING]
+    errors = np.array([driven.errors(pose, k) for k, pose in known]).reshape(-1, 3)
+    bounds = np.array([(*pose.protection_m, pose.protection_rad) for _, pose in known]).reshape(-1, 3)
+    return errors, bounds

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.localization.driven import MOUNT, cameras, drive, lined, mapped, moved, yard
+from tests.localization.driven import MOUNT, cameras, drive, follow, lined, mapped, moved, tracked, yard
 from v2hdm.cli.main import run
 from v2hdm.detection.frames import Frame
 from v2hdm.detection.road import Road, RoadLane, RoadMarking, as_record
@@ -29,23 +29,6 @@ from v2hdm.localization.pose import Status
 from v2hdm.localization.seeing import Look, expect
 from v2hdm.localization.stream import MotionLines, look_of, pose_record
 from v2hdm.records import Calibration, GeodeticOrigin, HDMap, Marking, MarkingDetection
-
-
-def follow(driven, hd_map, seed=0, prior=True, calibrations=None):
-    """The poses after each moment."""
-    start = driven.rough(np.random.default_rng(seed)) if prior else None
-    localizer = Localizer(hd_map, calibrations or driven.calibrations, start)
-    return [
-        localizer.update(looks, motion) for looks, motion in zip(driven.looks, driven.motion, strict=True)
-    ]
-
-
-def tracked(driven, poses):
-    """The errors (K, 3) of the tracked poses, and their bounds."""
-    known = [(k, pose) for k, pose in enumerate(poses) if pose.status == Status.TRACKING]
-    errors = np.array([driven.errors(pose, k) for k, pose in known]).reshape(-1, 3)
-    bounds = np.array([(*pose.protection_m, pose.protection_rad) for _, pose in known]).reshape(-1, 3)
-    return errors, bounds
 
 
 def first_said(poses):
@@ -77,68 +60,6 @@ def test_the_stated_covariance_holds():
                 at = poses[frame].map_from_vehicle[:2, 3] - driven.poses[frame, :2, 3]
                 squared.append(at @ np.linalg.solve(poses[frame].covariance[:2, :2], at))
     assert 0.5 < np.mean(squared) < 3.5  # of two coordinates: honest is 2
-
-
-def late_by(driven, late_s):
-    """A drive whose odometry is stamped late."""
-    stamped = [sample._replace(stamp_s=sample.stamp_s + late_s) for part in driven.motion for sample in part]
-    begins_s = [-np.inf, *driven.stamp_s[:-1]]
-    motion = [
-        [sample for sample in stamped if begin_s < sample.stamp_s <= end_s]
-        for begin_s, end_s in zip(begins_s, driven.stamp_s, strict=True)
-    ]
-    return replace(driven, motion=motion)
-
-
-@pytest.mark.parametrize("late_s", [0.0, 0.05, 0.1])
-def test_an_odometry_that_comes_late_is_known_to_and_no_camera_is_blamed(late_s):
-    painted = yard(6)
-    driven = drive(painted, 6, seconds=16.0, swerve_rad=0.15)
-    poses = follow(late_by(driven, late_s), mapped(painted, 6))
-    errors, bounds = tracked(driven, poses)
-    assert poses[-1].motion[2] == pytest.approx(late_s, abs=0.012)
-    assert (np.abs(errors) < bounds).all()
-    assert not poses[-1].turned
-
-
-@pytest.mark.parametrize("late_s", [0.1, 0.2])
-def test_a_sharp_bend_under_a_late_odometry_is_no_turned_mounting(late_s):
-    painted = yard(6)
-    driven = drive(painted, 6, seconds=10.0, swerve_rad=0.5)
-    poses = follow(late_by(driven, late_s), mapped(painted, 6))
-    errors, bounds = tracked(driven, poses)
-    assert len(errors) > 80
-    assert (np.abs(errors) < bounds).all()
-    assert not any(pose.turned for pose in poses)
-    reasons = {reason for pose in poses for reason in pose.reasons}
-    assert all("not told apart" in reason for reason in reasons)
-
-
-def test_a_camera_that_is_pushed_is_named_under_a_late_odometry_too():
-    painted = yard(8)
-    turned = ("front", 8.0, np.deg2rad([0.0, 0.8, 0.0]))
-    driven = drive(painted, 8, seconds=14.0, swerve_rad=0.15, turned=turned)
-    poses = follow(late_by(driven, 0.1), mapped(painted, 8))
-    assert [turned.camera for turned in poses[-1].turned] == ["front"]
-
-
-def test_what_a_late_odometry_has_not_told_yet_is_open():
-    noise = MotionNoise()
-    log = MotionLog()
-    for k in range(20):
-        log.add(Motion(0.05 * k, 4.0, 0.0))
-    state = belief.start(0.0, np.zeros(3), np.array([0.01, 0.01, 1e-4]), [MOUNT], noise)
-    for late_s in (0.0, 0.2):
-        mean = state.mean.copy()
-        mean[belief.LATE] = late_s
-        late = belief.replace(state, mean=mean)
-        told = belief.predict(late, log.pieces(0.0, 0.1), noise).covariance([0, 1, 2])
-        all_of_it = belief.predict(late, log.pieces(0.0, 0.1), noise, has_untold=True).covariance([0, 1, 2])
-        # Half the acceleration by the time squared: of the lateness, and of its own sigma of 50 ms. Within a
-        # tenth of a second an acceleration that lasts for one changes by 0.44 of its sigma.
-        squared_s2 = (late_s**2 + noise.late_s**2) * np.sqrt(2 * (1 - np.exp(-0.1)))
-        sigmas = np.array([0.5 * 1.5 * squared_s2, 0.0, 0.5 * 0.3 * squared_s2])
-        np.testing.assert_allclose(np.diag(all_of_it - told), sigmas**2, rtol=1e-3, atol=1e-9)
 
 
 def test_a_vehicle_that_knows_nothing_finds_itself_by_the_pattern_of_the_markings():

@@ -2,7 +2,8 @@
 
 Parts that fit in memory together are solved at once, in a third of the time; others, roughly, by themselves.
 Then rounds follow: every part summarises what it says of its border (:mod:`v2hdm.adjust.sections.summary`),
-the summaries are joined (:mod:`v2hdm.adjust.sections.join`), and each part follows the border. This is a
+the summaries are joined (:mod:`v2hdm.adjust.sections.join`), and each part follows the border
+(:mod:`v2hdm.adjust.sections.rounds`). This is a
 Gauss-Newton descent of the whole in which no process holds more than one part; parts are jobs of an executor,
 and their estimates lie in files between rounds. So do their whitenings, which cost ten rounds: they are made
 at the start, after long steps, and at the end, for the covariances. After a solve at once one round states
@@ -13,10 +14,9 @@ these.
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,79 +24,30 @@ import numpy as np
 import torch
 
 from v2hdm.adjust.covariance import Covariance
-from v2hdm.adjust.descent import Descent, descend
-from v2hdm.adjust.engine import TorchEngine
-from v2hdm.adjust.engines import make_engine
-from v2hdm.adjust.layout import nearby_origin
-from v2hdm.adjust.model import Estimate, Loss, rigid
-from v2hdm.adjust.problem import Problem, SolveOptions
+from v2hdm.adjust.model import Estimate, rigid
+from v2hdm.adjust.problem import Problem
 from v2hdm.adjust.sections.blocks import BlockCholesky
-from v2hdm.adjust.sections.join import Joined, Labels, Net, Shared, labels_of
+from v2hdm.adjust.sections.join import Joined, Labels, Net, Shared
 from v2hdm.adjust.sections.parts import Link, Part, whole_of
-from v2hdm.adjust.sections.summary import (
-    Border,
-    Footing,
-    JoinedCovariance,
-    Place,
-    Summary,
-    Values,
-    summarise,
-)
+from v2hdm.adjust.sections.rounds import GAP, Finish, Job, PartStates, Shape, Work, covariance_file, load_part
+from v2hdm.adjust.sections.summary import Summary, Values
 from v2hdm.adjust.solution import Solution
-from v2hdm.adjust.solve import Start, report_of, solve, start_of
-from v2hdm.adjust.threads import one_thread_in_torch
-from v2hdm.adjust.whitening import factorise
+from v2hdm.adjust.solve import solve
 from v2hdm.errors import AdjustError, WorkerError
 from v2hdm.executor import HERE, Executor
-from v2hdm.progress import Progress, silent
 from v2hdm.records import FloatArray
-
-GAP = 1e-8
-"""Twice the predicted decrease of the cost, as a fraction of it, at which the rounds end."""
 
 ROUGH_GAP = 1e-6  # as GAP, where only residuals are asked for: a thousandth of a sigma in most of them
 
 AT_ONCE = 400_000
 """Most observations that are solved at once: they take 2.8 kB each, factors included, of 2 km of yards."""
 
-_ALONE_GAP = 1e-5  # gap, a fraction of the cost, of a part's own optimum: the rounds move it by more; chosen
 _FAR_GAP = 1e-3  # gap of a round, a fraction of the cost, above which the next whitens anew: chosen
 _SLOW = 0.6  # gap of a round, a fraction of that before, above which the next whitens anew: chosen
 _SETTLED_SHARE = 0.1  # gap of a part with its border held, as a fraction of that of all: chosen
-_PROTOCOL = 5  # of pickles: the first that keeps arrays as they are
 _MOST_ROUNDS = 15  # rounds of joining and following, after which the solve has not converged; chosen
-_HELD_SIGMA_M = 1.0  # standard deviation, m, of what holds border corners in a part: any ray tells more
 _CONTRADICTION = 9.0
 """Chi-square per shared coordinate from which parts contradict each other: 1 is usual, this is 3 sigmas."""
-
-
-class Shape(NamedTuple):
-    """The inputs that all parts share: cameras and priors of the whole, the arrays' origin (2,), options."""
-
-    problem: Problem  # without observations: the cameras and priors of the whole
-    origin_map: FloatArray
-    options: SolveOptions
-
-    @classmethod
-    def of(cls, problem: Problem, options: SolveOptions) -> Shape:
-        """The shape of a problem."""
-        empty = problem.observations.take(np.zeros(0, dtype=np.int64))
-        bare = replace(
-            problem, observations=empty, corner_count=0, corners_start=None, control=None, lengths=None
-        )
-        return cls(bare, nearby_origin(problem), options)
-
-
-class PartStates(NamedTuple):
-    """A part's border in a round: where it is, its value and what it tells."""
-
-    labels: Labels
-    values: Values
-    told: Summary
-
-
-Finish = Callable[[int, Part, Solution], Any]
-"""Makes the result of a part of its number, itself and its solution, in the process that solved it."""
 
 
 class Joint(NamedTuple):
@@ -121,224 +72,6 @@ class Fitted(NamedTuple):
     solution: Solution | None
 
 
-class _Open(NamedTuple):
-    """A part laid out: ``held`` (m,), 1 / m^2, holds corners of its border at ``held_map`` (m, 2)."""
-
-    plain: TorchEngine  # without what holds them
-    engine: TorchEngine
-    border: Border
-    held: torch.Tensor
-    held_map: torch.Tensor
-
-
-class _Stand(NamedTuple):
-    """A part laid out, and its last whitening."""
-
-    opened: _Open
-    footing: Footing
-
-    def bare(self) -> _Stand:
-        """The same without what a factor knows twice."""
-        whitening = self.footing.whitening
-        factor = replace(whitening.reduced_factor)
-        return self._replace(
-            footing=replace(self.footing, whitening=replace(whitening, reduced_factor=factor))
-        )
-
-
-@dataclass(frozen=True)
-class _Job:
-    """One round of one part; ``target`` is the value that its border moves to, None for the first round.
-
-    That begins at ``start``, if there is one; its corners are in the order of the part's problem. A round
-    that ``is_renewed`` whitens anew where it ends; another settles to a gap of ``settled``, its border held.
-    """
-
-    number: int
-    start: Estimate | None = None
-    target: Values | None = None
-    is_near: bool = False  # the part's problem starts near an optimum
-    is_renewed: bool = True
-    settled: float = 0.0
-    is_last: bool = False
-    is_finish: bool = False
-    gap: float = 0.0
-    rounds: int = 0
-
-
-@dataclass(frozen=True)
-class _Work:
-    """Rounds of parts whose files ``part_N``, ``stand_N`` and ``place_N`` are in ``folder``."""
-
-    folder: Path
-    shape: Shape
-    finish: Finish | None = None
-
-    def __call__(self, job: _Job, _: Progress = silent) -> Any:
-        """Do one round of one part, or finish it."""
-        part = load_part(self.folder, job.number)
-        options = self.shape.options
-        compiled = options.on_cpu and options.engine != "torch"
-        with one_thread_in_torch(len(part.problem.observations.corner), compiled):
-            if job.is_finish or job.is_last:
-                return self._finished(job, part)
-            return self._round(job, part)
-
-    def _open(self, part: Part) -> _Open:
-        """The part's engine, with the corners of its border held near their start.
-
-        Where a part saw a corner along one line alone, the part alone could not tell where it is; what holds
-        it is taken out of the summary again.
-        """
-        options = self.shape.options
-        arrays = part.arrays(options, self.shape.origin_map)
-        plain = make_engine(options.engine, arrays)
-        border = border_of(part, plain)
-        cameras = arrays.centre.new_tensor(part.problem.cam_from_vehicle)
-        start_map, _ = plain.back_project(cameras)
-        is_free = (arrays.control_root[border.corners] == 0).all(dim=1)
-        held = is_free.to(arrays.centre.dtype) / _HELD_SIGMA_M**2
-        control = arrays.control.clone()
-        root = arrays.control_root.clone()
-        control[border.corners[is_free]] = start_map[border.corners[is_free]]
-        root[border.corners[is_free]] = root.new_tensor([1.0, 0.0, 1.0]) / _HELD_SIGMA_M
-        engine = plain.over(replace(arrays, control=control, control_root=root))
-        engine = engine.keeping(border.frames, border.corners)
-        return _Open(plain, engine, border, held, control[border.corners])
-
-    def _round(self, job: _Job, part: Part) -> PartStates:
-        """The part's own optimum, or what follows the target, and what the part tells there."""
-        if job.target is None:
-            opened = self._open(part)
-            stand = self._new_stand(job.number, opened, self._first(job, part, opened))
-            place = Place.base(stand.footing.whitening)
-        else:
-            stand = self._stand(job.number)
-            place = stand.footing.follow(self._place(job.number), job.target)
-            if job.is_renewed:
-                stand = self._new_stand(job.number, stand.opened, place.estimate)
-                place = Place.base(stand.footing.whitening)
-            else:
-                place = stand.footing.settle(place, job.settled)
-        self._keep("place", job.number, place)
-        opened = stand.opened
-        border = opened.border
-        told = summarise(stand.footing, place, opened.held, opened.held_map)
-        order = opened.engine.arrays.corner_order.cpu().numpy()
-        labels = labels_of(part, order, border.corners.cpu().numpy())
-        return PartStates(labels, Values.of(place.estimate, border), told)
-
-    def _first(self, job: _Job, part: Part, opened: _Open) -> Estimate:
-        """Where a part's rounds begin."""
-        if job.start is not None:
-            return _in_order(job.start, opened)
-        if job.is_near:
-            return self._start(part, opened.engine).estimate
-        return self._own_optimum(job.number, part, opened.engine, self._robust)
-
-    def _new_stand(self, number: int, opened: _Open, estimate: Estimate) -> _Stand:
-        """Whiten a part at an estimate, and keep that for later rounds."""
-        whitening = factorise(opened.engine, opened.engine.plan(), estimate, self._robust)
-        stand = _Stand(opened, Footing.of(whitening, opened.border))
-        self._keep("stand", number, stand.bare())
-        return stand
-
-    @property
-    def _robust(self) -> Loss:
-        return Loss(self.shape.options.loss, self.shape.options.loss_scale)
-
-    def _start(self, part: Part, engine: TorchEngine) -> Start:
-        return start_of(part.problem, self.shape.origin_map, engine, self._robust, self.shape.options)
-
-    def _own_optimum(self, number: int, part: Part, engine: TorchEngine, robust: Loss) -> Estimate:
-        options = self.shape.options
-        start = self._start(part, engine)
-        descent = descend(
-            engine, start.estimate, robust, _ALONE_GAP, options.max_refreshes,
-            options.max_evaluations, start.opening,
-        )  # fmt: skip
-        if descent.is_singular:
-            x, y = part.problem.map_from_vehicle[:, :2, 3].mean(axis=0)
-            raise AdjustError(
-                f"section {number + 1}, about x {x:.0f} m, y {y:.0f} m: its {part.problem.corner_count} "
-                "corners leave a direction of a camera free; make sections longer"
-            )
-        return descent.estimate
-
-    def _keep(self, name: str, number: int, content: _Stand | Place) -> None:
-        # A pickle would hold the memory of a factor once for each of its tiles.
-        torch.save(content, self.folder / f"{name}_{number}", pickle_protocol=_PROTOCOL)
-
-    def _stand(self, number: int) -> _Stand:
-        stand = torch.load(self.folder / f"stand_{number}", weights_only=False)
-        assert isinstance(stand, _Stand)
-        return stand
-
-    def _place(self, number: int) -> Place:
-        place = torch.load(self.folder / f"place_{number}", weights_only=False)
-        assert isinstance(place, Place)
-        return place
-
-    def _finished(self, job: _Job, part: Part) -> Any:
-        """The result of ``finish`` for the solution where the part is."""
-        assert self.finish is not None
-        robust = self._robust
-        whitening = None
-        if job.is_finish:
-            stand = self._stand(job.number)
-            opened = stand.opened
-            whitening = stand.footing.whitening
-            estimate = whitening.estimate
-        else:
-            opened = self._open(part)
-            estimate = self._place(job.number).estimate if job.start is None else _in_order(job.start, opened)
-        descent = Descent(
-            engine=opened.plain,
-            plan=opened.engine.plan(),
-            estimate=estimate,
-            robust=robust,
-            terms=opened.plain.terms(estimate, robust),
-            gap=job.gap,
-            evaluations=job.rounds,
-            progressing=job.gap > GAP,
-            is_singular=False,
-            last_whitening=None,
-        )
-        options = replace(self.shape.options, gap_tolerance=GAP)
-        solution = report_of(part.problem, self.shape.origin_map, options, descent, 0)
-        if job.is_finish:
-            held = replace(descent, engine=opened.engine, last_whitening=whitening)
-            joint = np.load(_covariance_file(self.folder, job.number))
-            solution = replace(solution, covariance=JoinedCovariance(held, None, opened.border, joint))
-        return self.finish(job.number, part, solution)
-
-
-def _in_order(start: Estimate, opened: _Open) -> Estimate:
-    """An estimate whose corners are in the order of the part's problem, in that of its arrays."""
-    return replace(start, corners_map=start.corners_map[opened.engine.arrays.corner_order])
-
-
-def border_of(part: Part, engine: TorchEngine) -> Border:
-    """The border of a part in the order of its arrays."""
-    rank = torch.argsort(engine.arrays.corner_order)
-    corners = rank[torch.as_tensor(part.border_corners, device=rank.device)].sort().values
-    return Border(torch.as_tensor(part.border_frames, device=rank.device), corners)
-
-
-def save_part(folder: Path, number: int, part: Part) -> None:
-    """Write a part for :func:`solve_parts`."""
-    with (folder / f"part_{number}").open("wb") as stream:
-        pickle.dump(part, stream)
-
-
-def load_part(folder: Path, number: int) -> Part:
-    """Read a part that :func:`save_part` has written."""
-    with (folder / f"part_{number}").open("rb") as stream:
-        part = pickle.load(stream)
-    assert isinstance(part, Part)
-    return part
-
-
 def join_parts(
     folder: Path,
     count: int,
@@ -359,12 +92,12 @@ def join_parts(
     parts leave a direction free or contradict each other, WorkerError where a process died.
     """
     whole = _solved_at_once(folder, count, shape, at_once)
-    jobs = [_Job(number, is_near=are_near) for number in range(count)]
+    jobs = [Job(number, is_near=are_near) for number in range(count)]
     if whole is not None:
-        jobs = [_Job(number, start) for number, start in enumerate(whole.starts)]
+        jobs = [Job(number, start) for number, start in enumerate(whole.starts)]
     joint = _in_rounds(folder, jobs, links, shape, finish, executor, progress, GAP)
     for part, covariance in enumerate(joint.net.covariances(joint.factor)):
-        np.save(_covariance_file(folder, part), covariance)
+        np.save(covariance_file(folder, part), covariance)
     return joint
 
 
@@ -385,19 +118,19 @@ def fit_parts(
     """
     whole = _solved_at_once(folder, count, shape, at_once)
     if whole is None:
-        from_afar = [_Job(number, is_near=are_near) for number in range(count)]
+        from_afar = [Job(number, is_near=are_near) for number in range(count)]
         joint = _in_rounds(
             folder, from_afar, links, shape, finish, executor, progress, ROUGH_GAP, is_rough=True
         )
         return Fitted(joint.results, None, None)
-    jobs = [_Job(number, start, is_last=True) for number, start in enumerate(whole.starts)]
-    results = _side_by_side(executor, _Work(folder, shape, finish), jobs)
+    jobs = [Job(number, start, is_last=True) for number, start in enumerate(whole.starts)]
+    results = _side_by_side(executor, Work(folder, shape, finish), jobs)
     return Fitted(results, whole.problem, whole.solution)
 
 
 def _in_rounds(
     folder: Path,
-    jobs: Sequence[_Job],
+    jobs: Sequence[Job],
     links: Sequence[Link],
     shape: Shape,
     finish: Finish,
@@ -411,7 +144,7 @@ def _in_rounds(
     They end where all are whitened, unless the solve ``is_rough``.
     """
     report = progress or (lambda done, total: None)
-    work = _Work(folder, shape)
+    work = Work(folder, shape)
     are_joined = jobs[0].start is not None
     is_from_afar = not are_joined and not jobs[0].is_near
     before = np.inf
@@ -434,7 +167,7 @@ def _in_rounds(
             break
         moved = _moved(net, shared, joined)
         jobs = [
-            _Job(
+            Job(
                 part,
                 target=_values(net, moved, state.labels, state.values),
                 is_renewed=is_small or is_slow or gap > _FAR_GAP or number == _MOST_ROUNDS - 2,
@@ -442,7 +175,7 @@ def _in_rounds(
             )
             for part, state in enumerate(states)
         ]
-    last = [_Job(part, is_last=True, gap=gap, rounds=number + 1) for part in range(len(states))]
+    last = [Job(part, is_last=True, gap=gap, rounds=number + 1) for part in range(len(states))]
     results = _side_by_side(executor, replace(work, finish=finish), last)
     return Joint(results, net, joined.factor, gap, number + 1)
 
@@ -484,10 +217,6 @@ def _solved_at_once(folder: Path, count: int, shape: Shape, most: int) -> _AtOnc
     return _AtOnce(problem, solution, starts)
 
 
-def _covariance_file(folder: Path, number: int) -> Path:
-    return folder / f"covariance_{number}.npy"
-
-
 def finish_parts(
     folder: Path, joint: Joint, shape: Shape, finish: Finish, executor: Executor = HERE
 ) -> list[Any]:
@@ -496,13 +225,12 @@ def finish_parts(
     Raises WorkerError where a process died.
     """
     jobs = [
-        _Job(part, is_finish=True, gap=joint.gap, rounds=joint.rounds)
-        for part in range(len(joint.net.labels))
+        Job(part, is_finish=True, gap=joint.gap, rounds=joint.rounds) for part in range(len(joint.net.labels))
     ]
-    return _side_by_side(executor, _Work(folder, shape, finish), jobs)
+    return _side_by_side(executor, Work(folder, shape, finish), jobs)
 
 
-def _side_by_side(executor: Executor, work: _Work, jobs: Sequence[_Job]) -> list[Any]:
+def _side_by_side(executor: Executor, work: Work, jobs: Sequence[Job]) -> list[Any]:
     results: dict[int, Any] = {}
     with closing(executor.side_by_side(work, jobs)) as outcomes:
         for number, outcome in outcomes:

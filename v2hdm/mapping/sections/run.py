@@ -26,7 +26,8 @@ import numpy as np
 
 from v2hdm.adjust import PoseSigma, Problem, estimate_noise
 from v2hdm.adjust.sections.parts import Link, chains_of
-from v2hdm.adjust.sections.solve import Fitted, Joint, Shape, finish_parts, fit_parts, join_parts
+from v2hdm.adjust.sections.rounds import Shape
+from v2hdm.adjust.sections.solve import Fitted, Joint, finish_parts, fit_parts, join_parts
 from v2hdm.association.sightings import Sightings, frames_of
 from v2hdm.errors import WorkerError
 from v2hdm.executor import Executor

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from v2hdm.adjust import Problem, Solution
 from v2hdm.adjust.sections.parts import Part
-from v2hdm.adjust.sections.solve import save_part
+from v2hdm.adjust.sections.rounds import save_part
 from v2hdm.adjust.selection import busiest
 from v2hdm.association.groups import known_elsewhere
 from v2hdm.errors import AdjustError, MappingError
