@@ -10,7 +10,7 @@ from tests.adjust.scene import make_scene, with_ground, with_late_clocks
 from tests.adjust.site import DRIFTING
 from tests.adjust.test_sessions import joined, visited_again
 from v2hdm.adjust import ControlPoints, KnownLengths, Problem, SolveOptions, solve
-from v2hdm.adjust.sections import solve as rounds
+from v2hdm.adjust.sections import rounds
 from v2hdm.adjust.sections.blocks import BlockMatrix, BlockPattern
 from v2hdm.adjust.sections.parts import Part, cut
 from v2hdm.adjust.sections.rounds import Shape, save_part
