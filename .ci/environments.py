@@ -62,9 +62,10 @@ def requirements(of: Distribution, extras: Iterable[str]) -> list[Requirement]:
     """A distribution's requirements on this machine, with extras; the extra "" is the distribution alone."""
     listed = [Requirement(text) for text in of.requires or ()]
     return [
-        one
-        for one in listed
-        if one.marker is None or any(one.marker.evaluate({"extra": extra}) for extra in extras)
+        requirement
+        for requirement in listed
+        if requirement.marker is None
+        or any(requirement.marker.evaluate({"extra": extra}) for extra in extras)
     ]
 
 
@@ -78,20 +79,21 @@ def closure(asked: Iterable[Requirement]) -> dict[str, Distribution]:
         if str(requirement) in looked_at:
             continue
         looked_at.add(str(requirement))
-        has = distribution(requirement.name)
-        assert requirement.specifier.contains(has.version, prereleases=True), f"{requirement}: {has.version}"
-        needed[has.metadata["Name"]] = has
-        waiting += requirements(has, ("", *requirement.extras))
+        installed = distribution(requirement.name)
+        version = installed.version
+        assert requirement.specifier.contains(version, prereleases=True), f"{requirement}: {version}"
+        needed[installed.metadata["Name"]] = installed
+        waiting += requirements(installed, ("", *requirement.extras))
     return needed
 
 
 def link(linked: Iterable[Distribution], folder: Path) -> None:
     """Link what distributions have installed, but for their programs, into a folder."""
-    for each in linked:
-        assert each.files, f"{each.metadata['Name']}: pip has kept no list of its files"
-        for file in each.files:
+    for package in linked:
+        assert package.files, f"{package.metadata['Name']}: pip has kept no list of its files"
+        for file in package.files:
             if ".." not in file.parts:
-                source = Path(str(each.locate_file(file)))
+                source = Path(str(package.locate_file(file)))
                 _link(source, folder / file)
                 # What this Python has compiled of the file holds for the link, which has the same time.
                 if source.suffix == ".py" and ".dist-info" not in file.parts[0]:

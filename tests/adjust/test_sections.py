@@ -206,13 +206,17 @@ def test_a_section_of_two_observations_leaves_the_others_as_they_are(tmp_path):
     check(in_sections(tmp_path, problem, SolveOptions(), part), problem, SolveOptions())
 
 
-def test_drives_whose_poses_contradict_each_other_end_in_one_line(tmp_path):
-    """The second drive's poses are half a metre off, 25 sigmas."""
+def contradicting():
+    """Two drives of one street, of which the second's poses are half a metre off, 25 sigmas."""
     scene = make_scene(3, frames=80, start_error_deg=0.5)
     again = visited_again(scene, DRIFTING, 5)
     off = again.problem.map_from_vehicle.copy()
     off[:, :2, 3] += 0.5
-    problem = joined(scene.problem, replace(again.problem, map_from_vehicle=off))
+    return joined(scene.problem, replace(again.problem, map_from_vehicle=off))
+
+
+def test_drives_whose_poses_contradict_each_other_end_in_one_line(tmp_path):
+    problem = contradicting()
     with pytest.raises(
         AdjustError, match=r"the drives contradict each other, most about x .* chi-square 1\d for"
     ) as refused:
@@ -235,11 +239,7 @@ def from_their_optimum(part: Part, options: SolveOptions) -> Part:
 
 
 def test_drives_that_contradict_each_other_do_so_from_their_own_optima(tmp_path):
-    scene = make_scene(3, frames=80, start_error_deg=0.5)
-    again = visited_again(scene, DRIFTING, 5)
-    off = again.problem.map_from_vehicle.copy()
-    off[:, :2, 3] += 0.5
-    problem = joined(scene.problem, replace(again.problem, map_from_vehicle=off))
+    problem = contradicting()
     options = SolveOptions()
     parts, links = cut(problem, np.repeat([0, 1], 80), tuple(options.pose_states))
     for number, part in enumerate(parts):

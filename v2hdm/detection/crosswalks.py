@@ -28,12 +28,11 @@ FITTED = (1.87, 0.19, 3.04)
 LEAST_NAMED = 0.5  # least share of a bar's paint that the network names so, for a place in a row
 
 CONTINUING = ("named", "beyond", "aside")
-"""Of a piece of paint that the network names a bar: 1; how far it is beyond the row, in steps of the row's
-last bars; log of how far it reaches aside from the line through the bars, in half their lengths, 0 for a
-bar."""
+"""Features of a piece of paint that the network names a bar: 1; its distance beyond the row, in steps of the
+row's last bars; log of its reach aside from the line through the bars, in half their lengths, 0 for a bar."""
 
 CONTINUING_FITTED = (1.99, -0.56, -1.31)
-"""Weights of these, for its being of the row's crosswalk, fitted by ``python -m train.fit_crosswalks``."""
+"""Weights of the features :data:`CONTINUING`, fitted by ``python -m train.fit_crosswalks``."""
 
 MOST_BEYOND = 3.0  # steps beyond a row at most: two bars may be missing, as inside a row
 _NEXT_PLACE = 0.5  # steps beyond a row from which paint takes the place of its last bar

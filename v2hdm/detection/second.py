@@ -13,9 +13,12 @@ from v2hdm.detection.steps import Steps
 _STEP_S = 0.02  # time that a step takes, s, before any was timed: a whole image takes 70 ms in seven
 _SLOWER = 0.3  # share of a step's time by which the next of its kind may take longer
 _FORGETS = 0.9  # of the longest time of a step that is kept from one to the next
-# The same from one image to the next while there is no time for the step: one slow step would else stop a
-# search for ever. To begin the next image a little late is better than to search all of it at once.
 _IMPATIENT = 0.8
+"""Share of a step's longest time that is kept from one image to the next while there is no time for the step.
+
+Otherwise one slow step would stop the search for ever. To begin the next image a little late is better than
+to search all of it at once.
+"""
 
 
 class Second(NamedTuple):
@@ -37,8 +40,8 @@ class _Search(NamedTuple):
 class SecondLooks:
     """Searches the last image that was added, step by step, in the time that newer frames leave.
 
-    An image that comes while a step is taken waits for its end; none is begun shortly before one is expected,
-    if not for several images there was no time for it.
+    An image that comes while a step is taken waits for its end. No step is begun shortly before an image is
+    expected, unless several images in a row have left no time for it.
     """
 
     def __init__(self, frames: NewestFrames) -> None:

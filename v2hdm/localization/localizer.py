@@ -137,9 +137,8 @@ class Localizer:
         self._rig = Rig(dict(zip(self.calibrations, self._mountings, strict=True)))
         self._turned_s: float | None = None
         self._rig_since_s: float | None = None
-        self._undecided_s = (
-            -np.inf
-        )  # time of the last image that a turned mounting and a late odometry explain
+        # The time of the last image that a turned mounting and a late odometry both explain.
+        self._undecided_s = -np.inf
         self._way = Way(self._log)
         self._pace_reason: str | None = None
         self._reasons: dict[str, str] = {}
