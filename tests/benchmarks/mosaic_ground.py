@@ -92,7 +92,7 @@ def _blended(ground: Ground, shots: Sequence[Shot], consensus: Consensus | None)
     """The mosaic (rows, columns, 4) of some images by a consensus of them all."""
     canvas = ground.canvas
     rgba = np.zeros((canvas.rows, canvas.columns, 4), dtype=np.uint8)
-    for sheet in blend(canvas, shots, ground.lenses, "cpu", None, consensus, ground.area):
+    for sheet in blend(canvas, shots, ground.lenses, None, consensus, ground.area):
         rows, columns = sheet.rgba.shape[:2]
         rgba[sheet.row : sheet.row + rows, sheet.column : sheet.column + columns] = sheet.rgba
     return rgba

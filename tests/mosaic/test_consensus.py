@@ -81,10 +81,10 @@ def shown_in(rgba, canvas, x, y):
 
 def test_a_wall_is_cut_out_and_the_ground_before_and_beside_it_is_shown(site):
     shots, lenses, canvas = site
-    consensus = find_consensus(shots, lenses, canvas, "cpu")
+    consensus = find_consensus(shots, lenses, canvas)
     assert consensus is not None
     without = whole(canvas, shots, lenses)
-    rgba = whole(canvas, shots, lenses, "cpu", consensus)
+    rgba = whole(canvas, shots, lenses, consensus)
     behind = ((FACE_X + 0.5, FACE_X + 4.0), (1.6, 2.8))
     assert shown_in(without, canvas, *behind) > 0.9
     assert shown_in(rgba, canvas, *behind) < 0.05
@@ -100,7 +100,7 @@ def test_a_wall_is_cut_out_and_the_ground_before_and_beside_it_is_shown(site):
 
 def test_images_from_one_place_tell_nothing_and_that_is_said(site, caplog):
     shots, lenses, canvas = site
-    assert find_consensus(shots[20:22], lenses, canvas, "cpu") is None
+    assert find_consensus(shots[20:22], lenses, canvas) is None
     assert "the mosaic may show what stands" in caplog.text
 
 

@@ -5,25 +5,30 @@ nearest and steepest decide: ``det(H) / w^3``, H the homography from canvas to i
 coordinate of the mapped point, which is proportional to its depth. What the image is trusted for is warped
 with its colours, in one pass, and counts as far as the image shows the ground by
 :mod:`v2hdm.mosaic.consensus`. The canvas is done in sheets, so that memory does not grow with the drive, and
-each in tiles of which an image touches only those that it shows.
+each in tiles of which an image touches only those for which :mod:`v2hdm.mosaic.choice` has chosen it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
+import cv2
 import numpy as np
-import torch
-from kornia.geometry.transform import remap
-from torch import Tensor
 
+from v2hdm.executor import HERE, Executor
 from v2hdm.geometry.ipm import apply_homography
+from v2hdm.mosaic.choice import Candidate, chosen
 from v2hdm.mosaic.consensus import Consensus
 from v2hdm.mosaic.views import Canvas, Lens, Shot
-from v2hdm.mosaic.warp import SHEET_PX, TILE_PX, Area, Source, Views, Warp, plan_sheets, sources
-from v2hdm.progress import Steps
-from v2hdm.records import FloatArray
+from v2hdm.mosaic.warp import TILE_PX, Area, SheetPlan, Sources, Views, Warp, over_sheets, plan_sheets, sample
+from v2hdm.progress import Progress, Steps
+
+SHEET_PX = 2048  # side of a sheet, px of the canvas: 84 MB of weighted sums where all of it is seen
+_NODE_PX = 4  # largest distance of the nodes of a tile, px of the canvas
+_NODE_M = 0.08  # largest distance of the nodes of a tile, m: a quarter of a block of the consensus
+_COARSER = 2  # distance of the nodes by which images are chosen, in distances of those of the warp
 
 
 @dataclass(frozen=True)
@@ -37,15 +42,11 @@ class Sheet:
 
 
 def whole(
-    canvas: Canvas,
-    shots: Sequence[Shot],
-    lenses: Mapping[str, Lens],
-    device: str = "cpu",
-    consensus: Consensus | None = None,
+    canvas: Canvas, shots: Sequence[Shot], lenses: Mapping[str, Lens], consensus: Consensus | None = None
 ) -> np.ndarray:
     """A canvas in one piece: (rows, columns, 4) uint8 RGBA."""
     out = np.zeros((canvas.rows, canvas.columns, 4), dtype=np.uint8)
-    for sheet in blend(canvas, shots, lenses, device, None, consensus):
+    for sheet in blend(canvas, shots, lenses, None, consensus):
         rows, columns = sheet.rgba.shape[:2]
         out[sheet.row : sheet.row + rows, sheet.column : sheet.column + columns] = sheet.rgba
     return out
@@ -55,35 +56,108 @@ def blend(
     canvas: Canvas,
     shots: Sequence[Shot],
     lenses: Mapping[str, Lens],
-    device: str = "cpu",
     progress: Steps | None = None,
     consensus: Consensus | None = None,
     area: Area | None = None,
+    executor: Executor = HERE,
 ) -> Iterator[Sheet]:
-    """The sheets of a canvas that any image shows, in driving order; DriveError where one cannot be read.
+    """The sheets of a canvas that any image shows, as they are done; DriveError where one cannot be read.
 
     Of each image counts what shows the ground by the ``consensus`` of all, everything without one.
+    ``progress`` and errors: see :func:`v2hdm.mosaic.warp.over_sheets`.
     """
-    plan = plan_sheets(canvas, shots, lenses, area)
-    full_weight = _full_weight(canvas, shots, lenses)
-    order = [index for _, views in plan for index, _ in views]
-    images = sources(shots, lenses, device, order)
-    done = 0
-    for (row, column), views in plan:
-        rows = min(SHEET_PX, canvas.rows - row)
-        columns = min(SHEET_PX, canvas.columns - column)
-        sums = _Sums((rows, columns), views, device, consensus, full_weight)
-        map_from_sheet = canvas.window(row, column, rows, columns).map_from_canvas
+    plan = plan_sheets(canvas, shots, lenses, area, SHEET_PX)
+    yield from over_sheets(_Blend(canvas, shots, lenses, consensus), plan, progress, executor)
+
+
+class _Blend:
+    """Blends the images of one sheet after the other."""
+
+    def __init__(
+        self,
+        canvas: Canvas,
+        shots: Sequence[Shot],
+        lenses: Mapping[str, Lens],
+        consensus: Consensus | None,
+    ) -> None:
+        self._canvas = canvas
+        self._shots = shots
+        self._lenses = lenses
+        self._consensus = consensus
+        self._full_density = _full_density(canvas, shots, lenses)
+        self._sources = Sources(shots, lenses)
+
+    def __call__(self, plan: SheetPlan, progress: Progress) -> Sheet:
+        rows = min(SHEET_PX, self._canvas.rows - plan.row)
+        columns = min(SHEET_PX, self._canvas.columns - plan.column)
+        map_from_sheet = self._canvas.window(plan.row, plan.column, rows, columns).map_from_canvas
+        step_px = _node_step_px(self._canvas.cell_m)
+        views = self._chosen(plan.views, Warp(map_from_sheet, _COARSER * step_px))
+        sums = _Sums(np.concatenate([tiles for _, tiles in plan.views]))
+        warp = Warp(map_from_sheet, step_px)
+        images = self._sources.in_order([index for index, _ in views])
+        for (index, tiles), pixels in zip(views, images, strict=True):
+            sums.add(tiles, self._contribution(index, tiles, pixels, warp))
+        return Sheet(plan.row, plan.column, sums.mean(rows, columns))
+
+    def _chosen(self, views: Views, warp: Warp) -> Views:
+        """The views that leave all pixels as all of them would."""
+        candidates = []
         for index, tiles in views:
-            sums.add(index, shots[index], next(images), map_from_sheet, tiles)
-            done += 1
-            if progress:
-                progress(done, len(order))
-        yield Sheet(row, column, sums.mean())
+            shot = self._shots[index]
+            lens = self._lenses[shot.camera]
+            nodes = warp.nodes(shot, lens, tiles)
+            places_px = (nodes.x_px.astype(np.float32), nodes.y_px.astype(np.float32))
+            trust = sample(lens.trust[lens.trusted_box], *places_px)
+            if self._consensus is not None:
+                trust *= self._consensus.share(index, warp.nodes_map(tiles))
+            counts = self._counts(trust, nodes.density)
+            flat = (len(tiles), -1)
+            candidates.append(
+                Candidate(index, tiles, counts.weight.reshape(flat), counts.opacity.reshape(flat))
+            )
+        return chosen(candidates)
+
+    def _contribution(self, index: int, tiles: np.ndarray, pixels: np.ndarray, warp: Warp) -> np.ndarray:
+        """What an image adds to the sums of tiles (T, 2): (5, T, pixels)."""
+        shot = self._shots[index]
+        lens = self._lenses[shot.camera]
+        where = warp.pixels(warp.nodes(shot, lens, tiles))
+        bgra = cv2.cvtColor(pixels, cv2.COLOR_BGR2BGRA)
+        bgra[..., 3] = np.rint(255 * lens.trust[lens.trusted_box])
+        *colours, alpha = cv2.split(sample(bgra, where.x_px, where.y_px).reshape(len(tiles), -1, 4))
+        trust = alpha * np.float32(1 / 255)
+        if self._consensus is not None:
+            share = self._consensus.share(index, warp.nodes_map(tiles))
+            trust *= warp.between(share).reshape(trust.shape)
+        counts = self._counts(trust, where.density.reshape(trust.shape))
+        weighted = [colour * counts.weight for colour in colours]
+        return np.stack([*weighted, counts.weight, counts.opacity])
+
+    def _counts(self, trust: np.ndarray, density: np.ndarray) -> _Counts:
+        """How much an image counts where it is trusted so far and shows the ground so finely."""
+        # As opaque as the ground is trusted, wherever it is shown finely enough.
+        opacity = trust * (density * (1 / self._full_density)).clip(max=1)
+        return _Counts((trust * density**2).astype(np.float32), opacity.astype(np.float32))
 
 
-def _full_weight(canvas: Canvas, shots: Sequence[Shot], lenses: Mapping[str, Lens]) -> float:
-    """The least weight of ground that an image is trusted for: in px of the image a px of the canvas."""
+class _Counts(NamedTuple):
+    """How much an image counts, place by place."""
+
+    weight: np.ndarray
+    opacity: np.ndarray
+
+
+def _node_step_px(cell_m: float) -> int:
+    """The distance of the nodes on a canvas."""
+    step_px = _NODE_PX
+    while step_px > 1 and step_px * cell_m > _NODE_M:
+        step_px //= 2
+    return step_px
+
+
+def _full_density(canvas: Canvas, shots: Sequence[Shot], lenses: Mapping[str, Lens]) -> float:
+    """The least density of ground that an image is trusted for: px of the image in a px of the canvas."""
     least = []
     for shot in {shot.camera: shot for shot in shots}.values():
         px_from_canvas = shot.pinhole_px_from_map @ canvas.map_from_canvas
@@ -94,61 +168,27 @@ def _full_weight(canvas: Canvas, shots: Sequence[Shot], lenses: Mapping[str, Len
 
 
 class _Sums:
-    """The sums (tiles, 5, side, side) of weighted colours, weights and opacities on one sheet."""
+    """The sums of weighted colours (B, G, R), weights and opacities of the pixels of some tiles."""
 
-    def __init__(
-        self,
-        shape: tuple[int, int],
-        views: Views,
-        device: str,
-        consensus: Consensus | None,
-        full_weight: float,
-    ):
-        self._shape = shape
-        self._device = device
-        self._tiles = np.unique(np.concatenate([tiles for _, tiles in views]), axis=0)
-        self._at = {(int(c), int(r)): k for k, (c, r) in enumerate(self._tiles)}
-        self._sums = torch.zeros((len(self._tiles), 5, TILE_PX, TILE_PX), device=device)
-        self._full_weight = full_weight
-        self._warp = Warp(device)
-        self._consensus = consensus
+    def __init__(self, tiles: np.ndarray) -> None:
+        self._tiles = np.unique(tiles, axis=0)
+        self._at = {(int(column), int(row)): k for k, (column, row) in enumerate(self._tiles)}
+        self._sums = np.zeros((5, len(self._tiles), TILE_PX**2), dtype=np.float32)
 
-    def add(
-        self, index: int, shot: Shot, source: Source, map_from_sheet: FloatArray, tiles: np.ndarray
-    ) -> None:
-        """Add the image ``index`` to the tiles (T, 2) of (column, row) that it shows."""
-        x, y, density = self._warp(source, shot, map_from_sheet, tiles)
-        image = source.values.expand(len(tiles), -1, -1, -1)
-        values: Tensor = remap(image, x, y, align_corners=True, normalized_coordinates=True)
-        trust = values[:, 3]
-        if self._consensus is not None:
-            share = self._consensus.share(index, _points_of(tiles, map_from_sheet))
-            trust = trust * share.to(trust)
-        weight = trust * density**2
-        # As opaque as the ground is trusted, wherever it is shown finely enough.
-        opacity = trust * (density / self._full_weight).clamp(max=1)
-        values = torch.cat([values[:, :3] * weight[:, None], weight[:, None], opacity[:, None]], dim=1)
-        at = torch.tensor([self._at[int(c), int(r)] for c, r in tiles], device=self._device)
-        self._sums.index_add_(0, at, values)
+    def add(self, tiles: np.ndarray, contribution: np.ndarray) -> None:
+        """Add what an image contributes (5, T, pixels) to tiles (T, 2) of (column, row)."""
+        at = [self._at[int(column), int(row)] for column, row in tiles]
+        self._sums[:, at] += contribution
 
-    def mean(self) -> np.ndarray:
+    def mean(self, rows: int, columns: int) -> np.ndarray:
         """The sheet as (rows, columns, 4) uint8 RGBA."""
-        weight = self._sums[:, 3:4]
-        colours = self._sums[:, [2, 1, 0]] / weight.where(weight > 0, torch.ones_like(weight))
-        alpha = (255 * self._sums[:, 4:]).clamp(max=255)
-        rgba = torch.cat([colours, alpha], dim=1).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().numpy()
-        (rows, columns) = self._shape
+        weight = self._sums[3]
+        colours = self._sums[2::-1] / np.where(weight > 0, weight, 1)
+        alpha = (255 * self._sums[4:]).clip(max=255)
+        rgba = np.rint(np.concatenate([colours, alpha])).astype(np.uint8)
         side = TILE_PX
         down = -(-rows // side)
         across = -(-columns // side)
         out = np.zeros((down, side, across, side, 4), dtype=np.uint8)
-        out[self._tiles[:, 1], :, self._tiles[:, 0]] = rgba
+        out[self._tiles[:, 1], :, self._tiles[:, 0]] = np.moveaxis(rgba, 0, -1).reshape(-1, side, side, 4)
         return out.reshape(down * side, -1, 4)[:rows, :columns]
-
-
-def _points_of(tiles: np.ndarray, map_from_sheet: FloatArray) -> FloatArray:
-    """The places (T, side, side, 2) of the pixels of tiles (T, 2) of (column, row)."""
-    at = np.arange(TILE_PX)
-    pixels = np.stack(np.meshgrid(at, at), axis=-1) + TILE_PX * tiles[:, None, None]
-    points = apply_homography(map_from_sheet, pixels.reshape(-1, 2).astype(np.float64))
-    return points.reshape(*pixels.shape)

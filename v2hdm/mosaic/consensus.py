@@ -10,19 +10,20 @@ pattern is what the nearest block with one is.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
+import cv2
 import numpy as np
-import torch
-from kornia.geometry.transform import remap
 from scipy import ndimage
-from torch import Tensor
 
+from v2hdm.executor import HERE, Executor
 from v2hdm.geometry.ipm import apply_homography
 from v2hdm.mosaic.views import Canvas, Lens, Shot
-from v2hdm.mosaic.warp import TILE_PX, Area, Source, Warp, plan_sheets, sources
-from v2hdm.progress import Steps
+from v2hdm.mosaic.warp import TILE_PX, Area, SheetPlan, Sources, Warp, over_sheets, plan_sheets, sample
+from v2hdm.progress import Progress, Steps
 from v2hdm.records import BoolArray, FloatArray
 
 _log = logging.getLogger(__name__)
@@ -31,6 +32,8 @@ CELL_M = 0.04  # side of a cell in which patterns are compared, m; chosen
 BLOCK_PX = 8  # side of a block, cells: 0.32 m; chosen
 BLOCK_M = BLOCK_PX * CELL_M  # side of a block, m
 _BLOCKS = TILE_PX // BLOCK_PX  # blocks along a side of a tile
+_NODE_PX = BLOCK_PX // 2  # distance of the nodes of a tile, cells: a block has one in its middle
+_SHEET_PX = 1024  # side of a sheet, cells: 41 m, whose patches take some 30 MB
 
 _TEXTURE = 2.5  # standard deviation of grey values in a block that is more than an image's noise; chosen
 _AGREES = 0.4  # least correlation of an image's pattern with that of the others; chosen
@@ -59,7 +62,7 @@ class Shown:
 
     row: int
     column: int
-    shows: Tensor  # (rows, columns) of 0 or 1
+    shows: np.ndarray  # (rows, columns) float32, 0 or 1
 
 
 @dataclass(frozen=True)
@@ -70,57 +73,45 @@ class Consensus:
     kinds: np.ndarray  # (rows, columns) of all blocks
     by_shot: Mapping[int, Shown]
 
-    def share(self, index: int, points_map: FloatArray) -> Tensor:
-        """How far the image ``index`` shows the ground at points (..., 2): 0 to 1, smooth between blocks."""
+    def share(self, index: int, points_map: FloatArray) -> np.ndarray:
+        """How far the image ``index`` shows the ground at points (T, side, side, 2), smooth between blocks.
+
+        From 0 to 1, (T, side, side) float32.
+        """
         shown = self.by_shot.get(index)
         if shown is None:
-            return torch.zeros(points_map.shape[:-1])
+            return np.zeros(points_map.shape[:-1], dtype=np.float32)
         offset_m = points_map - self.canvas.corner_map
-        x = offset_m[..., 0] / BLOCK_M - 0.5 - shown.column
-        y = -offset_m[..., 1] / BLOCK_M - 0.5 - shown.row
-        x_px, y_px = (
-            torch.from_numpy(np.ascontiguousarray(part)).float().reshape(1, 1, -1) for part in (x, y)
-        )
-        share: Tensor = remap(shown.shows[None, None], x_px, y_px, align_corners=True)
+        column = offset_m[..., 0] / BLOCK_M - 0.5 - shown.column
+        row = -offset_m[..., 1] / BLOCK_M - 0.5 - shown.row
+        share = sample(shown.shows, column.astype(np.float32), row.astype(np.float32))
         # Nothing beyond the border of a block that shows the ground.
-        return (2 * share.reshape(points_map.shape[:-1]) - 1).clamp(min=0)
+        return (2 * share - 1).clip(min=0)
 
 
 def find_consensus(
     shots: Sequence[Shot],
     lenses: Mapping[str, Lens],
     canvas: Canvas,
-    device: str,
     area: Area | None = None,
     progress: Steps | None = None,
+    executor: Executor = HERE,
 ) -> Consensus | None:
     """Compare all images with each other on a canvas of cells of :data:`CELL_M`.
 
-    None where images are too few, or too near together, to tell ground anywhere.
+    None where images are too few, or too near together, to tell ground anywhere. Raises DriveError where an
+    image cannot be read; ``progress`` and other errors: see :func:`v2hdm.mosaic.warp.over_sheets`.
     """
     rows = -(-canvas.rows // TILE_PX) * _BLOCKS
     columns = -(-canvas.columns // TILE_PX) * _BLOCKS
     kinds = np.full((rows, columns), UNSEEN, dtype=np.uint8)
-    agreed: dict[int, list[tuple[int, int, BoolArray]]] = {}
-    plan = plan_sheets(canvas, shots, lenses, area)
-    order = [index for _, views in plan for index, _ in views]
-    images = sources(shots, lenses, device, order)
-    done = 0
-    for (row, column), views in plan:
-        map_from_sheet = canvas.window(row, column, canvas.rows, canvas.columns).map_from_canvas
-        sheet = _Sheet(device)
-        for index, tiles in views:
-            sheet.add(index, shots[index], next(images), map_from_sheet, tiles)
-            done += 1
-            if progress:
-                progress(done, len(order))
-        for (tile_column, tile_row), patches in sheet.patches.items():
-            top = row // BLOCK_PX + tile_row * _BLOCKS
-            left = column // BLOCK_PX + tile_column * _BLOCKS
-            block_kinds, shows = _compare(patches)
-            kinds[top : top + _BLOCKS, left : left + _BLOCKS] = block_kinds
-            for patch, flags in zip(patches, shows, strict=True):
-                agreed.setdefault(patch.index, []).append((top, left, flags))
+    agreed: dict[int, list[tuple[int, int, BoolArray]]] = defaultdict(list)
+    plan = plan_sheets(canvas, shots, lenses, area, _SHEET_PX)
+    for compared in over_sheets(_Comparison(shots, lenses, canvas), plan, progress, executor):
+        for tile in compared:
+            kinds[tile.row : tile.row + _BLOCKS, tile.column : tile.column + _BLOCKS] = tile.kinds
+            for index, shows in zip(tile.indices, tile.shows, strict=True):
+                agreed[index].append((tile.row, tile.column, shows))
     is_ground = ground_of(kinds)
     if not is_ground.any():
         _log.warning("the mosaic may show what stands: no images look at the same ground from two sides")
@@ -146,7 +137,7 @@ def _joined(parts: Sequence[tuple[int, int, BoolArray]], is_ground: BoolArray) -
     for top, left, flags in parts:
         is_there = is_ground[top : top + _BLOCKS, left : left + _BLOCKS]
         shows[top - row : top - row + _BLOCKS, left - column : left - column + _BLOCKS] = flags & is_there
-    return Shown(row, column, torch.from_numpy(shows))
+    return Shown(row, column, shows)
 
 
 def ground_of(kinds: np.ndarray) -> BoolArray:
@@ -177,94 +168,143 @@ def _larger_than(size: int, flags: BoolArray) -> BoolArray:
     return np.asarray(sizes[labels] > size)
 
 
-@dataclass(frozen=True)
-class _Patch:
-    """One tile in one image: grey values, and by block how fine it is, and the camera's direction."""
+class _Patch(NamedTuple):
+    """One tile in one image."""
 
     index: int
-    grey: np.ndarray  # (TILE_PX, TILE_PX) float16
-    density: FloatArray  # (blocks, blocks) px of the image a cell; 0 where not all of it is trusted
-    direction: FloatArray  # (blocks, blocks, 2) from the camera, over its height
+    grey: np.ndarray  # (TILE_PX, TILE_PX) uint8
+    density: np.ndarray  # (blocks, blocks) px of the image a cell; 0 where not all of it is trusted
 
 
-class _Sheet:
-    """The patches of all images on one sheet, by tile."""
+class _Tile(NamedTuple):
+    """What is told of a tile, its first block at (``row``, ``column``)."""
 
-    def __init__(self, device: str) -> None:
-        self._warp = Warp(device)
-        self.patches: dict[tuple[int, int], list[_Patch]] = {}
+    row: int
+    column: int
+    kinds: np.ndarray  # (blocks, blocks)
+    indices: Sequence[int]  # of the images that show some of it
+    shows: BoolArray  # (images, blocks, blocks), which of the blocks each shows
 
-    def add(
-        self, index: int, shot: Shot, source: Source, map_from_sheet: FloatArray, tiles: np.ndarray
-    ) -> None:
-        """Add the image ``index`` to the tiles (T, 2) of (column, row) that it shows."""
-        centre_map = shot.centre_map
-        if centre_map is None:
+
+class _Comparison:
+    """Compares the images of one sheet after the other."""
+
+    def __init__(self, shots: Sequence[Shot], lenses: Mapping[str, Lens], canvas: Canvas) -> None:
+        if any(shot.centre_map is None for shot in shots):
             raise ValueError("an image of which no camera's place is known shows no parallax")
-        where = self._warp(source, shot, map_from_sheet, tiles)
-        image = source.values
-        grey = torch.stack([0.114 * image[0] + 0.587 * image[1] + 0.299 * image[2], image[3]])
-        values: Tensor = remap(
-            grey.expand(len(tiles), -1, -1, -1),
-            where.x,
-            where.y,
-            align_corners=True,
-            normalized_coordinates=True,
+        self._shots = shots
+        self._lenses = lenses
+        self._canvas = canvas
+        self._sources = Sources(shots, lenses)
+
+    def __call__(self, plan: SheetPlan, progress: Progress) -> list[_Tile]:
+        map_from_sheet = self._canvas.window(plan.row, plan.column, _SHEET_PX, _SHEET_PX).map_from_canvas
+        warp = Warp(map_from_sheet, _NODE_PX)
+        patches: dict[tuple[int, int], list[_Patch]] = defaultdict(list)
+        images = self._sources.in_order([index for index, _ in plan.views])
+        for (index, tiles), pixels in zip(plan.views, images, strict=True):
+            for (column, row), patch in self._patches(index, tiles, pixels, warp):
+                patches[column, row].append(patch)
+        first_row = plan.row // BLOCK_PX
+        first_column = plan.column // BLOCK_PX
+        compared = []
+        for (column, row), of_tile in patches.items():
+            kinds, shows = _compare(of_tile, self._directions(of_tile, map_from_sheet, column, row))
+            indices = [patch.index for patch in of_tile]
+            place = (first_row + row * _BLOCKS, first_column + column * _BLOCKS)
+            compared.append(_Tile(*place, kinds, indices, shows))
+        return compared
+
+    def _patches(
+        self, index: int, tiles: np.ndarray, pixels: np.ndarray, warp: Warp
+    ) -> Iterator[tuple[tuple[int, int], _Patch]]:
+        """By (column, row) the patches of those tiles (T, 2) of which an image shows something."""
+        shot = self._shots[index]
+        lens = self._lenses[shot.camera]
+        nodes = warp.nodes(shot, lens, tiles)
+        trust = sample(
+            lens.trust[lens.trusted_box], nodes.x_px.astype(np.float32), nodes.y_px.astype(np.float32)
         )
-        blocks = (len(tiles), _BLOCKS, BLOCK_PX, _BLOCKS, BLOCK_PX)
-        trust = values[:, 1].reshape(blocks).amin(dim=(2, 4))
-        mean_density = where.density.reshape(blocks).mean(dim=(2, 4)) * (trust > 0)
-        density = (mean_density * (mean_density >= _COARSEST)).cpu().numpy()
-        greys = values[:, 0].half().cpu().numpy()
+        density = _in_middle(nodes.density) * (_least_around(trust) > 0)
+        density[density < _COARSEST] = 0
+        is_shown = density.any(axis=(1, 2))
+        if not is_shown.any():
+            return
+        where = warp.pixels(nodes.of(is_shown))
+        greys = sample(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), where.x_px, where.y_px)
+        for tile, grey, fineness in zip(tiles[is_shown], greys, density[is_shown], strict=True):
+            yield (int(tile[0]), int(tile[1])), _Patch(index, grey, fineness.astype(np.float32))
+
+    def _directions(
+        self, patches: Sequence[_Patch], map_from_sheet: FloatArray, column: int, row: int
+    ) -> FloatArray:
+        """The directions (blocks, blocks, N, 2) of blocks of a tile from cameras, over their heights."""
         at = (np.arange(_BLOCKS) + 0.5) * BLOCK_PX - 0.5
-        for number, (column, row) in enumerate(tiles.tolist()):
-            if not density[number].any():
-                continue
-            centres = np.stack(np.meshgrid(at + column * TILE_PX, at + row * TILE_PX), axis=-1)
-            points_map = apply_homography(map_from_sheet, centres.reshape(-1, 2)).reshape(_BLOCKS, _BLOCKS, 2)
-            direction = (points_map - centre_map[:2]) / centre_map[2]
-            patch = _Patch(index, greys[number], density[number], direction)
-            self.patches.setdefault((column, row), []).append(patch)
+        centres_px = np.stack(np.meshgrid(at + column * TILE_PX, at + row * TILE_PX), axis=-1)
+        centres_map = apply_homography(map_from_sheet, centres_px)
+        cameras_map = np.array([self._shots[patch.index].centre_map for patch in patches], dtype=np.float64)
+        return (centres_map[:, :, None] - cameras_map[:, :2]) / cameras_map[:, 2:]
 
 
-def _compare(patches: Sequence[_Patch]) -> tuple[np.ndarray, np.ndarray]:
-    """The kinds of the blocks of a tile, and which of them each patch shows (N, blocks, blocks)."""
-    grey = np.stack([patch.grey for patch in patches]).astype(np.float32)
-    pattern = grey.reshape(-1, _BLOCKS, BLOCK_PX, _BLOCKS, BLOCK_PX).swapaxes(2, 3)
-    pattern = pattern.reshape(len(patches), _BLOCKS, _BLOCKS, -1)
-    pattern = pattern - pattern.mean(axis=-1, keepdims=True)
-    size = np.sqrt((pattern**2).sum(axis=-1))
-    weight = np.stack([patch.density for patch in patches])
+def _in_middle(values: np.ndarray) -> np.ndarray:
+    """The values (T, blocks, blocks) in the middle of blocks, of those (T, side, side) at nodes."""
+    return values[:, 1::2, 1::2].copy()
+
+
+def _least_around(values: np.ndarray) -> np.ndarray:
+    """The least values (T, blocks, blocks) at the nodes in and around blocks, of those (T, side, side)."""
+    by_row = np.minimum(np.minimum(values[:, :-1:2], values[:, 1::2]), values[:, 2::2])
+    return np.minimum(np.minimum(by_row[:, :, :-1:2], by_row[:, :, 1::2]), by_row[:, :, 2::2])
+
+
+def _compare(patches: Sequence[_Patch], directions: FloatArray) -> tuple[np.ndarray, BoolArray]:
+    """The kinds of the blocks of a tile, and which of them each patch shows (N, blocks, blocks).
+
+    ``directions`` (blocks, blocks, N, 2) are those from the cameras.
+    """
+    grey = np.stack([patch.grey for patch in patches])
+    by_block = grey.reshape(-1, _BLOCKS, BLOCK_PX, _BLOCKS, BLOCK_PX).transpose(1, 3, 0, 2, 4)
+    pattern = by_block.reshape(_BLOCKS, _BLOCKS, len(patches), -1).astype(np.float32)
+    pattern -= pattern.mean(axis=-1, keepdims=True)
+    power = np.einsum("...i,...i->...", pattern, pattern)
+    weight = np.stack([patch.density for patch in patches], axis=-1)
     is_valid = weight > 0
-    has_texture = is_valid & (size > _TEXTURE * BLOCK_PX)
+    has_texture = is_valid & (power > (_TEXTURE * BLOCK_PX) ** 2)
     trusted = weight * has_texture
     for _ in range(2):
-        correlation = _correlation(pattern, size, trusted)
+        correlation = _correlation(pattern, power, trusted)
         trusted = weight * has_texture * np.maximum(correlation, 0.05) ** 2
     agrees = has_texture & (correlation > _AGREES)
-    direction = np.stack([patch.direction for patch in patches])
-    spread = _spread(direction, agrees)
-    textured = (weight * has_texture).sum(axis=0)
-    share = (weight * agrees).sum(axis=0) / np.maximum(textured, 1e-9)
-    is_ground = (agrees.sum(axis=0) >= _FEWEST) & (spread >= _SPREAD) & (share >= _MAJORITY)
-    has_pattern = textured >= _PATTERNED * weight.sum(axis=0)
+    spread = _spread(directions, agrees)
+    textured = (weight * has_texture).sum(axis=-1)
+    share = (weight * agrees).sum(axis=-1) / np.maximum(textured, 1e-9)
+    is_ground = (agrees.sum(axis=-1) >= _FEWEST) & (spread >= _SPREAD) & (share >= _MAJORITY)
+    has_pattern = textured >= _PATTERNED * weight.sum(axis=-1)
     is_standing = has_pattern & (share < _CONTRADICTED)
     kinds = np.where(is_ground, GROUND, np.where(is_standing, STANDING, PLAIN))
-    kinds = np.where(is_valid.sum(axis=0) >= _SEEN_BY, kinds, UNSEEN)
+    kinds = np.where(is_valid.sum(axis=-1) >= _SEEN_BY, kinds, UNSEEN)
     shows = is_valid & (agrees | ~has_texture)
-    return kinds.astype(np.uint8), shows
+    return kinds.astype(np.uint8), np.moveaxis(shows, -1, 0)
 
 
-def _correlation(pattern: np.ndarray, size: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Correlation (N, ...) of each pattern with the weighted mean of the others."""
-    weighted = weight[..., None] * pattern
-    others = weighted.sum(axis=0) - weighted
-    norm = np.sqrt((others**2).sum(axis=-1)) * size
-    return np.asarray((others * pattern).sum(axis=-1) / np.maximum(norm, 1e-9))
+def _correlation(pattern: np.ndarray, power: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Correlation (..., N) of each pattern (..., N, cells) with the weighted mean of the others.
+
+    ``power`` (..., N) are sums of the squares of patterns. The others are all less the pattern itself.
+    """
+    total = weight[..., None, :] @ pattern
+    with_total = (pattern @ np.swapaxes(total, -1, -2))[..., 0].astype(np.float64)
+    with_itself = weight * power.astype(np.float64)
+    power_of_total = np.square(total, dtype=np.float64).sum(axis=-1)
+    with_others = with_total - with_itself
+    power_of_others = power_of_total - 2 * weight * with_total + weight * with_itself
+    # Nothing is left of float32 below a thousandth of all.
+    power_of_others = np.maximum(power_of_others, 1e-6 * power_of_total)
+    return np.asarray(with_others / np.maximum(np.sqrt(power_of_others * power), 1e-9))
 
 
-def _spread(direction: FloatArray, agrees: BoolArray) -> FloatArray:
-    """How far apart the directions (N, ..., 2) of those that agree are."""
-    high = np.where(agrees[..., None], direction, -np.inf).max(axis=0)
-    low = np.where(agrees[..., None], direction, np.inf).min(axis=0)
-    return np.asarray(np.where(agrees.any(axis=0), np.hypot(*np.moveaxis(high - low, -1, 0)), 0.0))
+def _spread(directions: FloatArray, agrees: BoolArray) -> FloatArray:
+    """How far apart the directions (..., N, 2) of those that agree (..., N) are."""
+    high = np.where(agrees[..., None], directions, -np.inf).max(axis=-2)
+    low = np.where(agrees[..., None], directions, np.inf).min(axis=-2)
+    return np.asarray(np.where(agrees.any(axis=-1), np.hypot(*np.moveaxis(high - low, -1, 0)), 0.0))

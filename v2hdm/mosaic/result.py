@@ -16,6 +16,7 @@ import numpy as np
 from v2hdm.detection.batch import with_own_vehicle
 from v2hdm.detection.detector import Detector
 from v2hdm.errors import ConfigError, MapFileError, need
+from v2hdm.executor import HERE, Executor
 from v2hdm.geometry.geodetic import crs_of
 from v2hdm.geometry.planar import densified
 from v2hdm.io.maps.reading import read_geojson
@@ -68,11 +69,10 @@ def save_comparison(
     map_from_vehicle: FloatArray,
     panels: Mapping[str, Sequence[Shot]],
     lenses: Mapping[str, Lens],
-    device: str,
 ) -> None:
     """Draw the ground about a pose (4, 4) as several sets of shots, by title, show it, side by side."""
     canvas = close_up_canvas(map_from_vehicle)
-    pictures = [whole(canvas, shots, lenses, device) for shots in panels.values()]
+    pictures = [whole(canvas, shots, lenses) for shots in panels.values()]
     last = pictures[-1]
     grey = cv2.cvtColor(np.ascontiguousarray(last[..., :3]), cv2.COLOR_RGB2GRAY)[last[..., 3] > 0]
     low, high = np.percentile(grey, (0.2, 99.8)) if grey.size else (0.0, 255.0)
@@ -187,19 +187,19 @@ class Ground:
     canvas: Canvas
     area: Area  # that is shown
 
-    def consensus(self, device: str = "cpu", progress: Steps | None = None) -> Consensus | None:
+    def consensus(self, progress: Steps | None = None, executor: Executor = HERE) -> Consensus | None:
         """Which images show the ground, place by place; None where that cannot be told."""
         west, south, east, north = self.canvas.bounds_m
         canvas = Canvas.around(np.array([[west, south], [east, north]]), CELL_M)
-        return find_consensus(self.after, self.lenses, canvas, device, self.area, progress)
+        return find_consensus(self.after, self.lenses, canvas, self.area, progress, executor)
 
 
 def write_mosaic(
     folder: Path,
     drive: Drive,
     resolution_m: float = RESOLUTION_M,
-    device: str = "cpu",
     progress: Steps | None = None,
+    executor: Executor = HERE,
 ) -> dict[str, Any]:
     """Write the mosaic of a run's ground into its folder; returns what stands in ``mosaic.json``.
 
@@ -221,9 +221,9 @@ def write_mosaic(
         except ConfigError as missing:
             _log.warning("no GeoTIFF was written: %s", missing)
             put = None
-        consensus = ground.consensus(device, progress)
+        consensus = ground.consensus(progress, executor)
         for sheet in blend(
-            ground.canvas, ground.after, ground.lenses, device, progress, consensus, ground.area
+            ground.canvas, ground.after, ground.lenses, progress, consensus, ground.area, executor
         ):
             if put is not None:
                 put(sheet)
@@ -241,7 +241,7 @@ def write_mosaic(
         "before: initial calibration, recorded poses": ground.before,
         "after: optimised calibration, adjusted poses": ground.after,
     }
-    save_comparison(folder / names.COMPARISON, richest_place(drive, hd_map), panels, ground.lenses, device)
+    save_comparison(folder / names.COMPARISON, richest_place(drive, hd_map), panels, ground.lenses)
     write_json(folder / names.MOSAIC_EXTENT, content)
     return content
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -94,6 +94,13 @@ class Lens:
     info: CameraInfo
     trust: np.ndarray  # (height, width) float32, 1 within, 0 outside of the ROI and on its own vehicle
     outline_pinhole_px: FloatArray  # (N, 2) convex hull of what is trusted
+
+    @cached_property
+    def trusted_box(self) -> tuple[slice, slice]:
+        """The rows and columns that are trusted at all, and one around them."""
+        trusted = (np.flatnonzero(self.trust.any(axis=axis)) for axis in (1, 0))
+        rows, columns = (slice(max(int(index[0]) - 1, 0), int(index[-1]) + 2) for index in trusted)
+        return rows, columns
 
 
 @dataclass(frozen=True)

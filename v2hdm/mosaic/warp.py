@@ -2,49 +2,58 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
+import cv2
 import numpy as np
-import torch
-from kornia.geometry.linalg import transform_points
 from scipy.spatial import cKDTree
-from torch import Tensor
 
 from v2hdm.detection.frames import read_bgr
-from v2hdm.errors import DriveError
-from v2hdm.geometry import tensors
+from v2hdm.errors import DriveError, WorkerError
+from v2hdm.executor import HERE, Executor
 from v2hdm.geometry.ipm import apply_homography
+from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.planar import turned_left
 from v2hdm.mosaic.views import Canvas, Lens, Shot
+from v2hdm.progress import Progress, Steps
 from v2hdm.records import BoolArray, FloatArray
 
 TILE_PX = 64  # side of a tile, px of the canvas
-_NODE_PX = 4  # distance of the points of a tile at which the lens is evaluated, px of the canvas
-_FAR_OUT = 99.0  # a place outside of any image, in halves of its size from its middle
-SHEET_PX = 2048  # side of a sheet, px of the canvas: 70 MB of weighted sums where all of it is seen
+_FAR_OUT_PX = 1e5  # a place outside of any image, px from its corner
 _ROW_M = 6.0  # markings of a row are no farther apart than twice this, m; chosen
 _FARTHEST_M = 14.0  # distance of paint from the way up to which the mosaic reaches, m; chosen
-_KEPT_IMAGES = 96  # decoded images that neighbouring sheets share, 1.5 MB each
+_FEW_SHEETS = 3  # most sheets that are done faster here than other processes start; chosen
+_KEPT_IMAGES = 96  # decoded images that neighbouring sheets share, 2 MB each
 
+_Result = TypeVar("_Result")
 
 Views = list[tuple[int, FloatArray]]
 """Images that show a sheet: the index of each and the (column, row) of the tiles (T, 2) that it shows."""
 
 
+class SheetPlan(NamedTuple):
+    """A sheet by its first pixel, and what shows it."""
+
+    row: int
+    column: int
+    views: Views
+
+
 def plan_sheets(
-    canvas: Canvas, shots: Sequence[Shot], lenses: Mapping[str, Lens], area: Area | None
-) -> list[tuple[tuple[int, int], Views]]:
-    """By the first pixel (row, column) of each sheet, in the order of the first image: its views.
+    canvas: Canvas, shots: Sequence[Shot], lenses: Mapping[str, Lens], area: Area | None, side_px: int
+) -> list[SheetPlan]:
+    """The sheets of ``side_px`` that any image shows, in the order of the first image.
 
     Tiles outside of the ``area`` are left out.
     """
     canvas_from_map = canvas.canvas_from_map
-    in_sheet = SHEET_PX // TILE_PX
+    in_sheet = side_px // TILE_PX
     limit = np.ceil([canvas.columns / TILE_PX, canvas.rows / TILE_PX]).astype(int)
     plan: dict[tuple[int, int], Views] = {}
     for index, shot in enumerate(shots):
@@ -54,9 +63,32 @@ def plan_sheets(
             tiles = tiles[area.meets(canvas, tiles)]
         for sheet in np.unique(tiles // in_sheet, axis=0):
             mine = tiles[(tiles // in_sheet == sheet).all(axis=1)] - sheet * in_sheet
-            key = (int(sheet[1]) * SHEET_PX, int(sheet[0]) * SHEET_PX)
+            key = (int(sheet[1]) * side_px, int(sheet[0]) * side_px)
             plan.setdefault(key, []).append((index, mine))
-    return list(plan.items())
+    return [SheetPlan(row, column, views) for (row, column), views in plan.items()]
+
+
+def over_sheets(
+    work: Callable[[SheetPlan, Progress], _Result],
+    plan: Sequence[SheetPlan],
+    progress: Steps | None,
+    executor: Executor,
+) -> Iterator[_Result]:
+    """The results of work on sheets as they are done, few of them in this process.
+
+    ``progress`` counts images put onto sheets. Raises errors of the work, or WorkerError if a process died.
+    """
+    total = sum(len(sheet.views) for sheet in plan)
+    done = 0
+    executor = executor if len(plan) > _FEW_SHEETS else HERE
+    with closing(executor.side_by_side(work, plan)) as outcomes:
+        for number, outcome in outcomes:
+            if isinstance(outcome, WorkerError):
+                raise outcome
+            done += len(plan[number].views)
+            if progress:
+                progress(done, total)
+            yield outcome
 
 
 def tiles_under(polygon: FloatArray, limit: np.ndarray) -> np.ndarray:
@@ -109,102 +141,131 @@ class Area:
         return self.holds(centres, canvas.cell_m * TILE_PX / np.sqrt(2))
 
 
-@dataclass(frozen=True)
-class Source:
-    """An image cut to the rows and columns that are trusted: (4, height, width), B, G, R and trust."""
+class Sources:
+    """The images of shots, each cut to the rows and columns that are trusted."""
 
-    values: Tensor
-    corner_px: tuple[int, int]
-    lens: Lens
+    def __init__(self, shots: Sequence[Shot], lenses: Mapping[str, Lens]) -> None:
+        self._shots = shots
+        self._lenses = lenses
+        self._decoded = lru_cache(maxsize=_KEPT_IMAGES)(self._decode)
 
-
-def sources(
-    shots: Sequence[Shot], lenses: Mapping[str, Lens], device: str, order: Sequence[int]
-) -> Iterator[Source]:
-    """The images of shots in some order; the next is decoded meanwhile, the last used stay decoded."""
-    boxes = {name: _box(lens.trust) for name, lens in lenses.items()}
-    trusts = {key: torch.from_numpy(lenses[key].trust[box].copy()).to(device) for key, box in boxes.items()}
-
-    @lru_cache(maxsize=_KEPT_IMAGES)
-    def decoded(path: Path, camera: str) -> np.ndarray:
+    def _decode(self, path: Path, camera: str) -> np.ndarray:
         pixels = read_bgr(path)
-        lens = lenses[camera]
+        lens = self._lenses[camera]
         if pixels.shape[:2] != lens.trust.shape:
             raise DriveError(
                 f"{path}: the image is {pixels.shape[1]}x{pixels.shape[0]} but camera {camera!r} has "
                 f"{lens.info.width}x{lens.info.height}; fix its camera_info or images"
             )
-        return pixels[boxes[camera]].copy()
+        return pixels[lens.trusted_box].copy()
 
-    ordered = [shots[index] for index in order]
-    with ThreadPoolExecutor(1) as decoder:
-        ahead = [decoder.submit(decoded, shot.path, shot.camera) for shot in ordered[:1]]
-        for shot, following in zip(ordered, [*ordered[1:], None], strict=True):
-            pixels = ahead.pop().result()
-            if following is not None:
-                ahead.append(decoder.submit(decoded, following.path, following.camera))
-            box = boxes[shot.camera]
-            trust = trusts[shot.camera]
-            values = torch.empty((4, *trust.shape), dtype=torch.float32, device=device)
-            values[:3] = torch.from_numpy(pixels).to(device).permute(2, 0, 1)
-            values[3] = trust
-            yield Source(values, (box[1].start, box[0].start), lenses[shot.camera])
+    def in_order(self, order: Sequence[int]) -> Iterator[np.ndarray]:
+        """Images (height, width, 3) uint8 BGR; the next is decoded meanwhile, the last used stay decoded."""
+        ordered = [self._shots[index] for index in order]
+        with ThreadPoolExecutor(1) as decoder:
+            ahead = [decoder.submit(self._decoded, shot.path, shot.camera) for shot in ordered[:1]]
+            for following in [*ordered[1:], None]:
+                pixels = ahead.pop().result()
+                if following is not None:
+                    ahead.append(decoder.submit(self._decoded, following.path, following.camera))
+                yield pixels
 
 
-def _box(trust: np.ndarray) -> tuple[slice, slice]:
-    """The rows and columns that are trusted at all, and one around them."""
-    trusted = (np.flatnonzero(trust.any(axis=axis)) for axis in (1, 0))
-    rows, columns = (slice(max(int(index[0]) - 1, 0), int(index[-1]) + 2) for index in trusted)
-    return rows, columns
+def sample(image: np.ndarray, x_px: np.ndarray, y_px: np.ndarray) -> np.ndarray:
+    """The values (T, side, side, ...) of an image at places (T, side, side), bilinear, and 0 outside."""
+    # Flat, as OpenCV takes two dimensions.
+    count = len(x_px)
+    values = cv2.remap(image, x_px.reshape(count, -1), y_px.reshape(count, -1), cv2.INTER_LINEAR)
+    return values.reshape(*x_px.shape, *image.shape[2:])
 
 
-class Warped(NamedTuple):
-    """Where pixels (T, side, side) lie in an image, as ``grid_sample`` has it, and their density."""
+class Nodes(NamedTuple):
+    """Where nodes of tiles, each (T, side, side), lie in an image that is cut to what is trusted."""
 
-    x: Tensor
-    y: Tensor
-    density: Tensor  # px of the image that a px of the canvas covers; 0 behind the camera
+    x_px: FloatArray
+    y_px: FloatArray
+    third: FloatArray  # coordinate of the mapped point, proportional to its depth
+    volume: float  # of the density, times the third power of that
+
+    def of(self, chosen: BoolArray) -> Nodes:
+        """The nodes of chosen (T,) tiles."""
+        return Nodes(self.x_px[chosen], self.y_px[chosen], self.third[chosen], self.volume)
+
+    @property
+    def density(self) -> FloatArray:
+        """Px of the image that a px of the canvas covers at each node; 0 behind the camera."""
+        return self.volume / np.where(self.third > 0, self.third, np.inf) ** 3
+
+
+class Pixels(NamedTuple):
+    """Where pixels of tiles (T, side, side), float32, lie in such an image, and their density."""
+
+    x_px: np.ndarray
+    y_px: np.ndarray
+    density: np.ndarray
 
 
 class Warp:
-    """The way from the tiles of a sheet into images."""
+    """The way from the tiles of a sheet into images: exact at nodes, interpolated between them."""
 
-    def __init__(self, device: str) -> None:
-        at = torch.arange(0, TILE_PX + 1, _NODE_PX, device=device).float()
-        self._nodes = torch.cartesian_prod(at, at).flip(1)
-        x, y = (self._nodes / TILE_PX).T
-        self._from_corners = torch.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], dim=1)
-        distance_px = (torch.arange(TILE_PX, device=device)[:, None] - at).abs()
-        self._from_nodes = (1 - distance_px / _NODE_PX).clamp(min=0)  # hat functions (TILE_PX, nodes)
+    def __init__(self, map_from_sheet: FloatArray, step_px: int) -> None:
+        """Nodes are ``step_px`` of the canvas apart, which divides :data:`TILE_PX`."""
+        self._map_from_sheet = map_from_sheet
+        at_px = np.arange(0, TILE_PX + 1, step_px)
+        self._nodes_px = np.stack(np.meshgrid(at_px, at_px), axis=-1)
+        x, y = np.moveaxis(self._nodes_px / TILE_PX, -1, 0)
+        self._from_corners = np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], axis=-1)
+        distance_px = np.abs(np.arange(TILE_PX)[:, None] - at_px)
+        # Hat functions (TILE_PX, nodes of a side).
+        self._from_nodes = (1 - distance_px / step_px).clip(min=0).astype(np.float32)
 
-    def __call__(self, source: Source, shot: Shot, map_from_sheet: FloatArray, tiles: np.ndarray) -> Warped:
-        """Where the pixels of tiles (T, 2) of (column, row) lie in an image.
+    def _nodes_of(self, tiles: np.ndarray) -> FloatArray:
+        """The nodes (T, side, side, 2) of tiles (T, 2) of (column, row), px of the sheet."""
+        return np.asarray(TILE_PX * tiles[:, None, None] + self._nodes_px, dtype=np.float64)
 
-        The lens is evaluated at nodes. Times the third coordinate, where a pixel lies is linear on the ground
-        but for the lens: interpolated so, a pixel is at most 0.01 px off, or 0.1 px a metre from a fisheye.
-        """
-        points = TILE_PX * torch.from_numpy(tiles).to(self._nodes)[:, None] + self._nodes
+    def nodes_map(self, tiles: np.ndarray) -> FloatArray:
+        """The nodes (T, side, side, 2) of tiles (T, 2) of (column, row), m in the map."""
+        return apply_homography(self._map_from_sheet, self._nodes_of(tiles))
+
+    def nodes(self, shot: Shot, lens: Lens, tiles: np.ndarray) -> Nodes:
+        """Where the nodes of tiles (T, 2) of (column, row) lie in an image."""
+        points = self._nodes_of(tiles)
         if shot.on_plane is not None:
             corners = TILE_PX * (tiles[:, None] + np.array([[0, 0], [1, 0], [0, 1], [1, 1]])).reshape(-1, 2)
-            sheet_from_map = np.asarray(np.linalg.inv(map_from_sheet), dtype=np.float64)
-            moved = shot.on_plane(apply_homography(map_from_sheet, corners.astype(np.float64)))
-            moved_px = torch.from_numpy(apply_homography(sheet_from_map, moved) - corners)
-            points = points + self._from_corners @ moved_px.reshape(-1, 4, 2).to(points)
-        pinhole_px_from_sheet = shot.pinhole_px_from_map @ map_from_sheet
-        homography = torch.from_numpy(pinhole_px_from_sheet).to(points)
-        third = points @ homography[2, :2] + homography[2, 2]
-        pinhole_px = transform_points(homography.expand(len(tiles), 3, 3), points)
-        px = tensors.distort_points(source.lens.info, pinhole_px.reshape(-1, 2)).reshape(points.shape)
-        height, width = source.values.shape[1:]
-        placed = 2 * (px - px.new_tensor(source.corner_px)) / px.new_tensor([width - 1, height - 1]) - 1
-        # In the camera's plane a lens has no end; what lies there must not spoil the rest of its tile.
-        placed = placed.nan_to_num(_FAR_OUT).clamp(-_FAR_OUT, _FAR_OUT)
-        nodes = torch.stack([*(placed * third[..., None]).unbind(-1), third])
-        side = len(self._from_nodes.T)
-        x, y, third = self._from_nodes @ nodes.reshape(3, len(tiles), side, side) @ self._from_nodes.T
-        in_front = third > 0  # a tile may reach beyond the horizon, where no image shows the ground
-        depth = third.where(in_front, third.new_tensor(1.0))
-        density = float(np.linalg.det(pinhole_px_from_sheet)) / depth**3
-        placed = torch.stack([x, y]) / depth
-        x, y = placed.where(in_front, placed.new_tensor(_FAR_OUT))
-        return Warped(x, y, density * in_front)
+            sheet_from_map = np.asarray(np.linalg.inv(self._map_from_sheet), dtype=np.float64)
+            moved = shot.on_plane(apply_homography(self._map_from_sheet, corners.astype(np.float64)))
+            moved_px = apply_homography(sheet_from_map, moved) - corners
+            points = points + self._from_corners @ moved_px.reshape(-1, 1, 4, 2)
+        pinhole_px_from_sheet = shot.pinhole_px_from_map @ self._map_from_sheet
+        homogeneous = points @ pinhole_px_from_sheet[:, :2].T + pinhole_px_from_sheet[:, 2]
+        third = homogeneous[..., 2]
+        with np.errstate(all="ignore"):  # in the camera's plane, where the lens has no end
+            pinhole_px = homogeneous[..., :2] / third[..., None]
+            px = distort_points(lens.info, pinhole_px.reshape(-1, 2)).reshape(points.shape)
+        rows, columns = lens.trusted_box
+        # What lies far out must not spoil the rest of its tile.
+        placed = np.nan_to_num(px - (columns.start, rows.start), nan=_FAR_OUT_PX)
+        placed = placed.clip(-_FAR_OUT_PX, _FAR_OUT_PX)
+        return Nodes(placed[..., 0], placed[..., 1], third, float(np.linalg.det(pinhole_px_from_sheet)))
+
+    def between(self, values: np.ndarray) -> np.ndarray:
+        """Values (..., side, side) of nodes at the pixels (..., TILE_PX, TILE_PX) of their tiles, float32."""
+        return self._from_nodes @ (values.astype(np.float32) @ self._from_nodes.T)
+
+    def pixels(self, nodes: Nodes) -> Pixels:
+        """Where the pixels of the tiles lie.
+
+        Times the third coordinate, where a pixel lies is linear on the ground but for the lens: interpolated
+        so between nodes 4 px of 2 cm apart, it is at most 0.01 px off, or 0.1 px a metre from a fisheye.
+        """
+        x, y, third = self.between(
+            np.stack([nodes.x_px * nodes.third, nodes.y_px * nodes.third, nodes.third])
+        )
+        # A tile may reach beyond the horizon, where no image shows the ground.
+        is_behind = third <= 0
+        third[is_behind] = np.inf
+        nearness = 1 / third
+        x_px = (x * nearness).clip(-_FAR_OUT_PX, _FAR_OUT_PX)
+        y_px = (y * nearness).clip(-_FAR_OUT_PX, _FAR_OUT_PX)
+        x_px[is_behind] = _FAR_OUT_PX
+        return Pixels(x_px, y_px, np.float32(nodes.volume) * nearness**3)

@@ -75,7 +75,8 @@ def write_result(result: Result, folder: Path, outputs: Outputs, context: Contex
     if outputs.mosaic and result.methods and drive.has_pictures and not drive.joined:
         with context.timed("mosaic"):
             try:
-                write_mosaic(folder, drive, device=result.device, progress=context.steps("mosaic"))
+                steps = context.steps("mosaic")
+                write_mosaic(folder, drive, progress=steps, executor=context.executor)
             except (ConfigError, DriveError) as failure:  # a picture is no reason to lose a map
                 _log.warning("no mosaic was made: %s", failure)
     if "qgis" in outputs.formats and result.methods:  # it opens the mosaic, too
