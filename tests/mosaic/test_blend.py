@@ -74,7 +74,7 @@ def test_the_result_does_not_depend_on_the_size_of_sheets(drive, monkeypatch):
     canvas = Canvas(np.array([5.0, 3.0]), 0.02, 300, 400)
     at_once = whole(canvas, recorded_shots(drive), lenses(drive))
     monkeypatch.setattr(blend, "SHEET_PX", 128)
-    monkeypatch.setattr(warp, "_KEPT_IMAGES", 2)
+    monkeypatch.setattr(warp, "_KEPT_BYTES", 1)
     in_sheets = whole(canvas, recorded_shots(drive), lenses(drive))
     assert np.abs(at_once.astype(int) - in_sheets).max() <= 1
 

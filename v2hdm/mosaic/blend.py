@@ -20,7 +20,7 @@ import numpy as np
 from v2hdm.executor import HERE, Executor
 from v2hdm.geometry.ipm import apply_homography
 from v2hdm.mosaic.choice import Candidate, chosen
-from v2hdm.mosaic.consensus import Consensus
+from v2hdm.mosaic.consensus import Consensus, share_of
 from v2hdm.mosaic.views import Canvas, Lens, Shot
 from v2hdm.mosaic.warp import TILE_PX, Area, SheetPlan, Sources, Views, Warp, over_sheets, plan_sheets, sample
 from v2hdm.progress import Progress, Steps
@@ -85,6 +85,9 @@ class _Blend:
         self._lenses = lenses
         self._consensus = consensus
         self._full_density = _full_density(canvas, shots, lenses)
+        self._alphas = {
+            name: np.rint(255 * lens.trusted_part).astype(np.uint8) for name, lens in lenses.items()
+        }
         self._sources = Sources(shots, lenses)
 
     def __call__(self, plan: SheetPlan, progress: Progress) -> Sheet:
@@ -108,9 +111,9 @@ class _Blend:
             lens = self._lenses[shot.camera]
             nodes = warp.nodes(shot, lens, tiles)
             places_px = (nodes.x_px.astype(np.float32), nodes.y_px.astype(np.float32))
-            trust = sample(lens.trust[lens.trusted_box], *places_px)
+            trust = sample(lens.trusted_part, *places_px)
             if self._consensus is not None:
-                trust *= self._consensus.share(index, warp.nodes_map(tiles))
+                trust *= share_of(self._consensus.shown(index, warp.nodes_map(tiles)))
             counts = self._counts(trust, nodes.density)
             flat = (len(tiles), -1)
             candidates.append(
@@ -124,12 +127,12 @@ class _Blend:
         lens = self._lenses[shot.camera]
         where = warp.pixels(warp.nodes(shot, lens, tiles))
         bgra = cv2.cvtColor(pixels, cv2.COLOR_BGR2BGRA)
-        bgra[..., 3] = np.rint(255 * lens.trust[lens.trusted_box])
+        bgra[..., 3] = self._alphas[shot.camera]
         *colours, alpha = cv2.split(sample(bgra, where.x_px, where.y_px).reshape(len(tiles), -1, 4))
         trust = alpha * np.float32(1 / 255)
         if self._consensus is not None:
-            share = self._consensus.share(index, warp.nodes_map(tiles))
-            trust *= warp.between(share).reshape(trust.shape)
+            shown = warp.between(self._consensus.shown(index, warp.nodes_map(tiles)))
+            trust *= share_of(shown).reshape(trust.shape)
         counts = self._counts(trust, where.density.reshape(trust.shape))
         weighted = [colour * counts.weight for colour in colours]
         return np.stack([*weighted, counts.weight, counts.opacity])

@@ -15,7 +15,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from scipy import ndimage
 
@@ -33,7 +32,7 @@ BLOCK_PX = 8  # side of a block, cells: 0.32 m; chosen
 BLOCK_M = BLOCK_PX * CELL_M  # side of a block, m
 _BLOCKS = TILE_PX // BLOCK_PX  # blocks along a side of a tile
 _NODE_PX = BLOCK_PX // 2  # distance of the nodes of a tile, cells: a block has one in its middle
-_SHEET_PX = 1024  # side of a sheet, cells: 41 m, whose patches take some 30 MB
+_SHEET_PX = 1024  # side of a sheet, cells: 41 m, whose patches take some 120 MB
 
 _TEXTURE = 2.5  # standard deviation of grey values in a block that is more than an image's noise; chosen
 _AGREES = 0.4  # least correlation of an image's pattern with that of the others; chosen
@@ -73,10 +72,10 @@ class Consensus:
     kinds: np.ndarray  # (rows, columns) of all blocks
     by_shot: Mapping[int, Shown]
 
-    def share(self, index: int, points_map: FloatArray) -> np.ndarray:
-        """How far the image ``index`` shows the ground at points (T, side, side, 2), smooth between blocks.
+    def shown(self, index: int, points_map: FloatArray) -> np.ndarray:
+        """Whether the image ``index`` shows the ground at points (T, side, side, 2), linear between blocks.
 
-        From 0 to 1, (T, side, side) float32.
+        From 0 to 1, (T, side, side) float32; see :func:`share_of`.
         """
         shown = self.by_shot.get(index)
         if shown is None:
@@ -84,9 +83,12 @@ class Consensus:
         offset_m = points_map - self.canvas.corner_map
         column = offset_m[..., 0] / BLOCK_M - 0.5 - shown.column
         row = -offset_m[..., 1] / BLOCK_M - 0.5 - shown.row
-        share = sample(shown.shows, column.astype(np.float32), row.astype(np.float32))
-        # Nothing beyond the border of a block that shows the ground.
-        return (2 * share - 1).clip(min=0)
+        return sample(shown.shows, column.astype(np.float32), row.astype(np.float32))
+
+
+def share_of(shown: np.ndarray) -> np.ndarray:
+    """How far an image counts that shows the ground so: nothing beyond the border of a block that does."""
+    return (2 * shown - 1).clip(min=0)
 
 
 def find_consensus(
@@ -172,7 +174,7 @@ class _Patch(NamedTuple):
     """One tile in one image."""
 
     index: int
-    grey: np.ndarray  # (TILE_PX, TILE_PX) uint8
+    grey: np.ndarray  # (TILE_PX, TILE_PX) float32
     density: np.ndarray  # (blocks, blocks) px of the image a cell; 0 where not all of it is trusted
 
 
@@ -195,7 +197,7 @@ class _Comparison:
         self._shots = shots
         self._lenses = lenses
         self._canvas = canvas
-        self._sources = Sources(shots, lenses)
+        self._sources = Sources(shots, lenses, is_grey=True)
 
     def __call__(self, plan: SheetPlan, progress: Progress) -> list[_Tile]:
         map_from_sheet = self._canvas.window(plan.row, plan.column, _SHEET_PX, _SHEET_PX).map_from_canvas
@@ -222,18 +224,16 @@ class _Comparison:
         shot = self._shots[index]
         lens = self._lenses[shot.camera]
         nodes = warp.nodes(shot, lens, tiles)
-        trust = sample(
-            lens.trust[lens.trusted_box], nodes.x_px.astype(np.float32), nodes.y_px.astype(np.float32)
-        )
-        density = _in_middle(nodes.density) * (_least_around(trust) > 0)
+        where = warp.pixels(nodes)
+        trusted = np.where(lens.trusted_part > 0, np.uint8(255), np.uint8(0))
+        is_whole = _all_of_block(sample(trusted, where.x_px, where.y_px))
+        density = nodes.density[:, 1::2, 1::2] * is_whole  # in the middle of blocks
         density[density < _COARSEST] = 0
-        is_shown = density.any(axis=(1, 2))
-        if not is_shown.any():
-            return
-        where = warp.pixels(nodes.of(is_shown))
-        greys = sample(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), where.x_px, where.y_px)
-        for tile, grey, fineness in zip(tiles[is_shown], greys, density[is_shown], strict=True):
-            yield (int(tile[0]), int(tile[1])), _Patch(index, grey, fineness.astype(np.float32))
+        # As decimals, since whole grey values would add to the pattern of asphalt.
+        greys = sample(pixels.astype(np.float32), where.x_px, where.y_px)
+        for tile, grey, fineness in zip(tiles, greys, density.astype(np.float32), strict=True):
+            if fineness.any():
+                yield (int(tile[0]), int(tile[1])), _Patch(index, grey, fineness)
 
     def _directions(
         self, patches: Sequence[_Patch], map_from_sheet: FloatArray, column: int, row: int
@@ -246,15 +246,11 @@ class _Comparison:
         return (centres_map[:, :, None] - cameras_map[:, :2]) / cameras_map[:, 2:]
 
 
-def _in_middle(values: np.ndarray) -> np.ndarray:
-    """The values (T, blocks, blocks) in the middle of blocks, of those (T, side, side) at nodes."""
-    return values[:, 1::2, 1::2].copy()
-
-
-def _least_around(values: np.ndarray) -> np.ndarray:
-    """The least values (T, blocks, blocks) at the nodes in and around blocks, of those (T, side, side)."""
-    by_row = np.minimum(np.minimum(values[:, :-1:2], values[:, 1::2]), values[:, 2::2])
-    return np.minimum(np.minimum(by_row[:, :, :-1:2], by_row[:, :, 1::2]), by_row[:, :, 2::2])
+def _all_of_block(values: np.ndarray) -> BoolArray:
+    """Which blocks (T, blocks, blocks) have values above 0 in all of their cells (T, TILE_PX, TILE_PX)."""
+    count = len(values)
+    by_column = values.reshape(count, _BLOCKS, BLOCK_PX, TILE_PX).min(axis=2)
+    return np.asarray(by_column.reshape(count, _BLOCKS, _BLOCKS, BLOCK_PX).min(axis=3) > 0)
 
 
 def _compare(patches: Sequence[_Patch], directions: FloatArray) -> tuple[np.ndarray, BoolArray]:
@@ -264,7 +260,7 @@ def _compare(patches: Sequence[_Patch], directions: FloatArray) -> tuple[np.ndar
     """
     grey = np.stack([patch.grey for patch in patches])
     by_block = grey.reshape(-1, _BLOCKS, BLOCK_PX, _BLOCKS, BLOCK_PX).transpose(1, 3, 0, 2, 4)
-    pattern = by_block.reshape(_BLOCKS, _BLOCKS, len(patches), -1).astype(np.float32)
+    pattern = by_block.reshape(_BLOCKS, _BLOCKS, len(patches), -1)
     pattern -= pattern.mean(axis=-1, keepdims=True)
     power = np.einsum("...i,...i->...", pattern, pattern)
     weight = np.stack([patch.density for patch in patches], axis=-1)

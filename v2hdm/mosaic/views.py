@@ -102,6 +102,11 @@ class Lens:
         rows, columns = (slice(max(int(index[0]) - 1, 0), int(index[-1]) + 2) for index in trusted)
         return rows, columns
 
+    @cached_property
+    def trusted_part(self) -> np.ndarray:
+        """The trust of :attr:`trusted_box`."""
+        return self.trust[self.trusted_box].copy()
+
 
 @dataclass(frozen=True)
 class Shot:

@@ -23,13 +23,14 @@ from v2hdm.geometry.planar import turned_left
 from v2hdm.mosaic.views import Canvas, Lens, Shot
 from v2hdm.progress import Progress, Steps
 from v2hdm.records import BoolArray, FloatArray
+from v2hdm.safe.pixels import read_pixels
 
 TILE_PX = 64  # side of a tile, px of the canvas
 _FAR_OUT_PX = 1e5  # a place outside of any image, px from its corner
 _ROW_M = 6.0  # markings of a row are no farther apart than twice this, m; chosen
 _FARTHEST_M = 14.0  # distance of paint from the way up to which the mosaic reaches, m; chosen
 _FEW_SHEETS = 3  # most sheets that are done faster here than other processes start; chosen
-_KEPT_IMAGES = 96  # decoded images that neighbouring sheets share, 2 MB each
+_KEPT_BYTES = 500_000_000  # size of decoded images that neighbouring sheets share, 2 MB each; chosen
 
 _Result = TypeVar("_Result")
 
@@ -144,13 +145,16 @@ class Area:
 class Sources:
     """The images of shots, each cut to the rows and columns that are trusted."""
 
-    def __init__(self, shots: Sequence[Shot], lenses: Mapping[str, Lens]) -> None:
+    def __init__(self, shots: Sequence[Shot], lenses: Mapping[str, Lens], is_grey: bool = False) -> None:
         self._shots = shots
         self._lenses = lenses
-        self._decoded = lru_cache(maxsize=_KEPT_IMAGES)(self._decode)
+        self._is_grey = is_grey
+        channels = 1 if is_grey else 3
+        largest_bytes = max((channels * lens.trusted_part.size for lens in lenses.values()), default=1)
+        self._decoded = lru_cache(maxsize=max(_KEPT_BYTES // largest_bytes, 1))(self._decode)
 
     def _decode(self, path: Path, camera: str) -> np.ndarray:
-        pixels = read_bgr(path)
+        pixels = read_pixels(path, cv2.IMREAD_GRAYSCALE) if self._is_grey else read_bgr(path)
         lens = self._lenses[camera]
         if pixels.shape[:2] != lens.trust.shape:
             raise DriveError(
@@ -160,7 +164,10 @@ class Sources:
         return pixels[lens.trusted_box].copy()
 
     def in_order(self, order: Sequence[int]) -> Iterator[np.ndarray]:
-        """Images (height, width, 3) uint8 BGR; the next is decoded meanwhile, the last used stay decoded."""
+        """Images, uint8, (height, width) or (height, width, 3) BGR; the next is decoded meanwhile.
+
+        The last used stay decoded.
+        """
         ordered = [self._shots[index] for index in order]
         with ThreadPoolExecutor(1) as decoder:
             ahead = [decoder.submit(self._decoded, shot.path, shot.camera) for shot in ordered[:1]]
@@ -186,10 +193,6 @@ class Nodes(NamedTuple):
     y_px: FloatArray
     third: FloatArray  # coordinate of the mapped point, proportional to its depth
     volume: float  # of the density, times the third power of that
-
-    def of(self, chosen: BoolArray) -> Nodes:
-        """The nodes of chosen (T,) tiles."""
-        return Nodes(self.x_px[chosen], self.y_px[chosen], self.third[chosen], self.volume)
 
     @property
     def density(self) -> FloatArray:
