@@ -28,6 +28,7 @@ from v2hdm.progress import Progress, Steps
 SHEET_PX = 2048  # side of a sheet, px of the canvas: 84 MB of weighted sums where all of it is seen
 _NODE_PX = 4  # largest distance of the nodes of a tile, px of the canvas
 _NODE_M = 0.08  # largest distance of the nodes of a tile, m: a quarter of a block of the consensus
+_FINEST = 1e6  # largest density that counts, in that of the coarsest ground; larger ones are in no image
 _COARSER = 2  # distance of the nodes by which images are chosen, in distances of those of the warp
 
 
@@ -114,15 +115,17 @@ class _Blend:
             trust = sample(lens.trusted_part, *places_px)
             if self._consensus is not None:
                 trust *= share_of(self._consensus.shown(index, warp.nodes_map(tiles)))
-            counts = self._counts(trust, nodes.density)
+            counts = self._counts(trust, nodes.density.astype(np.float32))
             flat = (len(tiles), -1)
             candidates.append(
                 Candidate(index, tiles, counts.weight.reshape(flat), counts.opacity.reshape(flat))
             )
         return chosen(candidates)
 
-    def _contribution(self, index: int, tiles: np.ndarray, pixels: np.ndarray, warp: Warp) -> np.ndarray:
-        """What an image adds to the sums of tiles (T, 2): (5, T, pixels)."""
+    def _contribution(
+        self, index: int, tiles: np.ndarray, pixels: np.ndarray, warp: Warp
+    ) -> list[np.ndarray]:
+        """What an image adds to the five sums of tiles (T, 2): each (T, pixels)."""
         shot = self._shots[index]
         lens = self._lenses[shot.camera]
         where = warp.pixels(warp.nodes(shot, lens, tiles))
@@ -135,13 +138,13 @@ class _Blend:
             trust *= share_of(shown).reshape(trust.shape)
         counts = self._counts(trust, where.density.reshape(trust.shape))
         weighted = [colour * counts.weight for colour in colours]
-        return np.stack([*weighted, counts.weight, counts.opacity])
+        return [*weighted, counts.weight, counts.opacity]
 
     def _counts(self, trust: np.ndarray, density: np.ndarray) -> _Counts:
         """How much an image counts where it is trusted so far and shows the ground so finely."""
+        fineness = (density * np.float32(1 / self._full_density)).clip(max=_FINEST)
         # As opaque as the ground is trusted, wherever it is shown finely enough.
-        opacity = trust * (density * (1 / self._full_density)).clip(max=1)
-        return _Counts((trust * density**2).astype(np.float32), opacity.astype(np.float32))
+        return _Counts(trust * np.square(fineness), trust * fineness.clip(max=1))
 
 
 class _Counts(NamedTuple):
@@ -178,10 +181,11 @@ class _Sums:
         self._at = {(int(column), int(row)): k for k, (column, row) in enumerate(self._tiles)}
         self._sums = np.zeros((5, len(self._tiles), TILE_PX**2), dtype=np.float32)
 
-    def add(self, tiles: np.ndarray, contribution: np.ndarray) -> None:
-        """Add what an image contributes (5, T, pixels) to tiles (T, 2) of (column, row)."""
+    def add(self, tiles: np.ndarray, contribution: Sequence[np.ndarray]) -> None:
+        """Add what an image contributes, five times (T, pixels), to tiles (T, 2) of (column, row)."""
         at = [self._at[int(column), int(row)] for column, row in tiles]
-        self._sums[:, at] += contribution
+        for total, addend in zip(self._sums, contribution, strict=True):
+            total[at] += addend
 
     def mean(self, rows: int, columns: int) -> np.ndarray:
         """The sheet as (rows, columns, 4) uint8 RGBA."""

@@ -1,8 +1,8 @@
 """Which images of a tile are blended: the fewest that leave its pixels as all of them would have them.
 
-An image counts with the square of its density, so with the sixth power of its distance: where thirty show a
-place, the nearest eight have all but a fiftieth of the weight. They are chosen by the weights at nodes of the
-tile before any is decoded.
+An image counts with the square of its density, so with the sixth power of its distance: of thirty that show a
+place, a few have all but a twentieth of the weight. They are chosen by the weights at nodes of the tile,
+before any image is decoded.
 """
 
 from __future__ import annotations
@@ -15,9 +15,12 @@ import numpy as np
 from v2hdm.mosaic.warp import Views
 from v2hdm.records import BoolArray, IntArray
 
-LEFT_OUT = 0.02
-"""Largest share of the weight, and of the opacity, of a place that images left out may have: up to 5 of 255
-grey values where they show white and the others black; chosen."""
+LEFT_OUT = 0.05
+"""Largest share of the weight of a place that images left out may have: its colour moves by so much of their
+difference from the others, half a grey value where they differ by ten; chosen."""
+_FAINTER = 1 / 255
+"""Largest opacity that a place may lose by images left out: one step of alpha, so that the same ground is
+shown."""
 
 
 class Candidate(NamedTuple):
@@ -59,6 +62,7 @@ def _needed(weight: np.ndarray, opacity: np.ndarray) -> IntArray:
     share_up_to = np.cumsum(share[order], axis=0)
     opacity_up_to = np.cumsum(opacity[order], axis=0)
     has_weight = (share_up_to >= 1 - LEFT_OUT).all(axis=1)
-    has_opacity = (opacity_up_to >= opacity_up_to[-1].clip(max=1) - LEFT_OUT).all(axis=1)
-    count = int(np.argmax(has_weight & has_opacity)) + 1
-    return order[:count]
+    has_opacity = (opacity_up_to >= opacity_up_to[-1].clip(max=1) - _FAINTER).all(axis=1)
+    is_enough = has_weight & has_opacity
+    is_enough[-1] = True  # all of them are, whatever their shares are rounded to
+    return order[: int(np.argmax(is_enough)) + 1]

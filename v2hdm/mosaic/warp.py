@@ -265,10 +265,14 @@ class Warp:
             np.stack([nodes.x_px * nodes.third, nodes.y_px * nodes.third, nodes.third])
         )
         # A tile may reach beyond the horizon, where no image shows the ground.
-        is_behind = third <= 0
-        third[is_behind] = np.inf
+        is_behind = third <= 0 if (nodes.third <= 0).any() else None
+        if is_behind is not None:
+            third[is_behind] = np.inf
         nearness = 1 / third
-        x_px = (x * nearness).clip(-_FAR_OUT_PX, _FAR_OUT_PX)
-        y_px = (y * nearness).clip(-_FAR_OUT_PX, _FAR_OUT_PX)
-        x_px[is_behind] = _FAR_OUT_PX
-        return Pixels(x_px, y_px, np.float32(nodes.volume) * nearness**3)
+        x *= nearness
+        y *= nearness
+        if is_behind is not None:
+            x[is_behind] = _FAR_OUT_PX
+            for place_px in (x, y):
+                np.clip(place_px, -_FAR_OUT_PX, _FAR_OUT_PX, out=place_px)
+        return Pixels(x, y, np.float32(nodes.volume) * nearness * nearness * nearness)
