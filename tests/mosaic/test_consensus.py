@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from tests.mosaic import scene
+from v2hdm.executor.processes import ProcessExecutor
 from v2hdm.geometry.ipm import apply_homography, ground_from_pinhole_px
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.rigid import camera_centre, inverse
-from v2hdm.mosaic.blend import whole
+from v2hdm.mosaic import warp
+from v2hdm.mosaic.blend import blend, whole
 from v2hdm.mosaic.consensus import CELL_M, GROUND, PLAIN, STANDING, UNSEEN, find_consensus, ground_of
 from v2hdm.mosaic.views import Canvas, adjusted_shots, lens_of
 from v2hdm.mosaic.warp import Area
@@ -96,6 +98,18 @@ def test_a_wall_is_cut_out_and_the_ground_before_and_beside_it_is_shown(site):
     off, aside = (np.abs(rgba[..., 0] - grey_at(GROUND_GREY, points + shift))[shown] for shift in (0.0, 0.5))
     assert np.median(off) < 8.0
     assert np.median(aside) > 2 * np.median(off)
+
+
+def test_other_processes_make_the_same_picture(site, monkeypatch):
+    shots, lenses, canvas = site
+    consensus = find_consensus(shots, lenses, canvas)
+    rgba = whole(canvas, shots, lenses, consensus)
+    monkeypatch.setattr(warp, "_FEW_SHEETS", 0)
+    executor = ProcessExecutor(2)
+    again = find_consensus(shots, lenses, canvas, executor=executor)
+    np.testing.assert_array_equal(again.kinds, consensus.kinds)
+    (sheet,) = blend(canvas, shots, lenses, consensus=again, executor=executor)
+    np.testing.assert_array_equal(sheet.rgba, rgba)
 
 
 def test_images_from_one_place_tell_nothing_and_that_is_said(site, caplog):

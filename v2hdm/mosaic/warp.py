@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -149,9 +149,12 @@ class Sources:
         self._shots = shots
         self._lenses = lenses
         self._is_grey = is_grey
-        channels = 1 if is_grey else 3
-        largest_bytes = max((channels * lens.trusted_part.size for lens in lenses.values()), default=1)
-        self._decoded = lru_cache(maxsize=max(_KEPT_BYTES // largest_bytes, 1))(self._decode)
+
+    @cached_property  # not before the first image, as what is made then cannot go to another process
+    def _decoded(self) -> Callable[[Path, str], np.ndarray]:
+        channels = 1 if self._is_grey else 3
+        largest_bytes = max(channels * lens.trusted_part.size for lens in self._lenses.values())
+        return lru_cache(maxsize=max(_KEPT_BYTES // largest_bytes, 1))(self._decode)
 
     def _decode(self, path: Path, camera: str) -> np.ndarray:
         pixels = read_pixels(path, cv2.IMREAD_GRAYSCALE) if self._is_grey else read_bgr(path)
