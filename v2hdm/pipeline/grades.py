@@ -79,7 +79,8 @@ def accurate_enough(
         best = min(marking.accuracy or "" for marking in markings)
         raise MappingError(
             f"none of {len(markings)} markings is of accuracy {least_accuracy}, for which "
-            f"mapping.acceptance.accuracy asks; the best are of accuracy {best}: ask for that, or see docs/accuracy.md"
+            f"mapping.acceptance.accuracy asks; the best are of accuracy {best}: ask for that, or see "
+            "docs/accuracy.md"
         )
     return chosen
 
