@@ -55,7 +55,7 @@ def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Findin
         corners = f"95 % of the corners of {len(judged)} markings"
         says = f"{corners} within {_cm(reached_m)} in the frame of the {frame}"
         if best.evidence is not None:
-            says += _conditions(best.evidence, told=[finding.check for finding in unknown_clocks])
+            says += _conditions(best.evidence, raised_checks=[finding.check for finding in unknown_clocks])
         relative_m = relative_radii_m(judged)
         if len(relative_m):
             says += f", {_cm(radius_of_all_m(relative_m))} from marking to marking"
