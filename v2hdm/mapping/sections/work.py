@@ -16,6 +16,7 @@ from v2hdm.adjust import Problem, Solution
 from v2hdm.adjust.sections.joined import JoinedCovariance
 from v2hdm.adjust.sections.parts import Part
 from v2hdm.adjust.sections.rounds import save_part
+from v2hdm.adjust.sections.solve import ROUGH_GAP
 from v2hdm.adjust.selection import busiest
 from v2hdm.association.groups import known_elsewhere
 from v2hdm.errors import AdjustError, MappingError
@@ -127,6 +128,8 @@ class Work:
         section: Section = self.read("section", number)
         detections = self.detections_of(section.drive.images, section.images)
         inputs = Inputs(section.drive, detections, self.cameras, self.options)
+        # All sections together are solved again, to the end.
+        inputs.optimiser.settled_gap = ROUGH_GAP
         try:
             examined = examine(inputs, lambda step: None)
         except MappingError as failure:
