@@ -128,9 +128,9 @@ class Work:
         section: Section = self.read("section", number)
         detections = self.detections_of(section.drive.images, section.images)
         inputs = Inputs(section.drive, detections, self.cameras, self.options)
-        # All sections together are solved again, to the end.
-        inputs.optimiser.settled_gap = ROUGH_GAP
         try:
+            # All sections together are solved again, to the end.
+            inputs.optimiser.settled_gap = ROUGH_GAP
             examined = examine(inputs, lambda step: None)
         except MappingError as failure:
             raise MappingError(f"{section.name}: {failure}") from None
