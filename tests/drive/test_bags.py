@@ -265,7 +265,7 @@ def test_images_that_come_late_or_twice_or_have_no_time_are_sorted_or_dropped_an
     expected = read_drive(folder)
     times = front_times(expected)
     pixels = {(image.camera, image.stamp_s): cv2.imread(str(image.path)) for image in expected.images}
-    for name, messages, kept in (
+    for name, messages, expected_times in (
         ("late", messages_of(folder), times),
         ("twice", messages_of(folder), times),
         ("zero", _restamped(folder, FRONT, {0: 0}), times[1:]),
@@ -278,7 +278,7 @@ def test_images_that_come_late_or_twice_or_have_no_time_are_sorted_or_dropped_an
         if name == "twice":
             messages.rows.insert(places[0], messages.rows[places[0]])
         got = read(tmp_path / name, topics_for(folder, write_ros2(tmp_path / f"bag_{name}", messages)))
-        assert front_times(got) == kept
+        assert front_times(got) == expected_times
         for image in got.images:
             np.testing.assert_array_equal(cv2.imread(str(image.path)), pixels[image.camera, image.stamp_s])
     for words in ("sorted images that were late: 1", "whose time repeats: 1", "without a time: 1"):
