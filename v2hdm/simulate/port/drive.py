@@ -126,7 +126,9 @@ def _between(low: float, high: float, start: float, end: float) -> tuple[float, 
 
 
 @exact_kernel
-def _cross_boxes(boxes: FloatArray, centre_map: FloatArray, points_map: FloatArray, hidden: BoolArray) -> None:
+def _cross_boxes(
+    boxes: FloatArray, centre_map: FloatArray, points_map: FloatArray, hidden: BoolArray
+) -> None:
     """Mark in ``hidden`` (N,) the lines from a centre (3,) to points (N, 3) through one of boxes (B, 11).
 
     A box is its centre's x and y, its yaw's cosine and sine, its size, its base, and the plane beneath it.
