@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 from v2hdm.errors import ConfigError, DriveError, WorkerError
-from v2hdm.executor import HERE, Executor, open_executor, opening
+from v2hdm.executor import HERE, open_executor, opening
 from v2hdm.executor.processes import ProcessExecutor
-from v2hdm.progress import silent
 from v2hdm.store.files import whole_file
 
 ROOT = Path(__file__).parents[2]
@@ -25,6 +24,10 @@ def nothing(): ...
 
 def slowly_doubled(number):
     time.sleep(0.2 if number % 3 == 0 else 0.0)
+    return 2 * number
+
+
+def doubled(number):
     return 2 * number
 
 
@@ -82,29 +85,10 @@ def test_results_come_in_the_order_of_the_jobs(two):
     assert taken == [0, 2, 4, 6, 8, 10, 12, 14, 16]
 
 
-class Backwards(Executor):
-    """Two workers of this process, of which the last job is done first."""
-
-    def __init__(self):
-        self.handed_over = 0
-
-    @property
-    def workers(self):
-        return 2
-
-    def outcomes(self, stage, jobs, progress, at_once):
-        self.handed_over = len(jobs)
-        for number in reversed(range(len(jobs))):
-            yield number, stage.work(jobs[number], silent)
-
-
-@pytest.mark.parametrize(("jobs", "handed_over"), [(0, 0), (1, 1), (127, 127), (128, 64), (808, 101)])
-def test_many_short_jobs_are_handed_over_together_and_few_one_by_one(jobs, handed_over):
+def test_many_jobs_are_handed_over_together_and_their_results_come_in_order(two):
     taken: list[int] = []
-    executor = Backwards()
-    executor.share_out(str, range(jobs), nothing, (), taken.append)
-    assert taken == [str(number) for number in range(jobs)]
-    assert executor.handed_over == handed_over
+    two.share_out(doubled, range(99), nothing, (), taken.append, together=4)
+    assert taken == [2 * number for number in range(99)]
 
 
 def test_a_failure_is_raised_here_and_tells_where_it_happened(two):

@@ -17,6 +17,8 @@ TWICE_DEAD = (
     "workers= (--workers)"
 )
 
+_PARTS = 8  # least number of parts of a stage's jobs a worker: the last ones keep others waiting; chosen
+
 _Job = TypeVar("_Job")
 _Result = TypeVar("_Result")
 
@@ -48,12 +50,8 @@ class Stage(Generic[_Job, _Result]):
     processes: int = 0  # that take part at most, 0 for all: each may hold much of a GPU
 
 
-_LARGEST_BATCH = 8  # short jobs handed over together: Dask takes 6 ms of CPU to hand over the least of them
-_BATCHES_A_PROCESS = 32  # batches of each process at least, so that all end within a thirtieth of each other
-
-
-class _Batches(Generic[_Job, _Result]):
-    """Work on several jobs, one after the other, that tells nothing of its steps."""
+class _Plain(Generic[_Job, _Result]):
+    """Work on several jobs, which tells nothing of its steps."""
 
     def __init__(self, work: Callable[[_Job], _Result]) -> None:
         self._work = work
@@ -100,19 +98,21 @@ class Executor(ABC):
         arguments: tuple[object, ...],
         take: Callable[[_Result], None],
         processes: int = 0,
+        together: int = 1,
     ) -> None:
         """Do short jobs in processes that call ``start`` first; ``take`` gets their results in order.
 
-        At most so many ``processes`` take part, 0 for all. Raises errors of the work, or WorkerError.
+        At most so many ``processes`` take part, 0 for all. Where there are many jobs, a process gets so many
+        ``together``: to hand one over costs some 17 ms of CPU. Raises errors of the work, or WorkerError.
         """
         results: dict[int, list[_Result]] = {}
         taken_count = 0
-        count = min(self.workers, processes or self.workers)
-        size = min(max(1, len(jobs) // (_BATCHES_A_PROCESS * count)), _LARGEST_BATCH)
-        batches = [jobs[begin : begin + size] for begin in range(0, len(jobs), size)]
-        stage = Stage(_Batches(work), start, arguments, processes)
-        # Two batches a worker, so that none waits for the next one to reach it.
-        outcomes = self.outcomes(stage, batches, no_progress, 2 * count)
+        stage = Stage(_Plain(work), start, arguments, processes)
+        at_work = min(self.workers, processes or self.workers)
+        size = min(together, max(1, len(jobs) // (_PARTS * at_work)))
+        parts = [jobs[first : first + size] for first in range(0, len(jobs), size)]
+        # Two parts a worker, so that none waits for the next one to reach it.
+        outcomes = self.outcomes(stage, parts, no_progress, 2 * at_work)
         with closing(outcomes):
             for number, result in outcomes:
                 if isinstance(result, WorkerError):

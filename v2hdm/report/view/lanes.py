@@ -85,6 +85,6 @@ def _question(question: Question) -> dict[str, Any]:
     return {"key": key, "subject": question.subject, "text": question.text, "p": flat_mm(places)}
 
 
-def _places(asked: Any) -> FloatArray:
+def _places(question: Any) -> FloatArray:
     """The one or two places (N, 2), m, of a question or an answer."""
-    return np.stack([place for place in (asked.place_map, asked.to_map) if place is not None])
+    return np.stack([place for place in (question.place_map, question.to_map) if place is not None])
