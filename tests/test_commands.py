@@ -225,12 +225,18 @@ def test_a_terminal_that_fails_stops_no_work_and_is_reported_at_its_end(monkeypa
 
 
 @pytest.mark.parametrize(
-    ("variables", "expected"), [({}, "passive"), ({"OMP_WAIT_POLICY": "active"}, "active")]
+    ("variable", "default"), [("OMP_WAIT_POLICY", "passive"), ("OPENBLAS_NUM_THREADS", "1")]
 )
-def test_openmp_waits_without_spinning_unless_the_user_says_so(variables, expected, tmp_path, monkeypatch):
-    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
-    (tmp_path / "torch.py").write_text("import os; raise SystemExit(os.environ['OMP_WAIT_POLICY'])")
-    assert run_command(tmp_path, "v2hdm.map", "+run=port2", **variables).stderr.strip() == expected
+@pytest.mark.parametrize("setting", [None, "3"])
+def test_waiting_threads_do_not_spin_unless_the_user_says_so(
+    variable, default, setting, tmp_path, monkeypatch
+):
+    monkeypatch.delenv(variable, raising=False)
+    for library in ("numpy", "torch"):  # whichever is loaded first, reads the variables
+        (tmp_path / f"{library}.py").write_text(f"import os; raise SystemExit(os.environ[{variable!r}])")
+    environment = {} if setting is None else {variable: setting}
+    line = run_command(tmp_path, "v2hdm.map", "+run=port2", **environment).stderr.strip()
+    assert line == (setting or default)
 
 
 @pytest.mark.parametrize("number", ["-1.3e-05", "-2E3", "-.5", "-7", "-4."])

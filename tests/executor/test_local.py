@@ -27,6 +27,10 @@ def slowly_doubled(number):
     return 2 * number
 
 
+def doubled(number):
+    return 2 * number
+
+
 def refuse(name):
     raise DriveError(f"{name}: damaged")
 
@@ -79,6 +83,12 @@ def test_results_come_in_the_order_of_the_jobs(two):
     results: list[int] = []
     two.share_out(slowly_doubled, range(9), nothing, (), results.append)
     assert results == [0, 2, 4, 6, 8, 10, 12, 14, 16]
+
+
+def test_many_jobs_are_handed_over_together_and_their_results_come_in_order(two):
+    taken: list[int] = []
+    two.share_out(doubled, range(99), nothing, (), taken.append, together=4)
+    assert taken == [2 * number for number in range(99)]
 
 
 def test_a_failure_is_raised_here_and_tells_where_it_happened(two):

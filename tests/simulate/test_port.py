@@ -180,6 +180,34 @@ def test_hidden_points_are_those_the_picture_hides():
     assert points_seen(info, cam_from_map, points, [box]).sum() == (~hidden_by([box], centre, points)).sum()
 
 
+def _crosses(box, eye_map, points_map):
+    """Which lines from an eye to points (N, 3) pass through a box on level ground, by numpy."""
+    turn = np.array([[np.cos(box.yaw_rad), -np.sin(box.yaw_rad)], [np.sin(box.yaw_rad), np.cos(box.yaw_rad)]])
+    ends = np.vstack([eye_map, points_map])
+    eye, *ground = np.column_stack([(ends[:, :2] - box.centre_map) @ turn, ends[:, 2] - box.base_m])
+    half_length, half_width = box.size_m[0] / 2, box.size_m[1] / 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first = (np.array([-half_length, -half_width, 0.0]) - eye) / (ground - eye)
+        second = (np.array([half_length, half_width, box.size_m[2]]) - eye) / (ground - eye)
+    enter = np.fmin(first, second).max(axis=1)
+    leave = np.fmax(first, second).min(axis=1)
+    return (enter < np.minimum(leave, 1.0)) & (leave > 0)
+
+
+def test_lines_through_boxes_are_those_that_numpy_names():
+    rng = np.random.default_rng(3)
+    eye_map = np.array([0.5, -0.25, 2.5])
+    points_map = np.column_stack([rng.uniform(-20, 20, (4000, 2)), np.zeros(4000)])
+    points_map[:500, 0] = eye_map[0]  # straight ahead of the eye: a line along two sides of an unturned box
+    boxes = [
+        Box(centre_map=tuple(rng.uniform(-9, 9, 2)), size_m=(3.0, 2.0, 2.0), yaw_rad=yaw, base_m=base)
+        for yaw, base in ((0.0, 0.0), (0.7, 0.0), (2.0, 1.2), (0.0, 1.0))
+    ]
+    expected = np.any([_crosses(box, eye_map, points_map) for box in boxes], axis=0)
+    assert 0.05 < expected.mean() < 0.95
+    assert np.array_equal(hidden_by(boxes, eye_map, points_map), expected)
+
+
 @pytest.mark.parametrize(
     ("changes", "word"),
     [
