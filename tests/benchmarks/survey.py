@@ -84,7 +84,7 @@ def _matched(
     detected: MarkingDetection, shown: dict[int, FloatArray], truth: Truth
 ) -> tuple[int, FloatArray, int] | None:
     """The marking that a detection is of, the errors (4, 2) of its corners, px, and which came first."""
-    known = detected.corner_valid if detected.corner_valid.any() else np.ones(4, dtype=bool)
+    is_known = detected.corner_valid if detected.corner_valid.any() else np.ones(4, dtype=bool)
     candidates = [
         (j, detected.corners_px - np.roll(px, turn, axis=0), turn)
         for j, px in shown.items()
@@ -93,8 +93,8 @@ def _matched(
     ]
     if not candidates:
         return None
-    best = min(candidates, key=lambda candidate: np.linalg.norm(candidate[1][known], axis=1).mean())
-    return best if np.linalg.norm(best[1][known], axis=1).mean() < _MATCH_PX else None
+    best = min(candidates, key=lambda candidate: np.linalg.norm(candidate[1][is_known], axis=1).mean())
+    return best if np.linalg.norm(best[1][is_known], axis=1).mean() < _MATCH_PX else None
 
 
 def statistics(folder: Path, every: int) -> None:
@@ -111,7 +111,7 @@ def statistics(folder: Path, every: int) -> None:
         cam_from_map = truth.cam_from_vehicle[image.camera] @ np.linalg.inv(truth.map_from_vehicle[row])
         camera_map = np.linalg.inv(cam_from_map)[:2, 3]
         shown = _projected(drive, truth, row)
-        found = set()
+        found_markings = set()
         for detected in detect_image(detector, drive, row).markings:
             if len(detected.outline_px):
                 continue
@@ -121,7 +121,7 @@ def statistics(folder: Path, every: int) -> None:
                 false += 1
                 continue
             j, off_px, first = match
-            found.add(j)
+            found_markings.add(j)
             away_m = float(np.linalg.norm(truth.map.markings[j].corners_map.mean(axis=0) - camera_map))
             for k in np.flatnonzero(detected.corner_valid).tolist():
                 covariance = detected.covariance_px[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]
@@ -138,7 +138,7 @@ def statistics(folder: Path, every: int) -> None:
             inside = ((px > _BORDER_PX) & (px < size - 1 - _BORDER_PX)).all()
             if inside and truth.visibility[row, j] > 0.97:
                 away_m = float(np.linalg.norm(truth.map.markings[j].corners_map.mean(axis=0) - camera_map))
-                markings.append((away_m, j in found))
+                markings.append((away_m, j in found_markings))
     _print(np.array(corners), np.array(markings, dtype=float))
     _print_alike(by_corner)
     print(f"{detections} detections, {false} of no marking ({false / detections:.3f})")
@@ -208,7 +208,7 @@ def survey_of(length_km: float, cache: Path) -> tuple[Drive, HDMap]:
         OmegaConf.structured(PortConfig), OmegaConf.load(conf_dir() / "run" / "port2.yaml").simulate
     )
     config = replace(OmegaConf.to_object(port), survey=SurveyConfig(length_km=length_km))
-    folders = simulated_drives(config, cache, HERE, lambda done, total: None)
+    folders = simulated_drives(config, cache, HERE, lambda finished, total: None)
     drive = join_drives([read_drive(folder) for folder in folders])
     return drive, read_geojson(folders[0] / "truth" / "map.geojson")
 
@@ -378,13 +378,13 @@ def apart(length_km: float, section_m: float, cache: Path) -> None:
 def _print_apart(whole: HDMap, parted: HDMap) -> None:
     """Print distances of the corners of two maps, and ratios of their sigmas."""
     corners = np.array([marking.corners_map for marking in whole.markings])
-    away_m, near = cKDTree(corners.mean(axis=1)).query(
+    away_m, nearest = cKDTree(corners.mean(axis=1)).query(
         [marking.corners_map.mean(axis=0) for marking in parted.markings]
     )
     are_same = away_m < 0.3
     off_mm, ratio = [], []
     for number in np.flatnonzero(are_same).tolist():
-        marking, other = parted.markings[number], whole.markings[int(near[number])]
+        marking, other = parted.markings[number], whole.markings[int(nearest[number])]
         turn = min(
             range(4),
             key=lambda turn: np.abs(np.roll(marking.corners_map, turn, axis=0) - other.corners_map).max(),
@@ -423,20 +423,20 @@ def grow(lengths_km: list[float], section_m: float, workers: int, memory_gb: flo
 def _in_a_process(words: list[str], cache: Path) -> dict[str, float]:
     """The figures that this module prints with some words of its command; its progress is shown."""
     command = [sys.executable, "-m", "tests.benchmarks.survey", *words, "--cache", str(cache)]
-    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
-    figures: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
+    process = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+    figures: dict[str, float] = json.loads(process.stdout.splitlines()[-1])
     return figures
 
 
 def main() -> None:
     """Print what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
-    asked = parser.add_mutually_exclusive_group(required=True)
-    asked.add_argument("--statistics", type=Path, metavar="DRIVE")
-    asked.add_argument("--joint", type=float, metavar="KM")
-    asked.add_argument("--grow", type=float, nargs="+", metavar="KM")
-    asked.add_argument("--apart", type=float, metavar="KM")
-    asked.add_argument("--one", type=float, metavar="KM", help=argparse.SUPPRESS)
+    choice = parser.add_mutually_exclusive_group(required=True)
+    choice.add_argument("--statistics", type=Path, metavar="DRIVE")
+    choice.add_argument("--joint", type=float, metavar="KM")
+    choice.add_argument("--grow", type=float, nargs="+", metavar="KM")
+    choice.add_argument("--apart", type=float, metavar="KM")
+    choice.add_argument("--one", type=float, metavar="KM", help=argparse.SUPPRESS)
     parser.add_argument("--every", type=int, default=3, metavar="N", help="look at every N-th image")
     parser.add_argument("--section-m", type=float, default=1000.0, metavar="M")
     parser.add_argument("--keep", type=Path, help=argparse.SUPPRESS)

@@ -82,9 +82,9 @@ def whole(scene) -> MethodResult:
 
 def test_sections_have_every_image_once_as_their_own(scene):
     sections = sections_of(scene.drive, 65.0)
-    own = np.concatenate([section.images[section.is_own] for section in sections])
+    numbers = np.concatenate([section.images[section.is_own] for section in sections])
     assert len(sections) == 2
-    np.testing.assert_array_equal(np.sort(own), np.arange(len(scene.drive.images)))
+    np.testing.assert_array_equal(np.sort(numbers), np.arange(len(scene.drive.images)))
     assert all(not section.is_own.all() for section in sections)
 
 
@@ -148,8 +148,8 @@ def test_what_goes_with_the_map_is_of_the_whole_drive(scene, result, whole):
 def test_a_section_without_a_marking_is_named_in_one_line(scene, tmp_path):
     first = sections_of(scene.drive, 65.0)[0].images
     bare = [
-        replace(found, markings=()) if found.image in set(first.tolist()) else found
-        for found in scene.detections
+        replace(in_image, markings=()) if in_image.image in set(first.tolist()) else in_image
+        for in_image in scene.detections
     ]
     with pytest.raises(
         MappingError, match=r"section \d, about x .* m, y .* m: no markings were found"

@@ -78,17 +78,17 @@ def detect_in_pieces(
         _log.info("detections in %d of %d images reused from an earlier run", total - len(todo), total)
     progress(total - len(todo), total)
     piece_so_far: _Piece = []
-    done = 0
+    finished = 0
 
     def take(detections: ImageDetections) -> None:
-        nonlocal done
-        done += 1
+        nonlocal finished
+        finished += 1
         start = detections.image - detections.image % PIECE
         piece_so_far.append(replace(detections, image=detections.image - start))
         if len(piece_so_far) == min(PIECE, total - start):
             pieces[start] = cache.put(_DETECT, keys[start], _Piece, piece_so_far)
             piece_so_far.clear()
-        progress(total - len(todo) + done, total)
+        progress(total - len(todo) + finished, total)
 
     if todo:
         (detect or detect_images)(drive, options, todo, context.executor, take)
