@@ -30,7 +30,9 @@ def hd_map():
 
 
 def values(findings, name):
-    return [one.value for finding in findings for one in finding.quantities if one.name == name]
+    return [
+        quantity.value for finding in findings for quantity in finding.quantities if quantity.name == name
+    ]
 
 
 def test_lengths_widths_gaps_and_spacings_are_measured(tmp_path, hd_map):

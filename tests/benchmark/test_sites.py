@@ -25,7 +25,7 @@ from v2hdm.simulate.port.config import PortConfig, SurveyConfig
 from v2hdm.simulate.port.drive import folder_of_port, true_drive
 
 
-def quiet(done, total):
+def quiet(finished, total):
     """Progress that nobody sees."""
 
 

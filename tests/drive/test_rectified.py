@@ -26,21 +26,21 @@ LENS = CameraInfo(
 
 def renamed(folder, topic):
     """The messages of ``folder`` with its front images on ``topic``."""
-    made = messages_of(folder)
-    made.rows = [(at, topic if name == RAW else name, message) for at, name, message in made.rows]
-    return made
+    messages = messages_of(folder)
+    messages.rows = [(at, topic if name == RAW else name, message) for at, name, message in messages.rows]
+    return messages
 
 
 def rectified_bag(folder, path, topic):
     """The bag of ``folder`` whose front images are on ``topic``, turned by TURN, of a lens that bends."""
-    made = renamed(folder, topic)
-    for _, name, message in made.rows:
+    messages = renamed(folder, topic)
+    for _, name, message in messages.rows:
         if name == "/sensing/front/camera_info":
             message.d[:] = LENS.distortion
             message.p[[0, 5]] = 47.0, 47.5
             message.p[3] = -9.4  # of a stereo pair's right camera
             message.r[:] = TURN.ravel()
-    return write_ros2(path, made)
+    return write_ros2(path, messages)
 
 
 def drive_of(folder, tmp_path, topic, **info):

@@ -99,10 +99,10 @@ def test_an_upload_that_stopped_anywhere_is_no_result_and_is_done_again(calls, m
     new = {"map": b"4", "log": b"5", "own": b"6"}
     with suppress(Stop):
         upload(stopping(memory, calls), new, "us", quiet)
-    kept = {"map": b"1", "log": b"2", "old": b"3"}
+    old_files = {"map": b"1", "log": b"2", "old": b"3"}
     whole = is_whole_at(memory.below("run"))
-    found = {name: data for name, data in there(memory).items() if name != UNFINISHED}
-    assert not whole or found in (kept, new)
+    files = {name: data for name, data in there(memory).items() if name != UNFINISHED}
+    assert not whole or files in (old_files, new)
     assert whole == (calls < 2 or calls > 8)
     assert put(memory, **new)
     assert there(memory) == new

@@ -60,7 +60,7 @@ class Comparison:
     misfit: Misfit | None  # None where too little is found to tell
 
     def count(self, fate: Fate) -> int:
-        """How many findings are of that fate."""
+        """The number of findings with that fate."""
         return sum(finding.fate is fate for finding in self.findings)
 
     @property

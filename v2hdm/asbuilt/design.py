@@ -158,7 +158,7 @@ _LEAST_AREA_M2 = 1e-4  # least area of a shape, m^2: a centimetre squared
 def check_place(places: FloatArray, others: FloatArray, source: str, called: str) -> None:
     """Raise MapFileError where all ``places`` (N, 2) of a source lie far from ``others`` (M, 2), m.
 
-    ``called`` is what the others are. The message says so where swapped axes explain it.
+    ``called`` names the others. The message names swapped axes where they explain it.
     """
     low = others.min(axis=0)
     high = others.max(axis=0)

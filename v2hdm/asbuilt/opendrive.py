@@ -16,7 +16,7 @@ from v2hdm.store.files import read_text
 _SAME_PLACE_M = 1e-6  # distance, m, of a last corner that repeats the first
 _PAINT_M = 0.1  # largest height, m, of an object that may be paint: posts and barriers are higher; chosen
 _MOST_REPEATED = 100_000  # repetitions of an object; a road of 100 km has fewer dashes
-_STEP_M = 0.05  # step, m, by which a spiral is integrated: it is exact to a micrometre in bends of roads
+_STEP_M = 0.05  # integration step of a spiral, m: exact to a micrometre in bends of roads
 
 
 class ObjectOutline(NamedTuple):

@@ -132,7 +132,7 @@ def _is_ours(path: Path) -> bool:
 def of_known_kinds(
     shapes: Iterable[Drawn], classes: Collection[str], source: Source, path: Path
 ) -> list[tuple[Drawn, str | None]]:
-    """Shapes with their classes; those with names of no class are left out, with one line that says so."""
+    """Shapes with their classes; shapes whose names match no class are left out, with one warning line."""
     stated_kinds = source.kinds or {}
     for name, stated in stated_kinds.items():
         if stated not in classes:
@@ -264,7 +264,7 @@ def _read_geopackage(path: Path, source: Source) -> _File:
         files.append(_of_features(features, authority if system.get("srs_id", 0) > 0 else None))
     systems_used = {file.crs for file in files if file.shapes}
     if len(systems_used) > 1 and source.crs is None:
-        raise MapFileError(f"{path}: its layers are of several systems; give one with one system")
+        raise MapFileError(f"{path}: its layers use several coordinate systems; give a file that uses one")
     shapes = [shape for file in files for shape in file.shapes]
     return _File(shapes, next(iter(systems_used), None), sum(file.lines for file in files))
 

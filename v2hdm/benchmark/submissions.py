@@ -35,7 +35,7 @@ _log = logging.getLogger(__name__)
 
 VERDICTS = ("PASS", "WARN", "FAIL")
 
-_SWAPPED = 2.0  # factor by which more markings must match with swapped axes to call them swapped; chosen
+_SWAPPED = 2.0  # swapped axes must match this many times more markings to be reported as swapped; chosen
 
 
 @dataclass(frozen=True)

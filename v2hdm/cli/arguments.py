@@ -50,7 +50,7 @@ def log_to_terminal() -> None:
     terminal.setFormatter(logging.Formatter("%(message)s"))
     terminal.addFilter(_Once())
     logging.basicConfig(handlers=[terminal])
-    logging.getLogger("v2hdm.io").setLevel(logging.INFO)  # an import may take minutes, and says so
+    logging.getLogger("v2hdm.io").setLevel(logging.INFO)  # an import may take minutes and logs its progress
 
 
 class _Once(logging.Filter):

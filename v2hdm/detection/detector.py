@@ -101,7 +101,7 @@ class Detector:
     def detect_in(
         self, output: NetworkOutput, image_bgr: np.ndarray, camera: Camera, has_boundaries: bool = True
     ) -> tuple[tuple[MarkingDetection, ...], tuple[LaneDetection, ...]]:
-        """Find the markings and lanes of an image of which the network's output is known."""
+        """Find the markings and lanes of an image from the network's output."""
         looked = last(self.steps_in(output, image_bgr, camera, has_boundaries))
         return looked.markings, looked.lanes
 
@@ -114,7 +114,7 @@ class Detector:
     def steps_in(
         self, output: NetworkOutput, image_bgr: np.ndarray, camera: Camera, has_boundaries: bool = True
     ) -> Steps[Looked]:
-        """As :meth:`steps`, of an image of which the network's output is known."""
+        """As :meth:`steps`, from the network's output on the image."""
         with lap("propose"):
             proposals = self.propose(output, camera)
         yield

@@ -131,7 +131,7 @@ class _Course:
         future.add_done_callback(lambda _: self.inbox.put(number))
 
     def next_message(self) -> _Step | int:
-        """The next step that is told, or the number of a job that is over; else WorkerError."""
+        """The next reported step, or the number of a finished job; raises WorkerError otherwise."""
         client = self._cluster.client
         last_s = time.monotonic()
         while True:

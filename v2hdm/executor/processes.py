@@ -96,7 +96,7 @@ class _Pool:
             self._pool = ProcessPoolExecutor(workers, spawn, _begin, (stage,))
 
     def submit(self, job: object) -> Future[Any]:
-        """Have a job done; where processes have died, its result says so."""
+        """Submit a job; its future fails if a process of the pool has died."""
         with undisturbed_starts():
             try:
                 return self._pool.submit(_perform, job)

@@ -42,7 +42,7 @@ NOISES = len(_ERRORS_OF_POSES) + 2
 """Kinds of noise: that of observations, the errors of poses, and that of all other priors."""
 
 POSITION_NOISE = 1
-"""The kind that is of positions."""
+"""The kind of position errors."""
 
 _AT_ONCE = 64  # columns whose gradients are in memory at a time
 _NUMBERS_AT_ONCE = 1 << 25  # most numbers, of 8 bytes, in columns that are solved for together

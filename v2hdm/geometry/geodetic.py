@@ -83,8 +83,8 @@ _LONGEST_CRS = 20_000  # letters of a system's description: WKT of a compound on
 LOCAL = "local"  # name of the map's own frame as a coordinate system
 _GRID_DECIMALS = 4  # decimals of a coordinate in metres: 0.1 mm
 _DEGREE_DECIMALS = 9  # decimals of a latitude or longitude in degrees: 0.1 mm on the ground
-_ZONE_DEG = 6.0  # width of a zone, deg of longitude, by which a grid may be used beyond its edges for a job
-_BESIDE_DEG = 1.0  # longitude, deg, by which a zone's grid is in use beyond its edges
+_ZONE_DEG = 6.0  # deg of longitude that a job's grid may reach beyond a zone's edges: one zone
+_BESIDE_DEG = 1.0  # deg of longitude that a zone's grid is used beyond the zone's edges
 
 
 @dataclass(frozen=True)

@@ -238,7 +238,7 @@ def interpolate(
 
 
 def in_order(image: Image) -> tuple[int, float, str]:
-    """Key by which a drive's images are sorted."""
+    """The sort key of a drive's images."""
     return image.session, image.taken_s, image.camera
 
 

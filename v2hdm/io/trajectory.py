@@ -33,8 +33,8 @@ _FARTHEST_M = 1e8  # coordinates on the earth end at ten thousand kilometres
 _FARTHEST_FROM_ORIGIN_M = 1e5  # a map is flat, and there the ground is 800 m below it
 _LEAP_M = 1e4  # least step, m, between poses that another grid's coordinates make: a zone's are 400 km off
 _FASTEST_MPS = 300.0  # no vehicle is faster, m/s
-_STRAYS = 0.05  # share of times out of order up to which these are left out; more are of two recordings
-LATE_S = 1.0  # a reading that comes later than this after its successor is of another clock or recording
+_STRAYS = 0.05  # largest share of times out of order that is left out; more mean two recordings
+LATE_S = 1.0  # a reading this late after its successor comes from another clock or recording
 
 _UNITS: Mapping[str, float] = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 """How many of each unit, in which stamps may be by mistake, make a second."""

@@ -1,4 +1,4 @@
-"""The localiser: the newest looks and the odometry in, the vehicle's pose and what it is worth out."""
+"""The localiser: takes the newest detections and the odometry, gives the vehicle's pose and its bounds."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ from v2hdm.records import BoolArray, Calibration, FloatArray, HDMap
 
 _LAG_S = 1.0  # images may be so late
 _NO_IMAGE_S = 1.0  # time, s, without an image that is said
-_FUTURE_S = 2.0  # a stamp farther ahead of the odometry, s, is of another clock
+_FUTURE_S = 2.0  # a stamp farther ahead of the odometry, s, comes from another clock
 # With a larger standard deviation of the place the vehicle does not know where it is: half a dash's gap.
 _LOST_M = 0.3
 _MOST_FEATURES = 36  # markings, stretches of lines and areas whose places' errors are states: those seen last
@@ -520,7 +520,7 @@ class Localizer:
         return self._moved_to(belief, stamp_s, has_untold)
 
     def _missing(self, stamp_s: float) -> dict[str, str]:
-        """Sentences on cameras of which no image has come lately."""
+        """Sentences on cameras that have sent no image lately."""
         if not self._images_s:
             waited_s = stamp_s - self._log.stamps_s[0] if self._log.stamps_s else 0.0
             return {"images": "no image has come yet"} if waited_s > _NO_IMAGE_S else {}

@@ -149,7 +149,7 @@ def search(
     prior: Prior | None,
     word_scores: WordScores = _no_words,
 ) -> list[Place]:
-    """The places of a patch, the likeliest first; ``prior`` is of the vehicle at a pose of the odometry."""
+    """The places of a patch, the likeliest first; ``prior`` is the vehicle's at a pose of the odometry."""
     objects = patch.sure
     if len(objects) < 2 or not len(paint):
         return []

@@ -195,7 +195,7 @@ def _of_camera(number: int, road: RoadDetector | None, rough: RoughCamera) -> It
 def _newest_frames(
     source: str, road: RoadDetector | None, rough: RoughCamera, are_read_ahead: bool
 ) -> Iterator[Frame]:
-    """The newest frame each time, of a camera or a folder, of which one may be read while another is seen."""
+    """The newest frame of a camera or a folder each time; the next is read while the last is processed."""
     path = Path(source)
     if source.isdecimal() and not path.exists():
         return NewestFrames(_of_camera(int(source), road, rough))

@@ -17,7 +17,7 @@ def limit_steps(data: Any, path: Path) -> None:
 
 @contextmanager
 def opened(path: Path, how: str) -> Iterator[sqlite3.Connection]:
-    """A connection to read the file at ``path``; ``how`` is of SQLite's own options."""
+    """Open the file at ``path`` for reading; ``how`` holds SQLite's own options."""
     with closing(sqlite3.connect(f"{path.resolve().as_uri()}?{how}", uri=True)) as data:
         limit_steps(data, path)
         yield data

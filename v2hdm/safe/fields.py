@@ -17,7 +17,7 @@ _HIGHEST_FRAME_M = 12.0  # of a vehicle above the ground, straddle carriers incl
 _LONGEST_DATUM = 200  # letters of a datum's name; chosen
 _LARGEST_PX = 65535  # side of an image: JPEG has no larger one
 _LONGEST_FOCAL_PX = 1e6  # focal length, or offset of the centre, of any camera; chosen
-_ROUNDING = 1e-3  # share by which a covariance may be off for having been rounded
+_ROUNDING = 1e-3  # relative rounding error that a covariance may have
 _MIDDLE = 1.0  # focal lengths from the axis to 45 degrees from it: farther out radial terms prevail
 _WIDEST_RAD = np.deg2rad(89.5)  # rays farther from the axis have no pixel in the pinhole image
 

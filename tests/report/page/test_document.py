@@ -39,7 +39,9 @@ def make_survey(folder):
         hd_map = read_geojson(result / "map.geojson")
         Context().run(write_geojson, replace(hd_map, origin=HAMBURG), result / "map.geojson", None)
         write_job(result, StatedJob(JOB))
-        mountings = {name: one.calibration.cam_from_vehicle for name, one in read_cameras(result).items()}
+        mountings = {
+            name: camera.calibration.cam_from_vehicle for name, camera in read_cameras(result).items()
+        }
         write_coverage(result, coverage_of(dated, mountings))
     return result, dated
 

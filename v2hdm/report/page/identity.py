@@ -30,7 +30,7 @@ class Identity(NamedTuple):
 
 
 def identity_of(facts: Facts, reference: Reference) -> Identity:
-    """All of it; what nobody has stated says so."""
+    """All fields; a field that nobody has stated reads so."""
     job = facts.job.job
     survey = (
         Row("Site", job.site or NOT_STATED),

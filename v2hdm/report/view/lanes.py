@@ -26,7 +26,7 @@ class Lanes:
     """The lane graph of a map, as its corrections are now; it is made anew where these change it."""
 
     def __init__(self, hd_map: HDMap, trajectories: Sequence[Trajectory]) -> None:
-        """``trajectories`` are of the drives, in the frame of the map."""
+        """``trajectories`` are those of the drives, in the map frame."""
         self._hd_map = hd_map
         self._trajectories = trajectories
         self._lock = threading.Lock()

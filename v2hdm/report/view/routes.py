@@ -109,7 +109,7 @@ class Shown:
 
 
 class Pages:
-    """The answers, of which the slow ones are made once, by whoever asks first."""
+    """The server's answers; slow ones are computed once, at the first request."""
 
     def __init__(self, shown: Shown) -> None:
         self._shown = shown

@@ -27,7 +27,7 @@ _LEAST_OFFSET_M = 0.03  # a smaller offset is no finding, however sure it is: co
 
 _MOUNTING_LIMIT_SIGMAS = 5.0
 """Largest deviation of a camera's mounting, solved alone, from that solved with all cameras, in the sigmas of
-the former: below 2 on clean drives."""
+the drift: below 2 on clean drives."""
 
 _GROUND_LIMIT_SIGMAS = 4.0
 """Largest root mean square of a mounting's deviations, in the sigmas of both: less than one in a million by

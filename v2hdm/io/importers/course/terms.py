@@ -66,7 +66,7 @@ _GYRO_RAD = 1.8e-4  # angle random walk after a second, rad: .01 deg/s per root 
 _WHEELS_M_S = 0.03  # noise of a wheel's speed, m/s: counts of an encoder
 _DRIFT_SHARE = 0.5  # of a position's variance, that drifts: as in records.PoseNoise
 _DRIFT_OVER_M = 30.0  # distance over which a position's drift fades, m: as in records.PoseNoise
-_LEAST_WAY_M = 0.01  # way by which a drift fades at least from epoch to epoch: it fades with time, too
+_LEAST_WAY_M = 0.01  # least way per epoch over which a drift fades, m: it fades with time, too
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class State:
 
 
 def terms_of(course: Course, state: State, way_m: FloatArray) -> list[Term]:
-    """All residuals; ``way_m`` (P - 1,) is the way between epochs, by which noise grows."""
+    """All residuals; ``way_m`` (P - 1,) is the way between epochs; noise grows with it."""
     return [
         _positions(course, state),
         _drifts(course, state, way_m),
