@@ -1,10 +1,10 @@
 """Each extra keeps what the documents promise: ``make installs`` installs the wheel and tries it.
 
 The wheel is built once. The base install and ``[map]`` have an environment each; ``[map,ros]``,
-``[map,video]``, ``[map,text]`` and ``[map,pdf]`` stand on ``[map]``. A page, or a section, begins with what it needs; the
-first command there with each word of :data:`PROMISES` runs in the environment with just that, on the small
-drive of the documents' tests, which the first command of ``[map]`` renders and maps. The documents' tests run
-all commands.
+``[map,video]``, ``[map,text]`` and ``[map,pdf]`` stand on ``[map]``. A page, or a section, begins with what
+it needs; the first command there with each word of :data:`PROMISES` runs in the environment with just that,
+on the small drive of the documents' tests, which the first command of ``[map]`` renders and maps. The
+documents' tests run all commands.
 """
 
 from __future__ import annotations
