@@ -26,6 +26,7 @@ import cv2
 
 from v2hdm.errors import WorkerError
 from v2hdm.executor.executor import TWICE_DEAD, Executor, JobProgress, Outcomes, Stage
+from v2hdm.executor.memory import keep_freed_memory
 from v2hdm.progress import silent
 from v2hdm.settings import THREAD_VARIABLES
 
@@ -142,6 +143,7 @@ def _perform(job: object) -> object:
 
 def prepare_process() -> None:
     """Make a worker process one of one thread, whose log is for the results to state."""
+    keep_freed_memory()
     cv2.setNumThreads(1)
     torch: Any = sys.modules.get("torch")
     if torch is not None:
