@@ -17,9 +17,7 @@ _QUERY = re.compile(
 )
 _AZURE = ("abfs", "abfss")  # whose URLs name a container where others have a login
 _MASK = "***"
-_MOST_MASKED = (
-    10_000  # letters of a message that are looked at for secrets; the middle of longer ones is cut out
-)
+_MOST_MASKED = 10_000  # characters of a message that are searched for secrets; its middle is cut beyond
 
 
 def masked(text: str) -> str:

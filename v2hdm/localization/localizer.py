@@ -45,25 +45,23 @@ from v2hdm.localization.starting import Quest
 from v2hdm.localization.way import Way
 from v2hdm.records import BoolArray, Calibration, FloatArray, HDMap
 
-_LAG_S = 1.0  # images may be so late
-_NO_IMAGE_S = 1.0  # time, s, without an image that is said
+_LAG_S = 1.0  # images may be this late, s
+_NO_IMAGE_S = 1.0  # time without an image, s, after which a reason says so
 _FUTURE_S = 2.0  # a stamp farther ahead of the odometry, s, comes from another clock
 # With a larger standard deviation of the place the vehicle does not know where it is: half a dash's gap.
 _LOST_M = 0.3
 _MOST_FEATURES = 36  # markings, stretches of lines and areas whose places' errors are states: those seen last
-_STARTED = 4  # images from the start on whose agreement makes it sure
-_START_SIGMA = np.array([0.25, 0.25, np.deg2rad(1.5)])  # of a place that was found, m, m and rad
-_UNSTATED = np.diag(np.square([0.01, 0.01, 0.01, *(3 * [np.deg2rad(0.05)])]))  # of a calibration without one
-_AGAIN_SIGMA_M = (
-    4.0  # standard deviation of the place, m, and of the heading, rad, from which a lost one is sought
-)
-_AGAIN_SIGMA_RAD = 0.2  # of its heading
-_TURNED_RAD = np.deg2rad(1.0)  # standard deviation of what a camera that was pushed has turned
-_LOOSENED_RAD = np.deg2rad(0.2)  # of what a mounting has turned that is found to have turned slowly
-_PINNED_RAD = np.deg2rad(0.01)  # of what the others have meanwhile
-_BEFORE_S = 0.25  # so long before it was noticed, s, a mounting may have turned
-_LATER_S = 0.1  # standard deviation, s, of how much later than thought an odometry may be
-_UNDECIDED_S = 0.5  # time, s, for which no bound is stated after an image that both may explain
+_STARTED = 4  # number of images after the start that must agree before the place is sure
+_START_SIGMA = np.array([0.25, 0.25, np.deg2rad(1.5)])  # standard deviations of a place found, m, m, rad
+_UNSTATED = np.diag(np.square([0.01, 0.01, 0.01, *(3 * [np.deg2rad(0.05)])]))  # where a calibration has none
+_AGAIN_SIGMA_M = 4.0  # standard deviation of a lost vehicle's place when the search begins again, m
+_AGAIN_SIGMA_RAD = 0.2  # standard deviation of its heading then, rad
+_TURNED_RAD = np.deg2rad(1.0)  # standard deviation of the turn of a camera that was pushed
+_LOOSENED_RAD = np.deg2rad(0.2)  # standard deviation of the turn of a mounting that turned slowly
+_PINNED_RAD = np.deg2rad(0.01)  # standard deviation of the other mountings' turn meanwhile
+_BEFORE_S = 0.25  # a mounting may have turned this long before it was noticed, s
+_LATER_S = 0.1  # standard deviation of an odometry's unexpected delay, s
+_UNDECIDED_S = 0.5  # time without a bound after an image with two possible causes, s
 _FEW = 0.7  # share of an image's detections under which a turned mounting and a late odometry are tried
 
 
@@ -531,7 +529,7 @@ class Localizer:
         }
 
     def _pose_of_search(self, stamp_s: float, reasons: dict[str, str]) -> Pose:
-        """The pose while nothing is believed of the place."""
+        """The pose while the place is unknown."""
         if (quest := self._search.prior) is not None and not len(self.paint.near(quest.pose[:2], 60.0)):
             reasons["place"] = (
                 "no marking of the map lies within 60 m of where the vehicle should be: is it the map of "
@@ -539,11 +537,7 @@ class Localizer:
             )
             self._is_lost = True
         status = Status.LOST if self._is_lost or self._pace_reason else Status.INITIALISING
-        nothing = np.full((3, 3), np.inf)
-        infinite = (np.inf, np.inf)
-        return Pose(
-            stamp_s, status, None, nothing, infinite, np.inf, (1.0, 0.0, 0.0), 0, tuple(reasons.values())
-        )
+        return Pose.unknown(stamp_s, status, tuple(reasons.values()))
 
     def _pose(self) -> Pose:
         """The pose at the newest stamp."""

@@ -136,9 +136,7 @@ _ABOUT = "files that v2hdm wrote here, which it may remove to make room; touched
 
 _VERSION = 3  # raised whenever an import comes out as other files
 _IMAGES = (".png", ".jpg", ".jpeg")  # endings of files that are listed without a digest
-_WRITER = (
-    f"{HOST}-{secrets.token_hex(4)}"  # this process in names of unfinished files: its host and 8 hex digits
-)
+_WRITER = f"{HOST}-{secrets.token_hex(4)}"  # this process in unfinished files' names
 _STALE_S = 3600.0  # time without a write after which an unfinished folder counts as left by a killed run, s
 
 
