@@ -208,7 +208,7 @@ def _start(problem: Problem, engine: TorchEngine, robust: Loss, options: SolveOp
 def _nearer(
     problem: Problem, engine: TorchEngine, robust: Loss, estimate: Estimate, opening: Whitening
 ) -> Start:
-    """The start with the cameras where a Newton step leads, if that is nearer to the optimum.
+    """The start with its cameras moved by a Newton step, if that is nearer to the optimum.
 
     Corners are back-projected anew, and so follow the cameras exactly: by the step itself they would to first
     order. Of 4,000 observations that saves three of six evaluations, with frame states four of fourteen.

@@ -65,7 +65,7 @@ class Comparison:
 
     @property
     def conforms(self) -> bool:
-        """Whether nothing is off, missing or extra, and the design as a whole lies where it should."""
+        """Whether nothing is off, missing or extra, and the whole design is in place."""
         wrong = (Fate.OFF, Fate.MISSING, Fate.EXTRA)
         is_moved = self.misfit is not None and self.misfit.is_significant
         return not is_moved and not any(finding.fate in wrong for finding in self.findings)
@@ -191,7 +191,7 @@ def _extra(shape: BuiltShape) -> Finding:
 
 
 def _is_designed(shape: BuiltShape, kinds: Sequence[str | None]) -> bool:
-    """Whether the design has shapes of this class, so that one more is not meant."""
+    """Whether the design has shapes of this class, which makes this one extra."""
     return None in kinds or shape.kind in kinds
 
 

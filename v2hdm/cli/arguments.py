@@ -47,7 +47,7 @@ def drive_of(parsed: argparse.Namespace) -> Drive:
 
 
 def log_to_terminal() -> None:
-    """Show warnings, and what reading a drive takes and decides, on stderr."""
+    """Show warnings, and the choices of the drive's reader, on stderr."""
     terminal = logging.StreamHandler()
     terminal.setFormatter(logging.Formatter("%(message)s"))
     terminal.addFilter(_Once())

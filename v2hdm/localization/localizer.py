@@ -147,14 +147,14 @@ class Localizer:
     def update(
         self, images: Sequence[Look] = (), motion: Sequence[Motion] = (), fixes: Sequence[Fix] = ()
     ) -> Pose:
-        """Take what is new, in any order, and say where the vehicle is at the newest stamp of all."""
+        """Take new detections and motions, in any order; return the pose at the newest stamp."""
         for sample in motion:
             problem = self._log.add(Motion(*(float(value) for value in sample)))
             if problem is not None:
                 self._forget(problem)
         if self._log.refused:
             self._reasons["odometry"] = (
-                f"{self._log.refused} samples of the odometry are no motion of a road vehicle; "
+                f"{self._log.refused} samples of the odometry are impossible for a road vehicle; "
                 "state m/s and rad/s"
             )
         self._way.follow_all_but(_LAG_S)
@@ -165,7 +165,7 @@ class Localizer:
         return replace(self._pose(), images_s=dict(self._images_s))
 
     def regions(self, camera: str, stamp_s: float) -> FloatArray | None:
-        """Where to look in the next image of a camera, taken at about a time: around what the map will show.
+        """The boxes to search in a camera's image at about ``stamp_s``: around markings that the map expects.
 
         Boxes (R, 4) of left, top, right and bottom, px, for :meth:`v2hdm.detection.road.RoadDetector.detect`.
         None to look everywhere: every few images, and where the place, the map or a mounting is in doubt, few
@@ -243,7 +243,7 @@ class Localizer:
             self._see(past.look, is_new=False)
 
     def _look_again(self, look: Look) -> None:
-        """Hold all that an image shows against the map; the look at parts of it has moved the belief."""
+        """Test the map with all of an image; its regions have moved the belief already."""
         self._looking.of(look.camera).note_all(look.stamp_s)
         earlier = [
             past.before
@@ -258,7 +258,7 @@ class Localizer:
         self._agreement.note(judged, self._way.length_m, look)
 
     def _see(self, look: Look, is_new: bool) -> None:
-        """Move the belief to a look, and take what that shows."""
+        """Predict the belief to a look and update it with the look."""
         calibration = self.calibrations[look.camera]
         quads = sighted(look, calibration)
         if is_new:
@@ -315,7 +315,7 @@ class Localizer:
         return range(begin, begin + 3)
 
     def _let_turn(self, since_s: float) -> None:
-        """Go back to before a mounting turned, and see again what came since with mountings that are free.
+        """Go back to before a mounting turned, and repeat the looks since then with free mountings.
 
         Which of them has turned is not known: what one image took for the vehicle's own roll, free
         mountings and the vehicle's springs, which fade, explain better and better.
@@ -350,7 +350,7 @@ class Localizer:
         return [self._numbers[turned.camera] for turned in self._rig.turned if turned.is_slow]
 
     def _located(self, belief: Belief, look: Look, quads: Sighted, is_new: bool) -> Belief:
-        """The belief after a look; other causes are tried where too little of it is explained."""
+        """The belief after a look; other causes are tried if it explains too little of the look."""
         noise = self._noise[look.camera]
         scene = self._scene(belief, look, quads)
         located = locate(belief, scene)
@@ -417,7 +417,7 @@ class Localizer:
         return Scene(quads, self.paint, plane, self._numbers[look.camera], calibration, factor)
 
     def _find(self, look: Look) -> None:
-        """Search for a place that explains what is seen as no other does."""
+        """Search for the one place that explains the detections."""
         local = self._way.at(look.stamp_s)
         proposal = self._search.propose(
             look, local, self._way.length_m, self.paint, self.areas, self.calibrations, self._tried
@@ -454,7 +454,7 @@ class Localizer:
         self._reasons.pop("lost", None)
 
     def _judge(self, look: Look) -> None:
-        """Whether the belief still holds, by what it explains."""
+        """Test whether the belief still explains the looks."""
         assert self._belief is not None
         if not self._is_sure:
             self._confirmed += self._matched.markings >= 2
@@ -472,7 +472,7 @@ class Localizer:
             self._forget("no marking of the map was seen for too long")
 
     def _forget(self, reason: str) -> None:
-        """Give the belief up, and search about where it was."""
+        """Drop the belief, and search around its last place."""
         prior = self._search.prior
         if self._belief is not None and self._is_sure:
             pose = self._belief.mean[:3].copy()
@@ -488,7 +488,7 @@ class Localizer:
         self._reasons["lost"] = reason
 
     def _fix(self, fix: Fix) -> None:
-        """Keep a position by RTK until the images of before it have come."""
+        """Keep an RTK position until all earlier images have come."""
         belief = self._belief
         if belief is None:
             self._way.follow(fix.stamp_s)
