@@ -100,7 +100,7 @@ def test_a_geopackage_of_other_programs_is_in_the_system_of_its_layer(tmp_path, 
 
 def test_names_that_are_no_classes_are_left_out_unless_they_are_explained(tmp_path, hd_map, caplog):
     path = foreign(tmp_path / "a.geojson", hd_map, Class="MARK 02")
-    with pytest.raises(MapFileError, match=r"no classes: 'MARK 02' .18.; --class NAME=CLASS"):
+    with pytest.raises(MapFileError, match=r"unknown classes: 'MARK 02' .18.; --class NAME=CLASS"):
         read_design(path, hd_map)
     design = read_design(path, hd_map, Source(kinds={"MARK 02": "diamond"}))
     assert {shape.kind for shape in design.shapes} == {"diamond"}

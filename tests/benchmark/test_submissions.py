@@ -43,7 +43,7 @@ def test_a_map_of_ours_with_another_origin_is_brought_to_the_sites(tmp_path, ref
 def test_names_of_another_tool_are_explained(tmp_path, reference):
     features = [feature("rhombus", m.corners_map) for m in reference.truth.map.markings[:30]]
     path = write(tmp_path / "map.geojson", features)
-    with pytest.raises(MapFileError, match=r"no classes: 'rhombus' .30.; --class NAME=CLASS"):
+    with pytest.raises(MapFileError, match=r"unknown classes: 'rhombus' .30.; --class NAME=CLASS"):
         read_submission(path, reference.truth.map)
     submission = read_submission(path, reference.truth.map, Source(kinds={"rhombus": "diamond"}))
     assert {marking.kind for marking in submission.hd_map.markings} == {"diamond"}
@@ -67,7 +67,7 @@ def test_a_polygon_of_more_corners_is_scored_by_the_box_about_it(tmp_path, refer
 
 
 BAD = {
-    "swapped degrees": (lambda r: paint(r, swap=True), {}, "no longitude and latitude; are its axes swapped"),
+    "swapped degrees": (lambda r: paint(r, swap=True), {}, "not a longitude and latitude; are its axes swapped"),
     "grid without its name": (
         lambda r: paint(r, (351_000.0, 3_314_000.0), local=True), {}, "or is it in another system"
     ),
