@@ -150,7 +150,7 @@ def of_known_kinds(
             out.append((shape, kind))
     if unknown:
         named = ", ".join(f"{shown(name)} ({count})" for name, count in list(unknown.items())[:_MOST_NAMED])
-        line = f"{path}: left out shapes of unknown classes: {named}; name their class by --class NAME=CLASS"
+        line = f"{path}: left out shapes of unknown classes: {named}; --class NAME=CLASS names their class"
         if not out:
             raise MapFileError(line)
         _log.warning(line)
