@@ -33,10 +33,11 @@ map: $(MAP_INSTALLED)
 
 installed: $(DEV_INSTALLED)
 
-# The tests run side by side; more threads in each would only get in their way.
+# The tests run side by side; more threads in each would only get in their way. In the order of their folders
+# the last files are short: by their numbers of tests, the last ones would be long files of a test or two.
 test: export OMP_NUM_THREADS = 1
 test: $(DEV_INSTALLED)
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 check: $(DEV_INSTALLED)
 	$(BIN)/ruff format --check .
@@ -76,6 +77,7 @@ clean:
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.12 ...")'
 	$(PYTHON) -m venv $(VENV)
+	$(INSTALL) --upgrade pip
 
 $(MAP_INSTALLED): $(INSTALLED_FROM) | $(BIN)/python
 	@echo "installing into $(VENV): some minutes"

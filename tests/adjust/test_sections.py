@@ -10,7 +10,7 @@ from tests.adjust.scene import make_scene, with_ground, with_late_clocks
 from tests.adjust.site import DRIFTING
 from tests.adjust.test_sessions import joined, visited_again
 from v2hdm.adjust import ControlPoints, KnownLengths, Problem, SolveOptions, solve
-from v2hdm.adjust.sections import rounds
+from v2hdm.adjust.sections import rounds, summary
 from v2hdm.adjust.sections.blocks import BlockMatrix, BlockPattern
 from v2hdm.adjust.sections.parts import Part, cut
 from v2hdm.adjust.sections.rounds import Shape, save_part
@@ -284,3 +284,31 @@ def test_a_single_section_is_the_street(tmp_path):
     options = SolveOptions()
     part = np.zeros(60, dtype=np.int64)
     check(in_sections(tmp_path, scene.problem, options, part), scene.problem, options)
+
+
+def compare_pairs(number, part, solution):
+    """Covariances of groups of which some are known, beside those of groups that are asked for."""
+    covariance = solution.covariance
+    groups = np.arange(part.problem.corner_count // 3 * 3).reshape(-1, 3)[::-1]
+    # Every third group is not known, and one corner stands twice in a group.
+    groups[0, 1] = groups[0, 0]
+    known = groups[np.arange(len(groups)) % 3 > 0]
+    first, second = np.broadcast_arrays(known[:, :, None], known[:, None, :])
+    knowing = covariance.with_pairs(first.ravel(), second.ravel())
+    return knowing.corners(groups), covariance.corners(groups), knowing.pairs.of_groups(known).is_known
+
+
+@pytest.mark.parametrize("states", [("roll", "pitch"), ()])
+def test_covariances_of_pairs_are_those_of_groups(tmp_path, monkeypatch, states):
+    """Also where the corners of a pair are solved for one after the other, as in a long section."""
+    monkeypatch.setattr(summary, "_CORNERS_AT_ONCE", 7)
+    scene = make_scene(3, frames=100, jitter=DRIFTING if states else None, start_error_deg=0.5)
+    options = SolveOptions(pose_states=states)
+    parts, links = cut(scene.problem, np.arange(100) // 50, states)
+    for number, part in enumerate(parts):
+        save_part(tmp_path, number, part)
+    shape = Shape.of(scene.problem, options)
+    joint = join_parts(tmp_path, 2, links, shape, lambda number, part, solution: None)
+    for known, asked, is_known in finish_parts(tmp_path, joint, shape, compare_pairs):
+        assert is_known.all()
+        np.testing.assert_allclose(known, asked, rtol=1e-8, atol=1e-14)

@@ -18,7 +18,7 @@ from v2hdm.geometry.planar import length_along
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions, SizeOptions
 from v2hdm.mapping.results import NO_SEGMENT, MethodResult
-from v2hdm.mapping.sections import run
+from v2hdm.mapping.sections import run, work
 from v2hdm.mapping.sections.common import Names, named, with_owners
 from v2hdm.mapping.sections.faults import pooled_tests, refuse_contradicted
 from v2hdm.mapping.sections.joint import (
@@ -29,6 +29,7 @@ from v2hdm.mapping.sections.joint import (
     refuse_contradicting_drives,
     scatter_by_marking,
 )
+from v2hdm.mapping.sections.ours import Pairs
 from v2hdm.mapping.sections.run import map_in_sections
 from v2hdm.mapping.sections.section import sections_of
 from v2hdm.mapping.sections.work import Work
@@ -108,6 +109,21 @@ def test_the_map_is_that_of_the_drive(result, whole):
         assert np.abs(turned - np.eye(4)).max() < 1e-3
         sigma = np.sqrt(np.diag(calibration.covariance) / np.diag(whole.calibrations[name].covariance))
         np.testing.assert_allclose(sigma, 1.0, atol=0.01)
+
+
+def test_a_map_is_the_same_where_every_section_solves_for_all_that_it_shows(
+    scene, result, tmp_path, monkeypatch
+):
+    """Otherwise a section solves for its own candidates alone, and for each column of these once."""
+    none = np.zeros(0, dtype=np.int64)
+    monkeypatch.setattr(work, "of_ours", lambda final, is_ours: final)
+    monkeypatch.setattr(work, "near_corners", lambda bundle, is_ours: Pairs(none, none))
+    slowly = in_sections(scene, tmp_path)
+    assert len(slowly.hd_map.markings) == len(result.hd_map.markings)
+    for marking, other in zip(result.hd_map.markings, slowly.hd_map.markings, strict=True):
+        np.testing.assert_allclose(marking.corners_map, other.corners_map, atol=1e-9)
+        np.testing.assert_allclose(marking.covariance_m2, other.covariance_m2, rtol=1e-5, atol=1e-12)
+        np.testing.assert_allclose(marking.relative_sigma_m, other.relative_sigma_m, rtol=1e-5)
 
 
 def test_no_marking_is_mapped_twice(result):

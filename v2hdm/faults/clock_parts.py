@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from v2hdm.adjust.problem import Problem
-from v2hdm.adjust.sections.summary import JoinedCovariance
+from v2hdm.adjust.sections.joined import JoinedCovariance
 from v2hdm.adjust.solution import Solution
 from v2hdm.faults.clock_errors import ClockEvidence, errors_of_clocks
 from v2hdm.faults.jacobians import Whitened
