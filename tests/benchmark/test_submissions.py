@@ -67,7 +67,7 @@ def test_a_polygon_of_more_corners_is_scored_by_the_box_about_it(tmp_path, refer
 
 
 BAD = {
-    "swapped degrees": (lambda r: paint(r, swap=True), {}, "not a longitude and latitude; are its axes swapped"),
+    "swapped degrees": (lambda r: paint(r, swap=True), {}, "not a longitude and latitude; are its axes"),
     "grid without its name": (
         lambda r: paint(r, (351_000.0, 3_314_000.0), local=True), {}, "or is it in another system"
     ),
