@@ -177,7 +177,7 @@ def undisturbed_starts() -> Iterator[None]:
 
 
 def _start_tracker() -> None:
-    """Start the process that frees what killed processes leave; that it does so is no news for a user."""
+    """Start the resource tracker, and silence its messages on killed processes."""
     sys.warnoptions.append("ignore:resource_tracker:UserWarning")  # which it inherits
     try:
         resource_tracker.ensure_running()
