@@ -125,7 +125,7 @@ class _View:
 
 @dataclass(frozen=True)
 class _Eye:
-    """One image as a camera of the run: where it was, while each of its rows was read."""
+    """An image's camera and its poses while the rows were read."""
 
     info: CameraInfo
     cam_from_map: FloatArray  # (2, 4, 4), when the first and the last row was read
@@ -160,7 +160,7 @@ class _Eye:
         return distort_points(self.info, (1 - share) * first_px + share * last_px), depth_m
 
     def polygon(self, outline_map: FloatArray) -> tuple[FloatArray, bool]:
-        """The part (N, 2), recorded px, of an outline that lies in the image, and whether that is all."""
+        """The part (N, 2), recorded px, of an outline inside the image, and whether it is all of it."""
         depth_m = self.project(outline_map)[1]
         part = outline_map
         if (depth_m < _NEAREST_M).any():

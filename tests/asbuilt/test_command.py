@@ -61,8 +61,8 @@ def test_rules_take_the_place_of_a_design(site, capsys):
     ("words", "says"),
     [
         (["map.geojson", "nothing.geojson"], "nothing.geojson"),
-        (["map.geojson", "map.txt"], "is no design that can be read"),
-        (["map.geojson", "map.geojson", "--tolerance", "0"], "--tolerance 0: is no tolerance in m"),
+        (["map.geojson", "map.txt"], "is not a readable design"),
+        (["map.geojson", "map.geojson", "--tolerance", "0"], "--tolerance 0: is not a tolerance in m"),
         (["map.geojson", "map.geojson", "--class", "a"], "--class a: give it as NAME=CLASS"),
         (["nothing", "map.geojson"], "nothing"),
     ],

@@ -64,7 +64,7 @@ def test_the_true_map_has_a_perfect_score_and_a_moved_one_its_error(tmp_path, ca
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["make", "port3", "drive"], "'port3': is no site of the benchmark"),
+        (["make", "port3", "drive"], "'port3': is not a site of the benchmark"),
         (["score", "nothing.geojson", "streets"], "nothing.geojson: no such file"),
         (["score", "empty.geojson", "streets"], "has no marking of four corners to score"),
         (["score", "empty.geojson", "streets", "--class", "a"], "--class a: give it as NAME=CLASS"),

@@ -105,9 +105,9 @@ def line(**changes: object) -> dict[str, object]:
         ({"markings": [marking(corners_px=[[0, 0]] * 3)]}, "expected 4 x 2 numbers"),
         ({"markings": [marking(known=[1, 1, 1, 1])]}, "true or false"),
         ({"markings": [marking(colour="white")]}, "unknown key 'colour'"),
-        ({"markings": [marking(score=95)]}, "95 is no probability"),
+        ({"markings": [marking(score=95)]}, "95 is not a probability"),
         ({"markings": [], "lanes": [line(sigma_px=[1.0, -1.0])]}, "is not above 0"),
-        ({"markings": [], "lanes": [line(score=-1)]}, "-1 is no probability"),
+        ({"markings": [], "lanes": [line(score=-1)]}, "-1 is not a probability"),
     ],
 )
 def test_a_damaged_file_is_one_line_that_names_it(tmp_path, content, says):

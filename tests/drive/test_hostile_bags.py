@@ -77,7 +77,7 @@ def test_a_database_that_computes_its_rows_is_refused(mode, sql, folder, tmp_pat
         database.executescript(sql)
     data = plain.read_bytes()
     file.write_bytes(zstd.compress(data) if mode == CompressionMode.FILE else data)
-    with pytest.raises(DriveError, match="is no plain table of a recording"):
+    with pytest.raises(DriveError, match="is not a plain table of a recording"):
         read(tmp_path / "drive", topics_for(folder, bag))
 
 

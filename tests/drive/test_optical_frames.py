@@ -75,7 +75,7 @@ def test_a_frame_that_is_not_optical_is_named_with_the_mounting_that_its_turn_gi
     )
     assert (mount.frame, mount.vehicle_from_cam) == ("", None)
     assert (
-        "camera_link is no optical frame: its z axis, along which a camera looks, points 73 deg up"
+        "camera_link is not an optical frame: its z axis, along which a camera looks, points 73 deg up"
         in mount.problem
     )
     offer = yaml.safe_load(mount.offer.strip("'"))
@@ -119,7 +119,7 @@ def test_a_bag_whose_images_name_the_body_s_frame_is_one_answer_away_from_a_driv
     check = ["check", str(bag), "--no-ground", "--output", "out", "--write", "d"]
     assert run(check) == 2
     error = capsys.readouterr().err
-    assert "camera_link is no optical frame" in error
+    assert "camera_link is not an optical frame" in error
     assert "roi_vehicle" not in error
     (answer,) = re.findall(r"along its x axis: '(\{.*\})'", error)
     assert run([*check, "--set", f"cameras.front.mounting={answer}"]) in (0, 3)

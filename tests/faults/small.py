@@ -46,8 +46,8 @@ ROUTES = [
     *(("yaw_deg", cell, "yaw_deg|cells under|not a table") for cell in ("x", LONG)),
     *(("sigma_m", cell, "no position is known") for cell in ("inf", "1e300", "0.2")),
 ]  # fmt: skip
-OPEN = {"x_m": "positions that are no numbers", "stamp_s": "lines without a time"}
-OPEN |= {"yaw_deg": "headings that are no numbers"}
+OPEN = {"x_m": "positions that are not numbers", "stamp_s": "lines without a time"}
+OPEN |= {"yaw_deg": "headings that are not numbers"}
 
 
 def _routes() -> Iterator[Case]:

@@ -167,7 +167,7 @@ def test_speeds_in_kilometres_per_hour_are_said():
 def test_yaw_rates_in_degrees_are_said():
     localizer = Localizer(yard(0), cameras())
     pose = localizer.update([], [Motion(0.1 * k, 4.0, 12.0) for k in range(5)])
-    assert "5 samples of the odometry are no motion of a road vehicle" in pose.reasons[0]
+    assert "5 samples of the odometry are impossible for a road vehicle" in pose.reasons[0]
 
 
 def test_images_in_another_order_give_the_same_pose():
@@ -374,7 +374,7 @@ def test_lines_of_an_odometry_are_json_or_csv_and_may_hold_positions():
 @pytest.mark.parametrize(
     ("line", "says"),
     [
-        ("{", "line 1: is no JSON object"),
+        ("{", "line 1: is not a JSON object"),
         ("time,v", "names no motion"),
         ('{"speed": 3}', "give stamp_s, speed_m_s, yaw_rate_rad_s"),
         ('{"stamp_s": 1, "speed_m_s": "fast", "yaw_rate_rad_s": 0}', "speed_m_s is 'fast'; give a number"),

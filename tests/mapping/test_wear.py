@@ -13,7 +13,7 @@ from v2hdm.records import Calibration, HDMap, PaintLeft
 from v2hdm.simulate.port.build import build_port
 from v2hdm.simulate.port.config import PaintConfig, RouteConfig
 from v2hdm.simulate.render import ground
-from v2hdm.site.living.wear import with_wear
+from v2hdm.site.living.wear import Footage, with_wear
 
 FOOTPRINT_M = 0.012  # of a pixel of the nearest images, at which the renderer draws the flakes
 
@@ -54,7 +54,8 @@ def measured(folder, port, earlier=None):
     centres = np.array([paint.polygon_map.mean(axis=0) for paint in paints])
     nearest = [np.argmin(((centres - m.corners_map.mean(axis=0)) ** 2).sum(axis=1)) for m in markings]
     poses, grey = truth.map_from_vehicle, grey_reader(drive)
-    hd_map = with_wear(HDMap(tuple(markings)), drive.images, poses, calibrations, grey, shown, earlier)
+    footage = Footage(drive.images, poses, calibrations, None)
+    hd_map = with_wear(HDMap(tuple(markings)), footage, grey, shown, earlier)
     return hd_map, {m.id: share_rendered(paints[k]) for m, k in zip(markings, nearest, strict=True)}
 
 
@@ -106,12 +107,8 @@ def test_a_marking_that_no_image_shows_keeps_what_the_earlier_map_says(small_dri
     drive = read_drive(small_drive)
     away = replace(read_truth(drive).map.markings[0], corners_map=np.eye(4)[:, :2] + 1e4, id=1)
     before = HDMap((replace(away, paint=PaintLeft(0.7, 0.1)),))
-    arguments = (
-        drive.images,
-        [image.map_from_vehicle for image in drive.images],
-        {},
-        grey_reader(drive),
-        set(),
-    )
-    assert with_wear(HDMap((away,)), *arguments, before).markings[0].paint == PaintLeft(0.7, 0.1)
-    assert with_wear(HDMap((away,)), *arguments).markings[0].paint is None
+    footage = Footage(drive.images, [image.map_from_vehicle for image in drive.images], {}, None)
+    grey = grey_reader(drive)
+    updated = with_wear(HDMap((away,)), footage, grey, set(), before)
+    assert updated.markings[0].paint == PaintLeft(0.7, 0.1)
+    assert with_wear(HDMap((away,)), footage, grey, set()).markings[0].paint is None

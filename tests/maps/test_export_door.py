@@ -296,4 +296,4 @@ def test_questions_that_were_answered_in_their_file_are_followed(tmp_path, monke
     text = (tmp_path / "answers.geojson").read_text().replace('"connection"', '"colour"')
     (tmp_path / "answers.geojson").write_text(text)
     assert run([*again, "--answers", "answers.geojson", "--output", "there"]) == 2
-    assert "'colour' is no subject of a question" in capsys.readouterr().err
+    assert "'colour' is not a subject of a question" in capsys.readouterr().err

@@ -128,5 +128,5 @@ def test_a_base_of_another_frame_or_site_is_refused(results):
     far = [replace(image, map_from_vehicle=image.map_from_vehicle.copy()) for image in drive.images]
     for image in far:
         image.map_from_vehicle[0, 3] += 500.0
-    with pytest.raises(MapFileError, match="it is of another site"):
+    with pytest.raises(MapFileError, match="it is a map of another site"):
         check_together(base, replace(drive, images=far), "monday")

@@ -43,7 +43,7 @@ def test_what_is_not_ours_is_neither_replaced_nor_removed(memory):
     put(memory, map=b"1")
     memory.write("run/notes", b"mine")
     put(memory, map=b"2")
-    with pytest.raises(ConfigError, match="run/notes: is no object of ours"):
+    with pytest.raises(ConfigError, match="run/notes: was not written by V2HDM"):
         put(memory, map=b"3", notes=b"ours")
     assert there(memory) == {"map": b"2", "notes": b"mine"}
 
@@ -140,7 +140,7 @@ def test_what_others_put_there_during_an_upload_is_not_replaced(memory):
         if done == 1:
             memory.write("run/log", b"mine")
 
-    with pytest.raises(ConfigError, match="run/log: is no object of ours"):
+    with pytest.raises(ConfigError, match="run/log: was not written by V2HDM"):
         upload(memory.below("run"), {"map": b"1", "log": b"2"}, "us", meanwhile)
     assert there(memory)["log"] == b"mine"
 

@@ -90,12 +90,12 @@ def test_a_stated_speed_is_that_of_all_lanes():
 @pytest.mark.parametrize(
     ("answer", "message"),
     [
-        (("direction", "left", (30, 5), (35, 5)), "'left' is no direction"),
+        (("direction", "left", (30, 5), (35, 5)), "'left' is not a direction"),
         (("direction", "along", (30, 50), (35, 50)), r"no lane lies at \(30.0, 50.0\)"),
         (("connection", "yes", (30, 5), (35, 5)), r"no lane ends at \(30.0, 5.0\)"),
         (("connection", "yes", (30, 5), None), "it has one place"),
-        (("speed", "quick", (0, 0), None), "'quick' is no speed"),
-        (("speed", "-3", (0, 0), None), "'-3' is no speed"),
+        (("speed", "quick", (0, 0), None), "'quick' is not a speed"),
+        (("speed", "-3", (0, 0), None), "'-3' is not a speed"),
     ],
 )
 def test_an_answer_that_cannot_be_followed_is_one_line(answer, message):

@@ -26,7 +26,7 @@ from v2hdm.records import (
 
 @dataclass(frozen=True)
 class DesignShape:
-    """A piece of paint as it is meant to be: a closed ``outline_map`` (N, 2), m, counter-clockwise."""
+    """A piece of paint in the design: a closed ``outline_map`` (N, 2), m, counter-clockwise."""
 
     name: str  # of its feature in the file
     kind: str | None  # class, None where the file does not tell
@@ -35,7 +35,7 @@ class DesignShape:
 
 @dataclass(frozen=True)
 class Design:
-    """The shapes of a design in the frame of the map that it is compared with, and where they are from."""
+    """The shapes of a design in the frame of the map, and their source."""
 
     shapes: tuple[DesignShape, ...]
     source: str = "the design"

@@ -21,9 +21,7 @@ _SEMI_MAJOR_M = 6378137.0  # semi-major axis, m, of the ellipsoid WGS84 (NGA.STN
 _FLATTENING = 1 / 298.257223563  # flattening of the ellipsoid WGS84 (NGA.STND.0036)
 _ECCENTRICITY2 = _FLATTENING * (2 - _FLATTENING)  # square of the first eccentricity of WGS84
 
-_SAME_ELLIPSOID_M = (
-    1e-3  # difference, m, of axes of one ellipsoid: GRS80's semi-minor is 0.1 mm longer than WGS84's
-)
+_SAME_ELLIPSOID_M = 1e-3  # axes that differ less, m, are of one ellipsoid: GRS80's and WGS84's by 0.1 mm
 _WGS84 = ("World Geodetic System 1984", "World Geodetic System 1984 ensemble")  # datum's names in PROJ
 _CONFORMAL_DEG = 1e-3  # tolerance, deg, of a conformal grid's angles, for rounding
 

@@ -52,7 +52,7 @@ _CLOCKS: Mapping[float, str] = {
     37.0: "one is TAI (PTP), the other UTC (37 s since 2017)",
     315964800.0: "one counts from 1970, the other from 1980, as GPS does",
     315964782.0: "one is UTC since 1970, the other GPS time since 1980",
-    619315200.0: "the receiver's date is 1024 weeks early: its count of weeks has begun anew",
+    619315200.0: "the receiver's date is 1024 weeks early: its week number has rolled over",
 }
 """Differences of clocks that are mixed up, s (IERS Bulletin C; IS-GPS-200)."""
 
@@ -143,7 +143,7 @@ def read_tum(path: Path) -> Trajectory:
     stamp_s = table[:, 0] / (layout.per_s or units_per_second(table[:, 0]))
     order = in_order(stamp_s, str(path), "pose")
     if lost:
-        _log.warning("%s: left out %d of %d poses that are no numbers", path, lost, lost + len(table))
+        _log.warning("%s: left out %d of %d poses that are not numbers", path, lost, lost + len(table))
     if len(order) < len(table):
         left_out = len(table) - len(order)
         _log.warning("%s: left out %d of %d poses of equal or stray times", path, left_out, len(table))

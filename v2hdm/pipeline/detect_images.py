@@ -116,7 +116,7 @@ def detect_images(
 
 
 def _check_numbers(mounting: Sequence[float] | None, limit: int | None) -> None:
-    """Raise ConfigError for a mounting that is not of three numbers, or no positive limit."""
+    """Raise ConfigError unless a mounting has three numbers and a limit is positive."""
     if mounting is not None and len(mounting) != 3:
         raise ConfigError(
             f"--mounting: {len(mounting)} numbers; give height (m), pitch (deg) and field of view (deg)"
@@ -285,7 +285,7 @@ def _glances(
     regions: Regions | None,
     later: SecondLooks | None,
 ) -> Iterator[_Glance]:
-    """The road of every frame, and of some a second time once all of it was searched."""
+    """The road of every frame; some frames yield a second one after a search of the whole image."""
     while True:
         if later is not None and (second := later.look()) is not None:
             yield _Glance(Detected(second.frame, second.camera, second.road), None)

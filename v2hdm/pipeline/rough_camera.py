@@ -27,14 +27,10 @@ ROUGH_NAME = "camera"  # name of a camera without a calibration file
 _UNKNOWN_PITCH_DEG = 8.0  # standard deviation of a pitch that nobody states, deg
 _STATED_PITCH_DEG = 4.0  # standard deviation of a pitch that the user states, deg
 _ROLL_DEG = 1.5  # standard deviation of a camera's roll about zero, deg
-_LOG_FOCAL = (
-    0.3  # standard deviation of the log of an assumed focal length: lenses of 46 to 76 deg are within
-)
+_LOG_FOCAL = 0.3  # standard deviation of an assumed focal length's log: lenses of 46 to 76 deg
 
 _LOOKS = 6  # images of a folder that are looked at before the first, so that it has a prior from others
-_SURE = (
-    0.9  # probability that a horizon is not above the rows that the network is run on; else it is run again
-)
+_SURE = 0.9  # least probability that the searched rows contain the horizon; else search again
 _LOOK_SHARE = 0.25  # time of a look in half the resolution, of one in full
 _KNOWN_RAD = np.deg2rad(0.5)  # a stream's horizon is said when its standard deviation is this
 

@@ -102,7 +102,7 @@ def in_child(
 
 
 class _Job(NamedTuple):
-    """Work for a child: a function by its name in a module, and what the child has of its parent."""
+    """Work for a child: a function's module and name, and the parent's settings."""
 
     function: str
     arguments: tuple[Any, ...]
@@ -145,7 +145,7 @@ class _ForkServer:
 
     @classmethod
     def idle(cls) -> _ForkServer:
-        """One that was started as it would be now: a waiting one, or a new one."""
+        """A child started under the present settings: a waiting one, or a new one."""
         now = _conditions()
         while True:
             try:
@@ -269,7 +269,7 @@ def _answer(stream: IO[bytes]) -> tuple[list[Any] | None, int | None]:
 
 
 def _refuse_death(code: int, said: str, limits: Limits, where: str, error: type[V2hdmError]) -> Never:
-    """Raise what a child died of that has given no answer; ``code`` is its exit code or minus a signal."""
+    """Raise the error of a child that died without an answer; ``code`` is its exit code or minus a signal."""
     if resource is not None and code == -signal.SIGXCPU:
         most = f"{limits.step_s:.0f} s of a processor"
         raise error(f"{where}: takes more than {most} for one piece; it is damaged, or a trap")

@@ -11,7 +11,7 @@ _SPARE_STEPS = 1_000_000  # steps that any query may take beyond those
 
 
 def limit_steps(data: Any, path: Path) -> None:
-    """Let no query of a connection to ``path``, of sqlite3 or apsw, take more than what its bytes need."""
+    """Limit the time of a connection's queries (sqlite3 or apsw) by the bytes of the file ``path``."""
     data.set_progress_handler(lambda: True, _STEPS * path.stat().st_size + _SPARE_STEPS)
 
 

@@ -67,7 +67,7 @@ def take_origin(content: object, where: str, error: type[V2hdmError]) -> Geodeti
         raise error(f"{where}: latitude must lie within +-90 and longitude within +-180 degrees; fix them")
     datum = take_text(entry.get("datum", "WGS84"), f"{where}, datum", error)
     if not datum.isprintable() or len(datum) > _LONGEST_DATUM:
-        raise error(f"{where}, datum: {shown(datum)} is no name of a datum; give one such as ETRS89")
+        raise error(f"{where}, datum: {shown(datum)} is not the name of a datum; give one such as ETRS89")
     return GeodeticOrigin(
         latitude_deg=latitude_deg,
         longitude_deg=longitude_deg,

@@ -102,7 +102,11 @@ def test_an_address_that_cannot_serve_is_refused_in_a_line_without_its_secrets(
 
 @pytest.mark.parametrize(
     ("content", "status", "message"),
-    [(b"<html>no", 200, "no PNG, JPEG or WebP"), (RED, 403, "answers 403"), (RED * 9000, 200, "no PNG")],
+    [
+        (b"<html>no", 200, "not a PNG, JPEG or WebP"),
+        (RED, 403, "answers 403"),
+        (RED * 9000, 200, "not a PNG"),
+    ],
 )
 def test_what_is_no_tile_is_refused(content, status, message):
     with service(content, status) as (address, _), pytest.raises(ConfigError, match=message):

@@ -56,13 +56,17 @@ def _run(arguments: Sequence[str]) -> None:
     parser.add_argument("--mounting", type=float, nargs=3, metavar=values, help=rough)
     parser.add_argument("--linear", action="store_true", help="grey values proportional to light, not sRGB")
     parser.add_argument("--model", metavar="FILE", help="the network, ONNX (default: the shipped one)")
-    parser.add_argument("--threads", type=int, default=1, metavar="N", help="for the network (default: 1)")
+    parser.add_argument(
+        "--threads", type=int, default=1, metavar="N", help="threads of the network (default: 1)"
+    )
     parser.add_argument("--limit", type=int, metavar="N", help="stop after N images")
     newest = "process the newest image of a camera or growing folder, and drop older ones"
     parser.add_argument("--live", action="store_true", help=newest)
     where = "with --live: read where to look next from standard input, JSON lines (docs/detect.md)"
     parser.add_argument("--regions", action="store_true", help=where)
-    parser.add_argument("--output", type=Path, metavar="FILE", help="for the JSON lines (default: stdout)")
+    parser.add_argument(
+        "--output", type=Path, metavar="FILE", help="file for the JSON lines (default: stdout)"
+    )
     parser.add_argument("--draw", type=Path, metavar="DIR", help="folder for images with detections drawn")
     _detect(parser.parse_args(arguments))
 

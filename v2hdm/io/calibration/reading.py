@@ -318,7 +318,7 @@ def take_rotation(content: object, where: str, error: type[V2hdmError]) -> Float
     rotation = take_array(content, (3, 3), where, error)
     limited = np.clip(rotation, -2.0, 2.0)  # larger numbers belong to no rotation, and their squares overflow
     if not (np.abs(limited @ limited.T - np.eye(3)).max() < _ROTATION_TOLERANCE < np.linalg.det(limited)):
-        raise error(f"{where}: is no rotation (rows of length 1, at right angles); fix it")
+        raise error(f"{where}: is not a rotation (rows of length 1, at right angles); fix it")
     return np.asarray(rotation)
 
 

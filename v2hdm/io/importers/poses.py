@@ -334,7 +334,7 @@ def _finite(values: FloatArray, sigma_m: FloatArray, where: str, things: str) ->
         raise DriveError(f"{where}: none of its {len(is_number)} {things} is a number; record it again")
     if lost.any():
         _log.warning(
-            "%s: left out %d of %d %s that are no numbers", where, int(lost.sum()), len(lost), things
+            "%s: left out %d of %d %s that are not numbers", where, int(lost.sum()), len(lost), things
         )
     return is_number
 

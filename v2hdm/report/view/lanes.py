@@ -23,7 +23,7 @@ from v2hdm.topology.graph import LaneOfGraph, Question
 
 
 class Lanes:
-    """The lane graph of a map, as its corrections are now; it is made anew where these change it."""
+    """The lane graph of a map with its current corrections; rebuilt when they change it."""
 
     def __init__(self, hd_map: HDMap, trajectories: Sequence[Trajectory]) -> None:
         """``trajectories`` are those of the drives, in the map frame."""

@@ -34,9 +34,7 @@ _GROUND_LIMIT_SIGMAS = 4.0
 chance."""
 
 _LEAST_TURN_DEG = 0.2  # smallest angle between two mountings at which bare ground is the better judge
-_LEAST_HEIGHT_M = (
-    0.04  # smallest difference of two mountings' heights at which bare ground is the better judge
-)
+_LEAST_HEIGHT_M = 0.04  # least height difference, m, at which bare ground is the better judge
 _OVERLAP = 0.1  # share of the smaller of two markings of a class that both cover; paint does not lie on paint
 _DOUBLES_LIMIT = 0.02  # share of markings that overlap another: none on clean drives, 0.01 on old paint
 

@@ -287,7 +287,7 @@ def _check_plain(path: Path) -> None:
     query = f"SELECT m.name FROM {columns} WHERE {computes} OR {repeats}"
     with opened(path, "immutable=1") as data:
         for (name,) in data.execute(query):
-            raise DriveError(f"{path}: {name} is no plain table of a recording; convert it to MCAP")
+            raise DriveError(f"{path}: {name} is not a plain table of a recording; convert it to MCAP")
         names = {name.lower() for (name,) in data.execute("SELECT name FROM sqlite_master")}
         for table in names & {"topics", "message_definitions"}:
             deque(rows_of(data, path, table), maxlen=0)

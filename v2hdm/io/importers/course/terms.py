@@ -53,9 +53,7 @@ SLIP = 0.005
 (Pacejka, Tire and Vehicle Dynamics), gives .005 to .01; a stiff axle at a crawl gives none."""
 
 _ACCELERATION = 1.4  # of the speed after a second, m/s: accelerations of 1 m/s2 that last a second
-_STEERING = (
-    0.08  # of the curvature after a second, 1/m: full lock, .2, takes yard tractors two to three seconds
-)
+_STEERING = 0.08  # sigma of a second's change of curvature, 1/m: tractors need 2 to 3 s to full lock
 _SPEED_M_S = 20.0  # standard deviation of the speed before the drive, m/s
 _CURVATURE_PER_M = 0.15  # standard deviation of the curvature before the drive: circles of 7 m
 _SLIP_M = 0.003  # the way sideways after a metre, m: uneven ground; a course of .1 deg over 3 m
