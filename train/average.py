@@ -47,11 +47,11 @@ def mean_checkpoint(
     mean = load_checkpoint(first)
     classes_of_files = [mean.classes]
     mean.averaged = with_classes(mean.averaged, mean.classes, mean.catalogue, str(first))
-    asked = TrainConfig(net=recorded_net(mean.config["net"]), data=DataConfig(**mean.config["data"]))
+    config = TrainConfig(net=recorded_net(mean.config["net"]), data=DataConfig(**mean.config["data"]))
     states = [mean.averaged]
     for path in others:
         torch.manual_seed(mean.config["seed"])  # what a smaller network grows by is drawn as that run drew it
-        states.append(fresh_checkpoint(replace(asked, start=str(path)), mean.catalogue).averaged)
+        states.append(fresh_checkpoint(replace(config, start=str(path)), mean.catalogue).averaged)
         classes_of_files.append(classes_of(path))
     knows = torch.tensor([[name in classes for name in mean.catalogue.names] for classes in classes_of_files])
     of_class = _shares_of_classes(torch.tensor(shares, dtype=torch.float64), knows)

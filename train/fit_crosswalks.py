@@ -160,10 +160,10 @@ class Gathered(NamedTuple):
     is_true: FloatArray
 
     @classmethod
-    def of(cls, known: Sequence[tuple[FloatArray, bool]], width: int) -> Gathered:
+    def of(cls, samples: Sequence[tuple[FloatArray, bool]], width: int) -> Gathered:
         """Of features (width,), each with its truth."""
-        features = np.array([features for features, _ in known]).reshape(-1, width)
-        return cls(features, np.array([is_true for _, is_true in known], dtype=np.float64))
+        features = np.array([features for features, _ in samples]).reshape(-1, width)
+        return cls(features, np.array([is_true for _, is_true in samples], dtype=np.float64))
 
     def fitted(self) -> tuple[float, ...]:
         """The likeliest weights of the features."""
@@ -172,10 +172,10 @@ class Gathered(NamedTuple):
     def say(self, name: str, odds: FloatArray, least: float) -> None:
         """Print how many have at least a probability, by log odds (N,)."""
         is_kept = as_probability(odds) >= least
-        kept = int((is_kept & (self.is_true > 0)).sum())
+        true_kept = int((is_kept & (self.is_true > 0)).sum())
         others = int((is_kept & (self.is_true == 0)).sum())
         true = int(self.is_true.sum())
-        print(f"{name}: {kept} of {true}, {others} of {len(self.is_true) - true} others")
+        print(f"{name}: {true_kept} of {true}, {others} of {len(self.is_true) - true} others")
 
 
 def main() -> None:

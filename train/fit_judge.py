@@ -288,7 +288,7 @@ def fit_all(
     spotted = np.array(gathered.lit)
     photo = np.array(gathered.photograph)
     print(f"{(true & ~spotted).sum()} of {(has_answer & ~spotted).sum()} readings true", flush=True)
-    asked = Quadrilaterals(
+    quadrilaterals = Quadrilaterals(
         np.array(gathered.views, dtype=np.float32),
         np.array(gathered.evidence, dtype=np.float32),
         one_hot(gathered.kind),
@@ -304,26 +304,28 @@ def fit_all(
 
     def learnt_from(rows: BoolArray) -> Judge:
         chosen = np.flatnonzero(rows)
-        return train_judge(asked.take(np.concatenate([chosen, chosen[photo[chosen]]])), CONFIG, before)
+        return train_judge(
+            quadrilaterals.take(np.concatenate([chosen, chosen[photo[chosen]]])), CONFIG, before
+        )
 
     # Each is judged by odds that its own image had no part in.
     odds = np.zeros(len(true))
     side_sigma_px = np.ones((len(true), 4))
     for k in range(_JUDGE_FOLDS):
         judge = learnt_from(lessons & (fold != k))
-        odds[fold == k], side_sigma_px[fold == k] = judged(judge, asked.take(fold == k))
+        odds[fold == k], side_sigma_px[fold == k] = judged(judge, quadrilaterals.take(fold == k))
         tell((k + 1) / (_JUDGE_FOLDS + 2))
-    _print_sides(asked, side_sigma_px)
+    _print_sides(quadrilaterals, side_sigma_px)
     seen_through = (odds < 0)[spotted & has_answer & ~true]
     print(f"seen through: {seen_through.mean():.3f} of the false claims", flush=True)
     return learnt_from(lessons), fit_among(gathered, odds)
 
 
-def _print_sides(asked: Quadrilaterals, side_sigma_px: FloatArray) -> None:
+def _print_sides(quadrilaterals: Quadrilaterals, side_sigma_px: FloatArray) -> None:
     """Whether the errors of sides of images left out are as large as stated."""
-    is_known = np.isfinite(asked.side_error)
-    square = (asked.side_error**2 / (asked.side_variance + side_sigma_px**2))[is_known]
-    alone = (asked.side_error**2 / asked.side_variance)[is_known]
+    is_known = np.isfinite(quadrilaterals.side_error)
+    square = (quadrilaterals.side_error**2 / (quadrilaterals.side_variance + side_sigma_px**2))[is_known]
+    alone = (quadrilaterals.side_error**2 / quadrilaterals.side_variance)[is_known]
     for name, values in (("by the fit alone", alone), ("with the judge", square)):
         inner = np.sort(values)[: int(0.95 * len(values))].mean()
         print(

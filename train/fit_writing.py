@@ -138,9 +138,11 @@ def main() -> None:
             ("in company", writing_probability(score, company, weight)),
         ):
             is_kept = probability >= LEAST_KEPT
-            kept = int((is_kept & is_word).sum())
+            words_kept = int((is_kept & is_word).sum())
             others = int((is_kept & ~is_word).sum())
-            print(f"{name}, {how}: {kept} of {is_word.sum()} words, {others} of {(~is_word).sum()} others")
+            print(
+                f"{name}, {how}: {words_kept} of {is_word.sum()} words, {others} of {(~is_word).sum()} others"
+            )
 
 
 if __name__ == "__main__":

@@ -77,21 +77,21 @@ def with_classes(
     missing = [name for name in then if name not in catalogue.classes]
     if missing:
         raise ConfigError(f"{where} knows {', '.join(missing)}: list every class of it in catalogue=, too")
-    told = dict(weights)
+    grown = dict(weights)
     if tuple(then) == catalogue.names:
-        return told
+        return grown
     has_earlier = [name in then for name in catalogue.names]
     origin = [
         then.index(name if name in then else _STARTS_AS[catalogue.classes[name].family])
         for name in catalogue.names
     ]
-    for head in (head for head in CLASS_LAYERS if f"{head}.bias" in told):
+    for head in (head for head in CLASS_LAYERS if f"{head}.bias" in grown):
         for part in ("weight", "bias"):
-            told[f"{head}.{part}"] = told[f"{head}.{part}"][origin]
-    told["kinds.bias"] = told["kinds.bias"] + torch.where(
+            grown[f"{head}.{part}"] = grown[f"{head}.{part}"][origin]
+    grown["kinds.bias"] = grown["kinds.bias"] + torch.where(
         torch.tensor(has_earlier), 0.0, math.log(_STARTS_WITH)
     )
-    return told
+    return grown
 
 
 def recorded_net(settings: Mapping[str, Any]) -> NetConfig:

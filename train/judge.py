@@ -129,13 +129,13 @@ def _side_loss(error: torch.Tensor, variance: torch.Tensor, log_sigma: torch.Ten
     return (loss * is_known).sum() / is_known.sum().clamp(min=1)
 
 
-def judged(judge: Judge, asked: Quadrilaterals) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def judged(judge: Judge, quadrilaterals: Quadrilaterals) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Log odds (N,), and how far the sides may be off (N, 4), px."""
     out = []
     sides = []
     with torch.no_grad():
-        for first in range(0, len(asked.true), 512):
-            part = asked.take(np.arange(first, min(first + 512, len(asked.true))))
+        for first in range(0, len(quadrilaterals.true), 512):
+            part = quadrilaterals.take(np.arange(first, min(first + 512, len(quadrilaterals.true))))
             inputs = (torch.from_numpy(array) for array in (part.views, part.evidence, part.shape))
             odds, log_sigma = judge(*inputs)
             out.append(odds.numpy().astype(np.float64))

@@ -51,11 +51,11 @@ def with_hints(images: Sequence[LabelledImage], config: DataConfig, tell: Tell) 
         DriveError: an image cannot be read.
     """
     hints = _Hints.of(config)
-    done = []
+    hinted = []
     for number, image in enumerate(images):
-        done.append(hints.of_image(image) if image.shapes is not None else image)
+        hinted.append(hints.of_image(image) if image.shapes is not None else image)
         tell((number + 1) / len(images))
-    return done
+    return hinted
 
 
 @dataclass(frozen=True)

@@ -190,13 +190,13 @@ def _fit_judge(order: Order, folder: Path, tell: Share) -> None:
             for k, numbers in enumerate(_in_parts(len(labels.images)))
         ]
     left = [part for part in parts if not part.path.is_file()]
-    done = len(parts) - len(left)
+    finished = len(parts) - len(left)
 
     def take(_: object) -> None:
-        nonlocal done
-        done += 1
-        share = _EXPORTED + (_GATHERED - _EXPORTED) * done / len(parts)
-        tell(share, f"judge: {done * _PART_IMAGES} images seen")
+        nonlocal finished
+        finished += 1
+        share = _EXPORTED + (_GATHERED - _EXPORTED) * finished / len(parts)
+        tell(share, f"judge: {finished * _PART_IMAGES} images seen")
 
     tell(_EXPORTED, "judge: looking at images")
     with open_executor(order.workers, isolated=True) as executor:

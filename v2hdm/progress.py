@@ -21,7 +21,7 @@ Steps = Callable[[int, int], None]  # called with how many steps of one task are
 Progress = Callable[[str, int, int], None]
 
 
-def silent(task: str, done: int, total: int) -> None:
+def silent(task: str, finished: int, total: int) -> None:
     """A ``Progress`` that shows nothing."""
 
 
@@ -29,11 +29,11 @@ def progress_lines(write: Callable[[str], None]) -> Progress:
     """A ``Progress`` for a log: a line when a task begins and ends, and every ten seconds between."""
     written_s: dict[str, float] = {}
 
-    def advance(task: str, done: int, total: int) -> None:
+    def advance(task: str, finished: int, total: int) -> None:
         now_s = time.monotonic()
-        if task not in written_s or done == total or now_s - written_s[task] >= _EVERY_S:
+        if task not in written_s or finished == total or now_s - written_s[task] >= _EVERY_S:
             written_s[task] = now_s
-            write(f"{task}: {done} of {total}")
+            write(f"{task}: {finished} of {total}")
 
     return advance
 
@@ -79,9 +79,9 @@ def progress_bars(console: Console) -> Iterator[Progress]:
     with Bars(title, BarColumn(40), MofNCompleteColumn(), TimeRemainingColumn(), console=console) as bars:
         tasks = {}
 
-        def advance(task: str, done: int, total: int) -> None:
+        def advance(task: str, finished: int, total: int) -> None:
             if task not in tasks:
                 tasks[task] = bars.add_task(task, total=total)
-            bars.update(tasks[task], completed=done, total=total)
+            bars.update(tasks[task], completed=finished, total=total)
 
         yield advance

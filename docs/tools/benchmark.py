@@ -47,10 +47,10 @@ def table(scores: Sequence[Mapping[str, Any]]) -> str:
 
 def with_table(page: str, text: str) -> str:
     """The page with another table in place of the one that begins with our first head."""
-    before, head, rest = page.partition(f"| {HEADS[0]} | ")
+    before, head, after_head = page.partition(f"| {HEADS[0]} | ")
     if not head:
         raise SystemExit(f"{PAGE}: has no table that begins with {HEADS[0]}")
-    after = rest.partition("\n\n")[2]
+    after = after_head.partition("\n\n")[2]
     return f"{before}{text}\n\n{after}"
 
 

@@ -8,7 +8,11 @@ from xml.sax.saxutils import escape
 
 ROOT = Path(__file__).parents[2]
 PICTURE = ROOT / "docs" / "floors.svg"
-_WIDTH, _MARGIN, _FLOOR, _GAP, _LETTER = 800, 10, 26, 6, 7.3
+_WIDTH = 800  # width of the picture, px
+_MARGIN = 10  # margin of the picture, px
+_FLOOR = 26  # height of a floor, px
+_GAP = 6  # gap between parts and between floors, px
+_LETTER = 7.3  # width of a letter of the font below, px
 _STYLE = (
     "rect{fill:#e8eef4;stroke:#5b6b7b}rect.light{fill:#fff3d6}text{font:12px monospace;fill:#1b2733;"
     "text-anchor:middle}"
@@ -18,13 +22,17 @@ _STYLE = (
 def floors() -> list[list[str]]:
     """The library's parts by floor, the highest first; neighbours never import each other."""
     contracts = _contracts()
-    layers = next(one["layers"] for one in contracts if one["type"] == "layers" and "containers" not in one)
+    layers = next(
+        contract["layers"]
+        for contract in contracts
+        if contract["type"] == "layers" and "containers" not in contract
+    )
     return [[part.strip().removeprefix("v2hdm.") for part in floor.split("|")] for floor in layers]
 
 
 def without_torch() -> set[str]:
     """The parts that a contract keeps free of torch."""
-    free = next(one for one in _contracts() if "torch" in one.get("forbidden_modules", ()))
+    free = next(contract for contract in _contracts() if "torch" in contract.get("forbidden_modules", ()))
     return {name.removeprefix("v2hdm.") for name in free["source_modules"]}
 
 
@@ -46,7 +54,7 @@ def draw() -> str:
         left = float(_MARGIN)
         for name in row:
             width = room * (len(name) + 2) / total
-            light = any(f"{name}.".startswith(f"{one}.") for one in free)
+            light = any(f"{name}.".startswith(f"{package}.") for package in free)
             kind = ' class="light"' if light else ""
             parts.append(
                 f'<rect{kind} x="{left:.0f}" y="{top}" width="{width:.0f}" height="{_FLOOR}" rx="3"/>'
@@ -65,7 +73,7 @@ def _rows(floor: list[str]) -> list[list[str]]:
     """A floor in rows that its names fit into."""
     rows: list[list[str]] = [[]]
     for name in floor:
-        if sum(len(one) * _LETTER + 20 for one in [*rows[-1], name]) > _WIDTH - 2 * _MARGIN:
+        if sum(len(label) * _LETTER + 20 for label in [*rows[-1], name]) > _WIDTH - 2 * _MARGIN:
             rows.append([])
         rows[-1].append(name)
     return rows

@@ -38,25 +38,25 @@ class Part(NamedTuple):
 def parts() -> list[Part]:
     """The installed packages of all extras, by name."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    found: dict[str, Part] = {}
+    part_of_name: dict[str, Part] = {}
     for extra in EXTRAS:
         stated = project["optional-dependencies"][extra] if extra else project["dependencies"]
-        for installed in _required(stated, set(found)):
+        for installed in _required(stated, set(part_of_name)):
             name = canonicalize_name(installed.metadata["Name"])
-            found[name] = Part(name, installed.version, licence_of(installed), extra)
-    return sorted(found.values())
+            part_of_name[name] = Part(name, installed.version, licence_of(installed), extra)
+    return sorted(part_of_name.values())
 
 
-def _required(stated: Sequence[str], known: set[str]) -> Iterator[Distribution]:
+def _required(stated: Sequence[str], listed: set[str]) -> Iterator[Distribution]:
     """The packages that requirements bring, but those whose names are ``known``, which grows."""
     pending = [Requirement(line) for line in stated]
     while pending:
         requirement = pending.pop()
         name = canonicalize_name(requirement.name)
         chosen = [{"extra": extra} for extra in requirement.extras] or [{"extra": ""}]
-        if name in known or (requirement.marker and not any(map(requirement.marker.evaluate, chosen))):
+        if name in listed or (requirement.marker and not any(map(requirement.marker.evaluate, chosen))):
             continue
-        known.add(name)
+        listed.add(name)
         try:
             installed = distribution(name)
         except PackageNotFoundError:  # of another platform, or of no extra that is installed

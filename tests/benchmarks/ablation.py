@@ -138,8 +138,8 @@ def _with_narrow_scatter() -> Iterator[None]:
 def _without_side_doubt() -> Iterator[None]:
     classify_alone = find.classify_alone
 
-    def sure(*given: Any) -> tuple[FloatArray, FloatArray]:
-        odds, sigma_px = classify_alone(*given)
+    def sure(*features: Any) -> tuple[FloatArray, FloatArray]:
+        odds, sigma_px = classify_alone(*features)
         return odds, 0 * sigma_px
 
     with patch.object(find, "classify_alone", sure):
@@ -182,16 +182,18 @@ def row(name: str, shown: Sequence[Example]) -> str:
     """One line of the table."""
     detector = Detector.load(options=DetectorOptions(max_range_m=24.0))
     tally = Tally()
-    known = []
-    for one in shown:
-        markings, _ = detector.detect(one.image, one.camera)
-        tally.add_markings(one.markings, markings)
-        known += [bool(marking.corner_valid.all()) for marking in markings if not len(marking.outline_px)]
+    has_all_corners = []
+    for picture in shown:
+        markings, _ = detector.detect(picture.image, picture.camera)
+        tally.add_markings(picture.markings, markings)
+        has_all_corners += [
+            bool(marking.corner_valid.all()) for marking in markings if not len(marking.outline_px)
+        ]
     error = np.linalg.norm(np.array(tally.corner_error_px).reshape(-1, 2), axis=1)
     square = np.sort(tally.normalised)[: int(0.95 * len(error))]
     recall = sum(tally.found.values()) / max(sum(tally.fair.values()), 1)
     return (
-        f"{name:38s} {recall:7.3f} {tally.false:6d} {np.mean(known):10.3f} {np.median(error):8.3f} "
+        f"{name:38s} {recall:7.3f} {tally.false:6d} {np.mean(has_all_corners):10.3f} {np.median(error):8.3f} "
         f"{np.quantile(error, 0.95):8.3f} {square.mean():8.2f}"
     )
 
@@ -245,9 +247,9 @@ def row_of_verdict(name: str, seeds: Sequence[int], faults: Sequence[str]) -> st
         judged += [judge(row, clean) for row in of_seed]
         spoilt += of_seed
     silent = sum(judgement.silent for judgement in judged)
-    told = [judgement.named for judgement in judged if judgement.told]
+    raised = [judgement.named for judgement in judged if judgement.told]
     inside = shares_inside(spoilt)["corners"]
-    return f"{name:38s} {failed:7d} {silent:7d} {len(told):7d} {told.count('first'):7d} {inside:7.2f}"
+    return f"{name:38s} {failed:7d} {silent:7d} {len(raised):7d} {raised.count('first'):7d} {inside:7.2f}"
 
 
 def terms() -> Iterator[Part]:
@@ -307,8 +309,8 @@ def _countless(*_: Any) -> float:
 def _without_repeats() -> Iterator[None]:
     lengths = hypotheses.Hypotheses._other_lengths
 
-    def alone(space: Any, *given: Any) -> tuple[FloatArray, FloatArray]:
-        spread_m, again = lengths(space, *given)
+    def alone(space: Any, *arguments: Any) -> tuple[FloatArray, FloatArray]:
+        spread_m, again = lengths(space, *arguments)
         return spread_m, 0 * again
 
     with patch.object(hypotheses.Hypotheses, "_other_lengths", alone):
@@ -342,9 +344,9 @@ def _no_images(_: Any, __: Any, corners_map: FloatArray) -> FloatArray:
 def _without_kind(kind: int) -> Callable[[], AbstractContextManager[Any]]:
     add = hypotheses.Hypotheses.add
 
-    def unless(space: Any, own: int, *given: Any, **named: Any) -> None:
-        if own != kind:
-            add(space, own, *given, **named)
+    def unless(space: Any, kind_of_row: int, *arguments: Any, **named: Any) -> None:
+        if kind_of_row != kind:
+            add(space, kind_of_row, *arguments, **named)
 
     return partial(patch.object, hypotheses.Hypotheses, "add", unless)
 
@@ -369,11 +371,11 @@ class Mapped:
             in_order_of(mapped[row].corners_map, truth.map.markings[column].corners_map)
             for row, column in zip(rows, columns, strict=True)
         ]
-        known = [mapped[row] for row in rows]
+        markings_met = [mapped[row] for row in rows]
         off_m = np.array(
-            [np.linalg.norm(a.corners_map - b, axis=1) for a, b in zip(known, true, strict=True)]
+            [np.linalg.norm(a.corners_map - b, axis=1) for a, b in zip(markings_met, true, strict=True)]
         )
-        sigmas2 = corner_errors(known, np.array(true)).reshape(-1, 4)
+        sigmas2 = corner_errors(markings_met, np.array(true)).reshape(-1, 4)
         self.markings += figures.markings
         self.false += figures.false_markings
         self.found += figures.recall * figures.expected
@@ -404,7 +406,12 @@ def site_drives(seeds: Sequence[int], folders: Sequence[Path]) -> Iterator[SiteD
             (make(draw(seed)), detect, ("front", "rear"), False),
             (make(draw(seed)), detect_pieces, ("front", "rear"), False),
             (make_boxes(draw(seed, "straight")), detect_pieces, ("front",), True),
-            (make_boxes(draw(seed, "straight")), partial(detect_pieces, known=_MOST_ENDS), ("front",), False),
+            (
+                make_boxes(draw(seed, "straight")),
+                partial(detect_pieces, share_known=_MOST_ENDS),
+                ("front",),
+                False,
+            ),
             (make_queue(draw(seed, "straight")), detect_queue, ("front",), False),
             (make_lengths(draw(seed, "straight")), detect, ("front",), False),
         ):
@@ -415,8 +422,8 @@ def site_drives(seeds: Sequence[int], folders: Sequence[Path]) -> Iterator[SiteD
             yield SiteDrive(drive, detections, truth, cameras, grey)
     for folder in folders:
         drive = read_drive(folder)
-        found = detect_all(drive, DetectorOptions.for_mapping())
-        yield SiteDrive(drive, found, read_truth(drive), tuple(drive.cameras), grey_reader(drive))
+        detected = detect_all(drive, DetectorOptions.for_mapping())
+        yield SiteDrive(drive, detected, read_truth(drive), tuple(drive.cameras), grey_reader(drive))
 
 
 def rendered_once(world: World) -> Callable[[Image], np.ndarray]:
@@ -433,28 +440,28 @@ def rendered_once(world: World) -> Callable[[Image], np.ndarray]:
 
 def rows_of_site(only: str, seeds: Sequence[int], folders: Sequence[Path]) -> Iterator[str]:
     """The table of the site model. Each drive is mapped once, and its candidates classified once a term."""
-    wanted = [(name, off) for name, off in terms() if re.search(only, name) or name == "nothing off"]
-    tally = {name: Mapped() for name, _ in wanted}
+    chosen_terms = [(name, off) for name, off in terms() if re.search(only, name) or name == "nothing off"]
+    tally = {name: Mapped() for name, _ in chosen_terms}
     for drive, detections, truth, cameras, grey in site_drives(seeds, folders):
-        expected, asked = driven_past(drive, truth, cameras), []
+        expected, classified_inputs = driven_past(drive, truth, cameras), []
 
-        def classify(*given: Any, asked: list[Any] = asked) -> markings.Classified:
-            asked.append(given)
-            return markings.classify(*given)
+        def classify(*arguments: Any, recorded: list[Any] = classified_inputs) -> markings.Classified:
+            recorded.append(arguments)
+            return markings.classify(*arguments)
 
         asked_symbols: list[Any] = []
 
         original = symbols.map_symbols
 
-        def map_symbols(*given: Any, asked: list[Any] = asked_symbols, call: Any = original) -> Any:
-            asked.append(given)
-            return call(*given)
+        def map_symbols(*arguments: Any, recorded: list[Any] = asked_symbols, call: Any = original) -> Any:
+            recorded.append(arguments)
+            return call(*arguments)
 
         asked_parallax: list[Any] = []
 
-        def measure(*given: Any, asked: list[Any] = asked_parallax) -> parallax.Parallax:
-            asked.append(given)
-            return parallax.measure_parallax(*given)
+        def measure(*arguments: Any, recorded: list[Any] = asked_parallax) -> parallax.Parallax:
+            recorded.append(arguments)
+            return parallax.measure_parallax(*arguments)
 
         with (
             patch.object(conclusion, "classify", classify),
@@ -462,15 +469,15 @@ def rows_of_site(only: str, seeds: Sequence[int], folders: Sequence[Path]) -> It
             patch.object(symbols, "map_symbols", map_symbols),
         ):
             run_methods(drive, detections, cameras, grey=grey)
-        for name, off in wanted:
+        for name, off in chosen_terms:
             with off():
-                solved, kind, kinds, counted, _, *others = asked[-1]
+                solved, kind, kinds, counted, _, *others = classified_inputs[-1]
                 on_ground = parallax.measure_parallax(*asked_parallax[-1])
                 classified = markings.classify(solved, kind, kinds, counted, on_ground, *others)
                 tally[name].add(classified.markings(), truth, expected)
                 if asked_symbols:  # a drive without a symbol asks for none
                     tally[name].symbols += len(symbols.map_symbols(*asked_symbols[-1])[0])
-    return (f"{name:38s} {own}" for name, own in tally.items())
+    return (f"{name:38s} {counts}" for name, counts in tally.items())
 
 
 def holds() -> Iterator[Part]:

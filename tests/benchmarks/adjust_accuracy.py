@@ -157,18 +157,18 @@ def street(seed: int, jitter: PoseSigma | None = None, outliers: float = 0.0, **
 def print_honesty(drives: int) -> None:
     """The table of :func:`honesty`."""
     for name, jitter in (("white", WHITE), ("drifting", ALL_DRIFTING)):
-        found = [honesty(street(seed, jitter)) for seed in range(drives)]
-        for figure, wanted in (
+        results = [honesty(street(seed, jitter)) for seed in range(drives)]
+        for figure, goal in (
             ("corner_nees", 1.0),
             ("corner_coverage", 0.95),
             ("rotation_nees", 1.0),
             ("centre_nees", 1.0),
             ("chi2_per_dof", 1.0),
         ):
-            values = np.array([getattr(one, figure) for one in found])
+            values = np.array([getattr(result, figure) for result in results])
             error = values.std(ddof=1) / np.sqrt(drives)
             print(
-                f"  {name:9s} {figure:16s} asked {wanted:4.2f}  measured {values.mean():5.3f} +- {error:5.3f}"
+                f"  {name:9s} {figure:16s} asked {goal:4.2f}  measured {values.mean():5.3f} +- {error:5.3f}"
             )
 
 
@@ -200,7 +200,7 @@ def print_disturbances(drives: int) -> None:
             f"  {route}: undisturbed poses, paper's model {root_mean_cm(calm):.2f} cm (bound "
             f"{root_mean_cm(calm_bound):.2f}); by who takes them for disturbed {root_mean_cm(wary):.2f} cm"
         )
-        for name, jitter, outliers, options, wanted in (
+        for name, jitter, outliers, options, goal in (
             ("white", WHITE, 0.0, PLAIN, "<= 1.2"),
             ("white, robust", WHITE, 0.0, ROBUST, "<= 1.2"),
             ("3 % wrong", WHITE, 0.03, ROBUST, "<= 1.3"),
@@ -215,7 +215,7 @@ def print_disturbances(drives: int) -> None:
                 f"    {name:14s} {root_mean_cm(ours):5.2f} cm (bound {root_mean_cm(bound):5.2f}) = "
                 f"{root_ratio(ours, calm):5.2f} x undisturbed (bounds {root_ratio(bound, calm_bound):5.2f}), "
                 f"{root_ratio(ours, paper):5.2f} x paper's model ({root_mean_cm(paper):5.2f} cm, "
-                f"bound {root_ratio(bound, paper):5.2f}); asked {wanted}",
+                f"bound {root_ratio(bound, paper):5.2f}); asked {goal}",
                 flush=True,
             )
 
@@ -226,13 +226,13 @@ def driven_again(scene: Scene, passes: int) -> Scene:
     In between the vehicle is far away, so that a drift has faded when it comes back.
     """
     problem, frames = scene.problem, len(scene.problem.map_from_vehicle) + 1
-    seen, count = problem.observations, len(scene.problem.observations.corner)
+    observations, count = problem.observations, len(scene.problem.observations.corner)
     again = Observations(
-        np.tile(seen.camera, passes),
-        np.tile(seen.frame, passes) + frames * np.repeat(np.arange(passes), count),
-        np.tile(seen.corner, passes),
-        np.tile(seen.pinhole_px, (passes, 1)),
-        np.tile(seen.covariance_px, (passes, 1, 1)),
+        np.tile(observations.camera, passes),
+        np.tile(observations.frame, passes) + frames * np.repeat(np.arange(passes), count),
+        np.tile(observations.corner, passes),
+        np.tile(observations.pinhole_px, (passes, 1)),
+        np.tile(observations.covariance_px, (passes, 1, 1)),
     )
     away = np.eye(4)
     away[0, 3] = 10_000.0

@@ -114,12 +114,14 @@ def _transforms(turns: np.ndarray, shifts: np.ndarray) -> np.ndarray:
 
 def _built(problem: Problem, blocks: _Blocks, options: CeresOptions) -> Any:
     """The problem as Ceres knows it."""
-    built, seen = pyceres.Problem(), problem.observations
+    built, observations = pyceres.Problem(), problem.observations
     model = pycolmap.CameraModelId.PINHOLE
     robust = pyceres.CauchyLoss(options.cauchy_scale) if options.cauchy_scale else None
-    for k in range(len(seen.corner)):
-        c, j, n = seen.camera[k], seen.frame[k], seen.corner[k]
-        cost = cost_functions.RigReprojErrorCost(model, seen.covariance_px[k], seen.pinhole_px[k])
+    for k in range(len(observations.corner)):
+        c, j, n = observations.camera[k], observations.frame[k], observations.corner[k]
+        cost = cost_functions.RigReprojErrorCost(
+            model, observations.covariance_px[k], observations.pinhole_px[k]
+        )
         camera, frame = (blocks.turns[c], blocks.shifts[c]), (blocks.frame_turns[j], blocks.frame_shifts[j])
         built.add_residual_block(cost, robust, [*camera, *frame, blocks.points[n], blocks.intrinsic[c]])
     _add_cameras(built, problem, blocks)

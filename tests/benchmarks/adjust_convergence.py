@@ -64,8 +64,8 @@ Solver = Callable[[Problem], End]
 def by_us(problem: Problem, options: SolveOptions) -> End:
     """Ours; its coarse stage, where it is on, is part of it."""
     began = time.process_time()
-    found = solve(problem, options)
-    return End(found.cost, found.corners_map, found.evaluations, time.process_time() - began)
+    solution = solve(problem, options)
+    return End(solution.cost, solution.corners_map, solution.evaluations, time.process_time() - began)
 
 
 def by_ceres(problem: Problem, options: NativeOptions, coarse: bool = False) -> End:
@@ -81,8 +81,8 @@ def by_ceres(problem: Problem, options: NativeOptions, coarse: bool = False) -> 
     start = np.empty((problem.corner_count, 2))
     start[arrays.corner_order.numpy()] = corners.numpy()
     problem = replace(problem, cam_from_vehicle=extrinsics.numpy(), corners_start=start)
-    found = solve_native(problem, options)
-    return End(found.cost, found.corners_map, found.steps, found.cpu_s)
+    solution = solve_native(problem, options)
+    return End(solution.cost, solution.corners_map, solution.steps, solution.cpu_s)
 
 
 def solvers(options: SolveOptions) -> dict[str, Solver]:
@@ -91,7 +91,9 @@ def solvers(options: SolveOptions) -> dict[str, Solver]:
         "ours": options,
         "ours, without its coarse stage": replace(options, coarse=False),
     }
-    rows: dict[str, Solver] = {name: partial(by_us, options=each) for name, each in ours.items()}
+    rows: dict[str, Solver] = {
+        name: partial(by_us, options=solve_options) for name, solve_options in ours.items()
+    }
     if build()[0] is not None:
         scale = 0.0 if options.loss == "none" else options.loss_scale
         solver = "sparse_schur" if options.pose_states else "dense_schur"
@@ -114,8 +116,8 @@ def attempts(scene: Scene, solver: Solver) -> tuple[End | None, End]:
 
 def reaches_the_optimum(scene: Scene, solver: Solver) -> bool:
     """Whether a solver ends where it ends from the true extrinsics."""
-    found, best = attempts(scene, solver)
-    return found is not None and found.is_that_of(best)
+    end, best = attempts(scene, solver)
+    return end is not None and end.is_that_of(best)
 
 
 def print_model(title: str, options: SolveOptions, scenes: list[Scene]) -> None:
@@ -124,8 +126,8 @@ def print_model(title: str, options: SolveOptions, scenes: list[Scene]) -> None:
     usual = None
     for name, solver in solvers(options).items():
         pairs = [attempts(scene, solver) for scene in scenes]
-        ends = [found for found, _ in pairs if found is not None]
-        reached = sum(found is not None and found.is_that_of(best) for found, best in pairs)
+        ends = [end for end, _ in pairs if end is not None]
+        reached = sum(end is not None and end.is_that_of(best) for end, best in pairs)
         cost = np.array([best.cost for _, best in pairs])
         usual = cost if usual is None else usual
         more = np.max(cost / usual) - 1

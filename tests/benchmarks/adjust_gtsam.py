@@ -42,17 +42,17 @@ def solve_gtsam(problem: Problem, tolerance: float = 1e-12, max_steps: int = 100
     parameters.setMaxIterations(max_steps)
     ready, cpu = time.perf_counter(), time.process_time()
     optimiser = gtsam.LevenbergMarquardtOptimizer(graph, start, parameters)
-    found = optimiser.optimize()
+    values = optimiser.optimize()
     took, cpu = time.perf_counter() - ready, time.process_time() - cpu
     cameras = range(len(problem.intrinsic))
     return PeerResult(
         setup_s=ready - began,
         solve_s=took,
         cpu_s=cpu,
-        cost=float(graph.error(found)),
+        cost=float(graph.error(values)),
         steps=int(optimiser.iterations()),
-        cam_from_vehicle=np.array([np.linalg.inv(found.atPose3(_camera(c)).matrix()) for c in cameras]),
-        corners_map=np.array([found.atPoint3(_corner(k))[:2] for k in range(problem.corner_count)]),
+        cam_from_vehicle=np.array([np.linalg.inv(values.atPose3(_camera(c)).matrix()) for c in cameras]),
+        corners_map=np.array([values.atPoint3(_corner(k))[:2] for k in range(problem.corner_count)]),
     )
 
 
@@ -69,12 +69,16 @@ def _corner(number: int) -> int:
 
 
 def _observed(problem: Problem) -> Any:
-    graph, seen = gtsam.NonlinearFactorGraph(), problem.observations
+    graph, observations = gtsam.NonlinearFactorGraph(), problem.observations
     lenses = [gtsam.Cal3_S2(fx, fy, 0.0, cx, cy) for fx, fy, cx, cy in problem.intrinsic]
     for camera, frame, corner, px, covariance in zip(
-        seen.camera.tolist(), seen.frame.tolist(), seen.corner.tolist(), seen.pinhole_px,
-        seen.covariance_px, strict=True,
-    ):  # fmt: skip
+        observations.camera.tolist(),
+        observations.frame.tolist(),
+        observations.corner.tolist(),
+        observations.pinhole_px,
+        observations.covariance_px,
+        strict=True,
+    ):
         noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
         keys = _frame(frame), _camera(camera), _corner(corner)
         graph.add(gtsam_unstable.ProjectionFactorPPPCal3_S2(px, noise, *keys, lenses[camera]))

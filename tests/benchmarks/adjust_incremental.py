@@ -36,26 +36,26 @@ class Growth:
 
 def street(markings: int) -> Problem:
     """At least so many markings of four corners, each seen in a few images by two cameras."""
-    one = make_scene(0, frames=400, every_m=1.0, max_range_m=12.0, start_error_deg=1.0, min_views=3).problem
-    return driven_on(one, -(-markings * CORNERS // one.corner_count))
+    lap = make_scene(0, frames=400, every_m=1.0, max_range_m=12.0, start_error_deg=1.0, min_views=3).problem
+    return driven_on(lap, -(-markings * CORNERS // lap.corner_count))
 
 
 def by_marking(problem: Problem, markings: int) -> list[Sighted]:
     """The observations of the first markings: four corners each, in the order of the route."""
-    seen = problem.observations
-    order = np.argsort(seen.corner, kind="stable")
-    bounds = np.searchsorted(seen.corner[order], CORNERS * np.arange(markings + 1))
+    observations = problem.observations
+    order = np.argsort(observations.corner, kind="stable")
+    bounds = np.searchsorted(observations.corner[order], CORNERS * np.arange(markings + 1))
     out = []
     for marking in range(markings):
         rows = order[bounds[marking] : bounds[marking + 1]]
-        own = Observations(
-            seen.camera[rows],
-            seen.frame[rows],
-            seen.corner[rows] - CORNERS * marking,
-            seen.pinhole_px[rows],
-            seen.covariance_px[rows],
+        of_marking = Observations(
+            observations.camera[rows],
+            observations.frame[rows],
+            observations.corner[rows] - CORNERS * marking,
+            observations.pinhole_px[rows],
+            observations.covariance_px[rows],
         )
-        out.append(Sighted(own))
+        out.append(Sighted(of_marking))
     return out
 
 
@@ -63,9 +63,9 @@ def grow(problem: Problem, markings: list[Sighted]) -> Growth:
     """Take the markings up one by one."""
     grown = IncrementalMap(problem, OPTIONS)
     took_s = np.zeros(len(markings))
-    for marking, seen in enumerate(markings):
+    for marking, sighted in enumerate(markings):
         began = time.process_time()
-        grown.observe(marking, seen)
+        grown.observe(marking, sighted)
         took_s[marking] = time.process_time() - began
     return Growth(took_s, np.stack([grown.corners_map(m) for m in range(len(markings))]))
 

@@ -56,8 +56,8 @@ def arrays_of(record: object) -> Iterator[np.ndarray]:
 def measure(observations: int, options: SolveOptions) -> dict[str, float | str]:
     """Solve one problem of at least so many observations in this process."""
     solve(make_scene(0, frames=30).problem, options)
-    one = make_scene(0, frames=400, every_m=1.0, jitter=None, max_range_m=12.0, start_error_deg=1.0).problem
-    problem = driven_on(one, -(-observations // len(one.observations.corner)))
+    lap = make_scene(0, frames=400, every_m=1.0, jitter=None, max_range_m=12.0, start_error_deg=1.0).problem
+    problem = driven_on(lap, -(-observations // len(lap.observations.corner)))
     problem = dataclasses.replace(problem, pose_sigma=PoseSigma())
     count = len(problem.observations.corner)
     gc.collect()

@@ -74,9 +74,9 @@ def build() -> tuple[Path | None, str]:
         ["cmake", "-S", str(SOURCE), "-B", str(BUILT)],
         ["cmake", "--build", str(BUILT)],
     ):
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode:
-            lines = [line for line in (done.stderr or done.stdout).splitlines() if line.strip()]
+        compiler = subprocess.run(command, capture_output=True, text=True, check=False)
+        if compiler.returncode:
+            lines = [line for line in (compiler.stderr or compiler.stdout).splitlines() if line.strip()]
             return None, f"native Ceres is left out: {' '.join(command)}: {lines[0] if lines else 'failed'}"
     return BUILT / "native_ceres", ""
 
@@ -94,8 +94,8 @@ def solve_native(problem: Problem, options: NativeOptions) -> NativeResult:
         command = [str(program), str(written), str(result), options.linear_solver, str(options.threads)]
         command += [str(options.tolerance), str(options.max_steps)]
         command.append("batched" if options.is_batched else "single")
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
-        setup_s, solve_s, cpu_s, cost, steps, ended = done.stdout.split(maxsplit=5)
+        process = subprocess.run(command, capture_output=True, text=True, check=True)
+        setup_s, solve_s, cpu_s, cost, steps, ended = process.stdout.split(maxsplit=5)
         values = np.fromfile(result)
     cameras = len(problem.intrinsic)
     return NativeResult(
@@ -115,16 +115,16 @@ def _write(problem: Problem, options: NativeOptions, path: Path) -> None:
     assert problem.corners_start is not None
     assert problem.centre_vehicle is not None
     assert problem.centre_sigma_m is not None
-    seen = problem.observations
-    order = np.lexsort((seen.frame, seen.camera, seen.corner))
-    camera, frame, corner = seen.camera[order], seen.frame[order], seen.corner[order]
+    observations = problem.observations
+    order = np.lexsort((observations.frame, observations.camera, observations.corner))
+    camera, frame, corner = observations.camera[order], observations.frame[order], observations.corner[order]
     focal, principal = problem.intrinsic[camera, :2], problem.intrinsic[camera, 2:]
-    covariance = seen.covariance_px[order]
+    covariance = observations.covariance_px[order]
     first = np.sqrt(covariance[:, 0, 0])
     below = covariance[:, 1, 0] / first
     last = np.sqrt(covariance[:, 1, 1] - below**2)
     numbers = np.empty((len(order), 5))
-    numbers[:, :2] = (seen.pinhole_px[order] - principal) / focal
+    numbers[:, :2] = (observations.pinhole_px[order] - principal) / focal
     numbers[:, 2] = focal[:, 0] / first
     numbers[:, 3] = -below * focal[:, 0] / (first * last)
     numbers[:, 4] = focal[:, 1] / last

@@ -79,10 +79,10 @@ def street(observations: int) -> Problem:
     """About so many observations by two cameras, started one degree off; corners from back-projection."""
     frames = 400 if observations > STREET else max(observations // 43, 20)
     every_m, range_m = (1.0, 12.0) if observations > STREET else (2.0, 15.0)
-    one = make_scene(
+    lap = make_scene(
         0, frames=frames, every_m=every_m, jitter=None, max_range_m=range_m, start_error_deg=1.0
     ).problem
-    problem = driven_on(one, -(-observations // len(one.observations.corner))) if frames == 400 else one
+    problem = driven_on(lap, -(-observations // len(lap.observations.corner))) if frames == 400 else lap
     arrays = make_arrays(problem, (), "cpu")
     corners, _ = make_engine("auto", arrays).back_project(torch.as_tensor(problem.cam_from_vehicle))
     start = np.empty((problem.corner_count, 2))
@@ -102,43 +102,52 @@ def ours(problem: Problem, options: SolveOptions, name: str) -> Row:
 
 def native(problem: Problem, options: NativeOptions) -> Row:
     """Native Ceres with analytic derivatives."""
-    found = solve_native(problem, options)
+    solution = solve_native(problem, options)
     form = "batched" if options.is_batched else "single"
     name = f"native Ceres, {form}, {options.linear_solver}"
-    note = f"{found.steps} steps, {found.ended.lower()}"
-    return Row(name, found.setup_s, found.solve_s, found.cpu_s, found.cost, note)
+    note = f"{solution.steps} steps, {solution.ended.lower()}"
+    return Row(name, solution.setup_s, solution.solve_s, solution.cpu_s, solution.cost, note)
 
 
 def ceres(problem: Problem, options: CeresOptions) -> Row:
     """Ceres through pyceres: Levenberg-Marquardt on the Schur complement."""
-    found = solve_ceres(problem, options)
-    return Row("pyceres", found.setup_s, found.solve_s, found.cpu_s, found.cost, f"{found.steps} steps")
+    solution = solve_ceres(problem, options)
+    return Row(
+        "pyceres",
+        solution.setup_s,
+        solution.solve_s,
+        solution.cpu_s,
+        solution.cost,
+        f"{solution.steps} steps",
+    )
 
 
 def by_gtsam(problem: Problem) -> Row:
     """GTSAM: Levenberg-Marquardt, its own factors and elimination."""
-    found = solve_gtsam(problem)
-    return Row("gtsam", found.setup_s, found.solve_s, found.cpu_s, found.cost, f"{found.steps} steps")
+    solution = solve_gtsam(problem)
+    return Row(
+        "gtsam", solution.setup_s, solution.solve_s, solution.cpu_s, solution.cost, f"{solution.steps} steps"
+    )
 
 
 def scipy_trf(problem: Problem) -> Row:
     """SciPy's trust region reflective, differences coloured by the Jacobian's sparsity, LSMR steps."""
     began = time.perf_counter()
-    cameras, seen = len(problem.intrinsic), problem.observations
-    vehicle_from_map = np.linalg.inv(problem.map_from_vehicle)[seen.frame]
-    root = np.linalg.inv(np.linalg.cholesky(seen.covariance_px))
-    intrinsic, start = problem.intrinsic[seen.camera], problem.cam_from_vehicle
+    cameras, observations = len(problem.intrinsic), problem.observations
+    vehicle_from_map = np.linalg.inv(problem.map_from_vehicle)[observations.frame]
+    root = np.linalg.inv(np.linalg.cholesky(observations.covariance_px))
+    intrinsic, start = problem.intrinsic[observations.camera], problem.cam_from_vehicle
     assert problem.corners_start is not None
 
     def residuals(x: np.ndarray) -> np.ndarray:
         """Residuals of all observations, then priors; x holds each camera's turn and centre, then corners."""
         turn, centre = x[: 6 * cameras].reshape(-1, 2, 3).transpose(1, 0, 2)
-        corner = x[6 * cameras :].reshape(-1, 2)[seen.corner]
+        corner = x[6 * cameras :].reshape(-1, 2)[observations.corner]
         ground = np.column_stack([corner, np.zeros(len(corner)), np.ones(len(corner))])
-        vehicle = np.einsum("kab,kb->ka", vehicle_from_map[:, :3], ground) - centre[seen.camera]
+        vehicle = np.einsum("kab,kb->ka", vehicle_from_map[:, :3], ground) - centre[observations.camera]
         rotation = Rotation.from_rotvec(turn).as_matrix() @ start[:, :3, :3]
-        point = np.einsum("kab,kb->ka", rotation[seen.camera], vehicle)
-        off = intrinsic[:, :2] * point[:, :2] / point[:, 2:] + intrinsic[:, 2:] - seen.pinhole_px
+        point = np.einsum("kab,kb->ka", rotation[observations.camera], vehicle)
+        off = intrinsic[:, :2] * point[:, :2] / point[:, 2:] + intrinsic[:, 2:] - observations.pinhole_px
         prior = (centre - problem.centre_vehicle) / problem.centre_sigma_m
         return np.concatenate([np.einsum("kab,kb->ka", root, off).ravel(), prior.ravel()])
 
@@ -147,18 +156,18 @@ def scipy_trf(problem: Problem) -> Row:
         [np.stack([np.zeros_like(centre), centre], axis=1).ravel(), problem.corners_start.ravel()]
     )
     ready, cpu = time.perf_counter(), time.process_time()
-    found = least_squares(
+    result = least_squares(
         residuals, x, jac_sparsity=_sparsity(problem), x_scale="jac", ftol=1e-12, xtol=1e-12, gtol=1e-12
     )
     took, cpu = time.perf_counter() - ready, time.process_time() - cpu
-    return Row("scipy, trf", ready - began, took, cpu, float(found.cost), f"{found.nfev} steps")
+    return Row("scipy, trf", ready - began, took, cpu, float(result.cost), f"{result.nfev} steps")
 
 
 def _sparsity(problem: Problem) -> coo_matrix:
     """Which unknowns each residual of :func:`scipy_trf` depends on."""
-    cameras, seen = len(problem.intrinsic), problem.observations
-    of_camera = 6 * seen.camera[:, None] + np.arange(6)
-    of_corner = 6 * cameras + 2 * seen.corner[:, None] + np.arange(2)
+    cameras, observations = len(problem.intrinsic), problem.observations
+    of_camera = 6 * observations.camera[:, None] + np.arange(6)
+    of_corner = 6 * cameras + 2 * observations.corner[:, None] + np.arange(2)
     columns = np.concatenate([of_camera, of_corner], axis=1).repeat(2, axis=0)
     rows = np.arange(len(columns))[:, None].repeat(8, axis=1)
     prior = np.arange(3 * cameras)
@@ -177,8 +186,8 @@ def in_turn(problem: Problem, states: bool, threads: int, rounds: int) -> list[R
             for name in POSE_SOLVERS if states else PAPER_SOLVERS:
                 # A batch has no poses of frames.
                 for is_batched in (False,) if states else (False, True):
-                    wanted = NativeOptions(states, 0.0, threads, name, is_batched=is_batched)
-                    rows.append(native(problem, wanted))
+                    native_options = NativeOptions(states, 0.0, threads, name, is_batched=is_batched)
+                    rows.append(native(problem, native_options))
     names = dict.fromkeys(row.name for row in rows)
     return [min((row for row in rows if row.name == name), key=lambda row: row.cpu_s) for name in names]
 

@@ -19,16 +19,16 @@ from v2hdm.adjust import Observations, PoseSigma, Problem, SolveOptions, solve
 
 def driven_on(problem: Problem, copies: int) -> Problem:
     """The same street ``copies`` times, each beyond the last, seen by the same cameras."""
-    frames, seen = len(problem.map_from_vehicle), problem.observations
+    frames, sightings = len(problem.map_from_vehicle), problem.observations
     poses = np.tile(problem.map_from_vehicle, (copies, 1, 1))
     poses[:, 0, 3] += 1000.0 * np.repeat(np.arange(copies), frames)
-    block = np.repeat(np.arange(copies), len(seen.corner))
+    block = np.repeat(np.arange(copies), len(sightings.corner))
     observations = Observations(
-        np.tile(seen.camera, copies),
-        np.tile(seen.frame, copies) + frames * block,
-        np.tile(seen.corner, copies) + problem.corner_count * block,
-        np.tile(seen.pinhole_px, (copies, 1)),
-        np.tile(seen.covariance_px, (copies, 1, 1)),
+        np.tile(sightings.camera, copies),
+        np.tile(sightings.frame, copies) + frames * block,
+        np.tile(sightings.corner, copies) + problem.corner_count * block,
+        np.tile(sightings.pinhole_px, (copies, 1)),
+        np.tile(sightings.covariance_px, (copies, 1, 1)),
     )
     return replace(
         problem,

@@ -58,10 +58,10 @@ def case_of(shapes: Sequence[DesignShape], tolerance: Tolerances, seed: int, mot
     shift = np.array(motion[:2])
     out = []
     conforms = {}
-    taken = 0
+    count = 0
     for shape in shapes:
         if rng.random() < 0.03:
-            taken = taken + 1
+            count = count + 1
             continue
         offset = np.zeros(2)
         turn = 0.0
@@ -79,7 +79,7 @@ def case_of(shapes: Sequence[DesignShape], tolerance: Tolerances, seed: int, mot
         pattern = shapes[rng.integers(len(shapes))]
         outline = turned(pattern.outline_map + np.array([0, ASIDE_M]), turn_deg) + shift
         out.append(DesignShape(f"added {number}", pattern.kind, outline))
-    return Case(Design(tuple(out)), conforms, taken)
+    return Case(Design(tuple(out)), conforms, count)
 
 
 def within(outline: FloatArray, off_m: FloatArray, turn_deg: float, tolerance: Tolerances) -> bool:

@@ -22,14 +22,14 @@ def main() -> int:
     parser.add_argument("--verbose", action="store_true", help="print what every case said")
     parsed = parser.parse_args()
     cases = [case for case in all_cases() if parsed.only in case.name]
-    found: Counter[str] = Counter()
+    fault_counts: Counter[str] = Counter()
     bad, begin_s = 0, time.perf_counter()
     for case in cases:
         with tempfile.TemporaryDirectory() as folder:
             outcome = judge(case, Path(folder))
         faults = outcome.faults(case)
         bad += bool(faults)
-        found.update(fault.split(" ")[0] for fault in faults)
+        fault_counts.update(fault.split(" ")[0] for fault in faults)
         if faults or parsed.verbose:
             print(f"{'BAD ' if faults else 'good'} {case.name}: {'; '.join(faults)}")
             print(f"     {' | '.join(outcome.error.strip().splitlines()[-3:])[-400:]}", flush=True)

@@ -55,10 +55,10 @@ def stage(address: str, folder: Path) -> str:
     names = [f"{number}.txt" for number in range(JOBS)]
     try:
         with open_executor(2, address) as executor:
-            done = dict(executor.side_by_side(write_slowly, [folder / name for name in names]))
+            name_of_job = dict(executor.side_by_side(write_slowly, [folder / name for name in names]))
     except WorkerError as error:
         return f"said: {str(error).partition(';')[0].rpartition(':')[2].strip()}"
-    return "finished" if [done[number] for number in range(JOBS)] == names else "WRONG"
+    return "finished" if [name_of_job[number] for number in range(JOBS)] == names else "WRONG"
 
 
 def kill(whom: str, machines: Machines, folder: Path, at_s: float) -> str:
@@ -125,7 +125,7 @@ def fleets(count: int, scratch: Path) -> bool:
     """Print what a second worker gains for so many drives; whether the maps are the same."""
     drive = scratch / "drive"
     if not (drive / "drive.yaml").is_file():
-        render_drive(short_port(), drive, HERE, lambda done, total: None)
+        render_drive(short_port(), drive, HERE, lambda finished, total: None)
     spent_s = []
     digests = []
     for workers in (1, 2):

@@ -38,37 +38,42 @@ def main() -> None:
     parser.add_argument("drive", type=Path)
     parser.add_argument("result", type=Path)
     parser.add_argument("camera", nargs="?", default="front")
-    given = parser.parse_args()
-    drive = read_drive(given.drive)
-    truth, rows = read_truth(drive), [i for i, one in enumerate(drive.images) if one.camera == given.camera]
+    arguments = parser.parse_args()
+    drive = read_drive(arguments.drive)
+    truth, rows = (
+        read_truth(drive),
+        [i for i, image in enumerate(drive.images) if image.camera == arguments.camera],
+    )
     recorded = np.array([drive.images[i].map_from_vehicle for i in rows])
     with TemporaryDirectory() as scratch:
         began = time.perf_counter()
-        found, registered, points, error_px = colmap(drive, rows, given.camera, Path(scratch))
+        cam_from_map_colmap, registered, points, error_px = colmap(
+            drive, rows, arguments.camera, Path(scratch)
+        )
         seconds = time.perf_counter() - began
     print(f"COLMAP: {registered} of {len(rows)} images, {points} points, {error_px:.2f} px, {seconds:.0f} s")
-    facts = read_facts(given.result, drive)
+    facts = read_facts(arguments.result, drive)
     assert facts.route is not None
     at = [np.abs(facts.route.stamp_s - drive.images[i].stamp_s).argmin() for i in rows]
-    mounting = facts.cameras[given.camera].calibration.cam_from_vehicle
+    mounting = facts.cameras[arguments.camera].calibration.cam_from_vehicle
     ours = mounting @ inverse(facts.route.flat[at])
     px, took = facts.best["reprojection_rmse_px"], sum(facts.metrics["seconds"].values())
     print(f"V2HDM: {len(rows)} images, {facts.best['markings']} markings, {px:.2f} px, {took:.0f} s")
-    for name, cam_from_map, of in (("COLMAP", found, None), ("V2HDM", ours, mounting)):
-        known = np.isfinite(cam_from_map[:, 0, 0])
-        if not known.any():
+    for name, cam_from_map, of in (("COLMAP", cam_from_map_colmap, None), ("V2HDM", ours, mounting)):
+        is_registered = np.isfinite(cam_from_map[:, 0, 0])
+        if not is_registered.any():
             print(f"{name}: no image was registered")
             continue
-        mean = mean_pose(cam_from_map[known] @ recorded[known]) if of is None else of
-        turned_deg, off_m = extrinsic_metrics(mean, truth.cam_from_vehicle[given.camera]).values()
-        errors = corner_errors_m(truth, rows, cam_from_map, drive.cameras[given.camera].info)
+        mean = mean_pose(cam_from_map[is_registered] @ recorded[is_registered]) if of is None else of
+        turned_deg, off_m = extrinsic_metrics(mean, truth.cam_from_vehicle[arguments.camera]).values()
+        errors = corner_errors_m(truth, rows, cam_from_map, drive.cameras[arguments.camera].info)
         print(
             f"{name}: camera {turned_deg:.3f} deg, {100 * off_m:.1f} cm off; "
             f"perfect tracks of {len(errors)} corners {100 * rms(errors):.1f} cm RMSE, "
             f"median {100 * np.median(np.linalg.norm(errors, axis=1)):.1f} cm"
         )
-    own = facts.best.get("corner_rmse_m", float("nan"))
-    print(f"V2HDM's own map, from its detections: {100 * own:.1f} cm RMSE")
+    rmse_m = facts.best.get("corner_rmse_m", float("nan"))
+    print(f"V2HDM's own map, from its detections: {100 * rmse_m:.1f} cm RMSE")
 
 
 def colmap(drive: Drive, rows: list[int], camera: str, scratch: Path) -> tuple[FloatArray, int, int, float]:
@@ -90,16 +95,16 @@ def colmap(drive: Drive, rows: list[int], camera: str, scratch: Path) -> tuple[F
         camera_model="OPENCV", camera_params=",".join(map(repr, map(float, parameters)))
     )
     pycolmap.extract_features(
-        database, folder, [one.path.name for one in images], pycolmap.CameraMode.SINGLE, reading,
+        database, folder, [image.path.name for image in images], pycolmap.CameraMode.SINGLE, reading,
         device=pycolmap.Device.cpu,
     )  # fmt: skip
     with pycolmap.Database.open(database) as opened:
-        for one in images:
-            centre = (one.map_from_vehicle @ [*prior.centre_vehicle, 1.0])[:3]
+        for image in images:
+            centre = (image.map_from_vehicle @ [*prior.centre_vehicle, 1.0])[:3]
             covariance = np.diag(prior.sigma_m**2 + drive.pose_noise.position_m**2)
             cartesian = pycolmap.PosePriorCoordinateSystem.CARTESIAN
             placed = pycolmap.PosePrior(
-                corr_data_id=opened.read_image_with_name(one.path.name).data_id,
+                corr_data_id=opened.read_image_with_name(image.path.name).data_id,
                 position=centre,
                 position_covariance=covariance,
                 coordinate_system=cartesian,
@@ -116,10 +121,10 @@ def colmap(drive: Drive, rows: list[int], camera: str, scratch: Path) -> tuple[F
     if not models:
         return out, 0, 0, float("nan")
     best = max(models.values(), key=lambda model: model.num_reg_images())
-    by_name = {one.name: one for one in best.images.values() if one.has_pose}
-    for n, one in enumerate(images):
-        if one.path.name in by_name:
-            out[n] = np.vstack([by_name[one.path.name].cam_from_world().matrix(), [0, 0, 0, 1]])
+    by_name = {image.name: image for image in best.images.values() if image.has_pose}
+    for n, image in enumerate(images):
+        if image.path.name in by_name:
+            out[n] = np.vstack([by_name[image.path.name].cam_from_world().matrix(), [0, 0, 0, 1]])
     return out, len(by_name), best.num_points3D(), best.compute_mean_reprojection_error()
 
 
@@ -137,15 +142,21 @@ def corner_errors_m(truth: Truth, rows: list[int], cam_from_map: FloatArray, inf
     out = []
     for j, marking in enumerate(truth.map.markings):
         for corner in marking.corners_map:
-            seen = (true_cam @ [*corner, 0.0, 1.0])[:, :3]
-            px = seen @ info.intrinsic.T
+            corner_cam = (true_cam @ [*corner, 0.0, 1.0])[:, :3]
+            px = corner_cam @ info.intrinsic.T
             with np.errstate(divide="ignore", invalid="ignore"):
                 px = px[:, :2] / px[:, 2:]
-            good = (seen[:, 2] > NEAREST_M) & (seen[:, 2] < FARTHEST_M) & np.isfinite(cam_from_map[:, 0, 0])
+            good = (
+                (corner_cam[:, 2] > NEAREST_M)
+                & (corner_cam[:, 2] < FARTHEST_M)
+                & np.isfinite(cam_from_map[:, 0, 0])
+            )
             good &= ((px > 0) & (px < [info.width, info.height])).all(axis=1)
             good &= truth.visibility[rows, j] >= FULLY_VISIBLE
             if good.sum() >= 2:
-                out.append(triangulated(seen[good, :2] / seen[good, 2:], cam_from_map[good])[:2] - corner)
+                out.append(
+                    triangulated(corner_cam[good, :2] / corner_cam[good, 2:], cam_from_map[good])[:2] - corner
+                )
     return np.array(out).reshape(-1, 2)
 
 

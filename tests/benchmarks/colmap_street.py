@@ -41,10 +41,10 @@ class _Model(NamedTuple):
     spent_s: float
 
 
-def _kept_model(drive: Drive, rows: list[int], camera: str, kept: Path | None) -> _Model:
+def _kept_model(drive: Drive, rows: list[int], camera: str, model_file: Path | None) -> _Model:
     """COLMAP's model of the images ``rows``, from a file if there is one."""
-    if kept is not None and kept.exists():
-        with np.load(kept) as content:
+    if model_file is not None and model_file.exists():
+        with np.load(model_file) as content:
             return _Model(
                 content["cam_from_map"],
                 int(content["registered"]),
@@ -56,8 +56,8 @@ def _kept_model(drive: Drive, rows: list[int], camera: str, kept: Path | None) -
         began_s = time.process_time()
         poses, registered, points, error_px = colmap(drive, rows, camera, Path(scratch))
         model = _Model(poses, registered, points, error_px, time.process_time() - began_s)
-    if kept is not None:
-        np.savez(kept, **model._asdict())
+    if model_file is not None:
+        np.savez(model_file, **model._asdict())
     return model
 
 
@@ -67,8 +67,8 @@ def main() -> None:
     parser.add_argument("drive", type=Path)
     parser.add_argument("result", type=Path)
     parser.add_argument("camera")
-    kept = "NPZ of what COLMAP found: read if it is there, else written after minutes of CPU"
-    parser.add_argument("--kept", type=Path, metavar="FILE", help=kept)
+    help_text = "NPZ of what COLMAP found: read if it is there, else written after minutes of CPU"
+    parser.add_argument("--kept", type=Path, metavar="FILE", help=help_text)
     parsed = parser.parse_args()
     drive = read_drive(parsed.drive)
     rows = [row for row, image in enumerate(drive.images) if image.camera == parsed.camera]
@@ -82,9 +82,9 @@ def main() -> None:
     facts = read_facts(parsed.result, drive)
     ours = facts.cameras[parsed.camera].calibration.cam_from_vehicle
     print(f"V2HDM: {facts.best['markings']} markings, {facts.best['reprojection_rmse_px']:.2f} px")
-    known = np.isfinite(poses[:, 0, 0])
+    is_registered = np.isfinite(poses[:, 0, 0])
     recorded = np.array([drive.images[row].map_from_vehicle for row in rows])
-    cam_from_vehicle = poses[known] @ recorded[known]
+    cam_from_vehicle = poses[is_registered] @ recorded[is_registered]
     mean = mean_pose(cam_from_vehicle)
     scatter = np.std([turned_deg(pose, mean) for pose in cam_from_vehicle], axis=0)
     for name, extrinsic in (("COLMAP", mean), ("V2HDM", ours)):

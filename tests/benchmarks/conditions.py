@@ -136,13 +136,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--only", nargs="+", default=list(CONDITIONS), choices=CONDITIONS)
     parser.add_argument("--length-m", type=float, default=40.0)
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    asked = parser.parse_args(arguments)
+    parsed = parser.parse_args(arguments)
     of_cells: dict[tuple[str, str], list[Mapped]] = {}
-    for run in asked.ports:
-        for seed in asked.seeds:
-            for condition in asked.only:
-                port = port_of(run, seed, condition, asked.length_m)
-                with open_executor(asked.workers) as executor:
+    for run in parsed.ports:
+        for seed in parsed.seeds:
+            for condition in parsed.only:
+                port = port_of(run, seed, condition, parsed.length_m)
+                with open_executor(parsed.workers) as executor:
                     for mapping in mapped(port, executor):
                         of_cells.setdefault((condition, mapping.cameras), []).append(mapping)
                         print(line(f"{run} {seed} {condition}, {mapping.cameras}", mapping), flush=True)

@@ -127,7 +127,7 @@ def map_of(path: Path, output: Path, workers: int) -> Mapped:
         output=str(output), cache=str(output / "cache"), workers=workers,
     )  # fmt: skip
     result = run(config)
-    raised = frozenset(f"{one.check}: {one.status.name}" for one in result.verdict.findings)
+    raised = frozenset(f"{finding.check}: {finding.status.name}" for finding in result.verdict.findings)
     markings = read_geojson(result.folder / "map.geojson").markings
     return Mapped(markings, result.verdict.status.name, raised)
 
@@ -135,16 +135,16 @@ def map_of(path: Path, output: Path, workers: int) -> Mapped:
 def apart_m(a: Sequence[Marking], b: Sequence[Marking]) -> tuple[int, float]:
     """How many markings of ``a`` are in ``b``, and the largest distance of a corner of theirs."""
     largest, shared = 0.0, 0
-    for one in a:
-        near = [
+    for marking in a:
+        candidates = [
             two for two in b
-            if two.kind == one.kind
-            and np.linalg.norm(two.corners_map.mean(axis=0) - one.corners_map.mean(axis=0)) < SAME_M
+            if two.kind == marking.kind
+            and np.linalg.norm(two.corners_map.mean(axis=0) - marking.corners_map.mean(axis=0)) < SAME_M
         ]  # fmt: skip
-        if near:
+        if candidates:
             shared += 1
-            rolled = [np.roll(near[0].corners_map, k, axis=0) for k in range(4)]
-            largest = max(largest, min(np.linalg.norm(one.corners_map - r, axis=1).max() for r in rolled))
+            rolled = [np.roll(candidates[0].corners_map, k, axis=0) for k in range(4)]
+            largest = max(largest, min(np.linalg.norm(marking.corners_map - r, axis=1).max() for r in rolled))
     return shared, float(largest)
 
 
@@ -157,25 +157,27 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=1)
     parsed = parser.parse_args()
     reference: Mapped | None = None
-    with nullcontext(parsed.keep) if parsed.keep else TemporaryDirectory() as kept:
+    with nullcontext(parsed.keep) if parsed.keep else TemporaryDirectory() as folder:
         for number, (name, write) in enumerate(containers(parsed.drive).items()):
             if parsed.only and name not in ("folder", *parsed.only):
                 continue
-            own = Path(kept) / str(number)
-            (own / "given").mkdir(parents=True)
-            found = map_of(write(own / "given"), own / "out", parsed.workers)
-            reference = reference or found
-            shared, largest_m = apart_m(reference.markings, found.markings)
+            run_folder = Path(folder) / str(number)
+            (run_folder / "given").mkdir(parents=True)
+            mapped = map_of(write(run_folder / "given"), run_folder / "out", parsed.workers)
+            reference = reference or mapped
+            shared, largest_m = apart_m(reference.markings, mapped.markings)
             same = (
-                "same" if found.raised == reference.raised else f"differs: {found.raised ^ reference.raised}"
+                "same"
+                if mapped.raised == reference.raised
+                else f"differs: {mapped.raised ^ reference.raised}"
             )
             print(
-                f"{name:14s} {len(found.markings):4d} markings, {shared:4d} of the folder's, "
-                f"largest distance {1e3 * largest_m:7.4f} mm, verdict {found.verdict} ({same})",
+                f"{name:14s} {len(mapped.markings):4d} markings, {shared:4d} of the folder's, "
+                f"largest distance {1e3 * largest_m:7.4f} mm, verdict {mapped.verdict} ({same})",
                 flush=True,
             )
             if not parsed.keep:
-                shutil.rmtree(own)
+                shutil.rmtree(run_folder)
 
 
 if __name__ == "__main__":

@@ -66,13 +66,15 @@ def rendered(root: Path, camera: int, images: int, seed: int = SEED) -> Folder:
     folder.mkdir()
     truth = []
     for index in range(images):
-        one = np.random.default_rng([seed, camera, index])
-        angles = np.deg2rad([yaw_deg, *(np.array([pitch_deg, roll_deg]) + one.normal(0, _BODY_DEG, 2))])
-        centre = np.array([0.0, one.normal(0, 0.6), height_m])
-        shown = _render(one, looking(centre, *angles.tolist()), fov_deg)
+        rng_of_image = np.random.default_rng([seed, camera, index])
+        angles = np.deg2rad(
+            [yaw_deg, *(np.array([pitch_deg, roll_deg]) + rng_of_image.normal(0, _BODY_DEG, 2))]
+        )
+        centre = np.array([0.0, rng_of_image.normal(0, 0.6), height_m])
+        shown = _render(rng_of_image, looking(centre, *angles.tolist()), fov_deg)
         cv2.imwrite(str(folder / f"{index:03d}.png"), shown.image)
-        near = [t for t in shown.markings if t.fair and t.range_m <= MAX_RANGE_M]
-        truth.append([(t.kind, t.polygon_px) for t in near])
+        in_range = [t for t in shown.markings if t.fair and t.range_m <= MAX_RANGE_M]
+        truth.append([(t.kind, t.polygon_px) for t in in_range])
     return Folder(folder, truth, (height_m, pitch_deg, fov_deg))
 
 
@@ -92,23 +94,23 @@ def photographs(
 ) -> Folder:
     """Labelled photographs of one camera, 16:9 again."""
     content = json.loads(labels.read_text(encoding="utf-8"))
-    names = {one["id"]: one["name"] for one in content["categories"]}
+    names = {category["id"]: category["name"] for category in content["categories"]}
     of_image = defaultdict(list)
-    for one in content["annotations"]:
-        of_image[one["image_id"]].append(one)
-    chosen = sorted(content["images"], key=lambda one: one["file_name"])
-    chosen = [one for one in chosen if int(one["file_name"][:3]) < stems][::every]
+    for annotation in content["annotations"]:
+        of_image[annotation["image_id"]].append(annotation)
+    chosen = sorted(content["images"], key=lambda image: image["file_name"])
+    chosen = [image for image in chosen if int(image["file_name"][:3]) < stems][::every]
     folder = root / "photographs"
     folder.mkdir()
     truth = []
-    for one in chosen:
-        squeezed = read_bgr(labels.parent / "images" / one["file_name"])
+    for annotation in chosen:
+        squeezed = read_bgr(labels.parent / "images" / annotation["file_name"])
         image = cv2.resize(squeezed, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
-        cv2.imwrite(str(folder / Path(one["file_name"]).with_suffix(".png")), image)
-        scale = np.array([WIDTH / one["width"], HEIGHT / one["height"]])
+        cv2.imwrite(str(folder / Path(annotation["file_name"]).with_suffix(".png")), image)
+        scale = np.array([WIDTH / annotation["width"], HEIGHT / annotation["height"]])
         parts = [
             (names[a["category_id"]], np.reshape(part, (-1, 2)) * scale)
-            for a in of_image[one["id"]]
+            for a in of_image[annotation["id"]]
             for part in a["segmentation"]
         ]
         truth.append([(kind, p) for name, p in parts if (kind := _kind(name, p, mounting))])
@@ -152,7 +154,7 @@ def count(
         ]
         counts.update((kind, "given") for kind, _ in shapes)
         for kind, polygon_px in truth:
-            overlaps = [(polygon_overlap(shape, polygon_px), given) for given, shape in shapes]
+            overlaps = [(polygon_overlap(shape, polygon_px), kind) for kind, shape in shapes]
             best, name = max(overlaps, default=(0.0, ""))
             counts[kind, "true"] += 1
             counts[kind, "found"] += best > _OVERLAP

@@ -87,10 +87,10 @@ def peak_memory_mb(images: Path, calibration: Path, model: str | None) -> float:
     """The on-vehicle process's peak memory, by its own count."""
     command = [sys.executable, "-m", "v2hdm.detect", str(images), "--camera", str(calibration)]
     command += ["--model", model] if model else []
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    found = re.search(r"peak memory (\d+) MB", done.stderr)
-    assert found is not None, done.stderr
-    return float(found[1])
+    process = subprocess.run(command, capture_output=True, text=True, check=True)
+    peak = re.search(r"peak memory (\d+) MB", process.stderr)
+    assert peak is not None, process.stderr
+    return float(peak[1])
 
 
 def main() -> None:

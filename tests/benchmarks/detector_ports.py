@@ -56,8 +56,8 @@ def _lanes_near(port: Port, view: TrainingView) -> list[FloatArray]:
     centre = np.linalg.inv(view.cam_from_map)[:2, 3]
     stretches = []
     for lane in port.hd_map.lanes:
-        near = np.flatnonzero(np.linalg.norm(lane.points_map - centre, axis=1) < LANES_WITHIN_M)
-        stretches += [lane.points_map[run] for run in np.split(near, np.flatnonzero(np.diff(near) > 1) + 1)]
+        rows = np.flatnonzero(np.linalg.norm(lane.points_map - centre, axis=1) < LANES_WITHIN_M)
+        stretches += [lane.points_map[run] for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)]
     return [stretch for stretch in stretches if len(stretch) > 1]
 
 

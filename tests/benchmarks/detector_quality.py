@@ -57,13 +57,13 @@ class Tally:
         self.lane_false = 0
         self.lanes_given = 0
 
-    def add_markings(self, truth: list[TrueMarking], given: tuple[MarkingDetection, ...]) -> None:
+    def add_markings(self, truth: list[TrueMarking], detections: tuple[MarkingDetection, ...]) -> None:
         """Match by overlap, best score first, each truth once."""
         for true in truth:
             self.fair[true.kind] += true.fair
         free = set(range(len(truth)))
-        seen = set()
-        for detection in sorted(given, key=lambda d: -d.score):
+        matched = set()
+        for detection in sorted(detections, key=lambda d: -d.score):
             sure = detection.score >= self.least_score
             quad = detection.outline_px if len(detection.outline_px) else detection.corners_px
             overlap = {k: polygon_overlap(quad, truth[k].polygon_px) for k in range(len(truth))}
@@ -76,11 +76,11 @@ class Tally:
                     self.scored[detection.kind].append((detection.score, True))
                     self.found[detection.kind] += sure
                     if sure:
-                        seen.add(best)
+                        matched.add(best)
                         self._add_corners(truth[best], detection)
                 continue
-            near = max(overlap.values(), default=0.0)
-            if near > 0.05:
+            largest_overlap = max(overlap.values(), default=0.0)
+            if largest_overlap > 0.05:
                 k = max(overlap, key=overlap.__getitem__)
                 if truth[k].kind != detection.kind and truth[k].fair:
                     self.taken_for[truth[k].kind, detection.kind] += sure
@@ -88,7 +88,7 @@ class Tally:
                 continue
             self.false += sure and detection.kind in CORNERED_CLASSES
             self.scored[detection.kind].append((detection.score, False))
-        self.found_of_size += [(true.narrow_px, k in seen) for k, true in enumerate(truth) if true.fair]
+        self.found_of_size += [(true.narrow_px, k in matched) for k, true in enumerate(truth) if true.fair]
 
     def _add_corners(self, true: TrueMarking, detection: MarkingDetection) -> None:
         if true.range_m > CORNER_RANGE_M:
@@ -104,35 +104,36 @@ class Tally:
             self.normalised.append(float(error[corner] @ np.linalg.solve(covariance, error[corner])))
 
     def add_lanes(
-        self, truth: list[FloatArray], shown: list[bool], given: list[FloatArray], first_row: float
+        self, truth: list[FloatArray], shown: list[bool], drawn: list[FloatArray], first_row: float
     ) -> None:
         """Points within 20 px (widened by the line's slope) on every tenth row are right.
 
         A line given is false if fewer than 85 % of its points lie on any true line.
         """
-        official = judge([lane for lane, show in zip(truth, shown, strict=True) if show], given)
+        official = judge([lane for lane, show in zip(truth, shown, strict=True) if show], drawn)
         self.tusimple += [official] if official else []
         rows = np.arange(np.ceil(first_row / 10) * 10, HEIGHT, 10.0)
-        lines = [_at_rows(line, rows) for line in given]
+        lines = [_at_rows(line, rows) for line in drawn]
         self.lanes_given += len(lines)
         for lane, show in zip(truth, shown, strict=True):
             u = _at_rows(lane, rows)
-            seen = (u >= 0) & (u < WIDTH)
-            if seen.sum() < 5:
+            in_image = (u >= 0) & (u < WIDTH)
+            if in_image.sum() < 5:
                 continue
-            slope = np.abs(np.polyfit(rows[seen], u[seen], 1)[0])
+            slope = np.abs(np.polyfit(rows[in_image], u[in_image], 1)[0])
             tolerance = LANE_TOLERANCE_PX * np.hypot(1, slope)
-            right = [(np.abs(line - u)[seen] < tolerance).sum() for line in lines]
-            self.lane_points += int(seen.sum())
+            right = [(np.abs(line - u)[in_image] < tolerance).sum() for line in lines]
+            self.lane_points += int(in_image.sum())
             self.lane_right += int(max(right, default=0))
-            self.shown_points += int(seen.sum()) if show else 0
+            self.shown_points += int(in_image.sum()) if show else 0
             self.shown_right += int(max(right, default=0)) if show else 0
         for line in lines:
-            known = np.isfinite(line)
-            near = [
-                (np.abs(_at_rows(lane, rows) - line)[known] < 2 * LANE_TOLERANCE_PX).mean() for lane in truth
+            has_column = np.isfinite(line)
+            overlaps = [
+                (np.abs(_at_rows(lane, rows) - line)[has_column] < 2 * LANE_TOLERANCE_PX).mean()
+                for lane in truth
             ]
-            self.lane_false += max(near, default=0.0) < LANE_MATCH
+            self.lane_false += max(overlaps, default=0.0) < LANE_MATCH
 
 
 def _at_rows(line: FloatArray, rows: FloatArray) -> FloatArray:
@@ -197,11 +198,11 @@ def summary(tally: Tally, images: int) -> str:
 
 
 def _size_line(tally: Tally) -> str:
-    narrow, found = np.array(tally.found_of_size, dtype=np.float64).reshape(-1, 2).T
+    narrow, is_found = np.array(tally.found_of_size, dtype=np.float64).reshape(-1, 2).T
     parts = []
     for low, high in pairwise(_NARROW_PX):
         of_size = (narrow >= low) & (narrow < high)
-        share = found[of_size].sum() / max(of_size.sum(), 1)
+        share = is_found[of_size].sum() / max(of_size.sum(), 1)
         parts.append(f"{low:g} to {high:g} px {share:.3f} ({of_size.sum()})")
     return f"recall by narrow side: {', '.join(parts)}"
 

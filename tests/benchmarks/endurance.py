@@ -56,10 +56,10 @@ def processor_s(process: int) -> float:
 
 def detecting(drive: Path, images: int, every: int) -> Iterator[Sample]:
     """Samples of the door's process while it looks at the images of one camera again and again."""
-    found = sorted(drive.rglob("*.jpg"))
-    if not found:
+    pictures = sorted(drive.rglob("*.jpg"))
+    if not pictures:
         raise SystemExit(f"{drive}: no .jpg in it")
-    files = sorted(found[0].parent.glob("*.jpg"))
+    files = sorted(pictures[0].parent.glob("*.jpg"))
     with TemporaryDirectory(prefix="endurance-") as scratch:
         folder = Path(scratch)
         for i, file in zip(range(images), itertools.cycle(files), strict=False):
@@ -67,9 +67,9 @@ def detecting(drive: Path, images: int, every: int) -> Iterator[Sample]:
         command = [sys.executable, "-m", "v2hdm.detect", str(folder)]
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as door:
             assert door.stdout is not None
-            for done, _ in enumerate(door.stdout, 1):
-                if done % every == 0 and done < images:
-                    yield done, resident_mb(door.pid), processor_s(door.pid)
+            for count, _ in enumerate(door.stdout, 1):
+                if count % every == 0 and count < images:
+                    yield count, resident_mb(door.pid), processor_s(door.pid)
         if door.returncode != 0:
             raise SystemExit(f"the door ended with {door.returncode}")
 
@@ -78,22 +78,22 @@ def mapping(drive: Path, images: int, cameras: tuple[str, ...]) -> Iterator[Samp
     """Samples of this process while it maps one drive again and again, after each round."""
     read = read_drive(drive, DriveConfig(cameras=list(cameras)))
     with open_executor() as executor:
-        found = detect_all(read, DetectorOptions(), executor)
+        detections = detect_all(read, DetectorOptions(), executor)
 
     def replay(
         drive: Drive, options: DetectorOptions, images: Sequence[int], executor: Executor, take: Any
     ) -> None:
         for index in images:
-            take(found[index])
+            take(detections[index])
 
     with TemporaryDirectory(prefix="endurance-") as scratch:
-        for done in itertools.count(len(read.images), len(read.images)):
+        for count in itertools.count(len(read.images), len(read.images)):
             result = map_drive(read, detector=DetectorOptions(), context=Context(detect=replay, workers=1))
             result.save(Path(scratch) / "result")
             del result
             gc.collect()
-            yield done, resident_mb(os.getpid()), time.process_time()
-            if done >= images:
+            yield count, resident_mb(os.getpid()), time.process_time()
+            if count >= images:
                 return
 
 
@@ -107,22 +107,22 @@ def main() -> int:
     parsed = parser.parse_args()
     images = parsed.images or {"detect": 20_000, "map": 800_000}[parsed.what]
     began = time.perf_counter()
-    seen: list[Sample] = []
+    measured: list[Sample] = []
     if parsed.what == "detect":
         samples = detecting(parsed.drive, images, max(images // 100, 1))
     else:
         samples = mapping(parsed.drive, images, tuple(parsed.cameras))
     for sample in samples:
-        seen.append(sample)
-        done, resident, used_s = sample
-        last = seen[-2] if len(seen) > 1 else (0, 0.0, 0.0)
-        each_ms = 1000 * (used_s - last[2]) / (done - last[0])
+        measured.append(sample)
+        count, resident, used_s = sample
+        last = measured[-2] if len(measured) > 1 else (0, 0.0, 0.0)
+        each_ms = 1000 * (used_s - last[2]) / (count - last[0])
         print(
-            f"{time.perf_counter() - began:8.0f} s  {done:8d} images  {resident:8.1f} MB  "
+            f"{time.perf_counter() - began:8.0f} s  {count:8d} images  {resident:8.1f} MB  "
             f"{each_ms:6.2f} ms an image",
             flush=True,
         )
-    counts, resident_all, used = np.array(seen).T
+    counts, resident_all, used = np.array(measured).T
     first = int(np.searchsorted(counts, _FIRST * images))
     growth = resident_all[first:].max() / resident_all[: first + 1].max() - 1
     rate = np.diff(used) / np.diff(counts)

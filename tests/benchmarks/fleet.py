@@ -25,10 +25,10 @@ from v2hdm.fleet import FleetOptions, run_fleet
 OPTIONS = SolveOptions(coarse=False)
 
 
-def off_m(one: Solution, other: Solution) -> float:
+def off_m(solution: Solution, other: Solution) -> float:
     """The largest distance of corners, camera centres' coordinates and poses of two solutions."""
     return max(
-        float(np.abs(getattr(one, name) - getattr(other, name)).max())
+        float(np.abs(getattr(solution, name) - getattr(other, name)).max())
         for name in ("corners_map", "cam_from_vehicle", "map_from_vehicle")
     )
 
@@ -38,16 +38,16 @@ def crowd(frames: int) -> None:
     solve(site(2, 40, 10), OPTIONS)  # compiles, or loads what was compiled
     clearly_less = engine._CLEARLY_LESS
     for drives in (2, 4, 8):
-        problem, spent, found = site(drives, frames, frames), [], []
+        problem, spent, solutions = site(drives, frames, frames), [], []
         for share in (0.0, clearly_less):
             engine._CLEARLY_LESS = share
             cpu = time.process_time()
-            found.append(solve(problem, OPTIONS))
+            solutions.append(solve(problem, OPTIONS))
             spent.append(time.process_time() - cpu)
-        kept = len(found[1].covariance.whitening.plan.kept_corners)
+        corners = len(solutions[1].covariance.whitening.plan.kept_corners)
         print(
             f"{drives} drives of one way: {spent[0]:.2f} s CPU with corners first, {spent[1]:.2f} s with "
-            f"{kept} kept; {off_m(*found):.1e} m apart",
+            f"{corners} kept; {off_m(*solutions):.1e} m apart",
             flush=True,
         )
 

@@ -39,16 +39,16 @@ def disturbed(camera: Camera, off_deg: FloatArray) -> Camera:
     return replace(camera, ipm={"estimated": ipm}, initial_ipm="estimated")
 
 
-def errors(found: Calibration, true: FloatArray) -> tuple[FloatArray, FloatArray]:
+def errors(calibration: Calibration, true: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Errors (4,) of roll, pitch, yaw (deg) and height (cm) in vehicle axes, and their covariance (4, 4)."""
-    matrix = found.cam_from_vehicle
+    matrix = calibration.cam_from_vehicle
     turn = np.rad2deg(cv2.Rodrigues(matrix[:3, :3].T @ true[:3, :3])[0].ravel())
     centres = [-m[:3, :3].T @ m[:3, 3] for m in (matrix, true)]
     jacobian = np.zeros((4, 6))
     jacobian[:3, 3:] = -np.rad2deg(matrix[:3, :3].T)
     jacobian[3, :3] = -100 * matrix[:3, :3].T[2]
-    assert found.covariance is not None
-    return np.append(turn, 100 * (centres[0] - centres[1])[2]), jacobian @ found.covariance @ jacobian.T
+    assert calibration.covariance is not None
+    return np.append(turn, 100 * (centres[0] - centres[1])[2]), jacobian @ calibration.covariance @ jacobian.T
 
 
 def late(drive: Drive, clock_s: float) -> Drive:
@@ -95,9 +95,11 @@ def print_faults(drive: Drive, camera: str) -> None:
     }
     for name, (faulty, parameter) in faults.items():
         estimate = estimate_ground(faulty, camera)
-        found = estimate.parameters.get(parameter)
+        fitted = estimate.parameters.get(parameter)
         value = (
-            "none" if found is None else f"{found.value:+.4f} +- {found.sigma:.4f} told {found.observable}"
+            "none"
+            if fitted is None
+            else f"{fitted.value:+.4f} +- {fitted.sigma:.4f} told {fitted.observable}"
         )
         print(f"  {name:<14} {parameter:<14} {value}, residual {estimate.median_residual:.2f}", flush=True)
 

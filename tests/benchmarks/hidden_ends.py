@@ -59,11 +59,11 @@ class BoxEnds(NamedTuple):
     passing: int  # of these, with an end that passes as true
 
 
-def ends_behind_boxes(seed: int, known: float) -> BoxEnds:
+def ends_behind_boxes(seed: int, share_known: float) -> BoxEnds:
     """Map a made drive past boxes, and judge the ends that these hide."""
     world = make_boxes(draw(seed, "straight"))
     drive = drive_of(world)
-    detections, visibility = detect_pieces(world, drive, known)
+    detections, visibility = detect_pieces(world, drive, share_known)
     truth = truth_of(world, drive, visibility)
     mapped = run_methods(drive, detections, (_CAMERA,), grey=rendered_once(world), naive=False)[BEST]
     dashes = [number for number, marking in enumerate(truth.map.markings) if marking.kind == LANE_DASH]
@@ -103,15 +103,15 @@ def found_on(
     polygon_px = view.project(painted.polygon_map)
     if not view.holds(polygon_px) or any(_touches_box(polygon_px, box) for box in hidden):
         return None
-    found = None
+    hit = None
     largest = 0.0
     for detection in dashes:
         centre_map = centre_of_area(view.ground(detection.corners_px))
         overlap = _overlap(detection.corners_px, polygon_px)
         if overlap > largest and np.linalg.norm(centre_map - painted.centre_map) <= painted.tolerance_m:
-            found = detection
+            hit = detection
             largest = overlap
-    return found
+    return hit
 
 
 def visible_ends(

@@ -107,7 +107,7 @@ def main() -> int:
     scratch = parsed.scratch.resolve()
     rendered = scratch / "drive"
     if not (rendered / "drive.yaml").is_file():
-        render_drive(short_port(), rendered, HERE, lambda done, total: None)
+        render_drive(short_port(), rendered, HERE, lambda finished, total: None)
     cameras = ["front"] if parsed.one_camera else []
     drive = DriveConfig(path=str(rendered), limit=parsed.images, cameras=cameras)
 
@@ -128,21 +128,23 @@ def main() -> int:
         if not kill_at(start(folder, drive), at_s, rng):
             continue
         killed += 1
-        kept = Counter(item.kind for item in items_of(folder / "cache"))
-        furthest = [stage for stage in ("finished", "map", "detect", "own_vehicle", "check") if kept[stage]]
-        reached[f"{furthest[0]} {kept[furthest[0]]}" if furthest else "nothing"] += 1
+        counts = Counter(item.kind for item in items_of(folder / "cache"))
+        furthest = [stage for stage in ("finished", "map", "detect", "own_vehicle", "check") if counts[stage]]
+        reached[f"{furthest[0]} {counts[furthest[0]]}" if furthest else "nothing"] += 1
         more_s = finish(start(folder, drive))
         shares.append((at_s / whole_s, more_s / whole_s))
         is_same = digest(folder) == expected
         same += is_same
         left += len([path for path in (folder / "out").iterdir() if path.name != "run"])
-        print(f"kill {killed} at {at_s:.2f} s, kept {dict(kept)}: {more_s:.1f} s more, {is_same}", flush=True)
+        print(
+            f"kill {killed} at {at_s:.2f} s, kept {dict(counts)}: {more_s:.1f} s more, {is_same}", flush=True
+        )
     print(f"maps byte-identical after a kill: {same} of {killed}; {left} files left beside the results")
     print(f"kept at the kill, by the last stage reached: {dict(reached)}")
-    done, more = np.mean(shares, axis=0)
+    share_before, more = np.mean(shares, axis=0)
     print(
-        f"killed after {done:.2f} of the work on average, a run that goes on does {more:.2f} of it: "
-        f"{(1 - more) / done:.0%} of what was done was saved"
+        f"killed after {share_before:.2f} of the work on average, a run that goes on does {more:.2f} of it: "
+        f"{(1 - more) / share_before:.0%} of what was done was saved"
     )
     return int(same < killed)
 

@@ -65,23 +65,23 @@ print(len(lanelets), sum(len(ends(start, {start})) for start in starts))
 """
 
 
-def counts(found: list, truth: set) -> np.ndarray:
+def counts(places_found: list, truth: set) -> np.ndarray:
     """How many true ones were found, how many are true, and how many of those found are false."""
-    places = matched(found, truth)
-    return np.array([len(places - {None}), len(truth), len(found) - len(places - {None})])
+    places = matched(places_found, truth)
+    return np.array([len(places - {None}), len(truth), len(places_found) - len(places - {None})])
 
 
 def pairs(graph: LaneGraph) -> int:
     """How many pairs of a lane that none leads to and one that leads nowhere have a way between them."""
     reached = 0
     for start in range(len(graph.lanes)):
-        pending, seen = [start] if not graph.before(start) else [], set()
+        pending, visited = [start] if not graph.before(start) else [], set()
         while pending:
             lane = pending.pop()
-            if lane not in seen:
-                seen.add(lane)
+            if lane not in visited:
+                visited.add(lane)
                 pending += graph.after(lane)
-        reached += sum(not graph.after(lane) for lane in seen)
+        reached += sum(not graph.after(lane) for lane in visited)
     return reached
 
 
@@ -98,14 +98,14 @@ def issues(path: Path, checker: str) -> int:
 
 def found_of(graph: LaneGraph) -> dict[str, list]:
     """The pairs of ends of a graph's lanes, ways, and questions on turns."""
-    asked = [(q.place_map, q.to_map) for q in graph.questions if q.subject == "connection"]
-    return {"lanes": lanes_of(graph), "ways": ways_of(graph), "questions": asked}
+    open_links = [(q.place_map, q.to_map) for q in graph.questions if q.subject == "connection"]
+    return {"lanes": lanes_of(graph), "ways": ways_of(graph), "questions": open_links}
 
 
 def scores(graph: LaneGraph, truth: dict[str, set[Pair]]) -> np.ndarray:
     """The :func:`counts` of lanes, ways and questions, a row each."""
-    found = found_of(graph)
-    return np.array([counts(found[name], pairs_of_ends) for name, pairs_of_ends in truth.items()])
+    graph_places = found_of(graph)
+    return np.array([counts(graph_places[name], pairs_of_ends) for name, pairs_of_ends in truth.items()])
 
 
 def shown(table: np.ndarray) -> str:

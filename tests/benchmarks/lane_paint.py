@@ -92,8 +92,8 @@ class Tally:
     def _add_shown(self, image: Image, camera: RoadCamera, pieces_map: FloatArray) -> None:
         """Count the drawn paint of lanes that an image shows whole, and what of it has a piece on it."""
         for painted in self._lanes:
-            there = np.linalg.inv(image.map_from_vehicle)
-            ring = painted.polygon_map @ there[:2, :2].T + there[:2, 3]
+            vehicle_from_map = np.linalg.inv(image.map_from_vehicle)
+            ring = painted.polygon_map @ vehicle_from_map[:2, :2].T + vehicle_from_map[:2, 3]
             ahead = ring[:, 0] > camera.foot_vehicle[0]
             if not (ahead & (camera.range_m(ring) < REACH_M)).all():
                 continue

@@ -85,8 +85,8 @@ def pictures(folder: Path, images: int, markings: int) -> dict[str, list[bytes]]
         frames = np.linspace(0, len(port.driven.stamp_s) - 1, _CHOSEN_OF * images).astype(int).tolist()
         files = [port.jpeg(port.picture(name, frame).image) for frame in frames]
         decoded = (cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) for data in files)
-        found = np.array([len(road.detect(np.asarray(image)).markings) for image in decoded])
-        nearest = np.argsort(np.abs(found - markings), kind="stable")[:images]
+        counts = np.array([len(road.detect(np.asarray(image)).markings) for image in decoded])
+        nearest = np.argsort(np.abs(counts - markings), kind="stable")[:images]
         chosen[name] = [files[k] for k in np.sort(nearest).tolist()]
     return chosen
 

@@ -166,7 +166,7 @@ def errors_of(driven: LiveDrive, run: Run) -> Errors:
 
 def tracking_line(parts: Sequence[Errors], count: int, cpu_s: float) -> str:
     """The figures of drives as one line."""
-    errors, bounds, squared, sigma = (np.concatenate(own) for own in zip(*parts, strict=True))
+    errors, bounds, squared, sigma = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     rmse = np.sqrt((errors**2).mean(axis=0)) * [100, 100, np.degrees(1)]
     inside = (squared < _SQUARE_95).mean()
     heading = (np.abs(errors[:, 2]) < 1.96 * sigma).mean()
@@ -178,13 +178,13 @@ def tracking_line(parts: Sequence[Errors], count: int, cpu_s: float) -> str:
     )
 
 
-def starts(driven: LiveDrive, count: int, rng: np.random.Generator, known: bool) -> IntArray:
+def starts(driven: LiveDrive, count: int, rng: np.random.Generator, is_rough_known: bool) -> IntArray:
     """Right, wrong and no starts from random places, and how many said of the right map that it is wrong."""
     totals = np.zeros(4, dtype=np.int64)
     for begin in rng.integers(0, len(driven.stamp_s) - _START_FRAMES, count).tolist():
-        frames = range(begin, begin + (_START_FRAMES if known else 75))
+        frames = range(begin, begin + (_START_FRAMES if is_rough_known else 75))
         frames = range(begin, min(frames.stop, len(driven.stamp_s)))
-        run = follow(driven, rough(driven, begin, rng) if known else None, frames)
+        run = follow(driven, rough(driven, begin, rng) if is_rough_known else None, frames)
         totals[3] += any(pose.reasons for pose in run.poses)
         errors = errors_of(driven, run).errors
         if not len(errors):
@@ -259,14 +259,14 @@ def repainted_line(driven: LiveDrive, rng: np.random.Generator, seed: int, every
     )
     later_map = replace(hd_map, markings=later)
     on = follow(driven, rough(driven, 0, rng), range(count), later_map, every_full=every_full)
-    near = _first_near(driven, later)
+    first_near = _first_near(driven, later)
     errors = [errors_of(driven, run) for run in (*runs, on)]
     outside = sum(int((np.abs(part.errors) > part.bounds).any(axis=1).sum()) for part in errors)
     return (
         f"half repainted: from the start {said_line(times_s, ways_m)}; "
         f"from the middle on after {said(on, middle):.1f} s, since a moved marking was near "
-        f"{said(on, near):.1f} s and {way_m(driven, near, said(on, near)):.1f} m; poses outside their "
-        f"bounds {outside} of {sum(len(part.errors) for part in errors)}"
+        f"{said(on, first_near):.1f} s and {way_m(driven, first_near, said(on, first_near)):.1f} m; "
+        f"poses outside their bounds {outside} of {sum(len(part.errors) for part in errors)}"
     )
 
 
@@ -294,9 +294,9 @@ def pushed_line(driven: LiveDrive, rng: np.random.Generator, seed: int, every_fu
         run = follow(
             driven, rough(driven, 0, rng), range(len(driven.stamp_s)), looks=looks, every_full=every_full
         )
-        found = errors_of(driven, run)
-        outside = int((np.abs(found.errors) > found.bounds).any(axis=1).sum())
-        named = [own.camera for own in run.poses[-1].turned]
+        errors = errors_of(driven, run)
+        outside = int((np.abs(errors.errors) > errors.bounds).any(axis=1).sum())
+        named = [camera_turn.camera for camera_turn in run.poses[-1].turned]
         time_s = said(run, middle)
         when = f"said after {time_s:.1f} s and {way_m(driven, middle, time_s):.1f} m"
         parts.append(f"{'xyz'[axis]}: {when}, {named}, outside {outside}")
@@ -376,8 +376,8 @@ def antenna_line(driven: LiveDrive, rng: np.random.Generator) -> str:
         run = Run(poses, range(count), 0.0)
         errors = errors_of(driven, run)
         first = next((frame for frame, pose in enumerate(poses) if pose.status == Status.TRACKING), None)
-        begun = "never" if first is None else f"after {way_m(driven, 0, first / RATE_HZ):.1f} m"
-        texts.append(f"{name}: tracked {begun}, {tracking_line([errors], count, 0.0)}")
+        begin_text = "never" if first is None else f"after {way_m(driven, 0, first / RATE_HZ):.1f} m"
+        texts.append(f"{name}: tracked {begin_text}, {tracking_line([errors], count, 0.0)}")
     return "; ".join(texts)
 
 
@@ -469,15 +469,15 @@ class _Totals:
 
     def lines(self) -> list[str]:
         """The summary."""
-        known = self.known_starts
+        counts = self.known_starts
         unknown = self.unknown_starts
         of_gaps = {"with lines": self.gaps[True], "without lines": self.gaps[False]}
         return [
             f"all: {tracking_line(self.errors, self.images, float(np.mean(self.cpu_s)))}",
             alarm_line(self.alarms, self.images / RATE_HZ),
             *(gap_line(of_drives, name) for name, of_drives in of_gaps.items() if of_drives),
-            f"starts from 5 m and 20 deg: {known[0]} right, {known[1]} wrong, {known[2]} none in 3 s, "
-            f"{known[3]} called the map wrong",
+            f"starts from 5 m and 20 deg: {counts[0]} right, {counts[1]} wrong, {counts[2]} none in 3 s, "
+            f"{counts[3]} called the map wrong",
             f"starts from nothing: {unknown[0]} right, {unknown[1]} wrong, {unknown[2]} none within 30 m, "
             f"{unknown[3]} called the map wrong",
         ]
@@ -494,8 +494,8 @@ def _try_parts(
     """Try the chosen parts on one drive; ``other`` is the map of the other port."""
     parts = parsed.only or _PARTS
     if "starts" in parts:
-        totals.known_starts += starts(driven, parsed.starts, rng, known=True)
-        totals.unknown_starts += starts(driven, max(parsed.starts // 4, 1), rng, known=False)
+        totals.known_starts += starts(driven, parsed.starts, rng, is_rough_known=True)
+        totals.unknown_starts += starts(driven, max(parsed.starts // 4, 1), rng, is_rough_known=False)
     if "wrong" in parts:
         print(f"  {wrong_map_line(driven, other, rng, parsed.every_full)}", flush=True)
     if "moved" in parts:

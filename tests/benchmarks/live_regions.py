@@ -125,7 +125,7 @@ def followed(ride: Ride, every_full: int, roads: dict[str, RoadDetector]) -> str
     begin = ride.map_from_vehicle[0]
     start = rough_position(*begin[:2, 3].tolist(), float(np.degrees(heading_rad(begin))))
     localizer = Localizer(ride.truth.map, ride.calibrations, start, every_full=every_full)
-    errors, found, detected_s, parts_s, localised_s = [], [], [], [], []
+    errors, counts, detected_s, parts_s, localised_s = [], [], [], [], []
     later: list[tuple[int, Look]] = []
     for moment, images in enumerate(ride.moments):
         localizer.update([look for due, look in later if due == moment], ride.motion(moment))
@@ -149,7 +149,7 @@ def followed(ride: Ride, every_full: int, roads: dict[str, RoadDetector]) -> str
             localised_s.append(asked_s + update_s)
             if regions_px is not None:
                 parts_s.append(look_s)
-            found.append(len(road.markings))
+            counts.append(len(road.markings))
             if pose.status == Status.TRACKING and pose.map_from_vehicle is not None:
                 true = ride.truth.map_from_vehicle[i]
                 off = true[:2, :2].T @ (pose.map_from_vehicle[:2, 3] - true[:2, 3])
@@ -160,7 +160,7 @@ def followed(ride: Ride, every_full: int, roads: dict[str, RoadDetector]) -> str
     count = sum(map(len, ride.moments))
     return (
         f"every {every_full}: tracked {len(errors)} of {count}, along {rmse[0]:.2f} cm, lateral "
-        f"{rmse[1]:.2f} cm, heading {rmse[2]:.3f} deg, {np.mean(found):.1f} markings an image; CPU, ms: "
+        f"{rmse[1]:.2f} cm, heading {rmse[2]:.3f} deg, {np.mean(counts):.1f} markings an image; CPU, ms: "
         f"detector {1e3 * np.mean(detected_s):.0f} (mean){parts}, localiser {1e3 * np.mean(localised_s):.0f}"
     )
 

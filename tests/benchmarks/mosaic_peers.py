@@ -104,8 +104,8 @@ def main() -> None:
     hd_map = read_geojson(parsed.result / MAP)
     ground = ground_of(parsed.result, drive_of(parsed.result, None), parsed.resolution, hd_map)
     shots, lenses = ground.after[: parsed.images], ground.lenses
-    seen = np.concatenate([shot.outline_map(lenses[shot.camera]) for shot in shots])
-    canvas = Canvas.around(seen, parsed.resolution, MULTIPLE_PX)
+    outlines_map = np.concatenate([shot.outline_map(lenses[shot.camera]) for shot in shots])
+    canvas = Canvas.around(outlines_map, parsed.resolution, MULTIPLE_PX)
     ways: dict[str, Callable[[], np.ndarray]] = {
         "ours": lambda: whole(canvas, shots, lenses),
         "plain": lambda: plain_loop(canvas, shots, lenses, by_undistort(lenses)),
@@ -124,8 +124,8 @@ def main() -> None:
         f"{len(shots)} images on {canvas.rows} x {canvas.columns} px of {parsed.resolution:g} m, "
         f"{parsed.threads} threads, {parsed.rounds} rounds"
     )
-    for name, taken in seconds.items():
-        cpu_s, wall_s = np.min(taken, axis=0)
+    for name, times in seconds.items():
+        cpu_s, wall_s = np.min(times, axis=0)
         off = np.abs(ours[opaque][:, :3].astype(int) - pictures[name][opaque][:, :3])
         print(
             f"{name:>7}: CPU {cpu_s:6.2f} s, wall {wall_s:6.2f} s; "

@@ -82,8 +82,10 @@ def polygons(mask: np.ndarray) -> list[list[float]]:
     """The outlines of a mask's pieces along its pixels' borders, as COCO has them."""
     fine = np.kron(mask.astype(np.uint8), np.ones((_FINER, _FINER), np.uint8))
     contours, _ = cv2.findContours(fine, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    kept = [contour[:, 0] for contour in contours if cv2.contourArea(contour) >= _FINER**2 * LEAST_PX]
-    return [((contour + 0.5) / _FINER).ravel().tolist() for contour in kept]
+    large_contours = [
+        contour[:, 0] for contour in contours if cv2.contourArea(contour) >= _FINER**2 * LEAST_PX
+    ]
+    return [((contour + 0.5) / _FINER).ravel().tolist() for contour in large_contours]
 
 
 def main() -> None:

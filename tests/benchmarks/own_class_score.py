@@ -53,16 +53,17 @@ def port_of(run_file: Path) -> Port:
 
 def true_symbols(port: Port) -> list[TrueSymbol]:
     """All painted symbols; one was driven past as a marking is, see :mod:`v2hdm.report.metrics`."""
-    pieces_of = {name: len(one.shapes_m) for name, one in port.config.paint.stencils.items()}
+    pieces_of = {name: len(stencil.shapes_m) for name, stencil in port.config.paint.stencils.items()}
     pieces_of = {ARROW: ARROW_PIECES} | {name: count for name, count in pieces_of.items() if count > 1}
-    found = []
+    symbols = []
     for kind, count in pieces_of.items():
         pieces = [paint.polygon_map for paint in port.renderer.scene.paints if paint.kind == kind]
         groups = [pieces[k : k + count] for k in range(0, len(pieces), count)]
-        found += [
-            TrueSymbol(kind, own, _images(port, np.concatenate(own)) >= MIN_SIGHTINGS) for own in groups
+        symbols += [
+            TrueSymbol(kind, pieces, _images(port, np.concatenate(pieces)) >= MIN_SIGHTINGS)
+            for pieces in groups
         ]
-    return found
+    return symbols
 
 
 def _images(port: Port, points: FloatArray) -> int:
@@ -72,8 +73,8 @@ def _images(port: Port, points: FloatArray) -> int:
         for name, camera in port.cameras.items():
             if inside_convex(camera.roi_vehicle, ground_in_vehicle(pose, points)).all():
                 boxes = port.renderer.scene.boxes + port.moving_boxes(frame)
-                seen = points_seen(camera.info, port.cam_from_map(name, frame), points, boxes)
-                count += bool(seen.all())
+                is_seen = points_seen(camera.info, port.cam_from_map(name, frame), points, boxes)
+                count += bool(is_seen.all())
     return count
 
 
@@ -87,24 +88,24 @@ def centre_and_overlap(pieces: Sequence[FloatArray], outline: FloatArray) -> tup
             fixed = np.round((shape - low) / CELL_M * 16).astype(np.int32)
             cv2.fillPoly(mask, [fixed], 1, shift=4)
     true, mapped = (np.argwhere(mask)[:, ::-1].mean(axis=0) for mask in masks)
-    both = masks[0] & masks[1]
-    return (mapped - true) * CELL_M, float(both.sum() / (masks[0] | masks[1]).sum())
+    overlap = masks[0] & masks[1]
+    return (mapped - true) * CELL_M, float(overlap.sum() / (masks[0] | masks[1]).sum())
 
 
 def scored(kind: str, true: Sequence[TrueSymbol], mapped: Sequence[Symbol]) -> str:
     """One line of the table."""
-    wanted = [one for one in true if one.kind == kind]
-    left = [one for one in mapped if one.kind == kind]
+    of_kind = [symbol for symbol in true if symbol.kind == kind]
+    left = [symbol for symbol in mapped if symbol.kind == kind]
     count, errors, overlaps, hits, expected = len(left), [], [], 0, 0
-    for one in wanted:
-        centre = np.concatenate(one.pieces).mean(axis=0)
-        apart = [float(np.linalg.norm(symbol.outline_map.mean(axis=0) - centre)) for symbol in left]
-        nearest = int(np.argmin(apart)) if apart else -1
-        found = nearest >= 0 and apart[nearest] < FOUND_M
-        expected += one.expected
-        hits += one.expected and found
-        if found:
-            error, overlap = centre_and_overlap(one.pieces, left.pop(nearest).outline_map)
+    for symbol in of_kind:
+        centre = np.concatenate(symbol.pieces).mean(axis=0)
+        distances_m = [float(np.linalg.norm(symbol.outline_map.mean(axis=0) - centre)) for symbol in left]
+        nearest = int(np.argmin(distances_m)) if distances_m else -1
+        is_found = nearest >= 0 and distances_m[nearest] < FOUND_M
+        expected += symbol.expected
+        hits += symbol.expected and is_found
+        if is_found:
+            error, overlap = centre_and_overlap(symbol.pieces, left.pop(nearest).outline_map)
             errors.append(error)
             overlaps.append(overlap)
     rmse_cm = 100 * np.sqrt((np.array(errors) ** 2).sum(axis=1).mean()) if errors else float("nan")
@@ -131,7 +132,7 @@ def main() -> None:
         )
     true = true_symbols(port_of(RUN_FILE))
     mapped = read_geojson(folder / "map.geojson").symbols
-    for kind in dict.fromkeys([*(one.kind for one in true), *(symbol.kind for symbol in mapped)]):
+    for kind in dict.fromkeys([*(symbol.kind for symbol in true), *(symbol.kind for symbol in mapped)]):
         print(scored(kind, true, mapped))
 
 

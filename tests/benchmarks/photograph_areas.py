@@ -53,13 +53,13 @@ def kinds_of(output: RawOutput) -> np.ndarray:
     return np.where(output.paint > 0, kinds, 0).astype(np.uint8)
 
 
-def hulls_of(mask: np.ndarray, apart: float) -> list[FloatArray]:
+def hulls_of(mask: np.ndarray, gap_in_sizes: float) -> list[FloatArray]:
     """Convex hulls (N, 2), px, of neighbouring pieces of a mask of cells of 2 px."""
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     pieces = [piece for piece in contours if len(piece) >= 3]
     if not pieces:
         return []
-    long_enough = (hull for hull in joined([piece[:, 0] for piece in pieces], apart) if len(hull) > 2)
+    long_enough = (hull for hull in joined([piece[:, 0] for piece in pieces], gap_in_sizes) if len(hull) > 2)
     return [hull * CELL_PX + 0.5 for hull in long_enough if np.ptp(hull, axis=0).sum() >= LEAST_CELLS]
 
 
@@ -86,14 +86,14 @@ class Counts:
         """Count one image."""
         self.images += 1
         kinds = kinds_of(output)
-        near = labels.near()
+        near_mask = labels.near()
         masks = {name: (kinds == 1 + k).astype(np.uint8) for k, name in enumerate(classes)}
         hulls = {name: hulls_of(masks[name], APART[name]) for name in APART if name in masks}
         for name, of_class in hulls.items():
             for hull in of_class:
                 mask = np.zeros((HEIGHT, WIDTH), np.uint8)
                 cv2.fillPoly(mask, [np.round(hull).astype(np.int32)], 1)
-                self.alone[name] += not (mask & near).any()
+                self.alone[name] += not (mask & near_mask).any()
         for label, polygon in zip(labels.names, labels.polygons, strict=True):
             if label == STOP_LINE:
                 size = "stop_line >= 11 px" if np.ptp(polygon[:, 1]) >= STOP_LINE_PX else "stop_line < 11 px"

@@ -109,20 +109,24 @@ class Labels:
         return masks[0] > 0, masks[1] > 0
 
 
-def small_outlines(mask: np.ndarray, scale: FloatArray, top_px: int, apart: float | None) -> list[np.ndarray]:
+def small_outlines(
+    mask: np.ndarray, scale: FloatArray, top_px: int, gap_in_sizes: float | None
+) -> list[np.ndarray]:
     """Outlines in px of 256 x 256 of the pieces of a mask that begins at the row ``top_px`` of an image.
 
     They are convex hulls of neighbouring pieces where ``apart`` is a number, see :data:`_APART`.
     """
-    mode = cv2.RETR_CCOMP if apart is None else cv2.RETR_EXTERNAL
+    mode = cv2.RETR_CCOMP if gap_in_sizes is None else cv2.RETR_EXTERNAL
     pieces = list(cv2.findContours(mask.astype(np.uint8), mode, cv2.CHAIN_APPROX_SIMPLE)[0])
-    if apart is not None and pieces:
+    if gap_in_sizes is not None and pieces:
         box = np.array([cv2.boundingRect(piece) for piece in pieces], dtype=np.float64)
         low, high = box[:, :2], box[:, :2] + box[:, 2:]
         gap = np.maximum(low[:, None] - high, low - high[:, None])
-        near = (gap <= apart * np.maximum(box[:, None, 2:], box[:, 2:])).all(axis=2)
-        count, group = connected_components(near)
-        together = (np.vstack([pieces[k] for k in np.flatnonzero(group == one)]) for one in range(count))
+        is_near = (gap <= gap_in_sizes * np.maximum(box[:, None, 2:], box[:, 2:])).all(axis=2)
+        count, group = connected_components(is_near)
+        together = (
+            np.vstack([pieces[k] for k in np.flatnonzero(group == number)]) for number in range(count)
+        )
         pieces = [cv2.convexHull(points) for points in together]
     moved = ((piece[:, 0] + 0.5) * scale - 0.5 + (0, top_px * SMALL / HEIGHT) for piece in pieces)
     return [np.round(ring).astype(np.int32) for ring in moved]
@@ -142,12 +146,12 @@ def regions(output: NetworkOutput) -> np.ndarray:
     painted, drawn = output.paint > 0, np.zeros((SMALL, SMALL), np.uint8)
     enclosed = {DIAMOND: 0.0, **dict.fromkeys(OUTLINED_TOGETHER, _APART)}
     of_its_own = painted.copy()
-    for name, apart in enclosed.items():
+    for name, gap_in_sizes in enclosed.items():
         if name not in output.classes:
             continue
-        own = painted & (kinds == output.classes.index(name))
-        of_its_own &= ~own
-        for ring in small_outlines(own, scale, output.top, apart):
+        of_class = painted & (kinds == output.classes.index(name))
+        of_its_own &= ~of_class
+        for ring in small_outlines(of_class, scale, output.top, gap_in_sizes):
             cv2.fillPoly(drawn, [ring], 1)
     cv2.fillPoly(drawn, small_outlines(of_its_own, scale, output.top, None), 1)
     return drawn > 0
@@ -182,23 +186,23 @@ def read(labels: Path, roles: tuple[str, ...], stop_lines: Collection[int] = ())
     out = {files[key]: Labels() for key, role in its.items() if role in roles}
     for annotation in content["annotations"]:
         if its[annotation["image_id"]] in roles:
-            one = out[files[annotation["image_id"]]]
+            labels_of_file = out[files[annotation["image_id"]]]
             for ring in annotation["segmentation"]:
                 is_stop_line = annotation["id"] in stop_lines
-                one.names.append(STOP_LINE if is_stop_line else names[annotation["category_id"]])
-                one.polygons.append(np.reshape(ring, (-1, 2)) * (WIDTH / 640, HEIGHT / 640) - 0.5)
+                labels_of_file.names.append(STOP_LINE if is_stop_line else names[annotation["category_id"]])
+                labels_of_file.polygons.append(np.reshape(ring, (-1, 2)) * (WIDTH / 640, HEIGHT / 640) - 0.5)
     return out
 
 
-def joined(pieces: Sequence[FloatArray], apart: float) -> list[FloatArray]:
+def joined(pieces: Sequence[FloatArray], gap_in_sizes: float) -> list[FloatArray]:
     """Convex hulls (N, 2) of neighbouring pieces (N, 2), px, ``apart`` as of :data:`_APART`."""
     if not pieces:
         return []
     low, high = (np.array([end(piece, axis=0) for piece in pieces]) for end in (np.min, np.max))
     size = high - low + 1
     gap = np.maximum(low[:, None] - high, low - high[:, None])
-    near = (gap <= apart * np.maximum(size[:, None], size)).all(axis=2)
-    count, group = connected_components(near)
+    is_near = (gap <= gap_in_sizes * np.maximum(size[:, None], size)).all(axis=2)
+    count, group = connected_components(is_near)
     together = (np.vstack([pieces[k] for k in np.flatnonzero(group == number)]) for number in range(count))
     return [
         np.asarray(cv2.convexHull(points.astype(np.float32))[:, 0], dtype=np.float64) for points in together
@@ -229,16 +233,16 @@ class Tally:
         self.false_areas: Counter[str] = Counter()
         self.images = 0
 
-    def add(self, labels: Labels, given: tuple[MarkingDetection, ...]) -> None:
+    def add(self, labels: Labels, detections: tuple[MarkingDetection, ...]) -> None:
         """Count one image."""
         self.images += 1
-        outlines = [d.outline_px if len(d.outline_px) else d.corners_px for d in given]
-        near = labels.near()
-        for detection, outline in zip(given, outlines, strict=True):
+        outlines = [d.outline_px if len(d.outline_px) else d.corners_px for d in detections]
+        near_mask = labels.near()
+        for detection, outline in zip(detections, outlines, strict=True):
             self.given[detection.kind] += 1
             mask = np.zeros((HEIGHT, WIDTH), np.uint8)
             cv2.fillPoly(mask, [np.round(outline).astype(np.int32)], 1)
-            alone = not (mask & near).any()
+            alone = not (mask & near_mask).any()
             self.false[detection.kind] += alone and detection.kind in _SYMBOLS
             self.false_areas[detection.kind] += alone and detection.kind in WHOLE_OF.values()
         for name, polygon in zip(labels.names, labels.polygons, strict=True):
@@ -253,13 +257,13 @@ class Tally:
             overlap = [polygon_overlap(outline, polygon) for outline in outlines]
             over = [k for k, share in enumerate(overlap) if share > FOUND_IOU]
             self.found[kind, size] += bool(over)
-            self.named[kind, size] += any(given[k].kind == kind for k in over)
-            if over and not any(given[k].kind == kind for k in over):
-                self.taken_for[kind][given[max(over, key=overlap.__getitem__)].kind] += 1
+            self.named[kind, size] += any(detections[k].kind == kind for k in over)
+            if over and not any(detections[k].kind == kind for k in over):
+                self.taken_for[kind][detections[max(over, key=overlap.__getitem__)].kind] += 1
 
-    def add_areas(self, labels: Labels, given: tuple[MarkingDetection, ...]) -> None:
+    def add_areas(self, labels: Labels, detections: tuple[MarkingDetection, ...]) -> None:
         """Count the stop lines, crosswalks, words and boxes of one image."""
-        outlines = [(d.kind, d.outline_px if len(d.outline_px) else d.corners_px) for d in given]
+        outlines = [(d.kind, d.outline_px if len(d.outline_px) else d.corners_px) for d in detections]
         stop_lines = [outline for kind, outline in outlines if kind == STOP_LINE]
         for name, polygon in zip(labels.names, labels.polygons, strict=True):
             if name == STOP_LINE:
@@ -286,8 +290,8 @@ class Tally:
         print(f"areas where no label is near: {alone}")
         for (kind, size), count in sorted(self.count.items()):
             low, high = TALL_PX[size]
-            found, named = self.found[kind, size] / count, self.named[kind, size] / count
-            print(f"{kind:8s} {low:g} to {high:g} px: {count:4d}, found {found:.2f}, named {named:.2f}")
+            found_share, named = self.found[kind, size] / count, self.named[kind, size] / count
+            print(f"{kind:8s} {low:g} to {high:g} px: {count:4d}, found {found_share:.2f}, named {named:.2f}")
         print(f"taken for: { {kind: dict(other) for kind, other in self.taken_for.items()} }")
         print(
             f"symbols where no label is near, an image: {self.false.total() / self.images:.3f} "
@@ -330,25 +334,25 @@ def main() -> None:
             path = Path(folder, f"{number:04d}_{Path(name).stem}.png")
             cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
         sources = sorted(Path(folder).iterdir()) if parsed.alone else [Path(folder)]
-        for seen in (
+        for in_image in (
             detected
             for source in sources
             for detected in detect_images(source, mounting=parsed.mounting, detector=detector)
         ):
-            labels = labelled[Path(seen.frame.name).stem[5:] + ".jpg"]
-            given = tuple(marking.image for marking in seen.road.markings)
-            tally.add(labels, given)
-            tally.add_areas(labels, given)
+            labels = labelled[Path(in_image.frame.name).stem[5:] + ".jpg"]
+            detections = tuple(marking.image for marking in in_image.road.markings)
+            tally.add(labels, detections)
+            tally.add_areas(labels, detections)
             truth, of_pieces = labels.small()
             paint, drawn = as_it_is(detector.output), regions(detector.output)
-            for row, (said, known) in enumerate(((paint, True), (paint, ~of_pieces), (drawn, True))):
-                true, said = truth & known, said & known
-                areas[row] += [each.sum() for each in (true & said, true | said, true, said)]
+            for row, (said, is_labelled) in enumerate(((paint, True), (paint, ~of_pieces), (drawn, True))):
+                true, said = truth & is_labelled, said & is_labelled
+                areas[row] += [pixels.sum() for pixels in (true & said, true | said, true, said)]
     print(f"{tally.images} images, mounting {parsed.mounting or 'not stated'}")
     tally.print()
     hows = "paint as it is", "paint outside of outlines of pieces", "paint drawn as the labels are"
-    for (both, either, true, said), how in zip(areas, hows, strict=True):
-        print(f"{how}: IoU / F1 {both / either:.3f} / {2 * both / (true + said):.3f}")
+    for (overlap, either, true, said), how in zip(areas, hows, strict=True):
+        print(f"{how}: IoU / F1 {overlap / either:.3f} / {2 * overlap / (true + said):.3f}")
     print(f"published, all pixels of other images of the set: {PUBLISHED}")
 
 

@@ -36,7 +36,7 @@ def map_one(seed: int) -> tuple[int, str]:
     except V2hdmError as refusal:
         return 0, f"{seed:4d} refused: {refusal}"
     figures = marking_metrics(best.hd_map, truth, driven_past(drive, truth, (_CAMERA,)))
-    reasons = Counter(one.reason for one in best.excluded)
+    reasons = Counter(exclusion.reason for exclusion in best.excluded)
     why = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
     return figures.false_markings, (
         f"{seed:4d} {figures.false_markings} false of {figures.markings:3d}, recall {figures.recall:.3f}, "
@@ -53,8 +53,8 @@ def main() -> None:
     torch.set_num_threads(1)
     false = 0
     for seed in range(*parsed.seeds):
-        own, line = map_one(seed)
-        false += own
+        false_of_drive, line = map_one(seed)
+        false += false_of_drive
         print(line, flush=True)
     print(f"{false} markings mapped where there is no paint")
 

@@ -75,9 +75,9 @@ def align(
     for reach_px in _REACHES_PX:
         at_px, normal = _on_image(moved, edges)
         offset_px, fall = edge_offsets(grey, at_px, normal, reach_px)
-        seen = np.isfinite(offset_px) & (fall >= _LEAST_FALL)
-        offset_px = np.where(seen, offset_px, 0.0)
-        weight = seen / (1 + (offset_px / (0.3 * reach_px)) ** 2) ** 2
+        is_visible = np.isfinite(offset_px) & (fall >= _LEAST_FALL)
+        offset_px = np.where(is_visible, offset_px, 0.0)
+        weight = is_visible / (1 + (offset_px / (0.3 * reach_px)) ** 2) ** 2
         step = 1e-5
         jacobian = np.column_stack(
             [
@@ -141,11 +141,11 @@ def _visible(edges: Edges, view: View, hidden: Sequence[FloatArray]) -> Edges:
     """The edges well inside the image, near and not hidden."""
     at_px = view.project(edges.points_map)
     limit = np.array([view.info.width, view.info.height]) - 1 - _BORDER_PX
-    seen = ((at_px > _BORDER_PX) & (at_px < limit)).all(axis=1)
-    seen &= view.ranges_m(edges.points_map) <= MAX_RANGE_M
+    is_visible = ((at_px > _BORDER_PX) & (at_px < limit)).all(axis=1)
+    is_visible &= view.ranges_m(edges.points_map) <= MAX_RANGE_M
     for box in hidden:
-        seen &= ~((at_px >= box[:2]) & (at_px <= box[2:])).all(axis=1)
-    return Edges(edges.points_map[seen], edges.outward_map[seen])
+        is_visible &= ~((at_px >= box[:2]) & (at_px <= box[2:])).all(axis=1)
+    return Edges(edges.points_map[is_visible], edges.outward_map[is_visible])
 
 
 def _on_image(view: View, edges: Edges) -> tuple[FloatArray, FloatArray]:

@@ -70,13 +70,13 @@ def stitch(tile: Tile, route: Route, views: Sequence[View], images: Sequence[np.
         ranges_m = view.ranges_m(points_map)
         at = view.project(points_map)
         limit = np.array([view.info.width, view.info.height]) - 1
-        taken = ((at >= 0) & (at <= limit)).all(axis=1) & (ranges_m > _NEAREST_M) & (ranges_m < nearest)
-        if not taken.any():
+        is_nearest = ((at >= 0) & (at <= limit)).all(axis=1) & (ranges_m > _NEAREST_M) & (ranges_m < nearest)
+        if not is_nearest.any():
             continue
-        nearest[taken] = ranges_m[taken]
-        u, v = np.moveaxis(np.where(taken[:, None], at, -1.0).astype(np.float32), 1, 0)
+        nearest[is_nearest] = ranges_m[is_nearest]
+        u, v = np.moveaxis(np.where(is_nearest[:, None], at, -1.0).astype(np.float32), 1, 0)
         shown = cv2.remap(image, u.reshape(picture.shape[:2]), v.reshape(picture.shape[:2]), cv2.INTER_LINEAR)
-        mask = taken.reshape(picture.shape[:2])
+        mask = is_nearest.reshape(picture.shape[:2])
         picture[mask] = shown[mask]
     return picture
 
@@ -104,10 +104,10 @@ def _align_all(reference: Reference, views: Sequence[View], images: Sequence[np.
     aligned = []
     for index, (view, image) in enumerate(zip(views, images, strict=True)):
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        found = align(view, grey, polygons, reference.hidden.get(index, []))
-        turn, shift = np.round(np.degrees(found.motion[:3]), 2), np.round(found.motion[3:], 3)
-        print(f"image {index}: {found.edges} edges, {found.spread_px:.2f} px; {turn} deg, {shift} m")
-        aligned.append(found.view)
+        alignment = align(view, grey, polygons, reference.hidden.get(index, []))
+        turn, shift = np.round(np.degrees(alignment.motion[:3]), 2), np.round(alignment.motion[3:], 3)
+        print(f"image {index}: {alignment.edges} edges, {alignment.spread_px:.2f} px; {turn} deg, {shift} m")
+        aligned.append(alignment.view)
     return aligned
 
 

@@ -90,12 +90,12 @@ def judge_image(
     for d, detection in enumerate(detections):
         shape_px = outline(detection)
         ground = view.ground(shape_px)
-        near = [m for m, p in enumerate(reference.markings) if is_near(ground, p.polygon_map)]
-        if not near:
+        close_markings = [m for m, p in enumerate(reference.markings) if is_near(ground, p.polygon_map)]
+        if not close_markings:
             if not reference.whole or detection.kind in reference.whole:
                 result.false.append(detection)
             continue
-        overlap = {m: _overlap(shape_px, polygons_px[m]) for m in near}
+        overlap = {m: _overlap(shape_px, polygons_px[m]) for m in close_markings}
         best = max(overlap, key=overlap.__getitem__)
         if overlap[best] > 0:
             result.on.append((best, detection.kind))
@@ -104,10 +104,10 @@ def judge_image(
             beside_m = float(np.linalg.norm(centre - reference.markings[m].centre_map))
             if share > 0 and beside_m <= reference.markings[m].tolerance_m:
                 pairs.append((share, m, d))
-    found: dict[int, int] = {}
+    detection_of: dict[int, int] = {}
     for _, m, d in sorted(pairs, reverse=True):
-        if m not in found and d not in found.values():
-            found[m] = d
+        if m not in detection_of and d not in detection_of.values():
+            detection_of[m] = d
     for m, painted in enumerate(reference.markings):
         range_m = view.range_m(painted.centre_map)
         if painted.optional or painted.kind == LANE_LINE:
@@ -115,7 +115,9 @@ def judge_image(
         if range_m > MAX_RANGE_M or not view.holds(polygons_px[m]):
             continue
         if not any(_touches_box(polygons_px[m], box) for box in hidden):
-            result.shown.append(Shown(m, range_m, detections[found[m]].kind if m in found else None))
+            result.shown.append(
+                Shown(m, range_m, detections[detection_of[m]].kind if m in detection_of else None)
+            )
     return result
 
 
@@ -126,13 +128,13 @@ def outline(detection: MarkingDetection) -> FloatArray:
 
 def is_near(points_map: FloatArray, polygon_map: FloatArray) -> bool:
     """Whether a polygon (N, 2), nan where it has no place, has a part within the tolerance of another."""
-    known = points_map[np.isfinite(points_map).all(axis=1)]
-    if not len(known):
+    finite_points = points_map[np.isfinite(points_map).all(axis=1)]
+    if not len(finite_points):
         return False
     origin = polygon_map[0]
     return any(
         cv2.pointPolygonTest((inner - origin).astype(np.float32), (float(x), float(y)), True) >= -TOLERANCE_M
-        for inner, outer in ((polygon_map, known), (known, polygon_map))
+        for inner, outer in ((polygon_map, finite_points), (finite_points, polygon_map))
         for x, y in outer - origin
     )
 
@@ -219,9 +221,9 @@ def summary(tally: Tally, reference: Reference) -> str:
             f"{_share(tally.right[group], tally.found[group]):>6s} "
             f"{_share(tally.on_right[group], tally.on[group]):>12s}  {target}"
         )
-    found, right = sum(tally.found.values()), sum(tally.right.values())
+    found_count, right = sum(tally.found.values()), sum(tally.right.values())
     false = sum(tally.false.values())
-    lines.append(f"class right: {_share(right, found)} of all found (target 95 %)")
+    lines.append(f"class right: {_share(right, found_count)} of all found (target 95 %)")
     lines.append(f"taken for another class: {dict(tally.taken_for)}")
     lines.append(
         f"{_false_name(reference)}: {false} in {tally.images} images, {false / max(tally.images, 1):.2f} an "
@@ -313,19 +315,19 @@ def map_summary(
     lines = [f"{'':28s} {'painted':>8s} {'found':>6s} {'mapped':>7s}"]
     missing = []
     for kind in sorted({painted.kind for painted in reference.markings}):
-        asked = [
+        of_kind = [
             m
             for m, painted in enumerate(reference.markings)
             if painted.kind == kind and not (painted.optional or painted.other_road)
         ]
         lost = []
-        for m in asked:
+        for m in of_kind:
             painted = reference.markings[m]
             off_m = np.linalg.norm(centres_map[kinds == kind] - painted.centre_map, axis=1)
             if off_m.min(initial=np.inf) > painted.tolerance_m:
                 lost.append(m)
-        found = sum(tally.images_found[m] > 0 for m in asked)
-        lines.append(f"{kind:28s} {len(asked):8d} {found:6d} {len(asked) - len(lost):7d}")
+        found_count = sum(tally.images_found[m] > 0 for m in of_kind)
+        lines.append(f"{kind:28s} {len(of_kind):8d} {found_count:6d} {len(of_kind) - len(lost):7d}")
         missing += lost
     for m in missing:
         painted = reference.markings[m]

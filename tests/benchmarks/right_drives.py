@@ -191,7 +191,7 @@ def map_one(job: Job) -> Row:
     height_off_m, height_sigma_m = height_errors_m(world, best.hd_map)
     errors["heights"] = np.square(height_off_m / height_sigma_m)
     assert best.evidence is not None
-    about["drawn"] |= {f"read_out_s {name}": found for name, found in best.evidence.read_out_s.items()}
+    about["drawn"] |= {f"read_out_s {name}": read_out for name, read_out in best.evidence.read_out_s.items()}
     return Row(
         **about,
         status=verdict.status.value,
@@ -203,8 +203,8 @@ def map_one(job: Job) -> Row:
         recall=figures.recall,
         false=figures.false_markings,
         markings=figures.markings,
-        tests=[_test(one) for one in (*best.evidence.corrected, *best.evidence.score_tests)],
-        errors={name: np.round(own, 3).tolist() for name, own in errors.items()},
+        tests=[_test(test) for test in (*best.evidence.corrected, *best.evidence.score_tests)],
+        errors={name: np.round(values, 3).tolist() for name, values in errors.items()},
         seconds=seconds,
     )
 
@@ -216,20 +216,20 @@ def unknown(best: MethodResult) -> list[Finding]:
 
 def height_errors_m(world: World, hd_map: HDMap) -> tuple[FloatArray, FloatArray]:
     """The errors of the corners' heights, by the nearest true corner, and their sigmas; none are not told."""
-    true, told = (
+    true, with_height = (
         world.corners_map.reshape(-1, 3),
         [m for m in hd_map.markings if m.heights_sigma_m is not None],
     )
-    if not told:
+    if not with_height:
         return np.zeros(0), np.zeros(0)
-    corners = np.concatenate([marking.corners_map for marking in told])
+    corners = np.concatenate([marking.corners_map for marking in with_height])
     heights, sigmas = (
-        np.concatenate([getattr(marking, name) for marking in told])
+        np.concatenate([getattr(marking, name) for marking in with_height])
         for name in ("heights_m", "heights_sigma_m")
     )
     away_m, nearest = cKDTree(true[:, :2]).query(corners)
-    near = away_m < _PAIRED_M
-    return (heights - true[nearest, 2])[near], sigmas[near]
+    is_paired = away_m < _PAIRED_M
+    return (heights - true[nearest, 2])[is_paired], sigmas[is_paired]
 
 
 def findings_of_inputs(drive: Drive) -> list[Finding]:
@@ -250,19 +250,19 @@ def findings_of_inputs(drive: Drive) -> list[Finding]:
     return causes(findings)
 
 
-def _test(one: Any) -> dict[str, Any]:
+def _test(test: Any) -> dict[str, Any]:
     """A score test for the record; its p-value is its own where it has one, else that of its chi-square."""
-    own = getattr(one, "p_value", None)
-    whose = "each" if len(one.cameras) == 1 else "all"
+    p_value = getattr(test, "p_value", None)
+    whose = "each" if len(test.cameras) == 1 else "all"
     return {
-        "kind": f"{one.fault.name} {one.axis} {whose}",
-        "cameras": list(one.cameras),
-        "p": float(chi2.sf(one.sigmas**2, 1)) if own is None else float(own),
-        "value": one.value,
-        "sigma": one.sigma,
-        "log_odds": log_odds(one),
-        "doubt": doubt(one),
-        "matters": matters(one),
+        "kind": f"{test.fault.name} {test.axis} {whose}",
+        "cameras": list(test.cameras),
+        "p": float(chi2.sf(test.sigmas**2, 1)) if p_value is None else float(p_value),
+        "value": test.value,
+        "sigma": test.sigma,
+        "log_odds": log_odds(test),
+        "doubt": doubt(test),
+        "matters": matters(test),
     }
 
 
@@ -295,8 +295,13 @@ def line(row: Row, clean: Row | None) -> str:
 
 def _read_outs(row: Row) -> str:
     """The estimated read-out times, if there are any."""
-    found = {key.split()[1]: one for key, one in row.drawn.items() if key.startswith("read_out_s ")}
-    return "".join(f" | {name} {1e3 * one[0]:.2f} +- {1e3 * one[1]:.2f} ms" for name, one in found.items())
+    read_outs = {
+        key.split()[1]: read_out for key, read_out in row.drawn.items() if key.startswith("read_out_s ")
+    }
+    return "".join(
+        f" | {name} {1e3 * read_out[0]:.2f} +- {1e3 * read_out[1]:.2f} ms"
+        for name, read_out in read_outs.items()
+    )
 
 
 class Judgement(NamedTuple):
@@ -378,9 +383,9 @@ def summary_of_right(rows: Sequence[Row]) -> list[str]:
     )
     by_kind: dict[str, list[float]] = {}
     for row in rows:
-        for one in row.tests:
-            if np.isfinite(one["sigma"]):
-                by_kind.setdefault(one["kind"], []).append(one["p"])
+        for test in row.tests:
+            if np.isfinite(test["sigma"]):
+                by_kind.setdefault(test["kind"], []).append(test["p"])
     lines.append(f"{'score test':22s}{'tests':>6s}{'KS p':>10s}{'least p':>10s}{'p < .05':>9s}")
     for kind, p in sorted(by_kind.items()):
         uniform = float(kstest(p, "uniform").pvalue)
@@ -391,13 +396,13 @@ def summary_of_right(rows: Sequence[Row]) -> list[str]:
     lines.append(
         f"{'inside 95 %':22s}" + " ".join(f"{name:>9s}" for name in (*QUANTITIES, "heights", "mountings"))
     )
-    for name, own in (
+    for name, errors in (
         ("noise stated", [row for row in rows if not row.default_noise]),
         ("noise by default", [row for row in rows if row.default_noise]),
         ("attitude recorded", [row for row in rows if row.road]),
         ("all", rows),
     ):
-        lines.append(f"{name:22s}" + " ".join(f"{share:9.3f}" for share in shares_inside(own).values()))
+        lines.append(f"{name:22s}" + " ".join(f"{share:9.3f}" for share in shares_inside(errors).values()))
     rmse = np.array([row.rmse_m for row in rows])
     lines.append(
         f"corner RMSE, median {100 * np.nanmedian(rmse):.2f} cm, recall "
@@ -412,12 +417,12 @@ def summary_of_spoilt(rows: Sequence[Row], clean: dict[int, Row]) -> list[str]:
     lines = [f"{'fault':18s}" + "".join(f"{column:>7s}" for column in (*columns, "inside"))]
     totals: Counter[str] = Counter()
     for spoil in dict.fromkeys(row.spoil for row in rows):
-        own = [row for row in rows if row.spoil == spoil]
-        counts = _counts([judge(row, clean[row.seed]) for row in own])
+        of_spoil = [row for row in rows if row.spoil == spoil]
+        counts = _counts([judge(row, clean[row.seed]) for row in of_spoil])
         totals.update(counts)
-        inside = f"{shares_inside(own)['corners']:7.2f}"
+        inside = f"{shares_inside(of_spoil)['corners']:7.2f}"
         lines.append(f"{spoil:18s}" + "".join(f"{counts[column]:7d}" for column in columns) + inside)
-        said = Counter(finding["check"] for row in own for finding in row.findings)
+        said = Counter(finding["check"] for row in of_spoil for finding in row.findings)
         checks = ", ".join(f"{check} {count}" for check, count in said.most_common())
         lines.append(f"    {checks or 'nothing'}")
     lines.append(f"{'all':18s}" + "".join(f"{totals[column]:7d}" for column in columns))
@@ -498,10 +503,14 @@ def main() -> None:
     parsed = parser.parse_args()
     seeds = [s for s in range(*parsed.seeds) if re.search(parsed.only, Job(s, parsed.route).recipe.name)]
     kinds = [CLEAN, *(spoil.name for spoil in wanted_spoils(parsed.spoil))]
-    rest = parsed.control, parsed.read_out, parsed.estimate, parsed.ground
+    settings = parsed.control, parsed.read_out, parsed.estimate, parsed.ground
     apart_s = {seed: APART_S if parsed.in_turn else draw_apart_s(seed) for seed in seeds}
-    taken = parsed.stated, parsed.camera
-    jobs = [Job(seed, parsed.route, kind, *rest, apart_s[seed], *taken) for seed in seeds for kind in kinds]
+    stated_settings = parsed.stated, parsed.camera
+    jobs = [
+        Job(seed, parsed.route, kind, *settings, apart_s[seed], *stated_settings)
+        for seed in seeds
+        for kind in kinds
+    ]
     rows = measure(jobs, parsed.workers, parsed.verbose or bool(parsed.spoil))
     parsed.out.parent.mkdir(parents=True, exist_ok=True)
     parsed.out.write_text(json.dumps([asdict(row) for row in rows]))

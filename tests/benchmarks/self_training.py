@@ -35,8 +35,8 @@ def mapped(folder: Path, name: str, drive: str, paint: Sequence[str], model: str
         run(
             "v2hdm", "map", "+run=port2", f"name={name}", f"output={folder}", f"cache={folder / 'cache'}",
             f"simulate.name={drive}", f"simulate.seed={SEEDS[drive]}", f"simulate.route.pieces={ROUTE}",
-            "simulate.route.image_spacing_m=1.5", *(f"simulate.paint.{one}" for one in paint), "workers=1",
-            *([f"detector.model={model}"] if model else []),
+            "simulate.route.image_spacing_m=1.5", *(f"simulate.paint.{override}" for override in paint),
+            "workers=1", *([f"detector.model={model}"] if model else []),
         )  # fmt: skip
     return result
 
@@ -62,9 +62,9 @@ def row(name: str, result: Path) -> str:
     figures = json.loads((result / "metrics.json").read_text())
     of_all = figures["results"]["both"]["Opt"]
     recall = ", ".join(
-        f"{kind} {one['recall']:.2f} of {one['expected']}"
-        for kind, one in of_all["by_class"].items()
-        if one["expected"]
+        f"{kind} {counts['recall']:.2f} of {counts['expected']}"
+        for kind, counts in of_all["by_class"].items()
+        if counts["expected"]
     )
     verdict = figures["verdict"]["status"]
     return f"{name:28s} recall {of_all['recall']:.3f} ({recall}), {of_all['false_markings']} false, {verdict}"

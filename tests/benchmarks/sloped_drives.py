@@ -116,8 +116,8 @@ def judge(drive: Drive, detections: list[ImageDetections], rotation: FloatArray)
     cameras = tuple(drive.cameras)
     truth = read_truth(drive)
     expected = driven_past(drive, truth, cameras)
-    found = run_methods(drive, detections, cameras)["Opt"]
-    figures = marking_metrics(found.hd_map, tilted_truth(truth, rotation), expected)
+    optimum = run_methods(drive, detections, cameras)["Opt"]
+    figures = marking_metrics(optimum.hd_map, tilted_truth(truth, rotation), expected)
     tilt_deg = np.degrees(np.arccos([image.map_from_vehicle[2, 2] for image in drive.images]))
     return (
         f"{100 * figures.corner_rmse_m:6.2f} cm  {figures.markings:4d} markings, {figures.false_markings} "

@@ -62,9 +62,9 @@ def stages(checkout: Path, overrides: list[str]) -> dict[str, float]:
         places = [f"output={folder / 'out'}", f"cache={folder / 'cache'}"]
         command = [sys.executable, str(folder / "program.py"), str(folder / "cpu.json"), *overrides, *places]
         environment = {**os.environ, "PYTHONPATH": str(checkout)}
-        done = subprocess.run(command, cwd=checkout, env=environment, capture_output=True, text=True)
-        if done.returncode == 2:
-            raise SystemExit(f"{checkout}: {done.stdout[-400:]}{done.stderr[-400:]}")
+        process = subprocess.run(command, cwd=checkout, env=environment, capture_output=True, text=True)
+        if process.returncode == 2:
+            raise SystemExit(f"{checkout}: {process.stdout[-400:]}{process.stderr[-400:]}")
         return json.loads((folder / "cpu.json").read_text())
 
 
@@ -77,7 +77,7 @@ def main() -> None:
     here = Path(__file__).parents[2]
     for _ in range(parsed.rounds):
         before, after = (
-            stages(one.resolve(), overrides or ["+run=port2"]) for one in (parsed.checkout, here)
+            stages(checkout.resolve(), overrides or ["+run=port2"]) for checkout in (parsed.checkout, here)
         )
         for stage, took_s in before.items():
             now_s = after.get(stage, 0.0)

@@ -26,7 +26,7 @@ STEP_M = 0.005
 def true_arrows(run: str) -> list[FloatArray]:
     """The vertices (7, 2) of the arrows of a shipped run's port, from its shafts and heads."""
     paints = build_port(port_config(run)).renderer.scene.paints
-    pieces = [one.polygon_map for one in paints if one.kind == ARROW]
+    pieces = [paint.polygon_map for paint in paints if paint.kind == ARROW]
     arrows = []
     for shaft, (right, tip, left) in zip(pieces[::2], pieces[1::2], strict=True):
         # Shafts run on under their heads: they meet where the head begins.
@@ -45,9 +45,9 @@ def along(ring: FloatArray) -> FloatArray:
     )
 
 
-def apart(one: FloatArray, other: FloatArray) -> FloatArray:
+def apart(outline: FloatArray, other: FloatArray) -> FloatArray:
     """Distances (N,) of points (N, 2) from the nearest of others (M, 2)."""
-    return np.asarray(np.linalg.norm(one[:, None] - other, axis=2).min(axis=1))
+    return np.asarray(np.linalg.norm(outline[:, None] - other, axis=2).min(axis=1))
 
 
 def main() -> None:
@@ -60,7 +60,7 @@ def main() -> None:
     for symbol in read_geojson(arguments.folder / "map.geojson").symbols:
         outline = along(symbol.outline_map)
         nearest = min(
-            true, key=lambda one: float(np.linalg.norm(along(one).mean(axis=0) - outline.mean(axis=0)))
+            true, key=lambda arrow: float(np.linalg.norm(along(arrow).mean(axis=0) - outline.mean(axis=0)))
         )
         if np.linalg.norm(along(nearest).mean(axis=0) - outline.mean(axis=0)) > NEAR_M:
             print(f"false: a {symbol.kind} at {symbol.outline_map.mean(axis=0).round(1)}")

@@ -36,11 +36,11 @@ def test_exact_corners_lie_on_the_true_paint() -> None:
     detections, _ = detect(world, drive)
     true_map = world.corners_map[..., :2].reshape(-1, 2)
     off_m = []
-    for found in detections[:20]:
-        image = drive.images[found.image]
+    for in_image in detections[:20]:
+        image = drive.images[in_image.image]
         frame, lens = world.frame_of(image), world.lenses[image.camera]
         pose = world.cam_from_vehicle[image.camera][frame] @ np.linalg.inv(world.map_from_vehicle[frame])
-        for marking in found.markings:
+        for marking in in_image.markings:
             pinhole = undistort_points(lens, marking.corners_px[marking.corner_valid])
             ground = apply_homography(ground_from_pinhole_px(lens.intrinsic, pose), pinhole)
             off_m += [np.linalg.norm(true_map - corner, axis=1).min() for corner in ground]
@@ -102,11 +102,12 @@ def test_the_largest_part_in_view_is_the_larger_of_two_beside_what_hides_the_res
 def test_behind_boxes_pieces_are_found_beside_all_else() -> None:
     world = make(draw(1))
     drive = drive_of(world)
-    whole, (found, _) = detect(world, drive)[0], detect_pieces(world, drive)
-    pieces = [b.markings[len(a.markings) :] for a, b in zip(whole, found, strict=True)]
-    for a, b in zip(whole, found, strict=True):
+    whole, (with_pieces, _) = detect(world, drive)[0], detect_pieces(world, drive)
+    pieces = [b.markings[len(a.markings) :] for a, b in zip(whole, with_pieces, strict=True)]
+    for a, b in zip(whole, with_pieces, strict=True):
         np.testing.assert_equal(
-            [one.corners_px for one in a.markings], [one.corners_px for one in b.markings[: len(a.markings)]]
+            [marking.corners_px for marking in a.markings],
+            [marking.corners_px for marking in b.markings[: len(a.markings)]],
         )
     assert sum(map(len, pieces)) > 50
 
@@ -114,7 +115,7 @@ def test_behind_boxes_pieces_are_found_beside_all_else() -> None:
 def test_a_box_stands_on_the_far_end_of_every_second_dash_at_the_right() -> None:
     world = make_boxes(draw(5, "straight"))
     route, stood_on = world.port.route, 0
-    dashes = [one.corners_map for one in world.port.hd_map.markings if one.kind == LANE_DASH]
+    dashes = [marking.corners_map for marking in world.port.hd_map.markings if marking.kind == LANE_DASH]
     boxes = world.port.renderer.scene.boxes[len(make(draw(5, "straight")).port.renderer.scene.boxes) :]
     for dash in dashes:
         station_m, _ = beside(route, dash)

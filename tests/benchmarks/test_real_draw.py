@@ -50,8 +50,8 @@ def rendered(view: View, painted: list[FloatArray], seed: int = 0) -> np.ndarray
     return np.asarray(np.clip(cv2.GaussianBlur(grey, (0, 0), 0.6) + grain, 0, 255).astype(np.uint8))
 
 
-def gap_px(found: View, truth: View, polygons: list[FloatArray]) -> float:
-    return float(max(np.abs(found.project(p) - truth.project(p)).max() for p in polygons))
+def gap_px(aligned: View, truth: View, polygons: list[FloatArray]) -> float:
+    return float(max(np.abs(aligned.project(p) - truth.project(p)).max() for p in polygons))
 
 
 @pytest.mark.parametrize("motion", [(0.15, 0.3, 0.1, 0.03), (-0.2, -0.3, -0.1, -0.03)])
@@ -60,10 +60,10 @@ def test_a_camera_that_is_off_is_moved_until_the_drawing_lies_on_its_paint(
 ) -> None:
     truth = turned(*motion)
     assert gap_px(VIEW, truth, PAINTED) > 4
-    found = align(VIEW, rendered(truth, PAINTED), PAINTED)
-    assert gap_px(found.view, truth, PAINTED) < 0.4
-    assert found.spread_px < 0.4
-    np.testing.assert_allclose(np.degrees(found.motion[:2]), motion[:2], atol=0.1)
+    alignment = align(VIEW, rendered(truth, PAINTED), PAINTED)
+    assert gap_px(alignment.view, truth, PAINTED) < 0.4
+    assert alignment.spread_px < 0.4
+    np.testing.assert_allclose(np.degrees(alignment.motion[:2]), motion[:2], atol=0.1)
 
 
 def test_what_stands_before_the_road_moves_the_camera_only_if_it_is_not_said_to_hide() -> None:
@@ -78,15 +78,15 @@ def test_what_stands_before_the_road_moves_the_camera_only_if_it_is_not_said_to_
 
 
 def test_a_camera_that_sees_nothing_of_the_drawing_stays() -> None:
-    found = align(VIEW, rendered(VIEW, []), [dash(40, 0)])
-    assert found.edges == 0
-    np.testing.assert_array_equal(found.view.cam_from_map, VIEW.cam_from_map)
+    alignment = align(VIEW, rendered(VIEW, []), [dash(40, 0)])
+    assert alignment.edges == 0
+    np.testing.assert_array_equal(alignment.view.cam_from_map, VIEW.cam_from_map)
 
 
 def test_a_drawing_of_the_other_turning_has_the_same_edges() -> None:
     truth = turned(0.1, 0.2, 0.0, 0.0)
-    found = align(VIEW, rendered(truth, PAINTED), [polygon[::-1] for polygon in PAINTED])
-    assert gap_px(found.view, truth, PAINTED) < 0.4
+    alignment = align(VIEW, rendered(truth, PAINTED), [polygon[::-1] for polygon in PAINTED])
+    assert gap_px(alignment.view, truth, PAINTED) < 0.4
 
 
 def test_an_edge_is_found_between_pixels_and_none_where_grey_only_rises() -> None:
@@ -115,11 +115,11 @@ def test_a_tile_shows_paint_where_it_lies_on_the_road() -> None:
 
 
 def test_a_place_of_a_tile_is_taken_from_the_nearest_image() -> None:
-    near = replace(VIEW, cam_from_map=VIEW.cam_from_map.copy())
-    near.cam_from_map[2, 3] = -6.0
+    near_view = replace(VIEW, cam_from_map=VIEW.cam_from_map.copy())
+    near_view.cam_from_map[2, 3] = -6.0
     images = [np.full((INFO.height, INFO.width, 3), level, dtype=np.uint8) for level in (60, 160)]
     tile = Tile((34.0, 48.0), (-1.0, 1.0), 0.1)
-    picture = stitch(tile, ROUTE, [VIEW, near], images)
+    picture = stitch(tile, ROUTE, [VIEW, near_view], images)
     for way, level in ((38.0, 60), (45.0, 160)):
         x, y = np.round(tile.pixels(np.array([[way, 0.0]]))[0]).astype(int)
         assert (picture[y, x] == level).all()

@@ -110,9 +110,9 @@ def test_a_detection_away_from_all_paint_is_false_and_one_beside_its_dash_is_not
 
 def test_two_detections_on_one_dash_find_it_once_and_a_wrong_class_is_told() -> None:
     reference = whole(Painted(LANE_DASH, dash(8)))
-    given = [detection(dash(8), ARROW), detection(dash(8.3))]
+    detections = [detection(dash(8), ARROW), detection(dash(8.3))]
     tally = Tally(reference, np.zeros(1))
-    tally.add(judge_image(VIEW, reference, [], given))
+    tally.add(judge_image(VIEW, reference, [], detections))
     assert tally.found["dashes in the sun"] == 1
     assert tally.right["dashes in the sun"] == 0
     assert "100.0 %" in summary(tally, reference)
@@ -132,9 +132,9 @@ def test_the_map_is_judged_by_what_is_painted() -> None:
     tally.add(judge_image(VIEW, reference, [], [detection(dash(14))]))
     mapped = [(LANE_DASH, dash(8)), (LANE_DASH, dash(8, -4.0)), (LANE_LINE, dash(8, -6.0))]
     left_out = Exclusion(LANE_DASH, np.array([15.0, 1.5]), 7, "its position is too uncertain")
-    table, *rest = map_summary(mapped, [left_out], reference, tally).split("\n")[1:]
+    table, *lines = map_summary(mapped, [left_out], reference, tally).split("\n")[1:]
     assert table.split() == ["lane_dash", "3", "1", "1"]
-    assert rest == [
+    assert lines == [
         "missing: lane_dash at 15.5, 1.5: found in 1 of the 1 images that show it; left out as lane_dash of "
         "7 sightings: its position is too uncertain",
         "missing: lane_dash at 21.5, 1.5: found in 0 of the 0 images that show it; no candidate of the map "

@@ -39,25 +39,25 @@ def columns(line_px: FloatArray) -> FloatArray:
 def judge(truth_px: list[FloatArray], given_px: list[FloatArray]) -> TuSimple | None:
     """The figures of one image; None where it has no lanes, of which TuSimple has no images."""
     truth = [u for line in truth_px if ((u := columns(line)) >= 0).sum() > 1]
-    given = [u for line in given_px if ((u := columns(line)) >= 0).any()]
+    answered = [u for line in given_px if ((u := columns(line)) >= 0).any()]
     if not truth:
         return None
-    if len(given) > len(truth) + 2:
+    if len(answered) > len(truth) + 2:
         return TuSimple(0.0, 0.0, 1.0)
-    right = sorted((_best(line, given) for line in truth), reverse=True)
+    right = sorted((_best(line, answered) for line in truth), reverse=True)
     matched = sum(share >= _MATCH for share in right)
     missed = len(truth) - matched
     if len(truth) > _LANES_JUDGED:
         missed -= missed > 0
         right = right[:-1]
     judged = min(_LANES_JUDGED, len(truth))
-    false = (len(given) - matched) / len(given) if given else 0.0
+    false = (len(answered) - matched) / len(answered) if answered else 0.0
     return TuSimple(sum(right) / judged, false, missed / judged)
 
 
-def _best(line: FloatArray, given: list[FloatArray]) -> float:
+def _best(line: FloatArray, answered: list[FloatArray]) -> float:
     """The share of rows on which the best of the given lines is right."""
-    there = line >= 0
-    slope = np.polyfit(ROWS[there], line[there], 1)[0]
+    has_line = line >= 0
+    slope = np.polyfit(ROWS[has_line], line[has_line], 1)[0]
     tolerance = _TOLERANCE_PX * np.hypot(1, slope)
-    return max((float((np.abs(u - line) < tolerance).mean()) for u in given), default=0.0)
+    return max((float((np.abs(u - line) < tolerance).mean()) for u in answered), default=0.0)

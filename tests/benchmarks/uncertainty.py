@@ -56,7 +56,10 @@ def squared_errors(result: MethodResult, truth: Truth) -> Errors:
         ]
     )
     cameras = np.array(
-        [camera_errors(one, truth.cam_from_vehicle[name]) for name, one in result.calibrations.items()]
+        [
+            camera_errors(calibration, truth.cam_from_vehicle[name])
+            for name, calibration in result.calibrations.items()
+        ]
     )
     return {
         "corners": corner_errors(mapped, true) * INSIDE / INSIDE_95,
@@ -69,7 +72,7 @@ def squared_errors(result: MethodResult, truth: Truth) -> Errors:
 def in_order_of(corners: FloatArray, other: FloatArray) -> FloatArray:
     """``other`` (4, 2), beginning with the corner that comes nearest to ``corners``."""
     turned = [np.roll(other, shift, axis=0) for shift in range(4)]
-    return min(turned, key=lambda one: float(((one - corners) ** 2).sum()))
+    return min(turned, key=lambda corners_turned: float(((corners_turned - corners) ** 2).sum()))
 
 
 def corner_errors(mapped: Sequence[Marking], true: FloatArray) -> FloatArray:
@@ -100,23 +103,23 @@ def distance_errors(mapped: Sequence[Marking], true: FloatArray) -> FloatArray:
     centres = np.array([marking.corners_map.mean(axis=0) for marking in mapped])
     true_centres = true.mean(axis=1)
     sigma = np.array([marking.relative_sigma_m or np.nan for marking in mapped])
-    near = neighbours(centres)
-    first = np.array([k for k, others in enumerate(near) if len(others)], dtype=np.int64)
-    second = np.array([near[k][0] for k in first], dtype=np.int64)
+    neighbours_of = neighbours(centres)
+    first = np.array([k for k, others in enumerate(neighbours_of) if len(others)], dtype=np.int64)
+    second = np.array([neighbours_of[k][0] for k in first], dtype=np.int64)
     off = np.linalg.norm(centres[first] - centres[second], axis=1)
     off -= np.linalg.norm(true_centres[first] - true_centres[second], axis=1)
     squared = off**2 / (sigma[first] ** 2 + sigma[second] ** 2)
     return np.asarray(squared[np.isfinite(squared)])
 
 
-def camera_errors(found: Calibration, true: FloatArray) -> FloatArray:
+def camera_errors(calibration: Calibration, true: FloatArray) -> FloatArray:
     """Squared errors of a camera's height, roll, pitch and yaw (4,), in sigmas."""
-    assert found.covariance is not None
-    off = found.cam_from_vehicle @ np.linalg.inv(true)
+    assert calibration.covariance is not None
+    off = calibration.cam_from_vehicle @ np.linalg.inv(true)
     turn = Rotation.from_matrix(off[:3, :3]).as_rotvec()
-    to_vehicle = np.kron(np.eye(2), found.cam_from_vehicle[:3, :3].T)
+    to_vehicle = np.kron(np.eye(2), calibration.cam_from_vehicle[:3, :3].T)
     error = to_vehicle @ np.concatenate([off[:3, 3], turn])
-    variance = np.diag(to_vehicle @ found.covariance @ to_vehicle.T)
+    variance = np.diag(to_vehicle @ calibration.covariance @ to_vehicle.T)
     return np.asarray((error**2 / variance)[2:])
 
 
@@ -155,7 +158,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     arguments = parser.parse_args()
     print(" " * 25 + " ".join(f"{name:>9s}" for name in QUANTITIES))
-    found: list[Errors] = []
+    errors_of_drives: list[Errors] = []
     for name, recorded in drives(arguments):
         drive = replace(recorded, pose_noise=PoseNoise.from_stated()) if arguments.no_noise else recorded
         with open_executor(arguments.workers) as executor:
@@ -163,9 +166,11 @@ def main() -> None:
         result = run_methods(drive, detections, list(drive.cameras), MappingOptions(mode=arguments.mode))[
             "Opt"
         ]
-        found.append(squared_errors(result, read_truth(drive)))
-        print_shares(name, found[-1])
-    print_shares("all", {name: np.concatenate([one[name] for one in found]) for name in QUANTITIES})
+        errors_of_drives.append(squared_errors(result, read_truth(drive)))
+        print_shares(name, errors_of_drives[-1])
+    print_shares(
+        "all", {name: np.concatenate([errors[name] for errors in errors_of_drives]) for name in QUANTITIES}
+    )
 
 
 if __name__ == "__main__":

@@ -88,8 +88,8 @@ def _measure(page: Any, axe: Path | None) -> None:
         page.evaluate(axe.read_text())
         for state in ("selected", "with keys"):
             result = page.evaluate("axe.run()")
-            found = [(rule["id"], rule["impact"], len(rule["nodes"])) for rule in result["violations"]]
-            print(f"axe, {state}: {len(result['passes'])} rules pass, violations {found}")
+            violations = [(rule["id"], rule["impact"], len(rule["nodes"])) for rule in result["violations"]]
+            print(f"axe, {state}: {len(result['passes'])} rules pass, violations {violations}")
             page.keyboard.press("?")
 
 

@@ -150,13 +150,13 @@ def judge(drive: str, fault: Fault, outcome: Outcome, clean: Outcome) -> Row:
     )
     said = [_clause(finding) for finding in outcome.findings] or [outcome.message]
     pattern = fault.cause
-    told = outcome.status in ("WARN", "FAIL", _REFUSED)
+    is_raised = outcome.status in ("WARN", "FAIL", _REFUSED)
     hidden = fault.hidden_on_straight if "straight" in drive else None
-    if hidden is not None and not told:
-        said = [_clause(one) for one in outcome.unobservable]
-        told, pattern = bool(said), hidden
-    named = [pattern is None or re.search(pattern, one, re.IGNORECASE) is not None for one in said]
-    return Row(drive, fault.name, outcome, right, told, any(named), bool(named and named[0]))
+    if hidden is not None and not is_raised:
+        said = [_clause(clause) for clause in outcome.unobservable]
+        is_raised, pattern = bool(said), hidden
+    named = [pattern is None or re.search(pattern, clause, re.IGNORECASE) is not None for clause in said]
+    return Row(drive, fault.name, outcome, right, is_raised, any(named), bool(named and named[0]))
 
 
 def _clause(finding: dict[str, Any]) -> str:
@@ -192,12 +192,12 @@ def _work(job: _Job) -> Outcome:
 def measure(ports: Sequence[PortConfig], only: str, workers: int, cache: Path, scratch: Path) -> list[Row]:
     """Run all faults that match ``only`` on all drives; prints a row as each is finished."""
     faults, rows = _faults(), []
-    wanted = [k for k, fault in enumerate(faults) if k == 0 or re.search(only, fault.name)]
+    fault_numbers = [k for k, fault in enumerate(faults) if k == 0 or re.search(only, fault.name)]
     jobs: list[_Job] = []
     for port in ports:
         with open_executor(workers) as executor:
-            good = rendered_drive(port, cache, executor, lambda done, total: None).resolve()
-        jobs += [(f"{port.name}_{port.seed}", k, str(good), str(scratch.resolve())) for k in wanted]
+            good = rendered_drive(port, cache, executor, lambda finished, total: None).resolve()
+        jobs += [(f"{port.name}_{port.seed}", k, str(good), str(scratch.resolve())) for k in fault_numbers]
     pending, clean = iter(jobs), {}
 
     def take(outcome: Outcome) -> None:

@@ -150,12 +150,12 @@ def test_correlated_noise_keeps_its_sigma_and_its_length():
 
 def test_disturbances_are_as_large_as_configured():
     config = RouteConfig(pieces=[[3000.0, 0.0]])
-    wanted = DisturbanceConfig()
-    driven = drive_along(build_route(config), config, wanted, np.random.default_rng(2))
+    configured = DisturbanceConfig()
+    driven = drive_along(build_route(config), config, configured, np.random.default_rng(2))
     recorded, inside = interpolate(driven.recorded, driven.stamp_s, 0.5)
     assert inside.all()
     tilt = np.rad2deg(driven.map_from_vehicle[:, 2, :2])
-    assert tilt.std(axis=0) == pytest.approx([wanted.roll_pitch_deg] * 2, rel=0.08)
+    assert tilt.std(axis=0) == pytest.approx([configured.roll_pitch_deg] * 2, rel=0.08)
     error = (recorded - driven.map_from_vehicle)[:, :2, 3]
     assert np.sqrt((error**2).mean()) > 0.009
     assert not np.isin(driven.stamp_s, driven.recorded.stamp_s).any()
@@ -178,6 +178,34 @@ def test_hidden_points_are_those_the_picture_hides():
     assert agree.mean() > 0.985
     assert not hidden_by([box], centre, points).all()
     assert points_seen(info, cam_from_map, points, [box]).sum() == (~hidden_by([box], centre, points)).sum()
+
+
+def _crosses(box, eye_map, points_map):
+    """Which lines from an eye to points (N, 3) pass through a box on level ground, by numpy."""
+    turn = np.array([[np.cos(box.yaw_rad), -np.sin(box.yaw_rad)], [np.sin(box.yaw_rad), np.cos(box.yaw_rad)]])
+    ends = np.vstack([eye_map, points_map])
+    eye, *ground = np.column_stack([(ends[:, :2] - box.centre_map) @ turn, ends[:, 2] - box.base_m])
+    half_length, half_width = box.size_m[0] / 2, box.size_m[1] / 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first = (np.array([-half_length, -half_width, 0.0]) - eye) / (ground - eye)
+        second = (np.array([half_length, half_width, box.size_m[2]]) - eye) / (ground - eye)
+    enter = np.fmin(first, second).max(axis=1)
+    leave = np.fmax(first, second).min(axis=1)
+    return (enter < np.minimum(leave, 1.0)) & (leave > 0)
+
+
+def test_lines_through_boxes_are_those_that_numpy_names():
+    rng = np.random.default_rng(3)
+    eye_map = np.array([0.5, -0.25, 2.5])
+    points_map = np.column_stack([rng.uniform(-20, 20, (4000, 2)), np.zeros(4000)])
+    points_map[:500, 0] = eye_map[0]  # straight ahead of the eye: a line along two sides of an unturned box
+    boxes = [
+        Box(centre_map=tuple(rng.uniform(-9, 9, 2)), size_m=(3.0, 2.0, 2.0), yaw_rad=yaw, base_m=base)
+        for yaw, base in ((0.0, 0.0), (0.7, 0.0), (2.0, 1.2), (0.0, 1.0))
+    ]
+    expected = np.any([_crosses(box, eye_map, points_map) for box in boxes], axis=0)
+    assert 0.05 < expected.mean() < 0.95
+    assert np.array_equal(hidden_by(boxes, eye_map, points_map), expected)
 
 
 @pytest.mark.parametrize(
@@ -222,8 +250,8 @@ def test_the_stated_drift_is_that_of_the_recorded_positions():
 
 def test_another_session_finds_the_same_paint_under_other_noise():
     first, second = build_port(tiny_port()), build_port(tiny_port(session=1))
-    for one, other in zip(first.hd_map.markings, second.hd_map.markings, strict=True):
-        np.testing.assert_array_equal(one.corners_map, other.corners_map)
+    for marking, other in zip(first.hd_map.markings, second.hd_map.markings, strict=True):
+        np.testing.assert_array_equal(marking.corners_map, other.corners_map)
     assert not np.allclose(first.driven.map_from_vehicle, second.driven.map_from_vehicle, atol=1e-6)
     camera = next(iter(first.cameras))
     assert (first.picture(camera, 0).image != second.picture(camera, 0).image).any()
@@ -257,9 +285,9 @@ def test_a_port_with_stencils_is_otherwise_the_same():
     plain, stencilled = build_port(tiny_port()), build_port(tiny_port(paint=PaintConfig(stencils=STENCILS)))
     before, after = plain.renderer.scene.paints, stencilled.renderer.scene.paints
     assert len(after) > len(before)
-    for one, other in zip(before, after, strict=False):
-        assert replace(one, polygon_map=0) == replace(other, polygon_map=0)  # type: ignore[arg-type]
-        np.testing.assert_array_equal(one.polygon_map, other.polygon_map)
+    for paint, other in zip(before, after, strict=False):
+        assert replace(paint, polygon_map=0) == replace(other, polygon_map=0)  # type: ignore[arg-type]
+        np.testing.assert_array_equal(paint.polygon_map, other.polygon_map)
 
 
 def test_own_paint_has_labels_after_those_of_the_shipped_classes():

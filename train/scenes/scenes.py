@@ -203,8 +203,8 @@ def _in_image(view: TrainingView, points_map: FloatArray) -> tuple[FloatArray, N
     pixels = pixels[about]
     # Far outside the image the lens polynomial folds back into it.
     back = undistort_points(view.info, pixels)
-    told = np.linalg.norm(back - pinhole, axis=1) < _LENS_TOLERANCE_PX
-    return pixels[told], index[told]
+    is_inverted = np.linalg.norm(back - pinhole, axis=1) < _LENS_TOLERANCE_PX
+    return pixels[is_inverted], index[is_inverted]
 
 
 def random_scene(

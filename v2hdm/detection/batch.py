@@ -29,6 +29,7 @@ Detect = Callable[[Drive, DetectorOptions, Sequence[int], Executor, Callable[[Im
 """A function that does what :func:`detect_images` does."""
 
 _FEW_IMAGES = 8  # fewer images than this are looked at before a process has started
+_IMAGES_TOGETHER = 4  # most images that a process looks at before it reports; chosen
 
 _IMAGES = 24  # images in which a camera's own vehicle is looked for: a second and a half of work
 _LEAST_IMAGES = 10  # images that a mask of the vehicle needs at least
@@ -125,7 +126,7 @@ def detect_images(
             take(detect_image(detector, drive, index))
         return
     processes = 0 if options.device == "cpu" else _WORKERS_A_GPU
-    executor.share_out(_work, images, _start_worker, (drive, options), take, processes)
+    executor.share_out(_work, images, _start_worker, (drive, options), take, processes, _IMAGES_TOGETHER)
 
 
 def own_vehicles(drive: Drive, detector: Detector) -> dict[str, BoolArray]:

@@ -28,26 +28,25 @@ def with_answers(result: Result, corrections: Sequence[Correction]) -> Result:
     answered = answered_graph(result.map, result.drive.paths, answers)
     places = [correction.place for correction in corrections if correction.is_answer]
     reason_of = {id(refusal.answer): refusal.reason for refusal in answered.refused}
-    told = [
+    heard_answers = [
         Heard(place, f"answered: {answer.answer}", f"not followed: {reason_of[id(answer)]}")
         if id(answer) in reason_of
         else Heard(place, f"answered: {answer.answer}")
         for place, answer in zip(places, answers, strict=True)
     ]
-    for heard in told:
+    for heard in heard_answers:
         _log.info("%s", f"answer on lanes: {heard.sentence}")
     figures = dict(result.figures)
-    figures["corrections"] = [*figures.get("corrections", ()), *map(asdict, told)]
-    findings = [*result.verdict.findings, _finding(told, len(answered.refused))]
+    figures["corrections"] = [*figures.get("corrections", ()), *map(asdict, heard_answers)]
+    findings = [*result.verdict.findings, _finding(heard_answers, len(answered.refused))]
     return replace(result, answers=answered.followed, figures=figures, verdict=Verdict.of(findings))
 
 
-def _finding(told: Sequence[Heard], refused: int) -> Finding:
+def _finding(heard_answers: Sequence[Heard], refused: int) -> Finding:
     about = "map.corrections"
     if not refused:
-        return passed("answers on lanes", about, f"the lanes follow {len(told)} answers", 0.0)
-    sentences = [heard.sentence for heard in told if heard.against]
-    says = (
-        f"{refused} of {len(told)} cannot be followed: {'; '.join(sentences[:_LISTED])}: answer these again"
-    )
+        return passed("answers on lanes", about, f"the lanes follow {len(heard_answers)} answers", 0.0)
+    sentences = [heard.sentence for heard in heard_answers if heard.against]
+    listed = "; ".join(sentences[:_LISTED])
+    says = f"{refused} of {len(heard_answers)} cannot be followed: {listed}: answer these again"
     return Finding("answers on lanes", Status.WARN, float(refused), 0.0, "", says, about)

@@ -59,14 +59,18 @@ def graded(hd_map: HDMap, goal_m: float) -> HDMap:
     )
 
 
-def accurate_enough(methods: CameraSets, asked: str, corrections: Sequence[Correction] = ()) -> CameraSets:
-    """Results without what is of a worse grade than ``asked``, but with what a person has confirmed.
+def accurate_enough(
+    methods: CameraSets, least_accuracy: str, corrections: Sequence[Correction] = ()
+) -> CameraSets:
+    """Results without markings below ``least_accuracy``, except those that a person has confirmed.
 
     Raises:
         MappingError: nothing of the map of all cameras would be left.
     """
     chosen = {
-        name: {method: without_worse(result, asked, corrections) for method, result in by_method.items()}
+        name: {
+            method: without_worse(result, least_accuracy, corrections) for method, result in by_method.items()
+        }
         for name, by_method in methods.items()
     }
     name = list(methods)[-1]
@@ -74,20 +78,23 @@ def accurate_enough(methods: CameraSets, asked: str, corrections: Sequence[Corre
     if markings and not chosen[name][BEST].hd_map.markings:
         best = min(marking.accuracy or "" for marking in markings)
         raise MappingError(
-            f"none of {len(markings)} markings is of accuracy {asked}, for which mapping.acceptance.accuracy "
-            f"asks; the best are of accuracy {best}: ask for that, or see docs/accuracy.md"
+            f"none of {len(markings)} markings is of accuracy {least_accuracy}, for which "
+            f"mapping.acceptance.accuracy asks; the best are of accuracy {best}: ask for that, or see "
+            "docs/accuracy.md"
         )
     return chosen
 
 
-def without_worse(result: MethodResult, asked: str, corrections: Sequence[Correction] = ()) -> MethodResult:
+def without_worse(
+    result: MethodResult, least_accuracy: str, corrections: Sequence[Correction] = ()
+) -> MethodResult:
     """The result without markings and symbols of a worse grade, which become exclusions.
 
     The others keep the ids that they have in the whole map. What a person accepted or corrected stays.
     """
 
     def objection(paint: Marking | Symbol) -> str | None:
-        against = objection_to(paint.accuracy, asked)
+        against = objection_to(paint.accuracy, least_accuracy)
         return None if against and is_confirmed(_outline(paint), corrections) else against
 
     ids = [feature.id for feature in features_of(result.hd_map)]
@@ -107,7 +114,7 @@ def without_worse(result: MethodResult, asked: str, corrections: Sequence[Correc
 
 
 def _with_fewer_markings(result: MethodResult, hd_map: HDMap) -> MethodResult:
-    """The result with a map some of whose markings are gone; the others have the ids that they had."""
+    """The result with some of its map's markings removed; the others keep their ids."""
     kept_ids = [marking.id or 0 for marking in hd_map.markings]
     residuals = result.residuals
     if residuals is not None:

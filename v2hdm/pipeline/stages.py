@@ -78,17 +78,17 @@ def detect_in_pieces(
         _log.info("detections in %d of %d images reused from an earlier run", total - len(todo), total)
     progress(total - len(todo), total)
     piece_so_far: _Piece = []
-    done = 0
+    finished = 0
 
     def take(detections: ImageDetections) -> None:
-        nonlocal done
-        done += 1
+        nonlocal finished
+        finished += 1
         start = detections.image - detections.image % PIECE
         piece_so_far.append(replace(detections, image=detections.image - start))
         if len(piece_so_far) == min(PIECE, total - start):
             pieces[start] = cache.put(_DETECT, keys[start], _Piece, piece_so_far)
             piece_so_far.clear()
-        progress(total - len(todo) + done, total)
+        progress(total - len(todo) + finished, total)
 
     if todo:
         (detect or detect_images)(drive, options, todo, context.executor, take)
@@ -305,5 +305,5 @@ class _Work:
         _log.info("mapped with %s: %d markings, %.1f s", name, len(best.hd_map.markings), took_s)
         for exclusion in best.excluded:
             where = ", ".join(f"{value:.2f}" for value in exclusion.position_map)
-            _log.debug("%s: left out a %s at (%s): %s", name, exclusion.kind, where, exclusion.reason)
+            _log.debug("%s: left out %s at (%s): %s", name, exclusion.kind, where, exclusion.reason)
         return MappedSet(methods, checked)

@@ -114,7 +114,7 @@ def drive_bars(console: Console, endings: Collection[str] = ()) -> Iterator[Driv
     """A bar per running drive, until its stage is one of ``endings``; lines if there is no terminal."""
     if not console.is_terminal:
         lines = progress_lines(lambda line: plain(console, line))
-        yield lambda drive, stage, done, total: lines(f"{drive}: {stage}", done, total)
+        yield lambda drive, stage, finished, total: lines(f"{drive}: {stage}", finished, total)
         return
     name = TextColumn("{task.description:<20}", markup=False)
     stage_name = TextColumn("{task.fields[stage]:<16}", markup=False)
@@ -122,14 +122,16 @@ def drive_bars(console: Console, endings: Collection[str] = ()) -> Iterator[Driv
     with Progress(*columns, console=console) as bars:
         tasks: dict[str, TaskID] = {}
 
-        def advance(drive: str, stage: str, done: int, total: int) -> None:
+        def advance(drive: str, stage: str, finished: int, total: int) -> None:
             if stage in endings:
                 if drive in tasks:
                     bars.remove_task(tasks.pop(drive))
                 return
             if drive not in tasks:
                 tasks[drive] = bars.add_task(drive, total=total, stage=stage)
-            bars.update(tasks[drive], completed=done, total=total, stage="" if stage == "drives" else stage)
+            bars.update(
+                tasks[drive], completed=finished, total=total, stage="" if stage == "drives" else stage
+            )
 
         yield advance
 

@@ -142,8 +142,8 @@ def check_raster(raster: Any, path: Path, error: type[V2hdmError]) -> None:
 
 def png(pixels: np.ndarray) -> bytes:
     """The PNG file of an image, (H, W) or (H, W, 3) BGR uint8, quick rather than small."""
-    done, data = cv2.imencode(".png", pixels, _QUICK)
-    assert done
+    is_encoded, data = cv2.imencode(".png", pixels, _QUICK)
+    assert is_encoded
     return data.tobytes()
 
 

@@ -49,11 +49,11 @@ def well_known(markings: Sequence[Marking]) -> Sequence[Marking]:
     return better_known if 2 * len(better_known) > len(markings) else markings
 
 
-def objection_to(accuracy: str | None, asked: str) -> str | None:
+def objection_to(accuracy: str | None, least_accuracy: str) -> str | None:
     """Reason against a marking of that accuracy where ``asked`` is the worst allowed; None if unknown."""
-    if accuracy is None or ACCURACIES.index(accuracy) <= ACCURACIES.index(asked):
+    if accuracy is None or ACCURACIES.index(accuracy) <= ACCURACIES.index(least_accuracy):
         return None
-    return _LEFT_OUT.format(accuracy, asked)
+    return _LEFT_OUT.format(accuracy, least_accuracy)
 
 
 def corner_radii_m(covariance_m2: FloatArray) -> FloatArray:

@@ -47,10 +47,10 @@ def lane_graph(
     tied_lines = tied(graph, hd_map.markings)
     graph = replace(graph, stop_lines=tuple(tied_lines.stop_lines))
     graph = replace(graph, stated_rights=stated_rights(graph, answers))
-    asked = [*lines.asked, *graph.questions, *tied_lines.asked]
-    asked += questions_of(graph, bool(trajectories))
-    is_open = [not any(answer.closes(question) for answer in answers) for question in asked]
-    return replace(graph, questions=tuple(compress(asked, is_open)))
+    questions = [*lines.questions, *graph.questions, *tied_lines.questions]
+    questions += questions_of(graph, bool(trajectories))
+    is_open = [not any(answer.closes(question) for answer in answers) for question in questions]
+    return replace(graph, questions=tuple(compress(questions, is_open)))
 
 
 class Refusal(NamedTuple):
@@ -133,14 +133,14 @@ class _Builder:
         links = [
             Link(number, starts[end_of(lane)]) for number, lane in enumerate(closed) if end_of(lane) in starts
         ]
-        asked = [*directed_lanes.asked, *ways.asked]
+        questions = [*directed_lanes.questions, *ways.questions]
         for connection in painted:
             lane = self._along_line(connection, closed)
             pair = (connection.before, connection.after)
             drives = tuple(sorted(ways.followed.get(pair, ())))
             if self._has_drives and not drives and abs(turn_rad(lane.centre_map)) > TURN_RAD:
                 text = "a line leads around this corner, and no drive took it; may one turn there?"
-                asked.append(Question("connection", text, lane.centre_map[0], pair, lane.centre_map[-1]))
+                questions.append(Question("connection", text, lane.centre_map[0], pair, lane.centre_map[-1]))
                 continue
             direction = directed_lanes.direction[connection.before]
             self._add(lanes, links, replace(lane, direction=direction, drives=drives), pair)
@@ -158,7 +158,7 @@ class _Builder:
             if answer.subject == "speed":
                 lanes = [replace(lane, speed_kmh=answer.speed_kmh) for lane in lanes]
         result = joined(lanes, links)
-        return LaneGraph(tuple(result.lanes), tuple(links), tuple(result.junctions), (), tuple(asked))
+        return LaneGraph(tuple(result.lanes), tuple(links), tuple(result.junctions), (), tuple(questions))
 
     @staticmethod
     def _add(lanes: list[LaneOfGraph], links: list[Link], lane: LaneOfGraph, pair: tuple[int, int]) -> None:

@@ -20,12 +20,12 @@ _End = tuple[int, int, int, int]
 
 @dataclass(frozen=True)
 class DirectedLanes:
-    """Lanes in their directions, what says so, and the drives that passed each; ``asked`` are questions."""
+    """Lanes in their directions, what says so, and the drives that passed each; ``questions`` are open."""
 
     lanes: list[ClosedLane]
     direction: list[Direction]
     drives: list[tuple[int, ...]]
-    asked: list[Question] = field(default_factory=list)
+    questions: list[Question] = field(default_factory=list)
 
 
 def directed(
@@ -53,10 +53,10 @@ def directed(
     turned = {number: way.is_backward and not way.is_forward for number, way in driven_lanes.items()}
     turned |= _continued(lanes, lines_map, turned)
     driven = set(turned)
-    asked = []
+    unclear_lanes = []
     for number in range(len(lanes)):
         if number not in turned:  # lanes that continue each other are one question
-            asked.append(number)
+            unclear_lanes.append(number)
             turned[number] = False
             turned |= _continued(lanes, lines_map, turned)
     for number, (lane, way) in enumerate(zip(lanes, ways, strict=True)):
@@ -67,19 +67,19 @@ def directed(
         drives = way.backward_drives if turned[number] else way.forward_drives
         result.drives.append(tuple(sorted(drives)))
         place = shapes[number].centre[len(shapes[number].centre) // 2]
-        if number in asked:
+        if number in unclear_lanes:
             text = "no drive went along this lane; is it driven along this line, against it, or both ways?"
             to = shapes[number].centre[
                 min(len(shapes[number].centre) // 2 + 10, len(shapes[number].centre) - 1)
             ]
-            result.asked.append(Question("direction", text, place, (len(result.lanes) - 1,), to))
+            result.questions.append(Question("direction", text, place, (len(result.lanes) - 1,), to))
         if way.is_forward and way.is_backward:
             result.lanes.append(lane.turned)
             result.direction.append(says)
             result.drives.append(tuple(sorted(way.backward_drives)))
             numbers = (len(result.lanes) - 2, len(result.lanes) - 1)
             text = "drives went both ways along this lane; is it open both ways?"
-            result.asked.append(Question("two ways", text, place, numbers))
+            result.questions.append(Question("two ways", text, place, numbers))
     return result
 
 

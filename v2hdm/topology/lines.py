@@ -18,23 +18,23 @@ class UsableLines(NamedTuple):
     """Lines by their number in the map, (N, 3) m, empty for those that bound no lane; and questions."""
 
     xyz_map: list[FloatArray]
-    asked: list[Question]
+    questions: list[Question]
 
 
 def usable_lines(lanes: Sequence[Lane]) -> UsableLines:
-    """The lines of a map without those that cross themselves: nobody can say what lies beside these."""
+    """The lines of a map without those that cross themselves, whose sides are undefined."""
     lines = []
-    asked = []
+    questions = []
     for number, lane in enumerate(lanes):
         heights_m = np.zeros(len(lane.points_map)) if lane.heights_m is None else lane.heights_m
         xyz = np.column_stack([lane.points_map, heights_m])
         place = crosses_itself(lane.points_map)
         if place is not None:
             name = number + 1 if lane.id is None else lane.id
-            asked.append(Question("line", f"lane line {name} crosses itself; how does it run?", place))
+            questions.append(Question("line", f"lane line {name} crosses itself; how does it run?", place))
             xyz = np.empty((0, 3))
         lines.append(xyz)
-    return UsableLines(lines, asked)
+    return UsableLines(lines, questions)
 
 
 def crosses_itself(line: FloatArray) -> FloatArray | None:

@@ -17,14 +17,14 @@ _NEAR_M = 10.0  # distance from the lanes of a crossing within which a lane that
 
 def questions_of(graph: LaneGraph, has_drives: bool) -> list[Question]:
     """The open questions of a graph, whose crossings are known only if drives are."""
-    asked = []
+    questions = []
     for junction in graph.junctions:
         if junction.is_crossing and has_drives:
-            asked += [*_turns(graph, junction), *rights_asked(graph, junction)]
+            questions += [*_turns(graph, junction), *rights_asked(graph, junction)]
     if graph.lanes and all(lane.speed_kmh is None for lane in graph.lanes):
         place = graph.lanes[0].centre_map[0]
-        asked.append(Question("speed", "no speed limit is stated; how fast may one drive?", place))
-    return asked
+        questions.append(Question("speed", "no speed limit is stated; how fast may one drive?", place))
+    return questions
 
 
 def _turns(graph: LaneGraph, junction: Junction) -> Iterator[Question]:

@@ -22,13 +22,13 @@ class TiedLines(NamedTuple):
     """Stop lines with the lanes that they end, and questions."""
 
     stop_lines: list[StopLine]
-    asked: list[Question]
+    questions: list[Question]
 
 
 def tied(graph: LaneGraph, markings: Sequence[Marking]) -> TiedLines:
     """The stop lines among a map's markings, and questions for those that end no lane."""
     stop_lines = []
-    asked = []
+    questions = []
     centres = [lane.centre_map for lane in graph.lanes]
     for number, marking in enumerate(markings):
         if marking.kind != STOP_LINE:
@@ -36,7 +36,7 @@ def tied(graph: LaneGraph, markings: Sequence[Marking]) -> TiedLines:
         ended = tuple(sorted(set(_ended(graph, centres, marking.corners_map))))
         if not ended and graph.lanes:
             text = "this stop line ends no lane; which one does it belong to?"
-            asked.append(Question("stop line", text, marking.corners_map.mean(axis=0)))
+            questions.append(Question("stop line", text, marking.corners_map.mean(axis=0)))
         right = Right.GIVE_WAY if marking.variety == GIVE_WAY else Right.STOP
         stop_lines.append(StopLine(number, right, ended))
     held = {lane for stop in stop_lines for lane in stop.lanes}
@@ -44,7 +44,7 @@ def tied(graph: LaneGraph, markings: Sequence[Marking]) -> TiedLines:
         stop if stop.right is Right.STOP else replace(stop, yields_to=_yields_to(graph, centres, stop, held))
         for stop in stop_lines
     ]
-    return TiedLines(weighed, asked)
+    return TiedLines(weighed, questions)
 
 
 def _ended(graph: LaneGraph, centres: Sequence[FloatArray], corners_map: FloatArray) -> Iterator[int]:

@@ -44,7 +44,7 @@ class DrivenWays:
     ways: list[Way] = field(default_factory=list)
     cuts: list[Cut] = field(default_factory=list)
     followed: dict[tuple[int, int], set[int]] = field(default_factory=dict)  # drives along given links
-    asked: list[Question] = field(default_factory=list)
+    questions: list[Question] = field(default_factory=list)
 
 
 class _Place(NamedTuple):
@@ -116,7 +116,8 @@ class WayFinder:
         if gap_m > _LONGEST_M:
             text = f"a drive went {gap_m:.0f} m without lanes from this lane to another; is it a lane?"
             places = self._paths[before.path].points_map[[before.last, after.first]]
-            result.asked.append(Question("connection", text, places[0], (before.lane, after.lane), places[1]))
+            pair = (before.lane, after.lane)
+            result.questions.append(Question("connection", text, places[0], pair, places[1]))
             return
         left = self._end(self._departure(stays, before), result)
         entered = self._start(self._arrival(stays, after), result)

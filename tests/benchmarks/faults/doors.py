@@ -30,7 +30,7 @@ def small_drive(scratch: Path, cameras: Sequence[str] = ("front",), images: int 
     """A drive with so many images of each camera, rendered where it is not there yet."""
     rendered, folder = scratch / "rendered", scratch / f"drive-{'-'.join(cameras)}-{images}"
     if not (rendered / "drive.yaml").is_file():
-        render_drive(short_port(), rendered, HERE, lambda done, total: None)
+        render_drive(short_port(), rendered, HERE, lambda finished, total: None)
     if not (folder / "drive.yaml").is_file():
         shutil.rmtree(folder, ignore_errors=True)
         shutil.copytree(rendered, folder, ignore=shutil.ignore_patterns("front", "rear", "drive.yaml"))
@@ -92,16 +92,16 @@ class Doors:
         return _Given(self.mapped(), names)
 
     def _maps(self) -> Iterator[Situation]:
-        done = self.given("cache", "out/run")
+        files = self.given("cache", "out/run")
         arguments = map_arguments(self.drive, "all_maps=true", f"export=[{_FORMATS}]")
-        yield Situation(Case("map again, all files", "v2hdm map", arguments, done, ""))
+        yield Situation(Case("map again, all files", "v2hdm map", arguments, files, ""))
         yield Situation(
-            Case("map with a mosaic", "v2hdm map", (*map_arguments(self.drive), "mosaic=true"), done, "")
+            Case("map with a mosaic", "v2hdm map", (*map_arguments(self.drive), "mosaic=true"), files, "")
         )
         yield Situation(Case("map", "v2hdm map", map_arguments(self.drive), self.given(), ""))
         update = (*map_arguments(self.drive), "map.base=base/out/run", "name=update")
-        given = _Given(self.mapped(), ("cache", "out/run"), ("out/run", "base/out/run"))
-        yield Situation(Case("update", "v2hdm map", update, given, ""))
+        update_files = _Given(self.mapped(), ("cache", "out/run"), ("out/run", "base/out/run"))
+        yield Situation(Case("update", "v2hdm map", update, update_files, ""))
 
     def _of_drives(self) -> Iterator[Situation]:
         common = (str(self.drive), "--workers", "1", "--output", "out")
@@ -117,16 +117,16 @@ class Doors:
         )
 
     def _of_results(self) -> Iterator[Situation]:
-        done = self.given("out/run")
-        yield Situation(Case("mosaic", "v2hdm mosaic", ("out/run",), done, ""), grows=True)
-        yield Situation(Case("report", "v2hdm report", ("out/run",), done, ""), grows=True)
+        files = self.given("out/run")
+        yield Situation(Case("mosaic", "v2hdm mosaic", ("out/run",), files, ""), grows=True)
+        yield Situation(Case("report", "v2hdm report", ("out/run",), files, ""), grows=True)
         formats = [word for name in _FORMATS.split(",") for word in ("--format", name)]
-        given = ("out/run/map.geojson", *formats, "--output", "there")
-        yield Situation(Case("export", "v2hdm export", given, done, ""), grows=True)
+        words = ("out/run/map.geojson", *formats, "--output", "there")
+        yield Situation(Case("export", "v2hdm export", words, files, ""), grows=True)
         forms = ("camera_info", "static_transform", "urdf", "kalibr", "opencv")
         formats = [word for name in forms for word in ("--format", name)]
-        given = ("out/run/calibration_front.yaml", *formats, "--output", "there")
-        yield Situation(Case("export a calibration", "v2hdm export", given, done, ""), grows=True)
+        words = ("out/run/calibration_front.yaml", *formats, "--output", "there")
+        yield Situation(Case("export a calibration", "v2hdm export", words, files, ""), grows=True)
 
     def _of_files(self) -> Iterator[Situation]:
         detect = ("images", "--limit", "3", "--output", "found.jsonl", "--draw", "drawn")
@@ -141,8 +141,8 @@ class Doors:
             "views_per_render=2",
             "reservoir=4",
         )
-        rest = ("steps=2", "batch=2", "data.workers=0", "validation.images=1", "output=out", "device=cpu")
-        train = (*tiny, *(f"data.{one}" for one in data), *rest)
+        settings = ("steps=2", "batch=2", "data.workers=0", "validation.images=1", "output=out", "device=cpu")
+        train = (*tiny, *(f"data.{setting}" for setting in data), *settings)
         yield Situation(Case("train", "train.__main__", train, lambda root: None, ""), grows=True)
 
     def images(self, root: Path) -> None:
@@ -169,11 +169,11 @@ class _Given:
 def cache_defects(cache: Path) -> list[str]:
     """Defects of a cache after a run: damaged entries, and entries that were never finished."""
     items = items_of(cache)
-    known = {item.path for item in items}
+    listed_paths = {item.path for item in items}
     strange = [
         path.name
         for path in (cache / STAGES).rglob("*")
-        if path.is_file() and path not in known and IN_USE not in path.as_posix()
+        if path.is_file() and path not in listed_paths and IN_USE not in path.as_posix()
     ]
     left = [item.path.name for item in items if item.kind == LEFT]
     entries = [item.path for item in items if item.kind not in (DRIVES, LEFT)]

@@ -119,8 +119,8 @@ def _answer_all(
         events = waiting.poll(200)
         if events and events[0][1] & select.POLLIN:
             _answer(listener, below, failure, calls)
-        elif ended is None and (found := os.waitpid(process, os.WNOHANG))[0]:
-            ended = os.waitstatus_to_exitcode(found[1])
+        elif ended is None and (waited := os.waitpid(process, os.WNOHANG))[0]:
+            ended = os.waitstatus_to_exitcode(waited[1])
         if ended is not None and (not events or events[0][1] & select.POLLHUP):
             return ended
     os.killpg(process, signal.SIGKILL)
@@ -130,12 +130,12 @@ def _answer_all(
 
 
 def _answer(listener: int, below: str, failure: Failure | None, calls: list[str]) -> None:
-    asked = bytearray(_NOTIFICATION.size)
+    notification = bytearray(_NOTIFICATION.size)
     try:
-        fcntl.ioctl(listener, _RECEIVE, asked)
+        fcntl.ioctl(listener, _RECEIVE, notification)
     except FileNotFoundError:  # who asked was killed meanwhile
         return
-    key, process, _, number, _, _, *arguments = _NOTIFICATION.unpack(asked)
+    key, process, _, number, _, _, *arguments = _NOTIFICATION.unpack(notification)
     name, path = _NAMES[number], _written(process, number, arguments)
     error = 0
     if path is not None and path.startswith(below):
@@ -149,7 +149,7 @@ def _answer(listener: int, below: str, failure: Failure | None, calls: list[str]
         return
 
 
-_NAMES = {one[0]: name for kind in (_BY_DESCRIPTOR, _BY_PATH, _OPENING) for name, one in kind.items()}  # type: ignore[attr-defined]
+_NAMES = {call[0]: name for kind in (_BY_DESCRIPTOR, _BY_PATH, _OPENING) for name, call in kind.items()}  # type: ignore[attr-defined]
 
 
 def _written(process: int, number: int, arguments: list[int]) -> str | None:
@@ -174,12 +174,12 @@ def _written(process: int, number: int, arguments: list[int]) -> str | None:
 def _text(process: int, address: int) -> str:
     """The text that ends with a zero byte at an address of a process."""
     page = os.sysconf("SC_PAGESIZE")
-    found = b""
+    text = b""
     with Path(f"/proc/{process}/mem").open("rb", buffering=0) as memory:
-        while b"\0" not in found and len(found) < _LONGEST_NAME:
-            memory.seek(address + len(found))
-            found += memory.read(page - (address + len(found)) % page)
-    return os.fsdecode(found.split(b"\0", 1)[0])
+        while b"\0" not in text and len(text) < _LONGEST_NAME:
+            memory.seek(address + len(text))
+            text += memory.read(page - (address + len(text)) % page)
+    return os.fsdecode(text.split(b"\0", 1)[0])
 
 
 def _filtered() -> int:
@@ -200,7 +200,7 @@ def _program() -> bytes:
     """The kernel's filter: calls of the tables above are handed over, those that open only if to write."""
     load, equal, any_bit, give = 0x20, 0x15, 0x45, 0x06
     hand_over, allow = 0x7FC00000, 0x7FFF0000
-    plain = [one[0] for kind in (_BY_DESCRIPTOR, _BY_PATH) for one in kind.values()]  # type: ignore[attr-defined]
+    plain = [call[0] for kind in (_BY_DESCRIPTOR, _BY_PATH) for call in kind.values()]  # type: ignore[attr-defined]
     steps: list[tuple[int, int | str, int | str, int]] = [
         (load, 0, 0, 4),
         (equal, 0, "allow", _X86_64),

@@ -44,9 +44,9 @@ def damaged_images(order: Order) -> Iterator[Row]:
 
     def spoil(folder: Path) -> str:
         images = folder / "front" / "images"
-        there = images.resolve()
+        source = images.resolve()
         images.unlink()
-        shutil.copytree(there, images)
+        shutil.copytree(source, images)
         return damage(_any(order, sorted(images.iterdir())), order.rng)
 
     if re.search(order.only, "image of a drive"):
@@ -57,8 +57,10 @@ def faulty_frames(order: Order) -> Iterator[Row]:
     """Images that are frozen, exchanged, dropped, doubled or mixed up, and drop-outs of RTK."""
     good = order.doors.longer_drive
     clean = _mapped(order, good, lambda folder: None)
-    known = [one for one in camera_faults() if re.search("frozen|swapped|twice|off by one|missing", one.name)]
-    for fault in [*known, *frame_faults()]:
+    of_cameras = [
+        fault for fault in camera_faults() if re.search("frozen|swapped|twice|off by one|missing", fault.name)
+    ]
+    for fault in [*of_cameras, *frame_faults()]:
         if re.search(order.only, fault.name):
             yield _row(fault.name, _mapped(order, good, fault.spoil), clean)
 
@@ -68,16 +70,18 @@ def _maps(order: Order, name: str, spoil: Callable[[Path], str]) -> Iterator[Row
     clean = _mapped(order, good, lambda folder: None)
     for _ in range(order.each):
         how: list[str] = []
-        found = _mapped(order, good, lambda folder, how=how: how.append(spoil(folder)))
-        yield _row(f"{name}: {how[0]}", found, clean)
+        mapped = _mapped(order, good, lambda folder, how=how: how.append(spoil(folder)))
+        yield _row(f"{name}: {how[0]}", mapped, clean)
 
 
-def _row(name: str, found: Mapped, clean: Mapped) -> Row:
-    row = judge_map(name, Fault(name, None), found, clean)
-    crashed = found.status == "CRASHED"
+def _row(name: str, mapped: Mapped, clean: Mapped) -> Row:
+    row = judge_map(name, Fault(name, None), mapped, clean)
+    crashed = mapped.status == "CRASHED"
     end = "DEFECT" if row.silently_wrong or crashed else "right" if row.right else "told"
-    first = found.message or "; ".join(f"{one['check']}: {one['says']}" for one in found.findings[:1])
-    error = f"{100 * found.rmse_m:.1f} cm, {found.false} false of {found.markings}, {found.status}"
+    first = mapped.message or "; ".join(
+        f"{finding['check']}: {finding['says']}" for finding in mapped.findings[:1]
+    )
+    error = f"{100 * mapped.rmse_m:.1f} cm, {mapped.false} false of {mapped.markings}, {mapped.status}"
     return Row(name, end, f"{error}: {first}"[:300])
 
 
@@ -111,14 +115,14 @@ def damaged_networks(order: Order) -> Iterator[Row]:
 
 def damaged_caches(order: Order) -> Iterator[Row]:
     """Entries of the cache: they are made anew, and the map is the same to the byte."""
-    made = order.doors.given("cache")
-    case = Case("cache", "v2hdm map", map_arguments(order.doors.drive), made, "")
+    cached = order.doors.given("cache")
+    case = Case("cache", "v2hdm map", map_arguments(order.doors.drive), cached, "")
     yield from _told(order, Situation(case), "cache/stages/[!f]*/*.v2hdm", remade=True)
 
 
 def damaged_results(order: Order) -> Iterator[Row]:
     """Files of a result, before the same run again, and before the doors that read results."""
-    doors, done = order.doors, order.doors.given("out/run")
+    doors, files = order.doors, order.doors.given("out/run")
     again = Case("run again", "v2hdm map", map_arguments(doors.drive), doors.given("cache", "out/run"), "")
     yield from _told(order, Situation(again), "out/run/*")
     for situation in doors.all():
@@ -128,10 +132,10 @@ def damaged_results(order: Order) -> Iterator[Row]:
             yield from _told(order, situation, "out/run/*.[gjty][esua]*")
     for source, form in (("map.geojson", "csv"), ("calibration_front.yaml", "kalibr")):
         words = (f"out/run/{source}", "--format", form, "--output", "there")
-        case = Case(f"export {source}", "v2hdm export", words, done, "")
+        case = Case(f"export {source}", "v2hdm export", words, files, "")
         yield from _told(order, Situation(case, grows=True), f"out/run/{source}")
     words = ("out/run/calibration_front.yaml", "out/run")
-    compare = Case("compare calibrations", "v2hdm calibrate compare", words, done, "")
+    compare = Case("compare calibrations", "v2hdm calibrate compare", words, files, "")
     yield from _told(order, Situation(compare), "out/run/calibration_front.yaml")
 
 

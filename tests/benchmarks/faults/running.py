@@ -51,11 +51,11 @@ def in_fork(work: Callable[[], Any]) -> Any:
             os._exit(0)
     theirs.close()
     try:
-        found = ours.recv()
+        answer = ours.recv()
     except EOFError:
-        found = None
+        answer = None
     os.waitpid(process, 0)
-    return found
+    return answer
 
 
 @contextmanager

@@ -65,17 +65,17 @@ class Expected:
     def defects(self, situation: Situation, outcome: Outcome, again: Outcome | None = None) -> list[str]:
         """Defects of an outcome on a disk that fails, and of ``again`` on one that does not any more."""
         if outcome.code != 2:
-            found = self._wrong(situation, outcome, "is")
+            defects = self._wrong(situation, outcome, "is")
         else:
             before, after = _without(situation, outcome.before), _without(situation, outcome.after)
-            made = {
+            new_files = {
                 name for name, digest in after.items() if situation.grows and self._is_whole(name, digest)
             }
-            before = {name: one for name, one in before.items() if name not in made}
-            leaves = "|".join(f"^{re.escape(name)}$" for name in made) or r"(?!)"
-            told = replace(situation.case, says=r"\S", code=2, leaves=leaves)
-            found = replace(outcome, before=before, after=after).faults(told)
-        return found + ([] if again is None else self._wrong(situation, again, "is afterwards"))
+            before = {name: content for name, content in before.items() if name not in new_files}
+            leaves = "|".join(f"^{re.escape(name)}$" for name in new_files) or r"(?!)"
+            case = replace(situation.case, says=r"\S", code=2, leaves=leaves)
+            defects = replace(outcome, before=before, after=after).faults(case)
+        return defects + ([] if again is None else self._wrong(situation, again, "is afterwards"))
 
     def _is_whole(self, name: str, digest: str) -> bool:
         """Whether a file is there as it must be in the end."""
@@ -83,27 +83,27 @@ class Expected:
 
     def _wrong(self, situation: Situation, outcome: Outcome, when: str) -> list[str]:
         """Whether what there is, is what there must be."""
-        found = [] if outcome.code == self.code else [f"exit code {when} {outcome.code}, not {self.code}"]
+        defects = [] if outcome.code == self.code else [f"exit code {when} {outcome.code}, not {self.code}"]
         if "Traceback" in outcome.error:
-            found.append(f"a traceback {when} there")
-        there = _without(situation, outcome.after)
+            defects.append(f"a traceback {when} there")
+        files = _without(situation, outcome.after)
         # Of a file that a damaged list no longer names the door says under which name it keeps it.
         said = outcome.error + outcome.output
-        kept = {name for name in there if ".kept." in name and Path(name).name in said}
+        backups = {name for name in files if ".kept." in name and Path(name).name in said}
         changed = [
             name
-            for name in (self.files.keys() | there.keys()) - kept
-            if name not in there or not self._is_whole(name, there[name])
+            for name in (self.files.keys() | files.keys()) - backups
+            if name not in files or not self._is_whole(name, files[name])
         ]
-        return [*found, *([f"{when} wrong or missing: {sorted(changed)[:4]}"] if changed else [])]
+        return [*defects, *([f"{when} wrong or missing: {sorted(changed)[:4]}"] if changed else [])]
 
 
 def _without(situation: Situation, state: dict[str, str]) -> dict[str, str]:
     """A state without the cache; where files come one by one without their list, too."""
     cache = f"{HERE}{situation.cache}"
     return {
-        name: one
-        for name, one in state.items()
+        name: content
+        for name, content in state.items()
         if name != cache
         and not name.startswith(f"{cache}/")
         and not (situation.grows and name.rpartition("/")[2].startswith((LIST, "events.out.")))

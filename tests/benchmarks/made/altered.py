@@ -36,7 +36,7 @@ class Alteration:
 @contextmanager
 def altered(count: int, seed: int) -> Iterator[list[Alteration]]:
     """Within, ports of this process have so many markings moved, removed and added; these are listed."""
-    made: list[Alteration] = []
+    alterations: list[Alteration] = []
 
     def repainted(paint: PaintConfig, route: Route, rng: np.random.Generator) -> Layout:
         layout, again = build_layout(paint, route, rng), np.random.default_rng([seed, _STREAM])
@@ -47,11 +47,11 @@ def altered(count: int, seed: int) -> Iterator[list[Alteration]]:
             anew.remove()
         for _ in range(count):
             anew.add(_DIAMOND * (paint.diamond_length_m, paint.diamond_width_m))
-        made[:] = anew.done
+        alterations[:] = anew.done
         return _painted(layout, anew.done, again)
 
     with patch("v2hdm.simulate.port.build.build_layout", repainted):
-        yield made
+        yield alterations
 
 
 @dataclass
@@ -80,7 +80,7 @@ class _Alterer:
         for _ in range(_TRIES):
             before = self._any(DIAMOND, LANE_DASH)
             if before is not None:
-                kind = next(one.kind for one in self.layout.markings if one.corners_map is before)
+                kind = next(marking.kind for marking in self.layout.markings if marking.corners_map is before)
                 self.done.append(Alteration(kind, before, None))
                 return
 
@@ -97,27 +97,34 @@ class _Alterer:
 
     def _any(self, *kinds: str) -> FloatArray | None:
         """Corners of a marking drawn at random; None where it is off the route or near an altered one."""
-        own = [one.corners_map for one in self.layout.markings if one.kind in kinds]
-        corners = own[int(self.rng.integers(len(own)))]
+        of_kinds = [marking.corners_map for marking in self.layout.markings if marking.kind in kinds]
+        corners = of_kinds[int(self.rng.integers(len(of_kinds)))]
         beside = float(self.route.distance_to(corners.mean(axis=0)[None])[0]) <= _BESIDE_ROUTE_M
         return corners if beside and self._is_apart(corners) else None
 
     def _is_apart(self, corners: FloatArray) -> bool:
         centre = corners.mean(axis=0)
-        others = [one for each in self.done for one in (each.before, each.after) if one is not None]
+        others = [
+            outline
+            for alteration in self.done
+            for outline in (alteration.before, alteration.after)
+            if outline is not None
+        ]
         return all(np.linalg.norm(centre - other.mean(axis=0)) > _CLEAR_M for other in others)
 
     def _is_clear(self, corners: FloatArray, itself: FloatArray | None) -> bool:
         """Whether new paint keeps clear of all other."""
         centre = corners.mean(axis=0)
-        others = [one.polygon_map for one in self.layout.paints if one.polygon_map is not itself]
+        others = [paint.polygon_map for paint in self.layout.paints if paint.polygon_map is not itself]
         lines = [lane.points_map for lane in self.layout.lanes]
         nearest = min(float(np.linalg.norm(points - centre, axis=1).min()) for points in [*others, *lines])
         return nearest > _FREE_M - (0.0 if itself is None else 0.3)
 
 
-def _painted(layout: Layout, done: list[Alteration], rng: np.random.Generator) -> Layout:
-    now = {id(one.before): one.after for one in done if one.before is not None}
+def _painted(layout: Layout, alterations: list[Alteration], rng: np.random.Generator) -> Layout:
+    now = {
+        id(alteration.before): alteration.after for alteration in alterations if alteration.before is not None
+    }
     paints, markings = [], []
     for paint in layout.paints:
         if (polygon := now.get(id(paint.polygon_map), paint.polygon_map)) is not None:
@@ -126,9 +133,9 @@ def _painted(layout: Layout, done: list[Alteration], rng: np.random.Generator) -
         if (corners := now.get(id(marking.corners_map), marking.corners_map)) is not None:
             markings.append(replace(marking, corners_map=corners))
     like = next((paint for paint in layout.paints if paint.kind == DIAMOND), None)
-    for one in done:
-        if one.before is None and one.after is not None and like is not None:
+    for alteration in alterations:
+        if alteration.before is None and alteration.after is not None and like is not None:
             seed = int(rng.integers(1 << 30))
-            paints.append(replace(like, polygon_map=one.after, wear=0.05, dirt=0.05, seed=seed))
-            markings.append(Marking(DIAMOND, one.after, 0))
+            paints.append(replace(like, polygon_map=alteration.after, wear=0.05, dirt=0.05, seed=seed))
+            markings.append(Marking(DIAMOND, alteration.after, 0))
     return Layout(paints, markings, layout.lanes, layout.occupied_map)

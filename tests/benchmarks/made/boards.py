@@ -64,11 +64,11 @@ def make_short(recipe: Recipe) -> ShortDrive:
     cameras = {CAMERA: replace(world.cameras[CAMERA], ground_plane=None)}
     drive = replace(whole, images=tuple(images), cameras=cameras, unposed={CAMERA: 0})
     drive = replace(drive, cameras={CAMERA: _measured(world, drive.cameras[CAMERA])})
-    found, visibility = detect(world, drive)
+    detections, visibility = detect(world, drive)
     boards_map = _boards(world)
     with_boards = [
         replace(in_image, markings=(*in_image.markings, *_seen(world, drive, in_image, boards_map)))
-        for in_image in found
+        for in_image in detections
     ]
     return ShortDrive(drive, with_boards, truth_of(world, drive, visibility))
 
@@ -120,13 +120,13 @@ def _seen(
     lens = world.lenses[CAMERA]
     rng = np.random.default_rng([world.recipe.seed, _BOARDS, frame])
     pose = world.cam_from_vehicle[CAMERA][frame] @ np.linalg.inv(world.map_from_vehicle[frame])
-    seen = project(lens, pose, boards_map)
+    projected = project(lens, pose, boards_map)
     sigma_px = 2 * world.recipe.detector.sigma_px
     covariance = np.tile(sigma_px**2 * np.eye(2), (4, 1, 1))
-    near, far = _SEEN_M
+    nearest_m, far = _SEEN_M
     out = []
-    for px, is_inside, distance_m in zip(seen.px, seen.inside, seen.distance_m, strict=True):
-        if is_inside.all() and near < distance_m.min() and distance_m.max() < far:
+    for px, is_inside, distance_m in zip(projected.px, projected.inside, projected.distance_m, strict=True):
+        if is_inside.all() and nearest_m < distance_m.min() and distance_m.max() < far:
             noisy_px = px + rng.normal(0.0, sigma_px, (4, 2))
             out.append(_detection(LANE_DASH, noisy_px, covariance, is_inside, lens))
     return out

@@ -31,9 +31,9 @@ def make_boxes(recipe: Recipe) -> World:
     station_m, right = station_m.reshape(-1, 4), left_m.reshape(-1, 4).mean(axis=1) < 0
     boxes = []
     for dash in np.flatnonzero(right)[1::_PERIOD]:
-        near, far = dashes[dash][np.argsort(station_m[dash])].reshape(2, 2, 2).mean(axis=1)
-        along = (far - near) / np.linalg.norm(far - near)
-        centre = near + (1 - _HIDDEN) * (far - near) + _BOX_M[0] / 2 * along
+        near_end, far = dashes[dash][np.argsort(station_m[dash])].reshape(2, 2, 2).mean(axis=1)
+        along = (far - near_end) / np.linalg.norm(far - near_end)
+        centre = near_end + (1 - _HIDDEN) * (far - near_end) + _BOX_M[0] / 2 * along
         centre = centre + (_BOX_M[1] / 2 - _INWARDS_M) * np.array([along[1], -along[0]])
         yaw = float(np.arctan2(along[1], along[0]))
         boxes.append(Box(centre_map=(centre[0], centre[1]), size_m=_BOX_M, yaw_rad=yaw))
@@ -42,40 +42,44 @@ def make_boxes(recipe: Recipe) -> World:
     return replace(world, port=replace(world.port, renderer=replace(renderer, scene=scene)))
 
 
-def detect_pieces(world: World, drive: Drive, known: float = 0.0) -> tuple[list[ImageDetections], FloatArray]:
+def detect_pieces(
+    world: World, drive: Drive, share_known: float = 0.0
+) -> tuple[list[ImageDetections], FloatArray]:
     """The detections of :func:`detect`, and of pieces; the share of each marking shown.
 
     A piece is the largest part in view between parallels to a marking's sides. Of a share of the images,
     ``known``, it is known where these sides are hidden; in the others its corners look like any.
     """
-    found, visibility = detect(world, drive)
+    detections, visibility = detect(world, drive)
     out, errors, corners = [], world.recipe.detector, world.corners_map
     s, t = np.meshgrid(*2 * [np.linspace(0.0, 1.0, _CELLS + 1)], indexing="ij")
     points = Quad(corners).at(s.ravel(), t.ravel())
-    for one in found:
-        image = drive.images[one.image]
+    for in_image in detections:
+        image = drive.images[in_image.image]
         frame, lens = world.frame_of(image), world.lenses[image.camera]
         rng = np.random.default_rng([world.recipe.seed, _PIECES, len(image.camera), frame])
         pose = world.cam_from_vehicle[image.camera][frame] @ np.linalg.inv(world.map_from_vehicle[frame])
-        seen = project(lens, pose, corners)
-        near = np.flatnonzero((seen.distance_m.max(axis=1) < _RANGE_M) & seen.inside.all(axis=1))
+        projected = project(lens, pose, corners)
+        markings = np.flatnonzero(
+            (projected.distance_m.max(axis=1) < _RANGE_M) & projected.inside.all(axis=1)
+        )
         pieces = []
-        if len(near):
-            near = near[_covered(world, frame, camera_centre(pose), corners[near]).any(axis=1)]
-        hidden = _covered(world, frame, camera_centre(pose), points[near])
-        for j, of_marking in zip(near.tolist(), hidden, strict=True):
+        if len(markings):
+            markings = markings[_covered(world, frame, camera_centre(pose), corners[markings]).any(axis=1)]
+        hidden = _covered(world, frame, camera_centre(pose), points[markings])
+        for j, of_marking in zip(markings.tolist(), hidden, strict=True):
             piece, share = largest(~of_marking.reshape(s.shape))
             if share < _LEAST or rng.random() < errors.missed:
                 continue
-            seen = project(lens, pose, points[j].reshape(*s.shape, 3)[tuple(piece.T)][None])
-            sigma = errors.sigma_px * (1 + (seen.distance_m[0] / errors.doubled_at_m) ** 2)
-            px = seen.px[0] + rng.standard_normal((4, 2)) * sigma[:, None]
+            projected = project(lens, pose, points[j].reshape(*s.shape, 3)[tuple(piece.T)][None])
+            sigma = errors.sigma_px * (1 + (projected.distance_m[0] / errors.doubled_at_m) ** 2)
+            px = projected.px[0] + rng.standard_normal((4, 2)) * sigma[:, None]
             covariance = errors.stated_factor * sigma[:, None, None] ** 2 * np.eye(2)
-            if rng.random() < known:
+            if rng.random() < share_known:
                 covariance += _hidden(px, piece)
             kind = world.port.hd_map.markings[j].kind
-            pieces.append(_detection(kind, px, covariance, seen.inside[0], lens))
-        out.append(replace(one, markings=(*one.markings, *pieces)))
+            pieces.append(_detection(kind, px, covariance, projected.inside[0], lens))
+        out.append(replace(in_image, markings=(*in_image.markings, *pieces)))
     return out, visibility
 
 

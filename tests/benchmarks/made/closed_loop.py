@@ -235,8 +235,8 @@ def lap(
 
 def room_m(site: Site, van: Van) -> float:
     """The way from a van's outline to the paint of the nearest border, m; negative where it touches one."""
-    near = site.borders.data[site.borders.query_ball_point(van.place_map, _NEAR_M)]
-    return clearance_m(van, near) - site.half_width_m
+    borders = site.borders.data[site.borders.query_ball_point(van.place_map, _NEAR_M)]
+    return clearance_m(van, borders) - site.half_width_m
 
 
 def _row(site: Site, van: Van, located: FloatArray, about_m: float) -> list[float]:

@@ -48,7 +48,7 @@ class Projected:
 
 def detect(world: World, drive: Drive) -> tuple[list[ImageDetections], FloatArray]:
     """The detections in every image of a drive, and the share (I, J) of each marking that it shows."""
-    names, found = sorted(world.cameras), []
+    names, detections = sorted(world.cameras), []
     visibility = np.zeros((len(drive.images), len(world.corners_map)))
     for i, image in enumerate(drive.images):
         frame = world.frame_of(image)
@@ -59,8 +59,8 @@ def detect(world: World, drive: Drive) -> tuple[list[ImageDetections], FloatArra
         markings, shown = _in_image(source, image.camera, frame, rng)
         if source is world:
             visibility[i] = shown
-        found.append(ImageDetections(i, tuple(markings), ()))
-    return found, visibility
+        detections.append(ImageDetections(i, tuple(markings), ()))
+    return detections, visibility
 
 
 def _in_image(
@@ -71,46 +71,48 @@ def _in_image(
     cam_from_map = world.cam_from_vehicle[camera][frame] @ np.linalg.inv(world.map_from_vehicle[frame])
     lens = world.lenses[camera]
     pose = partial(world.cam_from_map, camera, frame) if world.read_out_s else cam_from_map
-    seen = project(lens, pose, corners)
-    candidates = (seen.distance_m.max(axis=1) < _RANGE_M) & (seen.inside.sum(axis=1) >= 2)
-    covered = np.zeros_like(seen.inside)
+    projected = project(lens, pose, corners)
+    candidates = (projected.distance_m.max(axis=1) < _RANGE_M) & (projected.inside.sum(axis=1) >= 2)
+    covered = np.zeros_like(projected.inside)
     covered[candidates] = _covered(world, frame, camera_centre(cam_from_map), corners[candidates])
-    shown = (seen.inside & ~covered).mean(axis=1)
+    shown = (projected.inside & ~covered).mean(axis=1)
     # All is drawn for all markings, so that a fault which hides some leaves the errors of the others alone.
     count = len(corners)
     light = np.exp(rng.normal(0.0, errors.sigma_spread))
     spread = np.exp(rng.normal(0.0, errors.sigma_spread, (count, 4)))
-    sigma = errors.sigma_px * light * spread * (1 + (seen.distance_m / errors.doubled_at_m) ** 2)
+    sigma = errors.sigma_px * light * spread * (1 + (projected.distance_m / errors.doubled_at_m) ** 2)
     off = rng.standard_normal((count, 4, 2)) * sigma[..., None]
     missed, cut = rng.random(count) < errors.missed, rng.random(count) < errors.cut
-    found = []
+    markings = []
     for j in np.flatnonzero(candidates & ~covered.any(axis=1) & ~missed):
-        px, covariance = seen.px[j] + off[j], np.zeros((4, 2, 2))
+        px, covariance = projected.px[j] + off[j], np.zeros((4, 2, 2))
         covariance[:] = np.square(sigma[j])[:, None, None] * np.eye(2)
-        for k in np.flatnonzero(~seen.inside[j]):
-            px[k], covariance[k] = _at_border(lens, pose, corners[j], seen, j, k, sigma[j, k])
+        for k in np.flatnonzero(~projected.inside[j]):
+            px[k], covariance[k] = _at_border(lens, pose, corners[j], projected, j, k, sigma[j, k])
             px[k] += rng.multivariate_normal(np.zeros(2), np.square(sigma[j, k]) * np.eye(2))
         if cut[j]:
             px = _cut(px, float(rng.uniform(0.2, 0.6)))
         covariance *= errors.stated_factor
         kind = world.port.hd_map.markings[j].kind
-        found.append(_detection(kind, px, covariance, seen.inside[j], lens))
-    for _ in range(rng.poisson(errors.false * len(found))):
+        markings.append(_detection(kind, px, covariance, projected.inside[j], lens))
+    for _ in range(rng.poisson(errors.false * len(markings))):
         false = _false(world, camera, frame, pose, rng)
         if false is not None:
-            found.append(false)
-    return found, shown
+            markings.append(false)
+    return markings, shown
 
 
 def _covered(world: World, frame: int, centre_map: FloatArray, corners_map: FloatArray) -> BoolArray:
     """Which points (J, K, 3) a stack, a truck or a barrier hides from a camera."""
-    near = [
+    close_boxes = [
         box
         for box in world.port.renderer.scene.boxes + world.port.moving_boxes(frame)
         if np.hypot(*(np.array(box.centre_map) - centre_map[:2])) < _RANGE_M + np.hypot(*box.size_m[:2])
         and box.base_m < centre_map[2]
     ]
-    return hidden_by(near, centre_map, corners_map[..., :2].reshape(-1, 2)).reshape(corners_map.shape[:2])
+    return hidden_by(close_boxes, centre_map, corners_map[..., :2].reshape(-1, 2)).reshape(
+        corners_map.shape[:2]
+    )
 
 
 Pose = FloatArray | Callable[[FloatArray], FloatArray]
@@ -122,12 +124,12 @@ def project(lens: CameraInfo, cam_from_map: Pose, points_map: FloatArray) -> Pro
     if not callable(cam_from_map):
         return _project(lens, cam_from_map, points_map)
     row_share = np.zeros(points_map.shape[0] * points_map.shape[1])
-    seen = _project(lens, cam_from_map(row_share), points_map)
+    projected = _project(lens, cam_from_map(row_share), points_map)
     for _ in range(_TURNS):
-        known = np.isfinite(seen.px[..., 1].ravel())
-        row_share[known] = row_shares(lens, seen.px.reshape(-1, 2)[known])
-        seen = _project(lens, cam_from_map(row_share), points_map)
-    return seen
+        is_finite = np.isfinite(projected.px[..., 1].ravel())
+        row_share[is_finite] = row_shares(lens, projected.px.reshape(-1, 2)[is_finite])
+        projected = _project(lens, cam_from_map(row_share), points_map)
+    return projected
 
 
 def _project(lens: CameraInfo, cam_from_map: FloatArray, points_map: FloatArray) -> Projected:
@@ -153,15 +155,15 @@ def _at_border(
     lens: CameraInfo,
     cam_from_map: Pose,
     corners: FloatArray,
-    seen: Projected,
+    projected: Projected,
     j: int,
     k: int,
     sigma_px: float,
 ) -> tuple[FloatArray, FloatArray]:
     """Where a side leaves the image on its way to a corner outside, and the covariance of that corner."""
-    beside = [n for n in ((k + 1) % 4, (k - 1) % 4) if seen.inside[j, n]]
+    beside = [n for n in ((k + 1) % 4, (k - 1) % 4) if projected.inside[j, n]]
     if not beside:
-        corner = seen.px[j, seen.inside[j]].mean(axis=0)
+        corner = projected.px[j, projected.inside[j]].mean(axis=0)
         return corner, _HIDDEN_PX**2 * np.eye(2)
     start, end = corners[beside[0]], corners[k]
     low, high = 0.0, 1.0
@@ -211,11 +213,11 @@ def _false(
     quad = 0.5 * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * (length_m, width_m)
     quad = quad @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]) + spot
     points = apply(world.map_from_vehicle[frame], np.column_stack([quad, np.zeros(4)]))
-    seen = project(world.lenses[camera], cam_from_map, points[None])
-    if not seen.inside.all():
+    projected = project(world.lenses[camera], cam_from_map, points[None])
+    if not projected.inside.all():
         return None
     kind = str(rng.choice([DIAMOND, LANE_DASH, STOP_LINE]))
     sigma = 2.0 * world.recipe.detector.sigma_px
-    px = seen.px[0] + rng.normal(0.0, sigma, (4, 2))
+    px = projected.px[0] + rng.normal(0.0, sigma, (4, 2))
     covariance = np.tile(sigma**2 * np.eye(2), (4, 1, 1))
-    return _detection(kind, px, covariance, seen.inside[0], world.lenses[camera])
+    return _detection(kind, px, covariance, projected.inside[0], world.lenses[camera])

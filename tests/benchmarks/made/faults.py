@@ -91,8 +91,8 @@ def _counted(world: World) -> World:
     """Stamps are counted from the first at the mean rate, which varied with the vehicle's speed."""
 
     def change(stamp_s: FloatArray) -> FloatArray:
-        counted_s, taken = stamp_s.copy(), np.flatnonzero(np.isfinite(stamp_s))
-        counted_s[taken] = np.linspace(*stamp_s[taken[[0, -1]]], len(taken))
+        counted_s, frames = stamp_s.copy(), np.flatnonzero(np.isfinite(stamp_s))
+        counted_s[frames] = np.linspace(*stamp_s[frames[[0, -1]]], len(frames))
         return counted_s
 
     return _with_stamps(world, change)
@@ -102,11 +102,11 @@ def _knocked(camera: str, roll_pitch_yaw_deg: tuple[float, float, float], world:
     """A camera is turned about the vehicle's axes, around its own centre, halfway."""
     angles = (np.array([np.deg2rad(angle)]) for angle in roll_pitch_yaw_deg)
     turn = rotation_from_euler(*angles)[0]
-    own = world.cam_from_vehicle[camera].copy()
-    centre = np.linalg.inv(own[0])[:3, 3]
-    turned = own[0, :3, :3] @ turn.T
-    own[world.second_half, :3, :3], own[world.second_half, :3, 3] = turned, -turned @ centre
-    return replace(world, cam_from_vehicle={**world.cam_from_vehicle, camera: own})
+    of_camera = world.cam_from_vehicle[camera].copy()
+    centre = np.linalg.inv(of_camera[0])[:3, 3]
+    turned = of_camera[0, :3, :3] @ turn.T
+    of_camera[world.second_half, :3, :3], of_camera[world.second_half, :3, 3] = turned, -turned @ centre
+    return replace(world, cam_from_vehicle={**world.cam_from_vehicle, camera: of_camera})
 
 
 def _loaded(pitch_deg: float, world: World) -> World:
@@ -222,8 +222,8 @@ _KNOCK = r"\bknock|\bmounting"
 _LEVER = r"antenna|lever|survey|\bcentre"
 
 SPOILS: Mapping[str, Spoil] = {
-    one.name: one
-    for one in (
+    fault.name: fault
+    for fault in (
         Spoil("position step", r"\bsteps?\b|jump|\bfix\b", partial(_step, 0.06)),
         Spoil("fast clock", _CLOCK, partial(_fast_clock, 0.005), _CLOCK),
         Spoil("clock jitter", _JITTER, partial(_jitter, 0.02)),

@@ -77,8 +77,8 @@ def surveyed(true: HDMap, heights_m: FloatArray, seed: int) -> HDMap:
     shared = (_DRIFT_M**2 + _RELATIVE_M**2) * np.tile(np.eye(2), (4, 4)) + _CORNER_M**2 * np.eye(8)
     relative_m = float(np.hypot(_RELATIVE_M, _CORNER_M / 2))
     markings = tuple(
-        Marking(own.kind, corners[j], 20, shared, relative_m, heights_m[j], id=j + 1)
-        for j, own in enumerate(true.markings)
+        Marking(marking.kind, corners[j], 20, shared, relative_m, heights_m[j], id=j + 1)
+        for j, marking in enumerate(true.markings)
     )
     lanes = _mapped_lanes(true, centres, drift, seed)
     return HDMap(markings, lanes, true.origin, drift_over_m=_DRIFT_OVER_M)
@@ -127,10 +127,10 @@ def moved(hd_map: HDMap, share: float, by_m: float, seed: int) -> HDMap:
     """The map of a day before a share of the markings was repainted elsewhere."""
     rng = np.random.default_rng([seed, _MOVED])
     markings = []
-    for own in hd_map.markings:
+    for marking in hd_map.markings:
         angle = rng.uniform(0, 2 * np.pi)
         off = by_m * np.array([np.cos(angle), np.sin(angle)]) * (rng.random() < share)
-        markings.append(replace(own, corners_map=own.corners_map + off))
+        markings.append(replace(marking, corners_map=marking.corners_map + off))
     return replace(hd_map, markings=tuple(markings))
 
 
@@ -164,7 +164,8 @@ def drive(recipe: Recipe, seed: int, seconds: float, begin_m: float = 3.0) -> Li
         taken_s=stamp_s[frames],
         map_from_vehicle=poses[frames],
         cam_from_vehicle={
-            name: np.tile(own, (len(frames), 1, 1)) for name, own in world.port.cam_from_vehicle.items()
+            name: np.tile(cam_from_vehicle, (len(frames), 1, 1))
+            for name, cam_from_vehicle in world.port.cam_from_vehicle.items()
         },
     )
     hd_map = surveyed(world.port.hd_map, world.corners_map[..., 2], seed)

@@ -76,16 +76,16 @@ def make_queue(recipe: Recipe) -> World:
     true = _driven(
         recipe, world.port, Ground.of(recipe, world.port), np.concatenate([taken_s, poses_there_s])
     )
-    own = {name: value for name, value in vars(world.port).items() if name != "driven"}
+    fields = {name: value for name, value in vars(world.port).items() if name != "driven"}
     driven = replace(world.port.driven, stamp_s=taken_s, map_from_vehicle=true[: len(taken_s)])
     recorded = _recorded(recipe, world.port, poses_there_s, true[len(taken_s) :])
     return replace(
         world,
-        port=Behind(**own, driven=driven, lorry_m=lorry_m),
+        port=Behind(**fields, driven=driven, lorry_m=lorry_m),
         taken_s=taken_s,
         map_from_vehicle=true[: len(taken_s)],
         cam_from_vehicle={
-            name: np.tile(each[0], (len(taken_s), 1, 1)) for name, each in world.cam_from_vehicle.items()
+            name: np.tile(poses[0], (len(taken_s), 1, 1)) for name, poses in world.cam_from_vehicle.items()
         },
         stamp_s=dict.fromkeys(world.cameras, stamp_s),
         recorded=Trajectory(poses_s, recorded),
@@ -114,23 +114,24 @@ def _schedule(
 
 def detect_queue(world: World, drive: Drive) -> tuple[list[ImageDetections], FloatArray]:
     """The detections of :func:`detect`, and those on the lorry's rear; the share of each marking shown."""
-    found, visibility = detect(world, drive)
+    detections, visibility = detect(world, drive)
     out, errors = [], world.recipe.detector
-    for one in found:
-        image = drive.images[one.image]
+    for in_image in detections:
+        image = drive.images[in_image.image]
         frame, lens = world.frame_of(image), world.lenses[image.camera]
         rng = np.random.default_rng([world.recipe.seed, _SIGHTINGS, len(image.camera), frame])
         pose = world.cam_from_vehicle[image.camera][frame] @ np.linalg.inv(world.map_from_vehicle[frame])
-        seen = project(lens, pose, rear_map(world, frame))
-        sigma = errors.sigma_px * (1 + (seen.distance_m / errors.doubled_at_m) ** 2)
-        px = seen.px + rng.standard_normal(seen.px.shape) * sigma[..., None]
+        projected = project(lens, pose, rear_map(world, frame))
+        sigma = errors.sigma_px * (1 + (projected.distance_m / errors.doubled_at_m) ** 2)
+        px = projected.px + rng.standard_normal(projected.px.shape) * sigma[..., None]
         missed = rng.random(len(px)) < errors.missed
         covariance = errors.stated_factor * sigma[..., None, None] ** 2 * np.eye(2)
-        shown = seen.inside.all(axis=1) & (seen.distance_m.max(axis=1) < _RANGE_M) & ~missed
+        shown = projected.inside.all(axis=1) & (projected.distance_m.max(axis=1) < _RANGE_M) & ~missed
         on_rear = [
-            _detection(REAR[j][0], px[j], covariance[j], seen.inside[j], lens) for j in np.flatnonzero(shown)
+            _detection(REAR[j][0], px[j], covariance[j], projected.inside[j], lens)
+            for j in np.flatnonzero(shown)
         ]
-        out.append(replace(one, markings=(*one.markings, *on_rear)))
+        out.append(replace(in_image, markings=(*in_image.markings, *on_rear)))
     return out, visibility
 
 

@@ -90,7 +90,9 @@ class World:
 
     def rolling(self, read_out_s: float, stated: bool) -> World:
         """The same, recorded by rolling shutters, of which the user knows or not."""
-        cameras = {name: replace(one, read_out_s=read_out_s * stated) for name, one in self.cameras.items()}
+        cameras = {
+            name: replace(camera, read_out_s=read_out_s * stated) for name, camera in self.cameras.items()
+        }
         return replace(self, read_out_s=read_out_s, cameras=cameras)
 
     def cam_from_map(self, camera: str, frame: int, row_share: FloatArray) -> FloatArray:
@@ -175,7 +177,9 @@ class Ground:
 
     def height_at(self, station_m: FloatArray, left_m: FloatArray) -> FloatArray:
         """Height (K,) at stations, ``left_m`` (K,) to the left of the route."""
-        height, fall = (np.interp(station_m, self.station_m, own) for own in (self.height_m, self.fall))
+        height, fall = (
+            np.interp(station_m, self.station_m, profile) for profile in (self.height_m, self.fall)
+        )
         return np.asarray(height + fall * left_m)
 
 
@@ -262,12 +266,12 @@ def drive_of(world: World) -> Drive:
     root, images, unposed = Path(world.recipe.name.replace(" ", "_")), [], {}
     for name in world.cameras:
         stamp_s = world.stamp_s[name]
-        taken = np.flatnonzero(np.isfinite(stamp_s))
-        poses, inside = interpolate(laid.trajectory, stamp_s[taken], MAX_GAP_S)
+        frames = np.flatnonzero(np.isfinite(stamp_s))
+        poses, inside = interpolate(laid.trajectory, stamp_s[frames], MAX_GAP_S)
         unposed[name] = int((~inside).sum())
         images += [
             Image(name, float(stamp_s[frame]), root / name / f"{frame:06d}.jpg", pose)
-            for frame, pose in zip(taken[inside].tolist(), poses[inside], strict=True)
+            for frame, pose in zip(frames[inside].tolist(), poses[inside], strict=True)
         ]
     return Drive(
         name=world.recipe.name,
@@ -295,7 +299,7 @@ def truth_of(world: World, drive: Drive, visibility: FloatArray) -> Truth:
     frames = [world.frame_of(image) for image in drive.images]
     return Truth(
         map=world.port.hd_map,
-        cam_from_vehicle={name: own[0] for name, own in world.cam_from_vehicle.items()},
+        cam_from_vehicle={name: poses[0] for name, poses in world.cam_from_vehicle.items()},
         map_from_vehicle=world.map_from_vehicle[frames],
         visibility=visibility,
         lane_visible=tuple(np.zeros(len(lane.points_map), dtype=bool) for lane in world.port.hd_map.lanes),

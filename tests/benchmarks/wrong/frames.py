@@ -25,8 +25,8 @@ def _edit_list(change: Callable[[FloatArray, _Names], tuple[FloatArray, _Names]]
 
 
 def _drop(stamp_s: FloatArray, names: _Names) -> tuple[FloatArray, _Names]:
-    kept = np.flatnonzero(np.random.default_rng(5).random(len(names)) > 1 / 3)
-    return stamp_s[kept], [names[k] for k in kept]
+    rows = np.flatnonzero(np.random.default_rng(5).random(len(names)) > 1 / 3)
+    return stamp_s[rows], [names[k] for k in rows]
 
 
 def _double(stamp_s: FloatArray, names: _Names) -> tuple[FloatArray, _Names]:
@@ -61,8 +61,8 @@ def _exchange_cameras(folder: Path) -> None:
 def _lost(seconds: float, stamp_s: FloatArray, poses: FloatArray) -> Any:
     """No poses at all."""
     middle = (stamp_s[0] + stamp_s[-1]) / 2
-    kept = np.abs(stamp_s - middle) > seconds / 2
-    return stamp_s[kept], poses[kept]
+    is_kept = np.abs(stamp_s - middle) > seconds / 2
+    return stamp_s[is_kept], poses[is_kept]
 
 
 def _drifting(off_m: float, seconds: float, stamp_s: FloatArray, poses: FloatArray) -> Any:

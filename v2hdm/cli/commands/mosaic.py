@@ -17,8 +17,10 @@ def _run(arguments: Sequence[str]) -> None:
     """Add the mosaic to a result: the ground as a GeoTIFF, and pictures before and after."""
     parser = COMMAND.parser()
     add_result(parser)
-    parser.add_argument("--resolution", type=float, metavar="M", default=0.02, help="a pixel (default: 0.02)")
-    workers = "processes (default: all cores)"
+    parser.add_argument(
+        "--resolution", type=float, metavar="M", default=0.02, help="size of a pixel (default: 0.02)"
+    )
+    workers = "number of processes (default: all cores)"
     parser.add_argument("--workers", type=int, default=0, metavar="N", help=workers)
     parser.add_argument("--device", help=argparse.SUPPRESS)  # of 1.0
     parsed = parser.parse_args(arguments)

@@ -23,10 +23,10 @@ from v2hdm.topology.graph import LaneOfGraph, Question
 
 
 class Lanes:
-    """The lane graph of a map, as its corrections are now; it is made anew where these change it."""
+    """The lane graph of a map with its current corrections; rebuilt when they change it."""
 
     def __init__(self, hd_map: HDMap, trajectories: Sequence[Trajectory]) -> None:
-        """``trajectories`` are of the drives, in the frame of the map."""
+        """``trajectories`` are those of the drives, in the map frame."""
         self._hd_map = hd_map
         self._trajectories = trajectories
         self._lock = threading.Lock()
@@ -85,6 +85,6 @@ def _question(question: Question) -> dict[str, Any]:
     return {"key": key, "subject": question.subject, "text": question.text, "p": flat_mm(places)}
 
 
-def _places(asked: Any) -> FloatArray:
+def _places(question: Any) -> FloatArray:
     """The one or two places (N, 2), m, of a question or an answer."""
-    return np.stack([place for place in (asked.place_map, asked.to_map) if place is not None])
+    return np.stack([place for place in (question.place_map, question.to_map) if place is not None])

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from v2hdm.compiled import exact_kernel, exactly_inlined
 from v2hdm.errors import DriveError
 from v2hdm.executor import Executor
 from v2hdm.geometry.lens import distort_points
@@ -95,24 +96,58 @@ def hidden_by(boxes: Sequence[Box], centre_map: FloatArray, points_map: FloatArr
     """Flags (N,) of lines from ``centre_map`` (3,) to points (N, 2 or 3) through a box (Kay, Kajiya 1986)."""
     hidden = np.zeros(len(points_map), dtype=np.bool_)
     points = points_map if points_map.shape[1] == 3 else _on_ground(points_map, None)
-    for box in boxes:
-        cos = np.cos(box.yaw_rad)
-        sin = np.sin(box.yaw_rad)
-        turn = np.array([[cos, -sin], [sin, cos]])
-        ends = np.vstack([centre_map, points])
-        above_m = ends[:, 2] - ground_under(box, ends[:, :2]) - box.base_m
-        eye, *ground = np.column_stack([(ends[:, :2] - box.centre_map) @ turn, above_m])
-        ray = np.reshape(ground, (-1, 3)) - eye
-        half = np.array([box.size_m[0] / 2, box.size_m[1] / 2])
-        low = np.append(-half, 0.0)
-        high = np.append(half, box.size_m[2])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            first = (low - eye) / ray
-            second = (high - eye) / ray
-        enter = np.fmin(first, second).max(axis=1)
-        leave = np.fmax(first, second).min(axis=1)
-        hidden |= (enter < np.minimum(leave, 1.0)) & (leave > 0)
+    placed = [
+        (*box.centre_map, np.cos(box.yaw_rad), np.sin(box.yaw_rad), *box.size_m, box.base_m, *box.beneath)
+        for box in boxes
+    ]
+    lines = (np.asarray(centre_map), np.ascontiguousarray(points, dtype=np.float64))
+    _cross_boxes(np.array(placed).reshape(-1, 11), *lines, hidden)
     return hidden
+
+
+@exactly_inlined
+def _in_box(box: FloatArray, x_m: float, y_m: float, z_m: float) -> tuple[float, float, float]:
+    """A point in a box's frame: along and across it from its middle, and above its lower side."""
+    east = x_m - box[0]
+    north = y_m - box[1]
+    above_m = z_m - (box[8] + (east * box[9] + north * box[10])) - box[7]
+    return east * box[2] + north * box[3], north * box[2] - east * box[3], above_m
+
+
+@exactly_inlined
+def _between(low: float, high: float, start: float, end: float) -> tuple[float, float]:
+    """The shares of the way at which a line enters and leaves the space between two planes."""
+    step = end - start
+    if step == 0:
+        return (-np.inf, np.inf) if low < start < high else (np.inf, -np.inf)
+    first = (low - start) / step
+    second = (high - start) / step
+    return min(first, second), max(first, second)
+
+
+@exact_kernel
+def _cross_boxes(
+    boxes: FloatArray, centre_map: FloatArray, points_map: FloatArray, hidden: BoolArray
+) -> None:
+    """Mark in ``hidden`` (N,) the lines from a centre (3,) to points (N, 3) through one of boxes (B, 11).
+
+    A box is its centre's x and y, its yaw's cosine and sine, its size, its base, and the plane beneath it.
+    """
+    for b in range(len(boxes)):
+        box = boxes[b]
+        half_length = box[4] / 2
+        half_width = box[5] / 2
+        eye = _in_box(box, centre_map[0], centre_map[1], centre_map[2])
+        for n in range(len(points_map)):
+            if hidden[n]:
+                continue
+            x, y, z = _in_box(box, points_map[n, 0], points_map[n, 1], points_map[n, 2])
+            enter_x, leave_x = _between(-half_length, half_length, eye[0], x)
+            enter_y, leave_y = _between(-half_width, half_width, eye[1], y)
+            enter_z, leave_z = _between(0.0, box[6], eye[2], z)
+            enter = max(enter_x, enter_y, enter_z)
+            leave = min(leave_x, leave_y, leave_z)
+            hidden[n] = enter < min(leave, 1.0) and leave > 0
 
 
 class TrueDrive(NamedTuple):
@@ -124,6 +159,7 @@ class TrueDrive(NamedTuple):
 
 _Job = tuple[str, int, str]  # camera, frame and path of an image
 
+_IMAGES_TOGETHER = 8  # most images that a process renders before it reports; chosen
 _LANE_SIGHTINGS = 2  # least number of images that show a lane vertex which counts as seen
 _worker_port: Port | None = None
 
@@ -238,7 +274,9 @@ def _render_all(port: Port, images: list[Image], executor: Executor, progress: S
             _write_picture(job, port)
             report()
     else:
-        executor.share_out(_write_picture, jobs, _start_worker, (port.config,), report)
+        executor.share_out(
+            _write_picture, jobs, _start_worker, (port.config,), report, together=_IMAGES_TOGETHER
+        )
 
 
 def _start_worker(config: PortConfig) -> None:

@@ -55,7 +55,7 @@ def check_goal(best: MethodResult, goal_m: float, frame: str) -> Iterator[Findin
         corners = f"95 % of the corners of {len(judged)} markings"
         says = f"{corners} within {_cm(reached_m)} in the frame of the {frame}"
         if best.evidence is not None:
-            says += _conditions(best.evidence, told=[finding.check for finding in unknown_clocks])
+            says += _conditions(best.evidence, raised_checks=[finding.check for finding in unknown_clocks])
         relative_m = relative_radii_m(judged)
         if len(relative_m):
             says += f", {_cm(radius_of_all_m(relative_m))} from marking to marking"
@@ -140,13 +140,13 @@ def _beside(best: MethodResult, coarse: int) -> str:
     return says
 
 
-def _conditions(evidence: SolveEvidence, told: Sequence[str]) -> str:
+def _conditions(evidence: SolveEvidence, raised_checks: Sequence[str]) -> str:
     """The inputs that absolute accuracy rests on: one that may be wrong, or those that no image shows.
 
     What is unknown of the inputs of the checks ``told`` is part of the stated accuracy.
     """
     doubtful = doubted(evidence)
-    relied = [name for check, name in relied_on(evidence).items() if check not in told]
+    relied = [name for check, name in relied_on(evidence).items() if check not in raised_checks]
     if doubtful is not None:
         return f" (unless the {doubtful.fault.check} is off, which is possible)"
     return f" (if {' and '.join(relied)} are right, which this drive cannot show)" if relied else ""
