@@ -79,13 +79,18 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 	$(INSTALL) --upgrade pip
 
-$(MAP_INSTALLED): $(INSTALLED_FROM) | $(BIN)/python
+# The kernels are compiled while what the package needs is chosen and unpacked.
+define INSTALL_WITH
 	@echo "installing into $(VENV): some minutes"
-	$(INSTALL) -e '.[map]'
+	$(BIN)/python .ci/needed.py $(1) >$(VENV)/needed-$(1).txt
+	$(INSTALL) --no-deps -e . & $(INSTALL) -r $(VENV)/needed-$(1).txt && wait $$!
+endef
+
+$(MAP_INSTALLED): $(INSTALLED_FROM) | $(BIN)/python
+	$(call INSTALL_WITH,map)
 	@touch $@
 
 # The development packages include those for mapping.
 $(DEV_INSTALLED): $(INSTALLED_FROM) | $(BIN)/python
-	@echo "installing into $(VENV): some minutes"
-	$(INSTALL) -e '.[dev]'
+	$(call INSTALL_WITH,dev)
 	@touch $(MAP_INSTALLED) $@
