@@ -281,6 +281,41 @@ def ground_tone(
 
 
 @exact_kernel
+def spread(tone: _Plane, colour: _Plane, out: _Plane) -> None:
+    """Write a tone (H', W) times a colour (3,) into ``out`` (H', W, 3)."""
+    for row in range(tone.shape[0]):
+        for column in range(tone.shape[1]):
+            for c in range(3):
+                out[row, column, c] = tone[row, column] * colour[c]
+
+
+@exact_kernel
+def draw_sky(
+    azimuth: _Plane, elevation: _Plane, clouds: _Plane, scale: _Plane, sky: _Plane, skyline: _Plane,
+    per_turn: Any, height_rad: Any, per_focal: Any, out: _Plane,
+) -> None:  # fmt: skip
+    """Write sky and skyline (R, W, 3) by each pixel's direction (R, W), rad.
+
+    ``sky`` (3, 3) is the colour at the horizon, by how much the zenith differs, and the walls'; ``skyline``
+    (2, blocks) has heights and tones of blocks, ``per_turn`` of them a rad.
+    """
+    blocks = skyline.shape[1]
+    for row in range(azimuth.shape[0]):
+        for column in range(azimuth.shape[1]):
+            turn = azimuth[row, column]
+            up = elevation[row, column]
+            cloud = _sample(clouds, turn, up * _f(2.0), scale[0], scale[1], scale[2])
+            bright = _ONE + _f(0.05) * cloud
+            share = _f(np.sqrt(_clip(up * _f(2.2), _ZERO, _ONE)))
+            block = int(np.floor((turn + _f(np.pi)) * per_turn)) % blocks
+            above = skyline[0, block] * height_rad - up
+            covered = _clip(above / per_focal + _HALF, _ZERO, _ONE)
+            for c in range(3):
+                lit = (sky[0, c] + sky[1, c] * share) * bright
+                out[row, column, c] = lit + covered * (sky[2, c] * skyline[1, block] - lit)
+
+
+@exact_kernel
 def light_ground(
     albedo: _Plane, sun: _Plane, wet: _Plane, ground: Any, centre: _Plane, light: _Plane
 ) -> None:
@@ -315,8 +350,8 @@ def _at_border(place: int, size: int) -> int:
 
 
 @exact_kernel
-def blur_along(image: _Plane, flow: _Plane, out: _Plane) -> None:
-    """Write the mean (H, W, 3) of an image and of it moved by the flow (H, W, 2) px either way."""
+def blur_along(image: _Plane, flow: _Plane, share: Any, out: _Plane) -> None:
+    """Write the mean (H, W, 3) of an image and of it moved by a ``share`` of the flow (H, W, 2) px either way."""
     height = image.shape[0]
     width = image.shape[1]
     for row in range(height):
@@ -324,8 +359,8 @@ def blur_along(image: _Plane, flow: _Plane, out: _Plane) -> None:
             for c in range(3):
                 out[row, column, c] = image[row, column, c]
             for sign in (_f(-1.0), _ONE):
-                x = _f(column) + sign * flow[row, column, 0]
-                y = _f(row) + sign * flow[row, column, 1]
+                x = _f(column) + sign * (flow[row, column, 0] * share)
+                y = _f(row) + sign * (flow[row, column, 1] * share)
                 floor_x = _f(np.floor(x))
                 floor_y = _f(np.floor(y))
                 share_x = x - floor_x
@@ -345,19 +380,18 @@ def blur_along(image: _Plane, flow: _Plane, out: _Plane) -> None:
 
 @exact_kernel
 def record(
-    image: _Plane,
-    noise: _Plane,
-    per_electron: Any,
-    dark: Any,
-    codes: NDArray[np.uint8],
-    out: NDArray[np.uint8],
-) -> None:
-    """Write the codes (H, W, 3) of an exposed image with shot noise and noise in the dark."""
+    image: _Plane, gain: _Plane, falloff: _Plane, noise: _Plane, per_electron: Any, dark: Any,
+    codes: NDArray[np.uint8], out: NDArray[np.uint8],
+) -> None:  # fmt: skip
+    """Write the codes (H, W, 3) of an image with shot noise and noise in the dark.
+
+    It is exposed by a ``gain`` (3,) and the lens's ``falloff`` (H, W).
+    """
     steps = _f(len(codes) - 1)
     for row in range(image.shape[0]):
         for column in range(image.shape[1]):
             for c in range(3):
-                level = image[row, column, c]
+                level = image[row, column, c] * gain[c] * falloff[row, column]
                 sigma = _f(np.sqrt(max(level, _ZERO) * per_electron + dark))
                 level = (level + sigma * noise[row, column, c]) * steps
                 out[row, column, c] = codes[int(_clip(level, _ZERO, steps))]

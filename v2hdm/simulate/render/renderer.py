@@ -193,19 +193,22 @@ def draw_background(view: View, light: Light, backdrop: Backdrop, last_row: int)
     x, y, z = (row[0] * u + row[1] * v + row[2] for row in rotation)
     elevation = np.arctan2(z, np.hypot(x, y))
     azimuth = np.arctan2(y, x)
-    height = np.clip(elevation * np.float32(2.2), 0, 1)[..., None]
-    clouds = sample(_CLOUD_TILE, azimuth, elevation * 2)[..., None]
-    horizon, zenith = (np.array(c, dtype=np.float32) for c in (light.horizon_bgr, light.zenith_bgr))
-    out = horizon + (zenith - horizon) * np.sqrt(height)
-    out *= np.float32(1.0) + np.float32(0.05) * clouds
+    horizon, zenith, wall = np.array([light.horizon_bgr, light.zenith_bgr, backdrop.albedo_bgr], np.float32)
     blocks = max(int(2 * np.pi / backdrop.block_rad), 8)
-    skyline = _skyline(backdrop.seed, blocks)
-    turn = (azimuth + np.float32(np.pi)) * np.float32(blocks / (2 * np.pi))
-    index = np.floor(turn).astype(np.int32) % blocks
-    above = skyline[0][index] * np.float32(backdrop.height_rad) - elevation
-    covered = np.clip(above / np.float32(1.0 / view.rays.info.intrinsic[0, 0]) + 0.5, 0, 1)
-    wall = np.array(backdrop.albedo_bgr, dtype=np.float32) * skyline[1][index][..., None]
-    return np.asarray(out + covered[..., None] * (wall - out), dtype=np.float32)
+    out = np.empty((*azimuth.shape, 3), dtype=np.float32)
+    kernels.draw_sky(
+        azimuth,
+        elevation,
+        _CLOUD_TILE.padded,
+        np.array(scale_of(_CLOUD_TILE, (0.0, 0.0)), dtype=np.float32),
+        np.stack([horizon, zenith - horizon, wall]),
+        _skyline(backdrop.seed, blocks),
+        np.float32(blocks / (2 * np.pi)),
+        np.float32(backdrop.height_rad),
+        np.float32(1.0 / view.rays.info.intrinsic[0, 0]),
+        out,
+    )
+    return out
 
 
 RENDERER_VERSION = 2
@@ -281,7 +284,7 @@ class Renderer:
         sky_rows = np.flatnonzero(~ground.below.all(axis=1))
         last_row = ground.first_row + (int(sky_rows[-1]) + 1 if len(sky_rows) else 0)
         radiance = np.empty((height, width, 3), dtype=np.float32)
-        radiance[ground.first_row :] = self._ground(view, ground, shadows, labels)
+        self._draw_ground(view, ground, shadows, radiance[ground.first_row :], labels)
         if last_row:
             background = draw_background(view, scene.light, scene.backdrop, last_row)
             radiance[: ground.first_row] = background[: ground.first_row]
@@ -293,12 +296,18 @@ class Renderer:
             radiance[rows] = background[rows] + clear * (radiance[rows] - background[rows])
         return radiance
 
-    def _ground(
-        self, view: View, ground: GroundField, shadows: Sequence[ShadowLayer], labels: NDArray[np.uint8]
-    ) -> Float32:
+    def _draw_ground(
+        self,
+        view: View,
+        ground: GroundField,
+        shadows: Sequence[ShadowLayer],
+        albedo: Float32,
+        labels: NDArray[np.uint8],
+    ) -> None:
+        """Write the ground's radiance to ``albedo`` (H', W, 3), which is its reflectance on the way there."""
         scene = self.scene
         bare = on_ground.tone(scene.ground, ground)
-        albedo = _float32(cv2.merge([bare * np.float32(c) for c in scene.ground.albedo_bgr]))
+        kernels.spread(bare, np.array(scene.ground.albedo_bgr, dtype=np.float32), albedo)
         self._paint.draw(view, ground, albedo, labels)
         sun = on_ground.sun_visibility(shadows, scene.shades, view, ground)
         wet = on_ground.wetness(scene.ground, ground)
@@ -310,7 +319,6 @@ class Renderer:
         height = max(light.sun_direction_map[2], 0.0)
         lights = np.array([[s * height for s in light.sun_bgr], light.sky_bgr, light.horizon_bgr], np.float32)
         kernels.light_ground(albedo, sun, wet, (ground.x_m, ground.y_m), centre, lights)
-        return albedo
 
 
 _CODE_STEPS = 16384  # number of levels of linear light that the table of sRGB codes tells apart
@@ -351,17 +359,20 @@ def expose(image: Float32, optics: Optics, rng: np.random.Generator) -> NDArray[
         image = _float32(cv2.GaussianBlur(image, (0, 0), optics.psf_sigma_px))
     height, width = image.shape[:2]
     gain = optics.mean_level / max(float(image[height // 3 :: 4, ::4].mean()), 1e-6)
-    balance = np.diag(gain * np.array(optics.white_balance_bgr)).astype(np.float32)
-    image = _float32(cv2.multiply(cv2.transform(image, balance), _vignette(height, width, optics.vignetting)))
+    balance = (gain * np.array(optics.white_balance_bgr)).astype(np.float32)
+    falloff = _vignette(height, width, optics.vignetting)
     if optics.grey:
-        image = np.repeat(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)[..., None], 3, axis=2)
+        grey = cv2.cvtColor(image * balance * falloff[..., None], cv2.COLOR_BGR2GRAY)
+        image = np.repeat(grey[..., None], 3, axis=2)
+        balance = np.ones_like(balance)
+        falloff = np.ones_like(falloff)
     out = np.empty(image.shape, dtype=np.uint8)
     row, column = (int(n) for n in rng.integers(0, _NOISE_SHIFT_PX, 2))
     field = _normal_field(height + _NOISE_SHIFT_PX, width + _NOISE_SHIFT_PX)
     noise = field[row : row + height, column : column + width]
     per_electron = np.float32(1.0 / optics.full_well_electrons)
     dark = np.float32(optics.read_noise**2)
-    kernels.record(image, noise, per_electron, dark, _srgb_codes(), out)
+    kernels.record(image, balance, falloff, noise, per_electron, dark, _srgb_codes(), out)
     return out
 
 
@@ -373,12 +384,13 @@ def _float32(array: NDArray[Any]) -> Float32:
 def _motion_blur(radiance: Float32, view: View, motion: Motion) -> Float32:
     """Mean of three images displaced along the image flow over the exposure, symmetric about its middle."""
     if motion.exposure_s <= 0:
-        return radiance.copy()
-    flow = _flow(view, motion) * np.float32(motion.exposure_s / 3.0)
-    if float(np.abs(flow).max()) < 0.02:
-        return radiance.copy()
+        return radiance
+    flow = _flow(view, motion)
+    share = np.float32(motion.exposure_s / 3.0)
+    if cv2.norm(flow, cv2.NORM_INF) * share < 0.02:
+        return radiance
     out = np.empty_like(radiance)
-    kernels.blur_along(radiance, flow, out)
+    kernels.blur_along(radiance, flow, share, out)
     return out
 
 
@@ -415,8 +427,7 @@ def _normal_field(height: int, width: int) -> Float32:
 @lru_cache(maxsize=4)
 def _vignette(height: int, width: int, loss: float) -> Float32:
     v, u = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
-    falloff = (1.0 - loss * 0.5 * (u * u + v * v)).astype(np.float32)
-    return np.ascontiguousarray(np.repeat(falloff[..., None], 3, axis=2))
+    return np.asarray(1.0 - loss * 0.5 * (u * u + v * v), dtype=np.float32)
 
 
 @cache
